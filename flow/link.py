@@ -1,0 +1,79 @@
+"""Link: one contact with the outside. Sources bring records in, sinks take messages out, taps see every edge.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flow.message import Message
+from flow.stage import Node
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Raw bytes as they entered: what a recording keeps and what `Source.decode` takes."""
+
+    topic: str
+    arrival_ns: int  # on the host
+    stamp_ns: int  # when it was measured, on the host's timeline
+    data: bytes
+    sequence: int = 0  # one counter over the whole recording
+
+
+class LinkError(Exception):
+    """A link cannot do its work. The text says what to check; it is shown to the user without a traceback."""
+
+
+class Link(Node):
+    """Base of all links: sources (records in), sinks (`on_<port>`), or both, as a servo is."""
+
+
+class Source(Link):
+    """A link that brings records in.
+
+    Live, `listen` opens the hardware and yields records; in replay they come from a recording by `topic`.
+    Both go through the same `decode`, whose annotation declares the outputs.
+    """
+
+    topic: str
+
+    def decode(self, record: Record) -> Any:
+        """Messages of one record: None, one message, or an iterable of messages."""
+        raise NotImplementedError
+
+    def listen(self) -> AbstractContextManager[Iterator[Record]]:
+        """Open the hardware: `with link.listen() as records`. Errors are LinkError."""
+        raise NotImplementedError(f"{type(self).__name__} cannot run live")
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What a tap is told when a run starts."""
+
+    out_dir: Path
+    name: str
+    mermaid: str  # the graph as text
+    settings_yaml: str  # the configuration as run
+
+
+class Tap(Link):
+    """A link that sees every message on every edge, in the order of the run, without the stages knowing.
+
+    It is declared in YAML beside the other links, without inputs. It may not change a message, and what it
+    raises stops the run: a tap that can fail for outside reasons (disk, viewer) handles that itself and counts it.
+    """
+
+    def open(self, run: Run) -> None:
+        """Called once before the first message."""
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        """One message, once, as it leaves `output` ("track.drone_fix"); arrival_ns is the run's clock."""
+
+    def close(self) -> None:
+        """Called once after the last message, also when the run fails."""

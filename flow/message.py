@@ -1,0 +1,145 @@
+"""Messages: what travels on an edge of the graph.
+
+One frozen, slotted dataclass per meaning and frame, so that a wrong wire fails when the graph is loaded.
+Arrays declare element type and shape once, in the annotation; `check_arrays` reads them there.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import re
+import struct
+from typing import Annotated, Any, Protocol, TypeVar, cast, dataclass_transform, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+C = TypeVar("C", bound=type)
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, kw_only_default=True)
+def message(cls: C) -> C:
+    """Make a `Message` subclass a frozen, slotted, keyword-only dataclass (identity equality: it holds arrays)."""
+    return cast(C, dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)(cls))
+
+
+@message
+class Message:
+    """Base of all messages. `stamp_ns` is when the content was true [ns], never when it arrived."""
+
+    stamp_ns: int
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Shape:
+    """Declared array shape: a number is exact, a letter binds to one size within a message.
+
+    `xyz_lidar_m: Annotated[NDArray[np.float32], Shape("n", 3)]`
+    """
+
+    dims: tuple[int | str, ...]
+
+    def __init__(self, *dims: int | str) -> None:
+        object.__setattr__(self, "dims", dims)
+
+    def __str__(self) -> str:
+        return "(" + ", ".join(str(d) for d in self.dims) + ("," if len(self.dims) == 1 else "") + ")"
+
+
+# Array types that messages use; the unit stands in the field's name.
+Vec3 = Annotated[NDArray[np.float64], Shape(3)]
+Mat3 = Annotated[NDArray[np.float64], Shape(3, 3)]
+Points32 = Annotated[NDArray[np.float32], Shape("n", 3)]
+Points64 = Annotated[NDArray[np.float64], Shape("n", 3)]
+PerPointF32 = Annotated[NDArray[np.float32], Shape("n")]
+PerPointF64 = Annotated[NDArray[np.float64], Shape("n")]
+PerPointI64 = Annotated[NDArray[np.int64], Shape("n")]
+PerPointU8 = Annotated[NDArray[np.uint8], Shape("n")]
+PerPointBool = Annotated[NDArray[np.bool_], Shape("n")]
+
+
+def port_name(message_type: type[Message]) -> str:
+    """Output port of a message type: `DroneFix` -> `drone_fix`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", message_type.__name__).lower()
+
+
+@functools.cache
+def array_fields(message_type: type[Message]) -> tuple[tuple[str, np.dtype[Any], Shape], ...]:
+    """(field, dtype, shape) of each declared array field of a message type."""
+    found: list[tuple[str, np.dtype[Any], Shape]] = []
+    for name, hint in get_type_hints(message_type, include_extras=True).items():
+        if get_origin(hint) is not Annotated:
+            continue
+        base, *extras = get_args(hint)
+        shape = next((x for x in extras if isinstance(x, Shape)), None)
+        if shape is not None:
+            dtype = get_args(get_args(base)[1])[0]  # NDArray[T] is ndarray[shape, dtype[T]]
+            found.append((name, np.dtype(dtype), shape))
+    return tuple(found)
+
+
+def check_arrays(message: Message) -> None:
+    """Raise TypeError when an array's dtype or shape is not what the message type declares."""
+    sizes: dict[str, int] = {}
+    for name, dtype, shape in array_fields(type(message)):
+        value: Any = getattr(message, name)
+        where = f"{type(message).__name__}.{name}"
+        array: NDArray[Any] = np.asarray(value)
+        if array is not value or array.dtype != dtype or array.ndim != len(shape.dims):
+            raise TypeError(f"{where}: declared {dtype} {shape}, got {array.dtype} {array.shape}")
+        for declared, size in zip(shape.dims, array.shape, strict=True):
+            wanted = sizes.setdefault(declared, size) if isinstance(declared, str) else declared
+            if size != wanted:
+                raise TypeError(f"{where}: declared {shape} with {declared} = {wanted}, got {array.shape}")
+
+
+class Hasher(Protocol):
+    """The part of hashlib's objects that `hash_into` needs."""
+
+    def update(self, data: Any, /) -> None: ...
+
+
+@functools.cache
+def _field_names(cls: type[Any]) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(cls))
+
+
+_pack_float = struct.Struct("<d").pack
+
+
+def hash_into(hasher: Hasher, value: Any) -> None:
+    """Feed a message, to the last bit and with its types, into a hashlib object. Unknown types are an error."""
+    if dataclasses.is_dataclass(value):
+        hasher.update(b"{" + type(value).__name__.encode())
+        for name in _field_names(type(value)):
+            hash_into(hasher, getattr(value, name))
+        hasher.update(b"}")
+    elif isinstance(value, np.ndarray):
+        array = cast("NDArray[Any]", value)
+        hasher.update(f"[{array.dtype.str}{array.shape}".encode())
+        hasher.update(np.ascontiguousarray(array).data if array.size else b"")
+    elif isinstance(value, enum.Enum):
+        hasher.update(b"e" + value.name.encode() + b";")
+    elif isinstance(value, bool | np.bool_):
+        hasher.update(b"T" if value else b"F")
+    elif isinstance(value, int | np.integer):
+        hasher.update(b"i%d;" % int(cast(int, value)))
+    elif isinstance(value, float | np.floating):
+        hasher.update(b"d" + _pack_float(float(cast(float, value))))
+    elif isinstance(value, str):
+        hasher.update(b"s%d:" % len(value) + value.encode())
+    elif isinstance(value, bytes):
+        hasher.update(b"b%d:" % len(value) + value)
+    elif value is None:
+        hasher.update(b"N")
+    elif isinstance(value, tuple):
+        items = cast("tuple[Any, ...]", value)
+        hasher.update(b"(%d:" % len(items))
+        for item in items:
+            hash_into(hasher, item)
+    else:
+        raise TypeError(f"a message may not hold a {type(value).__name__}: {value!r}")

@@ -1,0 +1,104 @@
+"""Stage: one step of the method. Its ports are read from its method signatures.
+
+    class Track(Stage):
+        radius_m: float = Field(1.0, gt=0)                    # a setting
+        _state: State = PrivateAttr(default_factory=State)    # what it remembers
+
+        def on_points(self, points: SweptPoints) -> Iterator[DroneFix | TrackState]: ...
+
+declares an input port `points` and the outputs `drone_fix` and `track_state`. Nothing is declared twice.
+A stage has no thread, clock, socket, file or global: same inputs, same outputs.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import collections.abc
+import functools
+import types
+import typing
+from collections.abc import Iterable, Iterator
+from typing import Any, ClassVar, Union, get_args, get_origin, get_type_hints
+
+from pydantic import BaseModel, ConfigDict
+
+from flow.message import Message, port_name
+
+
+class Node(BaseModel):
+    """What stages and links share: checked, frozen settings and ports found in the signatures."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset()
+    """Input ports that may stay unwired."""
+
+
+class Stage(Node):
+    """Base of all stages. `on_<port>(self, message: Type) -> outputs` is a port; state lives in private attributes."""
+
+    def finish(self) -> Iterable[Message] | Message | None:
+        """Called once after the last event; may return or yield outputs (annotate them), as a port does."""
+        return None
+
+
+class PortError(TypeError):
+    """A stage's class is written wrongly (a port without annotation, two outputs of one name)."""
+
+
+_CONTAINERS = (Union, types.UnionType, collections.abc.Iterator, collections.abc.Iterable, list, tuple)
+
+
+def _message_types(annotation: Any, where: str) -> Iterator[type[Message]]:
+    """Message types in an output annotation: a union, an Iterator/Iterable/list/tuple of them, or None."""
+    if annotation in (None, type(None), Ellipsis, Message):  # the bare base promises nothing
+        return
+    origin = get_origin(annotation)
+    if origin in _CONTAINERS:
+        for part in get_args(annotation):
+            yield from _message_types(part, where)
+    elif isinstance(annotation, type) and issubclass(annotation, Message):
+        yield annotation
+    else:
+        raise PortError(f"{where}: the return annotation has {annotation!r}, which is no message type")
+
+
+def _hints(cls: type[Node], method: str) -> dict[str, Any]:
+    try:
+        return get_type_hints(getattr(cls, method))
+    except NameError as error:
+        raise PortError(
+            f"{cls.__name__}.{method}: {error}; import message types at run time, not under TYPE_CHECKING"
+        ) from None
+
+
+@functools.cache
+def input_ports(cls: type[Node]) -> dict[str, type[Message]]:
+    """Input port -> message type, in the order the class writes them."""
+    ports: dict[str, type[Message]] = {}
+    names = [name for base in reversed(cls.__mro__) for name in vars(base) if name.startswith("on_")]
+    for name in dict.fromkeys(names):
+        hints = _hints(cls, name)
+        hints.pop("return", None)
+        if len(hints) != 1:
+            raise PortError(f"{cls.__name__}.{name}: a port takes one annotated message")
+        ((_, wanted),) = hints.items()
+        if not (isinstance(wanted, type) and issubclass(wanted, Message)):
+            raise PortError(f"{cls.__name__}.{name}: {wanted!r} is no message type")
+        ports[name.removeprefix("on_")] = wanted
+    return ports
+
+
+@functools.cache
+def output_ports(cls: type[Node]) -> dict[str, type[Message]]:
+    """Output port -> message type, from the return annotations of all `on_*`, `finish` and `decode` methods."""
+    methods = [f"on_{port}" for port in input_ports(cls)] + [m for m in ("finish", "decode") if hasattr(cls, m)]
+    ports: dict[str, type[Message]] = {}
+    for name in methods:
+        where = f"{cls.__name__}.{name}"
+        annotation = _hints(cls, name).get("return")
+        for found in _message_types(None if annotation is typing.Any else annotation, where):
+            if ports.setdefault(port_name(found), found) is not found:
+                raise PortError(f"{where}: two message types share the output name {port_name(found)!r}")
+    return ports

@@ -1,0 +1,1 @@
+"""The outside world: sensors, servo, autopilot, recordings, viewer, command line. Only links touch it."""

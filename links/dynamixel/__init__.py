@@ -1,0 +1,8 @@
+"""The turntable's servo, a DYNAMIXEL MX-28AR: recorded states in. Driving the real one is not built yet.
+
+Source: ours; recording format in recordings/README.md (/servo/state).
+"""
+
+from links.dynamixel.servo import Servo
+
+__all__ = ["Servo"]

@@ -1,0 +1,1 @@
+"""The method: messages, geometry, and one file per step of the paper."""

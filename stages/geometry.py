@@ -1,0 +1,126 @@
+"""Frames and rigid transforms. The one frame table of the project.
+
+| frame     | origin, axes                                                                        |
+| --------- | ----------------------------------------------------------------------------------- |
+| vehicle   | at the vehicle camera; x forward, y left, z up                                       |
+| drone     | at the drone body's centre; x forward, y left, z up                                  |
+| world     | the vehicle frame at the start, z up                                                 |
+| turntable | on the servo's axis, z up along it, turned by the servo angle                         |
+| lidar     | Velodyne's: z_lidar is the spin axis, azimuth 0 along +y_lidar, growing towards +x    |
+
+`T_a_b` takes points from b to a: p_a = T_a_b @ p_b (4x4, float64). NED and FRD live in links/mavlink only.
+
+Source: DESIGN, Frames; VLP-16 user manual 63-9243, section 9 (lidar axes).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Array64 = NDArray[np.float64]
+Vector3 = tuple[float, float, float]
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def rotation_from_rpy_deg(rpy_deg: Vector3) -> Array64:
+    """R = Rz(yaw) Ry(pitch) Rx(roll), fixed axes (URDF's convention), degrees. (3, 3)."""
+    roll, pitch, yaw = (math.radians(a) for a in rpy_deg)
+    cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def rotation_from_quaternion_xyzw(quaternion_xyzw: tuple[float, float, float, float]) -> Array64:
+    """Rotation of a quaternion (x, y, z, w), normalised first. (3, 3)."""
+    x, y, z, w = np.asarray(quaternion_xyzw, dtype=np.float64) / math.hypot(*quaternion_xyzw)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def rotation_z(angle_rad: float) -> Array64:
+    """Turn about z by `angle_rad`, counter-clockwise seen from above. (3, 3)."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def transform(rotation: Array64, translation_m: Array64) -> Array64:
+    """T_a_b (4, 4) from R_a_b (3, 3) and the origin of b in a (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = translation_m
+    return T
+
+
+class Pose(_Settings):
+    """A transform as people write it: `{xyz_m: [0, 0, 1.2], rpy_deg: [0, 0, 90]}` or with `quaternion_xyzw`."""
+
+    xyz_m: Vector3 = (0.0, 0.0, 0.0)
+    rpy_deg: Vector3 | None = None
+    quaternion_xyzw: tuple[float, float, float, float] | None = None
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> Pose:
+        if self.rpy_deg is not None and self.quaternion_xyzw is not None:
+            raise ValueError("give rpy_deg or quaternion_xyzw, not both")
+        if self.quaternion_xyzw is not None and abs(math.hypot(*self.quaternion_xyzw) - 1.0) > 1e-3:
+            raise ValueError("quaternion_xyzw must have length 1")
+        return self
+
+    def matrix(self) -> Array64:
+        """The transform as (4, 4)."""
+        if self.quaternion_xyzw is not None:
+            rotation = rotation_from_quaternion_xyzw(self.quaternion_xyzw)
+        else:
+            rotation = rotation_from_rpy_deg(self.rpy_deg or (0.0, 0.0, 0.0))
+        return transform(rotation, np.asarray(self.xyz_m, dtype=np.float64))
+
+
+class Harmonic(_Settings):
+    """One term of the servo encoder's error: amplitude * sin(order * angle + phase)."""
+
+    order: Annotated[int, Field(ge=1, le=16)]
+    amplitude_deg: Annotated[float, Field(ge=0, le=5)]
+    phase_deg: float = 0.0
+
+
+class LidarMount(_Settings):
+    """How the LiDAR sits on the vehicle: T_vehicle_lidar = T_vehicle_turntable Rz(angle) T_turntable_lidar.
+
+    angle = sign * (servo position - zero) - encoder error. `turns: false` is a LiDAR bolted down, without servo.
+    A servo stamp is corrected by `servo_time_offset_s` before interpolation (positive: the servo's stamps are early).
+    """
+
+    T_vehicle_turntable: Pose = Pose()
+    T_turntable_lidar: Pose = Pose()
+    turns: bool = True
+    servo_sign: Literal[1, -1] = 1
+    servo_zero_deg: float = 0.0
+    servo_time_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    servo_harmonics: tuple[Harmonic, ...] = ()
+
+    def turntable_rad(self, servo_rad: Array64) -> Array64:
+        """Turntable angle for servo encoder positions (n,) [rad]."""
+        angle = self.servo_sign * (servo_rad - math.radians(self.servo_zero_deg))
+        for term in self.servo_harmonics:
+            angle = angle - math.radians(term.amplitude_deg) * np.sin(
+                term.order * servo_rad + math.radians(term.phase_deg)
+            )
+        return angle

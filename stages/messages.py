@@ -1,0 +1,135 @@
+"""Every message of the method, in the order data flows. Frames: see `stages/geometry.py`.
+
+Source: DESIGN, the graph. Sensor messages carry what was measured; nothing here comes from truth.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.message import (
+    Mat3,
+    Message,
+    PerPointBool,
+    PerPointF32,
+    PerPointF64,
+    PerPointI64,
+    PerPointU8,
+    Points32,
+    Points64,
+    Shape,
+    Vec3,
+    message,
+)
+
+DepthPixels = Annotated[NDArray[np.float32], Shape("h", "w")]
+
+
+@message
+class LidarFirings(Message):
+    """One decoded LiDAR packet, every laser pulse of it: also those that saw nothing (range_m = 0). Frame: lidar."""
+
+    pulse_stamp_ns: PerPointI64  # when each laser fired
+    laser: PerPointU8  # 0..15, the packet's channel order
+    azimuth_rad: PerPointF32  # 0 along +y_lidar, clockwise seen from +z_lidar, [0, 2 pi)
+    range_m: PerPointF32  # 0: no return
+    reflectivity: PerPointU8  # 0..255, calibrated by the sensor
+    return_kind: PerPointU8  # 0 strongest (or only), 1 last; dual mode has both
+    xyz_lidar_m: Points32  # (0, 0, 0) where there was no return
+    lost_packets: int  # packets missing just before this one
+
+
+@message
+class ServoState(Message):
+    """The turntable's servo as it answered; stamp_ns is mid-exchange."""
+
+    position_rad: float
+    velocity_radps: float
+    goal_rad: float
+    error: int  # the servo's own error bits, 0 is healthy
+
+
+@message
+class SweptPoints(Message):
+    """Returns in the vehicle frame, each at its own time; stamp_ns is the first pulse's of the slice."""
+
+    point_stamp_ns: PerPointI64
+    xyz_vehicle_m: Points32
+    laser: PerPointU8
+    reflectivity: PerPointU8
+    servo_rad: PerPointF32  # turntable angle at the pulse, after sign, zero and time offset
+    pulses: int  # laser pulses fired in this slice, with those that returned nothing
+    origin_vehicle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where the beams start, mid-slice
+    unplaced: int = 0  # returns left out because the turntable's angle at their time is not known
+    reason: str = ""  # why returns were left out; empty when none were
+
+
+@message
+class DepthImage(Message):
+    """One whole sweep seen from the turntable as a pinhole image looking up; stamp_ns is the sweep's end. P III.A.
+
+    Pixel (row v, column u) looks along (x, y, 1) with x = (u + 0.5 - w/2) / focal_px, y = (v + 0.5 - h/2) / focal_px,
+    in axes parallel to the vehicle's. Depth is z over the origin.
+    """
+
+    start_ns: int
+    depth_m: DepthPixels  # z of the nearest return, 0: none
+    focal_px: float  # plane height / pixel size on that plane
+    origin_vehicle_m: Vec3  # where the image looks from
+    points: int  # returns that fell into the image
+    returns: int  # returns of the whole sweep, in the image or not
+    turned_rad: float  # servo travel the sweep covered; 0 for a bolted-down LiDAR
+    lost_packets: int = 0  # LiDAR packets missing within the sweep
+
+
+@message
+class ScoreImage(Message):
+    """The detector's score per pixel of a DepthImage: lower is more like a drone, NaN is no candidate. P III.B."""
+
+    score: DepthPixels
+
+
+@message
+class Detections(Message):
+    """Drone candidates of one sweep, best first. An empty or wholly refused list with its reasons is a normal answer."""
+
+    xyz_vehicle_m: Points64
+    score: PerPointF64  # e = e_inner + e_outer
+    e_inner: PerPointF64
+    e_outer: PerPointF64
+    accepted: PerPointBool
+    reasons: tuple[str, ...]  # one per candidate: why it was accepted or refused
+    verdict: str  # one sentence for people: "drone at ..." or "no drone: ..."
+
+
+class TrackingState(enum.Enum):
+    """What the tracker is doing."""
+
+    SEARCHING = 0  # no drone known
+    TRACKING = 2
+    LOST = 4  # had one, has none
+
+
+@message
+class DroneFix(Message):
+    """Where the LiDAR saw the drone; stamp_ns is the weighted mean time of the returns used. P III.C."""
+
+    xyz_vehicle_m: Vec3
+    covariance_m2: Mat3
+    hits: int  # returns used
+    iterations: int
+    shift_m: float  # last mean shift step
+
+
+@message
+class TrackState(Message):
+    """The tracker's state after each frame, with the reason for it in words."""
+
+    state: TrackingState
+    reason: str
+    hits: int  # returns within the radius in the frame just ended
+    frame_s: float  # how long that frame was

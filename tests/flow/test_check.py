@@ -1,0 +1,279 @@
+"""Every kind of configuration error: its text, place and suggestion, pinned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flow.graph import load_graph
+from flow.problem import ConfigError, Place
+from tests.flow.toys import GRAPH
+
+
+def problems_of(tmp_path: Path, text: str, **kwargs) -> list[str]:
+    file = tmp_path / "x.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_graph(file, **kwargs)
+    return [str(p).replace(f"{tmp_path}/", "") for p in caught.value.problems]
+
+
+def only_problem(tmp_path: Path, text: str, **kwargs) -> str:
+    (problem,) = problems_of(tmp_path, text, **kwargs)
+    return problem
+
+
+def test_a_right_graph_has_no_problems_and_ranks_producers_first(tmp_path):
+    (tmp_path / "x.yaml").write_text(GRAPH)
+    graph = load_graph(tmp_path / "x.yaml")
+    assert list(graph.nodes) == ["numbers", "double", "add"]
+    assert [(e.producer, e.output, e.consumer, e.port) for e in graph.edges] == [
+        ("numbers", "number", "double", "number"),
+        ("numbers", "number", "add", "left"),
+        ("double", "number", "add", "right"),
+    ]
+
+
+CASES = {
+    "unknown stage": (
+        ("tests.flow.toys.Double", "stages.detct.Detect"),
+        "x.yaml:3: stages.double.use: unknown stage 'stages.detct.Detect'. Did you mean 'stages.detect.Detect'?",
+    ),
+    "unknown class in a known module": (
+        ("tests.flow.toys.Double", "tests.flow.toys.Dubble"),
+        "x.yaml:3: stages.double.use: unknown stage 'tests.flow.toys.Dubble'.",
+    ),
+    "no import path": (
+        ("tests.flow.toys.Double", "Double"),
+        "x.yaml:3: stages.double.use: must name a class as module.Class, got 'Double'.",
+    ),
+    "a link under stages": (
+        ("use: tests.flow.toys.Double", "use: tests.flow.toys.Printer"),
+        "x.yaml:3: stages.double.use: 'tests.flow.toys.Printer' is no stage; it belongs under 'links:'.",
+    ),
+    "no stage at all": (
+        ("use: tests.flow.toys.Double", "use: tests.flow.toys.Number"),
+        "x.yaml:3: stages.double.use: 'tests.flow.toys.Number' is no stage.",
+    ),
+    "a class written wrongly": (
+        ("use: tests.flow.toys.Double", "use: tests.flow.toys.Untyped"),
+        "x.yaml:3: stages.double.use: 'tests.flow.toys.Untyped' is written wrongly: "
+        "Untyped.on_number: a port takes one annotated message.",
+    ),
+    "missing use": (
+        ("    use: tests.flow.toys.Double\n", ""),
+        "x.yaml:2: stages.double.use: is missing.",
+    ),
+    "unknown setting": (
+        ("{name: adder}", "{name: adder, windw: 4}"),
+        "x.yaml:7: stages.add.config.windw: unknown setting 'windw'. Did you mean 'window'?",
+    ),
+    "unknown setting, nothing near": (
+        ("{name: adder}", "{name: adder, colour: red}"),
+        "x.yaml:7: stages.add.config.colour: unknown setting 'colour'. Add has 'window' or 'name'.",
+    ),
+    "wrong type": (
+        ("{name: adder}", "{name: adder, window: many}"),
+        "x.yaml:7: stages.add.config.window: must be a valid integer, unable to parse string as an integer, got 'many'.",
+    ),
+    "out of range": (
+        ("{name: adder}", "{name: adder, window: 0}"),
+        "x.yaml:7: stages.add.config.window: must be greater than or equal to 1, got 0.",
+    ),
+    "missing setting": (
+        ("    config: {name: adder}\n", ""),
+        "x.yaml:5: stages.add.config.name: is missing and has no default.",
+    ),
+    "settings that are no mapping": (
+        ("{name: adder}", "[adder]"),
+        "x.yaml:7: stages.add.config: must be a mapping of settings.",
+    ),
+    "unknown key": (
+        ("inputs: {number", "input: {number"),
+        "x.yaml:4: stages.double.input: unknown key 'input'; there is 'use', 'config' or 'inputs'. Did you mean 'inputs'?",
+    ),
+    "unknown port": (
+        ("left: numbers.number", "left: numbers.number\n      lef: numbers.number"),
+        "x.yaml:10: stages.add.inputs.lef: unknown port 'lef'. Did you mean 'left'?",
+    ),
+    "unwired port": (
+        ("      left: numbers.number\n", ""),
+        "x.yaml:8: stages.add.inputs: port 'left' (Number) is not wired. "
+        "Of that type there is 'double.number' or 'numbers.number'.",
+    ),
+    "unknown node": (
+        ("left: numbers.number", "left: nubers.number"),
+        "x.yaml:9: stages.add.inputs.left: no stage or link 'nubers'. Did you mean 'numbers'?",
+    ),
+    "unknown output": (
+        ("left: numbers.number", "left: numbers.nmber"),
+        "x.yaml:9: stages.add.inputs.left: 'numbers' has no output 'nmber'. Did you mean 'number'?",
+    ),
+    "no edge": (
+        ("left: numbers.number", "left: numbers"),
+        "x.yaml:9: stages.add.inputs.left: must read node.output, got 'numbers'.",
+    ),
+    "type mismatch": (
+        ("left: numbers.number", "left: add.text"),
+        "x.yaml:9: stages.add.inputs.left: type mismatch: add.text is Text, add.left takes Number.",
+    ),
+    "cycle": (
+        ("{number: numbers.number}", "{number: again.number}\n  again:\n    use: tests.flow.toys.Double\n    inputs: {number: double.number}"),
+        "x.yaml:4: stages.double.inputs: cycle double -> again -> double; "
+        "a cycle is legal only through a link (a servo, an autopilot).",
+    ),
+    "unknown section": (
+        ("links:", "lnks: {}\nlinks:"),
+        "x.yaml:11: lnks: unknown section 'lnks'; there is 'include', 'replay', 'rig', 'stages' or 'links'. "
+        "Did you mean 'links'?",
+    ),
+    "a name twice": (
+        ("  numbers: {use: tests.flow.toys.Numbers}", "  numbers: {use: tests.flow.toys.Numbers}\n  numbers: {use: tests.flow.toys.Numbers}"),
+        "x.yaml:13: links.numbers: is written twice (first on line 12).",
+    ),
+    "a name for a stage and a link": (
+        ("  numbers: {use: tests.flow.toys.Numbers}", "  numbers: {use: tests.flow.toys.Numbers}\n  add: {use: tests.flow.toys.Words}"),
+        "x.yaml:13: links.add: a stage is called 'add' already; an edge could not tell them apart.",
+    ),
+    "a bad name": (
+        ("links:\n", "links:\n  Two Words: {use: tests.flow.toys.Words}\n"),
+        "x.yaml:12: links.Two Words: 'Two Words' is no name: use small letters, digits and '_', starting with a letter.",
+    ),
+    "two sources of one topic": (
+        ("links:\n", "links:\n  other: {use: tests.flow.toys.Numbers}\n"),
+        "x.yaml:13: links.numbers.config.topic: 'other' already brings in /numbers: one source for each topic.",
+    ),
+    "not YAML": (
+        ("{name: adder}", "{name: adder"),
+        "x.yaml:8: is not YAML: expected ',' or '}', but got ':'.",
+    ),
+    "a reference to nothing": (
+        ("{name: adder}", "{name: $rig.title}"),
+        "x.yaml:7: stages.add.config.name: '$rig.title' stands for nothing: the configuration has no 'rig'.",
+    ),
+    "a recording that is not there": (
+        ("links:\n", "replay: street.mcap\nlinks:\n"),
+        "x.yaml:11: replay: no such recording 'street.mcap'.",
+    ),
+    "an include that is not there": (
+        ("stages:\n", "include: base.yaml\nstages:\n"),
+        "x.yaml:1: include: no such file 'base.yaml'.",
+    ),
+    "an include of itself": (
+        ("stages:\n", "include: x.yaml\nstages:\n"),
+        "x.yaml:1: include: 'x.yaml' includes itself.",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_the_text_of_an_error(kind, tmp_path):
+    (old, new), expected = CASES[kind]
+    assert old in GRAPH
+    found = problems_of(tmp_path, GRAPH.replace(old, new, 1))
+    assert expected in found
+    # one mistake is one problem, unless the mistake takes away what others need
+    if kind not in ("missing use", "not YAML", "a name twice", "unknown key"):
+        assert found == [expected]
+
+
+def test_all_errors_come_at_once_in_the_order_of_the_lines(tmp_path):
+    text = GRAPH.replace("toys.Double", "toys.Dubble").replace("name: adder", "name: adder, window: 0")
+    text = text.replace("left: numbers.number", "left: numbers.nmber")
+    assert [p.split(":")[1] for p in problems_of(tmp_path, text)] == ["3", "7", "9"]
+
+
+def test_a_missing_file_names_its_neighbour(tmp_path):
+    (tmp_path / "quickstart.yaml").write_text(GRAPH)
+    with pytest.raises(ConfigError, match=r"quickstrat\.yaml: no such file\. Did you mean 'quickstart\.yaml'\?"):
+        load_graph(tmp_path / "quickstrat.yaml")
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (b"", "x.yaml: is empty."),
+        (b"- 1\n", "x.yaml:1: must be a mapping with 'stages:' and 'links:' at the top."),
+        (b"\xff\xfe\x00", "x.yaml: is not UTF-8 text (byte 0)."),
+        (b"a: " + b"[" * 5000, "x.yaml"),
+        (b"#" * 1_000_001, "x.yaml: larger than 1000000 bytes: that is no configuration."),
+        (b"a: &a [1,1,1,1,1,1,1,1,1,1]\nb: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a,*a]\nc: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b,*b]\n"
+         b"d: &d [*c,*c,*c,*c,*c,*c,*c,*c,*c,*c]\ne: [*d,*d,*d,*d,*d,*d,*d,*d,*d,*d]\n",
+         "x.yaml: is too large or too deep: that is no configuration."),
+        (b"stages: !!python/object/apply:os.system ['true']\n", "x.yaml"),
+    ],
+)
+def test_a_file_that_is_no_configuration(content, text, tmp_path):
+    (tmp_path / "x.yaml").write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        load_graph(tmp_path / "x.yaml")
+    assert text in str(caught.value)
+
+
+def test_set_changes_a_setting_by_the_stages_name(tmp_path):
+    (tmp_path / "x.yaml").write_text(GRAPH)
+    graph = load_graph(tmp_path / "x.yaml", sets=["add.window=7", "stages.double.config.factor=0.5"])
+    assert graph.nodes["add"].build().window == 7
+    assert graph.nodes["double"].build().factor == 0.5
+
+
+@pytest.mark.parametrize(
+    ("option", "text"),
+    [
+        ("ad.window=7", "--set ad.window=7: no stage or link 'ad'. Did you mean 'add'?"),
+        ("add.window", "--set add.window: must read NAME.SETTING=VALUE, as in --set track.radius_m=0.8."),
+        ("add.window=0", "--set add.window=0: stages.add.config.window: must be greater than or equal to 1, got 0."),
+        ("add.windw=4", "--set add.windw=4: stages.add.config.windw: unknown setting 'windw'. Did you mean 'window'?"),
+        ("add.window=[1", "--set add.window=[1: the value is not YAML: while parsing a flow sequence."),
+    ],
+)
+def test_a_wrong_set_names_the_option(option, text, tmp_path):
+    assert only_problem(tmp_path, GRAPH, sets=[option]) == text
+
+
+def test_an_overlay_changes_settings_and_null_removes(tmp_path):
+    (tmp_path / "x.yaml").write_text(GRAPH)
+    (tmp_path / "over.yaml").write_text("stages:\n  double: null\n  add:\n    inputs: {right: numbers.number}\n")
+    graph = load_graph(tmp_path / "x.yaml", overlays=[tmp_path / "over.yaml"])
+    assert list(graph.nodes) == ["numbers", "add"]
+
+
+def test_removing_what_is_not_there_is_said(tmp_path):
+    (tmp_path / "over.yaml").write_text("stages:\n  dubble: null\n")
+    found = only_problem(tmp_path, GRAPH, overlays=[tmp_path / "over.yaml"])
+    assert found == "over.yaml:2: stages.dubble: removes what is not there."
+
+
+def test_a_stage_swapped_in_an_overlay_starts_with_its_own_settings(tmp_path):
+    text = GRAPH.replace("toys.Double\n", "toys.Double\n    config: {factor: 3}\n")
+    (tmp_path / "x.yaml").write_text(text)
+    (tmp_path / "over.yaml").write_text("stages:\n  double: {use: tests.flow.toys.Liar}\n")
+    with pytest.raises(ConfigError, match="has no output 'number'"):  # not: unknown setting 'factor'
+        load_graph(tmp_path / "x.yaml", overlays=[tmp_path / "over.yaml"])
+
+
+def test_an_include_lies_below_and_its_errors_name_its_own_file(tmp_path):
+    (tmp_path / "base.yaml").write_text(GRAPH.replace("{name: adder}", "{name: adder, window: 0}"))
+    found = only_problem(tmp_path, "include: base.yaml\nstages:\n  double: {config: {factor: 5}}\n")
+    assert found == "base.yaml:7: stages.add.config.window: must be greater than or equal to 1, got 0."
+
+
+def test_a_reference_stands_for_a_value_elsewhere(tmp_path):
+    text = "rig: {names: {a: anna}, other: $rig.names.a}\n" + GRAPH.replace("adder", "$rig.other")
+    (tmp_path / "x.yaml").write_text(text)
+    assert load_graph(tmp_path / "x.yaml").nodes["add"].build().name == "anna"
+
+
+def test_a_reference_to_itself_is_said(tmp_path):
+    text = "rig: {a: $rig.b, b: $rig.a}\n" + GRAPH.replace("adder", "$rig.a")
+    assert any("'$rig.a' stands for itself." in p for p in problems_of(tmp_path, text))
+
+
+def test_a_recordings_rig_replaces_the_files_own_and_set_changes_both(tmp_path):
+    (tmp_path / "x.yaml").write_text("rig: {a: own, b: own}\n" + GRAPH.replace("{name: adder}", "{name: $rig.a}"))
+    sections = {"rig": ({"a": "recorded"}, Place("street.mcap rig.yaml", 0))}
+    graph = load_graph(tmp_path / "x.yaml", sections=sections)
+    assert (graph.nodes["add"].build().name, graph.values["rig"]) == ("recorded", {"a": "recorded"})
+    graph = load_graph(tmp_path / "x.yaml", sections=sections, sets=["rig.a=by hand"])
+    assert graph.nodes["add"].build().name == "by hand"

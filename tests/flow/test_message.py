@@ -1,0 +1,104 @@
+"""Messages: declared arrays, port names, hashing."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import hashlib
+from typing import Annotated
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flow.message import Mat3, Message, PerPointU8, Points32, Shape, check_arrays, hash_into, message, port_name
+
+
+class Colour(enum.Enum):
+    RED = 1
+
+
+@message
+class Cloud(Message):
+    xyz_m: Points32
+    ring: PerPointU8
+    covariance_m2: Mat3
+    image: Annotated[NDArray[np.uint16], Shape("h", "w")]
+    colour: Colour
+    reasons: tuple[str, ...]
+
+
+def cloud(**changes):
+    fields = {
+        "stamp_ns": 7,
+        "xyz_m": np.zeros((4, 3), np.float32),
+        "ring": np.zeros(4, np.uint8),
+        "covariance_m2": np.eye(3),
+        "image": np.zeros((2, 5), np.uint16),
+        "colour": Colour.RED,
+        "reasons": ("a", "bc"),
+    }
+    return Cloud(**(fields | changes))
+
+
+def digest(value):
+    hasher = hashlib.blake2b()
+    hash_into(hasher, value)
+    return hasher.hexdigest()
+
+
+def test_an_output_is_named_after_its_message():
+    names = {"DroneFix": "drone_fix", "LidarFirings": "lidar_firings", "VPRotation": "vp_rotation"}
+    assert {n: port_name(type(n, (Message,), {})) for n in names} == names
+
+
+def test_a_message_cannot_be_changed_or_given_new_fields():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        cloud().stamp_ns = 8
+    with pytest.raises((AttributeError, TypeError)):
+        object.__setattr__(cloud(), "new", 1)
+
+
+def test_arrays_as_declared_pass():
+    check_arrays(cloud())
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"xyz_m": np.zeros((4, 3))}, r"Cloud\.xyz_m: declared float32 \(n, 3\), got float64 \(4, 3\)"),
+        ({"xyz_m": np.zeros((4, 2), np.float32)}, r"Cloud\.xyz_m: declared \(n, 3\) with 3 = 3, got \(4, 2\)"),
+        ({"ring": np.zeros(5, np.uint8)}, r"Cloud\.ring: declared \(n,\) with n = 4, got \(5,\)"),
+        ({"covariance_m2": np.zeros(3)}, r"Cloud\.covariance_m2: declared float64 \(3, 3\), got float64 \(3,\)"),
+        ({"image": [[1]]}, r"Cloud\.image: declared uint16 \(h, w\), got int64 \(1, 1\)"),
+    ],
+)
+def test_arrays_of_another_type_or_shape_are_named(changes, text):
+    with pytest.raises(TypeError, match=text):
+        check_arrays(cloud(**changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"stamp_ns": 8},
+        {"ring": np.array([0, 0, 0, 1], np.uint8)},
+        {"image": np.zeros((5, 2), np.uint16)},
+        {"reasons": ("ab", "c")},
+        {"covariance_m2": -0.0 * np.eye(3) + np.eye(3) * 1.0000000000000002},
+    ],
+)
+def test_the_hash_sees_every_bit(changes):
+    assert digest(cloud()) != digest(cloud(**changes))
+
+
+def test_the_hash_is_that_of_the_content_not_of_the_memory():
+    wide = np.zeros((4, 6), np.float32)[:, ::2]  # not contiguous
+    assert digest(cloud()) == digest(cloud(xyz_m=wide))
+    empty = np.zeros((0, 3), np.float32)
+    assert digest(cloud(xyz_m=empty)) != digest(cloud())
+
+
+def test_what_cannot_be_hashed_is_refused():
+    with pytest.raises(TypeError, match=r"a message may not hold a dict"):
+        digest({"a": 1})

@@ -1,0 +1,131 @@
+"""Small stages and links for the engine's tests; the engine knows nothing about drones, so neither do they."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from pydantic import Field, PrivateAttr
+
+from flow.link import Link, LinkError, Record, Source
+from flow.message import Message, PerPointF32, message
+from flow.stage import Stage
+
+
+@message
+class Number(Message):
+    """A number."""
+
+    value: float
+
+
+@message
+class Sum(Message):
+    """A running sum."""
+
+    total: float
+    last: PerPointF32
+
+
+@message
+class Text(Message):
+    """Something else than a number."""
+
+    words: str
+
+
+class Numbers(Source):
+    """Brings in numbers written as text."""
+
+    topic: str = "/numbers"
+
+    def decode(self, record: Record) -> Number | None:
+        if record.data == b"refuse":
+            raise LinkError("no numbers here: is the counter plugged in?")
+        return Number(stamp_ns=record.stamp_ns, value=float(record.data)) if record.data else None
+
+
+class Words(Source):
+    """Brings in words."""
+
+    topic: str = "/words"
+
+    def decode(self, record: Record) -> Text:
+        return Text(stamp_ns=record.stamp_ns, words=record.data.decode())
+
+
+class Printer(Link):
+    """Takes sums out."""
+
+    def on_sum(self, sum: Sum) -> None:
+        raise AssertionError("a replay sends nothing out")
+
+
+class Double(Stage):
+    """Doubles, by a factor if asked."""
+
+    factor: float = Field(2.0, gt=0)
+    unused_option: bool = False
+
+    def on_number(self, number: Number) -> Number:
+        return Number(stamp_ns=number.stamp_ns, value=number.value * self.factor)
+
+
+class Add(Stage):
+    """Adds two streams; gives a sum for each number and a word when it ends."""
+
+    optional_inputs = frozenset({"words"})
+    window: int = Field(3, ge=1, le=100)
+    name: str
+    _seen: list[float] = PrivateAttr(default_factory=list)
+
+    def on_left(self, number: Number) -> Iterator[Sum]:
+        self._seen.append(number.value)
+        tail = np.asarray(self._seen[-self.window :], dtype=np.float32)
+        yield Sum(stamp_ns=number.stamp_ns, total=sum(self._seen), last=tail)
+
+    def on_right(self, number: Number) -> Iterator[Sum]:
+        yield from self.on_left(number)
+
+    def on_words(self, text: Text) -> None:
+        if text.words == "fail":
+            raise ZeroDivisionError("asked to")
+
+    def finish(self) -> Text:
+        return Text(stamp_ns=0, words=f"{self.name} ends with {sum(self._seen)}")
+
+
+class Liar(Stage):
+    """Promises a sum of float32 and gives float64."""
+
+    def on_number(self, number: Number) -> Sum:
+        return Sum(stamp_ns=number.stamp_ns, total=0.0, last=np.zeros(2))
+
+
+class Careless(Stage):
+    """Gives what it does not promise."""
+
+    def on_number(self, number: Number) -> Sum | None:
+        return Text(stamp_ns=0, words="surprise")  # type: ignore[return-value]
+
+
+class Untyped(Stage):
+    """A port without a type."""
+
+    def on_number(self, number): ...
+
+
+GRAPH = """\
+stages:
+  double:
+    use: tests.flow.toys.Double
+    inputs: {number: numbers.number}
+  add:
+    use: tests.flow.toys.Add
+    config: {name: adder}
+    inputs:
+      left: numbers.number
+      right: double.number
+links:
+  numbers: {use: tests.flow.toys.Numbers}
+"""

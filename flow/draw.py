@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from html import escape
 
-from flow.graph import Graph
+from flow.graph import Graph, NodeSpec
+from flow.link import Tap
 from flow.stage import output_ports
 
-_BOX_W, _BOX_H, _GAP_X, _GAP_Y, _MARGIN = 190, 58, 130, 42, 24
+_BOX_W, _BOX_H, _GAP_X, _GAP_Y, _MARGIN = 210, 58, 130, 42, 24
 _FILL = {"stages": "#e8f0fe", "links": "#fef3e0"}
 
 
@@ -18,7 +19,7 @@ def mermaid(graph: Graph) -> str:
     """Flowchart text: stages as boxes, links as rounded boxes, each edge with its message; unwired outputs dotted."""
     lines = ["flowchart LR"]
     for spec in graph.nodes.values():
-        label = f'"{spec.name}<br/><small>{spec.cls.__module__}.{spec.cls.__qualname__}</small>"'
+        label = f'"{spec.name}<br/><small>{_says(spec)}</small>"'
         lines.append(f"    {spec.name}[{label}]" if spec.kind == "stages" else f"    {spec.name}([{label}])")
     for edge in graph.edges:
         lines.append(f"    {edge.producer} -- {edge.output} --> {edge.consumer}")
@@ -59,10 +60,14 @@ def svg(graph: Graph) -> str:
             f'fill="{_FILL[spec.kind]}" stroke="#555"/>'
             f'<text x="{x + _BOX_W / 2:.0f}" y="{y + 25:.0f}" text-anchor="middle" font-size="15">'
             f"{escape(spec.name)}</text>"
-            f'<text x="{x + _BOX_W / 2:.0f}" y="{y + 43:.0f}" text-anchor="middle" font-size="10" fill="#555">'
-            f"{escape(spec.cls.__module__)}.{escape(spec.cls.__qualname__)}</text>"
+            f'<text x="{x + _BOX_W / 2:.0f}" y="{y + 43:.0f}" text-anchor="middle" font-size="9" fill="#555">'
+            f"{escape(_says(spec))}</text>"
         )
     return "\n".join([*parts, "</svg>"]) + "\n"
+
+
+def _says(spec: NodeSpec) -> str:
+    return f"{spec.use}, sees every edge" if issubclass(spec.cls, Tap) else spec.use
 
 
 def _columns(graph: Graph) -> dict[str, int]:

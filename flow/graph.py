@@ -55,6 +55,7 @@ class NodeSpec:
 
     name: str
     kind: str  # "stages" or "links"
+    use: str  # import path as declared
     cls: type[Node]
     config: dict[str, Any]
 
@@ -162,7 +163,7 @@ def _nodes(tree: Tree, kind: str) -> Iterator[NodeSpec]:
             config = resolve(tree, (*path, "config"), declared.get("config") or {})
             if len(tree.problems) == before:  # a reference to nothing is said already
                 config = _settings(tree, path, cls, config)
-            yield NodeSpec(name, kind, cls, config)
+            yield NodeSpec(name, kind, declared["use"], cls, config)
 
 
 def _class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node] | None:

@@ -28,7 +28,7 @@ class Servo(Source):
         return self._refused
 
     def decode(self, record: Record) -> ServoState | None:
-        """`{"position_rad": 1.2, "velocity_radps": 0.0, "goal_rad": 1.3, "error": 0}` to a message; None if it is not that."""
+        """A message of `{"position_rad": 1.2, "velocity_radps": 0.0, "goal_rad": 1.3, "error": 0}`, else None."""
         try:
             return parse_state(record.stamp_ns, record.data)
         except ValueError:
@@ -37,7 +37,7 @@ class Servo(Source):
 
 
 def parse_state(stamp_ns: int, data: bytes) -> ServoState:
-    """One recorded state. Raises ValueError when a field is missing, no finite number, or the text is no JSON object."""
+    """One recorded state. Raises ValueError when it is no JSON object, or a field is missing or no finite number."""
     if len(data) > MAX_STATE_BYTES:
         raise ValueError(f"a servo state of {len(data)} bytes")
     try:

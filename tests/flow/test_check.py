@@ -37,8 +37,8 @@ def test_a_right_graph_has_no_problems_and_ranks_producers_first(tmp_path):
 
 CASES = {
     "unknown stage": (
-        ("tests.flow.toys.Double", "stages.detct.Detect"),
-        "x.yaml:3: stages.double.use: unknown stage 'stages.detct.Detect'. Did you mean 'stages.detect.Detect'?",
+        ("tests.flow.toys.Double", "stages.detct.KernelDetect"),
+        "x.yaml:3: stages.double.use: unknown stage 'stages.detct.KernelDetect'. Did you mean 'stages.detect.KernelDetect'?",
     ),
     "unknown class in a known module": (
         ("tests.flow.toys.Double", "tests.flow.toys.Dubble"),
@@ -119,7 +119,10 @@ CASES = {
         "x.yaml:9: stages.add.inputs.left: type mismatch: add.text is Text, add.left takes Number.",
     ),
     "cycle": (
-        ("{number: numbers.number}", "{number: again.number}\n  again:\n    use: tests.flow.toys.Double\n    inputs: {number: double.number}"),
+        (
+            "{number: numbers.number}",
+            "{number: again.number}\n  again:\n    use: tests.flow.toys.Double\n    inputs: {number: double.number}",
+        ),
         "x.yaml:4: stages.double.inputs: cycle double -> again -> double; "
         "a cycle is legal only through a link (a servo, an autopilot).",
     ),
@@ -129,11 +132,17 @@ CASES = {
         "Did you mean 'links'?",
     ),
     "a name twice": (
-        ("  numbers: {use: tests.flow.toys.Numbers}", "  numbers: {use: tests.flow.toys.Numbers}\n  numbers: {use: tests.flow.toys.Numbers}"),
+        (
+            "  numbers: {use: tests.flow.toys.Numbers}",
+            "  numbers: {use: tests.flow.toys.Numbers}\n  numbers: {use: tests.flow.toys.Numbers}",
+        ),
         "x.yaml:13: links.numbers: is written twice (first on line 12).",
     ),
     "a name for a stage and a link": (
-        ("  numbers: {use: tests.flow.toys.Numbers}", "  numbers: {use: tests.flow.toys.Numbers}\n  add: {use: tests.flow.toys.Words}"),
+        (
+            "  numbers: {use: tests.flow.toys.Numbers}",
+            "  numbers: {use: tests.flow.toys.Numbers}\n  add: {use: tests.flow.toys.Words}",
+        ),
         "x.yaml:13: links.add: a stage is called 'add' already; an edge could not tell them apart.",
     ),
     "a bad name": (
@@ -198,9 +207,11 @@ def test_a_missing_file_names_its_neighbour(tmp_path):
         (b"\xff\xfe\x00", "x.yaml: is not UTF-8 text (byte 0)."),
         (b"a: " + b"[" * 5000, "x.yaml"),
         (b"#" * 1_000_001, "x.yaml: larger than 1000000 bytes: that is no configuration."),
-        (b"a: &a [1,1,1,1,1,1,1,1,1,1]\nb: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a,*a]\nc: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b,*b]\n"
-         b"d: &d [*c,*c,*c,*c,*c,*c,*c,*c,*c,*c]\ne: [*d,*d,*d,*d,*d,*d,*d,*d,*d,*d]\n",
-         "x.yaml: is too large or too deep: that is no configuration."),
+        (
+            b"a: &a [1,1,1,1,1,1,1,1,1,1]\nb: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a,*a]\nc: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b,*b]\n"
+            b"d: &d [*c,*c,*c,*c,*c,*c,*c,*c,*c,*c]\ne: [*d,*d,*d,*d,*d,*d,*d,*d,*d,*d]\n",
+            "x.yaml: is too large or too deep: that is no configuration.",
+        ),
         (b"stages: !!python/object/apply:os.system ['true']\n", "x.yaml"),
     ],
 )

@@ -127,7 +127,9 @@ def test_the_csv_tap_writes_every_output_with_flat_columns(tmp_path):
     tap.open(Run(tmp_path, "x", "", ""))
     replay(graph_of(tmp_path), numbers(1, 2), [tap])
     tap.close()
-    assert (tmp_path / "csv" / "double.number.csv").read_text() == "arrival_ns,stamp_ns,value\n1000,500,2.0\n1010,510,4.0\n"
+    assert (
+        tmp_path / "csv" / "double.number.csv"
+    ).read_text() == "arrival_ns,stamp_ns,value\n1000,500,2.0\n1010,510,4.0\n"
     assert sorted(p.name for p in (tmp_path / "csv").iterdir()) == [
         "add.sum.csv",
         "add.text.csv",

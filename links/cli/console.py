@@ -1,0 +1,86 @@
+"""What all commands share: the two consoles, errors in words with an exit code, a progress bar.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar, cast
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from flow.link import LinkError
+from flow.problem import ConfigError
+from flow.replay import RunError
+
+FINDING, WRONG_USE = 1, 2
+BAR_AFTER_S = 1.0  # anything that takes longer than 2 s shows a bar before that
+
+out = Console(highlight=False, soft_wrap=True)
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def in_words(command: F) -> F:
+    """Errors that are the user's to mend become a text and exit code 2 (1 when a stage failed), without a traceback."""
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return command(*args, **kwargs)
+        except ConfigError as error:
+            for problem in error.problems:
+                err.print(str(problem), markup=False, style="red")
+            raise typer.Exit(WRONG_USE) from None
+        except LinkError as error:
+            err.print(str(error), markup=False, style="red")
+            raise typer.Exit(WRONG_USE) from None
+        except RunError as error:
+            err.print(str(error), markup=False, style="red")
+            raise typer.Exit(FINDING) from error
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            err.print(f"{where}{error.strerror or error}.", markup=False, style="red")
+            raise typer.Exit(WRONG_USE) from None
+        except KeyboardInterrupt:
+            err.print("stopped.")
+            raise typer.Exit(130) from None
+
+    return cast(F, wrapped)
+
+
+@contextmanager
+def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
+    """`with progress_bar("replay") as step: step(done, total)`: a bar on stderr once the work has taken a second."""
+    begin = time.monotonic()
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    bar = Progress(*columns, console=err, transient=True, refresh_per_second=5)
+    task = bar.add_task(label, total=None)
+    shown = False
+
+    def step(done: float, total: float) -> None:
+        nonlocal shown
+        if not shown:
+            if time.monotonic() - begin < BAR_AFTER_S:
+                return
+            bar.start()
+            shown = True
+        bar.update(task, completed=done, total=total)
+
+    try:
+        yield step
+    finally:
+        if shown:
+            bar.stop()
+
+
+def warn(text: str) -> None:
+    """A warning on stderr."""
+    err.print(f"warning: {text}", markup=False, style="yellow")

@@ -1,0 +1,127 @@
+"""`grd import`, `grd recover`, `grd simulate`, `grd view`: recordings and runs as files.
+
+Source: DESIGN, Command line.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
+
+
+@in_words
+def import_recording(
+    file: Annotated[Path, typer.Argument(help="A VLP-16 capture (.pcap) or a MAVLink log (.tlog).")],
+    out_file: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Recording to write [default: beside FILE].")
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="rig.yaml to attach [default for .pcap: bolted upright].")
+    ] = None,
+    port: Annotated[int, typer.Option("--port", help="UDP port of the LiDAR's data packets in the capture.")] = 2368,
+    sender: Annotated[
+        str | None, typer.Option("--sender", help="IPv4 address of the LiDAR, if there are several.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make a recording of a capture or a telemetry log.
+
+    Example: grd import flight.pcap -o flight.mcap --rig configs/rigs/standard.yaml
+    """
+    from links.recording import import_file
+
+    rig_yaml = rig.read_text(encoding="utf-8") if rig is not None else None
+    with progress_bar(f"import {file.name}") as step:
+        report = import_file(
+            file, out_file, rig_yaml=rig_yaml, port=port, sender=sender, overwrite=overwrite, progress=step
+        )
+    for text in report.warnings:
+        warn(text)
+    for reason, count in report.skipped.items():
+        warn(f"{count} left out: {reason}")
+    topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())
+    out.print(f"{report.path}: {topics}", markup=False)
+
+
+@in_words
+def recover_recording(
+    file: Annotated[Path, typer.Argument(help="An unfinished or damaged recording.")],
+    out_file: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Clean copy to write [default: FILE with .recovered.mcap].")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make a clean copy of a damaged recording.
+
+    Copies what can be read of a cut-off or damaged file; exit code 1 when something was lost.
+
+    Example: grd recover flight.mcap
+    """
+    from links.recording import recover
+
+    with progress_bar(f"recover {file.name}") as step:
+        report = recover(file, out_file, overwrite=overwrite, progress=step)
+    for text in report.warnings:
+        warn(text)
+    topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())
+    out.print(f"{report.path}: {topics}", markup=False)
+    if report.warnings:
+        raise typer.Exit(FINDING)
+
+
+@in_words
+def simulate_recording(
+    scenario: Annotated[Path, typer.Argument(help="Scenario file, as in configs/scenarios/.")],
+    out_file: Annotated[Path, typer.Option("--out", "-o", help="Recording to write.")],
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Another world and other noise [default: the scenario's].")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make a recording of a simulated flight.
+
+    It holds the bytes that the sensors would have sent, and the truth beside them.
+
+    Example: grd simulate configs/scenarios/street_sweep.yaml -o street.mcap --seed 3
+    """
+    from links.simulated.run import simulate
+
+    with progress_bar(f"simulate {scenario.name}") as step:
+        report = simulate(scenario, out_file, seed=seed, overwrite=overwrite, progress=lambda done: step(done, 1.0))
+    out.print(str(report), markup=False)
+
+
+@in_words
+def view(
+    rrd: Annotated[Path, typer.Argument(help="The run.rrd of a run.")],
+    picture: Annotated[
+        Path | None,
+        typer.Option("--screenshot", help="Write a picture instead of opening a window (no screen needed)."),
+    ] = None,
+    at: Annotated[
+        float, typer.Option("--at", min=0, max=1, help="Moment of the picture, as a fraction of the run.")
+    ] = 0.9,
+) -> None:
+    """Open a run in the Rerun viewer, or draw it.
+
+    With --screenshot a picture is written; exit code 1 when a view has errors.
+
+    Example: grd view out/street_sweep-replay/run.rrd --screenshot run.png
+    """
+    from links.viewer import screenshot, show
+
+    if picture is None:
+        show(rrd)
+        return
+    complaints = screenshot(rrd, picture, at=at)
+    for text in complaints:
+        err.print(text, markup=False, style="red")
+    out.print(f"wrote {picture}", markup=False)
+    if complaints:
+        raise typer.Exit(FINDING)

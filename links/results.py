@@ -1,0 +1,125 @@
+"""What a run leaves for people: fixes as a TUM trajectory and a covariance table, and the story in words.
+
+Source: DESIGN, Outputs of a run. TUM lines are `stamp_s tx ty tz qx qy qz qw` of T_vehicle_drone.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PrivateAttr
+
+from flow.link import Run, Tap
+from flow.message import Message
+from stages.messages import Detections, DroneFix, TrackState
+
+FIX_FILE, COVARIANCE_FILE, LOG_FILE = "fix_vehicle_drone.tum", "fix_covariance.csv", "run.log"
+POSITION_ONLY = (
+    "# T_vehicle_drone, position only: the LiDAR does not measure orientation, '0 0 0 1' stands for not measured\n"
+)
+
+
+def stamp_s(stamp_ns: int) -> str:
+    """Nanoseconds as decimal seconds, exactly."""
+    return f"{stamp_ns // 1_000_000_000}.{stamp_ns % 1_000_000_000:09d}"
+
+
+def tum_line(stamp_ns: int, xyz_m: NDArray[np.float64], quaternion_xyzw: tuple[float, ...] = (0, 0, 0, 1)) -> str:
+    """One line of a TUM file."""
+    return " ".join([stamp_s(stamp_ns), *(f"{v:.6f}" for v in xyz_m), *(f"{q:g}" for q in quaternion_xyzw)]) + "\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """The tracker changed its state."""
+
+    stamp_ns: int
+    state: str
+    reason: str
+
+
+class Results(Tap):
+    """Collects fixes, verdicts and state changes; writes each as it comes, so that a stopped run keeps what it had."""
+
+    _files: dict[str, TextIO] = PrivateAttr(default_factory=dict)
+    _covariance: Any = PrivateAttr(default=None)
+    _fixes: list[DroneFix] = PrivateAttr(default_factory=list)
+    _sweeps: Counter[str] = PrivateAttr(default_factory=Counter)
+    _found: int = PrivateAttr(default=0)
+    _transitions: list[Transition] = PrivateAttr(default_factory=list)
+
+    @property
+    def fixes(self) -> list[DroneFix]:
+        """All drone fixes, in order."""
+        return self._fixes
+
+    @property
+    def sweeps_with_drone(self) -> int:
+        """Sweeps in which the detector accepted a candidate."""
+        return self._found
+
+    @property
+    def sweeps(self) -> int:
+        """Sweeps that were searched."""
+        return sum(self._sweeps.values())
+
+    @property
+    def verdicts(self) -> Counter[str]:
+        """What the detector said, and how often."""
+        return self._sweeps
+
+    @property
+    def transitions(self) -> list[Transition]:
+        """Every change of the tracker's state, with its reason."""
+        return self._transitions
+
+    def open(self, run: Run) -> None:
+        """Start the run's files."""
+        for name in (FIX_FILE, COVARIANCE_FILE, LOG_FILE):
+            self._files[name] = _line_buffered(run.out_dir / name)
+        self._files[FIX_FILE].write(POSITION_ONLY)
+        self._covariance = csv.writer(self._files[COVARIANCE_FILE])
+        upper = [f"c{a}{b}_m2" for a, b in zip("xxxyyz", "xyzyzz", strict=True)]
+        self._covariance.writerow(["stamp_s", *upper, "hits", "iterations"])
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        """Take what belongs here; all else passes by."""
+        if isinstance(message, DroneFix):
+            self._fixes.append(message)
+            self._files[FIX_FILE].write(tum_line(message.stamp_ns, message.xyz_vehicle_m))
+            upper = message.covariance_m2[np.triu_indices(3)]
+            cells = [stamp_s(message.stamp_ns), *(f"{v:.9g}" for v in upper), message.hits, message.iterations]
+            self._covariance.writerow(cells)
+        elif isinstance(message, Detections):
+            self._sweeps[message.verdict] += 1
+            self._found += bool(message.accepted.any())
+            self._log(message.stamp_ns, output, message.verdict)
+        elif isinstance(message, TrackState):
+            last = self._transitions[-1].state if self._transitions else None
+            if message.state.name != last:
+                self._transitions.append(Transition(message.stamp_ns, message.state.name, message.reason))
+                self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")
+
+    def note(self, text: str) -> None:
+        """One line of the log without a time: a warning of the recording, the hash."""
+        self._files[LOG_FILE].write(f"{text}\n")
+
+    def _log(self, stamp_ns: int, output: str, text: str) -> None:
+        self.note(f"{stamp_s(stamp_ns)} {output}: {text}")
+
+    def close(self) -> None:
+        """Close the run's files."""
+        for stream in self._files.values():
+            stream.close()
+        self._files.clear()
+
+
+def _line_buffered(path: Path) -> TextIO:
+    return io.TextIOWrapper(path.open("wb"), encoding="utf-8", newline="", line_buffering=True, write_through=True)

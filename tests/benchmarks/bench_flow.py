@@ -1,0 +1,86 @@
+"""The engine's own cost: a graph of three stages replayed, beside the same stages called by hand on the same records.
+
+Run: pytest tests/benchmarks/bench_flow.py --benchmark-columns=min,median,max
+Cost per event = (median of the replay - median by hand) / EVENTS; `test_cost_per_event` measures both in turn and says it.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+
+import pytest
+
+from flow.graph import load_graph
+from flow.link import Record
+from flow.replay import Replay, replay
+from flow.taps import Digest
+from tests.flow.toys import GRAPH, Add, Double, Numbers
+
+RECORDS = [Record("/numbers", 1000 + i, i, b"1.5", i) for i in range(2_000)]
+EVENTS = 4 * len(RECORDS)  # decode, double, add.left, add.right
+
+
+@pytest.fixture
+def graph(tmp_path):
+    (tmp_path / "x.yaml").write_text(GRAPH)
+    return load_graph(tmp_path / "x.yaml")
+
+
+def by_hand():
+    numbers, double, add = Numbers(), Double(), Add(name="adder")
+    add._seen = Total()
+    for record in RECORDS:
+        number = numbers.decode(record)
+        doubled = double.on_number(number)
+        tuple(add.on_left(number))
+        tuple(add.on_right(doubled))
+
+
+class Total(list):
+    """Keeps the adder's memory short: its running sum would otherwise outgrow the engine's cost."""
+
+    def append(self, value):
+        if len(self) >= 8:
+            self.clear()
+        super().append(value)
+
+
+def by_engine(graph, taps=()):
+    runner = Replay(graph, taps)
+    runner.nodes["add"]._seen = Total()
+    for record in RECORDS:
+        runner.feed(record)
+    return runner.finish()
+
+
+def test_stages_called_by_hand(benchmark):
+    benchmark.pedantic(by_hand, rounds=15, warmup_rounds=2)
+
+
+def test_stages_in_the_engine(benchmark, graph):
+    report = benchmark.pedantic(by_engine, (graph,), rounds=15, warmup_rounds=2)
+    assert report.events == EVENTS + 2  # and a finish for each stage
+
+
+def test_stages_in_the_engine_with_the_hash_of_every_message(benchmark, graph):
+    benchmark.pedantic(lambda: by_engine(graph, [Digest()]), rounds=15, warmup_rounds=2)
+
+
+def test_cost_per_event(benchmark, graph):
+    """Paired: the two ways alternate, so that a noisy neighbour hits both."""
+
+    def once(work):
+        begin = time.perf_counter()
+        work()
+        return time.perf_counter() - begin
+
+    pairs = [(once(by_hand), once(lambda: by_engine(graph))) for _ in range(15)]
+    costs_us = [(engine - hand) / EVENTS * 1e6 for hand, engine in pairs]
+    benchmark.extra_info["engine_us_per_event"] = round(statistics.median(costs_us), 2)
+    benchmark.extra_info["ratio"] = round(statistics.median(e / h for h, e in pairs), 2)
+    sys.stdout.write(
+        f"\nengine cost per event: median {statistics.median(costs_us):.2f} us (range {min(costs_us):.2f}-{max(costs_us):.2f})"
+    )
+    benchmark.pedantic(replay, (graph, []), rounds=1)

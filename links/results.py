@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ FIX_FILE, COVARIANCE_FILE, LOG_FILE = "fix_vehicle_drone.tum", "fix_covariance.c
 POSITION_ONLY = (
     "# T_vehicle_drone, position only: the LiDAR does not measure orientation, '0 0 0 1' stands for not measured\n"
 )
+_NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
 
 
 def stamp_s(stamp_ns: int) -> str:
@@ -52,6 +54,7 @@ class Results(Tap):
     _covariance: Any = PrivateAttr(default=None)
     _fixes: list[DroneFix] = PrivateAttr(default_factory=list)
     _sweeps: Counter[str] = PrivateAttr(default_factory=Counter)
+    _examples: dict[str, str] = PrivateAttr(default_factory=dict)
     _found: int = PrivateAttr(default=0)
     _transitions: list[Transition] = PrivateAttr(default_factory=list)
 
@@ -71,9 +74,9 @@ class Results(Tap):
         return sum(self._sweeps.values())
 
     @property
-    def verdicts(self) -> Counter[str]:
-        """What the detector said, and how often."""
-        return self._sweeps
+    def verdicts(self) -> list[tuple[str, int]]:
+        """What the detector said and how often, most frequent first; verdicts that differ in numbers only are one."""
+        return [(self._examples[kind], count) for kind, count in self._sweeps.most_common()]
 
     @property
     def transitions(self) -> list[Transition]:
@@ -98,7 +101,9 @@ class Results(Tap):
             cells = [stamp_s(message.stamp_ns), *(f"{v:.9g}" for v in upper), message.hits, message.iterations]
             self._covariance.writerow(cells)
         elif isinstance(message, Detections):
-            self._sweeps[message.verdict] += 1
+            kind = _NUMBER.sub("#", message.verdict)
+            self._sweeps[kind] += 1
+            self._examples.setdefault(kind, message.verdict)
             self._found += bool(message.accepted.any())
             self._log(message.stamp_ns, output, message.verdict)
         elif isinstance(message, TrackState):

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import typer
 
-from links.cli import files, graphs, run
+from links.cli.files import import_recording, recover_recording, simulate_recording, view
+from links.cli.graphs import check, graph, schema
+from links.cli.run import replay_recording, run
 
 app = typer.Typer(
     name="grd",
@@ -17,15 +19,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.command("run")(run.run)
-app.command("replay")(run.replay_recording)
-app.command("check")(graphs.check)
-app.command("graph")(graphs.graph)
-app.command("schema")(graphs.schema)
-app.command("import")(files.import_recording)
-app.command("recover")(files.recover_recording)
-app.command("simulate")(files.simulate_recording)
-app.command("view")(files.view)
+app.command("run")(run)
+app.command("replay")(replay_recording)
+app.command("check")(check)
+app.command("graph")(graph)
+app.command("schema")(schema)
+app.command("import")(import_recording)
+app.command("recover")(recover_recording)
+app.command("simulate")(simulate_recording)
+app.command("view")(view)
 
 
 def main() -> None:

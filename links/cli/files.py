@@ -9,9 +9,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+import yaml
+from pydantic import ValidationError
 
+from flow.link import LinkError
 from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+from stages.geometry import LidarMount
 
+MAX_RIG_BYTES = 100_000
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
 
@@ -36,7 +41,7 @@ def import_recording(
     """
     from links.recording import import_file
 
-    rig_yaml = rig.read_text(encoding="utf-8") if rig is not None else None
+    rig_yaml = read_rig(rig) if rig is not None else None
     with progress_bar(f"import {file.name}") as step:
         report = import_file(
             file, out_file, rig_yaml=rig_yaml, port=port, sender=sender, overwrite=overwrite, progress=step
@@ -47,6 +52,27 @@ def import_recording(
         warn(f"{count} left out: {reason}")
     topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())
     out.print(f"{report.path}: {topics}", markup=False)
+
+
+def read_rig(file: Path) -> str:
+    """A rig file's text as recordings hold it; a configuration's `rig:` section will do. LinkError says what is wrong."""
+    with file.open("rb") as stream:
+        data = stream.read(MAX_RIG_BYTES + 1)
+    try:
+        tree = yaml.safe_load(data.decode("utf-8")) if len(data) <= MAX_RIG_BYTES else None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise LinkError(f"{file} is no rig: {str(error).splitlines()[0]}") from None
+    rig = tree.get("rig", tree) if isinstance(tree, dict) else None
+    if not isinstance(rig, dict) or "lidar" not in rig:
+        raise LinkError(f"{file} is no rig: it needs 'lidar:' with 'mount:' as configs/rigs/standard.yaml has")
+    mount = rig["lidar"].get("mount") if isinstance(rig["lidar"], dict) else None
+    try:
+        LidarMount.model_validate(mount)
+    except ValidationError as errors:
+        first = errors.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in ("lidar", "mount", *first["loc"]))
+        raise LinkError(f"{file}: {where}: {first['msg']}") from None
+    return yaml.safe_dump(rig, sort_keys=False)
 
 
 @in_words

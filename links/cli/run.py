@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 import yaml
 from rich.table import Table
+from rich.text import Text
 
 from flow.draw import mermaid
 from flow.graph import Graph, load_graph, recording_named
@@ -183,7 +184,7 @@ def _write_summary(run: Finished, config: Path, overlays: list[Path], sets: list
         "messages": report.messages,
         "sweeps": results.sweeps,
         "sweeps_with_drone": results.sweeps_with_drone,
-        "verdicts": dict(results.verdicts),
+        "verdicts": [{"sweeps": count, "example": verdict} for verdict, count in results.verdicts],
         "fixes": len(results.fixes),
         "states": [{"stamp_s": stamp_s(t.stamp_ns), "state": t.state, "reason": t.reason} for t in results.transitions],
         "warnings": run.warnings,
@@ -232,8 +233,8 @@ def _tell(run: Finished) -> None:
     if not results.sweeps:
         out.print("no drone: no sweep was completed, so nothing was searched")
     elif not results.fixes:
-        for verdict, count in results.verdicts.most_common(3):
-            out.print(f"{verdict} [dim](in {count} of {results.sweeps} sweeps)[/dim]")
+        for verdict, count in results.verdicts[:3]:
+            out.print(f"in {count} of {results.sweeps} sweeps: {verdict}", markup=False)
     for change in results.transitions[-3:]:
         out.print(f"tracker at {stamp_s(change.stamp_ns)} s: {change.state}, {change.reason}", markup=False)
     if run.errors is not None and len(run.errors.stamps_ns):
@@ -260,7 +261,7 @@ def _table(run: Finished) -> Table:
     table = Table(title=f"drone in the vehicle frame, {len(fixes[::step])} of {len(fixes)} fixes", title_justify="left")
     heads = ["t [s]", "x forward [m]", "y left [m]", "z up [m]", "sigma [m]", "hits", *(["error [m]"] if error else [])]
     for head in heads:
-        table.add_column(head, justify="right")
+        table.add_column(Text(head), justify="right")
     for fix in fixes[::step]:
         since_s = (fix.stamp_ns - run.report.first_ns) / 1e9
         sigma_m = float(fix.covariance_m2.trace()) ** 0.5

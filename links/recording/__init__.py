@@ -1,0 +1,23 @@
+"""Recordings: what came in, byte by byte, in one MCAP file; recordings/README.md documents the format."""
+
+from links.recording.compressed_image import CompressedImage, decode_compressed_image, encode_compressed_image
+from links.recording.format import TOPICS, Progress, Topic
+from links.recording.importing import ImportReport, import_file
+from links.recording.reader import RecordingReader
+from links.recording.recover import RecoverReport, recover
+from links.recording.writer import RecordingWriter
+
+__all__ = [
+    "TOPICS",
+    "CompressedImage",
+    "ImportReport",
+    "Progress",
+    "RecordingReader",
+    "RecordingWriter",
+    "RecoverReport",
+    "Topic",
+    "decode_compressed_image",
+    "encode_compressed_image",
+    "import_file",
+    "recover",
+]

@@ -1,0 +1,112 @@
+"""The recording format: an MCAP file with profile "grd"; recordings/README.md documents it.
+
+    header             profile "grd"
+    metadata "grd"     format_version; then metadata "recording": what the writer was told
+    attachments        rig.yaml, config.yaml (both at the start, so that a killed recording keeps them)
+    chunks             camera topics uncompressed (JPEG does not shrink), all others zstd
+    metadata "losses"  only when records were dropped
+    summary            indexes and counts; an unfinished recording has none
+
+A message's log_time is the arrival on the host, its publish_time the measurement; sequence is one global counter.
+
+Source: MCAP specification 0 (https://mcap.dev/spec); the topics are ours.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from links.recording.compressed_image import COMPRESSED_IMAGE_SCHEMA
+
+PROFILE = "grd"
+FORMAT_VERSION = (1, 0)  # a reader refuses a newer major; a minor only adds topics or metadata
+METADATA_FORMAT = "grd"
+METADATA_USER = "recording"
+METADATA_LOSSES = "losses"
+RIG_ATTACHMENT = "rig.yaml"
+CONFIG_ATTACHMENT = "config.yaml"
+
+MAX_MESSAGE_BYTES = 32 * 2**20  # one record; more is a mistake of the caller
+MAX_CHUNK_BYTES = 64 * 2**20  # uncompressed; a file that claims more is damaged
+MAX_TIME_NS = 2**63 - 1
+
+Progress = Callable[[int, int], None]
+"""Called with (bytes done, bytes in all), often enough for a progress bar."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """What a topic holds and how MCAP declares it."""
+
+    name: str
+    holds: str
+    encoding: str  # MCAP message encoding
+    schema_name: str = ""  # empty: no schema, raw bytes
+    schema_encoding: str = ""
+    schema: bytes = b""
+    compress: bool = True
+
+
+_XYZ = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3, "description": "[m]"}
+_QUATERNION = {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4}
+_COVARIANCE = {
+    "type": "array",
+    "items": {"type": "number"},
+    "minItems": 36,
+    "maxItems": 36,
+    "description": "6x6 by rows: rotation [rad], then translation [m], tangent at the body",
+}
+_POSE = {"xyz_m": _XYZ, "quaternion_xyzw": _QUATERNION}
+
+
+def _raw(name: str, encoding: str, holds: str) -> Topic:
+    return Topic(name=name, holds=holds, encoding=encoding)
+
+
+def _json(name: str, schema_name: str, fields: dict[str, Any], holds: str) -> Topic:
+    schema = {"title": schema_name, "type": "object", "properties": fields, "required": list(fields)}
+    text = json.dumps(schema, separators=(",", ":")).encode()
+    return Topic(name, holds, "json", schema_name, "jsonschema", text)
+
+
+def _jpeg(name: str, holds: str) -> Topic:
+    return Topic(
+        name, holds, "protobuf", "foxglove.CompressedImage", "protobuf", COMPRESSED_IMAGE_SCHEMA, compress=False
+    )
+
+
+_SERVO = {
+    "position_rad": {"type": "number"},
+    "velocity_radps": {"type": "number"},
+    "goal_rad": {"type": "number"},
+    "error": {"type": "integer", "description": "the servo's own error bits, 0 is healthy"},
+}
+
+TOPICS: dict[str, Topic] = {
+    topic.name: topic
+    for topic in (
+        _raw("/lidar/packets", "velodyne-data", "VLP-16 data packet: the 1206-byte UDP payload"),
+        _raw("/lidar/position", "velodyne-position", "VLP-16 position packet: the 512-byte UDP payload"),
+        _json("/servo/state", "grd.ServoState", _SERVO, "servo reading; stamp = middle of request and reply"),
+        _jpeg("/camera/vehicle", "vehicle fisheye, JPEG"),
+        _jpeg("/camera/drone", "drone fisheye, JPEG"),
+        _raw("/autopilot/rx", "mavlink", "one MAVLink frame from the autopilot"),
+        _raw("/autopilot/tx", "mavlink", "one MAVLink frame to the autopilot"),
+        _json(
+            "/vehicle/odometry",
+            "grd.PoseWithCovariance",
+            {**_POSE, "covariance": _COVARIANCE},
+            "the vehicle's own odometry, when it has one",
+        ),
+        _json("/truth/vehicle", "grd.Pose", _POSE, "T_world_vehicle; simulated only, never wired to a stage"),
+        _json("/truth/drone", "grd.Pose", _POSE, "T_world_drone; simulated only, never wired to a stage"),
+    )
+}
+
+
+def topic(name: str) -> Topic:
+    """Declaration of a topic; one that the table does not know is kept as raw bytes."""
+    return TOPICS.get(name) or _raw(name, "application/octet-stream", "raw bytes of a topic that grd does not know")

@@ -1,0 +1,246 @@
+"""Make a recording of someone else's file: a VLP-16 `.pcap`, or a MAVLink `.tlog`. What it is, its bytes tell.
+
+The file's time of a packet is its arrival. Nothing better is known of when it was measured, so it is the stamp, too.
+
+Source: ours; VLP-16 user manual 63-9243 Rev. E, chapter 9 (packets, ports, product ids).
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from mcap.writer import MCAP0_MAGIC
+
+from flow.link import LinkError, Record
+from links.recording.format import Progress
+from links.recording.pcap import Datagram, PcapReport, is_pcap, read_datagrams
+from links.recording.reader import open_file
+from links.recording.tlog import TlogReport, looks_like_tlog, read_frames
+from links.recording.writer import RecordingWriter
+from links.velodyne import vlp16
+
+_LIDAR, _POSITION, _AUTOPILOT = "/lidar/packets", "/lidar/position", "/autopilot/rx"
+_PROGRESS_EVERY = 1000  # records
+_SNIFF_BYTES = 4096
+
+DEFAULT_RIG = """\
+# Made by `grd import`: a capture does not say how its lidar was mounted. This assumes a VLP-16 bolted down upright,
+# without servo, 1.8 m over the vehicle's origin. The true mount is unknown: positions are relative to this guess.
+version: 1
+lidar:
+  model: VLP-16
+  mount:
+    turns: false
+    T_vehicle_turntable: {xyz_m: [0.0, 0.0, 1.8]}
+    T_turntable_lidar: {xyz_m: [0.0, 0.0, 0.0]}
+drone: {span_m: 0.5}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportReport:
+    """What an import wrote, and what it left out."""
+
+    path: Path
+    topics: dict[str, int]  # records by topic
+    skipped: dict[str, int]  # packets or bytes by reason
+    warnings: list[str]
+
+
+def import_file(
+    path: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    rig_yaml: str | None = None,
+    port: int = vlp16.DATA_PORT,
+    sender: str | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> ImportReport:
+    """Turn a .pcap or .tlog into a recording beside it (or at `out`).
+
+    `port` and `sender` (IPv4 address) choose the lidar in a capture; `rig_yaml` is the text of its calibration, by
+    default DEFAULT_RIG for a capture and none for a telemetry log. LinkError when nothing in the file is of use; a
+    half-made import is removed.
+    """
+    source = Path(path)
+    target = Path(out) if out is not None else source.with_suffix(".mcap")
+    with open_file(source) as stream:
+        if target.exists() and target.samefile(source):
+            raise LinkError(f"{target} is the file to import: give the recording another name")
+        foreign = _recognise(stream, source, port, sender)
+        records = foreign.records()
+        first = next(records, None)
+        if first is None:
+            raise LinkError(foreign.nothing_found())
+        topics: Counter[str] = Counter()
+        total_bytes = source.stat().st_size
+        writer = RecordingWriter(
+            target,
+            rig_yaml=rig_yaml or foreign.default_rig,
+            metadata={"imported_from": source.name},
+            channels=foreign.channels(),
+            lossless=True,
+            overwrite=overwrite,
+        )
+        try:
+            with writer:
+                for number, record in enumerate(itertools.chain([first], records)):
+                    writer.write(record)
+                    topics[record.topic] += 1
+                    if progress and number % _PROGRESS_EVERY == 0:
+                        progress(foreign.done_bytes(), total_bytes)
+        except BaseException:
+            with suppress(OSError):
+                target.unlink()
+            raise
+    if progress:
+        progress(total_bytes, total_bytes)
+    return ImportReport(target, dict(topics), foreign.skipped(), foreign.warnings())
+
+
+def _recognise(stream: IO[bytes], source: Path, port: int, sender: str | None) -> _Foreign:
+    start = stream.read(_SNIFF_BYTES)
+    stream.seek(0)
+    if is_pcap(start):
+        return _Capture(stream, source, port, sender)
+    if start.startswith(MCAP0_MAGIC):
+        raise LinkError(f"{source} is an MCAP file already: use it as it is (`grd replay {source}`)")
+    if source.suffix == ".tlog" or looks_like_tlog(start):
+        return _TelemetryLog(stream, source)
+    raise LinkError(f"{source} is neither a pcap capture nor a MAVLink telemetry log (.tlog): these can be imported")
+
+
+class _Foreign(ABC):
+    """A file that can be imported."""
+
+    default_rig: str | None = None
+
+    @abstractmethod
+    def records(self) -> Iterator[Record]:
+        """What is of use in it, in file order."""
+
+    @abstractmethod
+    def done_bytes(self) -> int:
+        """How much of it was read."""
+
+    @abstractmethod
+    def skipped(self) -> dict[str, int]:
+        """What was passed over, by reason."""
+
+    @abstractmethod
+    def warnings(self) -> list[str]:
+        """What is wrong with the file, with byte offsets."""
+
+    @abstractmethod
+    def nothing_found(self) -> str:
+        """Why it gave no record, and what to try."""
+
+    def channels(self) -> dict[str, dict[str, str]]:
+        """What is known of the senders, once there was a record."""
+        return {}
+
+
+class _Capture(_Foreign):
+    """One VLP-16's packets in a pcap capture."""
+
+    default_rig = DEFAULT_RIG
+
+    def __init__(self, stream: IO[bytes], source: Path, port: int, sender: str | None) -> None:
+        self._stream = stream
+        self._source = source
+        self._port = port
+        self._sender = sender
+        self._report = PcapReport()
+        self._elsewhere: Counter[int] = Counter()  # data packets on other ports
+
+    def records(self) -> Iterator[Record]:
+        skipped = self._report.skipped
+        for datagram in read_datagrams(self._stream, self._source, self._report):
+            topic = self._topic(datagram)
+            if topic is None:
+                skipped[f"on UDP port {datagram.port}"] += 1
+            elif datagram.sender != (self._sender or datagram.sender):
+                skipped[f"from another sender, {datagram.sender}"] += 1
+            else:
+                if topic == _LIDAR:
+                    self._check_model(datagram)
+                    self._sender = datagram.sender
+                # other payloads than data packets keep their arrival time
+                stamp_ns = vlp16.first_pulse_ns(datagram.time_ns, datagram.payload)
+                yield Record(topic, datagram.time_ns, stamp_ns, datagram.payload)
+
+    def done_bytes(self) -> int:
+        return self._report.done_bytes
+
+    def skipped(self) -> dict[str, int]:
+        return dict(self._report.skipped.most_common())
+
+    def warnings(self) -> list[str]:
+        return self._report.warnings
+
+    def channels(self) -> dict[str, dict[str, str]]:
+        known = {"model": "VLP-16", **({"sender": self._sender} if self._sender else {})}
+        return {_LIDAR: {**known, "port": str(self._port)}, _POSITION: {**known, "port": str(vlp16.POSITION_PORT)}}
+
+    def nothing_found(self) -> str:
+        text = f"{self._source}: no VLP-16 packet ({vlp16.PACKET_BYTES} bytes) on UDP port {self._port}"
+        if self._sender:
+            text += f" from {self._sender}"
+        if self._elsewhere:
+            ((port, count),) = self._elsewhere.most_common(1)
+            return f"{text}; {count} on port {port}: try --port {port}"
+        seen = [f"{count} packets {reason}" for reason, count in self._report.skipped.most_common(3)]
+        return "; ".join([text, *seen, *self._report.warnings])
+
+    def _topic(self, datagram: Datagram) -> str | None:
+        size = len(datagram.payload)
+        if size == vlp16.PACKET_BYTES:
+            if datagram.port == self._port:
+                return _LIDAR
+            self._elsewhere[datagram.port] += 1
+        elif size == vlp16.POSITION_BYTES and datagram.port == vlp16.POSITION_PORT:
+            return _POSITION
+        return None
+
+    def _check_model(self, datagram: Datagram) -> None:
+        product = datagram.payload[vlp16.PRODUCT_ID_AT]
+        if product != vlp16.PRODUCT_ID:
+            name = vlp16.OTHER_PRODUCTS.get(product, f"an unknown model (product id 0x{product:02x})")
+            raise LinkError(
+                f"{self._source}: the packet at byte {datagram.offset} is from {name}, not a VLP-16:"
+                " its beams are elsewhere, every point would be misplaced. Import a VLP-16's capture"
+            )
+
+
+class _TelemetryLog(_Foreign):
+    """The MAVLink frames of a telemetry log."""
+
+    def __init__(self, stream: IO[bytes], source: Path) -> None:
+        self._data = stream.read()
+        self._source = source
+        self._report = TlogReport()
+
+    def records(self) -> Iterator[Record]:
+        for time_ns, frame in read_frames(self._data, self._source, self._report):
+            yield Record(_AUTOPILOT, time_ns, time_ns, frame)
+
+    def done_bytes(self) -> int:
+        return self._report.done_bytes
+
+    def skipped(self) -> dict[str, int]:
+        return {"bytes that are no MAVLink frame": self._report.bad_bytes} if self._report.bad_bytes else {}
+
+    def warnings(self) -> list[str]:
+        return self._report.warnings
+
+    def nothing_found(self) -> str:
+        return f"{self._source}: no MAVLink frame in {len(self._data)} bytes: is it a telemetry log (.tlog)?"

@@ -1,0 +1,144 @@
+"""Triangle meshes with a surface per triangle, and rays against them.
+
+Source: ours; reflectivities at 903 nm are typical values of published spectral libraries (USGS, ECOSTRESS), rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flow.link import LinkError
+from stages.compiled import compiled
+
+try:
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+except ImportError as error:
+    raise LinkError("the simulator needs embreex: pip install 'grd[simulate]'") from error
+
+Array32 = NDArray[np.float32]
+Array64 = NDArray[np.float64]
+
+GLOSS_EXPONENT = 60  # a glossy lobe a few degrees wide around normal incidence
+
+SURFACES: dict[str, tuple[float, float]] = {  # name: (diffuse reflectivity, mirror-like part)
+    "asphalt": (0.16, 0.0),
+    "paving": (0.30, 0.0),
+    "kerb": (0.35, 0.0),
+    "brick": (0.35, 0.0),
+    "plaster": (0.55, 0.0),
+    "concrete": (0.38, 0.0),
+    "glass": (0.03, 0.50),
+    "roof": (0.20, 0.0),
+    "leaf": (0.45, 0.0),
+    "bark": (0.30, 0.0),
+    "metal": (0.30, 0.10),
+    "wire": (0.10, 0.0),
+    "rubber": (0.05, 0.0),
+    "paint_dark": (0.08, 0.30),
+    "paint_light": (0.50, 0.20),
+    "carbon": (0.12, 0.0),
+}
+_ROW = {name: row for row, name in enumerate(SURFACES)}
+_DIFFUSE, _GLOSS = np.array(list(SURFACES.values()), dtype=np.float32).T
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in metres; `surface` is the row of SURFACES of each face."""
+
+    vertices_m: Array64  # (v, 3)
+    faces: NDArray[np.int32]  # (f, 3)
+    surface: NDArray[np.uint8]  # (f,)
+
+    def moved(self, xyz_m: ArrayLike = (0.0, 0.0, 0.0), rotation: Array64 | None = None) -> Mesh:
+        """The mesh turned by `rotation` (3, 3), then shifted."""
+        turned = self.vertices_m if rotation is None else self.vertices_m @ rotation.T
+        return Mesh(turned + np.asarray(xyz_m, dtype=np.float64), self.faces, self.surface)
+
+
+def merge(meshes: Iterable[Mesh]) -> Mesh:
+    """All meshes as one."""
+    parts = list(meshes)
+    first = np.cumsum([0] + [len(part.vertices_m) for part in parts[:-1]])
+    return Mesh(
+        np.concatenate([part.vertices_m for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, first, strict=True)]).astype(np.int32),
+        np.concatenate([part.surface for part in parts]),
+    )
+
+
+def quads(corners_m: ArrayLike, surface: str) -> Mesh:
+    """Plane quadrilaterals (q, 4, 3), corners in order around each."""
+    corners = np.asarray(corners_m, dtype=np.float64).reshape(-1, 4, 3)
+    start = 4 * np.arange(len(corners), dtype=np.int32)[:, None, None]
+    faces = (start + np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)).reshape(-1, 3)
+    return Mesh(corners.reshape(-1, 3), faces, np.full(len(faces), _ROW[surface], dtype=np.uint8))
+
+
+def box(low_m: ArrayLike, high_m: ArrayLike, surface: str, taper: float = 0.0) -> Mesh:
+    """An upright box between two corners; `taper` shrinks its top by that fraction in x and y."""
+    low, high = np.asarray(low_m, dtype=np.float64), np.asarray(high_m, dtype=np.float64)
+    middle = (low + high) / 2
+    unit = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=np.float64)
+    v = low + unit * (high - low)
+    v[4:, :2] = middle[:2] + (v[4:, :2] - middle[:2]) * (1 - taper)
+    sides = [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+    return quads(v[np.array(sides)], surface)
+
+
+def rod(start_m: ArrayLike, end_m: ArrayLike, radius_m: float, surface: str, sides: int = 6) -> Mesh:
+    """An open prism of `sides` faces from start to end."""
+    a, b = np.asarray(start_m, dtype=np.float64), np.asarray(end_m, dtype=np.float64)
+    axis = (b - a) / np.linalg.norm(b - a)
+    across = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    angle = 2 * np.pi * np.arange(sides + 1) / sides
+    ring = radius_m * (np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across))
+    return quads(np.stack([a + ring[:-1], a + ring[1:], b + ring[1:], b + ring[:-1]], axis=1), surface)
+
+
+class RayScene:
+    """A mesh that rays can be cast against (embree, single precision)."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._scene = EmbreeScene()
+        self._mesh = TriangleMesh(self._scene, mesh.vertices_m.astype(np.float32), mesh.faces.astype(np.int32))
+        self._diffuse = _DIFFUSE[mesh.surface]
+        self._gloss = _GLOSS[mesh.surface]
+        self.radius_m = float(np.linalg.norm(mesh.vertices_m, axis=1).max())
+
+    def cast(self, origins: Array32, directions: Array32, max_range_m: float) -> tuple[Array32, Array32]:
+        """First hit of rays (n, 3) with unit directions: range (n,) [m] (inf: none) and returned fraction (n,).
+
+        The fraction is what comes back towards the ray's origin: diffuse cos(a) + gloss cos(a)^60 at incidence a.
+        """
+        limit = np.full(len(origins), max_range_m, dtype=np.float32)
+        hit = self._scene.run(origins, directions, dists=limit, output=True)
+        return _answers(directions, hit["tfar"], hit["primID"], hit["Ng"], self._diffuse, self._gloss)
+
+
+@compiled
+def _answers(
+    directions: Array32,
+    hit_m: Array32,
+    face: NDArray[np.int32],
+    normal: Array32,
+    diffuse: Array32,
+    gloss: Array32,
+) -> tuple[Array32, Array32]:
+    ranges = np.full(len(face), np.inf, dtype=np.float32)
+    fractions = np.zeros(len(face), dtype=np.float32)
+    for i in range(len(face)):
+        if face[i] < 0:
+            continue
+        n, d = normal[i], directions[i]
+        along = abs(n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
+        cosine = along / max(np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2), 1e-20)
+        ranges[i] = hit_m[i]
+        fractions[i] = diffuse[face[i]] * cosine + gloss[face[i]] * cosine**GLOSS_EXPONENT
+    return ranges, fractions

@@ -1,0 +1,216 @@
+"""Runs a scenario: records in order of arrival, or a recording on disk.
+
+Source: ours. The same scenario and seed give the same bytes. Truth goes to /truth/* and nowhere else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path as FilePath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.link import Record
+from links.recording import RecordingWriter
+from links.simulated.lidar import Lidar, Pulses
+from links.simulated.mesh import Array64
+from links.simulated.operator import ScriptedOperator
+from links.simulated.path import rotations_z
+from links.simulated.scenario import Scenario, load_scenario
+from links.simulated.scene import Scene, Truth
+from links.simulated.servo import ServoBus
+from links.simulated.vehicle import vehicle_mesh
+from links.simulated.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
+from links.simulated.world import world_mesh
+from links.velodyne import vlp16
+
+BATCH_PACKETS = 32  # pulses are cast in batches; how many does not change a byte
+TRUTH_PERIOD_NS = 10_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationReport:
+    """What a simulation made."""
+
+    seed: int
+    records: int
+    pulses: int
+    returns: int
+    drone_returns: int  # pulses with a return that has most of its power from the drone
+    wall_s: float
+    size_bytes: int
+
+    def __str__(self) -> str:
+        return (
+            f"seed {self.seed}: {self.records} records, {self.pulses} pulses, {self.returns} with a return, "
+            f"{self.drone_returns} from the drone; {self.size_bytes / 1e6:.2f} MB in {self.wall_s:.1f} s"
+        )
+
+
+class Simulation:
+    """One run of a scenario. Iterate `records()` once; the counts and `drone_return_ns` fill as it goes."""
+
+    def __init__(self, scenario: Scenario, seed: int | None = None) -> None:
+        self.scenario = scenario
+        self.seed = scenario.seed if seed is None else seed
+        drone = scenario.drone
+        self.truth = Truth(scenario.start_ns, scenario.vehicle.path, drone.path if drone else None)
+        height = scenario.vehicle.camera_height_m
+        self._scene = Scene(
+            world_mesh(scenario.scene, height, self.seed),
+            vehicle_mesh(height),
+            drone.span_m if drone else 0.0,
+            self.truth,
+        )
+        self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed)
+        operator = ScriptedOperator(scenario.script, self.drone_servo_rad if drone else None, self.seed)
+        shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)
+        self._servo = ServoBus(scenario.servo, operator, scenario.start_ns, shift_ns, self.seed)
+        self._arrival = np.random.default_rng([self.seed, 5])
+        self.pulses = 0
+        self.returns = 0
+        self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from the drone
+
+    def records(self) -> Iterator[Record]:
+        """All records in order of arrival, numbered."""
+        waiting: list[tuple[int, int, Record]] = []
+        made = sent = 0
+        start_ns = self.scenario.start_ns
+        end_ns = start_ns + round(self.scenario.duration_s * 1e9)
+        packet_ns = firings_per_packet(self.scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
+        first_ns, truth_ns = start_ns, start_ns
+        while first_ns < end_ns:
+            packets = min(BATCH_PACKETS, -(-(end_ns - first_ns) // packet_ns))
+            next_ns = first_ns + packets * packet_ns
+            records = self._servo.advance(next_ns)
+            records += self._lidar_records(first_ns, packets, packet_ns)
+            count = -(-(next_ns - truth_ns) // TRUTH_PERIOD_NS)
+            records += self._truth_records(truth_ns + TRUTH_PERIOD_NS * np.arange(count))
+            truth_ns += count * TRUTH_PERIOD_NS
+            for record in records:
+                heapq.heappush(waiting, (record.arrival_ns, made, record))
+                made += 1
+            first_ns = next_ns
+            while waiting and (waiting[0][0] < next_ns or first_ns >= end_ns):
+                yield dataclasses.replace(heapq.heappop(waiting)[2], sequence=sent)
+                sent += 1
+
+    def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
+        """Where the LiDAR truly is: rotations (n, 3, 3), positions (n, 3) [m]. T_wv T_vt Rz(angle) T_tl."""
+        mount = self.scenario.mount
+        T_vehicle_turntable, T_turntable_lidar = mount.T_vehicle_turntable.matrix(), mount.T_turntable_lidar.matrix()
+        R_world_vehicle, t_world_vehicle = self.truth.T_world_vehicle(stamp_ns)
+        turn = rotations_z(mount.turntable_rad(self._servo.position_rad(stamp_ns)))
+        R_vehicle_turned = T_vehicle_turntable[:3, :3] @ turn
+        t_vehicle_lidar = T_vehicle_turntable[:3, 3] + R_vehicle_turned @ T_turntable_lidar[:3, 3]
+        rotations = R_world_vehicle @ (R_vehicle_turned @ T_turntable_lidar[:3, :3])
+        return rotations, t_world_vehicle + np.einsum("nij,nj->ni", R_world_vehicle, t_vehicle_lidar)
+
+    def drone_servo_rad(self, time_s: float) -> float:
+        """Servo position at which the drone lies in the plane through the turntable's axis and azimuth 0."""
+        stamp = np.array([self.scenario.start_ns + round(max(time_s, 0.0) * 1e9)])
+        R, t = (part[0] for part in self.truth.T_world_vehicle(stamp))
+        drone = R.T @ (self.truth.T_world_drone(stamp)[1][0] - t)
+        mount = self.scenario.mount
+        T = mount.T_vehicle_turntable.matrix()
+        x, y, _ = T[:3, :3].T @ (drone - T[:3, 3])
+        return mount.servo_sign * float(np.mod(np.arctan2(y, x), np.pi)) + np.radians(mount.servo_zero_deg)
+
+    def _lidar_records(self, first_ns: int, packets: int, packet_ns: int) -> list[Record]:
+        firings = firings_per_packet(self.scenario.lidar.return_mode)
+        sequence_ns = first_ns + vlp16.SEQUENCE_NS * np.arange(packets * firings, dtype=np.int64)
+        pulse_ns = (sequence_ns[:, None] + vlp16.PULSE_NS * np.arange(vlp16.LASERS)).ravel()
+        pulses = self._lidar.fire(pulse_ns, *self.T_world_lidar(pulse_ns), self._scene)
+        self._count(pulse_ns, pulses)
+        azimuth = self._lidar.azimuth_rad(sequence_ns[::FIRINGS_PER_BLOCK]).reshape(packets, -1)
+        ranges = pulses.range_m.reshape(-1, packets, firings, vlp16.LASERS)
+        shades = pulses.reflectivity.reshape(ranges.shape)
+        jitter_ns = self._arrival.uniform(3e5, 8e5, packets).astype(np.int64)
+        last_pulse_ns = pulse_ns.reshape(packets, -1)[:, -1]
+        records: list[Record] = []
+        for i in range(packets):
+            at = first_ns + i * packet_ns
+            data = encode_packet(at, azimuth[i], ranges[:, i], shades[:, i], self.scenario.lidar.return_mode)
+            arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
+            records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
+        return records
+
+    def _count(self, pulse_ns: NDArray[np.int64], pulses: Pulses) -> None:
+        self.pulses += len(pulse_ns)
+        self.returns += int(np.count_nonzero(pulses.range_m))
+        self.drone_return_ns += pulse_ns[(pulses.drone_share > 0.5).any(axis=0)].tolist()
+
+    def _truth_records(self, stamp_ns: NDArray[np.int64]) -> list[Record]:
+        poses = {"/truth/vehicle": self.truth.T_world_vehicle(stamp_ns)}
+        if self.truth.drone is not None:
+            poses["/truth/drone"] = self.truth.T_world_drone(stamp_ns)
+        records: list[Record] = []
+        for topic, (rotations, positions) in poses.items():
+            for stamp, R, t in zip(stamp_ns.tolist(), rotations, positions, strict=True):
+                pose = {"xyz_m": np.round(t, 6).tolist(), "quaternion_xyzw": np.round(quaternion_xyzw(R), 9).tolist()}
+                records.append(Record(topic, arrival_ns=stamp, stamp_ns=stamp, data=json.dumps(pose).encode()))
+        return records
+
+
+def quaternion_xyzw(rotation: Array64) -> Array64:
+    """Unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3): the eigenvector of Bar-Itzhack's symmetric matrix."""
+    R = rotation
+    K = np.array(
+        [
+            [R[0, 0] - R[1, 1] - R[2, 2], 0.0, 0.0, 0.0],
+            [R[1, 0] + R[0, 1], R[1, 1] - R[0, 0] - R[2, 2], 0.0, 0.0],
+            [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], R[2, 2] - R[0, 0] - R[1, 1], 0.0],
+            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], R[0, 0] + R[1, 1] + R[2, 2]],
+        ]
+    )
+    q = np.linalg.eigh(K)[1][:, -1]  # eigh reads the lower half
+    return q if q[3] >= 0 else -q
+
+
+def simulate_records(scenario: Scenario, seed: int | None = None) -> Iterator[Record]:
+    """All records of a scenario, in order of arrival, without a file."""
+    return Simulation(scenario, seed).records()
+
+
+def simulate(
+    scenario: FilePath,
+    out: FilePath,
+    seed: int | None = None,
+    progress: Callable[[float], None] | None = None,
+    overwrite: bool = False,
+) -> SimulationReport:
+    """Run a scenario file into a recording. `progress` is told the share done, 0 to 1. Errors are LinkError."""
+    began = time.perf_counter()
+    checked = load_scenario(scenario)
+    simulation = Simulation(checked, seed)
+    metadata = {"made_by": "grd simulate", "scenario": checked.name, "seed": str(simulation.seed)}
+    count = 0
+    with RecordingWriter(
+        out,
+        rig_yaml=checked.rig_yaml(),
+        config_yaml=scenario.read_text(encoding="utf-8"),
+        metadata=metadata,
+        lossless=True,
+        overwrite=overwrite,
+    ) as writer:
+        for record in simulation.records():
+            writer.write(record)
+            count += 1
+            if progress is not None and count % 100 == 0:
+                progress(min(1.0, (record.arrival_ns - checked.start_ns) * 1e-9 / checked.duration_s))
+    if progress is not None:
+        progress(1.0)
+    return SimulationReport(
+        seed=simulation.seed,
+        records=count,
+        pulses=simulation.pulses,
+        returns=simulation.returns,
+        drone_returns=len(simulation.drone_return_ns),
+        wall_s=time.perf_counter() - began,
+        size_bytes=out.stat().st_size,
+    )

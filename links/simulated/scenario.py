@@ -1,0 +1,131 @@
+"""Scenarios: one YAML file says what stands where, how it moves, and what the servo is told.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path as FilePath
+from typing import Any, Literal, Self
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from flow.link import LinkError
+from links.simulated.lidar import LidarSettings
+from links.simulated.operator import Segment, Vibrate
+from links.simulated.path import Path
+from links.simulated.servo import ServoSettings
+from links.simulated.world import SceneSettings
+from stages.geometry import LidarMount, Pose
+
+CLEARANCE_M = 0.3  # a path may not come nearer to the road
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class VehicleSettings(_Settings):
+    """The vehicle: its camera is the origin of the vehicle frame."""
+
+    camera_height_m: float = Field(default=1.8, ge=1.0, le=5.0)
+    path: Path = Path(waypoints=({"t_s": 0.0, "xyz_m": (0.0, 0.0, 0.0)},))  # pyright: ignore[reportArgumentType]
+
+
+class DroneSettings(_Settings):
+    """The drone and where it flies, world frame."""
+
+    span_m: float = Field(default=0.5, ge=0.1, le=3.0)
+    path: Path
+
+
+class RigLidar(_Settings):
+    """The LiDAR on its turntable, as the rig file writes it."""
+
+    model: Literal["VLP-16"] = "VLP-16"
+    mount: LidarMount = LidarMount(
+        T_vehicle_turntable=Pose(xyz_m=(0.0, 0.0, 0.25)),
+        T_turntable_lidar=Pose(xyz_m=(0.0, 0.0, 0.10), rpy_deg=(90.0, 0.0, 0.0)),
+    )
+
+
+class Scenario(_Settings):
+    """A whole scenario. `model_copy(update=...)` or the `with_*` methods make variants."""
+
+    version: Literal[1] = 1
+    name: str
+    description: str = ""
+    seed: int = Field(default=1, ge=0)
+    start_utc: datetime.datetime
+    duration_s: float = Field(gt=0, le=3600)
+    scene: SceneSettings = SceneSettings()
+    vehicle: VehicleSettings = VehicleSettings()
+    drone: DroneSettings | None = None
+    lidar: LidarSettings = LidarSettings()
+    servo: ServoSettings = ServoSettings()
+    script: tuple[Segment, ...] = ()
+    rig: RigLidar = RigLidar()  # what the rig attached to the recording says
+    true_mount: LidarMount | None = None  # how it really sits, when that differs from the rig
+
+    @field_validator("start_utc")
+    @classmethod
+    def _has_zone(cls, value: datetime.datetime) -> datetime.datetime:
+        if value.tzinfo is None:
+            raise ValueError("give the time zone, as in 2025-06-01T10:20:30Z")
+        return value
+
+    @model_validator(mode="after")
+    def _can_be_flown(self) -> Self:
+        if self.drone is None and any(isinstance(s, Vibrate) and s.follow_drone for s in self.script):
+            raise ValueError("script: follow_drone is set but the scenario has no drone; give an azimuth_table")
+        if self.drone is not None:
+            times = np.arange(0.0, self.duration_s, 0.05)
+            height = self.drone.path.at(times)[0][:, 2] + self.vehicle.camera_height_m
+            if height.min() < CLEARANCE_M:
+                raise ValueError(
+                    f"drone.path: {height.min():.2f} m above the road at {times[height.argmin()]:.2f} s, "
+                    f"less than {CLEARANCE_M} m; z is counted from the camera, {self.vehicle.camera_height_m} m up"
+                )
+        return self
+
+    @property
+    def start_ns(self) -> int:
+        """UTC of the start [ns]."""
+        since = self.start_utc - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+        return (since // datetime.timedelta(microseconds=1)) * 1000
+
+    @property
+    def mount(self) -> LidarMount:
+        """How the LiDAR truly sits."""
+        return self.true_mount or self.rig.mount
+
+    def with_drone(self, path: Path, span_m: float = 0.5) -> Scenario:
+        """The same scenario with another flight, checked again."""
+        return self.changed(drone={"span_m": span_m, "path": path})
+
+    def changed(self, **settings: Any) -> Scenario:
+        """The same scenario with some settings replaced, checked again."""
+        return Scenario.model_validate(dict(self) | settings)
+
+    def rig_yaml(self) -> str:
+        """The rig file attached to the recording."""
+        lidar = self.rig.model_dump(mode="json", exclude_unset=False, exclude_none=True)
+        span_m = 0.5 if self.drone is None else self.drone.span_m
+        return yaml.safe_dump({"version": 1, "lidar": lidar, "drone": {"span_m": span_m}}, sort_keys=False)
+
+
+def load_scenario(path: FilePath) -> Scenario:
+    """Read and check a scenario file. LinkError lists everything that is wrong in it."""
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return Scenario.model_validate(tree)
+    except OSError as error:
+        raise LinkError(f"{path}: {error.strerror or error}; give the path of a scenario YAML file") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise LinkError(f"{path}: not a YAML file: {error}") from error
+    except ValidationError as error:
+        lines = [f"{path}: {'.'.join(map(str, e['loc'])) or 'scenario'}: {e['msg']}" for e in error.errors()]
+        raise LinkError("\n".join(lines)) from error

@@ -1,0 +1,59 @@
+"""Writes VLP-16 data packets: the 1206-byte UDP payload, byte for byte as the sensor sends it.
+
+Source: VLP-16 user manual 63-9243, section 9.3 (packet structure, return modes, factory bytes); table in
+links/velodyne/vlp16.py. Written from the manual with numpy's structured types, apart from the decoder it tests.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from links.velodyne import vlp16
+
+FIRINGS_PER_BLOCK = 2
+RETURN_MODE_BYTE = {"strongest": vlp16.STRONGEST, "last": vlp16.LAST, "dual": vlp16.DUAL}
+
+_CHANNEL = [("range", "<u2"), ("reflectivity", "u1")]
+_BLOCK = [("flag", "S2"), ("azimuth", "<u2"), ("channels", _CHANNEL, (FIRINGS_PER_BLOCK, vlp16.LASERS))]
+_PACKET = np.dtype([("blocks", _BLOCK, vlp16.BLOCKS), ("timestamp_us", "<u4"), ("mode", "u1"), ("product", "u1")])
+
+
+def firings_per_packet(mode: str) -> int:
+    """Firing sequences in one packet: 24, or 12 when each is sent twice (dual)."""
+    return vlp16.BLOCKS * FIRINGS_PER_BLOCK // (2 if mode == "dual" else 1)
+
+
+def encode_packet(
+    first_pulse_ns: int,
+    azimuth_rad: NDArray[np.float64],
+    range_m: NDArray[np.float64],
+    reflectivity: NDArray[np.uint8],
+    mode: str,
+) -> bytes:
+    """One packet from a row of firing sequences.
+
+    first_pulse_ns: UTC of the first pulse; the packet carries its microsecond past the hour, rounded down.
+    azimuth_rad (blocks,): rotor angle at the first pulse of each block, 12 of them, or 6 in dual mode.
+    range_m, reflectivity (returns, firings, 16): 0 m is no return. Dual mode has returns = 2: strongest (or second
+    strongest), then last; they go into odd and even blocks.
+    """
+    returns, firings = 2 if mode == "dual" else 1, firings_per_packet(mode)
+    if range_m.shape != (returns, firings, vlp16.LASERS):
+        raise ValueError(f"{mode} packets take ranges {(returns, firings, vlp16.LASERS)}, got {range_m.shape}")
+    packet = np.zeros((), dtype=_PACKET)
+    blocks = packet["blocks"]
+    blocks["flag"] = vlp16.BLOCK_FLAG
+    hundredths = np.rint(np.degrees(azimuth_rad) * 100).astype(np.int64) % vlp16.AZIMUTH_TURN
+    ticks = np.rint(1000 * range_m / vlp16.RANGE_UNIT_MM).astype(np.uint16)
+    shades = np.where(ticks > 0, reflectivity, 0)
+    by_block = (returns, firings // FIRINGS_PER_BLOCK, FIRINGS_PER_BLOCK, vlp16.LASERS)
+    for kind in range(returns):
+        rows = slice(returns - 1 - kind, None, returns)  # dual: last in blocks 0, 2, ..; strongest in 1, 3, ..
+        blocks["azimuth"][rows] = hundredths
+        blocks["channels"]["range"][rows] = ticks.reshape(by_block)[kind]
+        blocks["channels"]["reflectivity"][rows] = shades.reshape(by_block)[kind]
+    packet["timestamp_us"] = first_pulse_ns // 1000 % vlp16.HOUR_US
+    packet["mode"] = RETURN_MODE_BYTE[mode]
+    packet["product"] = vlp16.PRODUCT_ID
+    return packet.tobytes()

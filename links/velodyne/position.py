@@ -1,0 +1,71 @@
+"""The VLP-16's position packet: what the sensor knows of GPS time, and whether its clock is locked to it.
+
+Source: VLP-16 User Manual 63-9243 Rev. E, section 9.3.3, tables 9-3 and 9-4. The manual counts from the Ethernet
+frame's start; offsets here are into the UDP payload (42 bytes less).
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from flow.link import LinkError
+from links.velodyne import vlp16
+
+_TIMESTAMP_AT = 0xF0 - 42
+_PPS_AT = 0xF4 - 42
+_NMEA_AT = 0xF8 - 42
+
+
+class Pps(enum.Enum):
+    """Table 9-4: the pulse per second at the sensor's interface box."""
+
+    ABSENT = 0
+    SYNCHRONIZING = 1
+    LOCKED = 2
+    ERROR = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """One position packet."""
+
+    timestamp_us: int  # the sensor's microseconds of the hour when it put the packet together
+    pps: Pps
+    nmea: str  # the last GPRMC sentence as it came, "" when there was none
+    gps_utc: datetime | None  # its date and time; None without a sentence, or with one that is damaged
+    gps_valid: bool  # the receiver says its fix is valid (status A)
+
+
+def parse_position(data: bytes) -> Position:
+    """Read a position packet (UDP payload of 512 bytes). LinkError when it is not one."""
+    if len(data) != vlp16.POSITION_BYTES:
+        raise LinkError(f"a position packet has {vlp16.POSITION_BYTES} bytes, this one {len(data)}: is it UDP 8308?")
+    timestamp_us = int.from_bytes(data[_TIMESTAMP_AT : _TIMESTAMP_AT + 4], "little")
+    if timestamp_us >= vlp16.HOUR_US or data[_PPS_AT] > Pps.ERROR.value:
+        raise LinkError("a position packet with impossible time or PPS state: is the sender a VLP-16?")
+    nmea = data[_NMEA_AT:].split(b"\r", 1)[0].split(b"\0", 1)[0].decode("ascii", errors="replace")
+    gps_utc, valid = _read_gprmc(nmea)
+    return Position(timestamp_us, Pps(data[_PPS_AT]), nmea, gps_utc, valid)
+
+
+def _read_gprmc(sentence: str) -> tuple[datetime | None, bool]:
+    """UTC and validity of `$GPRMC,hhmmss[.ss],A,...,ddmmyy,...*checksum`; (None, False) when it is damaged."""
+    body, star, checksum = sentence.removeprefix("$").partition("*")
+    fields = body.split(",")
+    if not star or fields[0] != "GPRMC" or len(fields) < 10:
+        return None, False
+    parity = 0
+    for character in body:
+        parity ^= ord(character)
+    try:
+        if int(checksum, 16) != parity:
+            return None, False
+        midnight = datetime.strptime(fields[9], "%d%m%y").replace(tzinfo=UTC)
+        clock = datetime.strptime(fields[1][:6], "%H%M%S")
+        fraction_s = float("0" + fields[1][6:])
+    except ValueError:
+        return None, False
+    since_midnight = timedelta(hours=clock.hour, minutes=clock.minute, seconds=clock.second + fraction_s)
+    return midnight + since_midnight, fields[2] == "A"

@@ -1,0 +1,163 @@
+"""The command line as a user meets it: what it prints, writes and returns."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from links.cli.app import app
+from links.cli.files import read_rig
+
+ROOT = Path(__file__).resolve().parents[3]
+STREET = ROOT / "recordings" / "street_sweep.mcap"
+
+
+@pytest.fixture
+def grd(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: object, code: int = 0) -> str:
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        if result.exception and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        assert result.exit_code == code, result.output
+        return result.output
+
+    return call
+
+
+def without_viewer(folder: Path) -> Path:
+    overlay = folder / "no_viewer.yaml"
+    overlay.write_text("links: {viewer: null}\n")
+    return overlay
+
+
+@pytest.mark.parametrize(
+    "command", ["run", "replay", "check", "graph", "schema", "import", "recover", "simulate", "view"]
+)
+def test_every_command_explains_itself_with_an_example(grd, command):
+    assert f"Example: grd {command} " in grd(command, "--help").replace("\n  ", " ").replace("  ", " ")
+
+
+def test_quickstart_says_where_the_drone_is_and_where_to_look(grd, tmp_path):
+    text = grd("run", ROOT / "configs" / "quickstart.yaml")
+    folder = tmp_path / "out" / "street_sweep-quickstart"
+    for words in ("x forward [m]", "output hash", "run.rrd", "fix_vehicle_drone.tum", "against the simulation's truth"):
+        assert words in text
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        "config.yaml",
+        "fix_covariance.csv",
+        "fix_vehicle_drone.tum",
+        "run.log",
+        "run.rrd",
+        "summary.json",
+        "truth_vehicle_drone.tum",
+    }
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["output_hash"] in text
+    fixes = [line.split() for line in (folder / "fix_vehicle_drone.tum").read_text().splitlines()[1:]]
+    assert len(fixes) == summary["fixes"] > 0
+    assert all(len(line) == 8 for line in fixes)
+
+
+def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_path):
+    overlay = without_viewer(tmp_path)
+    for _ in range(2):
+        grd("replay", STREET, "--overlay", overlay)
+    names = ["street_sweep-replay", "street_sweep-replay-2"]
+    hashes = {json.loads((tmp_path / "out" / name / "summary.json").read_text())["output_hash"] for name in names}
+    assert len(hashes) == 1
+    again = grd("replay", STREET, "--out", tmp_path / "out" / names[0], code=2)
+    assert "holds a run already" in again
+
+
+def test_a_changed_setting_changes_the_hash(grd, tmp_path):
+    overlay = without_viewer(tmp_path)
+    grd("replay", STREET, "--overlay", overlay, "--out", "a")
+    grd("replay", STREET, "--overlay", overlay, "--out", "b", "--set", "track.frame_s=0.1")
+    a, b = (json.loads((tmp_path / name / "summary.json").read_text()) for name in "ab")
+    assert a["output_hash"] != b["output_hash"]
+    assert b["set"] == ["track.frame_s=0.1"]
+
+
+def test_all_that_is_wrong_with_a_configuration_is_said_at_once(grd, tmp_path):
+    (tmp_path / "wrong.yaml").write_text(
+        f"include: {ROOT}/configs/replay.yaml\nstages:\n  track:\n    config: {{radius: 2}}\n    inputs: {{points: sweep.depth_image}}\n"
+    )
+    text = grd("check", "wrong.yaml", code=1)
+    assert "wrong.yaml:4: stages.track.config.radius: unknown setting 'radius'. Did you mean 'radius_m'?" in text
+    assert (
+        "wrong.yaml:5: stages.track.inputs.points: type mismatch: sweep.depth_image is DepthImage, "
+        "track.points takes SweptPoints." in text
+    )
+    assert grd("replay", STREET, "--config", "wrong.yaml", code=2) == text
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "no such"),
+        (b"", "empty"),
+        (b"hello, this is no recording\n" * 10, ""),
+    ],
+)
+def test_a_recording_that_is_none_is_said_in_one_line(grd, tmp_path, content, words):
+    if content is not None:
+        (tmp_path / "x.mcap").write_bytes(content)
+    text = grd("replay", "x.mcap", code=2)
+    assert "x.mcap" in text
+    assert words in text.lower()
+    assert "Traceback" not in text
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_truncated_recording_runs_as_far_as_it_goes_with_a_warning(grd, tmp_path):
+    data = STREET.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    text = grd("replay", "cut.mcap", "--overlay", without_viewer(tmp_path))
+    assert "warning: " in text
+    assert "byte" in text
+    summary = json.loads((tmp_path / "out" / "cut-replay" / "summary.json").read_text())
+    assert summary["records"] > 0
+    assert summary["warnings"]
+
+
+def test_a_configuration_without_a_recording_says_how_to_use_it(grd):
+    text = grd("run", ROOT / "configs" / "paper.yaml", code=2)
+    assert "grd replay FILE.mcap --config" in text
+
+
+def test_a_recording_from_another_place_is_replayed_with_its_own_rig(grd, tmp_path):
+    shutil.copy(ROOT / "recordings" / "einride_vlp16.mcap", tmp_path / "room.mcap")
+    text = grd("replay", "room.mcap", "--overlay", without_viewer(tmp_path))
+    assert "no drone: " in text
+    assert "0 fixes" in text
+    config = (tmp_path / "out" / "room-replay" / "config.yaml").read_text()
+    assert "turns: false" in config
+
+
+def test_an_import_takes_the_rig_of_a_file_or_of_a_configuration(grd, tmp_path):
+    capture = ROOT / "tests" / "links" / "recording" / "none.pcap"
+    assert grd("import", capture, code=2).startswith(f"{capture}: no such file")
+    for name, text, words in [
+        ("a.yaml", "lidar: {mount: {turn: true}}", "a.yaml: lidar.mount.turn: Extra inputs are not permitted"),
+        ("b.yaml", "- 1", "b.yaml is no rig: it needs 'lidar:'"),
+        ("c.yaml", "a: [", "c.yaml is no rig: "),
+    ]:
+        (tmp_path / name).write_text(text)
+        assert words in grd("import", capture, "--rig", name, code=2)
+    rig = yaml.safe_load(read_rig(ROOT / "configs" / "rigs" / "standard.yaml"))
+    assert rig["lidar"]["mount"]["T_turntable_lidar"]["rpy_deg"] == [90.0, 0.0, 0.0]
+
+
+def test_graph_and_schema_are_written(grd, tmp_path):
+    grd("graph", ROOT / "configs" / "paper.yaml", "--format", "svg", "-o", "graph.svg")
+    assert (tmp_path / "graph.svg").read_text().startswith("<svg ")
+    assert "flowchart LR" in grd("graph", ROOT / "configs" / "paper.yaml")
+    assert json.loads(grd("schema"))["title"] == "grd configuration"

@@ -16,8 +16,3 @@ F = TypeVar("F", bound=Callable[..., Any])
 def compiled(function: F) -> F:
     """`numba.njit(cache=True, nogil=True)`: IEEE arithmetic, so that two machines agree."""
     return cast(F, numba.njit(cache=True, nogil=True)(function))  # pyright: ignore
-
-
-def compiled_fastmath(function: F) -> F:
-    """As `compiled`, but sums may be reordered for SIMD: for kernels whose result is not compared bit by bit across machines."""
-    return cast(F, numba.njit(cache=True, nogil=True, fastmath=True)(function))  # pyright: ignore

@@ -54,6 +54,14 @@ class ServoState(Message):
 
 
 @message
+class ServoGoal(Message):
+    """Where the turntable's servo shall go; stamp_ns is that of the servo state it was decided on."""
+
+    position_rad: float
+    speed_radps: float  # at most; the servo keeps to what its motor can do
+
+
+@message
 class SweptPoints(Message):
     """Returns in the vehicle frame, each at its own time; stamp_ns is the first pulse's of the slice."""
 
@@ -95,7 +103,7 @@ class ScoreImage(Message):
 
 @message
 class Detections(Message):
-    """Drone candidates of one sweep, best first. An empty or wholly refused list with its reasons is a normal answer."""
+    """Drone candidates of one sweep, best first. A list that is empty or wholly refused is a normal answer."""
 
     xyz_vehicle_m: Points64
     score: PerPointF64  # e = e_inner + e_outer

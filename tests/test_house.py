@@ -32,13 +32,17 @@ TOP_LEVEL = {"flow", "stages", "links", "configs", "recordings", "tests"}
 
 
 def imports_of(file: Path) -> set[str]:
+    """Names of the modules that a file imports; `from package import module` is the module."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{file}: imports are written in full"
-            found.add(node.module or "")
+            inside = ROOT / (node.module or "").replace(".", "/")
+            for alias in node.names:
+                is_module = (inside / f"{alias.name}.py").is_file() or (inside / alias.name / "__init__.py").is_file()
+                found.add(f"{node.module}.{alias.name}" if is_module else node.module or "")
     return found
 
 

@@ -1,0 +1,102 @@
+"""How a recording opens: where the drone is on the left, why and how sure on the right, both over what is said.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from links.viewer.scene import DRONE_FRAME, TIMELINE
+
+_BACKGROUND = [12, 15, 22]
+_WHOLE_RUN = rrb.TimeAxis(
+    view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+)
+
+
+def layout() -> rrb.Blueprint:
+    """The blueprint. Views ask for groups of entities, whatever the stages are called: see `links/viewer/draw.py`."""
+    scene = _space(
+        "Vehicle frame: last returns (blue low, white high), LiDAR fan, drone with 95 % ellipsoid",
+        ["/vehicle/**", "/labels/**", "/lidar/**", "/frames/**"],
+        frame="vehicle",
+        eye=rrb.EyeControls3D(position=(-22.0, -17.0, 17.0), look_target=(5.0, 0.5, 7.0), eye_up=(0.0, 0.0, 1.0)),
+        grid_m=5.0,
+    )
+    close_up = _space(
+        "Close-up: follows the drone",
+        ["/vehicle/**", "/frames/**"],
+        frame=DRONE_FRAME,
+        eye=rrb.EyeControls3D(position=(-2.6, -2.0, 1.4), look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)),
+        grid_m=None,
+    )
+    words = rrb.Tabs(
+        rrb.TextDocumentView(name="Now", origin="/now"),
+        rrb.TextLogView(name="Verdicts", origin="/log", contents="/log/**"),
+        rrb.TextDocumentView(name="Graph", origin="/about/graph"),
+        rrb.TextDocumentView(name="Settings", origin="/about/settings"),
+        _curves("All other numbers", "/plots/other/**"),
+    )
+    images = rrb.Horizontal(
+        _image("Depth image, up (blue near, red far)", ["/depth/**", "/marks/**"]),
+        rrb.Tabs(
+            _image("Score (bright: like a drone)", ["/score/**", "/marks/**"]),
+            rrb.TensorView(
+                name="LiDAR range",
+                origin="/range",
+                contents="/range/**",
+                view_fit="fill",
+                scalar_mapping=rrb.TensorScalarMapping(colormap="turbo", mag_filter="nearest"),
+            ),
+        ),
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(scene, rrb.Horizontal(close_up, words, column_shares=[2, 3]), row_shares=[2, 1]),
+            rrb.Vertical(
+                images,
+                _curves("Position of the drone [m]", "/plots/position/**"),
+                _curves("Its sigma [m]", "/plots/sigma/**"),
+                _curves("Returns on the drone, per frame", "/plots/hits/**"),
+                _curves("Servo angle and goal [deg]", "/plots/servo/**"),
+                rrb.StateTimelineView(name="States", origin="/states", contents="/states/**", time_view=_WHOLE_RUN),
+                row_shares=[32, 14, 12, 9, 10, 21],
+            ),
+            column_shares=[11, 10],
+        ),
+        # Following: a live run moves on, a finished file opens at its end, with every curve complete.
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def _space(
+    name: str, contents: list[str], *, frame: str, eye: rrb.EyeControls3D, grid_m: float | None
+) -> rrb.Spatial3DView:
+    return rrb.Spatial3DView(
+        name=name,
+        origin="/",
+        contents=contents,
+        background=_BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=grid_m is not None, spacing=grid_m or 1.0, color=[255, 255, 255, 14]),
+        spatial_information=rrb.SpatialInformation(target_frame=frame, axes=rr.ViewCoordinates.FLU),
+        eye_controls=eye,
+    )
+
+
+def _image(name: str, contents: list[str]) -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(name=name, origin="/", contents=contents, background=[0, 0, 0])
+
+
+def _curves(name: str, contents: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        name=name,
+        origin="/plots",
+        contents=contents,
+        axis_x=_WHOLE_RUN,
+        plot_legend=rrb.Corner2D.LeftTop,
+    )

@@ -1,0 +1,93 @@
+"""The Rerun recording of one run: a file, a loopback server, one timeline. Used by one thread only.
+
+Source: ours. Rerun 0.41's traps: DESIGN, Links.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from links.viewer.layout import layout
+from links.viewer.rrd_file import RrdFile
+from links.viewer.scene import TIMELINE, Mark
+
+APPLICATION = "grd"
+LOOPBACK = "127.0.0.1"
+EPOCH_FROM_NS = 10**17  # stamps above are times since 1970 (1973 on), below are times since some start
+
+
+class Stream:
+    """A Rerun stream that outlives its sinks: what it cannot write or serve is counted in `errors`."""
+
+    def __init__(self, file: Path | None, port: int | None, memory_limit: str, errors: Counter[str]) -> None:
+        self._styled: set[str] = set()
+        self._since_1970: bool | None = None
+        self._rerun = rr.RecordingStream(APPLICATION)
+        self._rerun.set_log_time_enabled(False)  # the sensors' time is the only one
+        sinks: list[Any] = []
+        if port is not None and _is_free(port):
+            # Never GrpcSink (connect_grpc): without a viewer at the other end, log() would block for ever.
+            sinks.append(rr.GrpcServerSink(LOOPBACK, port, server_memory_limit=memory_limit))
+        elif port is not None:
+            errors[f"port {port} is taken, so nothing is served: does another run or viewer have it? Set `port`."] += 1
+        self._file: RrdFile | None = None
+        if file is not None:
+            try:
+                self._file = RrdFile(file, errors)
+                sinks.append(self._file.sink)
+            except OSError as error:
+                errors[f"cannot write {file}: {error.strerror}; the run goes on without it"] += 1
+        if not sinks:
+            self._rerun.disconnect()
+            return
+        try:
+            self._rerun.set_sinks(*sinks, default_blueprint=layout())
+        except RuntimeError as error:
+            errors[f"nothing is shown, Rerun cannot start: {error}"] += 1
+        finally:
+            if self._file is not None:
+                self._file.connected()
+
+    def at(self, stamp_ns: int) -> bool:
+        """Set the time of what follows; true the first time, which decides if the timeline counts from 1970."""
+        first = self._since_1970 is None
+        if self._since_1970 is None:
+            self._since_1970 = abs(stamp_ns) > EPOCH_FROM_NS
+        if self._since_1970:
+            self._rerun.set_time(TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
+        else:
+            self._rerun.set_time(TIMELINE, duration=np.timedelta64(stamp_ns, "ns"))
+        return first
+
+    def put(self, mark: Mark, *, static: bool = False) -> None:
+        """Log a mark; its frame and style go once per entity, static."""
+        if mark.path not in self._styled:
+            self._styled.add(mark.path)
+            style = [] if mark.style is None else [mark.style()]
+            if mark.frame is not None:
+                style.append(rr.CoordinateFrame(mark.frame))
+            if style:
+                self._rerun.log(mark.path, *style, static=True)
+        self._rerun.log(mark.path, *mark.parts, static=static)
+
+    def close(self) -> None:
+        """Push everything out and end the file."""
+        self._rerun.disconnect()
+        if self._file is not None:
+            self._file.close()
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,152 @@
+"""Viewer: a tap that logs every message of every edge to Rerun, into a file and, when asked, to a loopback server.
+
+`see` only puts the message into a bounded box; one thread draws. Nothing outside (a slow viewer, a full disk, a taken
+port) stops the run: it is counted in `dropped` and `errors`, and said in the log when the run ends.
+
+Source: ours. Rerun 0.41's traps: DESIGN, Links.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+import rerun as rr
+from pydantic import Field, PrivateAttr
+
+from flow.link import Run, Tap
+from flow.message import Message
+from links.viewer.draw import draw
+from links.viewer.mailbox import Mailbox
+from links.viewer.scene import Mark, Scene, opening, scenery
+from links.viewer.slices import Slicer
+from links.viewer.stream import LOOPBACK, Stream
+from stages.geometry import LidarMount
+
+PATIENCE_S = 10.0  # a lossless run waits this long for a stalled viewer
+CLOSE_S = {True: 60.0, False: 1.5}  # lossless: the whole end; live: a stop takes two seconds in all
+
+# What drawing raises for a message it cannot show; Rerun's own refusals (strict mode) are among them.
+DRAWING_ERRORS = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+
+_log = logging.getLogger("grd.viewer")
+
+
+class Viewer(Tap):
+    """Log every edge to Rerun. `lossless: true`, for replays: the run waits for the viewer instead of dropping."""
+
+    file: str | None = "run.rrd"  # in the run's folder; null: no file
+    serve: bool = False  # to viewers on this host; binds 127.0.0.1 only
+    port: int = Field(9876, ge=1024, le=65535)
+    memory_limit: str = Field("256MiB", pattern=r"^\d+(kB|MB|GB|KiB|MiB|GiB)$")  # the server's, for viewers coming late
+    lossless: bool = False
+    queue_size: int = Field(4096, ge=1)
+    slice_s: float = Field(0.1, gt=0, le=10)  # messages that come per packet are joined to slices this long
+    history_s: float = Field(3.0, gt=0, le=60)  # how much of the cloud is visible at a time: a whole sweep
+    max_points_per_slice: int = Field(6000, ge=1)
+    trail_s: float = Field(20.0, ge=0)  # how much of the drone's path is visible at a time
+    mount: LidarMount | None = None  # shows the turntable, the LiDAR and the fan of its beams where they are
+
+    _box: Mailbox[Message] | None = PrivateAttr(None)
+    _thread: threading.Thread | None = PrivateAttr(None)
+    _errors: Counter[str] = PrivateAttr(default_factory=Counter)
+    _finished: bool = PrivateAttr(False)
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Messages that were not drawn because the viewer did not keep up, by output."""
+        return dict(self._box.dropped) if self._box else {}
+
+    @property
+    def errors(self) -> dict[str, int]:
+        """What went wrong, each text with how often."""
+        return dict(self._errors)
+
+    @property
+    def url(self) -> str:
+        """Where a viewer finds a serving run: `rerun --connect URL`."""
+        return f"rerun+http://{LOOPBACK}:{self.port}/proxy"
+
+    def open(self, run: Run) -> None:
+        """Start the logging thread; Rerun is first touched there, which takes half a second."""
+        self._errors.clear()
+        self._finished = False
+        self._box = Mailbox(self.queue_size, lossless=self.lossless, patience_s=PATIENCE_S)
+        self._thread = threading.Thread(target=self._work, args=(run, self._box), name="viewer", daemon=True)
+        self._thread.start()
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        """Put the message into the box; the time that counts is its stamp, not its arrival."""
+        if self._box is not None:
+            self._box.put(output, message)
+
+    def close(self) -> None:
+        """Draw what is left, end the file, and say what was lost."""
+        if self._box is None or self._thread is None:
+            return
+        self._box.close()
+        patience_s = CLOSE_S[self.lossless]
+        self._thread.join(patience_s)
+        if self._thread.is_alive():
+            self._errors[f"the viewer needs over {patience_s} s: the end of {self.file} is missing"] += 1
+        elif not self._finished:
+            self._errors["the logging thread died, see its traceback; nothing after that is shown"] += 1
+        for output, count in self.dropped.items():
+            _log.warning("%d messages of %s are missing in the viewer", count, output)
+        for text, count in self.errors.items():
+            _log.warning("%s%s", text, f" ({count} times)" if count > 1 else "")
+
+    def _work(self, run: Run, box: Mailbox[Message]) -> None:
+        """The logging thread. However it ends, nobody waits for it any more."""
+        try:
+            self._log_all(run, box)
+            self._finished = True
+        finally:
+            box.close()
+
+    def _log_all(self, run: Run, box: Mailbox[Message]) -> None:
+        rr.set_strict_mode(True)  # what Rerun refuses is raised and counted, not warned about
+        stream = Stream(
+            run.out_dir / self.file if self.file is not None else None,
+            self.port if self.serve else None,
+            self.memory_limit,
+            self._errors,
+        )
+        for mark in (*_about(run), *scenery(self.mount)):
+            stream.put(mark, static=True)
+        scene = Scene(
+            mount=self.mount,
+            history_s=self.history_s,
+            slice_s=self.slice_s,
+            max_points=self.max_points_per_slice,
+            trail_s=self.trail_s,
+        )
+        slicer = Slicer(self.slice_s)
+        dropped = 0
+        while (batch := box.take()) is not None:
+            for output, message in batch:
+                self._draw(stream, scene, slicer.add(output, message))
+            if box.dropped.total() > dropped:
+                dropped = box.dropped.total()
+                stream.put(Mark("log/viewer", rr.TextLog(f"{dropped} messages dropped so far", level="WARN")))
+        self._draw(stream, scene, slicer.finish())
+        stream.close()
+
+    def _draw(self, stream: Stream, scene: Scene, ready: Iterable[tuple[str, int, Message]]) -> None:
+        for output, stamp_ns, message in ready:
+            try:
+                if stream.at(stamp_ns):
+                    for mark in opening(self.mount):
+                        stream.put(mark)
+                for mark in draw(message, output.replace(".", "/"), scene):
+                    stream.put(mark)
+            except DRAWING_ERRORS as error:
+                self._errors[f"{output} could not be drawn: {type(error).__name__}: {error}"] += 1
+
+
+def _about(run: Run) -> Iterator[Mark]:
+    markdown = rr.MediaType.MARKDOWN
+    yield Mark("about/graph", rr.TextDocument(f"```mermaid\n{run.mermaid}\n```", media_type=markdown))
+    yield Mark("about/settings", rr.TextDocument(f"```yaml\n{run.settings_yaml}\n```", media_type=markdown))

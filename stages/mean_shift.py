@@ -1,0 +1,113 @@
+"""Mean shift: the weighted mean of the returns around the drone's last position, and how far to trust it.
+
+    C(t) = exp(-|t - t_hat|^2),  t^{n+1} = sum_F C(t) t / sum_F C(t)                        Equation (6)
+
+t in metres, t_hat = t^n. F, the returns within r of t^0, stays the same for the whole frame.
+
+Source: P III.C, Equation 6. The covariance is ours: the paper gives none.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.compiled import compiled
+from stages.geometry import Array64
+
+NEW_CROSSING_NS = 10_000_000  # a laser silent on the target this long and back again is another pass of the fan
+
+
+@compiled
+def within(points_m: NDArray[np.float32], t_0: NDArray[np.float64], radius_m: float) -> NDArray[np.int64]:
+    """F: which of points (n, 3) lie within radius_m of t_0 (3,)."""
+    index = np.empty(points_m.shape[0], dtype=np.int64)
+    n = 0
+    for i in range(points_m.shape[0]):
+        dx, dy, dz = points_m[i, 0] - t_0[0], points_m[i, 1] - t_0[1], points_m[i, 2] - t_0[2]
+        if dx * dx + dy * dy + dz * dz <= radius_m * radius_m:
+            index[n] = i
+            n += 1
+    return index[:n]
+
+
+@compiled
+def mean_shift(
+    points_m: NDArray[np.float64], t_0: NDArray[np.float64], max_iterations: int, tolerance_m: float
+) -> tuple[Array64, Array64, int, float]:
+    """Equation (6) over points (n, 3), n > 0, from t_0 (3,), until a step is shorter than tolerance_m.
+
+    Returns (t (3,) [m], the weights C (n,) of the last step, iterations, last step [m]).
+    """
+    n = points_m.shape[0]
+    weights = np.empty(n)
+    t = t_0.copy()
+    shift_m = math.inf
+    iterations = 0
+    while iterations < max_iterations and shift_m >= tolerance_m:
+        sum_w = sum_x = sum_y = sum_z = 0.0
+        for i in range(n):
+            dx, dy, dz = points_m[i, 0] - t[0], points_m[i, 1] - t[1], points_m[i, 2] - t[2]
+            w = math.exp(-(dx * dx + dy * dy + dz * dz))
+            weights[i] = w
+            sum_w += w
+            sum_x += w * dx
+            sum_y += w * dy
+            sum_z += w * dz
+        step_x, step_y, step_z = sum_x / sum_w, sum_y / sum_w, sum_z / sum_w
+        t[0] += step_x
+        t[1] += step_y
+        t[2] += step_z
+        shift_m = math.sqrt(step_x * step_x + step_y * step_y + step_z * step_z)
+        iterations += 1
+    return t, weights, iterations, shift_m
+
+
+def crossings(point_stamp_ns: NDArray[np.int64], laser: NDArray[np.uint8]) -> int:
+    """How many times a beam crossed the target: runs of one laser without a pause of NEW_CROSSING_NS."""
+    count = 0
+    for beam in np.unique(laser):
+        count += 1 + int((np.diff(np.sort(point_stamp_ns[laser == beam])) > NEW_CROSSING_NS).sum())
+    return count
+
+
+def fix_covariance_m2(
+    points_m: Array64,
+    weights: Array64,
+    beam_crossings: int,
+    origin_m: Array64,
+    span_m: float,
+    range_noise_m: float,
+    pointing_rad: float,
+    beam_rad: float,
+) -> Array64:
+    """Covariance (3, 3) of the weighted mean of points (n, 3) as the position of the drone's *centre*.
+
+        P = S / n_eff + u u^T (sigma_r^2 + s^2 / 12) + (I - u u^T) (s^2 / (12 m) + R^2 (sigma_p^2 + beta^2 / 12))
+
+    S / n_eff    weighted scatter over n_eff = (sum C)^2 / sum C^2: chance of which spots of the drone were hit
+    u, R         direction and distance from the LiDAR to the mean
+    sigma_r      range noise. It is the same for neighbouring returns, so it is not divided by their number
+    s^2 / 12     along the ray the centre lies behind the hull that was hit, anywhere from 0 to s/2, and the mean is not
+                 moved for it: the mean square of a uniform offset in [0, s/2]
+    s^2 / (12 m) across the ray one crossing beam tells only that the drone is somewhere within its span: uniform,
+                 variance s^2 / 12; m crossings are m such looks
+    sigma_p      pointing: encoder, calibration, servo time. Common to all returns of a frame, so not divided
+    beta         beam divergence: a return may come from anywhere in the footprint, uniform over R beta
+
+    Positive definite for span_m > 0 or all of the noises > 0, also for a single return.
+    """
+    mean_m = np.average(points_m, axis=0, weights=weights)
+    offsets = points_m - mean_m
+    share = weights / weights.sum()
+    scatter = (offsets * share[:, np.newaxis]).T @ offsets
+    n_eff = 1.0 / float((share * share).sum())
+    ray = mean_m - origin_m
+    distance_m = float(np.linalg.norm(ray))
+    u = ray / distance_m if distance_m > 0 else np.array([0.0, 0.0, 1.0])
+    along = np.outer(u, u)
+    hull = span_m**2 / 12.0
+    across_m2 = hull / beam_crossings + distance_m**2 * (pointing_rad**2 + beam_rad**2 / 12.0)
+    return scatter / n_eff + along * (range_noise_m**2 + hull) + (np.eye(3) - along) * across_m2

@@ -1,0 +1,189 @@
+"""Track: returns near the drone's last position, frame by frame, become its next position.
+
+    F = {returns of this frame within r of t^0},  t^0 = the last frame's t,  then `stages/mean_shift.py`
+
+SEARCHING until a detection is accepted; TRACKING from there; a frame without hits is normal (the beam is elsewhere),
+but `lost_after_s` without any is LOST for one frame, then SEARCHING again. Frames are cut by the points' own times on a
+fixed grid, so it does not matter how the points are sliced into messages.
+
+A detection is up to one sweep old (2.6 s), so the first hits are looked for within `acquire_radius_m`: 3 m for a drone
+at up to 1.1 m/s. The paper keeps r = 1 m there, and loses what flies faster than 0.4 m/s before the first frame.
+
+While TRACKING the track goes its own way, as in the paper. But a track may sit on the wrong thing: when
+`rival_sweeps` sweeps in a row accept a drone elsewhere (farther than r) and none here, or one sweep does so in which
+the track had no hit at all, it starts anew from the detection. `rival_sweeps: null` is the paper literally.
+
+Source: P III.C, Equation 6 (r = 1 m, n_max = 10, frames of 120 ms); states, covariance and rivals are ours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import Field, PrivateAttr
+
+from flow.stage import Stage
+from stages.geometry import Array64
+from stages.mean_shift import crossings, fix_covariance_m2, mean_shift, within
+from stages.messages import Detections, DroneFix, SweptPoints, TrackingState, TrackState
+
+
+@dataclass(slots=True)
+class _Now:
+    """What the tracker remembers."""
+
+    frame_end_ns: int | None = None
+    t_hat: Array64 | None = None  # where the drone was last, None while searching
+    last_hit_ns: int = 0
+    acquired: bool = False  # hit at least once since the detection
+    hit_since_sweep: bool = False
+    rivals: int = 0  # sweeps in a row that saw a drone elsewhere
+    why: str = "no drone detected yet"  # why it searches, or news to tell with the next state
+    near: list[SweptPoints] = field(default_factory=lambda: list[SweptPoints]())  # F, slice by slice
+
+
+class MeanShiftTrack(Stage):
+    """P III.C: mean shift on the returns around the last position. One fix per frame with at least `min_hits`."""
+
+    radius_m: float = Field(1.0, gt=0, le=10)  # r
+    acquire_radius_m: float = Field(3.0, gt=0, le=10)  # in place of r until the first hits; the paper's is r
+    max_iterations: int = Field(10, ge=1)  # n_max
+    tolerance_m: float = Field(1e-4, ge=0)  # a shorter step ends the frame's iteration
+    frame_s: float = Field(0.12, gt=0)
+    min_hits: int = Field(1, ge=1)
+    lost_after_s: float = Field(3.0, gt=0)  # a whole sweep (2.6 s) may pass without a hit
+    rival_sweeps: int | None = Field(2, ge=1)
+    span_m: float = Field(0.5, gt=0, le=10)  # s, the drone's largest extent, for the covariance
+    range_noise_m: float = Field(0.03, ge=0)  # VLP-16 datasheet 63-9229: typical accuracy +-3 cm
+    pointing_deg: float = Field(0.1, ge=0)  # encoder, calibration and servo time together, one sigma
+    beam_deg: float = Field(0.17, ge=0)  # VLP-16 divergence, 3 mrad
+
+    _now: _Now = PrivateAttr(default_factory=lambda: _Now())
+
+    def on_detections(self, detections: Detections) -> None:
+        """Start from the best accepted detection; while tracking, count rivals."""
+        now = self._now
+        accepted = detections.xyz_vehicle_m[detections.accepted]
+        if now.t_hat is None:
+            if len(accepted):
+                self._start(detections.stamp_ns, accepted[0], "started at a detection")
+            return
+        here = len(accepted) and (np.linalg.norm(accepted - now.t_hat, axis=1) <= self.radius_m).any()
+        now.rivals = 0 if here or not len(accepted) else now.rivals + 1
+        unsupported = not now.hit_since_sweep
+        now.hit_since_sweep = False
+        if self.rival_sweeps is not None and now.rivals and (unsupported or now.rivals >= self.rival_sweeps):
+            distance_m = float(np.linalg.norm(accepted[0] - now.t_hat))
+            why = "the last sweep had no hit here" if unsupported else f"{now.rivals} sweeps in a row saw it there"
+            self._start(detections.stamp_ns, accepted[0], f"moved {distance_m:.1f} m to a detection: {why}")
+
+    def on_points(self, points: SweptPoints) -> Iterator[DroneFix | TrackState]:
+        """Collect the returns near t^0; close frames that are over."""
+        now = self._now
+        stamps_ns = points.point_stamp_ns
+        if now.frame_end_ns is None:
+            now.frame_end_ns = points.stamp_ns + self._frame_ns
+        taken = 0
+        last_ns = max(points.stamp_ns, int(stamps_ns[-1])) if stamps_ns.size else points.stamp_ns
+        while last_ns >= now.frame_end_ns:
+            split = int(np.searchsorted(stamps_ns, now.frame_end_ns))
+            self._collect(points, taken, split)
+            taken = max(taken, split)
+            yield from self._close_frame()
+            next_ns = int(stamps_ns[taken]) if taken < stamps_ns.size else last_ns
+            skipped = max(0, next_ns - now.frame_end_ns) // self._frame_ns
+            now.frame_end_ns += (skipped + 1) * self._frame_ns
+        self._collect(points, taken, stamps_ns.size)
+
+    def finish(self) -> Iterator[DroneFix | TrackState]:
+        """Close the last frame."""
+        now = self._now
+        if now.frame_end_ns is not None:
+            yield from self._close_frame()
+
+    @property
+    def _frame_ns(self) -> int:
+        return round(self.frame_s * 1e9)
+
+    def _start(self, stamp_ns: int, xyz_vehicle_m: Array64, why: str) -> None:
+        now = self._now
+        now.t_hat = xyz_vehicle_m.astype(np.float64)
+        now.last_hit_ns = stamp_ns
+        now.acquired = now.hit_since_sweep = False
+        now.rivals = 0
+        now.why = why
+        now.near.clear()
+
+    def _collect(self, points: SweptPoints, start: int, end: int) -> None:
+        """Keep returns start..end of a slice that lie within r of t^0: the set F."""
+        now = self._now
+        if now.t_hat is None or start >= end:
+            return
+        radius_m = self.radius_m if now.acquired else self.acquire_radius_m
+        near = start + within(points.xyz_vehicle_m[start:end], now.t_hat, radius_m)
+        if near.size:
+            now.near.append(
+                SweptPoints(
+                    stamp_ns=points.stamp_ns,
+                    point_stamp_ns=points.point_stamp_ns[near],
+                    xyz_vehicle_m=points.xyz_vehicle_m[near],
+                    laser=points.laser[near],
+                    reflectivity=points.reflectivity[near],
+                    servo_rad=points.servo_rad[near],
+                    pulses=points.pulses,
+                    origin_vehicle_m=points.origin_vehicle_m,
+                )
+            )
+
+    def _close_frame(self) -> Iterator[DroneFix | TrackState]:
+        now = self._now
+        assert now.frame_end_ns is not None
+        near, now.near = now.near, []
+        hits = sum(len(part.laser) for part in near)
+        state, reason = TrackingState.SEARCHING, now.why
+        if now.t_hat is not None:
+            silent_s = (now.frame_end_ns - now.last_hit_ns) / 1e9
+            if hits >= self.min_hits:
+                fix = self._fix(near, now.t_hat)
+                now.t_hat = fix.xyz_vehicle_m
+                now.last_hit_ns = fix.stamp_ns
+                now.acquired = now.hit_since_sweep = True
+                state, reason = TrackingState.TRACKING, f"{hits} hits"
+                yield fix
+            elif silent_s > self.lost_after_s:
+                state, reason = TrackingState.LOST, f"fewer than {self.min_hits} hits a frame for {silent_s:.1f} s"
+                now.t_hat, now.why = None, "lost the drone, waiting for a detection"
+            else:
+                few = f"{hits} hits" if hits else "no hit"
+                state, reason = TrackingState.TRACKING, f"{few}, {silent_s:.2f} s since the last fix or detection"
+            if now.why and now.t_hat is not None:
+                reason, now.why = f"{now.why}; {reason}", ""
+        yield TrackState(stamp_ns=now.frame_end_ns, state=state, reason=reason, hits=hits, frame_s=self.frame_s)
+
+    def _fix(self, near: list[SweptPoints], t_0: Array64) -> DroneFix:
+        points_m = np.concatenate([part.xyz_vehicle_m for part in near]).astype(np.float64)
+        stamps_ns = np.concatenate([part.point_stamp_ns for part in near])
+        laser = np.concatenate([part.laser for part in near])
+        t, weights, iterations, shift_m = mean_shift(points_m, t_0, self.max_iterations, self.tolerance_m)
+        since_ns = stamps_ns - stamps_ns[0]
+        covariance_m2 = fix_covariance_m2(
+            points_m,
+            weights,
+            crossings(stamps_ns, laser),
+            np.array(near[0].origin_vehicle_m),
+            self.span_m,
+            self.range_noise_m,
+            math.radians(self.pointing_deg),
+            math.radians(self.beam_deg),
+        )
+        return DroneFix(
+            stamp_ns=int(stamps_ns[0]) + round(float(np.average(since_ns, weights=weights))),
+            xyz_vehicle_m=t,
+            covariance_m2=covariance_m2,
+            hits=len(points_m),
+            iterations=iterations,
+            shift_m=shift_m,
+        )

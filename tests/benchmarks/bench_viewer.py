@@ -1,0 +1,62 @@
+"""What the viewer costs the run: `see` beside doing the same drawing in the caller's thread, and a slice's thinning.
+
+Run: python -m pytest tests/benchmarks/bench_viewer.py --benchmark-only
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from flow.link import Run
+from links.viewer import Viewer
+from links.viewer.draw import draw
+from links.viewer.scene import Scene
+from links.viewer.slices import thin
+
+sys.path.append(str(Path(__file__).parents[1] / "links" / "viewer"))
+import synthetic
+
+MESSAGES = list(synthetic.run(1.0))
+
+
+@pytest.fixture
+def viewer(tmp_path):
+    """A viewer that never drops nor waits in the time of a benchmark."""
+    tap = Viewer(queue_size=10_000_000)
+    tap.open(Run(out_dir=tmp_path, name="bench", mermaid="", settings_yaml=""))
+    yield tap
+    tap.close()
+
+
+def test_see_a_second_of_messages(benchmark, viewer):
+    def see_all():
+        for output, content in MESSAGES:
+            viewer.see(output, content, 0)
+
+    benchmark.pedantic(see_all, rounds=20)
+    benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(MESSAGES) * 1e6, 2)
+
+
+def test_draw_a_second_of_messages_in_the_caller(benchmark, tmp_path):
+    stream = rr.RecordingStream("bench")
+    stream.set_sinks(rr.FileSink(tmp_path / "bench.rrd"))
+
+    def draw_all():
+        scene = Scene(mount=synthetic.MOUNT, history_s=3.0, slice_s=0.1, max_points=6000, trail_s=20.0)
+        for output, content in MESSAGES:
+            stream.set_time("sensor_time", timestamp=np.datetime64(content.stamp_ns, "ns"))
+            for mark in draw(content, output.replace(".", "/"), scene):
+                stream.log(mark.path, *mark.parts)
+
+    benchmark.pedantic(draw_all, rounds=2)
+    benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(MESSAGES) * 1e6, 2)
+
+
+def test_thin_a_slice(benchmark):
+    points = np.random.default_rng(0).uniform(-30, 30, (15_000, 3)).astype(np.float32)
+    benchmark(thin, points, 6000)

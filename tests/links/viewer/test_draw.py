@@ -1,0 +1,266 @@
+"""What each message becomes: paths, frames and numbers, by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+import numpy as np
+import pytest
+import synthetic
+
+from flow.message import Mat3, Message, Points64, message
+from links.viewer import colours, images
+from links.viewer.draw import draw
+from links.viewer.ellipsoid import ellipsoid, quaternion_xyzw
+from links.viewer.scene import Scene, opening, scenery, turntable_transform
+from stages.geometry import rotation_from_quaternion_xyzw, rotation_from_rpy_deg
+from stages.messages import DepthImage, Detections, DroneFix, ScoreImage, ServoState, TrackingState, TrackState
+
+
+def scene(**changes) -> Scene:
+    settings = {"mount": synthetic.MOUNT, "history_s": 3.0, "slice_s": 0.1, "max_points": 6000, "trail_s": 20.0}
+    return Scene(**(settings | changes))
+
+
+def drawn(content, name: str, where: Scene | None = None) -> dict:
+    return {mark.path: mark for mark in draw(content, name, where or scene())}
+
+
+def numbers(batch) -> np.ndarray:
+    return np.array(batch.as_arrow_array().to_pylist(), dtype=float)
+
+
+def fix(stamp_ns: int = 0, xyz=(3.0, 4.0, 12.0), covariance=None) -> DroneFix:
+    return DroneFix(
+        stamp_ns=stamp_ns,
+        xyz_vehicle_m=np.array(xyz),
+        covariance_m2=np.diag([0.01, 0.04, 0.09]) if covariance is None else covariance,
+        hits=5,
+        iterations=3,
+        shift_m=0.001,
+    )
+
+
+def track_state(state: TrackingState, hits: int = 0) -> TrackState:
+    return TrackState(stamp_ns=0, state=state, reason="why", hits=hits, frame_s=0.12)
+
+
+def image(depth_m: np.ndarray) -> DepthImage:
+    return DepthImage(
+        stamp_ns=0,
+        start_ns=0,
+        depth_m=depth_m,
+        focal_px=10.0,
+        origin_vehicle_m=np.array([0.0, 0.0, 0.25]),
+        points=1,
+        returns=2,
+        turned_rad=3.1,
+    )
+
+
+def test_the_ellipsoid_holds_95_percent_of_a_known_covariance():
+    half_sizes_m, axes = ellipsoid(np.diag([0.01, 0.04, 0.09]))
+    # sqrt(7.8147) = 2.7955 standard deviations in three dimensions
+    np.testing.assert_allclose(half_sizes_m, [0.27955, 0.5591, 0.83865], atol=1e-4)
+    samples = np.random.default_rng(0).multivariate_normal(np.zeros(3), np.diag([0.01, 0.04, 0.09]), 100_000)
+    inside = (((samples @ axes) / half_sizes_m) ** 2).sum(axis=1) < 1
+    assert inside.mean() == pytest.approx(0.95, abs=0.004)
+
+
+def test_the_ellipsoid_turns_with_its_covariance():
+    turn = rotation_from_rpy_deg((20.0, -35.0, 70.0))
+    covariance = turn @ np.diag([0.01, 0.04, 0.09]) @ turn.T
+    half_sizes_m, axes = ellipsoid(covariance)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    np.testing.assert_allclose(axes @ np.diag(half_sizes_m**2 / 7.814727903) @ axes.T, covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize("rpy_deg", [(0, 0, 0), (180, 0, 0), (0, 180, 0), (0, 0, 180), (12, -50, 170)])
+def test_a_quaternion_turns_as_its_matrix_does(rpy_deg):
+    rotation = rotation_from_rpy_deg(rpy_deg)
+    x, y, z, w = quaternion_xyzw(rotation)
+    np.testing.assert_allclose(rotation_from_quaternion_xyzw((x, y, z, w)), rotation, atol=1e-12)
+
+
+def test_a_fix_is_an_ellipsoid_in_the_vehicle_frame_with_trail_and_curves():
+    marks = drawn(fix(), "track/drone_fix")
+    mark = marks["vehicle/track/drone_fix/ellipsoid_95"]
+    assert mark.frame == "vehicle"
+    np.testing.assert_allclose(numbers(mark.parts[0].centers), [[3.0, 4.0, 12.0]])
+    np.testing.assert_allclose(sorted(numbers(mark.parts[0].half_sizes)[0]), [0.27955, 0.5591, 0.83865], atol=1e-4)
+    np.testing.assert_allclose(numbers(marks["plots/position/track/drone_fix"].parts[0].scalars), [3.0, 4.0, 12.0])
+    np.testing.assert_allclose(numbers(marks["plots/sigma/track/drone_fix"].parts[0].scalars), [0.1, 0.2, 0.3])
+    assert {"vehicle/track/drone_fix/trail", "labels/track/drone_fix", "frames/drone_position", "now"} <= set(marks)
+    label = marks["labels/track/drone_fix"].parts[0].labels.as_arrow_array().to_pylist()
+    assert label == ["drone 13.0 m, 5 hits"]
+
+
+def test_a_trail_is_broken_by_a_pause_and_forgets_what_is_old():
+    where = scene(trail_s=5.0)
+    for second in (0.0, 0.5, 4.0, 4.5, 5.2):
+        strips = where.trail("track/drone_fix", fix(int(second * 1e9), xyz=(second, 0.0, 10.0)))
+    assert [[float(point[0]) for point in strip] for strip in strips] == [[0.5], [4.0, 4.5, pytest.approx(5.2)]]
+
+
+def test_the_close_up_follows_the_first_of_two_trackers():
+    where = scene()
+    assert "frames/drone_position" in drawn(fix(), "track/drone_fix", where)
+    assert "frames/drone_position" not in drawn(fix(), "other/drone_fix", where)
+    assert "frames/drone_position" in drawn(fix(), "track/drone_fix", where)
+
+
+def test_candidates_are_marked_where_they_lie_in_the_depth_image():
+    where = scene()
+    drawn(image(np.zeros((40, 60), np.float32)), "sweep/depth_image", where)
+    candidates = Detections(
+        stamp_ns=0,
+        xyz_vehicle_m=np.array([[2.0, -1.0, 10.25], [1.0, 1.0, 5.25], [0.0, 0.0, -3.0]]),
+        score=np.array([1.0, 2.0, 3.0]),
+        e_inner=np.zeros(3),
+        e_outer=np.zeros(3),
+        accepted=np.array([True, False, False]),
+        reasons=("lowest", "touches a wall", "below"),
+        verdict="drone at 10.4 m",
+    )
+    marks = drawn(candidates, "detect/detections", where)
+    # u = 10 * 2/10 + 60/2 = 32, v = 10 * -1/10 + 40/2 = 19; the one below the lidar is not in the image
+    np.testing.assert_allclose(numbers(marks["marks/detect/detections/accepted"].parts[0].centers), [[32.0, 19.0]])
+    np.testing.assert_allclose(numbers(marks["marks/detect/detections/refused"].parts[0].centers), [[32.0, 22.0]])
+    refused = marks["vehicle/detect/detections/refused"].parts[0]
+    assert refused.labels.as_arrow_array().to_pylist() == ["candidate 2: touches a wall", "candidate 3: below"]
+    assert numbers(refused.positions).shape == (2, 3)
+    assert marks["log/detect/detections"].parts[0].text.as_arrow_array().to_pylist() == ["drone at 10.4 m"]
+
+
+def test_no_candidate_is_drawn_as_no_drone():
+    nothing = Detections(
+        stamp_ns=0,
+        xyz_vehicle_m=np.zeros((0, 3)),
+        score=np.zeros(0),
+        e_inner=np.zeros(0),
+        e_outer=np.zeros(0),
+        accepted=np.zeros(0, dtype=bool),
+        reasons=(),
+        verdict="no drone: no candidate",
+    )
+    marks = drawn(nothing, "detect/detections")
+    assert marks["states/detect"].parts[0].state.as_arrow_array().to_pylist() == ["no drone"]
+    assert len(marks["labels/detect/detections"].parts[0].positions) == 0  # an earlier label goes away
+
+
+def test_a_lane_changes_only_when_the_state_does():
+    where = scene()
+    seen = [
+        "states/track" in drawn(track_state(state), "track/track_state", where)
+        for state in (TrackingState.SEARCHING, TrackingState.SEARCHING, TrackingState.TRACKING, TrackingState.LOST)
+    ]
+    assert seen == [True, False, True, True]
+
+
+def test_the_servo_turns_the_turntable_as_the_mount_says():
+    state = ServoState(stamp_ns=0, position_rad=np.pi / 2, velocity_radps=0.5, goal_rad=1.0, error=4)
+    marks = drawn(state, "servo/servo_state")
+    np.testing.assert_allclose(numbers(marks["plots/servo/servo/servo_state"].parts[0].scalars), [90.0, 57.29578])
+    assert marks["states/servo"].parts[0].state.as_arrow_array().to_pylist() == ["error 0x04"]
+    columns = numbers(marks["frames/turntable"].parts[0].mat3x3).reshape(3, 3)
+    np.testing.assert_allclose(columns.T, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-7)  # Rerun stores columns
+    backwards = synthetic.MOUNT.model_copy(update={"servo_sign": -1})
+    columns = numbers(turntable_transform(backwards, np.pi / 2).mat3x3).reshape(3, 3)
+    np.testing.assert_allclose(columns.T, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-7)
+
+
+def test_without_a_mount_no_frame_is_made_up():
+    assert {mark.path for mark in scenery(None)} == {"vehicle/axes", "vehicle/name"}
+    assert [mark.path for mark in opening(None)] == ["frames/drone_position"]
+    state = ServoState(stamp_ns=0, position_rad=1.0, velocity_radps=0.0, goal_rad=1.0, error=0)
+    assert "frames/turntable" not in drawn(state, "servo/servo_state", scene(mount=None))
+
+
+def test_slices_of_the_cloud_take_turns_and_the_drone_is_warm():
+    where = scene(history_s=0.3)
+    drawn(fix(xyz=(6.0, 0.0, 12.0)), "track/drone_fix", where)
+    _, swept = synthetic.packet(0.0)
+    paths = [
+        next(iter(drawn(dataclasses.replace(swept, stamp_ns=k * 100_000_000), "sweep/swept_points", where)))
+        for k in range(4)
+    ]
+    assert paths == [f"vehicle/sweep/swept_points/slice_{k:02d}" for k in (0, 1, 2, 0)]
+    packed = where.colours(np.array([[6.5, 0.0, 12.0], [6.5, 5.0, 12.0]], np.float32))
+    assert packed[0] == colours.DRONE
+    assert packed[1] == colours.by_height(np.array([12.0], np.float32))[0]
+
+
+def test_the_range_image_has_the_highest_beam_on_top():
+    firings, _ = synthetic.packet(0.05)  # half a turn on, the beams look down
+    pixels = images.range_counts(firings)
+    assert pixels.shape == (16, 900)
+    pulse = int(np.flatnonzero(firings.range_m > 0)[0])
+    row = round((15.0 - np.rad2deg(synthetic.ELEVATION_RAD[firings.laser[pulse]])) / 2)
+    column = int(firings.azimuth_rad[pulse] / (2 * np.pi) * 900)
+    assert pixels[row, column] * 0.002 == pytest.approx(float(firings.range_m[pulse]), abs=0.06)
+
+
+def test_empty_depth_stays_empty_and_a_lone_pixel_grows_to_three():
+    depth = np.zeros((20, 30), np.float32)
+    depth[5, 7] = 12.0
+    depth[5, 9] = 3.0
+    counts = images.depth_counts(image(depth))
+    assert counts.dtype == np.uint16
+    assert (counts > 0).sum() == 15  # two squares of 3 x 3 that share a column
+    assert counts[5, 7] == 6000
+    assert counts[4, 8] == 1500  # between both: the nearer
+
+
+def test_the_best_score_is_the_brightest_and_no_candidate_is_black():
+    score = np.full((10, 10), np.nan, np.float32)
+    score[2, 2], score[7, 7] = 12.0, 900.0
+    counts = images.score_counts(ScoreImage(stamp_ns=0, score=score))
+    assert counts[2, 2] == 65535
+    assert 0 < counts[7, 7] < 65535 / 4
+    assert counts[0, 9] == 0
+    nothing = images.score_counts(ScoreImage(stamp_ns=0, score=np.full((4, 4), np.nan, np.float32)))
+    assert not nothing.any()
+
+
+class Mood(enum.Enum):
+    CALM = 0
+
+
+@message
+class Unheard(Message):
+    """A type the viewer has no function for."""
+
+    level_v: float
+    count: int
+    healthy: bool
+    mood: Mood
+    words: str
+    points_vehicle_m: Points64
+    covariance_m2: Mat3
+    samples: np.ndarray
+
+
+def test_a_message_of_unknown_type_is_visible_field_by_field():
+    content = Unheard(
+        stamp_ns=0,
+        level_v=12.5,
+        count=3,
+        healthy=True,
+        mood=Mood.CALM,
+        words="hello",
+        points_vehicle_m=np.arange(30.0).reshape(10, 3),
+        covariance_m2=np.eye(3),
+        samples=np.arange(100.0),
+    )
+    marks = drawn(content, "power/unheard")
+    assert numbers(marks["plots/other/power/unheard/level_v"].parts[0].scalars) == [12.5]
+    assert numbers(marks["plots/other/power/unheard/count"].parts[0].scalars) == [3]
+    assert numbers(marks["plots/other/power/unheard/healthy"].parts[0].scalars) == [1]
+    assert marks["states/power/unheard/mood"].parts[0].state.as_arrow_array().to_pylist() == ["CALM"]
+    assert marks["log/power/unheard/words"].parts[0].text.as_arrow_array().to_pylist() == ["hello"]
+    assert marks["vehicle/power/unheard/points_vehicle_m"].frame == "vehicle"
+    assert len(numbers(marks["plots/other/power/unheard/covariance_m2"].parts[0].scalars)) == 9
+    np.testing.assert_allclose(
+        numbers(marks["plots/other/power/unheard/samples"].parts[0].scalars), [100, 0.0, 49.5, 99.0]
+    )

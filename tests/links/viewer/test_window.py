@@ -1,0 +1,81 @@
+"""The picture: the installed viewer, without a screen, shows a whole run without complaint."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import synthetic
+from rerun.chunk import RrdReader
+
+from flow.link import LinkError, Run
+from links.viewer import Viewer, ViewerMissing, screenshot, show
+
+
+def record(folder: Path, seconds: float, *, only: str = "", mount=synthetic.MOUNT) -> Path:
+    viewer = Viewer(lossless=True, mount=mount)
+    viewer.open(Run(out_dir=folder, name="test", mermaid=synthetic.MERMAID, settings_yaml=synthetic.SETTINGS))
+    for output, content in synthetic.run(seconds):
+        if output.startswith(only):
+            viewer.see(output, content, 0)
+    viewer.close()
+    assert viewer.errors == {}
+    return folder / "run.rrd"
+
+
+def complaints(rrd: Path, png: Path) -> list[str]:
+    try:
+        return screenshot(rrd, png, size="960x540", wait_s=0.5)
+    except ViewerMissing as error:
+        pytest.skip(str(error))
+
+
+def size_of(png: Path) -> tuple[int, int]:
+    head = png.read_bytes()[:24]
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    return int.from_bytes(head[16:20]), int.from_bytes(head[20:24])
+
+
+def test_a_run_is_shown_without_a_complaint_of_any_view(tmp_path):
+    png = tmp_path / "run.png"
+    assert complaints(record(tmp_path, 3.0), png) == []
+    assert size_of(png) == (960, 540)
+    assert png.stat().st_size > 150_000  # a layout without data has a third of it
+
+
+def test_a_run_of_the_lidar_alone_without_mount_is_shown_too(tmp_path):
+    assert complaints(record(tmp_path, 0.5, only="lidar", mount=None), tmp_path / "run.png") == []
+
+
+def test_a_damaged_file_is_named_and_does_not_hang(tmp_path):
+    damaged = tmp_path / "damaged.rrd"
+    damaged.write_bytes(b"no rerun recording" * 100)
+    with pytest.raises(LinkError, match=r"damaged\.rrd: the viewer cannot show it"):
+        complaints(damaged, tmp_path / "x.png")
+
+
+def test_a_run_that_was_cut_short_can_be_mended_as_the_error_says(tmp_path):
+    rrd = record(tmp_path, 0.5)
+    rrd.write_bytes(rrd.read_bytes()[: rrd.stat().st_size // 2])
+    with pytest.raises(LinkError, match=r"rerun rrd merge .*run\.rrd -o mended\.rrd"):
+        complaints(rrd, tmp_path / "x.png")
+    mended = tmp_path / "mended.rrd"
+    subprocess.run(
+        [sys.executable, "-m", "rerun_cli", "rrd", "merge", rrd, "-o", mended], check=True, capture_output=True
+    )
+    entities = {chunk.entity_path for chunk in RrdReader(mended).stream().to_chunks()}
+    assert "/frames/turntable" in entities
+
+
+@pytest.mark.skipif("DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ, reason="would open a window")
+def test_without_a_screen_the_window_says_what_to_do_instead(tmp_path):
+    with pytest.raises(ViewerMissing, match="--screenshot"):
+        show(record(tmp_path, 0.1))
+
+
+def test_a_missing_file_is_said_before_anything_is_started(tmp_path):
+    with pytest.raises(LinkError, match="no such file"):
+        screenshot(tmp_path / "none.rrd", tmp_path / "x.png")

@@ -1,0 +1,135 @@
+"""Angles between servo states, and points turned with them: by hand, with offset, sign, zero and harmonics."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from stages.geometry import Harmonic, LidarMount, Pose, rotation_from_rpy_deg
+from stages.turntable import STATES_KEPT, Turntable
+from tests.stages.made import MS, ON_ITS_SIDE, START_NS, firings, servo
+
+
+def turntable(mount=ON_ITS_SIDE, max_gap_s=0.1, min_range_m=0.6, states=()):
+    table = Turntable(mount, max_gap_s, min_range_m)
+    for stamp_ns, position_rad in states:
+        table.add(servo(START_NS + stamp_ns, position_rad))
+    return table
+
+
+def test_the_angle_is_linear_between_the_neighbouring_states():
+    table = turntable(states=[(0, 0.2), (10 * MS, 0.4), (20 * MS, 1.0)])
+    assert table.angle_rad(START_NS + int(2.5 * MS)) == pytest.approx(0.25)
+    assert table.angle_rad(START_NS + 10 * MS) == pytest.approx(0.4)
+    assert table.angle_rad(START_NS + 15 * MS) == pytest.approx(0.7)
+
+
+def test_nothing_is_extrapolated_and_long_gaps_are_not_bridged():
+    table = turntable(states=[(0, 0.0), (100 * MS, 1.0), (201 * MS, 2.0), (210 * MS, 2.1)])
+    assert table.angle_rad(START_NS + 50 * MS) == pytest.approx(0.5)  # a gap of exactly 0.1 s is allowed
+    for t in (-1, 150 * MS, 210 * MS + 1):
+        assert math.isnan(table.angle_rad(START_NS + t))
+    assert table.angle_rad(START_NS + 201 * MS) == 2.0  # the state itself is known
+    assert "silent for 0.101 s" in table.why_unknown(START_NS + 150 * MS)
+    assert "no servo state before" in table.why_unknown(START_NS - 1)
+    assert "no servo state after" in table.why_unknown(START_NS + 211 * MS)
+    assert "wired" in turntable().why_unknown(START_NS)
+
+
+def test_a_single_turn_encoder_runs_on_over_its_end():
+    table = turntable(states=[(0, math.tau - 0.1), (10 * MS, 0.1), (20 * MS, 0.3)])
+    assert table.angle_rad(START_NS + 5 * MS) == pytest.approx(math.tau)
+    assert table.angle_rad(START_NS + 15 * MS) == pytest.approx(math.tau + 0.2)
+    back = turntable(states=[(0, 0.1), (10 * MS, math.tau - 0.1)])
+    assert back.angle_rad(START_NS + 5 * MS) == pytest.approx(0.0)
+
+
+def test_time_offset_sign_zero_and_harmonics_follow_the_mount():
+    mount = LidarMount(
+        servo_sign=-1,
+        servo_zero_deg=30.0,
+        servo_time_offset_s=0.004,
+        servo_harmonics=(Harmonic(order=2, amplitude_deg=1.0, phase_deg=15.0),),
+    )
+    table = turntable(mount, states=[(0, 0.5), (10 * MS, 0.5)])
+    expected = -(0.5 - math.radians(30)) - math.radians(1.0) * math.sin(2 * 0.5 + math.radians(15))
+    assert table.angle_rad(START_NS + 4 * MS) == pytest.approx(expected)
+    assert table.angle_rad(START_NS + 14 * MS) == pytest.approx(expected)
+    assert math.isnan(table.angle_rad(START_NS + 3 * MS))  # the state was true 4 ms after its stamp
+
+
+def test_a_repeated_or_older_state_is_ignored():
+    table = turntable(states=[(0, 0.0), (10 * MS, 1.0), (10 * MS, 5.0), (5 * MS, 5.0)])
+    assert table.known_until_ns == START_NS + 10 * MS
+    assert table.angle_rad(START_NS + 10 * MS) == 1.0
+
+
+def test_a_point_is_turned_by_hand():
+    # lidar +y (azimuth 0) -> rpy 90,0,0 -> turntable +z; lidar +x stays +x, then turns to +y at 90 deg
+    table = turntable(states=[(0, math.pi / 2), (10 * MS, math.pi / 2)])
+    placed = table.place(firings([[0, 20, 0], [7, 0, 0], [0, 0, 9]]))
+    expected = [[0, 0, 0.35 + 20], [0, 7, 0.35], [9, 0, 0.35]]  # lidar +z -> turntable -y -> vehicle +x
+    np.testing.assert_allclose(placed.xyz_vehicle_m, expected, atol=1e-5)
+    np.testing.assert_allclose(placed.turntable_rad, math.pi / 2)
+
+
+def test_each_pulse_turns_with_the_angle_at_its_own_time():
+    table = turntable(states=[(0, 0.0), (10 * MS, math.pi / 2)])
+    packet = firings([[10, 0, 0]] * 3, START_NS + np.array([0, 5, 10]) * MS)
+    placed = table.place(packet)
+    angle = np.array([0, math.pi / 4, math.pi / 2])
+    expected = np.c_[10 * np.cos(angle), 10 * np.sin(angle), np.full(3, 0.35)]
+    np.testing.assert_allclose(placed.xyz_vehicle_m, expected, atol=1e-5)
+    np.testing.assert_allclose(placed.turntable_rad, angle, atol=1e-6)
+
+
+def test_the_whole_chain_equals_the_matrices():
+    mount = LidarMount(
+        T_vehicle_turntable=Pose(xyz_m=(0.3, -0.2, 0.5), rpy_deg=(2.0, -3.0, 40.0)),
+        T_turntable_lidar=Pose(xyz_m=(0.01, 0.02, 0.1), rpy_deg=(88.0, 1.0, -2.0)),
+    )
+    table = turntable(mount, states=[(0, 0.7), (10 * MS, 0.7)])
+    points = np.random.default_rng(0).normal(size=(50, 3)) * 20
+    placed = table.place(firings(points))
+    T = mount.T_vehicle_turntable.matrix()
+    Rz = np.eye(4)
+    Rz[:3, :3] = rotation_from_rpy_deg((0, 0, math.degrees(0.7)))
+    T = T @ Rz @ mount.T_turntable_lidar.matrix()
+    np.testing.assert_allclose(placed.xyz_vehicle_m, points @ T[:3, :3].T + T[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(table.lidar_origin_vehicle_m(0.7), T[:3, 3])
+
+
+def test_only_returns_beyond_the_least_range_are_placed():
+    table = turntable(states=[(0, 0.0), (10 * MS, 0.0)])
+    placed = table.place(firings([[0, 0, 0], [0.5, 0, 0], [0.7, 0, 0], [0, 0, 0], [3, 0, 0]]))
+    assert placed.pulse.tolist() == [2, 4]
+    assert placed.unplaced == 0
+
+
+def test_returns_without_an_angle_are_counted_and_left_out():
+    table = turntable(states=[(0, 0.0), (10 * MS, 0.0)])
+    packet = firings([[5, 0, 0], [5, 0, 0], [0, 0, 0], [5, 0, 0]], START_NS + np.array([-1, 5, 20, 30]) * MS)
+    placed = table.place(packet)
+    assert placed.pulse.tolist() == [1]
+    assert placed.unplaced == 2  # the pulse without return lost nothing
+
+
+def test_a_bolted_down_lidar_needs_no_servo():
+    table = turntable(LidarMount(turns=False, T_turntable_lidar=Pose(xyz_m=(0, 0, 1.0))))
+    placed = table.place(firings([[5, 1, 2]]))
+    np.testing.assert_allclose(placed.xyz_vehicle_m, [[5, 1, 3]])
+    assert placed.unplaced == 0
+
+
+def test_memory_is_bounded_when_no_packet_comes():
+    table = turntable(states=[(i * MS, 0.0) for i in range(3 * STATES_KEPT)])
+    assert len(table._states) == STATES_KEPT
+
+
+def test_states_that_no_pulse_needs_are_forgotten():
+    table = turntable(states=[(i * 10 * MS, 0.1 * i) for i in range(10)])
+    table.forget_before(START_NS + 45 * MS)
+    assert table._states[0][0] == START_NS + 40 * MS
+    assert table.angle_rad(START_NS + 45 * MS) == pytest.approx(0.45)

@@ -116,7 +116,10 @@ def simulate_recording(
 
     Example: grd simulate configs/scenarios/street_sweep.yaml -o street.mcap --seed 3
     """
-    from links.simulated.run import simulate
+    try:
+        from links.simulated.run import simulate
+    except ModuleNotFoundError as error:
+        raise LinkError(f"simulating needs '{error.name}', which is not installed: pip install 'grd[simulate]'") from None
 
     with progress_bar(f"simulate {scenario.name}") as step:
         report = simulate(scenario, out_file, seed=seed, overwrite=overwrite, progress=lambda done: step(done, 1.0))

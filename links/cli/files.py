@@ -118,8 +118,8 @@ def simulate_recording(
     """
     try:
         from links.simulated.run import simulate
-    except ModuleNotFoundError as error:
-        raise LinkError(f"simulating needs '{error.name}', which is not installed: pip install 'grd[simulate]'") from None
+    except ModuleNotFoundError as missing:
+        raise LinkError(f"simulating needs '{missing.name}', not installed: pip install 'grd[simulate]'") from None
 
     with progress_bar(f"simulate {scenario.name}") as step:
         report = simulate(scenario, out_file, seed=seed, overwrite=overwrite, progress=lambda done: step(done, 1.0))

@@ -11,7 +11,8 @@ from flow.graph import Graph, NodeSpec
 from flow.link import Tap
 from flow.stage import output_ports
 
-_BOX_W, _BOX_H, _GAP_X, _GAP_Y, _MARGIN = 210, 58, 130, 42, 24
+_BOX_W, _BOX_H, _GAP_X, _GAP_Y, _MARGIN, _LANE = 210, 58, 130, 42, 24, 14
+_LEFT = 90  # room for wires back to the first column
 _FILL = {"stages": "#e8f0fe", "links": "#fef3e0"}
 
 
@@ -31,7 +32,7 @@ def mermaid(graph: Graph) -> str:
 
 
 def svg(graph: Graph) -> str:
-    """A self-contained SVG; the column of a node is the longest way to it, a wire back (through a link) runs below."""
+    """A self-contained SVG; a node's column is the longest way to it; wires past a column, or back, run below."""
     column = _columns(graph)
     rows: dict[int, list[str]] = {}
     for name in graph.nodes:
@@ -41,9 +42,10 @@ def svg(graph: Graph) -> str:
     for col, names in rows.items():
         spare = (tallest - len(names)) * (_BOX_H + _GAP_Y) / 2
         for row, name in enumerate(names):
-            at[name] = (_MARGIN + col * (_BOX_W + _GAP_X), _MARGIN + spare + row * (_BOX_H + _GAP_Y))
+            at[name] = (_LEFT + col * (_BOX_W + _GAP_X), _MARGIN + spare + row * (_BOX_H + _GAP_Y))
     width = max(x for x, _ in at.values()) + _BOX_W + _MARGIN + _GAP_X
-    height = max(y for _, y in at.values()) + _BOX_H + 2 * _MARGIN + 20
+    long_wires = sum(column[e.consumer] != column[e.producer] + 1 for e in graph.edges)
+    height = max(y for _, y in at.values()) + _BOX_H + 2 * _MARGIN + _LANE * long_wires
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" '
         f'width="{width:.0f}" height="{height:.0f}" font-family="sans-serif">',
@@ -51,7 +53,7 @@ def svg(graph: Graph) -> str:
         '<path d="M0,0 L7,3 L0,6 z" fill="#555"/></marker></defs>',
         f'<rect width="{width:.0f}" height="{height:.0f}" fill="white"/>',
     ]
-    parts += _wires(graph, at, height)
+    parts += _wires(graph, at)
     for spec in graph.nodes.values():
         x, y = at[spec.name]
         radius = 6 if spec.kind == "stages" else 26
@@ -78,9 +80,10 @@ def _columns(graph: Graph) -> dict[str, int]:
     return column
 
 
-def _wires(graph: Graph, at: dict[str, tuple[float, float]], height: float) -> list[str]:
+def _wires(graph: Graph, at: dict[str, tuple[float, float]]) -> list[str]:
     parts: list[str] = []
     wired = {(edge.producer, edge.output) for edge in graph.edges}
+    low = lane = max(y for _, y in at.values()) + _BOX_H
     for spec in graph.nodes.values():
         outputs = list(output_ports(spec.cls))
         for index, output in enumerate(outputs):
@@ -96,11 +99,12 @@ def _wires(graph: Graph, at: dict[str, tuple[float, float]], height: float) -> l
                 incoming = [e for e in graph.edges if e.consumer == edge.consumer]
                 tx, ty = at[edge.consumer]
                 ty += _BOX_H * (incoming.index(edge) + 1) / (len(incoming) + 1)
-                if tx >= x:
+                if 0 <= tx - x <= _GAP_X:
                     bend = (tx - x) / 2
                     path = f"M{x:.0f},{y:.0f} C{x + bend:.0f},{y:.0f} {tx - bend:.0f},{ty:.0f} {tx:.0f},{ty:.0f}"
-                else:
-                    low = height - _MARGIN
-                    path = f"M{x:.0f},{y:.0f} C{x + 60:.0f},{low:.0f} {tx - 60:.0f},{low:.0f} {tx:.0f},{ty:.0f}"
+                else:  # past other columns, or back: along a lane of its own below all boxes
+                    lane += _LANE
+                    turn, back = x + _LANE + (lane - low) / 2, tx - _LANE - (lane - low) / 2
+                    path = f"M{x:.0f},{y:.0f} H{turn:.0f} V{lane:.0f} H{back:.0f} V{ty:.0f} H{tx:.0f}"
                 parts.append(f'<path d="{path}" stroke="#555" fill="none" marker-end="url(#a)"/>')
     return parts

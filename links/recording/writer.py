@@ -15,6 +15,7 @@ import os
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -93,6 +94,8 @@ class RecordingWriter:
                 channels=channels or {},
             )
         except OSError as error:
+            with suppress(OSError):  # what is buffered cannot be written either
+                self._stream.close()
             raise LinkError(self._disk_trouble(error)) from None
         self._threads = [threading.Thread(target=self._write_all, name="recording", daemon=True)]
         if not lossless:

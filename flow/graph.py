@@ -25,7 +25,7 @@ from typing import Any, cast
 import yaml
 from pydantic import ValidationError
 
-from flow.link import Link, Source
+from flow.link import TRUTH_TOPICS, Link, Source
 from flow.message import Message
 from flow.problem import ConfigError, did_you_mean, one_of
 from flow.stage import Node, PortError, Stage, input_ports, output_ports
@@ -304,9 +304,11 @@ def _check_topics(tree: Tree, nodes: dict[str, NodeSpec]) -> None:
     for spec in nodes.values():
         if issubclass(spec.cls, Source):
             topic = str(spec.config.get("topic", spec.cls.model_fields["topic"].default))
+            path = (spec.kind, spec.name, "config", "topic")
+            if topic.startswith(TRUTH_TOPICS):
+                tree.problem(path, f"truth is for evaluation only: no source may bring in '{topic}'.")
             first = taken.setdefault(topic, spec.name)
             if first != spec.name:
-                path = (spec.kind, spec.name, "config", "topic")
                 tree.problem(path, f"'{first}' already brings in {topic}: one source for each topic.")
 
 

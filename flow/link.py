@@ -14,6 +14,9 @@ from typing import Any
 from flow.message import Message
 from flow.stage import Node
 
+TRUTH_TOPICS = "/truth"
+"""Topics that start so hold what an evaluation compares with; no source may bring them in (`flow.graph` refuses)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Record:

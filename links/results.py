@@ -19,9 +19,12 @@ from pydantic import PrivateAttr
 
 from flow.link import Run, Tap
 from flow.message import Message
-from stages.messages import Detections, DroneFix, TrackState
+from stages.messages import DepthImage, Detections, DroneFix, TrackState
 
 FIX_FILE, COVARIANCE_FILE, LOG_FILE = "fix_vehicle_drone.tum", "fix_covariance.csv", "run.log"
+DETECTIONS_FILE, SUMMARY_FILE = "detections.csv", "summary.json"
+TRUTH_FILE, TRUTH_HITS_FILE = "truth_vehicle_drone.tum", "truth_hits.csv"
+POSE_FILE, POSE_COVARIANCE_FILE = "pose_vehicle_drone.tum", "pose_covariance.csv"
 POSITION_ONLY = (
     "# T_vehicle_drone, position only: the LiDAR does not measure orientation, '0 0 0 1' stands for not measured\n"
 )
@@ -52,6 +55,9 @@ class Results(Tap):
 
     _files: dict[str, TextIO] = PrivateAttr(default_factory=dict)
     _covariance: Any = PrivateAttr(default=None)
+    _detections: Any = PrivateAttr(default=None)
+    _sweep_start_ns: dict[int, int] = PrivateAttr(default_factory=dict)  # of the newest depth image, by its stamp
+    _last_sweep_ns: int | None = PrivateAttr(default=None)
     _fixes: list[DroneFix] = PrivateAttr(default_factory=list)
     _sweeps: Counter[str] = PrivateAttr(default_factory=Counter)
     _examples: dict[str, str] = PrivateAttr(default_factory=dict)
@@ -85,12 +91,14 @@ class Results(Tap):
 
     def open(self, run: Run) -> None:
         """Start the run's files."""
-        for name in (FIX_FILE, COVARIANCE_FILE, LOG_FILE):
+        for name in (FIX_FILE, COVARIANCE_FILE, DETECTIONS_FILE, LOG_FILE):
             self._files[name] = _line_buffered(run.out_dir / name)
         self._files[FIX_FILE].write(POSITION_ONLY)
         self._covariance = csv.writer(self._files[COVARIANCE_FILE])
         upper = [f"c{a}{b}_m2" for a, b in zip("xxxyyz", "xyzyzz", strict=True)]
         self._covariance.writerow(["stamp_s", *upper, "hits", "iterations"])
+        self._detections = csv.writer(self._files[DETECTIONS_FILE])
+        self._detections.writerow(["start_s", "end_s", "x_m", "y_m", "z_m", "score"])
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Take what belongs here; all else passes by."""
@@ -100,7 +108,10 @@ class Results(Tap):
             upper = message.covariance_m2[np.triu_indices(3)]
             cells = [stamp_s(message.stamp_ns), *(f"{v:.9g}" for v in upper), message.hits, message.iterations]
             self._covariance.writerow(cells)
+        elif isinstance(message, DepthImage):
+            self._sweep_start_ns = {message.stamp_ns: message.start_ns}
         elif isinstance(message, Detections):
+            self._write_detections(message)
             kind = _NUMBER.sub("#", message.verdict)
             self._sweeps[kind] += 1
             self._examples.setdefault(kind, message.verdict)
@@ -111,6 +122,16 @@ class Results(Tap):
             if message.state.name != last:
                 self._transitions.append(Transition(message.stamp_ns, message.state.name, message.reason))
                 self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")
+
+    def _write_detections(self, message: Detections) -> None:
+        """A line for each accepted candidate, best first; a sweep without one is a line without a position."""
+        since = self._last_sweep_ns if self._last_sweep_ns is not None else message.stamp_ns
+        start_ns = self._sweep_start_ns.get(message.stamp_ns, since)
+        self._last_sweep_ns = message.stamp_ns
+        span = [stamp_s(start_ns), stamp_s(message.stamp_ns)]
+        accepted = zip(message.xyz_vehicle_m[message.accepted], message.score[message.accepted], strict=True)
+        lines = [[*span, *(f"{v:.4f}" for v in xyz), f"{score:.6g}"] for xyz, score in accepted]
+        self._detections.writerows(lines or [[*span, "", "", "", ""]])
 
     def note(self, text: str) -> None:
         """One line of the log without a time: a warning of the recording, the hash."""

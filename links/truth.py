@@ -8,17 +8,22 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flow.link import LinkError, Record
+from links.evaluation.associate import interpolate
+from links.evaluation.tum import FULL_POSE, NO_DRONE
+from links.results import TRUTH_FILE, TRUTH_HITS_FILE, stamp_s, tum_line
 from stages.geometry import rotation_from_quaternion_xyzw
 from stages.messages import DroneFix
 
-TOPIC_VEHICLE, TOPIC_DRONE = "/truth/vehicle", "/truth/drone"
+TOPIC_VEHICLE, TOPIC_DRONE, TOPIC_HITS = "/truth/vehicle", "/truth/drone", "/truth/hits"
 MAX_GAP_NS = 50_000_000  # truth further apart than this is not interpolated over
+Quaternion = tuple[float, float, float, float]  # x, y, z, w
 CHI2_95_3 = 7.814728  # 95 % quantile of chi-square with 3 degrees of freedom
 
 
@@ -28,6 +33,7 @@ class TruthLog:
 
     vehicle: dict[int, Any] = field(default_factory=dict)
     drone: dict[int, Any] = field(default_factory=dict)
+    hits_ns: list[int] | None = None  # pulses that the drone returned; None: the recording does not say
 
     def aside(self, records: Iterable[Record]) -> Iterator[Record]:
         """Pass on all records but those of truth, which are kept here."""
@@ -36,21 +42,63 @@ class TruthLog:
                 self.vehicle[record.stamp_ns] = _pose(record)
             elif record.topic == TOPIC_DRONE:
                 self.drone[record.stamp_ns] = _pose(record)
+            elif record.topic == TOPIC_HITS:
+                self.hits_ns = self.hits_ns or []
+                self.hits_ns += _pulses(record)
             else:
                 yield record
 
     def drone_in_vehicle(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Stamps (n,) [ns] and the drone's position in the vehicle frame (n, 3) [m], where both poses are known."""
-        stamps = np.array(sorted(self.vehicle.keys() & self.drone.keys()), dtype=np.int64)
+        stamps = self._stamps()
         xyz = np.empty((len(stamps), 3))
-        for row, stamp in enumerate(stamps.tolist()):
+        for row, stamp in enumerate(stamps):
             t_vehicle, q_vehicle = self.vehicle[stamp]
             R_world_vehicle = rotation_from_quaternion_xyzw(q_vehicle)
             xyz[row] = R_world_vehicle.T @ (np.asarray(self.drone[stamp][0]) - np.asarray(t_vehicle))
-        return stamps, xyz
+        return np.array(stamps, dtype=np.int64), xyz
+
+    def write(self, folder: Path) -> None:
+        """Write T_vehicle_drone and the drone's hits beside a run's results; nothing when the recording holds no truth.
+
+        A recording that knows where the vehicle is and has no drone gives a file that says so.
+        """
+        if not self.vehicle and not self.drone:
+            return
+        stamps_ns, xyz = self.drone_in_vehicle()
+        lines = [f"# T_vehicle_drone, {FULL_POSE}, truth\n" if self.drone else f"# {NO_DRONE} in this recording\n"]
+        for stamp, position in zip(stamps_ns.tolist(), xyz, strict=True):
+            q = _relative(self.vehicle[stamp][1], self.drone[stamp][1])
+            lines.append(tum_line(stamp, position, q))
+        (folder / TRUTH_FILE).write_text("".join(lines), encoding="utf-8")
+        if self.hits_ns is not None:
+            hits = "".join(f"{stamp_s(stamp)}\n" for stamp in sorted(self.hits_ns))
+            (folder / TRUTH_HITS_FILE).write_text(f"stamp_s\n{hits}", encoding="utf-8")
+
+    def _stamps(self) -> list[int]:
+        return sorted(self.vehicle.keys() & self.drone.keys())
 
 
-def _pose(record: Record) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+def _relative(a: Quaternion, b: Quaternion) -> Quaternion:
+    """a^-1 b of unit quaternions (x, y, z, w)."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx - ax * bw - ay * bz + az * by,
+        aw * by + ax * bz - ay * bw - az * bx,
+        aw * bz - ax * by + ay * bx - az * bw,
+        aw * bw + ax * bx + ay * by + az * bz,
+    )
+
+
+def _pulses(record: Record) -> list[int]:
+    try:
+        return [int(stamp) for stamp in json.loads(record.data)["pulse_stamp_ns"]]
+    except (ValueError, TypeError, KeyError) as error:
+        raise LinkError(f"{record.topic} at {record.stamp_ns} ns holds no pulses ({error!r})") from None
+
+
+def _pose(record: Record) -> tuple[tuple[float, float, float], Quaternion]:
     try:
         fields = json.loads(record.data)
         x, y, z = (float(v) for v in fields["xyz_m"])
@@ -89,20 +137,9 @@ class FixErrors:
 
 def fix_errors(fixes: list[DroneFix], stamps_ns: NDArray[np.int64], xyz_vehicle_m: NDArray[np.float64]) -> FixErrors:
     """Compare each fix with truth interpolated linearly to the fix's own stamp."""
-    kept: list[int] = []
-    errors: list[NDArray[np.float64]] = []
-    nees: list[float] = []
-    for fix in fixes:
-        after = int(np.searchsorted(stamps_ns, fix.stamp_ns))
-        if after == 0 or after == len(stamps_ns):
-            continue
-        t0, t1 = int(stamps_ns[after - 1]), int(stamps_ns[after])
-        if t1 - t0 > MAX_GAP_NS:
-            continue
-        w = (fix.stamp_ns - t0) / (t1 - t0)
-        error = fix.xyz_vehicle_m - ((1 - w) * xyz_vehicle_m[after - 1] + w * xyz_vehicle_m[after])
-        kept.append(fix.stamp_ns)
-        errors.append(error)
-        nees.append(float(error @ np.linalg.solve(fix.covariance_m2, error)))
-    error_m = np.array(errors).reshape(-1, 3)
-    return FixErrors(np.array(kept, dtype=np.int64), error_m, np.array(nees), len(fixes) - len(kept))
+    at_ns = np.array([fix.stamp_ns for fix in fixes], dtype=np.int64)
+    known, true_m, _ = interpolate(at_ns, stamps_ns, xyz_vehicle_m, None, MAX_GAP_NS)
+    judged = [fix for fix, is_known in zip(fixes, known, strict=True) if is_known]
+    error_m = np.array([fix.xyz_vehicle_m for fix in judged]).reshape(-1, 3) - true_m[known]
+    nees = [float(e @ np.linalg.solve(fix.covariance_m2, e)) for e, fix in zip(error_m, judged, strict=True)]
+    return FixErrors(at_ns[known], error_m, np.array(nees), len(fixes) - len(judged))

@@ -7,6 +7,7 @@
 | world     | the vehicle frame at the start, z up                                                 |
 | turntable | on the servo's axis, z up along it, turned by the servo angle                         |
 | lidar     | Velodyne's: z_lidar is the spin axis, azimuth 0 along +y_lidar, growing towards +x    |
+| camera    | at the lens; z along the optical axis, x right in the image, y down                   |
 
 `T_a_b` takes points from b to a: p_a = T_a_b @ p_b (4x4, float64). NED and FRD live in links/mavlink only.
 

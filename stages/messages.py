@@ -27,6 +27,7 @@ from flow.message import (
 )
 
 DepthPixels = Annotated[NDArray[np.float32], Shape("h", "w")]
+Mat6 = Annotated[NDArray[np.float64], Shape(6, 6)]
 
 
 @message
@@ -41,6 +42,14 @@ class LidarFirings(Message):
     return_kind: PerPointU8  # 0 strongest (or only), 1 last; dual mode has both
     xyz_lidar_m: Points32  # (0, 0, 0) where there was no return
     lost_packets: int  # packets missing just before this one
+
+
+@message
+class Image(Message):
+    """One camera frame in grey; stamp_ns is the middle of its middle row's exposure. Lens: the rig's."""
+
+    frame_id: str  # which camera: camera_vehicle, camera_drone
+    grey: Annotated[NDArray[np.uint8], Shape("h", "w")]
 
 
 @message
@@ -141,3 +150,53 @@ class TrackState(Message):
     reason: str
     hits: int  # returns within the radius in the frame just ended
     frame_s: float  # how long that frame was
+
+
+@message
+class DroneAttitude(Message):
+    """The autopilot's attitude. Frame local is the autopilot's own: x its north, z up; its yaw is unrelated to ours."""
+
+    R_local_drone: Mat3
+    angular_velocity_drone_radps: Vec3
+
+
+@message
+class DroneLocalPosition(Message):
+    """The autopilot's position and velocity in its local frame (see DroneAttitude), origin where it began."""
+
+    xyz_local_m: Vec3
+    velocity_local_mps: Vec3
+
+
+@message
+class DroneOdometry(Message):
+    """The autopilot's whole estimate: T_local_drone and how it changes. Covariances are rotation first, drone axes."""
+
+    xyz_local_m: Vec3
+    R_local_drone: Mat3
+    velocity_drone_mps: Vec3
+    angular_velocity_drone_radps: Vec3
+    pose_covariance: Mat6 | None  # [rad, m], tangent at the body; None: the autopilot does not say
+    velocity_covariance: Mat6 | None  # [rad/s, m/s]
+    reset_counter: int  # a change: the estimate jumped
+    quality_percent: int | None  # None: unknown; a failed estimate is 0
+
+
+@message
+class DroneImu(Message):
+    """One inertial sample, drone axes."""
+
+    acceleration_drone_mps2: Vec3  # specific force: +g along z at rest
+    angular_velocity_drone_radps: Vec3
+
+
+@message
+class AutopilotStatus(Message):
+    """The autopilot's heartbeat, with what its link and clock do."""
+
+    armed: bool
+    custom_mode: int  # the autopilot's own mode number
+    failsafe: bool  # it says critical, emergency or termination
+    lost_frames: int  # missing in its sequence since the start
+    clock_offset_ns: int | None  # host - autopilot's time since boot; None: not known yet
+    clock_uncertainty_ns: int | None  # the offset is wrong by at most this; None: no TIMESYNC, delays are unknown

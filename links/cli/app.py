@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import typer
 
-from links.cli.files import import_recording, recover_recording, simulate_recording, view
+from links.cli.evaluate import evaluate_runs
+from links.cli.files import import_recording, recover_recording, simulate_matrix, simulate_recording, view
 from links.cli.graphs import check, graph, schema
 from links.cli.run import replay_recording, run
 
@@ -27,7 +28,9 @@ app.command("schema")(schema)
 app.command("import")(import_recording)
 app.command("recover")(recover_recording)
 app.command("simulate")(simulate_recording)
+app.command("matrix")(simulate_matrix)
 app.command("view")(view)
+app.command("evaluate")(evaluate_runs)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""`grd import`, `grd recover`, `grd simulate`, `grd view`: recordings and runs as files.
+"""`grd import`, `grd recover`, `grd simulate`, `grd matrix`, `grd view`: recordings and runs as files.
 
 Source: DESIGN, Command line.
 """
@@ -17,6 +17,10 @@ from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
 from stages.geometry import LidarMount
 
 MAX_RIG_BYTES = 100_000
+ClosedLoop = Annotated[
+    Path | None,
+    typer.Option("--closed-loop", metavar="CONFIG", help="Configuration whose own aim turns the servo, in its time."),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
 
@@ -55,7 +59,7 @@ def import_recording(
 
 
 def read_rig(file: Path) -> str:
-    """A rig file's text as recordings hold it; a configuration's `rig:` section will do. LinkError says what is wrong."""
+    """A rig file's text as recordings hold it; a configuration's `rig:` section will do. LinkError: what is wrong."""
     with file.open("rb") as stream:
         data = stream.read(MAX_RIG_BYTES + 1)
     try:
@@ -108,22 +112,79 @@ def simulate_recording(
     seed: Annotated[
         int | None, typer.Option("--seed", help="Another world and other noise [default: the scenario's].")
     ] = None,
+    closed_loop: ClosedLoop = None,
+    duration_s: Annotated[
+        float | None,
+        typer.Option("--duration", min=0.1, max=3600, help="Seconds to simulate [default: the scenario's]."),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Make a recording of a simulated flight.
 
-    It holds the bytes that the sensors would have sent, and the truth beside them.
+    It holds the bytes that the sensors would have sent, and the truth beside them. The scenario's script turns the
+    servo, or in closed loop a configuration's own aim does.
 
-    Example: grd simulate configs/scenarios/street_sweep.yaml -o street.mcap --seed 3
+    Example: grd simulate configs/scenarios/experiment_1.yaml -o flight.mcap --closed-loop configs/sim.yaml --seed 3
     """
     try:
         from links.simulated.run import simulate
     except ModuleNotFoundError as missing:
-        raise LinkError(f"simulating needs '{missing.name}', not installed: pip install 'grd[simulate]'") from None
+        raise _not_installed(missing) from None
 
     with progress_bar(f"simulate {scenario.name}") as step:
-        report = simulate(scenario, out_file, seed=seed, overwrite=overwrite, progress=lambda done: step(done, 1.0))
+        report = simulate(
+            scenario,
+            out_file,
+            seed=seed,
+            overwrite=overwrite,
+            progress=lambda done: step(done, 1.0),
+            closed_loop=closed_loop,
+            duration_s=duration_s,
+        )
     out.print(str(report), markup=False)
+
+
+@in_words
+def simulate_matrix(
+    folder: Annotated[Path, typer.Argument(help="Where the recordings go, one for each cell and seed.")],
+    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Make seeds 1 to N of each cell.")] = 1,
+    only: Annotated[str, typer.Option("--only", help="Cells whose name matches, as in 'campus-*-orbit-parked'.")] = "*",
+    pairs: Annotated[
+        bool, typer.Option("--pairs", help="Few cells in which each two of range, motion, vehicle and scene meet.")
+    ] = False,
+    closed_loop: ClosedLoop = None,
+    list_only: Annotated[bool, typer.Option("--list", help="Name the cells; make none.")] = False,
+) -> None:
+    """Make the recordings of the scenario matrix.
+
+    Range x motion x vehicle x scene, an occlusion, and a drone that leaves and returns. Recordings that are there and
+    complete are kept, so it can be stopped and started again. Exit code 1 when a scene had no place for a cell.
+
+    Example: grd matrix out/matrix --seeds 5 --only 'campus-*-hover-*' --closed-loop configs/paper.yaml
+    """
+    try:
+        from links.simulated.matrix import cells, make_matrix
+    except ModuleNotFoundError as missing:
+        raise _not_installed(missing) from None
+
+    wanted = cells(only, pairs)
+    if not wanted:
+        raise LinkError(f"no cell is called like '{only}'; `grd matrix {folder} --list` names them all")
+    if list_only:
+        for cell in wanted:
+            out.print(cell.name, markup=False)
+        return
+    with progress_bar(f"{len(wanted) * seeds} recordings") as step:
+        report = make_matrix(folder, wanted, range(1, seeds + 1), closed_loop, step)
+    for text in report.impossible:
+        warn(text)
+    out.print(f"{folder}: {report.made} made, {report.kept} were there already", markup=False)
+    if report.impossible:
+        raise typer.Exit(FINDING)
+
+
+def _not_installed(missing: ModuleNotFoundError) -> LinkError:
+    return LinkError(f"simulating needs '{missing.name}', not installed: pip install 'grd[simulate]'")
 
 
 @in_words

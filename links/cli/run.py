@@ -27,10 +27,10 @@ from flow.taps import Digest
 from flow.tree import Section
 from links.cli.console import err, in_words, out, progress_bar, warn
 from links.recording import RecordingReader
-from links.results import FIX_FILE, Results, stamp_s, tum_line
+from links.results import FIX_FILE, SUMMARY_FILE, Results, stamp_s
 from links.truth import FixErrors, TruthLog, fix_errors
 
-TRUTH_FILE, SUMMARY_FILE, CONFIG_FILE = "truth_vehicle_drone.tum", "summary.json", "config.yaml"
+CONFIG_FILE = "config.yaml"
 TABLE_ROWS = 12
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEFAULT_REPLAY_CONFIG = REPOSITORY / "configs" / "replay.yaml"
@@ -152,11 +152,9 @@ def _replay(graph: Graph, reader: RecordingReader, recording: Path, folder: Path
         for text in (*warnings, f"output hash {digest.hexdigest()}"):
             results.note(text)
     errors = None
+    truth.write(folder)
     if truth.drone:
-        stamps_ns, xyz = truth.drone_in_vehicle()
-        lines = [tum_line(int(stamp), position) for stamp, position in zip(stamps_ns, xyz, strict=True)]
-        (folder / TRUTH_FILE).write_text("".join(lines), encoding="utf-8")
-        errors = fix_errors(results.fixes, stamps_ns, xyz)
+        errors = fix_errors(results.fixes, *truth.drone_in_vehicle())
     wall_s = time.monotonic() - begin
     return Finished(recording, folder, report, results, errors, digest.hexdigest(), wall_s, warnings, graph)
 
@@ -180,6 +178,8 @@ def _write_summary(run: Finished, config: Path, overlays: list[Path], sets: list
         "set": sets,
         "output_hash": run.digest,
         "records": report.records,
+        "start_s": stamp_s(report.first_ns),
+        "end_s": stamp_s(report.last_ns),
         "recorded_s": (report.last_ns - report.first_ns) / 1e9,
         "messages": report.messages,
         "sweeps": results.sweeps,

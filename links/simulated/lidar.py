@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from links.simulated.mesh import Array32, Array64
+from links.simulated.weather import RainClutter, Weather
 from links.velodyne import vlp16
 from stages.compiled import compiled
 
@@ -71,10 +72,10 @@ class Surroundings(Protocol):
         """Range (n, k) [m] (inf: none), fraction sent back (n, k), and whether the drone was hit (n, k)."""
         ...
 
-    def near_drone(
+    def near_small_body(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32
     ) -> NDArray[np.bool_]:
-        """Pulses (n,) whose axis, (n, 3), passes the drone so closely that some of it may be lit."""
+        """Pulses (n,) whose axis, (n, 3), passes the drone or a bird so closely that some of it may be lit."""
         ...
 
 
@@ -90,7 +91,8 @@ class Pulses:
 class Lidar:
     """The sensor: its rotor, its 16 lasers and their noise. Feed it pulses in order of time."""
 
-    def __init__(self, settings: LidarSettings, start_ns: int, seed: int) -> None:
+    def __init__(self, settings: LidarSettings, start_ns: int, seed: int, weather: Weather | None = None) -> None:
+        weather = weather or Weather()
         self.settings = settings
         fixed, self._noise, self._loss = (np.random.default_rng([seed, 2, i]) for i in range(3))
         self._start_ns = start_ns
@@ -98,6 +100,11 @@ class Lidar:
         self._rotor_radps = settings.rotor_rpm / 60 * 2 * np.pi * (1 + fixed.normal(0, 3e-4))
         self._bias_m = fixed.normal(0, settings.laser_bias_m, vlp16.LASERS)
         self._threshold = 0.10 / settings.range_at_10_percent_m**2
+        self._extinction_per_m = weather.extinction_per_m()
+        self._drops = None
+        if weather.rain_mmph > 0:
+            self._drops = RainClutter(weather, self._threshold, settings.min_range_m, APERTURE_M, FOOTPRINT_RAD)
+            self._rain = np.random.default_rng([seed, 12])
 
     def azimuth_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
         """Rotor angle [0, 2 pi): 0 along +y_lidar, growing towards +x_lidar. Its speed wanders by some 0.02 %."""
@@ -116,16 +123,17 @@ class Lidar:
         threshold = self._threshold * 10 ** (-0.1 * s.power_spread_db * normal[0])
         threshold[self._loss.uniform(size=count) < s.dropout] = np.inf
 
+        drops = np.full((2, count), np.inf) if self._drops is None else np.array(self._drops.draw(self._rain, count))
+
         origins, directions = sub_rays(azimuth, laser, R_world_lidar, t_world_lidar_m, COARSE.offsets)
         seen = around.cast(pulse_ns, origins, directions, s.max_range_m + PULSE_LENGTH_M)
-        ranges, power, drone_power = echoes(*seen, COARSE.shares, threshold, s.min_range_m, s.return_mode)
-        lowest, highest = seen[0].min(axis=1), seen[0].max(axis=1)
-        edge = np.isfinite(lowest) & (highest > lowest + COARSE_SPREAD_M)  # also where some sub-rays meet nothing
-        fine = np.nonzero(edge | around.near_drone(pulse_ns, origins[:, 0], directions[:, 0]))[0]
+        ranges, power, drone_power = self._received(seen, COARSE.shares, threshold, drops)
+        edge = sees_edge(seen[0], COARSE_SPREAD_M)
+        fine = np.nonzero(edge | around.near_small_body(pulse_ns, origins[:, 0], directions[:, 0]))[0]
         if len(fine):
             rays = sub_rays(azimuth[fine], laser[fine], R_world_lidar[fine], t_world_lidar_m[fine], FINE.offsets)
             seen = around.cast(pulse_ns[fine], *rays, s.max_range_m + PULSE_LENGTH_M)
-            again = echoes(*seen, FINE.shares, threshold[fine], s.min_range_m, s.return_mode)
+            again = self._received(seen, FINE.shares, threshold[fine], drops[:, fine])
             ranges[:, fine], power[:, fine], drone_power[:, fine] = again
 
         margin = np.maximum(power / self._threshold, 1.0)
@@ -136,6 +144,74 @@ class Lidar:
         shade = np.clip(np.rint(100 * power * ranges**2 * (1 + 0.05 * normal[3])), 1, 255)
         share = np.divide(drone_power, power, out=np.zeros_like(power), where=lit)
         return Pulses(np.where(lit, measured, 0.0), np.where(lit, shade, 0).astype(np.uint8), share)
+
+    def _received(
+        self,
+        seen: tuple[Array32, Array32, NDArray[np.bool_]],
+        shares: Array64,
+        threshold: Array64,
+        drops: Array64,
+    ) -> tuple[Array64, Array64, Array64]:
+        """`echoes` through the weather: Beer-Lambert there and back, and each pulse's nearest bright drop (2, n)."""
+        ranges, fractions, drone = seen
+        s = self.settings
+        if self._extinction_per_m > 0:
+            reach = np.where(np.isfinite(ranges), ranges, 0.0)
+            fractions = fractions * np.exp(-2 * self._extinction_per_m * reach).astype(np.float32)
+        if self._drops is not None:
+            before = drops[0] < ranges.max(axis=1)  # what stands nearer leaves no room for the drop
+            near = np.where(before, drops[0], np.inf)
+            ranges = np.column_stack([ranges, near]).astype(np.float32)
+            back = np.where(before, drops[1] * np.where(before, near, 0.0) ** 2, 0.0)
+            fractions = np.column_stack([fractions, back]).astype(np.float32)
+            drone = np.column_stack([drone, np.zeros(len(drone), dtype=np.bool_)])
+            shares = np.append(shares, 1.0)
+        return echoes(ranges, fractions, drone, shares, threshold, s.min_range_m, s.return_mode)
+
+
+@compiled
+def turned_poses(
+    R_world_vehicle: Array64,
+    t_world_vehicle_m: Array64,
+    T_vehicle_turntable: Array64,
+    turned_rad: Array64,
+    T_turntable_lidar: Array64,
+) -> tuple[Array64, Array64]:
+    """T_world_lidar = T_world_vehicle T_vehicle_turntable Rz(turned) T_turntable_lidar: (n, 3, 3) and (n, 3)."""
+    count = len(turned_rad)
+    rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))
+    turned, mounted = np.empty((3, 4)), np.empty((3, 4))
+    for n in range(count):
+        c, s = np.cos(turned_rad[n]), np.sin(turned_rad[n])
+        for j in range(4):
+            x, y, z = T_turntable_lidar[0, j], T_turntable_lidar[1, j], T_turntable_lidar[2, j]
+            turned[0, j], turned[1, j], turned[2, j] = c * x - s * y, s * x + c * y, z
+        for i in range(3):
+            for j in range(4):
+                mounted[i, j] = T_vehicle_turntable[i, 3] if j == 3 else 0.0
+                for k in range(3):
+                    mounted[i, j] += T_vehicle_turntable[i, k] * turned[k, j]
+        for i in range(3):
+            for j in range(3):
+                rotations[n, i, j] = 0.0
+                for k in range(3):
+                    rotations[n, i, j] += R_world_vehicle[n, i, k] * mounted[k, j]
+            positions[n, i] = t_world_vehicle_m[n, i]
+            for k in range(3):
+                positions[n, i] += R_world_vehicle[n, i, k] * mounted[k, 3]
+    return rotations, positions
+
+
+@compiled
+def sees_edge(ranges_m: Array32, spread_m: float) -> NDArray[np.bool_]:
+    """Pulses (n,) whose sub-rays (n, k) differ by more than the spread, or of which only some meet anything."""
+    found = np.zeros(len(ranges_m), dtype=np.bool_)
+    for i in range(len(ranges_m)):
+        lowest = highest = ranges_m[i, 0]
+        for r in ranges_m[i]:
+            lowest, highest = min(lowest, r), max(highest, r)
+        found[i] = np.isfinite(lowest) and highest > lowest + np.float32(spread_m)
+    return found
 
 
 @compiled

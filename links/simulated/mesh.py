@@ -42,9 +42,20 @@ SURFACES: dict[str, tuple[float, float]] = {  # name: (diffuse reflectivity, mir
     "paint_dark": (0.08, 0.30),
     "paint_light": (0.50, 0.20),
     "carbon": (0.12, 0.0),
+    "grass": (0.40, 0.0),
+    "marking": (0.55, 0.0),
+    "feather": (0.25, 0.0),
+    "latex": (0.40, 0.15),
+    "dark_shell": (0.06, 0.05),
+    "grey_shell": (0.20, 0.05),
+    "light_shell": (0.60, 0.10),
 }
+WET_DIFFUSE = 0.45  # a porous surface that is wet all over keeps this much of its diffuse reflectivity
+POROUS = ("asphalt", "paving", "kerb", "brick", "plaster", "concrete", "roof", "bark", "grass", "marking")
 _ROW = {name: row for row, name in enumerate(SURFACES)}
 _DIFFUSE, _GLOSS = np.array(list(SURFACES.values()), dtype=np.float32).T
+_POROUS = np.array([name in POROUS for name in SURFACES])
+SURFACE_NAMES = tuple(SURFACES)
 
 
 @dataclass(frozen=True)
@@ -59,6 +70,20 @@ class Mesh:
         """The mesh turned by `rotation` (3, 3), then shifted."""
         turned = self.vertices_m if rotation is None else self.vertices_m @ rotation.T
         return Mesh(turned + np.asarray(xyz_m, dtype=np.float64), self.faces, self.surface)
+
+    def normals(self) -> Array64:
+        """Unit normal of each face (f, 3); which side is out is not known."""
+        a, b, c = (self.vertices_m[self.faces[:, i]] for i in range(3))
+        n = np.cross(b - a, c - a)
+        return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-20)
+
+    def only(self, faces: NDArray[np.bool_]) -> Mesh:
+        """The mesh of some of the faces (f,)."""
+        return Mesh(self.vertices_m, self.faces[faces], self.surface[faces])
+
+    def is_surface(self, *names: str) -> NDArray[np.bool_]:
+        """Which faces (f,) are of these surfaces."""
+        return np.isin(self.surface, [_ROW[name] for name in names])
 
 
 def merge(meshes: Iterable[Mesh]) -> Mesh:
@@ -105,21 +130,37 @@ def rod(start_m: ArrayLike, end_m: ArrayLike, radius_m: float, surface: str, sid
 class RayScene:
     """A mesh that rays can be cast against (embree, single precision)."""
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: Mesh, wetness: float = 0.0) -> None:
+        """`wetness` 0 to 1 darkens porous surfaces, as rain does."""
         self._scene = EmbreeScene()
         self._mesh = TriangleMesh(self._scene, mesh.vertices_m.astype(np.float32), mesh.faces.astype(np.int32))
-        self._diffuse = _DIFFUSE[mesh.surface]
+        darker = np.where(_POROUS, 1 - wetness * (1 - WET_DIFFUSE), 1.0).astype(np.float32)
+        self._diffuse = (_DIFFUSE * darker)[mesh.surface]
         self._gloss = _GLOSS[mesh.surface]
         self.radius_m = float(np.linalg.norm(mesh.vertices_m, axis=1).max())
 
-    def cast(self, origins: Array32, directions: Array32, max_range_m: float) -> tuple[Array32, Array32]:
+    def cast(self, origins: Array32, directions: Array32, max_range_m: float | Array32) -> tuple[Array32, Array32]:
         """First hit of rays (n, 3) with unit directions: range (n,) [m] (inf: none) and returned fraction (n,).
 
-        The fraction is what comes back towards the ray's origin: diffuse cos(a) + gloss cos(a)^60 at incidence a.
+        Rays end at one range or each at its own (n,). The fraction is what comes back towards the ray's origin:
+        diffuse cos(a) + gloss cos(a)^60 at incidence a.
         """
-        limit = np.full(len(origins), max_range_m, dtype=np.float32)
+        limit = np.broadcast_to(np.asarray(max_range_m, dtype=np.float32), len(origins)).copy()
         hit = self._scene.run(origins, directions, dists=limit, output=True)
         return _answers(directions, hit["tfar"], hit["primID"], hit["Ng"], self._diffuse, self._gloss)
+
+    def hits(
+        self, origins: Array32, directions: Array32, max_range_m: float
+    ) -> tuple[Array32, NDArray[np.int32], Array32, Array32]:
+        """First hit of rays (n, 3): range (n,) [m], face (n,) (-1: none), barycentric u and v (n,) on that face."""
+        limit = np.full(len(origins), max_range_m, dtype=np.float32)
+        hit = self._scene.run(origins, directions, dists=limit, output=True)
+        return hit["tfar"], hit["primID"], hit["u"], hit["v"]
+
+    def blocked(self, origins: Array32, directions: Array32, max_range_m: float) -> NDArray[np.bool_]:
+        """Whether rays (n, 3) meet anything at all."""
+        limit = np.full(len(origins), max_range_m, dtype=np.float32)
+        return self._scene.run(origins, directions, dists=limit, query="OCCLUDED") != -1
 
 
 @compiled

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from links.simulated.mesh import Array64
+from stages.compiled import compiled
 
 GRAVITY_MPS2 = 9.81
 DRAG_PER_S = 0.3  # drag acceleration per speed of a small quadrotor
@@ -63,13 +64,15 @@ class Path(BaseModel):
         return np.stack([np.cross(left, up), left, up], axis=2), position
 
 
+@compiled
 def rotations_z(angle_rad: Array64) -> Array64:
     """Rz for each angle: (n, 3, 3)."""
     rotations = np.zeros((len(angle_rad), 3, 3))
-    rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(angle_rad)
-    rotations[:, 1, 0] = np.sin(angle_rad)
-    rotations[:, 0, 1] = -rotations[:, 1, 0]
-    rotations[:, 2, 2] = 1.0
+    for i in range(len(angle_rad)):
+        c, s = np.cos(angle_rad[i]), np.sin(angle_rad[i])
+        rotations[i, 0, 0], rotations[i, 0, 1] = c, -s
+        rotations[i, 1, 0], rotations[i, 1, 1] = s, c
+        rotations[i, 2, 2] = 1.0
     return rotations
 
 

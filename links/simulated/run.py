@@ -15,18 +15,26 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.link import Record
+from flow.link import TRUTH_TOPICS, Record
 from links.recording import RecordingWriter
-from links.simulated.lidar import Lidar, Pulses
+from links.simulated.autopilot import Autopilot
+from links.simulated.camera import build_cameras
+from links.simulated.camera_paint import Street
+from links.simulated.clearance import check_travel
+from links.simulated.closed_loop import ClosedLoop, load_loop
+from links.simulated.flight import Flight
+from links.simulated.lidar import Lidar, Pulses, turned_poses
 from links.simulated.mesh import Array64
 from links.simulated.operator import ScriptedOperator
-from links.simulated.path import rotations_z
+from links.simulated.path import Path
+from links.simulated.ride import Ride
 from links.simulated.scenario import Scenario, load_scenario
-from links.simulated.scene import Scene, Truth
+from links.simulated.scene import Scene, Truth, drone_shapes
 from links.simulated.servo import ServoBus
-from links.simulated.vehicle import vehicle_mesh
+from links.simulated.vehicle import vehicle_mesh, vehicle_mesh_from_camera
+from links.simulated.vehicle_odometry import VehicleOdometry
 from links.simulated.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
-from links.simulated.world import world_mesh
+from links.simulated.world import build_world
 from links.velodyne import vlp16
 
 BATCH_PACKETS = 32  # pulses are cast in batches; how many does not change a byte
@@ -44,34 +52,64 @@ class SimulationReport:
     drone_returns: int  # pulses with a return that has most of its power from the drone
     wall_s: float
     size_bytes: int
+    output_hash: str | None = None  # of the closed loop; a replay with the same configuration gives it again
 
     def __str__(self) -> str:
-        return (
+        text = (
             f"seed {self.seed}: {self.records} records, {self.pulses} pulses, {self.returns} with a return, "
             f"{self.drone_returns} from the drone; {self.size_bytes / 1e6:.2f} MB in {self.wall_s:.1f} s"
         )
+        return text if self.output_hash is None else f"{text}; closed loop's output hash {self.output_hash}"
 
 
 class Simulation:
     """One run of a scenario. Iterate `records()` once; the counts and `drone_return_ns` fill as it goes."""
 
-    def __init__(self, scenario: Scenario, seed: int | None = None) -> None:
+    def __init__(self, scenario: Scenario, seed: int | None = None, loop: ClosedLoop | None = None) -> None:
+        """With a `loop` the pipeline in it commands the servo, and the scenario's script is not used."""
+        self._loop = loop
         self.scenario = scenario
         self.seed = scenario.seed if seed is None else seed
         drone = scenario.drone
-        self.truth = Truth(scenario.start_ns, scenario.vehicle.path, drone.path if drone else None)
+        start_ns, duration_s = scenario.start_ns, scenario.duration_s
+        flown: Path | Flight | None = drone.path if drone else None
+        self._talkers: list[Autopilot | VehicleOdometry] = []
+        if drone is not None and scenario.autopilot is not None:
+            flown = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
+            self._talkers.append(Autopilot(scenario.autopilot, flown, start_ns, duration_s, self.seed))
+        vehicle = scenario.vehicle
+        ridden = Ride(vehicle.path, vehicle.ride, duration_s, self.seed) if vehicle.ride else vehicle.path
+        if scenario.vehicle_odometry is not None:
+            odometry = VehicleOdometry(scenario.vehicle_odometry, ridden, start_ns, duration_s, self.seed)
+            self._talkers.append(odometry)
+        self.truth = Truth(start_ns, ridden, flown)
         height = scenario.vehicle.camera_height_m
+        driven = scenario.vehicle.path.at(np.arange(0.0, scenario.duration_s, 0.25))[0]
+        world = build_world(scenario.scene, height, self.seed, driven[:, :2])
         self._scene = Scene(
-            world_mesh(scenario.scene, height, self.seed),
+            world.mesh,
             vehicle_mesh(height),
-            drone.span_m if drone else 0.0,
+            drone_shapes(drone.span_m, drone.model) if drone else (),
             self.truth,
+            world.movers,
+            scenario.weather.wetness,
         )
-        self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed)
-        operator = ScriptedOperator(scenario.script, self.drone_servo_rad if drone else None, self.seed)
+        check_travel(self._scene.world, self.truth, scenario.duration_s, drone.span_m if drone else 0.0)
+        self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
+        script = scenario.script if loop is None else ()
+        operator = ScriptedOperator(script, self.drone_servo_rad if drone else None, self.seed)
         shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)
         self._servo = ServoBus(scenario.servo, operator, scenario.start_ns, shift_ns, self.seed)
         self._arrival = np.random.default_rng([self.seed, 5])
+        self._cameras = build_cameras(
+            scenario.cameras,
+            self._scene,
+            Street.of(scenario.scene, height),
+            scenario.weather,
+            vehicle_mesh_from_camera(height, scenario.mount),
+            scenario.start_ns,
+            self.seed,
+        )
         self.pulses = 0
         self.returns = 0
         self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from the drone
@@ -84,11 +122,16 @@ class Simulation:
         end_ns = start_ns + round(self.scenario.duration_s * 1e9)
         packet_ns = firings_per_packet(self.scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
         first_ns, truth_ns = start_ns, start_ns
+        most = BATCH_PACKETS if self._loop is None else max(1, self._loop.longest_batch_ns() // packet_ns)
         while first_ns < end_ns:
-            packets = min(BATCH_PACKETS, -(-(end_ns - first_ns) // packet_ns))
+            packets = min(most, -(-(end_ns - first_ns) // packet_ns))
             next_ns = first_ns + packets * packet_ns
             records = self._servo.advance(next_ns)
             records += self._lidar_records(first_ns, packets, packet_ns)
+            for camera in self._cameras:
+                records += camera.records(next_ns)
+            for talker in self._talkers:
+                records += talker.records(next_ns)
             count = -(-(next_ns - truth_ns) // TRUTH_PERIOD_NS)
             records += self._truth_records(truth_ns + TRUTH_PERIOD_NS * np.arange(count))
             truth_ns += count * TRUTH_PERIOD_NS
@@ -97,19 +140,29 @@ class Simulation:
                 made += 1
             first_ns = next_ns
             while waiting and (waiting[0][0] < next_ns or first_ns >= end_ns):
-                yield dataclasses.replace(heapq.heappop(waiting)[2], sequence=sent)
+                record = dataclasses.replace(heapq.heappop(waiting)[2], sequence=sent)
+                self._tell_loop(record)
+                yield record
                 sent += 1
+        if self._loop is not None:
+            self._loop.finish()
+
+    def _tell_loop(self, record: Record) -> None:
+        """Records reach the pipeline as they arrive, truth never; its goals go to the servo."""
+        if self._loop is None or record.topic.startswith(TRUTH_TOPICS):
+            return
+        sent = self._loop.take(record)
+        if sent is not None:
+            left_ns, command = sent
+            self._servo.command(left_ns, command.position_rad, command.speed_radps)
 
     def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """Where the LiDAR truly is: rotations (n, 3, 3), positions (n, 3) [m]. T_wv T_vt Rz(angle) T_tl."""
         mount = self.scenario.mount
         T_vehicle_turntable, T_turntable_lidar = mount.T_vehicle_turntable.matrix(), mount.T_turntable_lidar.matrix()
         R_world_vehicle, t_world_vehicle = self.truth.T_world_vehicle(stamp_ns)
-        turn = rotations_z(mount.turntable_rad(self._servo.position_rad(stamp_ns)))
-        R_vehicle_turned = T_vehicle_turntable[:3, :3] @ turn
-        t_vehicle_lidar = T_vehicle_turntable[:3, 3] + R_vehicle_turned @ T_turntable_lidar[:3, 3]
-        rotations = R_world_vehicle @ (R_vehicle_turned @ T_turntable_lidar[:3, :3])
-        return rotations, t_world_vehicle + np.einsum("nij,nj->ni", R_world_vehicle, t_vehicle_lidar)
+        turned_rad = mount.turntable_rad(self._servo.turned_rad(stamp_ns))
+        return turned_poses(R_world_vehicle, t_world_vehicle, T_vehicle_turntable, turned_rad, T_turntable_lidar)
 
     def drone_servo_rad(self, time_s: float) -> float:
         """Servo position at which the drone lies in the plane through the turntable's axis and azimuth 0."""
@@ -138,6 +191,18 @@ class Simulation:
             data = encode_packet(at, azimuth[i], ranges[:, i], shades[:, i], self.scenario.lidar.return_mode)
             arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
             records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
+        if self.truth.drone is not None:
+            records += self._hit_records(pulse_ns.reshape(packets, -1), pulses)
+        return records
+
+    def _hit_records(self, pulse_ns: NDArray[np.int64], pulses: Pulses) -> list[Record]:
+        """Which pulses (packets, n) the drone returned, by packet; the first packet tells it even of none."""
+        hit = np.asarray((pulses.drone_share > 0.5).any(axis=0)).reshape(pulse_ns.shape)
+        records: list[Record] = []
+        for stamps, is_hit in zip(pulse_ns, hit, strict=True):
+            if is_hit.any() or stamps[0] == self.scenario.start_ns:
+                data = json.dumps({"pulse_stamp_ns": stamps[is_hit].tolist()}).encode()
+                records.append(Record("/truth/hits", int(stamps[-1]), int(stamps[0]), data))
         return records
 
     def _count(self, pulse_ns: NDArray[np.int64], pulses: Pulses) -> None:
@@ -183,17 +248,44 @@ def simulate(
     seed: int | None = None,
     progress: Callable[[float], None] | None = None,
     overwrite: bool = False,
+    closed_loop: FilePath | None = None,
+    duration_s: float | None = None,
 ) -> SimulationReport:
-    """Run a scenario file into a recording. `progress` is told the share done, 0 to 1. Errors are LinkError."""
-    began = time.perf_counter()
+    """Run a scenario file into a recording, in closed loop with a configuration if one is given.
+
+    `progress` is told the share done, 0 to 1. Errors are LinkError, and ConfigError for the configuration's.
+    """
     checked = load_scenario(scenario)
-    simulation = Simulation(checked, seed)
+    text = scenario.read_text(encoding="utf-8")
+    if duration_s is not None:
+        checked = checked.changed(duration_s=duration_s)
+        text = checked.as_yaml()
+    return simulate_into(out, checked, text, seed, progress, overwrite, closed_loop)
+
+
+def simulate_into(
+    out: FilePath,
+    checked: Scenario,
+    text: str,
+    seed: int | None = None,
+    progress: Callable[[float], None] | None = None,
+    overwrite: bool = False,
+    closed_loop: FilePath | None = None,
+) -> SimulationReport:
+    """The same for a scenario in memory; `text` is its YAML, kept in the recording."""
+    began = time.perf_counter()
+    loop = None
+    if closed_loop is not None:
+        loop = load_loop(closed_loop, checked.rig_yaml(), f"{checked.name} (rig)", checked.closed_loop)
+    simulation = Simulation(checked, seed, loop)
     metadata = {"made_by": "grd simulate", "scenario": checked.name, "seed": str(simulation.seed)}
+    if closed_loop is not None:
+        metadata["closed_loop"] = closed_loop.name
     count = 0
     with RecordingWriter(
         out,
         rig_yaml=checked.rig_yaml(),
-        config_yaml=scenario.read_text(encoding="utf-8"),
+        config_yaml=text,
         metadata=metadata,
         lossless=True,
         overwrite=overwrite,
@@ -213,4 +305,5 @@ def simulate(
         drone_returns=len(simulation.drone_return_ns),
         wall_s=time.perf_counter() - began,
         size_bytes=out.stat().st_size,
+        output_hash=None if loop is None else loop.output_hash,
     )

@@ -14,14 +14,22 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from flow.link import LinkError
+from links.simulated.autopilot import AutopilotSettings
+from links.simulated.camera import CamerasSettings, rig_cameras
+from links.simulated.closed_loop import ClosedLoopSettings
+from links.simulated.drone import DroneModel, drone_mesh
 from links.simulated.lidar import LidarSettings
 from links.simulated.operator import Segment, Vibrate
 from links.simulated.path import Path
+from links.simulated.ride import RideSettings
 from links.simulated.servo import ServoSettings
+from links.simulated.vehicle_odometry import VehicleOdometrySettings
+from links.simulated.weather import Weather
 from links.simulated.world import SceneSettings
 from stages.geometry import LidarMount, Pose
 
 CLEARANCE_M = 0.3  # a path may not come nearer to the road
+WHEELS_M = 0.15  # a vehicle bounces on its springs by no more
 
 
 class _Settings(BaseModel):
@@ -33,12 +41,14 @@ class VehicleSettings(_Settings):
 
     camera_height_m: float = Field(default=1.8, ge=1.0, le=5.0)
     path: Path = Path(waypoints=({"t_s": 0.0, "xyz_m": (0.0, 0.0, 0.0)},))  # pyright: ignore[reportArgumentType]
+    ride: RideSettings | None = None  # with one it pitches and rolls; without, it drives level
 
 
 class DroneSettings(_Settings):
     """The drone and where it flies, world frame."""
 
     span_m: float = Field(default=0.5, ge=0.1, le=3.0)
+    model: DroneModel = DroneModel()
     path: Path
 
 
@@ -62,11 +72,16 @@ class Scenario(_Settings):
     start_utc: datetime.datetime
     duration_s: float = Field(gt=0, le=3600)
     scene: SceneSettings = SceneSettings()
+    weather: Weather = Weather()
     vehicle: VehicleSettings = VehicleSettings()
     drone: DroneSettings | None = None
     lidar: LidarSettings = LidarSettings()
     servo: ServoSettings = ServoSettings()
+    cameras: CamerasSettings = CamerasSettings()
+    autopilot: AutopilotSettings | None = None  # with one the drone flies by its dynamics; without, exactly its path
+    vehicle_odometry: VehicleOdometrySettings | None = None
     script: tuple[Segment, ...] = ()
+    closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # used instead of the script with --closed-loop
     rig: RigLidar = RigLidar()  # what the rig attached to the recording says
     true_mount: LidarMount | None = None  # how it really sits, when that differs from the rig
 
@@ -78,7 +93,21 @@ class Scenario(_Settings):
         return value
 
     @model_validator(mode="after")
+    def _can_be_driven(self) -> Self:
+        times = np.arange(0.0, self.duration_s, 0.05)
+        lift = self.vehicle.path.at(times)[0][:, 2]
+        worst = np.abs(lift).argmax()
+        if abs(lift[worst]) > WHEELS_M:
+            raise ValueError(
+                f"vehicle.path: {lift[worst]:+.2f} m off the road at {times[worst]:.2f} s; "
+                "z is counted from the camera's height at the start and the road is flat: keep it 0"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _can_be_flown(self) -> Self:
+        if self.drone is None and self.autopilot is not None:
+            raise ValueError("autopilot: the scenario has no drone for it; add one, or leave the autopilot out")
         if self.drone is None and any(isinstance(s, Vibrate) and s.follow_drone for s in self.script):
             raise ValueError("script: follow_drone is set but the scenario has no drone; give an azimuth_table")
         if self.drone is not None:
@@ -110,11 +139,17 @@ class Scenario(_Settings):
         """The same scenario with some settings replaced, checked again."""
         return Scenario.model_validate(dict(self) | settings)
 
+    def as_yaml(self) -> str:
+        """The whole scenario as a scenario file, with every setting."""
+        return yaml.safe_dump(self.model_dump(mode="json", exclude_none=True), sort_keys=False, width=120)
+
     def rig_yaml(self) -> str:
         """The rig file attached to the recording."""
         lidar = self.rig.model_dump(mode="json", exclude_unset=False, exclude_none=True)
         span_m = 0.5 if self.drone is None else self.drone.span_m
-        return yaml.safe_dump({"version": 1, "lidar": lidar, "drone": {"span_m": span_m}}, sort_keys=False)
+        rig: dict[str, Any] = {"version": 1, "lidar": lidar, "drone": {"span_m": span_m}}
+        cameras = rig_cameras(self.cameras, drone_mesh(span_m, model=self.drone.model) if self.drone else None)
+        return yaml.safe_dump(rig | ({"cameras": cameras} if cameras else {}), sort_keys=False)
 
 
 def load_scenario(path: FilePath) -> Scenario:

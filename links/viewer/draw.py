@@ -38,6 +38,7 @@ from stages.messages import (
     DroneFix,
     LidarFirings,
     ScoreImage,
+    ServoGoal,
     ServoState,
     SweptPoints,
     TrackingState,
@@ -67,7 +68,8 @@ def _draw_field(value: Any, name: str, scene: Scene) -> Marks:
     elif isinstance(value, bytes):
         yield _plot(f"plots/other/{name}", [len(value)], [f"{name} bytes"])
     elif 0 < np.size(value) <= 9:
-        yield _plot(f"plots/other/{name}", np.ravel(value).astype(np.float64), [])
+        names = [name] if np.size(value) == 1 else [f"{name} {i}" for i in range(np.size(value))]
+        yield _plot(f"plots/other/{name}", np.ravel(value).astype(np.float64), names)
     elif np.ndim(value) == 2 and np.shape(value)[1] == 3 and name.endswith("_vehicle_m"):
         shown = value[thin(np.asarray(value, dtype=np.float32), scene.max_points)]
         yield Mark(f"vehicle/{name}", rr.Points3D(shown, colors=colours.NEUTRAL), frame="vehicle")
@@ -93,6 +95,12 @@ def _(message: ServoState, name: str, scene: Scene) -> Marks:
     yield from _state(_lane(name), f"error 0x{message.error:02X}" if message.error else "ok", scene)
     if scene.mount is not None and scene.mount.turns and scene.turntable_is_due(message.stamp_ns):
         yield Mark("frames/turntable", turntable_transform(scene.mount, message.position_rad))
+
+
+@draw.register
+def _(message: ServoGoal, name: str, scene: Scene) -> Marks:
+    yield _plot(f"plots/servo/{name}", [math.degrees(message.position_rad)], ["asked"])
+    yield _plot(f"plots/other/{name}/speed", [math.degrees(message.speed_radps)], ["asked [deg/s]"])
 
 
 @draw.register

@@ -114,6 +114,13 @@ CASES = {
         ("left: numbers.number", "left: numbers"),
         "x.yaml:9: stages.add.inputs.left: must read node.output, got 'numbers'.",
     ),
+    "a source of truth": (
+        (
+            "numbers: {use: tests.flow.toys.Numbers}",
+            "numbers: {use: tests.flow.toys.Numbers, config: {topic: /truth/drone}}",
+        ),
+        "x.yaml:12: links.numbers.config.topic: truth is for evaluation only: no source may bring in '/truth/drone'.",
+    ),
     "type mismatch": (
         ("left: numbers.number", "left: add.text"),
         "x.yaml:9: stages.add.inputs.left: type mismatch: add.text is Text, add.left takes Number.",

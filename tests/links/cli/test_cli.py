@@ -38,7 +38,7 @@ def without_viewer(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "command", ["run", "replay", "check", "graph", "schema", "import", "recover", "simulate", "view"]
+    "command", ["run", "replay", "check", "graph", "schema", "import", "recover", "simulate", "view", "evaluate"]
 )
 def test_every_command_explains_itself_with_an_example(grd, command):
     assert f"Example: grd {command} " in grd(command, "--help").replace("\n  ", " ").replace("  ", " ")
@@ -52,6 +52,7 @@ def test_quickstart_says_where_the_drone_is_and_where_to_look(grd, tmp_path):
     names = {path.name for path in folder.iterdir()}
     assert names == {
         "config.yaml",
+        "detections.csv",
         "fix_covariance.csv",
         "fix_vehicle_drone.tum",
         "run.log",

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 
 from flow.link import Record
 from links.dynamixel import Servo
+from links.dynamixel.servo import goal_command
+from stages.messages import ServoGoal
 
 GOOD = {"position_rad": 1.5, "velocity_radps": -0.25, "goal_rad": 2.0, "error": 32}
 
@@ -49,3 +52,32 @@ def test_what_is_no_state_is_counted_and_left_out(data):
     servo = Servo()
     assert servo.decode(record(data)) is None
     assert servo.refused == 1
+
+
+def goal(position_rad: float, speed_radps: float) -> ServoGoal:
+    return ServoGoal(stamp_ns=0, position_rad=position_rad, speed_radps=speed_radps)
+
+
+def test_a_goal_is_written_in_steps_and_units_of_0_229_rpm():
+    command = goal_command(goal(math.pi, 11.4 * math.tau / 60))
+    assert (command.position_ticks, command.velocity_units) == (2048, 50)
+    assert command.position_rad == pytest.approx(math.pi)
+    assert command.speed_radps == pytest.approx(11.45 * math.tau / 60)
+
+
+def test_a_goal_stays_within_one_turn_and_never_means_no_speed_limit():
+    assert goal_command(goal(-0.1, 0.0)).position_ticks == 0
+    assert goal_command(goal(7.0, 1e3)).position_ticks == 4095
+    assert goal_command(goal(0.0, 0.0)).velocity_units == 1
+    assert goal_command(goal(0.0, 1e3)).velocity_units == 1023
+
+
+def test_the_newest_goal_waits_for_the_line_and_is_taken_once():
+    servo = Servo()
+    assert servo.take_command() is None
+    servo.on_goal(goal(1.0, 1.0))
+    servo.on_goal(goal(2.0, 1.0))
+    command = servo.take_command()
+    assert command is not None
+    assert command.position_rad == pytest.approx(2.0, abs=0.001)
+    assert servo.take_command() is None

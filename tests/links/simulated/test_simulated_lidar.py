@@ -25,7 +25,7 @@ class _Room:
         found = self._scene.cast(origins_world_m.reshape(-1, 3), directions_world.reshape(-1, 3), max_range_m)
         return found[0].reshape(rays), found[1].reshape(rays), np.zeros(rays, dtype=np.bool_)
 
-    def near_drone(self, pulse_ns, origins_world_m, directions_world):
+    def near_small_body(self, pulse_ns, origins_world_m, directions_world):
         return np.zeros(len(pulse_ns), dtype=np.bool_)
 
 

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from links.simulated.operator import ScriptedOperator, Sweep, Vibrate
-from links.simulated.servo import RPM_RADPS, TICK_RAD, Servo, ServoBus, ServoSettings
+from links.simulated.servo import RPM_RADPS, TICK_RAD, Servo, ServoBus, ServoSettings, Turned
 
 START_NS = 1_748_773_230_000_000_000
 
@@ -107,3 +107,51 @@ def test_a_vibration_needs_exactly_one_aim() -> None:
     for wrong in ({}, {"follow_drone": True, "azimuth_table": ((0.0, 1.0),)}):
         with pytest.raises(ValidationError, match="give either follow_drone: true or an azimuth_table"):
             Vibrate(duration_s=1.0, **wrong)
+
+
+def test_play_holds_the_turntable_until_the_shaft_takes_it_along() -> None:
+    turned = Turned(ServoSettings(backlash_deg=0.4), 1)
+    degrees = [0.0, 0.1, 0.3, 5.0, 4.9, 4.6, 4.5, 0.0]
+    seen = [math.degrees(turned.follow(math.radians(d))) for d in degrees]
+    assert seen == pytest.approx([0.0, 0.0, 0.1, 4.8, 4.8, 4.8, 4.7, 0.2])
+
+
+def test_without_errors_the_turntable_stands_where_the_encoder_is() -> None:
+    bus = _bus(Sweep())
+    _, times, position = _run(bus, 1.0)
+    np.testing.assert_array_equal(bus.turned_rad(START_NS + np.rint(times * 1e9).astype(np.int64)), position)
+
+
+def test_the_encoders_error_is_harmonic_has_the_peak_asked_for_and_its_shape_by_seed() -> None:
+    around = np.linspace(0, 2 * math.pi, 3601)
+    shapes = []
+    for seed in (1, 2):
+        turned = Turned(ServoSettings(encoder_error_deg=0.5), seed)
+        error = np.degrees([turned.encoder_error_rad(p) for p in around])
+        spectrum = np.abs(np.fft.rfft(error[:-1])) / 1800
+        assert 0.3 < np.abs(error).max() <= 0.5 + 1e-9
+        assert spectrum[1] + spectrum[2] == pytest.approx(0.5)
+        assert spectrum[[0, 3, 4]].max() < 1e-9
+        shapes.append(error)
+        position = 1.0
+        assert turned.follow(position) == pytest.approx(position - turned.encoder_error_rad(position))
+    assert np.abs(shapes[0] - shapes[1]).max() > 0.1
+
+
+def test_a_command_is_obeyed_its_latency_after_it_was_sent_and_in_order() -> None:
+    bus = _bus(command_latency_s=0.030, command_jitter_s=0.004)
+    bus.command(START_NS + 100_000_000, math.radians(90.0), 1.0)
+    bus.command(START_NS + 101_000_000, math.radians(20.0), 1.0)
+    bus.command(START_NS + 300_000_000, math.radians(40.0), 1.0)
+    records, times, position = _run(bus, 0.6)
+    began_s = times[np.argmax(position > 1e-6)]
+    assert 0.129 < began_s < 0.150
+    goals = np.degrees([json.loads(r.data)["goal_rad"] for r in records])
+    changes = goals[np.append(0, np.nonzero(np.diff(goals))[0] + 1)]
+    assert changes[-2:] == pytest.approx([20.0, 40.0], abs=0.05)
+    assert 90.0 not in np.round(changes[-2:])
+
+
+def test_a_reading_takes_at_least_its_latency() -> None:
+    slow, _, _ = _run(_bus(read_latency_s=0.003, read_latency_jitter_s=0.0, read_jitter_s=0.0), 0.2)
+    assert {round((r.arrival_ns - r.stamp_ns) * 1e-6, 3) for r in slow} == {1.5}

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from links.simulated.drone import drone_mesh
-from links.simulated.mesh import RayScene, box, merge, rod
+from links.simulated.drone import DroneModel, drone_mesh
+from links.simulated.mesh import SURFACE_NAMES, RayScene, box, merge, rod
 from links.simulated.path import Path, Waypoint
-from links.simulated.scene import Scene, Truth
+from links.simulated.reality import drone_area_m2
+from links.simulated.scene import Body, Scene, Truth, drone_shapes, into_body
 from links.simulated.vehicle import vehicle_mesh
 from links.simulated.world import SceneSettings, world_mesh
+from stages.geometry import rotation_from_rpy_deg
 
 
 def _rays(origin, directions):
@@ -43,9 +45,10 @@ def test_merged_meshes_keep_their_faces_and_surfaces() -> None:
 
 
 def test_the_drone_is_as_wide_as_its_span_and_mostly_air() -> None:
-    for span_m in (0.35, 0.5, 0.8):
+    for span_m, shape in ((0.35, "folding"), (0.5, "x4"), (0.8, "hexa"), (0.4, "hexa")):
         blades = np.linspace(0, np.pi, 32)
-        width = max(np.linalg.norm(drone_mesh(span_m, a).vertices_m[:, :2], axis=1).max() for a in blades)
+        meshes = [drone_mesh(span_m, a, DroneModel(shape=shape)) for a in blades]
+        width = max(np.linalg.norm(mesh.vertices_m[:, :2], axis=1).max() for mesh in meshes)
         assert abs(2 * width - span_m) < 0.02 * span_m
     scene = RayScene(drone_mesh(0.5))
     x, y = np.meshgrid(np.linspace(-0.25, 0.25, 101), np.linspace(-0.25, 0.25, 101))
@@ -71,7 +74,8 @@ def test_a_scene_follows_from_its_seed() -> None:
 
 
 def _scene(drone: Path | None, vehicle: Path) -> Scene:
-    return Scene(box((100, -1, -1), (101, 1, 1), "brick"), vehicle_mesh(1.8), 0.5, Truth(0, vehicle, drone))
+    shapes = drone_shapes(0.5, DroneModel())
+    return Scene(box((100, -1, -1), (101, 1, 1), "brick"), vehicle_mesh(1.8), shapes, Truth(0, vehicle, drone))
 
 
 def test_a_moving_drone_is_met_where_it_is_at_the_pulse() -> None:
@@ -94,3 +98,48 @@ def test_the_vehicle_shadows_what_lies_below_and_drives_along() -> None:
     later = scene.cast(np.array([1_000_000_000]), origins[:, None], directions[:, None], 90.0)[0]
     assert np.isinf(start[0, 0])
     assert abs(later[0, 0] - 0.5) < 1e-3
+
+
+def test_a_tilted_vehicle_is_met_by_rays_that_point_up_in_the_world() -> None:
+    """Culling goes by the body's own box, not by the world's downwards."""
+    turn = rotation_from_rpy_deg((0.0, -40.0, 0.0))  # nose up
+    body = Body("vehicle", (vehicle_mesh(1.8),), lambda ns: (np.tile(turn, (len(ns), 1, 1)), np.zeros((len(ns), 3))),
+                None, 50.0, False)  # fmt: skip
+    bonnet = turn @ [1.8, 0.0, -0.9] - turn @ [0.0, 0.0, 0.35]
+    origins, directions = _rays(turn @ [0.0, 0.0, 0.35], [bonnet])
+    assert directions[0, 2] > 0
+    pick, R, t = body.near(np.zeros(1, dtype=np.int64), origins, directions)
+    o, d, ray = into_body(R, t, origins[:, None], directions[:, None], pick, *body.box_m)
+    assert len(ray) == 1
+    assert np.isfinite(body.scenes[0].cast(o, d, 90.0)[0]).all()
+
+
+def test_only_rays_that_meet_a_bodys_box_are_cast() -> None:
+    origins, directions = _rays((0, 0, 0), [(1, 0, 0), (0, 1, 0), (-1, 0, 0), (1, 0.01, 0)])
+    low, high = np.array([4.0, -1.0, -1.0]), np.array([6.0, 1.0, 1.0])
+    _, _, ray = into_body(
+        np.eye(3)[None], np.zeros((1, 3)), origins[:, None], directions[:, None], np.arange(4), low, high
+    )
+    np.testing.assert_array_equal(ray, [0, 3])
+
+
+def test_a_dark_drone_fades_first_and_a_light_one_last() -> None:
+    def hits(surface: str, range_m: float) -> float:
+        mesh = drone_mesh(0.5, 0.4, DroneModel(surface=surface))
+        return drone_area_m2(mesh, range_m * np.array([0.6, 0.0, -0.8]), 0.03 / range_m)
+
+    near = hits("carbon", 15.0)
+    assert 0.2 * near < hits("carbon", 40.0) < 0.8 * near
+    assert hits("carbon", 62.0) == 0.0
+    assert hits("dark_shell", 45.0) < hits("carbon", 45.0) < hits("grey_shell", 45.0) < hits("light_shell", 45.0)
+    assert hits("light_shell", 62.0) > 0.5 * near
+
+
+def test_a_face_knows_its_normal_and_its_surface() -> None:
+    mesh = merge([box((0, 0, 0), (1, 2, 3), "brick"), box((5, 0, 0), (6, 1, 1), "marking")])
+    normals = mesh.normals()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    np.testing.assert_allclose(np.abs(normals).max(axis=1), 1.0)
+    assert {SURFACE_NAMES[row] for row in mesh.surface} == {"brick", "marking"}
+    assert mesh.only(mesh.is_surface("marking")).vertices_m[mesh.only(mesh.is_surface("marking")).faces].min() == 0.0
+    assert mesh.is_surface("marking").sum() == 12

@@ -1,0 +1,5 @@
+"""Fisheye cameras: recorded JPEG frames to images."""
+
+from links.camera.camera import Camera
+
+__all__ = ["Camera"]

@@ -1,0 +1,217 @@
+"""What there is to judge: a run's folder, or a TUM file, with the truth that belongs to it.
+
+Source: DESIGN, Outputs of a run; file names in links/results.py.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.link import LinkError
+from links.evaluation.tum import NO_DRONE, Trajectory, read_matrices, read_number, read_stamp_ns, read_table, read_tum
+from links.results import (
+    COVARIANCE_FILE,
+    DETECTIONS_FILE,
+    FIX_FILE,
+    POSE_COVARIANCE_FILE,
+    POSE_FILE,
+    SUMMARY_FILE,
+    TRUTH_FILE,
+    TRUTH_HITS_FILE,
+)
+from stages.geometry import Array64
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """One output of a run over time, with what the run itself says about how good each is."""
+
+    name: str  # "fix": the LiDAR's; "pose": fused; "file": a lone TUM file
+    poses: Trajectory
+    covariance: Array64 | None = None  # (n, 3, 3) [m2] vehicle axes, or (n, 6, 6) rotation first, tangent at the drone
+    why_no_covariance: str = ""
+    good: NDArray[np.bool_] | None = None  # (n,) what the run marked good; None: it marks nothing
+    hits: NDArray[np.int64] | None = None  # (n,) returns used
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One searched sweep and the candidates that were accepted in it, best first."""
+
+    start_ns: int
+    end_ns: int
+    accepted_xyz_m: Array64  # (k, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class RunData:
+    """A run as read. What is None was not recorded; `missing` says why, by what it is needed for."""
+
+    name: str  # as the user gave it
+    recording: str  # what it is a run of: runs of the same recording are compared with each other
+    outputs: tuple[Output, ...]  # the first is the run's answer
+    truth: Trajectory | None
+    no_drone: bool  # known: there was no drone at all
+    start_ns: int | None  # of the recording
+    end_ns: int | None
+    sweeps: tuple[Sweep, ...] | None
+    drone_hits_ns: NDArray[np.int64] | None  # truth: when the drone returned a pulse
+    states: tuple[tuple[int, str], ...]  # (since, state)
+    compute_ms: dict[str, dict[str, float]]
+    missing: dict[str, str]
+
+
+def read_run(path: Path, truth_file: Path | None = None, no_drone: bool = False) -> RunData:
+    """Read a run's folder or a TUM file. Errors are LinkError."""
+    if path.is_dir():
+        run = _read_folder(path, truth_file, no_drone)
+    elif path.suffix.lower() in {".mcap", ".rrd", ".html", ".json", ".yaml"}:
+        raise LinkError(
+            f"{path}: a run's folder or a TUM file is wanted, not a {path.suffix} file (replay a recording first)"
+        )
+    else:
+        poses = read_tum(path)
+        truth = read_tum(truth_file) if truth_file else None
+        nothing = f"{path.name} is a lone TUM file, not a run's folder"
+        missing = {"covariance": nothing, "recording": nothing, "detections": nothing, "compute": nothing}
+        if truth is None:
+            missing["truth"] = "no truth was given (--truth FILE.tum)"
+        output = Output("file", poses, why_no_covariance=nothing)
+        run = RunData(str(path), path.stem, (output,), truth, no_drone, None, None, None, None, (), {}, missing)
+    if run.truth is not None and not no_drone:
+        _demand_overlap(run, run.truth)
+    return run
+
+
+def _read_folder(folder: Path, truth_file: Path | None, no_drone: bool) -> RunData:
+    summary = _read_summary(folder / SUMMARY_FILE)
+    missing: dict[str, str] = {}
+    outputs: list[Output] = []
+    if (folder / POSE_FILE).exists():
+        outputs.append(_read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6))
+    if (folder / FIX_FILE).exists():
+        outputs.append(_read_output("fix", folder / FIX_FILE, folder / COVARIANCE_FILE, 3))
+    if not outputs:
+        raise LinkError(f"{folder}: neither {POSE_FILE} nor {FIX_FILE}: is it the --out folder of a run?")
+    truth, said_empty = _read_truth(folder, truth_file, missing)
+    start_ns, end_ns = (
+        read_stamp_ns(str(summary[key]), f"{folder / SUMMARY_FILE}: {key}") if key in summary else None
+        for key in ("start_s", "end_s")
+    )
+    if start_ns is None or end_ns is None:
+        missing["recording"] = f"{SUMMARY_FILE} does not say when the recording began and ended (an older grd wrote it)"
+    sweeps = None
+    if (folder / DETECTIONS_FILE).exists():
+        sweeps = _read_sweeps(folder / DETECTIONS_FILE)
+    else:
+        missing["detections"] = f"the run has no {DETECTIONS_FILE} (an older grd wrote it)"
+    hits_ns = None
+    if (folder / TRUTH_HITS_FILE).exists():
+        rows = read_table(folder / TRUTH_HITS_FILE, ("stamp_s",))
+        hits_ns = np.sort(np.array([read_stamp_ns(row["stamp_s"], where) for where, row in rows], dtype=np.int64))
+    else:
+        missing["hits"] = "the recording does not say which returns came from the drone"
+    states = summary.get("states", [])
+    compute = summary.get("compute_ms", {})
+    return RunData(
+        name=str(folder),
+        recording=Path(str(summary.get("recording", folder.name))).stem,
+        outputs=tuple(outputs),
+        truth=truth,
+        no_drone=no_drone or said_empty,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        sweeps=sweeps,
+        drone_hits_ns=hits_ns,
+        states=tuple((read_stamp_ns(str(s["stamp_s"]), f"{folder}: states"), str(s["state"])) for s in states),
+        compute_ms={stage: values for stage, values in compute.items() if values.get("calls")},
+        missing=missing,
+    )
+
+
+def _read_summary(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        raise LinkError(f"{path.parent}: no {path.name}: is it the --out folder of a run, and did the run end?")
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise LinkError(f"{path}: not JSON: {error}") from None
+    if not isinstance(summary, dict):
+        raise LinkError(f"{path}: not the summary of a run")
+    return summary
+
+
+def _read_truth(folder: Path, truth_file: Path | None, missing: dict[str, str]) -> tuple[Trajectory | None, bool]:
+    """-> the truth, and whether the recording's truth says that there was no drone."""
+    if truth_file is not None:
+        return read_tum(truth_file), False
+    path = folder / TRUTH_FILE
+    if not path.exists():
+        missing["truth"] = "the recording holds no truth (real flight?); give one with --truth FILE.tum"
+        return None, False
+    truth = read_tum(path, may_be_empty=True)
+    if len(truth):
+        return truth, False
+    missing["truth"] = "there was no drone" if NO_DRONE in truth.header else f"{path} is empty"
+    return None, NO_DRONE in truth.header
+
+
+def _read_output(name: str, poses_file: Path, covariance_file: Path, size: int) -> Output:
+    poses = read_tum(poses_file, may_be_empty=True)
+    if not covariance_file.exists():
+        return Output(name, poses, why_no_covariance=f"the run has no {covariance_file.name}")
+    matrices, rows = read_matrices(covariance_file, size)
+    stamps = poses.stamps_ns.tolist()
+    without = [stamp for stamp in stamps if stamp not in matrices]
+    if without:
+        why = f"{len(without)} of {len(stamps)} lines of {poses_file.name} have none in {covariance_file.name}"
+        return Output(name, poses, why_no_covariance=why)
+    covariance = np.array([matrices[stamp] for stamp in stamps]).reshape(-1, size, size)
+    good = hits = None
+    if stamps and "good" in rows[stamps[0]]:
+        good = np.array([rows[stamp]["good"].strip().lower() in {"1", "true"} for stamp in stamps])
+    if stamps and "hits" in rows[stamps[0]]:
+        hits = np.array([_whole(rows[stamp]["hits"], covariance_file) for stamp in stamps], dtype=np.int64)
+    return Output(name, poses, covariance, "", good, hits)
+
+
+def _whole(word: str, path: Path) -> int:
+    if not word.strip().isdigit():
+        raise LinkError(f"{path}: hits '{word[:20]}' is no whole number")
+    return int(word)
+
+
+def _read_sweeps(path: Path) -> tuple[Sweep, ...]:
+    found: dict[tuple[int, int], list[list[float]]] = {}
+    for where, row in read_table(path, ("start_s", "end_s", "x_m", "y_m", "z_m")):
+        span = read_stamp_ns(row["start_s"], where), read_stamp_ns(row["end_s"], where)
+        accepted = found.setdefault(span, [])
+        if row["x_m"]:
+            accepted.append([read_number(row[key], where) for key in ("x_m", "y_m", "z_m")])
+    return tuple(Sweep(a, b, np.array(xyz, dtype=np.float64).reshape(-1, 3)) for (a, b), xyz in found.items())
+
+
+def _demand_overlap(run: RunData, truth: Trajectory) -> None:
+    """LinkError when no output lies within truth's span: two clocks, or the wrong file."""
+    for output in run.outputs:
+        stamps = output.poses.stamps_ns
+        if len(stamps) and (stamps[-1] < truth.stamps_ns[0] or stamps[0] > truth.stamps_ns[-1]):
+            raise LinkError(
+                f"{output.poses.path} spans {_span(stamps)}, truth {truth.path} spans {_span(truth.stamps_ns)}: they "
+                "do not overlap; both must be on the recording's clock, in seconds"
+            )
+    if run.start_ns is None or run.end_ns is None:
+        return
+    if run.end_ns < truth.stamps_ns[0] or run.start_ns > truth.stamps_ns[-1]:
+        span = _span(np.array([run.start_ns, run.end_ns]))
+        raise LinkError(f"{run.name}: the recording spans {span}, truth {_span(truth.stamps_ns)}: no overlap")
+
+
+def _span(stamps_ns: NDArray[np.int64]) -> str:
+    return f"{stamps_ns[0] / 1e9:.3f} .. {stamps_ns[-1] / 1e9:.3f} s"

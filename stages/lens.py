@@ -1,0 +1,348 @@
+"""Fisheye lenses on unit vectors: equidistant, Kannala-Brandt and OCam, beyond 90 deg off axis.
+
+Frame: camera (x right in the image, y down, z along the optical axis). Pixels are (column, row), whole numbers are
+pixel centres. A ray at angle theta off the axis and azimuth phi meets the sensor at centre + A rho (cos phi, sin phi).
+
+| model          | rho(theta)                                                        | A                           |
+| -------------- | ----------------------------------------------------------------- | --------------------------- |
+| equidistant    | theta                                                             | f I                         |
+| kannala_brandt | theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9         | diag(fx, fy)                |
+| ocam           | root of rho cos(theta) + f(rho) sin(theta) = 0, f(rho) = sum a_i rho^i (a_0 < 0) | [[1, e], [d, c]] |
+
+Rays are the truth: `project` inverts OCam's direct polynomial exactly instead of using its fitted inverse.
+
+Source: Kannala and Brandt, A generic camera model, PAMI 2006, eq. 6 (as in Kalibr's pinhole-equi);
+Scaramuzza, OCamCalib, world2cam/cam2world (there x is down, y right and z backwards). Ours beyond 90 deg: cv2.fisheye
+mirrors and collapses there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, Self, cast
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, TypeAdapter, field_validator, model_validator
+
+from stages.compiled import compiled
+
+Array64 = NDArray[np.float64]
+Pixel = tuple[float, float]
+
+_ANGLE_SERIES, _OCAM = 0, 1  # what the coefficients of the radial function mean
+WIDEST_RHO = 20.0  # focal lengths; no image circle is wider
+_TURNS = 60  # of the bracketed Newton iteration; 6 are usual
+
+
+class _Lens(BaseModel):
+    """What all lenses share. A ray or pixel beyond `max_off_axis_deg` gives NaN, never a wrong number."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    centre_px: Pixel  # (column, row) of the optical axis
+    max_off_axis_deg: float = Field(default=117.5, gt=0, le=150)
+    _max_rho: float = PrivateAttr(default=0.0)
+
+    def _radial(self) -> tuple[int, Array64]:
+        raise NotImplementedError
+
+    def _affine(self) -> Array64:
+        raise NotImplementedError
+
+    @model_validator(mode="after")
+    def _grows_to_its_edge(self) -> Self:
+        if abs(np.linalg.det(self._affine())) < 1e-9:
+            raise ValueError("the focal lengths or affine terms leave no image: their matrix is singular")
+        largest, reached = _monotonic_to(*self._radial(), math.radians(self.max_off_axis_deg))
+        if math.degrees(reached) < self.max_off_axis_deg - 1e-6:
+            raise ValueError(
+                f"these coefficients fold the image back at {math.degrees(reached):.1f} deg off axis: "
+                f"set max_off_axis_deg to at most {math.floor(10 * math.degrees(reached)) / 10:.1f}"
+            )
+        self._max_rho = largest
+        return self
+
+    def project(self, rays: Array64) -> Array64:
+        """Pixels (n, 2) of rays (n, 3) in the camera frame, of any length; NaN beyond the lens's edge."""
+        kind, coefficients = self._radial()
+        limit = math.radians(self.max_off_axis_deg)
+        return _project(
+            _rows(rays, 3), kind, coefficients, self._affine(), np.array(self.centre_px), limit, self._max_rho
+        )
+
+    def unproject(self, pixels: Array64) -> Array64:
+        """Unit rays (n, 3) in the camera frame of pixels (n, 2); NaN outside the lens's circle."""
+        kind, coefficients = self._radial()
+        limit = math.radians(self.max_off_axis_deg)
+        inverse = np.asarray(np.linalg.inv(self._affine()), dtype=np.float64)
+        return _unproject(_rows(pixels, 2), kind, coefficients, inverse, np.array(self.centre_px), limit, self._max_rho)
+
+    @property
+    def circle_px(self) -> float:
+        """Radius of the image circle, where rays are `max_off_axis_deg` off the axis."""
+        return self._max_rho * math.sqrt(abs(float(np.linalg.det(self._affine()))))
+
+    def _scaled_centre(self, factor: float) -> Pixel:
+        return (self.centre_px[0] + 0.5) * factor - 0.5, (self.centre_px[1] + 0.5) * factor - 0.5
+
+
+class Equidistant(_Lens):
+    """r = f theta: the ideal fisheye."""
+
+    model: Literal["equidistant"] = "equidistant"
+    focal_px: float = Field(gt=0)
+
+    def _radial(self) -> tuple[int, Array64]:
+        return _ANGLE_SERIES, np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+
+    def _affine(self) -> Array64:
+        return self.focal_px * np.eye(2)
+
+    def scaled(self, factor: float) -> Equidistant:
+        """The same lens on an image enlarged by `factor`."""
+        return self.model_validate(
+            self.model_dump() | {"focal_px": self.focal_px * factor, "centre_px": self._scaled_centre(factor)}
+        )
+
+
+class KannalaBrandt(_Lens):
+    """r = f (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9)."""
+
+    model: Literal["kannala_brandt"] = "kannala_brandt"
+    focal_px: Pixel  # fx, fy
+    k: tuple[float, float, float, float]
+
+    def _radial(self) -> tuple[int, Array64]:
+        return _ANGLE_SERIES, np.array([1.0, *self.k])
+
+    def _affine(self) -> Array64:
+        return np.diag(self.focal_px)
+
+    def scaled(self, factor: float) -> KannalaBrandt:
+        """The same lens on an image enlarged by `factor`."""
+        focal = (self.focal_px[0] * factor, self.focal_px[1] * factor)
+        return self.model_validate(self.model_dump() | {"focal_px": focal, "centre_px": self._scaled_centre(factor)})
+
+
+class OCam(_Lens):
+    """Scaramuzza's polynomial: the ray of a point (x, y), rho from the centre, is (x, y, -sum a_i rho^i)."""
+
+    model: Literal["ocam"] = "ocam"
+    polynomial: tuple[float, ...] = Field(min_length=2, max_length=10)  # a_0 (negative), a_1, ... for rho in pixels
+    affine_cde: tuple[float, float, float] = (1.0, 0.0, 0.0)  # row = c x + d y, column = e x + y, x down, y right
+
+    @field_validator("polynomial")
+    @classmethod
+    def _looks_forward(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if value[0] >= 0:
+            raise ValueError("the first coefficient must be negative, as OCamCalib writes it")
+        return value
+
+    def _radial(self) -> tuple[int, Array64]:
+        return _OCAM, np.array(self.polynomial)
+
+    def _affine(self) -> Array64:
+        c, d, e = self.affine_cde
+        return np.array([[1.0, e], [d, c]])
+
+    def scaled(self, factor: float) -> OCam:
+        """The same lens on an image enlarged by `factor`: a_i becomes a_i factor^(1 - i)."""
+        polynomial = tuple(a * factor ** (1 - i) for i, a in enumerate(self.polynomial))
+        return self.model_validate(
+            self.model_dump() | {"polynomial": polynomial, "centre_px": self._scaled_centre(factor)}
+        )
+
+
+Lens = Annotated[Equidistant | KannalaBrandt | OCam, Field(discriminator="model")]
+_LENS: TypeAdapter[Equidistant | KannalaBrandt | OCam] = TypeAdapter(Lens)
+
+
+def lens_from_tree(tree: object) -> Equidistant | KannalaBrandt | OCam:
+    """A lens from a rig file's `lens:` mapping. ValueError (pydantic's) names what is wrong."""
+    return _LENS.validate_python(tree)
+
+
+def lens_from_kalibr(text: str, camera: str = "cam0", max_off_axis_deg: float = 117.5) -> KannalaBrandt:
+    """A camera of a Kalibr camchain YAML: `camera_model: pinhole` with `distortion_model: equidistant`.
+
+    Kalibr has no field of view of its own: say how far off axis the calibration may be trusted.
+    """
+    try:
+        tree: Any = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"this is no YAML: {error}") from None
+    cameras = cast("dict[str, Any]", tree) if isinstance(tree, dict) else {}
+    found = cameras.get(camera)
+    if not isinstance(found, dict):
+        raise ValueError(f"no camera {camera!r} in this Kalibr file; it has: {', '.join(map(str, cameras)) or 'none'}")
+    chain = cast("dict[str, Any]", found)
+    models = (chain.get("camera_model"), chain.get("distortion_model"))
+    if models != ("pinhole", "equidistant"):
+        raise ValueError(
+            f"{camera}: camera_model {models[0]!r} with distortion_model {models[1]!r} is not read here; "
+            "calibrate with `--models pinhole-equi`, or use OCamCalib"
+        )
+    intrinsics, k = chain.get("intrinsics"), chain.get("distortion_coeffs")
+    if not _numbers(intrinsics, 4) or not _numbers(k, 4):
+        raise ValueError(f"{camera}: intrinsics and distortion_coeffs must be four numbers each")
+    fu, fv, pu, pv = (float(v) for v in cast("list[float]", intrinsics))
+    k1, k2, k3, k4 = (float(v) for v in cast("list[float]", k))
+    return KannalaBrandt(focal_px=(fu, fv), centre_px=(pu, pv), k=(k1, k2, k3, k4), max_off_axis_deg=max_off_axis_deg)
+
+
+def lens_from_ocamcalib(text: str, max_off_axis_deg: float = 100.0) -> OCam:
+    """A lens from OCamCalib's calib_results.txt: lines starting with # and empty lines are skipped."""
+    lines = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    try:
+        rows = [[float(word) for word in line] for line in lines]
+        direct, _, (row, column), affine, (_, _) = rows
+        count = int(direct[0])
+        c, d, e = affine
+    except ValueError as error:
+        raise ValueError(
+            "this is no OCamCalib file (direct and inverse polynomial, centre, affine c d e, image size "
+            f"on one line each): {error}"
+        ) from None
+    if count != len(direct) - 1:
+        raise ValueError(f"the direct polynomial announces {count} coefficients and has {len(direct) - 1}")
+    return OCam(
+        polynomial=tuple(direct[1:]), centre_px=(column, row), affine_cde=(c, d, e), max_off_axis_deg=max_off_axis_deg
+    )
+
+
+def _numbers(value: object, count: int) -> bool:
+    if not isinstance(value, list):
+        return False
+    items = cast("list[object]", value)
+    return len(items) == count and all(isinstance(v, int | float) for v in items)
+
+
+def _rows(values: Array64, width: int) -> Array64:
+    rows = np.ascontiguousarray(values, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != width:
+        raise ValueError(f"expected an array of shape (n, {width}), got {rows.shape}")
+    return rows
+
+
+@compiled
+def _project(
+    rays: Array64, kind: int, a: Array64, affine: Array64, centre: Array64, max_theta: float, max_rho: float
+) -> Array64:
+    pixels = np.full((len(rays), 2), np.nan)
+    for i in range(len(rays)):
+        x, y, z = rays[i, 0], rays[i, 1], rays[i, 2]
+        across = math.hypot(x, y)
+        theta = math.atan2(across, z)
+        if not theta <= max_theta + 1e-12 or (across == 0.0 and z <= 0.0):  # also NaN
+            continue
+        rho = _rho_of_theta(theta, kind, a, max_theta, max_rho)
+        u, v = (rho * x / across, rho * y / across) if across > 0.0 else (0.0, 0.0)
+        pixels[i, 0] = centre[0] + affine[0, 0] * u + affine[0, 1] * v
+        pixels[i, 1] = centre[1] + affine[1, 0] * u + affine[1, 1] * v
+    return pixels
+
+
+@compiled
+def _unproject(
+    pixels: Array64, kind: int, a: Array64, inverse: Array64, centre: Array64, max_theta: float, max_rho: float
+) -> Array64:
+    rays = np.full((len(pixels), 3), np.nan)
+    for i in range(len(pixels)):
+        du, dv = pixels[i, 0] - centre[0], pixels[i, 1] - centre[1]
+        u = inverse[0, 0] * du + inverse[0, 1] * dv
+        v = inverse[1, 0] * du + inverse[1, 1] * dv
+        rho = math.hypot(u, v)
+        if not rho <= max_rho * (1.0 + 1e-12):  # also NaN
+            continue
+        theta = _theta_of_rho(rho, kind, a, max_theta, max_rho)
+        s = math.sin(theta) / rho if rho > 0.0 else 0.0
+        rays[i, 0], rays[i, 1], rays[i, 2] = s * u, s * v, math.cos(theta)
+    return rays
+
+
+@compiled
+def _rho_of_theta(theta: float, kind: int, a: Array64, max_theta: float, max_rho: float) -> float:
+    if kind == _ANGLE_SERIES:
+        return _series(theta, a)[0]
+    # rho cos(theta) + f(rho) sin(theta) = 0: below the root the ray is nearer to the axis and the value negative
+    c, s = math.cos(theta), math.sin(theta)
+    low, high = 0.0, max_rho
+    rho = max_rho * theta / max_theta
+    for _ in range(_TURNS):
+        f, slope = _polynomial(rho, a)
+        value = rho * c + f * s
+        if value > 0.0:
+            high = rho
+        else:
+            low = rho
+        rho, done = _newton(rho, value, c + slope * s, low, high)
+        if done:
+            break
+    return rho
+
+
+@compiled
+def _theta_of_rho(rho: float, kind: int, a: Array64, max_theta: float, max_rho: float) -> float:
+    if kind == _OCAM:
+        return math.atan2(rho, -_polynomial(rho, a)[0])
+    low, high = 0.0, max_theta
+    theta = max_theta * rho / max_rho
+    for _ in range(_TURNS):
+        value, slope = _series(theta, a)
+        if value > rho:
+            high = theta
+        else:
+            low = theta
+        theta, done = _newton(theta, value - rho, slope, low, high)
+        if done:
+            break
+    return theta
+
+
+@compiled
+def _newton(x: float, value: float, slope: float, low: float, high: float) -> tuple[float, bool]:
+    """One Newton step kept inside the bracket, and whether it no longer moves."""
+    following = x - value / slope if slope != 0.0 else low - 1.0
+    if not low <= following <= high:
+        following = 0.5 * (low + high)
+    return following, abs(following - x) <= 1e-14 * (1.0 + abs(x))
+
+
+@compiled
+def _series(theta: float, a: Array64) -> tuple[float, float]:
+    """Value and slope of a_0 t + a_1 t^3 + ... + a_4 t^9."""
+    square = theta * theta
+    value, slope = 0.0, 0.0
+    for i in range(len(a) - 1, -1, -1):
+        value = value * square + a[i]
+        slope = slope * square + (2 * i + 1) * a[i]
+    return value * theta, slope
+
+
+@compiled
+def _polynomial(rho: float, a: Array64) -> tuple[float, float]:
+    """Value and slope of a_0 + a_1 rho + ..."""
+    value, slope = 0.0, 0.0
+    for i in range(len(a) - 1, -1, -1):
+        slope = slope * rho + value
+        value = value * rho + a[i]
+    return value, slope
+
+
+def _monotonic_to(kind: int, a: Array64, max_theta: float) -> tuple[float, float]:
+    """(rho, theta) of the widest ray up to max_theta to which radius and angle grow together."""
+    if kind == _ANGLE_SERIES:
+        theta = np.linspace(0.0, max_theta, 2001)
+        slope = np.array([_series(angle, a)[1] for angle in theta])
+        folds = np.nonzero(slope <= 0)[0]
+        reached = float(theta[max(folds[0] - 1, 0)]) if len(folds) else max_theta
+        return _series(reached, a)[0], reached
+    rho = np.linspace(0.0, WIDEST_RHO * abs(float(a[0])), 20_001)
+    theta = np.array([math.atan2(r, -_polynomial(r, a)[0]) for r in rho])
+    folds = np.nonzero(np.diff(theta) <= 0)[0]
+    fold = int(folds[0]) if len(folds) else len(rho) - 1
+    if theta[fold] <= max_theta:
+        return float(rho[fold]), float(theta[fold])
+    return _rho_of_theta(max_theta, kind, a, max_theta, float(rho[fold])), max_theta

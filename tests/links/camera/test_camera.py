@@ -1,0 +1,64 @@
+"""Recorded frames to images: whole ones are decoded, anything else is counted."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from flow.link import Record
+from flow.message import check_arrays
+from links.camera import Camera
+from links.camera.camera import decode_image, jpeg_size
+from links.recording import CompressedImage, encode_compressed_image
+
+
+def jpeg(height=48, width=64, progressive=False):
+    ramp = np.tile(np.linspace(20, 230, width).astype(np.uint8), (height, 1))
+    flags = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_PROGRESSIVE, int(progressive)]
+    return ramp, cv2.imencode(".jpg", ramp, flags)[1].tobytes()
+
+
+def record(data, format="jpeg"):
+    frame = CompressedImage(123, "camera_vehicle", data, format)
+    return Record("/camera/vehicle", arrival_ns=200, stamp_ns=150, data=encode_compressed_image(frame))
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_frame_is_decoded_in_grey_at_the_records_time(progressive):
+    ramp, data = jpeg(progressive=progressive)
+    camera = Camera(topic="/camera/vehicle")
+    image = camera.decode(record(data))
+    assert image is not None
+    check_arrays(image)
+    assert (image.stamp_ns, image.frame_id) == (150, "camera_vehicle")
+    assert np.abs(image.grey.astype(int) - ramp).max() < 6
+    assert camera.refused == 0
+
+
+def test_the_size_is_read_before_anything_is_decoded():
+    assert jpeg_size(jpeg(48, 64)[1]) == (64, 48)
+    with pytest.raises(ValueError, match="no JPEG"):
+        jpeg_size(b"\x89PNG....")
+
+
+def test_a_huge_frame_is_refused_before_it_takes_memory():
+    _, data = jpeg()
+    at = data.index(b"\xff\xc0") + 5
+    huge = data[:at] + b"\xff\xff\xff\xff" + data[at + 4 :]
+    with pytest.raises(ValueError, match="65535 x 65535"):
+        decode_image(0, CompressedImage(0, "", huge))
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff\xd8", b"\xff\xd8\xff\xe0\x00\x00" * 3, jpeg()[1][:-30], b"GIF89a"])
+def test_a_damaged_frame_is_counted_and_left_out(data):
+    camera = Camera(topic="/camera/vehicle")
+    assert camera.decode(record(data)) is None
+    assert camera.refused == 1
+
+
+def test_another_format_or_no_protobuf_is_counted_and_left_out():
+    camera = Camera(topic="/camera/vehicle")
+    assert camera.decode(record(jpeg()[1], "png")) is None
+    assert camera.decode(Record("/camera/vehicle", 2, 1, b"\xff\xff\xff")) is None
+    assert camera.refused == 2

@@ -1,0 +1,101 @@
+"""Run folders with metrics known by hand: the files `grd replay` writes, made of arrays."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+START_S = 1_748_773_230
+SECOND = 1_000_000_000
+START_NS = START_S * SECOND
+
+
+def stamp(t_s: float) -> str:
+    ns = START_NS + round(t_s * 1e9)
+    return f"{ns // SECOND}.{ns % SECOND:09d}"
+
+
+def truth_at(t_s: np.ndarray) -> np.ndarray:
+    """A drone 12 m up that flies along x at 1 m/s: linear, so interpolation is exact."""
+    return np.column_stack([1.0 * t_s, np.full(len(t_s), 3.0), np.full(len(t_s), 12.0)])
+
+
+def lines(t_s, xyz, quaternions=None) -> str:
+    q = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)) if quaternions is None else quaternions
+    rows = [
+        f"{stamp(t)} " + " ".join(f"{v:.9f}" for v in (*p, *o)) for t, p, o in zip(t_s, np.asarray(xyz), q, strict=True)
+    ]
+    return "".join(f"{row}\n" for row in rows)
+
+
+def make_run(
+    folder: Path,
+    t_s,
+    xyz,
+    *,
+    sigma_m: float | np.ndarray | None = 0.1,
+    duration_s: float = 10.0,
+    recording: str = "flight",
+    truth: np.ndarray | str | None = None,
+    truth_step_s: float = 0.01,
+    sweeps: list[tuple[float, float, list[list[float]]]] | None = None,
+    hits_s: list[float] | None = None,
+    compute_ms: dict | None = None,
+    states: list[tuple[float, str]] = (),
+) -> Path:
+    """A run with fixes at `t_s`. `truth` "no drone" or "none" leaves it out; default: `truth_at` over the whole recording."""
+    folder.mkdir(parents=True)
+    t_s, xyz = np.asarray(t_s, dtype=float), np.asarray(xyz, dtype=float).reshape(-1, 3)
+    (folder / "fix_vehicle_drone.tum").write_text("# T_vehicle_drone, position only\n" + lines(t_s, xyz))
+    if sigma_m is not None:
+        variances = np.broadcast_to(np.asarray(sigma_m, dtype=float), len(t_s)) ** 2
+        rows = [f"{stamp(t)},{v},0,0,{v},0,{v},5,3\n" for t, v in zip(t_s, variances, strict=True)]
+        head = "stamp_s,cxx_m2,cxy_m2,cxz_m2,cyy_m2,cyz_m2,czz_m2,hits,iterations\n"
+        (folder / "fix_covariance.csv").write_text(head + "".join(rows))
+    if isinstance(truth, str):
+        if truth == "no drone":
+            (folder / "truth_vehicle_drone.tum").write_text("# no drone in this recording\n")
+    else:
+        times = np.arange(0, duration_s + truth_step_s / 2, truth_step_s)
+        path = truth_at(times) if truth is None else truth
+        (folder / "truth_vehicle_drone.tum").write_text("# T_vehicle_drone, full pose, truth\n" + lines(times, path))
+    if sweeps is not None:
+        text = "start_s,end_s,x_m,y_m,z_m,score\n"
+        for start, end, accepted in sweeps:
+            for cells in accepted or [["", "", ""]]:
+                score = "1" if accepted else ""
+                text += ",".join([stamp(start), stamp(end), *map(str, cells), score]) + "\n"
+        (folder / "detections.csv").write_text(text)
+    if hits_s is not None:
+        (folder / "truth_hits.csv").write_text("stamp_s\n" + "".join(f"{stamp(t)}\n" for t in hits_s))
+    summary = {
+        "recording": f"{recording}.mcap",
+        "start_s": stamp(0.0),
+        "end_s": stamp(duration_s),
+        "states": [{"stamp_s": stamp(t), "state": state, "reason": ""} for t, state in states],
+        "compute_ms": compute_ms or {},
+    }
+    (folder / "summary.json").write_text(json.dumps(summary))
+    return folder
+
+
+def add_pose(
+    folder: Path, t_s, xyz, quaternions, covariance: np.ndarray | None, good: np.ndarray | None = None
+) -> None:
+    """The fused pose beside the fixes, with its 6x6 covariance."""
+    (folder / "pose_vehicle_drone.tum").write_text(lines(t_s, xyz, quaternions))
+    if covariance is None:
+        return
+    names = [f"c{a}{b}" for a in range(6) for b in range(a, 6)]
+    text = ",".join(["stamp_s", *names, *(["good"] if good is not None else [])]) + "\n"
+    for i, t in enumerate(t_s):
+        cells = [f"{v:.12g}" for v in covariance[np.triu_indices(6)]]
+        text += ",".join([stamp(t), *cells, *([str(int(good[i]))] if good is not None else [])]) + "\n"
+    (folder / "pose_covariance.csv").write_text(text)
+
+
+def yaw_quaternion(yaw_rad) -> np.ndarray:
+    half = np.asarray(yaw_rad, dtype=float) / 2
+    return np.column_stack([0 * half, 0 * half, np.sin(half), np.cos(half)])

@@ -1,0 +1,285 @@
+"""MAVLink frames into messages: fields by hand, sequence, foreign and damaged frames, a real flight's log."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega
+
+from flow.link import Record
+from flow.message import check_arrays
+from flow.stage import output_ports
+from links.mavlink import Autopilot
+from links.recording import RecordingReader, import_file
+from stages.messages import AutopilotStatus, DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry
+
+mavlink: Any = ardupilotmega
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "mavlink"
+HOST0, MS = 1_748_773_230_000_000_000, 1_000_000
+UPPER = [0.0] * 21
+
+
+class Sender:
+    """Packs messages as one system would, numbered."""
+
+    def __init__(self, system: int = 1, component: int = 1, v1: bool = False) -> None:
+        self._mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._v1 = v1
+
+    def frame(self, message: Any) -> bytes:
+        data = bytes(message.pack(self._mav, force_mavlink1=self._v1))
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return data
+
+    def attitude(self, boot_ms: int, roll: float = 0.1, pitch: float = 0.2, yaw: float = 0.3) -> bytes:
+        return self.frame(mavlink.MAVLink_attitude_message(boot_ms, roll, pitch, yaw, 1.0, 2.0, 3.0))
+
+
+def record(data: bytes, at_ms: float = 0.0) -> Record:
+    at_ns = HOST0 + round(at_ms * MS)
+    return Record("/autopilot/rx", arrival_ns=at_ns, stamp_ns=at_ns, data=data)
+
+
+def odometry(
+    q: Any = (1, 0, 0, 0), frame: int = 20, child: int = 12, x: float = 1.0, upper: Any = UPPER, quality: int = 80
+):
+    moving = (4.0, 5.0, 6.0, 0.1, 0.2, 0.3)
+    return mavlink.MAVLink_odometry_message(
+        7_000_123, frame, child, x, 2.0, 3.0, list(q), *moving, list(upper), UPPER, 9, 0, quality
+    )
+
+
+def test_the_outputs_are_the_five_messages():
+    assert set(output_ports(Autopilot)) == {
+        "drone_attitude",
+        "drone_local_position",
+        "drone_odometry",
+        "drone_imu",
+        "autopilot_status",
+    }
+
+
+@pytest.mark.parametrize("v1", [False, True])
+def test_attitude_and_position_come_in_our_axes(v1: bool):
+    sender, link = Sender(v1=v1), Autopilot()
+    attitude = link.decode(record(sender.attitude(7000, 0.0, 0.0, math.pi / 2)))
+    assert isinstance(attitude, DroneAttitude)
+    check_arrays(attitude)
+    np.testing.assert_allclose(attitude.R_local_drone @ [1, 0, 0], [0, -1, 0], atol=1e-6)
+    np.testing.assert_allclose(attitude.angular_velocity_drone_radps, [1, -2, -3])
+    moved = mavlink.MAVLink_local_position_ned_message(7001, 1.0, 2.0, -3.0, 4.0, 5.0, -6.0)
+    position = link.decode(record(sender.frame(moved), 1.0))
+    assert isinstance(position, DroneLocalPosition)
+    check_arrays(position)
+    np.testing.assert_allclose(position.xyz_local_m, [1, -2, 3])
+    np.testing.assert_allclose(position.velocity_local_mps, [4, -5, 6])
+
+
+def test_odometry_has_the_velocity_in_the_body_and_rotation_first_in_its_covariance():
+    upper = [1.0, 0, 0, 0, 0, 0, 2.0, 0, 0, 0, 0, 3.0, 0, 0, 0, 4.0, 0, 0, 5.0, 0, 6.0]
+    message = Autopilot().decode(record(Sender().frame(odometry(upper=upper))))
+    assert isinstance(message, DroneOdometry)
+    check_arrays(message)
+    np.testing.assert_allclose(message.xyz_local_m, [1, -2, -3])
+    np.testing.assert_allclose(message.velocity_drone_mps, [4, -5, -6])
+    np.testing.assert_allclose(message.angular_velocity_drone_radps, [0.1, -0.2, -0.3], rtol=1e-6)
+    np.testing.assert_allclose(message.R_local_drone, np.eye(3), atol=1e-12)
+    assert message.pose_covariance is not None
+    np.testing.assert_allclose(np.diagonal(message.pose_covariance), [4, 5, 6, 1, 2, 3])
+    assert (message.reset_counter, message.quality_percent) == (9, 80)
+
+
+def test_an_odometry_without_covariance_or_quality_says_so():
+    message = Autopilot().decode(record(Sender().frame(odometry(upper=[math.nan] * 21, quality=0))))
+    assert isinstance(message, DroneOdometry)
+    assert (message.pose_covariance, message.quality_percent) == (None, None)
+    failed = Autopilot().decode(record(Sender().frame(odometry(quality=-1))))
+    assert isinstance(failed, DroneOdometry)
+    assert failed.quality_percent == 0
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (odometry(frame=0), "odometry in other frames"),
+        (odometry(child=1), "odometry in other frames"),
+        (odometry(q=(0, 0, 0, 0)), "no rotation"),
+        (odometry(q=(math.nan, 0, 0, 0)), "no rotation"),
+        (odometry(x=math.inf), "not finite"),
+        (mavlink.MAVLink_attitude_message(1, math.nan, 0, 0, 0, 0, 0), "not finite"),
+        (mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, math.inf, 0), "not finite"),
+    ],
+)
+def test_what_makes_no_sense_is_counted_by_reason(message: Any, reason: str):
+    link = Autopilot()
+    assert link.decode(record(Sender().frame(message))) is None
+    assert link.counters[f"refused: {reason}"] == 1
+
+
+def test_both_imus_are_si_in_drone_axes_and_gravity_is_felt_upwards():
+    raw = mavlink.MAVLink_raw_imu_message(7_000_000, 100, 200, -1000, 10, 20, 30, 0, 0, 0)
+    highres = mavlink.MAVLink_highres_imu_message(
+        7_000_000, 0.980665, 1.96133, -9.80665, 0.01, 0.02, 0.03, 0, 0, 0, math.nan, 0, 0, 0, 63
+    )
+    for message in (raw, highres):
+        imu = Autopilot().decode(record(Sender().frame(message)))
+        assert isinstance(imu, DroneImu)
+        check_arrays(imu)
+        np.testing.assert_allclose(imu.acceleration_drone_mps2, [0.980665, -1.96133, 9.80665], rtol=1e-6)
+        np.testing.assert_allclose(imu.angular_velocity_drone_radps, [0.01, -0.02, -0.03], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("mode", "state", "armed", "failsafe"), [(128 + 1, 4, True, False), (1, 5, False, True)])
+def test_a_heartbeat_tells_armed_mode_and_failsafe(mode: int, state: int, armed: bool, failsafe: bool):
+    status = Autopilot().decode(record(Sender().frame(mavlink.MAVLink_heartbeat_message(2, 3, mode, 5, state, 3))))
+    assert isinstance(status, AutopilotStatus)
+    assert (status.armed, status.custom_mode, status.failsafe) == (armed, 5, failsafe)
+    assert (status.clock_offset_ns, status.clock_uncertainty_ns) == (None, None)
+
+
+def test_a_stamp_in_milliseconds_is_taken_in_their_middle_and_never_after_arrival():
+    sender, link = Sender(), Autopilot(clock_drift_limit_ppm=0.0)
+    prompt = link.decode(record(sender.attitude(7000), 10.0))
+    late = link.decode(record(sender.attitude(7020), 80.0))
+    assert prompt is not None
+    assert late is not None
+    assert prompt.stamp_ns == HOST0 + 10 * MS
+    assert late.stamp_ns == HOST0 + 30 * MS + MS // 2
+
+
+def test_missing_frames_are_counted_over_the_wrap_of_the_number():
+    sender, link = Sender(), Autopilot()
+    for i in range(600):
+        data = sender.attitude(20 * i)
+        if i not in (100, 255, 256, 257, 400):
+            link.decode(record(data, 20.0 * i))
+    assert link.counters["lost"] == 5
+    assert link.counters["decoded"] == 595
+
+
+def test_a_repeated_or_late_frame_is_refused_and_a_numbering_begun_anew_is_not():
+    sender, link = Sender(), Autopilot()
+    frames = [sender.attitude(20 * i) for i in range(200)]
+    for i in (0, 1, 2, 2, 4, 3, *range(5, 200)):
+        link.decode(record(frames[i], 20.0 * i))
+    assert link.counters["refused: repeated or late"] == 2
+    again = Sender()
+    kept = [link.decode(record(again.attitude(4000 + 20 * i), 4000.0 + 20 * i)) for i in range(3)]
+    assert [message is None for message in kept] == [False, False, False]
+    assert link.counters["lost"] == 1 + 56  # 3 was missing when 4 came; 199 -> 0 looks like 56 missing
+    far = Sender()
+    kept = [link.decode(record(far.attitude(5000 + 20 * i), 5000.0 + 20 * i)) for i in range(5)]
+    assert [message is None for message in kept] == [True, False, False, False, False]
+
+
+def test_other_systems_neither_speak_nor_disturb_the_sequence():
+    ours, radio, link = Sender(), Sender(51, 68), Autopilot()
+    for i in range(10):
+        link.decode(record(ours.attitude(20 * i), 20.0 * i))
+        assert link.decode(record(radio.attitude(9_000_000), 20.0 * i)) is None
+    assert link.counters["refused: from another system"] == 10
+    assert (link.counters["lost"], link.counters["clock restarts"], link.counters["decoded"]) == (0, 0, 10)
+    other = Autopilot(system_id=51, component_id=68)
+    assert isinstance(other.decode(record(radio.attitude(1))), DroneAttitude)
+
+
+def test_a_message_beyond_our_dialect_counts_as_a_frame_and_is_no_loss():
+    sender, link = Sender(), Autopilot()
+    link.decode(record(sender.attitude(0)))
+    private = bytearray(sender.attitude(20))
+    private[7:10] = b"\xf0\xff\x00"
+    assert link.decode(record(bytes(private), 20.0)) is None
+    assert link.decode(record(sender.attitude(40), 40.0)) is not None
+    assert (link.counters["refused: unknown message"], link.counters["lost"]) == (1, 0)
+
+
+@pytest.mark.parametrize("cut", [0, 1, 7, 8, 20])
+def test_a_damaged_frame_takes_no_other_with_it(cut: int):
+    sender, link = Sender(), Autopilot()
+    whole = [sender.attitude(20 * i) for i in range(3)]
+    assert link.decode(record(whole[0])) is not None
+    assert link.decode(record(whole[1][:cut], 20.0)) is None
+    assert link.decode(record(whole[2], 40.0)) is not None
+    assert (link.counters["refused: damaged"], link.counters["lost"]) == (1, 1)
+
+
+@given(st.binary(max_size=300))
+def test_no_bytes_make_it_fail(data: bytes):
+    Autopilot().decode(record(data))
+
+
+SAMPLES = [
+    Sender().attitude(7000),
+    Sender().frame(odometry()),
+    Sender().frame(mavlink.MAVLink_timesync_message(7 * 10**9, HOST0)),
+    Sender().frame(mavlink.MAVLink_raw_imu_message(7, 1, 2, 3, 4, 5, 6, 0, 0, 0)),
+]
+
+
+@given(
+    st.sampled_from(SAMPLES),
+    st.lists(st.tuples(st.integers(0, 279), st.integers(0, 255)), max_size=4),
+    st.integers(0, 300),
+)
+def test_flipped_and_cut_bytes_are_counted_never_raised(frame: bytes, changes: list[tuple[int, int]], length: int):
+    data = bytearray(frame)
+    for at, value in changes:
+        data[at % len(data)] = value
+    link = Autopilot()
+    link.decode(record(bytes(data[:length])))
+    counters = link.counters
+    used = counters["decoded"] + counters["of no use here"] + counters["timesync replies"]
+    assert used + sum(n for name, n in counters.items() if name.startswith("refused")) == 1
+
+
+FLOATS = st.floats(width=32)
+
+
+@given(
+    st.lists(FLOATS, min_size=13, max_size=13), st.lists(FLOATS, min_size=42, max_size=42), st.integers(0, 2**64 - 1)
+)
+def test_odometry_with_a_right_checksum_and_any_numbers_is_finite_or_refused(
+    state: list[float], covariances: list[float], time_usec: int
+):
+    message = mavlink.MAVLink_odometry_message(
+        time_usec, 20, 12, *state[:3], state[3:7], *state[7:], covariances[:21], covariances[21:], 0, 0, 0
+    )
+    decoded = Autopilot().decode(record(Sender().frame(message)))
+    if decoded is not None:
+        assert isinstance(decoded, DroneOdometry)
+        for array in (decoded.xyz_local_m, decoded.R_local_drone, decoded.velocity_drone_mps):
+            assert np.isfinite(array).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "attitudes", "restarts", "damaged"),
+    [("copter_flight_part1.tlog", 2002, 1, 729), ("plane_bench_disarmed.tlog", 270, 0, 0)],  # 729: its ground station's
+)
+def test_a_real_log_decodes_with_growing_stamps_before_arrival(
+    name: str, attitudes: int, restarts: int, damaged: int, tmp_path: Path
+):
+    if not (SHARED / name).exists():
+        pytest.skip("needs ../shared/data/mavlink")
+    imported = import_file(SHARED / name, tmp_path / "flight.mcap")
+    link, last = Autopilot(), Counter[type]()
+    counts: Counter[type] = Counter()
+    with RecordingReader(imported.path) as reader:
+        for rec in reader.records():
+            message = link.decode(rec)
+            if message is None:
+                continue
+            check_arrays(message)
+            kind = type(message)
+            counts[kind] += 1
+            assert last[kind] < message.stamp_ns <= rec.arrival_ns
+            last[kind] = message.stamp_ns
+    assert link.counters["clock restarts"] == restarts
+    assert 0.97 * attitudes < counts[DroneAttitude] <= attitudes
+    assert link.counters.get("refused: damaged", 0) == damaged

@@ -90,3 +90,20 @@ def test_a_real_room_seen_from_its_floor_holds_no_drone(tmp_path, mount):
 def test_the_paper_literally_invents_a_drone_in_that_room(tmp_path, mount):
     results, _, _ = run(tmp_path, "einride_vlp16", "paper", ON_ITS_SIDE[mount])
     assert (results.sweeps, results.sweeps_with_drone) == (13, 13)
+
+
+@pytest.mark.parametrize(
+    ("number", "fixes", "states"),
+    [
+        (1, 0, ["SEARCHING", "TRACKING", "LOST", "SEARCHING"]),
+        (2, 36, ["SEARCHING", "TRACKING"]),
+        (3, 0, ["SEARCHING", "TRACKING", "LOST", "SEARCHING"]),
+        (4, 0, ["SEARCHING", "TRACKING", "LOST", "SEARCHING"]),
+    ],
+)
+def test_the_paper_literally_fails_the_first_seconds_of_each_experiment(tmp_path, number, fixes, states):
+    """It takes something else for the drone, aims at it, and either keeps it (2) or finds nothing there."""
+    results, _, truth = run(tmp_path, f"experiment_{number}", "paper")
+    assert (results.sweeps, len(results.fixes)) == (1, fixes)
+    assert [t.state for t in results.transitions] == states
+    assert all(np.linalg.norm(error) > 10 for error in fix_errors(results.fixes, *truth.drone_in_vehicle()).error_m)

@@ -16,6 +16,7 @@ from flow.link import LinkError
 from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
 from links.evaluation import Evaluation, Limits, evaluate, read_run
 from links.evaluation.compare import Pair, pair_up
+from links.evaluation.groups import group_table, groups
 from links.evaluation.report import write_report
 from links.evaluation.tables import MAX_COLUMNS, as_json, comparison_table, headline_table, label, metrics_table
 
@@ -39,6 +40,10 @@ def evaluate_runs(
     no_drone: Annotated[
         bool, typer.Option("--no-drone", help="There was no drone: all that a run says is a false alarm.")
     ] = False,
+    by: Annotated[
+        list[int] | None,
+        typer.Option("--by", min=1, help="Sum up by this word of the recordings' names (SCENE-RANGE-...); repeatable."),
+    ] = None,
     max_gap_s: Annotated[
         float, typer.Option("--max-gap", min=0.001, max=10, help="Truth is not interpolated over a longer gap [s].")
     ] = DEFAULTS.max_gap_s,
@@ -70,7 +75,11 @@ def evaluate_runs(
     own = [e for group in judged[: len(runs)] for e in group]
     others = [e for group in judged[len(runs) :] for e in group]
     pairs, warnings = pair_up(own, others) if others else ([], [])
-    _tell(own, pairs, warnings)
+    if by:
+        for number in by:
+            out.print(group_table(groups(own, number), number))
+    else:
+        _tell(own, pairs, warnings)
     _write(own, others, pairs, warnings, report, out_dir)
     if any(e.findings for e in own):
         raise typer.Exit(FINDING)

@@ -122,7 +122,6 @@ def make_matrix(
                 simulate_into(
                     file,
                     scenario,
-                    scenario.as_yaml(),
                     progress=lambda share, cell=cell, at=start_s: progress(at + share * cell.duration_s, whole_s),
                     overwrite=True,
                     closed_loop=closed_loop,

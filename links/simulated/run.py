@@ -27,6 +27,7 @@ from links.simulated.lidar import Lidar, Pulses, turned_poses
 from links.simulated.mesh import Array64
 from links.simulated.operator import ScriptedOperator
 from links.simulated.path import Path
+from links.simulated.quaternion import quaternions_xyzw
 from links.simulated.ride import Ride
 from links.simulated.scenario import Scenario, load_scenario
 from links.simulated.scene import Scene, Truth, drone_shapes
@@ -216,25 +217,11 @@ class Simulation:
             poses["/truth/drone"] = self.truth.T_world_drone(stamp_ns)
         records: list[Record] = []
         for topic, (rotations, positions) in poses.items():
-            for stamp, R, t in zip(stamp_ns.tolist(), rotations, positions, strict=True):
-                pose = {"xyz_m": np.round(t, 6).tolist(), "quaternion_xyzw": np.round(quaternion_xyzw(R), 9).tolist()}
+            turns = np.round(quaternions_xyzw(rotations), 9).tolist()
+            for stamp, q, t in zip(stamp_ns.tolist(), turns, np.round(positions, 6).tolist(), strict=True):
+                pose = {"xyz_m": t, "quaternion_xyzw": q}
                 records.append(Record(topic, arrival_ns=stamp, stamp_ns=stamp, data=json.dumps(pose).encode()))
         return records
-
-
-def quaternion_xyzw(rotation: Array64) -> Array64:
-    """Unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3): the eigenvector of Bar-Itzhack's symmetric matrix."""
-    R = rotation
-    K = np.array(
-        [
-            [R[0, 0] - R[1, 1] - R[2, 2], 0.0, 0.0, 0.0],
-            [R[1, 0] + R[0, 1], R[1, 1] - R[0, 0] - R[2, 2], 0.0, 0.0],
-            [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], R[2, 2] - R[0, 0] - R[1, 1], 0.0],
-            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], R[0, 0] + R[1, 1] + R[2, 2]],
-        ]
-    )
-    q = np.linalg.eigh(K)[1][:, -1]  # eigh reads the lower half
-    return q if q[3] >= 0 else -q
 
 
 def simulate_records(scenario: Scenario, seed: int | None = None) -> Iterator[Record]:
@@ -255,29 +242,24 @@ def simulate(
 
     `progress` is told the share done, 0 to 1. Errors are LinkError, and ConfigError for the configuration's.
     """
-    checked = load_scenario(scenario)
-    text = scenario.read_text(encoding="utf-8")
-    if duration_s is not None:
-        checked = checked.changed(duration_s=duration_s)
-        text = checked.as_yaml()
-    return simulate_into(out, checked, text, seed, progress, overwrite, closed_loop)
+    asked = {"seed": seed, "duration_s": duration_s}
+    checked = load_scenario(scenario).changed(**{name: value for name, value in asked.items() if value is not None})
+    return simulate_into(out, checked, progress, overwrite, closed_loop)
 
 
 def simulate_into(
     out: FilePath,
     checked: Scenario,
-    text: str,
-    seed: int | None = None,
     progress: Callable[[float], None] | None = None,
     overwrite: bool = False,
     closed_loop: FilePath | None = None,
 ) -> SimulationReport:
-    """The same for a scenario in memory; `text` is its YAML, kept in the recording."""
+    """The same for a scenario in memory. The recording keeps the whole scenario, with every setting, as its config."""
     began = time.perf_counter()
     loop = None
     if closed_loop is not None:
         loop = load_loop(closed_loop, checked.rig_yaml(), f"{checked.name} (rig)", checked.closed_loop)
-    simulation = Simulation(checked, seed, loop)
+    simulation = Simulation(checked, loop=loop)
     metadata = {"made_by": "grd simulate", "scenario": checked.name, "seed": str(simulation.seed)}
     if closed_loop is not None:
         metadata["closed_loop"] = closed_loop.name
@@ -285,7 +267,7 @@ def simulate_into(
     with RecordingWriter(
         out,
         rig_yaml=checked.rig_yaml(),
-        config_yaml=text,
+        config_yaml=checked.as_yaml(),
         metadata=metadata,
         lossless=True,
         overwrite=overwrite,

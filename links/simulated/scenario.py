@@ -13,7 +13,8 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from flow.link import LinkError
+from flow.problem import ConfigError, did_you_mean
+from flow.tree import load_tree, resolve
 from links.simulated.autopilot import AutopilotSettings
 from links.simulated.camera import CamerasSettings, rig_cameras
 from links.simulated.closed_loop import ClosedLoopSettings
@@ -153,14 +154,15 @@ class Scenario(_Settings):
 
 
 def load_scenario(path: FilePath) -> Scenario:
-    """Read and check a scenario file. LinkError lists everything that is wrong in it."""
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return Scenario.model_validate(tree)
-    except OSError as error:
-        raise LinkError(f"{path}: {error.strerror or error}; give the path of a scenario YAML file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise LinkError(f"{path}: not a YAML file: {error}") from error
-    except ValidationError as error:
-        lines = [f"{path}: {'.'.join(map(str, e['loc'])) or 'scenario'}: {e['msg']}" for e in error.errors()]
-        raise LinkError("\n".join(lines)) from error
+    """Read and check a scenario file with what it includes. ConfigError lists everything wrong in it, file and line."""
+    tree = load_tree(path)
+    values = resolve(tree, (), tree.values)
+    if not tree.problems:
+        try:
+            return Scenario.model_validate(values)
+        except ValidationError as errors:
+            for error in errors.errors(include_url=False):
+                where = tuple(str(part) for part in error["loc"])
+                near = did_you_mean(where[-1], Scenario.model_fields) if error["type"] == "extra_forbidden" else ""
+                tree.problem(where, f"{error['msg'].removeprefix('Value error, ')}.{near}")
+    raise ConfigError(tree.problems)

@@ -11,13 +11,14 @@ import pytest
 import yaml
 
 from flow.link import LinkError, Record
+from flow.problem import ConfigError
 from links.recording import RecordingReader
 from links.simulated import run
 from links.simulated.path import Path, Waypoint
-from links.simulated.run import Simulation, quaternion_xyzw, simulate, simulate_records
+from links.simulated.run import Simulation, simulate, simulate_records
 from links.simulated.scenario import Scenario, load_scenario
 from links.velodyne import Lidar
-from stages.geometry import LidarMount, Pose, rotation_from_quaternion_xyzw, rotation_from_rpy_deg, rotation_z
+from stages.geometry import LidarMount, Pose, rotation_from_quaternion_xyzw, rotation_z
 
 ROOT = FilePath(__file__).parents[3]
 SCENARIOS = sorted((ROOT / "configs/scenarios").glob("*.yaml"))
@@ -148,7 +149,7 @@ def test_a_simulation_is_written_with_its_rig_and_scenario(tmp_path: FilePath) -
     assert told[-1] == 1.0
     assert report.seed == 5
     with RecordingReader(out) as reader:
-        assert reader.config_yaml == text
+        assert reader.config_yaml == load_scenario(source).changed(seed=5).as_yaml()
         assert reader.metadata["seed"] == "5"
         rig = yaml.safe_load(reader.rig_yaml)
         count = sum(1 for _ in reader.records())
@@ -173,7 +174,7 @@ def test_the_committed_recording_is_small_and_says_where_it_comes_from() -> None
     with RecordingReader(path) as reader:
         assert reader.warnings == []
         assert reader.metadata["scenario"] == "street_sweep"
-        assert reader.config_yaml == STREET.read_text(encoding="utf-8")
+        assert reader.config_yaml == load_scenario(STREET).as_yaml()
         assert set(reader.topics) - {"/truth/hits"} == {
             "/lidar/packets",
             "/servo/state",
@@ -185,7 +186,7 @@ def test_the_committed_recording_is_small_and_says_where_it_comes_from() -> None
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"duration": 3}, "duration: Extra inputs are not permitted"),
+        ({"duration": 3}, "duration: Extra inputs are not permitted. Did you mean 'duration_s'?"),
         ({"duration_s": -1}, "duration_s: Input should be greater than 0"),
         ({"drone": None}, "follow_drone is set but the scenario has no drone"),
         ({"start_utc": "2025-06-01T10:20:30"}, "give the time zone"),
@@ -198,21 +199,22 @@ def test_a_wrong_scenario_is_an_error_that_names_the_file_and_the_key(
 ) -> None:
     path = tmp_path / "wrong.yaml"
     path.write_text(yaml.safe_dump(yaml.safe_load(STREET.read_text(encoding="utf-8")) | change), encoding="utf-8")
-    with pytest.raises(LinkError) as caught:
+    with pytest.raises(ConfigError) as caught:
         load_scenario(path)
-    assert str(caught.value).startswith(f"{path}: ")
+    assert str(caught.value).startswith(f"{path}:")  # and the line
     assert message in str(caught.value)
 
 
 def test_a_file_that_is_missing_or_no_yaml_is_an_error(tmp_path: FilePath) -> None:
-    with pytest.raises(LinkError, match="give the path of a scenario YAML file"):
+    with pytest.raises(ConfigError, match=r"none\.yaml: no such file\."):
         load_scenario(tmp_path / "none.yaml")
     (tmp_path / "bad.yaml").write_text("a: [1", encoding="utf-8")
-    with pytest.raises(LinkError, match="not a YAML file"):
+    with pytest.raises(ConfigError, match=r"bad\.yaml:1: is not YAML"):
         load_scenario(tmp_path / "bad.yaml")
 
 
-def test_quaternions_turn_back_into_their_rotation() -> None:
-    for rpy in [(0.0, 0.0, 0.0), (10.0, -20.0, 30.0), (180.0, 0.0, 0.0), (0.0, 0.0, 180.0), (90.0, 0.0, -90.0)]:
-        R = rotation_from_rpy_deg(rpy)
-        np.testing.assert_allclose(rotation_from_quaternion_xyzw(tuple(quaternion_xyzw(R))), R, atol=1e-12)
+def test_a_scenario_may_include_another_and_change_it(tmp_path: FilePath) -> None:
+    (tmp_path / "short.yaml").write_text(f"include: {STREET}\nname: short\nduration_s: 1.5\n", encoding="utf-8")
+    short = load_scenario(tmp_path / "short.yaml")
+    assert (short.name, short.duration_s) == ("short", 1.5)
+    assert short.drone == load_scenario(STREET).drone

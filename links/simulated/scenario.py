@@ -163,6 +163,9 @@ def load_scenario(path: FilePath) -> Scenario:
         except ValidationError as errors:
             for error in errors.errors(include_url=False):
                 where = tuple(str(part) for part in error["loc"])
-                near = did_you_mean(where[-1], Scenario.model_fields) if error["type"] == "extra_forbidden" else ""
-                tree.problem(where, f"{error['msg'].removeprefix('Value error, ')}.{near}")
+                if error["type"] == "extra_forbidden":
+                    known = Scenario.model_fields if len(where) == 1 else ()
+                    tree.problem(where, f"unknown key '{where[-1]}'.{did_you_mean(where[-1], known)}")
+                else:
+                    tree.problem(where, f"{error['msg'].removeprefix('Value error, ')}.")
     raise ConfigError(tree.problems)

@@ -59,6 +59,7 @@ def test_quickstart_says_where_the_drone_is_and_where_to_look(grd, tmp_path):
         "run.log",
         "run.rrd",
         "summary.json",
+        "truth_hits.csv",
         "truth_vehicle_drone.tum",
     }
     summary = json.loads((folder / "summary.json").read_text())

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from flow.link import LinkError
+from flow.problem import ConfigError
 from links.simulated.clearance import check_path, fits, room_m, sample_times_s, under_open_sky, visible
 from links.simulated.mesh import RayScene, box, merge
 from links.simulated.run import Simulation
@@ -72,5 +73,5 @@ def test_a_vehicle_off_the_road_is_a_scenario_error(tmp_path: FilePath) -> None:
     path = tmp_path / "sunk.yaml"
     vehicle = {"path": {"waypoints": [{"t_s": 0, "xyz_m": [0, 0, 0]}, {"t_s": 2, "xyz_m": [4, 0, -1]}]}}
     path.write_text(yaml.safe_dump(yaml.safe_load(STREET.read_text("utf-8")) | {"vehicle": vehicle}), encoding="utf-8")
-    with pytest.raises(LinkError, match=r"vehicle\.path: -1\.00 m off the road at 2\.00 s; .* keep it 0"):
+    with pytest.raises(ConfigError, match=r"vehicle\.path: -1\.00 m off the road at 2\.00 s; .* keep it 0"):
         load_scenario(path)

@@ -184,7 +184,7 @@ def simulate_matrix(
 
 
 def _not_installed(missing: ModuleNotFoundError) -> LinkError:
-    return LinkError(f"simulating needs '{missing.name}', not installed: pip install 'grd[simulate]'")
+    return LinkError(f"simulating needs '{missing.name}', not installed: pip install -e '.[simulate]'")
 
 
 @in_words

@@ -10,7 +10,7 @@ import numpy as np
 
 from links.evaluation.errors import AtOutputs
 
-INSTALL = "evo is not installed: pip install 'grd[evaluate]'"
+INSTALL = "evo is not installed: pip install -e '.[evaluate]'"
 
 
 def evo_errors(at: AtOutputs, estimate_xyz_m: np.ndarray) -> dict[str, float] | str:

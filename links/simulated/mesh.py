@@ -18,7 +18,7 @@ try:
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 except ImportError as error:
-    raise LinkError("the simulator needs embreex: pip install 'grd[simulate]'") from error
+    raise LinkError("the simulator needs embreex: pip install -e '.[simulate]'") from error
 
 Array32 = NDArray[np.float32]
 Array64 = NDArray[np.float64]

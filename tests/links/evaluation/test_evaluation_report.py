@@ -199,7 +199,7 @@ def test_without_evo_its_metrics_say_how_to_get_them(tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", no_evo)
     e = judge(fly(tmp_path / "a"))
-    assert e.values["evo_ape_rmse_m"].note == "evo is not installed: pip install 'grd[evaluate]'"
+    assert e.values["evo_ape_rmse_m"].note == "evo is not installed: pip install -e '.[evaluate]'"
     assert e.values["rmse_m"].value == pytest.approx(0.1)
 
 

@@ -56,6 +56,31 @@ def rotation_from_quaternion_xyzw(quaternion_xyzw: tuple[float, float, float, fl
     )
 
 
+def quaternions_xyzw(rotations: Array64) -> Array64:
+    """(n, 4), w >= 0, of rotations (n, 3, 3): the eigenvector of Bar-Itzhack's symmetric matrix (2000)."""
+    R = rotations
+    K = np.zeros((len(R), 4, 4))  # its lower half, which is what eigh reads
+    K[:, 0, 0] = R[:, 0, 0] - R[:, 1, 1] - R[:, 2, 2]
+    K[:, 1, 1] = R[:, 1, 1] - R[:, 0, 0] - R[:, 2, 2]
+    K[:, 2, 2] = R[:, 2, 2] - R[:, 0, 0] - R[:, 1, 1]
+    K[:, 3, 3] = R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2]
+    K[:, 1, 0], K[:, 2, 0], K[:, 2, 1] = (R[:, i, j] + R[:, j, i] for i, j in ((1, 0), (2, 0), (2, 1)))
+    K[:, 3, 0], K[:, 3, 1], K[:, 3, 2] = (R[:, i, j] - R[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    q = np.linalg.eigh(K)[1][:, :, -1]
+    return np.where(q[:, 3:] >= 0, q, -q)
+
+
+def rotations_from_xyzw(quaternions: Array64) -> Array64:
+    """Rotations (n, 3, 3) of quaternions (n, 4) of any length."""
+    x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
 def rotation_z(angle_rad: float) -> Array64:
     """Turn about z by `angle_rad`, counter-clockwise seen from above. (3, 3)."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)

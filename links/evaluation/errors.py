@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from links.evaluation.associate import interpolate, newest
 from links.evaluation.run_data import Output, RunData
 from links.evaluation.tum import Trajectory
-from stages.geometry import Array64
+from stages.geometry import Array64, rotations_from_xyzw
 
 GRID_NS = 20_000_000  # time is looked at each 20 ms
 
@@ -61,9 +61,9 @@ def at_outputs(output: Output, truth: Trajectory, limits: Limits) -> AtOutputs:
     distance = np.linalg.norm(error, axis=1)
     euler = angle = R_estimate = R_true = None
     if poses.quaternion_xyzw is not None:
-        R_estimate = rotations(poses.quaternion_xyzw[index])
+        R_estimate = rotations_from_xyzw(poses.quaternion_xyzw[index])
     if both and quaternion is not None and R_estimate is not None:
-        R_true = rotations(quaternion[index])
+        R_true = rotations_from_xyzw(quaternion[index])
         euler = wrap(euler_rpy(R_estimate) - euler_rpy(R_true))
         angle = np.linalg.norm(log_rotation(np.swapaxes(R_estimate, 1, 2) @ R_true), axis=1)
     covariance = sigma = nees = nees6 = None
@@ -129,17 +129,6 @@ def span_of(run: RunData) -> tuple[tuple[int, int] | None, str]:
     if run.truth is not None:
         return (int(run.truth.stamps_ns[0]), int(run.truth.stamps_ns[-1])), "the truth"
     return None, "neither the recording's time nor truth is known"
-
-
-def rotations(quaternion_xyzw: Array64) -> Array64:
-    """Rotations (n, 3, 3) of unit quaternions (n, 4)."""
-    x, y, z, w = quaternion_xyzw.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def euler_rpy(R: Array64) -> Array64:

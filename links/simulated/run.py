@@ -27,7 +27,6 @@ from links.simulated.lidar import Lidar, Pulses, turned_poses
 from links.simulated.mesh import Array64
 from links.simulated.operator import ScriptedOperator
 from links.simulated.path import Path
-from links.simulated.quaternion import quaternions_xyzw
 from links.simulated.ride import Ride
 from links.simulated.scenario import Scenario, load_scenario
 from links.simulated.scene import Scene, Truth, drone_shapes
@@ -37,6 +36,7 @@ from links.simulated.vehicle_odometry import VehicleOdometry
 from links.simulated.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world import build_world
 from links.velodyne import vlp16
+from stages.geometry import quaternions_xyzw
 
 BATCH_PACKETS = 32  # pulses are cast in batches; how many does not change a byte
 TRUTH_PERIOD_NS = 10_000_000

@@ -16,8 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from flow.link import Record
 from links.simulated.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.path import Path
-from links.simulated.quaternion import quaternions_xyzw
 from links.simulated.ride import Ride
+from stages.geometry import quaternions_xyzw
 
 NS = 1_000_000_000
 

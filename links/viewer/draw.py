@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 
 from flow.message import Message
 from links.viewer import colours, images
-from links.viewer.ellipsoid import ellipsoid, quaternion_xyzw
+from links.viewer.ellipsoid import ellipsoid
 from links.viewer.scene import DRONE_FRAME, Mark, Scene, drone_transform, turntable_transform
 from links.viewer.slices import thin
+from stages.geometry import quaternions_xyzw
 from stages.messages import (
     DepthImage,
     Detections,
@@ -171,7 +172,7 @@ def _(message: DroneFix, name: str, scene: Scene) -> Marks:
         rr.Ellipsoids3D(
             centers=[xyz_m],
             half_sizes=[half_sizes_m],
-            quaternions=[rr.Quaternion(xyzw=quaternion_xyzw(rotation))],
+            quaternions=[rr.Quaternion(xyzw=quaternions_xyzw(rotation[None])[0])],
             colors=colours.DRONE_VEIL,
             fill_mode=rr.components.FillMode.TransparentFillMajorWireframe,
         ),

@@ -1,6 +1,6 @@
 """A covariance as the ellipsoid a person can look at.
 
-Source: ours; the quaternion is Bar-Itzhack's (2000, "New method for extracting the quaternion from a rotation matrix").
+Source: ours.
 """
 
 from __future__ import annotations
@@ -20,17 +20,3 @@ def ellipsoid(covariance_m2: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     if np.linalg.det(axes) < 0:
         axes = axes * [1.0, 1.0, -1.0]
     return np.sqrt(CHI2_3D_95 * np.maximum(eigenvalues, 0.0)), axes
-
-
-def quaternion_xyzw(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternion (x, y, z, w) of a rotation matrix: the eigenvector of K to its largest eigenvalue."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    k = np.array(
-        [
-            [a - e - i, b + d, c + g, h - f],
-            [b + d, e - a - i, f + h, c - g],
-            [c + g, f + h, i - a - e, d - b],
-            [h - f, c - g, d - b, a + e + i],
-        ]
-    )
-    return np.linalg.eigh(k / 3.0)[1][:, -1]

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from links.evaluation.associate import interpolate, newest, slerp
-from links.evaluation.errors import euler_rpy, log_rotation, mahalanobis, pose_error, rotations, sigma_along
+from links.evaluation.errors import euler_rpy, log_rotation, mahalanobis, pose_error, sigma_along
 from links.evaluation.statistics import (
     chi2_cdf,
     chi2_density,
@@ -19,7 +19,7 @@ from links.evaluation.statistics import (
     mean_nees_bounds,
     wilson_interval,
 )
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry import rotation_from_rpy_deg, rotations_from_xyzw
 from tests.links.evaluation.made_runs import yaw_quaternion
 
 
@@ -79,7 +79,7 @@ def test_truth_is_linear_between_its_samples_and_unknown_elsewhere():
 def test_slerp_takes_the_shorter_way_whatever_the_signs():
     q0, q1 = yaw_quaternion([0.2, 3.0]), yaw_quaternion([1.0, -3.0])
     half = slerp(q0, -q1, np.array([0.5, 0.5]))
-    yaw = euler_rpy(rotations(half))[:, 2]
+    yaw = euler_rpy(rotations_from_xyzw(half))[:, 2]
     assert yaw[0] == pytest.approx(0.6)
     assert abs(yaw[1]) == pytest.approx(math.pi)
 
@@ -93,13 +93,13 @@ def test_the_newest_output_is_never_one_of_the_future():
 def test_the_logarithm_undoes_a_rotation(rpy, angle):
     axis = rotation_from_rpy_deg(rpy)[:, 0]
     q = np.array([[*(axis * math.sin(angle / 2)), math.cos(angle / 2)]])
-    assert log_rotation(rotations(q))[0] == pytest.approx(axis * angle, abs=1e-6)
+    assert log_rotation(rotations_from_xyzw(q))[0] == pytest.approx(axis * angle, abs=1e-6)
 
 
 def test_half_a_turn_has_the_length_pi():
     for axis in np.eye(3):
         q = np.array([[*axis, 0.0]])
-        assert np.linalg.norm(log_rotation(rotations(q))) == pytest.approx(math.pi)
+        assert np.linalg.norm(log_rotation(rotations_from_xyzw(q))) == pytest.approx(math.pi)
 
 
 def test_euler_angles_are_those_of_the_project():

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError, Record, Run
-from links.evaluation.errors import euler_rpy, rotations
+from links.evaluation.errors import euler_rpy
 from links.evaluation.tum import read_tum
 from links.results import Results
 from links.truth import TruthLog
+from stages.geometry import rotations_from_xyzw
 from stages.messages import DepthImage, Detections
 from tests.links.evaluation.made_runs import yaw_quaternion
 
@@ -37,7 +38,7 @@ def test_truth_is_written_as_the_drone_in_the_vehicle_with_its_rotation(tmp_path
     assert truth.stamps_ns.tolist() == [1_000_000_000]
     assert truth.xyz_m[0] == pytest.approx([5, 0, 7])
     assert truth.quaternion_xyzw is not None
-    assert np.degrees(euler_rpy(rotations(truth.quaternion_xyzw)))[0] == pytest.approx([0, 0, 90], abs=1e-3)
+    assert np.degrees(euler_rpy(rotations_from_xyzw(truth.quaternion_xyzw)))[0] == pytest.approx([0, 0, 90], abs=1e-3)
     assert (tmp_path / "truth_hits.csv").read_text() == "stamp_s\n0.000000002\n3.000000001\n"
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from links.simulated.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.path import Path, Waypoint, rotations_z
-from links.simulated.quaternion import quaternions_xyzw, rotations_from_vectors, rotations_from_xyzw
+from links.simulated.quaternion import rotations_from_vectors
 from links.simulated.series import between_steps, gauss_markov, random_walk
 from links.simulated.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
-from stages.geometry import rotation_from_quaternion_xyzw, rotation_from_rpy_deg
+from stages.geometry import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg, rotations_from_xyzw
 
 NONE = DriftSettings(
     scale=0,

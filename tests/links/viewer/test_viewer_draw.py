@@ -12,9 +12,9 @@ import synthetic
 from flow.message import Mat3, Message, Points64, message
 from links.viewer import colours, images
 from links.viewer.draw import draw
-from links.viewer.ellipsoid import ellipsoid, quaternion_xyzw
+from links.viewer.ellipsoid import ellipsoid
 from links.viewer.scene import Scene, opening, scenery, turntable_transform
-from stages.geometry import rotation_from_quaternion_xyzw, rotation_from_rpy_deg
+from stages.geometry import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
 from stages.messages import DepthImage, Detections, DroneFix, ScoreImage, ServoState, TrackingState, TrackState
 
 
@@ -79,7 +79,7 @@ def test_the_ellipsoid_turns_with_its_covariance():
 @pytest.mark.parametrize("rpy_deg", [(0, 0, 0), (180, 0, 0), (0, 180, 0), (0, 0, 180), (12, -50, 170)])
 def test_a_quaternion_turns_as_its_matrix_does(rpy_deg):
     rotation = rotation_from_rpy_deg(rpy_deg)
-    x, y, z, w = quaternion_xyzw(rotation)
+    x, y, z, w = quaternions_xyzw(rotation[None])[0]
     np.testing.assert_allclose(rotation_from_quaternion_xyzw((x, y, z, w)), rotation, atol=1e-12)
 
 

@@ -86,6 +86,32 @@ class SweptPoints(Message):
 
 
 @message
+class SweptPulses(Message):
+    """Every laser pulse of a slice in the vehicle frame, also those that saw nothing: what flew free is evidence too.
+
+    One row per pulse, in firing order; of two returns of a pulse the nearer. stamp_ns is the first pulse's. A slice
+    whose turntable angle is not known is empty.
+    """
+
+    point_stamp_ns: PerPointI64  # when each laser fired
+    direction_vehicle: Points32  # unit vectors
+    range_m: PerPointF32  # along the direction, from origin_vehicle_m; 0: no return
+    laser: PerPointU8
+    reflectivity: PerPointU8
+    turntable_rad: float  # turntable angle, mid-slice; NaN: not known
+    origin_vehicle_m: tuple[float, float, float]  # where the beams start, mid-slice
+
+
+@message
+class VehicleMotion(Message):
+    """Where the vehicle has driven since it started: T_start_vehicle, smooth and drifting, by its own odometry."""
+
+    xyz_start_m: Vec3
+    R_start_vehicle: Mat3
+    covariance: Mat6 | None  # rotation [rad] before translation [m]; None: the source does not say
+
+
+@message
 class DepthImage(Message):
     """One whole sweep seen from the turntable as a pinhole image looking up; stamp_ns is the sweep's end. P III.A.
 
@@ -112,22 +138,33 @@ class ScoreImage(Message):
 
 @message
 class Detections(Message):
-    """Drone candidates of one sweep, best first. A list that is empty or wholly refused is a normal answer."""
+    """Drone candidates of one search, best first. A list that is empty or wholly refused is a normal answer.
 
-    xyz_vehicle_m: Points64
-    score: PerPointF64  # e = e_inner + e_outer
-    e_inner: PerPointF64
+    stamp_ns: up to when was searched. The paper's detector judges whole sweeps by e = e_inner + e_outer, lower is
+    better; the detector by evidence judges as data arrive and states a probability.
+    """
+
+    xyz_vehicle_m: Points64  # at seen_ns
+    score: PerPointF64  # e, or ln of the odds that it is a drone
+    e_inner: PerPointF64  # paper only, else 0
     e_outer: PerPointF64
     accepted: PerPointBool
     reasons: tuple[str, ...]  # one per candidate: why it was accepted or refused
     verdict: str  # one sentence for people: "drone at ..." or "no drone: ..."
+    start_ns: int | None = None  # since when was searched; None: since the depth image's start
+    seen_ns: PerPointI64 | None = None  # when each was seen last; None: at some time in the sweep
+    velocity_vehicle_mps: Points64 | None = None
+    probability: PerPointF64 | None = None  # that it is a drone, as calibrated; None: the score says nothing of it
+    candidate_id: PerPointI64 | None = None  # the same thing keeps its number
 
 
 class TrackingState(enum.Enum):
     """What the tracker is doing."""
 
     SEARCHING = 0  # no drone known
+    CANDIDATE = 1  # something that may be one is being looked at
     TRACKING = 2
+    COASTING = 3  # not seen now, predicted; the covariance grows
     LOST = 4  # had one, has none
 
 
@@ -140,16 +177,22 @@ class DroneFix(Message):
     hits: int  # returns used
     iterations: int
     shift_m: float  # last mean shift step
+    track_id: int = 1  # which drone
+    velocity_vehicle_mps: Vec3 | None = None  # relative to the vehicle; None: not estimated
 
 
 @message
 class TrackState(Message):
-    """The tracker's state after each frame, with the reason for it in words."""
+    """A track's state after each frame, with the reason for it in words, and where it is predicted at stamp_ns."""
 
     state: TrackingState
     reason: str
     hits: int  # returns within the radius in the frame just ended
     frame_s: float  # how long that frame was
+    track_id: int = 1  # which drone; one that was lost and found elsewhere has a new number
+    xyz_vehicle_m: Vec3 | None = None  # None: not predicted
+    velocity_vehicle_mps: Vec3 | None = None
+    covariance_m2: Mat3 | None = None  # of the position
 
 
 @message

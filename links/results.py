@@ -24,11 +24,18 @@ from stages.messages import DepthImage, Detections, DroneFix, TrackState
 FIX_FILE, COVARIANCE_FILE, LOG_FILE = "fix_vehicle_drone.tum", "fix_covariance.csv", "run.log"
 DETECTIONS_FILE, SUMMARY_FILE = "detections.csv", "summary.json"
 TRUTH_FILE, TRUTH_HITS_FILE = "truth_vehicle_drone.tum", "truth_hits.csv"
+TRUTH_VISIBLE_FILE = "truth_visible.csv"
 POSE_FILE, POSE_COVARIANCE_FILE = "pose_vehicle_drone.tum", "pose_covariance.csv"
 POSITION_ONLY = (
     "# T_vehicle_drone, position only: the LiDAR does not measure orientation, '0 0 0 1' stands for not measured\n"
 )
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
+
+
+def of_drone(name: str, number: int) -> str:
+    """`truth_hits.csv` for drone 1, `truth_hits_2.csv` for drone 2."""
+    stem, suffix = name.rsplit(".", 1)
+    return name if number == 1 else f"{stem}_{number}.{suffix}"
 
 
 def stamp_s(stamp_ns: int) -> str:
@@ -43,11 +50,12 @@ def tum_line(stamp_ns: int, xyz_m: NDArray[np.float64], quaternion_xyzw: tuple[f
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """The tracker changed its state."""
+    """A track changed its state."""
 
     stamp_ns: int
     state: str
     reason: str
+    track_id: int = 1
 
 
 class Results(Tap):
@@ -63,6 +71,7 @@ class Results(Tap):
     _examples: dict[str, str] = PrivateAttr(default_factory=dict)
     _found: int = PrivateAttr(default=0)
     _transitions: list[Transition] = PrivateAttr(default_factory=list)
+    _state: dict[int, str] = PrivateAttr(default_factory=dict)  # of each track
 
     @property
     def fixes(self) -> list[DroneFix]:
@@ -86,7 +95,7 @@ class Results(Tap):
 
     @property
     def transitions(self) -> list[Transition]:
-        """Every change of the tracker's state, with its reason."""
+        """Every change of a track's state, with its reason; those of all tracks as they came."""
         return self._transitions
 
     def open(self, run: Run) -> None:
@@ -96,7 +105,7 @@ class Results(Tap):
         self._files[FIX_FILE].write(POSITION_ONLY)
         self._covariance = csv.writer(self._files[COVARIANCE_FILE])
         upper = [f"c{a}{b}_m2" for a, b in zip("xxxyyz", "xyzyzz", strict=True)]
-        self._covariance.writerow(["stamp_s", *upper, "hits", "iterations"])
+        self._covariance.writerow(["stamp_s", *upper, "hits", "iterations", "track_id"])
         self._detections = csv.writer(self._files[DETECTIONS_FILE])
         self._detections.writerow(["start_s", "end_s", "x_m", "y_m", "z_m", "score"])
 
@@ -106,8 +115,8 @@ class Results(Tap):
             self._fixes.append(message)
             self._files[FIX_FILE].write(tum_line(message.stamp_ns, message.xyz_vehicle_m))
             upper = message.covariance_m2[np.triu_indices(3)]
-            cells = [stamp_s(message.stamp_ns), *(f"{v:.9g}" for v in upper), message.hits, message.iterations]
-            self._covariance.writerow(cells)
+            counts = [message.hits, message.iterations, message.track_id]
+            self._covariance.writerow([stamp_s(message.stamp_ns), *(f"{v:.9g}" for v in upper), *counts])
         elif isinstance(message, DepthImage):
             self._sweep_start_ns = {message.stamp_ns: message.start_ns}
         elif isinstance(message, Detections):
@@ -118,15 +127,27 @@ class Results(Tap):
             self._found += bool(message.accepted.any())
             self._log(message.stamp_ns, output, message.verdict)
         elif isinstance(message, TrackState):
-            last = self._transitions[-1].state if self._transitions else None
-            if message.state.name != last:
-                self._transitions.append(Transition(message.stamp_ns, message.state.name, message.reason))
-                self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")
+            self._note_state(output, message)
+
+    def _note_state(self, output: str, message: TrackState) -> None:
+        """Keep and log a track's state when it is another than before."""
+        state, number = message.state.name, message.track_id
+        if self._state.get(number) == state:
+            return
+        self._state[number] = state
+        self._transitions.append(Transition(message.stamp_ns, state, message.reason, number))
+        who = f"track {number} " if number > 1 else ""
+        self._log(message.stamp_ns, output, f"{who}{state}: {message.reason}")
 
     def _write_detections(self, message: Detections) -> None:
-        """A line for each accepted candidate, best first; a sweep without one is a line without a position."""
-        since = self._last_sweep_ns if self._last_sweep_ns is not None else message.stamp_ns
-        start_ns = self._sweep_start_ns.get(message.stamp_ns, since)
+        """A line for each accepted candidate, best first; a search without one is a line without a position.
+
+        A search began when its message says, else with its depth image, else where the search before it ended.
+        """
+        start_ns = message.start_ns
+        if start_ns is None:
+            since = self._last_sweep_ns if self._last_sweep_ns is not None else message.stamp_ns
+            start_ns = self._sweep_start_ns.get(message.stamp_ns, since)
         self._last_sweep_ns = message.stamp_ns
         span = [stamp_s(start_ns), stamp_s(message.stamp_ns)]
         accepted = zip(message.xyz_vehicle_m[message.accepted], message.score[message.accepted], strict=True)

@@ -6,6 +6,7 @@ Source: ours; recording format in recordings/README.md (/truth/*).
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,15 +17,26 @@ from numpy.typing import NDArray
 
 from flow.link import LinkError, Record
 from links.evaluation.associate import interpolate
+from links.evaluation.tracks import follow
 from links.evaluation.tum import FULL_POSE, NO_DRONE
-from links.results import TRUTH_FILE, TRUTH_HITS_FILE, stamp_s, tum_line
+from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VISIBLE_FILE, of_drone, stamp_s, tum_line
 from stages.geometry import rotation_from_quaternion_xyzw
 from stages.messages import DroneFix
 
-TOPIC_VEHICLE, TOPIC_DRONE, TOPIC_HITS = "/truth/vehicle", "/truth/drone", "/truth/hits"
+TOPIC_VEHICLE = "/truth/vehicle"
+OF_A_DRONE = re.compile(r"/truth/(drone|hits|visible)(?:_([1-9]\d*))?")  # /truth/hits_2 is of drone 2
 MAX_GAP_NS = 50_000_000  # truth further apart than this is not interpolated over
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
 CHI2_95_3 = 7.814728  # 95 % quantile of chi-square with 3 degrees of freedom
+
+
+@dataclass
+class TrueDrone:
+    """What a recording's truth says of one drone."""
+
+    pose: dict[int, Any] = field(default_factory=dict)  # T_world_drone by stamp [ns]
+    hits_ns: list[int] | None = None  # pulses that it returned; None: the recording does not say
+    visible: dict[int, bool] | None = None  # whether the LiDAR has a line of sight to it, since when
 
 
 @dataclass
@@ -32,51 +44,85 @@ class TruthLog:
     """Sets truth records aside while a recording streams by."""
 
     vehicle: dict[int, Any] = field(default_factory=dict)
-    drone: dict[int, Any] = field(default_factory=dict)
-    hits_ns: list[int] | None = None  # pulses that the drone returned; None: the recording does not say
+    drones: dict[int, TrueDrone] = field(default_factory=dict)  # by number, from 1
 
     def aside(self, records: Iterable[Record]) -> Iterator[Record]:
         """Pass on all records but those of truth, which are kept here."""
         for record in records:
+            of_a_drone = OF_A_DRONE.fullmatch(record.topic)
             if record.topic == TOPIC_VEHICLE:
                 self.vehicle[record.stamp_ns] = _pose(record)
-            elif record.topic == TOPIC_DRONE:
-                self.drone[record.stamp_ns] = _pose(record)
-            elif record.topic == TOPIC_HITS:
-                self.hits_ns = self.hits_ns or []
-                self.hits_ns += _pulses(record)
+            elif of_a_drone:
+                drone = self.drones.setdefault(int(of_a_drone[2] or 1), TrueDrone())
+                _keep(drone, of_a_drone[1], record)
             else:
                 yield record
 
-    def drone_in_vehicle(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Stamps (n,) [ns] and the drone's position in the vehicle frame (n, 3) [m], where both poses are known."""
-        stamps = self._stamps()
+    def drone_in_vehicle(self, number: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Stamps (n,) [ns] and a drone's position in the vehicle frame (n, 3) [m], where both poses are known."""
+        poses = self.drones[number].pose if number in self.drones else {}
+        stamps = sorted(self.vehicle.keys() & poses.keys())
         xyz = np.empty((len(stamps), 3))
         for row, stamp in enumerate(stamps):
             t_vehicle, q_vehicle = self.vehicle[stamp]
             R_world_vehicle = rotation_from_quaternion_xyzw(q_vehicle)
-            xyz[row] = R_world_vehicle.T @ (np.asarray(self.drone[stamp][0]) - np.asarray(t_vehicle))
+            xyz[row] = R_world_vehicle.T @ (np.asarray(poses[stamp][0]) - np.asarray(t_vehicle))
         return np.array(stamps, dtype=np.int64), xyz
 
+    def errors_of(self, fixes: list[DroneFix]) -> FixErrors | None:
+        """Each fix against the drone that its track follows; None when there was none."""
+        numbers = [number for number, drone in sorted(self.drones.items()) if drone.pose]
+        paths = [self.drone_in_vehicle(number) for number in numbers]
+        if len(paths) < 2:
+            return fix_errors(fixes, *paths[0]) if paths else None
+        stamps_ns = np.array([fix.stamp_ns for fix in fixes], dtype=np.int64)
+        xyz_m = np.array([fix.xyz_vehicle_m for fix in fixes]).reshape(-1, 3)
+        tracks = np.array([fix.track_id for fix in fixes], dtype=np.int64)
+        followed = follow(stamps_ns, xyz_m, tracks, paths, MAX_GAP_NS).drone
+        parts = [
+            fix_errors([fix for fix, which in zip(fixes, followed, strict=True) if which == index], *path)
+            for index, path in enumerate(paths)
+        ]
+        stamps = np.concatenate([part.stamps_ns for part in parts])
+        order = np.argsort(stamps, kind="stable")
+        errors, nees = (np.concatenate([getattr(part, what) for part in parts]) for what in ("error_m", "nees"))
+        return FixErrors(stamps[order], errors[order], nees[order], sum(part.not_covered for part in parts))
+
     def write(self, folder: Path) -> None:
-        """Write T_vehicle_drone and the drone's hits beside a run's results; nothing when the recording holds no truth.
+        """Write what is known of each drone beside a run's results; nothing when the recording holds no truth.
 
         A recording that knows where the vehicle is and has no drone gives a file that says so.
         """
-        if not self.vehicle and not self.drone:
-            return
-        stamps_ns, xyz = self.drone_in_vehicle()
-        lines = [f"# T_vehicle_drone, {FULL_POSE}, truth\n" if self.drone else f"# {NO_DRONE} in this recording\n"]
-        for stamp, position in zip(stamps_ns.tolist(), xyz, strict=True):
-            q = _relative(self.vehicle[stamp][1], self.drone[stamp][1])
-            lines.append(tum_line(stamp, position, q))
-        (folder / TRUTH_FILE).write_text("".join(lines), encoding="utf-8")
-        if self.hits_ns is not None:
-            hits = "".join(f"{stamp_s(stamp)}\n" for stamp in sorted(self.hits_ns))
-            (folder / TRUTH_HITS_FILE).write_text(f"stamp_s\n{hits}", encoding="utf-8")
+        if any(drone.pose for drone in self.drones.values()):
+            for number, drone in self.drones.items():
+                self._write_drone(folder, number, drone)
+        elif self.vehicle:
+            (folder / TRUTH_FILE).write_text(f"# {NO_DRONE} in this recording\n", encoding="utf-8")
 
-    def _stamps(self) -> list[int]:
-        return sorted(self.vehicle.keys() & self.drone.keys())
+    def _write_drone(self, folder: Path, number: int, drone: TrueDrone) -> None:
+        lines = [f"# T_vehicle_drone, {FULL_POSE}, truth\n"]
+        for stamp, position in zip(*self.drone_in_vehicle(number), strict=True):
+            stamp_ns = int(stamp)
+            q = _relative(self.vehicle[stamp_ns][1], drone.pose[stamp_ns][1])
+            lines.append(tum_line(stamp_ns, position, q))
+        (folder / of_drone(TRUTH_FILE, number)).write_text("".join(lines), encoding="utf-8")
+        if drone.hits_ns is not None:
+            hits = "".join(f"{stamp_s(stamp)}\n" for stamp in sorted(drone.hits_ns))
+            (folder / of_drone(TRUTH_HITS_FILE, number)).write_text(f"stamp_s\n{hits}", encoding="utf-8")
+        if drone.visible is not None:
+            rows = "".join(f"{stamp_s(stamp)},{int(seen)}\n" for stamp, seen in sorted(drone.visible.items()))
+            (folder / of_drone(TRUTH_VISIBLE_FILE, number)).write_text(f"stamp_s,visible\n{rows}", encoding="utf-8")
+
+
+def _keep(drone: TrueDrone, what: str, record: Record) -> None:
+    if what == "drone":
+        drone.pose[record.stamp_ns] = _pose(record)
+    elif what == "hits":
+        drone.hits_ns = drone.hits_ns or []
+        drone.hits_ns += _pulses(record)
+    else:
+        drone.visible = drone.visible or {}
+        drone.visible[record.stamp_ns] = _visible(record)
 
 
 def _relative(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -96,6 +142,16 @@ def _pulses(record: Record) -> list[int]:
         return [int(stamp) for stamp in json.loads(record.data)["pulse_stamp_ns"]]
     except (ValueError, TypeError, KeyError) as error:
         raise LinkError(f"{record.topic} at {record.stamp_ns} ns holds no pulses ({error!r})") from None
+
+
+def _visible(record: Record) -> bool:
+    try:
+        visible = json.loads(record.data)["visible"]
+    except (ValueError, TypeError, KeyError) as error:
+        raise LinkError(f"{record.topic} at {record.stamp_ns} ns does not say what is visible ({error!r})") from None
+    if not isinstance(visible, bool):
+        raise LinkError(f"{record.topic} at {record.stamp_ns} ns: visible is {visible!r}, neither true nor false")
+    return visible
 
 
 def _pose(record: Record) -> tuple[tuple[float, float, float], Quaternion]:

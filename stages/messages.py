@@ -42,6 +42,7 @@ class LidarFirings(Message):
     return_kind: PerPointU8  # 0 strongest (or only), 1 last; dual mode has both
     xyz_lidar_m: Points32  # (0, 0, 0) where there was no return
     lost_packets: int  # packets missing just before this one
+    laser_elevation_rad: Annotated[NDArray[np.float64], Shape("lasers")]  # where each laser points, over z_lidar = 0
 
 
 @message
@@ -156,6 +157,19 @@ class Detections(Message):
     velocity_vehicle_mps: Points64 | None = None
     probability: PerPointF64 | None = None  # that it is a drone, as calibrated; None: the score says nothing of it
     candidate_id: PerPointI64 | None = None  # the same thing keeps its number
+
+
+@message
+class Candidates(Message):
+    """What may be a drone right now and is worth another look, most probable first; told when it changes."""
+
+    candidate_id: PerPointI64  # the same as in Detections
+    xyz_vehicle_m: Points64  # predicted at stamp_ns
+    velocity_vehicle_mps: Points64
+    probability: PerPointF64
+    seen_ns: PerPointI64
+    looks: PerPointI64  # turns of the rotor in which it was hit
+    reasons: tuple[str, ...]  # what speaks for and against, one each
 
 
 class TrackingState(enum.Enum):

@@ -22,7 +22,7 @@ from pydantic import Field, PrivateAttr
 from flow.stage import Stage
 from stages.depth_image import DepthCanvas
 from stages.geometry import LidarMount
-from stages.messages import DepthImage, LidarFirings, ServoState, SweptPoints
+from stages.messages import DepthImage, LidarFirings, ServoState, SweptPoints, SweptPulses
 from stages.turntable import Turntable
 
 
@@ -62,7 +62,7 @@ class Sweep(Stage):
         else:
             self._travel = Revolution()
 
-    def on_firings(self, firings: LidarFirings) -> Iterator[SweptPoints | DepthImage]:
+    def on_firings(self, firings: LidarFirings) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
         """Queue the packet; give out what can be placed."""
         if firings.pulse_stamp_ns.size == 0:
             return
@@ -71,17 +71,17 @@ class Sweep(Stage):
         if len(self._waiting) > self.max_waiting_packets:
             yield from self._place(self._waiting.popleft())
 
-    def on_servo(self, servo: ServoState) -> Iterator[SweptPoints | DepthImage]:
+    def on_servo(self, servo: ServoState) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
         """One more angle; give out what waited for it."""
         self._turntable.add(servo)
         yield from self._release()
 
-    def finish(self) -> Iterator[SweptPoints | DepthImage]:
+    def finish(self) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
         """Give out what still waits, as far as its angle is known. A sweep cut short makes no image."""
         while self._waiting:
             yield from self._place(self._waiting.popleft())
 
-    def _release(self) -> Iterator[SweptPoints | DepthImage]:
+    def _release(self) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
         waiting, turntable, turns = self._waiting, self._turntable, self.mount.turns
         while waiting:
             known_ns = turntable.known_until_ns
@@ -89,7 +89,7 @@ class Sweep(Stage):
                 return
             yield from self._place(waiting.popleft())
 
-    def _place(self, firings: LidarFirings) -> Iterator[SweptPoints | DepthImage]:
+    def _place(self, firings: LidarFirings) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
         turntable, travel, canvas = self._turntable, self._travel, self._canvas  # a private attribute costs 2 us a look
         pulse_ns = firings.pulse_stamp_ns
         first_ns, middle_ns, last_ns = (int(pulse_ns[i]) for i in (0, pulse_ns.size // 2, -1))
@@ -110,6 +110,7 @@ class Sweep(Stage):
             unplaced=placed.unplaced,
             reason=reason,
         )
+        yield turntable.pulses(firings)
         turntable.forget_before(last_ns)
         if math.isnan(angle_rad):
             travel.restart()

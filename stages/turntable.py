@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stages.compiled import compiled
 from stages.geometry import Array64, LidarMount
-from stages.messages import LidarFirings, ServoState
+from stages.messages import LidarFirings, ServoState, SweptPulses
 
 STATES_KEPT = 512  # 5 s at 100 Hz: far longer than any packet waits
 
@@ -79,6 +79,72 @@ def place_returns(
         turntable_rad[placed] = angle
         placed += 1
     return placed, unplaced
+
+
+@compiled
+def place_pulses(
+    pulse_ns: NDArray[np.int64],
+    return_kind: NDArray[np.uint8],
+    laser: NDArray[np.uint8],
+    azimuth_rad: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    xyz_lidar_m: NDArray[np.float32],
+    elevation_rad: Array64,
+    state_ns: NDArray[np.int64],
+    state_rad: Array64,
+    max_gap_ns: int,
+    T_vehicle_turntable: Array64,
+    T_turntable_lidar: Array64,
+    origin_vehicle_m: Array64,
+    row: NDArray[np.int64],
+    direction_vehicle: NDArray[np.float32],
+    distance_m: NDArray[np.float32],
+) -> int:
+    """Fill the last three arrays with every pulse of a packet: its row, unit direction, distance of its nearest return.
+
+    Both are seen from origin_vehicle_m (3,). Returns how many pulses there are, 0 when an angle is not known. A pulse
+    that returned nothing looks along (cos w sin a, cos w cos a, sin w) of the lidar frame.
+    """
+    A, B = T_vehicle_turntable, T_turntable_lidar
+    n = 0
+    for i in range(pulse_ns.size):
+        if return_kind[i] != 0:  # the last return of the pulse before
+            if n > 0 and range_m[i] > 0.0 and (distance_m[n - 1] == 0.0 or range_m[i] < distance_m[n - 1]):
+                n -= 1  # nearer: takes its place
+            else:
+                continue
+        angle = angle_at(pulse_ns[i], state_ns, state_rad, max_gap_ns)
+        if math.isnan(angle):
+            return 0
+        seen = range_m[i] > 0.0
+        if seen:
+            px, py, pz = float(xyz_lidar_m[i, 0]), float(xyz_lidar_m[i, 1]), float(xyz_lidar_m[i, 2])
+        else:
+            w = elevation_rad[laser[i]]
+            c = math.cos(w)
+            px, py, pz = c * math.sin(azimuth_rad[i]), c * math.cos(azimuth_rad[i]), math.sin(w)
+        x = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz
+        y = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz
+        z = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz
+        if seen:
+            x, y, z = x + B[0, 3], y + B[1, 3], z + B[2, 3]
+        c, s = math.cos(angle), math.sin(angle)
+        x, y = c * x - s * y, s * x + c * y
+        vx = A[0, 0] * x + A[0, 1] * y + A[0, 2] * z
+        vy = A[1, 0] * x + A[1, 1] * y + A[1, 2] * z
+        vz = A[2, 0] * x + A[2, 1] * y + A[2, 2] * z
+        if seen:
+            vx += A[0, 3] - origin_vehicle_m[0]
+            vy += A[1, 3] - origin_vehicle_m[1]
+            vz += A[2, 3] - origin_vehicle_m[2]
+        length = math.sqrt(vx * vx + vy * vy + vz * vz)
+        row[n] = i
+        direction_vehicle[n, 0] = vx / length
+        direction_vehicle[n, 1] = vy / length
+        direction_vehicle[n, 2] = vz / length
+        distance_m[n] = length if seen else 0.0
+        n += 1
+    return n
 
 
 class Placed(NamedTuple):
@@ -155,10 +221,7 @@ class Turntable:
     def place(self, firings: LidarFirings) -> Placed:
         """The packet's returns in the vehicle frame."""
         n = firings.pulse_stamp_ns.size
-        state_ns, state_rad, max_gap_ns = self._state_ns, self._state_rad, self._max_gap_ns
-        if not self._mount.turns:
-            state_ns = np.array([firings.pulse_stamp_ns.min(), firings.pulse_stamp_ns.max()], dtype=np.int64)
-            state_rad, max_gap_ns = np.zeros(2), int(state_ns[1] - state_ns[0])
+        state_ns, state_rad, max_gap_ns = self._states_for(firings.pulse_stamp_ns)
         pulse = np.empty(n, dtype=np.int64)
         xyz_vehicle_m = np.empty((n, 3), dtype=np.float32)
         turntable_rad = np.empty(n, dtype=np.float32)
@@ -177,6 +240,53 @@ class Turntable:
             turntable_rad,
         )
         return Placed(pulse[:placed], xyz_vehicle_m[:placed], turntable_rad[:placed], unplaced)
+
+    def pulses(self, firings: LidarFirings) -> SweptPulses:
+        """Every pulse of the packet in the vehicle frame; none when the angle is not known for all of it."""
+        pulse_ns = firings.pulse_stamp_ns
+        n = pulse_ns.size
+        state_ns, state_rad, max_gap_ns = self._states_for(pulse_ns)
+        middle_rad = float(angle_at(int(pulse_ns[n // 2]), state_ns, state_rad, max_gap_ns))
+        origin = self.lidar_origin_vehicle_m(0.0 if math.isnan(middle_rad) else middle_rad)
+        row = np.empty(n, dtype=np.int64)
+        direction_vehicle = np.empty((n, 3), dtype=np.float32)
+        distance_m = np.empty(n, dtype=np.float32)
+        count = place_pulses(
+            pulse_ns,
+            firings.return_kind,
+            firings.laser,
+            firings.azimuth_rad,
+            firings.range_m,
+            firings.xyz_lidar_m,
+            firings.laser_elevation_rad,
+            state_ns,
+            state_rad,
+            max_gap_ns,
+            self.T_vehicle_turntable,
+            self._T_turntable_lidar,
+            np.array(origin),
+            row,
+            direction_vehicle,
+            distance_m,
+        )
+        row = row[:count]
+        return SweptPulses(
+            stamp_ns=int(pulse_ns[0]),
+            point_stamp_ns=pulse_ns[row],
+            direction_vehicle=direction_vehicle[:count],
+            range_m=distance_m[:count],
+            laser=firings.laser[row],
+            reflectivity=firings.reflectivity[row],
+            turntable_rad=middle_rad,
+            origin_vehicle_m=origin,
+        )
+
+    def _states_for(self, pulse_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array64, int]:
+        """States around the pulses and the longest gap between two; a LiDAR without servo stands at 0."""
+        if self._mount.turns:
+            return self._state_ns, self._state_rad, self._max_gap_ns
+        state_ns = np.array([pulse_ns.min(), pulse_ns.max()], dtype=np.int64)
+        return state_ns, np.zeros(2), int(state_ns[1] - state_ns[0])
 
     def why_unknown(self, t_ns: int) -> str:
         """Why the angle at a time is not known, in words."""

@@ -15,10 +15,14 @@ import typer
 from flow.link import LinkError
 from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
 from links.evaluation import Evaluation, Limits, evaluate, read_run
-from links.evaluation.compare import Pair, pair_up
-from links.evaluation.groups import group_table, groups
+from links.evaluation.compare import Pair, by_config, pair_up, uneven
+from links.evaluation.csv_table import write_csv
+from links.evaluation.groups import Key, groups, parse_by
+from links.evaluation.no_drone import alarms
 from links.evaluation.report import write_report
+from links.evaluation.summaries import Summary, alarm_summary, group_summary
 from links.evaluation.tables import MAX_COLUMNS, as_json, comparison_table, headline_table, label, metrics_table
+from links.evaluation.tracks import per_drone
 
 JSON_FILE, DEFAULTS = "evaluation.json", Limits()
 MAX_NAMED = 4  # runs named before a text that holds for them; the report names all
@@ -41,9 +45,15 @@ def evaluate_runs(
         bool, typer.Option("--no-drone", help="There was no drone: all that a run says is a false alarm.")
     ] = False,
     by: Annotated[
-        list[int] | None,
-        typer.Option("--by", min=1, help="Sum up by this word of the recordings' names (SCENE-RANGE-...); repeatable."),
+        list[str] | None,
+        typer.Option(
+            "--by",
+            metavar="WORD",
+            help="Sum up by a word of the recordings' names (2 of SCENE-RANGE-...), by several (2,3) or by "
+            "configuration alone (config); several configurations stand side by side. Repeatable.",
+        ),
     ] = None,
+    csv_file: Annotated[Path | None, typer.Option("--csv", help="Table of all metrics to write, a line a run.")] = None,
     max_gap_s: Annotated[
         float, typer.Option("--max-gap", min=0.001, max=10, help="Truth is not interpolated over a longer gap [s].")
     ] = DEFAULTS.max_gap_s,
@@ -59,35 +69,56 @@ def evaluate_runs(
     Errors are told at the outputs' own times and over all time with the last output held, so that saying nothing is
     never better than being right. What could not be evaluated is listed with its reason. Exit code 1 when something
     is wrong with a run (false outputs, a covariance that promises too much, a wrong yaw branch, no output at all).
+    RUNS of several configurations stand side by side; of several drones each is judged by the tracks that follow it.
 
     Example: grd evaluate out/street_sweep-replay --against out/street_sweep-paper --report out/compare.html
     """
     if no_drone and truth is not None:
         raise LinkError("--no-drone and --truth contradict each other: give one of them")
+    keys = [parse_by(text) for text in by or []]
     limits = Limits(max_gap_s=max_gap_s, max_age_s=max_age_s, reach_m=reach_m)
     paths = [*runs, *(against or [])]
     judged: list[list[Evaluation]] = []
     with progress_bar(f"evaluate {len(paths)} runs") as step:
         for done, path in enumerate(paths):
-            run = read_run(path, truth, no_drone)
-            judged.append([evaluate(run, output, limits) for output in run.outputs])
+            parts = per_drone(read_run(path, truth, no_drone), limits.max_gap_s)
+            judged.append([evaluate(run, output, limits) for run in parts for output in run.outputs])
             step(done + 1, len(paths))
     own = [e for group in judged[: len(runs)] for e in group]
     others = [e for group in judged[len(runs) :] for e in group]
     pairs, warnings = pair_up(own, others) if others else ([], [])
-    if by:
-        for number in by:
-            out.print(group_table(groups(own, number), number))
-    else:
-        _tell(own, pairs, warnings)
-    _write(own, others, pairs, warnings, report, out_dir)
+    summaries = _summaries(own, keys)
+    warnings += uneven(own) if summaries else []
+    for text in warnings:
+        warn(text)
+    for summary in summaries:
+        out.print(summary.table(), crop=False)
+    for note in dict.fromkeys(summary.note for summary in summaries if summary.note):
+        out.print(note, markup=False)
+    if not keys:
+        _tell(own, pairs)
+    _write(own, others, pairs, warnings, summaries, report, out_dir)
+    if csv_file is not None:
+        csv_file.parent.mkdir(parents=True, exist_ok=True)
+        write_csv(csv_file, own)
+        out.print(f"table       {csv_file}", markup=False)
     if any(e.findings for e in own):
         raise typer.Exit(FINDING)
 
 
-def _tell(own: list[Evaluation], pairs: list[Pair], warnings: list[str]) -> None:
-    for text in warnings:
-        warn(text)
+def _summaries(own: list[Evaluation], keys: list[Key]) -> list[Summary]:
+    """The tables that were asked for; without any, configurations side by side when there are several."""
+    answers = [e for e in own if e.output is e.run.outputs[0]]
+    flown = [e for e in answers if not e.run.no_drone]
+    empty = [e for e in answers if e.run.no_drone]
+    wanted = keys or ([()] if len(by_config(own)) > 1 else [])
+    found = [group_summary(groups(flown, key), key) for key in wanted if flown]
+    if empty and (wanted or len(empty) > 1):
+        found.append(alarm_summary(alarms(empty)))
+    return found
+
+
+def _tell(own: list[Evaluation], pairs: list[Pair]) -> None:
     if len(own) > MAX_COLUMNS:
         out.print(headline_table(own))
     if pairs:
@@ -127,6 +158,7 @@ def _write(
     others: list[Evaluation],
     pairs: list[Pair],
     warnings: list[str],
+    summaries: list[Summary],
     report: Path | None,
     out_dir: Path | None,
 ) -> None:
@@ -138,5 +170,5 @@ def _write(
         out.print(f"numbers     {folder / JSON_FILE}", markup=False)
     if report is not None:
         report.parent.mkdir(parents=True, exist_ok=True)
-        write_report(report, own, others, pairs, warnings)
+        write_report(report, own, others, pairs, warnings, summaries)
         out.print(f"report      {report}", markup=False)

@@ -148,34 +148,47 @@ def simulate_recording(
 def simulate_matrix(
     folder: Annotated[Path, typer.Argument(help="Where the recordings go, one for each cell and seed.")],
     seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Make seeds 1 to N of each cell.")] = 1,
-    only: Annotated[str, typer.Option("--only", help="Cells whose name matches, as in 'campus-*-orbit-parked'.")] = "*",
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", help="Cells whose name matches, as in 'campus-*-orbit-parked'; may be repeated."),
+    ] = None,
     pairs: Annotated[
         bool, typer.Option("--pairs", help="Few cells in which each two of range, motion, vehicle and scene meet.")
     ] = False,
     closed_loop: ClosedLoop = None,
+    calibrated: Annotated[
+        bool, typer.Option("--calibrated", help="The rig knows the error of the servo's encoder.")
+    ] = False,
+    odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle has odometry.")] = False,
+    rain: Annotated[bool, typer.Option("--rain", help="It rains, 5 mm/h.")] = False,
     list_only: Annotated[bool, typer.Option("--list", help="Name the cells; make none.")] = False,
 ) -> None:
     """Make the recordings of the scenario matrix.
 
-    Range x motion x vehicle x scene, an occlusion, and a drone that leaves and returns. Recordings that are there and
-    complete are kept, so it can be stopped and started again. Exit code 1 when a scene had no place for a cell.
+    Range x motion x vehicle x scene, an occlusion, and a drone that leaves and returns; beside them an empty sky, two
+    drones, a drone to search for at 40 m, and drones at 50 m. Recordings that are there, complete and made alike are
+    kept, so it can be stopped and started again. Exit code 1 when a scene had no place for a cell.
 
-    Example: grd matrix out/matrix --seeds 5 --only 'campus-*-hover-*' --closed-loop configs/paper.yaml
+    Example: grd matrix out/matrix --seeds 5 --only '*-empty-*' --only '*-two-*' --closed-loop configs/sim.yaml
     """
     try:
-        from links.simulated.matrix import cells, make_matrix
+        from links.simulated.matrix import Conditions, cells, make_matrix
     except ModuleNotFoundError as missing:
         raise _not_installed(missing) from None
 
-    wanted = cells(only, pairs)
+    patterns = only or ["*"]
+    wanted = cells(patterns, pairs)
     if not wanted:
-        raise LinkError(f"no cell is called like '{only}'; `grd matrix {folder} --list` names them all")
+        names = " or ".join(f"'{pattern}'" for pattern in patterns)
+        few = " among the pairs" if pairs else ""
+        raise LinkError(f"no cell{few} is called like {names}; `grd matrix {folder} --list` names them all")
     if list_only:
         for cell in wanted:
             out.print(cell.name, markup=False)
         return
     with progress_bar(f"{len(wanted) * seeds} recordings") as step:
-        report = make_matrix(folder, wanted, range(1, seeds + 1), closed_loop, step)
+        conditions = Conditions(calibrated, odometry, rain)
+        report = make_matrix(folder, wanted, range(1, seeds + 1), closed_loop, step, conditions)
     for text in report.impossible:
         warn(text)
     out.print(f"{folder}: {report.made} made, {report.kept} were there already", markup=False)

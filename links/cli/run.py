@@ -28,7 +28,7 @@ from flow.tree import Section
 from links.cli.console import err, in_words, out, progress_bar, warn
 from links.recording import RecordingReader
 from links.results import FIX_FILE, SUMMARY_FILE, Results, stamp_s
-from links.truth import FixErrors, TruthLog, fix_errors
+from links.truth import FixErrors, TruthLog
 
 CONFIG_FILE = "config.yaml"
 TABLE_ROWS = 12
@@ -151,10 +151,8 @@ def _replay(graph: Graph, reader: RecordingReader, recording: Path, folder: Path
         warnings = [*reader.warnings, *_remarks(graph, report)]
         for text in (*warnings, f"output hash {digest.hexdigest()}"):
             results.note(text)
-    errors = None
     truth.write(folder)
-    if truth.drone:
-        errors = fix_errors(results.fixes, *truth.drone_in_vehicle())
+    errors = truth.errors_of(results.fixes)
     wall_s = time.monotonic() - begin
     return Finished(recording, folder, report, results, errors, digest.hexdigest(), wall_s, warnings, graph)
 
@@ -186,7 +184,10 @@ def _write_summary(run: Finished, config: Path, overlays: list[Path], sets: list
         "sweeps_with_drone": results.sweeps_with_drone,
         "verdicts": [{"sweeps": count, "example": verdict} for verdict, count in results.verdicts],
         "fixes": len(results.fixes),
-        "states": [{"stamp_s": stamp_s(t.stamp_ns), "state": t.state, "reason": t.reason} for t in results.transitions],
+        "states": [
+            {"stamp_s": stamp_s(t.stamp_ns), "track_id": t.track_id, "state": t.state, "reason": t.reason}
+            for t in results.transitions
+        ],
         "warnings": run.warnings,
         "wall_s": round(run.wall_s, 3),
         "compute_ms": {
@@ -236,7 +237,8 @@ def _tell(run: Finished) -> None:
         for verdict, count in results.verdicts[:3]:
             out.print(f"in {count} of {results.sweeps} sweeps: {verdict}", markup=False)
     for change in results.transitions[-3:]:
-        out.print(f"tracker at {stamp_s(change.stamp_ns)} s: {change.state}, {change.reason}", markup=False)
+        who = f"track {change.track_id}" if change.track_id > 1 else "tracker"
+        out.print(f"{who} at {stamp_s(change.stamp_ns)} s: {change.state}, {change.reason}", markup=False)
     if run.errors is not None and len(run.errors.stamps_ns):
         x, y, z = run.errors.rmse_xyz_m
         out.print(

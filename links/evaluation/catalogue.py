@@ -116,14 +116,26 @@ def _catalogue() -> dict[str, Metric]:
             (band_key("right_share", low), f"{band_name(low, high)}: time right", "%", "high"),
         )
     add(
+        "keeping it",
+        ("lost_count", "times lost though in sight", "", "low"),
+        ("reacquired_s", "worst time to find it again", "s", "low"),
+        ("longest_hit_gap_s", "longest gap of returns, while kept", "s", "low"),
+        ("longest_hit_gap_whole_s", "longest gap of returns, all time", "s", "low"),
+        ("identity_swaps", "tracks gone over to another drone", "", "low"),
+    )
+    add(
         "false and missed",
         ("false_outputs", "false outputs", "", "low"),
         ("false_per_min", "false outputs", "/min", "low"),
         ("beyond_1m_share", "outputs off by more than 1 m", "%", "low"),
         ("found_share", "sweeps in which it was found", "%", "high"),
-        ("missed_sweeps", "sweeps missed, 4 or more returns", "", "low"),
+        ("found_when_seen_share", "found, of sweeps with 4+ returns", "%", "high"),
+        ("missed_sweeps", "sweeps missed, 4+ returns", "", "low"),
+        ("hit_share", "sweeps with a return of the drone", "%", "none"),
+        ("seen_share", "sweeps with 4+ returns", "%", "none"),
         ("false_detections_per_min", "false detections", "/min", "low"),
         ("false_alarms_per_h", "false alarms, no drone", "/h", "low"),
+        ("invented_drones", "drones invented, no drone", "", "low"),
     )
     add(
         "rotation",

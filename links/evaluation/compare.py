@@ -16,6 +16,7 @@ from links.evaluation.catalogue import CATALOGUE, Better, metric_of
 from links.evaluation.judged import Evaluation
 
 COMMON = "3D RMSE in the time both have an output"
+MAX_NAMED = 4  # recordings named in a warning
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +41,39 @@ def pooled(evaluations: list[Evaluation], key: str) -> Pooled:
     values = [e.values[key] for e in evaluations if key in e.values]
     ranks = [rank for value in values if (rank := value.ranked(better)) is not None]
     failed = sum(value.failed for value in values)
-    return Pooled(_median(ranks), len(ranks), failed, len(evaluations) - len(ranks))
+    return Pooled(median(ranks), len(ranks), failed, len(evaluations) - len(ranks))
 
 
-def _median(ranks: list[float]) -> float | None:
+def by_config(evaluations: list[Evaluation]) -> dict[str, list[Evaluation]]:
+    """Runs by what they were made with, in the order in which they were given."""
+    found: dict[str, list[Evaluation]] = {}
+    for e in evaluations:
+        found.setdefault(e.run.config, []).append(e)
+    return found
+
+
+def uneven(evaluations: list[Evaluation]) -> list[str]:
+    """Warnings: recordings that some configurations were run on and others not, or that count twice."""
+    configs = by_config(evaluations)
+    counts = {name: Counter(_flight(e) for e in runs) for name, runs in configs.items()}
+    warnings: list[str] = []
+    every = sorted({flight for count in counts.values() for flight in count})
+    for name, count in counts.items():
+        missing = [flight for flight in every if flight not in count]
+        twice = [flight for flight, n in sorted(count.items()) if n > 1]
+        for flights, what in ((missing, "not run on"), (twice, "counted twice or more on")):
+            if flights:
+                names = ", ".join(dict.fromkeys(recording for recording, *_ in flights[:MAX_NAMED]))
+                more = f" and {len(flights) - MAX_NAMED} more" if len(flights) > MAX_NAMED else ""
+                warnings.append(f"{name or 'a configuration without a name'}: {what} {names}{more}")
+    return warnings
+
+
+def _flight(e: Evaluation) -> tuple[str, str, int]:
+    return e.run.recording, e.output.name, e.run.drone
+
+
+def median(ranks: list[float]) -> float | None:
     """Of an even number the mean of the middle two; the infinite one when one of them is."""
     if not ranks:
         return None
@@ -78,10 +108,11 @@ def pair_up(own: list[Evaluation], others: list[Evaluation]) -> tuple[list[Pair]
     """Pairs by recording (and output, where both have it), and warnings. LinkError when nothing can be paired."""
     warnings: list[str] = []
     for side, name in ((own, "RUN"), (others, "--against")):
-        twice = [key for key, count in Counter((e.run.recording, e.output.name) for e in side).items() if count > 1]
+        twice = [key for key, count in Counter(_flight(e) for e in side).items() if count > 1]
         if twice:
             raise LinkError(
-                f"{name}: two runs of recording '{twice[0][0]}'; runs are paired by recording, so give one of each"
+                f"{name}: two runs of recording '{twice[0][0]}'; runs are paired by recording, so give one of each "
+                "(several configurations side by side: all as RUNS, with --by config)"
             )
     pairs = [Pair(a, b) for a in own for b in others if _key(a, b) == _key(b, a)]
     if not pairs and len({e.run.name for e in own}) == len({e.run.name for e in others}) == 1:
@@ -100,13 +131,13 @@ def pair_up(own: list[Evaluation], others: list[Evaluation]) -> tuple[list[Pair]
     return pairs, warnings
 
 
-def _key(evaluation: Evaluation, other: Evaluation) -> tuple[str, str]:
+def _key(evaluation: Evaluation, other: Evaluation) -> tuple[str, str, int]:
     """The outputs' names count only where both runs have both; a lone file stands for any output."""
     names = [{o.name for o in e.run.outputs} for e in (evaluation, other)]
     if names[0] & names[1]:
-        return evaluation.run.recording, evaluation.output.name
+        return _flight(evaluation)
     first = evaluation.output.name == evaluation.run.outputs[0].name
-    return evaluation.run.recording, "answer" if first else evaluation.output.name
+    return evaluation.run.recording, "answer" if first else evaluation.output.name, evaluation.run.drone
 
 
 def _same_flight(pair: Pair) -> str | None:
@@ -139,7 +170,7 @@ def compared(pairs: list[Pair], key: str) -> Compared:
         if (a := p.own.values[key].value) is not None and (b := p.other.values[key].value) is not None and b > 0
     ]
     own, other = (pooled(side, key) for side in ([p.own for p in judged], [p.other for p in judged]))
-    return Compared(own, other, _median(ratios), len(ratios))
+    return Compared(own, other, median(ratios), len(ratios))
 
 
 def _ranked(evaluation: Evaluation, key: str) -> float | None:

@@ -77,6 +77,7 @@ def covariance(judged: Evaluation) -> None:
     else:
         judged.values["nees_mean"] = _nees(judged, at.nees, 3, "position")
     inside = np.nan_to_num(at.nees, nan=np.inf) <= chi2_quantile(0.95, 3)  # a broken covariance holds nothing
+    judged.counts["inside_95_share"] = int(inside.sum()), len(inside)
     share, worth = float(inside.mean()), effective_samples(np.nan_to_num(at.nees, nan=0.0))
     low, high = wilson_interval(share * worth, worth)
     note = f"interval for {worth:.0f} independent samples of {len(inside)}"

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from links.evaluation.associate import interpolate, newest
-from links.evaluation.run_data import Output, RunData
+from links.evaluation.output import Output
+from links.evaluation.run_data import RunData
 from links.evaluation.tum import Trajectory
 from stages.geometry import Array64, rotations_from_xyzw
 

@@ -9,9 +9,12 @@ from links.evaluation.accuracy import at_own_stamps, over_all_time, timing
 from links.evaluation.catalogue import CATALOGUE, Value
 from links.evaluation.consistency import covariance, rotation
 from links.evaluation.errors import GRID_NS, AtOutputs, Limits, OverTime, at_outputs, over_time, span_of
-from links.evaluation.faults import detections, false_outputs
+from links.evaluation.faults import false_outputs
 from links.evaluation.judged import Evaluation
-from links.evaluation.run_data import Output, RunData
+from links.evaluation.keeping import keeping
+from links.evaluation.output import Output
+from links.evaluation.run_data import RunData
+from links.evaluation.searches import detections
 
 
 def evaluate(run: RunData, output: Output, limits: Limits | None = None) -> Evaluation:
@@ -31,6 +34,7 @@ def evaluate(run: RunData, output: Output, limits: Limits | None = None) -> Eval
     timing(judged)
     over_all_time(judged)
     at_own_stamps(judged)
+    keeping(judged)
     false_outputs(judged)
     detections(judged)
     rotation(judged)

@@ -1,4 +1,4 @@
-"""False outputs, false alarms, and sweeps in which the drone was found or missed.
+"""False outputs, false alarms and invented drones.
 
 Source: ours; limits in links/evaluation/errors.py.
 """
@@ -6,12 +6,12 @@ Source: ours; limits in links/evaluation/errors.py.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from links.evaluation.associate import interpolate
 from links.evaluation.catalogue import Value, failure
-from links.evaluation.errors import GRID_NS
-from links.evaluation.judged import NO_DRONE, NO_SPAN, Evaluation, minutes, no_error, no_truth, share
-from links.evaluation.statistics import wilson_interval
+from links.evaluation.judged import NO_DRONE, Evaluation, minutes, no_error, no_truth, share
+
+SILENCE_NS = 1_000_000_000  # a track that says nothing for longer has ended
 
 
 def false_outputs(judged: Evaluation) -> None:
@@ -23,7 +23,8 @@ def false_outputs(judged: Evaluation) -> None:
         judged.does_not_apply(NO_DRONE, *keys)
         _false_alarms(judged, outputs)
         return
-    judged.does_not_apply("for recordings without a drone (--no-drone says so)", "false_alarms_per_h")
+    without = "for recordings without a drone (--no-drone says so)"
+    judged.does_not_apply(without, "false_alarms_per_h", "invented_drones")
     if at is None:
         no_truth(judged, *keys)
         return
@@ -51,6 +52,8 @@ def false_outputs(judged: Evaluation) -> None:
 
 def _false_alarms(judged: Evaluation, outputs: int) -> None:
     """Recordings without a drone: everything that is said is false."""
+    invented = stretches(judged.output.poses.stamps_ns, judged.output.track)
+    judged.values["invented_drones"] = Value(float(invented), outputs)
     if judged.span_ns is None:
         judged.cannot("the recording's length is not known", "false_alarms_per_h")
     else:
@@ -62,56 +65,9 @@ def _false_alarms(judged: Evaluation, outputs: int) -> None:
         judged.findings.append(f"{outputs} outputs though there was no drone")
 
 
-def detections(judged: Evaluation) -> None:
-    """Sweeps in which the drone was found, missed, or seen where it was not."""
-    keys = ("found_share", "missed_sweeps", "false_detections_per_min")
-    sweeps, truth, limits = judged.run.sweeps, judged.run.truth, judged.limits
-    if sweeps is None:
-        judged.cannot(judged.run.missing.get("detections", "no detections recorded"), *keys)
-        return
-    if judged.span_ns is None:
-        judged.cannot(NO_SPAN, *keys)
-        return
-    false = found = asked = missed = unknown = 0
-    for sweep in sweeps:
-        if judged.run.no_drone:
-            false += len(sweep.accepted_xyz_m)
-            continue
-        moments = np.append(np.arange(sweep.start_ns, sweep.end_ns, GRID_NS, dtype=np.int64), sweep.end_ns)
-        if truth is None:
-            break
-        known, path, _ = interpolate(moments, truth.stamps_ns, truth.xyz_m, None, round(limits.max_gap_s * 1e9))
-        if not known.any():
-            unknown += 1
-            continue
-        away_m = np.linalg.norm(sweep.accepted_xyz_m[:, None] - path[known], axis=2).min(axis=1)
-        false += int(np.count_nonzero(away_m > limits.wrong_m))
-        here = bool(len(away_m) and away_m[0] <= limits.wrong_m)  # the best one is what a track starts from
-        if (np.linalg.norm(path[known], axis=1) <= limits.reach_m).any():
-            asked += 1
-            found += here
-        if judged.run.drone_hits_ns is not None:
-            first, last = np.searchsorted(judged.run.drone_hits_ns, [sweep.start_ns, sweep.end_ns + 1])
-            missed += int(last - first >= limits.min_hits and not here)
-    if unknown:
-        judged.remarks.append(f"{unknown} of {len(sweeps)} sweeps have no truth; they are neither found nor false")
-    if truth is None and not judged.run.no_drone:
-        no_truth(judged, *keys)
-        return
-    judged.values["false_detections_per_min"] = Value(false / minutes(judged.span_ns), false)
-    if judged.run.no_drone:
-        judged.does_not_apply(NO_DRONE, "found_share", "missed_sweeps")
-        if false:
-            judged.findings.append(f"{false} detections though there was no drone")
-        return
-    if false:
-        judged.findings.append(f"{false} false detections in {len(sweeps) - unknown} sweeps")
-    if asked:
-        low, high = wilson_interval(found, asked)
-        judged.values["found_share"] = Value(100 * found / asked, asked, 100 * low, 100 * high)
-    else:
-        judged.cannot("no whole sweep with a drone in reach", "found_share")
-    if judged.run.drone_hits_ns is None:
-        judged.cannot(judged.run.missing.get("hits", "the drone's returns are not recorded"), "missed_sweeps")
-    else:
-        judged.values["missed_sweeps"] = Value(float(missed), len(sweeps) - unknown)
+def stretches(stamps_ns: NDArray[np.int64], tracks: NDArray[np.int64] | None) -> int:
+    """How many things were reported: outputs of one track without a silence of more than a second are one."""
+    if tracks is None:
+        tracks = np.ones(len(stamps_ns), dtype=np.int64)
+    of_each = [stamps_ns[tracks == track] for track in np.unique(tracks)]
+    return sum(1 + int(np.count_nonzero(np.diff(own) > SILENCE_NS)) for own in of_each)

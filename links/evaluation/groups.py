@@ -1,76 +1,156 @@
-"""Many runs in few rows: grouped by a word of the recording's name, as the scenario matrix names them.
+"""Many runs in few rows: grouped by words of the recording's name, as the matrix names them, and by configuration.
 
 `manhattan-20m-hover-parked-s1`: word 1 is the scene, 2 the range, 3 the motion, 4 the vehicle, 5 the seed.
 
-Source: ours. Shares are over all runs of a group; one that gave nothing counts as never right.
+Source: ours. Counts and shares are over all runs of a group; one that failed counts as infinite in a median and a 95 %
+point, a maximum is over those that did not fail, and how many did stands beside it.
 """
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rich.table import Table
-from rich.text import Text
-
 from flow.link import LinkError
-from links.evaluation.judged import Evaluation
+from links.evaluation.compare import by_config, median
+from links.evaluation.judged import Evaluation, minutes
+
+CONFIG, ALL = "config", "all"
+Key = tuple[int, ...]  # words of the recording's name that a table is grouped by; none: all runs are one group
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """A number of every run, where it could be measured."""
+
+    values: tuple[float, ...]  # rising; inf where the run failed
+
+    @property
+    def succeeded(self) -> tuple[float, ...]:
+        """Without the failures."""
+        return tuple(v for v in self.values if math.isfinite(v))
+
+    @property
+    def median(self) -> float | None:
+        """inf when half of the runs failed."""
+        return median(list(self.values))
+
+    @property
+    def p95(self) -> float | None:
+        """The smallest value that 95 % do not exceed."""
+        return self.values[math.ceil(0.95 * len(self.values) - 1e-9) - 1] if self.values else None
+
+    @property
+    def largest(self) -> float | None:
+        """Of the runs that succeeded."""
+        return max(self.succeeded, default=None)
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Runs that share a word, summed up."""
+    """Runs of one configuration that share words of their recordings' names, summed up. Shares are in percent."""
 
-    name: str
+    words: tuple[str, ...]
+    config: str
     runs: int
-    right_share: float | None  # mean time right [%] of the runs in which it could be judged
+    right_share: float | None  # mean over the runs
     ever_right: int
     silent: int  # runs without any output
     mostly_false: int  # runs in which more than half of the outputs are false
-    missed_sweeps: int  # with 4 or more returns of the drone
-    median_rmse_m: float | None  # of the outputs of the runs that were right at least once
+    hit: tuple[int, int]  # searches with a return of the drone, of all
+    seen: tuple[int, int]  # searches with 4 or more returns of the drone, of all
+    found: tuple[int, int]  # searches in which the best candidate was the drone, of all
+    found_when_seen: tuple[int, int]  # searches in which a candidate was, of those with 4 or more returns
+    first_right_s: Spread
+    shortest_failed_s: float | None  # length of the shortest run that never was right
+    hit_gap_s: Spread
+    reacquired_s: Spread  # one value for each time the drone came back in sight
+    lost: int | None  # times lost though in sight
+    rmse_m: Spread  # of the outputs of the runs that were right at least once
+    inside_95: tuple[int, int]  # outputs whose 95 % ellipsoid holds the truth
+    false_per_h: float | None
 
 
-def groups(evaluations: list[Evaluation], word: int) -> list[Group]:
-    """One group for each value of the word, numbers in their order. LinkError when a name has no such word."""
-    by_name: dict[str, list[Evaluation]] = {}
+def parse_by(text: str) -> Key:
+    """`2`, `2,3`, `config`, `2,config` -> the words. Configurations stand side by side in any case."""
+    words: list[int] = []
+    for part in map(str.strip, text.split(",")):
+        if part.isdecimal() and int(part) > 0:
+            words.append(int(part))
+        elif part != CONFIG:
+            raise LinkError(f"--by {text}: a word's number from 1 on, several as in 2,3, or '{CONFIG}' is wanted")
+    return tuple(words)
+
+
+def groups(evaluations: Sequence[Evaluation], key: Key) -> list[Group]:
+    """A group for each combination of the words and, within it, for each configuration; all runs together last.
+
+    Numbers stand in their order, configurations as they were given. LinkError when a name has no such word.
+    """
+    configs = list(by_config(list(evaluations)))
+    cells: dict[tuple[str, ...], list[Evaluation]] = {}
     for e in evaluations:
         words = e.run.recording.split("-")
-        if not 1 <= word <= len(words):
-            raise LinkError(f"--by {word}: '{e.run.recording}' has {len(words)} words, joined by '-'")
-        by_name.setdefault(words[word - 1], []).append(e)
-    return [_group(name, by_name[name]) for name in sorted(by_name, key=_natural)]
+        if max(key, default=0) > len(words):
+            raise LinkError(f"--by {max(key)}: '{e.run.recording}' has {len(words)} words, joined by '-'")
+        cells.setdefault(tuple(words[word - 1] for word in key), []).append(e)
+    rows = [(words, cells[words]) for words in sorted(cells, key=lambda words: [_natural(word) for word in words])]
+    if key:
+        rows.append(((ALL, *[""] * (len(key) - 1)), list(evaluations)))
+    return [
+        _group(words, config, own)
+        for words, several in rows
+        for config in configs
+        if (own := [e for e in several if e.run.config == config])
+    ]
 
 
-def group_table(found: list[Group], word: int) -> Table:
-    """The groups as rows, and all runs together as the last."""
-    table = Table(title=f"by word {word} of the recording's name", title_justify="left")
-    heads = ["", "runs", "time right [%]", "ever right", "no output", "mostly false", "missed sweeps", "3D RMSE [m]"]
-    for head in heads:
-        table.add_column(Text(head), justify="right" if head else "left", no_wrap=not head)
-    for group in found:
-        right = "-" if group.right_share is None else f"{group.right_share:.1f}"
-        rmse = "-" if group.median_rmse_m is None else f"{group.median_rmse_m:.2f}"
-        counts = (group.ever_right, group.silent, group.mostly_false, group.missed_sweeps)
-        table.add_row(Text(group.name), str(group.runs), right, *map(str, counts), rmse)
-    return table
-
-
-def _group(name: str, evaluations: list[Evaluation]) -> Group:
+def _group(words: tuple[str, ...], config: str, evaluations: list[Evaluation]) -> Group:
     right = [v for e in evaluations if (v := _number(e, "right_share")) is not None]
     was_right = [e for e in evaluations if (_number(e, "right_share") or 0.0) > 0.0]
-    rmse = sorted(v for e in was_right if (v := _number(e, "rmse_m")) is not None)
-    outputs = {id(e): len(e.output.poses.stamps_ns) for e in evaluations}
+    lost = [v for e in evaluations if (v := _number(e, "lost_count")) is not None]
+    failed = [e.span_ns for e in evaluations if "first_right_s" in e.values and e.values["first_right_s"].failed]
+    lengths_s = [60 * minutes(span) for span in failed if span is not None]
     return Group(
-        name=name,
+        words=words,
+        config=config,
         runs=len(evaluations),
         right_share=sum(right) / len(right) if right else None,
         ever_right=len(was_right),
-        silent=sum(count == 0 for count in outputs.values()),
-        mostly_false=sum((_number(e, "false_outputs") or 0) > 0.5 * outputs[id(e)] for e in evaluations),
-        missed_sweeps=sum(int(_number(e, "missed_sweeps") or 0) for e in evaluations),
-        median_rmse_m=rmse[len(rmse) // 2] if rmse else None,
+        silent=sum(len(e.output.poses) == 0 for e in evaluations),
+        mostly_false=sum((_number(e, "false_outputs") or 0) > 0.5 * len(e.output.poses) for e in evaluations),
+        hit=_pooled(evaluations, "hit_share"),
+        seen=_pooled(evaluations, "seen_share"),
+        found=_pooled(evaluations, "found_share"),
+        found_when_seen=_pooled(evaluations, "found_when_seen_share"),
+        first_right_s=_spread(evaluations, "first_right_s"),
+        shortest_failed_s=min(lengths_s, default=None),
+        hit_gap_s=_spread(evaluations, "longest_hit_gap_s"),
+        reacquired_s=Spread(tuple(sorted(t for e in evaluations for t in e.reappeared_s))),
+        lost=int(sum(lost)) if lost else None,
+        rmse_m=_spread(was_right, "rmse_m"),
+        inside_95=_pooled(evaluations, "inside_95_share"),
+        false_per_h=_false_per_h(evaluations),
     )
+
+
+def _false_per_h(evaluations: list[Evaluation]) -> float | None:
+    counted = [(v, e.span_ns) for e in evaluations if (v := _number(e, "false_outputs")) is not None and e.span_ns]
+    hours = sum(minutes(span) for _, span in counted) / 60
+    return sum(count for count, _ in counted) / hours if counted else None
+
+
+def _spread(evaluations: list[Evaluation], key: str) -> Spread:
+    """Of metrics of which less is better."""
+    ranks = [value.ranked("low") for e in evaluations if (value := e.values.get(key)) is not None]
+    return Spread(tuple(sorted(rank for rank in ranks if rank is not None)))
+
+
+def _pooled(evaluations: list[Evaluation], key: str) -> tuple[int, int]:
+    counts = [e.counts[key] for e in evaluations if key in e.counts]
+    return sum(count for count, _ in counts), sum(of for _, of in counts)
 
 
 def _number(e: Evaluation, key: str) -> float | None:

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from links.evaluation.catalogue import CATALOGUE, Value, failure, not_applicable, not_evaluated
 from links.evaluation.errors import GRID_NS, AtOutputs, Limits, OverTime
-from links.evaluation.run_data import Output, RunData
+from links.evaluation.output import Output
+from links.evaluation.run_data import RunData
+from links.evaluation.statistics import wilson_interval
 from stages.geometry import Array64
 
 SLOWEST_HZ = 4.0  # ArduPilot's EKF drops external poses that come slower
@@ -33,6 +35,8 @@ class Evaluation:
     remarks: list[str] = field(default_factory=list)  # how it was judged, and what was left out
     at: AtOutputs | None = None
     over: OverTime | None = None
+    counts: dict[str, tuple[int, int]] = field(default_factory=dict)  # of some shares: (how many, of how many)
+    reappeared_s: list[float] = field(default_factory=list)  # time to find it again, each time; inf: never
 
     def cannot(self, reason: str, *keys: str) -> None:
         """These could not be evaluated, and why."""
@@ -49,6 +53,13 @@ class Evaluation:
             if value.value is None and value.applies and not value.failed:
                 reasons.setdefault(value.note, []).append(CATALOGUE[key].name if key in CATALOGUE else key)
         return reasons
+
+
+def counted_share(judged: Evaluation, key: str, count: int, of: int) -> None:
+    """A share with its 95 % interval, kept as counts too so that runs can be pooled."""
+    low, high = wilson_interval(count, of)
+    judged.counts[key] = (count, of)
+    judged.values[key] = Value(100 * count / of, of, 100 * low, 100 * high)
 
 
 def no_truth(judged: Evaluation, *keys: str) -> None:

@@ -20,7 +20,14 @@ from links.evaluation.svg import BAD, BAND, GOOD, INK, SOFT, TRUTH, Chart, Serie
 MAX_POINTS = 1500
 WIDE, SQUARE, LOW = (960, 220), (474, 400), (960, 130)
 HALF = (474, 260)
-STATE_COLORS = {"SEARCHING": "#e9b44c", "TRACKING": "#3aa76d", "LOST": "#d12f2f"}
+STATE_COLORS = {
+    "SEARCHING": "#e9b44c",
+    "CANDIDATE": "#7fa8d9",
+    "TRACKING": "#3aa76d",
+    "COASTING": "#b5d99c",
+    "LOST": "#d12f2f",
+}
+MAX_LANES = 8  # tracks whose states are drawn
 BIN_NS = 120_000_000  # returns of the drone are counted per tracker frame of the paper
 
 
@@ -200,17 +207,22 @@ def _by_range(e: Evaluation) -> list[Chart]:
 
 
 def _lanes(e: Evaluation) -> list[Chart]:
-    """What the tracker said it was doing, over whether there was an output and whether it was right."""
+    """What the tracker said it was doing, a lane for each track, over whether there was an output and it was right."""
     states, span = e.run.states, _duration(e)
     if not states and e.over is None:
         return []
     chart = Chart("states", "time [s]", "", span, (0.0, 2.0), LOW)
     chart.without_y_ticks()
-    since = [*(float(_seconds(e, np.array([at]))[0]) for at, _ in states), span[1]]
-    for (_, state), start, end in zip(states, since[:-1], since[1:], strict=True):
-        chart.box((start, end), (1.1, 1.9), STATE_COLORS.get(state, SOFT), 0.85)
-        if end - start > 0.06 * span[1]:
-            chart.text(start + 0.005 * span[1], 1.5, state)
+    tracks = sorted({track for _, _, track in states})[:MAX_LANES]
+    height = 0.9 / max(1, len(tracks))
+    for lane, number in enumerate(tracks):
+        own = [(at, state) for at, state, track in states if track == number]
+        since = [*(float(_seconds(e, np.array([at]))[0]) for at, _ in own), span[1]]
+        low = 1.95 - (lane + 1) * height
+        for (_, state), start, end in zip(own, since[:-1], since[1:], strict=True):
+            chart.box((start, end), (low, low + 0.9 * height), STATE_COLORS.get(state, SOFT), 0.85)
+            if end - start > 0.06 * span[1] and len(tracks) < 3:
+                chart.text(start + 0.005 * span[1], low + 0.45 * height, state)
     if e.over is not None:
         t = _seconds(e, e.over.at_ns)
         right = e.over.fresh & (np.nan_to_num(e.over.held_m, nan=np.inf) <= e.limits.wrong_m)

@@ -12,12 +12,14 @@ from links.evaluation.catalogue import Metric, Value, metric_of
 from links.evaluation.compare import COMMON, Pair, pooled
 from links.evaluation.judged import Evaluation
 from links.evaluation.plots import plots
+from links.evaluation.summaries import Summary
 from links.evaluation.tables import (
     HEADLINES,
     cell,
     common_rmse,
     comparison_rows,
     label,
+    median_columns,
     number,
     pooled_cell,
     ratio_cell,
@@ -52,18 +54,24 @@ CARDS = (
 
 
 def write_report(
-    path: Path, own: list[Evaluation], others: list[Evaluation], pairs: list[Pair], warnings: list[str]
+    path: Path,
+    own: list[Evaluation],
+    others: list[Evaluation],
+    pairs: list[Pair],
+    warnings: list[str],
+    summaries: list[Summary],
 ) -> None:
     """Write the report."""
     parts = ["<h1>grd evaluate</h1>", _how(own[0])]
     parts += [f'<p class="bad">{escape(text)}</p>' for text in warnings]
+    parts += [_summary(summary) for summary in summaries]
     if pairs:
         parts.append(_comparison(pairs))
     if len(own) > 1:
         parts.append(_headlines(own))
         parts.append(_metrics("All metrics, medians over the runs", own, columns=[]))
     shown = [*own, *others][:MAX_PICTURED]
-    parts += [_run(e, "" if e in own else " (the other)") for e in shown]
+    parts += [_run(e, "" if index < len(own) else " (the other)") for index, e in enumerate(shown)]
     if len(own) + len(others) > MAX_PICTURED:
         parts.append(f"<p>{len(own) + len(others) - MAX_PICTURED} more runs are in the tables above only.</p>")
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>grd evaluate</title>'
@@ -82,6 +90,13 @@ def _how(e: Evaluation) -> str:
         "its best detection is that near to where the drone was at any moment of the sweep. In a median a run that "
         "gave nothing counts as the worst. Latency is not judged: a run's files hold measurement times only.</p>"
     )
+
+
+def _summary(summary: Summary) -> str:
+    head = "".join(f"<th>{escape(text).replace(chr(10), '<br>')}</th>" for text in summary.heads)
+    rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in summary.rows)
+    table = f'<div class="wide"><table><tr>{head}</tr>{rows}</table></div>'
+    return f'<h2>{escape(summary.title)}</h2>{table}<p class="soft">{escape(summary.note)}</p>'
 
 
 def _comparison(pairs: list[Pair]) -> str:
@@ -114,8 +129,9 @@ def _headlines(own: list[Evaluation]) -> str:
         values = [(e.values[key], metric_of(key)) for key in HEADLINES]
         cells = "".join(f"<td{_css(value)}>{escape(_short(value, metric))}</td>" for value, metric in values)
         rows.append(f"<tr><td>{escape(label(e))}</td>{cells}</tr>")
-    medians = "".join(f"<td><b>{escape(_median(own, key))}</b></td>" for key in HEADLINES)
-    rows.append(f"<tr><td><b>median of {len(own)}</b></td>{medians}</tr>")
+    for name, several in median_columns(own):
+        medians = "".join(f"<td><b>{escape(_median(several, key))}</b></td>" for key in HEADLINES)
+        rows.append(f"<tr><td><b>{escape(name)}</b></td>{medians}</tr>")
     return f'<h2>Runs</h2><div class="wide"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
 
 
@@ -135,8 +151,8 @@ def _css(value: Value) -> str:
 
 
 def _metrics(title: str, evaluations: list[Evaluation], columns: list[Evaluation]) -> str:
-    pool = len(evaluations) > 1
-    names = [*(label(e) for e in columns), f"median of {len(evaluations)}" if pool else "n"]
+    medians = median_columns(evaluations)
+    names = [*(label(e) for e in columns), *([name for name, _ in medians] or ["n"])]
     rows: list[str] = []
     group = ""
     for key in rows_that_matter(evaluations):
@@ -146,9 +162,8 @@ def _metrics(title: str, evaluations: list[Evaluation], columns: list[Evaluation
             f'<td{_css(e.values[key])} title="{escape(e.values[key].note)}">{escape(cell(e.values[key], metric))}</td>'
             for e in columns
         )
-        if pool:
-            cells += f"<td>{escape(pooled_cell(pooled(evaluations, key), metric))}</td>"
-        else:
+        cells += "".join(f"<td>{escape(pooled_cell(pooled(e, key), metric))}</td>" for _, e in medians)
+        if not medians:
             samples = evaluations[0].values[key].samples
             cells += f'<td class="soft">{"" if samples is None else samples}</td>'
         rows.append(f"<tr><td>{escape(titled(metric))}</td>{cells}</tr>")

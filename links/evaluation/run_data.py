@@ -6,6 +6,7 @@ Source: DESIGN, Outputs of a run; file names in links/results.py.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.link import LinkError
-from links.evaluation.tum import NO_DRONE, Trajectory, read_matrices, read_number, read_stamp_ns, read_table, read_tum
+from links.evaluation.output import Output, read_output
+from links.evaluation.true_drone import TrueDrone, read_true_drones
+from links.evaluation.tum import Trajectory, read_number, read_stamp_ns, read_table, read_tum
 from links.results import (
     COVARIANCE_FILE,
     DETECTIONS_FILE,
@@ -22,22 +25,8 @@ from links.results import (
     POSE_COVARIANCE_FILE,
     POSE_FILE,
     SUMMARY_FILE,
-    TRUTH_FILE,
-    TRUTH_HITS_FILE,
 )
 from stages.geometry import Array64
-
-
-@dataclass(frozen=True, slots=True)
-class Output:
-    """One output of a run over time, with what the run itself says about how good each is."""
-
-    name: str  # "fix": the LiDAR's; "pose": fused; "file": a lone TUM file
-    poses: Trajectory
-    covariance: Array64 | None = None  # (n, 3, 3) [m2] vehicle axes, or (n, 6, 6) rotation first, tangent at the drone
-    why_no_covariance: str = ""
-    good: NDArray[np.bool_] | None = None  # (n,) what the run marked good; None: it marks nothing
-    hits: NDArray[np.int64] | None = None  # (n,) returns used
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,15 +45,24 @@ class RunData:
     name: str  # as the user gave it
     recording: str  # what it is a run of: runs of the same recording are compared with each other
     outputs: tuple[Output, ...]  # the first is the run's answer
-    truth: Trajectory | None
+    truth: Trajectory | None  # of the drone that is judged
     no_drone: bool  # known: there was no drone at all
     start_ns: int | None  # of the recording
     end_ns: int | None
     sweeps: tuple[Sweep, ...] | None
     drone_hits_ns: NDArray[np.int64] | None  # truth: when the drone returned a pulse
-    states: tuple[tuple[int, str], ...]  # (since, state)
+    states: tuple[tuple[int, str, int], ...]  # (since, state, track)
     compute_ms: dict[str, dict[str, float]]
     missing: dict[str, str]
+    config: str = ""  # what it was made with; "": not known
+    hidden_ns: NDArray[np.int64] | None = None  # (m, 2) truth: since when and until when the drone was hidden
+    drones: tuple[TrueDrone, ...] = ()  # all that truth knows of, the one that is judged among them
+    drone: int = 1  # number of the one that is judged
+
+    @property
+    def other_paths(self) -> list[Trajectory]:
+        """Truth of the drones that are not judged."""
+        return [d.path for number, d in enumerate(self.drones, start=1) if d.path is not None and number != self.drone]
 
 
 def read_run(path: Path, truth_file: Path | None = None, no_drone: bool = False) -> RunData:
@@ -79,7 +77,9 @@ def read_run(path: Path, truth_file: Path | None = None, no_drone: bool = False)
         poses = read_tum(path)
         truth = read_tum(truth_file) if truth_file else None
         nothing = f"{path.name} is a lone TUM file, not a run's folder"
-        missing = {"covariance": nothing, "recording": nothing, "detections": nothing, "compute": nothing}
+        missing: dict[str, str] = dict.fromkeys(
+            ("covariance", "recording", "detections", "compute", "hits", "visible"), nothing
+        )
         if truth is None:
             missing["truth"] = "no truth was given (--truth FILE.tum)"
         output = Output("file", poses, why_no_covariance=nothing)
@@ -94,12 +94,13 @@ def _read_folder(folder: Path, truth_file: Path | None, no_drone: bool) -> RunDa
     missing: dict[str, str] = {}
     outputs: list[Output] = []
     if (folder / POSE_FILE).exists():
-        outputs.append(_read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6))
+        outputs.append(read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6))
     if (folder / FIX_FILE).exists():
-        outputs.append(_read_output("fix", folder / FIX_FILE, folder / COVARIANCE_FILE, 3))
+        outputs.append(read_output("fix", folder / FIX_FILE, folder / COVARIANCE_FILE, 3))
     if not outputs:
         raise LinkError(f"{folder}: neither {POSE_FILE} nor {FIX_FILE}: is it the --out folder of a run?")
-    truth, said_empty = _read_truth(folder, truth_file, missing)
+    drones, said_empty = read_true_drones(folder, truth_file)
+    missing |= drones[0].missing
     start_ns, end_ns = (
         read_stamp_ns(str(summary[key]), f"{folder / SUMMARY_FILE}: {key}") if key in summary else None
         for key in ("start_s", "end_s")
@@ -111,27 +112,28 @@ def _read_folder(folder: Path, truth_file: Path | None, no_drone: bool) -> RunDa
         sweeps = _read_sweeps(folder / DETECTIONS_FILE)
     else:
         missing["detections"] = f"the run has no {DETECTIONS_FILE} (an older grd wrote it)"
-    hits_ns = None
-    if (folder / TRUTH_HITS_FILE).exists():
-        rows = read_table(folder / TRUTH_HITS_FILE, ("stamp_s",))
-        hits_ns = np.sort(np.array([read_stamp_ns(row["stamp_s"], where) for where, row in rows], dtype=np.int64))
-    else:
-        missing["hits"] = "the recording does not say which returns came from the drone"
     states = summary.get("states", [])
     compute = summary.get("compute_ms", {})
+    recording = Path(str(summary.get("recording", folder.name))).stem
     return RunData(
         name=str(folder),
-        recording=Path(str(summary.get("recording", folder.name))).stem,
+        recording=recording,
         outputs=tuple(outputs),
-        truth=truth,
+        truth=drones[0].path,
         no_drone=no_drone or said_empty,
         start_ns=start_ns,
         end_ns=end_ns,
         sweeps=sweeps,
-        drone_hits_ns=hits_ns,
-        states=tuple((read_stamp_ns(str(s["stamp_s"]), f"{folder}: states"), str(s["state"])) for s in states),
+        drone_hits_ns=drones[0].hits_ns,
+        states=tuple(
+            (read_stamp_ns(str(s["stamp_s"]), f"{folder}: states"), str(s["state"]), int(s.get("track_id", 1)))
+            for s in states
+        ),
         compute_ms={stage: values for stage, values in compute.items() if values.get("calls")},
         missing=missing,
+        config=_configuration(folder, recording, summary),
+        hidden_ns=drones[0].hidden_ns,
+        drones=drones,
     )
 
 
@@ -147,44 +149,18 @@ def _read_summary(path: Path) -> dict[str, Any]:
     return summary
 
 
-def _read_truth(folder: Path, truth_file: Path | None, missing: dict[str, str]) -> tuple[Trajectory | None, bool]:
-    """-> the truth, and whether the recording's truth says that there was no drone."""
-    if truth_file is not None:
-        return read_tum(truth_file), False
-    path = folder / TRUTH_FILE
-    if not path.exists():
-        missing["truth"] = "the recording holds no truth (real flight?); give one with --truth FILE.tum"
-        return None, False
-    truth = read_tum(path, may_be_empty=True)
-    if len(truth):
-        return truth, False
-    missing["truth"] = "there was no drone" if NO_DRONE in truth.header else f"{path} is empty"
-    return None, NO_DRONE in truth.header
+def _configuration(folder: Path, recording: str, summary: dict[str, Any]) -> str:
+    """What the run was made with. `<recording>-NAME` is the user's own name for it; else the summary says.
 
-
-def _read_output(name: str, poses_file: Path, covariance_file: Path, size: int) -> Output:
-    poses = read_tum(poses_file, may_be_empty=True)
-    if not covariance_file.exists():
-        return Output(name, poses, why_no_covariance=f"the run has no {covariance_file.name}")
-    matrices, rows = read_matrices(covariance_file, size)
-    stamps = poses.stamps_ns.tolist()
-    without = [stamp for stamp in stamps if stamp not in matrices]
-    if without:
-        why = f"{len(without)} of {len(stamps)} lines of {poses_file.name} have none in {covariance_file.name}"
-        return Output(name, poses, why_no_covariance=why)
-    covariance = np.array([matrices[stamp] for stamp in stamps]).reshape(-1, size, size)
-    good = hits = None
-    if stamps and "good" in rows[stamps[0]]:
-        good = np.array([rows[stamp]["good"].strip().lower() in {"1", "true"} for stamp in stamps])
-    if stamps and "hits" in rows[stamps[0]]:
-        hits = np.array([_whole(rows[stamp]["hits"], covariance_file) for stamp in stamps], dtype=np.int64)
-    return Output(name, poses, covariance, "", good, hits)
-
-
-def _whole(word: str, path: Path) -> int:
-    if not word.strip().isdigit():
-        raise LinkError(f"{path}: hits '{word[:20]}' is no whole number")
-    return int(word)
+    A folder named by `grd replay` itself (`<recording>-replay-2`) tells less than its summary: `replay a.b=2`.
+    """
+    stem = Path(str(summary.get("config", ""))).stem
+    own = folder.resolve().name.removeprefix(f"{recording}-")
+    if own != folder.resolve().name and not re.fullmatch(rf"{re.escape(stem)}(-\d+)?", own):
+        return own
+    overlays = [Path(str(name)).stem for name in summary.get("overlays", [])]
+    sets = [str(text) for text in summary.get("set", []) if not str(text).startswith("viewer.")]
+    return " ".join(["+".join([stem, *overlays]), *sets])
 
 
 def _read_sweeps(path: Path) -> tuple[Sweep, ...]:

@@ -75,6 +75,11 @@ def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
+def poisson_upper(events: int) -> float:
+    """The mean that gives so few events or fewer in 5 % of trials only: chi2_{2 events + 2}(95 %) / 2."""
+    return chi2_quantile(0.95, 2 * events + 2) / 2
+
+
 def effective_samples(series: Array64) -> float:
     """How many independent samples have the information of this series: n / (1 + 2 sum of its autocorrelation).
 

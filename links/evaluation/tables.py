@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from links.evaluation.catalogue import Metric, Value, metric_of
-from links.evaluation.compare import COMMON, Compared, Pair, Pooled, compared, keys_of, pooled, verdict
+from links.evaluation.compare import COMMON, Compared, Pair, Pooled, by_config, compared, keys_of, pooled, verdict
 from links.evaluation.judged import Evaluation
 
 MAX_COLUMNS = 4  # more runs than this are rows of a table of headlines
@@ -36,9 +36,12 @@ HEADLINES = {
 
 
 def label(evaluation: Evaluation) -> str:
-    """A run's column: its folder's name, and the output when the run has several."""
-    name = evaluation.run.name.rstrip("/").split("/")[-1]
-    return f"{name} {evaluation.output.name}" if len(evaluation.run.outputs) > 1 else name
+    """A run's column: its folder's name, and configuration, output and drone where the name does not tell them."""
+    run = evaluation.run
+    name = run.name.rstrip("/").split("/")[-1]
+    name += f" ({run.config})" if name == run.recording and run.config else ""
+    name += f" {evaluation.output.name}" if len(run.outputs) > 1 else ""
+    return name + (f" drone {run.drone}" if len(run.drones) > 1 else "")
 
 
 def number(value: float, metric: Metric) -> str:
@@ -76,14 +79,15 @@ def rows_that_matter(evaluations: list[Evaluation]) -> list[str]:
 
 
 def metrics_table(evaluations: list[Evaluation]) -> Table:
-    """Metrics down, runs across (up to MAX_COLUMNS), the median over runs last."""
+    """Metrics down, runs across (up to MAX_COLUMNS), the medians over the runs of each configuration last."""
     shown = evaluations if len(evaluations) <= MAX_COLUMNS else []
     table = Table(title="against truth", title_justify="left")
     table.add_column("metric", no_wrap=True)
     for evaluation in shown:
         table.add_column(Text(label(evaluation)), justify="right")
-    if len(evaluations) > 1:
-        table.add_column(f"median of {len(evaluations)}", justify="right")
+    medians = [(name, several) for name, several in median_columns(evaluations) if len(several) > 1 or not shown]
+    for name, _ in medians:
+        table.add_column(Text(name), justify="right")
     group = ""
     for key in rows_that_matter(evaluations):
         if key.endswith("_p50"):
@@ -94,10 +98,19 @@ def metrics_table(evaluations: list[Evaluation]) -> Table:
             table.add_section()
             table.add_row(Text(group, style="bold"))
         cells = [Text(cell(e.values.get(key), metric)) for e in shown]
-        if len(evaluations) > 1:
-            cells.append(Text(pooled_cell(pooled(evaluations, key), metric)))
+        cells += [Text(pooled_cell(pooled(several, key), metric)) for _, several in medians]
         table.add_row(Text(titled(metric)), *cells)
     return table
+
+
+def median_columns(evaluations: list[Evaluation]) -> list[tuple[str, list[Evaluation]]]:
+    """`median of 6`, of each configuration its own; nothing for a single run."""
+    if len(evaluations) < 2:
+        return []
+    configs = by_config(evaluations)
+    if len(configs) == 1:
+        return [(f"median of {len(evaluations)}", evaluations)]
+    return [(f"{name}: median of {len(e)}" if len(e) > 1 else name, e) for name, e in configs.items()]
 
 
 def titled(metric: Metric) -> str:
@@ -193,8 +206,15 @@ def as_json(evaluations: list[Evaluation], pairs: list[Pair], warnings: list[str
         "warnings": warnings,
         "runs": [_run_json(e) for e in evaluations],
     }
-    if len(evaluations) > 1:
-        tree["median"] = {key: _pooled_json(pooled(evaluations, key)) for key in keys_of(evaluations)}
+    configs = by_config(evaluations)
+    medians = {
+        name: {key: _pooled_json(pooled(several, key)) for key in keys_of(evaluations)}
+        for name, several in configs.items()
+    }
+    if len(configs) > 1:
+        tree["median_by_config"] = medians
+    elif len(evaluations) > 1:
+        tree["median"] = next(iter(medians.values()))
     if pairs:
         tree["against"] = {
             "pairs": [
@@ -214,6 +234,8 @@ def _run_json(e: Evaluation) -> dict[str, Any]:
     return {
         "name": e.run.name,
         "recording": e.run.recording,
+        "config": e.run.config,
+        "drone": e.run.drone,
         "output": e.output.name,
         "outputs": len(e.output.poses),
         "span_s": None if e.span_ns is None else [t / 1e9 for t in e.span_ns],

@@ -39,8 +39,11 @@ class Trajectory:
         return len(self.stamps_ns)
 
 
-def read_tum(path: Path, may_be_empty: bool = False) -> Trajectory:
-    """Read a TUM file. LinkError names the first line that is wrong and what is wrong with it."""
+def read_tum(path: Path, may_be_empty: bool = False, in_order: bool = True) -> Trajectory:
+    """Read a TUM file. LinkError names the first line that is wrong and what is wrong with it.
+
+    Stamps must rise, unless `in_order` is False: fixes of several tracks come as they were made.
+    """
     header: list[str] = []
     stamps: list[int] = []
     rows: list[list[float]] = []
@@ -54,7 +57,7 @@ def read_tum(path: Path, may_be_empty: bool = False) -> Trajectory:
         if len(words) != 8:
             raise LinkError(f"{where}: {len(words)} columns, a TUM line has 8: {COLUMNS}")
         stamp_ns = read_stamp_ns(words[0], where)
-        if stamps and stamp_ns <= stamps[-1]:
+        if in_order and stamps and stamp_ns <= stamps[-1]:
             what = "the same stamp as" if stamp_ns == stamps[-1] else "earlier than"
             raise LinkError(f"{where}: {what} the line before it; stamps must rise: sort the file, drop duplicates")
         values = [read_number(word, where) for word in words[1:]]
@@ -100,19 +103,27 @@ def read_table(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[str, dict[
         yield where, dict(zip(header, cells, strict=True))
 
 
-def read_matrices(path: Path, size: int) -> tuple[dict[int, Array64], dict[int, dict[str, str]]]:
-    """Symmetric matrices by stamp [ns] from a CSV of upper triangles (`upper_names`), and all cells of each row."""
+@dataclass(frozen=True, slots=True)
+class MatrixRow:
+    """One line of a table of covariances."""
+
+    where: str  # "file:line"
+    stamp_ns: int
+    matrix: Array64  # symmetric
+    cells: dict[str, str]  # by column
+
+
+def read_matrices(path: Path, size: int) -> list[MatrixRow]:
+    """The lines of a CSV of upper triangles (`upper_names`), in their order."""
     names = upper_names(size)
-    matrices: dict[int, Array64] = {}
-    others: dict[int, dict[str, str]] = {}
+    found: list[MatrixRow] = []
     upper = np.triu_indices(size)
     for where, row in read_table(path, ("stamp_s", *names)):
         matrix = np.zeros((size, size))
         matrix[upper] = [read_number(row[name], where) for name in names]
         stamp_ns = read_stamp_ns(row["stamp_s"], where)
-        matrices[stamp_ns] = matrix + np.triu(matrix, 1).T
-        others[stamp_ns] = row
-    return matrices, others
+        found.append(MatrixRow(where, stamp_ns, matrix + np.triu(matrix, 1).T, row))
+    return found
 
 
 def upper_names(size: int) -> tuple[str, ...]:

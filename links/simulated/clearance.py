@@ -5,6 +5,7 @@ Source: ours. Rays from each sample of a path: 26 directions around it for what 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -62,13 +63,14 @@ def fits(world: RayScene, points_world_m: Array64, room_needed_m: float) -> bool
     return bool(np.isinf(near).all() and under_open_sky(world, points_world_m).all())
 
 
-def check_travel(world: RayScene, truth: Truth, duration_s: float, span_m: float) -> None:
-    """LinkError when the vehicle's camera or the drone (of this span) cannot go where they are told in this scene."""
+def check_travel(world: RayScene, truth: Truth, duration_s: float, spans_m: Sequence[float]) -> None:
+    """LinkError when the vehicle's camera or a drone (of these spans) cannot go where it is told in this scene."""
     times = sample_times_s(duration_s)
     stamps = truth.start_ns + np.rint(times * 1e9).astype(np.int64)
     check_path(world, times, truth.T_world_vehicle(stamps)[1], MAST_M, "vehicle.path")
-    if truth.drone is not None:
-        check_path(world, times, truth.T_world_drone(stamps)[1], span_m / 2, "drone.path")
+    for number, span_m in zip(truth.drones, spans_m, strict=True):
+        name = "drone.path" if number == 1 else f"other_drones.{number - 2}.path"
+        check_path(world, times, truth.T_world_drone(stamps, number)[1], span_m / 2, name)
 
 
 def check_path(world: RayScene, time_s: Array64, points_world_m: Array64, room_needed_m: float, name: str) -> None:

@@ -68,14 +68,14 @@ class Surroundings(Protocol):
 
     def cast(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32, max_range_m: float
-    ) -> tuple[Array32, Array32, NDArray[np.bool_]]:
-        """Range (n, k) [m] (inf: none), fraction sent back (n, k), and whether the drone was hit (n, k)."""
+    ) -> tuple[Array32, Array32, NDArray[np.uint8]]:
+        """Range (n, k) [m] (inf: none), fraction sent back (n, k), and which drone was hit (n, k), 0: none."""
         ...
 
     def near_small_body(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32
     ) -> NDArray[np.bool_]:
-        """Pulses (n,) whose axis, (n, 3), passes the drone or a bird so closely that some of it may be lit."""
+        """Pulses (n,) whose axis, (n, 3), passes a drone or a bird so closely that some of it may be lit."""
         ...
 
 
@@ -85,7 +85,12 @@ class Pulses:
 
     range_m: Array64  # (returns, n), a multiple of 2 mm, 0: no return
     reflectivity: NDArray[np.uint8]  # (returns, n)
-    drone_share: Array64  # (returns, n) truth, not sent: how much of the return's power came from the drone
+    drone_share: Array64  # (returns, n) truth, not sent: how much of the return's power came from a drone
+    drone: NDArray[np.uint8]  # (returns, n) truth, not sent: which drone that was; 0: none
+
+    def hits(self, drone: int) -> NDArray[np.bool_]:
+        """Pulses (n,) with a return that has most of its power from this drone."""
+        return np.asarray(((self.drone_share > 0.5) & (self.drone == drone)).any(axis=0))
 
 
 class Lidar:
@@ -127,14 +132,14 @@ class Lidar:
 
         origins, directions = sub_rays(azimuth, laser, R_world_lidar, t_world_lidar_m, COARSE.offsets)
         seen = around.cast(pulse_ns, origins, directions, s.max_range_m + PULSE_LENGTH_M)
-        ranges, power, drone_power = self._received(seen, COARSE.shares, threshold, drops)
+        ranges, power, drone_power, drone = self._received(seen, COARSE.shares, threshold, drops)
         edge = sees_edge(seen[0], COARSE_SPREAD_M)
         fine = np.nonzero(edge | around.near_small_body(pulse_ns, origins[:, 0], directions[:, 0]))[0]
         if len(fine):
             rays = sub_rays(azimuth[fine], laser[fine], R_world_lidar[fine], t_world_lidar_m[fine], FINE.offsets)
             seen = around.cast(pulse_ns[fine], *rays, s.max_range_m + PULSE_LENGTH_M)
             again = self._received(seen, FINE.shares, threshold[fine], drops[:, fine])
-            ranges[:, fine], power[:, fine], drone_power[:, fine] = again
+            ranges[:, fine], power[:, fine], drone_power[:, fine], drone[:, fine] = again
 
         margin = np.maximum(power / self._threshold, 1.0)
         sigma = np.sqrt(s.range_noise_m**2 + s.weak_range_noise_m**2 / margin)
@@ -143,15 +148,15 @@ class Lidar:
         lit = (power > 0) & (measured >= s.min_range_m) & (measured <= s.max_range_m)
         shade = np.clip(np.rint(100 * power * ranges**2 * (1 + 0.05 * normal[3])), 1, 255)
         share = np.divide(drone_power, power, out=np.zeros_like(power), where=lit)
-        return Pulses(np.where(lit, measured, 0.0), np.where(lit, shade, 0).astype(np.uint8), share)
+        return Pulses(np.where(lit, measured, 0.0), np.where(lit, shade, 0).astype(np.uint8), share, drone)
 
     def _received(
         self,
-        seen: tuple[Array32, Array32, NDArray[np.bool_]],
+        seen: tuple[Array32, Array32, NDArray[np.uint8]],
         shares: Array64,
         threshold: Array64,
         drops: Array64,
-    ) -> tuple[Array64, Array64, Array64]:
+    ) -> tuple[Array64, Array64, Array64, NDArray[np.uint8]]:
         """`echoes` through the weather: Beer-Lambert there and back, and each pulse's nearest bright drop (2, n)."""
         ranges, fractions, drone = seen
         s = self.settings
@@ -164,7 +169,7 @@ class Lidar:
             ranges = np.column_stack([ranges, near]).astype(np.float32)
             back = np.where(before, drops[1] * np.where(before, near, 0.0) ** 2, 0.0)
             fractions = np.column_stack([fractions, back]).astype(np.float32)
-            drone = np.column_stack([drone, np.zeros(len(drone), dtype=np.bool_)])
+            drone = np.column_stack([drone, np.zeros(len(drone), dtype=np.uint8)])
             shares = np.append(shares, 1.0)
         return echoes(ranges, fractions, drone, shares, threshold, s.min_range_m, s.return_mode)
 
@@ -256,13 +261,14 @@ def sub_rays(
 def echoes(
     ranges_m: Array32,
     fractions: Array32,
-    drone: NDArray[np.bool_],
+    drone: NDArray[np.uint8],
     shares: Array64,
     threshold: Array64,
     min_range_m: float,
     return_mode: str,
-) -> tuple[Array64, Array64, Array64]:
-    """What pulses (of n, with k sub-rays) return: range, power, power from the drone, each (1, n), in dual mode (2, n).
+) -> tuple[Array64, Array64, Array64, NDArray[np.uint8]]:
+    """What pulses (of n, with k sub-rays) return: range, power, power from a drone, and from which (0: none; of two in
+    one echo the farther), each (1, n), in dual mode (2, n).
 
     Sub-rays sorted by range join into one echo while the next is within the pulse length of the one before; its range
     is the mean weighted by power = share * fraction / range^2. Echoes weaker than the pulse's threshold (n,), and
@@ -274,8 +280,10 @@ def echoes(
     result = np.zeros((rows, count))
     power = np.zeros((rows, count))
     from_drone = np.zeros((rows, count))
+    which = np.zeros((rows, count), dtype=np.uint8)
     order = np.empty(rays, dtype=np.int64)
     echo_range, echo_power, echo_drone = np.empty(rays), np.empty(rays), np.empty(rays)
+    echo_which = np.empty(rays, dtype=np.uint8)
     for i in range(count):
         for k in range(rays):  # insertion sort: few, and mostly sorted
             j = k
@@ -291,7 +299,7 @@ def echoes(
             if r - previous > PULSE_LENGTH_M:
                 if found < 0 or echo_power[found] >= threshold[i]:  # a weaker echo's place is used again
                     found += 1
-                echo_range[found], echo_power[found], echo_drone[found] = 0.0, 0.0, 0.0
+                echo_range[found], echo_power[found], echo_drone[found], echo_which[found] = 0.0, 0.0, 0.0, 0
             previous = r
             if r >= min_range_m:
                 p = shares[k] * fractions[i, k] / (r * r)
@@ -299,6 +307,7 @@ def echoes(
                 echo_power[found] += p
                 if drone[i, k]:
                     echo_drone[found] += p
+                    echo_which[found] = drone[i, k]
         if found >= 0 and echo_power[found] < threshold[i]:
             found -= 1
         if found < 0:
@@ -312,4 +321,5 @@ def echoes(
             result[row, i] = echo_range[e] / echo_power[e]
             power[row, i] = echo_power[e]
             from_drone[row, i] = echo_drone[e]
-    return result, power, from_drone
+            which[row, i] = echo_which[e]
+    return result, power, from_drone, which

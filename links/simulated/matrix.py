@@ -1,5 +1,7 @@
 """The scenario matrix: range x motion x vehicle x scene, an occlusion and a flight out of sight and back, by seed.
 
+Beside it stand the cells of single goals: an empty sky, two drones, a drone to be searched for, drones at 50 m.
+
 A cell says what happens (`links/simulated/matrix_flights.py`), a seed where: it draws the scene and the side.
 
 Source: ours, after the cases of issue "A simulated rig".
@@ -8,7 +10,7 @@ Source: ours, after the cases of issue "A simulated rig".
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from itertools import product
@@ -20,10 +22,13 @@ from flow.link import LinkError
 from links.recording import RecordingReader
 from links.simulated.clearance import sample_times_s
 from links.simulated.drone import DroneModel
-from links.simulated.matrix_flights import CAMERA_HEIGHT_M, Cell, drone_path, vehicle_path
+from links.simulated.matrix_flights import CAMERA_HEIGHT_M, Cell, drone_path, two_paths, vehicle_path
+from links.simulated.operator import Sweep, Vibrate
 from links.simulated.run import simulate_into
-from links.simulated.scenario import DroneSettings, Scenario
-from links.simulated.servo import ServoSettings
+from links.simulated.scenario import DroneSettings, RigLidar, Scenario
+from links.simulated.servo import ServoSettings, Turned
+from links.simulated.vehicle_odometry import VehicleOdometrySettings
+from links.simulated.weather import Weather
 from links.simulated.world import SceneSettings
 from links.simulated.world.settings import Kind
 
@@ -33,15 +38,36 @@ VEHICLES = ("parked", "driving", "turning")
 SCENES: tuple[Kind, ...] = ("manhattan", "atlanta", "campus", "park_edge", "open_lot")
 OPEN: Kind = "open_lot"  # nothing to hide behind
 SPECIALS = {"occlusion": 35, "return": 20}  # at which range
+GOALS = (  # range, motion, vehicles; in every scene
+    (0, "empty", VEHICLES),
+    (20, "two", ("parked",)),
+    (40, "search", ("parked",)),
+    (50, "hover", ("parked",)),
+    (50, "orbit", ("parked",)),
+)
+SEARCHING = ("empty", "two", "search")  # without a closed loop the servo sweeps all along
 LIDAR_UP_M = 0.35  # over the camera, as in the standard rig
 DRONE = DroneModel(surface="grey_shell")  # the LiDAR sees half of it at 45 m, nothing at 70 m
 SERVO = ServoSettings(command_latency_s=0.002, command_jitter_s=5e-4, encoder_error_deg=0.3, backlash_deg=0.33)
+SWEEPS = (Sweep(times=100),)
+SWEEP_THEN_FOLLOW = (Sweep(), Vibrate(duration_s=60.0, follow_drone=True))
+RAIN = Weather(rain_mmph=5.0)
 
 
-def cells(only: str = "*", pairs: bool = False) -> list[Cell]:
-    """All cells whose name matches a pattern (`campus-*-parked`).
+@dataclass(frozen=True)
+class Conditions:
+    """What holds in all cells of one run over the matrix."""
 
-    With `pairs` a small part in which each two values of range, motion, vehicle and scene still meet at least once.
+    calibrated: bool = False  # the rig knows the servo encoder's own error
+    odometry: bool = False  # the vehicle tells where it drives
+    rain: bool = False  # 5 mm/h
+
+
+def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
+    """All cells whose name matches one of the patterns (`campus-*-parked`).
+
+    With `pairs` a small part in which each two values of range, motion, vehicle and scene still meet at least once; the
+    goals' cells are not in it.
     """
     found: list[Cell] = []
     for (r, range_m), (m, motion), (v, vehicle), (s, scene) in product(
@@ -51,27 +77,45 @@ def cells(only: str = "*", pairs: bool = False) -> list[Cell]:
             found.append(Cell(scene, range_m, motion, vehicle))
     found += [Cell(scene, SPECIALS["return"], "return", "parked") for scene in SCENES]
     found += [Cell(scene, SPECIALS["occlusion"], "occlusion", "parked") for scene in SCENES if scene != OPEN]
-    return [cell for cell in found if fnmatch(cell.name, only)]
+    if not pairs:
+        found += [Cell(s, range_m, motion, v) for range_m, motion, vehicles in GOALS for s in SCENES for v in vehicles]
+    return [cell for cell in found if any(fnmatch(cell.name, pattern) for pattern in only)]
 
 
-def scenario_of(cell: Cell, seed: int) -> Scenario:
+def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> Scenario:
     """The scenario of a cell. LinkError when the seed's scene has no place for it (no building to hide behind)."""
+    conditions = conditions or Conditions()
     rng = np.random.default_rng([seed, 42])
     times = sample_times_s(cell.duration_s)
     vehicle, world = vehicle_path(cell, seed, rng, times)
     lidar_m = vehicle.at(times)[0] + [0.0, 0.0, LIDAR_UP_M]
-    drone = drone_path(cell, world, rng, times, lidar_m)
+    if cell.motion == "empty":
+        flown = ()
+    elif cell.motion == "two":
+        flown = two_paths(cell, world, rng, times, lidar_m)
+    else:
+        flown = (drone_path(cell, world, rng, times, lidar_m),)
+    drones = tuple(DroneSettings(path=path, model=DRONE) for path in flown)
+    what = f"{cell.motion} at {cell.range_m} m" if drones else "no drone"
+    straight = RigLidar()
+    known = straight.mount.model_copy(update={"servo_harmonics": Turned(SERVO, seed).harmonics()})
     return Scenario(
         name=cell.name,
-        description=f"{cell.motion} at {cell.range_m} m, vehicle {cell.vehicle}, {cell.scene}",
+        description=f"{what}, vehicle {cell.vehicle}, {cell.scene}",
         seed=seed,
         start_utc=datetime.datetime(2025, 6, 1, 10, 20, 30, tzinfo=datetime.UTC),
         duration_s=cell.duration_s,
         scene=SceneSettings(kind=cell.scene),
         vehicle={"camera_height_m": CAMERA_HEIGHT_M, "path": vehicle},  # pyright: ignore[reportArgumentType]
-        drone=DroneSettings(path=drone, model=DRONE),
+        drone=drones[0] if drones else None,
+        other_drones=drones[1:],
         servo=SERVO,
-        script=({"do": "sweep"}, {"do": "vibrate", "duration_s": 60.0, "follow_drone": True}),  # pyright: ignore[reportArgumentType]
+        script=SWEEPS if cell.motion in SEARCHING else SWEEP_THEN_FOLLOW,
+        truth_visible=bool(drones),
+        weather=RAIN if conditions.rain else Weather(),
+        vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,
+        rig=RigLidar(mount=known) if conditions.calibrated else straight,
+        true_mount=straight.mount if conditions.calibrated else None,
     )
 
 
@@ -102,6 +146,7 @@ def make_matrix(
     seeds: range,
     closed_loop: FilePath | None,
     progress: Callable[[float, float], None],
+    conditions: Conditions | None = None,
 ) -> MatrixReport:
     """Make what is missing: `folder/<cell>-s<seed>.mcap`. `progress` is told simulated seconds done and in all."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -111,7 +156,7 @@ def make_matrix(
     for seed, cell in product(seeds, wanted):
         file = folder / f"{cell.name}-s{seed}.mcap"
         try:
-            scenario = scenario_of(cell, seed)
+            scenario = scenario_of(cell, seed, conditions)
         except LinkError as error:
             impossible.append(f"seed {seed}: {error}")
         else:

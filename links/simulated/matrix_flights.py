@@ -9,7 +9,7 @@ Source: ours, after the cases of issue "A simulated rig".
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -24,15 +24,18 @@ from links.simulated.world import SceneSettings, build_world
 from links.simulated.world.settings import Kind
 
 CAMERA_HEIGHT_M = 1.8
-DURATION_S = {"occlusion": 16.0, "return": 24.0}
+DURATION_S = {"occlusion": 16.0, "return": 24.0, "empty": 30.0}
 USUAL_DURATION_S = 12.0
 KNOT_S = 0.5
 ROOM_M = 1.0  # around the drone
 BODY_ROOM_M = 1.2  # around the vehicle's camera
 WAY_STEP = 5  # of the samples: the vehicle's way each 0.25 s, as `Simulation` tells it to the scene
+ELEVATIONS_RAD = np.radians((45.0, 60.0, 75.0))
 MUST_SEE = 0.95  # of the time
 HIDDEN_S = 3.0
+FARTHEST_M = 75.0  # half way to where a scene ends: no vehicle drives on
 FAR_M = 105.0  # beyond the LiDAR's reach
+APART_DEG = (40.0, 60.0)  # between two drones at the start; they come no nearer
 
 Motion = Callable[[Array64], Array64]  # times (n,) -> offset (n, 3) from the LiDAR, world axes [m]
 
@@ -43,7 +46,7 @@ class Cell:
 
     scene: Kind
     range_m: int
-    motion: str  # of MOTIONS or SPECIALS
+    motion: str  # of MOTIONS, SPECIALS or GOALS
     vehicle: str
 
     @property
@@ -58,7 +61,7 @@ class Cell:
 
 
 def vehicle_path(cell: Cell, seed: int, rng: Generator, times: Array64) -> tuple[Path, RayScene]:
-    """Straight at 5 m/s, or round in circles at 20 deg/s; slower or tighter where there is no room for that.
+    """Straight at 5 m/s, or round in circles at 20 deg/s; slower or tighter where there is no room or time for that.
 
     The scene goes with it: it keeps the vehicle's way free of what is not built of stone.
     """
@@ -69,7 +72,7 @@ def vehicle_path(cell: Cell, seed: int, rng: Generator, times: Array64) -> tuple
     elif cell.vehicle == "driving":
         tried = [
             path_of(knots, np.outer(speed * knots, [np.cos(yaw), np.sin(yaw), 0.0]), np.full(len(knots), yaw))
-            for speed in (5.0, 3.0, 1.5)
+            for speed in np.minimum((5.0, 3.0, 1.5), FARTHEST_M / cell.duration_s)
             for yaw in side * np.radians([0, 10, -10, 20, -20, 45, -45, 90, -90, 180])
         ]
     else:
@@ -89,18 +92,58 @@ def vehicle_path(cell: Cell, seed: int, rng: Generator, times: Array64) -> tuple
 
 def drone_path(cell: Cell, world: RayScene, rng: Generator, times: Array64, lidar_m: Array64) -> Path:
     """The first flight, of all sides from low to high, that has room and is seen as the cell wants it."""
-    knots = np.arange(0.0, cell.duration_s + KNOT_S, KNOT_S)
+    for path, _, _ in _flights(cell, world, rng, times, lidar_m):
+        return path
+    raise _no_flight(cell)
+
+
+def two_paths(cell: Cell, world: RayScene, rng: Generator, times: Array64, lidar_m: Array64) -> tuple[Path, Path]:
+    """One drone that orbits and one that hovers where the first one came from, both free and in sight."""
+    hover = replace(cell, motion="hover")
+    behind = np.radians([50.0, 45.0, 55.0, *APART_DEG])
+    for orbit, azimuth, elevation in _flights(cell, world, rng, times, lidar_m):
+        orbit_m = orbit.at(times)[0]
+        for height, aside in product((elevation, *ELEVATIONS_RAD), behind):
+            path, flown_m = _flown(hover, next(motions(hover, azimuth - float(aside), height)), times, lidar_m)
+            apart = _azimuths_apart(orbit_m - lidar_m, flown_m - lidar_m).min()
+            if apart > np.radians(APART_DEG[0] - 2.0) and _is_possible(hover, world, lidar_m, flown_m):
+                return orbit, path
+    raise _no_flight(cell)
+
+
+def _flights(
+    cell: Cell, world: RayScene, rng: Generator, times: Array64, lidar_m: Array64
+) -> Iterator[tuple[Path, float, float]]:
+    """All flights that are possible, with the azimuth and elevation [rad] that they start towards."""
     azimuths = rng.permutation(24) * np.radians(15.0) + rng.uniform(0, np.radians(15.0))
-    elevations = (10.0, 17.0, 25.0, 33.0) if cell.motion == "occlusion" else (45.0, 60.0, 75.0)
-    at_knots = np.column_stack([np.interp(knots, times, lidar_m[:, axis]) for axis in range(3)])
-    for elevation, azimuth in product(np.radians(elevations), azimuths):
+    elevations = np.radians((10.0, 17.0, 25.0, 33.0)) if cell.motion == "occlusion" else ELEVATIONS_RAD
+    for elevation, azimuth in product(elevations, azimuths):
         for motion in motions(cell, float(azimuth), float(elevation)):
-            path = path_of(knots, at_knots + motion(knots))
-            flown_m = path.at(times)[0]
-            seen = visible(world, lidar_m, flown_m)
-            if _as_wanted(cell, seen) and fits(world, flown_m, ROOM_M):
-                return path
-    raise LinkError(f"{cell.name}: no free flight of this kind in this scene; take another seed")
+            path, flown_m = _flown(cell, motion, times, lidar_m)
+            if _is_possible(cell, world, lidar_m, flown_m):
+                yield path, float(azimuth), float(elevation)
+
+
+def _flown(cell: Cell, motion: Motion, times: Array64, lidar_m: Array64) -> tuple[Path, Array64]:
+    """A motion on top of the vehicle's, and where it is (n, 3) at `times`."""
+    knots = np.arange(0.0, cell.duration_s + KNOT_S, KNOT_S)
+    at_knots = np.column_stack([np.interp(knots, times, lidar_m[:, axis]) for axis in range(3)])
+    path = path_of(knots, at_knots + motion(knots))
+    return path, path.at(times)[0]
+
+
+def _is_possible(cell: Cell, world: RayScene, lidar_m: Array64, flown_m: Array64) -> bool:
+    return _as_wanted(cell, visible(world, lidar_m, flown_m)) and fits(world, flown_m, ROOM_M)
+
+
+def _no_flight(cell: Cell) -> LinkError:
+    return LinkError(f"{cell.name}: no free flight of this kind in this scene; take another seed")
+
+
+def _azimuths_apart(a: Array64, b: Array64) -> Array64:
+    """Angle (n,) between the azimuths of directions (n, 3), 0 to pi [rad]."""
+    turn = np.arctan2(a[:, 1], a[:, 0]) - np.arctan2(b[:, 1], b[:, 0])
+    return np.abs(np.mod(turn + np.pi, 2 * np.pi) - np.pi)
 
 
 def _as_wanted(cell: Cell, seen: NDArray[np.bool_]) -> bool:
@@ -128,9 +171,9 @@ def motions(cell: Cell, azimuth: float, elevation: float) -> Iterator[Motion]:
         """Back and forth, starting at the middle with this speed [m/s]."""
         return amplitude * np.sin(speed / amplitude * t)
 
-    if cell.motion == "hover":
+    if cell.motion in ("hover", "search"):
         yield lambda t: centre + np.outer(swing(t, 0.3, 0.2), aside) + np.outer(swing(t, 0.2, 0.15), up)
-    elif cell.motion == "orbit":
+    elif cell.motion in ("orbit", "two"):
         radius = reach * np.cos(elevation)
         yield lambda t: around(azimuth + 3.0 / radius * t, radius, reach * np.sin(elevation))
     elif cell.motion == "cross":

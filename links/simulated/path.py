@@ -91,16 +91,30 @@ def natural_spline(knot_s: Array64, knots: Array64, time_s: Array64) -> tuple[Ar
     chord = np.diff(knots, axis=0) / h
     A = np.eye(count)
     b = np.zeros_like(knots)
-    for i in range(1, count - 1):
-        A[i, i - 1 : i + 2] = [h[i - 1, 0], 2 * (h[i - 1, 0] + h[i, 0]), h[i, 0]]
-        b[i] = 6 * (chord[i] - chord[i - 1])
-    M = np.linalg.solve(A, b)
-    t = np.clip(time_s, knot_s[0], knot_s[-1])
-    i = np.clip(np.searchsorted(knot_s, t, side="right") - 1, 0, count - 2)
-    s = (t - knot_s[i])[:, None]
-    linear = chord[i] - h[i] * (2 * M[i] + M[i + 1]) / 6
-    cubic = (M[i + 1] - M[i]) / (6 * h[i])
-    inside = ((time_s >= knot_s[0]) & (time_s <= knot_s[-1]))[:, None]
-    value = knots[i] + s * (linear + s * (M[i] / 2 + s * cubic))
-    slope = linear + s * (M[i] + 3 * s * cubic)
-    return value, np.where(inside, slope, 0.0), np.where(inside, M[i] + 6 * s * cubic, 0.0)
+    inner = np.arange(1, count - 1)
+    A[inner, inner - 1], A[inner, inner + 1] = h[:-1, 0], h[1:, 0]
+    A[inner, inner] = 2 * (h[:-1, 0] + h[1:, 0])
+    b[inner] = 6 * (chord[1:] - chord[:-1])
+    M = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+    linear = chord - h * (2 * M[:-1] + M[1:]) / 6
+    cubic = (M[1:] - M[:-1]) / (6 * h)
+    return _along(knot_s, knots, linear, M, cubic, time_s)
+
+
+@compiled
+def _along(
+    knot_s: Array64, knots: Array64, linear: Array64, M: Array64, cubic: Array64, time_s: Array64
+) -> tuple[Array64, Array64, Array64]:
+    """y_i + s (linear_i + s (M_i / 2 + s cubic_i)) with s = t - t_i, and its derivatives."""
+    shape = (len(time_s), knots.shape[1])
+    value, slope, curve = np.empty(shape), np.zeros(shape), np.zeros(shape)
+    for n in range(len(time_s)):
+        t = min(max(time_s[n], knot_s[0]), knot_s[-1])
+        i = min(max(np.searchsorted(knot_s, t, side="right") - 1, 0), len(knot_s) - 2)
+        s = t - knot_s[i]
+        for d in range(knots.shape[1]):
+            value[n, d] = knots[i, d] + s * (linear[i, d] + s * (M[i, d] / 2 + s * cubic[i, d]))
+            if t == time_s[n]:
+                slope[n, d] = linear[i, d] + s * (M[i, d] + 3 * s * cubic[i, d])
+                curve[n, d] = M[i, d] + 6 * s * cubic[i, d]
+    return value, slope, curve

@@ -141,11 +141,11 @@ class Still:
 
     def cast(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32, max_range_m: float
-    ) -> tuple[Array32, Array32, NDArray[np.bool_]]:
+    ) -> tuple[Array32, Array32, NDArray[np.uint8]]:
         """See `lidar.Surroundings`."""
         rays = directions_world.shape[:2]
         found = self._scene.cast(origins_world_m.reshape(-1, 3), directions_world.reshape(-1, 3), max_range_m)
-        return found[0].reshape(rays), found[1].reshape(rays), np.zeros(rays, dtype=np.bool_)
+        return found[0].reshape(rays), found[1].reshape(rays), np.zeros(rays, dtype=np.uint8)
 
     def near_small_body(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32
@@ -205,7 +205,7 @@ def drone_area_m2(mesh: Mesh, from_m: Array64, step_rad: float = 4e-3) -> float:
     ranges, fractions = RayScene(mesh).cast(origins.reshape(-1, 3), directions.reshape(-1, 3), 200.0)
     settings = LidarSettings()
     threshold = np.full(len(axis), 0.10 / settings.range_at_10_percent_m**2)
-    seen = (ranges.reshape(shape), fractions.reshape(shape), np.zeros(shape, dtype=np.bool_))
+    seen = (ranges.reshape(shape), fractions.reshape(shape), np.zeros(shape, dtype=np.uint8))
     found = echoes(*seen, FINE.shares, threshold, settings.min_range_m, "strongest")[0][0] > 0
     return float(found.sum()) * step_rad**2 * away_m**2
 

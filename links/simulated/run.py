@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
-import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path as FilePath
@@ -23,7 +22,7 @@ from links.simulated.camera_paint import Street
 from links.simulated.clearance import check_travel
 from links.simulated.closed_loop import ClosedLoop, load_loop
 from links.simulated.flight import Flight
-from links.simulated.lidar import Lidar, Pulses, turned_poses
+from links.simulated.lidar import Lidar, turned_poses
 from links.simulated.mesh import Array64
 from links.simulated.operator import ScriptedOperator
 from links.simulated.path import Path
@@ -31,15 +30,14 @@ from links.simulated.ride import Ride
 from links.simulated.scenario import Scenario, load_scenario
 from links.simulated.scene import Scene, Truth, drone_shapes
 from links.simulated.servo import ServoBus
+from links.simulated.truth_records import TruthRecords
 from links.simulated.vehicle import vehicle_mesh, vehicle_mesh_from_camera
 from links.simulated.vehicle_odometry import VehicleOdometry
 from links.simulated.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world import build_world
 from links.velodyne import vlp16
-from stages.geometry import quaternions_xyzw
 
 BATCH_PACKETS = 32  # pulses are cast in batches; how many does not change a byte
-TRUTH_PERIOD_NS = 10_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +48,7 @@ class SimulationReport:
     records: int
     pulses: int
     returns: int
-    drone_returns: int  # pulses with a return that has most of its power from the drone
+    drone_returns: int  # pulses with a return that has most of its power from a drone
     wall_s: float
     size_bytes: int
     output_hash: str | None = None  # of the closed loop; a replay with the same configuration gives it again
@@ -83,7 +81,8 @@ class Simulation:
         if scenario.vehicle_odometry is not None:
             odometry = VehicleOdometry(scenario.vehicle_odometry, ridden, start_ns, duration_s, self.seed)
             self._talkers.append(odometry)
-        self.truth = Truth(start_ns, ridden, flown)
+        others = scenario.other_drones
+        self.truth = Truth(start_ns, ridden, flown, tuple(other.path for other in others))
         height = scenario.vehicle.camera_height_m
         driven = scenario.vehicle.path.at(np.arange(0.0, scenario.duration_s, 0.25))[0]
         world = build_world(scenario.scene, height, self.seed, driven[:, :2])
@@ -94,8 +93,10 @@ class Simulation:
             self.truth,
             world.movers,
             scenario.weather.wetness,
+            [drone_shapes(other.span_m, other.model) for other in others],
         )
-        check_travel(self._scene.world, self.truth, scenario.duration_s, drone.span_m if drone else 0.0)
+        spans_m = [flying.span_m for flying in (drone, *others) if flying is not None]
+        check_travel(self._scene.world, self.truth, scenario.duration_s, spans_m)
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
         script = scenario.script if loop is None else ()
         operator = ScriptedOperator(script, self.drone_servo_rad if drone else None, self.seed)
@@ -111,9 +112,11 @@ class Simulation:
             scenario.start_ns,
             self.seed,
         )
+        lidar_at = (lambda stamp_ns: self.T_world_lidar(stamp_ns)[1]) if scenario.truth_visible else None
+        self._true = TruthRecords(self.truth, self._scene.world, lidar_at)
         self.pulses = 0
         self.returns = 0
-        self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from the drone
+        self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from drones
 
     def records(self) -> Iterator[Record]:
         """All records in order of arrival, numbered."""
@@ -122,7 +125,7 @@ class Simulation:
         start_ns = self.scenario.start_ns
         end_ns = start_ns + round(self.scenario.duration_s * 1e9)
         packet_ns = firings_per_packet(self.scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
-        first_ns, truth_ns = start_ns, start_ns
+        first_ns = start_ns
         most = BATCH_PACKETS if self._loop is None else max(1, self._loop.longest_batch_ns() // packet_ns)
         while first_ns < end_ns:
             packets = min(most, -(-(end_ns - first_ns) // packet_ns))
@@ -133,9 +136,7 @@ class Simulation:
                 records += camera.records(next_ns)
             for talker in self._talkers:
                 records += talker.records(next_ns)
-            count = -(-(next_ns - truth_ns) // TRUTH_PERIOD_NS)
-            records += self._truth_records(truth_ns + TRUTH_PERIOD_NS * np.arange(count))
-            truth_ns += count * TRUTH_PERIOD_NS
+            records += self._true.records(next_ns)
             for record in records:
                 heapq.heappush(waiting, (record.arrival_ns, made, record))
                 made += 1
@@ -180,7 +181,9 @@ class Simulation:
         sequence_ns = first_ns + vlp16.SEQUENCE_NS * np.arange(packets * firings, dtype=np.int64)
         pulse_ns = (sequence_ns[:, None] + vlp16.PULSE_NS * np.arange(vlp16.LASERS)).ravel()
         pulses = self._lidar.fire(pulse_ns, *self.T_world_lidar(pulse_ns), self._scene)
-        self._count(pulse_ns, pulses)
+        self.pulses += len(pulse_ns)
+        self.returns += int(np.count_nonzero(pulses.range_m))
+        self.drone_return_ns += pulse_ns[(pulses.drone_share > 0.5).any(axis=0)].tolist()
         azimuth = self._lidar.azimuth_rad(sequence_ns[::FIRINGS_PER_BLOCK]).reshape(packets, -1)
         ranges = pulses.range_m.reshape(-1, packets, firings, vlp16.LASERS)
         shades = pulses.reflectivity.reshape(ranges.shape)
@@ -192,36 +195,7 @@ class Simulation:
             data = encode_packet(at, azimuth[i], ranges[:, i], shades[:, i], self.scenario.lidar.return_mode)
             arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
             records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
-        if self.truth.drone is not None:
-            records += self._hit_records(pulse_ns.reshape(packets, -1), pulses)
-        return records
-
-    def _hit_records(self, pulse_ns: NDArray[np.int64], pulses: Pulses) -> list[Record]:
-        """Which pulses (packets, n) the drone returned, by packet; the first packet tells it even of none."""
-        hit = np.asarray((pulses.drone_share > 0.5).any(axis=0)).reshape(pulse_ns.shape)
-        records: list[Record] = []
-        for stamps, is_hit in zip(pulse_ns, hit, strict=True):
-            if is_hit.any() or stamps[0] == self.scenario.start_ns:
-                data = json.dumps({"pulse_stamp_ns": stamps[is_hit].tolist()}).encode()
-                records.append(Record("/truth/hits", int(stamps[-1]), int(stamps[0]), data))
-        return records
-
-    def _count(self, pulse_ns: NDArray[np.int64], pulses: Pulses) -> None:
-        self.pulses += len(pulse_ns)
-        self.returns += int(np.count_nonzero(pulses.range_m))
-        self.drone_return_ns += pulse_ns[(pulses.drone_share > 0.5).any(axis=0)].tolist()
-
-    def _truth_records(self, stamp_ns: NDArray[np.int64]) -> list[Record]:
-        poses = {"/truth/vehicle": self.truth.T_world_vehicle(stamp_ns)}
-        if self.truth.drone is not None:
-            poses["/truth/drone"] = self.truth.T_world_drone(stamp_ns)
-        records: list[Record] = []
-        for topic, (rotations, positions) in poses.items():
-            turns = np.round(quaternions_xyzw(rotations), 9).tolist()
-            for stamp, q, t in zip(stamp_ns.tolist(), turns, np.round(positions, 6).tolist(), strict=True):
-                pose = {"xyz_m": t, "quaternion_xyzw": q}
-                records.append(Record(topic, arrival_ns=stamp, stamp_ns=stamp, data=json.dumps(pose).encode()))
-        return records
+        return records + self._true.hits(pulse_ns.reshape(packets, -1), pulses)
 
 
 def simulate_records(scenario: Scenario, seed: int | None = None) -> Iterator[Record]:

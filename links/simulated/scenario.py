@@ -20,6 +20,7 @@ from links.simulated.camera import CamerasSettings, rig_cameras
 from links.simulated.closed_loop import ClosedLoopSettings
 from links.simulated.drone import DroneModel, drone_mesh
 from links.simulated.lidar import LidarSettings
+from links.simulated.mesh import Array64
 from links.simulated.operator import Segment, Vibrate
 from links.simulated.path import Path
 from links.simulated.ride import RideSettings
@@ -31,6 +32,7 @@ from stages.geometry import LidarMount, Pose
 
 CLEARANCE_M = 0.3  # a path may not come nearer to the road
 WHEELS_M = 0.15  # a vehicle bounces on its springs by no more
+YOUNG = ("other_drones", "truth_visible")  # settings that a scenario file holds only where they are used
 
 
 class _Settings(BaseModel):
@@ -46,7 +48,7 @@ class VehicleSettings(_Settings):
 
 
 class DroneSettings(_Settings):
-    """The drone and where it flies, world frame."""
+    """A drone and where it flies, world frame."""
 
     span_m: float = Field(default=0.5, ge=0.1, le=3.0)
     model: DroneModel = DroneModel()
@@ -76,6 +78,7 @@ class Scenario(_Settings):
     weather: Weather = Weather()
     vehicle: VehicleSettings = VehicleSettings()
     drone: DroneSettings | None = None
+    other_drones: tuple[DroneSettings, ...] = Field(default=(), max_length=9)  # each flies exactly its path
     lidar: LidarSettings = LidarSettings()
     servo: ServoSettings = ServoSettings()
     cameras: CamerasSettings = CamerasSettings()
@@ -83,6 +86,7 @@ class Scenario(_Settings):
     vehicle_odometry: VehicleOdometrySettings | None = None
     script: tuple[Segment, ...] = ()
     closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # used instead of the script with --closed-loop
+    truth_visible: bool = False  # whether /truth/visible tells the LiDAR's line of sight to each drone
     rig: RigLidar = RigLidar()  # what the rig attached to the recording says
     true_mount: LidarMount | None = None  # how it really sits, when that differs from the rig
 
@@ -111,15 +115,30 @@ class Scenario(_Settings):
             raise ValueError("autopilot: the scenario has no drone for it; add one, or leave the autopilot out")
         if self.drone is None and any(isinstance(s, Vibrate) and s.follow_drone for s in self.script):
             raise ValueError("script: follow_drone is set but the scenario has no drone; give an azimuth_table")
-        if self.drone is not None:
-            times = np.arange(0.0, self.duration_s, 0.05)
-            height = self.drone.path.at(times)[0][:, 2] + self.vehicle.camera_height_m
+        if self.drone is None and (self.other_drones or self.truth_visible):
+            word = "other_drones" if self.other_drones else "truth_visible"
+            raise ValueError(f"{word}: the scenario has no drone; add 'drone', the first one, or leave {word} out")
+        times = np.arange(0.0, self.duration_s, 0.05)
+        flown: list[tuple[str, DroneSettings, Array64]] = []
+        for name, drone in self._drones():
+            at_m = drone.path.at(times)[0]
+            height = at_m[:, 2] + self.vehicle.camera_height_m
             if height.min() < CLEARANCE_M:
                 raise ValueError(
-                    f"drone.path: {height.min():.2f} m above the road at {times[height.argmin()]:.2f} s, "
+                    f"{name}.path: {height.min():.2f} m above the road at {times[height.argmin()]:.2f} s, "
                     f"less than {CLEARANCE_M} m; z is counted from the camera, {self.vehicle.camera_height_m} m up"
                 )
+            for other_name, other, other_m in flown:
+                apart = np.linalg.norm(at_m - other_m, axis=1)
+                if apart.min() < (drone.span_m + other.span_m) / 2:
+                    raise ValueError(f"{name}.path: runs into {other_name} at {times[apart.argmin()]:.2f} s")
+            flown.append((name, drone, at_m))
         return self
+
+    def _drones(self) -> list[tuple[str, DroneSettings]]:
+        """All drones with their keys."""
+        others = [(f"other_drones.{index}", drone) for index, drone in enumerate(self.other_drones)]
+        return ([] if self.drone is None else [("drone", self.drone)]) + others
 
     @property
     def start_ns(self) -> int:
@@ -141,8 +160,10 @@ class Scenario(_Settings):
         return Scenario.model_validate(dict(self) | settings)
 
     def as_yaml(self) -> str:
-        """The whole scenario as a scenario file, with every setting."""
-        return yaml.safe_dump(self.model_dump(mode="json", exclude_none=True), sort_keys=False, width=120)
+        """The whole scenario as a scenario file, with every setting (`YOUNG` ones where used: files stay the same)."""
+        unused = {name for name in YOUNG if not getattr(self, name)}
+        settings = self.model_dump(mode="json", exclude_none=True, exclude=unused)
+        return yaml.safe_dump(settings, sort_keys=False, width=120)
 
     def rig_yaml(self) -> str:
         """The rig file attached to the recording."""

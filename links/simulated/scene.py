@@ -32,11 +32,12 @@ BEAM_START_M = 0.01  # and where it leaves the sensor
 
 @dataclass(frozen=True)
 class Truth:
-    """Where vehicle and drone are at any moment; `drone` is None in an empty sky."""
+    """Where vehicle and drones are at any moment; `drone` is None in an empty sky."""
 
     start_ns: int
     vehicle: Path | Ride  # a path is driven level, a ride on springs
     drone: Path | Flight | None  # a path is flown exactly, a flight with its own dynamics
+    others: tuple[Path, ...] = ()  # drones 2, 3, ...
 
     def seconds(self, stamp_ns: NDArray[np.int64]) -> Array64:
         """Time since the start [s]."""
@@ -46,24 +47,31 @@ class Truth:
         """Rotations (n, 3, 3) and positions (n, 3) [m]."""
         return self.vehicle.level_poses(self.seconds(stamp_ns))
 
-    def T_world_drone(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
-        """Rotations (n, 3, 3) and positions (n, 3) [m]; a LookupError when there is no drone."""
-        if self.drone is None:
-            raise LookupError("this scenario has no drone")
-        return self.drone.flying_poses(self.seconds(stamp_ns))
+    @property
+    def drones(self) -> range:
+        """Numbers of the drones, from 1."""
+        return range(1, 1 if self.drone is None else 2 + len(self.others))
+
+    def T_world_drone(self, stamp_ns: NDArray[np.int64], number: int = 1) -> tuple[Array64, Array64]:
+        """Rotations (n, 3, 3) and positions (n, 3) [m]; a LookupError when there is no such drone."""
+        flown = (self.drone, *self.others)[number - 1] if number in self.drones else None
+        if flown is None:
+            raise LookupError(f"this scenario has no drone {number}")
+        return flown.flying_poses(self.seconds(stamp_ns))
 
 
 @dataclass(frozen=True)
 class Body:
     """Something that moves: its shapes, and where it is when."""
 
-    name: str  # vehicle, drone, car, bird, balloon
+    name: str  # vehicle, drone, drone_2, car, bird, balloon
     meshes: tuple[Mesh, ...]  # in its own frame
     pose: Callable[[NDArray[np.int64]], tuple[Array64, Array64]]  # T_world_body at times (n,) [ns]
     shape: Callable[[NDArray[np.int64]], NDArray[np.int64]] | None  # which mesh it has at times (n,); None: the first
     speed_mps: float  # never faster
     small: bool  # a pulse that passes near is looked at finely
     wetness: float = 0.0
+    drone: int = 0  # which drone it is, from 1; 0: none
 
     @cached_property
     def scenes(self) -> tuple[RayScene, ...]:
@@ -113,14 +121,17 @@ class Scene:
         truth: Truth,
         movers: Sequence[Mover] = (),
         wetness: float = 0.0,
+        others: Sequence[tuple[Mesh, ...]] = (),
     ) -> None:
-        """`drone` are the meshes of `drone_shapes`; they are not used in an empty sky."""
+        """`drone` and `others` are the meshes of `drone_shapes` for drones 1 and 2, 3, ...; none in an empty sky."""
         self.world_mesh = world
         self.world = RayScene(world, wetness)
         self._truth = truth
         self.bodies = [Body("vehicle", (vehicle,), truth.T_world_vehicle, None, TOP_SPEED_MPS, False, wetness)]
-        if truth.drone is not None:
-            self.bodies.append(Body("drone", drone, truth.T_world_drone, self._rotor_step, TOP_SPEED_MPS, True))
+        for number, shapes in zip(truth.drones, (drone, *others), strict=False):
+            name = "drone" if number == 1 else f"drone_{number}"
+            flown = partial(truth.T_world_drone, number=number)
+            self.bodies.append(Body(name, shapes, flown, self._rotor_step, TOP_SPEED_MPS, True, drone=number))
         for mover in movers:
             self.bodies.append(
                 Body(
@@ -143,13 +154,13 @@ class Scene:
 
     def cast(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32, max_range_m: float
-    ) -> tuple[Array32, Array32, NDArray[np.bool_]]:
+    ) -> tuple[Array32, Array32, NDArray[np.uint8]]:
         """See `lidar.Surroundings`."""
         rays = directions_world.shape[1]
         flat_o, flat_d = origins_world_m.reshape(-1, 3), directions_world.reshape(-1, 3)
         ranges = np.full(len(flat_o), np.inf, dtype=np.float32)
         fractions = np.zeros(len(flat_o), dtype=np.float32)
-        is_drone = np.zeros(len(flat_o), dtype=np.bool_)
+        drone = np.zeros(len(flat_o), dtype=np.uint8)
         for body in self.bodies:
             pick, R, t = body.near(pulse_ns, origins_world_m[:, 0], directions_world[:, 0])
             if len(pick) == 0:
@@ -162,10 +173,10 @@ class Scene:
                 if len(target):
                     found = scene.cast(origins[of_shape], directions[of_shape], max_range_m)
                     nearer = _keep_nearer(target, *found, ranges, fractions)
-                    is_drone[nearer] = body.name == "drone"
+                    drone[nearer] = body.drone
         limit = np.minimum(ranges, np.float32(max_range_m))  # embree is quick about rays that end near
-        is_drone[_keep_nearer(None, *self.world.cast(flat_o, flat_d, limit), ranges, fractions)] = False
-        return ranges.reshape(-1, rays), fractions.reshape(-1, rays), is_drone.reshape(-1, rays)
+        drone[_keep_nearer(None, *self.world.cast(flat_o, flat_d, limit), ranges, fractions)] = 0
+        return ranges.reshape(-1, rays), fractions.reshape(-1, rays), drone.reshape(-1, rays)
 
     def near_small_body(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32

@@ -24,6 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from flow.link import Record
 from links.dynamixel.servo import TICK_RAD, VELOCITY_UNIT_RADPS
 from links.simulated.mesh import Array64
+from stages.geometry import Harmonic
 
 RPM_RADPS = 2 * math.pi / 60
 STEP_NS = 1_000_000
@@ -94,6 +95,14 @@ class Turned:
         """What the encoder shows too much: a_1 sin(p + b_1) + a_2 sin(2 p + b_2)."""
         (a1, a2), (b1, b2) = self._amplitudes_rad, self._phases_rad
         return a1 * math.sin(position_rad + b1) + a2 * math.sin(2 * position_rad + b2)
+
+    def harmonics(self) -> tuple[Harmonic, ...]:
+        """The same error as a calibrated rig states it (`LidarMount.servo_harmonics`, servo_sign 1)."""
+        terms = zip((1, 2), self._amplitudes_rad, self._phases_rad, strict=True)
+        return tuple(
+            Harmonic(order=order, amplitude_deg=round(math.degrees(a), 6), phase_deg=round(math.degrees(b), 6))
+            for order, a, b in terms
+        )
 
     def follow(self, position_rad: float) -> float:
         """The turntable's angle after the encoder has moved to `position_rad`. Call it for every step, in order."""

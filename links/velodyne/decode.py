@@ -30,7 +30,8 @@ _PULSE = np.arange(vlp16.BLOCK_PULSES)
 _LASER = (_PULSE % vlp16.LASERS).astype(np.uint8)
 _DELAY_NS = (_PULSE // vlp16.LASERS * vlp16.SEQUENCE_NS + _PULSE % vlp16.LASERS * vlp16.PULSE_NS).astype(np.int64)
 _BLOCK_NS = 2 * vlp16.SEQUENCE_NS
-_ELEVATION_RAD = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))[_LASER]
+_LASER_ELEVATION_RAD = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))
+_ELEVATION_RAD = _LASER_ELEVATION_RAD[_LASER]
 _COS_ELEVATION, _SIN_ELEVATION = np.cos(_ELEVATION_RAD), np.sin(_ELEVATION_RAD)
 _Z_OFFSET_M = 1e-3 * np.array(vlp16.VERTICAL_OFFSET_MM, dtype=np.float64)[_LASER]
 
@@ -201,6 +202,7 @@ def decode_packet(data: bytes, stamp_ns: int, lost_packets: int) -> LidarFirings
         return_kind=return_kind,
         xyz_lidar_m=xyz_lidar_m,
         lost_packets=lost_packets,
+        laser_elevation_rad=_LASER_ELEVATION_RAD,
     )
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from stages.depth_image import focal_length_px
-from stages.detect import KernelDetect
-from stages.kernel_score import inner_half_px, kernel_terms, score_image
-from stages.mean_shift import mean_shift
+from stages.detect.kernel import KernelDetect
+from stages.detect.kernel_score import inner_half_px, kernel_terms, score_image
+from stages.track.mean_shift import mean_shift
 from stages.sweep import Sweep
-from stages.track import MeanShiftTrack
+from stages.track.mean_shift_track import MeanShiftTrack
 from tests.stages.made import MS, ON_ITS_SIDE, START_NS, ball_seen, depth_image, detections, street_depth, swept
 
 FOCAL = focal_length_px(512, 120.0)

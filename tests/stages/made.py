@@ -36,6 +36,7 @@ def firings(xyz_lidar_m, pulse_ns=None, azimuth_rad=0.0, lost_packets=0) -> Lida
         return_kind=np.zeros(n, dtype=np.uint8),
         xyz_lidar_m=xyz,
         lost_packets=lost_packets,
+        laser_elevation_rad=ELEVATION_RAD,
     )
 
 
@@ -148,5 +149,6 @@ def ball_seen(
             return_kind=np.zeros(384, dtype=np.uint8),
             xyz_lidar_m=(rays * distance[:, np.newaxis]).astype(np.float32),
             lost_packets=0,
+            laser_elevation_rad=ELEVATION_RAD,
         )
     yield servo(next_servo_ns, servo_rad((next_servo_ns - START_NS) / 1e9))

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from stages.aim import (
+from stages.aim.vibrate import (
     SweepVibrateAim,
     nearest_within,
     plane_angles_rad,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.depth_image import focal_length_px
-from stages.kernel_score import inner_half_px, kernel_terms, score_image
+from stages.detect.kernel_score import inner_half_px, kernel_terms, score_image
 from tests.stages.made import street_depth
 
 FOCAL = focal_length_px(512, 120.0)  # h / res = 147.80

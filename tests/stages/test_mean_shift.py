@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stages.geometry import rotation_z
-from stages.mean_shift import crossings, fix_covariance_m2, mean_shift
+from stages.track.mean_shift import crossings, fix_covariance_m2, mean_shift
 from tests.stages.made import MS
 
 RNG = np.random.default_rng(0)

@@ -13,10 +13,10 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays, hash_into
 from flow.stage import input_ports, output_ports
-from stages.detect import KernelDetect
+from stages.detect.kernel import KernelDetect
 from stages.messages import DepthImage, Detections, DroneFix, SweptPoints, TrackingState, TrackState
 from stages.sweep import Sweep
-from stages.track import MeanShiftTrack
+from stages.track.mean_shift_track import MeanShiftTrack
 from tests.stages.made import MS, ON_ITS_SIDE, START_NS, ball_seen, detections, swept
 
 T0 = np.array([1.0, 2.0, 20.0])

@@ -43,7 +43,11 @@ def make_run(
     sweeps: list[tuple[float, float, list[list[float]]]] | None = None,
     hits_s: list[float] | None = None,
     compute_ms: dict | None = None,
-    states: list[tuple[float, str]] = (),
+    states: list[tuple] = (),
+    tracks: list[int] | np.ndarray | None = None,
+    visible: list[tuple[float, int]] | None = None,
+    config: str = "",
+    sets: list[str] = (),
 ) -> Path:
     """A run with fixes at `t_s`. `truth` "no drone" or "none" leaves it out; default: `truth_at` over the whole recording."""
     folder.mkdir(parents=True)
@@ -51,8 +55,9 @@ def make_run(
     (folder / "fix_vehicle_drone.tum").write_text("# T_vehicle_drone, position only\n" + lines(t_s, xyz))
     if sigma_m is not None:
         variances = np.broadcast_to(np.asarray(sigma_m, dtype=float), len(t_s)) ** 2
-        rows = [f"{stamp(t)},{v},0,0,{v},0,{v},5,3\n" for t, v in zip(t_s, variances, strict=True)]
-        head = "stamp_s,cxx_m2,cxy_m2,cxz_m2,cyy_m2,cyz_m2,czz_m2,hits,iterations\n"
+        ends = [""] * len(t_s) if tracks is None else [f",{track}" for track in tracks]
+        rows = [f"{stamp(t)},{v},0,0,{v},0,{v},5,3{end}\n" for t, v, end in zip(t_s, variances, ends, strict=True)]
+        head = f"stamp_s,cxx_m2,cxy_m2,cxz_m2,cyy_m2,cyz_m2,czz_m2,hits,iterations{'' if tracks is None else ',track_id'}\n"
         (folder / "fix_covariance.csv").write_text(head + "".join(rows))
     if isinstance(truth, str):
         if truth == "no drone":
@@ -68,14 +73,23 @@ def make_run(
                 score = "1" if accepted else ""
                 text += ",".join([stamp(start), stamp(end), *map(str, cells), score]) + "\n"
         (folder / "detections.csv").write_text(text)
+    if visible is not None:
+        rows = "".join(f"{stamp(t)},{seen}\n" for t, seen in visible)
+        (folder / "truth_visible.csv").write_text(f"stamp_s,visible\n{rows}")
     if hits_s is not None:
         (folder / "truth_hits.csv").write_text("stamp_s\n" + "".join(f"{stamp(t)}\n" for t in hits_s))
     summary = {
         "recording": f"{recording}.mcap",
         "start_s": stamp(0.0),
         "end_s": stamp(duration_s),
-        "states": [{"stamp_s": stamp(t), "state": state, "reason": ""} for t, state in states],
+        "states": [
+            {"stamp_s": stamp(t), "state": state, "reason": ""} | ({"track_id": track[0]} if track else {})
+            for t, state, *track in states
+        ],
         "compute_ms": compute_ms or {},
+        "config": f"{config}.yaml",
+        "overlays": [],
+        "set": list(sets),
     }
     (folder / "summary.json").write_text(json.dumps(summary))
     return folder

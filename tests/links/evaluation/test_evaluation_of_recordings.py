@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError, Record, Run
+from links.evaluation import read_run
 from links.evaluation.errors import euler_rpy
+from links.evaluation.true_drone import NEVER_NS, read_true_drones
 from links.evaluation.tum import read_tum
 from links.results import Results
 from links.truth import TruthLog
 from stages.geometry import rotations_from_xyzw
-from stages.messages import DepthImage, Detections
+from stages.messages import DepthImage, Detections, DroneFix, TrackingState, TrackState
 from tests.links.evaluation.made_runs import yaw_quaternion
 
 
@@ -53,9 +55,134 @@ def test_a_recording_without_a_drone_says_so_and_one_without_truth_says_nothing(
     assert list((tmp_path / "b").iterdir()) == []
 
 
+def test_each_drone_has_its_own_files_of_truth(tmp_path):
+    """Drone 2 is 3 m over drone 1; nothing hides drone 1, drone 2 is hidden after 1 s."""
+    log = TruthLog()
+    records = [pose("/truth/vehicle", 7, [1.0, 0, 0], 0), pose("/truth/drone", 7, [1.0, 0, 5], 0)]
+    records += [pose("/truth/drone_2", 7, [1.0, 0, 8], 0), Record("/truth/hits_2", 0, 0, b'{"pulse_stamp_ns": [7]}')]
+    records += [
+        Record("/truth/visible", 0, 0, b'{"visible": true}'),
+        Record("/truth/visible_2", 0, 0, b'{"visible": true}'),
+    ]
+    records += [Record("/truth/visible_2", 1_000_000_000, 1_000_000_000, b'{"visible": false}')]
+    assert list(log.aside(records)) == []
+    log.write(tmp_path)
+    drones, said_empty = read_true_drones(tmp_path, None)
+    assert not said_empty
+    one, two = drones
+    assert one.path is not None
+    assert two.path is not None
+    assert (one.path.xyz_m.tolist(), two.path.xyz_m.tolist()) == ([[0, 0, 5]], [[0, 0, 8]])
+    assert one.hits_ns is None
+    assert two.hits_ns is not None
+    assert two.hits_ns.tolist() == [7]
+    assert one.hidden_ns is not None
+    assert two.hidden_ns is not None
+    assert (one.hidden_ns.tolist(), two.hidden_ns.tolist()) == ([], [[1_000_000_000, NEVER_NS]])
+
+
+def test_fixes_are_compared_with_the_drone_their_track_follows():
+    log = TruthLog()
+    for stamp in (0, 10_000_000):
+        log.vehicle[stamp] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        for number in (1, 2):
+            list(log.aside([pose(f"/truth/drone_{number}", stamp, [0, 0, 10 * number], 0)]))
+    fixes = [fix(5_000_000, 19.5, track_id=4), fix(6_000_000, 10.25, track_id=9), fix(20_000_000, 10, track_id=9)]
+    errors = log.errors_of(fixes)
+    assert errors is not None
+    assert errors.error_m[:, 2] == pytest.approx([-0.5, 0.25])
+    assert errors.stamps_ns.tolist() == [5_000_000, 6_000_000]
+    assert errors.not_covered == 1
+    assert TruthLog().errors_of(fixes) is None
+
+
+@pytest.mark.parametrize("data", [b"{}", b'{"visible": 1}', b"no"])
+def test_what_is_visible_is_true_or_false(data):
+    with pytest.raises(LinkError, match=r"/truth/visible at 3 ns"):
+        list(TruthLog().aside([Record("/truth/visible", 3, 3, data)]))
+
+
+def fix(stamp_ns: int, z_m: float, track_id: int) -> DroneFix:
+    where = np.array([0.0, 0.0, z_m])
+    return DroneFix(
+        stamp_ns=stamp_ns,
+        xyz_vehicle_m=where,
+        covariance_m2=np.eye(3),
+        hits=5,
+        iterations=1,
+        shift_m=0.0,
+        track_id=track_id,
+    )
+
+
 def test_hits_that_are_none_are_refused():
     with pytest.raises(LinkError, match="holds no pulses"):
         list(TruthLog().aside([Record("/truth/hits", 0, 0, b"{}")]))
+
+
+def test_fixes_of_all_tracks_are_written_with_their_number(tmp_path):
+    results = Results()
+    results.open(Run(tmp_path, "", "", ""))
+    for stamp, track in ((2_000_000_000, 1), (2_000_000_000, 2), (1_000_000_000, 2)):
+        results.see("track.drone_fix", fix(stamp, float(track), track), 0)
+    results.close()
+    rows = (tmp_path / "fix_covariance.csv").read_text().splitlines()
+    assert rows[0].endswith(",hits,iterations,track_id")
+    assert [row.split(",")[-1] for row in rows[1:]] == ["1", "2", "2"]
+    (tmp_path / "summary.json").write_text("{}")
+    output = read_run(tmp_path).outputs[0]
+    assert output.track is not None
+    assert (output.track.tolist(), output.poses.xyz_m[:, 2].tolist()) == ([2, 1, 2], [2.0, 1.0, 2.0])
+
+
+def test_each_track_tells_its_own_changes_of_state(tmp_path):
+    results = Results()
+    results.open(Run(tmp_path, "", "", ""))
+    told = [
+        (1, "SEARCHING"),
+        (1, "TRACKING"),
+        (2, "CANDIDATE"),
+        (1, "TRACKING"),
+        (2, "CANDIDATE"),
+        (2, "TRACKING"),
+        (1, "COASTING"),
+    ]
+    for second, (track, state) in enumerate(told):
+        message = TrackState(
+            stamp_ns=second * 1_000_000_000,
+            state=TrackingState[state],
+            reason="why",
+            hits=0,
+            frame_s=0.1,
+            track_id=track,
+        )
+        results.see("track.track_state", message, 0)
+    results.close()
+    assert [(t.track_id, t.state) for t in results.transitions] == [told[i] for i in (0, 1, 2, 5, 6)]
+    assert (tmp_path / "run.log").read_text().splitlines() == [
+        "0.000000000 track.track_state: SEARCHING: why",
+        "1.000000000 track.track_state: TRACKING: why",
+        "2.000000000 track.track_state: track 2 CANDIDATE: why",
+        "5.000000000 track.track_state: track 2 TRACKING: why",
+        "6.000000000 track.track_state: COASTING: why",
+    ]
+
+
+def test_a_search_that_says_when_it_began_is_believed(tmp_path):
+    results = Results()
+    results.open(Run(tmp_path, "", "", ""))
+    for start, end in ((1_000_000_000, 2_000_000_000), (2_000_000_000, 2_500_000_000), (None, 3_000_000_000)):
+        empty = np.zeros(0)
+        found = Detections(
+            stamp_ns=end, xyz_vehicle_m=np.zeros((0, 3)), score=empty, e_inner=empty, e_outer=empty,
+            accepted=np.zeros(0, dtype=bool), reasons=(), verdict="no drone", start_ns=start,
+        )  # fmt: skip
+        results.see("detect.detections", found, 0)
+    results.close()
+    lines = (tmp_path / "detections.csv").read_text().splitlines()[1:]
+    assert [line.split(",")[:2] for line in lines] == [
+        ["1.000000000", "2.000000000"], ["2.000000000", "2.500000000"], ["2.500000000", "3.000000000"]
+    ]  # fmt: skip
 
 
 def test_every_sweep_has_a_line_with_its_accepted_candidates(tmp_path):

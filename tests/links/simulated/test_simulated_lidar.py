@@ -23,7 +23,7 @@ class _Room:
     def cast(self, pulse_ns, origins_world_m, directions_world, max_range_m):
         rays = directions_world.shape[:2]
         found = self._scene.cast(origins_world_m.reshape(-1, 3), directions_world.reshape(-1, 3), max_range_m)
-        return found[0].reshape(rays), found[1].reshape(rays), np.zeros(rays, dtype=np.bool_)
+        return found[0].reshape(rays), found[1].reshape(rays), np.zeros(rays, dtype=np.uint8)
 
     def near_small_body(self, pulse_ns, origins_world_m, directions_world):
         return np.zeros(len(pulse_ns), dtype=np.bool_)
@@ -46,12 +46,12 @@ def _fire(room, sequences: int, R=None, seed: int = 1, **settings):
 
 def _echo(ranges, fractions, threshold=1e-12, mode="dual", shares=SHARES):
     ranges, fractions = np.array([ranges], dtype=np.float32), np.array([fractions], dtype=np.float32)
-    drone = np.zeros(ranges.shape, dtype=np.bool_)
+    drone = np.zeros(ranges.shape, dtype=np.uint8)
     return [part[:, 0] for part in echoes(ranges, fractions, drone, shares, np.array([threshold]), 0.5, mode)]
 
 
 def test_an_echo_is_the_power_weighted_mean_of_what_lies_within_a_pulse_length() -> None:
-    ranges, power, _ = _echo([10.0, 10.5, 11.2, np.inf], [0.2, 0.4, 0.8, 0.0], mode="strongest")
+    ranges, power, _, _ = _echo([10.0, 10.5, 11.2, np.inf], [0.2, 0.4, 0.8, 0.0], mode="strongest")
     p = 0.25 * np.array([0.2, 0.4, 0.8]) / np.array([10.0, 10.5, 11.2]) ** 2  # 1.2 m in all, but no gap over 1 m
     assert power[0] == pytest.approx(p.sum(), rel=1e-6)
     assert ranges[0] == pytest.approx((p @ [10.0, 10.5, 11.2]) / p.sum(), abs=1e-5)

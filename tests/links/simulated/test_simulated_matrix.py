@@ -10,15 +10,29 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from flow.link import LinkError
 from links.cli.app import app
 from links.recording import RecordingReader
 from links.simulated import matrix_flights
 from links.simulated.clearance import sample_times_s, visible
-from links.simulated.matrix import MOTIONS, RANGES_M, SCENES, VEHICLES, cells, make_matrix, scenario_of
-from links.simulated.matrix_flights import Cell
-from links.simulated.mesh import RayScene
+from links.simulated.matrix import (
+    MOTIONS,
+    RANGES_M,
+    SCENES,
+    SERVO,
+    VEHICLES,
+    Conditions,
+    cells,
+    make_matrix,
+    scenario_of,
+)
+from links.simulated.matrix_flights import Cell, drone_path, two_paths
+from links.simulated.mesh import RayScene, box, merge
+from links.simulated.run import Simulation
 from links.simulated.scenario import Scenario
+from links.simulated.servo import Turned
 from links.simulated.world import build_world
+from links.simulated.world.settings import Kind
 
 LIDAR_UP = np.array([0.0, 0.0, 0.35])
 
@@ -39,14 +53,16 @@ def seen(scenario: Scenario) -> np.ndarray:
 
 def test_the_matrix_is_the_whole_product_with_the_special_flights_and_no_name_twice() -> None:
     names = [cell.name for cell in cells()]
-    assert len(names) == len(set(names)) == 5 * 6 * 3 * 5 + 5 + 4
+    goals = 5 * 3 + 5 + 5 + 2 * 5  # empty, two, search, 50 m
+    assert len(names) == len(set(names)) == 5 * 6 * 3 * 5 + 5 + 4 + goals
     assert min(RANGES_M) == 10
     assert max(RANGES_M) == 60
-    assert [cell.name for cell in cells("campus-20m-orbit-*")] == [f"campus-20m-orbit-{v}" for v in VEHICLES]
-    assert cells("nowhere-*") == []
+    assert [cell.name for cell in cells(["campus-20m-orbit-*"])] == [f"campus-20m-orbit-{v}" for v in VEHICLES]
+    assert cells(["nowhere-*"]) == []
 
 
 def test_in_pairs_each_two_values_meet_in_few_cells() -> None:
+    assert len(cells(pairs=True)) == 39
     few = [cell for cell in cells(pairs=True) if cell.motion in MOTIONS]
     assert len(few) == 30
     axes = {"range_m": RANGES_M, "motion": MOTIONS, "vehicle": VEHICLES, "scene": SCENES}
@@ -106,6 +122,88 @@ def test_a_drone_leaves_the_lidars_reach_and_returns() -> None:
     assert range_m[-1] == pytest.approx(20.0, abs=0.1)
 
 
+def test_cells_of_the_goals_are_named_by_what_happens() -> None:
+    patterns = ["*-0m-empty-*", "*-20m-two-parked", "*-40m-search-parked", "*-50m-*"]
+    names = {cell.name for cell in cells(patterns)}
+    assert len(names) == 35
+    assert {"campus-0m-empty-driving", "atlanta-20m-two-parked", "open_lot-40m-search-parked"} <= names
+    assert {"manhattan-50m-hover-parked", "park_edge-50m-orbit-parked"} <= names
+    assert cells(patterns, pairs=True) == []
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_an_empty_sky_has_no_drone_and_the_vehicle_stays_in_the_scene(vehicle: str) -> None:
+    scenario = scenario_of(Cell("park_edge", 0, "empty", vehicle), 1)
+    assert (scenario.drone, scenario.truth_visible, scenario.duration_s) == (None, False, 30.0)
+    driven = scenario.vehicle.path.at(sample_times_s(30.0))[0]
+    far_m = np.linalg.norm(driven, axis=1).max()
+    assert (far_m > 40) if vehicle == "driving" else (far_m < 9)
+    assert far_m < 76
+
+
+@pytest.mark.parametrize("scene", ["manhattan", "open_lot"])
+def test_of_two_drones_one_orbits_and_one_hovers_and_they_stay_apart(scene: Kind) -> None:
+    scenario = scenario_of(Cell(scene, 20, "two", "parked"), 1)
+    times, lidar, orbiting = flown(scenario)
+    (other,) = scenario.other_drones
+    hovering = other.path.at(times)[0]
+    assert np.linalg.norm(orbiting - lidar, axis=1) == pytest.approx(20.0, abs=0.1)
+    assert np.linalg.norm(hovering - lidar, axis=1) == pytest.approx(20.0, abs=0.3)
+    speeds = [np.linalg.norm(np.diff(p, axis=0), axis=1) / np.diff(times) for p in (orbiting, hovering)]
+    assert speeds[0][10:-10] == pytest.approx(3.0, rel=0.02)
+    assert speeds[1].max() < 0.3
+    azimuths = [np.degrees(np.arctan2(p[:, 1], p[:, 0])) for p in (orbiting, hovering)]
+    apart = np.abs((azimuths[0] - azimuths[1] + 180) % 360 - 180)
+    assert 38 < apart[0] < 62
+    assert apart.min() > 38
+    assert seen(scenario).mean() > 0.94
+    assert seen(scenario.changed(drone=other, other_drones=())).mean() > 0.94
+
+
+def test_two_drones_that_would_have_to_meet_are_not_made() -> None:
+    """Between walls 8 m away only steep flights have room, and a steep orbit comes all the way round in 12 s."""
+    walls = [box((x, y, -2), (x + dx, y + dy, 60), "brick") for x, y, dx, dy in ((-9, -9, 1, 18), (8, -9, 1, 18))]
+    walls += [box((x, y, -2), (x + dx, y + dy, 60), "brick") for x, y, dx, dy in ((-9, -9, 18, 1), (-9, 8, 18, 1))]
+    world, times = RayScene(merge(walls)), sample_times_s(12.0)
+    lidar = np.tile(LIDAR_UP, (len(times), 1))
+    drone_path(Cell("manhattan", 20, "orbit", "parked"), world, np.random.default_rng(1), times, lidar)  # alone it may
+    with pytest.raises(LinkError, match="manhattan-20m-two-parked: no free flight of this kind"):
+        two_paths(Cell("manhattan", 20, "two", "parked"), world, np.random.default_rng(1), times, lidar)
+
+
+def test_a_drone_to_search_for_hovers_high_at_40_m_while_the_servo_sweeps() -> None:
+    scenario = scenario_of(Cell("campus", 40, "search", "parked"), 2)
+    _, lidar, drone = flown(scenario)
+    offset = drone - lidar
+    assert np.linalg.norm(offset, axis=1) == pytest.approx(40.0, abs=0.3)
+    assert np.degrees(np.arctan2(offset[:, 2], np.hypot(offset[:, 0], offset[:, 1]))).min() > 44
+    assert [segment.do for segment in scenario.script] == ["sweep"]
+
+
+def test_a_calibrated_rig_knows_the_encoders_error_and_the_world_stays_the_same() -> None:
+    cell = Cell("open_lot", 20, "hover", "parked")
+    plain, known = scenario_of(cell, 3), scenario_of(cell, 3, Conditions(calibrated=True))
+    assert known.mount == plain.mount == plain.rig.mount
+    assert known.mount.servo_harmonics == ()
+    tight = SERVO.model_copy(update={"backlash_deg": 0.0})
+    turned = Turned(tight, 3)
+    encoder = np.linspace(0.0, np.pi, 50)
+    truly = np.array([turned.follow(p) for p in encoder])
+    assert known.rig.mount.turntable_rad(encoder) == pytest.approx(truly, abs=1e-7)
+    assert np.abs(plain.rig.mount.turntable_rad(encoder) - truly).max() > np.radians(0.1)
+    sensed = [[(r.topic, r.data) for r in Simulation(s.changed(duration_s=0.2)).records()] for s in (plain, known)]
+    assert sensed[0] == sensed[1]
+    assert Scenario.model_validate(yaml.safe_load(known.as_yaml())) == known
+
+
+def test_odometry_and_rain_are_added_to_a_cell_and_change_nothing_else() -> None:
+    cell = Cell("open_lot", 20, "hover", "driving")
+    both = scenario_of(cell, 3, Conditions(odometry=True, rain=True))
+    assert both.vehicle_odometry is not None
+    assert both.weather.rain_mmph == 5.0
+    assert both.changed(vehicle_odometry=None, weather={}) == scenario_of(cell, 3)
+
+
 def test_a_seed_makes_one_scenario_and_another_seed_another() -> None:
     cell = Cell("park_edge", 30, "cross", "driving")
     assert scenario_of(cell, 1) == scenario_of(cell, 1)
@@ -119,7 +217,7 @@ def test_a_scenario_survives_its_own_yaml() -> None:
 
 def test_what_is_there_and_whole_is_kept_and_all_else_made_again(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matrix_flights, "USUAL_DURATION_S", 0.2)
-    wanted, told = cells("open_lot-10m-hover-*"), []
+    wanted, told = cells(["open_lot-10m-hover-*"]), []
     first = make_matrix(tmp_path, wanted, range(1, 2), None, lambda done, whole: told.append((done, whole)))
     assert (first.made, first.kept, first.impossible) == (3, 0, ())
     assert told[-1] == pytest.approx((0.6, 0.6))
@@ -131,6 +229,9 @@ def test_what_is_there_and_whole_is_kept_and_all_else_made_again(tmp_path, monke
     again = make_matrix(tmp_path, wanted, range(1, 2), None, lambda done, whole: None)
     assert (again.made, again.kept) == (1, 2)
     assert file.read_bytes() == whole
+    wet = Conditions(rain=True)
+    third = make_matrix(tmp_path, wanted[:1], range(1, 2), None, lambda done, whole: None, wet)
+    assert (third.made, third.kept) == (1, 0)
 
 
 def test_a_scene_without_a_place_is_told_and_the_rest_is_made(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,3 +250,19 @@ def test_the_command_names_cells_and_refuses_a_pattern_that_fits_none(tmp_path: 
     wrong = CliRunner().invoke(app, ["matrix", str(tmp_path), "--only", "moon-*"])
     assert wrong.exit_code == 2
     assert "no cell is called like 'moon-*'" in wrong.output
+    several = ["--only", "campus-0m-empty-parked", "--only", "campus-*-two-*", "--list"]
+    listed = CliRunner().invoke(app, ["matrix", str(tmp_path), *several])
+    assert listed.stdout.split() == ["campus-0m-empty-parked", "campus-20m-two-parked"]
+
+
+def test_the_commands_conditions_reach_the_recording(tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matrix_flights, "USUAL_DURATION_S", 0.2)
+    asked = ["--only", "open_lot-20m-two-parked", "--calibrated", "--odometry", "--rain"]
+    made = CliRunner().invoke(app, ["matrix", str(tmp_path), *asked])
+    assert made.exit_code == 0, made.output
+    with RecordingReader(tmp_path / "open_lot-20m-two-parked-s1.mcap") as reader:
+        scenario, rig = yaml.safe_load(reader.config_yaml), yaml.safe_load(reader.rig_yaml)
+        topics = set(reader.topics)
+    assert [term["order"] for term in rig["lidar"]["mount"]["servo_harmonics"]] == [1, 2]
+    assert scenario["weather"]["rain_mmph"] == 5.0
+    assert {"/vehicle/odometry", "/truth/drone_2", "/truth/hits_2", "/truth/visible", "/truth/visible_2"} <= topics

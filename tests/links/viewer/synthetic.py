@@ -87,6 +87,7 @@ def packet(t_s: float) -> tuple[LidarFirings, SweptPoints]:
         return_kind=np.zeros(len(laser), np.uint8),
         xyz_lidar_m=(ray_lidar * distance[:, None]).astype(np.float32),
         lost_packets=0,
+        laser_elevation_rad=ELEVATION_RAD,
     )
     swept = SweptPoints(
         stamp_ns=int(stamps[0]),

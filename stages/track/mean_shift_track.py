@@ -1,6 +1,6 @@
 """Track: returns near the drone's last position, frame by frame, become its next position.
 
-    F = {returns of this frame within r of t^0},  t^0 = the last frame's t,  then `stages/mean_shift.py`
+    F = {returns of this frame within r of t^0},  t^0 = the last frame's t,  then `stages/track/mean_shift.py`
 
 SEARCHING until a detection is accepted; TRACKING from there; a frame without hits is normal (the beam is elsewhere),
 but `lost_after_s` without any is LOST for one frame, then SEARCHING again. Frames are cut by the points' own times on a
@@ -27,7 +27,7 @@ from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
 from stages.geometry import Array64
-from stages.mean_shift import crossings, fix_covariance_m2, mean_shift, within
+from stages.track.mean_shift import crossings, fix_covariance_m2, mean_shift, within
 from stages.messages import Detections, DroneFix, SweptPoints, TrackingState, TrackState
 
 

@@ -2,8 +2,8 @@
 
     t_hat_0 = unproject(argmin_c e(c))                                                      Equation (1)
 
-over all pixels with depth, e from `stages/kernel_score.py`. The paper stops there and so always has a drone; here the
-local minima are walked from the lowest score up and each is accepted or refused, in words (`stages/candidates.py`).
+over all pixels with depth, e from `stages/detect/kernel_score.py`. The paper stops there and so always has a drone; here the
+local minima are walked from the lowest score up and each is accepted or refused, in words (`stages/detect/candidates.py`).
 `gates: null` is the paper literally: the lowest score is the drone.
 
 Source: P III.B, Equations 1-5; the gates are ours.
@@ -19,9 +19,9 @@ import numpy as np
 from pydantic import Field
 
 from flow.stage import Stage
-from stages.candidates import Gates, Pixel, local_minima, refusal
+from stages.detect.candidates import Gates, Pixel, local_minima, refusal
 from stages.depth_image import unproject
-from stages.kernel_score import inner_half_px, kernel_terms, score_image
+from stages.detect.kernel_score import inner_half_px, kernel_terms, score_image
 from stages.messages import DepthImage, Detections, ScoreImage
 
 

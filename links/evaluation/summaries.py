@@ -1,0 +1,119 @@
+"""Groups and drone-free runs as tables of text, for the terminal and the report.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rich.cells import cell_len
+from rich.table import Table
+from rich.text import Text
+
+from links.evaluation.groups import CONFIG, Group, Key
+from links.evaluation.no_drone import Alarms
+
+HOW = (
+    "ever, mute, false: runs that were right at least once, said nothing, were mostly false. hit, seen: sweeps with a "
+    "return of the drone, with 4 or more; found: by the best candidate; found/seen: of those seen, by any. back: found "
+    "again after it was hidden; lost: in sight. 3D RMSE: of the runs that were right at least once. Medians and 95 % "
+    "count a failure as infinite ('never', or longer than the shortest run that failed); maxima are over what did not "
+    "fail. Of several drones each counts as a run."
+)
+NOTHING = "-"
+Column = tuple[str, Callable[[Group], str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A table in words."""
+
+    title: str
+    heads: list[str]
+    rows: list[list[str]]
+    named: int  # columns at the left that name the row
+    note: str = ""
+
+    def table(self) -> Table:
+        """For the terminal, as wide as it must be: columns are not cut to fit a window."""
+        columns = [[head, *cells] for head, cells in zip(self.heads, zip(*self.rows, strict=True), strict=True)]
+        widths = [max(cell_len(line) for cell in column for line in cell.split("\n")) for column in columns]
+        table = Table(title=self.title, title_justify="left", width=sum(widths) + 3 * len(widths) + 1)
+        for index, head in enumerate(self.heads):
+            table.add_column(Text(head), justify="left" if index < self.named else "right", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*(Text(cell) for cell in row))
+        return table
+
+
+COLUMNS: tuple[Column, ...] = (
+    ("runs", lambda g: str(g.runs)),
+    ("right\n[%]", lambda g: _digits(g.right_share, 1)),
+    ("ever", lambda g: str(g.ever_right)),
+    ("mute", lambda g: str(g.silent)),
+    ("false", lambda g: str(g.mostly_false)),
+    ("hit\n[%]", lambda g: _percent(g.hit)),
+    ("seen\n[%]", lambda g: _percent(g.seen)),
+    ("found\n[%]", lambda g: _percent(g.found)),
+    ("found/\nseen [%]", lambda g: _percent(g.found_when_seen)),
+    ("first\nmedian [s]", lambda g: _digits(g.first_right_s.median, 1, g.shortest_failed_s)),
+    ("first\n95 % [s]", lambda g: _digits(g.first_right_s.p95, 1, g.shortest_failed_s)),
+    ("hit gap\nmedian [s]", lambda g: _digits(g.hit_gap_s.median, 2)),
+    ("hit gap\nmax [s]", lambda g: _digits(g.hit_gap_s.largest, 2)),
+    ("back", lambda g: _of(len(g.reacquired_s.succeeded), len(g.reacquired_s.values))),
+    ("back\nmedian [s]", lambda g: _digits(g.reacquired_s.median, 2)),
+    ("back\nmax [s]", lambda g: _digits(g.reacquired_s.largest, 2)),
+    ("lost", lambda g: NOTHING if g.lost is None else str(g.lost)),
+    ("3D RMSE\nmedian [m]", lambda g: _digits(g.rmse_m.median, 3)),
+    ("in 95 %\n[%]", lambda g: _percent(g.inside_95)),
+    ("false\n[/h]", lambda g: _digits(g.false_per_h, 0)),
+)
+
+
+def group_summary(found: list[Group], key: Key) -> Summary:
+    """Groups down, numbers across; the configuration is a column when there are several or nothing else names a row."""
+    with_config = not key or len({group.config for group in found}) > 1
+    by = f"word {', '.join(map(str, key))} of the recording's name" if key else CONFIG
+    told = {head: [tell(group) for group in found] for head, tell in COLUMNS}
+    kept = {head: cells for head, cells in told.items() if any(cell != NOTHING for cell in cells)}
+    names = [[*group.words, *([group.config] if with_config else [])] for group in found]
+    heads = [*(f"word {word}" for word in key), *([CONFIG] if with_config else []), *kept]
+    rows = [[*name, *cells] for name, cells in zip(names, zip(*kept.values(), strict=True), strict=True)]
+    left_out = ", ".join(head.replace("\n", " ") for head in told if head not in kept)
+    return Summary(f"by {by}", heads, rows, len(names[0]), HOW + (f" Nothing to tell: {left_out}." if left_out else ""))
+
+
+def alarm_summary(found: list[Alarms]) -> Summary:
+    """Configurations down; the note names the recordings in which drones were invented."""
+    heads = [CONFIG, "runs", "hours", "outputs", "false\ndetections", "drones\ninvented", "[/h]", "below [/h]\n(95 %)"]
+    rows = [
+        [a.config, str(a.runs), f"{a.hours:.3g}", *map(str, (a.outputs, a.detections, a.invented))]
+        + [f"{rate:.3g}" for rate in (a.per_h, a.upper_per_h)]
+        for a in found
+    ]
+    where = [
+        f"{a.config or 'runs'}: drones invented in "
+        + ", ".join(f"{name} ({count})" if count > 1 else name for name, count in a.by_recording.items())
+        for a in found
+        if a.by_recording
+    ]
+    return Summary("without a drone", heads, rows, 1, "; ".join(where))
+
+
+def _digits(value: float | None, digits: int, longer_than: float | None = None) -> str:
+    if value is None:
+        return NOTHING
+    if math.isinf(value):
+        return "never" if longer_than is None else f">{longer_than:.0f}"
+    return f"{value:.{digits}f}"
+
+
+def _percent(counts: tuple[int, int]) -> str:
+    return f"{100 * counts[0] / counts[1]:.1f}" if counts[1] else NOTHING
+
+
+def _of(count: int, of: int) -> str:
+    return f"{count}/{of}" if of else NOTHING

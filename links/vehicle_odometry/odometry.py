@@ -1,0 +1,83 @@
+"""The vehicle's own odometry as a source: one JSON object per pose, T_start_vehicle.
+
+A recording without it is no error: the source stays silent, and the run says so once.
+
+Source: ours; recording format in recordings/README.md (/vehicle/odometry).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+from pydantic import PrivateAttr
+
+from flow.link import Record, Source
+from stages.geometry import Array64, rotation_from_quaternion_xyzw
+from stages.messages import VehicleMotion
+
+MAX_BYTES = 4_000
+MAX_M = 1e7
+LENGTH_SLACK = 1e-3  # of a quaternion
+CORRELATION_SLACK = 1e-4  # what rounding to six digits does to a covariance
+
+
+class VehicleOdometry(Source):
+    """Where the vehicle has driven. A record that holds no pose is counted in `refused` and left out."""
+
+    topic: str = "/vehicle/odometry"
+    _refused: int = PrivateAttr(default=0)
+
+    @property
+    def refused(self) -> int:
+        """Records that held no pose, or one that cannot be true."""
+        return self._refused
+
+    def decode(self, record: Record) -> VehicleMotion | None:
+        """A message of `{"xyz_m": [...], "quaternion_xyzw": [...], "covariance": [36 numbers] or null}`, else None."""
+        try:
+            return parse_pose(record.stamp_ns, record.data)
+        except ValueError:
+            self._refused += 1
+            return None
+
+
+def parse_pose(stamp_ns: int, data: bytes) -> VehicleMotion:
+    """One recorded pose. Raises ValueError when it is none: fields missing, not finite, no rotation, no covariance."""
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"a pose of {len(data)} bytes")
+    try:
+        fields: Any = json.loads(data)
+        xyz_m = np.asarray(fields["xyz_m"], dtype=np.float64)
+        qx, qy, qz, qw = (float(v) for v in fields["quaternion_xyzw"])
+        rows = fields.get("covariance")
+        covariance = None if rows is None else checked_covariance(np.asarray(rows, dtype=np.float64))
+    except (TypeError, KeyError, AttributeError, OverflowError, RecursionError) as problem:
+        raise ValueError(f"no pose: {problem!r}") from None
+    if xyz_m.shape != (3,) or not (np.abs(xyz_m) < MAX_M).all():  # NaN compares false
+        raise ValueError(f"a pose at {xyz_m.tolist()}")
+    if not abs(math.hypot(qx, qy, qz, qw) - 1) < LENGTH_SLACK:
+        raise ValueError(f"no rotation: {[qx, qy, qz, qw]}")
+    return VehicleMotion(
+        stamp_ns=stamp_ns,
+        xyz_start_m=xyz_m,
+        R_start_vehicle=rotation_from_quaternion_xyzw((qx, qy, qz, qw)),
+        covariance=covariance,
+    )
+
+
+def checked_covariance(rows: Array64) -> Array64:
+    """(6, 6) of 36 numbers by rows. Raises ValueError when it is not symmetric or has a negative eigenvalue."""
+    if rows.shape != (36,) or not np.isfinite(rows).all():
+        raise ValueError("a covariance without 36 finite numbers")
+    covariance = rows.reshape(6, 6)
+    variances = np.diagonal(covariance)
+    sigmas = np.sqrt(np.where(variances > 0, variances, 1.0))
+    correlation = covariance / np.outer(sigmas, sigmas)
+    if np.abs(correlation - correlation.T).max() > CORRELATION_SLACK:
+        raise ValueError("a covariance that is not symmetric")
+    if np.linalg.eigvalsh(correlation)[0] < -CORRELATION_SLACK:
+        raise ValueError("a covariance with a negative variance")
+    return (covariance + covariance.T) / 2

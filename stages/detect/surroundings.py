@@ -1,0 +1,149 @@
+"""What was measured around a place: sectors that pulses flew through, sectors in which something stands, and big things.
+
+Around a place at range R, in the plane across the line of sight:
+
+    inner disc     the thing itself: hits, and pulses that passed
+    ring           8 sectors between `inner` and `outer`: free when a pulse went on farther than R there, occupied when
+                   one returned near R, within `depth` and a slope
+
+A drone hangs free: pulses pass it on every side. What stands on a pole, hangs on a wire, sticks out of a tree or ends a
+wall has something beside it. A sector nothing flew through says nothing.
+
+Source: ours; DESIGN, "a small cluster with *measured* emptiness around it".
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.compiled import compiled
+from stages.geometry import Array64
+
+SECTORS = 8
+INNER_HITS, INNER_PASSES, NEARER, FREE_0 = 0, 1, 2, 3  # FREE_0.. 8 free, then 8 occupied
+OCCUPIED_0 = FREE_0 + SECTORS
+TALLY = OCCUPIED_0 + SECTORS
+BITS = 16  # of the map's table
+MAP_SIZE = 1 << BITS
+
+
+@compiled
+def look_around(
+    direction: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    origin_m: Array64,
+    centre_m: Array64,
+    disc_m: float,
+    inner_m: float,
+    outer_m: float,
+    depth_m: float,
+    tally: NDArray[np.int64],
+) -> None:
+    """Add to tally (TALLY,) what pulses (n, 3), (n,) found around centre_m (3,)."""
+    x, y, z = centre_m[0] - origin_m[0], centre_m[1] - origin_m[1], centre_m[2] - origin_m[2]
+    R = math.sqrt(x * x + y * y + z * z)
+    ux, uy, uz = x / R, y / R, z / R
+    level = math.hypot(ux, uy)
+    if level < 1e-6:
+        ax, ay = 1.0, 0.0
+    else:
+        ax, ay = -uy / level, ux / level  # a: level, across the line of sight; b = u x a
+    bx, by, bz = -uz * ay, uz * ax, ux * ay - uy * ax
+    least = math.cos(min(outer_m / R * 1.05, 1.5))
+    for i in range(range_m.size):
+        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        along = dx * ux + dy * uy + dz * uz
+        if along < least:
+            continue
+        a = R * (dx * ax + dy * ay) / along
+        b = R * (dx * bx + dy * by + dz * bz) / along
+        away = math.hypot(a, b)
+        if away > outer_m:
+            continue
+        r = range_m[i]
+        deep = depth_m + 1.2 * away  # a wire may run towards us
+        if r > 0.0 and r < R - deep:
+            tally[NEARER] += 1
+            continue
+        hit = r > 0.0 and r < R + deep
+        if away <= disc_m:
+            if hit:
+                tally[INNER_HITS] += 1
+            else:
+                tally[INNER_PASSES] += 1
+        elif away >= inner_m:
+            sector = int((math.atan2(b, a) + math.pi) / (2 * math.pi) * SECTORS) % SECTORS
+            if hit:
+                tally[OCCUPIED_0 + sector] += 1
+            else:
+                tally[FREE_0 + sector] += 1
+
+
+@compiled
+def _cell(x: int, y: int, z: int) -> int:
+    return ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & (MAP_SIZE - 1)
+
+
+@compiled
+def remember(
+    points_m: Array64, cell_m: float, stamp_ns: int, key: NDArray[np.int64], when: NDArray[np.int64]
+) -> None:
+    """Note the cells of points (n, 3); a cell that shares its place in the table takes it over."""
+    for i in range(points_m.shape[0]):
+        x, y, z = (
+            math.floor(points_m[i, 0] / cell_m),
+            math.floor(points_m[i, 1] / cell_m),
+            math.floor(points_m[i, 2] / cell_m),
+        )
+        place = _cell(x, y, z)
+        key[place] = (x + 4096) | ((y + 4096) << 16) | ((z + 4096) << 32)
+        when[place] = stamp_ns
+
+
+@compiled
+def nearest_remembered(
+    centre_m: Array64, cell_m: float, least_m: float, most_m: float, since_ns: int, key: NDArray[np.int64],
+    when: NDArray[np.int64],
+) -> float:
+    """Distance [m] to the nearest noted cell's middle between least_m and most_m of centre_m (3,); inf without one."""
+    reach = math.ceil(most_m / cell_m)
+    x0, y0, z0 = (
+        math.floor(centre_m[0] / cell_m),
+        math.floor(centre_m[1] / cell_m),
+        math.floor(centre_m[2] / cell_m),
+    )
+    best = math.inf
+    for x in range(x0 - reach, x0 + reach + 1):
+        for y in range(y0 - reach, y0 + reach + 1):
+            for z in range(z0 - reach, z0 + reach + 1):
+                place = _cell(x, y, z)
+                if when[place] < since_ns or key[place] != (x + 4096) | ((y + 4096) << 16) | ((z + 4096) << 32):
+                    continue
+                away = math.sqrt(
+                    ((x + 0.5) * cell_m - centre_m[0]) ** 2
+                    + ((y + 0.5) * cell_m - centre_m[1]) ** 2
+                    + ((z + 0.5) * cell_m - centre_m[2]) ** 2
+                )
+                if least_m <= away <= most_m:
+                    best = min(best, away)
+    return best
+
+
+class BigThings:
+    """Where walls, ground, trunks and crowns stand: cells in which a beam's chord was longer than any drone."""
+
+    def __init__(self, cell_m: float = 0.5) -> None:
+        self._cell_m = cell_m
+        self._key = np.zeros(MAP_SIZE, dtype=np.int64)
+        self._when = np.zeros(MAP_SIZE, dtype=np.int64)
+
+    def add(self, points_m: Array64, stamp_ns: int) -> None:
+        """Points (n, 3) of big things, in a frame in which they stand still."""
+        remember(points_m, self._cell_m, stamp_ns, self._key, self._when)
+
+    def nearest_m(self, centre_m: Array64, least_m: float, most_m: float, since_ns: int) -> float:
+        """How near the nearest one is, of those seen since; inf beyond most_m. What is nearer than least_m is the thing itself."""
+        return float(nearest_remembered(centre_m, self._cell_m, least_m, most_m, since_ns, self._key, self._when))

@@ -1,0 +1,380 @@
+"""Track by hits and misses: each look at a drone, hits and misses together, moves its position and velocity.
+
+    SEARCHING   no hypothesis
+    CANDIDATE   something worth another look is followed, silently
+    TRACKING    the detector accepted it, and it was hit lately: a DroneFix for every look with a hit
+    COASTING    not hit lately; predicted, the covariance grows
+    LOST        not hit for `lost_after_s`, or no longer taken for a drone
+
+A look is one passing of the rotor. Its pulses are measured against where the drone is at each pulse's own time
+(de-skew by its velocity and the vehicle's motion), those beside it count as misses (stages/track/hull.py). Several
+hypotheses are followed while doubtful, several drones as long as each is hit.
+
+Source: ours, for P III.C; DESIGN, The graph: track.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field, PrivateAttr
+
+from flow.stage import Stage
+from stages.geometry import Array64
+from stages.messages import (
+    Candidates,
+    Detections,
+    DroneFix,
+    SweptPulses,
+    TrackingState,
+    TrackState,
+    VehicleMotion,
+)
+from stages.track.hull import A, B, COLUMNS, DEPTH, HIT, KIND, WHEN_S, WIDTH, basis, collect, posterior
+from stages.track.kalman import condition, measured, predicted
+from stages.trail import VehicleTrail
+
+LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
+SCAN_COS = math.cos(math.radians(24.0))  # a slice covers 15 deg to each side of its middle and 5 deg along
+
+
+@dataclass(slots=True, eq=False)
+class _Look:
+    """Pulses of one passing of the rotor."""
+
+    start_ns: int
+    last_ns: int
+    x: Array64  # predicted state and covariance at start_ns
+    P: Array64
+    line: Array64  # unit line of sight, local frame
+    range_m: float
+    parts: list[Array64] = field(default_factory=lambda: list[Array64]())
+
+
+@dataclass(slots=True, eq=False)
+class _Track:
+    """One hypothesis."""
+
+    number: int  # 0 while it is a candidate only
+    candidate: int  # the detector's number
+    stamp_ns: int
+    x: Array64
+    P: Array64
+    last_hit_ns: int
+    p_0: float
+    odds: float = 0.0
+    confirmed: bool = False
+    hits: int = 0  # of the newest look
+    looks: int = 0
+    look: _Look | None = None
+    told_ns: int = 0
+    told: TrackingState | None = None
+    reason: str = ""
+
+    def at(self, stamp_ns: int, q: float) -> tuple[Array64, Array64]:
+        return predicted(self.x, self.P, (stamp_ns - self.stamp_ns) * 1e-9, q)
+
+
+class HitMissTrack(Stage):
+    """Hits and misses of every look, de-skewed, on as many drones as there are."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion"})
+
+    span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
+    hull_offset_m: float = Field(0.01, ge=-1, le=1)  # the centre lies this far behind the mean of its returns
+    max_drones: int = Field(1, ge=1, le=8)
+    max_hypotheses: int = Field(4, ge=0, le=16)  # candidates followed beside them
+    own_sigma_m: float = Field(0.8, gt=0)  # less known, only the detector finds it again
+    manoeuvre: float = Field(2.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
+    coast_after_s: float = Field(0.35, gt=0)
+    lost_after_s: float = Field(6.0, gt=0)
+    start_sigma_mps: float = Field(3.0, gt=0)
+    pointing_deg: float = Field(0.1, ge=0)  # encoder, play, calibration: constant or slow, one sigma
+    shape_m: float = Field(0.03, ge=0)  # the drone's own outline is not round, one sigma
+    misses: bool = True  # ablation: without, only hits count
+    de_skew: bool = True  # ablation: without, a look is taken to be one moment
+
+    _trail: VehicleTrail = PrivateAttr(default_factory=VehicleTrail)
+    _tracks: list[_Track] = PrivateAttr(default_factory=lambda: list[_Track]())
+    _next_number: int = PrivateAttr(default=1)
+    _idle_ns: int = PrivateAttr(default=0)
+    _why_idle: str = PrivateAttr(default="nothing found yet")
+
+    def on_motion(self, motion: VehicleMotion) -> None:
+        """Where the vehicle is; without it, it is taken to be parked."""
+        self._trail.add(motion)
+
+    def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
+        """Follow the promising ones; drop what is no longer taken for a drone."""
+        R, t = self._trail.at(candidates.stamp_ns)
+        for i in range(len(candidates.candidate_id)):
+            number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])
+            xyz, v = R @ candidates.xyz_vehicle_m[i] + t, R @ candidates.velocity_vehicle_mps[i]
+            known = self._near(xyz, candidates.stamp_ns, number)
+            if known is not None:
+                if known.confirmed and P >= 0.5 and self._doubtful(known, candidates.stamp_ns):
+                    self._move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+                if P < 0.2 and known.confirmed:
+                    yield from self._lose(known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}")
+            elif P >= 0.5 and sum(not track.confirmed for track in self._tracks) < self.max_hypotheses:
+                self._start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+
+    def on_detections(self, detections: Detections) -> Iterator[TrackState | DroneFix]:
+        """What the detector accepts becomes a track."""
+        for i in np.nonzero(detections.accepted)[0]:
+            seen_ns = detections.stamp_ns if detections.seen_ns is None else int(detections.seen_ns[i])
+            number = -1 if detections.candidate_id is None else int(detections.candidate_id[i])
+            R, t = self._trail.at(seen_ns)
+            xyz = R @ detections.xyz_vehicle_m[i] + t
+            velocity = detections.velocity_vehicle_mps
+            v = np.zeros(3) if velocity is None else R @ velocity[i]
+            track = self._near(xyz, seen_ns, number)
+            if track is not None and track.confirmed and self._doubtful(track, seen_ns):
+                self._move(track, number, xyz, v, seen_ns, seen_ns)
+            if track is None:
+                if sum(track.confirmed for track in self._tracks) >= self.max_drones:
+                    continue
+                track = self._start(number, xyz, v, seen_ns, seen_ns)
+            if not track.confirmed and sum(track.confirmed for track in self._tracks) < self.max_drones:
+                track.confirmed = True
+                track.number, self._next_number = self._next_number, self._next_number + 1
+                track.candidate = number
+                track.reason = "accepted by the detector"
+                track.odds = max(track.odds, 4.0)
+                yield self._state(track, max(detections.stamp_ns, track.stamp_ns))
+
+    def on_pulses(self, pulses: SweptPulses) -> Iterator[DroneFix | TrackState]:
+        """Collect each track's pulses; close the looks that are over; tell who coasts or is lost."""
+        if pulses.range_m.size == 0:
+            return
+        now_ns = int(pulses.point_stamp_ns[-1])
+        R, t = self._trail.at(pulses.stamp_ns)
+        axis = pulses.direction_vehicle.mean(axis=0).astype(np.float64)
+        for track in tuple(self._tracks):
+            self._collect(track, pulses, R, t, axis)
+            look = track.look
+            if look is not None and now_ns - look.last_ns > LOOK_OVER_NS:
+                track.look = None
+                yield from self._close(track, look)
+            if track in self._tracks:
+                yield from self._watch(track, now_ns)
+        if not self._tracks and now_ns - self._idle_ns > 500_000_000:
+            self._idle_ns = now_ns
+            yield TrackState(
+                stamp_ns=now_ns, state=TrackingState.SEARCHING, reason=self._why_idle, hits=0, frame_s=0.5, track_id=0
+            )
+
+    # hypotheses
+
+    def _start(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> _Track:
+        P = np.diag([0.2**2] * 3 + [self.start_sigma_mps**2] * 3)
+        if stamp_ns > seen_ns:
+            xyz = xyz - (stamp_ns - seen_ns) * 1e-9 * v
+        track = _Track(number=0, candidate=number, stamp_ns=seen_ns, x=np.concatenate([xyz, v]), P=P,
+                       last_hit_ns=seen_ns, p_0=0.8)  # fmt: skip
+        self._tracks.append(track)
+        return track
+
+    def _doubtful(self, track: _Track, now_ns: int) -> bool:
+        """So long without a hit that what is found there may as well be something else."""
+        _, P = track.at(now_ns, self.manoeuvre)
+        return math.sqrt(float(np.linalg.eigvalsh(P[:3, :3])[-1])) > self.own_sigma_m
+
+    def _move(self, track: _Track, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> None:
+        """The detector found it again."""
+        new = self._start(number, xyz, v, seen_ns, stamp_ns)
+        self._tracks.remove(new)
+        track.candidate, track.stamp_ns, track.x, track.P = number, new.stamp_ns, new.x, new.P
+        track.last_hit_ns, track.look, track.odds = seen_ns, None, max(track.odds, 2.0)
+
+    def _near(self, xyz: Array64, stamp_ns: int, number: int) -> _Track | None:
+        """The track that this is: by the detector's number, or by its place."""
+        best, least = None, 9.0
+        for track in self._tracks:
+            x, P = track.at(stamp_ns, self.manoeuvre)
+            away = xyz - x[:3]
+            cost = float(away @ np.linalg.solve(P[:3, :3] + 0.3**2 * np.eye(3), away))
+            cost = min(cost, 4.0) if track.candidate == number and cost < 100.0 else cost
+            if cost < least:
+                best, least = track, cost
+        return best
+
+    def _lose(self, track: _Track, now_ns: int, why: str) -> Iterator[TrackState]:
+        self._tracks = [other for other in self._tracks if other is not track]
+        if track.confirmed:
+            self._why_idle = f"lost drone {track.number}: {why}"
+            track.reason, track.told = why, TrackingState.LOST
+            yield TrackState(
+                stamp_ns=now_ns, state=TrackingState.LOST, reason=why, hits=0, frame_s=0.1, track_id=track.number
+            )
+
+    def _watch(self, track: _Track, now_ns: int) -> Iterator[TrackState]:
+        """Coasting and losing are told without a look."""
+        silent_s = (now_ns - track.last_hit_ns) * 1e-9
+        if silent_s > (self.lost_after_s if track.confirmed else 1.5) or track.odds < -4.0:
+            why = f"not hit for {silent_s:.1f} s" if silent_s > 1.0 else "looked at again and again, not hit"
+            yield from self._lose(track, now_ns, why)
+        elif track.confirmed:
+            for other in tuple(self._tracks):  # two that became one
+                if other is not track and np.linalg.norm(other.x[:3] - track.x[:3]) < self.span_m:
+                    younger = other if not other.confirmed or other.number > track.number else track
+                    if younger is not track:
+                        yield from self._lose(other, now_ns, f"is the same as drone {track.number}")
+            if now_ns - track.told_ns > 100_000_000:
+                if silent_s > self.coast_after_s:
+                    track.reason = f"not hit for {silent_s:.1f} s"
+                yield self._state(track, now_ns)
+        elif now_ns - track.told_ns > 100_000_000:
+            yield self._state(track, now_ns)
+
+    def _state(self, track: _Track, now_ns: int) -> TrackState:
+        silent_s = (now_ns - track.last_hit_ns) * 1e-9
+        state = TrackingState.CANDIDATE
+        if track.confirmed:
+            state = TrackingState.COASTING if silent_s > self.coast_after_s else TrackingState.TRACKING
+        x, P = track.at(now_ns, self.manoeuvre)
+        R, t = self._trail.at(now_ns)
+        track.told_ns, track.told = now_ns, state
+        return TrackState(
+            stamp_ns=now_ns,
+            state=state,
+            reason=track.reason,
+            hits=track.hits,
+            frame_s=0.1,
+            track_id=track.number,
+            xyz_vehicle_m=R.T @ (x[:3] - t),
+            velocity_vehicle_mps=R.T @ x[3:],
+            covariance_m2=self._whole_covariance(R.T @ (x[:3] - t), R.T @ P[:3, :3] @ R),
+        )
+
+    # one look
+
+    def _collect(self, track: _Track, pulses: SweptPulses, R: Array64, t: Array64, axis: Array64) -> None:
+        look = track.look
+        start_ns = pulses.stamp_ns if look is None else look.start_ns
+        x, P = track.at(start_ns, self.manoeuvre) if look is None else (look.x, look.P)
+        origin = np.array(pulses.origin_vehicle_m)
+        away = R.T @ (x[:3] - t) - origin
+        range_m = float(np.linalg.norm(away))
+        if range_m < 0.5 or away @ axis < range_m * float(np.linalg.norm(axis)) * SCAN_COS:
+            return
+        sigma = math.sqrt(float(np.linalg.eigvalsh(P[:3, :3])[-1]))
+        reach_m = min(0.6 * self.span_m + 3.0 * sigma, 6.0)
+        line = away / range_m if look is None else R.T @ look.line
+        found = np.empty((pulses.range_m.size, COLUMNS))
+        velocity = R.T @ x[3:] if self.de_skew else np.zeros(3)
+        count = collect(
+            pulses.point_stamp_ns,
+            pulses.direction_vehicle,
+            pulses.range_m,
+            origin,
+            away + origin,
+            velocity,
+            start_ns,
+            reach_m,
+            0.5 + 3.0 * sigma,
+            line,
+            found,
+        )
+        if count == 0:
+            return
+        if look is None:
+            look = track.look = _Look(start_ns, start_ns, x, P, R @ line, range_m)
+        look.parts.append(found[:count])
+        look.last_ns = int(pulses.point_stamp_ns[-1])
+
+    def _close(self, track: _Track, look: _Look) -> Iterator[DroneFix | TrackState]:
+        pulses = np.concatenate(look.parts)
+        sigma = math.sqrt(float(np.linalg.eigvalsh(look.P[:3, :3])[-1]))
+        # what is hit far from where the drone was last seen is for the detector to judge
+        cluster = drone_hits(pulses, self.span_m, sigma) if sigma < self.own_sigma_m else None
+        ax, ay, bx, by, bz = basis(*look.line)
+        H = np.array([[ax, ay, 0.0], [bx, by, bz]])
+        prior = H @ look.P[:3, :3] @ H.T
+        if cluster is None:
+            track.hits = 0
+            if self.misses and sigma < 0.7 * self.span_m and len(pulses) > 1 and (pulses[:, KIND] != HIT).all():
+                mean, S = np.empty(2), np.empty((2, 2))
+                s_m = WIDTH * self.span_m
+                evidence, _ = posterior(pulses, prior, 0.0, 0.0, 3.0 * sigma, track.p_0, s_m, True, mean, S)
+                x, P = condition(look.x, look.P, H, mean, S)
+                track.stamp_ns, track.x, track.P = look.start_ns, x, P
+                track.odds = min(max(track.odds + max(evidence, -1.0), -8.0), 8.0)
+            return
+        used = np.concatenate([pulses[cluster], pulses[pulses[:, KIND] != HIT]])
+        hits = pulses[cluster]
+        middle_a, middle_b = (float(v) for v in hits[:, :2].mean(axis=0))
+        half = max(0.6 * self.span_m, 0.6 * math.hypot(middle_a, middle_b) + 0.3 * self.span_m)
+        mean, S = np.empty(2), np.empty((2, 2))
+        evidence, expected = posterior(
+            used, prior, middle_a, middle_b, half, track.p_0, WIDTH * self.span_m, self.misses, mean, S
+        )
+        x, P = condition(look.x, look.P, H, mean, S)
+        depth = float(np.median(hits[:, DEPTH])) + self.hull_offset_m
+        noise = math.sqrt(0.1**2 / len(hits) + 0.03**2)
+        x, P = measured(x, P, look.line, depth - float(look.line @ (x[:3] - look.x[:3])), noise)
+        # the measured offsets are where the drone was, beside its prediction, at each pulse's own time
+        when_s = float(hits[:, WHEN_S].mean())
+        track.x, track.P, track.stamp_ns = x, P, look.start_ns
+        track.hits, track.looks = len(hits), track.looks + 1
+        track.last_hit_ns = look.start_ns + round(when_s * 1e9)
+        track.odds = min(max(track.odds + min(evidence, 3.0), -8.0), 8.0)
+        if expected > 0.5:
+            track.p_0 += 0.1 * (min(max(track.p_0 * len(hits) / expected, 0.15), 0.95) - track.p_0)
+        track.reason = f"{len(hits)} hits, {int((pulses[:, KIND] != HIT).sum())} pulses beside it"
+        if track.confirmed:
+            yield self._fix(track)
+        yield self._state(track, max(look.last_ns, track.last_hit_ns))
+
+    def _fix(self, track: _Track) -> DroneFix:
+        x, P = track.at(track.last_hit_ns, self.manoeuvre)
+        R, t = self._trail.at(track.last_hit_ns)
+        xyz = R.T @ (x[:3] - t)
+        return DroneFix(
+            stamp_ns=track.last_hit_ns,
+            xyz_vehicle_m=xyz,
+            covariance_m2=self._whole_covariance(xyz, R.T @ P[:3, :3] @ R),
+            hits=track.hits,
+            iterations=1,
+            shift_m=0.0,
+            track_id=track.number,
+            velocity_vehicle_mps=R.T @ x[3:],
+        )
+
+    def _whole_covariance(self, xyz_vehicle_m: Array64, covariance_m2: Array64) -> Array64:
+        """The filter's, and what does not average out: the turntable's angle, and the drone's outline."""
+        level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * math.radians(self.pointing_deg)
+        return covariance_m2 + np.outer(level, level) + self.shape_m**2 * np.eye(3)
+
+
+def drone_hits(pulses: Array64, span_m: float, sigma_m: float) -> Array64 | None:
+    """Which of a look's pulses (n, COLUMNS) are the drone's returns: rows, or None when none are.
+
+    The densest group of the drone's size, near the prediction rather than far; none when more stands right beside it:
+    then the returns are those of something bigger.
+    """
+    rows = np.nonzero(pulses[:, KIND] == HIT)[0]
+    if len(rows) == 0:
+        return None
+    place = pulses[rows][:, [A, B, DEPTH]]
+    if len(rows) > 256:  # a wall: what is nearest to the prediction will do
+        rows = rows[np.argsort(np.sum(place**2, axis=1), kind="stable")[:256]]
+        place = pulses[rows][:, [A, B, DEPTH]]
+    apart = np.linalg.norm(place[:, None] - place[None], axis=2)
+    near = apart <= 0.5 * span_m
+    score = np.log(near.sum(axis=1)) - 0.5 * np.sum(place**2, axis=1) / (sigma_m**2 + (0.4 * span_m) ** 2)
+    best = int(score.argmax())
+    if score[best] < -8.0:
+        return None
+    group = near[best]
+    centre = place[group].mean(axis=0)
+    away = np.linalg.norm(place - centre, axis=1)
+    group = away <= 0.6 * span_m
+    beside = (away > 0.9 * span_m) & (away < 2.0)
+    if beside.sum() > max(2, int(group.sum())):
+        return None
+    return rows[group]

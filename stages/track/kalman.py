@@ -1,0 +1,48 @@
+"""Position and velocity of one drone in the local frame, and how a look's answer changes them.
+
+    x = (p, v),  p' = p + dt v,  white acceleration of density q on each axis        [m, m/s, m^2/s^3]
+
+A look answers with mean and covariance of some projection y = H p; `condition` moves the state to it whatever its
+shape: x + K (m - y), P - K (S - S') K^T with K = P H^T S^-1, S the covariance of y before and S' after.
+
+Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 6.2; ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.geometry import Array64
+
+
+def predicted(x: Array64, P: Array64, dt_s: float, q: float) -> tuple[Array64, Array64]:
+    """State (6,) and covariance (6, 6) after dt_s."""
+    F = np.eye(6)
+    F[0, 3] = F[1, 4] = F[2, 5] = dt_s
+    forward = F @ P @ F.T
+    dt = abs(dt_s)
+    for axis in range(3):
+        forward[axis, axis] += q * dt**3 / 3
+        forward[axis, axis + 3] += q * dt**2 / 2
+        forward[axis + 3, axis] += q * dt**2 / 2
+        forward[axis + 3, axis + 3] += q * dt
+    return F @ x, forward
+
+
+def condition(x: Array64, P: Array64, H: Array64, change: Array64, S_after: Array64) -> tuple[Array64, Array64]:
+    """State after y = H p (H (k, 3)) turned out `change` (k,) beside its prediction, with covariance S_after (k, k)."""
+    wide = np.zeros((H.shape[0], 6))
+    wide[:, :3] = H
+    S = wide @ P @ wide.T
+    K = np.linalg.solve(S, wide @ P).T
+    after = P - K @ (S - S_after) @ K.T
+    return x + K @ change, 0.5 * (after + after.T)
+
+
+def measured(x: Array64, P: Array64, h: Array64, residual: float, sigma: float) -> tuple[Array64, Array64]:
+    """Plain update by one number: `residual` beside h . p, with noise sigma."""
+    wide = np.concatenate([h, np.zeros(3)])
+    S = float(wide @ P @ wide) + sigma**2
+    K = P @ wide / S
+    left = np.eye(6) - np.outer(K, wide)
+    return x + K * residual, left @ P @ left.T + sigma**2 * np.outer(K, K)

@@ -1,0 +1,51 @@
+"""The vehicle's trail: where it was at each moment, so that what stands still in the world stands still in memory.
+
+Frame local: the vehicle's own odometry frame (T_local_vehicle = T_start_vehicle). Without VehicleMotion it is the
+vehicle's frame itself: right for a parked vehicle; then what stands still seems to move with a driving one.
+
+Source: DESIGN, sweep "ego-motion compensated"; ours.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+
+import numpy as np
+
+from stages.geometry import Array64
+from stages.messages import VehicleMotion
+
+KEPT = 512
+FURTHEST_NS = 300_000_000  # beyond the newest pose this much is extrapolated, no more
+
+
+class VehicleTrail:
+    """T_local_vehicle over time: linear between two poses, and with the last two a little beyond the newest."""
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[int, Array64, Array64]] = deque(maxlen=KEPT)
+
+    @property
+    def known(self) -> bool:
+        """Whether the vehicle told its motion at all."""
+        return bool(self._poses)
+
+    def add(self, motion: VehicleMotion) -> None:
+        """One more pose; one that is not newer than the last is ignored."""
+        if not self._poses or motion.stamp_ns > self._poses[-1][0]:
+            self._poses.append((motion.stamp_ns, motion.R_start_vehicle, motion.xyz_start_m))
+
+    def at(self, stamp_ns: int) -> tuple[Array64, Array64]:
+        """R_local_vehicle (3, 3) and t_local_vehicle (3,) [m]."""
+        poses = self._poses
+        if not poses:
+            return np.eye(3), np.zeros(3)
+        if len(poses) == 1 or stamp_ns <= poses[0][0]:
+            return poses[0][1], poses[0][2]
+        after = min(bisect_right(poses, stamp_ns, key=lambda pose: pose[0]), len(poses) - 1)
+        (t0, R0, x0), (t1, R1, x1) = poses[after - 1], poses[after]
+        share = (min(stamp_ns, t1 + FURTHEST_NS) - t0) / (t1 - t0)
+        R = R0 + share * (R1 - R0)  # poses are milliseconds apart: the mean of the two, made a rotation again
+        u, _, vt = np.linalg.svd(R)
+        return u @ vt, x0 + share * (x1 - x0)

@@ -17,6 +17,7 @@ from stages.geometry import Array64
 from stages.messages import VehicleMotion
 
 KEPT = 512
+STEP_NS = 50_000_000  # over which a velocity is taken
 FURTHEST_NS = 300_000_000  # beyond the newest pose this much is extrapolated, no more
 
 
@@ -49,3 +50,17 @@ class VehicleTrail:
         R = R0 + share * (R1 - R0)  # poses are milliseconds apart: the mean of the two, made a rotation again
         u, _, vt = np.linalg.svd(R)
         return u @ vt, x0 + share * (x1 - x0)
+
+    def to_vehicle(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
+        """Place (3,) and velocity (3,) as the vehicle sees them at a time, its own driving and turning in them."""
+        (R, t), (R_then, t_then) = self.at(stamp_ns), self.at(stamp_ns + STEP_NS)
+        now = R.T @ (xyz_m - t)
+        then = R_then.T @ (xyz_m + STEP_NS * 1e-9 * velocity_mps - t_then)
+        return now, (then - now) / (STEP_NS * 1e-9)
+
+    def to_local(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
+        """The inverse of `to_vehicle`."""
+        (R, t), (R_then, t_then) = self.at(stamp_ns), self.at(stamp_ns + STEP_NS)
+        now = R @ xyz_m + t
+        then = R_then @ (xyz_m + STEP_NS * 1e-9 * velocity_mps) + t_then
+        return now, (then - now) / (STEP_NS * 1e-9)

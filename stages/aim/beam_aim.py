@@ -102,7 +102,7 @@ class BeamAim(Stage):
     candidate_looks: int = Field(25, ge=1)  # then it is left alone for `candidate_rest_s`
     candidate_rest_s: float = Field(1.0, gt=0)
     candidate_probability: float = Field(0.015, ge=0, lt=1)  # less is not worth stopping for
-    stop_probability: float = Field(0.4, ge=0, le=1)  # more, met twice, interrupts the sweep; less waits for its end
+    stop_probability: float = Field(0.2, ge=0, le=1)  # more, met twice, interrupts the sweep; less waits for its end
     visits_s: float = Field(1.5, ge=0)  # for candidates after each sweep
     candidate_mps: float = Field(5.0, gt=0)  # faster ones are birds first of all: a glance will do
     turns_each: int = Field(3, ge=1)  # for each of several drones
@@ -226,7 +226,7 @@ class BeamAim(Stage):
         if not maybe:
             return None
         current = None if now.current is None else now.targets.get(now.current)
-        if current in maybe and (current.looks < 2 or current.probability > 0.25):
+        if current in maybe and (current.looks < 3 or current.probability > 0.3):
             return current
         return max(maybe, key=lambda t: (t.probability / (1.0 + t.looks), t.key))
 
@@ -262,14 +262,14 @@ class BeamAim(Stage):
         """How far beside the place the beam goes, look by look."""
         k = target.looks
         if target.sure:
-            wide = 0.1 * self.span_m + 0.5 * target.sigma_m
+            wide = 0.06 * self.span_m + 0.35 * target.sigma_m
             silent_s = (now_ns - target.heard_ns) * 1e-9
             if silent_s > 0.3:
                 wide = max(wide, math.radians(1.0) * range_m)
             return wide * low_discrepancy(k % 16)
         if k % 5 == 4:  # what is around it
             return math.radians(1.2) * range_m * low_discrepancy(k // 5 % 8)
-        return (0.1 * self.span_m + 0.4 * target.sigma_m) * low_discrepancy(k % 8)
+        return (0.04 * self.span_m + 0.2 * target.sigma_m) * low_discrepancy(k % 8)
 
     def _best(self, at_rad: float, place: Array64, offset_rad: float, T_tl: Array64) -> tuple[float, float, int] | None:
         """(servo position, table angle, beam) that puts a beam `offset_rad` beside a place, the cheapest one."""

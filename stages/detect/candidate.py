@@ -18,6 +18,7 @@ Source: ours; DESIGN, "a small cluster with *measured* emptiness around it, eval
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -55,6 +56,7 @@ class Evidence(BaseModel):
 
     bird: float = -0.5
     calm: float = 8.0  # each second in which it would have shown a bird's speed or turn
+    steady: float = 3.0  # each second of straight flight after the first
     most_calm: float = 8.0
     flew_so: float = 10.0  # it flew as only birds do, once
     bird_speed_mps: float = 9.0  # no drone of ours flies faster
@@ -71,6 +73,7 @@ class Sighting:
 
     stamp_ns: int
     xyz_local_m: Array64  # (3,)
+    vehicle_local_m: Array64  # (3,) where the vehicle was then
     range_m: float
     hits: int
     length_m: float  # extent of its returns
@@ -101,8 +104,9 @@ class Motion(NamedTuple):
 
 
 HISTORY = 40
-CALM_MPS = 5.5
+CALM_MPS = 6.5
 SLOW_MPS = 2.0
+STEADY_MPS2 = 2.0
 # ln of how much likelier a drone flies so than a bird, by the speed it reaches; of birds there are several
 FLIGHT_MPS = (0.0, 2.0, 4.0, 6.0, 9.0, 12.0)
 FLIGHT_NATS = (1.0, 1.0, 0.0, -2.0, -4.0, -7.0)
@@ -144,6 +148,8 @@ class Candidate:
     calm_s: float = 0.0  # for how long it clearly flew as no bird does
     worth: bool = False  # it was once worth a look: what became of it is told, too
     path_ns: list[int] = field(default_factory=lambda: list[int]())
+    steady_s: float = 0.0  # for how long it clearly flew straight on
+    beside_m: list[Array64] = field(default_factory=lambda: list[Array64]())  # its path seen from the vehicle's place
     path_m: list[Array64] = field(default_factory=lambda: list[Array64]())
 
     def predict(self, stamp_ns: int, acceleration_mps2: float) -> tuple[Array64, float]:
@@ -188,16 +194,19 @@ class Candidate:
         self.big_looks += math.isfinite(s.big_m)
         self.path_ns.append(s.stamp_ns)
         self.path_m.append(s.xyz_local_m)
+        self.beside_m.append(s.xyz_local_m - s.vehicle_local_m)
         if len(self.path_ns) > HISTORY:
-            del self.path_ns[0], self.path_m[0]
+            del self.path_ns[0], self.path_m[0], self.beside_m[0]
         if len(self.path_ns) > 1:
             self._note_calm((self.path_ns[-1] - self.path_ns[-2]) * 1e-9, s.xyz_local_m - self.path_m[-2])
 
     def _note_calm(self, since_s: float, way_m: Array64) -> None:
         """Count the time in which it flew as no bird does: slowly, and not just before a turn; or it is still there."""
-        motion = self.motion()
+        motion = self.gentler()
+        if motion is not None and motion.acceleration_mps2 + motion.acceleration_sigma_mps2 < STEADY_MPS2:
+            self.steady_s += min(since_s, 0.2)
         if since_s > 0.4:
-            calm = float(np.linalg.norm(way_m)) < 2.5 * since_s
+            calm = float(np.linalg.norm(way_m)) < 1.0 * since_s
         else:
             calm = motion is not None and (
                 motion.top_mps + motion.top_sigma_mps < CALM_MPS
@@ -211,13 +220,20 @@ class Candidate:
         self.missed += expected
         self.missed_looks += 1
 
-    def motion(self) -> Motion | None:
+    def gentler(self) -> Motion | None:
+        """How it moves in the world, or beside the vehicle if that is slower: a drone comes along with it, a bird no."""
+        world, beside = self.motion(), self.motion(beside=True)
+        if world is None or beside is None:
+            return world
+        return world if world.top_mps <= beside.top_mps else beside
+
+    def motion(self, beside: bool = False) -> Motion | None:
         """A parabola through the sightings of the last 1.2 s; None with too few."""
-        first = np.searchsorted(self.path_ns, self.path_ns[-1] - 1_200_000_000)
+        first = bisect_left(self.path_ns, self.path_ns[-1] - 1_200_000_000)
         t = (np.array(self.path_ns[first:]) - self.path_ns[-1]) * 1e-9
         if len(t) < 3 or t[0] > -0.15:
             return None
-        x = np.array(self.path_m[first:])
+        x = np.array((self.beside_m if beside else self.path_m)[first:])
         A = np.column_stack([np.ones(len(t)), t, t * t / 2])
         sigma = self._scatter_m
         information = A.T @ A / sigma**2 + np.diag([0.0, 1 / 8.0**2, 1 / 6.0**2])
@@ -273,13 +289,13 @@ class Candidate:
             said.append("single returns")
         if self.long_looks:
             said.append("longer than a drone")
-        moves = self._moves()
+        moves = self._moves(motion_known)
         if moves:
             odds += e.moves
         else:
             odds += min(e.still * self.hit_looks, e.most_still)
             said.append("it may stand still")
-        if self.big_looks > 0.3 * self.hit_looks and not (motion_known and moves):
+        if self.big_looks > 0.3 * self.hit_looks and not moves:
             odds -= e.near_big
             said.append("beside something big" + (f" {self.big_m:.1f} m away" if math.isfinite(self.big_m) else ""))
         motion = self.motion()
@@ -289,43 +305,46 @@ class Candidate:
         return odds, said
 
     def _over_bird(self, e: Evidence) -> float:
-        motion = self.motion()
+        motion = self.gentler()
         if motion is None:
             return e.bird
         fast = motion.speed_mps - 1.5 * motion.speed_sigma_mps > e.bird_speed_mps
         hard = motion.acceleration_mps2 - 2.5 * motion.acceleration_sigma_mps2 > e.bird_acceleration_mps2
         self.bird |= fast or hard
         flight = float(np.interp(motion.top_mps, FLIGHT_MPS, FLIGHT_NATS)) / (1.0 + (motion.top_sigma_mps / 4.0) ** 2)
-        return e.bird + flight + min(e.calm * self.calm_s, e.most_calm) - (e.flew_so if self.bird else 0.0)
+        flown = min(e.calm * self.calm_s + e.steady * max(self.steady_s - 1.0, 0.0), e.most_calm)
+        return e.bird + flight + flown - (e.flew_so if self.bird else 0.0)
 
     @property
     def _scatter_m(self) -> float:
         """How far sightings of one thing lie about its middle, one sigma: more where beams are farther apart."""
-        return 0.12 + 0.004 * self.range_m
+        return 0.10 + 0.0025 * self.range_m
 
-    def _moves(self) -> bool:
-        """Whether it has clearly moved in the local frame.
+    def _moves(self, motion_known: bool) -> bool:
+        """Whether it has clearly moved in the world.
 
         Steadily while it was looked at without a pause; or farther between two passes than one lamp is long. Something
-        long is met elsewhere as the fan passes over it, so a single passing proves nothing.
+        long is met elsewhere as the fan passes over it, so a single passing proves nothing. When the vehicle does not
+        tell how it moves, what stands may seem to go by: then only going up or down counts.
         """
         t = (np.array(self.path_ns) - self.path_ns[-1]) * 1e-9
         pauses = np.nonzero(np.diff(t) > 0.45)[0]
         first = int(pauses[-1]) + 1 if len(pauses) else 0
-        speed, sigma, lasted = self._steady(t[first:], first)
+        axes = slice(0, 3) if motion_known else slice(2, 3)
+        speed, sigma, lasted = self._steady(t[first:], first, axes)
         if len(t) - first >= 6 and lasted > 0.6 and speed > 4.0 * sigma and speed * lasted > 0.25:
             return True
-        speed, sigma, lasted = self._steady(t, 0)
+        speed, sigma, lasted = self._steady(t, 0, axes)
         return len(t) >= 5 and lasted > 1.0 and speed > 4.0 * sigma and speed * lasted > 1.5
 
-    def _steady(self, t: Array64, first: int) -> tuple[float, float, float]:
+    def _steady(self, t: Array64, first: int, axes: slice) -> tuple[float, float, float]:
         """Speed of a straight line through the sightings since `first`, its sigma, and how long they lasted."""
         if len(t) < 3:
             return 0.0, math.inf, 0.0
-        x = np.array(self.path_m[first:])
+        x = np.array(self.path_m[first:])[:, axes]
         since = t - t.mean()
         spread = float(since @ since)
         velocity = since @ x / spread
         left = x - x.mean(axis=0) - np.outer(since, velocity)
-        sigma = max(self._scatter_m, math.sqrt(float((left**2).sum()) / (3 * len(t)))) / math.sqrt(spread)
+        sigma = max(0.15 + 0.004 * self.range_m, math.sqrt(float((left**2).sum()) / left.size)) / math.sqrt(spread)
         return float(np.linalg.norm(velocity)), sigma, float(np.ptp(t))

@@ -166,6 +166,7 @@ class EvidenceDetect(Stage):
         return Sighting(
             stamp_ns=stamp_ns,
             xyz_local_m=local,
+            vehicle_local_m=nearest.t,
             range_m=range_m,
             hits=int(hits.sum()),
             length_m=max(extent, float(rows[:, chord.LENGTH].max())),
@@ -278,8 +279,8 @@ class EvidenceDetect(Stage):
             c.accepted and c.seen_ns >= self._start_ns for c in self._bank
         ):
             yield self._detections(now_ns)
-        else:
-            return
+        elif now_ns - self._start_ns > 3.0 * self.report_s * 1e9 and self._end_ns is None:
+            yield self._detections(now_ns)
 
     def _forget(self, now_ns: int) -> None:
         """Drop what was not seen for long; what nobody would look at again sooner."""
@@ -290,13 +291,12 @@ class EvidenceDetect(Stage):
         listed = [(c.judge(self.evidence, self.free_space, self._trail.known), c) for c in self._bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
         listed.sort(key=lambda item: -item[0][0])
         listed = listed[: self.max_candidates]
-        R, t = self._trail.at(now_ns)
-        xyz = np.array([R.T @ (c.predict(now_ns, 0.0)[0] - t) for _, c in listed]).reshape(-1, 3)
+        seen = [self._trail.to_vehicle(now_ns, c.predict(now_ns, 0.0)[0], c.velocity_mps) for _, c in listed]
         return Candidates(
             stamp_ns=now_ns,
             candidate_id=np.array([c.number for _, c in listed], dtype=np.int64),
-            xyz_vehicle_m=xyz,
-            velocity_vehicle_mps=np.array([R.T @ c.velocity_mps for _, c in listed]).reshape(-1, 3),
+            xyz_vehicle_m=np.array([xyz for xyz, _ in seen]).reshape(-1, 3),
+            velocity_vehicle_mps=np.array([v for _, v in seen]).reshape(-1, 3),
             probability=np.array([_probability(odds) for (odds, _), _ in listed], dtype=np.float64),
             seen_ns=np.array([c.seen_ns for _, c in listed], dtype=np.int64),
             looks=np.array([c.hit_looks for _, c in listed], dtype=np.int64),
@@ -309,8 +309,8 @@ class EvidenceDetect(Stage):
         judged = [(*c.judge(self.evidence, self.free_space, self._trail.known), c) for c in self._bank if c.seen_ns >= start_ns]
         judged.sort(key=lambda item: (not item[2].accepted, -item[0]))
         judged = judged[: self.max_candidates]
-        poses = [self._trail.at(c.seen_ns) for _, _, c in judged]
-        xyz = np.array([R.T @ (c.predict(c.seen_ns, 0.0)[0] - t) for (R, t), (_, _, c) in zip(poses, judged, strict=True)])
+        seen = [self._trail.to_vehicle(c.seen_ns, c.xyz_m, c.velocity_mps) for _, _, c in judged]
+        xyz = np.array([place for place, _ in seen])
         odds = np.array([o for o, _, _ in judged], dtype=np.float64)
         accepted = np.array([c.accepted for _, _, c in judged], dtype=np.bool_)
         probability = np.array([_probability(o) for o in odds], dtype=np.float64)
@@ -325,7 +325,6 @@ class EvidenceDetect(Stage):
             verdict = f"no drone: {sum(self._refused.values())} short returns refused at once ({refused or 'none'}){best}"
         self._refused.clear()
         n = len(judged)
-        velocity = [R.T @ c.velocity_mps for (R, _), (_, _, c) in zip(poses, judged, strict=True)]
         return Detections(
             stamp_ns=end_ns,
             xyz_vehicle_m=xyz.reshape(-1, 3),
@@ -337,7 +336,7 @@ class EvidenceDetect(Stage):
             verdict=verdict,
             start_ns=start_ns,
             seen_ns=np.array([c.seen_ns for _, _, c in judged], dtype=np.int64),
-            velocity_vehicle_mps=np.array(velocity).reshape(-1, 3),
+            velocity_vehicle_mps=np.array([v for _, v in seen]).reshape(-1, 3),
             probability=probability,
             candidate_id=np.array([c.number for _, _, c in judged], dtype=np.int64),
         )

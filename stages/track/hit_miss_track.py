@@ -110,10 +110,11 @@ class HitMissTrack(Stage):
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Follow the promising ones; drop what is no longer taken for a drone."""
-        R, t = self._trail.at(candidates.stamp_ns)
         for i in range(len(candidates.candidate_id)):
             number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])
-            xyz, v = R @ candidates.xyz_vehicle_m[i] + t, R @ candidates.velocity_vehicle_mps[i]
+            xyz, v = self._trail.to_local(
+                candidates.stamp_ns, candidates.xyz_vehicle_m[i], candidates.velocity_vehicle_mps[i]
+            )
             known = self._near(xyz, candidates.stamp_ns, number)
             if known is not None:
                 if known.confirmed and P >= 0.5 and self._doubtful(known, candidates.stamp_ns):
@@ -128,10 +129,9 @@ class HitMissTrack(Stage):
         for i in np.nonzero(detections.accepted)[0]:
             seen_ns = detections.stamp_ns if detections.seen_ns is None else int(detections.seen_ns[i])
             number = -1 if detections.candidate_id is None else int(detections.candidate_id[i])
-            R, t = self._trail.at(seen_ns)
-            xyz = R @ detections.xyz_vehicle_m[i] + t
             velocity = detections.velocity_vehicle_mps
-            v = np.zeros(3) if velocity is None else R @ velocity[i]
+            v = np.zeros(3) if velocity is None else velocity[i]
+            xyz, v = self._trail.to_local(seen_ns, detections.xyz_vehicle_m[i], v)
             track = self._near(xyz, seen_ns, number)
             if track is not None and track.confirmed and self._doubtful(track, seen_ns):
                 self._move(track, number, xyz, v, seen_ns, seen_ns)
@@ -237,7 +237,8 @@ class HitMissTrack(Stage):
         if track.confirmed:
             state = TrackingState.COASTING if silent_s > self.coast_after_s else TrackingState.TRACKING
         x, P = track.at(now_ns, self.manoeuvre)
-        R, t = self._trail.at(now_ns)
+        R, _ = self._trail.at(now_ns)
+        xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
         track.told_ns, track.told = now_ns, state
         return TrackState(
             stamp_ns=now_ns,
@@ -246,9 +247,9 @@ class HitMissTrack(Stage):
             hits=track.hits,
             frame_s=0.1,
             track_id=track.number,
-            xyz_vehicle_m=R.T @ (x[:3] - t),
-            velocity_vehicle_mps=R.T @ x[3:],
-            covariance_m2=self._whole_covariance(R.T @ (x[:3] - t), R.T @ P[:3, :3] @ R),
+            xyz_vehicle_m=xyz,
+            velocity_vehicle_mps=velocity,
+            covariance_m2=self._whole_covariance(xyz, R.T @ P[:3, :3] @ R),
         )
 
     # one look
@@ -332,8 +333,8 @@ class HitMissTrack(Stage):
 
     def _fix(self, track: _Track) -> DroneFix:
         x, P = track.at(track.last_hit_ns, self.manoeuvre)
-        R, t = self._trail.at(track.last_hit_ns)
-        xyz = R.T @ (x[:3] - t)
+        R, _ = self._trail.at(track.last_hit_ns)
+        xyz, velocity = self._trail.to_vehicle(track.last_hit_ns, x[:3], x[3:])
         return DroneFix(
             stamp_ns=track.last_hit_ns,
             xyz_vehicle_m=xyz,
@@ -342,7 +343,7 @@ class HitMissTrack(Stage):
             iterations=1,
             shift_m=0.0,
             track_id=track.number,
-            velocity_vehicle_mps=R.T @ x[3:],
+            velocity_vehicle_mps=velocity,
         )
 
     def _whole_covariance(self, xyz_vehicle_m: Array64, covariance_m2: Array64) -> Array64:

@@ -1,14 +1,13 @@
-"""Messages made by hand for the stages' tests: packets, servo states, depth images, and a ball seen by a VLP-16."""
+"""Messages made by hand for the stages' tests: packets, servo states, slices, depth images."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from stages.depth_image import focal_length_px, unproject
-from stages.geometry import LidarMount, Pose, rotation_z
+from stages.geometry import LidarMount, Pose
 from stages.messages import DepthImage, Detections, LidarFirings, ServoState, SweptPoints
 
 MS = 1_000_000
@@ -110,45 +109,3 @@ def street_depth(drone_at: tuple[int, int] | None = (200, 300), seed: int = 0) -
 
 def point_of(image: DepthImage, row: int, column: int) -> np.ndarray:
     return unproject(image, row, column)
-
-
-def ball_seen(
-    centre_vehicle_m: Callable[[int], tuple[float, float, float]],
-    radius_m: float,
-    servo_rad: Callable[[float], float],
-    seconds: float,
-    mount: LidarMount = ON_ITS_SIDE,
-) -> Iterator[LidarFirings | ServoState]:
-    """What a VLP-16 at 600 rpm and a servo at 100 Hz tell, in order of time, of one ball in an empty sky."""
-    A, B = mount.T_vehicle_turntable.matrix(), mount.T_turntable_lidar.matrix()
-    offset_ns = np.repeat(np.arange(24) * 55_296, 16) + np.tile(np.arange(16) * 2_304, 24)
-    cos_e, sin_e = np.tile(np.cos(ELEVATION_RAD), 24), np.tile(np.sin(ELEVATION_RAD), 24)
-    next_servo_ns = START_NS
-    for packet in range(int(seconds * 1e9 / PACKET_NS)):
-        pulse_ns = START_NS + packet * PACKET_NS + offset_ns
-        while next_servo_ns <= pulse_ns[0]:
-            yield servo(next_servo_ns, servo_rad((next_servo_ns - START_NS) / 1e9))
-            next_servo_ns += 10 * MS
-        azimuth = (pulse_ns - START_NS) / 1e8 * math.tau % math.tau
-        rays = np.stack([cos_e * np.sin(azimuth), cos_e * np.cos(azimuth), sin_e], axis=1)
-        # one angle for the packet is enough to place the ball (0.1 deg); its points then turn with their own angle
-        angle = servo_rad((pulse_ns[192] - START_NS) / 1e9)
-        T = A @ np.block([[rotation_z(angle), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]) @ B
-        centre = np.linalg.inv(T) @ np.array([*centre_vehicle_m(int(pulse_ns[192])), 1.0])
-        along = rays @ centre[:3]
-        below = along**2 - (centre[:3] @ centre[:3] - radius_m**2)
-        hit = (below > 0) & (along > 0)
-        distance = np.where(hit, along - np.sqrt(np.maximum(below, 0.0)), 0.0)
-        yield LidarFirings(
-            stamp_ns=int(pulse_ns[0]),
-            pulse_stamp_ns=pulse_ns.astype(np.int64),
-            laser=np.tile(np.arange(16), 24).astype(np.uint8),
-            azimuth_rad=azimuth.astype(np.float32),
-            range_m=distance.astype(np.float32),
-            reflectivity=np.full(384, 30, dtype=np.uint8),
-            return_kind=np.zeros(384, dtype=np.uint8),
-            xyz_lidar_m=(rays * distance[:, np.newaxis]).astype(np.float32),
-            lost_packets=0,
-            laser_elevation_rad=ELEVATION_RAD,
-        )
-    yield servo(next_servo_ns, servo_rad((next_servo_ns - START_NS) / 1e9))

@@ -11,9 +11,10 @@ from pydantic import ValidationError
 from flow.message import check_arrays, hash_into
 from flow.stage import input_ports, output_ports
 from stages.geometry import LidarMount
-from stages.messages import DepthImage, SweptPoints
+from stages.messages import DepthImage, SweptPoints, SweptPulses
 from stages.sweep import Sweep
-from tests.stages.made import MS, ON_ITS_SIDE, PACKET_NS, START_NS, ball_seen, firings, servo
+from tests.stages.caster import Ball, seen, still, sweeping
+from tests.stages.made import MS, ON_ITS_SIDE, PACKET_NS, START_NS, firings, servo
 
 UP = [[0.0, 20.0, 0.0]]  # along azimuth 0: straight up when the lidar lies on its side
 
@@ -47,7 +48,7 @@ def back_and_forth(amplitude_deg, speed_degps):
 
 def test_ports_are_what_the_graph_wires():
     assert list(input_ports(Sweep)) == ["firings", "servo"]
-    assert set(output_ports(Sweep)) == {"swept_points", "depth_image"}
+    assert set(output_ports(Sweep)) == {"swept_points", "swept_pulses", "depth_image"}
     assert Sweep.optional_inputs == {"servo"}
 
 
@@ -57,10 +58,12 @@ def test_a_packet_waits_for_a_newer_servo_state_and_packets_keep_their_order():
     assert list(stage.on_firings(firings(UP, [START_NS + 1 * MS]))) == []
     assert list(stage.on_firings(firings(UP, [START_NS + 9 * MS]))) == []
     out = list(stage.on_servo(servo(START_NS + 10 * MS, 0.1)))
-    assert [m.stamp_ns - START_NS for m in out] == [1 * MS, 9 * MS]
-    np.testing.assert_allclose([m.servo_rad[0] for m in out], [0.01, 0.09], atol=1e-6)
+    assert [type(m) for m in out] == [SweptPoints, SweptPulses] * 2  # of each packet the returns, then all its pulses
+    assert [m.stamp_ns - START_NS for m in out] == [1 * MS, 1 * MS, 9 * MS, 9 * MS]
+    np.testing.assert_allclose([m.servo_rad[0] for m in out[::2]], [0.01, 0.09], atol=1e-6)
+    np.testing.assert_allclose([m.turntable_rad for m in out[1::2]], [0.01, 0.09], atol=1e-6)
     late = list(stage.on_firings(firings(UP, [START_NS + 9_500_000])))  # its angle is known already
-    assert [m.stamp_ns for m in late] == [START_NS + 9_500_000]
+    assert [m.stamp_ns for m in late] == [START_NS + 9_500_000] * 2
 
 
 def test_a_slice_keeps_times_lasers_reflectivity_and_counts_pulses():
@@ -68,8 +71,8 @@ def test_a_slice_keeps_times_lasers_reflectivity_and_counts_pulses():
     list(stage.on_servo(servo(START_NS, 0.0)))
     packet = firings([[0, 20, 0], [0, 0, 0], [0, 30, 0]], START_NS + np.array([1, 2, 3]) * MS)
     list(stage.on_firings(packet))
-    (points,) = stage.on_servo(servo(START_NS + 10 * MS, 0.0))
-    assert points.pulses == 3
+    points, pulses = stage.on_servo(servo(START_NS + 10 * MS, 0.0))
+    assert points.pulses == pulses.range_m.size == 3
     assert points.laser.tolist() == [0, 2]
     assert points.reflectivity.tolist() == [0, 2]
     assert (points.point_stamp_ns - START_NS).tolist() == [1 * MS, 3 * MS]
@@ -82,8 +85,8 @@ def test_a_dual_return_packet_counts_each_pulse_once():
     stage = Sweep(mount=LidarMount(turns=False))
     packet = firings([[0, 5, 0], [0, 6, 0]])
     object.__setattr__(packet, "return_kind", np.array([0, 1], dtype=np.uint8))
-    (points,) = stage.on_firings(packet)
-    assert (points.pulses, len(points.xyz_vehicle_m)) == (1, 2)
+    points, pulses = stage.on_firings(packet)
+    assert (points.pulses, len(points.xyz_vehicle_m), pulses.range_m.size) == (1, 2, 1)
 
 
 def test_each_half_turn_back_and_forth_makes_one_image():
@@ -142,14 +145,12 @@ def test_a_silent_servo_loses_its_gap_with_a_reason_and_the_sweep_begins_anew():
 
 
 def test_the_image_has_the_points_the_slices_had():
-    ball = ball_seen(lambda t: (2.0, -3.0, 12.0), 0.25, lambda t: math.radians(90) * t, 2.1)
+    ball = seen([Ball(still(2.0, -3.0, 12.0), 0.25)], sweeping(math.radians(90)), 2.1)
     slices, (image,) = run(Sweep(mount=ON_ITS_SIDE), ball)
     points = np.concatenate([s.xyz_vehicle_m for s in slices if image.start_ns <= s.stamp_ns <= image.stamp_ns])
     assert len(points) > 20
     assert image.points == image.returns == len(points)
-    np.testing.assert_allclose(
-        np.linalg.norm(points - [2, -3, 12], axis=1), 0.25, atol=0.02
-    )  # on the ball, moved by 0.1 deg
+    np.testing.assert_allclose(np.linalg.norm(points - [2, -3, 12], axis=1), 0.25, atol=1e-3)
     rows, columns = np.nonzero(image.depth_m)
     assert abs(columns.mean() + 0.5 - 256 - 2 / 11.75 * image.focal_px) < 2
     assert abs(rows.mean() + 0.5 - 256 + 3 / 11.75 * image.focal_px) < 2
@@ -193,7 +194,8 @@ def test_packets_before_the_first_state_and_after_the_last_are_dropped_with_a_re
 def test_the_queue_is_bounded_when_the_servo_never_answers():
     stage = Sweep(mount=ON_ITS_SIDE, max_waiting_packets=10)
     out = [m for i in range(50) for m in stage.on_firings(firings(UP, [START_NS + i * PACKET_NS]))]
-    assert len(out) == 40
+    assert [m.range_m.size for m in out if isinstance(m, SweptPulses)] == [0] * 40  # without an angle, no direction
+    assert len([m for m in out if isinstance(m, SweptPoints)]) == 40
     assert len(stage._waiting) == 10
 
 

@@ -9,7 +9,16 @@ import pytest
 
 from stages.geometry import Harmonic, LidarMount, Pose, rotation_from_rpy_deg
 from stages.turntable import STATES_KEPT, Turntable
+from tests.stages.caster import LASER, PULSE_NS, beams_lidar, beams_vehicle, packet
 from tests.stages.made import MS, ON_ITS_SIDE, START_NS, firings, servo
+
+ASKEW = LidarMount(
+    T_vehicle_turntable=Pose(xyz_m=(0.3, -0.2, 0.5), rpy_deg=(2.0, -3.0, 40.0)),
+    T_turntable_lidar=Pose(xyz_m=(0.01, 0.02, 0.1), rpy_deg=(88.0, 1.0, -2.0)),
+    servo_sign=-1,
+    servo_zero_deg=12.0,
+    servo_harmonics=(Harmonic(order=1, amplitude_deg=0.5, phase_deg=20.0),),
+)
 
 
 def turntable(mount=ON_ITS_SIDE, max_gap_s=0.1, min_range_m=0.6, states=()):
@@ -86,10 +95,7 @@ def test_each_pulse_turns_with_the_angle_at_its_own_time():
 
 
 def test_the_whole_chain_equals_the_matrices():
-    mount = LidarMount(
-        T_vehicle_turntable=Pose(xyz_m=(0.3, -0.2, 0.5), rpy_deg=(2.0, -3.0, 40.0)),
-        T_turntable_lidar=Pose(xyz_m=(0.01, 0.02, 0.1), rpy_deg=(88.0, 1.0, -2.0)),
-    )
+    mount = ASKEW.model_copy(update={"servo_sign": 1, "servo_zero_deg": 0.0, "servo_harmonics": ()})
     table = turntable(mount, states=[(0, 0.7), (10 * MS, 0.7)])
     points = np.random.default_rng(0).normal(size=(50, 3)) * 20
     placed = table.place(firings(points))
@@ -133,3 +139,58 @@ def test_states_that_no_pulse_needs_are_forgotten():
     table.forget_before(START_NS + 45 * MS)
     assert table._states[0][0] == START_NS + 40 * MS
     assert table.angle_rad(START_NS + 45 * MS) == pytest.approx(0.45)
+
+
+@pytest.mark.parametrize("mount", [ON_ITS_SIDE, ASKEW])
+def test_a_pulse_without_return_looks_where_its_return_would_have_been(mount):
+    table = turntable(mount, states=[(0, 0.7), (10 * MS, 0.7)])
+    ranges_m = np.full(384, 20.0)
+    met = table.pulses(packet(START_NS + PULSE_NS, ranges_m))
+    free = table.pulses(packet(START_NS + PULSE_NS, np.zeros(384)))
+    np.testing.assert_allclose(free.direction_vehicle, met.direction_vehicle, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(free.direction_vehicle, axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(met.range_m, ranges_m, rtol=1e-6)
+    assert not free.range_m.any()
+
+
+def test_pulses_look_where_the_turning_beams_do_each_at_its_own_time():
+    table = turntable(ASKEW, states=[(0, 0.2), (10 * MS, 0.8)])  # 573 deg/s: 0.4 deg from first to last pulse
+    stamp_ns = START_NS + PULSE_NS
+    pulses = table.pulses(packet(stamp_ns, np.zeros(384)))
+    states_rad = ASKEW.turntable_rad(np.array([0.2, 0.8]))
+    angle = np.interp(PULSE_NS, [0, 10 * MS], states_rad)  # of the table: linear between the states
+    plain = LidarMount(T_vehicle_turntable=ASKEW.T_vehicle_turntable, T_turntable_lidar=ASKEW.T_turntable_lidar)
+    origin_m, direction = beams_vehicle(plain, angle, beams_lidar(stamp_ns, LASER))
+    np.testing.assert_allclose(pulses.direction_vehicle, direction, atol=1e-6)
+    np.testing.assert_allclose(pulses.origin_vehicle_m, origin_m[192], atol=1e-9)
+    assert pulses.turntable_rad == pytest.approx(angle[192])
+
+
+def test_each_pulse_keeps_its_time_laser_and_reflectivity():
+    table = turntable(states=[(0, 0.0), (10 * MS, 0.0)])
+    pulses = table.pulses(firings([[0, 20, 0], [0, 0, 0], [0, 30, 0]], START_NS + np.array([1, 2, 3]) * MS))
+    assert (pulses.point_stamp_ns - START_NS).tolist() == [1 * MS, 2 * MS, 3 * MS]
+    assert pulses.laser.tolist() == pulses.reflectivity.tolist() == [0, 1, 2]
+    assert pulses.range_m.tolist() == [20.0, 0.0, 30.0]
+
+
+@pytest.mark.parametrize(
+    ("strongest_m", "last_m", "expected_m", "reflectivity"),
+    [(20.0, 30.0, 20.0, 0), (30.0, 20.0, 20.0, 1), (0.0, 20.0, 20.0, 1), (20.0, 0.0, 20.0, 0), (0.0, 0.0, 0.0, 0)],
+)
+def test_of_two_returns_of_a_pulse_the_nearer_counts(strongest_m, last_m, expected_m, reflectivity):
+    table = turntable(states=[(0, 0.0), (10 * MS, 0.0)])
+    both = firings([[0, strongest_m, 0], [0, last_m, 0], [0, 40, 0]], START_NS + np.array([1, 1, 2]) * MS)
+    object.__setattr__(both, "return_kind", np.array([0, 1, 0], dtype=np.uint8))
+    pulses = table.pulses(both)
+    assert pulses.range_m.tolist() == [expected_m, 40.0]
+    assert pulses.reflectivity.tolist() == [reflectivity, 2]
+
+
+def test_a_packet_whose_angle_is_not_known_for_every_pulse_gives_no_pulses():
+    table = turntable(states=[(0, 0.0), (10 * MS, 0.0)])
+    for stamps in ([5, 11], [-1, 5], [20, 21]):
+        pulses = table.pulses(firings([[5, 0, 0], [0, 0, 0]], START_NS + np.array(stamps) * MS))
+        assert pulses.range_m.size == pulses.laser.size == len(pulses.direction_vehicle) == 0
+    assert math.isnan(pulses.turntable_rad)
+    assert table.pulses(firings([[5, 0, 0], [0, 0, 0]], START_NS + np.array([5, 6]) * MS)).range_m.size == 2

@@ -17,7 +17,8 @@ from stages.detect.kernel import KernelDetect
 from stages.messages import DepthImage, Detections, DroneFix, SweptPoints, TrackingState, TrackState
 from stages.sweep import Sweep
 from stages.track.mean_shift_track import MeanShiftTrack
-from tests.stages.made import MS, ON_ITS_SIDE, START_NS, ball_seen, detections, swept
+from tests.stages.caster import Ball, flying, seen
+from tests.stages.made import MS, ON_ITS_SIDE, START_NS, detections, swept
 
 T0 = np.array([1.0, 2.0, 20.0])
 
@@ -236,17 +237,15 @@ def test_turning_the_world_turns_the_fix():
 def test_packets_to_positions_the_whole_chain_finds_and_follows_a_ball():
     """A half-turn sweep, then vibration +-5 deg with a beam on the ball, which drifts at 0.4 m/s."""
 
-    def centre(stamp_ns):
-        t = (stamp_ns - START_NS) / 1e9
-        return (3.0 + 0.4 * t, 2.0, 12.0)
+    way = flying((3.0, 2.0, 12.0), (0.4, 0.0, 0.0))
 
     def servo_rad(t):
         aimed_s = 206.0 / 90.0  # the fan's plane goes through the ball at 26 deg, and so at 206 deg
-        return math.radians(90.0 * t if t < aimed_s else 206.0 + 5.0 * math.sin(2 * math.pi * 2.86 * (t - aimed_s)))
+        return np.radians(np.where(t < aimed_s, 90.0 * t, 206.0 + 5.0 * np.sin(2 * np.pi * 2.86 * (t - aimed_s))))
 
     sweep, detect, track = Sweep(mount=ON_ITS_SIDE), KernelDetect(span_m=0.5), MeanShiftTrack()
     fixes, verdicts = [], []
-    for message in ball_seen(centre, 0.25, servo_rad, 3.5):
+    for message in seen([Ball(way, 0.25)], servo_rad, 3.5):
         for out in sweep.on_servo(message) if hasattr(message, "goal_rad") else sweep.on_firings(message):
             if isinstance(out, DepthImage):
                 _, found = detect.on_image(out)
@@ -257,7 +256,7 @@ def test_packets_to_positions_the_whole_chain_finds_and_follows_a_ball():
     assert len(verdicts) == 1
     assert verdicts[0].startswith("drone at (3.")
     assert len(fixes) >= 5
-    errors = np.array([f.xyz_vehicle_m - centre(f.stamp_ns) for f in fixes])
+    errors = np.array([f.xyz_vehicle_m for f in fixes]) - way(np.array([f.stamp_ns - START_NS for f in fixes]) * 1e-9)
     nees = [e @ np.linalg.solve(f.covariance_m2, e) for e, f in zip(errors, fixes, strict=True)]
     assert np.abs(errors).max() < 0.35
     assert np.mean(nees) < 9.0

@@ -51,6 +51,10 @@ class VehicleTrail:
         u, _, vt = np.linalg.svd(R)
         return u @ vt, x0 + share * (x1 - x0)
 
+    def velocity_mps(self, stamp_ns: int) -> Array64:
+        """The vehicle's own velocity (3,) in the local frame."""
+        return (self.at(stamp_ns + STEP_NS)[1] - self.at(stamp_ns)[1]) / (STEP_NS * 1e-9)
+
     def to_vehicle(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
         """Place (3,) and velocity (3,) as the vehicle sees them at a time, its own driving and turning in them."""
         (R, t), (R_then, t_then) = self.at(stamp_ns), self.at(stamp_ns + STEP_NS)

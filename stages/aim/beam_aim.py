@@ -47,6 +47,7 @@ class _Target:
     sigma_m: float
     sure: bool  # a track, not a candidate
     probability: float = 1.0
+    glance: bool = False  # looked at in passing, the sweep goes on
     seen_looks: int = 0  # turns in which the detector saw it
     looks: int = 0  # planned for it
     first_ns: int = 0
@@ -80,7 +81,6 @@ class _Now:
     goal_rad: float | None = None
     hold_until_ns: int = 0  # a look is planned until then
     sweep_up: bool = True
-    visits_until_ns: int = 0
     nearest_rad: float = math.inf
     nearer_ns: int = 0
     current: tuple[str, int] | None = None
@@ -102,8 +102,10 @@ class BeamAim(Stage):
     candidate_looks: int = Field(25, ge=1)  # then it is left alone for `candidate_rest_s`
     candidate_rest_s: float = Field(1.0, gt=0)
     candidate_probability: float = Field(0.015, ge=0, lt=1)  # less is not worth stopping for
-    stop_probability: float = Field(0.2, ge=0, le=1)  # more, met twice, interrupts the sweep; less waits for its end
-    visits_s: float = Field(1.5, ge=0)  # for candidates after each sweep
+    stop_probability: float = Field(0.25, ge=0, le=1)  # more, met three times, interrupts the sweep
+    stop_looks: int = Field(2, ge=1)  # it was seen in so many turns of the rotor before it interrupts the sweep
+    glances: int = Field(3, ge=0)  # at a candidate in passing
+    glance_probability: float = Field(0.03, ge=0, le=1)
     candidate_mps: float = Field(5.0, gt=0)  # faster ones are birds first of all: a glance will do
     turns_each: int = Field(3, ge=1)  # for each of several drones
     beams: bool = True  # ablation: without, the middle of the fan is put on the drone
@@ -156,6 +158,7 @@ class BeamAim(Stage):
                 sure=False,
                 probability=float(candidates.probability[i]),
                 seen_looks=int(candidates.looks[i]),
+                glance=old.glance if old else False,
                 looks=old.looks if old else 0,
                 first_ns=old.first_ns if old else candidates.stamp_ns,
                 heard_ns=int(candidates.seen_ns[i]),
@@ -193,7 +196,8 @@ class BeamAim(Stage):
             if now.current is not None:
                 now.current, now.goal_rad = None, None
             return self._sweep(servo)
-        if servo.stamp_ns < now.hold_until_ns and now.current == target.key:
+        planned = None if now.current is None else now.targets.get(now.current)
+        if servo.stamp_ns < now.hold_until_ns and planned is not None and (planned is target or target.glance):
             return None
         return self._look(servo, target)
 
@@ -206,10 +210,8 @@ class BeamAim(Stage):
                 continue
             fast = target.seen_looks >= 2 and float(np.linalg.norm(target.velocity_mps)) > self.candidate_mps
             if target.looks >= self.candidate_looks or fast:
-                now.done[key[1]] = now_ns
-                if not fast:
-                    now.places.append((now_ns, target.at(now_ns)))
-            if now_ns - target.heard_ns > 1.2e9 or key[1] in now.done:
+                self._leave(target, now_ns, slow=not fast)
+            elif now_ns - target.heard_ns > 1.2e9:
                 del now.targets[key]
         now.places = [place for place in now.places if now_ns - place[0] < 4e9]
         sure = [t for t in now.targets.values() if t.sure and now_ns - t.heard_ns < self.coast_search_s * 1e9]
@@ -219,16 +221,39 @@ class BeamAim(Stage):
             order = sorted(sure, key=lambda t: t.key)
             after = [t for t in order if now.current is not None and t.key > now.current]
             return (after or order)[0]
-        # what the fan has only just met, it meets again on its way: first the whole sky, then the best of it
+        return self._candidate(now_ns)
+
+    def _candidate(self, now_ns: int) -> _Target | None:
+        """The one to stop at, else the one to glance at in passing; None: sweep on."""
+        now = self._now
         maybe = [t for t in now.targets.values() if not t.sure]
-        if now.visits_until_ns < now_ns:
-            maybe = [t for t in maybe if t.probability > self.stop_probability and (t.looks or t.seen_looks > 1)]
-        if not maybe:
-            return None
         current = None if now.current is None else now.targets.get(now.current)
-        if current in maybe and (current.looks < 3 or current.probability > 0.3):
-            return current
-        return max(maybe, key=lambda t: (t.probability / (1.0 + t.looks), t.key))
+        worth = [t for t in maybe if t.probability >= self.stop_probability and t.seen_looks >= self.stop_looks]
+        if current in worth and not current.glance:
+            if current.looks < 4 or (current.seen_looks > 0.4 * current.looks and current.probability > 0.12):
+                return current
+            self._leave(current, now_ns)  # it is seldom there, or most likely something else
+            worth.remove(current)
+        if worth:
+            best = max(worth, key=lambda t: (t.probability / (1.0 + t.looks), t.key))
+            best.glance = False
+            return best
+        # the sweep goes on by steps: each turn of the rotor a beam is put on something that was met a moment ago
+        fresh = [
+            t
+            for t in maybe
+            if t.looks < self.glances and now_ns - t.heard_ns < 350_000_000 and t.probability >= self.glance_probability
+        ]
+        for target in fresh:
+            target.glance = True
+        return max(fresh, key=lambda t: (t.probability / (1.0 + t.looks), t.key), default=None)
+
+    def _leave(self, target: _Target, now_ns: int, slow: bool = True) -> None:
+        """Looked at long enough: leave it, and what stands there, alone for a while."""
+        self._now.done[target.key[1]] = now_ns
+        self._now.targets.pop(target.key, None)
+        if slow:
+            self._now.places.append((now_ns, target.at(now_ns)))
 
     # one look
 
@@ -240,16 +265,24 @@ class BeamAim(Stage):
         T = self.mount.T_vehicle_turntable.matrix()
         T_tl = self.mount.T_turntable_lidar.matrix()
         speed = self.limit_rpm * RPM_RADPS
+        centre = servo.position_rad
+        if target.glance:  # go on sweeping while looking
+            step = self._search_radps() * math.tau / now.rotor.rate_radps
+            travel = math.radians(self.travel_deg[0]), math.radians(self.travel_deg[1])
+            centre = min(max(centre + (step if now.sweep_up else -step), travel[0]), travel[1])
         pass_ns = servo.stamp_ns + round((self.lead_s + 0.05) * 1e9)
         best: tuple[float, float, int] | None = None
         for _ in range(2):  # the place at the pass depends on when that is
             place = T[:3, :3].T @ (target.at(pass_ns) - T[:3, 3])
             range_m = max(float(np.linalg.norm(place - T_tl[:3, 3])), 0.5)
             offset_rad = self._offset_m(target, range_m, servo.stamp_ns) / range_m
-            best = self._best(servo.position_rad, place, offset_rad, T_tl)
+            best = self._best(centre, place, offset_rad, T_tl)
             if best is None:
                 return self._sweep(servo)
             goal, theta, _ = best
+            if target.glance and abs(goal - centre) > math.radians(12.0):
+                target.looks = self.glances  # the fan has passed it
+                return self._sweep(servo)
             ready_ns = servo.stamp_ns + round((self.lead_s + self.settle_s + abs(goal - servo.position_rad) / speed) * 1e9)
             pass_ns = now.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, place, theta), ready_ns)
         assert best is not None
@@ -305,7 +338,6 @@ class BeamAim(Stage):
             return None
         if now.goal_rad is not None:
             now.sweep_up = not now.sweep_up
-            now.visits_until_ns = servo.stamp_ns + round(self.visits_s * 1e9)
         if low + math.radians(2) > servo.position_rad:
             now.sweep_up = True
         elif high - math.radians(2) < servo.position_rad:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.detect.surroundings import FREE_0, OCCUPIED_0, SECTORS
+from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
 from stages.geometry import Array64
 
 
@@ -188,8 +188,11 @@ class Candidate:
         taken = s.around[OCCUPIED_0 : OCCUPIED_0 + SECTORS] >= 1
         self.occupied += taken
         measured = (s.around[FREE_0 : FREE_0 + SECTORS] >= 1).sum() >= SECTORS // 2
-        self.beside = 0.95 * self.beside + bool(taken.any())
-        self.alone = 0.95 * self.alone + bool(measured and not taken.any())
+        between = s.around[FREE_0 : FREE_0 + SECTORS] >= 1
+        farther = s.around[FARTHER_0 : FARTHER_0 + SECTORS] >= 1
+        standing = 1.0 if taken.any() else (0.5 if (farther & ~between).any() else (0.15 if farther.any() else 0.0))
+        self.beside = 0.95 * self.beside + standing
+        self.alone = 0.95 * self.alone + bool(measured and standing == 0.0)
         self.big_m = s.big_m
         self.big_looks += math.isfinite(s.big_m)
         self.path_ns.append(s.stamp_ns)
@@ -206,7 +209,7 @@ class Candidate:
         if motion is not None and motion.acceleration_mps2 + motion.acceleration_sigma_mps2 < STEADY_MPS2:
             self.steady_s += min(since_s, 0.2)
         if since_s > 0.4:
-            calm = float(np.linalg.norm(way_m)) < 1.0 * since_s
+            calm = self.hit_looks >= 4 and float(np.linalg.norm(way_m)) < 1.0 * since_s
         else:
             calm = motion is not None and (
                 motion.top_mps + motion.top_sigma_mps < CALM_MPS
@@ -305,14 +308,14 @@ class Candidate:
         return odds, said
 
     def _over_bird(self, e: Evidence) -> float:
+        flown = min(e.calm * self.calm_s + e.steady * max(self.steady_s - 1.0, 0.0), e.most_calm)
         motion = self.gentler()
         if motion is None:
-            return e.bird
+            return e.bird + flown - (e.flew_so if self.bird else 0.0)
         fast = motion.speed_mps - 1.5 * motion.speed_sigma_mps > e.bird_speed_mps
         hard = motion.acceleration_mps2 - 2.5 * motion.acceleration_sigma_mps2 > e.bird_acceleration_mps2
         self.bird |= fast or hard
         flight = float(np.interp(motion.top_mps, FLIGHT_MPS, FLIGHT_NATS)) / (1.0 + (motion.top_sigma_mps / 4.0) ** 2)
-        flown = min(e.calm * self.calm_s + e.steady * max(self.steady_s - 1.0, 0.0), e.most_calm)
         return e.bird + flight + flown - (e.flew_so if self.bird else 0.0)
 
     @property

@@ -144,6 +144,7 @@ class EvidenceDetect(Stage):
         nearest = min(self._slices, key=lambda s: abs(s.pulses.stamp_ns - stamp_ns))
         range_m = float(rows[:, chord.RANGE].mean())
         tally = np.zeros(TALLY, dtype=np.int64)
+        close_m = max(2.4 * self.span_m, 1.15 * BEAM_SPACING_RAD * range_m)  # two beams wide at least
         outer_m = max(self.clear_m, 1.5 * BEAM_SPACING_RAD * range_m)
         for part in self._slices:
             look_around(
@@ -153,6 +154,7 @@ class EvidenceDetect(Stage):
                 middle,
                 0.3 * self.span_m,
                 1.1 * self.span_m,
+                close_m,
                 outer_m,
                 0.5,
                 tally,
@@ -194,9 +196,9 @@ class EvidenceDetect(Stage):
                 first_ns=s.stamp_ns,
                 stamp_ns=s.stamp_ns,
                 xyz_m=s.xyz_local_m,
-                velocity_mps=np.zeros(3),
+                velocity_mps=self._trail.velocity_mps(s.stamp_ns),  # a drone comes along with the vehicle
                 range_m=s.range_m,
-                p=(0.15**2, 0.0, 4.0**2),
+                p=(0.15**2, 0.0, 6.0**2),
                 first_hits=s.hits,
                 seen_ns=s.stamp_ns,
             )
@@ -244,8 +246,8 @@ class EvidenceDetect(Stage):
             if range_m > 0.5 and line @ part.axis > range_m * 0.93:
                 tally = np.zeros(TALLY, dtype=np.int64)
                 look_around(
-                    part.pulses.direction_vehicle, part.pulses.range_m, origin, line + origin, 0.35 * self.span_m,
-                    1e9, 0.36 * self.span_m, 1.0, tally,
+                    part.pulses.direction_vehicle, part.pulses.range_m, origin, line + origin, 0.22 * self.span_m,
+                    1e9, 1e9, 0.23 * self.span_m, 1.0, tally,
                 )  # fmt: skip
                 if tally[INNER_HITS] + tally[INNER_PASSES]:
                     if watch is None:
@@ -255,7 +257,7 @@ class EvidenceDetect(Stage):
                     watch[2] = now_ns
             elif watch is not None and now_ns - watch[2] > SAME_LOOK_NS:
                 if watch[0] == 0 and now_ns - c.seen_ns > 2 * SAME_LOOK_NS:
-                    c.miss(watch[1])
+                    c.miss(watch[1] * min(1.0, (35.0 / c.range_m) ** 2))
                 del self._watched[c.number]
 
     # what is told

@@ -3,8 +3,9 @@
 Around a place at range R, in the plane across the line of sight:
 
     inner disc     the thing itself: hits, and pulses that passed
-    ring           8 sectors between `inner` and `outer`: free when a pulse went on farther than R there, occupied when
+    ring           8 sectors between `inner` and `close`: free when a pulse went on farther than R there, occupied when
                    one returned near R, within `depth` and a slope
+    farther        up to `outer`: what stands there counts where nothing says that it is free in between
 
 A drone hangs free: pulses pass it on every side. What stands on a pole, hangs on a wire, sticks out of a tree or ends a
 wall has something beside it. A sector nothing flew through says nothing.
@@ -25,7 +26,8 @@ from stages.geometry import Array64
 SECTORS = 8
 INNER_HITS, INNER_PASSES, NEARER, FREE_0 = 0, 1, 2, 3  # FREE_0.. 8 free, then 8 occupied
 OCCUPIED_0 = FREE_0 + SECTORS
-TALLY = OCCUPIED_0 + SECTORS
+FARTHER_0 = OCCUPIED_0 + SECTORS  # 8 in which something stands, but not close by
+TALLY = FARTHER_0 + SECTORS
 BITS = 16  # of the map's table
 MAP_SIZE = 1 << BITS
 
@@ -38,6 +40,7 @@ def look_around(
     centre_m: Array64,
     disc_m: float,
     inner_m: float,
+    close_m: float,
     outer_m: float,
     depth_m: float,
     tally: NDArray[np.int64],
@@ -76,9 +79,11 @@ def look_around(
                 tally[INNER_PASSES] += 1
         elif away >= inner_m:
             sector = int((math.atan2(b, a) + math.pi) / (2 * math.pi) * SECTORS) % SECTORS
-            if hit:
+            if hit and away <= close_m:
                 tally[OCCUPIED_0 + sector] += 1
-            else:
+            elif hit:
+                tally[FARTHER_0 + sector] += 1
+            elif away <= close_m:
                 tally[FREE_0 + sector] += 1
 
 

@@ -119,7 +119,8 @@ class HitMissTrack(Stage):
             if known is not None:
                 if known.confirmed and P >= 0.5 and self._doubtful(known, candidates.stamp_ns):
                     self._move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
-                if P < 0.2 and known.confirmed:
+                sure = known.candidate == number or candidates.looks[i] >= 6
+                if P < 0.2 and known.confirmed and sure:
                     yield from self._lose(known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}")
             elif P >= 0.5 and sum(not track.confirmed for track in self._tracks) < self.max_hypotheses:
                 self._start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)

@@ -221,7 +221,7 @@ def known_classes(kind: str) -> list[str]:
             classes = re.findall(
                 r"^class (\w+)\((?:\w+, )*(?:Stage|Source|Link|Tap)\b", source.read_text("utf-8"), re.M
             )
-            # a class in a private room of a package is used through the package's front door; stages/x.py is a front door
+            # a class in a private room of a package is used through the front door, a stages/x.py as it is
             private = not module.ispkg and (kind != "stages" or module.name.count(".") > 1)
             home = module.name.rpartition(".")[0] if private else module.name
             found += [f"{home}.{name}" for name in classes]

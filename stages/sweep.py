@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
@@ -66,10 +67,11 @@ class Sweep(Stage):
         """Queue the packet; give out what can be placed."""
         if firings.pulse_stamp_ns.size == 0:
             return
-        self._waiting.append(firings)
+        waiting = self._waiting
+        waiting.append(firings)
         yield from self._release()
-        if len(self._waiting) > self.max_waiting_packets:
-            yield from self._place(self._waiting.popleft())
+        if len(waiting) > self.max_waiting_packets:
+            yield from self._place(waiting.popleft())
 
     def on_servo(self, servo: ServoState) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
         """One more angle; give out what waited for it."""
@@ -92,9 +94,10 @@ class Sweep(Stage):
     def _place(self, firings: LidarFirings) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
         turntable, travel, canvas = self._turntable, self._travel, self._canvas  # a private attribute costs 2 us a look
         pulse_ns = firings.pulse_stamp_ns
-        first_ns, middle_ns, last_ns = (int(pulse_ns[i]) for i in (0, pulse_ns.size // 2, -1))
-        placed = turntable.place(firings)
-        middle_rad, angle_rad = turntable.angle_rad(middle_ns), turntable.angle_rad(last_ns)
+        first_ns, last_ns = int(pulse_ns[0]), int(pulse_ns[-1])
+        turns = turntable.turns(pulse_ns)
+        angle_rad = float(turns[-1, 0])
+        placed, pulses = turntable.place(firings, turns), turntable.pulses(firings, turns)
         reason = ""
         if placed.unplaced:
             reason = turntable.why_unknown(last_ns if math.isnan(angle_rad) else first_ns)
@@ -105,12 +108,12 @@ class Sweep(Stage):
             laser=firings.laser[placed.pulse],
             reflectivity=firings.reflectivity[placed.pulse],
             servo_rad=placed.turntable_rad,
-            pulses=int((firings.return_kind == 0).sum()),
-            origin_vehicle_m=turntable.lidar_origin_vehicle_m(0.0 if math.isnan(middle_rad) else middle_rad),
+            pulses=int(np.count_nonzero(firings.return_kind == 0)),
+            origin_vehicle_m=pulses.origin_vehicle_m,
             unplaced=placed.unplaced,
             reason=reason,
         )
-        yield turntable.pulses(firings)
+        yield pulses
         turntable.forget_before(last_ns)
         if math.isnan(angle_rad):
             travel.restart()

@@ -40,13 +40,20 @@ def angle_at(t_ns: int, state_ns: NDArray[np.int64], state_rad: Array64, max_gap
 
 
 @compiled
+def turns_at(
+    pulse_ns: NDArray[np.int64], state_ns: NDArray[np.int64], state_rad: Array64, max_gap_ns: int, turn: Array64
+) -> None:
+    """Fill turn (n, 3) with angle, cosine and sine at each pulse; NaN where the angle is not known."""
+    for i in range(pulse_ns.size):
+        angle = angle_at(pulse_ns[i], state_ns, state_rad, max_gap_ns)
+        turn[i, 0], turn[i, 1], turn[i, 2] = angle, math.cos(angle), math.sin(angle)
+
+
+@compiled
 def place_returns(
-    pulse_ns: NDArray[np.int64],
     range_m: NDArray[np.float32],
     xyz_lidar_m: NDArray[np.float32],
-    state_ns: NDArray[np.int64],
-    state_rad: Array64,
-    max_gap_ns: int,
+    turn: Array64,
     min_range_m: float,
     T_vehicle_turntable: Array64,
     T_turntable_lidar: Array64,
@@ -60,10 +67,10 @@ def place_returns(
     """
     A, B = T_vehicle_turntable, T_turntable_lidar
     placed = unplaced = 0
-    for i in range(pulse_ns.size):
+    for i in range(range_m.size):
         if range_m[i] <= 0.0 or range_m[i] < min_range_m:
             continue
-        angle = angle_at(pulse_ns[i], state_ns, state_rad, max_gap_ns)
+        angle, c, s = turn[i, 0], turn[i, 1], turn[i, 2]
         if math.isnan(angle):
             unplaced += 1
             continue
@@ -71,7 +78,6 @@ def place_returns(
         x = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz + B[0, 3]
         y = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz + B[1, 3]
         z = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz + B[2, 3]
-        c, s = math.cos(angle), math.sin(angle)
         x, y = c * x - s * y, s * x + c * y
         for axis in range(3):
             xyz_vehicle_m[placed, axis] = A[axis, 0] * x + A[axis, 1] * y + A[axis, 2] * z + A[axis, 3]
@@ -83,16 +89,13 @@ def place_returns(
 
 @compiled
 def place_pulses(
-    pulse_ns: NDArray[np.int64],
     return_kind: NDArray[np.uint8],
     laser: NDArray[np.uint8],
     azimuth_rad: NDArray[np.float32],
     range_m: NDArray[np.float32],
     xyz_lidar_m: NDArray[np.float32],
     elevation_rad: Array64,
-    state_ns: NDArray[np.int64],
-    state_rad: Array64,
-    max_gap_ns: int,
+    turn: Array64,
     T_vehicle_turntable: Array64,
     T_turntable_lidar: Array64,
     origin_vehicle_m: Array64,
@@ -107,28 +110,27 @@ def place_pulses(
     """
     A, B = T_vehicle_turntable, T_turntable_lidar
     n = 0
-    for i in range(pulse_ns.size):
+    cos_w, sin_w = np.cos(elevation_rad), np.sin(elevation_rad)
+    for i in range(range_m.size):
         if return_kind[i] != 0:  # the last return of the pulse before
             if n > 0 and range_m[i] > 0.0 and (distance_m[n - 1] == 0.0 or range_m[i] < distance_m[n - 1]):
                 n -= 1  # nearer: takes its place
             else:
                 continue
-        angle = angle_at(pulse_ns[i], state_ns, state_rad, max_gap_ns)
+        angle, c, s = turn[i, 0], turn[i, 1], turn[i, 2]
         if math.isnan(angle):
             return 0
         seen = range_m[i] > 0.0
         if seen:
             px, py, pz = float(xyz_lidar_m[i, 0]), float(xyz_lidar_m[i, 1]), float(xyz_lidar_m[i, 2])
         else:
-            w = elevation_rad[laser[i]]
-            c = math.cos(w)
-            px, py, pz = c * math.sin(azimuth_rad[i]), c * math.cos(azimuth_rad[i]), math.sin(w)
+            level, up = cos_w[laser[i]], sin_w[laser[i]]
+            px, py, pz = level * math.sin(azimuth_rad[i]), level * math.cos(azimuth_rad[i]), up
         x = B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz
         y = B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz
         z = B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz
         if seen:
             x, y, z = x + B[0, 3], y + B[1, 3], z + B[2, 3]
-        c, s = math.cos(angle), math.sin(angle)
         x, y = c * x - s * y, s * x + c * y
         vx = A[0, 0] * x + A[0, 1] * y + A[0, 2] * z
         vy = A[1, 0] * x + A[1, 1] * y + A[1, 2] * z
@@ -166,6 +168,7 @@ class Turntable:
         self._offset_ns = round(mount.servo_time_offset_s * 1e9)
         self.T_vehicle_turntable = mount.T_vehicle_turntable.matrix()
         self._T_turntable_lidar = mount.T_turntable_lidar.matrix()
+        self._lidar_turntable_m: tuple[float, float, float] = tuple(self._T_turntable_lidar[:3, 3].tolist())
         self._last_servo_rad: float | None = None
         self._states: deque[tuple[int, float]] = deque(maxlen=STATES_KEPT)
         self._state_ns = np.empty(0, dtype=np.int64)
@@ -205,33 +208,33 @@ class Turntable:
         self._state_ns = np.array([t for t, _ in self._states], dtype=np.int64)
         self._state_rad = np.array([angle for _, angle in self._states])
 
-    def angle_rad(self, t_ns: int) -> float:
-        """Turntable angle at a time, NaN when not known. A LiDAR without servo stands at 0."""
-        if not self._mount.turns:
-            return 0.0
-        return float(angle_at(t_ns, self._state_ns, self._state_rad, self._max_gap_ns))
-
     def lidar_origin_vehicle_m(self, angle_rad: float) -> tuple[float, float, float]:
-        """Where the beams start, for a turntable angle."""
-        x, y, z = self._T_turntable_lidar[:3, 3]
+        """Where the beams start, for a turntable angle; NaN counts as 0."""
+        angle_rad = 0.0 if math.isnan(angle_rad) else angle_rad
+        x, y, z = self._lidar_turntable_m
         c, s = math.cos(angle_rad), math.sin(angle_rad)
-        origin = self.T_vehicle_turntable @ np.array([c * x - s * y, s * x + c * y, z, 1.0])
-        return float(origin[0]), float(origin[1]), float(origin[2])
+        x, y, z, _ = (self.T_vehicle_turntable @ np.array([c * x - s * y, s * x + c * y, z, 1.0])).tolist()
+        return x, y, z
 
-    def place(self, firings: LidarFirings) -> Placed:
-        """The packet's returns in the vehicle frame."""
+    def turns(self, pulse_ns: NDArray[np.int64]) -> Array64:
+        """Angle, cosine and sine (n, 3) at each pulse; NaN where the angle is not known."""
+        turn = np.empty((pulse_ns.size, 3))
+        if self._mount.turns:
+            turns_at(pulse_ns, self._state_ns, self._state_rad, self._max_gap_ns, turn)
+        else:
+            turn[:] = 0.0, 1.0, 0.0
+        return turn
+
+    def place(self, firings: LidarFirings, turns: Array64) -> Placed:
+        """The packet's returns in the vehicle frame; `turns` are those of its pulses."""
         n = firings.pulse_stamp_ns.size
-        state_ns, state_rad, max_gap_ns = self._states_for(firings.pulse_stamp_ns)
         pulse = np.empty(n, dtype=np.int64)
         xyz_vehicle_m = np.empty((n, 3), dtype=np.float32)
         turntable_rad = np.empty(n, dtype=np.float32)
         placed, unplaced = place_returns(
-            firings.pulse_stamp_ns,
             firings.range_m,
             firings.xyz_lidar_m,
-            state_ns,
-            state_rad,
-            max_gap_ns,
+            turns,
             self._min_range_m,
             self.T_vehicle_turntable,
             self._T_turntable_lidar,
@@ -241,27 +244,23 @@ class Turntable:
         )
         return Placed(pulse[:placed], xyz_vehicle_m[:placed], turntable_rad[:placed], unplaced)
 
-    def pulses(self, firings: LidarFirings) -> SweptPulses:
+    def pulses(self, firings: LidarFirings, turns: Array64) -> SweptPulses:
         """Every pulse of the packet in the vehicle frame; none when the angle is not known for all of it."""
         pulse_ns = firings.pulse_stamp_ns
         n = pulse_ns.size
-        state_ns, state_rad, max_gap_ns = self._states_for(pulse_ns)
-        middle_rad = float(angle_at(int(pulse_ns[n // 2]), state_ns, state_rad, max_gap_ns))
-        origin = self.lidar_origin_vehicle_m(0.0 if math.isnan(middle_rad) else middle_rad)
+        middle_rad = float(turns[n // 2, 0])
+        origin = self.lidar_origin_vehicle_m(middle_rad)
         row = np.empty(n, dtype=np.int64)
         direction_vehicle = np.empty((n, 3), dtype=np.float32)
         distance_m = np.empty(n, dtype=np.float32)
         count = place_pulses(
-            pulse_ns,
             firings.return_kind,
             firings.laser,
             firings.azimuth_rad,
             firings.range_m,
             firings.xyz_lidar_m,
             firings.laser_elevation_rad,
-            state_ns,
-            state_rad,
-            max_gap_ns,
+            turns,
             self.T_vehicle_turntable,
             self._T_turntable_lidar,
             np.array(origin),
@@ -280,13 +279,6 @@ class Turntable:
             turntable_rad=middle_rad,
             origin_vehicle_m=origin,
         )
-
-    def _states_for(self, pulse_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array64, int]:
-        """States around the pulses and the longest gap between two; a LiDAR without servo stands at 0."""
-        if self._mount.turns:
-            return self._state_ns, self._state_rad, self._max_gap_ns
-        state_ns = np.array([pulse_ns.min(), pulse_ns.max()], dtype=np.int64)
-        return state_ns, np.zeros(2), int(state_ns[1] - state_ns[0])
 
     def why_unknown(self, t_ns: int) -> str:
         """Why the angle at a time is not known, in words."""

@@ -16,13 +16,20 @@ _WHOLE_RUN = rrb.TimeAxis(
 )
 
 
-def layout() -> rrb.Blueprint:
-    """The blueprint. Views ask for groups of entities, whatever the stages are called: see `links/viewer/draw.py`."""
+def layout(*, images: bool, evidence: bool) -> rrb.Blueprint:
+    """The blueprint. Views ask for groups of entities, whatever the stages are called: see `links/viewer/draw.py`.
+
+    `images`: the graph has depth images to show; `evidence`: it has candidates with reasons and a probability.
+    """
     scene = _space(
         "Vehicle frame: last returns (blue low, white high), LiDAR fan, drone with 95 % ellipsoid",
         ["/vehicle/**", "/labels/**", "/lidar/**", "/frames/**"],
         frame="vehicle",
-        eye=rrb.EyeControls3D(position=(-22.0, -17.0, 17.0), look_target=(5.0, 0.5, 7.0), eye_up=(0.0, 0.0, 1.0)),
+        eye=rrb.EyeControls3D(
+            position=(-38.0, -30.0, 20.0) if evidence else (-22.0, -17.0, 17.0),  # it sees farther
+            look_target=(5.0, 0.5, 15.0) if evidence else (5.0, 0.5, 7.0),
+            eye_up=(0.0, 0.0, 1.0),
+        ),
         grid_m=5.0,
     )
     close_up = _space(
@@ -32,37 +39,39 @@ def layout() -> rrb.Blueprint:
         eye=rrb.EyeControls3D(position=(-2.6, -2.0, 1.4), look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)),
         grid_m=None,
     )
+    candidates = rrb.TextDocumentView(name="Candidates: why, and why not", origin="/candidates")
+    lidar_range = rrb.TensorView(
+        name="LiDAR range",
+        origin="/range",
+        contents="/range/**",
+        view_fit="fill",
+        scalar_mapping=rrb.TensorScalarMapping(colormap="turbo", mag_filter="nearest"),
+    )
     words = rrb.Tabs(
         rrb.TextDocumentView(name="Now", origin="/now"),
         rrb.TextLogView(name="Verdicts", origin="/log", contents="/log/**"),
+        *([lidar_range] if evidence and not images else [candidates]),
         rrb.TextDocumentView(name="Graph", origin="/about/graph"),
         rrb.TextDocumentView(name="Settings", origin="/about/settings"),
         _curves("All other numbers", "/plots/other/**"),
     )
-    images = rrb.Horizontal(
+    pictures = rrb.Horizontal(
         _image("Depth image, up (blue near, red far)", ["/depth/**", "/marks/**"]),
-        rrb.Tabs(
-            _image("Score (bright: like a drone)", ["/score/**", "/marks/**"]),
-            rrb.TensorView(
-                name="LiDAR range",
-                origin="/range",
-                contents="/range/**",
-                view_fit="fill",
-                scalar_mapping=rrb.TensorScalarMapping(colormap="turbo", mag_filter="nearest"),
-            ),
-        ),
+        rrb.Tabs(_image("Score (bright: like a drone)", ["/score/**", "/marks/**"]), lidar_range),
     )
+    probability = _curves("Probability of a drone [%]", "/plots/probability/**")
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(scene, rrb.Horizontal(close_up, words, column_shares=[2, 3]), row_shares=[2, 1]),
             rrb.Vertical(
-                images,
+                pictures if images or not evidence else candidates,
+                *([probability] if evidence else []),
                 _curves("Position of the drone [m]", "/plots/position/**"),
                 _curves("Its sigma [m]", "/plots/sigma/**"),
-                _curves("Returns on the drone, per frame", "/plots/hits/**"),
+                _curves("Returns on the drone, per look", "/plots/hits/**"),
                 _curves("Servo angle and goal [deg]", "/plots/servo/**"),
                 rrb.StateTimelineView(name="States", origin="/states", contents="/states/**", time_view=_WHOLE_RUN),
-                row_shares=[32, 14, 12, 9, 10, 21],
+                row_shares=[26, 11, 11, 10, 7, 9, 26] if evidence else [32, 14, 12, 9, 10, 21],
             ),
             column_shares=[11, 10],
         ),

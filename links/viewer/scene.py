@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 
 from links.viewer import colours
 from stages.geometry import LidarMount, rotation_z, transform
-from stages.messages import DepthImage, DroneFix
+from stages.messages import Candidates, DepthImage, DroneFix, TrackingState, TrackState
 
 TIMELINE = "sensor_time"
 DRONE_FRAME = "drone_position"  # axes as the vehicle's, origin at the latest fix: the close-up looks from there
 FAN_RADIUS_M = 12.0
 NEAR_DRONE_M = 1.0
 TURNTABLE_EVERY_NS = 20_000_000
+FRESH_NS = 150_000_000  # a hypothesis is told ten times a second
+STATE_HOLDS_NS = 1_000_000_000
+FIRST_OF_ALL = (TrackingState.TRACKING, TrackingState.COASTING, TrackingState.CANDIDATE)
 FAN_HALF_OPENING_RAD = np.deg2rad(15.0)  # VLP-16 user manual 63-9243: beams from -15 to +15 deg
 
 
@@ -40,8 +43,16 @@ class Mark:
         self.style = style
 
 
+class Listed(NamedTuple):
+    """A candidate as it was told last."""
+
+    probability: float
+    seen_ns: int
+    reason: str
+
+
 class Scene:
-    """Memory of one run, bounded: trails, the last depth image's geometry, the last word of each state."""
+    """Memory of one run, bounded: trails, candidates, the last depth image's geometry, the last word of each state."""
 
     def __init__(self, *, mount: LidarMount | None, history_s: float, slice_s: float, max_points: int, trail_s: float):
         self.mount = mount
@@ -50,8 +61,11 @@ class Scene:
         self.slice_ns = int(slice_s * 1e9)
         self.slices = max(1, round(history_s / slice_s))
         self.depth: DepthImage | None = None
-        self.fixes: dict[str, DroneFix] = {}
-        self._lines: dict[tuple[int, str], str] = {}
+        self.fixes: dict[tuple[str, int], DroneFix] = {}  # by output and drone, until it is lost
+        self._lines: dict[str, dict[tuple[int, str], str]] = {}
+        self._listed: dict[str, dict[int, Listed]] = {}
+        self._tracks: dict[str, dict[int, TrackState]] = {}
+        self._hypotheses: dict[str, list[TrackState]] = {}
         self._turned_ns = -TURNTABLE_EVERY_NS
         self._said: dict[str, str] = {}
         self._trails: dict[str, deque[tuple[int, NDArray[np.float32]]]] = {}
@@ -62,6 +76,10 @@ class Scene:
             return False
         self._said[path] = word
         return True
+
+    def has_said(self, path: str) -> bool:
+        """Was anything said at `path`?"""
+        return path in self._said
 
     def turntable_is_due(self, stamp_ns: int) -> bool:
         """The turntable is moved 50 times a second at most, however often the servo answers."""
@@ -85,18 +103,77 @@ class Scene:
             previous_ns = stamp_ns
         return [np.array(strip) for strip in strips]
 
-    def now(self, rank: int, topic: str, text: str) -> Mark:
-        """The page that tells the present in words: one line per topic, always the newest."""
-        self._lines[rank, topic] = text
-        rows = "\n\n".join(f"**{topic}:** {line}" for (_, topic), line in sorted(self._lines.items()))
-        return Mark("now", rr.TextDocument(rows, media_type=rr.MediaType.MARKDOWN))
+    def no_longer(self, name: str, candidates: Candidates) -> list[tuple[int, Listed]]:
+        """Candidates told last time and not any more: dropped, or pushed out by better ones; as they were."""
+        told = zip(candidates.probability.tolist(), candidates.seen_ns.tolist(), candidates.reasons, strict=True)
+        now = dict(zip(candidates.candidate_id.tolist(), (Listed(*each) for each in told), strict=True))
+        before = self._listed.get(name, {})
+        self._listed[name] = now
+        return [(number, last) for number, last in before.items() if number not in now]
+
+    def overall(self, name: str, track: TrackState) -> TrackingState:
+        """What a tracker with several drones and hypotheses does, in one word: the most that it does for any."""
+        tracks = self._tracks.setdefault(name, {})
+        tracks[track.track_id] = track
+        for number in [n for n, t in tracks.items() if not 0 <= track.stamp_ns - t.stamp_ns < STATE_HOLDS_NS]:
+            del tracks[number]
+        states = {each.state for each in tracks.values()}
+        return next((first for first in FIRST_OF_ALL if first in states), track.state)
+
+    def hypotheses(self, path: str, track: TrackState) -> list[TrackState]:
+        """This one and the others without a number that were told just before."""
+        fresh = [t for t in self._hypotheses.get(path, []) if 0 <= track.stamp_ns - t.stamp_ns < FRESH_NS]
+        self._hypotheses[path] = [*fresh[-15:], track]
+        return self._hypotheses[path]
+
+    def none_left(self, path: str, track: TrackState) -> bool:
+        """Were there hypotheses without a number, and are they over? True once."""
+        last = self._hypotheses.get(path)
+        if not last or (track.track_id == 0 and track.state is TrackingState.CANDIDATE):
+            return False
+        if track.track_id and track.stamp_ns - last[-1].stamp_ns < 2 * FRESH_NS:
+            return False
+        del self._hypotheses[path]
+        return True
+
+    def forget_drone(self, stage: str, track_id: int) -> list[str]:
+        """A stage lost a drone: forget its fixes and what is said of it now; the outputs that told where it was."""
+        names = [name for name, number in self.fixes if number == track_id and name.split("/", 1)[0] == stage]
+        for name in names:
+            del self.fixes[name, track_id]
+            self._trails.pop(f"{name}/drone_{track_id}", None)
+        for rank, topic in list(self._lines.get("now", {})):
+            if topic.startswith(f"{stage}, drone {track_id}"):
+                self.now(rank, topic, None)
+        return names
+
+    def now(self, rank: int, topic: str, text: str | None) -> Mark:
+        """The page that tells the present in words: one line per topic, always the newest; None: nothing to tell."""
+        return self._page("now", rank, topic, text and f"**{topic}:** {text}")
+
+    def why(self, rank: int, topic: str, rows: list[str]) -> Mark:
+        """The page that tells why each candidate is taken for a drone or not."""
+        return self._page("candidates", rank, topic, "\n".join([f"**{topic}**\n", *(f"- {row}" for row in rows)]))
+
+    def _page(self, path: str, rank: int, topic: str, text: str | None) -> Mark:
+        lines = self._lines.setdefault(path, {})
+        lines.pop((rank, topic), None)
+        if text is not None:
+            lines[rank, topic] = text
+        together = "\n\n".join(line for _, line in sorted(lines.items()))
+        return Mark(path, rr.TextDocument(together, media_type=rr.MediaType.MARKDOWN))
+
+    def near_a_drone(self, xyz_m: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Which of the points (n, 3) lie within 1 m of a latest fix."""
+        near = np.zeros(len(xyz_m), dtype=np.bool_)
+        for fix in self.fixes.values():
+            near |= np.linalg.norm(xyz_m - fix.xyz_vehicle_m, axis=1) < NEAR_DRONE_M
+        return near
 
     def colours(self, xyz_m: NDArray[np.float32]) -> NDArray[np.uint32]:
         """Packed colours (n,) of returns (n, 3): by height, warm within 1 m of a latest fix."""
         packed = colours.by_height(xyz_m[:, 2])
-        for fix in self.fixes.values():
-            near = np.linalg.norm(xyz_m - fix.xyz_vehicle_m, axis=1) < NEAR_DRONE_M
-            packed[near] = colours.DRONE
+        packed[self.near_a_drone(xyz_m)] = colours.DRONE
         return packed
 
 

@@ -13,9 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.message import Message, array_fields
-from stages.messages import LidarFirings, SweptPoints
+from stages.messages import LidarFirings, SweptPoints, SweptPulses
 
-JOINED: dict[type[Message], tuple[str, ...]] = {LidarFirings: ("lost_packets",), SweptPoints: ("pulses", "unplaced")}
+JOINED: dict[type[Message], tuple[str, ...]] = {
+    LidarFirings: ("lost_packets",),
+    SweptPoints: ("pulses", "unplaced"),
+    SweptPulses: (),
+}
 """Message types that come packet by packet, with the fields that add up; their arrays are strung together."""
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
-from links.viewer.layout import layout
 from links.viewer.rrd_file import RrdFile
 from links.viewer.scene import TIMELINE, Mark
 
@@ -25,7 +25,10 @@ EPOCH_FROM_NS = 10**17  # stamps above are times since 1970 (1973 on), below are
 class Stream:
     """A Rerun stream that outlives its sinks: what it cannot write or serve is counted in `errors`."""
 
-    def __init__(self, file: Path | None, port: int | None, memory_limit: str, errors: Counter[str]) -> None:
+    def __init__(
+        self, file: Path | None, port: int | None, memory_limit: str, errors: Counter[str], opens: rrb.Blueprint
+    ) -> None:
+        """`opens`: how a viewer shows it at first."""
         self._styled: set[str] = set()
         self._since_1970: bool | None = None
         self._rerun = rr.RecordingStream(APPLICATION)
@@ -47,7 +50,7 @@ class Stream:
             self._rerun.disconnect()
             return
         try:
-            self._rerun.set_sinks(*sinks, default_blueprint=layout())
+            self._rerun.set_sinks(*sinks, default_blueprint=opens)
         except RuntimeError as error:
             errors[f"nothing is shown, Rerun cannot start: {error}"] += 1
         finally:

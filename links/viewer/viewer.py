@@ -19,6 +19,7 @@ from pydantic import Field, PrivateAttr
 from flow.link import Run, Tap
 from flow.message import Message
 from links.viewer.draw import draw
+from links.viewer.layout import layout
 from links.viewer.mailbox import Mailbox
 from links.viewer.scene import Mark, Scene, opening, scenery
 from links.viewer.slices import Slicer
@@ -70,9 +71,15 @@ class Viewer(Tap):
         return f"rerun+http://{LOOPBACK}:{self.port}/proxy"
 
     def open(self, run: Run) -> None:
-        """Start the logging thread; Rerun is first touched there, which takes half a second."""
+        """Start the logging thread; Rerun is first touched there, which takes half a second.
+
+        Without file and server there is nothing to draw for, and no thread.
+        """
         self._errors.clear()
         self._finished = False
+        self._box = None
+        if self.file is None and not self.serve:
+            return
         self._box = Mailbox(self.queue_size, lossless=self.lossless, patience_s=PATIENCE_S)
         self._thread = threading.Thread(target=self._work, args=(run, self._box), name="viewer", daemon=True)
         self._thread.start()
@@ -113,6 +120,7 @@ class Viewer(Tap):
             self.port if self.serve else None,
             self.memory_limit,
             self._errors,
+            layout(images=_wired(run, "depth_image"), evidence=_wired(run, "candidates")),
         )
         for mark in (*_about(run), *scenery(self.mount)):
             stream.put(mark, static=True)
@@ -144,6 +152,11 @@ class Viewer(Tap):
                     stream.put(mark)
             except DRAWING_ERRORS as error:
                 self._errors[f"{output} could not be drawn: {type(error).__name__}: {error}"] += 1
+
+
+def _wired(run: Run, output: str) -> bool:
+    """Does any stage take this output?"""
+    return f" -- {output} --> " in run.mermaid
 
 
 def _about(run: Run) -> Iterator[Mark]:

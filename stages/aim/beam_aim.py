@@ -103,10 +103,9 @@ class BeamAim(Stage):
     candidate_rest_s: float = Field(1.0, gt=0)
     candidate_probability: float = Field(0.015, ge=0, lt=1)  # less is not worth stopping for
     stop_probability: float = Field(0.25, ge=0, le=1)  # more, met three times, interrupts the sweep
-    stop_looks: int = Field(2, ge=1)  # it was seen in so many turns of the rotor before it interrupts the sweep
+    stop_looks: int = Field(3, ge=1)  # it was seen in so many turns of the rotor before it interrupts the sweep
     glances: int = Field(3, ge=0)  # at a candidate in passing
     glance_probability: float = Field(0.03, ge=0, le=1)
-    candidate_mps: float = Field(5.0, gt=0)  # faster ones are birds first of all: a glance will do
     turns_each: int = Field(3, ge=1)  # for each of several drones
     beams: bool = True  # ablation: without, the middle of the fan is put on the drone
     coast_search_s: float = Field(3.0, gt=0)  # coasting longer, the whole travel is swept
@@ -208,9 +207,8 @@ class BeamAim(Stage):
         for key, target in tuple(now.targets.items()):
             if target.sure:
                 continue
-            fast = target.seen_looks >= 2 and float(np.linalg.norm(target.velocity_mps)) > self.candidate_mps
-            if target.looks >= self.candidate_looks or fast:
-                self._leave(target, now_ns, slow=not fast)
+            if target.looks >= self.candidate_looks:
+                self._leave(target, now_ns)
             elif now_ns - target.heard_ns > 1.2e9:
                 del now.targets[key]
         now.places = [place for place in now.places if now_ns - place[0] < 4e9]
@@ -248,12 +246,11 @@ class BeamAim(Stage):
             target.glance = True
         return max(fresh, key=lambda t: (t.probability / (1.0 + t.looks), t.key), default=None)
 
-    def _leave(self, target: _Target, now_ns: int, slow: bool = True) -> None:
+    def _leave(self, target: _Target, now_ns: int) -> None:
         """Looked at long enough: leave it, and what stands there, alone for a while."""
         self._now.done[target.key[1]] = now_ns
         self._now.targets.pop(target.key, None)
-        if slow:
-            self._now.places.append((now_ns, target.at(now_ns)))
+        self._now.places.append((now_ns, target.at(now_ns)))
 
     # one look
 
@@ -283,7 +280,9 @@ class BeamAim(Stage):
             if target.glance and abs(goal - centre) > math.radians(12.0):
                 target.looks = self.glances  # the fan has passed it
                 return self._sweep(servo)
-            ready_ns = servo.stamp_ns + round((self.lead_s + self.settle_s + abs(goal - servo.position_rad) / speed) * 1e9)
+            ready_ns = servo.stamp_ns + round(
+                (self.lead_s + self.settle_s + abs(goal - servo.position_rad) / speed) * 1e9
+            )
             pass_ns = now.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, place, theta), ready_ns)
         assert best is not None
         self._now.targets[target.key].looks += 1

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
 from stages.geometry import Array64
@@ -52,7 +52,7 @@ class Evidence(BaseModel):
     long: float = 1.5  # each look longer than the drone, up to 4
     moves: float = 5.0  # it moved: what stands does not
     still: float = 0.12  # each look at something that does not, up to most_still: a lamp's pole is found sooner
-    most_still: float = 3.5
+    most_still: float = 1.5
 
     bird: float = -0.5
     calm: float = 8.0  # each second in which it would have shown a bird's speed or turn

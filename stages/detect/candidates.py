@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from stages.compiled import compiled
 from stages.depth_image import unproject
-from stages.geometry import Array64
 from stages.detect.kernel_score import inner_half_px
+from stages.geometry import Array64
 from stages.messages import DepthImage
 
 INFINITY_BITS = 0x7F80_0000  # of a float32; those of finite numbers from 0 up are lower, those of NaN are not

@@ -100,11 +100,11 @@ class EvidenceDetect(Stage):
         self._count += 1
         self._find(pulses, R, t)
         self._look_for_misses(now_ns)
-        if self._count % 64 == 0:  # about ten times a second
-            self._forget(now_ns)
         changed = False
+        if self._count % 64 == 0:  # about ten times a second
+            changed = self._forget(now_ns)
         if self._pending and self._pending[0][0] <= self._count - DELAY:
-            changed = self._judge_pending(now_ns)
+            changed |= self._judge_pending(now_ns)
         yield from self._report(now_ns, pulses.turntable_rad, changed)
 
     # what was seen
@@ -117,7 +117,9 @@ class EvidenceDetect(Stage):
         long = rows[:, chord.LONG] > 0
         if long.any():
             self._big.add(rows[long, :3] @ R.T + t, pulses.stamp_ns)
-        up = (rows[:, chord.Z] - pulses.origin_vehicle_m[2]) > math.sin(math.radians(self.lowest_deg)) * rows[:, chord.RANGE]
+        up = (rows[:, chord.Z] - pulses.origin_vehicle_m[2]) > math.sin(math.radians(self.lowest_deg)) * rows[
+            :, chord.RANGE
+        ]
         near = (rows[:, chord.RANGE] >= self.nearest_m) & (rows[:, chord.RANGE] <= self.furthest_m)
         short = ~long & up & near & (rows[:, chord.LENGTH] <= 1.6 * self.span_m)
         free = rows[:, chord.FREE] == 2.0
@@ -277,20 +279,26 @@ class EvidenceDetect(Stage):
             yield self._detections(now_ns)
         elif self._end_ns is not None and now_ns - self._end_ns >= self.settle_s * 1e9:
             yield self._detections(self._end_ns)
-        elif now_ns - self._start_ns > self.report_s * 1e9 and any(
-            c.accepted and c.seen_ns >= self._start_ns for c in self._bank
-        ):
-            yield self._detections(now_ns)
-        elif now_ns - self._start_ns > 3.0 * self.report_s * 1e9 and self._end_ns is None:
+        elif (
+            now_ns - self._start_ns > self.report_s * 1e9
+            and any(c.accepted and c.seen_ns >= self._start_ns for c in self._bank)
+        ) or (now_ns - self._start_ns > 3.0 * self.report_s * 1e9 and self._end_ns is None):
             yield self._detections(now_ns)
 
-    def _forget(self, now_ns: int) -> None:
-        """Drop what was not seen for long; what nobody would look at again sooner."""
+    def _forget(self, now_ns: int) -> bool:
+        """Drop what was not seen for long; what nobody would look at again sooner. True when one that was told goes."""
         long_ns, soon_ns = self.forget_s * 1e9, 0.35e9
-        self._bank = [c for c in self._bank if now_ns - c.seen_ns < (long_ns if c.told else soon_ns)]
+        kept = [c for c in self._bank if now_ns - c.seen_ns < (long_ns if c.told else soon_ns)]
+        gone = sum(c.told > 0 for c in self._bank) > sum(c.told > 0 for c in kept)
+        self._bank = kept
+        return gone
 
     def _candidates(self, now_ns: int) -> Candidates:
-        listed = [(c.judge(self.evidence, self.free_space, self._trail.known), c) for c in self._bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
+        listed = [
+            (c.judge(self.evidence, self.free_space, self._trail.known), c)
+            for c in self._bank
+            if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)
+        ]
         listed.sort(key=lambda item: -item[0][0])
         listed = listed[: self.max_candidates]
         seen = [self._trail.to_vehicle(now_ns, c.predict(now_ns, 0.0)[0], c.velocity_mps) for _, c in listed]
@@ -308,7 +316,11 @@ class EvidenceDetect(Stage):
     def _detections(self, end_ns: int) -> Detections:
         assert self._start_ns is not None
         start_ns, self._start_ns, self._end_ns = self._start_ns, end_ns + 1, None
-        judged = [(*c.judge(self.evidence, self.free_space, self._trail.known), c) for c in self._bank if c.seen_ns >= start_ns]
+        judged = [
+            (*c.judge(self.evidence, self.free_space, self._trail.known), c)
+            for c in self._bank
+            if c.seen_ns >= start_ns
+        ]
         judged.sort(key=lambda item: (not item[2].accepted, -item[0]))
         judged = judged[: self.max_candidates]
         seen = [self._trail.to_vehicle(c.seen_ns, c.xyz_m, c.velocity_mps) for _, _, c in judged]
@@ -324,7 +336,9 @@ class EvidenceDetect(Stage):
         else:
             refused = ", ".join(f"{n} for '{why}'" for why, n in self._refused.most_common(3) if n)
             best = f"; the best candidate, {100 * probability[0]:.1f} %: {judged[0][1]}" if judged else ""
-            verdict = f"no drone: {sum(self._refused.values())} short returns refused at once ({refused or 'none'}){best}"
+            verdict = (
+                f"no drone: {sum(self._refused.values())} short returns refused at once ({refused or 'none'}){best}"
+            )
         self._refused.clear()
         n = len(judged)
         return Detections(

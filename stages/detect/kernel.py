@@ -19,8 +19,8 @@ import numpy as np
 from pydantic import Field
 
 from flow.stage import Stage
-from stages.detect.candidates import Gates, Pixel, local_minima, refusal
 from stages.depth_image import unproject
+from stages.detect.candidates import Gates, Pixel, local_minima, refusal
 from stages.detect.kernel_score import inner_half_px, kernel_terms, score_image
 from stages.messages import DepthImage, Detections, ScoreImage
 

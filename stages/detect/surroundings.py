@@ -93,9 +93,7 @@ def _cell(x: int, y: int, z: int) -> int:
 
 
 @compiled
-def remember(
-    points_m: Array64, cell_m: float, stamp_ns: int, key: NDArray[np.int64], when: NDArray[np.int64]
-) -> None:
+def remember(points_m: Array64, cell_m: float, stamp_ns: int, key: NDArray[np.int64], when: NDArray[np.int64]) -> None:
     """Note the cells of points (n, 3); a cell that shares its place in the table takes it over."""
     for i in range(points_m.shape[0]):
         x, y, z = (
@@ -110,7 +108,12 @@ def remember(
 
 @compiled
 def nearest_remembered(
-    centre_m: Array64, cell_m: float, least_m: float, most_m: float, since_ns: int, key: NDArray[np.int64],
+    centre_m: Array64,
+    cell_m: float,
+    least_m: float,
+    most_m: float,
+    since_ns: int,
+    key: NDArray[np.int64],
     when: NDArray[np.int64],
 ) -> float:
     """Distance [m] to the nearest noted cell's middle between least_m and most_m of centre_m (3,); inf without one."""

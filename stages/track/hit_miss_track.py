@@ -34,7 +34,7 @@ from stages.messages import (
     TrackState,
     VehicleMotion,
 )
-from stages.track.hull import A, B, COLUMNS, DEPTH, HIT, KIND, WHEN_S, WIDTH, basis, collect, posterior
+from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, WHEN_S, WIDTH, A, B, basis, collect, posterior
 from stages.track.kalman import condition, measured, predicted
 from stages.trail import VehicleTrail
 
@@ -89,12 +89,12 @@ class HitMissTrack(Stage):
     max_drones: int = Field(1, ge=1, le=8)
     max_hypotheses: int = Field(4, ge=0, le=16)  # candidates followed beside them
     own_sigma_m: float = Field(0.8, gt=0)  # less known, only the detector finds it again
-    manoeuvre: float = Field(2.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
+    manoeuvre: float = Field(1.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
     coast_after_s: float = Field(0.35, gt=0)
     lost_after_s: float = Field(6.0, gt=0)
     start_sigma_mps: float = Field(3.0, gt=0)
-    pointing_deg: float = Field(0.1, ge=0)  # encoder, play, calibration: constant or slow, one sigma
-    shape_m: float = Field(0.03, ge=0)  # the drone's own outline is not round, one sigma
+    pointing_deg: float = Field(0.07, ge=0)  # encoder, play, calibration: constant or slow, one sigma
+    shape_m: float = Field(0.02, ge=0)  # the drone's own outline is not round, one sigma
     misses: bool = True  # ablation: without, only hits count
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
 
@@ -121,7 +121,9 @@ class HitMissTrack(Stage):
                     self._move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
                 sure = known.candidate == number or candidates.looks[i] >= 6
                 if P < 0.2 and known.confirmed and sure:
-                    yield from self._lose(known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}")
+                    yield from self._lose(
+                        known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}"
+                    )
             elif P >= 0.5 and sum(not track.confirmed for track in self._tracks) < self.max_hypotheses:
                 self._start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
 
@@ -156,11 +158,11 @@ class HitMissTrack(Stage):
         R, t = self._trail.at(pulses.stamp_ns)
         axis = pulses.direction_vehicle.mean(axis=0).astype(np.float64)
         for track in tuple(self._tracks):
-            self._collect(track, pulses, R, t, axis)
             look = track.look
-            if look is not None and now_ns - look.last_ns > LOOK_OVER_NS:
+            if look is not None and pulses.stamp_ns - look.last_ns > LOOK_OVER_NS:
                 track.look = None
                 yield from self._close(track, look)
+            self._collect(track, pulses, R, t, axis)
             if track in self._tracks:
                 yield from self._watch(track, now_ns)
         if not self._tracks and now_ns - self._idle_ns > 500_000_000:
@@ -191,6 +193,7 @@ class HitMissTrack(Stage):
         self._tracks.remove(new)
         track.candidate, track.stamp_ns, track.x, track.P = number, new.stamp_ns, new.x, new.P
         track.last_hit_ns, track.look, track.odds = seen_ns, None, max(track.odds, 2.0)
+        track.reason = "found again by the detector"
 
     def _near(self, xyz: Array64, stamp_ns: int, number: int) -> _Track | None:
         """The track that this is: by the detector's number, or by its place."""

@@ -26,7 +26,9 @@ from stages.geometry import Array64
 
 WIDTH = 0.2  # s over the span
 STRAY = 0.005  # eps: a return that is none of the drone's
-A, B, KIND, DEPTH, WHEN_S = range(5)  # of a collected pulse: offsets [m], hit or miss, range over the prediction [m], time
+A, B, KIND, DEPTH, WHEN_S = range(
+    5
+)  # of a collected pulse: offsets [m], hit or miss, range over the prediction [m], time
 COLUMNS = 5
 MISS, HIT, NEARER = 0.0, 1.0, 2.0
 CELLS = 25

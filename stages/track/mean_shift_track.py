@@ -27,8 +27,8 @@ from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
 from stages.geometry import Array64
-from stages.track.mean_shift import crossings, fix_covariance_m2, mean_shift, within
 from stages.messages import Detections, DroneFix, SweptPoints, TrackingState, TrackState
+from stages.track.mean_shift import crossings, fix_covariance_m2, mean_shift, within
 
 
 @dataclass(slots=True)

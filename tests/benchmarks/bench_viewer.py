@@ -16,12 +16,12 @@ from flow.link import Run
 from links.viewer import Viewer
 from links.viewer.draw import draw
 from links.viewer.scene import Scene
-from links.viewer.slices import thin
+from links.viewer.slices import Slicer, thin
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "viewer"))
 import synthetic
 
-MESSAGES = list(synthetic.run(1.0))
+RUNS = {"paper": list(synthetic.run(1.0)), "evidence": list(synthetic.run_by_evidence(1.0))}
 
 
 @pytest.fixture
@@ -33,28 +33,34 @@ def viewer(tmp_path):
     tap.close()
 
 
-def test_see_a_second_of_messages(benchmark, viewer):
+@pytest.mark.parametrize("run", RUNS)
+def test_see_a_second_of_messages(benchmark, viewer, run):
     def see_all():
-        for output, content in MESSAGES:
+        for output, content in RUNS[run]:
             viewer.see(output, content, 0)
 
     benchmark.pedantic(see_all, rounds=20)
-    benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(MESSAGES) * 1e6, 2)
+    benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(RUNS[run]) * 1e6, 2)
 
 
-def test_draw_a_second_of_messages_in_the_caller(benchmark, tmp_path):
+@pytest.mark.parametrize("joined", [True, False], ids=["slices", "packets"])
+@pytest.mark.parametrize("run", RUNS)
+def test_draw_a_second_of_messages_in_the_caller(benchmark, tmp_path, run, joined):
+    """Packets joined to slices, as the viewer does, beside each packet drawn by itself."""
     stream = rr.RecordingStream("bench")
     stream.set_sinks(rr.FileSink(tmp_path / "bench.rrd"))
 
     def draw_all():
         scene = Scene(mount=synthetic.MOUNT, history_s=3.0, slice_s=0.1, max_points=6000, trail_s=20.0)
-        for output, content in MESSAGES:
-            stream.set_time("sensor_time", timestamp=np.datetime64(content.stamp_ns, "ns"))
-            for mark in draw(content, output.replace(".", "/"), scene):
-                stream.log(mark.path, *mark.parts)
+        slicer = Slicer(0.1 if joined else 1e-6)
+        for output, content in RUNS[run]:
+            for name, stamp_ns, ready in slicer.add(output, content):
+                stream.set_time("sensor_time", timestamp=np.datetime64(stamp_ns, "ns"))
+                for mark in draw(ready, name.replace(".", "/"), scene):
+                    stream.log(mark.path, *mark.parts)
 
     benchmark.pedantic(draw_all, rounds=2)
-    benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(MESSAGES) * 1e6, 2)
+    benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(RUNS[run]) * 1e6, 2)
 
 
 def test_thin_a_slice(benchmark):

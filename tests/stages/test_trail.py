@@ -7,7 +7,7 @@ import pytest
 
 from stages.geometry import rotation_from_rpy_deg, rotation_z
 from stages.messages import VehicleMotion
-from stages.trail import FURTHEST_NS, KEPT, VehicleTrail
+from stages.trail import FURTHEST_NS, KEPT, STEP_NS, VehicleTrail
 from tests.stages.made import MS, START_NS
 
 
@@ -67,7 +67,9 @@ def test_before_the_oldest_pose_it_stood_there():
 
 
 def test_a_pose_that_is_not_newer_is_ignored():
-    made = trail(motion(0, (0, 0, 0)), motion(10 * MS, (1, 0, 0)), motion(10 * MS, (9, 9, 9)), motion(5 * MS, (9, 9, 9)))
+    made = trail(
+        motion(0, (0, 0, 0)), motion(10 * MS, (1, 0, 0)), motion(10 * MS, (9, 9, 9)), motion(5 * MS, (9, 9, 9))
+    )
     np.testing.assert_allclose(made.at(START_NS + 10 * MS)[1], (1, 0, 0))
 
 
@@ -75,3 +77,28 @@ def test_memory_is_bounded():
     made = trail(*(motion(i * MS, (i, 0, 0)) for i in range(3 * KEPT)))
     assert len(made._poses) == KEPT
     np.testing.assert_allclose(made.at(START_NS + (3 * KEPT - 2) * MS)[1], (3 * KEPT - 2, 0, 0))
+
+
+def test_the_vehicles_velocity_is_how_its_places_follow_one_another():
+    made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (0.5, 0, 0)), motion(200 * MS, (0.5, 0.8, 0)))
+    np.testing.assert_allclose(made.velocity_mps(START_NS + 40 * MS), (5, 0, 0), atol=1e-6)
+    np.testing.assert_allclose(made.velocity_mps(START_NS + 140 * MS), (0, 8, 0), atol=1e-6)
+    np.testing.assert_array_equal(trail().velocity_mps(START_NS), np.zeros(3))
+
+
+def test_a_place_and_velocity_are_seen_from_the_vehicle_with_its_own_driving_and_turning():
+    """Relative velocity: R^T (v - v_vehicle) - w x p, here w about z and p ahead."""
+    rate_radps, drives = 0.5, np.array([4.0, 0.0, 0.0])
+    made = trail(*(motion(k * 10 * MS, k * 0.01 * drives, rotation_z(rate_radps * k * 0.01)) for k in range(100)))
+    now_s, half_step_s = 0.5, STEP_NS / 2e9
+    place, velocity = np.array([12.0, 3.0, 8.0]), np.array([1.0, -2.0, 0.5])
+    seen_m, seen_mps = made.to_vehicle(START_NS + round(now_s * 1e9), place, velocity)
+    np.testing.assert_allclose(seen_m, rotation_z(rate_radps * now_s).T @ (place - now_s * drives), atol=1e-6)
+    middle_s = now_s + half_step_s  # of the step over which the velocity is taken
+    R = rotation_z(rate_radps * middle_s)
+    middle_m = R.T @ (place + half_step_s * velocity - middle_s * drives)
+    expected_mps = R.T @ (velocity - drives) - np.cross([0, 0, rate_radps], middle_m)
+    np.testing.assert_allclose(seen_mps, expected_mps, atol=1e-3)
+    back_m, back_mps = made.to_local(START_NS + round(now_s * 1e9), seen_m, seen_mps)
+    np.testing.assert_allclose(back_m, place, atol=1e-6)
+    np.testing.assert_allclose(back_mps, velocity, atol=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 
@@ -10,15 +11,19 @@ import numpy as np
 from flow.message import Message
 from stages.geometry import LidarMount, Pose, rotation_z
 from stages.messages import (
+    Candidates,
     DepthImage,
     Detections,
     DroneFix,
     LidarFirings,
     ScoreImage,
+    ServoGoal,
     ServoState,
     SweptPoints,
+    SweptPulses,
     TrackingState,
     TrackState,
+    VehicleMotion,
 )
 
 START_NS = 1_760_000_000_000_000_000
@@ -192,8 +197,132 @@ def run(duration_s: float) -> Iterator[tuple[str, Message]]:
             yield "track.track_state", state
 
 
+def pulses(firings: LidarFirings) -> SweptPulses:
+    """The same pulses placed, pointing wherever."""
+    return SweptPulses(
+        stamp_ns=firings.stamp_ns,
+        point_stamp_ns=firings.pulse_stamp_ns,
+        direction_vehicle=np.tile(np.array([[0.0, 0.0, 1.0]], np.float32), (len(firings.laser), 1)),
+        range_m=firings.range_m,
+        laser=firings.laser,
+        reflectivity=firings.reflectivity,
+        turntable_rad=0.0,
+        origin_vehicle_m=(0.0, 0.0, 0.35),
+    )
+
+
+def candidates(stamp_ns: int, t_s: float) -> Candidates:
+    """The drone, ever surer, and a lamp that is dropped after 1 s."""
+    n = 2 if t_s < 1.0 else 1
+    xyz = np.array([drone_xyz(t_s), [-16.0, -23.0, 8.0]])[:n]
+    return Candidates(
+        stamp_ns=stamp_ns,
+        candidate_id=np.array([3, 5])[:n],
+        xyz_vehicle_m=xyz,
+        velocity_vehicle_mps=np.zeros((n, 3)),
+        probability=np.array([min(0.99, 0.2 + t_s), 0.01])[:n],
+        seen_ns=np.full(n, stamp_ns - 20_000_000),
+        looks=np.full(n, 4),
+        reasons=(
+            "9 looks; 8 of 8 sectors around it free",
+            "beside something big; if not a drone, a lamp, wire or edge",
+        )[:n],
+    )
+
+
+def judged(stamp_ns: int, t_s: float) -> Detections:
+    """The drone accepted, the lamp refused, by evidence."""
+    return Detections(
+        stamp_ns=stamp_ns,
+        xyz_vehicle_m=np.array([drone_xyz(t_s), [-16.0, -23.0, 8.0]]),
+        score=np.array([4.8, -4.6]),
+        e_inner=np.zeros(2),
+        e_outer=np.zeros(2),
+        accepted=np.array([True, False]),
+        reasons=("9 looks", "beside something big; if not a drone, a lamp, wire or edge"),
+        verdict="drone at (6.8, 3.1, 12.3) m, 99.2 %: 9 looks",
+        start_ns=START_NS,
+        seen_ns=np.full(2, stamp_ns),
+        velocity_vehicle_mps=np.zeros((2, 3)),
+        probability=np.array([0.992, 0.01]),
+        candidate_id=np.array([3, 5]),
+    )
+
+
+def tracks(stamp_ns: int, t_s: float, second_lost_s: float) -> Iterator[tuple[str, Message]]:
+    """Drone 1 is tracked and coasts from 1.5 s on; drone 2, 6 m beside it, is lost at `second_lost_s`."""
+    velocity = np.array([0.8, 1.2, 0.3])
+    coasting_s = max(t_s - 1.5, 0.0)
+    for number, xyz in ((1, drone_xyz(t_s)), (2, np.add(drone_xyz(t_s), [0.0, 6.0, 0.0]))):
+        lost = number == 2 and t_s >= second_lost_s
+        coasts = number == 1 and coasting_s > 0
+        if not lost and not coasts:
+            yield (
+                "track.drone_fix",
+                DroneFix(
+                    stamp_ns=stamp_ns,
+                    xyz_vehicle_m=xyz,
+                    covariance_m2=np.diag([0.05, 0.06, 0.09]) ** 2,
+                    hits=3,
+                    iterations=1,
+                    shift_m=0.0,
+                    track_id=number,
+                    velocity_vehicle_mps=velocity,
+                ),
+            )
+        yield (
+            "track.track_state",
+            TrackState(
+                stamp_ns=stamp_ns,
+                state=TrackingState.LOST if lost else TrackingState.COASTING if coasts else TrackingState.TRACKING,
+                reason=f"not hit for {coasting_s:.1f} s" if coasts else "3 hits, 12 pulses beside it",
+                hits=0 if lost or coasts else 3,
+                frame_s=0.1,
+                track_id=number,
+                xyz_vehicle_m=None if lost else xyz,
+                velocity_vehicle_mps=None if lost else velocity,
+                covariance_m2=None if lost else np.eye(3) * (0.1 + coasting_s) ** 2,
+            ),
+        )
+
+
+def run_by_evidence(duration_s: float) -> Iterator[tuple[str, Message]]:
+    """(output, message) of a run of the evidence detector and the hit-and-miss tracker, two drones, in time order."""
+    answered = False
+    for k in range(int(duration_s / PACKET_S)):
+        t_s = k * PACKET_S
+        stamp_ns = START_NS + int(t_s * 1e9)
+        if k % 4 == 0:
+            angle = servo_rad(t_s)
+            state = ServoState(stamp_ns=stamp_ns, position_rad=angle, velocity_radps=1.2, goal_rad=2.0, error=0)
+            yield "servo.servo_state", state
+        firings, swept = packet(t_s)
+        yield "lidar.lidar_firings", firings
+        yield "sweep.swept_points", swept
+        yield "sweep.swept_pulses", pulses(firings)
+        if k % 75 == 0:
+            yield (
+                "aim.servo_goal",
+                ServoGoal(stamp_ns=stamp_ns, position_rad=1.0 + 0.1 * (k // 75 % 3), speed_radps=5.0),
+            )
+            still = VehicleMotion(
+                stamp_ns=stamp_ns, xyz_start_m=np.zeros(3), R_start_vehicle=np.eye(3), covariance=None
+            )
+            yield "odometry.vehicle_motion", still
+            yield "detect.candidates", candidates(stamp_ns, t_s)
+            if t_s > 0.75 and not answered:
+                answered = True
+                yield "detect.detections", judged(stamp_ns, t_s)
+            if answered:
+                yield from tracks(stamp_ns, t_s, second_lost_s=1.8)
+            else:
+                maybe = next(state for _, state in tracks(stamp_ns, t_s, 0.0) if isinstance(state, TrackState))
+                yield "track.track_state", dataclasses.replace(maybe, state=TrackingState.CANDIDATE, track_id=0)
+
+
 MERMAID = """flowchart LR
   lidar --> sweep
   servo --> sweep
   sweep --> detect --> track"""
+EVIDENCE_MERMAID = MERMAID + "\n    detect -- candidates --> track\n"
 SETTINGS = "stages:\n  track:\n    use: stages.track.Track\n    config: {radius_m: 1.0}\n"

@@ -146,8 +146,8 @@ def test_every_edge_of_a_run_is_in_the_file_on_the_sensors_time(tmp_path):
         "/score/detect/score_image",
         "/vehicle/detect/detections/accepted",
         "/marks/detect/detections/accepted",
-        "/vehicle/track/drone_fix/ellipsoid_95",
-        "/plots/hits/track/track_state",
+        "/vehicle/track/drone_fix/drone_1/ellipsoid_95",
+        "/plots/hits/track/track_state/drone_1",
         "/states/track",
         "/about/graph",
         "/about/settings",
@@ -197,7 +197,7 @@ def test_a_message_that_cannot_be_drawn_is_counted_and_the_next_one_is(tmp_path)
     ((text, count),) = viewer.errors.items()
     assert text.startswith("track.drone_fix could not be drawn: LinAlgError")
     assert count == 1
-    assert rows(tmp_path / "run.rrd")["/vehicle/track/drone_fix/ellipsoid_95"] == 1
+    assert rows(tmp_path / "run.rrd")["/vehicle/track/drone_fix/drone_1/ellipsoid_95"] == 1
 
 
 def test_a_folder_that_cannot_be_written_is_an_error_of_the_viewer_not_of_the_run(tmp_path):
@@ -316,7 +316,11 @@ def test_a_taken_port_is_said_and_the_file_is_written_all_the_same(tmp_path):
     assert rows(tmp_path / "run.rrd")["/plots/other/clock/tick/count"] == 1
 
 
-def test_without_file_and_server_nothing_is_kept_and_nothing_fails(tmp_path):
+def test_without_file_and_server_nothing_is_drawn_and_nothing_fails(tmp_path, monkeypatch):
+    def never(*_: object):
+        raise ValueError
+
+    monkeypatch.setattr("links.viewer.viewer.draw", never)
     viewer = Viewer(file=None)
     viewer.open(a_run(tmp_path))
     viewer.see("clock.tick", ticks(1)[0], 0)

@@ -8,27 +8,14 @@ import enum
 import numpy as np
 import pytest
 import synthetic
+from shown import drawn, numbers, page, scene
 
 from flow.message import Mat3, Message, Points64, message
 from links.viewer import colours, images
-from links.viewer.draw import draw
 from links.viewer.ellipsoid import ellipsoid
-from links.viewer.scene import Scene, opening, scenery, turntable_transform
+from links.viewer.scene import opening, scenery, turntable_transform
 from stages.geometry import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
 from stages.messages import DepthImage, Detections, DroneFix, ScoreImage, ServoState, TrackingState, TrackState
-
-
-def scene(**changes) -> Scene:
-    settings = {"mount": synthetic.MOUNT, "history_s": 3.0, "slice_s": 0.1, "max_points": 6000, "trail_s": 20.0}
-    return Scene(**(settings | changes))
-
-
-def drawn(content, name: str, where: Scene | None = None) -> dict:
-    return {mark.path: mark for mark in draw(content, name, where or scene())}
-
-
-def numbers(batch) -> np.ndarray:
-    return np.array(batch.as_arrow_array().to_pylist(), dtype=float)
 
 
 def fix(stamp_ns: int = 0, xyz=(3.0, 4.0, 12.0), covariance=None) -> DroneFix:
@@ -85,15 +72,22 @@ def test_a_quaternion_turns_as_its_matrix_does(rpy_deg):
 
 def test_a_fix_is_an_ellipsoid_in_the_vehicle_frame_with_trail_and_curves():
     marks = drawn(fix(), "track/drone_fix")
-    mark = marks["vehicle/track/drone_fix/ellipsoid_95"]
+    mark = marks["vehicle/track/drone_fix/drone_1/ellipsoid_95"]
     assert mark.frame == "vehicle"
     np.testing.assert_allclose(numbers(mark.parts[0].centers), [[3.0, 4.0, 12.0]])
     np.testing.assert_allclose(sorted(numbers(mark.parts[0].half_sizes)[0]), [0.27955, 0.5591, 0.83865], atol=1e-4)
-    np.testing.assert_allclose(numbers(marks["plots/position/track/drone_fix"].parts[0].scalars), [3.0, 4.0, 12.0])
-    np.testing.assert_allclose(numbers(marks["plots/sigma/track/drone_fix"].parts[0].scalars), [0.1, 0.2, 0.3])
-    assert {"vehicle/track/drone_fix/trail", "labels/track/drone_fix", "frames/drone_position", "now"} <= set(marks)
-    label = marks["labels/track/drone_fix"].parts[0].labels.as_arrow_array().to_pylist()
-    assert label == ["drone 13.0 m, 5 hits"]
+    np.testing.assert_allclose(
+        numbers(marks["plots/position/track/drone_fix/drone_1"].parts[0].scalars), [3.0, 4.0, 12.0]
+    )
+    np.testing.assert_allclose(numbers(marks["plots/sigma/track/drone_fix/drone_1"].parts[0].scalars), [0.1, 0.2, 0.3])
+    assert {
+        "vehicle/track/drone_fix/drone_1/trail",
+        "labels/track/drone_fix/drone_1",
+        "frames/drone_position",
+        "now",
+    } <= set(marks)
+    label = marks["labels/track/drone_fix/drone_1"].parts[0].labels.as_arrow_array().to_pylist()
+    assert label == ["drone 1: 13.0 m, 5 hits"]
 
 
 def test_a_trail_is_broken_by_a_pause_and_forgets_what_is_old():
@@ -128,8 +122,13 @@ def test_candidates_are_marked_where_they_lie_in_the_depth_image():
     np.testing.assert_allclose(numbers(marks["marks/detect/detections/accepted"].parts[0].centers), [[32.0, 19.0]])
     np.testing.assert_allclose(numbers(marks["marks/detect/detections/refused"].parts[0].centers), [[32.0, 22.0]])
     refused = marks["vehicle/detect/detections/refused"].parts[0]
-    assert refused.labels.as_arrow_array().to_pylist() == ["candidate 2: touches a wall", "candidate 3: below"]
+    assert refused.labels.as_arrow_array().to_pylist() == [
+        "candidate 2, e = 2.0: touches a wall",
+        "candidate 3, e = 3.0: below",
+    ]
     assert numbers(refused.positions).shape == (2, 3)
+    assert marks["labels/detect/detections"].parts[0].labels.as_arrow_array().to_pylist() == ["candidate 1"]
+    assert "- 2: e = 2.0, refused at 1.0 / 1.0 / 5.2 m: touches a wall" in page(marks["candidates"])
     assert marks["log/detect/detections"].parts[0].text.as_arrow_array().to_pylist() == ["drone at 10.4 m"]
 
 

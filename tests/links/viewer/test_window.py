@@ -15,10 +15,11 @@ from flow.link import LinkError, Run
 from links.viewer import Viewer, ViewerMissing, screenshot, show
 
 
-def record(folder: Path, seconds: float, *, only: str = "", mount=synthetic.MOUNT) -> Path:
+def record(folder: Path, seconds: float, *, only: str = "", mount=synthetic.MOUNT, evidence: bool = False) -> Path:
     viewer = Viewer(lossless=True, mount=mount)
-    viewer.open(Run(out_dir=folder, name="test", mermaid=synthetic.MERMAID, settings_yaml=synthetic.SETTINGS))
-    for output, content in synthetic.run(seconds):
+    mermaid = synthetic.EVIDENCE_MERMAID if evidence else synthetic.MERMAID
+    viewer.open(Run(out_dir=folder, name="test", mermaid=mermaid, settings_yaml=synthetic.SETTINGS))
+    for output, content in (synthetic.run_by_evidence if evidence else synthetic.run)(seconds):
         if output.startswith(only):
             viewer.see(output, content, 0)
     viewer.close()
@@ -44,6 +45,12 @@ def test_a_run_is_shown_without_a_complaint_of_any_view(tmp_path):
     assert complaints(record(tmp_path, 3.0), png) == []
     assert size_of(png) == (960, 540)
     assert png.stat().st_size > 150_000  # a layout without data has a third of it
+
+
+def test_a_run_by_evidence_with_two_drones_one_of_them_lost_is_shown_too(tmp_path):
+    png = tmp_path / "run.png"
+    assert complaints(record(tmp_path, 2.2, evidence=True), png) == []
+    assert png.stat().st_size > 100_000
 
 
 def test_a_run_of_the_lidar_alone_without_mount_is_shown_too(tmp_path):

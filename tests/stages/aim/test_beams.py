@@ -79,7 +79,9 @@ def test_any_place_at_all_is_met_by_some_beam_within_half_a_turn_except_right_on
     for off_deg, azimuth_deg in [(1.05, 10.0), (1.05, 100.0), (3.0, 200.0), (20.0, 300.0), (89.0, 45.0)]:
         off, azimuth = math.radians(off_deg), math.radians(azimuth_deg)
         level = math.sin(off)
-        p = np.array([0, 0, 0.1]) + 30.0 * np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.cos(off)])
+        p = np.array([0, 0, 0.1]) + 30.0 * np.array(
+            [level * math.cos(azimuth), level * math.sin(azimuth), math.cos(off)]
+        )
         found = [
             servo_rad
             for elevation in ELEVATION_RAD
@@ -131,7 +133,9 @@ def test_the_sequence_of_offsets_fills_its_range_evenly_from_the_first_on():
 def largest_gap(step_rad, turns=50):
     """Between directions looked at, of those that the whole fan has passed over, in beam spacings."""
     directions = np.sort((np.arange(turns)[:, np.newaxis] * step_rad + ELEVATION_RAD).ravel())
-    inside = directions[(directions > ELEVATION_RAD.max()) & (directions < (turns - 1) * step_rad + ELEVATION_RAD.min())]
+    inside = directions[
+        (directions > ELEVATION_RAD.max()) & (directions < (turns - 1) * step_rad + ELEVATION_RAD.min())
+    ]
     return float(np.diff(inside).max()) / math.radians(2.0)
 
 

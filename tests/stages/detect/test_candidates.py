@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from stages.depth_image import focal_length_px
 from stages.detect import candidates
 from stages.detect.candidates import Gates, Pixel, company_pixels, local_minima, middle_m, own_pixels, refusal, width_px
-from stages.depth_image import focal_length_px
 from stages.detect.kernel_score import score_image
 from tests.stages.made import depth_image, point_of, street_depth
 

@@ -187,7 +187,11 @@ def fine(ranges, direction):
 
 
 def test_a_sweep_over_a_ball_and_a_house_gives_short_free_chords_for_the_one_and_long_ones_for_the_other():
-    ball, house, wire = Ball(flying((1.0, 8.0, 9.0), (0.3, 0.0, 0.0)), 0.25), Box((-6, -9, 0), (-3, -6, 12)), Wire((-9, 4, 8), (9, 4, 8), 0.02)
+    ball, house, wire = (
+        Ball(flying((1.0, 8.0, 9.0), (0.3, 0.0, 0.0)), 0.25),
+        Box((-6, -9, 0), (-3, -6, 12)),
+        Wire((-9, 4, 8), (9, 4, 8), 0.02),
+    )
     find = finder()
     rows = np.concatenate([find.feed(part).rows for part in pulses_seen([ball, house, wire], sweeping(), 1.5)])
     of_ball = rows[np.linalg.norm(rows[:, :3] - (1.2, 8.0, 9.0), axis=1) < 0.6]

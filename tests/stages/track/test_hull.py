@@ -7,7 +7,22 @@ import math
 import numpy as np
 import pytest
 
-from stages.track.hull import A, B, CELLS, COLUMNS, DEPTH, HIT, KIND, MISS, NEARER, STRAY, WHEN_S, basis, collect, posterior
+from stages.track.hull import (
+    CELLS,
+    COLUMNS,
+    DEPTH,
+    HIT,
+    KIND,
+    MISS,
+    NEARER,
+    STRAY,
+    WHEN_S,
+    A,
+    B,
+    basis,
+    collect,
+    posterior,
+)
 
 S_M = 0.1
 P_0 = 0.8
@@ -49,7 +64,9 @@ def brute_force(pulses, prior, half_m=1.2, cells=481, misses=True):
     total = w.sum()
     mean = np.array([(w * a).sum(), (w * b).sum()]) / total
     da, db = a - mean[0], b - mean[1]
-    covariance = np.array([[(w * da * da).sum(), (w * da * db).sum()], [(w * da * db).sum(), (w * db * db).sum()]]) / total
+    covariance = (
+        np.array([[(w * da * da).sum(), (w * da * db).sum()], [(w * da * db).sum(), (w * db * db).sum()]]) / total
+    )
     cell = (axis[1] - axis[0]) ** 2
     density = total * cell / (2 * math.pi * math.sqrt(np.linalg.det(prior)))
     return mean, covariance, log.max() + math.log(density) - nothing
@@ -59,12 +76,16 @@ LOOKS = {
     "one hit": look(hits=[(0.1, 0.05)]),
     "a stroke with its ends": look(hits=[(-0.05, 0.1), (0.02, 0.1), (0.09, 0.1)], misses=[(-0.12, 0.1), (0.16, 0.1)]),
     "misses only": look(misses=[(0.0, 0.0), (0.05, 0.0), (-0.05, 0.02)]),
-    "two beams": look(hits=[(0.0, -0.1), (0.07, -0.1), (0.03, 0.12)], misses=[(0.1, 0.12), (-0.08, 0.12), (0.14, -0.1)]),
+    "two beams": look(
+        hits=[(0.0, -0.1), (0.07, -0.1), (0.03, 0.12)], misses=[(0.1, 0.12), (-0.08, 0.12), (0.14, -0.1)]
+    ),
 }
 
 
 @pytest.mark.parametrize("name", LOOKS)
-@pytest.mark.parametrize("prior", [np.eye(2) * 0.15**2, np.array([[0.04, 0.012], [0.012, 0.01]])], ids=["round", "long"])
+@pytest.mark.parametrize(
+    "prior", [np.eye(2) * 0.15**2, np.array([[0.04, 0.012], [0.012, 0.01]])], ids=["round", "long"]
+)
 def test_mean_covariance_and_evidence_are_those_of_a_finer_grid(name, prior):
     mean, covariance, evidence, _ = solve(LOOKS[name], prior=prior)
     fine_mean, fine_covariance, fine_evidence = brute_force(LOOKS[name], prior)
@@ -132,7 +153,7 @@ def test_the_two_ways_across_a_line_of_sight_are_level_and_square(line):
 
 
 ORIGIN = np.array([0.0, 0.0, 0.35])
-CENTRE = ORIGIN + (0.0, 15.0, 0.0)
+CENTRE = np.add(ORIGIN, [0.0, 15.0, 0.0])
 LINE = np.array([0.0, 1.0, 0.0])
 NO_MOTION = np.zeros(3)
 
@@ -146,7 +167,17 @@ def collected(places, ranges, stamps_ns=None, velocity=NO_MOTION, reach_m=1.0, d
     found = np.full((room, COLUMNS), np.nan)
     direction = (away / length[:, np.newaxis]).astype(np.float32)
     n = collect(
-        stamps, direction, np.array(ranges, dtype=np.float32), ORIGIN, CENTRE, velocity, 0, reach_m, depth_m, LINE, found
+        stamps,
+        direction,
+        np.array(ranges, dtype=np.float32),
+        ORIGIN,
+        CENTRE,
+        velocity,
+        0,
+        reach_m,
+        depth_m,
+        LINE,
+        found,
     )
     return found[:n]
 
@@ -154,7 +185,7 @@ def collected(places, ranges, stamps_ns=None, velocity=NO_MOTION, reach_m=1.0, d
 def test_each_pulse_is_measured_across_and_along_the_line_of_sight():
     ax, ay, *_ = basis(*LINE)
     level = np.array([ax, ay, 0.0])
-    places = [CENTRE + 0.3 * level, CENTRE + (0, 0, 0.2), CENTRE + (0, 0.1, 0), CENTRE + 0.4 * level]
+    places = [CENTRE + 0.3 * level, np.add(CENTRE, [0, 0, 0.2]), np.add(CENTRE, [0, 0.1, 0]), CENTRE + 0.4 * level]
     found = collected(places, [None, None, None, 0.0])
     np.testing.assert_allclose(found[:, A], [0.3, 0, 0, 0.4], atol=1e-5)
     np.testing.assert_allclose(found[:, B], [0, 0.2, 0, 0], atol=1e-5)
@@ -162,13 +193,17 @@ def test_each_pulse_is_measured_across_and_along_the_line_of_sight():
     assert found[:, KIND].tolist() == [HIT, HIT, HIT, MISS]
 
 
-@pytest.mark.parametrize(("range_m", "kind"), [(0.0, MISS), (30.0, MISS), (15.5, HIT), (14.5, HIT), (15.7, MISS), (14.3, NEARER)])
+@pytest.mark.parametrize(
+    ("range_m", "kind"), [(0.0, MISS), (30.0, MISS), (15.5, HIT), (14.5, HIT), (15.7, MISS), (14.3, NEARER)]
+)
 def test_a_return_counts_by_how_deep_it_lies(range_m, kind):
     assert collected([CENTRE], [range_m])[0, KIND] == kind
 
 
 def test_pulses_beyond_reach_or_the_other_way_are_left_out_and_room_is_kept():
-    assert len(collected([CENTRE + (1.1, 0, 0), 2 * ORIGIN - CENTRE, CENTRE + (0, 0, -0.9)], [0.0] * 3)) == 1
+    assert (
+        len(collected([np.add(CENTRE, [1.1, 0, 0]), 2 * ORIGIN - CENTRE, np.add(CENTRE, [0, 0, -0.9])], [0.0] * 3)) == 1
+    )
     assert len(collected([CENTRE] * 10, [0.0] * 10, room=4)) == 4
 
 

@@ -286,15 +286,14 @@ class BeamAim(Stage):
             pass_ns = now.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, place, theta), ready_ns)
         assert best is not None
         self._now.targets[target.key].looks += 1
-        now.hold_until_ns = pass_ns + round((0.004 - self.lead_s) * 1e9)  # the next goal takes the lead to be obeyed
-        now.hold_until_ns = max(now.hold_until_ns, servo.stamp_ns + 5_000_000)
+        now.hold_until_ns = max(pass_ns + 4_000_000, servo.stamp_ns + 5_000_000)
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=best[0], speed_radps=speed)
 
     def _offset_m(self, target: _Target, range_m: float, now_ns: int) -> float:
         """How far beside the place the beam goes, look by look."""
         k = target.looks
         if target.sure:
-            wide = 0.06 * self.span_m + 0.35 * target.sigma_m
+            wide = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * self.span_m + 0.35 * target.sigma_m
             silent_s = (now_ns - target.heard_ns) * 1e-9
             if silent_s > 0.3:
                 wide = max(wide, math.radians(1.0) * range_m)

@@ -1,4 +1,4 @@
-"""Chords: how one beam crosses a thing. Each laser's returns, pulse after pulse, become runs with a beginning and an end.
+"""Chords: how one beam crosses a thing. Each laser's returns, pulse after pulse, become runs with two ends.
 
 A laser looks every 0.2 deg along its cone. Returns in a row at much the same range are one chord; it ends where the
 pulses go on and return nothing or something farther (it is free there), or something nearer (who knows). A drone gives

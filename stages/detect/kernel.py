@@ -2,8 +2,9 @@
 
     t_hat_0 = unproject(argmin_c e(c))                                                      Equation (1)
 
-over all pixels with depth, e from `stages/detect/kernel_score.py`. The paper stops there and so always has a drone; here the
-local minima are walked from the lowest score up and each is accepted or refused, in words (`stages/detect/candidates.py`).
+over all pixels with depth, e from `stages/detect/kernel_score.py`. The paper stops there and so always has a drone;
+here the local minima are walked from the lowest score up and each is accepted or refused, in words
+(`stages/detect/candidates.py`).
 `gates: null` is the paper literally: the lowest score is the drone.
 
 Source: P III.B, Equations 1-5; the gates are ours.

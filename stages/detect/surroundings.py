@@ -1,4 +1,4 @@
-"""What was measured around a place: sectors that pulses flew through, sectors in which something stands, and big things.
+"""What was measured around a place: sectors pulses flew through, sectors in which something stands, big things.
 
 Around a place at range R, in the plane across the line of sight:
 
@@ -153,5 +153,5 @@ class BigThings:
         remember(points_m, self._cell_m, stamp_ns, self._key, self._when)
 
     def nearest_m(self, centre_m: Array64, least_m: float, most_m: float, since_ns: int) -> float:
-        """How near the nearest one is, of those seen since; inf beyond most_m. What is nearer than least_m is the thing itself."""
+        """How near the nearest one seen since then is; inf beyond most_m. Nearer than least_m is the thing itself."""
         return float(nearest_remembered(centre_m, self._cell_m, least_m, most_m, since_ns, self._key, self._when))

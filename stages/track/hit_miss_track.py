@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -34,25 +34,11 @@ from stages.messages import (
     TrackState,
     VehicleMotion,
 )
-from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, WHEN_S, WIDTH, A, B, basis, collect, posterior
-from stages.track.kalman import condition, measured, predicted
+from stages.track.kalman import predicted
+from stages.track.look import Look, collect_into, evaluate, largest_sigma_m
 from stages.trail import VehicleTrail
 
 LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
-SCAN_COS = math.cos(math.radians(24.0))  # a slice covers 15 deg to each side of its middle and 5 deg along
-
-
-@dataclass(slots=True, eq=False)
-class _Look:
-    """Pulses of one passing of the rotor."""
-
-    start_ns: int
-    last_ns: int
-    x: Array64  # predicted state and covariance at start_ns
-    P: Array64
-    line: Array64  # unit line of sight, local frame
-    range_m: float
-    parts: list[Array64] = field(default_factory=lambda: list[Array64]())
 
 
 @dataclass(slots=True, eq=False)
@@ -69,8 +55,7 @@ class _Track:
     odds: float = 0.0
     confirmed: bool = False
     hits: int = 0  # of the newest look
-    looks: int = 0
-    look: _Look | None = None
+    look: Look | None = None
     told_ns: int = 0
     told: TrackingState | None = None
     reason: str = ""
@@ -162,7 +147,9 @@ class HitMissTrack(Stage):
             if look is not None and pulses.stamp_ns - look.last_ns > LOOK_OVER_NS:
                 track.look = None
                 yield from self._close(track, look)
-            self._collect(track, pulses, R, t, axis)
+            before = track.look
+            state = track.at(pulses.stamp_ns, self.manoeuvre) if before is None else (before.x, before.P)
+            track.look = collect_into(before, pulses, R, t, axis, *state, self.span_m, self.de_skew)
             if track in self._tracks:
                 yield from self._watch(track, now_ns)
         if not self._tracks and now_ns - self._idle_ns > 500_000_000:
@@ -185,7 +172,7 @@ class HitMissTrack(Stage):
     def _doubtful(self, track: _Track, now_ns: int) -> bool:
         """So long without a hit that what is found there may as well be something else."""
         _, P = track.at(now_ns, self.manoeuvre)
-        return math.sqrt(float(np.linalg.eigvalsh(P[:3, :3])[-1])) > self.own_sigma_m
+        return largest_sigma_m(P) > self.own_sigma_m
 
     def _move(self, track: _Track, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> None:
         """The detector found it again."""
@@ -258,82 +245,23 @@ class HitMissTrack(Stage):
 
     # one look
 
-    def _collect(self, track: _Track, pulses: SweptPulses, R: Array64, t: Array64, axis: Array64) -> None:
-        look = track.look
-        start_ns = pulses.stamp_ns if look is None else look.start_ns
-        x, P = track.at(start_ns, self.manoeuvre) if look is None else (look.x, look.P)
-        origin = np.array(pulses.origin_vehicle_m)
-        away = R.T @ (x[:3] - t) - origin
-        range_m = float(np.linalg.norm(away))
-        if range_m < 0.5 or away @ axis < range_m * float(np.linalg.norm(axis)) * SCAN_COS:
+    def _close(self, track: _Track, look: Look) -> Iterator[DroneFix | TrackState]:
+        seen = evaluate(look, self.span_m, self.hull_offset_m, track.p_0, self.misses, self.own_sigma_m)
+        track.hits = 0 if seen is None else seen.hits
+        if seen is None:
             return
-        sigma = math.sqrt(float(np.linalg.eigvalsh(P[:3, :3])[-1]))
-        reach_m = min(0.6 * self.span_m + 3.0 * sigma, 6.0)
-        line = away / range_m if look is None else R.T @ look.line
-        found = np.empty((pulses.range_m.size, COLUMNS))
-        velocity = R.T @ x[3:] if self.de_skew else np.zeros(3)
-        count = collect(
-            pulses.point_stamp_ns,
-            pulses.direction_vehicle,
-            pulses.range_m,
-            origin,
-            away + origin,
-            velocity,
-            start_ns,
-            reach_m,
-            0.5 + 3.0 * sigma,
-            line,
-            found,
-        )
-        if count == 0:
+        track.x, track.P, track.stamp_ns = seen.x, seen.P, look.start_ns
+        track.odds = min(max(track.odds + seen.evidence, -8.0), 8.0)
+        if seen.hits == 0:
             return
-        if look is None:
-            look = track.look = _Look(start_ns, start_ns, x, P, R @ line, range_m)
-        look.parts.append(found[:count])
-        look.last_ns = int(pulses.point_stamp_ns[-1])
-
-    def _close(self, track: _Track, look: _Look) -> Iterator[DroneFix | TrackState]:
-        pulses = np.concatenate(look.parts)
-        sigma = math.sqrt(float(np.linalg.eigvalsh(look.P[:3, :3])[-1]))
-        # what is hit far from where the drone was last seen is for the detector to judge
-        cluster = drone_hits(pulses, self.span_m, sigma) if sigma < self.own_sigma_m else None
-        ax, ay, bx, by, bz = basis(*look.line)
-        H = np.array([[ax, ay, 0.0], [bx, by, bz]])
-        prior = H @ look.P[:3, :3] @ H.T
-        if cluster is None:
-            track.hits = 0
-            if self.misses and sigma < 0.7 * self.span_m and len(pulses) > 1 and (pulses[:, KIND] != HIT).all():
-                mean, S = np.empty(2), np.empty((2, 2))
-                s_m = WIDTH * self.span_m
-                evidence, _ = posterior(pulses, prior, 0.0, 0.0, 3.0 * sigma, track.p_0, s_m, True, mean, S)
-                x, P = condition(look.x, look.P, H, mean, S)
-                track.stamp_ns, track.x, track.P = look.start_ns, x, P
-                track.odds = min(max(track.odds + max(evidence, -1.0), -8.0), 8.0)
-            return
-        used = np.concatenate([pulses[cluster], pulses[pulses[:, KIND] != HIT]])
-        hits = pulses[cluster]
-        middle_a, middle_b = (float(v) for v in hits[:, :2].mean(axis=0))
-        half = max(0.6 * self.span_m, 0.6 * math.hypot(middle_a, middle_b) + 0.3 * self.span_m)
-        mean, S = np.empty(2), np.empty((2, 2))
-        evidence, expected = posterior(
-            used, prior, middle_a, middle_b, half, track.p_0, WIDTH * self.span_m, self.misses, mean, S
-        )
-        x, P = condition(look.x, look.P, H, mean, S)
-        depth = float(np.median(hits[:, DEPTH])) + self.hull_offset_m
-        noise = math.sqrt(0.1**2 / len(hits) + 0.03**2)
-        x, P = measured(x, P, look.line, depth - float(look.line @ (x[:3] - look.x[:3])), noise)
-        # the measured offsets are where the drone was, beside its prediction, at each pulse's own time
-        when_s = float(hits[:, WHEN_S].mean())
-        track.x, track.P, track.stamp_ns = x, P, look.start_ns
-        track.hits, track.looks = len(hits), track.looks + 1
-        track.last_hit_ns = look.start_ns + round(when_s * 1e9)
-        track.odds = min(max(track.odds + min(evidence, 3.0), -8.0), 8.0)
-        if expected > 0.5:
-            track.p_0 += 0.1 * (min(max(track.p_0 * len(hits) / expected, 0.15), 0.95) - track.p_0)
-        track.reason = f"{len(hits)} hits, {int((pulses[:, KIND] != HIT).sum())} pulses beside it"
+        track.last_hit_ns = seen.hit_ns
+        if seen.expected > 0.5:
+            ratio = min(max(track.p_0 * seen.hits / seen.expected, 0.15), 0.95)
+            track.p_0 += 0.1 * (ratio - track.p_0)
+        track.reason = f"{seen.hits} hits, {seen.beside} pulses beside it"
         if track.confirmed:
             yield self._fix(track)
-        yield self._state(track, max(look.last_ns, track.last_hit_ns))
+        yield self._state(track, max(look.last_ns, track.last_hit_ns, track.told_ns))
 
     def _fix(self, track: _Track) -> DroneFix:
         x, P = track.at(track.last_hit_ns, self.manoeuvre)
@@ -354,32 +282,3 @@ class HitMissTrack(Stage):
         """The filter's, and what does not average out: the turntable's angle, and the drone's outline."""
         level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * math.radians(self.pointing_deg)
         return covariance_m2 + np.outer(level, level) + self.shape_m**2 * np.eye(3)
-
-
-def drone_hits(pulses: Array64, span_m: float, sigma_m: float) -> Array64 | None:
-    """Which of a look's pulses (n, COLUMNS) are the drone's returns: rows, or None when none are.
-
-    The densest group of the drone's size, near the prediction rather than far; none when more stands right beside it:
-    then the returns are those of something bigger.
-    """
-    rows = np.nonzero(pulses[:, KIND] == HIT)[0]
-    if len(rows) == 0:
-        return None
-    place = pulses[rows][:, [A, B, DEPTH]]
-    if len(rows) > 256:  # a wall: what is nearest to the prediction will do
-        rows = rows[np.argsort(np.sum(place**2, axis=1), kind="stable")[:256]]
-        place = pulses[rows][:, [A, B, DEPTH]]
-    apart = np.linalg.norm(place[:, None] - place[None], axis=2)
-    near = apart <= 0.5 * span_m
-    score = np.log(near.sum(axis=1)) - 0.5 * np.sum(place**2, axis=1) / (sigma_m**2 + (0.4 * span_m) ** 2)
-    best = int(score.argmax())
-    if score[best] < -8.0:
-        return None
-    group = near[best]
-    centre = place[group].mean(axis=0)
-    away = np.linalg.norm(place - centre, axis=1)
-    group = away <= 0.6 * span_m
-    beside = (away > 0.9 * span_m) & (away < 2.0)
-    if beside.sum() > max(2, int(group.sum())):
-        return None
-    return rows[group]

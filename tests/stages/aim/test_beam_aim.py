@@ -169,7 +169,8 @@ DIRECTIONS = {
 def test_a_beam_is_on_the_drone_turn_after_turn(where):
     way = towards(*DIRECTIONS[where])
     missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tracking(way), start_rad=1.0).missed_m(way)[10:]
-    assert np.mean(missed < 0.2) > 0.85
+    assert np.mean(missed < 0.2) > 0.75  # the rest is beside it on purpose
+    assert missed.max() < 0.35
     on_it = np.nonzero(missed < 0.2)[0]
     assert np.diff([-1, *on_it, len(missed)]).max() <= 4  # never 0.4 s without
     assert np.std(missed) > 0.005  # not always at the same spot of it: a little beside it in turn
@@ -195,12 +196,7 @@ def test_a_calibrated_mount_with_sign_zero_and_harmonics_is_aimed_as_well():
     assert np.mean(missed < 0.2) > 0.85
 
 
-EARLY = pytest.mark.xfail(
-    strict=True, reason="a servo that obeys sooner than lead_s leaves before the rotor has passed"
-)
-
-
-@pytest.mark.parametrize("latency_s", [pytest.param(0.0, marks=EARLY), LATENCY_S, 0.045])
+@pytest.mark.parametrize("latency_s", [0.0, LATENCY_S, 0.045])
 @pytest.mark.parametrize("velocity", [(8.0, 0.0, 0.0), (0.0, -6.0, 3.0)])
 def test_a_fast_drone_is_led_however_soon_the_servo_obeys(velocity, latency_s):
     way = flying(np.array([-8.0, 12.0, 12.0]), velocity)

@@ -12,8 +12,8 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
 from stages.track import HitMissTrack
-from stages.track.hit_miss_track import drone_hits
 from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, A, B
+from stages.track.look import drone_hits
 from tests.stages.caster import Box, Drone, During, Way, dithering, flying, pulses_seen, still
 from tests.stages.made import START_NS
 

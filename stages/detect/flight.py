@@ -1,0 +1,113 @@
+"""How a candidate flies, from its sightings: speed, turn, whether it moves at all, and for how long as no bird does.
+
+Source: ours. Birds: Alerstam et al., PLoS Biology 5 (2007) e197 (7 to 14 m/s); one that wheels is slow for a moment.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from typing import NamedTuple
+
+import numpy as np
+
+from stages.geometry import Array64
+
+BIRD_TURN_S = 1.4  # of speed over acceleration: a turn in 9 s
+CALM_MPS = 6.5  # slower, with what a turn would add, no bird stays
+SLOW_MPS = 2.0
+STEADY_MPS2 = 2.0
+RECENT_NS = 1_200_000_000
+PAUSE_S = 0.45  # without a sighting
+
+
+class Motion(NamedTuple):
+    """How a candidate flew lately."""
+
+    speed_mps: float
+    speed_sigma_mps: float  # an axis
+    acceleration_mps2: float
+    acceleration_sigma_mps2: float  # an axis
+    spread_m: float  # of its sightings about the parabola
+
+    @property
+    def top_sigma_mps(self) -> float:
+        """One sigma of `top_mps`."""
+        return math.hypot(self.speed_sigma_mps, BIRD_TURN_S * self.acceleration_sigma_mps2)
+
+    @property
+    def top_mps(self) -> float:
+        """How fast it will be: a bird that wheels is slow for a moment only, and turns hard then."""
+        return math.hypot(self.speed_mps, BIRD_TURN_S * self.acceleration_mps2)
+
+    @property
+    def calm(self) -> bool:
+        """Whether no bird flies so: slowly, and not as just before or after a turn."""
+        slow = self.speed_mps + 1.5 * self.speed_sigma_mps < SLOW_MPS
+        return slow or self.top_mps + self.top_sigma_mps < CALM_MPS
+
+    @property
+    def steady(self) -> bool:
+        """Whether it clearly flies straight on."""
+        return self.acceleration_mps2 + self.acceleration_sigma_mps2 < STEADY_MPS2
+
+
+def scatter_m(range_m: float) -> float:
+    """How far sightings of a drone lie about its middle, one sigma: more where beams are farther apart."""
+    return 0.10 + 0.0025 * range_m
+
+
+def fit_motion(path_ns: list[int], path_m: list[Array64], range_m: float) -> Motion | None:
+    """A parabola x + v t + a t^2 / 2 through the sightings of the last 1.2 s; None with too few.
+
+    Least squares with a prior of 8 m/s and 6 m/s^2, so that a short path says little and not nonsense.
+    """
+    first = bisect_left(path_ns, path_ns[-1] - RECENT_NS)
+    t = (np.array(path_ns[first:]) - path_ns[-1]) * 1e-9
+    if len(t) < 3 or t[0] > -0.15:
+        return None
+    x = np.array(path_m[first:])
+    A = np.column_stack([np.ones(len(t)), t, t * t / 2])
+    sigma = scatter_m(range_m)
+    information = A.T @ A / sigma**2 + np.diag([0.0, 1 / 8.0**2, 1 / 6.0**2])
+    covariance = np.linalg.inv(information)
+    fit = covariance @ (A.T @ x) / sigma**2
+    at = t.mean()
+    return Motion(
+        speed_mps=float(np.linalg.norm(fit[1] + at * fit[2])),
+        speed_sigma_mps=math.sqrt(covariance[1, 1] + 2 * at * covariance[1, 2] + at**2 * covariance[2, 2]),
+        acceleration_mps2=float(np.linalg.norm(fit[2])),
+        acceleration_sigma_mps2=math.sqrt(covariance[2, 2]),
+        spread_m=float(np.linalg.norm(x - A @ fit)) / math.sqrt(len(t)),
+    )
+
+
+def moves(path_ns: list[int], path_m: list[Array64], range_m: float, motion_known: bool) -> bool:
+    """Whether it has clearly moved in the world.
+
+    Steadily while it was looked at without a pause; or farther between two passes than one lamp is long. Something long
+    is met elsewhere as the fan passes over it, so a single passing proves nothing. When the vehicle does not tell how
+    it moves, what stands may seem to go by: then only going up or down counts.
+    """
+    t = (np.array(path_ns) - path_ns[-1]) * 1e-9
+    pauses = np.nonzero(np.diff(t) > PAUSE_S)[0]
+    first = int(pauses[-1]) + 1 if len(pauses) else 0
+    x = np.array(path_m)[:, slice(0, 3) if motion_known else slice(2, 3)]
+    speed, sigma, lasted = _straight(t[first:], x[first:], range_m)
+    if len(t) - first >= 6 and lasted > 0.6 and speed > 4.0 * sigma and speed * lasted > 0.25:
+        return True
+    speed, sigma, lasted = _straight(t, x, range_m)
+    return len(t) >= 5 and lasted > 1.0 and speed > 4.0 * sigma and speed * lasted > 1.5
+
+
+def _straight(t: Array64, x: Array64, range_m: float) -> tuple[float, float, float]:
+    """Speed of a straight line through sightings (n, k) at times (n,), its sigma, and how long they lasted."""
+    if len(t) < 3:
+        return 0.0, math.inf, 0.0
+    since = t - t.mean()
+    spread = float(since @ since)
+    velocity = since @ x / spread
+    left = x - x.mean(axis=0) - np.outer(since, velocity)
+    scatter = float(np.linalg.norm(left)) / math.sqrt(left.size)
+    sigma = max(0.15 + 0.004 * range_m, scatter) / math.sqrt(spread)
+    return float(np.linalg.norm(velocity)), sigma, float(np.ptp(t))

@@ -1,0 +1,157 @@
+"""From pulses to sightings: the short, free-ended chords of one look on one thing, and what was measured around it.
+
+A sighting is complete when the rotor has gone on: what stands around a place is known `DELAY` slices later.
+
+Source: ours; DESIGN, The graph: detect.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from typing import NamedTuple
+
+import numpy as np
+
+from stages.detect import chords as chord
+from stages.detect.candidate import Sighting
+from stages.detect.chords import ChordFinder
+from stages.detect.surroundings import TALLY, BigThings, look_around
+from stages.geometry import Array64
+from stages.messages import SweptPulses
+
+BEAM_SPACING_RAD = math.radians(2.0)  # between two lasers of a VLP-16
+SLICES = 7  # 34 deg of the rotor
+DELAY = 3  # slices after which what stands around a sighting has been seen
+MEMORY_NS = 3_000_000_000  # of big things, when the vehicle tells how it moves
+SHORT_MEMORY_NS = 1_000_000_000  # when it does not
+BALL_BULGE_PER_M = (1.2, 9.0)  # 1 / (2 radius), with what a beam's width adds
+BALL_ROUGH_M = 0.02
+
+
+class Slice(NamedTuple):
+    """A packet's pulses, and where the vehicle was."""
+
+    pulses: SweptPulses
+    R: Array64  # R_local_vehicle, t_local_vehicle
+    t: Array64
+    axis: Array64  # mean direction, unit
+
+
+class Limits(NamedTuple):
+    """Where a sighting may be."""
+
+    span_m: float
+    lowest_rad: float  # over the LiDAR's horizon
+    nearest_m: float
+    furthest_m: float
+    clear_m: float
+
+
+class _Chord(NamedTuple):
+    slice: int
+    row: Array64
+    stamp_ns: int
+
+
+class SightingFinder:
+    """Feed it slices in order of time; it keeps the last few, and where big things stand."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        span_m = limits.span_m
+        self._chords = ChordFinder(1.6 * span_m, 0.7 * span_m, 0.6 * span_m)
+        self._big = BigThings()
+        self._slices: deque[Slice] = deque(maxlen=SLICES)
+        self._waiting: list[_Chord] = []
+        self._count = 0
+        self.hidden: Counter[str] = Counter()  # short chords that were not free at both ends
+
+    def feed(self, part: Slice, motion_known: bool) -> list[Sighting]:
+        """The sightings that are complete with this slice."""
+        self._slices.append(part)
+        self._count += 1
+        self._find(part)
+        if not self._waiting or self._waiting[0].slice > self._count - DELAY:
+            return []
+        ready = [c for c in self._waiting if c.slice <= self._count - DELAY]
+        self._waiting = self._waiting[len(ready) :]
+        found: list[Sighting] = []
+        while ready:
+            first = ready[0].row[:3]
+            near = [np.linalg.norm(c.row[:3] - first) <= 1.2 * self._limits.span_m for c in ready]
+            found.append(self._sighting([c for c, same in zip(ready, near, strict=True) if same], motion_known))
+            ready = [c for c, same in zip(ready, near, strict=True) if not same]
+        return found
+
+    def _find(self, part: Slice) -> None:
+        limits, pulses = self._limits, part.pulses
+        found = self._chords.feed(pulses)
+        rows = found.rows
+        if not len(rows):
+            return
+        long = rows[:, chord.LONG] > 0
+        if long.any():
+            self._big.add(rows[long, :3] @ part.R.T + part.t, pulses.stamp_ns)
+        range_m = rows[:, chord.RANGE]
+        up = rows[:, chord.Z] - pulses.origin_vehicle_m[2] > math.sin(limits.lowest_rad) * range_m
+        near = (range_m >= limits.nearest_m) & (range_m <= limits.furthest_m)
+        short = ~long & up & near & (rows[:, chord.LENGTH] <= 1.6 * limits.span_m)
+        free = rows[:, chord.FREE] == 2.0
+        self.hidden["hidden at an end by something nearer"] += int((short & ~free).sum())
+        for i in np.nonzero(short & free)[0]:
+            self._waiting.append(_Chord(self._count, rows[i], int(found.first_ns[i] + found.last_ns[i]) // 2))
+
+    def _sighting(self, same: list[_Chord], motion_known: bool) -> Sighting:
+        span_m = self._limits.span_m
+        rows = np.array([c.row for c in same])
+        hits, stamp_ns = rows[:, chord.COUNT], same[0].stamp_ns
+        middle = hits @ rows[:, :3] / hits.sum()
+        then = min(self._slices, key=lambda s: abs(s.pulses.stamp_ns - stamp_ns))
+        range_m = float(rows[:, chord.RANGE].mean())
+        local = then.R @ middle + then.t
+        balls, rugged = round_and_rugged(rows)
+        extent_m = max(float(np.linalg.norm(np.ptp(rows[:, :3], axis=0))), float(rows[:, chord.LENGTH].max()))
+        since_ns = stamp_ns - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
+        return Sighting(
+            stamp_ns=stamp_ns,
+            xyz_local_m=local,
+            vehicle_local_m=then.t,
+            range_m=range_m,
+            hits=int(hits.sum()),
+            too_long=extent_m > 1.3 * span_m,
+            balls=balls,
+            rugged=rugged,
+            around=self._around(middle, range_m),
+            big_m=self._big.nearest_m(local, 1.1 * span_m, self._limits.clear_m, since_ns),
+        )
+
+    def _around(self, middle_m: Array64, range_m: float) -> Array64:
+        """What the last slices measured about a place of the vehicle frame: (TALLY,)."""
+        span_m = self._limits.span_m
+        tally = np.zeros(TALLY, dtype=np.int64)
+        close_m = max(2.4 * span_m, 1.15 * BEAM_SPACING_RAD * range_m)  # two beams wide at least
+        outer_m = max(self._limits.clear_m, 1.5 * BEAM_SPACING_RAD * range_m)
+        for part in self._slices:
+            look_around(
+                part.pulses.direction_vehicle,
+                part.pulses.range_m,
+                np.array(part.pulses.origin_vehicle_m),
+                middle_m,
+                0.3 * span_m,
+                1.1 * span_m,
+                close_m,
+                outer_m,
+                0.5,
+                tally,
+            )
+        return tally.astype(np.float64)
+
+
+def round_and_rugged(rows: Array64) -> tuple[int, int]:
+    """How many chords (n, COLUMNS) with five or more returns bulge as smoothly as a ball, and how many do not."""
+    whole = rows[:, chord.COUNT] >= 5
+    low, high = BALL_BULGE_PER_M
+    ball = whole & (rows[:, chord.BULGE] > low) & (rows[:, chord.BULGE] < high) & (rows[:, chord.ROUGH] < BALL_ROUGH_M)
+    ball &= (rows[:, chord.GAPS] <= 1) & (rows[:, chord.DEPTH] > 0.2 * rows[:, chord.LENGTH])
+    return int(ball.sum()), int((whole & ~ball).sum())

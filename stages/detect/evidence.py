@@ -80,6 +80,7 @@ class EvidenceDetect(Stage):
     sweep_deg: float = Field(180.0, gt=3, le=360)
     forget_s: float = Field(4.0, gt=0)
     max_candidates: int = Field(12, ge=1)  # given out
+    parked: bool = False  # the vehicle stands: what moves is known without VehicleMotion
     free_space: bool = True  # False: what was measured around a candidate counts for nothing, to see what it is worth
     evidence: Evidence = Evidence()
 
@@ -92,7 +93,7 @@ class EvidenceDetect(Stage):
         self._now = _Now(SightingFinder(limits), Travel(math.radians(self.sweep_deg - 3.0), math.radians(0.5)))
 
     def on_motion(self, motion: VehicleMotion) -> None:
-        """Where the vehicle is; without it, it is taken to be parked."""
+        """Where the vehicle is. Without it nothing is taken to move but what rises or sinks, unless `parked` is set."""
         self._now.trail.add(motion)
 
     def on_pulses(self, pulses: SweptPulses) -> Iterator[Candidates | Detections]:
@@ -106,7 +107,7 @@ class EvidenceDetect(Stage):
         axis = pulses.direction_vehicle.mean(axis=0).astype(np.float64)
         part = Slice(pulses, *now.trail.at(pulses.stamp_ns), axis / max(float(np.linalg.norm(axis)), 1e-9))
         changed = False
-        sightings = now.finder.feed(part, now.trail.known)
+        sightings = now.finder.feed(part, self.parked or now.trail.known)
         self._look_for_misses(now, part, now_ns)
         now.slices += 1
         if now.slices % BANK_TIDIED == 0:
@@ -150,7 +151,7 @@ class EvidenceDetect(Stage):
 
     def _weigh(self, now: _Now, c: Candidate) -> bool:
         """Judge it anew. True when that is news."""
-        c.odds, c.why = judge(c, self.evidence, self.free_space, now.trail.known)
+        c.odds, c.why = judge(c, self.evidence, self.free_space, self.parked or now.trail.known)
         accept = odds_of(self.accept_probability)
         c.accepted = c.odds >= accept or (c.accepted and c.odds >= accept - 3.0)
         was, c.told = c.told, c.odds >= odds_of(self.look_again_probability)

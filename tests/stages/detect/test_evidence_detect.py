@@ -201,7 +201,7 @@ def test_what_leaves_is_forgotten():
     for pulses in pulses_seen([gone], WATCHING, 4.0):
         list(stage.on_pulses(pulses))
     assert stage._now.bank == []
-    assert stage._watched == {}
+    assert stage._now.watches == {}
 
 
 def test_without_free_space_the_sectors_are_not_even_named():

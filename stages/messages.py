@@ -155,7 +155,9 @@ class Detections(Message):
     start_ns: int | None = None  # since when was searched; None: since the depth image's start
     seen_ns: PerPointI64 | None = None  # when each was seen last; None: at some time in the sweep
     velocity_vehicle_mps: Points64 | None = None
-    probability: PerPointF64 | None = None  # that it is a drone, as calibrated; None: the score says nothing of it
+    probability: PerPointF64 | None = (
+        None  # that it is a drone, as the detector judges; None: the score says nothing of it
+    )
     candidate_id: PerPointI64 | None = None  # the same thing keeps its number
 
 

@@ -50,7 +50,6 @@ class _Target:
     glance: bool = False  # looked at in passing, the sweep goes on
     seen_looks: int = 0  # turns in which the detector saw it
     looks: int = 0  # planned for it
-    first_ns: int = 0
     heard_ns: int = 0
 
     def at(self, stamp_ns: int) -> Array64:
@@ -159,7 +158,6 @@ class BeamAim(Stage):
                 seen_looks=int(candidates.looks[i]),
                 glance=old.glance if old else False,
                 looks=old.looks if old else 0,
-                first_ns=old.first_ns if old else candidates.stamp_ns,
                 heard_ns=int(candidates.seen_ns[i]),
             )
 
@@ -181,7 +179,6 @@ class BeamAim(Stage):
             sigma_m=sigma,
             sure=True,
             looks=old.looks if old else 0,
-            first_ns=old.first_ns if old else state.stamp_ns,
             heard_ns=state.stamp_ns if state.state is TrackingState.TRACKING or old is None else old.heard_ns,
         )
 
@@ -316,7 +313,7 @@ class BeamAim(Stage):
         if best is None and self.beams:  # nearly on the axis, or just beyond the travel: as near as it gets
             for theta in table_angles_rad(T_tl, place, 0.0):
                 for turn in (-math.tau, 0.0, math.tau):
-                    servo = math.radians(self.mount.servo_zero_deg) + self.mount.servo_sign * (theta + turn)
+                    servo = self.mount.servo_rad(theta) + turn
                     kept = min(max(servo, travel[0]), travel[1])
                     cost = abs(kept - servo)
                     if best is None or cost < best[0]:

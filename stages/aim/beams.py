@@ -43,13 +43,8 @@ def table_angles_rad(T_turntable_lidar: Array64, p_turntable_m: Array64, elevati
 
 
 def servo_positions_rad(mount: LidarMount, theta_rad: float, travel_rad: tuple[float, float]) -> list[float]:
-    """Servo positions within the travel that turn the table to theta.
-
-    The inverse of `LidarMount.turntable_rad`: servo = zero + sign (theta + encoder error), the error by fixed point.
-    """
-    servo = math.radians(mount.servo_zero_deg) + mount.servo_sign * theta_rad
-    for _ in range(3 if mount.servo_harmonics else 0):
-        servo += mount.servo_sign * (theta_rad - float(mount.turntable_rad(np.array([servo]))[0]))
+    """Servo positions within the travel that turn the table to theta."""
+    servo = mount.servo_rad(theta_rad)
     first = servo + math.tau * math.ceil((travel_rad[0] - servo) / math.tau)
     return [s for s in (first, first + math.tau) if s <= travel_rad[1]]
 

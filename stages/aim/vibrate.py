@@ -21,7 +21,6 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
@@ -139,17 +138,11 @@ def plane_angles_rad(T_turntable_lidar: Array64, p_turntable_m: Array64) -> tupl
 
 
 def servo_angles_rad(mount: LidarMount, xyz_vehicle_m: Array64) -> tuple[float, ...]:
-    """Servo positions within one turn either way of zero that put the scan plane on a point (3,) of the vehicle frame.
-
-    The inverse of `LidarMount.turntable_rad`: servo = zero + sign (theta + encoder error), the error by fixed point.
-    """
+    """Servo positions within a turn either way of zero that put the scan plane on a point (3,) of the vehicle frame."""
     T = mount.T_vehicle_turntable.matrix()
     found: list[float] = []
     for theta in plane_angles_rad(mount.T_turntable_lidar.matrix(), T[:3, :3].T @ (xyz_vehicle_m - T[:3, 3])):
-        ideal = math.radians(mount.servo_zero_deg) + mount.servo_sign * theta
-        servo = ideal
-        for _ in range(4):  # the error is below 5 deg and smooth: each round wins a digit or more
-            servo += mount.servo_sign * (theta - float(mount.turntable_rad(np.array([servo]))[0]))
+        servo = mount.servo_rad(theta)
         found += [servo - math.tau, servo, servo + math.tau]
     return tuple(found)
 

@@ -57,7 +57,6 @@ class _Track:
     hits: int = 0  # of the newest look
     look: Look | None = None
     told_ns: int = 0
-    told: TrackingState | None = None
     reason: str = ""
 
     def at(self, stamp_ns: int, q: float) -> tuple[Array64, Array64]:
@@ -198,7 +197,6 @@ class HitMissTrack(Stage):
         self._tracks = [other for other in self._tracks if other is not track]
         if track.confirmed:
             self._why_idle = f"lost drone {track.number}: {why}"
-            track.reason, track.told = why, TrackingState.LOST
             yield TrackState(
                 stamp_ns=now_ns, state=TrackingState.LOST, reason=why, hits=0, frame_s=0.1, track_id=track.number
             )
@@ -230,7 +228,7 @@ class HitMissTrack(Stage):
         x, P = track.at(now_ns, self.manoeuvre)
         R, _ = self._trail.at(now_ns)
         xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
-        track.told_ns, track.told = now_ns, state
+        track.told_ns = now_ns
         return TrackState(
             stamp_ns=now_ns,
             state=state,

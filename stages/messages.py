@@ -211,6 +211,72 @@ class TrackState(Message):
     covariance_m2: Mat3 | None = None  # of the position
 
 
+class Carrier(enum.Enum):
+    """What a camera is mounted on, and in whose axes its directions are told."""
+
+    VEHICLE = "vehicle"
+    DRONE = "drone"
+
+
+@message
+class VanishingDirections(Message):
+    """Directions in which a picture's straight lines run, and the lines; stamp_ns is the picture's. P IV, V.C.
+
+    Axes are the carrier's (x forward, y left, z up), not the lens's. A direction's sign means nothing.
+    No directions is a normal answer: `reason` says why.
+    """
+
+    carrier: Carrier
+    direction: Points64  # (n, 3) unit; the vertical first where there is one
+    sigma_rad: PerPointF64  # (n,) of each direction, one axis, 1 sigma
+    is_vertical: PerPointBool  # (n,)
+    frame: PerPointI64  # (n,) which horizontal pair it belongs to, 0 the strongest; -1: the vertical
+    line_normal: Points64  # (m, 3) unit normals of the great circles that the lines lie on
+    line_end: Annotated[NDArray[np.float64], Shape("m", 2, 3)]  # unit rays of each line's two ends
+    line_sigma_rad: PerPointF64  # (m,) of the normal, about the axis along the line
+    line_direction: PerPointI64  # (m,) index of its direction; -1: none
+    reason: str
+
+
+class BranchState(enum.Enum):
+    """How well it is known which of the street's four directions is which."""
+
+    NONE = 0  # no rotation now
+    AMBIGUOUS = 1  # up to a quarter turn, or half of one
+    RESOLVED = 2
+
+
+@message
+class RelativeRotation(Message):
+    """How the drone is turned in the vehicle's axes, up to the street's symmetry; stamp_ns is the pictures'. P IV.
+
+    Branch k is R_vehicle_drone with Rz(k * 90 deg) on its left; branch 0 is the most probable and given here.
+    """
+
+    R_vehicle_drone: Mat3 | None  # None: no rotation now, `reason` says why
+    covariance_rad2: Mat3 | None  # of phi in R exp(phi), the drone's axes
+    branch_probability: Annotated[NDArray[np.float64], Shape(4)]  # of Rz(k 90 deg) R_vehicle_drone
+    state: BranchState
+    switches: int  # how often the branch given out has changed since the start: a change is a jump
+    reason: str
+
+
+@message
+class DroneMotion(Message):
+    """How the drone's camera moved from one picture to a later one, told in the drone's axes. P V.E.
+
+    p_from = R_from_to p_to + |t| direction: the length is not known from one camera. stamp_ns is the later picture's.
+    """
+
+    from_ns: int
+    R_from_to: Mat3
+    covariance_rad2: Mat3  # of phi in R exp(phi), axes of the later picture's drone
+    direction_from: Vec3 | None  # unit; None: no motion seen beyond the rotation
+    direction_sigma_rad: float | None
+    matches: int  # features that agree
+    reason: str
+
+
 @message
 class DroneAttitude(Message):
     """The autopilot's attitude. Frame local is the autopilot's own: x its north, z up; its yaw is unrelated to ours."""

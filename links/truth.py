@@ -58,6 +58,11 @@ class TruthLog:
             else:
                 yield record
 
+    def take(self, records: Iterable[Record]) -> None:
+        """Keep what of these records is truth."""
+        for _ in self.aside(records):
+            pass
+
     def drone_in_vehicle(self, number: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Stamps (n,) [ns] and a drone's position in the vehicle frame (n, 3) [m], where both poses are known."""
         poses = self.drones[number].pose if number in self.drones else {}

@@ -231,10 +231,10 @@ class VanishingDirections(Message):
     sigma_rad: PerPointF64  # (n,) of each direction, one axis, 1 sigma
     is_vertical: PerPointBool  # (n,)
     frame: PerPointI64  # (n,) which horizontal pair it belongs to, 0 the strongest; -1: the vertical
-    line_normal: Points64  # (m, 3) unit normals of the great circles that the lines lie on
+    line_normal: Annotated[NDArray[np.float64], Shape("m", 3)]  # unit normals of the lines' great circles
     line_end: Annotated[NDArray[np.float64], Shape("m", 2, 3)]  # unit rays of each line's two ends
-    line_sigma_rad: PerPointF64  # (m,) of the normal, about the axis along the line
-    line_direction: PerPointI64  # (m,) index of its direction; -1: none
+    line_sigma_rad: Annotated[NDArray[np.float64], Shape("m")]  # of the normal, about the axis along the line
+    line_direction: Annotated[NDArray[np.int64], Shape("m")]  # index of its direction; -1: none
     reason: str
 
 

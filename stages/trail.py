@@ -17,6 +17,7 @@ from stages.geometry import Array64
 from stages.messages import VehicleMotion
 
 KEPT = 512
+NEWTON_STEPS = 4
 STEP_NS = 50_000_000  # over which a velocity is taken
 FURTHEST_NS = 300_000_000  # beyond the newest pose this much is extrapolated, no more
 
@@ -26,6 +27,7 @@ class VehicleTrail:
 
     def __init__(self) -> None:
         self._poses: deque[tuple[int, Array64, Array64]] = deque(maxlen=KEPT)
+        self._known: dict[int, tuple[Array64, Array64]] = {}  # asked since the newest pose: the same moments are, often
 
     @property
     def known(self) -> bool:
@@ -35,11 +37,14 @@ class VehicleTrail:
     def add(self, motion: VehicleMotion) -> None:
         """One more pose; one that is not newer than the last is ignored."""
         if not self._poses or motion.stamp_ns > self._poses[-1][0]:
+            self._known.clear()
             self._poses.append((motion.stamp_ns, motion.R_start_vehicle, motion.xyz_start_m))
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64]:
         """R_local_vehicle (3, 3) and t_local_vehicle (3,) [m]."""
         poses = self._poses
+        if stamp_ns in self._known:
+            return self._known[stamp_ns]
         if not poses:
             return np.eye(3), np.zeros(3)
         if len(poses) == 1 or stamp_ns <= poses[0][0]:
@@ -48,8 +53,12 @@ class VehicleTrail:
         (t0, R0, x0), (t1, R1, x1) = poses[after - 1], poses[after]
         share = (min(stamp_ns, t1 + FURTHEST_NS) - t0) / (t1 - t0)
         R = R0 + share * (R1 - R0)  # poses are milliseconds apart: the mean of the two, made a rotation again
-        u, _, vt = np.linalg.svd(R)
-        return u @ vt, x0 + share * (x1 - x0)
+        for _ in range(NEWTON_STEPS):  # towards the nearest rotation; Higham, Functions of Matrices (2008), 8.3
+            R = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
+        if len(self._known) >= KEPT:
+            self._known.clear()
+        self._known[stamp_ns] = R, x0 + share * (x1 - x0)
+        return self._known[stamp_ns]
 
     def velocity_mps(self, stamp_ns: int) -> Array64:
         """The vehicle's own velocity (3,) in the local frame."""

@@ -13,7 +13,7 @@ import yaml
 from pydantic import ValidationError
 
 from flow.link import LinkError
-from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+from links.cli.console import FINDING, WRONG_USE, err, in_words, out, progress_bar, warn
 from stages.geometry import LidarMount
 
 MAX_RIG_BYTES = 100_000
@@ -161,21 +161,41 @@ def simulate_matrix(
     ] = False,
     odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle has odometry.")] = False,
     rain: Annotated[bool, typer.Option("--rain", help="It rains, 5 mm/h.")] = False,
+    autopilot: Annotated[
+        bool, typer.Option("--autopilot", help="The drone tells over a radio how it flies, and flies by its dynamics.")
+    ] = False,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            "--results",
+            metavar="OUT",
+            help="Keep the closed loop's runs too, as OUT/<recording>-<config>: what `grd replay --config CONFIG` of "
+            "each recording leaves, without the second pass. No viewer file. For `grd evaluate OUT/*`.",
+        ),
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option("--jobs", min=1, max=256, help="Processes to share the recordings; the outcome is the same.")
+    ] = 1,
     list_only: Annotated[bool, typer.Option("--list", help="Name the cells; make none.")] = False,
 ) -> None:
     """Make the recordings of the scenario matrix.
 
     Range x motion x vehicle x scene, an occlusion, and a drone that leaves and returns; beside them an empty sky, two
-    drones, a drone to search for at 40 m, and drones at 50 m. Recordings that are there, complete and made alike are
-    kept, so it can be stopped and started again. Exit code 1 when a scene had no place for a cell.
+    drones, a drone to search for at 40 m, and drones at 50 m. Recordings that are there, complete and made alike (the
+    same scenario and all that CONFIG and its includes say) are kept, so it can be stopped and started again; changed
+    code is not noticed, take another DIR for it. When one cannot be made the others are made all the same, and it is
+    named in the end. Exit code 1 when a scene had no place for a cell or a stage failed, 2 when another thing did.
 
-    Example: grd matrix out/matrix --seeds 5 --only '*-empty-*' --only '*-two-*' --closed-loop configs/sim.yaml
+    Example: grd matrix out/matrix --only '*-empty-*' --closed-loop configs/sim.yaml --results out/runs --jobs 2
     """
     try:
-        from links.simulated.matrix import Conditions, cells, make_matrix
+        from links.simulated.matrix import Conditions, cells
+        from links.simulated.matrix_making import make_matrix
     except ModuleNotFoundError as missing:
         raise _not_installed(missing) from None
 
+    if results is not None and closed_loop is None:
+        raise LinkError("--results keeps the closed loop's runs: say whose with --closed-loop CONFIG")
     patterns = only or ["*"]
     wanted = cells(patterns, pairs)
     if not wanted:
@@ -187,12 +207,17 @@ def simulate_matrix(
             out.print(cell.name, markup=False)
         return
     with progress_bar(f"{len(wanted) * seeds} recordings") as step:
-        conditions = Conditions(calibrated, odometry, rain)
-        report = make_matrix(folder, wanted, range(1, seeds + 1), closed_loop, step, conditions)
+        conditions = Conditions(calibrated, odometry, rain, autopilot)
+        report = make_matrix(folder, wanted, range(1, seeds + 1), closed_loop, step, conditions, results, jobs)
     for text in report.impossible:
         warn(text)
-    out.print(f"{folder}: {report.made} made, {report.kept} were there already", markup=False)
-    if report.impossible:
+    for failure in report.failed:
+        err.print(failure.text, markup=False, style="red")
+    text = f"{folder}: {report.made} made, {report.kept} were there already"
+    out.print(f"{text}; {report.replayed} of them replayed" if report.replayed else text, markup=False)
+    if any(not failure.stage_failed for failure in report.failed):
+        raise typer.Exit(WRONG_USE)
+    if report.impossible or report.failed:
         raise typer.Exit(FINDING)
 
 

@@ -5,32 +5,19 @@ Source: DESIGN, Command line and Outputs of a run.
 
 from __future__ import annotations
 
-import json
-import time
-from contextlib import ExitStack
-from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-import yaml
 from rich.table import Table
 from rich.text import Text
 
-from flow.draw import mermaid
-from flow.graph import Graph, load_graph, recording_named
-from flow.link import LinkError, Run, Tap
-from flow.problem import Place
-from flow.replay import RunReport, replay
-from flow.taps import Digest
-from flow.tree import Section
+from flow.graph import recording_named
+from flow.link import LinkError
 from links.cli.console import err, in_words, out, progress_bar, warn
-from links.recording import RecordingReader
-from links.results import FIX_FILE, SUMMARY_FILE, Results, stamp_s
-from links.truth import FixErrors, TruthLog
+from links.results import FIX_FILE, SUMMARY_FILE, stamp_s
+from links.run_folder import Asked, Finished, replay_into
 
-CONFIG_FILE = "config.yaml"
 TABLE_ROWS = 12
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEFAULT_REPLAY_CONFIG = REPOSITORY / "configs" / "replay.yaml"
@@ -82,141 +69,29 @@ def replay_recording(
     _run(recording, config or DEFAULT_REPLAY_CONFIG, out_dir, overlay or [], sets or [], view)
 
 
-@dataclass(frozen=True, slots=True)
-class Finished:
-    """A run that is done, for telling about it."""
-
-    recording: Path
-    out_dir: Path
-    report: RunReport
-    results: Results
-    errors: FixErrors | None
-    digest: str
-    wall_s: float
-    warnings: list[str]
-    graph: Graph
-
-
 def _run(
     recording: Path, config: Path, out_dir: Path | None, overlays: list[Path], sets: list[str], view: bool
 ) -> None:
-    begin = time.monotonic()
-    with RecordingReader(recording) as reader:
-        graph = load_graph(config, overlays, sets, _own_rig(recording, reader.rig_yaml))
-        folder = _new_folder(out_dir, f"{recording.stem}-{config.stem}")
-        finished = _replay(graph, reader, recording, folder, begin)
-    _write_summary(finished, config, overlays, sets)
+    folder = _new_folder(out_dir, f"{recording.stem}-{config.stem}")
+    with progress_bar(f"replay {recording.name}") as step:
+        finished = replay_into(folder, recording, Asked(config, tuple(overlays), tuple(sets)), step)
     _tell(finished)
     if view:
         _open_viewer(finished.out_dir)
 
 
-def _own_rig(recording: Path, rig_yaml: str | None) -> dict[str, Section] | None:
-    if rig_yaml is None:
-        return None
-    place = Place(f"{recording} (rig.yaml)", 0)
-    try:
-        return {"rig": (yaml.safe_load(rig_yaml), place)}
-    except yaml.YAMLError as error:
-        raise LinkError(f"{place} is not YAML: {str(error).splitlines()[0]}") from None
-
-
 def _new_folder(wanted: Path | None, name: str) -> Path:
-    """The folder for the results; an earlier run is never overwritten."""
+    """Where the results go; an earlier run is never overwritten."""
     if wanted is not None:
         if (wanted / SUMMARY_FILE).exists():
             raise LinkError(f"{wanted} holds a run already: name another --out, or remove it first.")
-        folder = wanted
-    else:
-        folder = Path("out", name)
-        number = 1
-        while folder.exists():
-            number += 1
-            folder = Path("out", f"{name}-{number}")
-    folder.mkdir(parents=True, exist_ok=True)
+        return wanted
+    folder = Path("out", name)
+    number = 1
+    while folder.exists():
+        number += 1
+        folder = Path("out", f"{name}-{number}")
     return folder
-
-
-def _replay(graph: Graph, reader: RecordingReader, recording: Path, folder: Path, begin: float) -> Finished:
-    truth, digest, results = TruthLog(), Digest(), Results()
-    extra = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
-    taps: list[Tap] = [digest, results, *(tap for tap in extra if isinstance(tap, Tap))]
-    about = Run(folder, f"{recording.stem}", mermaid(graph), graph.settings_yaml())
-    (folder / CONFIG_FILE).write_text(about.settings_yaml, encoding="utf-8")
-    with ExitStack() as stack, progress_bar(f"replay {recording.name}") as step:
-        for tap in taps:
-            tap.open(about)
-            stack.callback(tap.close)
-        report = replay(graph, truth.aside(reader.records(progress=step)), taps)
-        warnings = [*reader.warnings, *_remarks(graph, report)]
-        for text in (*warnings, f"output hash {digest.hexdigest()}"):
-            results.note(text)
-    truth.write(folder)
-    errors = truth.errors_of(results.fixes)
-    wall_s = time.monotonic() - begin
-    return Finished(recording, folder, report, results, errors, digest.hexdigest(), wall_s, warnings, graph)
-
-
-def _remarks(graph: Graph, report: RunReport) -> list[str]:
-    """What the run did not use, so that a silent port is not taken for a quiet sensor."""
-    remarks = [f"{count} records on {topic} are wired to nothing" for topic, count in report.unwired_topics.items()]
-    silent = [spec.name for spec in graph.nodes.values() if spec.kind == "links" and report.nodes[spec.name].calls == 0]
-    sources = {edge.producer for edge in graph.edges}
-    remarks += [f"the recording holds nothing for '{name}'" for name in silent if name in sources]
-    return remarks
-
-
-def _write_summary(run: Finished, config: Path, overlays: list[Path], sets: list[str]) -> None:
-    report, results = run.report, run.results
-    summary: dict[str, Any] = {
-        "grd": version("grd"),
-        "recording": run.recording.name,
-        "config": config.name,
-        "overlays": [path.name for path in overlays],
-        "set": sets,
-        "output_hash": run.digest,
-        "records": report.records,
-        "start_s": stamp_s(report.first_ns),
-        "end_s": stamp_s(report.last_ns),
-        "recorded_s": (report.last_ns - report.first_ns) / 1e9,
-        "messages": report.messages,
-        "sweeps": results.sweeps,
-        "sweeps_with_drone": results.sweeps_with_drone,
-        "verdicts": [{"sweeps": count, "example": verdict} for verdict, count in results.verdicts],
-        "fixes": len(results.fixes),
-        "states": [
-            {"stamp_s": stamp_s(t.stamp_ns), "track_id": t.track_id, "state": t.state, "reason": t.reason}
-            for t in results.transitions
-        ],
-        "warnings": run.warnings,
-        "wall_s": round(run.wall_s, 3),
-        "compute_ms": {
-            name: {
-                "calls": node.calls,
-                "p50": round(node.compute.percentile_ns(50) / 1e6, 4),
-                "p99": round(node.compute.percentile_ns(99) / 1e6, 4),
-                "max": round(node.compute.max_ns / 1e6, 4),
-                "total": round(node.compute.total_ns / 1e6, 1),
-            }
-            for name, node in report.nodes.items()
-        },
-    }
-    if run.errors is not None:
-        summary["against_truth"] = _judged(run.errors)
-    (run.out_dir / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-
-
-def _judged(errors: FixErrors) -> dict[str, Any]:
-    if not len(errors.stamps_ns):
-        return {"fixes": 0, "fixes_without_truth": errors.not_covered}
-    return {
-        "fixes": len(errors.stamps_ns),
-        "fixes_without_truth": errors.not_covered,
-        "rmse_xyz_m": [round(float(v), 4) for v in errors.rmse_xyz_m],
-        "rmse_3d_m": round(errors.rmse_m, 4),
-        "mean_nees_of_3": round(float(errors.nees.mean()), 3),
-        "inside_95_percent_ellipsoid": round(errors.inside_95, 4),
-    }
 
 
 def _tell(run: Finished) -> None:

@@ -13,19 +13,21 @@ Source: ours; conservative look-ahead as in parallel discrete event simulation (
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
-from flow.graph import Graph, load_graph
+from flow.graph import Graph
 from flow.link import LinkError, Record, Tap
 from flow.message import Message
-from flow.problem import Place
 from flow.replay import Replay, RunReport
 from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import GoalCommand
+from links.run_folder import Asked
 from links.simulated.servo import STEP_NS
 from stages.messages import ServoGoal
 
@@ -59,9 +61,13 @@ class GoalTap(Tap):
 class ClosedLoop:
     """A graph that is fed with the simulation's records and commands its servo."""
 
-    def __init__(self, graph: Graph, settings: ClosedLoopSettings) -> None:
+    def __init__(
+        self, graph: Graph, settings: ClosedLoopSettings, made_with: dict[str, str], taps: Sequence[Tap] = ()
+    ) -> None:
+        """`made_with` is what recordings keep of the graph's origin; `taps` are open and see every message."""
+        self.made_with = made_with
         self._digest, goals = Digest(), GoalTap()
-        self._replay = Replay(graph, (self._digest, goals))
+        self._replay = Replay(graph, (self._digest, goals, *taps))
         name, output = servo_edge(graph)
         servo = self._replay.nodes[name]
         assert isinstance(servo, Servo)
@@ -84,6 +90,11 @@ class ClosedLoop:
         return self._replay.finish()
 
     @property
+    def report(self) -> RunReport:
+        """What the graph did so far."""
+        return self._replay.report
+
+    @property
     def output_hash(self) -> str:
         """Hash over every message so far, as `grd replay` writes it."""
         return self._digest.hexdigest()
@@ -104,7 +115,18 @@ def servo_edge(graph: Graph) -> tuple[str, str]:
     return found[0]
 
 
+def made_with(config: Path, graph: Graph) -> dict[str, str]:
+    """What a recording keeps of the configuration that closed its loop: the file's name and a hash of all it says.
+
+    Includes are in the hash and so is the rig; taps are not: they change no message.
+    """
+    taps = {name for name, spec in graph.nodes.items() if issubclass(spec.cls, Tap)}
+    links = {name: link for name, link in graph.values.get("links", {}).items() if name not in taps}
+    said = yaml.safe_dump(graph.values | {"links": links}, sort_keys=False)
+    return {"closed_loop": config.name, "closed_loop_hash": hashlib.blake2b(said.encode(), digest_size=16).hexdigest()}
+
+
 def load_loop(config: Path, rig_yaml: str, scenario: str, settings: ClosedLoopSettings) -> ClosedLoop:
     """A configuration as a closed loop on a scenario's rig. Raises ConfigError with every problem, or LinkError."""
-    graph = load_graph(config, sections={"rig": (yaml.safe_load(rig_yaml), Place(scenario, 0))})
-    return ClosedLoop(graph, settings)
+    graph = Asked(config).graph(rig_yaml, scenario)
+    return ClosedLoop(graph, settings, made_with(config, graph))

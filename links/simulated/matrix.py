@@ -10,21 +10,18 @@ Source: ours, after the cases of issue "A simulated rig".
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from itertools import product
-from pathlib import Path as FilePath
 
 import numpy as np
 
-from flow.link import LinkError
-from links.recording import RecordingReader
+from links.simulated.autopilot import AutopilotSettings
 from links.simulated.clearance import sample_times_s
 from links.simulated.drone import DroneModel
 from links.simulated.matrix_flights import CAMERA_HEIGHT_M, Cell, drone_path, two_paths, vehicle_path
 from links.simulated.operator import Sweep, Vibrate
-from links.simulated.run import simulate_into
 from links.simulated.scenario import DroneSettings, RigLidar, Scenario
 from links.simulated.servo import ServoSettings, Turned
 from links.simulated.vehicle_odometry import VehicleOdometrySettings
@@ -61,6 +58,7 @@ class Conditions:
     calibrated: bool = False  # the rig knows the servo encoder's own error
     odometry: bool = False  # the vehicle tells where it drives
     rain: bool = False  # 5 mm/h
+    autopilot: bool = False  # the drone tells how it flies, over a radio
 
 
 def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
@@ -112,66 +110,9 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         servo=SERVO,
         script=SWEEPS if cell.motion in SEARCHING else SWEEP_THEN_FOLLOW,
         truth_visible=bool(drones),
+        autopilot=AutopilotSettings() if conditions.autopilot and drones else None,
         weather=RAIN if conditions.rain else Weather(),
         vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,
         rig=RigLidar(mount=known) if conditions.calibrated else straight,
         true_mount=straight.mount if conditions.calibrated else None,
     )
-
-
-def is_made(file: FilePath, scenario: Scenario, closed_loop: str | None) -> bool:
-    """Whether a file is the complete recording of this scenario, made in the same way."""
-    if not file.is_file():
-        return False
-    try:
-        with RecordingReader(file) as reader:
-            same = reader.config_yaml == scenario.as_yaml() and reader.metadata.get("closed_loop") == closed_loop
-            return same and reader.finished
-    except LinkError:
-        return False
-
-
-@dataclass(frozen=True)
-class MatrixReport:
-    """What a run over the matrix did."""
-
-    made: int
-    kept: int  # were there, complete and the same
-    impossible: tuple[str, ...]  # cells that a seed's scene has no place for, in words
-
-
-def make_matrix(
-    folder: FilePath,
-    wanted: list[Cell],
-    seeds: range,
-    closed_loop: FilePath | None,
-    progress: Callable[[float, float], None],
-    conditions: Conditions | None = None,
-) -> MatrixReport:
-    """Make what is missing: `folder/<cell>-s<seed>.mcap`. `progress` is told simulated seconds done and in all."""
-    folder.mkdir(parents=True, exist_ok=True)
-    whole_s = sum(cell.duration_s for cell in wanted) * len(seeds)
-    done_s, made, kept = 0.0, 0, 0
-    impossible: list[str] = []
-    for seed, cell in product(seeds, wanted):
-        file = folder / f"{cell.name}-s{seed}.mcap"
-        try:
-            scenario = scenario_of(cell, seed, conditions)
-        except LinkError as error:
-            impossible.append(f"seed {seed}: {error}")
-        else:
-            if is_made(file, scenario, closed_loop and closed_loop.name):
-                kept += 1
-            else:
-                start_s = done_s
-                simulate_into(
-                    file,
-                    scenario,
-                    progress=lambda share, cell=cell, at=start_s: progress(at + share * cell.duration_s, whole_s),
-                    overwrite=True,
-                    closed_loop=closed_loop,
-                )
-                made += 1
-        done_s += cell.duration_s
-        progress(done_s, whole_s)
-    return MatrixReport(made, kept, tuple(impossible))

@@ -218,7 +218,10 @@ def simulate(
     """
     asked = {"seed": seed, "duration_s": duration_s}
     checked = load_scenario(scenario).changed(**{name: value for name, value in asked.items() if value is not None})
-    return simulate_into(out, checked, progress, overwrite, closed_loop)
+    loop = None
+    if closed_loop is not None:
+        loop = load_loop(closed_loop, checked.rig_yaml(), f"{checked.name} (rig)", checked.closed_loop)
+    return simulate_into(out, checked, progress, overwrite, loop)
 
 
 def simulate_into(
@@ -226,17 +229,14 @@ def simulate_into(
     checked: Scenario,
     progress: Callable[[float], None] | None = None,
     overwrite: bool = False,
-    closed_loop: FilePath | None = None,
+    loop: ClosedLoop | None = None,
 ) -> SimulationReport:
     """The same for a scenario in memory. The recording keeps the whole scenario, with every setting, as its config."""
     began = time.perf_counter()
-    loop = None
-    if closed_loop is not None:
-        loop = load_loop(closed_loop, checked.rig_yaml(), f"{checked.name} (rig)", checked.closed_loop)
     simulation = Simulation(checked, loop=loop)
     metadata = {"made_by": "grd simulate", "scenario": checked.name, "seed": str(simulation.seed)}
-    if closed_loop is not None:
-        metadata["closed_loop"] = closed_loop.name
+    if loop is not None:
+        metadata |= loop.made_with
     count = 0
     with RecordingWriter(
         out,

@@ -4,7 +4,7 @@
     candidate                  look at it and at what is around it until the detector has decided, then go on
     TRACKING, COASTING         each turn of the rotor one beam on the predicted place, a little beside it in turn;
                                while coasting farther and farther beside it, then sweep
-    several drones             a few turns for each in turn
+    several drones             a few turns for each in turn; fewer than expected: a piece of the sweep between
 
 The rotor's azimuth says when it passes a direction next. The table is moved between two passes and stands still when
 the rotor passes, so that offsets are chosen, not left to a beat between two periods. Of all beams that can be put on
@@ -33,6 +33,11 @@ from stages.aim.beams import (
 from stages.geometry import Array64, LidarMount
 from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, TrackingState, TrackState
 
+TOLD_NS = 12_000_000  # after its pass a look has been told of
+INNER_DEG = 8.0
+GLANCE_DEG = 12.0  # beside the sweep: its fan is 30 deg wide
+MOST_DONE = 256
+TARGET_SHARE = 0.5  # of its span: so wide a drone returns beams
 RPM_RADPS = math.tau / 60.0
 
 
@@ -50,6 +55,7 @@ class _Target:
     glance: bool = False  # looked at in passing, the sweep goes on
     seen_looks: int = 0  # turns in which the detector saw it
     looks: int = 0  # planned for it
+    missed: int = 0  # of them since it was seen last
     heard_ns: int = 0
 
     def at(self, stamp_ns: int) -> Array64:
@@ -75,15 +81,16 @@ class _Now:
     rotor: _Rotor = field(default_factory=_Rotor)
     elevations_rad: tuple[float, ...] = ()
     targets: dict[tuple[str, int], _Target] = field(default_factory=lambda: dict[tuple[str, int], _Target]())
-    places: list[tuple[int, Array64]] = field(default_factory=lambda: list[tuple[int, Array64]]())  # and where
-    done: dict[int, int] = field(default_factory=lambda: dict[int, int]())  # candidates looked at long enough: when
+    done: dict[int, tuple[int, int]] = field(default_factory=lambda: dict[int, tuple[int, int]]())  # see `_leave`
     goal_rad: float | None = None
     hold_until_ns: int = 0  # a look is planned until then
     sweep_up: bool = True
+    swept_rad: float | None = None  # how far the sweep has come while glances are taken beside it
     nearest_rad: float = math.inf
     nearer_ns: int = 0
     current: tuple[str, int] | None = None
     turns: int = 0  # in a row for the current one
+    search_until_ns: int = 0  # for more drones
 
 
 class BeamAim(Stage):
@@ -100,12 +107,15 @@ class BeamAim(Stage):
     settle_s: float = Field(0.015, ge=0)  # from arriving to standing still
     candidate_looks: int = Field(25, ge=1)  # then it is left alone for `candidate_rest_s`
     candidate_rest_s: float = Field(1.0, gt=0)
-    candidate_probability: float = Field(0.015, ge=0, lt=1)  # less is not worth stopping for
-    stop_probability: float = Field(0.25, ge=0, le=1)  # more, met three times, interrupts the sweep
-    stop_looks: int = Field(3, ge=1)  # it was seen in so many turns of the rotor before it interrupts the sweep
+    candidate_probability: float = Field(0.006, ge=0, lt=1)  # less is not worth stopping for
+    stop_probability: float = Field(0.35, ge=0, le=1)  # more, met `stop_looks` times, interrupts the sweep
+    patience: int = Field(8, ge=1)  # looks in a row that did not meet a candidate
+    stop_looks: int = Field(2, ge=1)  # it was seen in so many turns of the rotor before it interrupts the sweep
     glances: int = Field(3, ge=0)  # at a candidate in passing
-    glance_probability: float = Field(0.03, ge=0, le=1)
+    glance_probability: float = Field(0.006, ge=0, le=1)
     turns_each: int = Field(3, ge=1)  # for each of several drones
+    max_drones: int = Field(1, ge=1, le=8)  # with fewer tracks the search goes on between looks at them
+    search_s: float = Field(0.35, gt=0)  # at a time
     beams: bool = True  # ablation: without, the middle of the fan is put on the drone
     coast_search_s: float = Field(3.0, gt=0)  # coasting longer, the whole travel is swept
 
@@ -139,11 +149,8 @@ class BeamAim(Stage):
             if candidates.probability[i] < self.candidate_probability:
                 now.targets.pop(("candidate", number), None)
                 continue
-            if candidates.stamp_ns - now.done.get(number, -(10**18)) < self.candidate_rest_s * 1e9:
-                continue
-            now.done.pop(number, None)
-            xyz = candidates.xyz_vehicle_m[i]
-            if any(np.linalg.norm(xyz - place) < 1.0 for _, place in now.places):
+            rest_until_ns, _ = now.done.get(number, (0, 0))
+            if candidates.stamp_ns < rest_until_ns:
                 continue
             old = now.targets.get(("candidate", number))
             age_s = (candidates.stamp_ns - int(candidates.seen_ns[i])) * 1e-9
@@ -158,6 +165,7 @@ class BeamAim(Stage):
                 seen_looks=int(candidates.looks[i]),
                 glance=old.glance if old else False,
                 looks=old.looks if old else 0,
+                missed=old.missed if old and int(candidates.seen_ns[i]) <= old.heard_ns else 0,
                 heard_ns=int(candidates.seen_ns[i]),
             )
 
@@ -171,6 +179,7 @@ class BeamAim(Stage):
         old = now.targets.get(key)
         sigma = 0.3 if state.covariance_m2 is None else math.sqrt(float(np.linalg.eigvalsh(state.covariance_m2)[-1]))
         velocity = np.zeros(3) if state.velocity_vehicle_mps is None else state.velocity_vehicle_mps
+        heard = state.state is TrackingState.TRACKING or old is None
         now.targets[key] = _Target(
             key=key,
             stamp_ns=state.stamp_ns,
@@ -179,7 +188,8 @@ class BeamAim(Stage):
             sigma_m=sigma,
             sure=True,
             looks=old.looks if old else 0,
-            heard_ns=state.stamp_ns if state.state is TrackingState.TRACKING or old is None else old.heard_ns,
+            missed=old.missed if old and state.hits == 0 else 0,
+            heard_ns=state.stamp_ns if heard else old.heard_ns,
         )
 
     def on_servo(self, servo: ServoState) -> ServoGoal | None:
@@ -208,8 +218,9 @@ class BeamAim(Stage):
                 self._leave(target, now_ns)
             elif now_ns - target.heard_ns > 1.2e9:
                 del now.targets[key]
-        now.places = [place for place in now.places if now_ns - place[0] < 4e9]
         sure = [t for t in now.targets.values() if t.sure and now_ns - t.heard_ns < self.coast_search_s * 1e9]
+        if sure and len(sure) < self.max_drones and self._searches_on(sure, now_ns):
+            return self._candidate(now_ns)
         if sure:
             if now.current in [t.key for t in sure] and (len(sure) == 1 or now.turns < self.turns_each):
                 return now.targets[now.current]  # pyright: ignore[reportArgumentType]
@@ -218,6 +229,14 @@ class BeamAim(Stage):
             return (after or order)[0]
         return self._candidate(now_ns)
 
+    def _searches_on(self, sure: list[_Target], now_ns: int) -> bool:
+        """Whether the turns for each track are over, and it is time to look for others."""
+        now = self._now
+        looked_at = now.current in [t.key for t in sure]
+        if looked_at and now.turns + 1 >= self.turns_each * len(sure) and now_ns >= now.hold_until_ns:
+            now.search_until_ns = now_ns + round(self.search_s * 1e9)
+        return now_ns < now.search_until_ns
+
     def _candidate(self, now_ns: int) -> _Target | None:
         """The one to stop at, else the one to glance at in passing; None: sweep on."""
         now = self._now
@@ -225,9 +244,9 @@ class BeamAim(Stage):
         current = None if now.current is None else now.targets.get(now.current)
         worth = [t for t in maybe if t.probability >= self.stop_probability and t.seen_looks >= self.stop_looks]
         if current in worth and not current.glance:
-            if current.looks < 4 or (current.seen_looks > 0.4 * current.looks and current.probability > 0.12):
+            if current.missed < self.patience and current.probability > 0.5 * self.stop_probability:
                 return current
-            self._leave(current, now_ns)  # it is seldom there, or most likely something else
+            self._leave(current, now_ns)  # it is not there, or most likely something else
             worth.remove(current)
         if worth:
             best = max(worth, key=lambda t: (t.probability / (1.0 + t.looks), t.key))
@@ -244,10 +263,13 @@ class BeamAim(Stage):
         return max(fresh, key=lambda t: (t.probability / (1.0 + t.looks), t.key), default=None)
 
     def _leave(self, target: _Target, now_ns: int) -> None:
-        """Looked at long enough: leave it, and what stands there, alone for a while."""
-        self._now.done[target.key[1]] = now_ns
-        self._now.targets.pop(target.key, None)
-        self._now.places.append((now_ns, target.at(now_ns)))
+        """Looked at long enough: leave it alone for a while, each time for longer."""
+        now, number = self._now, target.key[1]
+        _, times = now.done.get(number, (0, 0))
+        now.done[number] = now_ns + round(self.candidate_rest_s * 2 ** min(times, 4) * 1e9), times + 1
+        now.targets.pop(target.key, None)
+        if len(now.done) > MOST_DONE:
+            del now.done[min(now.done)]  # the oldest number
 
     # one look
 
@@ -256,25 +278,25 @@ class BeamAim(Stage):
         now.turns = now.turns + 1 if now.current == target.key else 0
         now.current = target.key
         now.goal_rad = None
+        if not target.glance:
+            now.swept_rad = None
         T = self.mount.T_vehicle_turntable.matrix()
         T_tl = self.mount.T_turntable_lidar.matrix()
         speed = self.limit_rpm * RPM_RADPS
         centre = servo.position_rad
-        if target.glance:  # go on sweeping while looking
-            step = self._search_radps() * math.tau / now.rotor.rate_radps
-            travel = math.radians(self.travel_deg[0]), math.radians(self.travel_deg[1])
-            centre = min(max(centre + (step if now.sweep_up else -step), travel[0]), travel[1])
+        if target.glance:
+            centre = self._swept_rad(servo.position_rad)
         pass_ns = servo.stamp_ns + round((self.lead_s + 0.05) * 1e9)
         best: tuple[float, float, int] | None = None
         for _ in range(2):  # the place at the pass depends on when that is
             place = T[:3, :3].T @ (target.at(pass_ns) - T[:3, 3])
             range_m = max(float(np.linalg.norm(place - T_tl[:3, 3])), 0.5)
-            offset_rad = self._offset_m(target, range_m, servo.stamp_ns) / range_m
-            best = self._best(centre, place, offset_rad, T_tl)
+            offset_rad = self._offset_m(target, range_m) / range_m
+            best = self._best(centre, place, offset_rad, T_tl, math.inf if target.glance else math.radians(INNER_DEG))
             if best is None:
                 return self._sweep(servo)
             goal, theta, _ = best
-            if target.glance and abs(goal - centre) > math.radians(12.0):
+            if target.glance and abs(goal - centre) > math.radians(GLANCE_DEG):
                 target.looks = self.glances  # the fan has passed it
                 return self._sweep(servo)
             ready_ns = servo.stamp_ns + round(
@@ -283,31 +305,39 @@ class BeamAim(Stage):
             pass_ns = now.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, place, theta), ready_ns)
         assert best is not None
         self._now.targets[target.key].looks += 1
-        now.hold_until_ns = max(pass_ns + 4_000_000, servo.stamp_ns + 5_000_000)
+        self._now.targets[target.key].missed += 1
+        now.hold_until_ns = max(pass_ns + TOLD_NS, servo.stamp_ns + 5_000_000)
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=best[0], speed_radps=speed)
 
-    def _offset_m(self, target: _Target, range_m: float, now_ns: int) -> float:
-        """How far beside the place the beam goes, look by look."""
-        k = target.looks
-        if target.sure:
-            wide = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * self.span_m + 0.35 * target.sigma_m
-            silent_s = (now_ns - target.heard_ns) * 1e-9
-            if silent_s > 0.3:
-                wide = max(wide, math.radians(1.0) * range_m)
-            return wide * low_discrepancy(k % 16)
-        if k % 5 == 4:  # what is around it
-            return math.radians(1.2) * range_m * low_discrepancy(k // 5 % 8)
-        return (0.04 * self.span_m + 0.2 * target.sigma_m) * low_discrepancy(k % 8)
+    def _offset_m(self, target: _Target, range_m: float) -> float:
+        """How far beside the place the beam goes, look by look.
 
-    def _best(self, at_rad: float, place: Array64, offset_rad: float, T_tl: Array64) -> tuple[float, float, int] | None:
-        """(servo position, table angle, beam) that puts a beam `offset_rad` beside a place, the cheapest one."""
+        A drone that is met: a little to each side, its edges tell where it is. One that was missed: half a drone to one
+        side, to the other, farther, until the next beam of the fan has been where this one began.
+        """
+        tries = target.missed - 1 if target.sure else target.missed
+        if target.sure and tries < 1:
+            wide = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * self.span_m + 0.35 * target.sigma_m
+            return wide * low_discrepancy(target.looks % 16)
+        spacing_m = self._spacing_rad() * range_m
+        count = max(math.ceil(spacing_m / (TARGET_SHARE * self.span_m)), 1)
+        k = tries % count
+        return (k + 1) // 2 * (1 if k % 2 else -1) * spacing_m / count
+
+    def _best(
+        self, at_rad: float, place: Array64, offset_rad: float, T_tl: Array64, inner_rad: float
+    ) -> tuple[float, float, int] | None:
+        """(servo position, table angle, beam) that puts a beam `offset_rad` beside a place, the cheapest one.
+
+        Beams farther out than inner_rad are dear: beyond the last one nothing is seen of a drone that flies on.
+        """
         travel = math.radians(self.travel_deg[0]), math.radians(self.travel_deg[1])
         best: tuple[float, float, float, int] | None = None
         elevations = self._now.elevations_rad if self.beams else (0.0,)
         for beam, w in enumerate(elevations):
             for theta in table_angles_rad(T_tl, place, w + offset_rad):
                 for servo in servo_positions_rad(self.mount, theta, travel):
-                    cost = abs(servo - at_rad) + 0.5 * abs(w)
+                    cost = abs(servo - at_rad) + 0.5 * abs(w) + 3.0 * max(abs(w) - inner_rad, 0.0)
                     if best is None or cost < best[0]:
                         best = (cost, servo, theta, beam)
         if best is None and self.beams:  # nearly on the axis, or just beyond the travel: as near as it gets
@@ -322,8 +352,20 @@ class BeamAim(Stage):
 
     # search
 
+    def _swept_rad(self, position_rad: float) -> float:
+        """Where the sweep is by the next turn of the rotor; it goes on while something is glanced at beside it."""
+        now = self._now
+        low, high = math.radians(self.travel_deg[0]), math.radians(self.travel_deg[1])
+        step = self._search_radps() * math.tau / now.rotor.rate_radps
+        at = position_rad if now.swept_rad is None else now.swept_rad
+        if not low <= at + (step if now.sweep_up else -step) <= high:
+            now.sweep_up = not now.sweep_up
+        now.swept_rad = min(max(at + (step if now.sweep_up else -step), low), high)
+        return now.swept_rad
+
     def _sweep(self, servo: ServoState) -> ServoGoal | None:
         now = self._now
+        now.swept_rad = None
         low, high = math.radians(self.travel_deg[0]), math.radians(self.travel_deg[1])
         left = math.inf if now.goal_rad is None else abs(now.goal_rad - servo.position_rad)
         if left < now.nearest_rad:
@@ -341,11 +383,16 @@ class BeamAim(Stage):
         now.nearest_rad, now.nearer_ns = math.inf, servo.stamp_ns
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=now.goal_rad, speed_radps=self._search_radps())
 
+    def _spacing_rad(self) -> float:
+        """Between two beams of the fan."""
+        w = self._now.elevations_rad
+        return (w[-1] - w[0]) / (len(w) - 1) if len(w) > 1 else math.tau
+
     def _search_radps(self) -> float:
         now = self._now
         wanted = self.search_rpm * RPM_RADPS
         if now.rotor.rate_radps <= 0 or len(now.elevations_rad) < 2:
             return min(wanted, self.limit_rpm * RPM_RADPS)
-        spacing = (now.elevations_rad[-1] - now.elevations_rad[0]) / (len(now.elevations_rad) - 1)
+        spacing = self._spacing_rad()
         turn_s = math.tau / now.rotor.rate_radps
         return min(sweep_step_rad(spacing, wanted * turn_s) / turn_s, self.limit_rpm * RPM_RADPS)

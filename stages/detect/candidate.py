@@ -15,14 +15,17 @@ import numpy as np
 
 from stages.detect.flight import Motion, fit_motion, moves
 from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
+from stages.detect.telemetry import Heard
 from stages.geometry import Array64
 
 HISTORY = 40  # sightings
 SAME_LOOK_NS = 30_000_000
 FADING = 0.95  # what stood beside it counts less with each look since
-ALONE_PER_M = 0.0165  # share of looks at a drone that find one return alone, over range
+ALONE_PER_M = 0.0165  # share of looks at a drone that find one return alone (nearby: few), over range
 WIRE_ALONE = 0.75  # and of those at a wire
+FEW_M = 19.0  # over range: so few returns are few even nearby; a quarter of those of a beam across a drone of 0.5 m
 SIGMA_M = 0.15  # of a sighting
+STANDING_M = 0.6  # what stands is met again within this
 ACCELERATION_MPS2 = 4.0
 
 
@@ -72,6 +75,8 @@ class Candidate:
     seen_ns: int = 0
     odds: float = 0.0  # as last judged
     why: str = ""
+    suspect: str = ""  # what it is if it is no drone
+    among: bool = False  # where it appeared, something had been refused
     accepted: bool = False
     announced: bool = False  # as accepted
     told: bool = False  # it is worth another look
@@ -81,6 +86,7 @@ class Candidate:
     steady_s: float = 0.0  # for how long it clearly flew straight on
     beside_m: list[Array64] = field(default_factory=lambda: list[Array64]())  # its path seen from the vehicle's place
     path_m: list[Array64] = field(default_factory=lambda: list[Array64]())
+    heard: Heard | None = None  # its path against what the drone tells of its own; None: the drone is silent
 
     def predict(self, stamp_ns: int) -> tuple[Array64, float]:
         """Position (3,) and its variance [m^2] at a time."""
@@ -89,6 +95,15 @@ class Candidate:
         return self.xyz_m + dt * self.velocity_mps, a + 2 * dt * b + dt * dt * c + (
             ACCELERATION_MPS2 * dt * dt
         ) ** 2 / 4
+
+    def as_drone(self, stamp_ns: int, usual_mps: Array64, spread_mps: float) -> tuple[Array64, Array64]:
+        """Position and velocity (3,) at a time if it is a drone, which usually flies so, one sigma on each axis.
+
+        After two sightings its velocity is known to some metres a second; a drone's is better known beforehand.
+        """
+        share = spread_mps**2 / (spread_mps**2 + self.p[2])
+        velocity = usual_mps + share * (self.velocity_mps - usual_mps)
+        return self.xyz_m + (stamp_ns - self.stamp_ns) * 1e-9 * velocity, velocity
 
     def see(self, s: Sighting) -> None:
         """Take in one more sighting."""
@@ -111,8 +126,9 @@ class Candidate:
         """Count what this look says of it."""
         self.hits += s.hits
         self.long_looks += s.too_long
-        alone = min(ALONE_PER_M * s.range_m, 0.7)
-        self.few += math.log(alone / WIRE_ALONE) if s.hits == 1 else math.log((1 - alone) / (1 - WIRE_ALONE))
+        alone = min(max(ALONE_PER_M * s.range_m, 0.1), 0.7)
+        few = s.hits <= max(1.0, FEW_M / s.range_m)
+        self.few += math.log(alone / WIRE_ALONE) if few else math.log((1 - alone) / (1 - WIRE_ALONE))
         self.balls += s.balls
         self.rugged += s.rugged
         self.free += s.around[FREE_0 : FREE_0 + SECTORS] >= 2
@@ -152,6 +168,17 @@ class Candidate:
         else:
             calm = flown is not None and flown.calm
         self.calm_s += min(since_s, 0.8) * calm
+
+    @property
+    def stands(self) -> bool:
+        """Whether its last sightings lie in one place, as far as they tell: it was looked at, and did not go."""
+        place = np.array(self.path_m[-8:])
+        return self.hit_looks >= 3 and float(np.ptp(place, axis=0).max()) < STANDING_M
+
+    def wake(self, stamp_ns: int) -> None:
+        """It is met again where it stood."""
+        self.xyz_m, self.velocity_mps = np.mean(self.path_m[-8:], axis=0), np.zeros(3)
+        self.stamp_ns, self.p = stamp_ns, (0.3**2, 0.0, 0.5**2)
 
     def moves(self, motion_known: bool) -> bool:
         """Whether it has clearly moved in the world; see `stages/detect/flight.py`."""

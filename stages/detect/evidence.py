@@ -15,7 +15,7 @@ Source: ours, for P III.B; DESIGN, The graph: detect.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -24,16 +24,30 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
-from stages.detect.candidate import SAME_LOOK_NS, SIGMA_M, Candidate, Sighting
+from stages.detect.candidate import SAME_LOOK_NS, SIGMA_M, STANDING_M, Candidate, Sighting
+from stages.detect.flight import scatter_m
 from stages.detect.sightings import Limits, SightingFinder, Slice
-from stages.detect.surroundings import INNER_HITS, INNER_PASSES, TALLY, look_around
+from stages.detect.surroundings import INNER_HITS, INNER_PASSES, TALLY, BigThings, look_around
+from stages.detect.telemetry import DroneTelemetry, hear
 from stages.detect.telling import candidates_message, detections_message, odds_of
-from stages.detect.verdict import Evidence, judge
-from stages.messages import Candidates, Detections, SweptPulses, VehicleMotion
+from stages.detect.verdict import STANDING, Evidence, judge
+from stages.geometry import Array64
+from stages.messages import (
+    Candidates,
+    Detections,
+    DroneLocalPosition,
+    DroneOdometry,
+    SweptPulses,
+    VehicleMotion,
+)
 from stages.sweep import Travel
 from stages.trail import VehicleTrail
 
 BANK_TIDIED = 64  # slices: about ten times a second
+AMONG_M = 1.5
+AMONG_NS = 20_000_000_000
+MOST_STANDING = 64
+STANDING_NS = 60_000_000_000  # for so long it is known that something stands there
 FURTHEST_STEP_M = 2.5  # from where it was expected
 START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 
@@ -54,7 +68,10 @@ class _Now:
     finder: SightingFinder
     travel: Travel
     trail: VehicleTrail = field(default_factory=VehicleTrail)
+    told: tuple[DroneTelemetry, DroneTelemetry] = field(default_factory=lambda: (DroneTelemetry(), DroneTelemetry()))
     bank: list[Candidate] = field(default_factory=lambda: list[Candidate]())
+    standing: deque[Candidate] = field(default_factory=lambda: deque[Candidate](maxlen=MOST_STANDING))
+    refused_places: BigThings = field(default_factory=BigThings)
     watches: dict[int, _Watch] = field(default_factory=lambda: dict[int, _Watch]())
     refused: Counter[str] = field(default_factory=Counter[str])
     slices: int = 0
@@ -66,15 +83,15 @@ class _Now:
 class EvidenceDetect(Stage):
     """Small, alone, seen to be free all around, again and again: a drone. What is refused is refused with a reason."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion", "drone_position", "drone_odometry"})
 
     span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
     lowest_deg: float = Field(4.0, ge=-30, le=80)  # candidates are this far above the LiDAR's horizon
     nearest_m: float = Field(1.5, ge=0.3)
     furthest_m: float = Field(65.0, gt=1)
     clear_m: float = Field(2.0, gt=0.2)  # a lamp hangs this far from its pole; so near nothing may stand
-    accept_probability: float = Field(0.99, gt=0.5, lt=1)
-    look_again_probability: float = Field(0.015, gt=0, lt=0.5)
+    accept_probability: float = Field(0.995, gt=0.5, lt=1)
+    look_again_probability: float = Field(0.006, gt=0, lt=0.5)
     report_s: float = Field(1.0, gt=0.05)
     settle_s: float = Field(0.15, ge=0)  # what was seen just before the end of a pass is judged with it
     sweep_deg: float = Field(180.0, gt=3, le=360)
@@ -95,6 +112,15 @@ class EvidenceDetect(Stage):
     def on_motion(self, motion: VehicleMotion) -> None:
         """Where the vehicle is. Without it nothing is taken to move but what rises or sinks, unless `parked` is set."""
         self._now.trail.add(motion)
+
+    def on_drone_position(self, position: DroneLocalPosition) -> None:
+        """What the drone says of its flight; without it birds and lamps are told by how they fly alone."""
+        self._now.told[0].add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+
+    def on_drone_odometry(self, odometry: DroneOdometry) -> None:
+        """The same from an autopilot that sends this."""
+        velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
+        self._now.told[1].add(odometry.stamp_ns, odometry.xyz_local_m, velocity)
 
     def on_pulses(self, pulses: SweptPulses) -> Iterator[Candidates | Detections]:
         """One slice: judge the sightings that are complete with it, tell what changed."""
@@ -127,6 +153,7 @@ class EvidenceDetect(Stage):
             cost = away * away / (variance + SIGMA_M**2)
             if cost < least and away < FURTHEST_STEP_M:
                 best, least = c, cost
+        best = best or self._wake(now, s)
         if best is not None:
             best.see(s)
             return self._weigh(now, best)
@@ -141,17 +168,33 @@ class EvidenceDetect(Stage):
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
             first_hits=s.hits,
         )
+        since_ns = s.stamp_ns - (AMONG_NS if self.parked or now.trail.known else AMONG_NS // 20)
+        new.among = math.isfinite(now.refused_places.nearest_m(s.xyz_local_m, 0.0, AMONG_M, since_ns))
         new.note(s)
         news = self._weigh(now, new)
         if new.told:
             now.bank.append(new)
         else:
             now.refused[why_refused(new.why)] += 1
+            self._remember(now, new)
         return news
+
+    def _wake(self, now: _Now, s: Sighting) -> Candidate | None:
+        """Something that was looked at before and stood there: it goes on where it was, and is not looked at anew."""
+        for c in now.standing:
+            if float(np.linalg.norm(c.xyz_m - s.xyz_local_m)) < STANDING_M:
+                now.standing.remove(c)
+                c.wake(s.stamp_ns)
+                now.bank.append(c)
+                return c
+        return None
 
     def _weigh(self, now: _Now, c: Candidate) -> bool:
         """Judge it anew. True when that is news."""
-        c.odds, c.why = judge(c, self.evidence, self.free_space, self.parked or now.trail.known)
+        c.heard, motion_known = None, self.parked or now.trail.known
+        for told in now.told:
+            c.heard = c.heard or hear(told, c.path_ns, c.path_m, 0.03 + scatter_m(c.range_m), motion_known)
+        c.odds, c.why = judge(c, self.evidence, self.free_space, motion_known)
         accept = odds_of(self.accept_probability)
         c.accepted = c.odds >= accept or (c.accepted and c.odds >= accept - 3.0)
         was, c.told = c.told, c.odds >= odds_of(self.look_again_probability)
@@ -187,13 +230,38 @@ class EvidenceDetect(Stage):
                 del now.watches[c.number]
 
     def _tidy(self, now: _Now, now_ns: int) -> bool:
-        """Drop what was not seen for long; what nobody would look at again sooner. True when one that was told goes."""
-        long_ns, soon_ns = self.forget_s * 1e9, 0.35e9
-        kept = [c for c in now.bank if now_ns - c.seen_ns < (long_ns if c.told else soon_ns)]
+        """Put away what was not seen for long, sooner what was refused. True when one that was told goes."""
+        kept = [c for c in now.bank if now_ns - c.seen_ns < self._kept_ns(c)]
+        for c in now.bank:
+            if now_ns - c.seen_ns >= self._kept_ns(c) and not c.told:
+                self._remember(now, c)
+        if self.parked or now.trail.known:
+            now.standing.extend(c for c in now.bank if now_ns - c.seen_ns >= self._kept_ns(c) and c.stands)
+        while now.standing and now_ns - now.standing[0].seen_ns > STANDING_NS:
+            now.standing.popleft()
         gone = len({c.number for c in now.bank if c.told} - {c.number for c in kept}) > 0
         now.bank = kept
         now.watches = {c.number: now.watches[c.number] for c in kept if c.number in now.watches}
         return gone
+
+    def _usual_flight(self, now: _Now, now_ns: int) -> tuple[Array64, float]:
+        """How a drone flies now, one sigma on each axis: as fast as it says; else it comes along with the vehicle."""
+        speeds = [told.speed_mps(now_ns) for told in now.told]
+        for speed in speeds:
+            if speed is not None:
+                return np.array([0.0, 0.0, speed[1]]), 0.3 + 0.7 * speed[0]
+        return now.trail.velocity_mps(now_ns), START_SPEED_MPS / 2
+
+    def _remember(self, now: _Now, c: Candidate) -> None:
+        """Where something that stands was refused."""
+        if c.suspect == STANDING and (c.hit_looks < 3 or c.stands):
+            now.refused_places.add(c.xyz_m[None], c.seen_ns)
+
+    def _kept_ns(self, c: Candidate) -> float:
+        """How long a candidate is followed without a sighting."""
+        if c.told:
+            return self.forget_s * 1e9
+        return 1.5e9 if c.hit_looks >= 3 else 0.35e9
 
     def _report(self, now: _Now, now_ns: int, turntable_rad: float, changed: bool) -> Iterator[Candidates | Detections]:
         if not math.isnan(turntable_rad):
@@ -204,7 +272,8 @@ class EvidenceDetect(Stage):
         new = [c for c in now.bank if c.accepted and not c.announced]
         if changed or new:
             told = [c for c in now.bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
-            yield candidates_message(told, now.trail, now_ns, self.max_candidates)
+            usual_mps, spread_mps = self._usual_flight(now, now_ns)
+            yield candidates_message(told, now.trail, now_ns, self.max_candidates, usual_mps, spread_mps)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9
         here = any(c.accepted and c.seen_ns >= now.start_ns for c in now.bank)

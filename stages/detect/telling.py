@@ -11,6 +11,7 @@ from collections import Counter
 import numpy as np
 
 from stages.detect.candidate import Candidate
+from stages.geometry import Array64
 from stages.messages import Candidates, Detections
 from stages.trail import VehicleTrail
 
@@ -25,10 +26,12 @@ def odds_of(p: float) -> float:
     return math.log(p / (1.0 - p))
 
 
-def candidates_message(bank: list[Candidate], trail: VehicleTrail, now_ns: int, at_most: int) -> Candidates:
-    """The candidates where they are predicted now, most probable first."""
+def candidates_message(
+    bank: list[Candidate], trail: VehicleTrail, now_ns: int, at_most: int, usual_mps: Array64, spread_mps: float
+) -> Candidates:
+    """The candidates where they are if they are drones, most probable first; see `Candidate.as_drone`."""
     listed = sorted(bank, key=lambda c: -c.odds)[:at_most]
-    seen = [trail.to_vehicle(now_ns, c.predict(now_ns)[0], c.velocity_mps) for c in listed]
+    seen = [trail.to_vehicle(now_ns, *c.as_drone(now_ns, usual_mps, spread_mps)) for c in listed]
     return Candidates(
         stamp_ns=now_ns,
         candidate_id=np.array([c.number for c in listed], dtype=np.int64),

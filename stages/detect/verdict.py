@@ -7,6 +7,8 @@ A drone is weighed against each other thing that returns pulses in the sky, with
     bird                                       it is fast, or turns hard
     balloon                                    it is smooth and round
 
+Where the drone tells how it flies, that decides over still things, birds and balloons (stages/detect/telemetry.py).
+
     odds of a drone = 1 / sum_k exp(-o_k),     o_k = ln of the odds, drone over thing k
 
 Every o_k is a prior and a sum of log likelihood ratios, capped where looks repeat the same evidence. The numbers
@@ -25,6 +27,8 @@ from pydantic import BaseModel, ConfigDict
 
 from stages.detect.candidate import Candidate
 from stages.detect.surroundings import SECTORS
+
+STANDING = "a lamp, wire or edge"
 
 # ln of how much likelier a drone flies so than a bird, by the speed it reaches; of birds there are several
 FLIGHT_MPS = (0.0, 2.0, 4.0, 6.0, 9.0, 12.0)
@@ -46,7 +50,9 @@ class Evidence(BaseModel):
     clutter: float = -6.0  # prior, assumed: of short things in the sky one in 400 hangs free
     free_sector: float = 0.6  # each of eight sectors that pulses flew through
     beside: float = -3.0  # each look with something in a sector
-    alone: float = 0.3  # each look with nothing, up to 2
+    alone: float = 0.3  # each look with nothing, up to most_alone
+    most_alone: float = 2.0
+    most_alone_near: float = 1.5  # more to 10 m if a drone says it flies: no pole hides between beams there
     most_few: float = 6.0  # looks with a single return: a wire gives little else
     most_many: float = 2.0  # and those with more
     near_big: float = 8.0  # a wall, crown or trunk this close, and it has not moved away
@@ -55,6 +61,7 @@ class Evidence(BaseModel):
     moves: float = 5.0  # it moved: what stands does not
     still: float = 0.12  # each look at something that does not, up to most_still: a lamp's pole is found sooner
     most_still: float = 1.5
+    among: float = 2.0  # something was refused beside it, lately: wires are long
 
     bird: float = -0.5
     calm: float = 8.0  # each second in which it would have shown a bird's speed or turn
@@ -64,30 +71,38 @@ class Evidence(BaseModel):
     bird_speed_mps: float = 9.0  # no drone of ours flies faster
     bird_acceleration_mps2: float = 6.0
 
+    birds: float = -1.6  # prior of a bird, where the drone tells how it flies: one drone among five birds
+    told: float = 0.9  # share of what its path says against the drone's telemetry: sightings err together
+    most_told: float = 8.0
+    least_told: float = -12.0
+
     balloon: float = 5.0  # rare
     ball: float = 2.0  # each chord that bulges smoothly
     rugged: float = 1.2  # each chord with five or more returns that does not
 
 
 def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tuple[float, str]:
-    """ln of the odds that it is a drone, and why, in words.
+    """ln of the odds that it is a drone, and why, in words; what else it would be is noted in `c.suspect`.
 
     `free_space` False leaves out what was measured around it; `motion_known`: the vehicle tells how it moves.
     """
     clutter, said = over_clutter(c, e, free_space, motion_known)
     over = {
         "a stray return": over_stray(c, e),
-        "a lamp, wire or edge": clutter,
+        STANDING: clutter,
         "a bird": over_bird(c, e),
-        "a balloon": e.balloon + e.rugged * c.rugged - e.ball * c.balls,
+        "a balloon": over_balloon(c, e),
     }
     least = min(over, key=lambda name: over[name])
     shift = over[least]
+    c.suspect = least
     odds = shift - math.log(sum(math.exp(shift - value) for value in over.values()))
     words = [f"{c.hit_looks} looks, {c.hits} returns", *said]
     if c.motion is not None:
         words.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
-    if flew_as_bird(c, e):
+    if c.heard is not None and max(c.heard) > 3.0:
+        words.append("it flies as the drone says" if min(c.heard) > -3.0 else "it does not fly as the drone says")
+    elif flew_as_bird(c, e):
         words.append("flew as a bird does")
     if odds < 4.0:
         words.append(f"if not a drone, {least}")
@@ -106,7 +121,10 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     odds = e.clutter
     if free_space:
         free = int((c.free >= 1).sum())
-        odds += e.free_sector * free + max(e.beside * c.beside, -12.0) + min(e.alone * c.alone, 2.0)
+        most_alone = e.most_alone
+        if c.heard is not None:
+            most_alone += e.most_alone_near * min(max(2.0 - c.range_m / 10.0, 0.0), 1.0)
+        odds += e.free_sector * free + max(e.beside * c.beside, -12.0) + min(e.alone * c.alone, most_alone)
         said.append(f"{free} of {SECTORS} sectors around it free")
         if c.beside > 0.5:
             said.append("something beside it")
@@ -116,12 +134,18 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
         said.append("single returns")
     if c.long_looks:
         said.append("longer than a drone")
-    moved = c.moves(motion_known)
-    if moved:
-        odds += e.moves
+    if c.heard is not None:
+        moved = e.told * c.heard.over_still > 3.0
+        odds += believed(c.heard.over_still, e)
     else:
+        moved = c.moves(motion_known)
+        odds += e.moves if moved else 0.0
+    if not moved:
         odds += min(e.still * c.hit_looks, e.most_still)
         said.append("it may stand still")
+        if c.among:
+            odds -= e.among
+            said.append("something near it was refused")
     if c.big_looks > 0.3 * c.hit_looks and not moved:
         odds -= e.near_big
         said.append("beside something big" + (f" {c.big_m:.1f} m away" if math.isfinite(c.big_m) else ""))
@@ -133,12 +157,25 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
 
 def over_bird(c: Candidate, e: Evidence) -> float:
     """Drone over bird [nats]."""
+    if c.heard is not None:
+        return e.birds + believed(c.heard.over_bird, e)
     odds = e.bird + min(e.calm * c.calm_s + e.steady * max(c.steady_s - 1.0, 0.0), e.most_calm)
     motion = c.gentler
     if motion is not None:
         flight = float(np.interp(motion.top_mps, FLIGHT_MPS, FLIGHT_NATS))
         odds += flight / (1.0 + (motion.top_sigma_mps / 4.0) ** 2)
     return odds - (e.flew_so if flew_as_bird(c, e) else 0.0)
+
+
+def over_balloon(c: Candidate, e: Evidence) -> float:
+    """Drone over balloon [nats]."""
+    odds = e.balloon + e.rugged * c.rugged - e.ball * c.balls
+    return odds if c.heard is None else odds + believed(c.heard.over_balloon, e)
+
+
+def believed(told: float, e: Evidence) -> float:
+    """What a comparison with the drone's telemetry counts [nats]."""
+    return min(max(e.told * told, e.least_told), e.most_told)
 
 
 def flew_as_bird(c: Candidate, e: Evidence) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 import yaml
+from fast_loop import GRAPH
 from pydantic import PrivateAttr
 
 from flow.graph import load_graph
@@ -27,26 +28,6 @@ from stages.messages import ServoGoal
 ROOT = FilePath(__file__).parents[3]
 SIM = ROOT / "configs/sim.yaml"
 STREET = ROOT / "configs/scenarios/street_sweep.yaml"
-
-GRAPH = """\
-stages:
-  aim:
-    use: stages.aim.SweepVibrateAim
-    config: {mount: $rig.lidar.mount, sweep_rpm: 40}
-    inputs:
-      {servo: servo.servo_state, state: track.track_state, fix: track.drone_fix, detections: detect.detections}
-  sweep:
-    use: stages.sweep.Sweep
-    config: {mount: $rig.lidar.mount, image_size_px: 256}
-    inputs: {firings: lidar.lidar_firings, servo: servo.servo_state}
-  detect: {use: stages.detect.KernelDetect, inputs: {image: sweep.depth_image}}
-  track:
-    use: stages.track.MeanShiftTrack
-    inputs: {points: sweep.swept_points, detections: detect.detections}
-links:
-  lidar: {use: links.velodyne.Lidar}
-  servo: {use: links.dynamixel.Servo, inputs: {goal: aim.servo_goal}}
-"""
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,6 @@ from links.simulated.matrix import (
     VEHICLES,
     Conditions,
     cells,
-    make_matrix,
     scenario_of,
 )
 from links.simulated.matrix_flights import Cell, drone_path, two_paths
@@ -213,34 +212,6 @@ def test_a_seed_makes_one_scenario_and_another_seed_another() -> None:
 def test_a_scenario_survives_its_own_yaml() -> None:
     scenario = scenario_of(Cell("atlanta", 10, "orbit", "turning"), 4)
     assert Scenario.model_validate(yaml.safe_load(scenario.as_yaml())) == scenario
-
-
-def test_what_is_there_and_whole_is_kept_and_all_else_made_again(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matrix_flights, "USUAL_DURATION_S", 0.2)
-    wanted, told = cells(["open_lot-10m-hover-*"]), []
-    first = make_matrix(tmp_path, wanted, range(1, 2), None, lambda done, whole: told.append((done, whole)))
-    assert (first.made, first.kept, first.impossible) == (3, 0, ())
-    assert told[-1] == pytest.approx((0.6, 0.6))
-    file = tmp_path / "open_lot-10m-hover-parked-s1.mcap"
-    with RecordingReader(file) as reader:
-        assert reader.metadata["scenario"] == "open_lot-10m-hover-parked"
-    whole = file.read_bytes()
-    file.write_bytes(whole[: len(whole) // 2])
-    again = make_matrix(tmp_path, wanted, range(1, 2), None, lambda done, whole: None)
-    assert (again.made, again.kept) == (1, 2)
-    assert file.read_bytes() == whole
-    wet = Conditions(rain=True)
-    third = make_matrix(tmp_path, wanted[:1], range(1, 2), None, lambda done, whole: None, wet)
-    assert (third.made, third.kept) == (1, 0)
-
-
-def test_a_scene_without_a_place_is_told_and_the_rest_is_made(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(matrix_flights.DURATION_S, "occlusion", 0.3)
-    report = make_matrix(
-        tmp_path, [Cell("open_lot", 35, "occlusion", "parked")], range(1, 2), None, lambda done, whole: None
-    )
-    assert report.made == 0
-    assert report.impossible[0].startswith("seed 1: open_lot-35m-occlusion-parked: no free flight of this kind")
 
 
 def test_the_command_names_cells_and_refuses_a_pattern_that_fits_none(tmp_path: FilePath) -> None:

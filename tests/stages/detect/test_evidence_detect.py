@@ -57,7 +57,7 @@ def reasons_of(candidates):
 
 
 def test_ports_are_what_the_graph_wires():
-    assert list(input_ports(EvidenceDetect)) == ["motion", "pulses"]
+    assert list(input_ports(EvidenceDetect)) == ["motion", "drone_position", "drone_odometry", "pulses"]
     assert set(output_ports(EvidenceDetect)) == {"candidates", "detections"}
     assert EvidenceDetect.optional_inputs == {"motion"}
 

@@ -1,0 +1,201 @@
+"""The folder that a run leaves: its configuration, its results, what truth says of them, and a summary.
+
+A replay fills it, and so does a closed loop while its recording is made: one graph leaves the same files both ways.
+
+Source: DESIGN, Outputs of a run.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import yaml
+
+from flow.draw import mermaid
+from flow.graph import Graph, load_graph
+from flow.link import LinkError, Run, Tap
+from flow.problem import Place
+from flow.replay import RunReport, replay
+from flow.taps import Digest
+from flow.tree import Section
+from links.recording import Progress, RecordingReader
+from links.results import SUMMARY_FILE, Results, stamp_s
+from links.truth import FixErrors, TruthLog
+
+CONFIG_FILE = "config.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A configuration as it was asked for: a file, files laid over it, and settings changed."""
+
+    config: Path
+    overlays: tuple[Path, ...] = ()
+    sets: tuple[str, ...] = ()
+
+    def graph(self, rig_yaml: str | None, where: str) -> Graph:
+        """The graph, on a rig of its own or (None) the configuration's. Raises ConfigError; LinkError for the rig."""
+        sections: dict[str, Section] | None = None
+        if rig_yaml is not None:
+            place = Place(where, 0)
+            try:
+                sections = {"rig": (yaml.safe_load(rig_yaml), place)}
+            except yaml.YAMLError as error:
+                raise LinkError(f"{place} is not YAML: {str(error).splitlines()[0]}") from None
+        return load_graph(self.config, self.overlays, self.sets, sections)
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """A run that is done, for telling about it."""
+
+    recording: Path
+    out_dir: Path
+    report: RunReport
+    results: Results
+    errors: FixErrors | None
+    digest: str
+    wall_s: float
+    warnings: list[str]
+
+
+class RunFolder:
+    """`with RunFolder(folder, recording, asked, graph) as run`: a run tells `run.taps` all; `run.finish` ends it.
+
+    The summary comes last: a folder without one holds a run that was stopped.
+    """
+
+    def __init__(self, folder: Path, recording: Path, asked: Asked, graph: Graph, began_s: float | None = None) -> None:
+        """`began_s`: when the run began on the monotonic clock, now if not said."""
+        self._folder, self._recording, self._asked, self._graph = folder, recording, asked, graph
+        self._began_s = time.monotonic() if began_s is None else began_s
+        self._results, self._open = Results(), ExitStack()
+        declared = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
+        self.taps: list[Tap] = [self._results, *(tap for tap in declared if isinstance(tap, Tap))]
+
+    def __enter__(self) -> RunFolder:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        (self._folder / SUMMARY_FILE).unlink(missing_ok=True)
+        about = Run(self._folder, self._recording.stem, mermaid(self._graph), self._graph.settings_yaml())
+        (self._folder / CONFIG_FILE).write_text(about.settings_yaml, encoding="utf-8")
+        with ExitStack() as opening:
+            for tap in self.taps:
+                tap.open(about)
+                opening.callback(tap.close)
+            self._open = opening.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._open.close()
+
+    def finish(self, report: RunReport, output_hash: str, truth: TruthLog, warnings: list[str]) -> Finished:
+        """End the run: `warnings` are its recording's, `truth` is what the recording says of the drones."""
+        warnings = [*warnings, *_remarks(self._graph, report)]
+        for text in (*warnings, f"output hash {output_hash}"):
+            self._results.note(text)
+        self._open.close()
+        truth.write(self._folder)
+        finished = Finished(
+            recording=self._recording,
+            out_dir=self._folder,
+            report=report,
+            results=self._results,
+            errors=truth.errors_of(self._results.fixes),
+            digest=output_hash,
+            wall_s=time.monotonic() - self._began_s,
+            warnings=warnings,
+        )
+        text = json.dumps(_summary(finished, self._asked), indent=2)
+        (self._folder / SUMMARY_FILE).write_text(text + "\n", encoding="utf-8")
+        return finished
+
+
+def replay_into(folder: Path, recording: Path, asked: Asked, progress: Progress | None = None) -> Finished:
+    """Replay a recording, with its own rig when it has one. Raises ConfigError, LinkError, RunError."""
+    began_s = time.monotonic()
+    with RecordingReader(recording) as reader:
+        graph = asked.graph(reader.rig_yaml, f"{recording} (rig.yaml)")
+        truth, digest = TruthLog(), Digest()
+        with RunFolder(folder, recording, asked, graph, began_s) as run:
+            report = replay(graph, truth.aside(reader.records(progress=progress)), (digest, *run.taps))
+            return run.finish(report, digest.hexdigest(), truth, reader.warnings)
+
+
+def holds_run(folder: Path, recording: Path, graph: Graph) -> bool:
+    """Whether a folder holds the whole run of a graph over a recording: same settings, no older than the recording."""
+    try:
+        is_new = (folder / SUMMARY_FILE).stat().st_mtime_ns >= recording.stat().st_mtime_ns
+        return is_new and (folder / CONFIG_FILE).read_text(encoding="utf-8") == graph.settings_yaml()
+    except FileNotFoundError:
+        return False
+
+
+def _remarks(graph: Graph, report: RunReport) -> list[str]:
+    """What the run did not use, so that a silent port is not taken for a quiet sensor."""
+    remarks = [f"{count} records on {topic} are wired to nothing" for topic, count in report.unwired_topics.items()]
+    silent = [spec.name for spec in graph.nodes.values() if spec.kind == "links" and report.nodes[spec.name].calls == 0]
+    sources = {edge.producer for edge in graph.edges}
+    remarks += [f"the recording holds nothing for '{name}'" for name in silent if name in sources]
+    return remarks
+
+
+def _summary(run: Finished, asked: Asked) -> dict[str, Any]:
+    report, results = run.report, run.results
+    summary: dict[str, Any] = {
+        "grd": version("grd"),
+        "recording": run.recording.name,
+        "config": asked.config.name,
+        "overlays": [path.name for path in asked.overlays],
+        "set": list(asked.sets),
+        "output_hash": run.digest,
+        "records": report.records,
+        "start_s": stamp_s(report.first_ns),
+        "end_s": stamp_s(report.last_ns),
+        "recorded_s": (report.last_ns - report.first_ns) / 1e9,
+        "messages": report.messages,
+        "sweeps": results.sweeps,
+        "sweeps_with_drone": results.sweeps_with_drone,
+        "verdicts": [{"sweeps": count, "example": verdict} for verdict, count in results.verdicts],
+        "fixes": len(results.fixes),
+        "states": [
+            {"stamp_s": stamp_s(t.stamp_ns), "track_id": t.track_id, "state": t.state, "reason": t.reason}
+            for t in results.transitions
+        ],
+        "warnings": run.warnings,
+        "wall_s": round(run.wall_s, 3),
+        "compute_ms": {
+            name: {
+                "calls": node.calls,
+                "p50": round(node.compute.percentile_ns(50) / 1e6, 4),
+                "p99": round(node.compute.percentile_ns(99) / 1e6, 4),
+                "max": round(node.compute.max_ns / 1e6, 4),
+                "total": round(node.compute.total_ns / 1e6, 1),
+            }
+            for name, node in report.nodes.items()
+        },
+    }
+    if run.errors is not None:
+        summary["against_truth"] = _judged(run.errors)
+    return summary
+
+
+def _judged(errors: FixErrors) -> dict[str, Any]:
+    if not len(errors.stamps_ns):
+        return {"fixes": 0, "fixes_without_truth": errors.not_covered}
+    return {
+        "fixes": len(errors.stamps_ns),
+        "fixes_without_truth": errors.not_covered,
+        "rmse_xyz_m": [round(float(v), 4) for v in errors.rmse_xyz_m],
+        "rmse_3d_m": round(errors.rmse_m, 4),
+        "mean_nees_of_3": round(float(errors.nees.mean()), 3),
+        "inside_95_percent_ellipsoid": round(errors.inside_95, 4),
+    }

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from flow.link import Record
 from links.recording import CompressedImage, encode_compressed_image
+from links.simulated.camera_mask import own_body
 from links.simulated.camera_paint import Street
 from links.simulated.camera_rays import CameraScene
 from links.simulated.camera_sensor import SensorSettings, auto_exposure, develop, encode_jpeg, transmission
@@ -178,16 +179,21 @@ def mount_of(carrier: Carrier, settings: CameraSettings, drone: Mesh | None) -> 
     return Pose(xyz_m=(round(x, 4), 0.0, round(z - BELOW_BODY_M, 4)), rpy_deg=LOOKS_DOWN_RPY_DEG)
 
 
-def rig_cameras(settings: CamerasSettings, drone: Mesh | None) -> dict[str, Any]:
-    """The rig file's `cameras:`; empty without cameras."""
+def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Sequence[Mesh]) -> dict[str, Any]:
+    """The rig file's `cameras:`; empty without cameras. `drone`: how its blades may stand; nothing without a drone."""
     tree: dict[str, Any] = {}
     for carrier, one in _wanted(settings):
-        if carrier == "drone" and drone is None:
+        if carrier == "drone" and not drone:
             continue
+        mount = mount_of(carrier, one, drone[0] if drone else None)
+        meshes = [vehicle_from_camera] if carrier == "vehicle" else drone
+        masked_px, max_off_axis_deg = own_body(one.true_lens, one.size_px, mount, meshes)
         tree[carrier] = {
-            f"T_{carrier}_camera": mount_of(carrier, one, drone).model_dump(mode="json", exclude_none=True),
+            f"T_{carrier}_camera": mount.model_dump(mode="json", exclude_none=True),
             "lens": one.true_lens.model_dump(mode="json"),
             "size_px": one.size_px,
+            "masked_px": masked_px,
+            "max_off_axis_deg": max_off_axis_deg,
         }
     return tree
 

@@ -25,6 +25,7 @@ from links.simulated.operator import Segment, Vibrate
 from links.simulated.path import Path
 from links.simulated.ride import RideSettings
 from links.simulated.servo import ServoSettings
+from links.simulated.vehicle import vehicle_mesh_from_camera
 from links.simulated.vehicle_odometry import VehicleOdometrySettings
 from links.simulated.weather import Weather
 from links.simulated.world import SceneSettings
@@ -32,6 +33,7 @@ from stages.geometry import LidarMount, Pose
 
 CLEARANCE_M = 0.3  # a path may not come nearer to the road
 WHEELS_M = 0.15  # a vehicle bounces on its springs by no more
+BLADE_STEPS = 4  # of half a turn: how the blades stand when they hide the view
 YOUNG = ("other_drones", "truth_visible")  # settings that a scenario file holds only where they are used
 
 
@@ -170,7 +172,10 @@ class Scenario(_Settings):
         lidar = self.rig.model_dump(mode="json", exclude_unset=False, exclude_none=True)
         span_m = 0.5 if self.drone is None else self.drone.span_m
         rig: dict[str, Any] = {"version": 1, "lidar": lidar, "drone": {"span_m": span_m}}
-        cameras = rig_cameras(self.cameras, drone_mesh(span_m, model=self.drone.model) if self.drone else None)
+        turns = np.linspace(0.0, np.pi, BLADE_STEPS, endpoint=False)
+        drone = [drone_mesh(span_m, float(turn), self.drone.model) for turn in turns] if self.drone else []
+        vehicle = vehicle_mesh_from_camera(self.vehicle.camera_height_m, self.mount)
+        cameras = rig_cameras(self.cameras, vehicle, drone)
         return yaml.safe_dump(rig | ({"cameras": cameras} if cameras else {}), sort_keys=False)
 
 

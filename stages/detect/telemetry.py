@@ -4,7 +4,8 @@ The autopilot tells its position in a frame of its own: z up, north anywhere, dr
 drone moves as it says, turned by a yaw psi that nobody knows:
 
     drone      x_i = c + Rz(psi) d_i + u t_i + noise           u: drift, a few decimetres a second
-    still      x_i = c + noise                                 a lamp; or scattered along something long
+    still      x_i = c + noise                                 a lamp; or scattered, or met farther and farther along
+                                                               something long
     flier      x_i = c + v t_i + a t_i^2 / 2 + noise           v, a of a bird, or of a balloon
 
 Each is a Gaussian over the path's n points, c and psi are integrated out; ln of the ratio of two marginal likelihoods
@@ -34,6 +35,7 @@ MOST_POINTS = 14
 ANYWHERE_M = 100.0
 DRIFT_MPS = 0.3  # of the autopilot's velocity and the vehicle's, together
 SCATTERED_M = 0.45  # sightings of something long
+SLIDING_MPS = 0.5  # or how fast looks at it wander along
 CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time, speed; else anything up to it
 BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
 BALLOON = (0.7, 0.7, 0.3, 0.4)
@@ -121,9 +123,11 @@ def weigh(t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_kno
         d[:, axis] -= d[:, axis].mean()
     as_drone = _model(t_s, sigma_m, DRIFT_MPS, 0.0)
     as_still, as_long = _model(t_s, sigma_m, 0.0, 0.0), _model(t_s, SCATTERED_M, 0.0, 0.0)
+    as_sliding = _model(t_s, sigma_m, SLIDING_MPS, 0.0)
     up = x[:, 2].copy()
     drone = _log_p(as_drone, t_s, up - d[:, 2])
     still, long = _log_p(as_still, t_s, up), _log_p(as_long, t_s, up)
+    sliding = still
     bird = _log_p(_model(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
     balloon = _log_p(_model(t_s, sigma_m, BALLOON[2], BALLOON[3]), t_s, up)
     if level_known:
@@ -142,12 +146,13 @@ def weigh(t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_kno
             e = x[:, axis].copy()
             still += _log_p(as_still, t_s, e)
             long += _log_p(as_long, t_s, e)
+            sliding += _log_p(as_sliding, t_s, e)
             wheeling += _log_p(as_wheeling, t_s, e)
             balloon += _log_p(as_balloon, t_s, e)
         cruise = math.log(CRUISING) + _log_mean(cruising)
         wheeling += math.log(1.0 - CRUISING)
         bird += max(cruise, wheeling) + math.log1p(math.exp(-abs(cruise - wheeling)))
-    return drone - _log_mean(np.array([still, long])), drone - bird, drone - balloon
+    return drone - _log_mean(np.array([still, long, sliding])), drone - bird, drone - balloon
 
 
 @compiled

@@ -76,7 +76,7 @@ class HitMissTrack(Stage):
     manoeuvre: float = Field(1.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
     coast_after_s: float = Field(0.35, gt=0)
     lost_after_s: float = Field(6.0, gt=0)
-    start_sigma_mps: float = Field(3.0, gt=0)
+    start_sigma_mps: float = Field(1.5, gt=0)  # of the detector's velocity
     pointing_deg: float = Field(0.07, ge=0)  # encoder, play, calibration: constant or slow, one sigma
     shape_m: float = Field(0.02, ge=0)  # the drone's own outline is not round, one sigma
     misses: bool = True  # ablation: without, only hits count
@@ -100,6 +100,8 @@ class HitMissTrack(Stage):
                 candidates.stamp_ns, candidates.xyz_vehicle_m[i], candidates.velocity_vehicle_mps[i]
             )
             known = self._near(xyz, candidates.stamp_ns, number)
+            if known is None and P >= 0.5:
+                known = self._astray(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
             if known is not None:
                 if known.confirmed and P >= 0.5 and self._doubtful(known, candidates.stamp_ns):
                     self._move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
@@ -119,7 +121,7 @@ class HitMissTrack(Stage):
             velocity = detections.velocity_vehicle_mps
             v = np.zeros(3) if velocity is None else velocity[i]
             xyz, v = self._trail.to_local(seen_ns, detections.xyz_vehicle_m[i], v)
-            track = self._near(xyz, seen_ns, number)
+            track = self._near(xyz, seen_ns, number) or self._astray(number, xyz, v, seen_ns, seen_ns)
             if track is not None and track.confirmed and self._doubtful(track, seen_ns):
                 self._move(track, number, xyz, v, seen_ns, seen_ns)
             if track is None:
@@ -180,6 +182,14 @@ class HitMissTrack(Stage):
         track.candidate, track.stamp_ns, track.x, track.P = number, new.stamp_ns, new.x, new.P
         track.last_hit_ns, track.look, track.odds = seen_ns, None, max(track.odds, 2.0)
         track.reason = "found again by the detector"
+
+    def _astray(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> _Track | None:
+        """The confirmed track of this candidate, brought back to it: it followed something else."""
+        track = next((track for track in self._tracks if track.confirmed and track.candidate == number), None)
+        if track is not None:
+            self._move(track, number, xyz, v, seen_ns, stamp_ns)
+            track.reason = "had followed something else, brought back by the detector"
+        return track
 
     def _near(self, xyz: Array64, stamp_ns: int, number: int) -> _Track | None:
         """The track that this is: by the detector's number, or by its place."""

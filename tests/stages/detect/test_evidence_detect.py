@@ -15,14 +15,24 @@ from pydantic import ValidationError
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.detect import EvidenceDetect
-from stages.messages import Candidates, Detections, VehicleMotion
+from stages.detect.candidate import Sighting
+from stages.detect.evidence import AMONG_M, AMONG_NS, STANDING_NS
+from stages.detect.surroundings import FREE_0, SECTORS, TALLY
+from stages.detect.verdict import Evidence, over_clutter
+from stages.geometry import rotation_from_rpy_deg, rotation_z
+from stages.messages import Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
 from tests.stages.caster import Ball, Box, Drone, During, Wire, dithering, flying, pulses_seen, still, sweeping
 from tests.stages.made import ON_ITS_SIDE, START_NS
 
 PLACE_M = (0.0, 8.0, 10.0)  # 12.7 m away, 51 deg up
 WATCHING = dithering(half_rad=math.radians(1.0))  # as the aim does: each turn a beam comes near
 PASS_DEG = 4.5  # so that each swing of it counts as a pass: a verdict every 0.4 s
-HANGING = Drone(still(*PLACE_M))
+MOVING = flying((-0.8, 8.0, 10.0), (0.8, 0.0, 0.4))
+GLIDING = flying((-4.5, 8.0, 10.0), (3.0, 0.0, 0.0))  # as a drone may, and a bird
+
+
+def hanging(seed=0):
+    return Drone(still(*PLACE_M), seed=seed)
 
 
 def motion_at(t_s, velocity_mps=(0.0, 0.0, 0.0)):
@@ -34,17 +44,54 @@ def motion_at(t_s, velocity_mps=(0.0, 0.0, 0.0)):
     )
 
 
-def run(things, seconds=3.0, servo_rad=WATCHING, drives_mps=(0.0, 0.0, 0.0), **settings):
-    """(Candidates, Detections) that the stage tells; drives_mps None: the vehicle does not say how it moves."""
-    stage, told, next_s = EvidenceDetect(**{"sweep_deg": PASS_DEG, **settings}), [], 0.0
+def local_position(way, t_s, R=rotation_z(0.9), origin_m=(30.0, -4.0, 5.0)):
+    """What the drone's autopilot tells of a flight, in a frame of its own."""
+    place, soon = way(np.array([t_s, t_s + 0.01]))
+    return DroneLocalPosition(
+        stamp_ns=START_NS + round(t_s * 1e9),
+        xyz_local_m=R @ place + origin_m,
+        velocity_local_mps=R @ (soon - place) / 0.01,
+    )
+
+
+def odometry(way, t_s, R_local_drone):
+    """The same from an autopilot that tells its velocity in the drone's axes."""
+    position = local_position(way, t_s)
+    return DroneOdometry(
+        stamp_ns=position.stamp_ns,
+        xyz_local_m=position.xyz_local_m,
+        R_local_drone=R_local_drone,
+        velocity_drone_mps=R_local_drone.T @ position.velocity_local_mps,
+        angular_velocity_drone_radps=np.zeros(3),
+        pose_covariance=None,
+        velocity_covariance=None,
+        reset_counter=0,
+        quality_percent=None,
+    )
+
+
+def run(things, seconds=3.0, servo_rad=WATCHING, drives_mps=(0.0, 0.0, 0.0), say=None, stage=None, **settings):
+    """(Candidates, Detections) that the stage tells.
+
+    drives_mps None: the vehicle does not say how it moves. say(stage, t_s): what the drone says, 20 ms apart.
+    """
+    stage = stage or EvidenceDetect(**{"sweep_deg": PASS_DEG, **settings})
+    told, next_s = [], 0.0
     for pulses in pulses_seen(things, servo_rad, seconds):
-        while drives_mps is not None and START_NS + next_s * 1e9 <= pulses.point_stamp_ns[-1]:
-            stage.on_motion(motion_at(next_s, drives_mps))
+        while START_NS + next_s * 1e9 <= pulses.point_stamp_ns[-1]:
+            if drives_mps is not None:
+                stage.on_motion(motion_at(next_s, drives_mps))
+            if say is not None:
+                say(stage, next_s)
             next_s += 0.02
         told += stage.on_pulses(pulses)
     for message in told:
         check_arrays(message)
     return [m for m in told if isinstance(m, Candidates)], [m for m in told if isinstance(m, Detections)]
+
+
+def saying(way, until_s=math.inf, R=rotation_z(0.9)):
+    return lambda stage, t_s: stage.on_drone_position(local_position(way, t_s, R)) if t_s < until_s else None
 
 
 def accepted_after_s(detections):
@@ -57,21 +104,20 @@ def reasons_of(candidates):
 
 
 def test_ports_are_what_the_graph_wires():
-    assert list(input_ports(EvidenceDetect)) == ["motion", "drone_position", "drone_odometry", "pulses"]
+    assert set(input_ports(EvidenceDetect)) == {"motion", "pulses", "drone_position", "drone_odometry"}
     assert set(output_ports(EvidenceDetect)) == {"candidates", "detections"}
-    assert EvidenceDetect.optional_inputs == {"motion"}
+    assert EvidenceDetect.optional_inputs == {"motion", "drone_position", "drone_odometry"}
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_small_thing_that_moves_in_the_free_sky_is_a_drone_after_a_second_or_two_of_looks(seed):
-    way = flying((-0.8, 8.0, 10.0), (0.8, 0.0, 0.4))
-    candidates, detections = run([Drone(way, seed=seed)])
+    candidates, detections = run([Drone(MOVING, seed=seed)])
     assert 0.4 < accepted_after_s(detections) < 2.3
     last = detections[-1]
     assert last.accepted.tolist() == [True]
     assert last.probability[0] >= 0.99
     assert last.score[0] == pytest.approx(math.log(last.probability[0] / (1 - last.probability[0])))
-    truth = way(np.array([(last.seen_ns[0] - START_NS) * 1e-9]))[0]
+    truth = MOVING(np.array([(last.seen_ns[0] - START_NS) * 1e-9]))[0]
     np.testing.assert_allclose(last.xyz_vehicle_m[0], truth, atol=0.3)
     np.testing.assert_allclose(last.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
     assert last.verdict.startswith("drone at (")
@@ -80,15 +126,16 @@ def test_a_small_thing_that_moves_in_the_free_sky_is_a_drone_after_a_second_or_t
 
 
 def test_its_probability_is_told_from_the_first_looks_on_and_grows():
-    candidates, _ = run([Drone(flying((-0.8, 8.0, 10.0), (0.8, 0.0, 0.4)))])
+    candidates, _ = run([Drone(MOVING)])
     assert (candidates[0].stamp_ns - START_NS) * 1e-9 < 0.6
     probability = [float(c.probability[0]) for c in candidates]
     assert probability[0] < 0.5 < 0.99 < probability[-1]
     assert candidates[-1].looks[0] > 15
 
 
-def test_what_hangs_quite_still_in_the_free_sky_stays_a_candidate_because_lamps_do():
-    candidates, detections = run([HANGING], 4.2)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_hangs_quite_still_in_the_free_sky_stays_a_candidate_because_lamps_do(seed):
+    candidates, detections = run([hanging(seed)], 4.2)
     assert accepted_after_s(detections) == math.inf
     assert 0.9 < candidates[-1].probability.max() < 0.99
     assert "it may stand still" in candidates[-1].reasons[0]
@@ -104,7 +151,7 @@ BESIDE = {
 @pytest.mark.parametrize("where", BESIDE)
 def test_the_same_thing_is_refused_with_a_reason(where):
     other, words = BESIDE[where]
-    candidates, detections = run([HANGING, other], 3.0)
+    candidates, detections = run([hanging(), other], 3.0)
     assert accepted_after_s(detections) == math.inf
     assert len(detections) >= 6
     said = reasons_of(candidates) + " | ".join(d.verdict for d in detections)
@@ -122,7 +169,7 @@ def test_what_is_half_hidden_by_something_nearer_is_counted_as_such():
 
 def test_what_stands_far_behind_it_does_not_matter():
     wall = Box((-12.0, 16.0, 0.0), (12.0, 17.0, 30.0))
-    _, detections = run([Drone(flying((-0.8, 8.0, 10.0), (0.8, 0.0, 0.4))), wall])
+    _, detections = run([Drone(MOVING), wall])
     assert accepted_after_s(detections) < 2.3
 
 
@@ -153,7 +200,7 @@ def test_rain_is_never_a_drone():
 
 
 def test_a_smooth_ball_is_a_balloon_and_a_fast_thing_a_bird():
-    balloon, refused = run([Ball(flying((-0.8, 8.0, 10.0), (0.8, 0.0, 0.4)), 0.25)])
+    balloon, refused = run([Ball(MOVING, 0.25)])
     assert accepted_after_s(refused) == math.inf
     assert "balloon" in reasons_of(balloon)
     _, refused = run([Drone(flying((-15.0, 8.0, 10.0), (12.0, 0.0, 0.0)), span_m=0.4)])
@@ -168,7 +215,7 @@ def test_no_drone_is_a_normal_answer_at_the_end_of_each_pass():
 
 
 def test_searched_intervals_follow_one_another_without_gap():
-    for things in ([], [HANGING]):
+    for things in ([], [hanging()]):
         _, detections = run(things, 2.0)
         assert detections[0].start_ns == START_NS
         for before, after in pairwise(detections):
@@ -185,6 +232,185 @@ def test_a_sweep_over_the_whole_sky_finds_houses_no_drone_and_says_how_many_were
     assert "short returns refused at once" in detections[0].verdict
 
 
+# what the drone tells of its flight
+
+
+def test_a_drone_that_flies_as_it_says_is_told_so_and_accepted():
+    _, detections = run([Drone(MOVING)], say=saying(MOVING))
+    assert 0.4 < accepted_after_s(detections) < 2.0
+    assert "it flies as the drone says" in detections[-1].reasons[0]
+
+
+def test_which_way_its_autopilots_axes_point_does_not_matter():
+    told = [run([Drone(MOVING)], 2.0, say=saying(MOVING, R=rotation_z(yaw))) for yaw in (0.0, math.pi / 2, 0.13)]
+    at_s = [accepted_after_s(detections) for _, detections in told]
+    assert at_s[1] == at_s[0] < 2.0
+    assert at_s[2] == pytest.approx(at_s[0], abs=0.3)
+    assert told[1][0][-1].probability == pytest.approx(told[0][0][-1].probability, abs=1e-9)
+
+
+@pytest.mark.parametrize("tilt_deg", [(0.0, 0.0, 0.0), (20.0, -10.0, 130.0)])
+def test_an_autopilot_that_tells_its_odometry_is_understood_however_the_drone_is_turned(tilt_deg):
+    R = rotation_from_rpy_deg(tilt_deg)
+    by_position, _ = run([Drone(MOVING)], 2.0, say=saying(MOVING))
+    by_odometry, detections = run([Drone(MOVING)], 2.0, say=lambda s, t: s.on_drone_odometry(odometry(MOVING, t, R)))
+    assert "it flies as the drone says" in detections[-1].reasons[0]
+    for a, b in zip(by_position, by_odometry, strict=True):
+        np.testing.assert_allclose(a.probability, b.probability, atol=1e-9)
+        np.testing.assert_allclose(a.velocity_vehicle_mps, b.velocity_vehicle_mps, atol=1e-6)
+
+
+def test_what_glides_by_while_the_drone_hangs_is_a_bird():
+    glider = [Drone(GLIDING, span_m=0.4)]
+    _, silent = run(glider)
+    assert accepted_after_s(silent) < 2.5  # nothing else would tell it from a drone
+    candidates, detections = run([Drone(GLIDING, span_m=0.4)], say=saying(still(0.0, 0.0, 0.0)))
+    assert accepted_after_s(detections) == math.inf
+    assert candidates[-1].probability.max() < 0.05
+    assert "it does not fly as the drone says" in candidates[-1].reasons[0]
+    assert "if not a drone, a bird" in candidates[-1].reasons[0]
+
+
+def test_a_lamp_is_refused_while_the_drone_flies_and_not_while_it_hangs():
+    flies = saying(flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0)))
+    candidates, detections = run([hanging()], say=flies)
+    assert accepted_after_s(detections) == math.inf
+    assert candidates[-1].candidate_id.size == 0 or candidates[-1].probability.max() < 0.02
+    candidates, detections = run([hanging()], say=saying(still(0.0, 0.0, 0.0)))
+    assert accepted_after_s(detections) == math.inf
+    assert candidates[-1].probability.max() > 0.5  # it may be the drone
+
+
+def test_a_balloon_is_refused_though_it_drifts_as_the_drone_says_because_it_is_smooth():
+    candidates, detections = run([Ball(MOVING, 0.25)], say=saying(MOVING))
+    assert accepted_after_s(detections) == math.inf
+    assert "if not a drone, a balloon" in candidates[-1].reasons[0]
+    elsewhere, _ = run([Ball(MOVING, 0.25)], say=saying(flying((0.0, 0.0, 0.0), (3.0, 0.0, -0.5))))
+    assert elsewhere[-1].candidate_id.size == 0 or elsewhere[-1].probability[0] < 0.1 * candidates[-1].probability[0]
+
+
+def test_a_drone_that_falls_silent_is_judged_by_how_it_flies_alone():
+    spoke = run([Drone(MOVING)], say=saying(MOVING, until_s=0.4))
+    silent = run([Drone(MOVING)])
+    assert "the drone says" not in spoke[1][-1].reasons[0]
+    np.testing.assert_array_equal(spoke[1][-1].probability, silent[1][-1].probability)
+    np.testing.assert_array_equal(spoke[0][-1].velocity_vehicle_mps, silent[0][-1].velocity_vehicle_mps)
+
+
+def test_from_a_vehicle_that_does_not_say_how_it_drives_only_heights_are_compared():
+    says = flying((0.0, 0.0, 0.0), (0.0, 0.0, 1.5))
+    passes_and_rises = Drone(flying((-2.0, 8.0, 8.0), (1.5, 0.0, 1.5)))
+    heard, _ = run([passes_and_rises], 2.5, drives_mps=None, say=saying(says))
+    assert "it flies as the drone says" in heard[-1].reasons[0]
+    passes = Drone(flying((-2.0, 8.0, 10.0), (1.5, 0.0, 0.0)))
+    heard, detections = run([passes], 2.5, drives_mps=None, say=saying(says))
+    assert accepted_after_s(detections) == math.inf
+    assert heard[-1].probability.max(initial=0.0) < 0.1
+
+
+def test_a_candidate_seen_twice_is_expected_to_fly_as_fast_as_the_drone_says():
+    """At first its velocity is known to some metres a second; a drone that hangs is expected to stay."""
+    hangs, _ = run([hanging()], 0.5, say=saying(still(0.0, 0.0, 0.0)))
+    flies, _ = run([hanging()], 0.5, say=saying(flying((0.0, 0.0, 0.0), (8.0, 0.0, 2.0))))
+    first_hangs, first_flies = hangs[0].velocity_vehicle_mps[0], flies[0].velocity_vehicle_mps[0]
+    assert np.abs(first_hangs).max() < 0.02
+    assert first_flies[2] == pytest.approx(2.0, abs=1.5)  # it rises as the drone says
+
+
+# what stood there before
+
+
+def looking_away(from_s, to_s):
+    """Watches, but for some seconds in which the fan holds another part of the sky."""
+    return lambda t_s: WATCHING(t_s) + np.where((np.asarray(t_s) > from_s) & (np.asarray(t_s) < to_s), 0.8, 0.0)
+
+
+def test_what_stood_is_known_again_and_not_looked_at_anew():
+    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    candidates, detections = run([hanging()], 4.5, looking_away(1.5, 3.0), stage=stage)
+    numbers = {int(number) for told in candidates for number in told.candidate_id}
+    assert numbers == {1}
+    told = [c for c in candidates if c.candidate_id.size]
+    before = max(c.looks[0] for c in told if c.stamp_ns < START_NS + 2e9)
+    again = next(c for c in told if c.stamp_ns > START_NS + 2.9e9)
+    assert again.looks[0] > before > 5
+    assert accepted_after_s(detections) == math.inf
+    assert len(stage._now.standing) == 0  # it is a candidate again
+
+
+def test_what_stood_is_forgotten_with_an_unknown_vehicles_motion_and_what_flew_always():
+    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    run([hanging()], 2.5, looking_away(1.5, 9.0), drives_mps=None, stage=stage)
+    assert stage._now.bank == []
+    assert len(stage._now.standing) == 0
+    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    run([Drone(MOVING)], 2.5, looking_away(1.5, 9.0), stage=stage)
+    assert stage._now.bank == []
+    assert len(stage._now.standing) == 0
+
+
+def test_what_stood_is_forgotten_after_a_minute():
+    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5, parked=True)
+    run([hanging()], 2.5, looking_away(1.5, 9.0), stage=stage)
+    assert [c.number for c in stage._now.standing] == [1]
+    seen_ns = stage._now.standing[0].seen_ns
+    stage._tidy(stage._now, seen_ns + STANDING_NS - 1)
+    assert len(stage._now.standing) == 1
+    stage._tidy(stage._now, seen_ns + STANDING_NS + 1)
+    assert len(stage._now.standing) == 0
+
+
+def sighting(t_s, xyz_m, free_sectors=SECTORS, hits=1):
+    around = np.zeros(TALLY, dtype=np.int64)
+    around[FREE_0 : FREE_0 + free_sectors] = 3
+    return Sighting(
+        stamp_ns=START_NS + round(t_s * 1e9),
+        xyz_local_m=np.asarray(xyz_m, dtype=np.float64),
+        vehicle_local_m=np.zeros(3),
+        range_m=float(np.linalg.norm(xyz_m)),
+        hits=hits,
+        too_long=False,
+        balls=0,
+        rugged=0,
+        around=around,
+        big_m=math.inf,
+    )
+
+
+def beside_a_refused(away_m, after_s, parked=True, hits=1):
+    """The candidate that appears beside something that was refused at once for want of free space."""
+    stage = EvidenceDetect(parked=parked)
+    stage._take(stage._now, sighting(1.0, (0.0, 20.0, 20.0), free_sectors=0, hits=hits))
+    assert stage._now.bank == []
+    stage._take(stage._now, sighting(1.0 + after_s, (away_m, 20.0, 20.0), hits=3))
+    (candidate,) = stage._now.bank
+    return candidate
+
+
+def test_beside_something_refused_lately_a_still_thing_is_less_likely_a_drone():
+    beside, apart = beside_a_refused(1.0, 5.0), beside_a_refused(AMONG_M + 1.0, 5.0)
+    assert "something near it was refused" in beside.why
+    assert "something near it was refused" not in apart.why
+    assert beside.odds < apart.odds
+    (less, _), (more, _) = (over_clutter(c, Evidence(), True, True) for c in (beside, apart))
+    assert more - less == pytest.approx(Evidence().among, abs=0.01)  # 1 m more to it is a hair farther away
+
+
+@pytest.mark.parametrize(("parked", "memory_s"), [(True, AMONG_NS * 1e-9), (False, 0.05 * AMONG_NS * 1e-9)])
+def test_a_refused_place_is_forgotten_sooner_when_the_vehicles_motion_is_unknown(parked, memory_s):
+    assert beside_a_refused(1.0, memory_s - 0.1, parked).among
+    assert not beside_a_refused(1.0, memory_s + 0.1, parked).among
+
+
+def test_rain_is_no_place_where_something_stands():
+    stage = EvidenceDetect(parked=True)
+    stage._take(stage._now, sighting(1.0, (0.0, 45.0, 45.0), free_sectors=SECTORS))  # free all around, once, far away
+    assert stage._now.bank == []
+    assert dict(stage._now.refused) == {"a stray return": 1}
+    stage._take(stage._now, sighting(2.0, (0.5, 45.0, 45.0), hits=9))
+    assert not any(c.among for c in stage._now.bank)
+
+
 @pytest.mark.parametrize("told", [True, False])
 def test_from_a_driving_vehicle_only_its_odometry_tells_what_stands_still(told):
     drives = (1.5, 0.0, 0.0)
@@ -196,7 +422,7 @@ def test_from_a_driving_vehicle_only_its_odometry_tells_what_stands_still(told):
 
 
 def test_what_leaves_is_forgotten():
-    gone = During(HANGING, 0.0, 2.0)
+    gone = During(hanging(), 0.0, 2.0)
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
     for pulses in pulses_seen([gone], WATCHING, 4.0):
         list(stage.on_pulses(pulses))
@@ -205,7 +431,7 @@ def test_what_leaves_is_forgotten():
 
 
 def test_without_free_space_the_sectors_are_not_even_named():
-    candidates, _ = run([HANGING], 2.0, free_space=False)
+    candidates, _ = run([hanging()], 2.0, free_space=False)
     assert "sectors" not in reasons_of(candidates)
 
 

@@ -1,0 +1,90 @@
+"""What a comparison with the drone's telemetry counts: shares, caps, words; and what it replaces."""
+
+from __future__ import annotations
+
+import pytest
+
+from stages.detect.telemetry import Heard
+from stages.detect.verdict import STANDING, Evidence, believed, judge, over_balloon, over_bird, over_clutter
+from tests.stages.detect.test_candidate import candidate, sighting, way
+
+E = Evidence()
+NOTHING = Heard(0.0, 0.0, 0.0)
+
+
+def hanging(heard=None, range_m=20.0):
+    made = candidate(*(sighting(0.1 * k, range_m=range_m) for k in range(12)))
+    made.heard = heard
+    return made
+
+
+@pytest.mark.parametrize(
+    ("told", "counts"), [(0.0, 0.0), (5.0, 4.5), (-10.0, -9.0), (100.0, E.most_told), (-100.0, E.least_told)]
+)
+def test_a_share_of_what_is_told_counts_within_its_caps(told, counts):
+    assert believed(told, E) == pytest.approx(counts)
+
+
+def test_over_a_bird_only_what_is_told_counts_as_soon_as_something_is():
+    calm = hanging()
+    assert over_bird(calm, E) > 3.0  # it hung still for a second
+    calm.heard = Heard(0.0, 2.0, 0.0)
+    assert over_bird(calm, E) == pytest.approx(E.birds + E.told * 2.0)
+    fast = candidate(*way((14.0, 0.0, 0.0)))
+    fast.heard = Heard(0.0, 2.0, 0.0)
+    assert over_bird(fast, E) == pytest.approx(E.birds + E.told * 2.0)
+
+
+def test_over_a_balloon_it_is_added_to_how_round_it_is():
+    c = hanging()
+    c.balls = 2
+    assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball)
+    c.heard = Heard(0.0, 0.0, -3.0)
+    assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball - 3.0 * E.told)
+
+
+def test_over_what_stands_it_replaces_whether_it_moved():
+    silent, nothing, flew = hanging(), hanging(NOTHING), hanging(Heard(20.0, 0.0, 0.0))
+    (odds, said), (same, same_said), (more, more_said) = (
+        over_clutter(c, E, False, True) for c in (silent, nothing, flew)
+    )
+    assert same == pytest.approx(odds)
+    assert said == same_said
+    assert "it may stand still" in said
+    assert "it may stand still" not in more_said
+    assert more == pytest.approx(odds - E.still * 12 + E.most_told)
+    moved = candidate(*way((2.0, 0.0, 0.0), looks=12))
+    silently, _ = over_clutter(moved, E, False, True)
+    moved.heard = NOTHING
+    assert over_clutter(moved, E, False, True)[0] == pytest.approx(silently - E.moves + E.still * 12)
+
+
+def test_a_refused_neighbour_counts_only_against_what_may_stand():
+    for heard, counts in ((None, E.among), (NOTHING, E.among), (Heard(20.0, 0.0, 0.0), 0.0)):
+        c = hanging(heard)
+        apart, _ = over_clutter(c, E, False, True)
+        c.among = True
+        assert over_clutter(c, E, False, True)[0] == pytest.approx(apart - counts)
+
+
+@pytest.mark.parametrize(("range_m", "more"), [(5.0, 1.5), (10.0, 1.5), (15.0, 0.75), (20.0, 0.0), (40.0, 0.0)])
+def test_being_alone_nearby_counts_more_where_a_drone_says_that_it_flies(range_m, more):
+    silent, told = hanging(range_m=range_m), hanging(NOTHING, range_m)
+    for c in (silent, told):
+        c.alone = 100.0
+    assert over_clutter(told, E, True, True)[0] - over_clutter(silent, E, True, True)[0] == pytest.approx(more)
+
+
+def test_the_words_say_whether_it_flies_as_the_drone_says():
+    assert "the drone says" not in judge(hanging(), E, True, True)[1]
+    assert "the drone says" not in judge(hanging(NOTHING), E, True, True)[1]
+    assert "it flies as the drone says" in judge(hanging(Heard(9.0, 4.0, 4.0)), E, True, True)[1]
+    assert "it does not fly as the drone says" in judge(hanging(Heard(30.0, -9.0, 4.0)), E, True, True)[1]
+
+
+def test_what_it_is_if_it_is_no_drone_is_noted():
+    for heard, suspect in ((Heard(-50.0, 20.0, 20.0), STANDING), (Heard(20.0, -50.0, 20.0), "a bird")):
+        c = hanging(heard)
+        _, words = judge(c, E, True, True)
+        assert c.suspect == suspect
+        assert words.endswith(f"if not a drone, {suspect}")

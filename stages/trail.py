@@ -53,6 +53,9 @@ class VehicleTrail:
         (t0, R0, x0), (t1, R1, x1) = poses[after - 1], poses[after]
         share = (min(stamp_ns, t1 + FURTHEST_NS) - t0) / (t1 - t0)
         R = R0 + share * (R1 - R0)  # poses are milliseconds apart: the mean of the two, made a rotation again
+        if share > 1.0:  # far beyond, the other way might not converge
+            u, _, vt = np.linalg.svd(R)
+            R = u @ vt
         for _ in range(NEWTON_STEPS):  # towards the nearest rotation; Higham, Functions of Matrices (2008), 8.3
             R = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
         if len(self._known) >= KEPT:

@@ -36,6 +36,7 @@ from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, Tra
 TOLD_NS = 12_000_000  # after its pass a look has been told of
 INNER_DEG = 8.0
 GLANCE_DEG = 12.0  # beside the sweep: its fan is 30 deg wide
+TRACK_OWN_M = 1.0
 MOST_DONE = 256
 TARGET_SHARE = 0.5  # of its span: so wide a drone returns beams
 RPM_RADPS = math.tau / 60.0
@@ -90,7 +91,10 @@ class _Now:
     nearer_ns: int = 0
     current: tuple[str, int] | None = None
     turns: int = 0  # in a row for the current one
-    search_until_ns: int = 0  # for more drones
+    searching: bool = False  # for more drones, between looks at those there are
+    search_until_ns: int = 0
+    served: int = 0  # looks at tracks since the last piece of the search
+    left_off_rad: float | None = None  # where that ended
 
 
 class BeamAim(Stage):
@@ -197,7 +201,7 @@ class BeamAim(Stage):
         now = self._now
         if not self.mount.turns:
             return None
-        target = self._choose(servo.stamp_ns)
+        target = self._choose(servo)
         if target is None or now.rotor.rate_radps <= 0 or not now.elevations_rad:
             if now.current is not None:
                 now.current, now.goal_rad = None, None
@@ -209,8 +213,8 @@ class BeamAim(Stage):
 
     # what to look at
 
-    def _choose(self, now_ns: int) -> _Target | None:
-        now = self._now
+    def _choose(self, servo: ServoState) -> _Target | None:
+        now, now_ns = self._now, servo.stamp_ns
         for key, target in tuple(now.targets.items()):
             if target.sure:
                 continue
@@ -219,7 +223,9 @@ class BeamAim(Stage):
             elif now_ns - target.heard_ns > 1.2e9:
                 del now.targets[key]
         sure = [t for t in now.targets.values() if t.sure and now_ns - t.heard_ns < self.coast_search_s * 1e9]
-        if sure and len(sure) < self.max_drones and self._searches_on(sure, now_ns):
+        if not sure or len(sure) >= self.max_drones:
+            now.searching, now.served, now.left_off_rad = False, 0, None
+        elif self._searches_on(sure, servo):
             return self._candidate(now_ns)
         if sure:
             if now.current in [t.key for t in sure] and (len(sure) == 1 or now.turns < self.turns_each):
@@ -229,18 +235,24 @@ class BeamAim(Stage):
             return (after or order)[0]
         return self._candidate(now_ns)
 
-    def _searches_on(self, sure: list[_Target], now_ns: int) -> bool:
-        """Whether the turns for each track are over, and it is time to look for others."""
+    def _searches_on(self, sure: list[_Target], servo: ServoState) -> bool:
+        """Whether each track has had its turns and it is time for a piece of the sweep: from where the last one ended."""
         now = self._now
-        looked_at = now.current in [t.key for t in sure]
-        if looked_at and now.turns + 1 >= self.turns_each * len(sure) and now_ns >= now.hold_until_ns:
-            now.search_until_ns = now_ns + round(self.search_s * 1e9)
-        return now_ns < now.search_until_ns
+        if now.searching and servo.stamp_ns < now.search_until_ns:
+            return True
+        if now.searching:
+            now.searching, now.served, now.left_off_rad = False, 0, servo.position_rad
+        if now.served >= self.turns_each * len(sure) and servo.stamp_ns >= now.hold_until_ns:
+            way_rad = 0.0 if now.left_off_rad is None else abs(now.left_off_rad - servo.position_rad)
+            now.searching = True
+            now.search_until_ns = servo.stamp_ns + round((self.search_s + way_rad / (self.limit_rpm * RPM_RADPS)) * 1e9)
+        return now.searching
 
     def _candidate(self, now_ns: int) -> _Target | None:
         """The one to stop at, else the one to glance at in passing; None: sweep on."""
         now = self._now
-        maybe = [t for t in now.targets.values() if not t.sure]
+        tracks = [t.at(now_ns) for t in now.targets.values() if t.sure]
+        maybe = [t for t in now.targets.values() if not t.sure and not _among(t.at(now_ns), tracks)]
         current = None if now.current is None else now.targets.get(now.current)
         worth = [t for t in maybe if t.probability >= self.stop_probability and t.seen_looks >= self.stop_looks]
         if current in worth and not current.glance:
@@ -248,6 +260,7 @@ class BeamAim(Stage):
                 return current
             self._leave(current, now_ns)  # it is not there, or most likely something else
             worth.remove(current)
+            maybe.remove(current)
         if worth:
             best = max(worth, key=lambda t: (t.probability / (1.0 + t.looks), t.key))
             best.glance = False
@@ -306,6 +319,7 @@ class BeamAim(Stage):
         assert best is not None
         self._now.targets[target.key].looks += 1
         self._now.targets[target.key].missed += 1
+        self._now.served += target.sure
         now.hold_until_ns = max(pass_ns + TOLD_NS, servo.stamp_ns + 5_000_000)
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=best[0], speed_radps=speed)
 
@@ -366,6 +380,14 @@ class BeamAim(Stage):
     def _sweep(self, servo: ServoState) -> ServoGoal | None:
         now = self._now
         now.swept_rad = None
+        if now.searching and now.left_off_rad is not None:
+            if abs(now.left_off_rad - servo.position_rad) > math.radians(1.0):
+                if now.goal_rad == now.left_off_rad:
+                    return None
+                now.goal_rad = now.left_off_rad
+                speed_radps = self.limit_rpm * RPM_RADPS
+                return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=now.left_off_rad, speed_radps=speed_radps)
+            now.left_off_rad, now.goal_rad = None, None
         low, high = math.radians(self.travel_deg[0]), math.radians(self.travel_deg[1])
         left = math.inf if now.goal_rad is None else abs(now.goal_rad - servo.position_rad)
         if left < now.nearest_rad:
@@ -396,3 +418,8 @@ class BeamAim(Stage):
         spacing = self._spacing_rad()
         turn_s = math.tau / now.rotor.rate_radps
         return min(sweep_step_rad(spacing, wanted * turn_s) / turn_s, self.limit_rpm * RPM_RADPS)
+
+
+def _among(place_m: Array64, tracks_m: list[Array64]) -> bool:
+    """Whether it is a track's own place: the detector tells of what is tracked, too."""
+    return any(float(np.linalg.norm(place_m - track)) < TRACK_OWN_M for track in tracks_m)

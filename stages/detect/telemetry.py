@@ -3,8 +3,8 @@
 The autopilot tells its position in a frame of its own: z up, north anywhere, drifting slowly. A candidate that is the
 drone moves as it says, turned by a yaw psi that nobody knows:
 
-    drone      x_i = c + Rz(psi) d_i + u t_i + noise           u: drift, a few decimetres a second
-    still      x_i = c + noise                                 a lamp; or scattered, or met farther and farther along
+    drone      x_i = c + Rz(psi) d_i + u t_i + noise           u: drift of both odometries, decimetres a second
+    still      x_i = c + u t_i + noise                         a lamp; or scattered, or met farther and farther along
                                                                something long
     flier      x_i = c + v t_i + a t_i^2 / 2 + noise           v, a of a bird, or of a balloon
 
@@ -30,9 +30,10 @@ from stages.geometry import Array64
 KEPT_NS = 20_000_000_000
 AHEAD_NS = 500_000_000  # beyond the newest word it is not known any more
 JUMP_M = 1.0  # a step that its velocity does not explain: the autopilot's estimate was reset
-YAWS = 24
+YAWS = 72
 MOST_POINTS = 14
 ANYWHERE_M = 100.0
+DRIFT_UP_MPS = 0.1
 DRIFT_MPS = 0.3  # of the autopilot's velocity and the vehicle's, together
 SCATTERED_M = 0.45  # sightings of something long
 SLIDING_MPS = 0.5  # or how fast looks at it wander along
@@ -122,11 +123,12 @@ def weigh(t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_kno
         x[:, axis] -= x[:, axis].mean()
         d[:, axis] -= d[:, axis].mean()
     as_drone = _model(t_s, sigma_m, DRIFT_MPS, 0.0)
-    as_still, as_long = _model(t_s, sigma_m, 0.0, 0.0), _model(t_s, SCATTERED_M, 0.0, 0.0)
+    as_long = _model(t_s, SCATTERED_M, 0.0, 0.0)
     as_sliding = _model(t_s, sigma_m, SLIDING_MPS, 0.0)
     up = x[:, 2].copy()
-    drone = _log_p(as_drone, t_s, up - d[:, 2])
-    still, long = _log_p(as_still, t_s, up), _log_p(as_long, t_s, up)
+    upright = _model(t_s, sigma_m, DRIFT_UP_MPS, 0.0)
+    drone = _log_p(upright, t_s, up - d[:, 2])
+    still, long = _log_p(upright, t_s, up), _log_p(as_long, t_s, up)  # what stands drifts alike
     sliding = still
     bird = _log_p(_model(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
     balloon = _log_p(_model(t_s, sigma_m, BALLOON[2], BALLOON[3]), t_s, up)
@@ -144,7 +146,7 @@ def weigh(t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_kno
         drone += _log_mean(turned)
         for axis in range(2):
             e = x[:, axis].copy()
-            still += _log_p(as_still, t_s, e)
+            still += _log_p(as_drone, t_s, e)
             long += _log_p(as_long, t_s, e)
             sliding += _log_p(as_sliding, t_s, e)
             wheeling += _log_p(as_wheeling, t_s, e)

@@ -100,9 +100,11 @@ def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tu
     words = [f"{c.hit_looks} looks, {c.hits} returns", *said]
     if c.motion is not None:
         words.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
-    if c.heard is not None and max(c.heard) > 3.0:
-        words.append("it flies as the drone says" if min(c.heard) > -3.0 else "it does not fly as the drone says")
-    elif flew_as_bird(c, e):
+    if c.heard is not None and min(c.heard) < -3.0:
+        words.append("it does not fly as the drone says")
+    elif c.heard is not None and max(c.heard) > 3.0:
+        words.append("it flies as the drone says")
+    elif c.heard is None and flew_as_bird(c, e):
         words.append("flew as a bird does")
     if odds < 4.0:
         words.append(f"if not a drone, {least}")

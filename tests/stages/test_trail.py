@@ -53,6 +53,41 @@ def test_turns_between_two_poses_are_rotations_half_way():
     np.testing.assert_allclose(quarter, about @ rotation_z(0.025), atol=2e-5)
 
 
+def nearest_rotation(R):
+    u, _, vt = np.linalg.svd(R)
+    return u @ vt
+
+
+@pytest.mark.parametrize("turned_deg", [(5.0, 0.0, 0.0), (10.0, -20.0, 30.0), (0.0, 0.0, -60.0)])
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.8])
+def test_between_two_poses_it_is_the_rotation_nearest_to_their_mean(turned_deg, share):
+    first = rotation_from_rpy_deg((40.0, 20.0, -170.0))
+    then = first @ rotation_from_rpy_deg(turned_deg)
+    R, _ = trail(motion(0, (0, 0, 0), first), motion(10 * MS, (0, 0, 0), then)).at(START_NS + int(share * 10 * MS))
+    np.testing.assert_allclose(R, nearest_rotation(first + share * (then - first)), atol=1e-6)
+    assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("rate_radps", [-1.5, -0.3, 0.6, 1.5])
+def test_beyond_the_newest_pose_a_turning_vehicle_is_turned_on_by_a_rotation(rate_radps):
+    made = trail(*(motion(10 * k * MS, (0, 0, 0), rotation_z(rate_radps * 0.01 * k)) for k in range(3)))
+    R, _ = made.at(START_NS + 20 * MS + FURTHEST_NS)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-6)
+    further_rad = np.arctan(rate_radps * FURTHEST_NS * 1e-9)  # along the chord
+    np.testing.assert_allclose(R, rotation_z(rate_radps * 0.02 + further_rad), atol=2e-3)
+
+
+def test_a_moment_that_was_asked_for_before_is_the_same_until_a_newer_pose_is_known():
+    made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (1, 0, 0)))
+    soon = START_NS + 150 * MS
+    np.testing.assert_allclose(made.at(soon)[1], (1.5, 0, 0))
+    np.testing.assert_array_equal(made.at(soon)[1], made.at(soon)[1])
+    made.add(motion(50 * MS, (9, 9, 9)))  # older: nothing new
+    np.testing.assert_allclose(made.at(soon)[1], (1.5, 0, 0))
+    made.add(motion(200 * MS, (1, 4, 0)))
+    np.testing.assert_allclose(made.at(soon)[1], (1, 2, 0))
+
+
 def test_beyond_the_newest_pose_it_drives_on_for_a_while_and_then_stands():
     made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (1, 0, 0)))  # 10 m/s
     np.testing.assert_allclose(made.at(START_NS + 150 * MS)[1], (1.5, 0, 0))
@@ -77,6 +112,10 @@ def test_memory_is_bounded():
     made = trail(*(motion(i * MS, (i, 0, 0)) for i in range(3 * KEPT)))
     assert len(made._poses) == KEPT
     np.testing.assert_allclose(made.at(START_NS + (3 * KEPT - 2) * MS)[1], (3 * KEPT - 2, 0, 0))
+    for k in range(2 * KEPT):  # and of the moments that were asked for
+        made.at(START_NS + 2 * KEPT * MS + k)
+        assert len(made._known) <= KEPT
+    np.testing.assert_allclose(made.at(START_NS + 2 * KEPT * MS)[1], (2 * KEPT, 0, 0))
 
 
 def test_the_vehicles_velocity_is_how_its_places_follow_one_another():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from flow.stage import input_ports, output_ports
 from stages.aim import BeamAim
+from stages.aim.beam_aim import INNER_DEG
 from stages.geometry import Harmonic, LidarMount
 from stages.messages import Candidates, ServoGoal, TrackingState, TrackState
 from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Way, beams_lidar, beams_vehicle, flying, packet, still
@@ -109,14 +110,15 @@ def tracking(*ways: Way, until_s=math.inf) -> Tell:
     return tell
 
 
-def candidates(place_m, t_s, probability, looks=3) -> Candidates:
+def candidates(place_m, t_s, probability, looks=3, seen_s=None) -> Candidates:
+    """One candidate; seen_s: when it was seen last, None: now."""
     return Candidates(
         stamp_ns=START_NS + round(t_s * 1e9),
         candidate_id=np.array([1]),
         xyz_vehicle_m=np.array([place_m], dtype=np.float64),
         velocity_vehicle_mps=np.zeros((1, 3)),
         probability=np.array([probability]),
-        seen_ns=np.array([START_NS + round(t_s * 1e9)]),
+        seen_ns=np.array([START_NS + round((t_s if seen_s is None else seen_s) * 1e9)]),
         looks=np.array([looks]),
         reasons=("made",),
     )
@@ -294,6 +296,169 @@ def test_after_a_loss_it_sweeps_again():
     assert np.degrees(np.ptp(flight.servo_rad[250:])) > 150.0
 
 
+# what was missed
+
+
+def elevation_deg(goal_rad, place_m):
+    """How far from the fan's middle a place is when the table stands at a servo position."""
+    origin_m, middle = beams_vehicle(ON_ITS_SIDE, np.array([goal_rad]), np.array([[0.0, 0.0, 1.0]]))  # the spin axis
+    line = place_m - origin_m[0]
+    return math.degrees(math.asin(float(line @ middle[0]) / float(np.linalg.norm(line))))
+
+
+def looks_of(flight):
+    """Goals that are no ends of a sweep, with their seconds."""
+    return [(t, goal.position_rad) for t, goal in flight.goals if 0.001 < goal.position_rad < 3.141]
+
+
+ACROSS_M = np.array([-math.sin(math.radians(60.0)), math.cos(math.radians(60.0)), 0.0])  # the fan, at azimuth 60 deg
+SPACING_M = 20.0 * math.radians(2.0)  # between two beams, at 20 m
+
+
+@pytest.mark.parametrize("beside", [-0.5, -0.37, -0.25, -0.12, 0.12, 0.25, 0.37, 0.5])
+@pytest.mark.parametrize("sure", [False, True], ids=["candidate", "track"])
+def test_looks_that_miss_go_beside_it_until_a_whole_beam_spacing_is_covered(beside, sure):
+    """Wherever it is between two beams, one passes within a quarter of its span before the looks begin anew."""
+    way = towards(60.0, 30.0)
+    expected_m = way(np.zeros(1))[0] + beside * SPACING_M * ACROSS_M  # it is elsewhere
+
+    def tell(aim, t_s):
+        if round(t_s * 1000) % 100 == 0:
+            if sure:
+                coasting = TrackingState.TRACKING if t_s == 0 else TrackingState.COASTING
+                state = track_state(still(*expected_m), t_s, coasting, sigma_m=0.05)
+                aim.on_state(replace(state, hits=0))
+            else:
+                aim.on_candidates(candidates(expected_m, t_s, 0.7, seen_s=0.0))
+
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 0.9, tell, start_rad=math.radians(60.0))
+    missed = flight.missed_m(way)[1:]
+    assert missed.min() < 0.25 * 0.5 + 0.02
+    goals = np.degrees([goal for _, goal in looks_of(flight)])
+    assert len(goals) > 3
+    assert len(set(np.round(goals, 2))) >= 3  # not the same look again and again
+
+
+def test_a_candidate_that_is_met_is_looked_at_in_its_middle_again():
+    place = towards(60.0, 30.0)(np.zeros(1))[0]
+
+    def tell(aim, t_s):
+        if round(t_s * 1000) % 20 == 0:
+            aim.on_candidates(candidates(place, t_s, 0.7))
+
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 1.5, tell, start_rad=math.radians(60.0))
+    assert len(looks_of(flight)) > 10
+    assert np.ptp([goal for _, goal in looks_of(flight)]) < 1e-6
+
+
+@pytest.mark.parametrize("patience", [5, 8])
+def test_so_many_looks_in_a_row_that_meet_nothing_end_the_patience(patience):
+    place = towards(60.0, 45.0)(np.zeros(1))[0]
+
+    def tell(aim, t_s):
+        if round(t_s * 1000) % 50 == 0:
+            aim.on_candidates(candidates(place, t_s, 0.7, seen_s=0.0))
+
+    aim = BeamAim(mount=ON_ITS_SIDE, patience=patience, candidate_rest_s=60.0)
+    flight = fly(aim, 2.0, tell, start_rad=math.radians(60.0))
+    assert len(looks_of(flight)) == patience
+    assert [round(goal.position_rad, 3) for _, goal in flight.goals[1 + patience :]] == [3.142, 0.0]
+
+
+def test_a_candidate_that_is_met_now_and_then_keeps_the_patience():
+    place = towards(60.0, 45.0)(np.zeros(1))[0]
+
+    def tell(aim, t_s):
+        if round(t_s * 1000) % 50 == 0:
+            aim.on_candidates(candidates(place, t_s, 0.7, seen_s=0.4 * (t_s // 0.4)))  # every fourth look
+
+    flight = fly(BeamAim(mount=ON_ITS_SIDE, patience=6), 2.3, tell, start_rad=math.radians(60.0))
+    assert len(looks_of(flight)) > 18
+
+
+def test_each_rest_of_a_candidate_is_twice_as_long_as_the_one_before_up_to_sixteen_times():
+    place = towards(60.0, 45.0)(np.zeros(1))[0]
+
+    def tell(aim, t_s):
+        if round(t_s * 1000) % 50 == 0:
+            aim.on_candidates(candidates(place, t_s, 0.7))
+
+    aim = BeamAim(mount=ON_ITS_SIDE, candidate_looks=2, candidate_rest_s=0.2)
+    flight = fly(aim, 17.0, tell, start_rad=math.radians(60.0))
+    looked_s = np.array([t for t, _ in looks_of(flight)])
+    rests_s = np.diff(looked_s)[1::2]  # two looks, a rest, two looks
+    np.testing.assert_allclose(rests_s - [0.2, 0.4, 0.8, 1.6, 3.2, 3.2, 3.2], 0.025, atol=0.03)  # till the next word
+
+
+# which beam
+
+
+@pytest.mark.parametrize("start_deg", [30.0, 42.0, 78.0, 90.0])
+@pytest.mark.parametrize("sure", [False, True], ids=["candidate", "track"])
+def test_a_beam_near_the_fans_middle_is_put_on_it_even_where_an_outer_one_is_nearer(start_deg, sure):
+    way = towards(60.0, 45.0)
+    place = way(np.zeros(1))[0]
+
+    def tell(aim, t_s):
+        tracking(way)(aim, t_s) if sure else aim.on_candidates(candidates(place, t_s, 0.7))
+
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 0.8, tell, start_rad=math.radians(start_deg))
+    looks = looks_of(flight)
+    assert len(looks) > 3
+    for _, goal in looks:
+        assert abs(elevation_deg(goal, place)) < INNER_DEG + 1.5  # and what it goes beside it
+        assert abs(elevation_deg(goal, place)) > 0.3  # no beam lies in the middle
+
+
+def test_a_glance_in_passing_takes_the_beam_that_is_nearest_and_the_sweep_goes_on():
+    place = towards(60.0, 45.0)(np.zeros(1))[0]
+
+    def tell(aim, t_s):
+        if 0.3 <= t_s < 0.75 and round(t_s * 1000) % 50 == 0:
+            aim.on_candidates(candidates(place, t_s, 0.05, looks=1))
+
+    swept = fly(BeamAim(mount=ON_ITS_SIDE), 2.2, nothing)
+    glanced = fly(BeamAim(mount=ON_ITS_SIDE), 2.2, tell)
+    looks = [goal for _, goal in looks_of(glanced)]
+    assert 1 <= len(looks) <= 3
+    assert any(abs(elevation_deg(goal, place)) > INNER_DEG + 1.5 for goal in looks)
+    at_s = [np.argmax(np.degrees(flight.servo_rad) > 175.0) * TICK_NS * 1e-9 for flight in (swept, glanced)]
+    assert at_s[0] > 0.5
+    assert at_s[1] < at_s[0] + 0.25
+
+
+# how many there are
+
+
+def test_while_fewer_drones_than_expected_are_tracked_the_search_goes_on_between_looks_at_them():
+    way = towards(60.0, 45.0)
+    one = fly(BeamAim(mount=ON_ITS_SIDE), 5.0, tracking(way), start_rad=1.0)
+    two = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 5.0, tracking(way), start_rad=1.0)
+    ends = [[t for t, goal in flight.goals[1:] if goal.position_rad in (0.0, math.pi)] for flight in (one, two)]
+    assert ends[0] == []
+    assert len(ends[1]) > 2
+    assert np.degrees(np.ptp(one.servo_rad[100:])) < 5.0
+    assert np.degrees(np.ptp(two.servo_rad[100:])) > 120.0  # each piece goes on where the last one ended
+    met = np.nonzero(two.missed_m(way)[10:] < 0.25)[0]
+    assert len(met) > 10  # of 40
+    assert np.diff(met).max() <= 16  # looked at again within 1.6 s: the way there, `search_s` and the way back
+
+
+def test_a_longer_search_between_is_a_wider_one():
+    way = towards(60.0, 45.0)
+    widths = []
+    for search_s in (0.2, 0.6):
+        aim = BeamAim(mount=ON_ITS_SIDE, max_drones=2, search_s=search_s)
+        widths.append(np.ptp(fly(aim, 2.0, tracking(way), start_rad=1.0).servo_rad[100:]))
+    assert widths[1] > 1.3 * widths[0]
+
+
+def test_with_as_many_drones_as_expected_the_search_ends():
+    ways = towards(30.0, 45.0), towards(110.0, 50.0)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 4.0, tracking(*ways), start_rad=0.5)
+    assert len(looks_of(flight)) == len(flight.goals) - 1  # but for the first, before the rotor was known
+
+
 def test_a_track_comes_before_a_candidate():
     way, other = towards(80.0, 45.0), towards(20.0, 45.0)(np.zeros(1))[0]
 
@@ -337,6 +502,8 @@ def test_a_lidar_that_is_bolted_down_is_not_aimed():
         {},
         {"mount": ON_ITS_SIDE, "travel_deg": (90.0, 90.0)},
         {"mount": ON_ITS_SIDE, "limit_rpm": 0},
+        {"mount": ON_ITS_SIDE, "max_drones": 0},
+        {"mount": ON_ITS_SIDE, "patience": 0},
         {"mount": ON_ITS_SIDE, "mistyped": 1},
     ],
 )

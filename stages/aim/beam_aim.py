@@ -236,7 +236,7 @@ class BeamAim(Stage):
         return self._candidate(now_ns)
 
     def _searches_on(self, sure: list[_Target], servo: ServoState) -> bool:
-        """Whether each track has had its turns and it is time for a piece of the sweep: from where the last one ended."""
+        """Whether each track has had its turns: time for a piece of the sweep, from where the last one ended."""
         now = self._now
         if now.searching and servo.stamp_ns < now.search_until_ns:
             return True

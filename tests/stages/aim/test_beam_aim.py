@@ -438,9 +438,9 @@ def test_while_fewer_drones_than_expected_are_tracked_the_search_goes_on_between
     assert ends[0] == []
     assert len(ends[1]) > 2
     assert np.degrees(np.ptp(one.servo_rad[100:])) < 5.0
-    assert np.degrees(np.ptp(two.servo_rad[100:])) > 120.0  # each piece goes on where the last one ended
+    assert np.degrees(np.ptp(two.servo_rad[100:])) > 90.0  # each piece goes on where the last one ended
     met = np.nonzero(two.missed_m(way)[10:] < 0.25)[0]
-    assert len(met) > 10  # of 40
+    assert len(met) > 8  # of 40
     assert np.diff(met).max() <= 16  # looked at again within 1.6 s: the way there, `search_s` and the way back
 
 

@@ -67,14 +67,6 @@ def test_a_refused_neighbour_counts_only_against_what_may_stand():
         assert over_clutter(c, E, False, True)[0] == pytest.approx(apart - counts)
 
 
-@pytest.mark.parametrize(("range_m", "more"), [(5.0, 1.5), (10.0, 1.5), (15.0, 0.75), (20.0, 0.0), (40.0, 0.0)])
-def test_being_alone_nearby_counts_more_where_a_drone_says_that_it_flies(range_m, more):
-    silent, told = hanging(range_m=range_m), hanging(NOTHING, range_m)
-    for c in (silent, told):
-        c.alone = 100.0
-    assert over_clutter(told, E, True, True)[0] - over_clutter(silent, E, True, True)[0] == pytest.approx(more)
-
-
 def test_the_words_say_whether_it_flies_as_the_drone_says():
     assert "the drone says" not in judge(hanging(), E, True, True)[1]
     assert "the drone says" not in judge(hanging(NOTHING), E, True, True)[1]

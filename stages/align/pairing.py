@@ -1,0 +1,63 @@
+"""Which picture of the vehicle's camera goes with which of the drone's: the nearest in time.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+
+from stages.messages import VanishingDirections
+
+KEPT = 16
+
+
+Pair = tuple[VanishingDirections | None, VanishingDirections]
+
+
+class Pairing:
+    """Each drone picture with the vehicle picture nearest to it, told as soon as no nearer one can come."""
+
+    def __init__(self, furthest_ns: int) -> None:
+        self._furthest_ns = furthest_ns
+        self._vehicle: deque[VanishingDirections] = deque(maxlen=KEPT)
+        self._waiting: deque[VanishingDirections] = deque()
+
+    def vehicle(self, seen: VanishingDirections) -> Iterator[Pair]:
+        """One more picture of the vehicle's; one that is not newer than the last is ignored."""
+        if not self._vehicle or seen.stamp_ns > self._vehicle[-1].stamp_ns:
+            self._vehicle.append(seen)
+        yield from self._ready()
+
+    def drone(self, seen: VanishingDirections) -> Iterator[Pair]:
+        """One more picture of the drone's."""
+        self._waiting.append(seen)
+        yield from self._ready()
+
+    def rest(self) -> Iterator[Pair]:
+        """The drone's pictures that still wait, with what there is."""
+        while self._waiting:
+            drone = self._waiting.popleft()
+            yield self._nearest(drone), drone
+
+    def _ready(self) -> Iterator[Pair]:
+        while self._waiting and not self._may_come(self._waiting[0].stamp_ns):
+            drone = self._waiting.popleft()
+            yield self._nearest(drone), drone
+
+    def _may_come(self, stamp_ns: int) -> bool:
+        """Whether a picture of the vehicle's may still come that is nearer than all so far."""
+        if self._waiting[-1].stamp_ns - stamp_ns > 2 * self._furthest_ns:
+            return False  # it is late, or the camera is dead
+        if not self._vehicle:
+            return True
+        newest_ns = self._vehicle[-1].stamp_ns
+        period_ns = newest_ns - self._vehicle[-2].stamp_ns if len(self._vehicle) > 1 else 0
+        return newest_ns < stamp_ns and 2 * (stamp_ns - newest_ns) > period_ns
+
+    def _nearest(self, drone: VanishingDirections) -> VanishingDirections | None:
+        nearest = min(self._vehicle, key=lambda seen: abs(seen.stamp_ns - drone.stamp_ns), default=None)
+        if nearest is None or abs(nearest.stamp_ns - drone.stamp_ns) > self._furthest_ns:
+            return None
+        return nearest

@@ -1,0 +1,190 @@
+"""Correction by motion: which way the drone flew, by the LiDAR and by its own camera, must agree about Z.
+
+    f_hat = R_G R_GD0 dt_DD(i, j)          the camera's direction of motion (5-point), under the rotation so far
+    f     = t_D(j) - t_D(i),   t_D = R_G t_GD + t_G                                     what the LiDAR saw
+    j - i = 14 pictures, |f| >= 1 m; the last 7 of each, all within 30 deg of their sum, are summed
+    R_f   = rotation about Z that takes XY(sum f_hat) to XY(sum f)
+    R_GD  = R_G^-1 R_f R_G R_GD0
+
+The camera does not know lengths: f_hat is given f's. Where the odometry tells shorter steps than 14 pictures they are
+chained, each with the length that the LiDAR saw. R_G and t_G are the vehicle's own odometry; without it the vehicle is
+taken to stand. Z: where a sum stands steeper than 60 deg its heading says nothing, and there is no correction (ours).
+
+Source: P V.E, V.C; DESIGN, The paper's formulas. Interpolation between fixes is ours.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from stages.geometry import Array64
+from stages.messages import DroneFix, DroneMotion, VehicleMotion
+from stages.rotation import nearest_rotation
+from stages.trail import VehicleTrail
+
+KEPT = 256  # pictures, fixes, motions
+FIX_GAP_NS = 500_000_000  # between fixes further apart nothing is interpolated
+WAITS_NS = 1_000_000_000  # for the fix after a picture
+LEVEL_AT_LEAST = 0.5  # horizontal part of a sum, at least
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionRule:
+    """The paper's numbers."""
+
+    pictures_apart: int = 14  # j - i
+    shortest_m: float = 1.0  # |f|
+    last: int = 7
+    cone_rad: float = math.radians(30.0)
+
+
+class MotionCorrection:
+    """Collects fixes, motions and rotations; `turn_rad` is R_f's angle when the last seven agree."""
+
+    def __init__(self, rule: CorrectionRule) -> None:
+        self._rule = rule
+        self.trail = VehicleTrail()
+        self._fixes: deque[tuple[int, Array64]] = deque(maxlen=KEPT)
+        self._track_id: int | None = None
+        self._pictures: deque[int] = deque(maxlen=KEPT)  # stamps of the drone's
+        self._rotations: dict[int, Array64] = {}  # R_GD0 at the drone's pictures
+        self._motions: dict[int, DroneMotion] = {}  # by the later picture
+        self._waiting: deque[DroneMotion] = deque(maxlen=KEPT)
+        self._pairs: deque[tuple[Array64, Array64]] = deque(maxlen=rule.last)  # f_hat, f
+        self._news = False  # a pair since the last answer
+
+    def add_fix(self, fix: DroneFix) -> None:
+        """Where the LiDAR saw the drone; another track begins anew, a fix that is not newer is ignored."""
+        if fix.track_id != self._track_id:
+            self._fixes.clear()
+            self._track_id = fix.track_id
+        if not self._fixes or fix.stamp_ns > self._fixes[-1][0]:
+            self._fixes.append((fix.stamp_ns, fix.xyz_vehicle_m))
+
+    def add_vehicle(self, motion: VehicleMotion) -> None:
+        """Where the vehicle is."""
+        self.trail.add(motion)
+
+    def add_motion(self, motion: DroneMotion) -> None:
+        """How the drone moved between two pictures."""
+        self._motions[motion.stamp_ns] = motion
+        _drop_oldest(self._motions)
+        self._waiting.append(motion)
+
+    def add_picture(self, stamp_ns: int, R_vehicle_drone: Array64 | None) -> None:
+        """One picture of the drone and R_GD0 then; None: not known yet."""
+        if not self._pictures or stamp_ns > self._pictures[-1]:
+            self._pictures.append(stamp_ns)
+        if R_vehicle_drone is not None:
+            self._rotations[stamp_ns] = R_vehicle_drone
+            _drop_oldest(self._rotations)
+
+    def restart(self) -> None:
+        """Forget what was seen under a rotation that proved wrong."""
+        self._pairs.clear()
+        self._rotations.clear()
+
+    def turn_rad(self) -> float | None:
+        """Angle of R_f [rad]; None: too little motion, it does not agree, or nothing is new since the last answer."""
+        self._work()
+        news, self._news = self._news, False
+        if not news or len(self._pairs) < self._rule.last:
+            return None
+        f_hat, f = (np.stack(side) for side in zip(*self._pairs, strict=True))
+        if not (self._agree(f_hat) and self._agree(f)):
+            return None
+        return heading_change_rad(f_hat.sum(axis=0), f.sum(axis=0))
+
+    def _agree(self, vectors: Array64) -> bool:
+        total = vectors.sum(axis=0)
+        size = np.linalg.norm(vectors, axis=1) * np.linalg.norm(total)
+        return bool((vectors @ total >= math.cos(self._rule.cone_rad) * size).all())
+
+    def _work(self) -> None:
+        """Pairs of all motions whose later picture is paired and lies before a fix; the others wait a while."""
+        fixed_ns = self._fixes[-1][0] if self._fixes else 0
+        paired_ns = self._pictures[-1] if self._pictures else 0
+        while self._waiting:
+            motion = self._waiting[0]
+            late = max(fixed_ns, paired_ns) - motion.stamp_ns > WAITS_NS
+            if min(fixed_ns, paired_ns) < motion.stamp_ns and not late:
+                return
+            self._waiting.popleft()
+            pair = self._pair(motion)
+            if pair is not None:
+                self._pairs.append(pair)
+                self._news = True
+
+    def _pair(self, motion: DroneMotion) -> tuple[Array64, Array64] | None:
+        """(f_hat, f) of the chain of motions that ends with this one; None: unknown, or too short."""
+        chain = self._chain(motion)
+        if chain is None:
+            return None
+        first_ns, places = chain[0].from_ns, [self._place(chain[0].from_ns)]
+        places += [self._place(link.stamp_ns) for link in chain]
+        known = [place for place in places if place is not None]
+        R_GD0 = self._rotations.get(first_ns)
+        if len(known) < len(places) or R_GD0 is None:
+            return None
+        f = known[-1] - known[0]
+        if float(np.linalg.norm(f)) < self._rule.shortest_m:
+            return None
+        dt, turned = np.zeros(3), np.eye(3)  # R_i_k
+        for link, start, end in zip(chain, known[:-1], known[1:], strict=True):
+            if link.direction_from is not None:
+                dt += turned @ link.direction_from * float(np.linalg.norm(end - start))
+            turned = nearest_rotation(turned @ link.R_from_to)
+        length = float(np.linalg.norm(dt))
+        if length < 1e-6:
+            return None
+        f_hat = self.trail.at(first_ns)[0] @ R_GD0 @ dt
+        return f_hat * float(np.linalg.norm(f)) / length, f
+
+    def _chain(self, motion: DroneMotion) -> list[DroneMotion] | None:
+        """Motions, one after the other, over `pictures_apart` of the drone's pictures; None: a link is missing."""
+        chain = [motion]
+        while self._pictures_between(chain[0].from_ns, motion.stamp_ns) < self._rule.pictures_apart:
+            before = self._motions.get(chain[0].from_ns)
+            if before is None or before.from_ns >= before.stamp_ns:
+                return None
+            chain.insert(0, before)
+        return chain
+
+    def _pictures_between(self, from_ns: int, to_ns: int) -> int:
+        """j - i of the pictures at two times."""
+        return bisect_right(self._pictures, to_ns) - bisect_right(self._pictures, from_ns)
+
+    def _place(self, stamp_ns: int) -> Array64 | None:
+        """t_D (3,) = R_G t_GD + t_G at a time, between two fixes; None where there are none near enough."""
+        after = bisect_left(self._fixes, stamp_ns, key=lambda entry: entry[0])
+        if after == len(self._fixes):
+            return None
+        later_ns, later = self._fixes[after]
+        if later_ns == stamp_ns:
+            t_GD = later
+        elif after == 0 or later_ns - self._fixes[after - 1][0] > FIX_GAP_NS:
+            return None
+        else:
+            earlier_ns, earlier = self._fixes[after - 1]
+            t_GD = earlier + (stamp_ns - earlier_ns) / (later_ns - earlier_ns) * (later - earlier)
+        R_G, t_G = self.trail.at(stamp_ns)
+        return R_G @ t_GD + t_G
+
+
+def heading_change_rad(f_hat: Array64, f: Array64) -> float | None:
+    """Angle about Z from XY(f_hat) to XY(f), (-pi, pi]; None where either stands too steep to have a heading."""
+    for vector in (f_hat, f):
+        if math.hypot(vector[0], vector[1]) < LEVEL_AT_LEAST * float(np.linalg.norm(vector)):
+            return None
+    return math.atan2(f_hat[0] * f[1] - f_hat[1] * f[0], f_hat[0] * f[0] + f_hat[1] * f[1])
+
+
+def _drop_oldest(kept: dict[int, Any]) -> None:
+    while len(kept) > KEPT:
+        del kept[next(iter(kept))]

@@ -1,0 +1,169 @@
+"""Dead reckoning of the drone's rotation in the vehicle's start frame, from picture to picture.
+
+    R_start_drone(t) = R_start_drone(t0) R_drone(t0)_drone(t),  R_vehicle_drone = R_start_vehicle(t)^T R_start_drone(t)
+
+The drone's own turn comes from its autopilot or its pictures, the vehicle's from its motion. Yaw is told between the
+two cameras' level axes, the one number that pictures add an offset to (lock.py).
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.align.drone_trail import AutopilotTrail, PictureTrail, turn_between
+from stages.align.refine import Refined
+from stages.align.spectra import LevelLines
+from stages.geometry import Array64, rotation_z
+from stages.messages import DroneAttitude, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
+from stages.trail import VehicleTrail
+
+VEHICLE_RAD_PER_S = math.radians(20.0)  # a vehicle that does not tell its turns may turn like this
+VEHICLE_DRIFT_RAD2_PER_S = math.radians(0.1) ** 2
+ODOMETRY_NS = 1_000_000_000  # while it is heard, attitude and position of other messages are not needed
+
+
+@dataclass(frozen=True)
+class Reckoned:
+    """Where dead reckoning has a pair's level axes, in the start frame."""
+
+    stamp_ns: int
+    vehicle_rad: float  # heading of the vehicle's level axes
+    drone_rad: float  # of the drone's, less an unknown offset
+    variance_rad2: float  # of both, gathered since the pair before
+
+    @property
+    def yaw_rad(self) -> float:
+        """Of the drone's level axes in the vehicle's, less the offset."""
+        return self.drone_rad - self.vehicle_rad
+
+
+def _heading_rad(R_start_level: Array64) -> float:
+    """Of axes that are nearly level; what is left of a tilt is shared by both axes."""
+    return math.atan2(R_start_level[1, 0] - R_start_level[0, 1], R_start_level[0, 0] + R_start_level[1, 1])
+
+
+class Reckoning:
+    """All that tells of turns, and the rotation carried on by them; it lacks the offset that pictures add."""
+
+    def __init__(self, parked: bool) -> None:
+        """`parked`: the vehicle stands, whether it says so or not."""
+        self._parked = parked
+        self.vehicle = VehicleTrail()
+        self.autopilot = AutopilotTrail()
+        self.pictures = PictureTrail()
+        self._R_start_drone = np.eye(3)
+        self._stamp_ns: int | None = None
+        self._odometry_ns: int | None = None
+        self._silences = 0
+
+    @property
+    def vehicle_known(self) -> bool:
+        """Whether it is known where the vehicle is."""
+        return self._parked or self.vehicle.known
+
+    def add_vehicle(self, motion: VehicleMotion) -> None:
+        """The vehicle's pose since its start."""
+        self.vehicle.add(motion)
+
+    def add_attitude(self, attitude: DroneAttitude) -> None:
+        """The autopilot's attitude, unless its whole odometry is heard."""
+        if not self._odometry_heard(attitude.stamp_ns):
+            self.autopilot.add_attitude(
+                attitude.stamp_ns, attitude.R_local_drone, attitude.angular_velocity_drone_radps
+            )
+
+    def add_position(self, position: DroneLocalPosition) -> None:
+        """The autopilot's position, unless its whole odometry is heard."""
+        if not self._odometry_heard(position.stamp_ns):
+            self.autopilot.add_position(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+
+    def add_odometry(self, odometry: DroneOdometry) -> None:
+        """Both at once; an estimate that calls itself failed is not used."""
+        if odometry.quality_percent == 0:
+            return
+        R = odometry.R_local_drone
+        self._odometry_ns = odometry.stamp_ns
+        self.autopilot.reset(odometry.reset_counter)
+        self.autopilot.add_attitude(odometry.stamp_ns, R, odometry.angular_velocity_drone_radps)
+        self.autopilot.add_position(odometry.stamp_ns, odometry.xyz_local_m, R @ odometry.velocity_drone_mps)
+
+    def add_drone_motion(self, motion: DroneMotion) -> None:
+        """A step of the odometry by pictures."""
+        self.pictures.add(motion)
+
+    def _odometry_heard(self, stamp_ns: int) -> bool:
+        return self._odometry_ns is not None and stamp_ns - self._odometry_ns < ODOMETRY_NS
+
+    def new_silences(self) -> int:
+        """Times since the last call that the autopilot was not heard for so long that it may have jumped."""
+        new = self.autopilot.silences - self._silences
+        self._silences = self.autopilot.silences
+        return new
+
+    def rate_radps(self, stamp_ns: int) -> float:
+        """How fast the drone turns."""
+        return self.autopilot.rate_radps(stamp_ns)
+
+    def advance(self, vehicle_ns: int, drone_ns: int, vehicle: LevelLines, drone: LevelLines) -> Reckoned:
+        """Turn on to a pair's moments."""
+        R_start_vehicle = self.vehicle.at(vehicle_ns)[0]
+        variance = 0.0
+        if self._stamp_ns is None:
+            self._R_start_drone = R_start_vehicle @ vehicle.R_carrier_level @ drone.R_carrier_level.T
+        else:
+            dt = abs(drone_ns - self._stamp_ns) * 1e-9
+            turn = turn_between(self.autopilot, self.pictures, self._stamp_ns, drone_ns)
+            self._R_start_drone = self._R_start_drone @ turn.R_from_to
+            variance = turn.variance_rad2 + self._vehicle_variance_rad2(dt)
+        self._stamp_ns = drone_ns
+        return Reckoned(
+            drone_ns,
+            _heading_rad(R_start_vehicle @ vehicle.R_carrier_level),
+            _heading_rad(self._R_start_drone @ drone.R_carrier_level),
+            variance,
+        )
+
+    def correct(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> None:
+        """Take the tilts that the pictures tell; the yaw stays the dead reckoned one."""
+        level = refined.R_vehicle_level @ rotation_z(reckoned_rad) @ refined.R_drone_level.T
+        self._R_start_drone = self.vehicle.at(vehicle_ns)[0] @ level
+
+    def R_start_own(self, offset_rad: float) -> Array64 | None:
+        """How the autopilot's frame `own` is turned in the start frame; None: it has no attitude now."""
+        if self._stamp_ns is None:
+            return None
+        R_own_drone = self.autopilot.R_own_drone(self._stamp_ns)
+        return None if R_own_drone is None else rotation_z(offset_rad) @ self._R_start_drone @ R_own_drone.T
+
+    def R_start_drone(self, offset_rad: float, stamps_ns: list[int]) -> dict[int, Array64]:
+        """The drone's rotation at those moments of which it is known."""
+        if self._stamp_ns is None:
+            return {}
+        R = rotation_z(offset_rad) @ self._R_start_drone
+        turns = {ns: turn_between(self.autopilot, self.pictures, self._stamp_ns, ns) for ns in stamps_ns}
+        return {ns: R @ turn.R_from_to for ns, turn in turns.items() if turn.sure}
+
+    def at_one_moment(self, vehicle_ns: int, drone_ns: int) -> tuple[Array64, Array64, int, float]:
+        """L, R so that L R_vehicle(vehicle_ns)_drone(drone_ns) R is the rotation at one moment, that, and its variance.
+
+        At the drone's picture if the vehicle's turn is known, else at the vehicle's if the drone's is.
+        """
+        dt, one = abs(drone_ns - vehicle_ns) * 1e-9, np.eye(3)
+        if self.vehicle.known:
+            turn = self.vehicle.at(drone_ns)[0].T @ self.vehicle.at(vehicle_ns)[0]
+            return turn, one, drone_ns, VEHICLE_DRIFT_RAD2_PER_S * dt
+        own = turn_between(self.autopilot, self.pictures, drone_ns, vehicle_ns)
+        if own.sure and not self._parked:
+            return one, own.R_from_to, vehicle_ns, own.variance_rad2
+        return one, one, drone_ns, self._vehicle_variance_rad2(dt)
+
+    def _vehicle_variance_rad2(self, seconds: float) -> float:
+        """Of the vehicle's yaw, gathered in a time."""
+        if self.vehicle.known:
+            return VEHICLE_DRIFT_RAD2_PER_S * seconds
+        return 0.0 if self._parked else (VEHICLE_RAD_PER_S * seconds) ** 2

@@ -1,0 +1,229 @@
+"""Both cameras at once: the tilt of each, the yaw between them and the streets' directions, from all lines together.
+
+    unknown    tilt of each camera (2 angles each), yaw, azimuth a_k of each direction k, and as each camera has it
+    line i     n_i . h(a_vk) = 0 in the vehicle's level axes,  n_i . h(a_dk) = 0 in the drone's       robust weights
+    camera     a_vk = a_k,  a_dk = a_k - yaw        up to `direction_rad`: errors that many lines have in common
+    streets    a_j = a_k + 90 deg for two directions nearly at right angles      up to `square_rad`
+    tilt       as the pictures' verticals say, up to their sigma
+
+Hundreds of lines along one street do not average its error away: they share the lens, the picture and the street. So
+each camera has its own idea of each direction, and only these are tied together; the covariance is what is left.
+
+Source: ours, for P IV Eq. 7-10; DESIGN, Vision: raw covariance is overconfident (NEES/3 about 21).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.align.spectra import BIN_RAD, LevelLines
+from stages.geometry import Array64, rotation_z
+from stages.rotation import exp_rotation
+
+TILTS_AND_YAW = 5  # the first unknowns: tilt x, y of the vehicle, of the drone, yaw
+MOST_DIRECTIONS = 6
+APART_RAD = math.radians(4.0)  # directions nearer to each other than this are one
+WEAKEST = 0.08  # a direction with less of the strongest one's lines is none
+NEAR_RAD = math.radians(3.0)  # lines so near to a direction belong to it
+SQUARE_RAD = math.radians(2.5)  # two directions this near to a right angle are taken to be square
+CAUCHY = 2.0  # residuals, in sigmas, from which a line counts less
+ROUNDS = 4
+ODD = 16.0  # squared residuals count no more than this
+FEW = 20.0  # lines: a direction of so few is worse
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How far from perfect the world and the pictures are, one sigma [rad]."""
+
+    straight_rad: float  # a line of a street
+    direction_rad: float  # what all lines that one camera has of a street share
+    square_rad: float  # a crossing
+    tilt_rad: float  # a vertical, beyond what its picture says
+
+
+@dataclass(frozen=True)
+class Refined:
+    """R_vehicle_drone = R_vehicle_level Rz(yaw) R_drone_level^T, and how well its five angles are known."""
+
+    R_vehicle_level: Array64
+    R_drone_level: Array64
+    yaw_rad: float
+    covariance: Array64  # (5, 5) of the tilts x, y of the vehicle's level axes, of the drone's, and yaw
+    directions: int  # along which lines of both cameras run
+    vehicle_lines: int  # lines that speak, weighed: a line that fits badly is less than one
+    drone_lines: int
+
+    @property
+    def yaw_sigma_rad(self) -> float:
+        """Of the yaw alone."""
+        return math.sqrt(self.covariance[4, 4])
+
+    def R_vehicle_drone(self, quarters: int) -> Array64:
+        """The rotation (3, 3), turned by so many quarter turns about the vertical."""
+        return self.R_vehicle_level @ rotation_z(self.yaw_rad + quarters * math.pi / 2) @ self.R_drone_level.T
+
+    def covariance_rad2(self, quarters: int) -> Array64:
+        """(3, 3) of phi in R exp(phi), the drone's axes: phi = R_drone_level (Rz(-yaw) tilt_v + yaw z - tilt_d)."""
+        J = np.zeros((3, TILTS_AND_YAW))
+        J[:, :2] = rotation_z(-self.yaw_rad - quarters * math.pi / 2)[:, :2]
+        J[0, 2] = J[1, 3] = -1.0
+        J[2, 4] = 1.0
+        to_phi = self.R_drone_level @ J
+        return to_phi @ self.covariance @ to_phi.T
+
+
+def street_directions(vehicle: Array64, drone: Array64, yaw_rad: float) -> Array64:
+    """Azimuths (k,) in the vehicle's level axes of the strongest directions of both spectra (BINS,) together."""
+    together = vehicle + np.roll(drone, round(yaw_rad / BIN_RAD))
+    left, right = np.roll(together, 1), np.roll(together, -1)
+    tops = np.flatnonzero((together > left) & (together >= right) & (together > WEAKEST * together.max()))
+    found: list[float] = []
+    for k in tops[np.argsort(-together[tops], kind="stable")].tolist():
+        if all(abs(half_turn_difference(k * BIN_RAD - other)) >= APART_RAD for other in found):
+            found.append(k * BIN_RAD)
+        if len(found) == MOST_DIRECTIONS:
+            break
+    return np.array(found)
+
+
+def half_turn_difference(angle_rad: float) -> float:
+    """The angle modulo 180 deg, nearest to zero."""
+    return (angle_rad + math.pi / 2) % math.pi - math.pi / 2
+
+
+@dataclass
+class _Eye:
+    """One camera's share: its lines by direction, and its level axes as refined so far."""
+
+    R: Array64  # R_carrier_level
+    normal: Array64  # (m, 3) carrier axes
+    sigma: Array64  # (m,)
+    k: NDArray[np.int64]  # (m,) which direction
+    azimuth: Array64  # (K,) as this camera has it, in its own level axes
+    tilt: Array64  # (2,) turned so far from what the vertical says
+    tilt_sigma_rad: float
+    spoilt: Array64  # (K,) how many times worse than usual this camera has a direction: few lines, or at odds
+    sees: float = 0.0
+
+    def rows(self, at: int, tilt_at: int, unknowns: int) -> tuple[Array64, Array64]:
+        """J (m, unknowns) and r (m,) of the lines, in sigmas and weighed."""
+        n = self.normal @ self.R
+        a = self.azimuth[self.k]
+        c, s = np.cos(a), np.sin(a)
+        r = n[:, 0] * c + n[:, 1] * s
+        J = np.zeros((len(r), unknowns))
+        J[:, tilt_at] = n[:, 2] * s  # -(n x h) . x
+        J[:, tilt_at + 1] = -n[:, 2] * c  # -(n x h) . y
+        J[np.arange(len(r)), at + self.k] = n[:, 1] * c - n[:, 0] * s
+        scaled = r / self.sigma
+        weight = 1.0 / (1.0 + (scaled / CAUCHY) ** 2)
+        self.sees = float(weight.sum())
+        lines = np.maximum(np.bincount(self.k, minlength=len(self.azimuth)), 1)
+        at_odds = np.bincount(self.k, np.minimum(scaled**2, ODD), minlength=len(self.azimuth)) / lines
+        self.spoilt = np.maximum(at_odds, 1.0) * np.sqrt(1.0 + FEW / lines)
+        root = np.sqrt(weight) / self.sigma
+        return J * root[:, None], r * root
+
+
+def _eye(lines: LevelLines, directions: Array64, yaw_rad: float, allowed: Tolerances) -> _Eye:
+    """The lines near one of the directions (K,), which the vehicle has; `yaw_rad` turns them into the camera's."""
+    azimuth = directions - yaw_rad
+    off = lines.azimuth_rad[:, None] - azimuth
+    off = np.abs((off + math.pi / 2) % math.pi - math.pi / 2)
+    k = np.argmin(off, axis=1)
+    nearest = off[np.arange(len(k)), k]
+    own = nearest < np.maximum(NEAR_RAD, 2.0 * lines.azimuth_sigma_rad)
+    normal = lines.normal[own]
+    flat = np.hypot(normal[:, 0], normal[:, 1])
+    return _Eye(
+        R=lines.R_carrier_level,
+        normal=normal @ lines.R_carrier_level.T,
+        sigma=np.hypot(lines.sigma_rad[own], allowed.straight_rad * flat),
+        k=k[own],
+        azimuth=azimuth,
+        tilt=np.zeros(2),
+        tilt_sigma_rad=math.hypot(lines.tilt_sigma_rad, allowed.tilt_rad),
+        spoilt=np.ones(len(directions)),
+    )
+
+
+def refine(
+    vehicle: LevelLines,
+    drone: LevelLines,
+    directions: Array64,
+    yaw_rad: float,
+    allowed: Tolerances,
+) -> Refined:
+    """Gauss-Newton from the spectra's `yaw_rad` and `directions` (K,) on."""
+    K = len(directions)
+    unknowns = TILTS_AND_YAW + 3 * K
+    street, own = TILTS_AND_YAW, (TILTS_AND_YAW + K, TILTS_AND_YAW + 2 * K)
+    eyes = (
+        _eye(vehicle, directions, 0.0, allowed),
+        _eye(drone, directions, yaw_rad, allowed),
+    )
+    a, yaw = directions.copy(), yaw_rad
+    squares = [
+        (i, j)
+        for i in range(K)
+        for j in range(i)
+        if abs(abs(half_turn_difference(a[i] - a[j])) - math.pi / 2) < SQUARE_RAD
+    ]
+    ties = np.zeros((2 * K + len(squares) + 4, unknowns))
+    seen = np.arange(K)
+    for c, eye in enumerate(eyes):
+        ties[c * K + seen, own[c] + seen] = 1 / allowed.direction_rad
+        ties[c * K + seen, street + seen] = -1 / allowed.direction_rad
+        for axis in range(2):
+            ties[2 * K + len(squares) + 2 * c + axis, 2 * c + axis] = 1 / eye.tilt_sigma_rad
+    ties[K + seen, 4] = 1 / allowed.direction_rad
+    for row, (i, j) in enumerate(squares, 2 * K):
+        ties[row, [street + i, street + j]] = 1 / allowed.square_rad, -1 / allowed.square_rad
+    information = np.eye(unknowns)
+    weight = np.ones(len(ties))  # of the ties: a street that the cameras see differently counts less
+    for _ in range(ROUNDS):
+        off_square = [from_square(a[i] - a[j]) / allowed.square_rad for i, j in squares]
+        r_ties = np.concatenate(
+            [
+                (eyes[0].azimuth - a) / allowed.direction_rad,
+                (eyes[1].azimuth - a + yaw) / allowed.direction_rad,
+                off_square,
+                *(eye.tilt / eye.tilt_sigma_rad for eye in eyes),
+            ]
+        )
+        spoilt = np.concatenate([eye.spoilt for eye in eyes])
+        weight[: 2 * K] = 1.0 / (spoilt**2 + (r_ties[: 2 * K] / CAUCHY) ** 2)
+        information[:] = (ties.T * weight) @ ties
+        slope = (ties.T * weight) @ r_ties
+        for c, eye in enumerate(eyes):
+            J, r = eye.rows(own[c], 2 * c, unknowns)
+            information += J.T @ J
+            slope += J.T @ r
+        step = np.asarray(-np.linalg.solve(information, slope), dtype=np.float64)
+        for c, eye in enumerate(eyes):
+            turn = step[2 * c : 2 * c + 2]
+            eye.R = eye.R @ exp_rotation(np.append(turn, 0.0))
+            eye.tilt = eye.tilt + turn
+            eye.azimuth = eye.azimuth + step[own[c] : own[c] + K]
+        yaw += float(step[4])
+        a = a + step[street : street + K]
+    both = sum(1 for k in range(K) if all(np.any(eye.k == k) for eye in eyes))
+    return Refined(
+        R_vehicle_level=eyes[0].R,
+        R_drone_level=eyes[1].R,
+        yaw_rad=yaw,
+        covariance=np.asarray(np.linalg.inv(information), dtype=np.float64)[:TILTS_AND_YAW, :TILTS_AND_YAW],
+        directions=both,
+        vehicle_lines=round(eyes[0].sees),
+        drone_lines=round(eyes[1].sees),
+    )
+
+
+def from_square(angle_rad: float) -> float:
+    """How far two azimuths, `angle_rad` apart modulo 180 deg, are from a right angle; positive: more than +90 deg."""
+    return half_turn_difference(angle_rad - math.pi / 2)

@@ -1,0 +1,217 @@
+"""Arcs: pieces of chains that lie on one great circle, each with the plane through the lens's centre it spans.
+
+A straight line of the world is a great circle on the unit sphere, whatever the lens. A chain is split where it leaves
+the circle through its two ends by more than `tolerance` (Douglas-Peucker on the sphere); each piece is fitted:
+
+    n = n0 + a t0 + b m0,   minimise sum (n . r_k)^2 over its rays r_k  ->  (a, b)
+
+with n0, t0, m0 the plane of the two ends, the direction along it, and its middle ray.
+
+Source: ours. DESIGN, The graph: vp.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.compiled import compiled
+from stages.lens import Array64
+from stages.vp.edges import Chains
+from stages.vp.eye import STEP_PX, Eye
+
+TRIMMED = 1  # points at each end of a piece that a corner has bent
+CORRELATED = 2.0  # neighbouring points that share their error
+LEAST_SIGMA_PX = 0.12  # of a point's place; blur, sampling, JPEG
+DEEPEST = 64  # splits waiting at once
+WIDEST_RAD = 2.9  # an arc of half a turn has no plane
+NORMAL, FIRST, LAST, SIGMA, EXTENT, MOMENTS = 0, 3, 6, 9, 10, 11  # columns of the table
+COLUMNS = MOMENTS + 7  # six moments of the rays and their number
+
+
+@dataclass(frozen=True)
+class Arcs:
+    """Great-circle arcs, or lines made of several. All vectors unit, camera frame."""
+
+    normal: Array64  # (n, 3)
+    ends: Array64  # (n, 2, 3) on the circle
+    sigma_rad: Array64  # (n,) how far its turn about its middle ray is known
+    extent_rad: Array64  # (n,) from end to end
+    moments: Array64  # (n, 7) xx, xy, xz, yy, yz, zz of its rays and how many
+
+    def __len__(self) -> int:
+        return len(self.normal)
+
+
+def fit_arcs(chains: Chains, eye: Eye, tolerance_px: float, min_extent_px: float) -> Arcs:
+    """All arcs of all chains that reach over `min_extent_px`."""
+    tolerance, extent = tolerance_px * eye.pixel_rad, min_extent_px * eye.pixel_rad
+    rows = _split_all(chains.points_px, chains.start, eye.rays, tolerance, extent, LEAST_SIGMA_PX * eye.pixel_rad)
+    return arcs_of(rows)
+
+
+def arcs_of(rows: Array64) -> Arcs:
+    """Arcs of the table that the compiled functions write."""
+    return Arcs(
+        normal=np.ascontiguousarray(rows[:, NORMAL : NORMAL + 3]),
+        ends=np.ascontiguousarray(rows[:, FIRST : FIRST + 6]).reshape(-1, 2, 3),
+        sigma_rad=rows[:, SIGMA].copy(),
+        extent_rad=rows[:, EXTENT].copy(),
+        moments=np.ascontiguousarray(rows[:, MOMENTS:]),
+    )
+
+
+@compiled
+def _split_all(
+    points: NDArray[np.float32],
+    start: NDArray[np.int64],
+    table: NDArray[np.float32],
+    tolerance: float,
+    min_extent: float,
+    least_sigma: float,
+) -> Array64:
+    most = 0
+    for c in range(len(start) - 1):
+        most = max(most, start[c + 1] - start[c])
+    rays = np.empty((most, 3))
+    stack = np.empty((DEEPEST, 2), dtype=np.int64)
+    rows = np.empty((len(points) // (2 * TRIMMED + 3) + 1, COLUMNS))
+    count = 0
+    for c in range(len(start) - 1):
+        size = start[c + 1] - start[c]
+        for k in range(size):
+            _ray(table, points[start[c] + k, 0], points[start[c] + k, 1], rays[k])
+        stack[0, 0], stack[0, 1] = 0, size - 1
+        waiting = 1
+        while waiting > 0:
+            waiting -= 1
+            i, j = stack[waiting, 0], stack[waiting, 1]
+            if j - i < 2 * TRIMMED + 2 or waiting + 2 > DEEPEST:
+                continue
+            split = _worst(rays, i, j, tolerance)
+            if split >= 0:
+                stack[waiting, 0], stack[waiting, 1] = split, j
+                stack[waiting + 1, 0], stack[waiting + 1, 1] = i, split
+                waiting += 2
+            elif _fit_piece(rays, i + TRIMMED, j - TRIMMED, min_extent, least_sigma, rows[count]):
+                count += 1
+    return rows[:count].copy()
+
+
+@compiled
+def _ray(table: NDArray[np.float32], x: float, y: float, out: Array64) -> None:
+    """The ray at a place between pixels, a mean of the four of the table around it: off by 3e-5 rad at most."""
+    column, row = int(x) // STEP_PX, int(y) // STEP_PX
+    u, v = x / STEP_PX - column, y / STEP_PX - row
+    square = 0.0
+    for k in range(3):
+        top = table[row, column, k] * (1.0 - u) + table[row, column + 1, k] * u
+        low = table[row + 1, column, k] * (1.0 - u) + table[row + 1, column + 1, k] * u
+        out[k] = top * (1.0 - v) + low * v
+        square += out[k] * out[k]
+    scale = 1.0 / math.sqrt(square)
+    for k in range(3):
+        out[k] *= scale
+
+
+@compiled
+def _worst(rays: Array64, i: int, j: int, tolerance: float) -> int:
+    """The ray between i and j farthest from the circle through both, -1 when all are within the tolerance."""
+    nx = rays[i, 1] * rays[j, 2] - rays[i, 2] * rays[j, 1]
+    ny = rays[i, 2] * rays[j, 0] - rays[i, 0] * rays[j, 2]
+    nz = rays[i, 0] * rays[j, 1] - rays[i, 1] * rays[j, 0]
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    if length < 1e-9:
+        return (i + j) // 2
+    worst, at = tolerance * length, -1
+    for k in range(i + 1, j):
+        away = abs(nx * rays[k, 0] + ny * rays[k, 1] + nz * rays[k, 2])
+        if away > worst:
+            worst, at = away, k
+    return at
+
+
+@compiled
+def _fit_piece(rays: Array64, i: int, j: int, min_extent: float, least_sigma: float, row: Array64) -> bool:
+    """Fill a row of the table; False when the piece is too short."""
+    moments = row[MOMENTS:]
+    moments[:] = 0.0
+    for k in range(i, j + 1):
+        x, y, z = rays[k, 0], rays[k, 1], rays[k, 2]
+        moments[0] += x * x
+        moments[1] += x * y
+        moments[2] += x * z
+        moments[3] += y * y
+        moments[4] += y * z
+        moments[5] += z * z
+    moments[6] = j - i + 1
+    return fit_moments(moments, rays[i], rays[j], min_extent, least_sigma, row)
+
+
+@compiled
+def fit_moments(
+    moments: Array64, first: Array64, last: Array64, min_extent: float, least_sigma: float, row: Array64
+) -> bool:
+    """The circle through rays of these moments, from about `first` to about `last`. False: shorter than min_extent."""
+    n, m = np.empty(3), first + last
+    cross(first, last, n)
+    extent = math.atan2(math.sqrt(dot(n, n)), dot(first, last))
+    if not min_extent <= extent < WIDEST_RAD:
+        return False
+    n /= math.sqrt(dot(n, n))
+    m /= math.sqrt(dot(m, m))
+    t = np.empty(3)
+    cross(n, m, t)
+    tt, tm, mm = _form(moments, t, t), _form(moments, t, m), _form(moments, m, m)
+    tn, mn = _form(moments, t, n), _form(moments, m, n)
+    det = tt * mm - tm * tm
+    if det <= 1e-15:
+        return False
+    n += (tm * mn - mm * tn) / det * t + (tm * tn - tt * mn) / det * m
+    n /= math.sqrt(dot(n, n))
+    count = moments[6]
+    variance = max(max(_form(moments, n, n), 0.0) / max(count - 2.0, 1.0), least_sigma * least_sigma)
+    row[SIGMA] = math.sqrt(variance * min(CORRELATED, 0.5 * count) * mm / det)
+    row[EXTENT] = extent
+    row[NORMAL : NORMAL + 3] = n
+    _onto(first, n, row[FIRST : FIRST + 3])
+    _onto(last, n, row[LAST : LAST + 3])
+    row[MOMENTS:] = moments
+    return True
+
+
+@compiled
+def dot(a: Array64, b: Array64) -> float:
+    """a . b of (3,)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def cross(a: Array64, b: Array64, out: Array64) -> None:
+    """a x b of (3,)."""
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
+def _onto(ray: Array64, n: Array64, out: Array64) -> None:
+    """The ray moved onto the circle of n."""
+    out[:] = ray - n * dot(n, ray)
+    out /= math.sqrt(dot(out, out))
+
+
+@compiled
+def _form(moments: Array64, a: Array64, b: Array64) -> float:
+    """a^T M b of the symmetric matrix in `moments`."""
+    return (
+        moments[0] * a[0] * b[0]
+        + moments[1] * (a[0] * b[1] + a[1] * b[0])
+        + moments[2] * (a[0] * b[2] + a[2] * b[0])
+        + moments[3] * a[1] * b[1]
+        + moments[4] * (a[1] * b[2] + a[2] * b[1])
+        + moments[5] * a[2] * b[2]
+    )

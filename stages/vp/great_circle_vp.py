@@ -1,0 +1,125 @@
+"""Vanishing directions from great circles on the native fisheye: no rectified views, nothing lost beyond 90 deg.
+
+    picture -> chains of edge points (edges.py) -> great-circle arcs (arcs.py) -> lines (clustering.py)
+            -> the vertical, by gravity or found; horizontal pairs, one or more (search.py) -> directions with sigma
+
+Gravity is the autopilot's attitude on the drone, and the carrier's own z within `vertical_sigma_deg` without it: right
+for a vehicle. A picture without enough straight lines gives no directions and the reason.
+
+Source: ours, for P IV and V.C; DESIGN, The graph: vp.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field, PrivateAttr
+
+from flow.stage import Stage
+from stages.geometry import Pose
+from stages.lens import Array64, Lens
+from stages.messages import Carrier, DroneAttitude, Image, VanishingDirections
+from stages.vp.arcs import fit_arcs
+from stages.vp.clustering import cluster
+from stages.vp.directions import lines_of
+from stages.vp.edges import EdgeFinder
+from stages.vp.eye import Eye, Polygon, make_eye
+from stages.vp.gravity import GravityTrail
+from stages.vp.search import Found, Limits, Prior, find_structure
+
+MIN_POINTS = 6  # of a chain
+MOST_LINES = 400
+WIDE_RAD = 0.35  # a line seen over so much counts fully
+LEAST_SCATTER = 0.3  # of lines against `line_sigma_deg`: no world is straighter than so much of it
+SEARCH_DEG = {Carrier.VEHICLE: 0.0, Carrier.DRONE: 35.0}
+
+
+class GreatCircleVp(Stage):
+    """The directions in which a street runs, as one fisheye sees them, and how well they are known."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude"})
+
+    carrier: Carrier
+    T_carrier_camera: Pose
+    lens: Lens
+    masked_px: tuple[Polygon, ...] = ()  # where the carrier itself is seen: polygons of (column, row)
+    max_off_axis_deg: float | None = Field(None, gt=0, le=150)  # look no farther out; None: as far as the lens does
+    min_contrast: float = Field(8.0, gt=0, le=100)  # grey levels, of an edge
+    tolerance_px: float = Field(1.0, gt=0, le=10)  # how far a straight line may be from its great circle
+    min_extent_px: float = Field(14.0, ge=5)  # shorter arcs are not used
+    line_sigma_deg: float = Field(0.25, gt=0, le=5)  # how straight and parallel the world is, one sigma of a line
+    vertical_sigma_deg: float = Field(3.0, gt=0, le=60)  # how upright the carrier stands, without attitude
+    attitude_sigma_deg: float = Field(1.0, gt=0, le=30)  # of the attitude's roll and pitch
+    attitude_age_s: float = Field(0.2, gt=0)  # an older one is not used
+    search_deg: float | None = Field(None, ge=0, le=90)  # without attitude the vertical is within this cone about z;
+    # 0: it is z, within `vertical_sigma_deg`. None: 0 for a vehicle, 35 for a drone, which tilts as it flies
+    max_frames: int = Field(3, ge=1, le=6)  # horizontal pairs; 1: Manhattan
+    min_lines: int = Field(4, ge=2)  # of a horizontal pair
+    min_score: float = Field(7.0, gt=0)  # standard deviations over lines in random directions
+    least_sigma_deg: float = Field(0.1, gt=0, le=5)  # no direction is known better
+
+    _eye: Eye | None = PrivateAttr(default=None)
+    _edges: EdgeFinder = PrivateAttr()
+    _gravity: GravityTrail = PrivateAttr(default_factory=GravityTrail)
+
+    def model_post_init(self, context: Any, /) -> None:
+        if any(len(polygon) < 3 for polygon in self.masked_px):
+            raise ValueError("masked_px: a polygon has at least three corners (column, row)")
+
+    def on_attitude(self, attitude: DroneAttitude) -> None:
+        """Roll and pitch of the drone; its yaw is not used."""
+        if self.carrier is not Carrier.DRONE:
+            raise ValueError("attitude is the drone's: wire it to the stage whose carrier is the drone")
+        self._gravity.add(attitude)
+
+    def on_image(self, image: Image) -> VanishingDirections:
+        """One picture's directions and lines."""
+        if image.frame_id != f"camera_{self.carrier.value}":
+            raise ValueError(f"image comes from {image.frame_id}, this stage's carrier is the {self.carrier.value}")
+        if self._eye is None or self._eye.usable.shape != image.grey.shape:
+            self._eye = make_eye(self.lens, image.grey.shape, self.max_off_axis_deg, self.masked_px)
+            self._edges = EdgeFinder(self._eye.usable, self.min_contrast, MIN_POINTS)
+        eye = self._eye
+        chains = self._edges.find(image.grey)
+        arcs = cluster(fit_arcs(chains, eye, self.tolerance_px, self.min_extent_px), eye, MOST_LINES)
+        R = self.T_carrier_camera.matrix()[:3, :3]
+        lines = lines_of(arcs, R, WIDE_RAD)
+        found = find_structure(lines, self._prior(image.stamp_ns), self._limits())
+        return self._message(image.stamp_ns, found, lines.normal, arcs.ends @ R.T, arcs.sigma_rad)
+
+    def _prior(self, stamp_ns: int) -> Prior:
+        up = self._gravity.at(stamp_ns, self.attitude_age_s)
+        if up is not None:
+            return Prior(up, math.radians(self.attitude_sigma_deg), 0.0)
+        search_deg = SEARCH_DEG[self.carrier] if self.search_deg is None else self.search_deg
+        sigma_deg = max(self.vertical_sigma_deg, search_deg)
+        return Prior(np.array([0.0, 0.0, 1.0]), math.radians(sigma_deg), math.radians(search_deg))
+
+    def _limits(self) -> Limits:
+        return Limits(
+            math.radians(self.line_sigma_deg),
+            math.radians(self.least_sigma_deg),
+            LEAST_SCATTER,
+            self.max_frames,
+            self.min_lines,
+            self.min_score,
+        )
+
+    def _message(
+        self, stamp_ns: int, found: Found, normal: Array64, ends: Array64, sigma_rad: Array64
+    ) -> VanishingDirections:
+        return VanishingDirections(
+            stamp_ns=stamp_ns,
+            carrier=self.carrier,
+            direction=found.direction,
+            sigma_rad=found.sigma_rad,
+            is_vertical=found.frame < 0,
+            frame=found.frame,
+            line_normal=normal,
+            line_end=ends,
+            line_sigma_rad=sigma_rad,
+            line_direction=found.line_direction,
+            reason=found.reason,
+        )

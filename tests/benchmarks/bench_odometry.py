@@ -1,0 +1,154 @@
+"""Time per picture of odometry and ego-motion: `python -m pytest tests/benchmarks/bench_odometry.py`.
+
+Limit of the design: 15 ms a picture of 1080 px, one core. Beside it the usual way: corners on the whole picture,
+Lucas-Kanade forward and back, OpenCV's essential matrix on what lies within 80 deg of the axis, and poselib's RANSAC on
+the same points. Errors against the truth are in `extra_info`: ours from the key picture, the usual way from the picture
+before, so that its baseline is shorter.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import poselib
+import pytest
+
+from stages.ego import VehicleEgo
+from stages.messages import Image
+from stages.odometry import FisheyeOdometry
+from stages.pictures.two_view import Noise, relative_motion
+from stages.rotation import exp_rotation, log_rotation
+from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, degrees_between, lidar_slice, picture, point_rays
+
+PICTURES = 16
+STEP_NS = 66_000_000
+WIDEST = math.cos(math.radians(80.0))
+TURN_RADPS, VELOCITY_MPS = np.array([0.1, -0.1, 0.6]), np.array([3.0, 1.0, 0.0])
+
+
+def pose(k):
+    s = k * STEP_NS * 1e-9
+    return exp_rotation(s * TURN_RADPS), s * VELOCITY_MPS
+
+
+def flight(size_px, mount):
+    """Pictures of a turning, flying camera."""
+    C = mount.matrix()[:3, :3]
+    return [picture(pose(k)[0] @ C, pose(k)[1], k, size_px) for k in range(PICTURES)]
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    yield
+    cv2.setNumThreads(threads)
+
+
+@pytest.mark.parametrize("size_px", [720, 1080, 1440])
+@pytest.mark.benchmark(group="odometry, a picture")
+def test_ours(benchmark, size_px):
+    pictures = flight(size_px, LOOKS_DOWN)
+    turn, direction, clock = [], [], iter(range(1, 100_000))
+    odometry = FisheyeOdometry(lens=LENS.scaled(size_px / SIZE_PX), T_drone_camera=LOOKS_DOWN)
+
+    def one():
+        k = next(clock)
+        there = (k - 1) % (2 * PICTURES - 2)  # to and fro: every step is one of the flight
+        at = min(there, 2 * PICTURES - 2 - there)
+        return k, at, odometry.on_image(Image(stamp_ns=k * STEP_NS, frame_id="camera", grey=pictures[at]))
+
+    places = {}
+    for _ in range(5):
+        k, at, _ = one()
+        places[k] = at
+
+    def timed():
+        k, at, motion = one()
+        places[k] = at
+        if motion is not None:
+            (R0, p0), (R1, p1) = pose(places[motion.from_ns // STEP_NS]), pose(at)
+            turn.append(math.degrees(np.linalg.norm(log_rotation(motion.R_from_to.T @ R0.T @ R1))))
+            if motion.direction_from is not None and np.linalg.norm(p1 - p0) > 0.1:
+                direction.append(degrees_between(motion.direction_from, R0.T @ (p1 - p0)))
+
+    benchmark.pedantic(timed, rounds=50, iterations=1)
+    benchmark.extra_info |= {"turn_deg": float(np.median(turn)), "direction_deg": float(np.median(direction))}
+
+
+@pytest.mark.parametrize("size_px", [720, 1080])
+@pytest.mark.parametrize("solver", ["opencv", "poselib"])
+@pytest.mark.benchmark(group="odometry, a picture")
+def test_the_usual_way(benchmark, size_px, solver):
+    """From picture to picture, points in front of the lens only: their x / z, y / z."""
+    pictures, lens = flight(size_px, LOOKS_DOWN), LENS.scaled(size_px / SIZE_PX)
+    C = LOOKS_DOWN.matrix()[:3, :3]
+    turn, direction, k = [], [], iter(range(10_000))
+
+    def one():
+        at = next(k) % (PICTURES - 1)
+        before, now = pictures[at], pictures[at + 1]
+        corners = cv2.goodFeaturesToTrack(before, 300, 0.01, size_px / 40)
+        found, forward, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None)
+        back, backward, _ = cv2.calcOpticalFlowPyrLK(now, before, found, None)
+        good = (forward.ravel() * backward.ravel() > 0) & (
+            np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < 0.5
+        )
+        rays = [lens.unproject(p.reshape(-1, 2)[good].astype(np.float64)) for p in (corners, found)]
+        wide = (rays[0][:, 2] > WIDEST) & (rays[1][:, 2] > WIDEST)
+        flat = [r[wide, :2] / r[wide, 2:] for r in rays]
+        if solver == "opencv":
+            E, mask = cv2.findEssentialMat(*flat, np.eye(3), cv2.RANSAC, 0.999, 1.0 / lens.focal_px)
+            _, R, t, _ = cv2.recoverPose(E, *flat, np.eye(3), mask=mask)
+            t = t.ravel()
+        else:
+            camera = {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [lens.focal_px, 0.0, 0.0]}
+            scaled = [lens.focal_px * f for f in flat]
+            found_pose, _ = poselib.estimate_relative_pose(*scaled, camera, camera, {"max_epipolar_error": 1.0})
+            R, t = found_pose.R, found_pose.t
+        (R0, p0), (R1, p1) = pose(at), pose(at + 1)
+        turn.append(math.degrees(np.linalg.norm(log_rotation(C @ R @ C.T @ R0.T @ R1))))
+        direction.append(degrees_between(C @ (-R.T @ t), R0.T @ (p1 - p0)))
+
+    one()
+    benchmark.pedantic(one, rounds=30, iterations=1)
+    benchmark.extra_info |= {"turn_deg": float(np.median(turn)), "direction_deg": float(np.median(direction))}
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.4])
+@pytest.mark.benchmark(group="two views, 250 rays all around")
+def test_our_ransac(benchmark, outliers):
+    earlier, later, R, t = point_rays(250, (0.02, -0.05, 0.15), (0.6, -0.2, 0.1), 3e-4, outliers)
+    found = benchmark(relative_motion, earlier, later, np.eye(3), None, Noise(2e-4, 3e-4), 100)
+    benchmark.extra_info |= {
+        "turn_deg": math.degrees(np.linalg.norm(log_rotation(found.R_later_earlier @ R.T))),
+        "direction_deg": degrees_between(found.t_hat_later, t),
+    }
+
+
+@pytest.mark.parametrize("size_px", [720, 1080])
+@pytest.mark.benchmark(group="ego, a picture with its LiDAR")
+def test_ego(benchmark, size_px):
+    pictures, k = flight(size_px, LOOKS_UP), iter(range(1, 100_000))
+    ego = VehicleEgo(lens=LENS.scaled(size_px / SIZE_PX), T_vehicle_camera=LOOKS_UP)
+
+    def place(number):
+        there = (number - 1) % (2 * PICTURES - 2)
+        return min(there, 2 * PICTURES - 2 - there)
+
+    def ready():
+        number = next(k)
+        at = place(number)
+        slices = [lidar_slice(number * STEP_NS, *pose(at), number, 5000)]
+        return (slices, Image(stamp_ns=number * STEP_NS, frame_id="camera", grey=pictures[at])), {}
+
+    def one(slices, seen):
+        for points in slices:
+            ego.on_points(points)
+        ego.on_image(seen)
+
+    for _ in range(8):
+        one(*ready()[0])
+    benchmark.pedantic(one, setup=ready, rounds=40, iterations=1)

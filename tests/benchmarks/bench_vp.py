@@ -1,0 +1,176 @@
+"""Vanishing directions: time of ours on fisheyes of three sizes, and ours beside lu-vp-detect on York Urban.
+
+    python -m pytest tests/benchmarks/bench_vp.py --benchmark-columns=min,median,iqr,rounds -s
+
+lu-vp-detect needs OpenCV 4: make it an environment of its own and say where its Python is,
+
+    python -m venv luvp && luvp/bin/pip install lu-vp-detect==1.0.4 --no-deps
+    luvp/bin/pip install numpy scipy "opencv-python-headless==4.10.0.84"
+    GRD_LU_VP_PYTHON=luvp/bin/python python -m pytest tests/benchmarks/bench_vp.py -s
+
+Both see the same 51 pictures with the same camera on one thread, neither knows gravity, and both are asked for three
+directions at right angles. Errors are against the hand-labelled orthogonal directions, themselves good to about 1 deg.
+Recall counts true directions with a found one within so many degrees.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stages.geometry import Pose
+from stages.lens import Equidistant, OCam
+from stages.messages import Carrier, Image
+from stages.vp import GreatCircleVp, PaperVp
+
+YORK = Path(__file__).resolve().parents[3] / "shared" / "data" / "vp_york_urban"
+LU_PYTHON = os.environ.get("GRD_LU_VP_PYTHON", "")
+R_CARRIER_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks forward
+LU = """
+import json, sys, time
+import cv2
+from lu_vp_detect import VPDetection
+cv2.setNumThreads(1)
+focal, cx, cy, *paths = json.load(sys.stdin)
+detector = VPDetection(30, (cx, cy), focal, seed=1)
+out = []
+for path in paths:
+    picture = cv2.imread(path)
+    seconds = []
+    for again in range(3):
+        start = time.thread_time()
+        found = detector.find_vps(picture).tolist()
+        seconds.append(time.thread_time() - start)
+    out.append((min(seconds), found))
+print(json.dumps(out))
+"""
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    yield
+    cv2.setNumThreads(threads)
+
+
+def courtyard(size_px):
+    """A fisheye picture of chequered walls with noise: more edges than a street has."""
+    middle = (size_px - 1) / 2
+    lens = Equidistant(focal_px=(size_px / 2 - 2) / math.radians(117.5), centre_px=(middle, middle))
+    column, row = np.meshgrid(np.arange(size_px, dtype=np.float64), np.arange(size_px, dtype=np.float64))
+    rays = lens.unproject(np.column_stack([column.ravel(), row.ravel()]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = np.min(np.abs(np.array([6.0, 9.0, 4.0]) / rays), axis=1)
+    cells = np.floor(np.nan_to_num(rays * away[:, None]) / [1.9, 2.3, 1.3] + 0.5).sum(axis=1)
+    grey = np.where(np.isnan(away), 0.0, np.where(cells % 2 == 0, 90.0, 150.0)).reshape(size_px, size_px)
+    grey = cv2.GaussianBlur(grey, (3, 3), 0.6) + np.random.default_rng(0).normal(0, 2, grey.shape)
+    return lens, np.clip(np.round(grey), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("size_px", [720, 1080, 1440])
+def test_ours_whole_picture(benchmark, size_px):
+    lens, grey = courtyard(size_px)
+    vp = GreatCircleVp(carrier=Carrier.VEHICLE, T_carrier_camera=Pose(rpy_deg=(0.0, 0.0, 90.0)), lens=lens)
+    picture = Image(stamp_ns=0, frame_id="camera_vehicle", grey=grey)
+    assert len(vp.on_image(picture).direction) == 3
+    benchmark(vp.on_image, picture)
+
+
+@pytest.mark.parametrize("size_px", [720, 1080, 1440])
+def test_paper_whole_picture(benchmark, size_px):
+    """The same pictures through three views of 428 px; most of it is LSD's."""
+    lens, grey = courtyard(size_px)
+    looks_up = Pose(rpy_deg=(0.0, 0.0, 90.0))
+    vp = PaperVp(carrier=Carrier.VEHICLE, T_carrier_camera=looks_up, lens=lens, size_px=size_px)
+    picture = Image(stamp_ns=0, frame_id="camera_vehicle", grey=grey)
+    assert len(vp.on_image(picture).line_normal) > 100
+    benchmark(vp.on_image, picture)
+
+
+def york_camera():
+    """focal [px], and the principal point counted from 0."""
+    from scipy.io import loadmat
+
+    tree = loadmat(YORK / "cameraParameters.mat")
+    column, row = tree["pp"][0]
+    return float(tree["focal"][0, 0] / tree["pixelSize"][0, 0]), float(column) - 1, float(row) - 1
+
+
+def york_truth(folder):
+    """(3, 3) true directions as rows, camera frame (y down)."""
+    from scipy.io import loadmat
+
+    tree = loadmat(folder / f"{folder.name}GroundTruthVP_Orthogonal_CamParams.mat")
+    return tree["vp_orthogonal"].T * [1.0, -1.0, 1.0]
+
+
+def ours_on_york(folders):
+    """CPU time [s], the best of three, and directions (n, 3) in the camera frame of each picture."""
+    focal, column, row = york_camera()
+    lens = OCam(polynomial=(-focal, 0.0, 0.0, 0.0, 0.0), centre_px=(column, row), max_off_axis_deg=60.0)  # a pinhole
+    vp = GreatCircleVp(
+        carrier=Carrier.DRONE,
+        T_carrier_camera=Pose(quaternion_xyzw=(-0.5, 0.5, -0.5, 0.5)),
+        lens=lens,
+        search_deg=45.0,
+        vertical_sigma_deg=20.0,
+        max_frames=1,
+    )
+    pictures = [cv2.imread(str(folder / f"{folder.name}.jpg"), cv2.IMREAD_GRAYSCALE) for folder in folders]
+    answers = []
+    for grey in pictures:
+        seconds = []
+        for _ in range(3):
+            start = time.thread_time()
+            found = vp.on_image(Image(stamp_ns=0, frame_id="camera_drone", grey=grey))
+            seconds.append(time.thread_time() - start)
+        answers.append((min(seconds), found.direction @ R_CARRIER_CAMERA))
+    return answers
+
+
+def lu_on_york(folders):
+    focal, column, row = york_camera()
+    asked = json.dumps([focal, column, row, *(str(folder / f"{folder.name}.jpg") for folder in folders)])
+    told = subprocess.run([LU_PYTHON, "-c", LU], input=asked, capture_output=True, text=True, check=True)
+    return [(seconds, np.array(found)) for seconds, found in json.loads(told.stdout)]
+
+
+def errors_deg(found, truth):
+    """(3,) of each true direction to the nearest found one; 90 without any."""
+    if len(found) == 0:
+        return np.full(len(truth), 90.0)
+    return np.degrees(np.arccos(np.clip(np.abs(truth @ found.T), 0.0, 1.0))).min(axis=1)
+
+
+def line_of(name, errors, seconds):
+    recall = " ".join(f"{np.mean(errors < limit):.3f}" for limit in (1, 2, 5))
+    whole = " ".join(f"{np.mean(errors.max(axis=1) < limit):.2f}" for limit in (2, 5))
+    return (
+        f"{name:24s} median {np.median(errors):.2f} deg, RMS below 5 deg {np.sqrt(np.mean(errors[errors < 5] ** 2)):.2f}, "
+        f"recall 1/2/5 deg {recall}, whole pictures 2/5 deg {whole}, {1e3 * np.median(seconds):.1f} ms CPU a picture"
+    )
+
+
+def test_ours_beside_lu_vp_detect_on_york_urban():
+    if not YORK.exists():
+        pytest.skip("York Urban is not here (../shared/data/vp_york_urban)")
+    folders = sorted(YORK.glob("P*"))
+    truth = [york_truth(folder) for folder in folders]
+    print()  # noqa: T201
+    answers = ours_on_york(folders)
+    errors = np.array([errors_deg(a[1], t) for a, t in zip(answers, truth, strict=True)])
+    print(line_of("ours", errors, [a[0] for a in answers]))  # noqa: T201
+    if not LU_PYTHON:
+        pytest.skip("GRD_LU_VP_PYTHON does not name the Python of an environment with lu-vp-detect and OpenCV 4")
+    answers = lu_on_york(folders)
+    errors = np.array([errors_deg(a[1], t) for a, t in zip(answers, truth, strict=True)])
+    print(line_of("lu-vp-detect", errors, [a[0] for a in answers]))  # noqa: T201

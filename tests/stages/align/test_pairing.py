@@ -1,0 +1,55 @@
+"""Pictures are paired with the nearest, as soon as that is certain."""
+
+from __future__ import annotations
+
+from stages.align.pairing import Pairing
+from stages.messages import Carrier
+from tests.stages.align.made_lines import MS, nothing
+
+
+def run(events, furthest_ms=100):
+    """Events ("v" or "d", ms) -> pairs (vehicle ms or None, drone ms), each with how many events it took."""
+    pairing, out = Pairing(furthest_ms * MS), []
+    for count, (kind, ms) in enumerate(events, 1):
+        carrier = Carrier.VEHICLE if kind == "v" else Carrier.DRONE
+        seen = nothing(carrier, ms * MS)
+        ready = pairing.vehicle(seen) if kind == "v" else pairing.drone(seen)
+        out += [(v and v.stamp_ns // MS, d.stamp_ns // MS, count) for v, d in ready]
+    out += [(v and v.stamp_ns // MS, d.stamp_ns // MS, None) for v, d in pairing.rest()]
+    return out
+
+
+def test_one_at_the_same_moment_is_taken_at_once_whichever_comes_first():
+    assert run([("v", 100), ("d", 100)]) == [(100, 100, 2)]
+    assert run([("d", 100), ("v", 100)]) == [(100, 100, 2)]
+
+
+def test_the_next_picture_is_awaited_when_it_may_be_nearer():
+    assert run([("v", 0), ("v", 100), ("d", 180), ("v", 200)]) == [(200, 180, 4)]
+
+
+def test_the_next_picture_is_not_awaited_when_it_cannot_be_nearer():
+    assert run([("v", 0), ("v", 100), ("d", 140), ("v", 200)]) == [(100, 140, 3)]
+
+
+def test_each_drone_picture_is_answered_once_and_in_order():
+    events = sorted([("v", 33 + 100 * i) for i in range(8)] + [("d", 70 * i) for i in range(10)], key=lambda e: e[1])
+    pairs = run(events)
+    assert [d for _, d, _ in pairs] == [70 * i for i in range(10)]
+    assert all(abs(v - d) <= 50 for v, d, _ in pairs)
+
+
+def test_without_a_vehicle_picture_near_there_is_none():
+    assert run([("v", 0), ("v", 100), ("d", 400), ("v", 700)]) == [(None, 400, 4)]
+
+
+def test_a_dead_camera_does_not_hold_answers_back():
+    assert run([("d", 100 * i) for i in range(5)])[0] == (None, 0, 4)
+
+
+def test_what_waits_at_the_end_goes_with_what_there_is():
+    assert run([("v", 0), ("v", 100), ("d", 180)]) == [(100, 180, None)]
+
+
+def test_a_late_picture_of_the_vehicle_is_ignored():
+    assert run([("v", 100), ("v", 40), ("d", 50)]) == [(100, 50, 3)]

@@ -1,0 +1,204 @@
+"""PaperAlign: pairs in time, the branch it starts in, its correction by motion, what it says it knows."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from flow.message import check_arrays, hash_into
+from flow.stage import input_ports, output_ports
+from stages.align import PaperAlign
+from stages.align.paper_match import angle_between_rad
+from stages.geometry import rotation_z
+from stages.messages import BranchState, Carrier
+from tests.stages.align.paper_flight import START_NS, Flight, picture_ns, vanishing
+
+VEHICLE, DRONE = Carrier.VEHICLE, Carrier.DRONE
+
+
+def run(stage, flight, pictures, motions=True, seen=lambda flight, carrier, k: flight.seen(carrier, k)):
+    out = []
+    for k in range(pictures):
+        if motions:
+            stage.on_motion(flight.vehicle(k))
+            stage.on_fix(flight.fix(k))
+            if k >= 14:
+                stage.on_drone_motion(flight.motion(k - 14, k))
+        out += list(stage.on_vehicle(seen(flight, VEHICLE, k)))
+        out += list(stage.on_drone(seen(flight, DRONE, k)))
+    out += list(stage.finish())
+    for message in out:
+        check_arrays(message)
+    return out
+
+
+def errors_deg(out, flight):
+    return [
+        math.degrees(angle_between_rad(m.R_vehicle_drone, flight.R_vehicle_drone((m.stamp_ns - START_NS) // 10**8)))
+        for m in out
+        if m.R_vehicle_drone is not None
+    ]
+
+
+def test_ports_are_what_the_graph_wires():
+    assert set(input_ports(PaperAlign)) == {"vehicle", "drone", "fix", "drone_motion", "motion"}
+    assert set(output_ports(PaperAlign)) == {"relative_rotation"}
+    assert PaperAlign.optional_inputs == {"fix", "drone_motion", "motion"}
+
+
+def test_one_answer_for_each_picture_of_the_drone_at_its_time():
+    out = run(PaperAlign(), Flight(drone_yaw_deg=10), 20, motions=False)
+    assert [m.stamp_ns for m in out] == [picture_ns(k) for k in range(20)]
+    assert all(m.state is BranchState.AMBIGUOUS for m in out)
+    assert max(errors_deg(out, Flight(drone_yaw_deg=10))[3:]) < 0.5
+
+
+def test_without_motion_nothing_is_known_of_the_branch():
+    out = run(PaperAlign(), Flight(drone_yaw_deg=10), 30, motions=False)
+    np.testing.assert_array_equal(out[-1].branch_probability, [0.25] * 4)
+    assert out[-1].switches == 0
+
+
+@pytest.mark.parametrize(("yaw_deg", "off_deg"), [(95, 90), (-80, 90), (185, 180)])
+def test_a_wrong_start_is_a_wrong_branch_until_the_drone_has_moved(yaw_deg, off_deg):
+    flight = Flight(drone_yaw_deg=yaw_deg, vehicle_dps=0.0)
+    out = run(PaperAlign(), flight, 40)
+    errors = errors_deg(out, flight)
+    assert errors[15] == pytest.approx(off_deg, abs=1.0)
+    assert out[15].state is BranchState.AMBIGUOUS
+    first = next(k for k, m in enumerate(out) if m.switches == 1)
+    assert 14 + 6 <= first <= 14 + 8
+    assert out[first].reason.startswith("branch corrected: motion says")
+    assert max(errors[first:]) < 1.0
+    assert all(m.state is BranchState.RESOLVED and m.switches == 1 for m in out[first:])
+
+
+def test_the_correction_is_about_the_worlds_vertical_and_told_in_the_vehicles_axes():
+    """The vehicle turns at 30 deg/s: by the time of the correction it looks another way than at the start."""
+    flight = Flight(drone_yaw_deg=95, vehicle_dps=30.0, drone_dps=30.0)
+    out = run(PaperAlign(), flight, 40)
+    assert out[-1].switches == 1
+    assert errors_deg(out, flight)[-1] < 1.0
+
+
+def test_a_right_start_is_confirmed_and_no_jump():
+    flight = Flight(drone_yaw_deg=20, drone_dps=10.0)
+    out = run(PaperAlign(), flight, 40)
+    assert out[-1].state is BranchState.RESOLVED
+    assert out[-1].switches == 0
+    assert out[-1].reason.endswith("motion agrees")
+    assert max(errors_deg(out, flight)[10:]) < 1.5
+
+
+def test_a_correction_is_not_certain_and_says_so():
+    out = run(PaperAlign(wrong_share=0.06), Flight(drone_yaw_deg=95, vehicle_dps=0.0), 40)
+    np.testing.assert_allclose(out[-1].branch_probability, [0.94, 0.02, 0.02, 0.02])
+
+
+def test_the_error_of_the_motions_direction_does_not_reach_the_rotation():
+    """R_f is 12 deg off; the streets decide within the branch."""
+    flight = Flight(drone_yaw_deg=95, vehicle_dps=0.0)
+    stage, skewed = PaperAlign(), Flight(drone_yaw_deg=95 + 12, vehicle_dps=0.0)
+    for k in range(40):
+        stage.on_fix(flight.fix(k))
+        stage.on_motion(flight.vehicle(k))
+        if k >= 14:
+            stage.on_drone_motion(skewed.motion(k - 14, k))
+        out = [*stage.on_vehicle(flight.seen(VEHICLE, k)), *stage.on_drone(flight.seen(DRONE, k))]
+    assert out[-1].switches == 1
+    assert errors_deg(out[-1:], flight)[0] < 0.5
+
+
+def test_the_initial_yaw_is_where_matching_starts():
+    flight = Flight(drone_yaw_deg=95, vehicle_dps=0.0)
+    assert max(errors_deg(run(PaperAlign(initial_yaw_deg=80), flight, 10, motions=False), flight)) < 1.0
+
+
+def test_the_nearest_picture_of_the_vehicle_is_taken():
+    """The vehicle has turned by 0, 10 and 40 deg at its pictures; the drone's lies nearest to the second."""
+    stage = PaperAlign(initial_sigma_deg=90)
+    out = []
+    for after_ms, turned in ((0, 0.0), (60, 10.0), (130, 40.0)):
+        directions = np.eye(3) @ rotation_z(math.radians(turned))
+        out += list(stage.on_vehicle(vanishing(VEHICLE, START_NS + after_ms * 10**6, directions)))
+        if after_ms == 60:
+            out += list(stage.on_drone(vanishing(DRONE, START_NS + 80 * 10**6, np.eye(3))))
+    (answer,) = out
+    assert angle_between_rad(answer.R_vehicle_drone, rotation_z(math.radians(-10))) < math.radians(0.1)
+
+
+def test_pictures_far_apart_are_no_pair():
+    stage = PaperAlign(max_apart_s=0.05)
+    list(stage.on_drone(vanishing(DRONE, START_NS, np.eye(3))))
+    (answer,) = stage.on_vehicle(vanishing(VEHICLE, START_NS + 60 * 10**6, np.eye(3)))
+    assert answer.R_vehicle_drone is None
+    assert answer.covariance_rad2 is None
+    assert answer.state is BranchState.NONE
+    assert answer.reason == "no picture of the vehicle's within 0.05 s of the drone's"
+
+
+def test_a_drone_without_a_vehicle_gets_answers_without_rotation():
+    stage = PaperAlign()
+    out = [m for k in range(10) for m in stage.on_drone(Flight().seen(DRONE, k))] + list(stage.finish())
+    assert len(out) == 10
+    assert all(m.R_vehicle_drone is None for m in out)
+
+
+def test_pictures_without_directions_say_why_and_the_rest_goes_on():
+    flight = Flight(drone_yaw_deg=10)
+
+    def gap(flight, carrier, k):
+        if carrier is DRONE and 10 <= k < 15:
+            return vanishing(DRONE, picture_ns(k), np.empty((0, 3)), "1 of 3 views have a vanishing point")
+        return flight.seen(carrier, k)
+
+    out = run(PaperAlign(), flight, 30, seen=gap)
+    assert [m.R_vehicle_drone is None for m in out] == [10 <= k < 15 for k in range(30)]
+    assert out[12].reason == "drone: 1 of 3 views have a vanishing point"
+    assert max(errors_deg(out, flight)[5:]) < 1.0
+
+
+def test_the_covariance_is_the_filters_and_grows_in_a_gap():
+    flight = Flight(drone_yaw_deg=10)
+    out = run(PaperAlign(), flight, 30, motions=False)
+    sigma = [math.degrees(math.sqrt(m.covariance_rad2[2, 2])) for m in out]
+    assert sigma[0] == pytest.approx(1.0, abs=0.01), "the first observation is all there is"
+    assert sigma[-1] < sigma[0]
+    for message in out:
+        np.testing.assert_allclose(message.covariance_rad2, message.covariance_rad2.T, atol=1e-15)
+
+
+def test_the_other_cameras_directions_are_refused():
+    with pytest.raises(ValueError, match="input 'drone' got the directions of the vehicle: wire the other camera"):
+        list(PaperAlign().on_drone(vanishing(VEHICLE, START_NS, np.eye(3))))
+
+
+def test_the_same_inputs_give_the_same_bits():
+    digests = []
+    for _ in range(2):
+        digest = hashlib.sha256()
+        for message in run(PaperAlign(), Flight(drone_yaw_deg=95), 40):
+            hash_into(digest, message)
+        digests.append(digest.hexdigest())
+    assert digests[0] == digests[1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"pictures_apart": 0},
+        {"shortest_m": 0},
+        {"cone_deg": 90},
+        {"wrong_share": 0.75},
+        {"last": 0},
+        {"yaw": 3},
+        {"max_apart_s": 0},
+    ],
+)
+def test_settings_that_cannot_work_are_refused(settings):
+    with pytest.raises(ValidationError):
+        PaperAlign(**settings)

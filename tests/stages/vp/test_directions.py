@@ -1,0 +1,177 @@
+"""Directions of made lines: the formulas, their symmetries, several frames, honest sigma."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from stages.geometry import rotation_from_rpy_deg, rotation_z
+from stages.vp.directions import NONE, Lines, all_directions, assign, refine, residual_sigma, upright
+from stages.vp.search import Limits, Prior, find_structure
+from stages.vp.spectrum import peaks, yaw_spectrum
+from stages.vp.verticals import propose_verticals, refine_vertical
+
+SIGMA = np.radians(0.25)
+LIMITS = Limits(SIGMA, np.radians(0.05), 0.3, 3, 4, 7.0)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def lines_along(directions, each=20, turn_sigma_deg=0.5, noise_deg=0.2, seed=0, loose=0):
+    """Lines seen in all places that run along directions (k, 3), and loose ones that run anywhere."""
+    rng = np.random.default_rng(seed)
+    normals, middles, sigmas = [], [], []
+    for d in np.vstack([np.repeat(directions, each, axis=0), rng.normal(size=(loose, 3))]):
+        middle = rng.normal(size=3)
+        middle /= np.linalg.norm(middle)
+        n = np.cross(d, middle)
+        n /= np.linalg.norm(n)
+        sigma = np.radians(turn_sigma_deg) * rng.uniform(0.5, 1.5)
+        n = n + rng.normal(0, sigma) * np.cross(n, middle)  # turned about its middle ray
+        n = n + rng.normal(0, np.radians(noise_deg)) * d / np.linalg.norm(d)  # the world is not quite parallel
+        normals.append(n / np.linalg.norm(n))
+        middles.append(middle - normals[-1] * (normals[-1] @ middle))
+        sigmas.append(sigma)
+    normal = np.array(normals)
+    middle = np.array(middles) / np.linalg.norm(middles, axis=1, keepdims=True)
+    return Lines(normal, np.cross(normal, middle), np.array(sigmas), np.ones(len(normal)))
+
+
+def off_deg(a, b):
+    return np.degrees(np.arccos(np.clip(np.abs(a @ b), 0, 1)))
+
+
+def test_the_residual_s_sigma_is_turn_and_world_together():
+    lines = Lines(np.array([[0.0, 0, 1]]), np.array([[1.0, 0, 0]]), np.array([3e-3]), np.ones(1))
+    assert residual_sigma(lines, np.array([1.0, 0, 0]), 4e-3)[0] == pytest.approx(5e-3)
+    assert residual_sigma(lines, np.array([0.0, 1, 0]), 4e-3)[0] == pytest.approx(4e-3)
+
+
+def test_axes_stand_upright_on_any_vertical():
+    for v in (UP, np.array([0, 1.0, 0]), np.array([0.6, 0, -0.8])):
+        axes = upright(v)
+        np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+        assert np.linalg.det(axes) == pytest.approx(1)
+        np.testing.assert_allclose(axes[:, 2], v)
+        directions = all_directions(axes, np.array([0.0, 0.3]))
+        np.testing.assert_allclose(directions[1:] @ v, 0, atol=1e-12)
+        assert directions[1] @ directions[2] == pytest.approx(0, abs=1e-12)
+        assert directions[1] @ directions[3] == pytest.approx(np.cos(0.3))
+
+
+def test_the_spectrum_peaks_at_the_street_s_yaw_modulo_90_deg():
+    R = rotation_z(np.radians(20.0))
+    for turned in (R, R @ rotation_z(np.pi / 2)):
+        lines = lines_along(turned[:, :2].T, each=30)
+        spectrum = yaw_spectrum(lines, np.eye(3), np.ones(len(lines.normal), dtype=bool), SIGMA, 180)
+        assert np.degrees(peaks(spectrum, 1)[0]) == pytest.approx(20, abs=0.6)
+        assert spectrum.score.max() > 15
+    none = lines_along(np.empty((0, 3)), loose=60)
+    assert yaw_spectrum(none, np.eye(3), np.ones(60, dtype=bool), SIGMA, 180).score.max() < LIMITS.min_score
+
+
+def test_the_score_is_in_standard_deviations_of_yaws_drawn_at_random():
+    sigma = 0.05
+    lines = Lines(np.array([[0.0, 1, 0]]), np.array([[0.0, 0, 1]]), np.array([0.0]), np.array([0.5]))
+    spectrum = yaw_spectrum(lines, np.eye(3), np.ones(1, dtype=bool), sigma / 2, 900)  # it runs along x
+    share = math.sqrt(2 * math.pi) * sigma / (math.pi / 2)  # the kernel's mean over a quarter turn
+    assert spectrum.lines.max() == pytest.approx(0.5, abs=1e-3)
+    assert spectrum.lines.mean() == pytest.approx(0.5 * share, rel=0.01)
+    deviation = 0.5 * math.sqrt(share / math.sqrt(2) - share**2)
+    assert spectrum.score.max() == pytest.approx((0.5 - 0.5 * share) / deviation, rel=0.01)
+    assert spectrum.lines.std() == pytest.approx(deviation, rel=0.02)
+
+
+def test_the_vertical_is_found_from_a_start_some_degrees_off():
+    truth = rotation_from_rpy_deg((3.0, -2.0, 0.0))
+    lines = lines_along(truth[:, 2][None], each=30, loose=20)
+    v = refine_vertical(lines, UP, UP, np.radians(5), SIGMA, np.radians(6))
+    assert off_deg(v, truth[:, 2]) < 0.2
+
+
+def test_proposals_hold_the_vertical_with_and_without_upright_lines():
+    truth = rotation_from_rpy_deg((20.0, -10.0, 40.0))
+    for rows in (truth.T, truth[:, :2].T):
+        found = propose_verticals(lines_along(rows, loose=10), UP, np.radians(35), SIGMA, 45, 8)
+        assert off_deg(found, truth[:, 2]).min() < 1.0
+
+
+def test_refining_recovers_the_rotation_and_turns_with_the_world():
+    truth = rotation_from_rpy_deg((4.0, -3.0, 25.0))
+    lines = lines_along(truth.T)
+    start = truth @ rotation_from_rpy_deg((1.0, -1.0, 1.5))
+    s = refine(lines, start, np.zeros(1), truth[:, 2], np.radians(1), SIGMA)
+    assert off_deg(s.axes.T, truth).diagonal().max() < 0.3
+    R = rotation_from_rpy_deg((70.0, 20.0, -130.0))
+    turned = Lines(lines.normal @ R.T, lines.tangent @ R.T, lines.sigma_rad, lines.weight)
+    t = refine(turned, R @ start, np.zeros(1), R @ truth[:, 2], np.radians(1), SIGMA)
+    np.testing.assert_allclose(t.axes, R @ s.axes, atol=1e-9)
+    np.testing.assert_array_equal(t.assigned, s.assigned)
+    np.testing.assert_allclose(t.information, s.information, rtol=1e-6, atol=1e-3)
+
+
+def test_gravity_holds_the_vertical_where_lines_do_not():
+    up = rotation_from_rpy_deg((2.0, -1.0, 0.0))[:, 2]
+    towards_x = Lines(np.array([[0.0, 1, 0]]), np.array([[0.0, 0, 1]]), np.array([1e-3]), np.ones(1))
+    s = refine(towards_x, np.eye(3), np.zeros(1), up, np.radians(1), SIGMA)
+    assert off_deg(s.axes[:, 2], up) < 0.01
+
+
+def test_lines_that_fit_no_direction_have_none():
+    lines = lines_along(np.vstack([np.eye(3), [[0.6, 0.0, 0.8]]]), each=5)
+    assigned, r, sigma = assign(lines, np.eye(3), SIGMA)
+    assert (assigned[:15] == np.repeat([0, 1, 2], 5)).mean() > 0.8
+    assert (assigned[15:] == NONE).mean() > 0.7
+    np.testing.assert_allclose(np.abs(r[0]), np.abs(lines.normal[0] @ np.eye(3)[assigned[0]]))
+    assert (sigma >= SIGMA).all()
+
+
+def test_stated_sigmas_hold_what_they_promise():
+    squares, places = [], []
+    for seed in range(150):
+        truth = rotation_from_rpy_deg((2.0, 1.0, 30.0 + seed))
+        lines = lines_along(truth.T, each=6, seed=seed, loose=4)
+        found = find_structure(lines, Prior(truth[:, 2], np.radians(3), 0.0), LIMITS)
+        for d, sigma in zip(found.direction, found.sigma_rad, strict=True):
+            off = np.radians(off_deg(truth.T, d).min())
+            squares.append(off**2 / 2 / sigma**2)
+            places.append(off < 2.45 * sigma)
+    assert len(squares) > 400
+    assert 0.4 < np.mean(squares) < 1.6
+    assert np.mean(places) > 0.9
+
+
+def test_two_horizontal_frames_are_told_apart_and_numbered_by_strength():
+    other = rotation_z(np.radians(30.0))
+    rows = np.vstack([np.eye(3), np.eye(3)[:2], other[:, :2].T])
+    found = find_structure(lines_along(rows, each=12), Prior(UP, np.radians(3), 0.0), LIMITS)
+    assert list(found.frame) == [-1, 0, 0, 1, 1]
+    for k, d in enumerate(found.direction[1:]):
+        assert off_deg(other.T if k >= 2 else np.eye(3), d).min() < 0.5
+    assert found.sigma_rad[3] > found.sigma_rad[1]
+    one = find_structure(
+        lines_along(rows, each=12), Prior(UP, np.radians(3), 0.0), dataclasses.replace(LIMITS, max_frames=1)
+    )
+    assert list(one.frame) == [-1, 0, 0]
+
+
+@pytest.mark.parametrize(("apart_deg", "frames"), [(3.0, {-1, 0}), (7.0, {-1, 0, 1})])
+def test_pairs_are_told_apart_from_some_degrees_on(apart_deg, frames):
+    nearby = rotation_z(np.radians(apart_deg))
+    rows = np.vstack([np.eye(3), np.eye(3)[:2], nearby[:, :2].T])
+    found = find_structure(lines_along(rows, each=12), Prior(UP, np.radians(3), 0.0), LIMITS)
+    assert set(found.frame) == frames
+    for f, truth in ((0, np.eye(3)), (1, nearby)):
+        assert (off_deg(truth.T, found.direction[found.frame == f].T).min(axis=0) < 0.5).all()
+
+
+def test_loose_lines_are_no_structure_and_the_reason_says_so():
+    found = find_structure(lines_along(np.empty((0, 3)), loose=80), Prior(UP, np.radians(3), 0.0), LIMITS)
+    assert not (found.frame >= 0).any()
+    assert "stands out by" in found.reason
+    few = find_structure(lines_along(np.eye(3)[:1], each=2), Prior(UP, np.radians(3), 0.0), LIMITS)
+    assert len(few.direction) == 0
+    assert "too few" in few.reason
+    assert list(few.line_direction) == [-1, -1]

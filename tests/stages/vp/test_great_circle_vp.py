@@ -1,0 +1,198 @@
+"""The stage on made pictures: known streets through known lenses, turned cameras, parks, hidden bodies, gravity."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from streets import LOOKS_DOWN, LOOKS_UP, fisheye, foliage, street
+
+from stages.geometry import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
+from stages.lens import KannalaBrandt
+from stages.messages import Carrier, DroneAttitude, Image
+from stages.vp import GreatCircleVp
+
+LENS = fisheye()
+UP = Pose(rpy_deg=(0.0, 0.0, 90.0))
+DOWN = Pose(rpy_deg=(180.0, 0.0, -90.0))
+STILL = np.zeros(3)
+
+
+def image(grey, stamp_ns=5, carrier="vehicle"):
+    return Image(stamp_ns=stamp_ns, frame_id=f"camera_{carrier}", grey=grey)
+
+
+def attitude(R, stamp_ns=5, rate_radps=STILL):
+    return DroneAttitude(stamp_ns=stamp_ns, R_local_drone=R, angular_velocity_drone_radps=rate_radps)
+
+
+def vehicle_vp(**settings):
+    return GreatCircleVp(**{"carrier": Carrier.VEHICLE, "T_carrier_camera": UP, "lens": LENS} | settings)
+
+
+def drone_vp(**settings):
+    return GreatCircleVp(**{"carrier": Carrier.DRONE, "T_carrier_camera": DOWN, "lens": LENS} | settings)
+
+
+def off_deg(directions, truth):
+    """How far each direction is from the nearest of the true ones (rows)."""
+    return np.degrees(np.arccos(np.clip(np.abs(directions @ np.asarray(truth).T), 0, 1))).min(axis=1)
+
+
+@pytest.fixture(scope="module")
+def level():
+    return street(LOOKS_UP, LENS)
+
+
+def test_a_street_gives_its_vertical_and_one_pair_in_the_vehicle_s_axes(level):
+    found = vehicle_vp().on_image(image(level, stamp_ns=77))
+    assert found.stamp_ns == 77
+    assert found.carrier is Carrier.VEHICLE
+    assert list(found.is_vertical) == [True, False, False]
+    assert list(found.frame) == [-1, 0, 0]
+    assert off_deg(found.direction[:1], [[0, 0, 1]]) < 0.15
+    assert off_deg(found.direction[1:], np.eye(3)[:2]).max() < 0.2
+    assert abs(found.direction[1] @ found.direction[2]) < 1e-9
+    assert (np.degrees(found.sigma_rad) > 0.05).all()
+    assert (np.degrees(found.sigma_rad) < 0.5).all()
+
+
+def test_its_lines_lie_on_their_circles_and_run_in_their_directions(level):
+    found = vehicle_vp().on_image(image(level))
+    assert len(found.line_normal) > 50
+    np.testing.assert_allclose(np.linalg.norm(found.line_normal, axis=1), 1)
+    np.testing.assert_allclose(np.einsum("nej,nj->ne", found.line_end, found.line_normal), 0, atol=1e-9)
+    has = found.line_direction >= 0
+    assert has.mean() > 0.8
+    r = np.einsum("nj,nj->n", found.line_normal[has], found.direction[found.line_direction[has]])
+    assert np.degrees(np.median(np.abs(r))) < 0.25
+    assert set(found.line_direction) <= {-1, 0, 1, 2}
+
+
+@pytest.mark.parametrize("rpy_deg", [(0.0, 0.0, 33.0), (2.0, -1.5, -70.0), (-1.0, 2.0, 170.0)])
+def test_turning_the_vehicle_turns_the_directions_back(rpy_deg):
+    R_world_vehicle = rotation_from_rpy_deg(rpy_deg)
+    found = vehicle_vp().on_image(image(street(R_world_vehicle @ LOOKS_UP, LENS)))
+    assert list(found.frame) == [-1, 0, 0]
+    assert off_deg(found.direction @ R_world_vehicle.T, np.eye(3)).max() < 0.3
+    assert off_deg(found.direction[:1] @ R_world_vehicle.T, [[0, 0, 1]]) < 0.2
+
+
+def test_another_lens_and_mount_see_the_same_street():
+    lens = KannalaBrandt(
+        focal_px=(113.0, 115.0), centre_px=(242.0, 236.0), k=(0.02, -0.004, 0.0, 0.0), max_off_axis_deg=115
+    )
+    tilted = rotation_from_rpy_deg((15.0, -10.0, 60.0))
+    mount = Pose(quaternion_xyzw=tuple(quaternions_xyzw(tilted[None])[0]))
+    found = vehicle_vp(lens=lens, T_carrier_camera=mount).on_image(image(street(tilted, lens)))
+    assert list(found.frame) == [-1, 0, 0]
+    assert off_deg(found.direction, np.eye(3)).max() < 0.3
+
+
+def test_walls_at_an_odd_angle_are_a_second_frame():
+    grey = street(LOOKS_UP, LENS, wall_turns_deg=(0.0, 30.0))
+    found = vehicle_vp().on_image(image(grey))
+    assert list(np.unique(found.frame)) == [-1, 0, 1]
+    other = rotation_z(np.radians(30.0))[:, :2].T
+    of = [found.direction[found.frame == f] for f in (0, 1)]
+    street_first = off_deg(of[0], np.eye(3)[:2]).max() < 1
+    assert off_deg(of[0 if street_first else 1], np.eye(3)[:2]).max() < 0.3
+    assert off_deg(of[1 if street_first else 0], other).max() < 0.3
+    alone = vehicle_vp(max_frames=1).on_image(image(grey))
+    assert set(alone.frame) == {-1, 0}
+
+
+def test_a_drone_takes_roll_and_pitch_from_its_attitude_and_no_yaw():
+    R_world_drone = rotation_from_rpy_deg((14.0, -20.0, 50.0))
+    grey = street(R_world_drone @ LOOKS_DOWN, LENS, up_m=6.0)
+    answers = []
+    for heading_deg in (0.0, 123.0):
+        vp = drone_vp()
+        vp.on_attitude(attitude(rotation_z(np.radians(heading_deg)) @ R_world_drone))
+        answers.append(vp.on_image(image(grey, carrier="drone")))
+        assert off_deg(answers[-1].direction @ R_world_drone.T, np.eye(3)).max() < 0.3
+    np.testing.assert_allclose(answers[0].direction, answers[1].direction, atol=1e-6)
+
+
+def test_a_drone_without_attitude_finds_the_vertical_by_itself():
+    R_world_drone = rotation_from_rpy_deg((14.0, -20.0, 50.0))
+    grey = street(R_world_drone @ LOOKS_DOWN, LENS, up_m=6.0)
+    found = drone_vp().on_image(image(grey, carrier="drone"))
+    assert off_deg(found.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) < 0.3
+    assert off_deg(found.direction @ R_world_drone.T, np.eye(3)).max() < 0.3
+
+
+def test_an_attitude_is_turned_to_the_picture_s_time_and_forgotten_when_old():
+    R_world_drone = rotation_from_rpy_deg((14.0, 0.0, 20.0))
+    grey = street(R_world_drone @ LOOKS_DOWN, LENS, up_m=6.0)
+    before = R_world_drone @ rotation_from_rpy_deg((-6.0, 0.0, 0.0))  # 0.1 s ago, rolling at 60 deg/s
+    vp = drone_vp(attitude_sigma_deg=0.3, search_deg=0.0)
+    vp.on_attitude(attitude(before, 900_000_000, np.array([np.radians(60.0), 0, 0])))
+    found = vp.on_image(image(grey, 1_000_000_000, "drone"))
+    assert off_deg(found.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) < 0.3
+    late = vp.on_image(image(grey, 1_200_000_000, "drone"))  # no attitude: its z is taken for upright, 14 deg off
+    assert not len(late.direction) or off_deg(late.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) > 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_foliage_and_noise_are_no_structure(seed):
+    found = vehicle_vp().on_image(image(foliage(seed=seed)))
+    assert not (found.frame >= 0).any()
+    assert found.reason
+    noise = np.random.default_rng(seed).normal(110, 12, (480, 480)).astype(np.uint8)
+    assert len(vehicle_vp().on_image(image(noise)).direction) == 0
+
+
+def test_a_black_picture_has_no_lines_and_says_so():
+    found = vehicle_vp().on_image(image(np.zeros((480, 480), dtype=np.uint8)))
+    assert found.direction.shape == (0, 3)
+    assert found.line_end.shape == (0, 2, 3)
+    assert "too few" in found.reason
+
+
+def test_masked_pixels_and_the_rim_give_no_lines(level):
+    hidden = ((100.0, 0.0), (479.0, 0.0), (479.0, 200.0), (100.0, 200.0))
+    found = vehicle_vp(masked_px=(hidden,), max_off_axis_deg=80.0).on_image(image(level))
+    pixels = LENS.project((found.line_end @ LOOKS_UP).reshape(-1, 3))
+    assert len(pixels) > 10
+    assert not ((pixels[:, 0] > 101) & (pixels[:, 1] < 199)).any()
+    assert (found.line_end[:, :, 2] > np.cos(np.radians(81.0))).all()
+
+
+def test_the_same_picture_gives_the_same_bytes_whatever_came_before(level):
+    vp = vehicle_vp()
+    first = vp.on_image(image(level))
+    vp.on_image(image(foliage()))
+    again = vp.on_image(image(level))
+    np.testing.assert_array_equal(first.direction, again.direction)
+    np.testing.assert_array_equal(first.line_normal, again.line_normal)
+    assert first.reason == again.reason
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"min_contrast": 0.0},
+        {"max_frames": 0},
+        {"search_deg": 120.0},
+        {"masked_px": (((1.0, 2.0), (3.0, 4.0)),)},
+        {"line_sigma_deg": -1.0},
+        {"spam": 1},
+    ],
+)
+def test_impossible_settings_are_refused(settings):
+    with pytest.raises(ValidationError):
+        vehicle_vp(**settings)
+
+
+def test_a_mask_that_hides_everything_is_refused_with_what_to_do(level):
+    everything = ((0.0, 0.0), (479.0, 0.0), (479.0, 479.0), (0.0, 479.0))
+    with pytest.raises(ValueError, match="draw smaller polygons"):
+        vehicle_vp(masked_px=(everything,)).on_image(image(level))
+
+
+def test_another_carrier_s_picture_or_attitude_is_refused(level):
+    with pytest.raises(ValueError, match="image comes from camera_drone"):
+        vehicle_vp().on_image(image(level, carrier="drone"))
+    with pytest.raises(ValueError, match="attitude is the drone's"):
+        vehicle_vp().on_attitude(attitude(np.eye(3)))

@@ -1,0 +1,157 @@
+"""PaperVp: a chequered room's axes from three views, whatever way camera and room are turned; absence; bad settings."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from flow.message import check_arrays, hash_into
+from flow.stage import input_ports, output_ports
+from stages.geometry import Pose, rotation_from_rpy_deg
+from stages.messages import Carrier, Image
+from stages.vp import PaperVp
+from stages.vp.paper_vp import lines_of
+from tests.stages.vp.paper_rooms import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, courtyard, plain
+
+
+def vp(mount=LOOKS_UP, carrier="vehicle", **settings):
+    base = {"carrier": carrier, "T_carrier_camera": mount, "lens": LENS, "size_px": SIZE_PX, "view_px": 300}
+    return PaperVp.model_validate(base | settings)
+
+
+def directions(R_room_carrier, mount=LOOKS_UP, carrier="vehicle", **settings):
+    R_carrier_camera = mount.matrix()[:3, :3]
+    message = vp(mount, carrier, **settings).on_image(courtyard(R_room_carrier @ R_carrier_camera, 77, carrier))
+    check_arrays(message)
+    return message
+
+
+def off_axes_deg(message, R_room_carrier):
+    """How far each direction is from the nearest axis of the room."""
+    in_room = message.direction @ R_room_carrier.T
+    return np.degrees(np.arccos(np.clip(np.abs(in_room).max(axis=1), 0, 1)))
+
+
+def test_ports_are_what_the_graph_wires():
+    assert set(input_ports(PaperVp)) == {"image"}
+    assert set(output_ports(PaperVp)) == {"vanishing_directions"}
+
+
+@pytest.mark.parametrize(
+    ("rpy_deg", "mount", "carrier"),
+    [
+        ((0, 0, 20), LOOKS_UP, "vehicle"),
+        ((4, -3, -65), LOOKS_UP, "vehicle"),
+        ((-5, 6, 130), LOOKS_DOWN, "drone"),
+        ((10, 0, 75), LOOKS_DOWN, "drone"),
+    ],
+)
+def test_the_rooms_axes_are_found_in_the_carriers_axes(rpy_deg, mount, carrier):
+    R = rotation_from_rpy_deg(rpy_deg)
+    message = directions(R, mount, carrier)
+    assert message.stamp_ns == 77
+    assert message.carrier is Carrier(carrier)
+    assert len(message.direction) == 3, message.reason
+    assert off_axes_deg(message, R).max() < 1.0
+    np.testing.assert_allclose(np.linalg.norm(message.direction, axis=1), 1.0, atol=1e-12)
+    assert len(set(np.argmax(np.abs(message.direction @ R.T), axis=1))) == 3, "three different axes"
+
+
+def test_the_vertical_comes_first_and_is_said_to_be():
+    message = directions(rotation_from_rpy_deg((3, 2, 40)))
+    assert message.is_vertical.tolist() == [True, False, False]
+    assert message.frame.tolist() == [-1, 0, 0]
+    assert abs(message.direction[0, 2]) > np.cos(np.radians(6))
+
+
+def test_turning_the_camera_on_its_carrier_changes_nothing():
+    R = rotation_from_rpy_deg((0, 0, 25))
+    turned = Pose(rpy_deg=(8.0, -5.0, 200.0))
+    assert off_axes_deg(directions(R, turned), R).max() < 1.0
+
+
+def test_lines_lie_on_great_circles_through_their_ends_and_belong_to_a_direction():
+    message = directions(rotation_from_rpy_deg((0, 0, 20)))
+    ends, normal = message.line_end, message.line_normal
+    np.testing.assert_allclose(np.linalg.norm(ends, axis=2), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.einsum("nki,ni->nk", ends, normal), 0.0, atol=1e-9)
+    assert (message.line_sigma_rad > 0).all()
+    assert len(normal) > 100
+    assert (message.line_direction >= 0).mean() > 0.9
+    assert set(message.line_direction.tolist()) >= {0, 1, 2}
+    of_first = normal[message.line_direction == 1]
+    assert np.abs(of_first @ message.direction[1]).max() <= np.sin(np.radians(2.0))
+
+
+def test_the_third_direction_stands_on_the_two_that_were_found():
+    d = directions(rotation_from_rpy_deg((5, -4, 33))).direction
+    cosines = np.sort(np.abs([d[0] @ d[1], d[0] @ d[2], d[1] @ d[2]]))
+    np.testing.assert_allclose(cosines[:2], 0.0, atol=1e-12)
+    assert cosines[2] < np.sin(np.radians(2.0)), "found, not made orthogonal"
+
+
+def test_the_same_picture_gives_the_same_bits():
+    digests = []
+    for _ in range(2):
+        digest = hashlib.sha256()
+        hash_into(digest, directions(rotation_from_rpy_deg((0, 0, 20))))
+        digests.append(digest.hexdigest())
+    assert digests[0] == digests[1]
+
+
+def test_an_empty_picture_has_no_directions_and_says_why():
+    message = vp().on_image(plain())
+    check_arrays(message)
+    assert message.direction.shape == (0, 3)
+    assert message.line_normal.shape == (0, 3)
+    assert message.line_end.shape == (0, 2, 3)
+    assert message.reason == "0 of 3 views have a vanishing point"
+
+
+def test_one_direction_seen_by_all_views_is_no_answer():
+    picture = plain().grey.copy()
+    rays = LENS.unproject(np.argwhere(picture > 0)[:, ::-1].astype(np.float64))
+    spokes = (np.degrees(np.arctan2(rays[:, 1], rays[:, 0])) // 6) % 2 > 0  # all run to the zenith
+    picture[:] = np.where(spokes, 60, 190).reshape(picture.shape)
+    message = vp().on_image(Image(stamp_ns=1, frame_id="camera_vehicle", grey=picture))
+    assert len(message.direction) == 0
+    assert message.reason == "1 of 3 views have a vanishing point"
+    by_themselves = vp(apart_deg=0).on_image(Image(stamp_ns=1, frame_id="camera_vehicle", grey=picture))
+    assert by_themselves.reason == "no two vanishing points are at a right angle: 0 deg at most"
+    assert len(message.line_normal) > 20
+    assert (message.line_direction == -1).all()
+
+
+def test_a_picture_of_another_size_is_refused_with_what_to_do():
+    with pytest.raises(ValueError, match="a picture of 200 x 200 px, but size_px is 480: give the lens"):
+        vp().on_image(plain(size_px=200))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (
+            {"views": [{"azimuth_deg": 0, "off_axis_deg": 130}, {"azimuth_deg": 90, "off_axis_deg": 60}]},
+            "views.0: the lens sees",
+        ),
+        ({"views": [{"azimuth_deg": 0, "off_axis_deg": 60}]}, "at least 2"),
+        ({"fov_deg": 180.0}, "less than or equal to 120"),
+        ({"carrier": "truck"}, "'vehicle' or 'drone'"),
+        ({"min_lines": 1}, "greater than or equal to 2"),
+        ({"polish": True}, "Extra inputs"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(settings, words):
+    with pytest.raises(ValidationError, match=words):
+        vp(**settings)
+
+
+def test_a_line_belongs_to_the_direction_its_circle_passes_nearest():
+    normal = np.array([[0, 0, 1.0], [0, np.sin(0.01), np.cos(0.01)], [0.6, 0.8, 0]])
+    towards = np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    assert lines_of(normal, towards, 0.02).tolist() == [0, 0, -1]
+    assert lines_of(normal, np.empty((0, 3)), 0.02).tolist() == [-1, -1, -1]

@@ -18,6 +18,10 @@ FAN = 0x5AA9FF60  # where the LiDAR looks now
 NEUTRAL = 0x9AA4B2FF
 GOOD = 0x3FB871FF
 BAD = 0xD9534FFF
+VERTICAL = 0x64B5FFFF  # the vertical and what runs along it
+UNASSIGNED = 0x9AA4B290  # a line along no known direction
+PAIRS = ((0xFF9F43FF, 0xFFD9A6FF), (0x3FD07AFF, 0xB4F2CBFF), (0xE86AD0FF, 0xF6BFEAFF), (0xF2E03AFF, 0xFAF3AEFF))
+"""Horizontal pairs of directions, strongest first: each a hue, full for its one direction and pale for the other."""
 AXES = np.array([0xFF6B6BFF, 0x6BD66BFF, 0x6BA8FFFF], dtype=np.uint32)  # x, y, z as everywhere in Rerun
 
 EVEN_ODDS_SPAN = 5.0  # ln of the odds at which a probability has its last colour: 0.7 %, 99.3 %

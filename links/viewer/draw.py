@@ -5,8 +5,10 @@ Entity paths are a group, then the output (`vehicle/sweep/swept_points`), then w
 | group                          | what                                                        |
 | ------------------------------ | ----------------------------------------------------------- |
 | vehicle/, labels/, lidar/      | 3D: in the vehicle frame, its dots with words, in the lidar's |
-| frames/                        | the named frames vehicle -> turntable -> lidar, drone_position |
+| frames/                        | frames vehicle -> turntable -> lidar, drone_position; sphere_vehicle, sphere_drone |
 | depth/, score/, range/, marks/ | images, and what is marked on them                          |
+| camera/                        | by camera: its picture, and what was found in it            |
+| sphere/                        | directions, on the unit sphere of vehicle and drone         |
 | plots/                         | curves, by quantity                                         |
 | states/                        | lanes: one word at a time                                   |
 | log/, now, candidates, about/  | sentences, the present in words, why or why not, graph and settings |
@@ -25,7 +27,7 @@ import numpy as np
 import rerun as rr
 
 from flow.message import Message
-from links.viewer import colours, draw_drone, draw_sensors
+from links.viewer import colours, draw_cameras, draw_drone, draw_rotation, draw_sensors
 from links.viewer.marks import Marks, plot, say, state
 from links.viewer.scene import Mark, Scene
 from links.viewer.slices import thin
@@ -34,13 +36,17 @@ from stages.messages import (
     DepthImage,
     Detections,
     DroneFix,
+    DroneMotion,
+    Image,
     LidarFirings,
+    RelativeRotation,
     ScoreImage,
     ServoGoal,
     ServoState,
     SweptPoints,
     SweptPulses,
     TrackState,
+    VanishingDirections,
     VehicleMotion,
 )
 
@@ -65,6 +71,10 @@ draw.register(Candidates)(draw_drone.candidates)
 draw.register(Detections)(draw_drone.detections)
 draw.register(DroneFix)(draw_drone.drone_fix)
 draw.register(TrackState)(draw_drone.track_state)
+draw.register(Image)(draw_cameras.image)
+draw.register(VanishingDirections)(draw_cameras.vanishing_directions)
+draw.register(RelativeRotation)(draw_rotation.relative_rotation)
+draw.register(DroneMotion)(draw_rotation.drone_motion)
 
 
 def _draw_field(value: Any, name: str, scene: Scene) -> Marks:

@@ -5,10 +5,14 @@ Source: ours.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import rerun as rr
 import rerun.blueprint as rrb
 
-from links.viewer.scene import DRONE_FRAME, TIMELINE
+from links.viewer.scene import DRONE_FRAME, SPHERES_APART, TIMELINE, sphere_frame
+from stages.messages import Carrier
 
 _BACKGROUND = [12, 15, 22]
 _WHOLE_RUN = rrb.TimeAxis(
@@ -16,10 +20,20 @@ _WHOLE_RUN = rrb.TimeAxis(
 )
 
 
-def layout(*, images: bool, evidence: bool) -> rrb.Blueprint:
+class Vision(NamedTuple):
+    """What the graph has of the cameras."""
+
+    pictures: Sequence[str] = ()  # frame ids
+    directions: bool = False
+    rotation: bool = False
+    odometry: bool = False
+
+
+def layout(*, images: bool, evidence: bool, vision: Vision) -> rrb.Blueprint:
     """The blueprint. Views ask for groups of entities, whatever the stages are called: see `links/viewer/draw.py`.
 
-    `images`: the graph has depth images to show; `evidence`: it has candidates with reasons and a probability.
+    `images`: the graph has depth images to show; `evidence`: it has candidates with reasons and a probability;
+    `vision`: with anything of the cameras it has a third column, on the right.
     """
     scene = _space(
         "Vehicle frame: last returns (blue low, white high), LiDAR fan, drone with 95 % ellipsoid",
@@ -60,6 +74,7 @@ def layout(*, images: bool, evidence: bool) -> rrb.Blueprint:
         rrb.Tabs(_image("Score (bright: like a drone)", ["/score/**", "/marks/**"]), lidar_range),
     )
     probability = _curves("Probability of a drone [%]", "/plots/probability/**")
+    cameras = _of_cameras(vision)
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(scene, rrb.Horizontal(close_up, words, column_shares=[2, 3]), row_shares=[2, 1]),
@@ -73,7 +88,12 @@ def layout(*, images: bool, evidence: bool) -> rrb.Blueprint:
                 rrb.StateTimelineView(name="States", origin="/states", contents="/states/**", time_view=_WHOLE_RUN),
                 row_shares=[26, 11, 11, 10, 7, 9, 26] if evidence else [32, 14, 12, 9, 10, 21],
             ),
-            column_shares=[11, 10],
+            *(
+                [rrb.Vertical(*(view for _, view in cameras), row_shares=[share for share, _ in cameras])]
+                if cameras
+                else []
+            ),
+            column_shares=[11, 10] if not cameras else [11, 8, 11],
         ),
         # Following: a live run moves on, a finished file opens at its end, with every curve complete.
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
@@ -81,6 +101,32 @@ def layout(*, images: bool, evidence: bool) -> rrb.Blueprint:
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,
     )
+
+
+def _of_cameras(vision: Vision) -> list[tuple[int, rrb.View | rrb.Container]]:
+    """The views of the cameras, each with its share of the column's height."""
+    rows: list[tuple[int, rrb.View | rrb.Container]] = []
+    if vision.pictures:
+        views = [_image(frame_id.replace("_", " "), [f"/camera/{frame_id}/**"]) for frame_id in vision.pictures]
+        rows.append((30, rrb.Horizontal(*views)))
+    if vision.directions:
+        eye = rrb.EyeControls3D(
+            position=(-2.6, -0.5 * SPHERES_APART, 1.1),
+            look_target=(0.0, -0.5 * SPHERES_APART, 0.1),
+            eye_up=(0.0, 0.0, 1.0),
+        )
+        name = "Directions and lines on the unit sphere: vertical blue, each horizontal pair its hue"
+        contents = ["/sphere/**", "/frames/**"]
+        rows.append((24, _space(name, contents, frame=sphere_frame(Carrier.VEHICLE), eye=eye, grid_m=None)))
+    if vision.rotation:
+        rows.append((13, _curves("Branch of the rotation [%]", "/plots/branch/**")))
+        rows.append((11, _curves("The drone in the vehicle's axes [deg]", "/plots/rotation/**")))
+        rows.append((10, _curves("Sigma of the rotation [deg]", "/plots/rotation_sigma/**")))
+    if vision.odometry:
+        matches = _curves("Drone odometry: features that agree", "/plots/matches/**")
+        sigma = _curves("Sigma of the motion [deg]", "/plots/motion_sigma/**")
+        rows.append((11, rrb.Horizontal(matches, sigma)))
+    return rows
 
 
 def _space(

@@ -30,6 +30,13 @@ _LANE = {
     "no drone": colours.NEUTRAL,
     "ok": colours.GOOD,
     "packets lost": colours.BAD,
+    "directions": colours.GOOD,
+    "no directions": colours.NEUTRAL,
+    "RESOLVED": colours.GOOD,
+    "AMBIGUOUS": colours.COASTING,
+    "NONE": colours.NEUTRAL,
+    "moves": colours.GOOD,
+    "no motion": colours.NEUTRAL,
 }
 
 

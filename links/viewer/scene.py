@@ -15,12 +15,14 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from links.viewer import colours
-from stages.geometry import LidarMount, rotation_z, transform
-from stages.messages import Candidates, DepthImage, DroneFix, TrackingState, TrackState
+from links.viewer.lenses import Cameras
+from stages.geometry import Array64, LidarMount, rotation_z, transform
+from stages.messages import Candidates, Carrier, DepthImage, DroneFix, TrackingState, TrackState
 
 TIMELINE = "sensor_time"
 DRONE_FRAME = "drone_position"  # axes as the vehicle's, origin at the latest fix: the close-up looks from there
 FAN_RADIUS_M = 12.0
+SPHERES_APART = 2.8  # radii, between the unit spheres of vehicle and drone
 NEAR_DRONE_M = 1.0
 TURNTABLE_EVERY_NS = 20_000_000
 FRESH_NS = 150_000_000  # a hypothesis is told ten times a second
@@ -51,11 +53,37 @@ class Listed(NamedTuple):
     reason: str
 
 
+class Picture(NamedTuple):
+    """A camera's picture as it is shown."""
+
+    stamp_ns: int
+    width_px: int  # as it was taken
+    height_px: int
+    factor: float  # shown smaller by
+
+    def shown(self, pixels: Array64) -> Array64:
+        """Where pixels (n, 2) of the picture taken, whole numbers at centres, are in the one shown, corner at 0."""
+        return (pixels + 0.5) * self.factor
+
+
 class Scene:
     """Memory of one run, bounded: trails, candidates, the last depth image's geometry, the last word of each state."""
 
-    def __init__(self, *, mount: LidarMount | None, history_s: float, slice_s: float, max_points: int, trail_s: float):
+    def __init__(
+        self,
+        *,
+        mount: LidarMount | None,
+        history_s: float,
+        slice_s: float,
+        max_points: int,
+        trail_s: float,
+        cameras: Cameras | None = None,
+        picture_every_s: float = 0.0,
+    ):
         self.mount = mount
+        self.cameras = cameras or Cameras()
+        self.pictures: dict[str, Picture] = {}  # by frame id, the last one shown
+        self._picture_every_ns = int(picture_every_s * 1e9)
         self.max_points = max_points
         self.trail_s = trail_s
         self.slice_ns = int(slice_s * 1e9)
@@ -87,6 +115,11 @@ class Scene:
             return False
         self._turned_ns = stamp_ns
         return True
+
+    def picture_is_due(self, frame_id: str, stamp_ns: int) -> bool:
+        """Has the last picture of this camera been shown long enough?"""
+        last = self.pictures.get(frame_id)
+        return last is None or not 0 <= stamp_ns - last.stamp_ns < self._picture_every_ns
 
     def trail(self, name: str, fix: DroneFix) -> list[NDArray[np.float32]]:
         """Strips (n, 3) through the fixes of the last `trail_s`; a pause of a second starts a new strip."""
@@ -201,6 +234,42 @@ def opening(mount: LidarMount | None) -> Iterator[Mark]:
     yield Mark(f"frames/{DRONE_FRAME}", drone_transform(np.zeros(3)))
     if mount is not None:
         yield Mark("frames/turntable", turntable_transform(mount, math.radians(mount.servo_zero_deg)))
+
+
+def spheres() -> Iterator[Mark]:
+    """The unit spheres of both carriers' directions, side by side."""
+    for carrier in Carrier:
+        frame = sphere_frame(carrier)
+        ball = rr.Ellipsoids3D(
+            half_sizes=[[1.0, 1.0, 1.0]],
+            colors=0xFFFFFF18,
+            line_radii=rr.Radius.ui_points(0.5),
+            fill_mode=rr.components.FillMode.MajorWireframe,
+        )
+        yield Mark(f"sphere/{carrier.value}/ball", ball, frame=frame)
+        axes = rr.Arrows3D(vectors=0.35 * np.eye(3), colors=colours.AXES, radii=rr.Radius.ui_points(1.5))
+        yield Mark(f"sphere/{carrier.value}/axes", axes, frame=frame)
+    yield _sphere_name(Carrier.VEHICLE, "vehicle")
+
+
+def sphere_frame(carrier: Carrier) -> str:
+    """The carrier's axes, at the middle of its unit sphere."""
+    return f"sphere_{carrier.value}"
+
+
+def drone_sphere(R_vehicle_drone: Array64 | None, how: str = "own axes") -> Iterator[Mark]:
+    """The drone's sphere beside the vehicle's, turned as the drone is; None: that is not known. `how` it is turned."""
+    at = np.array([0.0, -SPHERES_APART, 0.0])
+    R = np.eye(3) if R_vehicle_drone is None else R_vehicle_drone
+    vehicle, drone = sphere_frame(Carrier.VEHICLE), sphere_frame(Carrier.DRONE)
+    yield Mark(f"frames/{drone}", _transform(transform(R, at), vehicle, drone))
+    yield _sphere_name(Carrier.DRONE, f"drone, {how}")
+
+
+def _sphere_name(carrier: Carrier, text: str) -> Mark:
+    above = [[0.0, -SPHERES_APART * (carrier is Carrier.DRONE), 1.4]]
+    words = rr.Points3D(above, labels=[text], show_labels=True, colors=colours.NEUTRAL, radii=0.0)
+    return Mark(f"sphere/{carrier.value}/name", words, frame=sphere_frame(Carrier.VEHICLE))
 
 
 def drone_transform(xyz_vehicle_m: NDArray[np.float64]) -> rr.Transform3D:

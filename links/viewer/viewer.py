@@ -19,14 +19,17 @@ from pydantic import Field, PrivateAttr
 from flow.link import Run, Tap
 from flow.message import Message
 from links.viewer.draw import draw
-from links.viewer.layout import layout
+from links.viewer.layout import Vision, layout
+from links.viewer.lenses import Cameras
 from links.viewer.mailbox import Mailbox
-from links.viewer.scene import Mark, Scene, opening, scenery
+from links.viewer.scene import Mark, Scene, drone_sphere, opening, scenery, spheres
 from links.viewer.slices import Slicer
 from links.viewer.stream import LOOPBACK, Stream
 from stages.geometry import LidarMount
+from stages.messages import Carrier
 
 PATIENCE_S = 10.0  # a lossless run waits this long for a stalled viewer
+PICTURE_EVERY_S = {True: 0.0, False: 0.2}  # lossless: each; live: enough to look at
 CLOSE_S = {True: 60.0, False: 1.5}  # lossless: the whole end; live: a stop takes two seconds in all
 
 # What drawing raises for a message it cannot show; Rerun's own refusals (strict mode) are among them.
@@ -49,6 +52,7 @@ class Viewer(Tap):
     max_points_per_slice: int = Field(6000, ge=1)
     trail_s: float = Field(20.0, ge=0)  # how much of the drone's path is visible at a time
     mount: LidarMount | None = None  # shows the turntable, the LiDAR and the fan of its beams where they are
+    cameras: Cameras = Cameras()  # the rig's: puts lines on the pictures
 
     _box: Mailbox[Message] | None = PrivateAttr(None)
     _thread: threading.Thread | None = PrivateAttr(None)
@@ -115,14 +119,19 @@ class Viewer(Tap):
 
     def _log_all(self, run: Run, box: Mailbox[Message]) -> None:
         rr.set_strict_mode(True)  # what Rerun refuses is raised and counted, not warned about
+        vision = self._vision(run)
         stream = Stream(
             run.out_dir / self.file if self.file is not None else None,
             self.port if self.serve else None,
             self.memory_limit,
             self._errors,
-            layout(images=_wired(run, "depth_image"), evidence=_wired(run, "candidates")),
+            layout(
+                images=_wired(run, "depth_image"),
+                evidence=_wired(run, "candidates"),
+                vision=vision,
+            ),
         )
-        for mark in (*_about(run), *scenery(self.mount)):
+        for mark in (*_about(run), *scenery(self.mount), *(spheres() if vision.directions else ())):
             stream.put(mark, static=True)
         scene = Scene(
             mount=self.mount,
@@ -130,33 +139,54 @@ class Viewer(Tap):
             slice_s=self.slice_s,
             max_points=self.max_points_per_slice,
             trail_s=self.trail_s,
+            cameras=self.cameras,
+            picture_every_s=PICTURE_EVERY_S[self.lossless],
         )
+        opens = [*opening(self.mount), *(drone_sphere(None) if vision.directions else ())]
         slicer = Slicer(self.slice_s)
         dropped = 0
         while (batch := box.take()) is not None:
             for output, message in batch:
-                self._draw(stream, scene, slicer.add(output, message))
+                self._draw(stream, scene, opens, slicer.add(output, message))
             if box.dropped.total() > dropped:
                 dropped = box.dropped.total()
                 stream.put(Mark("log/viewer", rr.TextLog(f"{dropped} messages dropped so far", level="WARN")))
-        self._draw(stream, scene, slicer.finish())
+        self._draw(stream, scene, opens, slicer.finish())
         stream.close()
 
-    def _draw(self, stream: Stream, scene: Scene, ready: Iterable[tuple[str, int, Message]]) -> None:
+    def _draw(
+        self, stream: Stream, scene: Scene, opens: Iterable[Mark], ready: Iterable[tuple[str, int, Message]]
+    ) -> None:
         for output, stamp_ns, message in ready:
             try:
                 if stream.at(stamp_ns):
-                    for mark in opening(self.mount):
+                    for mark in opens:
                         stream.put(mark)
                 for mark in draw(message, output.replace(".", "/"), scene):
                     stream.put(mark)
             except DRAWING_ERRORS as error:
                 self._errors[f"{output} could not be drawn: {type(error).__name__}: {error}"] += 1
 
+    def _vision(self, run: Run) -> Vision:
+        """What of the cameras there is to show."""
+        directions = _made(run, "vanishing_directions")
+        pictures = self.cameras.named() or [f"camera_{carrier.value}" for carrier in Carrier]
+        return Vision(
+            pictures=pictures if directions or _made(run, "image") else [],
+            directions=directions,
+            rotation=_made(run, "relative_rotation"),
+            odometry=_made(run, "drone_motion"),
+        )
+
 
 def _wired(run: Run, output: str) -> bool:
     """Does any stage take this output?"""
     return f" -- {output} --> " in run.mermaid
+
+
+def _made(run: Run, output: str) -> bool:
+    """Is there this output, whether taken by a stage or not?"""
+    return _wired(run, output) or f" -. {output} .-> " in run.mermaid
 
 
 def _about(run: Run) -> Iterator[Mark]:

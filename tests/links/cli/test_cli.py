@@ -61,6 +61,7 @@ def test_quickstart_says_where_the_drone_is_and_where_to_look(grd, tmp_path):
         "summary.json",
         "truth_hits.csv",
         "truth_vehicle_drone.tum",
+        "truth_world_vehicle.tum",
     }
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["output_hash"] in text

@@ -113,3 +113,35 @@ def add_pose(
 def yaw_quaternion(yaw_rad) -> np.ndarray:
     half = np.asarray(yaw_rad, dtype=float) / 2
     return np.column_stack([0 * half, 0 * half, np.sin(half), np.cos(half)])
+
+
+def add_rotations(
+    folder: Path, t_s, quaternions, *, variance_rad2=(1e-4, 1e-4, 1e-4), accepted=True, resolved=False, switches=0
+) -> Path:
+    """The rotation told at `t_s`, with a covariance along the drone's axes."""
+    n = len(t_s)
+    accepted, resolved, switches = (np.broadcast_to(flags, n) for flags in (accepted, resolved, switches))
+    rows = ["stamp_s,accepted,qx,qy,qz,qw,cxx_rad2,cxy_rad2,cxz_rad2,cyy_rad2,cyz_rad2,czz_rad2,state,switches,reason"]
+    for i, t in enumerate(t_s):
+        xx, yy, zz = variance_rad2
+        numbers = [*(f"{v:.12g}" for v in quaternions[i]), *map(str, (xx, 0, 0, yy, 0, zz))]
+        state = ("RESOLVED" if resolved[i] else "AMBIGUOUS") if accepted[i] else "NONE"
+        cells = [stamp(t), str(int(accepted[i])), *(numbers if accepted[i] else [""] * 10), state, str(switches[i])]
+        rows.append(",".join([*cells, '"lines, few"']))
+    (folder / "rotation_vehicle_drone.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def add_true_rotations(folder: Path, drone, vehicle=None, vehicle_xyz=None, duration_s: float = 10.0) -> Path:
+    """Truth, linear in time as `truth_at`: quaternions of the drone in the vehicle, and of the vehicle in the world.
+
+    Each is one quaternion, or one each 0.01 s.
+    """
+    times = np.arange(0, duration_s + 0.005, 0.01)
+    q = np.broadcast_to(drone, (len(times), 4))
+    (folder / "truth_vehicle_drone.tum").write_text("# full pose\n" + lines(times, truth_at(times), q))
+    if vehicle is not None:
+        xyz = np.zeros((len(times), 3)) if vehicle_xyz is None else vehicle_xyz(times)
+        q = np.broadcast_to(vehicle, (len(times), 4))
+        (folder / "truth_world_vehicle.tum").write_text("# full pose\n" + lines(times, xyz, q))
+    return folder

@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from flow.link import LinkError, Record
-from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VISIBLE_FILE
+from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
 from links.simulated import run
 from links.simulated.drone import DroneModel
 from links.simulated.lidar import echoes
@@ -183,11 +183,12 @@ def test_what_is_told_is_what_a_run_is_judged_by(pair: Scenario, tmp_path: FileP
     assert not [r for r in log.aside(Simulation(pair).records()) if r.topic.startswith("/truth")]
     log.write(tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {
+    of_a_drone = {
         name.replace(".", f"{number}.")
         for name in (TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VISIBLE_FILE)
         for number in ("", "_2")
     }
+    assert names == {TRUTH_VEHICLE_FILE} | of_a_drone
     assert (tmp_path / "truth_visible.csv").read_text() == "stamp_s,visible\n1748773230.000000000,1\n"
     last = (tmp_path / "truth_vehicle_drone_2.tum").read_text().splitlines()[-1].split()
     assert [float(v) for v in last[1:4]] == [-4.0, -2.0, 7.0]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import synthetic
+import synthetic_vision
 from rerun.chunk import RrdReader
 
 from flow.link import LinkError, Run
@@ -51,6 +52,16 @@ def test_a_run_by_evidence_with_two_drones_one_of_them_lost_is_shown_too(tmp_pat
     png = tmp_path / "run.png"
     assert complaints(record(tmp_path, 2.2, evidence=True), png) == []
     assert png.stat().st_size > 100_000
+
+
+def test_a_run_with_two_cameras_is_shown_too(tmp_path):
+    viewer = Viewer(lossless=True, mount=synthetic.MOUNT, cameras=synthetic_vision.CAMERAS)
+    viewer.open(Run(out_dir=tmp_path, name="test", mermaid=synthetic_vision.MERMAID, settings_yaml=""))
+    for output, content in synthetic_vision.run(1.2):
+        viewer.see(output, content, 0)
+    viewer.close()
+    assert viewer.errors == {}
+    assert complaints(tmp_path / "run.rrd", tmp_path / "run.png") == []
 
 
 def test_a_run_of_the_lidar_alone_without_mount_is_shown_too(tmp_path):

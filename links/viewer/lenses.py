@@ -1,0 +1,101 @@
+"""The cameras as the viewer needs them, and great-circle arcs as strips: on the unit sphere, and through a lens.
+
+Source: ours; lenses: stages/lens.py; a line of the world is a great circle of rays, P IV.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from stages.geometry import Array64, Pose
+from stages.lens import Lens
+from stages.messages import Carrier
+
+STEP_RAD = np.deg2rad(4.0)  # between points of an arc; a fisheye bends it by less than a tenth of a pixel within that
+
+
+class _Camera(BaseModel):
+    """One camera of the rig file. Its other keys are for the stages."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    lens: Lens
+    size_px: int | None = Field(None, ge=1)  # of the square pictures that the lens was calibrated with
+
+    def pose(self) -> Pose:
+        raise NotImplementedError
+
+
+class VehicleCamera(_Camera):
+    """The camera on the vehicle."""
+
+    T_vehicle_camera: Pose
+
+    def pose(self) -> Pose:
+        """T_carrier_camera."""
+        return self.T_vehicle_camera
+
+
+class DroneCamera(_Camera):
+    """The camera under the drone."""
+
+    T_drone_camera: Pose
+
+    def pose(self) -> Pose:
+        """T_carrier_camera."""
+        return self.T_drone_camera
+
+
+class Cameras(BaseModel):
+    """The rig file's `cameras:`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    vehicle: VehicleCamera | None = None
+    drone: DroneCamera | None = None
+
+    def of(self, carrier: Carrier) -> VehicleCamera | DroneCamera | None:
+        """The camera on this carrier."""
+        return self.vehicle if carrier is Carrier.VEHICLE else self.drone
+
+    def named(self) -> list[str]:
+        """Frame ids of the pictures."""
+        return [f"camera_{carrier.value}" for carrier in Carrier if self.of(carrier) is not None]
+
+
+def pixels_of(camera: VehicleCamera | DroneCamera, rays_carrier: Array64) -> Array64:
+    """Pixels (n, 2) of rays (n, 3) in the carrier's axes; NaN where the lens does not see them."""
+    R_carrier_camera = camera.pose().matrix()[:3, :3]
+    return camera.lens.project(rays_carrier @ R_carrier_camera)
+
+
+def arcs(ends: Array64, step_rad: float = STEP_RAD) -> tuple[Array64, NDArray[np.int64]]:
+    """Points (k, 3) on the shorter great-circle arcs between unit rays (m, 2, 3), and which arc each is of (k,).
+
+    p(s) = a cos(s) + q sin(s), q the unit vector from a towards b, s from 0 to the angle between them.
+    """
+    a, b = ends[:, 0], ends[:, 1]
+    along = np.sum(a * b, axis=1, keepdims=True)
+    q = b - along * a
+    across = np.linalg.norm(q, axis=1, keepdims=True)
+    q /= np.maximum(across, 1e-12)
+    angle = np.arctan2(across, along)[:, 0]
+    count = 2 + np.floor(angle / step_rad).astype(np.int64)
+    arc = np.repeat(np.arange(len(ends)), count)
+    nth = np.arange(len(arc)) - np.repeat(np.cumsum(count) - count, count)
+    s = (angle[arc] * nth / (count[arc] - 1))[:, None]
+    return a[arc] * np.cos(s) + q[arc] * np.sin(s), arc
+
+
+def strips(points: Array64, arc: NDArray[np.int64]) -> tuple[Sequence[NDArray[np.float32]], NDArray[np.int64]]:
+    """Strips of points (k, d) that belong together, and the arc of each; a point that is NaN breaks its strip."""
+    seen = np.asarray(np.isfinite(points).all(axis=1), dtype=np.bool_)
+    begins = np.append([True], (arc[1:] != arc[:-1]) | ~seen[:-1])[: len(points)]
+    strip, first, length = np.unique(np.cumsum(begins)[seen], return_index=True, return_counts=True)
+    parts = np.split(points[seen].astype(np.float32), first[1:])[: len(strip)]
+    drawn = np.flatnonzero(length > 1)
+    return [parts[k] for k in drawn], arc[seen][first[drawn]]

@@ -1,0 +1,129 @@
+"""Pictures, lines and rotations as a run with two fisheyes would tell them, built by hand: no stage is involved."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+import synthetic
+
+from flow.message import Message
+from links.viewer.lenses import Cameras
+from stages.geometry import rotation_z
+from stages.messages import BranchState, Carrier, DroneMotion, Image, RelativeRotation, VanishingDirections
+
+SIZE_PX = 720
+FOCAL_PX = 170.0
+PERIOD_NS = 100_000_000
+CAMERA = {
+    "lens": {"model": "equidistant", "focal_px": FOCAL_PX, "centre_px": [359.5, 359.5]},
+    "size_px": SIZE_PX,
+    "masked_px": [],
+    "max_off_axis_deg": 110.0,
+}
+RIG_CAMERAS = {
+    "vehicle": CAMERA | {"T_vehicle_camera": {"rpy_deg": [0.0, 0.0, 90.0]}},  # looks up, image right is left's opposite
+    "drone": CAMERA | {"T_drone_camera": {"rpy_deg": [180.0, 0.0, -90.0]}},
+}
+CAMERAS = Cameras.model_validate(RIG_CAMERAS)
+DIRECTIONS = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0], [0.6, 0.8, 0], [-0.8, 0.6, 0]])
+FRAMES = np.array([-1, 0, 0, 1, 1])
+MERMAID = (
+    synthetic.EVIDENCE_MERMAID
+    + "    camera_vehicle -- image --> vp_vehicle\n    vp_vehicle -- vanishing_directions --> align\n"
+    + "    drone_odometry -- drone_motion --> align\n    align -. relative_rotation .-> align_relative_rotation(( ))\n"
+)
+
+
+def picture(stamp_ns: int = 0, frame_id: str = "camera_vehicle", size_px: int = SIZE_PX) -> Image:
+    grey = np.tile(np.linspace(30, 220, size_px).astype(np.uint8), (size_px, 1))
+    return Image(stamp_ns=stamp_ns, frame_id=frame_id, grey=grey)
+
+
+def ends_along(direction: np.ndarray, seed: int, side: float) -> np.ndarray:
+    """Unit rays (2, 3) to two points of one line that runs along `direction`."""
+    start = np.random.default_rng(seed).normal((0.0, 0.0, 3.0 * side))
+    both = np.stack([start, start + 2.0 * direction])
+    return both / np.linalg.norm(both, axis=1, keepdims=True)
+
+
+def directions(stamp_ns: int = 0, carrier: Carrier = Carrier.VEHICLE, count: int = 5) -> VanishingDirections:
+    """The vertical and two horizontal pairs, or the first of them, with five lines each and five of none."""
+    side = 1.0 if carrier is Carrier.VEHICLE else -1.0
+    other = np.array([0.5, -0.5, 0.7071])
+    along = [*(d for d in DIRECTIONS[:count] for _ in range(5)), *([other] * 5)]
+    ends = np.array([ends_along(d, k, side) for k, d in enumerate(along)])
+    normal = np.cross(ends[:, 0], ends[:, 1])
+    return VanishingDirections(
+        stamp_ns=stamp_ns,
+        carrier=carrier,
+        direction=DIRECTIONS[:count],
+        sigma_rad=np.deg2rad([0.1, 0.2, 0.3, 0.4, 0.5])[:count],
+        is_vertical=FRAMES[:count] < 0,
+        frame=FRAMES[:count],
+        line_normal=normal / np.linalg.norm(normal, axis=1, keepdims=True),
+        line_end=ends,
+        line_sigma_rad=np.full(len(ends), 0.005),
+        line_direction=np.repeat([*range(count), -1], 5),
+        reason="" if count else "no structure: 5 lines, a pair needs 4",
+    )
+
+
+def one_line(ends: np.ndarray, stamp_ns: int = 0, carrier: Carrier = Carrier.VEHICLE) -> VanishingDirections:
+    """The vertical, and one line with these ends (2, 3) that runs along it."""
+    message = directions(stamp_ns, carrier, 1)
+    return dataclasses.replace(
+        message,
+        line_end=ends[None],
+        line_normal=message.line_normal[:1],
+        line_sigma_rad=message.line_sigma_rad[:1],
+        line_direction=np.array([0]),
+    )
+
+
+def rotation(stamp_ns: int = 0, **changes) -> RelativeRotation:
+    settled = RelativeRotation(
+        stamp_ns=stamp_ns,
+        R_vehicle_drone=rotation_z(np.deg2rad(30.0)),
+        covariance_rad2=np.diag(np.deg2rad([0.1, 0.2, 0.4]) ** 2),
+        branch_probability=np.array([0.6, 0.2, 0.1, 0.05]),
+        state=BranchState.AMBIGUOUS,
+        switches=0,
+        reason="waits for motion",
+    )
+    return dataclasses.replace(settled, **changes)
+
+
+def motion(stamp_ns: int = PERIOD_NS, **changes) -> DroneMotion:
+    moved = DroneMotion(
+        stamp_ns=stamp_ns,
+        from_ns=stamp_ns - PERIOD_NS,
+        R_from_to=rotation_z(np.deg2rad(90.0)),
+        covariance_rad2=np.diag(np.deg2rad([0.1, 0.3, 0.2]) ** 2),
+        direction_from=np.array([1.0, 0.0, 0.0]),
+        direction_sigma_rad=np.deg2rad(2.0),
+        matches=120,
+        reason="",
+    )
+    return dataclasses.replace(moved, **changes)
+
+
+def run(duration_s: float) -> Iterator[tuple[str, Message]]:
+    """A run by evidence, and both cameras ten times a second; the drone's sees no structure in every fifth picture."""
+    due_ns, k = synthetic.START_NS, 0
+    for output, content in synthetic.run_by_evidence(duration_s):
+        yield output, content
+        if content.stamp_ns < due_ns:
+            continue
+        yield "camera_vehicle.image", picture(due_ns)
+        yield "camera_drone.image", picture(due_ns, "camera_drone")
+        yield "vp_vehicle.vanishing_directions", directions(due_ns)
+        blind = k % 5 == 4
+        yield "vp_drone.vanishing_directions", directions(due_ns, Carrier.DRONE, 0 if blind else 3)
+        if k:
+            still = {"direction_from": None, "direction_sigma_rad": None, "reason": "no motion"}
+            yield "drone_odometry.drone_motion", motion(due_ns, **(still if k % 3 == 0 else {}))
+        none = {"R_vehicle_drone": None, "covariance_rad2": None, "state": BranchState.NONE, "reason": "no structure"}
+        yield "align.relative_rotation", rotation(due_ns, **(none if blind else {"switches": k // 6}))
+        due_ns, k = due_ns + PERIOD_NS, k + 1

@@ -19,13 +19,18 @@ from pydantic import PrivateAttr
 
 from flow.link import Run, Tap
 from flow.message import Message
-from stages.messages import DepthImage, Detections, DroneFix, TrackState
+from stages.geometry import quaternions_xyzw
+from stages.messages import DepthImage, Detections, DroneFix, RelativeRotation, TrackState
 
 FIX_FILE, COVARIANCE_FILE, LOG_FILE = "fix_vehicle_drone.tum", "fix_covariance.csv", "run.log"
 DETECTIONS_FILE, SUMMARY_FILE = "detections.csv", "summary.json"
 TRUTH_FILE, TRUTH_HITS_FILE = "truth_vehicle_drone.tum", "truth_hits.csv"
-TRUTH_VISIBLE_FILE = "truth_visible.csv"
+TRUTH_VISIBLE_FILE, TRUTH_VEHICLE_FILE = "truth_visible.csv", "truth_world_vehicle.tum"
 POSE_FILE, POSE_COVARIANCE_FILE = "pose_vehicle_drone.tum", "pose_covariance.csv"
+ROTATION_FILE = "rotation_vehicle_drone.csv"
+UPPER = tuple(a + b for a, b in zip("xxxyyz", "xyzyzz", strict=True))  # names of an upper triangle, by rows
+QUATERNION, ROTATION_UPPER = ("qx", "qy", "qz", "qw"), tuple(f"c{name}_rad2" for name in UPPER)  # empty: not given
+BRANCHES = ("p_0", "p_90", "p_180", "p_270")  # probability of the rotation given, and of it turned by so many degrees
 POSITION_ONLY = (
     "# T_vehicle_drone, position only: the LiDAR does not measure orientation, '0 0 0 1' stands for not measured\n"
 )
@@ -59,11 +64,16 @@ class Transition:
 
 
 class Results(Tap):
-    """Collects fixes, verdicts and state changes; writes each as it comes, so that a stopped run keeps what it had."""
+    """Collects fixes, verdicts and state changes; writes each as it comes, so that a stopped run keeps what it had.
+
+    A run in which nobody tells a rotation has no file of rotations.
+    """
 
     _files: dict[str, TextIO] = PrivateAttr(default_factory=dict)
     _covariance: Any = PrivateAttr(default=None)
     _detections: Any = PrivateAttr(default=None)
+    _rotations: Any = PrivateAttr(default=None)
+    _folder: Path = PrivateAttr()
     _sweep_start_ns: dict[int, int] = PrivateAttr(default_factory=dict)  # of the newest depth image, by its stamp
     _last_sweep_ns: int | None = PrivateAttr(default=None)
     _fixes: list[DroneFix] = PrivateAttr(default_factory=list)
@@ -72,6 +82,7 @@ class Results(Tap):
     _found: int = PrivateAttr(default=0)
     _transitions: list[Transition] = PrivateAttr(default_factory=list)
     _state: dict[int, str] = PrivateAttr(default_factory=dict)  # of each track
+    _branch: tuple[str, int] | None = PrivateAttr(default=None)  # state and switches of the newest rotation
 
     @property
     def fixes(self) -> list[DroneFix]:
@@ -102,9 +113,11 @@ class Results(Tap):
         """Start the run's files."""
         for name in (FIX_FILE, COVARIANCE_FILE, DETECTIONS_FILE, LOG_FILE):
             self._files[name] = _line_buffered(run.out_dir / name)
+        self._folder = run.out_dir
+        (run.out_dir / ROTATION_FILE).unlink(missing_ok=True)
         self._files[FIX_FILE].write(POSITION_ONLY)
         self._covariance = csv.writer(self._files[COVARIANCE_FILE])
-        upper = [f"c{a}{b}_m2" for a, b in zip("xxxyyz", "xyzyzz", strict=True)]
+        upper = [f"c{name}_m2" for name in UPPER]
         self._covariance.writerow(["stamp_s", *upper, "hits", "iterations", "track_id"])
         self._detections = csv.writer(self._files[DETECTIONS_FILE])
         self._detections.writerow(["start_s", "end_s", "x_m", "y_m", "z_m", "score"])
@@ -116,7 +129,7 @@ class Results(Tap):
             self._files[FIX_FILE].write(tum_line(message.stamp_ns, message.xyz_vehicle_m))
             upper = message.covariance_m2[np.triu_indices(3)]
             counts = [message.hits, message.iterations, message.track_id]
-            self._covariance.writerow([stamp_s(message.stamp_ns), *(f"{v:.9g}" for v in upper), *counts])
+            self._covariance.writerow([stamp_s(message.stamp_ns), *_digits(upper), *counts])
         elif isinstance(message, DepthImage):
             self._sweep_start_ns = {message.stamp_ns: message.start_ns}
         elif isinstance(message, Detections):
@@ -128,6 +141,8 @@ class Results(Tap):
             self._log(message.stamp_ns, output, message.verdict)
         elif isinstance(message, TrackState):
             self._note_state(output, message)
+        elif isinstance(message, RelativeRotation):
+            self._write_rotation(output, message)
 
     def _note_state(self, output: str, message: TrackState) -> None:
         """Keep and log a track's state when it is another than before."""
@@ -154,6 +169,23 @@ class Results(Tap):
         lines = [[*span, *(f"{v:.4f}" for v in xyz), f"{score:.6g}"] for xyz, score in accepted]
         self._detections.writerows(lines or [[*span, "", "", "", ""]])
 
+    def _write_rotation(self, output: str, message: RelativeRotation) -> None:
+        """A line for each answer, also for none; the log tells when its state or the branch changes."""
+        if self._rotations is None:
+            self._files[ROTATION_FILE] = _line_buffered(self._folder / ROTATION_FILE)
+            self._rotations = csv.writer(self._files[ROTATION_FILE])
+            head = ["stamp_s", "accepted", *QUATERNION, *ROTATION_UPPER, *BRANCHES, "state", "switches", "reason"]
+            self._rotations.writerow(head)
+        R, covariance_rad2 = message.R_vehicle_drone, message.covariance_rad2
+        quaternion = [""] * 4 if R is None else _digits(quaternions_xyzw(R[None])[0])
+        upper = [""] * 6 if covariance_rad2 is None else _digits(covariance_rad2[np.triu_indices(3)])
+        told = [*_digits(message.branch_probability), message.state.name, message.switches, message.reason]
+        self._rotations.writerow([stamp_s(message.stamp_ns), int(R is not None), *quaternion, *upper, *told])
+        branch = message.state.name, message.switches
+        if branch != self._branch:
+            self._branch = branch
+            self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")
+
     def note(self, text: str) -> None:
         """One line of the log without a time: a warning of the recording, the hash."""
         self._files[LOG_FILE].write(f"{text}\n")
@@ -166,6 +198,10 @@ class Results(Tap):
         for stream in self._files.values():
             stream.close()
         self._files.clear()
+
+
+def _digits(values: NDArray[np.float64]) -> list[str]:
+    return [f"{value:.9g}" for value in values]
 
 
 def _line_buffered(path: Path) -> TextIO:

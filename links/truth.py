@@ -19,7 +19,15 @@ from flow.link import LinkError, Record
 from links.evaluation.associate import interpolate
 from links.evaluation.tracks import follow
 from links.evaluation.tum import FULL_POSE, NO_DRONE
-from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VISIBLE_FILE, of_drone, stamp_s, tum_line
+from links.results import (
+    TRUTH_FILE,
+    TRUTH_HITS_FILE,
+    TRUTH_VEHICLE_FILE,
+    TRUTH_VISIBLE_FILE,
+    of_drone,
+    stamp_s,
+    tum_line,
+)
 from stages.geometry import rotation_from_quaternion_xyzw
 from stages.messages import DroneFix
 
@@ -94,13 +102,16 @@ class TruthLog:
         return FixErrors(stamps[order], errors[order], nees[order], sum(part.not_covered for part in parts))
 
     def write(self, folder: Path) -> None:
-        """Write what is known of each drone beside a run's results; nothing when the recording holds no truth.
+        """Write what is known of the vehicle and each drone beside a run's results; nothing when that is nothing.
 
         A recording that knows where the vehicle is and has no drone gives a file that says so.
         """
         if any(drone.pose for drone in self.drones.values()):
             for number, drone in self.drones.items():
                 self._write_drone(folder, number, drone)
+            lines = [tum_line(stamp, np.asarray(t), q) for stamp, (t, q) in sorted(self.vehicle.items())]
+            header = f"# T_world_vehicle, {FULL_POSE}, truth\n"
+            (folder / TRUTH_VEHICLE_FILE).write_text(header + "".join(lines), encoding="utf-8")
         elif self.vehicle:
             (folder / TRUTH_FILE).write_text(f"# {NO_DRONE} in this recording\n", encoding="utf-8")
 

@@ -20,7 +20,8 @@ from links.evaluation.csv_table import write_csv
 from links.evaluation.groups import Key, groups, parse_by
 from links.evaluation.no_drone import alarms
 from links.evaluation.report import write_report
-from links.evaluation.summaries import Summary, alarm_summary, group_summary
+from links.evaluation.rotation_groups import rotation_groups
+from links.evaluation.summaries import Summary, alarm_summary, group_summary, rotation_summary
 from links.evaluation.tables import MAX_COLUMNS, as_json, comparison_table, headline_table, label, metrics_table
 from links.evaluation.tracks import per_drone
 
@@ -113,6 +114,7 @@ def _summaries(own: list[Evaluation], keys: list[Key]) -> list[Summary]:
     empty = [e for e in answers if e.run.no_drone]
     wanted = keys or ([()] if len(by_config(own)) > 1 else [])
     found = [group_summary(groups(flown, key), key) for key in wanted if flown]
+    found += [rotation_summary(turned, key) for key in wanted if (turned := rotation_groups(flown, key))]
     if empty and (wanted or len(empty) > 1):
         found.append(alarm_summary(alarms(empty)))
     return found

@@ -73,6 +73,11 @@ def band_key(what: str, low_m: float) -> str:
     return f"range_{low_m:g}_{what}"
 
 
+CAMERAS = "rotation by both cameras"
+AS_GIVEN, MODULO = (
+    "given",
+    "modulo",
+)  # errors of the branch given; of the nearest, a quarter turn about the vertical off
 HEADLINE = "time"  # the group that a run which gives less can only lose in
 
 
@@ -144,6 +149,32 @@ def _catalogue() -> dict[str, Metric]:
         ("rmse_yaw_deg", "RMSE yaw", "deg", "low"),
         ("rmse_angle_deg", "RMSE of the whole angle", "deg", "low"),
         ("branch_wrong_s", "yaw branch wrong, marked good", "s", "low"),
+    )
+    add(
+        CAMERAS,
+        ("rotation_pictures", "pictures of the drone", "", "none"),
+        ("rotation_accepted_share", "pictures with a rotation", "%", "high"),
+    )
+    for which, told in ((AS_GIVEN, "as given"), (MODULO, "modulo quarter turns")):
+        add(
+            CAMERAS,
+            (f"rotation_{which}_rmse_deg", f"{told}: RMSE", "deg", "low"),
+            (f"rotation_{which}_median_deg", f"{told}: median", "deg", "low"),
+            (f"rotation_{which}_p95_deg", f"{told}: 95 %", "deg", "low"),
+            (f"rotation_{which}_rmse_roll_deg", f"{told}: RMSE roll", "deg", "low"),
+            (f"rotation_{which}_rmse_pitch_deg", f"{told}: RMSE pitch", "deg", "low"),
+            (f"rotation_{which}_rmse_yaw_deg", f"{told}: RMSE yaw", "deg", "low"),
+        )
+    add(
+        CAMERAS,
+        ("rotation_inside_95_share", "modulo, in the 95 % bound (honest: 95)", "%", "one"),
+        ("rotation_nees_of_1", "modulo, mean NEES / 3 (honest: 1)", "", "one"),
+        ("rotation_resolved", "RESOLVED rotations", "", "none"),
+        ("rotation_wrong_resolved", "wrong RESOLVED (> 45 deg off)", "", "low"),
+        ("rotation_resolved_s", "time to the first RESOLVED", "s", "low"),
+        ("rotation_resolved_m", "way to it, relative to the vehicle", "m", "low"),
+        ("rotation_resolved_ground_m", "way to it, over ground", "m", "low"),
+        ("rotation_switches", "changes of branch", "", "low"),
     )
     add(
         "honesty of the covariance",

@@ -16,7 +16,7 @@ from links.evaluation.statistics import chi2_quantile, effective_samples, mean_n
 from stages.geometry import Array64
 
 MIN_FOR_NEES = 10
-BRANCH_RAD = math.radians(45.0)
+BRANCH_RAD = math.radians(45.0)  # farther off is another branch
 
 
 def rotation(judged: Evaluation) -> None:
@@ -75,22 +75,28 @@ def covariance(judged: Evaluation) -> None:
         judged.findings.append(f"{broken} of {len(at.nees)} covariances are not positive definite")
         judged.cannot(f"{broken} covariances are not positive definite", "nees_mean")
     else:
-        judged.values["nees_mean"] = _nees(judged, at.nees, 3, "position")
-    inside = np.nan_to_num(at.nees, nan=np.inf) <= chi2_quantile(0.95, 3)  # a broken covariance holds nothing
-    judged.counts["inside_95_share"] = int(inside.sum()), len(inside)
-    share, worth = float(inside.mean()), effective_samples(np.nan_to_num(at.nees, nan=0.0))
-    low, high = wilson_interval(share * worth, worth)
-    note = f"interval for {worth:.0f} independent samples of {len(inside)}"
-    judged.values["inside_95_share"] = Value(100 * share, len(inside), 100 * low, 100 * high, note)
+        judged.values["nees_mean"] = mean_nees(judged, at.nees, 3, "position")
+    inside_95(judged, "inside_95_share", at.nees, 3)
     if at.nees6 is None:
         judged.cannot("no 6x6 covariance with rotation in the run and in truth", "nees6_mean")
     elif np.isnan(at.nees6).any():
         judged.cannot("some 6x6 covariances are not positive definite", "nees6_mean")
     else:
-        judged.values["nees6_mean"] = _nees(judged, at.nees6, 6, "pose")
+        judged.values["nees6_mean"] = mean_nees(judged, at.nees6, 6, "pose")
 
 
-def _nees(judged: Evaluation, nees: Array64, dof: int, what: str) -> Value:
+def inside_95(judged: Evaluation, key: str, nees: Array64, dof: int) -> None:
+    """The share of errors inside the 95 % ellipsoid, kept as counts too; a broken covariance (NaN) holds nothing."""
+    inside = np.nan_to_num(nees, nan=np.inf) <= chi2_quantile(0.95, dof)
+    judged.counts[key] = int(inside.sum()), len(inside)
+    share, worth = float(inside.mean()), effective_samples(np.nan_to_num(nees, nan=0.0))
+    low, high = wilson_interval(share * worth, worth)
+    note = f"interval for {worth:.0f} independent samples of {len(inside)}"
+    judged.values[key] = Value(100 * share, len(inside), 100 * low, 100 * high, note)
+
+
+def mean_nees(judged: Evaluation, nees: Array64, dof: int, what: str) -> Value:
+    """The mean with the bounds of an honest one; beyond them is a finding above and a remark below."""
     worth = effective_samples(nees)
     low, high = mean_nees_bounds(worth, dof)
     mean = float(nees.mean())

@@ -13,7 +13,15 @@ from links.evaluation.compare import keys_of
 from links.evaluation.judged import Evaluation
 
 ABOUT = ("recording", "config", "output", "drone", "run", "no_drone", "span_s", "outputs")
-COUNTED = ("found_share", "found_when_seen_share", "hit_share", "seen_share", "inside_95_share")  # may be pooled
+COUNTED = (  # may be pooled
+    "found_share",
+    "found_when_seen_share",
+    "hit_share",
+    "seen_share",
+    "inside_95_share",
+    "rotation_accepted_share",
+    "rotation_inside_95_share",
+)
 
 
 def write_csv(path: Path, evaluations: list[Evaluation]) -> None:

@@ -6,6 +6,7 @@ Source: DESIGN, evaluate.
 from __future__ import annotations
 
 from links.evaluation.accuracy import at_own_stamps, over_all_time, timing
+from links.evaluation.both_cameras import both_cameras
 from links.evaluation.catalogue import CATALOGUE, Value
 from links.evaluation.consistency import covariance, rotation
 from links.evaluation.errors import GRID_NS, AtOutputs, Limits, OverTime, at_outputs, over_time, span_of
@@ -38,6 +39,7 @@ def evaluate(run: RunData, output: Output, limits: Limits | None = None) -> Eval
     false_outputs(judged)
     detections(judged)
     rotation(judged)
+    both_cameras(judged)
     covariance(judged)
     _compute(judged)
     order = [*CATALOGUE, *(key for key in judged.values if key not in CATALOGUE)]

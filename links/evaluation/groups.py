@@ -85,7 +85,12 @@ def parse_by(text: str) -> Key:
 
 
 def groups(evaluations: Sequence[Evaluation], key: Key) -> list[Group]:
-    """A group for each combination of the words and, within it, for each configuration; all runs together last.
+    """The groups of `grouped`, summed up."""
+    return [_group(*group) for group in grouped(evaluations, key)]
+
+
+def grouped(evaluations: Sequence[Evaluation], key: Key) -> list[tuple[tuple[str, ...], str, list[Evaluation]]]:
+    """(words, configuration, runs) for each combination of the words and of configurations; all runs together last.
 
     Numbers stand in their order, configurations as they were given. LinkError when a name has no such word.
     """
@@ -100,7 +105,7 @@ def groups(evaluations: Sequence[Evaluation], key: Key) -> list[Group]:
     if key:
         rows.append(((ALL, *[""] * (len(key) - 1)), list(evaluations)))
     return [
-        _group(words, config, own)
+        (words, config, own)
         for words, several in rows
         for config in configs
         if (own := [e for e in several if e.run.config == config])
@@ -121,17 +126,17 @@ def _group(words: tuple[str, ...], config: str, evaluations: list[Evaluation]) -
         ever_right=len(was_right),
         silent=sum(len(e.output.poses) == 0 for e in evaluations),
         mostly_false=sum((_number(e, "false_outputs") or 0) > 0.5 * len(e.output.poses) for e in evaluations),
-        hit=_pooled(evaluations, "hit_share"),
-        seen=_pooled(evaluations, "seen_share"),
-        found=_pooled(evaluations, "found_share"),
-        found_when_seen=_pooled(evaluations, "found_when_seen_share"),
-        first_right_s=_spread(evaluations, "first_right_s"),
+        hit=pooled_counts(evaluations, "hit_share"),
+        seen=pooled_counts(evaluations, "seen_share"),
+        found=pooled_counts(evaluations, "found_share"),
+        found_when_seen=pooled_counts(evaluations, "found_when_seen_share"),
+        first_right_s=spread(evaluations, "first_right_s"),
         shortest_failed_s=min(lengths_s, default=None),
-        hit_gap_s=_spread(evaluations, "longest_hit_gap_s"),
+        hit_gap_s=spread(evaluations, "longest_hit_gap_s"),
         reacquired_s=Spread(tuple(sorted(t for e in evaluations for t in e.reappeared_s))),
         lost=int(sum(lost)) if lost else None,
-        rmse_m=_spread(was_right, "rmse_m"),
-        inside_95=_pooled(evaluations, "inside_95_share"),
+        rmse_m=spread(was_right, "rmse_m"),
+        inside_95=pooled_counts(evaluations, "inside_95_share"),
         false_per_h=_false_per_h(evaluations),
     )
 
@@ -142,13 +147,14 @@ def _false_per_h(evaluations: list[Evaluation]) -> float | None:
     return sum(count for count, _ in counted) / hours if counted else None
 
 
-def _spread(evaluations: list[Evaluation], key: str) -> Spread:
-    """Of metrics of which less is better."""
+def spread(evaluations: list[Evaluation], key: str) -> Spread:
+    """A metric of which less is better, over the runs that could be measured."""
     ranks = [value.ranked("low") for e in evaluations if (value := e.values.get(key)) is not None]
     return Spread(tuple(sorted(rank for rank in ranks if rank is not None)))
 
 
-def _pooled(evaluations: list[Evaluation], key: str) -> tuple[int, int]:
+def pooled_counts(evaluations: list[Evaluation], key: str) -> tuple[int, int]:
+    """Of a share that is kept as counts: (how many, of how many) over all runs."""
     counts = [e.counts[key] for e in evaluations if key in e.counts]
     return sum(count for count, _ in counts), sum(of for _, of in counts)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from links.evaluation.catalogue import CATALOGUE, Value, failure, not_applicable, not_evaluated
 from links.evaluation.errors import GRID_NS, AtOutputs, Limits, OverTime
 from links.evaluation.output import Output
+from links.evaluation.rotation_errors import RotationErrors
 from links.evaluation.run_data import RunData
 from links.evaluation.statistics import wilson_interval
 from stages.geometry import Array64
@@ -36,6 +37,7 @@ class Evaluation:
     at: AtOutputs | None = None
     over: OverTime | None = None
     counts: dict[str, tuple[int, int]] = field(default_factory=dict)  # of some shares: (how many, of how many)
+    turned: RotationErrors | None = None  # of both cameras' rotations
     reappeared_s: list[float] = field(default_factory=list)  # time to find it again, each time; inf: never
 
     def cannot(self, reason: str, *keys: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from links.evaluation.catalogue import BANDS_M
+from links.evaluation.consistency import BRANCH_RAD
 from links.evaluation.errors import AtOutputs
 from links.evaluation.judged import Evaluation
 from links.evaluation.statistics import chi2_density
@@ -35,7 +36,7 @@ def plots(e: Evaluation) -> list[str]:
     """All pictures this evaluation has data for, as SVG."""
     if e.span_ns is None:
         return []
-    made = [*_views(e), *_over_time(e), *_axes(e), *_hits(e), *_honesty(e), *_by_range(e), *_lanes(e)]
+    made = [*_views(e), *_over_time(e), *_axes(e), *_hits(e), *_honesty(e), *_by_range(e), *_lanes(e), *_rotation(e)]
     return [chart.svg() for chart in made]
 
 
@@ -234,6 +235,30 @@ def _lanes(e: Evaluation) -> list[Chart]:
             chart.named(color, name)
             for start, end in _stretches(flags):
                 chart.box((t[start], t[end - 1] + 0.02), (0.1, 0.9), color, 0.9)
+    return [chart]
+
+
+def _rotation(e: Evaluation) -> list[Chart]:
+    """How far off the nearest branch of the rotation is, coloured by whether it was the branch given."""
+    turned, told = e.turned, e.run.rotations
+    if turned is None or told is None or not len(turned.stamps_ns):
+        return []
+    rows = worst_of_each(turned.modulo.angle_rad)
+    t, off_deg = _seconds(e, turned.stamps_ns[rows]), np.degrees(turned.modulo.angle_rad[rows])
+    top = 1.1 * max(limits_of(off_deg, margin=0)[1], 0.1)
+    title = "rotation by both cameras, modulo quarter turns"
+    chart = Chart(title, "time [s]", "error [deg]", _duration(e), (0.0, top), WIDE)
+    refused = _seconds(e, told.stamps_ns[~told.accepted])
+    chart.points(refused, np.zeros(len(refused)), SOFT, "no rotation" if len(refused) else "")
+    wrong, resolved = turned.given.angle_rad[rows] > BRANCH_RAD, turned.resolved[rows]
+    for flags, color, name, radius in (
+        (~wrong & ~resolved, TRUTH, "branch right", 2),
+        (~wrong & resolved, GOOD, "branch right, RESOLVED", 2),
+        (wrong & ~resolved, INK, "branch wrong", 3),
+        (wrong & resolved, BAD, "branch wrong, RESOLVED", 4),
+    ):
+        if flags.any():
+            chart.points(t[flags], off_deg[flags], color, name, radius=radius)
     return [chart]
 
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from flow.link import LinkError
 from links.evaluation.output import Output, read_output
-from links.evaluation.true_drone import TrueDrone, read_true_drones
+from links.evaluation.rotations import Rotations, read_rotations
+from links.evaluation.true_drone import TrueDrone, read_true_drones, read_true_vehicle
 from links.evaluation.tum import Trajectory, read_number, read_stamp_ns, read_table, read_tum
 from links.results import (
     COVARIANCE_FILE,
@@ -24,6 +25,7 @@ from links.results import (
     FIX_FILE,
     POSE_COVARIANCE_FILE,
     POSE_FILE,
+    ROTATION_FILE,
     SUMMARY_FILE,
 )
 from stages.geometry import Array64
@@ -58,6 +60,8 @@ class RunData:
     hidden_ns: NDArray[np.int64] | None = None  # (m, 2) truth: since when and until when the drone was hidden
     drones: tuple[TrueDrone, ...] = ()  # all that truth knows of, the one that is judged among them
     drone: int = 1  # number of the one that is judged
+    rotations: Rotations | None = None  # of both cameras; None: no stage told any
+    vehicle: Trajectory | None = None  # truth: T_world_vehicle
 
     @property
     def other_paths(self) -> list[Trajectory]:
@@ -134,6 +138,8 @@ def _read_folder(folder: Path, truth_file: Path | None, no_drone: bool) -> RunDa
         config=_configuration(folder, recording, summary),
         hidden_ns=drones[0].hidden_ns,
         drones=drones,
+        rotations=read_rotations(folder / ROTATION_FILE) if (folder / ROTATION_FILE).exists() else None,
+        vehicle=read_true_vehicle(folder),
     )
 
 

@@ -8,13 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from rich.cells import cell_len
 from rich.table import Table
 from rich.text import Text
 
+from links.evaluation.catalogue import CAMERAS
 from links.evaluation.groups import CONFIG, Group, Key
 from links.evaluation.no_drone import Alarms
+from links.evaluation.rotation_groups import RotationGroup
 
 HOW = (
     "ever, mute, false: runs that were right at least once, said nothing, were mostly false. hit, seen: sweeps with a "
@@ -24,7 +27,14 @@ HOW = (
     "fail. Of several drones each counts as a run."
 )
 NOTHING = "-"
+ROTATION_HOW = (
+    f"{CAMERAS}: over all rotations of a group. given: the branch that was told; modulo: the nearest of its four, "
+    "quarter turns about the world's vertical, as are roll, pitch, yaw, the 95 % bound and NEES / 3 (honest: 1). "
+    "wrong: RESOLVED and more than 45 deg off. resolved: runs with a first RESOLVED that is right. first, ground: time "
+    "and the drone's way to it, relative to the vehicle and over ground, medians over runs."
+)
 Column = tuple[str, Callable[[Group], str]]
+AnyGroup = TypeVar("AnyGroup", Group, RotationGroup)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,18 +82,52 @@ COLUMNS: tuple[Column, ...] = (
     ("false\n[/h]", lambda g: _digits(g.false_per_h, 0)),
 )
 
+ROTATION_COLUMNS: tuple[tuple[str, Callable[[RotationGroup], str]], ...] = (
+    ("runs", lambda g: str(g.runs)),
+    ("pictures", lambda g: str(g.accepted[1])),
+    ("accepted\n[%]", lambda g: _percent(g.accepted)),
+    ("given\nRMSE [deg]", lambda g: _digits(g.given.rmse, 2)),
+    ("modulo\nRMSE [deg]", lambda g: _digits(g.modulo.rmse, 2)),
+    ("modulo\nmedian", lambda g: _digits(g.modulo.median, 2)),
+    ("modulo\n95 %", lambda g: _digits(g.modulo.p95, 2)),
+    ("roll\nRMSE", lambda g: _digits(g.modulo.rmse_rpy[0], 2)),
+    ("pitch\nRMSE", lambda g: _digits(g.modulo.rmse_rpy[1], 2)),
+    ("yaw\nRMSE", lambda g: _digits(g.modulo.rmse_rpy[2], 2)),
+    ("in 95 %\n[%]", lambda g: _percent(g.inside_95)),
+    ("NEES\n/ 3", lambda g: _digits(g.nees_of_1, 2)),
+    ("RESOLVED", lambda g: str(g.resolved)),
+    ("wrong", lambda g: NOTHING if g.wrong_resolved is None else str(g.wrong_resolved)),
+    ("resolved", lambda g: _of(len(g.resolved_s.succeeded), len(g.resolved_s.values))),
+    ("first\n[s]", lambda g: _digits(g.resolved_s.median, 1)),
+    ("first\n[m]", lambda g: _digits(g.resolved_m.median, 2)),
+    ("ground\n[m]", lambda g: _digits(g.resolved_ground_m.median, 2)),
+    ("switches", lambda g: str(g.switches)),
+)
+
 
 def group_summary(found: list[Group], key: Key) -> Summary:
     """Groups down, numbers across; the configuration is a column when there are several or nothing else names a row."""
+    return _by_group("", found, key, COLUMNS, HOW)
+
+
+def rotation_summary(found: list[RotationGroup], key: Key) -> Summary:
+    """The same of the rotation by both cameras."""
+    return _by_group(f"{CAMERAS}, ", found, key, ROTATION_COLUMNS, ROTATION_HOW)
+
+
+def _by_group(
+    title: str, found: list[AnyGroup], key: Key, columns: tuple[tuple[str, Callable[[AnyGroup], str]], ...], how: str
+) -> Summary:
     with_config = not key or len({group.config for group in found}) > 1
     by = f"word {', '.join(map(str, key))} of the recording's name" if key else CONFIG
-    told = {head: [tell(group) for group in found] for head, tell in COLUMNS}
+    told = {head: [tell(group) for group in found] for head, tell in columns}
     kept = {head: cells for head, cells in told.items() if any(cell != NOTHING for cell in cells)}
     names = [[*group.words, *([group.config] if with_config else [])] for group in found]
     heads = [*(f"word {word}" for word in key), *([CONFIG] if with_config else []), *kept]
     rows = [[*name, *cells] for name, cells in zip(names, zip(*kept.values(), strict=True), strict=True)]
     left_out = ", ".join(head.replace("\n", " ") for head in told if head not in kept)
-    return Summary(f"by {by}", heads, rows, len(names[0]), HOW + (f" Nothing to tell: {left_out}." if left_out else ""))
+    note = how + (f" Nothing to tell: {left_out}." if left_out else "")
+    return Summary(f"{title}by {by}", heads, rows, len(names[0]), note)
 
 
 def alarm_summary(found: list[Alarms]) -> Summary:

@@ -48,8 +48,10 @@ def number(value: float, metric: Metric) -> str:
     """Three significant digits, never fewer than the unit asks for."""
     if math.isinf(value):
         return "failed"
-    if metric.unit in ("%", "Hz", "deg"):
+    if metric.unit in ("%", "Hz"):
         return f"{value:.1f}"
+    if metric.unit == "deg":
+        return f"{value:.2f}"
     if metric.unit == "m":
         return f"{value:.3f}"
     if metric.unit == "" and value == round(value):

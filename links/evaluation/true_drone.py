@@ -1,4 +1,4 @@
-"""What the truth beside a run says of each drone: where it was, when it returned a pulse, when nothing hid it.
+"""What the truth beside a run says of the vehicle's way and of each drone: its path, its returns, what hid it.
 
 Source: links/truth.py, which writes it; file names in links/results.py.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flow.link import LinkError
 from links.evaluation.tum import NO_DRONE, Trajectory, read_stamp_ns, read_table, read_tum
-from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VISIBLE_FILE, of_drone
+from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE, of_drone
 
 NEVER_NS = np.iinfo(np.int64).max // 2  # the end of what did not end
 NO_HITS = "the recording does not say which returns came from the drone"
@@ -38,6 +38,13 @@ def read_true_drones(folder: Path, truth_file: Path | None) -> tuple[tuple[TrueD
         number = len(drones) + 1
         drones.append(_read_drone(folder, number, read_tum(folder / of_drone(TRUTH_FILE, number)), ""))
     return tuple(drones), said_empty
+
+
+def read_true_vehicle(folder: Path) -> Trajectory | None:
+    """T_world_vehicle; None when the run holds none."""
+    path = folder / TRUTH_VEHICLE_FILE
+    vehicle = read_tum(path, may_be_empty=True) if path.exists() else None
+    return vehicle if vehicle is not None and len(vehicle) else None
 
 
 def _read_path(folder: Path, truth_file: Path | None) -> tuple[Trajectory | None, str, bool]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.link import LinkError
+from links.results import UPPER
 from stages.geometry import Array64
 
 COLUMNS = "stamp_s tx ty tz qx qy qz qw"
@@ -117,19 +118,24 @@ def read_matrices(path: Path, size: int) -> list[MatrixRow]:
     """The lines of a CSV of upper triangles (`upper_names`), in their order."""
     names = upper_names(size)
     found: list[MatrixRow] = []
-    upper = np.triu_indices(size)
     for where, row in read_table(path, ("stamp_s", *names)):
-        matrix = np.zeros((size, size))
-        matrix[upper] = [read_number(row[name], where) for name in names]
         stamp_ns = read_stamp_ns(row["stamp_s"], where)
-        found.append(MatrixRow(where, stamp_ns, matrix + np.triu(matrix, 1).T, row))
+        found.append(MatrixRow(where, stamp_ns, symmetric([read_number(row[name], where) for name in names]), row))
     return found
+
+
+def symmetric(upper: Sequence[float]) -> Array64:
+    """The matrix of an upper triangle by rows: n (n + 1) / 2 numbers."""
+    size = round((math.sqrt(8 * len(upper) + 1) - 1) / 2)
+    matrix = np.zeros((size, size))
+    matrix[np.triu_indices(size)] = upper
+    return matrix + np.triu(matrix, 1).T
 
 
 def upper_names(size: int) -> tuple[str, ...]:
     """Columns of an upper triangle by rows: a position's (3) or a pose's (6), rotation [rad] before translation [m]."""
     if size == 3:
-        return tuple(f"c{a}{b}_m2" for a, b in zip("xxxyyz", "xyzyzz", strict=True))
+        return tuple(f"c{name}_m2" for name in UPPER)
     return tuple(f"c{a}{b}" for a in range(size) for b in range(a, size))
 
 

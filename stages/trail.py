@@ -52,15 +52,10 @@ class VehicleTrail:
         after = min(bisect_right(poses, stamp_ns, key=lambda pose: pose[0]), len(poses) - 1)
         (t0, R0, x0), (t1, R1, x1) = poses[after - 1], poses[after]
         share = (min(stamp_ns, t1 + FURTHEST_NS) - t0) / (t1 - t0)
-        R = R0 + share * (R1 - R0)  # poses are milliseconds apart: the mean of the two, made a rotation again
-        if share > 1.0:  # far beyond, the other way might not converge
-            u, _, vt = np.linalg.svd(R)
-            R = u @ vt
-        for _ in range(NEWTON_STEPS):  # towards the nearest rotation; Higham, Functions of Matrices (2008), 8.3
-            R = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
         if len(self._known) >= KEPT:
             self._known.clear()
-        self._known[stamp_ns] = R, x0 + share * (x1 - x0)
+        # poses are milliseconds apart: the mean of the two, made a rotation again
+        self._known[stamp_ns] = _rotation(R0 + share * (R1 - R0), near=share <= 1.0), x0 + share * (x1 - x0)
         return self._known[stamp_ns]
 
     def velocity_mps(self, stamp_ns: int) -> Array64:
@@ -80,3 +75,16 @@ class VehicleTrail:
         now = R @ xyz_m + t
         then = R_then @ (xyz_m + STEP_NS * 1e-9 * velocity_mps) + t_then
         return now, (then - now) / (STEP_NS * 1e-9)
+
+
+def _rotation(mean: Array64, near: bool) -> Array64:
+    """The rotation nearest to a matrix (3, 3); `near`: it is nearly one, and a few steps of Newton do.
+
+    Source: Higham, Functions of Matrices (2008), 8.3.
+    """
+    if not near:
+        u, _, vt = np.linalg.svd(mean)
+        return u @ vt
+    for _ in range(NEWTON_STEPS):
+        mean = mean @ (1.5 * np.eye(3) - 0.5 * (mean.T @ mean))
+    return mean

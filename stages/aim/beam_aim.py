@@ -183,7 +183,7 @@ class BeamAim(Stage):
         old = now.targets.get(key)
         sigma = 0.3 if state.covariance_m2 is None else math.sqrt(float(np.linalg.eigvalsh(state.covariance_m2)[-1]))
         velocity = np.zeros(3) if state.velocity_vehicle_mps is None else state.velocity_vehicle_mps
-        heard = state.state is TrackingState.TRACKING or old is None
+        seen = state.state is TrackingState.TRACKING
         now.targets[key] = _Target(
             key=key,
             stamp_ns=state.stamp_ns,
@@ -193,7 +193,7 @@ class BeamAim(Stage):
             sure=True,
             looks=old.looks if old else 0,
             missed=old.missed if old and state.hits == 0 else 0,
-            heard_ns=state.stamp_ns if heard else old.heard_ns,
+            heard_ns=state.stamp_ns if seen or old is None else old.heard_ns,
         )
 
     def on_servo(self, servo: ServoState) -> ServoGoal | None:

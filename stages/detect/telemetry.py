@@ -66,12 +66,14 @@ class DroneTelemetry:
                 return
             left = xyz_m - self._xyz_m[-1] - 0.5 * dt * (v_mps + self._v_mps[-1])
             if float(np.linalg.norm(left)) > JUMP_M + dt:
-                self._ns.clear(), self._xyz_m.clear(), self._v_mps.clear()
+                for kept in (self._ns, self._xyz_m, self._v_mps):
+                    kept.clear()
         self._ns.append(stamp_ns)
         self._xyz_m.append(xyz_m)
         self._v_mps.append(v_mps)
         while stamp_ns - self._ns[0] > KEPT_NS:
-            self._ns.popleft(), self._xyz_m.popleft(), self._v_mps.popleft()
+            for kept in (self._ns, self._xyz_m, self._v_mps):
+                kept.popleft()
 
     def speed_mps(self, stamp_ns: int) -> tuple[float, float] | None:
         """(level, up) at a time; None when it is silent."""
@@ -105,7 +107,8 @@ def hear(
     first = bisect_left(path_ns, path_ns[-1] - KEPT_NS // 2)
     rows = list(range(first, len(path_ns)))
     if len(rows) > MOST_POINTS:
-        rows = [rows[round(k)] for k in np.linspace(0, len(rows) - 1, MOST_POINTS)]
+        last = len(rows) - 1
+        rows = [rows[round(i * last / (MOST_POINTS - 1))] for i in range(MOST_POINTS)]
     if len(rows) < 2:
         return None
     told = telemetry.at([path_ns[k] for k in rows])

@@ -233,7 +233,9 @@ class VanishingDirections(Message):
     frame: PerPointI64  # (n,) which horizontal pair it belongs to, 0 the strongest; -1: the vertical
     line_normal: Annotated[NDArray[np.float64], Shape("m", 3)]  # unit normals of the lines' great circles
     line_end: Annotated[NDArray[np.float64], Shape("m", 2, 3)]  # unit rays of each line's two ends
-    line_sigma_rad: Annotated[NDArray[np.float64], Shape("m")]  # of the normal, about the axis along the line
+    line_sigma_rad: Annotated[
+        NDArray[np.float64], Shape("m")
+    ]  # (m,) how far the normal may be turned about the ray to the line's middle
     line_direction: Annotated[NDArray[np.int64], Shape("m")]  # index of its direction; -1: none
     reason: str
 
@@ -250,12 +252,13 @@ class BranchState(enum.Enum):
 class RelativeRotation(Message):
     """How the drone is turned in the vehicle's axes, up to the street's symmetry; stamp_ns is the pictures'. P IV.
 
-    Branch k is R_vehicle_drone with Rz(k * 90 deg) on its left; branch 0 is the most probable and given here.
+    Branch k is turned further by k * 90 deg about the world's vertical: Rz(k 90 deg) R_vehicle_drone where the vehicle
+    stands level. Branch 0 is the most probable and given here. What the probabilities leave to 1: none is right.
     """
 
     R_vehicle_drone: Mat3 | None  # None: no rotation now, `reason` says why
     covariance_rad2: Mat3 | None  # of phi in R exp(phi), the drone's axes
-    branch_probability: Annotated[NDArray[np.float64], Shape(4)]  # of Rz(k 90 deg) R_vehicle_drone
+    branch_probability: Annotated[NDArray[np.float64], Shape(4)]  # of branch k
     state: BranchState
     switches: int  # how often the branch given out has changed since the start: a change is a jump
     reason: str

@@ -116,7 +116,6 @@ class BeamAim(Stage):
     patience: int = Field(8, ge=1)  # looks in a row that did not meet a candidate
     stop_looks: int = Field(2, ge=1)  # it was seen in so many turns of the rotor before it interrupts the sweep
     glances: int = Field(3, ge=0)  # at a candidate in passing
-    glance_probability: float = Field(0.006, ge=0, le=1)
     turns_each: int = Field(3, ge=1)  # for each of several drones
     max_drones: int = Field(1, ge=1, le=8)  # with fewer tracks the search goes on between looks at them
     search_s: float = Field(0.35, gt=0)  # at a time
@@ -266,11 +265,7 @@ class BeamAim(Stage):
             best.glance = False
             return best
         # the sweep goes on by steps: each turn of the rotor a beam is put on something that was met a moment ago
-        fresh = [
-            t
-            for t in maybe
-            if t.looks < self.glances and now_ns - t.heard_ns < 350_000_000 and t.probability >= self.glance_probability
-        ]
+        fresh = [t for t in maybe if t.looks < self.glances and now_ns - t.heard_ns < 350_000_000]
         for target in fresh:
             target.glance = True
         return max(fresh, key=lambda t: (t.probability / (1.0 + t.looks), t.key), default=None)

@@ -30,11 +30,11 @@ from stages.geometry import Array64
 KEPT_NS = 20_000_000_000
 AHEAD_NS = 500_000_000  # beyond the newest word it is not known any more
 JUMP_M = 1.0  # a step that its velocity does not explain: the autopilot's estimate was reset
-YAWS = 72
+YAWS = 72  # steps of 5 deg: coarser, a fast straight flight fits none
 MOST_POINTS = 14
 ANYWHERE_M = 100.0
+DRIFT_MPS = 0.3  # of the autopilot's velocity and the vehicle's, together, level
 DRIFT_UP_MPS = 0.1
-DRIFT_MPS = 0.3  # of the autopilot's velocity and the vehicle's, together
 SCATTERED_M = 0.45  # sightings of something long
 SLIDING_MPS = 0.5  # or how fast looks at it wander along
 CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time, speed; else anything up to it
@@ -84,7 +84,7 @@ class DroneTelemetry:
 
     def at(self, stamps_ns: list[int]) -> Array64 | None:
         """Positions (n, 3) [m] in the autopilot's frame; None when it was silent then."""
-        if len(self._ns) < 2 or stamps_ns[0] < self._ns[0] or stamps_ns[-1] > self._ns[-1] + AHEAD_NS:
+        if len(self._ns) < 2 or stamps_ns[0] < self._ns[0]:
             return None
         known = list(self._ns)
         found = np.empty((len(stamps_ns), 3))

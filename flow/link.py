@@ -5,7 +5,7 @@ Source: ours.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,15 @@ class LinkError(Exception):
 
 class Link(Node):
     """Base of all links: sources (records in), sinks (`on_<port>`), or both, as a servo is."""
+
+    def sent(self) -> Iterable[Record]:
+        """What went out since the call before, for the recording; the live runner asks after each `on_<port>`."""
+        return ()
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Totals since the start for people: lost, refused, foreign; the live runner shows them."""
+        return {}
 
 
 class Source(Link):

@@ -120,7 +120,7 @@ class BeamAim(Stage):
     max_drones: int = Field(1, ge=1, le=8)  # with fewer tracks the search goes on between looks at them
     search_s: float = Field(0.35, gt=0)  # at a time
     beams: bool = True  # ablation: without, the middle of the fan is put on the drone
-    coast_search_s: float = Field(3.0, gt=0)  # coasting longer, the whole travel is swept
+    coast_sigma_m: float = Field(3.0, gt=0)  # less known while coasting, the whole travel is swept
 
     _now: _Now = PrivateAttr(default_factory=lambda: _Now())
 
@@ -221,7 +221,7 @@ class BeamAim(Stage):
                 self._leave(target, now_ns)
             elif now_ns - target.heard_ns > 1.2e9:
                 del now.targets[key]
-        sure = [t for t in now.targets.values() if t.sure and now_ns - t.heard_ns < self.coast_search_s * 1e9]
+        sure = [t for t in now.targets.values() if t.sure and t.sigma_m < self.coast_sigma_m]
         if not sure or len(sure) >= self.max_drones:
             now.searching, now.served, now.left_off_rad = False, 0, None
         elif self._searches_on(sure, servo):

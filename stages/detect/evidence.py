@@ -28,9 +28,10 @@ from stages.detect.candidate import SAME_LOOK_NS, SIGMA_M, STANDING_M, Candidate
 from stages.detect.flight import scatter_m
 from stages.detect.sightings import Limits, SightingFinder, Slice
 from stages.detect.surroundings import INNER_HITS, INNER_PASSES, TALLY, BigThings, look_around
-from stages.detect.telemetry import DroneTelemetry, hear
+from stages.detect.telemetry import hear
 from stages.detect.telling import candidates_message, detections_message, odds_of
 from stages.detect.verdict import STANDING, Evidence, judge
+from stages.drone_telemetry import DroneTelemetry
 from stages.geometry import Array64
 from stages.messages import (
     Candidates,

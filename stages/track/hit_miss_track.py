@@ -4,7 +4,7 @@
     CANDIDATE   something worth another look is followed, silently
     TRACKING    the detector accepted it, and it was hit lately: a DroneFix for every look with a hit
     COASTING    not hit lately; predicted, the covariance grows
-    LOST        not hit for `lost_after_s`, or no longer taken for a drone
+    LOST        not hit for `lost_after_s`, nor known by its own word; or no longer taken for a drone
 
 A look is one passing of the rotor. Its pulses are measured against where the drone is at each pulse's own time
 (de-skew by its velocity and the vehicle's motion), those beside it count as misses (stages/track/hull.py). Several
@@ -29,16 +29,19 @@ from stages.messages import (
     Candidates,
     Detections,
     DroneFix,
+    DroneLocalPosition,
+    DroneOdometry,
     SweptPulses,
     TrackingState,
     TrackState,
     VehicleMotion,
 )
-from stages.track.kalman import predicted
 from stages.track.look import Look, collect_into, evaluate, largest_sigma_m
+from stages.track.told_motion import ToldMotion, Word
 from stages.trail import VehicleTrail
 
 LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
+STALE_NS = 150_000_000  # a sighting so much older than a track's own hits says nothing of it
 
 
 @dataclass(slots=True, eq=False)
@@ -56,17 +59,16 @@ class _Track:
     confirmed: bool = False
     hits: int = 0  # of the newest look
     look: Look | None = None
+    word: Word | None = None  # what the drone's word was for stamp_ns when x was made
+    look_word: Word | None = None  # and for the look's start
     told_ns: int = 0
     reason: str = ""
-
-    def at(self, stamp_ns: int, q: float) -> tuple[Array64, Array64]:
-        return predicted(self.x, self.P, (stamp_ns - self.stamp_ns) * 1e-9, q)
 
 
 class HitMissTrack(Stage):
     """Hits and misses of every look, de-skewed, on as many drones as there are."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion", "drone_position", "drone_odometry"})
 
     span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
     hull_offset_m: float = Field(0.01, ge=-1, le=1)  # the centre lies this far behind the mean of its returns
@@ -74,8 +76,10 @@ class HitMissTrack(Stage):
     max_hypotheses: int = Field(4, ge=0, le=16)  # candidates followed beside them
     own_sigma_m: float = Field(0.8, gt=0)  # less known, only the detector finds it again
     manoeuvre: float = Field(1.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
+    told_manoeuvre: float = Field(0.02, gt=0)  # and what is left of it where the drone tells how it flies
     coast_after_s: float = Field(0.35, gt=0)
-    lost_after_s: float = Field(6.0, gt=0)
+    lost_after_s: float = Field(6.0, gt=0)  # later where the drone tells its flight, as long as
+    lost_sigma_m: float = Field(5.0, gt=0)  # it is known as well as this
     start_sigma_mps: float = Field(1.5, gt=0)  # of the detector's velocity
     pointing_deg: float = Field(0.07, ge=0)  # encoder, play, calibration: constant or slow, one sigma
     shape_m: float = Field(0.02, ge=0)  # the drone's own outline is not round, one sigma
@@ -83,6 +87,7 @@ class HitMissTrack(Stage):
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
 
     _trail: VehicleTrail = PrivateAttr(default_factory=VehicleTrail)
+    _told: tuple[ToldMotion, ToldMotion] = PrivateAttr(default_factory=lambda: (ToldMotion(0), ToldMotion(1)))
     _tracks: list[_Track] = PrivateAttr(default_factory=lambda: list[_Track]())
     _next_number: int = PrivateAttr(default=1)
     _idle_ns: int = PrivateAttr(default=0)
@@ -91,6 +96,15 @@ class HitMissTrack(Stage):
     def on_motion(self, motion: VehicleMotion) -> None:
         """Where the vehicle is; without it, it is taken to be parked."""
         self._trail.add(motion)
+
+    def on_drone_position(self, position: DroneLocalPosition) -> None:
+        """What the drone says of its flight: a track moves as it says."""
+        self._told[0].told.add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+
+    def on_drone_odometry(self, odometry: DroneOdometry) -> None:
+        """The same from an autopilot that sends this; taken where it sends both."""
+        velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
+        self._told[1].told.add(odometry.stamp_ns, odometry.xyz_local_m, velocity)
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Follow the promising ones; drop what is no longer taken for a drone."""
@@ -103,7 +117,8 @@ class HitMissTrack(Stage):
             if known is None and P >= 0.5:
                 known = self._astray(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
             if known is not None:
-                if known.confirmed and P >= 0.5 and self._doubtful(known, candidates.stamp_ns):
+                seen_later = int(candidates.seen_ns[i]) > known.last_hit_ns
+                if known.confirmed and P >= 0.5 and seen_later and self._doubtful(known, candidates.stamp_ns):
                     self._move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
                 sure = known.candidate == number or candidates.looks[i] >= 6
                 if P < 0.2 and known.confirmed and sure:
@@ -122,7 +137,7 @@ class HitMissTrack(Stage):
             v = np.zeros(3) if velocity is None else velocity[i]
             xyz, v = self._trail.to_local(seen_ns, detections.xyz_vehicle_m[i], v)
             track = self._near(xyz, seen_ns, number) or self._astray(number, xyz, v, seen_ns, seen_ns)
-            if track is not None and track.confirmed and self._doubtful(track, seen_ns):
+            if track is not None and track.confirmed and seen_ns > track.last_hit_ns and self._doubtful(track, seen_ns):
                 self._move(track, number, xyz, v, seen_ns, seen_ns)
             if track is None:
                 if sum(track.confirmed for track in self._tracks) >= self.max_drones:
@@ -149,8 +164,10 @@ class HitMissTrack(Stage):
                 track.look = None
                 yield from self._close(track, look)
             before = track.look
-            state = track.at(pulses.stamp_ns, self.manoeuvre) if before is None else (before.x, before.P)
+            state = self._at(track, pulses.stamp_ns) if before is None else (before.x, before.P)
             track.look = collect_into(before, pulses, R, t, axis, *state, self.span_m, self.de_skew)
+            if before is None:
+                track.look_word = self._word(pulses.stamp_ns)
             if track in self._tracks:
                 yield from self._watch(track, now_ns)
         if not self._tracks and now_ns - self._idle_ns > 500_000_000:
@@ -159,6 +176,17 @@ class HitMissTrack(Stage):
                 stamp_ns=now_ns, state=TrackingState.SEARCHING, reason=self._why_idle, hits=0, frame_s=0.5, track_id=0
             )
 
+    def _at(self, track: _Track, stamp_ns: int) -> tuple[Array64, Array64]:
+        """A track's state (6,) and covariance (6, 6) at a time."""
+        after = self._word(stamp_ns)
+        told = self._told[0 if after is None else after.source]
+        dt_s = (stamp_ns - track.stamp_ns) * 1e-9
+        return told.predicted(track.x, track.P, dt_s, track.word, after, self.manoeuvre, self.told_manoeuvre)
+
+    def _word(self, stamp_ns: int) -> Word | None:
+        """What the drone says of itself at a time, by the better of its messages."""
+        return self._told[1].word(stamp_ns) or self._told[0].word(stamp_ns)
+
     # hypotheses
 
     def _start(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> _Track:
@@ -166,13 +194,13 @@ class HitMissTrack(Stage):
         if stamp_ns > seen_ns:
             xyz = xyz - (stamp_ns - seen_ns) * 1e-9 * v
         track = _Track(number=0, candidate=number, stamp_ns=seen_ns, x=np.concatenate([xyz, v]), P=P,
-                       last_hit_ns=seen_ns, p_0=0.8)  # fmt: skip
+                       last_hit_ns=seen_ns, p_0=0.8, word=self._word(seen_ns))  # fmt: skip
         self._tracks.append(track)
         return track
 
     def _doubtful(self, track: _Track, now_ns: int) -> bool:
         """So long without a hit that what is found there may as well be something else."""
-        _, P = track.at(now_ns, self.manoeuvre)
+        _, P = self._at(track, now_ns)
         return largest_sigma_m(P) > self.own_sigma_m
 
     def _move(self, track: _Track, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> None:
@@ -181,11 +209,16 @@ class HitMissTrack(Stage):
         self._tracks.remove(new)
         track.candidate, track.stamp_ns, track.x, track.P = number, new.stamp_ns, new.x, new.P
         track.last_hit_ns, track.look, track.odds = seen_ns, None, max(track.odds, 2.0)
+        track.word = new.word
         track.reason = "found again by the detector"
 
     def _astray(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> _Track | None:
-        """The confirmed track of this candidate, brought back to it: it followed something else."""
-        track = next((track for track in self._tracks if track.confirmed and track.candidate == number), None)
+        """The confirmed track of this candidate, brought back to it: it followed something else.
+
+        Not where the detector has not seen it lately: then the track knows better.
+        """
+        mine = (track for track in self._tracks if track.confirmed and track.candidate == number)
+        track = next((track for track in mine if seen_ns > track.last_hit_ns - STALE_NS), None)
         if track is not None:
             self._move(track, number, xyz, v, seen_ns, stamp_ns)
             track.reason = "had followed something else, brought back by the detector"
@@ -195,7 +228,7 @@ class HitMissTrack(Stage):
         """The track that this is: by the detector's number, or by its place."""
         best, least = None, 9.0
         for track in self._tracks:
-            x, P = track.at(stamp_ns, self.manoeuvre)
+            x, P = self._at(track, stamp_ns)
             away = xyz - x[:3]
             cost = float(away @ np.linalg.solve(P[:3, :3] + 0.3**2 * np.eye(3), away))
             cost = min(cost, 4.0) if track.candidate == number and cost < 100.0 else cost
@@ -214,7 +247,12 @@ class HitMissTrack(Stage):
     def _watch(self, track: _Track, now_ns: int) -> Iterator[TrackState]:
         """Coasting and losing are told without a look."""
         silent_s = (now_ns - track.last_hit_ns) * 1e-9
-        if silent_s > (self.lost_after_s if track.confirmed else 1.5) or track.odds < -4.0:
+        gone = silent_s > 1.5
+        if track.confirmed and gone:
+            known = self._word(now_ns) is not None
+            known = known and largest_sigma_m(self._at(track, now_ns)[1]) < self.lost_sigma_m
+            gone = silent_s > self.lost_after_s and not known
+        if gone or track.odds < -4.0:
             why = f"not hit for {silent_s:.1f} s" if silent_s > 1.0 else "looked at again and again, not hit"
             yield from self._lose(track, now_ns, why)
         elif track.confirmed:
@@ -235,7 +273,7 @@ class HitMissTrack(Stage):
         state = TrackingState.CANDIDATE
         if track.confirmed:
             state = TrackingState.COASTING if silent_s > self.coast_after_s else TrackingState.TRACKING
-        x, P = track.at(now_ns, self.manoeuvre)
+        x, P = self._at(track, now_ns)
         R, _ = self._trail.at(now_ns)
         xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
         track.told_ns = now_ns
@@ -258,7 +296,7 @@ class HitMissTrack(Stage):
         track.hits = 0 if seen is None else seen.hits
         if seen is None:
             return
-        track.x, track.P, track.stamp_ns = seen.x, seen.P, look.start_ns
+        track.x, track.P, track.stamp_ns, track.word = seen.x, seen.P, look.start_ns, track.look_word
         track.odds = min(max(track.odds + seen.evidence, -8.0), 8.0)
         if seen.hits == 0:
             return
@@ -268,11 +306,14 @@ class HitMissTrack(Stage):
             track.p_0 += 0.1 * (ratio - track.p_0)
         track.reason = f"{seen.hits} hits, {seen.beside} pulses beside it"
         if track.confirmed:
+            x, P = self._at(track, track.last_hit_ns)
+            for told in self._told:
+                told.learn(track.number, track.last_hit_ns, x[:3], math.sqrt(float(np.trace(P[:3, :3])) / 3) + 0.05)
             yield self._fix(track)
         yield self._state(track, max(look.last_ns, track.last_hit_ns, track.told_ns))
 
     def _fix(self, track: _Track) -> DroneFix:
-        x, P = track.at(track.last_hit_ns, self.manoeuvre)
+        x, P = self._at(track, track.last_hit_ns)
         R, _ = self._trail.at(track.last_hit_ns)
         xyz, velocity = self._trail.to_vehicle(track.last_hit_ns, x[:3], x[3:])
         return DroneFix(

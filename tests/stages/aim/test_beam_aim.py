@@ -274,7 +274,7 @@ def test_while_coasting_it_looks_farther_and_farther_beside_the_prediction_and_t
             state = TrackingState.COASTING if coasting else TrackingState.TRACKING
             aim.on_state(track_state(way, t_s, state, sigma_m=0.05 + (t_s - 1.0 if coasting else 0.0)))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE, coast_search_s=2.0), 6.0, tell, start_rad=1.2)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE, coast_sigma_m=2.0), 6.0, tell, start_rad=1.2)
     positions = np.degrees(flight.servo_rad)
     tracked, coasted, searched = positions[60:200], positions[240:560], positions[700:]
     assert np.ptp(tracked) < 2.0

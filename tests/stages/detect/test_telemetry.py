@@ -9,8 +9,6 @@ import pytest
 
 from stages.detect import telemetry
 from stages.detect.telemetry import (
-    AHEAD_NS,
-    ANYWHERE_M,
     BALLOON,
     BIRD,
     CRUISE_MPS,
@@ -18,18 +16,17 @@ from stages.detect.telemetry import (
     CRUISING,
     DRIFT_MPS,
     DRIFT_UP_MPS,
-    JUMP_M,
-    KEPT_NS,
     MOST_POINTS,
     SCATTERED_M,
     SLIDING_MPS,
     YAWS,
-    DroneTelemetry,
     Heard,
     hear,
     weigh,
 )
+from stages.drone_telemetry import AHEAD_NS, JUMP_M, KEPT_NS, DroneTelemetry
 from stages.geometry import rotation_z
+from stages.smooth_motion import ANYWHERE_M
 from tests.stages.made import MS, START_NS
 
 SIGMA_M = 0.15

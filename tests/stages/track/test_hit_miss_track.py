@@ -99,9 +99,16 @@ def here(way: Way, t_s=0.0):
 
 
 def test_ports_are_what_the_graph_wires():
-    assert set(input_ports(HitMissTrack)) == {"candidates", "detections", "motion", "pulses"}
+    assert set(input_ports(HitMissTrack)) == {
+        "candidates",
+        "detections",
+        "motion",
+        "pulses",
+        "drone_position",
+        "drone_odometry",
+    }
     assert set(output_ports(HitMissTrack)) == {"drone_fix", "track_state"}
-    assert HitMissTrack.optional_inputs == {"candidates", "motion"}
+    assert HitMissTrack.optional_inputs == {"candidates", "motion", "drone_position", "drone_odometry"}
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -9,7 +9,9 @@ Source: ours.
 from __future__ import annotations
 
 import datetime
+import shutil
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -17,8 +19,8 @@ from typing import Literal
 
 from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, LinkError
+from flow.ports import RunError
 from flow.problem import ConfigError
-from flow.replay import RunError
 from links.recording import RecordingReader
 from links.run_folder import Asked, RunFolder, holds_run, replay_into
 from links.simulated.closed_loop import ClosedLoop, made_with, servo_edge
@@ -164,9 +166,13 @@ def _simulate_and_keep_run(
     file: Path, scenario: Scenario, folder: Path, asked: Asked, graph: Graph, progress: Callable[[float], None]
 ) -> None:
     """The closed loop runs the very graph that a replay of its recording would: it leaves the same run."""
-    with RunFolder(folder, file, asked, graph) as run:
+    is_new = not folder.exists()
+    with ExitStack() as undo, RunFolder(folder, file, asked, graph) as run:
+        if is_new:  # a flight that cannot be made leaves no folder that looks like a run
+            undo.callback(shutil.rmtree, folder)
         loop = ClosedLoop(graph, scenario.closed_loop, made_with(asked.config, graph), run.taps)
         _simulate(file, scenario, loop, progress)
+        undo.pop_all()
         truth = TruthLog()
         with RecordingReader(file) as reader:
             truth.take(reader.records([topic for topic in reader.topics if topic.startswith(TRUTH_TOPICS)]))

@@ -11,10 +11,47 @@ Source: ours; DESIGN, "putting a *beam* on the drone ... gives 2-4x the returns"
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from stages.geometry import Array64, LidarMount
+from stages.messages import LidarFirings
+
+
+@dataclass(slots=True, eq=False)
+class Rotor:
+    """Where the rotor is and how fast it turns."""
+
+    stamp_ns: int = 0
+    azimuth_rad: float = 0.0
+    rate_radps: float = 0.0
+
+    def next_pass_ns(self, azimuth_rad: float, after_ns: int) -> int:
+        """When it looks along an azimuth first after a time."""
+        at = (self.azimuth_rad + self.rate_radps * (after_ns - self.stamp_ns) * 1e-9) % math.tau
+        return after_ns + round(((azimuth_rad - at) % math.tau) / self.rate_radps * 1e9)
+
+    def hear(self, firings: LidarFirings) -> None:
+        """What a packet tells of it."""
+        n = firings.pulse_stamp_ns.size
+        if n < 2:
+            return
+        stamp_ns, azimuth = int(firings.pulse_stamp_ns[-1]), float(firings.azimuth_rad[-1])
+        dt = (stamp_ns - int(firings.pulse_stamp_ns[0])) * 1e-9
+        rate = ((azimuth - float(firings.azimuth_rad[0])) % math.tau) / dt if dt > 0 else 0.0
+        if rate > 0:
+            self.rate_radps = rate if self.rate_radps == 0 else self.rate_radps + 0.05 * (rate - self.rate_radps)
+        self.stamp_ns, self.azimuth_rad = stamp_ns, azimuth
+
+
+class Pointing(NamedTuple):
+    """How a place is looked at."""
+
+    servo_rad: float
+    table_rad: float
+    beam: int  # index of its elevation; -1: none meets it, the table stands as near as it gets
 
 
 def table_angles_rad(T_turntable_lidar: Array64, p_turntable_m: Array64, elevation_rad: float) -> tuple[float, ...]:
@@ -56,6 +93,42 @@ def rotor_azimuth_rad(T_turntable_lidar: Array64, p_turntable_m: Array64, theta_
     turned = np.array([c * x + s * y, -s * x + c * y, z]) - T_turntable_lidar[:3, 3]
     lidar = T_turntable_lidar[:3, :3].T @ turned
     return math.atan2(lidar[0], lidar[1]) % math.tau
+
+
+def cheapest(
+    mount: LidarMount,
+    travel_rad: tuple[float, float],
+    elevations_rad: tuple[float, ...],
+    at_rad: float,
+    place_m: Array64,
+    offset_rad: float,
+    inner_rad: float,
+) -> Pointing | None:
+    """Which beam is best put `offset_rad` beside a place (3,), turntable frame, from a servo position; None: none can.
+
+    Beams farther out than inner_rad are dear: beyond the last one nothing is seen of a drone that flies on.
+    """
+    T = mount.T_turntable_lidar.matrix()
+    best, least = None, math.inf
+    for beam, w in enumerate(elevations_rad):
+        for theta in table_angles_rad(T, place_m, w + offset_rad):
+            for servo in servo_positions_rad(mount, theta, travel_rad):
+                cost = abs(servo - at_rad) + 0.5 * abs(w) + 3.0 * max(abs(w) - inner_rad, 0.0)
+                if cost < least:
+                    best, least = Pointing(servo, theta, beam), cost
+    return best
+
+
+def nearest(mount: LidarMount, travel_rad: tuple[float, float], place_m: Array64) -> Pointing | None:
+    """The middle of the fan as near to a place (3,) as the travel allows: nearly on the axis, or just beyond."""
+    best, least = None, math.inf
+    for theta in table_angles_rad(mount.T_turntable_lidar.matrix(), place_m, 0.0):
+        for turn in (-math.tau, 0.0, math.tau):
+            servo = mount.servo_rad(theta) + turn
+            kept = min(max(servo, travel_rad[0]), travel_rad[1])
+            if abs(kept - servo) < least:
+                best, least = Pointing(kept, theta, -1), abs(kept - servo)
+    return best
 
 
 def low_discrepancy(k: int) -> float:

@@ -141,6 +141,18 @@ def test_a_run_that_is_missing_or_stopped_is_replayed_of_the_kept_recording(tmp_
     assert files_of(run) == whole
 
 
+def test_a_flight_that_cannot_be_made_leaves_no_folder_that_looks_like_a_run(
+    tmp_path, config: Path, monkeypatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise LinkError("the drone drifts into a building")
+
+    monkeypatch.setattr(matrix_making, "simulate_into", refuse)
+    report = make_matrix(tmp_path / "m", [HOVER], range(1, 2), config, silent, results=tmp_path / "runs")
+    assert len(report.failed) == 1, report
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
 def test_a_run_of_an_older_recording_is_not_kept(tmp_path, short, config: Path) -> None:
     """The recordings were made anew without runs, with rain; the run beside them is of the dry ones."""
     runs, recordings, wet = tmp_path / "runs", tmp_path / "m", Conditions(rain=True)

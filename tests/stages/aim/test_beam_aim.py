@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from flow.stage import input_ports, output_ports
 from stages.aim import BeamAim
-from stages.aim.beam_aim import INNER_DEG
+from stages.aim.beam_aim import INNER_RAD
 from stages.geometry import Harmonic, LidarMount
 from stages.messages import Candidates, ServoGoal, TrackingState, TrackState
 from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Way, beams_lidar, beams_vehicle, flying, packet, still
@@ -406,7 +406,7 @@ def test_a_beam_near_the_fans_middle_is_put_on_it_even_where_an_outer_one_is_nea
     looks = looks_of(flight)
     assert len(looks) > 3
     for _, goal in looks:
-        assert abs(elevation_deg(goal, place)) < INNER_DEG + 1.5  # and what it goes beside it
+        assert abs(elevation_deg(goal, place)) < math.degrees(INNER_RAD) + 1.5  # and what it goes beside it
         assert abs(elevation_deg(goal, place)) > 0.3  # no beam lies in the middle
 
 
@@ -421,7 +421,7 @@ def test_a_glance_in_passing_takes_the_beam_that_is_nearest_and_the_sweep_goes_o
     glanced = fly(BeamAim(mount=ON_ITS_SIDE), 2.2, tell)
     looks = [goal for _, goal in looks_of(glanced)]
     assert 1 <= len(looks) <= 3
-    assert any(abs(elevation_deg(goal, place)) > INNER_DEG + 1.5 for goal in looks)
+    assert any(abs(elevation_deg(goal, place)) > math.degrees(INNER_RAD) + 1.5 for goal in looks)
     at_s = [np.argmax(np.degrees(flight.servo_rad) > 175.0) * TICK_NS * 1e-9 for flight in (swept, glanced)]
     assert at_s[0] > 0.5
     assert at_s[1] < at_s[0] + 0.25

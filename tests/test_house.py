@@ -14,7 +14,7 @@ from flow.schema import schema
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = {"flow": {"flow"}, "stages": {"flow", "stages"}, "links": {"flow", "stages", "links"}}
-BASES = {"flow.message", "flow.stage"}  # what a stage may use of the engine
+BASES = {"flow.message", "flow.stage", "flow.compile_cache"}  # what a stage may use of the engine
 OUTSIDE = {
     "threading",
     "multiprocessing",

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from numba.core import config
 
-from stages.compiled import CACHE_FOLDER, COMPILED, cache_folder, cache_name
+from flow.compile_cache import cache_folder, cache_name
+from stages.compiled import CACHE_FOLDER, COMPILED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -28,15 +29,16 @@ def test_every_compiled_function_lies_where_the_name_looks():
     users = [path for package in ("flow", "links", "stages") for path in (REPOSITORY / package).rglob("*.py")]
     users = [path for path in users if "import compiled" in path.read_text(encoding="utf-8")]
     assert len(users) > 20
-    assert [path for path in users if not any(folder in path.parents for folder in COMPILED)] == []
+    assert [path for path in users if not any(REPOSITORY / folder in path.parents for folder in COMPILED)] == []
 
 
 def test_numba_uses_it_and_a_folder_that_cannot_be_made_is_no_error(tmp_path, monkeypatch):
     assert str(CACHE_FOLDER) == config.CACHE_DIR
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
-    assert cache_folder().name == cache_name(COMPILED)
-    assert tmp_path not in cache_folder().parents
+    folder = cache_folder("abc")
+    assert folder.name == "abc"
+    assert tmp_path not in folder.parents
 
 
 CALLEE = "from stages.compiled import compiled\n@compiled\ndef inner(x):\n    return x + {}\n"
@@ -49,7 +51,7 @@ def test_a_changed_callee_in_another_file_is_noticed(tmp_path):
     """With the cache named after these files, as it is after ours; numba alone goes on with the old code."""
     (tmp_path / "caller.py").write_text(CALLER)
     program = (
-        "import sys, pathlib, stages.compiled as c\n"
+        "import sys, pathlib, stages.compiled, flow.compile_cache as c\n"
         f"here = pathlib.Path({str(tmp_path)!r}); sys.path.insert(0, str(here))\n"
         "c.config.CACHE_DIR = str(here / 'cache' / (c.cache_name([here]) if sys.argv[1] == 'ours' else 'one'))\n"
         "from caller import outer\n"

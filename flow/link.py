@@ -17,6 +17,9 @@ from flow.stage import Node
 TRUTH_TOPICS = "/truth"
 """Topics that start so hold what an evaluation compares with; no source may bring them in (`flow.graph` refuses)."""
 
+RUN_TOPICS = "/run/"
+"""Topics that start so hold what a live run recorded of itself (`flow.consumption`); they are no node's either."""
+
 
 @dataclass(frozen=True, slots=True)
 class Record:
@@ -45,6 +48,11 @@ class Link(Node):
         """Totals since the start for people: lost, refused, foreign; the live runner shows them."""
         return {}
 
+    @property
+    def trouble(self) -> str | None:
+        """What does not work now, in words, where the link cannot raise it; the live runner says it when it changes."""
+        return None
+
 
 class Source(Link):
     """A link that brings records in.
@@ -60,7 +68,10 @@ class Source(Link):
         raise NotImplementedError
 
     def listen(self) -> AbstractContextManager[Iterator[Record]]:
-        """Open the hardware: `with link.listen() as records`. Errors are LinkError."""
+        """Open the hardware: `with link.listen() as records`. Errors are LinkError.
+
+        The context may be left by another thread: the records then end, at the latest after 0.5 s.
+        """
         raise NotImplementedError(f"{type(self).__name__} cannot run live")
 
 
@@ -72,13 +83,15 @@ class Run:
     name: str
     mermaid: str  # the graph as text
     settings_yaml: str  # the configuration as run
+    live: bool = False  # else it replays a recording
 
 
 class Tap(Link):
     """A link that sees every message on every edge, in the order of the run, without the stages knowing.
 
     It is declared in YAML beside the other links, without inputs. It may not change a message, and what it
-    raises stops the run: a tap that can fail for outside reasons (disk, viewer) handles that itself and counts it.
+    raises stops a replay: a tap that can fail for outside reasons (disk, viewer) handles that itself and counts it.
+    In a live run `see` is called from one thread of the tap's own, behind a queue that drops the oldest.
     """
 
     def open(self, run: Run) -> None:
@@ -86,6 +99,13 @@ class Tap(Link):
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """One message, once, as it leaves `output` ("track.drone_fix"); arrival_ns is the run's clock."""
+
+    def wants(self, message: type[Message]) -> bool:
+        """Whether a live run shall hand over messages of this type; asked once for each output."""
+        return True
+
+    def record(self, record: Record) -> None:
+        """One record of a live run as it came in, or as it was sent. Called from many threads; it may not wait."""
 
     def close(self) -> None:
         """Called once after the last message, also when the run fails."""

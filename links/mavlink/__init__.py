@@ -1,4 +1,4 @@
-"""MAVLink: what the drone's autopilot says. Sending poses to it is not built yet."""
+"""MAVLink: what the drone's autopilot says, and the poses it is told."""
 
 from links.mavlink.autopilot import Autopilot
 

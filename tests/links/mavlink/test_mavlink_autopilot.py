@@ -18,7 +18,14 @@ from flow.message import check_arrays
 from flow.stage import output_ports
 from links.mavlink import Autopilot
 from links.recording import RecordingReader, import_file
-from stages.messages import AutopilotStatus, DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry
+from stages.messages import (
+    AutopilotEstimator,
+    AutopilotStatus,
+    DroneAttitude,
+    DroneImu,
+    DroneLocalPosition,
+    DroneOdometry,
+)
 
 mavlink: Any = ardupilotmega
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "mavlink"
@@ -56,13 +63,14 @@ def odometry(
     )
 
 
-def test_the_outputs_are_the_five_messages():
+def test_the_outputs_are_the_six_messages():
     assert set(output_ports(Autopilot)) == {
         "drone_attitude",
         "drone_local_position",
         "drone_odometry",
         "drone_imu",
         "autopilot_status",
+        "autopilot_estimator",
     }
 
 
@@ -142,6 +150,35 @@ def test_a_heartbeat_tells_armed_mode_and_failsafe(mode: int, state: int, armed:
     assert isinstance(status, AutopilotStatus)
     assert (status.armed, status.custom_mode, status.failsafe) == (armed, 5, failsafe)
     assert (status.clock_offset_ns, status.clock_uncertainty_ns) == (None, None)
+
+
+def test_both_estimator_reports_tell_what_is_fused():
+    flags = 1 | 2 | 4 | 8 | 32
+    ardupilot = mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.2, 0.3, 0.4, 0.0, 0.0)
+    px4 = mavlink.MAVLink_estimator_status_message(7_000_000, flags, 0.1, 0.2, 0.3, 0.4, 0, 0, 1.0, 1.0)
+    for message in (ardupilot, px4):
+        told = Autopilot().decode(record(Sender().frame(message)))
+        assert isinstance(told, AutopilotEstimator)
+        assert (told.stamp_ns, told.flags) == (HOST0, flags)
+        assert (told.attitude_good, told.velocity_good, told.position_good, told.height_good) == (True,) * 4
+        assert not told.constant_position
+        ratios = [told.velocity_ratio, told.horizontal_ratio, told.height_ratio, told.compass_ratio]
+        np.testing.assert_allclose(ratios, [0.1, 0.2, 0.3, 0.4], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("bit", "lost"),
+    [(1, "attitude_good"), (2, "velocity_good"), (4, "velocity_good"), (8, "position_good"), (32, "height_good")],
+)
+def test_each_flag_of_the_estimator_means_its_own(bit: int, lost: str):
+    frame = mavlink.MAVLink_ekf_status_report_message((1 | 2 | 4 | 8 | 32 | 128) & ~bit, math.nan, -1.0, 0, 0, 0, 0)
+    told = Autopilot().decode(record(Sender().frame(frame)))
+    assert isinstance(told, AutopilotEstimator)
+    good = {n: getattr(told, n) for n in ("attitude_good", "velocity_good", "position_good", "height_good")}
+    assert good == {name: name != lost for name in good}
+    assert told.constant_position
+    assert math.isnan(told.velocity_ratio)
+    assert math.isnan(told.horizontal_ratio)
 
 
 def test_a_stamp_in_milliseconds_is_taken_in_their_middle_and_never_after_arrival():

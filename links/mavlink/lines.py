@@ -1,0 +1,268 @@
+"""TCP and serial lines to the autopilot: byte streams that are opened again when they are gone.
+
+Sending never waits. What a slow line has not taken yet is not added to: the frame is dropped and the next pose is
+newer. A line that is gone is tried again, more slowly each time up to 2 s.
+
+Source: ours; tty_ioctl(4) TIOCOUTQ, tcp(7) SIOCOUTQ for what a line has not taken yet; pyserial sets up the device.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import select
+import socket
+import struct
+import termios
+import threading
+import time
+from ipaddress import IPv4Address
+from typing import Any, Protocol
+
+from flow.link import LinkError
+from links.mavlink.connection import Connection, Endpoint, Source_, Udp
+
+CHUNK_BYTES = 4096
+TCP_BACKLOG_BYTES, SERIAL_BACKLOG_BYTES = 4096, 512  # not sent yet: at 921600 baud 512 bytes are 6 ms
+CONNECT_S, RECONNECT_S = 2.0, 0.4  # TCP: the first time, and while a listener may be waiting to be closed
+CLOSE_S = 0.1
+RETRY_S = (0.1, 2.0)  # first and last wait before the next try
+
+
+def open_connection(endpoint: Endpoint, sender: IPv4Address | None = None) -> Connection:
+    """Open a connection of any kind. LinkError says what to check."""
+    if endpoint.kind in ("udpin", "udpout"):
+        return Udp(endpoint, sender)
+    line = TcpLine(endpoint) if endpoint.kind == "tcp" else SerialLine(endpoint)
+    line.open()
+    return StreamConnection(line)
+
+
+class Line(Protocol):
+    """A byte stream that can be opened again. OSError: it is gone."""
+
+    backlog_bytes: int
+    name: str
+
+    def open(self) -> None:
+        """Open it. LinkError."""
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has arrived; empty: nothing within timeout_s."""
+        ...
+
+    def write(self, data: bytes) -> int:
+        """Bytes taken now."""
+        ...
+
+    def waiting_bytes(self) -> int:
+        """Bytes taken and not sent yet."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it."""
+
+
+class StreamConnection:
+    """A line that is opened again when it is gone, and takes no frame before the one before it is through."""
+
+    datagrams = False
+
+    def __init__(self, line: Line) -> None:
+        self.reconnects = self.foreign = 0
+        self._line = line
+        self.trouble: str | None = None
+        self._up = True
+        self._closed = False
+        self._reading = threading.Lock()  # held while the line is read, opened or closed
+        self._writing = threading.Lock()  # held while it is written or closed; a write never waits
+        self._rest = b""  # of a frame that the line took in part
+        self._retry_at_s, self._wait_s = 0.0, RETRY_S[0]
+
+    def receive(self, timeout_s: float) -> tuple[bytes, Source_] | None:
+        """See Connection."""
+        with self._reading:
+            data = self._read(timeout_s)
+            if self._closed:
+                self._let_go()
+        return (data, (self._line.name, 0)) if data else None
+
+    def answer_to(self, source: Source_) -> None:
+        """See Connection."""
+
+    def send(self, frame: bytes) -> bool:
+        """See Connection."""
+        with self._writing:
+            if not self._up:
+                return False
+            try:
+                if self._rest:
+                    self._rest = self._rest[self._line.write(self._rest) :]
+                if self._rest or self._line.waiting_bytes() > self._line.backlog_bytes:
+                    return False
+                self._rest = frame[self._line.write(frame) :]
+            except (OSError, ValueError):
+                self._lost()
+                return False
+            return True
+
+    def close(self) -> None:
+        """See Connection. Where a listener is at the line just now and stays there, it closes it when it leaves."""
+        self._closed, self._up = True, False
+        if self._reading.acquire(timeout=CLOSE_S):
+            self._let_go()
+            self._reading.release()
+
+    def _let_go(self) -> None:
+        with self._writing:
+            self._line.close()
+
+    def _read(self, timeout_s: float) -> bytes:
+        """What has arrived; nothing while the line is down."""
+        if self._closed or (not self._up and not self._again(timeout_s)):
+            return b""
+        try:
+            data = self._line.read(timeout_s)
+        except (OSError, ValueError):
+            self._lost()
+            return b""
+        if data:
+            self._wait_s = RETRY_S[0]
+        return data
+
+    def _lost(self) -> None:
+        """Only the listener closes and opens: nobody reads from a number that has become another file's."""
+        self._up, self._rest = False, b""
+        self.trouble = f"{self._line.name} is gone: is it plugged in and powered? Trying again"
+        self._retry_at_s = time.monotonic() + self._wait_s
+
+    def _again(self, timeout_s: float) -> bool:
+        self._let_go()
+        rest_s = self._retry_at_s - time.monotonic()
+        if rest_s > 0:
+            time.sleep(min(timeout_s, rest_s))
+            return False
+        try:
+            self._line.open()
+        except LinkError:
+            self._wait_s = min(2 * self._wait_s, RETRY_S[1])
+            self._retry_at_s = time.monotonic() + self._wait_s
+            return False
+        self._up, self.trouble = not self._closed, None
+        self.reconnects += 1
+        return True
+
+
+class TcpLine:
+    """A TCP client."""
+
+    backlog_bytes = TCP_BACKLOG_BYTES
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.name = f"{endpoint.host}:{endpoint.port}"
+        self._address = (endpoint.host, endpoint.port)
+        self._socket: socket.socket | None = None
+        self._connect_s = CONNECT_S
+
+    def open(self) -> None:
+        """Connect. LinkError."""
+        try:
+            self._socket = socket.create_connection(self._address, self._connect_s)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise LinkError(
+                f"cannot connect to TCP {self.name}: {reason}. Does the autopilot's bridge or simulator run there? "
+                "Check `connection`."
+            ) from None
+        self._connect_s = RECONNECT_S
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setblocking(False)
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has arrived. OSError: it is gone."""
+        line = self._there()
+        if not select.select([line], [], [], timeout_s)[0]:
+            return b""
+        data = line.recv(CHUNK_BYTES)
+        if not data:
+            raise ConnectionResetError("closed by the other side")
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Bytes taken."""
+        try:
+            return self._there().send(data)
+        except BlockingIOError:
+            return 0
+
+    def waiting_bytes(self) -> int:
+        """Bytes that the other side has not acknowledged."""
+        return struct.unpack("i", fcntl.ioctl(self._there(), termios.TIOCOUTQ, b"\0\0\0\0"))[0]
+
+    def close(self) -> None:
+        """Disconnect."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _there(self) -> socket.socket:
+        if self._socket is None:
+            raise ConnectionResetError("not connected")
+        return self._socket
+
+
+class SerialLine:
+    """A serial device, 8N1, raw."""
+
+    backlog_bytes = SERIAL_BACKLOG_BYTES
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.name = endpoint.host
+        self._baud = endpoint.port
+        self._port: Any = None  # serial.Serial
+
+    def open(self) -> None:
+        """Open the device for us alone. LinkError."""
+        import serial  # here: a UDP link needs none of it
+
+        try:
+            self._port = serial.Serial(self.name, self._baud, timeout=0.0, write_timeout=0.0, exclusive=True)
+        except (OSError, ValueError) as error:  # serial.SerialException is an OSError
+            raise LinkError(
+                f"cannot open {self.name} at {self._baud} baud: {error}. Is it plugged in, is no other program using "
+                "it, and may you use it (group dialout)? Check `connection`."
+            ) from None
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has arrived. OSError: it is gone."""
+        port = self._there()
+        if not select.select([port], [], [], timeout_s)[0]:
+            return b""
+        data = os.read(port.fileno(), CHUNK_BYTES)
+        if not data:  # readable, and nothing to read: unplugged
+            raise ConnectionResetError("unplugged")
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Bytes taken."""
+        try:
+            return os.write(self._there().fileno(), data)  # pyserial's own write spins while the line is full
+        except BlockingIOError:
+            return 0
+
+    def waiting_bytes(self) -> int:
+        """Bytes that the line has not sent."""
+        return self._there().out_waiting
+
+    def close(self) -> None:
+        """Let go of the device."""
+        if self._port is not None:
+            with contextlib.suppress(OSError):
+                self._port.close()
+            self._port = None
+
+    def _there(self) -> Any:
+        if self._port is None:
+            raise ConnectionResetError("not open")
+        return self._port

@@ -1,0 +1,159 @@
+"""What an autopilot's messages say, in our axes and units: one function for each message.
+
+RAW_IMU is read in ArduPilot's units (mg, mrad/s), HIGHRES_IMU (PX4) is SI; an autopilot sends one of them. Numbers
+that are not finite are refused with ValueError, never passed on.
+
+Source: https://mavlink.io/en/messages/common.html; ArduPilot GCS_MAVLINK::send_raw_imu for RAW_IMU's units,
+NavEKF3_core::send_status_report and getVariances for EKF_STATUS_REPORT.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from links.mavlink.frames import (
+    R_local_drone_from_rpy,
+    R_local_drone_from_wxyz,
+    pose_covariance_from_upper,
+    turned_over,
+    velocity_covariance_from_upper,
+)
+from stages.messages import (
+    AutopilotEstimator,
+    AutopilotStatus,
+    DroneAttitude,
+    DroneImu,
+    DroneLocalPosition,
+    DroneOdometry,
+)
+
+AutopilotMessage = DroneAttitude | DroneLocalPosition | DroneOdometry | DroneImu | AutopilotStatus | AutopilotEstimator
+
+STANDARD_GRAVITY_MPS2 = 9.80665
+LOCAL_FRAMES = (1, 20)  # MAV_FRAME_LOCAL_NED, MAV_FRAME_LOCAL_FRD
+BODY_FRD = 12
+
+# EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS agree in these
+ATTITUDE, VELOCITY_HORIZONTAL, VELOCITY_VERTICAL, HORIZONTAL_RELATIVE = 1, 2, 4, 8
+HEIGHT, CONSTANT_POSITION = 32, 128
+
+
+def _vector(frame: Any, *names: str, unit: float = 1.0) -> NDArray[np.float64]:
+    """Fields as a vector in our axes. ValueError when one is NaN or infinite."""
+    return turned_over(unit * np.array(_numbers(frame, *names)))
+
+
+def _numbers(frame: Any, *names: str) -> list[float]:
+    values = [float(getattr(frame, name)) for name in names]
+    if not all(map(math.isfinite, values)):
+        raise ValueError("not finite")
+    return values
+
+
+def read_attitude(frame: Any, stamp_ns: int) -> DroneAttitude:
+    """ATTITUDE."""
+    return DroneAttitude(
+        stamp_ns=stamp_ns,
+        R_local_drone=R_local_drone_from_rpy(*_numbers(frame, "roll", "pitch", "yaw")),
+        angular_velocity_drone_radps=_vector(frame, "rollspeed", "pitchspeed", "yawspeed"),
+    )
+
+
+def read_local_position(frame: Any, stamp_ns: int) -> DroneLocalPosition:
+    """LOCAL_POSITION_NED."""
+    return DroneLocalPosition(
+        stamp_ns=stamp_ns,
+        xyz_local_m=_vector(frame, "x", "y", "z"),
+        velocity_local_mps=_vector(frame, "vx", "vy", "vz"),
+    )
+
+
+def read_odometry(frame: Any, stamp_ns: int) -> DroneOdometry:
+    """ODOMETRY of a local frame with the velocity in the body's; others are refused, not guessed."""
+    if frame.frame_id not in LOCAL_FRAMES or frame.child_frame_id != BODY_FRD:
+        raise ValueError("odometry in other frames")
+    length = math.hypot(*frame.q)
+    if not abs(length - 1.0) < 0.01:  # NaN compares false
+        raise ValueError("no rotation")
+    R_local_drone = R_local_drone_from_wxyz(frame.q)
+    return DroneOdometry(
+        stamp_ns=stamp_ns,
+        xyz_local_m=_vector(frame, "x", "y", "z"),
+        R_local_drone=R_local_drone,
+        velocity_drone_mps=_vector(frame, "vx", "vy", "vz"),
+        angular_velocity_drone_radps=_vector(frame, "rollspeed", "pitchspeed", "yawspeed"),
+        pose_covariance=pose_covariance_from_upper(frame.pose_covariance, R_local_drone),
+        velocity_covariance=velocity_covariance_from_upper(frame.velocity_covariance),
+        reset_counter=frame.reset_counter,
+        quality_percent=None if frame.quality == 0 else max(frame.quality, 0),
+    )
+
+
+def read_raw_imu(frame: Any, stamp_ns: int) -> DroneImu:
+    """RAW_IMU as ArduPilot fills it: mg and mrad/s."""
+    return DroneImu(
+        stamp_ns=stamp_ns,
+        acceleration_drone_mps2=_vector(frame, "xacc", "yacc", "zacc", unit=1e-3 * STANDARD_GRAVITY_MPS2),
+        angular_velocity_drone_radps=_vector(frame, "xgyro", "ygyro", "zgyro", unit=1e-3),
+    )
+
+
+def read_highres_imu(frame: Any, stamp_ns: int) -> DroneImu:
+    """HIGHRES_IMU: m/s^2 and rad/s."""
+    return DroneImu(
+        stamp_ns=stamp_ns,
+        acceleration_drone_mps2=_vector(frame, "xacc", "yacc", "zacc"),
+        angular_velocity_drone_radps=_vector(frame, "xgyro", "ygyro", "zgyro"),
+    )
+
+
+def read_ekf_status(frame: Any, stamp_ns: int) -> AutopilotEstimator:
+    """EKF_STATUS_REPORT (ArduPilot). What it calls variances are innovation test ratios, the square root taken."""
+    names = ("velocity_variance", "pos_horiz_variance", "pos_vert_variance", "compass_variance")
+    return _estimator(frame.flags, stamp_ns, [getattr(frame, name) for name in names])
+
+
+def read_estimator_status(frame: Any, stamp_ns: int) -> AutopilotEstimator:
+    """ESTIMATOR_STATUS (PX4)."""
+    ratios = [frame.vel_ratio, frame.pos_horiz_ratio, frame.pos_vert_ratio, frame.mag_ratio]
+    return _estimator(frame.flags, stamp_ns, ratios)
+
+
+def _estimator(flags: int, stamp_ns: int, ratios: list[float]) -> AutopilotEstimator:
+    """A ratio that is no number or negative is told as NaN, not said."""
+    velocity, horizontal, height, compass = (float(r) if math.isfinite(r) and r >= 0 else math.nan for r in ratios)
+    moving = VELOCITY_HORIZONTAL | VELOCITY_VERTICAL
+    return AutopilotEstimator(
+        stamp_ns=stamp_ns,
+        attitude_good=bool(flags & ATTITUDE),
+        velocity_good=flags & moving == moving,
+        position_good=bool(flags & HORIZONTAL_RELATIVE),
+        height_good=bool(flags & HEIGHT),
+        constant_position=bool(flags & CONSTANT_POSITION),
+        velocity_ratio=velocity,
+        horizontal_ratio=horizontal,
+        height_ratio=height,
+        compass_ratio=compass,
+        flags=flags,
+    )
+
+
+Reader = Callable[[Any, int], AutopilotMessage]
+
+READERS: dict[str, Reader] = {
+    "ATTITUDE": read_attitude,
+    "LOCAL_POSITION_NED": read_local_position,
+    "ODOMETRY": read_odometry,
+    "RAW_IMU": read_raw_imu,
+    "HIGHRES_IMU": read_highres_imu,
+    "ESTIMATOR_STATUS": read_estimator_status,
+}
+"""Messages that carry the autopilot's time."""
+
+TIMELESS_READERS: dict[str, Reader] = {"EKF_STATUS_REPORT": read_ekf_status}
+"""Messages without a time: they are true when they arrive."""

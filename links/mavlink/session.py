@@ -1,0 +1,197 @@
+"""A live link to one autopilot: hears it, answers it, and sends it what is due, from whichever thread.
+
+    received -> frames -> signature, echo -> records for the graph; TIMESYNC requests are answered at once
+    poses    -> gate and speaker -> frames, at once or not at all
+    a thread of its own: HEARTBEAT and TIMESYNC once a second, texts, the origin; also when no pose comes
+
+time_usec and TIMESYNC are the host's timeline, microseconds and nanoseconds since 1970. ArduPilot finds the offset to
+its own clock by the promptest message (JitterCorrection), PX4 by the answers to its own TIMESYNC requests.
+
+Source: https://mavlink.io/en/services/timesync.html, /heartbeat.html; ArduPilot libraries/AP_RTC/JitterCorrection.cpp;
+PX4 src/modules/mavlink/mavlink_timesync.cpp.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+from flow.link import LinkError, Record
+from links.mavlink.connection import Connection
+from links.mavlink.origin import OriginGiver
+from links.mavlink.signing import Signer
+from links.mavlink.speaker import PoseSpeaker
+from links.mavlink.wire import FrameSplitter, dialect, header, packed
+from stages.messages import RelativePose
+
+WAKE_S = 0.05  # how often the housekeeper looks, and a waiting listener whether it was closed
+SILENT_S = 3.0  # three heartbeats
+SECOND_NS = 1_000_000_000
+ONBOARD_CONTROLLER, NO_AUTOPILOT = 18, 8  # MAV_TYPE, MAV_AUTOPILOT_INVALID
+STANDBY, ACTIVE = 3, 4  # MAV_STATE
+SENT_RECORDS = 4096  # kept for the recording until it asks
+
+
+class Session:
+    """One connection's life. `records` from one thread, `pose` and `sent` from others."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        target: tuple[int, int],
+        own: tuple[int, int],
+        speaker: PoseSpeaker,
+        origin: OriginGiver,
+        signer: Signer | None,
+        now_ns: Callable[[], int],
+        topics: tuple[str, str],
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self.connection, self.speaker, self.origin = connection, speaker, origin
+        self._target, self._own = target, own
+        self._signer, self._now_ns = signer, now_ns
+        self._received_topic, self._sent_topic = topics
+        self._splitter = FrameSplitter()
+        self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
+        self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
+        self._lock = threading.Lock()  # over what numbers, signs and sends
+        self._closed = threading.Event()
+        self._failure: LinkError | None = None
+        self._second_ns = 0
+        self._target_ns = now_ns()  # when the autopilot was heard last, or the session began
+        self._keeper = threading.Thread(target=self._keep, name="mavlink housekeeping", daemon=True)
+        self._keeper.start()
+
+    def records(self) -> Iterator[Record]:
+        """Frames as they arrive, until closed. LinkError when the link has failed for good."""
+        while not self._closed.is_set():
+            if self._failure is not None:
+                raise self._failure
+            try:
+                received = self.connection.receive(WAKE_S)
+            except LinkError:
+                if self._closed.is_set():
+                    return
+                raise
+            if received is None:
+                continue
+            arrival_ns = self._now_ns()
+            data, source = received
+            frames = self._splitter.datagram(data) if self.connection.datagrams else self._splitter.stream(data)
+            for frame, message in frames:
+                if self._hear(frame, message, source):
+                    yield Record(self._received_topic, arrival_ns, arrival_ns, frame)
+
+    def pose(self, pose: RelativePose) -> None:
+        """Send a pose, or refuse it; never waits for the line."""
+        with self._lock:
+            now_ns = self._now_ns()
+            messages = self.speaker.speak(pose, now_ns)
+            if any([self._send(message) for message in messages]):  # all are tried
+                self.speaker.went_out(pose, now_ns)
+            self._send_all(self.speaker.texts(now_ns))
+
+    def sent(self) -> list[Record]:
+        """What went out since the call before."""
+        with self._lock:
+            records = list(self._sent)
+            self._sent.clear()
+        return records
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Totals since the start: received, sent, not sent, held back by reason."""
+        with self._lock:
+            held = {f"pose held back: {why.value}": count for why, count in self.speaker.refused.items()}
+            counts = dict(self.counts)
+        return {
+            **counts,
+            **held,
+            "stray bytes": self._splitter.stray_bytes,
+            "from other senders": self.connection.foreign,
+            "reconnects": self.connection.reconnects,
+        }
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing goes out any more."""
+        return self._closed.is_set()
+
+    @property
+    def trouble(self) -> str | None:
+        """What does not work now; None: all does."""
+        silent_s = (self._now_ns() - self._target_ns) / SECOND_NS
+        if self.connection.trouble is not None or self.closed or silent_s < SILENT_S:
+            return None if self.closed else self.connection.trouble
+        return (
+            f"no word from the autopilot (system {self._target[0]}, component {self._target[1]}) for "
+            f"{SILENT_S:g} s: is it powered, does it speak here, and are system_id and component_id its own?"
+        )
+
+    def close(self) -> None:
+        """Stop and let go of the line."""
+        self._closed.set()
+        self._keeper.join()
+        with self._lock:
+            self.connection.close()
+            if self._signer is not None:
+                self._signer.close()
+
+    def _hear(self, frame: bytes, message: Any, source: tuple[str, int]) -> bool:
+        """Whether a frame is one for the graph; acts on those that ask something."""
+        sender, _ = header(frame)
+        if sender == self._own:
+            self.counts["our own, come back"] += 1
+            return False
+        with self._lock:
+            if self._signer is not None and not self._signer.verify(frame):
+                self.counts["not signed with our key"] += 1
+                return False
+            self.counts["received"] += 1
+            if sender == self._target:
+                self.connection.answer_to(source)
+                self._target_ns = self._now_ns()
+                if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                    self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
+                self.origin.hear(message)
+        return True
+
+    def _keep(self) -> None:
+        while not self._closed.wait(WAKE_S):
+            try:
+                with self._lock:
+                    self._tick(self._now_ns())
+            except LinkError as error:  # the signature's time cannot be written
+                self._failure = error
+                return
+
+    def _tick(self, now_ns: int) -> None:
+        if now_ns - self._second_ns >= SECOND_NS:
+            self._second_ns = now_ns
+            state = ACTIVE if self.speaker.sending else STANDBY
+            self._send(dialect().MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, state, 3))
+            self._send(dialect().MAVLink_timesync_message(0, self._now_ns()))
+            if self._signer is not None:
+                self._signer.keep()
+        self._send_all(self.origin.due(now_ns))
+        self._send_all(self.speaker.texts(now_ns))
+
+    def _send_all(self, messages: Iterable[Any]) -> None:
+        for message in messages:
+            self._send(message)
+
+    def _send(self, message: Any) -> bool:
+        """Pack, sign and send one message. The lock is held."""
+        now_ns = self._now_ns()
+        if self._signer is not None:
+            self._signer.sign_for(self._mav, now_ns)
+        frame = packed(message, self._mav)
+        kind = message.get_type()
+        if not self.connection.send(frame):
+            self.counts[f"not sent: {kind}"] += 1
+            return False
+        self.counts[f"sent: {kind}"] += 1
+        self._sent.append(Record(self._sent_topic, now_ns, now_ns, frame))
+        return True

@@ -1,0 +1,134 @@
+"""MAVLink frames as bytes: taken out of datagrams and byte streams, read one by one, packed.
+
+A datagram is taken for itself, so what is damaged in it cannot take the next with it; on a byte stream (TCP, serial)
+the reader falls into step again at the next frame whose checksum is right. Bytes that are no frame are counted.
+
+Source: https://mavlink.io/en/guide/serialization.html (frames, checksum); pymavlink's dialect for the messages.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+V1, V2 = 0xFE, 0xFD
+SIGNED = 0x01  # the one incompatibility flag that is defined
+SIGNATURE_BYTES = 13
+V1_EXTRA_BYTES, V2_EXTRA_BYTES = 8, 12  # header and checksum
+MIN_FRAME_BYTES, MAX_FRAME_BYTES = 8, 280
+SEQUENCE = 256
+
+
+@functools.cache
+def dialect() -> Any:
+    """pymavlink's ArduPilot dialect: `common` and what ArduPilot adds."""
+    from pymavlink.dialects.v20 import ardupilotmega  # here: it takes 0.2 s, and most commands need none of it
+
+    return ardupilotmega
+
+
+@functools.cache
+def _parser() -> tuple[Any, type[Exception]]:
+    """pymavlink's parser and the error it raises. Used frame by frame, it remembers nothing that matters."""
+    return dialect().MAVLink(None), dialect().MAVError
+
+
+def header(data: bytes) -> tuple[tuple[int, int], int]:
+    """(system id, component id) and sequence number of a frame."""
+    at = 3 if data[0] == V1 else 5
+    return (data[at], data[at + 1]), data[at - 1]
+
+
+def is_signed(data: bytes) -> bool:
+    """Whether a frame says that it ends with a signature."""
+    return data[0] == V2 and bool(data[2] & SIGNED)
+
+
+def parse_frame(data: bytes) -> Any:
+    """pymavlink's message of exactly one frame, "UNKNOWN_..." beyond its dialect. ValueError: damaged, or no frame."""
+    if not MIN_FRAME_BYTES <= len(data) <= MAX_FRAME_BYTES or data[0] not in (V1, V2):
+        raise ValueError("no MAVLink frame")
+    if data[0] == V2 and data[2] & ~SIGNED:
+        raise ValueError("unknown incompatibility flags")
+    parser, parser_error = _parser()
+    try:
+        return parser.decode(bytearray(data))
+    except parser_error as error:
+        raise ValueError(str(error)) from None
+
+
+def packed(message: Any, sender: Any) -> bytes:
+    """The frame of a message, numbered after the last one of `sender` (pymavlink's MAVLink)."""
+    frame = bytes(message.pack(sender))
+    sender.seq = (sender.seq + 1) % SEQUENCE
+    return frame
+
+
+def frame_bytes(data: bytes | bytearray, at: int = 0) -> int | None:
+    """Length of the frame that begins at `at`, by its header; None: too little is here to tell. 0: none begins."""
+    if at >= len(data):
+        return None
+    if data[at] == V1:
+        return None if at + 2 > len(data) else data[at + 1] + V1_EXTRA_BYTES
+    if data[at] != V2:
+        return 0
+    if at + 3 > len(data):
+        return None
+    if data[at + 2] & ~SIGNED:
+        return 0
+    return data[at + 1] + V2_EXTRA_BYTES + (SIGNATURE_BYTES if data[at + 2] & SIGNED else 0)
+
+
+def known(message: Any) -> bool:
+    """Whether our dialect has the message, and so its checksum was looked at."""
+    return not message.get_type().startswith("UNKNOWN")
+
+
+def _begins(data: bytes | bytearray, at: int) -> bool:
+    """Whether a frame may begin at `at`, or the data end there: what stands for a frame without checksum."""
+    return at == len(data) or data[at] in (V1, V2)
+
+
+class FrameSplitter:
+    """Takes whole frames out of what arrives. `stray_bytes` counts what is no frame."""
+
+    def __init__(self) -> None:
+        self.stray_bytes = 0
+        self._rest = bytearray()
+
+    def datagram(self, data: bytes) -> list[tuple[bytes, Any]]:
+        """(bytes, message) of each frame in one datagram."""
+        return self._frames(data, whole=True)
+
+    def stream(self, data: bytes) -> list[tuple[bytes, Any]]:
+        """(bytes, message) of each frame that these bytes complete; the beginning of the next one is kept."""
+        self._rest += data
+        return self._frames(self._rest, whole=False)
+
+    def _frames(self, data: bytes | bytearray, whole: bool) -> list[tuple[bytes, Any]]:
+        found: list[tuple[bytes, Any]] = []
+        at = 0
+        while at < len(data):
+            length = frame_bytes(data, at)
+            if length is None or (length and at + length > len(data)):
+                if not whole:
+                    break  # the rest of it is still to come
+                length = 0
+            frame = bytes(data[at : at + length])
+            message = self._message(frame)
+            if message is None or not (known(message) or _begins(data, at + length)):
+                self.stray_bytes += 1
+                at += 1
+            else:
+                found.append((frame, message))
+                at += len(frame)
+        if not whole:
+            del self._rest[:at]
+        return found
+
+    @staticmethod
+    def _message(frame: bytes) -> Any:
+        try:
+            return parse_frame(frame)
+        except ValueError:
+            return None

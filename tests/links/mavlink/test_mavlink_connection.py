@@ -1,0 +1,271 @@
+"""Lines to the autopilot: who is heard, what comes back after a loss, and that sending never waits."""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from ipaddress import IPv4Address
+
+import pytest
+
+from flow.link import LinkError
+from links.mavlink.connection import Connection, Endpoint, Udp, parse_connection
+from links.mavlink.lines import StreamConnection, open_connection
+
+FRAME = bytes(244)
+
+
+@pytest.mark.parametrize(
+    ("text", "endpoint"),
+    [
+        ("udpin:127.0.0.1:14550", Endpoint("udpin", "127.0.0.1", 14550)),
+        ("udpout:drone.local:14550", Endpoint("udpout", "drone.local", 14550)),
+        ("tcp:10.0.0.1:5760", Endpoint("tcp", "10.0.0.1", 5760)),
+        ("serial:/dev/ttyUSB0:57600", Endpoint("serial", "/dev/ttyUSB0", 57600)),
+        ("serial:/dev/ttyACM0", Endpoint("serial", "/dev/ttyACM0", 921600)),
+    ],
+)
+def test_connections_are_written_as_mavutil_writes_them(text: str, endpoint: Endpoint):
+    assert parse_connection(text) == endpoint
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "udp:1:2", "udpin:14550", "udpin:host:14550", "udpout:1.2.3.4:0", "tcp:1.2.3.4:70000", "serial:", "tcp::1"],
+)
+def test_a_connection_that_cannot_be_is_refused(text: str):
+    with pytest.raises(ValueError):
+        parse_connection(text)
+
+
+def udp_pair(host: str = "127.0.0.1") -> tuple[Udp, socket.socket]:
+    link = open_connection(parse_connection("udpin:127.0.0.1:0"))
+    assert isinstance(link, Udp)
+    other = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    other.bind((host, 0))
+    other.settimeout(5.0)
+    return link, other
+
+
+def test_udp_answers_the_autopilot_and_nobody_before_it_spoke():
+    link, drone = udp_pair()
+    assert not link.send(b"pose")
+    drone.sendto(b"hello", ("127.0.0.1", link.port))
+    received = link.receive(5.0)
+    assert received == (b"hello", drone.getsockname())
+    link.answer_to(received[1])
+    assert link.send(b"pose")
+    assert drone.recv(100) == b"pose"
+    link.close()
+    drone.close()
+
+
+def test_udp_hears_its_sender_alone():
+    link = Udp(Endpoint("udpin", "127.0.0.1", 0), IPv4Address("127.0.0.9"))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(b"land now", ("127.0.0.1", link.port))
+        assert link.receive(5.0) is None
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as drone:
+        drone.bind(("127.0.0.9", 0))
+        drone.sendto(b"hello", ("127.0.0.1", link.port))
+        assert link.receive(5.0) == (b"hello", drone.getsockname())
+    assert link.foreign == 1
+    link.close()
+
+
+def test_udp_out_hears_nobody_but_whom_it_sends_to_and_bears_a_closed_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as drone:
+        drone.bind(("127.0.0.1", 0))
+        drone.settimeout(5.0)
+        link = open_connection(Endpoint("udpout", "127.0.0.1", drone.getsockname()[1]))
+        assert link.send(b"pose")
+        data, source = drone.recvfrom(100)
+        assert data == b"pose"
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.sendto(b"land now", source)
+            assert link.receive(5.0) is None
+            link.answer_to(stranger.getsockname())
+        drone.sendto(b"hello", source)
+        assert link.receive(5.0) == (b"hello", drone.getsockname())
+    assert link.foreign == 1
+    for _ in range(5):
+        link.send(b"pose")  # refused by the kernel now and then: nobody is there
+        assert link.receive(0.01) is None
+    link.close()
+
+
+def test_a_port_in_use_says_what_to_check():
+    link, other = udp_pair()
+    with pytest.raises(LinkError, match=f"UDP 127.0.0.1:{link.port}.*another program"):
+        open_connection(Endpoint("udpin", "127.0.0.1", link.port))
+    link.close()
+    other.close()
+
+
+def until(link: Connection, wanted: bytes) -> None:
+    """Receive until the bytes have come."""
+    got = b""
+    for _ in range(500):
+        received = link.receive(0.02)
+        got += received[0] if received else b""
+        if wanted in got:
+            return
+    pytest.fail(f"only {got!r} came")
+
+
+def test_tcp_is_opened_again_after_the_other_side_closed_it():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = open_connection(Endpoint("tcp", "127.0.0.1", server.getsockname()[1]))
+        first, _ = server.accept()
+        first.sendall(b"one")
+        until(link, b"one")
+        assert link.send(b"pose")
+        assert first.recv(100) == b"pose"
+        first.close()
+        second: list[socket.socket] = []
+        waiting = threading.Thread(target=lambda: second.append(server.accept()[0]))
+        waiting.start()
+        for _ in range(500):
+            link.receive(0.02)
+            if link.reconnects:
+                break
+        waiting.join(10)
+        second[0].sendall(b"two")
+        until(link, b"two")
+        assert (link.reconnects, link.trouble) == (1, None)
+        assert link.send(b"pose")
+        link.close()
+        second[0].close()
+
+
+def test_while_tcp_is_down_nothing_is_sent_and_it_says_so():
+    server = socket.create_server(("127.0.0.1", 0))
+    link = open_connection(Endpoint("tcp", "127.0.0.1", server.getsockname()[1]))
+    accepted, _ = server.accept()
+    accepted.close()
+    server.close()
+    for _ in range(20):
+        link.receive(0.02)
+    assert not link.send(FRAME)
+    assert link.trouble is not None
+    assert "Trying again" in link.trouble
+    link.close()
+
+
+def test_tcp_to_nobody_says_what_to_check():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(LinkError, match=f"TCP 127.0.0.1:{port}.*Check `connection`"):
+        open_connection(Endpoint("tcp", "127.0.0.1", port))
+
+
+def test_a_tcp_peer_that_does_not_read_costs_frames_and_never_time():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = open_connection(Endpoint("tcp", "127.0.0.1", server.getsockname()[1]))
+        peer, _ = server.accept()
+        taken = sum(link.send(FRAME) for _ in range(50_000))  # 12 MB: would wait for ever if it waited
+        assert taken < 50_000
+        link.close()
+        peer.close()
+
+
+class SlowLine:
+    """A line that takes a few bytes at a time."""
+
+    name, backlog_bytes = "slow", 1000
+
+    def __init__(self) -> None:
+        self.room, self.taken = 0, b""
+
+    def open(self) -> None: ...
+
+    def read(self, timeout_s: float) -> bytes:
+        return b""
+
+    def write(self, data: bytes) -> int:
+        size = min(self.room, len(data))
+        self.taken += data[:size]
+        self.room -= size
+        return size
+
+    def waiting_bytes(self) -> int:
+        return 0
+
+    def close(self) -> None: ...
+
+
+def test_a_frame_begun_is_finished_before_the_next_and_those_between_are_dropped():
+    line = SlowLine()
+    link = StreamConnection(line)
+    line.room = 2
+    assert link.send(b"AAAA")
+    line.room = 1
+    assert not link.send(b"BBBB")
+    line.room = 100
+    assert link.send(b"CCCC")
+    assert line.taken == b"AAAACCCC"
+
+
+def test_serial_on_a_pseudo_terminal_carries_all_bytes_both_ways_and_notices_when_it_goes():
+    ours, theirs = pty.openpty()
+    link = open_connection(Endpoint("serial", os.ttyname(theirs), 57600))
+    everything = bytes(range(256))
+    os.write(ours, everything)
+    until(link, everything)
+    assert link.send(everything)
+    assert os.read(ours, 1000) == everything
+    os.close(theirs)
+    os.close(ours)
+    for _ in range(10):
+        link.receive(0.01)
+    assert link.trouble is not None
+    assert not link.send(b"pose")
+    link.close()
+
+
+def test_a_serial_line_that_is_full_drops_the_newest_and_does_not_wait():
+    ours, theirs = pty.openpty()
+    link = open_connection(Endpoint("serial", os.ttyname(theirs), 57600))
+    taken = sum(link.send(FRAME) for _ in range(1000))
+    assert 0 < taken < 1000
+    link.close()
+    os.close(theirs)
+    os.close(ours)
+
+
+def test_a_device_that_is_not_there_says_what_to_check():
+    with pytest.raises(LinkError, match=r"/dev/no-such-tty at 57600 baud.*dialout"):
+        open_connection(Endpoint("serial", "/dev/no-such-tty", 57600))
+
+
+def read_until(link: Connection, begun: threading.Event, ended: threading.Event) -> None:
+    while not ended.is_set():
+        begun.set()
+        link.receive(0.05)
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcp", "serial"])
+def test_a_line_that_is_closed_while_it_is_read_ends_quietly_or_as_a_link_error(kind: str):
+    server = socket.create_server(("127.0.0.1", 0))
+    ours, theirs = pty.openpty()
+    endpoints = {
+        "udpin": Endpoint("udpin", "127.0.0.1", 0),
+        "tcp": Endpoint("tcp", "127.0.0.1", server.getsockname()[1]),
+        "serial": Endpoint("serial", os.ttyname(theirs), 57600),
+    }
+    with ThreadPoolExecutor(1) as pool:
+        for _ in range(5):
+            link = open_connection(endpoints[kind])
+            begun, ended = threading.Event(), threading.Event()
+            reading = pool.submit(read_until, link, begun, ended)
+            assert begun.wait(5)
+            link.close()
+            assert not link.send(FRAME)
+            ended.set()
+            assert isinstance(reading.exception(5), LinkError | None)
+    server.close()
+    os.close(theirs)
+    os.close(ours)

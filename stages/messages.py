@@ -64,6 +64,17 @@ class ServoState(Message):
 
 
 @message
+class ServoOffset(Message):
+    """How early the servo's stamps are against the LiDAR's, as what was seen tells; stamp_ns is the newest packet's."""
+
+    offset_s: float | None  # the rig's `servo_time_offset_s` as it should be; None: not known yet
+    sigma_s: float | None  # one sigma
+    rig_s: float  # what the rig says
+    windows: int  # that have told so far
+    reason: str  # what the newest window said, or why it said nothing
+
+
+@message
 class ServoGoal(Message):
     """Where the turntable's servo shall go; stamp_ns is that of the servo state it was decided on."""
 

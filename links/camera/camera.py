@@ -1,16 +1,25 @@
-"""A camera as a source: one foxglove.CompressedImage per frame, JPEG.
+"""A camera as a source: one foxglove.CompressedImage per frame, JPEG. Live from a device, a stream or a video file.
+
+A frame is stamped when it came, less `latency_s`: how long after the middle of its middle row's exposure it comes. That
+is the camera's, and measured once (a clock filmed beside its own picture); nothing here can know it.
 
 Source: recording format in recordings/README.md (/camera/*); ITU-T T.81, B.1.1 and B.2.2 (markers, frame header).
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import cv2
 import numpy as np
-from pydantic import PrivateAttr
+from pydantic import Field, PrivateAttr
 
 from flow.link import LinkError, Record, Source
-from links.recording import CompressedImage, decode_compressed_image
+from links.camera.capture import CaptureSettings, Frame
+from links.camera.live import LiveCamera
+from links.recording import CompressedImage, decode_compressed_image, encode_compressed_image
 from stages.messages import Image
 
 MAX_PIXELS = 4096 * 4096  # of a frame; a larger one is refused before it takes memory
@@ -21,12 +30,57 @@ class Camera(Source):
     """Frames of one camera, in grey. A frame that cannot be decoded is counted in `refused` and left out."""
 
     topic: str
+    source: str | None = None  # live: /dev/video0 (better /dev/v4l/by-id/...), rtsp://..., http://..., a video file
+    frame_id: str | None = None  # None: by the topic, /camera/vehicle is camera_vehicle
+    size_px: int | tuple[int, int] | None = None  # what the lens was calibrated for: `$rig.cameras.vehicle.size_px`
+    fps: float = Field(30.0, ge=1, le=240)  # asked of a device
+    latency_s: float = Field(0.0, ge=0, le=1)  # from the exposure of the middle row to the frame's arrival
+    timeout_s: float = Field(3.0, gt=0, le=30)  # of a stream: to open it, and between two frames
+    jpeg_quality: int = Field(90, ge=30, le=100)  # where frames do not come as JPEG
     _refused: int = PrivateAttr(default=0)
+    _counts: Counter[str] = PrivateAttr(default_factory=Counter[str])
 
     @property
     def refused(self) -> int:
         """Records that held no whole JPEG image."""
         return self._refused
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Totals: frames refused, lost and opened again, stale (waiting when asked for), overtaken by a newer one."""
+        return {"refused": self._refused, **self._counts}
+
+    @contextmanager
+    def listen(self) -> Iterator[Iterator[Record]]:
+        """Open the camera: `with camera.listen() as records`. LinkError when it cannot, or frames have another size.
+
+        One that is lost later is opened again, for ever; a video file comes at its own pace, and ends.
+        """
+        if self.source is None:
+            raise LinkError(f"{self.topic}: give `source` to run live: /dev/video0, a URL, or a video file")
+        size_px = (self.size_px, self.size_px) if isinstance(self.size_px, int) else self.size_px
+        settings = CaptureSettings(self.source, size_px, self.fps, self.timeout_s, self.jpeg_quality)
+        with LiveCamera(settings, self._counts).open() as frames:
+            yield self._records(frames, size_px)
+
+    def _records(self, frames: Iterator[Frame], size_px: tuple[int, int] | None) -> Iterator[Record]:
+        frame_id = self.frame_id or self.topic.strip("/").replace("/", "_")
+        for sequence, frame in enumerate(frames):
+            self._check_size(frame.jpeg, size_px)
+            stamp_ns = frame.arrival_ns - round(1e9 * self.latency_s)
+            data = encode_compressed_image(CompressedImage(stamp_ns, frame_id, frame.jpeg))
+            yield Record(self.topic, frame.arrival_ns, stamp_ns, data, sequence)
+
+    def _check_size(self, jpeg: bytes, wanted_px: tuple[int, int] | None) -> None:
+        try:
+            found_px = jpeg_size(jpeg)
+        except ValueError:
+            return  # decoding counts it
+        if wanted_px is not None and found_px != wanted_px:
+            raise LinkError(
+                f"{self.topic}: frames of {found_px[0]} x {found_px[1]} pixels, but the lens is calibrated for "
+                f"{wanted_px[0]} x {wanted_px[1]}: set the camera's mode, or calibrate the lens in this one"
+            )
 
     def decode(self, record: Record) -> Image | None:
         """The image of one record, stamped as the record is."""

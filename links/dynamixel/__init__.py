@@ -1,4 +1,4 @@
-"""The turntable's servo, a DYNAMIXEL MX-28AR: states in, goals out. Driving the real one is not built yet.
+"""The turntable's servo, a DYNAMIXEL MX-28AR: states in, goals out; live through a process of its own.
 
 Source: ours; recording format in recordings/README.md (/servo/state).
 """

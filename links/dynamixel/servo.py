@@ -1,27 +1,40 @@
 """The servo as a link: its states come in, one JSON object per exchange, and goals go out in its own units.
 
-In replay nothing goes out: the recorded states are used. In closed loop the simulated servo obeys `take_command`.
+Live a process of its own talks to the servo (`links.dynamixel.worker`); a state's stamp is mid-exchange. A goal beyond
+the soft limits or faster than the servo goes at the limit, and is counted. In replay nothing goes out: the recorded
+states are used. In closed loop the simulated servo obeys `take_command`.
 
-Source: ours; recording format in recordings/README.md (/servo/state). Units: ROBOTIS e-manual, MX-28AR(2.0), control
-table, https://emanual.robotis.com/docs/en/dxl/mx/mx-28-2/ (goal position 4096 steps a turn, profile velocity in units
-of 0.229 rpm, where 0 would mean no limit).
+Source: ours; recording format in recordings/README.md (/servo/state). Units: ROBOTIS e-manual, MX-28AR(2.0), see
+links/dynamixel/mx28.py (goal position 4096 steps a turn, profile velocity in units of 0.229 rpm, 0 means no limit).
 """
 
 from __future__ import annotations
 
 import json
 import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
-from pydantic import PrivateAttr
+from pydantic import Field, PrivateAttr, model_validator
 
-from flow.link import Record, Source
+from flow.link import LinkError, Record, Source
+from links import host_time
+from links.dynamixel import wire
+from links.dynamixel.drive import DriveSettings
+from links.dynamixel.mx28 import NO_LOAD_RPM, STEPS_PER_TURN, TICK_RAD, VELOCITY_UNIT_RADPS, VELOCITY_UNIT_RPM
+from links.dynamixel.process import ProcessEnded, ServoProcess
 from stages.messages import ServoGoal, ServoState
 
 MAX_STATE_BYTES = 1_000
-TICK_RAD = math.tau / 4096
-VELOCITY_UNIT_RADPS = 0.229 * math.tau / 60
+WAKE_S = 0.2  # how often a waiting listener looks whether it was closed
+RESTART_S, MOST_STARTS = 0.1, 4  # a process that died is started again, so often before it has to read the servo
+
+Baud = Literal[57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,36 +61,184 @@ class Servo(Source):
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"goal"})
 
     topic: str = "/servo/state"
-    _refused: int = PrivateAttr(default=0)
+    port: str = "/dev/ttyUSB0"  # better a name that stays: /dev/serial/by-id/...
+    baud: Baud = 1_000_000
+    servo_id: int = Field(1, ge=0, le=252)
+    rate_hz: float = Field(250.0, ge=10, le=500)  # block reads
+    limits_deg: tuple[float, float] = (0.0, 180.0)  # goals stay within, in the servo's own angle
+    speed_limit_rpm: float = Field(NO_LOAD_RPM, ge=1, le=200)  # an MX-28 does 55 rpm at 12 V
+    goal_slack_s: float = Field(0.5, gt=0, le=10)  # a goal not reached so long after it could be: stop
+    watchdog_s: float = Field(0.1, ge=0.02, le=2.5)  # the servo stops by itself when nobody talks to it for so long
+    reply_timeout_s: float = Field(0.02, ge=0.002, le=0.1)
+    start_timeout_s: float = Field(3.0, gt=0, le=60)  # until the first answer; later ones are waited for without end
+    write_settings: bool = False  # correct the servo's EEPROM (return delay, modes) rather than refuse it
+    reboot: bool = True  # a servo that has shut down, as by overload
+
+    _counts: Counter[str] = PrivateAttr(default_factory=Counter[str])
     _waiting: GoalCommand | None = PrivateAttr(default=None)
+    _process: ServoProcess | None = PrivateAttr(default=None)
+    _lock: threading.Lock = PrivateAttr(default_factory=threading.Lock)  # over who replaces the process
+    _ended: Counter[str] = PrivateAttr(default_factory=Counter[str])  # totals of processes that are no more
+    _health: wire.Health | None = PrivateAttr(default=None)
+
+    @model_validator(mode="after")
+    def _settings_agree(self) -> Servo:
+        low, high = self.limits_deg
+        if self.watchdog_s * self.rate_hz < 4:
+            raise ValueError("watchdog_s: give it four periods of rate_hz, or it stops a servo that is read in time")
+        if not 0.0 <= low < high <= 360.0:
+            raise ValueError("limits_deg: give two growing angles within 0..360, the servo's one turn")
+        return self
 
     @property
     def refused(self) -> int:
         """Records that held no servo state."""
-        return self._refused
+        return self._counts["refused: no servo state"]
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Totals since the start; `connected`, voltage and temperature are as told last."""
+        now = {} if self._health is None else self._health._asdict()
+        told = {name: now.get(name, 0) + self._ended[name] for name in TOTALS} | {
+            name: now.get(name, 0) for name in NOW
+        }
+        here = dict(self._counts)
+        return {**told, **here, "goals_lost": told["goals_lost"] + here.get("goals_lost", 0)}
 
     def decode(self, record: Record) -> ServoState | None:
         """A message of `{"position_rad": 1.2, "velocity_radps": 0.0, "goal_rad": 1.3, "error": 0}`, else None."""
         try:
             return parse_state(record.stamp_ns, record.data)
         except ValueError:
-            self._refused += 1
+            self._counts["refused: no servo state"] += 1
             return None
 
     def on_goal(self, goal: ServoGoal) -> None:
-        """The goal waits until the line to the servo is free; a newer one takes its place."""
-        self._waiting = goal_command(goal)
+        """Live it goes out at once, within the limits. Else it waits to be taken; a newer one takes its place."""
+        process = self._process
+        if process is None:
+            self._waiting = goal_command(goal)
+            self._counts["goals while not live"] += 1
+        elif not (math.isfinite(goal.position_rad) and math.isfinite(goal.speed_radps)):
+            self._counts["goals refused: no number"] += 1
+        elif not process.send(self._within_limits(goal)):
+            self._counts["goals_lost"] += 1
 
     def take_command(self) -> GoalCommand | None:
         """The newest goal not yet sent, once."""
         command, self._waiting = self._waiting, None
         return command
 
+    @contextmanager
+    def listen(self) -> Iterator[Iterator[Record]]:
+        """Start the servo's process: `with servo.listen() as records`; the end of the context stops the servo.
+
+        LinkError when the servo does not answer, or is not one that may be driven. Later faults are mended there and
+        counted; no record comes meanwhile.
+        """
+        closed = threading.Event()
+        try:
+            self._process = ServoProcess(self._drive_settings())
+            yield self._records(closed)
+        finally:
+            with self._lock:
+                closed.set()
+                process, self._process = self._process, None
+            if process is not None:
+                process.close()
+
+    def _records(self, closed: threading.Event) -> Iterator[Record]:
+        host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
+        starts, sequence = 1, 0  # starts: of a process, since the last reading
+        while not closed.is_set():
+            process = self._process
+            if process is None:
+                return
+            try:
+                packet = process.receive(WAKE_S)
+            except ProcessEnded as ended:
+                if closed.wait(RESTART_S * starts):
+                    return
+                if starts == MOST_STARTS:
+                    raise LinkError(
+                        f"the servo's process ended {starts} times before it read the servo ({ended}): see its own "
+                        "message above; is the memory full, or is something else wrong with this installation?"
+                    ) from None
+                self._restart(process, closed)
+                starts += 1
+                continue
+            except (OSError, ValueError):
+                if closed.is_set():  # the socket went away under the wait
+                    return
+                raise
+            if isinstance(packet, wire.Health):
+                self._health = packet
+            elif isinstance(packet, wire.Reading):
+                yield reading_record(self.topic, packet, host_ahead_ns, sequence)
+                starts, sequence = 0, sequence + 1
+
+    def _restart(self, ended: ServoProcess, closed: threading.Event) -> None:
+        """Another process in the place of one that died; the servo stopped by itself meanwhile."""
+        ended.close()
+        if self._health is not None:
+            self._ended += Counter({name: getattr(self._health, name) for name in TOTALS})
+            self._health = None
+        with self._lock:
+            if not closed.is_set():
+                self._counts["process restarts"] += 1
+                self._process = ServoProcess(self._drive_settings())
+
+    def _within_limits(self, goal: ServoGoal) -> wire.Goal:
+        """What is sent for a goal: at the limit where it lies beyond, and then it is counted."""
+        low, high = (math.radians(angle) for angle in self.limits_deg)
+        if not low - 0.5 * TICK_RAD <= goal.position_rad <= high + 0.5 * TICK_RAD:
+            self._counts["goals kept within limits_deg"] += 1
+        low_ticks, high_ticks = self._limit_ticks()
+        command = goal_command(goal)
+        fastest = max(math.floor(self.speed_limit_rpm / VELOCITY_UNIT_RPM), 1)
+        self._counts["goals slowed to speed_limit_rpm"] += command.velocity_units > fastest
+        return wire.Goal(min(max(command.position_ticks, low_ticks), high_ticks), min(command.velocity_units, fastest))
+
+    def _limit_ticks(self) -> tuple[int, int]:
+        low, high = (math.radians(angle) / TICK_RAD for angle in self.limits_deg)
+        return math.ceil(low - 1e-6), min(math.floor(high + 1e-6), STEPS_PER_TURN - 1)
+
+    def _drive_settings(self) -> DriveSettings:
+        return DriveSettings(
+            port=self.port,
+            servo_id=self.servo_id,
+            baud=self.baud,
+            limit_ticks=self._limit_ticks(),
+            watchdog_ms=round(1e3 * self.watchdog_s),
+            reply_timeout_ms=1e3 * self.reply_timeout_s,
+            goal_slack_ms=1e3 * self.goal_slack_s,
+            rate_hz=self.rate_hz,
+            start_s=self.start_timeout_s,
+            write_settings=self.write_settings,
+            reboot=self.reboot,
+        )
+
+
+NOW = ("connected", "low_latency", "voltage_mv", "temperature_c")  # of wire.Health: not totals, but how it is
+TOTALS = tuple(name for name in wire.Health._fields if name not in NOW)
+
 
 def goal_command(goal: ServoGoal) -> GoalCommand:
     """A goal in the servo's units: the nearest step of one turn, and the nearest speed but never 0, its 'no limit'."""
     ticks = min(max(round(goal.position_rad / TICK_RAD), 0), 4095)
     return GoalCommand(ticks, min(max(round(goal.speed_radps / VELOCITY_UNIT_RADPS), 1), 1023))
+
+
+def reading_record(topic: str, reading: wire.Reading, host_ahead_ns: int, sequence: int) -> Record:
+    """A block read as it is recorded: stamped mid-exchange, arrived with the reply; host_ahead_ns: host - monotonic."""
+    state = {
+        "position_rad": round(reading.position_ticks * TICK_RAD, 9),
+        "velocity_radps": round(reading.velocity_units * VELOCITY_UNIT_RADPS, 9),
+        "goal_rad": round(reading.goal_ticks * TICK_RAD, 9),
+        "error": reading.error,
+    }
+    stamp_ns = (reading.request_ns + reading.reply_ns) // 2 + host_ahead_ns
+    return Record(topic, reading.reply_ns + host_ahead_ns, stamp_ns, json.dumps(state).encode(), sequence)
 
 
 def parse_state(stamp_ns: int, data: bytes) -> ServoState:

@@ -1,13 +1,18 @@
 """The VLP-16 as a source: UDP packets live, recorded packets in replay, one decoder for both.
 
+Live it can listen to the sensor's position packets, too: they are recorded under /lidar/position, and what they say of
+GPS and PPS is counted. With `clock: utc` nothing is taken before they say that the sensor's clock is locked to UTC; a
+lock that is lost later is counted, and the sensor's clock drifts on by some millionths.
+
 Source: VLP-16 User Manual 63-9243 Rev. E, chapter 9. What to do about bad, lost and repeated packets is ours.
 """
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from functools import cached_property
 from ipaddress import IPv4Address
 
@@ -17,10 +22,12 @@ from flow.link import LinkError, Record, Source
 from links.velodyne import vlp16
 from links.velodyne.clock import ClockMode, DeviceClock
 from links.velodyne.decode import compile_kernels, decode_packet, refusal_of, timestamp_us
+from links.velodyne.position import PpsWatch
 from links.velodyne.refusal import Refusal
-from links.velodyne.udp import UdpCounters, listen_udp
+from links.velodyne.udp import Channel, UdpCounters, listen_udp
 from stages.messages import LidarFirings
 
+POSITION_TOPIC = "/lidar/position"
 REFUSED_IN_A_ROW = 100
 
 
@@ -33,8 +40,10 @@ class Lidar(Source):
     bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address; 0.0.0.0 when the lidar broadcasts
     port: int = Field(vlp16.DATA_PORT, ge=1, le=65535)
     sender: IPv4Address | None = None  # the lidar's address, 192.168.1.201 from the factory
+    position_port: int | None = Field(None, ge=1, le=65535)  # 8308 from the factory; None: do not listen to it
     timeout_s: float = Field(2.0, gt=0, le=60)
 
+    _pps: PpsWatch = PrivateAttr(default_factory=PpsWatch)
     _udp: UdpCounters = PrivateAttr(default_factory=UdpCounters)
 
     @model_validator(mode="after")
@@ -54,11 +63,37 @@ class Lidar(Source):
         """Pulses of one packet; None when it is refused. LinkError for another model, or 100 refused in a row."""
         return self._stream.decode(record)
 
-    def listen(self) -> AbstractContextManager[Iterator[Record]]:
-        """Receive packets from the network: `with lidar.listen() as records`. LinkError: see `listen_udp`."""
+    @contextmanager
+    def listen(self) -> Iterator[Iterator[Record]]:
+        """Receive packets from the network: `with lidar.listen() as records`. LinkError: see `listen_udp`, or utc's."""
         compile_kernels()
+        if self.clock == "utc" and self.position_port is None:
+            raise LinkError(
+                f"clock: utc needs to know that the sensor is locked to UTC: set position_port: {vlp16.POSITION_PORT} "
+                "(its position packets), or clock: free"
+            )
+        channels = [Channel(self.topic, self.port)]
+        if self.position_port is not None:
+            channels.append(Channel(POSITION_TOPIC, self.position_port))
         sender = None if self.sender is None else str(self.sender)
-        return listen_udp(self.topic, str(self.bind), self.port, sender, self.timeout_s, self._udp)
+        with listen_udp(channels, str(self.bind), sender, self.timeout_s, self._udp) as records:
+            yield self._watched(records) if self.position_port is not None else records
+
+    def _watched(self, records: Iterator[Record]) -> Iterator[Record]:
+        """The records, with an eye on the sensor's clock; for utc no data packet before it is locked."""
+        waits, deadline_s = self.clock == "utc", time.monotonic() + self.timeout_s
+        for record in records:
+            if record.topic == POSITION_TOPIC:
+                self._pps.see(record.data)
+                waits = waits and not self._pps.locked
+            elif waits:
+                if time.monotonic() > deadline_s:
+                    raise LinkError(
+                        f"clock: utc, but the sensor's clock is not locked to UTC: {self._pps.in_words()}. Check its "
+                        "GPS receiver and PPS wire (the sensor's web page shows both), or set clock: free"
+                    )
+                continue
+            yield record
 
     @property
     def counters(self) -> dict[str, int]:
@@ -70,6 +105,7 @@ class Lidar(Source):
             "lost": stream.lost,
             "clock disagreements": stream.clock.disagreements,
             "from other senders": self._udp.foreign,
+            **self._pps.counters,
             **refused,
         }
 

@@ -7,6 +7,7 @@ frame's start; offsets here are into the UDP payload (42 bytes less).
 from __future__ import annotations
 
 import enum
+from collections import Counter
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
@@ -36,6 +37,48 @@ class Position:
     nmea: str  # the last GPRMC sentence as it came, "" when there was none
     gps_utc: datetime | None  # its date and time; None without a sentence, or with one that is damaged
     gps_valid: bool  # the receiver says its fix is valid (status A)
+
+
+class PpsWatch:
+    """What position packets have told of the sensor's clock since the start."""
+
+    def __init__(self) -> None:
+        self.pps: Pps | None = None
+        """As told last; None before the first packet."""
+        self._seen: Counter[str] = Counter()
+        self._gps_valid = False
+
+    @property
+    def locked(self) -> bool:
+        """Whether the sensor's clock is locked to UTC: to the pulse per second, with a GPS that knows the time."""
+        return self.pps is Pps.LOCKED and self._gps_valid
+
+    def see(self, data: bytes) -> None:
+        """One packet; what is no position packet is counted and tells nothing."""
+        try:
+            position = parse_position(data)
+        except LinkError:
+            self._seen["position packets damaged"] += 1
+            return
+        self._seen["position packets"] += 1
+        if self.locked and not (position.pps is Pps.LOCKED and position.gps_valid):
+            self._seen["PPS locks lost"] += 1
+        self.pps, self._gps_valid = position.pps, position.gps_valid
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Totals, and with 1 or 0 the state as told last; nothing before the first packet."""
+        if not self._seen:
+            return {}
+        state = {f"PPS {pps.name.lower()}": int(pps is self.pps) for pps in Pps}
+        return {**self._seen, **state, "GPS time valid": int(self._gps_valid)}
+
+    def in_words(self) -> str:
+        """The state, to be put into a sentence."""
+        if self.pps is None:
+            return "no position packet has come"
+        gps = "its GPS knows the time" if self._gps_valid else "its GPS does not know the time"
+        return f"its PPS is {self.pps.name.lower()}, {gps}"
 
 
 def parse_position(data: bytes) -> Position:

@@ -1,7 +1,8 @@
-"""Live VLP-16 packets from a UDP socket, from one sender, stamped by the kernel when they arrived.
+"""Live VLP-16 packets from UDP sockets, from one sender, stamped by the kernel when they arrived.
 
 Nothing is queued here: what the consumer does not take in time waits in the socket's bounded buffer, then the kernel
-drops it, and the decoder counts it from the gap in device time.
+drops it, and the decoder counts it from the gap in device time. The kernel stamps with the wall clock;
+`links/host_time.py` makes of it a time that a step of that clock does not move.
 
 Source: VLP-16 User Manual 63-9243 Rev. E, section 9.3 (ports); socket(7), SO_TIMESTAMPNS.
 """
@@ -9,16 +10,19 @@ Source: VLP-16 User Manual 63-9243 Rev. E, section 9.3 (ports); socket(7), SO_TI
 from __future__ import annotations
 
 import errno
+import select
 import socket
 import struct
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from flow.link import LinkError, Record
+from links import host_time
 from links.velodyne import vlp16
 
 RECEIVE_BUFFER_BYTES = 1 << 20  # 0.6 s of packets, where the host's net.core.rmem_max allows it
@@ -38,29 +42,44 @@ class UdpCounters:
     last_foreign: str = ""
 
 
+class Channel(NamedTuple):
+    """What comes on one port."""
+
+    topic: str
+    port: int
+
+
 @contextmanager
 def listen_udp(
-    topic: str, bind: str, port: int, sender: str | None, timeout_s: float, counters: UdpCounters
+    channels: Sequence[Channel], bind: str, sender: str | None, timeout_s: float, counters: UdpCounters
 ) -> Iterator[Iterator[Record]]:
-    """Open the socket and yield an iterator of records. LinkError when it cannot open, or nothing comes for timeout_s.
+    """Open a socket for each channel and yield an iterator of records. LinkError when one cannot open, or nothing
+    comes on the first one for timeout_s.
 
     `record.stamp_ns` is when the packet's first laser fired as far as its arrival tells (`vlp16.first_pulse_ns`).
     The iterator ends when the context is left, also from another thread.
     """
     closed = threading.Event()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+    with ExitStack() as stack:
+        sockets = {stack.enter_context(_open(bind, channel.port)): channel for channel in channels}
+        try:
+            yield _records(sockets, closed, sender, timeout_s, counters)
+        finally:
+            closed.set()
+
+
+def _open(bind: str, port: int) -> socket.socket:
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
         udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         if _SO_TIMESTAMPNS is not None:
             udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        try:
-            udp.bind((bind, port))
-        except OSError as error:
-            raise LinkError(f"cannot listen on UDP {bind}:{port}: {error.strerror}. {_bind_advice(error)}") from error
-        udp.settimeout(min(_WAKE_S, timeout_s))
-        try:
-            yield _records(udp, closed, topic, port, sender, timeout_s, counters)
-        finally:
-            closed.set()
+        udp.bind((bind, port))
+    except OSError as error:
+        udp.close()
+        raise LinkError(f"cannot listen on UDP {bind}:{port}: {error.strerror}. {_bind_advice(error)}") from error
+    udp.setblocking(False)
+    return udp
 
 
 def _bind_advice(error: OSError) -> str:
@@ -72,37 +91,41 @@ def _bind_advice(error: OSError) -> str:
 
 
 def _records(
-    udp: socket.socket,
+    sockets: dict[socket.socket, Channel],
     closed: threading.Event,
-    topic: str,
-    port: int,
     sender: str | None,
     timeout_s: float,
     counters: UdpCounters,
 ) -> Iterator[Record]:
+    first = next(iter(sockets.values()))
     deadline_s = time.monotonic() + timeout_s
     foreign_before = counters.foreign
     while not closed.is_set():
         try:
-            data, ancillary, _, (host, _) = udp.recvmsg(_DATAGRAM_BYTES, 64)
-        except TimeoutError:
-            data = None
-        except OSError as error:
+            ready, _, _ = select.select(list(sockets), [], [], min(_WAKE_S, timeout_s))
+            received = [(sockets[udp], udp.recvmsg(_DATAGRAM_BYTES, 64)) for udp in ready]
+        except BlockingIOError:  # a datagram that the kernel found damaged after it had been announced
+            continue
+        except (OSError, ValueError) as error:
             if closed.is_set():
                 return
-            raise LinkError(f"UDP {port}: {error.strerror}: is the network interface still up?") from error
-        if data is not None and (sender is None or host == sender):
-            arrival_ns = _kernel_time_ns(ancillary) or time.time_ns()
-            yield Record(topic, arrival_ns, vlp16.first_pulse_ns(arrival_ns, data), data, counters.received)
+            raise LinkError(f"UDP {first.port}: {error}: is the network interface still up?") from error
+        for channel, (data, ancillary, _, (host, _)) in received:
+            if sender is not None and host != sender:
+                counters.foreign += 1
+                counters.last_foreign = host
+                continue
+            kernel_ns = _kernel_time_ns(ancillary)
+            arrival_ns = host_time.now_ns() if kernel_ns is None else host_time.from_wall_ns(kernel_ns)
+            stamp_ns = vlp16.first_pulse_ns(arrival_ns, data)
+            yield Record(channel.topic, arrival_ns, stamp_ns, data, counters.received)
             counters.received += 1
-            deadline_s = time.monotonic() + timeout_s
-            foreign_before = counters.foreign
-            continue
-        if data is not None:
-            counters.foreign += 1
-            counters.last_foreign = host
+            if channel is first:
+                deadline_s = time.monotonic() + timeout_s
+                foreign_before = counters.foreign
         if time.monotonic() > deadline_s:
-            raise LinkError(_silence(port, sender, timeout_s, counters.foreign - foreign_before, counters.last_foreign))
+            foreign = counters.foreign - foreign_before
+            raise LinkError(_silence(first.port, sender, timeout_s, foreign, counters.last_foreign))
 
 
 def _kernel_time_ns(ancillary: list[tuple[int, int, bytes]]) -> int | None:

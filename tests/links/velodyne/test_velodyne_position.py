@@ -1,10 +1,13 @@
 """Position packets: GPS time and whether the sensor's clock is locked to it."""
 
+import contextlib
+import socket
+import threading
 from datetime import UTC, datetime
 
 import pytest
 import velodyne_decoder
-from hand_built import captured, record
+from hand_built import captured, packet, record
 
 from flow.link import LinkError
 from links.velodyne import Lidar
@@ -67,3 +70,95 @@ def test_the_data_topic_ignores_and_counts_position_packets():
     assert sum(answer is not None for answer in answers) == lidar.counters["decoded"] == 293
     assert sum(count for name, count in lidar.counters.items() if "position packet" in name) == 57
     assert lidar.counters["lost"] == 0
+
+
+def free_ports(count):
+    with contextlib.ExitStack() as stack:
+        probes = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return [probe.getsockname()[1] for probe in probes]
+
+
+@pytest.fixture
+def ports():
+    return free_ports(2)
+
+
+def send(port, *datagrams, host="127.0.0.1"):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind((host, 0))
+        for data in datagrams:
+            sender.sendto(data, ("127.0.0.1", port))
+
+
+def test_live_position_packets_are_records_of_their_own_and_their_state_is_counted(ports):
+    lidar = Lidar(port=ports[0], position_port=ports[1], sender="127.0.0.1")
+    with lidar.listen() as records:
+        assert "PPS locked" not in lidar.counters  # nothing is known yet
+        send(ports[1], position(pps=1), host="127.0.0.2")  # somebody else's
+        send(ports[1], position(pps=0))
+        assert next(records).data == position(pps=0)
+        assert (lidar.counters["PPS absent"], lidar.counters["PPS locked"]) == (1, 0)
+        send(ports[1], position())
+        found = next(records)
+        assert (found.topic, found.data, found.stamp_ns) == ("/lidar/position", position(), found.arrival_ns)
+        send(ports[0], packet())
+        assert next(records).topic == "/lidar/packets"
+        send(ports[1], position(pps=1), b"no position packet")
+        next(records), next(records)
+    counters = lidar.counters
+    assert (counters["PPS absent"], counters["PPS locked"], counters["PPS synchronizing"]) == (0, 0, 1)
+    assert (counters["position packets"], counters["position packets damaged"]) == (3, 1)
+    assert (counters["PPS locks lost"], counters["GPS time valid"], counters["from other senders"]) == (1, 1, 1)
+
+
+def test_silence_on_the_position_port_alone_is_no_error_and_on_the_data_port_it_is(ports):
+    lidar = Lidar(port=ports[0], position_port=ports[1], timeout_s=0.1)
+    with lidar.listen() as records:
+        send(ports[1], position())
+        assert next(records).topic == "/lidar/position"
+        with pytest.raises(LinkError, match=rf"no packet on UDP {ports[0]} for 0.1 s"):
+            next(records)
+
+
+def test_with_clock_utc_no_pulse_counts_before_the_sensor_is_locked(ports):
+    lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc")
+    with lidar.listen() as records:
+        send(ports[0], packet(azimuth=1))
+        send(ports[1], position(pps=1))
+        assert next(records).topic == "/lidar/position"  # recorded all the same
+        send(ports[1], position(GPRMC.replace("A", "V", 1)))  # a pulse without the time
+        assert next(records).topic == "/lidar/position"
+        send(ports[1], position())
+        assert next(records).topic == "/lidar/position"
+        send(ports[0], packet(azimuth=2))
+        assert next(records).data == packet(azimuth=2)
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [((), "no position packet has come"), ((position(pps=3),), "its PPS is error, its GPS knows the time")],
+)
+def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_that_says_why(ports, told, words):
+    lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc", timeout_s=0.1)
+    with lidar.listen() as records:
+        send(ports[1], *told)
+        for _ in told:
+            next(records)
+        stop = threading.Event()
+        sending = threading.Thread(
+            target=lambda: [send(ports[0], packet()) for _ in iter(lambda: stop.wait(0.01), True)]
+        )
+        sending.start()
+        try:
+            with pytest.raises(LinkError, match=f"not locked to UTC: {words}.*clock: free"):
+                next(records)
+        finally:
+            stop.set()
+            sending.join()
+
+
+def test_clock_utc_without_position_packets_is_refused_live(ports):
+    with pytest.raises(LinkError, match=r"set position_port: 8308.*or clock: free"), Lidar(clock="utc").listen():
+        pass

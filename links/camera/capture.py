@@ -1,0 +1,170 @@
+"""One open camera, stream or video file: frames as JPEG with the time at which they came.
+
+What it may be: a V4L2 device (`/dev/video0`, the SP360 as a webcam), a URL (RTSP, HTTP) or a video file, through
+OpenCV's V4L2 and FFmpeg. Frames that are JPEG already (MJPEG) are taken as they are, others are decoded and encoded.
+
+A frame's time is when the grab that waited for it returned. A grab that returns at once brings a frame that has been
+waiting for an unknown time: after opening those are thrown away until one had to be waited for, later never two in a
+row, so that a host that is too slow sees every second frame.
+
+Source: ours; OpenCV 5, VideoCapture (CAP_PROP_FORMAT -1: the stream's own packets; CAP_PROP_CONVERT_RGB 0).
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+WAITED_SHARE = 0.25  # of a frame's period: a grab that took less found the frame waiting
+BACKLOG_S = 1.0  # after opening, at most
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_URL = re.compile(r"^[a-z][a-z0-9+.-]*://", re.IGNORECASE)
+
+
+class CaptureLost(Exception):
+    """The source cannot be opened, or gives no more frames. The text says what it was."""
+
+
+class CaptureEnded(CaptureLost):
+    """A video file is over."""
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureSettings:
+    """What to open, and how."""
+
+    source: str
+    size_px: tuple[int, int] | None  # to ask a device for
+    fps: float
+    timeout_s: float
+    jpeg_quality: int
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame."""
+
+    arrival_ns: int  # on the clock that the capture was given
+    jpeg: bytes
+
+
+def is_url(source: str) -> bool:
+    """Whether a source is a stream."""
+    return _URL.match(source) is not None
+
+
+def is_device(source: str) -> bool:
+    """Whether a source is a camera on this host."""
+    return source.startswith("/dev/")
+
+
+def shown(source: str) -> str:
+    """A source as it may be printed: without the name and password in a URL."""
+    return re.sub(r"(?<=://)[^/@]*@", "", source)
+
+
+class Capture:
+    """An open source; `read` gives frame after frame. CaptureLost when it cannot be opened or has died."""
+
+    def __init__(self, settings: CaptureSettings, now_ns: Callable[[], int], counters: Counter[str]) -> None:
+        """`counters`: where frames that are thrown away because they had been waiting are counted, as "stale"."""
+        self._settings, self._now_ns, self._counters = settings, now_ns, counters
+        self._live = is_device(settings.source) or is_url(settings.source)
+        self._name = shown(settings.source)
+        self._video, self._raw = self._open()
+        self._opened_ns = now_ns()
+        self._caught_up = not self._live
+        self._dropped_last = False
+
+    def close(self) -> None:
+        """Give the device or connection back."""
+        self._video.release()
+
+    def read(self) -> Frame:
+        """The next frame whose time is known; waits for it."""
+        while True:
+            asked_ns = self._now_ns()
+            if not self._video.grab():
+                if not self._live:
+                    raise CaptureEnded(f"{self._name} is over")
+                raise CaptureLost(f"{self._name} gives no more frames")
+            arrival_ns = self._now_ns() if self._live else self._due_ns()
+            if self._live and self._was_waiting(asked_ns, arrival_ns):
+                self._counters["stale"] += 1
+                continue
+            found, picture = self._video.retrieve()
+            if not found or picture is None or picture.size == 0:
+                raise CaptureLost(f"{self._name} gives frames that cannot be read")
+            return Frame(arrival_ns, self._jpeg(np.asarray(picture)))
+
+    def _open(self) -> tuple[cv2.VideoCapture, bool]:
+        s = self._settings
+        if is_device(s.source):
+            return self._open_device()
+        if not is_url(s.source) and not Path(s.source).is_file():
+            raise CaptureLost(f"there is no file {s.source}")
+        limit_ms = round(1e3 * s.timeout_s)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms]
+        video = cv2.VideoCapture(s.source, cv2.CAP_FFMPEG, [*limits, cv2.CAP_PROP_FORMAT, -1])
+        if video.isOpened() and _codec(video) in ("MJPG", "mjpg", "jpeg"):
+            return video, True
+        if video.isOpened():  # another codec: its packets are no pictures, open it decoded
+            video.release()
+            video = cv2.VideoCapture(s.source, cv2.CAP_FFMPEG, limits)
+        if not video.isOpened():
+            raise CaptureLost(f"{self._name} cannot be opened")
+        return video, False
+
+    def _open_device(self) -> tuple[cv2.VideoCapture, bool]:
+        s = self._settings
+        if not Path(s.source).exists():
+            raise CaptureLost(f"there is no {s.source}")
+        asked = [cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"), cv2.CAP_PROP_FPS, round(s.fps)]
+        if s.size_px is not None:
+            asked += [cv2.CAP_PROP_FRAME_WIDTH, s.size_px[0], cv2.CAP_PROP_FRAME_HEIGHT, s.size_px[1]]
+        video = cv2.VideoCapture(s.source, cv2.CAP_V4L2, [*asked, cv2.CAP_PROP_CONVERT_RGB, 0])
+        if video.isOpened() and _codec(video) == "MJPG":
+            return video, True
+        video.release()
+        video = cv2.VideoCapture(s.source, cv2.CAP_V4L2, asked)
+        if not video.isOpened():
+            raise CaptureLost(f"{s.source} cannot be opened as a camera")
+        return video, False
+
+    def _was_waiting(self, asked_ns: int, arrival_ns: int) -> bool:
+        waited = arrival_ns - asked_ns > WAITED_SHARE * 1e9 / self._settings.fps
+        if not self._caught_up:
+            self._caught_up = waited or arrival_ns - self._opened_ns > BACKLOG_S * 1e9
+            return not self._caught_up
+        self._dropped_last = not waited and not self._dropped_last
+        return self._dropped_last
+
+    def _due_ns(self) -> int:
+        """When a file's frame would have come, by its own timeline; waits until then."""
+        due_ns = self._opened_ns + round(1e6 * max(self._video.get(cv2.CAP_PROP_POS_MSEC), 0.0))
+        while (left_ns := due_ns - self._now_ns()) > 0:
+            time.sleep(min(1e-9 * left_ns, 0.1))
+        return due_ns
+
+    def _jpeg(self, picture: np.ndarray) -> bytes:
+        if self._raw:
+            data = picture.tobytes()
+            end = data.rfind(JPEG_END)  # a device's buffer may be longer than its picture
+            if not data.startswith(JPEG_START) or end < 0:
+                raise CaptureLost(f"{self._name} gives frames that are no JPEG")
+            return data[: end + 2]
+        written, coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, self._settings.jpeg_quality])
+        if not written:
+            raise CaptureLost(f"{self._name}: a frame of shape {picture.shape} cannot be written as JPEG")
+        return coded.tobytes()
+
+
+def _codec(video: cv2.VideoCapture) -> str:
+    return int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=False).decode("ascii", "replace")

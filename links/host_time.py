@@ -1,0 +1,68 @@
+"""One timeline of the host: nanoseconds since 1970 that only ever go forward.
+
+The wall clock is read once, when the process starts; from then on the monotonic clock counts. NTP, a GPS fix or a hand
+on the clock may set the wall clock while a run goes on: nothing here moves. What the kernel stamps with the wall clock
+(SO_TIMESTAMPNS) is mapped by `from_wall_ns`, which notices such a step.
+
+Source: ours; clock_gettime(2), socket(7).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+STEP_NS = 1_000_000  # wall against monotonic since the call before; NTP slews by at most 0.5 ms in a second
+PROMPT_NS, LOOKS = 20_000, 5  # two clocks read together
+MAX_AGE_NS = 1_000_000_000  # a stamp further back says nothing: no socket's buffer holds that much
+
+
+class HostTime:
+    """The monotonic clock, counted from the wall clock's reading at the start."""
+
+    def __init__(
+        self, wall_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._wall_ns, self._monotonic_ns = wall_ns, monotonic_ns
+        self._start_ns = wall_ns() - monotonic_ns()
+        self._wall_ahead_ns = 0  # wall - host at the newest look
+        self._looked_ns = self._stepped_ns = self.now_ns()
+        self._lock = threading.Lock()
+        self.steps = 0
+        """Times the wall clock was seen to be set."""
+
+    def now_ns(self) -> int:
+        """Now; never less than the call before gave."""
+        return self._start_ns + self._monotonic_ns()
+
+    def from_wall_ns(self, stamp_ns: int) -> int:
+        """The host time of a moment just gone by that the kernel stamped with the wall clock.
+
+        Where the wall clock was set after the stamp was taken, nobody knows how old the stamp is: then it is now.
+        Too late, never too early: a sensor's clock that is read from the promptest packets stays right.
+        """
+        with self._lock:
+            now_ns, ahead_ns = self._look()
+            slack_ns = STEP_NS + (now_ns - self._looked_ns) // 1000  # the clocks may drift apart by 1000 ppm
+            if abs(ahead_ns - self._wall_ahead_ns) > slack_ns:
+                self.steps += 1
+                self._stepped_ns = now_ns
+            self._wall_ahead_ns, self._looked_ns = ahead_ns, now_ns
+            host_ns = stamp_ns - ahead_ns
+            believed = max(self._stepped_ns, now_ns - MAX_AGE_NS) <= host_ns <= now_ns
+            return host_ns if believed else now_ns
+
+    def _look(self) -> tuple[int, int]:
+        """(now, wall - host), from readings that no other thread or process came between; else from the last ones."""
+        looks = 0
+        while True:
+            before_ns, wall_ns, after_ns = self.now_ns(), self._wall_ns(), self.now_ns()
+            looks += 1
+            if after_ns - before_ns < PROMPT_NS or looks == LOOKS:
+                return after_ns, wall_ns - before_ns
+
+
+_HOST = HostTime()
+now_ns = _HOST.now_ns
+from_wall_ns = _HOST.from_wall_ns

@@ -1,0 +1,1 @@
+"""Self-calibration: how the LiDAR sits on its servo, from surfaces seen more than once during a sweep."""

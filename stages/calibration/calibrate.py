@@ -1,0 +1,130 @@
+"""Self-calibration: from returns and servo states to a better mount, or a sentence why not.
+
+Source: ours; issue 7, point 5: planes seen twice must coincide.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.calibration.columns import LASERS, Placed, place
+from stages.calibration.looks import Returns, ServoTrace, servo_at
+from stages.calibration.motion import drift, shift
+from stages.calibration.patches import Patches, thickness_m
+from stages.calibration.servo_mount import ServoMount, lidar_mount, servo_mount
+from stages.calibration.solve import COARSE_RAD, Solution, linearise, solve
+from stages.calibration.verdict import Finding, Travel, accepted, curve_sigmas, judge
+from stages.geometry import Array64, LidarMount
+
+LEAST_TRAVEL_RAD = math.radians(40.0)  # the fan is 30 deg wide: less, and nothing is seen at two angles
+FEWEST_RETURNS = 2_000
+FEWEST_PATCHES = 30
+MOVED_M, TURNED_RAD = 0.03, math.radians(0.1)  # over the whole time; less does not matter
+
+
+class CannotCalibrate(Exception):
+    """This recording cannot calibrate anything; the text says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Thickness:
+    """Root mean square distance of returns from their patch (m,) [m], before and after, and how far off it is (m,)."""
+
+    before_m: Array64
+    after_m: Array64
+    range_m: Array64
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was found, and what is known of it."""
+
+    mount: LidarMount  # the rig with the numbers that are told
+    findings: tuple[Finding, ...]
+    covariance: Array64  # of all numbers, in the order of PARAMETERS, inside units
+    curve_sigma_rad: float  # of the encoder's error over the sweep, without its mean
+    curve_mean_sigma_rad: float  # of that mean: alike a zero
+    travel: Travel
+    thickness: Thickness
+    before: Placed  # the returns of all patches under the rig
+    after: Placed  # and under the mount found
+    patches: Patches
+    numbers: ServoMount  # the mount found, as it is written
+
+
+def calibrate(returns: Returns, trace: ServoTrace, rig: LidarMount, max_gap_s: float = 0.1) -> Calibration:
+    """Find how the LiDAR sits on its servo. Raises CannotCalibrate when nothing can be told."""
+    if not rig.turns:
+        raise CannotCalibrate("the rig says that its LiDAR is bolted down (turns: false): there is no servo mount")
+    if len(trace.stamp_ns) < 2:
+        raise CannotCalibrate("the recording holds no servo states: a LiDAR that does not turn sees nothing twice")
+    if len(returns.stamp_ns) < FEWEST_RETURNS:
+        raise CannotCalibrate(
+            f"the LiDAR returned {len(returns.stamp_ns)} pulses, at least {FEWEST_RETURNS} are needed: was it running?"
+        )
+    numbers = servo_mount(rig)
+    at = servo_at(trace, returns.stamp_ns, numbers, max_gap_s)
+    if not np.isfinite(at.position_rad).any():
+        raise CannotCalibrate("no pulse of the LiDAR lies between two servo states: were their clocks the same?")
+    travel = Travel.of(at.position_rad, at.rate_radps)
+    if travel.angle_rad < LEAST_TRAVEL_RAD:
+        raise CannotCalibrate(
+            f"the servo turned by {math.degrees(travel.angle_rad):.0f} deg only, at least "
+            f"{math.degrees(LEAST_TRAVEL_RAD):.0f} deg are needed: let it sweep, best from end to end and back"
+        )
+    solution = solve(returns, trace, numbers, max_gap_s)
+    _check_still(returns, trace, numbers, solution, max_gap_s)
+    if solution is None or len(solution.system.patches.first) < FEWEST_PATCHES:
+        raise CannotCalibrate(
+            "too few flat surfaces were seen more than once: drive to where there are walls, and stand still there"
+        )
+    findings = judge(numbers, solution.mount, solution.covariance, travel)
+    written = accepted(numbers, solution.mount, findings, solution.covariance, travel)
+    curve_rad, mean_rad = curve_sigmas(solution.covariance, travel)
+    chosen = solution.system.chosen
+    looked_at = Returns(returns.stamp_ns[chosen], returns.laser[chosen], returns.xyz_lidar_m[chosen])
+    before, after = (
+        place(looked_at, servo_at(trace, looked_at.stamp_ns, mount, max_gap_s), mount, solution.bias_m)
+        for mount in (numbers, written)
+    )
+    patches = solution.system.patches
+    centre = patches.centre_m
+    return Calibration(
+        mount=lidar_mount(written, rig),
+        findings=findings,
+        covariance=solution.covariance,
+        curve_sigma_rad=curve_rad,
+        curve_mean_sigma_rad=mean_rad,
+        travel=travel,
+        thickness=Thickness(
+            thickness_m(before.xyz_m, patches), thickness_m(after.xyz_m, patches), np.linalg.norm(centre, axis=1)
+        ),
+        before=before,
+        after=after,
+        patches=patches,
+        numbers=written,
+    )
+
+
+def _check_still(
+    returns: Returns, trace: ServoTrace, rig: ServoMount, solution: Solution | None, max_gap_s: float
+) -> None:
+    """Raise CannotCalibrate when the vehicle moved, under the mount found, or the rig's where none was."""
+    mount, bias_m = (solution.mount, solution.bias_m) if solution else (rig, np.zeros(LASERS))
+    placed = place(returns, servo_at(trace, returns.stamp_ns, mount, max_gap_s), mount, bias_m)
+    between = shift(placed.xyz_m, returns.stamp_ns)
+    system = linearise(returns, trace, mount, bias_m, COARSE_RAD[0], max_gap_s)
+    steady = drift(system, returns) if system and solution else None
+    how = ""
+    if between is not None and between.moved:
+        how = "what stands upright was elsewhere in the second half of the time"
+    elif steady is not None and (steady.moved_m > MOVED_M or steady.turned_rad > TURNED_RAD):
+        how = f"surfaces fit a drive by {steady.moved_m:.2f} m and a turn by {math.degrees(steady.turned_rad):.2f} deg"
+    if how:
+        raise CannotCalibrate(
+            f"the vehicle did not stand still: {how}. Take a recording of a parked vehicle, or a part of this one "
+            "in which it stands (--from, --to)"
+        )

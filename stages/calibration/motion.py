@@ -1,0 +1,98 @@
+"""Whether the vehicle stood still: when it drives, surfaces smear as they do under a wrong mount.
+
+Two looks at it. A drive by centimetres bends patches: beside the mount's numbers a steady velocity and turn rate are
+put into the least squares, to see whether they explain something. A drive by more takes surfaces out of their patches:
+then what stood upright is compared as seen from above, first half of the time against the second, at all shifts; of a
+vehicle that stands, no shift fits better than none.
+
+Source: ours; shifts by correlation: Kuglin, Hines (1975).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.calibration.columns import drift_columns
+from stages.calibration.looks import Returns
+from stages.calibration.solve import PRIOR, System, one_step, sandwich, without_planes
+from stages.geometry import Array64
+
+SURE = 5.0  # sigmas
+EXPECTED = np.array([5.0, 5.0, 0.5, 0.2, 0.2, 0.5])  # [m/s], [rad/s]: one sigma before anything is seen
+CELL_M = 0.2
+CELLS = 512
+FARTHEST_M = 50.0
+UPRIGHT_M = 0.5  # a column of air in which returns are this far apart in height holds something upright
+FEWEST_CELLS = 150
+SECTORS = 72
+BETTER = 1.1  # a shift must match so much more
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How far the vehicle seems to have moved and turned over the time looked at; 0 where that is not sure."""
+
+    moved_m: float
+    turned_rad: float
+
+
+def drift(system: System, returns: Returns) -> Drift:
+    """The steady motion that patches tell, at the mount of a system."""
+    stamp_ns = returns.stamp_ns[system.chosen]
+    since_s = (stamp_ns - stamp_ns.mean()) * 1e-9
+    normal = system.patches.normal[system.patches.patch]
+    moving = without_planes(drift_columns(system.placed, normal, since_s), system.weight, system.patches)
+    wider = replace(system, columns=np.column_stack([system.columns, moving]))
+    k = len(PRIOR)
+    prior = np.zeros((k + len(EXPECTED), k + len(EXPECTED)))
+    prior[:k, :k], prior[k:, k:] = PRIOR, np.diag(EXPECTED**-2.0)
+    step = one_step(wider, np.zeros(len(prior)), prior)
+    explained = replace(wider, residual=wider.residual + wider.columns @ step)
+    sigma = np.sqrt(np.diag(sandwich(explained, stamp_ns, prior))[k:])
+    rate = np.where(np.abs(step[k:]) > SURE * sigma, step[k:], 0.0) * float(np.ptp(since_s))
+    return Drift(float(np.linalg.norm(rate[:3])), float(np.linalg.norm(rate[3:])))
+
+
+@dataclass(frozen=True)
+class Shift:
+    """What two halves of the time have in common, seen from above."""
+
+    best_m: tuple[float, float]  # at which shift they fit best
+    gain: float  # how much better than without: 1 is not at all
+
+    @property
+    def moved(self) -> bool:
+        """Whether the vehicle moved, or the scene about it."""
+        return self.gain > BETTER
+
+
+def shift(xyz_m: Array64, stamp_ns: NDArray[np.int64]) -> Shift | None:
+    """Compare the halves of a cloud (n, 3) with NaN for unknown places; None: too little was seen in both."""
+    known = np.isfinite(xyz_m[:, 0]) & (np.hypot(xyz_m[:, 0], xyz_m[:, 1]) < FARTHEST_M)
+    xyz_m, late = xyz_m[known], (stamp_ns > (stamp_ns[0] + stamp_ns[-1]) // 2)[known]
+    sector = ((np.arctan2(xyz_m[:, 1], xyz_m[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
+    seen = [np.bincount(sector[half], minlength=SECTORS) > 0 for half in (late, ~late)]
+    both = (seen[0] & seen[1])[sector]
+    first, second = (_upright(xyz_m[both & half]) for half in (~late, late))
+    if min(first.sum(), second.sum()) < FEWEST_CELLS:
+        return None
+    spectrum = np.fft.rfft2(second) * np.conj(np.fft.rfft2(first))
+    common = np.fft.fftshift(np.fft.irfft2(spectrum, first.shape))
+    middle = CELLS // 2
+    none = max(float(common[middle, middle]), 1e-9)
+    best = np.unravel_index(int(common.argmax()), common.shape)
+    best_m = float((best[0] - middle) * CELL_M), float((best[1] - middle) * CELL_M)
+    return Shift(best_m, float(common.max()) / none)
+
+
+def _upright(xyz_m: Array64) -> Array64:
+    """Where something upright stands, (CELLS, CELLS) of 0 and 1 from above."""
+    cell = np.floor(xyz_m[:, :2] / CELL_M).astype(np.int64) + CELLS // 2
+    place = cell[:, 0] * CELLS + cell[:, 1]
+    low, high = np.full(CELLS**2, np.inf), np.full(CELLS**2, -np.inf)
+    np.minimum.at(low, place, xyz_m[:, 2])
+    np.maximum.at(high, place, xyz_m[:, 2])
+    return (high - low > UPRIGHT_M).astype(np.float64).reshape(CELLS, CELLS)

@@ -1,0 +1,387 @@
+"""The servo live: a process of its own, the real SDK, and the emulated servo on a pty, healthy and with every fault."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from flow.link import LinkError
+from links import host_time
+from links.dynamixel import Servo, mx28
+from links.simulated.dynamixel_emulator import DynamixelEmulator
+from links.simulated.servo import ServoSettings
+from stages.messages import ServoGoal
+
+RPM = math.tau / 60
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def emulator():
+    with DynamixelEmulator(ServoSettings(travel_deg=(0.0, 360.0), start_deg=90.0)) as servo:
+        yield servo
+
+
+def live(emulator, **config):
+    return Servo(port=str(emulator.path), **config)
+
+
+def goal(position_deg, speed_rpm=20.0):
+    return ServoGoal(stamp_ns=0, position_rad=math.radians(position_deg), speed_radps=speed_rpm * RPM)
+
+
+def until(records, wanted):
+    """The states up to the first one that is wanted, which is the last."""
+    seen, deadline_s = [], time.monotonic() + PATIENCE_S
+    for record in records:
+        seen.append(json.loads(record.data))
+        if wanted(seen[-1]):
+            return seen
+        assert time.monotonic() < deadline_s, f"not within {PATIENCE_S} s; last: {seen[-1]}"
+    raise AssertionError("the records ended")
+
+
+def eventually(wanted):
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not wanted():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+def at(position_deg):
+    return lambda state: abs(math.degrees(state["position_rad"]) - position_deg) < 0.2
+
+
+def test_states_are_stamped_when_the_servo_stood_there(emulator):
+    servo = live(emulator)
+    host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(150, 40))
+        moving = []
+        for record in records:
+            assert record.topic == "/servo/state"
+            assert record.stamp_ns < record.arrival_ns
+            state = servo.decode(record)
+            truth = emulator.position_rad(np.array([record.stamp_ns - host_ahead_ns]))[0]
+            if abs(state.velocity_radps) > 3:
+                moving.append(state.position_rad - truth)
+            if at(150)({"position_rad": state.position_rad}):
+                break
+    assert len(moving) > 20
+    assert abs(np.median(moving)) < 2 * mx28.TICK_RAD  # 40 rpm is 2.7 ticks a millisecond
+    assert state.goal_rad == pytest.approx(math.radians(150), abs=mx28.TICK_RAD)
+
+
+def test_the_newest_goal_is_obeyed_at_its_speed(emulator):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(10, 5))
+        servo.on_goal(goal(120, 30))
+        states = until(records, at(120))
+    assert max(s["velocity_radps"] for s in states) == pytest.approx(30 * RPM, rel=0.02)
+    assert servo.counters["goals_sent"] + servo.counters["goals_lost"] <= 2
+
+
+def test_a_goal_beyond_the_soft_limits_goes_to_the_limit_and_is_counted(emulator):
+    servo = live(emulator, limits_deg=(60.0, 110.0))
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(175, 40))
+        states = until(records, at(110))
+        servo.on_goal(goal(-20, 40))
+        states += until(records, at(60))
+    assert servo.counters["goals kept within limits_deg"] == 2
+    assert all(math.radians(59.8) < s["goal_rad"] < math.radians(110.1) for s in states)
+
+
+def test_a_goal_faster_than_the_servo_is_slowed_and_counted(emulator):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(120, 57.2))
+        until(records, at(120))
+    assert emulator.get(mx28.PROFILE_VELOCITY) == 240  # 54.96 rpm
+    assert servo.counters["goals slowed to speed_limit_rpm"] == 1
+
+
+def test_a_goal_that_is_no_number_moves_nothing(emulator):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(ServoGoal(stamp_ns=0, position_rad=math.nan, speed_radps=1.0))
+        servo.on_goal(ServoGoal(stamp_ns=0, position_rad=1.0, speed_radps=math.inf))
+        assert {next(records).data for _ in range(20)} == {next(records).data}
+    assert servo.counters["goals refused: no number"] == 2
+
+
+def test_leaving_the_context_stops_a_moving_servo_where_it_is(emulator):
+    servo = live(emulator, watchdog_s=2.5)  # which is too slow to have done it
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(170, 10))
+        until(records, lambda s: math.degrees(s["position_rad"]) > 95)
+    stopped_deg = emulator.get(mx28.GOAL_POSITION) * 360 / 4096
+    assert emulator.get(mx28.BUS_WATCHDOG) != mx28.WATCHDOG_TRIPPED
+    assert 95 < stopped_deg < 140
+    assert emulator.get(mx28.TORQUE_ENABLE) == 1  # it holds
+    before = servo.counters
+    servo.on_goal(goal(20))
+    assert servo.counters["goals while not live"] == before.get("goals while not live", 0) + 1
+
+
+def test_a_goal_that_is_not_reached_in_time_is_given_up(emulator):
+    servo = live(emulator, goal_slack_s=0.1)
+    with servo.listen() as records:
+        next(records)
+        emulator.stall()
+        servo.on_goal(goal(100, 55))
+        until(records, lambda s: s["goal_rad"] > math.radians(99))
+        states = until(records, lambda s: s["goal_rad"] < math.radians(91))
+        assert at(90)(states[-1])
+        emulator.free()
+        states = [json.loads(next(records).data) for _ in range(50)]
+        until(records, lambda _: servo.counters["goals_expired"] == 1)
+    assert all(at(90)(s) for s in states)  # it does not go on when it could
+
+
+def test_after_an_overload_it_is_rebooted_and_set_up_and_its_angle_is_told_meanwhile(emulator):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        emulator.stall(overload_s=0.05)
+        servo.on_goal(goal(120))
+        until(records, lambda s: s["error"] == mx28.OVERLOAD)
+        emulator.free()
+        states = until(records, lambda s: s["error"] == 0)
+        until(records, lambda _: servo.counters["connected"] == 1)
+        assert at(90)(states[-1])  # the goal from before does not come back
+        servo.on_goal(goal(120))
+        until(records, at(120))
+    assert servo.counters["reboots"] >= 1
+    assert servo.counters["set_ups"] == 2
+
+
+def test_without_leave_to_reboot_it_stays_down_and_says_so(emulator):
+    servo = live(emulator, reboot=False)
+    with servo.listen() as records:
+        next(records)
+        emulator.overload()
+        until(records, lambda s: s["error"] == mx28.OVERLOAD)
+        until(records, lambda _: servo.counters["connected"] == 0)
+        servo.on_goal(goal(120))
+        states = until(records, lambda _: servo.counters["goals_lost"] == 1)
+    assert at(90)(states[-1])
+    assert servo.counters["reboots"] == 0
+    assert emulator.get(mx28.TORQUE_ENABLE) == 0
+
+
+def test_an_error_that_it_does_not_shut_down_for_is_told_and_it_is_driven_on(emulator):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        emulator.overload(0x01)  # the supply's voltage; not among what it shuts down for from the factory
+        until(records, lambda s: s["error"] == 0x01)
+        servo.on_goal(goal(120))
+        assert until(records, at(120))[-1]["error"] == 0x01
+        emulator.torque_off()
+        until(records, lambda _: servo.counters["set_ups"] == 2)
+        servo.on_goal(goal(90))
+        until(records, at(90))
+    assert servo.counters["reboots"] == 0
+
+
+@pytest.mark.parametrize(
+    ("fault", "counter"),
+    [
+        (lambda e: e.torque_off(), "torque_losses"),
+        (lambda e: e.power_cycle(), "no_reply"),
+        (lambda e: e.set(mx28.BUS_WATCHDOG, mx28.WATCHDOG_TRIPPED), "watchdog_stops"),
+    ],
+    ids=["torque off", "power cycle", "watchdog"],
+)
+def test_a_servo_that_let_go_is_set_up_again_where_it_stands(emulator, fault, counter):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(170, 10))
+        until(records, lambda s: math.degrees(s["position_rad"]) > 93)
+        fault(emulator)
+        states = until(records, lambda _: servo.counters["set_ups"] == 2 and servo.counters["connected"] == 1)
+        assert math.degrees(states[-1]["goal_rad"]) < 110  # it stands; the old goal is forgotten
+        servo.on_goal(goal(60, 40))
+        until(records, at(60))
+        assert emulator.get(mx28.BUS_WATCHDOG) == 5
+    assert servo.counters[counter] >= 1
+
+
+def test_a_cable_that_is_pulled_and_put_back_is_found_again(emulator):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(170, 10))
+        until(records, lambda s: math.degrees(s["position_rad"]) > 93)
+        emulator.unplug()
+        eventually(lambda: emulator.get(mx28.BUS_WATCHDOG) == mx28.WATCHDOG_TRIPPED)  # it stopped by itself
+        emulator.plug_in()
+        states = until(records, lambda _: servo.counters["set_ups"] == 2)
+        assert math.degrees(states[-1]["position_rad"]) < 120
+        servo.on_goal(goal(60, 40))
+        until(records, at(60))
+    assert servo.counters["unplugged"] >= 1
+
+
+@pytest.mark.parametrize(
+    ("fault", "counter"),
+    [
+        (lambda e: e.bad_crc(3), "damaged"),
+        (lambda e: e.hold_back(), "wrong"),
+        (lambda e: e.short_data(3), "wrong"),
+        (lambda e: e.lie(3000, 1), "implausible"),
+        (lambda e: e.garbage(b"\xff\xff\xfd\x00\x01\x07\x00\x55" + bytes(7), 3), "damaged"),
+    ],
+    ids=["crc", "late", "short", "lie", "garbage"],
+)
+def test_spoilt_answers_are_counted_and_no_false_angle_comes_of_them(emulator, fault, counter):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        fault(emulator)
+        states = until(records, lambda _: servo.counters[counter] >= 1)
+        states += [json.loads(next(records).data) for _ in range(30)]
+    assert all(at(90)(s) for s in states)
+    assert servo.counters["set_ups"] == 1
+
+
+def test_a_place_that_is_told_twice_is_believed(emulator):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        emulator.lie(3000, 400)
+        until(records, lambda s: s["position_rad"] > 4)
+        until(records, lambda _: servo.counters["implausible"] >= 1)
+
+
+def test_when_its_process_is_killed_the_servo_stops_by_itself_and_another_process_takes_over(emulator):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(170, 5))
+        until(records, lambda s: math.degrees(s["position_rad"]) > 93)
+        os.kill(servo._process.pid, signal.SIGKILL)
+        eventually(lambda: emulator.get(mx28.BUS_WATCHDOG) == mx28.WATCHDOG_TRIPPED)
+        states = until(records, lambda _: servo.counters["process restarts"] == 1)
+        assert math.degrees(states[-1]["position_rad"]) < 110
+        servo.on_goal(goal(60, 40))
+        until(records, at(60))
+
+
+PARENT = """
+import sys
+from links.dynamixel import Servo
+from stages.messages import ServoGoal
+servo = Servo(port=sys.argv[1], watchdog_s=2.5)
+with servo.listen() as records:
+    next(records)
+    servo.on_goal(ServoGoal(stamp_ns=0, position_rad=3.0, speed_radps=0.5))
+    for record in records:
+        if servo.decode(record).position_rad > 1.65:
+            print(servo._process.pid, flush=True)
+            break
+    for record in records:
+        pass
+"""
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return "Z" not in open(f"/proc/{pid}/stat").read().rsplit(")", 1)[1].split()[0]
+
+
+def test_when_its_parent_is_killed_the_servo_is_stopped_and_its_process_ends(emulator):
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, str(emulator.path)], stdout=subprocess.PIPE, text=True)
+    with parent:
+        worker = int(parent.stdout.readline())
+        parent.kill()
+    eventually(lambda: not alive(worker))
+    assert emulator.get(mx28.BUS_WATCHDOG) != mx28.WATCHDOG_TRIPPED
+    goal_deg = emulator.get(mx28.GOAL_POSITION) * 360 / 4096
+    assert 94 < goal_deg < 130
+    eventually(lambda: abs(math.degrees(emulator.position_rad(np.array([time.monotonic_ns()]))[0]) - goal_deg) < 0.2)
+
+
+def refusal(servo):
+    with pytest.raises(LinkError) as caught, servo.listen() as records:
+        next(records)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "words"),
+    [
+        (mx28.MODEL_NUMBER, 29, "model number 29.*1.0 firmware.*DYNAMIXEL Wizard"),
+        (mx28.FIRMWARE_VERSION, 37, "firmware is version 37; from 38 on"),
+        (mx28.RETURN_DELAY_TIME, 250, r"Return Delay Time \(9\) is 250, not 0.*write_settings: true"),
+        (mx28.OPERATING_MODE, 4, r"Operating Mode \(11\) is 4, not 3"),
+        (mx28.DRIVE_MODE, 4, r"Drive Mode \(10\) is 4, not 0"),
+        (mx28.MAX_POSITION_LIMIT, 1500, r"Max Position Limit \(48\) is 1500, not 2048"),
+    ],
+)
+def test_a_servo_that_may_not_be_driven_is_an_error_that_says_what_to_change(emulator, register, value, words):
+    emulator.set(register, value)
+    servo = live(emulator)
+    with pytest.raises(LinkError, match=words), servo.listen() as records:
+        next(records)
+    assert emulator.get(mx28.TORQUE_ENABLE) == 0
+
+
+def test_with_leave_to_write_its_settings_are_corrected_and_kept(emulator):
+    emulator.set(mx28.RETURN_DELAY_TIME, 250)
+    emulator.set(mx28.OPERATING_MODE, 4)
+    emulator.set(mx28.TORQUE_ENABLE, 1)  # a run before was killed
+    with live(emulator, write_settings=True).listen() as records:
+        next(records)
+    assert emulator.get(mx28.RETURN_DELAY_TIME) == 0
+    assert emulator.get(mx28.OPERATING_MODE) == 3
+
+
+def test_no_servo_and_no_port_are_errors_that_say_what_to_check(emulator, tmp_path):
+    words = refusal(live(emulator, servo_id=7, start_timeout_s=0.2))
+    assert "the servo with id 7 does not answer at 1000000 baud" in words
+    assert "Is it powered (12 V) and wired" in words
+    words = refusal(Servo(port=str(tmp_path / "none"), start_timeout_s=0.2))
+    assert "cannot open" in words
+    assert "Is the USB adapter plugged in" in words
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"limits_deg": (90.0, 90.0)},
+        {"limits_deg": (-1.0, 90.0)},
+        {"limits_deg": (0.0, 361.0)},
+        {"baud": 9600},
+        {"rate_hz": 5},
+        {"servo_id": 253},
+        {"watchdog_s": 3},
+        {"watchdog_s": 0.1, "rate_hz": 20},
+        {"goal_slack_s": 0},
+        {"typo": 1},
+    ],
+)
+def test_impossible_settings_are_errors(setting):
+    with pytest.raises(ValidationError):
+        Servo(**setting)

@@ -1,0 +1,88 @@
+"""The host's timeline goes on evenly whatever is done to the wall clock."""
+
+from __future__ import annotations
+
+import pytest
+
+from links.host_time import MAX_AGE_NS, HostTime, from_wall_ns, now_ns
+
+START_NS = 1_750_000_000_000_000_000
+MS = 1_000_000
+
+
+class Clocks:
+    """A wall clock that can be set, and the monotonic clock under it."""
+
+    def __init__(self):
+        self.monotonic_ns, self.offset_ns = 5_000 * MS, START_NS
+
+    def wall(self):
+        return self.monotonic_ns + self.offset_ns
+
+    def monotonic(self):
+        return self.monotonic_ns
+
+
+@pytest.fixture
+def clocks():
+    return Clocks()
+
+
+@pytest.fixture
+def host(clocks):
+    return HostTime(clocks.wall, clocks.monotonic)
+
+
+def test_it_starts_at_the_wall_clocks_time_and_counts_the_monotonic_clock(clocks, host):
+    began = host.now_ns()
+    assert began == START_NS + 5_000 * MS
+    clocks.monotonic_ns += 7 * MS
+    assert host.now_ns() == began + 7 * MS
+
+
+@pytest.mark.parametrize("step_ns", [3_600_000 * MS, -3_600_000 * MS, 300 * MS, -40 * MS])
+def test_a_wall_clock_that_is_set_does_not_move_it(clocks, host, step_ns):
+    before = host.now_ns()
+    clocks.offset_ns += step_ns
+    assert host.now_ns() == before
+
+
+def test_a_kernel_stamp_keeps_its_age(clocks, host):
+    clocks.monotonic_ns += 50 * MS
+    stamp = clocks.wall() - 3 * MS
+    assert host.from_wall_ns(stamp) == host.now_ns() - 3 * MS
+
+
+@pytest.mark.parametrize("step_ns", [3_600_000 * MS, -3_600_000 * MS, 300 * MS, -40 * MS, 2 * MS])
+def test_a_stamp_from_before_the_clock_was_set_is_taken_as_now_and_later_ones_are_right_again(clocks, host, step_ns):
+    clocks.monotonic_ns += 20 * MS
+    host.from_wall_ns(clocks.wall())
+    clocks.monotonic_ns += 20 * MS
+    old = [clocks.wall() - 2 * MS, clocks.wall() - MS]  # still in the socket's buffer when the clock is set
+    clocks.offset_ns += step_ns
+    for stamp in old:
+        clocks.monotonic_ns += 100_000
+        assert host.from_wall_ns(stamp) == host.now_ns()
+    assert host.steps == 1
+    clocks.monotonic_ns += 10 * MS
+    assert host.from_wall_ns(clocks.wall() - MS) == host.now_ns() - MS
+
+
+def test_a_wall_clock_that_is_slewed_is_followed(clocks, host):
+    for _ in range(100):
+        clocks.monotonic_ns += 1_000 * MS
+        clocks.offset_ns += MS // 2  # 500 ppm
+        assert host.from_wall_ns(clocks.wall() - 2 * MS) == host.now_ns() - 2 * MS
+    assert host.steps == 0
+
+
+def test_a_stamp_from_the_future_or_from_long_ago_is_taken_as_now(clocks, host):
+    clocks.monotonic_ns += 10 * MAX_AGE_NS
+    assert host.from_wall_ns(clocks.wall() + MS) == host.now_ns()
+    assert host.from_wall_ns(clocks.wall() - MAX_AGE_NS - 1) == host.now_ns()
+
+
+def test_the_process_has_one_timeline():
+    before = now_ns()
+    between = from_wall_ns(0)
+    assert before <= between <= now_ns()

@@ -27,11 +27,12 @@ import numpy as np
 import rerun as rr
 
 from flow.message import Message
-from links.viewer import colours, draw_cameras, draw_drone, draw_rotation, draw_sensors
+from links.viewer import colours, draw_cameras, draw_drone, draw_pose, draw_rotation, draw_sensors
 from links.viewer.marks import Marks, plot, say, state
 from links.viewer.scene import Mark, Scene
 from links.viewer.slices import thin
 from stages.messages import (
+    AutopilotEstimator,
     Candidates,
     DepthImage,
     Detections,
@@ -39,9 +40,11 @@ from stages.messages import (
     DroneMotion,
     Image,
     LidarFirings,
+    RelativePose,
     RelativeRotation,
     ScoreImage,
     ServoGoal,
+    ServoOffset,
     ServoState,
     SweptPoints,
     SweptPulses,
@@ -75,6 +78,9 @@ draw.register(Image)(draw_cameras.image)
 draw.register(VanishingDirections)(draw_cameras.vanishing_directions)
 draw.register(RelativeRotation)(draw_rotation.relative_rotation)
 draw.register(DroneMotion)(draw_rotation.drone_motion)
+draw.register(RelativePose)(draw_pose.relative_pose)
+draw.register(AutopilotEstimator)(draw_pose.autopilot_estimator)
+draw.register(ServoOffset)(draw_pose.servo_offset)
 
 
 def _draw_field(value: Any, name: str, scene: Scene) -> Marks:

@@ -25,7 +25,8 @@ class Vision(NamedTuple):
 
     pictures: Sequence[str] = ()  # frame ids
     directions: bool = False
-    rotation: bool = False
+    rotation: bool = False  # between the cameras' directions
+    pose: bool = False  # fused, with a rotation
     odometry: bool = False
 
 
@@ -33,7 +34,7 @@ def layout(*, images: bool, evidence: bool, vision: Vision) -> rrb.Blueprint:
     """The blueprint. Views ask for groups of entities, whatever the stages are called: see `links/viewer/draw.py`.
 
     `images`: the graph has depth images to show; `evidence`: it has candidates with reasons and a probability;
-    `vision`: with anything of the cameras it has a third column, on the right.
+    `vision`: with anything of the cameras, or a fused pose, it has a third column, on the right.
     """
     scene = _space(
         "Vehicle frame: last returns (blue low, white high), LiDAR fan, drone with 95 % ellipsoid",
@@ -120,6 +121,7 @@ def _of_cameras(vision: Vision) -> list[tuple[int, rrb.View | rrb.Container]]:
         rows.append((24, _space(name, contents, frame=sphere_frame(Carrier.VEHICLE), eye=eye, grid_m=None)))
     if vision.rotation:
         rows.append((13, _curves("Branch of the rotation [%]", "/plots/branch/**")))
+    if vision.rotation or vision.pose:
         rows.append((11, _curves("The drone in the vehicle's axes [deg]", "/plots/rotation/**")))
         rows.append((10, _curves("Sigma of the rotation [deg]", "/plots/rotation_sigma/**")))
     if vision.odometry:

@@ -37,6 +37,10 @@ _LANE = {
     "NONE": colours.NEUTRAL,
     "moves": colours.GOOD,
     "no motion": colours.NEUTRAL,
+    "FULL": colours.GOOD,
+    "POSITION_ONLY": colours.MAYBE,
+    "fused": colours.GOOD,
+    "not fused": colours.BAD,
 }
 
 

@@ -168,13 +168,14 @@ class Viewer(Tap):
                 self._errors[f"{output} could not be drawn: {type(error).__name__}: {error}"] += 1
 
     def _vision(self, run: Run) -> Vision:
-        """What of the cameras there is to show."""
+        """What of the cameras and the fused pose there is to show."""
         directions = _made(run, "vanishing_directions")
         pictures = self.cameras.named() or [f"camera_{carrier.value}" for carrier in Carrier]
         return Vision(
             pictures=pictures if directions or _made(run, "image") else [],
             directions=directions,
             rotation=_made(run, "relative_rotation"),
+            pose=_made(run, "relative_pose"),
             odometry=_made(run, "drone_motion"),
         )
 

@@ -1,0 +1,121 @@
+"""The fused pose in the viewer, and what the autopilot makes of it: states, jumps, what is not known."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import rerun.blueprint as rrb
+from shown import drawn, numbers, page, scene
+
+from links.viewer.layout import Vision, layout
+from stages.geometry import rotation_from_rpy_deg
+from stages.messages import AutopilotEstimator, PoseState, RelativePose, ServoOffset
+
+NAME = "fuse/relative_pose"
+R = rotation_from_rpy_deg((0.0, 0.0, 90.0))
+
+
+def pose(**changes) -> RelativePose:
+    covariance = np.diag([1e-4, 4e-4, 9e-4, 0.04, 0.09, 0.16])
+    full = RelativePose(
+        stamp_ns=2_000_000_000,
+        state=PoseState.FULL,
+        reason="all there",
+        measured_ns=1_900_000_000,
+        track_id=1,
+        xyz_vehicle_m=np.array([1.0, 2.0, 10.0]),
+        R_vehicle_drone=R,
+        covariance=covariance,
+        velocity_vehicle_mps=np.zeros(3),
+        xyz_start_m=np.array([1.0, 2.0, 10.0]),
+        R_start_drone=R,
+        start_covariance=covariance,
+        velocity_start_mps=np.zeros(3),
+        velocity_covariance=np.eye(3),
+        resets=0,
+        nis=2.5,
+    )
+    return dataclasses.replace(full, **changes)
+
+
+def scalars(mark) -> list[float]:
+    return numbers(mark.parts[0].scalars).ravel().tolist()
+
+
+def test_a_full_pose_has_axes_curves_and_sigmas_in_the_vehicle_s_axes():
+    marks = drawn(pose(), NAME)
+    np.testing.assert_allclose(scalars(marks[f"plots/position/{NAME}"]), [1.0, 2.0, 10.0])
+    # tangent at the body: its x lies along the vehicle's y
+    np.testing.assert_allclose(scalars(marks[f"plots/sigma/{NAME}"]), [0.3, 0.2, 0.4], atol=1e-12)
+    np.testing.assert_allclose(scalars(marks[f"plots/rotation/{NAME}"]), [0.0, 0.0, 90.0], atol=1e-9)
+    np.testing.assert_allclose(scalars(marks[f"plots/other/{NAME}/age"]), [0.1])
+    arrows = marks[f"vehicle/{NAME}/axes"].parts[0]
+    np.testing.assert_allclose(numbers(arrows.vectors).reshape(3, 3)[0], [0.0, 0.8, 0.0], atol=1e-6)
+    assert page(marks["now"]).startswith("**fuse:** FULL: 1.00 / 2.00 / 10.00 m, sigma 0.30 / 0.20 / 0.40 m; roll")
+
+
+def test_without_a_rotation_no_axes_and_no_angles_are_shown():
+    unknown = np.diag([math.inf] * 3 + [0.04, 0.09, 0.16])
+    where = scene()
+    drawn(pose(), NAME, where)
+    marks = drawn(pose(state=PoseState.POSITION_ONLY, R_vehicle_drone=None, covariance=unknown), NAME, where)
+    np.testing.assert_allclose(scalars(marks[f"plots/sigma/{NAME}"]), [0.2, 0.3, 0.4], atol=1e-12)
+    assert f"plots/rotation/{NAME}" not in marks
+    assert "Clear" in type(marks[f"vehicle/{NAME}/axes"].parts[0]).__name__
+
+
+def test_a_lost_pose_clears_all_and_a_jump_is_said():
+    where = scene()
+    drawn(pose(), NAME, where)
+    assert "the pose jumped, 1 so far: a new branch" in str(
+        drawn(pose(resets=1, reason="a new branch"), NAME, where)[f"log/{NAME}"].parts[0].text.as_arrow_array()
+    )
+    lost = pose(state=PoseState.LOST, xyz_vehicle_m=None, R_vehicle_drone=None, covariance=None, reason="no drone")
+    marks = drawn(lost, NAME, where)
+    assert "Clear" in type(marks[f"vehicle/{NAME}"].parts[0]).__name__
+    assert f"plots/position/{NAME}" not in marks
+    assert page(marks["now"]) == "**fuse:** LOST: no drone"
+
+
+def test_what_the_autopilot_does_not_fuse_is_said_in_words():
+    estimator = AutopilotEstimator(
+        stamp_ns=0,
+        attitude_good=True,
+        velocity_good=True,
+        position_good=False,
+        height_good=True,
+        constant_position=True,
+        velocity_ratio=0.1,
+        horizontal_ratio=1.7,
+        height_ratio=0.2,
+        compass_ratio=math.nan,
+        flags=5,
+    )
+    marks = drawn(estimator, "autopilot/autopilot_estimator")
+    assert page(marks["now"]) == "**autopilot, its EKF:** no good position; it pretends to stand still"
+    np.testing.assert_allclose(scalars(marks["plots/other/autopilot/autopilot_estimator"])[:3], [0.1, 1.7, 0.2])
+
+
+def test_a_servo_offset_is_shown_beside_the_rig_s():
+    offset = ServoOffset(stamp_ns=0, offset_s=0.0012, sigma_s=0.0001, rig_s=0.002, windows=2, reason="told")
+    marks = drawn(offset, "servo_clock/servo_offset")
+    assert page(marks["now"]) == "**servo_clock:** 1.20 +- 0.10 ms, the rig says 2.00 ms; told"
+    nothing = drawn(dataclasses.replace(offset, offset_s=None, sigma_s=None), "servo_clock/servo_offset")
+    assert list(nothing) == ["now"]
+
+
+def names(view) -> list[str]:
+    """Names of all views below."""
+    if isinstance(view, rrb.View):
+        return [str(view.name)]
+    return [name for part in view.contents for name in names(part)]
+
+
+def test_a_graph_that_fuses_without_cameras_shows_the_rotation():
+    def shown(vision):
+        return set(names(layout(images=False, evidence=True, vision=vision).root_container))
+
+    added = shown(Vision(pose=True)) - shown(Vision())
+    assert added == {"The drone in the vehicle's axes [deg]", "Sigma of the rotation [deg]"}

@@ -164,6 +164,12 @@ def simulate_matrix(
     autopilot: Annotated[
         bool, typer.Option("--autopilot", help="The drone tells over a radio how it flies, and flies by its dynamics.")
     ] = False,
+    cameras_hz: Annotated[
+        float | None,
+        typer.Option(
+            "--cameras", metavar="HZ", min=1, max=15, help="Two 720 px fisheyes at this rate; 0.8 s of a core a pair."
+        ),
+    ] = None,
     results: Annotated[
         Path | None,
         typer.Option(
@@ -207,7 +213,7 @@ def simulate_matrix(
             out.print(cell.name, markup=False)
         return
     with progress_bar(f"{len(wanted) * seeds} recordings") as step:
-        conditions = Conditions(calibrated, odometry, rain, autopilot)
+        conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz)
         report = make_matrix(folder, wanted, range(1, seeds + 1), closed_loop, step, conditions, results, jobs)
     for text in report.impossible:
         warn(text)

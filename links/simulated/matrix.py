@@ -18,6 +18,7 @@ from itertools import product
 import numpy as np
 
 from links.simulated.autopilot import AutopilotSettings
+from links.simulated.camera import CameraSettings, CamerasSettings
 from links.simulated.clearance import sample_times_s
 from links.simulated.drone import DroneModel
 from links.simulated.matrix_flights import CAMERA_HEIGHT_M, Cell, drone_path, two_paths, vehicle_path
@@ -59,6 +60,7 @@ class Conditions:
     odometry: bool = False  # the vehicle tells where it drives
     rain: bool = False  # 5 mm/h
     autopilot: bool = False  # the drone tells how it flies, over a radio
+    cameras_hz: float | None = None  # two 720 px fisheyes; None: none
 
 
 def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
@@ -111,8 +113,17 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         script=SWEEPS if cell.motion in SEARCHING else SWEEP_THEN_FOLLOW,
         truth_visible=bool(drones),
         autopilot=AutopilotSettings() if conditions.autopilot and drones else None,
+        cameras=_cameras(conditions.cameras_hz, bool(drones)),
         weather=RAIN if conditions.rain else Weather(),
         vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,
         rig=RigLidar(mount=known) if conditions.calibrated else straight,
         true_mount=straight.mount if conditions.calibrated else None,
     )
+
+
+def _cameras(rate_hz: float | None, drone: bool) -> CamerasSettings:
+    """The vehicle's and, where there is a drone to carry it, the drone's."""
+    if rate_hz is None:
+        return CamerasSettings()
+    one = CameraSettings(rate_hz=rate_hz)
+    return CamerasSettings(vehicle=one, drone=one if drone else None)

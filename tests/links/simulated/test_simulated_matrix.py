@@ -203,6 +203,18 @@ def test_odometry_and_rain_are_added_to_a_cell_and_change_nothing_else() -> None
     assert both.changed(vehicle_odometry=None, weather={}) == scenario_of(cell, 3)
 
 
+def test_cameras_are_added_to_a_cell_and_change_nothing_else() -> None:
+    cell = Cell("open_lot", 20, "hover", "driving")
+    seen = scenario_of(cell, 3, Conditions(cameras_hz=4.0))
+    assert seen.cameras.vehicle is not None
+    assert seen.cameras.drone is not None
+    assert (seen.cameras.vehicle.rate_hz, seen.cameras.drone.rate_hz) == (4.0, 4.0)
+    assert seen.changed(cameras={}) == scenario_of(cell, 3)
+    nobody = scenario_of(Cell("open_lot", 0, "empty", "parked"), 3, Conditions(cameras_hz=4.0))
+    assert nobody.cameras.vehicle is not None
+    assert nobody.cameras.drone is None
+
+
 def test_a_seed_makes_one_scenario_and_another_seed_another() -> None:
     cell = Cell("park_edge", 30, "cross", "driving")
     assert scenario_of(cell, 1) == scenario_of(cell, 1)

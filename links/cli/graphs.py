@@ -13,14 +13,18 @@ from typing import Annotated
 import typer
 
 from flow.draw import mermaid, svg
-from flow.graph import load_graph
+from flow.graph import Graph, load_graph
+from flow.hosts import Hosts
+from flow.hosts_file import load_hosts
 from flow.problem import ConfigError
 from flow.schema import schema as schema_of
-from links.cli.console import FINDING, err, in_words, out
+from links.cli.console import FINDING, WRONG_USE, err, in_words, out
 from links.cli.run import Overlay, Sets
+from links.zenoh import host_graph
 
 Config = Annotated[Path, typer.Argument(help="Configuration file.")]
 OutFile = Annotated[Path | None, typer.Option("--out", "-o", help="File to write [default: the terminal].")]
+HostsFile = Annotated[Path | None, typer.Option("--hosts", help="A hosts file: which host runs what.")]
 
 
 class Format(StrEnum):
@@ -31,8 +35,8 @@ class Format(StrEnum):
 
 
 @in_words
-def check(config: Config, overlay: Overlay = None, sets: Sets = None) -> None:
-    """Say everything that is wrong with CONFIG.
+def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: HostsFile = None) -> None:
+    """Say everything that is wrong with CONFIG, and with the hosts file where one is given.
 
     Each problem with its line and a suggestion; exit code 1 when there is one.
 
@@ -40,12 +44,26 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None) -> None:
     """
     try:
         graph = load_graph(config, overlay or (), sets or ())
+        placed = load_hosts(hosts, graph) if hosts is not None else None
     except ConfigError as error:
         for problem in error.problems:
             err.print(str(problem), markup=False, style="red")
         raise typer.Exit(FINDING) from None
     stages = sum(spec.kind == "stages" for spec in graph.nodes.values())
     out.print(f"{config}: {stages} stages, {len(graph.nodes) - stages} links, {len(graph.edges)} edges, no problems")
+    if placed is not None:
+        _tell_hosts(placed)
+
+
+def _tell_hosts(hosts: Hosts) -> None:
+    """What each host runs and sends."""
+    for name in hosts.hosts:
+        nodes = [node for node in hosts.graph.nodes if hosts.place[node] == name]
+        hub = ", the hub" if name == hosts.hub else ""
+        out.print(f"{name}{hub}: runs {', '.join(nodes) or 'nothing'}", markup=False)
+        for hop in hosts.hops:
+            if hop.sender == name:
+                out.print(f"  to {hop.receiver}: {hop.producer}.{hop.output} ({hop.waiting})", markup=False)
 
 
 @in_words
@@ -55,13 +73,33 @@ def graph(
     out_file: OutFile = None,
     overlay: Overlay = None,
     sets: Sets = None,
+    hosts: HostsFile = None,
+    host: Annotated[str | None, typer.Option("--host", help="Draw what this one of the hosts runs.")] = None,
 ) -> None:
-    """Draw the graph of CONFIG.
+    """Draw the graph of CONFIG; with --hosts a box around what each host runs, with --host what that one runs.
 
     Example: grd graph configs/paper.yaml --format svg -o graph.svg
     """
     checked = load_graph(config, overlay or (), sets or ())
-    _write(svg(checked) if format is Format.SVG else mermaid(checked), out_file)
+    if host is not None and hosts is None:
+        err.print("--host NAME needs --hosts FILE")
+        raise typer.Exit(WRONG_USE)
+    if hosts is not None and host is None and format is Format.SVG:
+        err.print("an SVG shows one host: say --host NAME, or draw all of them as mermaid")
+        raise typer.Exit(WRONG_USE)
+    if hosts is not None and host is not None:
+        checked = host_graph(checked, hosts, host)
+    boxes = _boxes(checked, load_hosts(hosts, checked)) if hosts is not None and host is None else ""
+    _write(svg(checked) if format is Format.SVG else mermaid(checked) + boxes, out_file)
+
+
+def _boxes(graph: Graph, hosts: Hosts) -> str:
+    """Mermaid subgraphs: what each host runs."""
+    lines: list[str] = []
+    for name in hosts.hosts:
+        inside = [f"        {node}" for node in graph.nodes if hosts.place[node] == name]
+        lines += [f"    subgraph {name}", *inside, "    end"] if inside else []
+    return "\n".join(lines) + "\n"
 
 
 @in_words

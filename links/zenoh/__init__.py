@@ -1,0 +1,38 @@
+"""Edges between hosts over Eclipse Zenoh: `host_graph` gives the graph that one host of a hosts file runs.
+
+Source: DESIGN, Hosts and Links: Zenoh.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flow.graph import Graph, NodeSpec
+from flow.hosts import Hop, Hosts, part_of
+from flow.hosts_file import load_hosts
+from links.zenoh.receiver import Receiver, receiver_class
+from links.zenoh.sender import Sender, sender_class
+from links.zenoh.session import Session, session_of
+
+__all__ = ["Receiver", "Sender", "Session", "ZenohEnds", "host_graph", "session_of"]
+
+TOPIC = "/hosts/"
+
+
+class ZenohEnds:
+    """Makes the nodes at the ends of hops."""
+
+    def receiver(self, hosts: Hosts, name: str, hops: list[Hop]) -> NodeSpec:
+        """A source with the name of the node that it stands for; its topic is /hosts/<name>."""
+        config = {"topic": TOPIC + name, "session": session_of(hosts, hops[0].receiver), "sender": hops[0].sender}
+        return NodeSpec(name, "links", "links.zenoh.Receiver", receiver_class(hops), config)
+
+    def sender(self, hosts: Hosts, name: str, hops: list[Hop]) -> NodeSpec:
+        """A sink with a port for each hop; its topic has no records."""
+        config = {"topic": TOPIC + name, "session": session_of(hosts, hops[0].sender), "to": hops[0].receiver}
+        return NodeSpec(name, "links", "links.zenoh.Sender", sender_class(hops), config)
+
+
+def host_graph(graph: Graph, hosts_file: Path, host: str) -> Graph:
+    """The graph that `host` runs. ConfigError with all that is wrong in the hosts file."""
+    return part_of(load_hosts(hosts_file, graph), host, ZenohEnds())

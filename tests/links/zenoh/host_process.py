@@ -1,0 +1,46 @@
+"""One host of a test as a process of its own: `host_process.py CONFIG HOSTS NAME [clock ahead in s]`.
+
+Runs its part of the graph live; without a hosts file (`-`) all of it. Lines come in on stdin: `report` answers with a line of counters, end of file stops.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+ahead_ns = round(float(sys.argv[4]) * 1e9) if len(sys.argv) > 4 else 0
+wall_ns = time.time_ns
+time.time_ns = lambda: wall_ns() + ahead_ns  # before anything reads it: this host's clock was set wrongly
+
+from flow.graph import load_graph  # noqa: E402
+from flow.live import Live  # noqa: E402
+from links.host_time import now_ns  # noqa: E402
+from links.zenoh import host_graph  # noqa: E402
+
+
+def say(**what: object) -> None:
+    sys.stdout.write(json.dumps(what) + "\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    graph = load_graph(Path(sys.argv[1]))
+    if sys.argv[2] != "-":
+        graph = host_graph(graph, Path(sys.argv[2]), sys.argv[3])
+    live = Live(graph, now_ns=now_ns)
+    live.start()
+    say(kind="started")
+    for line in sys.stdin:
+        if line.strip() == "report":
+            report = live.report()
+            troubles = {name: link.trouble for name, link in live.nodes.items() if link.trouble}
+            incidents = [str(incident) for incident in report.incidents]
+            say(kind="report", counters=report.counters, troubles=troubles, incidents=incidents)
+    begin_s = time.monotonic()
+    live.stop()
+    say(kind="stopped", took_s=time.monotonic() - begin_s)
+
+
+main()

@@ -1,0 +1,160 @@
+"""Edges that cross hosts, with processes, TLS and the live runner: what goes through, what is refused, what comes back."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+
+import pytest
+from certificates import make_all, need_openssl
+from hosts_running import HostProcess, free_port, write_config, write_hosts
+from proxy import Proxy
+
+needs_zenoh = pytest.mark.skipif(
+    importlib.util.find_spec("zenoh") is None, reason="needs Eclipse Zenoh: pip install -e '.[hosts]'"
+)
+pytestmark = needs_zenoh
+DRONE_SIDE = {"beats": "drone", "echo": "vehicle", "teller": "vehicle"}
+
+
+@pytest.fixture(scope="module")
+def signed(tmp_path_factory):
+    """A folder with certificates."""
+    need_openssl()
+    folder = tmp_path_factory.mktemp("certificates")
+    make_all(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(signed, tmp_path):
+    for file in signed.iterdir():
+        shutil.copy(file, tmp_path)
+    return tmp_path
+
+
+def test_a_cycle_through_two_hosts_whose_clocks_are_an_hour_apart(folder):
+    """Drone: beats and teller. Vehicle: the echo between them. Every time is right on the host that reads it."""
+    config = write_config(folder)
+    hosts = write_hosts(folder, f"127.0.0.1:{free_port()}", {"beats": "drone", "echo": "vehicle", "teller": "drone"})
+    with (
+        HostProcess(config, hosts, "vehicle", ahead_s=-3600.0) as vehicle,
+        HostProcess(config, hosts, "drone") as drone,
+    ):
+        beats = drone.wait_for("beat", 100)
+        there, back = vehicle.report()["counters"]["beats"], drone.report()["counters"]["echo"]
+        assert [b["number"] for b in beats] == list(range(beats[0]["number"], beats[0]["number"] + 100))
+        wrong_ms = [abs(b["late_ms"] - b["true_late_ms"]) for b in beats]
+        assert max(wrong_ms) < 50.0  # two translations, each refused when it is not known to 25 ms
+        assert wrong_ms[-1] * 1000 < there["clock uncertainty [us]"] + back["clock uncertainty [us]"] + 1000
+        assert {round(b["earlier_ms"], 6) for b in beats} == {1.0}
+        assert abs(there["clock offset [us]"] + 3_600_000_000) < 2_000_000
+        assert abs(back["clock offset [us]"] - 3_600_000_000) < 2_000_000
+        assert there["lost"] == back["lost"] == 0
+        assert vehicle.stop() < 2.0
+        assert drone.stop() < 2.0
+
+
+def test_the_hub_hands_on_between_two_others(folder):
+    config = write_config(folder, every=1)
+    hosts = write_hosts(folder, f"127.0.0.1:{free_port()}", {"beats": "drone", "echo": "drone", "teller": "base"})
+    with (
+        HostProcess(config, hosts, "vehicle", ahead_s=100.0) as vehicle,
+        HostProcess(config, hosts, "drone", ahead_s=-50.0),
+        HostProcess(config, hosts, "base") as base,
+    ):
+        beat, picture = base.wait_for("beat", 20)[-1], base.wait_for("picture")[0]
+        assert abs(beat["late_ms"] - beat["true_late_ms"]) < 50.0
+        assert abs(picture["late_ms"]) < 5000.0
+        assert {"echo", "beats", "to_base"} <= set(vehicle.report()["counters"])
+
+
+def test_a_certificate_of_another_authority_is_not_taken_in(folder):
+    config = write_config(folder)
+    listen = f"127.0.0.1:{free_port()}"
+    honest = write_hosts(folder, listen, DRONE_SIDE)
+    rogue = write_hosts(folder, listen, DRONE_SIDE, name="rogue.yaml", drone="rogue")
+    with HostProcess(config, honest, "vehicle") as vehicle, HostProcess(config, rogue, "drone") as intruder:
+        intruder.wait_for("started")
+        said = intruder.until_trouble("to_vehicle", "does not take us in")
+        assert "of the same authority (ca.pem)?" in said
+        assert vehicle.report()["counters"]["beats"]["received"] == 0
+        assert vehicle.of("beat") == []
+        with HostProcess(config, honest, "drone"):  # and the hub is as well as before
+            vehicle.wait_for("beat", 3)
+        assert intruder.stop() < 2.0
+
+
+def test_a_host_cannot_say_what_another_one_s_nodes_say(folder):
+    """A drone that was taken over: its certificate is good, its hosts file says that it runs what the base runs."""
+    config = write_config(folder)
+    listen = f"127.0.0.1:{free_port()}"
+    honest = write_hosts(folder, listen, {"beats": "base", "echo": "vehicle", "teller": "vehicle"})
+    taken = write_hosts(folder, listen, DRONE_SIDE, name="taken.yaml")
+    posing = write_hosts(folder, listen, {**DRONE_SIDE, "beats": "base"}, name="posing.yaml")
+    posing.write_text(posing.read_text().replace("base.pem", "drone.pem").replace("base.key", "drone.key"))
+    with HostProcess(config, honest, "vehicle") as vehicle:
+        with HostProcess(config, taken, "drone") as drone, HostProcess(config, posing, "base") as poser:
+            drone.wait_for("started")
+            poser.wait_for("started")
+            drone.until_trouble("to_vehicle", "vehicle")
+            poser.until_trouble("to_vehicle", "vehicle")
+            assert vehicle.report()["counters"]["beats"]["received"] == 0
+            assert vehicle.of("beat") == []
+        with HostProcess(config, honest, "base"):
+            vehicle.wait_for("beat", 3)
+
+
+def test_a_line_that_was_cut_comes_back(folder):
+    """Cut for longer than Zenoh's lease, with a picture on its way. What is sent then is new; the old is counted."""
+    config = write_config(folder, rate_hz=50.0, every=5, size_px=512)
+    port = free_port()
+    with Proxy(port) as proxy:
+        hosts = write_hosts(folder, f"127.0.0.1:{port}", DRONE_SIDE, connect=f"127.0.0.1:{proxy.port}")
+        with (
+            HostProcess(config, hosts, "vehicle", ahead_s=-3600.0) as vehicle,
+            HostProcess(config, hosts, "drone") as drone,
+        ):
+            vehicle.wait_for("picture", 3)
+            proxy.cut()
+            vehicle.until_trouble("beats", "has not answered for")
+            before = drone.report()["counters"]["to_vehicle"]
+            proxy.mend()
+            newest = vehicle.lines[-1].get("number", 0)
+            vehicle.until(lambda line: line["kind"] == "picture" and line["number"] > newest + 50)
+            beat = vehicle.wait_for("beat", 10)[-1]
+            assert before["dropped: beats.picture"] >= 10
+            assert before["late: beats.beat"] > 0
+            assert beat["true_late_ms"] < 2000.0
+            assert abs(beat["late_ms"] - beat["true_late_ms"]) < 50.0
+            numbers = [line["number"] for line in vehicle.of("beat")]
+            assert numbers == sorted(set(numbers))
+            vehicle.until_trouble("beats", None)
+            assert drone.stop() < 2.0
+
+
+def test_a_host_that_starts_anew_is_heard_anew(folder):
+    """Its clock and its counting begin again: nothing of the first run is used for the second."""
+    config = write_config(folder)
+    hosts = write_hosts(folder, f"127.0.0.1:{free_port()}", DRONE_SIDE)
+    with HostProcess(config, hosts, "vehicle") as vehicle:
+        with HostProcess(config, hosts, "drone", ahead_s=1000.0):
+            vehicle.until(lambda line: line.get("number", 0) > 200)
+        with HostProcess(config, hosts, "drone", ahead_s=-2.0):
+            vehicle.until(lambda line: line.get("number", 200) < 200)
+            beat = vehicle.wait_for("beat", 20)[-1]
+            assert abs(beat["late_ms"] - beat["true_late_ms"]) < 50.0
+            assert vehicle.report()["counters"]["beats"]["restarts of the other host"] == 1
+
+
+def test_two_hubs_on_one_port_are_told_apart(folder):
+    config = write_config(folder)
+    hosts = write_hosts(folder, f"127.0.0.1:{free_port()}", DRONE_SIDE)
+    with HostProcess(config, hosts, "vehicle") as first:
+        first.wait_for("started")
+        with HostProcess(config, hosts, "drone"):
+            first.wait_for("beat")
+            with HostProcess(config, hosts, "vehicle") as second:
+                second.wait_for("started")
+                said = second.until_trouble("beats", "cannot open tls/127.0.0.1:")
+    assert "Address already in use" in said

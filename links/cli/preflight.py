@@ -1,0 +1,104 @@
+"""`grd preflight`: everything that a configuration declares, checked before the flight; go or no go in words.
+
+Source: DESIGN, Command line; the checks are in `links/preflight`.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.text import Text
+
+from flow.link import LinkError
+from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+from links.cli.run import Overlay, Sets
+from links.live_run import live_graph
+from links.preflight import Level, Step, Verdict, is_go, preflight_live, preflight_recording
+from links.recording import RecordingReader
+from links.run_folder import Asked
+
+COLOURS = {Level.OK: "green", Level.WARNING: "yellow", Level.FAIL: "red"}
+WORDS = {Level.OK: "ok", Level.WARNING: "look", Level.FAIL: "NO GO"}
+
+
+@in_words
+def preflight(
+    config: Annotated[Path, typer.Argument(help="The configuration to fly with, as configs/field.yaml.")],
+    overlay: Overlay = None,
+    sets: Sets = None,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Check a recording instead of what is connected.")
+    ] = None,
+    for_s: Annotated[
+        float, typer.Option("--for", min=0.5, max=600, metavar="SECONDS", help="Live: listen so long.")
+    ] = 5.0,
+    motion: Annotated[
+        bool,
+        typer.Option(
+            "--motion/--no-motion", help="Move the drone by hand; in a recording: compare axes, track the drone."
+        ),
+    ] = True,
+    step_s: Annotated[
+        float, typer.Option("--step", min=0.5, max=120, metavar="SECONDS", help="Time for each motion by hand.")
+    ] = 6.0,
+) -> None:
+    """Check LiDAR, servo, cameras, autopilot, clocks, parameters and axes; say GO or NO-GO.
+
+    Live, the turntable holds still at first; for the motions by hand it turns. Poses are not sent to the autopilot.
+    Warnings ("look") are for you to judge. Exit code 0: go, 1: no go, 2: wrong use.
+
+    Example: grd preflight configs/field.yaml --set lidar.bind=192.168.1.100 --set lidar.sender=192.168.1.201
+    """
+    asked = Asked(config, tuple(overlay or ()), tuple(sets or ()))
+    if recording is None:
+        verdicts = _told(preflight_live(live_graph(asked), for_s, _wait, _ask if motion else None, step_s))
+    else:
+        verdicts = _on_recording(asked, recording, motion)
+    failed = [v for v in verdicts if v.level is Level.FAIL]
+    looks = sum(v.level is Level.WARNING for v in verdicts)
+    more = f"; {looks} to look at" if looks else ""
+    if is_go(verdicts):
+        out.print(Text(f"GO: {len(verdicts)} checks, none forbids the flight{more}", style="bold green"))
+        return
+    names = ", ".join(v.name for v in failed)
+    out.print(Text(f"NO-GO: {len(failed)} of {len(verdicts)} checks failed ({names}){more}", style="bold red"))
+    raise typer.Exit(FINDING)
+
+
+def _on_recording(asked: Asked, recording: Path, motion: bool) -> list[Verdict]:
+    with RecordingReader(recording) as reader, progress_bar(f"look through {recording.name}") as step:
+        graph = asked.graph(reader.rig_yaml, f"{recording} (rig.yaml)")
+        verdicts = list(preflight_recording(graph, reader, motion, step))
+        for text in reader.warnings:
+            warn(text)
+    return _told(iter(verdicts))
+
+
+def _told(verdicts: Iterator[Verdict]) -> list[Verdict]:
+    """Each verdict in a line, as it is known."""
+    told: list[Verdict] = []
+    for verdict in verdicts:
+        line = Text(f"{WORDS[verdict.level]:<6}", style=COLOURS[verdict.level]).append(
+            f"{verdict.name}: ", style="bold"
+        )
+        out.print(line.append(verdict.sentence, style="default"))
+        told.append(verdict)
+    if not told:
+        raise LinkError("this configuration has nothing to check")
+    return told
+
+
+def _wait(seconds: float) -> None:
+    time.sleep(seconds)
+
+
+def _ask(step: Step) -> None:
+    """Say what to do; a person at a terminal says when they begin."""
+    err.print(step.ask, markup=False, style="bold")
+    if sys.stdin.isatty():
+        typer.prompt("Enter when you begin", default="", show_default=False, err=True)

@@ -1,0 +1,59 @@
+"""Is a camera as it must be: frames, their size against the rig's lens, their rate.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from links.camera import Camera
+from links.preflight.heard import CameraSeen, Heard
+from links.preflight.verdict import Verdict, fail, ok, warning
+
+LEAST_HZ = 1.0
+FULL_RATE = 0.5  # of what was asked of the device
+
+
+def camera_checks(heard: Heard, rig_px: tuple[int, int] | None) -> Iterator[Verdict]:
+    """All checks of one camera; `rig_px`: width, height that the lens was calibrated for; None: the rig is silent."""
+    link, seen = heard.link, heard.seen
+    assert isinstance(link, Camera)
+    assert isinstance(seen, CameraSeen)
+    if not seen.sizes_px:
+        refused = f"{seen.arrivals.count} records came that hold no picture; " if seen.arrivals.count else ""
+        yield fail(f"{heard.name} frames", f"{refused}{heard.silence}")
+        return
+    yield _rate(heard, link)
+    yield _size(heard.name, seen, rig_px)
+
+
+def _rate(heard: Heard, link: Camera) -> Verdict:
+    name, arrivals = f"{heard.name} frames", heard.seen.arrivals
+    refused = heard.counters.get("refused", 0)
+    told = f"{arrivals.rate_hz:.1f} a second" if arrivals.count > 1 else "one frame"
+    text = told + (f", {refused} of {arrivals.count} damaged" if refused else "")
+    if not arrivals.rate_hz >= LEAST_HZ or (heard.live and heard.trouble):
+        why = heard.trouble or "too slow for any motion"
+        return fail(name, f"{text}: {why}")
+    if refused > 0.01 * arrivals.count:
+        return warning(name, f"{text}: check cable and hub")
+    if heard.live and arrivals.rate_hz < FULL_RATE * link.fps:
+        return warning(
+            name, f"{text}, {link.fps:g} were asked for: is it too dark, the bus shared, this host too busy?"
+        )
+    return ok(name, text)
+
+
+def _size(name: str, seen: CameraSeen, rig_px: tuple[int, int] | None) -> Verdict:
+    name = f"{name} size"
+    found = ", ".join(f"{w} x {h}" for w, h in seen.sizes_px)
+    if rig_px is None:
+        return warning(name, f"{found}; the rig does not say what the lens was calibrated for (size_px)")
+    if set(seen.sizes_px) != {rig_px}:
+        return fail(
+            name,
+            f"{found}, but the lens is calibrated for {rig_px[0]} x {rig_px[1]}: set the camera's mode, or calibrate "
+            "the lens in this one",
+        )
+    return ok(name, f"{found}, as the rig says")

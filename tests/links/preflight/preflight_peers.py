@@ -1,0 +1,196 @@
+"""The rig that a preflight listens to: a LiDAR that sends for ever, a drone that a hand moves as it is told, a toy eye."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+
+import cv2
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega
+
+from flow.link import Record
+from flow.stage import Stage
+from links.mavlink.profiles import PROFILES
+from links.mavlink.wire import packed, parse_frame
+from links.preflight.heard import Ear, Heard
+from links.simulated.autopilot import Autopilot, AutopilotSettings
+from links.simulated.flight import Flight
+from links.simulated.path import Path, Waypoint
+from links.simulated.vlp16_packets import encode_packet
+from links.velodyne import vlp16
+from stages.messages import DroneFix, DroneLocalPosition
+
+SPEED = 8.0  # rad/s of the phase of a motion by hand: there and back in 0.4 s
+START_NS, SECONDS = 1_748_773_230_000_000_000, 60.0
+
+
+def free_port() -> int:
+    """A UDP port that nobody listens on just now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.bind(("127.0.0.1", 0))
+        return udp.getsockname()[1]
+
+
+def packet(first_pulse_ns: int, mode: str = "strongest") -> bytes:
+    """A VLP-16 packet in which every pulse returns from 10 m."""
+    returns, firings = (2, 12) if mode == "dual" else (1, 24)
+    shape = (returns, firings, 16)
+    azimuths = np.linspace(0.0, 0.08, firings // 2)
+    return encode_packet(first_pulse_ns, azimuths, np.full(shape, 10.0), np.full(shape, 50, np.uint8), mode)
+
+
+class SendingLidar:
+    """Sends packets at the sensor's pace, in a thread, until its context ends."""
+
+    def __init__(self, port: int) -> None:
+        self._port, self._closed = port, threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> SendingLidar:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._closed.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        template, sent, began_ns = bytearray(packet(0)), 0, time.monotonic_ns()
+        packet_ns, at = vlp16.packet_ns(vlp16.STRONGEST), vlp16.TIMESTAMP_AT
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+            while not self._closed.wait(0.002):
+                while (sent + 1) * packet_ns < time.monotonic_ns() - began_ns:
+                    template[at : at + 4] = (sent * packet_ns // 1000).to_bytes(4, "little")
+                    udp.sendto(template, ("127.0.0.1", self._port))
+                    sent += 1
+
+
+def good_parameters(profile="ardupilot") -> dict[str, float]:
+    """What a profile wants, the best value of each."""
+    return {
+        w.name: w.values[0] if w.values else float(w.bits) or (w.at_least + w.at_most) / 2
+        for w in PROFILES[profile].wanted
+    }
+
+
+def flight() -> Autopilot:
+    """A drone that drifts slowly to the east."""
+    path = Path(
+        waypoints=(Waypoint(t_s=0.0, xyz_m=(0, 0, 10), yaw_deg=0), Waypoint(t_s=70.0, xyz_m=(14, 0, 10), yaw_deg=0))
+    )
+    settings = AutopilotSettings(timesync_hz=0)
+    return Autopilot(settings, Flight(path, settings.flight, SECONDS, 1), START_NS, SECONDS, 1)
+
+
+class OnTheGround:
+    """A flight that says it is disarmed; `upside_down`: its accelerometer has its z axis the wrong way."""
+
+    def __init__(self, upside_down: bool = False) -> None:
+        self._flight, self._upside_down = flight(), upside_down
+        self._mav = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
+        self.device_ns = self._flight.device_ns
+
+    def records(self, until_ns: int) -> list[Record]:
+        """See Autopilot."""
+        return [self._changed(record) for record in self._flight.records(until_ns)]
+
+    def _changed(self, record: Record) -> Record:
+        message = parse_frame(record.data)
+        if message.get_type() == "HEARTBEAT":
+            message.base_mode &= ~128
+        elif message.get_type() == "RAW_IMU" and self._upside_down:
+            message.zacc = -message.zacc
+        else:
+            return record
+        return Record(record.topic, record.arrival_ns, record.stamp_ns, packed(message, self._mav))
+
+
+class HandHeld:
+    """A drone whose hand does what the preflight asks, at 50 Hz; `turned`: its board is mounted backwards."""
+
+    def __init__(self, turned: bool = False) -> None:
+        self._mav = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
+        self._sign = -1.0 if turned else 1.0
+        self._asked, self._since_ns, self._next_ns, self._beat_ns = "", 0, 0, 0
+
+    def ask(self, step) -> None:
+        """A step begins."""
+        self._asked, self._since_ns = step.what, self._next_ns
+
+    def device_ns(self, scenario_ns: int) -> int:
+        """Its time since boot."""
+        return scenario_ns - START_NS + 100_000_000_000
+
+    def records(self, until_ns: int) -> list[Record]:
+        """What it says until then."""
+        records: list[Record] = []
+        if not self._next_ns:
+            self._next_ns = self._beat_ns = self._since_ns = until_ns
+        while self._next_ns < until_ns:
+            at_ns, self._next_ns = self._next_ns, self._next_ns + 20_000_000
+            said = [self._attitude(at_ns), self._position(at_ns)]
+            if at_ns >= self._beat_ns:
+                self._beat_ns += 1_000_000_000
+                said.append(ardupilotmega.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3))
+            records += [Record("/autopilot/rx", at_ns, at_ns, packed(message, self._mav)) for message in said]
+        return records
+
+    def _attitude(self, at_ns: int):
+        gone_s = (at_ns - self._since_ns) * 1e-9
+        angle = math.radians(40) * math.sin(min(gone_s * SPEED, math.pi))
+        rate = math.radians(40) * SPEED * math.cos(gone_s * SPEED) * (gone_s * SPEED < math.pi)
+        roll, pitch = angle * (self._asked == "right side down"), -angle * (self._asked == "nose down")
+        yaw = -angle * (self._asked == "turn left")  # FRD: nose up, right side down and clockwise are positive
+        rates = [rate * (self._asked == what) for what in ("right side down", "nose down", "turn left")]
+        s = self._sign
+        return ardupilotmega.MAVLink_attitude_message(
+            self.device_ns(at_ns) // 1_000_000, s * roll, s * pitch, yaw, s * rates[0], -s * rates[1], -rates[2]
+        )
+
+    def _position(self, at_ns: int):
+        turn = 6.0 * (at_ns - self._since_ns) * 1e-9 * (self._asked == "carry")
+        x, y, z = 1.5 * math.cos(turn), 1.5 * math.sin(turn), -0.7 * math.sin(0.5 * turn) ** 2 * 2
+        return ardupilotmega.MAVLink_local_position_ned_message(self.device_ns(at_ns) // 1_000_000, x, y, z, 0, 0, 0)
+
+
+class Eye(Stage):
+    """Sees the drone where the hand carries it, in a vehicle frame that is turned by 30 deg."""
+
+    mirror: float = 1.0  # -1: it and the autopilot do not agree on left and right
+
+    def on_position(self, position: DroneLocalPosition) -> DroneFix:
+        """A fix where it is."""
+        c, s = math.cos(0.5), math.sin(0.5)
+        x, y, z = position.xyz_local_m
+        y = y * self.mirror
+        return DroneFix(
+            stamp_ns=position.stamp_ns,
+            xyz_vehicle_m=np.array([c * x - s * y + 3, s * x + c * y, z + 5]),
+            covariance_m2=np.eye(3) * 0.01,
+            hits=9,
+            iterations=1,
+            shift_m=0.0,
+        )
+
+
+def film(file, seconds: float = 12.0, size: int = 64, fps: int = 15) -> None:
+    """A grey film that gets brighter."""
+    video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), fps, (size, size))
+    for number in range(int(seconds * fps)):
+        video.write(np.full((size, size, 3), number % 200, np.uint8))
+    video.release()
+
+
+def hear(link, records, *, counters=None, trouble=None, live=True, end_ns=None) -> Heard:
+    """What a preflight has of one link after these records, each decoded."""
+    ear = Ear()
+    ear.attach({"it": link})
+    for record in records:
+        ear.record(record)
+        link.decode(record)
+    last_ns = records[-1].arrival_ns if records else 0
+    told = dict(link.counters) | (counters or {})
+    return Heard("it", link, ear.seen("it"), told, trouble, last_ns if end_ns is None else end_ns, live)

@@ -1,0 +1,186 @@
+"""The autopilot's checks by frames made by hand, and what a configuration lacks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as m
+
+from flow.graph import load_graph
+from flow.link import Record
+from links.mavlink import Autopilot
+from links.mavlink.parameters import Answers
+from links.mavlink.wire import packed
+from links.preflight.autopilot import autopilot_checks
+from links.preflight.graphs import listening, tracking
+from links.preflight.parameters import parameter_check
+from links.preflight.preflight import absences
+from links.preflight.verdict import Level
+from stages.messages import AutopilotEstimator, AutopilotStatus
+from tests.links.preflight.preflight_peers import good_parameters, hear
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+BEGIN_NS, S, MS = 1_748_773_230_000_000_000, 1_000_000_000, 1_000_000
+
+
+def frames(seconds=4.0, *, system=1, autopilot=3, beats=True, attitude_hz=50, odometry_hz=30, base_mode=0, lose=0):
+    """What an autopilot says, in order."""
+    mav, said = m.MAVLink(None, srcSystem=system, srcComponent=1), []
+    for k in range(int(seconds * 100)):
+        at_ms = k * 10
+        now = []
+        if beats and at_ms % 1000 == 0:
+            now.append(m.MAVLink_heartbeat_message(2, autopilot, base_mode, 0, 3, 3))
+        if attitude_hz and at_ms % (1000 // attitude_hz // 10 * 10) == 0:
+            now.append(m.MAVLink_attitude_message(5000 + at_ms, 0, 0, 0, 0, 0, 0))
+        if odometry_hz and at_ms % (1000 // odometry_hz // 10 * 10) == 0:
+            now.append(m.MAVLink_local_position_ned_message(5000 + at_ms, 0, 0, 0, 0, 0, 0))
+        for message in now:
+            at_ns = BEGIN_NS + at_ms * MS
+            said.append(Record("/autopilot/rx", at_ns, at_ns, packed(message, mav)))
+    return said[: len(said) // 2] + said[len(said) // 2 + lose :]
+
+
+def status(offset_ns=S, unsure_ns=2 * MS, armed=False, failsafe=False):
+    return AutopilotStatus(
+        stamp_ns=BEGIN_NS,
+        armed=armed,
+        custom_mode=0,
+        failsafe=failsafe,
+        lost_frames=0,
+        clock_offset_ns=offset_ns,
+        clock_uncertainty_ns=unsure_ns,
+    )
+
+
+def estimator(ratio=0.1, position=True, attitude=True, constant=False):
+    return AutopilotEstimator(
+        stamp_ns=BEGIN_NS,
+        attitude_good=attitude,
+        velocity_good=True,
+        position_good=position,
+        height_good=True,
+        constant_position=constant,
+        velocity_ratio=ratio,
+        horizontal_ratio=ratio,
+        height_ratio=ratio,
+        compass_ratio=0.0,
+        flags=0,
+    )
+
+
+SAID, ESTIMATORS = status(), (estimator(),)
+
+
+def check(records, *, said=SAID, estimators=ESTIMATORS, **kinds):
+    heard = hear(Autopilot(), records, **kinds)
+    return {v.name: v for v in autopilot_checks(heard, [said] if records else [], estimators)}
+
+
+def test_an_autopilot_that_says_all_we_need_is_good():
+    found = check(frames())
+    assert {v.level for v in found.values()} == {Level.OK}
+    assert set(found) == {f"it {what}" for what in ("heartbeat", "frames", "clock", "rates", "estimate")}
+    assert "1.0 a second, ardupilot, disarmed" in found["it heartbeat"].sentence
+    assert "ATTITUDE 50 Hz" in found["it rates"].sentence
+
+
+@pytest.mark.parametrize(
+    ("records", "given", "name", "words"),
+    [
+        (frames(autopilot=12), {}, "heartbeat", "set profile: px4"),
+        (frames(), {"said": status(armed=True)}, "heartbeat", "disarm it"),
+        (frames(), {"said": status(failsafe=True)}, "heartbeat", "emergency"),
+        (frames(), {"end_ns": BEGIN_NS + 9 * S}, "heartbeat", "none for 6.0 s"),
+        (frames(lose=100), {}, "frames", "100 of"),
+        (frames(), {"said": status(unsure_ns=80 * MS)}, "clock", "known to 80.0 ms"),
+        (frames(), {"said": status(offset_ns=None, unsure_ns=None)}, "clock", "no message carried its time"),
+        (frames(), {"counters": {"clock restarts": 2}}, "clock", "began anew 2 times"),
+        (frames(attitude_hz=0), {}, "rates", "its attitude is needed"),
+        (frames(), {"estimators": [estimator(attitude=False)]}, "estimate", "no attitude yet"),
+        (frames(), {"estimators": [estimator(ratio=1.6)]}, "estimate", "refuses velocity (1.6)"),
+    ],
+)
+def test_an_autopilot_that_is_not_fit_to_fly_is_no_go(records, given, name, words):
+    found = check(records, **given)[f"it {name}"]
+    assert found.level is Level.FAIL
+    assert words in found.sentence
+
+
+@pytest.mark.parametrize(
+    ("records", "given", "name"),
+    [
+        (frames(lose=10), {}, "frames"),
+        (frames(), {"counters": {"from other senders": 3}}, "frames"),
+        (frames(), {"said": status(unsure_ns=None)}, "clock"),
+        (frames(), {"said": status(unsure_ns=20 * MS)}, "clock"),
+        (frames(odometry_hz=0), {}, "rates"),
+        (frames(attitude_hz=5), {}, "rates"),
+        (frames(), {"estimators": []}, "estimate"),
+        (frames(), {"estimators": [estimator(position=False, constant=True)]}, "estimate"),
+        (frames(), {"estimators": [estimator(ratio=0.8)]}, "estimate"),
+    ],
+)
+def test_what_is_for_a_person_to_judge_is_a_warning(records, given, name):
+    assert check(records, **given)[f"it {name}"].level is Level.WARNING
+
+
+def test_a_silent_autopilot_and_one_with_another_id_are_told_apart():
+    assert "no word from system 1, component 1" in check([])["it heartbeat"].sentence
+    other = check(frames(system=9))["it heartbeat"]
+    assert other.level is Level.FAIL
+    assert "system 9 component 1 speak here" in other.sentence
+    mute = check(frames(beats=False))["it heartbeat"]
+    assert "though it sends other messages" in mute.sentence
+    unsigned = check([], counters={"not signed with our key": 8})["it heartbeat"]
+    assert "8 frames came that are not signed" in unsigned.sentence
+
+
+def test_a_flight_that_was_recorded_may_be_armed():
+    assert check(frames(), said=status(armed=True), live=False)["it heartbeat"].level is Level.OK
+
+
+@pytest.mark.parametrize("profile", ["ardupilot", "px4"])
+def test_parameters_are_compared_with_the_profile(profile):
+    good = good_parameters(profile)
+    assert parameter_check("it", profile, Answers(good, [], 40)).level is Level.OK
+    first, second = list(good)[:2]
+    bad = parameter_check("it", profile, Answers({**good, first: 99.0} | {second: 98.0}, [], 40))
+    assert bad.level is Level.FAIL
+    assert f"{first} is 99" in bad.sentence
+    assert f"{second} is 98" in bad.sentence
+    assert "did not answer" in parameter_check("it", profile, Answers({}, list(good), 0)).sentence
+    assert "none was told" in parameter_check("it", profile, Answers({}, list(good), 9)).sentence
+
+
+def test_what_a_configuration_lacks_is_said():
+    field = load_graph(CONFIGS / "field.yaml")
+    assert list(absences(field, field.values["rig"])) == []
+    names = ("lidar", "servo", "odometry", "autopilot", "recorder", "camera_vehicle", "camera_drone")
+    bare = field.__class__(
+        {n: s for n, s in field.nodes.items() if n not in names and s.kind == "links"}, (), None, field.values
+    )
+    found = {v.name: v.level.value for v in absences(bare, field.values["rig"])}
+    assert found == {
+        "lidar": "fail",
+        "servo": "fail",
+        "stages": "fail",
+        "cameras": "warning",
+        "autopilot": "warning",
+        "vehicle odometry": "warning",
+        "recorder": "warning",
+    }
+    bolted = {v.name: v.level.value for v in absences(bare, {"lidar": {"mount": {"turns": False}}})}
+    assert bolted["servo"] == "ok"
+
+
+def test_no_pose_goes_out_and_while_listening_nothing_moves():
+    field = load_graph(CONFIGS / "field.yaml")
+    assert listening(field).edges == ()
+    assert all(spec.kind == "links" for spec in listening(field).nodes.values())
+    seeing = tracking(field)
+    assert "fuse" not in seeing.nodes
+    assert not any(edge.consumer == "autopilot" for edge in seeing.edges)
+    assert any((edge.producer, edge.consumer) == ("aim", "servo") for edge in seeing.edges)
+    assert {"lidar", "servo", "camera_drone", "detect", "track"} <= set(seeing.nodes)

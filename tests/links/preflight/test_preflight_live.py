@@ -1,0 +1,149 @@
+"""A whole preflight over real sockets and a pty, against the simulated peers: go, and why not."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from flow.graph import Graph, load_graph
+from links.cli.app import app
+from links.preflight import Level, is_go, preflight_live
+from links.simulated.ardupilot_rules import ArduPilotRules
+from links.simulated.autopilot_socket import AutopilotSocket
+from links.simulated.dynamixel_emulator import DynamixelEmulator
+from links.simulated.servo import ServoSettings
+from links.velodyne.decode import compile_kernels
+from tests.links.preflight.preflight_peers import (
+    START_NS,
+    HandHeld,
+    OnTheGround,
+    SendingLidar,
+    film,
+    free_port,
+    good_parameters,
+)
+
+ROOT = Path(__file__).resolve().parents[3]
+LISTEN_S = 2.2
+CONFIG = """\
+include: {estimate}
+links:
+  lidar: {{config: {{port: {lidar}, timeout_s: 1.0}}}}
+  servo: {{config: {{port: {servo}, start_timeout_s: 0.3, reply_timeout_s: 0.1, watchdog_s: 1.0}}}}
+  autopilot: {{config: {{connection: "udpin:127.0.0.1:{autopilot}"}}, inputs: {{pose: fuse.relative_pose}}}}
+  camera_vehicle: {{use: links.camera.Camera, config: {{topic: /camera/vehicle, source: {film}, size_px: 64}}}}
+  recorder: {{use: links.recording.Recorder}}
+  viewer: null
+"""
+HAND = """\
+stages:
+  eye: {{use: tests.links.preflight.preflight_peers.Eye, config: {{mirror: {mirror}}},
+         inputs: {{position: autopilot.drone_local_position}}}}
+links:
+  autopilot: {{use: links.mavlink.Autopilot, config: {{connection: "udpin:127.0.0.1:{autopilot}"}}}}
+"""
+
+
+class Bench:
+    """Peers on this host, and the configuration that finds them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.config = folder, folder / "bench.yaml"
+        self.ports = {"lidar": free_port(), "autopilot": free_port()}
+        film(folder / "film.avi")
+
+    def write(self, servo: Path) -> Graph:
+        estimate = ROOT / "configs" / "estimate.yaml"
+        text = CONFIG.format(estimate=estimate, servo=servo, film=self.folder / "film.avi", **self.ports)
+        return self.read(text)
+
+    def read(self, text: str) -> Graph:
+        """The configuration's graph; what takes long at the first time is done then, before the peers begin."""
+        self.config.write_text(text)
+        compile_kernels()
+        return load_graph(self.config)
+
+    def drone(self, **given) -> AutopilotSocket:
+        given = {"flight": OnTheGround(), "parameters": good_parameters()} | given
+        began_ns = time.monotonic_ns()
+        scenario_ns = lambda: START_NS + time.monotonic_ns() - began_ns  # noqa: E731
+        send_to = ("127.0.0.1", self.ports["autopilot"])
+        return AutopilotSocket(ArduPilotRules(), send_to=send_to, scenario_ns=scenario_ns, **given)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    return Bench(tmp_path)
+
+
+@pytest.fixture
+def emulator():
+    with DynamixelEmulator(ServoSettings(travel_deg=(0.0, 360.0), start_deg=90.0)) as servo:
+        yield servo
+
+
+def wait(seconds: float) -> None:
+    threading.Event().wait(seconds)
+
+
+def judged(graph: Graph, ask=None, listen_s=LISTEN_S):
+    return {v.name: v for v in preflight_live(graph, listen_s, wait, ask, step_s=0.6)}
+
+
+def test_a_rig_that_is_fit_to_fly_is_go_with_exit_code_0(bench, emulator):
+    bench.write(emulator.path)
+    with SendingLidar(bench.ports["lidar"]), bench.drone():
+        result = CliRunner().invoke(app, ["preflight", str(bench.config), "--for", str(LISTEN_S), "--no-motion"])
+    assert result.exit_code == 0, result.output
+    assert "GO: " in result.output
+    for name in ("lidar rate", "lidar losses", "servo answers", "camera_vehicle size", "autopilot parameters"):
+        assert f" {name}: " in result.output, result.output
+
+
+def test_a_rig_of_which_nothing_answers_is_no_go_for_each_part(bench, emulator):
+    graph = bench.write(emulator.path)
+    (bench.folder / "film.avi").unlink()
+    emulator.silence()
+    found = judged(graph)
+    assert not is_go(found.values())
+    assert "no packet on UDP" in found["lidar packets"].sentence
+    assert "the servo with id 1 does not answer" in found["servo answers"].sentence
+    assert "no word from system 1, component 1" in found["autopilot heartbeat"].sentence
+    assert "there is no file" in found["camera_vehicle frames"].sentence
+    assert {v.level for v in found.values() if v.level is not Level.WARNING} == {Level.FAIL}
+    assert not {"autopilot parameters", "axes: accelerometer"} & set(found)
+
+
+def test_a_wrong_parameter_and_an_axis_upside_down_are_no_go(bench, emulator):
+    graph = bench.write(emulator.path)
+    parameters = good_parameters() | {"EK3_SRC1_YAW": 1.0}
+    with SendingLidar(bench.ports["lidar"]), bench.drone(flight=OnTheGround(upside_down=True), parameters=parameters):
+        found = judged(graph)
+    assert {n for n, v in found.items() if v.level is Level.FAIL} == {"autopilot parameters", "axes: accelerometer"}
+    assert "EK3_SRC1_YAW is 1, and must be 6" in found["autopilot parameters"].sentence
+    assert "z is told as -z" in found["axes: accelerometer"].sentence
+
+
+@pytest.mark.parametrize(
+    ("turned", "mirror", "wrong"),
+    [
+        (False, 1, set()),
+        (True, -1, {"by hand: nose down", "by hand: right side down", "axes: LiDAR and autopilot"}),
+    ],
+)
+def test_a_drone_moved_by_hand_tells_its_signs(tmp_path, turned, mirror, wrong):
+    with ExitStack() as stack:
+        bench = Bench(tmp_path)
+        graph = bench.read(HAND.format(mirror=mirror, **bench.ports))
+        held = HandHeld(turned)
+        stack.enter_context(bench.drone(flight=held))
+        found = judged(graph, held.ask, listen_s=1.2)
+    moved = {n: v for n, v in found.items() if n.startswith(("by hand", "axes"))}
+    assert {n for n, v in moved.items() if v.level is Level.FAIL} == wrong, moved
+    assert moved["axes: attitude's turn rates"].level is Level.OK, moved
+    assert found["lidar"].level is Level.FAIL

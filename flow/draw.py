@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from html import escape
 
+from flow.edge import usual_waiting
 from flow.graph import Graph, NodeSpec
 from flow.link import Tap
 from flow.stage import output_ports
@@ -17,13 +18,18 @@ _FILL = {"stages": "#e8f0fe", "links": "#fef3e0"}
 
 
 def mermaid(graph: Graph) -> str:
-    """Flowchart text: stages as boxes, links as rounded boxes, each edge with its message; unwired outputs dotted."""
+    """Flowchart text: stages as boxes, links as rounded boxes, each edge with its message; unwired outputs dotted.
+
+    Where an edge declares how messages wait on it, a comment says so.
+    """
     lines = ["flowchart LR"]
     for spec in graph.nodes.values():
         label = f'"{spec.name}<br/><small>{_says(spec)}</small>"'
         lines.append(f"    {spec.name}[{label}]" if spec.kind == "stages" else f"    {spec.name}([{label}])")
     for edge in graph.edges:
         lines.append(f"    {edge.producer} -- {edge.output} --> {edge.consumer}")
+        if edge.waiting != usual_waiting(edge.message):
+            lines.append(f"    %% live: {edge.name} takes {edge.output} as {edge.waiting}")
     wired = {(edge.producer, edge.output) for edge in graph.edges}
     for node, output, _ in graph.outputs():
         if (node, output) not in wired:
@@ -106,5 +112,6 @@ def _wires(graph: Graph, at: dict[str, tuple[float, float]]) -> list[str]:
                     lane += _LANE
                     turn, back = x + _LANE + (lane - low) / 2, tx - _LANE - (lane - low) / 2
                     path = f"M{x:.0f},{y:.0f} H{turn:.0f} V{lane:.0f} H{back:.0f} V{ty:.0f} H{tx:.0f}"
-                parts.append(f'<path d="{path}" stroke="#555" fill="none" marker-end="url(#a)"/>')
+                tip = f"<title>{escape(f'{edge.name}: {edge.output}; live: {edge.waiting}')}</title>"
+                parts.append(f'<path d="{path}" stroke="#555" fill="none" marker-end="url(#a)">{tip}</path>')
     return parts

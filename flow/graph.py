@@ -4,9 +4,11 @@
       track:
         use: stages.track.Track            # module.Class
         config: {radius_m: 0.8}            # the class's settings
-        inputs: {points: sweep.swept_points}
+        inputs: {points: sweep.swept_points}  # how messages wait in a live run: flow/edge.py
+        on_error: restart                  # live, when it raises: a fresh one takes over; or skip; or stop the run
+        thread: lidar                      # live: shared with others that say so; without it, it has its own
     links:
-      lidar: {use: links.velodyne.Lidar}   # sources and sinks; the same three keys
+      lidar: {use: links.velodyne.Lidar}   # sources and sinks; the first three keys
 
 Source: ours.
 """
@@ -20,12 +22,13 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast, get_args
 
 import yaml
 from pydantic import ValidationError
 
-from flow.link import TRUTH_TOPICS, Link, Source
+from flow.edge import Edge, Waiting, read_waiting, usual_waiting
+from flow.link import RUN_TOPICS, TRUTH_TOPICS, Link, Source
 from flow.message import Message
 from flow.problem import ConfigError, did_you_mean, one_of
 from flow.stage import Node, PortError, Stage, input_ports, output_ports
@@ -34,19 +37,10 @@ from flow.tree import Path_, Section, Tree, load_tree, resolve
 TOP_LEVEL = ("include", "replay", "rig", "stages", "links")
 KINDS: dict[str, type[Node]] = {"stages": Stage, "links": Link}
 HOMES = {"stages": "stages", "links": "links"}  # package in which classes of a kind are looked for when suggesting
-NODE_KEYS = ("use", "config", "inputs")
+OnError = Literal["restart", "skip", "stop"]
+ON_ERROR: tuple[str, ...] = get_args(OnError)
+NODE_KEYS = {"stages": ("use", "config", "inputs", "on_error", "thread"), "links": ("use", "config", "inputs")}
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
-
-
-@dataclass(frozen=True, slots=True)
-class Edge:
-    """One wire: an output of one node to an input port of another."""
-
-    producer: str
-    output: str
-    consumer: str
-    port: str
-    message: type[Message]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +52,8 @@ class NodeSpec:
     use: str  # import path as declared
     cls: type[Node]
     config: dict[str, Any]
+    on_error: OnError = "restart"  # of a stage that raises in a live run
+    thread: str = ""  # of a stage in a live run; stages of one name share it
 
     def build(self) -> Node:
         """A fresh instance with empty memory."""
@@ -107,6 +103,7 @@ def check(tree: Tree, file: Path) -> Graph:
     if not tree.values.get("stages"):
         tree.problem(("stages",), "no stages: a graph needs at least one.")
     edges = tuple(edge for spec in nodes.values() for edge in _edges(tree, nodes, spec))
+    _check_threads(tree, nodes, edges)
     _check_topics(tree, nodes)
     order = _rank(tree, nodes, edges)
     return Graph({name: nodes[name] for name in order}, edges, _recording(tree, file), tree.values)
@@ -153,17 +150,23 @@ def _nodes(tree: Tree, kind: str) -> Iterator[NodeSpec]:
             continue
         declared = cast("dict[str, Any]", raw)
         for key in declared:
-            if key not in NODE_KEYS:
-                tree.problem(
-                    (*path, key), f"unknown key '{key}'; there is {one_of(NODE_KEYS)}.{did_you_mean(key, NODE_KEYS)}"
-                )
+            if key not in NODE_KEYS[kind]:
+                known = NODE_KEYS[kind]
+                tree.problem((*path, key), f"unknown key '{key}'; there is {one_of(known)}.{did_you_mean(key, known)}")
+        on_error: Any = declared.get("on_error", "restart")
+        if on_error not in ON_ERROR:
+            near = did_you_mean(on_error, ON_ERROR) if isinstance(on_error, str) else ""
+            tree.problem((*path, "on_error"), f"must be {one_of(ON_ERROR)}, got {on_error!r}.{near}")
+        thread: Any = declared.get("thread", name)
+        if not (isinstance(thread, str) and _NAME.match(thread)):
+            tree.problem((*path, "thread"), f"must be a name as stages have, got {thread!r}.")
         cls = _class(tree, kind, path, declared.get("use"))
         if cls is not None:
             before = len(tree.problems)
             config = resolve(tree, (*path, "config"), declared.get("config") or {})
             if len(tree.problems) == before:  # a reference to nothing is said already
                 config = _settings(tree, path, cls, config)
-            yield NodeSpec(name, kind, declared["use"], cls, config)
+            yield NodeSpec(name, kind, declared["use"], cls, config, cast(OnError, on_error), str(thread))
 
 
 def _class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node] | None:
@@ -264,9 +267,11 @@ def _edges(tree: Tree, nodes: dict[str, NodeSpec], spec: NodeSpec) -> Iterator[E
     if not isinstance(declared, dict):
         tree.problem(path, "must be a mapping of port: node.output.")
         return
-    wires = cast("dict[str, Any]", declared)
-    for port, source in wires.items():
+    wires = {port: wire for port, wire in cast("dict[str, Any]", declared).items() if wire is not None}  # null: unwired
+    for port, declaration in wires.items():
         here = (*path, port)
+        waiting = cast("dict[str, Any]", declaration) if isinstance(declaration, dict) else {}
+        source = waiting.get("from") if isinstance(declaration, dict) else declaration
         if port not in ports:
             takes = (
                 f" {spec.cls.__name__} takes {one_of(ports)}." if ports else f" {spec.cls.__name__} takes no inputs."
@@ -275,7 +280,8 @@ def _edges(tree: Tree, nodes: dict[str, NodeSpec], spec: NodeSpec) -> Iterator[E
             continue
         node, dot, output = source.partition(".") if isinstance(source, str) else ("", "", "")
         if not (node and dot and output):
-            tree.problem(here, f"must read node.output, got {source!r}.")
+            form = "say 'from: node.output'" if waiting else "read node.output"
+            tree.problem(here, f"must {form}, got {source!r}.")
         elif node not in nodes:
             if not any(node in (tree.values.get(kind) or {}) for kind in KINDS):  # else its own problem is said already
                 tree.problem(here, f"no stage or link '{node}'.{did_you_mean(node, nodes)}")
@@ -288,7 +294,8 @@ def _edges(tree: Tree, nodes: dict[str, NodeSpec], spec: NodeSpec) -> Iterator[E
                 has, wants = outputs[output].__name__, ports[port].__name__
                 tree.problem(here, f"type mismatch: {node}.{output} is {has}, {spec.name}.{port} takes {wants}.")
             else:
-                yield Edge(node, output, spec.name, port, outputs[output])
+                message = outputs[output]
+                yield Edge(node, output, spec.name, port, message, _waiting(tree, here, message, waiting))
     for port, wanted in ports.items():
         if port not in wires and port not in spec.cls.optional_inputs:
             fits = [
@@ -300,6 +307,23 @@ def _edges(tree: Tree, nodes: dict[str, NodeSpec], spec: NodeSpec) -> Iterator[E
             tree.problem(path, f"port '{port}' ({wanted.__name__}) is not wired.{hint}")
 
 
+def _waiting(tree: Tree, path: Path_, message: type[Message], declared: dict[str, Any]) -> Waiting:
+    waiting, problems = read_waiting(declared, usual_waiting(message))
+    for key, text in problems:
+        tree.problem((*path, key), text)
+    return waiting
+
+
+def _check_threads(tree: Tree, nodes: dict[str, NodeSpec], edges: tuple[Edge, ...]) -> None:
+    """A thread must not wait for itself."""
+    for edge in edges:
+        producer, consumer = nodes[edge.producer], nodes[edge.consumer]
+        both = producer.kind == consumer.kind == "stages" and producer.thread == consumer.thread
+        if both and edge.waiting.policy == "block":
+            text = f"'block' would wait for ever: '{edge.producer}' works in the same thread, '{consumer.thread}'."
+            tree.problem(("stages", edge.consumer, "inputs", edge.port, "policy"), text)
+
+
 def _check_topics(tree: Tree, nodes: dict[str, NodeSpec]) -> None:
     taken: dict[str, str] = {}
     for spec in nodes.values():
@@ -308,6 +332,8 @@ def _check_topics(tree: Tree, nodes: dict[str, NodeSpec]) -> None:
             path = (spec.kind, spec.name, "config", "topic")
             if topic.startswith(TRUTH_TOPICS):
                 tree.problem(path, f"truth is for evaluation only: no source may bring in '{topic}'.")
+            if topic.startswith(RUN_TOPICS):
+                tree.problem(path, f"what a run tells of itself stands under '{topic}': no source may bring it in.")
             first = taken.setdefault(topic, spec.name)
             if first != spec.name:
                 tree.problem(path, f"'{first}' already brings in {topic}: one source for each topic.")

@@ -17,14 +17,11 @@ from time import perf_counter_ns
 from typing import Any
 
 from flow.graph import Graph
-from flow.link import LinkError, Record, Source, Tap
-from flow.message import Message, check_arrays
+from flow.link import RUN_TOPICS, Record, Source, Tap
+from flow.message import Message
 from flow.metrics import Latency
+from flow.ports import Output, admit, call
 from flow.stage import Node, Stage, input_ports, output_ports
-
-
-class RunError(Exception):
-    """A stage or link raised while the graph ran. The text names node, port and time; the cause is chained."""
 
 
 @dataclass(slots=True)
@@ -48,15 +45,6 @@ class RunReport:
     nodes: dict[str, NodeReport] = field(default_factory=dict[str, NodeReport])
 
 
-class _Output:
-    """One output of one running node: its name, its taps' view and the ports it feeds."""
-
-    __slots__ = ("checked", "count", "feeds", "name")
-
-    def __init__(self, name: str, feeds: list[_Port]) -> None:
-        self.name, self.feeds, self.count, self.checked = name, feeds, 0, False
-
-
 class _Port:
     """One input port of one running node, bound to its handler."""
 
@@ -68,7 +56,7 @@ class _Port:
         rank: int,
         index: int,
         handler: Callable[[Any], Any],
-        outputs: dict[type[Message], _Output],
+        outputs: dict[type[Message], Output[_Port]],
         compute: Latency,
     ) -> None:
         self.name, self.rank, self.index, self.handler = name, rank, index, handler
@@ -88,10 +76,10 @@ class Replay:
         self._heap: list[tuple[int, int, int, int, _Port, Any]] = []
         self._sequence = 0
         self.nodes: dict[str, Node] = {spec.name: spec.build() for spec in graph.nodes.values()}
-        self._outputs: dict[str, dict[type[Message], _Output]] = {}
+        self._outputs: dict[str, dict[type[Message], Output[_Port]]] = {}
         for name, node in self.nodes.items():
             ports = output_ports(type(node))
-            self._outputs[name] = {message: _Output(f"{name}.{output}", []) for output, message in ports.items()}
+            self._outputs[name] = {message: Output(f"{name}.{output}", []) for output, message in ports.items()}
             self.report.nodes[name] = NodeReport(0, Latency())
         self._topics: dict[str, _Port] = {}
         self._finishers: list[_Port] = []
@@ -120,7 +108,8 @@ class Replay:
         report.last_ns = record.arrival_ns
         port = self._topics.get(record.topic)
         if port is None:
-            report.unwired_topics[record.topic] += 1
+            if not record.topic.startswith(RUN_TOPICS):
+                report.unwired_topics[record.topic] += 1
             return
         self._call(port, record.arrival_ns, record)
         heap = self._heap
@@ -144,41 +133,16 @@ class Replay:
     def _call(self, port: _Port, arrival_ns: int, message: Any) -> None:
         self.report.events += 1
         begin = perf_counter_ns()
-        try:
-            result = port.handler(message)
-            if result is not None and not isinstance(result, Message):
-                result = tuple(result)  # a generator does its work here
-        except LinkError:
-            raise  # says itself what to check
-        except Exception as error:
-            raise RunError(
-                f"{port.name} failed at {arrival_ns / 1e9:.6f} s: {type(error).__name__}: {error}"
-            ) from error
+        result = call(port.name, port.handler, message, arrival_ns)
         port.compute.add(perf_counter_ns() - begin)
-        if result is None:
-            return
-        if isinstance(result, Message):
-            self._send(port, arrival_ns, result)
-        else:
-            for item in result:
-                self._send(port, arrival_ns, item)
-
-    def _send(self, port: _Port, arrival_ns: int, message: Message) -> None:
-        output = port.outputs.get(type(message))
-        if output is None:
-            raise RunError(f"{port.name} gave a {type(message).__name__}, which its annotation does not promise")
-        if self._strict or not output.checked:
-            output.checked = True
-            try:
-                check_arrays(message)
-            except TypeError as error:
-                raise RunError(f"{output.name}: {error}") from None
-        output.count += 1
-        for tap in self._taps:
-            tap.see(output.name, message, arrival_ns)
-        for feed in output.feeds:
-            self._sequence += 1
-            heappush(self._heap, (arrival_ns, feed.rank, feed.index, self._sequence, feed, message))
+        for item in result:
+            output = admit(port.name, port.outputs, item, self._strict)
+            output.count += 1
+            for tap in self._taps:
+                tap.see(output.name, item, arrival_ns)
+            for feed in output.feeds:
+                self._sequence += 1
+                heappush(self._heap, (arrival_ns, feed.rank, feed.index, self._sequence, feed, item))
 
 
 def replay(graph: Graph, records: Iterable[Record], taps: Sequence[Tap] = (), *, strict: bool = False) -> RunReport:

@@ -11,7 +11,8 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from flow.graph import HOMES, KINDS, TOP_LEVEL, known_classes
+from flow.edge import MAX_DEADLINE_MS, MAX_DEPTH, POLICIES
+from flow.graph import HOMES, KINDS, ON_ERROR, TOP_LEVEL, known_classes
 from flow.stage import Node, input_ports, output_ports
 
 _REFERENCE = {
@@ -19,12 +20,27 @@ _REFERENCE = {
     "pattern": r"^\$",
     "description": "the value that stands there in the merged configuration",
 }
-_EDGE = {"type": "string", "pattern": r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$"}
+_OUTPUT = {"type": "string", "pattern": r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$", "description": "node.output"}
+_WAITING = {
+    "type": "object",
+    "description": "an edge, and how messages wait on it in a live run",
+    "additionalProperties": False,
+    "properties": {
+        "from": _OUTPUT,
+        "policy": {"enum": list(POLICIES), "description": "what becomes of messages when the stage does not keep up"},
+        "depth": {"type": "integer", "minimum": 1, "maximum": MAX_DEPTH, "description": "messages that wait at most"},
+        "deadline_ms": {"type": "number", "exclusiveMinimum": 0, "maximum": MAX_DEADLINE_MS},
+    },
+}
+_ANY_EDGE = {"anyOf": [_OUTPUT, _WAITING, {"type": "null", "description": "unwired, where an included file wires it"}]}
+_EDGE = {"$ref": "#/$defs/edge"}
+_THREAD = {"type": "string", "description": "live: stages of one name share a thread; else each has its own"}
+_ON_ERROR = {"enum": list(ON_ERROR), "description": "live, when it raises: a fresh one, skip the message, or stop"}
 
 
 def schema() -> dict[str, Any]:
     """The schema of a configuration file with all stages and links that the home packages hold."""
-    definitions: dict[str, Any] = {}
+    definitions: dict[str, Any] = {"edge": _ANY_EDGE}
     sections = {kind: _section(kind, definitions) for kind in HOMES}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -58,6 +74,7 @@ def _section(kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
             "use": {"type": "string", "examples": list(classes), "description": "module.Class"},
             "config": {"type": "object"},
             "inputs": {"type": "object", "additionalProperties": _EDGE},
+            **({"on_error": _ON_ERROR, "thread": _THREAD} if kind == "stages" else {}),
         },
         "allOf": [
             {"if": {"properties": {"use": {"const": use}}, "required": ["use"]}, "then": {"$ref": f"#/$defs/{use}"}}

@@ -24,18 +24,26 @@ FORMULA_STARTERS = ("=", "+", "-", "@")  # a spreadsheet would run such a text
 
 
 class Digest(Tap):
-    """One BLAKE2b hash over every message on every edge, in order: equal for two replays of one recording."""
+    """One BLAKE2b hash over every message of every output, each output's in order: equal for two replays.
 
-    _hash: Any = PrivateAttr(default_factory=lambda: hashlib.blake2b(digest_size=16))
+    How messages of different outputs lie in time does not matter, so that a live run, in which many threads send, and
+    its repetition have one hash. Threads may call `see` at the same time, for different outputs.
+    """
+
+    _hashes: dict[str, Any] = PrivateAttr(default_factory=dict[str, Any])
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
-        """Hash the output's name, the run's clock and the whole message."""
-        self._hash.update(b"%s@%d" % (output.encode(), arrival_ns))
-        hash_into(self._hash, message)
+        """Hash the run's clock and the whole message."""
+        hasher = self._hashes.get(output)
+        if hasher is None:
+            hasher = self._hashes[output] = hashlib.blake2b(digest_size=16)
+        hasher.update(b"@%d" % arrival_ns)
+        hash_into(hasher, message)
 
     def hexdigest(self) -> str:
-        """32 hex digits."""
-        return self._hash.hexdigest()
+        """32 hex digits, of the outputs' names and hashes."""
+        parts = [f"{name} {hasher.hexdigest()}" for name, hasher in sorted(self._hashes.items())]
+        return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
 
 
 class Csv(Tap):

@@ -1,4 +1,4 @@
-"""What a run leaves for people: fixes as a TUM trajectory and a covariance table, and the story in words.
+"""What a run leaves for people: fixes and poses as TUM trajectories and covariance tables, and the story in words.
 
 Source: DESIGN, Outputs of a run. TUM lines are `stamp_s tx ty tz qx qy qz qw` of T_vehicle_drone.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections import Counter
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from pydantic import PrivateAttr
 from flow.link import Run, Tap
 from flow.message import Message
 from stages.geometry import quaternions_xyzw
-from stages.messages import DepthImage, Detections, DroneFix, RelativeRotation, TrackState
+from stages.messages import DepthImage, Detections, DroneFix, PoseState, RelativePose, RelativeRotation, TrackState
 
 FIX_FILE, COVARIANCE_FILE, LOG_FILE = "fix_vehicle_drone.tum", "fix_covariance.csv", "run.log"
 DETECTIONS_FILE, SUMMARY_FILE = "detections.csv", "summary.json"
@@ -34,6 +35,11 @@ BRANCHES = ("p_0", "p_90", "p_180", "p_270")  # probability of the rotation give
 POSITION_ONLY = (
     "# T_vehicle_drone, position only: the LiDAR does not measure orientation, '0 0 0 1' stands for not measured\n"
 )
+POSE_UPPER = tuple(f"c{a}{b}" for a in range(6) for b in range(a, 6))  # rotation [rad] before translation [m]
+POSE_HEAD = (
+    "# T_vehicle_drone, fused; '0 0 0 1' where its rotation is not known: rotation is 0 in the table of covariances\n"
+)
+UNKNOWN_RAD2 = math.pi**2  # variance written for a rotation that is not known: a table of numbers holds no infinity
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
 
 
@@ -66,13 +72,14 @@ class Transition:
 class Results(Tap):
     """Collects fixes, verdicts and state changes; writes each as it comes, so that a stopped run keeps what it had.
 
-    A run in which nobody tells a rotation has no file of rotations.
+    A run in which nobody tells a rotation has no file of rotations; one in which nobody fuses has none of poses.
     """
 
     _files: dict[str, TextIO] = PrivateAttr(default_factory=dict)
     _covariance: Any = PrivateAttr(default=None)
     _detections: Any = PrivateAttr(default=None)
     _rotations: Any = PrivateAttr(default=None)
+    _poses: Any = PrivateAttr(default=None)
     _folder: Path = PrivateAttr()
     _sweep_start_ns: dict[int, int] = PrivateAttr(default_factory=dict)  # of the newest depth image, by its stamp
     _last_sweep_ns: int | None = PrivateAttr(default=None)
@@ -82,6 +89,7 @@ class Results(Tap):
     _found: int = PrivateAttr(default=0)
     _transitions: list[Transition] = PrivateAttr(default_factory=list)
     _state: dict[int, str] = PrivateAttr(default_factory=dict)  # of each track
+    _pose_state: PoseState | None = PrivateAttr(default=None)
     _branch: tuple[str, int] | None = PrivateAttr(default=None)  # state and switches of the newest rotation
 
     @property
@@ -114,7 +122,8 @@ class Results(Tap):
         for name in (FIX_FILE, COVARIANCE_FILE, DETECTIONS_FILE, LOG_FILE):
             self._files[name] = _line_buffered(run.out_dir / name)
         self._folder = run.out_dir
-        (run.out_dir / ROTATION_FILE).unlink(missing_ok=True)
+        for name in (ROTATION_FILE, POSE_FILE, POSE_COVARIANCE_FILE):
+            (run.out_dir / name).unlink(missing_ok=True)
         self._files[FIX_FILE].write(POSITION_ONLY)
         self._covariance = csv.writer(self._files[COVARIANCE_FILE])
         upper = [f"c{name}_m2" for name in UPPER]
@@ -143,6 +152,8 @@ class Results(Tap):
             self._note_state(output, message)
         elif isinstance(message, RelativeRotation):
             self._write_rotation(output, message)
+        elif isinstance(message, RelativePose):
+            self._write_pose(output, message)
 
     def _note_state(self, output: str, message: TrackState) -> None:
         """Keep and log a track's state when it is another than before."""
@@ -185,6 +196,32 @@ class Results(Tap):
         if branch != self._branch:
             self._branch = branch
             self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")
+
+    def _write_pose(self, output: str, message: RelativePose) -> None:
+        """A line for each pose whose position is known; the log tells when the state changes.
+
+        `rotation`: whether it is known; `good` says the same. Where it is not known the covariance's position is in the
+        vehicle's axes.
+        """
+        if message.state is not self._pose_state:
+            self._pose_state = message.state
+            self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")
+        if self._poses is None:
+            for name in (POSE_FILE, POSE_COVARIANCE_FILE):
+                self._files[name] = _line_buffered(self._folder / name)
+            self._files[POSE_FILE].write(POSE_HEAD)
+            self._poses = csv.writer(self._files[POSE_COVARIANCE_FILE])
+            self._poses.writerow(["stamp_s", *POSE_UPPER, "state", "good", "rotation", "resets", "nis", "measured_s"])
+        R, xyz_m, covariance = message.R_vehicle_drone, message.xyz_vehicle_m, message.covariance
+        if xyz_m is None or covariance is None:
+            return
+        q = (0.0, 0.0, 0.0, 1.0) if R is None else tuple(quaternions_xyzw(R[None])[0].tolist())
+        self._files[POSE_FILE].write(tum_line(message.stamp_ns, xyz_m, q))
+        upper = np.where(np.isinf(covariance), UNKNOWN_RAD2, covariance)[np.triu_indices(6)]
+        measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
+        nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
+        told = [message.state.name, int(R is not None), int(R is not None), message.resets, nis, measured]
+        self._poses.writerow([stamp_s(message.stamp_ns), *_digits(upper), *told])
 
     def note(self, text: str) -> None:
         """One line of the log without a time: a warning of the recording, the hash."""

@@ -1,6 +1,6 @@
 """The folder that a run leaves: its configuration, its results, what truth says of them, and a summary.
 
-A replay fills it, and so does a closed loop while its recording is made: one graph leaves the same files both ways.
+A replay fills it, and so do a live run and a closed loop while its recording is made: one graph leaves the same files.
 
 Source: DESIGN, Outputs of a run.
 """
@@ -8,9 +8,10 @@ Source: DESIGN, Outputs of a run.
 from __future__ import annotations
 
 import json
+import resource
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -21,13 +22,14 @@ import yaml
 from flow.draw import mermaid
 from flow.graph import Graph, load_graph
 from flow.link import LinkError, Run, Tap
+from flow.live_report import LiveReport
 from flow.problem import Place
 from flow.replay import RunReport, replay
 from flow.taps import Digest
 from flow.tree import Section
 from links.recording import Progress, RecordingReader
 from links.results import SUMMARY_FILE, Results, stamp_s
-from links.truth import FixErrors, TruthLog
+from links.truth import TRUTH_RECORDING, FixErrors, TruthLog
 
 CONFIG_FILE = "config.yaml"
 
@@ -72,9 +74,19 @@ class RunFolder:
     The summary comes last: a folder without one holds a run that was stopped.
     """
 
-    def __init__(self, folder: Path, recording: Path, asked: Asked, graph: Graph, began_s: float | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        recording: Path,
+        asked: Asked,
+        graph: Graph,
+        began_s: float | None = None,
+        *,
+        live: bool = False,
+    ) -> None:
         """`began_s`: when the run began on the monotonic clock, now if not said."""
         self._folder, self._recording, self._asked, self._graph = folder, recording, asked, graph
+        self._live = live
         self._began_s = time.monotonic() if began_s is None else began_s
         self._results, self._open = Results(), ExitStack()
         declared = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
@@ -83,7 +95,8 @@ class RunFolder:
     def __enter__(self) -> RunFolder:
         self._folder.mkdir(parents=True, exist_ok=True)
         (self._folder / SUMMARY_FILE).unlink(missing_ok=True)
-        about = Run(self._folder, self._recording.stem, mermaid(self._graph), self._graph.settings_yaml())
+        name = self._asked.config.stem if self._live else self._recording.stem
+        about = Run(self._folder, name, mermaid(self._graph), self._graph.settings_yaml(), self._live)
         (self._folder / CONFIG_FILE).write_text(about.settings_yaml, encoding="utf-8")
         with ExitStack() as opening:
             for tap in self.taps:
@@ -97,12 +110,21 @@ class RunFolder:
     ) -> None:
         self._open.close()
 
-    def finish(self, report: RunReport, output_hash: str, truth: TruthLog, warnings: list[str]) -> Finished:
-        """End the run: `warnings` are its recording's, `truth` is what the recording says of the drones."""
+    def note(self, text: str) -> None:
+        """A line of the run's log."""
+        self._results.note(text)
+
+    def finish(self, report: RunReport, output_hash: str, truth: TruthLog | None, warnings: list[str]) -> Finished:
+        """End the run: `warnings` are its recording's, `truth` is what the recording says of the drones.
+
+        None: what a simulated rig, which is a tap that has ended then, wrote beside the recording.
+        """
         warnings = [*warnings, *_remarks(self._graph, report)]
         for text in (*warnings, f"output hash {output_hash}"):
-            self._results.note(text)
+            self.note(text)
         self._open.close()
+        if truth is None:
+            truth = truth_beside(self._recording)
         truth.write(self._folder)
         finished = Finished(
             recording=self._recording,
@@ -124,10 +146,19 @@ def replay_into(folder: Path, recording: Path, asked: Asked, progress: Progress 
     began_s = time.monotonic()
     with RecordingReader(recording) as reader:
         graph = asked.graph(reader.rig_yaml, f"{recording} (rig.yaml)")
-        truth, digest = TruthLog(), Digest()
+        truth, digest = truth_beside(recording), Digest()
         with RunFolder(folder, recording, asked, graph, began_s) as run:
             report = replay(graph, truth.aside(reader.records(progress=progress)), (digest, *run.taps))
             return run.finish(report, digest.hexdigest(), truth, reader.warnings)
+
+
+def truth_beside(recording: Path) -> TruthLog:
+    """The truth that a simulated rig wrote beside a live recording; empty where there is none."""
+    truth, file = TruthLog(), recording.parent / TRUTH_RECORDING
+    if file.is_file() and file != recording:
+        with RecordingReader(file) as reader:
+            truth.take(reader.records())
+    return truth
 
 
 def holds_run(folder: Path, recording: Path, graph: Graph) -> bool:
@@ -140,7 +171,9 @@ def holds_run(folder: Path, recording: Path, graph: Graph) -> bool:
 
 
 def _remarks(graph: Graph, report: RunReport) -> list[str]:
-    """What the run did not use, so that a silent port is not taken for a quiet sensor."""
+    """What the run did not use, so that a silent port is not taken for a quiet sensor; live, what went wrong."""
+    if isinstance(report, LiveReport):
+        return [str(incident) for incident in report.incidents]
     remarks = [f"{count} records on {topic} are wired to nothing" for topic, count in report.unwired_topics.items()]
     silent = [spec.name for spec in graph.nodes.values() if spec.kind == "links" and report.nodes[spec.name].calls == 0]
     sources = {edge.producer for edge in graph.edges}
@@ -183,9 +216,44 @@ def _summary(run: Finished, asked: Asked) -> dict[str, Any]:
             for name, node in report.nodes.items()
         },
     }
+    if isinstance(report, LiveReport):
+        summary["live"] = _live(report)
     if run.errors is not None:
         summary["against_truth"] = _judged(run.errors)
     return summary
+
+
+def _live(report: LiveReport) -> dict[str, Any]:
+    """What only a live run can tell: how late it was, what it dropped, what went wrong."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    edges = {name: {key: _rounded(value) for key, value in asdict(edge).items()} for name, edge in report.edges.items()}
+    return {
+        "cpu_s": round(used.ru_utime + used.ru_stime, 2),
+        "max_rss_mb": round(used.ru_maxrss / 1024, 1),  # Linux tells kB
+        "dropped": report.dropped,
+        "missed_deadlines": report.missed,
+        "edges": edges,
+        "links": {name: asdict(link) for name, link in report.links.items()},
+        "counters": report.counters,
+        "restarts": report.restarts,
+        "failures": report.failures,
+        "switched_off": report.off,
+        "stopped_by": report.stopped_by,
+        "not_shown": report.tap_drops,
+        "incidents": [
+            {
+                "first_s": stamp_s(i.first_ns),
+                "last_s": stamp_s(i.last_ns),
+                "count": i.count,
+                "what": f"{i.node}: {i.text}",
+            }
+            for i in report.incidents
+        ],
+    }
+
+
+def _rounded(value: Any) -> Any:
+    return round(value, 3) if isinstance(value, float) else value
 
 
 def _judged(errors: FixErrors) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from stages.geometry import rotation_from_quaternion_xyzw
 from stages.messages import DroneFix
 
 TOPIC_VEHICLE = "/truth/vehicle"
+TRUTH_RECORDING = "truth.mcap"  # beside a live recording of the simulated rig: the truth, which no run takes in
 OF_A_DRONE = re.compile(r"/truth/(drone|hits|visible)(?:_([1-9]\d*))?")  # /truth/hits_2 is of drone 2
 MAX_GAP_NS = 50_000_000  # truth further apart than this is not interpolated over
 Quaternion = tuple[float, float, float, float]  # x, y, z, w

@@ -127,11 +127,17 @@ class Harmonic(_Settings):
     phase_deg: float = 0.0
 
 
+def _is_zero(value: float) -> bool:
+    return value == 0.0
+
+
 class LidarMount(_Settings):
     """How the LiDAR sits on the vehicle: T_vehicle_lidar = T_vehicle_turntable Rz(angle) T_turntable_lidar.
 
     angle = sign * (servo position - zero) - encoder error. `turns: false` is a LiDAR bolted down, without servo.
     A servo stamp is corrected by `servo_time_offset_s` before interpolation (positive: the servo's stamps are early).
+    `servo_play_deg` is the gear's play, end to end: the table hangs back by half of it (`stages/turntable.py`). A file
+    holds it only where there is some.
     """
 
     T_vehicle_turntable: Pose = Pose()
@@ -141,6 +147,7 @@ class LidarMount(_Settings):
     servo_zero_deg: float = 0.0
     servo_time_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     servo_harmonics: tuple[Harmonic, ...] = ()
+    servo_play_deg: Annotated[float, Field(ge=0, le=5, exclude_if=_is_zero)] = 0.0
 
     def turntable_rad(self, servo_rad: Array64) -> Array64:
         """Turntable angle for servo encoder positions (n,) [rad]."""

@@ -170,6 +170,8 @@ class Turntable:
         self._T_turntable_lidar = mount.T_turntable_lidar.matrix()
         self._lidar_turntable_m: tuple[float, float, float] = tuple(self._T_turntable_lidar[:3, 3].tolist())
         self._last_servo_rad: float | None = None
+        self._half_play_rad = math.radians(mount.servo_play_deg) / 2
+        self._lag_rad = 0.0  # by how much the turntable hangs back within the play
         self._states: deque[tuple[int, float]] = deque(maxlen=STATES_KEPT)
         self._state_ns = np.empty(0, dtype=np.int64)
         self._state_rad = np.empty(0)
@@ -182,16 +184,20 @@ class Turntable:
     def add(self, servo: ServoState) -> None:
         """One more state. One that is not newer than the last is ignored: it can only be a repeated answer.
 
-        A single-turn encoder jumps by a whole turn at its end; the shorter way round is taken, so angles run on.
+        A single-turn encoder jumps by a whole turn at its end; the shorter way round is taken, so angles run on. The
+        turntable follows the servo with play: it stays where it is until the servo takes it along. Where it stands in
+        its play before the first move is not known: the middle is taken.
         """
         stamp_ns = servo.stamp_ns + self._offset_ns
         if self._states and stamp_ns <= self._states[-1][0]:
             return
         servo_rad = servo.position_rad
         if self._last_servo_rad is not None:
-            servo_rad = self._last_servo_rad + math.remainder(servo_rad - self._last_servo_rad, math.tau)
+            step_rad = math.remainder(servo_rad - self._last_servo_rad, math.tau)
+            servo_rad = self._last_servo_rad + step_rad
+            self._lag_rad = min(max(self._lag_rad + step_rad, -self._half_play_rad), self._half_play_rad)
         self._last_servo_rad = servo_rad
-        angle_rad = float(self._mount.turntable_rad(np.array([servo_rad]))[0])
+        angle_rad = float(self._mount.turntable_rad(np.array([servo_rad]))[0]) - self._mount.servo_sign * self._lag_rad
         self._states.append((stamp_ns, angle_rad))
         self._freeze()
 

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import typer
 
+from links.cli.calibrate import calibrate_recording
 from links.cli.evaluate import evaluate_runs
 from links.cli.files import import_recording, recover_recording, simulate_matrix, simulate_recording, view
 from links.cli.graphs import check, graph, schema
+from links.cli.preflight import preflight
 from links.cli.run import replay_recording, run
 
 app = typer.Typer(
@@ -30,6 +32,8 @@ app.command("recover")(recover_recording)
 app.command("simulate")(simulate_recording)
 app.command("matrix")(simulate_matrix)
 app.command("view")(view)
+app.command("preflight")(preflight)
+app.command("calibrate")(calibrate_recording)
 app.command("evaluate")(evaluate_runs)
 
 

@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from flow.link import LinkError
+from flow.ports import RunError
 from flow.problem import ConfigError
-from flow.replay import RunError
 
 FINDING, WRONG_USE = 1, 2
 BAR_AFTER_S = 1.0  # anything that takes longer than 2 s shows a bar before that

@@ -1,4 +1,4 @@
-"""`grd run` and `grd replay`: a graph over a recording, into a folder with everything people look at afterwards.
+"""`grd run` and `grd replay`: a graph, live or over a recording, into a folder with all that people look at afterwards.
 
 Source: DESIGN, Command line and Outputs of a run.
 """
@@ -14,9 +14,14 @@ from rich.text import Text
 
 from flow.graph import recording_named
 from flow.link import LinkError
-from links.cli.console import err, in_words, out, progress_bar, warn
+from flow.live_report import LiveReport
+from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+from links.cli.live_view import LiveView
+from links.live_run import live_graph, run_live
+from links.repeat import repeat_into
 from links.results import FIX_FILE, SUMMARY_FILE, stamp_s
 from links.run_folder import Asked, Finished, replay_into
+from links.warm_up import warm_up
 
 TABLE_ROWS = 12
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -32,23 +37,51 @@ View = Annotated[bool, typer.Option("--view", help="Open the run in the Rerun vi
 
 @in_words
 def run(
-    config: Annotated[Path, typer.Argument(help="Configuration; its `replay:` names the recording.")],
+    config: Annotated[Path, typer.Argument(help="Configuration; live, unless its `replay:` names a recording.")],
     out_dir: Out = None,
     overlay: Overlay = None,
     sets: Sets = None,
+    for_s: Annotated[
+        float | None,
+        typer.Option("--for", min=0.1, metavar="SECONDS", help="Live: stop after so long [default: at Ctrl-C]."),
+    ] = None,
+    warm: Annotated[
+        bool,
+        typer.Option(
+            "--warm-up/--no-warm-up", help="Live: try the graph on a recording first, so that all is compiled."
+        ),
+    ] = True,
     view: View = False,
 ) -> None:
-    """Run what CONFIG says.
+    """Run what CONFIG says: live, or the recording it names.
+
+    A live run records itself (`links.recording.Recorder`); Ctrl-C or SIGTERM ends it. Exit code 1 when a stage stopped
+    it, or was switched off because it kept raising.
 
     Example: grd run configs/quickstart.yaml --set track.radius_m=0.8
     """
     recording = recording_named(config, overlay or (), sets or ())
-    if recording is None:
-        raise LinkError(
-            f"{config} names no recording ('replay: FILE.mcap'), so it would run live; live runs are not built yet."
-            f" Replay a recording with it: grd replay FILE.mcap --config {config}"
-        )
-    _run(recording, config, out_dir, overlay or [], sets or [], view)
+    if recording is not None:
+        if for_s is not None:
+            raise LinkError(f"--for is of live runs, and {config} replays {recording.name}: leave it out")
+        _run(recording, config, out_dir, overlay or [], sets or [], view)
+        return
+    asked = Asked(config, tuple(overlay or ()), tuple(sets or ()))
+    graph, folder = live_graph(asked), _new_folder(out_dir, f"live-{config.stem}")
+    with progress_bar("warm up") as step:
+        rough = warm_up(graph, step) if warm else None
+    if rough:
+        warn(rough)
+    with LiveView() as watch:
+        finished = run_live(folder, asked, graph, watch.show, for_s, (watch.newest,))
+    _tell(finished)
+    if view:
+        _open_viewer(finished.out_dir)
+    report = finished.report
+    if isinstance(report, LiveReport) and report.off:
+        what = "stopped the run" if report.stopped_by else "did not work to the end: it kept raising"
+        err.print(f"'{report.stopped_by or report.off[0]}' {what}", markup=False, style="red")
+        raise typer.Exit(FINDING)
 
 
 @in_words
@@ -60,12 +93,30 @@ def replay_recording(
     out_dir: Out = None,
     overlay: Overlay = None,
     sets: Sets = None,
+    as_live: Annotated[
+        bool,
+        typer.Option(
+            "--as-live",
+            help="A live run's recording: the run itself again, with its own configuration, drops and hash, "
+            "instead of what this configuration makes of its records.",
+        ),
+    ] = False,
     view: View = False,
 ) -> None:
     """Replay RECORDING: deterministic, as fast as possible.
 
+    With --as-live each stage takes what it took in the live run, in that order; exit code 1 when the hash is not the
+    live run's.
+
     Example: grd replay recordings/street_sweep.mcap --out out/mine
     """
+    if as_live:
+        if config or overlay or sets:
+            raise LinkError(
+                "--as-live takes the recording's own configuration: leave out --config, --overlay and --set"
+            )
+        _repeat(recording, out_dir, view)
+        return
     _run(recording, config or DEFAULT_REPLAY_CONFIG, out_dir, overlay or [], sets or [], view)
 
 
@@ -78,6 +129,18 @@ def _run(
     _tell(finished)
     if view:
         _open_viewer(finished.out_dir)
+
+
+def _repeat(recording: Path, out_dir: Path | None, view: bool) -> None:
+    folder = _new_folder(out_dir, f"{recording.stem}-as-live")
+    with progress_bar(f"replay {recording.name} as live") as step:
+        repeated = repeat_into(folder, recording, step)
+    _tell(repeated.finished)
+    out.print(repeated.verdict)
+    if view:
+        _open_viewer(folder)
+    if not repeated.same:
+        raise typer.Exit(FINDING)
 
 
 def _new_folder(wanted: Path | None, name: str) -> Path:
@@ -96,9 +159,10 @@ def _new_folder(wanted: Path | None, name: str) -> Path:
 
 def _tell(run: Finished) -> None:
     """The positions, the answer in a sentence, and where to look."""
-    for text in run.warnings:
-        warn(text)
     results, report = run.results, run.report
+    live = isinstance(report, LiveReport)
+    for text in () if live else run.warnings:  # live they were said as they came
+        warn(text)
     if results.fixes:
         out.print(_table(run))
     recorded_s = (report.last_ns - report.first_ns) / 1e9
@@ -123,6 +187,8 @@ def _tell(run: Finished) -> None:
     out.print(f"output hash {run.digest}")
     out.print(f"positions   {run.out_dir / FIX_FILE}")
     out.print(f"summary     {run.out_dir / SUMMARY_FILE}")
+    if live and run.recording.is_file():
+        out.print(f"flight      {run.recording}   (the same again: grd replay {run.recording} --as-live)")
     rerun_files = sorted(run.out_dir.glob("*.rrd"))
     for path in rerun_files:
         out.print(f"recording   {path}   (look at it: rerun {path})")

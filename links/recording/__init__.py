@@ -4,7 +4,9 @@ from links.recording.compressed_image import CompressedImage, decode_compressed_
 from links.recording.format import TOPICS, Progress, Topic
 from links.recording.importing import ImportReport, import_file
 from links.recording.reader import RecordingReader
+from links.recording.recorder import Recorder
 from links.recording.recover import RecoverReport, recover
+from links.recording.session import parts_of, records_of
 from links.recording.writer import RecordingWriter
 
 __all__ = [
@@ -12,6 +14,7 @@ __all__ = [
     "CompressedImage",
     "ImportReport",
     "Progress",
+    "Recorder",
     "RecordingReader",
     "RecordingWriter",
     "RecoverReport",
@@ -19,5 +22,7 @@ __all__ = [
     "decode_compressed_image",
     "encode_compressed_image",
     "import_file",
+    "parts_of",
+    "records_of",
     "recover",
 ]

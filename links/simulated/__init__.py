@@ -1,1 +1,8 @@
-"""A simulated world and sensors that give the same bytes as the hardware."""
+"""A simulated world and sensors that give the same bytes as the hardware.
+
+Source: ours.
+"""
+
+from links.simulated.live_rig import LiveRig
+
+__all__ = ["LiveRig"]

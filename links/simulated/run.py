@@ -72,15 +72,15 @@ class Simulation:
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
         flown: Path | Flight | None = drone.path if drone else None
-        self._talkers: list[Autopilot | VehicleOdometry] = []
+        self.talkers: list[Autopilot | VehicleOdometry] = []
         if drone is not None and scenario.autopilot is not None:
             flown = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
-            self._talkers.append(Autopilot(scenario.autopilot, flown, start_ns, duration_s, self.seed))
+            self.talkers.append(Autopilot(scenario.autopilot, flown, start_ns, duration_s, self.seed))
         vehicle = scenario.vehicle
         ridden = Ride(vehicle.path, vehicle.ride, duration_s, self.seed) if vehicle.ride else vehicle.path
         if scenario.vehicle_odometry is not None:
             odometry = VehicleOdometry(scenario.vehicle_odometry, ridden, start_ns, duration_s, self.seed)
-            self._talkers.append(odometry)
+            self.talkers.append(odometry)
         others = scenario.other_drones
         self.truth = Truth(start_ns, ridden, flown, tuple(other.path for other in others))
         height = scenario.vehicle.camera_height_m
@@ -114,6 +114,7 @@ class Simulation:
         )
         lidar_at = (lambda stamp_ns: self.T_world_lidar(stamp_ns)[1]) if scenario.truth_visible else None
         self._true = TruthRecords(self.truth, self._scene.world, lidar_at)
+        self.lidar_clock_ns = 0  # how far the LiDAR's clock is ahead of the scenario's
         self.pulses = 0
         self.returns = 0
         self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from drones
@@ -131,12 +132,12 @@ class Simulation:
             packets = min(most, -(-(end_ns - first_ns) // packet_ns))
             next_ns = first_ns + packets * packet_ns
             records = self._servo.advance(next_ns)
-            records += self._lidar_records(first_ns, packets, packet_ns)
+            records += self.lidar_records(first_ns, packets, packet_ns)
             for camera in self._cameras:
                 records += camera.records(next_ns)
-            for talker in self._talkers:
+            for talker in self.talkers:
                 records += talker.records(next_ns)
-            records += self._true.records(next_ns)
+            records += self.truth_records(next_ns)
             for record in records:
                 heapq.heappush(waiting, (record.arrival_ns, made, record))
                 made += 1
@@ -159,12 +160,16 @@ class Simulation:
             self._servo.command(left_ns, command.position_rad, command.speed_radps)
 
     def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
-        """Where the LiDAR truly is: rotations (n, 3, 3), positions (n, 3) [m]. T_wv T_vt Rz(angle) T_tl."""
+        """Where the LiDAR truly is: rotations (n, 3, 3), positions (n, 3) [m]."""
+        return self.T_world_lidar_at(stamp_ns, self._servo.turned_rad(stamp_ns))
+
+    def T_world_lidar_at(self, stamp_ns: NDArray[np.int64], turned_rad: Array64) -> tuple[Array64, Array64]:
+        """The same where the servo has turned the turntable by so much (n,): T_wv T_vt Rz(angle) T_tl."""
         mount = self.scenario.mount
         T_vehicle_turntable, T_turntable_lidar = mount.T_vehicle_turntable.matrix(), mount.T_turntable_lidar.matrix()
         R_world_vehicle, t_world_vehicle = self.truth.T_world_vehicle(stamp_ns)
-        turned_rad = mount.turntable_rad(self._servo.turned_rad(stamp_ns))
-        return turned_poses(R_world_vehicle, t_world_vehicle, T_vehicle_turntable, turned_rad, T_turntable_lidar)
+        angle_rad = mount.turntable_rad(turned_rad)
+        return turned_poses(R_world_vehicle, t_world_vehicle, T_vehicle_turntable, angle_rad, T_turntable_lidar)
 
     def drone_servo_rad(self, time_s: float) -> float:
         """Servo position at which the drone lies in the plane through the turntable's axis and azimuth 0."""
@@ -176,7 +181,12 @@ class Simulation:
         x, y, _ = T[:3, :3].T @ (drone - T[:3, 3])
         return mount.servo_sign * float(np.mod(np.arctan2(y, x), np.pi)) + np.radians(mount.servo_zero_deg)
 
-    def _lidar_records(self, first_ns: int, packets: int, packet_ns: int) -> list[Record]:
+    def truth_records(self, until_ns: int) -> list[Record]:
+        """What was true before a time and since the call before."""
+        return self._true.records(until_ns)
+
+    def lidar_records(self, first_ns: int, packets: int, packet_ns: int) -> list[Record]:
+        """The LiDAR's packets from a time on, in order of time; and which pulses of them the drones returned."""
         firings = firings_per_packet(self.scenario.lidar.return_mode)
         sequence_ns = first_ns + vlp16.SEQUENCE_NS * np.arange(packets * firings, dtype=np.int64)
         pulse_ns = (sequence_ns[:, None] + vlp16.PULSE_NS * np.arange(vlp16.LASERS)).ravel()
@@ -192,7 +202,8 @@ class Simulation:
         records: list[Record] = []
         for i in range(packets):
             at = first_ns + i * packet_ns
-            data = encode_packet(at, azimuth[i], ranges[:, i], shades[:, i], self.scenario.lidar.return_mode)
+            mode = self.scenario.lidar.return_mode
+            data = encode_packet(at + self.lidar_clock_ns, azimuth[i], ranges[:, i], shades[:, i], mode)
             arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
             records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
         return records + self._true.hits(pulse_ns.reshape(packets, -1), pulses)

@@ -1,4 +1,4 @@
-"""The vehicle's own odometry as a source: one JSON object per pose, T_start_vehicle.
+"""The vehicle's own odometry as a source: one JSON object per pose, T_start_vehicle; live by UDP (`udp.py`).
 
 A recording without it is no error: the source stays silent, and the run says so once.
 
@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from ipaddress import IPv4Address
 from typing import Any
 
 import numpy as np
-from pydantic import PrivateAttr
+from pydantic import Field, PrivateAttr, model_validator
 
-from flow.link import Record, Source
+from flow.link import LinkError, Record, Source
+from links.vehicle_odometry.udp import listen_udp
 from stages.geometry import Array64, rotation_from_quaternion_xyzw
 from stages.messages import VehicleMotion
 
@@ -28,12 +33,34 @@ class VehicleOdometry(Source):
     """Where the vehicle has driven. A record that holds no pose is counted in `refused` and left out."""
 
     topic: str = "/vehicle/odometry"
+    port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: there is none, or it is in recordings only
+    bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address
+    sender: IPv4Address | None = None  # who tells it; others are ignored
     _refused: int = PrivateAttr(default=0)
+    _udp: Counter[str] = PrivateAttr(default_factory=Counter[str])
+
+    @model_validator(mode="after")
+    def _sender_is_known(self) -> VehicleOdometry:
+        if self.sender is None and not self.bind.is_loopback:
+            raise ValueError(f"sender: say who tells the odometry when binding to {self.bind}: others are ignored")
+        return self
 
     @property
     def refused(self) -> int:
         """Records that held no pose, or one that cannot be true."""
         return self._refused
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Totals since the start: refused, from other senders."""
+        return {"refused": self._refused, **self._udp}
+
+    def listen(self) -> AbstractContextManager[Iterator[Record]]:
+        """Receive poses: `with odometry.listen() as records`. LinkError without a port, or when it cannot be opened."""
+        if self.port is None:
+            raise LinkError(f"{self.topic}: give `port` to hear the vehicle's odometry, or take the link out")
+        sender = None if self.sender is None else str(self.sender)
+        return listen_udp(self.topic, str(self.bind), self.port, sender, self._udp)
 
     def decode(self, record: Record) -> VehicleMotion | None:
         """A message of `{"xyz_m": [...], "quaternion_xyzw": [...], "covariance": [36 numbers] or null}`, else None."""

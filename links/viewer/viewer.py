@@ -39,7 +39,7 @@ _log = logging.getLogger("grd.viewer")
 
 
 class Viewer(Tap):
-    """Log every edge to Rerun. `lossless: true`, for replays: the run waits for the viewer instead of dropping."""
+    """Log every edge to Rerun. `lossless: true`: a replay waits for the viewer instead of dropping; a live run never."""
 
     file: str | None = "run.rrd"  # in the run's folder; null: no file
     serve: bool = False  # to viewers on this host; binds 127.0.0.1 only
@@ -58,6 +58,7 @@ class Viewer(Tap):
     _thread: threading.Thread | None = PrivateAttr(None)
     _errors: Counter[str] = PrivateAttr(default_factory=Counter)
     _finished: bool = PrivateAttr(False)
+    _waits: bool = PrivateAttr(False)  # lossless, and not live
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -84,7 +85,8 @@ class Viewer(Tap):
         self._box = None
         if self.file is None and not self.serve:
             return
-        self._box = Mailbox(self.queue_size, lossless=self.lossless, patience_s=PATIENCE_S)
+        self._waits = self.lossless and not run.live
+        self._box = Mailbox(self.queue_size, lossless=self._waits, patience_s=PATIENCE_S)
         self._thread = threading.Thread(target=self._work, args=(run, self._box), name="viewer", daemon=True)
         self._thread.start()
 
@@ -98,7 +100,7 @@ class Viewer(Tap):
         if self._box is None or self._thread is None:
             return
         self._box.close()
-        patience_s = CLOSE_S[self.lossless]
+        patience_s = CLOSE_S[self._waits]
         self._thread.join(patience_s)
         if self._thread.is_alive():
             self._errors[f"the viewer needs over {patience_s} s: the end of {self.file} is missing"] += 1
@@ -140,7 +142,7 @@ class Viewer(Tap):
             max_points=self.max_points_per_slice,
             trail_s=self.trail_s,
             cameras=self.cameras,
-            picture_every_s=PICTURE_EVERY_S[self.lossless],
+            picture_every_s=PICTURE_EVERY_S[self._waits],
         )
         opens = [*opening(self.mount), *(drone_sphere(None) if vision.directions else ())]
         slicer = Slicer(self.slice_s)

@@ -37,6 +37,11 @@ class Thickness:
     after_m: Array64
     range_m: Array64
 
+    @property
+    def medians_m(self) -> tuple[float, float]:
+        """Of the patches, before and after."""
+        return float(np.median(self.before_m)), float(np.median(self.after_m))
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -55,8 +60,13 @@ class Calibration:
     numbers: ServoMount  # the mount found, as it is written
 
 
-def calibrate(returns: Returns, trace: ServoTrace, rig: LidarMount, max_gap_s: float = 0.1) -> Calibration:
-    """Find how the LiDAR sits on its servo. Raises CannotCalibrate when nothing can be told."""
+def calibrate(
+    returns: Returns, trace: ServoTrace, rig: LidarMount, *, parked: bool = False, max_gap_s: float = 0.1
+) -> Calibration:
+    """Find how the LiDAR sits on its servo. Raises CannotCalibrate when nothing can be told.
+
+    `parked`: it is known that the vehicle stood still. A servo that comes back shows that by itself.
+    """
     if not rig.turns:
         raise CannotCalibrate("the rig says that its LiDAR is bolted down (turns: false): there is no servo mount")
     if len(trace.stamp_ns) < 2:
@@ -75,8 +85,13 @@ def calibrate(returns: Returns, trace: ServoTrace, rig: LidarMount, max_gap_s: f
             f"the servo turned by {math.degrees(travel.angle_rad):.0f} deg only, at least "
             f"{math.degrees(LEAST_TRAVEL_RAD):.0f} deg are needed: let it sweep, best from end to end and back"
         )
+    if not (travel.both_ways or parked):
+        raise CannotCalibrate(
+            "the servo turned one way only, which does not show whether the vehicle stood still: sweep there and back, "
+            "or say that it stood with --parked"
+        )
     solution = solve(returns, trace, numbers, max_gap_s)
-    _check_still(returns, trace, numbers, solution, max_gap_s)
+    _check_still(returns, trace, numbers, solution, travel.both_ways, max_gap_s)
     if solution is None or len(solution.system.patches.first) < FEWEST_PATCHES:
         raise CannotCalibrate(
             "too few flat surfaces were seen more than once: drive to where there are walls, and stand still there"
@@ -110,17 +125,17 @@ def calibrate(returns: Returns, trace: ServoTrace, rig: LidarMount, max_gap_s: f
 
 
 def _check_still(
-    returns: Returns, trace: ServoTrace, rig: ServoMount, solution: Solution | None, max_gap_s: float
+    returns: Returns, trace: ServoTrace, rig: ServoMount, solution: Solution | None, both_ways: bool, max_gap_s: float
 ) -> None:
     """Raise CannotCalibrate when the vehicle moved, under the mount found, or the rig's where none was."""
     mount, bias_m = (solution.mount, solution.bias_m) if solution else (rig, np.zeros(LASERS))
     placed = place(returns, servo_at(trace, returns.stamp_ns, mount, max_gap_s), mount, bias_m)
-    between = shift(placed.xyz_m, returns.stamp_ns)
+    between = None if not both_ways else shift(placed.xyz_m, returns.stamp_ns)
     system = linearise(returns, trace, mount, bias_m, COARSE_RAD[0], max_gap_s)
     steady = drift(system, returns) if system and solution else None
     how = ""
     if between is not None and between.moved:
-        how = "what stands upright was elsewhere in the second half of the time"
+        how = "what stands upright was elsewhere when it was seen again"
     elif steady is not None and (steady.moved_m > MOVED_M or steady.turned_rad > TURNED_RAD):
         how = f"surfaces fit a drive by {steady.moved_m:.2f} m and a turn by {math.degrees(steady.turned_rad):.2f} deg"
     if how:

@@ -16,6 +16,7 @@ from stages.compiled import compiled
 from stages.geometry import Array64
 
 SMOOTHED_STATES = (2, 4, 8, 12)  # on either side
+SETTLED_RAD = math.radians(0.5)  # a turn-back is over after that: how play gives way is not modelled so finely
 RATE_STATES = 4  # the rate is taken over so many states on either side: a step of the encoder is 0.088 deg
 
 
@@ -46,11 +47,11 @@ class Returns:
 
 @dataclass(frozen=True)
 class ServoAt:
-    """The servo at the time of each return (n,); NaN where it is not known."""
+    """The servo at the time of each return (n,)."""
 
-    position_rad: Array64  # of the encoder
+    position_rad: Array64  # of the encoder; NaN where it is not known, or not on which side the play is
     rate_radps: Array64
-    hang: Array64  # where the turntable hangs in its play: +1 behind after a move up, -1 after a move down
+    hang: Array64  # on which side of its play the turntable is: +1 after a move up, -1 after a move down
 
     def taken(self, index: NDArray[np.int64]) -> ServoAt:
         """Some of the returns."""
@@ -85,19 +86,21 @@ def smoothed(stamp_ns: NDArray[np.int64], position_rad: Array64, step_rad: float
 
 @compiled
 def hangs(position_rad: Array64, play_rad: float, hang: Array64) -> None:
-    """Fill hang (m,): the turntable's place in its play after each state, as a share of half of it.
+    """Fill hang (m,): +1 where the turntable hangs behind a servo that went up, -1 behind one that went down.
 
-    It stays until the servo takes it along. NaN until the servo has gone further one way than the play is wide.
+    NaN in between: after a turn-back, until the servo has gone the play and SETTLED_RAD further.
     """
-    half = max(play_rad, 1e-9) / 2
-    lag, low, high = 0.0, position_rad[0], position_rad[0]
-    known = False
-    for k in range(position_rad.size):
-        if k > 0:
-            lag = min(max(lag + position_rad[k] - position_rad[k - 1], -half), half)
-        low, high = min(low, position_rad[k]), max(high, position_rad[k])
-        known = known or high - low > 2 * half
-        hang[k] = lag / half if known else math.nan
+    half = max(play_rad, 0.0) / 2
+    lag = beyond = 0.0
+    hang[0] = math.nan
+    for k in range(1, position_rad.size):
+        step = position_rad[k] - position_rad[k - 1]
+        pushed = lag + step
+        lag = min(max(pushed, -half), half)
+        if step * beyond < 0.0:
+            beyond = 0.0
+        beyond += pushed - lag
+        hang[k] = math.nan if abs(beyond) < SETTLED_RAD else math.copysign(1.0, beyond)
 
 
 def servo_at(trace: ServoTrace, stamp_ns: NDArray[np.int64], mount: ServoMount, max_gap_s: float) -> ServoAt:
@@ -113,9 +116,9 @@ def servo_at(trace: ServoTrace, stamp_ns: NDArray[np.int64], mount: ServoMount, 
     hangs(trace.position_rad, mount.play_rad, hang)
     first, last = np.maximum(after - RATE_STATES, 0), np.minimum(after + RATE_STATES - 1, len(state_ns) - 1)
     rate = (trace.position_rad[last] - trace.position_rad[first]) / ((state_ns[last] - state_ns[first]) * 1e-9)
-    known = inside & (gap_ns <= max_gap_s * 1e9)
+    known = inside & (gap_ns <= max_gap_s * 1e9) & (hang[after - 1] == hang[after])
     return ServoAt(
         position_rad=np.where(known, before + share * step, np.nan),
         rate_radps=rate,
-        hang=hang[after - 1] + share * (hang[after] - hang[after - 1]),
+        hang=hang[after],
     )

@@ -2,8 +2,9 @@
 
 Two looks at it. A drive by centimetres bends patches: beside the mount's numbers a steady velocity and turn rate are
 put into the least squares, to see whether they explain something. A drive by more takes surfaces out of their patches:
-then what stood upright is compared as seen from above, first half of the time against the second, at all shifts; of a
-vehicle that stands, no shift fits better than none.
+then what stood upright is compared as seen from above, an earlier look against a later one, at all shifts; of a vehicle
+that stands, no shift fits better than none. That takes a servo that comes back: one way only, little is seen twice with
+time between.
 
 Source: ours; shifts by correlation: Kuglin, Hines (1975).
 """
@@ -58,7 +59,7 @@ def drift(system: System, returns: Returns) -> Drift:
 
 @dataclass(frozen=True)
 class Shift:
-    """What two halves of the time have in common, seen from above."""
+    """What two looks have in common, seen from above."""
 
     best_m: tuple[float, float]  # at which shift they fit best
     gain: float  # how much better than without: 1 is not at all
@@ -70,9 +71,10 @@ class Shift:
 
 
 def shift(xyz_m: Array64, stamp_ns: NDArray[np.int64]) -> Shift | None:
-    """Compare the halves of a cloud (n, 3) with NaN for unknown places; None: too little was seen in both."""
+    """Compare the halves of the time in a cloud (n, 3), NaN for unknown places; None: too little was seen in both."""
     known = np.isfinite(xyz_m[:, 0]) & (np.hypot(xyz_m[:, 0], xyz_m[:, 1]) < FARTHEST_M)
-    xyz_m, late = xyz_m[known], (stamp_ns > (stamp_ns[0] + stamp_ns[-1]) // 2)[known]
+    late = (stamp_ns > (stamp_ns[0] + stamp_ns[-1]) // 2)[known]
+    xyz_m = xyz_m[known]
     sector = ((np.arctan2(xyz_m[:, 1], xyz_m[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
     seen = [np.bincount(sector[half], minlength=SECTORS) > 0 for half in (late, ~late)]
     both = (seen[0] & seen[1])[sector]

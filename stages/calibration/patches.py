@@ -145,6 +145,8 @@ def _even(
     roughest: float,
 ) -> NDArray[np.bool_]:
     """Patches (m,) no rougher than most: not those with sills, leaves or window panes in them."""
+    if len(first) == 0:
+        return np.zeros(0, dtype=np.bool_)
     patch = _numbers(first, len(index))
     normal = axes[:, :, 0][patch]
     beam = beam_m[index]

@@ -132,7 +132,7 @@ def solve(returns: Returns, trace: ServoTrace, rig: ServoMount, max_gap_s: float
         return None
     covariance = sandwich(system, returns.stamp_ns[system.chosen])[:p, :p]
     settled = last[:, :p].std(axis=0) < SETTLED * np.sqrt(np.diag(covariance))
-    return Solution(mount, x[p:], covariance, system) if settled.all() else None
+    return Solution(mount, x[p:], with_floor(covariance), system) if settled.all() else None
 
 
 def one_step(system: System, x: Array64, prior: Array64 = PRIOR) -> Array64:
@@ -151,6 +151,12 @@ def sandwich(system: System, stamp_ns: NDArray[np.int64], prior: Array64 = PRIOR
     values, axes = np.linalg.eigh(bread @ (meat - J.T @ J / v) @ bread)
     excess = (axes * np.maximum(values, 0.0)) @ axes.T  # no less than independent returns would give
     return np.asarray(INFLATION**2 * (bread + excess), dtype=np.float64)
+
+
+def with_floor(covariance: Array64) -> Array64:
+    """The covariance of PARAMETERS with what no longer look takes away: see `Parameter.floor`."""
+    floor = np.array([parameter.floor * parameter.per_unit for parameter in PARAMETERS])
+    return covariance + np.diag(floor**2)
 
 
 def surfaces(patches: Patches) -> NDArray[np.int64]:

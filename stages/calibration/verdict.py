@@ -94,16 +94,20 @@ def judge(rig: ServoMount, found: ServoMount, covariance: Array64, travel: Trave
     sigma = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sigma, sigma)
     curve_rad, _ = curve_sigmas(covariance, travel)
+    blind = unseen(travel)
     findings: list[Finding] = []
     for i, parameter in enumerate(PARAMETERS):
         if parameter.name in CURVE:
             sure = curve_rad < CURVE_LIMIT_RAD
             limit = f"the curve's sigma is {math.degrees(curve_rad):.3f} deg, more than 0.03 deg"
+        elif parameter.name in blind:
+            sure, sigma[i] = False, parameter.expected * parameter.per_unit
+            limit = f"taken as {parameter.expected:g} {parameter.unit} uncertain"
         else:
             sure = sigma[i] < parameter.limit * parameter.per_unit
             told = sigma[i] / parameter.per_unit
             limit = f"sigma is {told:.3g} {parameter.unit}, more than {parameter.limit:g} {parameter.unit}"
-        refused = "" if sure else f"{_why(i, sigma, correlation, travel)} ({limit})"
+        refused = "" if sure else f"{blind.get(parameter.name) or _why(i, sigma, correlation)} ({limit})"
         scale = 1 / parameter.per_unit
         findings.append(
             Finding(
@@ -139,8 +143,9 @@ def values_of(mount: ServoMount, rig: ServoMount) -> dict[str, float]:
     }
 
 
-def accepted(rig: ServoMount, found: ServoMount, findings: tuple[Finding, ...], covariance: Array64,
-             travel: Travel) -> ServoMount:  # fmt: skip
+def accepted(
+    rig: ServoMount, found: ServoMount, findings: tuple[Finding, ...], covariance: Array64, travel: Travel
+) -> ServoMount:
     """The rig with the numbers that are told.
 
     The curve's mean over the sweep turns everything as a zero does; where it is not sure, the zero takes it back, so
@@ -149,36 +154,40 @@ def accepted(rig: ServoMount, found: ServoMount, findings: tuple[Finding, ...], 
     before, after = values_of(rig, rig), values_of(found, rig)
     told = {f.name for f in findings if not f.refused}
     step = {name: after[name] - before[name] for name in NAMES if name in told}
+    step["play"] = max(step.get("play", 0.0), -before["play"])  # less than none is none
     _, mean_sigma = curve_sigmas(covariance, travel)
     limit = next(p.limit * p.per_unit for p in PARAMETERS if p.name == "zero")
     if told.issuperset(CURVE) and "zero" not in told and mean_sigma > limit:
         turn = float(curve_rows(travel).mean(axis=0) @ np.array([step[name] for name in CURVE]))
         step["zero"] = -rig.sign * turn
-    if "tilt_x" in told or "tilt_y" in told:
-        step["tilt_x"], step["tilt_y"] = step.get("tilt_x", 0.0), step.get("tilt_y", 0.0)
     return rig.moved(step)
 
 
-def _why(i: int, sigma: Array64, correlation: Array64, travel: Travel) -> str:
-    """The reason why a number is not known, for a person who can do something about it."""
-    name = NAMES[i]
-    turns = {"play", "time", *CURVE}
-    if name == "zero":
-        return (
-            "a turn of everything about the servo's axis leaves every surface thin, so no scene tells it: "
-            "measure it at the vehicle"
-        )
-    if name == "time" and not travel.both_ways:
-        return "the servo turned one way only, so a late clock looks like a zero: sweep there and back"
-    if name == "play" and not travel.both_ways:
-        return "the servo turned one way only, so the play never changed sides: sweep there and back"
-    if name in ("time", "play") and not travel.two_speeds:
-        return (
+def unseen(travel: Travel) -> dict[str, str]:
+    """What no scene can tell after such a travel, with the reason, for a person who can do something about it.
+
+    The few milliseconds in which a servo starts and stops are no second speed: the clock would be taken from how it
+    brakes.
+    """
+    found = {
+        "zero": "a turn of everything about the servo's axis leaves every surface thin, so no scene tells it: "
+        "measure it at the vehicle"
+    }
+    if not travel.both_ways:
+        found["time"] = "the servo turned one way only, so a late clock looks like a zero: sweep there and back"
+        found["play"] = "the servo turned one way only, so the play never changed sides: sweep there and back"
+    elif not travel.two_speeds:
+        found["time"] = found["play"] = (
             "the servo turned at one speed only, so a late clock and the play of the gear look alike: sweep at another "
             "speed as well, or vibrate"
         )
+    return found
+
+
+def _why(i: int, sigma: Array64, correlation: Array64) -> str:
+    """The reason why the scene does not show a number."""
     if sigma[i] > BLIND * PARAMETERS[i].expected * PARAMETERS[i].per_unit:
-        if name in turns:
+        if NAMES[i] in ("play", "time", *CURVE):
             return "too little that stands upright was seen more than once, and level ground does not show a turn"
         return "the surfaces seen more than once do not show it: walls in two directions would"
     other = max((k for k in range(len(NAMES)) if k != i), key=lambda k: abs(float(correlation[i, k])))

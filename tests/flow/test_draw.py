@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 
 from flow.draw import mermaid, svg
 from flow.graph import load_graph
+from flow.schema import schema
 from tests.flow.toys import GRAPH
 
 
@@ -35,3 +36,22 @@ def test_the_svg_is_well_formed_and_columns_follow_the_data(tmp_path):
     assert x_of["numbers"] < x_of["double"] < x_of["add"]
     arrows = [p for p in root.iter(f"{space}path") if p.get("marker-end")]
     assert len(arrows) == 3
+
+
+def test_how_messages_wait_is_drawn_where_an_edge_declares_it(tmp_path):
+    waiting = "number: {from: numbers.number, policy: drop_oldest, depth: 5}"
+    (tmp_path / "x.yaml").write_text(GRAPH.replace("number: numbers.number", waiting))
+    graph = load_graph(tmp_path / "x.yaml")
+    lines = mermaid(graph).splitlines()
+    at = lines.index("    numbers -- number --> double")
+    assert lines[at + 1] == "    %% live: double.number takes number as drop_oldest 5"
+    assert sum("%% live" in line for line in lines) == 1
+    assert "double.number: number; live: drop_oldest 5" in svg(graph)
+
+
+def test_the_schema_takes_an_edge_as_text_or_with_how_messages_wait():
+    edge = schema()["$defs"]["edge"]["anyOf"]
+    assert edge[1]["properties"]["policy"]["enum"] == ["latest", "drop_oldest", "block"]
+    stages = schema()["properties"]["stages"]["additionalProperties"]["properties"]
+    assert stages["on_error"]["enum"] == ["restart", "skip", "stop"]
+    assert "on_error" not in schema()["properties"]["links"]["additionalProperties"]["properties"]

@@ -7,7 +7,8 @@ import pytest
 from flow.graph import load_graph
 from flow.link import LinkError, Record, Run, Tap
 from flow.message import Message
-from flow.replay import RunError, replay
+from flow.ports import RunError
+from flow.replay import replay
 from flow.taps import Csv, Digest
 from tests.flow.toys import GRAPH
 

@@ -132,9 +132,11 @@ def test_a_truncated_recording_runs_as_far_as_it_goes_with_a_warning(grd, tmp_pa
     assert summary["warnings"]
 
 
-def test_a_configuration_without_a_recording_says_how_to_use_it(grd):
-    text = grd("run", ROOT / "configs" / "paper.yaml", code=2)
-    assert "grd replay FILE.mcap --config" in text
+def test_a_configuration_without_a_recording_runs_live_and_says_what_is_missing(grd, tmp_path):
+    overlay = without_viewer(tmp_path)
+    text = grd("run", ROOT / "configs" / "paper.yaml", "--for", 0.3, "--no-warm-up", "--overlay", overlay)
+    assert "no links.recording.Recorder is configured: nothing is recorded" in text
+    assert "no drone: no sweep was completed" in text
 
 
 def test_a_recording_from_another_place_is_replayed_with_its_own_rig(grd, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from hypothesis import strategies as st
 
 from flow.link import Record
 from links.simulated.vlp16_packets import encode_packet, firings_per_packet
+from links.simulated.vlp16_position import encode_position
 from links.velodyne import Lidar, vlp16
+from links.velodyne.position import Pps, parse_position
 from stages.messages import LidarFirings
 
 START_NS = 1_748_773_230_000_000_000  # 10:20:30 UTC
@@ -83,3 +86,12 @@ def test_the_packets_ends_are_where_the_manual_puts_them() -> None:
 def test_a_row_of_the_wrong_length_is_refused() -> None:
     with pytest.raises(ValueError, match=r"dual packets take ranges \(2, 12, 16\), got \(1, 24, 16\)"):
         encode_packet(0, np.zeros(12), np.zeros((1, 24, 16)), np.zeros((1, 24, 16), dtype=np.uint8), "dual")
+
+
+def test_a_position_packet_tells_the_time_and_that_the_clock_is_locked_to_it():
+    at_ns = 1_748_773_230_250_000_000  # 2025-06-01T10:20:30.25Z
+    read = parse_position(encode_position(at_ns))
+    assert read.gps_utc == datetime(2025, 6, 1, 10, 20, 30, tzinfo=UTC)
+    assert read.gps_valid
+    assert read.pps is Pps.LOCKED
+    assert read.timestamp_us == (20 * 60 + 30) * 1_000_000 + 250_000

@@ -1,0 +1,99 @@
+"""The thread of a source in a live run: it listens, records, decodes and sends, and opens the link again when it dies.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from time import perf_counter_ns
+
+from flow.link import LinkError, Record, Source
+from flow.live_report import LinkReport
+from flow.live_threads import Feed, Shared, Worker
+from flow.message import Message
+from flow.metrics import Latency
+from flow.ports import Output, RunError, decoded, named
+
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 8.0  # before a link that died is opened again; doubles each time
+
+
+class SourceThread(Worker):
+    """Listens to one source, records, decodes and sends; opens it again when it dies."""
+
+    def __init__(self, name: str, source: Source, outputs: dict[type[Message], Output[Feed]], shared: Shared) -> None:
+        super().__init__(f"listen {name}", shared)
+        self.node, self.source = name, source
+        self.compute = Latency()
+        self.report = LinkReport("opening")
+        self.first_ns = self.last_ns = 0
+        self._outputs = outputs
+        self._lock = threading.Lock()
+        self._opened: AbstractContextManager[Iterator[Record]] | None = None
+
+    def run(self) -> None:
+        stopping, pause_s = self.shared.stopping, FIRST_PAUSE_S
+        while not stopping.is_set():
+            records_before = self.report.records
+            try:
+                self._listen()
+                trouble = "its records have ended"
+            except (LinkError, RunError) as error:
+                trouble = str(error)
+            if stopping.is_set():
+                break
+            self.report.state = trouble
+            pause_s = FIRST_PAUSE_S if self.report.records > records_before else min(2 * pause_s, LONGEST_PAUSE_S)
+            self.shared.incidents.report(self.node, f"{trouble}; it is opened again")
+            stopping.wait(pause_s)
+        self.report.state = "closed"
+
+    def close(self) -> None:
+        """End the listening, from any thread."""
+        with self._lock:
+            opened, self._opened = self._opened, None
+        if opened is not None:
+            opened.__exit__(None, None, None)
+
+    def _listen(self) -> None:
+        """From opening to the end of the records. LinkError, or RunError for what no link should raise."""
+        with named(f"{self.node}.listen"):
+            opened = self.source.listen()
+            records = opened.__enter__()
+            with self._lock:
+                self._opened = opened
+            self.report.openings += 1
+            if self.report.openings == 1:
+                self.report.state = "open"
+            try:
+                if self.shared.stopping.is_set():  # whoever stops the run had nothing to close yet
+                    return
+                for record in records:
+                    if self.shared.stopping.is_set():
+                        return
+                    self._take(record)
+            finally:
+                self.close()
+
+    def _take(self, record: Record) -> None:
+        if self.report.state != "open":
+            self.report.state = "open"
+            self.shared.incidents.report(self.node, "records come again")
+        if record.arrival_ns < self.last_ns:  # a recording is read in the order of arrival: it must be ours
+            record = dataclasses.replace(record, arrival_ns=self.last_ns)
+        self.first_ns, self.last_ns = self.first_ns or record.arrival_ns, record.arrival_ns
+        self.report.records += 1
+        self.shared.keep(record)
+        if record.topic != self.source.topic:
+            return
+        begin = perf_counter_ns()
+        try:
+            for output, message in decoded(self.node, self.source, record, self._outputs, self.shared.strict):
+                self.shared.send(output, message, record.arrival_ns)
+        except (LinkError, RunError) as error:
+            self.report.undecoded += 1
+            self.shared.incidents.report(self.node, str(error))
+        self.compute.add(perf_counter_ns() - begin)

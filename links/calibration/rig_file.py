@@ -1,0 +1,72 @@
+"""The new rig as a file: to lay over a configuration (`--overlay`), to include in one, or to import with (`--rig`).
+
+Source: ours; the format of configs/rigs/standard.yaml.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import yaml
+
+from stages.calibration.calibrate import Calibration
+from stages.calibration.verdict import Finding
+from stages.geometry import LidarMount, Pose
+
+DIGITS = 7
+
+
+def rig_text(rig: dict[str, Any], found: Calibration, source: str) -> str:
+    """The whole rig file: what was known, with the LiDAR's mount as it was found, and a line for each number."""
+    new = copy.deepcopy(rig)
+    new["lidar"]["mount"] = mount_tree(found.mount)
+    head = [
+        f"# Found by `grd calibrate {source}`; everything but lidar.mount is as it was.",
+        "# To replay with it: grd replay RECORDING --overlay THIS_FILE; to fly: include it in place of the rig's file.",
+        *(f"# {said(finding)}" for finding in found.findings),
+        "# A zero that differs from that takes back the mean of the encoder's error, which nothing tells from a zero.",
+    ]
+    return "\n".join([*head, yaml.safe_dump({"rig": new}, sort_keys=False, width=120)])
+
+
+def mount_tree(mount: LidarMount) -> dict[str, Any]:
+    """A mount as YAML values; every key is there, so that laid over another rig nothing of that one shows through."""
+    return {
+        "T_vehicle_turntable": pose_tree(mount.T_vehicle_turntable),
+        "T_turntable_lidar": pose_tree(mount.T_turntable_lidar),
+        "turns": mount.turns,
+        "servo_sign": mount.servo_sign,
+        "servo_zero_deg": round(mount.servo_zero_deg, DIGITS),
+        "servo_time_offset_s": round(mount.servo_time_offset_s, DIGITS),
+        "servo_harmonics": [
+            {
+                "order": term.order,
+                "amplitude_deg": round(term.amplitude_deg, DIGITS),
+                "phase_deg": round(term.phase_deg, DIGITS),
+            }
+            for term in mount.servo_harmonics
+        ],
+        "servo_play_deg": round(mount.servo_play_deg, DIGITS),
+    }
+
+
+def pose_tree(pose: Pose) -> dict[str, Any]:
+    """A pose as YAML values, the way of writing the rotation that is not used as null."""
+    return {
+        "xyz_m": [round(value, DIGITS) for value in pose.xyz_m],
+        "rpy_deg": None if pose.rpy_deg is None else list(pose.rpy_deg),
+        "quaternion_xyzw": None if pose.quaternion_xyzw is None else [round(q, 9) for q in pose.quaternion_xyzw],
+    }
+
+
+def said(finding: Finding) -> str:
+    """A finding in one line."""
+    if finding.refused:
+        return f"{finding.what}: stays {finding.before:.4g} {finding.unit}: {finding.refused}"
+    digits = max(0, 1 - math.floor(math.log10(max(finding.sigma, 1e-9))))
+    return (
+        f"{finding.what}: {finding.after:.{digits}f} +- {finding.sigma:.{digits}f} {finding.unit} "
+        f"(was {finding.before:.{digits}f})"
+    )

@@ -1,0 +1,104 @@
+"""`grd calibrate`: how the LiDAR sits on its servo, found from a sweep of a parked vehicle.
+
+Source: DESIGN, Command line; the maths is in `stages/calibration`.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from flow.link import LinkError
+from links.cli.console import FINDING, err, in_words, out, progress_bar
+from links.cli.files import read_rig
+
+ROUNDING_DEG = 1e-6
+STILL_M = 0.05  # of the vehicle's own odometry over the whole time
+
+
+@in_words
+def calibrate_recording(
+    recording: Annotated[
+        Path, typer.Argument(help="A recording in which the vehicle stands still and the servo sweeps.")
+    ],
+    out_file: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Rig file to write [default: RECORDING with .rig.yaml].")
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="Rig to start from [default: the one in RECORDING].")
+    ] = None,
+    parked: Annotated[
+        bool, typer.Option("--parked", help="The vehicle stood still: for a servo that swept one way only.")
+    ] = False,
+    from_s: Annotated[float, typer.Option("--from", min=0, help="Second of RECORDING to begin at.")] = 0.0,
+    to_s: Annotated[
+        float | None, typer.Option("--to", min=0, help="Second of RECORDING to end at [default: its end].")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output files.")] = False,
+) -> None:
+    """Find how the LiDAR sits on its servo, from surfaces that a sweep of RECORDING sees more than once.
+
+    Tilt and place on the servo's axis, the encoder's error, the play of the gear and the servo's time offset, each with
+    a sigma; what the sweep or the scene cannot tell stays as it is, with the reason. Writes a new rig file and, beside
+    it, pictures (.svg). The vehicle must stand still. Best is a sweep there and back at two speeds near walls. Exit
+    code 1 when nothing could be told, then nothing is written.
+
+    Example: grd calibrate parked.mcap -o rig.yaml && grd replay flight.mcap --overlay rig.yaml
+    """
+    from links.calibration import gather, pictures, rig_text
+    from stages.calibration.calibrate import CannotCalibrate, calibrate
+
+    target = out_file or recording.with_suffix(".rig.yaml")
+    if target.suffix not in (".yaml", ".yml"):
+        raise LinkError(f"{target}: a rig file ends in .yaml")
+    picture = target.with_suffix(".svg")
+    for file in (target, picture):
+        if file.exists() and not overwrite:
+            raise LinkError(f"{file} is there already: name another with --out, or give --overwrite")
+    if to_s is not None and to_s <= from_s:
+        raise LinkError(f"--to {to_s:g} is not after --from {from_s:g}")
+    with progress_bar(f"read {recording.name}") as step:
+        rig_yaml = None if rig is None else read_rig(rig)
+        gathered = gather(recording, rig_yaml, (from_s, math.inf if to_s is None else to_s), progress=step)
+    try:
+        if gathered.driven_m is not None and gathered.driven_m > STILL_M:
+            raise CannotCalibrate(
+                f"the vehicle did not stand still: its odometry says that it drove {gathered.driven_m:.2f} m. Take a "
+                "recording of a parked vehicle, or a part of this one in which it stands (--from, --to)"
+            )
+        stood = parked or gathered.driven_m is not None
+        found = calibrate(gathered.returns, gathered.trace, gathered.mount, parked=stood)
+    except CannotCalibrate as why:
+        err.print(f"{recording}: {why}.", markup=False, style="red")
+        raise typer.Exit(FINDING) from None
+    table = Table(title=f"{len(found.patches.first)} flat patches in {gathered.seconds:.1f} s", title_justify="left")
+    for head in ("", "before", "found", "sigma", ""):
+        table.add_column(Text(head), justify="left" if not head else "right")
+    for f in found.findings:
+        after = "-" if f.refused else f"{f.after:.4f}"
+        table.add_row(Text(f.what), f"{f.before:.4f}", after, f"{f.sigma:.4f}", f.unit)
+    out.print(table)
+    for f in found.findings:
+        if f.refused:
+            out.print(f"{f.what} stays as it is: {f.refused}", markup=False)
+    taken_back_deg = found.mount.servo_zero_deg - gathered.mount.servo_zero_deg
+    if abs(taken_back_deg) > ROUNDING_DEG:
+        out.print(
+            f"the zero is written as {found.mount.servo_zero_deg:.4f} deg: it takes back the mean of the encoder's "
+            "error, so that the sweep as a whole points where it pointed before"
+        )
+    before_mm, after_mm = (1e3 * t for t in found.thickness.medians_m)
+    out.print(
+        f"encoder's error over the sweep known to {math.degrees(found.curve_sigma_rad):.4f} deg (one sigma), its mean, "
+        f"which is like a zero, to {math.degrees(found.curve_mean_sigma_rad):.4f} deg"
+    )
+    out.print(f"flat patches: {before_mm:.1f} mm thick before, {after_mm:.1f} mm after (median)")
+    target.write_text(rig_text(gathered.rig, found, recording.name), encoding="utf-8")
+    picture.write_text(pictures(found), encoding="utf-8")
+    out.print(f"rig         {target}   (use it: grd replay RECORDING --overlay {target})", markup=False)
+    out.print(f"pictures    {picture}", markup=False)

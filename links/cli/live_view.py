@@ -1,0 +1,134 @@
+"""What the console shows while a run is live: a table on a terminal, a line now and then elsewhere (a log, systemd).
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from pydantic import PrivateAttr
+from rich.console import Console, Group
+from rich.live import Live as Screen
+from rich.table import Table
+from rich.text import Text
+
+from flow.link import Tap
+from flow.live_report import LiveReport
+from flow.message import Message
+from links.cli.console import err, out
+from links.live_run import Look
+from stages.messages import DroneFix, RelativePose, TrackState
+
+SCREEN_S, LINE_S = 0.25, 5.0
+SHOWN = (RelativePose, DroneFix, TrackState)
+
+
+class Newest(Tap):
+    """Keeps the newest message of each kind that the console shows."""
+
+    _messages: dict[type[Message], Any] = PrivateAttr(default_factory=dict)
+
+    def wants(self, message: type[Message]) -> bool:
+        """The kinds that are shown."""
+        return message in SHOWN
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        """Keep it."""
+        self._messages[type(message)] = message
+
+    def now(self) -> tuple[str, str]:
+        """State and pose in words, of the best there is: the fused pose, else the track and its last fix."""
+        pose: RelativePose | None = self._messages.get(RelativePose)
+        if pose is not None:
+            return f"{pose.state.name}: {pose.reason}", _pose(pose)
+        track: TrackState | None = self._messages.get(TrackState)
+        fix: DroneFix | None = self._messages.get(DroneFix)
+        state = "no drone yet" if track is None else f"{track.state.name}: {track.reason}"
+        return state, "" if fix is None else _position(fix.xyz_vehicle_m, fix.covariance_m2)
+
+
+def _pose(pose: RelativePose) -> str:
+    if pose.xyz_vehicle_m is None:
+        return ""
+    sigma_m2 = None if pose.covariance is None else pose.covariance[3:, 3:]
+    text = _position(pose.xyz_vehicle_m, sigma_m2)
+    if pose.R_vehicle_drone is not None:
+        R = pose.R_vehicle_drone
+        text += f"  yaw {np.degrees(np.arctan2(R[1, 0], R[0, 0])):.1f} deg"
+    return text
+
+
+def _position(xyz_m: Any, covariance_m2: Any) -> str:
+    x, y, z = xyz_m
+    sigma = "" if covariance_m2 is None else f"  sigma {float(np.trace(covariance_m2)) ** 0.5:.2f} m"
+    return f"x {x:.2f}  y {y:.2f}  z {z:.2f} m{sigma}"
+
+
+class LiveView:
+    """`with LiveView() as view`: `view.newest` is a tap of the run, `view.show` is told how it goes."""
+
+    def __init__(self, console: Console = out) -> None:
+        self.newest = Newest()
+        self._console = console
+        self._screen = Screen(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+        self._next_s = 0.0
+
+    def __enter__(self) -> LiveView:
+        if self._screen is not None:
+            self._screen.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._screen is not None:
+            self._screen.stop()
+
+    def show(self, look: Look) -> None:
+        """News at once; the rest some times a second on a terminal, else each few seconds."""
+        for text in look.news:
+            (self._console if self._screen is not None else err).print(text, markup=False, style="yellow")
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return
+        if self._screen is not None:
+            self._next_s = now_s + SCREEN_S
+            self._screen.update(self._table(look), refresh=True)
+        else:
+            self._next_s = now_s + LINE_S
+            self._console.print(self._line(look), markup=False)
+
+    def _line(self, look: Look) -> str:
+        report = look.report
+        state, pose = self.newest.now()
+        closed = [f"{name} {link.state}" for name, link in report.links.items() if link.state != "open"]
+        parts = [f"{look.since_s:.1f} s", state, pose, _numbers(report), *closed]
+        return "; ".join(part for part in parts if part)
+
+    def _table(self, look: Look) -> Group:
+        report = look.report
+        state, pose = self.newest.now()
+        head = Text(f"{look.since_s:8.1f} s   {state}\n             {pose}\n             {_numbers(report)}")
+        edges = Table("edge", "from", box=None, pad_edge=False)
+        for name in ("lag [ms]", "p99", "max", "taken", "dropped", "late"):
+            edges.add_column(Text(name), justify="right")
+        for name, edge in report.edges.items():
+            bad = "red" if edge.dropped or edge.missed else None
+            numbers = [f"{edge.lag_ms:.1f}", f"{edge.lag_p99_ms:.1f}", f"{edge.lag_max_ms:.0f}"]
+            counts = [str(edge.taken), str(edge.dropped), str(edge.missed)]
+            edges.add_row(name, edge.source, *numbers, *counts, style=bad)
+        links = Table("link", "records", "state", box=None, pad_edge=False)
+        for name, link in report.links.items():
+            told = ", ".join(f"{key} {value}" for key, value in report.counters.get(name, {}).items() if value)
+            links.add_row(name, str(link.records), Text(f"{link.state}  {told}", overflow="ellipsis", no_wrap=True))
+        return Group(head, edges, links)
+
+
+def _numbers(report: LiveReport) -> str:
+    worst = max((edge.lag_p99_ms for edge in report.edges.values()), default=0.0)
+    text = f"{report.records} records, worst lag p99 {worst:.1f} ms, {report.dropped} dropped, {report.missed} late"
+    return text + (f", OFF: {', '.join(report.off)}" if report.off else "")

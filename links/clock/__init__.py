@@ -1,0 +1,8 @@
+"""The host's clock as a link.
+
+Source: ours.
+"""
+
+from links.clock.clock import Clock
+
+__all__ = ["Clock"]

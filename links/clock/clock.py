@@ -1,0 +1,58 @@
+"""The host's clock as a source: a tick so many times a second, so that a run goes on though every sensor is silent.
+
+A tick's stamp is the moment that was meant, its arrival when the thread came to it; a busy machine makes them differ.
+Ticks that it missed altogether are left out, not made up for. A replay takes the recorded ticks.
+
+Source: ours; links/host_time.py (a wall clock that is set moves no tick).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from pydantic import Field, PrivateAttr
+
+from flow.link import Record, Source
+from links import host_time
+from stages.messages import Tick
+
+
+class Clock(Source):
+    """Ticks at `rate_hz`."""
+
+    topic: str = "/clock"
+    rate_hz: float = Field(50.0, ge=0.1, le=1000)
+    _missed: int = PrivateAttr(default=0)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Ticks left out because the machine was busy."""
+        return {"missed": self._missed}
+
+    def decode(self, record: Record) -> Tick:
+        """The time of a tick."""
+        return Tick(stamp_ns=record.stamp_ns)
+
+    @contextmanager
+    def listen(self) -> Iterator[Iterator[Record]]:
+        """Ticks from now on: `with clock.listen() as records`."""
+        closed = threading.Event()
+        try:
+            yield self._ticks(closed)
+        finally:
+            closed.set()
+
+    def _ticks(self, closed: threading.Event) -> Iterator[Record]:
+        period_ns = round(1e9 / self.rate_hz)
+        due_ns = host_time.now_ns() + period_ns
+        while not closed.wait(max(0, due_ns - host_time.now_ns()) * 1e-9):
+            now_ns = host_time.now_ns()
+            if now_ns < due_ns:
+                continue
+            missed = (now_ns - due_ns) // period_ns
+            self._missed += missed
+            due_ns += missed * period_ns
+            yield Record(self.topic, now_ns, due_ns, b"")
+            due_ns += period_ns

@@ -1,0 +1,173 @@
+"""The recorder of a live run: every record that came in and every one that was sent, from the first to the last.
+
+A session is one file, or several parts (flight.mcap, flight-2.mcap, ...): each has the rig and the configuration and
+can be replayed alone. A thread of its own opens and closes parts and looks after the disk; a sensor's thread only puts
+its record into the writer's queue. When the disk is nearly full, or fails, recording stops, the run goes on, and it is
+tried again. A killed run leaves what was recorded up to 0.5 s before (`RecordingWriter`).
+
+Source: ours; recordings/README.md.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+import uuid
+from pathlib import Path
+
+import yaml
+from pydantic import Field, PrivateAttr
+
+from flow.link import LinkError, Record, Run, Tap
+from flow.message import Message
+from links.recording.writer import RecordingWriter
+
+LOOK_S = 0.25  # how often size, age and disk are looked at
+MB = 1_000_000
+AGAIN_S = 10.0  # a recording that had to stop is tried again so often
+SESSION, PART = "session", "part"
+"""Metadata of a recording: which run it is of, and its number among that run's parts, from 1."""
+
+
+class Recorder(Tap):
+    """Records a live run into its folder. Replays it ignores: they have their recording."""
+
+    file: str = Field("flight.mcap", pattern=r"^[\w.-]+\.mcap$")
+    split_s: float = Field(900.0, ge=1)  # a part is this long at most
+    split_mb: float = Field(2000.0, ge=1)  # and this big
+    reserve_mb: float = Field(200.0, ge=0)  # is left free on the disk, for the results
+
+    _lock: threading.Lock = PrivateAttr(default_factory=threading.Lock)
+    _writer: RecordingWriter | None = PrivateAttr(default=None)
+    _run: Run | None = PrivateAttr(default=None)
+    _thread: threading.Thread | None = PrivateAttr(default=None)
+    _closing: threading.Event = PrivateAttr(default_factory=threading.Event)
+    _session: str = PrivateAttr(default="")
+    _parts: int = PrivateAttr(default=0)
+    _part_bytes: int = PrivateAttr(default=0)
+    _part_s: float = PrivateAttr(default=0.0)  # when it was opened, monotonic
+    _stopped_s: float = PrivateAttr(default=0.0)
+    _missed: int = PrivateAttr(default=0)  # while nothing was recorded
+    _before: tuple[int, int] = PrivateAttr(default=(0, 0))  # written and dropped in earlier parts
+    _trouble: str | None = PrivateAttr(default=None)
+
+    def wants(self, message: type[Message]) -> bool:
+        """Records only."""
+        return False
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        """A replay shows all taps everything; messages are not recorded, they follow from the records."""
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Records written, dropped (a slow disk), missed (no recording), and parts."""
+        written, dropped = self._totals()
+        return {"written": written, "dropped": dropped, "missed": self._missed, "parts": self._parts}
+
+    @property
+    def trouble(self) -> str | None:
+        """Why nothing is recorded now, in words; None: it is."""
+        return self._trouble
+
+    def open(self, run: Run) -> None:
+        """Begin the first part. That nothing can be recorded is `trouble`, and does not stop a run."""
+        if not run.live:
+            return
+        self._run, self._session = run, uuid.uuid4().hex
+        self._closing.clear()
+        self._begin_part()
+        self._thread = threading.Thread(target=self._look_after, name="recorder", daemon=True)
+        self._thread.start()
+
+    def record(self, record: Record) -> None:
+        """Into the queue. LinkError for a record that no recording can hold."""
+        with self._lock:
+            if self._writer is None:
+                self._missed += 1
+                return
+            self._part_bytes += len(record.data)
+            self._writer.write(record)
+
+    def close(self) -> None:
+        """Write what is queued and end the part."""
+        if self._thread is None:
+            return
+        self._closing.set()
+        self._thread.join()
+        self._thread = None
+        self._end_part(self._swap(None))
+
+    def _look_after(self) -> None:
+        while not self._closing.wait(LOOK_S):
+            writer, now_s = self._writer, time.monotonic()
+            if writer is None:
+                if now_s >= self._stopped_s + AGAIN_S and self._free_bytes() > 2 * self.reserve_mb * MB:
+                    self._begin_part()
+            elif writer.trouble is not None:
+                self._give_up(writer.trouble)
+            elif self._free_bytes() < self.reserve_mb * MB:
+                self._give_up(f"less than {self.reserve_mb:g} MB are free at {writer.path.parent}: make room")
+            elif now_s - self._part_s >= self.split_s or self._part_bytes >= self.split_mb * MB:
+                self._begin_part()
+
+    def _begin_part(self) -> None:
+        """A new file takes the records from here on; the one before is ended."""
+        assert self._run is not None
+        path = self._path(self._run.out_dir, self._parts + 1)
+        values = yaml.safe_load(self._run.settings_yaml) or {}
+        rig_yaml = yaml.safe_dump(values["rig"], sort_keys=False) if "rig" in values else None
+        try:
+            if self._free_bytes() < self.reserve_mb * MB:
+                raise LinkError(f"less than {self.reserve_mb:g} MB are free at {path.parent}: make room")
+            writer = RecordingWriter(
+                path,
+                rig_yaml=rig_yaml,
+                config_yaml=self._run.settings_yaml,
+                metadata={
+                    "made_by": "grd run",
+                    "run": self._run.name,
+                    SESSION: self._session,
+                    PART: str(self._parts + 1),
+                },
+            )
+        except LinkError as error:
+            self._give_up(str(error))
+            return
+        self._parts += 1
+        before = self._swap(writer)
+        self._part_s, self._trouble = time.monotonic(), None
+        self._end_part(before)
+
+    def _path(self, folder: Path, part: int) -> Path:
+        file = folder / self.file
+        return file if part == 1 else file.with_stem(f"{file.stem}-{part}")
+
+    def _swap(self, writer: RecordingWriter | None) -> RecordingWriter | None:
+        with self._lock:
+            before, self._writer = self._writer, writer
+            self._part_bytes = 0
+        return before
+
+    def _end_part(self, writer: RecordingWriter | None) -> None:
+        if writer is None:
+            return
+        try:
+            writer.close()
+        except LinkError as error:
+            self._trouble = self._trouble or str(error)
+        self._before = self._before[0] + writer.written, self._before[1] + writer.dropped
+
+    def _give_up(self, why: str) -> None:
+        self._trouble = f"{why}; nothing is recorded now, the run goes on"
+        self._stopped_s = time.monotonic()
+        self._end_part(self._swap(None))
+
+    def _totals(self) -> tuple[int, int]:
+        writer = self._writer
+        now = (writer.written, writer.dropped) if writer is not None else (0, 0)
+        return self._before[0] + now[0], self._before[1] + now[1]
+
+    def _free_bytes(self) -> int:
+        assert self._run is not None
+        return shutil.disk_usage(self._run.out_dir).free

@@ -1,0 +1,76 @@
+"""The vehicle's odometry live: a JSON object in each UDP datagram, from one sender.
+
+    {"xyz_m": [x, y, z], "quaternion_xyzw": [x, y, z, w], "covariance": [36 numbers] or null, "age_s": 0.004}
+
+`age_s`: how long before it was sent the pose was true; 0 when it does not say. What it says else is as recorded.
+
+Source: ours; recording format in recordings/README.md (/vehicle/odometry).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from flow.link import LinkError, Record
+from links import host_time
+
+DATAGRAM_BYTES = 4096
+WAKE_S = 0.2  # how often a waiting listener looks whether it was closed
+MOST_AGE_S = 1.0
+
+
+@contextmanager
+def listen_udp(
+    topic: str, bind: str, port: int, sender: str | None, counters: Counter[str]
+) -> Iterator[Iterator[Record]]:
+    """Open the socket and yield an iterator of records; it ends when the context is left. LinkError: it cannot open."""
+    closed = threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        try:
+            udp.bind((bind, port))
+        except OSError as error:
+            raise LinkError(
+                f"cannot listen on UDP {bind}:{port} for the vehicle's odometry: {error.strerror}. Check `bind` and "
+                "`port`; is another grd listening there?"
+            ) from error
+        udp.settimeout(WAKE_S)
+        try:
+            yield _records(udp, closed, topic, sender, counters)
+        finally:
+            closed.set()
+
+
+def _records(
+    udp: socket.socket, closed: threading.Event, topic: str, sender: str | None, counters: Counter[str]
+) -> Iterator[Record]:
+    while not closed.is_set():
+        try:
+            data, (host, _) = udp.recvfrom(DATAGRAM_BYTES)
+        except TimeoutError:
+            continue
+        except OSError as error:
+            if closed.is_set():
+                return
+            raise LinkError(f"the vehicle's odometry: {error.strerror}: is the network interface still up?") from error
+        arrival_ns = host_time.now_ns()
+        if sender is not None and host != sender:
+            counters["from other senders"] += 1
+            continue
+        yield Record(topic, arrival_ns, arrival_ns - round(1e9 * age_s(data)), data)
+
+
+def age_s(data: bytes) -> float:
+    """What a datagram says of its age; 0 when it says nothing that can be true (decoding looks at the rest)."""
+    try:
+        fields: Any = json.loads(data)
+        age = float(fields.get("age_s", 0.0))
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return 0.0
+    return age if math.isfinite(age) and 0.0 <= age <= MOST_AGE_S else 0.0

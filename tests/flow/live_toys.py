@@ -1,0 +1,207 @@
+"""Small sources, sinks, stages and taps for live runs: they do what a test tells them, when it tells them."""
+
+from __future__ import annotations
+
+import mmap
+import queue
+import struct
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pydantic import PrivateAttr
+
+from flow.graph import Graph, load_graph
+from flow.link import Link, LinkError, Record, Run, Source, Tap
+from flow.live import Live
+from flow.message import Message
+from flow.stage import Stage
+from stages.messages import Tick
+from tests.flow.toys import Number, Sum
+
+PATIENCE_S = 60.0  # for what surely comes, on however busy a machine
+
+
+class Line(Source):
+    """A source whose bytes a test puts in; it can be cut."""
+
+    topic: str = "/numbers"
+    _queue: queue.SimpleQueue = PrivateAttr(default_factory=queue.SimpleQueue)
+    _openings: list[threading.Event] = PrivateAttr(default_factory=list)
+    _arrival_ns: int = PrivateAttr(default=1_000)
+
+    def decode(self, record: Record) -> Number | None:
+        if record.data == b"refuse":
+            raise LinkError("no numbers here: is the counter plugged in?")
+        return Number(stamp_ns=record.stamp_ns, value=float(record.data)) if record.data else None
+
+    @contextmanager
+    def listen(self) -> Iterator[Iterator[Record]]:
+        closed = threading.Event()
+        self._openings.append(closed)
+
+        def records() -> Iterator[Record]:
+            while not closed.is_set():
+                try:
+                    data = self._queue.get(timeout=0.05)
+                except queue.Empty:
+                    continue
+                if data == b"cut":
+                    raise LinkError("the line is dead: is it plugged in?")
+                if data == b"burn":
+                    raise KeyError("smoke")
+                if data == b"end":
+                    return
+                self._arrival_ns += 10
+                yield Record(self.topic, self._arrival_ns, self._arrival_ns - 5, data)
+
+        try:
+            yield records()
+        finally:
+            closed.set()
+
+    def put(self, *values: object) -> None:
+        for value in values:
+            self._queue.put(str(value).encode())
+
+
+class OtherLine(Line):
+    """A second one."""
+
+    topic: str = "/others"
+
+
+class Collector(Link):
+    """A sink that keeps what it is given, and tells what it sent."""
+
+    _got: queue.SimpleQueue = PrivateAttr(default_factory=queue.SimpleQueue)
+    _sent: list[Record] = PrivateAttr(default_factory=list)
+
+    def on_number(self, number: Number) -> None:
+        if number.value == 13:
+            raise LinkError("thirteen is not sent: choose another number")
+        self._sent.append(Record("/sent", number.stamp_ns, number.stamp_ns, b"%d" % int(number.value)))
+        self._got.put(number.value)
+
+    def sent(self) -> list[Record]:
+        sent, self._sent = self._sent, []
+        return sent
+
+    def take(self, count: int) -> list[float]:
+        return [self._got.get(timeout=PATIENCE_S) for _ in range(count)]
+
+
+class Brittle(Stage):
+    """Doubles; breaks at 666, and again at each 999; counts what this object took."""
+
+    _taken: int = PrivateAttr(default=0)
+
+    def on_number(self, number: Number) -> Number:
+        self._taken += 1
+        if number.value in (666, 999):
+            raise ArithmeticError(f"cannot bear {number.value:g}")
+        return Number(stamp_ns=self._taken, value=2 * number.value)
+
+
+class Gate(Stage):
+    """Passes numbers on, but stands still in each until a test opens it."""
+
+    _open: threading.Event = PrivateAttr(default_factory=threading.Event)
+    _entered: threading.Event = PrivateAttr(default_factory=threading.Event)
+
+    def on_number(self, number: Number) -> Number:
+        self._entered.set()
+        assert self._open.wait(PATIENCE_S)
+        return number
+
+
+class Order(Stage):
+    """Its output tells in which order it took its inputs."""
+
+    _value: float = PrivateAttr(default=0.0)
+
+    def on_left(self, number: Number) -> Number:
+        self._value = (3 * self._value + number.value) % 1_000_003
+        return Number(stamp_ns=number.stamp_ns, value=self._value)
+
+    def on_right(self, number: Number) -> Number:
+        self._value = (5 * self._value + 7 * number.value) % 1_000_003
+        return Number(stamp_ns=number.stamp_ns, value=self._value)
+
+    def finish(self) -> Number:
+        return Number(stamp_ns=1, value=self._value)
+
+
+class Memory(Tap):
+    """Keeps records and messages."""
+
+    _records: list[Record] = PrivateAttr(default_factory=list)
+    _seen: list[tuple[str, int, Message]] = PrivateAttr(default_factory=list)
+
+    def record(self, record: Record) -> None:
+        self._records.append(record)
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        if not output.startswith("run."):
+            self._seen.append((output, arrival_ns, message))
+
+
+class Stuck(Tap):
+    """A viewer that hangs at the first message until a test lets it go."""
+
+    _go: threading.Event = PrivateAttr(default_factory=threading.Event)
+
+    def wants(self, message: type[Message]) -> bool:
+        return issubclass(message, Number | Sum)
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        self._go.wait(PATIENCE_S)
+
+
+def graph_of(folder, text: str) -> Graph:
+    (folder / "live.yaml").write_text(text)
+    return load_graph(folder / "live.yaml")
+
+
+def run_live(graph: Graph, taps=(), **kwargs) -> Live:
+    """A run that has started; the clock stands still, so that no lag depends on the machine."""
+    live = Live(graph, taps, now_ns=lambda: 2_000, **kwargs)
+    live.start()
+    return live
+
+
+class Ticker(Stage):
+    """Counts ticks."""
+
+    raise_at: int | None = None
+    _count: int = PrivateAttr(default=0)
+
+    def on_tick(self, tick: Tick) -> Number:
+        self._count += 1
+        if self._count == self.raise_at:
+            raise ArithmeticError(f"asked to at {self._count}")
+        return Number(stamp_ns=tick.stamp_ns, value=self._count)
+
+
+class Judge(Tap):
+    """Keeps the newest record's arrival in a mapped file, which outlives the process."""
+
+    file: Path
+    _map: Any = PrivateAttr(default=None)
+
+    def wants(self, message: type[Message]) -> bool:
+        return False
+
+    def open(self, run: Run) -> None:
+        if run.live:
+            self.file.write_bytes(bytes(8))
+            with self.file.open("r+b") as stream:
+                self._map = mmap.mmap(stream.fileno(), 8)
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        pass
+
+    def record(self, record: Record) -> None:
+        self._map[:] = struct.pack("<q", record.arrival_ns)

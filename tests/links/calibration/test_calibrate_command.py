@@ -1,0 +1,108 @@
+"""`grd calibrate` as a user meets it: a new rig that a replay takes, pictures, and refusals in words."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from flow.graph import load_graph
+from links.calibration.gather import checked_rig
+from links.cli.app import app
+from links.cli.files import read_rig
+from links.recording import RecordingReader, RecordingWriter
+
+ROOT = Path(__file__).resolve().parents[3]
+STREET = ROOT / "recordings" / "street_sweep.mcap"
+
+
+def grd(*words: object, code: int = 0) -> str:
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    return " ".join(result.output.split())
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("calibrated")
+    recording = folder / "street.mcap"
+    shutil.copy(STREET, recording)
+    text = grd("calibrate", recording)
+    return folder, text
+
+
+def test_a_street_is_told_number_by_number_with_what_is_refused(calibrated):
+    _, text = calibrated
+    assert "servo's zero stays as it is" in text
+    assert "mm thick before" in text
+    assert "--overlay" in text
+
+
+def test_the_new_rig_can_be_laid_over_a_configuration(calibrated):
+    folder, _ = calibrated
+    rig = folder / "street.rig.yaml"
+    graph = load_graph(ROOT / "configs" / "replay.yaml", overlays=[rig])
+    mount = graph.nodes["sweep"].build().mount  # pyright: ignore[reportAttributeAccessIssue]
+    written = yaml.safe_load(rig.read_text())["rig"]["lidar"]["mount"]
+    assert mount.servo_time_offset_s == written["servo_time_offset_s"]
+    assert abs(mount.servo_time_offset_s) < 2e-4  # this simulated servo has no error: none is invented
+    assert list(mount.T_turntable_lidar.quaternion_xyzw) == written["T_turntable_lidar"]["quaternion_xyzw"]
+    assert checked_rig(read_rig(rig), "rig")[1] == mount
+
+
+def test_the_pictures_are_one_svg_with_four_charts(calibrated):
+    folder, _ = calibrated
+    tree = ElementTree.parse(folder / "street.rig.svg")
+    charts = [e.get("aria-label") or "" for e in tree.iter() if e.get("role") == "img"]
+    assert len(charts) == 4
+    assert "thick before" in charts[0]
+
+
+def test_an_old_rig_is_never_written_over_unasked(calibrated):
+    folder, _ = calibrated
+    before = (folder / "street.rig.yaml").read_bytes()
+    assert "--overwrite" in grd("calibrate", folder / "street.mcap", code=2)
+    assert (folder / "street.rig.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["einride_vlp16", "mrpt_vlp16_gps"])
+def test_a_real_capture_without_servo_is_refused_in_a_sentence(name, tmp_path):
+    text = grd("calibrate", ROOT / "recordings" / f"{name}.mcap", "-o", tmp_path / "rig.yaml", code=2)
+    assert "no servo states" in text
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_a_part_with_too_little_travel_is_a_finding_and_writes_nothing(tmp_path):
+    text = grd("calibrate", STREET, "-o", tmp_path / "rig.yaml", "--to", "0.4", code=1)
+    assert "turned by" in text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_vehicle_that_says_it_drove_is_refused(tmp_path):
+    drove = tmp_path / "drove.mcap"
+    with RecordingReader(STREET) as reader, RecordingWriter(drove, rig_yaml=reader.rig_yaml or "") as writer:
+        topics = ["/lidar/packets", "/servo/state"]
+        for k, record in enumerate(r for r in reader.records(topics) if r.arrival_ns < reader.start_ns + 3e8):
+            writer.write(replace(record, sequence=2 * k))
+            pose = {"xyz_m": [1e-3 * k, 0.0, 0.0], "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
+            data = json.dumps(pose).encode()
+            writer.write(replace(record, topic="/vehicle/odometry", data=data, sequence=2 * k + 1))
+    text = grd("calibrate", drove, code=1)
+    assert "odometry says that it drove 0." in text
+    assert list(tmp_path.iterdir()) == [drove]
+
+
+def test_a_rig_goes_into_a_yaml_file_only(tmp_path):
+    assert ".yaml" in grd("calibrate", STREET, "-o", tmp_path / "rig.svg", code=2)
+
+
+def test_a_part_that_ends_before_it_begins_is_wrong_use(tmp_path):
+    assert "--to" in grd("calibrate", STREET, "-o", tmp_path / "r.yaml", "--from", "2", "--to", "1", code=2)

@@ -1,0 +1,182 @@
+"""`grd run` live as a user meets it: started, stopped, killed, and taken again from its recording."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from links.cli.app import app
+from links.recording import RecordingReader, recover
+
+ROOT = Path(__file__).resolve().parents[3]
+PATIENCE_S = 120.0
+CONFIG = """\
+stages:
+  ticker: {use: tests.flow.live_toys.Ticker, inputs: {tick: clock.tick}}
+  order: {use: tests.flow.live_toys.Order, inputs: {left: ticker.number, right: ticker.number}}
+links:
+  clock: {use: links.clock.Clock, config: {rate_hz: 100}}
+  recorder: {use: links.recording.Recorder}
+"""
+
+
+@pytest.fixture
+def grd(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ticks.yaml").write_text(CONFIG)
+
+    def call(*words: object, code: int = 0) -> str:
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        if result.exception and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        assert result.exit_code == code, result.output
+        return result.output
+
+    return call
+
+
+def test_a_live_run_leaves_its_folder_and_is_repeated_to_the_same_hash(grd, tmp_path):
+    text = grd("run", "ticks.yaml", "--for", 0.6, "--no-warm-up")
+    folder = tmp_path / "out" / "live-ticks"
+    assert {path.name for path in folder.iterdir()} >= {"flight.mcap", "summary.json", "config.yaml", "run.log"}
+    summary = json.loads((folder / "summary.json").read_text())
+    assert f"output hash {summary['output_hash']}" in text
+    assert summary["messages"]["ticker.number"] == summary["records"] > 1
+    live = summary["live"]
+    assert live["edges"]["ticker.tick"]["taken"] == summary["records"]
+    assert live["edges"]["ticker.tick"]["source"] == "clock.tick"
+    assert live["edges"]["ticker.tick"]["lag_max_ms"] > 0
+    assert live["links"]["clock"]["openings"] == 1
+    assert live["counters"]["recorder"]["dropped"] == 0
+    assert (live["dropped"], live["incidents"], live["switched_off"]) == (0, [], [])
+
+    again = grd("replay", folder / "flight.mcap", "--as-live")
+    assert f"output hash {summary['output_hash']}" in again
+    assert "the live run's hash was the same" in again
+    repeated = json.loads((tmp_path / "out" / "flight-as-live" / "summary.json").read_text())
+    assert repeated["messages"] == summary["messages"]
+
+    plain = grd("replay", folder / "flight.mcap", "--config", "ticks.yaml")
+    assert "wired to nothing" not in plain
+
+
+def test_a_repetition_that_differs_is_a_finding(grd, tmp_path, monkeypatch):
+    grd("run", "ticks.yaml", "--for", 0.3, "--no-warm-up")
+    monkeypatch.setattr("tests.flow.live_toys.Order.finish", lambda self: None)  # another version of a stage
+    text = grd("replay", tmp_path / "out" / "live-ticks" / "flight.mcap", "--as-live", code=1)
+    assert "the live run's hash was " in text
+    assert "the same" not in text
+
+
+def test_what_cannot_be_repeated_says_why(grd):
+    street = ROOT / "recordings" / "street_sweep.mcap"
+    assert "no live run's recording" in grd("replay", street, "--as-live", code=2).replace("\n", " ")
+    text = grd("replay", street, "--as-live", "--set", "track.radius_m=2", code=2)
+    assert "--as-live takes the recording's own configuration" in text
+
+
+def test_a_stage_that_is_switched_off_is_a_finding_and_the_run_went_on(grd, tmp_path):
+    text = CONFIG.replace("Ticker, ", "Ticker, config: {raise_at: 1}, ")
+    (tmp_path / "bad.yaml").write_text(text)
+    output = grd("run", "bad.yaml", "--for", 0.6, "--no-warm-up", code=1)
+    assert "ArithmeticError: asked to at 1; ticker starts afresh" in output
+    live = json.loads((tmp_path / "out" / "live-bad" / "summary.json").read_text())["live"]
+    assert live["switched_off"] == ["ticker"]
+    assert live["restarts"] == {"ticker": 5}
+    assert live["stopped_by"] is None
+    assert "'ticker' did not work to the end: it kept raising" in output
+
+
+def test_a_stage_may_stop_the_run_before_its_time(grd, tmp_path):
+    (tmp_path / "bad.yaml").write_text(CONFIG.replace("Ticker, ", "Ticker, on_error: stop, config: {raise_at: 3}, "))
+    output = grd("run", "bad.yaml", "--for", PATIENCE_S, "--no-warm-up", code=1)
+    assert "'ticker' stopped the run" in output
+
+
+def test_a_run_without_a_recorder_says_that_nothing_is_recorded(grd, tmp_path):
+    (tmp_path / "none.yaml").write_text(CONFIG.replace("  recorder: {use: links.recording.Recorder}\n", ""))
+    output = grd("run", "none.yaml", "--for", 0.2, "--no-warm-up")
+    assert "no links.recording.Recorder is configured: nothing is recorded" in output
+
+
+def test_for_is_of_live_runs_only(grd):
+    text = grd("run", ROOT / "configs" / "quickstart.yaml", "--for", 1, code=2)
+    assert "--for is of live runs" in text
+
+
+def start(folder: Path, config: str) -> tuple[subprocess.Popen[str], Path]:
+    """A live run in a process of its own, and the mapped file with the newest record's arrival."""
+    last = folder / "last_arrival"
+    judge = f"  judge: {{use: tests.flow.live_toys.Judge, config: {{file: '{last}'}}}}\n"
+    (folder / "ticks.yaml").write_text(config + judge)
+    command = [sys.executable, "-c", "from links.cli import main; main()"]
+    options = ["run", str(folder / "ticks.yaml"), "--out", str(folder / "run"), "--no-warm-up"]
+    child = subprocess.Popen(
+        [*command, *options],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": "."},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    return child, last
+
+
+def arrival_ns(last: Path) -> int:
+    data = last.read_bytes() if last.exists() else b""
+    return struct.unpack("<q", data)[0] if len(data) == 8 else 0
+
+
+def wait_for_records(child: subprocess.Popen[str], last: Path, for_s: float) -> None:
+    """Until so much time has passed between records; fails when the child ends."""
+    first = 0
+    while arrival_ns(last) < first + for_s * 1e9 or not first:
+        first = first or arrival_ns(last)
+        assert child.poll() is None, child.communicate()[0]
+        threading.Event().wait(0.01)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_a_run_in_order(tmp_path, number):
+    child, last = start(tmp_path, CONFIG)
+    wait_for_records(child, last, 0.3)
+    child.send_signal(number)
+    output, _ = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 0, output
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["output_hash"] in output
+    with RecordingReader(tmp_path / "run" / "flight.mcap") as reader:
+        assert reader.finished
+        assert reader.topics["/clock"] == summary["records"]
+
+
+@pytest.mark.parametrize("after_s", [0.7, 1.3])
+def test_a_run_killed_with_sigkill_loses_at_most_half_a_second_and_what_is_left_can_be_repeated(tmp_path, grd, after_s):
+    child, last = start(tmp_path, CONFIG)
+    try:
+        wait_for_records(child, last, after_s)
+    finally:
+        child.send_signal(signal.SIGKILL)
+        child.communicate()
+    assert child.returncode == -signal.SIGKILL
+    report = recover(tmp_path / "run" / "flight.mcap")
+    with RecordingReader(report.path) as reader:
+        ticks = list(reader.records(["/clock"]))
+        orders = list(reader.records(["/run/order"]))
+        assert "rate_hz: 100" in reader.config_yaml
+    assert arrival_ns(last) - ticks[-1].arrival_ns <= 500_000_000
+    assert orders
+    assert not (tmp_path / "run" / "summary.json").exists()
+    text = grd("replay", report.path, "--as-live", "--out", tmp_path / "again")
+    assert "the live run was not stopped in order, so its hash is not known" in text
+    repeated = json.loads((tmp_path / "again" / "summary.json").read_text())
+    assert 0 < repeated["messages"]["order.number"] <= 2 * len(ticks)

@@ -1,0 +1,115 @@
+"""What the console shows of a live run, on a terminal and in a log."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from flow.edge import Edge, Waiting
+from flow.live_report import EdgeCount, LinkReport, LiveReport, edge_report
+from flow.taps import Digest
+from links.cli.live_view import LiveView
+from links.live_run import Look
+from stages.messages import DroneFix, Image, PoseState, RelativePose, SweptPulses, TrackingState, TrackState
+
+
+def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
+    count = EdgeCount(Edge("sweep", "swept_pulses", "track", "pulses", SweptPulses, Waiting("drop_oldest", 64)))
+    for lag_ms in lags_ms:
+        count.done(round(lag_ms * 1e6))
+    return LiveReport(
+        records=1234,
+        edges={"track.pulses": edge_report(count, dropped)},
+        links={"lidar": LinkReport(state, 1200, 1)},
+        counters={"lidar": {"lost": 7, "from other senders": 0}},
+        off=list(off),
+    )
+
+
+def pose(state=PoseState.FULL, **changes):
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    values = {
+        "stamp_ns": 1,
+        "state": state,
+        "reason": "seen now",
+        "measured_ns": 1,
+        "track_id": 1,
+        "xyz_vehicle_m": np.array([1.0, -2.0, 10.0]),
+        "R_vehicle_drone": quarter,
+        "covariance": np.diag([1.0, 1.0, 1.0, 0.01, 0.02, 0.06]),
+        "velocity_vehicle_mps": None,
+        "xyz_start_m": None,
+        "R_start_drone": None,
+        "start_covariance": None,
+        "velocity_start_mps": None,
+        "velocity_covariance": None,
+        "resets": 0,
+        "nis": 1.0,
+    }
+    return RelativePose(**(values | changes))
+
+
+def shown(report, *messages, terminal=False, news=()):
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=terminal, width=160, highlight=False, soft_wrap=True)
+    with LiveView(console) as view:
+        for message in messages:
+            view.newest.see("x", message, 0)
+        view.show(Look(12.34, report, list(news)))
+    return stream.getvalue()
+
+
+def test_a_log_has_one_line_with_state_pose_lag_and_losses():
+    line = shown(report_of(), pose())
+    assert line == (
+        "12.3 s; FULL: seen now; x 1.00  y -2.00  z 10.00 m  sigma 0.30 m  yaw 90.0 deg; "
+        "1234 records, worst lag p99 150.0 ms, 2 dropped, 1 late\n"
+    )
+
+
+def test_without_a_fused_pose_the_track_and_its_last_fix_are_shown():
+    track = TrackState(stamp_ns=1, state=TrackingState.TRACKING, reason="5 hits", hits=5, frame_s=0.1)
+    fix = DroneFix(
+        stamp_ns=1,
+        xyz_vehicle_m=np.array([3.0, 4.0, 5.0]),
+        covariance_m2=0.03 * np.eye(3),
+        hits=5,
+        iterations=1,
+        shift_m=0.0,
+    )
+    assert "TRACKING: 5 hits; x 3.00  y 4.00  z 5.00 m  sigma 0.30 m; " in shown(report_of(), track, fix)
+    assert "no drone yet; 1234 records" in shown(report_of())
+
+
+def test_a_lost_pose_has_no_numbers():
+    assert "LOST: seen now; 1234 records" in shown(report_of(), pose(PoseState.LOST, xyz_vehicle_m=None))
+
+
+def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():
+    line = shown(report_of(state="no packet on UDP 2368 for 2 s", off=["vp_drone"]))
+    assert "OFF: vp_drone; lidar no packet on UDP 2368 for 2 s\n" in line
+
+
+def test_news_are_told_at_once_even_between_two_lines(capsys):
+    stream = io.StringIO()
+    with LiveView(Console(file=stream, width=160, soft_wrap=True)) as view:
+        view.show(Look(0.0, report_of(), ["lidar: first"]))
+        view.show(Look(0.1, report_of(), ["lidar: second"]))
+    assert stream.getvalue().count("\n") == 1
+    assert capsys.readouterr().err == "lidar: first\nlidar: second\n"
+
+
+def test_a_terminal_shows_every_edge_and_link():
+    text = shown(report_of(), pose(), terminal=True, news=["servo: stalled"])
+    for words in ("track.pulses", "sweep.swept_pulses", "150.0", "lidar", "lost 7", "FULL: seen now", "servo: stalled"):
+        assert words in text
+    assert "from other senders" not in text, "counts of zero are left out"
+
+
+@pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (Image, False)])
+def test_the_view_takes_only_what_it_shows(kind, wanted):
+    assert LiveView().newest.wants(kind) is wanted
+    assert Digest().wants(kind)

@@ -1,0 +1,91 @@
+"""Fused poses in a run's folder: a line each, the rotation marked where it is not known, states in the log."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import numpy as np
+import pytest
+
+from flow.link import Run
+from links.evaluation.output import read_output
+from links.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
+from stages.fuse.told import Known, Verdict, lost, pose
+from stages.geometry import quaternions_xyzw, rotation_z
+from stages.messages import PoseState
+from stages.trail import VehicleTrail
+
+S = 1_000_000_000
+FULL, POSITION_ONLY = PoseState.FULL, PoseState.POSITION_ONLY
+
+
+def verdict(state, resets=0):
+    return Verdict(state, f"why {state.name}", 2 * S, 1, resets, 1.5)
+
+
+def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.01, 0.02, 0.03, 0.1, 0.2, 0.3)):
+    known = Known(round(t_s * S), R, np.array(xyz), np.diag(variances), np.zeros(3), np.eye(3))
+    return pose(known, verdict(state), VehicleTrail())
+
+
+@pytest.fixture
+def run(tmp_path):
+    def write(messages):
+        results = Results()
+        results.open(Run(tmp_path, "made", "", ""))
+        for message in messages:
+            results.see("fuse.relative_pose", message, message.stamp_ns)
+        results.close()
+        return tmp_path
+
+    return write
+
+
+def test_a_pose_is_a_line_of_both_files_and_reads_back(run):
+    R = rotation_z(0.5)
+    folder = run([made(1.0, R), made(1.02, R, xyz=(1.1, 2.0, 3.0))])
+    back = read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6)
+    assert back.poses.stamps_ns.tolist() == [S, 1_020_000_000]
+    assert np.allclose(back.poses.xyz_m, [[1, 2, 3], [1.1, 2, 3]])
+    assert np.allclose(back.poses.quaternion_xyzw, quaternions_xyzw(np.array([R, R])), atol=1e-5)
+    assert np.allclose(back.covariance[0], np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]))
+    assert back.good.tolist() == [True, True]
+
+
+def test_a_pose_without_rotation_is_marked_and_its_variance_is_no_infinity(run):
+    folder = run([made(1.0, state=POSITION_ONLY), made(1.02, rotation_z(0.5))])
+    back = read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6)
+    assert back.good.tolist() == [False, True]
+    assert np.allclose(np.diag(back.covariance[0])[:3], UNKNOWN_RAD2)
+    assert np.allclose(np.diag(back.covariance[0])[3:], [0.1, 0.2, 0.3])
+    rows = list(csv.DictReader((folder / POSE_COVARIANCE_FILE).open()))
+    assert [row["state"] for row in rows] == ["POSITION_ONLY", "FULL"]
+    assert rows[0]["measured_s"] == "2.000000000"
+    assert (folder / POSE_FILE).read_text().splitlines()[1].endswith(" 0 0 0 1")
+
+
+def test_a_lost_drone_has_no_line_and_the_log_tells_each_change(run):
+    R = np.eye(3)
+    messages = [lost(S, verdict(PoseState.LOST)), made(1.02, R), made(1.04, R), lost(2 * S, verdict(PoseState.LOST))]
+    folder = run(messages)
+    assert len((folder / POSE_FILE).read_text().splitlines()) == 2 + 1
+    told = [line for line in (folder / "run.log").read_text().splitlines() if "fuse.relative_pose" in line]
+    assert [line.split(": ", 1)[1] for line in told] == ["LOST: why LOST", "FULL: why FULL", "LOST: why LOST"]
+
+
+def test_a_run_in_which_nobody_fuses_has_no_poses_not_even_old_ones(run):
+    folder = run([made(1.0, np.eye(3))])
+    assert (folder / POSE_FILE).exists()
+    run([])
+    assert not (folder / POSE_FILE).exists()
+    assert not (folder / POSE_COVARIANCE_FILE).exists()
+
+
+def test_a_number_that_is_not_known_is_empty(run):
+    message = made(1.0, np.eye(3))
+    object.__setattr__(message, "nis", math.nan)
+    object.__setattr__(message, "measured_ns", None)
+    folder = run([message])
+    row = next(csv.DictReader((folder / POSE_COVARIANCE_FILE).open()))
+    assert (row["nis"], row["measured_s"]) == ("", "")

@@ -39,7 +39,7 @@ _log = logging.getLogger("grd.viewer")
 
 
 class Viewer(Tap):
-    """Log every edge to Rerun. `lossless: true`: a replay waits for the viewer instead of dropping; a live run never."""
+    """Log every edge to Rerun. `lossless: true`: a replay waits for the viewer, dropping nothing; a live run never."""
 
     file: str | None = "run.rrd"  # in the run's folder; null: no file
     serve: bool = False  # to viewers on this host; binds 127.0.0.1 only

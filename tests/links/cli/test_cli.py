@@ -39,7 +39,21 @@ def without_viewer(folder: Path) -> Path:
 
 @pytest.mark.parametrize(
     "command",
-    ["run", "replay", "check", "graph", "schema", "import", "recover", "simulate", "matrix", "evaluate", "view"],
+    [
+        "run",
+        "replay",
+        "check",
+        "graph",
+        "schema",
+        "import",
+        "recover",
+        "preflight",
+        "calibrate",
+        "simulate",
+        "matrix",
+        "evaluate",
+        "view",
+    ],
 )
 def test_every_command_explains_itself_with_an_example(grd, command):
     assert f"Example: grd {command} " in grd(command, "--help").replace("\n  ", " ").replace("  ", " ")

@@ -71,7 +71,7 @@ class HitMissTrack(Stage):
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion", "drone_position", "drone_odometry"})
 
     span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
-    hull_offset_m: float = Field(0.01, ge=-1, le=1)  # the centre lies this far behind the mean of its returns
+    hull_offset_m: float = Field(0.03, ge=-1, le=1)  # the centre lies this far behind the mean of its returns
     max_drones: int = Field(1, ge=1, le=8)
     max_hypotheses: int = Field(4, ge=0, le=16)  # candidates followed beside them
     own_sigma_m: float = Field(0.8, gt=0)  # less known, only the detector finds it again
@@ -82,7 +82,7 @@ class HitMissTrack(Stage):
     lost_sigma_m: float = Field(5.0, gt=0)  # it is known as well as this
     start_sigma_mps: float = Field(1.5, gt=0)  # of the detector's velocity
     pointing_deg: float = Field(0.07, ge=0)  # encoder, play, calibration: constant or slow, one sigma
-    shape_m: float = Field(0.02, ge=0)  # the drone's own outline is not round, one sigma
+    shape_m: float = Field(0.015, ge=0)  # the drone's own outline is not round, one sigma
     misses: bool = True  # ablation: without, only hits count
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
 

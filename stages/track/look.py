@@ -20,7 +20,7 @@ from stages.track.kalman import condition, measured
 SCAN_COS = math.cos(math.radians(24.0))  # a slice covers 15 deg to each side of its middle and 5 deg along
 FURTHEST_M = 6.0  # beside the prediction pulses are collected
 RANGE_NOISE_M = 0.1  # of one return about the body's middle, one sigma: it is as deep
-RANGE_FLOOR_M = 0.03
+RANGE_FLOOR_M = 0.02
 MOST_ROWS = 256
 
 

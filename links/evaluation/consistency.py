@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from links.evaluation.catalogue import Value, failure
 from links.evaluation.errors import AtOutputs
@@ -34,15 +35,23 @@ def rotation(judged: Evaluation) -> None:
         judged.cannot(f"truth gives no rotation: {truth.why_no_rotation}", *keys)
     elif not len(at.index):
         judged.cannot(no_error(judged, at).note, *keys)
+    elif not (told := _rotation_told(judged, at)).any():
+        judged.cannot("the run never knew the rotation", *keys)
     else:
-        n = len(at.index)
-        for key, series in zip(keys, np.degrees(at.euler_error_rad).T, strict=False):
+        n = int(told.sum())
+        for key, series in zip(keys, np.degrees(at.euler_error_rad[told]).T, strict=False):
             judged.values[key] = Value(rms(series), n)
-        judged.values["rmse_angle_deg"] = Value(rms(np.degrees(at.angle_error_rad)), n)
+        judged.values["rmse_angle_deg"] = Value(rms(np.degrees(at.angle_error_rad[told])), n)
         wrong_s, note = _branch_wrong(judged, at, at.euler_error_rad[:, 2])
         judged.values["branch_wrong_s"] = Value(wrong_s, n, note=note)
         if wrong_s > 0:
             judged.findings.append(f"yaw wrong by more than 45 deg for {wrong_s:.1f} s while marked good")
+
+
+def _rotation_told(judged: Evaluation, at: AtOutputs) -> NDArray[np.bool_]:
+    """Outputs (n,) that give a rotation at all; a run that does not mark them gives one with each."""
+    rotated = judged.output.rotated
+    return np.ones(len(at.index), dtype=np.bool_) if rotated is None else rotated[at.index]
 
 
 def _branch_wrong(judged: Evaluation, at: AtOutputs, yaw_error_rad: Array64) -> tuple[float, str]:
@@ -79,10 +88,12 @@ def covariance(judged: Evaluation) -> None:
     inside_95(judged, "inside_95_share", at.nees, 3)
     if at.nees6 is None:
         judged.cannot("no 6x6 covariance with rotation in the run and in truth", "nees6_mean")
-    elif np.isnan(at.nees6).any():
+    elif not (told := _rotation_told(judged, at)).any():
+        judged.cannot("the run never knew the rotation", "nees6_mean")
+    elif np.isnan(at.nees6[told]).any():
         judged.cannot("some 6x6 covariances are not positive definite", "nees6_mean")
     else:
-        judged.values["nees6_mean"] = mean_nees(judged, at.nees6, 6, "pose")
+        judged.values["nees6_mean"] = mean_nees(judged, at.nees6[told], 6, "pose")
 
 
 def inside_95(judged: Evaluation, key: str, nees: Array64, dof: int) -> None:

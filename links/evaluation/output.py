@@ -29,6 +29,7 @@ class Output:
     hits: NDArray[np.int64] | None = None  # (n,) returns used
     track: NDArray[np.int64] | None = None  # (n,) which track; None: the run has one only
     swaps: int | None = None  # how often its tracks went over to another drone; None: there was one drone
+    rotated: NDArray[np.bool_] | None = None  # (n,) whether the rotation is known; None: the run does not say
 
 
 def read_output(name: str, poses_file: Path, covariance_file: Path, size: int) -> Output:
@@ -59,14 +60,16 @@ def read_output(name: str, poses_file: Path, covariance_file: Path, size: int) -
         return Output(name, poses, why_no_covariance=why)
     rows = [rows[i] for i in order]
     covariance = np.array([row.matrix for row in rows]).reshape(-1, size, size)
-    good = hits = track = None
+    good = hits = track = rotated = None
     if rows and "good" in rows[0].cells:
         good = np.array([row.cells["good"].strip().lower() in {"1", "true"} for row in rows])
+    if rows and "rotation" in rows[0].cells:
+        rotated = np.array([row.cells["rotation"].strip() == "1" for row in rows])
     if rows and "hits" in rows[0].cells:
         hits = np.array([_whole(row, "hits") for row in rows], dtype=np.int64)
     if rows and "track_id" in rows[0].cells:
         track = np.array([_whole(row, "track_id") for row in rows], dtype=np.int64)
-    return Output(name, poses, covariance, "", good, hits, track)
+    return Output(name, poses, covariance, "", good, hits, track, rotated=rotated)
 
 
 def _next_key(taken: Mapping[tuple[int, int], object], stamp_ns: int) -> tuple[int, int]:

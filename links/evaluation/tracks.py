@@ -104,4 +104,5 @@ def _some(output: Output, kept: NDArray[np.bool_], swaps: int) -> Output:
         None if output.hits is None else output.hits[kept],
         None if output.track is None else output.track[kept],
         swaps,
+        None if output.rotated is None else output.rotated[kept],
     )

@@ -106,15 +106,15 @@ class JointAlign(Stage):
 
     def on_attitude(self, attitude: DroneAttitude) -> None:
         """How the drone turns; its yaw's zero is not ours."""
-        self._now.reckoning.add_attitude(attitude)
+        self._now.reckoning.add_autopilot(attitude)
 
     def on_position(self, position: DroneLocalPosition) -> None:
         """How the drone moves, in the same frame as its attitude."""
-        self._now.reckoning.add_position(position)
+        self._now.reckoning.add_autopilot(position)
 
     def on_odometry(self, odometry: DroneOdometry) -> None:
         """Both at once."""
-        self._now.reckoning.add_odometry(odometry)
+        self._now.reckoning.add_autopilot(odometry)
 
     def on_drone_motion(self, motion: DroneMotion) -> None:
         """Turn and direction from the drone's pictures."""

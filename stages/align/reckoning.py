@@ -15,16 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.align.drone_trail import AutopilotTrail, PictureTrail, turn_between
 from stages.align.refine import Refined
 from stages.align.spectra import LevelLines
+from stages.drone_trail import AutopilotTrail, PictureTrail, turn_between
 from stages.geometry import Array64, rotation_z
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
 from stages.trail import VehicleTrail
 
 VEHICLE_RAD_PER_S = math.radians(20.0)  # a vehicle that does not tell its turns may turn like this
 VEHICLE_DRIFT_RAD2_PER_S = math.radians(0.1) ** 2
-ODOMETRY_NS = 1_000_000_000  # while it is heard, attitude and position of other messages are not needed
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,6 @@ class Reckoning:
         self.pictures = PictureTrail()
         self._R_start_drone = np.eye(3)
         self._stamp_ns: int | None = None
-        self._odometry_ns: int | None = None
         self._silences = 0
 
     @property
@@ -70,34 +68,13 @@ class Reckoning:
         """The vehicle's pose since its start."""
         self.vehicle.add(motion)
 
-    def add_attitude(self, attitude: DroneAttitude) -> None:
-        """The autopilot's attitude, unless its whole odometry is heard."""
-        if not self._odometry_heard(attitude.stamp_ns):
-            self.autopilot.add_attitude(
-                attitude.stamp_ns, attitude.R_local_drone, attitude.angular_velocity_drone_radps
-            )
-
-    def add_position(self, position: DroneLocalPosition) -> None:
-        """The autopilot's position, unless its whole odometry is heard."""
-        if not self._odometry_heard(position.stamp_ns):
-            self.autopilot.add_position(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
-
-    def add_odometry(self, odometry: DroneOdometry) -> None:
-        """Both at once; an estimate that calls itself failed is not used."""
-        if odometry.quality_percent == 0:
-            return
-        R = odometry.R_local_drone
-        self._odometry_ns = odometry.stamp_ns
-        self.autopilot.reset(odometry.reset_counter)
-        self.autopilot.add_attitude(odometry.stamp_ns, R, odometry.angular_velocity_drone_radps)
-        self.autopilot.add_position(odometry.stamp_ns, odometry.xyz_local_m, R @ odometry.velocity_drone_mps)
+    def add_autopilot(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
+        """What the autopilot says of itself."""
+        self.autopilot.hear(word)
 
     def add_drone_motion(self, motion: DroneMotion) -> None:
         """A step of the odometry by pictures."""
         self.pictures.add(motion)
-
-    def _odometry_heard(self, stamp_ns: int) -> bool:
-        return self._odometry_ns is not None and stamp_ns - self._odometry_ns < ODOMETRY_NS
 
     def new_silences(self) -> int:
         """Times since the last call that the autopilot was not heard for so long that it may have jumped."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.align.branches import ASKEW, R_TURNS, Displacement
-from stages.align.drone_trail import AutopilotTrail
+from stages.drone_trail import AutopilotTrail
 from stages.geometry import Array64
 from stages.messages import DroneFix, DroneMotion
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from stages.align.branches import ASKEW, R_TURNS
-from stages.align.drone_trail import AutopilotTrail
 from stages.align.windows import Windows
+from stages.drone_trail import AutopilotTrail
 from stages.geometry import rotation_z
 from stages.messages import DroneFix, DroneMotion
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from stages.align.drone_trail import (
+from stages.drone_trail import (
     AutopilotTrail,
     PictureTrail,
     turn_between,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.geometry import Array64
-from stages.messages import DroneMotion
+from stages.messages import DroneAttitude, DroneLocalPosition, DroneMotion, DroneOdometry
 from stages.rotation import exp_rotation, log_rotation
 
 KEPT = 1024
@@ -29,6 +29,7 @@ JUMP_M = 0.3
 DRIFT_RAD2_PER_S = math.radians(0.3) ** 2  # of an attitude: walk
 CLOCK_S = 0.02  # an attitude's stamp may be off by this: at 120 deg/s that is 2.4 deg
 UNKNOWN_RAD_PER_S = math.radians(40.0)  # a heading nobody tells changes like this
+ODOMETRY_NS = 1_000_000_000  # while it is heard, attitude and position of other messages are not needed
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,28 @@ class AutopilotTrail:
         self._R_own_local = np.eye(3)
         self._offset_m = np.zeros(3)  # xyz_own = R_own_local xyz_local + offset
         self._reset_counter: int | None = None
+        self._odometry_ns: int | None = None
         self.jumps = 0  # taken out
         self.silences = 0  # after which a jump could not have been seen
+
+    def hear(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
+        """A message of the autopilot's: its whole odometry rather than attitude and position by themselves.
+
+        An estimate that calls itself failed is not used.
+        """
+        if isinstance(word, DroneOdometry):
+            if word.quality_percent == 0:
+                return
+            self._odometry_ns = word.stamp_ns
+            self.reset(word.reset_counter)
+            self.add_attitude(word.stamp_ns, word.R_local_drone, word.angular_velocity_drone_radps)
+            self.add_position(word.stamp_ns, word.xyz_local_m, word.R_local_drone @ word.velocity_drone_mps)
+        elif self._odometry_ns is not None and word.stamp_ns - self._odometry_ns < ODOMETRY_NS:
+            return
+        elif isinstance(word, DroneAttitude):
+            self.add_attitude(word.stamp_ns, word.R_local_drone, word.angular_velocity_drone_radps)
+        else:
+            self.add_position(word.stamp_ns, word.xyz_local_m, word.velocity_local_mps)
 
     def add_attitude(self, stamp_ns: int, R_local_drone: Array64, rate_drone_radps: Array64) -> None:
         """One more attitude; one that is not newer than the last is ignored."""
@@ -153,6 +174,23 @@ class AutopilotTrail:
         share = since_s / ((after.stamp_ns - before.stamp_ns) * 1e-9)
         return before.xyz_own_m + share * (after.xyz_own_m - before.xyz_own_m), before.stretch
 
+    def velocity_own_mps(self, stamp_ns: int) -> Array64 | None:
+        """Velocity (3,) in frame own, as said last before a time; None: not known."""
+        places = self._places
+        if not places or not places[0].stamp_ns <= stamp_ns <= places[-1].stamp_ns + AHEAD_NS:
+            return None
+        return places[bisect_right(places, stamp_ns, key=lambda place: place.stamp_ns) - 1].velocity_own_mps
+
+    @property
+    def attitude_ns(self) -> int | None:
+        """Time of the newest attitude."""
+        return self._nodes[-1].stamp_ns if self._nodes else None
+
+    @property
+    def place_ns(self) -> int | None:
+        """Time of the newest position."""
+        return self._places[-1].stamp_ns if self._places else None
+
     def _before(self, stamp_ns: int) -> _Node | None:
         at = bisect_right(self._nodes, stamp_ns, key=lambda node: node.stamp_ns)
         return self._nodes[at - 1] if at else None
@@ -176,6 +214,11 @@ class PictureTrail:
                 self._nodes.append(start)
         variance = start[2] + float(np.trace(motion.covariance_rad2)) / 3
         self._nodes.append((motion.stamp_ns, start[1] @ motion.R_from_to, variance, start[3]))
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Time of the newest picture."""
+        return self._nodes[-1][0] if self._nodes else None
 
     def at(self, stamp_ns: int) -> tuple[Array64, float, int] | None:
         """R_chain_drone, the variance so far [rad^2] and the chain; None: not known."""

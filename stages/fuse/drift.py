@@ -1,0 +1,144 @@
+"""Where the LiDAR has the drone, and how fast that creeps away from what its odometry tells.
+
+    p' = p + u + b dt      u: the odometry's way, turned into the start frame;   z = p + noise
+
+With odometry b is its drift, a Gauss-Markov velocity that lasts for seconds: known from the fixes of the last seconds
+it makes a gap without fixes less bad. Without odometry u = 0 and b is the drone's whole velocity, with white
+acceleration, and with as much more as the drone says its velocity has changed, in whatever direction.
+
+    V(T) = T^2 P_b + q T^3 / 3
+
+is what a time T without a fix adds to the position's covariance, q = 2 sigma^2 / tau with odometry.
+
+Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 6.2; ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.fuse.settings import FuseErrors
+from stages.geometry import Array64
+
+START_MPS = 1.0  # a tracker's velocity, one sigma
+UNKNOWN_MPS = 6.0  # nobody's
+
+
+class Drift:
+    """A Kalman filter over the fixes, in the start frame."""
+
+    def __init__(self, errors: FuseErrors, odometry: bool) -> None:
+        """`odometry`: whether u is told."""
+        self._errors, self.odometry = errors, odometry
+        self._x = np.zeros(6)
+        self._covariance = np.eye(6)
+        self.stamp_ns: int | None = None  # of the newest fix
+        self.q = 2 * errors.drift_mps**2 / errors.drift_time_s if odometry else errors.manoeuvre
+
+    @property
+    def xyz_start_m(self) -> Array64:
+        """At the newest fix."""
+        return self._x[:3]
+
+    @property
+    def velocity_mps(self) -> Array64:
+        """b (3,), start axes."""
+        return self._x[3:]
+
+    @property
+    def velocity_covariance(self) -> Array64:
+        """Of b (3, 3)."""
+        return self._covariance[3:, 3:]
+
+    def start(self, stamp_ns: int, xyz_m: Array64, covariance_m2: Array64, velocity_mps: Array64 | None) -> None:
+        """Begin at a fix; with odometry b begins at none, else at the tracker's velocity."""
+        self.stamp_ns = stamp_ns
+        known = np.zeros(3) if self.odometry or velocity_mps is None else velocity_mps
+        sigma = START_MPS if velocity_mps is not None else UNKNOWN_MPS
+        self._x = np.concatenate([xyz_m, known])
+        self._covariance = np.zeros((6, 6))
+        self._covariance[:3, :3] = covariance_m2
+        self._covariance[3:, 3:] = (self._errors.drift_mps if self.odometry else sigma) ** 2 * np.eye(3)
+
+    def see(
+        self, stamp_ns: int, xyz_m: Array64, covariance_m2: Array64, moved_m: Array64 | None, turned_mps: float
+    ) -> None:
+        """One more fix; an older one than the newest is left to others.
+
+        moved_m: u since the fix before; turned_mps: how much the drone says its velocity has changed since then.
+        """
+        if self.stamp_ns is None or stamp_ns <= self.stamp_ns:
+            return
+        dt = (stamp_ns - self.stamp_ns) * 1e-9
+        e = self._errors
+        moved = np.zeros(3) if moved_m is None else moved_m
+        keep = float(np.exp(-dt / e.drift_time_s)) if self.odometry else 1.0
+        walk = e.walk_m_per_sqrt_s**2 * dt if self.odometry else 0.0
+        fresh = ((e.drift_scale if self.odometry else 0.7) * turned_mps) ** 2
+        self._x, self._covariance = _step(self._x, self._covariance, moved, dt, keep, self.q, walk, fresh)
+        self._x, self._covariance = _correct(self._x, self._covariance, xyz_m - self._x[:3], covariance_m2)
+        self.stamp_ns = stamp_ns
+
+    def turn(self, R: Array64, t_m: Array64) -> None:
+        """The start frame is another one now: p <- R p + t."""
+        whole = np.zeros((6, 6))
+        whole[:3, :3] = whole[3:, 3:] = R
+        self._x = whole @ self._x
+        self._x[:3] += t_m
+        self._covariance = whole @ self._covariance @ whole.T
+
+    def ahead(self, stamp_ns: int) -> tuple[Array64, Array64]:
+        """Position (3,) and its covariance (3, 3) at a time, moved by b alone."""
+        assert self.stamp_ns is not None
+        dt = (stamp_ns - self.stamp_ns) * 1e-9
+        x, P = _step(self._x, self._covariance, np.zeros(3), dt, 1.0, self.q if dt > 0 else 0.0, 0.0, 0.0)
+        return x[:3], P[:3, :3]
+
+    def look_along(self, direction_start: Array64, sigma_rad: float) -> None:
+        """The drone flies this way, says its camera, at whatever speed: v across it is none."""
+        speed = float(np.linalg.norm(self._x[3:]))
+        across = np.eye(3) - np.outer(direction_start, direction_start)
+        self._x, self._covariance = _across(self._x, self._covariance, across, (speed * sigma_rad) ** 2 + 0.05**2)
+
+    def gathered(self, since_s: float) -> Array64:
+        """V(T) (3, 3), start axes."""
+        T = max(since_s, 0.0)
+        return T**2 * self._covariance[3:, 3:] + self.q * T**3 / 3 * np.eye(3)
+
+
+def _step(
+    x: Array64, P: Array64, moved: Array64, dt: float, keep: float, q: float, walk: float, fresh: float
+) -> tuple[Array64, Array64]:
+    F = np.eye(6)
+    for axis in range(3):
+        F[axis, axis + 3] = dt
+        F[axis + 3, axis + 3] = keep
+    ahead = F @ x
+    ahead[:3] += moved
+    spread = F @ P @ F.T
+    for axis in range(3):
+        spread[axis, axis] += q * dt**3 / 3 + walk
+        spread[axis, axis + 3] += q * dt**2 / 2
+        spread[axis + 3, axis] += q * dt**2 / 2
+        spread[axis + 3, axis + 3] += q * dt + fresh
+    return ahead, spread
+
+
+def _correct(x: Array64, P: Array64, residual: Array64, R: Array64) -> tuple[Array64, Array64]:
+    """Joseph's form of z = p + noise."""
+    K = np.linalg.solve(P[:3, :3] + R, np.ascontiguousarray(P[:3, :])).T
+    left = np.eye(6)
+    left[:, :3] -= K
+    after = left @ P @ left.T + K @ R @ K.T
+    return x + K @ residual, 0.5 * (after + after.T)
+
+
+def _across(x: Array64, P: Array64, across: Array64, variance: float) -> tuple[Array64, Array64]:
+    """0 = across v + noise."""
+    H = np.zeros((3, 6))
+    H[:, 3:] = across
+    S = H @ P @ H.T + variance * np.eye(3)
+    K = np.linalg.solve(S, H @ P).T
+    left = np.eye(6) - K @ H
+    after = left @ P @ left.T + variance * (K @ K.T)
+    return x - K @ (H @ x), 0.5 * (after + after.T)

@@ -1,0 +1,79 @@
+"""The back end as a plain error-state Kalman filter: one pose, late data brought to its time by the drone's own motion.
+
+    extend       T <- T D,  P <- Ad(D^-1) P Ad(D^-1)^T + Q
+    position     z = T d + noise,  d: where the body was at the measurement's time, in the body's axes now
+    rotation     R_z = R d_R exp(noise)
+
+Kept for comparison with the smoother (tests/benchmarks/bench_fuse.py): as accurate while all is well, it cannot mend a
+bad start.
+
+Source: Sola, Quaternion kinematics for the error-state Kalman filter (2017), 6; DESIGN, Fusion.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.fuse.back_end import HUBER
+from stages.fuse.carried import Step
+from stages.fuse.rigid import carried_covariance
+from stages.geometry import Array64
+from stages.rotation import exp_rotation, hat, log_rotation
+
+
+class Ekf:
+    """See `stages.fuse.back_end.BackEnd`."""
+
+    def __init__(self) -> None:
+        self.stamp_ns, self.recoveries = 0, 0
+        self.R_start_drone, self.xyz_start_m, self.covariance = np.eye(3), np.zeros(3), np.eye(6)
+
+    def start(self, stamp_ns: int, R_start_drone: Array64, xyz_start_m: Array64, covariance: Array64) -> None:
+        """Begin here."""
+        self.stamp_ns, self.covariance = stamp_ns, covariance
+        self.R_start_drone, self.xyz_start_m = R_start_drone, xyz_start_m
+
+    def extend(self, stamp_ns: int, step: Step, up_drone: Array64 | None, tilt_rad2: float) -> None:
+        """Move on; `up_drone`: where the autopilot has the vertical."""
+        self.xyz_start_m = self.xyz_start_m + self.R_start_drone @ step.t_m
+        self.R_start_drone = self.R_start_drone @ step.R
+        self.covariance = carried_covariance(self.covariance, step.R, step.t_m, step.covariance)
+        self.stamp_ns = stamp_ns
+        if up_drone is not None:
+            H = np.zeros((3, 6))
+            H[:, :3] = hat(self.R_start_drone.T[:, 2].copy())  # of R^T z
+            self._correct(H, up_drone - self.R_start_drone.T[:, 2], tilt_rad2 * np.eye(3))
+
+    def near(self, stamp_ns: int) -> tuple[int, Array64, Array64]:
+        """The moment whose pose is known that a measurement is told from, and that pose."""
+        return self.stamp_ns, self.R_start_drone, self.xyz_start_m
+
+    def add_position(self, key_ns: int, step: Step, xyz_m: Array64, covariance_m2: Array64) -> bool:
+        """A position at the end of a step from the known moment."""
+        H = np.zeros((3, 6))
+        H[:, :3] = -self.R_start_drone @ hat(step.t_m)
+        H[:, 3:] = self.R_start_drone
+        self._correct(H, xyz_m - self.xyz_start_m - self.R_start_drone @ step.t_m, covariance_m2)
+        return True
+
+    def add_rotation(self, key_ns: int, step: Step, R: Array64, covariance_rad2: Array64) -> bool:
+        """A rotation at the end of a step."""
+        H = np.zeros((3, 6))
+        H[:, :3] = np.eye(3)
+        e = log_rotation(self.R_start_drone.T @ R @ step.R.T)
+        self._correct(H, e, step.R @ covariance_rad2 @ step.R.T)
+        return True
+
+    def _correct(self, H: Array64, e: Array64, noise: Array64) -> None:
+        """Huber's weight on the whitened residual, as the smoother's factors have."""
+        far = math.sqrt(max(float(e @ np.linalg.solve(noise, e)), 0.0))
+        noise = noise * max(1.0, far / HUBER)
+        K = np.linalg.solve(H @ self.covariance @ H.T + noise, H @ self.covariance).T
+        left = np.eye(6) - K @ H
+        after = left @ self.covariance @ left.T + K @ noise @ K.T
+        xi = K @ e
+        self.xyz_start_m = self.xyz_start_m + self.R_start_drone @ xi[3:]
+        self.R_start_drone = self.R_start_drone @ exp_rotation(xi[:3])
+        self.covariance = 0.5 * (after + after.T)

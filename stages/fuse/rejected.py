@@ -1,0 +1,45 @@
+"""Measurements refused in a row: when they agree with each other it is the estimate that is wrong.
+
+Source: DESIGN, Fusion: restart after 8 mutually consistent rejections; ours: agreement by a line through them.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from stages.fuse.rigid import distance2
+from stages.geometry import Array64
+
+ENOUGH = 8
+LONGEST_NS = 3_000_000_000
+AGREE = 3.0  # chi-square for each degree of freedom
+
+
+class Rejected:
+    """The last ones, with what they were off the estimate."""
+
+    def __init__(self) -> None:
+        self._off: deque[tuple[int, Array64, Array64]] = deque(maxlen=ENOUGH)
+
+    def __len__(self) -> int:
+        return len(self._off)
+
+    def clear(self) -> None:
+        """One was accepted."""
+        self._off.clear()
+
+    def add(self, stamp_ns: int, off: Array64, covariance: Array64) -> bool:
+        """One more refused, off (3,) the estimate; True: enough of them lie on a line in time."""
+        self._off.append((stamp_ns, off, covariance))
+        while self._off[0][0] < stamp_ns - LONGEST_NS:
+            self._off.popleft()
+        if len(self._off) < ENOUGH:
+            return False
+        t = np.array([(ns - stamp_ns) * 1e-9 for ns, _, _ in self._off])
+        y = np.array([e for _, e, _ in self._off])
+        A = np.column_stack([np.ones(len(t)), t])
+        left = y - A @ np.linalg.solve(A.T @ A, A.T @ y)
+        chi2 = sum(distance2(left[i], C) for i, (_, _, C) in enumerate(self._off))
+        return bool(chi2 <= AGREE * 3 * (ENOUGH - 2))

@@ -1,0 +1,96 @@
+"""The message made of a pose in the start frame: in the vehicle's, with velocities and honest covariances.
+
+A covariance's translation is in the drone's axes where the rotation is known, else in the frame's own; then its
+rotation has infinite variance.
+
+Source: ours; stages/messages.py (RelativePose).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry import Array64
+from stages.messages import PoseState, RelativePose
+from stages.trail import VehicleTrail
+
+
+@dataclass(frozen=True)
+class Known:
+    """The drone in the start frame at one moment."""
+
+    stamp_ns: int
+    R_start_drone: Array64 | None
+    xyz_start_m: Array64
+    covariance: Array64  # (6, 6); without a rotation only its position block counts, start axes
+    velocity_start_mps: Array64
+    velocity_covariance: Array64
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is to be said with it."""
+
+    state: PoseState
+    reason: str
+    measured_ns: int | None
+    track_id: int
+    resets: int
+    nis: float
+
+
+def lost(stamp_ns: int, verdict: Verdict) -> RelativePose:
+    """Nothing is known."""
+    return RelativePose(
+        stamp_ns=stamp_ns,
+        state=PoseState.LOST,
+        reason=verdict.reason,
+        measured_ns=verdict.measured_ns,
+        track_id=verdict.track_id,
+        xyz_vehicle_m=None,
+        R_vehicle_drone=None,
+        covariance=None,
+        velocity_vehicle_mps=None,
+        xyz_start_m=None,
+        R_start_drone=None,
+        start_covariance=None,
+        velocity_start_mps=None,
+        velocity_covariance=None,
+        resets=verdict.resets,
+        nis=math.nan,
+    )
+
+
+def pose(known: Known, verdict: Verdict, vehicle: VehicleTrail) -> RelativePose:
+    """The pose, in both frames."""
+    R_start_vehicle, _ = vehicle.at(known.stamp_ns)
+    xyz, velocity = vehicle.to_vehicle(known.stamp_ns, known.xyz_start_m, known.velocity_start_mps)
+    R = known.R_start_drone
+    if R is None:
+        start = np.diag([math.inf] * 3 + [0.0] * 3)
+        relative = start.copy()
+        start[3:, 3:] = known.covariance[3:, 3:]
+        relative[3:, 3:] = R_start_vehicle.T @ known.covariance[3:, 3:] @ R_start_vehicle
+    else:
+        start = relative = known.covariance  # tangent at the drone: the same seen from either frame
+    return RelativePose(
+        stamp_ns=known.stamp_ns,
+        state=verdict.state,
+        reason=verdict.reason,
+        measured_ns=verdict.measured_ns,
+        track_id=verdict.track_id,
+        xyz_vehicle_m=xyz,
+        R_vehicle_drone=None if R is None else R_start_vehicle.T @ R,
+        covariance=relative,
+        velocity_vehicle_mps=velocity,
+        xyz_start_m=known.xyz_start_m,
+        R_start_drone=R,
+        start_covariance=start,
+        velocity_start_mps=known.velocity_start_mps,
+        velocity_covariance=known.velocity_covariance,
+        resets=verdict.resets,
+        nis=verdict.nis,
+    )

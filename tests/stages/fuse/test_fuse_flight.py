@@ -1,0 +1,312 @@
+"""The fused pose over whole flights: what it knows, what it admits not to know, and what faults do to it."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from stages.fuse import EkfFuse, Fuse
+from stages.messages import PoseState, TrackingState
+from tests.stages.fuse.made_drone_flight import START_NS, Made, S, fix, ns, rms, rotation, track
+
+FULL, COASTING, LOST = PoseState.FULL, PoseState.COASTING, PoseState.LOST
+POSITION_ONLY, AMBIGUOUS = PoseState.POSITION_ONLY, PoseState.AMBIGUOUS
+
+
+def wrong(made, poses, deg=45.0):
+    """Poses given out with a rotation that is another branch's."""
+    return sum(angle > deg for angle in made.judge(poses).angle_deg)
+
+
+@pytest.mark.parametrize("stage_type", [Fuse, EkfFuse])
+def test_fixes_rotations_and_odometry_make_one_full_pose(stage_type):
+    made = Made(until_s=8, vehicle_mps=3.0, vehicle_dps=10.0)
+    seen = made.judge(made.run(stage_type()), after_s=4)
+    assert set(seen.states) == {FULL}
+    assert seen.rmse_m() < 0.12
+    assert rms(seen.angle_deg) < 0.6
+
+
+def test_poses_come_each_20_ms_on_the_grid_and_never_go_back():
+    made = Made(until_s=5, clock_hz=100)
+    stamps = [pose.stamp_ns for pose in made.run(Fuse())]
+    assert all(stamp % 20_000_000 == 0 for stamp in stamps)
+    assert {b - a for a, b in pairwise(stamps)} == {20_000_000}
+
+
+def test_two_runs_give_the_same_to_the_last_bit():
+    a, b = (Made(until_s=5).run(Fuse()) for _ in range(2))
+    for p, q in zip(a, b, strict=True):
+        assert p.state is q.state
+        assert np.array_equal(p.xyz_vehicle_m, q.xyz_vehicle_m) or p.xyz_vehicle_m is None
+        assert p.covariance is None or np.array_equal(p.covariance, q.covariance)
+
+
+def test_relative_pose_and_pose_in_the_start_frame_are_one():
+    made = Made(until_s=5, vehicle_mps=3.0, vehicle_dps=20.0)
+    poses = [pose for pose in made.run(Fuse()) if pose.state is FULL]
+    for pose in poses[::20]:
+        R, x = made.T_world_vehicle((pose.stamp_ns - START_NS) / S)
+        assert np.allclose(R @ pose.xyz_vehicle_m + x, pose.xyz_start_m, atol=0.03)
+        assert np.allclose(R @ pose.R_vehicle_drone, pose.R_start_drone, atol=1e-2)
+        assert pose.covariance is not None
+        assert np.allclose(pose.covariance, pose.start_covariance)
+
+
+def test_velocities_are_the_drones_over_ground_and_beside_the_vehicle():
+    made = Made(until_s=8, vehicle_mps=3.0)
+    poses = [pose for pose in made.run(Fuse()) if pose.stamp_ns > ns(4)]
+    over_ground = [np.linalg.norm(p.velocity_start_mps - made.velocity_mps((p.stamp_ns - START_NS) / S)) for p in poses]
+    beside = [
+        np.linalg.norm(p.velocity_vehicle_mps + np.array([3, 0, 0]) - made.velocity_mps((p.stamp_ns - START_NS) / S))
+        for p in poses
+    ]
+    assert rms(over_ground) < 0.3
+    assert rms(beside) < 0.35
+
+
+# where the rotation comes from
+
+
+def test_without_pictures_the_drones_motion_tells_its_heading():
+    made = Made(rotations=False)
+    poses = made.run(Fuse())
+    first = next(pose for pose in poses if pose.state is FULL)
+    assert 2.0 < (first.stamp_ns - START_NS) / S < 6.0
+    assert "motion" in first.reason
+    assert max(made.judge(poses).angle_deg) < 10
+
+
+def test_a_drone_that_hangs_still_tells_no_heading():
+    poses = Made(rotations=False, radius_m=0.0).run(Fuse())
+    assert {pose.state for pose in poses} == {LOST, POSITION_ONLY}
+    assert poses[-1].R_vehicle_drone is None
+    assert np.isinf(np.diag(poses[-1].covariance)[:3]).all()
+    assert "too little" in poses[-1].reason
+
+
+def test_an_unresolved_rotation_is_not_given_out():
+    poses = Made(until_s=6, radius_m=0.0, resolved_after_s=99).run(Fuse())
+    assert poses[-1].state is AMBIGUOUS
+    assert all(pose.R_vehicle_drone is None for pose in poses)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("quarter", [1, 2, 3])
+def test_streets_that_tell_another_quarter_than_the_drones_motion_are_not_believed(quarter, seed):
+    made = Made(until_s=9, quarters=((0.0, quarter),), seed=seed)
+    poses = made.run(Fuse())
+    assert wrong(made, poses) == 0
+    assert poses[-1].state is AMBIGUOUS
+
+
+@pytest.mark.parametrize("said", [True, False])
+def test_a_branch_that_changes_in_flight_ends_full(said):
+    made = Made(until_s=9, quarters=((5.0, 1),), switches=said)
+    poses = made.run(Fuse())
+    assert wrong(made, poses) == 0
+    assert poses[-1].state is AMBIGUOUS
+    assert poses[-1].resets > 0
+
+
+def test_what_the_streets_alone_told_is_doubted_when_they_are_not_resolved_any_more():
+    stage, R = Fuse(), np.eye(3)
+    told = [pose for i in range(20) for pose in stage.on_fix(fix(0.1 * i, [0, 0, 10]))]
+    told += [pose for i in range(10) for pose in stage.on_rotation(rotation(1.95 + 0.02 * i, R))]
+    assert told[-1].state is FULL
+    told += list(stage.on_rotation(rotation(2.2, R, resolved=False)))
+    assert told[-1].state is AMBIGUOUS
+
+
+def test_a_north_turned_during_a_silence_gives_no_wrong_pose():
+    made = Made(rotations=False, false_north=(6.0, 90.0), gaps_s={"odometry": (5.8, 7.0)})
+    assert wrong(made, made.run(Fuse())) == 0
+
+
+def test_a_north_turned_while_heard_is_taken_out():
+    made = Made(rotations=False, false_north=(8.0, 90.0))
+    poses = made.run(Fuse())
+    assert poses[-1].state is FULL
+    assert max(made.judge(poses).angle_deg) < 10
+
+
+# inputs that vanish
+
+
+def test_through_three_seconds_without_lidar_the_odometry_carries_the_pose():
+    made = Made(until_s=14, speed_mps=5.0, gaps_s={"fix": (9.0, 12.0)}, clock_hz=100)
+    poses = made.run(Fuse())
+    in_gap = [pose for pose in poses if ns(9.4) < pose.stamp_ns < ns(12.0)]
+    assert {pose.state for pose in in_gap} == {COASTING}
+    assert "has not seen it" in in_gap[0].reason
+    assert max(b.stamp_ns - a.stamp_ns for a, b in pairwise(poses)) == 20_000_000
+    seen = made.judge(in_gap)
+    assert max(seen.error_m) < 0.7
+    assert np.mean(seen.nees3) < 7.8
+    assert seen.sigma_m[-1] > 2 * seen.sigma_m[0]
+    assert poses[-1].state is FULL
+
+
+def test_it_is_lost_when_the_lidar_sees_nothing_for_long():
+    made = Made(until_s=16, gaps_s={"fix": (5.0, 99.0)})
+    poses = made.run(Fuse())
+    assert poses[-1].state is LOST
+    assert poses[-1].xyz_vehicle_m is None
+    assert "no LiDAR position" in poses[-1].reason
+    assert poses[-1].measured_ns < ns(5.1)
+
+
+def test_a_drone_that_was_lost_has_its_heading_when_it_is_found_again():
+    made = Made(until_s=20, rotations=False, gaps_s={"fix": (8.0, 18.0)})
+    poses = made.run(Fuse())
+    found = next(pose for pose in poses if pose.stamp_ns > ns(18) and pose.state is FULL)
+    assert (found.stamp_ns - ns(18)) / S < 0.5
+    assert found.resets == next(pose for pose in poses if pose.state is FULL).resets + 1
+    assert max(made.judge(poses).angle_deg) < 10
+
+
+def test_without_an_autopilot_rotations_and_the_drones_pictures_make_it_full():
+    made = Made(autopilot="none", pictures=True)
+    seen = made.judge(made.run(Fuse()), after_s=3)
+    assert set(seen.states) == {FULL}
+    assert rms(seen.angle_deg) < 1.0
+
+
+def test_directions_without_a_scale_sharpen_the_velocity_of_a_drone_without_autopilot():
+    """Rotations too, so that directions can be turned into the start frame; fixes each 0.1 s, rough."""
+    errors = []
+    for pictures in (False, True):
+        made = Made(autopilot="none", pictures=pictures, turn_dps=0.0, fix_sigma_m=0.15, seed=4)
+        poses = [pose for pose in made.run(Fuse()) if pose.stamp_ns > ns(4)]
+        errors.append(
+            rms([np.linalg.norm(p.velocity_start_mps - made.velocity_mps((p.stamp_ns - START_NS) / S)) for p in poses])
+        )
+    assert errors[1] < 0.9 * errors[0]
+
+
+def test_without_an_autopilot_or_pictures_the_position_is_followed():
+    made = Made(until_s=6, autopilot="none", rotations=False)
+    seen = made.judge(made.run(Fuse()), after_s=2)
+    assert set(seen.states) == {POSITION_ONLY}
+    assert seen.rmse_m() < 0.25
+
+
+@pytest.mark.parametrize("parked", [False, True])
+def test_without_word_of_the_vehicle_its_frame_is_the_start_frame(parked):
+    made = Made(until_s=8, vehicle=False)
+    poses = made.run(Fuse(parked=parked))
+    seen = made.judge(poses, after_s=4)
+    assert set(seen.states) == {FULL}
+    assert np.allclose(poses[-1].xyz_start_m, poses[-1].xyz_vehicle_m)
+    assert seen.rmse_m() < (0.12 if parked else 0.2)
+
+
+def test_a_vehicle_that_drives_and_does_not_say_so_makes_no_wrong_heading():
+    made = Made(vehicle=False, vehicle_mps=5.0, rotations=False)
+    poses = made.run(Fuse())
+    assert {pose.state for pose in poses} == {LOST, POSITION_ONLY}
+    assert made.judge(poses, after_s=3).rmse_m() < 0.3
+
+
+@pytest.mark.parametrize("port", ["fix", "rotation", "odometry", "motion"])
+def test_each_input_may_vanish_and_return(port):
+    made = Made(until_s=11, gaps_s={port: (4.0, 6.0)}, vehicle_mps=3.0, clock_hz=100)
+    poses = made.run(Fuse())
+    seen = made.judge(poses, after_s=2)
+    assert max(b.stamp_ns - a.stamp_ns for a, b in pairwise(poses)) == 20_000_000
+    assert max(seen.error_m) < 0.8
+    assert wrong(made, poses, deg=12) == 0
+    assert poses[-1].state is FULL
+
+
+@pytest.mark.parametrize("port", ["fix", "rotation", "odometry", "motion"])
+def test_each_input_may_come_300_ms_late(port):
+    made = Made(until_s=9, delays_s={port: 0.3}, vehicle_mps=3.0, clock_hz=100)
+    seen = made.judge(made.run(Fuse()), after_s=4)
+    assert set(seen.states) <= {FULL, COASTING}
+    assert seen.rmse_m() < 0.15
+    assert max(seen.angle_deg) < 2.0
+
+
+def test_a_fifth_of_false_fixes_and_rotations_does_little():
+    made = Made(until_s=9, outliers={"fix": 0.2, "rotation": 0.2})
+    seen = made.judge(made.run(Fuse()), after_s=4)
+    assert seen.rmse_m() < 0.15
+    assert max(seen.angle_deg) < 3.0
+
+
+# several drones
+
+
+def test_one_track_is_followed_the_lowest_and_another_one_when_it_is_lost():
+    stage, near = Fuse(), [5.0, 0, 10]
+    told = []
+    for i in range(20):
+        for number in (3, 2):
+            told += stage.on_track(track(0.1 * i, TrackingState.TRACKING, number))
+        for number, at in ((3, [-8.0, 0, 12]), (2, near)):
+            told += stage.on_fix(fix(0.1 * i + 0.01, at, track_id=number))
+    assert {pose.track_id for pose in told[5:]} == {2}
+    assert np.allclose(told[-1].xyz_vehicle_m, near, atol=0.1)
+    resets = told[-1].resets
+    told += stage.on_track(track(2.0, TrackingState.LOST, 2))
+    told += [pose for i in range(5) for pose in stage.on_fix(fix(2.05 + 0.1 * i, [-8.0, 0, 12], track_id=3))]
+    assert told[-1].track_id == 3
+    assert np.allclose(told[-1].xyz_vehicle_m, [-8.0, 0, 12], atol=0.1)
+    assert told[-1].resets == resets + 1
+
+
+def test_the_wanted_track_is_the_only_one_followed():
+    stage = Fuse(track_id=4)
+    assert list(stage.on_fix(fix(0.0, [1, 2, 10], track_id=1)))[-1].state is LOST
+    assert list(stage.on_fix(fix(0.1, [1, 2, 10], track_id=4)))[-1].state is POSITION_ONLY
+
+
+# what makes no sense
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "why"),
+    [
+        (fix(0.5, [math.nan, 0, 10]), "fix: not finite"),
+        (fix(0.5, [0, 0, 10], sigma=0.0), "fix: its covariance is not positive definite"),
+        (fix(0.5, [0, 0, 10], sigma=math.nan), "fix: not finite"),
+        (fix(3000.0, [0, 0, 10]), "fix: from the future"),
+        (fix(-30.0, [0, 0, 10]), "fix: older than the lag"),
+    ],
+)
+def test_a_message_without_sense_is_left_out_and_counted(spoilt, why):
+    stage = Fuse()
+    told = [pose for i in range(5) for pose in stage.on_fix(fix(0.1 * i, [0, 0, 10]))]
+    told += stage.on_fix(spoilt)
+    told += stage.on_fix(fix(0.6, [0, 0, 10]))
+    assert stage.refused == {why: 1}
+    assert told[-1].stamp_ns == ns(0.6)
+    assert np.allclose(told[-1].xyz_vehicle_m, [0, 0, 10], atol=1e-6)
+
+
+def test_a_rotation_that_is_not_finite_is_left_out():
+    stage = Fuse()
+    list(stage.on_fix(fix(0.0, [0, 0, 10])))
+    list(stage.on_rotation(rotation(0.1, np.full((3, 3), math.nan))))
+    assert stage.refused == {"rotation: not finite": 1}
+
+
+def test_a_position_only_covariance_is_in_the_frames_own_axes():
+    stage = Fuse()
+    long = fix(0.0, [0, 0, 10])
+    object.__setattr__(long, "covariance_m2", np.diag([0.04, 0.0004, 0.01]))
+    told = list(stage.on_fix(long))
+    assert told[-1].state is POSITION_ONLY
+    variances = np.diag(told[-1].covariance)[3:]
+    assert variances[0] > variances[2] > variances[1]
+
+
+def test_before_any_fix_the_drone_is_lost_and_the_reason_is_told():
+    told = Made(until_s=1, gaps_s={"fix": (0, 99)}).run(Fuse())
+    assert {pose.state for pose in told} == {LOST}
+    assert told[-1].reason == "no drone is tracked"
+    assert told[-1].measured_ns is None

@@ -1,0 +1,313 @@
+"""The parts of the fusion by hand: correlated errors, drift, steps, refusals, whose word on the heading counts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from stages.drone_trail import AutopilotTrail
+from stages.fuse.carried import Carrier
+from stages.fuse.correlated import MOST, Worth, inflation
+from stages.fuse.drift import Drift
+from stages.fuse.following import Following
+from stages.fuse.heading import Heading
+from stages.fuse.motion_yaw import Yaw
+from stages.fuse.north import DRIFT_RAD_PER_S, North, OwnYaw, heading_rad
+from stages.fuse.rejected import ENOUGH, Rejected
+from stages.fuse.rigid import carried_covariance, good_covariance
+from stages.fuse.settings import FuseErrors
+from stages.geometry import rotation_z
+from stages.messages import DroneAttitude, TrackingState
+from stages.rotation import exp_rotation, log_rotation
+from tests.stages.fuse.made_drone_flight import S, gauss_markov, track
+
+ERRORS = FuseErrors()
+QUARTER = math.pi / 2
+
+
+# errors that last
+
+
+def test_a_measurement_within_the_time_of_its_error_is_worth_little():
+    assert inflation(None, 1.0) == 1.0
+    assert inflation(0.1, 0.0) == 1.0
+    assert inflation(0.1, 1.0) == pytest.approx(20.0, rel=0.01)  # 2 tau / dt
+    assert inflation(10.0, 1.0) == pytest.approx(1.0, abs=1e-3)
+    assert inflation(0.0, 1.0) == MOST
+
+
+def test_the_mean_of_inflated_measurements_is_as_good_as_it_says():
+    """Of errors that last 1 s, met each 0.1 s for 20 s: the mean's variance is R factor / n."""
+    rng = np.random.default_rng(2)
+    means = [gauss_markov(rng, 1.0, 1.0, 0.1, 200, 1).mean() for _ in range(400)]
+    assert np.var(means) == pytest.approx(inflation(0.1, 1.0) / 200, rel=0.2)
+
+
+def test_each_measurement_is_counted_from_the_one_before():
+    worth = Worth(1.0)
+    assert worth.factor(0) == 1.0
+    assert worth.factor(S // 10) == pytest.approx(20.0, rel=0.01)
+    assert worth.factor(20 * S) == pytest.approx(1.0)
+    assert worth.factor(20 * S - S // 10) == pytest.approx(20.0, rel=0.01)  # a late one
+
+
+# drift
+
+
+def drifting(odometry, velocity, until=60, moved=0.2, seed=0):
+    """Fixes each 0.1 s of a drone that goes `moved` a step by its odometry, and `velocity` m/s in truth besides."""
+    rng = np.random.default_rng([seed, 3])
+    drift = Drift(ERRORS, odometry)
+    way = np.array([moved, 0.0, 0.0])
+    for i in range(until):
+        z = i * way + 0.1 * i * np.asarray(velocity) + rng.normal(0, 0.05, 3)
+        if i == 0:
+            drift.start(0, z, 0.05**2 * np.eye(3), None)
+        drift.see(i * S // 10, z, 0.05**2 * np.eye(3), way if odometry else None, 0.0)
+    return drift
+
+
+def test_what_odometry_leaves_over_is_found():
+    drift = drifting(True, [0.1, -0.15, 0.0])
+    assert np.allclose(drift.velocity_mps, [0.1, -0.15, 0.0], atol=0.06)
+    assert math.sqrt(drift.velocity_covariance[0, 0]) < 0.06
+
+
+def test_without_odometry_it_is_the_whole_velocity():
+    drift = drifting(False, [0.0, 1.5, 0.0])
+    sigma = np.sqrt(np.diag(drift.velocity_covariance))
+    assert (np.abs(drift.velocity_mps - [2.0, 1.5, 0.0]) < 3 * sigma).all()
+    x, P = drift.ahead(6 * S)
+    assert np.allclose(x, [12.0, 9.0, 0.0], atol=0.3)
+    assert P[0, 0] > 0
+
+
+def test_a_gap_costs_by_its_square_and_cube():
+    drift = drifting(True, [0, 0, 0])
+    V = [drift.gathered(t)[0, 0] for t in (0.0, 1.0, 2.0)]
+    P_b = drift.velocity_covariance[0, 0]
+    assert V[0] == 0
+    assert V[1] == pytest.approx(P_b + drift.q / 3)
+    assert V[2] == pytest.approx(4 * P_b + 8 * drift.q / 3)
+
+
+def test_a_fix_that_is_older_than_the_newest_is_left_to_others():
+    drift = drifting(True, [0, 0, 0])
+    x = drift.xyz_start_m.copy()
+    drift.see(S, np.array([99.0, 0, 0]), np.eye(3), np.zeros(3), 0.0)
+    assert np.array_equal(drift.xyz_start_m, x)
+
+
+def test_a_direction_of_flight_turns_the_velocity_and_leaves_its_length_alone():
+    drift = drifting(False, [0.0, 0.0, 0.0], until=5)
+    before = drift.velocity_mps.copy()
+    along = rotation_z(0.3) @ before / np.linalg.norm(before)
+    drift.look_along(along, 0.02)
+    off = math.acos(drift.velocity_mps @ along / np.linalg.norm(drift.velocity_mps))
+    assert off < 0.1
+    assert drift.velocity_mps @ along == pytest.approx(before @ along, rel=0.1)
+
+
+def test_another_start_frame_takes_position_and_velocity_along():
+    drift = drifting(False, [0, 0, 0])
+    x, v = drift.xyz_start_m.copy(), drift.velocity_mps.copy()
+    drift.turn(rotation_z(1.0), np.array([1.0, 2.0, 3.0]))
+    assert np.allclose(drift.xyz_start_m, rotation_z(1.0) @ x + [1, 2, 3])
+    assert np.allclose(drift.velocity_mps, rotation_z(1.0) @ v)
+
+
+# steps
+
+
+def test_a_covariance_carried_along_is_that_of_drawn_poses():
+    rng = np.random.default_rng(5)
+    P, Q = np.diag([0.02, 0.01, 0.03, 0.1, 0.2, 0.05]) ** 2, np.diag([0.01] * 3 + [0.05] * 3) ** 2
+    R_step, t_step = exp_rotation(np.array([0.1, -0.4, 0.8])), np.array([2.0, -1.0, 0.5])
+    off = []
+    for _ in range(4000):
+        a, b = rng.multivariate_normal(np.zeros(6), P), rng.multivariate_normal(np.zeros(6), Q)
+        R = exp_rotation(a[:3]) @ R_step
+        x = a[3:] + exp_rotation(a[:3]) @ t_step
+        off.append(np.concatenate([log_rotation(R_step.T @ R @ exp_rotation(b[:3])), R_step.T @ (x - t_step) + b[3:]]))
+    assert np.allclose(np.cov(np.array(off).T), carried_covariance(P, R_step, t_step, Q), atol=2e-3)
+
+
+def told(until_s=2.0, v=(1.0, 0.5, 0.0), rate=0.4, silent_after=math.inf):
+    carrier = Carrier(ERRORS)
+    for t in np.arange(0, until_s, 0.05):
+        if t < silent_after:
+            ns, R = round(t * S), rotation_z(0.3 + rate * t)
+            carrier.autopilot.add_attitude(ns, R, np.array([0, 0, rate]))
+            carrier.autopilot.add_position(ns, t * np.asarray(v) + [5.0, 6.0, 7.0], np.asarray(v))
+    return carrier
+
+
+def test_a_step_is_the_way_told_and_the_drift_in_the_drones_axes():
+    carrier, left, free = told(), Drift(ERRORS, True), Drift(ERRORS, False)
+    left.start(0, np.zeros(3), np.eye(3), None)
+    R_start_own = rotation_z(-1.1)
+    R0 = R_start_own @ rotation_z(0.3 + 0.4 * 0.5)
+    step = carrier.step(S // 2, 3 * S // 2, R0, left, free, True, S // 2)
+    assert step.by_odometry
+    assert step.turn_told
+    assert np.allclose(step.R, rotation_z(0.4), atol=1e-6)
+    assert np.allclose(R0 @ step.t_m, R_start_own @ [1.0, 0.5, 0.0], atol=1e-6)
+    assert good_covariance(step.covariance)
+    back = carrier.step(3 * S // 2, S // 2, R0 @ step.R, left, free, True, S // 2)
+    assert np.allclose(step.R @ back.R, np.eye(3), atol=1e-9)
+    assert np.allclose(step.t_m + step.R @ back.t_m, 0, atol=1e-9)
+
+
+def test_without_a_frame_that_stands_still_the_way_over_ground_is_not_used():
+    left, free = Drift(ERRORS, True), Drift(ERRORS, False)
+    left.start(0, np.zeros(3), np.eye(3), None)
+    free.start(0, np.zeros(3), np.eye(3), np.array([0.0, 0.0, 2.0]))
+    step = told().step(S // 2, S, np.eye(3), left, free, False, S // 2)
+    assert not step.by_odometry
+    assert np.allclose(step.t_m, [0, 0, 1.0])
+    assert step.covariance[2, 2] > math.radians(9) ** 2
+
+
+def test_beyond_its_newest_word_an_odometry_is_believed_less_and_less():
+    left, free = Drift(ERRORS, True), Drift(ERRORS, False)
+    left.start(0, np.zeros(3), np.eye(3), None)
+    free.start(0, np.zeros(3), np.eye(3), None)
+    carrier = told(silent_after=1.0)
+    spread = [
+        np.trace(carrier.step(9 * S // 10, round(t * S), np.eye(3), left, free, True, S).covariance)
+        for t in (1.0, 1.2, 1.4, 1.8)
+    ]
+    assert spread[0] < spread[1] < spread[2] < spread[3]
+    assert not carrier.step(9 * S // 10, 2 * S, np.eye(3), left, free, True, S).turn_told
+
+
+# refusals
+
+
+def refuse(offs, sigma=0.1):
+    refused = Rejected()
+    return [refused.add(i * S // 10, np.asarray(off, dtype=float), sigma**2 * np.eye(3)) for i, off in enumerate(offs)]
+
+
+def test_refusals_that_agree_are_believed_in_the_end():
+    assert refuse([[5.0, 1.0, 0.0]] * ENOUGH) == [False] * (ENOUGH - 1) + [True]
+    assert refuse([[0.2 * i, 1.0, 0.0] for i in range(ENOUGH)])[-1]  # on a line
+
+
+def test_refusals_that_scatter_are_not():
+    rng = np.random.default_rng(0)
+    assert not any(refuse(rng.normal(0, 3.0, (40, 3))))
+
+
+def test_one_that_is_accepted_begins_the_count_anew():
+    refused = Rejected()
+    for i in range(ENOUGH - 1):
+        refused.add(i * S // 10, np.ones(3), np.eye(3))
+    refused.clear()
+    assert not refused.add(S, np.ones(3), np.eye(3))
+
+
+# whose word on the heading
+
+
+def by_motion(at_s, yaw, sigma_deg=2.0):
+    return Yaw(round(at_s * S), yaw, math.radians(sigma_deg))
+
+
+def test_two_that_contradict_are_not_believed_until_they_agree():
+    heading = Heading()
+    assert heading.hear_streets(S, 0, 0.3, 0.01)
+    heading.hear_motion(by_motion(1.2, 0.3 + QUARTER))
+    assert "90 deg apart" in heading.contradiction
+    assert not heading.hear_streets(2 * S, 0, 0.3, 0.01)
+    heading.hear_motion(by_motion(2.5, 0.32))
+    assert heading.hear_streets(3 * S, 0, 0.3, 0.01)
+    assert heading.contradiction == ""
+
+
+def test_a_contradiction_outlives_the_motions_silence_but_not_the_streets():
+    heading = Heading()
+    heading.hear_motion(by_motion(1.0, 0.3 + QUARTER))
+    assert not heading.hear_streets(S, 0, 0.3, 0.01)
+    for t in range(2, 60):
+        heading.pass_time(t * S)
+        assert not heading.hear_streets(t * S, 0, 0.3, 0.01)
+    heading.pass_time(80 * S)
+    assert heading.contradiction
+    heading.pass_time(95 * S)
+    assert heading.contradiction == ""
+
+
+def test_small_differences_are_no_contradiction():
+    heading = Heading()
+    heading.hear_motion(by_motion(1.0, 0.3 + math.radians(8)))
+    assert heading.hear_streets(S, 0, 0.3, 0.01)
+
+
+def test_another_branch_is_believed_after_two_seconds_or_with_a_witness():
+    heading = Heading()
+    assert heading.hear_streets(S, 0, 0.3, 0.01)
+    assert not heading.hear_streets(2 * S, 1, 0.3 + QUARTER, 0.01)
+    assert not heading.hear_streets(3 * S, 1, 0.3 + QUARTER, 0.01)
+    assert heading.hear_streets(4 * S, 1, 0.3 + QUARTER, 0.01)
+    heading.hear_motion(by_motion(4.5, 0.3))
+    assert heading.contradiction
+    witnessed = Heading()
+    witnessed.hear_streets(S, 0, 0.3, 0.01)
+    witnessed.hear_motion(by_motion(3.5, 0.3 + QUARTER))  # the streets spoke long before
+    assert witnessed.hear_streets(4 * S, 1, 0.3 + QUARTER, 0.01)
+
+
+def test_a_remembered_yaw_is_worth_less_with_time():
+    own = OwnYaw(0, 1.0, math.radians(1) ** 2)
+    assert own.sigma_at(0) == pytest.approx(math.radians(1))
+    assert own.sigma_at(60 * S) > 60 * DRIFT_RAD_PER_S
+
+
+def attitude(t_s, yaw=0.0):
+    return DroneAttitude(
+        stamp_ns=round(t_s * S), R_local_drone=rotation_z(yaw), angular_velocity_drone_radps=np.zeros(3)
+    )
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "turned_rad", "sigma_rad"),
+    [(0.1, 0.0, 0.01), (2.0, 0.0, 0.02), (2.0, 0.3, 0.3), (2.0, QUARTER, None), (4.0, 0.0, None)],
+)
+def test_a_silence_of_the_autopilots_costs_and_a_long_one_costs_all(silent_s, turned_rad, sigma_rad):
+    north, trail = North(ERRORS, 0.14), AutopilotTrail()
+    for t in (0.0, 0.02, 0.04):
+        north.hear(trail, attitude(t))
+    north.yaw = OwnYaw(0, 0.5, 0.01**2)
+    north.hear(trail, attitude(0.04 + silent_s, turned_rad))
+    if sigma_rad is None:
+        assert north.yaw is None
+    else:
+        assert north.yaw.sigma_at(0) == pytest.approx(sigma_rad, rel=0.05)
+
+
+@pytest.mark.parametrize("yaw", [-3.0, 0.0, 2.5])
+def test_the_heading_of_a_nearly_level_rotation(yaw):
+    tilted = rotation_z(yaw) @ exp_rotation(np.array([0.02, -0.03, 0.0]))
+    assert math.remainder(heading_rad(tilted) - yaw, 2 * math.pi) == pytest.approx(0, abs=0.002)
+
+
+# which drone
+
+
+def test_without_track_states_the_first_drone_is_kept_until_it_is_silent():
+    following = Following(None)
+    assert following.takes(5, 0)
+    assert not following.takes(2, S)
+    assert following.takes(5, S)
+    assert following.takes(2, 4 * S)
+
+
+def test_a_candidate_is_no_track():
+    following = Following(None)
+    following.hear(track(0.0, TrackingState.CANDIDATE, 1))
+    following.hear(track(0.0, TrackingState.TRACKING, 2))
+    assert following.takes(2, 0)
+    assert following.number == 2

@@ -52,7 +52,6 @@ class Evidence(BaseModel):
     beside: float = -3.0  # each look with something in a sector
     alone: float = 0.3  # each look with nothing, up to most_alone
     most_alone: float = 2.0
-    most_alone_told: float = 3.5  # where the drone tells how it flies: then what hangs, or flies, must do as it does
     most_few: float = 6.0  # looks with a single return: a wire gives little else
     most_many: float = 2.0  # and those with more
     near_big: float = 8.0  # a wall, crown or trunk this close, and it has not moved away
@@ -123,8 +122,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     odds = e.clutter
     if free_space:
         free = int((c.free >= 1).sum())
-        most_alone = e.most_alone if c.heard is None else e.most_alone_told
-        odds += e.free_sector * free + max(e.beside * c.beside, -12.0) + min(e.alone * c.alone, most_alone)
+        odds += e.free_sector * free + max(e.beside * c.beside, -12.0) + min(e.alone * c.alone, e.most_alone)
         said.append(f"{free} of {SECTORS} sectors around it free")
         if c.beside > 0.5:
             said.append("something beside it")

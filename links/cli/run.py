@@ -22,6 +22,7 @@ from links.repeat import repeat_into
 from links.results import FIX_FILE, SUMMARY_FILE, stamp_s
 from links.run_folder import Asked, Finished, replay_into
 from links.warm_up import warm_up
+from links.zenoh import host_graph
 
 TABLE_ROWS = 12
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -51,6 +52,12 @@ def run(
             "--warm-up/--no-warm-up", help="Live: try the graph on a recording first, so that all is compiled."
         ),
     ] = True,
+    hosts: Annotated[
+        Path | None, typer.Option("--hosts", metavar="FILE", help="Live on several hosts: links/zenoh/README.md.")
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option("--host", metavar="NAME", help="Which of FILE's hosts this one is.")
+    ] = None,
     view: View = False,
 ) -> None:
     """Run what CONFIG says: live, or the recording it names.
@@ -61,13 +68,18 @@ def run(
     Example: grd run configs/quickstart.yaml --set track.radius_m=0.8
     """
     recording = recording_named(config, overlay or (), sets or ())
+    if (hosts is None) is not (host is None):
+        raise LinkError("--hosts FILE and --host NAME go together: the file says who runs what, the name who this is")
     if recording is not None:
-        if for_s is not None:
-            raise LinkError(f"--for is of live runs, and {config} replays {recording.name}: leave it out")
+        if for_s is not None or hosts is not None:
+            option = "--for" if for_s is not None else "--hosts"
+            raise LinkError(f"{option} is of live runs, and {config} replays {recording.name}: leave it out")
         _run(recording, config, out_dir, overlay or [], sets or [], view)
         return
     asked = Asked(config, tuple(overlay or ()), tuple(sets or ()))
     graph, folder = live_graph(asked), _new_folder(out_dir, f"live-{config.stem}")
+    if hosts is not None and host is not None:
+        graph = host_graph(graph, hosts, host, to_run=True)
     with progress_bar("warm up") as step:
         rough = warm_up(graph, step) if warm else None
     if rough:

@@ -10,6 +10,7 @@ from pathlib import Path
 from flow.graph import Graph, NodeSpec
 from flow.hosts import Hop, Hosts, part_of
 from flow.hosts_file import load_hosts
+from flow.link import LinkError
 from links.zenoh.receiver import Receiver, receiver_class
 from links.zenoh.sender import Sender, sender_class
 from links.zenoh.session import Session, session_of
@@ -33,6 +34,16 @@ class ZenohEnds:
         return NodeSpec(name, "links", "links.zenoh.Sender", sender_class(hops), config)
 
 
-def host_graph(graph: Graph, hosts_file: Path, host: str) -> Graph:
-    """The graph that `host` runs. ConfigError with all that is wrong in the hosts file."""
-    return part_of(load_hosts(hosts_file, graph), host, ZenohEnds())
+def host_graph(graph: Graph, hosts_file: Path, host: str, *, to_run: bool = False) -> Graph:
+    """The graph that `host` runs. ConfigError with all that is wrong in the hosts file.
+
+    `to_run`: its own key and the certificates must be there, too, else LinkError.
+    """
+    hosts = load_hosts(hosts_file, graph)
+    part = part_of(hosts, host, ZenohEnds())
+    if to_run:
+        own = hosts.hosts[host]
+        missing = [str(path) for path in (own.certificate, own.key, own.authority) if not path.is_file()]
+        if missing:
+            raise LinkError(f"{hosts_file}: host '{host}' needs {', '.join(missing)}: see links/zenoh/README.md")
+    return part

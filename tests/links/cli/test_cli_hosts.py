@@ -41,8 +41,8 @@ def test_check_tells_what_each_host_runs_and_sends(hosts):
     lines = done.output.splitlines()
     assert lines[1].startswith("vehicle, the hub: runs ")
     assert lines[2:4] == [
-        "  to base: track.drone_fix (drop_oldest 1024)",
-        "  to base: detect.detections (drop_oldest 1024)",
+        "  to base: track.drone_fix (drop_oldest 512)",
+        "  to base: detect.detections (drop_oldest 512)",
     ]
     assert lines[4] == "base: runs viewer"
 
@@ -66,3 +66,19 @@ def test_graph_draws_a_box_for_each_host_or_the_part_of_one(hosts):
 def test_graph_says_which_option_is_missing(hosts):
     assert grd("graph", PAPER, "--host", "base").exit_code == 2
     assert grd("graph", PAPER, "--hosts", hosts, "--format", "svg").exit_code == 2
+
+
+def test_run_says_which_option_is_missing_and_that_a_replay_has_one_host(hosts):
+    for options in (["--hosts", hosts], ["--host", "base"]):
+        done = grd("run", PAPER, *options)
+        assert done.exit_code == 2
+        assert "--hosts FILE and --host NAME go together" in done.output
+    done = grd("run", PAPER.with_name("quickstart.yaml"), "--hosts", hosts, "--host", "base")
+    assert done.exit_code == 2
+    assert "--hosts is of live runs" in done.output
+
+
+def test_run_refuses_a_host_whose_certificates_are_not_there(hosts, tmp_path):
+    done = grd("run", PAPER, "--hosts", hosts, "--host", "base", "--no-warm-up", "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "c.pem" in done.output

@@ -90,6 +90,8 @@ class Results(Tap):
     _transitions: list[Transition] = PrivateAttr(default_factory=list)
     _state: dict[int, str] = PrivateAttr(default_factory=dict)  # of each track
     _pose_state: PoseState | None = PrivateAttr(default=None)
+    _pose_states: Counter[str] = PrivateAttr(default_factory=Counter)
+    _resets: int = PrivateAttr(default=0)
     _branch: tuple[str, int] | None = PrivateAttr(default=None)  # state and switches of the newest rotation
 
     @property
@@ -111,6 +113,16 @@ class Results(Tap):
     def verdicts(self) -> list[tuple[str, int]]:
         """What the detector said and how often, most frequent first; verdicts that differ in numbers only are one."""
         return [(self._examples[kind], count) for kind, count in self._sweeps.most_common()]
+
+    @property
+    def pose_states(self) -> dict[str, int]:
+        """How many poses were told in each state, most frequent first; empty when nobody fuses."""
+        return dict(self._pose_states.most_common())
+
+    @property
+    def resets(self) -> int:
+        """How often the fused pose jumped."""
+        return self._resets
 
     @property
     def transitions(self) -> list[Transition]:
@@ -203,6 +215,8 @@ class Results(Tap):
         `rotation`: whether it is known; `good` says the same. Where it is not known the covariance's position is in the
         vehicle's axes.
         """
+        self._pose_states[message.state.name] += 1
+        self._resets = message.resets
         if message.state is not self._pose_state:
             self._pose_state = message.state
             self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")

@@ -199,6 +199,7 @@ def _summary(run: Finished, asked: Asked) -> dict[str, Any]:
         "sweeps_with_drone": results.sweeps_with_drone,
         "verdicts": [{"sweeps": count, "example": verdict} for verdict, count in results.verdicts],
         "fixes": len(results.fixes),
+        "poses": {"states": results.pose_states, "resets": results.resets},
         "states": [
             {"stamp_s": stamp_s(t.stamp_ns), "track_id": t.track_id, "state": t.state, "reason": t.reason}
             for t in results.transitions

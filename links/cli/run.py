@@ -19,7 +19,7 @@ from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
 from links.cli.live_view import LiveView
 from links.live_run import live_graph, run_live
 from links.repeat import repeat_into
-from links.results import FIX_FILE, SUMMARY_FILE, stamp_s
+from links.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
 from links.run_folder import Asked, Finished, replay_into
 from links.warm_up import warm_up
 from links.zenoh import host_graph
@@ -196,8 +196,13 @@ def _tell(run: Finished) -> None:
             f"against the simulation's truth: RMSE x/y/z {x:.3f} {y:.3f} {z:.3f} m, 3D {run.errors.rmse_m:.3f} m; "
             f"truth inside the 95 % ellipsoid in {100 * run.errors.inside_95:.0f} % of fixes"
         )
+    if results.pose_states:
+        states = ", ".join(f"{count} {state}" for state, count in results.pose_states.items())
+        out.print(f"fused poses: {states}; {results.resets} jumps")
     out.print(f"output hash {run.digest}")
     out.print(f"positions   {run.out_dir / FIX_FILE}")
+    if results.pose_states:
+        out.print(f"poses       {run.out_dir / POSE_FILE}")
     out.print(f"summary     {run.out_dir / SUMMARY_FILE}")
     if live and run.recording.is_file():
         out.print(f"flight      {run.recording}   (the same again: grd replay {run.recording} --as-live)")

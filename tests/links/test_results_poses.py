@@ -89,3 +89,18 @@ def test_a_number_that_is_not_known_is_empty(run):
     folder = run([message])
     row = next(csv.DictReader((folder / POSE_COVARIANCE_FILE).open()))
     assert (row["nis"], row["measured_s"]) == ("", "")
+
+
+def test_poses_are_counted_by_state_and_their_jumps_told(tmp_path):
+    results = Results()
+    results.open(Run(tmp_path, "made", "", ""))
+    assert results.pose_states == {}
+    unknown = pose(
+        Known(S, None, np.ones(3), np.eye(6), np.zeros(3), np.eye(3)), verdict(POSITION_ONLY), VehicleTrail()
+    )
+    turned = Known(2 * S, rotation_z(0.5), np.ones(3), np.eye(6), np.zeros(3), np.eye(3))
+    for message in (unknown, *[pose(turned, verdict(FULL, resets=1), VehicleTrail())] * 2):
+        results.see("fuse.relative_pose", message, message.stamp_ns)
+    results.close()
+    assert results.pose_states == {"FULL": 2, "POSITION_ONLY": 1}
+    assert results.resets == 1

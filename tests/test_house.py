@@ -28,7 +28,7 @@ OUTSIDE = {
     "random",
     "logging",
 }
-TOP_LEVEL = {"flow", "stages", "links", "configs", "recordings", "tests"}
+TOP_LEVEL = {"flow", "stages", "links", "configs", "deploy", "recordings", "tests"}
 
 
 def imports_of(file: Path) -> set[str]:

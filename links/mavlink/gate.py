@@ -107,4 +107,6 @@ def velocity_to_send(pose: RelativePose, limits: Limits) -> NDArray[np.float64] 
 
 
 def _is_rotation(R: NDArray[np.float64]) -> bool:
+    if np.abs(R).max() > 1.0 + ROTATION_ERROR:
+        return False
     return bool(np.abs(R.T @ R - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(R) > 0)

@@ -8,7 +8,6 @@ Source: ours.
 
 from __future__ import annotations
 
-import datetime
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -32,6 +31,7 @@ from links.simulated.scenario import Scenario
 from links.truth import TruthLog
 
 VIEWER = "links.viewer.Viewer"
+PLAIN = Cell("open_lot", 20, "hover", "parked")  # the rig is the same in all cells with a drone
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,9 @@ def make_matrix(
     `progress` is told simulated seconds done and in all. Raises ConfigError, or LinkError, for a configuration that
     closes no loop; what goes wrong with one recording is in the report, and the others are made.
     """
-    asked = None if closed_loop is None else _asked(closed_loop, results is not None)
-    making = Making(folder, asked, results, conditions or Conditions())
+    conditions = conditions or Conditions()
+    asked = None if closed_loop is None else _asked(closed_loop, conditions, results is not None)
+    making = Making(folder, asked, results, conditions)
     tasks = [Task(making, cell, seed) for seed, cell in product(seeds, wanted)]
     whole_s = sum(task.cell.duration_s for task in tasks)
 
@@ -114,11 +115,10 @@ def make_matrix(
     )
 
 
-def _asked(closed_loop: Path, for_results: bool) -> Asked:
-    """The configuration of all closed loops, tried on the standard rig; runs that are kept have no viewer file."""
-    start = datetime.datetime(2025, 1, 1, tzinfo=datetime.UTC)
-    rig_yaml = Scenario(name="standard", start_utc=start, duration_s=1.0).rig_yaml()
-    graph = Asked(closed_loop).graph(rig_yaml, "standard rig")
+def _asked(closed_loop: Path, conditions: Conditions, for_results: bool) -> Asked:
+    """The configuration of all closed loops, tried on a plain cell's rig; runs that are kept have no viewer file."""
+    rig_yaml = scenario_of(PLAIN, 1, conditions).rig_yaml()
+    graph = Asked(closed_loop).graph(rig_yaml, "the matrix's rig")
     servo_edge(graph)
     viewers = [spec.name for spec in graph.nodes.values() if spec.use == VIEWER]
     return Asked(closed_loop, sets=tuple(f"{name}.file=null" for name in viewers) if for_results else ())

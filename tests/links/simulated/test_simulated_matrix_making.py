@@ -153,6 +153,19 @@ def test_a_flight_that_cannot_be_made_leaves_no_folder_that_looks_like_a_run(
     assert list((tmp_path / "runs").iterdir()) == []
 
 
+def test_a_configuration_with_cameras_is_taken_where_the_rig_has_them(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(matrix_flights, "USUAL_DURATION_S", 0.2)
+    vision = Path(__file__).resolve().parents[3] / "configs" / "vision.yaml"
+    with pytest.raises(ConfigError, match="rig has no 'cameras'"):
+        make_matrix(tmp_path, [HOVER], range(1, 2), vision, silent, results=tmp_path / "runs")
+    seen = Conditions(cameras_hz=1.0)
+    report = make_matrix(tmp_path, [HOVER], range(1, 2), vision, silent, seen, results=tmp_path / "runs")
+    assert (report.made, report.failed) == (1, ())
+    with RecordingReader(tmp_path / "open_lot-10m-hover-parked-s1.mcap") as reader:
+        assert reader.rig_yaml is not None
+        assert "masked_px" in reader.rig_yaml
+
+
 def test_a_run_of_an_older_recording_is_not_kept(tmp_path, short, config: Path) -> None:
     """The recordings were made anew without runs, with rain; the run beside them is of the dry ones."""
     runs, recordings, wet = tmp_path / "runs", tmp_path / "m", Conditions(rain=True)

@@ -16,6 +16,7 @@ from stages.geometry import Array64
 KEPT_NS = 20_000_000_000
 AHEAD_NS = 500_000_000  # beyond the newest word it is not known any more
 JUMP_M = 1.0  # a step that its velocity does not explain: the autopilot's estimate was reset
+JUMP_MPS, JUMP_MPS2 = 1.5, 30.0  # nor does a drone change its velocity so: its frame was turned
 
 
 class DroneTelemetry:
@@ -25,20 +26,26 @@ class DroneTelemetry:
         self._ns: deque[int] = deque()
         self._xyz_m: deque[Array64] = deque()
         self._v_mps: deque[Array64] = deque()
+        self._counted: int | None = None
         self.resets = 0
         """How often its estimate jumped: places before and after have nothing to do with each other."""
 
-    def add(self, stamp_ns: int, xyz_m: Array64, v_mps: Array64) -> None:
-        """One word of it, in the autopilot's level frame; older than the newest is left out."""
+    def add(self, stamp_ns: int, xyz_m: Array64, v_mps: Array64, counted: int | None = None) -> None:
+        """One word of it, in the autopilot's level frame; older than the newest is left out.
+
+        `counted`: the autopilot's own count of its jumps, where it tells; each change is one.
+        """
         if self._ns:
             dt = (stamp_ns - self._ns[-1]) * 1e-9
             if dt <= 0:
                 return
             left = xyz_m - self._xyz_m[-1] - 0.5 * dt * (v_mps + self._v_mps[-1])
-            if float(np.linalg.norm(left)) > JUMP_M + dt:
+            turned = float(np.linalg.norm(v_mps - self._v_mps[-1])) > JUMP_MPS + JUMP_MPS2 * dt
+            if turned or counted != self._counted or float(np.linalg.norm(left)) > JUMP_M + dt:
                 self.resets += 1
                 for kept in (self._ns, self._xyz_m, self._v_mps):
                     kept.clear()
+        self._counted = counted
         self._ns.append(stamp_ns)
         self._xyz_m.append(xyz_m)
         self._v_mps.append(v_mps)

@@ -121,7 +121,7 @@ class EvidenceDetect(Stage):
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
         """The same from an autopilot that sends this."""
         velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
-        self._now.told[1].add(odometry.stamp_ns, odometry.xyz_local_m, velocity)
+        self._now.told[1].add(odometry.stamp_ns, odometry.xyz_local_m, velocity, odometry.reset_counter)
 
     def on_pulses(self, pulses: SweptPulses) -> Iterator[Candidates | Detections]:
         """One slice: judge the sightings that are complete with it, tell what changed."""

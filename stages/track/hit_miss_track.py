@@ -104,7 +104,7 @@ class HitMissTrack(Stage):
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
         """The same from an autopilot that sends this; taken where it sends both."""
         velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
-        self._told[1].told.add(odometry.stamp_ns, odometry.xyz_local_m, velocity)
+        self._told[1].told.add(odometry.stamp_ns, odometry.xyz_local_m, velocity, odometry.reset_counter)
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Follow the promising ones; drop what is no longer taken for a drone."""

@@ -60,11 +60,21 @@ class ToldMotion:
         """`source`: the number of the messages it comes from, should there be several."""
         self._source = source
         self.told = DroneTelemetry()
+        self._resets = 0  # of the frame whose yaw is learnt
         self._number = 0  # of the track learnt from
         self._places: deque[tuple[int, Array64, float]] = deque()
         self._prior = np.full(YAWS, 1.0 / YAWS)
         self._p = (1.0 - NONE) * self._prior
         self._moments = 0j, 0j
+
+    def _of_this_frame(self) -> None:
+        """What was learnt of psi is of no use once the autopilot's estimate jumped: it may have turned."""
+        if self._resets != self.told.resets:
+            self._resets = self.told.resets
+            self._places.clear()
+            self._prior = np.full(YAWS, 1.0 / YAWS)
+            self._p = (1.0 - NONE) * self._prior
+            self._moments = 0j, 0j
 
     @property
     def sure(self) -> float:
@@ -73,6 +83,7 @@ class ToldMotion:
 
     def learn(self, number: int, stamp_ns: int, xyz_local_m: Array64, sigma_m: float) -> None:
         """Where confirmed track `number` was, and how well that is known, one sigma an axis."""
+        self._of_this_frame()
         if number != self._number:
             sure = self.sure
             known = self._p / sure if sure > 0.9 else np.full(YAWS, 1.0 / YAWS)
@@ -125,6 +136,7 @@ class ToldMotion:
         """
         if before is None or after is None or before[:2] != after[:2] or dt_s <= 0:
             return predicted(x, P, dt_s, q_free)
+        self._of_this_frame()
         sure = self.sure
         x, covariance = predicted(x, P, dt_s, sure * q_told + (1.0 - sure) * q_free)
         step = after.xyz_m - before.xyz_m - dt_s * before.velocity_mps

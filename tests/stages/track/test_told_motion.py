@@ -155,6 +155,27 @@ def test_without_two_words_of_one_frame_the_track_flies_on(after):
     np.testing.assert_array_equal(covariance, expected)
 
 
+@pytest.mark.parametrize("counts", [False, True], ids=["by its velocity", "by the autopilot's counter"])
+def test_a_frame_that_was_turned_is_noticed_and_its_yaw_learnt_anew(counts):
+    motion, (x, P) = taught(), state(4.02)
+    before = motion.word(at_ns(4.0))
+    for k in range(1, 6):
+        t_s, yaw_rad = 4.0 + 0.02 * k, YAW_RAD + math.pi / 2
+        place = told(4.0)[0]  # no step that its place would show
+        velocity = told(4.0)[1] if counts else told(t_s, yaw_rad=yaw_rad)[1]
+        motion.told.add(at_ns(t_s), place, velocity, 1 if counts else None)
+    after = motion.word(at_ns(4.06))
+    assert before is not None
+    assert after is not None
+    assert before[:2] != after[:2]
+    plain, expected = predicted(x, P, 0.06, 1.0)
+    ahead, covariance = motion.predicted(x, P, 0.06, before, after, 1.0, 0.02)
+    np.testing.assert_array_equal(ahead, plain)
+    np.testing.assert_array_equal(covariance, expected)
+    motion.predicted(x, P, 0.04, after, motion.word(at_ns(4.1)), 1.0, 0.02)
+    assert abs(motion._moments[0]) == 0.0
+
+
 def test_the_next_track_begins_with_the_yaw_of_the_last():
     motion = taught()
     first = motion._moments[0]

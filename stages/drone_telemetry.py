@@ -53,6 +53,11 @@ class DroneTelemetry:
             for kept in (self._ns, self._xyz_m, self._v_mps):
                 kept.popleft()
 
+    @property
+    def heard_ns(self) -> tuple[int, int] | None:
+        """Times of the oldest word that is kept and of the newest; None before the first."""
+        return (self._ns[0], self._ns[-1]) if self._ns else None
+
     def speed_mps(self, stamp_ns: int) -> tuple[float, float] | None:
         """(level, up) at a time; None when it is silent."""
         if not self._ns or abs(stamp_ns - self._ns[-1]) > AHEAD_NS:
@@ -72,9 +77,3 @@ class DroneTelemetry:
             return None
         velocity = self._v_mps[near]
         return self._xyz_m[near] + since_ns * 1e-9 * velocity, velocity
-
-    def at(self, stamps_ns: list[int]) -> Array64 | None:
-        """Positions (n, 3) [m] in the autopilot's frame; None when it was silent at one of these times."""
-        states = [self.state(stamp) for stamp in stamps_ns]
-        known = [state[0] for state in states if state is not None]
-        return np.array(known) if len(known) == len(states) else None

@@ -20,6 +20,7 @@ from stages.geometry import Array64
 
 HISTORY = 40  # sightings
 SAME_LOOK_NS = 30_000_000
+OPEN_LOOKS = 3  # a sector free in so many looks holds nothing up: what stands behind it is something else
 FADING = 0.95  # what stood beside it counts less with each look since
 ALONE_PER_M = 0.0165  # share of looks at a drone that find one return alone (nearby: few), over range
 WIRE_ALONE = 0.75  # and of those at a wire
@@ -135,7 +136,7 @@ class Candidate:
         taken = s.around[OCCUPIED_0 : OCCUPIED_0 + SECTORS] >= 1
         measured = (s.around[FREE_0 : FREE_0 + SECTORS] >= 1).sum() >= SECTORS // 2
         between = s.around[FREE_0 : FREE_0 + SECTORS] >= 1
-        farther = s.around[FARTHER_0 : FARTHER_0 + SECTORS] >= 1
+        farther = (s.around[FARTHER_0 : FARTHER_0 + SECTORS] >= 1) & (self.free < OPEN_LOOKS)
         standing = 1.0 if taken.any() else (0.5 if (farther & ~between).any() else (0.15 if farther.any() else 0.0))
         self.beside = FADING * self.beside + standing
         self.alone = FADING * self.alone + bool(measured and standing == 0.0)

@@ -5,7 +5,7 @@ drone moves as it says, turned by a yaw psi that nobody knows:
 
     drone      x_i = c + Rz(psi) d_i + u t_i + noise           u: drift of both odometries, decimetres a second
     still      x_i = c + u t_i + noise                         a lamp; or scattered, or met farther and farther along
-                                                               something long
+                                                               something long (a wire: as fast as one looks along it)
     flier      x_i = c + v t_i + a t_i^2 / 2 + noise           v, a of a bird, or of a balloon
 
 Each is a Gaussian over the path's n points, c and psi are integrated out; ln of the ratio of two marginal likelihoods
@@ -30,10 +30,12 @@ from stages.smooth_motion import log_p, model_of
 
 YAWS = 72  # steps of 5 deg: coarser, a fast straight flight fits none
 MOST_POINTS = 14
+SILENT_NS = 2_000_000_000  # by then a path may have gone over from one thing to another
 DRIFT_MPS = 0.3  # of the autopilot's velocity and the vehicle's, together, level
 DRIFT_UP_MPS = 0.1
 SCATTERED_M = 0.45  # sightings of something long
 SLIDING_MPS = 0.5  # or how fast looks at it wander along
+FOLLOWED_MPS = 3.0  # and along a wire, where each next look is aimed at as if it flew
 CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time, speed; else anything up to it
 BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
 BALLOON = (0.7, 0.7, 0.3, 0.4)
@@ -45,6 +47,7 @@ class Heard(NamedTuple):
     over_still: float
     over_bird: float
     over_balloon: float
+    over_wire: float  # over what is met farther and farther along it, at any speed: the aim looks where it expects
 
 
 def hear(
@@ -52,24 +55,31 @@ def hear(
 ) -> Heard | None:
     """Compare a path (n, 3) in a frame that stands still and is level with what the drone says; None: nothing to say.
 
+    Sightings at which the drone was silent are left out; when it is silent by now it says nothing at all.
+
     `level_known` False: the vehicle's motion is not known, so only heights are compared. sigma_m: of a sighting.
     """
-    first = bisect_left(path_ns, path_ns[-1] - KEPT_NS // 2)
+    heard_ns = telemetry.heard_ns
+    if heard_ns is None or path_ns[-1] > heard_ns[1] + SILENT_NS:
+        return None
+    first = bisect_left(path_ns, max(path_ns[-1] - KEPT_NS // 2, heard_ns[0]))
     rows = list(range(first, len(path_ns)))
     if len(rows) > MOST_POINTS:
         last = len(rows) - 1
         rows = [rows[round(i * last / (MOST_POINTS - 1))] for i in range(MOST_POINTS)]
-    if len(rows) < 2:
+    states = {k: telemetry.state(path_ns[k]) for k in rows}
+    places = {k: state[0] for k, state in states.items() if state is not None}
+    if len(places) < 2:
         return None
-    told = telemetry.at([path_ns[k] for k in rows])
-    if told is None:
-        return None
+    rows, told = list(places), np.array(list(places.values()))
     t = (np.array([path_ns[k] for k in rows]) - path_ns[rows[-1]]) * 1e-9
     return Heard(*weigh(t, np.array([path_m[k] for k in rows]), told, sigma_m, level_known))
 
 
 @compiled
-def weigh(t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_known: bool) -> tuple[float, float, float]:
+def weigh(
+    t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_known: bool
+) -> tuple[float, float, float, float]:
     """The evidence (see Heard) of a path x (n, 3) at times t (n,) against what the drone told of itself (n, 3)."""
     x, d = x_m.copy(), told_m.copy()
     for axis in range(3):
@@ -77,12 +87,12 @@ def weigh(t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_kno
         d[:, axis] -= d[:, axis].mean()
     as_drone = model_of(t_s, sigma_m, DRIFT_MPS, 0.0)
     as_long = model_of(t_s, SCATTERED_M, 0.0, 0.0)
-    as_sliding = model_of(t_s, sigma_m, SLIDING_MPS, 0.0)
+    as_sliding, as_followed = model_of(t_s, sigma_m, SLIDING_MPS, 0.0), model_of(t_s, sigma_m, FOLLOWED_MPS, 0.0)
     up = x[:, 2].copy()
     upright = model_of(t_s, sigma_m, DRIFT_UP_MPS, 0.0)
     drone = log_p(upright, t_s, up - d[:, 2])
     still, long = log_p(upright, t_s, up), log_p(as_long, t_s, up)  # what stands drifts alike
-    sliding = still
+    sliding = followed = still
     bird = log_p(model_of(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
     balloon = log_p(model_of(t_s, sigma_m, BALLOON[2], BALLOON[3]), t_s, up)
     if level_known:
@@ -102,12 +112,14 @@ def weigh(t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_kno
             still += log_p(as_drone, t_s, e)
             long += log_p(as_long, t_s, e)
             sliding += log_p(as_sliding, t_s, e)
+            followed += log_p(as_followed, t_s, e)
             wheeling += log_p(as_wheeling, t_s, e)
             balloon += log_p(as_balloon, t_s, e)
         cruise = math.log(CRUISING) + _log_mean(cruising)
         wheeling += math.log(1.0 - CRUISING)
         bird += max(cruise, wheeling) + math.log1p(math.exp(-abs(cruise - wheeling)))
-    return drone - _log_mean(np.array([still, long, sliding])), drone - bird, drone - balloon
+    over_still = drone - _log_mean(np.array([still, long, sliding]))
+    return over_still, drone - bird, drone - balloon, min(over_still, drone - followed)
 
 
 @compiled

@@ -52,6 +52,9 @@ class Evidence(BaseModel):
     beside: float = -3.0  # each look with something in a sector
     alone: float = 0.3  # each look with nothing, up to most_alone
     most_alone: float = 2.0
+    near_alone: float = 3.0  # nearby up to so much more: there a wire that held it would return pulses, too
+    wire_m: float = 20.0  # up to this range,
+    unseen_m: float = 45.0  # and none from here on
     most_few: float = 6.0  # looks with a single return: a wire gives little else
     most_many: float = 2.0  # and those with more
     near_big: float = 8.0  # a wall, crown or trunk this close, and it has not moved away
@@ -99,9 +102,9 @@ def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tu
     words = [f"{c.hit_looks} looks, {c.hits} returns", *said]
     if c.motion is not None:
         words.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
-    if c.heard is not None and min(c.heard) < -3.0:
+    if c.heard is not None and min(c.heard[:3]) < -3.0:
         words.append("it does not fly as the drone says")
-    elif c.heard is not None and max(c.heard) > 3.0:
+    elif c.heard is not None and max(c.heard[:3]) > 3.0:
         words.append("it flies as the drone says")
     elif c.heard is None and flew_as_bird(c, e):
         words.append("flew as a bird does")
@@ -122,7 +125,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     odds = e.clutter
     if free_space:
         free = int((c.free >= 1).sum())
-        odds += e.free_sector * free + max(e.beside * c.beside, -12.0) + min(e.alone * c.alone, e.most_alone)
+        odds += e.free_sector * free + max(e.beside * c.beside, -12.0) + min(e.alone * c.alone, most_alone(c, e))
         said.append(f"{free} of {SECTORS} sectors around it free")
         if c.beside > 0.5:
             said.append("something beside it")
@@ -133,8 +136,9 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     if c.long_looks:
         said.append("longer than a drone")
     if c.heard is not None:
-        moved = e.told * c.heard.over_still > 3.0
-        odds += believed(c.heard.over_still, e)
+        told = c.heard.over_still if few >= -1.0 else c.heard.over_wire
+        moved = e.told * told > 3.0
+        odds += believed(told, e)
     else:
         moved = c.moves(motion_known)
         odds += e.moves if moved else 0.0
@@ -151,6 +155,13 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
         odds -= e.spread
         said.append(f"scattered over {c.motion.spread_m:.1f} m")
     return odds, said
+
+
+def most_alone(c: Candidate, e: Evidence) -> float:
+    """What looks with nothing beside it can count [nats]: a wire is seen nearby, once pulses crossed every sector."""
+    crossed = min(max((float(c.free.min()) - 2.0) / 6.0, 0.0), 1.0)
+    seen = min(max((e.unseen_m - c.range_m) / (e.unseen_m - e.wire_m), 0.0), 1.0)
+    return e.most_alone + e.near_alone * crossed * seen
 
 
 def over_bird(c: Candidate, e: Evidence) -> float:

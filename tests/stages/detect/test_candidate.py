@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from stages.detect.candidate import ALONE_PER_M, FEW_M, STANDING_M, WIRE_ALONE, Candidate, Sighting
-from stages.detect.surroundings import TALLY
+from stages.detect.candidate import ALONE_PER_M, FEW_M, OPEN_LOOKS, STANDING_M, WIRE_ALONE, Candidate, Sighting
+from stages.detect.surroundings import FARTHER_0, FREE_0, TALLY
 from tests.stages.made import START_NS
 
 PLACE_M = np.array([3.0, 15.0, 12.0])
@@ -142,3 +142,15 @@ def test_it_is_met_again_in_the_middle_of_its_sightings_at_rest_and_goes_on_coun
     c.see(sighting(31.0, PLACE_M))
     assert (c.hit_looks, len(c.path_ns)) == (9, 9)
     assert np.linalg.norm(c.velocity_mps) < 0.5  # not thrown far off by half a minute
+
+
+def test_what_stands_behind_a_sector_that_is_free_again_and_again_is_not_what_holds_it():
+    def look(t_s, farther):
+        seen = sighting(t_s)
+        seen.around[FREE_0] = 3
+        seen.around[FARTHER_0] = farther
+        return seen
+
+    known_free = [look(0.1 * k, 0) for k in range(OPEN_LOOKS)]
+    assert candidate(look(0.0, 2)).beside > 0.0
+    assert candidate(*known_free, look(1.0, 2)).beside == 0.0

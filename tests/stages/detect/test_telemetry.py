@@ -16,6 +16,7 @@ from stages.detect.telemetry import (
     CRUISING,
     DRIFT_MPS,
     DRIFT_UP_MPS,
+    FOLLOWED_MPS,
     MOST_POINTS,
     SCATTERED_M,
     SLIDING_MPS,
@@ -76,21 +77,23 @@ def by_hand(t, x, d, sigma, axes):
     drone = log_mean([all_axes(x - d @ rotation_z(yaw).T, sigma, drift) for yaw in yaws])
     still, long = all_axes(x, sigma, drift), all_axes(x, SCATTERED_M)
     sliding = all_axes(x, sigma, SLIDING_MPS) if axes == (0, 1) else still  # level only
+    followed = all_axes(x, sigma, FOLLOWED_MPS) if axes == (0, 1) else still
     balloon = flier(BALLOON[:2], BALLOON[2:])
     bird = flier(BIRD[:2], BIRD[2:])
     if axes == (0, 1):
         headings = [CRUISE_MPS * np.array([math.cos(yaw), math.sin(yaw), 0.0]) for yaw in yaws]
         cruising = log_mean([all_axes(x - np.outer(t, v), sigma, CRUISE_SIGMA_MPS, BIRD[1]) for v in headings])
         bird = np.logaddexp(math.log(CRUISING) + cruising, math.log(1 - CRUISING) + bird)
-    return drone, still, long, sliding, bird, balloon
+    return drone, still, long, sliding, bird, balloon, followed
 
 
 def heard_by_hand(t, x, d, sigma, level_known):
     parts = np.array(by_hand(t, x, d, sigma, (2,)))
     if level_known:
         parts = parts + np.array(by_hand(t, x, d, sigma, (0, 1)))
-    drone, still, long, sliding, bird, balloon = parts
-    return drone - log_mean([still, long, sliding]), drone - bird, drone - balloon
+    drone, still, long, sliding, bird, balloon, followed = parts
+    over_still = drone - log_mean([still, long, sliding])
+    return over_still, drone - bird, drone - balloon, min(over_still, drone - followed)
 
 
 @pytest.mark.parametrize("level_known", [True, False])
@@ -213,6 +216,16 @@ def test_a_wire_that_is_met_farther_and_farther_along_is_no_drone_that_flies_or_
     assert against(rises, np.outer(T_S, (0.0, 0.0, 0.8))).over_still > 10.0
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wire_looked_at_farther_along_as_fast_as_the_drone_flies_is_told_from_it_by_a_turn_alone(seed):
+    slides = np.outer(T_S, (2.0, -1.5, 0.0)) + noise(seed)
+    straight = against(slides, np.outer(T_S, (2.5, 0.0, 0.0)))
+    assert straight.over_still > 8.0  # what nobody looks along does not go so far
+    assert straight.over_wire < 4.0
+    turned = turning()
+    assert against(turned + noise(seed), turned).over_wire > 10.0
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_drone_that_hangs_still_says_nothing_against_a_lamp(seed):
     heard = against(noise(seed), HANGING_M)
@@ -272,42 +285,48 @@ def ns(*times_s):
     return [START_NS + round(t * 1e9) for t in times_s]
 
 
+def places(told, stamps_ns):
+    """Where it says it was (n, 3); None: it was silent at one of these times."""
+    states = [told.state(stamp_ns) for stamp_ns in stamps_ns]
+    return None if any(state is None for state in states) else np.array([state[0] for state in states])
+
+
 def test_between_and_just_beyond_its_words_a_drone_flies_on():
     told = telling(circle)
     times = (0.0, 1.04, 2.5, 3.96, 4.05)
     expected = np.array([circle(t) for t in times])
-    np.testing.assert_allclose(told.at(ns(*times)), expected, atol=0.01)
-    assert told.at(ns(1.04)).shape == (1, 3)
+    np.testing.assert_allclose(places(told, ns(*times)), expected, atol=0.01)
+    assert places(told, ns(1.04)).shape == (1, 3)
 
 
 def test_a_place_is_taken_from_the_nearer_of_two_words():
     told = DroneTelemetry()
     told.add(START_NS, np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
     told.add(START_NS + 400 * MS, np.array([0.0, 0.0, 0.0]), np.array([0.0, 2.0, 0.0]))
-    np.testing.assert_allclose(told.at(ns(0.1)), [[0.1, 0.0, 0.0]])
-    np.testing.assert_allclose(told.at(ns(0.3)), [[0.0, -0.2, 0.0]])
+    np.testing.assert_allclose(places(told, ns(0.1)), [[0.1, 0.0, 0.0]])
+    np.testing.assert_allclose(places(told, ns(0.3)), [[0.0, -0.2, 0.0]])
 
 
 @pytest.mark.parametrize(
     "times", [(-0.1, 1.0), (1.0, 4.6), (3.0, 60.0)], ids=["before its first word", "long after its last", "later"]
 )
 def test_when_it_was_silent_nothing_is_known(times):
-    assert telling(circle).at(ns(*times)) is None
+    assert places(telling(circle), ns(*times)) is None
 
 
 def test_in_a_gap_nothing_is_known():
     told = telling(lambda t: np.zeros(3), seconds=1.0)
     telling(lambda t: np.zeros(3), seconds=1.0, start_ns=START_NS + 4_000 * MS, into=told)
-    assert told.at(ns(0.5, 4.5)) is not None
-    assert told.at(ns(0.5, 2.5, 4.5)) is None
+    assert places(told, ns(0.5, 4.5)) is not None
+    assert places(told, ns(0.5, 2.5, 4.5)) is None
 
 
 def test_one_word_is_not_enough_and_none_is_silence():
     told = DroneTelemetry()
-    assert told.at(ns(0.0)) is None
+    assert places(told, ns(0.0)) is None
     assert told.speed_mps(START_NS) is None
     told.add(START_NS, np.zeros(3), np.zeros(3))
-    assert told.at(ns(0.0)) is None
+    assert places(told, ns(0.0)) is None
 
 
 def test_its_speed_is_level_and_up_while_it_is_heard():
@@ -321,28 +340,28 @@ def test_a_word_that_is_not_newer_is_ignored():
     told = telling(circle)
     told.add(START_NS + 2_000 * MS, np.full(3, 99.0), np.zeros(3))
     told.add(START_NS + 4_000 * MS, np.full(3, 99.0), np.zeros(3))
-    np.testing.assert_allclose(told.at(ns(2.0, 4.0)), [circle(2.0), circle(4.0)], atol=1e-6)
+    np.testing.assert_allclose(places(told, ns(2.0, 4.0)), [circle(2.0), circle(4.0)], atol=1e-6)
 
 
 def test_a_jump_that_its_velocity_does_not_explain_is_a_reset_and_what_was_before_is_forgotten():
     told = telling(circle)
     telling(shifted(4.1, JUMP_M + 0.2), 1.0, start_ns=START_NS + 4_100 * MS, into=told)
-    assert told.at(ns(3.0, 4.5)) is None
-    assert told.at(ns(4.2, 4.5)) is not None
+    assert places(told, ns(3.0, 4.5)) is None
+    assert places(told, ns(4.2, 4.5)) is not None
 
 
 def test_a_small_correction_and_a_fast_flight_are_no_resets():
     told = telling(circle)
     telling(shifted(4.1, JUMP_M - 0.2), 1.0, start_ns=START_NS + 4_100 * MS, into=told)
-    assert told.at(ns(3.0, 4.5)) is not None
-    assert telling(lambda t: np.array([15.0 * t, 0.0, 0.0]), step_s=0.4).at(ns(0.5, 3.5)) is not None
+    assert places(told, ns(3.0, 4.5)) is not None
+    assert places(telling(lambda t: np.array([15.0 * t, 0.0, 0.0]), step_s=0.4), ns(0.5, 3.5)) is not None
 
 
 def test_its_memory_is_bounded():
     told = telling(lambda t: np.zeros(3), seconds=60.0)
     assert len(told._ns) == len(told._xyz_m) == len(told._v_mps) == round(KEPT_NS * 1e-8) + 1
-    assert told.at(ns(39.0, 60.0)) is None
-    assert told.at(ns(40.0, 60.0)) is not None
+    assert places(told, ns(39.0, 60.0)) is None
+    assert places(told, ns(40.0, 60.0)) is not None
 
 
 # a path and the telemetry together
@@ -371,20 +390,36 @@ def test_only_heights_are_heard_of_when_the_vehicle_does_not_say_how_it_drives()
 def test_silence_and_a_single_sighting_say_nothing():
     stamps, path = path_of(circle, np.linspace(1.0, 3.0, 9))
     assert hear(DroneTelemetry(), stamps, path, SIGMA_M, True) is None
-    assert hear(telling(circle, seconds=2.0), stamps, path, SIGMA_M, True) is None  # it fell silent meanwhile
+    assert hear(telling(circle, seconds=0.9), stamps, path, SIGMA_M, True) is None  # it fell silent long ago
     assert hear(telling(circle), stamps[:1], path[:1], SIGMA_M, True) is None
+
+
+def test_sightings_at_which_it_was_silent_are_left_out():
+    times = np.linspace(0.5, 3.5, 13)
+    late, early = telling(circle, start_ns=START_NS), telling(circle, seconds=1.5)
+    between = DroneTelemetry()
+    telling(lambda t: circle(1.4 + t), seconds=1.2, start_ns=START_NS + 1_400 * MS, into=between)
+    for told, heard in ((late, times >= 0.0), (early, times <= 2.0), (between, (times > 1.4) & (times < 3.1))):
+        expected = hear(told, *path_of(circle, times[heard]), SIGMA_M, True)
+        if heard[-1]:
+            np.testing.assert_allclose(hear(told, *path_of(circle, times), SIGMA_M, True), expected)
+        else:  # the same path, seen from a later moment
+            np.testing.assert_allclose(hear(told, *path_of(circle, times), SIGMA_M, True), expected, rtol=1e-6)
 
 
 def test_after_a_reset_a_path_from_before_it_is_not_compared():
     told = telling(circle, seconds=2.0)
     telling(shifted(2.1, 5.0), 2.0, start_ns=START_NS + 2_100 * MS, into=told)
-    assert hear(told, *path_of(circle, np.linspace(1.0, 3.0, 9)), SIGMA_M, True) is None
-    assert hear(told, *path_of(circle, np.linspace(2.5, 4.0, 9)), SIGMA_M, True) is not None
+    assert hear(told, *path_of(circle, np.linspace(0.5, 2.0, 9)), SIGMA_M, True) is None
+    after = hear(told, *path_of(circle, np.linspace(2.25, 4.0, 8)), SIGMA_M, True)
+    np.testing.assert_allclose(hear(told, *path_of(circle, np.linspace(1.0, 4.0, 13)), SIGMA_M, True), after)
 
 
 def test_only_the_latest_ten_seconds_and_so_many_points_of_them_are_compared(monkeypatch):
     asked = []
-    monkeypatch.setattr(telemetry, "weigh", lambda t, x, d, sigma_m, level: asked.append((t, x)) or (0.0, 0.0, 0.0))
+    monkeypatch.setattr(
+        telemetry, "weigh", lambda t, x, d, sigma_m, level: asked.append((t, x)) or (0.0, 0.0, 0.0, 0.0)
+    )
     told = telling(circle, seconds=20.0)
     stamps, path = path_of(circle, np.linspace(1.0, 19.0, 181))
     hear(told, stamps, path, SIGMA_M, True)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from stages.detect.telemetry import Heard
-from stages.detect.verdict import STANDING, Evidence, believed, judge, over_balloon, over_bird, over_clutter
+from stages.detect.verdict import STANDING, Evidence, believed, judge, most_alone, over_balloon, over_bird, over_clutter
 from tests.stages.detect.test_candidate import candidate, sighting, way
 
 E = Evidence()
-NOTHING = Heard(0.0, 0.0, 0.0)
+NOTHING = Heard(0.0, 0.0, 0.0, 0.0)
 
 
 def hanging(heard=None, range_m=20.0):
@@ -28,10 +28,10 @@ def test_a_share_of_what_is_told_counts_within_its_caps(told, counts):
 def test_over_a_bird_only_what_is_told_counts_as_soon_as_something_is():
     calm = hanging()
     assert over_bird(calm, E) > 3.0  # it hung still for a second
-    calm.heard = Heard(0.0, 2.0, 0.0)
+    calm.heard = Heard(0.0, 2.0, 0.0, 0.0)
     assert over_bird(calm, E) == pytest.approx(E.birds + E.told * 2.0)
     fast = candidate(*way((14.0, 0.0, 0.0)))
-    fast.heard = Heard(0.0, 2.0, 0.0)
+    fast.heard = Heard(0.0, 2.0, 0.0, 0.0)
     assert over_bird(fast, E) == pytest.approx(E.birds + E.told * 2.0)
 
 
@@ -39,12 +39,12 @@ def test_over_a_balloon_it_is_added_to_how_round_it_is():
     c = hanging()
     c.balls = 2
     assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball)
-    c.heard = Heard(0.0, 0.0, -3.0)
+    c.heard = Heard(0.0, 0.0, -3.0, 0.0)
     assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball - 3.0 * E.told)
 
 
 def test_over_what_stands_it_replaces_whether_it_moved():
-    silent, nothing, flew = hanging(), hanging(NOTHING), hanging(Heard(20.0, 0.0, 0.0))
+    silent, nothing, flew = hanging(), hanging(NOTHING), hanging(Heard(20.0, 0.0, 0.0, 20.0))
     (odds, said), (same, same_said), (more, more_said) = (
         over_clutter(c, E, False, True) for c in (silent, nothing, flew)
     )
@@ -59,8 +59,27 @@ def test_over_what_stands_it_replaces_whether_it_moved():
     assert over_clutter(moved, E, False, True)[0] == pytest.approx(silently - E.moves + E.still * 12)
 
 
+def test_what_returns_little_is_taken_for_a_wire_that_was_looked_along():
+    flew = Heard(20.0, 9.0, 9.0, 1.0)
+    many, little = hanging(flew), candidate(*(sighting(0.1 * k, hits=1, range_m=10.0) for k in range(12)))
+    little.heard = flew
+    assert "it may stand still" not in over_clutter(many, E, False, True)[1]
+    assert "it may stand still" in over_clutter(little, E, False, True)[1]
+
+
+def test_nearby_looks_with_nothing_beside_it_count_more_once_every_sector_was_crossed():
+    near, far = hanging(range_m=15.0), hanging(range_m=60.0)
+    assert most_alone(near, E) == most_alone(far, E) == E.most_alone  # nothing was measured around them
+    for c in (near, far):
+        c.free[:] = 20.0
+    assert most_alone(near, E) == E.most_alone + E.near_alone
+    assert most_alone(far, E) == E.most_alone
+    near.free[3] = 0.0
+    assert most_alone(near, E) == E.most_alone
+
+
 def test_a_refused_neighbour_counts_only_against_what_may_stand():
-    for heard, counts in ((None, E.among), (NOTHING, E.among), (Heard(20.0, 0.0, 0.0), 0.0)):
+    for heard, counts in ((None, E.among), (NOTHING, E.among), (Heard(20.0, 0.0, 0.0, 20.0), 0.0)):
         c = hanging(heard)
         apart, _ = over_clutter(c, E, False, True)
         c.among = True
@@ -70,12 +89,12 @@ def test_a_refused_neighbour_counts_only_against_what_may_stand():
 def test_the_words_say_whether_it_flies_as_the_drone_says():
     assert "the drone says" not in judge(hanging(), E, True, True)[1]
     assert "the drone says" not in judge(hanging(NOTHING), E, True, True)[1]
-    assert "it flies as the drone says" in judge(hanging(Heard(9.0, 4.0, 4.0)), E, True, True)[1]
-    assert "it does not fly as the drone says" in judge(hanging(Heard(30.0, -9.0, 4.0)), E, True, True)[1]
+    assert "it flies as the drone says" in judge(hanging(Heard(9.0, 4.0, 4.0, 9.0)), E, True, True)[1]
+    assert "it does not fly as the drone says" in judge(hanging(Heard(30.0, -9.0, 4.0, 30.0)), E, True, True)[1]
 
 
 def test_what_it_is_if_it_is_no_drone_is_noted():
-    for heard, suspect in ((Heard(-50.0, 20.0, 20.0), STANDING), (Heard(20.0, -50.0, 20.0), "a bird")):
+    for heard, suspect in ((Heard(-50.0, 20.0, 20.0, -50.0), STANDING), (Heard(20.0, -50.0, 20.0, 20.0), "a bird")):
         c = hanging(heard)
         _, words = judge(c, E, True, True)
         assert c.suspect == suspect

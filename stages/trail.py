@@ -15,9 +15,9 @@ import numpy as np
 
 from stages.geometry import Array64
 from stages.messages import VehicleMotion
+from stages.rotation import nearly_rotation
 
 KEPT = 512
-NEWTON_STEPS = 4
 STEP_NS = 50_000_000  # over which a velocity is taken
 FURTHEST_NS = 300_000_000  # beyond the newest pose this much is extrapolated, no more
 
@@ -55,7 +55,7 @@ class VehicleTrail:
         if len(self._known) >= KEPT:
             self._known.clear()
         # poses are milliseconds apart: the mean of the two, made a rotation again
-        self._known[stamp_ns] = _rotation(R0 + share * (R1 - R0), near=share <= 1.0), x0 + share * (x1 - x0)
+        self._known[stamp_ns] = nearly_rotation(R0 + share * (R1 - R0)), x0 + share * (x1 - x0)
         return self._known[stamp_ns]
 
     def velocity_mps(self, stamp_ns: int) -> Array64:
@@ -75,16 +75,3 @@ class VehicleTrail:
         now = R @ xyz_m + t
         then = R_then @ (xyz_m + STEP_NS * 1e-9 * velocity_mps) + t_then
         return now, (then - now) / (STEP_NS * 1e-9)
-
-
-def _rotation(mean: Array64, near: bool) -> Array64:
-    """The rotation nearest to a matrix (3, 3); `near`: it is nearly one, and a few steps of Newton do.
-
-    Source: Higham, Functions of Matrices (2008), 8.3.
-    """
-    if not near:
-        u, _, vt = np.linalg.svd(mean)
-        return u @ vt
-    for _ in range(NEWTON_STEPS):
-        mean = mean @ (1.5 * np.eye(3) - 0.5 * (mean.T @ mean))
-    return mean

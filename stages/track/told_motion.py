@@ -148,12 +148,11 @@ class ToldMotion:
         moved = a * m1
         x[[0, 1, 3, 4]] += (moved[0].real, moved[0].imag, moved[1].real, moved[1].imag)
         K, pseudo = np.outer(a, a.conj()) * (sure - abs(m1) ** 2), np.outer(a, a) * (m2 - m1 * m1)
-        real, imag = [0, 3], [1, 4]
-        covariance[np.ix_(real, real)] += 0.5 * (K + pseudo).real
-        covariance[np.ix_(imag, imag)] += 0.5 * (K - pseudo).real
         across = 0.5 * (pseudo - K).imag  # E Re z Im z'
-        covariance[np.ix_(real, imag)] += across
-        covariance[np.ix_(imag, real)] += across.T
+        covariance[0::3, 0::3] += 0.5 * (K + pseudo).real  # x of place and velocity
+        covariance[1::3, 1::3] += 0.5 * (K - pseudo).real  # y of both
+        covariance[0::3, 1::3] += across
+        covariance[1::3, 0::3] += across.T
         return x, covariance
 
 

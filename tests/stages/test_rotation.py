@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from stages.rotation import exp_rotation, hat, log_rotation
+from stages.rotation import exp_rotation, hat, log_rotation, nearest_rotation, nearly_rotation
 
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
@@ -26,3 +26,13 @@ def test_the_logarithm_undoes_the_exponential(angle):
         np.testing.assert_allclose(exp_rotation(log_rotation(R)), R, atol=1e-7)
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
         assert np.linalg.norm(log_rotation(R)) == pytest.approx(angle, abs=1e-7)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0, 3.0, 15.0, 200.0])
+def test_nearly_a_rotation_or_not_the_nearest_is_found(share):
+    rng = np.random.default_rng(3)
+    for angle_rad in (1e-4, 0.02, 0.3, 1.5):
+        R = exp_rotation(rng.normal(size=3))
+        turned = R @ exp_rotation(angle_rad * np.array([0.6, -0.48, 0.64]))
+        M = R + share * (turned - R)
+        np.testing.assert_allclose(nearly_rotation(M), nearest_rotation(M), atol=1e-12)

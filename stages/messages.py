@@ -292,6 +292,18 @@ class DroneMotion(Message):
 
 
 @message
+class FollowedFeatures(Message):
+    """Features of a camera followed from an earlier picture to this one; stamp_ns is this picture's. P V.B, V.E."""
+
+    frame_id: str  # which camera
+    from_ns: int  # the earlier picture's stamp
+    pixel_from: Annotated[NDArray[np.float64], Shape("n", 2)]  # column, row in the earlier picture
+    pixel_to: Annotated[NDArray[np.float64], Shape("n", 2)]
+    residual_rad: PerPointF64  # by how much each misses the camera's motion that was found
+    agrees: PerPointBool  # with that motion
+
+
+@message
 class DroneAttitude(Message):
     """The autopilot's attitude. Frame local is the autopilot's own: x its north, z up; its yaw is unrelated to ours."""
 

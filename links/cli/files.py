@@ -117,6 +117,15 @@ def simulate_recording(
         float | None,
         typer.Option("--duration", min=0.1, max=3600, help="Seconds to simulate [default: the scenario's]."),
     ] = None,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(
+            "--pictures",
+            metavar="FROM.mcap",
+            help="Take the cameras' pictures from a recording of the same flight instead of painting them, which takes "
+            "most of the time. LiDAR, servo, radio and CONFIG may differ; what pictures show may not.",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Make a recording of a simulated flight.
@@ -140,6 +149,7 @@ def simulate_recording(
             progress=lambda done: step(done, 1.0),
             closed_loop=closed_loop,
             duration_s=duration_s,
+            pictures=pictures,
         )
     out.print(str(report), markup=False)
 
@@ -168,6 +178,15 @@ def simulate_matrix(
         float | None,
         typer.Option(
             "--cameras", metavar="HZ", min=1, max=15, help="Two 720 px fisheyes at this rate; 0.8 s of a core a pair."
+        ),
+    ] = None,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(
+            "--pictures",
+            metavar="DIR",
+            help="Take the pictures from DIR's recordings of the same names; where one is missing or of another flight "
+            "that is an error (the same command without --pictures then paints what is left).",
         ),
     ] = None,
     results: Annotated[
@@ -202,6 +221,8 @@ def simulate_matrix(
 
     if results is not None and closed_loop is None:
         raise LinkError("--results keeps the closed loop's runs: say whose with --closed-loop CONFIG")
+    if pictures is not None and cameras_hz is None:
+        raise LinkError("--pictures is for recordings with cameras: say at which rate with --cameras HZ")
     patterns = only or ["*"]
     wanted = cells(patterns, pairs)
     if not wanted:
@@ -214,7 +235,9 @@ def simulate_matrix(
         return
     with progress_bar(f"{len(wanted) * seeds} recordings") as step:
         conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz)
-        report = make_matrix(folder, wanted, range(1, seeds + 1), closed_loop, step, conditions, results, jobs)
+        report = make_matrix(
+            folder, wanted, range(1, seeds + 1), closed_loop, step, conditions, results, jobs, pictures
+        )
     for text in report.impossible:
         warn(text)
     for failure in report.failed:

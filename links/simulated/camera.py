@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -74,6 +74,33 @@ class CamerasSettings(_Settings):
     drone: CameraSettings | None = None
 
 
+class FrameTimes:
+    """When a camera's frames are taken: known before any is made."""
+
+    def __init__(self, carrier: Carrier, settings: CameraSettings, start_ns: int, seed: int) -> None:
+        self._settings = settings
+        self.seed = [seed, 21 if carrier == "vehicle" else 22]
+        timing = np.random.default_rng([*self.seed, 0])
+        self._first_ns = start_ns + round(timing.uniform(0.2, 1.0) * 1e9 / settings.rate_hz)
+
+    def stamp_ns(self, frame: int) -> int:
+        """Frames are triggered at a steady rate, off by some 50 us."""
+        jitter_ns = np.random.default_rng([*self.seed, 2, frame]).normal(0, 5e4)
+        return self._first_ns + round(frame * 1e9 / self._settings.rate_hz + jitter_ns)
+
+    def ends_ns(self, frame: int) -> int:
+        """No exposure is longer than the longest: how long it is shows only when the frame is made."""
+        sensor = self._settings.sensor
+        longest_ms = self._settings.readout_ms + (sensor.exposure_ms or sensor.max_exposure_ms)
+        return self.stamp_ns(frame) + round(0.5e6 * longest_ms)
+
+    def arrival_ns(self, frame: int) -> int:
+        """The host has it this much later."""
+        low, high = self._settings.latency_ms
+        rng = np.random.default_rng([*self.seed, 3, frame])
+        return self.ends_ns(frame) + round(1e6 * rng.triangular(low, (2 * low + high) / 3, high + 1e-9))
+
+
 class Camera:
     """A camera in the scene. `records` gives its frames as they are measured."""
 
@@ -91,16 +118,14 @@ class Camera:
         self._view = View(scene, self._pixels, self.T_world_camera, own, covered)
         limit_rad = math.radians(settings.true_lens.max_off_axis_deg)
         self._transmission = transmission(self._pixels.off_axis_rad, limit_rad, settings.sensor.vignetting)
-        self._seed = [seed, 21 if carrier == "vehicle" else 22]
-        timing = np.random.default_rng([*self._seed, 0])
-        self._first_ns = start_ns + round(timing.uniform(0.2, 1.0) * 1e9 / settings.rate_hz)
+        self._times = FrameTimes(carrier, settings, start_ns, seed)
         self._frame = 0
 
     def records(self, until_ns: int) -> list[Record]:
         """Frames whose readout ended before `until_ns`, each once."""
         records: list[Record] = []
-        while (ends_ns := self._ends_ns(self._frame)) < until_ns:
-            records.append(self._record(self._frame, ends_ns))
+        while self._times.ends_ns(self._frame) < until_ns:
+            records.append(self._record(self._frame))
             self._frame += 1
         return records
 
@@ -112,7 +137,7 @@ class Camera:
 
     def image(self, stamp_ns: int, frame: int = 0) -> NDArray[np.uint8]:
         """The picture (size, size, 3), RGB, of a frame whose middle is `stamp_ns`."""
-        rng = np.random.default_rng([*self._seed, 1, frame])
+        rng = np.random.default_rng([*self._times.seed, 1, frame])
         exposure_s, gain = auto_exposure(self.settings.sensor, mean_radiance(self._view, stamp_ns))
         row_s = 1e-3 * self.settings.readout_ms / self.settings.size_px
         shutter = Shutter(stamp_ns, exposure_s, row_s)
@@ -120,26 +145,11 @@ class Camera:
         radiance[self._pixels.rows, self._pixels.columns] *= self._transmission[:, None]
         return develop(radiance, self.settings.sensor, exposure_s, gain, rng)
 
-    def _stamp_ns(self, frame: int) -> int:
-        """Frames are triggered at a steady rate, off by some 50 us."""
-        jitter_ns = np.random.default_rng([*self._seed, 2, frame]).normal(0, 5e4)
-        return self._first_ns + round(frame * 1e9 / self.settings.rate_hz + jitter_ns)
-
-    def _ends_ns(self, frame: int) -> int:
-        """No exposure is longer than the longest: how long it is shows only when the frame is made."""
-        sensor = self.settings.sensor
-        longest_ms = self.settings.readout_ms + (sensor.exposure_ms or sensor.max_exposure_ms)
-        return self._stamp_ns(frame) + round(0.5e6 * longest_ms)
-
-    def _record(self, frame: int, ends_ns: int) -> Record:
-        stamp_ns = self._stamp_ns(frame)
-        low, high = self.settings.latency_ms
-        latency_ns = round(
-            1e6 * np.random.default_rng([*self._seed, 3, frame]).triangular(low, (2 * low + high) / 3, high + 1e-9)
-        )
+    def _record(self, frame: int) -> Record:
+        stamp_ns = self._times.stamp_ns(frame)
         jpeg = encode_jpeg(self.image(stamp_ns, frame), self.settings.sensor.jpeg_quality)
         data = encode_compressed_image(CompressedImage(stamp_ns, self._frame_id, jpeg))
-        return Record(self._topic, arrival_ns=ends_ns + latency_ns, stamp_ns=stamp_ns, data=data)
+        return Record(self._topic, arrival_ns=self._times.arrival_ns(frame), stamp_ns=stamp_ns, data=data)
 
 
 def build_cameras(
@@ -153,13 +163,11 @@ def build_cameras(
 ) -> list[Camera]:
     """The scenario's cameras. The vehicle's camera sits inside the vehicle's mesh: it sees another one instead."""
     cameras: list[Camera] = []
-    for carrier, one in _wanted(settings):
+    for carrier, one in wanted_cameras(settings, any(body.name == "drone" for body in scene.bodies)):
         bodies = list(scene.bodies)
         if carrier == "vehicle":
             own = next(i for i, body in enumerate(bodies) if body.name == carrier)
             bodies[own] = dataclasses.replace(bodies[own], meshes=(vehicle_from_camera,))
-        elif not any(body.name == carrier for body in bodies):
-            continue  # an empty sky has no drone to carry a camera
         around = CameraScene(scene.world, scene.world_mesh, bodies, street, light(weather, seed))
         drone = next((body.meshes[0] for body in bodies if body.name == "drone"), None)
         cameras.append(Camera(carrier, one, mount_of(carrier, one, drone), around, start_ns, seed))
@@ -182,9 +190,7 @@ def mount_of(carrier: Carrier, settings: CameraSettings, drone: Mesh | None) -> 
 def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Sequence[Mesh]) -> dict[str, Any]:
     """The rig file's `cameras:`; empty without cameras. `drone`: how its blades may stand; nothing without a drone."""
     tree: dict[str, Any] = {}
-    for carrier, one in _wanted(settings):
-        if carrier == "drone" and not drone:
-            continue
+    for carrier, one in wanted_cameras(settings, len(drone) > 0):
         mount = mount_of(carrier, one, drone[0] if drone else None)
         meshes = [vehicle_from_camera] if carrier == "vehicle" else drone
         masked_px, max_off_axis_deg = own_body(one.true_lens, one.size_px, mount, meshes)
@@ -198,8 +204,11 @@ def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Seq
     return tree
 
 
-def _wanted(settings: CamerasSettings) -> Iterator[tuple[Carrier, CameraSettings]]:
+def wanted_cameras(settings: CamerasSettings, drone: bool) -> list[tuple[Carrier, CameraSettings]]:
+    """The cameras there are, by what carries them: an empty sky has no drone to carry one."""
+    wanted: list[tuple[Carrier, CameraSettings]] = []
     if settings.vehicle is not None:
-        yield "vehicle", settings.vehicle
-    if settings.drone is not None:
-        yield "drone", settings.drone
+        wanted.append(("vehicle", settings.vehicle))
+    if settings.drone is not None and drone:
+        wanted.append(("drone", settings.drone))
+    return wanted

@@ -42,6 +42,7 @@ class Making:
     closed_loop: Asked | None
     results: Path | None  # where the closed loop's runs go, if they are wanted
     conditions: Conditions
+    pictures: Path | None = None  # recordings of the same names, whose pictures are taken instead of painted
 
 
 @dataclass(frozen=True)
@@ -88,15 +89,18 @@ def make_matrix(
     conditions: Conditions | None = None,
     results: Path | None = None,
     jobs: int = 1,
+    pictures: Path | None = None,
 ) -> MatrixReport:
     """Make what is missing: `folder/<cell>-s<seed>.mcap`, `results/<cell>-s<seed>-<configuration>`.
 
+    With `pictures` those of its `<cell>-s<seed>.mcap` are taken; where that is missing or of another flight the
+    recording fails (painting is slow, and a second call without `pictures` paints just what is missing).
     `progress` is told simulated seconds done and in all. Raises ConfigError, or LinkError, for a configuration that
     closes no loop; what goes wrong with one recording is in the report, and the others are made.
     """
     conditions = conditions or Conditions()
     asked = None if closed_loop is None else _asked(closed_loop, conditions, results is not None)
-    making = Making(folder, asked, results, conditions)
+    making = Making(folder, asked, results, conditions, pictures)
     tasks = [Task(making, cell, seed) for seed, cell in product(seeds, wanted)]
     whole_s = sum(task.cell.duration_s for task in tasks)
 
@@ -144,7 +148,7 @@ def _make(task: Task, scenario: Scenario, progress: Callable[[float], None]) -> 
     if asked is None:
         if is_made(file, scenario, {}):
             return Outcome("kept")
-        _simulate(file, scenario, None, progress)
+        _simulate(task, file, scenario, None, progress)
         return Outcome("made")
     graph = asked.graph(scenario.rig_yaml(), f"{scenario.name} (rig)")
     made_by = made_with(asked.config, graph)
@@ -156,14 +160,20 @@ def _make(task: Task, scenario: Scenario, progress: Callable[[float], None]) -> 
         replay_into(folder, file, asked, lambda done, whole: progress(done / whole))
         return Outcome("kept", replayed=True)
     if folder is None:
-        _simulate(file, scenario, ClosedLoop(graph, scenario.closed_loop, made_by), progress)
+        _simulate(task, file, scenario, ClosedLoop(graph, scenario.closed_loop, made_by), progress)
     else:
-        _simulate_and_keep_run(file, scenario, folder, asked, graph, progress)
+        _simulate_and_keep_run(task, file, scenario, folder, asked, graph, progress)
     return Outcome("made")
 
 
 def _simulate_and_keep_run(
-    file: Path, scenario: Scenario, folder: Path, asked: Asked, graph: Graph, progress: Callable[[float], None]
+    task: Task,
+    file: Path,
+    scenario: Scenario,
+    folder: Path,
+    asked: Asked,
+    graph: Graph,
+    progress: Callable[[float], None],
 ) -> None:
     """The closed loop runs the very graph that a replay of its recording would: it leaves the same run."""
     is_new = not folder.exists()
@@ -171,7 +181,7 @@ def _simulate_and_keep_run(
         if is_new:  # a flight that cannot be made leaves no folder that looks like a run
             undo.callback(shutil.rmtree, folder)
         loop = ClosedLoop(graph, scenario.closed_loop, made_with(asked.config, graph), run.taps)
-        _simulate(file, scenario, loop, progress)
+        _simulate(task, file, scenario, loop, progress)
         undo.pop_all()
         truth = TruthLog()
         with RecordingReader(file) as reader:
@@ -179,11 +189,14 @@ def _simulate_and_keep_run(
             run.finish(loop.report, loop.output_hash, truth, reader.warnings)
 
 
-def _simulate(file: Path, scenario: Scenario, loop: ClosedLoop | None, progress: Callable[[float], None]) -> None:
+def _simulate(
+    task: Task, file: Path, scenario: Scenario, loop: ClosedLoop | None, progress: Callable[[float], None]
+) -> None:
     """Make a recording; it has its name only when it is complete."""
+    pictures = task.making.pictures and task.making.pictures / file.name
     part = file.with_name(f"{file.name}.part")
     try:
-        simulate_into(part, scenario, progress, overwrite=True, loop=loop)
+        simulate_into(part, scenario, progress, overwrite=True, loop=loop, pictures=pictures)
         part.replace(file)
     finally:
         part.unlink(missing_ok=True)

@@ -8,20 +8,21 @@ from __future__ import annotations
 import dataclasses
 import heapq
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path as FilePath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.link import TRUTH_TOPICS, Record
+from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.recording import RecordingWriter
 from links.simulated.autopilot import Autopilot
-from links.simulated.camera import build_cameras
+from links.simulated.camera import Camera, build_cameras
 from links.simulated.camera_paint import Street
 from links.simulated.clearance import check_travel
 from links.simulated.closed_loop import ClosedLoop, load_loop
 from links.simulated.flight import Flight
+from links.simulated.kept_pictures import KeptCamera, KeptPictures, world_of
 from links.simulated.lidar import Lidar, turned_poses
 from links.simulated.mesh import Array64
 from links.simulated.operator import ScriptedOperator
@@ -34,7 +35,6 @@ from links.simulated.truth_records import TruthRecords
 from links.simulated.vehicle import vehicle_mesh, vehicle_mesh_from_camera
 from links.simulated.vehicle_odometry import VehicleOdometry
 from links.simulated.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
-from links.simulated.world import build_world
 from links.velodyne import vlp16
 
 BATCH_PACKETS = 32  # pulses are cast in batches; how many does not change a byte
@@ -64,11 +64,20 @@ class SimulationReport:
 class Simulation:
     """One run of a scenario. Iterate `records()` once; the counts and `drone_return_ns` fill as it goes."""
 
-    def __init__(self, scenario: Scenario, seed: int | None = None, loop: ClosedLoop | None = None) -> None:
-        """With a `loop` the pipeline in it commands the servo, and the scenario's script is not used."""
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int | None = None,
+        loop: ClosedLoop | None = None,
+        pictures: KeptPictures | None = None,
+    ) -> None:
+        """With a `loop` the pipeline in it commands the servo, and the scenario's script is not used.
+
+        With `pictures` of the same scenario the cameras' are not painted.
+        """
         self._loop = loop
-        self.scenario = scenario
-        self.seed = scenario.seed if seed is None else seed
+        self.scenario = scenario if seed is None else scenario.changed(seed=seed)
+        self.seed = self.scenario.seed
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
         flown: Path | Flight | None = drone.path if drone else None
@@ -84,8 +93,7 @@ class Simulation:
         others = scenario.other_drones
         self.truth = Truth(start_ns, ridden, flown, tuple(other.path for other in others))
         height = scenario.vehicle.camera_height_m
-        driven = scenario.vehicle.path.at(np.arange(0.0, scenario.duration_s, 0.25))[0]
-        world = build_world(scenario.scene, height, self.seed, driven[:, :2])
+        world = world_of(self.scenario)
         self._scene = Scene(
             world.mesh,
             vehicle_mesh(height),
@@ -103,7 +111,19 @@ class Simulation:
         shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)
         self._servo = ServoBus(scenario.servo, operator, scenario.start_ns, shift_ns, self.seed)
         self._arrival = np.random.default_rng([self.seed, 5])
-        self._cameras = build_cameras(
+        self._cameras: Sequence[Camera | KeptCamera] = (
+            self._painting_cameras() if pictures is None else pictures.cameras(self.truth)
+        )
+        lidar_at = (lambda stamp_ns: self.T_world_lidar(stamp_ns)[1]) if scenario.truth_visible else None
+        self._true = TruthRecords(self.truth, self._scene.world, lidar_at)
+        self.lidar_clock_ns = 0  # how far the LiDAR's clock is ahead of the scenario's
+        self.pulses = 0
+        self.returns = 0
+        self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from drones
+
+    def _painting_cameras(self) -> list[Camera]:
+        scenario, height = self.scenario, self.scenario.vehicle.camera_height_m
+        return build_cameras(
             scenario.cameras,
             self._scene,
             Street.of(scenario.scene, height),
@@ -112,12 +132,6 @@ class Simulation:
             scenario.start_ns,
             self.seed,
         )
-        lidar_at = (lambda stamp_ns: self.T_world_lidar(stamp_ns)[1]) if scenario.truth_visible else None
-        self._true = TruthRecords(self.truth, self._scene.world, lidar_at)
-        self.lidar_clock_ns = 0  # how far the LiDAR's clock is ahead of the scenario's
-        self.pulses = 0
-        self.returns = 0
-        self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from drones
 
     def records(self) -> Iterator[Record]:
         """All records in order of arrival, numbered."""
@@ -222,9 +236,11 @@ def simulate(
     overwrite: bool = False,
     closed_loop: FilePath | None = None,
     duration_s: float | None = None,
+    pictures: FilePath | None = None,
 ) -> SimulationReport:
     """Run a scenario file into a recording, in closed loop with a configuration if one is given.
 
+    `pictures` is a recording of the same flight whose pictures are taken instead of painted; not a byte differs.
     `progress` is told the share done, 0 to 1. Errors are LinkError, and ConfigError for the configuration's.
     """
     asked = {"seed": seed, "duration_s": duration_s}
@@ -232,7 +248,7 @@ def simulate(
     loop = None
     if closed_loop is not None:
         loop = load_loop(closed_loop, checked.rig_yaml(), f"{checked.name} (rig)", checked.closed_loop)
-    return simulate_into(out, checked, progress, overwrite, loop)
+    return simulate_into(out, checked, progress, overwrite, loop, pictures)
 
 
 def simulate_into(
@@ -241,10 +257,13 @@ def simulate_into(
     progress: Callable[[float], None] | None = None,
     overwrite: bool = False,
     loop: ClosedLoop | None = None,
+    pictures: FilePath | None = None,
 ) -> SimulationReport:
     """The same for a scenario in memory. The recording keeps the whole scenario, with every setting, as its config."""
+    if pictures is not None and out.exists() and out.samefile(pictures):
+        raise LinkError(f"{out} is both what is written and where pictures come from: take another name for one")
     began = time.perf_counter()
-    simulation = Simulation(checked, loop=loop)
+    simulation = Simulation(checked, loop=loop, pictures=pictures and KeptPictures(pictures, checked))
     metadata = {"made_by": "grd simulate", "scenario": checked.name, "seed": str(simulation.seed)}
     if loop is not None:
         metadata |= loop.made_with

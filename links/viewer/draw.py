@@ -38,6 +38,7 @@ from stages.messages import (
     Detections,
     DroneFix,
     DroneMotion,
+    FollowedFeatures,
     Image,
     LidarFirings,
     RelativePose,
@@ -76,6 +77,7 @@ draw.register(DroneFix)(draw_drone.drone_fix)
 draw.register(TrackState)(draw_drone.track_state)
 draw.register(Image)(draw_cameras.image)
 draw.register(VanishingDirections)(draw_cameras.vanishing_directions)
+draw.register(FollowedFeatures)(draw_cameras.followed_features)
 draw.register(RelativeRotation)(draw_rotation.relative_rotation)
 draw.register(DroneMotion)(draw_rotation.drone_motion)
 draw.register(RelativePose)(draw_pose.relative_pose)

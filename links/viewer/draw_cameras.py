@@ -1,8 +1,8 @@
-"""How the cameras' messages look: the picture, the lines found in it, and the directions these run in.
+"""How the cameras' messages look: the picture, its lines and the directions these run in, the features followed.
 
-Lines and directions stand on their own picture only: where that one was left out, they are on the sphere alone.
+They stand on their own picture only: where that one was left out, lines and directions are on the sphere alone.
 
-Source: ours, for P IV and V.C. A fisheye is no pinhole: rays are drawn where its lens puts them.
+Source: ours, for P IV, V.B, V.C and V.E. A fisheye is no pinhole: rays are drawn where its lens puts them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from links.viewer.lenses import arcs, pixels_of, strips
 from links.viewer.marks import Marks, lane_of, plot, say, stage_of, state
 from links.viewer.scene import Mark, Picture, Scene, sphere_frame
 from stages.geometry import Array64
-from stages.messages import Image, VanishingDirections
+from stages.messages import FollowedFeatures, Image, VanishingDirections
 
 PICTURE_PX = 480  # longer side of a picture in the viewer
 JPEG_QUALITY = 75
@@ -62,6 +62,27 @@ def vanishing_directions(message: VanishingDirections, name: str, scene: Scene) 
     points, arc = arcs(message.line_end)
     yield from _sphere(message, f"sphere/{name}", points, arc, by_line, by_direction)
     yield from _on_picture(message, name, points, arc, by_line, by_direction, scene)
+
+
+def followed_features(message: FollowedFeatures, name: str, scene: Scene) -> Marks:
+    """Each feature as a stroke from where it was to where it is: green where it agrees with the motion found."""
+    agree = int(np.count_nonzero(message.agrees))
+    yield plot(f"plots/other/{name}/features", [len(message.agrees), agree], ["features followed", "that agree"])
+    if agree:
+        median_deg = math.degrees(float(np.median(message.residual_rad[message.agrees])))
+        yield plot(f"plots/other/{name}/residual", [median_deg], ["residual of those that agree, median [deg]"])
+    picture = scene.pictures.get(message.frame_id)
+    if picture is None or picture.stamp_ns != message.stamp_ns:
+        return
+    strokes = np.stack([picture.shown(message.pixel_from), picture.shown(message.pixel_to)], axis=1)
+    packed = np.where(message.agrees, np.uint32(colours.GOOD), np.uint32(colours.BAD))
+    path = f"camera/{message.frame_id}/{name}"
+    lines = rr.LineStrips2D(
+        strokes.astype(np.float32), colors=packed, radii=rr.Radius.ui_points(LINE_POINTS), draw_order=10
+    )
+    yield Mark(f"{path}/strokes", lines)
+    ends = rr.Points2D(strokes[:, 1], colors=packed, radii=rr.Radius.ui_points(1.5), draw_order=11)
+    yield Mark(f"{path}/ends", ends)
 
 
 def direction_colours(message: VanishingDirections) -> NDArray[np.uint32]:

@@ -14,6 +14,9 @@ nothing at all (a false fix), `m` of those told the wrong way round. None of the
 bird: any direction is alike then, with the odometry's length or with any; or when the streets were matched askew: then
 an angle between the branches explains all windows, without the large steady drift that a branch would need for it.
 
+Before any street is known the same windows weigh headings all round the circle (HeadingBank): where streets run at many
+angles, the heading by motion tells which of them both cameras see.
+
 Source: ours; DESIGN, Yaw branch: a naive bank was 30 % wrong.
 """
 
@@ -30,9 +33,18 @@ from stages.geometry import Array64
 NONE = 4  # index of "none of them" in a bank's probabilities
 ASKEW = 16  # hypotheses round the circle: the branches are each fourth, those between are streets matched askew
 ASKEW_SHARE = 0.02  # of the chance that none is right, at first; the rest is nonsense
-TURNS_RAD = 2 * math.pi / ASKEW * np.arange(ASKEW)
-R_TURNS = np.array([[[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]] for a in TURNS_RAD])  # (ASKEW, 2, 2)
-BRANCHES = np.arange(0, ASKEW, ASKEW // 4)
+
+HEADING_STEP_DEG = 2.5
+NONSENSE_LIKELY = 0.01
+WORST_HEADING_RAD = math.radians(4.0)  # one sigma: streets are 14 deg and more apart
+
+
+@dataclass(frozen=True)
+class Heading:
+    """How far the odometry has to be turned, on the whole circle."""
+
+    turn_rad: float
+    sigma_rad: float
 
 
 class BranchSettings(BaseModel):
@@ -53,13 +65,23 @@ class BranchSettings(BaseModel):
     leak_per_s: float = Field(default=1e-6, ge=0)  # a known branch is forgotten this fast
 
 
+def turns_rad(count: int) -> Array64:
+    """Angles (count,) round the circle, from 0 on."""
+    return 2 * math.pi / count * np.arange(count, dtype=np.float64)
+
+
+def turns(count: int) -> Array64:
+    """The same as rotations (count, 2, 2)."""
+    return np.array([[[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]] for a in turns_rad(count)])
+
+
 @dataclass(frozen=True)
 class Displacement:
     """One window: the drone's way, told twice; horizontal, start frame. Branch 0 has turned the odometry's into it."""
 
     start_ns: int
     end_ns: int
-    lidar_m: Array64  # (ASKEW, 2) as each hypothesis has it: fixes are averaged along the way it believes
+    lidar_m: Array64  # (h, 2) as each hypothesis has it: fixes are averaged along the way it believes
     lidar_m2: Array64  # (2, 2) covariance
     odometry_m: Array64  # (2,) by branch 0; of unknown length when `metric` is false
     bearing_rad: float  # error of the odometry's direction, turned by branch 0
@@ -74,8 +96,11 @@ class Displacement:
 class BranchBank:
     """Probabilities of four branches, counted from a yaw that is followed through time, and of none of them."""
 
-    def __init__(self, settings: BranchSettings) -> None:
+    def __init__(self, settings: BranchSettings, hypotheses: int = ASKEW) -> None:
+        """`hypotheses` round the circle, a multiple of 4."""
         self.settings = settings
+        self._turns_rad, self._R = turns_rad(hypotheses), turns(hypotheses)
+        self._branches = np.arange(0, hypotheses, hypotheses // 4)
         self.windows = 0  # of evidence since the last reset
         self._last_ns: int | None = None
         self.reset()
@@ -84,27 +109,26 @@ class BranchBank:
         """Nothing is known, except how likely it is that none is right."""
         self._weight = self._first(self.settings.none_right if none_right is None else none_right)
         self.windows = 0
-        self._drift_mps = np.zeros((ASKEW, 2))
-        self._drift_m2ps2 = np.tile(np.eye(2) * self.settings.drift_mps**2, (ASKEW, 1, 1))
+        self._drift_mps = np.zeros((len(self._R), 2))
+        self._drift_m2ps2 = np.tile(np.eye(2) * self.settings.drift_mps**2, (len(self._R), 1, 1))
         self._drift_ns: int | None = None
 
-    @staticmethod
-    def _first(none: float) -> Array64:
-        """Weights (ASKEW + 1,): the hypotheses round the circle, then nonsense."""
-        weight = np.full(ASKEW + 1, ASKEW_SHARE * none / (ASKEW - 4))
-        weight[BRANCHES] = (1 - none) / 4
+    def _first(self, none: float) -> Array64:
+        """Weights (h + 1,): the hypotheses round the circle, then nonsense."""
+        weight = np.full(len(self._R) + 1, ASKEW_SHARE * none / (len(self._R) - 4))
+        weight[self._branches] = (1 - none) / 4
         weight[-1] = (1 - ASKEW_SHARE) * none
         return weight
 
     @property
     def probability(self) -> Array64:
         """(5,): of the four branches, and that none of them is right."""
-        branches = self._weight[BRANCHES]
+        branches = self._weight[self._branches]
         return np.append(branches, max(1.0 - branches.sum(), 0.0))
 
     def best(self, current: int) -> int:
         """The most probable branch; `current` if it is as probable as any."""
-        p = self._weight[BRANCHES]
+        p = self._weight[self._branches]
         return current if p[current] >= p.max() * (1 - 1e-9) else int(np.argmax(p))
 
     def resolved(self, branch: int, probability: float) -> bool:
@@ -123,12 +147,13 @@ class BranchBank:
 
     def slip(self, weights: Array64) -> None:
         """The followed yaw may be quarter turns off what it was: `weights` (4,), index m: true branch is now k + m."""
-        round_ = self._weight[:ASKEW]
-        self._weight[:ASKEW] = sum(float(w) * np.roll(round_, m * ASKEW // 4) for m, w in enumerate(weights))
+        h = len(self._R)
+        round_ = self._weight[:h]
+        self._weight[:h] = sum(float(w) * np.roll(round_, m * h // 4) for m, w in enumerate(weights))
 
     def expect_yaw(self, off_rad: float, sigma_rad: float, trust: float) -> None:
         """A compass's or somebody's word: `off_rad` is how far branch 0 is from it; `trust` that it means anything."""
-        off = (off_rad + TURNS_RAD + math.pi) % (2 * math.pi) - math.pi
+        off = (off_rad + self._turns_rad + math.pi) % (2 * math.pi) - math.pi
         near = np.exp(-0.5 * (off / sigma_rad) ** 2) / (math.sqrt(2 * math.pi) * sigma_rad)
         self._weigh(np.append(trust * near + (1 - trust) / (2 * math.pi), 1 / (2 * math.pi)))
 
@@ -138,17 +163,17 @@ class BranchBank:
         self.windows += 1
 
     def _weigh(self, likelihood: Array64) -> None:
-        """Bayes' rule; likelihood (ASKEW + 1,)."""
+        """Bayes' rule; likelihood (h + 1,)."""
         self._weight = self._weight * likelihood
         self._weight /= self._weight.sum()
 
     def _metric(self, moved: Displacement) -> Array64:
-        """Likelihoods (ASKEW + 1,); the drift of each hypothesis that believes the window is updated."""
+        """Likelihoods (h + 1,); the drift of each hypothesis that believes the window is updated."""
         s, T = self.settings, moved.seconds
         length = float(np.linalg.norm(moved.odometry_m))
         reach = 2.0 * max(length, float(np.linalg.norm(moved.lidar_m[0]))) + 1.0
         nonsense = 1.0 / (math.pi * reach**2)
-        told = R_TURNS @ moved.odometry_m
+        told = self._R @ moved.odometry_m
         along = told / max(length, 1e-9)
         stretched = (s.scale * length) ** 2 * along[:, :, None] * along[:, None, :]
         across = np.column_stack([-along[:, 1], along[:, 0]])
@@ -172,7 +197,7 @@ class BranchBank:
         """Density of a way as long as the odometry's in any direction: what flies like the drone and is not it."""
         s, T = self.settings, moved.seconds
         variance = 0.5 * float(np.trace(moved.lidar_m2)) + (s.scale * length) ** 2 + (T * s.drift_mps) ** 2
-        seen = float(np.linalg.norm(moved.lidar_m, axis=1).sum() / ASKEW)
+        seen = float(np.linalg.norm(moved.lidar_m, axis=1).mean())
         ring = math.exp(-0.5 * (seen - length) ** 2 / variance) / math.sqrt(2 * math.pi * variance)
         return ring / (2 * math.pi * max(seen, math.sqrt(variance)))
 
@@ -186,9 +211,9 @@ class BranchBank:
         self._drift_ns = stamp_ns if self._drift_ns is None else max(self._drift_ns, stamp_ns)
 
     def _bearing(self, moved: Displacement) -> Array64:
-        """Likelihoods (ASKEW + 1,) of a direction without a length."""
+        """Likelihoods (h + 1,) of a direction without a length."""
         s, way = self.settings, moved.lidar_m
-        told = R_TURNS @ moved.odometry_m
+        told = self._R @ moved.odometry_m
         length = np.linalg.norm(way, axis=1)
         variance = moved.bearing_rad**2 + math.radians(s.bearing_floor_deg) ** 2
         variance += (0.5 * float(np.trace(moved.lidar_m2)) + (s.drift_mps * moved.seconds) ** 2) / length**2
@@ -199,3 +224,27 @@ class BranchBank:
         anywhere = 1 / (2 * math.pi)
         near = (right + wrong_way) / (math.sqrt(2 * math.pi) * sigma)
         return np.append(near + s.bearing_outliers * anywhere, anywhere)
+
+
+class HeadingBank(BranchBank):
+    """The same evidence while no street is known: any heading is alike at first, in steps of HEADING_STEP_DEG."""
+
+    HYPOTHESES = round(360 / HEADING_STEP_DEG)
+
+    def __init__(self, settings: BranchSettings) -> None:
+        super().__init__(settings, self.HYPOTHESES)
+
+    def _first(self, none: float) -> Array64:
+        """Weights (h + 1,): all headings, then nonsense."""
+        return np.append(np.full(len(self._R), (1 - none) / len(self._R)), none)
+
+    @property
+    def heading(self) -> Heading | None:
+        """Their mean; None while they are spread too far, too few windows have spoken, or nonsense is likely."""
+        weight = self._weight[:-1]
+        if self.windows < self.settings.least_windows or self._weight[-1] > NONSENSE_LIKELY:
+            return None
+        mean = complex((weight * np.exp(1j * self._turns_rad)).sum() / weight.sum())
+        sigma_rad = math.sqrt(-2.0 * math.log(min(abs(mean), 1.0))) if abs(mean) > 0.5 else math.inf
+        sigma_rad = math.hypot(sigma_rad, math.radians(HEADING_STEP_DEG) / math.sqrt(12.0))
+        return Heading(math.atan2(mean.imag, mean.real), sigma_rad) if sigma_rad < WORST_HEADING_RAD else None

@@ -8,6 +8,10 @@ A rotation is given for each picture of the drone's, or the reason why there is 
 `resolve_probability`; what the four lack to 1 is that none of them is right. Nothing but motion, or motion and a prior,
 gets there; what was RESOLVED is so no longer when the thread of turns is lost, or when motion says otherwise.
 
+Where streets run at many angles the lines alone seldom say which of them both cameras see. The drone's way, told by the
+LiDAR and by its autopilot, is a heading without a street (HeadingBank): it says which, and denies a match made askew.
+A picture that contradicts what was known of tilt or yaw is given out, but as uncertain as it is far off.
+
 Without `motion` the vehicle is taken to stand if `parked` says so; else nothing is concluded from the drone's motion.
 
 Source: ours, for P IV Eq. 7-10 and V.E; DESIGN, Vision and Yaw branch.
@@ -24,13 +28,14 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
-from stages.align.branches import NONE, BranchBank, BranchSettings
+from stages.align.branches import NONE, BranchBank, BranchSettings, Heading, HeadingBank
 from stages.align.lock import YawLock
 from stages.align.pairing import Pair, Pairing
-from stages.align.reckoning import Reckoning
+from stages.align.reckoning import Reckoned, Reckoning
 from stages.align.refine import Refined, Tolerances, refine, street_directions
-from stages.align.spectra import level_lines, spectrum
+from stages.align.spectra import level_lines, quarter_difference, spectrum
 from stages.align.windows import Windows
+from stages.geometry import Array64
 from stages.messages import (
     BranchState,
     Carrier,
@@ -48,6 +53,8 @@ SILENCE_SHARE = 1e-4  # chance that the autopilot's heading jumped while it was 
 NONSENSE = 0.99  # that none of the branches is right, from which all is begun anew
 SUSPICION = 0.95  # of that, then
 JUMP_RAD = math.radians(30.0)  # of what is given out
+SURPRISE_RAD = math.radians(0.3)  # beyond the tilts' own errors
+SURE_RAD2 = math.radians(1.0) ** 2  # of the turns felt between two pictures: worse ones contradict nobody
 BEARING_RAD = math.radians(2.0)  # error of an odometry's heading within a window
 
 
@@ -59,12 +66,15 @@ class _Now:
     bank: BranchBank
     windows: Windows
     reckoning: Reckoning
+    headings: HeadingBank  # of the offset, whatever the streets say
+    heading_windows: Windows
     lock: YawLock = field(default_factory=YawLock)
     branch: int = 0  # given out, counted from the yaw followed
     given_rad: float | None = None  # yaw given out less the dead reckoned one
     switches: int = 0
     news: str = ""  # to be told with the next rotation
     expected: bool = False  # the prior has been weighed
+    surprised: bool = False  # the pictures before contradicted the turns felt
 
 
 class JointAlign(Stage):
@@ -98,6 +108,8 @@ class JointAlign(Stage):
             BranchBank(self.branches),
             Windows(self.branches.baseline_m),
             Reckoning(self.parked),
+            HeadingBank(self.branches),
+            Windows(self.branches.baseline_m, HeadingBank.HYPOTHESES),
         )
 
     def on_motion(self, motion: VehicleMotion) -> None:
@@ -126,7 +138,10 @@ class JointAlign(Stage):
         now, offset_rad = self._now, self._now.lock.offset_rad
         if not now.reckoning.vehicle_known:
             return
-        now.windows.add_fix(fix, *now.reckoning.vehicle.at(fix.stamp_ns), now.reckoning.autopilot)
+        at = now.reckoning.vehicle.at(fix.stamp_ns)
+        now.windows.add_fix(fix, *at, now.reckoning.autopilot)
+        now.heading_windows.add_fix(fix, *at, now.reckoning.autopilot)
+        self._hear_heading(fix.stamp_ns)
         if offset_rad is None:
             return
         bearing_rad = math.hypot(math.sqrt(now.lock.variance_rad2), BEARING_RAD)
@@ -141,6 +156,16 @@ class JointAlign(Stage):
             if now.bank.probability[NONE] > NONSENSE:
                 now.lock.forget()
                 self._begin_anew("the drone's motion fits no branch, all is begun anew")
+
+    def _hear_heading(self, stamp_ns: int) -> None:
+        """The way that the autopilot tells, laid on the LiDAR's: its heading, without a street."""
+        now = self._now
+        R_start_own = now.reckoning.R_start_own(0.0)
+        if R_start_own is None or now.reckoning.autopilot.place(stamp_ns) is None:
+            return
+        moved = now.heading_windows.close_metric(R_start_own, 0.0)
+        if moved is not None:
+            now.headings.see(moved)
 
     def on_vehicle(self, seen: VanishingDirections) -> Iterator[RelativeRotation]:
         """The vehicle's lines."""
@@ -175,9 +200,14 @@ class JointAlign(Stage):
         a, b = spectrum(vehicle), spectrum(drone)
         now = self._now
         reckoned = now.reckoning.advance(vehicle_ns, drone_ns, vehicle, drone)
+        silences = now.reckoning.new_silences()
         now.bank.pass_time(drone_ns)
-        now.bank.mix(1.0 - (1.0 - SILENCE_SHARE) ** now.reckoning.new_silences())
-        match = now.lock.choose(a, b, reckoned, now.reckoning.rate_radps(drone_ns))
+        now.bank.mix(1.0 - (1.0 - SILENCE_SHARE) ** silences)
+        told = self._told_heading(drone_ns, silences)
+        if now.lock.denied(told):
+            now.lock.let_go()
+            self._begin_anew("the drone's motion denies the streets matched, all is begun anew")
+        match = now.lock.choose(a, b, reckoned, now.reckoning.rate_radps(drone_ns), told)
         if match.yaw_rad is None:
             return self._no_rotation(drone_ns, match.reason)
         streets = street_directions(a, b, match.yaw_rad)
@@ -186,10 +216,44 @@ class JointAlign(Stage):
             return self._no_rotation(drone_ns, "too few lines run along the same streets")
         if now.lock.relocked:
             self._begin_anew("the lines match elsewhere for long now, all is begun anew there")
+        off_yaw = self._surprising_yaw(refined, reckoned)
         now.bank.slip(now.lock.accept(refined.yaw_rad, refined.yaw_sigma_rad, reckoned))
-        now.reckoning.correct(vehicle_ns, refined, reckoned.yaw_rad)
+        off = self._surprising_tilt(vehicle_ns, refined, reckoned) + off_yaw * refined.R_drone_level[:, 2]
         self._expect(refined, drone_ns)
-        return self._rotation(vehicle_ns, drone_ns, refined, reckoned.yaw_rad)
+        return self._rotation(vehicle_ns, drone_ns, refined, reckoned.yaw_rad, off)
+
+    def _surprising_yaw(self, refined: Refined, reckoned: Reckoned) -> float:
+        """By how much [rad] this picture's yaw is off what was known before; 0 if that is near."""
+        lock = self._now.lock
+        if lock.offset_rad is None or lock.relocked or not lock.variance_rad2 < SURE_RAD2:
+            return 0.0
+        off_rad = quarter_difference(refined.yaw_rad - reckoned.yaw_rad - lock.offset_rad)
+        near_rad = 3.0 * math.hypot(refined.yaw_sigma_rad, math.sqrt(lock.variance_rad2)) + SURPRISE_RAD
+        return off_rad if abs(off_rad) > near_rad else 0.0
+
+    def _surprising_tilt(self, vehicle_ns: int, refined: Refined, reckoned: Reckoned) -> Array64:
+        """Tilt (3,) [rad], the drone's axes, by which the pictures contradict the turns felt since the last ones.
+
+        Zero where they agree. Leaves and cars have verticals of their own: one picture's word against the turns is not
+        taken over, two pictures' is.
+        """
+        now = self._now
+        off = now.reckoning.tilt_off(vehicle_ns, refined, reckoned.yaw_rad)
+        tilts = float(np.trace(refined.covariance[:4, :4])) / 2 + reckoned.variance_rad2
+        surprised = float(np.linalg.norm(off)) > 3.0 * math.sqrt(tilts) + SURPRISE_RAD
+        if not surprised or now.surprised or not reckoned.variance_rad2 < SURE_RAD2:
+            now.reckoning.correct(vehicle_ns, refined, reckoned.yaw_rad)
+        now.surprised = surprised
+        return off if surprised and reckoned.variance_rad2 < SURE_RAD2 else np.zeros(3)
+
+    def _told_heading(self, stamp_ns: int, silences: int) -> Heading | None:
+        """The offset as the drone's motion tells it; forgotten when the autopilot may have turned its north unheard."""
+        headings = self._now.headings
+        headings.pass_time(stamp_ns)
+        if silences:
+            headings.reset()
+            self._now.heading_windows.restart()
+        return headings.heading
 
     def _expect(self, refined: Refined, drone_ns: int) -> None:
         """Weigh the word of people or of a compass, once."""
@@ -207,8 +271,10 @@ class JointAlign(Stage):
             now.bank.expect_yaw(off_rad, math.radians(self.prior_sigma_deg), self.prior_trust)
             now.expected = True
 
-    def _rotation(self, vehicle_ns: int, drone_ns: int, refined: Refined, reckoned_rad: float) -> RelativeRotation:
-        """The message for the most probable branch."""
+    def _rotation(
+        self, vehicle_ns: int, drone_ns: int, refined: Refined, reckoned_rad: float, off: Array64
+    ) -> RelativeRotation:
+        """The message for the most probable branch; `off`: by how much it contradicts what is known, its error then."""
         now = self._now
         before, now.branch = now.branch, now.bank.best(now.branch)
         given_rad = refined.yaw_rad + now.branch * math.pi / 2 - reckoned_rad
@@ -222,7 +288,7 @@ class JointAlign(Stage):
         probability = np.roll(now.bank.probability[:4], -now.branch)
         resolved = now.bank.resolved(now.branch, self.resolve_probability)
         left, right, stamp_ns, variance_rad2 = now.reckoning.at_one_moment(vehicle_ns, drone_ns)
-        covariance = right.T @ refined.covariance_rad2(now.branch) @ right
+        covariance = right.T @ (refined.covariance_rad2(now.branch) + np.outer(off, off)) @ right
         told = f"{refined.directions} directions, {refined.vehicle_lines} and {refined.drone_lines} lines"
         known = f"{now.bank.windows} windows of motion, none right: {now.bank.probability[NONE]:.1g}"
         news, now.news = now.news, ""

@@ -11,8 +11,9 @@ further matches. The first one is taken from the maps, which know more streets t
     nearly all lines of both cameras match and no other match comes near     (streets at right angles), or
     most lines match, along two directions or more, and no other comes near  (streets at other angles)
 
-as one direction alone could be any of the streets. A match elsewhere that fits the maps better for long is taken
-over, and the jump is told.
+as one direction alone could be any of the streets. Where the drone's motion has told its heading (branches.py), the
+match there is taken though others compete, and one that motion denies is let go. A match elsewhere that fits the maps
+better for long is taken over, and the jump is told.
 
 Source: ours.
 """
@@ -24,6 +25,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from stages.align.branches import Heading
 from stages.align.reckoning import Reckoned
 from stages.align.spectra import BIN_RAD, BINS, Peak, overlap, peaks, quarter_difference, shared_directions
 from stages.geometry import Array64
@@ -31,6 +33,8 @@ from stages.geometry import Array64
 APART_RAD = math.radians(4.0)  # matches nearer to each other are one
 NEARLY_ALL, MOST = 0.8, 0.75  # of the lines
 ONE_COMPETES, MORE_COMPETE = 0.65, 0.72  # a second match with this share of the best's likeness could be it
+SOME = 0.35  # of the lines, where motion says that it is this match
+DENIED_RAD = math.radians(3.0)  # beyond the heading's own errors: how far streets and motion may be apart
 LEAST = 0.2  # likeness of the match that is followed, in one picture
 GATE_RAD = math.radians(2.5)  # of the prediction
 STRIKE_S = 2.0  # a better match elsewhere is believed after this time
@@ -67,8 +71,21 @@ class YawLock:
         self._vehicle, self._drone = np.zeros(BINS), np.zeros(BINS)
         self._better_since_ns = None
 
-    def choose(self, vehicle: Array64, drone: Array64, at: Reckoned, rate_radps: float) -> Match:
-        """Which match of this pair's spectra (BINS,) it is, while the drone turns at some rate."""
+    def denied(self, told: Heading | None) -> bool:
+        """Whether the drone's motion says that another match is followed than the true one."""
+        return self.offset_rad is not None and told is not None and not _agrees(told, self.offset_rad)
+
+    def let_go(self) -> None:
+        """Follow nothing; what was seen is remembered."""
+        self.offset_rad, self._better_since_ns = None, None
+
+    def choose(
+        self, vehicle: Array64, drone: Array64, at: Reckoned, rate_radps: float, told: Heading | None = None
+    ) -> Match:
+        """Which match of this pair's spectra (BINS,) it is, while the drone turns at some rate.
+
+        `told`: the offset as the drone's motion tells it.
+        """
         self.relocked = False
         self.variance_rad2 += at.variance_rad2
         self._remember(vehicle, drone, at)
@@ -76,9 +93,9 @@ class YawLock:
         if not found:
             return Match(None, "the two cameras' lines have no direction in common")
         if self.offset_rad is None or self.variance_rad2 > LOST_RAD2:
-            return self._first(found, at)
+            return self._first(found, at, told)
         if self._better_elsewhere(at.stamp_ns):
-            match = self._first(found, at)
+            match = self._first(found, at, told)
             self.relocked = match.yaw_rad is not None
             return match
         predicted = at.yaw_rad + self.offset_rad
@@ -118,15 +135,35 @@ class YawLock:
             return None, f"two matches {apart_deg:.0f} deg apart fit {best.likeness:.0%} and {second:.0%} of the lines"
         return best, ""
 
-    def _first(self, found: list[Peak], at: Reckoned) -> Match:
+    def _first(self, found: list[Peak], at: Reckoned, told: Heading | None) -> Match:
         """The match of the maps, if this picture has it too."""
         best, reason = self._clear()
         if best is None:
-            return Match(None, reason)
+            return Match(None, reason) if told is None else self._by_motion(found, at, told, reason)
+        if told is not None and not _agrees(told, best.yaw_rad):
+            return Match(None, "the lines match best elsewhere than the drone's motion says")
         near = [peak for peak in found if abs(quarter_difference(peak.yaw_rad - at.yaw_rad - best.yaw_rad)) < GATE_RAD]
         if not near:
             return Match(None, "this picture's lines match elsewhere than those of the last seconds")
         start = at.yaw_rad + (self.offset_rad or 0.0)
+        return Match(start + quarter_difference(near[0].yaw_rad - start), "")
+
+    def _by_motion(self, found: list[Peak], at: Reckoned, told: Heading, reason: str) -> Match:
+        """The only match of the maps and of this picture where the drone's motion says it is."""
+        reach_rad = 3.0 * told.sigma_rad + math.radians(1.0)
+        of_maps = [
+            peak
+            for peak in peaks(overlap(self._vehicle, self._drone), APART_RAD)
+            if peak.likeness > SOME and abs(quarter_difference(peak.yaw_rad - told.turn_rad)) < reach_rad
+        ]
+        if len(of_maps) != 1:
+            which = "several matches" if of_maps else "no match"
+            return Match(None, f"{reason}, and {which} where the drone's motion says")
+        offset_rad = told.turn_rad + quarter_difference(of_maps[0].yaw_rad - told.turn_rad)
+        start = at.yaw_rad + offset_rad
+        near = [peak for peak in found if abs(quarter_difference(peak.yaw_rad - start)) < GATE_RAD]
+        if not near:
+            return Match(None, "this picture's lines match elsewhere than those of the last seconds")
         return Match(start + quarter_difference(near[0].yaw_rad - start), "")
 
     def _better_elsewhere(self, stamp_ns: int) -> bool:
@@ -157,3 +194,8 @@ class YawLock:
         self.offset_rad += gain * innovation
         self.variance_rad2 *= 1 - gain
         return weights / weights.sum()
+
+
+def _agrees(told: Heading, offset_rad: float) -> bool:
+    """Whether an offset is, up to quarter turns, where the drone's motion says."""
+    return abs(quarter_difference(offset_rad - told.turn_rad)) < 4.0 * told.sigma_rad + DENIED_RAD

@@ -20,6 +20,7 @@ from stages.align.spectra import LevelLines
 from stages.drone_trail import AutopilotTrail, PictureTrail, turn_between
 from stages.geometry import Array64, rotation_z
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
+from stages.rotation import log_rotation
 from stages.trail import VehicleTrail
 
 VEHICLE_RAD_PER_S = math.radians(20.0)  # a vehicle that does not tell its turns may turn like this
@@ -107,8 +108,17 @@ class Reckoning:
 
     def correct(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> None:
         """Take the tilts that the pictures tell; the yaw stays the dead reckoned one."""
+        self._R_start_drone = self._told(vehicle_ns, refined, reckoned_rad)
+
+    def tilt_off(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> Array64:
+        """How far (3,) [rad] the tilts that the pictures tell are from the dead reckoned ones, the drone's axes."""
+        R = self._told(vehicle_ns, refined, reckoned_rad)
+        off, up = log_rotation(np.ascontiguousarray(self._R_start_drone.T @ R)), R[2]
+        return off - (off @ up) * up
+
+    def _told(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> Array64:
         level = refined.R_vehicle_level @ rotation_z(reckoned_rad) @ refined.R_drone_level.T
-        self._R_start_drone = self.vehicle.at(vehicle_ns)[0] @ level
+        return self.vehicle.at(vehicle_ns)[0] @ level
 
     def R_start_own(self, offset_rad: float) -> Array64 | None:
         """How the autopilot's frame `own` is turned in the start frame; None: it has no attitude now."""

@@ -43,7 +43,7 @@ class Tolerances:
     straight_rad: float  # a line of a street
     direction_rad: float  # what all lines that one camera has of a street share
     square_rad: float  # a crossing
-    tilt_rad: float  # a vertical, beyond what its picture says
+    tilt_rad: float  # a vertical, beyond what its picture says, and what all lines of a picture share
 
 
 @dataclass(frozen=True)
@@ -212,12 +212,14 @@ def refine(
             eye.azimuth = eye.azimuth + step[own[c] : own[c] + K]
         yaw += float(step[4])
         a = a + step[street : street + K]
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)[:TILTS_AND_YAW, :TILTS_AND_YAW]
+    covariance[range(4), range(4)] += allowed.tilt_rad**2  # hundreds of lines share this, too
     both = sum(1 for k in range(K) if all(np.any(eye.k == k) for eye in eyes))
     return Refined(
         R_vehicle_level=eyes[0].R,
         R_drone_level=eyes[1].R,
         yaw_rad=yaw,
-        covariance=np.asarray(np.linalg.inv(information), dtype=np.float64)[:TILTS_AND_YAW, :TILTS_AND_YAW],
+        covariance=covariance,
         directions=both,
         vehicle_lines=round(eyes[0].sees),
         drone_lines=round(eyes[1].sees),

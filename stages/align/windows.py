@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.align.branches import ASKEW, R_TURNS, Displacement
+from stages.align.branches import ASKEW, Displacement, turns
 from stages.drone_trail import AutopilotTrail
 from stages.geometry import Array64
 from stages.messages import DroneFix, DroneMotion
@@ -53,8 +53,10 @@ class _Handful:
 class Windows:
     """Collects fixes and steps; `close` tells the displacement since the last window, once it is long enough."""
 
-    def __init__(self, baseline_m: float) -> None:
+    def __init__(self, baseline_m: float, hypotheses: int = ASKEW) -> None:
+        """`hypotheses` round the circle, as the bank has that is told."""
         self._baseline_m = baseline_m
+        self._R = turns(hypotheses)
         self._recent: deque[_Fix] = deque(maxlen=HANDFUL)
         self._start: _Handful | None = None
         self._track: int | None = None
@@ -100,10 +102,10 @@ class Windows:
         middle = [np.mean(t, axis=0) for t in told]
         odometry = middle[1] - middle[0]
         left = [  # of the fixes, when the way told is taken off as each hypothesis turns it
-            np.median(np.array([f.xyz_start_m[:2] for f in h.fixes]) - np.array(t) @ np.swapaxes(R_TURNS, 1, 2), axis=1)
+            np.median(np.array([f.xyz_start_m[:2] for f in h.fixes]) - np.array(t) @ np.swapaxes(self._R, 1, 2), axis=1)
             for h, t in zip((start, end), told, strict=True)
         ]
-        lidar = left[1] - left[0] + R_TURNS @ odometry
+        lidar = left[1] - left[0] + self._R @ odometry
         noise = start.covariance_m2 + end.covariance_m2
         length, sigma = float(np.linalg.norm(odometry)), math.sqrt(0.5 * float(np.trace(noise)))
         seen = float(np.linalg.norm(lidar, axis=1).min())
@@ -136,7 +138,7 @@ class Windows:
         flat = float(np.linalg.norm(flown[:2]))
         if covered < COVERED * (end.stamp_ns - start.stamp_ns) or flat < STRAIGHT * max(flew, 1.0):
             return None
-        lidar = np.tile(way, (ASKEW, 1))
+        lidar = np.tile(way, (len(self._R), 1))
         return Displacement(
             start.stamp_ns, end.stamp_ns, lidar, noise, flown[:2] / flat, math.hypot(sigma, bearing_rad), False
         )

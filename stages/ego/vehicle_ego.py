@@ -8,7 +8,8 @@
 The start frame is the vehicle's at the first picture, or, when it drove off without any length known, at the first
 one from which a length was known. Its z axis is up as far as the vehicle stood level.
 
-A vehicle with odometry of its own needs none of this: wire links.vehicle_odometry instead.
+A vehicle with odometry of its own needs none of this. Wired as `odometry` it lets the stage rest while it is heard;
+when it falls silent the stage begins anew, with the speed that it told last (motion_choice.py joins the two).
 
 Source: P V.B (Harris and KLT, 5-DoF, scale from projected LiDAR points, windowed bundle adjustment).
 """
@@ -17,22 +18,24 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
 from stages.ego.lidar_depth import Depths, RayDepths
+from stages.ego.motion_choice import SILENT_S
 from stages.ego.scale import Length, length_of, parallax_ratio
 from stages.ego.step import Pose6, Step, after, believable, carried
 from stages.ego.window import KeyPicture, adjusted
 from stages.geometry import Array64, Pose
 from stages.lens import Lens
-from stages.messages import Image, SweptPoints, VehicleMotion
+from stages.messages import FollowedFeatures, Image, SweptPoints, VehicleMotion
 from stages.pictures.features import FeatureSettings, Tracks
-from stages.pictures.motion_link import Link, LinkSettings, MotionLinks
+from stages.pictures.motion_link import Link, LinkSettings, MotionLinks, followed
 from stages.pictures.two_view import backwards
 from stages.rotation import exp_rotation, log_rotation
 
@@ -40,6 +43,7 @@ ACCELERATION_MPS2 = 3.0  # one sigma: how far the last speed can be trusted when
 TURN_RADPS = 0.3  # one sigma of the turn rate, unseen
 STILL_M = 0.003  # one sigma of a place held because no motion is seen
 LEAST_LENGTHS = 3  # the first ones come from points placed by a speed not yet known
+SPEED_OF = 10  # poses of the odometry, its last speed
 REMEMBERED = 20_000  # LiDAR points
 WAITING_SLICES = 2_000
 
@@ -77,7 +81,9 @@ class _Now:
 
 
 class VehicleEgo(Stage):
-    """T_start_vehicle at every picture, by camera and LiDAR."""
+    """T_start_vehicle at every picture, by camera and LiDAR; nothing while the vehicle's own odometry is heard."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry"})
 
     lens: Lens
     T_vehicle_camera: Pose
@@ -86,45 +92,82 @@ class VehicleEgo(Stage):
     window_keys: int = Field(6, ge=3, le=12)  # pictures in the bundle adjustment
     every_nth_point: int = Field(2, ge=1, le=50)  # of the LiDAR's returns
     reach_deg: float = Field(2.0, gt=0.1, le=10)  # LiDAR points this near a feature tell its depth
+    silent_s: float = Field(SILENT_S, gt=0, le=10)  # of the odometry: two of its periods at least
 
     _links: MotionLinks = PrivateAttr()
     _mount: Array64 = PrivateAttr()
     _now: _Now = PrivateAttr(default_factory=_Now)
+    _odometry: deque[VehicleMotion] = PrivateAttr(default_factory=lambda: deque[VehicleMotion](maxlen=SPEED_OF))
+    _resting: bool = PrivateAttr(default=False)
 
     def model_post_init(self, context: Any, /) -> None:
         self._links = MotionLinks(self.lens, self.features, self.link)
         self._mount = self.T_vehicle_camera.matrix()
 
+    def on_odometry(self, motion: VehicleMotion) -> None:
+        """The vehicle tells its motion itself: nothing is to be done here."""
+        if not self._odometry or motion.stamp_ns > self._odometry[-1].stamp_ns:
+            self._odometry.append(motion)
+        self._resting = True
+
     def on_points(self, points: SweptPoints) -> None:
         """LiDAR returns wait until a picture has told where the vehicle was."""
+        if self._resting:
+            return
         n = self.every_nth_point
         xyz = points.xyz_vehicle_m[::n].astype(np.float64)
         if len(xyz):
             stamp_ns = int(points.point_stamp_ns[len(points.point_stamp_ns) // 2])
             self._now.waiting.append((stamp_ns, (xyz - self._mount[:3, 3]) @ self._mount[:3, :3]))
 
-    def on_image(self, image: Image) -> VehicleMotion | None:
-        """Where the vehicle is at this picture. None: as long as no length is known, and where nothing is followed."""
-        now = self._now
+    def on_image(self, image: Image) -> Iterator[VehicleMotion | FollowedFeatures]:
+        """Where the vehicle is at this picture, and from which features.
+
+        Nothing as long as no length is known, where nothing is followed, and while its own odometry is heard.
+        """
+        if self._resting:
+            if image.stamp_ns - self._odometry[-1].stamp_ns < self.silent_s * 1e9:
+                return
+            self._wake()
         link = self._links.feed(image.stamp_ns, image.grey)
+        if link is not None:
+            yield followed(link, image.frame_id)
+        motion = self._moved(image.stamp_ns, link)
+        if motion is not None:
+            yield motion
+
+    def _moved(self, stamp_ns: int, link: Link | None) -> VehicleMotion | None:
+        """Where the vehicle is at the newest picture."""
+        now = self._now
         tracks = self._links.key
         assert tracks is not None, "the first picture fed becomes the key"
         if link is None:
-            if tracks.stamp_ns != image.stamp_ns or (now.key is not None and now.key.tracks is tracks):
+            if tracks.stamp_ns != stamp_ns or (now.key is not None and now.key.tracks is tracks):
                 return None  # no newer than the last one
-            at = self._unseen(image.stamp_ns)
-            self._place(image.stamp_ns, at)
+            at = self._unseen(stamp_ns)
+            self._place(stamp_ns, at)
             now.key = self._key_picture(tracks, at, None)
             now.window.clear()
-            return self._told(image.stamp_ns, at) if now.told else None
+            return self._told(stamp_ns, at) if now.told else None
         assert now.key is not None
         step = self._step(now.key, link)
         at = after(now.key.at, step)
-        self._place(image.stamp_ns, at)
+        self._place(stamp_ns, at)
         if link.last:
             at = self._next_key(now.key, link, step, at, tracks)
         now.told |= now.metric or step.standing
-        return self._told(image.stamp_ns, at) if now.told else None
+        return self._told(stamp_ns, at) if now.told else None
+
+    def _wake(self) -> None:
+        """Begin anew at this picture; how fast the vehicle drives is known from its odometry."""
+        first, last = self._odometry[0], self._odometry[-1]
+        self._resting = False
+        self._links = MotionLinks(self.lens, self.features, self.link)
+        self._now = _Now(lengths=LEAST_LENGTHS, told=True)
+        if last.stamp_ns > first.stamp_ns:
+            way_m = float(np.linalg.norm(last.xyz_start_m - first.xyz_start_m))
+            self._now.speed_mps = way_m / ((last.stamp_ns - first.stamp_ns) * 1e-9)
+        self._odometry.clear()
 
     def _next_key(self, key: _Key, link: Link, step: Step, at: Pose6, tracks: Tracks) -> Pose6:
         """The newest picture becomes the key; its pose after bundle adjustment."""

@@ -14,6 +14,7 @@ Source: P V.E (5-point); ours: bearing vectors, key pictures, "no motion" as an 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,9 +23,9 @@ from pydantic import Field, PrivateAttr
 from flow.stage import Stage
 from stages.geometry import Array64, Pose
 from stages.lens import Lens
-from stages.messages import DroneImu, DroneMotion, Image
+from stages.messages import DroneImu, DroneMotion, FollowedFeatures, Image
 from stages.pictures.features import FeatureSettings
-from stages.pictures.motion_link import Link, LinkSettings, MotionLinks
+from stages.pictures.motion_link import Link, LinkSettings, MotionLinks, followed
 from stages.pictures.two_view import backwards
 from stages.rotation import exp_rotation
 
@@ -56,17 +57,19 @@ class FisheyeOdometry(Stage):
         if not self._gyro or imu.stamp_ns > self._gyro[-1][0]:
             self._gyro.append((imu.stamp_ns, imu.angular_velocity_drone_radps))
 
-    def on_image(self, image: Image) -> DroneMotion | None:
-        """The motion since the key picture. None: the first picture, or nothing to follow."""
+    def on_image(self, image: Image) -> Iterator[DroneMotion | FollowedFeatures]:
+        """The motion since the key picture, and from what. Nothing: the first picture, or nothing to follow."""
         gyro, before_ns = self._gyro, self._links.newest_ns
         while len(gyro) > 1 and gyro[1][0] <= before_ns:
             gyro.popleft()
         R = turned(list(gyro), before_ns, image.stamp_ns) if gyro else None
         C = self._R_drone_camera
         link = self._links.feed(image.stamp_ns, image.grey, None if R is None else C.T @ R.T @ C)
-        if link is None or np.count_nonzero(link.motion.inlier) < self.least_matches:
-            return None
-        return drone_motion(link, C)
+        if link is None:
+            return
+        yield followed(link, image.frame_id)
+        if np.count_nonzero(link.motion.inlier) >= self.least_matches:
+            yield drone_motion(link, C)
 
 
 def drone_motion(link: Link, R_drone_camera: Array64) -> DroneMotion:

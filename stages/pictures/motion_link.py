@@ -18,6 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from stages.geometry import Array64
 from stages.lens import Equidistant, KannalaBrandt, OCam
+from stages.messages import FollowedFeatures
+from stages.pictures.epipolar import epipolar
 from stages.pictures.features import FeatureSettings, FeatureTracker, Tracks
 from stages.pictures.patches import Grey
 from stages.pictures.two_view import LEAST, Noise, TwoView, backwards, relative_motion
@@ -136,6 +138,26 @@ class MotionLinks:
         self._key, self._R_now_key = self._tracker.complete(np.eye(3)), np.eye(3)
         self._rate_radps, self._t_hat_key, self._parallax_rad, self._most_clear = np.zeros(3), None, 0.0, 0
         self.reason = reason
+
+
+def followed(link: Link, frame_id: str) -> FollowedFeatures:
+    """What a motion was found from, for people to look at."""
+    motion = link.motion
+    if motion.t_hat_later is None:
+        parted = np.linalg.norm(link.ray_now - link.ray_key @ motion.R_later_earlier.T, axis=1)
+        residual = parted / math.sqrt(2.0)
+    else:
+        missed, _ = epipolar(link.ray_key, link.ray_now, motion.R_later_earlier, motion.t_hat_later, motion.sigma_rad)
+        residual = np.abs(missed)
+    return FollowedFeatures(
+        stamp_ns=link.now.stamp_ns,
+        frame_id=frame_id,
+        from_ns=link.key.stamp_ns,
+        pixel_from=link.key.pixel[np.searchsorted(link.key.number, link.number)],
+        pixel_to=link.now.pixel[np.searchsorted(link.now.number, link.number)],
+        residual_rad=residual,
+        agrees=motion.inlier,
+    )
 
 
 def pixel_rad(lens: Equidistant | KannalaBrandt | OCam) -> float:

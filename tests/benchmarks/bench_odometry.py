@@ -16,11 +16,11 @@ import poselib
 import pytest
 
 from stages.ego import VehicleEgo
-from stages.messages import Image
+from stages.messages import DroneMotion, Image
 from stages.odometry import FisheyeOdometry
 from stages.pictures.two_view import Noise, relative_motion
 from stages.rotation import exp_rotation, log_rotation
-from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, degrees_between, lidar_slice, picture, point_rays
+from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, degrees_between, lidar_slice, of, picture, point_rays
 
 PICTURES = 16
 STEP_NS = 66_000_000
@@ -58,7 +58,11 @@ def test_ours(benchmark, size_px):
         k = next(clock)
         there = (k - 1) % (2 * PICTURES - 2)  # to and fro: every step is one of the flight
         at = min(there, 2 * PICTURES - 2 - there)
-        return k, at, odometry.on_image(Image(stamp_ns=k * STEP_NS, frame_id="camera", grey=pictures[at]))
+        return (
+            k,
+            at,
+            of(odometry.on_image(Image(stamp_ns=k * STEP_NS, frame_id="camera", grey=pictures[at])), DroneMotion),
+        )
 
     places = {}
     for _ in range(5):
@@ -147,7 +151,7 @@ def test_ego(benchmark, size_px):
     def one(slices, seen):
         for points in slices:
             ego.on_points(points)
-        ego.on_image(seen)
+        list(ego.on_image(seen))
 
     for _ in range(8):
         one(*ready()[0])

@@ -131,3 +131,10 @@ def pinhole(focal_px: float, centre_px: tuple[float, float], max_off_axis_deg: f
     return KannalaBrandt(
         focal_px=(focal_px, focal_px), centre_px=centre_px, k=(k1, k2, k3, k4), max_off_axis_deg=max_off_axis_deg
     )
+
+
+def of(messages, kind):
+    """The one message of a kind among those told, or None."""
+    found = [m for m in messages if isinstance(m, kind)]
+    assert len(found) < 2
+    return found[0] if found else None

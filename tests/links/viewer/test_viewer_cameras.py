@@ -18,7 +18,7 @@ from links.viewer import Viewer, colours
 from links.viewer.draw import draw
 from links.viewer.draw_cameras import direction_colours
 from links.viewer.lenses import Cameras, arcs, strips
-from stages.messages import Carrier
+from stages.messages import Carrier, FollowedFeatures
 
 VP, LINES = "vp_vehicle/vanishing_directions", "camera/camera_vehicle/vp_vehicle/vanishing_directions/lines"
 
@@ -254,3 +254,37 @@ def test_a_graph_without_cameras_has_no_sphere(tmp_path):
     viewer.close()
     entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "run.rrd").stream().to_chunks()}
     assert not {path for path in entities if "sphere" in path}
+
+
+def followed(stamp_ns: int = 0) -> FollowedFeatures:
+    """Two that agree with the motion and one that does not."""
+    return FollowedFeatures(
+        stamp_ns=stamp_ns,
+        frame_id="camera_vehicle",
+        from_ns=stamp_ns - 200_000_000,
+        pixel_from=np.array([[100.0, 200.0], [300.0, 300.0], [500.0, 100.0]]),
+        pixel_to=np.array([[110.0, 200.0], [310.0, 300.0], [500.0, 190.0]]),
+        residual_rad=np.deg2rad([0.1, 0.3, 9.0]),
+        agrees=np.array([True, True, False]),
+    )
+
+
+def test_features_are_strokes_on_their_picture_green_where_they_agree():
+    where, name = seeing(), "ego/followed_features"
+    drawn(picture(), "camera_vehicle/image", where)
+    marks = drawn(followed(), name, where)
+    strokes = marks[f"camera/camera_vehicle/{name}/strokes"].parts[0]
+    shown = 480 / 720 * (np.array([[[100.0, 200.0], [110.0, 200.0]]]) + 0.5)
+    np.testing.assert_allclose(numbers(strokes.strips).reshape(3, 2, 2)[:1], shown, atol=1e-4)
+    np.testing.assert_array_equal(numbers(strokes.colors), [colours.GOOD, colours.GOOD, colours.BAD])
+    ends = marks[f"camera/camera_vehicle/{name}/ends"].parts[0]
+    np.testing.assert_allclose(numbers(ends.positions)[2], 480 / 720 * np.array([500.5, 190.5]), atol=1e-4)
+    np.testing.assert_allclose(numbers(marks[f"plots/other/{name}/features"].parts[0].scalars).ravel(), [3, 2])
+    np.testing.assert_allclose(numbers(marks[f"plots/other/{name}/residual"].parts[0].scalars).ravel(), [0.2])
+
+
+def test_features_of_a_picture_left_out_are_numbers_only():
+    marks = drawn(followed(stamp_ns=5), "ego/followed_features", seeing())
+    assert set(marks) == {"plots/other/ego/followed_features/features", "plots/other/ego/followed_features/residual"}
+    none = dataclasses.replace(followed(), agrees=np.zeros(3, bool))
+    assert set(drawn(none, "ego/followed_features", seeing())) == {"plots/other/ego/followed_features/features"}

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from stages.align.branches import ASKEW, NONE, R_TURNS, BranchBank, BranchSettings, Displacement
+from stages.align.branches import ASKEW, NONE, BranchBank, BranchSettings, Displacement, turns
 from stages.geometry import rotation_z
 
 S = 1_000_000_000
@@ -16,7 +16,7 @@ NOISE = 0.1**2 * np.eye(2)
 
 def quarter_turned(v, k):
     """Rz(k 90 deg) v."""
-    return R_TURNS[k % 4 * ASKEW // 4] @ v
+    return turns(ASKEW)[k % 4 * ASKEW // 4] @ v
 
 
 def moved(odometry_m, lidar_m, start_s=0.0, seconds=0.5, metric=True, bearing_rad=0.03) -> Displacement:

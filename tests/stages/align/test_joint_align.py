@@ -10,7 +10,14 @@ import pytest
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.align.joint_align import JointAlign
-from stages.messages import BranchState, Carrier, RelativeRotation, VanishingDirections
+from stages.messages import (
+    BranchState,
+    Carrier,
+    DroneAttitude,
+    RelativeRotation,
+    VanishingDirections,
+    VehicleMotion,
+)
 from stages.rotation import exp_rotation, log_rotation
 from tests.stages.align.made_joint_flight import START_NS, Flight, S, wrong_and_resolved
 from tests.stages.align.made_lines import ATLANTA, CAMPUS, MS, nothing, seen, turned
@@ -283,3 +290,25 @@ def test_no_wrong_branch_is_resolved_over_many_flights():
         assert wrong_and_resolved(flight, told) == 0
         decided += told[-1].state is BranchState.RESOLVED
     assert decided >= 12
+
+
+def test_a_picture_that_contradicts_the_turns_felt_is_wrong_by_as_much_and_leads_nobody_astray():
+    """Leaves have verticals of their own: one picture of twelve tells a roll and a yaw that nobody felt."""
+    stage, R_d, told = JointAlign(), turned(3, -2, 40), []
+    for i in range(12):
+        now_ns = S + i * 200 * MS
+        for ns in range(now_ns - 150 * MS, now_ns + 1, 50 * MS):
+            stage.on_attitude(DroneAttitude(stamp_ns=ns, R_local_drone=R_d, angular_velocity_drone_radps=np.zeros(3)))
+            stage.on_motion(
+                VehicleMotion(stamp_ns=ns, xyz_start_m=np.zeros(3), R_start_vehicle=np.eye(3), covariance=None)
+            )
+        R_seen = turned(5, -2, 42) if i == 8 else R_d
+        told += stage.on_vehicle(seen(Carrier.VEHICLE, np.eye(3), stamp_ns=now_ns))
+        told += stage.on_drone(seen(Carrier.DRONE, R_seen, stamp_ns=now_ns))
+    wrong = log_rotation(told[8].R_vehicle_drone.T @ told[7].R_vehicle_drone)
+    assert math.degrees(np.linalg.norm(wrong)) > 2.0
+    assert wrong @ np.linalg.solve(told[8].covariance_rad2, wrong) < 7.8
+    sigma_deg = [math.degrees(math.sqrt(np.trace(m.covariance_rad2))) for m in told]
+    assert sigma_deg[8] > 2.0
+    assert sigma_deg[9] < 1.3 * sigma_deg[7] < 0.7
+    assert angle_deg(told[9].R_vehicle_drone, told[7].R_vehicle_drone) < 0.3

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from stages.align.branches import ASKEW, R_TURNS
+from stages.align.branches import ASKEW, turns
 from stages.align.windows import Windows
 from stages.drone_trail import AutopilotTrail
 from stages.geometry import rotation_z
@@ -69,9 +69,9 @@ def test_each_hypothesis_brings_the_fixes_together_its_own_way():
     """Where hypothesis i is true, its residual is nothing though the drone moves within a handful."""
     for i in (0, 3, 4, 9):
         R = np.eye(3)
-        R[:2, :2] = R_TURNS[i]
+        R[:2, :2] = turns(ASKEW)[i]
         moved = metric(Windows(0.4), autopilot(), 2000, at=lambda ms, R=R: R @ V * ms * 1e-3)[0]
-        np.testing.assert_allclose(moved.lidar_m[i], R_TURNS[i] @ moved.odometry_m, atol=1e-9)
+        np.testing.assert_allclose(moved.lidar_m[i], turns(ASKEW)[i] @ moved.odometry_m, atol=1e-9)
         assert moved.lidar_m.shape == (ASKEW, 2)
 
 

@@ -10,9 +10,9 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.ego import VehicleEgo
 from stages.geometry import Pose
-from stages.messages import Image
+from stages.messages import Image, VehicleMotion
 from stages.rotation import exp_rotation, log_rotation
-from tests.stages.seen import LENS, LOOKS_UP, SIZE_PX, STEP_NS, image, lidar_slice
+from tests.stages.seen import LENS, LOOKS_UP, SIZE_PX, STEP_NS, image, lidar_slice, of
 
 START_NS = 1_000_000_000
 
@@ -40,7 +40,7 @@ def driven(at, count, mount=LOOKS_UP, lidar=True, settings=None, blank=()):
         seen = image(stamp_ns, R, p + R @ np.array(mount.xyz_m), mount)
         if k in blank:
             seen = Image(stamp_ns=stamp_ns, frame_id="camera", grey=np.full((SIZE_PX, SIZE_PX), 70, np.uint8))
-        told.append(ego.on_image(seen))
+        told.append(of(ego.on_image(seen), VehicleMotion))
     return told
 
 
@@ -122,14 +122,44 @@ def test_after_a_blank_picture_it_goes_on_less_sure():
 def test_a_picture_that_is_not_newer_is_left_out():
     ego = VehicleEgo(lens=LENS, T_vehicle_camera=LOOKS_UP)
     seen = image(START_NS, np.eye(3), np.zeros(3), LOOKS_UP)
-    assert ego.on_image(seen) is None
-    assert ego.on_image(seen) is None
-    assert ego.on_image(image(START_NS + STEP_NS, np.eye(3), np.zeros(3), LOOKS_UP)) is not None
+    assert of(ego.on_image(seen), VehicleMotion) is None
+    assert of(ego.on_image(seen), VehicleMotion) is None
+    later = image(START_NS + STEP_NS, np.eye(3), np.zeros(3), LOOKS_UP)
+    assert of(ego.on_image(later), VehicleMotion) is not None
 
 
-def test_its_ports_are_image_and_points_and_it_tells_the_vehicles_motion():
-    assert set(input_ports(VehicleEgo)) == {"image", "points"}
-    assert set(output_ports(VehicleEgo)) == {"vehicle_motion"}
+def odometry(at, stamp_ns):
+    """The vehicle's own word."""
+    R, p = at((stamp_ns - START_NS) * 1e-9)
+    return VehicleMotion(
+        stamp_ns=stamp_ns, xyz_start_m=p + np.array([5.0, 0.0, 0.0]), R_start_vehicle=R, covariance=None
+    )
+
+
+def test_it_rests_while_odometry_is_heard_and_goes_on_at_once_with_its_speed():
+    at, ego, told = even((0, 0, 0.2), (3, 0, 0)), VehicleEgo(lens=LENS, T_vehicle_camera=LOOKS_UP), []
+    silent_from = START_NS + 6 * STEP_NS
+    for k in range(24):
+        for part in range(6):
+            stamp_ns = START_NS + (k - 1) * STEP_NS + part * STEP_NS // 6
+            if stamp_ns < silent_from:
+                ego.on_odometry(odometry(at, stamp_ns))
+            ego.on_points(lidar_slice(stamp_ns, *at((stamp_ns - START_NS) * 1e-9), seed=10 * k + part))
+        seen = image(START_NS + k * STEP_NS, *at(k * STEP_NS * 1e-9), LOOKS_UP)
+        told.append(of(ego.on_image(seen), VehicleMotion))
+    awake = next(k for k, m in enumerate(told) if m is not None)
+    assert awake == math.ceil((silent_from - START_NS) / STEP_NS - 1 / 6 + ego.silent_s * 1e9 / STEP_NS)
+    assert told[awake].xyz_start_m.tolist() == [0.0, 0.0, 0.0]
+    assert all(m is not None for m in told[awake:])
+    off_m = np.linalg.norm(errors(at, told)[:, 3:], axis=1)
+    assert off_m.max() < 0.03 * 3 * (23 - awake) * STEP_NS * 1e-9
+    ego.on_odometry(odometry(at, START_NS + 24 * STEP_NS))
+    assert list(ego.on_image(image(START_NS + 24 * STEP_NS, *at(24 * STEP_NS * 1e-9), LOOKS_UP))) == []
+
+
+def test_its_ports_are_image_points_and_odometry_and_it_tells_the_vehicles_motion():
+    assert set(input_ports(VehicleEgo)) == {"image", "points", "odometry"}
+    assert set(output_ports(VehicleEgo)) == {"vehicle_motion", "followed_features"}
 
 
 @pytest.mark.parametrize("wrong", [{"window_keys": 2}, {"every_nth_point": 0}, {"reach_deg": 0.0}, {"scale": 1.0}])

@@ -9,14 +9,14 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
-from stages.messages import DroneImu, Image
+from stages.messages import DroneImu, DroneMotion, FollowedFeatures, Image
 from stages.odometry import FisheyeOdometry
 from stages.odometry.fisheye_odometry import drone_motion, turned
 from stages.pictures.features import Tracks
 from stages.pictures.motion_link import Link
 from stages.pictures.two_view import TwoView
 from stages.rotation import exp_rotation, log_rotation
-from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, STEP_NS, degrees_between, image
+from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, PIXEL_RAD, SIZE_PX, STEP_NS, degrees_between, image, of
 
 YAW = np.array([0.0, 0.0, 1.0])
 
@@ -38,7 +38,7 @@ def flown(turn_radps, velocity_mps, count, mount=LOOKS_DOWN, settings=None, imu=
                         angular_velocity_drone_radps=np.asarray(turn_radps, float),
                     )
                 )
-        motions.append(odometry.on_image(image(stamp_ns, *truth[stamp_ns], mount)))
+        motions.append(of(odometry.on_image(image(stamp_ns, *truth[stamp_ns], mount)), DroneMotion))
     return motions, truth
 
 
@@ -155,7 +155,7 @@ def test_a_blank_picture_ends_the_chain_and_the_next_begins_one():
         seen = image(stamp_ns, np.eye(3), np.array([0.2 * k, 0, 0]), LOOKS_DOWN)
         if k in (2, 3):
             seen = Image(stamp_ns=stamp_ns, frame_id="camera", grey=blank)
-        told.append(odometry.on_image(seen))
+        told.append(of(odometry.on_image(seen), DroneMotion))
     assert [m is not None for m in told] == [False, True, False, False, False, True]
     assert told[5].from_ns == stamps[4]
 
@@ -163,10 +163,31 @@ def test_a_blank_picture_ends_the_chain_and_the_next_begins_one():
 def test_a_picture_that_is_not_newer_is_left_out():
     odometry = FisheyeOdometry(lens=LENS, T_drone_camera=LOOKS_DOWN)
     seen = image(1_000_000_000, np.eye(3), np.zeros(3), LOOKS_DOWN)
-    assert odometry.on_image(seen) is None
-    assert odometry.on_image(seen) is None
+    assert of(odometry.on_image(seen), DroneMotion) is None
+    assert of(odometry.on_image(seen), DroneMotion) is None
     later = image(1_000_000_000 + STEP_NS, np.eye(3), np.array([0.2, 0, 0]), LOOKS_DOWN)
-    assert odometry.on_image(later).from_ns == 1_000_000_000
+    assert of(odometry.on_image(later), DroneMotion).from_ns == 1_000_000_000
+
+
+def test_it_shows_what_it_followed_between_which_pictures():
+    odometry = FisheyeOdometry(lens=LENS, T_drone_camera=LOOKS_DOWN)
+    shift = np.array([0.2, 0, 0])
+    for k in range(3):
+        told = list(odometry.on_image(image(1_000_000_000 + k * STEP_NS, np.eye(3), k * shift, LOOKS_DOWN)))
+        motion, followed = of(told, DroneMotion), of(told, FollowedFeatures)
+        if k == 0:
+            assert told == []
+            continue
+        assert (followed.stamp_ns, followed.from_ns) == (motion.stamp_ns, motion.from_ns)
+        assert followed.frame_id == "camera"
+        assert followed.agrees.sum() == motion.matches
+        check_arrays(followed)
+        C = LOOKS_DOWN.matrix()[:3, :3]
+        ray_from, ray_to = LENS.unproject(followed.pixel_from) @ C.T, LENS.unproject(followed.pixel_to) @ C.T
+        plane = np.cross(ray_from, ray_to)  # a motion along x: no rotation, so every plane holds x
+        plane /= np.linalg.norm(plane, axis=1, keepdims=True)
+        assert np.abs(plane[followed.agrees, 0]).max() < 0.2
+        assert np.median(followed.residual_rad[followed.agrees]) < 0.3 * PIXEL_RAD
 
 
 def test_the_same_pictures_give_the_same_motions():
@@ -179,7 +200,7 @@ def test_the_same_pictures_give_the_same_motions():
 def test_its_ports_are_image_and_a_gyro_that_may_be_missing():
     assert set(input_ports(FisheyeOdometry)) == {"image", "imu"}
     assert FisheyeOdometry.optional_inputs == {"imu"}
-    assert set(output_ports(FisheyeOdometry)) == {"drone_motion"}
+    assert set(output_ports(FisheyeOdometry)) == {"drone_motion", "followed_features"}
 
 
 @pytest.mark.parametrize(

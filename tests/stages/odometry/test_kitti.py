@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from stages.geometry import Pose
-from stages.messages import Image
+from stages.messages import DroneMotion, Image
 from stages.odometry import FisheyeOdometry
 from stages.rotation import log_rotation
-from tests.stages.seen import degrees_between, pinhole
+from tests.stages.seen import degrees_between, of, pinhole
 
 DRIVE = Path(__file__).resolve().parents[4] / "shared" / "data" / "vo_kitti00"
 STEP_NS = 100_000_000
@@ -28,7 +28,7 @@ def test_a_real_drive_is_followed_picture_by_picture():
     turn_deg, direction_deg = [], []
     for i, file in enumerate(sorted((DRIVE / "left").iterdir())):
         grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        motion = odometry.on_image(Image(stamp_ns=(i + 1) * STEP_NS, frame_id="camera", grey=grey))
+        motion = of(odometry.on_image(Image(stamp_ns=(i + 1) * STEP_NS, frame_id="camera", grey=grey)), DroneMotion)
         if i == 0:
             assert motion is None
             continue

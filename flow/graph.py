@@ -227,7 +227,8 @@ def known_classes(kind: str) -> list[str]:
             # a class in a private room of a package is used through the front door, a stages/x.py as it is
             private = not module.ispkg and (kind != "stages" or module.name.count(".") > 1)
             home = module.name.rpartition(".")[0] if private else module.name
-            found += [f"{home}.{name}" for name in classes]
+            door = (file.parent / "__init__.py").read_text("utf-8") if private else source.read_text("utf-8")
+            found += [f"{home}.{name}" for name in classes if re.search(rf"\b{name}\b", door)]
     return sorted(dict.fromkeys(found))
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import json
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from flow.graph import load_graph
+from flow.graph import known_classes, load_graph
 from flow.schema import schema
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -139,3 +140,11 @@ def test_the_readme_and_ci_run_the_same_test_command():
     ci = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     command = next(line.strip() for line in readme.splitlines() if "-m pytest" in line)
     assert command in ci
+
+
+def test_each_class_that_an_error_suggests_can_be_used() -> None:
+    """A tap that a package keeps to itself is none to be put into a configuration."""
+    for kind in ("stages", "links"):
+        for use in known_classes(kind):
+            module, _, name = use.rpartition(".")
+            assert hasattr(importlib.import_module(module), name), use

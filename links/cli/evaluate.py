@@ -19,6 +19,7 @@ from links.evaluation.compare import Pair, by_config, pair_up, uneven
 from links.evaluation.csv_table import write_csv
 from links.evaluation.groups import Key, groups, parse_by
 from links.evaluation.no_drone import alarms
+from links.evaluation.paper_tables import markdown, paper_tables
 from links.evaluation.report import write_report
 from links.evaluation.rotation_groups import rotation_groups
 from links.evaluation.summaries import Summary, alarm_summary, group_summary, rotation_summary
@@ -55,6 +56,14 @@ def evaluate_runs(
         ),
     ] = None,
     csv_file: Annotated[Path | None, typer.Option("--csv", help="Table of all metrics to write, a line a run.")] = None,
+    tables_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--paper-tables",
+            help="Markdown file to write: the paper's Tables I and II, with the runs of recordings named "
+            "experiment_1 ... experiment_4-... beside them.",
+        ),
+    ] = None,
     max_gap_s: Annotated[
         float, typer.Option("--max-gap", min=0.001, max=10, help="Truth is not interpolated over a longer gap [s].")
     ] = DEFAULTS.max_gap_s,
@@ -89,6 +98,8 @@ def evaluate_runs(
     others = [e for group in judged[len(runs) :] for e in group]
     pairs, warnings = pair_up(own, others) if others else ([], [])
     summaries = _summaries(own, keys)
+    if tables_file is not None:
+        summaries += _paper_tables(tables_file, own)
     warnings += uneven(own) if summaries else []
     for text in warnings:
         warn(text)
@@ -99,12 +110,26 @@ def evaluate_runs(
     if not keys:
         _tell(own, pairs)
     _write(own, others, pairs, warnings, summaries, report, out_dir)
+    if tables_file is not None:
+        out.print(f"tables      {tables_file}", markup=False)
     if csv_file is not None:
         csv_file.parent.mkdir(parents=True, exist_ok=True)
         write_csv(csv_file, own)
         out.print(f"table       {csv_file}", markup=False)
     if any(e.findings for e in own):
         raise typer.Exit(FINDING)
+
+
+def _paper_tables(file: Path, own: list[Evaluation]) -> list[Summary]:
+    """Written, and shown with the others."""
+    tables = paper_tables(own)
+    if not tables:
+        raise LinkError(
+            "--paper-tables: no run is of a recording named experiment_1 ... experiment_4, nor -s1 and so on"
+        )
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(markdown(tables), encoding="utf-8")
+    return tables
 
 
 def _summaries(own: list[Evaluation], keys: list[Key]) -> list[Summary]:

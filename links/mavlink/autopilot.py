@@ -20,7 +20,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from flow.link import LinkError, Record, Source
 from links import host_time
-from links.mavlink.clock import AutopilotClock
+from links.device_clock import DeviceClock
 from links.mavlink.connection import Udp, parse_connection
 from links.mavlink.gate import Limits
 from links.mavlink.lines import open_connection
@@ -93,7 +93,7 @@ class Autopilot(Source):
 
     @cached_property  # not a private attribute: decoding asks for it at every frame
     def _stream(self) -> FrameStream:
-        clock = AutopilotClock(self.clock_drift_limit_ppm, round(1e9 * self.clock_jump_limit_s))
+        clock = DeviceClock(self.clock_drift_limit_ppm, round(1e9 * self.clock_jump_limit_s))
         return FrameStream((self.system_id, self.component_id), clock)
 
     def decode(self, record: Record) -> AutopilotMessage | None:

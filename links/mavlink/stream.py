@@ -12,7 +12,7 @@ from collections import Counter
 from typing import Any
 
 from flow.link import Record
-from links.mavlink.clock import AutopilotClock
+from links.device_clock import DeviceClock
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
 from links.mavlink.wire import SEQUENCE, header, known, parse_frame
 from stages.messages import AutopilotStatus
@@ -26,7 +26,7 @@ LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost one
 class FrameStream:
     """Decodes frames in turn; keeps the clock, the sequence and the counts."""
 
-    def __init__(self, sender: tuple[int, int], clock: AutopilotClock) -> None:
+    def __init__(self, sender: tuple[int, int], clock: DeviceClock) -> None:
         self.clock = clock
         self.decoded = self.unused = self.lost = 0
         self.refused: Counter[str] = Counter()

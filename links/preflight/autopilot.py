@@ -10,7 +10,8 @@ from collections.abc import Iterator, Sequence
 
 from links.mavlink import Autopilot
 from links.preflight.arrivals import Arrivals
-from links.preflight.heard import AutopilotSeen, Heard
+from links.preflight.heard import Heard
+from links.preflight.seen import AutopilotSeen
 from links.preflight.verdict import Verdict, fail, ok, warning
 from stages.messages import AutopilotEstimator, AutopilotStatus
 

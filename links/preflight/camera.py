@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from links.camera import Camera
-from links.preflight.heard import CameraSeen, Heard
+from links.preflight.heard import Heard
+from links.preflight.seen import CameraSeen
 from links.preflight.verdict import Verdict, fail, ok, warning
 
 LEAST_HZ = 1.0

@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from links.preflight.heard import Heard, LidarSeen
+from links.preflight.heard import Heard
+from links.preflight.seen import LidarSeen
 from links.preflight.verdict import Verdict, fail, ok, warning
 from links.velodyne import Lidar, vlp16
 from links.velodyne.lidar import POSITION_TOPIC

@@ -74,13 +74,14 @@ def listen_to_recording(graph: Graph, reader: RecordingReader, progress: Progres
 
 @contextmanager
 def simulated_rig(graph: Graph) -> Iterator[None]:
-    """With the simulated rig, where the configuration has one: it is started as `grd run` does. LinkError."""
+    """With the simulated rig, where the configuration has one, started as `grd run` does, but disarmed. LinkError."""
     with ExitStack() as stack:
         for spec in graph.nodes.values():
             if issubclass(spec.cls, LiveRig):
                 folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="grd-preflight-")))
                 rig = spec.build()
                 assert isinstance(rig, LiveRig)
+                rig = rig.model_copy(update={"armed": False})
                 rig.open(Run(folder, spec.name, mermaid(graph), graph.settings_yaml(), live=True))
                 stack.callback(rig.close)
         yield

@@ -9,7 +9,8 @@ import math
 from collections.abc import Iterator
 
 from links.dynamixel import Servo, mx28
-from links.preflight.heard import Heard, ServoSeen
+from links.preflight.heard import Heard
+from links.preflight.seen import ServoSeen
 from links.preflight.verdict import Verdict, fail, ok, warning
 
 LEAST_HZ, FULL_RATE = 50.0, 0.8  # of the configured rate

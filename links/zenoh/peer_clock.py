@@ -1,7 +1,7 @@
 """Another host's timeline told in ours, with what it may be wrong by.
 
 Each message bounds the difference from above (it cannot arrive before it was sent), each answer to "what time is it?"
-from below; `links.mavlink.clock` has the reasoning. Nothing is told before there was an answer, and nothing when the
+from below; `links.device_clock` has the reasoning. Nothing is told before there was an answer, and nothing when the
 bounds are further apart than `MAX_UNCERTAINTY_NS`: 25 ms are 25 cm at 10 m/s.
 
 Source: ours.
@@ -12,7 +12,7 @@ from __future__ import annotations
 import threading
 from typing import NamedTuple
 
-from links.mavlink.clock import AutopilotClock
+from links.device_clock import DeviceClock
 
 MAX_UNCERTAINTY_NS = 25_000_000
 
@@ -30,7 +30,7 @@ class PeerClock:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._run: int | None = None
-        self._clock = AutopilotClock()
+        self._clock = DeviceClock()
         self.answered_ns: int | None = None
         """When it answered last, our time."""
         self.restarts = 0
@@ -41,7 +41,7 @@ class PeerClock:
         with self._lock:
             if run != self._run:
                 self.restarts += self._run is not None
-                self._run, self._clock = run, AutopilotClock()
+                self._run, self._clock = run, DeviceClock()
             self._clock.read(told_ns, arrival_ns)
             if self._clock.round_trip(asked_ns, told_ns, arrival_ns):
                 self.answered_ns = arrival_ns

@@ -87,6 +87,12 @@ class Drift:
         self._x[:3] += t_m
         self._covariance = whole @ self._covariance @ whole.T
 
+    def forget_velocity(self) -> None:
+        """What was known of b counts no more."""
+        self._x[3:] = 0.0
+        self._covariance[3:, :] = self._covariance[:, 3:] = 0.0
+        self._covariance[3:, 3:] = UNKNOWN_MPS**2 * np.eye(3)
+
     def ahead(self, stamp_ns: int) -> tuple[Array64, Array64]:
         """Position (3,) and its covariance (3, 3) at a time, moved by b alone."""
         assert self.stamp_ns is not None

@@ -27,17 +27,19 @@ from stages.geometry import Array64
 APART_NS = 400_000_000  # of the fixes used: their errors last that long
 WINDOW_NS = 30_000_000_000
 LEAST, MOST = 6, 48  # points
+LEAST_TO_BACK = 4  # that somebody else's yaw is none of its other quarter turns
 LEAST_M = 1.0  # of displacement
 FLOOR_M = 0.05  # no fix is better
 SCALE = 0.03  # of lengths; the drone's scale and the vehicle's
 BEND = 0.01  # of a displacement, gathered heading error of both odometries
 HEIGHT_WALK_M = 0.08  # per sqrt(s)
-UNHEARD_NS = 3_000_000_000
 WITNESS_RAD = math.radians(11.5)  # worse than this it is no yaw at all
 FALSE_SHARE = 0.2  # of the points may be false
 BANK_RAD = 2 * math.pi / 72 * np.arange(72)
 NEAR_RAD = math.radians(45.0)
 DOUBT = 1e-3
+BACKED_NS = 5_000_000_000  # so long ago that is still said of now
+ALIKE, SLACK_RAD = 3.0, math.radians(5.0)
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,26 @@ class Yaw:
 
 
 @dataclass(frozen=True)
+class Leaning:
+    """The likelihood round the circle, exp(sharpness (cos(yaw - peak) - 1)), though it may be flat."""
+
+    stamp_ns: int
+    peak_rad: float
+    sharpness: float
+
+    def others(self, yaw_rad: float) -> float:
+        """Odds of the three other quarter turns together against a yaw."""
+        quarters = yaw_rad - self.peak_rad + 0.5 * math.pi * np.arange(1, 4)
+        return float(np.exp(self.sharpness * (np.cos(quarters) - math.cos(yaw_rad - self.peak_rad))).sum())
+
+
+@dataclass(frozen=True)
 class Weighed:
     """What the points say."""
 
     reason: str
+    leaning: Leaning | None = None  # None: nothing, or that both do not tell one motion
     yaw: Yaw | None = None  # None: they tell none
-    still: bool = False  # because the drone has hardly moved: they speak against none either
 
 
 class MotionYaw:
@@ -94,10 +110,14 @@ class MotionYaw:
         """Why there is none, or how well it is known."""
         return self._told.reason
 
-    def has_nothing_to_say(self, now_ns: int) -> bool:
-        """Whether nobody need wait for it: the drone hangs still, or nothing is heard that could tell."""
-        unheard = not self._points or now_ns - self._points[-1].stamp_ns > UNHEARD_NS
-        return unheard or self._told.still
+    def backs(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
+        """Whether the motion seen lately agrees with a yaw, and with none of its other quarter turns."""
+        lean = self._told.leaning
+        if lean is None or lean.sharpness <= 0.0 or abs(stamp_ns - lean.stamp_ns) > BACKED_NS:
+            return False
+        off = abs(math.remainder(yaw_rad - lean.peak_rad, 2 * math.pi))
+        near = off <= ALIKE * math.hypot(1.0 / math.sqrt(lean.sharpness), sigma_rad) + SLACK_RAD
+        return near and lean.others(yaw_rad) <= DOUBT
 
     def restart(self) -> None:
         """Nothing before now counts."""
@@ -120,13 +140,14 @@ class MotionYaw:
 
 def weigh(points: tuple[Point, ...], errors: FuseErrors) -> Weighed:
     """The yaw that points tell, or none, and why."""
-    if len(points) < LEAST:
-        return Weighed(f"{len(points)} LiDAR positions beside the autopilot's, {LEAST} are needed")
+    few = Weighed(f"{len(points)} LiDAR positions beside the autopilot's, {LEAST} are needed")
+    if len(points) < LEAST_TO_BACK:
+        return few
     t = np.array([(p.stamp_ns - points[0].stamp_ns) * 1e-9 for p in points])
     z, own = np.array([p.xyz_start_m for p in points]), np.array([p.xyz_own_m for p in points])
     moved_m = float(np.linalg.norm(own[:, :2] - own[0, :2], axis=1).max())
     if moved_m < LEAST_M:
-        return Weighed(f"the drone has moved {moved_m:.1f} m, too little to tell its heading", still=True)
+        return Weighed(f"the drone has moved {moved_m:.1f} m, too little to tell its heading")
     variance = np.array([p.variance_m2 for p in points]) + FLOOR_M**2
     false: list[int] = []
     while True:
@@ -145,15 +166,18 @@ def weigh(points: tuple[Point, ...], errors: FuseErrors) -> Weighed:
         false.append(int(rows[off]))
     length = float(np.linalg.norm(a))
     sigma = 1.0 / (math.sqrt(precision) * max(length, 1e-6))
-    if sigma > WITNESS_RAD:
-        return Weighed(f"heading by motion hardly known: {moved_m:.1f} m moved", still=True)
     if abs(length - 1.0) > 3.3 * math.hypot(SCALE, 1.0 / math.sqrt(precision)):
         return Weighed(f"the LiDAR sees {length:.2f} of the way that the drone says it flew")
     peak, nearest, odds = bank(a, precision)
+    lean = Leaning(points[-1].stamp_ns, peak, precision * length)
+    if len(points) < LEAST:
+        return Weighed(few.reason, lean)
+    if sigma > WITNESS_RAD:
+        return Weighed(f"heading by motion hardly known: {moved_m:.1f} m moved", lean)
     if nearest < 1 - DOUBT or odds > DOUBT:
-        return Weighed(f"several headings fit its motion: P {nearest:.3f}")
+        return Weighed(f"several headings fit its motion: P {nearest:.3f}", lean)
     told = f"heading by motion {math.degrees(peak):.0f} deg, sigma {math.degrees(sigma):.1f}, {moved_m:.1f} m moved"
-    return Weighed(told, Yaw(points[-1].stamp_ns, peak, sigma))
+    return Weighed(told, lean, Yaw(points[-1].stamp_ns, peak, sigma))
 
 
 def bank(a: Array64, precision: float) -> tuple[float, float, float]:

@@ -86,11 +86,10 @@ class North:
             self.yaw = OwnYaw(told.stamp_ns, told.yaw_rad, told.sigma_rad**2)
         return True
 
-    def lets(self, stamp_ns: int, yaw_rad: float | None, sigma_rad: float) -> bool:
-        """Whether the drone's motion has nothing against a yaw, and has been asked."""
-        if yaw_rad is None or self.by_motion.has_nothing_to_say(stamp_ns):
-            return True
-        return self.heading.agrees(stamp_ns, yaw_rad, sigma_rad)
+    def backs(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
+        """Whether the drone's motion agrees with a yaw and with none of its other quarter turns."""
+        denied = self.heading.denies(stamp_ns, yaw_rad, sigma_rad)
+        return not denied and self.by_motion.backs(stamp_ns, yaw_rad, sigma_rad)
 
     def by_motion_too(self, stamp_ns: int) -> bool:
         """Whether the drone's motion has told the yaw believed."""

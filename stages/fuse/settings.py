@@ -22,6 +22,7 @@ class FuseErrors(BaseModel):
     tilt_deg: float = Field(default=1.0, gt=0)  # of the autopilot's vertical in the start frame
     tilt_time_s: float = Field(default=20.0, gt=0)
     manoeuvre: float = Field(default=5.0, gt=0)  # density of the drone's acceleration where no odometry tells [m2/s3]
+    manoeuvre_told: float = Field(default=0.7, gt=0)  # beside the change of velocity that its autopilot tells
     fix_variance: float = Field(default=0.65, gt=0)  # a fix's true variance over the one told; trackers are careful
     fix_time_s: float = Field(default=0.2, ge=0)  # for which the error of a fix lasts
     fix_lasting: float = Field(default=0.25, ge=0, lt=1)  # share of its variance that never averages out: calibration

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stages.fuse.motions import Motions
 from stages.geometry import Array64
 from stages.messages import PoseState, RelativePose
-from stages.trail import VehicleTrail
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,9 @@ def lost(stamp_ns: int, verdict: Verdict) -> RelativePose:
     )
 
 
-def pose(known: Known, verdict: Verdict, vehicle: VehicleTrail) -> RelativePose:
-    """The pose, in both frames."""
+def pose(known: Known, verdict: Verdict, motions: Motions) -> RelativePose:
+    """The pose, in both frames. Relative to the vehicle it is no better than the vehicle's own place is known."""
+    vehicle = motions.vehicle
     R_start_vehicle, _ = vehicle.at(known.stamp_ns)
     xyz, velocity = vehicle.to_vehicle(known.stamp_ns, known.xyz_start_m, known.velocity_start_mps)
     R = known.R_start_drone
@@ -76,6 +77,7 @@ def pose(known: Known, verdict: Verdict, vehicle: VehicleTrail) -> RelativePose:
         relative[3:, 3:] = R_start_vehicle.T @ known.covariance[3:, 3:] @ R_start_vehicle
     else:
         start = relative = known.covariance  # tangent at the drone: the same seen from either frame
+    relative = relative + _vehicle_ahead(motions, known.stamp_ns, xyz, None if R is None else R_start_vehicle.T @ R)
     return RelativePose(
         stamp_ns=known.stamp_ns,
         state=verdict.state,
@@ -94,3 +96,16 @@ def pose(known: Known, verdict: Verdict, vehicle: VehicleTrail) -> RelativePose:
         resets=verdict.resets,
         nis=verdict.nis,
     )
+
+
+def _vehicle_ahead(motions: Motions, stamp_ns: int, xyz_vehicle_m: Array64, R_vehicle_drone: Array64 | None) -> Array64:
+    """(6, 6) what the vehicle may have moved since its newest word: a shift, and a yaw that turns place and drone."""
+    place_m2, yaw_rad2, lever = motions.vehicle_ahead_m2(stamp_ns, xyz_vehicle_m)
+    covariance = np.zeros((6, 6))
+    if R_vehicle_drone is None:
+        covariance[3:, 3:] = place_m2
+        return covariance
+    R = R_vehicle_drone
+    turned = np.concatenate([R[2], R.T @ lever])
+    covariance[3:, 3:] = R.T @ (place_m2 - yaw_rad2 * np.outer(lever, lever)) @ R
+    return covariance + yaw_rad2 * np.outer(turned, turned)

@@ -11,10 +11,11 @@ import pytest
 from flow.link import Run
 from links.evaluation.output import read_output
 from links.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
+from stages.fuse.motions import Motions
+from stages.fuse.settings import FuseErrors
 from stages.fuse.told import Known, Verdict, lost, pose
 from stages.geometry import quaternions_xyzw, rotation_z
 from stages.messages import PoseState
-from stages.trail import VehicleTrail
 
 S = 1_000_000_000
 FULL, POSITION_ONLY = PoseState.FULL, PoseState.POSITION_ONLY
@@ -26,7 +27,7 @@ def verdict(state, resets=0):
 
 def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.01, 0.02, 0.03, 0.1, 0.2, 0.3)):
     known = Known(round(t_s * S), R, np.array(xyz), np.diag(variances), np.zeros(3), np.eye(3))
-    return pose(known, verdict(state), VehicleTrail())
+    return pose(known, verdict(state), Motions(FuseErrors(), parked=True))
 
 
 @pytest.fixture
@@ -96,10 +97,12 @@ def test_poses_are_counted_by_state_and_their_jumps_told(tmp_path):
     results.open(Run(tmp_path, "made", "", ""))
     assert results.pose_states == {}
     unknown = pose(
-        Known(S, None, np.ones(3), np.eye(6), np.zeros(3), np.eye(3)), verdict(POSITION_ONLY), VehicleTrail()
+        Known(S, None, np.ones(3), np.eye(6), np.zeros(3), np.eye(3)),
+        verdict(POSITION_ONLY),
+        Motions(FuseErrors(), parked=True),
     )
     turned = Known(2 * S, rotation_z(0.5), np.ones(3), np.eye(6), np.zeros(3), np.eye(3))
-    for message in (unknown, *[pose(turned, verdict(FULL, resets=1), VehicleTrail())] * 2):
+    for message in (unknown, *[pose(turned, verdict(FULL, resets=1), Motions(FuseErrors(), parked=True))] * 2):
         results.see("fuse.relative_pose", message, message.stamp_ns)
     results.close()
     assert results.pose_states == {"FULL": 2, "POSITION_ONLY": 1}

@@ -113,12 +113,11 @@ def test_a_branch_that_changes_in_flight_ends_full(said):
 
 
 def test_what_the_streets_alone_told_is_doubted_when_they_are_not_resolved_any_more():
-    stage, R = Fuse(), np.eye(3)
-    told = [pose for i in range(20) for pose in stage.on_fix(fix(0.1 * i, [0, 0, 10]))]
-    told += [pose for i in range(10) for pose in stage.on_rotation(rotation(1.95 + 0.02 * i, R))]
-    assert told[-1].state is FULL
-    told += list(stage.on_rotation(rotation(2.2, R, resolved=False)))
-    assert told[-1].state is AMBIGUOUS
+    made, stage = Made(until_s=5, autopilot="none", pictures=True), Fuse()
+    poses = made.run(stage)
+    assert poses[-1].state is FULL
+    poses += list(stage.on_rotation(rotation(5.05, made.truth(5.05)[0], resolved=False)))
+    assert poses[-1].state is AMBIGUOUS
 
 
 def test_a_north_turned_during_a_silence_gives_no_wrong_pose():
@@ -196,10 +195,12 @@ def test_without_an_autopilot_or_pictures_the_position_is_followed():
 
 @pytest.mark.parametrize("parked", [False, True])
 def test_without_word_of_the_vehicle_its_frame_is_the_start_frame(parked):
+    """Only one that is known to stand lets the drone's motion agree with the streets."""
     made = Made(until_s=8, vehicle=False)
     poses = made.run(Fuse(parked=parked))
     seen = made.judge(poses, after_s=4)
-    assert set(seen.states) == {FULL}
+    assert set(seen.states) == {FULL if parked else AMBIGUOUS}
+    assert parked or "how the vehicle moves is not told" in poses[-1].reason
     assert np.allclose(poses[-1].xyz_start_m, poses[-1].xyz_vehicle_m)
     assert seen.rmse_m() < (0.12 if parked else 0.2)
 
@@ -217,7 +218,7 @@ def test_each_input_may_vanish_and_return(port):
     poses = made.run(Fuse())
     seen = made.judge(poses, after_s=2)
     assert max(b.stamp_ns - a.stamp_ns for a, b in pairwise(poses)) == 20_000_000
-    assert max(seen.error_m) < 0.8
+    assert max(seen.error_m) < (1.3 if port == "motion" else 0.8)  # fixes wait for a vehicle that may only be late
     assert wrong(made, poses, deg=12) == 0
     assert poses[-1].state is FULL
 

@@ -14,14 +14,16 @@ from stages.fuse.drift import Drift
 from stages.fuse.following import Following
 from stages.fuse.heading import Heading
 from stages.fuse.motion_yaw import Yaw
+from stages.fuse.motions import Motions
 from stages.fuse.north import DRIFT_RAD_PER_S, North, OwnYaw, heading_rad
+from stages.fuse.positions import Positions
 from stages.fuse.rejected import ENOUGH, Rejected
 from stages.fuse.rigid import carried_covariance, good_covariance
 from stages.fuse.settings import FuseErrors
 from stages.geometry import rotation_z
-from stages.messages import DroneAttitude, TrackingState
+from stages.messages import DroneAttitude, DroneLocalPosition, TrackingState
 from stages.rotation import exp_rotation, log_rotation
-from tests.stages.fuse.made_drone_flight import S, gauss_markov, track
+from tests.stages.fuse.made_drone_flight import S, fix, gauss_markov, ns, track
 
 ERRORS = FuseErrors()
 QUARTER = math.pi / 2
@@ -311,3 +313,27 @@ def test_a_candidate_is_no_track():
     following.hear(track(0.0, TrackingState.TRACKING, 2))
     assert following.takes(2, 0)
     assert following.number == 2
+
+
+def test_a_drone_that_tells_its_velocity_cannot_have_turned_unheard():
+    """Half a second after the last fix: q dt^3 / 3 of what nobody tells, beside the same velocity."""
+    sigmas = []
+    for told in (False, True):
+        motions = Motions(FuseErrors(), parked=True)
+        positions = Positions(FuseErrors(), motions)
+        for i in range(30):
+            t = 0.1 * i
+            if told:
+                motions.carrier.autopilot.hear(
+                    DroneLocalPosition(
+                        stamp_ns=ns(t), xyz_local_m=np.array([2 * t, 0, 9]), velocity_local_mps=np.array([2.0, 0, 0])
+                    )
+                )
+            z = np.array([2 * t, 0.0, 9.0])
+            if i == 0:
+                positions.find(fix(t, z, 0.05), z, 0.05**2 * np.eye(3))
+            else:
+                positions.takes(ns(t), np.zeros(3), np.eye(3), 0.05**2 * np.eye(3))
+                positions.follow(ns(t), z, 1.0, None)
+        sigmas.append(math.sqrt(positions.at(ns(2.99))[1][4, 4]))
+    assert sigmas[1] < 0.8 * sigmas[0]

@@ -8,7 +8,19 @@ import numpy as np
 import pytest
 
 from stages.fuse.heading import apart_rad
-from stages.fuse.motion_yaw import LEAST, MotionYaw, Point, bank, chi2_999, fit, level_covariance, weigh
+from stages.fuse.motion_yaw import (
+    LEAST,
+    LEAST_TO_BACK,
+    Leaning,
+    MotionYaw,
+    Point,
+    Weighed,
+    bank,
+    chi2_999,
+    fit,
+    level_covariance,
+    weigh,
+)
 from stages.fuse.settings import FuseErrors
 from stages.geometry import rotation_z
 from tests.stages.fuse.made_drone_flight import gauss_markov
@@ -111,17 +123,18 @@ def test_heights_must_agree():
     assert weigh(climbs, ERRORS).yaw is None
 
 
-def test_a_drone_that_hardly_moves_tells_nothing_and_is_called_still():
+def test_a_drone_that_hardly_moves_tells_nothing():
     told = weigh(points(0.05 * circle()), ERRORS)
     assert told.yaw is None
-    assert told.still
+    assert told.leaning is None
     assert "too little" in told.reason
 
 
-def test_too_few_points_are_no_answer_and_no_excuse():
-    told = weigh(points(circle())[: LEAST - 1], ERRORS)
-    assert told.yaw is None
-    assert not told.still
+def test_too_few_points_are_no_answer():
+    few = weigh(points(circle())[: LEAST - 1], ERRORS)
+    assert few.yaw is None
+    assert few.leaning is not None  # enough to speak for another's
+    assert weigh(points(circle())[: LEAST_TO_BACK - 1], ERRORS).leaning is None
 
 
 def test_the_bank_has_one_peak_and_doubts_when_it_is_flat():
@@ -153,12 +166,25 @@ def test_a_jump_of_the_autopilots_frame_begins_anew():
     p = points(circle())[-1]
     bank_.add(Point(p.stamp_ns + S, p.xyz_start_m, p.variance_m2, p.xyz_own_m, stretch=1))
     assert bank_.yaw is None
-    assert not bank_.has_nothing_to_say(p.stamp_ns + S)
+    assert not bank_.backs(p.stamp_ns, 0.0, 0.01)
 
 
-def test_nobody_waits_for_motion_that_is_not_heard():
+def test_the_odds_of_other_quarters_are_the_likelihoods():
+    """exp(k (cos a - 1)): two quarter turns and one half against a yaw at the peak."""
+    lean = Leaning(0, 0.7, 3.0)
+    assert lean.others(0.7) == pytest.approx(2 * math.exp(-3.0) + math.exp(-6.0))
+    assert lean.others(0.7 + math.pi / 4) > 1.0  # halfway to another one
+    assert lean.others(0.7 + math.pi / 2) > 10.0
+
+
+def test_a_short_way_backs_a_yaw_before_it_tells_one():
+    """Its sigma is 15 deg, too much for a heading and little beside a quarter turn."""
     bank_ = MotionYaw(ERRORS, math.radians(6))
-    assert bank_.has_nothing_to_say(0)
-    bank_.add(points(circle())[0])
-    assert not bank_.has_nothing_to_say(S)
-    assert bank_.has_nothing_to_say(5 * S)
+    p = points(circle())[0]
+    bank_._told = Weighed("", Leaning(p.stamp_ns, 0.3, 1 / math.radians(15) ** 2))
+    assert bank_.witness is None
+    assert bank_.backs(p.stamp_ns, 0.4, 0.01)
+    assert not bank_.backs(p.stamp_ns, 0.4 + math.pi / 2, 0.01)
+    assert not bank_.backs(p.stamp_ns + 6 * S, 0.4, 0.01)
+    bank_._told = Weighed("", Leaning(p.stamp_ns, 0.3, 1 / math.radians(30) ** 2))
+    assert not bank_.backs(p.stamp_ns, 0.3, 0.01)  # odds 1 : 19

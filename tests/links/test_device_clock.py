@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from links.mavlink.clock import DISAGREEMENTS, AutopilotClock
+from links.device_clock import DISAGREEMENTS, DeviceClock
 
 MS, S = 1_000_000, 1_000_000_000
 HOST0 = 1_748_773_230 * S
@@ -20,7 +20,7 @@ def _device(host_ns: int, ppm: float = 0.0) -> int:
 
 
 def test_the_promptest_message_gives_the_offset_and_no_stamp_is_after_arrival():
-    clock = AutopilotClock(drift_limit_ppm=0.0)
+    clock = DeviceClock(drift_limit_ppm=0.0)
     stamps = [clock.read(_device(HOST0 + i * S), HOST0 + i * S + late * MS) for i, late in enumerate([30, 10, 20, 50])]
     assert [s - HOST0 - i * S for i, s in enumerate(stamps) if s is not None] == [30 * MS, 10 * MS, 10 * MS, 10 * MS]
     assert clock.uncertainty_ns is None  # one-way messages do not tell how late the promptest was
@@ -28,7 +28,7 @@ def test_the_promptest_message_gives_the_offset_and_no_stamp_is_after_arrival():
 
 
 def test_an_old_bound_loosens_with_the_drift_limit():
-    clock = AutopilotClock(drift_limit_ppm=100.0)
+    clock = DeviceClock(drift_limit_ppm=100.0)
     clock.read(_device(HOST0), HOST0 + 5 * MS)
     stamp = clock.read(_device(HOST0 + 20 * S), HOST0 + 20 * S + 50 * MS)
     assert stamp is not None
@@ -39,7 +39,7 @@ def test_an_old_bound_loosens_with_the_drift_limit():
 @pytest.mark.parametrize("timesync", [False, True])
 def test_the_offset_is_known_within_the_latency_while_the_clocks_drift(ppm: float, timesync: bool):
     rng = np.random.default_rng(3)
-    clock, errors, uncertain, last = AutopilotClock(100.0), [], [], HOST0
+    clock, errors, uncertain, last = DeviceClock(100.0), [], [], HOST0
     for i in range(6000):
         host = HOST0 + i * 20 * MS
         last = max(last, host + 6 * MS + round(rng.exponential(4 * MS)))
@@ -60,7 +60,7 @@ def test_the_offset_is_known_within_the_latency_while_the_clocks_drift(ppm: floa
 
 
 def test_timesync_sees_a_delay_that_one_way_messages_cannot():
-    one_way, both = AutopilotClock(), AutopilotClock()
+    one_way, both = DeviceClock(), DeviceClock()
     for i in range(20):
         host = HOST0 + i * S
         for clock in (one_way, both):
@@ -72,7 +72,7 @@ def test_timesync_sees_a_delay_that_one_way_messages_cannot():
 
 
 def test_replies_to_others_or_from_the_past_are_refused():
-    clock = AutopilotClock()
+    clock = DeviceClock()
     assert not clock.round_trip(HOST0, _device(HOST0), HOST0 + MS)  # before any message
     clock.read(_device(HOST0), HOST0 + 5 * MS)
     assert not clock.round_trip(HOST0 + 9 * MS, _device(HOST0), HOST0 + 8 * MS)  # asked after the answer
@@ -82,7 +82,7 @@ def test_replies_to_others_or_from_the_past_are_refused():
 
 
 def test_one_wild_time_is_refused_and_a_reboot_begins_anew():
-    clock = AutopilotClock()
+    clock = DeviceClock()
     clock.read(_device(HOST0), HOST0 + 5 * MS)
     assert clock.read(2**63, HOST0 + S) is None
     assert clock.read(_device(HOST0 + S), HOST0 + S + 5 * MS) is not None
@@ -94,7 +94,7 @@ def test_one_wild_time_is_refused_and_a_reboot_begins_anew():
 
 @given(st.lists(st.tuples(st.integers(0, 2**64), st.integers(0, 2**62), st.integers(-(2**63), 2**63)), max_size=30))
 def test_no_times_make_it_fail(times: list[tuple[int, int, int]]):
-    clock = AutopilotClock()
+    clock = DeviceClock()
     for device, arrival, ts1 in times:
         stamp = clock.read(device, arrival)
         assert stamp is None or stamp <= arrival

@@ -1,9 +1,9 @@
-"""The autopilot's time since boot -> nanoseconds on the host's timeline.
+"""The clock of a device that talks to us, an autopilot's since boot or another host's -> the host's timeline.
 
 What is sought is the offset, host = device + offset. Two bounds hold it, and each message can only tighten them:
 
     a message cannot arrive before it was sent:        offset <= arrival - device
-    a TIMESYNC reply (tc1) came after its request (ts1): offset >= ts1 - tc1
+    an answer (MAVLink's TIMESYNC, tc1) came after its question (ts1): offset >= ts1 - tc1
 
 The clocks drift apart by at most `drift_limit_ppm`, so a bound loosens by that much as it ages: one old prompt message
 neither holds for ever nor is forgotten at once. The answer is the upper bound, late by the delay of the promptest
@@ -21,7 +21,7 @@ DISAGREEMENTS = 5  # in a row, then the device's clock was set and not the messa
 MAX_ROUND_TRIP_NS = 1_000_000_000  # a slower TIMESYNC reply tells nothing of use
 
 
-class AutopilotClock:
+class DeviceClock:
     """Turns device times into host times, message by message. Pure: the same messages give the same times."""
 
     def __init__(self, drift_limit_ppm: float = 100.0, jump_limit_ns: int = 5_000_000_000) -> None:

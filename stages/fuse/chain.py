@@ -1,0 +1,107 @@
+"""The chain of poses of a drone whose rotation is known: begun at one, lengthened by the drone's own way, measured.
+
+A rotation is gated by chi-square on its innovation with P + R, then weighed by Huber in the back end, as fixes are.
+Eight refused in a row that agree with each other are right.
+
+Source: DESIGN, Fusion; ours.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.fuse.back_end import BackEnd
+from stages.fuse.correlated import Worth, inflation
+from stages.fuse.positions import GATE, Positions
+from stages.fuse.rejected import Rejected
+from stages.fuse.rigid import carried_covariance, distance2, position_covariance
+from stages.fuse.settings import FuseErrors
+from stages.geometry import Array64
+from stages.rotation import log_rotation
+
+PERIOD_NS = 100_000_000  # of the chain's poses
+
+
+class Chain:
+    """The back end while it runs; what it says counts only then."""
+
+    def __init__(self, back: BackEnd, errors: FuseErrors, positions: Positions) -> None:
+        self.back = back
+        self._errors, self._positions = errors, positions
+        self.lose()
+
+    def lose(self) -> None:
+        """No rotation is known, nor what was refused before."""
+        self.running = False
+        self.rotation_covariance_rad2 = np.zeros((3, 3))
+        self._refused = Rejected()
+        self._worth = Worth(self._errors.rotation_time_s)
+
+    def start(self, stamp_ns: int, R: Array64, covariance_rad2: Array64) -> None:
+        """Begin with a rotation told for some moment, at the newest fix; or where the chain before had come."""
+        if self.running:
+            at_ns, xyz_m = self.back.stamp_ns, self.back.xyz_start_m
+            covariance_m2 = position_covariance(self.back.covariance, self.back.R_start_drone)
+        else:
+            free = self._positions.free
+            assert free.stamp_ns is not None
+            at_ns = free.stamp_ns
+            xyz_m, covariance_m2 = free.ahead(at_ns)
+            self._positions.begin_left_over(xyz_m, covariance_m2)
+        turn = self._positions.step(stamp_ns, at_ns, R)
+        R_start_drone = R @ turn.R
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = turn.R.T @ covariance_rad2 @ turn.R + turn.covariance[:3, :3]
+        covariance[3:, 3:] = R_start_drone.T @ covariance_m2 @ R_start_drone
+        self.back.start(at_ns, R_start_drone, xyz_m, covariance)
+        self.running = True
+        self.rotation_covariance_rad2 = covariance_rad2
+        self._worth = Worth(self._errors.rotation_time_s)
+
+    def extend(self, next_ns: int, R_own_drone: Array64 | None) -> None:
+        """One pose more; `R_own_drone`: the autopilot's attitude there, of which the vertical is used."""
+        step = self._positions.step(self.back.stamp_ns, next_ns, self.back.R_start_drone)
+        tilt_rad2 = math.radians(self._errors.tilt_deg) ** 2 * inflation(1e-9 * PERIOD_NS, self._errors.tilt_time_s)
+        self.back.extend(next_ns, step, None if R_own_drone is None else R_own_drone[2], tilt_rad2)
+
+    def at(self, stamp_ns: int) -> tuple[Array64, Array64, Array64]:
+        """R_start_drone, position and covariance (6, 6), carried from the nearest pose of the chain."""
+        key_ns, R, xyz_m = self.back.near(stamp_ns)
+        step = self._positions.step(key_ns, stamp_ns, R)
+        covariance = carried_covariance(self.back.covariance, step.R, step.t_m, step.covariance)
+        return R @ step.R, xyz_m + R @ step.t_m, covariance
+
+    def add_position(self, stamp_ns: int, R_start_drone: Array64, z: Array64, covariance_m2: Array64) -> None:
+        """A LiDAR position at its own time; R_start_drone as the chain has it there."""
+        key_ns, R_key, _ = self.back.near(stamp_ns)
+        step = self._positions.step(key_ns, stamp_ns, R_key)
+        self.back.add_position(key_ns, step, z, covariance_m2 + position_covariance(step.covariance, R_start_drone))
+
+    def fits(self, stamp_ns: int, R: Array64, covariance_rad2: Array64) -> bool | None:
+        """Whether a rotation is within the gate; None: it is not; False: nor were those before, and they agree."""
+        R_expected, _, covariance = self.at(stamp_ns)
+        off = log_rotation(R_expected.T @ R)
+        if distance2(off, covariance[:3, :3] + covariance_rad2) <= GATE:
+            self._refused.clear()
+            return True
+        return False if self._refused.add(stamp_ns, off, covariance_rad2) else None
+
+    def add_rotation(self, stamp_ns: int, R: Array64, covariance_rad2: Array64) -> None:
+        """A rotation at its own time."""
+        self.rotation_covariance_rad2 = covariance_rad2
+        worth = (1.0 - self._errors.rotation_lasting) * self._worth.factor(stamp_ns)
+        key_ns, R_key, _ = self.back.near(stamp_ns)
+        step = self._positions.step(key_ns, stamp_ns, R_key)
+        self.back.add_rotation(key_ns, step, R, worth * covariance_rad2 + step.covariance[:3, :3])
+
+    @property
+    def yaw_sigma_rad(self) -> float:
+        """Of the newest pose."""
+        return yaw_sigma_rad(self.back.R_start_drone, self.back.covariance)
+
+
+def yaw_sigma_rad(R: Array64, covariance: Array64) -> float:
+    """Of a pose's rotation about the vertical."""
+    return math.sqrt(max(float(R[2] @ covariance[:3, :3] @ R[2]), 0.0))

@@ -1,0 +1,113 @@
+"""How much later than the LiDAR packet that let it out a pose leaves for the autopilot.
+
+    python -m pytest tests/benchmarks/bench_packet_to_mavlink.py -s
+    GRD_FLIGHT=out/live/flight.mcap python -m pytest tests/benchmarks/bench_packet_to_mavlink.py -s
+
+The first flies a simulated drone in closed loop through the whole graph, on one thread: it times each record, from when
+it is fed until its pose's datagram is read at a peer's socket, so it is the computing alone. With GRD_FLIGHT, the
+recording of a live run (`grd run`), threads and their queues are in it: a pose is predicted to the newest stamp heard,
+so it could go out when the first record of that time or later had arrived; its ODOMETRY frame did so at the time recorded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import socket
+import sys
+import time
+from bisect import bisect_left
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import PrivateAttr
+
+from flow.link import Tap
+from flow.replay import Replay
+from links import host_time
+from links.mavlink import Autopilot
+from links.mavlink.wire import parse_frame
+from links.recording import RecordingReader
+from links.run_folder import Asked
+from links.simulated.matrix import Conditions, scenario_of
+from links.simulated.matrix_flights import Cell
+from links.simulated.run import simulate_records
+from stages.messages import RelativePose
+
+sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))
+from mavlink_poses import good_pose
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "estimate.yaml"
+ODOMETRY = 331
+FLIGHT = os.environ.get("GRD_FLIGHT")
+
+
+class ToAutopilot(Tap):
+    """Hands each fused pose to a live autopilot link, as good and of now, and waits for its datagram at the peer."""
+
+    def wire(self, link: Autopilot, peer: socket.socket) -> None:
+        self._link, self._peer = link, peer
+
+    def see(self, output, message, arrival_ns) -> None:
+        if isinstance(message, RelativePose):
+            self._link.on_pose(dataclasses.replace(good_pose(), stamp_ns=host_time.now_ns()))
+            while int.from_bytes(self._peer.recv(400)[7:10], "little") != ODOMETRY:
+                pass
+            self._out.append((time.perf_counter_ns(), message.measured_ns))
+
+    def took(self) -> tuple[int, int | None] | None:
+        """When the newest pose since the call before was read, and its newest fix; None: none went out."""
+        newest, self._out = (self._out[-1] if self._out else None), []
+        return newest
+
+    _link: Autopilot = PrivateAttr()
+    _peer: socket.socket = PrivateAttr()
+    _out: list[tuple[int, int | None]] = PrivateAttr(default_factory=list)
+
+
+def told(name: str, took_ms: list[float]) -> None:
+    p50, p99 = np.percentile(took_ms, [50, 99])
+    print(f"\n{name}: p50 {p50:.2f}, p99 {p99:.2f}, max {max(took_ms):.1f} ms, {len(took_ms)} poses")  # noqa: T201
+
+
+def test_a_packet_to_its_poses_datagram_by_computing() -> None:
+    scenario = scenario_of(Cell("manhattan", 10, "orbit", "driving"), 1, Conditions(odometry=True, autopilot=True))
+    graph = Asked(CONFIG, sets=("viewer.file=null",)).graph(scenario.rig_yaml(), scenario.name)
+    tap = ToAutopilot()
+    runner, all_ms, fix_ms, newest_fix = Replay(graph, (tap,)), [], [], None
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        peer.settimeout(5.0)
+        link = Autopilot(connection=f"udpout:127.0.0.1:{peer.getsockname()[1]}")
+        with link.listen():
+            tap.wire(link, peer)
+            for record in simulate_records(scenario):
+                begin = time.perf_counter_ns()
+                runner.feed(record)
+                out = tap.took()
+                if out is not None and record.topic == "/lidar/packets":
+                    all_ms.append(1e-6 * (out[0] - begin))
+                    if out[1] != newest_fix:
+                        newest_fix = out[1]
+                        fix_ms.append(all_ms[-1])
+    told("LiDAR packet -> datagram, one thread", all_ms[len(all_ms) // 10 :])  # the first are compiled meanwhile
+    told("those with a new LiDAR position", fix_ms[len(fix_ms) // 10 :])
+
+
+@pytest.mark.skipif(FLIGHT is None, reason="GRD_FLIGHT names no recording of a live run")
+def test_a_packet_to_its_poses_datagram_in_a_live_run() -> None:
+    with RecordingReader(Path(FLIGHT or "")) as reader:
+        packets, sent = [], []
+        for record in reader.records(["/lidar/packets", "/servo/state", "/autopilot/rx", "/autopilot/tx"]):
+            if record.topic != "/autopilot/tx":
+                packets.append((record.stamp_ns, record.arrival_ns))
+            elif (frame := parse_frame(record.data)).get_type() == "ODOMETRY":
+                sent.append((1000 * frame.time_usec, record.arrival_ns))
+    packets.sort()
+    stamps = [stamp for stamp, _ in packets]
+    firsts = [bisect_left(stamps, stamp) for stamp, _ in sent]
+    after = [1e-6 * (out - packets[i][1]) for (_, out), i in zip(sent, firsts, strict=True) if i < len(packets)]
+    assert after, f"{FLIGHT} holds no ODOMETRY that was sent"
+    told("first record of the pose's time -> datagram, live", after)
+    told("stamp of the pose -> datagram, live", [1e-6 * (out - stamp) for stamp, out in sent])

@@ -1,0 +1,236 @@
+"""What the fusion hears in a recorded flight, taken out of a replay once, so that it can be fused again and again.
+
+A fault changes what is heard: messages left out, later, or false. `judge` holds the poses against the truth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import PrivateAttr
+
+from flow.graph import Graph
+from flow.link import Tap
+from flow.replay import Replay
+from flow.stage import input_ports
+from links.recording import RecordingReader
+from links.run_folder import Asked
+from links.truth import TruthLog
+from stages.fuse import Fuse
+from stages.geometry import rotation_from_quaternion_xyzw
+from stages.messages import DroneFix, PoseState, RelativePose, RelativeRotation
+from stages.rotation import exp_rotation, log_rotation
+from tests.stages.fuse.made_drone_flight import gauss_markov, rotation
+
+GRID_S = 0.02
+CHI2_95_3 = 7.814728
+Event = tuple[int, str, Any]  # arrival [ns], port, message
+Fault = Callable[[list[Event]], list[Event]]
+
+
+@dataclass
+class Flown:
+    """A flight: what the fusion hears, in order, and where the drone truly was in the vehicle's frame."""
+
+    name: str
+    events: list[Event]
+    truth_ns: np.ndarray
+    truth_xyz_m: np.ndarray
+    truth_R: np.ndarray
+
+    def truth(self, stamp_ns: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """R_vehicle_drone and position at a time; None where there is no truth."""
+        i = int(np.searchsorted(self.truth_ns, stamp_ns))
+        if i == 0 or i >= len(self.truth_ns):
+            return None
+        a, b = self.truth_ns[i - 1], self.truth_ns[i]
+        share = (stamp_ns - a) / (b - a)
+        turn = log_rotation(self.truth_R[i - 1].T @ self.truth_R[i])
+        return self.truth_R[i - 1] @ exp_rotation(share * turn), (
+            (1 - share) * self.truth_xyz_m[i - 1] + share * self.truth_xyz_m[i]
+        )
+
+    def fuse(self, stage: Fuse | None = None, fault: Fault | None = None) -> list[RelativePose]:
+        """The poses told when this is heard, with a fault."""
+        stage, poses = stage or Fuse(), []
+        for _, port, message in fault(self.events) if fault else self.events:
+            poses += getattr(stage, f"on_{port}")(message)
+        return poses
+
+
+def heard(recording: Path, config: Path, fuse: str = "fuse") -> Flown:
+    """Replay a recording and keep what its fusion hears."""
+    truth = TruthLog()
+    with RecordingReader(recording) as reader:
+        graph = Asked(config, sets=("viewer.file=null",)).graph(reader.rig_yaml, str(recording))
+        tap = Hearing(graph, fuse)
+        runner = Replay(graph, (tap,))
+        for record in truth.aside(reader.records()):
+            runner.feed(record)
+        runner.finish()
+    return flown(recording.stem, tap, truth)
+
+
+def flown(name: str, tap: Hearing, truth: TruthLog) -> Flown:
+    """What a tap heard, beside the truth."""
+    poses = truth.drones[1].pose
+    stamps = sorted(truth.vehicle.keys() & poses.keys())
+    R, xyz = [], []
+    for stamp in stamps:
+        (t_vehicle, q_vehicle), (t_drone, q_drone) = truth.vehicle[stamp], poses[stamp]
+        R_world_vehicle = rotation_from_quaternion_xyzw(q_vehicle)
+        R.append(R_world_vehicle.T @ rotation_from_quaternion_xyzw(q_drone))
+        xyz.append(R_world_vehicle.T @ (np.asarray(t_drone) - np.asarray(t_vehicle)))
+    return Flown(name, tap.all(), np.array(stamps), np.array(xyz), np.array(R))
+
+
+class Hearing(Tap):
+    """Keeps what goes to one stage, in the order in which a replay hands it over."""
+
+    def __init__(self, graph: Graph, consumer: str) -> None:
+        super().__init__()
+        order = list(input_ports(graph.nodes[consumer].cls))
+        edges = [e for e in graph.edges if e.consumer == consumer]
+        self._ports = {f"{e.producer}.{e.output}": (order.index(e.port), e.port) for e in edges}
+
+    def see(self, output, message, arrival_ns) -> None:
+        if output in self._ports:
+            index, port = self._ports[output]
+            self._heard.append((arrival_ns, index, len(self._heard), (arrival_ns, port, message)))
+
+    def all(self) -> list[Event]:
+        return [event for *_, event in sorted(self._heard, key=lambda e: e[:3])]
+
+    _ports: dict[str, tuple[int, str]] = PrivateAttr(default_factory=dict)
+    _heard: list[tuple[int, int, int, Event]] = PrivateAttr(default_factory=list)
+
+
+# faults
+
+
+def without(ports: tuple[str, ...], from_s: float = -math.inf, until_s: float = math.inf) -> Fault:
+    """What these ports hear between two times of the flight, by its own time, is lost."""
+
+    def fault(events: list[Event]) -> list[Event]:
+        first = events[0][0]
+        return [e for e in events if e[1] not in ports or not from_s <= (e[2].stamp_ns - first) * 1e-9 < until_s]
+
+    return fault
+
+
+def late(ports: tuple[str, ...], by_s: float) -> Fault:
+    """What these ports hear comes later, in the same order."""
+
+    def fault(events: list[Event]) -> list[Event]:
+        moved = [(at + round(by_s * 1e9) if port in ports else at, port, m) for at, port, m in events]
+        return sorted(moved, key=lambda e: e[0])
+
+    return fault
+
+
+def spoilt(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
+    """This share of what these ports hear is false: places by metres, turns by some tens of degrees."""
+
+    def fault(events: list[Event]) -> list[Event]:
+        rng = np.random.default_rng(seed)
+        return [
+            (at, port, falsified(m, rng) if port in ports and rng.random() < share else m) for at, port, m in events
+        ]
+
+    return fault
+
+
+def falsified(message: Any, rng: np.random.Generator) -> Any:
+    """The same message telling something else."""
+    changed: dict[str, Any] = {}
+    for name in message.__dataclass_fields__:
+        value = getattr(message, name)
+        if value is None or "covariance" in name:
+            continue
+        if name.startswith("xyz_"):
+            changed[name] = value + rng.normal(0, 3.0, 3)
+        elif name.startswith("velocity_"):
+            changed[name] = value + rng.normal(0, 2.0, 3)
+        elif name.startswith("R_"):
+            changed[name] = value @ exp_rotation(rng.normal(0, 0.4, 3))
+    return replace(message, **changed)
+
+
+def with_rotations(flown: Flown, wrong_quarter: int = 0, after_s: float = 2.0, seed: int = 3) -> Flown:
+    """The same flight with rotations told five times a second, RESOLVED, as good as `align`'s in Manhattan."""
+    rng = np.random.default_rng(seed)
+    first = flown.events[0][0]
+    times = np.arange(after_s, (flown.truth_ns[-1] - first) * 1e-9 - 0.1, 0.2)
+    off = gauss_markov(rng, math.radians(0.3), 1.0, 0.2, len(times))
+    more: list[Event] = []
+    quarter = exp_rotation(np.array([0.0, 0.0, wrong_quarter * math.pi / 2]))
+    for t, e in zip(times, off, strict=True):
+        stamp_ns = first + round(t * 1e9)
+        true = flown.truth(stamp_ns)
+        if true is None:
+            continue
+        told = rotation(0.0, quarter @ true[0] @ exp_rotation(e), math.radians(0.3))
+        more.append((stamp_ns + 80_000_000, "rotation", replace(told, stamp_ns=stamp_ns)))
+    events = [e for e in flown.events if not isinstance(e[2], RelativeRotation)] + more
+    return replace(flown, events=sorted(events, key=lambda e: e[0]))
+
+
+# judging
+
+
+@dataclass
+class Row:
+    """What came of a flight, or of several added up."""
+
+    states: Counter[PoseState] = field(default_factory=Counter)
+    longest_gap_s: float = 0.0
+    wrong_quarter_full: int = 0  # poses with a rotation more than 45 deg off
+    error_m: list[float] = field(default_factory=list)
+    angle_deg: list[float] = field(default_factory=list)
+    nees3: list[float] = field(default_factory=list)
+    nees6: list[float] = field(default_factory=list)
+    state_of: list[PoseState] = field(default_factory=list)  # of each error
+    age_s: list[float] = field(default_factory=list)  # since the newest LiDAR position, of each error
+    range_m: list[float] = field(default_factory=list)
+    fix_error_m: list[float] = field(default_factory=list)
+
+    def inside(self, rows: np.ndarray | None = None) -> float:
+        nees = np.array(self.nees3) if rows is None else np.array(self.nees3)[rows]
+        return 100 * float((nees <= CHI2_95_3).mean()) if len(nees) else math.nan
+
+
+def judge(flown: Flown, poses: list[RelativePose], into: Row | None = None) -> Row:
+    """Poses against the truth; the gap is between two outputs, from the first to the end of what is heard."""
+    row = into or Row()
+    stamps = [p.stamp_ns for p in poses] + [max(e[2].stamp_ns for e in flown.events)]
+    row.longest_gap_s = max(row.longest_gap_s, float(np.diff(stamps).max()) * 1e-9)
+    for pose in poses:
+        row.states[pose.state] += 1
+        true = flown.truth(pose.stamp_ns)
+        if pose.xyz_vehicle_m is None or pose.covariance is None or true is None:
+            continue
+        R, xyz = true
+        e, P = pose.xyz_vehicle_m - xyz, pose.covariance
+        row.error_m.append(float(np.linalg.norm(e)))
+        row.state_of.append(pose.state)
+        row.age_s.append((pose.stamp_ns - (pose.measured_ns or pose.stamp_ns)) * 1e-9)
+        row.range_m.append(float(np.linalg.norm(xyz)))
+        if pose.R_vehicle_drone is None:
+            row.nees3.append(float(e @ np.linalg.solve(P[3:, 3:], e)))
+            continue
+        off = np.concatenate([log_rotation(pose.R_vehicle_drone.T @ R), -pose.R_vehicle_drone.T @ e])
+        row.nees3.append(float(off[3:] @ np.linalg.solve(P[3:, 3:], off[3:])))
+        row.nees6.append(float(off @ np.linalg.solve(P, off)))
+        row.angle_deg.append(math.degrees(float(np.linalg.norm(off[:3]))))
+        row.wrong_quarter_full += row.angle_deg[-1] > 45.0
+    return row
+
+
+def fixes_of(flown: Flown) -> list[DroneFix]:
+    return [m for _, _, m in flown.events if isinstance(m, DroneFix)]

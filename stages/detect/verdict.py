@@ -54,7 +54,7 @@ class Evidence(BaseModel):
     most_alone: float = 2.0
     near_alone: float = 3.0  # nearby up to so much more: there a wire that held it would return pulses, too
     wire_m: float = 20.0  # up to this range,
-    unseen_m: float = 45.0  # and none from here on
+    unseen_m: float = 30.0  # and none from here on
     most_few: float = 6.0  # looks with a single return: a wire gives little else
     most_many: float = 2.0  # and those with more
     near_big: float = 8.0  # a wall, crown or trunk this close, and it has not moved away

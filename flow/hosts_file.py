@@ -104,7 +104,7 @@ def _place(tree: Tree, graph: Graph, hosts: dict[str, Any]) -> dict[str, str]:
         path = ("place", node)
         if node not in graph.nodes:
             tree.problem(path, f"no stage or link '{node}'.{did_you_mean(node, graph.nodes)}")
-        elif host not in hosts:
+        elif not isinstance(host, str) or host not in hosts:
             near = did_you_mean(host, hosts) if isinstance(host, str) else ""
             tree.problem(path, f"no host {host!r}; there is {one_of(hosts)}.{near}")
         else:
@@ -134,11 +134,11 @@ def _seen(tree: Tree, graph: Graph, place: dict[str, str]) -> dict[str, list[tup
             continue
         names = cast("list[Any]", wanted)
         for index, name in enumerate(names):
-            if name not in outputs:
+            if not isinstance(name, str) or name not in outputs:
                 near = did_you_mean(name, outputs) if isinstance(name, str) else ""
                 tree.problem((*path, str(index)), f"no output {name!r}.{near}")
         if tap in place:
-            seen[tap] = [outputs[name] for name in names if name in outputs]
+            seen[tap] = [outputs[name] for name in names if isinstance(name, str) and name in outputs]
     return seen
 
 

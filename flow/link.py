@@ -53,6 +53,10 @@ class Link(Node):
         """What does not work now, in words, where the link cannot raise it; the live runner says it when it changes."""
         return None
 
+    def orphaned(self, port: str) -> str | None:
+        """The stage behind an input works no more (live): what was done about it, in words. None: nothing need be."""
+        return None
+
 
 class Source(Link):
     """A link that brings records in.

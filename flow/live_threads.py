@@ -6,6 +6,7 @@ Source: ours.
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter_ns
@@ -76,9 +77,17 @@ class StageRun:
     """One stage with its inbox, while its thread works."""
 
     def __init__(
-        self, life: StageLife, inbox: Inbox, counts: list[EdgeCount], order: OrderLog | None, shared: Shared
+        self,
+        life: StageLife,
+        inbox: Inbox,
+        counts: list[EdgeCount],
+        order: OrderLog | None,
+        shared: Shared,
+        gave_up: Callable[[], None],
     ) -> None:
+        """`gave_up` is called when the stage has, once."""
         self.life, self.inbox = life, inbox
+        self._tell_gave_up = gave_up
         self.ended = threading.Event()
         self._ports = [(count.edge.port, count) for count in counts]
         self._order, self._shared = order, shared
@@ -103,9 +112,11 @@ class StageRun:
                 self._order.add_finish()
             for output, message in self.life.finish():
                 self._shared.send(output, message, self.life.last_ns)
-        elif self.life.stops_run:
-            self._shared.stopped_by = self.life.name
-            self._shared.stopping.set()
+        else:
+            self._tell_gave_up()
+            if self.life.stops_run:
+                self._shared.stopped_by = self.life.name
+                self._shared.stopping.set()
         self.ended.set()
 
 
@@ -144,13 +155,19 @@ class SinkThread(Worker):
         self.compute = Latency()
         self.failures = 0
         self.ended = threading.Event()
+        self._orphaned: deque[tuple[str, str]] = deque()
+
+    def orphan(self, port: str, stage: str) -> None:
+        """The stage behind a port has given up; any thread may say so."""
+        self._orphaned.append((port, stage))
 
     def run(self) -> None:
         handlers = [(f"{self.node}.{c.edge.port}", getattr(self.link, f"on_{c.edge.port}")) for c in self.counts]
         done = False
         while not done:
+            orphaned = len(self._orphaned)  # looked at first: what those stages gave is all in the inbox then
             item = self.inbox.take()
-            if item is None:
+            if item is None and not orphaned:
                 done = self.inbox.done
                 if not done:
                     self.inbox.bell.wait([self.inbox], SENT_S)
@@ -160,6 +177,12 @@ class SinkThread(Worker):
                     call(*handlers[item.port], item.message, item.arrival_ns)
                     self.compute.add(perf_counter_ns() - begin)
                     self.counts[item.port].done(self.shared.now_ns() - item.arrival_ns)
+                if item is None and orphaned:
+                    port, stage = self._orphaned.popleft()
+                    with named(f"{self.node}.orphaned"):
+                        done_about_it = self.link.orphaned(port)
+                    if done_about_it is not None:
+                        self.shared.incidents.report(self.node, f"'{stage}' works no more: {done_about_it}")
                 with named(f"{self.node}.sent"):
                     for record in self.link.sent():
                         self.shared.keep(record)

@@ -95,7 +95,15 @@ class Wiring:
             order = OrderLog(spec.name, [count.edge.port for count in counts])
             self.orders.append(order)
         life = StageLife(spec, self.outputs[spec.name], self._teller(spec.name), strict=shared.strict)
-        self.stages.append(StageRun(life, inbox, counts, order, shared))
+        self.stages.append(StageRun(life, inbox, counts, order, shared, lambda: self._orphan(spec.name)))
+
+    def _orphan(self, stage: str) -> None:
+        """Links that a stage fed learn that it has given up."""
+        for edge in self.edges.values():
+            if edge.count.edge.producer == stage:
+                for sink in self.sinks:
+                    if sink.node == edge.count.edge.consumer:
+                        sink.orphan(edge.count.edge.port, stage)
 
     def _teller(self, name: str) -> Callable[[str, RunError], None]:
         def tell(done: str, error: RunError) -> None:

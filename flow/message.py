@@ -109,37 +109,60 @@ def _field_names(cls: type[Any]) -> tuple[str, ...]:
 
 
 _pack_float = struct.Struct("<d").pack
+_heads: dict[tuple[np.dtype[Any], tuple[int, ...]], bytes] = {}  # of arrays: few kinds and sizes, written often
+MOST_HEADS = 4096
+
+
+def _head(array: NDArray[Any]) -> bytes:
+    """An array's type and shape, as they are hashed."""
+    kind = array.dtype, array.shape
+    head = _heads.get(kind)
+    if head is None:
+        if len(_heads) >= MOST_HEADS:
+            _heads.clear()
+        head = _heads[kind] = f"[{array.dtype.str}{array.shape}".encode()
+    return head
 
 
 def hash_into(hasher: Hasher, value: Any) -> None:
-    """Feed a message, to the last bit and with its types, into a hashlib object. Unknown types are an error."""
-    if dataclasses.is_dataclass(value):
-        hasher.update(b"{" + type(value).__name__.encode())
-        for name in _field_names(type(value)):
-            hash_into(hasher, getattr(value, name))
-        hasher.update(b"}")
-    elif isinstance(value, np.ndarray):
+    """Feed a message, to the last bit and with its types, into a hashlib object. Unknown types are an error.
+
+    In one piece: hashlib lets go of Python's lock at each piece beyond 2 kB, and then has to wait for it.
+    """
+    parts: list[Any] = []
+    _add_parts(parts, value)
+    hasher.update(b"".join(parts))
+
+
+def _add_parts(parts: list[Any], value: Any) -> None:
+    if isinstance(value, np.ndarray):
         array = cast("NDArray[Any]", value)
-        hasher.update(f"[{array.dtype.str}{array.shape}".encode())
-        hasher.update(np.ascontiguousarray(array).data if array.size else b"")
+        parts.append(_head(array))
+        if array.size:
+            parts.append(array.data if array.flags.c_contiguous else np.ascontiguousarray(array).data)
+    elif isinstance(value, Message) or dataclasses.is_dataclass(value):
+        parts.append(b"{" + type(value).__name__.encode())
+        for name in _field_names(type(value)):
+            _add_parts(parts, getattr(value, name))
+        parts.append(b"}")
     elif isinstance(value, enum.Enum):
-        hasher.update(b"e" + value.name.encode() + b";")
+        parts.append(b"e" + value.name.encode() + b";")
     elif isinstance(value, bool | np.bool_):
-        hasher.update(b"T" if value else b"F")
+        parts.append(b"T" if value else b"F")
     elif isinstance(value, int | np.integer):
-        hasher.update(b"i%d;" % int(cast(int, value)))
+        parts.append(b"i%d;" % int(cast(int, value)))
     elif isinstance(value, float | np.floating):
-        hasher.update(b"d" + _pack_float(float(cast(float, value))))
+        parts.append(b"d" + _pack_float(float(cast(float, value))))
     elif isinstance(value, str):
-        hasher.update(b"s%d:" % len(value) + value.encode())
+        parts.append(b"s%d:" % len(value) + value.encode())
     elif isinstance(value, bytes):
-        hasher.update(b"b%d:" % len(value) + value)
+        parts += b"b%d:" % len(value), value
     elif value is None:
-        hasher.update(b"N")
+        parts.append(b"N")
     elif isinstance(value, tuple):
         items = cast("tuple[Any, ...]", value)
-        hasher.update(b"(%d:" % len(items))
+        parts.append(b"(%d:" % len(items))
         for item in items:
-            hash_into(hasher, item)
+            _add_parts(parts, item)
     else:
         raise TypeError(f"a message may not hold a {type(value).__name__}: {value!r}")

@@ -19,7 +19,7 @@ import functools
 import types
 import typing
 from collections.abc import Iterable, Iterator
-from typing import Any, ClassVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ConfigDict
 
@@ -33,6 +33,15 @@ class Node(BaseModel):
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset()
     """Input ports that may stay unwired."""
+
+    if not TYPE_CHECKING:  # a type checker would take every name for one of ours
+
+        def __getattr__(self, name: str) -> Any:
+            """A private attribute: asked for 20 000 times a second, and pydantic's own way takes four times as long."""
+            try:
+                return object.__getattribute__(self, "__pydantic_private__")[name]
+            except (AttributeError, TypeError, KeyError):  # not made yet, there are none, none of this name
+                return super().__getattr__(name)
 
 
 class Stage(Node):

@@ -25,6 +25,7 @@ from flow.taps import Digest
 from links import host_time
 from links.recording import Recorder
 from links.run_folder import Asked, Finished, RunFolder
+from links.usage import Usage
 
 LOOK_S = 0.1
 STOPPING = (signal.SIGINT, signal.SIGTERM)
@@ -69,14 +70,15 @@ def run_live(
         gc.collect()
         gc.freeze()  # what is there now stays: the collector has less to look through, and pauses are short
         live.start()
-        started_s = time.monotonic()
+        started_s, usage = time.monotonic(), Usage()
         while live.running and not stop.wait(LOOK_S) and (for_s is None or time.monotonic() < started_s + for_s):
             _show(live, started_s, show, run)
+            usage.look()
         report = live.stop()
         _show(live, started_s, show, run)
         gc.unfreeze()
         warnings = [] if report.stopped_by is None else [f"'{report.stopped_by}' stopped the run"]
-        return run.finish(report, digest.hexdigest(), None, warnings)
+        return run.finish(report, digest.hexdigest(), None, warnings, usage)
 
 
 def _show(live: Live, started_s: float, show: Show, run: RunFolder) -> None:

@@ -11,6 +11,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 from flow.consumption import END_TOPIC, ORDER_TOPIC, read_orders
 from flow.graph import Graph, load_graph
 from flow.link import LinkError
@@ -66,6 +68,12 @@ def _graph_of(recording: Path) -> tuple[Graph, Asked, list[str]]:
         text, warnings = reader.config_yaml, list(reader.warnings)
     if text is None:
         raise LinkError(f"{recording} carries no configuration: it is no live run's recording. Leave out --as-live")
+    values = yaml.safe_load(text)
+    if isinstance(values, dict) and "host" in values:
+        raise LinkError(
+            f"{recording} is what host '{values['host']}' recorded of a run on several hosts: --as-live repeats runs "
+            "on one host only. What its own sensors gave can be replayed: name a configuration with --config instead"
+        )
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder, "config.yaml")
         config.write_text(text, encoding="utf-8")

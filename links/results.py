@@ -6,13 +6,12 @@ Source: DESIGN, Outputs of a run. TUM lines are `stamp_s tx ty tz qx qy qz qw` o
 from __future__ import annotations
 
 import csv
-import io
 import math
 import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from pydantic import PrivateAttr
 
 from flow.link import Run, Tap
 from flow.message import Message
+from links.result_file import ResultFile
 from stages.geometry import quaternions_xyzw
 from stages.messages import DepthImage, Detections, DroneFix, PoseState, RelativePose, RelativeRotation, TrackState
 
@@ -75,7 +75,8 @@ class Results(Tap):
     A run in which nobody tells a rotation has no file of rotations; one in which nobody fuses has none of poses.
     """
 
-    _files: dict[str, TextIO] = PrivateAttr(default_factory=dict)
+    _files: dict[str, ResultFile] = PrivateAttr(default_factory=dict)
+    _live: bool = PrivateAttr(default=False)
     _covariance: Any = PrivateAttr(default=None)
     _detections: Any = PrivateAttr(default=None)
     _rotations: Any = PrivateAttr(default=None)
@@ -131,9 +132,9 @@ class Results(Tap):
 
     def open(self, run: Run) -> None:
         """Start the run's files."""
+        self._folder, self._live = run.out_dir, run.live
         for name in (FIX_FILE, COVARIANCE_FILE, DETECTIONS_FILE, LOG_FILE):
-            self._files[name] = _line_buffered(run.out_dir / name)
-        self._folder = run.out_dir
+            self._files[name] = self._file(name)
         for name in (ROTATION_FILE, POSE_FILE, POSE_COVARIANCE_FILE):
             (run.out_dir / name).unlink(missing_ok=True)
         self._files[FIX_FILE].write(POSITION_ONLY)
@@ -195,7 +196,7 @@ class Results(Tap):
     def _write_rotation(self, output: str, message: RelativeRotation) -> None:
         """A line for each answer, also for none; the log tells when its state or the branch changes."""
         if self._rotations is None:
-            self._files[ROTATION_FILE] = _line_buffered(self._folder / ROTATION_FILE)
+            self._files[ROTATION_FILE] = self._file(ROTATION_FILE)
             self._rotations = csv.writer(self._files[ROTATION_FILE])
             head = ["stamp_s", "accepted", *QUATERNION, *ROTATION_UPPER, *BRANCHES, "state", "switches", "reason"]
             self._rotations.writerow(head)
@@ -222,7 +223,7 @@ class Results(Tap):
             self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")
         if self._poses is None:
             for name in (POSE_FILE, POSE_COVARIANCE_FILE):
-                self._files[name] = _line_buffered(self._folder / name)
+                self._files[name] = self._file(name)
             self._files[POSE_FILE].write(POSE_HEAD)
             self._poses = csv.writer(self._files[POSE_COVARIANCE_FILE])
             self._poses.writerow(["stamp_s", *POSE_UPPER, "state", "good", "rotation", "resets", "nis", "measured_s"])
@@ -236,6 +237,15 @@ class Results(Tap):
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
         told = [message.state.name, int(R is not None), int(R is not None), message.resets, nis, measured]
         self._poses.writerow([stamp_s(message.stamp_ns), *_digits(upper), *told])
+
+    def _file(self, name: str) -> ResultFile:
+        return ResultFile(self._folder / name, patient=self._live)
+
+    @property
+    def trouble(self) -> str | None:
+        """That the disk does not take the results of a live run."""
+        why = next((file.trouble for file in self._files.values() if file.trouble), None)
+        return None if why is None else f"{self._folder}: results are being lost ({why}): make room; the run goes on"
 
     def note(self, text: str) -> None:
         """One line of the log without a time: a warning of the recording, the hash."""
@@ -253,7 +263,3 @@ class Results(Tap):
 
 def _digits(values: NDArray[np.float64]) -> list[str]:
     return [f"{value:.9g}" for value in values]
-
-
-def _line_buffered(path: Path) -> TextIO:
-    return io.TextIOWrapper(path.open("wb"), encoding="utf-8", newline="", line_buffering=True, write_through=True)

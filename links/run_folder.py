@@ -28,8 +28,10 @@ from flow.replay import RunReport, replay
 from flow.taps import Digest
 from flow.tree import Section
 from links.recording import Progress, RecordingReader
+from links.result_file import ResultFile
 from links.results import SUMMARY_FILE, Results, stamp_s
 from links.truth import TRUTH_RECORDING, FixErrors, TruthLog
+from links.usage import Usage
 
 CONFIG_FILE = "config.yaml"
 
@@ -66,6 +68,7 @@ class Finished:
     digest: str
     wall_s: float
     warnings: list[str]
+    usage: Usage | None = None  # of a live run
 
 
 class RunFolder:
@@ -97,7 +100,7 @@ class RunFolder:
         (self._folder / SUMMARY_FILE).unlink(missing_ok=True)
         name = self._asked.config.stem if self._live else self._recording.stem
         about = Run(self._folder, name, mermaid(self._graph), self._graph.settings_yaml(), self._live)
-        (self._folder / CONFIG_FILE).write_text(about.settings_yaml, encoding="utf-8")
+        self._write(CONFIG_FILE, about.settings_yaml)
         with ExitStack() as opening:
             for tap in self.taps:
                 tap.open(about)
@@ -110,11 +113,24 @@ class RunFolder:
     ) -> None:
         self._open.close()
 
+    def _write(self, name: str, text: str) -> None:
+        """A file of the folder. A full disk keeps nobody from flying, and is said by the results."""
+        file = ResultFile(self._folder / name, patient=self._live)
+        file.write(text)
+        file.close()
+
     def note(self, text: str) -> None:
         """A line of the run's log."""
         self._results.note(text)
 
-    def finish(self, report: RunReport, output_hash: str, truth: TruthLog | None, warnings: list[str]) -> Finished:
+    def finish(
+        self,
+        report: RunReport,
+        output_hash: str,
+        truth: TruthLog | None,
+        warnings: list[str],
+        usage: Usage | None = None,
+    ) -> Finished:
         """End the run: `warnings` are its recording's, `truth` is what the recording says of the drones.
 
         None: what a simulated rig, which is a tap that has ended then, wrote beside the recording.
@@ -135,9 +151,10 @@ class RunFolder:
             digest=output_hash,
             wall_s=time.monotonic() - self._began_s,
             warnings=warnings,
+            usage=usage,
         )
         text = json.dumps(_summary(finished, self._asked), indent=2)
-        (self._folder / SUMMARY_FILE).write_text(text + "\n", encoding="utf-8")
+        self._write(SUMMARY_FILE, text + "\n")
         return finished
 
 
@@ -218,7 +235,7 @@ def _summary(run: Finished, asked: Asked) -> dict[str, Any]:
         },
     }
     if isinstance(report, LiveReport):
-        summary["live"] = _live(report)
+        summary["live"] = _live(report) | ({} if run.usage is None else {"usage": run.usage.columns})
     if run.errors is not None:
         summary["against_truth"] = _judged(run.errors)
     return summary

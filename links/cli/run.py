@@ -199,6 +199,8 @@ def _tell(run: Finished) -> None:
     if results.pose_states:
         states = ", ".join(f"{count} {state}" for state, count in results.pose_states.items())
         out.print(f"fused poses: {states}; {results.resets} jumps")
+    if run.usage is not None and str(run.usage):
+        out.print(f"used: {run.usage}")
     out.print(f"output hash {run.digest}")
     out.print(f"positions   {run.out_dir / FIX_FILE}")
     if results.pose_states:

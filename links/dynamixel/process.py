@@ -53,10 +53,10 @@ class ServoProcess:
         """The process's id."""
         return self._process.pid
 
-    def send(self, goal: wire.Goal) -> bool:
-        """Hand a goal over; False when it could not be."""
+    def send(self, packet: wire.Goal | wire.Stop) -> bool:
+        """Hand a goal over, or that it shall stop; False when that could not be."""
         try:
-            self._line.send(wire.pack(goal), socket.MSG_DONTWAIT)
+            self._line.send(wire.pack(packet), socket.MSG_DONTWAIT)
         except OSError:
             return False
         return True

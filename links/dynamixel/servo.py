@@ -124,6 +124,14 @@ class Servo(Source):
         elif not process.send(self._within_limits(goal)):
             self._counts["goals_lost"] += 1
 
+    def orphaned(self, port: str) -> str | None:
+        """Nobody aims any more: the servo stops where it is, rather than finish a sweep that nobody follows."""
+        process = self._process
+        if process is None:
+            return None
+        self._counts["stopped: nobody aims"] += 1
+        return "the servo stays where it is" if process.send(wire.Stop()) else "the servo could not be told to stop"
+
     def take_command(self) -> GoalCommand | None:
         """The newest goal not yet sent, once."""
         command, self._waiting = self._waiting, None

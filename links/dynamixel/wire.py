@@ -72,8 +72,14 @@ class Fatal(NamedTuple):
     layout = struct.Struct("<B800s")
 
 
-Packet = Goal | Reading | Health | Fatal
-_KINDS: tuple[type[Goal] | type[Reading] | type[Health] | type[Fatal], ...] = (Goal, Reading, Health, Fatal)
+class Stop(NamedTuple):
+    """To the process: stay where you are."""
+
+    layout = struct.Struct("<B")
+
+
+Packet = Goal | Reading | Health | Fatal | Stop
+_KINDS: tuple[type[Packet], ...] = (Goal, Reading, Health, Fatal, Stop)
 
 
 def pack(packet: Packet) -> bytes:

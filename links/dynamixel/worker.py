@@ -48,6 +48,7 @@ class Worker:
         self._driving = self._ever = False
         self._goal: wire.Goal | None = None
         self._goal_ends_ns = 0  # 0: nothing to wait for
+        self._halt = False
         self._error = 0
         self._counts: Counter[str] = Counter()
         self._faults: Counter[str] = Counter()
@@ -91,10 +92,12 @@ class Worker:
                 data = b""
             if not data:
                 raise ParentGone
-            goal = wire.unpack(data)
-            if isinstance(goal, wire.Goal):
+            packet = wire.unpack(data)
+            if isinstance(packet, wire.Goal):
                 self._counts["goals_lost"] += (self._goal is not None) or not self._driving
-                self._goal = goal if self._driving else None
+                self._goal, self._halt = (packet if self._driving else None), False
+            elif isinstance(packet, wire.Stop):
+                self._goal, self._halt = None, True
 
     def _cycle(self, now_ns: int) -> None:
         if self._drive is None:
@@ -104,6 +107,9 @@ class Worker:
         assert self._drive is not None
         if not self._driving and now_ns >= self._retry_ns:
             self._restore(now_ns)
+        if self._halt and self._driving:
+            self._drive.stop()  # tried again in the next cycle where it fails
+            self._halt, self._goal_ends_ns = False, 0
         if self._goal is not None and self._driving:
             self._send(self._goal)
         measured = self._drive.measure()

@@ -18,6 +18,7 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +27,16 @@ from flow.link import TRUTH_TOPICS, LinkError, Record
 from flow.metrics import Latency
 from flow.problem import ConfigError
 from links import host_time
+from links.mavlink.profiles import ARDUPILOT
+from links.mavlink.stream import ARMED
 from links.recording import RecordingWriter
 from links.simulated.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot import Autopilot
 from links.simulated.autopilot_socket import AutopilotSocket
+from links.simulated.camera import CamerasSettings
 from links.simulated.dynamixel_emulator import DynamixelEmulator
+from links.simulated.kept_pictures import KeptCamera, KeptPictures
+from links.simulated.live_pictures import PicturesInTime
 from links.simulated.live_rig import READY, RIG_REPORT, LiveRig
 from links.simulated.mesh import Array64
 from links.simulated.run import Simulation
@@ -51,8 +57,8 @@ SWITCH_S = 5e-4  # the servo's thread must not wait long for the one that casts
 class LiveSimulation(Simulation):
     """A scenario that begins when it is told to, with an emulated servo. Its own times are the scenario's."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        super().__init__(scenario)
+    def __init__(self, scenario: Scenario, pictures: KeptPictures | None = None) -> None:
+        super().__init__(scenario, pictures=pictures)
         self.packet_ns = firings_per_packet(scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
         self.ahead_ns = 0
         self.emulator: DynamixelEmulator | None = None
@@ -64,6 +70,11 @@ class LiveSimulation(Simulation):
         self.ahead_ns = self.lidar_clock_ns = host_time.now_ns() - self.scenario.start_ns
         self.emulator = DynamixelEmulator(self.scenario.servo, self.seed, servo, self.now_ns)
         return self.emulator
+
+    @property
+    def kept_cameras(self) -> list[KeptCamera]:
+        """Cameras with their pictures from a recording; no other can keep up."""
+        return [camera for camera in self._cameras if isinstance(camera, KeptCamera)]
 
     def now_ns(self) -> int:
         """The scenario's time."""
@@ -90,17 +101,34 @@ class LiveSimulation(Simulation):
         return Record(record.topic, record.arrival_ns + self.ahead_ns, record.stamp_ns + self.ahead_ns, data)
 
 
+class LiveAutopilot(AutopilotSocket):
+    """Set up as it must be; can say that it is disarmed, though its drone hangs in the air."""
+
+    armed = True
+
+    def _send(self, message: Any) -> None:
+        if not self.armed and message.get_type() == "HEARTBEAT":
+            message.base_mode &= ~ARMED
+        super()._send(message)
+
+
 class RigInTime:
     """Sends until it is told to stop, or the scenario is over."""
 
     def __init__(self, rig: LiveRig, folder: Path) -> None:
         scenario = load_scenario(rig.scenario)
-        self._scenario = scenario if rig.seed is None else scenario.changed(seed=rig.seed)
+        asked = {"seed": rig.seed, "duration_s": rig.duration_s}
+        scenario = scenario.changed(**{name: value for name, value in asked.items() if value is not None})
         self._rig, self._folder = rig, folder
-        self.simulation = LiveSimulation(self._scenario)
+        if rig.pictures is None:  # nobody sees what its cameras would
+            self._scenario = scenario.changed(cameras=CamerasSettings())
+            self.simulation = LiveSimulation(self._scenario)
+        else:
+            self._scenario = scenario
+            self.simulation = LiveSimulation(scenario, KeptPictures(rig.pictures, scenario))
         self.late = Latency()  # a packet's sending after its last pulse
         self.stop = threading.Event()
-        self.packets = self.skipped = self.heard = 0
+        self.packets = self.skipped = self.heard = self.pictures = 0
 
     def run(self, ready: threading.Event) -> None:
         """The whole flight, in real time."""
@@ -114,18 +142,34 @@ class RigInTime:
             autopilot = self._autopilot(simulation)
             if autopilot is not None:
                 open_parts.enter_context(autopilot)
+            pictures = open_parts.enter_context(self._cameras(simulation))
             ready.set()
             self._send(simulation, udp, truth)
+            self.pictures = pictures.shown
             if autopilot is not None:
                 self.heard = len(autopilot.heard)
         self._report()
+
+    def _cameras(self, simulation: LiveSimulation) -> PicturesInTime:
+        seen = () if self._rig.pictures is None else self._rig.camera_ports.items()
+        ports = {f"/camera/{carrier}": port for carrier, port in seen}
+        end_ns = self._scenario.start_ns + round(1e9 * self._scenario.duration_s)
+        return PicturesInTime(simulation.kept_cameras, ports, simulation.now_ns, end_ns)
 
     def _autopilot(self, simulation: LiveSimulation) -> AutopilotSocket | None:
         flight = next((talker for talker in simulation.talkers if isinstance(talker, Autopilot)), None)
         if flight is None or self._rig.autopilot_port is None:
             return None
         send_to = LOOPBACK, self._rig.autopilot_port
-        return AutopilotSocket(ArduPilotRules(), send_to=send_to, flight=flight, scenario_ns=simulation.now_ns)
+        autopilot = LiveAutopilot(
+            ArduPilotRules(),
+            send_to=send_to,
+            flight=flight,
+            scenario_ns=simulation.now_ns,
+            parameters={w.name: w.values[0] if w.values else w.at_least for w in ARDUPILOT.wanted},
+        )
+        autopilot.armed = self._rig.armed
+        return autopilot
 
     def _send(self, simulation: LiveSimulation, udp: socket.socket, truth: RecordingWriter) -> None:
         rig, scenario = self._rig, self._scenario
@@ -173,6 +217,7 @@ class RigInTime:
                 "max": round(late.max_ns / 1e6, 3),
             },
             "mavlink_heard": self.heard,
+            "pictures": self.pictures,
             "cpu_s": round(used.ru_utime + used.ru_stime, 2),
             "max_rss_mb": round(used.ru_maxrss / 1024, 1),
         }

@@ -3,7 +3,7 @@
 The process (`links.simulated.live_process`) sends what the hardware would: VLP-16 packets and the vehicle's odometry by
 UDP, the servo on a pty, the autopilot's MAVLink by UDP, all on this host. It hears nothing of the graph but the
 servo's goals and the poses that go to the autopilot. What was true goes to `truth.mcap` in the run's folder, how well
-it kept up to `rig.json`.
+it kept up to `rig.json`. Cameras it cannot paint in time: it serves the pictures of a recording of the same flight.
 
 Source: ours.
 """
@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Annotated, Literal
 
 from pydantic import Field, PrivateAttr
 
@@ -26,17 +27,24 @@ START_S = 120.0  # to build the world and, once, to compile
 END_S = 1.0
 READY, RIG_REPORT = "ready", "rig.json"
 
+Carrier = Literal["vehicle", "drone"]
+Port = Annotated[int, Field(ge=1, le=65535)]
+
 
 class LiveRig(Tap):
     """A simulated rig, for the time of a live run."""
 
     scenario: Path  # as in configs/scenarios/, as seen from where grd is started
     seed: int | None = Field(None, ge=0)  # None: the scenario's
+    duration_s: float | None = Field(None, gt=0, le=3600)  # None: the scenario's; longer, all stays where it ended
     servo: Path  # where the link to the servo's pty is made: `$links.servo.config.port`
     lidar_port: int = Field(2368, ge=1, le=65535)
     position_port: int | None = Field(None, ge=1, le=65535)  # of the LiDAR's position packets; None: it sends none
     autopilot_port: int | None = Field(None, ge=1, le=65535)  # where grd hears it; None: the drone has no radio
+    armed: bool = True  # False: its autopilot says disarmed, as before a flight (`grd preflight` asks for that)
     odometry_port: int | None = Field(None, ge=1, le=65535)  # where grd hears the vehicle; None: it has no odometry
+    pictures: Path | None = None  # a recording of the scenario, made by `grd simulate`; None: no cameras
+    camera_ports: dict[Carrier, Port] = Field(default_factory=dict[Carrier, Port])  # http://127.0.0.1:PORT/ of each
     batch_packets: int = Field(8, ge=1, le=64)  # cast together: fewer come sooner, more cost less
 
     _process: subprocess.Popen[str] | None = PrivateAttr(default=None)
@@ -59,6 +67,11 @@ class LiveRig(Tap):
             return
         if not self.scenario.is_file():
             raise LinkError(f"{self.scenario}: no such scenario; its name is as seen from here, {Path.cwd()}")
+        if self.pictures is not None and not self.pictures.is_file():
+            raise LinkError(
+                f"{self.pictures}: no such recording, and fisheyes cannot be painted in real time. Paint them once, "
+                f"in some ten minutes: grd simulate {self.scenario} -o {self.pictures}"
+            )
         settings = json.dumps({**self.model_dump(mode="json"), "folder": str(run.out_dir)})
         command = [sys.executable, "-m", "links.simulated.live_process", settings]
         self._process = subprocess.Popen(

@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from flow.link import LinkError, Record
 from links import host_time
@@ -27,6 +27,7 @@ from links.velodyne import vlp16
 
 RECEIVE_BUFFER_BYTES = 1 << 20  # 0.6 s of packets, where the host's net.core.rmem_max allows it
 _DATAGRAM_BYTES = 2048
+_BURST = 16  # datagrams taken at once where several wait: each look whether one does costs as much as the datagram
 _WAKE_S = 0.2  # how often a waiting listener looks whether it was closed
 
 _SO_TIMESTAMPNS = 35 if sys.platform == "linux" else None  # asm-generic/socket.h; Python does not name it
@@ -103,9 +104,7 @@ def _records(
     while not closed.is_set():
         try:
             ready, _, _ = select.select(list(sockets), [], [], min(_WAKE_S, timeout_s))
-            received = [(sockets[udp], udp.recvmsg(_DATAGRAM_BYTES, 64)) for udp in ready]
-        except BlockingIOError:  # a datagram that the kernel found damaged after it had been announced
-            continue
+            received = [(sockets[udp], datagram) for udp in ready for datagram in _waiting(udp)]
         except (OSError, ValueError) as error:
             if closed.is_set():
                 return
@@ -126,6 +125,15 @@ def _records(
         if time.monotonic() > deadline_s:
             foreign = counters.foreign - foreign_before
             raise LinkError(_silence(first.port, sender, timeout_s, foreign, counters.last_foreign))
+
+
+def _waiting(udp: socket.socket) -> Iterator[Any]:
+    """The datagrams that wait, as `recvmsg` gives them; none where the kernel found the announced one damaged."""
+    try:
+        for _ in range(_BURST):
+            yield udp.recvmsg(_DATAGRAM_BYTES, 64)
+    except BlockingIOError:
+        return
 
 
 def _kernel_time_ns(ancillary: list[tuple[int, int, bytes]]) -> int | None:

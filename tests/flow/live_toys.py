@@ -85,6 +85,10 @@ class Collector(Link):
         self._sent.append(Record("/sent", number.stamp_ns, number.stamp_ns, b"%d" % int(number.value)))
         self._got.put(number.value)
 
+    def orphaned(self, port: str) -> str:
+        self._got.put(port)
+        return "it stands still"
+
     def sent(self) -> list[Record]:
         sent, self._sent = self._sent, []
         return sent

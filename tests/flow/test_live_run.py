@@ -140,7 +140,19 @@ def test_a_stage_that_keeps_raising_is_switched_off_and_the_rest_flies_on(tmp_pa
     assert report.off == ["brittle"]
     assert report.restarts == {"brittle": 5}
     assert collector_of(live).take(1) == [2.0]
-    assert "5 fresh starts in 60 s did not help: brittle stays off" in str(report.incidents[-1])
+    assert any("5 fresh starts in 60 s did not help: brittle stays off" in str(i) for i in report.incidents)
+
+
+def test_a_link_learns_that_the_stage_behind_it_gave_up_and_what_it_did_is_said(tmp_path):
+    live = run_live(graph_of(tmp_path, DOUBLING))
+    line_of(live).put(*[666] * 5)
+    line_of(live).put(7)
+    assert collector_of(live).take(1) == [14.0], "five fresh starts are no end"
+    line_of(live).put(666)
+    assert collector_of(live).take(1) == ["number"]
+    report = live.stop()
+    assert report.off == ["brittle"]
+    assert "collector: 'brittle' works no more: it stands still" in [str(i) for i in report.incidents]
 
 
 def test_a_stage_may_stop_the_run(tmp_path):

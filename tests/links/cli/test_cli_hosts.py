@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -9,8 +17,11 @@ from typer.testing import CliRunner
 
 from flow.graph import load_graph
 from links.cli.app import app
+from tests.links.zenoh.certificates import make_all, need_openssl
 
-PAPER = Path(__file__).resolve().parents[3] / "configs" / "paper.yaml"
+ROOT = Path(__file__).resolve().parents[3]
+PAPER = ROOT / "configs" / "paper.yaml"
+PATIENCE_S = 120.0
 FILES = "certificate: c.pem, key: k.pem, authority: a.pem"
 HOSTS = f"""
 hosts:
@@ -82,3 +93,63 @@ def test_run_refuses_a_host_whose_certificates_are_not_there(hosts, tmp_path):
     done = grd("run", PAPER, "--hosts", hosts, "--host", "base", "--no-warm-up", "--out", tmp_path / "out")
     assert done.exit_code == 2
     assert "c.pem" in done.output
+
+
+CROSSING = """\
+stages:
+  ticker: {use: tests.flow.live_toys.Ticker, inputs: {tick: clock.tick}}
+  order: {use: tests.flow.live_toys.Order, inputs: {left: ticker.number, right: ticker.number}}
+links:
+  clock: {use: links.clock.Clock, config: {rate_hz: 50}}
+  recorder: {use: links.recording.Recorder}
+"""
+PLACE = "place: {clock: vehicle, ticker: vehicle, order: base, recorder: base}\n"
+
+
+def test_two_commands_run_one_graph_on_two_hosts(tmp_path):
+    """The user's own way: the same files, a command on each host; here both are processes of this one."""
+    pytest.importorskip("zenoh", reason="several hosts need eclipse-zenoh: pip install -e '.[hosts]'")
+    need_openssl()
+    make_all(tmp_path)
+    files = "certificate: {0}.pem, key: {0}.key, authority: ca.pem"
+    vehicle = f"vehicle: {{listen: 'tls/127.0.0.1:{free_port()}', {files.format('vehicle')}}}"
+    (tmp_path / "hosts.yaml").write_text(f"hosts:\n  {vehicle}\n  base: {{{files.format('base')}}}\n{PLACE}")
+    (tmp_path / "ticks.yaml").write_text(CROSSING)
+    running = {}
+    for host in ("vehicle", "base"):
+        command = [sys.executable, "-c", "from links.cli import main; main()", "run", str(tmp_path / "ticks.yaml")]
+        command += ["--hosts", str(tmp_path / "hosts.yaml"), "--host", host, "--no-warm-up"]
+        running[host] = subprocess.Popen(
+            [*command, "--out", str(tmp_path / host)], cwd=ROOT, env={**os.environ, "PYTHONPATH": "."},
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+    wait_for_numbers(tmp_path / "base" / "flight.mcap", running)
+    for child in running.values():
+        child.send_signal(signal.SIGINT)
+    said = {host: child.communicate(timeout=PATIENCE_S)[0] for host, child in running.items()}
+    assert [child.returncode for child in running.values()] == [0, 0], said
+    told = {host: json.loads((tmp_path / host / "summary.json").read_text()) for host in running}
+    assert told["vehicle"]["messages"]["ticker.number"] > 10
+    assert told["base"]["messages"]["order.number"] > 10
+    assert told["base"]["live"]["counters"]["ticker"]["received"] > 10
+    again = grd("replay", tmp_path / "base" / "flight.mcap", "--as-live", "--out", tmp_path / "again")
+    assert again.exit_code == 2
+    assert "is what host 'base' recorded of a run on several hosts" in again.output.replace("\n", " ")
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def wait_for_numbers(recording, running):
+    """Until the base has recorded some that came over the line."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline_s:
+        for host, child in running.items():
+            assert child.poll() is None, f"{host}: {child.communicate()[0]}"
+        if recording.is_file() and recording.stat().st_size > 4000:
+            return
+        threading.Event().wait(0.1)
+    pytest.fail("nothing came over the line")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import struct
 import subprocess
@@ -26,6 +27,12 @@ stages:
 links:
   clock: {use: links.clock.Clock, config: {rate_hz: 100}}
   recorder: {use: links.recording.Recorder}
+"""
+FULL_DISK = """\
+import resource
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+from links.cli import main
+main()
 """
 
 
@@ -143,6 +150,26 @@ def wait_for_records(child: subprocess.Popen[str], last: Path, for_s: float) -> 
         first = first or arrival_ns(last)
         assert child.poll() is None, child.communicate()[0]
         threading.Event().wait(0.01)
+
+
+def test_a_run_begins_and_flies_on_though_the_disk_takes_nothing(tmp_path):
+    """As after a restart in flight on a full disk; here no file may have a byte."""
+    (tmp_path / "ticks.yaml").write_text(CONFIG)
+    words = ["run", str(tmp_path / "ticks.yaml"), "--out", str(tmp_path / "run"), "--no-warm-up", "--for", "1"]
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, *words],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": "."},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    said = (done.stdout + done.stderr).replace("\n", " ")
+    assert done.returncode == 0, said
+    assert "results are being lost" in said
+    assert "nothing is recorded now, the run goes on" in said
+    assert int(re.search(r"(\d+) records, [\d.]+ s recorded", said)[1]) > 10
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -66,19 +66,19 @@ def test_states_are_stamped_when_the_servo_stood_there(emulator):
     host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
     with servo.listen() as records:
         next(records)
-        servo.on_goal(goal(150, 40))
+        servo.on_goal(goal(150, 20))
         moving = []
         for record in records:
             assert record.topic == "/servo/state"
             assert record.stamp_ns < record.arrival_ns
             state = servo.decode(record)
             truth = emulator.position_rad(np.array([record.stamp_ns - host_ahead_ns]))[0]
-            if abs(state.velocity_radps) > 3:
+            if abs(state.velocity_radps) > 1.5:
                 moving.append(state.position_rad - truth)
             if at(150)({"position_rad": state.position_rad}):
                 break
     assert len(moving) > 20
-    assert abs(np.median(moving)) < 2 * mx28.TICK_RAD  # 40 rpm is 2.7 ticks a millisecond
+    assert abs(np.median(moving)) < 2 * mx28.TICK_RAD  # 20 rpm is 1.4 ticks a millisecond
     assert state.goal_rad == pytest.approx(math.radians(150), abs=mx28.TICK_RAD)
 
 
@@ -91,6 +91,23 @@ def test_the_newest_goal_is_obeyed_at_its_speed(emulator):
         states = until(records, at(120))
     assert max(s["velocity_radps"] for s in states) == pytest.approx(30 * RPM, rel=0.02)
     assert servo.counters["goals_sent"] + servo.counters["goals_lost"] <= 2
+
+
+def test_a_servo_that_nobody_aims_any_more_stops_in_mid_sweep_and_obeys_the_next_goal(emulator):
+    servo = live(emulator)
+    assert servo.orphaned("goal") is None, "it is not live yet"
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(170, 10))
+        until(records, lambda state: math.degrees(state["position_rad"]) > 100)
+        assert servo.orphaned("goal") == "the servo stays where it is"
+        stopped = until(records, lambda state: math.degrees(state["goal_rad"]) < 165)[-1]
+        until(records, lambda state: abs(state["velocity_radps"]) < 0.01)
+        assert math.degrees(emulator.position_rad(np.array([time.monotonic_ns()]))[0]) < 160
+        assert math.degrees(stopped["goal_rad"]) < 160
+        assert servo.counters["stopped: nobody aims"] == 1
+        servo.on_goal(goal(60, 40))
+        until(records, at(60))
 
 
 def test_a_goal_beyond_the_soft_limits_goes_to_the_limit_and_is_counted(emulator):
@@ -344,7 +361,7 @@ def test_a_servo_that_may_not_be_driven_is_an_error_that_says_what_to_change(emu
     emulator.set(register, value)
     servo = live(emulator)
     with pytest.raises(LinkError, match=words), servo.listen() as records:
-        next(records)
+        until(records, lambda _: False)  # on a busy machine it is read before the first look at its settings succeeds
     assert emulator.get(mx28.TORQUE_ENABLE) == 0
 
 

@@ -78,6 +78,7 @@ class Candidate:
     why: str = ""
     suspect: str = ""  # what it is if it is no drone
     among: bool = False  # where it appeared, something had been refused
+    again: bool = False  # in the very place, and the drone says that it flies
     accepted: bool = False
     announced: bool = False  # as accepted
     told: bool = False  # it is worth another look

@@ -47,6 +47,8 @@ from stages.trail import VehicleTrail
 BANK_TIDIED = 64  # slices: about ten times a second
 AMONG_M = 1.5
 AMONG_NS = 20_000_000_000
+SAME_PLACE_M = 0.5
+MOVES_MPS = 1.0
 MOST_STANDING = 64
 STANDING_NS = 60_000_000_000  # for so long it is known that something stands there
 FURTHEST_STEP_M = 2.5  # from where it was expected
@@ -170,7 +172,8 @@ class EvidenceDetect(Stage):
             first_hits=s.hits,
         )
         since_ns = s.stamp_ns - (AMONG_NS if self.parked or now.trail.known else AMONG_NS // 20)
-        new.among = math.isfinite(now.refused_places.nearest_m(s.xyz_local_m, 0.0, AMONG_M, since_ns))
+        refused_m = now.refused_places.nearest_m(s.xyz_local_m, 0.0, AMONG_M, since_ns)
+        new.among, new.again = math.isfinite(refused_m), refused_m < SAME_PLACE_M and self._drone_moves(now, s.stamp_ns)
         new.note(s)
         news = self._weigh(now, new)
         if new.told:
@@ -252,6 +255,11 @@ class EvidenceDetect(Stage):
             if speed is not None:
                 return np.array([0.0, 0.0, speed[1]]), 0.3 + 0.7 * speed[0]
         return now.trail.velocity_mps(now_ns), START_SPEED_MPS / 2
+
+    def _drone_moves(self, now: _Now, stamp_ns: int) -> bool:
+        """Whether the drone says that it flies: then it is not what stands where something stood."""
+        speeds = [told.speed_mps(stamp_ns) for told in now.told]
+        return any(speed is not None and math.hypot(*speed) > MOVES_MPS for speed in speeds)
 
     def _remember(self, now: _Now, c: Candidate) -> None:
         """Where something that stands was refused."""

@@ -64,6 +64,7 @@ class Evidence(BaseModel):
     still: float = 0.12  # each look at something that does not, up to most_still: a lamp's pole is found sooner
     most_still: float = 1.5
     among: float = 2.0  # something was refused beside it, lately: wires are long
+    again: float = 4.0  # and more in the very place, while the drone says that it flies
 
     bird: float = -0.5
     calm: float = 8.0  # each second in which it would have shown a bird's speed or turn
@@ -136,7 +137,8 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     if c.long_looks:
         said.append("longer than a drone")
     if c.heard is not None:
-        told = c.heard.over_still if few >= -1.0 else c.heard.over_wire
+        wire = few < -1.0 and c.range_m < e.unseen_m  # farther off a wire returns nothing
+        told = c.heard.over_wire if wire else c.heard.over_still
         moved = e.told * told > 3.0
         odds += believed(told, e)
     else:
@@ -146,7 +148,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
         odds += min(e.still * c.hit_looks, e.most_still)
         said.append("it may stand still")
         if c.among:
-            odds -= e.among
+            odds -= e.among + (e.again if c.again else 0.0)
             said.append("something near it was refused")
     if c.big_looks > 0.3 * c.hit_looks and not moved:
         odds -= e.near_big

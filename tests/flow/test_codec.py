@@ -258,6 +258,7 @@ def test_every_time_of_the_method_s_messages_is_known_as_one():
         "Detections.seen_ns": False,
         "Detections.start_ns": False,
         "DroneMotion.from_ns": False,
+        "FollowedFeatures.from_ns": False,
         "LidarFirings.pulse_stamp_ns": False,
         "RelativePose.measured_ns": False,
         "SweptPoints.point_stamp_ns": False,

@@ -481,3 +481,17 @@ def test_a_slice_without_pulses_is_nothing():
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValidationError):
         EvidenceDetect(**settings)
+
+
+def test_a_lamp_that_was_refused_at_first_sight_is_not_told_anew_while_the_drone_says_that_it_flies():
+    """It is seen in each passing; who looks at it once more has less time for the drone."""
+
+    def told_again(way, again):
+        stage = EvidenceDetect(sweep_deg=PASS_DEG, evidence=Evidence(again=again))
+        stage._now.refused_places.add(np.array([PLACE_M]), START_NS)
+        candidates, _ = run([hanging()], 0.5, say=saying(way), stage=stage)
+        return sum(c.candidate_id.size > 0 for c in candidates)
+
+    flies = flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0))
+    assert told_again(flies, 4.0) == 0 < told_again(flies, 0.0)
+    assert told_again(still(0.0, 0.0, 0.0), 4.0) > 0

@@ -86,6 +86,24 @@ def test_a_refused_neighbour_counts_only_against_what_may_stand():
         assert over_clutter(c, E, False, True)[0] == pytest.approx(apart - counts)
 
 
+def test_what_stands_where_something_was_refused_counts_little_while_the_drone_flies():
+    c = hanging(NOTHING)
+    c.among = True
+    beside, _ = over_clutter(c, E, False, True)
+    c.again = True
+    assert over_clutter(c, E, False, True)[0] == pytest.approx(beside - E.again)
+    c.heard = Heard(20.0, 0.0, 0.0, 20.0)
+    assert over_clutter(c, E, False, True)[0] > beside  # it moved
+
+
+def test_far_off_a_wire_returns_nothing_so_what_moved_as_the_drone_says_is_none():
+    flew = Heard(20.0, 9.0, 9.0, 1.0)
+    for range_m, still in ((10.0, True), (45.0, False)):
+        little = candidate(*(sighting(0.1 * k, hits=1, range_m=range_m) for k in range(40)))
+        little.heard = flew
+        assert ("it may stand still" in over_clutter(little, E, False, True)[1]) == still
+
+
 def test_the_words_say_whether_it_flies_as_the_drone_says():
     assert "the drone says" not in judge(hanging(), E, True, True)[1]
     assert "the drone says" not in judge(hanging(NOTHING), E, True, True)[1]

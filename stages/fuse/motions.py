@@ -65,10 +65,10 @@ class Motions:
         """Whether a pose is where the ones before lead."""
         assert self._vehicle_ns is not None
         dt = (motion.stamp_ns - self._vehicle_ns) * 1e-9
-        R, xyz_m = self.vehicle.at(self._vehicle_ns)
-        turn = log_rotation(R.T @ self.vehicle.at(self._vehicle_ns + STEP_NS)[0])
-        xyz_m = xyz_m + dt * self.vehicle.velocity_mps(self._vehicle_ns)
-        R = R @ exp_rotation(dt / (1e-9 * STEP_NS) * turn)
+        R_last, last_m = self.vehicle.at(self._vehicle_ns)
+        turn = log_rotation(R_last.T @ self.vehicle.at(self._vehicle_ns + STEP_NS)[0])
+        xyz_m = last_m + dt * self.vehicle.velocity_mps(self._vehicle_ns)
+        R = R_last @ exp_rotation(dt / (1e-9 * STEP_NS) * turn)
         off_m = float(np.linalg.norm(motion.xyz_start_m - xyz_m))
         off_rad = float(np.linalg.norm(log_rotation(R.T @ motion.R_start_vehicle)))
         return off_m <= OFF_M + 0.5 * HARD_MPS2 * dt**2 and off_rad <= OFF_RAD + 0.5 * HARD_RADPS2 * dt**2

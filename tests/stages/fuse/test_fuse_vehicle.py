@@ -41,6 +41,18 @@ def test_a_fifth_of_false_vehicle_poses_does_nothing(seed):
     assert max(seen.angle_deg) < 3
 
 
+def test_after_words_that_were_left_out_a_false_one_is_still_no_way_a_vehicle_drives():
+    """By pictures it tells its motion five times a second: the gap is long, and what it may have done in it is not."""
+    for off in (drive(1.6, x=2.0), drive(1.6, yaw=0.7)):
+        motions = Motions(FuseErrors(), parked=False)
+        for t in (0.2, 0.4, 0.6, 0.8, 1.0):
+            motions.hear_vehicle(drive(t))
+        motions.hear_vehicle(off)
+        np.testing.assert_allclose(motions.vehicle.at(ns(1.2))[1], (7.2, 0.0, 0.0), atol=1e-6)
+        motions.hear_vehicle(drive(1.65))
+        np.testing.assert_allclose(motions.vehicle.at(ns(1.65))[1], (9.9, 0.0, 0.0), atol=1e-6)
+
+
 def test_a_late_vehicle_makes_the_relative_pose_less_sure_and_not_false():
     made = Made(until_s=15, **DRIVES)
     on_time, behind = (made.judge(told(made, late(("motion",), by_s)), after_s=4) for by_s in (0.0, 0.3))

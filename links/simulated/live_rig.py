@@ -70,7 +70,7 @@ class LiveRig(Tap):
         if self.pictures is not None and not self.pictures.is_file():
             raise LinkError(
                 f"{self.pictures}: no such recording, and fisheyes cannot be painted in real time. Paint them once, "
-                f"in some ten minutes: grd simulate {self.scenario} -o {self.pictures}"
+                f"in some minutes: grd simulate {self.scenario} -o {self.pictures}"
             )
         settings = json.dumps({**self.model_dump(mode="json"), "folder": str(run.out_dir)})
         command = [sys.executable, "-m", "links.simulated.live_process", settings]

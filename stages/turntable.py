@@ -158,6 +158,25 @@ class Placed(NamedTuple):
     unplaced: int
 
 
+class GearPlay:
+    """The turntable follows the servo with play: it stays where it is until the servo takes it along.
+
+    Where it stands in its play before the first move is not known: the middle is taken. Angles in the servo's sense.
+    """
+
+    def __init__(self, mount: LidarMount) -> None:
+        self.half_rad = math.radians(mount.servo_play_deg) / 2
+        self.lag_rad = 0.0  # by how much the turntable hangs back
+
+    def move(self, step_rad: float) -> None:
+        """The servo went on by a step."""
+        self.lag_rad = min(max(self.lag_rad + step_rad, -self.half_rad), self.half_rad)
+
+    def goal_rad(self, servo_rad: float, wanted_rad: float) -> float:
+        """Where the servo, now at servo_rad, must go to: the table then stands as at wanted_rad without play."""
+        return wanted_rad + math.copysign(self.half_rad, wanted_rad - (servo_rad - self.lag_rad))
+
+
 class Turntable:
     """The servo's recent states as turntable angles over time, and the mount they turn."""
 
@@ -170,8 +189,7 @@ class Turntable:
         self._T_turntable_lidar = mount.T_turntable_lidar.matrix()
         self._lidar_turntable_m: tuple[float, float, float] = tuple(self._T_turntable_lidar[:3, 3].tolist())
         self._last_servo_rad: float | None = None
-        self._half_play_rad = math.radians(mount.servo_play_deg) / 2
-        self._lag_rad = 0.0  # by how much the turntable hangs back within the play
+        self._play = GearPlay(mount)
         self._states: deque[tuple[int, float]] = deque(maxlen=STATES_KEPT)
         self._state_ns = np.empty(0, dtype=np.int64)
         self._state_rad = np.empty(0)
@@ -184,9 +202,7 @@ class Turntable:
     def add(self, servo: ServoState) -> None:
         """One more state. One that is not newer than the last is ignored: it can only be a repeated answer.
 
-        A single-turn encoder jumps by a whole turn at its end; the shorter way round is taken, so angles run on. The
-        turntable follows the servo with play: it stays where it is until the servo takes it along. Where it stands in
-        its play before the first move is not known: the middle is taken.
+        A single-turn encoder jumps by a whole turn at its end; the shorter way round is taken, so angles run on.
         """
         stamp_ns = servo.stamp_ns + self._offset_ns
         if self._states and stamp_ns <= self._states[-1][0]:
@@ -195,9 +211,11 @@ class Turntable:
         if self._last_servo_rad is not None:
             step_rad = math.remainder(servo_rad - self._last_servo_rad, math.tau)
             servo_rad = self._last_servo_rad + step_rad
-            self._lag_rad = min(max(self._lag_rad + step_rad, -self._half_play_rad), self._half_play_rad)
+            self._play.move(step_rad)
         self._last_servo_rad = servo_rad
-        angle_rad = float(self._mount.turntable_rad(np.array([servo_rad]))[0]) - self._mount.servo_sign * self._lag_rad
+        angle_rad = (
+            float(self._mount.turntable_rad(np.array([servo_rad]))[0]) - self._mount.servo_sign * self._play.lag_rad
+        )
         self._states.append((stamp_ns, angle_rad))
         self._freeze()
 

@@ -28,6 +28,7 @@ from stages.aim.sweeping import Sweeping
 from stages.aim.targets import Key, Target, Targets
 from stages.geometry import LidarMount
 from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, TrackState
+from stages.turntable import GearPlay
 
 TOLD_NS = 12_000_000  # after its pass a look has been told of
 SHORTEST_LOOK_NS = 5_000_000
@@ -42,7 +43,9 @@ RPM_RADPS = math.tau / 60.0
 @dataclass(slots=True, eq=False)
 class _Now:
     sweeping: Sweeping
+    play: GearPlay
     rotor: Rotor = field(default_factory=Rotor)
+    servo_rad: float | None = None
     elevations_rad: tuple[float, ...] = ()
     targets: Targets = field(default_factory=Targets)
     hold_until_ns: int = 0  # a look is planned until then
@@ -89,7 +92,7 @@ class BeamAim(Stage):
     def model_post_init(self, context: Any, /) -> None:
         if self.travel_deg[1] <= self.travel_deg[0]:
             raise ValueError("travel_deg must be two growing angles")
-        self._now = _Now(Sweeping(*self._travel_rad))
+        self._now = _Now(Sweeping(*self._travel_rad), GearPlay(self.mount))
 
     @property
     def _travel_rad(self) -> tuple[float, float]:
@@ -114,6 +117,9 @@ class BeamAim(Stage):
         now = self._now
         if not self.mount.turns:
             return None
+        if now.servo_rad is not None:
+            now.play.move(math.remainder(servo.position_rad - now.servo_rad, math.tau))
+        now.servo_rad = servo.position_rad
         target = self._choose(servo)
         if target is None or now.rotor.rate_radps <= 0 or not now.elevations_rad:
             if now.current is not None:
@@ -206,8 +212,9 @@ class BeamAim(Stage):
                 best = nearest(self.mount, travel_rad, place)
             if best is None:
                 return self._sweep(servo)
-            goal_rad = best.servo_rad
-            if target.glance and abs(goal_rad - centre_rad) > GLANCE_RAD:
+            goal_rad = now.play.goal_rad(servo.position_rad, best.servo_rad)
+            goal_rad = min(max(goal_rad, travel_rad[0]), travel_rad[1])
+            if target.glance and abs(best.servo_rad - centre_rad) > GLANCE_RAD:
                 target.looks = self.glances  # the fan has passed it
                 return self._sweep(servo)
             way_s = abs(goal_rad - servo.position_rad) / speed_radps

@@ -202,8 +202,8 @@ def find_chords(
                         m[FIRST_X + axis] = point[axis]
                     _begin(m, r, reflectivity[i])
                     times[k, 0] = stamp_ns[i]
-            elif seen and r < m[LAST_RANGE]:  # something nearer hides how it goes on
-                _tell(m, False, k, m[TOLD] > 0.0, rows[told])
+            elif seen and r < m[LAST_RANGE]:  # something nearer hides how it goes on, unless it had ended before
+                _tell(m, m[MISSED] >= 2.0, k, m[TOLD] > 0.0, rows[told])
                 ended = True
             else:
                 m[MISSED] += 1.0

@@ -138,6 +138,8 @@ def test_a_step_in_range_parts_two_things():
     nearer, _, _ = feed(pulses([0] * 2 + [20.0] * 3 + [18.0] * 3 + [0] * 10))
     assert nearer[:, chord.COUNT].tolist() == [3, 3]
     assert nearer[:, chord.FREE].tolist() == [1, 2]  # the nearer one hides the end of the farther
+    later, _, _ = feed(pulses([0] * 2 + [20.0] * 3 + [26.0] * 2 + [18.0] * 3 + [0] * 10))
+    assert later[:, chord.FREE].tolist()[0] == 2  # two pulses had gone past its end before
 
 
 def test_lasers_do_not_know_of_each_other():

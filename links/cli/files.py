@@ -167,7 +167,7 @@ def simulate_matrix(
     ] = False,
     closed_loop: ClosedLoop = None,
     calibrated: Annotated[
-        bool, typer.Option("--calibrated", help="The rig knows the error of the servo's encoder.")
+        bool, typer.Option("--calibrated", help="The rig knows the error of the servo's encoder and its play.")
     ] = False,
     odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle has odometry.")] = False,
     rain: Annotated[bool, typer.Option("--rain", help="It rains, 5 mm/h.")] = False,

@@ -56,7 +56,9 @@ RAIN = Weather(rain_mmph=5.0)
 class Conditions:
     """What holds in all cells of one run over the matrix."""
 
-    calibrated: bool = False  # the rig knows the servo encoder's own error
+    calibrated: bool = (
+        False  # the rig knows the servo encoder's own error and the gear's play, as `grd calibrate` finds
+    )
     odometry: bool = False  # the vehicle tells where it drives
     rain: bool = False  # 5 mm/h
     autopilot: bool = False  # the drone tells how it flies, over a radio
@@ -98,7 +100,8 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
     drones = tuple(DroneSettings(path=path, model=DRONE) for path in flown)
     what = f"{cell.motion} at {cell.range_m} m" if drones else "no drone"
     straight = RigLidar()
-    known = straight.mount.model_copy(update={"servo_harmonics": Turned(SERVO, seed).harmonics()})
+    found = {"servo_harmonics": Turned(SERVO, seed).harmonics(), "servo_play_deg": SERVO.backlash_deg}
+    known = straight.mount.model_copy(update=found)
     return Scenario(
         name=cell.name,
         description=f"{what}, vehicle {cell.vehicle}, {cell.scene}",

@@ -78,7 +78,7 @@ class BeamAim(Stage):
     candidate_rest_s: float = Field(1.0, gt=0)
     candidate_probability: float = Field(0.006, ge=0, lt=1)  # less is not worth stopping for
     stop_probability: float = Field(0.35, ge=0, le=1)  # more, met `stop_looks` times, interrupts the sweep
-    patience: int = Field(8, ge=1)  # looks in a row that did not meet a candidate
+    patience: int = Field(8, ge=1)  # looks in a row that did not meet a sure candidate; a doubtful one has fewer
     stop_looks: int = Field(2, ge=1)  # it was seen in so many turns of the rotor before it interrupts the sweep
     glances: int = Field(3, ge=0)  # at a candidate in passing
     turns_each: int = Field(3, ge=1)  # for each of several drones
@@ -171,7 +171,8 @@ class BeamAim(Stage):
         current = now.targets.get(now.current)
         worth = [t for t in maybe if t.probability >= self.stop_probability and t.seen_looks >= self.stop_looks]
         if current in worth and not current.glance:
-            if current.missed < self.patience and current.probability > 0.5 * self.stop_probability:
+            doubtful = 0.5 * self.stop_probability  # so improbable it has none
+            if current.missed < self.patience * (current.probability - doubtful) / (1.0 - doubtful):
                 return current
             now.targets.leave(current, now_ns, self.candidate_rest_s)  # not there, or most likely something else
             worth.remove(current)

@@ -179,11 +179,12 @@ def test_a_drone_to_search_for_hovers_high_at_40_m_while_the_servo_sweeps() -> N
     assert [segment.do for segment in scenario.script] == ["sweep"]
 
 
-def test_a_calibrated_rig_knows_the_encoders_error_and_the_world_stays_the_same() -> None:
+def test_a_calibrated_rig_knows_the_encoders_error_and_its_play_and_the_world_stays_the_same() -> None:
     cell = Cell("open_lot", 20, "hover", "parked")
     plain, known = scenario_of(cell, 3), scenario_of(cell, 3, Conditions(calibrated=True))
     assert known.mount == plain.mount == plain.rig.mount
-    assert known.mount.servo_harmonics == ()
+    assert (known.mount.servo_harmonics, known.mount.servo_play_deg) == ((), 0.0)
+    assert known.rig.mount.servo_play_deg == SERVO.backlash_deg
     tight = SERVO.model_copy(update={"backlash_deg": 0.0})
     turned = Turned(tight, 3)
     encoder = np.linspace(0.0, np.pi, 50)

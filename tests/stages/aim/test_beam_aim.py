@@ -366,18 +366,20 @@ def test_a_candidate_that_is_met_is_looked_at_in_its_middle_again():
     assert np.ptp([goal for _, goal in looks_of(flight)]) < 1e-6
 
 
-@pytest.mark.parametrize("patience", [5, 8])
-def test_so_many_looks_in_a_row_that_meet_nothing_end_the_patience(patience):
+@pytest.mark.parametrize(("patience", "probability", "looks"), [(5, 0.999, 5), (8, 0.999, 8), (8, 0.6, 5), (8, 0.4, 3)])
+def test_so_many_looks_in_a_row_that_meet_nothing_end_the_patience_sooner_for_a_doubtful_one(
+    patience, probability, looks
+):
     place = towards(60.0, 45.0)(np.zeros(1))[0]
 
     def tell(aim, t_s):
         if round(t_s * 1000) % 50 == 0:
-            aim.on_candidates(candidates(place, t_s, 0.7, seen_s=0.0))
+            aim.on_candidates(candidates(place, t_s, probability, seen_s=0.0))
 
     aim = BeamAim(mount=ON_ITS_SIDE, patience=patience, candidate_rest_s=60.0)
     flight = fly(aim, 2.0, tell, start_rad=math.radians(60.0))
-    assert len(looks_of(flight)) == patience
-    assert [round(goal.position_rad, 3) for _, goal in flight.goals[1 + patience :]] == [3.142, 0.0]
+    assert len(looks_of(flight)) == looks
+    assert [round(goal.position_rad, 3) for _, goal in flight.goals[1 + looks :]] == [3.142, 0.0]
 
 
 def test_a_candidate_that_is_met_now_and_then_keeps_the_patience():
@@ -385,7 +387,7 @@ def test_a_candidate_that_is_met_now_and_then_keeps_the_patience():
 
     def tell(aim, t_s):
         if round(t_s * 1000) % 50 == 0:
-            aim.on_candidates(candidates(place, t_s, 0.7, seen_s=0.4 * (t_s // 0.4)))  # every fourth look
+            aim.on_candidates(candidates(place, t_s, 0.9, seen_s=0.4 * (t_s // 0.4)))  # every fourth look
 
     flight = fly(BeamAim(mount=ON_ITS_SIDE, patience=6), 2.3, tell, start_rad=math.radians(60.0))
     assert len(looks_of(flight)) > 18

@@ -48,7 +48,8 @@ def looking_at(*places_m, range_m):
 
 def test_a_sighting_fits_the_nearest_candidate_in_sigmas():
     found = bank(PLACE_M, beside(0.0, 0.0, 1.0), beside(0.0, 0.6, 0.0)).fitting(sighting(0.1))
-    assert found is not None and found.number == 0
+    assert found is not None
+    assert found.number == 0
 
 
 def test_it_fits_none_that_is_far_or_that_was_seen_later():
@@ -71,7 +72,8 @@ def test_more_candidates_than_rows_are_kept_and_forgotten():
     assert len(made) == 2 * ROWS + 1
     for k in (0, ROWS, 2 * ROWS):
         found = made.fitting(sighting(0.1, beside(0.0, 10.0 * k, 0.0)))
-        assert found is not None and found.number == k
+        assert found is not None
+        assert found.number == k
     made.keep([c for c in made if c.number == ROWS])
     assert [c.number for c in made] == [ROWS]
     assert made.fitting(sighting(0.1)) is None

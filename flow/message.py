@@ -13,6 +13,7 @@ import enum
 import functools
 import re
 import struct
+from collections.abc import Callable
 from typing import Annotated, Any, Protocol, TypeVar, cast, dataclass_transform, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -103,11 +104,6 @@ class Hasher(Protocol):
     def update(self, data: Any, /) -> None: ...
 
 
-@functools.cache
-def _field_names(cls: type[Any]) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(cls))
-
-
 _pack_float = struct.Struct("<d").pack
 _heads: dict[tuple[np.dtype[Any], tuple[int, ...]], bytes] = {}  # of arrays: few kinds and sizes, written often
 MOST_HEADS = 4096
@@ -130,39 +126,67 @@ def hash_into(hasher: Hasher, value: Any) -> None:
     In one piece: hashlib lets go of Python's lock at each piece beyond 2 kB, and then has to wait for it.
     """
     parts: list[Any] = []
-    _add_parts(parts, value)
+    _add(parts, value)
     hasher.update(b"".join(parts))
 
 
-def _add_parts(parts: list[Any], value: Any) -> None:
-    if isinstance(value, np.ndarray):
-        array = cast("NDArray[Any]", value)
-        parts.append(_head(array))
-        if array.size:
-            parts.append(array.data if array.flags.c_contiguous else np.ascontiguousarray(array).data)
-    elif isinstance(value, Message) or dataclasses.is_dataclass(value):
-        parts.append(b"{" + type(value).__name__.encode())
-        for name in _field_names(type(value)):
-            _add_parts(parts, getattr(value, name))
-        parts.append(b"}")
-    elif isinstance(value, enum.Enum):
-        parts.append(b"e" + value.name.encode() + b";")
-    elif isinstance(value, bool | np.bool_):
-        parts.append(b"T" if value else b"F")
-    elif isinstance(value, int | np.integer):
-        parts.append(b"i%d;" % int(cast(int, value)))
-    elif isinstance(value, float | np.floating):
-        parts.append(b"d" + _pack_float(float(cast(float, value))))
-    elif isinstance(value, str):
-        parts.append(b"s%d:" % len(value) + value.encode())
-    elif isinstance(value, bytes):
-        parts += b"b%d:" % len(value), value
-    elif value is None:
-        parts.append(b"N")
-    elif isinstance(value, tuple):
-        items = cast("tuple[Any, ...]", value)
-        parts.append(b"(%d:" % len(items))
-        for item in items:
-            _add_parts(parts, item)
+Adder = Callable[[list[Any], Any], None]
+_adders: dict[type[Any], Adder] = {}  # by type: asked for each field of each message
+
+
+def _add(parts: list[Any], value: Any) -> None:
+    cls: Any = value.__class__
+    (_adders.get(cls) or _adder_of(value, cls))(parts, value)
+
+
+def _adder_of(value: Any, cls: type[Any]) -> Adder:
+    """What writes values of this one's type."""
+    if dataclasses.is_dataclass(cls):
+        add = _fields_adder(cls)
     else:
-        raise TypeError(f"a message may not hold a {type(value).__name__}: {value!r}")
+        add = next((add for kind, add in _KINDS if isinstance(value, kind)), None)
+    if add is None:
+        raise TypeError(f"a message may not hold a {cls.__name__}: {value!r}")
+    _adders[cls] = add
+    return add
+
+
+def _fields_adder(cls: type[Any]) -> Adder:
+    head, names = b"{" + cls.__name__.encode(), [field.name for field in dataclasses.fields(cls)]
+
+    def add(parts: list[Any], value: Any) -> None:
+        parts.append(head)
+        for name in names:
+            _add(parts, getattr(value, name))
+        parts.append(b"}")
+
+    return add
+
+
+def _add_array(parts: list[Any], array: NDArray[Any]) -> None:
+    parts.append(_head(array))
+    if array.size:
+        parts.append(array.data if array.flags.c_contiguous else np.ascontiguousarray(array).data)
+
+
+def _add_text(parts: list[Any], value: str) -> None:
+    parts.append(b"s%d:" % len(value) + value.encode())
+
+
+def _add_tuple(parts: list[Any], value: tuple[Any, ...]) -> None:
+    parts.append(b"(%d:" % len(value))
+    for item in value:
+        _add(parts, item)
+
+
+_KINDS: tuple[tuple[Any, Adder], ...] = (
+    (np.ndarray, _add_array),
+    (enum.Enum, lambda parts, value: parts.append(b"e" + value.name.encode() + b";")),
+    (bool | np.bool_, lambda parts, value: parts.append(b"T" if value else b"F")),
+    (int | np.integer, lambda parts, value: parts.append(b"i%d;" % int(value))),
+    (float | np.floating, lambda parts, value: parts.append(b"d" + _pack_float(float(value)))),
+    (str, _add_text),
+    (bytes, lambda parts, value: parts.extend((b"b%d:" % len(value), value))),
+    (type(None), lambda parts, _: parts.append(b"N")),
+    (tuple, _add_tuple),
+)

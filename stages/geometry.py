@@ -17,13 +17,14 @@ Source: DESIGN, Frames; VLP-16 user manual 63-9243, section 9 (lidar axes).
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Array64 = NDArray[np.float64]
+Angle = TypeVar("Angle", float, Array64)
 Vector3 = tuple[float, float, float]
 
 
@@ -149,11 +150,12 @@ class LidarMount(_Settings):
     servo_harmonics: tuple[Harmonic, ...] = ()
     servo_play_deg: Annotated[float, Field(ge=0, le=5, exclude_if=_is_zero)] = 0.0
 
-    def turntable_rad(self, servo_rad: Array64) -> Array64:
-        """Turntable angle for servo encoder positions (n,) [rad]."""
-        angle = self.servo_sign * (servo_rad - math.radians(self.servo_zero_deg))
+    def turntable_rad(self, servo_rad: Angle) -> Angle:
+        """Turntable angle for servo encoder positions, one or (n,) [rad]."""
+        sin: Any = math.sin if isinstance(servo_rad, float) else np.sin
+        angle: Any = self.servo_sign * (servo_rad - math.radians(self.servo_zero_deg))
         for term in self.servo_harmonics:
-            angle = angle - math.radians(term.amplitude_deg) * np.sin(
+            angle = angle - math.radians(term.amplitude_deg) * sin(
                 term.order * servo_rad + math.radians(term.phase_deg)
             )
         return angle
@@ -165,5 +167,5 @@ class LidarMount(_Settings):
         """
         servo = math.radians(self.servo_zero_deg) + self.servo_sign * turntable_rad
         for _ in range(4 if self.servo_harmonics else 0):
-            servo += self.servo_sign * (turntable_rad - float(self.turntable_rad(np.array([servo]))[0]))
+            servo += self.servo_sign * (turntable_rad - self.turntable_rad(servo))
         return servo

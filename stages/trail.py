@@ -13,6 +13,7 @@ from collections import deque
 
 import numpy as np
 
+from stages.compiled import compiled
 from stages.geometry import Array64
 from stages.messages import VehicleMotion
 from stages.rotation import nearly_rotation
@@ -49,7 +50,9 @@ class VehicleTrail:
             return np.eye(3), np.zeros(3)
         if len(poses) == 1 or stamp_ns <= poses[0][0]:
             return poses[0][1], poses[0][2]
-        after = min(bisect_right(poses, stamp_ns, key=lambda pose: pose[0]), len(poses) - 1)
+        after = len(poses) - 1
+        if stamp_ns < poses[-2][0]:  # of the newest step or later, mostly
+            after = bisect_right(poses, stamp_ns, key=lambda pose: pose[0])
         (t0, R0, x0), (t1, R1, x1) = poses[after - 1], poses[after]
         share = (min(stamp_ns, t1 + FURTHEST_NS) - t0) / (t1 - t0)
         if len(self._known) >= KEPT:
@@ -64,14 +67,26 @@ class VehicleTrail:
 
     def to_vehicle(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
         """Place (3,) and velocity (3,) as the vehicle sees them at a time, its own driving and turning in them."""
-        (R, t), (R_then, t_then) = self.at(stamp_ns), self.at(stamp_ns + STEP_NS)
-        now = R.T @ (xyz_m - t)
-        then = R_then.T @ (xyz_m + STEP_NS * 1e-9 * velocity_mps - t_then)
-        return now, (then - now) / (STEP_NS * 1e-9)
+        return _to_vehicle(*self.at(stamp_ns), *self.at(stamp_ns + STEP_NS), xyz_m, velocity_mps)
 
     def to_local(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
         """The inverse of `to_vehicle`."""
-        (R, t), (R_then, t_then) = self.at(stamp_ns), self.at(stamp_ns + STEP_NS)
-        now = R @ xyz_m + t
-        then = R_then @ (xyz_m + STEP_NS * 1e-9 * velocity_mps) + t_then
-        return now, (then - now) / (STEP_NS * 1e-9)
+        return _to_local(*self.at(stamp_ns), *self.at(stamp_ns + STEP_NS), xyz_m, velocity_mps)
+
+
+@compiled
+def _to_vehicle(
+    R: Array64, t: Array64, R_then: Array64, t_then: Array64, xyz_m: Array64, velocity_mps: Array64
+) -> tuple[Array64, Array64]:
+    now = R.T @ (xyz_m - t)
+    then = R_then.T @ (xyz_m + STEP_NS * 1e-9 * velocity_mps - t_then)
+    return now, (then - now) / (STEP_NS * 1e-9)
+
+
+@compiled
+def _to_local(
+    R: Array64, t: Array64, R_then: Array64, t_then: Array64, xyz_m: Array64, velocity_mps: Array64
+) -> tuple[Array64, Array64]:
+    now = R @ xyz_m + t
+    then = R_then @ (xyz_m + STEP_NS * 1e-9 * velocity_mps) + t_then
+    return now, (then - now) / (STEP_NS * 1e-9)

@@ -213,9 +213,7 @@ class Turntable:
             servo_rad = self._last_servo_rad + step_rad
             self._play.move(step_rad)
         self._last_servo_rad = servo_rad
-        angle_rad = (
-            float(self._mount.turntable_rad(np.array([servo_rad]))[0]) - self._mount.servo_sign * self._play.lag_rad
-        )
+        angle_rad = self._mount.turntable_rad(servo_rad) - self._mount.servo_sign * self._play.lag_rad
         self._states.append((stamp_ns, angle_rad))
         self._freeze()
 

@@ -279,7 +279,7 @@ def drone_transform(xyz_vehicle_m: NDArray[np.float64]) -> rr.Transform3D:
 
 def turntable_transform(mount: LidarMount, servo_rad: float) -> rr.Transform3D:
     """T_vehicle_turntable Rz(angle) for a servo position."""
-    turn = rotation_z(float(mount.turntable_rad(np.array([servo_rad]))[0]))
+    turn = rotation_z(mount.turntable_rad(servo_rad))
     return _transform(mount.T_vehicle_turntable.matrix() @ transform(turn, np.zeros(3)), "vehicle", "turntable")
 
 

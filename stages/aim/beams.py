@@ -56,8 +56,12 @@ class Pointing(NamedTuple):
 
 def table_angles_rad(T_turntable_lidar: Array64, p_turntable_m: Array64, elevation_rad: float) -> tuple[float, ...]:
     """Turntable angles in [0, 2 pi) at which a beam of this elevation meets a point (3,); none when it never does."""
-    n, o = T_turntable_lidar[:3, 2], T_turntable_lidar[:3, 3]
-    x, y, z = p_turntable_m
+    n, o = (
+        T_turntable_lidar[:3, 2].tolist(),
+        T_turntable_lidar[:3, 3].tolist(),
+    )  # Python's floats are faster than numpy's
+    n_o = float(T_turntable_lidar[:3, 2] @ T_turntable_lidar[:3, 3])
+    x, y, z = p_turntable_m.tolist()
     m, rho = math.hypot(n[0], n[1]), math.hypot(x, y)
     if m * rho < 1e-9:
         return ()
@@ -67,7 +71,7 @@ def table_angles_rad(T_turntable_lidar: Array64, p_turntable_m: Array64, elevati
         d = math.sqrt(rho * rho + (z - o[2]) ** 2)  # |o| is small beside it; refined below
         theta = math.nan
         for _ in range(2):
-            share = (float(n @ o) - n[2] * z + d * math.sin(elevation_rad)) / (m * rho)
+            share = (n_o - n[2] * z + d * math.sin(elevation_rad)) / (m * rho)
             if abs(share) > 1.0:
                 theta = math.nan
                 break

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from stages.compiled import compiled
 from stages.detect.flight import Motion, fit_motion, moves
 from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
 from stages.detect.telemetry import Heard
@@ -90,14 +91,6 @@ class Candidate:
     path_m: list[Array64] = field(default_factory=lambda: list[Array64]())
     heard: Heard | None = None  # its path against what the drone tells of its own; None: the drone is silent
 
-    def predict(self, stamp_ns: int) -> tuple[Array64, float]:
-        """Position (3,) and its variance [m^2] at a time."""
-        dt = (stamp_ns - self.stamp_ns) * 1e-9
-        a, b, c = self.p
-        return self.xyz_m + dt * self.velocity_mps, a + 2 * dt * b + dt * dt * c + (
-            ACCELERATION_MPS2 * dt * dt
-        ) ** 2 / 4
-
     def as_drone(self, stamp_ns: int, usual_mps: Array64, spread_mps: float) -> tuple[Array64, Array64]:
         """Position and velocity (3,) at a time if it is a drone, which usually flies so, one sigma on each axis.
 
@@ -133,14 +126,9 @@ class Candidate:
         self.few += math.log(alone / WIRE_ALONE) if few else math.log((1 - alone) / (1 - WIRE_ALONE))
         self.balls += s.balls
         self.rugged += s.rugged
-        self.free += s.around[FREE_0 : FREE_0 + SECTORS] >= 2
-        taken = s.around[OCCUPIED_0 : OCCUPIED_0 + SECTORS] >= 1
-        measured = (s.around[FREE_0 : FREE_0 + SECTORS] >= 1).sum() >= SECTORS // 2
-        between = s.around[FREE_0 : FREE_0 + SECTORS] >= 1
-        farther = (s.around[FARTHER_0 : FARTHER_0 + SECTORS] >= 1) & (self.free < OPEN_LOOKS)
-        standing = 1.0 if taken.any() else (0.5 if (farther & ~between).any() else (0.15 if farther.any() else 0.0))
+        standing, measured = what_stands_beside(s.around, self.free)
         self.beside = FADING * self.beside + standing
-        self.alone = FADING * self.alone + bool(measured and standing == 0.0)
+        self.alone = FADING * self.alone + (measured and standing == 0.0)
         self.big_m = s.big_m
         self.big_looks += math.isfinite(s.big_m)
         self.path_ns.append(s.stamp_ns)
@@ -152,10 +140,11 @@ class Candidate:
 
     def _note_flight(self) -> None:
         """How it flies by now; and the time in which it flew as no bird does, or was still there after a pause."""
-        self.motion = self.gentler = fit_motion(self.path_ns, self.path_m, self.range_m)
-        beside = fit_motion(self.path_ns, self.beside_m, self.range_m)
-        if self.motion is not None and beside is not None and beside.top_mps < self.motion.top_mps:
-            self.gentler = beside
+        self.motion = self.gentler = None
+        motions = fit_motion(self.path_ns, (self.path_m, self.beside_m), self.range_m)
+        if motions is not None:
+            self.motion, beside = motions
+            self.gentler = beside if beside.top_mps < self.motion.top_mps else self.motion
         if len(self.path_ns) < 2:
             return
         since_s = (self.path_ns[-1] - self.path_ns[-2]) * 1e-9
@@ -185,3 +174,21 @@ class Candidate:
     def moves(self, motion_known: bool) -> bool:
         """Whether it has clearly moved in the world; see `stages/detect/flight.py`."""
         return moves(self.path_ns, self.path_m, self.range_m, motion_known)
+
+
+@compiled
+def what_stands_beside(around: Array64, free: Array64) -> tuple[float, bool]:
+    """How sure it is that something stands beside it, by one look (TALLY,), and whether half of the sectors were seen.
+
+    Adds the sectors that are free in this look to free (SECTORS,).
+    """
+    seen, taken, farther, behind = 0, False, False, False
+    for k in range(SECTORS):
+        free[k] += around[FREE_0 + k] >= 2
+        seen += around[FREE_0 + k] >= 1
+        taken |= around[OCCUPIED_0 + k] >= 1
+        if around[FARTHER_0 + k] >= 1 and free[k] < OPEN_LOOKS:
+            farther = True
+            behind |= around[FREE_0 + k] < 1
+    standing = 1.0 if taken else (0.5 if behind else (0.15 if farther else 0.0))
+    return standing, seen >= SECTORS // 2

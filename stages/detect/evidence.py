@@ -24,10 +24,11 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
+from stages.detect.bank import Bank, first_within, places_of
 from stages.detect.candidate import SAME_LOOK_NS, SIGMA_M, STANDING_M, Candidate, Sighting
 from stages.detect.flight import scatter_m
 from stages.detect.sightings import Limits, SightingFinder, Slice
-from stages.detect.surroundings import INNER_HITS, INNER_PASSES, TALLY, BigThings, look_around
+from stages.detect.surroundings import BigThings
 from stages.detect.telemetry import hear
 from stages.detect.telling import candidates_message, detections_message, odds_of
 from stages.detect.verdict import STANDING, Evidence, judge
@@ -41,6 +42,7 @@ from stages.messages import (
     SweptPulses,
     VehicleMotion,
 )
+from stages.pulses import mean_direction
 from stages.sweep import Travel
 from stages.trail import VehicleTrail
 
@@ -51,7 +53,6 @@ SAME_PLACE_M = 0.5
 MOVES_MPS = 1.0
 MOST_STANDING = 64
 STANDING_NS = 60_000_000_000  # for so long it is known that something stands there
-FURTHEST_STEP_M = 2.5  # from where it was expected
 START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 
 
@@ -72,8 +73,9 @@ class _Now:
     travel: Travel
     trail: VehicleTrail = field(default_factory=VehicleTrail)
     told: tuple[DroneTelemetry, DroneTelemetry] = field(default_factory=lambda: (DroneTelemetry(), DroneTelemetry()))
-    bank: list[Candidate] = field(default_factory=lambda: list[Candidate]())
+    bank: Bank = field(default_factory=Bank)
     standing: deque[Candidate] = field(default_factory=lambda: deque[Candidate](maxlen=MOST_STANDING))
+    standing_m: Array64 = field(default_factory=lambda: np.empty((0, 3)))  # where they are
     refused_places: BigThings = field(default_factory=BigThings)
     watches: dict[int, _Watch] = field(default_factory=lambda: dict[int, _Watch]())
     refused: Counter[str] = field(default_factory=Counter[str])
@@ -133,8 +135,8 @@ class EvidenceDetect(Stage):
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
             now.start_ns = pulses.stamp_ns
-        axis = pulses.direction_vehicle.mean(axis=0).astype(np.float64)
-        part = Slice(pulses, *now.trail.at(pulses.stamp_ns), axis / max(float(np.linalg.norm(axis)), 1e-9))
+        axis = mean_direction(pulses.direction_vehicle)
+        part = Slice(pulses, *now.trail.at(pulses.stamp_ns), axis / max(math.hypot(*axis.tolist()), 1e-9))
         changed = False
         sightings = now.finder.feed(part, self.parked or now.trail.known)
         self._look_for_misses(now, part, now_ns)
@@ -147,19 +149,12 @@ class EvidenceDetect(Stage):
 
     def _take(self, now: _Now, s: Sighting) -> bool:
         """Give a sighting to the candidate it fits, or make one of it. True when that is news."""
-        best, least = None, 9.0
-        for c in now.bank:
-            if s.stamp_ns < c.stamp_ns:
-                continue
-            place, variance = c.predict(s.stamp_ns)
-            away = float(np.linalg.norm(s.xyz_local_m - place))
-            cost = away * away / (variance + SIGMA_M**2)
-            if cost < least and away < FURTHEST_STEP_M:
-                best, least = c, cost
-        best = best or self._wake(now, s)
+        best = now.bank.fitting(s) or self._wake(now, s)
         if best is not None:
             best.see(s)
-            return self._weigh(now, best)
+            news = self._weigh(now, best)
+            now.bank.put(best)
+            return news
         now.number += 1
         new = Candidate(
             number=now.number,
@@ -177,7 +172,7 @@ class EvidenceDetect(Stage):
         new.note(s)
         news = self._weigh(now, new)
         if new.told:
-            now.bank.append(new)
+            now.bank.put(new)
         else:
             now.refused[why_refused(new.why)] += 1
             self._remember(now, new)
@@ -185,13 +180,14 @@ class EvidenceDetect(Stage):
 
     def _wake(self, now: _Now, s: Sighting) -> Candidate | None:
         """Something that was looked at before and stood there: it goes on where it was, and is not looked at anew."""
-        for c in now.standing:
-            if float(np.linalg.norm(c.xyz_m - s.xyz_local_m)) < STANDING_M:
-                now.standing.remove(c)
-                c.wake(s.stamp_ns)
-                now.bank.append(c)
-                return c
-        return None
+        place = first_within(now.standing_m, s.xyz_local_m, STANDING_M)
+        if place < 0:
+            return None
+        c = now.standing[place]
+        del now.standing[place]
+        now.standing_m = places_of(now.standing)
+        c.wake(s.stamp_ns)
+        return c
 
     def _weigh(self, now: _Now, c: Candidate) -> bool:
         """Judge it anew. True when that is news."""
@@ -207,30 +203,20 @@ class EvidenceDetect(Stage):
 
     def _look_for_misses(self, now: _Now, part: Slice, now_ns: int) -> None:
         """Count the pulses that went through where a candidate should be, look by look."""
-        origin = np.array(part.pulses.origin_vehicle_m)
-        for c in now.bank:
-            if not c.told or now_ns - c.seen_ns > 1_500_000_000:
+        origin_m, disc_m = np.array(part.pulses.origin_vehicle_m), 0.22 * self.span_m
+        for c, hits, passes, elsewhere in now.bank.looked_at(part, origin_m, now_ns, disc_m, (0.5 * self.span_m) ** 2):
+            if not elsewhere:
+                watch = now.watches.setdefault(c.number, _Watch())
+                watch.hits += hits
+                watch.passes += passes
+                watch.stamp_ns = now_ns
                 continue
-            place, variance = c.predict(now_ns)
-            if variance > (0.5 * self.span_m) ** 2:
-                continue
-            line = part.R.T @ (place - part.t) - origin
-            range_m = float(np.linalg.norm(line))
             watch = now.watches.get(c.number)
-            if range_m > 0.5 and line @ part.axis > range_m * 0.93:
-                tally = np.zeros(TALLY, dtype=np.int64)
-                disc_m, none = 0.22 * self.span_m, math.inf
-                directions, ranges = part.pulses.direction_vehicle, part.pulses.range_m
-                look_around(directions, ranges, origin, line + origin, disc_m, none, none, disc_m, 1.0, tally)
-                if tally[INNER_HITS] + tally[INNER_PASSES]:
-                    watch = now.watches.setdefault(c.number, _Watch())
-                    watch.hits += int(tally[INNER_HITS])
-                    watch.passes += int(tally[INNER_PASSES])
-                    watch.stamp_ns = now_ns
-            elif watch is not None and now_ns - watch.stamp_ns > SAME_LOOK_NS:
+            if watch is not None and now_ns - watch.stamp_ns > SAME_LOOK_NS:
                 if watch.hits == 0 and now_ns - c.seen_ns > 2 * SAME_LOOK_NS:
                     c.missed += watch.passes * min(1.0, (35.0 / c.range_m) ** 2)
                     self._weigh(now, c)
+                    now.bank.put(c)
                 del now.watches[c.number]
 
     def _tidy(self, now: _Now, now_ns: int) -> bool:
@@ -243,8 +229,9 @@ class EvidenceDetect(Stage):
             now.standing.extend(c for c in now.bank if now_ns - c.seen_ns >= self._kept_ns(c) and c.stands)
         while now.standing and now_ns - now.standing[0].seen_ns > STANDING_NS:
             now.standing.popleft()
+        now.standing_m = places_of(now.standing)
         gone = len({c.number for c in now.bank if c.told} - {c.number for c in kept}) > 0
-        now.bank = kept
+        now.bank.keep(kept)
         now.watches = {c.number: now.watches[c.number] for c in kept if c.number in now.watches}
         return gone
 

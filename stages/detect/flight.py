@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -57,29 +58,36 @@ def scatter_m(range_m: float) -> float:
     return 0.10 + 0.0025 * range_m
 
 
-def fit_motion(path_ns: list[int], path_m: list[Array64], range_m: float) -> Motion | None:
-    """A parabola x + v t + a t^2 / 2 through the sightings of the last 1.2 s; None with too few.
+def fit_motion(path_ns: list[int], paths_m: Sequence[list[Array64]], range_m: float) -> list[Motion] | None:
+    """A parabola x + v t + a t^2 / 2 through the sightings of the last 1.2 s, of each path; None with too few.
 
-    Least squares with a prior of 8 m/s and 6 m/s^2, so that a short path says little and not nonsense.
+    The paths have the same times. Least squares with a prior of 8 m/s and 6 m/s^2, so that a short path says little
+    and not nonsense.
     """
     first = bisect_left(path_ns, path_ns[-1] - RECENT_NS)
-    t = (np.array(path_ns[first:]) - path_ns[-1]) * 1e-9
-    if len(t) < 3 or t[0] > -0.15:
+    if len(path_ns) - first < 3 or (path_ns[first] - path_ns[-1]) * 1e-9 > -0.15:
         return None
-    x = np.array(path_m[first:])
+    t = (np.array(path_ns[first:]) - path_ns[-1]) * 1e-9
     A = np.column_stack([np.ones(len(t)), t, t * t / 2])
     sigma = scatter_m(range_m)
     information = A.T @ A / sigma**2 + np.diag([0.0, 1 / 8.0**2, 1 / 6.0**2])
     covariance = np.linalg.inv(information)
-    fit = covariance @ (A.T @ x) / sigma**2
     at = t.mean()
-    return Motion(
-        speed_mps=float(np.linalg.norm(fit[1] + at * fit[2])),
-        speed_sigma_mps=math.sqrt(covariance[1, 1] + 2 * at * covariance[1, 2] + at**2 * covariance[2, 2]),
-        acceleration_mps2=float(np.linalg.norm(fit[2])),
-        acceleration_sigma_mps2=math.sqrt(covariance[2, 2]),
-        spread_m=float(np.linalg.norm(x - A @ fit)) / math.sqrt(len(t)),
-    )
+    speed_sigma = math.sqrt(covariance[1, 1] + 2 * at * covariance[1, 2] + at**2 * covariance[2, 2])
+    motions: list[Motion] = []
+    for path_m in paths_m:
+        x = np.array(path_m[first:])
+        fit = covariance @ (A.T @ x) / sigma**2
+        motions.append(
+            Motion(
+                speed_mps=float(np.linalg.norm(fit[1] + at * fit[2])),
+                speed_sigma_mps=speed_sigma,
+                acceleration_mps2=float(np.linalg.norm(fit[2])),
+                acceleration_sigma_mps2=math.sqrt(covariance[2, 2]),
+                spread_m=float(np.linalg.norm(x - A @ fit)) / math.sqrt(len(t)),
+            )
+        )
+    return motions
 
 
 def moves(path_ns: list[int], path_m: list[Array64], range_m: float, motion_known: bool) -> bool:
@@ -89,6 +97,8 @@ def moves(path_ns: list[int], path_m: list[Array64], range_m: float, motion_know
     is met elsewhere as the fan passes over it, so a single passing proves nothing. When the vehicle does not tell how
     it moves, what stands may seem to go by: then only going up or down counts.
     """
+    if len(path_ns) < 5:
+        return False
     t = (np.array(path_ns) - path_ns[-1]) * 1e-9
     pauses = np.nonzero(np.diff(t) > PAUSE_S)[0]
     first = int(pauses[-1]) + 1 if len(pauses) else 0
@@ -97,7 +107,7 @@ def moves(path_ns: list[int], path_m: list[Array64], range_m: float, motion_know
     if len(t) - first >= 6 and lasted > 0.6 and speed > 4.0 * sigma and speed * lasted > 0.25:
         return True
     speed, sigma, lasted = _straight(t, x, range_m)
-    return len(t) >= 5 and lasted > 1.0 and speed > 4.0 * sigma and speed * lasted > 1.5
+    return lasted > 1.0 and speed > 4.0 * sigma and speed * lasted > 1.5
 
 
 def _straight(t: Array64, x: Array64, range_m: float) -> tuple[float, float, float]:

@@ -12,7 +12,9 @@ from collections import Counter, deque
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from stages.compiled import compiled
 from stages.detect import chords as chord
 from stages.detect.candidate import Sighting
 from stages.detect.chords import ChordFinder
@@ -25,6 +27,7 @@ SLICES = 7  # 34 deg of the rotor
 DELAY = 3  # slices after which what stands around a sighting has been seen
 MEMORY_NS = 3_000_000_000  # of big things, when the vehicle tells how it moves
 SHORT_MEMORY_NS = 1_000_000_000  # when it does not
+NONE, BIG, SMALL, HIDDEN = range(4)  # kinds of chords
 BALL_BULGE_PER_M = (1.2, 9.0)  # 1 / (2 radius), with what a beam's width adds
 BALL_ROUGH_M = 0.02
 
@@ -51,6 +54,7 @@ class Limits(NamedTuple):
 class _Chord(NamedTuple):
     slice: int
     row: Array64
+    place_m: tuple[float, ...]  # its middle
     stamp_ns: int
 
 
@@ -63,6 +67,7 @@ class SightingFinder:
         self._chords = ChordFinder(1.6 * span_m, 0.7 * span_m, 0.6 * span_m)
         self._big = BigThings()
         self._slices: deque[Slice] = deque(maxlen=SLICES)
+        self._lately = Lately()
         self._waiting: list[_Chord] = []
         self._count = 0
         self.hidden: Counter[str] = Counter()  # short chords that were not free at both ends
@@ -70,6 +75,7 @@ class SightingFinder:
     def feed(self, part: Slice, motion_known: bool) -> list[Sighting]:
         """The sightings that are complete with this slice."""
         self._slices.append(part)
+        self._lately.add(part.pulses)
         self._count += 1
         self._find(part)
         if not self._waiting or self._waiting[0].slice > self._count - DELAY:
@@ -78,8 +84,8 @@ class SightingFinder:
         self._waiting = self._waiting[len(ready) :]
         found: list[Sighting] = []
         while ready:
-            first = ready[0].row[:3]
-            near = [np.linalg.norm(c.row[:3] - first) <= 1.2 * self._limits.span_m for c in ready]
+            first = ready[0].place_m
+            near = [math.dist(c.place_m, first) <= 1.2 * self._limits.span_m for c in ready]
             found.append(self._sighting([c for c, same in zip(ready, near, strict=True) if same], motion_known))
             ready = [c for c, same in zip(ready, near, strict=True) if not same]
         return found
@@ -90,17 +96,13 @@ class SightingFinder:
         rows = found.rows
         if not len(rows):
             return
-        long = rows[:, chord.LONG] > 0
-        if long.any():
-            self._big.add(rows[long, :3] @ part.R.T + part.t, pulses.stamp_ns)
-        range_m = rows[:, chord.RANGE]
-        up = rows[:, chord.Z] - pulses.origin_vehicle_m[2] > math.sin(limits.lowest_rad) * range_m
-        near = (range_m >= limits.nearest_m) & (range_m <= limits.furthest_m)
-        short = ~long & up & near & (rows[:, chord.LENGTH] <= 1.6 * limits.span_m)
-        free = rows[:, chord.FREE] == 2.0
-        self.hidden["hidden at an end by something nearer"] += int((short & ~free).sum())
-        for i in np.nonzero(short & free)[0]:
-            self._waiting.append(_Chord(self._count, rows[i], int(found.first_ns[i] + found.last_ns[i]) // 2))
+        kinds = kinds_of(rows, pulses.origin_vehicle_m[2], *limits)
+        if (big := kinds == BIG).any():
+            self._big.add(rows[big, :3] @ part.R.T + part.t, pulses.stamp_ns)
+        self.hidden["hidden at an end by something nearer"] += int(np.count_nonzero(kinds == HIDDEN))
+        for i in np.nonzero(kinds == SMALL)[0].tolist():
+            middle_ns = int(found.first_ns[i] + found.last_ns[i]) // 2
+            self._waiting.append(_Chord(self._count, rows[i], tuple(rows[i, :3].tolist()), middle_ns))
 
     def _sighting(self, same: list[_Chord], motion_known: bool) -> Sighting:
         span_m = self._limits.span_m
@@ -129,23 +131,88 @@ class SightingFinder:
     def _around(self, middle_m: Array64, range_m: float) -> Array64:
         """What the last slices measured about a place of the vehicle frame: (TALLY,)."""
         span_m = self._limits.span_m
-        tally = np.zeros(TALLY, dtype=np.int64)
         close_m = max(2.4 * span_m, 1.15 * BEAM_SPACING_RAD * range_m)  # two beams wide at least
         outer_m = max(self._limits.clear_m, 1.5 * BEAM_SPACING_RAD * range_m)
-        for part in self._slices:
-            look_around(
-                part.pulses.direction_vehicle,
-                part.pulses.range_m,
-                np.array(part.pulses.origin_vehicle_m),
-                middle_m,
-                0.3 * span_m,
-                1.1 * span_m,
-                close_m,
-                outer_m,
-                0.5,
-                tally,
-            )
-        return tally.astype(np.float64)
+        return self._lately.around(middle_m, 0.3 * span_m, 1.1 * span_m, close_m, outer_m, 0.5)
+
+
+class Lately:
+    """The last slices' pulses side by side, so that one compiled call looks at all of them."""
+
+    def __init__(self) -> None:
+        self._direction = np.empty((SLICES, 0, 3), dtype=np.float32)
+        self._range_m = np.empty((SLICES, 0), dtype=np.float32)
+        self._origin_m = np.zeros((SLICES, 3))
+        self._sizes = np.zeros(SLICES, dtype=np.int64)
+        self._next = 0
+
+    def add(self, pulses: SweptPulses) -> None:
+        """One more; the oldest is forgotten."""
+        n, k = pulses.range_m.size, self._next
+        missing = n - self._range_m.shape[1]
+        if missing > 0:
+            self._direction = np.pad(self._direction, ((0, 0), (0, missing), (0, 0)))
+            self._range_m = np.pad(self._range_m, ((0, 0), (0, missing)))
+        self._direction[k, :n], self._range_m[k, :n] = pulses.direction_vehicle, pulses.range_m
+        self._origin_m[k], self._sizes[k] = pulses.origin_vehicle_m, n
+        self._next = (k + 1) % SLICES
+
+    def around(
+        self, centre_m: Array64, disc_m: float, inner_m: float, close_m: float, outer_m: float, depth_m: float
+    ) -> Array64:
+        """What they found around a place (3,) of the vehicle frame: (TALLY,); see `look_around`."""
+        return look_around_all(
+            self._direction, self._range_m, self._origin_m, self._sizes,
+            centre_m, disc_m, inner_m, close_m, outer_m, depth_m,
+        )  # fmt: skip
+
+
+@compiled
+def look_around_all(
+    direction: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    origin_m: Array64,
+    sizes: NDArray[np.int64],
+    centre_m: Array64,
+    disc_m: float,
+    inner_m: float,
+    close_m: float,
+    outer_m: float,
+    depth_m: float,
+) -> Array64:
+    """The tally (TALLY,) of slices (k, most, 3), (k, most), of each the first `sizes` (k,) pulses."""
+    tally = np.zeros(TALLY, dtype=np.int64)
+    for k in range(sizes.size):
+        n = sizes[k]
+        look_around(
+            direction[k, :n], range_m[k, :n], origin_m[k], centre_m, disc_m, inner_m, close_m, outer_m, depth_m, tally
+        )
+    return tally.astype(np.float64)
+
+
+@compiled
+def kinds_of(
+    rows: Array64,
+    origin_z_m: float,
+    span_m: float,
+    lowest_rad: float,
+    nearest_m: float,
+    furthest_m: float,
+    clear_m: float,
+) -> NDArray[np.int64]:
+    """What chords (n, COLUMNS) are of: BIG, SMALL and free at both ends, HIDDEN: small, not free, or NONE of these."""
+    kinds = np.full(rows.shape[0], NONE)
+    for i in range(rows.shape[0]):
+        range_m = rows[i, chord.RANGE]
+        if rows[i, chord.LONG] > 0.0:
+            kinds[i] = BIG
+        elif (
+            rows[i, chord.Z] - origin_z_m > math.sin(lowest_rad) * range_m
+            and nearest_m <= range_m <= furthest_m
+            and rows[i, chord.LENGTH] <= 1.6 * span_m
+        ):
+            kinds[i] = SMALL if rows[i, chord.FREE] == 2.0 else HIDDEN
+    return kinds
 
 
 def round_and_rugged(rows: Array64) -> tuple[int, int]:

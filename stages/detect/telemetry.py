@@ -63,6 +63,8 @@ def hear(
     if heard_ns is None or path_ns[-1] > heard_ns[1] + SILENT_NS:
         return None
     first = bisect_left(path_ns, max(path_ns[-1] - KEPT_NS // 2, heard_ns[0]))
+    if len(path_ns) - first < 2:
+        return None
     rows = list(range(first, len(path_ns)))
     if len(rows) > MOST_POINTS:
         last = len(rows) - 1

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def candidates_message(
 
 
 def detections_message(
-    bank: list[Candidate], trail: VehicleTrail, start_ns: int, end_ns: int, refused: Counter[str], at_most: int
+    bank: Iterable[Candidate], trail: VehicleTrail, start_ns: int, end_ns: int, refused: Counter[str], at_most: int
 ) -> Detections:
     """The answer of a search from start_ns to end_ns: its candidates where each was last seen, accepted ones first."""
     listed = sorted((c for c in bank if c.seen_ns >= start_ns), key=lambda c: (not c.accepted, -c.odds))[:at_most]

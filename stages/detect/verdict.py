@@ -99,7 +99,7 @@ def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tu
     least = min(over, key=lambda name: over[name])
     shift = over[least]
     c.suspect = least
-    odds = shift - math.log(sum(math.exp(shift - value) for value in over.values()))
+    odds = shift - math.log(sum([math.exp(shift - value) for value in over.values()]))
     words = [f"{c.hit_looks} looks, {c.hits} returns", *said]
     if c.motion is not None:
         words.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
@@ -125,7 +125,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     said: list[str] = []
     odds = e.clutter
     if free_space:
-        free = int((c.free >= 1).sum())
+        free = int(np.count_nonzero(c.free >= 1))
         odds += e.free_sector * free + max(e.beside * c.beside, -12.0) + min(e.alone * c.alone, most_alone(c, e))
         said.append(f"{free} of {SECTORS} sectors around it free")
         if c.beside > 0.5:

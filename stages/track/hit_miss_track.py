@@ -36,7 +36,8 @@ from stages.messages import (
     TrackState,
     VehicleMotion,
 )
-from stages.track.look import Look, collect_into, evaluate, largest_sigma_m
+from stages.pulses import mean_direction
+from stages.track.look import Look, collect_into, evaluate, largest_sigma_m, misfit
 from stages.track.told_motion import ToldMotion, Word
 from stages.trail import VehicleTrail
 
@@ -89,6 +90,9 @@ class HitMissTrack(Stage):
     _trail: VehicleTrail = PrivateAttr(default_factory=VehicleTrail)
     _told: tuple[ToldMotion, ToldMotion] = PrivateAttr(default_factory=lambda: (ToldMotion(0), ToldMotion(1)))
     _tracks: list[_Track] = PrivateAttr(default_factory=lambda: list[_Track]())
+    _predicted: dict[_Track, tuple[int, Array64, Array64]] = PrivateAttr(
+        default_factory=lambda: dict[_Track, tuple[int, Array64, Array64]]()
+    )  # as asked for last: each candidate asks for the same moment
     _next_number: int = PrivateAttr(default=1)
     _idle_ns: int = PrivateAttr(default=0)
     _why_idle: str = PrivateAttr(default="nothing found yet")
@@ -99,11 +103,13 @@ class HitMissTrack(Stage):
 
     def on_drone_position(self, position: DroneLocalPosition) -> None:
         """What the drone says of its flight: a track moves as it says."""
+        self._predicted.clear()
         self._told[0].told.add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
 
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
         """The same from an autopilot that sends this; taken where it sends both."""
         velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
+        self._predicted.clear()
         self._told[1].told.add(odometry.stamp_ns, odometry.xyz_local_m, velocity, odometry.reset_counter)
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
@@ -157,7 +163,7 @@ class HitMissTrack(Stage):
             return
         now_ns = int(pulses.point_stamp_ns[-1])
         R, t = self._trail.at(pulses.stamp_ns)
-        axis = pulses.direction_vehicle.mean(axis=0).astype(np.float64)
+        axis = mean_direction(pulses.direction_vehicle)
         for track in tuple(self._tracks):
             look = track.look
             if look is not None and pulses.stamp_ns - look.last_ns > LOOK_OVER_NS:
@@ -178,10 +184,14 @@ class HitMissTrack(Stage):
 
     def _at(self, track: _Track, stamp_ns: int) -> tuple[Array64, Array64]:
         """A track's state (6,) and covariance (6, 6) at a time."""
-        after = self._word(stamp_ns)
-        told = self._told[0 if after is None else after.source]
-        dt_s = (stamp_ns - track.stamp_ns) * 1e-9
-        return told.predicted(track.x, track.P, dt_s, track.word, after, self.manoeuvre, self.told_manoeuvre)
+        known = self._predicted.get(track)
+        if known is None or known[0] != stamp_ns:
+            after = self._word(stamp_ns)
+            told = self._told[0 if after is None else after.source]
+            dt_s = (stamp_ns - track.stamp_ns) * 1e-9
+            at = told.predicted(track.x, track.P, dt_s, track.word, after, self.manoeuvre, self.told_manoeuvre)
+            known = self._predicted[track] = (stamp_ns, *at)
+        return known[1], known[2]
 
     def _word(self, stamp_ns: int) -> Word | None:
         """What the drone says of itself at a time, by the better of its messages."""
@@ -210,6 +220,7 @@ class HitMissTrack(Stage):
         track.candidate, track.stamp_ns, track.x, track.P = number, new.stamp_ns, new.x, new.P
         track.last_hit_ns, track.look, track.odds = seen_ns, None, max(track.odds, 2.0)
         track.word = new.word
+        self._predicted.clear()
         track.reason = "found again by the detector"
 
     def _astray(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> _Track | None:
@@ -228,9 +239,7 @@ class HitMissTrack(Stage):
         """The track that this is: by the detector's number, or by its place."""
         best, least = None, 9.0
         for track in self._tracks:
-            x, P = self._at(track, stamp_ns)
-            away = xyz - x[:3]
-            cost = float(away @ np.linalg.solve(P[:3, :3] + 0.3**2 * np.eye(3), away))
+            cost = misfit(xyz, *self._at(track, stamp_ns))
             cost = min(cost, 4.0) if track.candidate == number and cost < 100.0 else cost
             if cost < least:
                 best, least = track, cost
@@ -238,6 +247,7 @@ class HitMissTrack(Stage):
 
     def _lose(self, track: _Track, now_ns: int, why: str) -> Iterator[TrackState]:
         self._tracks = [other for other in self._tracks if other is not track]
+        self._predicted.clear()
         if track.confirmed:
             self._why_idle = f"lost drone {track.number}: {why}"
             yield TrackState(
@@ -297,6 +307,7 @@ class HitMissTrack(Stage):
         if seen is None:
             return
         track.x, track.P, track.stamp_ns, track.word = seen.x, seen.P, look.start_ns, track.look_word
+        self._predicted.clear()
         track.odds = min(max(track.odds + seen.evidence, -8.0), 8.0)
         if seen.hits == 0:
             return
@@ -309,6 +320,7 @@ class HitMissTrack(Stage):
             x, P = self._at(track, track.last_hit_ns)
             for told in self._told:
                 told.learn(track.number, track.last_hit_ns, x[:3], math.sqrt(float(np.trace(P[:3, :3])) / 3) + 0.05)
+            self._predicted.clear()
             yield self._fix(track)
         yield self._state(track, max(look.last_ns, track.last_hit_ns, track.told_ns))
 

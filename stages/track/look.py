@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.compiled import compiled
 from stages.geometry import Array64
 from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, WHEN_S, WIDTH, A, B, basis, collect, posterior
@@ -53,9 +54,28 @@ class Seen(NamedTuple):
     hit_ns: int  # mean time of the hits; the look's start when there were none
 
 
+@compiled
 def largest_sigma_m(P: Array64) -> float:
     """Largest sigma of the position in a covariance (6, 6)."""
-    return math.sqrt(float(np.linalg.eigvalsh(P[:3, :3])[-1]))
+    return math.sqrt(np.linalg.eigvalsh(np.ascontiguousarray(P[:3, :3]))[-1])
+
+
+@compiled
+def misfit(xyz_m: Array64, x: Array64, P: Array64) -> float:
+    """How far a place (3,) is from a state's, squared sigmas, with 0.3 m of its own."""
+    away = xyz_m - x[:3]
+    return float(away @ np.linalg.solve(P[:3, :3] + 0.3**2 * np.eye(3), away))
+
+
+@compiled
+def seen_from(R: Array64, t: Array64, origin_m: Array64, x: Array64, axis: Array64) -> tuple[Array64, float, bool]:
+    """(line to a state's place (3,) [m], its length, whether a slice looks there), all in the vehicle frame.
+
+    R, t are T_local_vehicle of the slice, origin (3,) and axis (3,) its beams' start and mean direction.
+    """
+    away = R.T @ (x[:3] - t) - origin_m
+    range_m = math.sqrt(away @ away)
+    return away, range_m, range_m >= 0.5 and bool(away @ axis >= range_m * math.sqrt(axis @ axis) * SCAN_COS)
 
 
 def collect_into(
@@ -74,9 +94,8 @@ def collect_into(
     R, t are T_local_vehicle of the slice, `axis` (3,) its mean direction; x, P the state predicted at the look's start.
     """
     origin = np.array(pulses.origin_vehicle_m)
-    away = R.T @ (x[:3] - t) - origin
-    range_m = float(np.linalg.norm(away))
-    if range_m < 0.5 or away @ axis < range_m * float(np.linalg.norm(axis)) * SCAN_COS:
+    away, range_m, here = seen_from(R, t, origin, x, axis)
+    if not here:
         return look
     start_ns = pulses.stamp_ns if look is None else look.start_ns
     sigma_m = largest_sigma_m(P)

@@ -65,6 +65,7 @@ class ToldMotion:
         self._places: deque[tuple[int, Array64, float]] = deque()
         self._prior = np.full(YAWS, 1.0 / YAWS)
         self._p = (1.0 - NONE) * self._prior
+        self._sure = float(self._p.sum())
         self._moments = 0j, 0j
 
     def _of_this_frame(self) -> None:
@@ -74,12 +75,13 @@ class ToldMotion:
             self._places.clear()
             self._prior = np.full(YAWS, 1.0 / YAWS)
             self._p = (1.0 - NONE) * self._prior
+            self._sure = float(self._p.sum())
             self._moments = 0j, 0j
 
     @property
     def sure(self) -> float:
         """Probability that the track flies as told."""
-        return float(self._p.sum())
+        return self._sure
 
     def learn(self, number: int, stamp_ns: int, xyz_local_m: Array64, sigma_m: float) -> None:
         """Where confirmed track `number` was, and how well that is known, one sigma an axis."""
@@ -118,6 +120,7 @@ class ToldMotion:
         top = max(float(log_w.max()), free)
         w = np.exp(log_w - top)
         self._p = w / (w.sum() + math.exp(free - top))
+        self._sure = float(self._p.sum())
         turn = np.exp(1j * math.tau * np.arange(YAWS) / YAWS)
         self._moments = complex(self._p @ turn), complex(self._p @ turn**2)
 
@@ -146,8 +149,10 @@ class ToldMotion:
         m1, m2 = self._moments
         a = np.array([complex(step[0], step[1]), complex(change[0], change[1])])
         moved = a * m1
-        x[[0, 1, 3, 4]] += (moved[0].real, moved[0].imag, moved[1].real, moved[1].imag)
-        K, pseudo = np.outer(a, a.conj()) * (sure - abs(m1) ** 2), np.outer(a, a) * (m2 - m1 * m1)
+        x[0:2] += moved.view(np.float64)[:2]
+        x[3:5] += moved.view(np.float64)[2:]
+        aside = a[:, None]
+        K, pseudo = aside * a.conj() * (sure - abs(m1) ** 2), aside * a * (m2 - m1 * m1)
         across = 0.5 * (pseudo - K).imag  # E Re z Im z'
         covariance[0::3, 0::3] += 0.5 * (K + pseudo).real  # x of place and velocity
         covariance[1::3, 1::3] += 0.5 * (K - pseudo).real  # y of both

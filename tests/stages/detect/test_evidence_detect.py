@@ -360,11 +360,11 @@ def test_what_stood_is_known_again_and_not_looked_at_anew():
 def test_what_stood_is_forgotten_with_an_unknown_vehicles_motion_and_what_flew_always():
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
     run([hanging()], 2.5, looking_away(1.5, 9.0), drives_mps=None, stage=stage)
-    assert stage._now.bank == []
+    assert list(stage._now.bank) == []
     assert len(stage._now.standing) == 0
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
     run([Drone(MOVING)], 2.5, looking_away(1.5, 9.0), stage=stage)
-    assert stage._now.bank == []
+    assert list(stage._now.bank) == []
     assert len(stage._now.standing) == 0
 
 
@@ -400,7 +400,7 @@ def beside_a_refused(away_m, after_s, parked=True, hits=1):
     """The candidate that appears beside something that was refused at once for want of free space."""
     stage = EvidenceDetect(parked=parked)
     stage._take(stage._now, sighting(1.0, (0.0, 20.0, 20.0), free_sectors=0, hits=hits))
-    assert stage._now.bank == []
+    assert list(stage._now.bank) == []
     stage._take(stage._now, sighting(1.0 + after_s, (away_m, 20.0, 20.0), hits=3))
     (candidate,) = stage._now.bank
     return candidate
@@ -424,7 +424,7 @@ def test_a_refused_place_is_forgotten_sooner_when_the_vehicles_motion_is_unknown
 def test_rain_is_no_place_where_something_stands():
     stage = EvidenceDetect(parked=True)
     stage._take(stage._now, sighting(1.0, (0.0, 45.0, 45.0), free_sectors=SECTORS))  # free all around, once, far away
-    assert stage._now.bank == []
+    assert list(stage._now.bank) == []
     assert dict(stage._now.refused) == {"a stray return": 1}
     assert stage._now.refused_places.nearest_m(np.array([0.0, 45.0, 45.0]), 0.0, AMONG_M, START_NS) == math.inf
 
@@ -444,7 +444,7 @@ def test_what_leaves_is_forgotten():
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
     for pulses in pulses_seen([gone], WATCHING, 4.0):
         list(stage.on_pulses(pulses))
-    assert stage._now.bank == []
+    assert list(stage._now.bank) == []
     assert stage._now.watches == {}
 
 

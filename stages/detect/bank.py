@@ -1,0 +1,172 @@
+"""The detector's candidates, and where each is in a table, so that one compiled call looks at all of them.
+
+Under trees hundreds of things are followed for a moment, and each sighting and each slice asks about every one.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.compiled import compiled
+from stages.detect.candidate import ACCELERATION_MPS2, SIGMA_M, Candidate, Sighting
+from stages.detect.sightings import Slice
+from stages.detect.surroundings import INNER_HITS, INNER_PASSES, TALLY, look_around
+from stages.geometry import Array64
+
+FURTHEST_STEP_M = 2.5  # from where it was expected
+MOST_COST = 9.0  # of a sighting: squared sigmas
+SEEN_LATELY_NS = 1_500_000_000  # later nobody knows where a miss would be
+FAN_COS = 0.93  # a slice covers less to each side of its middle
+ROWS = 64  # at first; the table grows
+
+X, Y, Z, VX, VY, VZ, P_X, P_XV, P_V = range(9)  # [m], [m/s] in the local frame, and their variances
+STATE = 9
+STAMP, SEEN = 0, 1  # [ns]
+NOTHING, NEAR, ELSEWHERE = 0, 1, 2  # of a candidate: nothing to say; pulses near its middle; the fan is elsewhere
+
+
+class Bank:
+    """Candidates in the order in which they came; `put` each again when it has changed."""
+
+    def __init__(self) -> None:
+        self._candidates: list[Candidate] = []
+        self._rows: dict[int, int] = {}  # by number
+        self._state = np.empty((ROWS, STATE))
+        self._ns = np.empty((ROWS, 2), dtype=np.int64)
+        self._told = np.empty(ROWS, dtype=np.bool_)
+
+    def __iter__(self) -> Iterator[Candidate]:
+        return iter(self._candidates)
+
+    def __len__(self) -> int:
+        return len(self._candidates)
+
+    def put(self, c: Candidate) -> None:
+        """A new one, or one that has changed."""
+        row = self._rows.setdefault(c.number, len(self._candidates))
+        if row == len(self._candidates):
+            self._candidates.append(c)
+            if row == len(self._told):
+                self._state, self._ns = np.resize(self._state, (2 * row, STATE)), np.resize(self._ns, (2 * row, 2))
+                self._told = np.resize(self._told, 2 * row)
+        self._state[row] = (*c.xyz_m.tolist(), *c.velocity_mps.tolist(), *c.p)
+        self._ns[row], self._told[row] = (c.stamp_ns, c.seen_ns), c.told
+
+    def keep(self, kept: Iterable[Candidate]) -> None:
+        """Forget all others."""
+        self._candidates, self._rows = [], {}
+        for c in kept:
+            self.put(c)
+
+    def fitting(self, s: Sighting) -> Candidate | None:
+        """The candidate that a sighting is most likely of; None when it fits none."""
+        n = len(self._candidates)
+        row = nearest_row(self._state[:n], self._ns[:n], s.stamp_ns, s.xyz_local_m)
+        return self._candidates[row] if row >= 0 else None
+
+    def looked_at(
+        self, part: Slice, origin_m: Array64, now_ns: int, disc_m: float, most_variance: float
+    ) -> Iterator[tuple[Candidate, int, int, bool]]:
+        """(candidate, pulses that hit its middle, pulses that passed it, whether the fan is elsewhere) of a slice.
+
+        Only of those told of, seen lately, and known to within `most_variance` [m^2]; not where no pulse was near one
+        that the fan covers.
+        """
+        n, pulses = len(self._candidates), part.pulses
+        found = np.empty((n, 3), dtype=np.int64)
+        look_at_all(
+            self._state[:n], self._ns[:n], self._told[:n], now_ns, part.R, part.t, part.axis, origin_m,
+            pulses.direction_vehicle, pulses.range_m, disc_m, most_variance, found,
+        )  # fmt: skip
+        for row in np.nonzero(found[:, 0])[0].tolist():
+            where, hits, passes = found[row].tolist()
+            yield self._candidates[row], hits, passes, where == ELSEWHERE
+
+
+def places_of(candidates: Iterable[Candidate]) -> Array64:
+    """Where some are (n, 3), in the local frame."""
+    return np.array([c.xyz_m for c in candidates]).reshape(-1, 3)
+
+
+@compiled
+def first_within(places_m: Array64, xyz_m: Array64, reach_m: float) -> int:
+    """The first of places (n, 3) within reach of one (3,); -1 when none is."""
+    for k in range(places_m.shape[0]):
+        x, y, z = places_m[k, 0] - xyz_m[0], places_m[k, 1] - xyz_m[1], places_m[k, 2] - xyz_m[2]
+        if math.sqrt(x * x + y * y + z * z) < reach_m:
+            return k
+    return -1
+
+
+@compiled
+def predicted(state: Array64, dt_s: float) -> tuple[float, float, float, float]:
+    """Place x, y, z [m] and its variance [m^2] of a row of the table after dt_s."""
+    variance = state[P_X] + 2 * dt_s * state[P_XV] + dt_s * dt_s * state[P_V]
+    variance += (ACCELERATION_MPS2 * dt_s * dt_s) ** 2 / 4
+    return state[X] + dt_s * state[VX], state[Y] + dt_s * state[VY], state[Z] + dt_s * state[VZ], variance
+
+
+@compiled
+def nearest_row(state: Array64, ns: NDArray[np.int64], stamp_ns: int, xyz_m: Array64) -> int:
+    """Row of the candidate whose prediction is nearest to a sighting, in sigmas; -1 when none is near."""
+    best, least = -1, MOST_COST
+    for row in range(state.shape[0]):
+        if stamp_ns < ns[row, STAMP]:
+            continue
+        x, y, z, variance = predicted(state[row], (stamp_ns - ns[row, STAMP]) * 1e-9)
+        away2 = (xyz_m[0] - x) ** 2 + (xyz_m[1] - y) ** 2 + (xyz_m[2] - z) ** 2
+        cost = away2 / (variance + SIGMA_M**2)
+        if cost < least and away2 < FURTHEST_STEP_M**2:
+            best, least = row, cost
+    return best
+
+
+@compiled
+def look_at_all(
+    state: Array64,
+    ns: NDArray[np.int64],
+    told: NDArray[np.bool_],
+    now_ns: int,
+    R: Array64,
+    t: Array64,
+    axis: Array64,
+    origin_m: Array64,
+    direction: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    disc_m: float,
+    most_variance: float,
+    found: NDArray[np.int64],
+) -> None:
+    """Fill found (n, 3) with NOTHING, NEAR or ELSEWHERE, and the pulses of a slice that hit and passed each middle.
+
+    R, t are T_local_vehicle of the slice, axis (3,) its mean direction, direction (k, 3) and range (k,) its pulses.
+    """
+    tally, away, centre = np.zeros(TALLY, dtype=np.int64), np.empty(3), np.empty(3)
+    for row in range(state.shape[0]):
+        found[row] = 0
+        if not told[row] or now_ns - ns[row, SEEN] > SEEN_LATELY_NS:
+            continue
+        away[0], away[1], away[2], variance = predicted(state[row], (now_ns - ns[row, STAMP]) * 1e-9)
+        if variance > most_variance:
+            continue
+        away -= t
+        length2 = ahead = 0.0
+        for k in range(3):
+            along = R[0, k] * away[0] + R[1, k] * away[1] + R[2, k] * away[2] - origin_m[k]
+            centre[k] = along + origin_m[k]
+            length2 += along * along
+            ahead += along * axis[k]
+        length = math.sqrt(length2)
+        if length > 0.5 and ahead > length * FAN_COS:
+            tally[INNER_HITS] = tally[INNER_PASSES] = 0
+            look_around(direction, range_m, origin_m, centre, disc_m, math.inf, math.inf, disc_m, 1.0, tally)
+            found[row, 1], found[row, 2] = tally[INNER_HITS], tally[INNER_PASSES]
+            found[row, 0] = NEAR if tally[INNER_HITS] + tally[INNER_PASSES] > 0 else NOTHING
+        else:
+            found[row, 0] = ELSEWHERE

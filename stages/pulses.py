@@ -1,0 +1,24 @@
+"""What several stages ask of a slice's pulses.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.compiled import compiled
+from stages.geometry import Array64
+
+
+@compiled
+def mean_direction(direction: NDArray[np.float32]) -> Array64:
+    """The mean (3,) of directions (n, 3), n > 0, summed in single precision as numpy's mean does."""
+    x = y = z = np.float32(0.0)
+    for i in range(direction.shape[0]):
+        x += direction[i, 0]
+        y += direction[i, 1]
+        z += direction[i, 2]
+    n = np.float32(direction.shape[0])
+    return np.array([x / n, y / n, z / n], dtype=np.float64)

@@ -230,13 +230,15 @@ class BeamAim(Stage):
     def _offset_m(self, target: Target, range_m: float) -> float:
         """How far beside the place the beam goes, look by look.
 
-        A drone that is met: a little to each side, its edges tell where it is. One that was missed: half a drone to one
+        A drone that is met: a little to each side, its edges tell where it is; a candidate, too, or it is met at the
+        same edge for ever. One that was missed: half a drone to one
         side, to the other, farther, until the next beam of the fan has been where this one began.
         """
         tries = target.missed - 1 if target.sure else target.missed
-        if target.sure and tries < 1:
-            wide = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * self.span_m + 0.35 * target.sigma_m
-            return wide * low_discrepancy(target.looks % 16)
+        if tries < 1 and (target.sure or target.looks):
+            near = 0.35 * min(1.0, 10.0 / range_m)
+            wide_m = (0.06 + near) * self.span_m + 0.35 * target.sigma_m if target.sure else 0.5 * near * self.span_m
+            return wide_m * low_discrepancy(target.looks % 16)
         spacing_m = self._now.spacing_rad * range_m
         count = max(math.ceil(spacing_m / (TARGET_SHARE * self.span_m)), 1)
         k = tries % count

@@ -40,6 +40,7 @@ class Bank:
         self._state = np.empty((ROWS, STATE))
         self._ns = np.empty((ROWS, 2), dtype=np.int64)
         self._told = np.empty(ROWS, dtype=np.bool_)
+        self._joined = np.empty(ROWS, dtype=np.bool_)
 
     def __iter__(self) -> Iterator[Candidate]:
         return iter(self._candidates)
@@ -54,9 +55,9 @@ class Bank:
             self._candidates.append(c)
             if row == len(self._told):
                 self._state, self._ns = np.resize(self._state, (2 * row, STATE)), np.resize(self._ns, (2 * row, 2))
-                self._told = np.resize(self._told, 2 * row)
+                self._told, self._joined = np.resize(self._told, 2 * row), np.resize(self._joined, 2 * row)
         self._state[row] = (*c.xyz_m.tolist(), *c.velocity_mps.tolist(), *c.p)
-        self._ns[row], self._told[row] = (c.stamp_ns, c.seen_ns), c.told
+        self._ns[row], self._told[row], self._joined[row] = (c.stamp_ns, c.seen_ns), c.told, c.joined_at > 0
 
     def keep(self, kept: Iterable[Candidate]) -> None:
         """Forget all others."""
@@ -64,10 +65,10 @@ class Bank:
         for c in kept:
             self.put(c)
 
-    def fitting(self, s: Sighting) -> Candidate | None:
-        """The candidate that a sighting is most likely of; None when it fits none."""
+    def fitting(self, s: Sighting, joined: bool = False) -> Candidate | None:
+        """The candidate that a sighting is most likely of, of the joined or of the others; None: of none."""
         n = len(self._candidates)
-        row = nearest_row(self._state[:n], self._ns[:n], s.stamp_ns, s.xyz_local_m)
+        row = nearest_row(self._state[:n], self._ns[:n], self._joined[:n] == joined, s.stamp_ns, s.xyz_local_m)
         return self._candidates[row] if row >= 0 else None
 
     def looked_at(
@@ -113,11 +114,11 @@ def predicted(state: Array64, dt_s: float) -> tuple[float, float, float, float]:
 
 
 @compiled
-def nearest_row(state: Array64, ns: NDArray[np.int64], stamp_ns: int, xyz_m: Array64) -> int:
-    """Row of the candidate whose prediction is nearest to a sighting, in sigmas; -1 when none is near."""
+def nearest_row(state: Array64, ns: NDArray[np.int64], asked: NDArray[np.bool_], stamp_ns: int, xyz_m: Array64) -> int:
+    """Row of the asked candidate whose prediction is nearest to a sighting, in sigmas; -1 when none is near."""
     best, least = -1, MOST_COST
     for row in range(state.shape[0]):
-        if stamp_ns < ns[row, STAMP]:
+        if not asked[row] or stamp_ns < ns[row, STAMP]:
             continue
         x, y, z, variance = predicted(state[row], (stamp_ns - ns[row, STAMP]) * 1e-9)
         away2 = (xyz_m[0] - x) ** 2 + (xyz_m[1] - y) ** 2 + (xyz_m[2] - z) ** 2

@@ -80,6 +80,7 @@ class Candidate:
     suspect: str = ""  # what it is if it is no drone
     among: bool = False  # where it appeared, something had been refused
     again: bool = False  # in the very place, and the drone says that it flies
+    joined_at: int = 0  # looks before it was met again elsewhere, as the drone says that it flew; 0: never
     accepted: bool = False
     announced: bool = False  # as accepted
     told: bool = False  # it is worth another look

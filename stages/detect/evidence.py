@@ -27,6 +27,7 @@ from flow.stage import Stage
 from stages.detect.bank import Bank, first_within, places_of
 from stages.detect.candidate import SAME_LOOK_NS, SIGMA_M, STANDING_M, Candidate, Sighting
 from stages.detect.flight import scatter_m
+from stages.detect.rejoin import joined, met_again, without_twins
 from stages.detect.sightings import Limits, SightingFinder, Slice
 from stages.detect.surroundings import BigThings
 from stages.detect.telemetry import hear
@@ -149,12 +150,14 @@ class EvidenceDetect(Stage):
 
     def _take(self, now: _Now, s: Sighting) -> bool:
         """Give a sighting to the candidate it fits, or make one of it. True when that is news."""
+        both = now.bank.fitting(s, joined=True)
+        if both is not None:
+            self._see(now, both, s)
         best = now.bank.fitting(s) or self._wake(now, s)
         if best is not None:
-            best.see(s)
-            news = self._weigh(now, best)
-            now.bank.put(best)
-            return news
+            return self._see(now, best, s) or both is not None
+        if both is None:
+            self._join(now, s)
         now.number += 1
         new = Candidate(
             number=now.number,
@@ -177,6 +180,26 @@ class EvidenceDetect(Stage):
             now.refused[why_refused(new.why)] += 1
             self._remember(now, new)
         return news
+
+    def _see(self, now: _Now, c: Candidate, s: Sighting) -> bool:
+        """One more sighting of a candidate. True when that is news."""
+        c.see(s)
+        news = self._weigh(now, c)
+        now.bank.put(c)
+        return news
+
+    def _join(self, now: _Now, s: Sighting) -> None:
+        """What was met elsewhere and may have flown here, as the drone says, goes on here, too."""
+        if not (self.parked or now.trail.known) or not self._drone_moves(now, s.stamp_ns):
+            return
+        for told in now.told:
+            if met := met_again(now.bank, s, told):
+                now.number += 1
+                both = joined(met[0], now.number, s, met[1])
+                self._weigh(now, both)
+                if both.told:
+                    now.bank.put(both)
+                return
 
     def _wake(self, now: _Now, s: Sighting) -> Candidate | None:
         """Something that was looked at before and stood there: it goes on where it was, and is not looked at anew."""
@@ -221,7 +244,7 @@ class EvidenceDetect(Stage):
 
     def _tidy(self, now: _Now, now_ns: int) -> bool:
         """Put away what was not seen for long, sooner what was refused. True when one that was told goes."""
-        kept = [c for c in now.bank if now_ns - c.seen_ns < self._kept_ns(c)]
+        kept = without_twins(c for c in now.bank if now_ns - c.seen_ns < self._kept_ns(c))
         for c in now.bank:
             if now_ns - c.seen_ns >= self._kept_ns(c) and not c.told:
                 self._remember(now, c)

@@ -66,6 +66,8 @@ class Evidence(BaseModel):
     among: float = 2.0  # something was refused beside it, lately: wires are long
     again: float = 4.0  # and more in the very place, while the drone says that it flies
 
+    joined: float = 2.0  # two things that by chance lie as the drone flew; shared by the looks since
+
     bird: float = -0.5
     calm: float = 8.0  # each second in which it would have shown a bird's speed or turn
     steady: float = 3.0  # each second of straight flight after the first
@@ -101,6 +103,9 @@ def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tu
     c.suspect = least
     odds = shift - math.log(sum([math.exp(shift - value) for value in over.values()]))
     words = [f"{c.hit_looks} looks, {c.hits} returns", *said]
+    if c.joined_at:
+        odds -= e.joined / (c.hit_looks - c.joined_at)
+        words.append("met again where the drone says it would be")
     if c.motion is not None:
         words.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
     if c.heard is not None and min(c.heard[:3]) < -3.0:

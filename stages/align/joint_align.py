@@ -1,8 +1,8 @@
 """How the drone is turned in the vehicle's axes, from the lines of both cameras together.
 
     pairs of pictures (pairing.py) -> yaw spectra and their matches (spectra.py) -> the match that continues the last
-    ones (reckoning.py, lock.py) -> all angles refined together (refine.py) -> which quarter turn (branches.py), by
-    displacements told by LiDAR and by odometry (windows.py)
+    ones (reckoning.py, lock.py) -> all angles refined together (refine.py) -> which quarter turn (yaw_branches), by
+    displacements told by LiDAR and by odometry
 
 A rotation is given for each picture of the drone's, or the reason why there is none. It is RESOLVED when one branch has
 `resolve_probability`; what the four lack to 1 is that none of them is right. Nothing but motion, or motion and a prior,
@@ -28,13 +28,11 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
-from stages.align.branches import NONE, BranchBank, BranchSettings, Heading, HeadingBank
 from stages.align.lock import YawLock
 from stages.align.pairing import Pair, Pairing
 from stages.align.reckoning import Reckoned, Reckoning
 from stages.align.refine import Refined, Tolerances, refine, street_directions
 from stages.align.spectra import level_lines, quarter_difference, spectrum
-from stages.align.windows import Windows
 from stages.geometry import Array64
 from stages.messages import (
     BranchState,
@@ -48,6 +46,9 @@ from stages.messages import (
     VanishingDirections,
     VehicleMotion,
 )
+from stages.yaw_branches.bank import NONE, BranchBank, BranchSettings
+from stages.yaw_branches.heading_bank import Heading, HeadingBank
+from stages.yaw_branches.windows import Windows
 
 SILENCE_SHARE = 1e-4  # chance that the autopilot's heading jumped while it was not heard
 NONSENSE = 0.99  # that none of the branches is right, from which all is begun anew

@@ -11,7 +11,7 @@ further matches. The first one is taken from the maps, which know more streets t
     nearly all lines of both cameras match and no other match comes near     (streets at right angles), or
     most lines match, along two directions or more, and no other comes near  (streets at other angles)
 
-as one direction alone could be any of the streets. Where the drone's motion has told its heading (yaw_branches), the
+as one direction alone could be any of the streets. Where the drone's motion has told its heading (by_motion.py), the
 match there is taken though others compete, and one that motion denies is let go. A match elsewhere that fits the maps
 better for long is taken over, and the jump is told.
 

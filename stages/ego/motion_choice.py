@@ -24,9 +24,9 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
-from stages.ego.step import adjoint
 from stages.geometry import Array64, transform
 from stages.messages import VehicleMotion
+from stages.rigid import adjoint
 from stages.rotation import nearest_rotation
 from stages.vehicle_onward import along_its_bend
 

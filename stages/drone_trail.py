@@ -14,6 +14,7 @@ import math
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -54,6 +55,9 @@ class _Place:
     xyz_own_m: Array64
     velocity_own_mps: Array64
     stretch: int  # places of one stretch are told apart by displacement, those of two are not
+
+
+_Told = TypeVar("_Told", _Node, _Place)
 
 
 class AutopilotTrail:
@@ -146,29 +150,25 @@ class AutopilotTrail:
 
     def R_own_drone(self, stamp_ns: int) -> Array64 | None:
         """Attitude at a time, a little beyond the newest with its rate; None: not known."""
-        nodes = self._nodes
-        if not nodes or not nodes[0].stamp_ns <= stamp_ns <= nodes[-1].stamp_ns + AHEAD_NS:
+        around = _around(self._nodes, stamp_ns)
+        if around is None:
             return None
-        at = bisect_right(nodes, stamp_ns, key=lambda node: node.stamp_ns)
-        before = nodes[at - 1]
+        before, after = around
         since_s = (stamp_ns - before.stamp_ns) * 1e-9
-        if at == len(nodes):
+        if after is None:
             return before.R_own_drone @ exp_rotation(since_s * before.rate_drone_radps)
-        after = nodes[at]
         share = since_s / ((after.stamp_ns - before.stamp_ns) * 1e-9)
         return before.R_own_drone @ exp_rotation(share * log_rotation(before.R_own_drone.T @ after.R_own_drone))
 
     def place(self, stamp_ns: int) -> tuple[Array64, int] | None:
         """Position (3,) [m] in frame own and its stretch; None: not known."""
-        places = self._places
-        if not places or not places[0].stamp_ns <= stamp_ns <= places[-1].stamp_ns + AHEAD_NS:
+        around = _around(self._places, stamp_ns)
+        if around is None:
             return None
-        at = bisect_right(places, stamp_ns, key=lambda place: place.stamp_ns)
-        before = places[at - 1]
+        before, after = around
         since_s = (stamp_ns - before.stamp_ns) * 1e-9
-        if at == len(places):
+        if after is None:
             return before.xyz_own_m + since_s * before.velocity_own_mps, before.stretch
-        after = places[at]
         if after.stretch != before.stretch:
             return None
         share = since_s / ((after.stamp_ns - before.stamp_ns) * 1e-9)
@@ -176,10 +176,8 @@ class AutopilotTrail:
 
     def velocity_own_mps(self, stamp_ns: int) -> Array64 | None:
         """Velocity (3,) in frame own, as said last before a time; None: not known."""
-        places = self._places
-        if not places or not places[0].stamp_ns <= stamp_ns <= places[-1].stamp_ns + AHEAD_NS:
-            return None
-        return places[bisect_right(places, stamp_ns, key=lambda place: place.stamp_ns) - 1].velocity_own_mps
+        around = _around(self._places, stamp_ns)
+        return None if around is None else around[0].velocity_own_mps
 
     @property
     def attitude_ns(self) -> int | None:
@@ -194,6 +192,14 @@ class AutopilotTrail:
     def _before(self, stamp_ns: int) -> _Node | None:
         at = bisect_right(self._nodes, stamp_ns, key=lambda node: node.stamp_ns)
         return self._nodes[at - 1] if at else None
+
+
+def _around(told: deque[_Told], stamp_ns: int) -> tuple[_Told, _Told | None] | None:
+    """The words before and after a time; beyond the newest, for AHEAD_NS, that one and None. None: not known."""
+    if not told or not told[0].stamp_ns <= stamp_ns <= told[-1].stamp_ns + AHEAD_NS:
+        return None
+    at = bisect_right(told, stamp_ns, key=lambda word: word.stamp_ns)
+    return told[at - 1], told[at] if at < len(told) else None
 
 
 class PictureTrail:

@@ -88,6 +88,11 @@ def rotation_z(angle_rad: float) -> Array64:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def heading_rad(R: Array64) -> float:
+    """Angle of a rotation (3, 3) that is nearly one about z; what is left of a tilt is shared by both axes."""
+    return math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
+
+
 def transform(rotation: Array64, translation_m: Array64) -> Array64:
     """T_a_b (4, 4) from R_a_b (3, 3) and the origin of b in a (3,)."""
     T = np.eye(4)

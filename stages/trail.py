@@ -16,11 +16,12 @@ import numpy as np
 from stages.compiled import compiled
 from stages.geometry import Array64
 from stages.messages import VehicleMotion
-from stages.rotation import nearly_rotation
+from stages.rotation import exp_rotation, log_rotation, nearly_rotation
+from stages.vehicle_onward import TRAIL_S, USUAL
 
 KEPT = 512
 STEP_NS = 50_000_000  # over which a velocity is taken
-FURTHEST_NS = 300_000_000  # beyond the newest pose this much is extrapolated, no more
+FURTHEST_NS = round(1e9 * TRAIL_S)  # beyond the newest pose
 
 
 class VehicleTrail:
@@ -64,6 +65,34 @@ class VehicleTrail:
     def velocity_mps(self, stamp_ns: int) -> Array64:
         """The vehicle's own velocity (3,) in the local frame."""
         return (self.at(stamp_ns + STEP_NS)[1] - self.at(stamp_ns)[1]) / (STEP_NS * 1e-9)
+
+    def turn_rad(self, stamp_ns: int) -> Array64:
+        """How the vehicle turns (3,) in STEP_NS, its own axes."""
+        return log_rotation(self.at(stamp_ns)[0].T @ self.at(stamp_ns + STEP_NS)[0])
+
+    def straight_on(self, stamp_ns: int) -> tuple[Array64, Array64]:
+        """R and t where the newest pose's speed and turn lead, however long that is ago: they end only in `at`."""
+        newest_ns = self._poses[-1][0]
+        dt = (stamp_ns - newest_ns) * 1e-9
+        R, t = self.at(newest_ns)
+        turn = dt / (1e-9 * STEP_NS) * self.turn_rad(newest_ns)
+        return R @ exp_rotation(turn), t + dt * self.velocity_mps(newest_ns)
+
+    def unsure(self, stamp_ns: int) -> tuple[float, float]:
+        """One sigma of the place [m] and of the yaw [rad] that `at` tells beyond the newest pose, by what is not told.
+
+        The vehicle may have changed as USUAL says, and all its way from where the trail ends.
+        """
+        if not self._poses or stamp_ns <= self._poses[-1][0]:
+            return 0.0, 0.0
+        newest_ns = self._poses[-1][0]
+        dt = (stamp_ns - newest_ns) * 1e-9
+        place_m, yaw_rad = USUAL.place_m(dt), USUAL.turn_rad(dt)
+        beyond_s = dt - 1e-9 * FURTHEST_NS
+        if beyond_s > 0.0:
+            place_m += beyond_s * float(np.linalg.norm(self.velocity_mps(newest_ns)))
+            yaw_rad += beyond_s * float(np.linalg.norm(self.turn_rad(newest_ns))) / (1e-9 * STEP_NS)
+        return place_m, yaw_rad
 
     def to_vehicle(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
         """Place (3,) and velocity (3,) as the vehicle sees them at a time, its own driving and turning in them."""

@@ -1,6 +1,6 @@
 """The rotations that a run told of both cameras' pictures, as its table holds them.
 
-Source: stages/messages.py (RelativeRotation); written by links/results.py.
+Source: stages/messages/cameras.py; written by links/results.py.
 """
 
 from __future__ import annotations

@@ -19,11 +19,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stages.geometry import rotation_from_quaternion_xyzw, rotation_from_rpy_deg
-
-Array64 = NDArray[np.float64]
+from stages.geometry import Array64, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
 
 F = np.diag([1.0, -1.0, -1.0])
 UPPER = np.triu_indices(6)  # MAVLink's 21 numbers

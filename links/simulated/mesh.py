@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flow.link import LinkError
 from stages.compiled import compiled
+from stages.geometry import Array64
 
 try:
     from embreex.mesh_construction import TriangleMesh
@@ -21,7 +22,6 @@ except ImportError as error:
     raise LinkError("the simulator needs embreex: pip install -e '.[simulate]'") from error
 
 Array32 = NDArray[np.float32]
-Array64 = NDArray[np.float64]
 
 GLOSS_EXPONENT = 60  # a glossy lobe a few degrees wide around normal incidence
 

@@ -13,10 +13,9 @@ import math
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-Array64 = NDArray[np.float64]
+from stages.geometry import Array64
 
 LIDAR_NM = 903.0
 NEPER_PER_DB = math.log(10) / 10

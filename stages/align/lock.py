@@ -11,7 +11,7 @@ further matches. The first one is taken from the maps, which know more streets t
     nearly all lines of both cameras match and no other match comes near     (streets at right angles), or
     most lines match, along two directions or more, and no other comes near  (streets at other angles)
 
-as one direction alone could be any of the streets. Where the drone's motion has told its heading (branches.py), the
+as one direction alone could be any of the streets. Where the drone's motion has told its heading (by_motion.py), the
 match there is taken though others compete, and one that motion denies is let go. A match elsewhere that fits the maps
 better for long is taken over, and the jump is told.
 
@@ -25,10 +25,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stages.align.branches import Heading
 from stages.align.reckoning import Reckoned
 from stages.align.spectra import BIN_RAD, BINS, Peak, overlap, peaks, quarter_difference, shared_directions
 from stages.geometry import Array64
+from stages.yaw_branches.heading_bank import Heading
 
 APART_RAD = math.radians(4.0)  # matches nearer to each other are one
 NEARLY_ALL, MOST = 0.8, 0.75  # of the lines

@@ -18,7 +18,7 @@ import numpy as np
 from stages.align.refine import Refined
 from stages.align.spectra import LevelLines
 from stages.drone_trail import AutopilotTrail, PictureTrail, turn_between
-from stages.geometry import Array64, rotation_z
+from stages.geometry import Array64, heading_rad, rotation_z
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
 from stages.rotation import log_rotation
 from stages.trail import VehicleTrail
@@ -40,11 +40,6 @@ class Reckoned:
     def yaw_rad(self) -> float:
         """Of the drone's level axes in the vehicle's, less the offset."""
         return self.drone_rad - self.vehicle_rad
-
-
-def _heading_rad(R_start_level: Array64) -> float:
-    """Of axes that are nearly level; what is left of a tilt is shared by both axes."""
-    return math.atan2(R_start_level[1, 0] - R_start_level[0, 1], R_start_level[0, 0] + R_start_level[1, 1])
 
 
 class Reckoning:
@@ -101,8 +96,8 @@ class Reckoning:
         self._stamp_ns = drone_ns
         return Reckoned(
             drone_ns,
-            _heading_rad(R_start_vehicle @ vehicle.R_carrier_level),
-            _heading_rad(self._R_start_drone @ drone.R_carrier_level),
+            heading_rad(R_start_vehicle @ vehicle.R_carrier_level),
+            heading_rad(self._R_start_drone @ drone.R_carrier_level),
             variance,
         )
 

@@ -8,8 +8,8 @@ source is laid on the old one's end:
 
     T_start_vehicle = T_start_source T_source_vehicle,   T_start_source = T_start_vehicle(t) T_source_vehicle(t)^-1
 
-with t the new source's first stamp, to where the last motion is carried on. The start frame stays that of the first
-source heard. Consumers take T_start_vehicle for smooth: they never see a jump, but drift.
+with t the new source's first stamp, to where the vehicle went on (vehicle_onward.py). The start frame stays that of the
+first source heard. Consumers take T_start_vehicle for smooth: they never see a jump, but drift.
 
 Source: ours; P V.B for the camera's motion.
 """
@@ -24,17 +24,13 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
-from stages.ego.step import adjoint
 from stages.geometry import Array64, transform
 from stages.messages import VehicleMotion
-from stages.rotation import exp_rotation, log_rotation, nearest_rotation
+from stages.rigid import adjoint
+from stages.rotation import nearest_rotation
+from stages.vehicle_onward import along_its_bend
 
 SILENT_S = 0.25  # so long no odometry: it is gone
-ACCELERATION_MPS2 = 3.0  # one sigma, while nobody tells
-TURN_RADPS2 = 0.5  # one sigma of how the turn rate changes
-LEAST_SPAN_NS = 100_000_000  # of the last motion, over which its speed is taken
-MOST_SPAN_NS = 1_000_000_000
-CARRIED_S = 1.0  # so long the last motion is carried on, no longer
 
 
 class Teller(Enum):
@@ -90,7 +86,7 @@ class VehicleMotionChoice(Stage):
         """Lay the new source on the end of the old one."""
         if not self._told:
             return
-        at = carried_on(list(self._told), motion.stamp_ns)
+        at = along_its_bend(list(self._told), motion.stamp_ns)
         there = transform(motion.R_start_vehicle, motion.xyz_start_m)
         self._T_start_source = transform(at.R_start_vehicle, at.xyz_start_m) @ np.linalg.inv(there)
         self._joint = motion, at.covariance
@@ -109,27 +105,3 @@ class VehicleMotionChoice(Stage):
         A = adjoint(np.ascontiguousarray(T_now_first[:3, :3]), T_now_first[:3, 3])
         worse, axes = np.linalg.eigh(motion.covariance - A @ first.covariance @ A.T)
         return A @ P @ A.T + (axes * np.maximum(worse, 0.0)) @ axes.T
-
-
-def carried_on(told: list[VehicleMotion], stamp_ns: int) -> VehicleMotion:
-    """Where the vehicle is some time after the last word (`told`, oldest first): on with its last motion, less sure.
-
-    Its speed is that over the last tenth of a second or more; after CARRIED_S it is taken to stand where it is then,
-    and what it is unsure by grows on.
-    """
-    last = told[-1]
-    unheard_s = (stamp_ns - last.stamp_ns) * 1e-9
-    spans_ns = ((last.stamp_ns - m.stamp_ns, m) for m in reversed(told))
-    span_ns, before = next(((span, m) for span, m in spans_ns if span >= LEAST_SPAN_NS), (0, last))
-    share = min(unheard_s, CARRIED_S) / (span_ns * 1e-9) if 0 < span_ns <= MOST_SPAN_NS else 0.0
-    R = last.R_start_vehicle
-    turn = log_rotation(np.ascontiguousarray(before.R_start_vehicle.T @ R))
-    way_m = exp_rotation(-0.5 * turn) @ before.R_start_vehicle.T @ (last.xyz_start_m - before.xyz_start_m)  # own axes
-    place_m, turn_rad = 0.5 * ACCELERATION_MPS2 * unheard_s**2, 0.5 * TURN_RADPS2 * unheard_s**2
-    unsure = np.diag([turn_rad**2] * 3 + [place_m**2] * 3)
-    return VehicleMotion(
-        stamp_ns=stamp_ns,
-        xyz_start_m=last.xyz_start_m + R @ exp_rotation(0.5 * share * turn) @ (share * way_m),
-        R_start_vehicle=R @ exp_rotation(share * turn),
-        covariance=None if last.covariance is None else last.covariance + unsure,
-    )

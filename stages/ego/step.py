@@ -1,6 +1,6 @@
-"""One step of the vehicle's camera and how its uncertainty adds up. Covariances: rotation first, tangent at the body.
+"""One step of the vehicle's camera and how its uncertainty adds up. Covariances: stages/rigid.py.
 
-Source: Sola, Deray, Atchuthan, A micro Lie theory (2018), adjoint of SE(3).
+Source: ours.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from stages.ego.scale import Length
 from stages.geometry import Array64, transform
-from stages.rotation import hat
+from stages.rigid import adjoint, carried_covariance
 
 MANY = 12  # features
 
@@ -44,11 +44,10 @@ class Step:
 
 
 def after(at: Pose6, step: Step) -> Pose6:
-    """T T_step and its covariance: Ad(T_step^-1) P Ad(T_step^-1)^T + Q."""
-    A = adjoint(step.R.T, -step.R.T @ step.t)
+    """T T_step and its covariance."""
     Q = np.zeros((6, 6))
     Q[:3, :3], Q[3:, 3:] = step.turn_rad2, step.R.T @ step.spread_m2 @ step.R
-    return Pose6(at.R @ step.R, at.p + at.R @ step.t, A @ at.covariance @ A.T + Q)
+    return Pose6(at.R @ step.R, at.p + at.R @ step.t, carried_covariance(at.covariance, step.R, step.t, Q))
 
 
 def believable(found: Length, expected: Length) -> bool:
@@ -56,16 +55,9 @@ def believable(found: Length, expected: Length) -> bool:
     return found.features >= MANY or abs(found.m - expected.m) < 3.0 * math.hypot(found.sigma_m, expected.sigma_m)
 
 
-def carried(at: Pose6, T_carrier_camera: Array64) -> Pose6:
+def carrier_pose(at: Pose6, T_carrier_camera: Array64) -> Pose6:
     """T_start_carrier = M T_start_camera M^-1 with M = T_carrier_camera, and its covariance Ad(M) P Ad(M)^T."""
     M = T_carrier_camera
     T = M @ transform(at.R, at.p) @ np.linalg.inv(M)
     A = adjoint(M[:3, :3], M[:3, 3])
     return Pose6(T[:3, :3].copy(), T[:3, 3].copy(), A @ at.covariance @ A.T)
-
-
-def adjoint(R: Array64, t: Array64) -> Array64:
-    """Ad (6, 6) of (R, t), rotation first: [[R, 0], [[t]x R, R]]."""
-    A = np.zeros((6, 6))
-    A[:3, :3], A[3:, 3:], A[3:, :3] = R, R, hat(np.ascontiguousarray(t)) @ R
-    return A

@@ -29,7 +29,7 @@ from flow.stage import Stage
 from stages.ego.lidar_depth import Depths, RayDepths
 from stages.ego.motion_choice import SILENT_S
 from stages.ego.scale import Length, length_of, parallax_ratio
-from stages.ego.step import Pose6, Step, after, believable, carried
+from stages.ego.step import Pose6, Step, after, believable, carrier_pose
 from stages.ego.window import KeyPicture, adjusted
 from stages.geometry import Array64, Pose
 from stages.lens import Lens
@@ -38,8 +38,8 @@ from stages.pictures.features import FeatureSettings, Tracks
 from stages.pictures.motion_link import Link, LinkSettings, MotionLinks, followed
 from stages.pictures.two_view import backwards
 from stages.rotation import exp_rotation, log_rotation
+from stages.vehicle_onward import UNTOLD
 
-ACCELERATION_MPS2 = 3.0  # one sigma: how far the last speed can be trusted when nothing else gives a length
 TURN_RADPS = 0.3  # one sigma of the turn rate, unseen
 STILL_M = 0.003  # one sigma of a place held because no motion is seen
 LEAST_LENGTHS = 3  # the first ones come from points placed by a speed not yet known
@@ -202,7 +202,7 @@ class VehicleEgo(Stage):
         rho = parallax_ratio(link.ray_key, link.ray_now, link.motion.R_later_earlier, t_hat, link.motion.sigma_rad)
         found = length_of(rho[0][inlier], rho[1][inlier], known.inverse_m[rows][inlier], known.sigma[rows][inlier])
         m = now.speed_mps * span_s
-        expected = Length(m, 0.5 * ACCELERATION_MPS2 * span_s**2 + 0.1 * m, 0)
+        expected = Length(m, UNTOLD.place_m(span_s) + 0.1 * m, 0)
         if found is None or (now.metric and not believable(found, expected)):
             found = expected
         else:
@@ -224,7 +224,7 @@ class VehicleEgo(Stage):
         gap_s = (stamp_ns - now.poses[-1][0]) * 1e-9
         (t0, _, p0), (t1, R, p1) = now.poses[0], now.poses[-1]
         ahead = (p1 - p0) / max((t1 - t0) * 1e-9, 1e-3) * gap_s if len(now.poses) > 1 else np.zeros(3)
-        place = (0.5 * ACCELERATION_MPS2 * gap_s**2 + 0.3 * float(np.linalg.norm(ahead))) ** 2
+        place = (UNTOLD.place_m(gap_s) + 0.3 * float(np.linalg.norm(ahead))) ** 2
         turn = (TURN_RADPS * gap_s) ** 2
         return Pose6(R, p1 + ahead, now.key.at.covariance + np.diag([turn] * 3 + [place] * 3))
 
@@ -280,7 +280,7 @@ class VehicleEgo(Stage):
         return tracks, Depths(1.0 / away, relative / away)
 
     def _told(self, stamp_ns: int, at: Pose6) -> VehicleMotion:
-        vehicle = carried(at, self._mount)
+        vehicle = carrier_pose(at, self._mount)
         return VehicleMotion(
             stamp_ns=stamp_ns, xyz_start_m=vehicle.p, R_start_vehicle=vehicle.R, covariance=vehicle.covariance
         )

@@ -16,9 +16,9 @@ from stages.fuse.back_end import BackEnd
 from stages.fuse.correlated import Worth, inflation
 from stages.fuse.positions import GATE, Positions
 from stages.fuse.rejected import Rejected
-from stages.fuse.rigid import carried_covariance, distance2, position_covariance
 from stages.fuse.settings import FuseErrors
 from stages.geometry import Array64
+from stages.rigid import carried_covariance, distance2, position_covariance
 from stages.rotation import log_rotation
 
 PERIOD_NS = 100_000_000  # of the chain's poses

@@ -18,8 +18,8 @@ import numpy as np
 
 from stages.fuse.back_end import HUBER
 from stages.fuse.carried import Step
-from stages.fuse.rigid import carried_covariance
 from stages.geometry import Array64
+from stages.rigid import carried_covariance
 from stages.rotation import exp_rotation, hat, log_rotation
 
 

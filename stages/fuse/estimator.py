@@ -17,16 +17,16 @@ import numpy as np
 
 from stages.fuse.back_end import BackEnd
 from stages.fuse.chain import PERIOD_NS, Chain
-from stages.fuse.heading import apart_rad
 from stages.fuse.motion_yaw import DOUBT, Point
 from stages.fuse.motions import WAIT_NS, Motions
-from stages.fuse.north import North, heading_rad
+from stages.fuse.north import North
 from stages.fuse.positions import Positions
-from stages.fuse.rigid import position_covariance
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.witness import Witness
-from stages.geometry import Array64, rotation_z
+from stages.fuse.yaw import apart_rad
+from stages.geometry import Array64, heading_rad, rotation_z
 from stages.messages import DroneAttitude, DroneFix, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
+from stages.rigid import position_covariance
 
 LEAST_MPS = 0.5  # slower, a camera's direction of flight says nothing
 BRANCH_RAD, BRANCHES = math.radians(30.0), 3  # so many rotations in a row so far off are another branch

@@ -31,7 +31,6 @@ from stages.fuse.ekf import Ekf
 from stages.fuse.estimator import Estimator
 from stages.fuse.following import Following
 from stages.fuse.intake import Intake
-from stages.fuse.rigid import position_covariance
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
 from stages.fuse.told import Known, Verdict, lost, pose
@@ -51,6 +50,7 @@ from stages.messages import (
     TrackState,
     VehicleMotion,
 )
+from stages.rigid import position_covariance
 
 GRID_NS = 20_000_000
 AMBIGUOUS_NS = 1_000_000_000  # a rotation up to quarter turns counts for so long

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 
-from stages.fuse.motion_yaw import Yaw
+from stages.fuse.yaw import Yaw, apart_rad
 
 SLACK_RAD = math.radians(5.0)
 CLEAR, ALIKE = 4.0, 3.0  # sigmas
@@ -24,17 +24,12 @@ SETTLE_NS = 2_000_000_000
 FORGET_NS = 30_000_000_000
 
 
-def apart_rad(a_rad: float, b_rad: float) -> float:
-    """Angle between two yaws, 0 to pi."""
-    return abs(math.remainder(a_rad - b_rad, 2 * math.pi))
-
-
 class Heading:
     """Remembers what both said of the yaw of R_start_own, and judges."""
 
     def __init__(self) -> None:
         self._motion: Yaw | None = None
-        self._streets: tuple[int, float, float] | None = None  # time, yaw, sigma
+        self._streets: Yaw | None = None
         self._resolved_ns: int | None = None
         self._switches: int | None = None
         self._switched_ns: int | None = None
@@ -51,7 +46,7 @@ class Heading:
             self._switched_ns = stamp_ns
         self._switches, self._resolved_ns = switches, stamp_ns
         if yaw_rad is not None:
-            self._streets = (stamp_ns, yaw_rad, sigma_rad)
+            self._streets = Yaw(stamp_ns, yaw_rad, sigma_rad**2)
             self._compare(stamp_ns)
         if self.contradiction:
             return False
@@ -90,9 +85,9 @@ class Heading:
         return m if m is not None and abs(stamp_ns - m.stamp_ns) <= MOTION_NS else None
 
     def _compare(self, stamp_ns: int) -> None:
-        if self._streets is None or stamp_ns - self._streets[0] > STREETS_NS:
+        if self._streets is None or stamp_ns - self._streets.stamp_ns > STREETS_NS:
             return
-        _, yaw_rad, sigma_rad = self._streets
+        yaw_rad, sigma_rad = self._streets.yaw_rad, self._streets.sigma_rad
         if self.denies(stamp_ns, yaw_rad, sigma_rad):
             assert self._motion is not None
             off = math.degrees(apart_rad(self._motion.yaw_rad, yaw_rad))

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.fuse.settings import FuseErrors
+from stages.fuse.yaw import Yaw
 from stages.geometry import Array64
 
 APART_NS = 400_000_000  # of the fixes used: their errors last that long
@@ -51,15 +52,6 @@ class Point:
     variance_m2: float  # level, one axis
     xyz_own_m: Array64
     stretch: int
-
-
-@dataclass(frozen=True)
-class Yaw:
-    """R_start_own = Rz(yaw)."""
-
-    stamp_ns: int
-    yaw_rad: float
-    sigma_rad: float
 
 
 @dataclass(frozen=True)
@@ -177,7 +169,7 @@ def weigh(points: tuple[Point, ...], errors: FuseErrors) -> Weighed:
     if nearest < 1 - DOUBT or odds > DOUBT:
         return Weighed(f"several headings fit its motion: P {nearest:.3f}", lean)
     told = f"heading by motion {math.degrees(peak):.0f} deg, sigma {math.degrees(sigma):.1f}, {moved_m:.1f} m moved"
-    return Weighed(told, lean, Yaw(points[-1].stamp_ns, peak, sigma))
+    return Weighed(told, lean, Yaw(points[-1].stamp_ns, peak, sigma**2))
 
 
 def bank(a: Array64, precision: float) -> tuple[float, float, float]:

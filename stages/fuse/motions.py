@@ -2,9 +2,7 @@
 
 A pose of the vehicle's that is not where the ones before lead, or the first after a silence, is left out; when three in
 a row lie on one smooth way, that is the way, in a start frame that may have jumped.
-Beyond its newest pose the vehicle goes on as it went, and may have braked and turned meanwhile:
-
-    sigma of its place  a dt^2 / 2,  of its yaw  alpha dt^2 / 2,  and all its way from where the trail ends
+What is beyond the newest pose: trail.py, vehicle_onward.py.
 
 Source: ours.
 """
@@ -19,16 +17,15 @@ from stages.fuse.carried import Carrier
 from stages.fuse.settings import FuseErrors
 from stages.geometry import Array64
 from stages.messages import VehicleMotion
-from stages.rotation import exp_rotation, log_rotation
-from stages.trail import FURTHEST_NS, STEP_NS, VehicleTrail
+from stages.rotation import log_rotation
+from stages.trail import VehicleTrail
+from stages.vehicle_onward import HARD
 
 WAIT_NS = 350_000_000  # for an odometry that is late
 SOON_NS, VEHICLE_SOON_NS = 60_000_000, 200_000_000  # so far the drone's and the vehicle's are extrapolated instead
 STILL_NS = 700_000_000  # how the vehicle moves is known so long after its word: by pictures it comes 5 times a second
 OFF_M, OFF_RAD = 0.25, 0.1  # a pose so far off is false, or the start frame has jumped
-HARD_MPS2, HARD_RADPS2 = 6.0, 1.5  # no vehicle on the road does much more: full braking, a swerve
 AGREE = 3
-USUAL_MPS2, USUAL_RADPS2 = 2.0, 0.2  # one sigma
 
 
 class Motions:
@@ -65,13 +62,10 @@ class Motions:
         """Whether a pose is where the ones before lead."""
         assert self._vehicle_ns is not None
         dt = (motion.stamp_ns - self._vehicle_ns) * 1e-9
-        R_last, last_m = self.vehicle.at(self._vehicle_ns)
-        turn = log_rotation(R_last.T @ self.vehicle.at(self._vehicle_ns + STEP_NS)[0])
-        xyz_m = last_m + dt * self.vehicle.velocity_mps(self._vehicle_ns)
-        R = R_last @ exp_rotation(dt / (1e-9 * STEP_NS) * turn)
+        R, xyz_m = self.vehicle.straight_on(motion.stamp_ns)
         off_m = float(np.linalg.norm(motion.xyz_start_m - xyz_m))
         off_rad = float(np.linalg.norm(log_rotation(R.T @ motion.R_start_vehicle)))
-        return off_m <= OFF_M + 0.5 * HARD_MPS2 * dt**2 and off_rad <= OFF_RAD + 0.5 * HARD_RADPS2 * dt**2
+        return off_m <= OFF_M + HARD.place_m(dt) and off_rad <= OFF_RAD + HARD.turn_rad(dt)
 
     def vehicle_ahead_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> tuple[Array64, float, Array64]:
         """What the vehicle may have moved since its newest word, in its own axes.
@@ -80,16 +74,7 @@ class Motions:
         moves with the yaw (3,).
         """
         lever = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0])
-        if self._vehicle_ns is None or stamp_ns <= self._vehicle_ns or not self.still(stamp_ns):
-            return np.zeros((3, 3)), 0.0, lever
-        dt = (stamp_ns - self._vehicle_ns) * 1e-9
-        shift_m, yaw_rad = 0.5 * USUAL_MPS2 * dt**2, 0.5 * USUAL_RADPS2 * dt**2
-        beyond_s = dt - 1e-9 * FURTHEST_NS
-        if beyond_s > 0.0:
-            at_ns = self._vehicle_ns
-            shift_m += beyond_s * float(np.linalg.norm(self.vehicle.velocity_mps(at_ns)))
-            turn = self.vehicle.at(at_ns)[0].T @ self.vehicle.at(at_ns + STEP_NS)[0]
-            yaw_rad += beyond_s * float(np.linalg.norm(log_rotation(turn))) / (1e-9 * STEP_NS)
+        shift_m, yaw_rad = self.vehicle.unsure(stamp_ns) if self.still(stamp_ns) else (0.0, 0.0)
         return shift_m**2 * np.eye(3) + yaw_rad**2 * np.outer(lever, lever), yaw_rad**2, lever
 
     def still(self, stamp_ns: int) -> bool:
@@ -125,5 +110,5 @@ def _go_on(poses: tuple[VehicleMotion, ...]) -> bool:
     share, longer_s = second_s / first_s, max(first_s, second_s)
     off_m = c.xyz_start_m - b.xyz_start_m - share * (b.xyz_start_m - a.xyz_start_m)
     turns = log_rotation(a.R_start_vehicle.T @ b.R_start_vehicle), log_rotation(b.R_start_vehicle.T @ c.R_start_vehicle)
-    near = float(np.linalg.norm(off_m)) <= OFF_M + HARD_MPS2 * longer_s**2
-    return near and float(np.linalg.norm(turns[1] - share * turns[0])) <= OFF_RAD + HARD_RADPS2 * longer_s**2
+    near = float(np.linalg.norm(off_m)) <= OFF_M + 2.0 * HARD.place_m(longer_s)
+    return near and float(np.linalg.norm(turns[1] - share * turns[0])) <= OFF_RAD + 2.0 * HARD.turn_rad(longer_s)

@@ -1,15 +1,14 @@
-"""How the autopilot's own frame is turned in the start frame, and how long that may be believed.
+"""How the autopilot's own frame is turned in the start frame (yaw.py), and how long that may be believed.
 
-R_start_own = Rz(yaw). It is remembered while nothing measures it, over gaps of the LiDAR's too, until both odometries'
+It is remembered while nothing measures it, over gaps of the LiDAR's too, until both odometries'
 headings have drifted too far, the autopilot may have turned its north unheard, or somebody says otherwise (heading.py).
 
-Source: ours; sizes of the drift: links' and autopilots' usual degrees a minute.
+Source: ours.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,29 +16,14 @@ from stages.drone_trail import AutopilotTrail
 from stages.fuse.heading import Heading
 from stages.fuse.motion_yaw import MotionYaw, Point
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64
+from stages.fuse.yaw import Yaw
+from stages.geometry import Array64, heading_rad
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry
 from stages.rotation import log_rotation
 
 MOTION_DEG = 6.0  # a yaw by motion known worse is not told
 SILENCE_S, SILENCE_RAD = 3.0, math.radians(45.0)  # beyond, an autopilot may have turned its north unheard
 SILENT_RAD = math.radians(1.0)  # what a shorter silence costs
-DRIFT_RAD_PER_S = math.radians(2.0) / 60  # both odometries' headings, while nothing measures them
-WALK_RAD2_PER_S = math.radians(0.1) ** 2
-
-
-@dataclass(frozen=True)
-class OwnYaw:
-    """Yaw of R_start_own at a time."""
-
-    stamp_ns: int
-    yaw_rad: float
-    variance_rad2: float
-
-    def sigma_at(self, stamp_ns: int) -> float:
-        """[rad], with what has drifted since."""
-        dt = abs(stamp_ns - self.stamp_ns) * 1e-9
-        return math.sqrt(self.variance_rad2 + (DRIFT_RAD_PER_S * dt) ** 2 + WALK_RAD2_PER_S * dt)
 
 
 class North:
@@ -50,7 +34,7 @@ class North:
         self._sigma_rad = sigma_rad
         self.by_motion = MotionYaw(errors, min(math.radians(MOTION_DEG), sigma_rad))
         self.heading = Heading()
-        self.yaw: OwnYaw | None = None
+        self.yaw: Yaw | None = None
 
     def hear(self, trail: AutopilotTrail, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """The autopilot's word goes to its trail; a silence that may hide a turn of its north costs."""
@@ -68,8 +52,7 @@ class North:
         if silent_s > SILENCE_S or unexplained > SILENCE_RAD:
             self.forget()
         elif self.yaw is not None:
-            more = unexplained**2 + SILENT_RAD**2
-            self.yaw = OwnYaw(self.yaw.stamp_ns, self.yaw.yaw_rad, self.yaw.variance_rad2 + more)
+            self.yaw = self.yaw.less_sure(unexplained**2 + SILENT_RAD**2)
 
     def watch(self, point: Point) -> bool:
         """A fix beside the autopilot's position; False: the drone's motion denies the yaw believed so far."""
@@ -83,7 +66,7 @@ class North:
             self.yaw = None
             return False
         if told is not None and not self.heading.contradiction:
-            self.yaw = OwnYaw(told.stamp_ns, told.yaw_rad, told.sigma_rad**2)
+            self.yaw = told
         return True
 
     def backs(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
@@ -95,7 +78,7 @@ class North:
         """Whether the drone's motion has told the yaw believed."""
         return self.yaw is not None and self.heading.agrees(stamp_ns, self.yaw.yaw_rad, self.yaw.sigma_at(stamp_ns))
 
-    def known(self, stamp_ns: int) -> OwnYaw | None:
+    def known(self, stamp_ns: int) -> Yaw | None:
         """The yaw, if it is of use and nobody objects."""
         if self.yaw is None or self.heading.contradiction or self.yaw.sigma_at(stamp_ns) > self._sigma_rad:
             return None
@@ -104,15 +87,10 @@ class North:
     def remember(self, stamp_ns: int, R_start_own: Array64, variance_rad2: float) -> None:
         """What the pose tells of it, unless it is known better."""
         if self.yaw is None or math.sqrt(variance_rad2) <= self.yaw.sigma_at(stamp_ns):
-            self.yaw = OwnYaw(stamp_ns, heading_rad(R_start_own), variance_rad2)
+            self.yaw = Yaw(stamp_ns, heading_rad(R_start_own), variance_rad2)
 
     def forget(self) -> None:
         """Nothing said so far counts any more."""
         self.yaw = None
         self.by_motion.restart()
         self.heading.forget_motion()
-
-
-def heading_rad(R: Array64) -> float:
-    """Yaw of a rotation that is nearly one about z."""
-    return math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])

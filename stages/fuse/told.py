@@ -3,7 +3,7 @@
 A covariance's translation is in the drone's axes where the rotation is known, else in the frame's own; then its
 rotation has infinite variance.
 
-Source: ours; stages/messages.py (RelativePose).
+Source: ours; stages/messages/pose.py.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ turns them. They weigh the four branches as `align` does, but from nothing: no p
 there, and all is begun anew when the rotation told jumps. It is a second look at much the same evidence, so its odds
 are a condition beside align's and never multiplied with them.
 
-Source: ours; stages/align/windows.py, branches.py; DESIGN, Yaw branch.
+Source: ours; stages/yaw_branches; DESIGN, Yaw branch.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import math
 
 import numpy as np
 
-from stages.align.branches import BranchBank, BranchSettings
-from stages.align.windows import Windows
 from stages.drone_trail import turn_between
 from stages.fuse.motions import Motions
 from stages.geometry import Array64
 from stages.messages import DroneFix, DroneMotion
 from stages.rotation import log_rotation
+from stages.yaw_branches.bank import BranchBank, BranchSettings
+from stages.yaw_branches.windows import Windows
 
 BEARING_RAD = 0.05  # of the lever between the drone's camera and its middle, and of the streets
 JUMP_RAD = math.radians(30.0)  # a rotation so far from the one before, carried on, is of another branch

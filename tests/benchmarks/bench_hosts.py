@@ -17,8 +17,12 @@ from flow.codec import decode, encode
 from stages.messages import DroneFix, Image, SweptPulses
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "zenoh"))
+from socket import SOCK_STREAM
+
 from certificates import make_all, need_openssl
-from hosts_running import HostProcess, free_port, write_config, write_hosts
+from hosts_running import HostProcess, write_config, write_hosts
+
+from tests.links.ports import free_port
 
 PULSES = 384
 MESSAGES = {
@@ -79,7 +83,7 @@ def test_what_a_hop_adds(tmp_path, capsys, size_px):
     need_openssl()
     make_all(tmp_path)
     config = write_config(tmp_path, size_px=size_px)
-    hosts = write_hosts(tmp_path, f"127.0.0.1:{free_port()}", place("vehicle"))
+    hosts = write_hosts(tmp_path, f"127.0.0.1:{free_port(SOCK_STREAM)}", place("vehicle"))
     with HostProcess(config, Path("-"), "all") as one:
         one.wait_for("picture", 5)
         one.lines.clear()
@@ -101,7 +105,7 @@ def test_what_goes_through(tmp_path, capsys):
     need_openssl()
     make_all(tmp_path)
     config = write_config(tmp_path, rate_hz=200.0, every=1, size_px=1440)
-    hosts = write_hosts(tmp_path, f"127.0.0.1:{free_port()}", place("vehicle"))
+    hosts = write_hosts(tmp_path, f"127.0.0.1:{free_port(SOCK_STREAM)}", place("vehicle"))
     with HostProcess(config, hosts, "vehicle") as vehicle, HostProcess(config, hosts, "drone") as drone:
         vehicle.wait_for("picture", 5)
         vehicle.lines.clear()

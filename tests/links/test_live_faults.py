@@ -18,7 +18,6 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 from links.recording import RecordingReader
 from links.simulated.live_pictures import PictureServer
 from links.truth import TruthLog
+from tests.links.ports import free_ports
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
@@ -120,14 +120,6 @@ def positions(folder: Path) -> list[Told]:
     lines = [line.split() for line in poses.read_text().splitlines() if line[:1].isdigit()]
     whole = [line for line in lines if len(line) == 8 and line[0] in good]
     return [Told(float(line[0]), good[line[0]], tuple(map(float, line[1:]))) for line in whole]
-
-
-def free_ports(count: int) -> list[int]:
-    with ExitStack() as stack:
-        probes = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [probe.getsockname()[1] for probe in probes]
 
 
 @pytest.fixture

@@ -95,6 +95,25 @@ def test_beyond_the_newest_pose_it_drives_on_for_a_while_and_then_stands():
     np.testing.assert_allclose(made.at(START_NS + 100 * MS + 10 * FURTHEST_NS)[1], (furthest, 0, 0))
 
 
+def test_straight_on_it_drives_and_turns_without_an_end():
+    made = trail(*(motion(10 * k * MS, (0.1 * k, 0, 0), rotation_z(0.005 * k)) for k in range(3)))  # 10 m/s, 0.5 rad/s
+    R, t = made.straight_on(START_NS + 20 * MS + 4 * FURTHEST_NS)
+    far_s = 0.02 + 4 * FURTHEST_NS / 1e9
+    np.testing.assert_allclose(t, (10 * far_s, 0, 0), atol=1e-9)
+    np.testing.assert_allclose(R, rotation_z(0.5 * far_s), atol=1e-3)
+
+
+def test_beyond_the_newest_pose_it_is_less_sure_by_braking_and_by_the_way_not_gone():
+    made = trail(*(motion(10 * k * MS, (0.1 * k, 0, 0), rotation_z(0.005 * k)) for k in range(3)))
+    newest_ns = START_NS + 20 * MS
+    assert trail().unsure(START_NS) == (0.0, 0.0)
+    assert made.unsure(newest_ns) == (0.0, 0.0)
+    assert made.unsure(newest_ns + 200 * MS) == pytest.approx((0.5 * 2.0 * 0.2**2, 0.5 * 0.2 * 0.2**2))
+    place_m, yaw_rad = made.unsure(newest_ns + FURTHEST_NS + 100 * MS)
+    assert place_m == pytest.approx(0.5 * 2.0 * 0.4**2 + 10 * 0.1)
+    assert yaw_rad == pytest.approx(0.5 * 0.2 * 0.4**2 + 0.5 * 0.1, rel=1e-3)
+
+
 def test_before_the_oldest_pose_it_stood_there():
     made = trail(motion(0, (1, 1, 1)), motion(100 * MS, (2, 1, 1)))
     np.testing.assert_allclose(made.at(START_NS - 50 * MS)[1], (1, 1, 1))

@@ -10,24 +10,19 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from flow.graph import load_graph
 from links.calibration.gather import checked_rig
-from links.cli.app import app
 from links.cli.files import read_rig
 from links.recording import RecordingReader, RecordingWriter
+from tests.links import command
 
 ROOT = Path(__file__).resolve().parents[3]
 STREET = ROOT / "recordings" / "street_sweep.mcap"
 
 
 def grd(*words: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == code, result.output
-    return " ".join(result.output.split())
+    return " ".join(command.grd(*words, code=code).split())
 
 
 @pytest.fixture(scope="module")

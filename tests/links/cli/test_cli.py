@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from links.cli.app import app
 from links.cli.files import read_rig
+from tests.links import command
 
 ROOT = Path(__file__).resolve().parents[3]
 STREET = ROOT / "recordings" / "street_sweep.mcap"
@@ -20,15 +19,7 @@ STREET = ROOT / "recordings" / "street_sweep.mcap"
 @pytest.fixture
 def grd(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-    def call(*words: object, code: int = 0) -> str:
-        result = CliRunner().invoke(app, [str(word) for word in words])
-        if result.exception and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        assert result.exit_code == code, result.output
-        return result.output
-
-    return call
+    return command.grd
 
 
 def without_viewer(folder: Path) -> Path:

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from flow.graph import load_graph
 from links.cli.app import app
+from tests.links.ports import free_port
 from tests.links.zenoh.certificates import make_all, need_openssl
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -112,7 +113,7 @@ def test_two_commands_run_one_graph_on_two_hosts(tmp_path):
     need_openssl()
     make_all(tmp_path)
     files = "certificate: {0}.pem, key: {0}.key, authority: ca.pem"
-    vehicle = f"vehicle: {{listen: 'tls/127.0.0.1:{free_port()}', {files.format('vehicle')}}}"
+    vehicle = f"vehicle: {{listen: 'tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}', {files.format('vehicle')}}}"
     (tmp_path / "hosts.yaml").write_text(f"hosts:\n  {vehicle}\n  base: {{{files.format('base')}}}\n{PLACE}")
     (tmp_path / "ticks.yaml").write_text(CROSSING)
     running = {}
@@ -135,12 +136,6 @@ def test_two_commands_run_one_graph_on_two_hosts(tmp_path):
     again = grd("replay", tmp_path / "base" / "flight.mcap", "--as-live", "--out", tmp_path / "again")
     assert again.exit_code == 2
     assert "is what host 'base' recorded of a run on several hosts" in again.output.replace("\n", " ")
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def wait_for_numbers(recording, running):

@@ -13,10 +13,9 @@ import threading
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from links.cli.app import app
 from links.recording import RecordingReader, recover
+from tests.links import command
 
 ROOT = Path(__file__).resolve().parents[3]
 PATIENCE_S = 120.0
@@ -40,15 +39,7 @@ main()
 def grd(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ticks.yaml").write_text(CONFIG)
-
-    def call(*words: object, code: int = 0) -> str:
-        result = CliRunner().invoke(app, [str(word) for word in words])
-        if result.exception and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        assert result.exit_code == code, result.output
-        return result.output
-
-    return call
+    return command.grd
 
 
 def test_a_live_run_leaves_its_folder_and_is_repeated_to_the_same_hash(grd, tmp_path):

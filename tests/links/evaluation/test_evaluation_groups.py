@@ -8,16 +8,15 @@ import re
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from flow.link import LinkError
-from links.cli.app import app
 from links.evaluation import evaluate, read_run
 from links.evaluation.compare import uneven
 from links.evaluation.groups import Spread, groups, parse_by
 from links.evaluation.no_drone import alarms
 from links.evaluation.summaries import group_summary
 from links.evaluation.tables import median_columns
+from tests.links.command import grd
 from tests.links.evaluation.made_runs import make_run, truth_at
 
 T_S = np.arange(0.0, 10.0, 0.1)
@@ -26,14 +25,6 @@ T_S = np.arange(0.0, 10.0, 0.1)
 def judge(*folders):
     runs = [read_run(folder) for folder in folders]
     return [evaluate(run, output) for run in runs for output in run.outputs]
-
-
-def grd(*words: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, ["evaluate", *map(str, words)])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == code, result.output
-    return result.output
 
 
 @pytest.fixture
@@ -195,26 +186,26 @@ def test_drone_free_runs_are_pooled_with_a_bound_and_named(tmp_path):
         0.0,
         pytest.approx(2 * 2.996, abs=1e-2),
     )
-    text = grd(tmp_path / "a", tmp_path / "b", tmp_path / "c", "--by", "config", code=1)
+    text = grd("evaluate", tmp_path / "a", tmp_path / "b", tmp_path / "c", "--by", "config", code=1)
     assert "ours: drones invented in x (2)" in text
     assert re.search(r"ours +│ +2 │ +1 │ +6 │ +0 │ +2 │ +2 │ +6.3 │", text)
 
 
 def test_the_command_puts_configurations_side_by_side(two_configs, tmp_path):
-    text = grd(*two_configs, "--by", "2,1", "--by", "config", "--report", tmp_path / "r.html", code=1)
+    text = grd("evaluate", *two_configs, "--by", "2,1", "--by", "config", "--report", tmp_path / "r.html", code=1)
     assert re.search(r"│ 10m +│ a +│ paper +│ +1 │", text)
     assert re.search(r"│ all +│ +│ ours +│ +2 │", text)
     assert text.count("by config") == 1
     assert "by word 2, 1 of the recording&#x27;s name" in (tmp_path / "r.html").read_text()
-    unasked = grd(*two_configs, code=1)
+    unasked = grd("evaluate", *two_configs, code=1)
     assert "by config" in unasked
     assert [name for name, _ in median_columns(judge(*two_configs))] == ["paper: median of 2", "ours: median of 2"]
-    assert "--by 9: 'a-10m-s1' has 3 words" in grd(*two_configs, "--by", "9", code=2)
-    assert "with --by config" in grd(*two_configs, "--against", two_configs[0], code=2)
+    assert "--by 9: 'a-10m-s1' has 3 words" in grd("evaluate", *two_configs, "--by", "9", code=2)
+    assert "with --by config" in grd("evaluate", *two_configs, "--against", two_configs[0], code=2)
 
 
 def test_the_table_for_other_programs_has_a_line_a_run(two_configs, tmp_path):
-    grd(*two_configs, "--csv", tmp_path / "new" / "runs.csv", code=1)
+    grd("evaluate", *two_configs, "--csv", tmp_path / "new" / "runs.csv", code=1)
     rows = list(csv.DictReader((tmp_path / "new" / "runs.csv").open()))
     assert [(row["recording"], row["config"]) for row in rows] == [
         ("a-10m-s1", "paper"), ("a-10m-s1", "ours"), ("b-10m-s1", "paper"), ("b-10m-s1", "ours")

@@ -9,15 +9,14 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from flow.link import LinkError
-from links.cli.app import app
 from links.evaluation import evaluate, read_run
 from links.evaluation.compare import pair_up, pooled
 from links.evaluation.judged import Evaluation
 from links.evaluation.plots import MAX_POINTS, worst_of_each
 from links.evaluation.svg import limits_of, same_scale, ticks
+from tests.links.command import grd
 from tests.links.evaluation.made_runs import lines, make_run, truth_at
 
 EIGHT_HZ = np.arange(0.0, 10.0, 0.125)
@@ -30,14 +29,6 @@ def fly(folder, offset_m=0.1, recording="flight", t=EIGHT_HZ, **settings):
 def judge(folder) -> Evaluation:
     run = read_run(folder)
     return evaluate(run, run.outputs[0])
-
-
-def grd(*words: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, ["evaluate", *map(str, words)])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == code, result.output
-    return result.output
 
 
 def test_a_run_that_failed_counts_as_the_worst_in_a_median(tmp_path):
@@ -86,7 +77,7 @@ def test_two_runs_are_compared_in_the_time_both_have_an_output(tmp_path):
 
 def test_machines_read_numbers_or_reasons_but_never_nan(tmp_path):
     folder = fly(tmp_path / "a", truth="none")
-    grd(folder, "--out", tmp_path / "numbers")
+    grd("evaluate", folder, "--out", tmp_path / "numbers")
     text = (tmp_path / "numbers" / "evaluation.json").read_text()
     assert "NaN" not in text
     assert "Infinity" not in text
@@ -103,12 +94,12 @@ def test_machines_read_numbers_or_reasons_but_never_nan(tmp_path):
 
 def test_exit_codes_are_0_for_fine_1_for_findings_2_for_wrong_use(tmp_path):
     fine = fly(tmp_path / "fine", 0.1, sigma_m=0.1)
-    assert "RMSE z [m]" in grd(fine)
-    text = grd(fly(tmp_path / "false", 5.0), code=1)
+    assert "RMSE z [m]" in grd("evaluate", fine)
+    text = grd("evaluate", fly(tmp_path / "false", 5.0), code=1)
     assert "80 of 80 outputs are false" in text
-    assert "no summary.json" in grd(tmp_path, code=2)
-    assert "No such file" in grd(tmp_path / "nothing.tum", code=2)
-    assert "contradict" in grd(fine, "--no-drone", "--truth", fine / "truth_vehicle_drone.tum", code=2)
+    assert "no summary.json" in grd("evaluate", tmp_path, code=2)
+    assert "No such file" in grd("evaluate", tmp_path / "nothing.tum", code=2)
+    assert "contradict" in grd("evaluate", fine, "--no-drone", "--truth", fine / "truth_vehicle_drone.tum", code=2)
 
 
 def test_a_truth_file_is_taken_for_a_real_flight(tmp_path):
@@ -116,13 +107,13 @@ def test_a_truth_file_is_taken_for_a_real_flight(tmp_path):
     truth = tmp_path / "total_station.tum"
     times = np.arange(0, 10.05, 0.11)  # 9 Hz
     truth.write_text(lines(times, truth_at(times)))
-    text = grd(folder, "--truth", truth)
+    text = grd("evaluate", folder, "--truth", truth)
     assert re.search(r"RMSE z \[m\] +│ +0.100", text)
 
 
 def test_many_runs_are_rows_and_a_median(tmp_path):
     folders = [fly(tmp_path / f"seed{i}", 0.1 * (i + 1), f"seed{i}", sigma_m=0.4) for i in range(6)]
-    text = grd(*folders, "--out", tmp_path / "out", "--report", tmp_path / "out" / "r.html")
+    text = grd("evaluate", *folders, "--out", tmp_path / "out", "--report", tmp_path / "out" / "r.html")
     assert "median of 6" in text
     assert text.count("the run gives no rotation") == 1  # what holds for all runs is told once
     assert "all 6 runs: judged over 10.00 s" in text
@@ -133,7 +124,7 @@ def test_many_runs_are_rows_and_a_median(tmp_path):
 
 def test_against_another_run_there_are_both_columns_and_the_ratio(tmp_path):
     a, b = fly(tmp_path / "ours", 0.1), fly(tmp_path / "theirs", 0.2)
-    text = grd(a, "--against", b, "--out", tmp_path / "out")
+    text = grd("evaluate", a, "--against", b, "--out", tmp_path / "out")
     assert re.search(r"RMSE z \[m\] +│ +0.100 │ +0.200 │ +0.5 │ better", text)
     tree = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert tree["against"]["metrics"]["rmse_z_m"]["ratio"] == pytest.approx(0.5)
@@ -167,7 +158,7 @@ def test_the_report_stands_alone_and_escapes_what_it_is_told(tmp_path):
     evil = tmp_path / "a<img src=x onerror=alert(1)>&b"
     fly(evil, 3.0, sweeps=[(0, 5.0, [[1, 2, 3]])], hits_s=[1.0, 2.0], states=[(0.1, "<script>"), (3.0, "TRACKING")])
     report = tmp_path / "report.html"
-    grd(evil, "--against", fly(tmp_path / "other", 0.1), "--report", report, code=1)
+    grd("evaluate", evil, "--against", fly(tmp_path / "other", 0.1), "--report", report, code=1)
     text = report.read_text()
     page = Links()
     page.feed(text)
@@ -185,7 +176,7 @@ def test_the_report_stands_alone_and_escapes_what_it_is_told(tmp_path):
 
 def test_a_report_of_nothing_still_says_what_it_could_not_do(tmp_path):
     report = tmp_path / "r.html"
-    grd(make_run(tmp_path / "a", [], [], truth="none"), "--report", report)
+    grd("evaluate", make_run(tmp_path / "a", [], [], truth="none"), "--report", report)
     assert "Not evaluated" in report.read_text()
 
 

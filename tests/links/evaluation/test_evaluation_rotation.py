@@ -9,10 +9,8 @@ import re
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from flow.link import LinkError, Record, Run
-from links.cli.app import app
 from links.evaluation import evaluate, read_run
 from links.evaluation.both_cameras import KEYS
 from links.evaluation.judged import Evaluation
@@ -25,6 +23,7 @@ from links.truth import TruthLog
 from stages.geometry import quaternions_xyzw, rotation_from_rpy_deg, rotation_z
 from stages.messages import BranchState, RelativeRotation
 from stages.rotation import exp_rotation
+from tests.links.command import grd
 from tests.links.evaluation.made_runs import (
     add_rotations,
     add_true_rotations,
@@ -54,14 +53,6 @@ def judge(folder) -> Evaluation:
 
 def numbers(e: Evaluation, *keys: str) -> list[float | None]:
     return [e.values[f"rotation_{key}"].value for key in keys]
-
-
-def grd(*words: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, ["evaluate", *map(str, words)])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == code, result.output
-    return result.output
 
 
 def told(stamp_ns: int, R: np.ndarray | None, state: BranchState, switches: int = 0) -> RelativeRotation:
@@ -259,8 +250,19 @@ def test_the_second_drone_is_not_judged_by_the_first_ones_camera(tmp_path):
 
 def test_a_run_without_a_rotation_stage_says_nothing_of_it(tmp_path):
     folder = fly(tmp_path / "flight")
-    text = grd(folder, folder, "--by", "config", "--csv", tmp_path / "x.csv", "--report", tmp_path / "r.html", code=0)
-    text += grd(folder) + (tmp_path / "r.html").read_text()
+    text = grd(
+        "evaluate",
+        folder,
+        folder,
+        "--by",
+        "config",
+        "--csv",
+        tmp_path / "x.csv",
+        "--report",
+        tmp_path / "r.html",
+        code=0,
+    )
+    text += grd("evaluate", folder) + (tmp_path / "r.html").read_text()
     assert "both cameras" not in text
     assert "RESOLVED" not in text
     row = next(csv.DictReader((tmp_path / "x.csv").open()))
@@ -303,7 +305,9 @@ def test_rotations_of_a_group_are_one_series(three_flights):
 
 
 def test_configurations_stand_side_by_side_in_terminal_table_and_report(three_flights, tmp_path):
-    text = grd(*three_flights, "--by", "1", "--csv", tmp_path / "x.csv", "--report", tmp_path / "r.html", code=1)
+    text = grd(
+        "evaluate", *three_flights, "--by", "1", "--csv", tmp_path / "x.csv", "--report", tmp_path / "r.html", code=1
+    )
     assert re.search(r"│ a +│ ours +│ +1 │ +80 │ +100.0 │ +1.00 │ +1.00 │", text)
     assert re.search(r"│ a +│ paper +│ +1 │ +80 │ +100.0 │ +91.00 │ +1.00 │", text)
     assert re.search(r"│ all +│ ours +│ +2 │ +160 │ +62.5 │ +1.61 │", text)
@@ -315,7 +319,7 @@ def test_configurations_stand_side_by_side_in_terminal_table_and_report(three_fl
     report = (tmp_path / "r.html").read_text()
     for words in ("modulo quarter turns: RMSE roll [deg]", "branch wrong, RESOLVED", "no rotation", "NEES<br>/ 3"):
         assert words in report
-    alone = grd(three_flights[0], code=0)
+    alone = grd("evaluate", three_flights[0], code=0)
     assert re.search(r"as given: RMSE \[deg\] +│ +1.00 │", alone)
     assert re.search(r"way to it, relative to the vehicle \[m\] +│ +2.000 │", alone)
 

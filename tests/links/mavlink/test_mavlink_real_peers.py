@@ -34,6 +34,7 @@ from links.mavlink.wire import packed, parse_frame
 from links.recording import RecordingReader, RecordingWriter
 from stages.geometry import rotation_from_rpy_deg
 from stages.messages import PoseState, RelativePose
+from tests.links.ports import free_port
 
 mavlink: Any = ardupilotmega
 MAVSDK, MAVPROXY = os.environ.get("GRD_MAVSDK_PYTHON"), os.environ.get("GRD_MAVPROXY_PYTHON")
@@ -41,12 +42,6 @@ needs_mavsdk = pytest.mark.skipif(not MAVSDK, reason="GRD_MAVSDK_PYTHON names no
 needs_mavproxy = pytest.mark.skipif(not MAVPROXY, reason="GRD_MAVPROXY_PYTHON names no Python that has MAVProxy")
 PEER = Path(__file__).parent / "peers" / "mavsdk_peer.py"
 TICK_S, MOST_TICKS = 0.02, 1500
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-        udp.bind(("127.0.0.1", 0))
-        return udp.getsockname()[1]
 
 
 class Peer:

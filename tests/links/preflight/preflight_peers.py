@@ -27,13 +27,6 @@ SPEED = 8.0  # rad/s of the phase of a motion by hand: there and back in 0.4 s
 START_NS, SECONDS = 1_748_773_230_000_000_000, 60.0
 
 
-def free_port() -> int:
-    """A UDP port that nobody listens on just now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-        udp.bind(("127.0.0.1", 0))
-        return udp.getsockname()[1]
-
-
 def packet(first_pulse_ns: int, mode: str = "strongest") -> bytes:
     """A VLP-16 packet in which every pulse returns from 10 m."""
     returns, firings = (2, 12) if mode == "dual" else (1, 24)

@@ -18,13 +18,13 @@ from links.simulated.autopilot_socket import AutopilotSocket
 from links.simulated.dynamixel_emulator import DynamixelEmulator
 from links.simulated.servo import ServoSettings
 from links.velodyne.decode import compile_kernels
+from tests.links.ports import free_port
 from tests.links.preflight.preflight_peers import (
     START_NS,
     HandHeld,
     OnTheGround,
     SendingLidar,
     film,
-    free_port,
     good_parameters,
 )
 

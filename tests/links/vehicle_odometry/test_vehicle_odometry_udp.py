@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 
 import pytest
@@ -13,22 +12,18 @@ from flow.link import LinkError
 from links import host_time
 from links.vehicle_odometry import VehicleOdometry
 from links.vehicle_odometry.udp import age_s
+from tests.links import ports
 
 POSE = {"xyz_m": [1.0, 2.0, 3.0], "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
 
 
 @pytest.fixture
 def port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    return ports.free_port()
 
 
 def send(port, *poses, host="127.0.0.1"):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.bind((host, 0))
-        for pose in poses:
-            sender.sendto(json.dumps(pose).encode(), ("127.0.0.1", port))
+    ports.send(port, *(json.dumps(pose).encode() for pose in poses), host=host)
 
 
 def test_a_pose_arrives_stamped_by_its_age_and_decodes(port):

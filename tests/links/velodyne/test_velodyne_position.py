@@ -1,7 +1,5 @@
 """Position packets: GPS time and whether the sensor's clock is locked to it."""
 
-import contextlib
-import socket
 import threading
 from datetime import UTC, datetime
 
@@ -12,6 +10,7 @@ from hand_built import captured, packet, record
 from flow.link import LinkError
 from links.velodyne import Lidar
 from links.velodyne.position import Pps, parse_position
+from tests.links.ports import free_ports, send
 
 GPRMC = "$GPRMC,081802.50,A,3649.7478558,N,00224.4542928,W,0.034,212.5,210116,0.0,E,A*2B"
 
@@ -72,24 +71,9 @@ def test_the_data_topic_ignores_and_counts_position_packets():
     assert lidar.counters["lost"] == 0
 
 
-def free_ports(count):
-    with contextlib.ExitStack() as stack:
-        probes = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [probe.getsockname()[1] for probe in probes]
-
-
 @pytest.fixture
 def ports():
     return free_ports(2)
-
-
-def send(port, *datagrams, host="127.0.0.1"):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.bind((host, 0))
-        for data in datagrams:
-            sender.sendto(data, ("127.0.0.1", port))
 
 
 def test_live_position_packets_are_records_of_their_own_and_their_state_is_counted(ports):

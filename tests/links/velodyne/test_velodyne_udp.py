@@ -1,6 +1,5 @@
 """Live listening, on real loopback sockets."""
 
-import socket
 import threading
 import time
 
@@ -12,22 +11,14 @@ from flow.link import LinkError
 from links import host_time
 from links.velodyne import Lidar
 from links.velodyne.vlp16 import first_pulse_ns
+from tests.links.ports import free_port, send
 
 WIRE_NS = 101_760
 
 
 @pytest.fixture
 def port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def send(port, *datagrams, host="127.0.0.1"):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.bind((host, 0))
-        for data in datagrams:
-            sender.sendto(data, ("127.0.0.1", port))
+    return free_port()
 
 
 def test_packets_arrive_in_order_as_records_that_decode(port):

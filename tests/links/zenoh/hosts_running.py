@@ -6,7 +6,6 @@ import json
 import os
 import queue
 import shutil
-import socket
 import subprocess
 import sys
 import threading
@@ -25,12 +24,6 @@ links:
   beats: {use: crossing_toys.Beats, config: {rate_hz: RATE, every: EVERY, size_px: SIZE}}
   teller: {use: crossing_toys.Teller, inputs: {beat: echo.beat, picture: beats.picture}}
 """
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def write_config(folder: Path, rate_hz: float = 100.0, every: int = 10, size_px: int = 64) -> Path:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+from socket import SOCK_STREAM
 
 import pytest
 from certificates import make_all, need_openssl
-from hosts_running import HostProcess, free_port, write_config, write_hosts
+from hosts_running import HostProcess, write_config, write_hosts
 from proxy import Proxy
+
+from tests.links.ports import free_port
 
 needs_zenoh = pytest.mark.skipif(
     importlib.util.find_spec("zenoh") is None, reason="needs Eclipse Zenoh: pip install -e '.[hosts]'"
@@ -36,7 +39,9 @@ def folder(signed, tmp_path):
 def test_a_cycle_through_two_hosts_whose_clocks_are_an_hour_apart(folder):
     """Drone: beats and teller. Vehicle: the echo between them. Every time is right on the host that reads it."""
     config = write_config(folder)
-    hosts = write_hosts(folder, f"127.0.0.1:{free_port()}", {"beats": "drone", "echo": "vehicle", "teller": "drone"})
+    hosts = write_hosts(
+        folder, f"127.0.0.1:{free_port(SOCK_STREAM)}", {"beats": "drone", "echo": "vehicle", "teller": "drone"}
+    )
     with (
         HostProcess(config, hosts, "vehicle", ahead_s=-3600.0) as vehicle,
         HostProcess(config, hosts, "drone") as drone,
@@ -57,7 +62,9 @@ def test_a_cycle_through_two_hosts_whose_clocks_are_an_hour_apart(folder):
 
 def test_the_hub_hands_on_between_two_others(folder):
     config = write_config(folder, every=1)
-    hosts = write_hosts(folder, f"127.0.0.1:{free_port()}", {"beats": "drone", "echo": "drone", "teller": "base"})
+    hosts = write_hosts(
+        folder, f"127.0.0.1:{free_port(SOCK_STREAM)}", {"beats": "drone", "echo": "drone", "teller": "base"}
+    )
     with (
         HostProcess(config, hosts, "vehicle", ahead_s=100.0) as vehicle,
         HostProcess(config, hosts, "drone", ahead_s=-50.0),
@@ -71,7 +78,7 @@ def test_the_hub_hands_on_between_two_others(folder):
 
 def test_a_certificate_of_another_authority_is_not_taken_in(folder):
     config = write_config(folder)
-    listen = f"127.0.0.1:{free_port()}"
+    listen = f"127.0.0.1:{free_port(SOCK_STREAM)}"
     honest = write_hosts(folder, listen, DRONE_SIDE)
     rogue = write_hosts(folder, listen, DRONE_SIDE, name="rogue.yaml", drone="rogue")
     with HostProcess(config, honest, "vehicle") as vehicle, HostProcess(config, rogue, "drone") as intruder:
@@ -88,7 +95,7 @@ def test_a_certificate_of_another_authority_is_not_taken_in(folder):
 def test_a_host_cannot_say_what_another_one_s_nodes_say(folder):
     """A drone that was taken over: its certificate is good, its hosts file says that it runs what the base runs."""
     config = write_config(folder)
-    listen = f"127.0.0.1:{free_port()}"
+    listen = f"127.0.0.1:{free_port(SOCK_STREAM)}"
     honest = write_hosts(folder, listen, {"beats": "base", "echo": "vehicle", "teller": "vehicle"})
     taken = write_hosts(folder, listen, DRONE_SIDE, name="taken.yaml")
     posing = write_hosts(folder, listen, {**DRONE_SIDE, "beats": "base"}, name="posing.yaml")
@@ -108,7 +115,7 @@ def test_a_host_cannot_say_what_another_one_s_nodes_say(folder):
 def test_a_line_that_was_cut_comes_back(folder):
     """Cut for longer than Zenoh's lease, with a picture on its way. What is sent then is new; the old is counted."""
     config = write_config(folder, rate_hz=50.0, every=5, size_px=512)
-    port = free_port()
+    port = free_port(SOCK_STREAM)
     with Proxy(port) as proxy:
         hosts = write_hosts(folder, f"127.0.0.1:{port}", DRONE_SIDE, connect=f"127.0.0.1:{proxy.port}")
         with (
@@ -136,7 +143,7 @@ def test_a_line_that_was_cut_comes_back(folder):
 def test_a_host_that_starts_anew_is_heard_anew(folder):
     """Its clock and its counting begin again: nothing of the first run is used for the second."""
     config = write_config(folder)
-    hosts = write_hosts(folder, f"127.0.0.1:{free_port()}", DRONE_SIDE)
+    hosts = write_hosts(folder, f"127.0.0.1:{free_port(SOCK_STREAM)}", DRONE_SIDE)
     with HostProcess(config, hosts, "vehicle") as vehicle:
         with HostProcess(config, hosts, "drone", ahead_s=1000.0):
             vehicle.until(lambda line: line.get("number", 0) > 200)
@@ -149,7 +156,7 @@ def test_a_host_that_starts_anew_is_heard_anew(folder):
 
 def test_two_hubs_on_one_port_are_told_apart(folder):
     config = write_config(folder)
-    hosts = write_hosts(folder, f"127.0.0.1:{free_port()}", DRONE_SIDE)
+    hosts = write_hosts(folder, f"127.0.0.1:{free_port(SOCK_STREAM)}", DRONE_SIDE)
     with HostProcess(config, hosts, "vehicle") as first:
         first.wait_for("started")
         with HostProcess(config, hosts, "drone"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from stages.align.lock import YawLock
 from stages.align.reckoning import Reckoned
 from stages.align.spectra import spectrum
+from stages.yaw_branches.heading_bank import Heading
 from tests.stages.align.test_spectra import lines_at
 
 S = 1_000_000_000
@@ -147,3 +149,44 @@ def test_forgetting_starts_anew():
     assert lock.offset_rad is None
     yaw, _ = follow(lock, seen(0, 90), seen(-40, 50), at(0.2))
     assert yaw == pytest.approx(40.0, abs=0.3)
+
+
+# where streets run at many angles, by the heading that motion tells
+
+VEHICLE, DRONE = seen(0, 90, 0), seen(-20, 70, 14, 14, 41, 41)  # one street in common: no picture says which
+AT = Reckoned(S, 0.0, 0.0, math.radians(0.1) ** 2)
+
+
+@pytest.mark.parametrize("quarters", range(4))
+@pytest.mark.parametrize("street_deg", [20.0, -14.0, -41.0])
+def test_motion_says_which_of_many_streets_both_cameras_see_and_which_way_round(street_deg, quarters):
+    lock = YawLock()
+    assert lock.choose(VEHICLE, DRONE, AT, 0.0).yaw_rad is None
+    true_rad = math.radians(street_deg + 90 * quarters)
+    match = lock.choose(VEHICLE, DRONE, AT, 0.0, Heading(true_rad + math.radians(3.0), math.radians(2.0)))
+    assert match.yaw_rad is not None
+    assert math.remainder(match.yaw_rad - true_rad, 2 * math.pi) == pytest.approx(0.0, abs=math.radians(0.3))
+
+
+def test_where_motion_says_there_is_no_match_none_is_taken():
+    nowhere = Heading(math.radians(3.0), math.radians(1.5))
+    match = YawLock().choose(VEHICLE, DRONE, AT, 0.0, nowhere)
+    assert match.yaw_rad is None
+    assert "no match where the drone's motion says" in match.reason
+    square = YawLock().choose(seen(0, 90), seen(-20, 70), AT, 0.0, nowhere)
+    assert square.reason == "the lines match best elsewhere than the drone's motion says"
+
+
+def test_a_match_that_motion_denies_is_let_go_up_to_quarter_turns():
+    lock = YawLock()
+    match = lock.choose(seen(0, 90), seen(-20, 70), AT, 0.0)
+    lock.accept(match.yaw_rad, math.radians(0.2), AT)
+    sigma = math.radians(2.0)
+    assert not lock.denied(None)
+    assert not lock.denied(Heading(math.radians(20 + 180 + 8), sigma))
+    assert lock.denied(Heading(math.radians(20 - 90 + 14), sigma))
+    lock.let_go()
+    assert lock.offset_rad is None
+    assert not lock.denied(Heading(0.0, sigma))
+    again = lock.choose(seen(0, 90), seen(-20, 70), dataclasses.replace(AT, stamp_ns=2 * S), 0.0)
+    assert math.degrees(again.yaw_rad) == pytest.approx(20.0, abs=0.2)

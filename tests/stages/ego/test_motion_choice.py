@@ -12,7 +12,6 @@ from pydantic import ValidationError
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.ego import VehicleMotionChoice
-from stages.ego.motion_choice import CARRIED_S, carried_on
 from stages.geometry import rotation_z, transform
 from stages.messages import VehicleMotion
 
@@ -132,17 +131,6 @@ def test_a_source_that_does_not_say_how_sure_it_is_makes_nobody_sure():
     assert choice.on_odometry(word(0.0, sigma=None)).covariance is None
     assert choice.on_ego(word(1.0)).covariance is None
     assert choice.on_odometry(word(1.1, sigma=0.1)).covariance is None
-
-
-def test_a_motion_is_carried_on_for_a_second_and_no_longer():
-    words = [word(t) for t in seconds(0, 1, 0.1)]
-    near = carried_on(words, round(1.0 * S))
-    assert off(near, np.eye(4))[0] < 1e-3
-    one, many = (carried_on(words, words[-1].stamp_ns + round(s * S)) for s in (CARRIED_S, 5 * CARRIED_S))
-    np.testing.assert_allclose(one.xyz_start_m, many.xyz_start_m)
-    assert np.trace(many.covariance) > 100 * np.trace(one.covariance)
-    alone = carried_on(words[-1:], 2 * S)
-    np.testing.assert_allclose(alone.xyz_start_m, words[-1].xyz_start_m)
 
 
 def test_its_ports_are_the_two_sources_and_one_motion():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stages.ego.scale import length_of, parallax_ratio
-from stages.ego.step import Pose6, Step, adjoint, after, believable, carried
-from stages.rotation import exp_rotation, hat, log_rotation
+from stages.ego.step import Pose6, Step, after, believable, carrier_pose
+from stages.rotation import exp_rotation, log_rotation
 from tests.stages.seen import point_rays
 
 TURN, MOVE = (0.02, -0.05, 0.15), (0.6, -0.2, 0.1)
@@ -89,18 +89,11 @@ def test_the_carriers_covariance_is_that_of_its_pose():
     M[:3, :3], M[:3, 3] = exp_rotation(np.array([0.3, -0.2, 1.5])), [1.5, -0.4, 0.8]
     P = np.diag([1e-4, 4e-4, 1e-6, 1e-4, 9e-4, 1e-6])
     camera = Pose6(exp_rotation(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2.0, 3.0]), P)
-    vehicle = carried(camera, M)
+    vehicle = carrier_pose(camera, M)
     samples = []
     for _ in range(4000):
         xi = np.sqrt(np.diag(P)) * rng.normal(size=6)
-        other = carried(Pose6(camera.R @ exp_rotation(xi[:3]), camera.p + camera.R @ xi[3:], P), M)
+        other = carrier_pose(Pose6(camera.R @ exp_rotation(xi[:3]), camera.p + camera.R @ xi[3:], P), M)
         samples.append([*log_rotation(vehicle.R.T @ other.R), *(vehicle.R.T @ (other.p - vehicle.p))])
     np.testing.assert_allclose(np.cov(np.array(samples).T), vehicle.covariance, atol=0.06 * vehicle.covariance.max())
     np.testing.assert_allclose(vehicle.R, M[:3, :3] @ camera.R @ M[:3, :3].T)
-
-
-def test_the_adjoint_is_as_printed():
-    R, t = exp_rotation(np.array([0.3, 0.0, 0.1])), np.array([1.0, -2.0, 0.5])
-    A = adjoint(R, t)
-    np.testing.assert_allclose(A[3:, :3], hat(t) @ R)
-    np.testing.assert_allclose(A @ adjoint(R.T, -R.T @ t), np.eye(6), atol=1e-12)

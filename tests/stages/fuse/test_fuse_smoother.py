@@ -9,9 +9,9 @@ from gtsam.symbol_shorthand import X
 
 from stages.fuse.carried import Step
 from stages.fuse.ekf import Ekf
-from stages.fuse.rigid import carried_covariance
 from stages.fuse.smoother import Smoother
 from stages.geometry import rotation_z
+from stages.rigid import carried_covariance
 from stages.rotation import exp_rotation, log_rotation
 
 TENTH = 100_000_000

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from stages.align.branches import BranchBank, BranchSettings
 from stages.fuse import EkfFuse, Fuse
 from stages.messages import PoseState
+from stages.yaw_branches.bank import BranchBank, BranchSettings
 from tests.stages.fuse.made_drone_flight import Made, ns
 
 FULL, AMBIGUOUS, COASTING = PoseState.FULL, PoseState.AMBIGUOUS, PoseState.COASTING

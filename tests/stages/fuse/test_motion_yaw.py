@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from stages.fuse.heading import apart_rad
 from stages.fuse.motion_yaw import (
     LEAST,
     LEAST_TO_BACK,
@@ -22,6 +21,7 @@ from stages.fuse.motion_yaw import (
     weigh,
 )
 from stages.fuse.settings import FuseErrors
+from stages.fuse.yaw import apart_rad
 from stages.geometry import rotation_z
 from tests.stages.fuse.made_drone_flight import gauss_markov
 

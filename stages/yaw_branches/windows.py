@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.align.branches import ASKEW, Displacement, turns
 from stages.drone_trail import AutopilotTrail
 from stages.geometry import Array64
 from stages.messages import DroneFix, DroneMotion
+from stages.yaw_branches.bank import ASKEW, Displacement, turns
 
 HANDFUL = 3  # fixes
 HANDFUL_NS = 400_000_000

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from stages.align.branches import ASKEW, NONE, BranchBank, BranchSettings, Displacement, turns
 from stages.geometry import rotation_z
+from stages.yaw_branches.bank import ASKEW, NONE, BranchBank, BranchSettings, Displacement, turns
 
 S = 1_000_000_000
 NOISE = 0.1**2 * np.eye(2)

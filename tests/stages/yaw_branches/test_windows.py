@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from stages.align.branches import ASKEW, turns
-from stages.align.windows import Windows
 from stages.drone_trail import AutopilotTrail
 from stages.geometry import rotation_z
 from stages.messages import DroneFix, DroneMotion
+from stages.yaw_branches.bank import ASKEW, turns
+from stages.yaw_branches.windows import Windows
 
 MS = 1_000_000
 SAME = np.eye(3)

@@ -11,6 +11,13 @@ from stages.geometry import Array64
 from stages.rotation import hat
 
 
+def adjoint(R: Array64, t: Array64) -> Array64:
+    """Ad (6, 6) of (R, t), rotation first: [[R, 0], [[t]x R, R]]."""
+    A = np.zeros((6, 6))
+    A[:3, :3], A[3:, 3:], A[3:, :3] = R, R, hat(np.ascontiguousarray(t)) @ R
+    return A
+
+
 def carried_covariance(P: Array64, R_step: Array64, t_step_m: Array64, Q: Array64) -> Array64:
     """Covariance (6, 6) of T D, D = (R, t) with covariance Q, from that of T: Ad(D^-1) P Ad(D^-1)^T + Q."""
     A = np.zeros((6, 6))

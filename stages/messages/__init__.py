@@ -1,0 +1,37 @@
+"""Every message of the method. Frames: see `stages/geometry.py`. In the order data flows:
+
+    sensors -> sweep -> drone;  sensors -> cameras;  autopilot;  all of them -> pose
+
+Source: DESIGN, the graph. Sensor messages carry what was measured; nothing here comes from truth.
+"""
+
+from stages.messages.autopilot import AutopilotEstimator as AutopilotEstimator
+from stages.messages.autopilot import AutopilotStatus as AutopilotStatus
+from stages.messages.autopilot import DroneAttitude as DroneAttitude
+from stages.messages.autopilot import DroneImu as DroneImu
+from stages.messages.autopilot import DroneLocalPosition as DroneLocalPosition
+from stages.messages.autopilot import DroneOdometry as DroneOdometry
+from stages.messages.cameras import BranchState as BranchState
+from stages.messages.cameras import Carrier as Carrier
+from stages.messages.cameras import DroneMotion as DroneMotion
+from stages.messages.cameras import FollowedFeatures as FollowedFeatures
+from stages.messages.cameras import RelativeRotation as RelativeRotation
+from stages.messages.cameras import VanishingDirections as VanishingDirections
+from stages.messages.drone import Candidates as Candidates
+from stages.messages.drone import Detections as Detections
+from stages.messages.drone import DroneFix as DroneFix
+from stages.messages.drone import TrackingState as TrackingState
+from stages.messages.drone import TrackState as TrackState
+from stages.messages.pose import PoseState as PoseState
+from stages.messages.pose import RelativePose as RelativePose
+from stages.messages.sensors import Image as Image
+from stages.messages.sensors import LidarFirings as LidarFirings
+from stages.messages.sensors import ServoGoal as ServoGoal
+from stages.messages.sensors import ServoOffset as ServoOffset
+from stages.messages.sensors import ServoState as ServoState
+from stages.messages.sensors import Tick as Tick
+from stages.messages.sensors import VehicleMotion as VehicleMotion
+from stages.messages.sweep import DepthImage as DepthImage
+from stages.messages.sweep import ScoreImage as ScoreImage
+from stages.messages.sweep import SweptPoints as SweptPoints
+from stages.messages.sweep import SweptPulses as SweptPulses

@@ -1,0 +1,69 @@
+"""What the LiDAR saw, placed in the vehicle frame. P III.A, III.B."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.message import Message, PerPointF32, PerPointI64, PerPointU8, Points32, Shape, Vec3, message
+
+DepthPixels = Annotated[NDArray[np.float32], Shape("h", "w")]
+
+
+@message
+class SweptPoints(Message):
+    """Returns in the vehicle frame, each at its own time; stamp_ns is the first pulse's of the slice."""
+
+    point_stamp_ns: PerPointI64
+    xyz_vehicle_m: Points32
+    laser: PerPointU8
+    reflectivity: PerPointU8
+    servo_rad: PerPointF32  # turntable angle at the pulse, after sign, zero and time offset
+    pulses: int  # laser pulses fired in this slice, with those that returned nothing
+    origin_vehicle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where the beams start, mid-slice
+    unplaced: int = 0  # returns left out because the turntable's angle at their time is not known
+    reason: str = ""  # why returns were left out; empty when none were
+
+
+@message
+class SweptPulses(Message):
+    """Every laser pulse of a slice in the vehicle frame, also those that saw nothing: what flew free is evidence too.
+
+    One row per pulse, in firing order; of two returns of a pulse the nearer. stamp_ns is the first pulse's. A slice
+    whose turntable angle is not known is empty.
+    """
+
+    point_stamp_ns: PerPointI64  # when each laser fired
+    direction_vehicle: Points32  # unit vectors
+    range_m: PerPointF32  # along the direction, from origin_vehicle_m; 0: no return
+    laser: PerPointU8
+    reflectivity: PerPointU8
+    turntable_rad: float  # turntable angle, mid-slice; NaN: not known
+    origin_vehicle_m: tuple[float, float, float]  # where the beams start, mid-slice
+
+
+@message
+class DepthImage(Message):
+    """One whole sweep seen from the turntable as a pinhole image looking up; stamp_ns is the sweep's end. P III.A.
+
+    Pixel (row v, column u) looks along (x, y, 1) with x = (u + 0.5 - w/2) / focal_px, y = (v + 0.5 - h/2) / focal_px,
+    in axes parallel to the vehicle's. Depth is z over the origin.
+    """
+
+    start_ns: int
+    depth_m: DepthPixels  # z of the nearest return, 0: none
+    focal_px: float  # plane height / pixel size on that plane
+    origin_vehicle_m: Vec3  # where the image looks from
+    points: int  # returns that fell into the image
+    returns: int  # returns of the whole sweep, in the image or not
+    turned_rad: float  # servo travel the sweep covered; 0 for a bolted-down LiDAR
+    lost_packets: int = 0  # LiDAR packets missing within the sweep
+
+
+@message
+class ScoreImage(Message):
+    """The detector's score per pixel of a DepthImage: lower is more like a drone, NaN is no candidate. P III.B."""
+
+    score: DepthPixels

@@ -63,7 +63,7 @@ def test_from_20_m_on_one_return_alone_is_few(range_m):
 
 
 @pytest.mark.parametrize("range_m", [3.0, 5.0, 9.0])
-def test_nearby_as_many_are_few_as_a_quarter_of_a_beam_across_the_drone(range_m):
+def test_nearby_as_many_are_few_as_a_sixth_of_a_beam_across_the_drone(range_m):
     limit = int(FEW_M / range_m)
     assert candidate(sighting(0.0, hits=limit, range_m=range_m)).few < 0
     assert candidate(sighting(0.0, hits=limit + 1, range_m=range_m)).few > 0

@@ -40,6 +40,7 @@ POSE_HEAD = (
     "# T_vehicle_drone, fused; '0 0 0 1' where its rotation is not known: rotation is 0 in the table of covariances\n"
 )
 UNKNOWN_RAD2 = math.pi**2  # variance written for a rotation that is not known: a table of numbers holds no infinity
+KEPT = (DroneFix, DepthImage, Detections, TrackState, RelativeRotation, RelativePose)
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
 
 
@@ -143,6 +144,10 @@ class Results(Tap):
         self._covariance.writerow(["stamp_s", *upper, "hits", "iterations", "track_id"])
         self._detections = csv.writer(self._files[DETECTIONS_FILE])
         self._detections.writerow(["start_s", "end_s", "x_m", "y_m", "z_m", "score"])
+
+    def wants(self, message: type[Message]) -> bool:
+        """What the files hold: the rest comes by the thousand."""
+        return message in KEPT
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Take what belongs here; all else passes by."""

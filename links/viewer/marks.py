@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from links.viewer import colours
 from links.viewer.ellipsoid import ellipsoid
-from links.viewer.scene import Mark, Scene
+from links.viewer.scene import Curve, Mark, Scene
 from stages.geometry import quaternions_xyzw
 
 Marks = Iterator[Mark]
@@ -75,7 +75,7 @@ def plot(
         dotted = dots and line_colours is not None
         return [*lines, *(rr.SeriesPoints(**look).as_component_batches() if dotted else [])]
 
-    return Mark(path, rr.Scalars(values), style=style)
+    return Curve(path, values, style=style)
 
 
 def label(name: str, xyz_vehicle_m: NDArray[np.float64], texts: list[str], colour: Colour) -> Mark:

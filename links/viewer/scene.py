@@ -45,6 +45,16 @@ class Mark:
         self.style = style
 
 
+class Curve(Mark):
+    """Numbers (n,) to plot at an entity path."""
+
+    __slots__ = ("values",)
+
+    def __init__(self, path: str, values: Any, style: Callable[[], Any] | None = None) -> None:
+        super().__init__(path, style=style)
+        self.values = np.asarray(values, dtype=np.float64).ravel()
+
+
 class Listed(NamedTuple):
     """A candidate as it was told last."""
 

@@ -15,10 +15,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from links.viewer.rrd_file import RrdFile
-from links.viewer.scene import TIMELINE, Mark
+from links.viewer.scene import TIMELINE, Curve, Mark
+from stages.geometry import Array64
 
 APPLICATION = "grd"
 LOOPBACK = "127.0.0.1"
+CURVES_NS = 200_000_000  # of curves are written at a time: in rows, one by one, they cost more than all the rest
 EPOCH_FROM_NS = 10**17  # stamps above are times since 1970 (1973 on), below are times since some start
 
 
@@ -30,6 +32,8 @@ class Stream:
     ) -> None:
         """`opens`: how a viewer shows it at first."""
         self._styled: set[str] = set()
+        self._curves: dict[str, list[tuple[int, Array64]]] = {}  # not yet written
+        self._stamp_ns = self._curves_ns = 0
         self._since_1970: bool | None = None
         self._rerun = rr.RecordingStream(APPLICATION)
         self._rerun.set_log_time_enabled(False)  # the sensors' time is the only one
@@ -62,6 +66,10 @@ class Stream:
         first = self._since_1970 is None
         if self._since_1970 is None:
             self._since_1970 = abs(stamp_ns) > EPOCH_FROM_NS
+        self._stamp_ns = stamp_ns
+        if abs(stamp_ns - self._curves_ns) >= CURVES_NS:
+            self._curves_ns = stamp_ns
+            self._write_curves()
         if self._since_1970:
             self._rerun.set_time(TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
         else:
@@ -77,10 +85,25 @@ class Stream:
                 style.append(rr.CoordinateFrame(mark.frame))
             if style:
                 self._rerun.log(mark.path, *style, static=True)
-        self._rerun.log(mark.path, *mark.parts, static=static)
+        if isinstance(mark, Curve):
+            self._curves.setdefault(mark.path, []).append((self._stamp_ns, mark.values))
+        else:
+            self._rerun.log(mark.path, *mark.parts, static=static)
+
+    def _write_curves(self) -> None:
+        curves, self._curves = self._curves, {}
+        for path, rows in curves.items():
+            stamps_ns = np.array([stamp_ns for stamp_ns, _ in rows])
+            if self._since_1970:
+                times = rr.TimeColumn(TIMELINE, timestamp=stamps_ns.astype("datetime64[ns]"))
+            else:
+                times = rr.TimeColumn(TIMELINE, duration=stamps_ns.astype("timedelta64[ns]"))
+            columns = rr.Scalars.columns(scalars=np.concatenate([values for _, values in rows]))
+            self._rerun.send_columns(path, [times], columns.partition([len(values) for _, values in rows]))
 
     def close(self) -> None:
         """Push everything out and end the file."""
+        self._write_curves()
         self._rerun.disconnect()
         if self._file is not None:
             self._file.close()

@@ -90,6 +90,10 @@ class Viewer(Tap):
         self._thread = threading.Thread(target=self._work, args=(run, self._box), name="viewer", daemon=True)
         self._thread.start()
 
+    def wants(self, message: type[Message]) -> bool:
+        """All, where there is a file or a server to draw for."""
+        return self.file is not None or self.serve
+
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Put the message into the box; the time that counts is its stamp, not its arrival."""
         if self._box is not None:

@@ -42,6 +42,7 @@ class Candidates(Message):
     seen_ns: PerPointI64
     looks: PerPointI64  # turns of the rotor in which it was hit
     reasons: tuple[str, ...]  # what speaks for and against, one each
+    wander_mps: PerPointF64 | None = None  # level speed it says it has and heading unknown, beyond velocity_vehicle_mps
 
 
 class TrackingState(enum.Enum):

@@ -6,17 +6,19 @@ Run: python -m pytest tests/benchmarks/bench_viewer.py --benchmark-only
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rerun as rr
+import rerun.blueprint as rrb
 
 from flow.link import Run
 from links.viewer import Viewer
 from links.viewer.draw import draw
 from links.viewer.scene import Scene
 from links.viewer.slices import Slicer, thin
+from links.viewer.stream import Stream
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "viewer"))
 import synthetic
@@ -43,21 +45,30 @@ def test_see_a_second_of_messages(benchmark, viewer, run):
     benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(RUNS[run]) * 1e6, 2)
 
 
-@pytest.mark.parametrize("joined", [True, False], ids=["slices", "packets"])
+class RowByRow(Stream):
+    """Each number of a curve written when it comes."""
+
+    def put(self, mark, *, static=False):
+        super().put(mark, static=static)
+        self._write_curves()
+
+
+@pytest.mark.parametrize(
+    ("slice_s", "kind"), [(0.1, Stream), (0.1, RowByRow), (1e-6, Stream)], ids=["slices", "rows", "packets"]
+)
 @pytest.mark.parametrize("run", RUNS)
-def test_draw_a_second_of_messages_in_the_caller(benchmark, tmp_path, run, joined):
-    """Packets joined to slices, as the viewer does, beside each packet drawn by itself."""
-    stream = rr.RecordingStream("bench")
-    stream.set_sinks(rr.FileSink(tmp_path / "bench.rrd"))
+def test_draw_a_second_of_messages_in_the_caller(benchmark, tmp_path, run, slice_s, kind):
+    """As the viewer does, beside each number of a curve written by itself, and each packet drawn by itself."""
+    stream = kind(tmp_path / "bench.rrd", None, "256MiB", Counter(), rrb.Blueprint())
 
     def draw_all():
         scene = Scene(mount=synthetic.MOUNT, history_s=3.0, slice_s=0.1, max_points=6000, trail_s=20.0)
-        slicer = Slicer(0.1 if joined else 1e-6)
+        slicer = Slicer(slice_s)
         for output, content in RUNS[run]:
             for name, stamp_ns, ready in slicer.add(output, content):
-                stream.set_time("sensor_time", timestamp=np.datetime64(stamp_ns, "ns"))
+                stream.at(stamp_ns)
                 for mark in draw(ready, name.replace(".", "/"), scene):
-                    stream.log(mark.path, *mark.parts)
+                    stream.put(mark)
 
     benchmark.pedantic(draw_all, rounds=2)
     benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(RUNS[run]) * 1e6, 2)

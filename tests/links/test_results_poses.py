@@ -15,7 +15,7 @@ from stages.fuse.motions import Motions
 from stages.fuse.settings import FuseErrors
 from stages.fuse.told import Known, Verdict, lost, pose
 from stages.geometry import quaternions_xyzw, rotation_z
-from stages.messages import PoseState
+from stages.messages import DroneFix, PoseState, RelativePose, SweptPulses
 
 S = 1_000_000_000
 FULL, POSITION_ONLY = PoseState.FULL, PoseState.POSITION_ONLY
@@ -107,3 +107,8 @@ def test_poses_are_counted_by_state_and_their_jumps_told(tmp_path):
     results.close()
     assert results.pose_states == {"FULL": 2, "POSITION_ONLY": 1}
     assert results.resets == 1
+
+
+@pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (SweptPulses, False)])
+def test_a_live_run_hands_over_only_what_the_files_hold(kind, wanted):
+    assert Results().wants(kind) is wanted

@@ -322,6 +322,8 @@ def test_without_file_and_server_nothing_is_drawn_and_nothing_fails(tmp_path, mo
 
     monkeypatch.setattr("links.viewer.viewer.draw", never)
     viewer = Viewer(file=None)
+    assert not viewer.wants(type(ticks(1)[0])), "a live run hands it nothing"
+    assert Viewer(file=None, serve=True).wants(type(ticks(1)[0]))
     viewer.open(a_run(tmp_path))
     viewer.see("clock.tick", ticks(1)[0], 0)
     viewer.close()

@@ -159,8 +159,8 @@ def test_a_picture_without_directions_says_why_on_it_and_once_in_the_log():
         assert lane == [["directions"], ["no directions"], [], ["directions"]][k]
     assert said[0] == "no structure: 5 lines, a pair needs 4"
     assert said[1:] == ["again vertical +-0.10 deg, pair 1 +-0.20 deg, pair 1 +-0.30 deg; 15 of 20 lines"]
-    np.testing.assert_allclose(numbers(marks[f"plots/other/{VP}/lines"].parts[0].scalars), [20, 15])
-    np.testing.assert_allclose(numbers(marks[f"plots/other/{VP}/sigma"].parts[0].scalars), [0.1, 0.3])
+    np.testing.assert_allclose(marks[f"plots/other/{VP}/lines"].values, [20, 15])
+    np.testing.assert_allclose(marks[f"plots/other/{VP}/sigma"].values, [0.1, 0.3])
     assert "**vp_vehicle:** vertical" in page(marks["now"])
 
 
@@ -279,8 +279,8 @@ def test_features_are_strokes_on_their_picture_green_where_they_agree():
     np.testing.assert_array_equal(numbers(strokes.colors), [colours.GOOD, colours.GOOD, colours.BAD])
     ends = marks[f"camera/camera_vehicle/{name}/ends"].parts[0]
     np.testing.assert_allclose(numbers(ends.positions)[2], 480 / 720 * np.array([500.5, 190.5]), atol=1e-4)
-    np.testing.assert_allclose(numbers(marks[f"plots/other/{name}/features"].parts[0].scalars).ravel(), [3, 2])
-    np.testing.assert_allclose(numbers(marks[f"plots/other/{name}/residual"].parts[0].scalars).ravel(), [0.2])
+    np.testing.assert_allclose(marks[f"plots/other/{name}/features"].values, [3, 2])
+    np.testing.assert_allclose(marks[f"plots/other/{name}/residual"].values, [0.2])
 
 
 def test_features_of_a_picture_left_out_are_numbers_only():

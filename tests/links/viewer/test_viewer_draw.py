@@ -76,10 +76,8 @@ def test_a_fix_is_an_ellipsoid_in_the_vehicle_frame_with_trail_and_curves():
     assert mark.frame == "vehicle"
     np.testing.assert_allclose(numbers(mark.parts[0].centers), [[3.0, 4.0, 12.0]])
     np.testing.assert_allclose(sorted(numbers(mark.parts[0].half_sizes)[0]), [0.27955, 0.5591, 0.83865], atol=1e-4)
-    np.testing.assert_allclose(
-        numbers(marks["plots/position/track/drone_fix/drone_1"].parts[0].scalars), [3.0, 4.0, 12.0]
-    )
-    np.testing.assert_allclose(numbers(marks["plots/sigma/track/drone_fix/drone_1"].parts[0].scalars), [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(marks["plots/position/track/drone_fix/drone_1"].values, [3.0, 4.0, 12.0])
+    np.testing.assert_allclose(marks["plots/sigma/track/drone_fix/drone_1"].values, [0.1, 0.2, 0.3])
     assert {
         "vehicle/track/drone_fix/drone_1/trail",
         "labels/track/drone_fix/drone_1",
@@ -160,7 +158,7 @@ def test_a_lane_changes_only_when_the_state_does():
 def test_the_servo_turns_the_turntable_as_the_mount_says():
     state = ServoState(stamp_ns=0, position_rad=np.pi / 2, velocity_radps=0.5, goal_rad=1.0, error=4)
     marks = drawn(state, "servo/servo_state")
-    np.testing.assert_allclose(numbers(marks["plots/servo/servo/servo_state"].parts[0].scalars), [90.0, 57.29578])
+    np.testing.assert_allclose(marks["plots/servo/servo/servo_state"].values, [90.0, 57.29578])
     assert marks["states/servo"].parts[0].state.as_arrow_array().to_pylist() == ["error 0x04"]
     columns = numbers(marks["frames/turntable"].parts[0].mat3x3).reshape(3, 3)
     np.testing.assert_allclose(columns.T, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-7)  # Rerun stores columns
@@ -253,13 +251,11 @@ def test_a_message_of_unknown_type_is_visible_field_by_field():
         samples=np.arange(100.0),
     )
     marks = drawn(content, "power/unheard")
-    assert numbers(marks["plots/other/power/unheard/level_v"].parts[0].scalars) == [12.5]
-    assert numbers(marks["plots/other/power/unheard/count"].parts[0].scalars) == [3]
-    assert numbers(marks["plots/other/power/unheard/healthy"].parts[0].scalars) == [1]
+    assert marks["plots/other/power/unheard/level_v"].values == [12.5]
+    assert marks["plots/other/power/unheard/count"].values == [3]
+    assert marks["plots/other/power/unheard/healthy"].values == [1]
     assert marks["states/power/unheard/mood"].parts[0].state.as_arrow_array().to_pylist() == ["CALM"]
     assert marks["log/power/unheard/words"].parts[0].text.as_arrow_array().to_pylist() == ["hello"]
     assert marks["vehicle/power/unheard/points_vehicle_m"].frame == "vehicle"
-    assert len(numbers(marks["plots/other/power/unheard/covariance_m2"].parts[0].scalars)) == 9
-    np.testing.assert_allclose(
-        numbers(marks["plots/other/power/unheard/samples"].parts[0].scalars), [100, 0.0, 49.5, 99.0]
-    )
+    assert len(marks["plots/other/power/unheard/covariance_m2"].values) == 9
+    np.testing.assert_allclose(marks["plots/other/power/unheard/samples"].values, [100, 0.0, 49.5, 99.0])

@@ -68,7 +68,7 @@ def test_a_candidate_is_a_dot_by_probability_with_number_and_reason():
     assert words(marks["labels/detect/candidates"].parts[0].labels) == ["7: 20.0 %", "3: 99.9 %"]
     packed = numbers(dots.parts[0].colors).astype(int).ravel().tolist()
     assert packed == colours.by_probability(found.probability).tolist()
-    percent = numbers(marks["plots/probability/detect/candidates"].parts[0].scalars)
+    percent = marks["plots/probability/detect/candidates"].values
     np.testing.assert_allclose(percent, [99.9, 20.0])
     text = page(marks["candidates"])
     assert "- 7: 20.0 %, seen 0.5 s ago at 1.0 / 2.0 / 7.0 m: it may stand still" in text
@@ -89,7 +89,7 @@ def test_no_candidate_takes_the_dots_away():
     marks = drawn(candidates(1), "detect/candidates", where)
     assert len(numbers(marks["vehicle/detect/candidates"].parts[0].positions)) == 0
     assert len(numbers(marks["labels/detect/candidates"].parts[0].positions)) == 0
-    np.testing.assert_allclose(numbers(marks["plots/probability/detect/candidates"].parts[0].scalars), [0.0, 0.0])
+    np.testing.assert_allclose(marks["plots/probability/detect/candidates"].values, [0.0, 0.0])
     assert "no candidate" in page(marks["candidates"])
 
 
@@ -123,9 +123,7 @@ def test_an_answer_by_evidence_tells_why_each_candidate_was_refused():
     assert words(marks["vehicle/detect/detections/refused"].parts[0].labels) == [
         "candidate 5, 1.0 %: beside something big; if not a drone, a lamp, wire or edge"
     ]
-    np.testing.assert_allclose(
-        numbers(marks["plots/probability/detect/detections"].parts[0].scalars), [99.2, 1.0], atol=1e-9
-    )
+    np.testing.assert_allclose(marks["plots/probability/detect/detections"].values, [99.2, 1.0], atol=1e-9)
     assert "labels/detect/detections" not in marks  # it stands where the candidate was; Candidates tell where it is
     text = page(marks["candidates"])
     assert "- 5: 1.0 %, refused at -16.0 / -23.0 / 8.0 m: beside something big" in text
@@ -151,7 +149,7 @@ def test_each_drone_has_a_place_and_a_way_of_its_own():
         (strip,) = numbers(marks[f"vehicle/track/drone_fix/drone_{number}/trail"].parts[0].strips)
         assert [point[0] for point in strip] == x_m
         np.testing.assert_allclose(
-            numbers(marks[f"plots/position/track/drone_fix/drone_{number}"].parts[0].scalars), [x_m[-1], 4, 10 + number]
+            marks[f"plots/position/track/drone_fix/drone_{number}"].values, [x_m[-1], 4, 10 + number]
         )
         (text,) = words(marks[f"labels/track/drone_fix/drone_{number}"].parts[0].labels)
         assert text.startswith(f"drone {number}: ")
@@ -175,7 +173,7 @@ def test_a_coasting_drone_is_where_it_is_predicted_and_its_ellipsoid_grows():
         assert shape.frame == "vehicle"
         np.testing.assert_allclose(numbers(shape.parts[0].centers), [[3.0, 4.0, 11.0]])
         sizes.append(float(numbers(shape.parts[0].half_sizes)[0, 0]))
-        np.testing.assert_allclose(numbers(marks["plots/sigma/track/track_state/drone_1"].parts[0].scalars), [sigma_m])
+        np.testing.assert_allclose(marks["plots/sigma/track/track_state/drone_1"].values, [sigma_m])
     np.testing.assert_allclose(sizes, 2.7955 * np.array([0.1, 0.4, 1.6]), atol=1e-3)
     arrow = marks["vehicle/track/track_state/drone_1/velocity"].parts[0]
     np.testing.assert_allclose(numbers(arrow.origins), [[3.0, 4.0, 11.0]])
@@ -188,7 +186,7 @@ def test_a_lost_drone_leaves_its_way_and_nothing_else():
     drawn(fix(2), "track/drone_fix", where)
     drawn(state(TrackingState.TRACKING, 2), "track/track_state", where)
     marks = drawn(lost(2), "track/track_state", where)
-    cleared = {path for path, mark in marks.items() if isinstance(mark.parts[0], rr.Clear)}
+    cleared = {path for path, mark in marks.items() if mark.parts and isinstance(mark.parts[0], rr.Clear)}
     assert cleared == {
         "vehicle/track/track_state/drone_2",
         "vehicle/track/drone_fix/drone_2/ellipsoid_95",
@@ -287,8 +285,8 @@ def test_pulses_are_counted_per_slice_and_not_drawn():
     assert stamp_ns == 75 * 1_327_104  # 0.1 s; the packet after it is in the next slice
     marks = drawn(joined, "sweep/swept_pulses")
     assert set(marks) == {"plots/other/sweep/swept_pulses/pulses", "plots/other/sweep/swept_pulses/empty"}
-    np.testing.assert_allclose(numbers(marks["plots/other/sweep/swept_pulses/pulses"].parts[0].scalars), [76 * 4])
-    np.testing.assert_allclose(numbers(marks["plots/other/sweep/swept_pulses/empty"].parts[0].scalars), [50.0])
+    np.testing.assert_allclose(marks["plots/other/sweep/swept_pulses/pulses"].values, [76 * 4])
+    np.testing.assert_allclose(marks["plots/other/sweep/swept_pulses/empty"].values, [50.0])
 
 
 def test_a_slice_without_pulses_has_no_share():
@@ -298,7 +296,7 @@ def test_a_slice_without_pulses_has_no_share():
 
 def test_what_the_aim_asks_for_stands_beside_the_servos_angle():
     marks = drawn(ServoGoal(stamp_ns=0, position_rad=np.pi / 6, speed_radps=1.0), "aim/servo_goal")
-    np.testing.assert_allclose(numbers(marks["plots/servo/aim/servo_goal"].parts[0].scalars), [30.0])
+    np.testing.assert_allclose(marks["plots/servo/aim/servo_goal"].values, [30.0])
     held = [
         batch
         for batch in marks["plots/servo/aim/servo_goal"].style()
@@ -311,7 +309,7 @@ def test_the_vehicles_way_is_three_curves_and_a_yaw():
     R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     motion = VehicleMotion(stamp_ns=0, xyz_start_m=np.array([1.0, 2.0, 0.5]), R_start_vehicle=R, covariance=None)
     marks = drawn(motion, "odometry/vehicle_motion")
-    values = {path: numbers(mark.parts[0].scalars).tolist() for path, mark in marks.items()}
+    values = {path: mark.values.tolist() for path, mark in marks.items()}
     assert values == {
         "plots/other/odometry/vehicle_motion/position": [1.0, 2.0, 0.5],
         "plots/other/odometry/vehicle_motion/yaw": [pytest.approx(90.0)],

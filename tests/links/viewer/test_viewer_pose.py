@@ -41,7 +41,7 @@ def pose(**changes) -> RelativePose:
 
 
 def scalars(mark) -> list[float]:
-    return numbers(mark.parts[0].scalars).ravel().tolist()
+    return mark.values.tolist()
 
 
 def test_a_full_pose_has_axes_curves_and_sigmas_in_the_vehicle_s_axes():

@@ -20,7 +20,7 @@ NAME = "align/relative_rotation"
 
 
 def scalars(mark) -> list[float]:
-    return numbers(mark.parts[0].scalars).ravel().tolist()
+    return mark.values.tolist()
 
 
 def at_a_fix():

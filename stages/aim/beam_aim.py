@@ -26,6 +26,7 @@ from flow.stage import Stage
 from stages.aim.beams import Rotor, cheapest, low_discrepancy, nearest, rotor_azimuth_rad, sweep_step_rad
 from stages.aim.sweeping import Sweeping
 from stages.aim.targets import Key, Target, Targets
+from stages.aim.wandering import best_offset_m
 from stages.geometry import LidarMount
 from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, TrackState
 from stages.turntable import GearPlay
@@ -37,6 +38,7 @@ INNER_RAD = math.radians(8.0)
 GLANCE_RAD = math.radians(12.0)  # beside the sweep: its fan is 30 deg wide
 FRESH_NS = 350_000_000  # met a moment ago
 TARGET_SHARE = 0.5  # of its span: so wide a drone returns beams
+HALF_SHARE = 0.3  # of its span: a beam so far from its middle meets it now and then
 RPM_RADPS = math.tau / 60.0
 
 
@@ -203,11 +205,12 @@ class BeamAim(Stage):
         T, T_tl = self.mount.T_vehicle_turntable.matrix(), self.mount.T_turntable_lidar.matrix()
         speed_radps, travel_rad = self.limit_rpm * RPM_RADPS, self._travel_rad
         elevations_rad = now.elevations_rad if self.beams else (0.0,)
-        goal_rad, pass_ns = 0.0, servo.stamp_ns + round((self.lead_s + FIRST_GUESS_S) * 1e9)
+        offset_m, goal_rad, pass_ns = 0.0, 0.0, servo.stamp_ns + round((self.lead_s + FIRST_GUESS_S) * 1e9)
         for _ in range(2):  # the place at the pass depends on when that is
             place = T[:3, :3].T @ (target.at(pass_ns) - T[:3, 3])
             range_m = max(float(np.linalg.norm(place - T_tl[:3, 3])), 0.5)
-            offset_rad = self._offset_m(target, range_m) / range_m
+            offset_m = self._offset_m(target, range_m, pass_ns)
+            offset_rad = offset_m / range_m
             best = cheapest(self.mount, travel_rad, elevations_rad, centre_rad, place, offset_rad, inner_rad)
             if best is None and self.beams:
                 best = nearest(self.mount, travel_rad, place)
@@ -221,25 +224,29 @@ class BeamAim(Stage):
             way_s = abs(goal_rad - servo.position_rad) / speed_radps
             ready_ns = servo.stamp_ns + round((self.lead_s + self.settle_s + way_s) * 1e9)
             pass_ns = now.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, place, best.table_rad), ready_ns)
+        if target.wander_mps:
+            target.tried_m.append((target.wandered_m(pass_ns), offset_m))
         target.looks += 1
         target.missed += 1
         now.served += target.sure
         now.hold_until_ns = max(pass_ns + TOLD_NS, servo.stamp_ns + SHORTEST_LOOK_NS)
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=goal_rad, speed_radps=speed_radps)
 
-    def _offset_m(self, target: Target, range_m: float) -> float:
+    def _offset_m(self, target: Target, range_m: float, pass_ns: int) -> float:
         """How far beside the place the beam goes, look by look.
 
         A drone that is met: a little to each side, its edges tell where it is; a candidate, too, or it is met at the
         same edge for ever. One that was missed: half a drone to one
         side, to the other, farther, until the next beam of the fan has been where this one began.
         """
+        spacing_m = self._now.spacing_rad * range_m
+        if target.wander_mps:
+            return best_offset_m(target.wandered_m(pass_ns), target.tried_m, spacing_m, HALF_SHARE * self.span_m)
         tries = target.missed - 1 if target.sure else target.missed
         if tries < 1 and (target.sure or target.looks):
             near = 0.35 * min(1.0, 10.0 / range_m)
             wide_m = (0.06 + near) * self.span_m + 0.35 * target.sigma_m if target.sure else 0.5 * near * self.span_m
             return wide_m * low_discrepancy(target.looks % 16)
-        spacing_m = self._now.spacing_rad * range_m
         count = max(math.ceil(spacing_m / (TARGET_SHARE * self.span_m)), 1)
         k = tries % count
         return (k + 1) // 2 * (1 if k % 2 else -1) * spacing_m / count

@@ -35,10 +35,18 @@ class Target:
     seen_looks: int = 0  # turns in which the detector saw it
     looks: int = 0  # planned for it
     missed: int = 0  # of them since it was seen last
-    heard_ns: int = 0
+    heard_ns: int = 0  # seen, if it is a candidate
+    wander_mps: float = 0.0  # level, nobody knows whither
+    tried_m: list[tuple[float, float]] = field(
+        default_factory=lambda: list[tuple[float, float]]()
+    )  # see `wandering.py`
 
     def at(self, stamp_ns: int) -> Array64:
         return self.xyz_m + self.velocity_mps * ((stamp_ns - self.stamp_ns) * 1e-9)
+
+    def wandered_m(self, stamp_ns: int) -> float:
+        """How far it has flown since it was seen, nobody knows whither."""
+        return self.wander_mps * max(stamp_ns - self.heard_ns, 0) * 1e-9
 
 
 @dataclass(slots=True, eq=False)
@@ -65,6 +73,7 @@ class Targets:
             if candidates.stamp_ns < rest_until_ns:
                 continue
             old = self.known.get(("candidate", number))
+            again = old is None or int(candidates.seen_ns[i]) > old.heard_ns
             age_s = (candidates.stamp_ns - int(candidates.seen_ns[i])) * 1e-9
             self.known[("candidate", number)] = Target(
                 key=("candidate", number),
@@ -77,8 +86,10 @@ class Targets:
                 seen_looks=int(candidates.looks[i]),
                 glance=old.glance if old else False,
                 looks=old.looks if old else 0,
-                missed=old.missed if old and int(candidates.seen_ns[i]) <= old.heard_ns else 0,
+                missed=0 if old is None or again else old.missed,
                 heard_ns=int(candidates.seen_ns[i]),
+                wander_mps=0.0 if candidates.wander_mps is None else float(candidates.wander_mps[i]),
+                tried_m=[] if old is None or again else old.tried_m,
             )
 
     def hear_state(self, state: TrackState) -> None:

@@ -258,13 +258,16 @@ class EvidenceDetect(Stage):
         now.watches = {c.number: now.watches[c.number] for c in kept if c.number in now.watches}
         return gone
 
-    def _usual_flight(self, now: _Now, now_ns: int) -> tuple[Array64, float]:
-        """How a drone flies now, one sigma on each axis: as fast as it says; else it comes along with the vehicle."""
+    def _usual_flight(self, now: _Now, now_ns: int) -> tuple[Array64, float, float]:
+        """How a drone flies now, one sigma on each axis: as fast as it says; else it comes along with the vehicle.
+
+        And the level speed that it says it has, 0 when it is silent.
+        """
         speeds = [told.speed_mps(now_ns) for told in now.told]
         for speed in speeds:
             if speed is not None:
-                return np.array([0.0, 0.0, speed[1]]), 0.3 + 0.7 * speed[0]
-        return now.trail.velocity_mps(now_ns), START_SPEED_MPS / 2
+                return np.array([0.0, 0.0, speed[1]]), 0.3 + 0.7 * speed[0], speed[0]
+        return now.trail.velocity_mps(now_ns), START_SPEED_MPS / 2, 0.0
 
     def _drone_moves(self, now: _Now, stamp_ns: int) -> bool:
         """Whether the drone says that it flies: then it is not what stands where something stood."""
@@ -291,8 +294,8 @@ class EvidenceDetect(Stage):
         new = [c for c in now.bank if c.accepted and not c.announced]
         if changed or new:
             told = [c for c in now.bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
-            usual_mps, spread_mps = self._usual_flight(now, now_ns)
-            yield candidates_message(told, now.trail, now_ns, self.max_candidates, usual_mps, spread_mps)
+            flight = self._usual_flight(now, now_ns)
+            yield candidates_message(told, now.trail, now_ns, self.max_candidates, *flight)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9
         here = any(c.accepted and c.seen_ns >= now.start_ns for c in now.bank)

@@ -28,11 +28,23 @@ def odds_of(p: float) -> float:
 
 
 def candidates_message(
-    bank: list[Candidate], trail: VehicleTrail, now_ns: int, at_most: int, usual_mps: Array64, spread_mps: float
+    bank: list[Candidate],
+    trail: VehicleTrail,
+    now_ns: int,
+    at_most: int,
+    usual_mps: Array64,
+    spread_mps: float,
+    said_mps: float,
 ) -> Candidates:
-    """The candidates where they are if they are drones, most probable first; see `Candidate.as_drone`."""
+    """The candidates where they are if they are drones, most probable first; see `Candidate.as_drone`.
+
+    `said_mps`: the level speed that the drone says it has, 0 when it is silent.
+    """
     listed = sorted(bank, key=lambda c: -c.odds)[:at_most]
-    seen = [trail.to_vehicle(now_ns, *c.as_drone(now_ns, usual_mps, spread_mps)) for c in listed]
+    wander_mps = [said_mps if c.hit_looks == 1 else 0.0 for c in listed]
+    spreads_mps = [0.0 if wander else spread_mps for wander in wander_mps]
+    drones = [c.as_drone(now_ns, usual_mps, spread) for c, spread in zip(listed, spreads_mps, strict=True)]
+    seen = [trail.to_vehicle(now_ns, *drone) for drone in drones]
     return Candidates(
         stamp_ns=now_ns,
         candidate_id=np.array([c.number for c in listed], dtype=np.int64),
@@ -42,6 +54,7 @@ def candidates_message(
         seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
         looks=np.array([c.hit_looks for c in listed], dtype=np.int64),
         reasons=tuple(c.why for c in listed),
+        wander_mps=np.array(wander_mps, dtype=np.float64),
     )
 
 

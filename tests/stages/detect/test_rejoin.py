@@ -75,7 +75,7 @@ def test_nothing_is_met_by_what_was_not_worth_a_look_or_while_the_drone_was_sile
 
 def test_of_several_the_one_that_fits_best_is_met():
     near, nearer = seen_before(number=7), seen_before(number=8)
-    near.path_m[-1] = BEFORE_M + [0.0, 0.0, 0.25]
+    near.path_m[-1] = BEFORE_M + np.array([0.0, 0.0, 0.25])
     now = sighting(PAUSE_S, BEFORE_M + PAUSE_S * SAID_MPS)
     assert GATE > 1
     met = met_again([near, nearer], now, telemetry())

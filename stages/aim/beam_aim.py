@@ -24,9 +24,9 @@ from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
 from stages.aim.beams import Rotor, cheapest, low_discrepancy, nearest, rotor_azimuth_rad, sweep_step_rad
+from stages.aim.beside import Look, best_offset_m
 from stages.aim.sweeping import Sweeping
 from stages.aim.targets import Key, Target, Targets
-from stages.aim.wandering import best_offset_m
 from stages.geometry import LidarMount
 from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, TrackState
 from stages.turntable import GearPlay
@@ -37,7 +37,6 @@ FIRST_GUESS_S = 0.05  # to the rotor's next pass
 INNER_RAD = math.radians(8.0)
 GLANCE_RAD = math.radians(12.0)  # beside the sweep: its fan is 30 deg wide
 FRESH_NS = 350_000_000  # met a moment ago
-TARGET_SHARE = 0.5  # of its span: so wide a drone returns beams
 HALF_SHARE = 0.3  # of its span: a beam so far from its middle meets it now and then
 RPM_RADPS = math.tau / 60.0
 
@@ -224,8 +223,7 @@ class BeamAim(Stage):
             way_s = abs(goal_rad - servo.position_rad) / speed_radps
             ready_ns = servo.stamp_ns + round((self.lead_s + self.settle_s + way_s) * 1e9)
             pass_ns = now.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, place, best.table_rad), ready_ns)
-        if target.wander_mps:
-            target.tried_m.append((target.wandered_m(pass_ns), offset_m))
+        target.tried.append(Look(target.reach_m(pass_ns), offset_m))
         target.looks += 1
         target.missed += 1
         now.served += target.sure
@@ -236,20 +234,15 @@ class BeamAim(Stage):
         """How far beside the place the beam goes, look by look.
 
         A drone that is met: a little to each side, its edges tell where it is; a candidate, too, or it is met at the
-        same edge for ever. One that was missed: half a drone to one
-        side, to the other, farther, until the next beam of the fan has been where this one began.
+        same edge for ever. One that was missed, or was met only once: where it most likely is by now.
         """
-        spacing_m = self._now.spacing_rad * range_m
-        if target.wander_mps:
-            return best_offset_m(target.wandered_m(pass_ns), target.tried_m, spacing_m, HALF_SHARE * self.span_m)
-        tries = target.missed - 1 if target.sure else target.missed
-        if tries < 1 and (target.sure or target.looks):
+        if not target.tried and (target.sure or (target.looks and not target.wander_mps)):
             near = 0.35 * min(1.0, 10.0 / range_m)
             wide_m = (0.06 + near) * self.span_m + 0.35 * target.sigma_m if target.sure else 0.5 * near * self.span_m
             return wide_m * low_discrepancy(target.looks % 16)
-        count = max(math.ceil(spacing_m / (TARGET_SHARE * self.span_m)), 1)
-        k = tries % count
-        return (k + 1) // 2 * (1 if k % 2 else -1) * spacing_m / count
+        reach_m, headed = target.reach_m(pass_ns), target.wander_mps > 0.0
+        spacing_m = self._now.spacing_rad * range_m
+        return best_offset_m(reach_m, headed, target.tried, spacing_m, HALF_SHARE * self.span_m)
 
     # search
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from stages.aim.beside import Look
 from stages.geometry import Array64
 from stages.messages import Candidates, TrackingState, TrackState
 
@@ -37,16 +38,16 @@ class Target:
     missed: int = 0  # of them since it was seen last
     heard_ns: int = 0  # seen, if it is a candidate
     wander_mps: float = 0.0  # level, nobody knows whither
-    tried_m: list[tuple[float, float]] = field(
-        default_factory=lambda: list[tuple[float, float]]()
-    )  # see `wandering.py`
+    tried: list[Look] = field(default_factory=lambda: list[Look]())  # since it was seen last
 
     def at(self, stamp_ns: int) -> Array64:
         return self.xyz_m + self.velocity_mps * ((stamp_ns - self.stamp_ns) * 1e-9)
 
-    def wandered_m(self, stamp_ns: int) -> float:
-        """How far it has flown since it was seen, nobody knows whither."""
-        return self.wander_mps * max(stamp_ns - self.heard_ns, 0) * 1e-9
+    def reach_m(self, stamp_ns: int) -> float:
+        """How far beside its place it may be: one sigma; or how far it has flown since it was seen, if it wanders."""
+        if self.wander_mps:
+            return self.wander_mps * max(stamp_ns - self.heard_ns, 0) * 1e-9
+        return self.sigma_m
 
 
 @dataclass(slots=True, eq=False)
@@ -80,7 +81,7 @@ class Targets:
                 stamp_ns=candidates.stamp_ns,
                 xyz_m=candidates.xyz_vehicle_m[i],
                 velocity_mps=candidates.velocity_vehicle_mps[i],
-                sigma_m=0.2 + 2.0 * age_s,
+                sigma_m=0.15 + 1.0 * age_s,  # seen some times, its velocity is known to a metre a second
                 sure=False,
                 probability=float(candidates.probability[i]),
                 seen_looks=int(candidates.looks[i]),
@@ -89,7 +90,7 @@ class Targets:
                 missed=0 if old is None or again else old.missed,
                 heard_ns=int(candidates.seen_ns[i]),
                 wander_mps=0.0 if candidates.wander_mps is None else float(candidates.wander_mps[i]),
-                tried_m=[] if old is None or again else old.tried_m,
+                tried=[] if old is None or again else old.tried,
             )
 
     def hear_state(self, state: TrackState) -> None:
@@ -112,6 +113,7 @@ class Targets:
             sure=True,
             looks=old.looks if old else 0,
             missed=old.missed if old and state.hits == 0 else 0,
+            tried=old.tried if old and state.hits == 0 else [],
             heard_ns=state.stamp_ns if seen or old is None else old.heard_ns,
         )
 

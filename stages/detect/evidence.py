@@ -156,7 +156,10 @@ class EvidenceDetect(Stage):
         best = now.bank.fitting(s) or self._wake(now, s)
         if best is not None:
             return self._see(now, best, s) or both is not None
-        if both is None:
+        since_ns = s.stamp_ns - (AMONG_NS if self.parked or now.trail.known else AMONG_NS // 20)
+        refused_m = now.refused_places.nearest_m(s.xyz_local_m, 0.0, AMONG_M, since_ns)
+        among = math.isfinite(refused_m)
+        if both is None and not among and not math.isfinite(s.big_m):  # in a tree something lies everywhere
             self._join(now, s)
         now.number += 1
         new = Candidate(
@@ -169,9 +172,7 @@ class EvidenceDetect(Stage):
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
             first_hits=s.hits,
         )
-        since_ns = s.stamp_ns - (AMONG_NS if self.parked or now.trail.known else AMONG_NS // 20)
-        refused_m = now.refused_places.nearest_m(s.xyz_local_m, 0.0, AMONG_M, since_ns)
-        new.among, new.again = math.isfinite(refused_m), refused_m < SAME_PLACE_M and self._drone_moves(now, s.stamp_ns)
+        new.among, new.again = among, refused_m < SAME_PLACE_M and self._drone_moves(now, s.stamp_ns)
         new.note(s)
         news = self._weigh(now, new)
         if new.told:

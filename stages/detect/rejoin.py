@@ -41,7 +41,7 @@ def met_again(
         return None
     best, least, velocity = None, GATE**2, np.zeros(3)
     for c in candidates:
-        if not c.told or not SOONEST_NS < s.stamp_ns - c.seen_ns < LATEST_NS:
+        if not c.told or c.among or c.big_looks or not SOONEST_NS < s.stamp_ns - c.seen_ns < LATEST_NS:
             continue
         then = telemetry.state(c.seen_ns)
         if then is None:

@@ -66,7 +66,7 @@ class Evidence(BaseModel):
     among: float = 2.0  # something was refused beside it, lately: wires are long
     again: float = 4.0  # and more in the very place, while the drone says that it flies
 
-    joined: float = 2.0  # two things that by chance lie as the drone flew; shared by the looks since
+    joined: float = 3.0  # two things that by chance lie as the drone flew; shared by the looks since
 
     bird: float = -0.5
     calm: float = 8.0  # each second in which it would have shown a bird's speed or turn

@@ -341,10 +341,10 @@ def test_looks_that_miss_go_beside_it_until_a_whole_beam_spacing_is_covered(besi
         if round(t_s * 1000) % 100 == 0:
             if sure:
                 coasting = TrackingState.TRACKING if t_s == 0 else TrackingState.COASTING
-                state = track_state(still(*expected_m), t_s, coasting, sigma_m=0.05)
+                state = track_state(still(*expected_m), t_s, coasting, sigma_m=0.05 + 0.3 * t_s)
                 aim.on_state(replace(state, hits=0))
             else:
-                aim.on_candidates(candidates(expected_m, t_s, 0.7, seen_s=0.0))
+                aim.on_candidates(candidates(expected_m, t_s, 0.95, seen_s=0.0))
 
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 0.9, tell, start_rad=math.radians(60.0))
     missed = flight.missed_m(way)[1:]

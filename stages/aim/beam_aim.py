@@ -234,11 +234,13 @@ class BeamAim(Stage):
         """How far beside the place the beam goes, look by look.
 
         A drone that is met: a little to each side, its edges tell where it is; a candidate, too, or it is met at the
-        same edge for ever. One that was missed, or was met only once: where it most likely is by now.
+        same edge for ever, and a wire along the beam's way would seem to fly. One that was missed, or was met only
+        once: where it most likely is by now.
         """
         if not target.tried and (target.sure or (target.looks and not target.wander_mps)):
-            near = 0.35 * min(1.0, 10.0 / range_m)
-            wide_m = (0.06 + near) * self.span_m + 0.35 * target.sigma_m if target.sure else 0.5 * near * self.span_m
+            wide_m = 0.175 * self.span_m * min(1.0, 20.0 / range_m)
+            if target.sure:
+                wide_m = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * self.span_m + 0.35 * target.sigma_m
             return wide_m * low_discrepancy(target.looks % 16)
         reach_m, headed = target.reach_m(pass_ns), target.wander_mps > 0.0
         spacing_m = self._now.spacing_rad * range_m

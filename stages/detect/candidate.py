@@ -26,6 +26,7 @@ FADING = 0.95  # what stood beside it counts less with each look since
 ALONE_PER_M = 0.0165  # share of looks at a drone that find one return alone (nearby: few), over range
 WIRE_ALONE = 0.75  # and of those at a wire
 FEW_M = 24.0  # over range: so few returns are few even nearby; a sixth of those of a beam across a drone of 0.5 m
+SOME_M = 36.0  # and so few are no more a drone's than a wire's
 SIGMA_M = 0.15  # of a sighting
 STANDING_M = 0.6  # what stands is met again within this
 ACCELERATION_MPS2 = 4.0
@@ -124,7 +125,8 @@ class Candidate:
         self.long_looks += s.too_long
         alone = min(max(ALONE_PER_M * s.range_m, 0.1), 0.7)
         few = s.hits <= max(1.0, FEW_M / s.range_m)
-        self.few += math.log(alone / WIRE_ALONE) if few else math.log((1 - alone) / (1 - WIRE_ALONE))
+        if few or s.hits > SOME_M / s.range_m:
+            self.few += math.log(alone / WIRE_ALONE) if few else math.log((1 - alone) / (1 - WIRE_ALONE))
         self.balls += s.balls
         self.rugged += s.rugged
         standing, measured = what_stands_beside(s.around, self.free)

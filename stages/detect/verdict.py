@@ -142,7 +142,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     if c.long_looks:
         said.append("longer than a drone")
     if c.heard is not None:
-        wire = few < -1.0 and c.range_m < e.unseen_m  # farther off a wire returns nothing
+        wire = c.range_m < (e.unseen_m if few < -1.0 else e.wire_m)  # farther off a wire returns little, then nothing
         told = c.heard.over_wire if wire else c.heard.over_still
         moved = e.told * told > 3.0
         odds += believed(told, e)

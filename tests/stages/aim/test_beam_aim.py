@@ -364,7 +364,7 @@ def test_a_candidate_that_is_met_is_looked_at_a_little_to_each_side_of_its_middl
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 1.5, tell, start_rad=math.radians(60.0))
     assert len(looks_of(flight)) > 10
     goals_m = 20.0 * np.array([goal for _, goal in looks_of(flight)])
-    assert 0.02 < np.ptp(goals_m) < 0.15
+    assert 0.02 < np.ptp(goals_m) < 0.2
 
 
 @pytest.mark.parametrize(("patience", "probability", "looks"), [(5, 0.999, 5), (8, 0.999, 8), (8, 0.6, 5), (8, 0.4, 3)])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from stages.detect.candidate import ALONE_PER_M, FEW_M, OPEN_LOOKS, STANDING_M, WIRE_ALONE, Candidate, Sighting
+from stages.detect.candidate import ALONE_PER_M, FEW_M, OPEN_LOOKS, SOME_M, STANDING_M, WIRE_ALONE, Candidate, Sighting
 from stages.detect.surroundings import FARTHER_0, FREE_0, TALLY
 from tests.stages.made import START_NS
 
@@ -57,16 +57,17 @@ def way(velocity_mps, looks=10, step_s=0.1):
 @pytest.mark.parametrize("range_m", [20.0, 30.0, 40.0])
 def test_from_20_m_on_one_return_alone_is_few(range_m):
     share = ALONE_PER_M * range_m
-    one, two = (candidate(sighting(0.0, hits=n, range_m=range_m)).few for n in (1, 2))
+    one, three = (candidate(sighting(0.0, hits=n, range_m=range_m)).few for n in (1, 3))
     assert one == pytest.approx(math.log(share / WIRE_ALONE))
-    assert two == pytest.approx(math.log((1 - share) / (1 - WIRE_ALONE)))
+    assert three == pytest.approx(math.log((1 - share) / (1 - WIRE_ALONE)))
 
 
 @pytest.mark.parametrize("range_m", [3.0, 5.0, 9.0])
 def test_nearby_as_many_are_few_as_a_sixth_of_a_beam_across_the_drone(range_m):
     limit = int(FEW_M / range_m)
     assert candidate(sighting(0.0, hits=limit, range_m=range_m)).few < 0
-    assert candidate(sighting(0.0, hits=limit + 1, range_m=range_m)).few > 0
+    assert candidate(sighting(0.0, hits=limit + 1, range_m=range_m)).few == 0.0
+    assert candidate(sighting(0.0, hits=int(SOME_M / range_m) + 1, range_m=range_m)).few > 0
 
 
 def test_the_share_of_few_is_bounded_nearby_and_far_off():

@@ -270,10 +270,10 @@ def test_an_autopilot_that_tells_its_odometry_is_understood_however_the_drone_is
 
 
 def test_what_glides_by_while_the_drone_hangs_is_a_bird():
-    glider = [Drone(GLIDING, span_m=0.4)]
+    glider = [Drone(GLIDING, span_m=0.5)]
     _, silent = run(glider)
     assert accepted_after_s(silent) < 2.5  # nothing else would tell it from a drone
-    candidates, detections = run([Drone(GLIDING, span_m=0.4)], say=saying(still(0.0, 0.0, 0.0)))
+    candidates, detections = run([Drone(GLIDING, span_m=0.5)], say=saying(still(0.0, 0.0, 0.0)))
     assert accepted_after_s(detections) == math.inf
     assert candidates[-1].probability.max() < 0.05
     assert "it flies as the drone says" not in candidates[-1].reasons[0]

@@ -2,7 +2,8 @@
 
 `include:` composes files (they come first, the including file on top), overlay files and `--set track.radius_m=0.8`
 change what is there, `$rig.lidar.mount` stands for another value of the tree. Mappings merge, everything else is
-replaced, `null` removes a stage or link, and a stage whose `use` changes starts with an empty `config`.
+replaced, `null` removes a stage or link, a stage whose `use` changes starts with an empty `config`, and a lens whose
+`model` changes is replaced: other numbers belong to it.
 
 Source: ours. YAML 1.1 through PyYAML's safe loader: no object construction, bounded sizes.
 """
@@ -231,8 +232,10 @@ def _merge_mapping(base: Tree, top: Tree, path: Path_, below: dict[str, Any], ab
     for key, value in above.items():
         here = (*path, key)
         if isinstance(value, dict) and isinstance(below.get(key), dict):
-            _merge_mapping(base, top, here, below[key], cast("dict[str, Any]", value))
-            continue
+            values = cast("dict[str, Any]", value)
+            if key != "lens" or values.get("model") in (None, below[key].get("model")):
+                _merge_mapping(base, top, here, below[key], values)
+                continue
         _forget(base, here)
         if value is None and len(here) == 2 and here[0] in ("stages", "links"):
             if below.pop(key, None) is None:

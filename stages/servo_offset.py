@@ -4,7 +4,8 @@ Where the servo's stamps are early by dt, a surface passed at the rate w is plac
 back it is placed as far on the other side. Of some seconds in which the servo has passed the same angles both ways,
 the dt is taken under which what was seen twice is one thin surface: the least squares of `grd calibrate`
 (stages/calibration), with the mount's other numbers held near the rig's. Windows are then joined by a Kalman filter
-with a slow random walk.
+with a slow random walk. A window costs a fifth of a second of a core; so once the offset is known to 1 ms, only
+each `every_window`-th is taken.
 
 Told and not applied: people put it into the rig (`servo_time_offset_s`). Nothing is told of a window in which the
 vehicle moved, or the servo did not turn both ways. Play of the gear looks like a delay at one speed: the rig's
@@ -35,7 +36,8 @@ STEP_RAD = math.tau / 4096  # of the MX-28's encoder
 MOVING_RADPS = 0.1  # slower, a state says nothing of the direction
 BIN_RAD = math.radians(0.5)
 START_SIGMA_S = 0.02
-CLOSE_S = 1e-3  # with a sigma below, fewer rounds do
+CLOSE_S = 1e-3  # with a sigma below, fewer rounds do, and fewer windows
+TRACE_NS = 500_000_000  # of servo states before a window
 AXIS_SIGMA_M = 3e-3
 FEWEST_PATCHES = 20
 OUTLIER = 5.0  # sigmas of a window from what the others say
@@ -50,6 +52,9 @@ class ServoClock(Stage):
     mount: LidarMount
     window_s: float = Field(3.0, ge=1, le=20)
     every_packet: int = Field(12, ge=1, le=100)  # of the LiDAR's packets this one is taken
+    every_window: int = Field(
+        10, ge=1, le=1000
+    )  # of the windows this one is taken, once the offset is known to CLOSE_S
     both_ways_deg: float = Field(5.0, gt=0)  # so much has to be passed in both directions
     play_sigma_deg: float = Field(0.05, gt=0)  # how well the rig knows the gear's play
     angle_sigma_deg: float = Field(0.05, gt=0)  # and the LiDAR's tilt and the encoder's error
@@ -65,6 +70,7 @@ class ServoClock(Stage):
     _variance_s2: float = PrivateAttr(default=START_SIGMA_S**2)
     _windows: int = PrivateAttr(default=0)
     _known_ns: int | None = PrivateAttr(default=None)
+    _resting_until_ns: int = PrivateAttr(default=0)
     _prior: Array64 = PrivateAttr()
     _rig: ServoMount = PrivateAttr()
 
@@ -78,24 +84,30 @@ class ServoClock(Stage):
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Where the vehicle is."""
+        if motion.stamp_ns < self._resting_until_ns:
+            self._places.clear()
         self._places.append(motion.xyz_start_m)
 
     def on_servo(self, servo: ServoState) -> None:
         """Where the servo is."""
+        if servo.stamp_ns < self._resting_until_ns - TRACE_NS:
+            return
         if not self._states or servo.stamp_ns > self._states[-1].stamp_ns:
             self._states.append(servo)
 
     def on_firings(self, firings: LidarFirings) -> Iterator[ServoOffset]:
         """Collect; with a whole window, what it says."""
-        if not self.mount.turns or firings.pulse_stamp_ns.size == 0:
+        if not self.mount.turns or firings.pulse_stamp_ns.size == 0 or firings.stamp_ns < self._resting_until_ns:
             return
         self._packets += 1
         if self._packets % self.every_packet == 0:
             self._firings.append(firings)
         if self._firings and firings.stamp_ns - self._firings[0].stamp_ns > self.window_s * 1e9:
             reason = self._take_window()
+            if self._known_ns == self._firings[-1].stamp_ns and self._variance_s2 < CLOSE_S**2:
+                self._resting_until_ns = firings.stamp_ns + round((self.every_window - 1) * self.window_s * 1e9)
             self._firings, self._places = [], self._places[-1:]
-            self._states = [s for s in self._states if s.stamp_ns > firings.stamp_ns - 500_000_000]
+            self._states = [s for s in self._states if s.stamp_ns > firings.stamp_ns - TRACE_NS]
             yield self._told(firings.stamp_ns, reason)
 
     def _told(self, stamp_ns: int, reason: str) -> ServoOffset:

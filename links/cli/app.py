@@ -11,6 +11,7 @@ from links.cli.calibrate import calibrate_recording
 from links.cli.evaluate import evaluate_runs
 from links.cli.files import import_recording, recover_recording, simulate_matrix, simulate_recording, view
 from links.cli.graphs import check, graph, schema
+from links.cli.lens import import_lens
 from links.cli.preflight import preflight
 from links.cli.run import replay_recording, run
 
@@ -34,6 +35,7 @@ app.command("matrix")(simulate_matrix)
 app.command("view")(view)
 app.command("preflight")(preflight)
 app.command("calibrate")(calibrate_recording)
+app.command("lens")(import_lens)
 app.command("evaluate")(evaluate_runs)
 
 

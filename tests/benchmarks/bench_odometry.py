@@ -22,6 +22,8 @@ from stages.pictures.two_view import Noise, relative_motion
 from stages.rotation import exp_rotation, log_rotation
 from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, degrees_between, lidar_slice, of, picture, point_rays
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 PICTURES = 16
 STEP_NS = 66_000_000
 WIDEST = math.cos(math.radians(80.0))
@@ -37,14 +39,6 @@ def flight(size_px, mount):
     """Pictures of a turning, flying camera."""
     C = mount.matrix()[:3, :3]
     return [picture(pose(k)[0] @ C, pose(k)[1], k, size_px) for k in range(PICTURES)]
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    yield
-    cv2.setNumThreads(threads)
 
 
 @pytest.mark.parametrize("size_px", [720, 1080, 1440])

@@ -38,6 +38,8 @@ LU = """
 import json, sys, time
 import cv2
 from lu_vp_detect import VPDetection
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 cv2.setNumThreads(1)
 focal, cx, cy, *paths = json.load(sys.stdin)
 detector = VPDetection(30, (cx, cy), focal, seed=1)
@@ -52,14 +54,6 @@ for path in paths:
     out.append((min(seconds), found))
 print(json.dumps(out))
 """
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    yield
-    cv2.setNumThreads(threads)
 
 
 def courtyard(size_px):

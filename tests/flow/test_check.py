@@ -271,6 +271,22 @@ def test_a_stage_swapped_in_an_overlay_starts_with_its_own_settings(tmp_path):
         load_graph(tmp_path / "x.yaml", overlays=[tmp_path / "over.yaml"])
 
 
+def test_a_lens_of_another_model_has_none_of_the_numbers_of_the_one_below(tmp_path):
+    rig = "rig: {cameras: {a: {size_px: 9, lens: {model: equidistant, focal_px: 3, centre_px: [1, 2]}}}}\n"
+    (tmp_path / "x.yaml").write_text(rig + GRAPH)
+    lenses = []
+    for lens in ("{model: ocam, centre_px: [4, 5]}", "{model: equidistant, focal_px: 4}", "{centre_px: [6, 7]}"):
+        (tmp_path / "over.yaml").write_text(f"rig: {{cameras: {{a: {{lens: {lens}}}}}}}\n")
+        camera = load_graph(tmp_path / "x.yaml", overlays=[tmp_path / "over.yaml"]).values["rig"]["cameras"]["a"]
+        assert camera["size_px"] == 9
+        lenses.append(camera["lens"])
+    assert lenses == [
+        {"model": "ocam", "centre_px": [4, 5]},
+        {"model": "equidistant", "focal_px": 4, "centre_px": [1, 2]},
+        {"model": "equidistant", "focal_px": 3, "centre_px": [6, 7]},
+    ]
+
+
 def test_an_include_lies_below_and_its_errors_name_its_own_file(tmp_path):
     (tmp_path / "base.yaml").write_text(GRAPH.replace("{name: adder}", "{name: adder, window: 0}"))
     found = only_problem(tmp_path, "include: base.yaml\nstages:\n  double: {config: {factor: 5}}\n")

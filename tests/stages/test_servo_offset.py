@@ -113,7 +113,22 @@ def test_only_angles_passed_both_ways_count():
     assert both_ways_rad(stamp_ns, np.full(200, 0.5)) == 0
 
 
-@pytest.mark.parametrize("setting", [{"window_s": 0.1}, {"every_packet": 0}, {"floor_s": 0}, {"typo": 1}])
+def test_once_it_is_known_it_rests_and_what_happens_meanwhile_does_not_count(recorded):
+    later = [dataclasses.replace(m, stamp_ns=m.stamp_ns + 7_000_000_000) for m in recorded[1]]
+    twice = recorded[0], [*recorded[1], *later]
+    each = told(twice, to_s=20.0, every_window=1)
+    stage_s = [(offset.stamp_ns - each[0].stamp_ns) * 1e-9 for offset in told(twice, to_s=20.0, every_window=3)]
+    assert len(each) > 2
+    assert len(stage_s) == 2
+    assert stage_s[1] > 3 * 2.4 - 0.1
+    moved = told(twice, to_s=20.0, every_window=3, motion=[driven(0.0), driven(0.1)])
+    assert moved[0].reason == "the vehicle moved"
+    assert moved[1].stamp_ns - moved[0].stamp_ns < 3e9  # nothing was known: it goes on at once
+
+
+@pytest.mark.parametrize(
+    "setting", [{"window_s": 0.1}, {"every_window": 0}, {"every_packet": 0}, {"floor_s": 0}, {"typo": 1}]
+)
 def test_impossible_clock_settings_are_errors(setting):
     with pytest.raises(ValidationError):
         ServoClock(mount=LidarMount(), **setting)

@@ -22,6 +22,7 @@ from links.simulated.run import simulate_records
 from links.simulated.scenario import Scenario, load_scenario
 from stages.geometry import rotation_z
 from stages.messages import AutopilotStatus, DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry
+from tests.links.simulated.test_simulated_drift import NO_DRIFT
 
 M = TypeVar("M")
 S, MS = 1_000_000_000, 1_000_000
@@ -32,15 +33,6 @@ ORBIT = Path(
         Waypoint(t_s=t, xyz_m=(10 * np.cos(0.4 * t), 10 * np.sin(0.4 * t), 15), yaw_deg=np.degrees(0.4 * t) + 90)
         for t in np.arange(0.0, 23.0)
     )
-)
-NO_DRIFT = DriftSettings(
-    scale=0,
-    yaw_rate_deg_per_min=0,
-    yaw_walk_deg_per_sqrt_s=0,
-    position_walk_m_per_sqrt_s=0,
-    velocity_mps=0,
-    height_m=0,
-    lean_deg=0,
 )
 STREET = FilePath(__file__).parents[3] / "configs/scenarios/street_sweep.yaml"
 

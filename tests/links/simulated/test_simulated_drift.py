@@ -14,7 +14,7 @@ from links.simulated.series import between_steps, gauss_markov, random_walk
 from links.simulated.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
 from stages.geometry import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg, rotations_from_xyzw
 
-NONE = DriftSettings(
+NO_DRIFT = DriftSettings(
     scale=0,
     yaw_rate_deg_per_min=0,
     yaw_walk_deg_per_sqrt_s=0,
@@ -29,7 +29,7 @@ START_NS = 1_748_773_230_000_000_000
 
 
 def _estimate(position: np.ndarray = STRAIGHT, yaw: float = 0.0, seed: int = 1, **errors: float) -> DriftingEstimate:
-    return DriftingEstimate(position, yaw, NONE.model_copy(update=errors), np.random.default_rng(seed))
+    return DriftingEstimate(position, yaw, NO_DRIFT.model_copy(update=errors), np.random.default_rng(seed))
 
 
 def test_without_errors_it_is_the_truth_in_a_frame_of_its_own() -> None:
@@ -130,7 +130,7 @@ DRIVE = Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(0, 8 * t, 0), yaw_deg=90) fo
 
 
 def test_the_vehicles_odometry_starts_at_zero_and_drifts_with_the_way_driven() -> None:
-    exact = VehicleOdometry(VehicleOdometrySettings.model_validate({"drift": dict(NONE)}), DRIVE, START_NS, 20.0, 1)
+    exact = VehicleOdometry(VehicleOdometrySettings.model_validate({"drift": dict(NO_DRIFT)}), DRIVE, START_NS, 20.0, 1)
     records = exact.records(START_NS + 21_000_000_000)
     assert len(records) == 1000
     first, last = (json.loads(records[i].data) for i in (0, -1))

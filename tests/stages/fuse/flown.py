@@ -26,7 +26,7 @@ from stages.fuse import Fuse
 from stages.geometry import rotation_from_quaternion_xyzw
 from stages.messages import DroneFix, PoseState, RelativePose, RelativeRotation
 from stages.rotation import exp_rotation, log_rotation
-from tests.stages.fuse.made_drone_flight import gauss_markov, rotation
+from tests.stages.fuse.made_drone_flight import Errors, add_errors, gauss_markov, rotation
 
 GRID_S = 0.02
 CHI2_95_3 = 7.814728
@@ -185,16 +185,12 @@ def with_rotations(flown: Flown, wrong_quarter: int = 0, after_s: float = 2.0, s
 
 
 @dataclass
-class Row:
+class Row(Errors):
     """What came of a flight, or of several added up."""
 
     states: Counter[PoseState] = field(default_factory=Counter)
     longest_gap_s: float = 0.0
     wrong_quarter_full: int = 0  # poses with a rotation more than 45 deg off
-    error_m: list[float] = field(default_factory=list)
-    angle_deg: list[float] = field(default_factory=list)
-    nees3: list[float] = field(default_factory=list)
-    nees6: list[float] = field(default_factory=list)
     state_of: list[PoseState] = field(default_factory=list)  # of each error
     age_s: list[float] = field(default_factory=list)  # since the newest LiDAR position, of each error
     range_m: list[float] = field(default_factory=list)
@@ -216,19 +212,12 @@ def judge(flown: Flown, poses: list[RelativePose], into: Row | None = None) -> R
         if pose.xyz_vehicle_m is None or pose.covariance is None or true is None:
             continue
         R, xyz = true
-        e, P = pose.xyz_vehicle_m - xyz, pose.covariance
-        row.error_m.append(float(np.linalg.norm(e)))
+        add_errors(row, pose, R, xyz)
         row.state_of.append(pose.state)
         row.age_s.append((pose.stamp_ns - (pose.measured_ns or pose.stamp_ns)) * 1e-9)
         row.range_m.append(float(np.linalg.norm(xyz)))
-        if pose.R_vehicle_drone is None:
-            row.nees3.append(float(e @ np.linalg.solve(P[3:, 3:], e)))
-            continue
-        off = np.concatenate([log_rotation(pose.R_vehicle_drone.T @ R), -pose.R_vehicle_drone.T @ e])
-        row.nees3.append(float(off[3:] @ np.linalg.solve(P[3:, 3:], off[3:])))
-        row.nees6.append(float(off @ np.linalg.solve(P, off)))
-        row.angle_deg.append(math.degrees(float(np.linalg.norm(off[:3]))))
-        row.wrong_quarter_full += row.angle_deg[-1] > 45.0
+        if pose.R_vehicle_drone is not None:
+            row.wrong_quarter_full += row.angle_deg[-1] > 45.0
     return row
 
 

@@ -246,31 +246,43 @@ class Made:
             if pose.xyz_vehicle_m is None:
                 continue
             R, xyz = self.truth(t)
-            e, P = pose.xyz_vehicle_m - xyz, pose.covariance
+            P = pose.covariance
             out.at_s.append(t)
-            out.error_m.append(float(np.linalg.norm(e)))
             out.sigma_m.append(math.sqrt(float(np.trace(P[3:, 3:])) / 3))
-            if pose.R_vehicle_drone is None:
-                out.nees3.append(float(e @ np.linalg.solve(P[3:, 3:], e)))
-                continue
-            off = np.concatenate([log_rotation(pose.R_vehicle_drone.T @ R), -pose.R_vehicle_drone.T @ e])
-            out.nees3.append(float(off[3:] @ np.linalg.solve(P[3:, 3:], off[3:])))
-            out.nees6.append(float(off @ np.linalg.solve(P, off)))
-            out.angle_deg.append(math.degrees(float(np.linalg.norm(off[:3]))))
+            add_errors(out, pose, R, xyz)
         return out
 
 
 @dataclass
-class Judged:
+class Errors:
+    """Of each pose told with a position; the angle and `nees6` of those with a rotation."""
+
+    error_m: list[float] = field(default_factory=list)
+    angle_deg: list[float] = field(default_factory=list)
+    nees3: list[float] = field(default_factory=list)
+    nees6: list[float] = field(default_factory=list)
+
+
+def add_errors(errors: Errors, pose: RelativePose, R: np.ndarray, xyz_m: np.ndarray) -> None:
+    """What a pose with a position is off, and by its own covariance, whose axes are the drone's where it has any."""
+    e, P = pose.xyz_vehicle_m - xyz_m, pose.covariance
+    errors.error_m.append(float(np.linalg.norm(e)))
+    if pose.R_vehicle_drone is None:
+        errors.nees3.append(float(e @ np.linalg.solve(P[3:, 3:], e)))
+        return
+    off = np.concatenate([log_rotation(pose.R_vehicle_drone.T @ R), -pose.R_vehicle_drone.T @ e])
+    errors.nees3.append(float(off[3:] @ np.linalg.solve(P[3:, 3:], off[3:])))
+    errors.nees6.append(float(off @ np.linalg.solve(P, off)))
+    errors.angle_deg.append(math.degrees(float(np.linalg.norm(off[:3]))))
+
+
+@dataclass
+class Judged(Errors):
     """Of each pose told."""
 
     states: Counter[PoseState] = field(default_factory=Counter)
     at_s: list[float] = field(default_factory=list)
-    error_m: list[float] = field(default_factory=list)
     sigma_m: list[float] = field(default_factory=list)
-    angle_deg: list[float] = field(default_factory=list)  # of those with a rotation
-    nees3: list[float] = field(default_factory=list)
-    nees6: list[float] = field(default_factory=list)
 
     def rmse_m(self) -> float:
         return rms(self.error_m)

@@ -1,0 +1,101 @@
+"""`grd lens`: the lens of a camera, as a calibration program wrote it, as a rig file.
+
+Source: DESIGN, Command line; the programs' formats are in `stages/lens_files`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import yaml
+
+from flow.link import LinkError
+from links.cli.console import in_words, out
+from links.cli.files import Overwrite
+from stages.lens_files import CalibratedLens, LensFileError, lens_from_kalibr, lens_from_ocamcalib
+from stages.messages import Carrier
+
+MAX_BYTES = 1_000_000
+
+
+@in_words
+def import_lens(
+    file: Annotated[Path, typer.Argument(help="Kalibr's camchain.yaml, or OCamCalib's calib_results.txt.")],
+    carrier: Annotated[Carrier, typer.Argument(help="Which camera of the rig it is.")],
+    out_file: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Rig file to write [default: FILE with .CARRIER.rig.yaml].")
+    ] = None,
+    camera: Annotated[str, typer.Option("--camera", help="Its name in Kalibr's file.")] = "cam0",
+    max_off_axis_deg: Annotated[
+        float | None,
+        typer.Option(
+            "--max-off-axis-deg",
+            min=1,
+            max=150,
+            help="How far off axis the calibration holds [default: Kalibr 117.5, OCamCalib 100].",
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the lens in FILE as a rig file, to include in a configuration after its rig.
+
+    It holds the numbers: FILE is not needed any more. What else the rig says of the camera stays, so draw `masked_px`
+    and say `max_off_axis_deg` for pictures of this lens.
+
+    Example: grd lens camchain.yaml vehicle --camera cam0 -o configs/rigs/vehicle_lens.yaml
+    """
+    target = out_file or file.with_suffix(f".{carrier.value}.rig.yaml")
+    if target.suffix not in (".yaml", ".yml"):
+        raise LinkError(f"{target}: a rig file ends in .yaml")
+    if target.exists() and (not overwrite or target.samefile(file)):
+        raise LinkError(f"{target} is there already: name another with --out, or give --overwrite")
+    found = read_lens(file, camera, max_off_axis_deg)
+    target.write_text(lens_text(found, carrier, file.name), encoding="utf-8")
+    lens, size_px = found
+    width, height = size_px or (None, None)
+    size = f"{width} x {height} px" if size_px else "the file does not say for which size of pictures"
+    out.print(f"lens        {lens.model}, up to {lens.max_off_axis_deg:g} deg off axis, {size}", markup=False)
+    out.print(
+        f"rig         {target}   (to fly: include it after the rig; or grd replay --overlay {target})", markup=False
+    )
+    if width != height:
+        out.print(
+            f"size_px is left open: say size_px: [{width}, {height}] in the config of camera_{carrier.value}",
+            markup=False,
+        )
+    out.print(
+        f"check       cameras.{carrier.value}.masked_px and .max_off_axis_deg are still those of the rig below it"
+    )
+
+
+def read_lens(file: Path, camera: str, max_off_axis_deg: float | None) -> CalibratedLens:
+    """The lens in a calibration program's file. LinkError names the file and the line."""
+    with file.open("rb") as stream:
+        data = stream.read(MAX_BYTES + 1)
+    limit = {} if max_off_axis_deg is None else {"max_off_axis_deg": max_off_axis_deg}
+    try:
+        if len(data) > MAX_BYTES:
+            raise LensFileError(f"larger than {MAX_BYTES} bytes: that is no calibration")
+        if file.suffix in (".yaml", ".yml"):
+            return lens_from_kalibr(data.decode("utf-8"), camera, **limit)
+        if file.suffix == ".txt":
+            return lens_from_ocamcalib(data.decode("utf-8"), **limit)
+        raise LensFileError("neither Kalibr's .yaml nor OCamCalib's .txt")
+    except UnicodeDecodeError as error:
+        raise LinkError(f"{file}: is not UTF-8 text (byte {error.start})") from None
+    except LensFileError as error:
+        raise LinkError(f"{file}:{error.line}: {error}" if error.line else f"{file}: {error}") from None
+
+
+def lens_text(found: CalibratedLens, carrier: Carrier, source: str) -> str:
+    """The rig file. A size that is not known, or not square, is null: it hides that of the rig below."""
+    width, height = found.size_px or (None, None)
+    camera = {"size_px": width if width == height else None, "lens": found.lens.model_dump(mode="json")}
+    head = [
+        f"# The lens of the {carrier.value}'s camera, by `grd lens {source} {carrier.value}`.",
+        "# To fly: include it after the rig; to replay with it: grd replay RECORDING --overlay THIS_FILE.",
+    ]
+    tree = {"rig": {"cameras": {carrier.value: camera}}}
+    return "\n".join([*head, yaml.safe_dump(tree, sort_keys=False, width=120)])

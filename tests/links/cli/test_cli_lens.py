@@ -1,0 +1,70 @@
+"""`grd lens` as a user meets it: a calibration program's file becomes part of a rig, or is refused with its line."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from flow.graph import load_graph
+from tests.links import command
+from tests.stages.test_lens import KANNALA_BRANDT, OCAM
+from tests.stages.test_lens_files import KALIBR, OCAMCALIB
+from tests.test_house import ROOT
+
+
+@pytest.fixture
+def grd(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "camchain.yaml").write_text(KALIBR)
+    (tmp_path / "calib_results.txt").write_text(OCAMCALIB)
+    return command.grd
+
+
+def test_both_lenses_stand_in_the_rig_of_a_configuration_with_their_numbers(grd, tmp_path):
+    grd("lens", "camchain.yaml", "vehicle", "--max-off-axis-deg", "120", "-o", "vehicle.yaml")
+    text = grd("lens", "calib_results.txt", "drone", "--max-off-axis-deg", "120")
+    assert "1440 x 1440 px" in text
+    assert "calib_results.drone.rig.yaml" in text
+    config = tmp_path / "mine.yaml"
+    config.write_text(f"include: [{ROOT}/configs/field.yaml, vehicle.yaml, calib_results.drone.rig.yaml]\n")
+    (tmp_path / "camchain.yaml").unlink()  # the rig needs it no more
+    assert "no problems" in grd("check", config)
+    graph = load_graph(config)
+    assert graph.nodes["vp_vehicle"].build().lens == KANNALA_BRANDT  # pyright: ignore[reportAttributeAccessIssue]
+    assert graph.nodes["vp_drone"].build().lens == OCAM  # pyright: ignore[reportAttributeAccessIssue]
+    assert graph.nodes["camera_drone"].build().size_px == 1440  # pyright: ignore[reportAttributeAccessIssue]
+    cameras = yaml.safe_load(graph.settings_yaml())["rig"]["cameras"]  # what a recording brings
+    assert cameras["vehicle"]["lens"]["k"] == list(KANNALA_BRANDT.k)
+    assert "focal_px" not in cameras["drone"]["lens"]  # of the equidistant lens that stood there
+    assert cameras["drone"]["T_drone_camera"]["rpy_deg"] == [180.0, 0.0, -90.0]
+
+
+def test_a_size_that_is_not_square_is_left_to_the_camera_s_link(grd, tmp_path):
+    (tmp_path / "wide.yaml").write_text(KALIBR.replace("[720, 720]", "[1280, 800]"))
+    assert "size_px: [1280, 800] in the config of camera_vehicle" in grd("lens", "wide.yaml", "vehicle")
+    config = tmp_path / "mine.yaml"
+    config.write_text(
+        f"include: [{ROOT}/configs/field.yaml, wide.vehicle.rig.yaml]\n"
+        "links: {camera_vehicle: {config: {size_px: [1280, 800]}}}\n"
+    )
+    assert "no problems" in grd("check", config)
+
+
+def test_a_wrong_file_is_named_with_its_line_and_nothing_is_written(grd, tmp_path):
+    before = sorted(tmp_path.iterdir())
+    assert grd("lens", "camchain.yaml", "drone", "--camera", "cam1", code=2).startswith("camchain.yaml:8: cam1: ")
+    assert grd("lens", "camchain.yaml", "drone", "--camera", "cam7", code=2).startswith("camchain.yaml: no camera")
+    assert grd("lens", "none.yaml", "drone", code=2).startswith("none.yaml: No such file")
+    assert "at most" in grd("lens", "calib_results.txt", "drone", "--max-off-axis-deg", "150", code=2)
+    (tmp_path / "calib_results.txt").rename("lens.mat")
+    assert "neither Kalibr's .yaml" in grd("lens", "lens.mat", "drone", code=2)
+    assert grd("lens", "camchain.yaml", "bird", code=2)
+    assert sorted(tmp_path.iterdir()) == sorted([*(f for f in before if f.suffix != ".txt"), tmp_path / "lens.mat"])
+
+
+def test_a_file_that_is_there_is_not_written_over_unasked_and_the_calibration_never(grd, tmp_path):
+    grd("lens", "camchain.yaml", "drone")
+    assert "--overwrite" in grd("lens", "camchain.yaml", "drone", code=2)
+    grd("lens", "camchain.yaml", "drone", "--overwrite")
+    assert "name another" in grd("lens", "camchain.yaml", "drone", "-o", "camchain.yaml", "--overwrite", code=2)
+    assert (tmp_path / "camchain.yaml").read_text() == KALIBR

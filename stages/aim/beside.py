@@ -13,16 +13,17 @@ apart alike, so all of them count. Source: ours, after search theory (Koopman, S
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from statistics import NormalDist
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
+from numpy.typing import NDArray
 
 from stages.geometry import Array64
 
 PLACES = 36
 HEADINGS = np.cos(np.linspace(0.0, math.pi, PLACES, endpoint=False) + math.pi / (2 * PLACES))
-GAUSSIAN = ndtri((np.arange(PLACES) + 0.5) / PLACES)
+GAUSSIAN = np.array([NormalDist().inv_cdf((k + 0.5) / PLACES) for k in range(PLACES)])
 OFFSETS = 24  # between two beams
 ANYWHERE = 0.15  # share of the weight
 MET = 0.9  # of a drone that the beam crosses
@@ -51,7 +52,7 @@ def best_offset_m(reach_m: float, headed: bool, tried: list[Look], spacing_m: fl
     return float(offset[np.argmax(gain > gain.max() * (1.0 - 1e-9))])
 
 
-def _meets(beside_m: Array64, spacing_m: float, half_m: float) -> Array64:
+def _meets(beside_m: NDArray[Any], spacing_m: float, half_m: float) -> Array64:
     """How likely the nearest beam meets a drone so far beside one of them."""
     nearest_m = beside_m - spacing_m * np.round(beside_m / spacing_m)
     return np.exp(-math.log(2.0) * (nearest_m / half_m) ** 2)

@@ -30,6 +30,7 @@ SOME_M = 36.0  # and so few are no more a drone's than a wire's
 SIGMA_M = 0.15  # of a sighting
 STANDING_M = 0.6  # what stands is met again within this
 ACCELERATION_MPS2 = 4.0
+START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 
 
 @dataclass(slots=True, eq=False)

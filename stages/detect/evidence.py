@@ -25,15 +25,13 @@ from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
 from stages.detect.bank import Bank, first_within, places_of
-from stages.detect.candidate import SAME_LOOK_NS, SIGMA_M, STANDING_M, Candidate, Sighting
-from stages.detect.flight import scatter_m
-from stages.detect.rejoin import joined, met_again, without_twins
+from stages.detect.candidate import SAME_LOOK_NS, SIGMA_M, STANDING_M, START_SPEED_MPS, Candidate, Sighting
+from stages.detect.drone_word import DroneWord
+from stages.detect.rejoin import joined, without_twins
 from stages.detect.sightings import Limits, SightingFinder, Slice
 from stages.detect.surroundings import BigThings
-from stages.detect.telemetry import hear
 from stages.detect.telling import candidates_message, detections_message, odds_of
 from stages.detect.verdict import STANDING, Evidence, judge
-from stages.drone_telemetry import DroneTelemetry
 from stages.geometry import Array64
 from stages.messages import (
     Candidates,
@@ -51,10 +49,8 @@ BANK_TIDIED = 64  # slices: about ten times a second
 AMONG_M = 1.5
 AMONG_NS = 20_000_000_000
 SAME_PLACE_M = 0.5
-MOVES_MPS = 1.0
 MOST_STANDING = 64
 STANDING_NS = 60_000_000_000  # for so long it is known that something stands there
-START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 
 
 @dataclass(slots=True)
@@ -73,7 +69,7 @@ class _Now:
     finder: SightingFinder
     travel: Travel
     trail: VehicleTrail = field(default_factory=VehicleTrail)
-    told: tuple[DroneTelemetry, DroneTelemetry] = field(default_factory=lambda: (DroneTelemetry(), DroneTelemetry()))
+    word: DroneWord = field(default_factory=DroneWord)
     bank: Bank = field(default_factory=Bank)
     standing: deque[Candidate] = field(default_factory=lambda: deque[Candidate](maxlen=MOST_STANDING))
     standing_m: Array64 = field(default_factory=lambda: np.empty((0, 3)))  # where they are
@@ -121,12 +117,11 @@ class EvidenceDetect(Stage):
 
     def on_drone_position(self, position: DroneLocalPosition) -> None:
         """What the drone says of its flight; without it birds and lamps are told by how they fly alone."""
-        self._now.told[0].add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+        self._now.word.add_position(position)
 
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
         """The same from an autopilot that sends this."""
-        velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
-        self._now.told[1].add(odometry.stamp_ns, odometry.xyz_local_m, velocity, odometry.reset_counter)
+        self._now.word.add_odometry(odometry)
 
     def on_pulses(self, pulses: SweptPulses) -> Iterator[Candidates | Detections]:
         """One slice: judge the sightings that are complete with it, tell what changed."""
@@ -172,7 +167,7 @@ class EvidenceDetect(Stage):
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
             first_hits=s.hits,
         )
-        new.among, new.again = among, refused_m < SAME_PLACE_M and self._drone_moves(now, s.stamp_ns)
+        new.among, new.again = among, refused_m < SAME_PLACE_M and now.word.moves(s.stamp_ns)
         new.note(s)
         news = self._weigh(now, new)
         if new.told:
@@ -191,16 +186,14 @@ class EvidenceDetect(Stage):
 
     def _join(self, now: _Now, s: Sighting) -> None:
         """What was met elsewhere and may have flown here, as the drone says, goes on here, too."""
-        if not (self.parked or now.trail.known) or not self._drone_moves(now, s.stamp_ns):
+        if not (self.parked or now.trail.known) or not now.word.moves(s.stamp_ns):
             return
-        for told in now.told:
-            if met := met_again(now.bank, s, told):
-                now.number += 1
-                both = joined(met[0], now.number, s, met[1])
-                self._weigh(now, both)
-                if both.told:
-                    now.bank.put(both)
-                return
+        if met := now.word.met_again(now.bank, s):
+            now.number += 1
+            both = joined(met[0], now.number, s, met[1])
+            self._weigh(now, both)
+            if both.told:
+                now.bank.put(both)
 
     def _wake(self, now: _Now, s: Sighting) -> Candidate | None:
         """Something that was looked at before and stood there: it goes on where it was, and is not looked at anew."""
@@ -215,9 +208,8 @@ class EvidenceDetect(Stage):
 
     def _weigh(self, now: _Now, c: Candidate) -> bool:
         """Judge it anew. True when that is news."""
-        c.heard, motion_known = None, self.parked or now.trail.known
-        for told in now.told:
-            c.heard = c.heard or hear(told, c.path_ns, c.path_m, 0.03 + scatter_m(c.range_m), motion_known)
+        motion_known = self.parked or now.trail.known
+        c.heard = now.word.of(c, motion_known)
         c.odds, c.why = judge(c, self.evidence, self.free_space, motion_known)
         accept = odds_of(self.accept_probability)
         c.accepted = c.odds >= accept or (c.accepted and c.odds >= accept - 3.0)
@@ -259,22 +251,6 @@ class EvidenceDetect(Stage):
         now.watches = {c.number: now.watches[c.number] for c in kept if c.number in now.watches}
         return gone
 
-    def _usual_flight(self, now: _Now, now_ns: int) -> tuple[Array64, float, float]:
-        """How a drone flies now, one sigma on each axis: as fast as it says; else it comes along with the vehicle.
-
-        And the level speed that it says it has, 0 when it is silent.
-        """
-        speeds = [told.speed_mps(now_ns) for told in now.told]
-        for speed in speeds:
-            if speed is not None:
-                return np.array([0.0, 0.0, speed[1]]), 0.3 + 0.7 * speed[0], speed[0]
-        return now.trail.velocity_mps(now_ns), START_SPEED_MPS / 2, 0.0
-
-    def _drone_moves(self, now: _Now, stamp_ns: int) -> bool:
-        """Whether the drone says that it flies: then it is not what stands where something stood."""
-        speeds = [told.speed_mps(stamp_ns) for told in now.told]
-        return any(speed is not None and math.hypot(*speed) > MOVES_MPS for speed in speeds)
-
     def _remember(self, now: _Now, c: Candidate) -> None:
         """Where something that stands was refused."""
         if c.suspect == STANDING and (c.hit_looks < 3 or c.stands):
@@ -295,7 +271,7 @@ class EvidenceDetect(Stage):
         new = [c for c in now.bank if c.accepted and not c.announced]
         if changed or new:
             told = [c for c in now.bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
-            flight = self._usual_flight(now, now_ns)
+            flight = now.word.usual_flight(now.trail, now_ns)
             yield candidates_message(told, now.trail, now_ns, self.max_candidates, *flight)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9

@@ -1,0 +1,69 @@
+"""All that the drone says of its flight, by whichever messages its autopilot sends, as the detector asks for it.
+
+Source: ours; DESIGN, The graph: `odometry` ("autopilot odometry when present").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from stages.detect.candidate import START_SPEED_MPS, Candidate, Sighting
+from stages.detect.flight import scatter_m
+from stages.detect.rejoin import met_again
+from stages.detect.telemetry import Heard, hear
+from stages.drone_telemetry import DroneTelemetry
+from stages.geometry import Array64
+from stages.messages import DroneLocalPosition, DroneOdometry
+from stages.trail import VehicleTrail
+
+MOVES_MPS = 1.0
+
+
+class DroneWord:
+    """Its local position and its odometry; where both speak the first is asked first."""
+
+    def __init__(self) -> None:
+        self._position, self._odometry = DroneTelemetry(), DroneTelemetry()
+        self._both = (self._position, self._odometry)
+
+    def add_position(self, position: DroneLocalPosition) -> None:
+        """LOCAL_POSITION_NED and its like."""
+        self._position.add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+
+    def add_odometry(self, odometry: DroneOdometry) -> None:
+        """ODOMETRY; it counts its own jumps."""
+        velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
+        self._odometry.add(odometry.stamp_ns, odometry.xyz_local_m, velocity, odometry.reset_counter)
+
+    def of(self, c: Candidate, motion_known: bool) -> Heard | None:
+        """What it says for and against a candidate; None: nothing."""
+        heard = None
+        for told in self._both:
+            heard = heard or hear(told, c.path_ns, c.path_m, 0.03 + scatter_m(c.range_m), motion_known)
+        return heard
+
+    def met_again(self, candidates: Iterable[Candidate], s: Sighting) -> tuple[Candidate, Array64] | None:
+        """The candidate that a sighting elsewhere goes on with, and its velocity (3,); see `rejoin.py`."""
+        for told in self._both:
+            if met := met_again(candidates, s, told):
+                return met
+        return None
+
+    def moves(self, stamp_ns: int) -> bool:
+        """Whether it says that it flies: then it is not what stands where something stood."""
+        speeds = [told.speed_mps(stamp_ns) for told in self._both]
+        return any(speed is not None and math.hypot(*speed) > MOVES_MPS for speed in speeds)
+
+    def usual_flight(self, trail: VehicleTrail, now_ns: int) -> tuple[Array64, float, float]:
+        """How a drone flies now (3,), one sigma on each axis: as fast as it says; else it comes along with the vehicle.
+
+        And the level speed that it says it has, 0 when it is silent.
+        """
+        speeds = [told.speed_mps(now_ns) for told in self._both]
+        for speed in speeds:
+            if speed is not None:
+                return np.array([0.0, 0.0, speed[1]]), 0.3 + 0.7 * speed[0], speed[0]
+        return trail.velocity_mps(now_ns), START_SPEED_MPS / 2, 0.0

@@ -37,6 +37,7 @@ MOVING_RADPS = 0.1  # slower, a state says nothing of the direction
 BIN_RAD = math.radians(0.5)
 START_SIGMA_S = 0.02
 CLOSE_S = 1e-3  # with a sigma below, fewer rounds do, and fewer windows
+MOST_PLACES = 4096
 TRACE_NS = 500_000_000  # of servo states before a window
 AXIS_SIGMA_M = 3e-3
 FEWEST_PATCHES = 20
@@ -87,6 +88,7 @@ class ServoClock(Stage):
         if motion.stamp_ns < self._resting_until_ns:
             self._places.clear()
         self._places.append(motion.xyz_start_m)
+        del self._places[:-MOST_PLACES]
 
     def on_servo(self, servo: ServoState) -> None:
         """Where the servo is."""
@@ -94,6 +96,8 @@ class ServoClock(Stage):
             return
         if not self._states or servo.stamp_ns > self._states[-1].stamp_ns:
             self._states.append(servo)
+        if self._states[-1].stamp_ns - self._states[0].stamp_ns > 3.0 * self.window_s * 1e9 + 2 * TRACE_NS:
+            self._states, self._firings, self._places = [], [], self._places[-1:]  # the LiDAR is silent: begin anew
 
     def on_firings(self, firings: LidarFirings) -> Iterator[ServoOffset]:
         """Collect; with a whole window, what it says."""

@@ -16,8 +16,9 @@ from links.dynamixel import Servo
 from links.recording import RecordingReader
 from links.velodyne import Lidar
 from stages.geometry import LidarMount
-from stages.messages import LidarFirings, ServoState, VehicleMotion
+from stages.messages import LidarFirings, VehicleMotion
 from stages.servo_offset import ServoClock, both_ways_rad
+from tests.stages.made import servo
 
 RECORDING = Path(__file__).resolve().parents[2] / "recordings" / "street_sweep.mcap"
 VIBRATING_S = 2.65  # a sweep one way, then vibration
@@ -137,9 +138,7 @@ def test_impossible_clock_settings_are_errors(setting):
 def test_nothing_grows_while_the_lidar_is_silent():
     clock = ServoClock(mount=LidarMount())
     for k in range(20_000):
-        clock.on_servo(
-            ServoState(k * 5_000_000, position_rad=math.sin(0.01 * k), velocity_radps=0, goal_rad=0, error=0)
-        )
+        clock.on_servo(servo(k * 5_000_000, math.sin(0.01 * k)))
         clock.on_motion(driven(0.0))
     kept = (clock.__pydantic_private__ or {}).values()
     assert max(len(values) for values in kept if isinstance(values, list)) < 5000

@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field, PrivateAttr
@@ -37,33 +36,11 @@ from stages.messages import (
     VehicleMotion,
 )
 from stages.pulses import mean_direction
-from stages.track.look import Look, collect_into, evaluate, largest_sigma_m, misfit
-from stages.track.told_motion import ToldMotion, Word
+from stages.track.hypotheses import Hypotheses, Hypothesis
+from stages.track.look import Look, collect_into, evaluate, largest_sigma_m
 from stages.trail import VehicleTrail
 
 LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
-STALE_NS = 150_000_000  # a sighting so much older than a track's own hits says nothing of it
-
-
-@dataclass(slots=True, eq=False)
-class _Track:
-    """One hypothesis."""
-
-    number: int  # 0 while it is a candidate only
-    candidate: int  # the detector's number
-    stamp_ns: int
-    x: Array64
-    P: Array64
-    last_hit_ns: int
-    p_0: float
-    odds: float = 0.0
-    confirmed: bool = False
-    hits: int = 0  # of the newest look
-    look: Look | None = None
-    word: Word | None = None  # what the drone's word was for stamp_ns when x was made
-    look_word: Word | None = None  # and for the look's start
-    told_ns: int = 0
-    reason: str = ""
 
 
 class HitMissTrack(Stage):
@@ -88,14 +65,15 @@ class HitMissTrack(Stage):
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
 
     _trail: VehicleTrail = PrivateAttr(default_factory=VehicleTrail)
-    _told: tuple[ToldMotion, ToldMotion] = PrivateAttr(default_factory=lambda: (ToldMotion(0), ToldMotion(1)))
-    _tracks: list[_Track] = PrivateAttr(default_factory=lambda: list[_Track]())
-    _predicted: dict[_Track, tuple[int, Array64, Array64]] = PrivateAttr(
-        default_factory=lambda: dict[_Track, tuple[int, Array64, Array64]]()
-    )  # as asked for last: each candidate asks for the same moment
+    _known: Hypotheses = PrivateAttr()
     _next_number: int = PrivateAttr(default=1)
     _idle_ns: int = PrivateAttr(default=0)
     _why_idle: str = PrivateAttr(default="nothing found yet")
+
+    def model_post_init(self, context: Any, /) -> None:
+        self._known = Hypotheses(
+            self.manoeuvre, self.told_manoeuvre, self.start_sigma_mps, self.own_sigma_m, self.max_drones
+        )
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Where the vehicle is; without it, it is taken to be parked."""
@@ -103,14 +81,11 @@ class HitMissTrack(Stage):
 
     def on_drone_position(self, position: DroneLocalPosition) -> None:
         """What the drone says of its flight: a track moves as it says."""
-        self._predicted.clear()
-        self._told[0].told.add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+        self._known.hear_position(position)
 
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
         """The same from an autopilot that sends this; taken where it sends both."""
-        velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
-        self._predicted.clear()
-        self._told[1].told.add(odometry.stamp_ns, odometry.xyz_local_m, velocity, odometry.reset_counter)
+        self._known.hear_odometry(odometry)
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Follow the promising ones; drop what is no longer taken for a drone."""
@@ -119,20 +94,20 @@ class HitMissTrack(Stage):
             xyz, v = self._trail.to_local(
                 candidates.stamp_ns, candidates.xyz_vehicle_m[i], candidates.velocity_vehicle_mps[i]
             )
-            known = self._near(xyz, candidates.stamp_ns, number)
+            known = self._known.near(xyz, candidates.stamp_ns, number)
             if known is None and P >= 0.5:
-                known = self._astray(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+                known = self._known.astray(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
             if known is not None:
                 seen_later = int(candidates.seen_ns[i]) > known.last_hit_ns
-                if known.confirmed and P >= 0.5 and seen_later and self._doubtful(known, candidates.stamp_ns):
-                    self._move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+                if known.confirmed and P >= 0.5 and seen_later and self._known.doubtful(known, candidates.stamp_ns):
+                    self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
                 sure = known.candidate == number or candidates.looks[i] >= 6
                 if P < 0.2 and known.confirmed and sure:
                     yield from self._lose(
                         known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}"
                     )
-            elif P >= 0.5 and sum(not track.confirmed for track in self._tracks) < self.max_hypotheses:
-                self._start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+            elif P >= 0.5 and len(self._known) - len(self._known.confirmed) < self.max_hypotheses:
+                self._known.start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
 
     def on_detections(self, detections: Detections) -> Iterator[TrackState | DroneFix]:
         """What the detector accepts becomes a track."""
@@ -142,14 +117,17 @@ class HitMissTrack(Stage):
             velocity = detections.velocity_vehicle_mps
             v = np.zeros(3) if velocity is None else velocity[i]
             xyz, v = self._trail.to_local(seen_ns, detections.xyz_vehicle_m[i], v)
-            track = self._near(xyz, seen_ns, number) or self._astray(number, xyz, v, seen_ns, seen_ns)
-            if track is not None and track.confirmed and seen_ns > track.last_hit_ns and self._doubtful(track, seen_ns):
-                self._move(track, number, xyz, v, seen_ns, seen_ns)
+            track = self._known.near(xyz, seen_ns, number) or self._known.astray(number, xyz, v, seen_ns, seen_ns)
+            drone = track if track is not None and track.confirmed else None
+            if drone is not None and seen_ns > drone.last_hit_ns and self._known.doubtful(drone, seen_ns):
+                self._known.move(drone, number, xyz, v, seen_ns, seen_ns)
+            if drone is None and (old := self._known.gives_way(seen_ns)):
+                yield from self._lose(old, seen_ns, "not hit, while the detector accepted a drone elsewhere")
             if track is None:
-                if sum(track.confirmed for track in self._tracks) >= self.max_drones:
+                if len(self._known.confirmed) >= self.max_drones:
                     continue
-                track = self._start(number, xyz, v, seen_ns, seen_ns)
-            if not track.confirmed and sum(track.confirmed for track in self._tracks) < self.max_drones:
+                track = self._known.start(number, xyz, v, seen_ns, seen_ns)
+            if not track.confirmed and len(self._known.confirmed) < self.max_drones:
                 track.confirmed = True
                 track.number, self._next_number = self._next_number, self._next_number + 1
                 track.candidate = number
@@ -164,109 +142,45 @@ class HitMissTrack(Stage):
         now_ns = int(pulses.point_stamp_ns[-1])
         R, t = self._trail.at(pulses.stamp_ns)
         axis = mean_direction(pulses.direction_vehicle)
-        for track in tuple(self._tracks):
+        for track in self._known:
             look = track.look
             if look is not None and pulses.stamp_ns - look.last_ns > LOOK_OVER_NS:
                 track.look = None
                 yield from self._close(track, look)
             before = track.look
-            state = self._at(track, pulses.stamp_ns) if before is None else (before.x, before.P)
+            state = self._known.at(track, pulses.stamp_ns) if before is None else (before.x, before.P)
             track.look = collect_into(before, pulses, R, t, axis, *state, self.span_m, self.de_skew)
             if before is None:
-                track.look_word = self._word(pulses.stamp_ns)
-            if track in self._tracks:
+                track.look_word = self._known.word(pulses.stamp_ns)
+            if track in self._known:
                 yield from self._watch(track, now_ns)
-        if not self._tracks and now_ns - self._idle_ns > 500_000_000:
+        if not len(self._known) and now_ns - self._idle_ns > 500_000_000:
             self._idle_ns = now_ns
             yield TrackState(
                 stamp_ns=now_ns, state=TrackingState.SEARCHING, reason=self._why_idle, hits=0, frame_s=0.5, track_id=0
             )
 
-    def _at(self, track: _Track, stamp_ns: int) -> tuple[Array64, Array64]:
-        """A track's state (6,) and covariance (6, 6) at a time."""
-        known = self._predicted.get(track)
-        if known is None or known[0] != stamp_ns:
-            after = self._word(stamp_ns)
-            told = self._told[0 if after is None else after.source]
-            dt_s = (stamp_ns - track.stamp_ns) * 1e-9
-            at = told.predicted(track.x, track.P, dt_s, track.word, after, self.manoeuvre, self.told_manoeuvre)
-            known = self._predicted[track] = (stamp_ns, *at)
-        return known[1], known[2]
-
-    def _word(self, stamp_ns: int) -> Word | None:
-        """What the drone says of itself at a time, by the better of its messages."""
-        return self._told[1].word(stamp_ns) or self._told[0].word(stamp_ns)
-
-    # hypotheses
-
-    def _start(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> _Track:
-        P = np.diag([0.2**2] * 3 + [self.start_sigma_mps**2] * 3)
-        if stamp_ns > seen_ns:
-            xyz = xyz - (stamp_ns - seen_ns) * 1e-9 * v
-        track = _Track(number=0, candidate=number, stamp_ns=seen_ns, x=np.concatenate([xyz, v]), P=P,
-                       last_hit_ns=seen_ns, p_0=0.8, word=self._word(seen_ns))  # fmt: skip
-        self._tracks.append(track)
-        return track
-
-    def _doubtful(self, track: _Track, now_ns: int) -> bool:
-        """So long without a hit that what is found there may as well be something else."""
-        _, P = self._at(track, now_ns)
-        return largest_sigma_m(P) > self.own_sigma_m
-
-    def _move(self, track: _Track, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> None:
-        """The detector found it again."""
-        new = self._start(number, xyz, v, seen_ns, stamp_ns)
-        self._tracks.remove(new)
-        track.candidate, track.stamp_ns, track.x, track.P = number, new.stamp_ns, new.x, new.P
-        track.last_hit_ns, track.look, track.odds = seen_ns, None, max(track.odds, 2.0)
-        track.word = new.word
-        self._predicted.clear()
-        track.reason = "found again by the detector"
-
-    def _astray(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> _Track | None:
-        """The confirmed track of this candidate, brought back to it: it followed something else.
-
-        Not where the detector has not seen it lately: then the track knows better.
-        """
-        mine = (track for track in self._tracks if track.confirmed and track.candidate == number)
-        track = next((track for track in mine if seen_ns > track.last_hit_ns - STALE_NS), None)
-        if track is not None:
-            self._move(track, number, xyz, v, seen_ns, stamp_ns)
-            track.reason = "had followed something else, brought back by the detector"
-        return track
-
-    def _near(self, xyz: Array64, stamp_ns: int, number: int) -> _Track | None:
-        """The track that this is: by the detector's number, or by its place."""
-        best, least = None, 9.0
-        for track in self._tracks:
-            cost = misfit(xyz, *self._at(track, stamp_ns))
-            cost = min(cost, 4.0) if track.candidate == number and cost < 100.0 else cost
-            if cost < least:
-                best, least = track, cost
-        return best
-
-    def _lose(self, track: _Track, now_ns: int, why: str) -> Iterator[TrackState]:
-        self._tracks = [other for other in self._tracks if other is not track]
-        self._predicted.clear()
+    def _lose(self, track: Hypothesis, now_ns: int, why: str) -> Iterator[TrackState]:
+        self._known.drop(track)
         if track.confirmed:
             self._why_idle = f"lost drone {track.number}: {why}"
             yield TrackState(
                 stamp_ns=now_ns, state=TrackingState.LOST, reason=why, hits=0, frame_s=0.1, track_id=track.number
             )
 
-    def _watch(self, track: _Track, now_ns: int) -> Iterator[TrackState]:
+    def _watch(self, track: Hypothesis, now_ns: int) -> Iterator[TrackState]:
         """Coasting and losing are told without a look."""
         silent_s = (now_ns - track.last_hit_ns) * 1e-9
         gone = silent_s > 1.5
         if track.confirmed and gone:
-            known = self._word(now_ns) is not None
-            known = known and largest_sigma_m(self._at(track, now_ns)[1]) < self.lost_sigma_m
+            known = self._known.word(now_ns) is not None
+            known = known and largest_sigma_m(self._known.at(track, now_ns)[1]) < self.lost_sigma_m
             gone = silent_s > self.lost_after_s and not known
         if gone or track.odds < -4.0:
             why = f"not hit for {silent_s:.1f} s" if silent_s > 1.0 else "looked at again and again, not hit"
             yield from self._lose(track, now_ns, why)
         elif track.confirmed:
-            for other in tuple(self._tracks):  # two that became one
+            for other in self._known:  # two that became one
                 if other is not track and np.linalg.norm(other.x[:3] - track.x[:3]) < self.span_m:
                     younger = other if not other.confirmed or other.number > track.number else track
                     if younger is not track:
@@ -278,12 +192,12 @@ class HitMissTrack(Stage):
         elif now_ns - track.told_ns > 100_000_000:
             yield self._state(track, now_ns)
 
-    def _state(self, track: _Track, now_ns: int) -> TrackState:
+    def _state(self, track: Hypothesis, now_ns: int) -> TrackState:
         silent_s = (now_ns - track.last_hit_ns) * 1e-9
         state = TrackingState.CANDIDATE
         if track.confirmed:
             state = TrackingState.COASTING if silent_s > self.coast_after_s else TrackingState.TRACKING
-        x, P = self._at(track, now_ns)
+        x, P = self._known.at(track, now_ns)
         R, _ = self._trail.at(now_ns)
         xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
         track.told_ns = now_ns
@@ -301,13 +215,12 @@ class HitMissTrack(Stage):
 
     # one look
 
-    def _close(self, track: _Track, look: Look) -> Iterator[DroneFix | TrackState]:
+    def _close(self, track: Hypothesis, look: Look) -> Iterator[DroneFix | TrackState]:
         seen = evaluate(look, self.span_m, self.hull_offset_m, track.p_0, self.misses, self.own_sigma_m)
         track.hits = 0 if seen is None else seen.hits
         if seen is None:
             return
-        track.x, track.P, track.stamp_ns, track.word = seen.x, seen.P, look.start_ns, track.look_word
-        self._predicted.clear()
+        self._known.update(track, look.start_ns, seen.x, seen.P, track.look_word)
         track.odds = min(max(track.odds + seen.evidence, -8.0), 8.0)
         if seen.hits == 0:
             return
@@ -317,15 +230,12 @@ class HitMissTrack(Stage):
             track.p_0 += 0.1 * (ratio - track.p_0)
         track.reason = f"{seen.hits} hits, {seen.beside} pulses beside it"
         if track.confirmed:
-            x, P = self._at(track, track.last_hit_ns)
-            for told in self._told:
-                told.learn(track.number, track.last_hit_ns, x[:3], math.sqrt(float(np.trace(P[:3, :3])) / 3) + 0.05)
-            self._predicted.clear()
+            self._known.learn(track)
             yield self._fix(track)
         yield self._state(track, max(look.last_ns, track.last_hit_ns, track.told_ns))
 
-    def _fix(self, track: _Track) -> DroneFix:
-        x, P = self._at(track, track.last_hit_ns)
+    def _fix(self, track: Hypothesis) -> DroneFix:
+        x, P = self._known.at(track, track.last_hit_ns)
         R, _ = self._trail.at(track.last_hit_ns)
         xyz, velocity = self._trail.to_vehicle(track.last_hit_ns, x[:3], x[3:])
         return DroneFix(

@@ -166,6 +166,16 @@ def test_a_drone_that_comes_back_is_the_same_one(gap_s):
     assert fixes_of(out)[-1].stamp_ns > at_s(1.6 + gap_s)
 
 
+@pytest.mark.parametrize(("accepted_s", "numbers"), [(2.0, {1, 2}), (1.4, {1})])
+def test_a_drone_not_hit_for_a_second_gives_way_to_one_accepted_elsewhere(accepted_s, numbers):
+    first, second = still(-3.0, 8.0, 10.0), still(4.0, 8.0, 12.0)
+    things = [During(Drone(first), 0.0, 0.8), During(Drone(second), 1.0, 4.0)]
+    out = run(things, [accepted(here(first)), accepted(here(second), t_s=accepted_s, number=2)], 3.0)
+    assert {f.track_id for f in out if isinstance(f, DroneFix)} == numbers
+    lost = [m.reason for m in states_of(out) if m.state is TrackingState.LOST]
+    assert lost == (["not hit, while the detector accepted a drone elsewhere"] if 2 in numbers else [])
+
+
 def test_a_lost_drone_that_is_accepted_again_elsewhere_has_a_new_number():
     first, second = still(-1.0, 8.0, 10.0), still(2.0, 8.0, 12.0)
     things = [During(Drone(first), 0.0, 0.8), During(Drone(second), 2.0, 4.0)]

@@ -37,6 +37,7 @@ FIRST_GUESS_S = 0.05  # to the rotor's next pass
 INNER_RAD = math.radians(8.0)
 GLANCE_RAD = math.radians(12.0)  # beside the sweep: its fan is 30 deg wide
 FRESH_NS = 350_000_000  # met a moment ago
+MOST_TRIED = 24  # looks that missed are remembered; it flies on
 HALF_SHARE = 0.3  # of its span: a beam so far from its middle meets it now and then
 RPM_RADPS = math.tau / 60.0
 
@@ -224,6 +225,7 @@ class BeamAim(Stage):
             ready_ns = servo.stamp_ns + round((self.lead_s + self.settle_s + way_s) * 1e9)
             pass_ns = now.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, place, best.table_rad), ready_ns)
         target.tried.append(Look(target.reach_m(pass_ns), offset_m))
+        del target.tried[:-MOST_TRIED]
         target.looks += 1
         target.missed += 1
         now.served += target.sure

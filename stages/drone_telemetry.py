@@ -12,6 +12,7 @@ from collections import deque
 import numpy as np
 
 from stages.geometry import Array64
+from stages.messages import DroneLocalPosition, DroneOdometry
 
 KEPT_NS = 20_000_000_000
 AHEAD_NS = 500_000_000  # beyond the newest word it is not known any more
@@ -52,6 +53,15 @@ class DroneTelemetry:
         while stamp_ns - self._ns[0] > KEPT_NS:
             for kept in (self._ns, self._xyz_m, self._v_mps):
                 kept.popleft()
+
+    def add_position(self, position: DroneLocalPosition) -> None:
+        """LOCAL_POSITION_NED and its like."""
+        self.add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+
+    def add_odometry(self, odometry: DroneOdometry) -> None:
+        """ODOMETRY: its velocity is in the drone's axes, and it counts its own jumps."""
+        velocity_mps = odometry.R_local_drone @ odometry.velocity_drone_mps
+        self.add(odometry.stamp_ns, odometry.xyz_local_m, velocity_mps, odometry.reset_counter)
 
     @property
     def heard_ns(self) -> tuple[int, int] | None:

@@ -80,7 +80,7 @@ class BeamAim(Stage):
     candidate_rest_s: float = Field(1.0, gt=0)
     candidate_probability: float = Field(0.006, ge=0, lt=1)  # less is not worth stopping for
     stop_probability: float = Field(0.35, ge=0, le=1)  # more, met `stop_looks` times, interrupts the sweep
-    patience: int = Field(8, ge=1)  # looks in a row that did not meet a sure candidate; a doubtful one has fewer
+    patience: int = Field(8, ge=1, le=MOST_TRIED)  # looks in a row that missed a sure candidate; fewer, if doubtful
     stop_looks: int = Field(2, ge=1)  # it was seen in so many turns of the rotor before it interrupts the sweep
     glances: int = Field(3, ge=0)  # at a candidate in passing
     turns_each: int = Field(3, ge=1)  # for each of several drones
@@ -174,7 +174,7 @@ class BeamAim(Stage):
         worth = [t for t in maybe if t.probability >= self.stop_probability and t.seen_looks >= self.stop_looks]
         if current in worth and not current.glance:
             doubtful = 0.5 * self.stop_probability  # so improbable it has none
-            if current.missed < self.patience * (current.probability - doubtful) / (1.0 - doubtful):
+            if len(current.tried) < self.patience * (current.probability - doubtful) / (1.0 - doubtful):
                 return current
             now.targets.leave(current, now_ns, self.candidate_rest_s)  # not there, or most likely something else
             worth.remove(current)
@@ -227,7 +227,6 @@ class BeamAim(Stage):
         target.tried.append(Look(target.reach_m(pass_ns), offset_m))
         del target.tried[:-MOST_TRIED]
         target.looks += 1
-        target.missed += 1
         now.served += target.sure
         now.hold_until_ns = max(pass_ns + TOLD_NS, servo.stamp_ns + SHORTEST_LOOK_NS)
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=goal_rad, speed_radps=speed_radps)

@@ -56,10 +56,7 @@ class Pointing(NamedTuple):
 
 def table_angles_rad(T_turntable_lidar: Array64, p_turntable_m: Array64, elevation_rad: float) -> tuple[float, ...]:
     """Turntable angles in [0, 2 pi) at which a beam of this elevation meets a point (3,); none when it never does."""
-    n, o = (
-        T_turntable_lidar[:3, 2].tolist(),
-        T_turntable_lidar[:3, 3].tolist(),
-    )  # Python's floats are faster than numpy's
+    n, o = T_turntable_lidar[:3, 2].tolist(), T_turntable_lidar[:3, 3].tolist()  # Python's floats are faster here
     n_o = float(T_turntable_lidar[:3, 2] @ T_turntable_lidar[:3, 3])
     x, y, z = p_turntable_m.tolist()
     m, rho = math.hypot(n[0], n[1]), math.hypot(x, y)

@@ -35,10 +35,9 @@ class Target:
     glance: bool = False  # looked at in passing, the sweep goes on
     seen_looks: int = 0  # turns in which the detector saw it
     looks: int = 0  # planned for it
-    missed: int = 0  # of them since it was seen last
     heard_ns: int = 0  # seen, if it is a candidate
     wander_mps: float = 0.0  # level, nobody knows whither
-    tried: list[Look] = field(default_factory=lambda: list[Look]())  # since it was seen last
+    tried: list[Look] = field(default_factory=lambda: list[Look]())  # since it was seen last, the newest
 
     def at(self, stamp_ns: int) -> Array64:
         return self.xyz_m + self.velocity_mps * ((stamp_ns - self.stamp_ns) * 1e-9)
@@ -87,7 +86,6 @@ class Targets:
                 seen_looks=int(candidates.looks[i]),
                 glance=old.glance if old else False,
                 looks=old.looks if old else 0,
-                missed=0 if old is None or again else old.missed,
                 heard_ns=int(candidates.seen_ns[i]),
                 wander_mps=0.0 if candidates.wander_mps is None else float(candidates.wander_mps[i]),
                 tried=[] if old is None or again else old.tried,
@@ -112,7 +110,6 @@ class Targets:
             sigma_m=sigma,
             sure=True,
             looks=old.looks if old else 0,
-            missed=old.missed if old and state.hits == 0 else 0,
             tried=old.tried if old and state.hits == 0 else [],
             heard_ns=state.stamp_ns if seen or old is None else old.heard_ns,
         )

@@ -30,13 +30,12 @@ class DroneWord:
         self._both = (self._position, self._odometry)
 
     def add_position(self, position: DroneLocalPosition) -> None:
-        """LOCAL_POSITION_NED and its like."""
-        self._position.add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+        """What its position filter tells."""
+        self._position.add_position(position)
 
     def add_odometry(self, odometry: DroneOdometry) -> None:
-        """ODOMETRY; it counts its own jumps."""
-        velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
-        self._odometry.add(odometry.stamp_ns, odometry.xyz_local_m, velocity, odometry.reset_counter)
+        """The same from an autopilot that sends this."""
+        self._odometry.add_odometry(odometry)
 
     def of(self, c: Candidate, motion_known: bool) -> Heard | None:
         """What it says for and against a candidate; None: nothing."""

@@ -12,7 +12,7 @@ Where the drone tells how it flies, that decides over still things, birds and ba
     odds of a drone = 1 / sum_k exp(-o_k),     o_k = ln of the odds, drone over thing k
 
 Every o_k is a prior and a sum of log likelihood ratios, capped where looks repeat the same evidence. The numbers
-are ours: reasoned, then changed on two dozen matrix flights (seeds 901 to 906). `unseen_m` and `again` were
+are ours: reasoned, then changed on some dozens of matrix flights (seeds 901 to 921). `unseen_m` and `again` were
 changed after flights of README's table (seeds 1 to 3) went wrong. They are not fitted, so P is no measured frequency.
 
 Source: ours; DESIGN, "a small cluster with *measured* emptiness around it, evaluated as data arrives".

@@ -72,13 +72,12 @@ class Hypotheses:
     def hear_position(self, position: DroneLocalPosition) -> None:
         """What the drone says of its flight."""
         self._predicted.clear()
-        self._told[0].told.add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+        self._told[0].told.add_position(position)
 
     def hear_odometry(self, odometry: DroneOdometry) -> None:
         """The same from an autopilot that sends this; taken where it sends both."""
-        velocity = odometry.R_local_drone @ odometry.velocity_drone_mps
         self._predicted.clear()
-        self._told[1].told.add(odometry.stamp_ns, odometry.xyz_local_m, velocity, odometry.reset_counter)
+        self._told[1].told.add_odometry(odometry)
 
     def word(self, stamp_ns: int) -> Word | None:
         """What the drone says of itself at a time, by the better of its messages."""

@@ -117,7 +117,7 @@ def tracking(*ways: Way, until_s=math.inf) -> Tell:
     return tell
 
 
-def candidates(place_m, t_s, probability, looks=3, seen_s=None) -> Candidates:
+def candidates(place_m, t_s, probability, looks=3, seen_s=None, wander_mps=0.0) -> Candidates:
     """One candidate; seen_s: when it was seen last, None: now."""
     return Candidates(
         stamp_ns=START_NS + round(t_s * 1e9),
@@ -128,6 +128,7 @@ def candidates(place_m, t_s, probability, looks=3, seen_s=None) -> Candidates:
         seen_ns=np.array([START_NS + round((t_s if seen_s is None else seen_s) * 1e9)]),
         looks=np.array([looks]),
         reasons=("made",),
+        wander_mps=np.array([wander_mps]),
     )
 
 
@@ -392,6 +393,21 @@ def test_a_candidate_that_is_met_now_and_then_keeps_the_patience():
 
     flight = fly(BeamAim(mount=ON_ITS_SIDE, patience=6), 2.3, tell, start_rad=math.radians(60.0))
     assert len(looks_of(flight)) > 18
+
+
+def test_what_was_met_once_is_looked_for_beside_where_it_was_as_far_as_it_may_have_flown():
+    way = towards(60.0, 30.0)
+    place = way(np.zeros(1))[0]
+
+    def missed_m(wander_mps):
+        def tell(aim, t_s):
+            if round(t_s * 1000) % 50 == 0:
+                aim.on_candidates(candidates(place, t_s, 0.9, seen_s=0.0, wander_mps=wander_mps))
+
+        return fly(BeamAim(mount=ON_ITS_SIDE), 0.3, tell, start_rad=math.radians(60.0)).missed_m(way)[1]
+
+    assert missed_m(0.0) < 0.06  # it hangs
+    assert missed_m(4.0) > 0.12  # by the next turn it is most likely on either side
 
 
 def test_each_rest_of_a_candidate_is_twice_as_long_as_the_one_before_up_to_sixteen_times():

@@ -280,6 +280,27 @@ def test_what_glides_by_while_the_drone_hangs_is_a_bird():
     assert "if not a drone, a bird" in candidates[-1].reasons[0]
 
 
+SHOWN_S = ((0.0, 0.1), (1.5, 1.8))  # a look, and some more a pass of the fan later
+PASSING_BY = flying((-3.0, 8.0, 10.0), (3.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("say", "again"), [(saying(PASSING_BY), True), (None, False)], ids=["speaks", "silent"])
+def test_a_drone_met_a_pass_later_where_it_says_it_would_be_goes_on_with_its_evidence(say, again):
+    shown = [During(Drone(PASSING_BY, seed=i), *when) for i, when in enumerate(SHOWN_S)]
+    candidates, _ = run(shown, seconds=2.0, say=say)
+    assert ("met again where the drone says it would be" in reasons_of(candidates)) == again
+
+
+def test_what_was_met_once_flies_on_at_the_speed_that_the_drone_says_nobody_knows_whither():
+    for say, speed_mps in ((saying(PASSING_BY), 3.0), (None, 0.0)):
+        candidates, _ = run([Drone(PASSING_BY)], seconds=1.0, say=say)
+        once = [told.wander_mps[told.looks == 1] for told in candidates]
+        more = [told.wander_mps[told.looks > 1] for told in candidates]
+        np.testing.assert_allclose(np.concatenate(once), speed_mps, atol=0.01)
+        assert np.concatenate(once).size
+        assert not np.concatenate(more).any()
+
+
 def test_a_lamp_is_refused_while_the_drone_flies_and_not_while_it_hangs():
     flies = saying(flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0)))
     candidates, detections = run([hanging()], say=flies)

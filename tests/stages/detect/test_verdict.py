@@ -67,6 +67,25 @@ def test_what_returns_little_is_taken_for_a_wire_that_was_looked_along():
     assert "it may stand still" in over_clutter(little, E, False, True)[1]
 
 
+def test_nearby_a_path_that_a_wire_followed_by_the_aim_would_show_is_no_flight_however_much_it_returns():
+    followed = Heard(20.0, 9.0, 9.0, 1.0)
+    for range_m, still in ((11.0, True), (25.0, False)):
+        c = candidate(*(sighting(0.1 * k, hits=12, range_m=range_m) for k in range(12)))
+        c.heard = followed
+        assert ("it may stand still" in over_clutter(c, E, False, True)[1]) == still
+
+
+def test_two_things_may_lie_as_the_drone_flew_by_chance_less_with_each_look_since():
+    c = hanging()
+    alone, _ = judge(c, E, True, True)
+    c.joined_at = 10
+    assert judge(c, E, True, True)[0] == pytest.approx(alone - E.joined / 2)
+    c.joined_at = 6
+    odds, words = judge(c, E, True, True)
+    assert odds == pytest.approx(alone - E.joined / 6)
+    assert "met again where the drone says it would be" in words
+
+
 def test_nearby_looks_with_nothing_beside_it_count_more_once_every_sector_was_crossed():
     near, far = hanging(range_m=15.0), hanging(range_m=60.0)
     assert most_alone(near, E) == most_alone(far, E) == E.most_alone  # nothing was measured around them

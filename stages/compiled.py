@@ -21,3 +21,17 @@ CACHE_FOLDER = keep_compiled(COMPILED)
 def compiled(function: F) -> F:
     """`numba.njit(cache=True, nogil=True)`: IEEE arithmetic, so that two machines agree."""
     return cast(F, numba.njit(cache=True, nogil=True)(function))  # pyright: ignore
+
+
+def compiled_at_once(types: str) -> Callable[[F], F]:
+    """`compiled`, for arguments of these types when its module is loaded; for others at the first call.
+
+    For what is first called in flight, and not before by `links/warm_up.py`: "(float64[::1], float64)".
+    """
+
+    def compile_now(function: F) -> F:
+        dispatcher = compiled(function)
+        cast(Any, dispatcher).compile(types)
+        return dispatcher
+
+    return compile_now

@@ -1,7 +1,6 @@
 """A VLP-16, pulse by pulse: each pulse leaves from its own pose, spreads into a footprint, and is detected or not.
 
-Source: VLP-16 user manual 63-9243 (timing, elevations, vertical offsets, return modes; 1 m between two returns);
-footprint 3.0 x 1.5 mrad: VLS-128 user manual 63-9483, table F-1, the same family's optics. Range noise as measured on
+Source: VLP-16 user manual 63-9243 (timing, return modes; 1 m between two returns). Range noise as measured on
 the real captures (7 mm median on flat patches); 0.5 m is the shortest range in them. Detection is ours: received
 power against a threshold set by the range at which a 10 % target is seen in half of the pulses.
 """
@@ -15,17 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from links.simulated.footprint import (
+    APERTURE_M,
+    COARSE_SPREAD_M,
+    FINE,
+    FOOTPRINT_RAD,
+    FOOTPRINTS,
+    sees_edge,
+    sub_rays,
+)
 from links.simulated.mesh import Array32, Array64
 from links.simulated.weather import RainClutter, Weather
 from links.velodyne import vlp16
 from stages.compiled import compiled
 
-ELEVATION_RAD = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))
-VERTICAL_OFFSET_M = 1e-3 * np.array(vlp16.VERTICAL_OFFSET_MM)
 RANGE_STEP_M = 1e-3 * vlp16.RANGE_UNIT_MM
 PULSE_LENGTH_M = 1.0  # two surfaces closer than this in range give one, blended return
-FOOTPRINT_RAD = (3.0e-3, 1.5e-3)  # full width along the scan, across it
-APERTURE_M = (12.7e-3, 9.5e-3)  # the beam where it leaves the sensor
 
 
 class LidarSettings(BaseModel):
@@ -34,6 +38,7 @@ class LidarSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     return_mode: Literal["strongest", "last", "dual"] = "strongest"
+    footprint: Literal["dense", "sparse"] = "dense"  # how finely a pulse is sampled; sparse takes half the time
     rotor_rpm: float = Field(default=600.0, ge=300, le=1200)
     range_at_10_percent_m: float = Field(default=65.0, gt=1)  # half of the pulses on such a target return
     power_spread_db: float = Field(default=1.0, gt=0)  # pulse-to-pulse spread of the received power, one sigma
@@ -43,24 +48,6 @@ class LidarSettings(BaseModel):
     dropout: float = Field(default=0.005, ge=0, lt=1)  # pulses lost for no reason in the scene
     min_range_m: float = 0.5
     max_range_m: float = 105.0
-
-
-@dataclass(frozen=True)
-class Pattern:
-    """Sub-rays of one pulse: (k, 2) in halves of the footprint, along and across the scan, and their shares (k,)."""
-
-    offsets: Array64
-    shares: Array64
-
-
-COARSE = Pattern(
-    np.array([(0.0, 0.0), (-0.6, -0.6), (-0.6, 0.6), (0.6, -0.6), (0.6, 0.6)]),
-    np.array([1 / 3, 1 / 6, 1 / 6, 1 / 6, 1 / 6]),
-)
-FINE = Pattern(
-    np.array([(u, v) for u in np.linspace(-6 / 7, 6 / 7, 7) for v in np.linspace(-0.8, 0.8, 5)]), np.full(35, 1 / 35)
-)
-COARSE_SPREAD_M = 0.3  # a pulse whose coarse sub-rays differ by more sees an edge and is cast again, finely
 
 
 class Surroundings(Protocol):
@@ -103,6 +90,7 @@ class Lidar:
         self._start_ns = start_ns
         self._rotor_phase_rad = fixed.uniform(0, 2 * np.pi)
         self._rotor_radps = settings.rotor_rpm / 60 * 2 * np.pi * (1 + fixed.normal(0, 3e-4))
+        self._patterns = FOOTPRINTS[settings.footprint]
         self._bias_m = fixed.normal(0, settings.laser_bias_m, vlp16.LASERS)
         self._threshold = 0.10 / settings.range_at_10_percent_m**2
         self._extinction_per_m = weather.extinction_per_m()
@@ -130,16 +118,20 @@ class Lidar:
 
         drops = np.full((2, count), np.inf) if self._drops is None else np.array(self._drops.draw(self._rain, count))
 
-        origins, directions = sub_rays(azimuth, laser, R_world_lidar, t_world_lidar_m, COARSE.offsets)
+        coarse, at_edges = self._patterns
+        origins, directions = sub_rays(azimuth, laser, R_world_lidar, t_world_lidar_m, coarse.offsets)
         seen = around.cast(pulse_ns, origins, directions, s.max_range_m + PULSE_LENGTH_M)
-        ranges, power, drone_power, drone = self._received(seen, COARSE.shares, threshold, drops)
+        ranges, power, drone_power, drone = self._received(seen, coarse.shares, threshold, drops)
         edge = sees_edge(seen[0], COARSE_SPREAD_M)
-        fine = np.nonzero(edge | around.near_small_body(pulse_ns, origins[:, 0], directions[:, 0]))[0]
-        if len(fine):
-            rays = sub_rays(azimuth[fine], laser[fine], R_world_lidar[fine], t_world_lidar_m[fine], FINE.offsets)
-            seen = around.cast(pulse_ns[fine], *rays, s.max_range_m + PULSE_LENGTH_M)
-            again = self._received(seen, FINE.shares, threshold[fine], drops[:, fine])
-            ranges[:, fine], power[:, fine], drone_power[:, fine], drone[:, fine] = again
+        small = around.near_small_body(pulse_ns, origins[:, 0], directions[:, 0])
+        again = ((edge | small, FINE),) if at_edges is FINE else ((small, FINE), (edge & ~small, at_edges))
+        for of_pulse, pattern in again:
+            some = np.nonzero(of_pulse)[0]
+            if len(some):
+                rays = sub_rays(azimuth[some], laser[some], R_world_lidar[some], t_world_lidar_m[some], pattern.offsets)
+                seen = around.cast(pulse_ns[some], *rays, s.max_range_m + PULSE_LENGTH_M)
+                finer = self._received(seen, pattern.shares, threshold[some], drops[:, some])
+                ranges[:, some], power[:, some], drone_power[:, some], drone[:, some] = finer
 
         margin = np.maximum(power / self._threshold, 1.0)
         sigma = np.sqrt(s.range_noise_m**2 + s.weak_range_noise_m**2 / margin)
@@ -205,56 +197,6 @@ def turned_poses(
             for k in range(3):
                 positions[n, i] += R_world_vehicle[n, i, k] * mounted[k, 3]
     return rotations, positions
-
-
-@compiled
-def sees_edge(ranges_m: Array32, spread_m: float) -> NDArray[np.bool_]:
-    """Pulses (n,) whose sub-rays (n, k) differ by more than the spread, or of which only some meet anything."""
-    found = np.zeros(len(ranges_m), dtype=np.bool_)
-    for i in range(len(ranges_m)):
-        lowest = highest = ranges_m[i, 0]
-        for r in ranges_m[i]:
-            lowest, highest = min(lowest, r), max(highest, r)
-        found[i] = np.isfinite(lowest) and highest > lowest + np.float32(spread_m)
-    return found
-
-
-@compiled
-def sub_rays(
-    azimuth_rad: Array64,
-    laser: NDArray[np.intp],
-    R_world_lidar: Array64,
-    t_world_lidar_m: Array64,
-    offsets: Array64,
-) -> tuple[Array32, Array32]:
-    """Origins and unit directions (n, k, 3) in the world of the sub-rays of pulses (n,).
-
-    Axis in the lidar frame: (cos w sin a, cos w cos a, sin w), from (0, 0, vertical offset of the laser).
-    """
-    count, rays = len(azimuth_rad), len(offsets)
-    origins = np.empty((count, rays, 3), dtype=np.float32)
-    directions = np.empty((count, rays, 3), dtype=np.float32)
-    ray, start = np.empty(3), np.empty(3)
-    for i in range(count):
-        ca, sa = np.cos(azimuth_rad[i]), np.sin(azimuth_rad[i])
-        cw, sw = np.cos(ELEVATION_RAD[laser[i]]), np.sin(ELEVATION_RAD[laser[i]])
-        R = R_world_lidar[i]
-        for k in range(rays):
-            u, v = offsets[k]
-            turn, lift = u * FOOTPRINT_RAD[0] / 2, v * FOOTPRINT_RAD[1] / 2
-            across, up = u * APERTURE_M[0] / 2, v * APERTURE_M[1] / 2
-            # axis + turn * e_across + lift * e_up, with e_across = (ca, -sa, 0) and e_up = (-sw sa, -sw ca, cw)
-            ray[0] = cw * sa + turn * ca - lift * sw * sa
-            ray[1] = cw * ca - turn * sa - lift * sw * ca
-            ray[2] = sw + lift * cw
-            ray /= np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-            start[0] = across * ca - up * sw * sa
-            start[1] = -across * sa - up * sw * ca
-            start[2] = VERTICAL_OFFSET_M[laser[i]] + up * cw
-            for j in range(3):
-                directions[i, k, j] = R[j, 0] * ray[0] + R[j, 1] * ray[1] + R[j, 2] * ray[2]
-                origins[i, k, j] = t_world_lidar_m[i, j] + R[j, 0] * start[0] + R[j, 1] * start[1] + R[j, 2] * start[2]
-    return origins, directions
 
 
 @compiled

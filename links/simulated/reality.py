@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from flow.link import Record
 from links.recording import RecordingReader
 from links.simulated.drone import DroneModel, drone_mesh
-from links.simulated.lidar import FINE, Lidar, LidarSettings, echoes, sub_rays
+from links.simulated.footprint import FINE, sub_rays
+from links.simulated.lidar import Lidar, LidarSettings, echoes
 from links.simulated.mesh import Array32, Array64, Mesh, RayScene
 from links.simulated.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world.room import room_mesh

@@ -169,44 +169,79 @@ def refusal_of(data: bytes) -> Refusal | None:
     return Refusal.TIMESTAMP if timestamp_us(data) >= vlp16.HOUR_US else None
 
 
-def decode_packet(data: bytes, stamp_ns: int, lost_packets: int) -> LidarFirings | None:
-    """Every pulse of one data packet that passed `refusal_of` and whose first laser fired at stamp_ns.
+class FiringRows:
+    """The pulses of up to so many data packets in a row, as one message."""
 
-    384 rows in single return, 192 to 384 in dual return, in firing order: one row of kind 0 for each pulse, with range
-    0 and xyz (0, 0, 0) where nothing returned. In dual return it is followed by one of kind 1 and the same time where
-    the last return differs from the strongest (or second strongest, which the sensor sends when the strongest came
-    last). None when the azimuths cannot be right.
-    """
-    pulse_stamp_ns = np.empty(PULSES, np.int64)
-    laser = np.empty(PULSES, np.uint8)
-    azimuth_rad = np.empty(PULSES, np.float32)
-    range_m = np.empty(PULSES, np.float32)
-    reflectivity = np.empty(PULSES, np.uint8)
-    return_kind = np.empty(PULSES, np.uint8)
-    xyz_lidar_m = np.empty((PULSES, 3), np.float32)
-    kernel = _decode_dual if data[vlp16.RETURN_MODE_AT] == vlp16.DUAL else _decode
-    rows = kernel(data, stamp_ns, pulse_stamp_ns, laser, azimuth_rad, range_m, reflectivity, return_kind, xyz_lidar_m)
-    if rows == 0:
-        return None
-    if rows < PULSES:
-        pulse_stamp_ns, laser, azimuth_rad = pulse_stamp_ns[:rows], laser[:rows], azimuth_rad[:rows]
-        range_m, reflectivity, return_kind = range_m[:rows], reflectivity[:rows], return_kind[:rows]
-        xyz_lidar_m = xyz_lidar_m[:rows]
-    return LidarFirings(
-        stamp_ns=stamp_ns,
-        pulse_stamp_ns=pulse_stamp_ns,
-        laser=laser,
-        azimuth_rad=azimuth_rad,
-        range_m=range_m,
-        reflectivity=reflectivity,
-        return_kind=return_kind,
-        xyz_lidar_m=xyz_lidar_m,
-        lost_packets=lost_packets,
-        laser_elevation_rad=_LASER_ELEVATION_RAD,
-    )
+    def __init__(self, most: int) -> None:
+        """`most`: packets in a message."""
+        self._most = most
+        self._start()
+
+    def _start(self) -> None:
+        rows = self._most * PULSES
+        self.packets = self._rows = self._stamp_ns = self._lost_packets = 0
+        self._pulse_stamp_ns = np.empty(rows, np.int64)
+        self._laser = np.empty(rows, np.uint8)
+        self._azimuth_rad = np.empty(rows, np.float32)
+        self._range_m = np.empty(rows, np.float32)
+        self._reflectivity = np.empty(rows, np.uint8)
+        self._return_kind = np.empty(rows, np.uint8)
+        self._xyz_lidar_m = np.empty((rows, 3), np.float32)
+
+    @property
+    def full(self) -> bool:
+        """Whether it takes no more."""
+        return self.packets == self._most
+
+    def add(self, data: bytes, stamp_ns: int, lost_packets: int) -> bool:
+        """Every pulse of a packet that passed `refusal_of` and whose first laser fired at stamp_ns.
+
+        384 rows in single return, 192 to 384 in dual return, in firing order: one row of kind 0 for each pulse, with
+        range 0 and xyz (0, 0, 0) where nothing returned. In dual return it is followed by one of kind 1 and the same
+        time where the last return differs from the strongest (or second strongest, which the sensor sends when the
+        strongest came last). False, and nothing is taken, when the azimuths cannot be right.
+        """
+        free = slice(self._rows, self._rows + PULSES)
+        kernel = _decode_dual if data[vlp16.RETURN_MODE_AT] == vlp16.DUAL else _decode
+        rows = kernel(
+            data,
+            stamp_ns,
+            self._pulse_stamp_ns[free],
+            self._laser[free],
+            self._azimuth_rad[free],
+            self._range_m[free],
+            self._reflectivity[free],
+            self._return_kind[free],
+            self._xyz_lidar_m[free],
+        )
+        if rows == 0:
+            return False
+        if self.packets == 0:
+            self._stamp_ns, self._lost_packets = stamp_ns, lost_packets
+        self.packets += 1
+        self._rows += rows
+        return True
+
+    def take(self) -> LidarFirings:
+        """What was added since the call before."""
+        filled = slice(0, self._rows)
+        firings = LidarFirings(
+            stamp_ns=self._stamp_ns,
+            pulse_stamp_ns=self._pulse_stamp_ns[filled],
+            laser=self._laser[filled],
+            azimuth_rad=self._azimuth_rad[filled],
+            range_m=self._range_m[filled],
+            reflectivity=self._reflectivity[filled],
+            return_kind=self._return_kind[filled],
+            xyz_lidar_m=self._xyz_lidar_m[filled],
+            lost_packets=self._lost_packets,
+            laser_elevation_rad=_LASER_ELEVATION_RAD,
+        )
+        self._start()
+        return firings
 
 
 def compile_kernels() -> None:
     """Compile the kernels, or load them from numba's cache, before packets wait for it."""
     for mode in (vlp16.STRONGEST, vlp16.DUAL):
-        decode_packet(bytes(vlp16.RETURN_MODE_AT) + bytes([mode, vlp16.PRODUCT_ID]), 0, 0)
+        FiringRows(1).add(bytes(vlp16.RETURN_MODE_AT) + bytes([mode, vlp16.PRODUCT_ID]), 0, 0)

@@ -21,7 +21,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from flow.link import LinkError, Record, Source
 from links.velodyne import vlp16
 from links.velodyne.clock import ClockMode, DeviceClock
-from links.velodyne.decode import compile_kernels, decode_packet, refusal_of, timestamp_us
+from links.velodyne.decode import FiringRows, compile_kernels, refusal_of, timestamp_us
 from links.velodyne.position import PpsWatch
 from links.velodyne.refusal import Refusal
 from links.velodyne.udp import Channel, UdpCounters, listen_udp
@@ -42,6 +42,7 @@ class Lidar(Source):
     sender: IPv4Address | None = None  # the lidar's address, 192.168.1.201 from the factory
     position_port: int | None = Field(None, ge=1, le=65535)  # 8308 from the factory; None: do not listen to it
     timeout_s: float = Field(2.0, gt=0, le=60)
+    packets: int = Field(1, ge=1, le=16)  # in a message, 1.3 ms each: fewer messages cost less, and come later
 
     _pps: PpsWatch = PrivateAttr(default_factory=PpsWatch)
     _udp: UdpCounters = PrivateAttr(default_factory=UdpCounters)
@@ -57,10 +58,13 @@ class Lidar(Source):
 
     @cached_property  # a private attribute would cost 1.7 us at every packet
     def _stream(self) -> PacketStream:
-        return PacketStream(self.topic, DeviceClock(self.clock, round(1e9 * self.clock_limit_s)))
+        return PacketStream(self.topic, DeviceClock(self.clock, round(1e9 * self.clock_limit_s)), self.packets)
 
     def decode(self, record: Record) -> LidarFirings | None:
-        """Pulses of one packet; None when it is refused. LinkError for another model, or 100 refused in a row."""
+        """Pulses of a packet, or of `packets` once the last of them has come; None before, and when it is refused.
+
+        LinkError for another model, or 100 refused in a row.
+        """
         return self._stream.decode(record)
 
     @contextmanager
@@ -111,9 +115,13 @@ class Lidar(Source):
 
 
 class PacketStream:
-    """Decodes packets in turn, and counts what was lost between them and what was refused."""
+    """Decodes packets in turn, and counts what was lost between them and what was refused.
 
-    def __init__(self, topic: str, clock: DeviceClock) -> None:
+    A message holds packets that follow one another: a gap ends it early.
+    """
+
+    def __init__(self, topic: str, clock: DeviceClock, together: int = 1) -> None:
+        """`together`: packets in a message."""
         self.clock = clock
         self.decoded = 0
         self.lost = 0
@@ -122,6 +130,7 @@ class PacketStream:
         self._refused_in_a_row = 0
         self._lost_before = 0
         self._packet_ns = vlp16.packet_ns(vlp16.STRONGEST)
+        self._together, self._rows = together, FiringRows(together)
 
     def decode(self, record: Record) -> LidarFirings | None:
         """See `Lidar.decode`."""
@@ -134,17 +143,21 @@ class PacketStream:
             return self._refuse(tick, data)
         stamp_ns, gap_ns = tick
         # The packet before lasted _packet_ns: when this one is later than its end, others are missing between.
+        follows = abs(gap_ns - self._packet_ns) <= self._packet_ns // 2 and not self._lost_before
         lost = self._lost_before + max((gap_ns + self._packet_ns // 2) // self._packet_ns - 1, 0)
         self._packet_ns = vlp16.packet_ns(data[vlp16.RETURN_MODE_AT])
-        firings = decode_packet(data, stamp_ns, lost)
-        if firings is None:
+        rows = self._rows if follows or not self._rows.packets else FiringRows(self._together)
+        if not rows.add(data, stamp_ns, lost):
             self._lost_before = lost + 1
             return self._refuse(Refusal.AZIMUTH, data)
         self.lost += lost
         self._lost_before = 0
         self.decoded += 1
         self._refused_in_a_row = 0
-        return firings
+        before, self._rows = self._rows, rows
+        if rows.full:
+            return rows.take()
+        return before.take() if rows is not before else None
 
     def _refuse(self, refusal: Refusal, data: bytes) -> None:
         self.refused[refusal] += 1

@@ -13,7 +13,10 @@ from stages.messages.shapes import Mat6
 
 @message
 class LidarFirings(Message):
-    """One decoded LiDAR packet, every laser pulse of it: also those that saw nothing (range_m = 0). Frame: lidar."""
+    """One decoded LiDAR packet, or a few in a row, every laser pulse: also those that saw nothing (range_m = 0).
+
+    Frame: lidar.
+    """
 
     pulse_stamp_ns: PerPointI64  # when each laser fired
     laser: PerPointU8  # 0..15, the packet's channel order
@@ -22,7 +25,7 @@ class LidarFirings(Message):
     reflectivity: PerPointU8  # 0..255, calibrated by the sensor
     return_kind: PerPointU8  # 0 strongest (or only), 1 last; dual mode has both
     xyz_lidar_m: Points32  # (0, 0, 0) where there was no return
-    lost_packets: int  # packets missing just before this one
+    lost_packets: int  # packets missing just before
     laser_elevation_rad: Annotated[NDArray[np.float64], Shape("lasers")]  # where each laser points, over z_lidar = 0
 
 

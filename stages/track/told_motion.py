@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.compiled import compiled
+from stages.compiled import compiled_at_once
 from stages.drone_telemetry import DroneTelemetry
 from stages.geometry import Array64
 from stages.smooth_motion import log_p, model_of
@@ -161,7 +161,7 @@ class ToldMotion:
         return x, covariance
 
 
-@compiled
+@compiled_at_once("(float64[::1], float64[:, ::1], float64[:, ::1], float64)")
 def weigh_yaws(t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float) -> tuple[Array64, float]:
     """ln p (YAWS,) of a path x (n, 3) as told (n, 3) turned by each yaw, and of it as anything's."""
     x, d = x_m.copy(), told_m.copy()

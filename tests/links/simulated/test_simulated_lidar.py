@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from links.simulated.lidar import COARSE, FINE, Lidar, LidarSettings, echoes, sub_rays
+from links.simulated.footprint import COARSE, FINE, sub_rays
+from links.simulated.lidar import Lidar, LidarSettings, echoes
 from links.simulated.mesh import RayScene, box, merge, quads
 from links.velodyne import vlp16
 from stages.geometry import rotation_from_rpy_deg, rotation_z

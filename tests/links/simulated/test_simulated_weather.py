@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from links.simulated.lidar import APERTURE_M, FOOTPRINT_RAD, Lidar, LidarSettings
+from links.simulated.footprint import APERTURE_M, FOOTPRINT_RAD
+from links.simulated.lidar import Lidar, LidarSettings
 from links.simulated.mesh import RayScene, quads
 from links.simulated.reality import Still
 from links.simulated.weather import CLUTTER_REACH_M, RainClutter, Weather, haze_extinction_per_m

@@ -10,6 +10,7 @@ from hand_built import (
     HOUR_NS,
     PUCK_HI_RES,
     SINGLE_PACKET_NS,
+    STRONGEST,
     captured,
     captured_records,
     exact_records,
@@ -20,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flow.link import LinkError
-from flow.message import check_arrays
+from flow.message import array_fields, check_arrays
 from links.velodyne import Lidar
 from links.velodyne.refusal import Refusal
 
@@ -74,6 +75,46 @@ def test_repeated_and_overtaken_packets_are_ignored_and_counted():
     assert [answer is not None for answer in answers] == [True, True, False, False, True]
     assert [answers[k].lost_packets for k in (0, 1, 4)] == [0, 1, 0]
     assert refused(lidar, Refusal.ORDER) == 2
+
+
+def told(records, packets):
+    lidar = Lidar(packets=packets)
+    return [lidar.decode(r) for r in records]
+
+
+def packets_of(answers):
+    return [0 if answer is None else answer.pulse_stamp_ns.size // 384 for answer in answers]
+
+
+@pytest.mark.parametrize("mode", [STRONGEST, DUAL])
+def test_packets_told_together_are_those_told_alone_in_a_row(mode):
+    interval_ns = SINGLE_PACKET_NS // (2 if mode == DUAL else 1)
+    ranges = np.random.default_rng(1).integers(0, 30_000, (12, 32))
+    records = exact_records(9, interval_ns=interval_ns, mode=mode, ranges=ranges)
+    alone, three = told(records, 1), told(records, 3)
+    assert [answer is not None for answer in three] == 3 * [False, False, True]
+    for k, group in enumerate(three[2::3]):
+        check_arrays(group)
+        assert group.stamp_ns == alone[3 * k].stamp_ns
+        for name, _, shape in array_fields(type(group)):
+            if "n" in shape.dims:
+                parts = [getattr(one, name) for one in alone[3 * k : 3 * k + 3]]
+                np.testing.assert_array_equal(getattr(group, name), np.concatenate(parts), err_msg=name)
+
+
+def test_a_gap_ends_a_message_and_the_next_one_tells_what_was_lost():
+    records = exact_records(12)
+    answers = told(records[:2] + records[5:11], 4)
+    assert packets_of(answers) == [0, 0, 2, 0, 0, 4, 0, 0]
+    assert [answer.lost_packets for answer in answers if answer] == [0, 3]
+
+
+def test_a_packet_that_is_refused_ends_a_message_but_loses_nothing_of_it():
+    records = exact_records(6)
+    spoilt = [*records[:2], record(packet(step=3_000, time_us=2_654), 2_654_208), *records[3:]]
+    answers = told(spoilt, 3)
+    assert packets_of(answers) == [0, 0, 0, 2, 0, 3]
+    assert [answer.lost_packets for answer in answers if answer] == [0, 1]
 
 
 def damaged(**change):

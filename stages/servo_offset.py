@@ -52,7 +52,7 @@ class ServoClock(Stage):
 
     mount: LidarMount
     window_s: float = Field(3.0, ge=1, le=20)
-    every_packet: int = Field(12, ge=1, le=100)  # of the LiDAR's packets this one is taken
+    every_packet: int = Field(12, ge=1, le=100)  # of the LiDAR's messages one in so many is taken
     every_window: int = Field(
         10, ge=1, le=1000
     )  # of the windows this one is taken, once the offset is known to CLOSE_S

@@ -45,7 +45,7 @@ class Sweep(Stage):
     reversal_deg: float = Field(0.5, gt=0, lt=30)
     min_range_m: float = Field(0.6, ge=0)  # nearer returns are the sensor's own mount
     max_servo_gap_s: float = Field(0.1, ge=0.005)  # between two states; longer is not interpolated
-    max_waiting_packets: int = Field(256, ge=1)  # 0.34 s of a VLP-16; then the oldest goes without an angle
+    max_wait_s: float = Field(0.34, gt=0)  # for a servo state; then the oldest packet goes without an angle
 
     _waiting: deque[LidarFirings] = PrivateAttr(default_factory=lambda: deque[LidarFirings]())
     _turntable: Turntable = PrivateAttr()
@@ -70,7 +70,7 @@ class Sweep(Stage):
         waiting = self._waiting
         waiting.append(firings)
         yield from self._release()
-        if len(waiting) > self.max_waiting_packets:
+        if waiting and firings.stamp_ns - waiting[0].stamp_ns >= self.max_wait_s * 1e9:
             yield from self._place(waiting.popleft())
 
     def on_servo(self, servo: ServoState) -> Iterator[SweptPoints | SweptPulses | DepthImage]:

@@ -21,7 +21,7 @@ FOOTPRINT_RAD = (3.0e-3, 1.5e-3)  # full width along the scan, across it
 APERTURE_M = (12.7e-3, 9.5e-3)  # the beam where it leaves the sensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pattern:
     """Sub-rays of one pulse: (k, 2) in halves of the footprint, along and across the scan, and their shares (k,)."""
 

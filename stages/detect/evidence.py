@@ -45,7 +45,7 @@ from stages.pulses import mean_direction
 from stages.sweep import Travel
 from stages.trail import VehicleTrail
 
-BANK_TIDIED = 64  # slices: about ten times a second
+TIDIED_NS = 84_300_000  # about ten times a second
 AMONG_M = 1.5
 AMONG_NS = 20_000_000_000
 SAME_PLACE_M = 0.5
@@ -76,7 +76,7 @@ class _Now:
     refused_places: BigThings = field(default_factory=BigThings)
     watches: dict[int, _Watch] = field(default_factory=lambda: dict[int, _Watch]())
     refused: Counter[str] = field(default_factory=Counter[str])
-    slices: int = 0
+    tidied_ns: int = 0
     number: int = 0  # of the newest candidate
     start_ns: int | None = None  # of the search not yet reported
     end_ns: int | None = None  # of a pass that is over, not yet reported
@@ -130,14 +130,14 @@ class EvidenceDetect(Stage):
         now = self._now
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
-            now.start_ns = pulses.stamp_ns
+            now.start_ns = now.tidied_ns = pulses.stamp_ns
         axis = mean_direction(pulses.direction_vehicle)
         part = Slice(pulses, *now.trail.at(pulses.stamp_ns), axis / max(math.hypot(*axis.tolist()), 1e-9))
         changed = False
         sightings = now.finder.feed(part, self.parked or now.trail.known)
         self._look_for_misses(now, part, now_ns)
-        now.slices += 1
-        if now.slices % BANK_TIDIED == 0:
+        if now_ns - now.tidied_ns > TIDIED_NS:
+            now.tidied_ns = now_ns
             changed = self._tidy(now, now_ns)
         for sighting in sightings:
             changed |= self._take(now, sighting)

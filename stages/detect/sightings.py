@@ -1,6 +1,6 @@
 """From pulses to sightings: the short, free-ended chords of one look on one thing, and what was measured around it.
 
-A sighting is complete when the rotor has gone on: what stands around a place is known `DELAY` slices later.
+A sighting is complete when the rotor has gone on: what stands around a place is known `DELAY_NS` later.
 
 Source: ours; DESIGN, The graph: detect.
 """
@@ -23,8 +23,9 @@ from stages.geometry import Array64
 from stages.messages import SweptPulses
 
 BEAM_SPACING_RAD = math.radians(2.0)  # between two lasers of a VLP-16
-SLICES = 7  # 34 deg of the rotor
-DELAY = 3  # slices after which what stands around a sighting has been seen
+WINDOW_NS = 8_600_000  # what is kept: 31 deg of a rotor at 600 rpm and the slice that is begun
+MOST_SLICES = 16  # of them
+DELAY_NS = 3_300_000  # after which what stands around a sighting has been seen
 MEMORY_NS = 3_000_000_000  # of big things, when the vehicle tells how it moves
 SHORT_MEMORY_NS = 1_000_000_000  # when it does not
 NONE, BIG, SMALL, HIDDEN = range(4)  # kinds of chords
@@ -33,7 +34,7 @@ BALL_ROUGH_M = 0.02
 
 
 class Slice(NamedTuple):
-    """A packet's pulses, and where the vehicle was."""
+    """A packet's pulses, or those of a few in a row, and where the vehicle was."""
 
     pulses: SweptPulses
     R: Array64  # R_local_vehicle, t_local_vehicle
@@ -52,7 +53,7 @@ class Limits(NamedTuple):
 
 
 class _Chord(NamedTuple):
-    slice: int
+    found_ns: int  # the end of the slice it was found in
     row: Array64
     place_m: tuple[float, ...]  # its middle
     stamp_ns: int
@@ -66,21 +67,22 @@ class SightingFinder:
         span_m = limits.span_m
         self._chords = ChordFinder(1.6 * span_m, 0.7 * span_m, 0.6 * span_m)
         self._big = BigThings()
-        self._slices: deque[Slice] = deque(maxlen=SLICES)
+        self._slices: deque[Slice] = deque(maxlen=MOST_SLICES)
         self._lately = Lately()
         self._waiting: list[_Chord] = []
-        self._count = 0
         self.hidden: Counter[str] = Counter()  # short chords that were not free at both ends
 
     def feed(self, part: Slice, motion_known: bool) -> list[Sighting]:
         """The sightings that are complete with this slice."""
+        now_ns = int(part.pulses.point_stamp_ns[-1])
+        while self._slices and now_ns - self._slices[0].pulses.point_stamp_ns[-1] > WINDOW_NS:
+            self._slices.popleft()
         self._slices.append(part)
-        self._lately.add(part.pulses)
-        self._count += 1
-        self._find(part)
-        if not self._waiting or self._waiting[0].slice > self._count - DELAY:
+        self._lately.add(part.pulses, now_ns)
+        self._find(part, now_ns)
+        if not self._waiting or now_ns - self._waiting[0].found_ns < DELAY_NS:
             return []
-        ready = [c for c in self._waiting if c.slice <= self._count - DELAY]
+        ready = [c for c in self._waiting if now_ns - c.found_ns >= DELAY_NS]
         self._waiting = self._waiting[len(ready) :]
         found: list[Sighting] = []
         while ready:
@@ -90,7 +92,7 @@ class SightingFinder:
             ready = [c for c, same in zip(ready, near, strict=True) if not same]
         return found
 
-    def _find(self, part: Slice) -> None:
+    def _find(self, part: Slice, now_ns: int) -> None:
         limits, pulses = self._limits, part.pulses
         found = self._chords.feed(pulses)
         rows = found.rows
@@ -102,7 +104,7 @@ class SightingFinder:
         self.hidden["hidden at an end by something nearer"] += int(np.count_nonzero(kinds == HIDDEN))
         for i in np.nonzero(kinds == SMALL)[0].tolist():
             middle_ns = int(found.first_ns[i] + found.last_ns[i]) // 2
-            self._waiting.append(_Chord(self._count, rows[i], tuple(rows[i, :3].tolist()), middle_ns))
+            self._waiting.append(_Chord(now_ns, rows[i], tuple(rows[i, :3].tolist()), middle_ns))
 
     def _sighting(self, same: list[_Chord], motion_known: bool) -> Sighting:
         span_m = self._limits.span_m
@@ -140,22 +142,24 @@ class Lately:
     """The last slices' pulses side by side, so that one compiled call looks at all of them."""
 
     def __init__(self) -> None:
-        self._direction = np.empty((SLICES, 0, 3), dtype=np.float32)
-        self._range_m = np.empty((SLICES, 0), dtype=np.float32)
-        self._origin_m = np.zeros((SLICES, 3))
-        self._sizes = np.zeros(SLICES, dtype=np.int64)
+        self._direction = np.empty((MOST_SLICES, 0, 3), dtype=np.float32)
+        self._range_m = np.empty((MOST_SLICES, 0), dtype=np.float32)
+        self._origin_m = np.zeros((MOST_SLICES, 3))
+        self._sizes = np.zeros(MOST_SLICES, dtype=np.int64)  # 0: none, or too old
+        self._end_ns = np.zeros(MOST_SLICES, dtype=np.int64)
         self._next = 0
 
-    def add(self, pulses: SweptPulses) -> None:
-        """One more; the oldest is forgotten."""
+    def add(self, pulses: SweptPulses, end_ns: int) -> None:
+        """One more, whose last pulse left then; those before the window are forgotten."""
         n, k = pulses.range_m.size, self._next
         missing = n - self._range_m.shape[1]
         if missing > 0:
             self._direction = np.pad(self._direction, ((0, 0), (0, missing), (0, 0)))
             self._range_m = np.pad(self._range_m, ((0, 0), (0, missing)))
         self._direction[k, :n], self._range_m[k, :n] = pulses.direction_vehicle, pulses.range_m
-        self._origin_m[k], self._sizes[k] = pulses.origin_vehicle_m, n
-        self._next = (k + 1) % SLICES
+        self._origin_m[k], self._sizes[k], self._end_ns[k] = pulses.origin_vehicle_m, n, end_ns
+        self._sizes[end_ns - self._end_ns > WINDOW_NS] = 0
+        self._next = (k + 1) % MOST_SLICES
 
     def around(
         self, centre_m: Array64, disc_m: float, inner_m: float, close_m: float, outer_m: float, depth_m: float

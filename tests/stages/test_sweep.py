@@ -192,7 +192,7 @@ def test_packets_before_the_first_state_and_after_the_last_are_dropped_with_a_re
 
 
 def test_the_queue_is_bounded_when_the_servo_never_answers():
-    stage = Sweep(mount=ON_ITS_SIDE, max_waiting_packets=10)
+    stage = Sweep(mount=ON_ITS_SIDE, max_wait_s=9.5e-9 * PACKET_NS)
     out = [m for i in range(50) for m in stage.on_firings(firings(UP, [START_NS + i * PACKET_NS]))]
     assert [m.range_m.size for m in out if isinstance(m, SweptPulses)] == [0] * 40  # without an angle, no direction
     assert len([m for m in out if isinstance(m, SweptPoints)]) == 40

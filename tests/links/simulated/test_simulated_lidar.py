@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from links.simulated.footprint import COARSE, FINE, sub_rays
+from links.simulated.footprint import COARSE, FINE, FOOTPRINTS, sub_rays
 from links.simulated.lidar import Lidar, LidarSettings, echoes
 from links.simulated.mesh import RayScene, box, merge, quads
 from links.velodyne import vlp16
@@ -97,8 +97,10 @@ def test_the_footprint_is_3_by_1_5_mrad_and_its_shares_add_to_one() -> None:
     rays = rays[0].astype(np.float64)
     assert np.linalg.norm(rays[0] - rays[1]) == pytest.approx(3.0e-3, rel=1e-3)
     assert np.linalg.norm(rays[2] - rays[3]) == pytest.approx(1.5e-3, rel=1e-3)
-    assert COARSE.shares.sum() == pytest.approx(1.0)
-    assert FINE.shares.sum() == pytest.approx(1.0)
+    for pattern in {FINE, *FOOTPRINTS["dense"], *FOOTPRINTS["sparse"]}:
+        assert pattern.shares.sum() == pytest.approx(1.0)
+        assert len(pattern.shares) == len(pattern.offsets)
+        assert np.abs(pattern.shares @ pattern.offsets).max() < 1e-12  # its middle is the axis
 
 
 def test_a_turned_and_shifted_lidar_sends_turned_and_shifted_rays_from_its_aperture() -> None:
@@ -163,6 +165,18 @@ def test_an_edge_gives_mixed_returns_only_within_a_pulse_length() -> None:
 
     assert between(0.6) > 0
     assert between(3.0) == 0
+
+
+def test_a_sparse_footprint_sees_walls_alike_and_as_many_of_the_pulses_at_an_edge() -> None:
+    edge = quads([[(6.0, -50, -50), (6.0, 0.3, -50), (6.0, 0.3, 50), (6.0, -50, 50)]], "plaster")
+    room = _Room(merge([edge, _wall(9.0)]))
+    _, _, dense = _fire(room, 1900, footprint="dense")
+    _, _, sparse = _fire(room, 1900, footprint="sparse")
+    d, s = dense.range_m[0], sparse.range_m[0]
+    alike = np.abs(d - s) < 0.02
+    assert alike.mean() > 0.98
+    assert np.count_nonzero(s > 0) == pytest.approx(np.count_nonzero(d > 0), rel=0.002)
+    assert np.count_nonzero(s > 8.9) == pytest.approx(np.count_nonzero(d > 8.9), rel=0.01)
 
 
 def test_nothing_in_reach_is_no_return() -> None:

@@ -67,7 +67,6 @@ class Candidate:
     few: float = 0.0
     beside: float = 0.0  # recent looks in which something stood beside it
     alone: float = 0.0  # and those in which nothing did
-    open_looks: int = 0  # all of those
     balls: int = 0
     rugged: int = 0
     fastest_mps: float = 0.0  # speed and acceleration it clearly reached once
@@ -133,9 +132,7 @@ class Candidate:
         self.rugged += s.rugged
         standing, measured = what_stands_beside(s.around, self.free)
         self.beside = FADING * self.beside + standing
-        nothing = measured and standing == 0.0
-        self.alone = FADING * self.alone + nothing
-        self.open_looks += nothing
+        self.alone = FADING * self.alone + (measured and standing == 0.0)
         self.big_m = s.big_m
         self.big_looks += math.isfinite(s.big_m)
         self.path_ns.append(s.stamp_ns)

@@ -49,11 +49,7 @@ class Evidence(BaseModel):
 
     clutter: float = -6.0  # prior, assumed: of short things in the sky one in 400 hangs free
     free_sector: float = 0.6  # each of eight sectors that pulses flew through
-    beside: float = -3.0  # each look with something in a sector, lately
-    most_beside: float = -12.0
-    passing: float = (
-        20.0  # so many looks with nothing halve that for one that flies as the drone says: it passes something
-    )
+    beside: float = -3.0  # each look with something in a sector
     alone: float = 0.3  # each look with nothing, up to most_alone
     most_alone: float = 2.0
     near_alone: float = 3.0  # nearby up to so much more: there a wire that held it would return pulses, too
@@ -133,6 +129,12 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     """Drone over a lamp, wire, leaf or edge [nats], and what was noticed."""
     said: list[str] = []
     odds = e.clutter
+    if free_space:
+        free = int(np.count_nonzero(c.free >= 1))
+        odds += e.free_sector * free + max(e.beside * c.beside, -12.0) + min(e.alone * c.alone, most_alone(c, e))
+        said.append(f"{free} of {SECTORS} sectors around it free")
+        if c.beside > 0.5:
+            said.append("something beside it")
     few = min(max(c.few, -e.most_few), e.most_many)
     odds += few - e.long * min(c.long_looks, 4)
     if few < -1.0:
@@ -147,15 +149,6 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     else:
         moved = c.moves(motion_known)
         odds += e.moves if moved else 0.0
-    if free_space:
-        free = int(np.count_nonzero(c.free >= 1))
-        beside = max(e.beside * c.beside, e.most_beside)
-        if moved and c.heard is not None:  # what holds it would have been there all the way
-            beside /= 1.0 + c.open_looks / e.passing
-        odds += e.free_sector * free + beside + min(e.alone * c.alone, most_alone(c, e))
-        said.append(f"{free} of {SECTORS} sectors around it free")
-        if c.beside > 0.5:
-            said.append("something beside it")
     if not moved:
         odds += min(e.still * c.hit_looks, e.most_still)
         said.append("it may stand still")

@@ -67,16 +67,6 @@ def test_what_returns_little_is_taken_for_a_wire_that_was_looked_along():
     assert "it may stand still" in over_clutter(little, E, False, True)[1]
 
 
-def test_what_flies_as_the_drone_says_and_had_nothing_beside_it_for_long_may_pass_something():
-    flew, silent = hanging(Heard(20.0, 0.0, 0.0, 20.0)), hanging()
-    for c, counts in ((flew, E.most_beside / 4), (silent, E.most_beside)):
-        alone, _ = over_clutter(c, E, True, True)
-        c.beside, c.open_looks = 20.0, round(3 * E.passing)
-        odds, said = over_clutter(c, E, True, True)
-        assert odds == pytest.approx(alone + counts)
-        assert "something beside it" in said
-
-
 def test_nearby_a_path_that_a_wire_followed_by_the_aim_would_show_is_no_flight_however_much_it_returns():
     followed = Heard(20.0, 9.0, 9.0, 1.0)
     for range_m, still in ((11.0, True), (25.0, False)):

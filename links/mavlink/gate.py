@@ -46,7 +46,7 @@ class Limits(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    position_sigma_m: float = Field(default=0.5, gt=0, le=5)
+    position_sigma_m: float = Field(default=0.35, gt=0, le=5)  # 95 % are within 2.8 sigma, 1 m
     rotation_sigma_deg: float = Field(default=5.0, gt=0, le=15)
     velocity_sigma_mps: float = Field(default=0.5, gt=0, le=5)  # beyond it the pose goes out without velocity
     age_s: float = Field(default=0.15, gt=0, le=0.3)  # of the pose when it is to go out

@@ -26,9 +26,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
+from links.mavlink.gate import Limits, pose_sigmas
 from links.recording import RecordingReader
 from links.simulated.live_pictures import PictureServer
 from links.truth import TruthLog
+from tests.links.long_flight import flown_for
 from tests.links.ports import free_ports
 
 pytestmark = pytest.mark.slow
@@ -112,11 +114,21 @@ class Told:
     pose: tuple[float, ...]  # xyz, quaternion
 
 
+def given_out(row: dict[str, str]) -> bool:
+    """Whether a pose of this covariance goes to the autopilot (links/mavlink/gate.py)."""
+    covariance = np.zeros((6, 6))
+    for i, k in zip(*np.triu_indices(6), strict=True):
+        covariance[i, k] = covariance[k, i] = float(row[f"c{i}{k}"])
+    rotation_rad, position_m = pose_sigmas(covariance) or (np.inf, np.inf)
+    sure = position_m <= Limits().position_sigma_m and np.degrees(rotation_rad) <= Limits().rotation_sigma_deg
+    return bool(row["good"] == "1" and sure)
+
+
 def positions(folder: Path) -> list[Told]:
     poses, table = folder / "pose_vehicle_drone.tum", folder / "pose_covariance.csv"
     if not poses.exists() or not table.exists():
         return []
-    good = {row["stamp_s"]: row["good"] == "1" for row in csv.DictReader(table.read_text().splitlines())}
+    good = {row["stamp_s"]: given_out(row) for row in csv.DictReader(table.read_text().splitlines())}
     lines = [line.split() for line in poses.read_text().splitlines() if line[:1].isdigit()]
     whole = [line for line in lines if len(line) == 8 and line[0] in good]
     return [Told(float(line[0]), good[line[0]], tuple(map(float, line[1:]))) for line in whole]
@@ -128,8 +140,7 @@ def stage(tmp_path):
     ports = dict(zip(names, free_ports(len(names)), strict=True))
     servo = tmp_path / "servo"
     (tmp_path / "faults.yaml").write_text(OVERLAY.format(servo=servo, **ports))
-    scenario = (ROOT / "configs/scenarios/live_street.yaml").read_text().replace("duration_s: 120.0", "duration_s: 900")
-    (tmp_path / "long.yaml").write_text(scenario)
+    (tmp_path / "long.yaml").write_text(flown_for(900.0))
     settings = {
         "scenario": str(tmp_path / "long.yaml"),
         "servo": str(servo),

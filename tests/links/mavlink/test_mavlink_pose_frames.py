@@ -118,9 +118,9 @@ def test_turn_rates_are_never_said_and_the_velocitys_variances_are():
 
 def test_quality_falls_from_100_to_1_at_the_limit_by_the_worse_of_the_two():
     exact = np.diag([1e-12] * 6)
-    half = np.diag([1e-12] * 3 + [0.0625] * 3)  # 0.25 m of 0.5
+    half = np.diag([1e-12] * 3 + [(0.5 * LIMITS.position_sigma_m) ** 2] * 3)
     turned = np.diag([math.radians(4.0) ** 2] + [1e-12] * 5)  # 4 deg of 5
-    limit = np.diag([1e-12] * 3 + [0.25] * 3)
+    limit = np.diag([1e-12] * 3 + [LIMITS.position_sigma_m**2] * 3)
 
     def quality(start: Any, relative: Any) -> int:
         return quality_percent(good_pose(start_covariance=start, covariance=relative), LIMITS)

@@ -1,0 +1,63 @@
+"""The field's stack against the simulated rig for an hour: does anything grow, does anything stop?
+
+    python -m pytest -m slow -s tests/links/test_live_soak.py
+
+GRD_SOAK_S: seconds, 3600 unless told. It writes some 2 GB to the temporary folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.links.long_flight import flown_for
+from tests.links.ports import free_ports
+
+pytestmark = pytest.mark.slow
+pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
+
+ROOT = Path(__file__).resolve().parents[2]
+SOAK_S = float(os.environ.get("GRD_SOAK_S", "3600"))
+OVERLAY = """\
+links:
+  sim: {{config: {{scenario: {scenario}, autopilot_port: {autopilot}}}}}
+  lidar: {{config: {{port: {lidar}, position_port: {position}}}}}
+  servo: {{config: {{port: {servo}}}}}
+  odometry: {{config: {{port: {odometry}}}}}
+  autopilot: {{config: {{connection: "udpin:127.0.0.1:{autopilot}"}}}}
+  viewer: {{config: {{port: {viewer}}}}}
+"""
+
+
+def test_an_hour_in_flight_grows_nothing_and_stops_nothing(tmp_path):
+    names = ("lidar", "position", "odometry", "autopilot", "viewer")
+    ports = dict(zip(names, free_ports(len(names)), strict=True))
+    (tmp_path / "long.yaml").write_text(flown_for(SOAK_S + 60.0))
+    overlay = OVERLAY.format(scenario=tmp_path / "long.yaml", servo=tmp_path / "servo", **ports)
+    (tmp_path / "soak.yaml").write_text(overlay)
+    command = [sys.executable, "-c", "from links.cli import main; main()", "run", "configs/sim_live.yaml"]
+    command += ["--overlay", str(tmp_path / "soak.yaml"), "--for", str(SOAK_S), "--out", str(tmp_path / "soak")]
+    with (tmp_path / "log.txt").open("w") as log:
+        code = subprocess.run(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, check=False).returncode
+    assert code == 0, (tmp_path / "log.txt").read_text()[-2_000:]
+    summary = json.loads((tmp_path / "soak" / "summary.json").read_text())
+    usage = np.array([summary["live"]["usage"][name] for name in ("since_s", "rss_mb", "threads", "files")]).T
+    begun, ended = usage[usage[:, 0] > 0.25 * SOAK_S][0], usage[-1]
+    poses = np.loadtxt(tmp_path / "soak" / "pose_vehicle_drone.tum", usecols=0)
+    gaps_s = np.diff(poses)
+    sys.stdout.write(
+        f"\n{SOAK_S:.0f} s: {begun[1]:.0f} MB after a quarter, {ended[1]:.0f} MB at the end; threads {begun[2]:.0f}, "
+        f"{ended[2]:.0f}; files {begun[3]:.0f}, {ended[3]:.0f}; {len(poses)} poses, gaps p99 "
+        f"{1e3 * np.percentile(gaps_s, 99):.0f}, max {1e3 * gaps_s.max():.0f} ms; {summary['poses']['states']}; "
+        f"dropped {summary['live']['dropped']}; {summary['against_truth']}\n"
+    )
+    assert ended[1] < 1.05 * begun[1] + 10.0
+    assert ended[2] <= begun[2]
+    assert ended[3] <= begun[3] + 2
+    assert len(poses) > 0.98 * 50 * (SOAK_S - 5.0)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stages.compiled import compiled
 from stages.geometry import Array64
+from stages.messages import SweptPulses
 
 
 @compiled
@@ -22,3 +23,8 @@ def mean_direction(direction: NDArray[np.float32]) -> Array64:
         z += direction[i, 2]
     n = np.float32(direction.shape[0])
     return np.array([x / n, y / n, z / n], dtype=np.float64)
+
+
+def middle_ns(pulses: SweptPulses) -> int:
+    """When the middle one of a slice's pulses left: the vehicle's pose then is the slice's."""
+    return int(pulses.point_stamp_ns[pulses.point_stamp_ns.size // 2])

@@ -36,7 +36,7 @@ class LiveRig(Tap):
 
     scenario: Path  # as in configs/scenarios/, as seen from where grd is started
     seed: int | None = Field(None, ge=0)  # None: the scenario's
-    duration_s: float | None = Field(None, gt=0, le=3600)  # None: the scenario's; longer, all stays where it ended
+    duration_s: float | None = Field(None, gt=0, le=7200)  # None: the scenario's; longer, all stays where it ended
     servo: Path  # where the link to the servo's pty is made: `$links.servo.config.port`
     lidar_port: int = Field(2368, ge=1, le=65535)
     position_port: int | None = Field(None, ge=1, le=65535)  # of the LiDAR's position packets; None: it sends none

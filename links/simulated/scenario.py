@@ -75,7 +75,7 @@ class Scenario(_Settings):
     description: str = ""
     seed: int = Field(default=1, ge=0)
     start_utc: datetime.datetime
-    duration_s: float = Field(gt=0, le=3600)
+    duration_s: float = Field(gt=0, le=7200)
     scene: SceneSettings = SceneSettings()
     weather: Weather = Weather()
     vehicle: VehicleSettings = VehicleSettings()

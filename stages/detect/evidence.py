@@ -41,7 +41,7 @@ from stages.messages import (
     SweptPulses,
     VehicleMotion,
 )
-from stages.pulses import mean_direction
+from stages.pulses import mean_direction, middle_ns
 from stages.sweep import Travel
 from stages.trail import VehicleTrail
 
@@ -132,7 +132,7 @@ class EvidenceDetect(Stage):
         if now.start_ns is None:
             now.start_ns = now.tidied_ns = pulses.stamp_ns
         axis = mean_direction(pulses.direction_vehicle)
-        part = Slice(pulses, *now.trail.at(pulses.stamp_ns), axis / max(math.hypot(*axis.tolist()), 1e-9))
+        part = Slice(pulses, *now.trail.at(middle_ns(pulses)), axis / max(math.hypot(*axis.tolist()), 1e-9))
         changed = False
         sightings = now.finder.feed(part, self.parked or now.trail.known)
         self._look_for_misses(now, part, now_ns)

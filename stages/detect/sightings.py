@@ -21,6 +21,7 @@ from stages.detect.chords import ChordFinder
 from stages.detect.surroundings import TALLY, BigThings, look_around
 from stages.geometry import Array64
 from stages.messages import SweptPulses
+from stages.pulses import middle_ns
 
 BEAM_SPACING_RAD = math.radians(2.0)  # between two lasers of a VLP-16
 WINDOW_NS = 8_600_000  # what is kept: 31 deg of a rotor at 600 rpm and the slice that is begun
@@ -111,7 +112,7 @@ class SightingFinder:
         rows = np.array([c.row for c in same])
         hits, stamp_ns = rows[:, chord.COUNT], same[0].stamp_ns
         middle = hits @ rows[:, :3] / hits.sum()
-        then = min(self._slices, key=lambda s: abs(s.pulses.stamp_ns - stamp_ns))
+        then = min(self._slices, key=lambda s: abs(middle_ns(s.pulses) - stamp_ns))
         range_m = float(rows[:, chord.RANGE].mean())
         local = then.R @ middle + then.t
         balls, rugged = round_and_rugged(rows)

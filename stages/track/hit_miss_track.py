@@ -35,7 +35,7 @@ from stages.messages import (
     TrackState,
     VehicleMotion,
 )
-from stages.pulses import mean_direction
+from stages.pulses import mean_direction, middle_ns
 from stages.track.hypotheses import Hypotheses, Hypothesis
 from stages.track.look import Look, collect_into, evaluate, largest_sigma_m
 from stages.trail import VehicleTrail
@@ -140,7 +140,7 @@ class HitMissTrack(Stage):
         if pulses.range_m.size == 0:
             return
         now_ns = int(pulses.point_stamp_ns[-1])
-        R, t = self._trail.at(pulses.stamp_ns)
+        R, t = self._trail.at(middle_ns(pulses))
         axis = mean_direction(pulses.direction_vehicle)
         for track in self._known:
             look = track.look

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Protocol
 
 import numpy as np
@@ -204,6 +205,22 @@ def pulses_seen(
             reflectivity=np.full(384, 30, dtype=np.uint8),
             turntable_rad=float(mount.turntable_rad(servo_rad(middle_s))[0]),
             origin_vehicle_m=tuple(origin_m[192].tolist()),
+        )
+
+
+def together(slices: Iterator[SweptPulses], packets: int) -> Iterator[SweptPulses]:
+    """The same pulses with so many packets in a slice."""
+    while some := list(islice(slices, packets)):
+        middle = some[len(some) // 2]
+        yield SweptPulses(
+            stamp_ns=some[0].stamp_ns,
+            point_stamp_ns=np.concatenate([s.point_stamp_ns for s in some]),
+            direction_vehicle=np.concatenate([s.direction_vehicle for s in some]),
+            range_m=np.concatenate([s.range_m for s in some]),
+            laser=np.concatenate([s.laser for s in some]),
+            reflectivity=np.concatenate([s.reflectivity for s in some]),
+            turntable_rad=middle.turntable_rad,
+            origin_vehicle_m=middle.origin_vehicle_m,
         )
 
 

@@ -21,7 +21,19 @@ from stages.detect.surroundings import FREE_0, SECTORS, TALLY
 from stages.detect.verdict import Evidence, over_clutter
 from stages.geometry import rotation_from_rpy_deg, rotation_z
 from stages.messages import Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
-from tests.stages.caster import Ball, Box, Drone, During, Wire, dithering, flying, pulses_seen, still, sweeping
+from tests.stages.caster import (
+    Ball,
+    Box,
+    Drone,
+    During,
+    Wire,
+    dithering,
+    flying,
+    pulses_seen,
+    still,
+    sweeping,
+    together,
+)
 from tests.stages.made import ON_ITS_SIDE, START_NS
 
 PLACE_M = (0.0, 8.0, 10.0)  # 12.7 m away, 51 deg up
@@ -71,14 +83,16 @@ def odometry(way, t_s, R_local_drone):
     )
 
 
-def run(things, seconds=3.0, servo_rad=WATCHING, drives_mps=(0.0, 0.0, 0.0), say=None, stage=None, **settings):
+def run(
+    things, seconds=3.0, servo_rad=WATCHING, drives_mps=(0.0, 0.0, 0.0), say=None, stage=None, packets=1, **settings
+):
     """(Candidates, Detections) that the stage tells.
 
     drives_mps None: the vehicle does not say how it moves. say(stage, t_s): what the drone says, 20 ms apart.
     """
     stage = stage or EvidenceDetect(**{"sweep_deg": PASS_DEG, **settings})
     told, next_s = [], 0.0
-    for pulses in pulses_seen(things, servo_rad, seconds):
+    for pulses in together(pulses_seen(things, servo_rad, seconds), packets):
         while START_NS + next_s * 1e9 <= pulses.point_stamp_ns[-1]:
             if drives_mps is not None:
                 stage.on_motion(motion_at(next_s, drives_mps))
@@ -124,6 +138,15 @@ def test_a_small_thing_that_moves_in_the_free_sky_is_a_drone_after_a_second_or_t
     assert last.verdict.startswith("drone at (")
     assert "sectors around it free" in last.reasons[0]
     assert last.candidate_id[0] == candidates[0].candidate_id[0]  # the same thing keeps its number
+
+
+def test_four_packets_together_tell_the_same_as_one_by_one():
+    drives_mps = (5.0, 0.0, 0.0)  # and the drone with it
+    (candidates, one), (together_4, four) = (run([Drone(MOVING)], drives_mps=drives_mps, packets=n) for n in (1, 4))
+    assert accepted_after_s(four) == pytest.approx(accepted_after_s(one), abs=0.1)
+    assert together_4[-1].looks[0] == candidates[-1].looks[0]
+    assert together_4[-1].seen_ns[0] == pytest.approx(candidates[-1].seen_ns[0], abs=6e6)
+    np.testing.assert_allclose(together_4[-1].xyz_vehicle_m[0], candidates[-1].xyz_vehicle_m[0], atol=0.05)
 
 
 def test_its_probability_is_told_from_the_first_looks_on_and_grows():

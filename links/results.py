@@ -9,6 +9,7 @@ import csv
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from pydantic import PrivateAttr
 
 from flow.link import Run, Tap
 from flow.message import Message
+from links.fix_log import FixLog
 from links.result_file import ResultFile
 from stages.geometry import quaternions_xyzw
 from stages.messages import DepthImage, Detections, DroneFix, PoseState, RelativePose, RelativeRotation, TrackState
@@ -85,7 +87,7 @@ class Results(Tap):
     _folder: Path = PrivateAttr()
     _sweep_start_ns: dict[int, int] = PrivateAttr(default_factory=dict)  # of the newest depth image, by its stamp
     _last_sweep_ns: int | None = PrivateAttr(default=None)
-    _fixes: list[DroneFix] = PrivateAttr(default_factory=list)
+    _fixes: FixLog = PrivateAttr(default_factory=FixLog)
     _sweeps: Counter[str] = PrivateAttr(default_factory=Counter)
     _examples: dict[str, str] = PrivateAttr(default_factory=dict)
     _found: int = PrivateAttr(default=0)
@@ -97,7 +99,7 @@ class Results(Tap):
     _branch: tuple[str, int] | None = PrivateAttr(default=None)  # state and switches of the newest rotation
 
     @property
-    def fixes(self) -> list[DroneFix]:
+    def fixes(self) -> Sequence[DroneFix]:
         """All drone fixes, in order."""
         return self._fixes
 

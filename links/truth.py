@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -83,7 +83,7 @@ class TruthLog:
             xyz[row] = R_world_vehicle.T @ (np.asarray(poses[stamp][0]) - np.asarray(t_vehicle))
         return np.array(stamps, dtype=np.int64), xyz
 
-    def errors_of(self, fixes: list[DroneFix]) -> FixErrors | None:
+    def errors_of(self, fixes: Sequence[DroneFix]) -> FixErrors | None:
         """Each fix against the drone that its track follows; None when there was none."""
         numbers = [number for number, drone in sorted(self.drones.items()) if drone.pose]
         paths = [self.drone_in_vehicle(number) for number in numbers]
@@ -208,7 +208,9 @@ class FixErrors:
         return float(np.mean(self.nees <= CHI2_95_3))
 
 
-def fix_errors(fixes: list[DroneFix], stamps_ns: NDArray[np.int64], xyz_vehicle_m: NDArray[np.float64]) -> FixErrors:
+def fix_errors(
+    fixes: Sequence[DroneFix], stamps_ns: NDArray[np.int64], xyz_vehicle_m: NDArray[np.float64]
+) -> FixErrors:
     """Compare each fix with truth interpolated linearly to the fix's own stamp."""
     at_ns = np.array([fix.stamp_ns for fix in fixes], dtype=np.int64)
     known, true_m, _ = interpolate(at_ns, stamps_ns, xyz_vehicle_m, None, MAX_GAP_NS)

@@ -220,10 +220,21 @@ def kinds_of(
     return kinds
 
 
+@compiled
 def round_and_rugged(rows: Array64) -> tuple[int, int]:
     """How many chords (n, COLUMNS) with five or more returns bulge as smoothly as a ball, and how many do not."""
-    whole = rows[:, chord.COUNT] >= 5
     low, high = BALL_BULGE_PER_M
-    ball = whole & (rows[:, chord.BULGE] > low) & (rows[:, chord.BULGE] < high) & (rows[:, chord.ROUGH] < BALL_ROUGH_M)
-    ball &= (rows[:, chord.GAPS] <= 1) & (rows[:, chord.DEPTH] > 0.2 * rows[:, chord.LENGTH])
-    return int(ball.sum()), int((whole & ~ball).sum())
+    balls = rugged = 0
+    for i in range(rows.shape[0]):
+        if rows[i, chord.COUNT] < 5:
+            continue
+        if (
+            low < rows[i, chord.BULGE] < high
+            and rows[i, chord.ROUGH] < BALL_ROUGH_M
+            and rows[i, chord.GAPS] <= 1
+            and rows[i, chord.DEPTH] > 0.2 * rows[i, chord.LENGTH]
+        ):
+            balls += 1
+        else:
+            rugged += 1
+    return balls, rugged

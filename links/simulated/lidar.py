@@ -32,13 +32,17 @@ RANGE_STEP_M = 1e-3 * vlp16.RANGE_UNIT_MM
 PULSE_LENGTH_M = 1.0  # two surfaces closer than this in range give one, blended return
 
 
+def _is_dense(footprint: str) -> bool:
+    return footprint == "dense"  # files of scenarios made before there was another stay the same
+
+
 class LidarSettings(BaseModel):
     """The sensor's settings and how well it measures."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     return_mode: Literal["strongest", "last", "dual"] = "strongest"
-    footprint: Literal["dense", "sparse"] = "dense"  # how finely a pulse is sampled; sparse takes half the time
+    footprint: Literal["dense", "sparse"] = Field("dense", exclude_if=_is_dense)  # sparse takes half the time to cast
     rotor_rpm: float = Field(default=600.0, ge=300, le=1200)
     range_at_10_percent_m: float = Field(default=65.0, gt=1)  # half of the pulses on such a target return
     power_spread_db: float = Field(default=1.0, gt=0)  # pulse-to-pulse spread of the received power, one sigma

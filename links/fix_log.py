@@ -1,4 +1,4 @@
-"""The fixes of a run, some hundred bytes each: an hour's are kept in memory for its summary.
+"""The fixes of a run, 160 bytes each: an hour's are kept in memory for its summary.
 
 Source: ours.
 """

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e 
 
 KINDS = ("street", "manhattan", "atlanta", "campus", "park_edge")
 SCENES = 10
+ORDINARY = Path(__file__).resolve().parents[3] / "configs/scenarios/calibrate.yaml"
 SERVO_RAD = np.radians(np.linspace(5.0, 175.0, 341))
 
 
@@ -59,11 +61,10 @@ def found(tmp_path_factory):
     from links.simulated.scenario import load_scenario
     from links.simulated.servo import Turned
     from stages.calibration.calibrate import calibrate
-    from tests.links.long_flight import SCENARIO
 
     rows = []
     for seed in range(1, SCENES + 1):
-        ordinary = load_scenario(SCENARIO.parent / "calibrate.yaml")
+        ordinary = load_scenario(ORDINARY)
         true, servo = off_rig(seed, ordinary.rig.mount)
         scenario = ordinary.changed(
             seed=seed,

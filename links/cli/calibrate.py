@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flow.link import LinkError
-from links.cli.console import FINDING, err, in_words, out, progress_bar
+from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table
 from links.cli.files import read_rig
 
 ROUNDING_DEG = 1e-6
@@ -82,7 +82,7 @@ def calibrate_recording(
     for f in found.findings:
         after = "-" if f.refused else f"{f.after:.4f}"
         table.add_row(Text(f.what), f"{f.before:.4f}", after, f"{f.sigma:.4f}", f.unit)
-    out.print(table)
+    show_table(table)
     for f in found.findings:
         if f.refused:
             out.print(f"{f.what} stays as it is: {f.refused}", markup=False)

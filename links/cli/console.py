@@ -1,4 +1,4 @@
-"""What all commands share: the two consoles, errors in words with an exit code, a progress bar.
+"""What all commands share: the two consoles, errors in words with an exit code, a progress bar, tables.
 
 Source: ours.
 """
@@ -13,7 +13,9 @@ from typing import Any, TypeVar, cast
 
 import typer
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 from flow.link import LinkError
 from flow.ports import RunError
@@ -21,6 +23,7 @@ from flow.problem import ConfigError
 
 FINDING, WRONG_USE = 1, 2
 BAR_AFTER_S = 1.0  # anything that takes longer than 2 s shows a bar before that
+NO_WINDOW = 100_000  # columns
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -84,3 +87,9 @@ def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
 def warn(text: str) -> None:
     """A warning on stderr."""
     err.print(f"warning: {text}", markup=False, style="yellow")
+
+
+def show_table(table: Table) -> None:
+    """As wide as its cells are, also where the window, or a pipe's 80 columns, is narrower: no number is cut."""
+    table.width = Measurement.get(out, out.options.update(width=NO_WINDOW), table).maximum
+    out.print(table, crop=False)

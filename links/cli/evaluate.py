@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from flow.link import LinkError
-from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table, warn
 from links.evaluation import Evaluation, Limits, evaluate, read_run
 from links.evaluation.compare import Pair, by_config, pair_up, uneven
 from links.evaluation.csv_table import write_csv
@@ -104,7 +104,7 @@ def evaluate_runs(
     for text in warnings:
         warn(text)
     for summary in summaries:
-        out.print(summary.table(), crop=False)
+        show_table(summary.table())
     for note in dict.fromkeys(summary.note for summary in summaries if summary.note):
         out.print(note, markup=False)
     if not keys:
@@ -147,11 +147,11 @@ def _summaries(own: list[Evaluation], keys: list[Key]) -> list[Summary]:
 
 def _tell(own: list[Evaluation], pairs: list[Pair]) -> None:
     if len(own) > MAX_COLUMNS:
-        out.print(headline_table(own))
+        show_table(headline_table(own))
     if pairs:
-        out.print(comparison_table(pairs))
+        show_table(comparison_table(pairs))
     if not pairs or len(own) > 1:
-        out.print(metrics_table(own))
+        show_table(metrics_table(own))
     for text, names in _by_text(own, lambda e: [*e.remarks, *_not_evaluated(e)]):
         out.print(f"{names}: {text}", markup=False)
     for text, names in _by_text(own, lambda e: e.findings):

@@ -15,7 +15,7 @@ from rich.text import Text
 from flow.graph import recording_named
 from flow.link import LinkError
 from flow.live_report import LiveReport
-from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table, warn
 from links.cli.live_view import LiveView
 from links.live_run import live_graph, run_live
 from links.repeat import repeat_into
@@ -176,7 +176,7 @@ def _tell(run: Finished) -> None:
     for text in () if live else run.warnings:  # live they were said as they came
         warn(text)
     if results.fixes:
-        out.print(_table(run))
+        show_table(_table(run))
     recorded_s = (report.last_ns - report.first_ns) / 1e9
     out.print(
         f"{report.records} records, {recorded_s:.1f} s recorded, {run.wall_s:.1f} s to run; "

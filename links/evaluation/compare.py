@@ -52,6 +52,15 @@ def by_config(evaluations: list[Evaluation]) -> dict[str, list[Evaluation]]:
     return found
 
 
+def alike(evaluations: list[Evaluation]) -> dict[str, list[Evaluation]]:
+    """Runs whose numbers may be pooled: of one configuration, and of one output where runs have several."""
+    found: dict[str, list[Evaluation]] = {}
+    for e in evaluations:
+        name = f"{e.run.config} {e.output.name}".strip() if len(e.run.outputs) > 1 else e.run.config
+        found.setdefault(name, []).append(e)
+    return found
+
+
 def uneven(evaluations: list[Evaluation]) -> list[str]:
     """Warnings: recordings that some configurations were run on and others not, or that count twice."""
     configs = by_config(evaluations)

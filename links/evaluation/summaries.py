@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
-from rich.cells import cell_len
 from rich.table import Table
 from rich.text import Text
 
@@ -48,10 +47,8 @@ class Summary:
     note: str = ""
 
     def table(self) -> Table:
-        """For the terminal, as wide as it must be: columns are not cut to fit a window."""
-        columns = [[head, *cells] for head, cells in zip(self.heads, zip(*self.rows, strict=True), strict=True)]
-        widths = [max(cell_len(line) for cell in column for line in cell.split("\n")) for column in columns]
-        table = Table(title=self.title, title_justify="left", width=sum(widths) + 3 * len(widths) + 1)
+        """For the terminal."""
+        table = Table(title=self.title, title_justify="left")
         for index, head in enumerate(self.heads):
             table.add_column(Text(head), justify="left" if index < self.named else "right", no_wrap=True)
         for row in self.rows:

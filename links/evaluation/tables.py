@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from links.evaluation.catalogue import Metric, Value, metric_of
-from links.evaluation.compare import COMMON, Compared, Pair, Pooled, by_config, compared, keys_of, pooled, verdict
+from links.evaluation.compare import COMMON, Compared, Pair, Pooled, alike, compared, keys_of, pooled, verdict
 from links.evaluation.judged import Evaluation
 
 MAX_COLUMNS = 4  # more runs than this are rows of a table of headlines
@@ -106,13 +106,13 @@ def metrics_table(evaluations: list[Evaluation]) -> Table:
 
 
 def median_columns(evaluations: list[Evaluation]) -> list[tuple[str, list[Evaluation]]]:
-    """`median of 6`, of each configuration its own; nothing for a single run."""
+    """`median of 6`, of each configuration and output its own; nothing for a single run."""
     if len(evaluations) < 2:
         return []
-    configs = by_config(evaluations)
-    if len(configs) == 1:
+    pools = alike(evaluations)
+    if len(pools) == 1:
         return [(f"median of {len(evaluations)}", evaluations)]
-    return [(f"{name}: median of {len(e)}" if len(e) > 1 else name, e) for name, e in configs.items()]
+    return [(f"{name}: median of {len(e)}" if len(e) > 1 else name, e) for name, e in pools.items()]
 
 
 def titled(metric: Metric) -> str:
@@ -208,12 +208,12 @@ def as_json(evaluations: list[Evaluation], pairs: list[Pair], warnings: list[str
         "warnings": warnings,
         "runs": [_run_json(e) for e in evaluations],
     }
-    configs = by_config(evaluations)
+    pools = alike(evaluations)
     medians = {
         name: {key: _pooled_json(pooled(several, key)) for key in keys_of(evaluations)}
-        for name, several in configs.items()
+        for name, several in pools.items()
     }
-    if len(configs) > 1:
+    if len(pools) > 1:
         tree["median_by_config"] = medians
     elif len(evaluations) > 1:
         tree["median"] = next(iter(medians.values()))

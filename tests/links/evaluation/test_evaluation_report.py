@@ -17,7 +17,7 @@ from links.evaluation.judged import Evaluation
 from links.evaluation.plots import MAX_POINTS, worst_of_each
 from links.evaluation.svg import limits_of, same_scale, ticks
 from tests.links.command import grd
-from tests.links.evaluation.made_runs import lines, make_run, truth_at
+from tests.links.evaluation.made_runs import add_pose, lines, make_run, truth_at
 
 EIGHT_HZ = np.arange(0.0, 10.0, 0.125)
 
@@ -120,6 +120,23 @@ def test_many_runs_are_rows_and_a_median(tmp_path):
     pool = json.loads((tmp_path / "out" / "evaluation.json").read_text())["median"]["rmse_z_m"]
     assert pool["median"] == pytest.approx(0.35)
     assert pool["runs"] == 6
+
+
+def test_the_medians_of_fixes_and_of_poses_are_not_mixed(tmp_path):
+    """And no name and no number is cut where the table is wider than a pipe's 80 columns."""
+    folders = [fly(tmp_path / f"a-street-with-a-long-name-seed{i}", 0.1, f"seed{i}") for i in range(6)]
+    for folder in folders:
+        at = truth_at(EIGHT_HZ) + np.array([0, 0, 0.3])
+        add_pose(folder, EIGHT_HZ, at, np.tile([0.0, 0, 0, 1], (len(at), 1)), None)
+    text = grd("evaluate", *folders, "--out", tmp_path / "out")
+    assert "a-street-with-a-long-name-seed5 fix " in text
+    assert "…" not in text
+    pools = json.loads((tmp_path / "out" / "evaluation.json").read_text())["median_by_config"]
+    of = {name.split()[-1]: pool["rmse_z_m"] for name, pool in pools.items()}
+    assert {name: (pool["median"], pool["runs"]) for name, pool in of.items()} == {
+        "pose": (pytest.approx(0.3), 6),
+        "fix": (pytest.approx(0.1), 6),
+    }
 
 
 def test_against_another_run_there_are_both_columns_and_the_ratio(tmp_path):

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PATIENCE_S = 60.0
 
 SLOW = """\
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
 from links.simulated.jobs import run_all
 
@@ -35,6 +35,8 @@ def slow(name, tell):
         (here / f"{name}.ended").touch()
 
 if __name__ == "__main__":
+    # whoever started the tests may ignore it, as `sh -c "... &"` does, and children inherit that
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         run_all(slow, ["a", "b", "c"], 2, lambda shares: None)
     except KeyboardInterrupt:

@@ -5,7 +5,10 @@ Source: ours; bins grow by 2^(1/8), so a percentile is within 9 % of the true on
 
 from __future__ import annotations
 
+from array import array
 from math import log2
+
+import numpy as np
 
 BINS_PER_OCTAVE = 8
 _BINS = 40 * BINS_PER_OCTAVE  # 1 ns .. 1000 s
@@ -17,7 +20,7 @@ class Latency:
     __slots__ = ("_bins", "count", "max_ns", "total_ns")
 
     def __init__(self) -> None:
-        self._bins = [0] * _BINS
+        self._bins = array("q", bytes(8 * _BINS))
         self.count = self.total_ns = self.max_ns = 0
 
     def add(self, duration_ns: int) -> None:
@@ -30,12 +33,11 @@ class Latency:
 
     def percentile_ns(self, percent: float) -> float:
         """Upper edge of the bin that holds the percentile, at most the largest seen; 0 without data."""
-        wanted, seen = self.count * percent / 100, 0
-        for index, count in enumerate(self._bins):
-            seen += count
-            if count and seen >= wanted:
-                return float(min(2 ** ((index + 1) / BINS_PER_OCTAVE), self.max_ns))
-        return 0.0
+        if not self.count:
+            return 0.0
+        up_to = np.cumsum(np.frombuffer(self._bins, np.int64))
+        index = int(np.searchsorted(up_to, max(self.count * percent / 100, 1)))
+        return float(min(2 ** ((index + 1) / BINS_PER_OCTAVE), self.max_ns))
 
     @property
     def mean_ns(self) -> float:

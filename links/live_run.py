@@ -36,7 +36,7 @@ class Look:
     """What one who watches a run is shown, some times a second."""
 
     since_s: float
-    report: LiveReport
+    report: Callable[[], LiveReport]  # made when asked for: it costs some milliseconds of every thread
     news: list[str]  # incidents not told before
 
 
@@ -85,7 +85,7 @@ def _show(live: Live, started_s: float, show: Show, run: RunFolder) -> None:
     news = live.incidents.fetch()
     for text in news:
         run.note(text)
-    show(Look(time.monotonic() - started_s, live.report(), news))
+    show(Look(time.monotonic() - started_s, live.report, news))
 
 
 @contextmanager

@@ -103,14 +103,14 @@ class LiveView:
             self._console.print(self._line(look), markup=False)
 
     def _line(self, look: Look) -> str:
-        report = look.report
+        report = look.report()
         state, pose = self.newest.now()
         closed = [f"{name} {link.state}" for name, link in report.links.items() if link.state != "open"]
         parts = [f"{look.since_s:.1f} s", state, pose, _numbers(report), *closed]
         return "; ".join(part for part in parts if part)
 
     def _table(self, look: Look) -> Group:
-        report = look.report
+        report = look.report()
         state, pose = self.newest.now()
         head = Text(f"{look.since_s:8.1f} s   {state}\n             {pose}\n             {_numbers(report)}")
         edges = Table("edge", "from", box=None, pad_edge=False)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.calibration.servo_mount import ServoMount
-from stages.compiled import compiled
+from stages.compiled import compiled_at_once
 from stages.geometry import Array64
 
 SMOOTHED_STATES = (2, 4, 8, 12)  # on either side
@@ -84,7 +84,7 @@ def smoothed(stamp_ns: NDArray[np.int64], position_rad: Array64, step_rad: float
     return found
 
 
-@compiled
+@compiled_at_once("(float64[::1], float64, float64[::1])")
 def hangs(position_rad: Array64, play_rad: float, hang: Array64) -> None:
     """Fill hang (m,): +1 where the turntable hangs behind a servo that went up, -1 behind one that went down.
 

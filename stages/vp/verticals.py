@@ -10,11 +10,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.compiled import compiled
+from stages.compiled import compiled, compiled_at_once
 from stages.lens import Array64
 from stages.vp.directions import CAUCHY, GATE, Lines, upright
 
 ROUNDS = 5
+LEAST_SINE = 0.05  # two lines that meet at less do not say where
 LEVEL_APART_RAD = math.radians(12.0)  # between level directions tried for the vertical at right angles to both
 
 
@@ -27,7 +28,7 @@ def propose_verticals(
     Pairs are drawn from the widest lines.
     """
     count = min(pairs, len(lines.normal))
-    meet = _meetings(lines.normal[:count])
+    meet = _meetings(lines.normal[:count], LEAST_SINE)
     meet *= np.where(meet @ about < 0, -1.0, 1.0)[:, None]
     inside = meet @ about > math.cos(cone_rad)
     votes = _votes(meet, lines.normal, lines.tangent, lines.sigma_rad, lines.weight, 2.0 * sigma_model)
@@ -38,8 +39,8 @@ def propose_verticals(
     return np.vstack([upright_ones, crossed[crossed @ about > math.cos(cone_rad)]])
 
 
-@compiled
-def _meetings(normal: Array64, least_sine: float = 0.05) -> Array64:
+@compiled_at_once("(float64[:, ::1], float64)")
+def _meetings(normal: Array64, least_sine: float) -> Array64:
     """Cross products (k, 3), unit, of all pairs of (n, 3) that are not too parallel."""
     out = np.empty((len(normal) * (len(normal) - 1) // 2, 3))
     count = 0
@@ -58,7 +59,7 @@ def _best_apart(directions: Array64, votes: Array64, most: int, apart_rad: float
     return _picked(directions, np.argsort(-votes, kind="stable"), most, math.cos(apart_rad))
 
 
-@compiled
+@compiled_at_once("(float64[:, ::1], int64[::1], int64, float64)")
 def _picked(directions: Array64, order: NDArray[np.int64], most: int, cos_apart: float) -> Array64:
     out = np.empty((most, 3))
     count = 0
@@ -73,7 +74,7 @@ def _picked(directions: Array64, order: NDArray[np.int64], most: int, cos_apart:
     return out[:count].copy()
 
 
-@compiled
+@compiled_at_once("(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[::1], float64)")
 def _votes(
     proposal: Array64, normal: Array64, tangent: Array64, sigma: Array64, weight: Array64, sigma_model: float
 ) -> Array64:

@@ -58,7 +58,7 @@ def shown(report, *messages, terminal=False, news=()):
     with LiveView(console) as view:
         for message in messages:
             view.newest.see("x", message, 0)
-        view.show(Look(12.34, report, list(news)))
+        view.show(Look(12.34, lambda: report, list(news)))
     return stream.getvalue()
 
 
@@ -96,8 +96,8 @@ def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():
 def test_news_are_told_at_once_even_between_two_lines(capsys):
     stream = io.StringIO()
     with LiveView(Console(file=stream, width=160, soft_wrap=True)) as view:
-        view.show(Look(0.0, report_of(), ["lidar: first"]))
-        view.show(Look(0.1, report_of(), ["lidar: second"]))
+        view.show(Look(0.0, report_of, ["lidar: first"]))
+        view.show(Look(0.1, report_of, ["lidar: second"]))
     assert stream.getvalue().count("\n") == 1
     assert capsys.readouterr().err == "lidar: first\nlidar: second\n"
 

@@ -7,6 +7,7 @@
         inputs: {points: sweep.swept_points}  # how messages wait in a live run: flow/edge.py
         on_error: restart                  # live, when it raises: a fresh one takes over; or skip; or stop the run
         thread: lidar                      # live: shared with others that say so; without it, it has its own
+        yields: true                       # live: takes fewer pictures while others' queues run over (flow/yielding.py)
     links:
       lidar: {use: links.velodyne.Lidar}   # sources and sinks; the first three keys
 
@@ -39,7 +40,10 @@ KINDS: dict[str, type[Node]] = {"stages": Stage, "links": Link}
 HOMES = {"stages": "stages", "links": "links"}  # package in which classes of a kind are looked for when suggesting
 OnError = Literal["restart", "skip", "stop"]
 ON_ERROR: tuple[str, ...] = get_args(OnError)
-NODE_KEYS = {"stages": ("use", "config", "inputs", "on_error", "thread"), "links": ("use", "config", "inputs")}
+NODE_KEYS = {
+    "stages": ("use", "config", "inputs", "on_error", "thread", "yields"),
+    "links": ("use", "config", "inputs"),
+}
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
 
 
@@ -54,6 +58,7 @@ class NodeSpec:
     config: dict[str, Any]
     on_error: OnError = "restart"  # of a stage that raises in a live run
     thread: str = ""  # of a stage in a live run; stages of one name share it
+    yields: bool = False  # of a stage in a live run, to others that do not keep up
 
     def build(self) -> Node:
         """A fresh instance with empty memory."""
@@ -160,13 +165,18 @@ def _nodes(tree: Tree, kind: str) -> Iterator[NodeSpec]:
         thread: Any = declared.get("thread", name)
         if not (isinstance(thread, str) and _NAME.match(thread)):
             tree.problem((*path, "thread"), f"must be a name as stages have, got {thread!r}.")
+        yields: Any = declared.get("yields", False)
+        if not isinstance(yields, bool):
+            tree.problem((*path, "yields"), f"must be true or false, got {yields!r}.")
         cls = _class(tree, kind, path, declared.get("use"))
         if cls is not None:
             before = len(tree.problems)
             config = resolve(tree, (*path, "config"), declared.get("config") or {})
             if len(tree.problems) == before:  # a reference to nothing is said already
                 config = _settings(tree, path, cls, config)
-            yield NodeSpec(name, kind, declared["use"], cls, config, cast(OnError, on_error), str(thread))
+            yield NodeSpec(
+                name, kind, declared["use"], cls, config, cast(OnError, on_error), str(thread), yields is True
+            )
 
 
 def _class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node] | None:
@@ -316,7 +326,13 @@ def _waiting(tree: Tree, path: Path_, message: type[Message], declared: dict[str
 
 
 def _check_threads(tree: Tree, nodes: dict[str, NodeSpec], edges: tuple[Edge, ...]) -> None:
-    """A thread must not wait for itself."""
+    """A thread must not wait for itself, and yields with all of its stages."""
+    yields = {spec.thread: spec for spec in nodes.values() if spec.kind == "stages" and spec.yields}
+    for spec in nodes.values():
+        if spec.kind == "stages" and not spec.yields and spec.thread in yields:
+            other = yields[spec.thread].name
+            text = f"'{other}' works in the same thread, '{spec.thread}', and yields: both would rest."
+            tree.problem(("stages", spec.name, "thread"), text)
     for edge in edges:
         producer, consumer = nodes[edge.producer], nodes[edge.consumer]
         both = producer.kind == consumer.kind == "stages" and producer.thread == consumer.thread

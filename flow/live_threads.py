@@ -22,6 +22,7 @@ from flow.metrics import Latency
 from flow.ports import Output, RunError, call, named
 from flow.stage_life import StageLife
 from flow.taps import Digest
+from flow.yielding import MOST_S, Rest
 
 WAIT_S = 0.2  # a thread that waits looks this often whether the run has stopped
 SENT_S = 0.05  # what a link sent by itself is fetched this often
@@ -103,6 +104,10 @@ class StageRun:
         if self.life.gave_up:
             self.end()
 
+    def takes_newest(self, port: int) -> bool:
+        """Whether only the newest message waits there, as of pictures."""
+        return self._ports[port][1].edge.waiting.policy == "latest"
+
     def end(self) -> None:
         """It takes nothing any more. What it still holds goes out, unless it gave up."""
         self.inbox.close()
@@ -123,10 +128,10 @@ class StageRun:
 class StageThread(Worker):
     """Works for one stage, or for several that share a thread: what is nearest to the end of the line first."""
 
-    def __init__(self, name: str, stages: list[StageRun], bell: Bell, shared: Shared) -> None:
-        """`stages`: producers before consumers, all with this bell."""
+    def __init__(self, name: str, stages: list[StageRun], bell: Bell, shared: Shared, rest: Rest | None = None) -> None:
+        """`stages`: producers before consumers, all with this bell. `rest`: of stages that yield."""
         super().__init__(f"stage {name}", shared)
-        self.stages, self._bell = stages, bell
+        self.stages, self._bell, self._rest = stages, bell, rest
 
     def run(self) -> None:
         inboxes = [stage.inbox for stage in self.stages]
@@ -136,6 +141,8 @@ class StageThread(Worker):
                 item = stage.inbox.take()
                 if item is not None:
                     stage.take(item)
+                    if self._rest is not None and stage.takes_newest(item.port):
+                        self._lie_down(stage.life.name, self._rest)
                     break
                 if stage.inbox.done:
                     if not stage.ended.is_set():
@@ -144,6 +151,16 @@ class StageThread(Worker):
                     break
             else:
                 self._bell.wait(inboxes, WAIT_S)
+
+    def _lie_down(self, stage: str, rest: Rest) -> None:
+        """After a picture, for as long as others need it."""
+        full = rest.fullest()
+        rest_s = rest.next_s()
+        if rest_s >= MOST_S:
+            most = f", {full} most" if full else ""
+            self.shared.incidents.report(stage, f"takes fewer pictures: this host is too slow for all{most}")
+        if rest_s > 0.0:
+            self.shared.stopping.wait(rest_s)
 
 
 class SinkThread(Worker):

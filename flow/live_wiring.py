@@ -20,6 +20,7 @@ from flow.message import Message
 from flow.ports import Output, RunError
 from flow.stage import Stage, output_ports
 from flow.stage_life import StageLife
+from flow.yielding import Queue, Rest
 
 TAP_PICTURES = 8  # that wait for a tap: more would be much memory, fewer would lose some of each burst
 
@@ -36,6 +37,15 @@ class LiveEdge:
     def report(self) -> EdgeReport:
         """All counts so far."""
         return edge_report(self.count, self.inbox.dropped[self.port])
+
+    def runs_over(self, graph: Graph) -> bool:
+        """Whether what waits here is lost when it is too much, to a stage that does not yield."""
+        consumer = graph.nodes[self.count.edge.consumer]
+        return consumer.kind == "stages" and not consumer.yields and self.count.edge.waiting.policy == "drop_oldest"
+
+    def queue(self) -> Queue:
+        """For those who yield to it."""
+        return Queue(self.count.edge.name, self.inbox, self.port, self.count.edge.waiting.depth)
 
     def tell(self, now_ns: int) -> None:
         """Send the taps how the edge does."""
@@ -71,9 +81,12 @@ class Wiring:
         for spec in graph.nodes.values():
             self._add_node(spec, [edge for edge in graph.edges if edge.consumer == spec.name])
         names = {spec.name: spec.thread for spec in graph.nodes.values()}
+        yielding = {spec.thread for spec in graph.nodes.values() if spec.yields}
+        queues = [edge.queue() for edge in self.edges.values() if edge.runs_over(graph)]
         for thread, bell in self._bells.items():
             runs = [run for run in self.stages if names[run.life.name] == thread]
-            self.stage_threads.append(StageThread(thread, runs, bell, shared))
+            rest = Rest(queues) if thread in yielding else None
+            self.stage_threads.append(StageThread(thread, runs, bell, shared, rest))
         for tap in taps:
             self.links[type(tap).__name__.lower()] = tap
             self._add_tap(tap)

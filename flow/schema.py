@@ -35,6 +35,7 @@ _WAITING = {
 _ANY_EDGE = {"anyOf": [_OUTPUT, _WAITING, {"type": "null", "description": "unwired, where an included file wires it"}]}
 _EDGE = {"$ref": "#/$defs/edge"}
 _THREAD = {"type": "string", "description": "live: stages of one name share a thread; else each has its own"}
+_YIELDS = {"type": "boolean", "description": "live: fewer pictures are taken while others' queues run over"}
 _ON_ERROR = {"enum": list(ON_ERROR), "description": "live, when it raises: a fresh one, skip the message, or stop"}
 
 
@@ -74,7 +75,7 @@ def _section(kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
             "use": {"type": "string", "examples": list(classes), "description": "module.Class"},
             "config": {"type": "object"},
             "inputs": {"type": "object", "additionalProperties": _EDGE},
-            **({"on_error": _ON_ERROR, "thread": _THREAD} if kind == "stages" else {}),
+            **({"on_error": _ON_ERROR, "thread": _THREAD, "yields": _YIELDS} if kind == "stages" else {}),
         },
         "allOf": [
             {"if": {"properties": {"use": {"const": use}}, "required": ["use"]}, "then": {"$ref": f"#/$defs/{use}"}}

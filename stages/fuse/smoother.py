@@ -30,6 +30,7 @@ from stages.rigid import carried_covariance, good_covariance
 RAISED = (RuntimeError, IndexError, ValueError)  # what GTSAM's wrapper makes of C++ exceptions
 FLOOR = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)  # a step of no length is known no better
 FARTHEST_M = 1e5
+SLACK_S = 1e-3  # GTSAM keeps a pose for so much longer than it is asked for here: its times are floats
 UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 
 
@@ -42,7 +43,7 @@ class Smoother:
     """See `stages.fuse.back_end.BackEnd`."""
 
     def __init__(self, lag_s: float) -> None:
-        self._lag_s = lag_s
+        self._lag_s, self._lag_ns = lag_s, round(1e9 * lag_s)
         self._keys: deque[tuple[int, int]] = deque()  # (time, number) of the chain's poses in the window
         self._number = 0
         self._first_ns = 0
@@ -56,7 +57,7 @@ class Smoother:
         params.setRelinearizeThreshold(0.01)
         params.relinearizeSkip = 1
         params.findUnusedFactorSlots = True  # else its list of factors grows for ever
-        self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag_s, params)
+        self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag_s + SLACK_S, params)
         self._number, self._first_ns = self._number + 1, stamp_ns
         self._keys.clear()
         self._keys.append((stamp_ns, self._number))
@@ -83,23 +84,28 @@ class Smoother:
             graph.add(gtsam.AttitudeFactorPose3(X(self._number), UP, sigma, gtsam.Unit3(up_drone)))
         values.insert(X(self._number), gtsam.Pose3(gtsam.Rot3(R), t_m))
         self._keys.append((stamp_ns, self._number))
-        while self._keys[0][0] <= stamp_ns - self._lag_s * 1e9:
+        while self._keys[0][0] <= stamp_ns - self._lag_ns:
             self._keys.popleft()
         self.stamp_ns = stamp_ns
         at_s = (stamp_ns - self._first_ns) * 1e-9
         self._guarded(lambda: self._smoother.update(graph, values, {X(self._number): at_s}), R, t_m, P)
 
     def near(self, stamp_ns: int) -> tuple[int, Array64, Array64]:
-        """The newest pose of the chain not after a time; the oldest for what is older."""
+        """The newest pose of the chain not after a time; the oldest for what is older. Where it cannot be read, the chain
+        begins anew at its newest.
+        """
         key_ns, number = self._keys[0]
         for at_ns, candidate in reversed(self._keys):
             if at_ns <= stamp_ns:
                 key_ns, number = at_ns, candidate
                 break
-        if key_ns == self.stamp_ns:
-            return key_ns, self.R_start_drone, self.xyz_start_m
-        pose = self._smoother.calculateEstimatePose3(X(number))
-        return key_ns, pose.rotation().matrix(), pose.translation()
+        if key_ns != self.stamp_ns:
+            try:
+                pose = self._smoother.calculateEstimatePose3(X(number))
+                return key_ns, pose.rotation().matrix(), pose.translation()
+            except RAISED:
+                self._begin_anew(self.R_start_drone, self.xyz_start_m, self.covariance)
+        return self.stamp_ns, self.R_start_drone, self.xyz_start_m
 
     def add_position(self, key_ns: int, step: Step, xyz_m: Array64, covariance_m2: Array64) -> bool:
         """GPSFactorArm: X t_step = xyz."""
@@ -138,11 +144,14 @@ class Smoother:
         except RAISED:
             pass
         if newest is None:
-            self.recoveries += 1
-            self.start(self.stamp_ns, R, xyz_m, covariance)
+            self._begin_anew(R, xyz_m, covariance)
             return False
         self.R_start_drone, self.xyz_start_m, self.covariance = newest
         return True
+
+    def _begin_anew(self, R: Array64, xyz_m: Array64, covariance: Array64) -> None:
+        self.recoveries += 1
+        self.start(self.stamp_ns, R, xyz_m, covariance)
 
     def _newest(self) -> tuple[Array64, Array64, Array64] | None:
         """The newest pose with its covariance; None: they are nonsense."""

@@ -127,6 +127,20 @@ def test_a_pose_that_has_left_the_window_takes_nothing_more():
     assert back.recoveries == 0
 
 
+@pytest.mark.parametrize("start_ns", [1_748_859_641_434_316_687, 1_748_859_641_434_316_801, 0, 97])
+def test_every_pose_of_the_window_can_be_read_also_the_oldest(start_ns):
+    """Stamps are 1.7e18 ns: as floats they are 256 ns apart, and a tenth of a second thirty times over is no 3 s."""
+    back = Smoother(3.0)
+    back.start(start_ns, np.eye(3), np.zeros(3), P0)
+    for k in range(1, 120):
+        back.extend(start_ns + k * TENTH, way(), UP, TILT)
+        key_ns, _, xyz = back.near(start_ns)
+        oldest = max(0, k - 29)
+        assert key_ns == start_ns + oldest * TENTH
+        assert np.allclose(xyz, true_pose(oldest)[1], atol=1e-3)
+    assert back.recoveries == 0
+
+
 @pytest.mark.parametrize(
     ("xyz", "covariance"),
     [
@@ -174,11 +188,16 @@ def _unknown(back):
     return back._guarded(lambda: None, *now(back))
 
 
+def _unreadable(back):
+    back._keys.appendleft((2 * TENTH, 3))
+    return back.near(2 * TENTH)[0] != back.stamp_ns
+
+
 def now(back):
     return back.R_start_drone, back.xyz_start_m, back.covariance
 
 
-@pytest.mark.parametrize("spoil", [_marginalised, _nan, _indeterminate, _twice, _unknown])
+@pytest.mark.parametrize("spoil", [_marginalised, _nan, _indeterminate, _twice, _unknown, _unreadable])
 def test_after_every_error_of_gtsam_it_goes_on_from_the_last_good_pose(spoil):
     back = started(Smoother(3.0), steps=40)
     R, xyz, P = (a.copy() for a in now(back))

@@ -91,8 +91,9 @@ class Smoother:
         self._guarded(lambda: self._smoother.update(graph, values, {X(self._number): at_s}), R, t_m, P)
 
     def near(self, stamp_ns: int) -> tuple[int, Array64, Array64]:
-        """The newest pose of the chain not after a time; the oldest for what is older. Where it cannot be read, the chain
-        begins anew at its newest.
+        """The newest pose of the chain not after a time; the oldest for what is older.
+
+        Where it cannot be read, the chain begins anew at its newest.
         """
         key_ns, number = self._keys[0]
         for at_ns, candidate in reversed(self._keys):

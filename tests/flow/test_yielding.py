@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import pytest
 
@@ -12,9 +13,12 @@ from flow.inbox import Inbox
 from flow.problem import ConfigError
 from flow.stage import Stage
 from flow.yielding import FIRST_S, MOST_S, Queue, Rest
+from stages.messages import Image
 from tests.flow.live_toys import PATIENCE_S, Memory, graph_of, run_live
 from tests.flow.toys import Number
 
+ROOT = Path(__file__).resolve().parents[2]
+PICTURES = ("vp_vehicle", "vp_drone", "ego", "drone_odometry")
 DEPTH = 8
 LIVE = f"""\
 stages:
@@ -104,3 +108,10 @@ def test_a_configuration_says_whether_a_stage_yields(tmp_path):
     (tmp_path / "x.yaml").write_text(LIVE.replace("yields: true", "yields: true\n    thread: gate"))
     with pytest.raises(ConfigError, match="'pictures' works in the same thread, 'gate', and yields: both would rest"):
         load_graph(tmp_path / "x.yaml")
+
+
+def test_in_the_field_all_that_takes_pictures_yields_and_nothing_else():
+    graph = load_graph(ROOT / "configs" / "field.yaml")
+    pictures = {edge.consumer for edge in graph.edges if edge.message is Image and edge.consumer in graph.nodes}
+    stages = {name for name in pictures if graph.nodes[name].kind == "stages"}
+    assert {spec.name for spec in graph.nodes.values() if spec.yields} == stages == set(PICTURES)

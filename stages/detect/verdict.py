@@ -84,6 +84,7 @@ class Evidence(BaseModel):
     balloon: float = 5.0  # rare
     ball: float = 2.0  # each chord that bulges smoothly
     rugged: float = 1.2  # each chord with five or more returns that does not
+    most_round: float = 8.0  # chords that can tell a balloon: the next ones show the same side of the same thing
 
 
 def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tuple[float, str]:
@@ -185,7 +186,10 @@ def over_bird(c: Candidate, e: Evidence) -> float:
 
 def over_balloon(c: Candidate, e: Evidence) -> float:
     """Drone over balloon [nats]."""
-    odds = e.balloon + e.rugged * c.rugged - e.ball * c.balls
+    round_ = e.ball * c.balls - e.rugged * c.rugged
+    if round_ > 0.0:
+        round_ *= min(e.most_round / (c.balls + c.rugged), 1.0)
+    odds = e.balloon - round_
     return odds if c.heard is None else odds + believed(c.heard.over_balloon, e)
 
 

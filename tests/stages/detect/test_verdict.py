@@ -43,6 +43,19 @@ def test_over_a_balloon_it_is_added_to_how_round_it_is():
     assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball - 3.0 * E.told)
 
 
+def test_a_drone_whose_sides_look_round_now_and_then_is_no_balloon_however_long_it_is_seen():
+    """More chords of the same sides are no more evidence: 12 round ones of 21, as of a drone that was dropped for it."""
+    for times in (1, 2, 10):
+        c = hanging()
+        c.balls, c.rugged = 12 * times, 9 * times
+        assert over_balloon(c, E) == pytest.approx(E.balloon - (12 * E.ball - 9 * E.rugged) * E.most_round / 21)
+        assert over_balloon(c, E) > -0.5
+        c.balls, c.rugged = 11 * times, 3 * times  # a balloon
+        assert over_balloon(c, E) < -5.0
+        c.balls, c.rugged = 5 * times, 15 * times
+        assert over_balloon(c, E) == pytest.approx(E.balloon + times * (15 * E.rugged - 5 * E.ball))
+
+
 def test_over_what_stands_it_replaces_whether_it_moved():
     silent, nothing, flew = hanging(), hanging(NOTHING), hanging(Heard(20.0, 0.0, 0.0, 20.0))
     (odds, said), (same, same_said), (more, more_said) = (

@@ -2,10 +2,11 @@
 
     off by   a t^2 / 2 in place,   alpha t^2 / 2 in its turn        t since the last word
 
+Its speed is that of a tenth of a second or more: words that arrive together would make a parked vehicle race.
 Three go on past a word, each as far as an error of its own costs:
 
-    VehicleTrail (trail.py)     TRAIL_S, as between its last two words; USUAL. Asked at every slice, and the next word,
-                                which comes soon, takes the error back
+    VehicleTrail (trail.py)     TRAIL_S, straight on; USUAL. Asked at every slice, and the next word, which comes soon,
+                                takes the error back
     VehicleMotionChoice (ego)   JOINT_S, along its bend; UNTOLD. Another source is laid on there: the error stays
     VehicleEgo (ego)            to the next picture, straight on; UNTOLD, and a turn at any usual rate: how it turned is
                                 what its pictures would have told

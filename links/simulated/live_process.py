@@ -176,7 +176,7 @@ class RigInTime:
         odometry = next((talker for talker in simulation.talkers if isinstance(talker, VehicleOdometry)), None)
         batch_ns = rig.batch_packets * simulation.packet_ns
         first_ns, end_ns = scenario.start_ns, scenario.start_ns + round(1e9 * scenario.duration_s)
-        poses: list[tuple[int, bytes]] = []
+        poses: list[tuple[int, int, bytes]] = []  # when it is to arrive, when it was true
         position_ns = 0  # when the next position packet is due
         while first_ns + batch_ns <= end_ns:
             behind_ns = simulation.now_ns() - first_ns
@@ -198,11 +198,11 @@ class RigInTime:
             for record in true:
                 truth.write(record)
             for pose in odometry.records(next_ns) if odometry is not None else ():
-                heapq.heappush(poses, (pose.arrival_ns, _with_age(pose)))
+                heapq.heappush(poses, (pose.arrival_ns, pose.stamp_ns, pose.data))
             while poses and poses[0][0] <= simulation.now_ns():
-                pose_json = heapq.heappop(poses)[1]
+                _, stamp_ns, pose_json = heapq.heappop(poses)
                 if rig.odometry_port is not None:
-                    udp.sendto(pose_json, (LOOPBACK, rig.odometry_port))
+                    udp.sendto(_with_age(pose_json, simulation.now_ns() - stamp_ns), (LOOPBACK, rig.odometry_port))
             first_ns = next_ns
 
     def _report(self) -> None:
@@ -224,8 +224,8 @@ class RigInTime:
         (self._folder / RIG_REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
 
 
-def _with_age(pose: Record) -> bytes:
-    return json.dumps({**json.loads(pose.data), "age_s": (pose.arrival_ns - pose.stamp_ns) * 1e-9}).encode()
+def _with_age(pose_json: bytes, age_ns: int) -> bytes:
+    return json.dumps({**json.loads(pose_json), "age_s": age_ns * 1e-9}).encode()
 
 
 def main(settings: str) -> int:

@@ -2,7 +2,8 @@
 
     {"xyz_m": [x, y, z], "quaternion_xyzw": [x, y, z, w], "covariance": [36 numbers] or null, "age_s": 0.004}
 
-`age_s`: how long before it was sent the pose was true; 0 when it does not say. What it says else is as recorded.
+`age_s`: how long before it was sent the pose was true, to be told at the moment of sending; 0 when it does not say.
+What it says else is as recorded.
 
 Source: ours; recording format in recordings/README.md (/vehicle/odometry).
 """
@@ -19,7 +20,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from flow.link import LinkError, Record
-from links import host_time
+from links import datagram_time
 
 DATAGRAM_BYTES = 4096
 WAKE_S = 0.2  # how often a waiting listener looks whether it was closed
@@ -34,6 +35,7 @@ def listen_udp(
     closed = threading.Event()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         try:
+            datagram_time.ask_for_stamps(udp)
             udp.bind((bind, port))
         except OSError as error:
             raise LinkError(
@@ -52,14 +54,14 @@ def _records(
 ) -> Iterator[Record]:
     while not closed.is_set():
         try:
-            data, (host, _) = udp.recvfrom(DATAGRAM_BYTES)
+            data, ancillary, _, (host, _) = udp.recvmsg(DATAGRAM_BYTES, datagram_time.ANCILLARY_BYTES)
         except TimeoutError:
             continue
         except OSError as error:
             if closed.is_set():
                 return
             raise LinkError(f"the vehicle's odometry: {error.strerror}: is the network interface still up?") from error
-        arrival_ns = host_time.now_ns()
+        arrival_ns = datagram_time.arrival_ns(ancillary)
         if sender is not None and host != sender:
             counters["from other senders"] += 1
             continue

@@ -1,10 +1,9 @@
 """Live VLP-16 packets from UDP sockets, from one sender, stamped by the kernel when they arrived.
 
 Nothing is queued here: what the consumer does not take in time waits in the socket's bounded buffer, then the kernel
-drops it, and the decoder counts it from the gap in device time. The kernel stamps with the wall clock;
-`links/host_time.py` makes of it a time that a step of that clock does not move.
+drops it, and the decoder counts it from the gap in device time.
 
-Source: VLP-16 User Manual 63-9243 Rev. E, section 9.3 (ports); socket(7), SO_TIMESTAMPNS.
+Source: VLP-16 User Manual 63-9243 Rev. E, section 9.3 (ports).
 """
 
 from __future__ import annotations
@@ -12,8 +11,6 @@ from __future__ import annotations
 import errno
 import select
 import socket
-import struct
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -22,16 +19,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from flow.link import LinkError, Record
-from links import host_time
+from links import datagram_time
 from links.velodyne import vlp16
 
 RECEIVE_BUFFER_BYTES = 1 << 20  # 0.6 s of packets, where the host's net.core.rmem_max allows it
 _DATAGRAM_BYTES = 2048
 _BURST = 16  # datagrams taken at once where several wait: each look whether one does costs as much as the datagram
 _WAKE_S = 0.2  # how often a waiting listener looks whether it was closed
-
-_SO_TIMESTAMPNS = 35 if sys.platform == "linux" else None  # asm-generic/socket.h; Python does not name it
-_TIMESPEC = struct.Struct("@ll")
 
 
 @dataclass(slots=True)
@@ -73,8 +67,7 @@ def _open(bind: str, port: int) -> socket.socket:
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        if _SO_TIMESTAMPNS is not None:
-            udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        datagram_time.ask_for_stamps(udp)
         udp.bind((bind, port))
     except OSError as error:
         udp.close()
@@ -114,8 +107,7 @@ def _records(
                 counters.foreign += 1
                 counters.last_foreign = host
                 continue
-            kernel_ns = _kernel_time_ns(ancillary)
-            arrival_ns = host_time.now_ns() if kernel_ns is None else host_time.from_wall_ns(kernel_ns)
+            arrival_ns = datagram_time.arrival_ns(ancillary)
             stamp_ns = vlp16.first_pulse_ns(arrival_ns, data)
             yield Record(channel.topic, arrival_ns, stamp_ns, data, counters.received)
             counters.received += 1
@@ -131,17 +123,9 @@ def _waiting(udp: socket.socket) -> Iterator[Any]:
     """The datagrams that wait, as `recvmsg` gives them; none where the kernel found the announced one damaged."""
     try:
         for _ in range(_BURST):
-            yield udp.recvmsg(_DATAGRAM_BYTES, 64)
+            yield udp.recvmsg(_DATAGRAM_BYTES, datagram_time.ANCILLARY_BYTES)
     except BlockingIOError:
         return
-
-
-def _kernel_time_ns(ancillary: list[tuple[int, int, bytes]]) -> int | None:
-    for level, kind, value in ancillary:
-        if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(value) == _TIMESPEC.size:
-            seconds, nanoseconds = _TIMESPEC.unpack(value)
-            return 1_000_000_000 * seconds + nanoseconds
-    return None
 
 
 def _silence(port: int, sender: str | None, timeout_s: float, foreign: int, last_foreign: str) -> str:

@@ -54,6 +54,8 @@ class Motions:
         another = before_ns is None or len(known) > 1
         self._vehicle_ns = motion.stamp_ns
         self._odd.clear()
+        if another:
+            self.vehicle.begin_anew(known[0].stamp_ns)
         for pose in known:
             self.vehicle.add(pose)
         return another

@@ -26,10 +26,10 @@ def look() -> None:
 
 time.time_ns = lambda: really_ns() + ahead_ns
 
-from links.cli import main  # noqa: E402 (after the clock is ours)
-from links.velodyne import udp  # noqa: E402
+from links import datagram_time  # noqa: E402 (after the clock is ours)
+from links.cli import main  # noqa: E402
 
-kernel_ns = udp._kernel_time_ns
+kernel_ns = datagram_time.kernel_time_ns
 
 
 def stamped(ancillary):
@@ -37,7 +37,7 @@ def stamped(ancillary):
     return None if stamp_ns is None else stamp_ns + ahead_ns
 
 
-udp._kernel_time_ns = stamped
+datagram_time.kernel_time_ns = stamped
 
 if __name__ == "__main__":
     threading.Thread(target=look, daemon=True).start()

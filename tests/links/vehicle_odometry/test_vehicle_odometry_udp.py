@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 
 import pytest
 from pydantic import ValidationError
@@ -38,6 +39,14 @@ def test_a_pose_arrives_stamped_by_its_age_and_decodes(port):
     motion = odometry.decode(aged)
     assert motion.stamp_ns == aged.stamp_ns
     assert motion.xyz_start_m.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_a_pose_that_is_read_late_did_not_arrive_late(port):
+    with VehicleOdometry(port=port).listen() as records:
+        send(port, POSE)
+        sent_ns = host_time.now_ns()
+        time.sleep(0.3)
+        assert next(records).arrival_ns < sent_ns + 200_000_000
 
 
 def test_others_are_ignored_and_counted(port):

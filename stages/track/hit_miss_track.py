@@ -41,6 +41,7 @@ from stages.track.look import Look, collect_into, evaluate, largest_sigma_m
 from stages.trail import VehicleTrail
 
 LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
+CAREFUL = 0.5  # of the filter's variance is seen in simulated flights: a body is solid, its likelihood knows mostly air
 
 
 class HitMissTrack(Stage):
@@ -49,18 +50,18 @@ class HitMissTrack(Stage):
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion", "drone_position", "drone_odometry"})
 
     span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
-    hull_offset_m: float = Field(0.03, ge=-1, le=1)  # the centre lies this far behind the mean of its returns
+    hull_share: float = Field(0.075, ge=-1, le=1)  # of its span: the centre lies so far behind the mean of its returns
     max_drones: int = Field(1, ge=1, le=8)
     max_hypotheses: int = Field(4, ge=0, le=16)  # candidates followed beside them
     own_sigma_m: float = Field(0.8, gt=0)  # less known, only the detector finds it again
     manoeuvre: float = Field(1.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
-    told_manoeuvre: float = Field(0.02, gt=0)  # and what is left of it where the drone tells how it flies
+    told_manoeuvre: float = Field(0.01, gt=0)  # and what is left of it where the drone tells how it flies
     coast_after_s: float = Field(0.35, gt=0)
     lost_after_s: float = Field(6.0, gt=0)  # later where the drone tells its flight, as long as
     lost_sigma_m: float = Field(5.0, gt=0)  # it is known as well as this
     start_sigma_mps: float = Field(1.5, gt=0)  # of the detector's velocity
-    pointing_deg: float = Field(0.07, ge=0)  # encoder, play, calibration: constant or slow, one sigma
-    shape_m: float = Field(0.015, ge=0)  # the drone's own outline is not round, one sigma
+    pointing_deg: float = Field(0.1, ge=0)  # encoder, play, calibration: constant or slow, one sigma
+    shape_share: float = Field(0.05, ge=0, le=1)  # of its span: returns lie so far off its middle, one sigma, an axis
     misses: bool = True  # ablation: without, only hits count
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
 
@@ -216,7 +217,7 @@ class HitMissTrack(Stage):
     # one look
 
     def _close(self, track: Hypothesis, look: Look) -> Iterator[DroneFix | TrackState]:
-        seen = evaluate(look, self.span_m, self.hull_offset_m, track.p_0, self.misses, self.own_sigma_m)
+        seen = evaluate(look, self.span_m, self.hull_share * self.span_m, track.p_0, self.misses, self.own_sigma_m)
         track.hits = 0 if seen is None else seen.hits
         if seen is None:
             return
@@ -252,4 +253,4 @@ class HitMissTrack(Stage):
     def _whole_covariance(self, xyz_vehicle_m: Array64, covariance_m2: Array64) -> Array64:
         """The filter's, and what does not average out: the turntable's angle, and the drone's outline."""
         level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * math.radians(self.pointing_deg)
-        return covariance_m2 + np.outer(level, level) + self.shape_m**2 * np.eye(3)
+        return CAREFUL * covariance_m2 + np.outer(level, level) + (self.shape_share * self.span_m) ** 2 * np.eye(3)

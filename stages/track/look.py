@@ -20,7 +20,7 @@ from stages.track.kalman import condition, measured
 
 SCAN_COS = math.cos(math.radians(24.0))  # a slice covers 15 deg to each side of its middle and 5 deg along
 FURTHEST_M = 6.0  # beside the prediction pulses are collected
-RANGE_NOISE_M = 0.1  # of one return about the body's middle, one sigma: it is as deep
+RANGE_NOISE = 0.1  # of one return about the body's middle, one sigma, over the span: it is as deep
 RANGE_FLOOR_M = 0.02
 MOST_ROWS = 256
 
@@ -151,7 +151,7 @@ def evaluate(
     evidence, expected = posterior(used, prior, a, b, half_m, p_0, WIDTH * span_m, use_misses, mean, after)
     x, sideways = condition(look.x, look.P, H, mean, after)
     depth_m = float(np.median(hits[:, DEPTH])) + hull_offset_m
-    noise_m = math.sqrt(RANGE_NOISE_M**2 / len(hits) + RANGE_FLOOR_M**2)
+    noise_m = math.sqrt((RANGE_NOISE * span_m) ** 2 / len(hits) + RANGE_FLOOR_M**2)
     along_m = depth_m - float(look.line @ (x[:3] - look.x[:3]))
     x, both = measured(x, sideways, look.line, along_m, noise_m)
     hit_ns = look.start_ns + round(float(hits[:, WHEN_S].mean()) * 1e9)

@@ -1,7 +1,6 @@
 """Aim beams: sweep without blind spots, stop at what may be a drone, and then keep a beam on it, turn after turn.
 
     no track, no candidate     sweep the whole travel, there and back
-    met once                   the sweep waits a turn while a beam is put on it, then glances at it in passing
     candidate                  look at it and at what is around it until the detector has decided, then go on
     TRACKING, COASTING         each turn of the rotor one beam on the predicted place, a little beside it in turn;
                                while coasting farther and farther beside it, then sweep
@@ -38,7 +37,6 @@ FIRST_GUESS_S = 0.05  # to the rotor's next pass
 INNER_RAD = math.radians(8.0)
 GLANCE_RAD = math.radians(12.0)  # beside the sweep: its fan is 30 deg wide
 FRESH_NS = 350_000_000  # met a moment ago
-WAITED_FOR = 0.012  # probability: a single return in the open; the sweep waits for the first look at it
 MOST_TRIED = 24  # looks that missed are remembered; it flies on
 HALF_SHARE = 0.3  # of its span: a beam so far from its middle meets it now and then
 RPM_RADPS = math.tau / 60.0
@@ -200,8 +198,7 @@ class BeamAim(Stage):
         now.sweeping.stop()
         centre_rad, inner_rad = servo.position_rad, INNER_RAD
         if target.glance:
-            waits = target.looks == 0 and target.probability >= WAITED_FOR  # met at the fan's edge, it is soon passed
-            step_rad = 0.0 if waits else self._search_radps() * math.tau / now.rotor.rate_radps
+            step_rad = self._search_radps() * math.tau / now.rotor.rate_radps
             centre_rad, inner_rad = now.sweeping.glance_from(servo.position_rad, step_rad), math.inf
         else:
             now.sweeping.beside_rad = None

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from flow.stage import input_ports, output_ports
 from stages.aim import BeamAim
-from stages.aim.beam_aim import INNER_RAD, WAITED_FOR
+from stages.aim.beam_aim import INNER_RAD
 from stages.geometry import Harmonic, LidarMount
 from stages.messages import Candidates, ServoGoal, TrackingState, TrackState
 from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Way, beams_lidar, beams_vehicle, flying, packet, still
@@ -444,35 +444,21 @@ def test_a_beam_near_the_fans_middle_is_put_on_it_even_where_an_outer_one_is_nea
         assert abs(elevation_deg(goal, place)) > 0.3  # no beam lies in the middle
 
 
-def glanced_at(place, probability):
-    """A sweep past something that was met once, told for half a second."""
+def test_a_glance_in_passing_takes_the_beam_that_is_nearest_and_the_sweep_goes_on():
+    place = towards(60.0, 45.0)(np.zeros(1))[0]
 
     def tell(aim, t_s):
         if 0.3 <= t_s < 0.75 and round(t_s * 1000) % 50 == 0:
-            aim.on_candidates(candidates(place, t_s, probability, looks=1))
+            aim.on_candidates(candidates(place, t_s, 0.05, looks=1))
 
-    return fly(BeamAim(mount=ON_ITS_SIDE), 2.2, tell)
-
-
-def at_the_end_s(flight):
-    return np.argmax(np.degrees(flight.servo_rad) > 175.0) * TICK_NS * 1e-9
-
-
-def test_a_glance_in_passing_takes_the_beam_that_is_nearest_and_the_sweep_goes_on():
-    place = towards(60.0, 45.0)(np.zeros(1))[0]
-    glanced = glanced_at(place, 0.5 * WAITED_FOR)
+    swept = fly(BeamAim(mount=ON_ITS_SIDE), 2.2, nothing)
+    glanced = fly(BeamAim(mount=ON_ITS_SIDE), 2.2, tell)
     looks = [goal for _, goal in looks_of(glanced)]
     assert 1 <= len(looks) <= 3
     assert any(abs(elevation_deg(goal, place)) > math.degrees(INNER_RAD) + 1.5 for goal in looks)
-    swept_s = at_the_end_s(fly(BeamAim(mount=ON_ITS_SIDE), 2.2, nothing))
-    assert swept_s > 0.5
-    assert at_the_end_s(glanced) < swept_s + 0.25
-
-
-def test_the_sweep_waits_a_turn_for_the_first_look_at_what_was_met_in_the_open():
-    place = towards(60.0, 45.0)(np.zeros(1))[0]
-    doubtful, waited = glanced_at(place, 0.5 * WAITED_FOR), glanced_at(place, 2.0 * WAITED_FOR)
-    assert 0.05 < at_the_end_s(waited) - at_the_end_s(doubtful) < 0.2
+    at_s = [np.argmax(np.degrees(flight.servo_rad) > 175.0) * TICK_NS * 1e-9 for flight in (swept, glanced)]
+    assert at_s[0] > 0.5
+    assert at_s[1] < at_s[0] + 0.25
 
 
 # how many there are

@@ -85,6 +85,7 @@ class Candidate:
     among: bool = False  # where it appeared, something had been refused
     again: bool = False  # in the very place, and the drone says that it flies
     joined_at: int = 0  # looks before it was met again elsewhere, as the drone says that it flew; 0: never
+    joined_ns: int = 0  # when
     accepted: bool = False
     announced: bool = False  # as accepted
     told: bool = False  # it is worth another look

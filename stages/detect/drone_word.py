@@ -6,11 +6,12 @@ Source: ours; DESIGN, The graph: `odometry` ("autopilot odometry when present").
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterable
 
 import numpy as np
 
-from stages.detect.candidate import START_SPEED_MPS, Candidate, Sighting
+from stages.detect.candidate import DENIED, START_SPEED_MPS, Candidate, Sighting
 from stages.detect.flight import scatter_m
 from stages.detect.rejoin import met_again
 from stages.detect.telemetry import Heard, hear
@@ -20,6 +21,7 @@ from stages.messages import DroneLocalPosition, DroneOdometry
 from stages.trail import VehicleTrail
 
 MOVES_MPS = 1.0
+LOOKS_SINCE = 3  # that a way tells anything
 
 
 class DroneWord:
@@ -38,10 +40,22 @@ class DroneWord:
         self._odometry.add_odometry(odometry)
 
     def of(self, c: Candidate, motion_known: bool) -> Heard | None:
-        """What it says for and against a candidate; None: nothing."""
-        heard = None
+        """What it says for and against a candidate; None: nothing.
+
+        Of one that was met again elsewhere its way since then counts alone where that is denied: two things that by
+        chance lie as the drone flew, of which the second flies otherwise.
+        """
+        heard = self._of(c, 0, motion_known)
+        if heard is None or not c.joined_at or c.hit_looks - c.joined_at < LOOKS_SINCE:
+            return heard
+        since = self._of(c, bisect_left(c.path_ns, c.joined_ns), motion_known)
+        return since if since is not None and min(since[:3]) < DENIED else heard
+
+    def _of(self, c: Candidate, first: int, motion_known: bool) -> Heard | None:
+        """The same of its sightings from number `first` on."""
+        path_ns, path_m, heard = c.path_ns[first:], c.path_m[first:], None
         for told in self._both:
-            heard = heard or hear(told, c.path_ns, c.path_m, 0.03 + scatter_m(c.range_m), motion_known)
+            heard = heard or hear(told, path_ns, path_m, 0.03 + scatter_m(c.range_m), motion_known)
         return heard
 
     def met_again(self, candidates: Iterable[Candidate], s: Sighting) -> tuple[Candidate, Array64] | None:

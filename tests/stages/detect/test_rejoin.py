@@ -7,8 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from stages.detect.candidate import DENIED
+from stages.detect.drone_word import DroneWord
 from stages.detect.rejoin import GATE, LATEST_NS, LEAST_M, SOONEST_NS, TWIN_LOOKS, joined, met_again, without_twins
 from stages.drone_telemetry import DroneTelemetry
+from stages.messages import DroneLocalPosition
 from tests.stages.detect.test_candidate import candidate, sighting
 from tests.stages.made import START_NS
 
@@ -102,3 +105,30 @@ def test_of_two_with_the_same_last_sightings_the_likelier_is_kept():
     one.odds, two.odds, two.number, other.number = 1.0, 2.0, 2, 3
     assert [c.number for c in without_twins([one, two, other])] == [2, 3]
     assert [c.number for c in without_twins([other, candidate(sighting(0.0, BEFORE_M))])] == [3, 1]  # too few to tell
+
+
+def followed_on(velocity_mps, word):
+    """Met again where the drone says it would be, and seen there seven times, flying at this velocity (3,)."""
+    begin_m = BEFORE_M + PAUSE_S * SAID_MPS
+    before = candidate(*(sighting(0.1 * k, BEFORE_M + 0.1 * k * SAID_MPS) for k in range(-4, 1)))
+    c = joined(before, 2, sighting(PAUSE_S, begin_m), np.array(SAID_MPS))
+    for k in range(1, 7):
+        c.see(sighting(PAUSE_S + 0.1 * k, begin_m + 0.1 * k * np.asarray(velocity_mps)))
+    c.hear(word.of(c, True))
+    return c
+
+
+def test_what_flies_otherwise_since_it_was_met_again_is_denied_whatever_the_way_there():
+    word = DroneWord()
+    for k in range(60):
+        word.add_position(
+            DroneLocalPosition(
+                stamp_ns=START_NS - 1_000_000_000 + k * 100_000_000,
+                xyz_local_m=(0.1 * k - 1.0) * SAID_MPS,
+                velocity_local_mps=SAID_MPS,
+            )
+        )
+    drone, bird = followed_on(SAID_MPS, word), followed_on((-2.0, 9.0, 0.0), word)
+    assert min(drone.heard[:3]) > 0.0
+    assert min(bird.heard[:3]) < DENIED
+    assert (drone.joined_ns, bird.flown) == (START_NS + round(PAUSE_S * 1e9), 0.0)

@@ -147,7 +147,7 @@ class Candidate:
         self._note_flight()
 
     def hear(self, heard: Heard | None) -> None:
-        """What its path says by now. What flew in the open is not what stands where it comes to, until that is denied."""
+        """What its path says by now. What flew in the open is not what stands beside it then, till that is denied."""
         self.heard = heard
         if heard is None:
             return

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from stages.detect.candidate import DENIED, START_SPEED_MPS, Candidate, Sighting
+from stages.detect.candidate import START_SPEED_MPS, Candidate, Sighting
 from stages.detect.flight import scatter_m
 from stages.detect.rejoin import met_again
 from stages.detect.telemetry import Heard, hear
@@ -22,6 +22,7 @@ from stages.trail import VehicleTrail
 
 MOVES_MPS = 1.0
 LOOKS_SINCE = 3  # that a way tells anything
+DENIED = -3.0  # nats: it does not fly as the drone says
 
 
 class DroneWord:

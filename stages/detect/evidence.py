@@ -209,7 +209,7 @@ class EvidenceDetect(Stage):
     def _weigh(self, now: _Now, c: Candidate) -> bool:
         """Judge it anew. True when that is news."""
         motion_known = self.parked or now.trail.known
-        c.hear(now.word.of(c, motion_known))
+        c.heard = now.word.of(c, motion_known)
         c.odds, c.why = judge(c, self.evidence, self.free_space, motion_known)
         accept = odds_of(self.accept_probability)
         c.accepted = c.odds >= accept or (c.accepted and c.odds >= accept - 3.0)

@@ -87,7 +87,6 @@ def joined(c: Candidate, number: int, s: Sighting, velocity_mps: Array64) -> Can
         hit_looks=c.hit_looks + 1,
         joined_at=c.hit_looks,
         joined_ns=s.stamp_ns,
-        flown=0.0,
         accepted=False,
         announced=False,
         free=c.free.copy(),

@@ -198,7 +198,7 @@ def test_misses_make_the_estimate_better_and_its_covariance_truer():
 
 
 def test_pointing_makes_it_less_sure_the_farther_away_and_only_about_the_axis():
-    stage = HitMissTrack(shape_share=0.0, pointing_deg=1.0)
+    stage = HitMissTrack(shape_share=0.0, range_sigma_m=0.0, pointing_deg=1.0)
     added = stage._whole_covariance(np.array([0.0, 20.0, 5.0]), np.zeros((3, 3)))
     np.testing.assert_allclose(added, np.diag([(20 * math.radians(1)) ** 2, 0, 0]), atol=1e-12)
 

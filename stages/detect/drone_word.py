@@ -22,7 +22,6 @@ from stages.trail import VehicleTrail
 
 MOVES_MPS = 1.0
 LOOKS_SINCE = 3  # that a way tells anything
-DENIED = -3.0  # nats: it does not fly as the drone says
 
 
 class DroneWord:
@@ -50,7 +49,7 @@ class DroneWord:
         if heard is None or not c.joined_at or c.hit_looks - c.joined_at < LOOKS_SINCE:
             return heard
         since = self._of(c, bisect_left(c.path_ns, c.joined_ns), motion_known)
-        return since if since is not None and min(since[:3]) < DENIED else heard
+        return since if since is not None and since.denied else heard
 
     def _of(self, c: Candidate, first: int, motion_known: bool) -> Heard | None:
         """The same of its sightings from number `first` on."""

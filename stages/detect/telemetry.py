@@ -39,6 +39,7 @@ FOLLOWED_MPS = 5.0  # and along a wire, where each next look is aimed at as if i
 CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time, speed; else anything up to it
 BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
 BALLOON = (0.7, 0.7, 0.3, 0.4)
+DENIED = -3.0  # nats
 
 
 class Heard(NamedTuple):
@@ -48,6 +49,11 @@ class Heard(NamedTuple):
     over_bird: float
     over_balloon: float
     over_wire: float  # over what is met farther and farther along it, at any speed: the aim looks where it expects
+
+    @property
+    def denied(self) -> bool:
+        """Whether it clearly does not fly as the drone says."""
+        return min(self.over_still, self.over_bird, self.over_balloon) < DENIED
 
 
 def hear(

@@ -109,7 +109,7 @@ def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tu
         words.append("met again where the drone says it would be")
     if c.motion is not None:
         words.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
-    if c.heard is not None and min(c.heard[:3]) < -3.0:
+    if c.heard is not None and c.heard.denied:
         words.append("it does not fly as the drone says")
     elif c.heard is not None and max(c.heard[:3]) > 3.0:
         words.append("it flies as the drone says")

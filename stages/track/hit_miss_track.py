@@ -251,7 +251,10 @@ class HitMissTrack(Stage):
         )
 
     def _whole_covariance(self, xyz_vehicle_m: Array64, covariance_m2: Array64) -> Array64:
-        """The filter's, and what does not average out: the turntable's angle, the range, and the drone's outline."""
+        """The filter's (3, 3), and what does not average out: the turntable's angle, the range, the drone's outline.
+
+        Axes of the vehicle; the line of sight is taken from its origin, decimetres beside the LiDAR's.
+        """
         along = xyz_vehicle_m * (self.range_sigma_m / max(float(np.linalg.norm(xyz_vehicle_m)), 1e-9))
         level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * math.radians(self.pointing_deg)
         lasting_m2 = np.outer(level, level) + np.outer(along, along) + (self.shape_share * self.span_m) ** 2 * np.eye(3)

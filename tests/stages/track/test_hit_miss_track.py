@@ -203,6 +203,21 @@ def test_pointing_makes_it_less_sure_the_farther_away_and_only_about_the_axis():
     np.testing.assert_allclose(added, np.diag([(20 * math.radians(1)) ** 2, 0, 0]), atol=1e-12)
 
 
+def test_the_lidars_range_is_as_unsure_as_its_data_sheet_says_along_the_line_of_sight_alone():
+    stage = HitMissTrack(shape_share=0.0, range_sigma_m=0.03, pointing_deg=0.0)
+    for place in ((0.0, 20.0, 0.0), (3.0, 0.0, 4.0)):
+        line = np.array(place) / np.linalg.norm(place)
+        added = stage._whole_covariance(np.array(place), np.zeros((3, 3)))
+        np.testing.assert_allclose(added, 0.03**2 * np.outer(line, line), atol=1e-15)
+
+
+def test_a_larger_drones_outline_tells_less_of_its_middle():
+    for span_m in (0.35, 0.8):
+        stage = HitMissTrack(span_m=span_m, shape_share=0.05, range_sigma_m=0.0, pointing_deg=0.0)
+        added = stage._whole_covariance(np.array([0.0, 20.0, 5.0]), np.zeros((3, 3)))
+        np.testing.assert_allclose(added, (0.05 * span_m) ** 2 * np.eye(3), atol=1e-15)
+
+
 def test_a_candidate_is_followed_silently_until_the_detector_accepts_it():
     way = still(0.0, 8.0, 10.0)
     out = run([Drone(way)], [candidate(here(way), 0.7), accepted(here(way), t_s=1.0)], 2.0)

@@ -29,7 +29,7 @@ OUTSIDE = {
     "random",
     "logging",
 }
-TOP_LEVEL = {"flow", "stages", "links", "configs", "deploy", "recordings", "tests"}
+TOP_LEVEL = {"flow", "stages", "links", "configs", "deploy", "docs", "recordings", "tests"}
 
 
 def imports_of(file: Path) -> set[str]:

@@ -1,6 +1,6 @@
 """Sweeps of many simulated streets that nothing was fitted to: how often each configuration finds, misses, invents.
 
-Slow, so run by name; it prints the table of the README:
+Slow, so run by name; it prints the table of docs/RESULTS.md:
     python -m pytest tests/test_worlds.py -m slow -s
 """
 

@@ -41,6 +41,7 @@ from stages.track.look import Look, collect_into, evaluate, largest_sigma_m
 from stages.trail import VehicleTrail
 
 LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
+CANDIDATE_S = 1.5  # one that was not accepted is forgotten so long after its last hit
 
 
 class HitMissTrack(Stage):
@@ -144,6 +145,8 @@ class HitMissTrack(Stage):
         R, t = self._trail.at(middle_ns(pulses))
         axis = mean_direction(pulses.direction_vehicle)
         for track in self._known:
+            if track not in self._known:  # dropped a moment ago as the same as another
+                continue
             look = track.look
             if look is not None and pulses.stamp_ns - look.last_ns > LOOK_OVER_NS:
                 track.look = None
@@ -172,11 +175,10 @@ class HitMissTrack(Stage):
     def _watch(self, track: Hypothesis, now_ns: int) -> Iterator[TrackState]:
         """Coasting and losing are told without a look."""
         silent_s = (now_ns - track.last_hit_ns) * 1e-9
-        gone = silent_s > 1.5
+        gone = silent_s > (self.lost_after_s if track.confirmed else CANDIDATE_S)
         if track.confirmed and gone:
             known = self._known.word(now_ns) is not None
-            known = known and largest_sigma_m(self._known.at(track, now_ns)[1]) < self.lost_sigma_m
-            gone = silent_s > self.lost_after_s and not known
+            gone = not (known and largest_sigma_m(self._known.at(track, now_ns)[1]) < self.lost_sigma_m)
         if gone or track.odds < -4.0:
             why = f"not hit for {silent_s:.1f} s" if silent_s > 1.0 else "looked at again and again, not hit"
             yield from self._lose(track, now_ns, why)

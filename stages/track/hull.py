@@ -26,11 +26,10 @@ from stages.geometry import Array64
 
 WIDTH = 0.2  # s over the span
 STRAY = 0.005  # eps: a return that is none of the drone's
-A, B, KIND, DEPTH, WHEN_S = range(
-    5
-)  # of a collected pulse: offsets [m], hit or miss, range over the prediction [m], time
-COLUMNS = 5
-MISS, HIT, NEARER = 0.0, 1.0, 2.0
+# of a collected pulse: offsets [m], hit or miss, range over the prediction [m] (inf: no return), time, laser
+A, B, KIND, DEPTH, WHEN_S, LASER = range(6)
+COLUMNS = 6
+MISS, HIT, NEARER = 0.0, 1.0, 2.0  # NEARER says nothing: what is behind is hidden, or nobody knows what it is
 CELLS = 25
 
 
@@ -50,6 +49,7 @@ def collect(
     stamp_ns: NDArray[np.int64],
     direction: NDArray[np.float32],
     range_m: NDArray[np.float32],
+    laser: NDArray[np.uint8],
     origin_m: Array64,
     centre_m: Array64,
     velocity_mps: Array64,
@@ -82,7 +82,8 @@ def collect(
             continue
         r = range_m[i]
         away = r * along - R
-        found[n, A], found[n, B], found[n, WHEN_S], found[n, DEPTH] = a, b, dt, away
+        found[n, A], found[n, B], found[n, WHEN_S], found[n, LASER] = a, b, dt, laser[i]
+        found[n, DEPTH] = away if r > 0.0 else math.inf
         if r == 0.0 or away > depth_m:
             found[n, KIND] = MISS
         elif away < -depth_m:

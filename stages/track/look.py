@@ -17,6 +17,7 @@ from stages.geometry import Array64
 from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, WHEN_S, WIDTH, A, B, basis, collect, posterior
 from stages.track.kalman import condition, measured
+from stages.track.runs import LONGEST, leave_out_walls
 
 SCAN_COS = math.cos(math.radians(24.0))  # a slice covers 15 deg to each side of its middle and 5 deg along
 FURTHEST_M = 6.0  # beside the prediction pulses are collected
@@ -34,6 +35,7 @@ class Look:
     x: Array64  # (6,) predicted at start_ns, local frame
     P: Array64
     line: Array64  # unit line of sight, local frame
+    reach_m: float  # pulses so near the prediction count; those farther out show where a wall goes on
     parts: list[Array64] = field(default_factory=lambda: list[Array64]())
 
     @property
@@ -99,17 +101,19 @@ def collect_into(
         return look
     start_ns = pulses.stamp_ns if look is None else look.start_ns
     sigma_m = largest_sigma_m(P)
+    reach_m = min(0.6 * span_m + 3.0 * sigma_m, FURTHEST_M)
     line = away / range_m if look is None else R.T @ look.line
     found = np.empty((pulses.range_m.size, COLUMNS))
     count = collect(
         pulses.point_stamp_ns,
         pulses.direction_vehicle,
         pulses.range_m,
+        pulses.laser,
         origin,
         away + origin,
         R.T @ x[3:] if de_skew else np.zeros(3),
         start_ns,
-        min(0.6 * span_m + 3.0 * sigma_m, FURTHEST_M),
+        reach_m + LONGEST * span_m,
         0.5 + 3.0 * sigma_m,
         line,
         found,
@@ -117,7 +121,7 @@ def collect_into(
     if count == 0:
         return look
     if look is None:
-        look = Look(start_ns, start_ns, x, P, R @ line)
+        look = Look(start_ns, start_ns, x, P, R @ line, reach_m)
     look.parts.append(found[:count])
     look.last_ns = int(pulses.point_stamp_ns[-1])
     return look
@@ -131,6 +135,8 @@ def evaluate(
     What is hit where the prediction is worse than own_sigma_m may be anything: that is for the detector to judge.
     """
     pulses, sigma_m = np.concatenate(look.parts), look.sigma_m
+    leave_out_walls(pulses, span_m)
+    pulses = pulses[np.hypot(pulses[:, A], pulses[:, B]) <= look.reach_m]
     missed = pulses[pulses[:, KIND] != HIT]
     ax, ay, bx, by, bz = basis(*look.line)
     H = np.array([[ax, ay, 0.0], [bx, by, bz]])

@@ -12,6 +12,7 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
 from stages.track import HitMissTrack
+from stages.track.hit_miss_track import LOOK_OVER_NS
 from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, A, B
 from stages.track.look import drone_hits
 from tests.stages.caster import Box, Drone, During, Way, dithering, flying, pulses_seen, still
@@ -275,6 +276,34 @@ def test_a_drone_in_front_of_a_wall_is_not_dragged_onto_it():
     fixes = fixes_of(run([Drone(way), wall], [accepted(here(way))]))
     assert len(fixes) >= 12
     assert np.linalg.norm(errors_m(fixes, way), axis=1).max() < 0.4
+
+
+@pytest.mark.parametrize("gap_m", [0.3, 0.45, 0.7])
+def test_a_drone_close_before_a_wall_is_kept_and_when_it_has_gone_the_wall_is_not_taken_for_it(gap_m):
+    way = flying((0.0, 10.0, 8.0), (0.3, 0.0, 0.0))
+    wall = Box((-10.0, 10.0 + gap_m, 0.0), (10.0, 14.0, 24.0))
+    out = run([During(Drone(way), 0.0, 1.0), wall], [accepted(here(way), (0.3, 0.0, 0.0))], 3.0)
+    fixes = fixes_of(out)
+    assert len(fixes) >= 5
+    assert np.linalg.norm(errors_m(fixes, way), axis=1).max() < 0.3
+    assert fixes[-1].stamp_ns < at_s(1.05)
+    assert states_of(out)[-1].state is TrackingState.COASTING
+
+
+def test_of_two_that_became_one_the_younger_says_no_more():
+    """What is dropped in mid-look gives no fix after its LOST."""
+    stage, out = HitMissTrack(max_drones=2), []
+    elder, younger = still(-1.0, 8.0, 10.0), still(1.0, 8.0, 10.0)
+    for message in (accepted(here(elder), number=5), accepted(here(younger), number=9)):
+        out += stage.on_detections(message)
+    for pulses in pulses_seen([Drone(elder, seed=1), Drone(younger, seed=2)], WATCHING, 2.0):
+        both = [one for one in stage._known if one.look and pulses.stamp_ns - one.look.last_ns > LOOK_OVER_NS]
+        if len(both) == 2 and pulses.stamp_ns > at_s(1.0):  # both looks end now: the younger drifts onto the elder
+            both[1].x[:3] = both[0].x[:3]
+        out += stage.on_pulses(pulses)
+    (lost,) = [m for m in states_of(out) if m.state is TrackingState.LOST]
+    assert (lost.track_id, lost.reason) == (2, "is the same as drone 1")
+    assert all(m.track_id == 1 for m in out[out.index(lost) + 1 :])
 
 
 def test_from_a_driving_vehicle_a_drone_that_comes_along_is_kept_by_its_odometry():

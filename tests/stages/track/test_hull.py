@@ -13,6 +13,7 @@ from stages.track.hull import (
     DEPTH,
     HIT,
     KIND,
+    LASER,
     MISS,
     NEARER,
     STRAY,
@@ -170,6 +171,7 @@ def collected(places, ranges, stamps_ns=None, velocity=NO_MOTION, reach_m=1.0, d
         stamps,
         direction,
         np.array(ranges, dtype=np.float32),
+        np.arange(len(ranges), dtype=np.uint8),
         ORIGIN,
         CENTRE,
         velocity,
@@ -191,6 +193,8 @@ def test_each_pulse_is_measured_across_and_along_the_line_of_sight():
     np.testing.assert_allclose(found[:, B], [0, 0.2, 0, 0], atol=1e-5)
     np.testing.assert_allclose(found[:3, DEPTH], [0, 0, 0.1], atol=1e-5)
     assert found[:, KIND].tolist() == [HIT, HIT, HIT, MISS]
+    assert found[3, DEPTH] == math.inf
+    assert found[:, LASER].tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,47 @@
+"""What a beam keeps meeting for longer than the drone is wide is a wall, and none of its returns is the drone's.
+
+The pulses of one laser follow each other 0.2 deg apart. Returns in a row at much the same range are one run; a drone's
+are short, also where it hangs before a wall, because the range steps at its edge.
+
+Source: ours, for P III.C; the steps are those of `stages/detect/chords.py`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.compiled import compiled
+from stages.geometry import Array64
+from stages.track.hull import DEPTH, HIT, KIND, LASER, NEARER, A, B
+
+LONGEST = 1.6  # of the span, and it is no drone
+STEP = 0.7  # of the span: a step in range that ends a run
+HOLE = 0.6  # of the span: so wide a hole ends it, too
+LASERS = 256
+
+
+@compiled
+def leave_out_walls(pulses: Array64, span_m: float) -> None:
+    """Hits among a look's pulses (n, COLUMNS), in order of time, that belong to a long run become NEARER: no word."""
+    first, last = np.full(LASERS, -1), np.full(LASERS, -1)
+    run = np.full(pulses.shape[0], -1)  # row at which each row's run began
+    long = np.zeros(pulses.shape[0], dtype=np.bool_)  # by that row
+    for i in range(pulses.shape[0]):
+        if not math.isfinite(pulses[i, DEPTH]):
+            continue
+        k = int(pulses[i, LASER])
+        j = last[k]
+        goes_on = (
+            j >= 0
+            and abs(pulses[i, DEPTH] - pulses[j, DEPTH]) <= STEP * span_m
+            and math.hypot(pulses[i, A] - pulses[j, A], pulses[i, B] - pulses[j, B]) <= HOLE * span_m
+        )
+        if not goes_on:
+            first[k] = i
+        last[k], run[i], j = i, first[k], first[k]
+        long[j] |= math.hypot(pulses[i, A] - pulses[j, A], pulses[i, B] - pulses[j, B]) > LONGEST * span_m
+    for i in range(pulses.shape[0]):
+        if pulses[i, KIND] == HIT and long[run[i]]:
+            pulses[i, KIND] = NEARER

@@ -1,0 +1,63 @@
+"""Returns that a beam keeps meeting for longer than the drone is wide are none of the drone's."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, LASER, MISS, NEARER, A
+from stages.track.runs import leave_out_walls
+
+SPAN_M = 0.5
+
+
+def look(depths, laser=0, spacing_m=0.07):
+    """One laser's pulses side by side, with their depths [m], inf for none; what lies within .6 m is a hit."""
+    pulses = np.zeros((len(depths), COLUMNS))
+    pulses[:, A] = spacing_m * (np.arange(len(depths)) - 0.5 * len(depths))
+    pulses[:, DEPTH] = depths
+    pulses[:, LASER] = laser
+    pulses[:, KIND] = np.where(np.abs(depths) < 0.6, HIT, MISS)
+    return pulses
+
+
+def hits(pulses):
+    leave_out_walls(pulses, SPAN_M)
+    return np.nonzero(pulses[:, KIND] == HIT)[0].tolist()
+
+
+def test_a_drone_before_the_sky_or_before_a_wall_keeps_its_returns():
+    for behind_m in (math.inf, 3.0, 0.5):
+        assert hits(look([behind_m] * 14 + [0.0, 0.05, -0.05, 0.1, 0.0] + [behind_m] * 14)) == [14, 15, 16, 17, 18]
+
+
+def test_a_wall_at_the_drones_range_has_no_hit_and_no_miss():
+    pulses = look([0.0] * 20)
+    assert hits(pulses) == []
+    assert (pulses[:, KIND] == NEARER).all()
+    assert hits(look(np.linspace(-3.0, 3.0, 25))) == []  # also one that runs away from us
+
+
+def test_what_touches_the_wall_cannot_be_told_from_it():
+    assert hits(look([0.2] * 9 + [0.0] * 5 + [0.2] * 9)) == []
+
+
+@pytest.mark.parametrize("hole", [2, 9])
+def test_a_hole_in_a_wall_is_none_unless_it_is_wide(hole):
+    """Returns that are missing for a moment do not end it."""
+    depths = [0.0] * 8 + [math.inf] * hole + [0.0] * 8
+    assert (hits(look(depths)) == []) == (hole == 2)
+
+
+def test_each_laser_has_runs_of_its_own_and_the_order_of_pulses_is_that_of_time():
+    wall, drone = look([0.0] * 20, laser=3), look([math.inf] * 8 + [0.0] * 4 + [math.inf] * 8, laser=5)
+    both = np.stack([wall, drone], axis=1).reshape(-1, COLUMNS)  # fired in turn
+    leave_out_walls(both, SPAN_M)
+    assert set(both[both[:, KIND] == HIT][:, LASER]) == {5.0}
+    assert (both[:, KIND] == HIT).sum() == 4
+
+
+def test_nothing_in_nothing_out():
+    leave_out_walls(np.empty((0, COLUMNS)), SPAN_M)

@@ -59,7 +59,9 @@ class DroneTelemetry:
         self.add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
 
     def add_odometry(self, odometry: DroneOdometry) -> None:
-        """ODOMETRY: its velocity is in the drone's axes, and it counts its own jumps."""
+        """ODOMETRY: its velocity is in the drone's axes, and it counts its own jumps; one called failed is not used."""
+        if odometry.quality_percent == 0:
+            return
         velocity_mps = odometry.R_local_drone @ odometry.velocity_drone_mps
         self.add(odometry.stamp_ns, odometry.xyz_local_m, velocity_mps, odometry.reset_counter)
 

@@ -35,7 +35,7 @@ class Recorder(Tap):
 
     file: str = Field("flight.mcap", pattern=r"^[\w.-]+\.mcap$")
     split_s: float = Field(900.0, ge=1)  # a part is this long at most
-    split_mb: float = Field(2000.0, ge=1)  # and this big
+    split_mb: float = Field(2000.0, ge=1)  # and holds so much, before compression
     reserve_mb: float = Field(200.0, ge=0)  # is left free on the disk, for the results
 
     _lock: threading.Lock = PrivateAttr(default_factory=threading.Lock)
@@ -100,16 +100,22 @@ class Recorder(Tap):
 
     def _look_after(self) -> None:
         while not self._closing.wait(LOOK_S):
-            writer, now_s = self._writer, time.monotonic()
-            if writer is None:
-                if now_s >= self._stopped_s + AGAIN_S and self._free_bytes() > 2 * self.reserve_mb * MB:
-                    self._begin_part()
-            elif writer.trouble is not None:
-                self._give_up(writer.trouble)
-            elif self._free_bytes() < self.reserve_mb * MB:
-                self._give_up(f"less than {self.reserve_mb:g} MB are free at {writer.path.parent}: make room")
-            elif now_s - self._part_s >= self.split_s or self._part_bytes >= self.split_mb * MB:
+            try:
+                self._look()
+            except LinkError as error:
+                self._give_up(str(error))
+
+    def _look(self) -> None:
+        writer, now_s = self._writer, time.monotonic()
+        if writer is None:
+            if now_s >= self._stopped_s + AGAIN_S and self._free_bytes() > 2 * self.reserve_mb * MB:
                 self._begin_part()
+        elif writer.trouble is not None:
+            self._give_up(writer.trouble)
+        elif self._free_bytes() < self.reserve_mb * MB:
+            self._give_up(f"less than {self.reserve_mb:g} MB are free at {writer.path.parent}: make room")
+        elif now_s - self._part_s >= self.split_s or self._part_bytes >= self.split_mb * MB:
+            self._begin_part()
 
     def _begin_part(self) -> None:
         """A new file takes the records from here on; the one before is ended."""
@@ -169,5 +175,9 @@ class Recorder(Tap):
         return self._before[0] + now[0], self._before[1] + now[1]
 
     def _free_bytes(self) -> int:
+        """LinkError when the disk does not say: it is gone, or the folder is."""
         assert self._run is not None
-        return shutil.disk_usage(self._run.out_dir).free
+        try:
+            return shutil.disk_usage(self._run.out_dir).free
+        except OSError as error:
+            raise LinkError(f"{self._run.out_dir}: {error.strerror or error}: is the disk still there?") from None

@@ -78,6 +78,7 @@ class RecordingWriter:
         self._lock = threading.Condition()
         self._queue: deque[Record] = deque()
         self._waiting_bytes = 0  # queued, or in the writer thread's hands
+        self._in_hand = 0  # records the writer thread has taken and not yet written
         self._sequence = 0
         self._written = 0
         self._dropped = 0
@@ -96,6 +97,9 @@ class RecordingWriter:
         except OSError as error:
             with suppress(OSError):  # what is buffered cannot be written either
                 self._stream.close()
+            if not overwrite and self.path.is_file():  # nothing is in it, and it would be in the way of the next try
+                with suppress(OSError):
+                    self.path.unlink()
             raise LinkError(self._disk_trouble(error)) from None
         self._threads = [threading.Thread(target=self._write_all, name="recording", daemon=True)]
         if not lossless:
@@ -187,6 +191,7 @@ class RecordingWriter:
             self._stopped.set()
             if trouble:
                 self._fail(trouble)
+                self._dropped += self._in_hand
 
     def _drain(self) -> None:
         flush_at = time.monotonic() + FLUSH_S
@@ -195,11 +200,13 @@ class RecordingWriter:
                 if not self._queue and not self._closing:
                     self._lock.wait(_POLL_S)
                 batch, self._queue = self._queue, deque()
+                self._in_hand = len(batch)
                 closing = self._closing
             for record in batch:
                 self._file.add(record)
             with self._lock:
                 self._written += len(batch)
+                self._in_hand = 0
                 self._waiting_bytes -= sum(_RECORD_BYTES + len(record.data) for record in batch)
                 self._lock.notify_all()
             if closing and not batch:

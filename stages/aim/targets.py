@@ -17,6 +17,7 @@ from stages.messages import Candidates, TrackingState, TrackState
 TRACK_OWN_M = 1.0  # the detector tells of what is tracked, too
 MOST_DONE = 256
 FORGOTTEN_NS = 1_200_000_000  # a candidate nobody spoke of for so long
+GONE_NS = 8_000_000_000  # and a track: its tracker was started afresh, or sees nothing
 
 Key = tuple[str, int]
 
@@ -94,6 +95,9 @@ class Targets:
     def hear_state(self, state: TrackState) -> None:
         """Where a track is predicted; one that is lost is no target."""
         key = ("track", state.track_id)
+        if state.state is TrackingState.SEARCHING and state.track_id == 0:  # it follows nothing
+            for one in [one for one, target in self.known.items() if target.sure]:
+                del self.known[one]
         if state.state is TrackingState.LOST or state.state is TrackingState.SEARCHING:
             self.known.pop(key, None)
         if state.state not in (TrackingState.TRACKING, TrackingState.COASTING) or state.xyz_vehicle_m is None:
@@ -125,9 +129,11 @@ class Targets:
         return [t for t in maybe if not any(float(np.linalg.norm(t.at(now_ns) - x)) < TRACK_OWN_M for x in tracks)]
 
     def tidy(self, now_ns: int, most_looks: int, rest_s: float) -> None:
-        """Leave alone the candidates that had their looks; forget those nobody speaks of."""
+        """Leave alone the candidates that had their looks; forget what nobody speaks of."""
         for key, target in tuple(self.known.items()):
             if target.sure:
+                if now_ns - target.stamp_ns > GONE_NS:
+                    del self.known[key]
                 continue
             if target.looks >= most_looks:
                 self.leave(target, now_ns, rest_s)

@@ -195,11 +195,11 @@ class Estimator:
         if heading.switched(switches):
             self.unresolved()
         self._witness.hear_streets(stamp_ns, R)
-        own = self.north.yaw
+        own = self.north.useful(stamp_ns)
         if own is not None and yaw_rad is not None and apart_rad(own.yaw_rad, yaw_rad) > BRANCH_RAD:
             self._off_branch += 1
             if self._off_branch >= BRANCHES:
-                heading.contradict("the streets tell another heading than the one known so far")
+                heading.contradict("the streets tell another heading than the one known so far", stamp_ns)
             return
         self._off_branch = 0
         fits = not self.chain.running or self.chain.fits(stamp_ns, R, covariance_rad2)

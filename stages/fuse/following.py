@@ -1,14 +1,20 @@
 """Which track is fused: one drone's, the lowest number that is TRACKING, kept until it is lost.
 
+A tracker that was started afresh tells nobody what became of its tracks, and counts from 1 again: one that it says
+nothing of, while it speaks, is gone.
+
 Source: ours.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from stages.messages import TrackingState, TrackState
 
 HOLDS = (TrackingState.TRACKING, TrackingState.COASTING)
-SILENT_NS = 2_000_000_000  # without TrackStates a track that gave no fix for so long makes room for another
+SILENT_NS = 2_000_000_000  # a track of which nothing is said for so long is gone
+STEP_NS = 200_000_000  # of a pause of the tracker's so much counts: nothing is said of any track then
 
 
 class Following:
@@ -17,23 +23,34 @@ class Following:
     def __init__(self, wanted: int | None) -> None:
         """`wanted`: follow this track and no other."""
         self._wanted = wanted
-        self._states: dict[int, TrackingState] = {}
+        self._states: dict[int, tuple[TrackingState, int]] = {}  # and when, as the tracker's words count time
+        self._spoken_ns, self._newest_ns = 0, 0
         self._fix_ns = 0
         self.number = 0
         self.reason = "no drone is tracked"
 
     def hear(self, state: TrackState) -> None:
         """What the tracker says of a track."""
+        if state.track_id == 0 and state.state is TrackingState.SEARCHING:
+            self._forget(self._states, state.reason)
         if state.track_id == 0 or state.state is TrackingState.CANDIDATE:
             return
+        self._spoken_ns += min(max(state.stamp_ns - self._newest_ns, 0), STEP_NS)
+        self._newest_ns = max(state.stamp_ns, self._newest_ns)
+        old = [number for number, (_, at_ns) in self._states.items() if self._spoken_ns - at_ns > SILENT_NS]
+        self._forget(old, "the tracker says nothing of it")
         if state.state in HOLDS:
-            self._states[state.track_id] = state.state
+            self._states[state.track_id] = state.state, self._spoken_ns
             if state.track_id == self.number:
                 self.reason = state.reason
             return
-        self._states.pop(state.track_id, None)
-        if state.track_id == self.number:
-            self.number, self.reason = 0, f"the tracker lost it: {state.reason}"
+        self._forget([state.track_id], state.reason)
+
+    def _forget(self, numbers: Iterable[int], why: str) -> None:
+        for number in tuple(numbers):
+            self._states.pop(number, None)
+            if number == self.number:
+                self.number, self.reason = 0, f"the tracker lost it: {why}"
 
     def takes(self, track_id: int, stamp_ns: int) -> bool:
         """Whether a fix of a track is to be used; chooses a track where none is followed."""
@@ -42,7 +59,7 @@ class Following:
         if self.number not in self._states and stamp_ns - self._fix_ns > SILENT_NS:
             self.number = 0
         if self.number == 0:
-            tracked = [number for number, state in self._states.items() if state is TrackingState.TRACKING]
+            tracked = [number for number, (state, _) in self._states.items() if state is TrackingState.TRACKING]
             if tracked and self._wanted is None and track_id > min(tracked):
                 return False
             self.number = track_id

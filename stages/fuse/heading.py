@@ -67,9 +67,10 @@ class Heading:
         m = self._fresh_motion(stamp_ns)
         return m is not None and apart_rad(m.yaw_rad, yaw_rad) > CLEAR * math.hypot(m.sigma_rad, sigma_rad) + SLACK_RAD
 
-    def contradict(self, why: str) -> None:
-        """Found out elsewhere that they differ."""
+    def contradict(self, why: str, resolved_ns: int | None = None) -> None:
+        """Found out elsewhere that they differ; `resolved_ns`: by what the streets told then."""
         self.contradiction = why
+        self._resolved_ns = self._resolved_ns if resolved_ns is None else resolved_ns
 
     def pass_time(self, now_ns: int) -> None:
         """A contradiction is over when one side has been silent for long."""

@@ -59,9 +59,9 @@ class North:
         if not self.by_motion.add(point) or self.by_motion.witness is None:
             return True
         self.heading.hear_motion(self.by_motion.witness)
-        told = self.by_motion.yaw
-        if self.yaw is not None:
-            if not self.heading.denies(point.stamp_ns, self.yaw.yaw_rad, self.yaw.sigma_at(point.stamp_ns)):
+        told, own = self.by_motion.yaw, self.useful(point.stamp_ns)
+        if own is not None:
+            if not self.heading.denies(point.stamp_ns, own.yaw_rad, own.sigma_at(point.stamp_ns)):
                 return True
             self.yaw = None
             return False
@@ -78,11 +78,13 @@ class North:
         """Whether the drone's motion has told the yaw believed."""
         return self.yaw is not None and self.heading.agrees(stamp_ns, self.yaw.yaw_rad, self.yaw.sigma_at(stamp_ns))
 
+    def useful(self, stamp_ns: int) -> Yaw | None:
+        """The yaw, unless so much may have drifted since it was told that it says nothing any more."""
+        return self.yaw if self.yaw is not None and self.yaw.sigma_at(stamp_ns) <= self._sigma_rad else None
+
     def known(self, stamp_ns: int) -> Yaw | None:
         """The yaw, if it is of use and nobody objects."""
-        if self.yaw is None or self.heading.contradiction or self.yaw.sigma_at(stamp_ns) > self._sigma_rad:
-            return None
-        return self.yaw
+        return None if self.heading.contradiction else self.useful(stamp_ns)
 
     def remember(self, stamp_ns: int, R_start_own: Array64, variance_rad2: float) -> None:
         """What the pose tells of it, unless it is known better."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -130,6 +131,31 @@ def test_a_disk_that_gets_full_ends_the_recording_properly_and_room_again_begins
     assert recorder.counters == {"written": 2, "dropped": 0, "missed": 1, "parts": 2}
     with RecordingReader(tmp_path / "flight.mcap") as reader:
         assert reader.finished
+
+
+def test_a_disk_that_is_gone_is_said_and_the_recording_goes_on_when_it_is_back(tmp_path, monkeypatch):
+    monkeypatch.setattr("links.recording.recorder.AGAIN_S", 0.0)
+    recorder = opened(tmp_path)
+
+    def gone(folder):
+        raise OSError(errno.ESTALE, "Stale file handle")
+
+    with monkeypatch.context() as away:
+        away.setattr("shutil.disk_usage", gone)
+        wait_until(lambda: recorder.trouble is not None)
+        assert "Stale file handle: is the disk still there?; nothing is recorded now, the run goes on" in recorder.trouble
+    wait_until(lambda: recorder.trouble is None)
+    recorder.record(record(1))
+    recorder.close()
+    assert recorder.counters["parts"] == 2
+
+
+def wait_until(done):
+    for _ in range(500):
+        if done():
+            return
+        threading.Event().wait(0.02)
+    pytest.fail("nothing happened in ten seconds")
 
 
 def test_a_live_run_flies_on_when_the_disk_takes_no_more_and_says_so(tmp_path):

@@ -283,6 +283,20 @@ def failing_disk(monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
     use_disk(monkeypatch, path, fill)
 
 
+def test_a_recording_that_could_not_be_begun_is_not_in_the_way_of_the_next_try(tmp_path, monkeypatch):
+    path = tmp_path / "a.mcap"
+
+    def fail() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as full:
+        use_disk(full, path, fail)
+        with pytest.raises(LinkError, match="No space left"):
+            RecordingWriter(path)
+    assert not path.exists()
+    RecordingWriter(path).close()
+
+
 def test_a_disk_that_fills_up_is_told_at_close_and_what_is_on_it_can_be_read(tmp_path, monkeypatch):
     path = tmp_path / "a.mcap"
     failing_disk(monkeypatch, path)
@@ -292,6 +306,7 @@ def test_a_disk_that_fills_up_is_told_at_close_and_what_is_on_it_can_be_read(tmp
     with pytest.raises(LinkError, match=r"No space left on device after .* free space; `grd recover"):
         writer.close()
     assert writer.trouble
+    assert writer.written + writer.dropped == 5000
     report = recover(path)
     assert report.records < 5000
     assert "messages readable" in report.warnings[0]

@@ -312,6 +312,22 @@ def test_after_a_loss_it_sweeps_again():
     assert np.degrees(np.ptp(flight.servo_rad[250:])) > 150.0
 
 
+@pytest.mark.parametrize("says", [True, False])
+def test_a_track_that_its_tracker_has_forgotten_is_not_looked_at_for_ever(says):
+    """A tracker that was started afresh says of no track that it is lost: it searches, or says nothing."""
+    way = towards(80.0, 45.0)
+
+    def tell(aim, t_s):
+        if t_s < 1.0:
+            tracking(way)(aim, t_s)
+        elif says and round(t_s * 1000) == 1000:
+            state = track_state(way, t_s, TrackingState.SEARCHING, track_id=0)
+            aim.on_state(replace(state, xyz_vehicle_m=None, velocity_vehicle_mps=None, covariance_m2=None))
+
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 4.0 if says else 12.5, tell)
+    assert np.degrees(np.ptp(flight.servo_rad[250 if says else -650 :])) > 150.0
+
+
 # what was missed
 
 

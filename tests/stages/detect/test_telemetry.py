@@ -26,6 +26,7 @@ from stages.detect.telemetry import (
     weigh,
 )
 from stages.drone_telemetry import AHEAD_NS, JUMP_M, KEPT_NS, DroneTelemetry
+from stages.messages import DroneOdometry
 from stages.geometry import rotation_z
 from stages.smooth_motion import ANYWHERE_M
 from tests.stages.made import MS, START_NS
@@ -334,6 +335,25 @@ def test_its_speed_is_level_and_up_while_it_is_heard():
     told.add(START_NS, np.zeros(3), np.array([3.0, -4.0, -1.5]))
     assert told.speed_mps(START_NS + AHEAD_NS) == pytest.approx((5.0, -1.5))
     assert told.speed_mps(START_NS + AHEAD_NS + MS) is None
+
+
+def test_an_odometry_that_calls_itself_failed_is_not_heard():
+    told = DroneTelemetry()
+    for k, quality in enumerate((80, None, 0)):
+        told.add_odometry(
+            DroneOdometry(
+                stamp_ns=START_NS + k * 100 * MS,
+                xyz_local_m=np.full(3, 0.1 * k),
+                R_local_drone=np.eye(3),
+                velocity_drone_mps=np.ones(3),
+                angular_velocity_drone_radps=np.zeros(3),
+                pose_covariance=None,
+                velocity_covariance=None,
+                reset_counter=0,
+                quality_percent=quality,
+            )
+        )
+    assert told.heard_ns == (START_NS, START_NS + 100 * MS)
 
 
 def test_a_word_that_is_not_newer_is_ignored():

@@ -103,6 +103,17 @@ def test_streets_that_tell_another_quarter_than_the_drones_motion_are_not_believ
     assert poses[-1].state is AMBIGUOUS
 
 
+@pytest.mark.parametrize("quarter", [1, 2, 3])
+def test_streets_that_come_after_the_drones_motion_and_tell_another_quarter_end_full(quarter):
+    made = Made(until_s=14, quarters=((0.0, quarter),), gaps_s={"rotation": (0.0, 9.0)})
+    poses = made.run(Fuse())
+    before = [pose.state for pose in poses if ns(8) < pose.stamp_ns < ns(9)]
+    assert set(before) == {FULL}  # by motion alone
+    assert {pose.state for pose in poses if pose.stamp_ns > ns(10.5)} == {AMBIGUOUS}
+    assert "heading" in poses[-1].reason
+    assert wrong(made, poses) == 0
+
+
 @pytest.mark.parametrize("said", [True, False])
 def test_a_branch_that_changes_in_flight_ends_full(said):
     made = Made(until_s=9, quarters=((5.0, 1),), switches=said)

@@ -13,6 +13,7 @@ from stages.fuse.correlated import MOST, Worth, inflation
 from stages.fuse.drift import Drift
 from stages.fuse.following import Following
 from stages.fuse.heading import Heading
+from stages.fuse.motion_yaw import Point
 from stages.fuse.motions import Motions
 from stages.fuse.north import North
 from stages.fuse.positions import Positions
@@ -20,7 +21,7 @@ from stages.fuse.rejected import ENOUGH, Rejected
 from stages.fuse.settings import FuseErrors
 from stages.fuse.yaw import DRIFT_RAD_PER_S, Yaw
 from stages.geometry import rotation_z
-from stages.messages import DroneAttitude, DroneLocalPosition, TrackingState
+from stages.messages import DroneAttitude, DroneLocalPosition, TrackingState, TrackState
 from stages.rigid import good_covariance
 from tests.stages.fuse.made_drone_flight import S, fix, gauss_markov, ns, track
 
@@ -254,6 +255,32 @@ def test_a_remembered_yaw_is_worth_less_with_time():
     assert own.sigma_at(60 * S) > 60 * DRIFT_RAD_PER_S
 
 
+def flown(north, at_s, yaw):
+    """Twelve fixes beside a drone's own positions, six metres along: whether motion denies what was believed."""
+    way = np.outer(np.arange(12) * 0.5, [1.0, 0.3, 0.0])
+    points = [
+        Point(round((at_s + 0.5 * k) * S), rotation_z(yaw) @ own, 0.05**2, own, 0) for k, own in enumerate(way * 2.0)
+    ]
+    return [north.watch(point) for point in points]
+
+
+@pytest.mark.parametrize("age_s", [20.0, 600.0])
+def test_a_yaw_too_old_to_be_of_use_gives_way_to_what_motion_tells(age_s):
+    """After minutes without the drone nobody would deny it, and nobody could use it."""
+    north = North(ERRORS, math.radians(8.0))
+    north.yaw = Yaw(0, 0.5, math.radians(3.0) ** 2)
+    assert all(flown(north, age_s, 0.55))
+    own = north.known(round((age_s + 6.0) * S))
+    assert own is not None
+    assert own.yaw_rad == pytest.approx(0.55 if age_s > 60 else 0.5, abs=0.01)
+
+
+def test_a_yaw_that_is_of_use_is_denied_by_motion():
+    north = North(ERRORS, math.radians(8.0))
+    north.yaw = Yaw(0, 0.5, math.radians(2.0) ** 2)
+    assert False in flown(north, 5.0, 0.5 + QUARTER)
+
+
 def attitude(t_s, yaw=0.0):
     return DroneAttitude(
         stamp_ns=round(t_s * S), R_local_drone=rotation_z(yaw), angular_velocity_drone_radps=np.zeros(3)
@@ -293,6 +320,37 @@ def test_a_candidate_is_no_track():
     following.hear(track(0.0, TrackingState.TRACKING, 2))
     assert following.takes(2, 0)
     assert following.number == 2
+
+
+def searching(at_s):
+    return TrackState(
+        stamp_ns=ns(at_s), state=TrackingState.SEARCHING, reason="afresh", hits=0, frame_s=0.5, track_id=0
+    )
+
+
+def test_a_tracker_that_starts_afresh_and_says_that_it_searches_follows_nothing_any_more():
+    following = Following(None)
+    following.hear(track(0.0, TrackingState.TRACKING, 3))
+    assert following.takes(3, ns(0.0))
+    following.hear(searching(0.1))
+    assert (following.number, following.reason) == (0, "the tracker lost it: afresh")
+    following.hear(track(0.3, TrackingState.TRACKING, 1))
+    assert following.takes(1, ns(0.3))
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 5.0])
+def test_a_track_of_which_nothing_is_said_while_the_tracker_speaks_is_gone(pause_s):
+    """A pause of the tracker's, as when the LiDAR is cut, says nothing of any track."""
+    following = Following(None)
+    for number in (3, 4):
+        following.hear(track(0.0, TrackingState.TRACKING, number))
+    assert following.takes(3, ns(0.0))
+    following.hear(track(pause_s + 0.1, TrackingState.TRACKING, 4))
+    assert following.number == 3
+    for k in range(1, 25):
+        following.hear(track(pause_s + 0.1 * k, TrackingState.TRACKING, 4))
+    assert following.number == 0
+    assert following.takes(4, ns(pause_s + 2.5))
 
 
 def test_a_drone_that_tells_its_velocity_cannot_have_turned_unheard():

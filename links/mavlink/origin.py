@@ -1,8 +1,8 @@
 """Where on earth the local frame begins: given to an autopilot that has no such origin, never put over one it has.
 
 An EKF without GPS wants an origin before it fuses a position. It is asked for its own first (GPS_GLOBAL_ORIGIN); only
-when it answers that request and still shows none, three times, is ours sent. An autopilot that cannot be asked gets
-none: nobody knows what it has.
+when it answers that request and still shows none, three times, is ours sent; a second answer to one request is
+somebody else's. An autopilot that cannot be asked gets none: nobody knows what it has.
 
 Source: https://mavlink.io/en/messages/common.html#SET_GPS_GLOBAL_ORIGIN; ArduPilot NavEKF3_core::setOrigin (refuses a
 second one; older versions did not).
@@ -40,6 +40,7 @@ class OriginGiver:
         self._origin, self._target = origin, target
         self._asked_ns: int | None = None
         self._answers = 0
+        self._answered = False  # since it was asked last
 
     @property
     def done(self) -> bool:
@@ -63,7 +64,7 @@ class OriginGiver:
                     now_ns // 1000,
                 )
             ]
-        self._asked_ns = now_ns
+        self._asked_ns, self._answered = now_ns, False
         return [
             dialect().MAVLink_command_long_message(
                 *self._target, REQUEST_MESSAGE, 0, float(GPS_GLOBAL_ORIGIN), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -79,6 +80,7 @@ class OriginGiver:
             self.state = "it has one"
         elif kind == "COMMAND_ACK" and message.command == REQUEST_MESSAGE and self._asked_ns is not None:
             if message.result in HAS_NONE:
-                self._answers += 1
+                self._answers += not self._answered  # what else comes answers somebody else's request
+                self._answered = True
             else:
                 self.state = "it cannot be asked"

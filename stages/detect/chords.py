@@ -44,6 +44,9 @@ from stages.messages import SweptPulses
 X, Y, Z, RANGE, LENGTH, DEPTH, COUNT, GAPS, SHADE, FREE, LASER, LONG, BULGE, ROUGH = range(14)
 COLUMNS = 14
 
+FIRST, LAST, NEWEST = range(3)  # times a laser remembers: its open chord's first and last hit, its newest pulse
+GAP_NS = 150_000  # a laser fires each 55.3 us (VLP-16); after a longer pause packets are lost, and it looks elsewhere
+
 
 class Chords(NamedTuple):
     """Chords of a slice: (n, COLUMNS) and the times (n,) of their first and last hit."""
@@ -61,7 +64,7 @@ class ChordFinder:
         self._longest_m, self._jump_m, self._hole_m = longest_m, jump_m, hole_m
         self._open = np.zeros((lasers, MEMORY))
         self._open[:, BEFORE] = math.nan
-        self._times = np.zeros((lasers, 2), dtype=np.int64)
+        self._times = np.zeros((lasers, 3), dtype=np.int64)
 
     def feed(self, pulses: SweptPulses) -> Chords:
         """The chords that ended, or became too long, in this slice."""
@@ -174,6 +177,14 @@ def find_chords(
         r = float(range_m[i])
         seen = r > 0.0
         ended = False
+        if stamp_ns[i] - times[k, NEWEST] > GAP_NS:
+            if m[HITS] > 0.0:  # how it went on nobody knows
+                _tell(m, m[MISSED] >= 2.0, k, m[TOLD] > 0.0, rows[told])
+                row_ns[told, 0], row_ns[told, 1] = times[k, FIRST], times[k, LAST]
+                told += 1
+                m[HITS] = 0.0
+            m[BEFORE] = math.nan
+        times[k, NEWEST] = stamp_ns[i]
         if m[HITS] > 0.0:
             if seen and abs(r - m[LAST_RANGE]) <= jump_m:
                 m[HOLES] += m[MISSED]
@@ -191,17 +202,17 @@ def find_chords(
                 m[LAST_RANGE] = r
                 m[LEAST_RANGE] = min(m[LEAST_RANGE], r)
                 m[MOST_RANGE] = max(m[MOST_RANGE], r)
-                times[k, 1] = stamp_ns[i]
+                times[k, LAST] = stamp_ns[i]
                 if across2 > longest_m * longest_m:  # a wall: told piece by piece
                     _tell(m, False, k, True, rows[told])
-                    row_ns[told, 0], row_ns[told, 1] = times[k, 0], times[k, 1]
+                    row_ns[told, 0], row_ns[told, 1] = times[k, FIRST], times[k, LAST]
                     told += 1
                     m[TOLD] = 1.0
                     for axis in range(3):
                         m[SUM_X + axis] = point[axis]
                         m[FIRST_X + axis] = point[axis]
                     _begin(m, r, reflectivity[i])
-                    times[k, 0] = stamp_ns[i]
+                    times[k, FIRST] = stamp_ns[i]
             elif seen and r < m[LAST_RANGE]:  # something nearer hides how it goes on, unless it had ended before
                 _tell(m, m[MISSED] >= 2.0, k, m[TOLD] > 0.0, rows[told])
                 ended = True
@@ -216,7 +227,7 @@ def find_chords(
                     _tell(m, True, k, m[TOLD] > 0.0, rows[told])
                     ended = True
             if ended:
-                row_ns[told, 0], row_ns[told, 1] = times[k, 0], times[k, 1]
+                row_ns[told, 0], row_ns[told, 1] = times[k, FIRST], times[k, LAST]
                 told += 1
                 m[HITS] = 0.0
         if m[HITS] == 0.0 and seen:
@@ -228,6 +239,6 @@ def find_chords(
             _begin(m, r, reflectivity[i])
             m[MISSED], m[TOLD] = 0.0, 0.0
             m[FREE_BEFORE] = 1.0 if m[BEFORE] > r + jump_m else 0.0
-            times[k, 0] = times[k, 1] = stamp_ns[i]
+            times[k, FIRST] = times[k, LAST] = stamp_ns[i]
         m[BEFORE] = r if seen else math.inf
     return told

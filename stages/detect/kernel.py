@@ -103,4 +103,4 @@ class KernelDetect(Stage):
             near = f", none of them {self.nearest_m:g} m or more above the turntable" if image.points else ""
             return f"{image.points} of {image.returns} returns lie within {view_deg:.0f} deg of straight up{near}"
         limit = f" (the {len(judged)} lowest scores)" if len(judged) == self.max_minima else ""
-        return f"{len(judged)} of {len(judged)} candidates refused{limit}; the best: {judged[0].reason}"
+        return f"all {len(judged)} candidates refused{limit}; the best: {judged[0].reason}"

@@ -38,6 +38,7 @@ class Estimator:
     def __init__(self, back: BackEnd, errors: FuseErrors, limits: FuseLimits, parked: bool) -> None:
         self._tilt_rad2 = math.radians(errors.tilt_deg) ** 2
         self._yaw_sigma_rad = math.radians(limits.yaw_sigma_deg)
+        self._lost_ns = round(limits.lost_after_s * 1e9)
         self.motions = Motions(errors, parked)
         self.positions = Positions(errors, self.motions)
         self.chain = Chain(back, errors, self.positions)
@@ -112,6 +113,8 @@ class Estimator:
             self.doubt()
             self.north.yaw = None
         back = self.chain.back
+        if self.chain.running and now_ns - back.stamp_ns > self._lost_ns:
+            self.lose()  # nothing was heard of anything for so long: there is no way over it
         while self.chain.running and back.stamp_ns + PERIOD_NS <= now_ns:
             next_ns = back.stamp_ns + PERIOD_NS
             newest = self.motions.newest_ns(next_ns, now_ns)
@@ -130,11 +133,12 @@ class Estimator:
 
     def follow(self, track_id: int) -> None:
         """The next fixes are of this track; another one's position is not known."""
-        if track_id != self.track_id and self.positions.known:
-            self.lose()
+        if track_id != self.track_id:
             self._witness.restart()
             self.north.by_motion.restart()
-            self.resets += 1
+            if self.positions.known:
+                self.lose()
+                self.resets += 1
         self.track_id = track_id
 
     def see_fix(self, fix: DroneFix) -> None:

@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.message import Message
@@ -126,7 +127,9 @@ class Fuse(Stage):
 
     def on_drone_motion(self, motion: DroneMotion) -> Told:
         """The drone's odometry by its camera: turns, and directions without a scale."""
-        if self._intake.sound(motion, "drone motion", motion.R_from_to, motion.covariance_rad2):
+        direction, sigma_rad = motion.direction_from, np.array(motion.direction_sigma_rad or 0.0)
+        numbers = (motion.R_from_to, motion.covariance_rad2, sigma_rad, *(() if direction is None else (direction,)))
+        if self._intake.sound(motion, "drone motion", *numbers):
             self._estimator.hear_pictures(motion)
         yield from self._tell(motion)
 
@@ -137,7 +140,8 @@ class Fuse(Stage):
 
     def on_fix(self, fix: DroneFix) -> Told:
         """A LiDAR position."""
-        numbers = (fix.xyz_vehicle_m, fix.covariance_m2)
+        velocity = () if fix.velocity_vehicle_mps is None else (fix.velocity_vehicle_mps,)
+        numbers = (fix.xyz_vehicle_m, fix.covariance_m2, *velocity)
         if self._intake.sound(fix, "fix", *numbers) and self._intake.covariant(fix.covariance_m2, "fix"):
             self._waiting.append(fix)
         yield from self._tell(fix)
@@ -202,7 +206,7 @@ class Fuse(Stage):
         if state is PoseState.LOST or known is None:
             if known is not None:
                 e.lose()
-                self._jumps.lost()
+            self._jumps.lost()
             return lost(now_ns, self._verdict(PoseState.LOST, reason))
         self._jumps.see(known, e.resets)
         return pose(known, self._verdict(state, reason), e.motions)

@@ -156,6 +156,8 @@ def weigh(points: tuple[Point, ...], errors: FuseErrors) -> Weighed:
             return Weighed("what the LiDAR follows does not move as the drone says it does")
         off = int(np.argmax(np.abs(rise - np.median(rise)) / np.sqrt(variance[rows]))) if misfit < high else worst
         false.append(int(rows[off]))
+    if precision <= 0.0:  # all points that are left have one place
+        return Weighed("the drone's own positions tell no motion")
     length = float(np.linalg.norm(a))
     sigma = 1.0 / (math.sqrt(precision) * max(length, 1e-6))
     if abs(length - 1.0) > 3.3 * math.hypot(SCALE, 1.0 / math.sqrt(precision)):

@@ -4,7 +4,7 @@
     POSITION_ONLY   the LiDAR sees the drone, its yaw is not known
     AMBIGUOUS       as before; a rotation is told, up to quarter turns, or two tell different ones
     FULL            position and rotation
-    COASTING        was FULL; the drone's odometry carries the pose over a gap of the LiDAR's
+    COASTING        the same, but the LiDAR has not seen the drone for a while: its odometry carries the pose
 
 Source: ours.
 """

@@ -15,7 +15,7 @@ class PoseState(enum.Enum):
     POSITION_ONLY = 1  # the LiDAR sees the drone, its yaw relative to the vehicle is not known
     AMBIGUOUS = 2  # the rotation is known up to the street's quarter turns
     FULL = 3  # position and rotation
-    COASTING = 4  # was FULL; the LiDAR has not seen the drone for a while, its odometry carries the pose
+    COASTING = 4  # as FULL, but the LiDAR has not seen the drone for a while, its odometry carries the pose
 
 
 @message

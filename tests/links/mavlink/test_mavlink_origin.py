@@ -63,6 +63,14 @@ def test_an_answer_before_it_was_asked_is_anothers():
     assert [m.get_type() for m in giver.due(HOST0)] == ["COMMAND_LONG"]
 
 
+def test_answers_to_somebody_elses_requests_count_for_one_at_most():
+    giver = OriginGiver(PLACE, (1, 1))
+    assert len(giver.due(HOST0)) == 1
+    for _ in range(5):
+        giver.hear(ack(0))
+    assert [m.get_type() for m in giver.due(HOST0 + 1_100 * MS)] == ["COMMAND_LONG"]
+
+
 def test_without_an_origin_nothing_is_asked():
     assert run(OriginGiver(None, (1, 1)), 30, ack(0)) == []
 

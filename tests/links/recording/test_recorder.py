@@ -143,7 +143,9 @@ def test_a_disk_that_is_gone_is_said_and_the_recording_goes_on_when_it_is_back(t
     with monkeypatch.context() as away:
         away.setattr("shutil.disk_usage", gone)
         wait_until(lambda: recorder.trouble is not None)
-        assert "Stale file handle: is the disk still there?; nothing is recorded now, the run goes on" in recorder.trouble
+        assert (
+            "Stale file handle: is the disk still there?; nothing is recorded now, the run goes on" in recorder.trouble
+        )
     wait_until(lambda: recorder.trouble is None)
     recorder.record(record(1))
     recorder.close()

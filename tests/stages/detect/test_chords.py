@@ -76,6 +76,22 @@ def test_a_chord_is_told_as_soon_as_the_beam_is_a_holes_width_past_it():
     assert told == [0, 0, 0, 0, 0, 0, 0, 1, 0]
 
 
+@pytest.mark.parametrize("lost", [0, 24, 96])
+def test_where_packets_are_lost_a_chord_ends_and_nobody_knows_how(lost):
+    """Two things at one range, and a hole in what was heard between them."""
+    r = 20.0
+    before, after = pulses([0] * 10 + [r] * 4), pulses([r] * 4 + [0] * 20, first=14 + lost)
+    rows, *_ = feed(before, after)
+    assert rows[:, chord.COUNT].tolist() == ([8] if lost == 0 else [4, 4])
+    assert rows[:, chord.FREE].tolist() == ([2] if lost == 0 else [1, 1])
+    assert not rows[:, chord.LONG].any()
+
+
+def test_what_a_laser_saw_before_a_hole_does_not_make_a_wall_free():
+    wall = pulses([20.0] * 3 + [0] * 10, first=200)
+    assert feed(pulses([0] * 10), wall)[0][:, chord.FREE].tolist() == [1]
+
+
 def test_cutting_the_pulses_into_slices_changes_nothing():
     rng = np.random.default_rng(5)
     ranges = np.where(rng.random(400) < 0.6, 15.0 + rng.normal(0, 0.15, 400) + 3 * (rng.random(400) < 0.1), 0.0)

@@ -26,8 +26,8 @@ from stages.detect.telemetry import (
     weigh,
 )
 from stages.drone_telemetry import AHEAD_NS, JUMP_M, KEPT_NS, DroneTelemetry
-from stages.messages import DroneOdometry
 from stages.geometry import rotation_z
+from stages.messages import DroneOdometry
 from stages.smooth_motion import ANYWHERE_M
 from tests.stages.made import MS, START_NS
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.fuse import EkfFuse, Fuse
-from stages.messages import PoseState, TrackingState
+from stages.messages import PoseState, ServoState, TrackingState
 from tests.stages.fuse.made_drone_flight import START_NS, Made, S, fix, ns, rms, rotation, track
 
 FULL, COASTING, LOST = PoseState.FULL, PoseState.COASTING, PoseState.LOST
@@ -271,6 +271,31 @@ def test_one_track_is_followed_the_lowest_and_another_one_when_it_is_lost():
     assert told[-1].resets == resets + 1
 
 
+def test_what_moved_as_another_track_does_not_tell_how_the_new_one_is_turned():
+    made, stage = Made(until_s=16.0, rotations=False, gaps_s={"fix": (3.0, 99.0)}), Fuse()
+    assert made.run(stage)[-1].state is LOST
+    seen = stage._estimator.north.by_motion
+    assert "moved" in seen.reason
+    list(stage.on_track(track(16.0, TrackingState.LOST, 1)))
+    list(stage.on_fix(fix(15.9, made.truth(15.9)[1], track_id=2)))
+    list(stage.on_servo(servo(16.5)))
+    assert stage._estimator.track_id == 2
+    assert seen.reason == "its motion is being watched"
+
+
+def test_an_hour_in_which_nothing_was_heard_is_not_gone_through_step_by_step(monkeypatch):
+    made, stage = Made(until_s=6), Fuse(parked=True)
+    assert made.run(stage)[-1].state is FULL
+    monkeypatch.setattr(stage._estimator.chain, "extend", lambda *_: pytest.fail("step by step"))
+    for t in (3600.0, 3600.1, 3600.2, 3600.3, 3600.4, 3600.5):  # the sixth far ahead is believed
+        told = list(stage.on_servo(servo(t)))
+    assert told[-1].state is LOST
+
+
+def servo(t):
+    return ServoState(stamp_ns=ns(t), position_rad=0.0, velocity_radps=0.0, goal_rad=0.0, error=0)
+
+
 def test_the_wanted_track_is_the_only_one_followed():
     stage = Fuse(track_id=4)
     assert list(stage.on_fix(fix(0.0, [1, 2, 10], track_id=1)))[-1].state is LOST
@@ -286,6 +311,7 @@ def test_the_wanted_track_is_the_only_one_followed():
         (fix(0.5, [math.nan, 0, 10]), "fix: not finite"),
         (fix(0.5, [0, 0, 10], sigma=0.0), "fix: its covariance is not positive definite"),
         (fix(0.5, [0, 0, 10], sigma=math.nan), "fix: not finite"),
+        (fix(0.5, [0, 0, 10], velocity=np.array([0, math.inf, 0])), "fix: not finite"),
         (fix(3000.0, [0, 0, 10]), "fix: from the future"),
         (fix(-30.0, [0, 0, 10]), "fix: older than the lag"),
     ],

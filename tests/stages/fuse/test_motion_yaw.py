@@ -49,6 +49,14 @@ def straight(n=16, length=8.0):
     return np.outer(np.linspace(0, length, n), [0.6, 0.8, 0.0])
 
 
+@pytest.mark.parametrize("place", [0.0, 1 / 3, 1e3])
+def test_points_of_one_place_that_are_left_when_the_false_ones_are_out_tell_nothing(place):
+    way = np.full((14, 3), place)
+    way[[4, 9], :2] += [[1.5, 0.0], [0.0, 1.5]]
+    told = weigh(points(way, drift_mps=0.0, false=(4, 9)), ERRORS)
+    assert told.yaw is None
+
+
 def test_the_fit_is_that_of_complex_numbers():
     """z = c + a p without errors: a is found, with the precision sum of |p - mean|^2 / variance."""
     p = np.array([[0.0, 0], [1, 0], [1, 2], [3, 1]])

@@ -44,6 +44,12 @@ def basis(ux: float, uy: float, uz: float) -> tuple[float, float, float, float, 
     return ax, ay, -uz * ay, uz * ax, ux * ay - uy * ax
 
 
+def across(line: Array64) -> Array64:
+    """(2, 3): the axes a and b across a unit line of sight, in the frame in which its a is to be level."""
+    ax, ay, bx, by, bz = basis(line[0], line[1], line[2])
+    return np.array([[ax, ay, 0.0], [bx, by, bz]])
+
+
 @compiled
 def collect(
     stamp_ns: NDArray[np.int64],
@@ -57,14 +63,15 @@ def collect(
     reach_m: float,
     depth_m: float,
     line: Array64,
+    axes: Array64,
     found: Array64,
 ) -> int:
     """Fill found (n, COLUMNS) with the pulses that pass the moving centre within reach_m; returns how many.
 
-    Each is measured against where the centre is at its own time (de-skew), in the plane across `line`, the unit line of
-    sight of the look. A return nearer than depth_m before it hides what is behind and says nothing.
+    Each is measured against where the centre is at its own time (de-skew), along the `axes` (2, 3) across `line`, the
+    unit line of sight of the look. A return nearer than depth_m before it hides what is behind and says nothing.
     """
-    ax, ay, bx, by, bz = basis(line[0], line[1], line[2])
+    ax, ay, az, bx, by, bz = axes[0, 0], axes[0, 1], axes[0, 2], axes[1, 0], axes[1, 1], axes[1, 2]
     x, y, z = centre_m[0] - origin_m[0], centre_m[1] - origin_m[1], centre_m[2] - origin_m[2]
     n = 0
     least = math.cos(min(1.2 * reach_m / math.sqrt(x * x + y * y + z * z) + 0.01, 1.5))
@@ -76,7 +83,7 @@ def collect(
         dt = (stamp_ns[i] - centre_ns) * 1e-9
         cx, cy, cz = x + dt * velocity_mps[0], y + dt * velocity_mps[1], z + dt * velocity_mps[2]
         R = cx * line[0] + cy * line[1] + cz * line[2]
-        a = R / along * (dx * ax + dy * ay) - (cx * ax + cy * ay)
+        a = R / along * (dx * ax + dy * ay + dz * az) - (cx * ax + cy * ay + cz * az)
         b = R / along * (dx * bx + dy * by + dz * bz) - (cx * bx + cy * by + cz * bz)
         if a * a + b * b > reach_m * reach_m:
             continue

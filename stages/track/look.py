@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stages.compiled import compiled
 from stages.geometry import Array64
 from stages.messages import SweptPulses
-from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, WHEN_S, WIDTH, A, B, basis, collect, posterior
+from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, WHEN_S, WIDTH, A, B, across, collect, posterior
 from stages.track.kalman import condition, measured
 from stages.track.runs import LONGEST, leave_out_walls
 
@@ -102,7 +102,7 @@ def collect_into(
     start_ns = pulses.stamp_ns if look is None else look.start_ns
     sigma_m = largest_sigma_m(P)
     reach_m = min(0.6 * span_m + 3.0 * sigma_m, FURTHEST_M)
-    line = away / range_m if look is None else R.T @ look.line
+    line = R @ away / range_m if look is None else look.line
     found = np.empty((pulses.range_m.size, COLUMNS))
     count = collect(
         pulses.point_stamp_ns,
@@ -115,13 +115,14 @@ def collect_into(
         start_ns,
         reach_m + LONGEST * span_m,
         0.5 + 3.0 * sigma_m,
-        line,
+        R.T @ line,
+        across(line) @ R,  # level in the local frame, as `evaluate` takes them
         found,
     )
     if count == 0:
         return look
     if look is None:
-        look = Look(start_ns, start_ns, x, P, R @ line, reach_m)
+        look = Look(start_ns, start_ns, x, P, line, reach_m)
     look.parts.append(found[:count])
     look.last_ns = int(pulses.point_stamp_ns[-1])
     return look
@@ -138,8 +139,7 @@ def evaluate(
     leave_out_walls(pulses, span_m)
     pulses = pulses[np.hypot(pulses[:, A], pulses[:, B]) <= look.reach_m]
     missed = pulses[pulses[:, KIND] != HIT]
-    ax, ay, bx, by, bz = basis(*look.line)
-    H = np.array([[ax, ay, 0.0], [bx, by, bz]])
+    H = across(look.line)
     prior = H @ look.P[:3, :3] @ H.T
     mean, after = np.zeros(2), np.zeros((2, 2))
     rows = drone_hits(pulses, span_m, sigma_m) if sigma_m < own_sigma_m else None

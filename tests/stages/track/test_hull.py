@@ -20,6 +20,7 @@ from stages.track.hull import (
     WHEN_S,
     A,
     B,
+    across,
     basis,
     collect,
     posterior,
@@ -179,6 +180,7 @@ def collected(places, ranges, stamps_ns=None, velocity=NO_MOTION, reach_m=1.0, d
         reach_m,
         depth_m,
         LINE,
+        across(LINE),
         found,
     )
     return found[:n]

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from flow.message import Message
 from flow.stage import Node
@@ -66,6 +66,7 @@ class Source(Link):
     """
 
     topic: str
+    silent_after_s: ClassVar[float | None] = None  # one that has spoken and then says nothing for so long is in trouble
 
     def decode(self, record: Record) -> Any:
         """Messages of one record: None, one message, or an iterable of messages."""

@@ -126,8 +126,9 @@ class Live:
             status_s += STATUS_S
             for edge in self._wiring.edges.values():
                 edge.tell(self._shared.now_ns())
+            silent = {source.node: source.silence() for source in self._wiring.sources}
             for name, link in self._wiring.links.items():
-                trouble = link.trouble
+                trouble = link.trouble or silent.get(name)
                 if trouble != self._troubles.get(name):
                     self._troubles[name] = trouble
                     self.incidents.report(name, trouble or "works again")

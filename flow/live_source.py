@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from time import perf_counter_ns
@@ -31,6 +32,7 @@ class SourceThread(Worker):
         self.report = LinkReport("opening")
         self.first_ns = self.last_ns = 0
         self._outputs = outputs
+        self._spoke = 0, 0.0  # records by the last look at its silence, and since when so many
         self._lock = threading.Lock()
         self._opened: AbstractContextManager[Iterator[Record]] | None = None
 
@@ -57,6 +59,15 @@ class SourceThread(Worker):
             opened, self._opened = self._opened, None
         if opened is not None:
             opened.__exit__(None, None, None)
+
+    def silence(self) -> str | None:
+        """That it has spoken and says nothing any more, for one that should; asked now and then by one thread."""
+        after_s, records, now_s = self.source.silent_after_s, self.report.records, time.monotonic()
+        if records != self._spoke[0]:
+            self._spoke = records, now_s
+        if after_s is None or not records or self.report.state != "open" or now_s < self._spoke[1] + after_s:
+            return None
+        return f"has said nothing for {after_s:g} s: is it powered, and its line plugged in?"
 
     def _listen(self) -> None:
         """From opening to the end of the records. LinkError, or RunError for what no link should raise."""

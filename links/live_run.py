@@ -71,10 +71,12 @@ def run_live(
         gc.freeze()  # what is there now stays: the collector has less to look through, and pauses are short
         live.start()
         started_s, usage = time.monotonic(), Usage()
-        while live.running and not stop.wait(LOOK_S) and (for_s is None or time.monotonic() < started_s + for_s):
-            _show(live, started_s, show, run)
-            usage.look()
-        report = live.stop()
+        try:
+            while live.running and not stop.wait(LOOK_S) and (for_s is None or time.monotonic() < started_s + for_s):
+                _show(live, started_s, show, run)
+                usage.look()
+        finally:
+            report = live.stop()
         _show(live, started_s, show, run)
         gc.unfreeze()
         warnings = [] if report.stopped_by is None else [f"'{report.stopped_by}' stopped the run"]
@@ -85,7 +87,10 @@ def _show(live: Live, started_s: float, show: Show, run: RunFolder) -> None:
     news = live.incidents.fetch()
     for text in news:
         run.note(text)
-    show(Look(time.monotonic() - started_s, live.report, news))
+    try:
+        show(Look(time.monotonic() - started_s, live.report, news))
+    except (OSError, SystemExit) as error:  # where it is shown is full or gone; rich ends on a broken pipe
+        live.incidents.report("run", f"cannot be shown on the terminal: {error or type(error).__name__}")
 
 
 @contextmanager

@@ -251,7 +251,7 @@ class Results(Tap):
     @property
     def trouble(self) -> str | None:
         """That the disk does not take the results of a live run."""
-        why = next((file.trouble for file in self._files.values() if file.trouble), None)
+        why = next((file.trouble for file in tuple(self._files.values()) if file.trouble), None)
         return None if why is None else f"{self._folder}: results are being lost ({why}): make room; the run goes on"
 
     def note(self, text: str) -> None:

@@ -22,6 +22,7 @@ from stages.vehicle_onward import LEAST_SPAN_NS, TRAIL_S, USUAL
 KEPT = 512
 STEP_NS = 50_000_000  # over which a velocity is taken
 TOGETHER_NS = 10_000_000  # poses that arrived so soon after one another are no speed
+STILL_NS = 700_000_000  # how the vehicle moves is known so long after its word: by pictures it comes 5 times a second
 FURTHEST_NS = round(1e9 * TRAIL_S)  # beyond the newest pose
 
 
@@ -38,6 +39,10 @@ class VehicleTrail:
     def known(self) -> bool:
         """Whether the vehicle told its motion at all."""
         return bool(self._poses)
+
+    def known_at(self, stamp_ns: int) -> bool:
+        """Whether its newest word is not so old that it may be anywhere by now."""
+        return bool(self._poses) and stamp_ns - self._poses[-1][0] < STILL_NS
 
     def add(self, motion: VehicleMotion) -> None:
         """One more pose; one that is not newer than the last is ignored."""

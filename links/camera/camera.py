@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -28,6 +29,8 @@ FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive
 
 class Camera(Source):
     """Frames of one camera, in grey. A frame that cannot be decoded is counted in `refused` and left out."""
+
+    silent_after_s: ClassVar[float | None] = 4.0  # `timeout_s` is 3 s, and it is tried again at once
 
     topic: str
     source: str | None = None  # live: /dev/video0 (better /dev/v4l/by-id/...), rtsp://..., http://..., a video file

@@ -59,6 +59,7 @@ class Servo(Source):
     """States of the turntable's servo, and goals to it. An unreadable state is counted in `refused` and left out."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"goal"})
+    silent_after_s: ClassVar[float | None] = 2.0  # a link of its own mends what it can, and says nothing meanwhile
 
     topic: str = "/servo/state"
     port: str = "/dev/ttyUSB0"  # better a name that stays: /dev/serial/by-id/...

@@ -71,6 +71,11 @@ class OriginGiver:
             )
         ]
 
+    def unsent(self) -> None:
+        """What was due could not be sent."""
+        if self.state == "given":
+            self.state = "asking"
+
     def hear(self, message: Any) -> None:
         """Take note of the autopilot's answers."""
         if self.done:

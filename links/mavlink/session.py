@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from flow.link import LinkError, Record
@@ -91,7 +91,7 @@ class Session:
             messages = self.speaker.speak(pose, now_ns)
             if any([self._send(message) for message in messages]):  # all are tried
                 self.speaker.went_out(pose, now_ns)
-            self._send_all(self.speaker.texts(now_ns))
+            self._say(now_ns)
 
     def sent(self) -> list[Record]:
         """What went out since the call before."""
@@ -175,12 +175,16 @@ class Session:
             self._send(dialect().MAVLink_timesync_message(0, self._now_ns()))
             if self._signer is not None:
                 self._signer.keep()
-        self._send_all(self.origin.due(now_ns))
-        self._send_all(self.speaker.texts(now_ns))
+        for message in self.origin.due(now_ns):
+            if not self._send(message):
+                self.origin.unsent()
+        self._say(now_ns)
 
-    def _send_all(self, messages: Iterable[Any]) -> None:
-        for message in messages:
-            self._send(message)
+    def _say(self, now_ns: int) -> None:
+        """The text that is due. The lock is held."""
+        for message in self.speaker.texts(now_ns):
+            if not self._send(message):
+                self.speaker.unsaid()
 
     def _send(self, message: Any) -> bool:
         """Pack, sign and send one message. The lock is held."""

@@ -54,6 +54,7 @@ class PoseSpeaker:
         self._state: PoseState | None = None
         self._texts: dict[Literal["output", "state"], tuple[int, str]] = {}  # severity and text, waiting
         self._text_ns: int | None = None
+        self._offered: tuple[Literal["output", "state"], int, str] | None = None  # by `texts`, last
 
     @property
     def sending(self) -> bool:
@@ -90,6 +91,13 @@ class PoseSpeaker:
             self._stop("no pose goes out")
         return self._due(now_ns)
 
+    def unsaid(self) -> None:
+        """The text of `texts` could not be sent: it waits again, unless a newer one of its kind does."""
+        if self._offered is not None:
+            kind, severity, text = self._offered
+            self._texts.setdefault(kind, (severity, text))
+            self._offered = self._text_ns = None
+
     def _stop(self, why: str) -> None:
         if self._sending:
             self._sending = False
@@ -115,6 +123,8 @@ class PoseSpeaker:
         if not self._texts or (self._text_ns is not None and 0 <= now_ns - self._text_ns < TEXT_NS):
             return []
         self._text_ns = now_ns
-        severity, text = self._texts.pop("output" if "output" in self._texts else "state")
+        kind: Literal["output", "state"] = "output" if "output" in self._texts else "state"
+        severity, text = self._texts.pop(kind)
+        self._offered = kind, severity, text
         data = f"grd: {text}".encode("ascii", "replace")[:TEXT_BYTES]
         return [dialect().MAVLink_statustext_message(severity, data)]

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from ipaddress import IPv4Address
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
@@ -31,6 +31,8 @@ CORRELATION_SLACK = 1e-4  # what rounding to six digits does to a covariance
 
 class VehicleOdometry(Source):
     """Where the vehicle has driven. A record that holds no pose is counted in `refused` and left out."""
+
+    silent_after_s: ClassVar[float | None] = 2.0
 
     topic: str = "/vehicle/odometry"
     port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: there is none, or it is in recordings only

@@ -3,6 +3,7 @@
     {"xyz_m": [x, y, z], "quaternion_xyzw": [x, y, z, w], "covariance": [36 numbers] or null, "age_s": 0.004}
 
 `age_s`: how long before it was sent the pose was true, to be told at the moment of sending; 0 when it does not say.
+One that is older than a second is left out and counted: stamped as new it would put the vehicle where it was.
 What it says else is as recorded.
 
 Source: ours; recording format in recordings/README.md (/vehicle/odometry).
@@ -11,7 +12,6 @@ Source: ours; recording format in recordings/README.md (/vehicle/odometry).
 from __future__ import annotations
 
 import json
-import math
 import socket
 import threading
 from collections import Counter
@@ -65,14 +65,18 @@ def _records(
         if sender is not None and host != sender:
             counters["from other senders"] += 1
             continue
-        yield Record(topic, arrival_ns, arrival_ns - round(1e9 * age_s(data)), data)
+        age = age_s(data)
+        if age is None:
+            counters["too old, or of no age"] += 1
+            continue
+        yield Record(topic, arrival_ns, arrival_ns - round(1e9 * age), data)
 
 
-def age_s(data: bytes) -> float:
-    """What a datagram says of its age; 0 when it says nothing that can be true (decoding looks at the rest)."""
+def age_s(data: bytes) -> float | None:
+    """What a datagram says of its age, 0 when it does not; None: it cannot be true, or it is too old to be of use."""
     try:
         fields: Any = json.loads(data)
         age = float(fields.get("age_s", 0.0))
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        return 0.0
-    return age if math.isfinite(age) and 0.0 <= age <= MOST_AGE_S else 0.0
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
+        return 0.0 if b"age_s" not in data else None  # decoding looks at the rest
+    return age if 0.0 <= age <= MOST_AGE_S else None

@@ -57,7 +57,9 @@ class ByMotion:
     def see_fix(self, fix: DroneFix) -> bool:
         """Where the LiDAR saw the drone; True: its motion fits no branch, and the match followed is forgotten."""
         reckoning, lock = self._reckoning, self._lock
-        if not reckoning.vehicle_known:
+        if not reckoning.vehicle_known(fix.stamp_ns):  # its way would be taken for the drone's
+            self._windows.restart()
+            self._heading_windows.restart()
             return False
         at = reckoning.vehicle.at(fix.stamp_ns)
         self._windows.add_fix(fix, *at, reckoning.autopilot)

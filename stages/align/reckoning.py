@@ -55,10 +55,9 @@ class Reckoning:
         self._stamp_ns: int | None = None
         self._silences = 0
 
-    @property
-    def vehicle_known(self) -> bool:
-        """Whether it is known where the vehicle is."""
-        return self._parked or self.vehicle.known
+    def vehicle_known(self, stamp_ns: int) -> bool:
+        """Whether it is told where the vehicle is: not long after its last word."""
+        return self._parked or self.vehicle.known_at(stamp_ns)
 
     def add_vehicle(self, motion: VehicleMotion) -> None:
         """The vehicle's pose since its start."""
@@ -92,7 +91,7 @@ class Reckoning:
             dt = abs(drone_ns - self._stamp_ns) * 1e-9
             turn = turn_between(self.autopilot, self.pictures, self._stamp_ns, drone_ns)
             self._R_start_drone = self._R_start_drone @ turn.R_from_to
-            variance = turn.variance_rad2 + self._vehicle_variance_rad2(dt)
+            variance = turn.variance_rad2 + self._vehicle_variance_rad2(vehicle_ns, dt)
         self._stamp_ns = drone_ns
         return Reckoned(
             drone_ns,
@@ -136,16 +135,16 @@ class Reckoning:
         At the drone's picture if the vehicle's turn is known, else at the vehicle's if the drone's is.
         """
         dt, one = abs(drone_ns - vehicle_ns) * 1e-9, np.eye(3)
-        if self.vehicle.known:
+        if self.vehicle.known_at(drone_ns):
             turn = self.vehicle.at(drone_ns)[0].T @ self.vehicle.at(vehicle_ns)[0]
             return turn, one, drone_ns, VEHICLE_DRIFT_RAD2_PER_S * dt
         own = turn_between(self.autopilot, self.pictures, drone_ns, vehicle_ns)
         if own.sure and not self._parked:
             return one, own.R_from_to, vehicle_ns, own.variance_rad2
-        return one, one, drone_ns, self._vehicle_variance_rad2(dt)
+        return one, one, drone_ns, self._vehicle_variance_rad2(drone_ns, dt)
 
-    def _vehicle_variance_rad2(self, seconds: float) -> float:
-        """Of the vehicle's yaw, gathered in a time."""
-        if self.vehicle.known:
+    def _vehicle_variance_rad2(self, stamp_ns: int, seconds: float) -> float:
+        """Of the vehicle's yaw, gathered in a time up to then."""
+        if self.vehicle.known_at(stamp_ns):
             return VEHICLE_DRIFT_RAD2_PER_S * seconds
         return 0.0 if self._parked else (VEHICLE_RAD_PER_S * seconds) ** 2

@@ -30,6 +30,8 @@ SOME_M = 36.0  # over range: up to so many tell nothing, a wire returns them, to
 SIGMA_M = 0.15  # of a sighting
 STANDING_M = 0.6  # what stands is met again within this
 ACCELERATION_MPS2 = 4.0
+DENIED = -3.0  # nats: it does not fly as the drone says
+OPEN_BESIDE = 0.5  # of `Candidate.beside`: less, and it flies in the open
 START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 
 
@@ -94,6 +96,7 @@ class Candidate:
     beside_m: list[Array64] = field(default_factory=lambda: list[Array64]())  # its path seen from the vehicle's place
     path_m: list[Array64] = field(default_factory=lambda: list[Array64]())
     heard: Heard | None = None  # its path against what the drone tells of its own; None: the drone is silent
+    flown: float = 0.0  # the most that ever said against a still thing or a wire [nats], while nothing stood beside it
 
     def as_drone(self, stamp_ns: int, usual_mps: Array64, spread_mps: float) -> tuple[Array64, Array64]:
         """Position and velocity (3,) at a time if it is a drone, which usually flies so, one sigma on each axis.
@@ -142,6 +145,16 @@ class Candidate:
         if len(self.path_ns) > HISTORY:
             del self.path_ns[0], self.path_m[0], self.beside_m[0]
         self._note_flight()
+
+    def hear(self, heard: Heard | None) -> None:
+        """What its path says by now; what flew in the open is not what stands where it comes to, unless denied."""
+        self.heard = heard
+        if heard is None:
+            return
+        if heard.over_still < DENIED:
+            self.flown = 0.0
+        elif self.beside < OPEN_BESIDE:
+            self.flown = max(self.flown, heard.over_wire)
 
     def _note_flight(self) -> None:
         """How it flies by now; and the time in which it flew as no bird does, or was still there after a pause."""

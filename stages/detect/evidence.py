@@ -134,7 +134,7 @@ class EvidenceDetect(Stage):
         axis = mean_direction(pulses.direction_vehicle)
         part = Slice(pulses, *now.trail.at(middle_ns(pulses)), axis / max(math.hypot(*axis.tolist()), 1e-9))
         changed = False
-        sightings = now.finder.feed(part, self.parked or now.trail.known)
+        sightings = now.finder.feed(part, self._motion_known(now_ns))
         self._look_for_misses(now, part, now_ns)
         if now_ns - now.tidied_ns > TIDIED_NS:
             now.tidied_ns = now_ns
@@ -142,6 +142,10 @@ class EvidenceDetect(Stage):
         for sighting in sightings:
             changed |= self._take(now, sighting)
         yield from self._report(now, now_ns, pulses.turntable_rad, changed)
+
+    def _motion_known(self, stamp_ns: int) -> bool:
+        """Whether it is told how the vehicle moves: what stands still in the world is known then."""
+        return self.parked or self._now.trail.known_at(stamp_ns)
 
     def _take(self, now: _Now, s: Sighting) -> bool:
         """Give a sighting to the candidate it fits, or make one of it. True when that is news."""
@@ -151,7 +155,7 @@ class EvidenceDetect(Stage):
         best = now.bank.fitting(s) or self._wake(now, s)
         if best is not None:
             return self._see(now, best, s) or both is not None
-        since_ns = s.stamp_ns - (AMONG_NS if self.parked or now.trail.known else AMONG_NS // 20)
+        since_ns = s.stamp_ns - (AMONG_NS if self._motion_known(s.stamp_ns) else AMONG_NS // 20)
         refused_m = now.refused_places.nearest_m(s.xyz_local_m, 0.0, AMONG_M, since_ns)
         among = math.isfinite(refused_m)
         if both is None and not among and not math.isfinite(s.big_m):  # in a tree something lies everywhere
@@ -186,7 +190,7 @@ class EvidenceDetect(Stage):
 
     def _join(self, now: _Now, s: Sighting) -> None:
         """What was met elsewhere and may have flown here, as the drone says, goes on here, too."""
-        if not (self.parked or now.trail.known) or not now.word.moves(s.stamp_ns):
+        if not self._motion_known(s.stamp_ns) or not now.word.moves(s.stamp_ns):
             return
         if met := now.word.met_again(now.bank, s):
             now.number += 1
@@ -208,8 +212,8 @@ class EvidenceDetect(Stage):
 
     def _weigh(self, now: _Now, c: Candidate) -> bool:
         """Judge it anew. True when that is news."""
-        motion_known = self.parked or now.trail.known
-        c.heard = now.word.of(c, motion_known)
+        motion_known = self._motion_known(c.seen_ns)
+        c.hear(now.word.of(c, motion_known))
         c.odds, c.why = judge(c, self.evidence, self.free_space, motion_known)
         accept = odds_of(self.accept_probability)
         c.accepted = c.odds >= accept or (c.accepted and c.odds >= accept - 3.0)
@@ -241,7 +245,7 @@ class EvidenceDetect(Stage):
         for c in now.bank:
             if now_ns - c.seen_ns >= self._kept_ns(c) and not c.told:
                 self._remember(now, c)
-        if self.parked or now.trail.known:
+        if self._motion_known(now_ns):
             now.standing.extend(c for c in now.bank if now_ns - c.seen_ns >= self._kept_ns(c) and c.stands)
         while now.standing and now_ns - now.standing[0].seen_ns > STANDING_NS:
             now.standing.popleft()
@@ -284,10 +288,10 @@ class EvidenceDetect(Stage):
             end_ns = now_ns
         else:
             return
-        for c in new:
-            c.announced = True
         refused = now.refused + now.finder.hidden
         yield detections_message(now.bank, now.trail, now.start_ns, end_ns, refused, self.max_candidates)
+        for c in new:
+            c.announced = True
         now.start_ns, now.end_ns = end_ns + 1, None
         now.refused.clear()
         now.finder.hidden.clear()

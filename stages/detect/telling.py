@@ -61,8 +61,12 @@ def candidates_message(
 def detections_message(
     bank: Iterable[Candidate], trail: VehicleTrail, start_ns: int, end_ns: int, refused: Counter[str], at_most: int
 ) -> Detections:
-    """The answer of a search from start_ns to end_ns: its candidates where each was last seen, accepted ones first."""
-    listed = sorted((c for c in bank if c.seen_ns >= start_ns), key=lambda c: (not c.accepted, -c.odds))[:at_most]
+    """The answer of a search from start_ns to end_ns: its candidates where each was last seen, accepted ones first.
+
+    One that is accepted and was not announced is told, too: its last sighting may have been judged a moment later.
+    """
+    seen_now = (c for c in bank if c.seen_ns >= start_ns or (c.accepted and not c.announced))
+    listed = sorted(seen_now, key=lambda c: (not c.accepted, -c.odds))[:at_most]
     seen = [trail.to_vehicle(c.seen_ns, c.xyz_m, c.velocity_mps) for c in listed]
     xyz_vehicle_m = np.array([xyz for xyz, _ in seen]).reshape(-1, 3)
     accepted = sum(c.accepted for c in listed)

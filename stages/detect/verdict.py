@@ -25,7 +25,7 @@ import math
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from stages.detect.candidate import Candidate
+from stages.detect.candidate import OPEN_BESIDE, Candidate
 from stages.detect.surroundings import SECTORS
 
 STANDING = "a lamp, wire or edge"
@@ -49,7 +49,9 @@ class Evidence(BaseModel):
 
     clutter: float = -6.0  # prior, assumed: of short things in the sky one in 400 hangs free
     free_sector: float = 0.6  # each of eight sectors that pulses flew through
-    beside: float = -3.0  # each look with something in a sector
+    beside: float = -3.0  # each look with something in a sector, recently
+    most_beside: float = 12.0
+    most_beside_flown: float = 4.0  # where it had flown in the open before, as the drone says: it came to a wall
     alone: float = 0.3  # each look with nothing, up to most_alone
     most_alone: float = 2.0
     near_alone: float = 3.0  # nearby up to so much more: there a wire that held it would return pulses, too
@@ -130,12 +132,14 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     """Drone over a lamp, wire, leaf or edge [nats], and what was noticed."""
     said: list[str] = []
     odds = e.clutter
+    flew = c.heard is not None and e.told * c.flown > 3.0
     if free_space:
         free = int(np.count_nonzero(c.free >= 1))
-        odds += e.free_sector * free + max(e.beside * c.beside, -12.0) + min(e.alone * c.alone, most_alone(c, e))
+        beside = max(e.beside * c.beside, -(e.most_beside_flown if flew else e.most_beside))
+        odds += e.free_sector * free + beside + min(e.alone * c.alone, most_alone(c, e))
         said.append(f"{free} of {SECTORS} sectors around it free")
-        if c.beside > 0.5:
-            said.append("something beside it")
+        if c.beside > OPEN_BESIDE:
+            said.append("something beside it" + (", to which it flew through the open" if flew else ""))
     few = min(max(c.few, -e.most_few), e.most_many)
     odds += few - e.long * min(c.long_looks, 4)
     if few < -1.0:
@@ -144,7 +148,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
         said.append("longer than a drone")
     if c.heard is not None:
         wire = c.range_m < (e.unseen_m if few < -1.0 else e.wire_m)  # farther off a wire returns little, then nothing
-        told = c.heard.over_wire if wire else c.heard.over_still
+        told = max(c.heard.over_wire if wire else c.heard.over_still, c.flown)
         moved = e.told * told > 3.0
         odds += believed(told, e)
     else:

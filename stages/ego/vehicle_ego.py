@@ -38,6 +38,7 @@ from stages.pictures.features import FeatureSettings, Tracks
 from stages.pictures.motion_link import Link, LinkSettings, MotionLinks, followed
 from stages.pictures.two_view import backwards
 from stages.rotation import exp_rotation, log_rotation
+from stages.trail import TOGETHER_NS
 from stages.vehicle_onward import UNTOLD
 
 TURN_RADPS = 0.3  # one sigma of the turn rate, unseen
@@ -164,7 +165,7 @@ class VehicleEgo(Stage):
         self._resting = False
         self._links = MotionLinks(self.lens, self.features, self.link)
         self._now = _Now(lengths=LEAST_LENGTHS, told=True)
-        if last.stamp_ns > first.stamp_ns:
+        if last.stamp_ns - first.stamp_ns >= TOGETHER_NS:  # words that were held up arrive together
             way_m = float(np.linalg.norm(last.xyz_start_m - first.xyz_start_m))
             self._now.speed_mps = way_m / ((last.stamp_ns - first.stamp_ns) * 1e-9)
         self._odometry.clear()

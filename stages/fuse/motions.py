@@ -18,12 +18,11 @@ from stages.fuse.settings import FuseErrors
 from stages.geometry import Array64
 from stages.messages import VehicleMotion
 from stages.rotation import log_rotation
-from stages.trail import VehicleTrail
+from stages.trail import STILL_NS, VehicleTrail
 from stages.vehicle_onward import HARD
 
 WAIT_NS = 350_000_000  # for an odometry that is late
 SOON_NS, VEHICLE_SOON_NS = 60_000_000, 200_000_000  # so far the drone's and the vehicle's are extrapolated instead
-STILL_NS = 700_000_000  # how the vehicle moves is known so long after its word: by pictures it comes 5 times a second
 OFF_M, OFF_RAD = 0.25, 0.1  # a pose so far off is false, or the start frame has jumped
 AGREE = 3
 

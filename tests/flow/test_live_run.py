@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import pytest
 
@@ -75,6 +76,25 @@ def test_a_link_that_dies_is_said_and_opened_again_and_nothing_else_stops(tmp_pa
     assert "line: records come again (3 times)" in texts
     assert report.links["line"].openings == 4
     assert report.links["other"].openings == 1
+
+
+def test_a_source_that_has_spoken_and_falls_silent_is_said_and_its_return_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(Line, "silent_after_s", 0.3)
+    live = run_live(graph_of(tmp_path, DOUBLING + f"  other: {{use: {ROOM}.OtherLine}}\n"))  # that one never speaks
+    line_of(live).put(1)
+    assert collector_of(live).take(1) == [2.0]
+    said = "line: has said nothing for 0.3 s: is it powered, and its line plugged in?"
+    wait_until(lambda: said in [str(incident) for incident in live.report().incidents])
+    line_of(live).put(2)
+    wait_until(lambda: "line: works again" in [str(incident) for incident in live.report().incidents])
+    assert not [text for text in map(str, live.stop().incidents) if text.startswith("other")]
+
+
+def wait_until(done):
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not done():
+        assert time.monotonic() < deadline_s, "it was not said in time"
+        time.sleep(0.05)
 
 
 def test_a_record_that_cannot_be_decoded_costs_itself_only(tmp_path):

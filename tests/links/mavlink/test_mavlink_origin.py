@@ -71,6 +71,18 @@ def test_answers_to_somebody_elses_requests_count_for_one_at_most():
     assert [m.get_type() for m in giver.due(HOST0 + 1_100 * MS)] == ["COMMAND_LONG"]
 
 
+def test_an_origin_that_the_line_did_not_take_is_given_later():
+    giver = OriginGiver(PLACE, (1, 1))
+    for i in range(3):
+        giver.due(HOST0 + 1_100 * i * MS)
+        giver.hear(ack(0))
+    (lost,) = giver.due(HOST0 + 4_000 * MS)
+    giver.unsent()
+    (given,) = giver.due(HOST0 + 4_100 * MS) or giver.due(HOST0 + 6_000 * MS)
+    assert given.get_type() == lost.get_type() == "SET_GPS_GLOBAL_ORIGIN"
+    assert giver.state == "given"
+
+
 def test_without_an_origin_nothing_is_asked():
     assert run(OriginGiver(None, (1, 1)), 30, ack(0)) == []
 

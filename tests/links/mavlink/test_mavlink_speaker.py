@@ -135,6 +135,25 @@ def test_flapping_says_no_more_than_two_texts_a_second_and_ends_with_the_truth()
     assert [text for _, text in line.texts if "FULL" in text or "LOST" in text][-1].startswith("grd: FULL")
 
 
+def test_a_text_that_the_line_did_not_take_waits_unless_a_newer_one_does():
+    line = Line()
+    line.pose()
+    line.wait(1000)  # said: sending, FULL, STOPPED, each in its turn
+    line.wait(1000)
+    line.pose()
+    line.wait(250)
+    speaker, now_ns = line.speaker, line.now_ns + 600 * MS
+    (first,) = speaker.texts(now_ns)
+    assert first.text == "grd: STOPPED: no pose goes out"
+    speaker.unsaid()
+    (again,) = speaker.texts(now_ns + MS)  # at once
+    assert again.text == first.text
+    speaker.unsaid()
+    line.now_ns = now_ns
+    line.pose()
+    assert line.texts[-1][1] == "grd: sending poses"
+
+
 def test_nothing_to_send_is_no_sending_and_no_stop():
     speaker = PoseSpeaker((), Limits())
     assert speaker.speak(good_pose(), HOST0) == []

@@ -61,19 +61,30 @@ def test_others_are_ignored_and_counted(port):
 @pytest.mark.parametrize(
     "data",
     [
-        b"",
-        b"[]",
-        b"7",
-        b"\xff",
         b'{"age_s": -1}',
+        b'{"age_s": 1.2}',
+        b'{"age_s": 1%s}' % (b"0" * 400),
         b'{"age_s": 2}',
         b'{"age_s": NaN}',
         b'{"age_s": "x"}',
         b'{"age_s": []}',
     ],
 )
-def test_an_age_that_cannot_be_true_is_none(data):
+def test_an_age_that_cannot_be_true_or_is_too_great_is_none(data):
+    assert age_s(data) is None
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b"7", b"\xff", b"{}"])
+def test_what_says_no_age_is_new_and_decoding_looks_at_the_rest(data):
     assert age_s(data) == 0.0
+
+
+def test_a_pose_that_says_it_is_old_is_left_out_and_counted(port):
+    odometry = VehicleOdometry(port=port)
+    with odometry.listen() as records:
+        send(port, POSE | {"age_s": 1.5}, POSE)
+        assert next(records).data == json.dumps(POSE).encode()
+    assert odometry.counters["too old, or of no age"] == 1
 
 
 def test_leaving_the_context_ends_a_waiting_listener(port):

@@ -136,6 +136,42 @@ def test_far_off_a_wire_returns_nothing_so_what_moved_as_the_drone_says_is_none(
         assert ("it may stand still" in over_clutter(little, E, False, True)[1]) == still
 
 
+def come_to_a_wall(*told_on_the_way):
+    """A drone that hangs beside a wall, after it flew as told, and what was told of it there, told as little."""
+    c = hanging()
+    for told in told_on_the_way:
+        c.hear(told)
+    c.beside = 10.0
+    c.hear(NOTHING)
+    return c
+
+
+def test_what_flew_through_the_open_as_the_drone_says_is_not_what_stands_where_it_comes_to():
+    open_flight, denied = Heard(20.0, 9.0, 9.0, 15.0), Heard(-20.0, 9.0, 9.0, -20.0)
+    alone, flew = come_to_a_wall(), come_to_a_wall(open_flight)
+    less, _ = over_clutter(alone, E, True, True)
+    odds, said = over_clutter(flew, E, True, True)
+    assert (alone.flown, flew.flown) == (0.0, 15.0)
+    assert less < -8.0
+    assert odds > less + 10.0
+    assert "something beside it, to which it flew through the open" in said
+    assert come_to_a_wall(open_flight, denied).flown == 0.0
+    assert over_clutter(come_to_a_wall(open_flight, denied), E, True, True)[0] == pytest.approx(less)
+
+
+def test_what_had_something_beside_it_all_along_has_not_flown_through_the_open():
+    c = hanging()
+    c.beside = 1.0
+    c.hear(Heard(20.0, 9.0, 9.0, 15.0))
+    assert c.flown == 0.0
+
+
+def test_a_drone_that_falls_silent_beside_a_wall_has_nothing_to_show():
+    c = come_to_a_wall(Heard(20.0, 9.0, 9.0, 15.0))
+    c.hear(None)
+    assert over_clutter(c, E, True, True)[0] < -8.0
+
+
 def test_the_words_say_whether_it_flies_as_the_drone_says():
     assert "the drone says" not in judge(hanging(), E, True, True)[1]
     assert "the drone says" not in judge(hanging(NOTHING), E, True, True)[1]

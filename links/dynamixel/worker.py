@@ -157,12 +157,15 @@ class Worker:
             raise
         self._goal = None
         self._counts["goals_sent"] += 1
-        position_ticks = self._drive.measure().position_ticks
-        travel_s = (
-            abs(goal.position_ticks - position_ticks) * mx28.TICK_RAD / (goal.velocity_units * mx28.VELOCITY_UNIT_RADPS)
-        )
-        slack_ns = round(self._settings.goal_slack_ms * MS_NS)
-        self._goal_ends_ns = time.monotonic_ns() + round(travel_s * S_NS) + slack_ns
+        self._goal_ends_ns = self._end_ns(
+            goal, mx28.STEPS_PER_TURN
+        )  # until it is known from where, the last goal's is over
+        self._goal_ends_ns = self._end_ns(goal, abs(goal.position_ticks - self._drive.measure().position_ticks))
+
+    def _end_ns(self, goal: wire.Goal, travel_ticks: int) -> int:
+        """When a travel at the goal's speed that begins now is over."""
+        travel_s = travel_ticks * mx28.TICK_RAD / (goal.velocity_units * mx28.VELOCITY_UNIT_RADPS)
+        return time.monotonic_ns() + round(travel_s * S_NS) + round(self._settings.goal_slack_ms * MS_NS)
 
     def _give_up(self, measured: Measured) -> None:
         """The goal's time is over: where it has not been reached, the servo stays where it is."""

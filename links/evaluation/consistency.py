@@ -29,6 +29,9 @@ def rotation(judged: Evaluation) -> None:
     elif not len(output.poses):
         judged.values.update((key, failure("no output at all")) for key in keys[:4])
         judged.cannot("no output at all", "branch_wrong_s")
+    elif output.rotated is not None and not output.rotated.any():
+        judged.values.update((key, failure("the run never knew the rotation")) for key in keys[:4])
+        judged.cannot("the run never knew the rotation", "branch_wrong_s")
     elif output.poses.quaternion_xyzw is None:
         judged.cannot(f"the run gives no rotation: {output.poses.why_no_rotation}", *keys)
     elif at.euler_error_rad is None or at.angle_error_rad is None:
@@ -36,7 +39,7 @@ def rotation(judged: Evaluation) -> None:
     elif not len(at.index):
         judged.cannot(no_error(judged, at).note, *keys)
     elif not (told := _rotation_told(judged, at)).any():
-        judged.cannot("the run never knew the rotation", *keys)
+        judged.cannot("the run knew no rotation where truth does", *keys)
     else:
         n = int(told.sum())
         for key, series in zip(keys, np.degrees(at.euler_error_rad[told]).T, strict=False):

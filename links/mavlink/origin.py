@@ -71,6 +71,11 @@ class OriginGiver:
             )
         ]
 
+    def restart(self) -> None:
+        """The autopilot was away: it may have been started again, and have none."""
+        if self._origin is not None:
+            self.state, self._answers, self._answered, self._asked_ns = "asking", 0, False, None
+
     def unsent(self) -> None:
         """What was due could not be sent."""
         if self.state == "given":

@@ -152,6 +152,8 @@ class Session:
             self.counts["received"] += 1
             if sender == self._target:
                 self.connection.answer_to(source)
+                if self._now_ns() - self._target_ns > SILENT_S * SECOND_NS:
+                    self.origin.restart()
                 self._target_ns = self._now_ns()
                 if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                     self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))

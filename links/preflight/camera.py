@@ -13,6 +13,7 @@ from links.preflight.seen import CameraSeen
 from links.preflight.verdict import Verdict, fail, ok, warning
 
 LEAST_HZ = 1.0
+SILENT_S = 1.0  # a camera that gave pictures and then none for so long has died
 FULL_RATE = 0.5  # of what was asked of the device
 
 
@@ -37,6 +38,9 @@ def _rate(heard: Heard, link: Camera) -> Verdict:
     if not arrivals.rate_hz >= LEAST_HZ or (heard.live and heard.trouble):
         why = heard.trouble or "too slow for any motion"
         return fail(name, f"{text}: {why}")
+    silent_s = arrivals.longest_silence_s(heard.end_ns)
+    if heard.live and silent_s > max(SILENT_S, 3.0 / arrivals.rate_hz):
+        return fail(name, f"{text}; then none came for {silent_s:.1f} s: check its cable and power")
     if refused > 0.01 * arrivals.count:
         return warning(name, f"{text}: check cable and hub")
     if heard.live and arrivals.rate_hz < FULL_RATE * link.fps:

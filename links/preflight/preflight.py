@@ -39,6 +39,7 @@ from stages.messages import (
 
 OLD_MS = 200.0  # of a pose of the vehicle's odometry
 ODOMETRY_HZ = 5.0
+ODOMETRY_SILENT_S = 1.0  # one that told poses and then none for so long has died
 
 Wait = Callable[[float], None]
 Ask = Callable[[Step], None]  # tells a person what to do and returns when they begin
@@ -153,6 +154,9 @@ def odometry_check(heard: Heard, link: VehicleOdometry) -> Verdict:
     text = f"{arrivals.rate_hz:.0f} a second, at most {age_ms:.0f} ms old" + (f", {refused} refused" if refused else "")
     if refused >= arrivals.count:
         return fail(heard.name, f"{text}: none holds a pose (recordings/README.md, /vehicle/odometry)")
+    silent_s = arrivals.longest_silence_s(heard.end_ns)
+    if heard.live and silent_s > ODOMETRY_SILENT_S:
+        return fail(heard.name, f"{text}; then none came for {silent_s:.1f} s: is its sender still running?")
     if not arrivals.rate_hz >= ODOMETRY_HZ or age_ms > OLD_MS or refused:
         return warning(heard.name, f"{text}: check its rate, and that its age_s and clock are right")
     return ok(heard.name, text)

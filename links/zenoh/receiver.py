@@ -124,7 +124,7 @@ class Receiver(link.Source):
         if envelope is None:
             self._count("without an envelope")
             return None
-        run, number = self._newest.get(key, (envelope.run, -1))
+        run, number = self._newest.get(key, (envelope.run, envelope.number - 1))  # before, nobody was here to hear it
         if run == envelope.run:
             self._count("lost", max(envelope.number - number - 1, 0))
         self._newest[key] = envelope.run, envelope.number

@@ -186,6 +186,8 @@ def test_a_run_killed_with_sigkill_loses_at_most_half_a_second_and_what_is_left_
         child.send_signal(signal.SIGKILL)
         child.communicate()
     assert child.returncode == -signal.SIGKILL
+    again = grd("run", "ticks.yaml", "--for", "0.2", "--out", tmp_path / "run", code=2)
+    assert "holds the recording of a run that was cut off (flight.mcap): name another --out, or move it" in again
     report = recover(tmp_path / "run" / "flight.mcap")
     with RecordingReader(report.path) as reader:
         ticks = list(reader.records(["/clock"]))

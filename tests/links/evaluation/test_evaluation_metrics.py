@@ -280,6 +280,19 @@ def test_rotation_is_judged_for_the_fused_pose_and_a_wrong_branch_is_timed(tmp_p
     assert judge(folder, which=1).output.name == "fix"
 
 
+def test_a_run_that_never_knew_the_rotation_has_failed_there_and_is_not_left_out_of_medians(tmp_path):
+    folder = make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ))
+    (folder / "truth_vehicle_drone.tum").write_text("# full pose\n" + lines(EIGHT_HZ, truth_at(EIGHT_HZ)))
+    add_pose(folder, EIGHT_HZ, truth_at(EIGHT_HZ), yaw_quaternion(0 * EIGHT_HZ), np.eye(6) * 0.01)
+    file = folder / "pose_covariance.csv"
+    head, *rows = file.read_text().splitlines()
+    file.write_text("\n".join([f"{head},rotation", *(f"{row},0" for row in rows)]) + "\n")
+    e = judge(folder)
+    assert e.values["rmse_angle_deg"].failed
+    assert e.values["rmse_angle_deg"].note == "the run never knew the rotation"
+    assert not e.values["branch_wrong_s"].failed
+
+
 def test_identity_everywhere_is_no_rotation(tmp_path):
     """A TUM file that says 0 0 0 1 all along has not measured rotation; it may not earn 0 deg of error."""
     truth, file = tmp_path / "truth.tum", tmp_path / "estimate.tum"

@@ -83,6 +83,19 @@ def test_an_origin_that_the_line_did_not_take_is_given_later():
     assert giver.state == "given"
 
 
+def test_an_autopilot_that_was_away_is_asked_again():
+    giver = OriginGiver(PLACE, (1, 1))
+    run(giver, 30, ack(0))
+    assert giver.state == "given"
+    giver.restart()
+    sent = run(giver, 30, ack(0), mavlink.MAVLink_gps_global_origin_message(1, 2, 3))
+    assert [m.get_type() for m in sent] == ["COMMAND_LONG"]
+    assert giver.state == "it has one"
+    none = OriginGiver(None, (1, 1))
+    none.restart()
+    assert none.state == "none configured"
+
+
 def test_without_an_origin_nothing_is_asked():
     assert run(OriginGiver(None, (1, 1)), 30, ack(0)) == []
 

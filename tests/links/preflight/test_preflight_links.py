@@ -190,6 +190,22 @@ def test_a_camera_is_judged_by_its_rate_and_the_rigs_size():
     assert levels(camera_checks(hear(link, pictures(step_ns=2_000_000_000)), (64, 64)))["frames"] == "fail"
 
 
+def test_a_camera_and_an_odometry_that_fell_silent_are_no_go():
+    """Their rate, from the first record to the last, is that of a healthy one."""
+    later_ns = BEGIN_NS + 5_000_000_000
+    found = by_name(camera_checks(hear(Camera(topic="/camera/drone"), pictures(), end_ns=later_ns), (64, 64)))
+    assert found["frames"].level is Level.FAIL
+    assert "then none came for 3.1 s" in found["frames"].sentence
+    slow = hear(Camera(topic="/camera/drone"), pictures(step_ns=800_000_000, count=7), end_ns=later_ns + 800_000_000)
+    assert by_name(camera_checks(slow, (64, 64)))["frames"].level is not Level.OK
+    pose = json.dumps({"xyz_m": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1]}).encode()
+    poses = [Record("/vehicle/odometry", BEGIN_NS + k * 50_000_000, BEGIN_NS + k * 50_000_000, pose) for k in range(40)]
+    there = VehicleOdometry(port=14600)
+    died = odometry_check(hear(there, poses, end_ns=later_ns), there)
+    assert died.level is Level.FAIL
+    assert "is its sender still running?" in died.sentence
+
+
 def test_a_camera_without_pictures_is_no_go():
     link = Camera(topic="/camera/drone")
     (verdict,) = camera_checks(hear(link, [], trouble="there is no /dev/video9"), (64, 64))

@@ -157,9 +157,7 @@ class Worker:
             raise
         self._goal = None
         self._counts["goals_sent"] += 1
-        self._goal_ends_ns = self._end_ns(
-            goal, mx28.STEPS_PER_TURN
-        )  # until it is known from where, the last goal's is over
+        self._goal_ends_ns = self._end_ns(goal, mx28.STEPS_PER_TURN)  # from anywhere, while it does not answer
         self._goal_ends_ns = self._end_ns(goal, abs(goal.position_ticks - self._drive.measure().position_ticks))
 
     def _end_ns(self, goal: wire.Goal, travel_ticks: int) -> int:

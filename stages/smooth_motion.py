@@ -24,7 +24,7 @@ def model_of(t: Array64, sigma: float, speed: float, acceleration: float) -> Arr
     c, v, a are normal about zero with sigmas ANYWHERE_M, speed, acceleration; 0: there is none.
         ln p = -(e.e / sigma^2 - b.A^-1 b) / 2 - ln|A Q| / 2 - n ln sigma
         A = B'B / sigma^2 + Q^-1 = L L', b = B'e / sigma^2, B = (1, t, t^2 / 2)
-    but for n ln(2 pi) / 2.
+    but for n ln(2 pi) / 2. The first bracket is chi-square, n degrees of freedom: `misfit`.
     """
     model, power = np.zeros((4, 3)), np.empty(3)
     q = (ANYWHERE_M, speed, acceleration)
@@ -47,8 +47,8 @@ def model_of(t: Array64, sigma: float, speed: float, acceleration: float) -> Arr
 
 
 @compiled
-def log_p(model: Array64, t: Array64, e: Array64) -> float:
-    """ln of the marginal likelihood of e (n,); see `model_of`."""
+def misfit(model: Array64, t: Array64, e: Array64) -> float:
+    """How badly e (n,) fits: squared sigmas, n of them where the model is right."""
     b0 = b1 = b2 = square = 0.0
     for i in range(len(t)):
         square += e[i] * e[i]
@@ -63,4 +63,10 @@ def log_p(model: Array64, t: Array64, e: Array64) -> float:
         gained += z * z
         if model[3, 2] > 2.0:
             gained += ((b2 * weight - model[2, 0] * y - model[2, 1] * z) / model[2, 2]) ** 2
-    return model[3, 0] - 0.5 * square * weight + 0.5 * gained
+    return square * weight - gained
+
+
+@compiled
+def log_p(model: Array64, t: Array64, e: Array64) -> float:
+    """ln of the marginal likelihood of e (n,); see `model_of`."""
+    return model[3, 0] - 0.5 * misfit(model, t, e)

@@ -26,7 +26,7 @@ import numpy as np
 from stages.compiled import compiled
 from stages.drone_telemetry import KEPT_NS, DroneTelemetry
 from stages.geometry import Array64
-from stages.smooth_motion import log_p, model_of
+from stages.smooth_motion import log_p, misfit, model_of
 
 YAWS = 72  # steps of 5 deg: coarser, a fast straight flight fits none
 MOST_POINTS = 14
@@ -40,6 +40,9 @@ CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time,
 BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
 BALLOON = (0.7, 0.7, 0.3, 0.4)
 DENIED = -3.0  # nats
+MOST_MISFIT = (
+    4.0  # of `Heard.misfit`, drones come to 1.3: beyond, it is none of these, and nothing speaks for the drone
+)
 
 
 class Heard(NamedTuple):
@@ -49,6 +52,7 @@ class Heard(NamedTuple):
     over_bird: float
     over_balloon: float
     over_wire: float  # over what is met farther and farther along it, at any speed: the aim looks where it expects
+    misfit: float = 0.0  # by how many squared sigmas a coordinate it is off the drone's way at the best yaw
 
     @property
     def denied(self) -> bool:
@@ -81,14 +85,17 @@ def hear(
         return None
     rows, told = list(places), np.array(list(places.values()))
     t = (np.array([path_ns[k] for k in rows]) - path_ns[rows[-1]]) * 1e-9
-    return Heard(*weigh(t, np.array([path_m[k] for k in rows]), told, sigma_m, level_known))
+    heard = Heard(*weigh(t, np.array([path_m[k] for k in rows]), told, sigma_m, level_known))
+    if heard.misfit <= MOST_MISFIT:
+        return heard
+    return Heard(*(min(ratio, 0.0) for ratio in heard[:4]), heard.misfit)
 
 
 @compiled
 def weigh(
     t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_known: bool
-) -> tuple[float, float, float, float]:
-    """The evidence (see Heard) of a path x (n, 3) at times t (n,) against what the drone told of itself (n, 3)."""
+) -> tuple[float, float, float, float, float]:
+    """What Heard holds, of a path x (n, 3) at times t (n,) against what the drone told of itself (n, 3)."""
     x, d = x_m.copy(), told_m.copy()
     for axis in range(3):
         x[:, axis] -= x[:, axis].mean()
@@ -99,6 +106,7 @@ def weigh(
     up = x[:, 2].copy()
     upright = model_of(t_s, sigma_m, DRIFT_UP_MPS, 0.0)
     drone = log_p(upright, t_s, up - d[:, 2])
+    off2, coordinates = misfit(upright, t_s, up - d[:, 2]), 1.0
     still, long = log_p(upright, t_s, up), log_p(as_long, t_s, up)  # what stands drifts alike
     sliding = followed = still
     bird = log_p(model_of(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
@@ -107,14 +115,16 @@ def weigh(
         as_cruising = model_of(t_s, sigma_m, CRUISE_SIGMA_MPS, BIRD[1])
         as_wheeling = model_of(t_s, sigma_m, BIRD[0], BIRD[1])
         as_balloon = model_of(t_s, sigma_m, BALLOON[0], BALLOON[1])
-        turned, cruising, wheeling = np.empty(YAWS), np.empty(YAWS), 0.0
+        turned, cruising, wheeling, level2 = np.empty(YAWS), np.empty(YAWS), 0.0, math.inf
         for k in range(YAWS):
             c, s = math.cos(math.tau * k / YAWS), math.sin(math.tau * k / YAWS)
-            turned[k] = log_p(as_drone, t_s, x[:, 0] - c * d[:, 0] + s * d[:, 1])
-            turned[k] += log_p(as_drone, t_s, x[:, 1] - s * d[:, 0] - c * d[:, 1])
+            ex, ey = x[:, 0] - c * d[:, 0] + s * d[:, 1], x[:, 1] - s * d[:, 0] - c * d[:, 1]
+            turned[k] = log_p(as_drone, t_s, ex) + log_p(as_drone, t_s, ey)
+            level2 = min(level2, misfit(as_drone, t_s, ex) + misfit(as_drone, t_s, ey))
             cruising[k] = log_p(as_cruising, t_s, x[:, 0] - CRUISE_MPS * c * t_s)
             cruising[k] += log_p(as_cruising, t_s, x[:, 1] - CRUISE_MPS * s * t_s)
         drone += _log_mean(turned)
+        off2, coordinates = off2 + level2, 3.0
         for axis in range(2):
             e = x[:, axis].copy()
             still += log_p(as_drone, t_s, e)
@@ -127,7 +137,8 @@ def weigh(
         wheeling += math.log(1.0 - CRUISING)
         bird += max(cruise, wheeling) + math.log1p(math.exp(-abs(cruise - wheeling)))
     over_still = drone - _log_mean(np.array([still, long, sliding]))
-    return over_still, drone - bird, drone - balloon, min(over_still, drone - followed)
+    off2 /= coordinates * len(t_s)
+    return over_still, drone - bird, drone - balloon, min(over_still, drone - followed), off2
 
 
 @compiled

@@ -17,6 +17,7 @@ from stages.detect.telemetry import (
     DRIFT_MPS,
     DRIFT_UP_MPS,
     FOLLOWED_MPS,
+    MOST_MISFIT,
     MOST_POINTS,
     SCATTERED_M,
     SLIDING_MPS,
@@ -107,7 +108,24 @@ def test_the_evidence_is_the_ratio_of_the_dense_marginal_likelihoods(seed, level
     x = d @ rotation_z(0.3 * seed).T + rng.normal(0.0, 0.3, (n, 3)) + rng.normal(0.0, 30.0, 3)
     for sigma_m in (0.1, 0.4):
         expected = heard_by_hand(t, x, d, sigma_m, level_known)
-        np.testing.assert_allclose(weigh(t, x, d, sigma_m, level_known), expected, rtol=1e-7, atol=1e-5)
+        found = weigh(t, x, d, sigma_m, level_known)
+        np.testing.assert_allclose(found[:4], expected, rtol=1e-7, atol=1e-5)
+        assert found[4] == pytest.approx(misfit_by_hand(t, x, d, sigma_m, level_known), rel=1e-6)
+
+
+def misfit_by_hand(t, x, d, sigma, level_known):
+    """e' C^-1 e of the drone's own covariances, a coordinate."""
+    x, d = x - x.mean(axis=0), d - d.mean(axis=0)
+
+    def off2(e, drift):
+        C = sigma**2 * np.eye(len(t)) + ANYWHERE_M**2 + drift**2 * np.outer(t, t)
+        return e @ np.linalg.solve(C, e)
+
+    up = off2(x[:, 2] - d[:, 2], DRIFT_UP_MPS)
+    if not level_known:
+        return up / len(t)
+    level = [sum(off2(e, DRIFT_MPS) for e in (x - d @ rotation_z(math.tau * k / YAWS).T)[:, :2].T) for k in range(YAWS)]
+    return (up + min(level)) / (3 * len(t))
 
 
 def test_the_paths_that_are_given_stay_as_they_are():
@@ -399,6 +417,25 @@ def test_a_path_is_compared_with_what_was_told_at_its_times():
     expected = weigh(times - times[-1], np.array(path), np.array([circle(t) for t in times]), SIGMA_M, True)
     np.testing.assert_allclose(heard, expected, atol=0.2)
     assert heard.over_still > 30.0 < heard.over_balloon
+
+
+def test_nothing_speaks_for_a_drone_where_a_path_is_far_from_the_drones_though_all_else_is_farther():
+    """A thing that swings two metres to each side where the drone swings three: no lamp, no bird, and not the drone."""
+
+    def swinging(t, by_m=3.0):
+        return np.array([2.0 * t, by_m * math.sin(3.0 * t), 10.0])
+
+    times = np.linspace(1.0, 3.0, 9)
+    stamps, path = path_of(lambda t: swinging(t, 2.0), times)
+    told = np.array([swinging(t) for t in times])
+    assert min(weigh(times - times[-1], np.array(path), told, SIGMA_M, True)[:4]) > 5.0
+    heard = hear(telling(swinging), stamps, path, SIGMA_M, True)
+    assert heard.misfit > MOST_MISFIT
+    assert max(heard[:4]) == 0.0
+    stamps, path = path_of(swinging, times)
+    heard = hear(telling(swinging), stamps, path, SIGMA_M, True)
+    assert heard.misfit < 1.0
+    assert min(heard[:4]) > 5.0
 
 
 def test_only_heights_are_heard_of_when_the_vehicle_does_not_say_how_it_drives():

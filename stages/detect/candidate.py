@@ -16,7 +16,7 @@ import numpy as np
 from stages.compiled import compiled
 from stages.detect.flight import Motion, fit_motion, moves
 from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
-from stages.detect.telemetry import Heard
+from stages.detect.telemetry import DENIED, Heard
 from stages.geometry import Array64
 
 HISTORY = 40  # sightings
@@ -30,7 +30,6 @@ SOME_M = 36.0  # over range: up to so many tell nothing, a wire returns them, to
 SIGMA_M = 0.15  # of a sighting
 STANDING_M = 0.6  # what stands is met again within this
 ACCELERATION_MPS2 = 4.0
-DENIED = -3.0  # nats: it does not fly as the drone says
 OPEN_BESIDE = 0.5  # of `Candidate.beside`: less, and it flies in the open
 START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 

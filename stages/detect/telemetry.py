@@ -40,9 +40,7 @@ CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time,
 BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
 BALLOON = (0.7, 0.7, 0.3, 0.4)
 DENIED = -3.0  # nats
-MOST_MISFIT = (
-    4.0  # of `Heard.misfit`, drones come to 1.3: beyond, it is none of these, and nothing speaks for the drone
-)
+MOST_MISFIT = 4.0  # beyond it is none of these, and nothing speaks for the drone; drones come to 1.3
 
 
 class Heard(NamedTuple):
@@ -88,7 +86,8 @@ def hear(
     heard = Heard(*weigh(t, np.array([path_m[k] for k in rows]), told, sigma_m, level_known))
     if heard.misfit <= MOST_MISFIT:
         return heard
-    return Heard(*(min(ratio, 0.0) for ratio in heard[:4]), heard.misfit)
+    still, bird, balloon, wire = (min(ratio, 0.0) for ratio in heard[:4])
+    return Heard(still, bird, balloon, wire, heard.misfit)
 
 
 @compiled

@@ -90,7 +90,8 @@ def _show(live: Live, started_s: float, show: Show, run: RunFolder) -> None:
     try:
         show(Look(time.monotonic() - started_s, live.report, news))
     except (OSError, SystemExit) as error:  # where it is shown is full or gone; rich ends on a broken pipe
-        live.incidents.report("run", f"cannot be shown on the terminal: {error or type(error).__name__}")
+        why = error if isinstance(error, OSError) else "the pipe is closed"
+        live.incidents.report("run", f"cannot be shown on the terminal ({why}); the run goes on, run.log has it")
 
 
 @contextmanager

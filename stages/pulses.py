@@ -12,6 +12,10 @@ from stages.compiled import compiled
 from stages.geometry import Array64
 from stages.messages import SweptPulses
 
+# A laser's returns in a row, as shares of a drone's span: so long, they are of something larger; a step in range, or a
+# hole, so wide ends them.
+LONGEST, STEP, HOLE = 1.6, 0.7, 0.6
+
 
 @compiled
 def mean_direction(direction: NDArray[np.float32]) -> Array64:

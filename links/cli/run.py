@@ -80,7 +80,8 @@ def run(
     graph, folder = live_graph(asked), _new_folder(out_dir, f"live-{config.stem}")
     if parts := sorted(folder.glob("*.mcap")):
         raise LinkError(
-            f"{folder} holds the recording of a run that was cut off ({parts[0].name}): name another --out, or move it"
+            f"{folder} holds a recording already ({parts[0].name}), of a run that was cut off: "
+            "name another --out, or move it"
         )
     if hosts is not None and host is not None:
         graph = host_graph(graph, hosts, host, to_run=True)

@@ -92,10 +92,10 @@ class PoseSpeaker:
         return self._due(now_ns)
 
     def unsaid(self) -> None:
-        """The text of `texts` could not be sent: it waits again, unless a newer one of its kind does."""
+        """The text of `texts` could not be sent: it waits again. Say so at once, before a newer one of its kind comes."""
         if self._offered is not None:
             kind, severity, text = self._offered
-            self._texts.setdefault(kind, (severity, text))
+            self._texts[kind] = severity, text
             self._offered = self._text_ns = None
 
     def _stop(self, why: str) -> None:

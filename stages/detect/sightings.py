@@ -21,7 +21,7 @@ from stages.detect.chords import ChordFinder
 from stages.detect.surroundings import TALLY, BigThings, look_around
 from stages.geometry import Array64
 from stages.messages import SweptPulses
-from stages.pulses import middle_ns
+from stages.pulses import HOLE, LONGEST, STEP, middle_ns
 
 BEAM_SPACING_RAD = math.radians(2.0)  # between two lasers of a VLP-16
 WINDOW_NS = 8_600_000  # what is kept: 31 deg of a rotor at 600 rpm and the slice that is begun
@@ -66,7 +66,7 @@ class SightingFinder:
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         span_m = limits.span_m
-        self._chords = ChordFinder(1.6 * span_m, 0.7 * span_m, 0.6 * span_m)
+        self._chords = ChordFinder(LONGEST * span_m, STEP * span_m, HOLE * span_m)
         self._big = BigThings()
         self._slices: deque[Slice] = deque(maxlen=MOST_SLICES)
         self._lately = Lately()
@@ -214,7 +214,7 @@ def kinds_of(
         elif (
             rows[i, chord.Z] - origin_z_m > math.sin(lowest_rad) * range_m
             and nearest_m <= range_m <= furthest_m
-            and rows[i, chord.LENGTH] <= 1.6 * span_m
+            and rows[i, chord.LENGTH] <= LONGEST * span_m
         ):
             kinds[i] = SMALL if rows[i, chord.FREE] == 2.0 else HIDDEN
     return kinds

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from stages.compiled import compiled
 from stages.geometry import Array64
 from stages.messages import SweptPulses
+from stages.pulses import LONGEST
 from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, WHEN_S, WIDTH, A, B, across, collect, posterior
 from stages.track.kalman import condition, measured
-from stages.track.runs import LONGEST, leave_out_walls
+from stages.track.runs import leave_out_walls
 
 SCAN_COS = math.cos(math.radians(24.0))  # a slice covers 15 deg to each side of its middle and 5 deg along
 FURTHEST_M = 6.0  # beside the prediction pulses are collected

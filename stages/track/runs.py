@@ -3,7 +3,7 @@
 The pulses of one laser follow each other 0.2 deg apart. Returns in a row at much the same range are one run; a drone's
 are short, also where it hangs before a wall, because the range steps at its edge.
 
-Source: ours, for P III.C; the steps are those of `stages/detect/chords.py`.
+Source: ours, for P III.C; runs end as the detector's chords do (`stages/detect/chords.py`).
 """
 
 from __future__ import annotations
@@ -14,11 +14,9 @@ import numpy as np
 
 from stages.compiled import compiled
 from stages.geometry import Array64
+from stages.pulses import HOLE, LONGEST, STEP
 from stages.track.hull import DEPTH, HIT, KIND, LASER, NEARER, A, B
 
-LONGEST = 1.6  # of the span, and it is no drone
-STEP = 0.7  # of the span: a step in range that ends a run
-HOLE = 0.6  # of the span: so wide a hole ends it, too
 LASERS = 256
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from stages.geometry import rotation_from_rpy_deg, rotation_z
 from stages.messages import VehicleMotion
-from stages.trail import FURTHEST_NS, KEPT, STEP_NS, VehicleTrail
+from stages.trail import FURTHEST_NS, KEPT, STEP_NS, STILL_NS, VehicleTrail
 from tests.stages.made import MS, START_NS
 
 
@@ -33,6 +33,13 @@ def test_a_vehicle_that_tells_nothing_stands_at_the_origin():
     np.testing.assert_array_equal(t, np.zeros(3))
     assert not trail().known
     assert trail(motion(0, (1, 2, 3))).known
+
+
+def test_a_word_is_known_until_it_is_so_old_that_the_vehicle_may_be_anywhere():
+    made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (1, 0, 0)))
+    assert made.known_at(START_NS + 100 * MS + STILL_NS - 1)
+    assert not made.known_at(START_NS + 100 * MS + STILL_NS)
+    assert not trail().known_at(START_NS)
 
 
 def test_places_between_two_poses_are_linear_in_time():

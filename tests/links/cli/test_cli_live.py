@@ -14,7 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from links.live_run import live_graph, run_live
 from links.recording import RecordingReader, recover
+from links.run_folder import Asked
 from tests.links import command
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -177,6 +179,20 @@ def test_a_signal_ends_a_run_in_order(tmp_path, number):
         assert reader.topics["/clock"] == summary["records"]
 
 
+@pytest.mark.parametrize("trouble", [OSError(28, "No space left on device"), SystemExit(1)])
+def test_a_terminal_that_takes_no_more_ends_no_run(grd, tmp_path, trouble):
+    """A log on a full disk, or a pipe whose reader has gone (rich ends the program then)."""
+
+    def show(look):
+        raise trouble
+
+    asked = Asked(Path("ticks.yaml"), (), ())
+    finished = run_live(tmp_path / "run", asked, live_graph(asked), show, 0.8)
+    assert any("cannot be shown on the terminal (" in str(incident) for incident in finished.report.incidents)
+    assert finished.report.records > 40
+    assert "cannot be shown" in (tmp_path / "run" / "run.log").read_text()
+
+
 @pytest.mark.parametrize("after_s", [0.7, 1.3])
 def test_a_run_killed_with_sigkill_loses_at_most_half_a_second_and_what_is_left_can_be_repeated(tmp_path, grd, after_s):
     child, last = start(tmp_path, CONFIG)
@@ -187,7 +203,7 @@ def test_a_run_killed_with_sigkill_loses_at_most_half_a_second_and_what_is_left_
         child.communicate()
     assert child.returncode == -signal.SIGKILL
     again = grd("run", "ticks.yaml", "--for", "0.2", "--out", tmp_path / "run", code=2)
-    assert "holds the recording of a run that was cut off (flight.mcap): name another --out, or move it" in again
+    assert "holds a recording already (flight.mcap), of a run that was cut off: name another --out, or move it" in again
     report = recover(tmp_path / "run" / "flight.mcap")
     with RecordingReader(report.path) as reader:
         ticks = list(reader.records(["/clock"]))

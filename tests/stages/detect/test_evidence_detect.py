@@ -6,6 +6,7 @@ The skies are made by tests/stages/caster.py; nothing of them went into choosing
 from __future__ import annotations
 
 import math
+from collections import Counter
 from itertools import pairwise
 
 import numpy as np
@@ -18,9 +19,11 @@ from stages.detect import EvidenceDetect
 from stages.detect.candidate import Sighting
 from stages.detect.evidence import AMONG_M, AMONG_NS, STANDING_NS
 from stages.detect.surroundings import FREE_0, SECTORS, TALLY
+from stages.detect.telling import detections_message
 from stages.detect.verdict import Evidence, over_clutter
 from stages.geometry import rotation_from_rpy_deg, rotation_z
 from stages.messages import Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
+from stages.trail import VehicleTrail
 from tests.stages.caster import (
     Ball,
     Box,
@@ -34,6 +37,7 @@ from tests.stages.caster import (
     sweeping,
     together,
 )
+from tests.stages.detect.test_candidate import candidate
 from tests.stages.made import ON_ITS_SIDE, START_NS
 
 PLACE_M = (0.0, 8.0, 10.0)  # 12.7 m away, 51 deg up
@@ -54,6 +58,26 @@ def motion_at(t_s, velocity_mps=(0.0, 0.0, 0.0)):
         R_start_vehicle=np.eye(3),
         covariance=None,
     )
+
+
+def test_how_the_vehicle_moves_is_not_known_any_more_when_its_word_is_old():
+    stage = EvidenceDetect()
+    assert not stage._motion_known(START_NS)
+    stage.on_motion(motion_at(0.0))
+    assert stage._motion_known(START_NS + 600_000_000)
+    assert not stage._motion_known(START_NS + 800_000_000)
+    assert EvidenceDetect(parked=True)._motion_known(START_NS)
+
+
+def test_what_was_just_accepted_is_told_though_it_was_seen_before_the_search_began():
+    c = candidate(sighting(0.0, np.array(PLACE_M)))
+    c.accepted, c.odds, c.why = True, 6.0, "made"
+    later_ns = c.seen_ns + 5_000_000
+    told = detections_message([c], VehicleTrail(), later_ns, later_ns + 1, Counter(), 3)
+    assert told.accepted.tolist() == [True]
+    c.announced = True
+    told = detections_message([c], VehicleTrail(), later_ns, later_ns + 1, Counter(), 3)
+    assert told.accepted.tolist() == []
 
 
 def local_position(way, t_s, yaw_rad=0.9):

@@ -92,7 +92,7 @@ class PoseSpeaker:
         return self._due(now_ns)
 
     def unsaid(self) -> None:
-        """The text of `texts` could not be sent: it waits again. Say so at once, before a newer one of its kind comes."""
+        """The text of `texts` could not be sent: it waits again. To be said at once, before a newer one comes."""
         if self._offered is not None:
             kind, severity, text = self._offered
             self._texts[kind] = severity, text

@@ -177,8 +177,16 @@ def simulate_matrix(
     cameras_hz: Annotated[
         float | None,
         typer.Option(
-            "--cameras", metavar="HZ", min=1, max=15, help="Two 720 px fisheyes at this rate; 0.8 s of a core a pair."
+            "--cameras",
+            metavar="HZ",
+            min=1,
+            max=15,
+            help="Two fisheyes at this rate; at 720 px 0.8 s of a core a pair.",
         ),
+    ] = None,
+    cameras_px: Annotated[
+        int | None,
+        typer.Option("--pixels", min=64, max=1440, help="The fisheyes' pictures are this large. [default: 720]"),
     ] = None,
     pictures: Annotated[
         Path | None,
@@ -223,6 +231,8 @@ def simulate_matrix(
         raise LinkError("--results keeps the closed loop's runs: say whose with --closed-loop CONFIG")
     if pictures is not None and cameras_hz is None:
         raise LinkError("--pictures is for recordings with cameras: say at which rate with --cameras HZ")
+    if cameras_px is not None and cameras_hz is None:
+        raise LinkError("--pixels is for recordings with cameras: say at which rate with --cameras HZ")
     patterns = only or ["*"]
     wanted = cells(patterns, pairs)
     if not wanted:
@@ -234,7 +244,7 @@ def simulate_matrix(
             out.print(cell.name, markup=False)
         return
     with progress_bar(f"{len(wanted) * seeds} recordings") as step:
-        conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz)
+        conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, cameras_px or Conditions.cameras_px)
         report = make_matrix(
             folder, wanted, range(1, seeds + 1), closed_loop, step, conditions, results, jobs, pictures
         )

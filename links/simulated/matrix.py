@@ -62,7 +62,8 @@ class Conditions:
     odometry: bool = False  # the vehicle tells where it drives
     rain: bool = False  # 5 mm/h
     autopilot: bool = False  # the drone tells how it flies, over a radio
-    cameras_hz: float | None = None  # two 720 px fisheyes; None: none
+    cameras_hz: float | None = None  # two fisheyes; None: none
+    cameras_px: int = 720  # their size, square
 
 
 def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
@@ -116,7 +117,7 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         script=SWEEPS if cell.motion in SEARCHING else SWEEP_THEN_FOLLOW,
         truth_visible=bool(drones),
         autopilot=AutopilotSettings() if conditions.autopilot and drones else None,
-        cameras=_cameras(conditions.cameras_hz, bool(drones)),
+        cameras=_cameras(conditions, bool(drones)),
         weather=RAIN if conditions.rain else Weather(),
         vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,
         rig=RigLidar(mount=known) if conditions.calibrated else straight,
@@ -124,9 +125,9 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
     )
 
 
-def _cameras(rate_hz: float | None, drone: bool) -> CamerasSettings:
+def _cameras(conditions: Conditions, drone: bool) -> CamerasSettings:
     """The vehicle's and, where there is a drone to carry it, the drone's."""
-    if rate_hz is None:
+    if conditions.cameras_hz is None:
         return CamerasSettings()
-    one = CameraSettings(rate_hz=rate_hz)
+    one = CameraSettings(rate_hz=conditions.cameras_hz, size_px=conditions.cameras_px)
     return CamerasSettings(vehicle=one, drone=one if drone else None)

@@ -27,6 +27,7 @@ CLEAR = 3.0  # sigmas of the fixes' noise that a displacement must have
 FIX_FLOOR_M = 0.04  # no handful is placed better
 STRAIGHT = 0.7  # way told by directions alone: as the crow flies over flown
 COVERED = 0.8  # of a window, by pictures
+PICTURES_LATE_NS = 500_000_000  # a window that is long enough waits so long for the pictures of its end
 SLACK_M = 0.6  # the LiDAR may see so much more way than the odometry before that alone is a window
 
 
@@ -59,13 +60,14 @@ class Windows:
         self._R = turns(hypotheses)
         self._recent: deque[_Fix] = deque(maxlen=HANDFUL)
         self._start: _Handful | None = None
+        self._waiting: _Handful | None = None  # the end of a window whose pictures are still to come
         self._track: int | None = None
         self._steps: deque[DroneMotion] = deque(maxlen=512)
 
     def restart(self) -> None:
         """Nothing before now counts."""
         self._recent.clear()
-        self._start = None
+        self._start = self._waiting = None
 
     def add_step(self, motion: DroneMotion) -> None:
         """A step of the odometry by pictures: its direction."""
@@ -120,15 +122,19 @@ class Windows:
         start, end = self._ends()
         if start is None or end is None:
             return None
+        newest_ns, end = end.stamp_ns, self._waiting or end
         way = median_m(end) - median_m(start)
         noise = start.covariance_m2 + end.covariance_m2
         if float(np.linalg.norm(way)) < max(self._baseline_m, CLEAR * math.sqrt(0.5 * float(np.trace(noise)))):
             return None
-        self._start = end
+        pictures_ns = self._steps[-1].stamp_ns if self._steps else 0
+        if pictures_ns < end.stamp_ns and newest_ns - end.stamp_ns < PICTURES_LATE_NS:
+            self._waiting = end
+            return None
+        self._start, self._waiting = end, None
         flown, covered, flew, sigma = np.zeros(3), 0.0, 0.0, 0.0
-        for step in self._steps:
-            overlap = min(step.stamp_ns, end.stamp_ns) - max(step.from_ns, start.stamp_ns)
-            if overlap <= 0 or step.from_ns not in R_start_drone:
+        for step, overlap in self._keys_steps(start.stamp_ns, end.stamp_ns):
+            if step.from_ns not in R_start_drone:
                 continue
             covered += overlap
             if step.direction_from is not None and step.direction_sigma_rad is not None:
@@ -142,6 +148,15 @@ class Windows:
         return Displacement(
             start.stamp_ns, end.stamp_ns, lidar, noise, flown[:2] / flat, math.hypot(sigma, bearing_rad), False
         )
+
+    def _keys_steps(self, start_ns: int, end_ns: int) -> list[tuple[DroneMotion, int]]:
+        """One step of each key picture, with how much of the window [ns] it covers: most, and as little else."""
+        best: dict[int, tuple[DroneMotion, int]] = {}
+        for step in self._steps:  # those of one key from short to long: each covers what those before it do
+            overlap = min(step.stamp_ns, end_ns) - max(step.from_ns, start_ns)
+            if overlap > 0 and (step.from_ns not in best or overlap > best[step.from_ns][1]):
+                best[step.from_ns] = step, overlap
+        return list(best.values())
 
     def steps_since_start(self) -> list[int]:
         """from_ns of the steps that the open window may need."""

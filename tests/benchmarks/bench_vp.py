@@ -33,13 +33,14 @@ from stages.vp import GreatCircleVp, PaperVp
 
 YORK = Path(__file__).resolve().parents[3] / "shared" / "data" / "vp_york_urban"
 LU_PYTHON = os.environ.get("GRD_LU_VP_PYTHON", "")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 R_CARRIER_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks forward
 LU = """
 import json, sys, time
 import cv2
 from lu_vp_detect import VPDetection
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 cv2.setNumThreads(1)
 focal, cx, cy, *paths = json.load(sys.stdin)
 detector = VPDetection(30, (cx, cy), focal, seed=1)

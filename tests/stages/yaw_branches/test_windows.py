@@ -130,18 +130,23 @@ def test_the_vehicles_own_way_is_added():
     np.testing.assert_allclose(moved.lidar_m[0], moved.odometry_m, atol=1e-9)
 
 
-def by_pictures(directions, reach_s=3.0, hole=None):
-    """Bearing windows of fixes along V with a step of pictures each 100 ms; direction None: no motion seen."""
+def by_pictures(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms=10**9):
+    """Bearing windows of fixes along V with a step of pictures each 100 ms; direction None: no motion seen.
+
+    So many steps share a key; pictures come so late, and none of after `lost_ms`.
+    """
     windows = Windows(0.4)
     R_start_drone = rotation_z(0.9)
     out = []
-    for i, ms in enumerate(range(100, round(1000 * reach_s), 100)):
+    for ms in range(100, round(1000 * reach_s), 100):
+        seen_ms = ms - late_ms
+        i = seen_ms // 100 - 1
         direction = directions(i)
-        if hole is None or not hole[0] <= ms < hole[1]:
+        if 0 < seen_ms < lost_ms and (hole is None or not hole[0] <= seen_ms < hole[1]):
             windows.add_step(
                 DroneMotion(
-                    stamp_ns=ms * MS,
-                    from_ns=(ms - 100) * MS,
+                    stamp_ns=seen_ms * MS,
+                    from_ns=(seen_ms - 100 - 100 * (i % of_key)) * MS,
                     R_from_to=np.eye(3),
                     covariance_rad2=1e-6 * np.eye(3),
                     direction_from=None if direction is None else R_start_drone.T @ direction,
@@ -183,3 +188,24 @@ def test_a_window_that_pictures_hardly_cover_tells_nothing():
     moved = by_pictures(lambda i: ahead, reach_s=4.0, hole=(800, 1600))
     assert moved
     assert all(one.end_ns <= 900 * MS or one.start_ns >= 1400 * MS for one in moved)
+
+
+def test_pictures_of_one_key_cover_their_time_once():
+    ahead = V / np.linalg.norm(V)
+    assert by_pictures(lambda i: ahead, of_key=8)
+    assert by_pictures(lambda i: ahead, of_key=8, hole=(600, 1200), reach_s=1.2) == []  # .3 of .4 s, by three pictures
+
+
+def test_a_window_waits_for_the_pictures_of_its_end():
+    ahead = V / np.linalg.norm(V)
+    in_time = by_pictures(lambda i: ahead)
+    late = by_pictures(lambda i: ahead, late_ms=300, reach_s=3.3)
+    assert len(late) == len(in_time)
+    assert [one.end_ns for one in late] == [one.end_ns for one in in_time]
+
+
+def test_a_window_does_not_wait_for_pictures_that_do_not_come():
+    ahead = V / np.linalg.norm(V)
+    moved = by_pictures(lambda i: ahead, lost_ms=1500, reach_s=4.0)
+    assert moved
+    assert moved[-1].end_ns <= 1600 * MS

@@ -1,9 +1,9 @@
 """Configuration files as one tree that remembers where each value was written.
 
 `include:` composes files (they come first, the including file on top), overlay files and `--set track.radius_m=0.8`
-change what is there, `$rig.lidar.mount` stands for another value of the tree. Mappings merge, everything else is
-replaced, `null` removes a stage or link, a stage whose `use` changes starts with an empty `config`, and a lens whose
-`model` changes is replaced: other numbers belong to it.
+change what is there, `$rig.lidar.mount` stands for another value of the tree, and `$rig.cameras.drone.readout_ms or 0`
+for 0 where there is none. Mappings merge, everything else is replaced, `null` removes a stage or link, a stage whose
+`use` changes starts with an empty `config`, and a lens whose `model` changes is replaced: other numbers belong to it.
 
 Source: ours. YAML 1.1 through PyYAML's safe loader: no object construction, bounded sizes.
 """
@@ -87,14 +87,29 @@ def _resolve(tree: Tree, path: Path_, value: Any, within: tuple[str, ...]) -> An
         tree.problem(path, f"'{value}' stands for itself.")
         return None
     here: Any = tree.values
-    for i, part in enumerate(parts := value[1:].split(".")):
+    named, _, default = value[1:].partition(" or ")
+    for i, part in enumerate(parts := named.split(".")):
         known = cast("dict[str, Any]", here) if isinstance(here, dict) else {}
         if part not in known:
+            if default and not did_you_mean(part, known):  # a mistyped name is none that may be missing
+                return _scalar(tree, path, default)
             above = ".".join(parts[:i]) or "the configuration"
             tree.problem(path, f"'{value}' stands for nothing: {above} has no '{part}'.{did_you_mean(part, known)}")
             return None
         here = known[part]
     return _resolve(tree, path, here, (*within, value))
+
+
+def _scalar(tree: Tree, path: Path_, text: str) -> str | int | float | bool | None:
+    """A plain value written after `or`."""
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        value = ()
+    if value is None or isinstance(value, str | int | float | bool):
+        return value
+    tree.problem(path, f"'{text}' after 'or' is no plain value: write a number, a word, true, false or null.")
+    return None
 
 
 def _read(file: Path, tree: Tree, including: tuple[Path, ...]) -> Tree:

@@ -99,6 +99,11 @@ class VehicleTrail:
             self._onward = log_rotation(R_then.T @ R) / (span_ns * 1e-9), (t - t_then) / (span_ns * 1e-9)
         return self._onward
 
+    def rate_radps(self, stamp_ns: int) -> Array64:
+        """How the vehicle turns (3,), its own axes; zero where nothing tells."""
+        before, after = self.at(stamp_ns - STEP_NS // 2)[0], self.at(stamp_ns + STEP_NS // 2)[0]
+        return log_rotation(before.T @ after) / (STEP_NS * 1e-9)
+
     def velocity_mps(self, stamp_ns: int) -> Array64:
         """The vehicle's own velocity (3,) in the local frame."""
         return (self.at(stamp_ns + STEP_NS)[1] - self.at(stamp_ns)[1]) / (STEP_NS * 1e-9)

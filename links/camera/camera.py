@@ -38,6 +38,7 @@ class Camera(Source):
     size_px: int | tuple[int, int] | None = None  # what the lens was calibrated for: `$rig.cameras.vehicle.size_px`
     fps: float = Field(30.0, ge=1, le=240)  # asked of a device
     latency_s: float = Field(0.0, ge=0, le=1)  # from the exposure of the middle row to the frame's arrival
+    readout_ms: float = Field(0.0, ge=0, le=100)  # from the first row's exposure to the last's: a rolling shutter
     timeout_s: float = Field(3.0, gt=0, le=30)  # of a stream: to open it, and between two frames
     jpeg_quality: int = Field(90, ge=30, le=100)  # where frames do not come as JPEG
     _refused: int = PrivateAttr(default=0)
@@ -88,13 +89,13 @@ class Camera(Source):
     def decode(self, record: Record) -> Image | None:
         """The image of one record, stamped as the record is."""
         try:
-            return decode_image(record.stamp_ns, decode_compressed_image(record.data))
+            return decode_image(record.stamp_ns, decode_compressed_image(record.data), 1e-3 * self.readout_ms)
         except (ValueError, LinkError):
             self._refused += 1
             return None
 
 
-def decode_image(stamp_ns: int, frame: CompressedImage) -> Image:
+def decode_image(stamp_ns: int, frame: CompressedImage, readout_s: float = 0.0) -> Image:
     """A frame in grey. Raises ValueError when it is no JPEG, is cut off, or has more than MAX_PIXELS pixels."""
     if frame.format not in ("jpeg", "jpg"):
         raise ValueError(f"a frame in format {frame.format!r}; record JPEG")
@@ -106,7 +107,8 @@ def decode_image(stamp_ns: int, frame: CompressedImage) -> Image:
     grey = cv2.imdecode(np.frombuffer(frame.data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise ValueError("a damaged JPEG")
-    return Image(stamp_ns=stamp_ns, frame_id=frame.frame_id, grey=np.asarray(grey, dtype=np.uint8))
+    grey = np.asarray(grey, dtype=np.uint8)
+    return Image(stamp_ns=stamp_ns, frame_id=frame.frame_id, grey=grey, readout_s=readout_s)
 
 
 def jpeg_size(data: bytes) -> tuple[int, int]:

@@ -188,6 +188,12 @@ def simulate_matrix(
         int | None,
         typer.Option("--pixels", min=64, max=1440, help="The fisheyes' pictures are this large. [default: 720]"),
     ] = None,
+    readout_ms: Annotated[
+        float | None,
+        typer.Option(
+            "--readout", metavar="MS", min=0, max=60, help="Their rolling shutter, first to last row. [default: 0]"
+        ),
+    ] = None,
     pictures: Annotated[
         Path | None,
         typer.Option(
@@ -231,8 +237,9 @@ def simulate_matrix(
         raise LinkError("--results keeps the closed loop's runs: say whose with --closed-loop CONFIG")
     if pictures is not None and cameras_hz is None:
         raise LinkError("--pictures is for recordings with cameras: say at which rate with --cameras HZ")
-    if cameras_px is not None and cameras_hz is None:
-        raise LinkError("--pixels is for recordings with cameras: say at which rate with --cameras HZ")
+    for option, value in (("--pixels", cameras_px), ("--readout", readout_ms)):
+        if value is not None and cameras_hz is None:
+            raise LinkError(f"{option} is for recordings with cameras: say at which rate with --cameras HZ")
     patterns = only or ["*"]
     wanted = cells(patterns, pairs)
     if not wanted:
@@ -244,7 +251,8 @@ def simulate_matrix(
             out.print(cell.name, markup=False)
         return
     with progress_bar(f"{len(wanted) * seeds} recordings") as step:
-        conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, cameras_px or Conditions.cameras_px)
+        size_px = cameras_px or Conditions.cameras_px
+        conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0)
         report = make_matrix(
             folder, wanted, range(1, seeds + 1), closed_loop, step, conditions, results, jobs, pictures
         )

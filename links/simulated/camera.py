@@ -198,6 +198,7 @@ def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Seq
             f"T_{carrier}_camera": mount.model_dump(mode="json", exclude_none=True),
             "lens": one.true_lens.model_dump(mode="json"),
             "size_px": one.size_px,
+            "readout_ms": one.readout_ms,
             "masked_px": masked_px,
             "max_off_axis_deg": max_off_axis_deg,
         }

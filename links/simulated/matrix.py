@@ -64,6 +64,7 @@ class Conditions:
     autopilot: bool = False  # the drone tells how it flies, over a radio
     cameras_hz: float | None = None  # two fisheyes; None: none
     cameras_px: int = 720  # their size, square
+    readout_ms: float = 0.0  # their rolling shutter, first to last row; 0: all rows at once
 
 
 def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
@@ -129,5 +130,5 @@ def _cameras(conditions: Conditions, drone: bool) -> CamerasSettings:
     """The vehicle's and, where there is a drone to carry it, the drone's."""
     if conditions.cameras_hz is None:
         return CamerasSettings()
-    one = CameraSettings(rate_hz=conditions.cameras_hz, size_px=conditions.cameras_px)
+    one = CameraSettings(rate_hz=conditions.cameras_hz, size_px=conditions.cameras_px, readout_ms=conditions.readout_ms)
     return CamerasSettings(vehicle=one, drone=one if drone else None)

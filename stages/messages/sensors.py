@@ -35,6 +35,11 @@ class Image(Message):
 
     frame_id: str  # which camera: camera_vehicle, camera_drone
     grey: Annotated[NDArray[np.uint8], Shape("h", "w")]
+    readout_s: float = 0.0  # from the first row's exposure to the last's (rolling shutter); 0: all at once
+
+    def rows_after_s(self) -> float:
+        """How much later than the row above it a row is exposed."""
+        return self.readout_s / max(self.grey.shape[0] - 1, 1)
 
 
 @message

@@ -46,11 +46,18 @@ class Arcs:
         return len(self.normal)
 
 
-def fit_arcs(chains: Chains, eye: Eye, tolerance_px: float, min_extent_px: float) -> Arcs:
-    """All arcs of all chains that reach over `min_extent_px`."""
+def fit_arcs(
+    chains: Chains, eye: Eye, tolerance_px: float, min_extent_px: float, turn_rad_per_row: Array64 | None = None
+) -> Arcs:
+    """All arcs of all chains that reach over `min_extent_px`.
+
+    `turn_rad_per_row` (3,): how the camera turns from one row's exposure to the next one's, its own axes. Rays are told
+    in the axes that it had at the middle row.
+    """
     tolerance, extent = tolerance_px * eye.pixel_rad, min_extent_px * eye.pixel_rad
-    rows = _split_all(chains.points_px, chains.start, eye.rays, tolerance, extent, LEAST_SIGMA_PX * eye.pixel_rad)
-    return arcs_of(rows)
+    least, middle = LEAST_SIGMA_PX * eye.pixel_rad, 0.5 * (eye.usable.shape[0] - 1)
+    turn = np.zeros(3) if turn_rad_per_row is None else turn_rad_per_row
+    return arcs_of(_split_all(chains.points_px, chains.start, eye.rays, tolerance, extent, least, turn, middle))
 
 
 def arcs_of(rows: Array64) -> Arcs:
@@ -72,7 +79,10 @@ def _split_all(
     tolerance: float,
     min_extent: float,
     least_sigma: float,
+    turn_rad_per_row: Array64,
+    middle_row: float,
 ) -> Array64:
+    rolls = dot(turn_rad_per_row, turn_rad_per_row) > 0.0
     most = 0
     for c in range(len(start) - 1):
         most = max(most, start[c + 1] - start[c])
@@ -84,6 +94,8 @@ def _split_all(
         size = start[c + 1] - start[c]
         for k in range(size):
             _ray(table, points[start[c] + k, 0], points[start[c] + k, 1], rays[k])
+            if rolls:
+                _turn(rays[k], (points[start[c] + k, 1] - middle_row) * turn_rad_per_row)
         stack[0, 0], stack[0, 1] = 0, size - 1
         waiting = 1
         while waiting > 0:
@@ -115,6 +127,17 @@ def _ray(table: NDArray[np.float32], x: float, y: float, out: Array64) -> None:
     scale = 1.0 / math.sqrt(square)
     for k in range(3):
         out[k] *= scale
+
+
+@compiled
+def _turn(ray: Array64, by_rad: Array64) -> None:
+    """Turn a ray by an angle of some degrees at most, to its third power (Cayley's formula)."""
+    half = 0.5 * by_rad
+    across, twice = np.empty(3), np.empty(3)
+    cross(half, ray, across)
+    across += ray
+    cross(half, across, twice)
+    ray += 2.0 / (1.0 + dot(half, half)) * twice
 
 
 @compiled

@@ -4,7 +4,9 @@
             -> the vertical, by gravity or found; horizontal pairs, one or more (search.py) -> directions with sigma
 
 Gravity is the autopilot's attitude on the drone, and the carrier's own z within `vertical_sigma_deg` without it: right
-for a vehicle. A picture without enough straight lines gives no directions and the reason.
+for a vehicle. Where the camera's rows are exposed one after another (`readout_ms` of its link), each point is told in
+the axes of the middle row, by the carrier's turning: `attitude` on the drone, `motion` on the vehicle. A picture
+without enough straight lines gives no directions and the reason.
 
 Source: ours, for P IV and V.C; DESIGN, The graph: vp.
 """
@@ -20,7 +22,8 @@ from pydantic import Field, PrivateAttr
 from flow.stage import Stage
 from stages.geometry import Pose
 from stages.lens import Array64, Lens
-from stages.messages import Carrier, DroneAttitude, Image, VanishingDirections
+from stages.messages import Carrier, DroneAttitude, Image, VanishingDirections, VehicleMotion
+from stages.trail import VehicleTrail
 from stages.vp.arcs import fit_arcs
 from stages.vp.clustering import cluster
 from stages.vp.directions import lines_of
@@ -39,7 +42,7 @@ SEARCH_DEG = {Carrier.VEHICLE: 0.0, Carrier.DRONE: 35.0}
 class GreatCircleVp(Stage):
     """The directions in which a street runs, as one fisheye sees them, and how well they are known."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude", "motion"})
 
     carrier: Carrier
     T_carrier_camera: Pose
@@ -63,16 +66,23 @@ class GreatCircleVp(Stage):
     _eye: Eye | None = PrivateAttr(default=None)
     _edges: EdgeFinder = PrivateAttr()
     _gravity: GravityTrail = PrivateAttr(default_factory=GravityTrail)
+    _vehicle: VehicleTrail = PrivateAttr(default_factory=VehicleTrail)
 
     def model_post_init(self, context: Any, /) -> None:
         if any(len(polygon) < 3 for polygon in self.masked_px):
             raise ValueError("masked_px: a polygon has at least three corners (column, row)")
 
     def on_attitude(self, attitude: DroneAttitude) -> None:
-        """Roll and pitch of the drone; its yaw is not used."""
+        """Roll, pitch and turning of the drone; its yaw is not used."""
         if self.carrier is not Carrier.DRONE:
             raise ValueError("attitude is the drone's: wire it to the stage whose carrier is the drone")
         self._gravity.add(attitude)
+
+    def on_motion(self, motion: VehicleMotion) -> None:
+        """How the vehicle turns; nothing else of it is used."""
+        if self.carrier is not Carrier.VEHICLE:
+            raise ValueError("motion is the vehicle's: wire it to the stage whose carrier is the vehicle")
+        self._vehicle.add(motion)
 
     def on_image(self, image: Image) -> VanishingDirections:
         """One picture's directions and lines."""
@@ -83,11 +93,19 @@ class GreatCircleVp(Stage):
             self._edges = EdgeFinder(self._eye.usable, self.min_contrast, MIN_POINTS)
         eye = self._eye
         chains = self._edges.find(image.grey)
-        arcs = cluster(fit_arcs(chains, eye, self.tolerance_px, self.min_extent_px), eye, MOST_LINES)
         R = self.T_carrier_camera.matrix()[:3, :3]
+        turn = image.rows_after_s() * (self._rate_radps(image.stamp_ns) @ R)
+        arcs = cluster(fit_arcs(chains, eye, self.tolerance_px, self.min_extent_px, turn), eye, MOST_LINES)
         lines = lines_of(arcs, R, WIDE_RAD)
         found = find_structure(lines, self._prior(image.stamp_ns), self._limits())
         return self._message(image.stamp_ns, found, lines.normal, arcs.ends @ R.T, arcs.sigma_rad)
+
+    def _rate_radps(self, stamp_ns: int) -> Array64:
+        """How the carrier turns (3,), its own axes; zero where nothing tells."""
+        if self.carrier is Carrier.DRONE:
+            rate = self._gravity.rate_radps(stamp_ns, self.attitude_age_s)
+            return np.zeros(3) if rate is None else rate
+        return self._vehicle.rate_radps(stamp_ns) if self._vehicle.known_at(stamp_ns) else np.zeros(3)
 
     def _prior(self, stamp_ns: int) -> Prior:
         up = self._gravity.at(stamp_ns, self.attitude_age_s)

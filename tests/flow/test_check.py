@@ -299,6 +299,25 @@ def test_a_reference_stands_for_a_value_elsewhere(tmp_path):
     assert load_graph(tmp_path / "x.yaml").nodes["add"].build().name == "anna"
 
 
+@pytest.mark.parametrize(("rig", "name"), [("{title: anna}", "anna"), ("{}", "bert")])
+def test_a_reference_may_say_what_holds_where_nothing_stands(tmp_path, rig, name):
+    (tmp_path / "x.yaml").write_text(f"rig: {rig}\n" + GRAPH.replace("{name: adder}", "{name: $rig.title or bert}"))
+    assert load_graph(tmp_path / "x.yaml").nodes["add"].build().name == name
+
+
+@pytest.mark.parametrize(
+    ("reference", "told"),
+    [
+        ("$rig.titel or bert", "'$rig.titel or bert' stands for nothing: rig has no 'titel'. Did you mean 'title'?"),
+        ("$rig.name or [1, 2]", "'[1, 2]' after 'or' is no plain value"),
+        ("$rig.name or '", "after 'or' is no plain value"),
+    ],
+)
+def test_what_holds_where_nothing_stands_is_no_cover_for_mistakes(tmp_path, reference, told):
+    text = "rig: {title: anna}\n" + GRAPH.replace("{name: adder}", f'{{name: "{reference}"}}')
+    assert any(told in problem for problem in problems_of(tmp_path, text))
+
+
 def test_a_reference_to_itself_is_said(tmp_path):
     text = "rig: {a: $rig.b, b: $rig.a}\n" + GRAPH.replace("adder", "$rig.a")
     assert any("'$rig.a' stands for itself." in p for p in problems_of(tmp_path, text))

@@ -36,6 +36,13 @@ def test_a_frame_is_decoded_in_grey_at_the_records_time(progressive):
     assert camera.refused == 0
 
 
+def test_how_long_the_rows_take_goes_with_the_image():
+    image = Camera(topic="/camera/vehicle", readout_ms=23.5).decode(record(jpeg(48, 64)[1]))
+    assert image is not None
+    assert image.readout_s == pytest.approx(0.0235)
+    assert image.rows_after_s() == pytest.approx(0.0235 / 47)
+
+
 def test_the_size_is_read_before_anything_is_decoded():
     assert jpeg_size(jpeg(48, 64)[1]) == (64, 48)
     with pytest.raises(ValueError, match="no JPEG"):

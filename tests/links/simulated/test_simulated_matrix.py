@@ -210,10 +210,11 @@ def test_cameras_are_added_to_a_cell_and_change_nothing_else() -> None:
     assert seen.cameras.vehicle is not None
     assert seen.cameras.drone is not None
     assert (seen.cameras.vehicle.rate_hz, seen.cameras.drone.rate_hz) == (4.0, 4.0)
-    large = scenario_of(cell, 3, Conditions(cameras_hz=4.0, cameras_px=1080)).cameras
+    large = scenario_of(cell, 3, Conditions(cameras_hz=4.0, cameras_px=1080, readout_ms=20.0)).cameras
     assert large.vehicle is not None
     assert large.drone is not None
     assert (large.vehicle.size_px, large.drone.size_px) == (1080, 1080)
+    assert (large.vehicle.readout_ms, large.drone.readout_ms) == (20.0, 20.0)
     assert seen.changed(cameras={}) == scenario_of(cell, 3)
     nobody = scenario_of(Cell("open_lot", 0, "empty", "parked"), 3, Conditions(cameras_hz=4.0))
     assert nobody.cameras.vehicle is not None

@@ -6,6 +6,7 @@ import numpy as np
 
 from stages.geometry import rotation_from_rpy_deg
 from stages.lens import Equidistant
+from stages.rotation import exp_rotation
 
 SKY, WALL, WINDOW, ROAD, STRIPE = 180.0, 120.0, 50.0, 70.0, 150.0
 LOOKS_UP = rotation_from_rpy_deg((0.0, 0.0, 90.0))  # R_vehicle_camera: image top forward, right is left
@@ -17,16 +18,20 @@ def fisheye(size_px: int = 480) -> Equidistant:
     return Equidistant(focal_px=(size_px / 2 - 2) / np.radians(117.5), centre_px=(middle, middle))
 
 
-def street(R_world_camera, lens, size_px=480, wall_turns_deg=(0.0, 0.0), noise=1.0, up_m=2.0, seed=0):
+def street(R_world_camera, lens, size_px=480, wall_turns_deg=(0.0, 0.0), noise=1.0, up_m=2.0, seed=0, row_turn=None):
     """Grey picture of a street along x; its left and right walls are turned from it, each by its own angle.
 
-    The camera is `up_m` over the road; the walls stand 7 m away and are 10 m high.
+    The camera is `up_m` over the road; the walls stand 7 m away and are 10 m high. `row_turn` (3,) [rad]: how the
+    camera turns from row to row, its own axes; it is where R_world_camera says at the middle one.
     """
+    middle = 0.5 * (size_px - 1)
+    turns = [np.eye(3) if row_turn is None else exp_rotation((k - middle) * row_turn) for k in range(size_px)]
     column, row = np.meshgrid(np.arange(size_px), np.arange(size_px))
     total = np.zeros((size_px, size_px))
     for dx, dy in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         pixels = np.column_stack([column.ravel() + dx, row.ravel() + dy]).astype(np.float64)
-        total += _grey(lens.unproject(pixels) @ R_world_camera.T, wall_turns_deg, up_m).reshape(total.shape) / 4
+        rays = lens.unproject(pixels).reshape(size_px, size_px, 3) @ np.swapaxes(turns, 1, 2)
+        total += _grey(rays.reshape(-1, 3) @ R_world_camera.T, wall_turns_deg, up_m).reshape(total.shape) / 4
     total += np.random.default_rng(seed).normal(0.0, noise, total.shape)
     return np.clip(np.round(total), 0, 255).astype(np.uint8)
 

@@ -9,7 +9,7 @@ from streets import LOOKS_DOWN, LOOKS_UP, fisheye, foliage, street
 
 from stages.geometry import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
 from stages.lens import KannalaBrandt
-from stages.messages import Carrier, DroneAttitude, Image
+from stages.messages import Carrier, DroneAttitude, Image, VehicleMotion
 from stages.vp import GreatCircleVp
 
 LENS = fisheye()
@@ -18,8 +18,8 @@ DOWN = Pose(rpy_deg=(180.0, 0.0, -90.0))
 STILL = np.zeros(3)
 
 
-def image(grey, stamp_ns=5, carrier="vehicle"):
-    return Image(stamp_ns=stamp_ns, frame_id=f"camera_{carrier}", grey=grey)
+def image(grey, stamp_ns=5, carrier="vehicle", readout_s=0.0):
+    return Image(stamp_ns=stamp_ns, frame_id=f"camera_{carrier}", grey=grey, readout_s=readout_s)
 
 
 def attitude(R, stamp_ns=5, rate_radps=STILL):
@@ -196,3 +196,43 @@ def test_another_carrier_s_picture_or_attitude_is_refused(level):
         vehicle_vp().on_image(image(level, carrier="drone"))
     with pytest.raises(ValueError, match="attitude is the drone's"):
         vehicle_vp().on_attitude(attitude(np.eye(3)))
+
+
+@pytest.mark.parametrize("rate_dps", [(0.0, 0.0, 60.0), (40.0, -30.0, 20.0)])
+def test_a_rolling_shutter_is_taken_out_by_the_drones_turning(rate_dps):
+    rate = np.radians(rate_dps)
+    rolled = street(LOOKS_DOWN, LENS, up_m=8.0, row_turn=0.03 / 479 * (rate @ LOOKS_DOWN))
+    of = []
+    for readout_s in (0.03, 0.0):
+        vp = drone_vp()
+        vp.on_attitude(attitude(np.eye(3), rate_radps=rate))
+        found = vp.on_image(image(rolled, carrier="drone", readout_s=readout_s))
+        of.append(off_deg(found.direction[:3], np.eye(3)).max())
+    assert of[0] < 0.15
+    assert of[1] > 2 * of[0]
+
+
+def test_a_rolling_shutter_is_taken_out_by_the_vehicles_turning():
+    rate = np.radians([0.0, 0.0, 40.0])
+    rolled = street(LOOKS_UP, LENS, row_turn=0.03 / 479 * (rate @ LOOKS_UP))
+    vp = vehicle_vp()
+    of = []
+    for _ in range(2):
+        found = vp.on_image(image(rolled, stamp_ns=60_000_000, readout_s=0.03))
+        of.append(off_deg(found.direction[:3], np.eye(3)).max())
+        for ms in range(0, 101, 20):
+            R = rotation_z((ms - 60) * 1e-3 * rate[2])
+            vp.on_motion(
+                VehicleMotion(
+                    stamp_ns=ms * 1_000_000, R_start_vehicle=R, xyz_start_m=np.zeros(3), covariance=np.eye(6) * 1e-6
+                )
+            )
+    assert of[1] < 0.2  # as of a picture without any turning
+    assert of[0] > 0.3
+
+
+def test_motion_of_the_vehicle_is_refused_where_the_drone_carries_the_camera():
+    with pytest.raises(ValueError, match="motion is the vehicle's"):
+        drone_vp().on_motion(
+            VehicleMotion(stamp_ns=1, R_start_vehicle=np.eye(3), xyz_start_m=STILL, covariance=np.eye(6))
+        )

@@ -10,7 +10,9 @@ neither holds for ever nor is forgotten at once. The answer is the upper bound, 
 message; with TIMESYNC it is the middle of the two, wrong by at most half the round trip.
 
 A link that delays *every* message by the same time hides that from one-way messages; only TIMESYNC tells.
-A device clock that steps (a reboot) disagrees with the bounds: five disagreements in a row begin anew.
+A device clock that steps (a reboot) disagrees with the bounds: five disagreements in a row begin anew. Messages that
+waited in a line that stood still disagree, too, but their times go on from those before: they tell nothing, unless
+that lasts for longer than a line's buffers do.
 
 Source: ours; https://mavlink.io/en/services/timesync.html for the exchange.
 """
@@ -18,6 +20,7 @@ Source: ours; https://mavlink.io/en/services/timesync.html for the exchange.
 from __future__ import annotations
 
 DISAGREEMENTS = 5  # in a row, then the device's clock was set and not the message damaged
+BACKLOG_NS = 10_000_000_000  # what waited is through by then: who is still as late was off, or has another clock now
 MAX_ROUND_TRIP_NS = 1_000_000_000  # a slower TIMESYNC reply tells nothing of use
 
 
@@ -31,7 +34,9 @@ class DeviceClock:
         self._upper_ns: float | None = None  # offset bounds - base, as they were at host time _at_ns
         self._lower_ns: float | None = None
         self._at_ns = 0
+        self._newest_ns = 0  # device time, of those believed
         self._disagreed = 0
+        self._disagreed_at_ns = 0  # the first of them, host
         self.restarts = 0
         """Times the device's clock began anew."""
         self.round_trips = 0
@@ -59,13 +64,16 @@ class DeviceClock:
         self._age(arrival_ns)
         late_ns = arrival_ns - device_ns - self._base_ns
         if self._upper_ns is None or abs(late_ns - self._upper_ns) > self._jump_ns:
+            if self._disagreed == 0:
+                self._disagreed_at_ns = arrival_ns
             self._disagreed += 1
-            if self._disagreed < DISAGREEMENTS:
+            if self._disagreed < DISAGREEMENTS or self._waited(device_ns, late_ns, arrival_ns):
                 return None
             self.restarts += 1
             self._begin(arrival_ns - device_ns, arrival_ns)
             late_ns = 0
         self._disagreed = 0
+        self._newest_ns = max(self._newest_ns, device_ns)
         self._tighten(upper_ns=late_ns)
         return min(device_ns + (self.offset_ns or 0), arrival_ns)
 
@@ -79,9 +87,15 @@ class DeviceClock:
         self.round_trips += 1
         return True
 
+    def _waited(self, device_ns: int, late_ns: float, arrival_ns: int) -> bool:
+        """Whether a message too late for the bounds may be an old one of a clock that has not begun anew."""
+        late = self._upper_ns is not None and late_ns > self._upper_ns
+        goes_on = device_ns > self._newest_ns - self._jump_ns
+        return late and goes_on and arrival_ns - self._disagreed_at_ns < BACKLOG_NS
+
     def _begin(self, offset_ns: int, arrival_ns: int) -> None:
         self._base_ns, self._upper_ns, self._lower_ns, self._at_ns = offset_ns, 0.0, None, arrival_ns
-        self._disagreed = 0
+        self._disagreed = self._newest_ns = 0
 
     def _age(self, arrival_ns: int) -> None:
         slack = self._drift * max(arrival_ns - self._at_ns, 0)

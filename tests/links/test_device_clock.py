@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from links.device_clock import DISAGREEMENTS, DeviceClock
+from links.device_clock import BACKLOG_NS, DISAGREEMENTS, DeviceClock
 
 MS, S = 1_000_000, 1_000_000_000
 HOST0 = 1_748_773_230 * S
@@ -89,6 +89,29 @@ def test_one_wild_time_is_refused_and_a_reboot_begins_anew():
     stamps = [clock.read(i * 100 * MS, HOST0 + 2 * S + i * 100 * MS + 5 * MS) for i in range(8)]
     assert [s is None for s in stamps] == [True] * (DISAGREEMENTS - 1) + [False] * (8 - DISAGREEMENTS + 1)
     assert stamps[-1] == HOST0 + 2 * S + 705 * MS
+    assert clock.restarts == 1
+
+
+def test_what_waited_longer_than_the_jump_limit_is_never_stamped_as_new():
+    clock = DeviceClock()
+    for i in range(10):
+        clock.read(_device(HOST0 + i * 100 * MS), HOST0 + i * 100 * MS + 5 * MS)
+    end = HOST0 + 9 * S  # the line stood still for 8 s; what was sent meanwhile comes at once
+    for i in range(80):
+        said = HOST0 + S + i * 100 * MS
+        stamp = clock.read(_device(said), end + i * MS)
+        assert stamp is None or abs(stamp - said) < 10 * MS
+    assert clock.read(_device(end + S), end + S + 5 * MS) == pytest.approx(end + S + 5 * MS, abs=2 * MS)
+    assert clock.restarts == 0
+
+
+def test_a_device_that_was_off_for_longer_than_it_had_been_on_begins_anew_in_a_while():
+    clock = DeviceClock()
+    clock.read(3 * S, HOST0)
+    stamps = [clock.read(4 * S + i * 100 * MS, HOST0 + 60 * S + i * 100 * MS) for i in range(150)]
+    waited = BACKLOG_NS // (100 * MS)
+    assert [s is None for s in stamps] == [True] * waited + [False] * (150 - waited)
+    assert stamps[-1] == HOST0 + 60 * S + 149 * 100 * MS
     assert clock.restarts == 1
 
 

@@ -191,6 +191,17 @@ def test_a_stamp_in_milliseconds_is_taken_in_their_middle_and_never_after_arriva
     assert late.stamp_ns == HOST0 + 30 * MS + MS // 2
 
 
+def test_after_a_long_stall_of_the_line_what_waited_is_not_told_as_true_now():
+    sender, link = Sender(), Autopilot()
+    for i in range(50):
+        link.decode(record(sender.attitude(20 * i), 20.0 * i))
+    for i in range(50, 400):  # 7 s of them come together
+        message = link.decode(record(sender.attitude(20 * i), 8000.0 + 0.1 * i))
+        assert message is None or abs(message.stamp_ns - HOST0 - 20 * i * MS) < 10 * MS
+    assert link.counters["clock restarts"] == 0
+    assert link.decode(record(sender.attitude(8100), 8100.0)) is not None
+
+
 def test_missing_frames_are_counted_over_the_wrap_of_the_number():
     sender, link = Sender(), Autopilot()
     for i in range(600):

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 STEP_NS = 1_000_000  # wall against monotonic since the call before; NTP slews by at most 0.5 ms in a second
 PROMPT_NS, LOOKS = 20_000, 5  # two clocks read together
-MAX_AGE_NS = 1_000_000_000  # a stamp further back says nothing: no socket's buffer holds that much
+MAX_AGE_NS = 60_000_000_000  # a stamp further back says nothing; at 20 Hz a socket's buffer of 256 holds 13 s
 
 
 class HostTime:

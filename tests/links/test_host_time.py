@@ -53,6 +53,16 @@ def test_a_kernel_stamp_keeps_its_age(clocks, host):
     assert host.from_wall_ns(stamp) == host.now_ns() - 3 * MS
 
 
+def test_what_waited_while_the_process_stood_still_keeps_its_age(clocks, host):
+    """20 poses a second fill a socket's buffer in 13 s; stamped as of now they put the vehicle where it was."""
+    host.from_wall_ns(clocks.wall())
+    stamps = []
+    for _ in range(256):
+        clocks.monotonic_ns += 50 * MS
+        stamps.append((clocks.wall(), host.now_ns()))
+    assert [host.from_wall_ns(wall_ns) for wall_ns, _ in stamps] == [host_ns for _, host_ns in stamps]
+
+
 @pytest.mark.parametrize("step_ns", [3_600_000 * MS, -3_600_000 * MS, 300 * MS, -40 * MS, 2 * MS])
 def test_a_stamp_from_before_the_clock_was_set_is_taken_as_now_and_later_ones_are_right_again(clocks, host, step_ns):
     clocks.monotonic_ns += 20 * MS

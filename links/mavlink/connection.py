@@ -62,6 +62,7 @@ class Connection(Protocol):
     datagrams: bool
     reconnects: int
     foreign: int  # datagrams from others, not read
+    stalls: int  # times it stood still and was dropped
     trouble: str | None  # in words, while it is down
 
     def receive(self, timeout_s: float) -> tuple[bytes, Source_] | None:
@@ -86,7 +87,7 @@ class Udp:
     trouble: str | None = None
 
     def __init__(self, endpoint: Endpoint, sender: IPv4Address | None) -> None:
-        self.reconnects = self.foreign = 0
+        self.reconnects = self.foreign = self.stalls = 0
         self._only = None if sender is None else str(sender)
         self._peer: Source_ | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

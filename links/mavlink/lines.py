@@ -1,9 +1,12 @@
 """TCP and serial lines to the autopilot: byte streams that are opened again when they are gone.
 
 Sending never waits. What a slow line has not taken yet is not added to: the frame is dropped and the next pose is
-newer. A line that is gone is tried again, more slowly each time up to 2 s.
+newer. A line that is gone is tried again, more slowly each time up to 2 s. A line that has kept a frame for half a
+second stands still; it is dropped with what is in it, so that no pose arrives later as if it were of now. What the
+other side's system has taken and its program has not read is out of our hands.
 
-Source: ours; tty_ioctl(4) TIOCOUTQ, tcp(7) SIOCOUTQ for what a line has not taken yet; pyserial sets up the device.
+Source: ours; tty_ioctl(4) TIOCOUTQ, tcp(7) SIOCOUTQ for what a line has not taken yet; socket(7) SO_LINGER; pyserial
+sets up the device.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import struct
 import termios
 import threading
 import time
+from collections import deque
 from ipaddress import IPv4Address
 from typing import Any, Protocol
 
@@ -27,7 +31,9 @@ CHUNK_BYTES = 4096
 TCP_BACKLOG_BYTES, SERIAL_BACKLOG_BYTES = 4096, 512  # not sent yet: at 921600 baud 512 bytes are 6 ms
 CONNECT_S, RECONNECT_S = 2.0, 0.4  # TCP: the first time, and while a listener may be waiting to be closed
 CLOSE_S = 0.1
+THROWN_AWAY = struct.pack("ii", 1, 0)  # struct linger: closing ends it at once
 RETRY_S = (0.1, 2.0)  # first and last wait before the next try
+STALL_S = 0.5  # ArduPilot takes what comes later for half a second old (JitterCorrection), whatever its time says
 
 
 def open_connection(endpoint: Endpoint, sender: IPv4Address | None = None) -> Connection:
@@ -70,7 +76,7 @@ class StreamConnection:
     datagrams = False
 
     def __init__(self, line: Line) -> None:
-        self.reconnects = self.foreign = 0
+        self.reconnects = self.foreign = self.stalls = 0
         self._line = line
         self.trouble: str | None = None
         self._up = True
@@ -78,6 +84,8 @@ class StreamConnection:
         self._reading = threading.Lock()  # held while the line is read, opened or closed
         self._writing = threading.Lock()  # held while it is written or closed; a write never waits
         self._rest = b""  # of a frame that the line took in part
+        self._begun_bytes = 0  # since the line was opened: of all frames, with the rest
+        self._on_way: deque[tuple[int, float]] = deque()  # _begun_bytes after a frame, when it was begun [s]
         self._retry_at_s, self._wait_s = 0.0, RETRY_S[0]
 
     def receive(self, timeout_s: float) -> tuple[bytes, Source_] | None:
@@ -102,6 +110,8 @@ class StreamConnection:
                 if self._rest or self._line.waiting_bytes() > self._line.backlog_bytes:
                     return False
                 self._rest = frame[self._line.write(frame) :]
+                self._begun_bytes += len(frame)
+                self._on_way.append((self._begun_bytes, time.monotonic()))
             except (OSError, ValueError):
                 self._lost()
                 return False
@@ -123,6 +133,12 @@ class StreamConnection:
         if self._closed or (not self._up and not self._again(timeout_s)):
             return b""
         try:
+            if self._stands_still():
+                self.stalls += 1
+                self._lost(
+                    f"took nothing for {STALL_S:g} s and was dropped with what was in it: does anybody read there?"
+                )
+                return b""
             data = self._line.read(timeout_s)
         except (OSError, ValueError):
             self._lost()
@@ -131,10 +147,18 @@ class StreamConnection:
             self._wait_s = RETRY_S[0]
         return data
 
-    def _lost(self) -> None:
+    def _stands_still(self) -> bool:
+        """Whether a frame has waited for too long; looked at by the listener, many times a second."""
+        with self._writing:
+            through_bytes = self._begun_bytes - len(self._rest) - self._line.waiting_bytes()
+            while self._on_way and self._on_way[0][0] <= through_bytes:
+                self._on_way.popleft()
+            return bool(self._on_way) and time.monotonic() - self._on_way[0][1] > STALL_S
+
+    def _lost(self, how: str = "is gone: is it plugged in and powered?") -> None:
         """Only the listener closes and opens: nobody reads from a number that has become another file's."""
-        self._up, self._rest = False, b""
-        self.trouble = f"{self._line.name} is gone: is it plugged in and powered? Trying again"
+        self._up = False
+        self.trouble = f"{self._line.name} {how} Trying again"
         self._retry_at_s = time.monotonic() + self._wait_s
 
     def _again(self, timeout_s: float) -> bool:
@@ -149,6 +173,8 @@ class StreamConnection:
             self._wait_s = min(2 * self._wait_s, RETRY_S[1])
             self._retry_at_s = time.monotonic() + self._wait_s
             return False
+        self._rest, self._begun_bytes = b"", 0  # nobody writes while it is not up
+        self._on_way.clear()
         self._up, self.trouble = not self._closed, None
         self.reconnects += 1
         return True
@@ -177,6 +203,7 @@ class TcpLine:
             ) from None
         self._connect_s = RECONNECT_S
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, THROWN_AWAY)
         self._socket.setblocking(False)
 
     def read(self, timeout_s: float) -> bytes:
@@ -201,7 +228,7 @@ class TcpLine:
         return struct.unpack("i", fcntl.ioctl(self._there(), termios.TIOCOUTQ, b"\0\0\0\0"))[0]
 
     def close(self) -> None:
-        """Disconnect."""
+        """Disconnect. What the other side has not acknowledged is thrown away."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -256,8 +283,10 @@ class SerialLine:
         return self._there().out_waiting
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Let go of the device. What it has not sent is thrown away."""
         if self._port is not None:
+            with contextlib.suppress(OSError, termios.error):
+                self._port.reset_output_buffer()
             with contextlib.suppress(OSError):
                 self._port.close()
             self._port = None

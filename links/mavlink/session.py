@@ -112,6 +112,7 @@ class Session:
             "stray bytes": self._splitter.stray_bytes,
             "from other senders": self.connection.foreign,
             "reconnects": self.connection.reconnects,
+            "dropped: stood still": self.connection.stalls,
         }
 
     @property

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 import pty
+import select
 import socket
+import struct
+import termios
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from ipaddress import IPv4Address
@@ -13,7 +18,7 @@ import pytest
 
 from flow.link import LinkError
 from links.mavlink.connection import Connection, Endpoint, Udp, parse_connection
-from links.mavlink.lines import StreamConnection, open_connection
+from links.mavlink.lines import STALL_S, StreamConnection, open_connection
 
 FRAME = bytes(244)
 
@@ -172,13 +177,70 @@ def test_a_tcp_peer_that_does_not_read_costs_frames_and_never_time():
         peer.close()
 
 
+def small_server() -> socket.socket:
+    """A server whose connections hold little that nobody has read."""
+    server = socket.socket()
+    server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    server.bind(("127.0.0.1", 0))
+    server.listen()
+    return server
+
+
+def read_on(peer: socket.socket) -> int:
+    """Bytes that come until nothing more does."""
+    peer.settimeout(0.3)
+    taken = 0
+    with contextlib.suppress(TimeoutError, ConnectionResetError):
+        while data := peer.recv(65536):
+            taken += len(data)
+    return taken
+
+
+def unread(peer: socket.socket) -> int:
+    """Bytes that the peer's own system holds for it."""
+    return struct.unpack("i", fcntl.ioctl(peer, termios.FIONREAD, bytes(4)))[0]
+
+
+def test_what_a_tcp_peer_has_not_taken_for_half_a_second_never_arrives():
+    with small_server() as server:
+        link = open_connection(Endpoint("tcp", "127.0.0.1", server.getsockname()[1]))
+        peer, _ = server.accept()
+        for _ in range(500):  # 50 poses a second; nobody reads
+            link.send(FRAME)
+            link.receive(0.02)
+            if link.reconnects:
+                break
+        held = unread(peer)
+        assert 0 < read_on(peer) <= held
+        assert (link.stalls, link.reconnects, link.trouble) == (1, 1, None)
+        again, _ = server.accept()
+        assert read_on(again) == 0
+        assert link.send(b"new")
+        assert again.recv(100) == b"new"
+        link.close()
+        peer.close()
+        again.close()
+
+
+def test_what_is_on_its_way_when_tcp_is_closed_is_thrown_away():
+    with small_server() as server:
+        link = open_connection(Endpoint("tcp", "127.0.0.1", server.getsockname()[1]))
+        peer, _ = server.accept()
+        for _ in range(200):
+            link.send(FRAME)
+        link.close()
+        held = unread(peer)
+        assert 0 < read_on(peer) <= held
+        peer.close()
+
+
 class SlowLine:
     """A line that takes a few bytes at a time."""
 
     name, backlog_bytes = "slow", 1000
 
     def __init__(self) -> None:
-        self.room, self.taken = 0, b""
+        self.room, self.taken, self.waiting = 0, b"", 0
 
     def open(self) -> None: ...
 
@@ -192,7 +254,7 @@ class SlowLine:
         return size
 
     def waiting_bytes(self) -> int:
-        return 0
+        return self.waiting
 
     def close(self) -> None: ...
 
@@ -207,6 +269,33 @@ def test_a_frame_begun_is_finished_before_the_next_and_those_between_are_dropped
     line.room = 100
     assert link.send(b"CCCC")
     assert line.taken == b"AAAACCCC"
+
+
+@pytest.mark.parametrize("room", [0, 2, 4])  # we keep all of a frame, or the rest of it, or the line does
+def test_a_line_that_stands_still_is_dropped_and_says_so_and_one_that_moves_is_not(
+    room: int, monkeypatch: pytest.MonkeyPatch
+):
+    now_s = 0.0
+    monkeypatch.setattr("links.mavlink.lines.time.monotonic", lambda: now_s)
+    line = SlowLine()
+    link = StreamConnection(line)
+    for _ in range(100):  # never empty, and never still: each frame is through 0.3 s after it was sent
+        line.room = 4
+        link.send(b"AAAA")
+        line.waiting = 4
+        now_s += 0.3
+        link.receive(0.0)
+        line.waiting = 0
+    assert (link.stalls, link.trouble) == (0, None)
+    line.room = room
+    assert link.send(b"BBBB")
+    line.waiting = 4 if room == 4 else 0
+    now_s += STALL_S + 0.01
+    link.receive(0.0)
+    assert link.stalls == 1
+    assert "took nothing" in (link.trouble or "")
+    line.room = 100
+    assert not link.send(b"CCCC")
 
 
 def test_serial_on_a_pseudo_terminal_carries_all_bytes_both_ways_and_notices_when_it_goes():
@@ -232,6 +321,19 @@ def test_a_serial_line_that_is_full_drops_the_newest_and_does_not_wait():
     taken = sum(link.send(FRAME) for _ in range(1000))
     assert 0 < taken < 1000
     link.close()
+    os.close(theirs)
+    os.close(ours)
+
+
+def test_what_a_serial_line_has_not_sent_when_it_is_closed_is_thrown_away():
+    ours, theirs = pty.openpty()
+    link = open_connection(Endpoint("serial", os.ttyname(theirs), 57600))
+    taken = sum(link.send(FRAME) for _ in range(1000)) * len(FRAME)
+    link.close()
+    arrived = 0
+    while select.select([ours], [], [], 0.3)[0]:
+        arrived += len(os.read(ours, 65536))
+    assert 0 < arrived < taken / 2  # 4095 bytes were the other side's already
     os.close(theirs)
     os.close(ours)
 

@@ -39,6 +39,7 @@ class Refusal(enum.Enum):
     OLD = "too old"
     AHEAD = "from the future"
     NOT_NEWER = "not newer than the one before"
+    NOT_HEARD = "autopilot not heard"
 
 
 class Limits(BaseModel):

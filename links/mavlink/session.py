@@ -1,7 +1,8 @@
 """A live link to one autopilot: hears it, answers it, and sends it what is due, from whichever thread.
 
     received -> frames -> signature, echo -> records for the graph; TIMESYNC requests are answered at once
-    poses    -> gate and speaker -> frames, at once or not at all
+    poses    -> gate and speaker -> frames, at once or not at all; none to an autopilot that has fallen silent: what
+                stands still, it or a bridge before it, would keep them and take them for new when it goes on
     a thread of its own: HEARTBEAT and TIMESYNC once a second, texts, the origin; also when no pose comes
 
 time_usec and TIMESYNC are the host's timeline, microseconds and nanoseconds since 1970. ArduPilot finds the offset to
@@ -29,6 +30,7 @@ from stages.messages import RelativePose
 WAKE_S = 0.05  # how often the housekeeper looks, and a waiting listener whether it was closed
 SILENT_S = 3.0  # three heartbeats
 SECOND_NS = 1_000_000_000
+QUIET_NS = 1_500_000_000  # a heartbeat and a half: it gets no poses
 ONBOARD_CONTROLLER, NO_AUTOPILOT = 18, 8  # MAV_TYPE, MAV_AUTOPILOT_INVALID
 STANDBY, ACTIVE = 3, 4  # MAV_STATE
 SENT_RECORDS = 4096  # kept for the recording until it asks
@@ -61,6 +63,7 @@ class Session:
         self._failure: LinkError | None = None
         self._second_ns = 0
         self._target_ns = now_ns()  # when the autopilot was heard last, or the session began
+        self._heard_on: int | None = None  # the connection, by `reconnects`
         self._keeper = threading.Thread(target=self._keep, name="mavlink housekeeping", daemon=True)
         self._keeper.start()
 
@@ -88,7 +91,7 @@ class Session:
         """Send a pose, or refuse it; never waits for the line."""
         with self._lock:
             now_ns = self._now_ns()
-            messages = self.speaker.speak(pose, now_ns)
+            messages = self.speaker.speak(pose, now_ns, self._hears(now_ns))
             if any([self._send(message) for message in messages]):  # all are tried
                 self.speaker.went_out(pose, now_ns)
             self._say(now_ns)
@@ -155,11 +158,17 @@ class Session:
                 self.connection.answer_to(source)
                 if self._now_ns() - self._target_ns > SILENT_S * SECOND_NS:
                     self.origin.restart()
-                self._target_ns = self._now_ns()
+                self._target_ns, self._heard_on = self._now_ns(), self.connection.reconnects
                 if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                     self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
                 self.origin.hear(message)
         return True
+
+    def _hears(self, now_ns: int) -> bool:
+        """Whether the autopilot takes what is sent now, as it seems. By UDP one that never spoke is sent to, too."""
+        if self._heard_on is None:
+            return self.connection.datagrams
+        return self._heard_on == self.connection.reconnects and now_ns - self._target_ns < QUIET_NS
 
     def _keep(self) -> None:
         while not self._closed.wait(WAKE_S):

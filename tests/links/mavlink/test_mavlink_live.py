@@ -153,6 +153,42 @@ def test_it_stops_loudly_keeps_its_heartbeat_and_resets_when_it_goes_on():
         assert (beat.type, beat.autopilot) == (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
 
 
+def test_an_autopilot_that_stands_still_gets_no_poses_that_it_would_take_for_new_later():
+    with listening() as heard, drone_for(heard, ArduPilotRules()) as drone:
+        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        counter = drone.messages("ODOMETRY")[-1].reset_counter
+        drone.silent = True
+        heard.fly(lambda: heard.link.counters.get("pose held back: autopilot not heard", 0) >= 1, most=150)
+        sent = heard.link.counters["sent: ODOMETRY"]
+        heard.fly(lambda: heard.link.counters["pose held back: autopilot not heard"] >= 25)
+        assert heard.link.counters["sent: ODOMETRY"] == sent
+        drone.silent = False
+        heard.fly(lambda: drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256)
+
+
+def test_by_tcp_poses_go_to_whom_was_heard_on_this_connection():
+    beat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mavlink.MAVLink(None, 1, 1))
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        listening(connection=f"tcp:127.0.0.1:{server.getsockname()[1]}") as heard,
+    ):
+
+        def held() -> int:
+            return heard.link.counters.get("pose held back: autopilot not heard", 0)
+
+        def sent() -> int:
+            return heard.link.counters.get("sent: ODOMETRY", 0)
+
+        for connection in range(2):  # nobody need have accepted it: the system takes what is sent
+            held_before, sent_before = held(), sent()
+            heard.fly(lambda before=held_before: held() >= before + 5)
+            assert sent() == sent_before
+            with server.accept()[0] as peer:
+                peer.sendall(beat)
+                heard.fly(lambda before=sent_before: sent() > before)
+            heard.rest(lambda connection=connection: heard.link.counters["reconnects"] > connection)
+
+
 def test_timesync_is_answered_and_asked_for():
     with listening() as heard, drone_for(heard, Px4Rules()) as drone:
         before_ns = host_time.now_ns()

@@ -32,6 +32,7 @@ SILENT_S = 3.0  # three heartbeats
 SECOND_NS = 1_000_000_000
 QUIET_NS = 1_500_000_000  # a heartbeat and a half: it gets no poses
 ONBOARD_CONTROLLER, NO_AUTOPILOT = 18, 8  # MAV_TYPE, MAV_AUTOPILOT_INVALID
+NOWHERE = -1
 STANDBY, ACTIVE = 3, 4  # MAV_STATE
 SENT_RECORDS = 4096  # kept for the recording until it asks
 
@@ -63,7 +64,7 @@ class Session:
         self._failure: LinkError | None = None
         self._second_ns = 0
         self._target_ns = now_ns()  # when the autopilot was heard last, or the session began
-        self._heard_on: int | None = None  # the connection, by `reconnects`
+        self._heard_on: int | None = None  # the connection, by `reconnects`; NOWHERE: only with an old signature
         self._keeper = threading.Thread(target=self._keep, name="mavlink housekeeping", daemon=True)
         self._keeper.start()
 
@@ -151,7 +152,10 @@ class Session:
             return False
         with self._lock:
             if self._signer is not None and not self._signer.verify(frame):
-                self.counts["not signed with our key"] += 1
+                genuine = self._signer.genuine(frame)
+                self.counts["signed with our key, but not new" if genuine else "not signed with our key"] += 1
+                if genuine and sender == self._target:
+                    self._tell_time(source)
                 return False
             self.counts["received"] += 1
             if sender == self._target:
@@ -163,6 +167,15 @@ class Session:
                     self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
                 self.origin.hear(message)
         return True
+
+    def _tell_time(self, source: tuple[str, int]) -> None:
+        """An autopilot without a clock signs with an old time until it hears ours: heartbeats go to it, poses do not.
+
+        Anybody may send its old frames again, so that one that is heard is not left for them.
+        """
+        if self._heard_on is None or not self._hears(self._now_ns()):
+            self._heard_on = NOWHERE
+            self.connection.answer_to(source)
 
     def _hears(self, now_ns: int) -> bool:
         """Whether the autopilot takes what is sent now, as it seems. By UDP one that never spoke is sent to, too."""

@@ -2,7 +2,8 @@
 
 The key file holds 32 bytes, or 64 hexadecimal digits, and belongs to us alone (mode 0600). A signature carries a time
 that must grow for ever, over restarts and whatever the host's clock says: beside the key, in `<key>.timestamp`, stands
-one that has not been used yet, written a minute ahead so that a crash cannot repeat one.
+one that has not been used yet, written a minute ahead so that a crash cannot repeat one. An autopilot without a clock
+goes on from the time it noted last: it is not heard until it has heard ours, which the session sends it all the same.
 
 Source: https://mavlink.io/en/guide/message_signing.html. Verifying is ours: pymavlink 2.4 notes the time of a frame
 before it has looked at the signature, so that one forged frame silences the true sender.
@@ -80,12 +81,16 @@ class Signer:
             self._reserved = self._used + AHEAD_TICKS
             self._write(self._reserved)
 
-    def verify(self, frame: bytes) -> bool:
-        """Whether a frame is signed with our key and newer than those before it from the same sender."""
+    def genuine(self, frame: bytes) -> bool:
+        """Whether a frame is signed with our key, whatever its time."""
         if not is_signed(frame) or len(frame) <= SIGNATURE_BYTES:
             return False
         wanted = hashlib.sha256(self._secret + frame[:-HASH_AT]).digest()[:HASH_AT]
-        if not hmac.compare_digest(wanted, frame[-HASH_AT:]):
+        return hmac.compare_digest(wanted, frame[-HASH_AT:])
+
+    def verify(self, frame: bytes) -> bool:
+        """Whether a frame is signed with our key and newer than those before it from the same sender."""
+        if not self.genuine(frame):
             return False
         ticks = int.from_bytes(frame[-TIME_AT:-HASH_AT], "little")
         stream = frame[-LINK_AT], header(frame)[0]

@@ -235,6 +235,53 @@ def test_both_sides_of_a_signed_link_understand_each_other_and_unsigned_words_ar
     assert (tmp_path / "key.timestamp").exists()
 
 
+def test_an_autopilot_without_a_clock_is_told_the_time_before_it_is_heard_and_gets_no_poses_until_then(tmp_path: Path):
+    """ArduPilot begins with the time it signed with last, and takes that of a signed frame that is newer."""
+    key = tmp_path / "key"
+    key.write_bytes(b"k" * 32)
+    key.chmod(0o600)
+    drone = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    drone.signing.secret_key, drone.signing.sign_outgoing = b"k" * 32, True
+    drone.signing.timestamp = (host_time.now_ns() - 1_420_070_400 * 10**9) // 10_000 - 864_000 * 100_000  # 10 days ago
+    beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
+    with listening(signing_key=str(key)) as heard, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.bind(("127.0.0.1", 0))
+        udp.settimeout(3.0)
+        udp.sendto(packed(beat, drone), ("127.0.0.1", heard.link.port))
+        heard.rest(lambda: heard.link.counters.get("signed with our key, but not new", 0) == 1)
+        heard.link.on_pose(good_pose(host_time.now_ns()))
+        assert drone.decode(bytearray(udp.recv(300))).get_type() in ("HEARTBEAT", "TIMESYNC", "STATUSTEXT")
+        assert heard.records == []
+        assert heard.link.counters["pose held back: autopilot not heard"] == 1
+        udp.sendto(packed(beat, drone), ("127.0.0.1", heard.link.port))
+        heard.rest(lambda: len(heard.records) == 1)
+        heard.link.on_pose(good_pose(host_time.now_ns()))
+        assert heard.link.counters["sent: ODOMETRY"] == 1
+
+
+def test_an_old_signed_frame_sent_again_does_not_draw_the_poses_away(tmp_path: Path):
+    key = tmp_path / "key"
+    key.write_bytes(b"k" * 32)
+    key.chmod(0o600)
+    drone = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    drone.signing.secret_key, drone.signing.sign_outgoing = b"k" * 32, True
+    drone.signing.timestamp = (host_time.now_ns() - 1_420_070_400 * 10**9) // 10_000
+    frame = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), drone)
+    with (
+        listening(signing_key=str(key)) as heard,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
+        udp.settimeout(3.0)
+        udp.sendto(frame, ("127.0.0.1", heard.link.port))
+        heard.rest(lambda: len(heard.records) == 1)
+        other.sendto(frame, ("127.0.0.1", heard.link.port))
+        heard.rest(lambda: heard.link.counters.get("signed with our key, but not new", 0) == 1)
+        heard.link.on_pose(good_pose(host_time.now_ns()))
+        while parse_frame(udp.recv(300)).get_type() != "ODOMETRY":
+            pass
+
+
 def test_strangers_on_the_port_are_decoded_by_no_one_and_get_no_poses():
     with listening(sender="127.0.0.9") as heard:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:

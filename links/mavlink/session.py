@@ -188,6 +188,8 @@ class Session:
             try:
                 with self._lock:
                     self._tick(self._now_ns())
+                if self._signer is not None:
+                    self._signer.keep()  # not under the lock: the disk may be slow
             except LinkError as error:  # the signature's time cannot be written
                 self._failure = error
                 return
@@ -198,8 +200,6 @@ class Session:
             state = ACTIVE if self.speaker.sending else STANDBY
             self._send(dialect().MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, state, 3))
             self._send(dialect().MAVLink_timesync_message(0, self._now_ns()))
-            if self._signer is not None:
-                self._signer.keep()
         for message in self.origin.due(now_ns):
             if not self._send(message):
                 self.origin.unsent()

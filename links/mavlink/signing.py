@@ -15,6 +15,7 @@ import hashlib
 import hmac
 import os
 import stat
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,8 @@ class Signer:
         self._heard: dict[tuple[int, tuple[int, int]], int] = {}  # (link, sender) -> newest time
         self._link_id = link_id
         self._used = max(self._read_file(), ticks_of(now_ns))
-        self._reserved = 0
+        self._writing = threading.Lock()
+        self._reserved = 0  # stands in the file
         self.keep()
 
     def sign_for(self, sender: Any, now_ns: int) -> None:
@@ -76,10 +78,15 @@ class Signer:
         sender.signing.timestamp = self._used
 
     def keep(self) -> None:
-        """Write the file ahead where it is time; called now and then, so that signing itself need not wait for it."""
-        if self._used + AHEAD_TICKS // 2 >= self._reserved:
-            self._reserved = self._used + AHEAD_TICKS
-            self._write(self._reserved)
+        """Write the file ahead where it is time; called now and then, so that signing itself need not wait for it.
+
+        From any thread: one that waits for a slow disk holds up none that signs, for half a minute.
+        """
+        with self._writing:
+            used = self._used
+            if used + AHEAD_TICKS // 2 >= self._reserved:
+                self._write(used + AHEAD_TICKS)
+                self._reserved = used + AHEAD_TICKS
 
     def genuine(self, frame: bytes) -> bool:
         """Whether a frame is signed with our key, whatever its time."""
@@ -103,7 +110,8 @@ class Signer:
 
     def close(self) -> None:
         """Note the time used last, exactly."""
-        self._write(self._used + 1)
+        with self._writing:
+            self._write(self._used + 1)
 
     def _read_file(self) -> int:
         try:

@@ -22,6 +22,7 @@ from flow.link import LinkError, Record
 from flow.stage import input_ports
 from links import host_time
 from links.mavlink import Autopilot
+from links.mavlink.signing import AHEAD_TICKS
 from links.mavlink.wire import header, packed, parse_frame
 from links.simulated.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot_rules import Fate
@@ -67,6 +68,11 @@ class Heard:
                 return
             self._pause.wait(TICK_S)
         pytest.fail(f"not within {most * TICK_S:g} s: {self.link.counters}")
+
+
+def bound_port(udp: socket.socket) -> int:
+    udp.bind(("127.0.0.1", 0))
+    return udp.getsockname()[1]
 
 
 @contextmanager
@@ -280,6 +286,34 @@ def test_an_old_signed_frame_sent_again_does_not_draw_the_poses_away(tmp_path: P
         heard.link.on_pose(good_pose(host_time.now_ns()))
         while parse_frame(udp.recv(300)).get_type() != "ODOMETRY":
             pass
+
+
+def test_a_disk_that_takes_its_time_with_the_signatures_time_holds_no_pose_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    key = tmp_path / "key"
+    key.write_bytes(b"k" * 32)
+    key.chmod(0o600)
+    writing, release, released = threading.Event(), threading.Event(), list[bool]()
+
+    def slow(descriptor: int) -> None:
+        writing.set()
+        released.append(release.wait(5))
+
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
+        listening(connection=f"udpout:127.0.0.1:{bound_port(udp)}", signing_key=str(key)) as heard,
+    ):
+        session = heard.link._session
+        assert session is not None
+        assert session._signer is not None
+        monkeypatch.setattr("links.mavlink.signing.os.fsync", slow)
+        session._signer._reserved = session._signer._used + AHEAD_TICKS // 4  # it is time to write, not to wait for it
+        heard.rest(writing.is_set)
+        heard.link.on_pose(good_pose(host_time.now_ns()))
+        assert heard.link.counters["sent: ODOMETRY"] == 1
+        release.set()
+    assert all(released)
 
 
 def test_strangers_on_the_port_are_decoded_by_no_one_and_get_no_poses():

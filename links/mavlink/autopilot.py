@@ -94,7 +94,7 @@ class Autopilot(Source):
     @cached_property  # not a private attribute: decoding asks for it at every frame
     def _stream(self) -> FrameStream:
         clock = DeviceClock(self.clock_drift_limit_ppm, round(1e9 * self.clock_jump_limit_s))
-        return FrameStream((self.system_id, self.component_id), clock)
+        return FrameStream((self.system_id, self.component_id), self._own, clock)
 
     def decode(self, record: Record) -> AutopilotMessage | None:
         """The message of one frame; None when it says nothing of use here or is refused (see `counters`)."""

@@ -14,7 +14,7 @@ from typing import Any
 from flow.link import Record
 from links.device_clock import DeviceClock
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
-from links.mavlink.wire import SEQUENCE, header, known, parse_frame
+from links.mavlink.wire import SEQUENCE, header, known, parse_frame, timesync_target
 from stages.messages import AutopilotStatus
 
 HALF_MS_NS = 500_000  # time_boot_ms is cut off, not rounded: on average half a millisecond early
@@ -26,11 +26,11 @@ LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost one
 class FrameStream:
     """Decodes frames in turn; keeps the clock, the sequence and the counts."""
 
-    def __init__(self, sender: tuple[int, int], clock: DeviceClock) -> None:
+    def __init__(self, sender: tuple[int, int], own: tuple[int, int], clock: DeviceClock) -> None:
         self.clock = clock
         self.decoded = self.unused = self.lost = 0
         self.refused: Counter[str] = Counter()
-        self._sender = sender
+        self._sender, self._own = sender, own
         self._sequence: int | None = None
         self._last_ns: dict[str, int] = {}  # stamp of the last message of a kind
         self._late: int | None = None  # a number from the past, seen just before
@@ -52,7 +52,7 @@ class FrameStream:
         if not self._in_sequence(number):
             return self._refuse("repeated or late")
         if kind == "TIMESYNC":
-            return self._timesync(frame, record.arrival_ns)
+            return self._timesync(frame, timesync_target(record.data), record.arrival_ns)
         if kind == "HEARTBEAT":
             self.decoded += 1
             return self._status(frame, record.arrival_ns)
@@ -97,9 +97,12 @@ class FrameStream:
         self._sequence, self._late = number, None
         return True
 
-    def _timesync(self, frame: Any, arrival_ns: int) -> None:
+    def _timesync(self, frame: Any, target: tuple[int, int], arrival_ns: int) -> None:
+        """One that names nobody is taken for ours when its times may be: behind a router it can be another's still."""
         if frame.tc1 == 0:
             self.unused += 1  # the autopilot asks; answering is the sender's part
+        elif any(named not in (0, ours) for named, ours in zip(target, self._own, strict=True)):
+            self._refuse("timesync for another")
         elif not self.clock.round_trip(frame.ts1, frame.tc1, arrival_ns):
             self._refuse("timesync of another's or too slow")
 

@@ -39,6 +39,16 @@ def header(data: bytes) -> tuple[tuple[int, int], int]:
     return (data[at], data[at + 1]), data[at - 1]
 
 
+def timesync_target(data: bytes) -> tuple[int, int]:
+    """(system id, component id) that a TIMESYNC reply names; 0: it names none, as older autopilots do.
+
+    An extension of MAVLink 2 that pymavlink's ArduPilot dialect does not have; zeros at the end are not sent.
+    """
+    payload = data[10 : 10 + data[1]] if data[0] == V2 else b""
+    system, component = payload[16:18].ljust(2, b"\0")
+    return system, component
+
+
 def is_signed(data: bytes) -> bool:
     """Whether a frame says that it ends with a signature."""
     return data[0] == V2 and bool(data[2] & SIGNED)

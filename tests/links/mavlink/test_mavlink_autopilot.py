@@ -202,6 +202,30 @@ def test_after_a_long_stall_of_the_line_what_waited_is_not_told_as_true_now():
     assert link.decode(record(sender.attitude(8100), 8100.0)) is not None
 
 
+def timesync_reply(sender: Sender, asked_ns: int, tc1_ns: int, target: tuple[int, int] | None) -> bytes:
+    """A reply with the target that newer autopilots add: an extension, which our dialect does not know."""
+    frame = sender.frame(mavlink.MAVLink_timesync_message(tc1_ns, asked_ns))
+    if target is None:
+        return frame
+    payload = frame[10:-2].ljust(16, b"\0") + bytes(target)
+    body = bytes([len(payload)]) + frame[2:10] + payload
+    crc = mavlink.x25crc(bytearray(body + bytes([mavlink.MAVLink_timesync_message.crc_extra]))).crc
+    return frame[:1] + body + crc.to_bytes(2, "little")
+
+
+@pytest.mark.parametrize(
+    ("target", "used"), [(None, 1), ((0, 0), 1), ((1, 197), 1), ((1, 0), 1), ((1, 191), 0), ((255, 190), 0)]
+)
+def test_a_timesync_reply_that_names_another_is_not_ours(target: tuple[int, int] | None, used: int):
+    sender, link = Sender(), Autopilot()
+    link.decode(record(sender.attitude(7000)))
+    reply = timesync_reply(sender, HOST0 + 5 * MS, 7_010 * MS, target)
+    assert link.decode(record(reply, 20.0)) is None
+    assert link.counters["timesync replies"] == used
+    assert link.counters.get("refused: timesync for another", 0) == 1 - used
+    assert link.counters["lost"] == 0
+
+
 def test_missing_frames_are_counted_over_the_wrap_of_the_number():
     sender, link = Sender(), Autopilot()
     for i in range(600):

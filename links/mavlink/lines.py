@@ -28,7 +28,7 @@ from flow.link import LinkError
 from links.mavlink.connection import Connection, Endpoint, Source_, Udp
 
 CHUNK_BYTES = 4096
-TCP_BACKLOG_BYTES, SERIAL_BACKLOG_BYTES = 4096, 512  # not sent yet: at 921600 baud 512 bytes are 6 ms
+TCP_BACKLOG_BYTES, SERIAL_BACKLOG_BYTES = 2048, 512  # not through yet: .3 s at 64 kbit/s; at 921600 baud 512 are 6 ms
 CONNECT_S, RECONNECT_S = 2.0, 0.4  # TCP: the first time, and while a listener may be waiting to be closed
 CLOSE_S = 0.1
 THROWN_AWAY = struct.pack("ii", 1, 0)  # struct linger: closing ends it at once

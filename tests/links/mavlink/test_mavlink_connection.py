@@ -18,7 +18,7 @@ import pytest
 
 from flow.link import LinkError
 from links.mavlink.connection import Connection, Endpoint, Udp, parse_connection
-from links.mavlink.lines import STALL_S, StreamConnection, open_connection
+from links.mavlink.lines import STALL_S, TCP_BACKLOG_BYTES, StreamConnection, open_connection
 
 FRAME = bytes(244)
 
@@ -220,6 +220,10 @@ def test_what_a_tcp_peer_has_not_taken_for_half_a_second_never_arrives():
         link.close()
         peer.close()
         again.close()
+
+
+def test_what_may_wait_in_tcp_is_through_at_64_kbit_per_second_before_the_line_counts_as_standing_still():
+    assert TCP_BACKLOG_BYTES + len(FRAME) < STALL_S * 64_000 / 8
 
 
 def test_what_is_on_its_way_when_tcp_is_closed_is_thrown_away():

@@ -5,7 +5,8 @@
     tcp:127.0.0.1:5760           connect to it
     serial:/dev/ttyUSB0:921600   baud rate after the device
 
-Sending never waits. UDP is here, TCP and serial are in `lines.py`.
+Sending never waits, and little of what was sent waits for the line: a pose that comes late is taken for new. UDP is
+here, TCP and serial are in `lines.py`.
 
 Source: ours; mavutil's names for connections. mavutil's own connections answer whoever spoke last, wait while they
 reconnect and print.
@@ -22,6 +23,7 @@ from typing import Literal, Protocol
 from flow.link import LinkError
 
 DATAGRAM_BYTES = 2048
+UDP_BACKLOG_BYTES = 4096  # Linux doubles it: some six frames may wait for a slow radio, or for who does not answer ARP
 DEFAULT_BAUD = 921_600
 
 Source_ = tuple[str, int]
@@ -91,6 +93,7 @@ class Udp:
         self._only = None if sender is None else str(sender)
         self._peer: Source_ | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, UDP_BACKLOG_BYTES)
         try:
             if endpoint.kind == "udpin":
                 self._socket.bind((endpoint.host, endpoint.port))

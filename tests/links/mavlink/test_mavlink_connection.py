@@ -9,6 +9,8 @@ import pty
 import select
 import socket
 import struct
+import subprocess
+import sys
 import termios
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +23,17 @@ from links.mavlink.connection import Connection, Endpoint, Udp, parse_connection
 from links.mavlink.lines import STALL_S, TCP_BACKLOG_BYTES, StreamConnection, open_connection
 
 FRAME = bytes(244)
+UNSHARE = ("unshare", "-n") if os.geteuid() == 0 else ("unshare", "-rn")
+OWN_NETWORK = "ip link add grd0 type veth peer grd1 && ip link set grd0 up && ip link set grd1 up"
+
+
+def own_network() -> bool:
+    """Whether this host lets us have a network of our own, with a line to nobody."""
+    try:
+        run = subprocess.run([*UNSHARE, "sh", "-c", OWN_NETWORK], capture_output=True, check=False)
+    except FileNotFoundError:
+        return False
+    return run.returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -100,6 +113,20 @@ def test_udp_out_hears_nobody_but_whom_it_sends_to_and_bears_a_closed_port():
         link.send(b"pose")  # refused by the kernel now and then: nobody is there
         assert link.receive(0.01) is None
     link.close()
+
+
+SLOW_NETWORK = """
+from links.mavlink.connection import Endpoint, Udp
+link = Udp(Endpoint("udpout", "10.9.9.2", 14550), None)
+print(sum(link.send(bytes(244)) for _ in range(500)))
+"""
+
+
+@pytest.mark.skipif(not own_network(), reason="needs a network namespace of its own (unshare, ip)")
+def test_few_datagrams_wait_for_a_host_that_does_not_answer():
+    commands = f"{OWN_NETWORK} && ip addr add 10.9.9.1/24 dev grd0 && {sys.executable} -c '{SLOW_NETWORK}'"
+    run = subprocess.run([*UNSHARE, "sh", "-c", commands], capture_output=True, text=True, check=True)
+    assert 3 <= int(run.stdout) <= 10  # of 500; some 160 waited, 3 s of poses, in a buffer of the usual size
 
 
 def test_a_port_in_use_says_what_to_check():

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from flow.edge import Edge
-from flow.incidents import Incident
 from flow.message import Message, message
 from flow.metrics import Latency
 from flow.replay import RunReport
@@ -69,7 +68,6 @@ class LiveReport(RunReport):
     failures: dict[str, int] = field(default_factory=dict[str, int])
     off: list[str] = field(default_factory=list[str])  # stages that take nothing any more, because they raised
     tap_drops: dict[str, int] = field(default_factory=dict[str, int])
-    incidents: list[Incident] = field(default_factory=list[Incident])
     stopped_by: str | None = None  # a stage whose on_error stopped the run
 
     @property

@@ -4,6 +4,9 @@ An event is keyed by (arrival, rank, port, sequence): arrival of the record that
 it (producers before consumers), index of the port, and one running number. Two replays of one recording take the same
 steps in the same order, so their messages hash to the same value.
 
+A record that a source cannot decode (`LinkError`) is told and left out, as in a live run. Where a source gave nothing
+else in the whole recording, this is not its recording, and the replay ends with that error.
+
 Source: ours; after openpilot's process replay.
 """
 
@@ -17,7 +20,8 @@ from time import perf_counter_ns
 from typing import Any
 
 from flow.graph import Graph
-from flow.link import RUN_TOPICS, Record, Source, Tap
+from flow.incidents import Incident, Incidents
+from flow.link import RUN_TOPICS, LinkError, Record, Source, Tap
 from flow.message import Message
 from flow.metrics import Latency
 from flow.ports import Output, admit, call
@@ -43,6 +47,7 @@ class RunReport:
     messages: dict[str, int] = field(default_factory=dict[str, int])  # output -> how many
     unwired_topics: Counter[str] = field(default_factory=Counter[str])  # records that no source takes
     nodes: dict[str, NodeReport] = field(default_factory=dict[str, NodeReport])
+    incidents: list[Incident] = field(default_factory=list[Incident])
 
 
 class _Port:
@@ -75,6 +80,8 @@ class Replay:
         self._taps, self._strict = tuple(taps), strict
         self._heap: list[tuple[int, int, int, int, _Port, Any]] = []
         self._sequence = 0
+        self._incidents = Incidents(lambda: self.report.last_ns)
+        self._refusals: dict[str, LinkError] = {}  # by source, the first of each
         self.nodes: dict[str, Node] = {spec.name: spec.build() for spec in graph.nodes.values()}
         self._outputs: dict[str, dict[type[Message], Output[_Port]]] = {}
         for name, node in self.nodes.items():
@@ -111,31 +118,48 @@ class Replay:
             if not record.topic.startswith(RUN_TOPICS):
                 report.unwired_topics[record.topic] += 1
             return
-        self._call(port, record.arrival_ns, record)
+        try:
+            given = self._run(port, record.arrival_ns, record)
+        except LinkError as error:
+            source = port.name.partition(".")[0]
+            self._refusals.setdefault(source, error)
+            self._incidents.report(source, str(error))
+            return
+        self._send(port, record.arrival_ns, given)
         heap = self._heap
         while heap:
             arrival_ns, _, _, _, port, message = heappop(heap)
-            self._call(port, arrival_ns, message)
+            self._send(port, arrival_ns, self._run(port, arrival_ns, message))
 
     def finish(self) -> RunReport:
-        """Let every stage give out what it still holds; producers first."""
+        """Let every stage give out what it still holds; producers first. LinkError of a source that gave nothing."""
+        for source, error in self._refusals.items():
+            if not any(output.count for output in self._outputs[source].values()):
+                raise error
         for port in self._finishers:
-            self._call(port, self.report.last_ns, None)
+            last_ns = self.report.last_ns
+            self._send(port, last_ns, self._run(port, last_ns, None))
             while self._heap:
                 arrival_ns, _, _, _, consumer, message = heappop(self._heap)
-                self._call(consumer, arrival_ns, message)
+                self._send(consumer, arrival_ns, self._run(consumer, arrival_ns, message))
         for outputs in self._outputs.values():
             self.report.messages.update({output.name: output.count for output in outputs.values()})
         for node in self.report.nodes.values():
             node.calls = node.compute.count
+        self.report.incidents = self._incidents.all
         return self.report
 
-    def _call(self, port: _Port, arrival_ns: int, message: Any) -> None:
+    def _run(self, port: _Port, arrival_ns: int, message: Any) -> tuple[Message, ...]:
+        """What a port gives for a message."""
         self.report.events += 1
         begin = perf_counter_ns()
-        result = call(port.name, port.handler, message, arrival_ns)
+        given = call(port.name, port.handler, message, arrival_ns)
         port.compute.add(perf_counter_ns() - begin)
-        for item in result:
+        return given
+
+    def _send(self, port: _Port, arrival_ns: int, given: tuple[Message, ...]) -> None:
+        """To all that take what a port gave."""
+        for item in given:
             output = admit(port.name, port.outputs, item, self._strict)
             output.count += 1
             for tap in self._taps:
@@ -146,7 +170,7 @@ class Replay:
 
 
 def replay(graph: Graph, records: Iterable[Record], taps: Sequence[Tap] = (), *, strict: bool = False) -> RunReport:
-    """Run a graph over records sorted by arrival. Taps must be open; the caller closes them. Raises RunError."""
+    """Run a graph over records in order of arrival. Taps must be open; the caller closes them. RunError, LinkError."""
     runner = Replay(graph, taps, strict=strict)
     for record in records:
         runner.feed(record)

@@ -155,6 +155,7 @@ class Rerun:
             report.nodes[name] = NodeReport(step.life.compute.count, step.life.compute)
         for outputs in self._outputs.values():
             report.messages.update({output.name: output.count for output in outputs.values()})
+        report.incidents = self.incidents.all
         return report
 
     @property

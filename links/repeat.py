@@ -53,7 +53,6 @@ def repeat_into(folder: Path, recording: Path, progress: Progress | None = None)
                 live_hash = _hash_of(record.data)
             rerun.feed(record)
         report = rerun.finish()
-        warnings += [str(incident) for incident in rerun.incidents.all]
         warnings += [f"{name}: {n} messages of the live run are not there" for name, n in rerun.left.items()]
         finished = run.finish(report, digest.hexdigest(), truth, warnings)
     if live_hash is None:

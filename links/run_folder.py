@@ -188,10 +188,11 @@ def holds_run(folder: Path, recording: Path, graph: Graph) -> bool:
 
 
 def _remarks(graph: Graph, report: RunReport) -> list[str]:
-    """What the run did not use, so that a silent port is not taken for a quiet sensor; live, what went wrong."""
+    """What went wrong, and in a replay what was not used, so that a silent port is not taken for a quiet sensor."""
+    remarks = [str(incident) for incident in report.incidents]
     if isinstance(report, LiveReport):
-        return [str(incident) for incident in report.incidents]
-    remarks = [f"{count} records on {topic} are wired to nothing" for topic, count in report.unwired_topics.items()]
+        return remarks
+    remarks += [f"{count} records on {topic} are wired to nothing" for topic, count in report.unwired_topics.items()]
     silent = [spec.name for spec in graph.nodes.values() if spec.kind == "links" and report.nodes[spec.name].calls == 0]
     sources = {edge.producer for edge in graph.edges}
     remarks += [f"the recording holds nothing for '{name}'" for name in silent if name in sources]

@@ -104,6 +104,21 @@ def test_a_links_own_error_reaches_the_user_as_it_is(tmp_path):
         replay(graph_of(tmp_path), [Record("/numbers", 1, 1, b"refuse")])
 
 
+def test_what_a_source_refuses_in_mid_recording_is_told_and_the_replay_goes_on(tmp_path):
+    report = replay(graph_of(tmp_path), numbers("refuse", 1, "refuse", "refuse", 2))
+    assert report.messages["numbers.number"] == 2
+    assert [str(i) for i in report.incidents] == ["numbers: no numbers here: is the counter plugged in? (3 times)"]
+
+
+def test_a_tap_that_cannot_work_ends_a_replay(tmp_path):
+    class Broken(Tap):
+        def see(self, output: str, message: Message, arrival_ns: int) -> None:
+            raise LinkError("full")
+
+    with pytest.raises(LinkError, match="full"):
+        replay(graph_of(tmp_path), numbers(1, 2), [Broken()])
+
+
 @pytest.mark.parametrize(
     ("stage", "text"),
     [

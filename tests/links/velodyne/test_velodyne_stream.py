@@ -20,10 +20,19 @@ from hand_built import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flow.graph import load_graph
 from flow.link import LinkError
 from flow.message import array_fields, check_arrays
+from flow.replay import replay
 from links.velodyne import Lidar
 from links.velodyne.refusal import Refusal
+
+SWEEP = """\
+stages:
+  sweep: {use: stages.sweep.Sweep, config: {mount: {turns: false}}, inputs: {firings: lidar.lidar_firings}}
+links:
+  lidar: {use: links.velodyne.Lidar}
+"""
 
 
 def lost_in(records):
@@ -186,6 +195,16 @@ def test_a_hundred_bad_packets_in_a_row_are_an_error_that_gives_the_reasons():
         assert lidar.decode(record(bytes(100))) is None
     with pytest.raises(LinkError, match=r"100 packets in a row.*60 not the VLP-16's product id, 40 not 1206 bytes"):
         lidar.decode(record(bytes(100)))
+
+
+def test_a_recording_with_a_burst_of_bad_packets_is_replayed_to_its_end(tmp_path):
+    (tmp_path / "x.yaml").write_text(SWEEP)
+    good = exact_records(4)
+    report = replay(load_graph(tmp_path / "x.yaml"), [*good[:2], *[record(bytes(1206))] * 250, *good[2:]])
+    assert report.messages["lidar.lidar_firings"] == 4
+    (said,) = report.incidents
+    assert (said.node, said.count) == ("lidar", 2)
+    assert "100 packets in a row are no use" in said.text
 
 
 def test_one_good_packet_ends_a_row_of_bad_ones():

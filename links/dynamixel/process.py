@@ -11,6 +11,7 @@ import select
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import TracebackType
 
@@ -19,6 +20,7 @@ from links.dynamixel import wire
 from links.dynamixel.drive import DriveSettings
 
 ROOT = Path(__file__).resolve().parents[2]  # where `links` lies, also when it is not installed
+ALIVE_S = 0.05  # so often it is told that its readings are taken, at most
 END_S = 1.0  # the process needs some milliseconds to stop the servo
 
 
@@ -30,6 +32,7 @@ class ServoProcess:
     """One running process, from construction to `close`; closing it stops the servo where it is."""
 
     def __init__(self, settings: DriveSettings) -> None:
+        self._alive_s = 0.0  # when it was told last
         self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
         with theirs:
@@ -53,8 +56,8 @@ class ServoProcess:
         """The process's id."""
         return self._process.pid
 
-    def send(self, packet: wire.Goal | wire.Stop) -> bool:
-        """Hand a goal over, or that it shall stop; False when that could not be."""
+    def send(self, packet: wire.Goal | wire.Stop | wire.Alive) -> bool:
+        """Hand a goal over, that it shall stop, or that all is well; False when that could not be."""
         try:
             self._line.send(wire.pack(packet), socket.MSG_DONTWAIT)
         except OSError:
@@ -62,7 +65,14 @@ class ServoProcess:
         return True
 
     def receive(self, timeout_s: float) -> wire.Packet | None:
-        """The next packet, None when none came in time. LinkError with its last words, or ProcessEnded."""
+        """The next packet, None when none came in time. LinkError with its last words, or ProcessEnded.
+
+        Call it again and again: the process stops the servo for a parent that takes nothing any more.
+        """
+        now_s = time.monotonic()
+        if now_s >= self._alive_s + ALIVE_S:
+            self._alive_s = now_s
+            self.send(wire.Alive())
         try:
             if not select.select([self._line], [], [], timeout_s)[0]:
                 return None

@@ -143,7 +143,7 @@ class Servo(Source):
         """Start the servo's process: `with servo.listen() as records`; the end of the context stops the servo.
 
         LinkError when the servo does not answer, or is not one that may be driven. Later faults are mended there and
-        counted; no record comes meanwhile.
+        counted; no record comes meanwhile. While the records are not taken for half a second it goes to no goal.
         """
         closed = threading.Event()
         try:

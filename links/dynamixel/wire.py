@@ -44,6 +44,7 @@ class Health(NamedTuple):
     goals_sent: int
     goals_expired: int  # not reached in time: the servo was told to stay where it was
     goals_lost: int  # came while the servo could not be told
+    parent_hangs: int  # times the servo was told to stay where it was in mid-travel: the parent said nothing any more
     no_reply: int
     damaged: int
     wrong: int  # late or foreign replies, thrown away
@@ -61,7 +62,7 @@ class Health(NamedTuple):
     voltage_mv: int
     temperature_c: int
 
-    layout = struct.Struct("<B21I")
+    layout = struct.Struct("<B22I")
 
 
 class Fatal(NamedTuple):
@@ -78,8 +79,14 @@ class Stop(NamedTuple):
     layout = struct.Struct("<B")
 
 
-Packet = Goal | Reading | Health | Fatal | Stop
-_KINDS: tuple[type[Packet], ...] = (Goal, Reading, Health, Fatal, Stop)
+class Alive(NamedTuple):
+    """To the process: who takes the readings is at work."""
+
+    layout = struct.Struct("<B")
+
+
+Packet = Goal | Reading | Health | Fatal | Stop | Alive
+_KINDS: tuple[type[Packet], ...] = (Goal, Reading, Health, Fatal, Stop, Alive)
 
 
 def pack(packet: Packet) -> bytes:

@@ -2,7 +2,8 @@
 
 Alone in its process nothing holds it up, and when it or its parent dies nothing moves on: the parent's end shows as the
 end of the socket, and the servo is stopped where it is; this process's end shows to the servo as silence, and its bus
-watchdog stops it. A fault ends driving: the servo holds where it is, is read on if it answers (a servo that has let go
+watchdog stops it. A parent that hangs is one that no longer says that it takes the readings (`wire.Alive`): the servo
+stays where it is. A fault ends driving: the servo holds where it is, is read on if it answers (a servo that has let go
 still measures its angle), and is set up again, with growing pauses while that fails.
 
 Source: ours.
@@ -30,6 +31,7 @@ SUPPLY_NS = S_NS  # voltage and temperature
 LOST_NS = 200 * MS_NS  # a servo silent for so long is set up anew
 PAUSE_NS, LONGEST_PAUSE_NS = 100 * MS_NS, 10 * S_NS  # between attempts to reopen, reboot or set up
 STEADY_NS = 10 * S_NS  # driving for so long without a fault: the next fault's pause is the first one again
+HUNG_NS = 500 * MS_NS  # a parent silent for so long is not followed any more; a busy one may be late by some tenths
 STOP_NS = 700 * MS_NS  # for stopping the servo at the end; then its watchdog has done it
 
 
@@ -48,6 +50,7 @@ class Worker:
         self._driving = self._ever = False
         self._goal: wire.Goal | None = None
         self._goal_ends_ns = 0  # 0: nothing to wait for
+        self._heard_ns = time.monotonic_ns()  # when the parent spoke last
         self._halt = False
         self._error = 0
         self._counts: Counter[str] = Counter()
@@ -93,6 +96,7 @@ class Worker:
             if not data:
                 raise ParentGone
             packet = wire.unpack(data)
+            self._heard_ns = time.monotonic_ns()
             if isinstance(packet, wire.Goal):
                 self._counts["goals_lost"] += (self._goal is not None) or not self._driving
                 self._goal, self._halt = (packet if self._driving else None), False
@@ -119,7 +123,9 @@ class Worker:
             self._check(now_ns)
         self._pass_on(measured)
         if self._goal_ends_ns and measured.reply_ns > self._goal_ends_ns:
-            self._give_up(measured)
+            self._give_up(measured, "goals_expired")
+        elif self._goal_ends_ns and now_ns > self._heard_ns + HUNG_NS:
+            self._give_up(measured, "parent_hangs")
         if now_ns - self._supply_ns > SUPPLY_NS:
             self._supply_ns = now_ns
             self._supply = self._drive.supply()
@@ -165,12 +171,12 @@ class Worker:
         travel_s = travel_ticks * mx28.TICK_RAD / (goal.velocity_units * mx28.VELOCITY_UNIT_RADPS)
         return time.monotonic_ns() + round(travel_s * S_NS) + round(self._settings.goal_slack_ms * MS_NS)
 
-    def _give_up(self, measured: Measured) -> None:
-        """The goal's time is over: where it has not been reached, the servo stays where it is."""
+    def _give_up(self, measured: Measured, why: str) -> None:
+        """The goal's time is over, or nobody is there: where it has not been reached, the servo stays where it is."""
         assert self._drive is not None
         if self._driving and abs(measured.position_ticks - self._drive.goal_ticks) > ARRIVED_TICKS:
             self._drive.stop()  # tried again in the next cycle where it fails
-            self._counts["goals_expired"] += 1
+            self._counts[why] += 1
         self._goal_ends_ns = 0
 
     def _check(self, now_ns: int) -> None:
@@ -250,6 +256,7 @@ class Worker:
             goals_sent=counts["goals_sent"],
             goals_expired=counts["goals_expired"],
             goals_lost=counts["goals_lost"],
+            parent_hangs=counts["parent_hangs"],
             no_reply=faults["no reply"],
             damaged=faults["damaged"],
             wrong=faults["late or foreign"],

@@ -340,6 +340,36 @@ def test_when_its_parent_is_killed_the_servo_is_stopped_and_its_process_ends(emu
     eventually(lambda: abs(math.degrees(emulator.position_rad(np.array([time.monotonic_ns()]))[0]) - goal_deg) < 0.2)
 
 
+def test_when_its_parent_hangs_the_servo_stays_where_it_is(emulator):
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, str(emulator.path)], stdout=subprocess.PIPE, text=True)
+    with parent:
+        worker = int(parent.stdout.readline())
+        parent.send_signal(signal.SIGSTOP)
+        try:
+            eventually(lambda: emulator.get(mx28.GOAL_POSITION) * 360 / 4096 < 150)
+            assert emulator.get(mx28.BUS_WATCHDOG) != mx28.WATCHDOG_TRIPPED
+            assert alive(worker)
+        finally:
+            parent.kill()  # a stopped process, too
+    assert emulator.get(mx28.GOAL_POSITION) * 360 / 4096 > 94
+
+
+def test_whoever_takes_no_readings_for_long_is_counted_and_heard_again(emulator):
+    servo = live(emulator)
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(170, 5))
+        time.sleep(1.2)
+        until(records, lambda _: servo.counters["parent_hangs"] == 1)
+        servo.on_goal(goal(120, 20))
+        assert until(records, at(120))
+        time.sleep(1.2)  # nothing is under way any more
+        until(records, lambda _: servo.counters["reads"] > 0)
+        for _ in range(100):
+            next(records)
+    assert servo.counters["parent_hangs"] == 1
+
+
 def refusal(servo):
     with pytest.raises(LinkError) as caught, servo.listen() as records:
         next(records)

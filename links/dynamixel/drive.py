@@ -38,6 +38,7 @@ class DriveSettings:
     servo_id: int
     baud: int
     limit_ticks: tuple[int, int]  # the soft limits, which the servo's own limits must not be narrower than
+    fastest_units: int  # profile velocity of the fastest goal, which the servo's own limit must not be below
     watchdog_ms: int
     reply_timeout_ms: float
     goal_slack_ms: float  # a goal that is not reached so long after it could have been is given up
@@ -175,7 +176,7 @@ class Drive:
                 f"the servo's firmware is version {firmware}; from {mx28.WATCHDOG_FIRMWARE} on it stops by itself when "
                 "its host falls silent. Update it with DYNAMIXEL Wizard"
             )
-        wrong = list(wrong_settings(table, self._settings.limit_ticks))
+        wrong = list(wrong_settings(table, self._settings))
         if wrong and not self._settings.write_settings:
             listed = ", ".join(f"{r.name} ({r.address}) is {r.value(table)}, not {wanted}" for r, wanted in wrong)
             raise SetupError(
@@ -187,7 +188,7 @@ class Drive:
             for register, wanted in wrong:
                 self._bus.write(register, wanted)
             table = self._bus.read(0, mx28.EEPROM_END).data
-            if list(wrong_settings(table, self._settings.limit_ticks)):
+            if list(wrong_settings(table, self._settings)):
                 raise SetupError("the servo did not keep its new settings: is its EEPROM worn out?")
         self._servo_limits = mx28.MIN_POSITION_LIMIT.value(table), mx28.MAX_POSITION_LIMIT.value(table)
 
@@ -202,7 +203,7 @@ class Shutdown(BusError):
         self.error = error
 
 
-def wrong_settings(table: bytes, limit_ticks: tuple[int, int]) -> Iterator[tuple[Register, int]]:
+def wrong_settings(table: bytes, settings: DriveSettings) -> Iterator[tuple[Register, int]]:
     """(register, wanted value) of what is not as it must be in an EEPROM read from address 0 on."""
     wanted = {
         mx28.RETURN_DELAY_TIME: 0,
@@ -210,7 +211,10 @@ def wrong_settings(table: bytes, limit_ticks: tuple[int, int]) -> Iterator[tuple
         mx28.OPERATING_MODE: mx28.POSITION_CONTROL,
     }
     yield from ((register, value) for register, value in wanted.items() if register.value(table) != value)
-    if mx28.MIN_POSITION_LIMIT.value(table) > limit_ticks[0]:
-        yield mx28.MIN_POSITION_LIMIT, limit_ticks[0]
-    if mx28.MAX_POSITION_LIMIT.value(table) < limit_ticks[1]:
-        yield mx28.MAX_POSITION_LIMIT, limit_ticks[1]
+    low_ticks, high_ticks = settings.limit_ticks
+    if mx28.MIN_POSITION_LIMIT.value(table) > low_ticks:
+        yield mx28.MIN_POSITION_LIMIT, low_ticks
+    if mx28.MAX_POSITION_LIMIT.value(table) < high_ticks:
+        yield mx28.MAX_POSITION_LIMIT, high_ticks
+    if mx28.VELOCITY_LIMIT.value(table) < settings.fastest_units:
+        yield mx28.VELOCITY_LIMIT, settings.fastest_units

@@ -204,7 +204,7 @@ class Servo(Source):
             self._counts["goals kept within limits_deg"] += 1
         low_ticks, high_ticks = self._limit_ticks()
         command = goal_command(goal)
-        fastest = max(math.floor(self.speed_limit_rpm / VELOCITY_UNIT_RPM), 1)
+        fastest = self._fastest_units()
         self._counts["goals slowed to speed_limit_rpm"] += command.velocity_units > fastest
         return wire.Goal(min(max(command.position_ticks, low_ticks), high_ticks), min(command.velocity_units, fastest))
 
@@ -212,12 +212,16 @@ class Servo(Source):
         low, high = (math.radians(angle) / TICK_RAD for angle in self.limits_deg)
         return math.ceil(low - 1e-6), min(math.floor(high + 1e-6), STEPS_PER_TURN - 1)
 
+    def _fastest_units(self) -> int:
+        return max(math.floor(self.speed_limit_rpm / VELOCITY_UNIT_RPM), 1)
+
     def _drive_settings(self) -> DriveSettings:
         return DriveSettings(
             port=self.port,
             servo_id=self.servo_id,
             baud=self.baud,
             limit_ticks=self._limit_ticks(),
+            fastest_units=self._fastest_units(),
             watchdog_ms=round(1e3 * self.watchdog_s),
             reply_timeout_ms=1e3 * self.reply_timeout_s,
             goal_slack_ms=1e3 * self.goal_slack_s,

@@ -52,7 +52,7 @@ def test_sdk_alone(benchmark, port):
 
 
 def test_rate_of_the_whole_link(port):
-    settings = DriveSettings(port, 1, BAUD, (0, 2048), 100, 20, 500, 250, 3, False, True)
+    settings = DriveSettings(port, 1, BAUD, (0, 2048), 240, 100, 20, 500, 250, 3, False, True)
     readings, health, goals, begin_s = [], None, 0, time.monotonic()
     with ServoProcess(settings) as process:
         while (now_s := time.monotonic() - begin_s) < 10:

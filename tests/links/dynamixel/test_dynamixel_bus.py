@@ -280,6 +280,7 @@ def settings_of(emulator, **changed):
             "servo_id": 1,
             "baud": BAUD,
             "limit_ticks": (0, 2048),
+            "fastest_units": 240,
             "watchdog_ms": 100,
             "reply_timeout_ms": 30,
             "goal_slack_ms": 500,

@@ -384,6 +384,7 @@ def refusal(servo):
         (mx28.RETURN_DELAY_TIME, 250, r"Return Delay Time \(9\) is 250, not 0.*write_settings: true"),
         (mx28.OPERATING_MODE, 4, r"Operating Mode \(11\) is 4, not 3"),
         (mx28.DRIVE_MODE, 4, r"Drive Mode \(10\) is 4, not 0"),
+        (mx28.VELOCITY_LIMIT, 239, r"Velocity Limit \(44\) is 239, not 240"),
         (mx28.MAX_POSITION_LIMIT, 1500, r"Max Position Limit \(48\) is 1500, not 2048"),
     ],
 )
@@ -398,11 +399,13 @@ def test_a_servo_that_may_not_be_driven_is_an_error_that_says_what_to_change(emu
 def test_with_leave_to_write_its_settings_are_corrected_and_kept(emulator):
     emulator.set(mx28.RETURN_DELAY_TIME, 250)
     emulator.set(mx28.OPERATING_MODE, 4)
+    emulator.set(mx28.VELOCITY_LIMIT, 230)
     emulator.set(mx28.TORQUE_ENABLE, 1)  # a run before was killed
     with live(emulator, write_settings=True).listen() as records:
         next(records)
     assert emulator.get(mx28.RETURN_DELAY_TIME) == 0
     assert emulator.get(mx28.OPERATING_MODE) == 3
+    assert emulator.get(mx28.VELOCITY_LIMIT) == 240
 
 
 def test_no_servo_and_no_port_are_errors_that_say_what_to_check(emulator, tmp_path):

@@ -172,6 +172,32 @@ def test_a_goal_that_is_not_reached_in_time_is_given_up(emulator):
     assert all(at(90)(s) for s in states)  # it does not go on when it could
 
 
+def test_a_goal_that_is_reached_in_time_is_kept_when_its_time_is_over(emulator):
+    servo = live(emulator, goal_slack_s=0.1)
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(100, 55))
+        until(records, at(100))
+        states = [json.loads(next(records).data) for _ in range(100)]  # .4 s
+        until(records, lambda _: servo.counters["reads"] > 100)
+    assert all(at(100)(s) for s in states)
+    assert {round(s["goal_rad"] / mx28.TICK_RAD) for s in states} == {round(math.radians(100) / mx28.TICK_RAD)}
+    assert servo.counters["goals_expired"] == 0
+
+
+def test_a_newer_goal_has_its_own_time(emulator):
+    servo = live(emulator, goal_slack_s=0.4)
+    with servo.listen() as records:
+        next(records)
+        emulator.stall()
+        for position_deg in (100, 101, 100, 101):  # each a moment before the one before it would be given up
+            servo.on_goal(goal(position_deg, 55))
+            states = [json.loads(next(records).data) for _ in range(60)]  # .24 s
+            assert math.degrees(states[-1]["goal_rad"]) == pytest.approx(position_deg, abs=0.1)
+        assert servo.counters["goals_expired"] == 0
+        until(records, lambda s: s["goal_rad"] < math.radians(91))
+
+
 def test_after_an_overload_it_is_rebooted_and_set_up_and_its_angle_is_told_meanwhile(emulator):
     servo = live(emulator)
     with servo.listen() as records:

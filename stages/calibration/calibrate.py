@@ -20,6 +20,7 @@ from stages.calibration.verdict import Finding, Travel, accepted, curve_sigmas, 
 from stages.geometry import Array64, LidarMount
 
 LEAST_TRAVEL_RAD = math.radians(40.0)  # the fan is 30 deg wide: less, and nothing is seen at two angles
+STILL_RAD = math.radians(0.5)  # what the encoder's steps may look like
 FEWEST_RETURNS = 2_000
 FEWEST_PATCHES = 30
 MOVED_M, TURNED_RAD = 0.03, math.radians(0.1)  # over the whole time; less does not matter
@@ -75,16 +76,13 @@ def calibrate(
         raise CannotCalibrate(
             f"the LiDAR returned {len(returns.stamp_ns)} pulses, at least {FEWEST_RETURNS} are needed: was it running?"
         )
+    _check_travel(float(np.ptp(trace.position_rad)))  # first: of a servo that stands, no side of its play is known
     numbers = servo_mount(rig)
     at = servo_at(trace, returns.stamp_ns, numbers, max_gap_s)
     if not np.isfinite(at.position_rad).any():
         raise CannotCalibrate("no pulse of the LiDAR lies between two servo states: were their clocks the same?")
     travel = Travel.of(at.position_rad, at.rate_radps)
-    if travel.angle_rad < LEAST_TRAVEL_RAD:
-        raise CannotCalibrate(
-            f"the servo turned by {math.degrees(travel.angle_rad):.0f} deg only, at least "
-            f"{math.degrees(LEAST_TRAVEL_RAD):.0f} deg are needed: let it sweep, best from end to end and back"
-        )
+    _check_travel(travel.angle_rad)
     if not (travel.both_ways or parked):
         raise CannotCalibrate(
             "the servo turned one way only, which does not show whether the vehicle stood still: sweep there and back, "
@@ -122,6 +120,16 @@ def calibrate(
         patches=patches,
         numbers=written,
     )
+
+
+def _check_travel(angle_rad: float) -> None:
+    """Raise CannotCalibrate when the servo turned too little."""
+    if angle_rad < LEAST_TRAVEL_RAD:
+        turned = f"turned by {math.degrees(angle_rad):.0f} deg only" if angle_rad > STILL_RAD else "stood still"
+        raise CannotCalibrate(
+            f"the servo {turned}, at least {math.degrees(LEAST_TRAVEL_RAD):.0f} deg are needed: record while it "
+            "sweeps, best from end to end and back at two speeds"
+        )
 
 
 def _check_still(

@@ -153,6 +153,15 @@ def test_too_little_travel_is_refused_in_degrees():
         found_in(legs=((80.0, 100.0, SLOW), (100.0, 80.0, FAST)))
 
 
+@pytest.mark.parametrize("steps", [0, 1])
+def test_a_servo_that_stands_still_is_to_be_driven(steps):
+    made = sweep(wrong_mount(), count=8_000)
+    stamp_ns = made.trace.stamp_ns
+    stands_rad = 1.5 + STEP_RAD * np.random.default_rng(1).integers(0, steps + 1, len(stamp_ns))
+    with pytest.raises(CannotCalibrate, match=r"the servo stood still.*record while it sweeps"):
+        calibrate(made.returns, ServoTrace.of(stamp_ns, stands_rad, STEP_RAD), RIG)
+
+
 def test_a_bolted_down_lidar_and_a_silent_servo_are_refused():
     made = sweep(wrong_mount(), count=8_000)
     with pytest.raises(CannotCalibrate, match="bolted down"):

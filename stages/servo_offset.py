@@ -9,7 +9,9 @@ each `every_window`-th is taken.
 
 Told and not applied: people put it into the rig (`servo_time_offset_s`). Nothing is told of a window in which the
 vehicle moved, or the servo did not turn both ways. Play of the gear looks like a delay at one speed: the rig's
-`servo_play_deg` is believed to within `play_sigma_deg`, an error that all windows share; so sigma has a floor.
+`servo_play_deg` is believed to within `play_sigma_deg`. What the rig's numbers may be wrong by, all windows share: that
+part of sigma is kept apart, and no further window makes it smaller. Nor do windows with short, quick moves differ by
+chance alone: while our own aim moved the servo, simulated flights were off by .1 to .5 ms each, hence `floor_s`.
 
 Source: ours; the model is `stages/calibration/servo_mount.py`.
 """
@@ -27,7 +29,17 @@ from flow.stage import Stage
 from stages.calibration.looks import Returns, ServoTrace
 from stages.calibration.parameters import PARAMETERS
 from stages.calibration.servo_mount import ServoMount, servo_mount
-from stages.calibration.solve import COARSE_RAD, FINE_RAD, NAMES, PRIOR, linearise, one_step, sandwich
+from stages.calibration.solve import (
+    COARSE_RAD,
+    FINE_RAD,
+    INFLATION,
+    NAMES,
+    PRIOR,
+    System,
+    linearise,
+    one_step,
+    sandwich,
+)
 from stages.geometry import Array64, LidarMount
 from stages.messages import LidarFirings, ServoOffset, ServoState, VehicleMotion
 
@@ -59,7 +71,7 @@ class ServoClock(Stage):
     both_ways_deg: float = Field(5.0, gt=0)  # so much has to be passed in both directions
     play_sigma_deg: float = Field(0.05, gt=0)  # how well the rig knows the gear's play
     angle_sigma_deg: float = Field(0.05, gt=0)  # and the LiDAR's tilt and the encoder's error
-    floor_s: float = Field(1e-4, gt=0)  # no sigma is told below
+    floor_s: float = Field(3e-4, gt=0)  # no sigma is told below
     moved_m: float = Field(0.03, gt=0)  # a vehicle that moved farther in a window was not parked
     max_servo_gap_s: float = Field(0.1, gt=0)
 
@@ -69,6 +81,7 @@ class ServoClock(Stage):
     _packets: int = PrivateAttr(default=0)
     _offset_s: float = PrivateAttr(default=0.0)  # beyond the rig's
     _variance_s2: float = PrivateAttr(default=START_SIGMA_S**2)
+    _shared_s: float = PrivateAttr(default=0.0)  # sigma of what all windows have in common
     _windows: int = PrivateAttr(default=0)
     _known_ns: int | None = PrivateAttr(default=None)
     _resting_until_ns: int = PrivateAttr(default=0)
@@ -116,7 +129,7 @@ class ServoClock(Stage):
 
     def _told(self, stamp_ns: int, reason: str) -> ServoOffset:
         known = self._windows > 0
-        sigma_s = math.sqrt(self._variance_s2 + self.floor_s**2)
+        sigma_s = math.sqrt(self._variance_s2 + self._shared_s**2 + self.floor_s**2)
         return ServoOffset(
             stamp_ns=stamp_ns,
             offset_s=self.mount.servo_time_offset_s + self._offset_s if known else None,
@@ -143,8 +156,10 @@ class ServoClock(Stage):
             return "too few flat surfaces were seen"
         return self._join(*found)
 
-    def _solve(self, trace: ServoTrace) -> tuple[float, float] | None:
-        """(offset beyond the rig's, sigma) [s] of this window alone; None where too little was seen."""
+    def _solve(self, trace: ServoTrace) -> tuple[float, float, float] | None:
+        """(offset beyond the rig's, its own sigma, and the one it shares with others) [s] of this window; None where
+        too little was seen.
+        """
         hit = [(f, f.range_m > 0) for f in self._firings]
         returns = Returns(
             np.concatenate([f.pulse_stamp_ns[h] for f, h in hit]),
@@ -155,7 +170,7 @@ class ServoClock(Stage):
         x, mount = np.zeros(len(self._prior)), self._rig
         if close:  # from where the others say it is
             x[TIME], mount = self._offset_s, mount.moved({"time": self._offset_s})
-        variance_s2 = math.inf
+        variance_s2, common_s2 = math.inf, 0.0
         for tolerance_rad in (*(COARSE_RAD[2:] if close else COARSE_RAD), FINE_RAD, FINE_RAD):
             system = linearise(returns, trace, mount, x[len(NAMES) :], tolerance_rad, self.max_servo_gap_s)
             if system is None or len(system.patches.first) < FEWEST_PATCHES:
@@ -164,25 +179,41 @@ class ServoClock(Stage):
             x, mount = x + step, mount.moved(dict(zip(NAMES, step.tolist(), strict=False)))
             if tolerance_rad == FINE_RAD:
                 covariance = sandwich(system, returns.stamp_ns[system.chosen], self._prior)
-                variance_s2 = float(covariance[TIME, TIME])
-        return float(x[TIME]), math.sqrt(variance_s2)
+                common_s2 = shared_s2(system, self._prior)
+                variance_s2 = float(covariance[TIME, TIME]) - INFLATION**2 * common_s2
+        return float(x[TIME]), math.sqrt(variance_s2), math.sqrt(common_s2)
 
-    def _join(self, found_s: float, sigma_s: float) -> str:
-        """x <- x + K (z - x), K = P / (P + R), after P <- P + q dt."""
+    def _join(self, found_s: float, own_s: float, shared_s: float) -> str:
+        """x <- x + K (z - x), K = P / (P + R), after P <- P + q dt; P and R without what windows share."""
         now_ns = self._firings[-1].stamp_ns
         if self._known_ns is not None:
             self._variance_s2 += WALK_S**2 * (now_ns - self._known_ns) * 1e-9
         self._known_ns = now_ns
-        said = f"{1e3 * (self.mount.servo_time_offset_s + found_s):.2f} ms, sigma {1e3 * sigma_s:.2f} ms"
-        total_s2 = self._variance_s2 + sigma_s**2
-        if self._windows and (found_s - self._offset_s) ** 2 > OUTLIER**2 * (total_s2 + self.floor_s**2):
+        alone_s, sigma_s = self.mount.servo_time_offset_s + found_s, math.hypot(own_s, shared_s)
+        said = f"{1e3 * alone_s:.2f} ms, sigma {1e3 * sigma_s:.2f} ms"
+        total_s2 = self._variance_s2 + own_s**2
+        if self._windows and (found_s - self._offset_s) ** 2 > OUTLIER**2 * (total_s2 + shared_s**2 + self.floor_s**2):
             self._variance_s2 += (found_s - self._offset_s) ** 2 / OUTLIER**2  # if it stays there it will be believed
             return f"this window disagrees: {said}"
         gain = self._variance_s2 / total_s2
         self._offset_s += gain * (found_s - self._offset_s)
+        self._shared_s += gain * (shared_s - self._shared_s)
         self._variance_s2 *= 1.0 - gain
         self._windows += 1
         return f"this window alone: {said}"
+
+
+def shared_s2(system: System, prior: Array64) -> float:
+    """What of the offset's variance the rig's other numbers bring, which are as wrong in the next window.
+
+    Off by e ~ P^-1 they move the offset by (B P e)_t: variance (B P B)_tt with B = (J^T J / v + P)^-1; the time's own
+    P is none of them.
+    """
+    J, v = system.columns, system.variance_factor
+    others = prior.copy()
+    others[TIME, TIME] = 0.0
+    row = np.linalg.inv(J.T @ J / v + prior)[TIME]
+    return float(row @ others @ row)
 
 
 def both_ways_rad(stamp_ns: np.ndarray, position_rad: Array64) -> float:

@@ -76,7 +76,7 @@ class ServoProcess:
         try:
             if not select.select([self._line], [], [], timeout_s)[0]:
                 return None
-            data = self._line.recv(wire.MAX_BYTES)
+            data = self._received()
         except ConnectionError:
             data = b""
         if not data:
@@ -85,6 +85,13 @@ class ServoProcess:
         if isinstance(packet, wire.Fatal):
             raise LinkError(wire.text_of(packet))
         return packet
+
+    def _received(self) -> bytes:
+        """The next bytes. One that ended without reading all is told first, and its last words wait behind that."""
+        try:
+            return self._line.recv(wire.MAX_BYTES)
+        except ConnectionResetError:
+            return self._line.recv(wire.MAX_BYTES)
 
     def close(self) -> None:
         """End of the line: the process stops the servo and ends; one that hangs is killed."""

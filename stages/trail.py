@@ -3,6 +3,11 @@
 Frame local: the vehicle's own odometry frame (T_local_vehicle = T_start_vehicle). Without VehicleMotion it is the
 vehicle's frame itself: right for a parked vehicle; then what stands still seems to move with a driving one.
 
+The odometry's start frame may jump, as when it is started afresh (vehicle_onward.py says how that is told from a false
+pose). The new one is then laid on where the trail had the vehicle: the local frame goes on, and no jump is a speed.
+
+    T_local_vehicle = T_local_start T_start_vehicle,   T_local_start = T_local_vehicle(t) T_start_vehicle(t)^-1
+
 Source: DESIGN, sweep "ego-motion compensated"; ours.
 """
 
@@ -16,8 +21,8 @@ import numpy as np
 from stages.compiled import compiled
 from stages.geometry import Array64
 from stages.messages import VehicleMotion
-from stages.rotation import exp_rotation, log_rotation, nearly_rotation
-from stages.vehicle_onward import LEAST_SPAN_NS, TRAIL_S, USUAL
+from stages.rotation import exp_rotation, log_rotation, nearest_rotation, nearly_rotation
+from stages.vehicle_onward import LEAST_SPAN_NS, TRAIL_S, USUAL, JumpWatch, leads_to
 
 KEPT = 512
 STEP_NS = 50_000_000  # over which a velocity is taken
@@ -29,7 +34,10 @@ FURTHEST_NS = round(1e9 * TRAIL_S)  # beyond the newest pose
 class VehicleTrail:
     """T_local_vehicle over time: linear between two poses; a little beyond the newest as it went in the last 0.1 s."""
 
-    def __init__(self) -> None:
+    def __init__(self, joined: bool = True) -> None:
+        """`joined`: a start frame that jumped is laid on the one before; else another local frame begins."""
+        self._joined, self._watch = joined, JumpWatch()
+        self._local_start: tuple[Array64, Array64] | None = None  # R, t; None: the local frame is the start frame
         self._poses: deque[tuple[int, Array64, Array64]] = deque(maxlen=KEPT)
         self._onward: tuple[Array64, Array64] | None = None  # see `_went`, since the newest pose
         self._begun_ns = 0  # poses before lie in another frame
@@ -44,16 +52,59 @@ class VehicleTrail:
         """Whether its newest word is not so old that it may be anywhere by now."""
         return bool(self._poses) and stamp_ns - self._poses[-1][0] < STILL_NS
 
-    def add(self, motion: VehicleMotion) -> None:
-        """One more pose; one that is not newer than the last is ignored."""
-        if not self._poses or motion.stamp_ns > self._poses[-1][0]:
-            self._known.clear()
-            self._onward = None
-            self._poses.append((motion.stamp_ns, motion.R_start_vehicle, motion.xyz_start_m))
+    @property
+    def newest_ns(self) -> int | None:
+        """Time of its newest word."""
+        return self._poses[-1][0] if self._poses else None
 
-    def begin_anew(self, stamp_ns: int) -> None:
-        """From this pose on the local frame is another one: how it went before says nothing."""
-        self._begun_ns, self._onward = stamp_ns, None
+    def add(self, motion: VehicleMotion) -> bool:
+        """One more pose. True: what was remembered in the local frame may lie elsewhere from now on.
+
+        One that is not newer than the last is ignored, one that is not where those before lead is left out, until three
+        agree: then the start frame is another one. That is laid on the old one, which is no more than a guess after a
+        silence; where frames are not joined, another begins, and so it does after each silence.
+        """
+        if not self._poses:
+            self._append(motion)
+            return not self._joined
+        if motion.stamp_ns <= self._poses[-1][0]:
+            return False
+        heard = self._joined or self.known_at(motion.stamp_ns)
+        poses = self._watch.hear(motion, heard and self._leads_to(motion))
+        another = len(poses) > 1
+        elsewhere = another and not (self._joined and self.known_at(poses[0].stamp_ns))
+        if another:
+            self._begin_anew(poses[0])
+        for pose in poses:
+            self._append(pose)
+        return elsewhere
+
+    def _leads_to(self, motion: VehicleMotion) -> bool:
+        """Whether a pose is where the ones before lead."""
+        newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self._begun_ns)
+        speed_known = newest_ns - oldest_ns >= TOGETHER_NS
+        straight_on, seconds = self.straight_on(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
+        return leads_to(straight_on, self._local(motion), seconds, speed_known)
+
+    def _local(self, motion: VehicleMotion) -> tuple[Array64, Array64]:
+        """A pose in the local frame."""
+        if self._local_start is None:
+            return motion.R_start_vehicle, motion.xyz_start_m
+        R, t = self._local_start
+        return R @ motion.R_start_vehicle, R @ motion.xyz_start_m + t
+
+    def _append(self, motion: VehicleMotion) -> None:
+        self._known.clear()
+        self._onward = None
+        self._poses.append((motion.stamp_ns, *self._local(motion)))
+
+    def _begin_anew(self, first: VehicleMotion) -> None:
+        """From this pose on the start frame is another one: how it went before says nothing."""
+        if self._joined:
+            R, t = self.at(first.stamp_ns)
+            R_local_start = nearest_rotation(R @ first.R_start_vehicle.T)
+            self._local_start = R_local_start, t - R_local_start @ first.xyz_start_m
+        self._begun_ns = first.stamp_ns
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64]:
         """R_local_vehicle (3, 3) and t_local_vehicle (3,) [m]."""

@@ -11,17 +11,21 @@ Three go on past a word, each as far as an error of its own costs:
     VehicleEgo (ego)            to the next picture, straight on; UNTOLD, and a turn at any usual rate: how it turned is
                                 what its pictures would have told
 
-A word that is farther off than HARD lets it be is false (stages/fuse/motions.py).
+A word that is farther off than HARD lets it be is false, or its start frame has jumped, as when an odometry is started
+afresh: it is left out, and when three such in a row lie on one smooth way, that is the way, in another start frame.
+After seconds of silence HARD lets it be nearly anywhere: a small jump in them is not seen.
 
 Source: ours.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
+from stages.geometry import Array64
 from stages.messages import VehicleMotion
 from stages.rotation import exp_rotation, log_rotation
 
@@ -29,6 +33,10 @@ TRAIL_S = 0.3
 JOINT_S = 1.0
 LEAST_SPAN_NS = 100_000_000  # of the last motion, over which its speed is taken
 MOST_SPAN_NS = 1_000_000_000
+OFF_M, OFF_RAD = 0.25, 0.1  # a word so far off is false, or the start frame has jumped
+FASTEST_MPS, FASTEST_RADPS = 60.0, 2.0  # where no speed is known yet
+AGREE = 3
+Placed = tuple[Array64, Array64]  # R (3, 3), xyz (3,) [m] in one frame
 
 
 @dataclass(frozen=True)
@@ -52,17 +60,58 @@ UNTOLD = MayChange(3.0, 0.5)  # one sigma, over a gap in which anything may begi
 HARD = MayChange(6.0, 1.5)  # no vehicle on the road does much more: full braking, a swerve
 
 
-def along_its_bend(told: list[VehicleMotion], stamp_ns: int) -> VehicleMotion:
+class JumpWatch:
+    """Which words are believed, by whether each is where those before lead."""
+
+    def __init__(self) -> None:
+        self._odd: deque[VehicleMotion] = deque(maxlen=AGREE)  # left out since the newest believed
+
+    def hear(self, motion: VehicleMotion, leads: bool) -> tuple[VehicleMotion, ...]:
+        """What is believed now: the word; nothing yet; or three at once, and the start frame may be another one."""
+        if not leads:
+            self._odd.append(motion)
+            if not _go_on(tuple(self._odd)):
+                return ()
+        believed = (motion,) if leads else tuple(self._odd)
+        self._odd.clear()
+        return believed
+
+
+def leads_to(expected: Placed, told: Placed, seconds: float, speed_known: bool) -> bool:
+    """Whether the vehicle may be there, so long after the last word, which led it to another place."""
+    place_m, turn_rad = OFF_M + HARD.place_m(seconds), OFF_RAD + HARD.turn_rad(seconds)
+    if not speed_known:
+        place_m, turn_rad = place_m + FASTEST_MPS * seconds, turn_rad + FASTEST_RADPS * seconds
+    (R, xyz_m), (R_told, told_m) = expected, told
+    near = float(np.linalg.norm(told_m - xyz_m)) <= place_m
+    return near and float(np.linalg.norm(log_rotation(R.T @ R_told))) <= turn_rad
+
+
+def _go_on(words: tuple[VehicleMotion, ...]) -> bool:
+    """Whether three in a row are of one smooth way: the second step goes on as the first."""
+    if len(words) < AGREE:
+        return False
+    a, b, c = words
+    first_s, second_s = (b.stamp_ns - a.stamp_ns) * 1e-9, (c.stamp_ns - b.stamp_ns) * 1e-9
+    if min(first_s, second_s) <= 0.0:
+        return False
+    share, longer_s = second_s / first_s, max(first_s, second_s)
+    off_m = c.xyz_start_m - b.xyz_start_m - share * (b.xyz_start_m - a.xyz_start_m)
+    turns = log_rotation(a.R_start_vehicle.T @ b.R_start_vehicle), log_rotation(b.R_start_vehicle.T @ c.R_start_vehicle)
+    near = float(np.linalg.norm(off_m)) <= OFF_M + 2.0 * HARD.place_m(longer_s)
+    return near and float(np.linalg.norm(turns[1] - share * turns[0])) <= OFF_RAD + 2.0 * HARD.turn_rad(longer_s)
+
+
+def along_its_bend(told: list[VehicleMotion], stamp_ns: int, until_s: float = JOINT_S) -> VehicleMotion:
     """Where the vehicle is some time after the last word (`told`, oldest first), less sure as UNTOLD says.
 
-    Its speed and turn, in its own axes, are those over the last tenth of a second or more; after JOINT_S it is taken to
-    stand where it is then, and what it is unsure by grows on.
+    Its speed and turn, in its own axes, are those over the last tenth of a second or more; after `until_s` it is taken
+    to stand where it is then, and what it is unsure by grows on.
     """
     last = told[-1]
     untold_s = (stamp_ns - last.stamp_ns) * 1e-9
-    spans_ns = ((last.stamp_ns - m.stamp_ns, m) for m in reversed(told))
-    span_ns, before = next(((span, m) for span, m in spans_ns if span >= LEAST_SPAN_NS), (0, last))
-    share = min(untold_s, JOINT_S) / (span_ns * 1e-9) if 0 < span_ns <= MOST_SPAN_NS else 0.0
+    span_ns, before = _speed_span(told)
+    share = min(untold_s, until_s) / (span_ns * 1e-9) if span_ns else 0.0
     R = last.R_start_vehicle
     turn = log_rotation(np.ascontiguousarray(before.R_start_vehicle.T @ R))
     way_m = exp_rotation(-0.5 * turn) @ before.R_start_vehicle.T @ (last.xyz_start_m - before.xyz_start_m)  # own axes
@@ -73,3 +122,16 @@ def along_its_bend(told: list[VehicleMotion], stamp_ns: int) -> VehicleMotion:
         R_start_vehicle=R @ exp_rotation(share * turn),
         covariance=None if last.covariance is None else last.covariance + unsure,
     )
+
+
+def speed_known(told: list[VehicleMotion]) -> bool:
+    """Whether the words tell a speed."""
+    return _speed_span(told)[0] > 0
+
+
+def _speed_span(told: list[VehicleMotion]) -> tuple[int, VehicleMotion]:
+    """Since which word the speed is taken, and how long before the last that was; 0: no speed is known."""
+    last = told[-1]
+    spans_ns = ((last.stamp_ns - m.stamp_ns, m) for m in reversed(told))
+    span_ns, before = next(((span, m) for span, m in spans_ns if span >= LEAST_SPAN_NS), (0, last))
+    return (span_ns, before) if span_ns <= MOST_SPAN_NS else (0, last)

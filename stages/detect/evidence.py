@@ -77,6 +77,7 @@ class _Now:
     watches: dict[int, _Watch] = field(default_factory=lambda: dict[int, _Watch]())
     refused: Counter[str] = field(default_factory=Counter[str])
     tidied_ns: int = 0
+    elsewhere: bool = False  # all that is remembered, by the vehicle's odometry
     number: int = 0  # of the newest candidate
     start_ns: int | None = None  # of the search not yet reported
     end_ns: int | None = None  # of a pass that is over, not yet reported
@@ -113,7 +114,7 @@ class EvidenceDetect(Stage):
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Where the vehicle is. Without it nothing is taken to move but what rises or sinks, unless `parked` is set."""
-        self._now.trail.add(motion)
+        self._now.elsewhere |= self._now.trail.add(motion)
 
     def on_drone_position(self, position: DroneLocalPosition) -> None:
         """What the drone says of its flight; without it birds and lamps are told by how they fly alone."""
@@ -241,6 +242,8 @@ class EvidenceDetect(Stage):
 
     def _tidy(self, now: _Now, now_ns: int) -> bool:
         """Put away what was not seen for long, sooner what was refused. True when one that was told goes."""
+        if now.elsewhere:
+            return self._forget(now)
         kept = without_twins(c for c in now.bank if now_ns - c.seen_ns < self._kept_ns(c))
         for c in now.bank:
             if now_ns - c.seen_ns >= self._kept_ns(c) and not c.told:
@@ -253,6 +256,15 @@ class EvidenceDetect(Stage):
         gone = len({c.number for c in now.bank if c.told} - {c.number for c in kept}) > 0
         now.bank.keep(kept)
         now.watches = {c.number: now.watches[c.number] for c in kept if c.number in now.watches}
+        return gone
+
+    def _forget(self, now: _Now) -> bool:
+        """Put away all: nobody knows where it lies in the frame that the vehicle's odometry has come back with."""
+        gone = any(c.told for c in now.bank)
+        now.elsewhere, now.standing_m, now.refused_places = False, places_of(()), BigThings()
+        now.bank.keep(())
+        now.standing.clear()
+        now.watches.clear()
         return gone
 
     def _remember(self, now: _Now, c: Candidate) -> None:

@@ -43,10 +43,10 @@ def test_a_word_is_known_until_it_is_so_old_that_the_vehicle_may_be_anywhere():
 
 
 def test_places_between_two_poses_are_linear_in_time():
-    made = trail(motion(0, (0, 0, 0)), motion(10 * MS, (1, 2, 3)), motion(20 * MS, (5, 2, 3)))
-    np.testing.assert_allclose(made.at(START_NS + 5 * MS)[1], (0.5, 1.0, 1.5))
-    np.testing.assert_allclose(made.at(START_NS + 10 * MS)[1], (1, 2, 3))
-    np.testing.assert_allclose(made.at(START_NS + 15 * MS)[1], (3, 2, 3))
+    made = trail(motion(0, (0, 0, 0)), motion(10 * MS, (0.1, 0.2, 0.3)), motion(20 * MS, (0.3, 0.3, 0.5)))
+    np.testing.assert_allclose(made.at(START_NS + 5 * MS)[1], (0.05, 0.1, 0.15))
+    np.testing.assert_allclose(made.at(START_NS + 10 * MS)[1], (0.1, 0.2, 0.3))
+    np.testing.assert_allclose(made.at(START_NS + 15 * MS)[1], (0.2, 0.25, 0.4))
 
 
 def test_turns_between_two_poses_are_rotations_half_way():
@@ -70,7 +70,7 @@ def nearest_rotation(R):
 def test_between_two_poses_it_is_the_rotation_nearest_to_their_mean(turned_deg, share):
     first = rotation_from_rpy_deg((40.0, 20.0, -170.0))
     then = first @ rotation_from_rpy_deg(turned_deg)
-    R, _ = trail(motion(0, (0, 0, 0), first), motion(10 * MS, (0, 0, 0), then)).at(START_NS + int(share * 10 * MS))
+    R, _ = trail(motion(0, (0, 0, 0), first), motion(600 * MS, (0, 0, 0), then)).at(START_NS + int(share * 600 * MS))
     np.testing.assert_allclose(R, nearest_rotation(first + share * (then - first)), atol=1e-6)
     assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-6)
 
@@ -98,11 +98,57 @@ def test_two_words_are_a_speed_when_they_did_not_arrive_together():
 
 
 def test_a_speed_is_taken_in_one_frame_only():
-    made = trail(*(motion(20 * k * MS, (0.1 * k, 0, 0)) for k in range(6)))  # 5 m/s
-    made.begin_anew(START_NS + 120 * MS)
-    for k in range(6, 9):
-        made.add(motion(20 * k * MS, (3 + 0.1 * k, 0, 0)))
+    made = VehicleTrail(joined=False)
+    new = [made.add(motion(20 * k * MS, (0.1 * k + (3 if k >= 6 else 0), 0, 0))) for k in range(9)]  # 5 m/s
+    assert [k for k, another in enumerate(new) if another] == [0, 8]
     np.testing.assert_allclose(made.at(START_NS + 200 * MS)[1], (4, 0, 0))
+
+
+JUMP = rotation_from_rpy_deg((2.0, -3.0, 140.0)), np.array([-30.0, 12.0, 1.0])  # of the start frame
+
+
+def driving(k, jumped=False):
+    """10 m/s and 0.5 rad/s to the left, 20 ms a step."""
+    R, t = rotation_z(0.01 * k), np.array([0.2 * k, 0.001 * k * k, 0.0])
+    return motion(20 * k * MS, JUMP[0] @ t + JUMP[1], JUMP[0] @ R) if jumped else motion(20 * k * MS, t, R)
+
+
+def test_a_start_frame_that_jumps_is_laid_on_the_old_one_and_is_no_speed():
+    made = VehicleTrail()
+    assert not any(made.add(driving(k, jumped=k >= 30)) for k in range(60))
+    for k in range(60):
+        R, t = made.at(driving(k).stamp_ns)
+        np.testing.assert_allclose(t, driving(k).xyz_start_m, atol=0.08)
+        np.testing.assert_allclose(R, driving(k).R_start_vehicle, atol=0.002)
+        speed_mps = np.linalg.norm(made.velocity_mps(driving(k).stamp_ns - STEP_NS))
+        assert k == 0 or speed_mps < np.hypot(10, 0.1 * k) + 0.3
+
+
+def test_while_it_is_not_clear_that_the_start_frame_jumped_the_vehicle_goes_on():
+    made = trail(*(driving(k) for k in range(30)))
+    for k in (30, 31):
+        made.add(driving(k, jumped=True))
+        np.testing.assert_allclose(made.at(driving(k).stamp_ns)[1], driving(k).xyz_start_m, atol=0.05)
+
+
+def test_a_false_pose_is_left_out():
+    made = trail(*(driving(k, jumped=k in (7, 20, 21, 40)) for k in range(50)))
+    for k in range(50):
+        np.testing.assert_allclose(made.at(driving(k).stamp_ns)[1], driving(k).xyz_start_m, atol=0.01)
+
+
+def test_a_fast_vehicles_second_pose_is_no_jump_and_the_first_real_one_after_zeros_is():
+    fast = trail(*(motion(50 * k * MS, (1.5 * k, 0, 0)) for k in range(3)))
+    np.testing.assert_allclose(fast.at(START_NS + 50 * MS)[1], (1.5, 0, 0))
+    zeros = trail(motion(0, (0, 0, 0)), *(motion(50 * k * MS, (500 + 1.5 * k, 0, 0)) for k in range(1, 9)))
+    assert max(abs(zeros.velocity_mps(START_NS + 10 * k * MS)[0]) for k in range(40)) == pytest.approx(30)
+
+
+@pytest.mark.parametrize(("jumped", "elsewhere"), [(False, False), (True, True)])
+def test_what_was_remembered_lies_elsewhere_when_the_start_frame_jumped_in_a_silence(jumped, elsewhere):
+    made = trail(*(driving(k) for k in range(30)))
+    far = [motion(20 * k * MS, (0.2 * k + (500 if jumped else 0), 0, 0)) for k in range(90, 100)]  # 1.2 s later
+    assert any([made.add(one) for one in far]) == elsewhere
 
 
 def test_a_moment_that_was_asked_for_before_is_the_same_until_a_newer_pose_is_known():
@@ -112,8 +158,8 @@ def test_a_moment_that_was_asked_for_before_is_the_same_until_a_newer_pose_is_kn
     np.testing.assert_array_equal(made.at(soon)[1], made.at(soon)[1])
     made.add(motion(50 * MS, (9, 9, 9)))  # older: nothing new
     np.testing.assert_allclose(made.at(soon)[1], (1.5, 0, 0))
-    made.add(motion(200 * MS, (1, 4, 0)))
-    np.testing.assert_allclose(made.at(soon)[1], (1, 2, 0))
+    made.add(motion(200 * MS, (2, 0.2, 0)))
+    np.testing.assert_allclose(made.at(soon)[1], (1.5, 0.1, 0))
 
 
 def test_beyond_the_newest_pose_it_drives_on_for_a_while_and_then_stands():
@@ -150,25 +196,25 @@ def test_before_the_oldest_pose_it_stood_there():
 
 def test_a_pose_that_is_not_newer_is_ignored():
     made = trail(
-        motion(0, (0, 0, 0)), motion(10 * MS, (1, 0, 0)), motion(10 * MS, (9, 9, 9)), motion(5 * MS, (9, 9, 9))
+        motion(0, (0, 0, 0)), motion(10 * MS, (0.1, 0, 0)), motion(10 * MS, (0.2, 0, 0)), motion(5 * MS, (0.2, 0, 0))
     )
-    np.testing.assert_allclose(made.at(START_NS + 10 * MS)[1], (1, 0, 0))
+    np.testing.assert_allclose(made.at(START_NS + 10 * MS)[1], (0.1, 0, 0))
 
 
 def test_memory_is_bounded():
-    made = trail(*(motion(i * MS, (i, 0, 0)) for i in range(3 * KEPT)))
+    made = trail(*(motion(i * MS, (0.01 * i, 0, 0)) for i in range(3 * KEPT)))
     assert len(made._poses) == KEPT
-    np.testing.assert_allclose(made.at(START_NS + (3 * KEPT - 2) * MS)[1], (3 * KEPT - 2, 0, 0))
+    np.testing.assert_allclose(made.at(START_NS + (3 * KEPT - 2) * MS)[1], (0.01 * (3 * KEPT - 2), 0, 0))
     for k in range(2 * KEPT):  # and of the moments that were asked for
         made.at(START_NS + 2 * KEPT * MS + k)
         assert len(made._known) <= KEPT
-    np.testing.assert_allclose(made.at(START_NS + 2 * KEPT * MS)[1], (2 * KEPT, 0, 0))
+    np.testing.assert_allclose(made.at(START_NS + 2 * KEPT * MS)[1], (0.01 * 2 * KEPT, 0, 0))
 
 
 def test_the_vehicles_velocity_is_how_its_places_follow_one_another():
-    made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (0.5, 0, 0)), motion(200 * MS, (0.5, 0.8, 0)))
+    made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (0.5, 0, 0)), motion(200 * MS, (1.0, 0.2, 0)))
     np.testing.assert_allclose(made.velocity_mps(START_NS + 40 * MS), (5, 0, 0), atol=1e-6)
-    np.testing.assert_allclose(made.velocity_mps(START_NS + 140 * MS), (0, 8, 0), atol=1e-6)
+    np.testing.assert_allclose(made.velocity_mps(START_NS + 140 * MS), (5, 2, 0), atol=1e-6)
     np.testing.assert_array_equal(trail().velocity_mps(START_NS), np.zeros(3))
 
 

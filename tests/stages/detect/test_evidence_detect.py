@@ -5,6 +5,7 @@ The skies are made by tests/stages/caster.py; nothing of them went into choosing
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections import Counter
 from itertools import pairwise
@@ -505,6 +506,41 @@ def test_from_a_driving_vehicle_only_its_odometry_tells_what_stands_still(told):
     assert accepted_after_s(detections) == math.inf
     if told:
         assert "it may stand still" in candidates[-1].reasons[0]
+
+
+def jumping(at_s, by_m, silent_until_s=0.0):
+    """What a parked vehicle's odometry tells whose start frame jumps, maybe after a silence."""
+
+    def hear(stage, t_s):
+        if not at_s <= t_s < silent_until_s:
+            jump = motion_at(t_s)
+            stage.on_motion(dataclasses.replace(jump, xyz_start_m=np.asarray(by_m) * (t_s >= at_s)))
+
+    return hear
+
+
+@pytest.mark.parametrize("by_m", [(1.2, 0.5, 0.0), (300.0, -40.0, 0.0)])
+def test_where_the_vehicles_start_frame_jumps_nothing_is_lost_and_what_stands_has_not_moved(by_m):
+    candidates, detections = run(
+        [hanging()], 3.0, drives_mps=None, say=jumping(1.0, by_m), evidence=Evidence(near_alone=0.0)
+    )
+    assert {int(number) for told in candidates for number in told.candidate_id} == {1}
+    assert accepted_after_s(detections) == math.inf
+    assert "it may stand still" in candidates[-1].reasons[0]
+    assert candidates[-1].looks[0] > 12
+    _, detections = run([Drone(MOVING)], 4.0, drives_mps=None, say=jumping(1.0, by_m))
+    assert accepted_after_s(detections) < 3.0
+
+
+def test_where_it_jumped_in_a_silence_what_was_remembered_is_forgotten():
+    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    run(
+        [hanging()], 4.0, looking_away(1.5, 9.0), drives_mps=None, say=jumping(2.0, (300.0, 0.0, 0.0), 3.5), stage=stage
+    )
+    assert len(stage._now.standing) == len(list(stage._now.bank)) == 0
+    stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
+    run([hanging()], 4.0, looking_away(1.5, 9.0), drives_mps=None, say=jumping(2.0, (0.1, 0.0, 0.0), 3.5), stage=stage)
+    assert len(stage._now.standing) == 1
 
 
 def test_what_leaves_is_forgotten():

@@ -58,12 +58,15 @@ def candidate(xyz_m, probability, t_s=0.0, number=1) -> Candidates:
     )
 
 
-def run(things, told, seconds=2.0, drives_mps=(0.0, 0.0, 0.0), **settings):
-    """All the stage says when it is `told` messages at their own times and sees the things."""
+def run(things, told, seconds=2.0, drives_mps=(0.0, 0.0, 0.0), jump=(math.inf, 0.0), **settings):
+    """All the stage says when it is `told` messages at their own times and sees the things.
+
+    `jump`: when the start frame of the vehicle's odometry jumps, and by how many metres on each axis.
+    """
     stage, out, waiting, next_s = HitMissTrack(**settings), [], sorted(told, key=lambda m: m.stamp_ns), 0.0
     for pulses in pulses_seen(things, WATCHING, seconds):
         while any(drives_mps) and at_s(next_s) <= pulses.point_stamp_ns[-1]:
-            place = next_s * np.asarray(drives_mps, dtype=np.float64)
+            place = next_s * np.asarray(drives_mps, dtype=np.float64) + (jump[1] if next_s >= jump[0] else 0.0)
             stage.on_motion(
                 VehicleMotion(stamp_ns=at_s(next_s), xyz_start_m=place, R_start_vehicle=np.eye(3), covariance=None)
             )
@@ -312,6 +315,18 @@ def test_from_a_driving_vehicle_a_drone_that_comes_along_is_kept_by_its_odometry
     fixes = fixes_of(out)
     assert len(fixes) >= 12
     assert np.linalg.norm(errors_m(fixes, way)[4:], axis=1).max() < 0.4
+
+
+@pytest.mark.parametrize("by_m", [1.0, 200.0])
+def test_a_drone_is_kept_where_the_vehicles_start_frame_jumps(by_m):
+    way = still(0.0, 8.0, 10.0)
+    out = run([Drone(way)], [accepted(here(way))], 2.0, drives_mps=(8.0, 0.0, 0.0), jump=(1.0, by_m))
+    fixes = fixes_of(out)
+    assert len(fixes) >= 12
+    assert fixes[-1].stamp_ns > at_s(1.8)
+    assert np.linalg.norm(errors_m(fixes, way)[4:], axis=1).max() < 0.4
+    assert max(np.linalg.norm(f.velocity_vehicle_mps) for f in fixes[4:]) < 1.5
+    assert story(out) == ["TRACKING"]
 
 
 def test_the_velocity_told_is_relative_to_the_vehicle():

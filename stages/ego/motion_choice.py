@@ -8,7 +8,8 @@ source is laid on the old one's end:
 
     T_start_vehicle = T_start_source T_source_vehicle,   T_start_source = T_start_vehicle(t) T_source_vehicle(t)^-1
 
-with t the new source's first stamp, to where the vehicle went on (vehicle_onward.py). The start frame stays that of the
+with t the new source's first stamp, to where the vehicle went on (vehicle_onward.py). So it is, too, where a source's
+own frame jumps: its words are left out until three tell of one smooth way elsewhere. The start frame stays that of the
 first source heard. Consumers take T_start_vehicle for smooth: they never see a jump, but drift.
 
 Source: ours; P V.B for the camera's motion.
@@ -16,6 +17,7 @@ Source: ours; P V.B for the camera's motion.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from enum import Enum
 from typing import ClassVar
@@ -28,7 +30,7 @@ from stages.geometry import Array64, transform
 from stages.messages import VehicleMotion
 from stages.rigid import adjoint
 from stages.rotation import nearest_rotation
-from stages.vehicle_onward import along_its_bend
+from stages.vehicle_onward import JumpWatch, along_its_bend, leads_to, speed_known
 
 SILENT_S = 0.25  # so long no odometry: it is gone
 
@@ -49,6 +51,7 @@ class VehicleMotionChoice(Stage):
 
     _teller: Teller | None = PrivateAttr(default=None)
     _odometry_ns: int | None = PrivateAttr(default=None)
+    _watch: JumpWatch = PrivateAttr(default_factory=JumpWatch)
     _told: deque[VehicleMotion] = PrivateAttr(default_factory=lambda: deque[VehicleMotion](maxlen=64))
     _T_start_source: Array64 = PrivateAttr(default_factory=lambda: np.eye(4))
     _joint: tuple[VehicleMotion, Array64 | None] | None = PrivateAttr(default=None)  # the source's word at the change
@@ -66,21 +69,35 @@ class VehicleMotionChoice(Stage):
         return self._tell(Teller.EGO, motion)
 
     def _tell(self, teller: Teller, motion: VehicleMotion) -> VehicleMotion | None:
-        """None for what is not newer than what was told."""
+        """None for what is not newer than what was told, and for what lies elsewhere."""
         if self._told and motion.stamp_ns <= self._told[-1].stamp_ns:
             return None
-        if teller is not self._teller:
+        if teller is self._teller:
+            believed = self._watch.hear(motion, self._leads_to(motion))
+        else:
+            believed, self._watch, self._teller = (motion,), JumpWatch(), teller
             self._change_to(motion)
-            self._teller = teller
+        if len(believed) > 1:
+            self._change_to(believed[0])
+        self._told.extend(map(self._in_start, believed))
+        return self._told[-1] if believed else None
+
+    def _in_start(self, motion: VehicleMotion) -> VehicleMotion:
+        """A source's word, in the start frame."""
         T = self._T_start_source @ transform(motion.R_start_vehicle, motion.xyz_start_m)
-        told = VehicleMotion(
+        return VehicleMotion(
             stamp_ns=motion.stamp_ns,
             xyz_start_m=T[:3, 3].copy(),
             R_start_vehicle=nearest_rotation(np.ascontiguousarray(T[:3, :3])),
             covariance=self._covariance(motion),
         )
-        self._told.append(told)
-        return told
+
+    def _leads_to(self, motion: VehicleMotion) -> bool:
+        """Whether a word is where those told before lead."""
+        told, last_ns = list(self._told), self._told[-1].stamp_ns
+        there, at = self._in_start(motion), along_its_bend(told, motion.stamp_ns, until_s=math.inf)
+        expected, now = ((m.R_start_vehicle, m.xyz_start_m) for m in (at, there))
+        return leads_to(expected, now, (motion.stamp_ns - last_ns) * 1e-9, speed_known(told))
 
     def _change_to(self, motion: VehicleMotion) -> None:
         """Lay the new source on the end of the old one."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -35,6 +36,7 @@ def word(time_s, T_source_world=None, sigma=0.0):
 
 ELSEWHERE = transform(rotation_z(2.0), np.array([40.0, -7.0, 1.0]))
 ANEW = transform(rotation_z(-1.0), np.array([-3.0, 9.0, 0.0]))
+FAR = transform(rotation_z(-1.0), np.array([-300.0, 90.0, 0.0]))
 
 
 def told(choice, odometry=(), ego=()):
@@ -102,6 +104,44 @@ def test_the_camera_first_then_odometry_keeps_the_cameras_frame():
     errors = np.array([off(m, ELSEWHERE) for m in out])
     assert errors[:, 0].max() < 1e-3
     assert out[-1].stamp_ns > 2.9 * S
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 0.2, 2.0])
+@pytest.mark.parametrize("port", ["odometry", "ego"])
+def test_a_source_whose_own_frame_jumps_leaves_one_path(port, gap_s):
+    step_s = 0.02 if port == "odometry" else 0.2
+    words = [word(t, ELSEWHERE) for t in seconds(0, 3, step_s)]
+    words += [word(t, FAR) for t in seconds(3 + gap_s, 8, step_s)]
+    out = told(VehicleMotionChoice(), **{port: words})
+    errors = np.array([off(m, ELSEWHERE) for m in out])
+    assert errors[:, 0].max() < (5.0 if gap_s == 2.0 else 1e-3)  # after a second nobody knows where it went
+    assert errors[:, 1].max() < (0.5 if gap_s == 2.0 else 1e-3)
+    assert len(words) - len(out) == 2  # are left out
+    assert max(np.linalg.norm(b.xyz_start_m - a.xyz_start_m) for a, b in pairwise(out)) < 4.5
+
+
+def test_an_uncertain_join_makes_its_words_less_sure():
+    choice = VehicleMotionChoice()
+    words = [word(t, sigma=0.01) for t in seconds(0, 1, 0.02)] + [word(t, ANEW, 0.01) for t in seconds(1.4, 2, 0.02)]
+    out = told(choice, odometry=words)
+    place_m = math.hypot(0.01, 0.5 * 3.0 * (1.4 - 0.98) ** 2)
+    assert math.sqrt(out[50].covariance[5, 5]) == pytest.approx(place_m, rel=1e-3)
+
+
+def test_a_false_word_is_left_out():
+    words = [word(t, ANEW if 40 <= k < 42 else None) for k, t in enumerate(seconds(0, 2, 0.02))]
+    out = told(VehicleMotionChoice(), odometry=words)
+    assert len(out) == len(words) - 2
+    assert max(off(m, np.eye(4))[0] for m in out) < 1e-9
+
+
+def test_a_fast_vehicles_odometry_that_was_silent_is_not_taken_for_one_that_jumped():
+    times = [*seconds(0, 1, 0.02), *seconds(3, 4, 0.02)]
+    words = [
+        dataclasses.replace(word(t), xyz_start_m=np.array([30 * t, 0, 0]), R_start_vehicle=np.eye(3)) for t in times
+    ]
+    out = told(VehicleMotionChoice(), odometry=words)
+    assert [m.xyz_start_m[0] for m in out] == pytest.approx([30 * t for t in times])
 
 
 def test_what_is_not_newer_than_what_was_told_is_left_out():

@@ -5,6 +5,9 @@ do not confirm, or a step that the velocity does not, is such a jump: it is take
 local frame as it was first, continued smoothly. With no autopilot the odometry by pictures is chained instead; with
 neither the drone is taken to keep its heading, not better than so many degrees a second.
 
+Between two words it turned and flew evenly, unless they are so far apart that the middle would be invented: there it is
+not known, and what it did over the whole gap is.
+
 Source: ours; DESIGN: R_GD follows 120 deg/s.
 """
 
@@ -24,7 +27,7 @@ from stages.rotation import exp_rotation, log_rotation
 
 KEPT = 1024
 AHEAD_NS = 250_000_000  # beyond its newest word a source is believed this long
-GAP_S = 0.5  # after a longer silence rates and velocity say nothing about a jump
+GAP_S = 0.5  # in a longer silence nobody knows where it was, and after it rates and velocity say nothing about a jump
 JUMP_RAD = math.radians(3.0)
 JUMP_M = 0.3
 DRIFT_RAD2_PER_S = math.radians(0.3) ** 2  # of an attitude: walk
@@ -195,11 +198,17 @@ class AutopilotTrail:
 
 
 def _around(told: deque[_Told], stamp_ns: int) -> tuple[_Told, _Told | None] | None:
-    """The words before and after a time; beyond the newest, for AHEAD_NS, that one and None. None: not known."""
-    if not told or not told[0].stamp_ns <= stamp_ns <= told[-1].stamp_ns + AHEAD_NS:
-        return None
+    """The words before and after a time; beyond the newest and into a gap, for AHEAD_NS, the one before and None.
+
+    None: not known.
+    """
     at = bisect_right(told, stamp_ns, key=lambda word: word.stamp_ns)
-    return told[at - 1], told[at] if at < len(told) else None
+    if at == 0:
+        return None
+    before, after = told[at - 1], told[at] if at < len(told) else None
+    if after is not None and after.stamp_ns - before.stamp_ns <= GAP_S * 1e9:
+        return before, after
+    return (before, None) if stamp_ns - before.stamp_ns <= AHEAD_NS else None
 
 
 class PictureTrail:
@@ -238,7 +247,7 @@ class PictureTrail:
         if at == len(nodes) or at == 0:
             return (*nodes[at - 1][1:3], chain) if at else None
         (t0, R0, v0, chain0), (t1, R1, v1, chain1) = nodes[at - 1], nodes[at]
-        if chain0 != chain1:
+        if chain0 != chain1 or (t0 < stamp_ns < t1 and t1 - t0 > GAP_S * 1e9):
             return None
         share = (stamp_ns - t0) / (t1 - t0)
         variance = v0 + share * (v1 - v0) if share <= 1 else v1 + ((stamp_ns - t1) * 1e-9 * UNKNOWN_RAD_PER_S) ** 2

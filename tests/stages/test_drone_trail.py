@@ -81,6 +81,39 @@ def test_after_silence_a_jump_cannot_be_seen_and_that_is_counted():
     assert (trail.jumps, trail.silences) == (0, 1)
 
 
+def test_in_a_gap_it_is_known_a_little_beyond_its_beginning_alone():
+    """It turned 1.5 rad/s all the time: 6 rad in 4 s of silence, which the shorter way round would make a turn back."""
+    trail = AutopilotTrail()
+    for ms in [*range(0, 400, 20), *range(4400, 4800, 20)]:
+        trail.add_attitude(ms * MS, exp_rotation(ms * 1e-3 * RATE), RATE)
+        trail.add_position(ms * MS, np.array([ms * 1e-3, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(trail.R_own_drone(600 * MS), exp_rotation(0.6 * RATE), atol=1e-9)
+    for ms in (700, 2400, 4399):
+        assert trail.R_own_drone(ms * MS) is None
+        assert trail.place(ms * MS) is None
+        assert trail.velocity_own_mps(ms * MS) is None
+        assert not turn_between(trail, PictureTrail(), 200 * MS, ms * MS).sure
+    np.testing.assert_allclose(trail.R_own_drone(4400 * MS), exp_rotation(4.4 * RATE), atol=1e-9)
+    assert turn_between(trail, PictureTrail(), 200 * MS, 4500 * MS).sure  # over it both ends tell
+
+
+def test_words_half_a_second_apart_tell_of_the_time_between():
+    trail = AutopilotTrail()
+    for ms in range(0, 2000, 500):
+        trail.add_attitude(ms * MS, exp_rotation(ms * 1e-3 * RATE), RATE)
+    np.testing.assert_allclose(trail.R_own_drone(950 * MS), exp_rotation(0.95 * RATE), atol=1e-9)
+
+
+def test_pictures_far_apart_tell_of_the_whole_turn_and_not_of_the_time_between():
+    pictures = PictureTrail()
+    for one in (step(0, 200), step(200, 400), step(400, 2400), step(2400, 2600)):
+        pictures.add(one)
+    assert pictures.at(1400 * MS) is None
+    assert pictures.at(400 * MS) is not None
+    assert pictures.at(2400 * MS) is not None
+    assert turn_between(AutopilotTrail(), pictures, 300 * MS, 2500 * MS).sure
+
+
 def flown(jump_at=None, jump_m=(5.0, 0, 0)) -> AutopilotTrail:
     trail = AutopilotTrail()
     for i in range(30):

@@ -132,6 +132,7 @@ def _catalogue() -> dict[str, Metric]:
         "false and missed",
         ("false_outputs", "false outputs", "", "low"),
         ("false_per_min", "false outputs", "/min", "low"),
+        ("sure_false_outputs", "false by 3+ of their own sigmas", "", "low"),
         ("beyond_1m_share", "outputs off by more than 1 m", "%", "low"),
         ("found_share", "sweeps in which it was found", "%", "high"),
         ("found_when_seen_share", "found, of sweeps with 4+ returns", "%", "high"),

@@ -1,5 +1,8 @@
 """False outputs, false alarms and invented drones.
 
+An output is false by how far it is from the drone alone: a run that states a huge sigma has as many as one that states
+none. Those that are off by many of their own sigmas, too, are counted beside it: nobody was warned of them.
+
 Source: ours; limits in links/evaluation/errors.py.
 """
 
@@ -16,7 +19,7 @@ SILENCE_NS = 1_000_000_000  # a track that says nothing for longer has ended
 
 def false_outputs(judged: Evaluation) -> None:
     """Outputs far from the drone, or where there was none."""
-    keys = ("false_outputs", "false_per_min", "beyond_1m_share")
+    keys = ("false_outputs", "false_per_min", "beyond_1m_share", "sure_false_outputs")
     at, values, limits = judged.at, judged.values, judged.limits
     outputs = len(judged.output.poses)
     if judged.run.no_drone:
@@ -31,22 +34,21 @@ def false_outputs(judged: Evaluation) -> None:
     if not len(at.index) and outputs:
         judged.cannot(no_error(judged, at).note, *keys)
         return
-    limit = np.full(len(at.index), limits.wrong_m)
-    note = ""
-    if at.sigma_m is not None:
-        limit = np.maximum(limit, limits.wrong_sigmas * at.sigma_m)
-    else:
-        note = f"no covariance, so farther than {limits.wrong_m:g} m"
-    false = at.distance_m > limit
-    count = int(np.count_nonzero(false))
-    values["false_outputs"] = Value(float(count), len(at.index), note=note)
+    false = at.distance_m > limits.wrong_m
+    count, note = int(np.count_nonzero(false)), ""
+    values["false_outputs"] = Value(float(count), len(at.index))
     assert judged.span_ns is not None
-    values["false_per_min"] = Value(count / minutes(judged.span_ns), note=note)
-    values["beyond_1m_share"] = share(at.distance_m > limits.wrong_m) if len(at.index) else failure("no output at all")
+    values["false_per_min"] = Value(count / minutes(judged.span_ns))
+    values["beyond_1m_share"] = share(false) if len(at.index) else failure("no output at all")
+    if at.sigma_m is None:
+        judged.cannot(judged.output.why_no_covariance, "sure_false_outputs")
+    else:
+        sure = int(np.count_nonzero(false & (at.distance_m > limits.wrong_sigmas * at.sigma_m)))
+        values["sure_false_outputs"] = Value(float(sure), len(at.index))
+        note = f", {sure} of them by more than {limits.wrong_sigmas:g} of their own sigmas"
     if count:
         judged.findings.append(
-            f"{count} of {len(at.index)} outputs are false: farther than max({limits.wrong_m:g} m, "
-            f"{limits.wrong_sigmas:g} sigma) from the drone"
+            f"{count} of {len(at.index)} outputs are false: farther than {limits.wrong_m:g} m from the drone{note}"
         )
 
 

@@ -58,7 +58,7 @@ class Group:
     right_share: float | None  # mean over the runs
     ever_right: int
     silent: int  # runs without any output
-    mostly_false: int  # runs in which more than half of the outputs are false
+    mostly_false: int  # runs in which more than half of the outputs are false, whatever sigma they state
     hit: tuple[int, int]  # searches with a return of the drone, of all
     seen: tuple[int, int]  # searches with 4 or more returns of the drone, of all
     found: tuple[int, int]  # searches in which the best candidate was the drone, of all
@@ -71,6 +71,7 @@ class Group:
     rmse_m: Spread  # of the outputs of the runs that were right at least once
     inside_95: tuple[int, int]  # outputs whose 95 % ellipsoid holds the truth
     false_per_h: float | None
+    sure_false_per_h: float | None  # of those, beyond three of their own sigmas
 
 
 def parse_by(text: str) -> Key:
@@ -137,12 +138,13 @@ def _group(words: tuple[str, ...], config: str, evaluations: list[Evaluation]) -
         lost=int(sum(lost)) if lost else None,
         rmse_m=spread(was_right, "rmse_m"),
         inside_95=pooled_counts(evaluations, "inside_95_share"),
-        false_per_h=_false_per_h(evaluations),
+        false_per_h=_per_h(evaluations, "false_outputs"),
+        sure_false_per_h=_per_h(evaluations, "sure_false_outputs"),
     )
 
 
-def _false_per_h(evaluations: list[Evaluation]) -> float | None:
-    counted = [(v, e.span_ns) for e in evaluations if (v := _number(e, "false_outputs")) is not None and e.span_ns]
+def _per_h(evaluations: list[Evaluation], key: str) -> float | None:
+    counted = [(v, e.span_ns) for e in evaluations if (v := _number(e, key)) is not None and e.span_ns]
     hours = sum(minutes(span) for _, span in counted) / 60
     return sum(count for count, _ in counted) / hours if counted else None
 

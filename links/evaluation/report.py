@@ -86,9 +86,10 @@ def _how(e: Evaluation) -> str:
         f"to each output's stamp, not over gaps of more than {limits.max_gap_s:g} s. An output counts as present for "
         f"{limits.max_age_s:g} s; <i>right</i> is present and within {limits.wrong_m:g} m; <i>held</i> errors are "
         "taken every 20 ms from the first output on with the last one, however old. A <i>false</i> output is farther "
-        f"than max({limits.wrong_m:g} m, {limits.wrong_sigmas:g} sigma along the error). A sweep found the drone when "
-        "its best detection is that near to where the drone was at any moment of the sweep. In a median a run that "
-        "gave nothing counts as the worst. Latency is not judged: a run's files hold measurement times only.</p>"
+        f"than {limits.wrong_m:g} m, whatever sigma it states, and <i>sure</i> if that is more than "
+        f"{limits.wrong_sigmas:g} of it along the error. A sweep found the drone when its best detection is within "
+        f"{limits.wrong_m:g} m of where the drone was at any moment of the sweep. In a median a run that gave nothing "
+        "counts as the worst. Latency is not judged: a run's files hold measurement times only.</p>"
     )
 
 

@@ -23,7 +23,8 @@ HOW = (
     "return of the drone, with 4 or more; found: by the best candidate; found/seen: of those seen, by any. back: found "
     "again after it was hidden; lost: in sight. 3D RMSE: of the runs that were right at least once. Medians and 95 % "
     "count a failure as infinite ('never', or longer than the shortest run that failed); maxima are over what did not "
-    "fail. Of several drones each counts as a run."
+    "fail. false [/h]: outputs farther than 1 m from the drone, whatever sigma they state; sure: by more than three of "
+    "their own sigmas, too. Of several drones each counts as a run."
 )
 NOTHING = "-"
 ROTATION_HOW = (
@@ -77,6 +78,7 @@ COLUMNS: tuple[Column, ...] = (
     ("3D RMSE\nmedian [m]", lambda g: _digits(g.rmse_m.median, 3)),
     ("in 95 %\n[%]", lambda g: _percent(g.inside_95)),
     ("false\n[/h]", lambda g: _digits(g.false_per_h, 0)),
+    ("sure\n[/h]", lambda g: _digits(g.sure_false_per_h, 0)),
 )
 
 ROTATION_COLUMNS: tuple[tuple[str, Callable[[RotationGroup], str]], ...] = (

@@ -152,21 +152,26 @@ def test_a_covariance_that_is_none_is_neither_averaged_nor_inside(tmp_path):
     assert "40 of 80 covariances are not positive definite" in e.findings
 
 
-def test_false_outputs_are_beyond_a_metre_and_three_sigma(tmp_path):
+def test_false_outputs_are_beyond_a_metre_and_those_beyond_three_of_their_sigmas_are_told_beside_them(tmp_path):
     xyz = truth_at(EIGHT_HZ)
     xyz[10:20, 1] += 1.01  # beyond 1 m with a small sigma: false
     xyz[50:60, 1] += 0.9  # nine sigma, but within 1 m: not false
-    xyz[30:40, 1] += 1.01  # beyond 1 m, but said to be unsure by 0.5 m: not false, yet counted as off by 1 m
+    xyz[30:40, 1] += 1.01  # beyond 1 m, but said to be unsure by 0.5 m: false, and not sure
     sigma = np.full(80, 0.1)
     sigma[30:40] = 0.5
     e = judge(make_run(tmp_path / "a", EIGHT_HZ, xyz, sigma_m=sigma))
-    assert value(e, "false_outputs") == 10
-    assert value(e, "false_per_min") == pytest.approx(60.0)
+    assert (value(e, "false_outputs"), value(e, "sure_false_outputs")) == (20, 10)
+    assert value(e, "false_per_min") == pytest.approx(120.0)
     assert value(e, "beyond_1m_share") == 25.0
-    assert "10 of 80 outputs are false: farther than max(1 m, 3 sigma) from the drone" in e.findings
+    told = "20 of 80 outputs are false: farther than 1 m from the drone, 10 of them by more than 3 of their own sigmas"
+    assert told in e.findings
     none = judge(make_run(tmp_path / "b", EIGHT_HZ, xyz, sigma_m=None))
     assert value(none, "false_outputs") == 20
+    assert reason(none, "sure_false_outputs") == "the run has no fix_covariance.csv"
+    assert "20 of 80 outputs are false: farther than 1 m from the drone" in none.findings
     assert reason(none, "nees_mean") == "no covariance: the run has no fix_covariance.csv"
+    huge = judge(make_run(tmp_path / "c", EIGHT_HZ, xyz + np.array([0, 30, 0]), sigma_m=100.0))
+    assert (value(huge, "false_outputs"), value(huge, "sure_false_outputs")) == (80, 0)
 
 
 def test_early_false_fixes_do_not_count_as_first_right_one(tmp_path):

@@ -2,8 +2,9 @@
 
 `manhattan-20m-hover-parked-s1`: word 1 is the scene, 2 the range, 3 the motion, 4 the vehicle, 5 the seed.
 
-Source: ours. Counts and shares are over all runs of a group; one that failed counts as infinite in a median and a 95 %
-point, a maximum is over those that did not fail, and how many did stands beside it.
+Source: ours. Counts and shares are over all runs of a group, those of searches by their time (searches.py); one that
+failed counts as infinite in a median and a 95 % point, a maximum is over those that did not fail, and how many did
+stands beside it.
 """
 
 from __future__ import annotations
@@ -59,10 +60,10 @@ class Group:
     ever_right: int
     silent: int  # runs without any output
     mostly_false: int  # runs in which more than half of the outputs are false, whatever sigma they state
-    hit: tuple[int, int]  # searches with a return of the drone, of all
-    seen: tuple[int, int]  # searches with 4 or more returns of the drone, of all
-    found: tuple[int, int]  # searches in which the best candidate was the drone, of all
-    found_when_seen: tuple[int, int]  # searches in which a candidate was, of those with 4 or more returns
+    hit: tuple[float, float]  # seconds of searches with a return of the drone, of all
+    seen: tuple[float, float]  # of searches with 4 or more returns of the drone, of all
+    found: tuple[float, float]  # of searches in which the best candidate was the drone, of all
+    found_when_seen: tuple[float, float]  # of searches in which a candidate was, of those with 4 or more returns
     first_right_s: Spread
     shortest_failed_s: float | None  # length of the shortest run that never was right
     hit_gap_s: Spread
@@ -127,10 +128,10 @@ def _group(words: tuple[str, ...], config: str, evaluations: list[Evaluation]) -
         ever_right=len(was_right),
         silent=sum(len(e.output.poses) == 0 for e in evaluations),
         mostly_false=sum((_number(e, "false_outputs") or 0) > 0.5 * len(e.output.poses) for e in evaluations),
-        hit=pooled_counts(evaluations, "hit_share"),
-        seen=pooled_counts(evaluations, "seen_share"),
-        found=pooled_counts(evaluations, "found_share"),
-        found_when_seen=pooled_counts(evaluations, "found_when_seen_share"),
+        hit=pooled_seconds(evaluations, "hit_share"),
+        seen=pooled_seconds(evaluations, "seen_share"),
+        found=pooled_seconds(evaluations, "found_share"),
+        found_when_seen=pooled_seconds(evaluations, "found_when_seen_share"),
         first_right_s=spread(evaluations, "first_right_s"),
         shortest_failed_s=min(lengths_s, default=None),
         hit_gap_s=spread(evaluations, "longest_hit_gap_s"),
@@ -159,6 +160,12 @@ def pooled_counts(evaluations: list[Evaluation], key: str) -> tuple[int, int]:
     """Of a share that is kept as counts: (how many, of how many) over all runs."""
     counts = [e.counts[key] for e in evaluations if key in e.counts]
     return sum(count for count, _ in counts), sum(of for _, of in counts)
+
+
+def pooled_seconds(evaluations: list[Evaluation], key: str) -> tuple[float, float]:
+    """Of a share of time: (for how long, of how long) over all runs."""
+    seconds = [e.seconds[key] for e in evaluations if key in e.seconds]
+    return sum(some for some, _ in seconds), sum(of for _, of in seconds)
 
 
 def _number(e: Evaluation, key: str) -> float | None:

@@ -37,6 +37,7 @@ class Evaluation:
     at: AtOutputs | None = None
     over: OverTime | None = None
     counts: dict[str, tuple[int, int]] = field(default_factory=dict)  # of some shares: (how many, of how many)
+    seconds: dict[str, tuple[float, float]] = field(default_factory=dict)  # of others: (for how long, of how long)
     turned: RotationErrors | None = None  # of both cameras' rotations
     reappeared_s: list[float] = field(default_factory=list)  # time to find it again, each time; inf: never
 
@@ -62,6 +63,16 @@ def counted_share(judged: Evaluation, key: str, count: int, of: int) -> None:
     low, high = wilson_interval(count, of)
     judged.counts[key] = (count, of)
     judged.values[key] = Value(100 * count / of, of, 100 * low, 100 * high)
+
+
+def timed_share(
+    judged: Evaluation, key: str, chosen: NDArray[np.bool_], of: NDArray[np.bool_], length_s: Array64
+) -> None:
+    """The share of the time of some searches, kept as seconds too so that runs can be pooled; and as counts."""
+    some_s, all_s = float(length_s[chosen & of].sum()), float(length_s[of].sum())
+    judged.counts[key] = int((chosen & of).sum()), int(of.sum())
+    judged.seconds[key] = some_s, all_s
+    judged.values[key] = Value(100 * some_s / all_s, int(of.sum()))
 
 
 def no_truth(judged: Evaluation, *keys: str) -> None:

@@ -2,6 +2,9 @@
 
 Source: ours; limits in links/evaluation/errors.py. The physical limit stands beside it: a search in which no pulse came
 back from the drone can find nothing.
+
+Shares are of the time searched, not of searches: ours end one as soon as they find something, and wait up to three
+times as long for nothing, so that a second in which it is found makes more searches than one in which it is not.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ from numpy.typing import NDArray
 from links.evaluation.associate import interpolate
 from links.evaluation.catalogue import Value
 from links.evaluation.errors import GRID_NS
-from links.evaluation.judged import NO_DRONE, NO_SPAN, Evaluation, counted_share, minutes, no_truth
+from links.evaluation.judged import NO_DRONE, NO_SPAN, Evaluation, minutes, no_truth, timed_share
 from links.evaluation.run_data import Sweep
 from links.evaluation.tum import Trajectory
 from stages.geometry import Array64
@@ -40,7 +43,8 @@ def detections(judged: Evaluation) -> None:
 def _against_truth(judged: Evaluation, sweeps: tuple[Sweep, ...], truth: Trajectory) -> None:
     limits, others = judged.limits, judged.run.other_paths
     false = unknown = 0
-    returns: list[int] = []  # of each search with truth
+    length_s: list[float] = []  # of each search with truth
+    returns: list[int] = []
     is_asked: list[bool] = []
     is_found: list[tuple[bool, bool]] = []  # by the best candidate, by any
     for sweep in sweeps:
@@ -55,6 +59,7 @@ def _against_truth(judged: Evaluation, sweeps: tuple[Sweep, ...], truth: Traject
         here = here[~at_another]
         false += int(np.count_nonzero(~here))
         is_found.append((bool(len(here) and here[0]), bool(here.any())))
+        length_s.append(max(sweep.end_ns - sweep.start_ns, 1) * 1e-9)
         is_asked.append(bool((np.linalg.norm(path, axis=1) <= limits.reach_m).any()))
         if judged.run.drone_hits_ns is not None:
             first, last = np.searchsorted(judged.run.drone_hits_ns, [sweep.start_ns, sweep.end_ns + 1])
@@ -62,33 +67,36 @@ def _against_truth(judged: Evaluation, sweeps: tuple[Sweep, ...], truth: Traject
     if unknown:
         judged.remarks.append(f"{unknown} of {len(sweeps)} sweeps have no truth; they are neither found nor false")
     _tell_false(judged, false, len(sweeps) - unknown)
-    asked = sum(is_asked)
-    if asked:
-        found = sum(by_best for (by_best, _), is_one in zip(is_found, is_asked, strict=True) if is_one)
-        counted_share(judged, "found_share", found, asked)  # by the best one, which is what a track starts from
+    asked, found, lengths = np.array(is_asked, dtype=np.bool_), np.array(is_found, dtype=np.bool_), np.array(length_s)
+    found = found.reshape(-1, 2)
+    if asked.any():
+        timed_share(judged, "found_share", found[:, 0], asked, lengths)  # by the best one, which a track starts from
     else:
         judged.cannot("no whole sweep with a drone in reach", *FOUND)
     if judged.run.drone_hits_ns is None:
         judged.cannot(judged.run.missing.get("hits", "the drone's returns are not recorded"), *BY_HITS)
     else:
-        asked_of, found_in = np.array(is_asked, dtype=np.bool_), np.array(is_found, dtype=np.bool_).reshape(-1, 2)
-        _by_hits(judged, np.array(returns, dtype=np.int64), asked_of, found_in)
+        _by_hits(judged, np.array(returns, dtype=np.int64), asked, found, lengths)
 
 
 def _by_hits(
-    judged: Evaluation, returns: NDArray[np.int64], is_asked: NDArray[np.bool_], is_found: NDArray[np.bool_]
+    judged: Evaluation,
+    returns: NDArray[np.int64],
+    is_asked: NDArray[np.bool_],
+    is_found: NDArray[np.bool_],
+    length_s: Array64,
 ) -> None:
     """What could be found, and what of it was. Rows are searches; `is_found`: by the best candidate, by any."""
     seen = returns >= judged.limits.min_hits
     by_best, by_any = is_found.T
     judged.values["missed_sweeps"] = Value(float(np.count_nonzero(seen & ~by_best)), len(returns))
     if seen.any():
-        counted_share(judged, "found_when_seen_share", int((seen & by_any).sum()), int(seen.sum()))
+        timed_share(judged, "found_when_seen_share", by_any, seen, length_s)
     else:
         judged.does_not_apply(f"no sweep had {judged.limits.min_hits} returns", "found_when_seen_share")
     if is_asked.any():
-        counted_share(judged, "hit_share", int((is_asked & (returns >= 1)).sum()), int(is_asked.sum()))
-        counted_share(judged, "seen_share", int((is_asked & seen).sum()), int(is_asked.sum()))
+        timed_share(judged, "hit_share", returns >= 1, is_asked, length_s)
+        timed_share(judged, "seen_share", seen, is_asked, length_s)
     else:
         judged.cannot("no whole sweep with a drone in reach", "hit_share", "seen_share")
 

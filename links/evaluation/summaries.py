@@ -19,12 +19,13 @@ from links.evaluation.no_drone import Alarms
 from links.evaluation.rotation_groups import RotationGroup
 
 HOW = (
-    "ever, mute, false: runs that were right at least once, said nothing, were mostly false. hit, seen: sweeps with a "
-    "return of the drone, with 4 or more; found: by the best candidate; found/seen: of those seen, by any. back: found "
-    "again after it was hidden; lost: in sight. 3D RMSE: of the runs that were right at least once. Medians and 95 % "
-    "count a failure as infinite ('never', or longer than the shortest run that failed); maxima are over what did not "
-    "fail. false [/h]: outputs farther than 1 m from the drone, whatever sigma they state; sure: by more than three of "
-    "their own sigmas, too. Of several drones each counts as a run."
+    "ever, mute, false: runs that were right at least once, said nothing, were mostly false. hit, seen: share of the "
+    "time searched, over all runs, in sweeps with a return of the drone, with 4 or more; found: by the best candidate; "
+    "found/seen: of the time of those seen, by any. back: found again after it was hidden; lost: in sight. 3D RMSE: of "
+    "the runs that were right at least once. Medians and 95 % count a failure as infinite ('never', or longer than the "
+    "shortest run that failed); maxima are over what did not fail. false [/h]: outputs farther than 1 m from the "
+    "drone, whatever sigma they state; sure: by more than three of their own sigmas, too. Of several drones each "
+    "counts as a run."
 )
 NOTHING = "-"
 ROTATION_HOW = (
@@ -154,7 +155,7 @@ def _digits(value: float | None, digits: int, longer_than: float | None = None) 
     return f"{value:.{digits}f}"
 
 
-def _percent(counts: tuple[int, int]) -> str:
+def _percent(counts: tuple[float, float]) -> str:
     return f"{100 * counts[0] / counts[1]:.1f}" if counts[1] else NOTHING
 
 

@@ -126,11 +126,30 @@ def test_configurations_stand_side_by_side_in_every_group(two_configs):
     assert paper.first_right_s.values == (pytest.approx(3.0), math.inf)
     assert paper.shortest_failed_s == pytest.approx(10)
     assert ours.first_right_s.median == 0.0
-    assert (paper.found_when_seen, ours.found_when_seen) == ((1, 4), (2, 4))
+    assert (paper.found_when_seen, ours.found_when_seen) == ((5, 20), (10, 20))  # seconds
     assert paper.hit_gap_s.values == (pytest.approx(0.5), math.inf)
     assert (paper.rmse_m.median, ours.rmse_m.median) == (pytest.approx(0.2), pytest.approx(0.1))
     assert ours.inside_95 == (200, 200)
     assert (paper.lost, ours.lost) == (0, 0)
+
+
+def test_found_of_seen_weighs_time_and_not_searches_of_which_finding_makes_more(tmp_path):
+    """Found in each of ten seconds, which are ten searches, and in another run not at all, in two."""
+    hits = np.arange(0.05, 10, 0.1).tolist()
+    found_it = [(k, k + 1, truth_at(np.array([k])).tolist()) for k in range(10)]
+    half = [*found_it[:5], (5, 10, [])]
+    runs = judge(
+        make_run(tmp_path / "a", [], [], sweeps=found_it, hits_s=hits, recording="a-s1", config="ours"),
+        make_run(
+            tmp_path / "b", [], [], sweeps=[(0, 5, []), (5, 10, [])], hits_s=hits, recording="b-s1", config="ours"
+        ),
+        make_run(tmp_path / "c", [], [], sweeps=half, hits_s=hits, recording="c-s1", config="ours"),
+    )
+    assert [e.values["found_when_seen_share"].value for e in runs] == pytest.approx([100, 0, 50])
+    assert [e.values["found_share"].value for e in runs] == pytest.approx([100, 0, 50])
+    (whole,) = groups(runs, ())
+    assert whole.found_when_seen == pytest.approx((15, 30))
+    assert whole.seen == pytest.approx((30, 30))
 
 
 def test_one_row_for_each_configuration_is_the_table_of_ablations(two_configs):
@@ -214,3 +233,4 @@ def test_the_table_for_other_programs_has_a_line_a_run(two_configs, tmp_path):
     assert (rows[2]["rmse_m"], rows[2]["outputs"], rows[2]["right_share"]) == ("inf", "0", "0")
     assert rows[0]["rmse_yaw_deg"] == ""
     assert (rows[1]["found_when_seen_share_count"], rows[1]["found_when_seen_share_of"]) == ("1", "2")
+    assert (rows[1]["found_when_seen_share_s"], rows[1]["found_when_seen_share_of_s"]) == ("5.0", "10.0")

@@ -233,7 +233,8 @@ class Results(Tap):
                 self._files[name] = self._file(name)
             self._files[POSE_FILE].write(POSE_HEAD)
             self._poses = csv.writer(self._files[POSE_COVARIANCE_FILE])
-            self._poses.writerow(["stamp_s", *POSE_UPPER, "state", "good", "rotation", "resets", "nis", "measured_s"])
+            head = ["state", "good", "rotation", "resets", "nis", "measured_s", "track_id"]
+            self._poses.writerow(["stamp_s", *POSE_UPPER, *head])
         R, xyz_m, covariance = message.R_vehicle_drone, message.xyz_vehicle_m, message.covariance
         if xyz_m is None or covariance is None:
             return
@@ -243,6 +244,7 @@ class Results(Tap):
         measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
         told = [message.state.name, int(R is not None), int(R is not None), message.resets, nis, measured]
+        told.append(message.track_id)
         self._poses.writerow([stamp_s(message.stamp_ns), *_digits(upper), *told])
 
     def _file(self, name: str) -> ResultFile:

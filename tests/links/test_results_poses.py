@@ -21,8 +21,8 @@ S = 1_000_000_000
 FULL, POSITION_ONLY = PoseState.FULL, PoseState.POSITION_ONLY
 
 
-def verdict(state, resets=0):
-    return Verdict(state, f"why {state.name}", 2 * S, 1, resets, 1.5)
+def verdict(state, resets=0, track_id=1):
+    return Verdict(state, f"why {state.name}", 2 * S, track_id, resets, 1.5)
 
 
 def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.01, 0.02, 0.03, 0.1, 0.2, 0.3)):
@@ -52,6 +52,16 @@ def test_a_pose_is_a_line_of_both_files_and_reads_back(run):
     assert np.allclose(back.poses.quaternion_xyzw, quaternions_xyzw(np.array([R, R])), atol=1e-5)
     assert np.allclose(back.covariance[0], np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]))
     assert back.good.tolist() == [True, True]
+
+
+def test_each_pose_tells_which_drone_it_is_of(run):
+    known = [
+        Known(t * S, None, np.array([x, 2.0, 3.0]), np.eye(6), np.zeros(3), np.eye(3)) for t, x in ((1, 1), (2, 30))
+    ]
+    parked = Motions(FuseErrors(), parked=True)
+    folder = run([pose(one, verdict(POSITION_ONLY, track_id=k), parked) for k, one in enumerate(known, start=1)])
+    back = read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6)
+    assert back.track.tolist() == [1, 2]
 
 
 def test_a_pose_without_rotation_is_marked_and_its_variance_is_no_infinity(run):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.aim.beside import Look
+from stages.candidate_numbers import CandidateNumbers
 from stages.geometry import Array64
 from stages.messages import Candidates, TrackingState, TrackState
 
@@ -57,12 +58,17 @@ class Targets:
     known: dict[Key, Target] = field(default_factory=lambda: dict[Key, Target]())
     _rests: dict[int, tuple[int, int]] = field(default_factory=lambda: dict[int, tuple[int, int]]())  # until, times
 
+    _numbers: CandidateNumbers = field(default_factory=CandidateNumbers)
+
     def get(self, key: Key | None) -> Target | None:
         """One of them; None when it is gone."""
         return None if key is None else self.known.get(key)
 
     def hear_candidates(self, candidates: Candidates, least_probability: float) -> None:
         """What is worth another look now."""
+        if self._numbers.begin_anew(candidates):
+            self._rests.clear()
+            self.known = {key: target for key, target in self.known.items() if target.sure}
         for key in [key for key in self.known if key[0] == "candidate"]:
             if key[1] not in candidates.candidate_id:
                 del self.known[key]

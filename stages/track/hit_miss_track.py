@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
+from stages.candidate_numbers import CandidateNumbers
 from stages.geometry import Array64
 from stages.messages import (
     Candidates,
@@ -68,6 +69,7 @@ class HitMissTrack(Stage):
 
     _trail: VehicleTrail = PrivateAttr(default_factory=VehicleTrail)
     _known: Hypotheses = PrivateAttr()
+    _numbers: CandidateNumbers = PrivateAttr(default_factory=CandidateNumbers)
     _next_number: int = PrivateAttr(default=1)
     _idle_ns: int = PrivateAttr(default=0)
     _why_idle: str = PrivateAttr(default="nothing found yet")
@@ -91,6 +93,8 @@ class HitMissTrack(Stage):
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Follow the promising ones; drop what is no longer taken for a drone."""
+        if self._numbers.begin_anew(candidates):
+            self._known.forget_numbers()
         for i in range(len(candidates.candidate_id)):
             number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])
             xyz, v = self._trail.to_local(

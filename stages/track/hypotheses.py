@@ -29,7 +29,7 @@ class Hypothesis:
     """One of them."""
 
     number: int  # 0 while it is a candidate only
-    candidate: int  # the detector's number
+    candidate: int  # the detector's number; 0: it has none any more
     stamp_ns: int
     x: Array64  # (6,) position and velocity, local frame
     P: Array64  # (6, 6)
@@ -123,6 +123,11 @@ class Hypotheses:
             xyz = xyz - (stamp_ns - seen_ns) * 1e-9 * v
         return Hypothesis(number=0, candidate=number, stamp_ns=seen_ns, x=np.concatenate([xyz, v]), P=P,
                           last_hit_ns=seen_ns, p_0=0.8, word=self.word(seen_ns))  # fmt: skip
+
+    def forget_numbers(self) -> None:
+        """The detector's numbers mean other things from now on."""
+        for one in self._all:
+            one.candidate = 0
 
     def drop(self, one: Hypothesis) -> None:
         """Give it up."""

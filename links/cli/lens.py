@@ -66,7 +66,9 @@ def import_lens(
             markup=False,
         )
     out.print(
-        f"check       cameras.{carrier.value}.masked_px and .max_off_axis_deg are still those of the rig below it"
+        f"check       cameras.{carrier.value}.masked_px, .max_off_axis_deg and .readout_ms (rolling shutter) are still "
+        "those of the rig below it",
+        soft_wrap=True,
     )
 
 

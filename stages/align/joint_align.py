@@ -169,10 +169,11 @@ class JointAlign(Stage):
             return parts.answers.none(drone_ns, "too few lines run along the same streets")
         if parts.lock.relocked:
             self._begin_anew("the lines match elsewhere for long now, all is begun anew there")
-        off_rad = parts.surprise.off_rad(vehicle_ns, refined, reckoned)
+        off_rad = parts.surprise.tilt_off_rad(vehicle_ns, refined, reckoned)
+        weighed = parts.surprise.weigh_yaw(refined, reckoned)
         parts.motion.slip(parts.lock.accept(refined.yaw_rad, refined.yaw_sigma_rad, reckoned))
         parts.motion.weigh_prior(refined)
-        return parts.answers.rotation(vehicle_ns, drone_ns, refined, reckoned, off_rad)
+        return parts.answers.rotation(vehicle_ns, drone_ns, weighed, reckoned, off_rad)
 
     def _begin_anew(self, news: str) -> None:
         self._parts.answers.add_news(news)

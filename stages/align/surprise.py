@@ -1,7 +1,13 @@
-"""By how much a picture contradicts what was known of tilt and yaw: it is given out as uncertain as it is far off.
+"""What a pair of pictures is worth beside what was known before of tilt and yaw: the turns felt since the last pairs.
 
-Leaves and cars have verticals of their own: one picture's word against the turns felt is not taken over, two pictures'
-is.
+    yaw     the picture's and the one carried on, weighed by their variances. The picture's is no less than the last
+            pictures scattered; where the two are farther apart than both allow, either may be right, and the spread
+            of that is added
+    tilt    the picture's; where it contradicts the turns felt it is given out as uncertain as it is far off
+
+Where few lines run straight, other edges lie among them and pull a picture's yaw by a degree or two, each picture's
+otherwise: it does not know, and the next ones tell. Leaves and cars have verticals of their own: one picture's word
+against the turns felt is not taken over, two pictures' is.
 
 Source: ours.
 """
@@ -9,6 +15,7 @@ Source: ours.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +26,9 @@ from stages.align.spectra import quarter_difference
 from stages.geometry import Array64
 
 SURPRISE_RAD = math.radians(0.3)  # beyond the tilts' own errors
+SURPRISE = 3.0  # sigmas
 SURE_RAD2 = math.radians(1.0) ** 2  # of the turns felt between two pictures: worse ones contradict nobody
+SCATTER_OF = 10  # pictures
 
 
 class Surprise:
@@ -28,26 +37,32 @@ class Surprise:
     def __init__(self, reckoning: Reckoning, lock: YawLock) -> None:
         self._reckoning, self._lock = reckoning, lock
         self._tilted_before = False  # the pictures before contradicted the turns felt
+        self._scatter_rad2 = 0.0  # of the last pictures' yaws, each beside the one before it
+        self._off_rad = 0.0  # what was known less the last picture's
 
-    def off_rad(self, vehicle_ns: int, refined: Refined, reckoned: Reckoned) -> Array64:
-        """(3,) the drone's axes; zero where nothing is contradicted. To be asked before the lock takes the yaw."""
-        off_yaw_rad = self._yaw_rad(refined, reckoned)
-        return self._tilt_rad(vehicle_ns, refined, reckoned) + off_yaw_rad * refined.R_drone_level[:, 2]
-
-    def _yaw_rad(self, refined: Refined, reckoned: Reckoned) -> float:
-        """Of this picture's yaw from what was known before; 0 if that is near."""
+    def weigh_yaw(self, refined: Refined, reckoned: Reckoned) -> Refined:
+        """With the yaw that the turns felt carry on. To be asked before the lock takes the picture's."""
         lock = self._lock
         if lock.offset_rad is None or lock.relocked or not lock.variance_rad2 < SURE_RAD2:
-            return 0.0
-        off_rad = quarter_difference(refined.yaw_rad - reckoned.yaw_rad - lock.offset_rad)
-        near_rad = 3.0 * math.hypot(refined.yaw_sigma_rad, math.sqrt(lock.variance_rad2)) + SURPRISE_RAD
-        return off_rad if abs(off_rad) > near_rad else 0.0
+            return refined
+        off_rad = quarter_difference(reckoned.yaw_rad + lock.offset_rad - refined.yaw_rad)
+        apart_rad, self._off_rad = off_rad - self._off_rad, off_rad
+        self._scatter_rad2 += (min(0.5 * apart_rad**2, SURE_RAD2) - self._scatter_rad2) / SCATTER_OF
+        own, known = max(refined.yaw_sigma_rad**2, self._scatter_rad2), lock.variance_rad2
+        gain = own / (own + known)
+        keep = np.diag([1.0, 1.0, 1.0, 1.0, 1.0 - gain])
+        covariance = refined.covariance.copy()
+        covariance[4, 4] = own
+        covariance = keep @ covariance @ keep
+        at_odds = gain * (1.0 - gain) * max(off_rad**2 - own - known, 0.0)  # one of the two is wrong, and which?
+        covariance[4, 4] += gain**2 * known + at_odds
+        return replace(refined, yaw_rad=refined.yaw_rad + gain * off_rad, covariance=covariance)
 
-    def _tilt_rad(self, vehicle_ns: int, refined: Refined, reckoned: Reckoned) -> Array64:
-        """(3,) by which the pictures contradict the turns felt since the last ones."""
+    def tilt_off_rad(self, vehicle_ns: int, refined: Refined, reckoned: Reckoned) -> Array64:
+        """(3,) by which the pictures contradict the turns felt since the last ones, the drone's axes; zero mostly."""
         off = self._reckoning.tilt_off(vehicle_ns, refined, reckoned.yaw_rad)
         tilts = float(np.trace(refined.covariance[:4, :4])) / 2 + reckoned.variance_rad2
-        surprised = float(np.linalg.norm(off)) > 3.0 * math.sqrt(tilts) + SURPRISE_RAD
+        surprised = float(np.linalg.norm(off)) > SURPRISE * math.sqrt(tilts) + SURPRISE_RAD
         if not surprised or self._tilted_before or not reckoned.variance_rad2 < SURE_RAD2:
             self._reckoning.correct(vehicle_ns, refined, reckoned.yaw_rad)
         self._tilted_before = surprised

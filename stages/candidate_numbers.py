@@ -18,13 +18,15 @@ class CandidateNumbers:
     def __init__(self) -> None:
         self._looks: dict[int, int] = {}
 
-    def begin_anew(self, candidates: Candidates) -> bool:
+    def hear(self, candidates: Candidates) -> bool:
         """Whether numbers heard before mean other things from now on."""
         told = dict(zip(candidates.candidate_id.tolist(), candidates.looks.tolist(), strict=True))
         anew = any(looks < self._looks.get(number, 0) for number, looks in told.items())
         if anew:
             self._looks.clear()
-        self._looks |= told
+        for number, looks in told.items():
+            self._looks.pop(number, None)
+            self._looks[number] = looks  # the newest last
         while len(self._looks) > KEPT:
-            del self._looks[min(self._looks)]
+            del self._looks[next(iter(self._looks))]
         return anew

@@ -27,7 +27,8 @@ from stages.rotation import exp_rotation, log_rotation
 
 KEPT = 1024
 AHEAD_NS = 250_000_000  # beyond its newest word a source is believed this long
-GAP_S = 0.5  # in a longer silence nobody knows where it was, and after it rates and velocity say nothing about a jump
+BRIDGED_NS = 1_000_000_000  # a silence no longer than this is told through, linearly: radios pause as long
+GAP_S = 0.5  # after a longer silence rates and velocity say nothing about a jump
 JUMP_RAD = math.radians(3.0)
 JUMP_M = 0.3
 DRIFT_RAD2_PER_S = math.radians(0.3) ** 2  # of an attitude: walk
@@ -206,7 +207,7 @@ def _around(told: deque[_Told], stamp_ns: int) -> tuple[_Told, _Told | None] | N
     if at == 0:
         return None
     before, after = told[at - 1], told[at] if at < len(told) else None
-    if after is not None and after.stamp_ns - before.stamp_ns <= GAP_S * 1e9:
+    if after is not None and after.stamp_ns - before.stamp_ns <= BRIDGED_NS:
         return before, after
     return (before, None) if stamp_ns - before.stamp_ns <= AHEAD_NS else None
 

@@ -62,7 +62,8 @@ class VehicleTrail:
 
         One that is not newer than the last is ignored, one that is not where those before lead is left out, until three
         agree: then the start frame is another one. That is laid on the old one, which is no more than a guess after a
-        silence; where frames are not joined, another begins, and so it does after each silence.
+        silence: an odometry started afresh in it may begin anywhere near, and nothing tells. Where frames are not
+        joined, another begins, and so it does after each silence.
         """
         if not self._poses:
             self._append(motion)
@@ -72,7 +73,7 @@ class VehicleTrail:
         heard = self._joined or self.known_at(motion.stamp_ns)
         poses = self._watch.hear(motion, heard and self._leads_to(motion))
         another = len(poses) > 1
-        elsewhere = another and not (self._joined and self.known_at(poses[0].stamp_ns))
+        elsewhere = bool(poses) and not self.known_at(poses[0].stamp_ns) if self._joined else another
         if another:
             self._begin_anew(poses[0])
         for pose in poses:
@@ -84,7 +85,8 @@ class VehicleTrail:
         newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self._begun_ns)
         speed_known = newest_ns - oldest_ns >= TOGETHER_NS
         straight_on, seconds = self.straight_on(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
-        return leads_to(straight_on, self._local(motion), seconds, speed_known)
+        speed_mps = float(np.linalg.norm(self._went()[1])) if speed_known else None
+        return leads_to(straight_on, self._local(motion), seconds, speed_mps)
 
     def _local(self, motion: VehicleMotion) -> tuple[Array64, Array64]:
         """A pose in the local frame."""

@@ -34,6 +34,7 @@ JOINT_S = 1.0
 LEAST_SPAN_NS = 100_000_000  # of the last motion, over which its speed is taken
 MOST_SPAN_NS = 1_000_000_000
 OFF_M, OFF_RAD = 0.25, 0.1  # a word so far off is false, or the start frame has jumped
+LATE_S = 0.03  # a busy host stamps a word so much too late: at speed that is a way
 FASTEST_MPS, FASTEST_RADPS = 60.0, 2.0  # where no speed is known yet
 AGREE = 3
 Placed = tuple[Array64, Array64]  # R (3, 3), xyz (3,) [m] in one frame
@@ -77,11 +78,16 @@ class JumpWatch:
         return believed
 
 
-def leads_to(expected: Placed, told: Placed, seconds: float, speed_known: bool) -> bool:
-    """Whether the vehicle may be there, so long after the last word, which led it to another place."""
+def leads_to(expected: Placed, told: Placed, seconds: float, speed_mps: float | None) -> bool:
+    """Whether the vehicle may be there, so long after the last word, which led it to another place.
+
+    `speed_mps` is the speed it was led on at, None where none is known yet.
+    """
     place_m, turn_rad = OFF_M + HARD.place_m(seconds), OFF_RAD + HARD.turn_rad(seconds)
-    if not speed_known:
+    if speed_mps is None:
         place_m, turn_rad = place_m + FASTEST_MPS * seconds, turn_rad + FASTEST_RADPS * seconds
+    else:
+        place_m += LATE_S * speed_mps
     (R, xyz_m), (R_told, told_m) = expected, told
     near = float(np.linalg.norm(told_m - xyz_m)) <= place_m
     return near and float(np.linalg.norm(log_rotation(R.T @ R_told))) <= turn_rad
@@ -124,9 +130,10 @@ def along_its_bend(told: list[VehicleMotion], stamp_ns: int, until_s: float = JO
     )
 
 
-def speed_known(told: list[VehicleMotion]) -> bool:
-    """Whether the words tell a speed."""
-    return _speed_span(told)[0] > 0
+def speed_mps(told: list[VehicleMotion]) -> float | None:
+    """The speed that the words tell; None: they tell none."""
+    span_ns, before = _speed_span(told)
+    return float(np.linalg.norm(told[-1].xyz_start_m - before.xyz_start_m)) / (span_ns * 1e-9) if span_ns else None
 
 
 def _speed_span(told: list[VehicleMotion]) -> tuple[int, VehicleMotion]:

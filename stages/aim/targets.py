@@ -66,7 +66,7 @@ class Targets:
 
     def hear_candidates(self, candidates: Candidates, least_probability: float) -> None:
         """What is worth another look now."""
-        if self._numbers.begin_anew(candidates):
+        if self._numbers.hear(candidates):
             self._rests.clear()
             self.known = {key: target for key, target in self.known.items() if target.sure}
         for key in [key for key in self.known if key[0] == "candidate"]:

@@ -1,7 +1,7 @@
 """How the drone is turned in the vehicle's axes, from the lines of both cameras together.
 
     pairs of pictures (pairing.py) -> yaw spectra and their matches (spectra.py) -> the match that continues the last
-    ones (reckoning.py, lock.py) -> all angles refined together (refine.py), and how far that is off what was known
+    ones (reckoning.py, lock.py) -> all angles refined together (refine.py), weighed with what was known before
     (surprise.py) -> which quarter turn, by the drone's motion (by_motion.py) -> what is told of it (answers.py)
 
 A rotation is given for each picture of the drone's, or the reason why there is none. It is RESOLVED when one branch has
@@ -170,6 +170,7 @@ class JointAlign(Stage):
         if parts.lock.relocked:
             self._begin_anew("the lines match elsewhere for long now, all is begun anew there")
         off_rad = parts.surprise.tilt_off_rad(vehicle_ns, refined, reckoned)
+        refined = parts.surprise.as_scattered(refined, reckoned)
         weighed = parts.surprise.weigh_yaw(refined, reckoned)
         parts.motion.slip(parts.lock.accept(refined.yaw_rad, refined.yaw_sigma_rad, reckoned))
         parts.motion.weigh_prior(refined)

@@ -43,6 +43,7 @@ LOST_RAD2 = math.radians(20.0) ** 2  # a prediction this bad follows nothing
 BLUR_RAD2 = math.radians(1.0) ** 2  # a step this bad ends the memory
 LATE_S = 0.02  # stamps may be off by this, which matters in a turn
 PICTURE_RAD = math.radians(0.7)  # one picture's yaw, with errors that stay for a while
+PERIOD_S = 0.2  # pictures that come sooner after one another err alike: together they tell no more than one
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class YawLock:
     _drone: Array64 = field(default_factory=lambda: np.zeros(BINS))
     _better_since_ns: int | None = None
     _last_ns: int = 0
+    _accepted_ns: int = 0
 
     def forget(self) -> None:
         """Start anew."""
@@ -180,7 +182,9 @@ class YawLock:
     def accept(self, yaw_rad: float, sigma_rad: float, at: Reckoned) -> Array64:
         """Take the refined yaw. Weights (4,): that the true yaw is m quarter turns to the left of the one followed."""
         off = yaw_rad - at.yaw_rad
-        noise = sigma_rad**2 + PICTURE_RAD**2
+        since_s = (at.stamp_ns - self._accepted_ns) * 1e-9
+        self._accepted_ns = at.stamp_ns
+        noise = (sigma_rad**2 + PICTURE_RAD**2) * max(PERIOD_S / max(since_s, 1e-3), 1.0)
         if self.offset_rad is None or self.relocked or self.variance_rad2 > 4 * LOST_RAD2:
             weights = np.array([1.0, 0.0, 0.0, 0.0]) if self.offset_rad is None else np.full(4, 0.25)
             self.offset_rad, self.variance_rad2 = off, noise

@@ -28,7 +28,9 @@ from stages.geometry import Array64
 SURPRISE_RAD = math.radians(0.3)  # beyond the tilts' own errors
 SURPRISE = 3.0  # sigmas
 SURE_RAD2 = math.radians(1.0) ** 2  # of the turns felt between two pictures: worse ones contradict nobody
-SCATTER_OF = 10  # pictures
+SCATTER_S = 2.0  # over which the pictures' scatter is taken
+APART_NS = 180_000_000  # between two that are compared: sooner after one another they err alike
+MOST_RAD2 = math.radians(5.0) ** 2  # of one picture's scatter
 
 
 class Surprise:
@@ -37,26 +39,52 @@ class Surprise:
     def __init__(self, reckoning: Reckoning, lock: YawLock) -> None:
         self._reckoning, self._lock = reckoning, lock
         self._tilted_before = False  # the pictures before contradicted the turns felt
-        self._scatter_rad2 = 0.0  # of the last pictures' yaws, each beside the one before it
-        self._off_rad = 0.0  # what was known less the last picture's
+        self._scatter_rad2, self._scatter_s = (
+            0.0,
+            0.0,
+        )  # of the pictures' yaws, each beside an earlier one; over how long
+        self._before: tuple[int, float] | None = (
+            None  # of the picture to compare with: stamp, what was known less its yaw
+        )
+
+    def as_scattered(self, refined: Refined, reckoned: Reckoned) -> Refined:
+        """A yaw no surer than the last pictures scattered about the turns felt."""
+        lock = self._lock
+        if lock.offset_rad is None or lock.relocked:
+            self._before = None  # it was laid beside another offset
+        elif lock.variance_rad2 < SURE_RAD2:
+            self._compare(reckoned.stamp_ns, self._off_rad(refined, reckoned))
+        covariance = refined.covariance.copy()
+        covariance[4, 4] = max(covariance[4, 4], self._scatter_rad2)
+        return replace(refined, covariance=covariance)
+
+    def _compare(self, stamp_ns: int, off_rad: float) -> None:
+        if self._before is not None and stamp_ns - self._before[0] < APART_NS:
+            return
+        if self._before is not None:
+            since_s = min((stamp_ns - self._before[0]) * 1e-9, SCATTER_S)
+            self._scatter_s = min(self._scatter_s + since_s, SCATTER_S)
+            apart_rad2 = min(0.5 * (off_rad - self._before[1]) ** 2, MOST_RAD2)
+            self._scatter_rad2 += (apart_rad2 - self._scatter_rad2) * since_s / self._scatter_s
+        self._before = stamp_ns, off_rad
 
     def weigh_yaw(self, refined: Refined, reckoned: Reckoned) -> Refined:
         """With the yaw that the turns felt carry on. To be asked before the lock takes the picture's."""
         lock = self._lock
         if lock.offset_rad is None or lock.relocked or not lock.variance_rad2 < SURE_RAD2:
             return refined
-        off_rad = quarter_difference(reckoned.yaw_rad + lock.offset_rad - refined.yaw_rad)
-        apart_rad, self._off_rad = off_rad - self._off_rad, off_rad
-        self._scatter_rad2 += (min(0.5 * apart_rad**2, SURE_RAD2) - self._scatter_rad2) / SCATTER_OF
-        own, known = max(refined.yaw_sigma_rad**2, self._scatter_rad2), lock.variance_rad2
+        off_rad = self._off_rad(refined, reckoned)
+        own, known = refined.yaw_sigma_rad**2, lock.variance_rad2
         gain = own / (own + known)
         keep = np.diag([1.0, 1.0, 1.0, 1.0, 1.0 - gain])
-        covariance = refined.covariance.copy()
-        covariance[4, 4] = own
-        covariance = keep @ covariance @ keep
+        covariance = keep @ refined.covariance @ keep
         at_odds = gain * (1.0 - gain) * max(off_rad**2 - own - known, 0.0)  # one of the two is wrong, and which?
         covariance[4, 4] += gain**2 * known + at_odds
         return replace(refined, yaw_rad=refined.yaw_rad + gain * off_rad, covariance=covariance)
+
+    def _off_rad(self, refined: Refined, reckoned: Reckoned) -> float:
+        """What was known less the picture's yaw."""
+        return quarter_difference(reckoned.yaw_rad + (self._lock.offset_rad or 0.0) - refined.yaw_rad)
 
     def tilt_off_rad(self, vehicle_ns: int, refined: Refined, reckoned: Reckoned) -> Array64:
         """(3,) by which the pictures contradict the turns felt since the last ones, the drone's axes; zero mostly."""

@@ -30,7 +30,7 @@ from stages.geometry import Array64, transform
 from stages.messages import VehicleMotion
 from stages.rigid import adjoint
 from stages.rotation import nearest_rotation
-from stages.vehicle_onward import JumpWatch, along_its_bend, leads_to, speed_known
+from stages.vehicle_onward import JumpWatch, along_its_bend, leads_to, speed_mps
 
 SILENT_S = 0.25  # so long no odometry: it is gone
 
@@ -97,7 +97,7 @@ class VehicleMotionChoice(Stage):
         told, last_ns = list(self._told), self._told[-1].stamp_ns
         there, at = self._in_start(motion), along_its_bend(told, motion.stamp_ns, until_s=math.inf)
         expected, now = ((m.R_start_vehicle, m.xyz_start_m) for m in (at, there))
-        return leads_to(expected, now, (motion.stamp_ns - last_ns) * 1e-9, speed_known(told))
+        return leads_to(expected, now, (motion.stamp_ns - last_ns) * 1e-9, speed_mps(told))
 
     def _change_to(self, motion: VehicleMotion) -> None:
         """Lay the new source on the end of the old one."""

@@ -20,13 +20,13 @@ from stages.fuse.chain import PERIOD_NS, Chain
 from stages.fuse.motion_yaw import DOUBT, Point
 from stages.fuse.motions import WAIT_NS, Motions
 from stages.fuse.north import North
-from stages.fuse.positions import Positions
+from stages.fuse.positions import GATE, Positions
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.witness import Witness
 from stages.fuse.yaw import apart_rad
 from stages.geometry import Array64, heading_rad, rotation_z
 from stages.messages import DroneAttitude, DroneFix, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
-from stages.rigid import position_covariance
+from stages.rigid import distance2, position_covariance
 
 LEAST_MPS = 0.5  # slower, a camera's direction of flight says nothing
 BRANCH_RAD, BRANCHES = math.radians(30.0), 3  # so many rotations in a row so far off are another branch
@@ -45,6 +45,7 @@ class Estimator:
         self.north = North(errors, self._yaw_sigma_rad)
         self._witness = Witness(self.motions)
         self.resets, self.track_id = 0, 0
+        self.on_trial = False  # what is followed may be something else than what was before
         self._was_still = False
         self.newest_fix_ns: int | None = None  # also of a drone that is lost
         self.unbacked_ns: int | None = None  # when the streets told a rotation that no motion has agreed with yet
@@ -131,15 +132,30 @@ class Estimator:
 
     # fixes
 
-    def follow(self, track_id: int) -> None:
-        """The next fixes are of this track; another one's position is not known."""
-        if track_id != self.track_id:
+    def follow(self, fix: DroneFix) -> None:
+        """The next fixes are of this one's track; another one's position is not known.
+
+        What is found elsewhere than the pose was carried to may be something else: a yaw that is remembered turns it
+        into a pose only when it has moved, or hung, as the drone says it did (`on_trial`).
+        """
+        if fix.track_id != self.track_id:
             self._witness.restart()
             self.north.by_motion.restart()
+            self.on_trial = self.track_id != 0 and not self._expects(fix)
             if self.positions.known:
                 self.lose()
                 self.resets += 1
-        self.track_id = track_id
+        self.track_id = fix.track_id
+
+    def _expects(self, fix: DroneFix) -> bool:
+        """Whether a pose is known that was carried to where this fix is."""
+        if not self.chain.running:
+            return False
+        R_start_vehicle, t = self.motions.vehicle.at(fix.stamp_ns)
+        R, expected_m, covariance = self.chain.at(fix.stamp_ns)
+        told_m2 = R_start_vehicle @ fix.covariance_m2 @ R_start_vehicle.T
+        off_m = R_start_vehicle @ fix.xyz_vehicle_m + t - expected_m
+        return distance2(off_m, position_covariance(covariance, R) + told_m2) <= GATE
 
     def see_fix(self, fix: DroneFix) -> None:
         """A LiDAR position at its own time."""
@@ -253,6 +269,10 @@ class Estimator:
     def _resume(self, stamp_ns: int) -> None:
         """Begin a chain with the yaw that is known of the autopilot's frame, if it is."""
         own, R_own = self.north.known(stamp_ns), self.motions.R_own_drone(stamp_ns)
+        if own is not None and self.on_trial:
+            self.on_trial = not self.north.by_motion.fits(own)
+            if self.on_trial:
+                return
         if own is not None and R_own is not None:
             R = rotation_z(own.yaw_rad) @ R_own
             variance = np.diag([self._tilt_rad2, self._tilt_rad2, own.sigma_at(stamp_ns) ** 2])

@@ -191,7 +191,7 @@ class Fuse(Stage):
                 later.append(message)
             elif isinstance(message, DroneFix):
                 if self._following.takes(message.track_id, message.stamp_ns):
-                    self._estimator.follow(message.track_id)
+                    self._estimator.follow(message)
                     self._estimator.see_fix(message)
             elif message.R_vehicle_drone is not None and message.covariance_rad2 is not None:
                 self._estimator.see_rotation(

@@ -23,7 +23,7 @@ import numpy as np
 
 from stages.fuse.settings import FuseErrors
 from stages.fuse.yaw import Yaw
-from stages.geometry import Array64
+from stages.geometry import Array64, rotation_z
 
 APART_NS = 400_000_000  # of the fixes used: their errors last that long
 WINDOW_NS = 30_000_000_000
@@ -111,6 +111,14 @@ class MotionYaw:
         near = off <= ALIKE * math.hypot(1.0 / math.sqrt(lean.sharpness), sigma_rad) + SLACK_RAD
         return near and lean.others(yaw_rad) <= DOUBT
 
+    def fits(self, yaw: Yaw) -> bool | None:
+        """Whether what is followed moves as the drone says it does, with this yaw, or hangs as it hangs.
+
+        None: too few points to say.
+        """
+        points = tuple(self._points)
+        return None if len(points) < LEAST_TO_BACK else moves_with(points, yaw, self._errors)
+
     def restart(self) -> None:
         """Nothing before now counts."""
         self._points.clear()
@@ -172,6 +180,20 @@ def weigh(points: tuple[Point, ...], errors: FuseErrors) -> Weighed:
         return Weighed(f"several headings fit its motion: P {nearest:.3f}", lean)
     told = f"heading by motion {math.degrees(peak):.0f} deg, sigma {math.degrees(sigma):.1f}, {moved_m:.1f} m moved"
     return Weighed(told, lean, Yaw(points[-1].stamp_ns, peak, sigma**2))
+
+
+def moves_with(points: tuple[Point, ...], yaw: Yaw, errors: FuseErrors) -> bool:
+    """Whether the points lie on the way that the drone tells, turned by a yaw."""
+    t = np.array([(p.stamp_ns - points[0].stamp_ns) * 1e-9 for p in points])
+    variance = np.array([p.variance_m2 for p in points]) + FLOOR_M**2
+    z, own = np.array([p.xyz_start_m for p in points]), np.array([p.xyz_own_m for p in points])
+    way = own[:, :2] - own[0, :2]
+    level = level_covariance(t, own[:, :2], variance, errors) + yaw.sigma_at(points[-1].stamp_ns) ** 2 * (way @ way.T)
+    left = z[:, :2] - own[:, :2] @ rotation_z(yaw.yaw_rad)[:2, :2].T
+    height = np.diag(variance) + HEIGHT_WALK_M**2 * np.minimum.outer(t, t)
+    aside = _about_mean(left[:, 0], level) + _about_mean(left[:, 1], level)
+    high = _about_mean(z[:, 2] - own[:, 2], height)
+    return aside <= chi2_999(2 * len(points) - 2) and high <= chi2_999(len(points) - 1)
 
 
 def bank(a: Array64, precision: float) -> tuple[float, float, float]:

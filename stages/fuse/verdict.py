@@ -47,6 +47,8 @@ def state_of(
             return PoseState.AMBIGUOUS, e.north.heading.contradiction + unseen
         if doubt:
             return PoseState.AMBIGUOUS, doubt + unseen
+        if e.on_trial and e.north.known(now_ns) is not None:
+            return PoseState.POSITION_ONLY, f"found elsewhere: does it move as the drone says it does?{unseen}"
         return PoseState.POSITION_ONLY, f"heading not known: {e.north.by_motion.reason}{unseen}"
     if unseen:
         return PoseState.COASTING, f"carried by odometry{unseen}"

@@ -93,8 +93,9 @@ class HitMissTrack(Stage):
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Follow the promising ones; drop what is no longer taken for a drone."""
-        if self._numbers.begin_anew(candidates):
+        if self._numbers.hear(candidates):
             self._known.forget_numbers()
+        own = set(candidates.candidate_id[candidates.probability >= 0.5].tolist())
         for i in range(len(candidates.candidate_id)):
             number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])
             xyz, v = self._trail.to_local(
@@ -107,7 +108,8 @@ class HitMissTrack(Stage):
                 seen_later = int(candidates.seen_ns[i]) > known.last_hit_ns
                 if known.confirmed and P >= 0.5 and seen_later and self._known.doubtful(known, candidates.stamp_ns):
                     self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
-                sure = known.candidate == number or candidates.looks[i] >= 6
+                # what is refused beside a track whose own candidate is taken for a drone is another one there
+                sure = known.candidate == number or (candidates.looks[i] >= 6 and known.candidate not in own)
                 if P < 0.2 and known.confirmed and sure:
                     yield from self._lose(
                         known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}"

@@ -95,7 +95,7 @@ def _split_all(
         for k in range(size):
             _ray(table, points[start[c] + k, 0], points[start[c] + k, 1], rays[k])
             if rolls:
-                _turn(rays[k], (points[start[c] + k, 1] - middle_row) * turn_rad_per_row)
+                _turn(rays[k], points[start[c] + k, 1] - middle_row, turn_rad_per_row)
         stack[0, 0], stack[0, 1] = 0, size - 1
         waiting = 1
         while waiting > 0:
@@ -130,14 +130,15 @@ def _ray(table: NDArray[np.float32], x: float, y: float, out: Array64) -> None:
 
 
 @compiled
-def _turn(ray: Array64, by_rad: Array64) -> None:
-    """Turn a ray by an angle of some degrees at most, to its third power (Cayley's formula)."""
-    half = 0.5 * by_rad
-    across, twice = np.empty(3), np.empty(3)
-    cross(half, ray, across)
-    across += ray
-    cross(half, across, twice)
-    ray += 2.0 / (1.0 + dot(half, half)) * twice
+def _turn(ray: Array64, rows: float, turn_rad: Array64) -> None:
+    """Turn a ray by `rows` times the angle (3,), some degrees at most, to its third power (Cayley's formula)."""
+    a, b, c = 0.5 * rows * turn_rad[0], 0.5 * rows * turn_rad[1], 0.5 * rows * turn_rad[2]
+    x, y, z = ray[0], ray[1], ray[2]
+    u, v, w = x + b * z - c * y, y + c * x - a * z, z + a * y - b * x  # the ray and h x ray
+    scale = 2.0 / (1.0 + a * a + b * b + c * c)
+    ray[0] = x + scale * (b * w - c * v)
+    ray[1] = y + scale * (c * u - a * w)
+    ray[2] = z + scale * (a * v - b * u)
 
 
 @compiled

@@ -97,7 +97,7 @@ class Windows:
             return None
         stretches = {f.own[1] if f.own else None for f in start.fixes + end.fixes}
         if len(stretches) != 1 or None in stretches:
-            self._start = end
+            self._begin_at(end)
             return None
         anchor = own_m(start.fixes[0])
         told = [[(R_start_own @ (own_m(f) - anchor))[:2] for f in h.fixes] for h in (start, end)]
@@ -114,7 +114,7 @@ class Windows:
         long = length >= max(self._baseline_m, CLEAR * sigma)
         if not long and seen < self._baseline_m + SLACK_M + CLEAR * sigma:
             return None
-        self._start = end
+        self._begin_at(end)
         return Displacement(start.stamp_ns, end.stamp_ns, lidar, noise, odometry, bearing_rad, True)
 
     def close_bearing(self, R_start_drone: dict[int, Array64], bearing_rad: float) -> Displacement | None:
@@ -131,7 +131,7 @@ class Windows:
         if pictures_ns < end.stamp_ns and newest_ns - end.stamp_ns < PICTURES_LATE_NS:
             self._waiting = end
             return None
-        self._start, self._waiting = end, None
+        self._begin_at(end)
         flown, covered, flew, sigma = np.zeros(3), 0.0, 0.0, 0.0
         for step, overlap in self._keys_steps(start.stamp_ns, end.stamp_ns):
             if step.from_ns not in R_start_drone:
@@ -164,6 +164,10 @@ class Windows:
             return []
         return [step.from_ns for step in self._steps if step.stamp_ns > self._start.stamp_ns]
 
+    def _begin_at(self, handful: _Handful) -> None:
+        """The next window's start."""
+        self._start, self._waiting = handful, None
+
     def _handful(self) -> _Handful:
         fixes = tuple(self._recent)
         return _Handful(fixes[len(fixes) // 2].stamp_ns, fixes)
@@ -178,7 +182,7 @@ class Windows:
         if recent[-1].stamp_ns - recent[0].stamp_ns > HANDFUL_NS:
             return self._start, None
         if (recent[-1].stamp_ns - self._start.stamp_ns) * 1e-9 > LONGEST_S:
-            self._start = self._handful()
+            self._begin_at(self._handful())
             return self._start, None
         return self._start, self._handful()
 

@@ -28,12 +28,12 @@ def told(looks_by_number, t_s=0.0):
 def test_fewer_looks_than_before_are_anothers_and_only_then():
     numbers = CandidateNumbers()
     heard = [{1: 3}, {1: 3, 2: 1}, {2: 5}, {}, {1: 4, 3: 1}, {1: 1}, {1: 2, 2: 1}]
-    assert [numbers.begin_anew(told(looks)) for looks in heard] == [False] * 5 + [True, False]
+    assert [numbers.hear(told(looks)) for looks in heard] == [False] * 5 + [True, False]
 
 
 def test_memory_is_bounded():
     numbers = CandidateNumbers()
-    assert not any(numbers.begin_anew(told({k: 1})) for k in range(1, 2 * KEPT))
+    assert not any(numbers.hear(told({k: 1})) for k in range(1, 2 * KEPT))
     assert len(numbers._looks) == KEPT
 
 

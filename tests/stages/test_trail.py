@@ -144,11 +144,20 @@ def test_a_fast_vehicles_second_pose_is_no_jump_and_the_first_real_one_after_zer
     assert max(abs(zeros.velocity_mps(START_NS + 10 * k * MS)[0]) for k in range(40)) == pytest.approx(30)
 
 
-@pytest.mark.parametrize(("jumped", "elsewhere"), [(False, False), (True, True)])
-def test_what_was_remembered_lies_elsewhere_when_the_start_frame_jumped_in_a_silence(jumped, elsewhere):
+@pytest.mark.parametrize("jump_m", [0, 8, 500])
+@pytest.mark.parametrize(("first", "elsewhere"), [(90, True), (60, False)])
+def test_after_a_silence_what_was_remembered_may_lie_elsewhere(jump_m, first, elsewhere):
+    """1.2 s: an odometry started afresh in it may begin anywhere near. .6 s: it is where it was, or the jump is seen."""
     made = trail(*(driving(k) for k in range(30)))
-    far = [motion(20 * k * MS, (0.2 * k + (500 if jumped else 0), 0, 0)) for k in range(90, 100)]  # 1.2 s later
+    far = [motion(20 * k * MS, (0.2 * k + jump_m, 0, 0)) for k in range(first, first + 10)]
     assert any([made.add(one) for one in far]) == elsewhere
+
+
+def test_a_word_that_is_stamped_late_at_speed_is_no_jump():
+    fast = [motion(50 * k * MS + (30 * MS if k == 20 else 0), (0.05 * 20 * k, 0, 0)) for k in range(40)]
+    made = trail(*fast[:20])
+    made.add(fast[20])
+    assert made.newest_ns == fast[20].stamp_ns
 
 
 def test_a_moment_that_was_asked_for_before_is_the_same_until_a_newer_pose_is_known():

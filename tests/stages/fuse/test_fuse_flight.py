@@ -283,6 +283,44 @@ def test_what_moved_as_another_track_does_not_tell_how_the_new_one_is_turned():
     assert seen.reason == "its motion is being watched"
 
 
+def found_again(elsewhere_m, silent_s, moves=True):
+    """States from when another track is found, at 12 s, after so long without a fix; and when that was."""
+    made, stage = Made(until_s=16.0 + silent_s, rotations=False, speed_mps=3.0), Fuse()
+    at_s, poses = 12.0 + silent_s, []
+    for _, port, message in made.events():
+        t = (message.stamp_ns - START_NS) / S
+        if port == "fix" and t > 12.0:
+            if t < at_s:
+                continue
+            if stage._estimator.track_id == 1:
+                poses += stage.on_track(track(t, TrackingState.LOST, 1))
+            there = made.truth(t if moves else at_s)[1] + elsewhere_m
+            message = fix(t, there, track_id=2)
+        poses += getattr(stage, f"on_{port}")(message)
+    assert any(p.state is FULL for p in poses if p.stamp_ns < ns(12.0))
+    return [(p.state, (p.stamp_ns - ns(at_s)) / S) for p in poses if p.stamp_ns > ns(at_s + 0.3)]
+
+
+def test_another_track_that_is_where_the_pose_was_carried_to_is_full_at_once():
+    told = found_again(0.0, silent_s=1.0)
+    assert all(state is FULL for state, _ in told)
+
+
+def test_something_found_elsewhere_is_no_full_pose_until_it_has_moved_as_the_drone_says():
+    """The yaw that is remembered would make a full pose of any lamp or bird that is taken for the drone."""
+    still = found_again(np.array([16.0, 12.0, -8.0]), silent_s=2.0, moves=False)
+    assert all(state is not FULL for state, _ in still)
+    moving = found_again(np.array([16.0, 12.0, -8.0]), silent_s=2.0)  # the drone; what was carried was wrong
+    assert all(state is POSITION_ONLY for state, t in moving if t < 1.0)
+    assert moving[-1][0] is FULL
+
+
+def test_after_a_loss_the_drone_is_full_again_once_it_has_moved_as_it_says():
+    told = found_again(0.0, silent_s=12.0)
+    assert all(state is POSITION_ONLY for state, t in told if t < 1.0)
+    assert told[-1][0] is FULL
+
+
 def test_an_hour_in_which_nothing_was_heard_is_not_gone_through_step_by_step(monkeypatch):
     made, stage = Made(until_s=6), Fuse(parked=True)
     assert made.run(stage)[-1].state is FULL

@@ -231,6 +231,23 @@ def test_a_candidate_is_followed_silently_until_the_detector_accepts_it():
     assert story(run([Drone(way)], [candidate(here(way), 0.3)], 0.8)) == ["SEARCHING"]  # not promising enough
 
 
+@pytest.mark.parametrize("own", [0.99, 0.3])
+def test_what_is_refused_beside_a_track_costs_it_nothing_while_its_own_candidate_is_taken_for_a_drone(own):
+    """Overhead a drone is two candidates at times: one flies as the drone says, the other is thought a bird."""
+    way = still(0.0, 8.0, 10.0)
+    one, other = candidate(here(way), own, t_s=1.0, looks=30), candidate(here(way), 0.1, t_s=1.0, number=2, looks=6)
+    both = Candidates(
+        stamp_ns=one.stamp_ns,
+        reasons=one.reasons + other.reasons,
+        **{
+            name: np.concatenate([getattr(one, name), getattr(other, name)])
+            for name in ("candidate_id", "xyz_vehicle_m", "velocity_vehicle_mps", "probability", "seen_ns", "looks")
+        },
+    )
+    out = run([Drone(way)], [accepted(here(way)), both], 2.0)
+    assert ("LOST" in story(out)) == (own < 0.5)
+
+
 def test_a_track_whose_probability_falls_is_dropped_with_the_detectors_reason():
     way = still(0.0, 8.0, 10.0)
     out = run([Drone(way)], [accepted(here(way)), candidate(here(way), 0.1, t_s=1.0)], 2.0)

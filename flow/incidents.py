@@ -1,4 +1,4 @@
-"""What went wrong in a live run, in words: said at once, and when it goes on, not again and again.
+"""What went wrong in a run, in words: said at once, and when it goes on, not again and again.
 
 Source: ours.
 """

@@ -27,6 +27,8 @@ from flow.metrics import Latency
 from flow.ports import Output, admit, call
 from flow.stage import Node, Stage, input_ports, output_ports
 
+HOPELESS = 1000  # records refused, of a source that gave nothing yet: it will not
+
 
 @dataclass(slots=True)
 class NodeReport:
@@ -82,6 +84,7 @@ class Replay:
         self._sequence = 0
         self._incidents = Incidents(lambda: self.report.last_ns)
         self._refusals: dict[str, LinkError] = {}  # by source, the first of each
+        self._refused: Counter[str] = Counter()  # how many
         self.nodes: dict[str, Node] = {spec.name: spec.build() for spec in graph.nodes.values()}
         self._outputs: dict[str, dict[type[Message], Output[_Port]]] = {}
         for name, node in self.nodes.items():
@@ -123,6 +126,9 @@ class Replay:
         except LinkError as error:
             source = port.name.partition(".")[0]
             self._refusals.setdefault(source, error)
+            self._refused[source] += 1
+            if self._refused[source] >= HOPELESS and not self._gave(source):
+                raise
             self._incidents.report(source, str(error))
             return
         self._send(port, record.arrival_ns, given)
@@ -131,10 +137,14 @@ class Replay:
             arrival_ns, _, _, _, port, message = heappop(heap)
             self._send(port, arrival_ns, self._run(port, arrival_ns, message))
 
+    def _gave(self, source: str) -> bool:
+        """Whether a source has told anything yet."""
+        return any(output.count for output in self._outputs[source].values())
+
     def finish(self) -> RunReport:
         """Let every stage give out what it still holds; producers first. LinkError of a source that gave nothing."""
         for source, error in self._refusals.items():
-            if not any(output.count for output in self._outputs[source].values()):
+            if not self._gave(source):
                 raise error
         for port in self._finishers:
             last_ns = self.report.last_ns

@@ -106,7 +106,7 @@ def _scalar(tree: Tree, path: Path_, text: str) -> str | int | float | bool | No
         value = yaml.safe_load(text)
     except yaml.YAMLError:
         value = ()
-    if value is None or isinstance(value, str | int | float | bool):
+    if value is None or (isinstance(value, str | int | float | bool) and not text.startswith("$")):
         return value
     tree.problem(path, f"'{text}' after 'or' is no plain value: write a number, a word, true, false or null.")
     return None

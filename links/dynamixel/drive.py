@@ -178,10 +178,12 @@ class Drive:
             )
         wrong = list(wrong_settings(table, self._settings))
         if wrong and not self._settings.write_settings:
+            slow = any(register is mx28.VELOCITY_LIMIT for register, _ in wrong)
             listed = ", ".join(f"{r.name} ({r.address}) is {r.value(table)}, not {wanted}" for r, wanted in wrong)
             raise SetupError(
                 f"the servo is not set up for grd: {listed}. Set `write_settings: true` once to have grd change this, "
                 "or use DYNAMIXEL Wizard"
+                + ("; a lower `speed_limit_rpm` needs no other Velocity Limit" if slow else "")
             )
         if wrong:
             self._bus.write(mx28.TORQUE_ENABLE, 0)  # the EEPROM is locked otherwise

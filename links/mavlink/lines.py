@@ -101,6 +101,8 @@ class StreamConnection:
 
     def send(self, frame: bytes) -> bool:
         """See Connection."""
+        if not self._up:  # closing it may take long
+            return False
         with self._writing:
             if not self._up:
                 return False

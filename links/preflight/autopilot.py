@@ -54,6 +54,9 @@ def _silent(heard: Heard, seen: AutopilotSeen, who: str) -> Verdict:
     unsigned = heard.counters.get("not signed with our key", 0)
     if unsigned:
         return fail(name, f"{unsigned} frames came that are not signed with our key: check signing_key on both sides")
+    old = heard.counters.get("signed with our key, but not new", 0)
+    if old:
+        return fail(name, f"{old} frames came that are signed with an old time: does it hear us? Check both directions")
     return fail(name, heard.silence if heard.trouble else f"no word from {who}: {heard.silence}")
 
 

@@ -52,6 +52,7 @@ class SimulatedMx28:
         self._set(mx28.MAX_POSITION_LIMIT, min(high, mx28.STEPS_PER_TURN - 1))
         self._set(mx28.FIRMWARE_VERSION, firmware)
         self._set(mx28.RETURN_DELAY_TIME, 0)  # as grd wants it; a new one has 250
+        self._set(mx28.VELOCITY_LIMIT, 240)  # for 55 rpm; a new one has 230
         self._set(mx28.BAUD_RATE, mx28.BAUD_CODES[1_000_000])
         self._start_ns, self._steps = start_ns, 0
         self._trace_rad: Array64 = np.full(KEPT_STEPS, self._servo.position_rad)

@@ -110,6 +110,15 @@ def test_what_a_source_refuses_in_mid_recording_is_told_and_the_replay_goes_on(t
     assert [str(i) for i in report.incidents] == ["numbers: no numbers here: is the counter plugged in? (3 times)"]
 
 
+def test_a_source_that_refuses_all_ends_a_replay_before_its_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("flow.replay.HOPELESS", 3)
+    taken = []
+    with pytest.raises(LinkError, match="no numbers here"):
+        replay(graph_of(tmp_path), (taken.append(r) or r for r in numbers(*["refuse"] * 9)))
+    assert len(taken) == 3
+    assert replay(graph_of(tmp_path), numbers(1, *["refuse"] * 9)).messages["numbers.number"] == 1
+
+
 def test_a_tap_that_cannot_work_ends_a_replay(tmp_path):
     class Broken(Tap):
         def see(self, output: str, message: Message, arrival_ns: int) -> None:

@@ -410,7 +410,7 @@ def refusal(servo):
         (mx28.RETURN_DELAY_TIME, 250, r"Return Delay Time \(9\) is 250, not 0.*write_settings: true"),
         (mx28.OPERATING_MODE, 4, r"Operating Mode \(11\) is 4, not 3"),
         (mx28.DRIVE_MODE, 4, r"Drive Mode \(10\) is 4, not 0"),
-        (mx28.VELOCITY_LIMIT, 239, r"Velocity Limit \(44\) is 239, not 240"),
+        (mx28.VELOCITY_LIMIT, 239, r"Velocity Limit \(44\) is 239, not 240.*a lower `speed_limit_rpm`"),
         (mx28.MAX_POSITION_LIMIT, 1500, r"Max Position Limit \(48\) is 1500, not 2048"),
     ],
 )

@@ -77,13 +77,13 @@ class Stream:
         return first
 
     def put(self, mark: Mark, *, static: bool = False) -> None:
-        """Log a mark; its frame and style go once per entity, static."""
+        """Log a mark; its frame and style go once per entity, static. What clears an entity has neither."""
         if mark.path not in self._styled:
-            self._styled.add(mark.path)
             style = [] if mark.style is None else [mark.style()]
             if mark.frame is not None:
                 style.append(rr.CoordinateFrame(mark.frame))
             if style:
+                self._styled.add(mark.path)
                 self._rerun.log(mark.path, *style, static=True)
         if isinstance(mark, Curve):
             self._curves.setdefault(mark.path, []).append((self._stamp_ns, mark.values))

@@ -10,6 +10,7 @@ import rerun.blueprint as rrb
 from shown import drawn, numbers, page, scene
 
 from links.viewer.layout import Vision, layout
+from links.viewer.stream import Stream
 from stages.geometry import rotation_from_rpy_deg
 from stages.messages import AutopilotEstimator, PoseState, RelativePose, ServoOffset
 
@@ -119,3 +120,23 @@ def test_a_graph_that_fuses_without_cameras_shows_the_rotation():
 
     added = shown(Vision(pose=True)) - shown(Vision())
     assert added == {"The drone in the vehicle's axes [deg]", "Sigma of the rotation [deg]"}
+
+
+def test_axes_that_were_cleared_before_they_were_drawn_have_their_frame():
+    """A pose is POSITION_ONLY first, mostly: its axes are cleared before there are any."""
+    logged = []
+
+    class Recording:
+        def log(self, path, *parts, static=False):
+            logged.append((path, static, [type(part).__name__ for part in parts]))
+
+    stream = Stream.__new__(Stream)
+    stream._rerun, stream._styled, stream._curves = Recording(), set(), {}
+    where = scene()
+    for one in (pose(state=PoseState.POSITION_ONLY, R_vehicle_drone=None), pose(), pose()):
+        for mark in drawn(one, NAME, where).values():
+            if mark.path == f"vehicle/{NAME}/axes":
+                stream.put(mark)
+    path = f"vehicle/{NAME}/axes"
+    assert logged[:2] == [(path, False, ["Clear"]), (path, True, ["CoordinateFrame"])]
+    assert [static for _, static, _ in logged].count(True) == 1

@@ -28,6 +28,7 @@ KEPT = 512
 STEP_NS = 50_000_000  # over which a velocity is taken
 TOGETHER_NS = 10_000_000  # poses that arrived so soon after one another are no speed
 STILL_NS = 700_000_000  # how the vehicle moves is known so long after its word: by pictures it comes 5 times a second
+AFRESH_NS = 2_000_000_000  # in so long a silence an odometry may have been started afresh, and nothing tells
 FURTHEST_NS = round(1e9 * TRAIL_S)  # beyond the newest pose
 
 
@@ -73,7 +74,9 @@ class VehicleTrail:
         heard = self._joined or self.known_at(motion.stamp_ns)
         poses = self._watch.hear(motion, heard and self._leads_to(motion))
         another = len(poses) > 1
-        elsewhere = bool(poses) and not self.known_at(poses[0].stamp_ns) if self._joined else another
+        silent_ns = poses[0].stamp_ns - self._poses[-1][0] if poses else 0
+        guessed = silent_ns >= AFRESH_NS or (another and silent_ns >= STILL_NS)
+        elsewhere = guessed if self._joined else another
         if another:
             self._begin_anew(poses[0])
         for pose in poses:

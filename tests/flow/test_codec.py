@@ -162,9 +162,9 @@ def test_sizes_are_held_against_the_bytes_that_are_there():
 
 def test_an_empty_picture_may_not_claim_a_side_without_end():
     said = struct.pack("<qI", 0, 0)
-    assert decode(sealed(Image, said + struct.pack("<II", 0, 640)), EXPECTED).grey.shape == (0, 640)
+    assert decode(sealed(Image, said + struct.pack("<IId", 0, 640, 0.0)), EXPECTED).grey.shape == (0, 640)
     with pytest.raises(CodecError, match="cannot be in"):
-        decode(sealed(Image, said + struct.pack("<II", 0, 2**32 - 1)), EXPECTED)
+        decode(sealed(Image, said + struct.pack("<IId", 0, 2**32 - 1, 0.0)), EXPECTED)
 
 
 @settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck), database=None)

@@ -39,13 +39,9 @@ class Surprise:
     def __init__(self, reckoning: Reckoning, lock: YawLock) -> None:
         self._reckoning, self._lock = reckoning, lock
         self._tilted_before = False  # the pictures before contradicted the turns felt
-        self._scatter_rad2, self._scatter_s = (
-            0.0,
-            0.0,
-        )  # of the pictures' yaws, each beside an earlier one; over how long
-        self._before: tuple[int, float] | None = (
-            None  # of the picture to compare with: stamp, what was known less its yaw
-        )
+        self._scatter_rad2 = 0.0  # of the pictures' yaws, each beside an earlier one
+        self._scatter_s = 0.0  # over how long, SCATTER_S at most
+        self._before: tuple[int, float] | None = None  # the picture to compare with: stamp, `_off_rad`
 
     def as_scattered(self, refined: Refined, reckoned: Reckoned) -> Refined:
         """A yaw no surer than the last pictures scattered about the turns felt."""

@@ -4,8 +4,8 @@ An event is keyed by (arrival, rank, port, sequence): arrival of the record that
 it (producers before consumers), index of the port, and one running number. Two replays of one recording take the same
 steps in the same order, so their messages hash to the same value.
 
-A record that a source cannot decode (`LinkError`) is told and left out, as in a live run. Where a source gave nothing
-else in the whole recording, this is not its recording, and the replay ends with that error.
+A record that a source cannot decode (`LinkError`) is told and left out, as in a live run. Where a source gives nothing
+else, in HOPELESS records or in the whole recording, this is not its recording, and the replay ends with that error.
 
 Source: ours; after openpilot's process replay.
 """

@@ -311,6 +311,7 @@ def test_a_reference_may_say_what_holds_where_nothing_stands(tmp_path, rig, name
         ("$rig.titel or bert", "'$rig.titel or bert' stands for nothing: rig has no 'titel'. Did you mean 'title'?"),
         ("$rig.name or [1, 2]", "'[1, 2]' after 'or' is no plain value"),
         ("$rig.name or '", "after 'or' is no plain value"),
+        ("$rig.name or $rig.title", "after 'or' is no plain value"),
     ],
 )
 def test_what_holds_where_nothing_stands_is_no_cover_for_mistakes(tmp_path, reference, told):

@@ -241,14 +241,21 @@ def test_both_sides_of_a_signed_link_understand_each_other_and_unsigned_words_ar
     assert (tmp_path / "key.timestamp").exists()
 
 
-def test_an_autopilot_without_a_clock_is_told_the_time_before_it_is_heard_and_gets_no_poses_until_then(tmp_path: Path):
-    """ArduPilot begins with the time it signed with last, and takes that of a signed frame that is newer."""
-    key = tmp_path / "key"
+def signing_drone(folder: Path, days_ago: int = 0) -> tuple[Path, mavlink.MAVLink]:
+    """Our key's file, and a peer that signs with it, its clock so late."""
+    key = folder / "key"
     key.write_bytes(b"k" * 32)
     key.chmod(0o600)
     drone = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     drone.signing.secret_key, drone.signing.sign_outgoing = b"k" * 32, True
-    drone.signing.timestamp = (host_time.now_ns() - 1_420_070_400 * 10**9) // 10_000 - 864_000 * 100_000  # 10 days ago
+    since_2015_ns = host_time.now_ns() - 1_420_070_400 * 10**9
+    drone.signing.timestamp = since_2015_ns // 10_000 - days_ago * 86_400 * 100_000
+    return key, drone
+
+
+def test_an_autopilot_without_a_clock_is_told_the_time_before_it_is_heard_and_gets_no_poses_until_then(tmp_path: Path):
+    """ArduPilot begins with the time it signed with last, and takes that of a signed frame that is newer."""
+    key, drone = signing_drone(tmp_path, days_ago=10)
     beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
     with listening(signing_key=str(key)) as heard, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.bind(("127.0.0.1", 0))
@@ -266,12 +273,7 @@ def test_an_autopilot_without_a_clock_is_told_the_time_before_it_is_heard_and_ge
 
 
 def test_an_old_signed_frame_sent_again_does_not_draw_the_poses_away(tmp_path: Path):
-    key = tmp_path / "key"
-    key.write_bytes(b"k" * 32)
-    key.chmod(0o600)
-    drone = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    drone.signing.secret_key, drone.signing.sign_outgoing = b"k" * 32, True
-    drone.signing.timestamp = (host_time.now_ns() - 1_420_070_400 * 10**9) // 10_000
+    key, drone = signing_drone(tmp_path)
     frame = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), drone)
     with (
         listening(signing_key=str(key)) as heard,

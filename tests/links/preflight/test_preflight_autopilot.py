@@ -133,6 +133,8 @@ def test_a_silent_autopilot_and_one_with_another_id_are_told_apart():
     assert "system 9 component 1 speak here" in other.sentence
     mute = check(frames(beats=False))["it heartbeat"]
     assert "though it sends other messages" in mute.sentence
+    old = check([], counters={"signed with our key, but not new": 8})["it heartbeat"]
+    assert "8 frames came that are signed with an old time: does it hear us?" in old.sentence
     unsigned = check([], counters={"not signed with our key": 8})["it heartbeat"]
     assert "8 frames came that are not signed" in unsigned.sentence
 

@@ -86,6 +86,25 @@ def test_a_wall_clock_that_is_slewed_is_followed(clocks, host):
     assert host.steps == 0
 
 
+def test_a_machine_that_is_slow_to_read_its_clocks_did_not_set_them(clocks):
+    """Another process comes between the readings every time, the longest the last time."""
+    slow_ns = iter([9 * MS, 4 * MS, 3 * MS, 5 * MS, 40 * MS] * 2)
+
+    def wall():
+        clocks.monotonic_ns += next(slow_ns, 0)
+        return clocks.wall()
+
+    clocks.monotonic_ns += 20 * MS
+    host = HostTime(clocks.wall, clocks.monotonic)
+    host.from_wall_ns(clocks.wall())
+    host._wall_ns = wall
+    for _ in range(3):
+        clocks.monotonic_ns += 50 * MS
+        stamp, stamped_ns = clocks.wall() - 2 * MS, host.now_ns() - 2 * MS
+        assert stamped_ns - 3 * MS <= host.from_wall_ns(stamp) <= stamped_ns
+    assert host.steps == 0
+
+
 def test_a_stamp_from_the_future_or_from_long_ago_is_taken_as_now(clocks, host):
     clocks.monotonic_ns += 10 * MAX_AGE_NS
     assert host.from_wall_ns(clocks.wall() + MS) == host.now_ns()

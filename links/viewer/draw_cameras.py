@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from links.viewer import colours
 from links.viewer.lenses import arcs, pixels_of, strips
-from links.viewer.marks import Marks, lane_of, plot, say, stage_of, state
+from links.viewer.marks import Marks, lane_of, plot, say, stage_of, state, strip_batch
 from links.viewer.scene import Mark, Picture, Scene, sphere_frame
 from stages.geometry import Array64
 from stages.messages import FollowedFeatures, Image, VanishingDirections
@@ -110,8 +110,8 @@ def _sphere(
     by_direction: NDArray[np.uint32],
 ) -> Marks:
     frame = sphere_frame(message.carrier)
-    parts, owner = strips(points, arc)
-    lines = rr.LineStrips3D(parts, colors=by_line[owner], radii=rr.Radius.ui_points(1.0))
+    drawn, lengths, owner = strips(points, arc)
+    lines = rr.LineStrips3D(strip_batch(drawn, lengths), colors=by_line[owner], radii=rr.Radius.ui_points(1.0))
     yield Mark(f"{path}/lines", lines, frame=frame)
     both = 1.15 * np.stack([-message.direction, message.direction], axis=1)  # a direction's sign means nothing
     through = rr.LineStrips3D(both.astype(np.float32), colors=by_direction, radii=rr.Radius.ui_points(2.5))
@@ -150,8 +150,10 @@ def _on_picture(
             f"the picture of {frame_id} is {picture.width_px} px wide, its lens in `cameras` is for {camera.size_px}: "
             "is this the rig of this recording?"
         )
-    parts, owner = strips(picture.shown(pixels_of(camera, points)), arc)
-    lines = rr.LineStrips2D(parts, colors=by_line[owner], radii=rr.Radius.ui_points(LINE_POINTS), draw_order=20)
+    drawn, lengths, owner = strips(picture.shown(pixels_of(camera, points)), arc)
+    lines = rr.LineStrips2D(
+        strip_batch(drawn, lengths), colors=by_line[owner], radii=rr.Radius.ui_points(LINE_POINTS), draw_order=20
+    )
     yield Mark(f"{path}/lines", lines)
     targets = picture.shown(pixels_of(camera, np.concatenate([message.direction, -message.direction])))
     seen = np.isfinite(targets).all(axis=1)

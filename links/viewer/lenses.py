@@ -5,8 +5,6 @@ Source: ours; lenses: stages/lens.py; a line of the world is a great circle of r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
@@ -91,11 +89,17 @@ def arcs(ends: Array64, step_rad: float = STEP_RAD) -> tuple[Array64, NDArray[np
     return a[arc] * np.cos(s) + q[arc] * np.sin(s), arc
 
 
-def strips(points: Array64, arc: NDArray[np.int64]) -> tuple[Sequence[NDArray[np.float32]], NDArray[np.int64]]:
-    """Strips of points (k, d) that belong together, and the arc of each; a point that is NaN breaks its strip."""
+def strips(
+    points: Array64, arc: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
+    """Points (m, d) of points (k, d) strip after strip, how many each strip has (s,), and the arc that it is of (s,).
+
+    A point that is NaN breaks its arc's strip, one that is then alone is none.
+    """
     seen = np.asarray(np.isfinite(points).all(axis=1), dtype=np.bool_)
     begins = np.append([True], (arc[1:] != arc[:-1]) | ~seen[:-1])[: len(points)]
-    strip, first, length = np.unique(np.cumsum(begins)[seen], return_index=True, return_counts=True)
-    parts = np.split(points[seen].astype(np.float32), first[1:])[: len(strip)]
-    drawn = np.flatnonzero(length > 1)
-    return [parts[k] for k in drawn], arc[seen][first[drawn]]
+    _, first, strip, length = np.unique(
+        np.cumsum(begins)[seen], return_index=True, return_inverse=True, return_counts=True
+    )
+    drawn = length > 1
+    return points[seen][drawn[strip]].astype(np.float32), length[drawn], arc[seen][first[drawn]]

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
@@ -76,6 +77,19 @@ def plot(
         return [*lines, *(rr.SeriesPoints(**look).as_component_batches() if dotted else [])]
 
     return Curve(path, values, style=style)
+
+
+def strip_batch(points: NDArray[np.float32], lengths: NDArray[np.int64]) -> pa.Array:
+    """Strips for `LineStrips2D` or `LineStrips3D`: points (n, 2 or 3), strip after strip, and how many each has.
+
+    Made at once: Rerun 0.41 makes of a list one array for each strip, 27 ms a picture with its three hundred lines.
+    """
+    empty = (rr.components.LineStrip2DBatch if points.shape[1] == 2 else rr.components.LineStrip3DBatch)([])
+    strips = empty.as_arrow_array().type
+    flat = pa.array(points.ravel())
+    rows = pa.FixedSizeListArray.from_arrays(flat, type=strips.value_type)
+    ends = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(ends), rows, type=strips)
 
 
 def label(name: str, xyz_vehicle_m: NDArray[np.float64], texts: list[str], colour: Colour) -> Mark:

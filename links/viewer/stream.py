@@ -20,7 +20,7 @@ from stages.geometry import Array64
 
 APPLICATION = "grd"
 LOOPBACK = "127.0.0.1"
-CURVES_NS = 200_000_000  # of curves are written at a time: in rows, one by one, they cost more than all the rest
+CURVES_NS = 500_000_000  # of curves are written at a time: in rows, one by one, they cost more than all the rest
 EPOCH_FROM_NS = 10**17  # stamps above are times since 1970 (1973 on), below are times since some start
 
 

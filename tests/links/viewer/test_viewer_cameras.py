@@ -18,6 +18,7 @@ from links.viewer import Viewer, colours
 from links.viewer.draw import draw
 from links.viewer.draw_cameras import direction_colours
 from links.viewer.lenses import Cameras, arcs, strips
+from links.viewer.marks import strip_batch
 from stages.messages import Carrier, FollowedFeatures
 
 VP, LINES = "vp_vehicle/vanishing_directions", "camera/camera_vehicle/vp_vehicle/vanishing_directions/lines"
@@ -50,12 +51,14 @@ def test_arcs_of_any_length_keep_their_order_and_a_point_is_an_arc_too():
 def test_a_strip_ends_where_the_lens_sees_no_more_and_goes_on_behind():
     nan = np.nan
     points = np.array([[0.0, 0], [1, 0], [nan, nan], [3, 0], [4, 0], [5, 5], [nan, nan], [7, 7], [8, 8]])
-    parts, owner = strips(points, np.array([0, 0, 0, 0, 0, 1, 1, 2, 2]))
-    assert [part.tolist() for part in parts] == [[[0, 0], [1, 0]], [[3, 0], [4, 0]], [[7, 7], [8, 8]]]
+    drawn, lengths, owner = strips(points, np.array([0, 0, 0, 0, 0, 1, 1, 2, 2]))
+    parts = [[[0, 0], [1, 0]], [[3, 0], [4, 0]], [[7, 7], [8, 8]]]
+    assert drawn.tolist() == [point for part in parts for point in part]
+    assert strip_batch(drawn, lengths).to_pylist() == parts
     np.testing.assert_array_equal(owner, [0, 0, 2])
     for gone in (np.full((3, 2), nan), np.zeros((0, 2))):
-        parts, owner = strips(gone, np.zeros(len(gone), int))
-        assert (len(parts), len(owner)) == (0, 0)
+        drawn, lengths, owner = strips(gone, np.zeros(len(gone), int))
+        assert (len(lengths), len(owner), strip_batch(drawn, lengths).to_pylist()) == (0, 0, [])
 
 
 def test_a_picture_is_a_small_jpeg_of_its_own_view():

@@ -169,6 +169,12 @@ def simulate_matrix(
     calibrated: Annotated[
         bool, typer.Option("--calibrated", help="The rig knows the error of the servo's encoder and its play.")
     ] = False,
+    as_built: Annotated[
+        bool,
+        typer.Option(
+            "--as-built", help="Each flight's rig is not quite as its file says, its drone one of several kinds."
+        ),
+    ] = False,
     odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle has odometry.")] = False,
     rain: Annotated[bool, typer.Option("--rain", help="It rains, 5 mm/h.")] = False,
     autopilot: Annotated[
@@ -252,7 +258,7 @@ def simulate_matrix(
         return
     with progress_bar(f"{len(wanted) * seeds} recordings") as step:
         size_px = cameras_px or Conditions.cameras_px
-        conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0)
+        conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, as_built)
         report = make_matrix(
             folder, wanted, range(1, seeds + 1), closed_loop, step, conditions, results, jobs, pictures
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,17 +25,48 @@ from links.simulated.camera_view import PixelRays, Shutter, View, mean_radiance,
 from links.simulated.mesh import Array64, Mesh, RayScene
 from links.simulated.scene import Scene
 from links.simulated.weather import Weather
-from stages.geometry import Pose
+from stages.geometry import Pose, Vector3, quaternions_xyzw, rotation_from_rpy_deg
 from stages.lens import Equidistant, KannalaBrandt, Lens, OCam
 
 LOOKS_UP = Pose(rpy_deg=(0.0, 0.0, 90.0))  # the image's top is forward, its right is left
 LOOKS_DOWN_RPY_DEG = (180.0, 0.0, -90.0)  # the image's top is forward, its right is right
 BELOW_BODY_M = 0.02
 Carrier = Literal["vehicle", "drone"]
+AnyLens = Equidistant | KannalaBrandt | OCam
+
+
+def _is_none(value: object) -> bool:
+    return value is None  # files of scenarios made before there was one stay the same
 
 
 class _Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class CameraError(_Settings):
+    """How far what the rig file says of a camera is from how it is."""
+
+    turned_deg: Vector3 = (0.0, 0.0, 0.0)  # roll, pitch, yaw about the carrier's axes
+    focal_share: float = Field(default=0.0, ge=-0.1, le=0.1)  # of the focal length, too long
+    centre_share: tuple[float, float] = (0.0, 0.0)  # of the picture's size, to the right and down
+
+    def lens(self, true: AnyLens, size_px: int) -> AnyLens:
+        """The lens that the rig file has."""
+        told = true.scaled(1.0 + self.focal_share)
+        right, down = self.centre_share
+        centre_px = true.centre_px[0] + right * size_px, true.centre_px[1] + down * size_px
+        return told.model_copy(update={"centre_px": centre_px})
+
+    def mount(self, true: Pose) -> Pose:
+        """The mount that the rig file has."""
+        return turned(true, self.turned_deg)
+
+
+def turned(pose: Pose, rpy_deg: Vector3) -> Pose:
+    """A pose turned where it stands, about its parent's axes."""
+    R = rotation_from_rpy_deg(rpy_deg) @ pose.matrix()[:3, :3]
+    x, y, z, w = quaternions_xyzw(R[None])[0].tolist()
+    return Pose(xyz_m=pose.xyz_m, quaternion_xyzw=(x, y, z, w))
 
 
 class CameraSettings(_Settings):
@@ -48,6 +79,7 @@ class CameraSettings(_Settings):
     readout_ms: float = Field(default=0.0, ge=0, le=60)  # first to last row; 0: a global shutter
     latency_ms: tuple[float, float] = (30.0, 80.0)  # from the end of readout to arrival
     sensor: SensorSettings = SensorSettings()
+    error: Annotated[CameraError | None, Field(exclude_if=_is_none)] = None  # null: it is as the rig file says
 
     @model_validator(mode="after")
     def _fits_its_period(self) -> Self:
@@ -59,7 +91,7 @@ class CameraSettings(_Settings):
         return self
 
     @property
-    def true_lens(self) -> Equidistant | KannalaBrandt | OCam:
+    def true_lens(self) -> AnyLens:
         """The lens in use."""
         if self.lens is not None:
             return self.lens
@@ -194,9 +226,12 @@ def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Seq
         mount = mount_of(carrier, one, drone[0] if drone else None)
         meshes = [vehicle_from_camera] if carrier == "vehicle" else drone
         masked_px, max_off_axis_deg = own_body(one.true_lens, one.size_px, mount, meshes)
+        told, lens = mount, one.true_lens
+        if one.error is not None:
+            told, lens = one.error.mount(mount), one.error.lens(lens, one.size_px)
         tree[carrier] = {
-            f"T_{carrier}_camera": mount.model_dump(mode="json", exclude_none=True),
-            "lens": one.true_lens.model_dump(mode="json"),
+            f"T_{carrier}_camera": told.model_dump(mode="json", exclude_none=True),
+            "lens": lens.model_dump(mode="json"),
             "size_px": one.size_px,
             "readout_ms": one.readout_ms,
             "masked_px": masked_px,

@@ -15,16 +15,19 @@ from pydantic import BaseModel, ConfigDict
 from links.simulated.mesh import Mesh, box, merge, quads, rod
 
 BLADES = 2  # per rotor
+Shape = Literal["x4", "folding", "hexa"]
+Surface = Literal["carbon", "dark_shell", "grey_shell", "light_shell"]
+SPAN_M: dict[Shape, float] = {"x4": 0.5, "folding": 0.35, "hexa": 0.8}  # the models' own
 
 
 class DroneModel(BaseModel):
-    """What the drone looks like. Its span is set apart (`drone.span_m`): 0.35, 0.5 and 0.8 m are the models' own."""
+    """What the drone looks like. Its span is set apart (`drone.span_m`); `SPAN_M` are the models' own."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    shape: Literal["x4", "folding", "hexa"] = "x4"
+    shape: Shape = "x4"
     # at 903 nm: 0.12, 0.06, 0.20, 0.60; the LiDAR loses half of the hits near 40, 30, 45, 80 m
-    surface: Literal["carbon", "dark_shell", "grey_shell", "light_shell"] = "carbon"
+    surface: Surface = "carbon"
 
 
 def drone_mesh(span_m: float, rotor_rad: float = 0.0, model: DroneModel | None = None) -> Mesh:

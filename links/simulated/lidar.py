@@ -36,6 +36,10 @@ def _is_dense(footprint: str) -> bool:
     return footprint == "dense"  # files of scenarios made before there was another stay the same
 
 
+def _is_zero(offset: float) -> bool:
+    return offset == 0.0  # the same
+
+
 class LidarSettings(BaseModel):
     """The sensor's settings and how well it measures."""
 
@@ -49,6 +53,7 @@ class LidarSettings(BaseModel):
     range_noise_m: float = Field(default=0.008, ge=0)  # one sigma on a strong return
     weak_range_noise_m: float = Field(default=0.02, ge=0)  # added at the threshold, falls with power
     laser_bias_m: float = Field(default=0.01, ge=0)  # one sigma over the 16 lasers, constant in a run
+    range_offset_m: Annotated[float, Field(ge=-0.5, le=0.5, exclude_if=_is_zero)] = 0.0  # of all lasers alike
     dropout: float = Field(default=0.005, ge=0, lt=1)  # pulses lost for no reason in the scene
     min_range_m: float = 0.5
     max_range_m: float = 105.0
@@ -95,7 +100,7 @@ class Lidar:
         self._rotor_phase_rad = fixed.uniform(0, 2 * np.pi)
         self._rotor_radps = settings.rotor_rpm / 60 * 2 * np.pi * (1 + fixed.normal(0, 3e-4))
         self._patterns = FOOTPRINTS[settings.footprint]
-        self._bias_m = fixed.normal(0, settings.laser_bias_m, vlp16.LASERS)
+        self._bias_m = fixed.normal(0, settings.laser_bias_m, vlp16.LASERS) + settings.range_offset_m
         self._threshold = 0.10 / settings.range_at_10_percent_m**2
         self._extinction_per_m = weather.extinction_per_m()
         self._drops = None

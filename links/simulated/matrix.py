@@ -17,10 +17,12 @@ from itertools import product
 
 import numpy as np
 
+from links.simulated.as_built import AsBuilt, as_built
 from links.simulated.autopilot import AutopilotSettings
 from links.simulated.camera import CameraSettings, CamerasSettings
 from links.simulated.clearance import sample_times_s
 from links.simulated.drone import DroneModel
+from links.simulated.lidar import LidarSettings
 from links.simulated.matrix_flights import CAMERA_HEIGHT_M, Cell, drone_path, two_paths, vehicle_path
 from links.simulated.operator import Sweep, Vibrate
 from links.simulated.scenario import DroneSettings, RigLidar, Scenario
@@ -65,6 +67,7 @@ class Conditions:
     cameras_hz: float | None = None  # two fisheyes; None: none
     cameras_px: int = 720  # their size, square
     readout_ms: float = 0.0  # their rolling shutter, first to last row; 0: all rows at once
+    as_built: bool = False  # the rig is not quite as its file says, each flight is of its own kind of drone
 
 
 def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
@@ -99,11 +102,16 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         flown = two_paths(cell, world, rng, times, lidar_m)
     else:
         flown = (drone_path(cell, world, rng, times, lidar_m),)
-    drones = tuple(DroneSettings(path=path, model=DRONE) for path in flown)
+    built = as_built(cell.name, seed) if conditions.as_built else None
+    look = {"model": DRONE} if built is None else {"model": built.model, "span_m": built.span_m}
+    drones = tuple(DroneSettings.model_validate({"path": path} | look) for path in flown)
     what = f"{cell.motion} at {cell.range_m} m" if drones else "no drone"
     straight = RigLidar()
     found = {"servo_harmonics": Turned(SERVO, seed).harmonics(), "servo_play_deg": SERVO.backlash_deg}
     known = straight.mount.model_copy(update=found)
+    true_mount = straight.mount if conditions.calibrated else None
+    if built is not None:
+        true_mount = built.mount(straight.mount)
     return Scenario(
         name=cell.name,
         description=f"{what}, vehicle {cell.vehicle}, {cell.scene}",
@@ -118,17 +126,22 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         script=SWEEPS if cell.motion in SEARCHING else SWEEP_THEN_FOLLOW,
         truth_visible=bool(drones),
         autopilot=AutopilotSettings() if conditions.autopilot and drones else None,
-        cameras=_cameras(conditions, bool(drones)),
+        lidar=LidarSettings() if built is None else LidarSettings(range_offset_m=built.range_offset_m),
+        cameras=_cameras(conditions, bool(drones), built),
         weather=RAIN if conditions.rain else Weather(),
         vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,
         rig=RigLidar(mount=known) if conditions.calibrated else straight,
-        true_mount=straight.mount if conditions.calibrated else None,
+        true_mount=true_mount,
     )
 
 
-def _cameras(conditions: Conditions, drone: bool) -> CamerasSettings:
+def _cameras(conditions: Conditions, drone: bool, built: AsBuilt | None) -> CamerasSettings:
     """The vehicle's and, where there is a drone to carry it, the drone's."""
     if conditions.cameras_hz is None:
         return CamerasSettings()
     one = CameraSettings(rate_hz=conditions.cameras_hz, size_px=conditions.cameras_px, readout_ms=conditions.readout_ms)
-    return CamerasSettings(vehicle=one, drone=one if drone else None)
+    vehicle = drones = one
+    if built is not None:
+        vehicle = one.model_copy(update={"error": built.camera_vehicle})
+        drones = one.model_copy(update={"error": built.camera_drone})
+    return CamerasSettings(vehicle=vehicle, drone=drones if drone else None)

@@ -89,9 +89,7 @@ def arcs(ends: Array64, step_rad: float = STEP_RAD) -> tuple[Array64, NDArray[np
     return a[arc] * np.cos(s) + q[arc] * np.sin(s), arc
 
 
-def strips(
-    points: Array64, arc: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
+def strips(points: Array64, arc: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
     """Points (m, d) of points (k, d) strip after strip, how many each strip has (s,), and the arc that it is of (s,).
 
     A point that is NaN breaks its arc's strip, one that is then alone is none.

@@ -14,6 +14,7 @@ from flow.link import LinkError
 from links.cli.app import app
 from links.recording import RecordingReader
 from links.simulated import matrix_flights
+from links.simulated.camera import CamerasSettings
 from links.simulated.clearance import sample_times_s, visible
 from links.simulated.matrix import (
     MOTIONS,
@@ -32,6 +33,8 @@ from links.simulated.scenario import Scenario
 from links.simulated.servo import Turned
 from links.simulated.world import build_world
 from links.simulated.world.settings import Kind
+from stages.geometry import Pose
+from stages.rotation import log_rotation
 
 LIDAR_UP = np.array([0.0, 0.0, 0.35])
 
@@ -219,6 +222,44 @@ def test_cameras_are_added_to_a_cell_and_change_nothing_else() -> None:
     nobody = scenario_of(Cell("open_lot", 0, "empty", "parked"), 3, Conditions(cameras_hz=4.0))
     assert nobody.cameras.vehicle is not None
     assert nobody.cameras.drone is None
+
+
+def test_a_rig_as_built_is_off_and_its_drone_one_of_several_while_the_file_tells_what_was_meant() -> None:
+    cell, asked = Cell("open_lot", 20, "hover", "driving"), Conditions(calibrated=True, cameras_hz=4.0, as_built=True)
+    ideal = scenario_of(cell, 3, Conditions(calibrated=True, cameras_hz=4.0))
+    built = [scenario_of(cell, seed, asked) for seed in range(1, 60)]
+    third = built[2]
+    assert third.rig == ideal.rig
+    assert Scenario.model_validate(yaml.safe_load(third.as_yaml())) == third
+    zero_deg = [s.mount.servo_zero_deg for s in built]
+    lean_deg = [np.degrees(np.arccos(s.mount.T_vehicle_turntable.matrix()[2, 2])) for s in built]
+    assert 0.07 < np.std(zero_deg) < 0.13
+    assert 0.05 < np.sqrt(np.mean(np.square(lean_deg))) < 0.09  # of two axes
+    assert 0.012 < np.std([s.lidar.range_offset_m for s in built]) < 0.022
+    drones = [s.drone for s in built if s.drone is not None]
+    assert {(d.model.shape, d.span_m) for d in drones} == {("x4", 0.5), ("folding", 0.35), ("hexa", 0.8)}
+    assert len({d.model.surface for d in drones}) == 4
+    rig, was = (yaml.safe_load(s.rig_yaml()) for s in (third, ideal))
+    assert rig["lidar"] == was["lidar"]
+    assert third.drone is not None
+    assert rig["drone"] == {"span_m": third.drone.span_m}
+    for carrier, one in (("vehicle", third.cameras.vehicle), ("drone", third.cameras.drone)):
+        assert one is not None
+        told, true = Pose(**rig["cameras"][carrier][f"T_{carrier}_camera"]).matrix()[:3, :3], rig_mount(carrier, third)
+        turned_deg = np.degrees(np.linalg.norm(log_rotation(told @ true.T)))
+        assert 0.005 < turned_deg < 0.3
+        lens = rig["cameras"][carrier]["lens"]
+        assert 0 < abs(lens["focal_px"] / one.true_lens.focal_px - 1) < 0.003  # pyright: ignore
+        assert 0 < np.abs(np.subtract(lens["centre_px"], one.true_lens.centre_px)).max() < 1.0
+    other = scenario_of(Cell("campus", 20, "hover", "driving"), 3, asked)
+    assert other.mount.servo_zero_deg != third.mount.servo_zero_deg
+
+
+def rig_mount(carrier, scenario: Scenario) -> np.ndarray:
+    """How the camera really sits (3, 3): the rig file of the same rig without its errors."""
+    one = {c: getattr(scenario.cameras, c).model_copy(update={"error": None}) for c in ("vehicle", "drone")}
+    rig = yaml.safe_load(scenario.changed(cameras=CamerasSettings(**one)).rig_yaml())
+    return Pose(**rig["cameras"][carrier][f"T_{carrier}_camera"]).matrix()[:3, :3]
 
 
 def test_a_seed_makes_one_scenario_and_another_seed_another() -> None:

@@ -57,6 +57,7 @@ class Session:
         self._signer, self._now_ns = signer, now_ns
         self._received_topic, self._sent_topic = topics
         self._splitter = FrameSplitter()
+        self._split_on = 0  # the connection, by `reconnects`
         self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
         self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
         self._lock = threading.Lock()  # over what numbers, signs and sends
@@ -83,6 +84,9 @@ class Session:
                 continue
             arrival_ns = self._now_ns()
             data, source = received
+            if self._split_on != self.connection.reconnects:
+                self._splitter.begin_anew()
+                self._split_on = self.connection.reconnects
             frames = self._splitter.datagram(data) if self.connection.datagrams else self._splitter.stream(data)
             for frame, message in frames:
                 if self._hear(frame, message, source):

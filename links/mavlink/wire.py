@@ -115,6 +115,11 @@ class FrameSplitter:
         self._rest += data
         return self._frames(self._rest, whole=False)
 
+    def begin_anew(self) -> None:
+        """The stream was opened again: what was kept of the one before never becomes a frame."""
+        self.stray_bytes += len(self._rest)
+        self._rest.clear()
+
     def _frames(self, data: bytes | bytearray, whole: bool) -> list[tuple[bytes, Any]]:
         found: list[tuple[bytes, Any]] = []
         at = 0

@@ -195,6 +195,25 @@ def test_by_tcp_poses_go_to_whom_was_heard_on_this_connection():
             heard.rest(lambda connection=connection: heard.link.counters["reconnects"] > connection)
 
 
+def test_half_a_frame_of_the_line_before_holds_up_none_of_the_new_one():
+    """A frame that is announced as longer than what comes would wait for the rest, and be stamped then."""
+    mav = mavlink.MAVLink(None, 1, 1)
+    long = packed(mavlink.MAVLink_statustext_message(6, b"x" * 50), mav)
+    beat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mav)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        listening(connection=f"tcp:127.0.0.1:{server.getsockname()[1]}") as heard,
+    ):
+        with server.accept()[0] as peer:
+            peer.sendall(beat + long[:20])
+            heard.rest(lambda: len(heard.records) == 1)
+        heard.rest(lambda: heard.link.counters["reconnects"] == 1)
+        with server.accept()[0] as peer:
+            peer.sendall(beat)
+            heard.rest(lambda: len(heard.records) == 2, most=100)
+        assert heard.link.counters["stray bytes"] == 20
+
+
 def test_timesync_is_answered_and_asked_for():
     with listening() as heard, drone_for(heard, Px4Rules()) as drone:
         before_ns = host_time.now_ns()

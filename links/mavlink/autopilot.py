@@ -58,6 +58,7 @@ class Autopilot(Source):
     global_origin: GlobalOrigin | None = None  # given to an autopilot that has none
 
     _session: Session | None = PrivateAttr(default=None)
+    _signer: Signer | None = PrivateAttr(default=None)  # of all sessions
     _missed: int = PrivateAttr(default=0)
 
     @field_validator("connection")
@@ -122,7 +123,8 @@ class Autopilot(Source):
         if self.connection is None:
             raise LinkError("no connection to the autopilot: set `connection`, as in udpin:127.0.0.1:14550")
         target = self.system_id, self.component_id
-        signer = None if self.signing_key is None else Signer(self.signing_key, host_time.now_ns())
+        if self.signing_key is not None and self._signer is None:
+            self._signer = Signer(self.signing_key, host_time.now_ns())
         connection = open_connection(parse_connection(self.connection), self.sender)
         session = Session(
             connection,
@@ -130,7 +132,7 @@ class Autopilot(Source):
             self._own,
             PoseSpeaker(self.send, self.limits, reset_counter=host_time.now_ns() // 1_000_000_000),
             OriginGiver(self.global_origin, target),
-            signer,
+            self._signer,
             host_time.now_ns,
             (self.topic, SENT_TOPIC),
         )

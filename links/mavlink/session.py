@@ -62,7 +62,6 @@ class Session:
         self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
         self._lock = threading.Lock()  # over what numbers, signs and sends
         self._closed = threading.Event()
-        self._failure: LinkError | None = None
         self._second_ns = 0
         self._target_ns = now_ns()  # when the autopilot was heard last, or the session began
         self._heard_on: int | None = None  # the connection, by `reconnects`; NOWHERE: only with an old signature
@@ -72,8 +71,6 @@ class Session:
     def records(self) -> Iterator[Record]:
         """Frames as they arrive, until closed. LinkError when the link has failed for good."""
         while not self._closed.is_set():
-            if self._failure is not None:
-                raise self._failure
             try:
                 received = self.connection.receive(WAKE_S)
             except LinkError:
@@ -121,6 +118,7 @@ class Session:
             "from other senders": self.connection.foreign,
             "reconnects": self.connection.reconnects,
             "dropped: stood still": self.connection.stalls,
+            **({"signing time not written": self._signer.unwritten} if self._signer is not None else {}),
         }
 
     @property
@@ -131,9 +129,14 @@ class Session:
     @property
     def trouble(self) -> str | None:
         """What does not work now; None: all does."""
-        silent_s = (self._now_ns() - self._target_ns) / SECOND_NS
-        if self.connection.trouble is not None or self.closed or silent_s < SILENT_S:
-            return None if self.closed else self.connection.trouble
+        if self.closed:
+            return None
+        troubles = self.connection.trouble, self._silence(), None if self._signer is None else self._signer.trouble
+        return next((trouble for trouble in troubles if trouble is not None), None)
+
+    def _silence(self) -> str | None:
+        if self._now_ns() - self._target_ns < SILENT_S * SECOND_NS:
+            return None
         return (
             f"no word from the autopilot (system {self._target[0]}, component {self._target[1]}) for "
             f"{SILENT_S:g} s: is it powered, does it speak here, and are system_id and component_id its own?"
@@ -189,14 +192,10 @@ class Session:
 
     def _keep(self) -> None:
         while not self._closed.wait(WAKE_S):
-            try:
-                with self._lock:
-                    self._tick(self._now_ns())
-                if self._signer is not None:
-                    self._signer.keep()  # not under the lock: the disk may be slow
-            except LinkError as error:  # the signature's time cannot be written
-                self._failure = error
-                return
+            with self._lock:
+                self._tick(self._now_ns())
+            if self._signer is not None:
+                self._signer.keep()  # not under the lock: the disk may be slow
 
     def _tick(self, now_ns: int) -> None:
         if now_ns - self._second_ns >= SECOND_NS:

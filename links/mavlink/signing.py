@@ -2,8 +2,9 @@
 
 The key file holds 32 bytes, or 64 hexadecimal digits, and belongs to us alone (mode 0600). A signature carries a time
 that must grow for ever, over restarts and whatever the host's clock says: beside the key, in `<key>.timestamp`, stands
-one that has not been used yet, written a minute ahead so that a crash cannot repeat one. An autopilot without a clock
-goes on from the time it noted last: it is not heard until it has heard ours, which the session sends it all the same.
+one that has not been used yet, written a minute ahead so that a crash cannot repeat one. A disk that takes no more ends
+no flight: the times go on growing, and it is said that after a restart they may not. An autopilot without a clock goes
+on from the time it noted last: it is not heard until it has heard ours, which the session sends it all the same.
 
 Source: https://mavlink.io/en/guide/message_signing.html. Verifying is ours: pymavlink 2.4 notes the time of a frame
 before it has looked at the signature, so that one forged frame silences the true sender.
@@ -16,6 +17,7 @@ import hmac
 import os
 import stat
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ KEY_BYTES = 32
 EPOCH_S = 1_420_070_400  # 2015-01-01, in seconds since 1970
 TICK_NS = 10_000
 AHEAD_TICKS = 60 * 100_000  # a minute: how far ahead of use the file is written, and how old a new stream may be
+RETRY_S = 10.0  # a disk that took nothing
 LINK_AT, TIME_AT, HASH_AT = 13, 12, 6  # from the frame's end
 
 
@@ -55,9 +58,11 @@ def read_key(path: Path) -> bytes:
 
 
 class Signer:
-    """Signs what a pymavlink sender packs and verifies what comes in."""
+    """Signs what a pymavlink sender packs and verifies what comes in; one for a run, so that no time comes again."""
 
     def __init__(self, key_file: Path, now_ns: int, link_id: int = 0) -> None:
+        self.unwritten = 0  # times that the file could not be written
+        self.trouble: str | None = None  # in words, while it cannot
         self._secret = read_key(key_file)
         self._file = key_file.with_name(key_file.name + ".timestamp")
         self._heard: dict[tuple[int, tuple[int, int]], int] = {}  # (link, sender) -> newest time
@@ -65,12 +70,13 @@ class Signer:
         self._used = max(self._read_file(), ticks_of(now_ns))
         self._writing = threading.Lock()
         self._reserved = 0  # stands in the file
+        self._retry_at_s = 0.0
         self.keep()
 
     def sign_for(self, sender: Any, now_ns: int) -> None:
         """Make pymavlink's MAVLink `sender` sign what it packs next."""
         self._used = max(self._used + 1, ticks_of(now_ns))
-        if self._used >= self._reserved:
+        if self._used >= self._reserved and not self._writing.locked():
             self.keep()
         sender.signing.secret_key = self._secret
         sender.signing.sign_outgoing = True
@@ -80,13 +86,11 @@ class Signer:
     def keep(self) -> None:
         """Write the file ahead where it is time; called now and then, so that signing itself need not wait for it.
 
-        From any thread: one that waits for a slow disk holds up none that signs, for half a minute.
+        From any thread: one that waits for a slow disk holds up none that signs. What fails is tried again later.
         """
         with self._writing:
-            used = self._used
-            if used + AHEAD_TICKS // 2 >= self._reserved:
-                self._write(used + AHEAD_TICKS)
-                self._reserved = used + AHEAD_TICKS
+            if self._used + AHEAD_TICKS // 2 >= self._reserved and time.monotonic() >= self._retry_at_s:
+                self._write(self._used + AHEAD_TICKS)
 
     def genuine(self, frame: bytes) -> bool:
         """Whether a frame is signed with our key, whatever its time."""
@@ -125,6 +129,7 @@ class Signer:
             ) from None
 
     def _write(self, ticks: int) -> None:
+        """Write the file, or say that it cannot be: who signs need not know."""
         fresh = self._file.with_name(self._file.name + ".new")
         try:
             descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
@@ -134,6 +139,11 @@ class Signer:
                 os.fsync(file.fileno())
             fresh.replace(self._file)
         except OSError as error:
-            raise LinkError(
-                f"{self._file}: cannot be written: {error.strerror}. Check `signing_key`'s folder."
-            ) from None
+            self.unwritten += 1
+            self._retry_at_s = time.monotonic() + RETRY_S
+            self.trouble = (
+                f"{self._file}: the signing time cannot be written: {error.strerror}. Signing goes on; after a restart "
+                "with a wrong clock the autopilot may refuse it. Is the disk full, or signing_key's folder not ours?"
+            )
+        else:
+            self._reserved, self.trouble = ticks, None

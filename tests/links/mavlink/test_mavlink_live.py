@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
+import os
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -332,9 +334,36 @@ def test_a_disk_that_takes_its_time_with_the_signatures_time_holds_no_pose_up(
         session._signer._reserved = session._signer._used + AHEAD_TICKS // 4  # it is time to write, not to wait for it
         heard.rest(writing.is_set)
         heard.link.on_pose(good_pose(host_time.now_ns()))
-        assert heard.link.counters["sent: ODOMETRY"] == 1
+        session._signer._reserved = 0  # it hangs for so long that all is used up
+        heard.link.on_pose(good_pose(host_time.now_ns()))
+        assert heard.link.counters["sent: ODOMETRY"] == 2
         release.set()
     assert all(released)
+
+
+def test_a_disk_that_takes_no_signing_time_ends_no_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    key, drone = signing_drone(tmp_path)
+    beat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), drone)
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, listening(signing_key=str(key)) as heard:
+        session = heard.link._session
+        assert session is not None
+        signer = session._signer
+        assert signer is not None
+        monkeypatch.setattr("links.mavlink.signing.os.fsync", full)
+        signer._reserved = 0
+        heard.rest(lambda: heard.link.counters.get("signing time not written", 0) == 1)
+        assert "signing time cannot be written" in (heard.link.trouble or "")
+        udp.sendto(beat, ("127.0.0.1", heard.link.port))
+        heard.rest(lambda: len(heard.records) == 1)
+        heard.link.on_pose(good_pose(host_time.now_ns()))
+        assert heard.link.counters["sent: ODOMETRY"] == 1
+    with heard.link.listen():  # opened again in the same run: its times never go back
+        assert heard.link._session is not None
+        assert heard.link._session._signer is signer
 
 
 def test_strangers_on_the_port_are_decoded_by_no_one_and_get_no_poses():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import logging
 import os
@@ -13,7 +14,7 @@ from mavlink_poses import HOST0, MS
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import LinkError
-from links.mavlink.signing import AHEAD_TICKS, Signer, ticks_of
+from links.mavlink.signing import AHEAD_TICKS, RETRY_S, Signer, ticks_of
 from links.mavlink.wire import packed
 
 mavlink: Any = ardupilotmega
@@ -115,6 +116,37 @@ def test_after_a_restart_with_a_wrong_clock_no_time_is_used_again(key_file: Path
     first = ticks(signed(again, HOST0 - 10**9 * MS))
     assert last < first
     assert first <= last + (2 if closed else AHEAD_TICKS + 1)
+
+
+def full_disk(descriptor: int) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_disk_that_takes_no_more_is_said_and_counted_and_times_go_on_growing(
+    key_file: Path, monkeypatch: pytest.MonkeyPatch
+):
+    now_s = 0.0
+    monkeypatch.setattr("links.mavlink.signing.time.monotonic", lambda: now_s)
+    signer = Signer(key_file, HOST0)
+    with monkeypatch.context() as full:
+        full.setattr("links.mavlink.signing.os.fsync", full_disk)
+        times = [ticks(signed(signer, HOST0 + i * 1000 * MS)) for i in range(200)]
+        assert signer.unwritten == 1  # who signs does not try the disk each time
+        assert "cannot be written: No space left on device" in (signer.trouble or "")
+        signer.close()
+        times += [ticks(signed(signer, HOST0)) for _ in range(3)]  # the link again, and the clock set back
+        assert all(b > a for a, b in itertools.pairwise(times))
+    now_s += RETRY_S
+    signer.keep()
+    assert signer.trouble is None
+    assert ticks(signed(Signer(key_file, HOST0))) > times[-1]
+
+
+def test_a_signer_that_was_closed_and_goes_on_reserves_its_times_anew(key_file: Path):
+    signer = Signer(key_file, HOST0)
+    signer.close()
+    last = max(ticks(signed(signer, HOST0)) for _ in range(5))  # then it is killed
+    assert ticks(signed(Signer(key_file, HOST0))) > last
 
 
 def test_the_key_may_be_written_in_hexadecimal_and_its_files_are_ours_alone(key_file: Path, tmp_path: Path):

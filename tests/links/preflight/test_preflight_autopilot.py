@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as m
 
 from flow.graph import load_graph
-from flow.link import Record
+from flow.link import LinkError, Record
 from links.mavlink import Autopilot
 from links.mavlink.parameters import Answers
 from links.mavlink.wire import packed
 from links.preflight.autopilot import autopilot_checks
 from links.preflight.graphs import listening, tracking
-from links.preflight.parameters import parameter_check
+from links.preflight.parameters import ask_parameters, parameter_check
 from links.preflight.preflight import absences
 from links.preflight.verdict import Level
 from stages.messages import AutopilotEstimator, AutopilotStatus
@@ -154,6 +156,18 @@ def test_parameters_are_compared_with_the_profile(profile):
     assert f"{second} is 98" in bad.sentence
     assert "did not answer" in parameter_check("it", profile, Answers({}, list(good), 0)).sentence
     assert "none was told" in parameter_check("it", profile, Answers({}, list(good), 9)).sentence
+
+
+def test_a_disk_that_takes_no_signing_time_is_no_go_on_the_ground(tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    key = tmp_path / "key"
+    key.write_bytes(b"k" * 32)
+    key.chmod(0o600)
+    monkeypatch.setattr("links.mavlink.signing.os.fsync", full)
+    with pytest.raises(LinkError, match="signing time cannot be written: No space left"):
+        ask_parameters(Autopilot(connection="udpin:127.0.0.1:0", signing_key=key))
 
 
 def test_what_a_configuration_lacks_is_said():

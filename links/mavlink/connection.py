@@ -65,7 +65,11 @@ class Connection(Protocol):
     reconnects: int
     foreign: int  # datagrams from others, not read
     stalls: int  # times it stood still and was dropped
-    trouble: str | None  # in words, while it is down
+
+    @property
+    def trouble(self) -> str | None:
+        """What is wrong with it, in words; None: nothing."""
+        ...
 
     def receive(self, timeout_s: float) -> tuple[bytes, Source_] | None:
         """What has arrived and from where; None: nothing within timeout_s."""

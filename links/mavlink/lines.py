@@ -1,7 +1,7 @@
 """TCP and serial lines to the autopilot: byte streams that are opened again when they are gone.
 
 Sending never waits. What a slow line has not taken yet is not added to: the frame is dropped and the next pose is
-newer. A line that is gone is tried again, more slowly each time up to 2 s. A line that has kept a frame for half a
+newer, so that it gets as many as it takes. A line that is gone is tried again, more slowly each time up to 2 s. A line that has kept a frame for half a
 second stands still; it is dropped with what is in it, so that no pose arrives later as if it were of now. What the
 other side's system has taken and its program has not read is out of our hands.
 
@@ -26,13 +26,15 @@ from typing import Any, Protocol
 
 from flow.link import LinkError
 from links.mavlink.connection import Connection, Endpoint, Source_, Udp
+from links.mavlink.wire import MAX_FRAME_BYTES
 
 CHUNK_BYTES = 4096
-TCP_BACKLOG_BYTES, SERIAL_BACKLOG_BYTES = 2048, 512  # not through yet: .3 s at 64 kbit/s; at 921600 baud 512 are 6 ms
+TCP_BACKLOG_BYTES, SERIAL_BACKLOG_BYTES = 512, 512  # not through yet: two poses more, 6 ms at 921600 baud
 CONNECT_S, RECONNECT_S = 2.0, 0.4  # TCP: the first time, and while a listener may be waiting to be closed
 CLOSE_S = 0.1
 THROWN_AWAY = struct.pack("ii", 1, 0)  # struct linger: closing ends it at once
 RETRY_S = (0.1, 2.0)  # first and last wait before the next try
+TOLD_S = 5.0  # for so long a trouble is told at least: it is looked at once a second, and said once if it comes again
 STALL_S = 0.5  # ArduPilot takes what comes later for half a second old (JitterCorrection), whatever its time says
 
 
@@ -78,7 +80,7 @@ class StreamConnection:
     def __init__(self, line: Line) -> None:
         self.reconnects = self.foreign = self.stalls = 0
         self._line = line
-        self.trouble: str | None = None
+        self._trouble, self._trouble_s = "", -TOLD_S  # the last one, and when it came
         self._up = True
         self._closed = False
         self._reading = threading.Lock()  # held while the line is read, opened or closed
@@ -87,6 +89,12 @@ class StreamConnection:
         self._begun_bytes = 0  # since the line was opened: of all frames, with the rest
         self._on_way: deque[tuple[int, float]] = deque()  # _begun_bytes after a frame, when it was begun [s]
         self._retry_at_s, self._wait_s = 0.0, RETRY_S[0]
+
+    @property
+    def trouble(self) -> str | None:
+        """In words, while it is down and some seconds on."""
+        told = self._up and time.monotonic() - self._trouble_s >= TOLD_S
+        return None if told or not self._trouble else self._trouble
 
     def receive(self, timeout_s: float) -> tuple[bytes, Source_] | None:
         """See Connection."""
@@ -137,8 +145,10 @@ class StreamConnection:
         try:
             if self._stands_still():
                 self.stalls += 1
+                kbit_per_s = 8e-3 * (self._line.backlog_bytes + MAX_FRAME_BYTES) / STALL_S
                 self._lost(
-                    f"took nothing for {STALL_S:g} s and was dropped with what was in it: does anybody read there?"
+                    f"did not take what was sent within {STALL_S:g} s and was dropped with it: does anybody read there, "
+                    f"and does it carry {kbit_per_s:.0f} kbit/s (else fewer poses a second: clock.rate_hz)?"
                 )
                 return b""
             data = self._line.read(timeout_s)
@@ -160,7 +170,7 @@ class StreamConnection:
     def _lost(self, how: str = "is gone: is it plugged in and powered?") -> None:
         """Only the listener closes and opens: nobody reads from a number that has become another file's."""
         self._up = False
-        self.trouble = f"{self._line.name} {how} Trying again"
+        self._trouble, self._trouble_s = f"{self._line.name} {how} Trying again", time.monotonic()
         self._retry_at_s = time.monotonic() + self._wait_s
 
     def _again(self, timeout_s: float) -> bool:
@@ -177,7 +187,7 @@ class StreamConnection:
             return False
         self._rest, self._begun_bytes = b"", 0  # nobody writes while it is not up
         self._on_way.clear()
-        self._up, self.trouble = not self._closed, None
+        self._up = not self._closed
         self.reconnects += 1
         return True
 

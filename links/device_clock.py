@@ -87,6 +87,10 @@ class DeviceClock:
         self.round_trips += 1
         return True
 
+    def forget_answers(self) -> None:
+        """They may have been another's: the offset is held by one-way messages alone until the next."""
+        self._lower_ns = None
+
     def _waited(self, device_ns: int, late_ns: float, arrival_ns: int) -> bool:
         """Whether a message too late for the bounds may be an old one of a clock that has not begun anew."""
         late = self._upper_ns is not None and late_ns > self._upper_ns

@@ -40,6 +40,7 @@ class Refusal(enum.Enum):
     AHEAD = "from the future"
     NOT_NEWER = "not newer than the one before"
     NOT_HEARD = "autopilot not heard"
+    LINE_LATE = "line too slow"
 
 
 class Limits(BaseModel):

@@ -1,9 +1,9 @@
 """TCP and serial lines to the autopilot: byte streams that are opened again when they are gone.
 
 Sending never waits. What a slow line has not taken yet is not added to: the frame is dropped and the next pose is
-newer, so that it gets as many as it takes. A line that is gone is tried again, more slowly each time up to 2 s. A line that has kept a frame for half a
-second stands still; it is dropped with what is in it, so that no pose arrives later as if it were of now. What the
-other side's system has taken and its program has not read is out of our hands.
+newer, so that it gets as many as it takes. A line that is gone is tried again, more slowly each time up to 2 s. A line
+that has kept a frame for half a second stands still; it is dropped with what is in it, so that no pose arrives later as
+if it were of now. What the other side's system has taken and its program has not read is out of our hands.
 
 Source: ours; tty_ioctl(4) TIOCOUTQ, tcp(7) SIOCOUTQ for what a line has not taken yet; socket(7) SO_LINGER; pyserial
 sets up the device.
@@ -147,8 +147,8 @@ class StreamConnection:
                 self.stalls += 1
                 kbit_per_s = 8e-3 * (self._line.backlog_bytes + MAX_FRAME_BYTES) / STALL_S
                 self._lost(
-                    f"did not take what was sent within {STALL_S:g} s and was dropped with it: does anybody read there, "
-                    f"and does it carry {kbit_per_s:.0f} kbit/s (else fewer poses a second: clock.rate_hz)?"
+                    f"did not take what was sent within {STALL_S:g} s and was dropped with it: does anybody read "
+                    f"there, and does it carry {kbit_per_s:.0f} kbit/s (else fewer poses a second: clock.rate_hz)?"
                 )
                 return b""
             data = self._line.read(timeout_s)

@@ -2,8 +2,12 @@
 
     received -> frames -> signature, echo -> records for the graph; TIMESYNC requests are answered at once
     poses    -> gate and speaker -> frames, at once or not at all; none to an autopilot that has fallen silent: what
-                stands still, it or a bridge before it, would keep them and take them for new when it goes on
-    a thread of its own: HEARTBEAT and TIMESYNC once a second, texts, the origin; also when no pose comes
+                stands still, it or a bridge before it, would keep them and take them for new when it goes on; none
+                while TIMESYNC tells that they would come late (`round_trip.py`)
+    a thread of its own: HEARTBEAT once a second, TIMESYNC four times, texts, the origin; also when no pose comes
+
+An answer to our own TIMESYNC is recorded with the time that it was asked at as its stamp: by that the decoder knows it
+from another's, in replay, too.
 
 time_usec and TIMESYNC are the host's timeline, microseconds and nanoseconds since 1970. ArduPilot finds the offset to
 its own clock by the promptest message (JitterCorrection), PX4 by the answers to its own TIMESYNC requests.
@@ -21,7 +25,9 @@ from typing import Any
 
 from flow.link import LinkError, Record
 from links.mavlink.connection import Connection
+from links.mavlink.gate import Refusal
 from links.mavlink.origin import OriginGiver
+from links.mavlink.round_trip import ASK_NS, RoundTrips
 from links.mavlink.signing import Signer
 from links.mavlink.speaker import PoseSpeaker
 from links.mavlink.wire import FrameSplitter, dialect, header, packed
@@ -62,7 +68,8 @@ class Session:
         self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
         self._lock = threading.Lock()  # over what numbers, signs and sends
         self._closed = threading.Event()
-        self._second_ns = 0
+        self._second_ns = self._asked_ns = 0
+        self._trips = RoundTrips()
         self._target_ns = now_ns()  # when the autopilot was heard last, or the session began
         self._heard_on: int | None = None  # the connection, by `reconnects`; NOWHERE: only with an old signature
         self._keeper = threading.Thread(target=self._keep, name="mavlink housekeeping", daemon=True)
@@ -86,14 +93,15 @@ class Session:
                 self._split_on = self.connection.reconnects
             frames = self._splitter.datagram(data) if self.connection.datagrams else self._splitter.stream(data)
             for frame, message in frames:
-                if self._hear(frame, message, source):
-                    yield Record(self._received_topic, arrival_ns, arrival_ns, frame)
+                stamp_ns = self._hear(frame, message, source, arrival_ns)
+                if stamp_ns is not None:
+                    yield Record(self._received_topic, arrival_ns, stamp_ns, frame)
 
     def pose(self, pose: RelativePose) -> None:
         """Send a pose, or refuse it; never waits for the line."""
         with self._lock:
             now_ns = self._now_ns()
-            messages = self.speaker.speak(pose, now_ns, self._hears(now_ns))
+            messages = self.speaker.speak(pose, now_ns, self._refusal(now_ns))
             if any([self._send(message) for message in messages]):  # all are tried
                 self.speaker.went_out(pose, now_ns)
             self._say(now_ns)
@@ -111,6 +119,7 @@ class Session:
         with self._lock:
             held = {f"pose held back: {why.value}": count for why, count in self.speaker.refused.items()}
             counts = dict(self.counts)
+            took_ns = self._trips.newest_ns
         return {
             **counts,
             **held,
@@ -118,6 +127,7 @@ class Session:
             "from other senders": self.connection.foreign,
             "reconnects": self.connection.reconnects,
             "dropped: stood still": self.connection.stalls,
+            **({"round trip [ms]": took_ns // 1_000_000} if took_ns is not None else {}),
             **({"signing time not written": self._signer.unwritten} if self._signer is not None else {}),
         }
 
@@ -131,8 +141,8 @@ class Session:
         """What does not work now; None: all does."""
         if self.closed:
             return None
-        troubles = self.connection.trouble, self._silence(), None if self._signer is None else self._signer.trouble
-        return next((trouble for trouble in troubles if trouble is not None), None)
+        signing = None if self._signer is None else self._signer.trouble
+        return self.connection.trouble or self._silence() or self._trips.trouble or signing
 
     def _silence(self) -> str | None:
         if self._now_ns() - self._target_ns < SILENT_S * SECOND_NS:
@@ -151,29 +161,32 @@ class Session:
             if self._signer is not None:
                 self._signer.close()
 
-    def _hear(self, frame: bytes, message: Any, source: tuple[str, int]) -> bool:
-        """Whether a frame is one for the graph; acts on those that ask something."""
+    def _hear(self, frame: bytes, message: Any, source: tuple[str, int], arrival_ns: int) -> int | None:
+        """The stamp of a frame for the graph, None of another; acts on those that ask something."""
         sender, _ = header(frame)
         if sender == self._own:
             self.counts["our own, come back"] += 1
-            return False
+            return None
         with self._lock:
             if self._signer is not None and not self._signer.verify(frame):
                 genuine = self._signer.genuine(frame)
                 self.counts["signed with our key, but not new" if genuine else "not signed with our key"] += 1
                 if genuine and sender == self._target:
                     self._tell_time(source)
-                return False
+                return None
             self.counts["received"] += 1
             if sender == self._target:
                 self.connection.answer_to(source)
                 if self._now_ns() - self._target_ns > SILENT_S * SECOND_NS:
                     self.origin.restart()
                 self._target_ns, self._heard_on = self._now_ns(), self.connection.reconnects
-                if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                    self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
                 self.origin.hear(message)
-        return True
+                if message.get_type() == "TIMESYNC":
+                    if message.tc1 == 0:
+                        self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
+                    elif self._trips.answered(message.ts1, arrival_ns):
+                        return message.ts1
+        return arrival_ns
 
     def _tell_time(self, source: tuple[str, int]) -> None:
         """An autopilot without a clock signs with an old time until it hears ours: heartbeats go to it, poses do not.
@@ -190,6 +203,12 @@ class Session:
             return self.connection.datagrams
         return self._heard_on == self.connection.reconnects and now_ns - self._target_ns < QUIET_NS
 
+    def _refusal(self, now_ns: int) -> Refusal | None:
+        """Why no pose may go out on this line now, however good it is. The lock is held."""
+        if not self._hears(now_ns):
+            return Refusal.NOT_HEARD
+        return Refusal.LINE_LATE if self._trips.late else None
+
     def _keep(self) -> None:
         while not self._closed.wait(WAKE_S):
             with self._lock:
@@ -202,7 +221,11 @@ class Session:
             self._second_ns = now_ns
             state = ACTIVE if self.speaker.sending else STANDBY
             self._send(dialect().MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, state, 3))
-            self._send(dialect().MAVLink_timesync_message(0, self._now_ns()))
+        if now_ns - self._asked_ns >= ASK_NS:
+            self._asked_ns = now_ns
+            asked_ns = self._now_ns()
+            if self._send(dialect().MAVLink_timesync_message(0, asked_ns)):
+                self._trips.asked(asked_ns)
         for message in self.origin.due(now_ns):
             if not self._send(message):
                 self.origin.unsent()

@@ -61,16 +61,15 @@ class PoseSpeaker:
         """Whether poses are going out now."""
         return self._sending
 
-    def speak(self, pose: RelativePose, now_ns: int, heard: bool = True) -> list[Any]:
-        """Messages for one pose: those chosen; none where it is refused or not heard. Say `went_out` when they have."""
+    def speak(self, pose: RelativePose, now_ns: int, line: Refusal | None = None) -> list[Any]:
+        """Messages for one pose: those chosen; none where it, or `line`, is refused. Say `went_out` when they have."""
         if pose.state is not self._state:
             self._state = pose.state
             self._texts["state"] = SEVERITY.get(pose.state, WARNING), f"{pose.state.name}: {pose.reason}"
         why = refusal(pose, now_ns, self._limits)
         if why is None and self._sent is not None and pose.stamp_ns <= self._sent.stamp_ns:
             why = Refusal.NOT_NEWER
-        if why is None and not heard:
-            why = Refusal.NOT_HEARD
+        why = why or line
         if why is not None:
             self.refused[why] += 1
             if why is not Refusal.NOT_NEWER:  # the newer one went out

@@ -34,6 +34,7 @@ class FrameStream:
         self._sequence: int | None = None
         self._last_ns: dict[str, int] = {}  # stamp of the last message of a kind
         self._late: int | None = None  # a number from the past, seen just before
+        self._matched = False  # answers to our TIMESYNC come with its time as their stamp
 
     def decode(self, record: Record) -> AutopilotMessage | None:
         """The message of one frame; None when it says nothing of use here or is refused (see `refused`)."""
@@ -52,7 +53,7 @@ class FrameStream:
         if not self._in_sequence(number):
             return self._refuse("repeated or late")
         if kind == "TIMESYNC":
-            return self._timesync(frame, timesync_target(record.data), record.arrival_ns)
+            return self._timesync(frame, record)
         if kind == "HEARTBEAT":
             self.decoded += 1
             return self._status(frame, record.arrival_ns)
@@ -97,13 +98,22 @@ class FrameStream:
         self._sequence, self._late = number, None
         return True
 
-    def _timesync(self, frame: Any, target: tuple[int, int], arrival_ns: int) -> None:
-        """One that names nobody is taken for ours when its times may be: behind a router it can be another's still."""
+    def _timesync(self, frame: Any, record: Record) -> None:
+        """The session matches answers with our own requests; what was recorded without that is taken by who is named.
+
+        One that names nobody is then taken for ours when its times may be: behind a router it can be another's still.
+        """
         if frame.tc1 == 0:
             self.unused += 1  # the autopilot asks; answering is the sender's part
-        elif any(named not in (0, ours) for named, ours in zip(target, self._own, strict=True)):
+            return
+        matches = record.stamp_ns == frame.ts1
+        if matches and not self._matched:
+            self._matched = True
+            self.clock.forget_answers()
+        named = zip(timesync_target(record.data), self._own, strict=True)
+        if not matches and (self._matched or any(name not in (0, ours) for name, ours in named)):
             self._refuse("timesync for another")
-        elif not self.clock.round_trip(frame.ts1, frame.tc1, arrival_ns):
+        elif not self.clock.round_trip(frame.ts1, frame.tc1, record.arrival_ns):
             self._refuse("timesync of another's or too slow")
 
     def _status(self, frame: Any, arrival_ns: int) -> AutopilotStatus:

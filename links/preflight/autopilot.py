@@ -99,9 +99,9 @@ def _clock(heard: Heard, status: AutopilotStatus) -> Verdict:
     if status.clock_offset_ns is None:
         return fail(name, "no message carried its time: ask for ATTITUDE")
     if status.clock_uncertainty_ns is None:
-        return warning(
-            name, "no TIMESYNC reply: a constant delay of the link stays unknown; does it hear us (both ways)?"
-        )
+        named = heard.counters.get("refused: timesync for another", 0)
+        why = "does it hear us (both ways)?" if not named else f"{named} name another: own_system_id, own_component_id?"
+        return warning(name, f"no TIMESYNC reply: a constant delay of the link stays unknown; {why}")
     unsure_ms = 1e-6 * status.clock_uncertainty_ns
     text = f"offset {1e-9 * status.clock_offset_ns:.3f} s to its time since boot, known to {unsure_ms:.1f} ms"
     if unsure_ms > USELESS_MS:

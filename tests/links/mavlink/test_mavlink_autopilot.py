@@ -226,6 +226,40 @@ def test_a_timesync_reply_that_names_another_is_not_ours(target: tuple[int, int]
     assert link.counters["lost"] == 0
 
 
+def asked(reply: bytes, asked_ms: float, at_ms: float) -> Record:
+    """As the session records an answer to our own request."""
+    return Record("/autopilot/rx", HOST0 + round(at_ms * MS), HOST0 + round(asked_ms * MS), reply)
+
+
+def test_once_an_answer_was_matched_with_our_request_no_other_is_believed():
+    """The way takes 50 ms there and back; another requester's clock is 90 ms ahead: by its times it may be ours."""
+    sender, link = Sender(), Autopilot(clock_drift_limit_ppm=0.0)
+    beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
+
+    def offset_and_uncertainty_ms(at_ms: float) -> tuple[float, float]:
+        status = link.decode(record(sender.frame(beat), at_ms))
+        assert isinstance(status, AutopilotStatus)
+        assert status.clock_offset_ns is not None
+        assert status.clock_uncertainty_ns is not None
+        return (status.clock_offset_ns - HOST0) / MS + 7000, status.clock_uncertainty_ns / MS
+
+    link.decode(record(sender.frame(mavlink.MAVLink_highres_imu_message(7_000_000, *[0.0] * 13, 63)), 50.0))
+    link.decode(record(timesync_reply(sender, HOST0 + 40 * MS, 7_000 * MS, None), 50.0))
+    assert offset_and_uncertainty_ms(60.0) == (45, 5)  # nothing tells yet that it was another's
+    link.decode(asked(timesync_reply(sender, HOST0 + 950 * MS, 8_000 * MS, None), 950.0, 1050.0))
+    assert offset_and_uncertainty_ms(1060.0) == (0, 50)
+    link.decode(record(timesync_reply(sender, HOST0 + 1040 * MS, 8_000 * MS, (1, 197)), 1050.0))
+    assert offset_and_uncertainty_ms(1070.0) == (0, 50)
+    assert (link.counters["timesync replies"], link.counters["refused: timesync for another"]) == (2, 1)
+
+
+def test_a_replay_under_another_id_still_knows_the_answers_that_were_ours():
+    sender, link = Sender(), Autopilot(own_component_id=191, own_system_id=7)
+    link.decode(record(sender.attitude(7000)))
+    link.decode(asked(timesync_reply(sender, HOST0 + 5 * MS, 7_010 * MS, (1, 197)), 5.0, 20.0))
+    assert link.counters["timesync replies"] == 1
+
+
 def test_missing_frames_are_counted_over_the_wrap_of_the_number():
     sender, link = Sender(), Autopilot()
     for i in range(600):

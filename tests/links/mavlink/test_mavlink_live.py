@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import itertools
 import os
 import socket
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -226,6 +229,77 @@ def test_timesync_is_answered_and_asked_for():
         heard.rest(
             lambda: heard.link.counters["timesync replies"] >= 1
         )  # ours, answered; ESTIMATOR_STATUS has its time
+
+
+class Bridge:
+    """UDP between us and the autopilot: takes all at once, and hands on what is for the autopilot after a while."""
+
+    def __init__(self, ours: int) -> None:
+        self.delay_s = 0.0
+        self._ours = "127.0.0.1", ours
+        self._theirs: tuple[str, int] | None = None
+        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.port = bound_port(self._socket)
+        self._socket.settimeout(0.005)
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Bridge:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._closed.set()
+        self._thread.join()
+        self._socket.close()
+
+    def _run(self) -> None:
+        while not self._closed.is_set():
+            with contextlib.suppress(TimeoutError, ConnectionRefusedError):
+                data, source = self._socket.recvfrom(2048)
+                if source == self._ours:
+                    self._waiting.append((time.monotonic() + self.delay_s, data))
+                else:
+                    self._theirs = source
+                    self._socket.sendto(data, self._ours)
+            while self._theirs is not None and self._waiting and self._waiting[0][0] <= time.monotonic():
+                self._socket.sendto(self._waiting.popleft()[1], self._theirs)
+
+
+def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
+    with (
+        listening() as heard,
+        Bridge(heard.link.port or 0) as bridge,
+        AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", bridge.port)) as drone,
+    ):
+        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        counter = drone.messages("ODOMETRY")[-1].reset_counter
+        bridge.delay_s = 0.6
+        heard.fly(lambda: heard.link.counters.get("pose held back: line too slow", 0) >= 1)
+        sent = heard.link.counters["sent: ODOMETRY"]
+        heard.fly(lambda: heard.link.counters["pose held back: line too slow"] >= 25)
+        assert heard.link.counters["sent: ODOMETRY"] == sent
+        assert heard.link.counters["round trip [ms]"] >= 600
+        assert "answers to TIMESYNC take longer than 0.3 s" in (heard.link.trouble or "")
+        told = "grd: STOPPED: line too slow"
+        heard.rest(lambda: any((m.severity, m.text) == (2, told) for m in drone.messages("STATUSTEXT")))
+        bridge.delay_s = 0.0
+        heard.fly(lambda: drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256)
+        assert heard.link.trouble is None
+
+
+def test_an_answer_that_we_did_not_ask_for_is_not_believed_though_it_names_nobody():
+    with listening() as heard, drone_for(heard, Px4Rules()) as drone:
+        heard.rest(lambda: heard.link.counters["timesync replies"] >= 2)
+        drone._send(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
+        heard.rest(lambda: heard.link.counters.get("refused: timesync for another", 0) == 1)
+        before = heard.link.counters["timesync replies"]
+        heard.rest(lambda: heard.link.counters["timesync replies"] > before)
+    replayed = Autopilot(own_component_id=191)
+    for record in heard.records:
+        replayed.decode(record)
+    assert replayed.counters["timesync replies"] == heard.link.counters["timesync replies"]
 
 
 def test_an_origin_is_given_to_who_has_none_and_never_over_another():

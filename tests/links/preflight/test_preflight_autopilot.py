@@ -128,6 +128,13 @@ def test_what_is_for_a_person_to_judge_is_a_warning(records, given, name):
     assert check(records, **given)[f"it {name}"].level is Level.WARNING
 
 
+def test_timesync_replies_that_name_another_are_told_apart_from_none():
+    none = check(frames(), said=status(unsure_ns=None))["it clock"]
+    assert "does it hear us" in none.sentence
+    named = check(frames(), said=status(unsure_ns=None), counters={"refused: timesync for another": 7})["it clock"]
+    assert "7 name another: own_system_id, own_component_id?" in named.sentence
+
+
 def test_a_silent_autopilot_and_one_with_another_id_are_told_apart():
     assert "no word from system 1, component 1" in check([])["it heartbeat"].sentence
     other = check(frames(system=9))["it heartbeat"]

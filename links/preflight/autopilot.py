@@ -13,6 +13,7 @@ from links.preflight.arrivals import Arrivals
 from links.preflight.heard import Heard
 from links.preflight.seen import AutopilotSeen
 from links.preflight.verdict import Verdict, fail, ok, warning
+from stages.drone_trail import BRIDGED_NS
 from stages.messages import AutopilotEstimator, AutopilotStatus
 
 KINDS = {"ardupilot": 3, "px4": 12}  # MAV_AUTOPILOT
@@ -20,7 +21,9 @@ HEARTBEAT_GAP_S = 3.0
 SOME_LOSS, WORST_LOSS = 0.01, 0.2
 UNSURE_MS, USELESS_MS = 10.0, 50.0  # at 5 m/s 10 ms are 5 cm
 LEAST_HZ, GOOD_HZ = 4.0, 10.0
+MOST_GAP_S = 1e-9 * BRIDGED_NS
 NEAR_GATE = 0.5  # an innovation test ratio; at 1 the EKF refuses what it is told
+STEADY = "is the radio too far, or too slow for what is asked of it?"
 ASK = "ask for more (SRn_EXTRA1, SRn_POSITION of that port; PX4: its mavlink mode)"
 
 
@@ -38,7 +41,7 @@ def autopilot_checks(
     yield _heartbeat(heard, link, seen, statuses[-1])
     yield _losses(heard)
     yield _clock(heard, statuses[-1])
-    yield _rates(heard.name, seen)
+    yield _rates(heard, seen)
     yield _estimate(heard.name, estimators)
 
 
@@ -113,22 +116,35 @@ def _clock(heard: Heard, status: AutopilotStatus) -> Verdict:
     )
 
 
-def _rates(name: str, seen: AutopilotSeen) -> Verdict:
-    name = f"{name} rates"
+def _rates(heard: Heard, seen: AutopilotSeen) -> Verdict:
+    """How often it tells what we need; a rate hides gaps, so the longest is looked at, too."""
+    name = f"{heard.name} rates"
 
     def hz(kind: str) -> float:
         arrivals: Arrivals = seen.kinds[kind]
         return 0.0 if math.isnan(arrivals.rate_hz) else arrivals.rate_hz
+
+    def gap(what: str, *kinds: str) -> str | None:
+        gap_s = min(seen.kinds[kind].longest_silence_s(heard.end_ns) for kind in kinds)
+        return (
+            f"{text}; no {what} for {gap_s:.1f} s, {MOST_GAP_S:g} s at most: {STEADY}" if gap_s > MOST_GAP_S else None
+        )
 
     kinds = ("ATTITUDE", "ODOMETRY", "LOCAL_POSITION_NED")
     attitude, odometry, position = (hz(kind) for kind in kinds)
     text = ", ".join(f"{kind} {hz(kind):.0f} Hz" for kind in kinds)
     if max(attitude, odometry) < LEAST_HZ:
         return fail(name, f"{text}: its attitude is needed at {GOOD_HZ:.0f} Hz or more: {ASK}")
+    turned = gap("attitude", "ATTITUDE", "ODOMETRY")
+    if turned is not None:
+        return fail(name, turned) if heard.live else warning(name, turned)
     if max(odometry, position) < LEAST_HZ:
         return warning(
             name, f"{text}: without its odometry the pose ends where the LiDAR does not see the drone: {ASK}"
         )
+    moved = gap("odometry or position", "ODOMETRY", "LOCAL_POSITION_NED")
+    if moved is not None:
+        return warning(name, moved)
     slow = max(attitude, odometry) < GOOD_HZ or max(odometry, position) < GOOD_HZ
     return warning(name, f"{text}: slow; {ASK}") if slow else ok(name, text)
 

@@ -17,7 +17,7 @@ SILENT_S = 1.0  # a camera that gave pictures and then none for so long has died
 FULL_RATE = 0.5  # of what was asked of the device
 
 
-def camera_checks(heard: Heard, rig_px: tuple[int, int] | None) -> Iterator[Verdict]:
+def camera_checks(heard: Heard, rig_px: tuple[int, int] | None, readout_ms: float | None) -> Iterator[Verdict]:
     """All checks of one camera; `rig_px`: width, height that the lens was calibrated for; None: the rig is silent."""
     link, seen = heard.link, heard.seen
     assert isinstance(link, Camera)
@@ -28,6 +28,7 @@ def camera_checks(heard: Heard, rig_px: tuple[int, int] | None) -> Iterator[Verd
         return
     yield _rate(heard, link)
     yield _size(heard.name, seen, rig_px)
+    yield _readout(heard.name, link, readout_ms)
 
 
 def _rate(heard: Heard, link: Camera) -> Verdict:
@@ -62,3 +63,13 @@ def _size(name: str, seen: CameraSeen, rig_px: tuple[int, int] | None) -> Verdic
             "the lens in this one",
         )
     return ok(name, f"{found}, as the rig says")
+
+
+def _readout(name: str, link: Camera, readout_ms: float | None) -> Verdict:
+    name = f"{name} readout"
+    if readout_ms is None:
+        key = f"cameras.{link.topic.rpartition('/')[2]}.readout_ms"
+        return warning(
+            name, f"the rig does not say how long the rows take: most shutters roll; set {key} in it (0: all at once)"
+        )
+    return ok(name, f"{readout_ms:g} ms from the first row to the last" if readout_ms else "all rows at once")

@@ -93,7 +93,7 @@ def declared_checks(graph: Graph, heard: AllHeard) -> Iterator[Verdict]:
         elif isinstance(link, Servo):
             yield from servo_checks(part)
         elif isinstance(link, Camera):
-            yield from camera_checks(part, rig_size_px(rig, link))
+            yield from camera_checks(part, rig_size_px(rig, link), rig_readout_ms(rig, link))
         elif isinstance(link, Autopilot):
             yield from autopilot_checks(part, heard.all(AutopilotStatus), heard.all(AutopilotEstimator))
         elif isinstance(link, VehicleOdometry):
@@ -134,12 +134,22 @@ def absences(graph: Graph, rig: dict[str, Any]) -> Iterator[Verdict]:
 
 
 def rig_size_px(rig: dict[str, Any], link: Camera) -> tuple[int, int] | None:
-    """What a camera's lens was calibrated for: its own setting, or the rig's camera with the topic's last word."""
-    cameras: dict[str, Any] = rig.get("cameras") or {}
-    size: Any = link.size_px or (cameras.get(link.topic.rpartition("/")[2]) or {}).get("size_px")
+    """What a camera's lens was calibrated for: its own setting, or the rig's."""
+    size: Any = link.size_px or rig_camera(rig, link).get("size_px")
     if size is None:
         return None
     return (size, size) if isinstance(size, int) else (int(size[0]), int(size[1]))
+
+
+def rig_readout_ms(rig: dict[str, Any], link: Camera) -> float | None:
+    """How long a camera's rows take: its own setting, or the rig's; None: neither says (a link's 0 is the default)."""
+    return link.readout_ms or rig_camera(rig, link).get("readout_ms")
+
+
+def rig_camera(rig: dict[str, Any], link: Camera) -> dict[str, Any]:
+    """What the rig says of a camera: of the one with the topic's last word."""
+    cameras: dict[str, Any] = rig.get("cameras") or {}
+    return cameras.get(link.topic.rpartition("/")[2]) or {}
 
 
 def odometry_check(heard: Heard, link: VehicleOdometry) -> Verdict:

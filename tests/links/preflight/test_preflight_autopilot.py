@@ -26,8 +26,10 @@ CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 BEGIN_NS, S, MS = 1_748_773_230_000_000_000, 1_000_000_000, 1_000_000
 
 
-def frames(seconds=4.0, *, system=1, autopilot=3, beats=True, attitude_hz=50, odometry_hz=30, base_mode=0, lose=0):
-    """What an autopilot says, in order."""
+def frames(
+    seconds=4.0, *, system=1, autopilot=3, beats=True, attitude_hz=50, odometry_hz=30, base_mode=0, lose=0, quiet=None
+):
+    """What an autopilot says, in order. `quiet`: which message stays away for 1.5 s, a second before the end."""
     mav, said = m.MAVLink(None, srcSystem=system, srcComponent=1), []
     for k in range(int(seconds * 100)):
         at_ms = k * 10
@@ -39,6 +41,8 @@ def frames(seconds=4.0, *, system=1, autopilot=3, beats=True, attitude_hz=50, od
         if odometry_hz and at_ms % (1000 // odometry_hz // 10 * 10) == 0:
             now.append(m.MAVLink_local_position_ned_message(5000 + at_ms, 0, 0, 0, 0, 0, 0))
         for message in now:
+            if message.get_type() == quiet and 0 < 1000 * (seconds - 1) - at_ms <= 1500:
+                continue
             at_ns = BEGIN_NS + at_ms * MS
             said.append(Record("/autopilot/rx", at_ns, at_ns, packed(message, mav)))
     return said[: len(said) // 2] + said[len(said) // 2 + lose :]
@@ -126,6 +130,20 @@ def test_an_autopilot_that_is_not_fit_to_fly_is_no_go(records, given, name, word
 )
 def test_what_is_for_a_person_to_judge_is_a_warning(records, given, name):
     assert check(records, **given)[f"it {name}"].level is Level.WARNING
+
+
+def test_gaps_that_the_rate_does_not_show_are_told_with_what_they_may_be():
+    gaps = check(frames(8.0, quiet="ATTITUDE"))["it rates"]
+    assert gaps.level is Level.FAIL
+    assert "no attitude for 1.5 s, 1 s at most" in gaps.sentence
+    flown = check(frames(8.0, quiet="ATTITUDE"), live=False)["it rates"]
+    assert flown.level is Level.WARNING
+    still = check(frames(8.0, quiet="LOCAL_POSITION_NED"))["it rates"]
+    assert still.level is Level.WARNING
+    assert "no odometry or position for 1.5 s, 1 s at most" in still.sentence
+    died = check(frames(), end_ns=BEGIN_NS + 6 * S)["it rates"]
+    assert died.level is Level.FAIL
+    assert "no attitude for 2.0 s" in died.sentence
 
 
 def test_timesync_replies_that_name_another_are_told_apart_from_none():

@@ -14,7 +14,7 @@ from links.camera import Camera
 from links.dynamixel import Servo
 from links.preflight.camera import camera_checks
 from links.preflight.lidar import clock_drift_ppm, lidar_checks
-from links.preflight.preflight import odometry_check, rig_size_px
+from links.preflight.preflight import odometry_check, rig_readout_ms, rig_size_px
 from links.preflight.servo import servo_checks
 from links.preflight.verdict import Level
 from links.recording import CompressedImage, encode_compressed_image
@@ -179,25 +179,40 @@ def pictures(size=64, step_ns=50_000_000, count=40):
 
 def test_a_camera_is_judged_by_its_rate_and_the_rigs_size():
     link = Camera(topic="/camera/drone")
-    good = by_name(camera_checks(hear(link, pictures()), (64, 64)))
+    good = by_name(camera_checks(hear(link, pictures()), (64, 64), 0.0))
     assert {v.level for v in good.values()} == {Level.OK}
     assert "20.0 a second" in good["frames"].sentence
-    other = by_name(camera_checks(hear(link, pictures(size=80)), (64, 64)))["size"]
+    other = by_name(camera_checks(hear(link, pictures(size=80)), (64, 64), 0.0))["size"]
     assert other.level is Level.FAIL
     assert "80 x 80, but the lens is calibrated for 64 x 64" in other.sentence
-    assert levels(camera_checks(hear(link, pictures()), None))["size"] == "warning"
-    assert levels(camera_checks(hear(link, pictures(step_ns=100_000_000)), (64, 64)))["frames"] == "warning"
-    assert levels(camera_checks(hear(link, pictures(step_ns=2_000_000_000)), (64, 64)))["frames"] == "fail"
+    assert levels(camera_checks(hear(link, pictures()), None, 0.0))["size"] == "warning"
+    assert levels(camera_checks(hear(link, pictures(step_ns=100_000_000)), (64, 64), 0.0))["frames"] == "warning"
+    assert levels(camera_checks(hear(link, pictures(step_ns=2_000_000_000)), (64, 64), 0.0))["frames"] == "fail"
+
+
+def test_how_long_a_cameras_rows_take_is_asked_for_where_neither_rig_nor_link_says_it():
+    link = Camera(topic="/camera/drone")
+    silent = by_name(camera_checks(hear(link, pictures()), (64, 64), rig_readout_ms({}, link)))["readout"]
+    assert silent.level is Level.WARNING
+    assert "set cameras.drone.readout_ms" in silent.sentence
+    rig = {"cameras": {"drone": {"readout_ms": 0}, "vehicle": {"readout_ms": 12.5}}}
+    assert rig_readout_ms(rig, link) == 0
+    assert rig_readout_ms(rig, Camera(topic="/camera/vehicle")) == 12.5
+    assert rig_readout_ms({}, Camera(topic="/camera/vehicle", readout_ms=8)) == 8
+    told = by_name(camera_checks(hear(link, pictures()), (64, 64), 8.0))["readout"]
+    assert (told.level, told.sentence) == (Level.OK, "8 ms from the first row to the last")
+    at_once = by_name(camera_checks(hear(link, pictures()), (64, 64), 0.0))["readout"]
+    assert (at_once.level, at_once.sentence) == (Level.OK, "all rows at once")
 
 
 def test_a_camera_and_an_odometry_that_fell_silent_are_no_go():
     """Their rate, from the first record to the last, is that of a healthy one."""
     later_ns = BEGIN_NS + 5_000_000_000
-    found = by_name(camera_checks(hear(Camera(topic="/camera/drone"), pictures(), end_ns=later_ns), (64, 64)))
+    found = by_name(camera_checks(hear(Camera(topic="/camera/drone"), pictures(), end_ns=later_ns), (64, 64), 0.0))
     assert found["frames"].level is Level.FAIL
     assert "then none came for 3.1 s" in found["frames"].sentence
     slow = hear(Camera(topic="/camera/drone"), pictures(step_ns=800_000_000, count=7), end_ns=later_ns + 800_000_000)
-    assert by_name(camera_checks(slow, (64, 64)))["frames"].level is not Level.OK
+    assert by_name(camera_checks(slow, (64, 64), 0.0))["frames"].level is not Level.OK
     pose = json.dumps({"xyz_m": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1]}).encode()
     poses = [Record("/vehicle/odometry", BEGIN_NS + k * 50_000_000, BEGIN_NS + k * 50_000_000, pose) for k in range(40)]
     there = VehicleOdometry(port=14600)
@@ -208,9 +223,9 @@ def test_a_camera_and_an_odometry_that_fell_silent_are_no_go():
 
 def test_a_camera_without_pictures_is_no_go():
     link = Camera(topic="/camera/drone")
-    (verdict,) = camera_checks(hear(link, [], trouble="there is no /dev/video9"), (64, 64))
+    (verdict,) = camera_checks(hear(link, [], trouble="there is no /dev/video9"), (64, 64), 0.0)
     assert (verdict.level, verdict.sentence) == (Level.FAIL, "there is no /dev/video9")
-    (verdict,) = camera_checks(hear(link, [Record("/camera/drone", 1, 1, b"no picture")]), (64, 64))
+    (verdict,) = camera_checks(hear(link, [Record("/camera/drone", 1, 1, b"no picture")]), (64, 64), 0.0)
     assert "1 records came that hold no picture" in verdict.sentence
 
 

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.compiled import compiled_at_once
+from stages.compiled import compiled, compiled_at_once
 from stages.drone_telemetry import DroneTelemetry
 from stages.geometry import Array64
 from stages.smooth_motion import log_p, model_of
@@ -142,23 +142,41 @@ class ToldMotion:
         self._of_this_frame()
         sure = self.sure
         x, covariance = predicted(x, P, dt_s, sure * q_told + (1.0 - sure) * q_free)
-        step = after.xyz_m - before.xyz_m - dt_s * before.velocity_mps
-        change = after.velocity_mps - before.velocity_mps
-        x[2] += sure * step[2]
-        x[5] += sure * change[2]
-        m1, m2 = self._moments
-        a = np.array([complex(step[0], step[1]), complex(change[0], change[1])])
-        moved = a * m1
-        x[0:2] += moved.view(np.float64)[:2]
-        x[3:5] += moved.view(np.float64)[2:]
-        aside = a[:, None]
-        K, pseudo = aside * a.conj() * (sure - abs(m1) ** 2), aside * a * (m2 - m1 * m1)
-        across = 0.5 * (pseudo - K).imag  # E Re z Im z'
-        covariance[0::3, 0::3] += 0.5 * (K + pseudo).real  # x of place and velocity
-        covariance[1::3, 1::3] += 0.5 * (K - pseudo).real  # y of both
-        covariance[0::3, 1::3] += across
-        covariance[1::3, 0::3] += across.T
+        move_as_told(x, covariance, dt_s, *before[2:], *after[2:], sure, *self._moments)
         return x, covariance
+
+
+@compiled
+def move_as_told(
+    x: Array64,
+    P: Array64,
+    dt_s: float,
+    then_m: Array64,
+    then_mps: Array64,
+    now_m: Array64,
+    now_mps: Array64,
+    sure: float,
+    m_1: complex,
+    m_2: complex,
+) -> None:
+    """Add to state (6,) and covariance (6, 6) what the words (3,) for then and now say beyond a constant velocity."""
+    told = np.empty(2, dtype=np.complex128)  # level: of place and velocity
+    for k in range(2):
+        step = (now_m - then_m - dt_s * then_mps) if k == 0 else (now_mps - then_mps)
+        x[3 * k + 2] += sure * step[2]
+        told[k] = complex(step[0], step[1])
+        moved = told[k] * m_1
+        x[3 * k] += moved.real
+        x[3 * k + 1] += moved.imag
+    for i in range(2):
+        for j in range(2):
+            K = told[i] * told[j].conjugate() * (sure - abs(m_1) ** 2)
+            pseudo = told[i] * told[j] * (m_2 - m_1 * m_1)
+            P[3 * i, 3 * j] += 0.5 * (K + pseudo).real  # x of place and velocity
+            P[3 * i + 1, 3 * j + 1] += 0.5 * (K - pseudo).real  # y of both
+            across = 0.5 * (pseudo - K).imag  # E Re z Im z'
+            P[3 * i, 3 * j + 1] += across
+            P[3 * j + 1, 3 * i] += across
 
 
 @compiled_at_once("(float64[::1], float64[:, ::1], float64[:, ::1], float64)")

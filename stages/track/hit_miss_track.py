@@ -106,7 +106,8 @@ class HitMissTrack(Stage):
                 known = self._known.astray(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
             if known is not None:
                 seen_later = int(candidates.seen_ns[i]) > known.last_hit_ns
-                if known.confirmed and P >= 0.5 and seen_later and self._known.doubtful(known, candidates.stamp_ns):
+                doubtful = known.confirmed and seen_later and self._known.doubtful(known, candidates.stamp_ns)
+                if doubtful and P >= self._known.needed(known, candidates.stamp_ns):
                     self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
                 # what is refused beside a track whose own candidate is taken for a drone is another one there
                 sure = known.candidate == number or (candidates.looks[i] >= 6 and known.candidate not in own)

@@ -22,6 +22,8 @@ from stages.track.told_motion import ToldMotion, Word
 GIVES_WAY_NS = 1_000_000_000  # so long without a hit, another that was accepted takes its place
 STALE_NS = 150_000_000  # a sighting so much older than a track's own hits says nothing of it
 START_SIGMA_M = 0.2
+ACCEPTED_NATS = math.log(0.995 / 0.005)  # at which the detector accepts something, wherever it is
+SKY_M3 = 2.0 / 3.0 * math.pi * 35.0**3  # in which it finds drones
 
 
 @dataclass(slots=True, eq=False)
@@ -137,6 +139,15 @@ class Hypotheses:
     def doubtful(self, one: Hypothesis, now_ns: int) -> bool:
         """So long without a hit that what is found there may as well be something else."""
         return largest_sigma_m(self.at(one, now_ns)[1]) > self._own_sigma_m
+
+    def needed(self, one: Hypothesis, now_ns: int) -> float:
+        """How probably a drone a candidate near this one must be to be taken for it: .5 where it is known well.
+
+        As sure as the detector is when it accepts something in the whole sky, less what of the sky lies within three
+        sigmas of here: of all that is no drone only what is met there can be mistaken for it.
+        """
+        share = 36.0 * math.pi * math.sqrt(float(np.linalg.det(self.at(one, now_ns)[1][:3, :3]))) / SKY_M3
+        return 1.0 / (1.0 + math.exp(-max(ACCEPTED_NATS + math.log(share), 0.0)))
 
     def move(self, one: Hypothesis, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> None:
         """The detector found it again."""

@@ -170,6 +170,18 @@ def test_a_drone_that_comes_back_is_the_same_one(gap_s):
     assert fixes_of(out)[-1].stamp_ns > at_s(1.6 + gap_s)
 
 
+@pytest.mark.parametrize(
+    ("gap_s", "probability", "taken"), [(1.5, 0.4, False), (1.5, 0.7, True), (3.8, 0.7, False), (3.8, 0.99, True)]
+)
+def test_what_is_met_where_a_drone_may_be_must_be_the_surer_one_the_less_that_is_known(gap_s, probability, taken):
+    """After four seconds it may be anywhere within ten metres, and so may a bird."""
+    way, other = still(0.0, 8.0, 10.0), still(0.6, 8.0, 10.4)
+    things = [During(Drone(way), 0.0, 1.0), During(Drone(other, seed=1), 1.0 + gap_s, 9.0)]
+    met = candidate(here(other), probability, t_s=1.1 + gap_s, number=2)
+    out = run(things, [accepted(here(way)), met], 1.6 + gap_s)
+    assert (fixes_of(out)[-1].stamp_ns > at_s(1.1 + gap_s)) == taken
+
+
 @pytest.mark.parametrize(("accepted_s", "numbers"), [(2.0, {1, 2}), (1.4, {1})])
 def test_a_drone_not_hit_for_a_second_gives_way_to_one_accepted_elsewhere(accepted_s, numbers):
     first, second = still(-3.0, 8.0, 10.0), still(4.0, 8.0, 12.0)

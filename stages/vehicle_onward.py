@@ -13,13 +13,15 @@ Three go on past a word, each as far as an error of its own costs:
 
 A word that is farther off than HARD lets it be is false, or its start frame has jumped, as when an odometry is started
 afresh: it is left out, and when three such in a row lie on one smooth way, that is the way, in another start frame.
-After seconds of silence HARD lets it be nearly anywhere: a small jump in them is not seen.
+After seconds of silence HARD lets it be nearly anywhere: a small jump in them is not seen. So after three odd words one
+that may be true is not enough: nonsense that goes on would have one such in time.
 
 Source: ours.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -69,13 +71,45 @@ class JumpWatch:
 
     def hear(self, motion: VehicleMotion, leads: bool) -> tuple[VehicleMotion, ...]:
         """What is believed now: the word; nothing yet; or three at once, and the start frame may be another one."""
-        if not leads:
+        if not leads or len(self._odd) == AGREE:
             self._odd.append(motion)
             if not _go_on(tuple(self._odd)):
                 return ()
         believed = (motion,) if leads else tuple(self._odd)
         self._odd.clear()
         return believed
+
+
+class BelievedWords:
+    """The words of one source that are believed, in its own start frame."""
+
+    def __init__(self) -> None:
+        self._watch = JumpWatch()
+        self._words: deque[VehicleMotion] = deque(maxlen=64)  # of one start frame
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Time of the newest."""
+        return self._words[-1].stamp_ns if self._words else None
+
+    @property
+    def speed_mps(self) -> float:
+        """The speed that they tell; 0: they tell none."""
+        return (speed_mps(list(self._words)) or 0.0) if self._words else 0.0
+
+    def hear(self, motion: VehicleMotion) -> tuple[VehicleMotion, ...]:
+        """What is believed now, as JumpWatch says; a word that is not newer than the last is to be left out before."""
+        believed = (motion,) if not self._words else self._watch.hear(motion, self._leads_to(motion))
+        if len(believed) > 1:
+            self._words.clear()  # of another start frame
+        self._words.extend(believed)
+        return believed
+
+    def _leads_to(self, motion: VehicleMotion) -> bool:
+        words, last_ns = list(self._words), self._words[-1].stamp_ns
+        at = along_its_bend(words, motion.stamp_ns, until_s=math.inf)
+        expected, told = ((m.R_start_vehicle, m.xyz_start_m) for m in (at, motion))
+        return leads_to(expected, told, (motion.stamp_ns - last_ns) * 1e-9, speed_mps(words))
 
 
 def leads_to(expected: Placed, told: Placed, seconds: float, speed_mps: float | None) -> bool:

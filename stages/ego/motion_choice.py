@@ -2,6 +2,7 @@
 
     odometry heard      it is passed on as it comes
     odometry silent     the camera's motion goes on from where the vehicle was, and at the return the odometry again
+    nor believed        the same: what it tells is nonsense for as long
 
 Each source has a start frame of its own, and one that went away may come back with another. So at every change the new
 source is laid on the old one's end:
@@ -17,8 +18,7 @@ Source: ours; P V.B for the camera's motion.
 
 from __future__ import annotations
 
-import math
-from collections import deque
+from collections import Counter, deque
 from enum import Enum
 from typing import ClassVar
 
@@ -30,9 +30,9 @@ from stages.geometry import Array64, transform
 from stages.messages import VehicleMotion
 from stages.rigid import adjoint
 from stages.rotation import nearest_rotation
-from stages.vehicle_onward import JumpWatch, along_its_bend, leads_to, speed_mps
+from stages.vehicle_onward import BelievedWords, along_its_bend
 
-SILENT_S = 0.25  # so long no odometry: it is gone
+SILENT_S = 0.25  # so long no odometry, or none that is believed: it is gone
 
 
 class Teller(Enum):
@@ -50,37 +50,46 @@ class VehicleMotionChoice(Stage):
     silent_s: float = Field(SILENT_S, gt=0, le=10)  # two periods of the odometry at least
 
     _teller: Teller | None = PrivateAttr(default=None)
-    _odometry_ns: int | None = PrivateAttr(default=None)
-    _watch: JumpWatch = PrivateAttr(default_factory=JumpWatch)
+    _words: dict[Teller, BelievedWords] = PrivateAttr(default_factory=lambda: {t: BelievedWords() for t in Teller})
     _told: deque[VehicleMotion] = PrivateAttr(default_factory=lambda: deque[VehicleMotion](maxlen=64))
     _T_start_source: Array64 = PrivateAttr(default_factory=lambda: np.eye(4))
     _joint: tuple[VehicleMotion, Array64 | None] | None = PrivateAttr(default=None)  # the source's word at the change
+    _refused: Counter[str] = PrivateAttr(default_factory=Counter[str])
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Words left out, by reason."""
+        return self._refused
 
     def on_odometry(self, motion: VehicleMotion) -> VehicleMotion | None:
         """The vehicle's own odometry, passed on at once."""
-        if self._odometry_ns is None or motion.stamp_ns > self._odometry_ns:
-            self._odometry_ns = motion.stamp_ns
         return self._tell(Teller.ODOMETRY, motion)
 
     def on_ego(self, motion: VehicleMotion) -> VehicleMotion | None:
-        """The camera's motion; None while the odometry is heard."""
-        if self._odometry_ns is not None and motion.stamp_ns - self._odometry_ns < self.silent_s * 1e9:
+        """The camera's motion; None while the odometry is heard and believed."""
+        odometry_ns = self._words[Teller.ODOMETRY].newest_ns
+        if odometry_ns is not None and motion.stamp_ns - odometry_ns < self.silent_s * 1e9:
             return None
+        if self._teller is not Teller.EGO:
+            self._words[Teller.EGO] = BelievedWords()  # it has begun anew
         return self._tell(Teller.EGO, motion)
 
     def _tell(self, teller: Teller, motion: VehicleMotion) -> VehicleMotion | None:
         """None for what is not newer than what was told, and for what lies elsewhere."""
+        words = self._words[teller]
+        if words.newest_ns is not None and motion.stamp_ns <= words.newest_ns:
+            return None
+        believed = words.hear(motion)
+        if not believed:
+            self._refused[f"{teller.value}: not where the words before lead"] += 1
+            return None
         if self._told and motion.stamp_ns <= self._told[-1].stamp_ns:
             return None
-        if teller is self._teller:
-            believed = self._watch.hear(motion, self._leads_to(motion))
-        else:
-            believed, self._watch, self._teller = (motion,), JumpWatch(), teller
-            self._change_to(motion)
-        if len(believed) > 1:
+        if teller is not self._teller or len(believed) > 1:
+            self._teller = teller
             self._change_to(believed[0])
         self._told.extend(map(self._in_start, believed))
-        return self._told[-1] if believed else None
+        return self._told[-1]
 
     def _in_start(self, motion: VehicleMotion) -> VehicleMotion:
         """A source's word, in the start frame."""
@@ -91,13 +100,6 @@ class VehicleMotionChoice(Stage):
             R_start_vehicle=nearest_rotation(np.ascontiguousarray(T[:3, :3])),
             covariance=self._covariance(motion),
         )
-
-    def _leads_to(self, motion: VehicleMotion) -> bool:
-        """Whether a word is where those told before lead."""
-        told, last_ns = list(self._told), self._told[-1].stamp_ns
-        there, at = self._in_start(motion), along_its_bend(told, motion.stamp_ns, until_s=math.inf)
-        expected, now = ((m.R_start_vehicle, m.xyz_start_m) for m in (at, there))
-        return leads_to(expected, now, (motion.stamp_ns - last_ns) * 1e-9, speed_mps(told))
 
     def _change_to(self, motion: VehicleMotion) -> None:
         """Lay the new source on the end of the old one."""

@@ -8,8 +8,9 @@
 The start frame is the vehicle's at the first picture, or, when it drove off without any length known, at the first
 one from which a length was known. Its z axis is up as far as the vehicle stood level.
 
-A vehicle with odometry of its own needs none of this. Wired as `odometry` it lets the stage rest while it is heard;
-when it falls silent the stage begins anew, with the speed that it told last (motion_choice.py joins the two).
+A vehicle with odometry of its own needs none of this. Wired as `odometry` it lets the stage rest while it is heard and
+believed; when it falls silent or tells nonsense the stage begins anew, with the speed that it told last
+(motion_choice.py believes the same words, and joins the two).
 
 Source: P V.B (Harris and KLT, 5-DoF, scale from projected LiDAR points, windowed bundle adjustment).
 """
@@ -38,13 +39,11 @@ from stages.pictures.features import FeatureSettings, Tracks
 from stages.pictures.motion_link import Link, LinkSettings, MotionLinks, followed
 from stages.pictures.two_view import backwards
 from stages.rotation import exp_rotation, log_rotation
-from stages.trail import TOGETHER_NS
-from stages.vehicle_onward import UNTOLD
+from stages.vehicle_onward import UNTOLD, BelievedWords
 
 TURN_RADPS = 0.3  # one sigma of the turn rate, unseen
 STILL_M = 0.003  # one sigma of a place held because no motion is seen
 LEAST_LENGTHS = 3  # the first ones come from points placed by a speed not yet known
-SPEED_OF = 10  # poses of the odometry, its last speed
 REMEMBERED = 20_000  # LiDAR points
 WAITING_SLICES = 2_000
 
@@ -98,7 +97,7 @@ class VehicleEgo(Stage):
     _links: MotionLinks = PrivateAttr()
     _mount: Array64 = PrivateAttr()
     _now: _Now = PrivateAttr(default_factory=_Now)
-    _odometry: deque[VehicleMotion] = PrivateAttr(default_factory=lambda: deque[VehicleMotion](maxlen=SPEED_OF))
+    _odometry: BelievedWords = PrivateAttr(default_factory=BelievedWords)
     _resting: bool = PrivateAttr(default=False)
 
     def model_post_init(self, context: Any, /) -> None:
@@ -107,9 +106,9 @@ class VehicleEgo(Stage):
 
     def on_odometry(self, motion: VehicleMotion) -> None:
         """The vehicle tells its motion itself: nothing is to be done here."""
-        if not self._odometry or motion.stamp_ns > self._odometry[-1].stamp_ns:
-            self._odometry.append(motion)
-        self._resting = True
+        newest_ns = self._odometry.newest_ns
+        if newest_ns is None or motion.stamp_ns > newest_ns:
+            self._resting |= bool(self._odometry.hear(motion))
 
     def on_points(self, points: SweptPoints) -> None:
         """LiDAR returns wait until a picture has told where the vehicle was."""
@@ -127,7 +126,7 @@ class VehicleEgo(Stage):
         Nothing as long as no length is known, where nothing is followed, and while its own odometry is heard.
         """
         if self._resting:
-            if image.stamp_ns - self._odometry[-1].stamp_ns < self.silent_s * 1e9:
+            if image.stamp_ns - (self._odometry.newest_ns or 0) < self.silent_s * 1e9:
                 return
             self._wake()
         link = self._links.feed(image.stamp_ns, image.grey)
@@ -161,14 +160,9 @@ class VehicleEgo(Stage):
 
     def _wake(self) -> None:
         """Begin anew at this picture; how fast the vehicle drives is known from its odometry."""
-        first, last = self._odometry[0], self._odometry[-1]
         self._resting = False
         self._links = MotionLinks(self.lens, self.features, self.link)
-        self._now = _Now(lengths=LEAST_LENGTHS, told=True)
-        if last.stamp_ns - first.stamp_ns >= TOGETHER_NS:  # words that were held up arrive together
-            way_m = float(np.linalg.norm(last.xyz_start_m - first.xyz_start_m))
-            self._now.speed_mps = way_m / ((last.stamp_ns - first.stamp_ns) * 1e-9)
-        self._odometry.clear()
+        self._now = _Now(lengths=LEAST_LENGTHS, told=True, speed_mps=self._odometry.speed_mps)
 
     def _next_key(self, key: _Key, link: Link, step: Step, at: Pose6, tracks: Tracks) -> Pose6:
         """The newest picture becomes the key; its pose after bundle adjustment."""

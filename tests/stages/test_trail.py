@@ -137,6 +137,17 @@ def test_a_false_pose_is_left_out():
         np.testing.assert_allclose(made.at(driving(k).stamp_ns)[1], driving(k).xyz_start_m, atol=0.01)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_nonsense_that_goes_on_is_never_believed_and_the_true_words_after_it_are(seed):
+    made, rng = trail(*(driving(k) for k in range(30))), np.random.default_rng(seed)
+    for k in range(30, 430):
+        assert not made.add(motion(20 * k * MS, rng.uniform(-40, 40, 3)))
+    assert made.newest_ns == driving(29).stamp_ns
+    for k in range(430, 460):
+        made.add(driving(k))
+    np.testing.assert_allclose(made.at(driving(459).stamp_ns)[1], driving(459).xyz_start_m, atol=1e-9)
+
+
 def test_a_fast_vehicles_second_pose_is_no_jump_and_the_first_real_one_after_zeros_is():
     fast = trail(*(motion(50 * k * MS, (1.5 * k, 0, 0)) for k in range(3)))
     np.testing.assert_allclose(fast.at(START_NS + 50 * MS)[1], (1.5, 0, 0))

@@ -135,6 +135,38 @@ def test_a_false_word_is_left_out():
     assert max(off(m, np.eye(4))[0] for m in out) < 1e-9
 
 
+def nonsense(times, seed=0, spread_m=30.0):
+    """Words of an odometry that has gone mad: anywhere, turned anyhow."""
+    rng = np.random.default_rng(seed)
+    return [
+        word(t, transform(rotation_z(rng.uniform(-3, 3)), np.append(rng.uniform(-spread_m, spread_m, 2), 0.0)))
+        for t in times
+    ]
+
+
+def test_the_camera_goes_on_while_the_odometry_tells_nonsense_and_what_is_left_out_is_counted():
+    choice = VehicleMotionChoice()
+    mad, ego = nonsense(seconds(2, 6, 0.02)), [word(t, ELSEWHERE) for t in seconds(2.4, 6, 0.2)]
+    out = told(choice, [word(t) for t in seconds(0, 2, 0.02)] + mad, ego)
+    assert np.diff([m.stamp_ns for m in out]).max() < 0.5 * S
+    assert [m.stamp_ns for m in out[100:]] == [m.stamp_ns for m in ego]
+    assert max(off(m, np.eye(4))[0] for m in out) < 1e-3
+    assert choice.refused == {"odometry: not where the words before lead": len(mad)}
+    back = [choice.on_odometry(word(t, ANEW)) for t in (6.0, 6.02, 6.04, 6.06)]
+    assert [m is None for m in back] == [True, True, False, False]  # three that agree
+    assert off(back[-1], np.eye(4))[0] < 0.1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nonsense_is_not_believed_however_long_it_lasts_where_no_camera_tells(seed):
+    choice = VehicleMotionChoice()
+    out = told(choice, [word(t) for t in seconds(0, 2, 0.02)] + nonsense(seconds(2, 12, 0.02), seed))
+    assert len(out) == 100
+    sane = [choice.on_odometry(word(t)) for t in seconds(12, 13, 0.02)]
+    assert max(off(m, np.eye(4))[0] for m in sane if m is not None) < 1e-9  # in the frame of before
+    assert sum(m is None for m in sane) == 2
+
+
 def test_a_fast_vehicles_odometry_that_was_silent_is_not_taken_for_one_that_jumped():
     times = [*seconds(0, 1, 0.02), *seconds(3, 4, 0.02)]
     words = [

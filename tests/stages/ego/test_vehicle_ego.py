@@ -1,5 +1,6 @@
 """The vehicle's motion in a room with LiDAR: metres, axes, standing, covariance, and what is missing."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -155,6 +156,28 @@ def test_it_rests_while_odometry_is_heard_and_goes_on_at_once_with_its_speed():
     assert off_m.max() < 0.03 * 3 * (23 - awake) * STEP_NS * 1e-9
     ego.on_odometry(odometry(at, START_NS + 24 * STEP_NS))
     assert list(ego.on_image(image(START_NS + 24 * STEP_NS, *at(24 * STEP_NS * 1e-9), LOOKS_UP))) == []
+
+
+def test_it_works_while_the_odometry_tells_nonsense():
+    at, ego, told = even((0, 0, 0.2), (3, 0, 0)), VehicleEgo(lens=LENS, T_vehicle_camera=LOOKS_UP), []
+    mad_from, rng = START_NS + 6 * STEP_NS, np.random.default_rng(0)
+    for k in range(20):
+        for part in range(6):
+            stamp_ns = START_NS + (k - 1) * STEP_NS + part * STEP_NS // 6
+            word = odometry(at, stamp_ns)
+            if stamp_ns >= mad_from:
+                word = dataclasses.replace(word, xyz_start_m=rng.uniform(-90, 90, 3))
+            ego.on_odometry(word)
+            ego.on_points(lidar_slice(stamp_ns, *at((stamp_ns - START_NS) * 1e-9), seed=10 * k + part))
+        seen = image(START_NS + k * STEP_NS, *at(k * STEP_NS * 1e-9), LOOKS_UP)
+        told.append(of(ego.on_image(seen), VehicleMotion))
+    awake = next(k for k, m in enumerate(told) if m is not None)
+    assert awake == math.ceil((mad_from - START_NS) / STEP_NS - 1 / 6 + ego.silent_s * 1e9 / STEP_NS)
+    assert all(m is not None for m in told[awake:])
+    assert np.linalg.norm(errors(at, told)[:, 3:], axis=1).max() < 0.03 * 3 * (19 - awake) * STEP_NS * 1e-9
+    for part in range(3):  # sane again: three that agree
+        ego.on_odometry(odometry(at, START_NS + 19 * STEP_NS + (part + 1) * STEP_NS // 6))
+    assert list(ego.on_image(image(START_NS + 20 * STEP_NS, *at(20 * STEP_NS * 1e-9), LOOKS_UP))) == []
 
 
 def test_its_ports_are_image_points_and_odometry_and_it_tells_the_vehicles_motion():

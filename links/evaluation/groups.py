@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
 from flow.link import LinkError
 from links.evaluation.compare import by_config, median
@@ -20,6 +21,8 @@ from links.evaluation.judged import Evaluation, minutes
 
 CONFIG, ALL = "config", "all"
 Key = tuple[int, ...]  # words of the recording's name that a table is grouped by; none: all runs are one group
+
+Amount = TypeVar("Amount", int, float)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,17 +131,17 @@ def _group(words: tuple[str, ...], config: str, evaluations: list[Evaluation]) -
         ever_right=len(was_right),
         silent=sum(len(e.output.poses) == 0 for e in evaluations),
         mostly_false=sum((_number(e, "false_outputs") or 0) > 0.5 * len(e.output.poses) for e in evaluations),
-        hit=pooled_seconds(evaluations, "hit_share"),
-        seen=pooled_seconds(evaluations, "seen_share"),
-        found=pooled_seconds(evaluations, "found_share"),
-        found_when_seen=pooled_seconds(evaluations, "found_when_seen_share"),
+        hit=pooled((e.seconds for e in evaluations), "hit_share"),
+        seen=pooled((e.seconds for e in evaluations), "seen_share"),
+        found=pooled((e.seconds for e in evaluations), "found_share"),
+        found_when_seen=pooled((e.seconds for e in evaluations), "found_when_seen_share"),
         first_right_s=spread(evaluations, "first_right_s"),
         shortest_failed_s=min(lengths_s, default=None),
         hit_gap_s=spread(evaluations, "longest_hit_gap_s"),
         reacquired_s=Spread(tuple(sorted(t for e in evaluations for t in e.reappeared_s))),
         lost=int(sum(lost)) if lost else None,
         rmse_m=spread(was_right, "rmse_m"),
-        inside_95=pooled_counts(evaluations, "inside_95_share"),
+        inside_95=pooled((e.counts for e in evaluations), "inside_95_share"),
         false_per_h=_per_h(evaluations, "false_outputs"),
         sure_false_per_h=_per_h(evaluations, "sure_false_outputs"),
     )
@@ -156,16 +159,10 @@ def spread(evaluations: list[Evaluation], key: str) -> Spread:
     return Spread(tuple(sorted(rank for rank in ranks if rank is not None)))
 
 
-def pooled_counts(evaluations: list[Evaluation], key: str) -> tuple[int, int]:
-    """Of a share that is kept as counts: (how many, of how many) over all runs."""
-    counts = [e.counts[key] for e in evaluations if key in e.counts]
-    return sum(count for count, _ in counts), sum(of for _, of in counts)
-
-
-def pooled_seconds(evaluations: list[Evaluation], key: str) -> tuple[float, float]:
-    """Of a share of time: (for how long, of how long) over all runs."""
-    seconds = [e.seconds[key] for e in evaluations if key in e.seconds]
-    return sum(some for some, _ in seconds), sum(of for _, of in seconds)
+def pooled(shares: Iterable[Mapping[str, tuple[Amount, Amount]]], key: str) -> tuple[Amount, Amount]:
+    """Of a share that each run keeps as counts or seconds: (how many, of how many) over all runs."""
+    told = [share[key] for share in shares if key in share]
+    return cast(tuple[Amount, Amount], (sum(some for some, _ in told), sum(of for _, of in told)))
 
 
 def _number(e: Evaluation, key: str) -> float | None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from links.evaluation.groups import Key, Spread, grouped, pooled_counts, spread
+from links.evaluation.groups import Key, Spread, grouped, pooled, spread
 from links.evaluation.judged import Evaluation, p95, rms
 from links.evaluation.rotation_errors import Off
 from links.evaluation.statistics import chi2_quantile
@@ -64,7 +64,7 @@ def _group(words: tuple[str, ...], config: str, evaluations: list[Evaluation]) -
         words=words,
         config=config,
         runs=len(evaluations),
-        accepted=pooled_counts(evaluations, "rotation_accepted_share"),
+        accepted=pooled((e.counts for e in evaluations), "rotation_accepted_share"),
         given=_sizes([t.given for t in turned]),
         modulo=_sizes([t.modulo for t in turned]),
         inside_95=(int(np.count_nonzero(inside)), len(inside)),

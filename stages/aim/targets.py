@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.aim.beside import Look
-from stages.candidate_numbers import CandidateNumbers
 from stages.geometry import Array64
 from stages.messages import Candidates, TrackingState, TrackState
 
@@ -57,8 +56,7 @@ class Targets:
 
     known: dict[Key, Target] = field(default_factory=lambda: dict[Key, Target]())
     _rests: dict[int, tuple[int, int]] = field(default_factory=lambda: dict[int, tuple[int, int]]())  # until, times
-
-    _numbers: CandidateNumbers = field(default_factory=CandidateNumbers)
+    _detector_life: int | None = None  # that counts the candidates
 
     def get(self, key: Key | None) -> Target | None:
         """One of them; None when it is gone."""
@@ -66,7 +64,8 @@ class Targets:
 
     def hear_candidates(self, candidates: Candidates, least_probability: float) -> None:
         """What is worth another look now."""
-        if self._numbers.hear(candidates):
+        if candidates.detector_life != self._detector_life:  # those before were of other things
+            self._detector_life = candidates.detector_life
             self._rests.clear()
             self.known = {key: target for key, target in self.known.items() if target.sure}
         for key in [key for key in self.known if key[0] == "candidate"]:

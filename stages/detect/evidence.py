@@ -79,6 +79,7 @@ class _Now:
     tidied_ns: int = 0
     elsewhere: bool = False  # all that is remembered, by the vehicle's odometry
     number: int = 0  # of the newest candidate
+    detector_life: int = 0  # its first pulse's stamp
     start_ns: int | None = None  # of the search not yet reported
     end_ns: int | None = None  # of a pass that is over, not yet reported
 
@@ -131,7 +132,7 @@ class EvidenceDetect(Stage):
         now = self._now
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
-            now.start_ns = now.tidied_ns = pulses.stamp_ns
+            now.start_ns = now.tidied_ns = now.detector_life = pulses.stamp_ns
         axis = mean_direction(pulses.direction_vehicle)
         part = Slice(pulses, *now.trail.at(middle_ns(pulses)), axis / max(math.hypot(*axis.tolist()), 1e-9))
         changed = False
@@ -288,7 +289,7 @@ class EvidenceDetect(Stage):
         if changed or new:
             told = [c for c in now.bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
             flight = now.word.usual_flight(now.trail, now_ns)
-            yield candidates_message(told, now.trail, now_ns, self.max_candidates, *flight)
+            yield candidates_message(told, now.trail, now_ns, now.detector_life, self.max_candidates, *flight)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9
         here = any(c.accepted and c.seen_ns >= now.start_ns for c in now.bank)

@@ -31,6 +31,7 @@ def candidates_message(
     bank: list[Candidate],
     trail: VehicleTrail,
     now_ns: int,
+    detector_life: int,
     at_most: int,
     usual_mps: Array64,
     spread_mps: float,
@@ -55,6 +56,7 @@ def candidates_message(
         looks=np.array([c.hit_looks for c in listed], dtype=np.int64),
         reasons=tuple(c.why for c in listed),
         wander_mps=np.array(wander_mps, dtype=np.float64),
+        detector_life=detector_life,
     )
 
 

@@ -23,7 +23,6 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
-from stages.candidate_numbers import CandidateNumbers
 from stages.geometry import Array64
 from stages.messages import (
     Candidates,
@@ -69,7 +68,7 @@ class HitMissTrack(Stage):
 
     _trail: VehicleTrail = PrivateAttr(default_factory=VehicleTrail)
     _known: Hypotheses = PrivateAttr()
-    _numbers: CandidateNumbers = PrivateAttr(default_factory=CandidateNumbers)
+    _detector_life: int | None = PrivateAttr(default=None)  # that counts the candidates
     _next_number: int = PrivateAttr(default=1)
     _idle_ns: int = PrivateAttr(default=0)
     _why_idle: str = PrivateAttr(default="nothing found yet")
@@ -93,8 +92,9 @@ class HitMissTrack(Stage):
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Follow the promising ones; drop what is no longer taken for a drone."""
-        if self._numbers.hear(candidates):
+        if self._detector_life not in (None, candidates.detector_life):
             self._known.forget_numbers()
+        self._detector_life = candidates.detector_life
         own = set(candidates.candidate_id[candidates.probability >= 0.5].tolist())
         for i in range(len(candidates.candidate_id)):
             number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from flow.stage import input_ports, output_ports
 from stages.aim import BeamAim
 from stages.aim.beam_aim import INNER_RAD
+from stages.aim.targets import Targets
 from stages.geometry import Harmonic, LidarMount
 from stages.messages import Candidates, ServoGoal, TrackingState, TrackState
 from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Way, beams_lidar, beams_vehicle, flying, packet, still
@@ -117,9 +118,10 @@ def tracking(*ways: Way, until_s=math.inf) -> Tell:
     return tell
 
 
-def candidates(place_m, t_s, probability, looks=3, seen_s=None, wander_mps=0.0) -> Candidates:
+def candidates(place_m, t_s, probability, looks=3, seen_s=None, wander_mps=0.0, detector_life=START_NS) -> Candidates:
     """One candidate; seen_s: when it was seen last, None: now."""
     return Candidates(
+        detector_life=detector_life,
         stamp_ns=START_NS + round(t_s * 1e9),
         candidate_id=np.array([1]),
         xyz_vehicle_m=np.array([place_m], dtype=np.float64),
@@ -310,6 +312,16 @@ def test_after_a_loss_it_sweeps_again():
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, tell)
     assert {round(goal.position_rad, 3) for t, goal in flight.goals if t > 1.05} <= {0.0, 3.142}
     assert np.degrees(np.ptp(flight.servo_rad[250:])) > 150.0
+
+
+def test_a_new_candidate_is_not_left_alone_for_one_of_its_number_of_a_detector_that_was():
+    targets, place = Targets(), (0.0, 8.0, 10.0)
+    targets.hear_candidates(candidates(place, 0.0, 0.5, looks=6), 0.1)
+    targets.leave(targets.known["candidate", 1], START_NS, rest_s=10.0)
+    targets.hear_candidates(candidates(place, 1.0, 0.5, looks=7), 0.1)
+    assert not targets.known
+    targets.hear_candidates(candidates(place, 2.0, 0.5, looks=9, detector_life=START_NS + 1), 0.1)
+    assert list(targets.known) == [("candidate", 1)]
 
 
 @pytest.mark.parametrize("says", [True, False])

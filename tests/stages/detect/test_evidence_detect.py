@@ -191,6 +191,16 @@ def test_what_hangs_quite_still_nearby_is_a_drone_once_all_that_could_hold_it_wo
     assert accepted_after_s(told_to_doubt) == math.inf
 
 
+def test_candidates_tell_which_life_of_the_detector_counts_them():
+    stage = EvidenceDetect(sweep_deg=PASS_DEG)
+    whole, _ = run([hanging()], 1.5, stage=stage)
+    assert {m.detector_life for m in whole} == {START_NS}
+    later = [p for p in pulses_seen([hanging()], WATCHING, 1.5) if p.stamp_ns > START_NS + 700_000_000]
+    afresh = EvidenceDetect(sweep_deg=PASS_DEG)
+    told = [m for p in later for m in afresh.on_pulses(p) if isinstance(m, Candidates)]
+    assert {m.detector_life for m in told} == {later[0].stamp_ns}
+
+
 def test_far_away_it_stays_a_candidate_because_a_wire_would_not_be_seen():
     far_m = 2.6 * np.array(PLACE_M)
     candidates, detections = run([Drone(still(*far_m), span_m=0.9)], 4.2, span_m=0.9)

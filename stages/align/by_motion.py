@@ -49,6 +49,7 @@ class ByMotion:
         self._windows = Windows(settings.baseline_m)
         self._headings = HeadingBank(settings)
         self._heading_windows = Windows(settings.baseline_m, HeadingBank.HYPOTHESES)
+        self._frames = 0  # of the vehicle, as `reckoning` counts
 
     def hear_pictures(self, motion: DroneMotion) -> None:
         """A step of the drone's odometry by its camera."""
@@ -57,6 +58,7 @@ class ByMotion:
     def see_fix(self, fix: DroneFix) -> bool:
         """Where the LiDAR saw the drone; True: its motion fits no branch, and the match followed is forgotten."""
         reckoning, lock = self._reckoning, self._lock
+        self._stay_in_frame()
         if not reckoning.vehicle_known(fix.stamp_ns):  # its way would be taken for the drone's
             self._windows.restart()
             self._heading_windows.restart()
@@ -97,6 +99,7 @@ class ByMotion:
 
         It is forgotten, and the branches a little, when the autopilot may have turned its north unheard.
         """
+        self._stay_in_frame()
         silences = self._reckoning.new_silences()
         self.bank.pass_time(stamp_ns)
         self.bank.mix(1.0 - (1.0 - SILENCE_SHARE) ** silences)
@@ -105,6 +108,14 @@ class ByMotion:
             self._headings.reset()
             self._heading_windows.restart()
         return self._headings.heading
+
+    def _stay_in_frame(self) -> None:
+        """What was seen in another start frame of the vehicle's does not count."""
+        if self._frames != self._reckoning.frames:
+            self._frames = self._reckoning.frames
+            self._windows.restart()
+            self._heading_windows.restart()
+            self._headings.reset()
 
     def slip(self, weights: Array64) -> None:
         """The followed yaw may be quarter turns off what it was: weights (4,) of so many."""

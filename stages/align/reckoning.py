@@ -5,6 +5,9 @@
 The drone's own turn comes from its autopilot or its pictures, the vehicle's from its motion. Yaw is told between the
 two cameras' level axes, the one number that pictures add an offset to (lock.py).
 
+While the vehicle is silent that offset takes its turn over, which its next word tells again: so twice the heading is
+not known by as much as the vehicle may have turned, and not at all where its start frame may be another one.
+
 Source: ours.
 """
 
@@ -21,7 +24,7 @@ from stages.drone_trail import AutopilotTrail, PictureTrail, turn_between
 from stages.geometry import Array64, heading_rad, rotation_z
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
 from stages.rotation import log_rotation
-from stages.trail import VehicleTrail
+from stages.trail import FURTHEST_NS, VehicleTrail
 
 VEHICLE_RAD_PER_S = math.radians(20.0)  # a vehicle that does not tell its turns may turn like this
 VEHICLE_DRIFT_RAD2_PER_S = math.radians(0.1) ** 2
@@ -54,6 +57,8 @@ class Reckoning:
         self._R_start_drone = np.eye(3)
         self._stamp_ns: int | None = None
         self._silences = 0
+        self._silent_rad2 = 0.0  # `_vehicle_silent_rad2` at the pair before; a half turn's where the frame is another
+        self.frames = 0  # how often the vehicle's start frame may have become another one
 
     def vehicle_known(self, stamp_ns: int) -> bool:
         """Whether it is told where the vehicle is: not long after its last word."""
@@ -61,7 +66,10 @@ class Reckoning:
 
     def add_vehicle(self, motion: VehicleMotion) -> None:
         """The vehicle's pose since its start."""
-        self.vehicle.add(motion)
+        first = not self.vehicle.known
+        if self.vehicle.add(motion) or first:
+            self.frames += 1
+            self._silent_rad2 = math.pi**2
 
     def add_autopilot(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """What the autopilot says of itself."""
@@ -84,7 +92,7 @@ class Reckoning:
     def advance(self, vehicle_ns: int, drone_ns: int, vehicle: LevelLines, drone: LevelLines) -> Reckoned:
         """Turn on to a pair's moments."""
         R_start_vehicle = self.vehicle.at(vehicle_ns)[0]
-        variance = 0.0
+        variance, silent_rad2 = 0.0, self._vehicle_silent_rad2(vehicle_ns)
         if self._stamp_ns is None:
             self._R_start_drone = R_start_vehicle @ vehicle.R_carrier_level @ drone.R_carrier_level.T
         else:
@@ -92,6 +100,8 @@ class Reckoning:
             turn = turn_between(self.autopilot, self.pictures, self._stamp_ns, drone_ns)
             self._R_start_drone = self._R_start_drone @ turn.R_from_to
             variance = turn.variance_rad2 + self._vehicle_variance_rad2(vehicle_ns, dt)
+            variance += abs(silent_rad2 - self._silent_rad2)
+        self._silent_rad2 = silent_rad2
         self._stamp_ns = drone_ns
         return Reckoned(
             drone_ns,
@@ -148,3 +158,10 @@ class Reckoning:
         if self.vehicle.known_at(stamp_ns):
             return VEHICLE_DRIFT_RAD2_PER_S * seconds
         return 0.0 if self._parked else (VEHICLE_RAD_PER_S * seconds) ** 2
+
+    def _vehicle_silent_rad2(self, stamp_ns: int) -> float:
+        """Variance of the heading that is told of a vehicle beyond where its trail ends."""
+        newest_ns = self.vehicle.newest_ns
+        if newest_ns is None or self._parked or stamp_ns - newest_ns <= FURTHEST_NS:
+            return 0.0
+        return max(self.vehicle.unsure(stamp_ns)[1], VEHICLE_RAD_PER_S * (stamp_ns - newest_ns) * 1e-9) ** 2

@@ -41,6 +41,8 @@ class Flight:
     autopilot: str = "odometry"  # or "split": attitude and position; "attitude" alone; "none"
     pictures: bool = False  # DroneMotion
     tells_vehicle: bool = True
+    vehicle_silent: tuple[float, float] = (math.inf, math.inf)  # no word of the vehicle
+    vehicle_afresh_deg: float = 0.0  # its start frame is turned after that
     fix_sigma_m: float = 0.05
     false_yaw_deg: float = 0.0  # the fixes are turned: what a wrong branch would look like
     false_from_s: float = 0.0
@@ -83,12 +85,10 @@ class Flight:
 
     def _autopilot(self, stage: JointAlign, t: float) -> None:
         ns = START_NS + round(t * S)
-        if self.tells_vehicle:
-            stage.on_motion(
-                VehicleMotion(
-                    stamp_ns=ns, xyz_start_m=np.zeros(3), R_start_vehicle=self.R_world_vehicle(t), covariance=None
-                )
-            )
+        if self.tells_vehicle and not self.vehicle_silent[0] <= t < self.vehicle_silent[1]:
+            afresh_deg = self.vehicle_afresh_deg if t >= self.vehicle_silent[1] else 0.0
+            R = rotation_z(math.radians(afresh_deg)) @ self.R_world_vehicle(t)
+            stage.on_motion(VehicleMotion(stamp_ns=ns, xyz_start_m=np.zeros(3), R_start_vehicle=R, covariance=None))
         if self.silent[0] <= t < self.silent[1]:
             return
         if self.pictures and t > 0.04:

@@ -144,6 +144,24 @@ def test_a_turning_vehicle_is_taken_into_account():
     assert wrong_and_resolved(flight, told) == 0
 
 
+@pytest.mark.parametrize("afresh_deg", [0.0, 60.0, 90.0, 180.0])
+def test_a_vehicle_odometry_started_afresh_in_a_silence_is_never_a_quarter_turn_of_the_drone(afresh_deg):
+    """Its heading begins anew; where that is a quarter turn off, the streets look alike."""
+    flight = Flight(vehicle_silent=(4.0, 6.5), vehicle_afresh_deg=afresh_deg)
+    told = flight.run(JointAlign(), 12.0)
+    assert next(m for m in reversed(told) if m.stamp_ns < START_NS + 4 * S).state is BranchState.RESOLVED
+    assert wrong_and_resolved(flight, told) == 0
+    assert told[-1].state is BranchState.RESOLVED
+
+
+@pytest.mark.parametrize("vehicle_dps", [-60.0, 40.0, 50.0])
+def test_what_the_vehicle_turned_while_silent_is_no_quarter_turn_of_the_drone(vehicle_dps):
+    flight = Flight(vehicle_dps=vehicle_dps, vehicle_silent=(4.0, 5.6))
+    told = flight.run(JointAlign(), 10.0)
+    assert wrong_and_resolved(flight, told) == 0
+    assert told[-1].state is BranchState.RESOLVED
+
+
 def test_without_the_vehicles_motion_nothing_is_concluded_unless_it_is_parked():
     silent = Flight(tells_vehicle=False)
     assert silent.run(JointAlign(), 4.0)[-1].state is BranchState.AMBIGUOUS

@@ -155,6 +155,19 @@ class VehicleTrail:
             self._onward = log_rotation(R_then.T @ R) / (span_ns * 1e-9), (t - t_then) / (span_ns * 1e-9)
         return self._onward
 
+    def in_this_frame(self, stamp_ns: int) -> bool:
+        """Whether what `at` tells of a moment is in the frame that is told now."""
+        return self._joined or stamp_ns >= self._begun_ns
+
+    def in_newest_frame(self, stamp_ns: int) -> tuple[Array64, Array64]:
+        """R and t in the frame that is told now; before that began: straight back, as it goes in it."""
+        if self.in_this_frame(stamp_ns):
+            return self.at(stamp_ns)
+        first_ns, R, t = next(pose for pose in self._poses if pose[0] >= self._begun_ns)
+        turn_radps, velocity_mps = self._went()
+        back_s = (stamp_ns - first_ns) * 1e-9
+        return R @ exp_rotation(back_s * turn_radps), t + back_s * velocity_mps
+
     def rate_radps(self, stamp_ns: int) -> Array64:
         """How the vehicle turns (3,), its own axes; zero where nothing tells."""
         before, after = self.at(stamp_ns - STEP_NS // 2)[0], self.at(stamp_ns + STEP_NS // 2)[0]

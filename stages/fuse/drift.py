@@ -87,9 +87,9 @@ class Drift:
         self._x[:3] += t_m
         self._covariance = whole @ self._covariance @ whole.T
 
-    def forget_velocity(self) -> None:
-        """What was known of b counts no more."""
-        self._x[3:] = 0.0
+    def forget_velocity(self, guess_mps: Array64) -> None:
+        """What was known of b counts no more; it is guessed."""
+        self._x[3:] = guess_mps
         self._covariance[3:, :] = self._covariance[:, 3:] = 0.0
         self._covariance[3:, 3:] = UNKNOWN_MPS**2 * np.eye(3)
 

@@ -63,15 +63,19 @@ class Estimator:
 
     def hear_vehicle(self, motion: VehicleMotion) -> None:
         """Where the vehicle is. When it is heard at last, or again, the start frame may be another one."""
-        at_ns = self.positions.free.stamp_ns
-        before = None if at_ns is None else self.motions.vehicle.at(at_ns)
-        if self.motions.hear_vehicle(motion) and before is not None:
-            R, t = before
-            self.doubt()
-            self.north.forget()
-            self._witness.restart()
-            R_new_old = motion.R_start_vehicle @ R.T
-            self.positions.turn(R_new_old, motion.xyz_start_m - R_new_old @ t)
+        at_ns, vehicle = self.positions.free.stamp_ns, self.motions.vehicle
+        before = None if at_ns is None else (*vehicle.at(at_ns), vehicle.velocity_mps(at_ns))
+        if not self.motions.hear_vehicle(motion):
+            return
+        self.doubt()
+        self.north.forget()
+        self._witness.restart()
+        if at_ns is not None and before is not None:
+            R, t, velocity_mps = before
+            R_after, t_after = vehicle.in_newest_frame(at_ns)
+            R_new_old = R_after @ R.T
+            new_mps = vehicle.velocity_mps(motion.stamp_ns) - R_new_old @ velocity_mps
+            self.positions.turn(R_new_old, t_after - R_new_old @ t, new_mps)
 
     def hear_autopilot(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """The drone's own estimate."""
@@ -161,6 +165,8 @@ class Estimator:
         """A LiDAR position at its own time."""
         stamp_ns = fix.stamp_ns
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
+        if not self.motions.vehicle.in_this_frame(stamp_ns):
+            return
         R_start_vehicle, t = self.motions.vehicle.at(stamp_ns)
         z = R_start_vehicle @ fix.xyz_vehicle_m + t
         ahead_m2, _, _ = self.motions.vehicle_ahead_m2(stamp_ns, fix.xyz_vehicle_m)
@@ -208,6 +214,8 @@ class Estimator:
 
     def see_rotation(self, stamp_ns: int, R_vehicle_drone: Array64, covariance_rad2: Array64, switches: int) -> None:
         """A RESOLVED rotation at its own time."""
+        if not self.motions.vehicle.in_this_frame(stamp_ns):
+            return
         R, heading = self.motions.vehicle.at(stamp_ns)[0] @ R_vehicle_drone, self.north.heading
         R_own = self.motions.R_own_drone(stamp_ns)
         sigma = math.sqrt(float(np.linalg.eigvalsh(covariance_rad2)[-1]))

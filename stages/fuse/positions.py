@@ -86,15 +86,15 @@ class Positions:
         else:
             self.left.see(stamp_ns, z, worth * covariance_m2, R_start_drone @ R_own.T @ way[0], turned_mps)
 
-    def turn(self, R_new_old: Array64, t_m: Array64) -> None:
-        """The start frame is another one now: p <- R p + t."""
+    def turn(self, R_new_old: Array64, t_m: Array64, velocity_mps: Array64) -> None:
+        """The start frame is another one now: p <- R p + t, v <- R v + velocity, which is no more than a guess."""
         self.free.turn(R_new_old, t_m)
-        self.forget_velocity()
+        self.forget_velocity(self.free.velocity_mps + velocity_mps)
 
-    def forget_velocity(self) -> None:
+    def forget_velocity(self, guess_mps: Array64 | None = None) -> None:
         """The start frame moves, or moves no more: no velocity in it is known."""
         self.left = Drift(self._errors, odometry=True)
-        self.free.forget_velocity()
+        self.free.forget_velocity(np.zeros(3) if guess_mps is None else guess_mps)
 
     def begin_left_over(self, xyz_m: Array64, covariance_m2: Array64) -> None:
         """From the newest fix on the odometry's own drift is watched."""

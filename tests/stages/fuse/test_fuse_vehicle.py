@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -14,6 +15,7 @@ from stages.geometry import rotation_z
 from stages.messages import PoseState, VehicleMotion
 from tests.stages.fuse.flown import late, spoilt, without
 from tests.stages.fuse.made_drone_flight import Made, ns, rms
+from tests.stages.fuse.test_fuse_flight import wrong
 
 FULL, COASTING = PoseState.FULL, PoseState.COASTING
 DRIVES = {"vehicle_mps": 6.0, "vehicle_dps": 4.0}
@@ -86,6 +88,44 @@ def test_one_pose_that_jumps_is_left_out_and_three_that_agree_are_a_new_start_fr
     R, t = motions.vehicle.at(ns(0.48))
     assert t[0] == pytest.approx(6.0 * 0.48 + 3.0)
     assert math.atan2(R[1, 0], R[0, 0]) == pytest.approx(0.5)
+
+
+def jumped(from_s, deg=115.0, hz=50, silent_s=0.0):
+    """Its start frame is another one from a time on, perhaps after a silence."""
+    R = rotation_z(math.radians(deg))
+
+    def fault(events):
+        for at_ns, port, message in events:
+            if port == "motion" and message.stamp_ns >= ns(from_s):
+                xyz_m = R @ message.xyz_start_m + np.array([200.0, 0.0, 0.0])
+                message = dataclasses.replace(message, xyz_start_m=xyz_m, R_start_vehicle=R @ message.R_start_vehicle)
+            left_out = round((message.stamp_ns - ns(0)) / 2e7) % (50 // hz) or ns(0) <= message.stamp_ns - round(
+                from_s * 1e9
+            ) < ns(silent_s)
+            if port != "motion" or not left_out:
+                yield at_ns, port, message
+
+    return fault
+
+
+@pytest.mark.parametrize(("hz", "silent_s"), [(50, 0.0), (5, 0.0), (50, 1.5)])
+@pytest.mark.parametrize("vehicle_mps", [0.0, 6.0, 15.0])
+def test_a_start_frame_that_jumps_costs_the_rotation_and_not_the_position(vehicle_mps, hz, silent_s):
+    made = Made(until_s=13, vehicle_mps=vehicle_mps, vehicle_dps=4.0)
+    poses = told(made, jumped(8.0, hz=hz, silent_s=silent_s))
+    assert not wrong(made, poses)
+    seen = made.judge([p for p in poses if p.xyz_vehicle_m is not None], after_s=5)
+    off, sigma = np.array(seen.error_m), np.array(seen.sigma_m)
+    assert np.mean(off > 0.5 + 3.0 * sigma) < 0.01
+    assert poses[-1].state is FULL
+
+
+@pytest.mark.parametrize("deg", [90.0, 180.0, 60.0])
+def test_a_start_frame_that_jumps_while_the_drone_is_lost_is_no_heading_for_when_it_is_found(deg):
+    made = Made(until_s=20, vehicle_mps=6.0, gaps_s={"fix": (5.0, 15.0), "rotation": (5.0, 30.0)})
+    poses = told(made, jumped(14.0, deg))
+    assert any(p.state is PoseState.LOST for p in poses if p.stamp_ns > ns(13.0))
+    assert not wrong(made, poses)
 
 
 def test_beyond_its_newest_word_a_vehicle_may_have_braked_and_turned():

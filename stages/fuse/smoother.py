@@ -29,7 +29,7 @@ from stages.rigid import carried_covariance, good_covariance
 
 RAISED = (RuntimeError, IndexError, ValueError)  # what GTSAM's wrapper makes of C++ exceptions
 FLOOR = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)  # a step of no length is known no better
-FARTHEST_M = 1e5
+FARTHEST_M = 1e5  # from where it began
 SLACK_S = 1e-3  # GTSAM keeps a pose for so much longer than it is asked for here: its times are floats
 UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 
@@ -46,7 +46,7 @@ class Smoother:
         self._lag_s, self._lag_ns = lag_s, round(1e9 * lag_s)
         self._keys: deque[tuple[int, int]] = deque()  # (time, number) of the chain's poses in the window
         self._number = 0
-        self._first_ns = 0
+        self._first_ns, self._first_m = 0, np.zeros(3)
         self._smoother: Any = None
         self.stamp_ns, self.recoveries = 0, 0
         self.R_start_drone, self.xyz_start_m, self.covariance = np.eye(3), np.zeros(3), np.eye(6)
@@ -58,7 +58,7 @@ class Smoother:
         params.relinearizeSkip = 1
         params.findUnusedFactorSlots = True  # else its list of factors grows for ever
         self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag_s + SLACK_S, params)
-        self._number, self._first_ns = self._number + 1, stamp_ns
+        self._number, self._first_ns, self._first_m = self._number + 1, stamp_ns, xyz_start_m
         self._keys.clear()
         self._keys.append((stamp_ns, self._number))
         self.stamp_ns, self.covariance = stamp_ns, covariance
@@ -158,7 +158,7 @@ class Smoother:
         """The newest pose with its covariance; None: they are nonsense."""
         pose = self._smoother.calculateEstimatePose3(X(self._number))
         covariance = self._smoother.marginalCovariance(X(self._number))
-        near = bool(np.abs(pose.translation()).max() < FARTHEST_M)  # NaN compares false
+        near = bool(np.abs(pose.translation() - self._first_m).max() < FARTHEST_M)  # NaN compares false
         if not (near and good_covariance(covariance)):
             return None
         return pose.rotation().matrix(), pose.translation(), covariance

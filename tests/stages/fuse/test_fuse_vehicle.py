@@ -128,6 +128,18 @@ def test_a_start_frame_that_jumps_while_the_drone_is_lost_is_no_heading_for_when
     assert not wrong(made, poses)
 
 
+def test_an_odometry_that_tells_map_coordinates_serves_as_well():
+    made, far_m = Made(until_s=10, **DRIVES), np.array([5e5, 5.2e6, 100.0])
+    stage, poses = Fuse(), []
+    for _, port, message in made.events():
+        if port == "motion":
+            message = dataclasses.replace(message, xyz_start_m=message.xyz_start_m + far_m)
+        poses += getattr(stage, f"on_{port}")(message)
+    assert stage.recoveries == 0
+    near, far = (made.judge(p, after_s=4) for p in (made.run(Fuse()), poses))
+    assert far.rmse_m() == pytest.approx(near.rmse_m(), rel=0.01)
+
+
 def test_beyond_its_newest_word_a_vehicle_may_have_braked_and_turned():
     """a dt^2 / 2 each way, alpha dt^2 / 2 across; from 0.3 s on, where the trail ends, all its way."""
     motions, place = Motions(FuseErrors(), parked=False), np.array([3.0, 4.0, 12.0])

@@ -31,7 +31,12 @@ class Rejected:
         self._off.clear()
 
     def add(self, stamp_ns: int, off: Array64, covariance: Array64) -> bool:
-        """One more refused, off (3,) the estimate; True: enough of them lie on a line in time."""
+        """One more refused, off (3,) the estimate; True: enough of them lie on a line in time.
+
+        What comes twice counts once.
+        """
+        if any(stamp_ns == ns for ns, _, _ in self._off):
+            return False
         self._off.append((stamp_ns, off, covariance))
         while self._off[0][0] < stamp_ns - LONGEST_NS:
             self._off.popleft()

@@ -190,6 +190,13 @@ def test_refusals_that_scatter_are_not():
     assert not any(refuse(rng.normal(0, 3.0, (40, 3))))
 
 
+def test_one_that_comes_again_and_again_agrees_with_nobody():
+    refused = Rejected()
+    assert not any(refused.add(S, np.ones(3), 0.01 * np.eye(3)) for _ in range(3 * ENOUGH))
+    assert not any(refused.add(i * S // 10, np.ones(3), 0.01 * np.eye(3)) for i in range(11, 9 + ENOUGH))
+    assert refused.add(2 * S, np.ones(3), 0.01 * np.eye(3))
+
+
 def test_one_that_is_accepted_begins_the_count_anew():
     refused = Rejected()
     for i in range(ENOUGH - 1):

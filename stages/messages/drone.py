@@ -43,9 +43,7 @@ class Candidates(Message):
     looks: PerPointI64  # turns of the rotor in which it was hit
     reasons: tuple[str, ...]  # what speaks for and against, one each
     wander_mps: PerPointF64 | None = None  # level speed it says it has and heading unknown, beyond velocity_vehicle_mps
-    detector_life: int = (
-        0  # another one: it was started afresh, its numbers are of other things. No time: see in_our_time
-    )
+    detector_life: int = 0  # another one: it was started afresh, its numbers are of other things
 
 
 class TrackingState(enum.Enum):

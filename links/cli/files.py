@@ -157,7 +157,8 @@ def simulate_recording(
 @in_words
 def simulate_matrix(
     folder: Annotated[Path, typer.Argument(help="Where the recordings go, one for each cell and seed.")],
-    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Make seeds 1 to N of each cell.")] = 1,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Make so many seeds of each cell.")] = 1,
+    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first of them.")] = 1,
     only: Annotated[
         list[str] | None,
         typer.Option("--only", help="Cells whose name matches, as in 'campus-*-orbit-parked'; may be repeated."),
@@ -259,9 +260,8 @@ def simulate_matrix(
     with progress_bar(f"{len(wanted) * seeds} recordings") as step:
         size_px = cameras_px or Conditions.cameras_px
         conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, as_built)
-        report = make_matrix(
-            folder, wanted, range(1, seeds + 1), closed_loop, step, conditions, results, jobs, pictures
-        )
+        several = range(first_seed, first_seed + seeds)
+        report = make_matrix(folder, wanted, several, closed_loop, step, conditions, results, jobs, pictures)
     for text in report.impossible:
         warn(text)
     for failure in report.failed:

@@ -247,6 +247,14 @@ def test_the_command_names_what_failed_and_returns_what_it_returned_before(
     assert "2 made, 0 were there already\n" in result.output
 
 
+def test_seeds_begin_where_asked(tmp_path, monkeypatch) -> None:
+    made: list[int] = []
+    monkeypatch.setattr(matrix_making, "make_one", lambda task, tell: made.append(task.seed) or Outcome("made"))
+    words = ["matrix", str(tmp_path), "--only", "campus-10m-hover-parked", "--seeds", "3", "--first-seed", "6"]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert made == [6, 7, 8]
+
+
 def test_a_wrong_configuration_is_said_once_before_anything_is_made(tmp_path, config: Path) -> None:
     config.write_text(GRAPH.replace(", inputs: {goal: aim.servo_goal}", ""))
     with pytest.raises(LinkError, match="closed loop needs one servo"):

@@ -210,6 +210,9 @@ class HitMissTrack(Stage):
         x, P = self._known.at(track, now_ns)
         R, _ = self._trail.at(now_ns)
         xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
+        covariance = self._whole_covariance(xyz, R.T @ P[:3, :3] @ R)
+        if silent_s > self.coast_after_s:  # what is seen is seen from the vehicle, wherever that is
+            covariance += self._unsure_vehicle_m2(now_ns, xyz)
         track.told_ns = now_ns
         return TrackState(
             stamp_ns=now_ns,
@@ -220,8 +223,14 @@ class HitMissTrack(Stage):
             track_id=track.number,
             xyz_vehicle_m=xyz,
             velocity_vehicle_mps=velocity,
-            covariance_m2=self._whole_covariance(xyz, R.T @ P[:3, :3] @ R),
+            covariance_m2=covariance,
         )
+
+    def _unsure_vehicle_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> Array64:
+        """What a place beside a vehicle that is not heard any more is wrong by (3, 3), its axes."""
+        place_m, yaw_rad = self._trail.unsure(stamp_ns)
+        level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * yaw_rad
+        return place_m**2 * np.eye(3) + np.outer(level, level)
 
     # one look
 

@@ -183,6 +183,32 @@ def test_what_is_met_where_a_drone_may_be_must_be_the_surer_one_the_less_that_is
     assert (fixes_of(out)[-1].stamp_ns > at_s(1.1 + gap_s)) == taken
 
 
+def test_a_drone_out_of_sight_of_a_vehicle_that_is_not_heard_is_where_neither_tells():
+    """It may have braked meanwhile."""
+    sigmas_m = {}
+    for heard_s in (1.0, 3.0):
+        stage, states = HitMissTrack(), []
+        stage.on_motion(driven(0.0))
+        states += stage.on_detections(accepted((0.0, 8.0, 10.0)))
+        told = [driven(t) for t in np.arange(0.02, heard_s, 0.02)]
+        for pulses in pulses_seen([During(Drone(flying((0.0, 8.0, 10.0), (-8.0, 0.0, 0.0))), 0.0, 0.7)], WATCHING, 2.6):
+            while told and told[0].stamp_ns <= pulses.point_stamp_ns[-1]:
+                stage.on_motion(told.pop(0))
+            states += stage.on_pulses(pulses)
+        last = states_of(states)[-1]
+        assert last.state is TrackingState.COASTING
+        assert last.stamp_ns > at_s(2.4)
+        assert last.covariance_m2 is not None
+        sigmas_m[heard_s] = np.sqrt(np.diag(last.covariance_m2))
+    added_m = np.sqrt(sigmas_m[1.0] ** 2 - sigmas_m[3.0] ** 2)
+    assert (added_m > 0.5 * 2.0 * 1.4**2 / 2).all()  # braking or not, at 2 m/s^2, one sigma
+
+
+def driven(t_s) -> VehicleMotion:
+    place = np.array([8.0 * t_s, 0.0, 0.0])
+    return VehicleMotion(stamp_ns=at_s(t_s), xyz_start_m=place, R_start_vehicle=np.eye(3), covariance=None)
+
+
 @pytest.mark.parametrize(("accepted_s", "numbers"), [(2.0, {1, 2}), (1.4, {1})])
 def test_a_drone_not_hit_for_a_second_gives_way_to_one_accepted_elsewhere(accepted_s, numbers):
     first, second = still(-3.0, 8.0, 10.0), still(4.0, 8.0, 12.0)

@@ -64,7 +64,7 @@ class HostTime:
         looks = []
         while not looks or (looks[-1][0] >= PROMPT_NS and len(looks) < LOOKS):
             before_ns, wall_ns, after_ns = self.now_ns(), self._wall_ns(), self.now_ns()
-            looks.append((after_ns - before_ns, wall_ns - before_ns))
+            looks.append((after_ns - before_ns, wall_ns - after_ns))  # a stamp may come out late by that, never early
         doubt_ns, ahead_ns = min(looks)
         return after_ns, ahead_ns, doubt_ns
 

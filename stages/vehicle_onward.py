@@ -86,16 +86,12 @@ class BelievedWords:
     def __init__(self) -> None:
         self._watch = JumpWatch()
         self._words: deque[VehicleMotion] = deque(maxlen=64)  # of one start frame
+        self.speed_mps: float | None = None  # as they told it last; None: they never did
 
     @property
     def newest_ns(self) -> int | None:
         """Time of the newest."""
         return self._words[-1].stamp_ns if self._words else None
-
-    @property
-    def speed_mps(self) -> float:
-        """The speed that they tell; 0: they tell none."""
-        return (speed_mps(list(self._words)) or 0.0) if self._words else 0.0
 
     def hear(self, motion: VehicleMotion) -> tuple[VehicleMotion, ...]:
         """What is believed now, as JumpWatch says; a word that is not newer than the last is to be left out before."""
@@ -103,6 +99,9 @@ class BelievedWords:
         if len(believed) > 1:
             self._words.clear()  # of another start frame
         self._words.extend(believed)
+        if believed:
+            told_mps = speed_mps(list(self._words))
+            self.speed_mps = self.speed_mps if told_mps is None else told_mps
         return believed
 
     def _leads_to(self, motion: VehicleMotion) -> bool:

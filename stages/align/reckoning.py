@@ -162,6 +162,7 @@ class Reckoning:
     def _vehicle_silent_rad2(self, stamp_ns: int) -> float:
         """Variance of the heading that is told of a vehicle beyond where its trail ends."""
         newest_ns = self.vehicle.newest_ns
-        if newest_ns is None or self._parked or stamp_ns - newest_ns <= FURTHEST_NS:
-            return 0.0
-        return max(self.vehicle.unsure(stamp_ns)[1], VEHICLE_RAD_PER_S * (stamp_ns - newest_ns) * 1e-9) ** 2
+        beyond_ns = 0 if newest_ns is None or self._parked else stamp_ns - newest_ns - FURTHEST_NS
+        return (
+            0.0 if beyond_ns <= 0 else max(self.vehicle.unsure(stamp_ns)[1], VEHICLE_RAD_PER_S * beyond_ns * 1e-9) ** 2
+        )

@@ -162,7 +162,8 @@ class VehicleEgo(Stage):
         """Begin anew at this picture; how fast the vehicle drives is known from its odometry."""
         self._resting = False
         self._links = MotionLinks(self.lens, self.features, self.link)
-        self._now = _Now(lengths=LEAST_LENGTHS, told=True, speed_mps=self._odometry.speed_mps)
+        speed_mps = self._odometry.speed_mps
+        self._now = _Now() if speed_mps is None else _Now(lengths=LEAST_LENGTHS, told=True, speed_mps=speed_mps)
 
     def _next_key(self, key: _Key, link: Link, step: Step, at: Pose6, tracks: Tracks) -> Pose6:
         """The newest picture becomes the key; its pose after bundle adjustment."""

@@ -164,9 +164,9 @@ class Estimator:
     def see_fix(self, fix: DroneFix) -> None:
         """A LiDAR position at its own time."""
         stamp_ns = fix.stamp_ns
-        self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
         if not self.motions.vehicle.in_this_frame(stamp_ns):
             return
+        self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
         R_start_vehicle, t = self.motions.vehicle.at(stamp_ns)
         z = R_start_vehicle @ fix.xyz_vehicle_m + t
         ahead_m2, _, _ = self.motions.vehicle_ahead_m2(stamp_ns, fix.xyz_vehicle_m)

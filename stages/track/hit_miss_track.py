@@ -107,7 +107,8 @@ class HitMissTrack(Stage):
             if known is not None:
                 seen_later = int(candidates.seen_ns[i]) > known.last_hit_ns
                 doubtful = known.confirmed and seen_later and self._known.doubtful(known, candidates.stamp_ns)
-                if doubtful and P >= self._known.needed(known, candidates.stamp_ns):
+                own_word = known.candidate == number  # the detector itself has followed it on
+                if doubtful and (0.5 if own_word else self._known.needed(known, candidates.stamp_ns)) <= P:
                     self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
                 # what is refused beside a track whose own candidate is taken for a drone is another one there
                 sure = known.candidate == number or (candidates.looks[i] >= 6 and known.candidate not in own)

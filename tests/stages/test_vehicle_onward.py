@@ -9,7 +9,7 @@ import pytest
 
 from stages.geometry import rotation_z
 from stages.messages import VehicleMotion
-from stages.vehicle_onward import HARD, JOINT_S, UNTOLD, USUAL, MayChange, along_its_bend
+from stages.vehicle_onward import HARD, JOINT_S, UNTOLD, USUAL, BelievedWords, MayChange, along_its_bend
 
 S = 1_000_000_000
 
@@ -72,3 +72,15 @@ def test_one_word_alone_and_words_from_long_ago_tell_no_speed():
 
 def test_who_does_not_say_how_sure_it_is_is_not_made_sure():
     assert along_its_bend([word(0.0, covariance=False)], S).covariance is None
+
+
+def test_the_speed_outlives_a_start_frame_that_jumps():
+    words, far = BelievedWords(), 1000.0
+    assert words.speed_mps is None
+    for k in range(10):
+        words.hear(word(0.1 * k))
+    assert words.speed_mps == pytest.approx(3.0, abs=0.01)
+    for k in range(4):  # of a frame that begins anew, 20 ms apart: too short to tell a speed
+        words.hear(word(0.92 + 0.02 * k, lambda s: (bend(s)[0], bend(s)[1] + far)))
+    assert words.newest_ns == round(0.98 * S)
+    assert words.speed_mps == pytest.approx(3.0, abs=0.01)

@@ -172,13 +172,16 @@ def test_a_drone_that_comes_back_is_the_same_one(gap_s):
 
 
 @pytest.mark.parametrize(
-    ("gap_s", "probability", "taken"), [(1.5, 0.4, False), (1.5, 0.7, True), (3.8, 0.7, False), (3.8, 0.99, True)]
+    ("gap_s", "probability", "number", "taken"),
+    [(1.5, 0.4, 2, False), (1.5, 0.7, 2, True), (3.8, 0.7, 2, False), (3.8, 0.99, 2, True), (3.8, 0.7, 1, True)],
 )
-def test_what_is_met_where_a_drone_may_be_must_be_the_surer_one_the_less_that_is_known(gap_s, probability, taken):
-    """After four seconds it may be anywhere within ten metres, and so may a bird."""
+def test_what_is_met_where_a_drone_may_be_must_be_the_surer_one_the_less_that_is_known(
+    gap_s, probability, number, taken
+):
+    """After four seconds it may be anywhere within ten metres, and so may a bird; number 1 is the drone's own."""
     way, other = still(0.0, 8.0, 10.0), still(0.6, 8.0, 10.4)
     things = [During(Drone(way), 0.0, 1.0), During(Drone(other, seed=1), 1.0 + gap_s, 9.0)]
-    met = candidate(here(other), probability, t_s=1.1 + gap_s, number=2)
+    met = candidate(here(other), probability, t_s=1.1 + gap_s, number=number)
     out = run(things, [accepted(here(way)), met], 1.6 + gap_s)
     assert (fixes_of(out)[-1].stamp_ns > at_s(1.1 + gap_s)) == taken
 

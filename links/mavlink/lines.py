@@ -5,34 +5,24 @@ newer, so that it gets as many as it takes. A line that is gone is tried again, 
 that has kept a frame for half a second stands still; it is dropped with what is in it, so that no pose arrives later as
 if it were of now. What the other side's system has taken and its program has not read is out of our hands.
 
-Source: ours; tty_ioctl(4) TIOCOUTQ, tcp(7) SIOCOUTQ for what a line has not taken yet; socket(7) SO_LINGER; pyserial
-sets up the device.
+Source: ours.
 """
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
-import os
-import select
-import socket
-import struct
-import termios
 import threading
 import time
 from collections import deque
 from ipaddress import IPv4Address
-from typing import Any, Protocol
+from typing import Protocol
 
 from flow.link import LinkError
 from links.mavlink.connection import Connection, Endpoint, Source_, Udp
+from links.mavlink.serial_line import SerialLine
+from links.mavlink.tcp_line import TcpLine
 from links.mavlink.wire import MAX_FRAME_BYTES
 
-CHUNK_BYTES = 4096
-TCP_BACKLOG_BYTES, SERIAL_BACKLOG_BYTES = 512, 512  # not through yet: two poses more, 6 ms at 921600 baud
-CONNECT_S, RECONNECT_S = 2.0, 0.4  # TCP: the first time, and while a listener may be waiting to be closed
 CLOSE_S = 0.1
-THROWN_AWAY = struct.pack("ii", 1, 0)  # struct linger: closing ends it at once
 RETRY_S = (0.1, 2.0)  # first and last wait before the next try
 TOLD_S = 5.0  # for so long a trouble is told at least: it is looked at once a second, and said once if it comes again
 STALL_S = 0.5  # ArduPilot takes what comes later for half a second old (JitterCorrection), whatever its time says
@@ -190,120 +180,3 @@ class StreamConnection:
         self._up = not self._closed
         self.reconnects += 1
         return True
-
-
-class TcpLine:
-    """A TCP client."""
-
-    backlog_bytes = TCP_BACKLOG_BYTES
-
-    def __init__(self, endpoint: Endpoint) -> None:
-        self.name = f"{endpoint.host}:{endpoint.port}"
-        self._address = (endpoint.host, endpoint.port)
-        self._socket: socket.socket | None = None
-        self._connect_s = CONNECT_S
-
-    def open(self) -> None:
-        """Connect. LinkError."""
-        try:
-            self._socket = socket.create_connection(self._address, self._connect_s)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise LinkError(
-                f"cannot connect to TCP {self.name}: {reason}. Does the autopilot's bridge or simulator run there? "
-                "Check `connection`."
-            ) from None
-        self._connect_s = RECONNECT_S
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, THROWN_AWAY)
-        self._socket.setblocking(False)
-
-    def read(self, timeout_s: float) -> bytes:
-        """What has arrived. OSError: it is gone."""
-        line = self._there()
-        if not select.select([line], [], [], timeout_s)[0]:
-            return b""
-        data = line.recv(CHUNK_BYTES)
-        if not data:
-            raise ConnectionResetError("closed by the other side")
-        return data
-
-    def write(self, data: bytes) -> int:
-        """Bytes taken."""
-        try:
-            return self._there().send(data)
-        except BlockingIOError:
-            return 0
-
-    def waiting_bytes(self) -> int:
-        """Bytes that the other side has not acknowledged."""
-        return struct.unpack("i", fcntl.ioctl(self._there(), termios.TIOCOUTQ, b"\0\0\0\0"))[0]
-
-    def close(self) -> None:
-        """Disconnect. What the other side has not acknowledged is thrown away."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
-
-    def _there(self) -> socket.socket:
-        if self._socket is None:
-            raise ConnectionResetError("not connected")
-        return self._socket
-
-
-class SerialLine:
-    """A serial device, 8N1, raw."""
-
-    backlog_bytes = SERIAL_BACKLOG_BYTES
-
-    def __init__(self, endpoint: Endpoint) -> None:
-        self.name = endpoint.host
-        self._baud = endpoint.port
-        self._port: Any = None  # serial.Serial
-
-    def open(self) -> None:
-        """Open the device for us alone. LinkError."""
-        import serial  # here: a UDP link needs none of it
-
-        try:
-            self._port = serial.Serial(self.name, self._baud, timeout=0.0, write_timeout=0.0, exclusive=True)
-        except (OSError, ValueError) as error:  # serial.SerialException is an OSError
-            raise LinkError(
-                f"cannot open {self.name} at {self._baud} baud: {error}. Is it plugged in, is no other program using "
-                "it, and may you use it (group dialout)? Check `connection`."
-            ) from None
-
-    def read(self, timeout_s: float) -> bytes:
-        """What has arrived. OSError: it is gone."""
-        port = self._there()
-        if not select.select([port], [], [], timeout_s)[0]:
-            return b""
-        data = os.read(port.fileno(), CHUNK_BYTES)
-        if not data:  # readable, and nothing to read: unplugged
-            raise ConnectionResetError("unplugged")
-        return data
-
-    def write(self, data: bytes) -> int:
-        """Bytes taken."""
-        try:
-            return os.write(self._there().fileno(), data)  # pyserial's own write spins while the line is full
-        except BlockingIOError:
-            return 0
-
-    def waiting_bytes(self) -> int:
-        """Bytes that the line has not sent."""
-        return self._there().out_waiting
-
-    def close(self) -> None:
-        """Let go of the device. What it has not sent is thrown away."""
-        if self._port is not None:
-            with contextlib.suppress(OSError, termios.error):
-                self._port.reset_output_buffer()
-            with contextlib.suppress(OSError):
-                self._port.close()
-            self._port = None
-
-    def _there(self) -> Any:
-        if self._port is None:
-            raise ConnectionResetError("not open")
-        return self._port

@@ -20,7 +20,9 @@ import pytest
 
 from flow.link import LinkError
 from links.mavlink.connection import Connection, Endpoint, Udp, parse_connection
-from links.mavlink.lines import SERIAL_BACKLOG_BYTES, STALL_S, TCP_BACKLOG_BYTES, StreamConnection, open_connection
+from links.mavlink.lines import STALL_S, StreamConnection, open_connection
+from links.mavlink.serial_line import SERIAL_BACKLOG_BYTES
+from links.mavlink.tcp_line import TCP_BACKLOG_BYTES
 
 FRAME = bytes(244)
 UNSHARE = ("unshare", "-n") if os.geteuid() == 0 else ("unshare", "-rn")

@@ -72,6 +72,8 @@ class Session:
         self._trips = RoundTrips()
         self._target_ns = now_ns()  # when the autopilot was heard last, or the session began
         self._heard_on: int | None = None  # the connection, by `reconnects`; NOWHERE: only with an old signature
+        if signer is not None:
+            signer.keep()  # it may come from a session before
         self._keeper = threading.Thread(target=self._keep, name="mavlink housekeeping", daemon=True)
         self._keeper.start()
 

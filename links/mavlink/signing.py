@@ -74,17 +74,15 @@ class Signer:
         self.keep()
 
     def sign_for(self, sender: Any, now_ns: int) -> None:
-        """Make pymavlink's MAVLink `sender` sign what it packs next."""
+        """Make pymavlink's MAVLink `sender` sign what it packs next. It never waits for the disk: see `keep`."""
         self._used = max(self._used + 1, ticks_of(now_ns))
-        if self._used >= self._reserved and not self._writing.locked():
-            self.keep()
         sender.signing.secret_key = self._secret
         sender.signing.sign_outgoing = True
         sender.signing.link_id = self._link_id
         sender.signing.timestamp = self._used
 
     def keep(self) -> None:
-        """Write the file ahead where it is time; called now and then, so that signing itself need not wait for it.
+        """Write the file ahead where it is time; to be called when a link is opened and many times a minute from then.
 
         From any thread: one that waits for a slow disk holds up none that signs. What fails is tried again later.
         """

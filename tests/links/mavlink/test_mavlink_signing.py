@@ -6,6 +6,8 @@ import errno
 import itertools
 import logging
 import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,15 @@ def signed(signer: Signer, now_ns: int = HOST0, system: int = 1, component: int 
     mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
     signer.sign_for(mav, now_ns)
     return packed(BEAT, mav)
+
+
+def signed_for_minutes(signer: Signer) -> list[int]:
+    """Times of a frame a second for 200 s, kept as a session does."""
+    times = list[int]()
+    for second in range(200):
+        times.append(ticks(signed(signer, HOST0 + second * 1000 * MS)))
+        signer.keep()
+    return times
 
 
 def ticks(frame: bytes) -> int:
@@ -109,7 +120,7 @@ def test_times_follow_the_clock_and_grow_though_it_stands_or_goes_back(key_file:
 @pytest.mark.parametrize("closed", [True, False])
 def test_after_a_restart_with_a_wrong_clock_no_time_is_used_again(key_file: Path, closed: bool):
     signer = Signer(key_file, HOST0)
-    last = max(ticks(signed(signer, HOST0 + i * 1000 * MS)) for i in range(200))
+    last = max(signed_for_minutes(signer))
     if closed:  # else it was killed
         signer.close()
     again = Signer(key_file, HOST0 - 10**9 * MS)
@@ -130,8 +141,8 @@ def test_a_disk_that_takes_no_more_is_said_and_counted_and_times_go_on_growing(
     signer = Signer(key_file, HOST0)
     with monkeypatch.context() as full:
         full.setattr("links.mavlink.signing.os.fsync", full_disk)
-        times = [ticks(signed(signer, HOST0 + i * 1000 * MS)) for i in range(200)]
-        assert signer.unwritten == 1  # who signs does not try the disk each time
+        times = signed_for_minutes(signer)
+        assert signer.unwritten == 1  # it is not tried each time
         assert "cannot be written: No space left on device" in (signer.trouble or "")
         signer.close()
         times += [ticks(signed(signer, HOST0)) for _ in range(3)]  # the link again, and the clock set back
@@ -142,9 +153,38 @@ def test_a_disk_that_takes_no_more_is_said_and_counted_and_times_go_on_growing(
     assert ticks(signed(Signer(key_file, HOST0))) > times[-1]
 
 
+def test_a_disk_that_takes_its_time_and_then_fails_holds_up_none_that_signs(
+    key_file: Path, monkeypatch: pytest.MonkeyPatch
+):
+    signer = Signer(key_file, HOST0)
+    writing, release = threading.Event(), threading.Event()
+
+    def slow(descriptor: int) -> None:
+        writing.set()
+        if not release.wait(20):
+            pytest.fail("it waited for the disk")
+        full_disk(descriptor)
+
+    monkeypatch.setattr("links.mavlink.signing.os.fsync", slow)
+    late_ns = HOST0 + 61_000 * MS  # all that was written ahead is used up
+    times = [ticks(signed(signer, late_ns))]  # nobody writes: the disk is not asked
+    assert not writing.is_set()
+    with ThreadPoolExecutor(1) as pool:
+        keeping = pool.submit(signer.keep)
+        assert writing.wait(20)
+        times += [ticks(signed(signer, late_ns)) for _ in range(100)]
+        assert not keeping.done()
+        release.set()
+        keeping.result(20)
+    times += [ticks(signed(signer, late_ns + 60_000 * MS)) for _ in range(100)]  # long after RETRY_S: still not asked
+    assert signer.unwritten == 1
+    assert all(b > a for a, b in itertools.pairwise(times))
+
+
 def test_a_signer_that_was_closed_and_goes_on_reserves_its_times_anew(key_file: Path):
     signer = Signer(key_file, HOST0)
     signer.close()
+    signer.keep()  # a session opens
     last = max(ticks(signed(signer, HOST0)) for _ in range(5))  # then it is killed
     assert ticks(signed(Signer(key_file, HOST0))) > last
 

@@ -65,6 +65,7 @@ class Connection(Protocol):
     reconnects: int
     foreign: int  # datagrams from others, not read
     stalls: int  # times it stood still and was dropped
+    left_late: int  # frames that waited longer for the line than LATE_NS, as far as is known
 
     @property
     def trouble(self) -> str | None:
@@ -93,7 +94,7 @@ class Udp:
     trouble: str | None = None
 
     def __init__(self, endpoint: Endpoint, sender: IPv4Address | None) -> None:
-        self.reconnects = self.foreign = self.stalls = 0
+        self.reconnects = self.foreign = self.stalls = self.left_late = 0
         self._only = None if sender is None else str(sender)
         self._peer: Source_ | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

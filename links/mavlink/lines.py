@@ -5,6 +5,8 @@ newer, so that it gets as many as it takes. A line that is gone is tried again, 
 that has kept a frame for half a second stands still; it is dropped with what is in it, so that no pose arrives later as
 if it were of now. What the other side's system has taken and its program has not read is out of our hands.
 
+Frames that leave later than LATE_NS are counted: a line that is merely slow does not stand still, its poses are late.
+
 Source: ours.
 """
 
@@ -18,6 +20,7 @@ from typing import Protocol
 
 from flow.link import LinkError
 from links.mavlink.connection import Connection, Endpoint, Source_, Udp
+from links.mavlink.round_trip import LATE_NS
 from links.mavlink.serial_line import SerialLine
 from links.mavlink.tcp_line import TcpLine
 from links.mavlink.wire import MAX_FRAME_BYTES
@@ -68,7 +71,7 @@ class StreamConnection:
     datagrams = False
 
     def __init__(self, line: Line) -> None:
-        self.reconnects = self.foreign = self.stalls = 0
+        self.reconnects = self.foreign = self.stalls = self.left_late = 0
         self._line = line
         self._trouble, self._trouble_s = "", -TOLD_S  # the last one, and when it came
         self._up = True
@@ -107,7 +110,7 @@ class StreamConnection:
             try:
                 if self._rest:
                     self._rest = self._rest[self._line.write(self._rest) :]
-                if self._rest or self._line.waiting_bytes() > self._line.backlog_bytes:
+                if self._note_what_left() > self._line.backlog_bytes or self._rest:
                     return False
                 self._rest = frame[self._line.write(frame) :]
                 self._begun_bytes += len(frame)
@@ -152,10 +155,17 @@ class StreamConnection:
     def _stands_still(self) -> bool:
         """Whether a frame has waited for too long; looked at by the listener, many times a second."""
         with self._writing:
-            through_bytes = self._begun_bytes - len(self._rest) - self._line.waiting_bytes()
-            while self._on_way and self._on_way[0][0] <= through_bytes:
-                self._on_way.popleft()
+            self._note_what_left()
             return bool(self._on_way) and time.monotonic() - self._on_way[0][1] > STALL_S
+
+    def _note_what_left(self) -> int:
+        """Bytes that wait in the line. Those frames that are through wait no more, and some were late."""
+        waiting_bytes = self._line.waiting_bytes()
+        through_bytes = self._begun_bytes - len(self._rest) - waiting_bytes
+        while self._on_way and self._on_way[0][0] <= through_bytes:
+            _, begun_s = self._on_way.popleft()
+            self.left_late += time.monotonic() - begun_s > 1e-9 * LATE_NS
+        return waiting_bytes
 
     def _lost(self, how: str = "is gone: is it plugged in and powered?") -> None:
         """Only the listener closes and opens: nobody reads from a number that has become another file's."""

@@ -3,8 +3,9 @@
     received -> frames -> signature, echo -> records for the graph; TIMESYNC requests are answered at once
     poses    -> gate and speaker -> frames, at once or not at all; none to an autopilot that has fallen silent: what
                 stands still, it or a bridge before it, would keep them and take them for new when it goes on; none
-                while TIMESYNC tells that they would come late (`round_trip.py`)
-    a thread of its own: HEARTBEAT once a second, TIMESYNC four times, texts, the origin; also when no pose comes
+                while they would come late (`round_trip.py`)
+    a thread of its own: HEARTBEAT once a second, TIMESYNC four times, texts, the origin; also when no pose comes.
+                What is due and finds the line full is tried again at each step, before a pose: it is small
 
 An answer to our own TIMESYNC is recorded with the time that it was asked at as its stamp: by that the decoder knows it
 from another's, in replay, too.
@@ -70,6 +71,7 @@ class Session:
         self._closed = threading.Event()
         self._second_ns = self._asked_ns = 0
         self._trips = RoundTrips()
+        self._left_late = 0  # frames, of those that the connection counts
         self._target_ns = now_ns()  # when the autopilot was heard last, or the session began
         self._heard_on: int | None = None  # the connection, by `reconnects`; NOWHERE: only with an old signature
         if signer is not None:
@@ -103,6 +105,7 @@ class Session:
         """Send a pose, or refuse it; never waits for the line."""
         with self._lock:
             now_ns = self._now_ns()
+            self._beat(now_ns)
             messages = self.speaker.speak(pose, now_ns, self._refusal(now_ns))
             if any([self._send(message) for message in messages]):  # all are tried
                 self.speaker.went_out(pose, now_ns)
@@ -129,6 +132,7 @@ class Session:
             "from other senders": self.connection.foreign,
             "reconnects": self.connection.reconnects,
             "dropped: stood still": self.connection.stalls,
+            "left late": self.connection.left_late,
             **({"round trip [ms]": took_ns // 1_000_000} if took_ns is not None else {}),
             **({"signing time not written": self._signer.unwritten} if self._signer is not None else {}),
         }
@@ -181,12 +185,15 @@ class Session:
                 self.connection.answer_to(source)
                 if self._now_ns() - self._target_ns > SILENT_S * SECOND_NS:
                     self.origin.restart()
+                if not self._hears(self._now_ns()):
+                    self._trips.begin_anew()
+                self._trips.heard()
                 self._target_ns, self._heard_on = self._now_ns(), self.connection.reconnects
                 self.origin.hear(message)
                 if message.get_type() == "TIMESYNC":
                     if message.tc1 == 0:
                         self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
-                    elif self._trips.answered(message.ts1, arrival_ns):
+                    elif self._trips.answered(message.ts1, arrival_ns, self.speaker.sending):
                         return message.ts1
         return arrival_ns
 
@@ -218,16 +225,24 @@ class Session:
             if self._signer is not None:
                 self._signer.keep()  # not under the lock: the disk may be slow
 
-    def _tick(self, now_ns: int) -> None:
+    def _beat(self, now_ns: int) -> None:
+        """HEARTBEAT and TIMESYNC, where they are due and the line takes them. The lock is held."""
         if now_ns - self._second_ns >= SECOND_NS:
-            self._second_ns = now_ns
             state = ACTIVE if self.speaker.sending else STANDBY
-            self._send(dialect().MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, state, 3))
+            if self._send(dialect().MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, state, 3)):
+                self._second_ns = now_ns
         if now_ns - self._asked_ns >= ASK_NS:
-            self._asked_ns = now_ns
             asked_ns = self._now_ns()
             if self._send(dialect().MAVLink_timesync_message(0, asked_ns)):
-                self._trips.asked(asked_ns)
+                self._asked_ns = now_ns
+                if self._trips.asked(asked_ns):
+                    self.speaker.warn("answers no TIMESYNC: late is not seen")
+        if self.connection.left_late != self._left_late:
+            self._left_late = self.connection.left_late
+            self._trips.left_late(now_ns)
+
+    def _tick(self, now_ns: int) -> None:
+        self._beat(now_ns)
         for message in self.origin.due(now_ns):
             if not self._send(message):
                 self.origin.unsent()

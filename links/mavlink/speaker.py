@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from links.mavlink.gate import Limits, Refusal, refusal
 from links.mavlink.pose_frames import landing_target, odometry, vision_position_estimate
@@ -23,6 +23,7 @@ from links.mavlink.wire import SEQUENCE, dialect
 from stages.messages import PoseState, RelativePose
 
 Kind = Literal["odometry", "vision_position_estimate", "landing_target"]
+Text = Literal["output", "line", "state"]  # of each kind the newest waits; the first goes first
 
 SILENCE_NS = 300_000_000  # the autopilot takes us for gone
 TEXT_NS = 500_000_000  # between two texts
@@ -52,9 +53,9 @@ class PoseSpeaker:
         self._counted = False  # the counter has changed since `_sent`
         self._sending = False
         self._state: PoseState | None = None
-        self._texts: dict[Literal["output", "state"], tuple[int, str]] = {}  # severity and text, waiting
+        self._texts: dict[Text, tuple[int, str]] = {}  # severity and text, waiting
         self._text_ns: int | None = None
-        self._offered: tuple[Literal["output", "state"], int, str] | None = None  # by `texts`, last
+        self._offered: tuple[Text, int, str] | None = None  # by `texts`, last
 
     @property
     def sending(self) -> bool:
@@ -92,6 +93,10 @@ class PoseSpeaker:
             self._stop("no pose goes out")
         return self._due(now_ns)
 
+    def warn(self, text: str) -> None:
+        """Say something of the line."""
+        self._texts["line"] = WARNING, text
+
     def unsaid(self) -> None:
         """The text of `texts` could not be sent: it waits again. To be said at once, before a newer one comes."""
         if self._offered is not None:
@@ -120,11 +125,11 @@ class PoseSpeaker:
         return landing_target(pose)
 
     def _due(self, now_ns: int) -> list[Any]:
-        """The next text, output before state."""
+        """The next text."""
         if not self._texts or (self._text_ns is not None and 0 <= now_ns - self._text_ns < TEXT_NS):
             return []
         self._text_ns = now_ns
-        kind: Literal["output", "state"] = "output" if "output" in self._texts else "state"
+        kind: Text = next(kind for kind in get_args(Text) if kind in self._texts)
         severity, text = self._texts.pop(kind)
         self._offered = kind, severity, text
         data = f"grd: {text}".encode("ascii", "replace")[:TEXT_BYTES]

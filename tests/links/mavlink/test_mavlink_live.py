@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import itertools
 import os
 import socket
 import threading
-import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mavlink_bridges import Bridge
 from mavlink_poses import good_pose
 from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega
@@ -232,42 +230,6 @@ def test_timesync_is_answered_and_asked_for():
         )  # ours, answered; ESTIMATOR_STATUS has its time
 
 
-class Bridge:
-    """UDP between us and the autopilot: takes all at once, and hands on what is for the autopilot after a while."""
-
-    def __init__(self, ours: int) -> None:
-        self.delay_s = 0.0
-        self._ours = "127.0.0.1", ours
-        self._theirs: tuple[str, int] | None = None
-        self._waiting: deque[tuple[float, bytes]] = deque()
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.port = bound_port(self._socket)
-        self._socket.settimeout(0.005)
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> Bridge:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._closed.set()
-        self._thread.join()
-        self._socket.close()
-
-    def _run(self) -> None:
-        while not self._closed.is_set():
-            with contextlib.suppress(TimeoutError, ConnectionRefusedError):
-                data, source = self._socket.recvfrom(2048)
-                if source == self._ours:
-                    self._waiting.append((time.monotonic() + self.delay_s, data))
-                else:
-                    self._theirs = source
-                    self._socket.sendto(data, self._ours)
-            while self._theirs is not None and self._waiting and self._waiting[0][0] <= time.monotonic():
-                self._socket.sendto(self._waiting.popleft()[1], self._theirs)
-
-
 def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
     with (
         listening() as heard,
@@ -285,9 +247,12 @@ def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
         assert "answers to TIMESYNC take longer than 0.3 s" in (heard.link.trouble or "")
         told = "grd: STOPPED: line too slow"
         heard.rest(lambda: any((m.severity, m.text) == (2, told) for m in drone.messages("STATUSTEXT")))
+        assert heard.link.counters["sent: ODOMETRY"] == sent
+        prompt_us = host_time.now_ns() // 1000
         bridge.delay_s = 0.0
-        heard.fly(lambda: drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256)
-        assert heard.link.trouble is None
+        heard.fly(lambda: drone.messages("ODOMETRY")[-1].time_usec > prompt_us)
+        assert next(m for m in drone.messages("ODOMETRY") if m.time_usec > prompt_us).reset_counter != counter
+        heard.rest(lambda: heard.link.trouble is None)
 
 
 def test_an_answer_that_we_did_not_ask_for_is_not_believed_though_it_names_nobody():

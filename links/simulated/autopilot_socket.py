@@ -61,6 +61,7 @@ class AutopilotSocket:
         self.heard: deque[tuple[int, Any]] = deque(maxlen=HEARD)
         self.silent = False
         """Says and hears nothing while set: a radio in a shadow."""
+        self._to_say: deque[Any] = deque()
         self._flight, self._scenario_ns = flight, scenario_ns
         self._begin_ns = scenario_ns()
         self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
@@ -105,6 +106,10 @@ class AutopilotSocket:
         """Wait until something is true; looked at with each message that comes."""
         with self._changed:
             return self._changed.wait_for(predicate, timeout_s)
+
+    def say(self, message: Any) -> None:
+        """Send a message, from its own thread."""
+        self._to_say.append(message)
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -158,6 +163,8 @@ class AutopilotSocket:
         return mavlink.MAVLink_param_value_message(place[0], float(value), REAL32, *place[1:])
 
     def _speak(self) -> None:
+        while self._to_say:
+            self._send(self._to_say.popleft())
         if self._flight is not None:
             for record in self._flight.records(self._scenario_ns()):
                 if record.topic == "/autopilot/rx":

@@ -431,7 +431,7 @@ def test_what_a_serial_line_has_not_sent_when_it_is_closed_is_thrown_away():
     arrived = 0
     while select.select([ours], [], [], 0.3)[0]:
         arrived += len(os.read(ours, 65536))
-    assert 0 < arrived < taken / 2  # 4095 bytes were the other side's already
+    assert arrived < taken / 2  # up to 4095 bytes were the other side's already
     os.close(theirs)
     os.close(ours)
 

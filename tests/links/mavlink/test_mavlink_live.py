@@ -258,7 +258,7 @@ def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
 def test_an_answer_that_we_did_not_ask_for_is_not_believed_though_it_names_nobody():
     with listening() as heard, drone_for(heard, Px4Rules()) as drone:
         heard.rest(lambda: heard.link.counters["timesync replies"] >= 2)
-        drone._send(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
+        drone.say(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
         heard.rest(lambda: heard.link.counters.get("refused: timesync for another", 0) == 1)
         before = heard.link.counters["timesync replies"]
         heard.rest(lambda: heard.link.counters["timesync replies"] > before)

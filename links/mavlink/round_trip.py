@@ -4,7 +4,7 @@ A radio or a bridge behind a faster line takes poses at once and hands them on l
 only the answers tell. How much of a round trip is the way there is not known, so all of it may be. It is slow where
 
     two of the last three answers were late, or
-    five requests in a row found no answer while the autopilot was heard: a bridge that hangs on the way there, or
+    eight requests in a row found no answer while the autopilot was heard: a bridge that hangs on the way there, or
     two frames within a second left our own line late
 
 and late from then until it has not been slow for three seconds. What fills a bridge may be the poses themselves: then
@@ -12,7 +12,7 @@ a line that nobody sends on is soon prompt, and late again. So each time that la
 answers was prompt while poses went out, the wait doubles, up to a minute.
 
 An answer that is lost says nothing, and an autopilot that never answers is never late. One that has answered, is heard
-and answers no more for seven seconds is taken for one that never did when its wait is over: `unseen`.
+and answers no more for 27 seconds is taken for one that never did when its wait is over: `unseen`.
 
 Source: ours; https://mavlink.io/en/services/timesync.html; DESIGN: ArduPilot's health ends after 300 ms.
 """
@@ -25,8 +25,8 @@ ASK_NS = 250_000_000  # between two requests
 LATE_NS = 300_000_000  # what comes later, the autopilot would have taken for silence
 LATEST, LATE_OF_LATEST = 3, 2
 LEFT_LATE_NS = 1_000_000_000  # between two that left late
-UNANSWERED = 5  # for 1.25 s; where a tenth of all frames is lost that is once in some twenty minutes
-GIVEN_UP = 28  # seven seconds; with the first wait ten
+UNANSWERED = 8  # for 2 s; where a fifth of all frames is lost that is once in a quarter of an hour
+GIVEN_UP = 108  # 27 seconds; with the first wait half a minute
 FIRST_WAIT_NS, LONGEST_WAIT_NS = 3_000_000_000, 60_000_000_000
 PROVEN = 240  # prompt answers while poses go out: a minute
 WAITING = 64  # requests: a quarter of a minute

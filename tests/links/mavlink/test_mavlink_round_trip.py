@@ -94,11 +94,11 @@ def test_the_wait_is_short_again_after_a_minute_of_prompt_answers_while_poses_we
     assert waits == pytest.approx([WAIT, WAIT, 2 * WAIT], abs=3)
 
 
-def test_who_has_answered_and_is_heard_and_answers_five_in_a_row_no_more_is_late_from_then_on():
+def test_who_has_answered_and_is_heard_and_answers_eight_in_a_row_no_more_is_late_from_then_on():
     asking = Asking()
     told = asking.late_after([20] + [None] * (UNANSWERED + 1))
-    assert told == [False] * (UNANSWERED + 1) + [True]  # the fifth has had its quarter of a second
-    assert not any(Asking().late_after(([20] + [None] * (UNANSWERED - 1)) * 10))  # a radio loses four in a row
+    assert told == [False] * (UNANSWERED + 1) + [True]  # the eighth has had its quarter of a second
+    assert not any(Asking().late_after(([20] + [None] * (UNANSWERED - 1)) * 10))  # a radio loses seven in a row
 
 
 def test_what_is_not_heard_at_all_is_no_bridge_that_hangs():
@@ -107,7 +107,7 @@ def test_what_is_not_heard_at_all_is_no_bridge_that_hangs():
     assert not any(asking.late_after([None] * 100, heard=False))
 
 
-def test_who_is_heard_and_answers_no_more_gets_poses_again_after_ten_seconds_and_that_is_told_once():
+def test_who_is_heard_and_answers_no_more_gets_poses_again_after_half_a_minute_and_that_is_told_once():
     asking = Asking()
     asking.late_after([20])
     begun_ns, told = asking.now_ns, 0

@@ -89,6 +89,8 @@ class Estimator:
         fresh = fix_ns is not None and abs(motion.stamp_ns - fix_ns) < WAIT_NS
         if not (self.chain.running and fresh) or motion.direction_from is None or motion.direction_sigma_rad is None:
             return
+        if not self.motions.still(motion.stamp_ns):  # it flew so over ground, not beside the vehicle
+            return
         if np.linalg.norm(free.velocity_mps) > LEAST_MPS:
             R, _, P = self.chain.at(motion.from_ns)
             sigma = math.hypot(motion.direction_sigma_rad, math.sqrt(float(np.trace(P[:3, :3])) / 3))

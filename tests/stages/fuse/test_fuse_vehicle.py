@@ -74,6 +74,17 @@ def test_a_vehicle_that_falls_silent_ends_full_and_is_taken_up_again():
     assert max(seen.error_m) < 2.0
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_which_way_the_drone_flies_over_ground_is_not_how_it_moves_beside_a_vehicle_that_is_not_heard(seed):
+    """Its camera tells the way over ground; beside a vehicle at 6 m/s it may stand."""
+    made = Made(until_s=11, seed=seed, pictures=True, vehicle_mps=6.0)
+    poses = told(made, without(("motion",), 6.0, 10.0))
+    seen = made.judge([p for p in poses if ns(7.0) < p.stamp_ns < ns(9.9)])
+    assert len(seen.error_m) > 90
+    assert max(seen.error_m) < 0.5
+    assert np.mean(np.array(seen.nees3) < 7.81) > 0.9
+
+
 def test_one_pose_that_jumps_is_left_out_and_three_that_agree_are_a_new_start_frame():
     motions = Motions(FuseErrors(), parked=False)
     assert motions.hear_vehicle(drive(0.0))

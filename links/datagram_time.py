@@ -1,7 +1,8 @@
 """When a datagram arrived, as the kernel stamped it: a thread that comes late does not make it later.
 
 The kernel stamps with the wall clock; `links/host_time.py` makes of it a time that a step of that clock does not move.
-Where the kernel does not stamp, it is when the datagram was read.
+Where the kernel does not stamp, it is when the datagram was read; so it is in the first moments after it was asked to:
+a worker of its own turns that on.
 
 Source: socket(7), SO_TIMESTAMPNS.
 """

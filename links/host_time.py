@@ -72,8 +72,3 @@ class HostTime:
 _HOST = HostTime()
 now_ns = _HOST.now_ns
 from_wall_ns = _HOST.from_wall_ns
-
-
-def wall_steps() -> int:
-    """Times the wall clock was seen to be set since the process began."""
-    return _HOST.steps

@@ -4,7 +4,7 @@ The kernel stamps with the wall clock; `links/host_time.py` makes of it a time t
 Where the kernel does not stamp, it is when the datagram was read; so it is in the first moments after it was asked to:
 a worker of its own turns that on.
 
-Source: socket(7), SO_TIMESTAMPNS.
+Source: socket(7), SO_TIMESTAMPNS; Linux, net/core/dev.c, net_enable_timestamp.
 """
 
 from __future__ import annotations

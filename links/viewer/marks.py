@@ -82,7 +82,7 @@ def plot(
 def strip_batch(points: NDArray[np.float32], lengths: NDArray[np.int64]) -> pa.Array:
     """Strips for `LineStrips2D` or `LineStrips3D`: points (n, 2 or 3), strip after strip, and how many each has.
 
-    Made at once: Rerun 0.41 makes of a list one array for each strip, 27 ms a picture with its three hundred lines.
+    Made at once: Rerun 0.41 makes of a list one array for each strip, and a picture has three hundred.
     """
     empty = (rr.components.LineStrip2DBatch if points.shape[1] == 2 else rr.components.LineStrip3DBatch)([])
     strips = empty.as_arrow_array().type

@@ -13,6 +13,7 @@ from numpy.random import Generator
 from links.simulated.mesh import Array64, Mesh, box, merge, quads, rod
 from stages.geometry import rotation_z
 
+LEAST_M = 1e-6  # nothing is built that is shorter
 MARK_ABOVE_M = 0.004  # marks lie this far above the road, so that rays tell them apart
 
 
@@ -142,7 +143,7 @@ def dashes(start_m: tuple[float, float], end_m: tuple[float, float], z_m: float 
     along = (b - a) / length
     return [
         strip(tuple(a + s * along), tuple(a + min(s + 3.0, length) * along), 0.12, "marking", z_m)
-        for s in np.arange(0.0, length, 9.0)
+        for s in np.arange(0.0, length - LEAST_M, 9.0)
     ]
 
 
@@ -150,7 +151,7 @@ def house_row(width_m: float, depth_m: float, heights_m: tuple[float, float], rn
     """Houses wall to wall, front on y = 0 facing -y, from x = 0 to the width."""
     parts: list[Mesh] = []
     x = 0.0
-    while x < width_m:
+    while width_m - x > LEAST_M:  # what is left by rounding is no house
         width = min(rng.uniform(10, 24), width_m - x)
         width = width_m - x if width_m - x - width < 6 else width
         surface = str(rng.choice(["brick", "plaster", "concrete"]))

@@ -11,6 +11,7 @@ from links.simulated.reality import drone_area_m2
 from links.simulated.scene import Body, Scene, Truth, drone_shapes, into_body
 from links.simulated.vehicle import vehicle_mesh
 from links.simulated.world import SceneSettings, world_mesh
+from links.simulated.world.parts import dashes, house_row
 from stages.geometry import rotation_from_rpy_deg
 
 
@@ -143,3 +144,17 @@ def test_a_face_knows_its_normal_and_its_surface() -> None:
     assert {SURFACE_NAMES[row] for row in mesh.surface} == {"brick", "marking"}
     assert mesh.only(mesh.is_surface("marking")).vertices_m[mesh.only(mesh.is_surface("marking")).faces].min() == 0.0
     assert mesh.is_surface("marking").sum() == 12
+
+
+def test_a_row_of_houses_has_none_of_no_width() -> None:
+    for seed in range(190, 240):
+        rng = np.random.default_rng(seed)
+        row = house_row(float(rng.uniform(18, 42)), 12.0, (9.0, 20.0), rng)
+        a, b, c = (row.vertices_m[row.faces[:, i]] for i in range(3))
+        assert np.linalg.norm(np.cross(b - a, c - a), axis=1).min() > 1e-3
+
+
+def test_a_lane_that_ends_with_a_dash_has_no_stub_of_no_length() -> None:
+    lane = merge(dashes((1000.0, 0.0), (1009.0 + 2e-13, 0.0)))
+    assert np.isfinite(lane.vertices_m).all()
+    assert len(lane.faces) == len(merge(dashes((0.0, 0.0), (9.0, 0.0))).faces)

@@ -23,14 +23,23 @@ from flow.message import Message
 from links.fix_log import FixLog
 from links.result_file import ResultFile
 from stages.geometry import quaternions_xyzw
-from stages.messages import DepthImage, Detections, DroneFix, PoseState, RelativePose, RelativeRotation, TrackState
+from stages.messages import (
+    Candidates,
+    DepthImage,
+    Detections,
+    DroneFix,
+    PoseState,
+    RelativePose,
+    RelativeRotation,
+    TrackState,
+)
 
 FIX_FILE, COVARIANCE_FILE, LOG_FILE = "fix_vehicle_drone.tum", "fix_covariance.csv", "run.log"
 DETECTIONS_FILE, SUMMARY_FILE = "detections.csv", "summary.json"
 TRUTH_FILE, TRUTH_HITS_FILE = "truth_vehicle_drone.tum", "truth_hits.csv"
 TRUTH_VISIBLE_FILE, TRUTH_VEHICLE_FILE = "truth_visible.csv", "truth_world_vehicle.tum"
 POSE_FILE, POSE_COVARIANCE_FILE = "pose_vehicle_drone.tum", "pose_covariance.csv"
-ROTATION_FILE = "rotation_vehicle_drone.csv"
+ROTATION_FILE, CANDIDATES_FILE = "rotation_vehicle_drone.csv", "candidates.csv"
 UPPER = tuple(a + b for a, b in zip("xxxyyz", "xyzyzz", strict=True))  # names of an upper triangle, by rows
 QUATERNION, ROTATION_UPPER = ("qx", "qy", "qz", "qw"), tuple(f"c{name}_rad2" for name in UPPER)  # empty: not given
 BRANCHES = ("p_0", "p_90", "p_180", "p_270")  # probability of the rotation given, and of it turned by so many degrees
@@ -42,7 +51,7 @@ POSE_HEAD = (
     "# T_vehicle_drone, fused; '0 0 0 1' where its rotation is not known: rotation is 0 in the table of covariances\n"
 )
 UNKNOWN_RAD2 = math.pi**2  # variance written for a rotation that is not known: a table of numbers holds no infinity
-KEPT = (DroneFix, DepthImage, Detections, TrackState, RelativeRotation, RelativePose)
+KEPT = (DroneFix, DepthImage, Detections, Candidates, TrackState, RelativeRotation, RelativePose)
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
 
 
@@ -75,13 +84,16 @@ class Transition:
 class Results(Tap):
     """Collects fixes, verdicts and state changes; writes each as it comes, so that a stopped run keeps what it had.
 
-    A run in which nobody tells a rotation has no file of rotations; one in which nobody fuses has none of poses.
+    What no stage of a run tells has no file: rotations, fused poses, candidates.
     """
 
     _files: dict[str, ResultFile] = PrivateAttr(default_factory=dict)
     _live: bool = PrivateAttr(default=False)
     _covariance: Any = PrivateAttr(default=None)
     _detections: Any = PrivateAttr(default=None)
+    _candidates: Any = PrivateAttr(default=None)
+    _looks: dict[int, int] = PrivateAttr(default_factory=dict)  # of the candidates told last, by number
+    _detector_life: int = PrivateAttr(default=0)
     _rotations: Any = PrivateAttr(default=None)
     _poses: Any = PrivateAttr(default=None)
     _folder: Path = PrivateAttr()
@@ -138,7 +150,7 @@ class Results(Tap):
         self._folder, self._live = run.out_dir, run.live
         for name in (FIX_FILE, COVARIANCE_FILE, DETECTIONS_FILE, LOG_FILE):
             self._files[name] = self._file(name)
-        for name in (ROTATION_FILE, POSE_FILE, POSE_COVARIANCE_FILE):
+        for name in (ROTATION_FILE, POSE_FILE, POSE_COVARIANCE_FILE, CANDIDATES_FILE):
             (run.out_dir / name).unlink(missing_ok=True)
         self._files[FIX_FILE].write(POSITION_ONLY)
         self._covariance = csv.writer(self._files[COVARIANCE_FILE])
@@ -168,6 +180,8 @@ class Results(Tap):
             self._examples.setdefault(kind, message.verdict)
             self._found += bool(message.accepted.any())
             self._log(message.stamp_ns, output, message.verdict)
+        elif isinstance(message, Candidates):
+            self._write_candidates(message)
         elif isinstance(message, TrackState):
             self._note_state(output, message)
         elif isinstance(message, RelativeRotation):
@@ -199,6 +213,22 @@ class Results(Tap):
         accepted = zip(message.xyz_vehicle_m[message.accepted], message.score[message.accepted], strict=True)
         lines = [[*span, *(f"{v:.4f}" for v in xyz), f"{score:.6g}"] for xyz, score in accepted]
         self._detections.writerows(lines or [[*span, "", "", "", ""]])
+
+    def _write_candidates(self, message: Candidates) -> None:
+        """A line for each candidate that had one more look: where it is, and with what probability it is a drone."""
+        if self._candidates is None:
+            self._files[CANDIDATES_FILE] = self._file(CANDIDATES_FILE)
+            self._candidates = csv.writer(self._files[CANDIDATES_FILE])
+            head = ["stamp_s", "candidate", "detector_life", "looks", "probability", "x_m", "y_m", "z_m"]
+            self._candidates.writerow(head)
+        before = self._looks if message.detector_life == self._detector_life else {}
+        numbers, looks = message.candidate_id.tolist(), message.looks.tolist()
+        self._looks, self._detector_life = dict(zip(numbers, looks, strict=True)), message.detector_life
+        for i, number in enumerate(numbers):
+            if looks[i] != before.get(number):
+                told = [number, message.detector_life, looks[i], f"{message.probability[i]:.6g}"]
+                xyz = [f"{v:.4f}" for v in message.xyz_vehicle_m[i].tolist()]
+                self._candidates.writerow([stamp_s(message.stamp_ns), *told, *xyz])
 
     def _write_rotation(self, output: str, message: RelativeRotation) -> None:
         """A line for each answer, also for none; the log tells when its state or the branch changes."""

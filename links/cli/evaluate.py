@@ -20,9 +20,16 @@ from links.evaluation.csv_table import write_csv
 from links.evaluation.groups import Key, groups, parse_by
 from links.evaluation.no_drone import alarms
 from links.evaluation.paper_tables import markdown, paper_tables
+from links.evaluation.probabilities import reliabilities
 from links.evaluation.report import write_report
 from links.evaluation.rotation_groups import rotation_groups
-from links.evaluation.summaries import Summary, alarm_summary, group_summary, rotation_summary
+from links.evaluation.summaries import (
+    Summary,
+    alarm_summary,
+    group_summary,
+    reliability_summary,
+    rotation_summary,
+)
 from links.evaluation.tables import MAX_COLUMNS, as_json, comparison_table, headline_table, label, metrics_table
 from links.evaluation.tracks import per_drone
 
@@ -142,6 +149,8 @@ def _summaries(own: list[Evaluation], keys: list[Key]) -> list[Summary]:
     found += [rotation_summary(turned, key) for key in wanted if (turned := rotation_groups(flown, key))]
     if empty and (wanted or len(empty) > 1):
         found.append(alarm_summary(alarms(empty)))
+    if said := reliabilities(answers) if wanted or len(answers) > 1 else []:
+        found.append(reliability_summary(said))
     return found
 
 

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from flow.link import LinkError
 from links.evaluation.output import Output, read_output
 from links.evaluation.rotations import Rotations, read_rotations
+from links.evaluation.said import Said, read_said
 from links.evaluation.true_drone import TrueDrone, read_true_drones, read_true_vehicle
 from links.evaluation.tum import Trajectory, read_number, read_stamp_ns, read_table, read_tum
 from links.results import (
+    CANDIDATES_FILE,
     COVARIANCE_FILE,
     DETECTIONS_FILE,
     FIX_FILE,
@@ -62,6 +64,7 @@ class RunData:
     drone: int = 1  # number of the one that is judged
     rotations: Rotations | None = None  # of both cameras; None: no stage told any
     vehicle: Trajectory | None = None  # truth: T_world_vehicle
+    said: Said | None = None  # what may be a drone, with a probability; None: no stage tells that
 
     @property
     def other_paths(self) -> list[Trajectory]:
@@ -140,6 +143,7 @@ def _read_folder(folder: Path, truth_file: Path | None, no_drone: bool) -> RunDa
         drones=drones,
         rotations=read_rotations(folder / ROTATION_FILE) if (folder / ROTATION_FILE).exists() else None,
         vehicle=read_true_vehicle(folder),
+        said=read_said(folder / CANDIDATES_FILE) if (folder / CANDIDATES_FILE).exists() else None,
     )
 
 

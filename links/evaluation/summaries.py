@@ -16,6 +16,7 @@ from rich.text import Text
 from links.evaluation.catalogue import CAMERAS
 from links.evaluation.groups import CONFIG, Group, Key
 from links.evaluation.no_drone import Alarms
+from links.evaluation.probabilities import Reliability
 from links.evaluation.rotation_groups import RotationGroup
 
 HOW = (
@@ -33,6 +34,10 @@ ROTATION_HOW = (
     "quarter turns about the world's vertical, as are roll, pitch, yaw, the 95 % bound and NEES / 3 (honest: 1). "
     "wrong: RESOLVED and more than 45 deg off. resolved: runs with a first RESOLVED that is right. first, ground: time "
     "and the drone's way to it, relative to the vehicle and over ground, medians over runs."
+)
+RELIABILITY_HOW = (
+    "what may be a drone: each thing counts once in a row, when that probability was said of it first; it was a drone "
+    "when it was within 1 m of one then; 95 %: the interval in which the share lies."
 )
 Column = tuple[str, Callable[[Group], str]]
 AnyGroup = TypeVar("AnyGroup", Group, RotationGroup)
@@ -147,6 +152,22 @@ def alarm_summary(found: list[Alarms]) -> Summary:
     return Summary("without a drone", heads, rows, 1, "; ".join(where))
 
 
+def reliability_summary(found: list[Reliability]) -> Summary:
+    """Configurations and probabilities down: what was said, and what it was."""
+    heads = [CONFIG, "probability said", "things", "mean\n[%]", "a drone\n[%]", "95 %\n[%]"]
+    rows = [
+        [
+            r.config,
+            f"{r.low:g} to {r.high:g}",
+            str(r.things),
+            *_percents(r.stated, r.share),
+            " to ".join(_percents(*r.interval)),
+        ]
+        for r in found
+    ]
+    return Summary("what was said to be a drone", heads, rows, 2, RELIABILITY_HOW)
+
+
 def _digits(value: float | None, digits: int, longer_than: float | None = None) -> str:
     if value is None:
         return NOTHING
@@ -157,6 +178,10 @@ def _digits(value: float | None, digits: int, longer_than: float | None = None) 
 
 def _percent(counts: tuple[float, float]) -> str:
     return f"{100 * counts[0] / counts[1]:.1f}" if counts[1] else NOTHING
+
+
+def _percents(*shares: float) -> list[str]:
+    return [f"{100 * share:.1f}" for share in shares]
 
 
 def _of(count: int, of: int) -> str:

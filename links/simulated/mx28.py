@@ -132,9 +132,12 @@ class SimulatedMx28:
         return self._at(stamp_ns, self._turned_rad)
 
     def _at(self, stamp_ns: NDArray[np.int64], trace_rad: Array64) -> Array64:
-        oldest = max(self._steps - KEPT_STEPS + 1, 0)
-        steps = np.arange(oldest, self._steps + 1)
-        return np.interp(stamp_ns - self._start_ns, steps * STEP_NS, trace_rad[steps % KEPT_STEPS])
+        since_ns = stamp_ns - self._start_ns
+        oldest = max(self._steps - KEPT_STEPS + 1, 0)  # only what lies about the times is looked at: it is asked often
+        first = min(max(int(since_ns.min()) // STEP_NS, oldest), self._steps)
+        last = max(min(int(since_ns.max()) // STEP_NS + 1, self._steps), first)
+        steps = np.arange(first, last + 1)
+        return np.interp(since_ns, steps * STEP_NS, trace_rad[steps % KEPT_STEPS])
 
     def _step(self, now_ns: int) -> None:
         servo, before_rad = self._servo, self._servo.position_rad

@@ -51,6 +51,7 @@ WARM_PACKETS = 75  # a turn of the rotor
 SKIP_NS = 200_000_000  # so far behind, it leaves out what it cannot send in time: packets are lost
 LOOPBACK = "127.0.0.1"
 POSITION_NS = 100_000_000  # between two of the LiDAR's position packets
+TRUTH_NS = 100_000_000  # where all was is told so often: nobody waits for it, and told one by one it costs more
 SWITCH_S = 5e-4  # the servo's thread must not wait long for the one that casts
 
 
@@ -87,11 +88,14 @@ class LiveSimulation(Simulation):
         return self.T_world_lidar_at(stamp_ns, self.emulator.turned_rad(stamp_ns))
 
     def batch(self, first_ns: int, packets: int) -> tuple[list[Record], list[Record]]:
-        """LiDAR packets from a moment on that is past; and what was true until their end, in the host's time."""
+        """LiDAR packets from a moment on that is past; and what was true of them, in the host's time."""
         records = self.lidar_records(first_ns, packets, self.packet_ns)
-        true = [record for record in records if record.topic.startswith(TRUTH_TOPICS)]
-        true += self.truth_records(first_ns + packets * self.packet_ns)
-        return [r for r in records if not r.topic.startswith(TRUTH_TOPICS)], [self._on_host(r) for r in true]
+        true = [self._on_host(record) for record in records if record.topic.startswith(TRUTH_TOPICS)]
+        return [record for record in records if not record.topic.startswith(TRUTH_TOPICS)], true
+
+    def was_true(self, until_ns: int) -> list[Record]:
+        """What was true before a time and since the call before, in the host's time."""
+        return [self._on_host(record) for record in self.truth_records(until_ns)]
 
     def _on_host(self, record: Record) -> Record:
         data = record.data
@@ -144,7 +148,9 @@ class RigInTime:
                 open_parts.enter_context(autopilot)
             pictures = open_parts.enter_context(self._cameras(simulation))
             ready.set()
-            self._send(simulation, udp, truth)
+            sent_ns = self._send(simulation, udp, truth)
+            for record in simulation.was_true(sent_ns):
+                truth.write(record)
             self.pictures = pictures.shown
             if autopilot is not None:
                 self.heard = len(autopilot.heard)
@@ -171,13 +177,15 @@ class RigInTime:
         autopilot.armed = self._rig.armed
         return autopilot
 
-    def _send(self, simulation: LiveSimulation, udp: socket.socket, truth: RecordingWriter) -> None:
+    def _send(self, simulation: LiveSimulation, udp: socket.socket, truth: RecordingWriter) -> int:
+        """Packet after packet, to the end; up to when they were sent."""
         rig, scenario = self._rig, self._scenario
         odometry = next((talker for talker in simulation.talkers if isinstance(talker, VehicleOdometry)), None)
         batch_ns = rig.batch_packets * simulation.packet_ns
         first_ns, end_ns = scenario.start_ns, scenario.start_ns + round(1e9 * scenario.duration_s)
         poses: list[tuple[int, int, bytes]] = []  # when it is to arrive, when it was true
         position_ns = 0  # when the next position packet is due
+        true_ns = first_ns  # when all that was true is told next
         while first_ns + batch_ns <= end_ns:
             behind_ns = simulation.now_ns() - first_ns
             if behind_ns > SKIP_NS:
@@ -186,7 +194,7 @@ class RigInTime:
                 first_ns += skipped * simulation.packet_ns
             next_ns = first_ns + batch_ns
             if self.stop.wait(max(0, next_ns - simulation.now_ns()) * 1e-9):
-                return
+                return first_ns
             if rig.position_port is not None and next_ns >= position_ns:
                 udp.sendto(encode_position(host_time.now_ns()), (LOOPBACK, rig.position_port))
                 position_ns = next_ns + POSITION_NS
@@ -195,6 +203,9 @@ class RigInTime:
                 udp.sendto(packet.data, (LOOPBACK, rig.lidar_port))
                 self.late.add(max(simulation.now_ns() - packet.stamp_ns - simulation.packet_ns, 1))
             self.packets += len(packets)
+            if next_ns >= true_ns:
+                true += simulation.was_true(next_ns)
+                true_ns = next_ns + TRUTH_NS
             for record in true:
                 truth.write(record)
             for pose in odometry.records(next_ns) if odometry is not None else ():
@@ -204,6 +215,7 @@ class RigInTime:
                 if rig.odometry_port is not None:
                     udp.sendto(_with_age(pose_json, simulation.now_ns() - stamp_ns), (LOOPBACK, rig.odometry_port))
             first_ns = next_ns
+        return first_ns
 
     def _report(self) -> None:
         used = resource.getrusage(resource.RUSAGE_SELF)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import enum
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,23 +59,22 @@ def refusal(pose: RelativePose, now_ns: int, limits: Limits) -> Refusal | None:
     """Why the pose may not go out now; None: it may."""
     if pose.state not in SENDABLE:
         return Refusal[pose.state.name]
-    vectors = (pose.xyz_vehicle_m, pose.R_vehicle_drone, pose.xyz_start_m, pose.R_start_drone)
-    covariances = (pose.covariance, pose.start_covariance)
-    if any(v is None for v in (*vectors, *covariances)):
+    rotations = pose.R_vehicle_drone, pose.R_start_drone
+    vectors = (pose.xyz_vehicle_m, pose.xyz_start_m, *rotations, pose.covariance, pose.start_covariance)
+    given = [vector.ravel() for vector in vectors if vector is not None]
+    if len(given) < len(vectors):
         return Refusal.INCOMPLETE
-    if not all(np.isfinite(v).all() for v in (*vectors, *covariances) if v is not None):
+    if not np.isfinite(np.concatenate(given)).all():
         return Refusal.NOT_FINITE
-    if not all(_is_rotation(R) for R in (pose.R_vehicle_drone, pose.R_start_drone) if R is not None):
+    if not all([_is_rotation(R) for R in rotations if R is not None]):
         return Refusal.NO_ROTATION
-    worst = np.zeros(2)
-    for covariance in covariances:
-        sigmas = pose_sigmas(covariance) if covariance is not None else None
-        if sigmas is None:
-            return Refusal.COVARIANCE
-        worst = np.maximum(worst, sigmas)
-    if worst[1] > limits.position_sigma_m:
+    worst = worst_sigmas(pose)
+    if worst is None:
+        return Refusal.COVARIANCE
+    rotation_rad, position_m = worst
+    if position_m > limits.position_sigma_m:
         return Refusal.POSITION_SIGMA
-    if math.degrees(worst[0]) > limits.rotation_sigma_deg:
+    if math.degrees(rotation_rad) > limits.rotation_sigma_deg:
         return Refusal.ROTATION_SIGMA
     age_ns = now_ns - pose.stamp_ns
     if age_ns > 1e9 * limits.age_s:
@@ -82,18 +82,28 @@ def refusal(pose: RelativePose, now_ns: int, limits: Limits) -> Refusal | None:
     return Refusal.AHEAD if age_ns < -AHEAD_NS else None
 
 
-def pose_sigmas(covariance: NDArray[np.float64]) -> tuple[float, float] | None:
-    """(rotation [rad], position [m]): the worst sigma in any direction; None: it is no covariance.
+@lru_cache(maxsize=1)  # the gate asks, and the message tells its quality
+def worst_sigmas(pose: RelativePose) -> tuple[float, float] | None:
+    """`pose_sigmas` of both covariances of a pose; None: one is missing, or none."""
+    if pose.covariance is None or pose.start_covariance is None:
+        return None
+    return pose_sigmas(pose.covariance, pose.start_covariance)
+
+
+def pose_sigmas(*covariances: NDArray[np.float64]) -> tuple[float, float] | None:
+    """(rotation [rad], position [m]): the worst sigma in any direction; None: one is no covariance.
 
     A covariance of zeros is none: nothing is known exactly, and an autopilot would believe it.
     """
-    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12):
+    C = np.array(covariances)  # (n, 6, 6)
+    if not _is_symmetric(C):
         return None
-    eigenvalues = np.linalg.eigvalsh(covariance)
-    if eigenvalues[0] < -1e-9 * eigenvalues[-1] or (np.diagonal(covariance) <= 0).any():
+    eigenvalues = np.linalg.eigvalsh(C)
+    if (eigenvalues[:, 0] < -1e-9 * eigenvalues[:, -1]).any() or (np.diagonal(C, axis1=1, axis2=2) <= 0).any():
         return None
-    rotation, position = (np.linalg.eigvalsh(block)[-1] for block in (covariance[:3, :3], covariance[3:, 3:]))
-    return math.sqrt(rotation), math.sqrt(position)
+    blocks = np.concatenate([C[:, :3, :3], C[:, 3:, 3:]])
+    worst = np.linalg.eigvalsh(blocks)[:, -1].tolist()
+    return math.sqrt(max(worst[: len(C)])), math.sqrt(max(worst[len(C) :]))
 
 
 def velocity_to_send(pose: RelativePose, limits: Limits) -> NDArray[np.float64] | None:
@@ -101,14 +111,31 @@ def velocity_to_send(pose: RelativePose, limits: Limits) -> NDArray[np.float64] 
     velocity, covariance = pose.velocity_start_mps, pose.velocity_covariance
     if velocity is None or covariance is None or not (np.isfinite(velocity).all() and np.isfinite(covariance).all()):
         return None
-    if (np.diagonal(covariance) <= 0).any() or not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12):
+    if min(np.diagonal(covariance).tolist()) <= 0 or not _is_symmetric(covariance):
         return None
     eigenvalues = np.linalg.eigvalsh(covariance)
     good = eigenvalues[0] >= 0 and math.sqrt(eigenvalues[-1]) <= limits.velocity_sigma_mps
     return velocity if good else None
 
 
+def _is_symmetric(covariances: NDArray[np.float64]) -> bool:
+    """Whether matrices (..., n, n) are, to a millionth."""
+    turned = np.swapaxes(covariances, -1, -2)
+    return bool((np.abs(covariances - turned) <= 1e-12 + 1e-6 * np.abs(turned)).all())
+
+
 def _is_rotation(R: NDArray[np.float64]) -> bool:
-    if np.abs(R).max() > 1.0 + ROTATION_ERROR:
+    """Whether |R| <= 1, R^T R = 1 and det R > 0, by the rotation's columns x, y, z."""
+    (x0, y0, z0), (x1, y1, z1), (x2, y2, z2) = R.tolist()
+    if max(map(abs, (x0, y0, z0, x1, y1, z1, x2, y2, z2))) > 1.0 + ROTATION_ERROR:
         return False
-    return bool(np.abs(R.T @ R - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(R) > 0)
+    products = (
+        x0 * x0 + x1 * x1 + x2 * x2 - 1.0,
+        y0 * y0 + y1 * y1 + y2 * y2 - 1.0,
+        z0 * z0 + z1 * z1 + z2 * z2 - 1.0,
+        x0 * y0 + x1 * y1 + x2 * y2,
+        x0 * z0 + x1 * z1 + x2 * z2,
+        y0 * z0 + y1 * z1 + y2 * z2,
+    )
+    determinant = x0 * (y1 * z2 - z1 * y2) - y0 * (x1 * z2 - z1 * x2) + z0 * (x1 * y2 - y1 * x2)
+    return max(map(abs, products)) < ROTATION_ERROR and determinant > 0

@@ -30,7 +30,7 @@ from links.mavlink.frames import (
     upper_from_velocity_covariance,
     wxyz_from_R_local_drone,
 )
-from links.mavlink.gate import Limits, pose_sigmas, velocity_to_send
+from links.mavlink.gate import Limits, velocity_to_send, worst_sigmas
 from links.mavlink.wire import SEQUENCE, dialect
 from stages.messages import RelativePose
 
@@ -42,12 +42,10 @@ NO_NUMBERS = [math.nan] * 3
 
 def quality_percent(pose: RelativePose, limits: Limits) -> int:
     """1 (at the limit) to 100 (exact), linear in the worse of the two sigmas over their limits."""
-    worst = 0.0
-    for covariance in (pose.covariance, pose.start_covariance):
-        sigmas = None if covariance is None else pose_sigmas(covariance)
-        if sigmas is None:
-            return 1
-        worst = max(worst, math.degrees(sigmas[0]) / limits.rotation_sigma_deg, sigmas[1] / limits.position_sigma_m)
+    sigmas = worst_sigmas(pose)
+    if sigmas is None:
+        return 1
+    worst = max(math.degrees(sigmas[0]) / limits.rotation_sigma_deg, sigmas[1] / limits.position_sigma_m)
     return max(1, min(100, round(100 * (1 - worst))))
 
 

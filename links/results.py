@@ -51,6 +51,7 @@ POSE_HEAD = (
     "# T_vehicle_drone, fused; '0 0 0 1' where its rotation is not known: rotation is 0 in the table of covariances\n"
 )
 UNKNOWN_RAD2 = math.pi**2  # variance written for a rotation that is not known: a table of numbers holds no infinity
+UPPER_3, UPPER_6 = np.triu_indices(3), np.triu_indices(6)
 KEPT = (DroneFix, DepthImage, Detections, Candidates, TrackState, RelativeRotation, RelativePose)
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
 
@@ -68,7 +69,9 @@ def stamp_s(stamp_ns: int) -> str:
 
 def tum_line(stamp_ns: int, xyz_m: NDArray[np.float64], quaternion_xyzw: tuple[float, ...] = (0, 0, 0, 1)) -> str:
     """One line of a TUM file."""
-    return " ".join([stamp_s(stamp_ns), *(f"{v:.6f}" for v in xyz_m), *(f"{q:g}" for q in quaternion_xyzw)]) + "\n"
+    x, y, z = xyz_m.tolist()
+    qx, qy, qz, qw = quaternion_xyzw
+    return f"{stamp_s(stamp_ns)} {x:.6f} {y:.6f} {z:.6f} {qx:g} {qy:g} {qz:g} {qw:g}\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +171,7 @@ class Results(Tap):
         if isinstance(message, DroneFix):
             self._fixes.append(message)
             self._files[FIX_FILE].write(tum_line(message.stamp_ns, message.xyz_vehicle_m))
-            upper = message.covariance_m2[np.triu_indices(3)]
+            upper = message.covariance_m2[UPPER_3]
             counts = [message.hits, message.iterations, message.track_id]
             self._covariance.writerow([stamp_s(message.stamp_ns), *_digits(upper), *counts])
         elif isinstance(message, DepthImage):
@@ -239,7 +242,7 @@ class Results(Tap):
             self._rotations.writerow(head)
         R, covariance_rad2 = message.R_vehicle_drone, message.covariance_rad2
         quaternion = [""] * 4 if R is None else _digits(quaternions_xyzw(R[None])[0])
-        upper = [""] * 6 if covariance_rad2 is None else _digits(covariance_rad2[np.triu_indices(3)])
+        upper = [""] * 6 if covariance_rad2 is None else _digits(covariance_rad2[UPPER_3])
         told = [*_digits(message.branch_probability), message.state.name, message.switches, message.reason]
         self._rotations.writerow([stamp_s(message.stamp_ns), int(R is not None), *quaternion, *upper, *told])
         branch = message.state.name, message.switches
@@ -270,7 +273,8 @@ class Results(Tap):
             return
         q = (0.0, 0.0, 0.0, 1.0) if R is None else tuple(quaternions_xyzw(R[None])[0].tolist())
         self._files[POSE_FILE].write(tum_line(message.stamp_ns, xyz_m, q))
-        upper = np.where(np.isinf(covariance), UNKNOWN_RAD2, covariance)[np.triu_indices(6)]
+        upper = covariance[UPPER_6]
+        upper[np.isinf(upper)] = UNKNOWN_RAD2
         measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
         told = [message.state.name, int(R is not None), int(R is not None), message.resets, nis, measured]
@@ -301,4 +305,4 @@ class Results(Tap):
 
 
 def _digits(values: NDArray[np.float64]) -> list[str]:
-    return [f"{value:.9g}" for value in values]
+    return [f"{value:.9g}" for value in values.tolist()]

@@ -23,7 +23,6 @@ from mcap.records import (
     DataEnd,
     Footer,
     Header,
-    MessageIndex,
     Metadata,
     MetadataIndex,
     Schema,
@@ -37,7 +36,9 @@ from links.recording.format import FORMAT_VERSION, MAX_TIME_NS, METADATA_FORMAT,
 
 CHUNK_BYTES = 2**20  # a chunk is closed at this size [uncompressed]
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log_time, publish_time
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)  # packed faster than the member
 _MESSAGE_FIELDS_BYTES = 22
+_INDEX_HEAD = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the index: times and offsets
 _FOOTER_START = struct.Struct("<BQQQ")  # opcode, length, summary_start, summary_offset_start: covered by the CRC
 
 
@@ -53,22 +54,22 @@ class _OpenChunk:
         self.size = 0
         self.start_ns = MAX_TIME_NS
         self.end_ns = 0
-        self.indexes: dict[int, MessageIndex] = {}
+        self.indexes: dict[int, list[int]] = {}  # by channel: time and offset of each message
 
-    def add(self, channel_id: int, record: Record) -> None:
+    def add(self, channel_id: int, record: Record, sequence: int) -> None:
+        arrival_ns, data = record.arrival_ns, record.data
         index = self.indexes.get(channel_id)
         if index is None:
-            index = self.indexes[channel_id] = MessageIndex(channel_id, [])
-        index.records.append((record.arrival_ns, self.size))
-        length = _MESSAGE_FIELDS_BYTES + len(record.data)
-        sequence = record.sequence & 0xFFFF_FFFF
-        self.parts.append(
-            _MESSAGE.pack(Opcode.MESSAGE, length, channel_id, sequence, record.arrival_ns, record.stamp_ns)
-        )
-        self.parts.append(record.data)
+            index = self.indexes[channel_id] = []
+        index += arrival_ns, self.size
+        length = _MESSAGE_FIELDS_BYTES + len(data)
+        head = _MESSAGE.pack(_MESSAGE_OPCODE, length, channel_id, sequence & 0xFFFF_FFFF, arrival_ns, record.stamp_ns)
+        self.parts += head, data
         self.size += 9 + length
-        self.start_ns = min(self.start_ns, record.arrival_ns)
-        self.end_ns = max(self.end_ns, record.arrival_ns)
+        if arrival_ns < self.start_ns:
+            self.start_ns = arrival_ns
+        if arrival_ns > self.end_ns:
+            self.end_ns = arrival_ns
 
 
 class McapFile:
@@ -105,10 +106,10 @@ class McapFile:
             self._add_attachment(name, text)
         self._stream.flush()
 
-    def add(self, record: Record) -> None:
-        """Append one record, its sequence as it is."""
+    def add(self, record: Record, sequence: int | None = None) -> None:
+        """Append one record, with this sequence number or its own."""
         channel, chunk = self._channels.get(record.topic) or self._open_channel(record.topic)
-        chunk.add(channel.id, record)
+        chunk.add(channel.id, record, record.sequence if sequence is None else sequence)
         self._counts[channel.id] += 1
         if chunk.size >= CHUNK_BYTES:
             self._close_chunk(chunk)
@@ -213,9 +214,9 @@ class McapFile:
         ).write(record)
         chunk_length = record.count
         offsets: dict[int, int] = {}
-        for index in chunk.indexes.values():
-            offsets[index.channel_id] = self._offset + record.count
-            index.write(record)
+        for channel_id, index in chunk.indexes.items():
+            offsets[channel_id] = self._offset + record.count
+            record.write(_message_index(channel_id, index))
         ChunkIndex(
             chunk_length=chunk_length,
             chunk_start_offset=self._offset,
@@ -250,6 +251,12 @@ class McapFile:
     def _put(self, data: bytes) -> None:
         self._stream.write(data)
         self._offset += len(data)
+
+
+def _message_index(channel_id: int, index: list[int]) -> bytes:
+    """The record that tells where a channel's messages stand; in one piece, mcap's class writes it number by number."""
+    head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(index), channel_id, 8 * len(index))
+    return head + struct.pack(f"<{len(index)}Q", *index)
 
 
 _INDEX_OPCODES = {

@@ -30,6 +30,16 @@ SESSION, PART = "session", "part"
 """Metadata of a recording: which run it is of, and its number among that run's parts, from 1."""
 
 
+class _Intake:
+    """Where records go now. A plain object: a record costs less than to set an attribute of a `Tap` would."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.writer: RecordingWriter | None = None
+        self.part_bytes = 0
+        self.missed = 0  # while nothing was recorded
+
+
 class Recorder(Tap):
     """Records a live run into its folder. Replays it ignores: they have their recording."""
 
@@ -38,17 +48,14 @@ class Recorder(Tap):
     split_mb: float = Field(2000.0, ge=1)  # and holds so much, before compression
     reserve_mb: float = Field(200.0, ge=0)  # is left free on the disk, for the results
 
-    _lock: threading.Lock = PrivateAttr(default_factory=threading.Lock)
-    _writer: RecordingWriter | None = PrivateAttr(default=None)
+    _intake: _Intake = PrivateAttr(default_factory=_Intake)
     _run: Run | None = PrivateAttr(default=None)
     _thread: threading.Thread | None = PrivateAttr(default=None)
     _closing: threading.Event = PrivateAttr(default_factory=threading.Event)
     _session: str = PrivateAttr(default="")
     _parts: int = PrivateAttr(default=0)
-    _part_bytes: int = PrivateAttr(default=0)
     _part_s: float = PrivateAttr(default=0.0)  # when it was opened, monotonic
     _stopped_s: float = PrivateAttr(default=0.0)
-    _missed: int = PrivateAttr(default=0)  # while nothing was recorded
     _before: tuple[int, int] = PrivateAttr(default=(0, 0))  # written and dropped in earlier parts
     _trouble: str | None = PrivateAttr(default=None)
 
@@ -63,7 +70,7 @@ class Recorder(Tap):
     def counters(self) -> dict[str, int]:
         """Records written, dropped (a slow disk), missed (no recording), and parts."""
         written, dropped = self._totals()
-        return {"written": written, "dropped": dropped, "missed": self._missed, "parts": self._parts}
+        return {"written": written, "dropped": dropped, "missed": self._intake.missed, "parts": self._parts}
 
     @property
     def trouble(self) -> str | None:
@@ -82,12 +89,13 @@ class Recorder(Tap):
 
     def record(self, record: Record) -> None:
         """Into the queue. LinkError for a record that no recording can hold."""
-        with self._lock:
-            if self._writer is None:
-                self._missed += 1
+        intake = self._intake
+        with intake.lock:
+            if intake.writer is None:
+                intake.missed += 1
                 return
-            self._part_bytes += len(record.data)
-            self._writer.write(record)
+            intake.part_bytes += len(record.data)
+            intake.writer.write(record)
 
     def close(self) -> None:
         """Write what is queued and end the part."""
@@ -106,7 +114,7 @@ class Recorder(Tap):
                 self._give_up(str(error))
 
     def _look(self) -> None:
-        writer, now_s = self._writer, time.monotonic()
+        writer, now_s = self._intake.writer, time.monotonic()
         if writer is None:
             if now_s >= self._stopped_s + AGAIN_S and self._free_bytes() > 2 * self.reserve_mb * MB:
                 self._begin_part()
@@ -114,7 +122,7 @@ class Recorder(Tap):
             self._give_up(writer.trouble)
         elif self._free_bytes() < self.reserve_mb * MB:
             self._give_up(f"less than {self.reserve_mb:g} MB are free at {writer.path.parent}: make room")
-        elif now_s - self._part_s >= self.split_s or self._part_bytes >= self.split_mb * MB:
+        elif now_s - self._part_s >= self.split_s or self._intake.part_bytes >= self.split_mb * MB:
             self._begin_part()
 
     def _begin_part(self) -> None:
@@ -150,9 +158,10 @@ class Recorder(Tap):
         return file if part == 1 else file.with_stem(f"{file.stem}-{part}")
 
     def _swap(self, writer: RecordingWriter | None) -> RecordingWriter | None:
-        with self._lock:
-            before, self._writer = self._writer, writer
-            self._part_bytes = 0
+        intake = self._intake
+        with intake.lock:
+            before, intake.writer = intake.writer, writer
+            intake.part_bytes = 0
         return before
 
     def _end_part(self, writer: RecordingWriter | None) -> None:
@@ -170,7 +179,7 @@ class Recorder(Tap):
         self._end_part(self._swap(None))
 
     def _totals(self) -> tuple[int, int]:
-        writer = self._writer
+        writer = self._intake.writer
         now = (writer.written, writer.dropped) if writer is not None else (0, 0)
         return self._before[0] + now[0], self._before[1] + now[1]
 

@@ -10,7 +10,6 @@ Source: ours.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import threading
 import time
@@ -75,8 +74,9 @@ class RecordingWriter:
         self.path = Path(path)
         self._lossless = lossless
         self._queue_bytes = queue_bytes
-        self._lock = threading.Condition()
-        self._queue: deque[Record] = deque()
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
+        self._queue: deque[tuple[Record, int]] = deque()  # each with its sequence number
         self._waiting_bytes = 0  # queued, or in the writer thread's hands
         self._in_hand = 0  # records the writer thread has taken and not yet written
         self._sequence = 0
@@ -138,8 +138,8 @@ class RecordingWriter:
                 raise LinkError(f"{self.path}: the recording is closed already")
             if self._lossless:
                 while self._waiting_bytes and self._waiting_bytes + weight > self._queue_bytes and not self._trouble:
-                    self._lock.notify_all()
-                    self._lock.wait()
+                    self._changed.notify_all()
+                    self._changed.wait()
                 if self._trouble:
                     raise LinkError(self._trouble)
             sequence = self._sequence
@@ -147,7 +147,7 @@ class RecordingWriter:
             if self._trouble or (self._waiting_bytes and self._waiting_bytes + weight > self._queue_bytes):
                 self._dropped += 1
                 return
-            self._queue.append(dataclasses.replace(record, sequence=sequence))
+            self._queue.append((record, sequence))
             self._waiting_bytes += weight
 
     def close(self) -> None:
@@ -156,7 +156,7 @@ class RecordingWriter:
             if self._closing:
                 return
             self._closing = True
-            self._lock.notify_all()
+            self._changed.notify_all()
         deadline = time.monotonic() + CLOSE_TIMEOUT_S
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
@@ -198,17 +198,17 @@ class RecordingWriter:
         while True:
             with self._lock:
                 if not self._queue and not self._closing:
-                    self._lock.wait(_POLL_S)
+                    self._changed.wait(_POLL_S)
                 batch, self._queue = self._queue, deque()
                 self._in_hand = len(batch)
                 closing = self._closing
-            for record in batch:
-                self._file.add(record)
+            for record, sequence in batch:
+                self._file.add(record, sequence)
             with self._lock:
                 self._written += len(batch)
                 self._in_hand = 0
-                self._waiting_bytes -= sum(_RECORD_BYTES + len(record.data) for record in batch)
-                self._lock.notify_all()
+                self._waiting_bytes -= sum([_RECORD_BYTES + len(record.data) for record, _ in batch])
+                self._changed.notify_all()
             if closing and not batch:
                 return
             if not self._lossless and time.monotonic() >= flush_at:
@@ -230,7 +230,7 @@ class RecordingWriter:
             self._trouble = self._trouble or trouble
             self._dropped += len(self._queue)
             self._queue.clear()
-            self._lock.notify_all()
+            self._changed.notify_all()
 
     def _disk_trouble(self, error: OSError) -> str:
         return (

@@ -102,9 +102,8 @@ def checked_covariance(rows: Array64) -> Array64:
     if rows.shape != (36,) or not np.isfinite(rows).all():
         raise ValueError("a covariance without 36 finite numbers")
     covariance = rows.reshape(6, 6)
-    variances = np.diagonal(covariance)
-    sigmas = np.sqrt(np.where(variances > 0, variances, 1.0))
-    correlation = covariance / np.outer(sigmas, sigmas)
+    sigmas = np.array([math.sqrt(variance) if variance > 0 else 1.0 for variance in rows[::7].tolist()])
+    correlation = covariance / (sigmas[:, None] * sigmas)
     if np.abs(correlation - correlation.T).max() > CORRELATION_SLACK:
         raise ValueError("a covariance that is not symmetric")
     if np.linalg.eigvalsh(correlation)[0] < -CORRELATION_SLACK:

@@ -5,6 +5,8 @@ Source: ours.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +29,13 @@ def mean_direction(direction: NDArray[np.float32]) -> Array64:
         z += direction[i, 2]
     n = np.float32(direction.shape[0])
     return np.array([x / n, y / n, z / n], dtype=np.float64)
+
+
+@compiled
+def looking_along(direction: NDArray[np.float32]) -> Array64:
+    """`mean_direction` as a unit vector (3,); zero where there is none."""
+    mean = mean_direction(direction)
+    return mean / max(math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2), 1e-9)
 
 
 def middle_ns(pulses: SweptPulses) -> int:

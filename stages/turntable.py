@@ -186,6 +186,7 @@ class Turntable:
         self._min_range_m = min_range_m
         self._offset_ns = round(mount.servo_time_offset_s * 1e9)
         self.T_vehicle_turntable = mount.T_vehicle_turntable.matrix()
+        self._rows_vehicle_turntable: list[list[float]] = self.T_vehicle_turntable[:3].tolist()  # each packet asks
         self._T_turntable_lidar = mount.T_turntable_lidar.matrix()
         self._lidar_turntable_m: tuple[float, float, float] = tuple(self._T_turntable_lidar[:3, 3].tolist())
         self._last_servo_rad: float | None = None
@@ -235,8 +236,13 @@ class Turntable:
         angle_rad = 0.0 if math.isnan(angle_rad) else angle_rad
         x, y, z = self._lidar_turntable_m
         c, s = math.cos(angle_rad), math.sin(angle_rad)
-        x, y, z, _ = (self.T_vehicle_turntable @ np.array([c * x - s * y, s * x + c * y, z, 1.0])).tolist()
-        return x, y, z
+        x, y = c * x - s * y, s * x + c * y
+        a, b, c = self._rows_vehicle_turntable
+        return (
+            a[0] * x + a[1] * y + a[2] * z + a[3],
+            b[0] * x + b[1] * y + b[2] * z + b[3],
+            c[0] * x + c[1] * y + c[2] * z + c[3],
+        )
 
     def turns(self, pulse_ns: NDArray[np.int64]) -> Array64:
         """Angle, cosine and sine (n, 3) at each pulse; NaN where the angle is not known."""
@@ -290,14 +296,17 @@ class Turntable:
             direction_vehicle,
             distance_m,
         )
-        row = row[:count]
+        laser, reflectivity = firings.laser, firings.reflectivity
+        if count < n:  # else each pulse has one row, in order: the packet's own arrays will do
+            row = row[:count]
+            pulse_ns, laser, reflectivity = pulse_ns[row], laser[row], reflectivity[row]
         return SweptPulses(
-            stamp_ns=int(pulse_ns[0]),
-            point_stamp_ns=pulse_ns[row],
+            stamp_ns=int(firings.pulse_stamp_ns[0]),
+            point_stamp_ns=pulse_ns,
             direction_vehicle=direction_vehicle[:count],
             range_m=distance_m[:count],
-            laser=firings.laser[row],
-            reflectivity=firings.reflectivity[row],
+            laser=laser,
+            reflectivity=reflectivity,
             turntable_rad=middle_rad,
             origin_vehicle_m=origin,
         )

@@ -112,9 +112,12 @@ def cheapest(
     T = mount.T_turntable_lidar.matrix()
     best, least = None, math.inf
     for beam, w in enumerate(elevations_rad):
+        far_out = 0.5 * abs(w) + 3.0 * max(abs(w) - inner_rad, 0.0)
+        if far_out >= least:  # however near it is
+            continue
         for theta in table_angles_rad(T, place_m, w + offset_rad):
             for servo in servo_positions_rad(mount, theta, travel_rad):
-                cost = abs(servo - at_rad) + 0.5 * abs(w) + 3.0 * max(abs(w) - inner_rad, 0.0)
+                cost = abs(servo - at_rad) + far_out
                 if cost < least:
                     best, least = Pointing(servo, theta, beam), cost
     return best

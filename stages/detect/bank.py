@@ -41,6 +41,7 @@ class Bank:
         self._ns = np.empty((ROWS, 2), dtype=np.int64)
         self._told = np.empty(ROWS, dtype=np.bool_)
         self._joined = np.empty(ROWS, dtype=np.bool_)
+        self._found = np.empty((ROWS, 3), dtype=np.int64)  # of the last slice, by row
 
     def __iter__(self) -> Iterator[Candidate]:
         return iter(self._candidates)
@@ -56,6 +57,7 @@ class Bank:
             if row == len(self._told):
                 self._state, self._ns = np.resize(self._state, (2 * row, STATE)), np.resize(self._ns, (2 * row, 2))
                 self._told, self._joined = np.resize(self._told, 2 * row), np.resize(self._joined, 2 * row)
+                self._found = np.empty((2 * row, 3), dtype=np.int64)
         self._state[row] = (*c.xyz_m.tolist(), *c.velocity_mps.tolist(), *c.p)
         self._ns[row], self._told[row], self._joined[row] = (c.stamp_ns, c.seen_ns), c.told, c.joined_at > 0
 
@@ -67,8 +69,8 @@ class Bank:
 
     def fitting(self, s: Sighting, joined: bool = False) -> Candidate | None:
         """The candidate that a sighting is most likely of, of the joined or of the others; None: of none."""
-        n = len(self._candidates)
-        row = nearest_row(self._state[:n], self._ns[:n], self._joined[:n] == joined, s.stamp_ns, s.xyz_local_m)
+        rows = len(self._candidates)
+        row = nearest_row(self._state, self._ns, self._joined, rows, joined, s.stamp_ns, s.xyz_local_m)
         return self._candidates[row] if row >= 0 else None
 
     def looked_at(
@@ -79,15 +81,16 @@ class Bank:
         Only of those told of, seen lately, and known to within `most_variance` [m^2]; not where no pulse was near one
         that the fan covers.
         """
-        n, pulses = len(self._candidates), part.pulses
-        found = np.empty((n, 3), dtype=np.int64)
-        look_at_all(
-            self._state[:n], self._ns[:n], self._told[:n], now_ns, part.R, part.t, part.axis, origin_m,
-            pulses.direction_vehicle, pulses.range_m, disc_m, most_variance, found,
+        rows, pulses = len(self._candidates), part.pulses
+        said = look_at_all(
+            self._state, self._ns, self._told, rows, now_ns, part.R, part.t, part.axis, origin_m,
+            pulses.direction_vehicle, pulses.range_m, disc_m, most_variance, self._found,
         )  # fmt: skip
-        for row in np.nonzero(found[:, 0])[0].tolist():
-            where, hits, passes = found[row].tolist()
-            yield self._candidates[row], hits, passes, where == ELSEWHERE
+        if not said:
+            return
+        for row, (where, hits, passes) in enumerate(self._found[:rows].tolist()):
+            if where != NOTHING:
+                yield self._candidates[row], hits, passes, where == ELSEWHERE
 
 
 def places_of(candidates: Iterable[Candidate]) -> Array64:
@@ -114,11 +117,22 @@ def predicted(state: Array64, dt_s: float) -> tuple[float, float, float, float]:
 
 
 @compiled
-def nearest_row(state: Array64, ns: NDArray[np.int64], asked: NDArray[np.bool_], stamp_ns: int, xyz_m: Array64) -> int:
-    """Row of the asked candidate whose prediction is nearest to a sighting, in sigmas; -1 when none is near."""
+def nearest_row(
+    state: Array64,
+    ns: NDArray[np.int64],
+    joined: NDArray[np.bool_],
+    rows: int,
+    asked: bool,
+    stamp_ns: int,
+    xyz_m: Array64,
+) -> int:
+    """Row of the candidate, joined or not as asked, whose prediction is nearest to a sighting, in sigmas; -1: of none.
+
+    Of the table the first `rows` count.
+    """
     best, least = -1, MOST_COST
-    for row in range(state.shape[0]):
-        if not asked[row] or stamp_ns < ns[row, STAMP]:
+    for row in range(rows):
+        if joined[row] != asked or stamp_ns < ns[row, STAMP]:
             continue
         x, y, z, variance = predicted(state[row], (stamp_ns - ns[row, STAMP]) * 1e-9)
         away2 = (xyz_m[0] - x) ** 2 + (xyz_m[1] - y) ** 2 + (xyz_m[2] - z) ** 2
@@ -133,6 +147,7 @@ def look_at_all(
     state: Array64,
     ns: NDArray[np.int64],
     told: NDArray[np.bool_],
+    rows: int,
     now_ns: int,
     R: Array64,
     t: Array64,
@@ -143,13 +158,15 @@ def look_at_all(
     disc_m: float,
     most_variance: float,
     found: NDArray[np.int64],
-) -> None:
-    """Fill found (n, 3) with NOTHING, NEAR or ELSEWHERE, and the pulses of a slice that hit and passed each middle.
+) -> int:
+    """Fill found (rows, 3) with NOTHING, NEAR or ELSEWHERE, and the pulses of a slice that hit and passed each middle.
 
-    R, t are T_local_vehicle of the slice, axis (3,) its mean direction, direction (k, 3) and range (k,) its pulses.
+    Returns of how many there is something to say. R, t are T_local_vehicle of the slice, axis (3,) its mean direction,
+    direction (k, 3) and range (k,) its pulses.
     """
     tally, away, centre = np.zeros(TALLY, dtype=np.int64), np.empty(3), np.empty(3)
-    for row in range(state.shape[0]):
+    said = 0
+    for row in range(rows):
         found[row] = 0
         if not told[row] or now_ns - ns[row, SEEN] > SEEN_LATELY_NS:
             continue
@@ -171,3 +188,5 @@ def look_at_all(
             found[row, 0] = NEAR if tally[INNER_HITS] + tally[INNER_PASSES] > 0 else NOTHING
         else:
             found[row, 0] = ELSEWHERE
+        said += found[row, 0] != NOTHING
+    return said

@@ -41,7 +41,7 @@ from stages.messages import (
     SweptPulses,
     VehicleMotion,
 )
-from stages.pulses import mean_direction, middle_ns
+from stages.pulses import looking_along, middle_ns
 from stages.sweep import Travel
 from stages.trail import VehicleTrail
 
@@ -50,6 +50,7 @@ AMONG_M = 1.5
 AMONG_NS = 20_000_000_000
 SAME_PLACE_M = 0.5
 MOST_STANDING = 64
+STILL_MPS = np.zeros(3)
 STANDING_NS = 60_000_000_000  # for so long it is known that something stands there
 
 
@@ -133,8 +134,7 @@ class EvidenceDetect(Stage):
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
             now.start_ns = now.tidied_ns = now.detector_life = pulses.stamp_ns
-        axis = mean_direction(pulses.direction_vehicle)
-        part = Slice(pulses, *now.trail.at(middle_ns(pulses)), axis / max(math.hypot(*axis.tolist()), 1e-9))
+        part = Slice(pulses, *now.trail.at(middle_ns(pulses)), looking_along(pulses.direction_vehicle))
         changed = False
         sightings = now.finder.feed(part, self._motion_known(now_ns))
         self._look_for_misses(now, part, now_ns)
@@ -168,7 +168,7 @@ class EvidenceDetect(Stage):
             stamp_ns=s.stamp_ns,
             seen_ns=s.stamp_ns,
             xyz_m=s.xyz_local_m,
-            velocity_mps=now.trail.velocity_mps(s.stamp_ns),  # a drone comes along with the vehicle
+            velocity_mps=STILL_MPS,
             range_m=s.range_m,
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
             first_hits=s.hits,
@@ -177,6 +177,7 @@ class EvidenceDetect(Stage):
         new.note(s)
         news = self._weigh(now, new)
         if new.told:
+            new.velocity_mps = now.trail.velocity_mps(s.stamp_ns)  # a drone comes along with the vehicle
             now.bank.put(new)
         else:
             now.refused[why_refused(new.why)] += 1
@@ -285,14 +286,15 @@ class EvidenceDetect(Stage):
             if now.travel.whole:
                 now.travel.restart(turntable_rad)
                 now.end_ns = now.end_ns or now_ns
-        new = [c for c in now.bank if c.accepted and not c.announced]
+        accepted = [c for c in now.bank if c.accepted]
+        new = [c for c in accepted if not c.announced]
         if changed or new:
             told = [c for c in now.bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
             flight = now.word.usual_flight(now.trail, now_ns)
             yield candidates_message(told, now.trail, now_ns, now.detector_life, self.max_candidates, *flight)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9
-        here = any(c.accepted and c.seen_ns >= now.start_ns for c in now.bank)
+        here = any(c.seen_ns >= now.start_ns for c in accepted)
         if now.end_ns is not None and not new:
             if now_ns - now.end_ns < self.settle_s * 1e9 and not (here and since_s > self.report_s):
                 return

@@ -18,14 +18,13 @@ from stages.compiled import compiled
 from stages.detect import chords as chord
 from stages.detect.candidate import Sighting
 from stages.detect.chords import ChordFinder
-from stages.detect.surroundings import TALLY, BigThings, look_around
+from stages.detect.lately import MOST_SLICES, WINDOW_NS, Lately
+from stages.detect.surroundings import BigThings
 from stages.geometry import Array64
 from stages.messages import SweptPulses
 from stages.pulses import HOLE, LONGEST, STEP, middle_ns
 
 BEAM_SPACING_RAD = math.radians(2.0)  # between two lasers of a VLP-16
-WINDOW_NS = 8_600_000  # what is kept: 31 deg of a rotor at 600 rpm and the slice that is begun
-MOST_SLICES = 16  # of them
 DELAY_NS = 3_300_000  # after which what stands around a sighting has been seen
 MEMORY_NS = 3_000_000_000  # of big things, when the vehicle tells how it moves
 SHORT_MEMORY_NS = 1_000_000_000  # when it does not
@@ -53,6 +52,13 @@ class Limits(NamedTuple):
     clear_m: float
 
 
+class _Kept(NamedTuple):
+    middle_ns: int
+    end_ns: int
+    R: Array64
+    t: Array64
+
+
 class _Chord(NamedTuple):
     found_ns: int  # the end of the slice it was found in
     row: Array64
@@ -68,7 +74,7 @@ class SightingFinder:
         span_m = limits.span_m
         self._chords = ChordFinder(LONGEST * span_m, STEP * span_m, HOLE * span_m)
         self._big = BigThings()
-        self._slices: deque[Slice] = deque(maxlen=MOST_SLICES)
+        self._slices: deque[_Kept] = deque(maxlen=MOST_SLICES)
         self._lately = Lately()
         self._waiting: list[_Chord] = []
         self.hidden: Counter[str] = Counter()  # short chords that were not free at both ends
@@ -76,10 +82,10 @@ class SightingFinder:
     def feed(self, part: Slice, motion_known: bool) -> list[Sighting]:
         """The sightings that are complete with this slice."""
         now_ns = int(part.pulses.point_stamp_ns[-1])
-        while self._slices and now_ns - self._slices[0].pulses.point_stamp_ns[-1] > WINDOW_NS:
+        while self._slices and now_ns - self._slices[0].end_ns > WINDOW_NS:
             self._slices.popleft()
-        self._slices.append(part)
-        self._lately.add(part.pulses, now_ns)
+        self._slices.append(_Kept(middle_ns(part.pulses), now_ns, part.R, part.t))
+        self._lately.add(part.pulses, part.axis, now_ns)
         self._find(part, now_ns)
         if not self._waiting or now_ns - self._waiting[0].found_ns < DELAY_NS:
             return []
@@ -99,31 +105,31 @@ class SightingFinder:
         rows = found.rows
         if not len(rows):
             return
-        kinds = kinds_of(rows, pulses.origin_vehicle_m[2], *limits)
-        if (big := kinds == BIG).any():
-            self._big.add(rows[big, :3] @ part.R.T + part.t, pulses.stamp_ns)
-        self.hidden["hidden at an end by something nearer"] += int(np.count_nonzero(kinds == HIDDEN))
-        for i in np.nonzero(kinds == SMALL)[0].tolist():
-            middle_ns = int(found.first_ns[i] + found.last_ns[i]) // 2
-            self._waiting.append(_Chord(now_ns, rows[i], tuple(rows[i, :3].tolist()), middle_ns))
+        kinds = np.empty(len(rows), dtype=np.int64)
+        big, small, hidden = kinds_of(rows, pulses.origin_vehicle_m[2], *limits, kinds)
+        if big:
+            self._big.add(places_of_kind(rows, kinds, BIG, big, part.R, part.t), pulses.stamp_ns)
+        if hidden:
+            self.hidden["hidden at an end by something nearer"] += hidden
+        if small:
+            for i in np.nonzero(kinds == SMALL)[0].tolist():
+                half_way_ns = int(found.first_ns[i] + found.last_ns[i]) // 2
+                self._waiting.append(_Chord(now_ns, rows[i], tuple(rows[i, :3].tolist()), half_way_ns))
 
     def _sighting(self, same: list[_Chord], motion_known: bool) -> Sighting:
         span_m = self._limits.span_m
-        rows = np.array([c.row for c in same])
-        hits, stamp_ns = rows[:, chord.COUNT], same[0].stamp_ns
-        middle = hits @ rows[:, :3] / hits.sum()
-        then = min(self._slices, key=lambda s: abs(middle_ns(s.pulses) - stamp_ns))
-        range_m = float(rows[:, chord.RANGE].mean())
-        local = then.R @ middle + then.t
+        rows, stamp_ns = np.array([c.row for c in same]), same[0].stamp_ns
+        away_ns = [abs(kept.middle_ns - stamp_ns) for kept in self._slices]
+        then = self._slices[away_ns.index(min(away_ns))]
+        middle, local, hits, range_m, extent_m = one_thing(rows, then.R, then.t)
         balls, rugged = round_and_rugged(rows)
-        extent_m = max(float(np.linalg.norm(np.ptp(rows[:, :3], axis=0))), float(rows[:, chord.LENGTH].max()))
         since_ns = stamp_ns - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
         return Sighting(
             stamp_ns=stamp_ns,
             xyz_local_m=local,
             vehicle_local_m=then.t,
             range_m=range_m,
-            hits=int(hits.sum()),
+            hits=hits,
             too_long=extent_m > 1.3 * span_m,
             balls=balls,
             rugged=rugged,
@@ -139,62 +145,6 @@ class SightingFinder:
         return self._lately.around(middle_m, 0.3 * span_m, 1.1 * span_m, close_m, outer_m, 0.5)
 
 
-class Lately:
-    """The last slices' pulses side by side, so that one compiled call looks at all of them."""
-
-    def __init__(self) -> None:
-        self._direction = np.empty((MOST_SLICES, 0, 3), dtype=np.float32)
-        self._range_m = np.empty((MOST_SLICES, 0), dtype=np.float32)
-        self._origin_m = np.zeros((MOST_SLICES, 3))
-        self._sizes = np.zeros(MOST_SLICES, dtype=np.int64)  # 0: none, or too old
-        self._end_ns = np.zeros(MOST_SLICES, dtype=np.int64)
-        self._next = 0
-
-    def add(self, pulses: SweptPulses, end_ns: int) -> None:
-        """One more, whose last pulse left then; those before the window are forgotten."""
-        n, k = pulses.range_m.size, self._next
-        missing = n - self._range_m.shape[1]
-        if missing > 0:
-            self._direction = np.pad(self._direction, ((0, 0), (0, missing), (0, 0)))
-            self._range_m = np.pad(self._range_m, ((0, 0), (0, missing)))
-        self._direction[k, :n], self._range_m[k, :n] = pulses.direction_vehicle, pulses.range_m
-        self._origin_m[k], self._sizes[k], self._end_ns[k] = pulses.origin_vehicle_m, n, end_ns
-        self._sizes[end_ns - self._end_ns > WINDOW_NS] = 0
-        self._next = (k + 1) % MOST_SLICES
-
-    def around(
-        self, centre_m: Array64, disc_m: float, inner_m: float, close_m: float, outer_m: float, depth_m: float
-    ) -> Array64:
-        """What they found around a place (3,) of the vehicle frame: (TALLY,); see `look_around`."""
-        return look_around_all(
-            self._direction, self._range_m, self._origin_m, self._sizes,
-            centre_m, disc_m, inner_m, close_m, outer_m, depth_m,
-        )  # fmt: skip
-
-
-@compiled
-def look_around_all(
-    direction: NDArray[np.float32],
-    range_m: NDArray[np.float32],
-    origin_m: Array64,
-    sizes: NDArray[np.int64],
-    centre_m: Array64,
-    disc_m: float,
-    inner_m: float,
-    close_m: float,
-    outer_m: float,
-    depth_m: float,
-) -> Array64:
-    """The tally (TALLY,) of slices (k, most, 3), (k, most), of each the first `sizes` (k,) pulses."""
-    tally = np.zeros(TALLY, dtype=np.int64)
-    for k in range(sizes.size):
-        n = sizes[k]
-        look_around(
-            direction[k, :n], range_m[k, :n], origin_m[k], centre_m, disc_m, inner_m, close_m, outer_m, depth_m, tally
-        )
-    return tally.astype(np.float64)
-
-
 @compiled
 def kinds_of(
     rows: Array64,
@@ -204,9 +154,13 @@ def kinds_of(
     nearest_m: float,
     furthest_m: float,
     clear_m: float,
-) -> NDArray[np.int64]:
-    """What chords (n, COLUMNS) are of: BIG, SMALL and free at both ends, HIDDEN: small, not free, or NONE of these."""
-    kinds = np.full(rows.shape[0], NONE)
+    kinds: NDArray[np.int64],
+) -> tuple[int, int, int]:
+    """What chords (n, COLUMNS) are of: BIG, SMALL and free at both ends, HIDDEN: small, not free, or NONE of these.
+
+    Fills kinds (n,); returns how many are BIG, SMALL, HIDDEN.
+    """
+    kinds[:] = NONE
     for i in range(rows.shape[0]):
         range_m = rows[i, chord.RANGE]
         if rows[i, chord.LONG] > 0.0:
@@ -217,7 +171,33 @@ def kinds_of(
             and rows[i, chord.LENGTH] <= LONGEST * span_m
         ):
             kinds[i] = SMALL if rows[i, chord.FREE] == 2.0 else HIDDEN
-    return kinds
+    return np.sum(kinds == BIG), np.sum(kinds == SMALL), np.sum(kinds == HIDDEN)
+
+
+@compiled
+def places_of_kind(rows: Array64, kinds: NDArray[np.int64], kind: int, n: int, R: Array64, t: Array64) -> Array64:
+    """Where the n chords of a kind are (n, 3), by R (3, 3) and t (3,)."""
+    places_m = np.empty((n, 3))
+    k = 0
+    for i in range(rows.shape[0]):
+        if kinds[i] == kind:
+            x, y, z = rows[i, chord.X], rows[i, chord.Y], rows[i, chord.Z]
+            for j in range(3):
+                places_m[k, j] = x * R[j, 0] + y * R[j, 1] + z * R[j, 2] + t[j]
+            k += 1
+    return places_m
+
+
+@compiled
+def one_thing(rows: Array64, R: Array64, t: Array64) -> tuple[Array64, Array64, int, float, float]:
+    """Of chords (n, COLUMNS) of one thing: its middle (3,) and that by R (3, 3) and t (3,), hits, range, extent [m]."""
+    hits, places = np.ascontiguousarray(rows[:, chord.COUNT]), np.ascontiguousarray(rows[:, :3])
+    middle = hits @ places / hits.sum()
+    across2 = 0.0
+    for axis in range(3):
+        across2 += (places[:, axis].max() - places[:, axis].min()) ** 2
+    extent_m = max(math.sqrt(across2), rows[:, chord.LENGTH].max())
+    return middle, R @ middle + t, int(hits.sum()), rows[:, chord.RANGE].mean(), extent_m
 
 
 @compiled

@@ -134,7 +134,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     odds = e.clutter
     flew = c.heard is not None and e.told * c.flown > 3.0
     if free_space:
-        free = int(np.count_nonzero(c.free >= 1))
+        free = sum([looks >= 1.0 for looks in c.free.tolist()])
         beside = max(e.beside * c.beside, -(e.most_beside_flown if flew else e.most_beside))
         odds += e.free_sector * free + beside + min(e.alone * c.alone, most_alone(c, e))
         said.append(f"{free} of {SECTORS} sectors around it free")
@@ -171,7 +171,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
 
 def most_alone(c: Candidate, e: Evidence) -> float:
     """What looks with nothing beside it can count [nats]: a wire is seen nearby, once pulses crossed every sector."""
-    crossed = min(max((float(c.free.min()) - 2.0) / 6.0, 0.0), 1.0)
+    crossed = min(max((min(c.free.tolist()) - 2.0) / 6.0, 0.0), 1.0)
     seen = min(max((e.unseen_m - c.range_m) / (e.unseen_m - e.wire_m), 0.0), 1.0)
     return e.most_alone + e.near_alone * crossed * seen
 

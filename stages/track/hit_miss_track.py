@@ -152,21 +152,22 @@ class HitMissTrack(Stage):
         now_ns = int(pulses.point_stamp_ns[-1])
         R, t = self._trail.at(middle_ns(pulses))
         axis = mean_direction(pulses.direction_vehicle)
-        for track in self._known:
-            if track not in self._known:  # dropped a moment ago as the same as another
+        hypotheses, span_m, de_skew = self._known, self.span_m, self.de_skew  # a private attribute costs a look each
+        for track in hypotheses:
+            if track not in hypotheses:  # dropped a moment ago as the same as another
                 continue
             look = track.look
             if look is not None and pulses.stamp_ns - look.last_ns > LOOK_OVER_NS:
                 track.look = None
                 yield from self._close(track, look)
             before = track.look
-            state = self._known.at(track, pulses.stamp_ns) if before is None else (before.x, before.P)
-            track.look = collect_into(before, pulses, R, t, axis, *state, self.span_m, self.de_skew)
+            state = hypotheses.at(track, pulses.stamp_ns) if before is None else (before.x, before.P)
+            track.look = collect_into(before, pulses, R, t, axis, *state, span_m, de_skew)
             if before is None:
-                track.look_word = self._known.word(pulses.stamp_ns)
-            if track in self._known:
+                track.look_word = hypotheses.word(pulses.stamp_ns)
+            if track in hypotheses:
                 yield from self._watch(track, now_ns)
-        if not len(self._known) and now_ns - self._idle_ns > 500_000_000:
+        if not len(hypotheses) and now_ns - self._idle_ns > 500_000_000:
             self._idle_ns = now_ns
             yield TrackState(
                 stamp_ns=now_ns, state=TrackingState.SEARCHING, reason=self._why_idle, hits=0, frame_s=0.5, track_id=0

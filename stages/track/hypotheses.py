@@ -60,6 +60,7 @@ class Hypotheses:
         self._told = ToldMotion(0), ToldMotion(1)
         # as asked for last: each candidate asks for the same moment
         self._predicted: dict[Hypothesis, tuple[int, Array64, Array64]] = {}
+        self._word: tuple[int, Word | None] | None = None  # the same, of the drone's word
 
     def __iter__(self) -> Iterator[Hypothesis]:
         """Over those there are now: it may change meanwhile."""
@@ -69,21 +70,25 @@ class Hypotheses:
         return len(self._all)
 
     def __contains__(self, one: Hypothesis) -> bool:
-        return any(other is one for other in self._all)
+        return one in self._all  # by identity: a hypothesis equals itself only
 
     def hear_position(self, position: DroneLocalPosition) -> None:
         """What the drone says of its flight."""
         self._predicted.clear()
+        self._word = None
         self._told[0].told.add_position(position)
 
     def hear_odometry(self, odometry: DroneOdometry) -> None:
         """The same from an autopilot that sends this; taken where it sends both."""
         self._predicted.clear()
+        self._word = None
         self._told[1].told.add_odometry(odometry)
 
     def word(self, stamp_ns: int) -> Word | None:
         """What the drone says of itself at a time, by the better of its messages."""
-        return self._told[1].word(stamp_ns) or self._told[0].word(stamp_ns)
+        if self._word is None or self._word[0] != stamp_ns:
+            self._word = stamp_ns, self._told[1].word(stamp_ns) or self._told[0].word(stamp_ns)
+        return self._word[1]
 
     def learn(self, one: Hypothesis) -> None:
         """A hit on a drone tells which way its autopilot's axes point."""

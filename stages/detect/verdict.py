@@ -13,7 +13,8 @@ Where the drone tells how it flies, that decides over still things, birds and ba
 
 Every o_k is a prior and a sum of log likelihood ratios, capped where looks repeat the same evidence. The numbers
 are ours: reasoned, then changed on some dozens of matrix flights (seeds 901 to 921). `unseen_m` and `again` were
-changed after flights of the matrix (seeds 1 to 3) went wrong. They are not fitted, so P is no measured frequency.
+changed after flights of the matrix (seeds 1 to 3) went wrong. They are not fitted: what P was worth in
+unseen flights stands in `docs/RESULTS.md`.
 
 Source: ours; DESIGN, "a small cluster with *measured* emptiness around it, evaluated as data arrives".
 """

@@ -50,6 +50,7 @@ AMONG_M = 1.5
 AMONG_NS = 20_000_000_000
 SAME_PLACE_M = 0.5
 MOST_STANDING = 64
+KEPT_NATS = 2.3  # so much less than it takes to accept it, and it is accepted no more
 STILL_MPS = np.zeros(3)
 STANDING_NS = 60_000_000_000  # for so long it is known that something stands there
 
@@ -95,8 +96,8 @@ class EvidenceDetect(Stage):
     nearest_m: float = Field(1.5, ge=0.3)
     furthest_m: float = Field(65.0, gt=1)
     clear_m: float = Field(2.0, gt=0.2)  # a lamp hangs this far from its pole; so near nothing may stand
-    accept_probability: float = Field(0.995, gt=0.5, lt=1)
-    look_again_probability: float = Field(0.006, gt=0, lt=0.5)
+    accept_probability: float = Field(0.975, gt=0.5, lt=1)
+    look_again_probability: float = Field(0.014, gt=0, lt=0.5)
     report_s: float = Field(1.0, gt=0.05)
     settle_s: float = Field(0.15, ge=0)  # what was seen just before the end of a pass is judged with it
     sweep_deg: float = Field(180.0, gt=3, le=360)
@@ -219,7 +220,7 @@ class EvidenceDetect(Stage):
         c.hear(now.word.of(c, motion_known))
         c.odds, c.why = judge(c, self.evidence, self.free_space, motion_known)
         accept = odds_of(self.accept_probability)
-        c.accepted = c.odds >= accept or (c.accepted and c.odds >= accept - 3.0)
+        c.accepted = c.odds >= accept or (c.accepted and c.odds >= accept - KEPT_NATS)
         was, c.told = c.told, c.odds >= odds_of(self.look_again_probability)
         c.worth |= c.told
         return c.worth or was != c.told

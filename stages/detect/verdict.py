@@ -9,14 +9,17 @@ A drone is weighed against each other thing that returns pulses in the sky, with
 
 Where the drone tells how it flies, that decides over still things, birds and balloons (stages/detect/telemetry.py).
 
-    odds of a drone = 1 / sum_k exp(-o_k),     o_k = ln of the odds, drone over thing k
+    o = -ln sum_k exp(-o_k),     o_k = ln of the odds, drone over thing k
+    ln of the odds of a drone = weight o + offset
 
 Every o_k is a prior and a sum of log likelihood ratios, capped where looks repeat the same evidence. The numbers
 are ours: reasoned, then changed on some dozens of matrix flights (seeds 901 to 921). `unseen_m` and `again` were
-changed after flights of the matrix (seeds 1 to 3) went wrong. They are not fitted: what P was worth in
-unseen flights stands in `docs/RESULTS.md`.
+changed after flights of the matrix (seeds 1 to 3) went wrong. Only `weight` and `offset` are fitted, so that P is how
+often it is a drone: observations that count one by one are not independent. What P is worth in unseen flights stands in
+`docs/RESULTS.md`.
 
-Source: ours; DESIGN, "a small cluster with *measured* emptiness around it, evaluated as data arrives".
+Source: ours; weight and offset after Platt, Advances in Large Margin Classifiers (1999); DESIGN, "a small cluster with
+*measured* emptiness around it, evaluated as data arrives".
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from stages.detect.candidate import OPEN_BESIDE, Candidate
 from stages.detect.surroundings import SECTORS
 
 STANDING = "a lamp, wire or edge"
+UNSURE = 2.7  # ln of odds, below which it is said what else it may be
 
 # ln of how much likelier a drone flies so than a bird, by the speed it reaches; of birds there are several
 FLIGHT_MPS = (0.0, 2.0, 4.0, 6.0, 9.0, 12.0)
@@ -40,6 +44,9 @@ class Evidence(BaseModel):
     """How much each observation counts [nats], drone over the other thing, and where the caps are."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    weight: float = 0.76  # of all that follows, and
+    offset: float = -0.37  # fitted to what was a drone in 116 flights (matrix as built, seeds 6 to 8)
 
     stray: float = -5.0  # prior, assumed: of what is hit once, one in 150 is there again
     hit: float = 1.0  # each return of the first look, up to 4
@@ -105,10 +112,10 @@ def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tu
     least = min(over, key=lambda name: over[name])
     shift = over[least]
     c.suspect = least
-    odds = shift - math.log(sum([math.exp(shift - value) for value in over.values()]))
+    evidence = shift - math.log(sum([math.exp(shift - value) for value in over.values()]))
     words = [f"{c.hit_looks} looks, {c.hits} returns", *said]
     if c.joined_at:
-        odds -= e.joined / (c.hit_looks - c.joined_at)
+        evidence -= e.joined / (c.hit_looks - c.joined_at)
         words.append("met again where the drone says it would be")
     if c.motion is not None:
         words.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
@@ -118,7 +125,8 @@ def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tu
         words.append("it flies as the drone says")
     elif c.heard is None and flew_as_bird(c, e):
         words.append("flew as a bird does")
-    if odds < 4.0:
+    odds = e.weight * evidence + e.offset
+    if odds < UNSURE:
         words.append(f"if not a drone, {least}")
     return odds, "; ".join(words)
 

@@ -205,7 +205,7 @@ def test_far_away_it_stays_a_candidate_because_a_wire_would_not_be_seen():
     far_m = 2.6 * np.array(PLACE_M)
     candidates, detections = run([Drone(still(*far_m), span_m=0.9)], 4.2, span_m=0.9)
     assert accepted_after_s(detections) == math.inf
-    assert 0.5 < max(c.probability.max() for c in candidates if c.probability.size) < 0.995
+    assert 0.5 < max(c.probability.max() for c in candidates if c.probability.size) < 0.975
 
 
 BESIDE = {
@@ -366,7 +366,7 @@ def test_a_lamp_is_refused_while_the_drone_flies_and_not_while_it_hangs():
     assert candidates[-1].candidate_id.size == 0 or candidates[-1].probability.max() < 0.02
     candidates, detections = run([hanging()], say=saying(still(0.0, 0.0, 0.0)))
     assert accepted_after_s(detections) < 3.0
-    assert candidates[-1].probability.max() > 0.99
+    assert candidates[-1].probability.max() > 0.975
 
 
 def test_a_balloon_is_refused_though_it_drifts_as_the_drone_says_because_it_is_smooth():

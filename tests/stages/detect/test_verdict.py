@@ -92,11 +92,17 @@ def test_two_things_may_lie_as_the_drone_flew_by_chance_less_with_each_look_sinc
     c = hanging()
     alone, _ = judge(c, E, True, True)
     c.joined_at = 10
-    assert judge(c, E, True, True)[0] == pytest.approx(alone - E.joined / 2)
+    assert judge(c, E, True, True)[0] == pytest.approx(alone - E.weight * E.joined / 2)
     c.joined_at = 6
     odds, words = judge(c, E, True, True)
-    assert odds == pytest.approx(alone - E.joined / 6)
+    assert odds == pytest.approx(alone - E.weight * E.joined / 6)
     assert "met again where the drone says it would be" in words
+
+
+def test_the_odds_told_are_a_share_of_the_evidence_and_an_offset():
+    evidence, _ = judge(hanging(), Evidence(weight=1.0, offset=0.0), True, True)
+    assert evidence != 0.0
+    assert judge(hanging(), Evidence(weight=0.5, offset=-1.0), True, True)[0] == pytest.approx(0.5 * evidence - 1.0)
 
 
 def test_nearby_looks_with_nothing_beside_it_count_more_once_every_sector_was_crossed():

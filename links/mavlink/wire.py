@@ -54,12 +54,8 @@ def is_signed(data: bytes) -> bool:
     return data[0] == V2 and bool(data[2] & SIGNED)
 
 
-@functools.lru_cache(maxsize=64)  # live, a frame is read where it arrives, and soon again where it is decoded
 def parse_frame(data: bytes) -> Any:
-    """pymavlink's message of exactly one frame, "UNKNOWN_..." beyond its dialect. ValueError: damaged, or no frame.
-
-    The message is for reading alone: the same bytes give the same one again.
-    """
+    """pymavlink's message of exactly one frame, "UNKNOWN_..." beyond its dialect. ValueError: damaged, or no frame."""
     if not MIN_FRAME_BYTES <= len(data) <= MAX_FRAME_BYTES or data[0] not in (V1, V2):
         raise ValueError("no MAVLink frame")
     if data[0] == V2 and data[2] & ~SIGNED:

@@ -16,7 +16,7 @@ errors are ours.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -119,26 +119,13 @@ class Autopilot:
         while self._requests and self._requests[-1][0] < until_ns:
             at_ns, frame = self._requests.pop()
             records.append(Record("/autopilot/tx", arrival_ns=at_ns, stamp_ns=at_ns, data=frame))
-        for arrival_ns, _, frame in self.said(until_ns):
-            records.append(Record("/autopilot/rx", arrival_ns=arrival_ns, stamp_ns=arrival_ns, data=frame))
-        return records
-
-    def said(self, until_ns: int) -> Iterator[tuple[int, Any, bytes]]:
-        """What it said before `until_ns`, and since the call before, and the radio did not lose.
-
-        Each with its arrival, as pymavlink's message and as a frame.
-        """
         while self._waiting and self._waiting[-1][0] < until_ns:
             sent_ns, message = self._waiting.pop()
             frame = _packed(message, self._mav)
             arrival_ns = self._downlink.arrival_ns(sent_ns, len(frame))
             if arrival_ns is not None:
-                yield arrival_ns, message, frame
-
-    @property
-    def next_ns(self) -> int | None:
-        """When it says something next; None: never again."""
-        return self._waiting[-1][0] if self._waiting else None
+                records.append(Record("/autopilot/rx", arrival_ns=arrival_ns, stamp_ns=arrival_ns, data=frame))
+        return records
 
     def _plan(
         self,

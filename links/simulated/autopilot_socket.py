@@ -23,7 +23,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.wire import FrameSplitter, header, packed
+from links.mavlink.wire import FrameSplitter, header, packed, parse_frame
 from links.simulated.autopilot import Autopilot
 from links.simulated.autopilot_rules import Rules
 from links.simulated.px4_rules import Px4Rules
@@ -31,7 +31,7 @@ from links.simulated.px4_rules import Px4Rules
 mavlink: Any = ardupilotmega
 
 Address = tuple[str, int]
-LOOK_S = 0.01  # how often it looks for what it was told to say
+STEP_S = 0.002  # how exactly a frame leaves when it is due
 BOOT_NS = 100_000_000_000  # since boot when it begins, without a flight
 REPORT_HZ = 5.0
 PX4_TIMESYNC_HZ = 10.0
@@ -113,7 +113,7 @@ class AutopilotSocket:
 
     def _run(self) -> None:
         while not self._closed.is_set():
-            ready, _, _ = select.select([self._socket], [], [], self._pause_s())
+            ready, _, _ = select.select([self._socket], [], [], STEP_S)
             if ready:
                 try:
                     data, source = self._socket.recvfrom(2048)
@@ -122,11 +122,6 @@ class AutopilotSocket:
                 if not self.silent:
                     self._receive(data, source)
             self._speak()
-
-    def _pause_s(self) -> float:
-        """How long nothing has to be said: each waking costs more than a message."""
-        next_ns = None if self._flight is None else self._flight.next_ns
-        return LOOK_S if next_ns is None else min(max(1e-9 * (next_ns + 1 - self._scenario_ns()), 0.0), LOOK_S)
 
     def _receive(self, data: bytes, source: Address) -> None:
         self._peer = self._peer or source
@@ -171,10 +166,9 @@ class AutopilotSocket:
         while self._to_say:
             self._send(self._to_say.popleft())
         if self._flight is not None:
-            for _, message, _ in self._flight.said(self._scenario_ns()):
-                # numbered with what is sent here; its answers to the simulated host are not ours
-                if not (message.get_type() == "TIMESYNC" and message.tc1 != 0):
-                    self._send(message)
+            for record in self._flight.records(self._scenario_ns()):
+                if record.topic == "/autopilot/rx":
+                    self._pass_on(record.data)
         elif self._due("beat", 1.0):
             beat = (2, 12 if self._px4 else 3, 0, 0, 3, 3)  # quadrotor, kind of autopilot, standby
             self._send(mavlink.MAVLink_heartbeat_message(*beat))
@@ -184,6 +178,12 @@ class AutopilotSocket:
             self._send(report)
         if self._px4 and self._due("timesync", PX4_TIMESYNC_HZ):
             self._send(mavlink.MAVLink_timesync_message(0, self.device_ns()))
+
+    def _pass_on(self, frame: bytes) -> None:
+        """A frame of the flight, numbered with what is sent here; its answers to the simulated host are not ours."""
+        message = parse_frame(frame)
+        if not (message.get_type() == "TIMESYNC" and message.tc1 != 0):
+            self._send(message)
 
     def _due(self, what: str, rate_hz: float) -> bool:
         now_ns = self.device_ns()

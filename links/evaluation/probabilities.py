@@ -1,7 +1,8 @@
 """How often it was a drone, of what the detector gave a probability to: does P mean what it says?
 
-Each thing counts once in a row: when its probability was said to lie there first. It was a drone when it was within
-`wrong_m` of one then. Runs of a configuration together; where truth has a gap nothing counts.
+Each thing counts once in a row: at the first look at it after which its probability lay there; looks that miss it are
+none. It was a drone when it was within `wrong_m` of one then. Runs of a configuration together; where truth has a gap
+nothing counts.
 
 Source: ours; after the reliability tables of weather forecasts, Murphy and Winkler, Applied Statistics 26 (1977).
 """
@@ -71,7 +72,8 @@ def _counted(run: RunData, said: Said | None, near_m: float, gap_ns: int) -> tup
         for path in [drone.path for drone in run.drones if drone.path is not None]:
             told, xyz_m, _ = interpolate(said.stamps_ns, path.stamps_ns, path.xyz_m, None, gap_ns)
             known &= told
-            drone |= np.linalg.norm(said.xyz_m - xyz_m, axis=1) < near_m
+            drone |= told & (np.linalg.norm(said.xyz_m - xyz_m, axis=1) < near_m)
+        known |= drone  # whatever is not known of another one
     bins, thing, stated, drone = bins[known], said.thing[known], said.probability[known], drone[known]
     first = np.unique(thing * len(EDGES) + bins, return_index=True)[1]
     return bins[first].astype(np.float64), stated[first], drone[first].astype(np.float64)

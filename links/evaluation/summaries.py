@@ -36,8 +36,8 @@ ROTATION_HOW = (
     "and the drone's way to it, relative to the vehicle and over ground, medians over runs."
 )
 RELIABILITY_HOW = (
-    "what may be a drone: each thing counts once in a row, when that probability was said of it first; it was a drone "
-    "when it was within 1 m of one then; 95 %: the interval in which the share lies."
+    "what may be a drone: each thing counts once in a row, at the first look at it after which that was said; "
+    "it was a drone when it was within 1 m of one then; 95 %: the interval in which the share lies."
 )
 Column = tuple[str, Callable[[Group], str]]
 AnyGroup = TypeVar("AnyGroup", Group, RotationGroup)

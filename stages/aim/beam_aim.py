@@ -75,7 +75,7 @@ class BeamAim(Stage):
     limit_rpm: float = Field(55.0, gt=0)  # MX-28AR at 12 V
     search_rpm: float = Field(20.0, gt=0)  # about; adjusted to the rotor so that no direction is left out
     lead_s: float = Field(0.03, ge=0)  # from deciding to the servo's obeying
-    settle_s: float = Field(0.014, ge=0)  # from arriving to standing still
+    settle_s: float = Field(0.015, ge=0)  # from arriving to standing still
     candidate_looks: int = Field(25, ge=1)  # then it is left alone for `candidate_rest_s`
     candidate_rest_s: float = Field(1.0, gt=0)
     candidate_probability: float = Field(0.014, ge=0, lt=1)  # less is not worth stopping for

@@ -12,7 +12,7 @@ from links.evaluation.summaries import reliability_summary
 from links.results import CANDIDATES_FILE, Results
 from stages.messages import Candidates
 from tests.links.command import grd
-from tests.links.evaluation.made_runs import make_run, stamp, truth_at
+from tests.links.evaluation.made_runs import lines, make_run, stamp, truth_at
 
 HEAD = "stamp_s,candidate,detector_life,looks,probability,x_m,y_m,z_m\n"
 T_S = np.arange(0.0, 10.0, 0.1)
@@ -58,6 +58,14 @@ def test_without_a_drone_nothing_is_one_and_where_truth_is_silent_nothing_counts
     assert rows_of(after) == {(0.5, 0.7): (1, 0.6, 1)}
     unknown = run_that_said(tmp_path / "unknown", [(1.0, 1, 0.6, 0.0)], truth="none")
     assert rows_of(unknown) == {}
+
+
+def test_a_drone_is_one_whatever_is_not_known_of_another(tmp_path):
+    said = [(1.0, 1, 0.6, 0.0), (9.0, 2, 0.6, 0.0), (9.0, 3, 0.6, 5.0)]
+    folder = run_that_said(tmp_path / "two", said)
+    other = lines(T_S[:50], truth_at(T_S[:50]) + np.array([0.0, 30.0, 0.0]))
+    (folder / "truth_vehicle_drone_2.tum").write_text("# T_vehicle_drone, full pose, truth\n" + other)
+    assert rows_of(folder) == {(0.5, 0.7): (2, 0.6, 2)}  # the third may have been the other one
 
 
 def test_numbers_of_two_runs_and_of_two_lives_of_a_detector_are_of_other_things(tmp_path):

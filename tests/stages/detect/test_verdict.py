@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from stages.detect import EvidenceDetect
 from stages.detect.telemetry import Heard
+from stages.detect.telling import odds_of
 from stages.detect.verdict import STANDING, Evidence, believed, judge, most_alone, over_balloon, over_bird, over_clutter
 from tests.stages.detect.test_candidate import candidate, sighting, way
 
@@ -103,6 +105,12 @@ def test_the_odds_told_are_a_share_of_the_evidence_and_an_offset():
     evidence, _ = judge(hanging(), Evidence(weight=1.0, offset=0.0), True, True)
     assert evidence != 0.0
     assert judge(hanging(), Evidence(weight=0.5, offset=-1.0), True, True)[0] == pytest.approx(0.5 * evidence - 1.0)
+
+
+def test_what_is_accepted_and_looked_at_again_has_the_evidence_that_the_numbers_of_a_verdict_were_made_for():
+    for default, evidence in (("accept_probability", 5.3), ("look_again_probability", -5.1)):
+        asked = odds_of(EvidenceDetect.model_fields[default].default)
+        assert asked == pytest.approx(E.weight * evidence + E.offset, abs=0.03)
 
 
 def test_nearby_looks_with_nothing_beside_it_count_more_once_every_sector_was_crossed():

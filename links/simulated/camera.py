@@ -120,6 +120,10 @@ class FrameTimes:
         jitter_ns = np.random.default_rng([*self.seed, 2, frame]).normal(0, 5e4)
         return self._first_ns + round(frame * 1e9 / self._settings.rate_hz + jitter_ns)
 
+    def lasts_ns(self, frames: int) -> int:
+        """So many frames."""
+        return round(frames * 1e9 / self._settings.rate_hz)
+
     def ends_ns(self, frame: int) -> int:
         """No exposure is longer than the longest: how long it is shows only when the frame is made."""
         sensor = self._settings.sensor

@@ -25,6 +25,7 @@ from stages.geometry import quaternions_xyzw, rotations_from_xyzw
 
 STEP_S = 1 / 400
 BEYOND_S = 1.0  # the flight goes on this long after the scenario: sensors look a little ahead
+SETTLED_S = 60.0  # after so long a flight that goes round flies each round like the one before
 KP_PER_S2, KD_PER_S, KI_PER_S3 = 4.0, 3.0, 0.8
 VERTICAL_STIFFER = 2.0
 MAX_INTEGRAL_MPS2 = 3.0
@@ -48,15 +49,23 @@ class FlightSettings(BaseModel):
 
 
 class Flight:
-    """A flown path. Times outside the flight take its first or last state."""
+    """A flown path. Times outside the flight take its first or last state; one that goes round has no outside.
+
+    It goes round in the same gusts, so that one round's pictures are the next one's.
+    """
 
     def __init__(self, path: Path, settings: FlightSettings, duration_s: float, seed: int) -> None:
         self.path = path
-        steps = int(np.ceil((duration_s + BEYOND_S) / STEP_S)) + 1
+        if path.round_s is None:
+            steps = int(np.ceil((duration_s + BEYOND_S) / STEP_S)) + 1
+            round_steps = steps
+        else:
+            round_steps = round(path.round_s / STEP_S)
+            steps = (int(np.ceil(SETTLED_S / path.round_s)) + 1) * round_steps + 1
         time_s: Array64 = np.arange(steps, dtype=np.float64) * STEP_S
         position, velocity, acceleration, yaw = (np.ascontiguousarray(part) for part in path.at(time_s))
         mean_wind = np.array(settings.wind_world_mps)
-        wind = mean_wind + _gusts(settings, steps, np.random.default_rng([seed, 30]))
+        wind = mean_wind + _gusts(settings, steps, round_steps, np.random.default_rng([seed, 30]))
         headings = np.column_stack([yaw, np.gradient(yaw, STEP_S)])
         start = quaternions_xyzw(path.flying_poses(np.zeros(1))[0])[0]
         limits = np.array(
@@ -70,6 +79,8 @@ class Flight:
             ]
         )
         state = fly(position, velocity, acceleration, headings, wind, mean_wind, start, limits)
+        if path.round_s is not None:
+            state = state[-round_steps - 1 :]
         self._p, self._v, self._q, self._w, self._f = np.split(state, [3, 6, 10, 13], axis=1)
 
     def at(self, time_s: Array64) -> tuple[Array64, Array64, Array64, Array64]:
@@ -89,15 +100,16 @@ class Flight:
         """What the drone's own IMU feels, drone axes: turn rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2]."""
         return self._mix(self._w, time_s), self._mix(self._f, time_s)
 
-    @staticmethod
-    def _mix(rows: Array64, time_s: Array64) -> Array64:
-        return between_steps(rows, STEP_S, time_s)  # 2.5 ms bend less than 0.1 mm and 0.01 deg
+    def _mix(self, rows: Array64, time_s: Array64) -> Array64:
+        in_round_s = time_s if self.path.round_s is None else np.mod(time_s, self.path.round_s)
+        return between_steps(rows, STEP_S, in_round_s)  # 2.5 ms bend less than 0.1 mm and 0.01 deg
 
 
-def _gusts(settings: FlightSettings, steps: int, rng: np.random.Generator) -> Array64:
-    """(steps, 3) [m/s], world."""
+def _gusts(settings: FlightSettings, steps: int, round_steps: int, rng: np.random.Generator) -> Array64:
+    """(steps, 3) [m/s], world; what drives them comes again after `round_steps`."""
     sigma = settings.gust_mps * np.array([1.0, 1.0, 0.5])
-    return gauss_markov(rng.standard_normal((steps, 3)), sigma, settings.gust_time_s, STEP_S)
+    white = np.resize(rng.standard_normal((round_steps, 3)), (steps, 3))
+    return gauss_markov(white, sigma, settings.gust_time_s, STEP_S)
 
 
 @compiled

@@ -4,7 +4,8 @@ A closed loop run again with another LiDAR stage or setting sees the same street
 of 286 s of a core for 40 s with two 720 px cameras at 5 Hz).
 What the pictures show must be the same: seed, start, scene, weather, vehicle and drones with how they ride and fly,
 cameras, and the turntable, of which the vehicle's camera sees the LiDAR. All else may differ. The flight may be shorter
-than the recorded one.
+than the recorded one; longer only where a drone goes round and round (`path.round_s`) past a world that stands still:
+the pictures of the first round are those of the next ones, each so much later.
 
 The recording tells all that as its config. Code is not in it: that vehicle and drones were where they are now is asked
 of the truth recorded, and every picture must have the stamp that it would get now.
@@ -26,8 +27,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flow.link import LinkError, Record
-from links.recording import RecordingReader
-from links.simulated.camera import FrameTimes, wanted_cameras
+from links.recording import CompressedImage, RecordingReader, decode_compressed_image, encode_compressed_image
+from links.simulated.camera import CameraSettings, FrameTimes, wanted_cameras
 from links.simulated.mesh import Array64, Mesh
 from links.simulated.scenario import Scenario
 from links.simulated.scene import Truth
@@ -55,7 +56,8 @@ class KeptPictures:
                 if topic not in reader.topics:
                     raise LinkError(f"{file} has nothing on {topic}: {NOT_THESE}")
         difference = first_difference(pictured(recorded), pictured(scenario))
-        if difference is None and scenario.duration_s > recorded.duration_s:
+        self._round_s = round_of(scenario)
+        if difference is None and scenario.duration_s > recorded.duration_s and self._round_s is None:
             difference = "duration_s", f"{recorded.duration_s:g}", f"{scenario.duration_s:g}"
         if (
             difference is None
@@ -76,9 +78,23 @@ class KeptPictures:
         self._compare_flown(truth)
         start_ns, seed = self._scenario.start_ns, self._scenario.seed
         return [
-            KeptCamera(self._file, f"/camera/{carrier}", FrameTimes(carrier, settings, start_ns, seed))
+            KeptCamera(
+                self._file, f"/camera/{carrier}", FrameTimes(carrier, settings, start_ns, seed), self._frames(settings)
+            )
             for carrier, settings in wanted_cameras(self._scenario.cameras, truth.drone is not None)
         ]
+
+    def _frames(self, settings: CameraSettings) -> int | None:
+        """Pictures in a round; None where none comes again."""
+        if self._round_s is None:
+            return None
+        frames = self._round_s * settings.rate_hz
+        if abs(frames - round(frames)) > 1e-6:
+            raise LinkError(
+                f"{settings.rate_hz:g} Hz are {frames:.2f} pictures in a round of {self._round_s:g} s: "
+                "take a rate that makes a whole number of them"
+            )
+        return round(frames)
 
     def _compare_flown(self, truth: Truth) -> None:
         """LinkError where vehicle or drones were elsewhere than they are now."""
@@ -114,19 +130,28 @@ class KeptPictures:
 class KeptCamera:
     """A camera whose pictures are there already; `records` as `links.simulated.camera.Camera` gives them."""
 
-    def __init__(self, file: Path, topic: str, times: FrameTimes) -> None:
-        self._file, self._topic, self._times = file, topic, times
-        self._frame = 0
+    def __init__(self, file: Path, topic: str, times: FrameTimes, frames: int | None = None) -> None:
+        """`frames`: so many make a round, after which they come again; None: they do not."""
+        self._file, self._topic, self._times, self._frames = file, topic, times, frames
+        self._frame = 0  # of this round
+        self._later_ns = 0  # than in the first round
         self._coming = self._read()
         self._early: dict[int, Record] = {}  # by stamp: latencies differ, so a later picture may arrive first
 
     def records(self, until_ns: int) -> list[Record]:
         """Frames whose readout ended before `until_ns`, each once."""
         records: list[Record] = []
-        while self._times.ends_ns(self._frame) < until_ns:
+        while self._times.ends_ns(self._frame) + self._later_ns < until_ns:
             records.append(self._picture(self._times.stamp_ns(self._frame)))
             self._frame += 1
+            if self._frame == self._frames:
+                self._begin_again()
         return records
+
+    def _begin_again(self) -> None:
+        self._later_ns += self._times.lasts_ns(self._frame)
+        self._frame = 0
+        self._coming, self._early = self._read(), {}
 
     def _read(self) -> Iterator[Record]:
         with RecordingReader(self._file) as reader:
@@ -138,7 +163,16 @@ class KeptCamera:
             if record is None:
                 raise LinkError(f"{self._file} has no picture on {self._topic} stamped {stamp_ns}: {NOT_THESE}")
             self._early[record.stamp_ns] = record
-        return self._early.pop(stamp_ns)
+        return _so_much_later(self._early.pop(stamp_ns), self._later_ns)
+
+
+def _so_much_later(picture: Record, later_ns: int) -> Record:
+    if later_ns == 0:
+        return picture
+    image = decode_compressed_image(picture.data)
+    stamp_ns = picture.stamp_ns + later_ns
+    data = encode_compressed_image(CompressedImage(stamp_ns, image.frame_id, image.data))
+    return Record(picture.topic, picture.arrival_ns + later_ns, stamp_ns, data)
 
 
 def pictured(scenario: Scenario) -> dict[str, Any]:
@@ -149,6 +183,14 @@ def pictured(scenario: Scenario) -> dict[str, Any]:
     flown = None if scenario.autopilot is None else said["autopilot"]["flight"]
     turntable = {name: mount[name] for name in ("T_vehicle_turntable", "T_turntable_lidar")}
     return {name: said[name] for name in same} | {"autopilot": {"flight": flown}, "mount": turntable}
+
+
+def round_of(scenario: Scenario) -> float | None:
+    """After so long every picture is the same again [s]; None: never, or not for all that a camera sees."""
+    flown = () if scenario.drone is None else (scenario.drone, *scenario.other_drones)
+    rounds = {drone.path.round_s for drone in flown}
+    parked = len(scenario.vehicle.path.waypoints) == 1 and scenario.vehicle.ride is None
+    return rounds.pop() if len(rounds) == 1 and parked and not any(scenario.scene.movers()) else None
 
 
 def first_difference(there: Any, here: Any, where: str = "") -> tuple[str, str, str] | None:

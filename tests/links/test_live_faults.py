@@ -30,7 +30,6 @@ from links.mavlink.gate import Limits, pose_sigmas
 from links.recording import RecordingReader
 from links.simulated.live_pictures import PictureServer
 from links.truth import TruthLog
-from tests.links.long_flight import flown_for
 from tests.links.ports import free_ports
 
 pytestmark = pytest.mark.slow
@@ -140,9 +139,9 @@ def stage(tmp_path):
     ports = dict(zip(names, free_ports(len(names)), strict=True))
     servo = tmp_path / "servo"
     (tmp_path / "faults.yaml").write_text(OVERLAY.format(servo=servo, **ports))
-    (tmp_path / "long.yaml").write_text(flown_for(900.0))
     settings = {
-        "scenario": str(tmp_path / "long.yaml"),
+        "scenario": "configs/scenarios/live_street.yaml",
+        "duration_s": 900.0,
         "servo": str(servo),
         "folder": str(tmp_path),
         **{f"{name}_port": ports[name] for name in ("lidar", "position", "odometry", "autopilot")},

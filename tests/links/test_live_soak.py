@@ -2,7 +2,8 @@
 
     python -m pytest -m slow -s tests/links/test_live_soak.py
 
-GRD_SOAK_S: seconds, 3600 unless told. It writes some 2 GB to the temporary folder.
+GRD_SOAK_S: seconds, 3600 unless told. It writes some 2 GB to the temporary folder. With both cameras, GRD_SOAK_PICTURES:
+the recording that configs/scenarios/live_street_cameras.yaml says how to make; then some 12 GB.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.links.long_flight import flown_for
 from tests.links.ports import free_ports
 
 pytestmark = pytest.mark.slow
@@ -24,25 +24,36 @@ pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e 
 
 ROOT = Path(__file__).resolve().parents[2]
 SOAK_S = float(os.environ.get("GRD_SOAK_S", "3600"))
+PICTURES = os.environ.get("GRD_SOAK_PICTURES")
 OVERLAY = """\
 links:
-  sim: {{config: {{scenario: {scenario}, autopilot_port: {autopilot}}}}}
+  sim: {{config: {{duration_s: {duration_s}, autopilot_port: {autopilot}}}}}
   lidar: {{config: {{port: {lidar}, position_port: {position}}}}}
   servo: {{config: {{port: {servo}}}}}
   odometry: {{config: {{port: {odometry}}}}}
   autopilot: {{config: {{connection: "udpin:127.0.0.1:{autopilot}"}}}}
   viewer: {{config: {{port: {viewer}}}}}
 """
+WITH_CAMERAS = """\
+  camera_vehicle: {{config: {{source: "http://127.0.0.1:{vehicle}/"}}}}
+  camera_drone: {{config: {{source: "http://127.0.0.1:{drone}/"}}}}
+  sim: {{config: {{pictures: {pictures}, camera_ports: {{vehicle: {vehicle}, drone: {drone}}}}}}}
+"""
 
 
 def test_an_hour_in_flight_grows_nothing_and_stops_nothing(tmp_path):
-    names = ("lidar", "position", "odometry", "autopilot", "viewer")
+    names = ("lidar", "position", "odometry", "autopilot", "viewer", "vehicle", "drone")
     ports = dict(zip(names, free_ports(len(names)), strict=True))
-    (tmp_path / "long.yaml").write_text(flown_for(SOAK_S + 60.0))
-    overlay = OVERLAY.format(scenario=tmp_path / "long.yaml", servo=tmp_path / "servo", **ports)
-    (tmp_path / "soak.yaml").write_text(overlay)
-    command = [sys.executable, "-c", "from links.cli import main; main()", "run", "configs/sim_live.yaml"]
-    command += ["--overlay", str(tmp_path / "soak.yaml"), "--for", str(SOAK_S), "--out", str(tmp_path / "soak")]
+    config, overlays = "configs/sim_live.yaml", [OVERLAY]
+    if PICTURES is not None:
+        config, overlays = "configs/sim_live_cameras.yaml", [OVERLAY, "links:\n" + WITH_CAMERAS]
+    command = [sys.executable, "-c", "from links.cli import main; main()", "run", config]
+    for number, text in enumerate(overlays):
+        overlay = tmp_path / f"soak_{number}.yaml"
+        told = {**ports, "servo": tmp_path / "servo", "pictures": PICTURES, "duration_s": SOAK_S + 60.0}
+        overlay.write_text(text.format(**told))
+        command += ["--overlay", str(overlay)]
+    command += ["--for", str(SOAK_S), "--out", str(tmp_path / "soak")]
     with (tmp_path / "log.txt").open("w") as log:
         code = subprocess.run(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, check=False).returncode
     assert code == 0, (tmp_path / "log.txt").read_text()[-2_000:]
@@ -55,7 +66,7 @@ def test_an_hour_in_flight_grows_nothing_and_stops_nothing(tmp_path):
         f"\n{SOAK_S:.0f} s: {begun[1]:.0f} MB after a quarter, {ended[1]:.0f} MB at the end; threads {begun[2]:.0f}, "
         f"{ended[2]:.0f}; files {begun[3]:.0f}, {ended[3]:.0f}; {len(poses)} poses, gaps p99 "
         f"{1e3 * np.percentile(gaps_s, 99):.0f}, max {1e3 * gaps_s.max():.0f} ms; {summary['poses']['states']}; "
-        f"dropped {summary['live']['dropped']}; {summary['against_truth']}\n"
+        f"dropped {summary['live']['dropped']}; {summary['against_truth']}; rig {json.loads((tmp_path / 'soak' / 'rig.json').read_text())}\n"
     )
     assert ended[1] < 1.05 * begun[1] + 10.0
     assert ended[2] <= begun[2]

@@ -111,3 +111,21 @@ def test_an_impossible_drone_is_refused() -> None:
     for wrong in ({"rate_lag_s": 0.001}, {"lean_limit_deg": 90.0}, {"gusts": 1.0}):
         with pytest.raises(ValidationError):
             FlightSettings.model_validate(wrong)
+
+
+def test_a_flight_that_goes_round_flies_each_round_like_the_first_and_its_seam_is_no_jump() -> None:
+    square = tuple(
+        Waypoint(t_s=4.0 * k, xyz_m=(5 * x, 5 * y, 8), yaw_deg=90 * k)
+        for k, (x, y) in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)])
+    )
+    flight = Flight(Path(waypoints=square, round_s=16.0), FlightSettings(gust_mps=1.0), 1.0, 3)
+    t = np.linspace(0.0, 15.99, 400)
+    for now, later in zip(flight.flying_poses(t), flight.flying_poses(t + 48.0), strict=True):
+        np.testing.assert_allclose(now, later, atol=1e-9)
+    assert np.ptp(flight.flying_poses(t)[1][:, 0]) > 8.0
+    near = np.arange(15.9, 16.1, 1 / 400)
+    R, p = flight.flying_poses(near)
+    v = flight.at(near)[1]
+    np.testing.assert_allclose(np.diff(p, axis=0) * 400, (v[1:] + v[:-1]) / 2, atol=0.02)
+    assert np.abs(np.diff(v, axis=0)).max() < 0.03
+    assert np.abs(np.diff(R, axis=0)).max() < 0.02

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from flow.link import LinkError, Record
 from links.cli.app import app
-from links.recording import RecordingReader, RecordingWriter
+from links.recording import RecordingReader, RecordingWriter, decode_compressed_image
 from links.simulated import camera_view
 from links.simulated.camera import CameraSettings, CamerasSettings
 from links.simulated.kept_pictures import KeptPictures, first_difference
@@ -93,6 +93,47 @@ def test_a_shorter_flight_takes_the_pictures_that_it_would_have_painted(scenario
     assert list(Simulation(shorter, pictures=KeptPictures(painted, shorter)).records()) == list(
         Simulation(shorter).records()
     )
+
+
+@pytest.fixture(scope="module")
+def round_about(scenario: Scenario) -> Scenario:
+    """A parked vehicle, a drone that is back after a second; two of its rounds."""
+    way = [{"t_s": t, "xyz_m": (4.0 + x, 3.0, 6.0)} for t, x in ((0.0, 0.0), (0.5, 0.4))]
+    drone = {"path": {"round_s": 1.0, "waypoints": way}}
+    one = CameraSettings(size_px=64, rate_hz=5, latency_ms=(5.0, 300.0))
+    return scenario.changed(
+        vehicle={}, drone=drone, duration_s=2.6, cameras=CamerasSettings(vehicle=one, drone=one), vehicle_odometry=None
+    )
+
+
+def test_round_and_round_the_first_rounds_pictures_come_again_so_much_later(round_about, tmp_path) -> None:
+    simulate_into(tmp_path / "first.mcap", round_about.changed(duration_s=1.4))
+    kept = KeptPictures(tmp_path / "first.mcap", round_about)
+    records = [r for r in Simulation(round_about, pictures=kept).records() if r.topic.startswith("/camera/")]
+    for topic in ("/camera/vehicle", "/camera/drone"):
+        seen = sorted((r for r in records if r.topic == topic), key=lambda r: r.stamp_ns)
+        assert len(seen) >= 11
+        for first, second in zip(seen, seen[5:], strict=False):
+            assert second.stamp_ns == first.stamp_ns + 10**9
+            a, b = decode_compressed_image(first.data), decode_compressed_image(second.data)
+            assert (a.data, a.stamp_ns, b.stamp_ns) == (b.data, first.stamp_ns, second.stamp_ns)
+        assert len({r.data for r in seen[:5]}) == 5
+        assert all(r.arrival_ns >= r.stamp_ns for r in seen)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"vehicle": {"ride": {}}}, "duration_s is 1.4 there, 2.6 here"),
+        ({"scene": {"birds": 1}}, "duration_s is 1.4 there, 2.6 here"),
+        ({"cameras": {"vehicle": {"size_px": 64, "rate_hz": 4.5}}}, "4.5 Hz are 4.50 pictures in a round of 1 s"),
+    ],
+)
+def test_pictures_do_not_come_again_where_something_else_would_be_seen(round_about, tmp_path, change, says) -> None:
+    longer = round_about.changed(**change)
+    simulate_into(tmp_path / "first.mcap", longer.changed(duration_s=1.4))
+    with pytest.raises(LinkError, match=says.replace(".", r"\.")):
+        Simulation(longer, pictures=KeptPictures(tmp_path / "first.mcap", longer))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ Source: ours.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,11 +42,6 @@ class Link(Node):
     def sent(self) -> Iterable[Record]:
         """What went out since the call before, for the recording; the live runner asks after each `on_<port>`."""
         return ()
-
-    @property
-    def counters(self) -> Mapping[str, int]:
-        """Totals since the start for people: lost, refused, foreign; the live runner shows them."""
-        return {}
 
     @property
     def trouble(self) -> str | None:

@@ -164,7 +164,7 @@ class Live:
             nodes={name: NodeReport(c.count, c) for name in self._names for c in [compute.get(name, Latency())]},
             edges=edges,
             links={source.node: source.report for source in threads.sources},
-            counters={name: told for name, link in threads.links.items() if (told := dict(link.counters))},
+            counters={name: told for name, node in (threads.links | lives).items() if (told := dict(node.counters))},
             restarts={name: life.restarts for name, life in lives.items() if life.restarts},
             failures={name: count for name, count in failures.items() if count},
             off=[name for name, life in lives.items() if life.gave_up],

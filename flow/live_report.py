@@ -63,7 +63,6 @@ class LiveReport(RunReport):
 
     edges: dict[str, EdgeReport] = field(default_factory=dict[str, EdgeReport])  # by the consumer's port
     links: dict[str, LinkReport] = field(default_factory=dict[str, LinkReport])
-    counters: dict[str, dict[str, int]] = field(default_factory=dict[str, dict[str, int]])  # as links count
     restarts: dict[str, int] = field(default_factory=dict[str, int])  # of stages that raised
     failures: dict[str, int] = field(default_factory=dict[str, int])
     off: list[str] = field(default_factory=list[str])  # stages that take nothing any more, because they raised

@@ -50,6 +50,7 @@ class RunReport:
     unwired_topics: Counter[str] = field(default_factory=Counter[str])  # records that no source takes
     nodes: dict[str, NodeReport] = field(default_factory=dict[str, NodeReport])
     incidents: list[Incident] = field(default_factory=list[Incident])
+    counters: dict[str, dict[str, int]] = field(default_factory=dict[str, dict[str, int]])  # as links and stages count
 
 
 class _Port:
@@ -157,6 +158,7 @@ class Replay:
         for node in self.report.nodes.values():
             node.calls = node.compute.count
         self.report.incidents = self._incidents.all
+        self.report.counters = {name: told for name, node in self.nodes.items() if (told := dict(node.counters))}
         return self.report
 
     def _run(self, port: _Port, arrival_ns: int, message: Any) -> tuple[Message, ...]:

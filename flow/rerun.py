@@ -156,6 +156,8 @@ class Rerun:
         for outputs in self._outputs.values():
             report.messages.update({output.name: output.count for output in outputs.values()})
         report.incidents = self.incidents.all
+        lives = {name: step.life for name, step in self._steps.items()}
+        report.counters = {name: told for name, life in lives.items() if (told := life.counters)}
         return report
 
     @property

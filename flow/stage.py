@@ -18,7 +18,7 @@ import collections.abc
 import functools
 import types
 import typing
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ConfigDict
@@ -42,6 +42,11 @@ class Node(BaseModel):
                 return object.__getattribute__(self, "__pydantic_private__")[name]
             except (AttributeError, TypeError, KeyError):  # not made yet, there are none, none of this name
                 return super().__getattr__(name)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Totals since the start for people: lost, refused, foreign. A run shows them, and writes them in the end."""
+        return {}
 
 
 class Stage(Node):

@@ -7,7 +7,7 @@ Source: ours.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from time import perf_counter_ns
 from typing import Any
@@ -46,7 +46,13 @@ class StageLife:
         """Arrival of the newest message taken."""
         self._spec, self._outputs, self._tell, self._strict = spec, outputs, tell, strict
         self._failed_ns: deque[int] = deque(maxlen=MAX_RESTARTS)
+        self._counted: Counter[str] = Counter()  # by those that raised
         self._begin()
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """As the stage counts, those before it included."""
+        return dict(self._counted + Counter(self._stage.counters))
 
     def _begin(self) -> None:
         stage = self._spec.build()
@@ -93,5 +99,6 @@ class StageLife:
         else:
             self._failed_ns.append(arrival_ns)
             self.restarts += 1
+            self._counted += Counter(self._stage.counters)
             self._begin()
             self._tell(f"{self.name} starts afresh", error)

@@ -223,6 +223,7 @@ def _summary(run: Finished, asked: Asked) -> dict[str, Any]:
             for t in results.transitions
         ],
         "warnings": run.warnings,
+        "counters": report.counters,
         "wall_s": round(run.wall_s, 3),
         "compute_ms": {
             name: {
@@ -253,7 +254,6 @@ def _live(report: LiveReport) -> dict[str, Any]:
         "missed_deadlines": report.missed,
         "edges": edges,
         "links": {name: asdict(link) for name, link in report.links.items()},
-        "counters": report.counters,
         "restarts": report.restarts,
         "failures": report.failures,
         "switched_off": report.off,

@@ -125,7 +125,11 @@ class LiveView:
         for name, link in report.links.items():
             told = ", ".join(f"{key} {value}" for key, value in report.counters.get(name, {}).items() if value)
             links.add_row(name, str(link.records), Text(f"{link.state}  {told}", overflow="ellipsis", no_wrap=True))
-        return Group(head, edges, links)
+        others = Table("others", "counts", box=None, pad_edge=False)
+        for name, counted in report.counters.items():
+            if name not in report.links and any(counted.values()):
+                others.add_row(name, ", ".join(f"{key} {value}" for key, value in counted.items() if value))
+        return Group(head, edges, links, others) if others.row_count else Group(head, edges, links)
 
 
 def _numbers(report: LiveReport) -> str:

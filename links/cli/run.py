@@ -204,6 +204,14 @@ def _tell(run: Finished) -> None:
     if results.pose_states:
         states = ", ".join(f"{count} {state}" for state, count in results.pose_states.items())
         out.print(f"fused poses: {states}; {results.resets} jumps")
+    left_out = [
+        f"{name}: {count} {what}"
+        for name, told in report.counters.items()
+        for what, count in told.items()
+        if what.startswith("refused") and count
+    ]
+    if left_out:
+        out.print(f"left out: {'; '.join(left_out)}", markup=False)
     if run.usage is not None and str(run.usage):
         out.print(f"used: {run.usage}")
     out.print(f"output hash {run.digest}")

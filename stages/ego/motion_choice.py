@@ -61,6 +61,11 @@ class VehicleMotionChoice(Stage):
         """Words left out, by reason."""
         return self._refused
 
+    @property
+    def counters(self) -> dict[str, int]:
+        """What is refused."""
+        return {f"refused: {why}": count for why, count in self._refused.items()}
+
     def on_odometry(self, motion: VehicleMotion) -> VehicleMotion | None:
         """The vehicle's own odometry, passed on at once."""
         return self._tell(Teller.ODOMETRY, motion)

@@ -108,6 +108,10 @@ class Brittle(Stage):
             raise ArithmeticError(f"cannot bear {number.value:g}")
         return Number(stamp_ns=self._taken, value=2 * number.value)
 
+    @property
+    def counters(self) -> dict[str, int]:
+        return {"taken": self._taken}
+
 
 class Gate(Stage):
     """Passes numbers on, but stands still in each until a test opens it."""

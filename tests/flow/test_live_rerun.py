@@ -63,6 +63,7 @@ def test_a_live_run_taken_again_has_its_hash_with_all_drops_and_restarts(tmp_pat
     assert same == digest
     assert second.messages == report.messages
     assert rerun.left == {}
+    assert second.counters["brittle"] == report.counters["brittle"]
     assert second.nodes["brittle"].calls == report.nodes["brittle"].calls
     live = {(i.node, i.text, i.count) for i in report.incidents}
     assert {(i.node, i.text, i.count) for i in rerun.incidents.all} == live

@@ -122,6 +122,7 @@ def test_a_stage_that_raises_starts_afresh_and_the_rest_flies_on(tmp_path):
     assert collector_of(live).take(3) == [2.0, 6.0, 8.0]
     report = live.stop()
     assert (report.restarts, report.off) == ({"brittle": 1}, [])
+    assert report.counters["brittle"] == {"taken": 4}, "of both objects"
     (text,) = [str(i) for i in report.incidents]
     assert text.startswith("brittle: brittle.number failed at 0.000001 s: ArithmeticError: cannot bear 666")
     assert text.endswith("brittle starts afresh")

@@ -43,6 +43,7 @@ def test_producers_run_before_consumers_and_ports_in_their_order(tmp_path):
         ("add.text", None),
     ]
     assert report.messages == {"numbers.number": 1, "double.number": 1, "add.sum": 2, "add.text": 1}
+    assert report.counters == {"double": {"doubled": 1}}
 
 
 def test_a_message_keeps_its_stamp_and_the_tap_sees_the_arrival(tmp_path):

@@ -66,9 +66,15 @@ class Double(Stage):
 
     factor: float = Field(2.0, gt=0)
     unused_option: bool = False
+    _doubled: int = PrivateAttr(default=0)
 
     def on_number(self, number: Number) -> Number:
+        self._doubled += 1
         return Number(stamp_ns=number.stamp_ns, value=number.value * self.factor)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        return {"doubled": self._doubled}
 
 
 class Add(Stage):

@@ -133,8 +133,15 @@ class Harmonic(_Settings):
     phase_deg: float = 0.0
 
 
+UNCALIBRATED_DEG = 0.3  # of an MX-28 as it is bought: the encoder's error, half the gear's play, a zero set by eye
+
+
 def _is_zero(value: float) -> bool:
     return value == 0.0
+
+
+def _is_uncalibrated(value: float) -> bool:
+    return value == UNCALIBRATED_DEG
 
 
 class LidarMount(_Settings):
@@ -143,7 +150,8 @@ class LidarMount(_Settings):
     angle = sign * (servo position - zero) - encoder error. `turns: false` is a LiDAR bolted down, without servo.
     A servo stamp is corrected by `servo_time_offset_s` before interpolation (positive: the servo's stamps are early).
     `servo_play_deg` is the gear's play, end to end: the table hangs back by half of it (`stages/turntable.py`). A file
-    holds it only where there is some.
+    holds it only where there is some. `pointing_sigma_deg` is how well the angle is known, one sigma, of an error that
+    lasts; `grd calibrate` writes it.
     """
 
     T_vehicle_turntable: Pose = Pose()
@@ -154,6 +162,7 @@ class LidarMount(_Settings):
     servo_time_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     servo_harmonics: tuple[Harmonic, ...] = ()
     servo_play_deg: Annotated[float, Field(ge=0, le=5, exclude_if=_is_zero)] = 0.0
+    pointing_sigma_deg: Annotated[float, Field(ge=0, le=5, exclude_if=_is_uncalibrated)] = UNCALIBRATED_DEG
 
     def turntable_rad(self, servo_rad: Angle) -> Angle:
         """Turntable angle for servo encoder positions, one or (n,) [rad]."""

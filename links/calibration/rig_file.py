@@ -49,6 +49,7 @@ def mount_tree(mount: LidarMount) -> dict[str, Any]:
             for term in mount.servo_harmonics
         ],
         "servo_play_deg": round(mount.servo_play_deg, DIGITS),
+        "pointing_sigma_deg": round(mount.pointing_sigma_deg, 3),
     }
 
 

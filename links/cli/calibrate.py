@@ -92,6 +92,9 @@ def calibrate_recording(
             f"the zero is written as {found.mount.servo_zero_deg:.4f} deg: it takes back the mean of the encoder's "
             "error, so that the sweep as a whole points where it pointed before"
         )
+    out.print(
+        f"the rig takes the servo's angle as known to {found.mount.pointing_sigma_deg:.2f} deg, a zero set by eye in it"
+    )
     before_mm, after_mm = (1e3 * t for t in found.thickness.medians_m)
     out.print(
         f"encoder's error over the sweep known to {math.degrees(found.curve_sigma_rad):.4f} deg (one sigma), its mean, "

@@ -1,6 +1,7 @@
 """The host's clock as a source: a tick so many times a second, so that a run goes on though every sensor is silent.
 
 A tick's stamp is the moment that was meant, its arrival when the thread came to it; a busy machine makes them differ.
+The moments are whole multiples of the period, as those of the fused poses are: a pose does not wait for the next tick.
 Ticks that it missed altogether are left out, not made up for. A replay takes the recorded ticks.
 
 Source: ours; links/host_time.py (a wall clock that is set moves no tick).
@@ -46,7 +47,7 @@ class Clock(Source):
 
     def _ticks(self, closed: threading.Event) -> Iterator[Record]:
         period_ns = round(1e9 / self.rate_hz)
-        due_ns = host_time.now_ns() + period_ns
+        due_ns = (host_time.now_ns() // period_ns + 1) * period_ns
         while not closed.wait(max(0, due_ns - host_time.now_ns()) * 1e-9):
             now_ns = host_time.now_ns()
             if now_ns < due_ns:

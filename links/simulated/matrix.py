@@ -31,6 +31,7 @@ from links.simulated.vehicle_odometry import VehicleOdometrySettings
 from links.simulated.weather import Weather
 from links.simulated.world import SceneSettings
 from links.simulated.world.settings import Kind
+from stages.calibration.calibrate import ZERO_SIGMA_DEG
 
 RANGES_M = (10, 20, 30, 45, 60)
 MOTIONS = ("hover", "orbit", "cross", "fast", "overhead", "climb")
@@ -107,7 +108,11 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
     drones = tuple(DroneSettings.model_validate({"path": path} | look) for path in flown)
     what = f"{cell.motion} at {cell.range_m} m" if drones else "no drone"
     straight = RigLidar()
-    found = {"servo_harmonics": Turned(SERVO, seed).harmonics(), "servo_play_deg": SERVO.backlash_deg}
+    found = {
+        "servo_harmonics": Turned(SERVO, seed).harmonics(),
+        "servo_play_deg": SERVO.backlash_deg,
+        "pointing_sigma_deg": ZERO_SIGMA_DEG,  # as `grd calibrate` writes it
+    }
     known = straight.mount.model_copy(update=found)
     true_mount = straight.mount if conditions.calibrated else None
     if built is not None:

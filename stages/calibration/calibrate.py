@@ -16,7 +16,7 @@ from stages.calibration.motion import drift, shift
 from stages.calibration.patches import Patches, thickness_m
 from stages.calibration.servo_mount import ServoMount, lidar_mount, servo_mount
 from stages.calibration.solve import COARSE_RAD, Solution, linearise, solve
-from stages.calibration.verdict import Finding, Travel, accepted, curve_sigmas, judge
+from stages.calibration.verdict import CURVE, Finding, Travel, accepted, curve_sigmas, judge
 from stages.geometry import Array64, LidarMount
 
 LEAST_TRAVEL_RAD = math.radians(40.0)  # the fan is 30 deg wide: less, and nothing is seen at two angles
@@ -42,6 +42,9 @@ class Thickness:
     def medians_m(self) -> tuple[float, float]:
         """Of the patches, before and after."""
         return float(np.median(self.before_m)), float(np.median(self.after_m))
+
+
+ZERO_SIGMA_DEG = 0.1  # the zero against the vehicle's axes, which no sweep tells: 2 mm in a metre
 
 
 @dataclass(frozen=True)
@@ -105,8 +108,12 @@ def calibrate(
     )
     patches = solution.system.patches
     centre = patches.centre_m
+    mount = lidar_mount(written, rig)
+    if {f.name for f in findings if not f.refused}.issuperset({*CURVE, "play"}):
+        pointing_deg = math.hypot(ZERO_SIGMA_DEG, math.degrees(curve_rad), math.degrees(mean_rad))
+        mount = mount.model_copy(update={"pointing_sigma_deg": pointing_deg})
     return Calibration(
-        mount=lidar_mount(written, rig),
+        mount=mount,
         findings=findings,
         covariance=solution.covariance,
         curve_sigma_rad=curve_rad,

@@ -20,7 +20,7 @@ from stages.fuse.chain import PERIOD_NS, Chain
 from stages.fuse.motion_yaw import DOUBT, Point
 from stages.fuse.motions import WAIT_NS, Motions
 from stages.fuse.north import North
-from stages.fuse.positions import GATE, Positions
+from stages.fuse.positions import GATE, Positions, Told
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.witness import Witness
 from stages.fuse.yaw import apart_rad
@@ -172,31 +172,35 @@ class Estimator:
         R_start_vehicle, t = self.motions.vehicle.at(stamp_ns)
         z = R_start_vehicle @ fix.xyz_vehicle_m + t
         ahead_m2, _, _ = self.motions.vehicle_ahead_m2(stamp_ns, fix.xyz_vehicle_m)
-        told_m2 = R_start_vehicle @ (fix.covariance_m2 + ahead_m2) @ R_start_vehicle.T
+        lasting_m2 = fix.lasting_m2
+        told = Told(
+            R_start_vehicle @ (fix.covariance_m2 + ahead_m2) @ R_start_vehicle.T,
+            None if lasting_m2 is None else R_start_vehicle @ lasting_m2 @ R_start_vehicle.T,
+        )
         if not self.positions.known:
-            self.positions.find(fix, z, told_m2)
+            self.positions.find(fix, z, told)
             return
         R, expected_m, covariance = self.at(stamp_ns)
         expected_m2 = covariance[3:, 3:] if R is None else position_covariance(covariance, R)
-        taken = self.positions.takes(stamp_ns, z - expected_m, expected_m2, told_m2)
+        taken = self.positions.takes(stamp_ns, z - expected_m, expected_m2, told)
         if taken is None:
             return
         if not taken:
-            self._find_anew(fix, z, told_m2)
+            self._find_anew(fix, z, told)
             return
         worth = self.positions.worth(stamp_ns)
         if R is not None:
             self.chain.add_position(stamp_ns, R, z, worth * self.positions.fix_covariance_m2)
         self.positions.follow(stamp_ns, z, worth, R)
         self._witness.see_fix(fix)
-        self._watch_motion(stamp_ns, z, told_m2)
+        self._watch_motion(stamp_ns, z, told.whole_m2)
 
-    def _find_anew(self, fix: DroneFix, z: Array64, told_m2: Array64) -> None:
+    def _find_anew(self, fix: DroneFix, z: Array64, told: Told) -> None:
         """The fixes agree with each other and not with what is believed."""
         if self.chain.running and self.from_streets:
             self.north.heading.contradict("the LiDAR's positions deny the heading that the streets tell")
         self.lose()
-        self.positions.find(fix, z, told_m2)
+        self.positions.find(fix, z, told)
         self.north.yaw = None
         self.north.by_motion.restart()
         self._witness.restart()

@@ -96,6 +96,12 @@ class Fuse(Stage):
         return self._intake.refused
 
     @property
+    def counters(self) -> dict[str, int]:
+        """What is refused, and how often the back end began anew."""
+        begun = {"back end begun anew": self.recoveries} if self.recoveries else {}
+        return {f"refused: {why}": count for why, count in self.refused.items()} | begun
+
+    @property
     def recoveries(self) -> int:
         """How often the back end had to be begun anew after an error of its library."""
         return self._estimator.chain.back.recoveries
@@ -141,8 +147,9 @@ class Fuse(Stage):
     def on_fix(self, fix: DroneFix) -> Told:
         """A LiDAR position."""
         velocity = () if fix.velocity_vehicle_mps is None else (fix.velocity_vehicle_mps,)
-        numbers = (fix.xyz_vehicle_m, fix.covariance_m2, *velocity)
-        if self._intake.sound(fix, "fix", *numbers) and self._intake.covariant(fix.covariance_m2, "fix"):
+        lasting_m2 = np.zeros((3, 3)) if fix.lasting_m2 is None else fix.lasting_m2
+        numbers = (fix.xyz_vehicle_m, fix.covariance_m2, lasting_m2, *velocity)
+        if self._intake.sound(fix, "fix", *numbers) and self._intake.covariant(fix.covariance_m2 - lasting_m2, "fix"):
             self._waiting.append(fix)
         yield from self._tell(fix)
 
@@ -228,7 +235,7 @@ class Fuse(Stage):
         """The estimate carried to now, with what never averages out added."""
         e = self._estimator
         R, xyz_m, covariance = e.at(now_ns)
-        lasting = self.errors.fix_lasting * e.positions.fix_covariance_m2
+        lasting = e.positions.lasting_m2
         unsure = R is not None and yaw_sigma_rad(R, covariance) > math.radians(self.limits.yaw_sigma_deg)
         whole = covariance.copy()
         if R is None or unsure:

@@ -9,6 +9,7 @@ Source: DESIGN, Fusion; ours.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,13 @@ HELD_MPS = 0.1  # noise of the autopilot's velocity beside its drift, and of its
 GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
 
 
+class Told(NamedTuple):
+    """What a fix says of its error, start axes."""
+
+    whole_m2: Array64  # (3, 3)
+    lasting_m2: Array64 | None  # what of it is the same from fix to fix
+
+
 class Positions:
     """Of the drone that is followed."""
 
@@ -37,7 +45,8 @@ class Positions:
         """No position is known."""
         self.free, self.left = Drift(self._errors, odometry=False), Drift(self._errors, odometry=True)
         self.fix_ns: int | None = None
-        self.fix_covariance_m2 = np.zeros((3, 3))  # start axes, of the newest used
+        self.fix_covariance_m2 = np.zeros((3, 3))  # start axes, of the newest used: what averages out,
+        self.lasting_m2 = np.zeros((3, 3))  # and what never does
         self.nis = math.nan
         self._refused = Rejected()
         self._worth = Worth(self._errors.fix_time_s)
@@ -47,26 +56,36 @@ class Positions:
         """Whether there is a position."""
         return self.free.stamp_ns is not None
 
-    def find(self, fix: DroneFix, z: Array64, told_m2: Array64) -> None:
+    def find(self, fix: DroneFix, z: Array64, told: Told) -> None:
         """The first fix, or the first that is believed again."""
         velocity = fix.velocity_vehicle_mps
         if velocity is not None:
             velocity = self._motions.vehicle.to_local(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
-        self.free.start(fix.stamp_ns, z, told_m2, velocity)
-        self.fix_ns, self.fix_covariance_m2 = fix.stamp_ns, self._errors.fix_variance * told_m2
+        self.free.start(fix.stamp_ns, z, told.whole_m2, velocity)
+        self.fix_ns = fix.stamp_ns
+        self._believe(told)
 
-    def takes(self, stamp_ns: int, off_m: Array64, expected_m2: Array64, told_m2: Array64) -> bool | None:
+    def takes(self, stamp_ns: int, off_m: Array64, expected_m2: Array64, told: Told) -> bool | None:
         """Whether a fix is within the gate; None: it is not; False: nor were those before, and they agree."""
-        nis = distance2(off_m, expected_m2 + told_m2)
+        nis = distance2(off_m, expected_m2 + told.whole_m2)
         if not nis <= GATE:
-            return False if self._refused.add(stamp_ns, off_m, told_m2) else None
+            return False if self._refused.add(stamp_ns, off_m, told.whole_m2) else None
         self._refused.clear()
-        self.nis, self.fix_covariance_m2 = nis, self._errors.fix_variance * told_m2
+        self.nis = nis
+        self._believe(told)
         return True
+
+    def _believe(self, told: Told) -> None:
+        variance, share = self._errors.fix_variance, self._errors.fix_lasting
+        if told.lasting_m2 is None:
+            self.fix_covariance_m2 = (1.0 - share) * variance * told.whole_m2
+            self.lasting_m2 = share * variance * told.whole_m2
+        else:
+            self.fix_covariance_m2, self.lasting_m2 = variance * (told.whole_m2 - told.lasting_m2), told.lasting_m2
 
     def worth(self, stamp_ns: int) -> float:
         """Factor for the variance of the fix just taken."""
-        return (1.0 - self._errors.fix_lasting) * self._worth.factor(stamp_ns)
+        return self._worth.factor(stamp_ns)
 
     def follow(self, stamp_ns: int, z: Array64, worth: float, R_start_drone: Array64 | None) -> None:
         """A fix that was taken: velocity without odometry, and what odometry leaves over."""
@@ -75,7 +94,7 @@ class Positions:
         v1 = trail.velocity_own_mps(stamp_ns)
         turned_mps = 0.0 if v0 is None or v1 is None else float(np.linalg.norm(v1 - v0))
         self.free.q = self._manoeuvre(stamp_ns)
-        self.free.see(stamp_ns, z, covariance_m2, None, turned_mps)
+        self.free.see(stamp_ns, z, covariance_m2 + self.lasting_m2, None, turned_mps)
         self.fix_ns = max(stamp_ns, self.fix_ns or stamp_ns)
         R_own, last_ns = self._motions.R_own_drone(stamp_ns), self.left.stamp_ns
         if R_start_drone is None or R_own is None:

@@ -25,7 +25,8 @@ class FuseErrors(BaseModel):
     manoeuvre_told: float = Field(default=0.7, gt=0)  # beside the change of velocity that its autopilot tells
     fix_variance: float = Field(default=0.65, gt=0)  # a fix's true variance over the one told; trackers are careful
     fix_time_s: float = Field(default=0.2, ge=0)  # for which the error of a fix lasts
-    fix_lasting: float = Field(default=0.25, ge=0, lt=1)  # share of its variance that never averages out: calibration
+    # share of its variance that never averages out (calibration), where the tracker does not tell it itself
+    fix_lasting: float = Field(default=0.25, ge=0, lt=1)
     rotation_time_s: float = Field(default=1.0, ge=0)  # for which an error of the vanishing points lasts
     rotation_lasting: float = Field(default=0.2, ge=0, lt=1)
 

@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
-from stages.geometry import Array64
+from stages.geometry import Array64, LidarMount
 from stages.messages import (
     Candidates,
     Detections,
@@ -49,6 +49,7 @@ class HitMissTrack(Stage):
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion", "drone_position", "drone_odometry"})
 
+    mount: LidarMount = LidarMount()  # of it, how well the servo's angle is known
     span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
     hull_share: float = Field(0.075, ge=-1, le=1)  # of its span: the centre lies so far behind the mean of its returns
     max_drones: int = Field(1, ge=1, le=8)
@@ -60,8 +61,10 @@ class HitMissTrack(Stage):
     lost_after_s: float = Field(6.0, gt=0)  # later where the drone tells its flight, as long as
     lost_sigma_m: float = Field(5.0, gt=0)  # it is known as well as this
     start_sigma_mps: float = Field(1.5, gt=0)  # of the detector's velocity
-    pointing_deg: float = Field(0.1, ge=0)  # encoder, play, calibration: constant or slow, one sigma
-    range_sigma_m: float = Field(0.03, ge=0)  # of the LiDAR, constant: VLP-16 data sheet 63-9229, accuracy +-3 cm
+    tilt_deg: float = Field(0.05, ge=0)  # of the servo's axis against the vehicle's, about x and y, one sigma each
+    range_sigma_m: float = Field(
+        0.017, ge=0
+    )  # of the LiDAR, constant: VLP-16 data sheet 63-9229, +-3 cm, taken as even
     shape_share: float = Field(0.05, ge=0, le=1)  # of its span: returns lie so far off its middle, one sigma, an axis
     misses: bool = True  # ablation: without, only hits count
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
@@ -212,7 +215,7 @@ class HitMissTrack(Stage):
         x, P = self._known.at(track, now_ns)
         R, _ = self._trail.at(now_ns)
         xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
-        covariance = self._whole_covariance(xyz, R.T @ P[:3, :3] @ R)
+        covariance = R.T @ P[:3, :3] @ R + self._lasting_covariance(xyz)
         if silent_s > self.coast_after_s:  # what is seen is seen from the vehicle, wherever that is
             covariance += self._unsure_vehicle_m2(now_ns, xyz)
         track.told_ns = now_ns
@@ -259,23 +262,27 @@ class HitMissTrack(Stage):
         x, P = self._known.at(track, track.last_hit_ns)
         R, _ = self._trail.at(track.last_hit_ns)
         xyz, velocity = self._trail.to_vehicle(track.last_hit_ns, x[:3], x[3:])
+        lasting_m2 = self._lasting_covariance(xyz)
         return DroneFix(
             stamp_ns=track.last_hit_ns,
             xyz_vehicle_m=xyz,
-            covariance_m2=self._whole_covariance(xyz, R.T @ P[:3, :3] @ R),
+            covariance_m2=R.T @ P[:3, :3] @ R + lasting_m2,
             hits=track.hits,
             iterations=1,
             shift_m=0.0,
             track_id=track.number,
             velocity_vehicle_mps=velocity,
+            lasting_m2=lasting_m2,
         )
 
-    def _whole_covariance(self, xyz_vehicle_m: Array64, covariance_m2: Array64) -> Array64:
-        """The filter's (3, 3), and what does not average out: the turntable's angle, the range, the drone's outline.
+    def _lasting_covariance(self, xyz_vehicle_m: Array64) -> Array64:
+        """What does not average out (3, 3): the turntable's zero and tilt, the range, the drone's outline.
 
         Axes of the vehicle; the line of sight is taken from its origin, decimetres beside the LiDAR's.
         """
         along = xyz_vehicle_m * (self.range_sigma_m / max(float(np.linalg.norm(xyz_vehicle_m)), 1e-9))
-        level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * math.radians(self.pointing_deg)
-        lasting_m2 = np.outer(level, level) + np.outer(along, along) + (self.shape_share * self.span_m) ** 2 * np.eye(3)
-        return covariance_m2 + lasting_m2
+        level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * math.radians(self.mount.pointing_sigma_deg)
+        x, y, z = xyz_vehicle_m * math.radians(self.tilt_deg)
+        tilted = np.outer([0.0, -z, y], [0.0, -z, y]) + np.outer([z, 0.0, -x], [z, 0.0, -x])
+        outline = (self.shape_share * self.span_m) ** 2 * np.eye(3)
+        return np.outer(level, level) + tilted + np.outer(along, along) + outline

@@ -18,8 +18,7 @@ def test_ticks_lie_evenly_in_time_and_are_never_early():
     began_ns = host_time.now_ns()
     with clock.listen() as records:
         ticks = [next(records) for _ in range(20)]
-    steps = {(b.stamp_ns - a.stamp_ns) % 5_000_000 for a, b in pairwise(ticks)}
-    assert steps == {0}, "a tick that was missed is left out, the others stay where they belong"
+    assert {tick.stamp_ns % 5_000_000 for tick in ticks} == {0}, "on whole periods; one that was missed is left out"
     assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(ticks))
     assert all(began_ns < tick.stamp_ns <= tick.arrival_ns <= host_time.now_ns() for tick in ticks)
     assert {(tick.topic, tick.data) for tick in ticks} == {("/clock", b"")}

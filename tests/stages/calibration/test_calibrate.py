@@ -11,6 +11,7 @@ from stages.calibration.parameters import PARAMETERS
 from stages.calibration.servo_mount import servo_mount
 from stages.calibration.solve import NAMES
 from stages.calibration.verdict import CURVE, Finding, Travel, accepted, curve_rows, values_of
+from stages.geometry import UNCALIBRATED_DEG
 from tests.stages.calibration.made_sweep import FAST, GROUND, RIG, SLOW, STEP_RAD, YARD, sweep, wrong_mount
 from tests.stages.made import START_NS
 
@@ -76,6 +77,11 @@ def test_the_zero_is_never_told_and_stays(yard):
     assert "no scene tells it" in refused(found)["zero"]
 
 
+def test_the_rig_says_how_well_the_servos_angle_is_known_now(yard):
+    *_, found = yard
+    assert 0.1 <= found.mount.pointing_sigma_deg < 0.15, "no less than a zero that nobody has told"
+
+
 def test_sigmas_hold_over_many_yards():
     scores, nees = [], []
     for seed in range(1, 7):
@@ -116,6 +122,7 @@ def test_one_speed_does_not_tell_the_clock_from_the_play():
     _, found = found_in(legs=((0.0, 180.0, SLOW), (180.0, 0.0, SLOW)))
     assert "one speed only" in refused(found)["time"]
     assert "one speed only" in refused(found)["play"]
+    assert found.mount.pointing_sigma_deg == UNCALIBRATED_DEG
 
 
 def test_an_open_field_tells_tilts_but_no_turn():

@@ -72,6 +72,8 @@ class Made:
     fix_sigma_m: float = 0.06
     fix_time_s: float = 0.15
     fix_lasting: float = 0.2
+    bias_m: float = 0.0  # of all fixes of a flight, one sigma an axis, beside that
+    bias_told: bool = True  # whether a fix says so
     told_variance: float = 1.6  # of a fix, over the true one: trackers are careful
     rotation_sigma_deg: float = 0.3
     rotation_time_s: float = 1.0
@@ -181,10 +183,11 @@ class Made:
     def _fixes(self, rng):
         times = np.arange(0.25, self.until_s, 0.1) + rng.uniform(-0.02, 0.02, len(np.arange(0.25, self.until_s, 0.1)))
         lasting = math.sqrt(self.fix_lasting) * self.fix_sigma_m * rng.standard_normal(3)
+        bias = np.zeros(3) if self.bias_m == 0 else np.random.default_rng([self.seed, 78]).normal(0, self.bias_m, 3)
         e = gauss_markov(rng, math.sqrt(1 - self.fix_lasting) * self.fix_sigma_m, self.fix_time_s, 0.1, len(times))
         for i, t in enumerate(times):
             R_world_vehicle, _ = self.T_world_vehicle(t)
-            xyz = self.truth(t)[1] + e[i] + lasting
+            xyz = self.truth(t)[1] + e[i] + lasting + bias
             if rng.random() < self.outliers.get("fix", 0.0):
                 xyz = xyz + rng.normal(0, 4.0, 3)
             yield (
@@ -193,13 +196,20 @@ class Made:
                 fix(
                     t,
                     xyz,
-                    math.sqrt(self.told_variance) * self.fix_sigma_m,
+                    math.hypot(math.sqrt(self.told_variance) * self.fix_sigma_m, self.bias_m),
+                    lasting_m2=self._lasting_m2(),
                     velocity=R_world_vehicle.T @ (self.velocity_mps(t) - [self.vehicle_mps, 0, 0])
                     + rng.normal(0, 0.3, 3),
                 ),
             )
             if self.tracks:
                 yield t + 0.012, "track", track(t, TrackingState.TRACKING)
+
+    def _lasting_m2(self):
+        if self.bias_m == 0 or not self.bias_told:
+            return None
+        own = self.fix_lasting * self.fix_sigma_m**2
+        return (own + self.bias_m**2) * np.eye(3)
 
     def _rotations(self, rng):
         times = np.arange(0.3, self.until_s, 0.2) if self.rotations else np.array([])
@@ -296,7 +306,7 @@ def ns(t) -> int:
     return START_NS + round(float(t) * S)
 
 
-def fix(t, xyz, sigma=0.06, track_id=1, velocity=None) -> DroneFix:
+def fix(t, xyz, sigma=0.06, track_id=1, velocity=None, lasting_m2=None) -> DroneFix:
     return DroneFix(
         stamp_ns=ns(t),
         xyz_vehicle_m=np.asarray(xyz, dtype=float),
@@ -306,6 +316,7 @@ def fix(t, xyz, sigma=0.06, track_id=1, velocity=None) -> DroneFix:
         shift_m=0.0,
         track_id=track_id,
         velocity_vehicle_mps=velocity,
+        lasting_m2=lasting_m2,
     )
 
 

@@ -71,6 +71,18 @@ def test_taking_lasting_errors_for_fleeting_ones_promises_too_much():
     assert proud.mean() > 2 * honest.mean()
 
 
+@pytest.mark.parametrize("how", [{}, {"rotations": False, "autopilot": "none"}])
+def test_an_error_that_all_fixes_share_does_not_average_out_where_they_say_so(how):
+    """Told, the bias is in the covariance; not told, a fourth of the variance is taken to last, and that is too little."""
+    mean = {}
+    for told in (True, False):
+        made = flights(8, until_s=7, bias_m=0.12, bias_told=told, **how)
+        nees = [flight.judge(flight.run(Fuse()), after_s=3).nees3 for flight in made]
+        mean[told] = np.mean([n for one in nees for n in one])
+    assert 1.5 < mean[True] < 4.5
+    assert mean[False] > 1.4 * mean[True]
+
+
 def test_a_heading_by_motion_is_never_another_quarter():
     made = [
         Made(seed=seed, rotations=False, until_s=8, radius_m=radius, speed_mps=speed, local_yaw_deg=37.0 * seed)

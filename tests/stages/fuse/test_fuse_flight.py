@@ -350,6 +350,8 @@ def test_the_wanted_track_is_the_only_one_followed():
         (fix(0.5, [0, 0, 10], sigma=0.0), "fix: its covariance is not positive definite"),
         (fix(0.5, [0, 0, 10], sigma=math.nan), "fix: not finite"),
         (fix(0.5, [0, 0, 10], velocity=np.array([0, math.inf, 0])), "fix: not finite"),
+        (fix(0.5, [0, 0, 10], lasting_m2=np.full((3, 3), math.nan)), "fix: not finite"),
+        (fix(0.5, [0, 0, 10], lasting_m2=np.eye(3)), "fix: its covariance is not positive definite"),
         (fix(3000.0, [0, 0, 10]), "fix: from the future"),
         (fix(-30.0, [0, 0, 10]), "fix: older than the lag"),
     ],

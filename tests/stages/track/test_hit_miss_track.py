@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
+from stages.geometry import LidarMount
 from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
 from stages.track import HitMissTrack
 from stages.track.hit_miss_track import LOOK_OVER_NS
@@ -243,24 +244,48 @@ def test_misses_make_the_estimate_better_and_its_covariance_truer():
     assert np.mean(nees[True]) < 4.0  # 3 would be as stated
 
 
+CERTAIN = {"shape_share": 0.0, "range_sigma_m": 0.0, "mount": LidarMount(pointing_sigma_deg=0.0), "tilt_deg": 0.0}
+
+
+def lasting(place, **sigmas):
+    return HitMissTrack(**{**CERTAIN, **sigmas})._lasting_covariance(np.array(place))
+
+
 def test_pointing_makes_it_less_sure_the_farther_away_and_only_about_the_axis():
-    stage = HitMissTrack(shape_share=0.0, range_sigma_m=0.0, pointing_deg=1.0)
-    added = stage._whole_covariance(np.array([0.0, 20.0, 5.0]), np.zeros((3, 3)))
+    added = lasting((0.0, 20.0, 5.0), mount=LidarMount(pointing_sigma_deg=1.0))
     np.testing.assert_allclose(added, np.diag([(20 * math.radians(1)) ** 2, 0, 0]), atol=1e-12)
 
 
+def test_a_tilted_axis_moves_what_is_low_up_and_down_and_what_is_overhead_sideways():
+    arm = math.radians(1.0)
+    low, overhead = lasting((20.0, 0.0, 0.0), tilt_deg=1.0), lasting((0.0, 0.0, 20.0), tilt_deg=1.0)
+    np.testing.assert_allclose(low, np.diag([0, 0, (20 * arm) ** 2]), atol=1e-12)
+    np.testing.assert_allclose(overhead, np.diag([(20 * arm) ** 2, (20 * arm) ** 2, 0]), atol=1e-12)
+    place = np.array([7.0, -4.0, 9.0])  # as many tilts drawn give it
+    tilts = np.random.default_rng(1).normal(0.0, arm, (20_000, 2))
+    moved = np.cross(np.pad(tilts, ((0, 0), (0, 1))), place)
+    np.testing.assert_allclose(lasting(place, tilt_deg=1.0), moved.T @ moved / len(moved), rtol=0.05, atol=2e-4)
+
+
+def test_a_fix_tells_what_of_its_covariance_is_the_same_in_the_next_one():
+    way = still(0.0, 8.0, 10.0)
+    fixes = fixes_of(run([Drone(way)], [accepted(here(way))], 1.5))
+    assert fixes
+    for fix in fixes:
+        np.testing.assert_array_equal(fix.lasting_m2, HitMissTrack()._lasting_covariance(fix.xyz_vehicle_m))
+        assert np.linalg.eigvalsh(fix.covariance_m2 - fix.lasting_m2).min() > 0
+
+
 def test_the_lidars_range_is_as_unsure_as_its_data_sheet_says_along_the_line_of_sight_alone():
-    stage = HitMissTrack(shape_share=0.0, range_sigma_m=0.03, pointing_deg=0.0)
     for place in ((0.0, 20.0, 0.0), (3.0, 0.0, 4.0)):
         line = np.array(place) / np.linalg.norm(place)
-        added = stage._whole_covariance(np.array(place), np.zeros((3, 3)))
+        added = lasting(place, range_sigma_m=0.03)
         np.testing.assert_allclose(added, 0.03**2 * np.outer(line, line), atol=1e-15)
 
 
 def test_a_larger_drones_outline_tells_less_of_its_middle():
     for span_m in (0.35, 0.8):
-        stage = HitMissTrack(span_m=span_m, shape_share=0.05, range_sigma_m=0.0, pointing_deg=0.0)
-        added = stage._whole_covariance(np.array([0.0, 20.0, 5.0]), np.zeros((3, 3)))
+        added = lasting((0.0, 20.0, 5.0), span_m=span_m, shape_share=0.05)
         np.testing.assert_allclose(added, (0.05 * span_m) ** 2 * np.eye(3), atol=1e-15)
 
 

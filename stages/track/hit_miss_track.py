@@ -65,7 +65,7 @@ class HitMissTrack(Stage):
     range_sigma_m: float = Field(
         0.017, ge=0
     )  # of the LiDAR, constant: VLP-16 data sheet 63-9229, +-3 cm, taken as even
-    shape_share: float = Field(0.05, ge=0, le=1)  # of its span: returns lie so far off its middle, one sigma, an axis
+    shape_share: float = Field(0.03, ge=0, le=1)  # of its span: returns lie so far off its middle, one sigma, an axis
     misses: bool = True  # ablation: without, only hits count
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
 

@@ -24,6 +24,7 @@ from stages.messages import LidarFirings, ServoState
 
 MOST_RETURNS = 300_000  # more add seconds and no accuracy: firing sequences are left out evenly
 LASERS = 16
+LIDAR = "links.velodyne.Lidar"
 MIN_RANGE_M = 1.0  # nearer returns are the sensor's own mount and the roof's edge
 
 
@@ -43,11 +44,12 @@ def gather(
     recording: Path, rig_yaml: str | None, part_s: tuple[float, float], progress: Progress | None = None
 ) -> Gathered:
     """Read a recording from and to a time in it [s]; `rig_yaml` stands in for its own rig. Errors are LinkError."""
-    lidar, servo, odometry = Lidar.model_validate({}), Servo.model_validate({}), VehicleOdometry.model_validate({})
+    servo, odometry = Servo.model_validate({}), VehicleOdometry.model_validate({})
     firings: list[LidarFirings] = []
     states: list[ServoState] = []
     places_m: list[Array64] = []
     with RecordingReader(recording) as reader:
+        lidar = lidar_of(reader.config_yaml)
         text = rig_yaml or reader.rig_yaml
         if text is None:
             raise LinkError(f"{recording} holds no rig, which is what is to be improved: give one with --rig FILE")
@@ -75,6 +77,21 @@ def gather(
     trace = ServoTrace.of(np.array([s.stamp_ns for s in states]), np.array([s.position_rad for s in states]), TICK_RAD)
     seconds = (firings[-1].stamp_ns - firings[0].stamp_ns) * 1e-9
     return Gathered(returns_of(firings), trace, rig, mount, driven_m, seconds)
+
+
+def lidar_of(config_yaml: str | None) -> Lidar:
+    """The LiDAR with its clock as the recorded run had it: another would move all its pulses against the servo.
+
+    Free, a sensor's clock is set by the packets that come soonest: late by the shortest way, in the simulated rig 2 ms.
+    """
+    clock: dict[str, object] = {}
+    tree = None if config_yaml is None else yaml.safe_load(config_yaml)
+    links = tree.get("links") if isinstance(tree, dict) else None
+    for node in links.values() if isinstance(links, dict) else ():
+        if isinstance(node, dict) and node.get("use") == LIDAR:
+            config = node.get("config") or {}
+            clock = {name: config[name] for name in ("clock", "clock_limit_s") if name in config}
+    return Lidar.model_validate(clock)
 
 
 def returns_of(firings: list[LidarFirings]) -> Returns:

@@ -18,7 +18,8 @@ from links.cli.console import FINDING, err, in_words, out, progress_bar, show_ta
 from links.cli.files import read_rig
 
 ROUNDING_DEG = 1e-6
-STILL_M = 0.05  # of the vehicle's own odometry over the whole time
+STILL_M = 0.05  # of the vehicle's own odometry over the whole time: so little shows that it stood
+DRIFT_MPS = 0.02  # and this much more may be the odometry's drift: the surfaces tell then
 
 
 @in_words
@@ -66,12 +67,12 @@ def calibrate_recording(
         rig_yaml = None if rig is None else read_rig(rig)
         gathered = gather(recording, rig_yaml, (from_s, math.inf if to_s is None else to_s), progress=step)
     try:
-        if gathered.driven_m is not None and gathered.driven_m > STILL_M:
+        if gathered.driven_m is not None and gathered.driven_m > STILL_M + DRIFT_MPS * gathered.seconds:
             raise CannotCalibrate(
                 f"the vehicle did not stand still: its odometry says that it drove {gathered.driven_m:.2f} m. Take a "
                 "recording of a parked vehicle, or a part of this one in which it stands (--from, --to)"
             )
-        stood = parked or gathered.driven_m is not None
+        stood = parked or (gathered.driven_m is not None and gathered.driven_m <= STILL_M)
         found = calibrate(gathered.returns, gathered.trace, gathered.mount, parked=stood)
     except CannotCalibrate as why:
         err.print(f"{recording}: {why}.", markup=False, style="red")

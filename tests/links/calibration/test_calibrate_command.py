@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from flow.graph import load_graph
-from links.calibration.gather import checked_rig
+from links.calibration.gather import checked_rig, lidar_of
 from links.cli.files import read_rig
 from links.recording import RecordingReader, RecordingWriter
 from tests.links import command
@@ -93,6 +93,30 @@ def test_a_vehicle_that_says_it_drove_is_refused(tmp_path):
     text = grd("calibrate", drove, code=1)
     assert "odometry says that it drove 0." in text
     assert list(tmp_path.iterdir()) == [drove]
+
+
+def test_an_odometry_that_drifts_a_little_while_parked_leaves_it_to_the_surfaces(tmp_path):
+    drifts = tmp_path / "drifts.mcap"
+    with RecordingReader(STREET) as reader, RecordingWriter(drifts, rig_yaml=reader.rig_yaml or "") as writer:
+        begin_ns = reader.start_ns
+        for k, record in enumerate(reader.records(["/lidar/packets", "/servo/state"])):
+            writer.write(replace(record, sequence=2 * k))
+            pose = {
+                "xyz_m": [0.05 + 0.01e-9 * (record.arrival_ns - begin_ns), 0.0, 0.0] if k else [0.0, 0.0, 0.0],
+                "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0],
+                "covariance": None,
+            }
+            writer.write(replace(record, topic="/vehicle/odometry", data=json.dumps(pose).encode(), sequence=2 * k + 1))
+    assert "flat patches" in grd("calibrate", drifts)
+
+
+def test_the_lidars_clock_is_the_recorded_runs():
+    run = (
+        "links: {front: {use: links.velodyne.Lidar, config: {clock: utc, port: 2400}}, cam: {use: links.camera.Camera}}"
+    )
+    assert lidar_of(run).clock == "utc"
+    for other in (None, "seed: 3", "links: null", "links: {front: {use: links.velodyne.Lidar}}", "- 1"):
+        assert lidar_of(other).clock == "free"
 
 
 def test_a_rig_goes_into_a_yaml_file_only(tmp_path):

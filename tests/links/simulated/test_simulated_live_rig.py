@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from flow.link import LinkError, Run
 from links import host_time
@@ -128,3 +129,23 @@ def test_the_fields_stack_flies_against_the_simulated_rig_and_is_repeated_to_its
     again = [*grd, "replay", str(flight / "flight.mcap"), "--as-live", "--out", str(tmp_path / "again")]
     done = subprocess.run(again, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
     assert "the live run's hash was the same" in done.stdout, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_the_sweep_of_a_real_servo_calibrates_the_rig(tmp_path):
+    """As the README says: the sweep is driven, recorded and calibrated from. The true rig is as its file says."""
+    pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
+    grd = [sys.executable, "-c", "from links.cli import main; main()"]
+    sweep, rig = tmp_path / "sweep", tmp_path / "mine.yaml"
+    for words in (
+        ["run", "configs/sim_calibrate_sweep.yaml", "--for", "20", "--out", sweep],
+        ["calibrate", sweep / "flight.mcap", "-o", rig],
+    ):
+        done = subprocess.run(
+            [*grd, *map(str, words)], cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+    mount = yaml.safe_load(rig.read_text())["rig"]["lidar"]["mount"]
+    assert abs(mount["servo_time_offset_s"]) < 2e-4
+    assert abs(mount["servo_play_deg"]) < 0.02
+    assert 0.1 <= mount["pointing_sigma_deg"] < 0.12

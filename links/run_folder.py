@@ -27,7 +27,7 @@ from flow.problem import Place
 from flow.replay import RunReport, replay
 from flow.taps import Digest
 from flow.tree import Section
-from links.recording import Progress, RecordingReader
+from links.recording import Progress, RecordingReader, parts_from, records_of
 from links.result_file import ResultFile
 from links.results import SUMMARY_FILE, Results, stamp_s
 from links.truth import TRUTH_RECORDING, FixErrors, TruthLog
@@ -159,14 +159,20 @@ class RunFolder:
 
 
 def replay_into(folder: Path, recording: Path, asked: Asked, progress: Progress | None = None) -> Finished:
-    """Replay a recording, with its own rig when it has one. Raises ConfigError, LinkError, RunError."""
+    """Replay a recording and the later parts of its run, with its own rig when it has one.
+
+    Raises ConfigError, LinkError, RunError.
+    """
     began_s = time.monotonic()
+    parts, warnings = parts_from(recording)
     with RecordingReader(recording) as reader:
-        graph = asked.graph(reader.rig_yaml, f"{recording} (rig.yaml)")
-        truth, digest = truth_beside(recording), Digest()
-        with RunFolder(folder, recording, asked, graph, began_s) as run:
-            report = replay(graph, truth.aside(reader.records(progress=progress)), (digest, *run.taps))
-            return run.finish(report, digest.hexdigest(), truth, reader.warnings)
+        rig_yaml = reader.rig_yaml
+    graph = asked.graph(rig_yaml, f"{recording} (rig.yaml)")
+    truth, digest = truth_beside(recording), Digest()
+    with RunFolder(folder, recording, asked, graph, began_s) as run:
+        records = records_of(parts, progress=progress, warnings=warnings)
+        report = replay(graph, truth.aside(records), (digest, *run.taps))
+        return run.finish(report, digest.hexdigest(), truth, warnings)
 
 
 def truth_beside(recording: Path) -> TruthLog:

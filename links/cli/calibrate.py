@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flow.link import LinkError
-from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table
+from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table, warn
 from links.cli.files import read_rig
 
 ROUNDING_DEG = 1e-6
@@ -52,6 +52,7 @@ def calibrate_recording(
     Example: grd calibrate parked.mcap -o rig.yaml && grd replay flight.mcap --overlay rig.yaml
     """
     from links.calibration import gather, pictures, rig_text
+    from links.recording import other_parts
     from stages.calibration.calibrate import CannotCalibrate, calibrate
 
     target = out_file or recording.with_suffix(".rig.yaml")
@@ -65,6 +66,8 @@ def calibrate_recording(
         raise LinkError(f"--to {to_s:g} is not after --from {from_s:g}")
     with progress_bar(f"read {recording.name}") as step:
         rig_yaml = None if rig is None else read_rig(rig)
+        if (others := other_parts(recording)) is not None:
+            warn(others)
         gathered = gather(recording, rig_yaml, (from_s, math.inf if to_s is None else to_s), progress=step)
     try:
         if gathered.driven_m is not None and gathered.driven_m > STILL_M + DRIFT_MPS * gathered.seconds:

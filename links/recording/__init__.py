@@ -6,7 +6,7 @@ from links.recording.importing import ImportReport, import_file
 from links.recording.reader import RecordingReader
 from links.recording.recorder import Recorder
 from links.recording.recover import RecoverReport, recover
-from links.recording.session import parts_of, records_of
+from links.recording.session import other_parts, parts_from, parts_of, records_of
 from links.recording.writer import RecordingWriter
 
 __all__ = [
@@ -22,6 +22,8 @@ __all__ = [
     "decode_compressed_image",
     "encode_compressed_image",
     "import_file",
+    "other_parts",
+    "parts_from",
     "parts_of",
     "records_of",
     "recover",

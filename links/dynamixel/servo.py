@@ -26,7 +26,14 @@ from flow.link import LinkError, Record, Source
 from links import host_time
 from links.dynamixel import wire
 from links.dynamixel.drive import DriveSettings
-from links.dynamixel.mx28 import NO_LOAD_RPM, STEPS_PER_TURN, TICK_RAD, VELOCITY_UNIT_RADPS, VELOCITY_UNIT_RPM
+from links.dynamixel.mx28 import (
+    NO_LOAD_RPM,
+    STEPS_PER_TURN,
+    TICK_RAD,
+    VELOCITY_UNIT_RADPS,
+    VELOCITY_UNIT_RPM,
+    named_errors,
+)
 from links.dynamixel.process import ProcessEnded, ServoProcess
 from stages.messages import ServoGoal, ServoState
 
@@ -81,6 +88,8 @@ class Servo(Source):
     _lock: threading.Lock = PrivateAttr(default_factory=threading.Lock)  # over who replaces the process
     _ended: Counter[str] = PrivateAttr(default_factory=Counter[str])  # totals of processes that are no more
     _health: wire.Health | None = PrivateAttr(default=None)
+    _driven: bool = PrivateAttr(default=False)  # it has been set up once in this run
+    _error: int = PrivateAttr(default=0)  # Hardware Error Status as read last
 
     @model_validator(mode="after")
     def _settings_agree(self) -> Servo:
@@ -105,6 +114,20 @@ class Servo(Source):
         }
         here = dict(self._counts)
         return {**told, **here, "goals_lost": told["goals_lost"] + here.get("goals_lost", 0)}
+
+    @property
+    def trouble(self) -> str | None:
+        """That it is not driven, though it was before: it has shut down, or does not answer."""
+        health = self._health
+        if self._process is None or health is None or health.connected or not self._driven:
+            return None
+        why = f"has shut down ({named_errors(self._error)})" if self._error else "does not answer as one that is set up"
+        mends = (
+            "it is set up again by itself"
+            if self.reboot or not self._error
+            else "it is to be rebooted (`reboot: false`)"
+        )
+        return f"the servo {why} and stands still: {mends}; check its supply, its cable, and what its axis has to turn"
 
     def decode(self, record: Record) -> ServoState | None:
         """A message of `{"position_rad": 1.2, "velocity_radps": 0.0, "goal_rad": 1.3, "error": 0}`, else None."""
@@ -182,7 +205,9 @@ class Servo(Source):
                 raise
             if isinstance(packet, wire.Health):
                 self._health = packet
+                self._driven |= bool(packet.connected)
             elif isinstance(packet, wire.Reading):
+                self._error = packet.error
                 yield reading_record(self.topic, packet, host_ahead_ns, sequence)
                 starts, sequence = 0, sequence + 1
 

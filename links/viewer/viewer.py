@@ -71,6 +71,16 @@ class Viewer(Tap):
         return dict(self._errors)
 
     @property
+    def counters(self) -> dict[str, int]:
+        """Messages that were not drawn, and errors."""
+        return {"not drawn": sum(self.dropped.values()), "errors": sum(self._errors.values())}
+
+    @property
+    def trouble(self) -> str | None:
+        """What went wrong last, in words: the run goes on without it."""
+        return f"not all is drawn: {next(reversed(self._errors))}" if self._errors else None
+
+    @property
     def url(self) -> str:
         """Where a viewer finds a serving run: `rerun --connect URL`."""
         return f"rerun+http://{LOOPBACK}:{self.port}/proxy"

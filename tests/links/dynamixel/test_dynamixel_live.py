@@ -204,10 +204,15 @@ def test_after_an_overload_it_is_rebooted_and_set_up_and_its_angle_is_told_meanw
         next(records)
         emulator.stall(overload_s=0.05)
         servo.on_goal(goal(120))
+        assert servo.trouble is None
         until(records, lambda s: s["error"] == mx28.OVERLOAD)
+        until(
+            records, lambda _: "has shut down (overload) and stands still: it is set up again" in (servo.trouble or "")
+        )
         emulator.free()
         states = until(records, lambda s: s["error"] == 0)
         until(records, lambda _: servo.counters["connected"] == 1)
+        assert servo.trouble is None
         assert at(90)(states[-1])  # the goal from before does not come back
         servo.on_goal(goal(120))
         until(records, at(120))
@@ -222,6 +227,7 @@ def test_without_leave_to_reboot_it_stays_down_and_says_so(emulator):
         emulator.overload()
         until(records, lambda s: s["error"] == mx28.OVERLOAD)
         until(records, lambda _: servo.counters["connected"] == 0)
+        assert "to be rebooted (`reboot: false`)" in (servo.trouble or "")
         servo.on_goal(goal(120))
         states = until(records, lambda _: servo.counters["goals_lost"] == 1)
     assert at(90)(states[-1])

@@ -195,6 +195,8 @@ def test_a_message_that_cannot_be_drawn_is_counted_and_the_next_one_is(tmp_path)
     viewer.see(output, content, 0)
     viewer.close()
     ((text, count),) = viewer.errors.items()
+    assert viewer.trouble == f"not all is drawn: {text}"
+    assert viewer.counters["errors"] == count
     assert text.startswith("track.drone_fix could not be drawn: LinAlgError")
     assert count == 1
     assert rows(tmp_path / "run.rrd")["/vehicle/track/drone_fix/drone_1/ellipsoid_95"] == 1

@@ -7,7 +7,12 @@ A frame's time is when the grab that waited for it returned. A grab that returns
 waiting for an unknown time: after opening those are thrown away until one had to be waited for, later never two in a
 row, so that a host that is too slow sees every second frame.
 
-Source: ours; OpenCV 5, VideoCapture (CAP_PROP_FORMAT -1: the stream's own packets; CAP_PROP_CONVERT_RGB 0).
+FFmpeg decodes with one thread. With n it hands a picture out when the n - 1 after it have come (one a core is its rule:
+eight cores, 7 pictures late), and they take the cores from the LiDAR. H.264 comes one picture late even so: where a
+picture ends is known when the next begins.
+
+Source: ours; OpenCV 5, VideoCapture (CAP_PROP_FORMAT -1: the stream's own packets; CAP_PROP_CONVERT_RGB 0;
+CAP_PROP_N_THREADS, which can be set on opening only).
 """
 
 from __future__ import annotations
@@ -111,13 +116,14 @@ class Capture:
         if not is_url(s.source) and not Path(s.source).is_file():
             raise CaptureLost(f"there is no file {s.source}")
         limit_ms = round(1e3 * s.timeout_s)
-        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms]
-        video = cv2.VideoCapture(s.source, cv2.CAP_FFMPEG, [*limits, cv2.CAP_PROP_FORMAT, -1])
+        asked = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms]
+        asked += [cv2.CAP_PROP_N_THREADS, 1]
+        video = cv2.VideoCapture(s.source, cv2.CAP_FFMPEG, [*asked, cv2.CAP_PROP_FORMAT, -1])
         if video.isOpened() and _codec(video) in ("MJPG", "mjpg", "jpeg"):
             return video, True
         if video.isOpened():  # another codec: its packets are no pictures, open it decoded
             video.release()
-            video = cv2.VideoCapture(s.source, cv2.CAP_FFMPEG, limits)
+            video = cv2.VideoCapture(s.source, cv2.CAP_FFMPEG, asked)
         if not video.isOpened():
             raise CaptureLost(f"{self._name} cannot be opened")
         return video, False

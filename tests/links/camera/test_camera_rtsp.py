@@ -1,0 +1,89 @@
+"""Cameras live by RTSP: a network camera on this machine that sends H.264, is cut off, falls silent and comes back."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from flow.link import LinkError
+from links.camera import Camera
+from links.recording import decode_compressed_image
+from tests.links.camera.h264_by_hand import number_of
+from tests.links.camera.rtsp_camera import RtspCamera
+
+PERIOD_S = 0.02
+
+
+@pytest.fixture
+def network_camera():
+    served = RtspCamera(PERIOD_S, user="crew:secret")
+    yield served
+    served.stop()
+
+
+def camera_of(served, **settings):
+    settings = {"source": served.url, "size_px": (64, 48), "fps": 1 / PERIOD_S, "timeout_s": 2} | settings
+    return Camera(topic="/camera/drone", **settings)
+
+
+def test_h264_by_rtsp_is_decoded_and_stamped_when_it_came(network_camera):
+    camera = camera_of(network_camera, latency_s=0.25)
+    with camera.listen() as records:
+        taken = [next(records) for _ in range(30)]
+    numbers = [number_of(camera.decode(record).grey) for record in taken]
+    assert numbers == sorted(set(numbers))
+    assert [r.sequence for r in taken] == list(range(30))
+    for record in taken:
+        frame = decode_compressed_image(record.data)
+        assert (frame.frame_id, frame.stamp_ns) == ("camera_drone", record.stamp_ns)
+        assert record.arrival_ns - record.stamp_ns == 250_000_000
+    assert camera.counters["stale"] > 0  # what had come while it was opened
+    assert (
+        network_camera.asked[0][-1] == "TEARDOWN"
+    )  # it may serve one client: what it sends was asked first, and ended
+
+
+def test_without_its_password_a_network_camera_cannot_be_opened(network_camera):
+    camera = camera_of(network_camera, source=network_camera.url.replace("crew:secret@", ""))
+    with pytest.raises(LinkError, match="Check address, port, name and password"), camera.listen() as records:
+        next(records)
+
+
+def test_a_picture_comes_out_as_soon_as_the_next_one_begins(network_camera):
+    """Decoding that waits for more, one picture a thread, would have it come when two or more have been sent after it."""
+    camera = camera_of(network_camera)
+    with camera.listen() as records:
+        taken = [next(records) for _ in range(40)]
+    numbers = [number_of(camera.decode(record).grey) for record in taken]
+    newest = [max(n for n, ns in network_camera.began_ns.items() if ns <= r.arrival_ns) for r in taken]
+    assert np.min(np.subtract(newest, numbers)) == 1
+
+
+def test_a_network_camera_that_is_cut_off_and_comes_back_is_opened_again(network_camera):
+    camera = camera_of(network_camera)
+    with camera.listen() as records:
+        before = number_of(camera.decode(next(records)).grey)
+        network_camera.stop()
+        while camera.counters.get("lost", 0) == 0:
+            time.sleep(0.01)
+        network_camera.start()
+        while camera.counters.get("opened again", 0) == 0:
+            next(records)
+        assert number_of(camera.decode(next(records)).grey) > before
+    assert camera.counters["lost"] == 1
+
+
+def test_a_network_camera_that_falls_silent_is_lost_after_its_timeout(network_camera):
+    camera = camera_of(network_camera, timeout_s=1)
+    with camera.listen() as records:
+        next(records)
+        connections = len(network_camera.asked)
+        network_camera.silent = True
+        while camera.counters.get("lost", 0) == 0:
+            time.sleep(0.01)
+        network_camera.silent = False
+        while camera.counters.get("opened again", 0) == 0:
+            next(records)
+    assert len(network_camera.asked) > connections

@@ -51,7 +51,7 @@ class Camera(Source):
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals: frames refused, lost and opened again, stale (waiting when asked for), overtaken by a newer one."""
+        """Totals: frames refused, damaged, stale (waiting when asked for), overtaken; times lost and opened again."""
         return {"refused": self._refused, **self._counts}
 
     @contextmanager

@@ -29,6 +29,7 @@ import numpy as np
 
 WAITED_SHARE = 0.25  # of a frame's period: a grab that took less found the frame waiting
 BACKLOG_S = 1.0  # after opening, at most
+MOST_DAMAGED = 10  # pictures in a row
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _URL = re.compile(r"^[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
@@ -79,7 +80,7 @@ class Capture:
     """An open source; `read` gives frame after frame. CaptureLost when it cannot be opened or has died."""
 
     def __init__(self, settings: CaptureSettings, now_ns: Callable[[], int], counters: Counter[str]) -> None:
-        """`counters`: where frames that are thrown away because they had been waiting are counted, as "stale"."""
+        """`counters`: of frames thrown away, because they had been waiting ("stale") or were not whole ("damaged")."""
         self._settings, self._now_ns, self._counters = settings, now_ns, counters
         self._live = is_device(settings.source) or is_url(settings.source)
         self._name = shown(settings.source)
@@ -87,6 +88,7 @@ class Capture:
         self._opened_ns = now_ns()
         self._caught_up = not self._live
         self._dropped_last = False
+        self._damaged_in_a_row = 0
 
     def close(self) -> None:
         """Give the device or connection back."""
@@ -105,9 +107,15 @@ class Capture:
                 self._counters["stale"] += 1
                 continue
             found, picture = self._video.retrieve()
-            if not found or picture is None or picture.size == 0:
-                raise CaptureLost(f"{self._name} gives frames that cannot be read")
-            return Frame(arrival_ns, self._jpeg(np.asarray(picture)))
+            jpeg = self._jpeg(np.asarray(picture)) if found and picture is not None and picture.size else None
+            if jpeg is not None:
+                self._damaged_in_a_row = 0
+                return Frame(arrival_ns, jpeg)
+            self._counters["damaged"] += 1
+            self._damaged_in_a_row += 1
+            if self._damaged_in_a_row > MOST_DAMAGED:
+                what = "are no JPEG" if self._raw else "cannot be read"
+                raise CaptureLost(f"{self._name} gives frames that {what}")
 
     def _open(self) -> tuple[cv2.VideoCapture, bool]:
         s = self._settings
@@ -159,13 +167,12 @@ class Capture:
             time.sleep(min(1e-9 * left_ns, 0.1))
         return due_ns
 
-    def _jpeg(self, picture: np.ndarray) -> bytes:
+    def _jpeg(self, picture: np.ndarray) -> bytes | None:
+        """A picture as JPEG; None: it came as one that is not whole, as a webcam's first often does."""
         if self._raw:
             data = picture.tobytes()
             end = data.rfind(JPEG_END)  # a device's buffer may be longer than its picture
-            if not data.startswith(JPEG_START) or end < 0:
-                raise CaptureLost(f"{self._name} gives frames that are no JPEG")
-            return data[: end + 2]
+            return data[: end + 2] if data.startswith(JPEG_START) and end >= 0 else None
         written, coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, self._settings.jpeg_quality])
         if not written:
             raise CaptureLost(f"{self._name}: a frame of shape {picture.shape} cannot be written as JPEG")

@@ -98,8 +98,8 @@ class LiveCamera:
         source = self._settings.source
         if is_device(source):
             return (
-                "Is the camera plugged in and in webcam mode, is `source` its device (`ls -l /dev/v4l/by-id`), and is "
-                "this user in the group video?"
+                "Is the camera plugged in and in webcam mode, is `source` its device (`ls -l /dev/v4l/by-id`), is this "
+                "user in the group video, and does another program use it (`fuser -v /dev/video0`)?"
             )
         if is_url(source):
             return f"Does it play elsewhere, as by `ffplay {shown(source)}`? Check address, port, name and password."

@@ -1,4 +1,4 @@
-"""Is a camera as it must be: frames, their size against the rig's lens, their rate.
+"""Is a camera as it must be: frames, their size against the rig's lens, their rate, and when they were exposed.
 
 Source: ours.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from links.camera import Camera
+from links.camera.capture import is_device, is_url
 from links.preflight.heard import Heard
 from links.preflight.seen import CameraSeen
 from links.preflight.verdict import Verdict, fail, ok, warning
@@ -29,6 +30,8 @@ def camera_checks(heard: Heard, rig_px: tuple[int, int] | None, readout_ms: floa
     yield _rate(heard, link)
     yield _size(heard.name, seen, rig_px)
     yield _readout(heard.name, link, readout_ms)
+    if heard.live and link.source is not None and (is_device(link.source) or is_url(link.source)):
+        yield _latency(heard.name, link)
 
 
 def _rate(heard: Heard, link: Camera) -> Verdict:
@@ -73,3 +76,13 @@ def _readout(name: str, link: Camera, readout_ms: float | None) -> Verdict:
             name, f"the rig does not say how long the rows take: most shutters roll; set {key} in it (0: all at once)"
         )
     return ok(name, f"{readout_ms:g} ms from the first row to the last" if readout_ms else "all rows at once")
+
+
+def _latency(name: str, link: Camera) -> Verdict:
+    if link.latency_s:
+        return ok(f"{name} latency", f"{1e3 * link.latency_s:g} ms from a picture's exposure to its arrival")
+    return warning(
+        f"{name} latency",
+        "latency_s is 0: pictures count as exposed when they arrive, and 80 ms of it cost 18 cm and 1 deg; film a "
+        f"clock on this host's screen, and set {name}.latency_s to how far its picture is behind (configs/field.yaml)",
+    )

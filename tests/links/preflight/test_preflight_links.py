@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from flow.graph import load_graph
 from flow.link import Record
 from links.camera import Camera
 from links.dynamixel import Servo
@@ -23,6 +25,7 @@ from links.vehicle_odometry import VehicleOdometry
 from links.velodyne import Lidar, vlp16
 from tests.links.preflight.preflight_peers import hear, packet
 
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 BEGIN_NS = 1_748_773_230_000_000_000
 PACKET_NS = vlp16.packet_ns(vlp16.STRONGEST)
 
@@ -203,6 +206,28 @@ def test_how_long_a_cameras_rows_take_is_asked_for_where_neither_rig_nor_link_sa
     assert (told.level, told.sentence) == (Level.OK, "8 ms from the first row to the last")
     at_once = by_name(camera_checks(hear(link, pictures()), (64, 64), 0.0))["readout"]
     assert (at_once.level, at_once.sentence) == (Level.OK, "all rows at once")
+
+
+@pytest.mark.parametrize("source", ["/dev/video0", "rtsp://192.168.1.9/live", "http://127.0.0.1:8091/"])
+def test_how_old_a_live_cameras_pictures_are_is_asked_for_where_nothing_is_set(source):
+    def checked(live=True, **settings):
+        link = Camera(topic="/camera/drone", **settings)
+        return by_name(camera_checks(hear(link, pictures(), live=live), (64, 64), 0.0))
+
+    unset = checked(source=source)["latency"]
+    assert unset.level is Level.WARNING
+    assert "film a clock on this host's screen, and set it.latency_s" in unset.sentence
+    told = checked(source=source, latency_s=0.06)["latency"]
+    assert (told.level, told.sentence) == (Level.OK, "60 ms from a picture's exposure to its arrival")
+    assert "latency" not in checked(source=source, live=False)  # a recording's stamps are what they are
+    assert "latency" not in checked(source="film.mp4")  # a file's are its own
+
+
+def test_the_field_configuration_leaves_its_cameras_latency_to_be_set():
+    nodes = load_graph(CONFIGS / "field.yaml").nodes
+    for name in ("camera_vehicle", "camera_drone"):
+        assert nodes[name].config["latency_s"] == 0
+        assert levels(camera_checks(hear(nodes[name].build(), pictures()), (64, 64), 0.0))["latency"] == "warning"
 
 
 def test_a_camera_and_an_odometry_that_fell_silent_are_no_go():

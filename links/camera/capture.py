@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 
 WAITED_SHARE = 0.25  # of a frame's period: a grab that took less found the frame waiting
+DECODED_SHARE = 0.5  # the same where a grab decodes: on a small host that takes 10 ms of 33
 BACKLOG_S = 1.0  # after opening, at most
 MOST_DAMAGED = 10  # pictures in a row
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -86,6 +87,8 @@ class Capture:
         self._name = shown(settings.source)
         self._video, self._raw = self._open()
         self._opened_ns = now_ns()
+        share = WAITED_SHARE if self._raw or is_device(settings.source) else DECODED_SHARE
+        self._waited_ns = share * 1e9 / settings.fps
         self._caught_up = not self._live
         self._dropped_last = False
         self._damaged_in_a_row = 0
@@ -153,7 +156,7 @@ class Capture:
         return video, False
 
     def _was_waiting(self, asked_ns: int, arrival_ns: int) -> bool:
-        waited = arrival_ns - asked_ns > WAITED_SHARE * 1e9 / self._settings.fps
+        waited = arrival_ns - asked_ns > self._waited_ns
         if not self._caught_up:
             self._caught_up = waited or arrival_ns - self._opened_ns > BACKLOG_S * 1e9
             return not self._caught_up

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 
+import cv2
 import numpy as np
 import pytest
 
 from flow.link import LinkError
 from links.camera import Camera
+from links.camera.capture import Capture, CaptureSettings
 from links.recording import decode_compressed_image
 from tests.links.camera.h264_by_hand import number_of
 from tests.links.camera.rtsp_camera import RtspCamera
 
 PERIOD_S = 0.02
+STEP_NS = 33_000_000
 
 
 @pytest.fixture
@@ -59,6 +63,49 @@ def test_a_picture_comes_out_as_soon_as_the_next_one_begins(network_camera):
     numbers = [number_of(camera.decode(record).grey) for record in taken]
     newest = [max(n for n, ns in network_camera.began_ns.items() if ns <= r.arrival_ns) for r in taken]
     assert np.min(np.subtract(newest, numbers)) == 1
+
+
+class SlowDecoder:
+    """cv2.VideoCapture of a stream in which `waiting` pictures have come, by a clock of its own: a grab takes a while."""
+
+    def __init__(self, waiting, decoding_ns, coding_ns):
+        self.waiting, self.decoding_ns, self.coding_ns, self.now_ns, self.number = waiting, decoding_ns, coding_ns, 0, 0
+
+    def grab(self):
+        self.number += 1
+        self.now_ns = max(self.now_ns, self.came_ns(self.number)) + self.decoding_ns
+        return True
+
+    def came_ns(self, number):
+        return (number - self.waiting) * STEP_NS
+
+    def retrieve(self):
+        self.now_ns += self.coding_ns
+        return True, np.zeros((48, 64, 3), np.uint8)
+
+    def get(self, _):
+        return float(cv2.VideoWriter.fourcc(*"h264"))
+
+    def isOpened(self):
+        return True
+
+    def release(self):
+        pass
+
+
+@pytest.mark.parametrize(("decoding_ms", "coding_ms"), [(1, 5), (12, 5), (15, 22)])
+def test_what_waited_is_thrown_away_though_decoding_takes_its_time(monkeypatch, decoding_ms, coding_ms):
+    """A stamp is wrong by what a picture waited. A host for which each takes longer than a period sees every second."""
+    stream = SlowDecoder(30, decoding_ms * 1_000_000, coding_ms * 1_000_000)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: stream)
+    capture = Capture(CaptureSettings("rtsp://camera/live", None, 30.0, 1.0, 90), lambda: stream.now_ns, Counter())
+    late_ns = []
+    for _ in range(200):
+        arrival_ns = capture.read().arrival_ns
+        late_ns.append(arrival_ns - stream.came_ns(stream.number))
+    assert max(late_ns) < STEP_NS + stream.decoding_ns
+    taken = 200 * (1 if decoding_ms + coding_ms < 33 else 2)
+    assert stream.number < taken + 60  # the 30, what comes meanwhile, and no more
 
 
 def test_a_network_camera_that_is_cut_off_and_comes_back_is_opened_again(network_camera):

@@ -19,6 +19,8 @@ Source: ours; https://mavlink.io/en/services/timesync.html for the exchange.
 
 from __future__ import annotations
 
+from links.clock_drift import ClockDrift
+
 DISAGREEMENTS = 5  # in a row, then the device's clock was set and not the message damaged
 BACKLOG_NS = 10_000_000_000  # what waited is through by then: who is still as late was off, or has another clock now
 MAX_ROUND_TRIP_NS = 1_000_000_000  # a slower TIMESYNC reply tells nothing of use
@@ -37,6 +39,7 @@ class DeviceClock:
         self._newest_ns = 0  # device time, of those believed
         self._disagreed = 0
         self._disagreed_at_ns = 0  # the first of them, host
+        self.drift = ClockDrift()
         self.restarts = 0
         """Times the device's clock began anew."""
         self.round_trips = 0
@@ -84,12 +87,14 @@ class DeviceClock:
         if self.read(tc1_ns, arrival_ns) is None:
             return False
         self._tighten(lower_ns=ts1_ns - tc1_ns - self._base_ns)
+        self.drift.add(ts1_ns, tc1_ns, arrival_ns)
         self.round_trips += 1
         return True
 
     def forget_answers(self) -> None:
         """They may have been another's: the offset is held by one-way messages alone until the next."""
         self._lower_ns = None
+        self.drift.clear()
 
     def _waited(self, device_ns: int, late_ns: float, arrival_ns: int) -> bool:
         """Whether a message too late for the bounds may be an old one of a clock that has not begun anew."""
@@ -100,6 +105,7 @@ class DeviceClock:
     def _begin(self, offset_ns: int, arrival_ns: int) -> None:
         self._base_ns, self._upper_ns, self._lower_ns, self._at_ns = offset_ns, 0.0, None, arrival_ns
         self._disagreed = self._newest_ns = 0
+        self.drift.clear()
 
     def _age(self, arrival_ns: int) -> None:
         slack = self._drift * max(arrival_ns - self._at_ns, 0)

@@ -164,8 +164,20 @@ class Autopilot(Source):
             "lost": stream.lost,
             "clock restarts": stream.clock.restarts,
             "timesync replies": stream.clock.round_trips,
+            **_known_of(stream.clock),
             **refused,
         }
         live = {} if self._session is None else self._session.counters
         missed = {"poses while not connected": self._missed} if self._missed else {}
         return decoded | live | missed
+
+
+def _known_of(clock: DeviceClock) -> dict[str, int]:
+    """What is known of the autopilot's clock, once it is."""
+    told: dict[str, int] = {}
+    if clock.uncertainty_ns is not None:
+        told["clock uncertainty [us]"] = clock.uncertainty_ns // 1000
+    if clock.drift.ppm is not None:
+        drift_ppm, sigma_ppm = clock.drift.ppm
+        told |= {"clock drift [ppb]": round(1e3 * drift_ppm), "clock drift's sigma [ppb]": round(1e3 * sigma_ppm)}
+    return told

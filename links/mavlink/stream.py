@@ -117,6 +117,7 @@ class FrameStream:
             self._refuse("timesync of another's or too slow")
 
     def _status(self, frame: Any, arrival_ns: int) -> AutopilotStatus:
+        drift_ppm, drift_sigma_ppm = self.clock.drift.ppm or (None, None)
         return AutopilotStatus(
             stamp_ns=arrival_ns,  # a heartbeat carries no time
             armed=bool(frame.base_mode & ARMED),
@@ -125,6 +126,8 @@ class FrameStream:
             lost_frames=self.lost,
             clock_offset_ns=self.clock.offset_ns,
             clock_uncertainty_ns=self.clock.uncertainty_ns,
+            clock_drift_ppm=drift_ppm,
+            clock_drift_sigma_ppm=drift_sigma_ppm,
         )
 
     def _refuse(self, reason: str) -> None:

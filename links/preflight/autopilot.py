@@ -107,6 +107,8 @@ def _clock(heard: Heard, status: AutopilotStatus) -> Verdict:
         return warning(name, f"no TIMESYNC reply: a constant delay of the link stays unknown; {why}")
     unsure_ms = 1e-6 * status.clock_uncertainty_ns
     text = f"offset {1e-9 * status.clock_offset_ns:.3f} s to its time since boot, known to {unsure_ms:.1f} ms"
+    if status.clock_drift_ppm is not None and status.clock_drift_sigma_ppm is not None:
+        text += f", drifting by {status.clock_drift_ppm:.1f} +- {status.clock_drift_sigma_ppm:.1f} ppm"
     if unsure_ms > USELESS_MS:
         return fail(name, f"{text}: the link is too slow or too full; lower its rates or use a wire")
     return (

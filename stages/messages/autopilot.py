@@ -54,6 +54,8 @@ class AutopilotStatus(Message):
     lost_frames: int  # missing in its sequence since the start
     clock_offset_ns: int | None  # host - autopilot's time since boot; None: not known yet
     clock_uncertainty_ns: int | None  # the offset is wrong by at most this; None: no TIMESYNC, delays are unknown
+    clock_drift_ppm: float | None = None  # the host's clock gains so much on it; None: not known (yet)
+    clock_drift_sigma_ppm: float | None = None
 
 
 @message

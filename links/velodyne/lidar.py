@@ -2,7 +2,7 @@
 
 Live it can listen to the sensor's position packets, too: they are recorded under /lidar/position, and what they say of
 GPS and PPS is counted. With `clock: utc` nothing is taken before they say that the sensor's clock is locked to UTC; a
-lock that is lost later is counted, and the sensor's clock drifts on by some millionths.
+lock that is lost later is counted and said, and the sensor's clock drifts on by some millionths.
 
 Source: VLP-16 User Manual 63-9243 Rev. E, chapter 9. What to do about bad, lost and repeated packets is ours.
 """
@@ -29,6 +29,7 @@ from stages.messages import LidarFirings
 
 POSITION_TOPIC = "/lidar/position"
 REFUSED_IN_A_ROW = 100
+POSITION_SILENT_S = 3.0  # a sensor sends some of them each second
 
 
 class Lidar(Source):
@@ -44,6 +45,8 @@ class Lidar(Source):
     timeout_s: float = Field(2.0, gt=0, le=60)
     packets: int = Field(1, ge=1, le=16)  # in a message, 1.3 ms each: fewer messages cost less, and come later
 
+    _locked_once: bool = PrivateAttr(default=False)  # utc, since it listens: data packets are taken
+    _position_s: float = PrivateAttr(default=0.0)  # when the newest position packet came
     _pps: PpsWatch = PrivateAttr(default_factory=PpsWatch)
     _udp: UdpCounters = PrivateAttr(default_factory=UdpCounters)
 
@@ -81,7 +84,10 @@ class Lidar(Source):
             channels.append(Channel(POSITION_TOPIC, self.position_port))
         sender = None if self.sender is None else str(self.sender)
         with listen_udp(channels, str(self.bind), sender, self.timeout_s, self._udp) as records:
-            yield self._watched(records) if self.position_port is not None else records
+            try:
+                yield self._watched(records) if self.position_port is not None else records
+            finally:
+                self._locked_once = False
 
     def _watched(self, records: Iterator[Record]) -> Iterator[Record]:
         """The records, with an eye on the sensor's clock; for utc no data packet before it is locked."""
@@ -90,6 +96,8 @@ class Lidar(Source):
             if record.topic == POSITION_TOPIC:
                 self._pps.see(record.data)
                 waits = waits and not self._pps.locked
+                self._position_s = time.monotonic()
+                self._locked_once = self.clock == "utc" and not waits
             elif waits:
                 if time.monotonic() > deadline_s:
                     raise LinkError(
@@ -98,6 +106,26 @@ class Lidar(Source):
                     )
                 continue
             yield record
+
+    @property
+    def trouble(self) -> str | None:
+        """See Link: with `clock: utc`, the sensor's clock is not locked to UTC any more, or does not tell."""
+        if not self._locked_once:
+            return None
+        silent = time.monotonic() - self._position_s > max(self.timeout_s, POSITION_SILENT_S)
+        if self._pps.locked and not silent:
+            return None
+        lost = (
+            f"no position packet comes any more on UDP {self.position_port}, so whether the sensor's clock is locked "
+            "to UTC is not known"
+            if silent
+            else f"the sensor's clock is locked to UTC no more: {self._pps.in_words()}"
+        )
+        return (
+            f"clock: utc, and {lost}. Its packets are taken on, and their times may drift away by some millionths. "
+            "Check its GPS antenna's view of the sky and the PPS wire; if it does not come back, set clock: free "
+            "before the next flight"
+        )
 
     @property
     def counters(self) -> dict[str, int]:

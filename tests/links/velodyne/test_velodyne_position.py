@@ -1,6 +1,7 @@
 """Position packets: GPS time and whether the sensor's clock is locked to it."""
 
 import threading
+import time
 from datetime import UTC, datetime
 
 import pytest
@@ -141,6 +142,64 @@ def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_that_says_why(po
         finally:
             stop.set()
             sending.join()
+
+
+@pytest.mark.parametrize(
+    ("lost", "words"),
+    [
+        (position(pps=0), "its PPS is absent, its GPS knows the time"),
+        (position(GPRMC.replace("A", "V", 1)), "its PPS is locked, its GPS does not know the time"),
+    ],
+)
+def test_with_clock_utc_a_lock_that_is_lost_is_said_until_it_is_back_and_the_packets_are_taken_on(ports, lost, words):
+    lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc")
+    said = []
+    with lidar.listen() as records:
+        for told in (lost, position(), lost, position(pps=1), position(pps=7), position()):  # the 7 is damaged
+            said.append(lidar.trouble)
+            send(ports[1], told)
+            assert next(records).data == told
+            if lidar.counters.get("PPS locks lost"):
+                send(ports[0], packet())
+                assert next(records).data == packet()
+        said.append(lidar.trouble)
+    before, not_yet, locked, lost_now, still, unheard, again = said
+    assert (before, not_yet, locked, again) == (None,) * 4, "a lock that never was is an error of its own, later"
+    assert words in lost_now
+    assert "GPS antenna" in lost_now
+    assert "set clock: free" in lost_now
+    assert "PPS is synchronizing" in still
+    assert unheard == still
+
+
+def test_with_clock_utc_position_packets_that_end_are_said(ports, monkeypatch):
+    monkeypatch.setattr("links.velodyne.lidar.POSITION_SILENT_S", 0.15)
+    lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc", timeout_s=0.15)
+    with lidar.listen() as records:
+        send(ports[1], position())
+        next(records)
+        end_s = time.monotonic() + 10.0
+        while lidar.trouble is None and time.monotonic() < end_s:
+            send(ports[0], packet())
+            next(records)
+        assert "no position packet comes any more" in lidar.trouble
+        send(ports[1], position())
+        next(records)
+        assert lidar.trouble is None
+        send(ports[1], position(pps=0))
+        next(records)
+        assert lidar.trouble is not None
+    assert lidar.trouble is None, "nobody listens any more"
+
+
+def test_with_a_free_clock_a_lost_lock_is_no_trouble(ports):
+    lidar = Lidar(port=ports[0], position_port=ports[1])
+    with lidar.listen() as records:
+        for told in (position(), position(pps=0)):
+            send(ports[1], told)
+            next(records)
+        assert lidar.counters["PPS locks lost"] == 1
+        assert lidar.trouble is None
 
 
 def test_clock_utc_without_position_packets_is_refused_live(ports):

@@ -142,7 +142,7 @@ class Servo(Source):
         process = self._process
         if process is None:
             self._waiting = goal_command(goal)
-            self._counts["goals while not live"] += 1
+            self._counts[NOT_LIVE] += 1
         elif not (math.isfinite(goal.position_rad) and math.isfinite(goal.speed_radps)):
             self._counts["goals refused: no number"] += 1
         elif not process.send(self._within_limits(goal)):
@@ -257,6 +257,7 @@ class Servo(Source):
         )
 
 
+NOT_LIVE = "goals while not live"
 NOW = ("connected", "low_latency", "voltage_mv", "temperature_c")  # of wire.Health: not totals, but how it is
 TOTALS = tuple(name for name in wire.Health._fields if name not in NOW)
 

@@ -16,7 +16,7 @@ from stages.fuse.heading import Heading
 from stages.fuse.motion_yaw import Point
 from stages.fuse.motions import Motions
 from stages.fuse.north import North
-from stages.fuse.positions import Positions
+from stages.fuse.positions import Positions, Told
 from stages.fuse.rejected import ENOUGH, Rejected
 from stages.fuse.settings import FuseErrors
 from stages.fuse.yaw import DRIFT_RAD_PER_S, Yaw
@@ -362,7 +362,7 @@ def test_a_track_of_which_nothing_is_said_while_the_tracker_speaks_is_gone(pause
 
 def test_a_drone_that_tells_its_velocity_cannot_have_turned_unheard():
     """Half a second after the last fix: q dt^3 / 3 of what nobody tells, beside the same velocity."""
-    sigmas = []
+    sigmas, told_m2 = [], Told(0.05**2 * np.eye(3), None)
     for told in (False, True):
         motions = Motions(FuseErrors(), parked=True)
         positions = Positions(FuseErrors(), motions)
@@ -376,9 +376,9 @@ def test_a_drone_that_tells_its_velocity_cannot_have_turned_unheard():
                 )
             z = np.array([2 * t, 0.0, 9.0])
             if i == 0:
-                positions.find(fix(t, z, 0.05), z, 0.05**2 * np.eye(3))
+                positions.find(fix(t, z, 0.05), z, told_m2)
             else:
-                positions.takes(ns(t), np.zeros(3), np.eye(3), 0.05**2 * np.eye(3))
+                positions.takes(ns(t), np.zeros(3), np.eye(3), told_m2)
                 positions.follow(ns(t), z, 1.0, None)
         sigmas.append(math.sqrt(positions.at(ns(2.99))[1][4, 4]))
     assert sigmas[1] < 0.8 * sigmas[0]

@@ -73,6 +73,31 @@ class OtherLine(Line):
     topic: str = "/others"
 
 
+class Clinging(Line):
+    """A line that can be closed only when a test lets it go."""
+
+    _go: threading.Event = PrivateAttr(default_factory=threading.Event)
+
+    @contextmanager
+    def listen(self) -> Iterator[Iterator[Record]]:
+        with super().listen() as records:
+            try:
+                yield records
+            finally:
+                self._go.wait(PATIENCE_S)
+
+
+class Jam(Link):
+    """A sink that hangs at its first number until a test lets it go."""
+
+    _go: threading.Event = PrivateAttr(default_factory=threading.Event)
+    _entered: threading.Event = PrivateAttr(default_factory=threading.Event)
+
+    def on_number(self, number: Number) -> None:
+        self._entered.set()
+        self._go.wait(PATIENCE_S)
+
+
 class Collector(Link):
     """A sink that keeps what it is given, and tells what it sent."""
 

@@ -241,6 +241,36 @@ def test_a_stop_comes_through_though_a_stage_and_a_tap_hang(tmp_path):
     stuck._go.set()
 
 
+ALL_HANG = f"""\
+stages:
+  gate: {{use: {ROOM}.Gate, inputs: {{number: line.number}}}}
+  other_gate: {{use: {ROOM}.Gate, inputs: {{number: line.number}}}}
+links:
+  line: {{use: {ROOM}.Clinging}}
+  jam: {{use: {ROOM}.Jam, inputs: {{number: line.number}}}}
+"""
+
+
+def test_a_stop_takes_less_than_two_seconds_though_links_stages_and_a_tap_hang(tmp_path):
+    """All of each kind at once. The promise is of time: on a machine that is too busy for it, the best of three."""
+    took_s = []
+    while len(took_s) < 3 and min(took_s, default=2.0) >= 2.0:
+        stuck = Stuck()
+        live = run_live(graph_of(tmp_path, ALL_HANG), [stuck])
+        jam = live.nodes["jam"]
+        line_of(live).put(1, 2, 3)
+        gates = [run.life._stage for run in live._wiring.stages]
+        assert all(hanging._entered.wait(PATIENCE_S) for hanging in (*gates, jam))
+        began_s = time.monotonic()
+        report = live.stop()
+        took_s.append(time.monotonic() - began_s)
+        left = {str(i).split("'")[1] for i in report.incidents if "did not end in time" in str(i)}
+        assert {"listen line", "close line", "stage gate", "stage other_gate", "send jam", "tap stuck"} <= left
+        for event in (*(gate._open for gate in gates), jam._go, line_of(live)._go, stuck._go):
+            event.set()
+    assert min(took_s) < 2.0, took_s
+
+
 def test_lateness_is_counted_against_each_edges_own_deadline(tmp_path):
     text = DOUBLING.replace("number: line.number", "number: {from: line.number, deadline_ms: 0.001}")
     graph = graph_of(tmp_path, text)

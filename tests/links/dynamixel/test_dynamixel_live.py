@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -80,6 +81,56 @@ def test_states_are_stamped_when_the_servo_stood_there(emulator):
     assert len(moving) > 20
     assert abs(np.median(moving)) < 2 * mx28.TICK_RAD  # 20 rpm is 1.4 ticks a millisecond
     assert state.goal_rad == pytest.approx(math.radians(150), abs=mx28.TICK_RAD)
+
+
+def test_with_answers_that_come_late_a_stamp_is_still_in_the_middle_of_the_exchange(emulator):
+    """The emulated servo measures when it is asked and says so 8 ms later: 2 stamp - arrival is when it was asked."""
+    emulator.late(0.008, 100_000)
+    servo = live(emulator, rate_hz=80.0)
+    host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
+    off_ticks, half_ms = [], []
+    with servo.listen() as records:
+        next(records)
+        servo.on_goal(goal(175, 20))
+        for record in records:
+            state = servo.decode(record)
+            asked_ns = 2 * record.stamp_ns - record.arrival_ns - host_ahead_ns
+            truth = emulator.position_rad(np.array([asked_ns]))[0]
+            if abs(state.velocity_radps) > 1.5:
+                off_ticks.append((state.position_rad - truth) / mx28.TICK_RAD)
+                half_ms.append(1e-6 * (record.arrival_ns - record.stamp_ns))
+            if at(175)({"position_rad": state.position_rad}):
+                break
+    assert len(off_ticks) > 10
+    assert np.median(half_ms) > 4
+    assert abs(np.median(off_ticks)) < 3  # a stamp at the request would be off by 11 ticks, 1.4 in each millisecond
+
+
+def test_it_is_read_at_least_200_times_a_second(emulator):
+    """By default, with goals in between. On a busy machine not always: the best of three windows counts."""
+    servo, rates_hz = live(emulator), []
+    with servo.listen() as records:
+        next(records)
+        while len(rates_hz) < 3 and max(rates_hz, default=0.0) < 200.0:
+            stamps = []
+            for record in itertools.islice(records, 500):
+                stamps.append(record.stamp_ns)
+                if len(stamps) % 5 == 0:
+                    servo.on_goal(goal(100 + len(stamps) % 10))
+            rates_hz.append(1e9 / np.median(np.diff(stamps)))
+    assert max(rates_hz) >= 200.0, rates_hz
+
+
+def test_a_healthy_servo_is_never_in_trouble_from_its_start_to_its_end(emulator):
+    servo = live(emulator)
+    told = [servo.trouble]
+    with servo.listen() as records:
+        told.append(servo.trouble)
+        next(records)
+        servo.on_goal(goal(120, 40))
+        until(records, lambda state: told.append(servo.trouble) or at(120)(state))
+        until(records, lambda _: told.append(servo.trouble) or servo.counters["reads"] > 200)
+    assert {*told, servo.trouble} == {None}
 
 
 def test_the_newest_goal_is_obeyed_at_its_speed(emulator):

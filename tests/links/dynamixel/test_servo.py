@@ -8,8 +8,8 @@ import math
 import pytest
 
 from flow.link import Record
-from links.dynamixel import Servo
-from links.dynamixel.servo import goal_command
+from links.dynamixel import Servo, wire
+from links.dynamixel.servo import goal_command, reading_record
 from stages.messages import ServoGoal
 
 GOOD = {"position_rad": 1.5, "velocity_radps": -0.25, "goal_rad": 2.0, "error": 32}
@@ -52,6 +52,19 @@ def test_what_is_no_state_is_counted_and_left_out(data):
     servo = Servo()
     assert servo.decode(record(data)) is None
     assert servo.refused == 1
+
+
+def test_a_reading_is_stamped_in_the_middle_of_its_exchange_and_arrives_with_the_reply():
+    reading = wire.Reading(0, 10_000_000, 1024, 10, 1030, 32)
+    told = reading_record("/servo/state", reading, host_ahead_ns=0, sequence=7)
+    assert (told.stamp_ns, told.arrival_ns, told.sequence, told.topic) == (5_000_000, 10_000_000, 7, "/servo/state")
+    moved = reading_record("/servo/state", reading, host_ahead_ns=1_748_773_230_000_000_000, sequence=7)
+    assert moved.stamp_ns == 1_748_773_230_005_000_000
+    assert moved.arrival_ns == 1_748_773_230_010_000_000
+    state = Servo().decode(told)
+    assert (state.stamp_ns, state.error) == (5_000_000, 32)
+    assert (state.position_rad, state.goal_rad) == pytest.approx((math.pi / 2, 1030 * math.tau / 4096))
+    assert state.velocity_radps == pytest.approx(10 * 0.229 * math.tau / 60)
 
 
 def goal(position_rad: float, speed_radps: float) -> ServoGoal:

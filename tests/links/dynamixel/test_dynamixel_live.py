@@ -62,22 +62,30 @@ def at(position_deg):
     return lambda state: abs(math.degrees(state["position_rad"]) - position_deg) < 0.2
 
 
+def travel(servo, records, position_deg, speed_rpm):
+    """(record, state) until the servo is there; a goal that a busy machine made it forget is sent again."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    for number, record in enumerate(records):
+        state = servo.decode(record)
+        if number % 20 == 0 and abs(state.goal_rad - math.radians(position_deg)) > mx28.TICK_RAD:
+            servo.on_goal(goal(position_deg, speed_rpm))
+        yield record, state
+        if at(position_deg)({"position_rad": state.position_rad}):
+            return
+        assert time.monotonic() < deadline_s, f"not within {PATIENCE_S} s; last: {state}; {servo.counters}"
+
+
 def test_states_are_stamped_when_the_servo_stood_there(emulator):
     servo = live(emulator)
     host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
     with servo.listen() as records:
-        next(records)
-        servo.on_goal(goal(150, 20))
         moving = []
-        for record in records:
+        for record, state in travel(servo, records, 150, 20):
             assert record.topic == "/servo/state"
             assert record.stamp_ns < record.arrival_ns
-            state = servo.decode(record)
             truth = emulator.position_rad(np.array([record.stamp_ns - host_ahead_ns]))[0]
             if abs(state.velocity_radps) > 1.5:
                 moving.append(state.position_rad - truth)
-            if at(150)({"position_rad": state.position_rad}):
-                break
     assert len(moving) > 20
     assert abs(np.median(moving)) < 2 * mx28.TICK_RAD  # 20 rpm is 1.4 ticks a millisecond
     assert state.goal_rad == pytest.approx(math.radians(150), abs=mx28.TICK_RAD)
@@ -90,17 +98,12 @@ def test_with_answers_that_come_late_a_stamp_is_still_in_the_middle_of_the_excha
     host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
     off_ticks, half_ms = [], []
     with servo.listen() as records:
-        next(records)
-        servo.on_goal(goal(175, 20))
-        for record in records:
-            state = servo.decode(record)
+        for record, state in travel(servo, records, 175, 20):
             asked_ns = 2 * record.stamp_ns - record.arrival_ns - host_ahead_ns
             truth = emulator.position_rad(np.array([asked_ns]))[0]
             if abs(state.velocity_radps) > 1.5:
                 off_ticks.append((state.position_rad - truth) / mx28.TICK_RAD)
                 half_ms.append(1e-6 * (record.arrival_ns - record.stamp_ns))
-            if at(175)({"position_rad": state.position_rad}):
-                break
     assert len(off_ticks) > 10
     assert np.median(half_ms) > 4
     assert abs(np.median(off_ticks)) < 3  # a stamp at the request would be off by 11 ticks, 1.4 in each millisecond
@@ -122,7 +125,7 @@ def test_it_is_read_at_least_200_times_a_second(emulator):
 
 
 def test_a_healthy_servo_is_never_in_trouble_from_its_start_to_its_end(emulator):
-    servo = live(emulator)
+    servo = live(emulator, watchdog_s=2.5)  # a busy machine may be late
     told = [servo.trouble]
     with servo.listen() as records:
         told.append(servo.trouble)

@@ -88,7 +88,6 @@ class Servo(Source):
     _lock: threading.Lock = PrivateAttr(default_factory=threading.Lock)  # over who replaces the process
     _ended: Counter[str] = PrivateAttr(default_factory=Counter[str])  # totals of processes that are no more
     _health: wire.Health | None = PrivateAttr(default=None)
-    _driven: bool = PrivateAttr(default=False)  # it has been set up once in this run
     _error: int = PrivateAttr(default=0)  # Hardware Error Status as read last
 
     @model_validator(mode="after")
@@ -119,7 +118,9 @@ class Servo(Source):
     def trouble(self) -> str | None:
         """That it is not driven, though it was before: it has shut down, or does not answer."""
         health = self._health
-        if self._process is None or health is None or health.connected or not self._driven:
+        if self._process is None or health is None or health.connected:
+            return None
+        if not self._ended["set_ups"] + health.set_ups:  # it begins
             return None
         why = f"has shut down ({named_errors(self._error)})" if self._error else "does not answer as one that is set up"
         mends = (
@@ -205,7 +206,6 @@ class Servo(Source):
                 raise
             if isinstance(packet, wire.Health):
                 self._health = packet
-                self._driven |= bool(packet.connected)
             elif isinstance(packet, wire.Reading):
                 self._error = packet.error
                 yield reading_record(self.topic, packet, host_ahead_ns, sequence)

@@ -56,8 +56,9 @@ class KeptPictures:
                 if topic not in reader.topics:
                     raise LinkError(f"{file} has nothing on {topic}: {NOT_THESE}")
         difference = first_difference(pictured(recorded), pictured(scenario))
-        self._round_s = round_of(scenario)
-        if difference is None and scenario.duration_s > recorded.duration_s and self._round_s is None:
+        longer = scenario.duration_s > recorded.duration_s
+        self._round_s = round_of(scenario) if longer else None  # what was painted to its end needs no round again
+        if difference is None and longer and self._round_s is None:
             difference = "duration_s", f"{recorded.duration_s:g}", f"{scenario.duration_s:g}"
         if (
             difference is None

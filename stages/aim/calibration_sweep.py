@@ -15,10 +15,10 @@ from pydantic import Field, PrivateAttr
 
 from flow.stage import Stage
 from stages.aim.sweeping import Sweeping
+from stages.aim.vibrate import RPM_RADPS
 from stages.geometry import LidarMount
 from stages.messages import ServoGoal, ServoState
 
-RPM_RADPS = math.tau / 60.0
 Rpm = Annotated[float, Field(gt=0, le=120)]
 
 

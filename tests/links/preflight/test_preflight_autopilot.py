@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import os
 from pathlib import Path
@@ -225,3 +226,9 @@ def test_no_pose_goes_out_and_while_listening_nothing_moves():
     assert not any(edge.consumer == "autopilot" for edge in seeing.edges)
     assert any((edge.producer, edge.consumer) == ("aim", "servo") for edge in seeing.edges)
     assert {"lidar", "servo", "camera_drone", "detect", "track"} <= set(seeing.nodes)
+
+
+def test_how_fast_its_clock_runs_away_is_told_where_it_is_known():
+    drifting = dataclasses.replace(status(), clock_drift_ppm=-18.04, clock_drift_sigma_ppm=1.4)
+    assert "drifting by -18.0 +- 1.4 ppm" in check(frames(), said=drifting)["it clock"].sentence
+    assert "drifting" not in check(frames())["it clock"].sentence

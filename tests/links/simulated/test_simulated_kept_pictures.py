@@ -121,6 +121,15 @@ def test_round_and_round_the_first_rounds_pictures_come_again_so_much_later(roun
         assert all(r.arrival_ns >= r.stamp_ns for r in seen)
 
 
+def test_a_flight_no_longer_than_the_recorded_one_takes_its_own_pictures_beyond_a_round_too(
+    round_about, tmp_path
+) -> None:
+    once = round_about.changed(duration_s=1.5, cameras={"vehicle": {"size_px": 64, "rate_hz": 4.5}})
+    simulate_into(tmp_path / "first.mcap", once)
+    simulate_into(tmp_path / "again.mcap", once, pictures=tmp_path / "first.mcap")
+    assert (tmp_path / "again.mcap").read_bytes() == (tmp_path / "first.mcap").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -18,7 +18,7 @@ from flow.graph import Graph, load_graph
 from flow.link import LinkError
 from flow.rerun import Rerun
 from flow.taps import Digest
-from links.recording import Progress, RecordingReader, parts_of, records_of
+from links.recording import Progress, Session
 from links.run_folder import Asked, Finished, RunFolder, truth_beside
 
 
@@ -34,37 +34,38 @@ class Repeated:
 def repeat_into(folder: Path, recording: Path, progress: Progress | None = None) -> Repeated:
     """Take a live run again, all its parts. Raises ConfigError, LinkError."""
     began_s = time.monotonic()
-    parts = parts_of(recording)
-    orders = read_orders(records_of(parts, [ORDER_TOPIC]))
+    session = Session(recording, whole=True)
+    orders = read_orders(session.records([ORDER_TOPIC]))
     if not orders:
         raise LinkError(
             f"{recording} does not say in which order its stages worked (topic {ORDER_TOPIC}): it is no live run's"
             " recording. Replay it without --as-live"
         )
-    graph, asked, warnings = _graph_of(recording)
+    graph, asked = _graph_of(session)
+    warnings: list[str] = []
     for name, order in orders.items():
         if order.cut_off:
             warnings.append(f"{name}: a piece of its order is missing; it is repeated up to there")
     digest, truth, live_hash = Digest(), truth_beside(recording), None
     with RunFolder(folder, recording, asked, graph, began_s) as run:
         rerun = Rerun(graph, orders, (digest, *run.taps))
-        for record in records_of(parts, progress=progress):
+        for record in session.records(progress=progress):
             if record.topic == END_TOPIC:
                 live_hash = _hash_of(record.data)
             rerun.feed(record)
         report = rerun.finish()
         warnings += [f"{name}: {n} messages of the live run are not there" for name, n in rerun.left.items()]
-        finished = run.finish(report, digest.hexdigest(), truth, warnings)
+        warnings = [*session.warnings, *warnings]
+        finished = run.finish(report, digest.hexdigest(), truth, warnings, parts=len(session.parts))
     if live_hash is None:
         return Repeated(finished, True, "the live run was not stopped in order, so its hash is not known")
     same = live_hash == finished.digest
     return Repeated(finished, same, f"the live run's hash was {'the same' if same else live_hash}")
 
 
-def _graph_of(recording: Path) -> tuple[Graph, Asked, list[str]]:
+def _graph_of(session: Session) -> tuple[Graph, Asked]:
     """The graph of the configuration that the recording carries."""
-    with RecordingReader(recording) as reader:
-        text, warnings = reader.config_yaml, list(reader.warnings)
+    text, recording = session.config_yaml, session.path
     if text is None:
         raise LinkError(f"{recording} carries no configuration: it is no live run's recording. Leave out --as-live")
     values = yaml.safe_load(text)
@@ -76,7 +77,7 @@ def _graph_of(recording: Path) -> tuple[Graph, Asked, list[str]]:
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder, "config.yaml")
         config.write_text(text, encoding="utf-8")
-        return load_graph(config), Asked(config), warnings
+        return load_graph(config), Asked(config)
 
 
 def _hash_of(data: bytes) -> str | None:

@@ -27,7 +27,7 @@ from flow.problem import Place
 from flow.replay import RunReport, replay
 from flow.taps import Digest
 from flow.tree import Section
-from links.recording import Progress, RecordingReader, parts_from, records_of
+from links.recording import Progress, RecordingReader, Session
 from links.result_file import ResultFile
 from links.results import SUMMARY_FILE, Results, stamp_s
 from links.truth import TRUTH_RECORDING, FixErrors, TruthLog
@@ -69,6 +69,7 @@ class Finished:
     wall_s: float
     warnings: list[str]
     usage: Usage | None = None  # of a live run
+    parts: int | None = None  # of the recording, that a replay read
 
 
 class RunFolder:
@@ -130,6 +131,7 @@ class RunFolder:
         truth: TruthLog | None,
         warnings: list[str],
         usage: Usage | None = None,
+        parts: int | None = None,
     ) -> Finished:
         """End the run: `warnings` are its recording's, `truth` is what the recording says of the drones.
 
@@ -152,6 +154,7 @@ class RunFolder:
             wall_s=time.monotonic() - self._began_s,
             warnings=warnings,
             usage=usage,
+            parts=parts,
         )
         text = json.dumps(_summary(finished, self._asked), indent=2)
         self._write(SUMMARY_FILE, text + "\n")
@@ -159,20 +162,14 @@ class RunFolder:
 
 
 def replay_into(folder: Path, recording: Path, asked: Asked, progress: Progress | None = None) -> Finished:
-    """Replay a recording and the later parts of its run, with its own rig when it has one.
-
-    Raises ConfigError, LinkError, RunError.
-    """
+    """Replay a recording, all its parts, with its own rig when it has one. Raises ConfigError, LinkError, RunError."""
     began_s = time.monotonic()
-    parts, warnings = parts_from(recording)
-    with RecordingReader(recording) as reader:
-        rig_yaml = reader.rig_yaml
-    graph = asked.graph(rig_yaml, f"{recording} (rig.yaml)")
+    session = Session(recording)
+    graph = asked.graph(session.rig_yaml, f"{recording} (rig.yaml)")
     truth, digest = truth_beside(recording), Digest()
     with RunFolder(folder, recording, asked, graph, began_s) as run:
-        records = records_of(parts, progress=progress, warnings=warnings)
-        report = replay(graph, truth.aside(records), (digest, *run.taps))
-        return run.finish(report, digest.hexdigest(), truth, warnings)
+        report = replay(graph, truth.aside(session.records(progress=progress)), (digest, *run.taps))
+        return run.finish(report, digest.hexdigest(), truth, session.warnings, parts=len(session.parts))
 
 
 def truth_beside(recording: Path) -> TruthLog:
@@ -210,6 +207,7 @@ def _summary(run: Finished, asked: Asked) -> dict[str, Any]:
     summary: dict[str, Any] = {
         "grd": version("grd"),
         "recording": run.recording.name,
+        **({} if run.parts is None else {"parts": run.parts}),
         "config": asked.config.name,
         "overlays": [path.name for path in asked.overlays],
         "set": list(asked.sets),

@@ -5,26 +5,30 @@ Source: ours. Records go through the same decoders as in a run.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from flow.link import LinkError
+from flow.link import LinkError, Record
 from links.dynamixel import Servo
 from links.dynamixel.servo import TICK_RAD
-from links.recording import Progress, RecordingReader
+from links.recording import Progress, Session
 from links.vehicle_odometry import VehicleOdometry
 from links.velodyne import Lidar
 from stages.calibration.looks import Returns, ServoTrace
-from stages.geometry import Array64, LidarMount
-from stages.messages import LidarFirings, ServoState
+from stages.geometry import LidarMount
+from stages.messages import LidarFirings
 
 MOST_RETURNS = 300_000  # more add seconds and no accuracy: firing sequences are left out evenly
 LASERS = 16
 LIDAR = "links.velodyne.Lidar"
+Array = NDArray[Any]
 MIN_RANGE_M = 1.0  # nearer returns are the sensor's own mount and the roof's edge
 
 
@@ -38,45 +42,67 @@ class Gathered:
     mount: LidarMount
     driven_m: float | None  # by the vehicle's own odometry; None: it has none
     seconds: float
+    parts: int  # of the recording, that were read
+    warnings: list[str]  # what of it could not be read
 
 
 def gather(
     recording: Path, rig_yaml: str | None, part_s: tuple[float, float], progress: Progress | None = None
 ) -> Gathered:
-    """Read a recording from and to a time in it [s]; `rig_yaml` stands in for its own rig. Errors are LinkError."""
+    """Read a recording, all its parts, from and to a time in it [s]. `rig_yaml` stands in for its own rig. LinkError.
+
+    It is read twice, to count the returns and to take some: an hour of them all would not fit into the memory.
+    """
     servo, odometry = Servo.model_validate({}), VehicleOdometry.model_validate({})
-    firings: list[LidarFirings] = []
-    states: list[ServoState] = []
-    places_m: list[Array64] = []
-    with RecordingReader(recording) as reader:
-        lidar = lidar_of(reader.config_yaml)
-        text = rig_yaml or reader.rig_yaml
-        if text is None:
-            raise LinkError(f"{recording} holds no rig, which is what is to be improved: give one with --rig FILE")
-        begin_ns, end_ns = (reader.start_ns + 1e9 * s for s in part_s)
-        for record in reader.records([lidar.topic, servo.topic, odometry.topic], progress=progress):
-            if not begin_ns <= record.arrival_ns <= end_ns:
-                continue
-            if record.topic == lidar.topic:
-                firings += [decoded] if (decoded := lidar.decode(record)) is not None else []
-            elif record.topic == servo.topic:
-                states += [state] if (state := servo.decode(record)) is not None else []
-            elif (motion := odometry.decode(record)) is not None:
-                places_m.append(motion.xyz_start_m)
+    session = Session(recording)
+    text = rig_yaml or session.rig_yaml
+    if text is None:
+        raise LinkError(f"{recording} holds no rig, which is what is to be improved: give one with --rig FILE")
+    begin_ns, end_ns = (session.start_ns + 1e9 * s for s in part_s)
+
+    def between(topics: list[str], half: int) -> Iterator[Record]:
+        def step(done: int, of: int) -> None:
+            if progress is not None:
+                progress(half * of + done, 2 * of)
+
+        for record in session.records(topics, progress=step):
+            if record.arrival_ns > end_ns:
+                return
+            if record.arrival_ns >= begin_ns:
+                yield record
+
+    lidar = lidar_of(session.config_yaml)
+    good = 0
+    ends_ns: list[int] = []  # of the first packet and of the last
+    servo_stamps_ns: list[int] = []
+    servo_rad: list[float] = []
+    start_m, driven_m = None, None
+    for record in between([lidar.topic, servo.topic, odometry.topic], half=0):
+        if record.topic == lidar.topic:
+            if (packet := lidar.decode(record)) is not None:
+                good += int(np.count_nonzero(packet.range_m > MIN_RANGE_M))
+                ends_ns[1:] = [packet.stamp_ns]
+        elif record.topic == servo.topic:
+            if (state := servo.decode(record)) is not None:
+                servo_stamps_ns.append(state.stamp_ns)
+                servo_rad.append(state.position_rad)
+        elif (motion := odometry.decode(record)) is not None:
+            start_m = motion.xyz_start_m if start_m is None else start_m
+            driven_m = max(driven_m or 0.0, float(np.linalg.norm(motion.xyz_start_m - start_m)))
     rig, mount = checked_rig(text, str(recording if rig_yaml is None else "--rig"))
-    if not firings:
+    if not ends_ns:
         raise LinkError(f"{recording} holds no LiDAR packets in that time: is it the right recording, and the part?")
-    if not states:
+    if not servo_rad:
         raise LinkError(
             f"{recording} holds no servo states in that time: a LiDAR that does not turn sees nothing twice, "
             "so there is no servo mount to calibrate"
         )
-    driven_m = None
-    if places_m:
-        driven_m = float(np.linalg.norm(np.array(places_m) - places_m[0], axis=1).max())
-    trace = ServoTrace.of(np.array([s.stamp_ns for s in states]), np.array([s.position_rad for s in states]), TICK_RAD)
-    seconds = (firings[-1].stamp_ns - firings[0].stamp_ns) * 1e-9
-    return Gathered(returns_of(firings), trace, rig, mount, driven_m, seconds)
+    trace = ServoTrace.of(np.array(servo_stamps_ns), np.array(servo_rad), TICK_RAD)
+    seconds = (ends_ns[-1] - ends_ns[0]) * 1e-9
+    again = lidar_of(session.config_yaml)
+    packets = (packet for record in between([again.topic], half=1) if (packet := again.decode(record)) is not None)
+    returns = returns_of(packets, step=max(-(-good // MOST_RETURNS), 1))
+    return Gathered(returns, trace, rig, mount, driven_m, seconds, len(session.parts), session.warnings)
 
 
 def lidar_of(config_yaml: str | None) -> Lidar:
@@ -94,20 +120,24 @@ def lidar_of(config_yaml: str | None) -> Lidar:
     return Lidar.model_validate(clock)
 
 
-def returns_of(firings: list[LidarFirings]) -> Returns:
-    """Returns beyond MIN_RANGE_M of evenly chosen firing sequences: every laser stays."""
-    seen = [packet.range_m > MIN_RANGE_M for packet in firings]
-    step = max(-(-sum(int(s.sum()) for s in seen) // MOST_RETURNS), 1)
+def returns_of(packets: Iterable[LidarFirings], step: int) -> Returns:
+    """Returns beyond MIN_RANGE_M of every step-th firing sequence: every laser stays."""
     before = 0
-    kept: list[tuple[LidarFirings, np.ndarray]] = []
-    for packet, good in zip(firings, seen, strict=True):
+    stamps: list[Array] = []
+    lasers: list[Array] = []
+    points: list[Array] = []
+    for packet in packets:
+        good = packet.range_m > MIN_RANGE_M
         sequence = (before + np.arange(len(good))) // LASERS
         before += len(good)
-        kept.append((packet, np.nonzero(good & (sequence % step == 0) & (packet.return_kind == 0))[0]))
+        kept = np.nonzero(good & (sequence % step == 0) & (packet.return_kind == 0))[0]
+        stamps.append(packet.pulse_stamp_ns[kept])
+        lasers.append(packet.laser[kept])
+        points.append(packet.xyz_lidar_m[kept])
     return Returns(
-        stamp_ns=np.concatenate([p.pulse_stamp_ns[k] for p, k in kept]),
-        laser=np.concatenate([p.laser[k] for p, k in kept]),
-        xyz_lidar_m=np.concatenate([p.xyz_lidar_m[k] for p, k in kept]).astype(np.float64),
+        stamp_ns=np.concatenate(stamps),
+        laser=np.concatenate(lasers),
+        xyz_lidar_m=np.concatenate(points).astype(np.float64),
     )
 
 

@@ -52,7 +52,6 @@ def calibrate_recording(
     Example: grd calibrate parked.mcap -o rig.yaml && grd replay flight.mcap --overlay rig.yaml
     """
     from links.calibration import gather, pictures, rig_text
-    from links.recording import other_parts
     from stages.calibration.calibrate import CannotCalibrate, calibrate
 
     target = out_file or recording.with_suffix(".rig.yaml")
@@ -66,9 +65,10 @@ def calibrate_recording(
         raise LinkError(f"--to {to_s:g} is not after --from {from_s:g}")
     with progress_bar(f"read {recording.name}") as step:
         rig_yaml = None if rig is None else read_rig(rig)
-        if (others := other_parts(recording)) is not None:
-            warn(others)
         gathered = gather(recording, rig_yaml, (from_s, math.inf if to_s is None else to_s), progress=step)
+    for text in gathered.warnings:
+        warn(text)
+    parts = f" of the {gathered.parts} parts of {recording.name}" if gathered.parts > 1 else ""
     try:
         if gathered.driven_m is not None and gathered.driven_m > STILL_M + DRIFT_MPS * gathered.seconds:
             raise CannotCalibrate(
@@ -80,7 +80,9 @@ def calibrate_recording(
     except CannotCalibrate as why:
         err.print(f"{recording}: {why}.", markup=False, style="red")
         raise typer.Exit(FINDING) from None
-    table = Table(title=f"{len(found.patches.first)} flat patches in {gathered.seconds:.1f} s", title_justify="left")
+    table = Table(
+        title=f"{len(found.patches.first)} flat patches in {gathered.seconds:.1f} s{parts}", title_justify="left"
+    )
     for head in ("", "before", "found", "sigma", ""):
         table.add_column(Text(head), justify="left" if not head else "right")
     for f in found.findings:

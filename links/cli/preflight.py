@@ -19,7 +19,7 @@ from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
 from links.cli.run import Overlay, Sets
 from links.live_run import live_graph
 from links.preflight import Level, Step, Verdict, is_go, preflight_live, preflight_recording
-from links.recording import RecordingReader, other_parts
+from links.recording import Session
 from links.run_folder import Asked
 
 COLOURS = {Level.OK: "green", Level.WARNING: "yellow", Level.FAIL: "red"}
@@ -71,13 +71,14 @@ def preflight(
 
 
 def _on_recording(asked: Asked, recording: Path, motion: bool) -> list[Verdict]:
-    with RecordingReader(recording) as reader, progress_bar(f"look through {recording.name}") as step:
-        if (others := other_parts(recording)) is not None:
-            warn(others)
-        graph = asked.graph(reader.rig_yaml, f"{recording} (rig.yaml)")
-        verdicts = list(preflight_recording(graph, reader, motion, step))
-        for text in reader.warnings:
-            warn(text)
+    session = Session(recording)
+    graph = asked.graph(session.rig_yaml, f"{recording} (rig.yaml)")
+    with progress_bar(f"look through {recording.name}") as step:
+        verdicts = list(preflight_recording(graph, session, motion, step))
+    for text in session.warnings:
+        warn(text)
+    if len(session.parts) > 1:
+        out.print(f"{len(session.parts)} parts of the recording, looked through together")
     return _told(iter(verdicts))
 
 

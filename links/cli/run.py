@@ -120,7 +120,7 @@ def replay_recording(
     ] = False,
     view: View = False,
 ) -> None:
-    """Replay RECORDING: deterministic, as fast as possible.
+    """Replay RECORDING: deterministic, as fast as possible; of a live run's first part all parts, of a later one that.
 
     With --as-live each stage takes what it took in the live run, in that order; exit code 1 when the hash is not the
     live run's.
@@ -183,8 +183,9 @@ def _tell(run: Finished) -> None:
     if results.fixes:
         show_table(_table(run))
     recorded_s = (report.last_ns - report.first_ns) / 1e9
+    parts = f" in {run.parts} parts" if run.parts is not None and run.parts > 1 else ""
     out.print(
-        f"{report.records} records, {recorded_s:.1f} s recorded, {run.wall_s:.1f} s to run; "
+        f"{report.records} records{parts}, {recorded_s:.1f} s recorded, {run.wall_s:.1f} s to run; "
         f"drone accepted in {results.sweeps_with_drone} of {results.sweeps} sweeps, {len(results.fixes)} fixes"
     )
     if not results.sweeps:

@@ -18,7 +18,7 @@ from flow.live_report import LiveReport
 from flow.replay import Replay
 from links import host_time
 from links.preflight.heard import KEPT, AllHeard, Ear, Heard
-from links.recording import Progress, RecordingReader
+from links.recording import Progress, Session
 from links.simulated import LiveRig
 
 
@@ -54,19 +54,19 @@ def _trouble(name: str, link: Source, report: LiveReport) -> str | None:
     return raised[-1] if told.undecoded and raised else None
 
 
-def listen_to_recording(graph: Graph, reader: RecordingReader, progress: Progress | None = None) -> AllHeard:
+def listen_to_recording(graph: Graph, session: Session, progress: Progress | None = None) -> AllHeard:
     """Feed a recording to a graph and tell what came. Raises RunError where a stage fails, LinkError."""
     ear = Ear()
     runner = Replay(graph, (ear,))
     sources = {name: node for name, node in runner.nodes.items() if isinstance(node, Source)}
     ear.attach(sources)
-    for record in reader.records(progress=progress):
+    for record in session.records(progress=progress):
         if not record.topic.startswith(TRUTH_TOPICS):
             ear.record(record)
             runner.feed(record)
     runner.finish()
     heard = [
-        Heard(name, link, ear.seen(name), dict(link.counters), None, reader.end_ns, live=False)
+        Heard(name, link, ear.seen(name), dict(link.counters), None, session.end_ns, live=False)
         for name, link in sources.items()
     ]
     return AllHeard(tuple(heard), {kind: ear.messages(kind) for kind in KEPT}, live=False)

@@ -26,7 +26,7 @@ from links.preflight.motion import motion_checks
 from links.preflight.parameters import ask_parameters, parameter_check
 from links.preflight.servo import servo_checks
 from links.preflight.verdict import Verdict, fail, ok, warning
-from links.recording import Progress, Recorder, RecordingReader
+from links.recording import Progress, Recorder, Session
 from links.vehicle_odometry import VehicleOdometry
 from links.velodyne import Lidar
 from stages.messages import (
@@ -70,10 +70,10 @@ def preflight_live(graph: Graph, seconds: float, wait: Wait, ask: Ask | None, st
 
 
 def preflight_recording(
-    graph: Graph, reader: RecordingReader, motion: bool, progress: Progress | None = None
+    graph: Graph, session: Session, motion: bool, progress: Progress | None = None
 ) -> Iterator[Verdict]:
-    """The same checks on a recording; parameters and motions that are asked for are live only."""
-    heard = listen_to_recording(tracking(graph) if motion else listening(graph), reader, progress)
+    """The same checks on a recording, all its parts; parameters and motions that are asked for are live only."""
+    heard = listen_to_recording(tracking(graph) if motion else listening(graph), session, progress)
     yield from declared_checks(graph, heard)
     for autopilot in heard.of(Autopilot):
         yield warning(f"{autopilot.name} parameters", "a recording does not tell them: not checked")

@@ -6,7 +6,7 @@ from links.recording.importing import ImportReport, import_file
 from links.recording.reader import RecordingReader
 from links.recording.recorder import Recorder
 from links.recording.recover import RecoverReport, recover
-from links.recording.session import other_parts, parts_from, parts_of, records_of
+from links.recording.session import Session
 from links.recording.writer import RecordingWriter
 
 __all__ = [
@@ -18,13 +18,10 @@ __all__ = [
     "RecordingReader",
     "RecordingWriter",
     "RecoverReport",
+    "Session",
     "Topic",
     "decode_compressed_image",
     "encode_compressed_image",
     "import_file",
-    "other_parts",
-    "parts_from",
-    "parts_of",
-    "records_of",
     "recover",
 ]

@@ -1,92 +1,177 @@
 """A live run's recording as one, whether it has one part or several.
 
+Parts are known by what they say of themselves (run and number), not by their names. What of a run is not read is said.
+
 Source: ours; recordings/README.md.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+import re
+from collections import deque
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from heapq import heappop, heappush, heapreplace
 from pathlib import Path
 
+from flow.consumption import END_TOPIC
 from flow.link import LinkError, Record
 from links.recording.format import Progress
 from links.recording.reader import RecordingReader
 from links.recording.recorder import PART, SESSION
 
 
-def parts_of(path: str | os.PathLike[str]) -> list[Path]:
-    """All parts of the run that `path` is the first part of, in order; those of other runs beside it are left out.
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One file of a recording, as its index tells."""
 
-    A recording that is no part of a run is its only part. LinkError when `path` is a later part, or one is missing.
+    path: Path
+    run: str | None  # None: of no live run
+    number: int  # from 1
+    start_ns: int
+    end_ns: int
+    size: int  # [bytes]
+    stops_short: bool  # it was closed, but is not where the run ended in order
+
+
+class Session:
+    """A recording with all parts of its run, read as one: `for record in Session("flight.mcap").records(): ...`.
+
+    The first part stands for all. A later one that is named is read alone, and a part that is missing is left out, both
+    with a warning; with `whole` they are a LinkError. Files are open only while records are read.
     """
-    first = Path(path)
-    part, found = _beside(first)
-    if part != 1:
-        name = found[1].name if 1 in found else "which is not beside it"
-        raise LinkError(f"{first} is part {part} of its run: a run is taken again from its first part, {name}")
-    for number in range(1, max(found) + 1):
-        if number not in found:
-            raise LinkError(f"{first.parent}: part {number} of this run is missing, there are {len(found)} others")
-    return [found[number] for number in sorted(found)]
+
+    def __init__(self, path: str | os.PathLike[str], *, whole: bool = False) -> None:
+        self.path = Path(path)
+        self.warnings: list[str] = []
+        """What is not read, and why; `records` adds to it."""
+        with RecordingReader(self.path) as reader:
+            named = _part(reader)
+            self.rig_yaml, self.config_yaml = reader.rig_yaml, reader.config_yaml
+            self._note(reader.warnings)
+        found = {named.number: named}
+        if named.run is not None:
+            beside = self._look_beside(named, found)
+            self._note(beside if named.number == 1 else [])
+        self.known = len(found)
+        """Parts of the run that are there."""
+        if named.number != 1:
+            self._is_later(named, found, whole)
+            found = {named.number: named}
+        elif missing := sorted(set(range(1, max(found))) - set(found)):
+            self._lacks(missing, len(found), whole)
+        self._parts = [found[number] for number in sorted(found)]
+        last = self._parts[-1]
+        if named.number == 1 and last.stops_short:
+            text = "the last part here, and the run did not end in it: is one missing, or was the disk full?"
+            self._note([f"{last.path}: {text}"])
+        spans = [(part.start_ns, part.end_ns) for part in self._parts if part.end_ns] or [(0, 0)]
+        self.start_ns, self.end_ns = min(start for start, _ in spans), max(end for _, end in spans)
+
+    @property
+    def parts(self) -> list[Path]:
+        """The files that are read, in order."""
+        return [part.path for part in self._parts]
+
+    def records(self, topics: Collection[str] | None = None, *, progress: Progress | None = None) -> Iterator[Record]:
+        """All records, or those of `topics`, by arrival; of several parts as if they were one file."""
+        return _merged(self._parts, topics, progress, self._note)
+
+    def _note(self, warnings: Sequence[str]) -> None:
+        self.warnings += [text for text in warnings if text not in self.warnings]
+
+    def _look_beside(self, named: _Part, found: dict[int, _Part]) -> list[str]:
+        """Find the other parts in the folder; warnings of theirs, and of what is called like one and is none."""
+        beside: list[str] = []
+        alike = re.compile(rf"{re.escape(named.path.stem)}-\d+\.mcap")
+        for path in sorted(named.path.parent.glob("*.mcap")):
+            if path == named.path:
+                continue
+            try:
+                with RecordingReader(path) as reader:
+                    part, warnings = _part(reader), reader.warnings
+            except LinkError as error:
+                if alike.fullmatch(path.name):
+                    beside.append(f"left out: {error}")
+                continue
+            if part.run == named.run:
+                if found.setdefault(part.number, part) is part:
+                    beside += warnings
+            elif alike.fullmatch(path.name):
+                beside.append(f"{path} is of another run than {named.path.name}: left out")
+        return beside
+
+    def _is_later(self, named: _Part, found: dict[int, _Part], whole: bool) -> None:
+        first = found[1].path.name if 1 in found else "which is not beside it"
+        said = f"{named.path} is part {named.number} of its run"
+        if whole:
+            raise LinkError(f"{said}: a run is taken again from its first part, {first}")
+        self._note([f"{said}, and read alone; all parts are read where the first is named, {first}"])
+
+    def _lacks(self, missing: list[int], there: int, whole: bool) -> None:
+        numbers = ", ".join(map(str, missing))
+        said = f"{self.path.parent}: part {numbers} of this run is missing, there are {there} others"
+        if whole:
+            raise LinkError(said)
+        self._note([f"{said}: what it held is left out"])
 
 
-def parts_from(path: str | os.PathLike[str]) -> tuple[list[Path], list[str]]:
-    """What can be read of the run from `path` on without a gap; and in words what of the run that leaves out.
-
-    A first part brings the later ones, up to one that is missing; a later part stands for itself.
-    """
-    first = Path(path)
-    part, found = _beside(first)
-    if part != 1:
-        return [first], [f"{first.name} is part {part} of its run, and is read alone: name the first part for all"]
-    parts: list[Path] = []
-    while (number := len(parts) + 1) in found:
-        parts.append(found[number])
-    left_out = len(found) - len(parts)
-    missing = f"part {len(parts) + 1} of the run of {first.name} is missing: the {left_out} after it are not read"
-    return parts, [missing] if left_out else []
-
-
-def other_parts(path: str | os.PathLike[str]) -> str | None:
-    """That a recording is one part of several, for those that read one only; None: it is the whole run."""
-    first = Path(path)
-    part, found = _beside(first)
-    return (
-        None if len(found) == 1 else f"{first.name} is part {part} of {len(found)} of its run: this one alone is read"
+def _part(reader: RecordingReader) -> _Part:
+    run, number = reader.metadata.get(SESSION), reader.metadata.get(PART, "1")
+    return _Part(
+        path=reader.path,
+        run=run,
+        number=int(number) if number.isdecimal() else 1,
+        start_ns=reader.start_ns,
+        end_ns=reader.end_ns,
+        size=reader.path.stat().st_size,
+        stops_short=run is not None and reader.finished and END_TOPIC not in reader.topics,
     )
 
 
-def records_of(
-    parts: Collection[Path],
-    topics: Collection[str] | None = None,
-    progress: Progress | None = None,
-    warnings: list[str] | None = None,
+def _merged(
+    parts: Sequence[_Part], topics: Collection[str] | None, progress: Progress | None, note: Callable[[list[str]], None]
 ) -> Iterator[Record]:
-    """The records of all parts, one part after the other; `warnings` get what the readers have to say of each."""
-    for path in parts:
-        with RecordingReader(path) as reader:
-            yield from reader.records(topics, progress=progress)
-            if warnings is not None:
-                warnings += reader.warnings
+    """Records by (arrival, part, sequence). A part is opened when one at or after its start is due.
+
+    Where one part gives way to the next, many threads write: a record may be in the later one and have come before.
+    """
+    waiting = deque(sorted(parts, key=lambda part: (part.start_ns, part.number)))
+    done, whole = dict.fromkeys((part.number for part in parts), 0), sum(part.size for part in parts)
+
+    def stepper(part: _Part) -> Progress:
+        def step(read: int, of: int) -> None:
+            done[part.number] = part.size * read // of
+            if progress is not None:
+                progress(sum(done.values()), whole)
+
+        return step
+
+    heap: list[tuple[int, int, Record, Iterator[Record]]] = []  # arrival and part of the record that is next
+    with ExitStack() as stack:
+        while waiting or heap:
+            while waiting and (not heap or waiting[0].start_ns <= heap[0][0]):
+                part = waiting.popleft()
+                records = stack.enter_context(closing(_read(part.path, topics, stepper(part), note)))
+                if (first := next(records, None)) is not None:
+                    heappush(heap, (first.arrival_ns, part.number, first, records))
+            if not heap:
+                continue
+            _, number, record, records = heap[0]
+            yield record
+            after = next(records, None)
+            if after is None:
+                heappop(heap)
+            else:
+                heapreplace(heap, (after.arrival_ns, number, after, records))
 
 
-def _beside(path: Path) -> tuple[int, dict[int, Path]]:
-    """Which part of its run a recording is, and all parts of that run in its folder."""
-    session, part = _part(path)
-    found = {part: path}
-    for other in sorted(path.parent.glob("*.mcap")) if session is not None else ():
-        if other != path:
-            try:
-                whose, number = _part(other)
-            except LinkError:
-                continue  # no recording that can be read: none of ours
-            if whose == session:
-                found.setdefault(number, other)
-    return part, found
-
-
-def _part(path: Path) -> tuple[str | None, int]:
+def _read(
+    path: Path, topics: Collection[str] | None, progress: Progress, note: Callable[[list[str]], None]
+) -> Generator[Record]:
+    """One part's records; what could not be read is noted."""
     with RecordingReader(path) as reader:
-        number = reader.metadata.get(PART, "1")
-        return reader.metadata.get(SESSION), int(number) if number.isdecimal() else 1
+        yield from reader.records(topics, progress=progress)
+        note(reader.warnings)

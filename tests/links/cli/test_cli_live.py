@@ -70,6 +70,23 @@ def test_a_live_run_leaves_its_folder_and_is_repeated_to_the_same_hash(grd, tmp_
     assert "wired to nothing" not in plain
 
 
+def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_path):
+    (tmp_path / "split.yaml").write_text(CONFIG.replace("Recorder}", "Recorder, config: {split_s: 1}}"))
+    grd("run", "split.yaml", "--for", 2.8, "--no-warm-up")
+    folder = tmp_path / "out" / "live-split"
+    summary = json.loads((folder / "summary.json").read_text())
+    parts = summary["counters"]["recorder"]["parts"]
+    assert parts > 1
+    again = grd("replay", folder / "flight.mcap", "--as-live")
+    assert f"in {parts} parts" in again
+    assert "the live run's hash was the same" in again
+    plain = grd("replay", folder / "flight.mcap", "--config", "ticks.yaml", "--out", "plain")
+    assert f"in {parts} parts" in plain
+    assert "warning" not in plain
+    replayed = json.loads((tmp_path / "plain" / "summary.json").read_text())
+    assert replayed["messages"]["ticker.number"] == summary["messages"]["ticker.number"] == summary["records"]
+
+
 def test_a_repetition_that_differs_is_a_finding(grd, tmp_path, monkeypatch):
     grd("run", "ticks.yaml", "--for", 0.3, "--no-warm-up")
     monkeypatch.setattr("tests.flow.live_toys.Order.finish", lambda self: None)  # another version of a stage

@@ -13,21 +13,10 @@ from pathlib import Path
 import pytest
 
 from flow.link import LinkError, Record, Run
-from links.recording import (
-    Recorder,
-    RecordingReader,
-    RecordingWriter,
-    other_parts,
-    parts_from,
-    parts_of,
-    records_of,
-)
-from links.recording.recorder import PART, SESSION
-from links.run_folder import Asked, replay_into
+from links.recording import Recorder, RecordingReader, Session
 
 ROOT = Path(__file__).parents[3]
 CHILD = Path(__file__).with_name("record_on_a_small_disk.py")
-NO_VIEWER = ("viewer.file=null",)
 SETTINGS = "rig: {version: 1}\nstages: {}\n"
 
 
@@ -67,7 +56,7 @@ def test_each_part_can_be_replayed_alone_and_together_they_are_all(tmp_path):
         if part < 2:
             recorder._begin_part()  # as its thread does when a part is long or big enough
     recorder.close()
-    parts = parts_of(tmp_path / "flight.mcap")
+    parts = Session(tmp_path / "flight.mcap").parts
     assert [path.name for path in parts] == ["flight.mcap", "flight-2.mcap", "flight-3.mcap"]
     for number, path in enumerate(parts):
         with RecordingReader(path) as reader:
@@ -75,7 +64,7 @@ def test_each_part_can_be_replayed_alone_and_together_they_are_all(tmp_path):
             assert (reader.rig_yaml, reader.config_yaml) == ("version: 1\n", SETTINGS)
             assert reader.metadata["part"] == str(number + 1)
             assert sum(1 for _ in reader.records()) == 10
-    assert [r.arrival_ns for r in records_of(parts)] == [1_000 + n for n in range(30)]
+    assert [r.arrival_ns for r in Session(parts[0]).records()] == [1_000 + n for n in range(30)]
     assert recorder.counters == {"written": 30, "dropped": 0, "missed": 0, "parts": 3}
 
 
@@ -88,8 +77,7 @@ def test_a_part_that_is_big_enough_is_followed_by_another_and_nothing_is_lost_be
             number += 1
         threading.Event().wait(0.005)
     recorder.close()
-    parts = parts_of(tmp_path / "flight.mcap")
-    assert [r.arrival_ns for r in records_of(parts)] == [1_000 + n for n in range(number)]
+    assert [r.arrival_ns for r in Session(tmp_path / "flight.mcap").records()] == [1_000 + n for n in range(number)]
 
 
 def test_parts_of_other_runs_beside_are_left_out_and_missing_ones_are_said(tmp_path):
@@ -101,57 +89,18 @@ def test_parts_of_other_runs_beside_are_left_out_and_missing_ones_are_said(tmp_p
                 recorder._begin_part()
         recorder.close()
     (tmp_path / "torn.mcap").write_bytes(b"no recording")
-    assert [p.name for p in parts_of(tmp_path / "other.mcap")] == ["other.mcap", "other-2.mcap", "other-3.mcap"]
+    assert [p.name for p in Session(tmp_path / "other.mcap").parts] == ["other.mcap", "other-2.mcap", "other-3.mcap"]
     with pytest.raises(LinkError, match=r"flight-2.mcap is part 2 of its run: .* from its first part, flight.mcap"):
-        parts_of(tmp_path / "flight-2.mcap")
+        Session(tmp_path / "flight-2.mcap", whole=True)
     (tmp_path / "flight-2.mcap").unlink()
     with pytest.raises(LinkError, match=r"part 2 of this run is missing, there are 2 others"):
-        parts_of(tmp_path / "flight.mcap")
+        Session(tmp_path / "flight.mcap", whole=True)
 
 
 def test_a_recording_of_no_run_is_its_only_part():
     street = ROOT / "recordings" / "street_sweep.mcap"
-    assert parts_of(street) == [street]
-    assert parts_from(street) == ([street], [])
-    assert other_parts(street) is None
-
-
-def test_what_can_be_read_from_a_part_on_is_read_and_the_rest_is_said(tmp_path):
-    recorder = opened(tmp_path)
-    for part in range(4):
-        recorder.record(record(part))
-        if part < 3:
-            recorder._begin_part()
-    recorder.close()
-    names = [f"flight{number}.mcap" for number in ("", "-2", "-3", "-4")]
-    parts, said = parts_from(tmp_path / "flight.mcap")
-    assert ([p.name for p in parts], said) == (names, [])
-    assert other_parts(tmp_path / "flight.mcap") == "flight.mcap is part 1 of 4 of its run: this one alone is read"
-    parts, said = parts_from(tmp_path / "flight-3.mcap")
-    assert [p.name for p in parts] == ["flight-3.mcap"]
-    assert said == ["flight-3.mcap is part 3 of its run, and is read alone: name the first part for all"]
-    (tmp_path / "flight-3.mcap").unlink()
-    parts, said = parts_from(tmp_path / "flight.mcap")
-    assert [p.name for p in parts] == names[:2]
-    assert said == ["part 3 of the run of flight.mcap is missing: the 1 after it are not read"]
-
-
-def test_a_replay_takes_all_parts_to_the_hash_of_the_whole(tmp_path):
-    street, asked = ROOT / "recordings" / "street_sweep.mcap", Asked(ROOT / "configs" / "replay.yaml", sets=NO_VIEWER)
-    with RecordingReader(street) as reader:
-        records = list(reader.records())
-        for part, some in ((1, records[: len(records) // 2]), (2, records[len(records) // 2 :])):
-            file = tmp_path / ("flight.mcap" if part == 1 else "flight-2.mcap")
-            told = {SESSION: "one", PART: str(part)}
-            with RecordingWriter(file, rig_yaml=reader.rig_yaml or "", metadata=told, lossless=True) as writer:
-                for one in some:
-                    writer.write(one)
-    whole = replay_into(tmp_path / "whole", street, asked)
-    split = replay_into(tmp_path / "split", tmp_path / "flight.mcap", asked)
-    assert (split.digest, split.report.records) == (whole.digest, whole.report.records)
-    half = replay_into(tmp_path / "half", tmp_path / "flight-2.mcap", asked)
-    assert half.digest != whole.digest
-    assert any("part 2 of its run" in text for text in half.warnings)
+    assert Session(street).parts == [street]
+    assert Session(street).warnings == []
 
 
 def test_a_disk_without_room_is_said_and_records_are_counted_as_missed(tmp_path):
@@ -178,7 +127,7 @@ def test_a_disk_that_gets_full_ends_the_recording_properly_and_room_again_begins
         threading.Event().wait(0.01)
     recorder.record(record(3))
     recorder.close()
-    assert [r.arrival_ns for r in records_of(parts_of(tmp_path / "flight.mcap"))] == [1_001, 1_003]
+    assert [r.arrival_ns for r in Session(tmp_path / "flight.mcap").records()] == [1_001, 1_003]
     assert recorder.counters == {"written": 2, "dropped": 0, "missed": 1, "parts": 2}
     with RecordingReader(tmp_path / "flight.mcap") as reader:
         assert reader.finished

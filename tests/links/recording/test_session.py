@@ -1,0 +1,159 @@
+"""A live recording in several parts is read as one, by every command; what of it is not read is said."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flow.consumption import END_TOPIC
+from flow.link import LinkError
+from links.calibration.gather import gather
+from links.recording import RecordingReader, Session
+from tests.links import command
+from tests.links.recording.split import split
+
+ROOT = Path(__file__).resolve().parents[3]
+STREET = ROOT / "recordings" / "street_sweep.mcap"
+CUTS_S = (1.5, 3.0)
+
+
+def grd(*words: object, code: int = 0) -> str:
+    return " ".join(command.grd(*words, code=code).split())
+
+
+@pytest.fixture
+def first(tmp_path):
+    folder = tmp_path / "flown"
+    folder.mkdir()
+    return split(STREET, folder, CUTS_S)
+
+
+def beside(first: Path, part: int) -> Path:
+    return first.with_stem(f"{first.stem}-{part}")
+
+
+def keys(records):
+    return [(r.topic, r.arrival_ns, r.stamp_ns, r.data) for r in records if r.topic != END_TOPIC]
+
+
+def test_all_parts_are_read_in_the_order_of_one_file_though_they_overlap(first):
+    session = Session(first)
+    assert [path.name for path in session.parts] == ["flight.mcap", "flight-2.mcap", "flight-3.mcap"]
+    with RecordingReader(first) as part, RecordingReader(beside(first, 2)) as after, RecordingReader(STREET) as whole:
+        assert after.start_ns < part.end_ns
+        assert (session.start_ns, session.end_ns) == (whole.start_ns, whole.end_ns)
+        assert session.rig_yaml == whole.rig_yaml
+        assert keys(session.records()) == keys(whole.records())
+    assert session.warnings == []
+
+
+def test_the_progress_goes_once_from_nothing_to_all(first):
+    told: list[tuple[int, int]] = []
+    for _ in Session(first).records(progress=lambda done, of: told.append((done, of))):
+        pass
+    done = [step for step, _ in told]
+    size = sum(path.stat().st_size for path in first.parent.iterdir())
+    assert {of for _, of in told} == {size}
+    assert done == sorted(done)
+    assert done[0] < size / 3
+    assert done[-1] == size
+
+
+def test_a_part_is_opened_only_when_its_time_comes(first):
+    records = Session(first).records()
+    next(records)
+    beside(first, 3).unlink()
+    with pytest.raises(LinkError, match=r"flight-3\.mcap: no such file"):
+        list(records)
+
+
+def test_a_replay_reads_all_parts_says_so_and_has_the_hash_of_one_file(first, tmp_path):
+    text = grd("replay", first, "--out", tmp_path / "split")
+    grd("replay", STREET, "--out", tmp_path / "whole")
+    apart, whole = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("split", "whole"))
+    assert f"{whole['records'] + 1} records in 3 parts, 5.3 s recorded" in text  # and the run's end
+    assert (apart["parts"], whole["parts"]) == (3, 1)
+    assert apart["output_hash"] == whole["output_hash"]
+    assert apart["against_truth"] == whole["against_truth"]
+    assert apart["warnings"] == whole["warnings"]
+
+
+def test_a_later_part_is_replayed_alone_and_that_is_said(first, tmp_path):
+    text = grd("replay", beside(first, 2), "--out", tmp_path / "two")
+    assert "flight-2.mcap is part 2 of its run, and read alone" in text
+    assert "where the first is named, flight.mcap" in text
+    assert "1.5 s recorded" in text
+    assert json.loads((tmp_path / "two" / "summary.json").read_text())["parts"] == 1
+
+
+def test_a_missing_part_is_said_and_the_others_are_read(first):
+    beside(first, 2).unlink()
+    session = Session(first)
+    assert [path.name for path in session.parts] == ["flight.mcap", "flight-3.mcap"]
+    (said,) = session.warnings
+    assert "part 2 of this run is missing, there are 2 others: what it held is left out" in said
+    with pytest.raises(LinkError, match="part 2 of this run is missing"):
+        Session(first, whole=True)
+
+
+def test_a_missing_last_part_is_said_because_the_run_does_not_end(first):
+    beside(first, 3).unlink()
+    (said,) = Session(first).warnings
+    assert "flight-2.mcap: the last part here, and the run did not end in it" in said
+
+
+def test_a_part_of_another_run_with_such_a_name_and_one_that_cannot_be_read_are_said(first):
+    for path in (beside(first, 2), beside(first, 3)):
+        path.rename(path.with_stem(f"mine{path.stem[-1]}"))
+    split(STREET, first.parent, (1.0,), run="another", name="other")
+    beside(first, 2).hardlink_to(first.with_stem("other-2"))
+    beside(first, 4).touch()
+    session = Session(first)
+    assert [path.name for path in session.parts] == ["flight.mcap", "mine2.mcap", "mine3.mcap"]
+    foreign, empty = session.warnings
+    assert foreign.endswith("flight-2.mcap is of another run than flight.mcap: left out")
+    assert "left out: " in empty
+    assert "flight-4.mcap is empty" in empty
+
+
+def test_what_cannot_be_read_of_a_later_part_is_said(first):
+    damaged = beside(first, 2)
+    data = bytearray(damaged.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    damaged.write_bytes(data)
+    session = Session(first)
+    count = sum(1 for _ in session.records())
+    assert 0 < count < sum(1 for _ in Session(STREET).records())
+    assert [text for text in session.warnings if "flight-2.mcap: chunk at bytes" in text]
+
+
+@pytest.mark.parametrize("part_s", [(0.0, math.inf), (1.0, 4.0)])
+def test_a_calibration_takes_all_parts_as_it_takes_one_file(first, part_s):
+    apart, whole = gather(first, None, part_s), gather(STREET, None, part_s)
+    assert (apart.parts, whole.parts) == (3, 1)
+    assert apart.warnings == []
+    for field in ("stamp_ns", "laser", "xyz_lidar_m"):
+        assert np.array_equal(getattr(apart.returns, field), getattr(whole.returns, field))
+    assert (apart.seconds, apart.mount) == (whole.seconds, whole.mount)
+    assert apart.seconds > 2.9
+
+
+def test_calibrate_says_how_many_parts_it_took_and_what_is_missing(first, tmp_path):
+    beside(first, 3).unlink()
+    text = grd("calibrate", first, "-o", tmp_path / "rig.yaml")
+    assert "of the 2 parts of flight.mcap" in text
+    assert "warning: " in text
+    assert "flight-2.mcap: the last part here" in text
+
+
+def test_a_preflight_looks_through_all_parts(first):
+    config = ROOT / "configs" / "estimate.yaml"
+    text = grd("preflight", config, "--recording", first, "--no-motion", code=1)  # it has no autopilot
+    assert "3 parts of the recording, looked through together" in text
+    whole = grd("preflight", config, "--recording", STREET, "--no-motion", code=1)
+    (losses,) = (line for line in whole.split("ok ") if line.startswith("lidar losses"))
+    assert losses in text

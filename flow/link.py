@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -67,6 +67,11 @@ class Source(Link):
         """Messages of one record: None, one message, or an iterable of messages."""
         raise NotImplementedError
 
+    @property
+    def senders(self) -> dict[str, dict[str, str]]:
+        """What is known of who sends, by topic: a live recording says it with the topic's channel."""
+        return {}
+
     def listen(self) -> AbstractContextManager[Iterator[Record]]:
         """Open the hardware: `with link.listen() as records`. Errors are LinkError.
 
@@ -84,6 +89,7 @@ class Run:
     mermaid: str  # the graph as text
     settings_yaml: str  # the configuration as run
     live: bool = False  # else it replays a recording
+    senders: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])  # by topic, of live sources
 
 
 class Tap(Link):

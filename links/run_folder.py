@@ -21,7 +21,7 @@ import yaml
 
 from flow.draw import mermaid
 from flow.graph import Graph, load_graph
-from flow.link import LinkError, Run, Tap
+from flow.link import LinkError, Run, Source, Tap
 from flow.live_report import LiveReport
 from flow.problem import Place
 from flow.replay import RunReport, replay
@@ -100,7 +100,8 @@ class RunFolder:
         self._folder.mkdir(parents=True, exist_ok=True)
         (self._folder / SUMMARY_FILE).unlink(missing_ok=True)
         name = self._asked.config.stem if self._live else self._recording.stem
-        about = Run(self._folder, name, mermaid(self._graph), self._graph.settings_yaml(), self._live)
+        senders = _senders(self._graph) if self._live else {}
+        about = Run(self._folder, name, mermaid(self._graph), self._graph.settings_yaml(), self._live, senders)
         self._write(CONFIG_FILE, about.settings_yaml)
         with ExitStack() as opening:
             for tap in self.taps:
@@ -159,6 +160,17 @@ class RunFolder:
         text = json.dumps(_summary(finished, self._asked), indent=2)
         self._write(SUMMARY_FILE, text + "\n")
         return finished
+
+
+def _senders(graph: Graph) -> dict[str, dict[str, str]]:
+    """What the sources' settings tell of who sends on which topic."""
+    senders: dict[str, dict[str, str]] = {}
+    for spec in graph.nodes.values():
+        if issubclass(spec.cls, Source):
+            source = spec.build()
+            assert isinstance(source, Source)
+            senders |= source.senders
+    return senders
 
 
 def replay_into(folder: Path, recording: Path, asked: Asked, progress: Progress | None = None) -> Finished:

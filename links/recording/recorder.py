@@ -144,6 +144,7 @@ class Recorder(Tap):
                     SESSION: self._session,
                     PART: str(self._parts + 1),
                 },
+                channels=self._run.senders,
             )
         except LinkError as error:
             self._give_up(str(error))

@@ -70,6 +70,13 @@ class Lidar(Source):
         """
         return self._stream.decode(record)
 
+    @property
+    def senders(self) -> dict[str, dict[str, str]]:
+        """Model, port, and the sensor's address where it is given."""
+        known = {"model": "VLP-16"} | ({} if self.sender is None else {"sender": str(self.sender)})
+        ports = {self.topic: self.port} | ({} if self.position_port is None else {POSITION_TOPIC: self.position_port})
+        return {topic: {**known, "port": str(port)} for topic, port in ports.items()}
+
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
         """Receive packets from the network: `with lidar.listen() as records`. LinkError: see `listen_udp`, or utc's."""

@@ -15,9 +15,10 @@ from pathlib import Path
 
 import pytest
 
+from flow.link import Record
 from links.live_run import live_graph, run_live
-from links.recording import RecordingReader, recover
-from links.run_folder import Asked
+from links.recording import Recorder, RecordingReader, recover
+from links.run_folder import Asked, RunFolder
 from tests.links import command
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -85,6 +86,20 @@ def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_pat
     assert "warning" not in plain
     replayed = json.loads((tmp_path / "plain" / "summary.json").read_text())
     assert replayed["messages"]["ticker.number"] == summary["messages"]["ticker.number"] == summary["records"]
+
+
+def test_a_live_recording_says_with_the_channel_who_sent(tmp_path):
+    lidar = "  lidar: {use: links.velodyne.Lidar, config: {port: 42368, sender: 127.0.0.9}}\n"
+    (tmp_path / "lidar.yaml").write_text(CONFIG.replace("  recorder: {use: links.recording.Recorder}\n", lidar))
+    asked = Asked(tmp_path / "lidar.yaml")
+    heard = RunFolder(tmp_path / "run", tmp_path / "flight.mcap", asked, live_graph(asked), live=True)
+    recorder = Recorder()
+    heard.taps.append(recorder)
+    with heard:
+        for topic in ("/lidar/packets", "/servo/state"):
+            recorder.record(Record(topic, 2, 1, b"any"))
+    with RecordingReader(tmp_path / "run" / "flight.mcap") as reader:
+        assert reader.channels == {"/lidar/packets": {"model": "VLP-16", "port": "42368", "sender": "127.0.0.9"}}
 
 
 def test_a_repetition_that_differs_is_a_finding(grd, tmp_path, monkeypatch):

@@ -80,6 +80,35 @@ def test_a_part_that_is_big_enough_is_followed_by_another_and_nothing_is_lost_be
     assert [r.arrival_ns for r in Session(tmp_path / "flight.mcap").records()] == [1_000 + n for n in range(number)]
 
 
+def test_parts_split_by_time_have_the_static_data_each_and_every_record_once(tmp_path):
+    senders = {"/lidar/packets": {"model": "VLP-16", "port": "2368", "sender": "192.168.1.201"}}
+    recorder = Recorder(split_s=1)
+    recorder.open(Run(tmp_path, "field", "", SETTINGS, True, senders))
+    for number in range(10_000):
+        recorder.record(record(number))
+        if recorder._intake.writer.path.name == "flight-3.mcap":
+            break
+        threading.Event().wait(0.002)
+    recorder.record(record(number + 1))
+    recorder.close()
+    runs: list[str] = []
+    counts: list[int] = []
+    parts = Session(tmp_path / "flight.mcap").parts
+    for path in parts:
+        with RecordingReader(path) as reader:
+            assert reader.finished
+            assert (reader.rig_yaml, reader.config_yaml) == ("version: 1\n", SETTINGS)
+            assert reader.channels == senders
+            runs.append(reader.metadata["session"])
+            assert reader.metadata["part"] == str(len(runs))
+            counts.append(sum(1 for _ in reader.records()))
+    assert len(set(runs)) == 1
+    assert len(runs) == 3
+    assert all(counts)
+    assert [r.arrival_ns for r in Session(parts[0]).records()] == [1_000 + n for n in range(number + 2)]
+    assert recorder.counters == {"written": number + 2, "dropped": 0, "missed": 0, "parts": 3}
+
+
 def test_parts_of_other_runs_beside_are_left_out_and_missing_ones_are_said(tmp_path):
     for name in ("flight.mcap", "other.mcap"):
         recorder = opened(tmp_path, file=name)

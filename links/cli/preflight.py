@@ -18,7 +18,7 @@ from flow.link import LinkError
 from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
 from links.cli.run import Overlay, Sets
 from links.live_run import live_graph
-from links.preflight import Level, Step, Verdict, is_go, preflight_live, preflight_recording
+from links.preflight import OUT_DIR, Level, Step, Verdict, is_go, preflight_live, preflight_recording
 from links.recording import Session
 from links.run_folder import Asked
 
@@ -37,6 +37,9 @@ def preflight(
     for_s: Annotated[
         float, typer.Option("--for", min=0.5, max=600, metavar="SECONDS", help="Live: listen so long.")
     ] = 5.0,
+    out_dir: Annotated[
+        Path, typer.Option("--out", help="Live: the folder that `grd run` will be given; its disk is looked at.")
+    ] = OUT_DIR,
     motion: Annotated[
         bool,
         typer.Option(
@@ -47,7 +50,7 @@ def preflight(
         float, typer.Option("--step", min=0.5, max=120, metavar="SECONDS", help="Time for each motion by hand.")
     ] = 6.0,
 ) -> None:
-    """Check LiDAR, servo, cameras, autopilot, clocks, parameters and axes; say GO or NO-GO.
+    """Check LiDAR, servo, cameras, autopilot, clocks, parameters, axes and disk; say GO or NO-GO.
 
     Live, the turntable holds still at first; for the motions by hand it turns. Poses are not sent to the autopilot.
     Warnings ("look") are for you to judge. Exit code 0: go, 1: no go, 2: wrong use.
@@ -56,7 +59,7 @@ def preflight(
     """
     asked = Asked(config, tuple(overlay or ()), tuple(sets or ()))
     if recording is None:
-        verdicts = _told(preflight_live(live_graph(asked), for_s, _wait, _ask if motion else None, step_s))
+        verdicts = _told(preflight_live(live_graph(asked), for_s, _wait, _ask if motion else None, step_s, out_dir))
     else:
         verdicts = _on_recording(asked, recording, motion)
     failed = [v for v in verdicts if v.level is Level.FAIL]

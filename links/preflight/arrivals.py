@@ -1,4 +1,4 @@
-"""When the records of one topic came: how many, how often, with which gaps, how old.
+"""When the records of one topic came: how many, how big, how often, with which gaps, how old.
 
 Source: ours.
 """
@@ -16,6 +16,7 @@ class Arrivals:
     """Counts over records in the order of arrival."""
 
     count: int = 0
+    data_bytes: int = 0
     first_ns: int = 0
     last_ns: int = 0
     longest_gap_ns: int = 0
@@ -31,6 +32,7 @@ class Arrivals:
             self.longest_gap_ns = max(self.longest_gap_ns, record.arrival_ns - self.last_ns)
         self.least_age_ns, self.most_age_ns = min(self.least_age_ns, age_ns), max(self.most_age_ns, age_ns)
         self.last_ns = record.arrival_ns
+        self.data_bytes += len(record.data)
         self.count += 1
 
     @property

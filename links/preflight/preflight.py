@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from flow.graph import Graph
@@ -18,6 +19,7 @@ from links.mavlink import Autopilot
 from links.preflight.autopilot import autopilot_checks
 from links.preflight.by_hand import STEPS, Step, hand_check
 from links.preflight.camera import camera_checks
+from links.preflight.disk import disk_check
 from links.preflight.graphs import listening, sees_drones, tracking
 from links.preflight.heard import AllHeard, Ear, Heard
 from links.preflight.lidar import lidar_checks
@@ -37,6 +39,7 @@ from stages.messages import (
     RelativePose,
 )
 
+OUT_DIR = Path("out")  # where `grd run` puts its folders
 OLD_MS = 200.0  # of a pose of the vehicle's odometry
 ODOMETRY_HZ = 5.0
 ODOMETRY_SILENT_S = 1.0  # one that told poses and then none for so long has died
@@ -45,8 +48,12 @@ Wait = Callable[[float], None]
 Ask = Callable[[Step], None]  # tells a person what to do and returns when they begin
 
 
-def preflight_live(graph: Graph, seconds: float, wait: Wait, ask: Ask | None, step_s: float = 6.0) -> Iterator[Verdict]:
+def preflight_live(
+    graph: Graph, seconds: float, wait: Wait, ask: Ask | None, step_s: float = 6.0, out_dir: Path = OUT_DIR
+) -> Iterator[Verdict]:
     """All checks on live hardware, as they are known. `ask` None: no motion by hand. LinkError: the simulated rig.
+
+    `out_dir` is where the run's folder would be: the disk there is looked at.
 
     First the sources are heard alone for some seconds, then the autopilot's parameters are read, then the drone is
     moved by hand while the LiDAR looks for it.
@@ -54,6 +61,9 @@ def preflight_live(graph: Graph, seconds: float, wait: Wait, ask: Ask | None, st
     with simulated_rig(graph):
         heard = listen_live(listening(graph), lambda _: wait(seconds))
         yield from declared_checks(graph, heard)
+        for recorder in (spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Recorder)):
+            assert isinstance(recorder, Recorder)
+            yield disk_check(recorder, heard, out_dir)
         for autopilot in heard.of(Autopilot):
             if isinstance(autopilot.link, Autopilot) and autopilot.seen.arrivals.count:
                 yield _parameters(autopilot.name, autopilot.link)

@@ -6,6 +6,7 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
@@ -101,7 +102,8 @@ def test_a_rig_that_is_fit_to_fly_is_go_with_exit_code_0(bench, emulator):
         result = CliRunner().invoke(app, ["preflight", str(bench.config), "--for", str(LISTEN_S), "--no-motion"])
     assert result.exit_code == 0, result.output
     assert "GO: " in result.output
-    for name in ("lidar rate", "lidar losses", "servo answers", "camera_vehicle size", "autopilot parameters"):
+    names = ("lidar rate", "lidar losses", "servo answers", "camera_vehicle size", "autopilot parameters", "disk")
+    for name in names:
         assert f" {name}: " in result.output, result.output
 
 
@@ -115,8 +117,16 @@ def test_a_rig_of_which_nothing_answers_is_no_go_for_each_part(bench, emulator):
     assert "the servo with id 1 does not answer" in found["servo answers"].sentence
     assert "no word from system 1, component 1" in found["autopilot heartbeat"].sentence
     assert "there is no file" in found["camera_vehicle frames"].sentence
-    assert {v.level for v in found.values() if v.level is not Level.WARNING} == {Level.FAIL}
+    assert {n for n, v in found.items() if v.level is Level.OK} == {"disk"}
     assert not {"autopilot parameters", "axes: accelerometer"} & set(found)
+
+
+def test_a_disk_without_room_is_no_go_though_all_else_is_right(bench, emulator, monkeypatch):
+    graph = bench.write(emulator.path)
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1e6))
+    with SendingLidar(bench.ports["lidar"]), bench.drone():
+        found = judged(graph)
+    assert {n for n, v in found.items() if v.level is Level.FAIL} == {"disk"}
 
 
 def test_a_wrong_parameter_and_an_axis_upside_down_are_no_go(bench, emulator):

@@ -1,0 +1,117 @@
+"""deploy/grd.service: what of it a crew relies on, and that its two ways to start are what it says."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import time
+
+import pytest
+
+from tests.unit_file import UNIT, unit_file
+
+CHECK, RUN, RUN_AT_ONCE = (
+    "check configs/field.yaml --overlay /etc/grd/vehicle.yaml",
+    "run configs/field.yaml --overlay /etc/grd/vehicle.yaml",
+    "run configs/field.yaml --overlay /etc/grd/vehicle.yaml --no-warm-up",
+)
+
+
+@pytest.fixture
+def vehicle(tmp_path):
+    """/opt/grd and /run/grd in a folder; grd says what it was asked, one line each time."""
+    grd = tmp_path / ".venv" / "bin" / "grd"
+    grd.parent.mkdir(parents=True)
+    grd.write_text('#!/bin/sh\necho "$@"\n')
+    grd.chmod(0o755)
+    (tmp_path / "run").mkdir()
+    return tmp_path
+
+
+def do(vehicle, setting: str) -> str:
+    """What one of the unit's commands makes grd say, with /run/grd in the folder."""
+    command = shlex.split(unit_file()["Service"][setting].replace("/run/grd", str(vehicle / "run")))
+    return subprocess.run(command, cwd=vehicle, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def start(vehicle) -> list[str]:
+    return [said for setting in ("ExecStartPre", "ExecStart") if (said := do(vehicle, setting))]
+
+
+def since(vehicle, ago_s: float) -> None:
+    """grd was started so long ago."""
+    then_s = time.time() - ago_s
+    os.utime(vehicle / "run" / "since", (then_s, then_s))
+
+
+def test_the_stop_signal_goes_to_grd_alone_so_that_it_ends_the_servo_in_order():
+    service = unit_file()["Service"]
+    assert service["KillMode"] == "mixed"
+    assert service["KillSignal"] == "SIGTERM"
+    assert "exec .venv/bin/grd run" in service["ExecStart"], "a shell in between would be the main process"
+    assert float(service["TimeoutStopSec"]) >= 30, "a slow disk is waited for"
+
+
+def test_what_it_starts_after_it_wants_too():
+    unit = unit_file()["Unit"]
+    assert set(unit["After"].split()) == {"network-online.target", "time-sync.target"}
+    assert set(unit["Wants"].split()) == set(unit["After"].split())
+
+
+def test_grd_that_ends_by_itself_is_started_again_however_often():
+    parts = unit_file()
+    assert parts["Service"]["Restart"] == "on-failure"
+    assert 0 < float(parts["Service"]["RestartSec"]) <= 1
+    assert parts["Unit"]["StartLimitIntervalSec"] == "0"
+
+
+def test_its_note_of_the_start_outlives_a_restart_and_is_its_own():
+    service = unit_file()["Service"]
+    assert service["RuntimeDirectory"] == "grd"
+    assert service["RuntimeDirectoryPreserve"] == "restart"
+
+
+def test_a_first_start_is_checked_and_warmed_up(vehicle):
+    assert start(vehicle) == [CHECK, RUN]
+
+
+def test_a_crash_in_flight_is_answered_at_once_and_so_is_the_next(vehicle):
+    start(vehicle)
+    since(vehicle, 180.0)
+    assert start(vehicle) == [RUN_AT_ONCE]
+    assert start(vehicle) == [RUN_AT_ONCE]
+
+
+def test_a_crash_soon_after_the_start_is_not_one_in_flight(vehicle):
+    start(vehicle)
+    since(vehicle, 50.0)
+    assert start(vehicle) == [CHECK, RUN]
+    since(vehicle, 180.0)
+    start(vehicle)
+    assert start(vehicle) == [RUN_AT_ONCE], (
+        "the note is of the first start: crashes one after the other do not renew it"
+    )
+
+
+def test_who_stops_it_gets_a_careful_start_next(vehicle):
+    start(vehicle)
+    since(vehicle, 180.0)
+    do(vehicle, "ExecStop")
+    assert start(vehicle) == [CHECK, RUN]
+
+
+def test_a_wrong_configuration_is_refused_before_anything_starts(vehicle):
+    (vehicle / ".venv" / "bin" / "grd").write_text("#!/bin/sh\nexit 2\n")
+    with pytest.raises(subprocess.CalledProcessError) as told:
+        do(vehicle, "ExecStartPre")
+    assert told.value.returncode == 2
+    assert not (vehicle / "run" / "since").exists()
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze")
+def test_systemd_finds_nothing_wrong_with_it():
+    told = subprocess.run(["systemd-analyze", "verify", str(UNIT)], capture_output=True, text=True, check=False)
+    assert "grd.service" not in told.stderr, told.stderr
+    assert told.returncode == 0, told.stderr

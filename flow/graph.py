@@ -7,6 +7,7 @@
         inputs: {points: sweep.swept_points}  # how messages wait in a live run: flow/edge.py
         on_error: restart                  # live, when it raises: a fresh one takes over; or skip; or stop the run
         thread: lidar                      # live: shared with others that say so; without it, it has its own
+        process: pictures                  # live: works in a process of that name (flow/stage_process.py)
         yields: true                       # live: takes fewer pictures while others' queues run over (flow/yielding.py)
     links:
       lidar: {use: links.velodyne.Lidar}   # sources and sinks; the first three keys
@@ -41,7 +42,7 @@ HOMES = {"stages": "stages", "links": "links"}  # package in which classes of a 
 OnError = Literal["restart", "skip", "stop"]
 ON_ERROR: tuple[str, ...] = get_args(OnError)
 NODE_KEYS = {
-    "stages": ("use", "config", "inputs", "on_error", "thread", "yields"),
+    "stages": ("use", "config", "inputs", "on_error", "thread", "process", "yields"),
     "links": ("use", "config", "inputs"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
@@ -58,6 +59,7 @@ class NodeSpec:
     config: dict[str, Any]
     on_error: OnError = "restart"  # of a stage that raises in a live run
     thread: str = ""  # of a stage in a live run; stages of one name share it
+    process: str = ""  # of a stage in a live run, not the run's own; stages of one name share it
     yields: bool = False  # of a stage in a live run, to others that do not keep up
 
     def build(self) -> Node:
@@ -165,6 +167,11 @@ def _nodes(tree: Tree, kind: str) -> Iterator[NodeSpec]:
         thread: Any = declared.get("thread", name)
         if not (isinstance(thread, str) and _NAME.match(thread)):
             tree.problem((*path, "thread"), f"must be a name as stages have, got {thread!r}.")
+        process: Any = declared.get("process", "")
+        if not (isinstance(process, str) and (process == "" or _NAME.match(process))):
+            tree.problem((*path, "process"), f"must be a name as stages have, got {process!r}.")
+        elif process and "thread" in declared:
+            tree.problem((*path, "process"), "in a process each stage has a thread of its own: leave 'thread' out.")
         yields: Any = declared.get("yields", False)
         if not isinstance(yields, bool):
             tree.problem((*path, "yields"), f"must be true or false, got {yields!r}.")
@@ -174,9 +181,9 @@ def _nodes(tree: Tree, kind: str) -> Iterator[NodeSpec]:
             config = resolve(tree, (*path, "config"), declared.get("config") or {})
             if len(tree.problems) == before:  # a reference to nothing is said already
                 config = _settings(tree, path, cls, config)
-            yield NodeSpec(
-                name, kind, declared["use"], cls, config, cast(OnError, on_error), str(thread), yields is True
-            )
+            error: OnError = cast(OnError, on_error)
+            use = declared["use"]
+            yield NodeSpec(name, kind, use, cls, config, error, str(thread), str(process), yields is True)
 
 
 def _class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node] | None:

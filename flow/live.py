@@ -2,7 +2,8 @@
 
 One thread listens to each source, decodes there and sends; each stage, each sink and each tap has a thread and an
 inbox (`flow.edge`: how messages wait). Stages that do little for each of many messages share a thread (`thread: NAME`):
-Python lets one thread work at a time, and going from one to the next for each packet costs as much as the work.
+Python lets one thread work at a time, and going from one to the next for each packet costs as much as the work. Those
+that do much for each of few messages may work in a process of their own (`process: NAME`, `flow.stage_process`).
 
 What goes wrong is reported, handled as configured, and the rest flies on: a stage that raises (`flow.stage_life`), a
 link that dies (it is opened again, with pauses that grow), a tap that is slow (it misses messages). With a recorder
@@ -73,10 +74,16 @@ class Live:
         """Nobody asked for the end: neither `stop` nor a stage whose `on_error` does."""
         return not self._shared.stopping.is_set()
 
+    @property
+    def processes(self) -> list[int]:
+        """The process numbers of those in which stages work beside this one."""
+        return self._wiring.processes.pids
+
     def start(self) -> None:
         """Start all threads; sources last, so that nothing is sent to a stage that is not there yet."""
         sys.setswitchinterval(SWITCH_S)
         threads = self._wiring
+        threads.processes.wait()
         for thread in (*threads.taps, *threads.sinks, *threads.stage_threads, *threads.sources, self._house):
             thread.start()
 
@@ -104,6 +111,7 @@ class Live:
         for tap in threads.taps:
             tap.end()
         self._join(threads.taps, TAPS_S)
+        threads.processes.end()
         sys.setswitchinterval(self._switch_s)
         return self.report()
 

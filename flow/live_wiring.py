@@ -20,6 +20,7 @@ from flow.message import Message
 from flow.ports import Output, RunError
 from flow.stage import Stage, output_ports
 from flow.stage_life import StageLife
+from flow.stage_process import Processes
 from flow.yielding import Queue, Rest
 
 TAP_PICTURES = 8  # that wait for a tap: more would be much memory, fewer would lose some of each burst
@@ -73,6 +74,7 @@ class Wiring:
         self.edges: dict[str, LiveEdge] = {}
         self.links: dict[str, Link] = {}  # taps by their class
         self.outputs: dict[str, dict[type[Message], Output[Feed]]] = {}
+        self.processes = Processes()
         self._shared = shared
         self._bells: dict[str, Bell] = {}  # by thread
         for spec in graph.nodes.values():
@@ -107,7 +109,8 @@ class Wiring:
         if shared.recorders:
             order = OrderLog(spec.name, [count.edge.port for count in counts])
             self.orders.append(order)
-        life = StageLife(spec, self.outputs[spec.name], self._teller(spec.name), strict=shared.strict)
+        build = self.processes.build if spec.process else NodeSpec.build
+        life = StageLife(spec, self.outputs[spec.name], self._teller(spec.name), strict=shared.strict, build=build)
         self.stages.append(StageRun(life, inbox, counts, order, shared, lambda: self._orphan(spec.name)))
 
     def _orphan(self, stage: str) -> None:

@@ -19,6 +19,10 @@ class RunError(Exception):
     """A stage or link raised while the graph ran. The text names node, port and time; the cause is chained."""
 
 
+class RaisedElsewhereError(Exception):
+    """What a stage in another process raised, with its type's name, as text."""
+
+
 class Output(Generic[F]):
     """One output of one running node: its name, how many messages it gave, and the ports that it feeds."""
 
@@ -38,7 +42,8 @@ def call(name: str, handler: Callable[[Any], Any], message: Any, arrival_ns: int
     except LinkError:
         raise  # says itself what to check
     except Exception as error:
-        raise RunError(f"{name} failed at {arrival_ns / 1e9:.6f} s: {type(error).__name__}: {error}") from error
+        told = str(error) if isinstance(error, RaisedElsewhereError) else f"{type(error).__name__}: {error}"
+        raise RunError(f"{name} failed at {arrival_ns / 1e9:.6f} s: {told}") from error
 
 
 @contextmanager

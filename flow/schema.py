@@ -35,8 +35,10 @@ _WAITING = {
 _ANY_EDGE = {"anyOf": [_OUTPUT, _WAITING, {"type": "null", "description": "unwired, where an included file wires it"}]}
 _EDGE = {"$ref": "#/$defs/edge"}
 _THREAD = {"type": "string", "description": "live: stages of one name share a thread; else each has its own"}
+_PROCESS = {"type": "string", "description": "live: it works in a process of this name, with others that say so"}
 _YIELDS = {"type": "boolean", "description": "live: fewer pictures are taken while others' queues run over"}
 _ON_ERROR = {"enum": list(ON_ERROR), "description": "live, when it raises: a fresh one, skip the message, or stop"}
+_OF_STAGES = {"on_error": _ON_ERROR, "thread": _THREAD, "process": _PROCESS, "yields": _YIELDS}
 
 
 def schema() -> dict[str, Any]:
@@ -75,7 +77,7 @@ def _section(kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
             "use": {"type": "string", "examples": list(classes), "description": "module.Class"},
             "config": {"type": "object"},
             "inputs": {"type": "object", "additionalProperties": _EDGE},
-            **({"on_error": _ON_ERROR, "thread": _THREAD, "yields": _YIELDS} if kind == "stages" else {}),
+            **(_OF_STAGES if kind == "stages" else {}),
         },
         "allOf": [
             {"if": {"properties": {"use": {"const": use}}, "required": ["use"]}, "then": {"$ref": f"#/$defs/{use}"}}

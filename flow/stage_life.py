@@ -16,7 +16,6 @@ from flow.graph import NodeSpec
 from flow.message import Message
 from flow.metrics import Latency
 from flow.ports import Output, RunError, admit, call
-from flow.stage import Stage
 
 MAX_RESTARTS, WITHIN_NS = 5, 60_000_000_000
 """A stage that raises once more within this time is beyond help: it stops, the others fly on."""
@@ -32,7 +31,9 @@ class StageLife:
         tell: Callable[[str, RunError], None],
         *,
         strict: bool = False,
+        build: Callable[[NodeSpec], Any] = NodeSpec.build,
     ) -> None:
+        """`build` gives a fresh stage, or what stands for one that works elsewhere."""
         self.name = spec.name
         self.compute = Latency()
         self.stopped = False
@@ -45,6 +46,7 @@ class StageLife:
         self.last_ns = 0
         """Arrival of the newest message taken."""
         self._spec, self._outputs, self._tell, self._strict = spec, outputs, tell, strict
+        self._build = build
         self._failed_ns: deque[int] = deque(maxlen=MAX_RESTARTS)
         self._counted: Counter[str] = Counter()  # by those that raised
         self._begin()
@@ -55,9 +57,7 @@ class StageLife:
         return dict(self._counted + Counter(self._stage.counters))
 
     def _begin(self) -> None:
-        stage = self._spec.build()
-        assert isinstance(stage, Stage)
-        self._stage = stage
+        self._stage = self._build(self._spec)
 
     def take(self, port: str, message: Message, arrival_ns: int) -> list[tuple[Output[Any], Message]]:
         """What the stage gives for one message, each with the output it belongs to; nothing when it raised."""

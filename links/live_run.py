@@ -74,7 +74,7 @@ def run_live(
         try:
             while live.running and not stop.wait(LOOK_S) and (for_s is None or time.monotonic() < started_s + for_s):
                 _show(live, started_s, show, run)
-                usage.look()
+                usage.look(live.processes)
         finally:
             report = live.stop()
         _show(live, started_s, show, run)

@@ -253,19 +253,20 @@ def _summary(run: Finished, asked: Asked) -> dict[str, Any]:
         },
     }
     if isinstance(report, LiveReport):
-        summary["live"] = _live(report) | ({} if run.usage is None else {"usage": run.usage.columns})
+        summary["live"] = _live(report, run.usage) | ({} if run.usage is None else {"usage": run.usage.columns})
     if run.errors is not None:
         summary["against_truth"] = _judged(run.errors)
     return summary
 
 
-def _live(report: LiveReport) -> dict[str, Any]:
+def _live(report: LiveReport, usage: Usage | None) -> dict[str, Any]:
     """What only a live run can tell: how late it was, what it dropped, what went wrong."""
     used = resource.getrusage(resource.RUSAGE_SELF)
+    others_s = 0.0 if usage is None else usage.others_cpu_s
     edges = {name: {key: _rounded(value) for key, value in asdict(edge).items()} for name, edge in report.edges.items()}
     return {
-        "cpu_s": round(used.ru_utime + used.ru_stime, 2),
-        "max_rss_mb": round(used.ru_maxrss / 1024, 1),  # Linux tells kB
+        "cpu_s": round(used.ru_utime + used.ru_stime + others_s, 2),
+        "max_rss_mb": round(used.ru_maxrss / 1024, 1),  # Linux tells kB; `usage` has the other processes', too
         "dropped": report.dropped,
         "missed_deadlines": report.missed,
         "edges": edges,

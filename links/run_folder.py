@@ -219,7 +219,7 @@ def _summary(run: Finished, asked: Asked) -> dict[str, Any]:
     summary: dict[str, Any] = {
         "grd": version("grd"),
         "recording": run.recording.name,
-        **({} if run.parts is None else {"parts": run.parts}),
+        **({"parts": run.parts} if run.parts is not None and run.parts > 1 else {}),
         "config": asked.config.name,
         "overlays": [path.name for path in asked.overlays],
         "set": list(asked.sets),

@@ -9,11 +9,12 @@ import typer
 
 from links.cli.calibrate import calibrate_recording
 from links.cli.evaluate import evaluate_runs
-from links.cli.files import import_recording, recover_recording, simulate_matrix, simulate_recording, view
+from links.cli.files import import_recording, recover_recording, view
 from links.cli.graphs import check, graph, schema
 from links.cli.lens import import_lens
 from links.cli.preflight import preflight
 from links.cli.run import replay_recording, run
+from links.cli.simulate import simulate_matrix, simulate_recording
 
 app = typer.Typer(
     name="grd",

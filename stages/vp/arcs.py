@@ -30,6 +30,8 @@ DEEPEST = 64  # splits waiting at once
 WIDEST_RAD = 2.9  # an arc of half a turn has no plane
 NORMAL, FIRST, LAST, SIGMA, EXTENT, MOMENTS = 0, 3, 6, 9, 10, 11  # columns of the table
 COLUMNS = MOMENTS + 7  # six moments of the rays and their number
+Vector = tuple[float, float, float]  # in compiled code: an array of three is fetched from afar
+Moments = tuple[float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def _split_all(
     turn_rad_per_row: Array64,
     middle_row: float,
 ) -> Array64:
-    rolls = dot(turn_rad_per_row, turn_rad_per_row) > 0.0
+    rolls = bool(np.any(turn_rad_per_row != 0.0))
     most = 0
     for c in range(len(start) - 1):
         most = max(most, start[c + 1] - start[c])
@@ -93,7 +95,7 @@ def _split_all(
     for c in range(len(start) - 1):
         size = start[c + 1] - start[c]
         for k in range(size):
-            _ray(table, points[start[c] + k, 0], points[start[c] + k, 1], rays[k])
+            _ray(table, points[start[c] + k, 0], points[start[c] + k, 1], rays, k)
             if rolls:
                 _turn(rays[k], points[start[c] + k, 1] - middle_row, turn_rad_per_row)
         stack[0, 0], stack[0, 1] = 0, size - 1
@@ -114,19 +116,22 @@ def _split_all(
 
 
 @compiled
-def _ray(table: NDArray[np.float32], x: float, y: float, out: Array64) -> None:
+def _ray(table: NDArray[np.float32], x: float, y: float, out: Array64, at: int) -> None:
     """The ray at a place between pixels, a mean of the four of the table around it: off by 3e-5 rad at most."""
-    column, row = int(x) // STEP_PX, int(y) // STEP_PX
-    u, v = x / STEP_PX - column, y / STEP_PX - row
+    x, y = x / STEP_PX, y / STEP_PX
+    column, row = np.uint64(x), np.uint64(y)  # as these are never negative, no index is wound around
+    right, below = column + np.uint64(1), row + np.uint64(1)
+    u, v = x - column, y - row
     square = 0.0
     for k in range(3):
-        top = table[row, column, k] * (1.0 - u) + table[row, column + 1, k] * u
-        low = table[row + 1, column, k] * (1.0 - u) + table[row + 1, column + 1, k] * u
-        out[k] = top * (1.0 - v) + low * v
-        square += out[k] * out[k]
+        top = table[row, column, k] * (1.0 - u) + table[row, right, k] * u
+        low = table[below, column, k] * (1.0 - u) + table[below, right, k] * u
+        value = top * (1.0 - v) + low * v
+        out[at, k] = value
+        square += value * value
     scale = 1.0 / math.sqrt(square)
     for k in range(3):
-        out[k] *= scale
+        out[at, k] *= scale
 
 
 @compiled
@@ -161,75 +166,83 @@ def _worst(rays: Array64, i: int, j: int, tolerance: float) -> int:
 @compiled
 def _fit_piece(rays: Array64, i: int, j: int, min_extent: float, least_sigma: float, row: Array64) -> bool:
     """Fill a row of the table; False when the piece is too short."""
-    moments = row[MOMENTS:]
-    moments[:] = 0.0
+    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(i, j + 1):
         x, y, z = rays[k, 0], rays[k, 1], rays[k, 2]
-        moments[0] += x * x
-        moments[1] += x * y
-        moments[2] += x * z
-        moments[3] += y * y
-        moments[4] += y * z
-        moments[5] += z * z
-    moments[6] = j - i + 1
-    return fit_moments(moments, rays[i], rays[j], min_extent, least_sigma, row)
+        xx += x * x
+        xy += x * y
+        xz += x * z
+        yy += y * y
+        yz += y * z
+        zz += z * z
+    moments = (xx, xy, xz, yy, yz, zz, float(j - i + 1))
+    first, last = (rays[i, 0], rays[i, 1], rays[i, 2]), (rays[j, 0], rays[j, 1], rays[j, 2])
+    return fit_moments(moments, first, last, min_extent, least_sigma, row)
 
 
 @compiled
 def fit_moments(
-    moments: Array64, first: Array64, last: Array64, min_extent: float, least_sigma: float, row: Array64
+    moments: Moments, first: Vector, last: Vector, min_extent: float, least_sigma: float, row: Array64
 ) -> bool:
     """The circle through rays of these moments, from about `first` to about `last`. False: shorter than min_extent."""
-    n, m = np.empty(3), first + last
-    cross(first, last, n)
-    extent = math.atan2(math.sqrt(dot(n, n)), dot(first, last))
+    n = cross(first, last)
+    extent = math.atan2(_length(n), dot(first, last))
     if not min_extent <= extent < WIDEST_RAD:
         return False
-    n /= math.sqrt(dot(n, n))
-    m /= math.sqrt(dot(m, m))
-    t = np.empty(3)
-    cross(n, m, t)
+    n = _unit(n)
+    m = _unit((first[0] + last[0], first[1] + last[1], first[2] + last[2]))
+    t = cross(n, m)
     tt, tm, mm = _form(moments, t, t), _form(moments, t, m), _form(moments, m, m)
     tn, mn = _form(moments, t, n), _form(moments, m, n)
     det = tt * mm - tm * tm
     if det <= 1e-15:
         return False
-    n += (tm * mn - mm * tn) / det * t + (tm * tn - tt * mn) / det * m
-    n /= math.sqrt(dot(n, n))
+    a, b = (tm * mn - mm * tn) / det, (tm * tn - tt * mn) / det
+    n = _unit((n[0] + (a * t[0] + b * m[0]), n[1] + (a * t[1] + b * m[1]), n[2] + (a * t[2] + b * m[2])))
     count = moments[6]
     variance = max(max(_form(moments, n, n), 0.0) / max(count - 2.0, 1.0), least_sigma * least_sigma)
     row[SIGMA] = math.sqrt(variance * min(CORRELATED, 0.5 * count) * mm / det)
     row[EXTENT] = extent
-    row[NORMAL : NORMAL + 3] = n
-    _onto(first, n, row[FIRST : FIRST + 3])
-    _onto(last, n, row[LAST : LAST + 3])
-    row[MOMENTS:] = moments
+    first, last = _onto(first, n), _onto(last, n)
+    for k in range(3):
+        row[NORMAL + k], row[FIRST + k], row[LAST + k] = n[k], first[k], last[k]
+    for k in range(7):
+        row[MOMENTS + k] = moments[k]
     return True
 
 
 @compiled
-def dot(a: Array64, b: Array64) -> float:
-    """a . b of (3,)."""
+def dot(a: Vector, b: Vector) -> float:
+    """a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled
-def cross(a: Array64, b: Array64, out: Array64) -> None:
-    """a x b of (3,)."""
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]
+def cross(a: Vector, b: Vector) -> Vector:
+    """a x b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @compiled
-def _onto(ray: Array64, n: Array64, out: Array64) -> None:
+def _length(a: Vector) -> float:
+    return math.sqrt(dot(a, a))
+
+
+@compiled
+def _unit(a: Vector) -> Vector:
+    length = _length(a)
+    return a[0] / length, a[1] / length, a[2] / length
+
+
+@compiled
+def _onto(ray: Vector, n: Vector) -> Vector:
     """The ray moved onto the circle of n."""
-    out[:] = ray - n * dot(n, ray)
-    out /= math.sqrt(dot(out, out))
+    off = dot(n, ray)
+    return _unit((ray[0] - n[0] * off, ray[1] - n[1] * off, ray[2] - n[2] * off))
 
 
 @compiled
-def _form(moments: Array64, a: Array64, b: Array64) -> float:
+def _form(moments: Moments, a: Vector, b: Vector) -> float:
     """a^T M b of the symmetric matrix in `moments`."""
     return (
         moments[0] * a[0] * b[0]

@@ -33,6 +33,7 @@ CAUCHY = 1.5  # sigmas
 NORMAL_MEDIAN = 0.6745  # of the absolute value, in sigmas
 FEW_LINES = 10  # what was expected counts as much as so many lines
 GATE = 4.0  # sigmas; a line farther from all directions has none
+WELL = 1.0 + 1e-9  # beyond a bound by so much: beyond it, however it was rounded
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,22 @@ class Structure:
 
 def lines_of(arcs: Arcs, R_carrier_camera: Array64, wide_rad: float) -> Lines:
     """The search's view of the arcs. A line counts fully from `wide_rad` on."""
-    middle = arcs.ends.sum(axis=1)
-    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
-    tangent: Array64 = np.cross(arcs.normal, middle).astype(np.float64)
-    weight = np.minimum(arcs.extent_rad / wide_rad, 1.0)
     R = R_carrier_camera.T
-    return Lines(arcs.normal @ R, tangent @ R, arcs.sigma_rad, weight)
+    weight = np.minimum(arcs.extent_rad / wide_rad, 1.0)
+    return Lines(arcs.normal @ R, _tangents(arcs.normal, arcs.ends) @ R, arcs.sigma_rad, weight)
+
+
+@compiled
+def _tangents(normal: Array64, ends: Array64) -> Array64:
+    """n x m (n, 3) of the middle rays m."""
+    out = np.empty((len(normal), 3))
+    for i in range(len(normal)):
+        n, first, last = normal[i], ends[i, 0], ends[i, 1]
+        x, y, z = first[0] + last[0], first[1] + last[1], first[2] + last[2]
+        length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
+        x, y, z = x / length, y / length, z / length
+        out[i, 0], out[i, 1], out[i, 2] = n[1] * z - n[2] * y, n[2] * x - n[0] * z, n[0] * y - n[1] * x
+    return out
 
 
 def residual_sigma(lines: Lines, direction: Array64, sigma_model: float) -> Array64:
@@ -95,7 +106,7 @@ def upright(vertical: Array64) -> Array64:
 
 
 def assign(lines: Lines, directions: Array64, sigma_model: float) -> tuple[NDArray[np.int64], Array64, Array64]:
-    """Which direction each line runs in (NONE: none), its residual and the residual's sigma."""
+    """Which direction each line runs in (NONE: none); its residual and the residual's sigma, of those that have one."""
     return _assign(lines.normal, lines.tangent, lines.sigma_rad, directions, sigma_model)
 
 
@@ -107,12 +118,14 @@ def _assign(
     assigned = np.full(count, NONE)
     residual, spread = np.zeros(count), np.ones(count)
     for i in range(count):
-        n, t = normal[i], tangent[i]
-        least = np.inf
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        least, far = np.inf, WELL * GATE * (sigma[i] + sigma_model)
         for k in range(len(directions)):
-            d = directions[k]
-            r = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
-            s = math.hypot(sigma[i] * (t[0] * d[0] + t[1] * d[1] + t[2] * d[2]), sigma_model)
+            dx, dy, dz = directions[k, 0], directions[k, 1], directions[k, 2]
+            r = nx * dx + ny * dy + nz * dz
+            if abs(r) > far:
+                continue
+            s = math.hypot(sigma[i] * (tangent[i, 0] * dx + tangent[i, 1] * dy + tangent[i, 2] * dz), sigma_model)
             if abs(r) < least * s:
                 least, residual[i], spread[i] = abs(r) / s, r, s
                 assigned[i] = k
@@ -201,8 +214,9 @@ def _normal_equations(
         k = assigned[i]
         if k == NONE:
             continue
-        n, d = normal[i], directions[k]
-        x, y, z = d[1] * n[2] - d[2] * n[1], d[2] * n[0] - d[0] * n[2], d[0] * n[1] - d[1] * n[0]
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        dx, dy, dz = directions[k, 0], directions[k, 1], directions[k, 2]
+        x, y, z = dy * nz - dz * ny, dz * nx - dx * nz, dx * ny - dy * nx
         for a in range(3):  # n . (omega x d) = omega . (d x n)
             J[a], at[a] = x * axes[0, a] + y * axes[1, a] + z * axes[2, a], a
         frame = (k - 1) // 2 if k != VERTICAL else 0

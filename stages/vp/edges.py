@@ -162,8 +162,9 @@ def _walk(
         steep_x = abs(gx) > abs(gy)
         across = 1 if steep_x else width
         if steps % STRIDE == 0:
-            ahead = gx * dx[at + across] + gy * dy[at + across]
-            behind = gx * dx[at - across] + gy * dy[at - across]
+            one, other = np.uint64(at + across), np.uint64(at - across)
+            ahead = gx * dx[one] + gy * dy[one]
+            behind = gx * dx[other] + gy * dy[other]
             curve = 2 * square - ahead - behind
             shift = 0.5 * (ahead - behind) / curve if curve > 0 else 0.0
             shift = min(max(shift, -0.6), 0.6)
@@ -171,14 +172,14 @@ def _walk(
             out[count, 1] = row + (0.0 if steep_x else shift)
             count += 1
         steps += 1
-        free[at], free[at + across], free[at - across] = 0, 0, 0
+        free[np.uint64(at)], free[np.uint64(at + across)], free[np.uint64(at - across)] = 0, 0, 0
         # the edge runs across the gradient: one step along its main axis, to the steepest of three pixels
         step = (way if gx > 0 else -way) if steep_x else (-way if gy > 0 else way)
         ahead_at = at + (step * width if steep_x else step)
         best, best_side = np.int64(low), 2
         next_x, next_y = gx, gy
         for side in range(-1, 2):
-            to = ahead_at + side * across
+            to = np.uint64(ahead_at + side * across)  # as this is never negative, no index is wound around
             if free[to]:
                 hx, hy = np.int64(dx[to]), np.int64(dy[to])
                 steep, dot = hx * hx + hy * hy, gx * hx + gy * hy

@@ -100,8 +100,7 @@ def _best_pair(lines: Lines, vertical: Array64, prior: Prior, limits: Limits) ->
 
 
 def _along_vertical(lines: Lines, vertical: Array64, limits: Limits) -> NDArray[np.bool_]:
-    sigma = residual_sigma(lines, vertical, limits.sigma_model)
-    return np.abs(lines.normal @ vertical) < 3.0 * sigma
+    return np.abs(lines.normal @ vertical) < 3.0 * residual_sigma(lines, vertical, limits.sigma_model)
 
 
 def _frames(lines: Lines, axes: Array64, limits: Limits) -> tuple[list[float], float]:
@@ -167,9 +166,9 @@ def _sigma(cov: Array64, axes: Array64, d: Array64, frame: int) -> float:
     A[:, :3] = np.eye(3)
     if frame > 0:
         A[2, 2 + frame] = 1.0
+    turn = A @ cov @ A.T
     local = axes.T @ d
-    X = np.array([[0, local[2], -local[1]], [-local[2], 0, local[0]], [local[1], -local[0], 0]])
-    return math.sqrt(max(float(np.trace(X @ A @ cov @ A.T @ X.T)) / 2, 0.0))
+    return math.sqrt(max(float(turn.trace() - local @ turn @ local) / 2, 0.0))  # a turn about d moves it nowhere
 
 
 def _vertical_only(lines: Lines, v: Array64, prior: Prior, limits: Limits, peak: float) -> Found:

@@ -33,47 +33,90 @@ def yaw_spectrum(lines: Lines, axes: Array64, free: NDArray[np.bool_], sigma_mod
 
     score = (S - E[S]) / sd[S] when all yaws were drawn at random.
     """
-    flat = lines.normal @ axes[:, :2]
-    level = np.hypot(flat[:, 0], flat[:, 1])
-    yaw = np.arctan2(flat[:, 0], -flat[:, 1])  # of n x v
-    along = axes[:, :2] @ np.array([np.cos(yaw), np.sin(yaw)])
-    sigma_r = np.hypot(lines.sigma_rad * np.einsum("ij,ji->i", lines.tangent, along), 2.0 * sigma_model)
-    sigma = sigma_r / np.maximum(level, 1e-6)
-    use = free & (sigma < WIDEST_RAD)
     middles: Array64 = (np.arange(bins, dtype=np.float64) + 0.5) * (math.pi / 2 / bins)
-    weight = lines.weight * level
-    total, mean, variance = _spread(yaw[use], sigma[use], weight[use], middles)
+    total, mean, variance = _spread(
+        lines.normal,
+        lines.tangent,
+        lines.sigma_rad,
+        lines.weight,
+        np.ascontiguousarray(axes),
+        free,
+        2.0 * sigma_model,
+        middles,
+    )
     return Spectrum(middles, (total - mean) / math.sqrt(max(variance, 1e-12)), total)
 
 
 @compiled
-def _spread(yaw: Array64, sigma: Array64, weight: Array64, middles: Array64) -> tuple[Array64, float, float]:
-    quarter = 0.5 * np.pi
+def _spread(
+    normal: Array64,
+    tangent: Array64,
+    sigma_rad: Array64,
+    weights: Array64,
+    axes: Array64,
+    free: NDArray[np.bool_],
+    sigma_model: float,
+    middles: Array64,
+) -> tuple[Array64, float, float]:
+    quarter = 0.5 * math.pi
+    bins = len(middles)
     step = middles[1] - middles[0]
-    total = np.zeros(len(middles))
+    total = np.zeros(bins)
     mean, variance = 0.0, 0.0
-    for i in range(len(yaw)):
-        reach = int(3.0 * sigma[i] / step) + 1
-        at = int(np.floor((yaw[i] % quarter) / step))
+    for i in range(len(normal)):
+        if not free[i]:
+            continue
+        n, t = normal[i], tangent[i]
+        x = n[0] * axes[0, 0] + n[1] * axes[1, 0] + n[2] * axes[2, 0]
+        y = n[0] * axes[0, 1] + n[1] * axes[1, 1] + n[2] * axes[2, 1]
+        level = max(math.hypot(x, y), 1e-6)
+        # along n x v: (-y, x) / level in the axes' x and y
+        along = t[0] * (x * axes[0, 1] - y * axes[0, 0])
+        along += t[1] * (x * axes[1, 1] - y * axes[1, 0])
+        along += t[2] * (x * axes[2, 1] - y * axes[2, 0])
+        sigma = math.hypot(sigma_rad[i] * along / level, sigma_model) / level
+        if not sigma < WIDEST_RAD:
+            continue
+        yaw = math.atan2(x, -y) % quarter
+        weight = weights[i] * level
+        reach = int(3.0 * sigma / step) + 1
+        at = int(yaw / step)
         for k in range(at - reach, at + reach + 1):
-            away = (yaw[i] - middles[k % len(middles)] + 0.5 * quarter) % quarter - 0.5 * quarter
-            total[k % len(middles)] += weight[i] * np.exp(-0.5 * (away / sigma[i]) ** 2)
-        share = min(np.sqrt(2.0 * np.pi) * sigma[i] / quarter, 1.0)  # the kernel's mean over all yaws
-        mean += weight[i] * share
-        variance += weight[i] ** 2 * max(share / np.sqrt(2.0) - share * share, 0.0)
+            bin_ = k + bins if k < 0 else (k - bins if k >= bins else k)
+            away = yaw - middles[bin_]
+            if away > 0.5 * quarter:
+                away -= quarter
+            elif away < -0.5 * quarter:
+                away += quarter
+            total[bin_] += weight * math.exp(-0.5 * (away / sigma) ** 2)
+        share = min(math.sqrt(2.0 * math.pi) * sigma / quarter, 1.0)  # the kernel's mean over all yaws
+        mean += weight * share
+        variance += weight**2 * max(share / math.sqrt(2.0) - share * share, 0.0)
     return total, mean, variance
 
 
 def peaks(spectrum: Spectrum, most: int) -> list[float]:
     """Yaws of the highest places, each APART_RAD from the higher ones."""
-    found: list[float] = []
-    for k in np.argsort(-spectrum.score, kind="stable"):
-        yaw = float(spectrum.yaw_rad[k])
-        if all(abs(float(quarter(yaw - other))) > APART_RAD for other in found):
-            found.append(yaw)
-            if len(found) == most:
-                break
-    return found
+    return _peaks(spectrum.yaw_rad, spectrum.score, most).tolist()
+
+
+@compiled
+def _peaks(yaw_rad: Array64, score: Array64, most: int) -> Array64:
+    quarter = 0.5 * math.pi
+    out = np.empty(most)
+    left = np.ones(len(score), dtype=np.bool_)
+    for count in range(most):
+        best = -1
+        for k in range(len(score)):
+            if left[k] and (best < 0 or score[k] > score[best]):
+                best = k
+        if best < 0:
+            return out[:count].copy()
+        out[count] = yaw_rad[best]
+        for k in range(len(score)):
+            apart = abs(yaw_rad[k] - yaw_rad[best])
+            left[k] &= min(apart, quarter - apart) > APART_RAD
+    return out
 
 
 def quarter(angle: Array64 | float) -> Array64 | float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stages.compiled import compiled, compiled_at_once
 from stages.lens import Array64
-from stages.vp.directions import CAUCHY, GATE, Lines, upright
+from stages.vp.directions import CAUCHY, GATE, WELL, Lines, upright
 
 ROUNDS = 5
 LEAST_SINE = 0.05  # two lines that meet at less do not say where
@@ -79,15 +79,28 @@ def _votes(
     proposal: Array64, normal: Array64, tangent: Array64, sigma: Array64, weight: Array64, sigma_model: float
 ) -> Array64:
     out = np.zeros(len(proposal))
+    nx, ny, nz = normal[:, 0].copy(), normal[:, 1].copy(), normal[:, 2].copy()
+    far, beyond = np.empty(len(normal)), np.empty(len(normal))
+    near = np.empty(len(normal) + 1, dtype=np.int64)
+    for i in range(len(normal)):
+        far[i] = min(WELL * 3.0 * math.hypot(sigma[i], sigma_model), 0.2)
     for p in range(len(proposal)):
         x, y, z = proposal[p, 0], proposal[p, 1], proposal[p, 2]
+        for i in range(len(normal)):  # without a branch, so that several are done at once
+            beyond[i] = abs(nx[i] * x + ny[i] * y + nz[i] * z) - far[i]
+        count = 0
         for i in range(len(normal)):
-            r = normal[i, 0] * x + normal[i, 1] * y + normal[i, 2] * z
-            if abs(r) < 0.2:
-                s = sigma[i] * (tangent[i, 0] * x + tangent[i, 1] * y + tangent[i, 2] * z)
-                q = r * r / (s * s + sigma_model * sigma_model)
-                if q < 9.0:
-                    out[p] += weight[i] * (1.0 - q / 9.0) ** 2
+            near[count] = i
+            count += 1 if beyond[i] < 0.0 else 0
+        total = 0.0
+        for k in range(count):
+            i = near[k]
+            r = nx[i] * x + ny[i] * y + nz[i] * z
+            s = sigma[i] * (tangent[i, 0] * x + tangent[i, 1] * y + tangent[i, 2] * z)
+            q = r * r / (s * s + sigma_model * sigma_model)
+            if q < 9.0:
+                total += weight[i] * (1.0 - q / 9.0) ** 2
+        out[p] = total
     return out
 
 
@@ -141,14 +154,18 @@ def _vertical_step(
     """Normal equations of the vertical e[:, 2] turned towards e[:, 0] and e[:, 1]; the gate is at least `least`."""
     H, g = np.zeros((2, 2)), np.zeros(2)
     for i in range(len(normal)):
-        n, t = normal[i], tangent[i]
-        r = n[0] * e[0, 2] + n[1] * e[1, 2] + n[2] * e[2, 2]
-        s = math.hypot(sigma[i] * (t[0] * e[0, 2] + t[1] * e[1, 2] + t[2] * e[2, 2]), sigma_model)
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        r = nx * e[0, 2] + ny * e[1, 2] + nz * e[2, 2]
+        if abs(r) > WELL * max(GATE * (sigma[i] + sigma_model), least):
+            continue
+        s = math.hypot(
+            sigma[i] * (tangent[i, 0] * e[0, 2] + tangent[i, 1] * e[1, 2] + tangent[i, 2] * e[2, 2]), sigma_model
+        )
         s = max(s, least / GATE)
         if abs(r) < GATE * s:
             w = weight[i] / (s * s * (1.0 + (r / (CAUCHY * s)) ** 2))
-            a = n[0] * e[0, 0] + n[1] * e[1, 0] + n[2] * e[2, 0]
-            b = n[0] * e[0, 1] + n[1] * e[1, 1] + n[2] * e[2, 1]
+            a = nx * e[0, 0] + ny * e[1, 0] + nz * e[2, 0]
+            b = nx * e[0, 1] + ny * e[1, 1] + nz * e[2, 1]
             H[0, 0] += w * a * a
             H[0, 1] += w * a * b
             H[1, 0] += w * a * b

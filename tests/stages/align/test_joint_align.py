@@ -63,6 +63,25 @@ def test_one_pair_gives_the_rotation_up_to_a_quarter_turn(streets):
     assert np.all(np.linalg.eigvalsh(told.covariance_rad2) > 0)
 
 
+def test_the_stated_tilts_allow_for_cameras_that_do_not_sit_and_look_quite_as_their_file_says():
+    """NEES of both tilts over 150 rigs: mounts .05 deg off, and lens centres .15 px at 720 px, 175 px a radian."""
+    rng = np.random.default_rng(11)
+    off_rad = np.array([math.hypot(math.radians(0.05), 0.15 / 175.0)] * 2 + [math.radians(0.05)])
+    R_vehicle, R_drone = turned(0, 0, 0), turned(0, 0, 25)
+    squares = []
+    for seed in range(150):
+        off_v, off_d = exp_rotation(rng.normal(0, off_rad)), exp_rotation(rng.normal(0, off_rad))
+        answer = pair(
+            seen(Carrier.VEHICLE, R_vehicle @ off_v, ATLANTA, seed=seed),
+            seen(Carrier.DRONE, R_drone @ off_d, ATLANTA, seed=seed),
+        )
+        branches = (turned(0, 0, 25 + quarter).T @ answer.R_vehicle_drone for quarter in (0, 90, 180, 270))
+        phi = min((log_rotation(np.ascontiguousarray(off)) for off in branches), key=np.linalg.norm)
+        squares.append(phi[:2] @ np.linalg.solve(answer.covariance_rad2[:2, :2], phi[:2]))
+    assert 0.7 < np.mean(squares) / 2 < 1.3
+    assert np.mean(np.array(squares) < 5.99) > 0.9
+
+
 def test_pictures_without_structure_give_no_rotation_and_the_reason():
     some, none = seen(Carrier.VEHICLE, np.eye(3)), nothing(Carrier.DRONE, reason="6 lines only")
     told = pair(some, none)

@@ -116,13 +116,13 @@ def _follow(
     """
     height, width = grey.shape
     flat_x, flat_y, flat_free = dx.ravel(), dy.ravel(), free.ravel()
-    most = len(back)
+    most, lowest = len(back), threshold.min()  # most places are told by it alone
     chains, count = 0, 0
     for y in range(2, height - 2):
         for x in range(2 + (2 * y) % 5, width - 2, 5):
             gx, gy = np.int32(dx[y, x]), np.int32(dy[y, x])
             square = gx * gx + gy * gy
-            if square < threshold[grey[y, x] * LEVELS // 256] or not free[y, x]:
+            if square < lowest or square < threshold[grey[y, x] * LEVELS // 256] or not free[y, x]:
                 continue
             at = y * width + x
             across = 1 if abs(gx) > abs(gy) else width  # is it the ridge?

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.geometry import rotation_from_rpy_deg, rotation_z
-from stages.vp.directions import NONE, Lines, all_directions, assign, refine, residual_sigma, upright
+from stages.vp.directions import GATE, NONE, Lines, all_directions, assign, refine, residual_sigma, upright
 from stages.vp.search import Limits, Prior, find_structure
 from stages.vp.spectrum import peaks, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
@@ -126,6 +126,19 @@ def test_lines_that_fit_no_direction_have_none():
     assert (assigned[15:] == NONE).mean() > 0.7
     np.testing.assert_allclose(np.abs(r[0]), np.abs(lines.normal[0] @ np.eye(3)[assigned[0]]))
     assert (sigma >= SIGMA).all()
+
+
+def test_each_line_has_the_direction_that_it_is_fewest_sigmas_off():
+    rng = np.random.default_rng(4)
+    spread = lines_along(rng.normal(size=(60, 3)), each=5)
+    near = lines_along(np.eye(3), each=30, seed=1)
+    lines = Lines(*(np.concatenate([getattr(near, name), getattr(spread, name)]) for name in vars(near)))
+    assigned, r, sigma = assign(lines, np.eye(3), SIGMA)
+    off = np.abs(lines.normal) / np.array([residual_sigma(lines, d, SIGMA) for d in np.eye(3)]).T
+    np.testing.assert_array_equal(assigned, np.where(off.min(axis=1) > GATE, NONE, off.argmin(axis=1)))
+    own = assigned != NONE
+    assert 90 < own.sum() < len(own)
+    np.testing.assert_allclose(np.abs(r / sigma)[own], off.min(axis=1)[own])
 
 
 def test_stated_sigmas_hold_what_they_promise():

@@ -7,7 +7,7 @@
         inputs: {points: sweep.swept_points}  # how messages wait in a live run: flow/edge.py
         on_error: restart                  # live, when it raises: a fresh one takes over; or skip; or stop the run
         thread: lidar                      # live: shared with others that say so; without it, it has its own
-        process: pictures                  # live: works in a process of that name (flow/stage_process.py)
+        process: pictures                  # in that, live (flow/stage_process.py) and replayed (flow/apart.py)
         yields: true                       # live: takes fewer pictures while others' queues run over (flow/yielding.py)
     links:
       lidar: {use: links.velodyne.Lidar}   # sources and sinks; the first three keys
@@ -59,7 +59,7 @@ class NodeSpec:
     config: dict[str, Any]
     on_error: OnError = "restart"  # of a stage that raises in a live run
     thread: str = ""  # of a stage in a live run; stages of one name share it
-    process: str = ""  # of a stage in a live run, not the run's own; stages of one name share it
+    process: str = ""  # of a stage, not the run's own; stages of one name share it
     yields: bool = False  # of a stage in a live run, to others that do not keep up
 
     def build(self) -> Node:

@@ -107,7 +107,7 @@ class Tap(Link):
         """One message, once, as it leaves `output` ("track.drone_fix"); arrival_ns is the run's clock."""
 
     def wants(self, message: type[Message]) -> bool:
-        """Whether a live run shall hand over messages of this type; asked once for each output."""
+        """Whether a run shall hand over messages of this type; asked once for each output."""
         return True
 
     def record(self, record: Record) -> None:

@@ -24,12 +24,15 @@ class RaisedElsewhereError(Exception):
 
 
 class Output(Generic[F]):
-    """One output of one running node: its name, how many messages it gave, and the ports that it feeds."""
+    """One output of one running node: its name, its messages' number, the ports that it feeds, who else sees it."""
 
-    __slots__ = ("checked", "count", "feeds", "name")
+    __slots__ = ("checked", "count", "feeds", "name", "seen_by")
 
-    def __init__(self, name: str, feeds: list[F]) -> None:
-        self.name, self.feeds, self.count, self.checked = name, feeds, 0, False
+    def __init__(
+        self, name: str, feeds: list[F], seen_by: tuple[Callable[[str, Message, int], None], ...] = ()
+    ) -> None:
+        self.name, self.feeds, self.seen_by = name, feeds, seen_by
+        self.count, self.checked = 0, False
 
 
 def call(name: str, handler: Callable[[Any], Any], message: Any, arrival_ns: int) -> tuple[Message, ...]:

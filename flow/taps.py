@@ -31,6 +31,7 @@ class Digest(Tap):
     """
 
     _hashes: dict[str, Any] = PrivateAttr(default_factory=dict[str, Any])
+    _joined: dict[str, str] = PrivateAttr(default_factory=dict[str, str])
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Hash the run's clock and the whole message."""
@@ -40,9 +41,18 @@ class Digest(Tap):
         hasher.update(b"@%d" % arrival_ns)
         hash_into(hasher, message)
 
+    @property
+    def told(self) -> dict[str, str]:
+        """Each output's hash so far."""
+        return {name: hasher.hexdigest() for name, hasher in self._hashes.items()} | self._joined
+
+    def join(self, told: dict[str, str]) -> None:
+        """Take in the hashes of outputs that another digest saw."""
+        self._joined |= told
+
     def hexdigest(self) -> str:
         """32 hex digits, of the outputs' names and hashes."""
-        parts = [f"{name} {hasher.hexdigest()}" for name, hasher in sorted(self._hashes.items())]
+        parts = [f"{name} {told}" for name, told in sorted(self.told.items())]
         return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
 
 

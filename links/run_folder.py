@@ -19,6 +19,7 @@ from typing import Any
 
 import yaml
 
+from flow.apart import can_run_apart, replay_apart
 from flow.draw import mermaid
 from flow.graph import Graph, load_graph
 from flow.link import LinkError, Run, Source, Tap
@@ -173,14 +174,20 @@ def _senders(graph: Graph) -> dict[str, dict[str, str]]:
     return senders
 
 
-def replay_into(folder: Path, recording: Path, asked: Asked, progress: Progress | None = None) -> Finished:
-    """Replay a recording, all its parts, with its own rig when it has one. Raises ConfigError, LinkError, RunError."""
+def replay_into(
+    folder: Path, recording: Path, asked: Asked, progress: Progress | None = None, *, together: bool = False
+) -> Finished:
+    """Replay a recording, all its parts, with its own rig when it has one. Raises ConfigError, LinkError, RunError.
+
+    `together`: in one process, whatever the configuration says.
+    """
     began_s = time.monotonic()
     session = Session(recording)
     graph = asked.graph(session.rig_yaml, f"{recording} (rig.yaml)")
     truth, digest = truth_beside(recording), Digest()
     with RunFolder(folder, recording, asked, graph, began_s) as run:
-        report = replay(graph, truth.aside(session.records(progress=progress)), (digest, *run.taps))
+        run_all = replay if together or not can_run_apart() else replay_apart
+        report = run_all(graph, truth.aside(session.records(progress=progress)), (digest, *run.taps))
         return run.finish(report, digest.hexdigest(), truth, session.warnings, parts=len(session.parts))
 
 

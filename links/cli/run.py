@@ -118,6 +118,14 @@ def replay_recording(
             "instead of what this configuration makes of its records.",
         ),
     ] = False,
+    together: Annotated[
+        bool,
+        typer.Option(
+            "--together",
+            help="One process, also where the configuration has stages work in others (several cores only). "
+            "The outcome is the same.",
+        ),
+    ] = False,
     view: View = False,
 ) -> None:
     """Replay RECORDING: deterministic, as fast as possible; of a live run's first part all parts, of a later one that.
@@ -134,15 +142,22 @@ def replay_recording(
             )
         _repeat(recording, out_dir, view)
         return
-    _run(recording, config or DEFAULT_REPLAY_CONFIG, out_dir, overlay or [], sets or [], view)
+    _run(recording, config or DEFAULT_REPLAY_CONFIG, out_dir, overlay or [], sets or [], view, together)
 
 
 def _run(
-    recording: Path, config: Path, out_dir: Path | None, overlays: list[Path], sets: list[str], view: bool
+    recording: Path,
+    config: Path,
+    out_dir: Path | None,
+    overlays: list[Path],
+    sets: list[str],
+    view: bool,
+    together: bool = False,
 ) -> None:
     folder = _new_folder(out_dir, f"{recording.stem}-{config.stem}")
     with progress_bar(f"replay {recording.name}") as step:
-        finished = replay_into(folder, recording, Asked(config, tuple(overlays), tuple(sets)), step)
+        asked = Asked(config, tuple(overlays), tuple(sets))
+        finished = replay_into(folder, recording, asked, step, together=together)
     _tell(finished)
     if view:
         _open_viewer(finished.out_dir)

@@ -64,7 +64,7 @@ class Recorder(Tap):
         return False
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
-        """A replay shows all taps everything; messages are not recorded, they follow from the records."""
+        """Messages are not recorded, they follow from the records."""
 
     @property
     def counters(self) -> dict[str, int]:

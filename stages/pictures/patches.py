@@ -58,6 +58,31 @@ def at(grey: Grey, column: float, row: float) -> float:
 
 
 @compiled
+def look(grey: Grey, column: float, row: float, A: Array64, seen: Array64) -> bool:
+    """What a template warped by A (2, 2) sees about a pixel, into `seen` (SIDE * SIDE). False: beyond the picture.
+
+    Rounding keeps order, so that all its pixels lie between its corners' and none needs to be asked for itself.
+    """
+    height, width = grey.shape
+    for dv in (-RADIUS_PX, RADIUS_PX):
+        for du in (-RADIUS_PX, RADIUS_PX):
+            x, y = column + A[0, 0] * du + A[0, 1] * dv, row + A[1, 0] * du + A[1, 1] * dv
+            if not (0.0 <= y < height - 1 and 0.0 <= x < width - 1):  # NaN, too
+                return False
+    for v in range(SIDE_PX):
+        dv = v - RADIUS_PX
+        for u in range(SIDE_PX):
+            du = u - RADIUS_PX
+            x, y = column + A[0, 0] * du + A[0, 1] * dv, row + A[1, 0] * du + A[1, 1] * dv
+            i, j = np.uint32(y), np.uint32(x)
+            a, b = y - i, x - j
+            top = (1.0 - b) * grey[i, j] + b * grey[i, j + 1]
+            low = (1.0 - b) * grey[i + 1, j] + b * grey[i + 1, j + 1]
+            seen[v * SIDE_PX + u] = (1.0 - a) * top + a * low
+    return True
+
+
+@compiled
 def find(grey: Grey, templates: Array32, warp: Array64, guess: Array64) -> tuple[Array64, Array64]:
     """Pixels (n, 2) and likeness (n,), the correlation in [-1, 1]; likeness -1 where it is not found.
 
@@ -79,35 +104,42 @@ def find(grey: Grey, templates: Array32, warp: Array64, guess: Array64) -> tuple
                 gx[k] = (patch[v, right] - patch[v, left]) / (right - left)
                 gy[k] = (patch[down, u] - patch[up, u]) / (down - up)
                 mean += known[k]
-        known -= mean / size
+        mean /= size
         gx -= gx.mean()
         gy -= gy.mean()
-        energy = (known * known).sum()
-        a, b, c = (gx * gx).sum(), (gx * gy).sum(), (gy * gy).sum()
+        energy = a = b = c = x_known = y_known = 0.0
+        for k in range(size):
+            known[k] -= mean
+            energy += known[k] * known[k]
+            a += gx[k] * gx[k]
+            b += gx[k] * gy[k]
+            c += gy[k] * gy[k]
+            x_known += gx[k] * known[k]
+            y_known += gy[k] * known[k]
         det = a * c - b * b
         if not (energy > size * FLAT * FLAT and det > ROUNDNESS * (a + c) ** 2):  # NaN too
             continue
         for _ in range(STEPS):
-            mean = 0.0
-            for v in range(SIDE_PX):
-                for u in range(SIDE_PX):
-                    du, dv = u - RADIUS_PX, v - RADIUS_PX
-                    value = at(
-                        grey,
-                        place[i, 0] + A[0, 0] * du + A[0, 1] * dv,
-                        place[i, 1] + A[1, 0] * du + A[1, 1] * dv,
-                    )
-                    seen[v * SIDE_PX + u] = value
-                    mean += value
-            seen -= mean / size
-            power = (seen * seen).sum()
-            if not power > size * FLAT * FLAT:  # NaN: out of the picture
+            if not look(grey, place[i, 0], place[i, 1], A, seen):
                 likeness[i] = -1.0
                 break
-            gain = (seen * known).sum() / power
+            mean = 0.0
+            for k in range(size):
+                mean += seen[k]
+            mean /= size
+            power = alike = x_seen = y_seen = 0.0
+            for k in range(size):
+                value = seen[k] - mean
+                power += value * value
+                alike += value * known[k]
+                x_seen += gx[k] * value
+                y_seen += gy[k] * value
+            if not power > size * FLAT * FLAT:
+                likeness[i] = -1.0
+                break
+            gain = alike / power
             likeness[i] = gain * math.sqrt(power / energy)
-            r0 = gain * (gx * seen).sum() - (gx * known).sum()
-            r1 = gain * (gy * seen).sum() - (gy * known).sum()
+            r0, r1 = gain * x_seen - x_known, gain * y_seen - y_known
             s0, s1 = (c * r0 - b * r1) / det, (a * r1 - b * r0) / det
             length = math.hypot(s0, s1)
             if length > 1.0:

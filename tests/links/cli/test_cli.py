@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from flow import apart
+from flow.apart import can_run_apart
 from links.cli.files import read_rig
 from tests.links import command
 
@@ -84,6 +86,23 @@ def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_p
     assert len(hashes) == 1
     again = grd("replay", STREET, "--out", tmp_path / "out" / names[0], code=2)
     assert "holds a run already" in again
+
+
+@pytest.mark.skipif(not can_run_apart(), reason="one core, or no fork: there is one process anyway")
+def test_a_replay_in_several_processes_leaves_the_files_of_one(grd, tmp_path, monkeypatch):
+    started = []
+    start = apart._PartProcess.start
+    monkeypatch.setattr(apart._PartProcess, "start", lambda part: (started.append(part.topics), start(part))[1])
+    (tmp_path / "apart.yaml").write_text("stages: {sweep: {process: lidar}}\nlinks: {viewer: null}\n")
+    both = ("replay", STREET, "--config", ROOT / "configs" / "estimate.yaml", "--overlay", "apart.yaml")
+    grd(*both, "--out", "together", "--together")
+    assert not started
+    grd(*both, "--out", "apart")
+    assert [sorted(topics) for topics in started] == [["/lidar/packets", "/servo/state"]]
+    names = {path.name for path in (tmp_path / "together").iterdir()}
+    assert names == {path.name for path in (tmp_path / "apart").iterdir()} > {"run.log", "fix_vehicle_drone.tum"}
+    for name in names - {"summary.json"}:  # it tells how long the run took
+        assert (tmp_path / "together" / name).read_bytes() == (tmp_path / "apart" / name).read_bytes(), name
 
 
 def test_a_changed_setting_changes_the_hash(grd, tmp_path):

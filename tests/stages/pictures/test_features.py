@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from stages.pictures.features import FeatureSettings, FeatureTracker, best_per_cell, usable_pixels
-from stages.pictures.patches import find, take
+from stages.pictures.patches import RADIUS_PX, SIDE_PX, at, find, look, take
 from stages.rotation import exp_rotation
 from tests.stages.seen import LENS, PIXEL_RAD, SIZE_PX, picture
 
@@ -142,3 +142,26 @@ def test_what_is_usable_is_symmetric_about_the_lens():
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(ValidationError):
         FeatureSettings(**wrong)
+
+
+def test_a_template_is_looked_for_in_the_pixels_between_the_pictures_own_and_never_beyond_it():
+    rng = np.random.default_rng(7)
+    grey = rng.integers(0, 256, (40, 50)).astype(np.uint8)
+    seen, patch, beyond = np.empty(SIDE_PX**2), np.arange(SIDE_PX) - RADIUS_PX, 0
+    for _ in range(500):
+        column, row = rng.uniform(0.0, 50.0), rng.uniform(0.0, 40.0)
+        warp = np.eye(2) + rng.normal(0.0, 0.2, (2, 2))
+        wanted = np.array(
+            [
+                at(grey, column + warp[0, 0] * du + warp[0, 1] * dv, row + warp[1, 0] * du + warp[1, 1] * dv)
+                for dv in patch
+                for du in patch
+            ]
+        )
+        if look(grey, column, row, warp, seen):
+            np.testing.assert_array_equal(seen, wanted)
+        else:
+            beyond += 1
+            assert np.isnan(wanted).any()
+    assert 100 < beyond < 400
+    assert not look(grey, np.nan, 20.0, np.eye(2), seen)

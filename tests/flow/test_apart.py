@@ -1,0 +1,290 @@
+"""A replay in several processes: what is apart, and that outputs, order and errors are those of one process."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import random
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pydantic import Field, PrivateAttr
+
+from flow import apart
+from flow.apart import parts_of, replay_apart
+from flow.graph import load_graph
+from flow.link import LinkError, Record, Tap
+from flow.message import Message
+from flow.ports import RunError
+from flow.replay import replay
+from flow.stage import Stage
+from flow.taps import Digest
+from tests.flow.toys import Number, Numbers, Text
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked, and this system has no fork")
+
+
+class Slow(Stage):
+    """Gives a number on, and its negative, after a random while; remembers how many there were."""
+
+    longest_s: float = Field(0.0, ge=0)
+    dies_at: float | None = None
+    raises_at: float | None = None
+    lies_at: float | None = None
+    _count: int = PrivateAttr(default=0)
+
+    def on_number(self, number: Number) -> Iterator[Number]:
+        if self.longest_s:
+            time.sleep(random.random() * self.longest_s)
+        if number.value == self.dies_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        yield Number(stamp_ns=number.stamp_ns, value=number.value + self._count)
+        if number.value == self.raises_at:
+            raise ZeroDivisionError("asked to")
+        if number.value == self.lies_at:
+            yield Text(stamp_ns=0, words="not promised")  # type: ignore[misc]
+        yield Number(stamp_ns=number.stamp_ns, value=-number.value)
+        self._count += 1
+
+    def finish(self) -> Number:
+        return Number(stamp_ns=0, value=1e6 + self._count)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        return {"taken": self._count}
+
+
+class Numbers2(Numbers):
+    """Numbers by another topic."""
+
+    topic: str = "/numbers2"
+
+
+class Log(Tap):
+    """Keeps what it sees, in order; of some kinds of messages only, if so asked."""
+
+    only: str | None = None
+    _seen: list[tuple[str, int, str]] = PrivateAttr(default_factory=list)
+
+    def wants(self, message: type[Message]) -> bool:
+        return self.only is None or message.__name__ == self.only
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        content = [getattr(message, name) for name in ("value", "total", "words") if hasattr(message, name)]
+        self._seen.append((output, arrival_ns, f"{message.stamp_ns} {content}"))
+
+
+GRAPH = """\
+stages:
+  first: {use: tests.flow.test_apart.Slow, inputs: {number: numbers.number}}
+  near: {use: tests.flow.test_apart.Slow, inputs: {number: first.number}, process: near}
+  far: {use: tests.flow.test_apart.Slow, inputs: {number: numbers2.number}, process: far}
+  home: {use: tests.flow.test_apart.Slow, inputs: {number: first.number}}
+  join:
+    use: tests.flow.toys.Add
+    config: {name: joined}
+    inputs: {left: near.number, right: far.number, words: words.text}
+  end:
+    use: tests.flow.toys.Add
+    config: {name: end}
+    inputs: {left: home.number, right: near.number}
+links:
+  numbers: {use: tests.flow.toys.Numbers}
+  numbers2: {use: tests.flow.test_apart.Numbers2}
+  words: {use: tests.flow.toys.Words}
+"""
+
+
+def graph_of(folder, *changes: tuple[str, str]):
+    text = GRAPH
+    for old, new in changes:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    (folder / "x.yaml").write_text(text)
+    return load_graph(folder / "x.yaml")
+
+
+def setting(stage: str, text: str) -> tuple[str, str]:
+    return (
+        f"  {stage}: {{use: tests.flow.test_apart.Slow",
+        f"  {stage}: {{use: tests.flow.test_apart.Slow, config: {{{text}}}",
+    )
+
+
+def records(count: int, seed: int = 0) -> list[Record]:
+    """Of all topics in a random order, also several at one time, and of one that nobody takes."""
+    draw = random.Random(seed)
+    topics = ("/numbers", "/numbers2", "/words", "/nobody")
+    made = [(draw.choice(topics), 1000 + 10 * (i // 3), i) for i in range(count)]
+    return [Record(topic, at, at - 500, str(i).encode(), i) for topic, at, i in made]
+
+
+def ran(run, graph, given, **kwargs):
+    """(hash, what a tap saw in order, report without times) of a run."""
+    digest, log = Digest(), Log()
+    report = run(graph, given, (digest, log), **kwargs)
+    told = (report.records, report.first_ns, report.last_ns, report.events, report.messages, report.unwired_topics)
+    calls = {name: node.calls for name, node in report.nodes.items()}
+    return digest.hexdigest(), log._seen, (*told, calls, report.counters, [str(i) for i in report.incidents])
+
+
+def test_a_part_is_a_stage_with_all_that_it_needs_and_parts_that_share_a_node_are_one(tmp_path):
+    assert set(parts_of(graph_of(tmp_path))) == {
+        frozenset({"numbers", "first", "near"}),
+        frozenset({"numbers2", "far"}),
+    }
+    both = graph_of(tmp_path, ("far: {use: tests.flow.test_apart.Slow, inputs: {number: numbers2", "far: {use: tests.flow.test_apart.Slow, inputs: {number: numbers"))  # fmt: skip
+    assert parts_of(both) == [{"numbers", "first", "near", "far"}]
+    assert parts_of(graph_of(tmp_path, ("process: far", "process: near"))) == [
+        {"numbers", "first", "near", "numbers2", "far"}
+    ]
+    assert parts_of(load_graph(CONFIGS / "estimate.yaml")) == []
+
+
+def test_with_both_fisheyes_the_pictures_of_each_camera_are_apart():
+    drone, vehicle = sorted(parts_of(load_graph(CONFIGS / "vision.yaml")), key=len)
+    assert drone == {"camera_drone", "autopilot", "vp_drone", "drone_odometry"}
+    assert {"camera_vehicle", "vp_vehicle", "sweep", "lidar"} < vehicle
+    assert not vehicle & {"detect", "track", "align", "fuse"}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outputs_their_order_and_the_report_are_those_of_one_process_whatever_takes_how_long(
+    tmp_path, seed, monkeypatch
+):
+    monkeypatch.setattr(apart, "MOST_RECORDS", 40)
+    monkeypatch.setattr(apart, "AT_ONCE", 1 + 3 * seed)
+    given = records(400, seed)
+    wanted = ran(replay, graph_of(tmp_path), given)
+    slow = [
+        setting(name, "longest_s: 0.002") for name in random.Random(seed).sample(["first", "near", "far", "home"], 2)
+    ]
+    assert ran(replay_apart, graph_of(tmp_path, *slow), given) == wanted
+    assert len(wanted[1]) > 1000
+
+
+def test_a_configuration_without_apart_runs_as_ever(tmp_path):
+    (tmp_path / "y.yaml").write_text(GRAPH.replace(", process: near", "").replace(", process: far", ""))
+    plain = load_graph(tmp_path / "y.yaml")
+    assert ran(replay_apart, plain, records(50)) == ran(replay, graph_of(tmp_path), records(50))
+
+
+def test_an_empty_recording_runs_to_its_end(tmp_path):
+    assert ran(replay_apart, graph_of(tmp_path), []) == ran(replay, graph_of(tmp_path), [])
+
+
+@pytest.mark.parametrize("how", ["raises_at", "lies_at"])
+@pytest.mark.parametrize("stage", ["near", "far", "home"])
+def test_a_stage_that_raises_does_so_in_its_turn_with_the_same_words(tmp_path, how, stage):
+    graph, given = graph_of(tmp_path, setting(stage, f"{how}: 205")), records(400, 3)
+    given = [Record("/numbers2" if stage == "far" else "/numbers", r.arrival_ns, r.stamp_ns, r.data, r.sequence)
+             if r.data == b"205" else r for r in given]  # fmt: skip
+    if stage != "far":
+        given = [r for r in given if r.topic != "/numbers" or r.data == b"205"]  # first adds how many came before
+    seen = []
+    for run in (replay, replay_apart):
+        log = Log()
+        with pytest.raises(RunError) as caught:
+            run(graph, given, (log,))
+        seen.append((str(caught.value), type(caught.value.__cause__), log._seen))
+    assert seen[0] == seen[1]
+    assert stage in seen[0][0]
+
+
+def test_a_process_that_dies_is_named_with_the_signal(tmp_path):
+    graph = graph_of(tmp_path, setting("far", "dies_at: 7"))
+    given = [Record("/numbers2", 1000 + i, i, str(i).encode(), i) for i in range(2000)]
+    with pytest.raises(RunError, match=r"^the process of far ended by signal 9 \(Killed\)"):
+        replay_apart(graph, given)
+
+
+def test_what_a_source_refuses_is_told_and_one_that_refuses_all_ends_the_replay(tmp_path, monkeypatch):
+    given = records(60, 1)
+    some = [
+        Record(r.topic, r.arrival_ns, r.stamp_ns, b"refuse" if i % 7 == 0 else r.data, i) for i, r in enumerate(given)
+    ]
+    wanted = ran(replay, graph_of(tmp_path), some)
+    assert ran(replay_apart, graph_of(tmp_path), some) == wanted
+    assert any("plugged in" in text for text in wanted[2][-1])
+    every = [Record("/numbers2", 1000 + i, i, b"refuse", i) for i in range(9)]
+    with pytest.raises(LinkError, match=r"^no numbers here: is the counter plugged in\?$"):
+        replay_apart(graph_of(tmp_path), every)
+    monkeypatch.setattr("flow.replay.HOPELESS", 3)
+    log = Log()
+    with pytest.raises(LinkError, match="no numbers here"):
+        replay_apart(graph_of(tmp_path), [*every[:3], *given], (log,))
+    assert not log._seen
+
+
+def test_a_recording_that_cannot_be_read_on_ends_the_replay_after_what_was_read(tmp_path):
+    def broken():
+        yield from records(90, 2)
+        raise LinkError("the disk is gone")
+
+    seen = []
+    for run in (replay, replay_apart):
+        log = Log()
+        with pytest.raises(LinkError, match="the disk is gone"):
+            run(graph_of(tmp_path), broken(), (log,))
+        seen.append(log._seen)
+    assert seen[0] == seen[1]
+    assert len(seen[0]) > 200
+
+
+def test_a_tap_that_cannot_work_ends_a_replay_and_its_processes(tmp_path):
+    class Broken(Tap):
+        def see(self, output: str, message: Message, arrival_ns: int) -> None:
+            raise LinkError("full")
+
+    before = children()
+    with pytest.raises(LinkError, match="full"):
+        replay_apart(graph_of(tmp_path), records(50), (Broken(),))
+    assert children() == before
+
+
+def children() -> set[int]:
+    return {child.pid or 0 for child in multiprocessing.active_children()}
+
+
+def test_no_more_than_so_many_records_and_bytes_are_sent_ahead_of_their_turn(tmp_path, monkeypatch):
+    monkeypatch.setattr(apart, "MOST_RECORDS", 50)
+    monkeypatch.setattr(apart, "MOST_BYTES", 1000)
+    taken = 0
+
+    class Watch(Tap):
+        def see(self, output: str, message: Message, arrival_ns: int) -> None:
+            ahead.append(taken - message.stamp_ns)
+
+    def counted(size: int):
+        nonlocal taken
+        for i in range(300):
+            taken = i
+            yield Record("/numbers2", 1000 + i, i, b"%0*d" % (size, i), i)
+
+    for size, most in ((3, 50), (100, 11)):
+        ahead: list[int] = []
+        replay_apart(graph_of(tmp_path), counted(size), (Watch(),))
+        sources = ahead[: 300 * 3]
+        assert most - 5 <= max(sources) <= most
+
+
+def test_a_message_crosses_only_where_it_is_taken(tmp_path, monkeypatch):
+    told: list[tuple[str, Message | None]] = []
+    hear = apart._PartProcess.next
+
+    def listening(self, kind):
+        given = hear(self, kind)
+        told.extend(getattr(given, "messages", ()))
+        return given
+
+    monkeypatch.setattr(apart._PartProcess, "next", listening)
+    log = Log(only="Sum")
+    report = replay_apart(graph_of(tmp_path), records(100), (Digest(), log))
+    assert {name for name, message in told if message is None} == {"numbers.number", "numbers2.number"}
+    assert {name for name, message in told if message is not None} == {"first.number", "near.number", "far.number"}
+    assert {name for name, _, _ in log._seen} == {"join.sum", "end.sum"}
+    assert report.messages["numbers.number"] == sum(r.topic == "/numbers" for r in records(100))

@@ -4,7 +4,8 @@ Alone in its process nothing holds it up, and when it or its parent dies nothing
 end of the socket, and the servo is stopped where it is; this process's end shows to the servo as silence, and its bus
 watchdog stops it. A parent that hangs is one that no longer says that it takes the readings (`wire.Alive`): the servo
 stays where it is. A fault ends driving: the servo holds where it is, is read on if it answers (a servo that has let go
-still measures its angle), and is set up again, with growing pauses while that fails.
+still measures its angle), and is set up again, with growing pauses while that fails: short ones, so that a plug put
+back is served soon, but after a shutdown long ones, since each reboot lets an overloaded motor push again.
 
 Source: ours.
 """
@@ -29,7 +30,7 @@ S_NS = 1_000_000_000
 HEALTH_NS = 100 * MS_NS  # how often torque, error and watchdog are looked at, and totals are told
 SUPPLY_NS = S_NS  # voltage and temperature
 LOST_NS = 200 * MS_NS  # a servo silent for so long is set up anew
-PAUSE_NS, LONGEST_PAUSE_NS = 100 * MS_NS, 10 * S_NS  # between attempts to reopen, reboot or set up
+PAUSE_NS, LONGEST_PAUSE_NS, LONGEST_REBOOT_NS = 100 * MS_NS, S_NS, 10 * S_NS  # between attempts; of reboots the last
 STEADY_NS = 10 * S_NS  # driving for so long without a fault: the next fault's pause is the first one again
 HUNG_NS = 500 * MS_NS  # a parent silent for so long is not followed any more; a busy one may be late by some tenths
 STOP_NS = 700 * MS_NS  # for stopping the servo at the end; then its watchdog has done it
@@ -60,7 +61,7 @@ class Worker:
         self._began_ns = self._next_ns = self._healthy_ns = time.monotonic_ns()
         self._failing_ns = 0  # since when nothing succeeded; 0: all is well
         self._retry_ns = self._health_ns = self._told_ns = self._supply_ns = 0
-        self._pause_ns = PAUSE_NS
+        self._pause_ns = self._reboot_pause_ns = PAUSE_NS
 
     def run(self) -> None:
         """Until the parent is gone. SetupError when a person has to change something."""
@@ -144,6 +145,8 @@ class Worker:
             self._error = self._drive.set_up()
         except Shutdown as shutdown:
             self._error = shutdown.error
+            self._retry_ns = now_ns + self._reboot_pause_ns
+            self._reboot_pause_ns = min(2 * self._reboot_pause_ns, LONGEST_REBOOT_NS)
             if self._settings.reboot:
                 self._bus.reboot()
                 self._counts["reboots"] += 1
@@ -186,12 +189,12 @@ class Worker:
         self._error = condition.error
         if condition.torque and not condition.watchdog_tripped:  # with an error that it does not shut down for, too
             if now_ns - self._healthy_ns > STEADY_NS:
-                self._pause_ns = PAUSE_NS
+                self._pause_ns = self._reboot_pause_ns = PAUSE_NS
             return
         self._counts["torque_losses"] += not condition.torque
         self._counts["watchdog_stops"] += condition.watchdog_tripped
         self._release()
-        self._retry_ns = now_ns + (self._pause_ns if condition.error else 0)
+        self._retry_ns = now_ns + (self._reboot_pause_ns if condition.error else 0)
 
     def _failed(self, error: BusError, now_ns: int) -> None:
         self._faults[error.kind] += 1

@@ -27,8 +27,8 @@ MUST = {
     "servo stalls 3 s": Must(5, 8, 300),
     "servo: 20 answers 50 ms late": Must(5, 8, 300),
     "servo: garbage before 300 answers": Must(5, 8, 300),
-    "servo unplugged 3 s": Must(11, 13, 100),  # tried again after at most 10 s
-    "servo: power fails 3 s": Must(11, 13, 100),
+    "servo unplugged 3 s": Must(5, 8, 300),  # tried again after at most 1 s
+    "servo: power fails 3 s": Must(5, 8, 300),
     "camera gone 3 s": Must(8, 5, 300),  # tried again after at most 5 s; poses do without
     "autopilot boots again, 3 s silent": Must(5, 13, 50),  # its heading has to be seen anew
     "forged packets, 3 s": Must(None, 8, 200),

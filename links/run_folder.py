@@ -26,6 +26,7 @@ from flow.link import LinkError, Run, Source, Tap
 from flow.live_report import LiveReport
 from flow.problem import Place
 from flow.replay import RunReport, replay
+from flow.stage import Stage
 from flow.taps import Digest
 from flow.tree import Section
 from links.recording import Progress, RecordingReader, Session
@@ -33,8 +34,10 @@ from links.result_file import ResultFile
 from links.results import SUMMARY_FILE, Results, stamp_s
 from links.truth import TRUTH_RECORDING, FixErrors, TruthLog
 from links.usage import Usage
+from stages.messages import Detections, DroneFix, RelativePose
 
 CONFIG_FILE = "config.yaml"
+SEEKING = (Detections, DroneFix, RelativePose)  # who tells one of these seeks a drone
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +74,7 @@ class Finished:
     warnings: list[str]
     usage: Usage | None = None  # of a live run
     parts: int | None = None  # of the recording, that a replay read
+    ran_instead: str = ""  # the stages and what they told, of a configuration none of whose stages seeks a drone
 
 
 class RunFolder:
@@ -157,10 +161,23 @@ class RunFolder:
             warnings=warnings,
             usage=usage,
             parts=parts,
+            ran_instead=_ran_instead(self._graph, report),
         )
         text = json.dumps(_summary(finished, self._asked), indent=2)
         self._write(SUMMARY_FILE, text + "\n")
         return finished
+
+
+def _ran_instead(graph: Graph, report: RunReport) -> str:
+    """`aim (CalibrationSweep: 12 servo_goal)`, ...; empty where a stage seeks a drone: then its finds are the story."""
+    told: dict[str, list[str]] = {spec.name: [] for spec in graph.nodes.values() if issubclass(spec.cls, Stage)}
+    for node, output, message in graph.outputs():
+        if node not in told:
+            continue
+        if message in SEEKING:
+            return ""
+        told[node].append(f"{report.messages.get(f'{node}.{output}', 0)} {output}")
+    return "; ".join(f"{n} ({graph.nodes[n].cls.__name__}: {', '.join(t) or 'tells nothing'})" for n, t in told.items())
 
 
 def _senders(graph: Graph) -> dict[str, dict[str, str]]:

@@ -199,11 +199,14 @@ def _tell(run: Finished) -> None:
         show_table(_table(run))
     recorded_s = (report.last_ns - report.first_ns) / 1e9
     parts = f" in {run.parts} parts" if run.parts is not None and run.parts > 1 else ""
+    found = f"drone accepted in {results.sweeps_with_drone} of {results.sweeps} sweeps, {len(results.fixes)} fixes"
     out.print(
         f"{report.records} records{parts}, {recorded_s:.1f} s recorded, {run.wall_s:.1f} s to run; "
-        f"drone accepted in {results.sweeps_with_drone} of {results.sweeps} sweeps, {len(results.fixes)} fixes"
+        f"{'no stage seeks a drone' if run.ran_instead else found}"
     )
-    if not results.sweeps:
+    if run.ran_instead:
+        out.print(f"ran: {run.ran_instead}", markup=False)
+    elif not results.sweeps:
         out.print("no drone: no sweep was completed, so nothing was searched")
     elif not results.fixes:
         for verdict, count in results.verdicts[:3]:
@@ -231,7 +234,8 @@ def _tell(run: Finished) -> None:
     if run.usage is not None and str(run.usage):
         out.print(f"used: {run.usage}")
     out.print(f"output hash {run.digest}")
-    out.print(f"positions   {run.out_dir / FIX_FILE}")
+    if not run.ran_instead:
+        out.print(f"positions   {run.out_dir / FIX_FILE}")
     if results.pose_states:
         out.print(f"poses       {run.out_dir / POSE_FILE}")
     out.print(f"summary     {run.out_dir / SUMMARY_FILE}")

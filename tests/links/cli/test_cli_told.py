@@ -1,0 +1,68 @@
+"""What the end of a run tells: of a configuration that seeks no drone, and of what links and stages left out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from flow.link import Record
+from links.recording import RecordingWriter
+from tests.links import command
+
+ROOT = Path(__file__).resolve().parents[3]
+CONFIG = """\
+replay: drive.mcap
+stages:
+  motion: {use: stages.ego.VehicleMotionChoice, inputs: {odometry: odometry.vehicle_motion}}
+links:
+  odometry: {use: links.vehicle_odometry.VehicleOdometry}
+"""
+
+
+@pytest.fixture
+def drive(tmp_path, monkeypatch):
+    """A drive at 5 m/s, told 50 times a second: two of the words are no pose, one is 40 m off."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive.yaml").write_text(CONFIG)
+    with RecordingWriter(tmp_path / "drive.mcap") as writer:
+        for k in range(50):
+            pose = {
+                "xyz_m": [0.1 * k, 40.0 if k == 30 else 0.0, 0.0],
+                "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0],
+                "covariance": None,
+            }
+            data = b"no pose" if k in (10, 20) else json.dumps(pose).encode()
+            stamp_ns = 10**9 + 20_000_000 * k
+            writer.write(Record("/vehicle/odometry", stamp_ns, stamp_ns, data, k))
+    return tmp_path
+
+
+@pytest.mark.parametrize("words", [("run", "drive.yaml"), ("replay", "drive.mcap", "--config", "drive.yaml")])
+def test_a_configuration_that_seeks_no_drone_says_what_it_ran_instead(drive, words):
+    lines = command.grd(*words).splitlines()
+    assert lines[0].endswith("no stage seeks a drone")
+    assert lines[1] == "ran: motion (VehicleMotionChoice: 47 vehicle_motion)"
+    assert not any("drone accepted" in line or "no drone:" in line or line.startswith("positions") for line in lines)
+    assert any(line.startswith("summary") for line in lines)
+
+
+def test_a_configuration_that_seeks_one_says_nothing_of_the_kind(drive):
+    text = command.grd("replay", "drive.mcap", "--config", ROOT / "configs/replay.yaml", "--set", "viewer.file=null")
+    assert "no drone: no sweep was completed" in " ".join(text.split())
+    assert "no stage seeks a drone" not in text
+
+
+def test_what_links_and_stages_left_out_is_told_with_its_reason(drive):
+    text = " ".join(command.grd("run", "drive.yaml").split())
+    told = "left out: odometry: 2 refused; motion: 1 refused: odometry: not where the words before lead"
+    assert told in text
+
+
+def test_a_run_that_left_nothing_out_has_no_such_line(drive):
+    with RecordingWriter(drive / "still.mcap") as writer:
+        pose = {"xyz_m": [0.0] * 3, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
+        for k in range(3):
+            writer.write(Record("/vehicle/odometry", 10**9 * (k + 1), 10**9 * (k + 1), json.dumps(pose).encode(), k))
+    assert "left out" not in command.grd("replay", "still.mcap", "--config", "drive.yaml")

@@ -15,7 +15,7 @@ from stages.calibration.servo_mount import ServoMount
 from stages.compiled import compiled_at_once
 from stages.geometry import Array64
 
-SMOOTHED_STATES = (2, 4, 8, 12)  # on either side
+SMOOTHED_STATES = (2, 4, 8, 12, 24)  # on either side; wider means less of the steps, which a far wall shows as a turn
 SETTLED_RAD = math.radians(0.5)  # a turn-back is over after that: how play gives way is not modelled so finely
 RATE_STATES = 4  # the rate is taken over so many states on either side: a step of the encoder is 0.088 deg
 

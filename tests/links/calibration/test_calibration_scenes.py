@@ -55,7 +55,7 @@ def wave_deg(error_rad: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    """(axis [deg], time [s], encoder before, after [deg], play [deg]) of each scene."""
+    """(axis [deg], time [s], encoder before, after, its sigma [deg], play [deg]) of each scene."""
     from links.calibration import gather
     from links.simulated.run import simulate_into
     from links.simulated.scenario import load_scenario
@@ -86,6 +86,7 @@ def found(tmp_path_factory):
                 off_s,
                 wave_deg(wrong),
                 wave_deg(left),
+                math.degrees(told.curve_sigma_rad),
                 told.mount.servo_play_deg - servo["backlash_deg"],
             )
         )
@@ -94,12 +95,14 @@ def found(tmp_path_factory):
 
 
 def test_the_axis_the_clock_and_the_encoder_are_found(found):
-    axis_deg, time_s, before_deg, after_deg, _ = found.T
+    axis_deg, time_s, before_deg, after_deg, sigma_deg, _ = found.T
     better = before_deg / after_deg
     sys.stdout.write(
         f"\naxis {np.median(axis_deg):.4f}, worst {axis_deg.max():.4f} deg; time {1e3 * np.median(np.abs(time_s)):.3f}, "
-        f"worst {1e3 * np.abs(time_s).max():.3f} ms; encoder error {np.median(better):.0f} times smaller, least {better.min():.0f}\n"
+        f"worst {1e3 * np.abs(time_s).max():.3f} ms; encoder error {np.median(better):.0f} times smaller, least {better.min():.0f}, "
+        f"worst {(after_deg / sigma_deg).max():.1f} of its sigma\n"
     )
     assert axis_deg.max() < 0.05
     assert np.abs(time_s).max() < 2e-4
     assert np.median(better) >= 5.0
+    assert (after_deg < 2.5 * sigma_deg).all()

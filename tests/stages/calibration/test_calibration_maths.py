@@ -110,6 +110,7 @@ def test_the_encoders_steps_are_smoothed_away_but_not_its_turns():
     coarse = np.round(true / STEP_RAD) * STEP_RAD
     fine = smoothed(t, coarse, STEP_RAD)
     assert (fine - true)[20:180].std() < 0.4 * (coarse - true)[20:180].std()
+    assert (fine - true)[30:170].std() < 0.08 * (coarse - true)[30:170].std()  # steady over half a second
     assert np.abs(fine - true).max() < 1.2 * STEP_RAD
 
 

@@ -7,3 +7,4 @@ from links.calibration.gather import Gathered as Gathered
 from links.calibration.gather import gather as gather
 from links.calibration.pictures import pictures as pictures
 from links.calibration.rig_file import rig_text as rig_text
+from links.calibration.rig_file import zero_told as zero_told

@@ -16,6 +16,9 @@ from stages.calibration.verdict import Finding
 from stages.geometry import LidarMount, Pose
 
 DIGITS = 7
+TAKEN_BACK = (
+    "# A zero that differs from that takes back the mean of the encoder's error, which nothing tells from a zero."
+)
 
 
 def rig_text(rig: dict[str, Any], found: Calibration, source: str) -> str:
@@ -26,9 +29,14 @@ def rig_text(rig: dict[str, Any], found: Calibration, source: str) -> str:
         f"# Found by `grd calibrate {source}`; everything but lidar.mount is as it was.",
         "# To replay with it: grd replay RECORDING --overlay THIS_FILE; to fly: include it in place of the rig's file.",
         *(f"# {said(finding)}" for finding in found.findings),
-        "# A zero that differs from that takes back the mean of the encoder's error, which nothing tells from a zero.",
+        *(() if zero_told(found) else (TAKEN_BACK,)),
     ]
     return "\n".join([*head, yaml.safe_dump({"rig": new}, sort_keys=False, width=120)])
+
+
+def zero_told(found: Calibration) -> bool:
+    """Whether the servo's zero was found, by a wall."""
+    return not next(finding.refused for finding in found.findings if finding.name == "zero")
 
 
 def mount_tree(mount: LidarMount) -> dict[str, Any]:

@@ -98,7 +98,7 @@ def _on_grid(
     for share in (1.0, 0.5, 0.5):  # of the slack: nearer to the plane each time
         index, first = _many(index, first)
         patch = _numbers(first, len(index))
-        centre, axes, spread = _planes(xyz_m[index], first, patch)
+        centre, axes, spread = planes(xyz_m[index], first, patch)
         normal = axes[:, :, 0]
         residual = np.einsum("ij,ij->i", xyz_m[index] - centre[patch], normal[patch])
         cosine = np.abs(np.einsum("ij,ij->i", beam[index], normal[patch])) / range_m[index]
@@ -109,7 +109,7 @@ def _on_grid(
             break
     index, first = _many(index, first)
     patch = _numbers(first, len(index))
-    centre, axes, _ = _planes(xyz_m[index], first, patch)
+    centre, axes, _ = planes(xyz_m[index], first, patch)
     on_plane = _on_plane(beam[index], origin_m[index], axes[:, :, 0], centre, patch)
     inside = np.abs(on_plane - (corner[index] + 0.5) * edge[index, None])
     kept = (inside < edge[index, None] / 2 - MARGIN_M).all(axis=1) & _even(
@@ -117,7 +117,7 @@ def _on_grid(
     )[patch]
     index, first = _many(*_subset(index, patch, kept))
     patch = _numbers(first, len(index))
-    centre, axes, _ = _planes(xyz_m[index], first, patch)
+    centre, axes, _ = planes(xyz_m[index], first, patch)
     normal = axes[:, :, 0]
     on_plane = _on_plane(beam[index], origin_m[index], normal, centre, patch)
     cosine = np.abs(np.einsum("ij,ij->i", beam[index], normal[patch])) / range_m[index]
@@ -197,7 +197,7 @@ def _many(index: NDArray[np.int64], first: NDArray[np.int64]) -> tuple[NDArray[n
     return _subset(index, patch, (sizes >= FEWEST)[patch] if len(index) else np.zeros(0, dtype=np.bool_))
 
 
-def _planes(xyz_m: Array64, first: NDArray[np.int64], patch: NDArray[np.int64]) -> tuple[Array64, Array64, Array64]:
+def planes(xyz_m: Array64, first: NDArray[np.int64], patch: NDArray[np.int64]) -> tuple[Array64, Array64, Array64]:
     """Centre (m, 3), axes (m, 3, 3) from the thinnest to the widest, and spread (m, 3) along them [m]."""
     sizes = np.diff(np.append(first, len(xyz_m))).astype(np.float64)
     if len(first) == 0:
@@ -212,4 +212,4 @@ def _planes(xyz_m: Array64, first: NDArray[np.int64], patch: NDArray[np.int64]) 
 def thickness_m(xyz_m: Array64, patches: Patches) -> Array64:
     """How thick (m,) the returns (n, 3) of each patch lie about the plane through them, root mean square."""
     known = np.where(np.isfinite(xyz_m), xyz_m, patches.on_plane_m)
-    return _planes(known, patches.first, patches.patch)[2][:, 0]
+    return planes(known, patches.first, patches.patch)[2][:, 0]

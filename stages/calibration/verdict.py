@@ -171,7 +171,7 @@ def unseen(travel: Travel) -> dict[str, str]:
     """
     found = {
         "zero": "a turn of everything about the servo's axis leaves every surface thin, so no scene tells it: "
-        "measure it at the vehicle"
+        "measure it at the vehicle, or park parallel to a wall and say so (--parallel)"
     }
     if not travel.both_ways:
         found["time"] = "the servo turned one way only, so a late clock looks like a zero: sweep there and back"

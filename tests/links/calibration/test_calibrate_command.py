@@ -41,6 +41,20 @@ def test_a_street_is_told_number_by_number_with_what_is_refused(calibrated):
     assert "--overlay" in text
 
 
+def test_how_the_vehicle_stands_is_asked_for_and_then_tells_the_zero(calibrated, tmp_path):
+    _, without = calibrated
+    assert "--parallel" in without
+    text = grd("calibrate", STREET, "-o", tmp_path / "rig.yaml", "--parallel", "0.15", "--level", "0.2")
+    assert "servo's zero stays as it is" not in text
+    assert "the zero found in it" in text
+    assert "axis's tilt in the vehicle about x stays as it is" in text  # a road between two kerbs
+    written = (tmp_path / "rig.yaml").read_text()
+    assert "# servo's zero, by the wall" in written
+    mount = yaml.safe_load(written)["rig"]["lidar"]["mount"]
+    assert 0.15 <= mount["pointing_sigma_deg"] < 0.2
+    assert abs(mount["servo_zero_deg"]) < 0.1  # this simulated zero is right
+
+
 def test_the_new_rig_can_be_laid_over_a_configuration(calibrated):
     folder, _ = calibrated
     rig = folder / "street.rig.yaml"

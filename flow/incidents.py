@@ -11,6 +11,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from flow.message import Message, message
+
 AGAIN_NS, LONGEST_NS = 10_000_000_000, 600_000_000_000  # the same thing is said again after so long; doubles each time
 MAX_KINDS = 200  # that are told apart; more are counted together
 MAX_WAITING = 1000  # that nobody has fetched
@@ -33,6 +35,15 @@ class Incident:
         return f"{self.node}: {self.text}" + (f" ({self.count} times)" if self.count > 1 else "")
 
 
+@message
+class IncidentTold(Message):
+    """An incident as it is told, no more often than there: for taps, live, as `run.incidents`."""
+
+    node: str
+    text: str
+    mended: bool  # it came right again
+
+
 class Incidents:
     """Any thread reports, one fetches what is to be told."""
 
@@ -41,9 +52,10 @@ class Incidents:
         self._kinds: dict[tuple[str, str], Incident] = {}
         self._fresh: deque[str] = deque(maxlen=MAX_WAITING)
         self._lock = threading.Lock()
+        self.tell: Callable[[IncidentTold], None] | None = None  # each that is told at once, from the thread it is of
 
-    def report(self, node: str, text: str) -> None:
-        """One more thing went wrong at a node (or came right again)."""
+    def report(self, node: str, text: str, *, mended: bool = False) -> None:
+        """One more thing went wrong at a node, or came right again (`mended`)."""
         now_ns = self._now_ns()
         with self._lock:
             kind = (node, _NUMBER.sub("#", text))
@@ -59,7 +71,10 @@ class Incidents:
                     return
                 incident.quiet_ns = min(2 * incident.quiet_ns, LONGEST_NS)
             incident.quiet_until_ns = now_ns + incident.quiet_ns
-            self._fresh.append(str(incident))
+            told = str(incident)
+            self._fresh.append(told)
+        if self.tell is not None:
+            self.tell(IncidentTold(stamp_ns=now_ns, node=node, text=told.removeprefix(f"{node}: "), mended=mended))
 
     def fetch(self) -> list[str]:
         """What has not been told yet, oldest first."""

@@ -58,6 +58,7 @@ class Live:
         recorders = [tap for tap in taps if type(tap).record is not Tap.record]
         self._shared = Shared(now_ns, self.incidents, recorders, digest, strict)
         self._wiring = Wiring(graph, taps, self._shared)
+        self.incidents.tell = self._wiring.tell_incident
         self._names = list(graph.nodes)
         self._troubles: dict[str, str | None] = {}
         self._ended = threading.Event()
@@ -139,7 +140,7 @@ class Live:
                 trouble = link.trouble or silent.get(name)
                 if trouble != self._troubles.get(name):
                     self._troubles[name] = trouble
-                    self.incidents.report(name, trouble or "works again")
+                    self.incidents.report(name, trouble or "works again", mended=not trouble)
 
     def _keep_orders(self) -> None:
         for order in self._wiring.orders:

@@ -92,7 +92,7 @@ class SourceThread(Worker):
     def _take(self, record: Record) -> None:
         if self.report.state != "open":
             self.report.state = "open"
-            self.shared.incidents.report(self.node, "records come again")
+            self.shared.incidents.report(self.node, "records come again", mended=True)
         if record.arrival_ns < self.last_ns:  # a recording is read in the order of arrival: it must be ours
             record = dataclasses.replace(record, arrival_ns=self.last_ns)
         self.first_ns, self.last_ns = self.first_ns or record.arrival_ns, record.arrival_ns

@@ -12,6 +12,7 @@ from flow.consumption import OrderLog
 from flow.edge import Edge, Waiting, usual_waiting
 from flow.graph import Graph, NodeSpec
 from flow.inbox import Bell, Inbox
+from flow.incidents import IncidentTold
 from flow.link import Link, Source, Tap
 from flow.live_report import EdgeCount, EdgeReport, EdgeStatus, edge_report
 from flow.live_source import SourceThread
@@ -75,6 +76,7 @@ class Wiring:
         self.links: dict[str, Link] = {}  # taps by their class
         self.outputs: dict[str, dict[type[Message], Output[Feed]]] = {}
         self.processes = Processes()
+        self._incidents: Output[Feed] = Output("run.incidents", [])
         self._shared = shared
         self._bells: dict[str, Bell] = {}  # by thread
         for spec in graph.nodes.values():
@@ -92,6 +94,11 @@ class Wiring:
         for tap in taps:
             self.links[type(tap).__name__.lower()] = tap
             self._add_tap(tap)
+
+    def tell_incident(self, told: IncidentTold) -> None:
+        """Hand an incident to the taps that want it; any thread may."""
+        for inbox, port in self._incidents.feeds:
+            inbox.put(port, 0, told.stamp_ns, told)
 
     def _add_node(self, spec: NodeSpec, edges: list[Edge]) -> None:
         bell = self._bells.setdefault(spec.thread, Bell()) if issubclass(spec.cls, Stage) else None
@@ -140,10 +147,12 @@ class Wiring:
             self.sinks.append(SinkThread(spec.name, link, inbox, counts, shared))
 
     def _add_tap(self, tap: Tap) -> None:
-        """A tap's inbox with a port for each output that it wants to see, and for each edge's status."""
+        """A tap's inbox with a port for each output that it wants to see, each edge's status, and the incidents."""
         wanted = [(kind, out) for outs in self.outputs.values() for kind, out in outs.items() if tap.wants(kind)]
         if tap.wants(EdgeStatus):
             wanted += [(EdgeStatus, edge.status) for edge in self.edges.values()]
+        if tap.wants(IncidentTold):
+            wanted.append((IncidentTold, self._incidents))
         if not wanted:
             return
         usual = [usual_waiting(kind) for kind, _ in wanted]

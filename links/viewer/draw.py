@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from flow.incidents import IncidentTold
 from flow.message import Message
 from links.viewer import colours, draw_cameras, draw_drone, draw_pose, draw_rotation, draw_sensors
 from links.viewer.marks import Marks, plot, say, state
@@ -61,6 +62,12 @@ def draw(message: Any, name: str, scene: Scene) -> Marks:
     for field in dataclasses.fields(message):
         if field.name != "stamp_ns":
             yield from _draw_field(getattr(message, field.name), f"{name}/{field.name}", scene)
+
+
+@draw.register
+def incident(told: IncidentTold, name: str, scene: Scene) -> Marks:
+    """What went wrong, or came right again, as it is told on the terminal."""
+    yield say(f"{name}/{told.node}", told.text, "INFO" if told.mended else "WARN")
 
 
 draw.register(LidarFirings)(draw_sensors.lidar_firings)

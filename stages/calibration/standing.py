@@ -54,24 +54,26 @@ def stand(found: Calibration, rig: LidarMount, said: Standing) -> Calibration:
     xyz_m = np.where(np.isfinite(found.after.xyz_m), found.after.xyz_m, found.patches.on_plane_m)
     centre, axes, _ = planes(xyz_m, found.patches.first, found.patches.patch)
     T = rig.T_vehicle_turntable.matrix()
-    R, findings, mount = T[:3, :3], list(found.findings), found.mount
+    R_vehicle_base, findings, mount = T[:3, :3], list(found.findings), found.mount
     normal = axes[:, :, 0]
     if said.level_rad is not None:
-        before = _tilt_deg(R)
+        before = _tilt_deg(R_vehicle_base)
         try:
-            up, ground_rad = ground(normal @ R.T, centre @ R.T, -T[2, 3])
+            up, ground_rad = ground(normal @ R_vehicle_base.T, centre @ R_vehicle_base.T, -T[2, 3])
             sigma_rad, refused = math.hypot(said.level_rad, ground_rad), ""
-            R = _upright(up) @ R
-            mount = mount.model_copy(update={"T_vehicle_turntable": _pose(rig.T_vehicle_turntable, R)})
+            R_vehicle_base = _upright(up) @ R_vehicle_base
+            mount = mount.model_copy(update={"T_vehicle_turntable": _pose(rig.T_vehicle_turntable, R_vehicle_base)})
         except _Untold as why:
             sigma_rad, refused = math.radians(1.0), str(why)
         for i, axis in enumerate("xy"):
-            what, after = f"axis's tilt in the vehicle about {axis}", _tilt_deg(R)[i]
+            what, after = f"axis's tilt in the vehicle about {axis}", _tilt_deg(R_vehicle_base)[i]
             findings.append(Finding(f"level_{axis}", what, "deg", before[i], after, math.degrees(sigma_rad), refused))
     if said.parallel_rad is not None:
         at = next(i for i, finding in enumerate(findings) if finding.name == "zero")
         try:
-            where, heading_rad, wall_rad = wall(normal @ R.T, centre @ R.T + T[:3, 3], said.parallel_rad)
+            where, heading_rad, wall_rad = wall(
+                normal @ R_vehicle_base.T, centre @ R_vehicle_base.T + T[:3, 3], said.parallel_rad
+            )
             sigma_deg = math.degrees(math.hypot(said.parallel_rad, wall_rad))
             if sigma_deg > UNCALIBRATED_DEG:
                 raise _Untold(f"sigma is {sigma_deg:.2f} deg, no better than a rig as bought")

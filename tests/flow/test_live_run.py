@@ -6,8 +6,11 @@ import threading
 import time
 
 import pytest
+from pydantic import PrivateAttr
 
+from flow.incidents import IncidentTold
 from flow.link import Tap
+from flow.message import Message
 from tests.flow.live_toys import PATIENCE_S, Collector, Line, Memory, Stuck, graph_of, run_live
 
 ROOM = "tests.flow.live_toys"
@@ -76,6 +79,34 @@ def test_a_link_that_dies_is_said_and_opened_again_and_nothing_else_stops(tmp_pa
     assert "line: records come again (3 times)" in texts
     assert report.links["line"].openings == 4
     assert report.links["other"].openings == 1
+
+
+class Listener(Tap):
+    """Keeps the incidents it is told."""
+
+    _told: list[IncidentTold] = PrivateAttr(default_factory=list)
+
+    def wants(self, message: type[Message]) -> bool:
+        return message is IncidentTold
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        assert output == "run.incidents"
+        assert isinstance(message, IncidentTold)
+        self._told.append(message)
+
+
+def test_taps_are_told_of_incidents_at_their_time_and_not_again_and_again(tmp_path):
+    listener = Listener()
+    live = run_live(graph_of(tmp_path, DOUBLING.replace("brittle.number", "line.number")), [listener])
+    line_of(live).put(*[13] * 50, 1, "cut", 2)
+    assert collector_of(live).take(2) == [1.0, 2.0]
+    live.stop()
+    told = [(t.node, t.text, t.mended, t.stamp_ns) for t in listener._told]
+    assert sorted(told) == [
+        ("collector", "thirteen is not sent: choose another number", False, 2_000),
+        ("line", "records come again", True, 2_000),
+        ("line", "the line is dead: is it plugged in?; it is opened again", False, 2_000),
+    ]
 
 
 def test_a_source_that_has_spoken_and_falls_silent_is_said_and_its_return_too(tmp_path, monkeypatch):

@@ -66,3 +66,54 @@ def test_a_run_that_left_nothing_out_has_no_such_line(drive):
         for k in range(3):
             writer.write(Record("/vehicle/odometry", 10**9 * (k + 1), 10**9 * (k + 1), json.dumps(pose).encode(), k))
     assert "left out" not in command.grd("replay", "still.mcap", "--config", "drive.yaml")
+
+
+LIDAR = """\
+stages:
+  motion: {use: stages.ego.VehicleMotionChoice, inputs: {odometry: odometry.vehicle_motion}}
+links:
+  odometry: {use: links.vehicle_odometry.VehicleOdometry}
+  front: {use: links.velodyne.Lidar, config: {clock: CLOCK}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("flown", "replayed", "warned"),
+    [
+        ("free", "utc", True),
+        ("utc", "free", True),
+        ("free", "free", False),
+        ("utc", "utc", False),
+        (None, "utc", False),
+    ],
+)
+def test_a_lidar_replayed_with_another_clock_than_flown_is_warned_of(drive, flown, replayed, warned):
+    config = None if flown is None else LIDAR.replace("CLOCK", flown)
+    with RecordingWriter(drive / "flight.mcap", config_yaml=config) as writer:
+        pose = {"xyz_m": [0.0] * 3, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
+        writer.write(Record("/vehicle/odometry", 10**9, 10**9, json.dumps(pose).encode(), 0))
+    (drive / "again.yaml").write_text(LIDAR.replace("CLOCK", replayed))
+    text = " ".join(command.grd("replay", "flight.mcap", "--config", "again.yaml", "--out", "again").split())
+    told = f"front: flown with `clock: {flown}`, replayed with `clock: {replayed}`"
+    assert (told in text) is warned
+    summary = json.loads((drive / "again" / "summary.json").read_text())
+    assert any(told in warning for warning in summary["warnings"]) is warned
+
+
+@pytest.mark.parametrize("clock", ["free", "utc"])
+def test_a_flight_that_names_no_clock_was_flown_with_the_free_one(drive, clock):
+    with RecordingWriter(drive / "flight.mcap", config_yaml=LIDAR.replace(", config: {clock: CLOCK}", "")) as writer:
+        pose = {"xyz_m": [0.0] * 3, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
+        writer.write(Record("/vehicle/odometry", 10**9, 10**9, json.dumps(pose).encode(), 0))
+    (drive / "again.yaml").write_text(LIDAR.replace("CLOCK", clock))
+    text = command.grd("replay", "flight.mcap", "--config", "again.yaml")
+    assert ("flown with `clock: free`" in " ".join(text.split())) is (clock == "utc")
+
+
+@pytest.mark.parametrize("config", ["links: [", "links: 3", "links: {front: {use: links.velodyne.Lidar, config: 3}}"])
+def test_a_recording_with_a_broken_configuration_is_replayed_without_a_word_of_clocks(drive, config):
+    with RecordingWriter(drive / "flight.mcap", config_yaml=config) as writer:
+        pose = {"xyz_m": [0.0] * 3, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
+        writer.write(Record("/vehicle/odometry", 10**9, 10**9, json.dumps(pose).encode(), 0))
+    (drive / "again.yaml").write_text(LIDAR.replace("CLOCK", "free"))
+    assert "flown with" not in command.grd("replay", "flight.mcap", "--config", "again.yaml")

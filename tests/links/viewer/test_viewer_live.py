@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from shown import drawn
+from shown import drawn, words
 
+from flow.incidents import IncidentTold
 from flow.live_report import EdgeStatus
 
 
@@ -14,3 +15,13 @@ def test_lateness_and_losses_of_an_edge_are_curves(name, value):
     marks = drawn(status, "run/track/pulses")
     assert set(marks) == {f"plots/other/run/track/pulses/{n}" for n in ("lag_ms", "dropped", "missed", "waiting")}
     assert marks[f"plots/other/run/track/pulses/{name}"].values.tolist() == [value]
+
+
+@pytest.mark.parametrize(("mended", "level"), [(False, "WARN"), (True, "INFO")])
+def test_what_went_wrong_stands_in_the_log_under_who_it_happened_to(mended, level):
+    told = IncidentTold(stamp_ns=1, node="servo", text="has said nothing for 2 s (3 times)", mended=mended)
+    marks = drawn(told, "run/incidents")
+    assert list(marks) == ["log/run/incidents/servo"]
+    entry = marks["log/run/incidents/servo"].parts[0]
+    assert words(entry.text) == ["has said nothing for 2 s (3 times)"]
+    assert words(entry.level) == [level]

@@ -1,13 +1,15 @@
 """A camera as a source: one foxglove.CompressedImage per frame, JPEG. Live from a device, a stream or a video file.
 
-A frame is stamped when it came, less `latency_s`: how long after the middle of its middle row's exposure it comes. That
-is the camera's, and measured once (a clock filmed beside its own picture); nothing here can know it.
+A frame is stamped when it came (by RTSP without what it waited for the decoder), less `latency_s`: how long after the
+middle of its middle row's exposure it comes. That is the camera's, and measured once (a clock filmed beside its own
+picture); nothing here can know it.
 
 Source: recording format in recordings/README.md (/camera/*); ITU-T T.81, B.1.1 and B.2.2 (markers, frame header).
 """
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,6 +26,7 @@ from links.recording import CompressedImage, decode_compressed_image, encode_com
 from stages.messages import Image
 
 MAX_PIXELS = 4096 * 4096  # of a frame; a larger one is refused before it takes memory
+SLOW_TOLD_S = 5.0  # after the last sign of it
 FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive
 
 
@@ -43,6 +46,7 @@ class Camera(Source):
     jpeg_quality: int = Field(90, ge=30, le=100)  # where frames do not come as JPEG
     _refused: int = PrivateAttr(default=0)
     _counts: Counter[str] = PrivateAttr(default_factory=Counter[str])
+    _slow: tuple[int, float] = PrivateAttr(default=(0, 0.0))  # "too slow" as counted last, and when it had grown
 
     @property
     def refused(self) -> int:
@@ -51,8 +55,19 @@ class Camera(Source):
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals: frames refused, damaged, stale (waiting when asked for), overtaken; times lost and opened again."""
+        """Totals: frames refused, damaged, stale (waiting when asked for), late (the decoder
+        does not keep up), too slow (ten late in a row), overtaken; times lost and opened again."""
         return {"refused": self._refused, **self._counts}
+
+    @property
+    def trouble(self) -> str | None:
+        """That this host does not decode the stream as fast as it comes."""
+        slow, now_s = self._counts["too slow"], time.monotonic()
+        if slow > self._slow[0]:
+            self._slow = slow, now_s
+        if not slow or now_s > self._slow[1] + SLOW_TOLD_S:
+            return None
+        return "this host decodes its stream more slowly than it comes: fewer or smaller pictures, or MJPEG"
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
@@ -71,7 +86,7 @@ class Camera(Source):
         frame_id = self.frame_id or self.topic.strip("/").replace("/", "_")
         for sequence, frame in enumerate(frames):
             self._check_size(frame.jpeg, size_px)
-            stamp_ns = frame.arrival_ns - round(1e9 * self.latency_s)
+            stamp_ns = frame.came_ns - round(1e9 * self.latency_s)
             data = encode_compressed_image(CompressedImage(stamp_ns, frame_id, frame.jpeg))
             yield Record(self.topic, frame.arrival_ns, stamp_ns, data, sequence)
 

@@ -7,6 +7,10 @@ A frame's time is when the grab that waited for it returned. A grab that returns
 waiting for an unknown time: after opening those are thrown away until one had to be waited for, later never two in a
 row, so that a host that is too slow sees every second frame.
 
+What comes by RTSP has times of its own: by them a picture is freed of what it waited for the decoder
+(`links/camera/picture_clock.py`), however long that takes, and what is later than on a host that keeps up is thrown
+away, nine in a row at most.
+
 FFmpeg decodes with one thread. With n it hands a picture out when the n - 1 after it have come (one a core is its rule:
 eight cores, 7 pictures late), and they take the cores from the LiDAR. H.264 comes one picture late even so: where a
 picture ends is known when the next begins.
@@ -27,11 +31,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from links.camera.picture_clock import PictureClock
+
 WAITED_SHARE = 0.25  # of a frame's period: a grab that took less found the frame waiting
 DECODED_SHARE = 0.5  # the same where a grab decodes: on a small host that takes 10 ms of 33
-BACKLOG_S = 1.0  # after opening, at most
+BACKLOG_S, TOLD_BACKLOG_S = 1.0, 10.0  # after opening, at most; of a stream that tells its times
+LATE_PERIODS = 2.0  # by which a picture is later than the promptest one: the host is too slow for all
+MOST_LATE = 9  # thrown away in a row; if that does not help, decoding alone takes longer than a period
 MOST_DAMAGED = 10  # pictures in a row
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+RTSP = ("rtsp://", "rtsps://")
 _URL = re.compile(r"^[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
@@ -59,6 +68,7 @@ class Frame:
     """One frame."""
 
     arrival_ns: int  # on the clock that the capture was given
+    came_ns: int  # the same without what it waited for the decoder, where the stream tells
     jpeg: bytes
 
 
@@ -91,7 +101,9 @@ class Capture:
         self._waited_ns = share * 1e9 / settings.fps
         self._caught_up = not self._live
         self._dropped_last = False
-        self._damaged_in_a_row = 0
+        self._damaged_in_a_row = self._late_in_a_row = 0
+        tells = not self._raw and settings.source.lower().startswith(RTSP)
+        self._pictures = PictureClock() if tells else None
 
     def close(self) -> None:
         """Give the device or connection back."""
@@ -106,14 +118,15 @@ class Capture:
                     raise CaptureEnded(f"{self._name} is over")
                 raise CaptureLost(f"{self._name} gives no more frames")
             arrival_ns = self._now_ns() if self._live else self._due_ns()
-            if self._live and self._was_waiting(asked_ns, arrival_ns):
+            came_ns = self._came_ns(arrival_ns)
+            if self._live and self._was_waiting(asked_ns, arrival_ns, arrival_ns - came_ns):
                 self._counters["stale"] += 1
                 continue
             found, picture = self._video.retrieve()
             jpeg = self._jpeg(np.asarray(picture)) if found and picture is not None and picture.size else None
             if jpeg is not None:
                 self._damaged_in_a_row = 0
-                return Frame(arrival_ns, jpeg)
+                return Frame(arrival_ns, came_ns, jpeg)
             self._counters["damaged"] += 1
             self._damaged_in_a_row += 1
             if self._damaged_in_a_row > MOST_DAMAGED:
@@ -155,7 +168,29 @@ class Capture:
             raise CaptureLost(f"{s.source} cannot be opened as a camera")
         return video, False
 
-    def _was_waiting(self, asked_ns: int, arrival_ns: int) -> bool:
+    def _came_ns(self, arrival_ns: int) -> int:
+        """When the grabbed picture came, by the stream's own times where it has some that go on."""
+        if self._pictures is None:
+            return arrival_ns
+        came_ns = self._pictures.came_ns(round(1e6 * self._video.get(cv2.CAP_PROP_POS_MSEC)), arrival_ns)
+        if came_ns is None:
+            self._pictures = None
+            return arrival_ns
+        return came_ns
+
+    def _was_waiting(self, asked_ns: int, arrival_ns: int, late_ns: int) -> bool:
+        if self._pictures is not None:
+            if not self._caught_up:
+                self._caught_up = self._pictures.caught_up or arrival_ns - self._opened_ns > TOLD_BACKLOG_S * 1e9
+                return not self._caught_up
+            late = late_ns > LATE_PERIODS * 1e9 / self._settings.fps
+            self._counters["late"] += late
+            self._late_in_a_row = self._late_in_a_row + 1 if late else 0
+            if self._late_in_a_row > MOST_LATE:
+                self._counters["too slow"] += 1
+                self._late_in_a_row = 0
+                return False
+            return late
         waited = arrival_ns - asked_ns > self._waited_ns
         if not self._caught_up:
             self._caught_up = waited or arrival_ns - self._opened_ns > BACKLOG_S * 1e9

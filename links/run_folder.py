@@ -34,11 +34,10 @@ from links.result_file import ResultFile
 from links.results import SUMMARY_FILE, Results, stamp_s
 from links.truth import TRUTH_RECORDING, FixErrors, TruthLog
 from links.usage import Usage
-from links.velodyne import Lidar
+from links.velodyne import Lidar, flown_lidars
 from stages.messages import Detections, DroneFix, RelativePose
 
 CONFIG_FILE = "config.yaml"
-LIDAR_USE = "links.velodyne.Lidar"
 SEEKING = (Detections, DroneFix, RelativePose)  # who tells one of these seeks a drone
 
 
@@ -204,12 +203,11 @@ def replay_into(
     session = Session(recording)
     graph = asked.graph(session.rig_yaml, f"{recording} (rig.yaml)")
     truth, digest = truth_beside(recording), Digest()
-    warnings = [*session.warnings, *other_clocks(graph, session.config_yaml)]
+    clocks = other_clocks(graph, session.config_yaml)
     with RunFolder(folder, recording, asked, graph, began_s) as run:
         run_all = replay if together or not can_run_apart() else replay_apart
         report = run_all(graph, truth.aside(session.records(progress=progress)), (digest, *run.taps))
-        return run.finish(report, digest.hexdigest(), truth, session.warnings, parts=len(session.parts))
-        report = replay(graph, truth.aside(session.records(progress=progress)), (digest, *run.taps))
+        warnings = [*session.warnings, *clocks]
         return run.finish(report, digest.hexdigest(), truth, warnings, parts=len(session.parts))
 
 
@@ -219,13 +217,7 @@ def other_clocks(graph: Graph, flown_yaml: str | None) -> list[str]:
     `flown_yaml` is the configuration in the recording. Free, a LiDAR's stamps are late by a packet's shortest way: a
     `servo_time_offset_s` found with the one clock is wrong with the other.
     """
-    try:
-        tree = yaml.safe_load(flown_yaml or "")
-    except yaml.YAMLError:
-        return []
-    links = tree.get("links") if isinstance(tree, dict) else None
-    nodes = [node for node in (links.values() if isinstance(links, dict) else ()) if isinstance(node, dict)]
-    flown = dict(_topic_and_clock(node.get("config")) for node in nodes if node.get("use") == LIDAR_USE)
+    flown = dict(_topic_and_clock(config) for config in flown_lidars(flown_yaml))
     warnings: list[str] = []
     for name, spec in graph.nodes.items():
         topic, clock = _topic_and_clock(spec.config)
@@ -238,10 +230,9 @@ def other_clocks(graph: Graph, flown_yaml: str | None) -> list[str]:
     return warnings
 
 
-def _topic_and_clock(config: object) -> tuple[str, str]:
-    """Of a LiDAR's settings, whatever stands in them."""
-    told: dict[object, object] = config if isinstance(config, dict) else {}
-    topic, clock = (str(told.get(key, Lidar.model_fields[key].default)) for key in ("topic", "clock"))
+def _topic_and_clock(config: dict[str, Any]) -> tuple[str, str]:
+    """Of a LiDAR's settings."""
+    topic, clock = (str(config.get(key, Lidar.model_fields[key].default)) for key in ("topic", "clock"))
     return topic, clock
 
 

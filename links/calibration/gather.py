@@ -20,14 +20,13 @@ from links.dynamixel import Servo
 from links.dynamixel.servo import TICK_RAD
 from links.recording import Progress, Session
 from links.vehicle_odometry import VehicleOdometry
-from links.velodyne import Lidar
+from links.velodyne import Lidar, flown_lidars
 from stages.calibration.looks import Returns, ServoTrace
 from stages.geometry import LidarMount
 from stages.messages import LidarFirings
 
 MOST_RETURNS = 300_000  # more add seconds and no accuracy: firing sequences are left out evenly
 LASERS = 16
-LIDAR = "links.velodyne.Lidar"
 Array = NDArray[Any]
 MIN_RANGE_M = 1.0  # nearer returns are the sensor's own mount and the roof's edge
 
@@ -110,13 +109,8 @@ def lidar_of(config_yaml: str | None) -> Lidar:
 
     Free, a sensor's clock is set by the packets that come soonest: late by the shortest way, in the simulated rig 2 ms.
     """
-    clock: dict[str, object] = {}
-    tree = None if config_yaml is None else yaml.safe_load(config_yaml)
-    links = tree.get("links") if isinstance(tree, dict) else None
-    for node in links.values() if isinstance(links, dict) else ():
-        if isinstance(node, dict) and node.get("use") == LIDAR:
-            config = node.get("config") or {}
-            clock = {name: config[name] for name in ("clock", "clock_limit_s") if name in config}
+    config = next(reversed(flown_lidars(config_yaml)), {})
+    clock = {name: config[name] for name in ("clock", "clock_limit_s") if name in config}
     return Lidar.model_validate(clock)
 
 

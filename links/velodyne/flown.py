@@ -1,0 +1,25 @@
+"""The LiDARs of the configuration that a recording was flown with, of which its clock matters afterwards.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import yaml
+
+USE = "links.velodyne.Lidar"
+
+
+def flown_lidars(config_yaml: str | None) -> list[dict[str, Any]]:
+    """The settings of each, as written; none where the recording has no configuration that can be read."""
+    try:
+        tree = yaml.safe_load(config_yaml or "")
+    except yaml.YAMLError:
+        return []
+    links = tree.get("links") if isinstance(tree, dict) else None
+    nodes = cast("dict[str, Any]", links).values() if isinstance(links, dict) else ()
+    lidars = [node for node in nodes if isinstance(node, dict) and node.get("use") == USE]
+    configs = [cast("dict[str, Any]", node).get("config") for node in lidars]
+    return [cast("dict[str, Any]", config) if isinstance(config, dict) else {} for config in configs]

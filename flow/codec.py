@@ -50,7 +50,9 @@ class Plan:
             try:
                 self.fields.append((field.name, field_of(hints[field.name])))
             except TypeError as error:
-                raise TypeError(f"{cls.__name__}.{field.name} cannot cross hosts: {error}") from None
+                raise TypeError(
+                    f"{cls.__name__}.{field.name} cannot cross to another process or host: {error}"
+                ) from None
         told = ";".join(f"{name}:{field.told}" for name, field in self.fields)
         self.fingerprint = hashlib.blake2b(f"{cls.__name__}({told})".encode(), digest_size=8).digest()
 

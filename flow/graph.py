@@ -29,6 +29,7 @@ from typing import Any, Literal, cast, get_args
 import yaml
 from pydantic import ValidationError
 
+from flow.codec import plan_of
 from flow.edge import Edge, Waiting, read_waiting, usual_waiting
 from flow.link import RUN_TOPICS, TRUTH_TOPICS, Link, Source
 from flow.message import Message
@@ -111,6 +112,7 @@ def check(tree: Tree, file: Path) -> Graph:
         tree.problem(("stages",), "no stages: a graph needs at least one.")
     edges = tuple(edge for spec in nodes.values() for edge in _edges(tree, nodes, spec))
     _check_threads(tree, nodes, edges)
+    _check_processes(tree, nodes)
     _check_topics(tree, nodes)
     order = _rank(tree, nodes, edges)
     return Graph({name: nodes[name] for name in order}, edges, _recording(tree, file), tree.values)
@@ -346,6 +348,17 @@ def _check_threads(tree: Tree, nodes: dict[str, NodeSpec], edges: tuple[Edge, ..
         if both and edge.waiting.policy == "block":
             text = f"'block' would wait for ever: '{edge.producer}' works in the same thread, '{consumer.thread}'."
             tree.problem(("stages", edge.consumer, "inputs", edge.port, "policy"), text)
+
+
+def _check_processes(tree: Tree, nodes: dict[str, NodeSpec]) -> None:
+    """What goes to and from another process must be messages that travel."""
+    for spec in nodes.values():
+        for message in (*input_ports(spec.cls).values(), *output_ports(spec.cls).values()) if spec.process else ():
+            try:
+                plan_of(message)
+            except TypeError as error:
+                text = f"{error}: leave it out, the stage can work in the run's own process only."
+                tree.problem(("stages", spec.name, "process"), text)
 
 
 def _check_topics(tree: Tree, nodes: dict[str, NodeSpec]) -> None:

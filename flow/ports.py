@@ -35,13 +35,18 @@ class Output(Generic[F]):
         self.count, self.checked = 0, False
 
 
+def messages_of(handler: Callable[[Any], Any], message: Any) -> tuple[Message, ...]:
+    """What a handler gives for one message: none, one, or several."""
+    result = handler(message)
+    if result is None:
+        return ()
+    return (result,) if isinstance(result, Message) else tuple(result)  # a generator does its work here
+
+
 def call(name: str, handler: Callable[[Any], Any], message: Any, arrival_ns: int) -> tuple[Message, ...]:
     """What a handler gives for one message. RunError says what it raised; a link's own LinkError passes as it is."""
     try:
-        result = handler(message)
-        if result is None:
-            return ()
-        return (result,) if isinstance(result, Message) else tuple(result)  # a generator does its work here
+        return messages_of(handler, message)
     except LinkError:
         raise  # says itself what to check
     except Exception as error:

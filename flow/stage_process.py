@@ -5,8 +5,8 @@ use the second core, and what ends that process (a fault in a library's compiled
 one more way for a stage to raise, and a fresh one is started in a fresh process.
 
 The run keeps the stage's inbox, thread, order and counts; only the handlers' work is elsewhere. The same messages go
-in, in the same order, so a replay, which works in one process, gives the same (but after the end of such a process in
-flight: a fresh stage has forgotten what the replay's has not).
+in, in the same order, so the run taken again (`flow.rerun`, in one process) gives the same; but not after the end of
+such a process in flight: a fresh stage has forgotten what the one taken again has not.
 
 Source: ours.
 """

@@ -22,6 +22,7 @@ from typing import Any
 
 from flow.codec import decode, encode
 from flow.message import Message
+from flow.ports import messages_of
 from flow.stage import Stage, input_ports
 from flow.stage_wire import FINISH, GAVE, RAISED, Gone, packed, receive, send
 
@@ -61,9 +62,7 @@ class Worker(threading.Thread):
 
     def _answer(self, stage: Stage, handler: Callable[[Any], Any], message: Message | None) -> None:
         try:
-            result = handler(message)
-            messages = () if result is None else (result,) if isinstance(result, Message) else tuple(result)
-            what, parts = GAVE, [encode(item) for item in messages]
+            what, parts = GAVE, [encode(item) for item in messages_of(handler, message)]
         except Exception as error:  # noqa: BLE001  the run is told, as of one in its own process
             what, parts = RAISED, [f"{type(error).__name__}: {error}".encode()]
         send(self._line, what, packed(stage.counters, parts))

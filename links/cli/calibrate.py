@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -16,6 +16,10 @@ from rich.text import Text
 from flow.link import LinkError
 from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table, warn
 from links.cli.files import read_rig
+
+if TYPE_CHECKING:  # scipy and numba are loaded when it runs
+    from links.calibration import Gathered
+    from stages.calibration.calibrate import Calibration
 
 ROUNDING_DEG = 1e-6
 STILL_M = 0.05  # of the vehicle's own odometry over the whole time: so little shows that it stood
@@ -74,8 +78,8 @@ def calibrate_recording(
 
     Example: grd calibrate parked.mcap -o rig.yaml && grd replay flight.mcap --overlay rig.yaml
     """
-    from links.calibration import gather, pictures, rig_text, zero_told
-    from stages.calibration.calibrate import CannotCalibrate, calibrate
+    from links.calibration import gather, pictures, rig_text
+    from stages.calibration.calibrate import CannotCalibrate
     from stages.calibration.standing import Standing, stand
 
     target = out_file or recording.with_suffix(".rig.yaml")
@@ -92,20 +96,37 @@ def calibrate_recording(
         gathered = gather(recording, rig_yaml, (from_s, math.inf if to_s is None else to_s), progress=step)
     for text in gathered.warnings:
         warn(text)
-    parts = f" of the {gathered.parts} parts of {recording.name}" if gathered.parts > 1 else ""
+    said = Standing(*(None if deg is None else math.radians(deg) for deg in (level_deg, parallel_deg)))
     try:
-        if gathered.driven_m is not None and gathered.driven_m > STILL_M + DRIFT_MPS * gathered.seconds:
-            raise CannotCalibrate(
-                f"the vehicle did not stand still: its odometry says that it drove {gathered.driven_m:.2f} m. Take a "
-                "recording of a parked vehicle, or a part of this one in which it stands (--from, --to)"
-            )
-        stood = parked or (gathered.driven_m is not None and gathered.driven_m <= STILL_M)
-        found = calibrate(gathered.returns, gathered.trace, gathered.mount, parked=stood)
-        said = Standing(*(None if deg is None else math.radians(deg) for deg in (level_deg, parallel_deg)))
-        found = stand(found, gathered.mount, said)
+        found = stand(_calibrated(gathered, parked), gathered.mount, said)
     except CannotCalibrate as why:
         err.print(f"{recording}: {why}.", markup=False, style="red")
         raise typer.Exit(FINDING) from None
+    _tell(recording.name, found, gathered)
+    target.write_text(rig_text(gathered.rig, found, recording.name), encoding="utf-8")
+    picture.write_text(pictures(found), encoding="utf-8")
+    out.print(f"rig         {target}   (use it: grd replay RECORDING --overlay {target})", markup=False)
+    out.print(f"pictures    {picture}", markup=False)
+
+
+def _calibrated(gathered: Gathered, parked: bool) -> Calibration:
+    """What the sweep tells. CannotCalibrate, also of a vehicle that drove by its own odometry."""
+    from stages.calibration.calibrate import CannotCalibrate, calibrate
+
+    if gathered.driven_m is not None and gathered.driven_m > STILL_M + DRIFT_MPS * gathered.seconds:
+        raise CannotCalibrate(
+            f"the vehicle did not stand still: its odometry says that it drove {gathered.driven_m:.2f} m. Take a "
+            "recording of a parked vehicle, or a part of this one in which it stands (--from, --to)"
+        )
+    stood = parked or (gathered.driven_m is not None and gathered.driven_m <= STILL_M)
+    return calibrate(gathered.returns, gathered.trace, gathered.mount, parked=stood)
+
+
+def _tell(recording: str, found: Calibration, gathered: Gathered) -> None:
+    """What was found, how surely, and what was not."""
+    from links.calibration import zero_told
+
+    parts = f" of the {gathered.parts} parts of {recording}" if gathered.parts > 1 else ""
     table = Table(
         title=f"{len(found.patches.first)} flat patches in {gathered.seconds:.1f} s{parts}", title_justify="left"
     )
@@ -134,7 +155,3 @@ def calibrate_recording(
         f"which is like a zero, to {math.degrees(found.curve_mean_sigma_rad):.4f} deg"
     )
     out.print(f"flat patches: {before_mm:.1f} mm thick before, {after_mm:.1f} mm after (median)")
-    target.write_text(rig_text(gathered.rig, found, recording.name), encoding="utf-8")
-    picture.write_text(pictures(found), encoding="utf-8")
-    out.print(f"rig         {target}   (use it: grd replay RECORDING --overlay {target})", markup=False)
-    out.print(f"pictures    {picture}", markup=False)

@@ -112,7 +112,7 @@ def test_a_class_whose_fields_do_not_travel_says_so():
     class Odd(Message):
         things: dict[str, int]
 
-    with pytest.raises(TypeError, match=r"Odd\.things cannot cross hosts"):
+    with pytest.raises(TypeError, match=r"Odd\.things cannot cross to another process or host"):
         plan_of(Odd)
 
 

@@ -10,12 +10,29 @@ import time
 import pytest
 
 from flow.graph import load_graph
+from flow.message import Message, message
 from flow.problem import ConfigError
+from flow.stage import Stage
 from tests.flow.live_toys import PATIENCE_S, graph_of, run_live
 from tests.flow.test_live_rerun import RACE, again, race
 from tests.flow.test_live_run import DOUBLING, collector_of, line_of
+from tests.flow.toys import Number
 
 ELSEWHERE = DOUBLING.replace("inputs: {number: line.number}}", "inputs: {number: line.number}, process: aside}", 1)
+
+
+@message
+class Odd(Message):
+    """Does not travel."""
+
+    things: list[int]
+
+
+class Oddly(Stage):
+    """Gives what cannot cross to another process."""
+
+    def on_number(self, number: Number) -> Odd:
+        return Odd(stamp_ns=number.stamp_ns, things=[1])
 
 
 def runs(pid: int) -> bool:
@@ -118,3 +135,10 @@ def test_a_wrong_process_is_an_error_with_its_place(tmp_path, wrong, said):
     (problem,) = error.value.problems
     assert said in problem.text
     assert problem.place.line == 2
+
+
+def test_a_stage_whose_messages_cannot_cross_is_no_stage_for_a_process(tmp_path):
+    text = ELSEWHERE.replace("tests.flow.live_toys.Brittle", "tests.flow.test_stage_process.Oddly")
+    (tmp_path / "live.yaml").write_text(text[: text.index("  collector")])
+    with pytest.raises(ConfigError, match=r"Odd\.things cannot cross to another process or host: .* leave it out"):
+        load_graph(tmp_path / "live.yaml")

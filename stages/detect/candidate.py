@@ -22,7 +22,8 @@ from stages.geometry import Array64
 HISTORY = 40  # sightings
 SAME_LOOK_NS = 30_000_000
 OPEN_LOOKS = 3  # a sector free in so many looks holds nothing up: what stands behind it is something else
-FADING = 0.95  # what stood beside it counts less with each look since
+FADING = 0.95  # what stood beside it counts less with each look since,
+HELD_M = 2.0  # and not at all once it is so far away: that does not hold it
 ALONE_PER_M = 0.0165  # share of looks at a drone that find one return alone (nearby: few), over range
 WIRE_ALONE = 0.75  # and of those at a wire
 FEW_M = 24.0  # over range: so few returns are few even nearby; a sixth of those of a beam across a drone of 0.5 m
@@ -66,7 +67,7 @@ class Candidate:
     hits: int = 0
     long_looks: int = 0
     few: float = 0.0
-    beside: float = 0.0  # recent looks in which something stood beside it
+    beside: float = 0.0  # recent looks, about where it is now, in which something stood beside it
     alone: float = 0.0  # and those in which nothing did
     balls: int = 0
     rugged: int = 0
@@ -94,6 +95,7 @@ class Candidate:
     steady_s: float = 0.0  # for how long it clearly flew straight on
     beside_m: list[Array64] = field(default_factory=lambda: list[Array64]())  # its path seen from the vehicle's place
     path_m: list[Array64] = field(default_factory=lambda: list[Array64]())
+    held: list[tuple[Array64, float]] = field(default_factory=lambda: list[tuple[Array64, float]]())
     heard: Heard | None = None  # its path against what the drone tells of its own; None: the drone is silent
     flown: float = 0.0  # the most that ever said against a still thing or a wire [nats], while nothing stood beside it
 
@@ -134,7 +136,10 @@ class Candidate:
         self.balls += s.balls
         self.rugged += s.rugged
         standing, measured = what_stands_beside(s.around, self.free)
-        self.beside = FADING * self.beside + standing
+        self.held = [(place_m, FADING * sure) for place_m, sure in self.held[-HISTORY:]]
+        if standing > 0.0:
+            self.held.append((s.xyz_local_m, standing))
+        self.beside = sum([sure for place_m, sure in self.held if math.dist(place_m, s.xyz_local_m) < HELD_M])
         self.alone = FADING * self.alone + (measured and standing == 0.0)
         self.big_m = s.big_m
         self.big_looks += math.isfinite(s.big_m)

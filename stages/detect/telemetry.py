@@ -6,7 +6,7 @@ drone moves as it says, turned by a yaw psi that nobody knows:
     drone      x_i = c + Rz(psi) d_i + u t_i + noise           u: drift of both odometries, decimetres a second
     still      x_i = c + u t_i + noise                         a lamp; or scattered, or met farther and farther along
                                                                something long (a wire: as fast as one looks along it)
-    flier      x_i = c + v t_i + a t_i^2 / 2 + noise           v, a of a bird, or of a balloon
+    flier      x_i = c + v t_i + a t_i^2 / 2 + noise           v, a of a bird, or of a balloon, on a string or loose
 
 Each is a Gaussian over the path's n points, c and psi are integrated out; ln of the ratio of two marginal likelihoods
 is the evidence. Speeds and heights alone tell the drone from a bird in a few looks, whatever psi is. A drone that hangs
@@ -39,6 +39,8 @@ FOLLOWED_MPS = 5.0  # and along a wire, where each next look is aimed at as if i
 CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time, speed; else anything up to it
 BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
 BALLOON = (0.7, 0.7, 0.3, 0.4)
+SWAY_M = 1.0  # of a balloon on its string: so far it comes in all, however long one looks
+LOOSE, LOOSE_MPS, LOOSE_MPS2 = 0.1, 2.0, 0.3  # share of balloons that drift away with the wind
 DENIED = -3.0  # nats
 MOST_MISFIT = 4.0  # beyond it is none of these, and nothing speaks for the drone; drones come to 1.3
 
@@ -109,11 +111,14 @@ def weigh(
     still, long = log_p(upright, t_s, up), log_p(as_long, t_s, up)  # what stands drifts alike
     sliding = followed = still
     bird = log_p(model_of(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
-    balloon = log_p(model_of(t_s, sigma_m, BALLOON[2], BALLOON[3]), t_s, up)
+    sway_mps = SWAY_M / max(t_s.max() - t_s.min(), 1e-3)
+    balloon = log_p(model_of(t_s, sigma_m, min(BALLOON[2], sway_mps), BALLOON[3]), t_s, up)
+    loose = log_p(model_of(t_s, sigma_m, LOOSE_MPS, LOOSE_MPS2), t_s, up)
     if level_known:
         as_cruising = model_of(t_s, sigma_m, CRUISE_SIGMA_MPS, BIRD[1])
         as_wheeling = model_of(t_s, sigma_m, BIRD[0], BIRD[1])
-        as_balloon = model_of(t_s, sigma_m, BALLOON[0], BALLOON[1])
+        as_balloon = model_of(t_s, sigma_m, min(BALLOON[0], sway_mps), BALLOON[1])
+        as_loose = model_of(t_s, sigma_m, LOOSE_MPS, LOOSE_MPS2)
         turned, cruising, wheeling, level2 = np.empty(YAWS), np.empty(YAWS), 0.0, math.inf
         for k in range(YAWS):
             c, s = math.cos(math.tau * k / YAWS), math.sin(math.tau * k / YAWS)
@@ -132,12 +137,19 @@ def weigh(
             followed += log_p(as_followed, t_s, e)
             wheeling += log_p(as_wheeling, t_s, e)
             balloon += log_p(as_balloon, t_s, e)
+            loose += log_p(as_loose, t_s, e)
         cruise = math.log(CRUISING) + _log_mean(cruising)
         wheeling += math.log(1.0 - CRUISING)
-        bird += max(cruise, wheeling) + math.log1p(math.exp(-abs(cruise - wheeling)))
+        bird += _log_sum(cruise, wheeling)
+    balloon = _log_sum(math.log(1.0 - LOOSE) + balloon, math.log(LOOSE) + loose)
     over_still = drone - _log_mean(np.array([still, long, sliding]))
     off2 /= coordinates * len(t_s)
     return over_still, drone - bird, drone - balloon, min(over_still, drone - followed), off2
+
+
+@compiled
+def _log_sum(a: float, b: float) -> float:
+    return max(a, b) + math.log1p(math.exp(-abs(a - b)))
 
 
 @compiled

@@ -50,7 +50,7 @@ class Evidence(BaseModel):
 
     stray: float = -5.0  # prior, assumed: of what is hit once, one in 150 is there again
     hit: float = 1.0  # each return of the first look, up to 4
-    look: float = 2.5  # each further look with a return
+    look: float = 4.0  # each further look with a return
     miss: float = 0.25  # each pulse that went through the middle
     far_m: float = 35.0  # beyond, ever less of what returns anything is a drone
     far: float = 0.15  # each metre
@@ -61,6 +61,9 @@ class Evidence(BaseModel):
     most_beside: float = 12.0
     most_beside_flown: float = 4.0  # where it had flown in the open before, as the drone says: it came to a wall
     alone: float = 0.3  # each look with nothing, up to most_alone
+    alone_near: float = 0.7  # and so much more up to near_m, where a wire or pole returns pulses in each look,
+    near_m: float = 10.0
+    not_near_m: float = 16.0  # none from here on
     most_alone: float = 2.0
     near_alone: float = 3.0  # nearby up to so much more: there a wire that held it would return pulses, too
     wire_m: float = 20.0  # up to this range,
@@ -92,8 +95,8 @@ class Evidence(BaseModel):
     least_told: float = -12.0
 
     balloon: float = 5.0  # rare
-    ball: float = 2.0  # each chord that bulges smoothly
-    rugged: float = 1.2  # each chord with five or more returns that does not
+    ball: float = 2.0  # each chord that bulges smoothly: of balloons' nine in ten, of a small drone's half
+    rugged: float = 2.4  # each chord with five or more returns that does not
     most_round: float = 8.0  # chords that can tell a balloon: the next ones show the same side of the same thing
 
 
@@ -145,7 +148,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     if free_space:
         free = sum([looks >= 1.0 for looks in c.free.tolist()])
         beside = max(e.beside * c.beside, -(e.most_beside_flown if flew else e.most_beside))
-        odds += e.free_sector * free + beside + min(e.alone * c.alone, most_alone(c, e))
+        odds += e.free_sector * free + beside + min(each_alone(c, e) * c.alone, most_alone(c, e))
         said.append(f"{free} of {SECTORS} sectors around it free")
         if c.beside > OPEN_BESIDE:
             said.append("something beside it" + (", to which it flew through the open" if flew else ""))
@@ -176,6 +179,12 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
         odds -= e.spread
         said.append(f"scattered over {c.motion.spread_m:.1f} m")
     return odds, said
+
+
+def each_alone(c: Candidate, e: Evidence) -> float:
+    """What one look with nothing beside it counts [nats]."""
+    near = min(max((e.not_near_m - c.range_m) / (e.not_near_m - e.near_m), 0.0), 1.0)
+    return e.alone + e.alone_near * near
 
 
 def most_alone(c: Candidate, e: Evidence) -> float:

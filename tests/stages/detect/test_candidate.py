@@ -7,8 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from stages.detect.candidate import ALONE_PER_M, FEW_M, OPEN_LOOKS, SOME_M, STANDING_M, WIRE_ALONE, Candidate, Sighting
-from stages.detect.surroundings import FARTHER_0, FREE_0, TALLY
+from stages.detect.candidate import (
+    ALONE_PER_M,
+    FADING,
+    FEW_M,
+    OPEN_LOOKS,
+    SOME_M,
+    STANDING_M,
+    WIRE_ALONE,
+    Candidate,
+    Sighting,
+)
+from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, TALLY
 from tests.stages.made import START_NS
 
 PLACE_M = np.array([3.0, 15.0, 12.0])
@@ -152,3 +162,18 @@ def test_what_stands_behind_a_sector_that_is_free_again_and_again_is_not_what_ho
     known_free = [look(0.1 * k, 0) for k in range(OPEN_LOOKS)]
     assert candidate(look(0.0, 2)).beside > 0.0
     assert candidate(*known_free, look(1.0, 2)).beside == 0.0
+
+
+def test_what_stood_beside_it_holds_it_no_more_when_it_has_flown_away_from_there():
+    """A drone that had passed a wire was refused for seconds; a lamp, or what is met along a wire, has it beside it."""
+
+    def passing(mps, until_s):
+        places = [PLACE_M + np.array([mps * 0.1 * k, 0.0, 0.0]) for k in range(20)]
+        looks = [sighting(0.1 * k, place) for k, place in enumerate(places)]
+        for k, one in enumerate(looks):
+            one.around[OCCUPIED_0] = 0.1 * k <= until_s
+        return candidate(*looks).beside
+
+    assert passing(0.1, 0.55) > 2.0  # it hangs near what was seen beside it
+    assert passing(4.0, 0.55) == 0.0  # it is 4 m away
+    assert passing(4.0, 2.0) == pytest.approx(sum(FADING**k for k in range(5)), abs=1e-9)  # along a wire

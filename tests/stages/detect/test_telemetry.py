@@ -17,10 +17,14 @@ from stages.detect.telemetry import (
     DRIFT_MPS,
     DRIFT_UP_MPS,
     FOLLOWED_MPS,
+    LOOSE,
+    LOOSE_MPS,
+    LOOSE_MPS2,
     MOST_MISFIT,
     MOST_POINTS,
     SCATTERED_M,
     SLIDING_MPS,
+    SWAY_M,
     YAWS,
     Heard,
     hear,
@@ -80,20 +84,23 @@ def by_hand(t, x, d, sigma, axes):
     still, long = all_axes(x, sigma, drift), all_axes(x, SCATTERED_M)
     sliding = all_axes(x, sigma, SLIDING_MPS) if axes == (0, 1) else still  # level only
     followed = all_axes(x, sigma, FOLLOWED_MPS) if axes == (0, 1) else still
-    balloon = flier(BALLOON[:2], BALLOON[2:])
+    sway_mps = SWAY_M / np.ptp(t)  # on its string
+    balloon = flier((min(BALLOON[0], sway_mps), BALLOON[1]), (min(BALLOON[2], sway_mps), BALLOON[3]))
+    loose = flier((LOOSE_MPS, LOOSE_MPS2), (LOOSE_MPS, LOOSE_MPS2))
     bird = flier(BIRD[:2], BIRD[2:])
     if axes == (0, 1):
         headings = [CRUISE_MPS * np.array([math.cos(yaw), math.sin(yaw), 0.0]) for yaw in yaws]
         cruising = log_mean([all_axes(x - np.outer(t, v), sigma, CRUISE_SIGMA_MPS, BIRD[1]) for v in headings])
         bird = np.logaddexp(math.log(CRUISING) + cruising, math.log(1 - CRUISING) + bird)
-    return drone, still, long, sliding, bird, balloon, followed
+    return drone, still, long, sliding, bird, balloon, loose, followed
 
 
 def heard_by_hand(t, x, d, sigma, level_known):
     parts = np.array(by_hand(t, x, d, sigma, (2,)))
     if level_known:
         parts = parts + np.array(by_hand(t, x, d, sigma, (0, 1)))
-    drone, still, long, sliding, bird, balloon, followed = parts
+    drone, still, long, sliding, bird, balloon, loose, followed = parts
+    balloon = np.logaddexp(math.log(1 - LOOSE) + balloon, math.log(LOOSE) + loose)
     over_still = drone - log_mean([still, long, sliding])
     return over_still, drone - bird, drone - balloon, min(over_still, drone - followed)
 
@@ -257,6 +264,20 @@ def test_a_balloon_is_no_drone_that_flies_fast_and_nearly_one_that_drifts_as_it(
     path = np.outer(T_S, (0.8, 0.2, 0.2)) + noise(seed)
     assert against(path, STRAIGHT_M).over_balloon < -10.0
     assert -2.0 < against(path, np.outer(T_S, (0.8, 0.2, 0.2))).over_balloon < 12.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_flies_straight_on_for_metres_is_hardly_a_balloon_on_a_string(seed):
+    """Slow and straight as a balloon may drift for a second: a drone had to be looked at for six seconds."""
+
+    def over_balloon(seconds):
+        t_s = np.linspace(0.0, seconds, 14)
+        path = np.outer(t_s, (0.8, 0.3, 0.1))
+        return against(path + noise(seed), path, t_s=t_s).over_balloon
+
+    assert over_balloon(6.0) > over_balloon(1.0) + 3.0
+    swaying = 0.5 * np.sin(np.outer(np.linspace(0.0, 3.0, len(T_S)), (1.2, 1.9, 0.0)))
+    assert against(swaying + noise(seed), np.outer(T_S, (0.8, 0.3, 0.1))).over_balloon < -4.0
 
 
 def test_when_the_vehicles_motion_is_unknown_only_heights_are_compared():

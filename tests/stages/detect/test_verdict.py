@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from stages.detect import EvidenceDetect
+from stages.detect.surroundings import SECTORS
 from stages.detect.telemetry import Heard
 from stages.detect.telling import odds_of
-from stages.detect.verdict import STANDING, Evidence, believed, judge, most_alone, over_balloon, over_bird, over_clutter
+from stages.detect.verdict import (
+    STANDING,
+    Evidence,
+    believed,
+    each_alone,
+    judge,
+    most_alone,
+    over_balloon,
+    over_bird,
+    over_clutter,
+)
 from tests.stages.detect.test_candidate import candidate, sighting, way
 
 E = Evidence()
@@ -51,11 +63,23 @@ def test_a_drone_whose_sides_look_round_now_and_then_is_no_balloon_however_long_
         c = hanging()
         c.balls, c.rugged = 12 * times, 9 * times
         assert over_balloon(c, E) == pytest.approx(E.balloon - (12 * E.ball - 9 * E.rugged) * E.most_round / 21)
-        assert over_balloon(c, E) > -0.5
+        assert over_balloon(c, E) > 3.0
         c.balls, c.rugged = 11 * times, 3 * times  # a balloon
-        assert over_balloon(c, E) < -5.0
+        assert over_balloon(c, E) < -3.0
         c.balls, c.rugged = 5 * times, 15 * times
         assert over_balloon(c, E) == pytest.approx(E.balloon + times * (15 * E.rugged - 5 * E.ball))
+
+
+def test_a_look_with_nothing_beside_it_counts_more_nearby_where_what_holds_a_thing_would_return_pulses():
+    near, between, far = (hanging(range_m=range_m) for range_m in (8.0, 13.0, 20.0))
+    assert each_alone(near, E) == pytest.approx(E.alone + E.alone_near)
+    assert each_alone(between, E) == pytest.approx(E.alone + 0.5 * E.alone_near)
+    assert each_alone(far, E) == E.alone
+    plain = E.model_copy(update={"alone_near": 0.0})
+    for c in (near, far):
+        c.alone, c.free = 3.0, np.full(SECTORS, 12.0)
+    assert over_clutter(near, E, True, True)[0] - over_clutter(near, plain, True, True)[0] == pytest.approx(3 * 0.7)
+    assert over_clutter(far, E, True, True)[0] == over_clutter(far, plain, True, True)[0]
 
 
 def test_over_what_stands_it_replaces_whether_it_moved():

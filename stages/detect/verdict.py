@@ -50,7 +50,8 @@ class Evidence(BaseModel):
 
     stray: float = -5.0  # prior, assumed: of what is hit once, one in 150 is there again
     hit: float = 1.0  # each return of the first look, up to 4
-    look: float = 4.0  # each further look with a return
+    look: float = 4.0  # each further look with a return, up to wire_m,
+    look_far: float = 2.5  # and from unseen_m on: there looks are further apart, and more is met again by chance
     miss: float = 0.25  # each pulse that went through the middle
     far_m: float = 35.0  # beyond, ever less of what returns anything is a drone
     far: float = 0.15  # each metre
@@ -136,7 +137,8 @@ def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tu
 
 def over_stray(c: Candidate, e: Evidence) -> float:
     """Drone over rain, dust or a wrong return [nats]: that is gone at the next look."""
-    odds = e.stray + e.hit * min(c.first_hits, 4) + e.look * (c.hit_looks - 1) - e.miss * c.missed
+    look = e.look_far + (e.look - e.look_far) * nearness(c, e)
+    odds = e.stray + e.hit * min(c.first_hits, 4) + look * (c.hit_looks - 1) - e.miss * c.missed
     return min(odds, 10.0) - e.far * max(c.range_m - e.far_m, 0.0)
 
 
@@ -190,8 +192,12 @@ def each_alone(c: Candidate, e: Evidence) -> float:
 def most_alone(c: Candidate, e: Evidence) -> float:
     """What looks with nothing beside it can count [nats]: a wire is seen nearby, once pulses crossed every sector."""
     crossed = min(max((min(c.free.tolist()) - 2.0) / 6.0, 0.0), 1.0)
-    seen = min(max((e.unseen_m - c.range_m) / (e.unseen_m - e.wire_m), 0.0), 1.0)
-    return e.most_alone + e.near_alone * crossed * seen
+    return e.most_alone + e.near_alone * crossed * nearness(c, e)
+
+
+def nearness(c: Candidate, e: Evidence) -> float:
+    """1 where a wire would be seen, 0 where none is."""
+    return min(max((e.unseen_m - c.range_m) / (e.unseen_m - e.wire_m), 0.0), 1.0)
 
 
 def over_bird(c: Candidate, e: Evidence) -> float:

@@ -19,6 +19,7 @@ from stages.detect.verdict import (
     over_balloon,
     over_bird,
     over_clutter,
+    over_stray,
 )
 from tests.stages.detect.test_candidate import candidate, sighting, way
 
@@ -80,6 +81,12 @@ def test_a_look_with_nothing_beside_it_counts_more_nearby_where_what_holds_a_thi
         c.alone, c.free = 3.0, np.full(SECTORS, 12.0)
     assert over_clutter(near, E, True, True)[0] - over_clutter(near, plain, True, True)[0] == pytest.approx(3 * 0.7)
     assert over_clutter(far, E, True, True)[0] == over_clutter(far, plain, True, True)[0]
+
+
+@pytest.mark.parametrize(("range_m", "look"), [(15.0, E.look), (25.0, 0.5 * (E.look + E.look_far)), (30.0, E.look_far)])
+def test_one_more_look_at_the_same_thing_tells_less_against_a_stray_return_far_off(range_m, look):
+    once, twice = (candidate(*(sighting(0.1 * k, range_m=range_m) for k in range(n))) for n in (1, 2))
+    assert over_stray(twice, E) - over_stray(once, E) == pytest.approx(look)
 
 
 def test_over_what_stands_it_replaces_whether_it_moved():

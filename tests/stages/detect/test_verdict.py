@@ -87,6 +87,7 @@ def test_a_look_with_nothing_beside_it_counts_more_nearby_where_what_holds_a_thi
 def test_one_more_look_at_the_same_thing_tells_less_against_a_stray_return_far_off(range_m, look):
     once, twice = (candidate(*(sighting(0.1 * k, range_m=range_m) for k in range(n))) for n in (1, 2))
     assert over_stray(twice, E) - over_stray(once, E) == pytest.approx(look)
+    assert E.look_far < E.look
 
 
 def test_over_what_stands_it_replaces_whether_it_moved():

@@ -96,6 +96,7 @@ class Candidate:
     beside_m: list[Array64] = field(default_factory=lambda: list[Array64]())  # its path seen from the vehicle's place
     path_m: list[Array64] = field(default_factory=lambda: list[Array64]())
     held: list[tuple[Array64, float]] = field(default_factory=lambda: list[tuple[Array64, float]]())
+    # where it was, local frame [m], when something stood beside it, and how surely that counts by now
     heard: Heard | None = None  # its path against what the drone tells of its own; None: the drone is silent
     flown: float = 0.0  # the most that ever said against a still thing or a wire [nats], while nothing stood beside it
 

@@ -38,9 +38,9 @@ SLIDING_MPS = 0.5  # or how fast looks at it wander along
 FOLLOWED_MPS = 5.0  # and along a wire, where each next look is aimed at as if it flew
 CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time, speed; else anything up to it
 BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
-BALLOON = (0.7, 0.7, 0.3, 0.4)
-SWAY_M = 1.0  # of a balloon on its string: so far it comes in all, however long one looks
-LOOSE, LOOSE_MPS, LOOSE_MPS2 = 0.1, 2.0, 0.3  # share of balloons that drift away with the wind
+BALLOON = (0.7, 0.7, 0.3, 0.4)  # the same, on a string
+SWAY_M = 1.0  # sigma of how far that comes in all, however long one looks
+LOOSE, LOOSE_MPS, LOOSE_MPS2 = 0.1, 2.0, 0.3  # assumed share of balloons that drift with the wind, their sigmas
 DENIED = -3.0  # nats
 MOST_MISFIT = 4.0  # beyond it is none of these, and nothing speaks for the drone; drones come to 1.3
 

@@ -14,9 +14,11 @@ Where the drone tells how it flies, that decides over still things, birds and ba
 
 Every o_k is a prior and a sum of log likelihood ratios, capped where looks repeat the same evidence. The numbers
 are ours: reasoned, then changed on some dozens of matrix flights (seeds 901 to 921). `unseen_m` and `again` were
-changed after flights of the matrix (seeds 1 to 3) went wrong. Only `weight` and `offset` are fitted, so that P is how
-often it is a drone: observations that count one by one are not independent. What P is worth in unseen flights stands in
-`docs/RESULTS.md`.
+changed after flights of the matrix (seeds 1 to 3) went wrong; `alone_near` and `rugged` after how often drones and
+other things showed each (as built, seeds 21 to 24), `look` and `look_far` after what came of them (seeds 16 to 35).
+Only `weight` and `offset` are fitted, before those were changed, so that P is how often it is a drone: observations that
+count one by one are not independent. What P is worth in unseen flights, where it is a little too sure by now, stands
+in `docs/RESULTS.md`.
 
 Source: ours; weight and offset after Platt, Advances in Large Margin Classifiers (1999); DESIGN, "a small cluster with
 *measured* emptiness around it, evaluated as data arrives".
@@ -185,8 +187,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
 
 def each_alone(c: Candidate, e: Evidence) -> float:
     """What one look with nothing beside it counts [nats]."""
-    near = min(max((e.not_near_m - c.range_m) / (e.not_near_m - e.near_m), 0.0), 1.0)
-    return e.alone + e.alone_near * near
+    return e.alone + e.alone_near * share_at(c.range_m, e.near_m, e.not_near_m)
 
 
 def most_alone(c: Candidate, e: Evidence) -> float:
@@ -197,7 +198,12 @@ def most_alone(c: Candidate, e: Evidence) -> float:
 
 def nearness(c: Candidate, e: Evidence) -> float:
     """1 where a wire would be seen, 0 where none is."""
-    return min(max((e.unseen_m - c.range_m) / (e.unseen_m - e.wire_m), 0.0), 1.0)
+    return share_at(c.range_m, e.wire_m, e.unseen_m)
+
+
+def share_at(range_m: float, full_m: float, none_m: float) -> float:
+    """1 up to full_m, 0 from none_m on."""
+    return min(max((none_m - range_m) / max(none_m - full_m, 1e-9), 0.0), 1.0)
 
 
 def over_bird(c: Candidate, e: Evidence) -> float:

@@ -16,9 +16,9 @@ Every o_k is a prior and a sum of log likelihood ratios, capped where looks repe
 are ours: reasoned, then changed on some dozens of matrix flights (seeds 901 to 921). `unseen_m` and `again` were
 changed after flights of the matrix (seeds 1 to 3) went wrong; `alone_near` and `rugged` after how often drones and
 other things showed each (as built, seeds 21 to 24), `look` and `look_far` after what came of them (seeds 16 to 35).
-Only `weight` and `offset` are fitted, before those were changed, so that P is how often it is a drone: observations that
-count one by one are not independent. What P is worth in unseen flights, where it is a little too sure by now, stands
-in `docs/RESULTS.md`.
+Only `weight` and `offset` are fitted, before those were changed, so that P is how often it is a drone: observations
+that count one by one are not independent. What P is worth in unseen flights, where it is a little too sure by now,
+stands in `docs/RESULTS.md`.
 
 Source: ours; weight and offset after Platt, Advances in Large Margin Classifiers (1999); DESIGN, "a small cluster with
 *measured* emptiness around it, evaluated as data arrives".

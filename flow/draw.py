@@ -8,8 +8,9 @@ from __future__ import annotations
 from html import escape
 
 from flow.edge import usual_waiting
-from flow.graph import Graph, NodeSpec
+from flow.graph import Graph
 from flow.link import Tap
+from flow.node_spec import NodeSpec
 from flow.stage import output_ports
 
 _BOX_W, _BOX_H, _GAP_X, _GAP_Y, _MARGIN, _LANE = 210, 58, 130, 42, 24, 14

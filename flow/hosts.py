@@ -23,9 +23,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, cast
 
+from flow.classes import KINDS
 from flow.edge import Edge, Waiting
-from flow.graph import KINDS, Graph, NodeSpec
+from flow.graph import Graph
 from flow.message import Message
+from flow.node_spec import NodeSpec
 from flow.problem import ConfigError, Place, Problem, did_you_mean, one_of
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from flow.consumption import OrderLog
 from flow.edge import Edge, Waiting, usual_waiting
-from flow.graph import Graph, NodeSpec
+from flow.graph import Graph
 from flow.inbox import Bell, Inbox
 from flow.incidents import IncidentTold
 from flow.link import Link, Source, Tap
@@ -18,6 +18,7 @@ from flow.live_report import EdgeCount, EdgeReport, EdgeStatus, edge_report
 from flow.live_source import SourceThread
 from flow.live_threads import Feed, Shared, SinkThread, StageRun, StageThread, TapThread
 from flow.message import Message
+from flow.node_spec import NodeSpec
 from flow.ports import Output, RunError
 from flow.stage import Stage, output_ports
 from flow.stage_life import StageLife

@@ -13,11 +13,12 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 
 from flow.consumption import FINISH, StageOrder
-from flow.graph import Graph, NodeSpec
+from flow.graph import Graph
 from flow.incidents import Incidents
 from flow.link import RUN_TOPICS, LinkError, Record, Source, Tap
 from flow.message import Message
 from flow.metrics import Latency
+from flow.node_spec import NodeSpec
 from flow.ports import Output, RunError, decoded
 from flow.replay import NodeReport, RunReport
 from flow.stage import Stage, output_ports

@@ -11,8 +11,10 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+from flow.classes import HOMES, KINDS, known_classes
 from flow.edge import MAX_DEADLINE_MS, MAX_DEPTH, POLICIES
-from flow.graph import HOMES, KINDS, ON_ERROR, TOP_LEVEL, known_classes
+from flow.graph import TOP_LEVEL
+from flow.node_spec import ON_ERROR
 from flow.stage import Node, input_ports, output_ports
 
 _REFERENCE = {

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from time import perf_counter_ns
 from typing import Any
 
-from flow.graph import NodeSpec
 from flow.message import Message
 from flow.metrics import Latency
+from flow.node_spec import NodeSpec
 from flow.ports import Output, RunError, admit, call
 
 MAX_RESTARTS, WITHIN_NS = 5, 60_000_000_000

@@ -24,8 +24,8 @@ import threading
 from collections.abc import Callable
 
 from flow.codec import decode, encode
-from flow.graph import NodeSpec
 from flow.message import Message
+from flow.node_spec import NodeSpec
 from flow.ports import RaisedElsewhereError
 from flow.stage import input_ports, output_ports
 from flow.stage_wire import FINISH, RAISED, START, Gone, receive, send, unpacked

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from flow.graph import known_classes, load_graph
+from flow.classes import known_classes
+from flow.graph import load_graph
 from flow.schema import schema
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flow.graph import Graph, NodeSpec
+from flow.graph import Graph
 from flow.hosts import Hop, Hosts, part_of
 from flow.hosts_file import load_hosts
 from flow.link import LinkError
+from flow.node_spec import NodeSpec
 from links.zenoh.receiver import Receiver, receiver_class
 from links.zenoh.sender import Sender, sender_class
 from links.zenoh.session import Session, session_of

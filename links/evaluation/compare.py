@@ -66,13 +66,14 @@ def uneven(evaluations: list[Evaluation]) -> list[str]:
     configs = by_config(evaluations)
     counts = {name: Counter(_flight(e) for e in runs) for name, runs in configs.items()}
     warnings: list[str] = []
-    every = sorted({flight for count in counts.values() for flight in count})
+    every = sorted({recording for count in counts.values() for recording, *_ in count})
     for name, count in counts.items():
-        missing = [flight for flight in every if flight not in count]
-        twice = [flight for flight, n in sorted(count.items()) if n > 1]
+        run_on = {recording for recording, *_ in count}  # by any output: the paper's stages tell no pose
+        missing = [recording for recording in every if recording not in run_on]
+        twice = sorted({recording for (recording, *_), n in count.items() if n > 1})
         for flights, what in ((missing, "not run on"), (twice, "counted twice or more on")):
             if flights:
-                names = ", ".join(dict.fromkeys(recording for recording, *_ in flights[:MAX_NAMED]))
+                names = ", ".join(flights[:MAX_NAMED])
                 more = f" and {len(flights) - MAX_NAMED} more" if len(flights) > MAX_NAMED else ""
                 warnings.append(f"{name or 'a configuration without a name'}: {what} {names}{more}")
     return warnings

@@ -17,7 +17,7 @@ from links.evaluation.no_drone import alarms
 from links.evaluation.summaries import group_summary
 from links.evaluation.tables import median_columns
 from tests.links.command import grd
-from tests.links.evaluation.made_runs import make_run, truth_at
+from tests.links.evaluation.made_runs import add_pose, make_run, truth_at
 
 T_S = np.arange(0.0, 10.0, 0.1)
 
@@ -184,6 +184,16 @@ def test_what_one_configuration_was_not_run_on_is_warned_of(two_configs):
         "ours: not run on b-10m-s1",
         "ours: counted twice or more on a-10m-s1",
     ]
+
+
+def test_a_flight_judged_by_its_pose_in_one_configuration_and_by_its_fixes_in_the_other_was_run_on_by_both(tmp_path):
+    ours = make_run(tmp_path / "ours", T_S, truth_at(T_S), recording="a-10m-s1", config="ours")
+    add_pose(ours, T_S, truth_at(T_S), np.tile([0.0, 0.0, 0.0, 1.0], (len(T_S), 1)), None)
+    papers = make_run(tmp_path / "paper", T_S, truth_at(T_S), recording="a-10m-s1", config="paper")
+    both = judge(ours, papers)
+    chosen = [e for e in both if e.output.name == ("pose" if e.run.config == "ours" else "fix")]
+    assert [e.run.config for e in chosen] == ["ours", "paper"], [e.output.name for e in both]
+    assert uneven(chosen) == []
 
 
 def test_drone_free_runs_are_pooled_with_a_bound_and_named(tmp_path):

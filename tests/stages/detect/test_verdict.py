@@ -44,16 +44,41 @@ def test_over_a_bird_only_what_is_told_counts_as_soon_as_something_is():
     calm = hanging()
     assert over_bird(calm, E) > 3.0  # it hung still for a second
     calm.heard = Heard(0.0, 2.0, 0.0, 0.0)
-    assert over_bird(calm, E) == pytest.approx(E.birds + E.told * 2.0)
     fast = candidate(*way((14.0, 0.0, 0.0)))
     fast.heard = Heard(0.0, 2.0, 0.0, 0.0)
-    assert over_bird(fast, E) == pytest.approx(E.birds + E.told * 2.0)
+    assert over_bird(fast, E) == pytest.approx(over_bird(calm, E))
+
+
+def test_what_is_smaller_than_a_drone_is_met_nearby_so_far_off_it_is_less_likely_a_bird_or_a_stray_return():
+    ranges_m = (5.0, E.small_m, 0.5 * (E.small_m + E.unseen_m), E.unseen_m, 50.0)
+    told = [over_bird(hanging(Heard(0.0, 2.0, 0.0, 0.0), range_m=r), E) - E.told * 2.0 for r in ranges_m]
+    between = 0.5 * (E.birds + E.birds_far)
+    assert told == pytest.approx([E.birds, E.birds, between, E.birds_far, E.birds_far])
+    once = [candidate(sighting(0.0, hits=2, range_m=r)) for r in ranges_m]
+    for c in once:
+        c.heard = NOTHING
+    far = E.far * (50.0 - E.far_m)
+    between = 0.5 * (E.stray + E.stray_far)
+    priors = [E.stray, E.stray, between, E.stray_far, E.stray_far - far]
+    assert [over_stray(c, E) for c in once] == pytest.approx([p + 2 * E.hit for p in priors])
+    for c in once:
+        c.heard = None  # the drone tells nothing: none of this was fitted to that
+    assert [over_stray(c, E) for c in once[:4]] == pytest.approx([E.stray_untold + 2 * E.hit] * 4)
+
+
+def test_what_hangs_still_where_what_would_hold_it_is_unseen_is_less_likely_a_drone_the_farther():
+    plain = E.model_copy(update={"hung": 0.0})
+    for range_m, share in ((15.0, 0.0), (25.0, 0.5), (30.0, 1.0)):
+        still, flew = hanging(NOTHING, range_m), hanging(Heard(20.0, 20.0, 20.0, 20.0), range_m)
+        odds = [over_clutter(still, e, True, True)[0] for e in (E, plain)]
+        assert odds[1] - odds[0] == pytest.approx(share * E.hung)
+        assert over_clutter(flew, E, True, True) == over_clutter(flew, plain, True, True)
 
 
 def test_over_a_balloon_it_is_added_to_how_round_it_is():
     c = hanging()
     c.balls = 2
-    assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball)
+    assert over_balloon(c, E) == pytest.approx(E.balloon_untold - 2 * E.ball)
     c.heard = Heard(0.0, 0.0, -3.0, 0.0)
     assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball - 3.0 * E.told)
 
@@ -63,12 +88,12 @@ def test_a_drone_whose_sides_look_round_now_and_then_is_no_balloon_however_long_
     for times in (1, 2, 10):
         c = hanging()
         c.balls, c.rugged = 12 * times, 9 * times
-        assert over_balloon(c, E) == pytest.approx(E.balloon - (12 * E.ball - 9 * E.rugged) * E.most_round / 21)
+        assert over_balloon(c, E) == pytest.approx(E.balloon_untold - (12 * E.ball - 9 * E.rugged) * E.most_round / 21)
         assert over_balloon(c, E) > 3.0
         c.balls, c.rugged = 11 * times, 3 * times  # a balloon
         assert over_balloon(c, E) < -3.0
         c.balls, c.rugged = 5 * times, 15 * times
-        assert over_balloon(c, E) == pytest.approx(E.balloon + times * (15 * E.rugged - 5 * E.ball))
+        assert over_balloon(c, E) == pytest.approx(E.balloon_untold + times * (15 * E.rugged - 5 * E.ball))
 
 
 def test_a_look_with_nothing_beside_it_counts_more_nearby_where_what_holds_a_thing_would_return_pulses():
@@ -123,26 +148,28 @@ def test_nearby_a_path_that_a_wire_followed_by_the_aim_would_show_is_no_flight_h
 
 
 def test_two_things_may_lie_as_the_drone_flew_by_chance_less_with_each_look_since():
-    c = hanging()
+    c = hanging(NOTHING)
     alone, _ = judge(c, E, True, True)
     c.joined_at = 10
-    assert judge(c, E, True, True)[0] == pytest.approx(alone - E.weight * E.joined / 2)
+    assert judge(c, E, True, True)[0] == pytest.approx(alone - E.joined / 2)
     c.joined_at = 6
     odds, words = judge(c, E, True, True)
-    assert odds == pytest.approx(alone - E.weight * E.joined / 6)
+    assert odds == pytest.approx(alone - E.joined / 6)
     assert "met again where the drone says it would be" in words
 
 
-def test_the_odds_told_are_a_share_of_the_evidence_and_an_offset():
-    evidence, _ = judge(hanging(), Evidence(weight=1.0, offset=0.0), True, True)
+def test_where_the_drone_tells_nothing_the_odds_are_a_share_of_the_evidence_and_an_offset():
+    evidence, _ = judge(hanging(), Evidence(weight_untold=1.0, offset_untold=0.0), True, True)
     assert evidence != 0.0
-    assert judge(hanging(), Evidence(weight=0.5, offset=-1.0), True, True)[0] == pytest.approx(0.5 * evidence - 1.0)
+    share = Evidence(weight_untold=0.5, offset_untold=-1.0)
+    assert judge(hanging(), share, True, True)[0] == pytest.approx(0.5 * evidence - 1.0)
+    assert judge(hanging(NOTHING), share, True, True) == judge(hanging(NOTHING), E, True, True)
 
 
-def test_what_is_accepted_and_looked_at_again_has_the_evidence_that_the_numbers_of_a_verdict_were_made_for():
+def test_without_the_drones_word_what_is_accepted_and_looked_at_again_has_the_evidence_that_the_numbers_were_made_for():
     for default, evidence in (("accept_probability", 5.3), ("look_again_probability", -5.1)):
         asked = odds_of(EvidenceDetect.model_fields[default].default)
-        assert asked == pytest.approx(E.weight * evidence + E.offset, abs=0.03)
+        assert asked == pytest.approx(E.weight_untold * evidence + E.offset_untold, abs=0.03)
 
 
 def test_nearby_looks_with_nothing_beside_it_count_more_once_every_sector_was_crossed():

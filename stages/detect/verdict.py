@@ -80,7 +80,9 @@ class Evidence(BaseModel):
     spread: float = 3.0  # its sightings lie wider about a straight flight than a drone is large
     long: float = 1.5  # each look longer than the drone, up to 4
     moves: float = 5.0  # it moved: what stands does not
-    hung: float = 1.8  # it does not, and hangs where what would hold it may be unseen
+    hung: float = 1.8  # it does not, and hangs where what would hold it may be unseen;
+    hung_m: float = 28.0  # from here on a drone that hangs and a lamp are not told apart,
+    most_hung: float = 3.3  # so that it is never more likely one than that
     still: float = 0.12  # each look at something that does not, up to most_still: a lamp's pole is found sooner
     most_still: float = 1.5
     among: float = 2.0  # something was refused beside it, lately: wires are long
@@ -182,7 +184,8 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
         odds += e.moves if moved else 0.0
     if not moved:
         odds += min(e.still * c.hit_looks, e.most_still)
-        odds -= 0.0 if c.heard is None else e.hung * (1.0 - nearness(c, e))
+        if c.heard is not None:
+            odds -= e.hung * (1.0 - nearness(c, e))
         said.append("it may stand still")
         if c.among:
             odds -= e.among + (e.again if c.again else 0.0)
@@ -193,6 +196,8 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     if c.motion is not None and c.motion.spread_m > 0.35 and len(c.path_ns) > 3:
         odds -= e.spread
         said.append(f"scattered over {c.motion.spread_m:.1f} m")
+    if c.heard is not None and not moved and c.range_m > e.hung_m:
+        odds = min(odds, e.most_hung)
     return odds, said
 
 

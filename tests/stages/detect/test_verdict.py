@@ -75,6 +75,19 @@ def test_what_hangs_still_where_what_would_hold_it_is_unseen_is_less_likely_a_dr
         assert over_clutter(flew, E, True, True) == over_clutter(flew, plain, True, True)
 
 
+def test_from_28_m_on_what_may_stand_still_is_never_sure_enough_to_be_accepted_and_what_flew_is():
+    for range_m, still_accepted in ((20.0, True), (27.0, True), (29.0, False), (31.0, False)):
+        for told, moves in ((NOTHING, False), (Heard(20.0, 20.0, 20.0, 20.0), True)):
+            c = hanging(told, range_m)
+            c.alone, c.free, c.few = 30.0, np.full(SECTORS, 12.0), 30.0
+            c.rugged = 5
+            sure = E.model_copy(update={"clutter": 0.0, "birds_far": 9.0, "birds": 9.0})
+            odds, words = judge(c, sure, True, True)
+            assert ("it may stand still" in words) != moves
+            accepted = odds >= odds_of(EvidenceDetect.model_fields["accept_probability"].default)
+            assert accepted == (moves or still_accepted), (range_m, told, odds)
+
+
 def test_over_a_balloon_it_is_added_to_how_round_it_is():
     c = hanging()
     c.balls = 2

@@ -21,6 +21,7 @@ from pydantic import PrivateAttr
 from flow.link import Run, Tap
 from flow.message import Message
 from links.fix_log import FixLog
+from links.mavlink.gate import Limits, refusal
 from links.result_file import ResultFile
 from stages.geometry import quaternions_xyzw
 from stages.messages import (
@@ -89,6 +90,8 @@ class Results(Tap):
 
     What no stage of a run tells has no file: rotations, fused poses, candidates.
     """
+
+    limits: Limits = Limits()  # of the autopilot's gate: which poses are good
 
     _files: dict[str, ResultFile] = PrivateAttr(default_factory=dict)
     _live: bool = PrivateAttr(default=False)
@@ -253,8 +256,8 @@ class Results(Tap):
     def _write_pose(self, output: str, message: RelativePose) -> None:
         """A line for each pose whose position is known; the log tells when the state changes.
 
-        `rotation`: whether it is known; `good` says the same. Where it is not known the covariance's position is in the
-        vehicle's axes.
+        `rotation`: whether it is known; where it is not the covariance's position is in the vehicle's axes. `good`:
+        whether the autopilot's gate lets the pose out, at its own time.
         """
         self._pose_states[message.state.name] += 1
         self._resets = message.resets
@@ -277,8 +280,8 @@ class Results(Tap):
         upper[np.isinf(upper)] = UNKNOWN_RAD2
         measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
-        told = [message.state.name, int(R is not None), int(R is not None), message.resets, nis, measured]
-        told.append(message.track_id)
+        good = refusal(message, message.stamp_ns, self.limits) is None
+        told = [message.state.name, int(good), int(R is not None), message.resets, nis, measured, message.track_id]
         self._poses.writerow([stamp_s(message.stamp_ns), *_digits(upper), *told])
 
     def _file(self, name: str) -> ResultFile:

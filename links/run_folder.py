@@ -29,6 +29,8 @@ from flow.replay import RunReport, replay
 from flow.stage import Stage
 from flow.taps import Digest
 from flow.tree import Section
+from links.mavlink.autopilot import Autopilot
+from links.mavlink.gate import Limits
 from links.recording import Progress, RecordingReader, Session
 from links.result_file import ResultFile
 from links.results import SUMMARY_FILE, Results, stamp_s
@@ -98,7 +100,7 @@ class RunFolder:
         self._folder, self._recording, self._asked, self._graph = folder, recording, asked, graph
         self._live = live
         self._began_s = time.monotonic() if began_s is None else began_s
-        self._results, self._open = Results(), ExitStack()
+        self._results, self._open = Results(limits=_limits(graph)), ExitStack()
         declared = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
         self.taps: list[Tap] = [self._results, *(tap for tap in declared if isinstance(tap, Tap))]
 
@@ -179,6 +181,12 @@ def _ran_instead(graph: Graph, report: RunReport) -> str:
             return ""
         told[node].append(f"{report.messages.get(f'{node}.{output}', 0)} {output}")
     return "; ".join(f"{n} ({graph.nodes[n].cls.__name__}: {', '.join(t) or 'tells nothing'})" for n, t in told.items())
+
+
+def _limits(graph: Graph) -> Limits:
+    """Of the autopilot's gate, as configured."""
+    links = (spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Autopilot))
+    return next((link.limits for link in links if isinstance(link, Autopilot)), Limits())
 
 
 def _senders(graph: Graph) -> dict[str, dict[str, str]]:

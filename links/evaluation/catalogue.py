@@ -144,6 +144,14 @@ def _catalogue() -> dict[str, Metric]:
         ("invented_drones", "drones invented, no drone", "", "low"),
     )
     add(
+        "for the autopilot",
+        ("good_share", "time with a pose good enough", "%", "high"),
+        ("good_rmse_m", "its 3D RMSE", "m", "low"),
+        ("good_max_m", "its largest error", "m", "low"),
+        ("good_max_deg", "its largest error of rotation", "deg", "low"),
+        ("good_false", "such poses off by more than 1 m", "", "low"),
+    )
+    add(
         "rotation",
         ("rmse_roll_deg", "RMSE roll", "deg", "low"),
         ("rmse_pitch_deg", "RMSE pitch", "deg", "low"),

@@ -11,6 +11,7 @@ from links.evaluation.catalogue import CATALOGUE, Value
 from links.evaluation.consistency import covariance, rotation
 from links.evaluation.errors import GRID_NS, AtOutputs, Limits, OverTime, at_outputs, over_time, span_of
 from links.evaluation.faults import false_outputs
+from links.evaluation.for_autopilot import for_autopilot
 from links.evaluation.judged import Evaluation
 from links.evaluation.keeping import keeping
 from links.evaluation.output import Output
@@ -38,6 +39,7 @@ def evaluate(run: RunData, output: Output, limits: Limits | None = None) -> Eval
     keeping(judged)
     false_outputs(judged)
     detections(judged)
+    for_autopilot(judged)
     rotation(judged)
     both_cameras(judged)
     covariance(judged)

@@ -76,6 +76,9 @@ class Group:
     inside_95: tuple[int, int]  # outputs whose 95 % ellipsoid holds the truth
     false_per_h: float | None
     sure_false_per_h: float | None  # of those, beyond three of their own sigmas
+    good_share: float | None  # time with a pose good enough for the autopilot, mean over the runs
+    good_max_m: float | None  # largest errors of such poses
+    good_max_deg: float | None
 
 
 def parse_by(text: str) -> Key:
@@ -119,6 +122,7 @@ def grouped(evaluations: Sequence[Evaluation], key: Key) -> list[tuple[tuple[str
 
 def _group(words: tuple[str, ...], config: str, evaluations: list[Evaluation]) -> Group:
     right = [v for e in evaluations if (v := _number(e, "right_share")) is not None]
+    good = [v for e in evaluations if (v := _number(e, "good_share")) is not None]
     was_right = [e for e in evaluations if (_number(e, "right_share") or 0.0) > 0.0]
     lost = [v for e in evaluations if (v := _number(e, "lost_count")) is not None]
     failed = [e.span_ns for e in evaluations if "first_right_s" in e.values and e.values["first_right_s"].failed]
@@ -144,6 +148,9 @@ def _group(words: tuple[str, ...], config: str, evaluations: list[Evaluation]) -
         inside_95=pooled((e.counts for e in evaluations), "inside_95_share"),
         false_per_h=_per_h(evaluations, "false_outputs"),
         sure_false_per_h=_per_h(evaluations, "sure_false_outputs"),
+        good_share=sum(good) / len(good) if good else None,
+        good_max_m=spread(evaluations, "good_max_m").largest,
+        good_max_deg=spread(evaluations, "good_max_deg").largest,
     )
 
 

@@ -25,8 +25,8 @@ HOW = (
     "found/seen: of the time of those seen, by any. back: found again after it was hidden; lost: in sight. 3D RMSE: of "
     "the runs that were right at least once. Medians and 95 % count a failure as infinite ('never', or longer than the "
     "shortest run that failed); maxima are over what did not fail. false [/h]: outputs farther than 1 m from the "
-    "drone, whatever sigma they state; sure: by more than three of their own sigmas, too. Of several drones each "
-    "counts as a run."
+    "drone, whatever sigma they state; sure: by more than three of their own sigmas, too. sent: poses good enough for "
+    "the autopilot, by its gate: share of the time, and their largest errors. Of several drones each counts as a run."
 )
 NOTHING = "-"
 ROTATION_HOW = (
@@ -85,6 +85,9 @@ COLUMNS: tuple[Column, ...] = (
     ("in 95 %\n[%]", lambda g: _percent(g.inside_95)),
     ("false\n[/h]", lambda g: _digits(g.false_per_h, 0)),
     ("sure\n[/h]", lambda g: _digits(g.sure_false_per_h, 0)),
+    ("sent\n[%]", lambda g: _digits(g.good_share, 1)),
+    ("sent:\nmax [m]", lambda g: _digits(g.good_max_m, 2)),
+    ("sent:\nmax [deg]", lambda g: _digits(g.good_max_deg, 1)),
 )
 
 ROTATION_COLUMNS: tuple[tuple[str, Callable[[RotationGroup], str]], ...] = (

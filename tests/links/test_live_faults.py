@@ -27,7 +27,6 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.gate import Limits, pose_sigmas
 from links.recording import RecordingReader
 from links.simulated.live_pictures import PictureServer
 from links.truth import TruthLog
@@ -125,21 +124,11 @@ class Told:
     pose: tuple[float, ...]  # xyz, quaternion
 
 
-def given_out(row: dict[str, str]) -> bool:
-    """Whether a pose of this covariance goes to the autopilot (links/mavlink/gate.py)."""
-    covariance = np.zeros((6, 6))
-    for i, k in zip(*np.triu_indices(6), strict=True):
-        covariance[i, k] = covariance[k, i] = float(row[f"c{i}{k}"])
-    rotation_rad, position_m = pose_sigmas(covariance) or (np.inf, np.inf)
-    sure = position_m <= Limits().position_sigma_m and np.degrees(rotation_rad) <= Limits().rotation_sigma_deg
-    return bool(row["good"] == "1" and sure)
-
-
 def positions(folder: Path) -> list[Told]:
     poses, table = folder / "pose_vehicle_drone.tum", folder / "pose_covariance.csv"
     if not poses.exists() or not table.exists():
         return []
-    good = {row["stamp_s"]: given_out(row) for row in csv.DictReader(table.read_text().splitlines())}
+    good = {row["stamp_s"]: row["good"] == "1" for row in csv.DictReader(table.read_text().splitlines())}
     lines = [line.split() for line in poses.read_text().splitlines() if line[:1].isdigit()]
     whole = [line for line in lines if len(line) == 8 and line[0] in good]
     return [Told(float(line[0]), good[line[0]], tuple(map(float, line[1:]))) for line in whole]

@@ -10,6 +10,7 @@ import pytest
 
 from flow.link import Run
 from links.evaluation.output import read_output
+from links.mavlink.gate import Limits
 from links.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
 from stages.fuse.motions import Motions
 from stages.fuse.settings import FuseErrors
@@ -25,7 +26,7 @@ def verdict(state, resets=0, track_id=1):
     return Verdict(state, f"why {state.name}", 2 * S, track_id, resets, 1.5)
 
 
-def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.01, 0.02, 0.03, 0.1, 0.2, 0.3)):
+def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.001, 0.002, 0.003, 0.01, 0.02, 0.03)):
     known = Known(round(t_s * S), R, np.array(xyz), np.diag(variances), np.zeros(3), np.eye(3))
     return pose(known, verdict(state), Motions(FuseErrors(), parked=True))
 
@@ -50,7 +51,7 @@ def test_a_pose_is_a_line_of_both_files_and_reads_back(run):
     assert back.poses.stamps_ns.tolist() == [S, 1_020_000_000]
     assert np.allclose(back.poses.xyz_m, [[1, 2, 3], [1.1, 2, 3]])
     assert np.allclose(back.poses.quaternion_xyzw, quaternions_xyzw(np.array([R, R])), atol=1e-5)
-    assert np.allclose(back.covariance[0], np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]))
+    assert np.allclose(back.covariance[0], np.diag([0.001, 0.002, 0.003, 0.01, 0.02, 0.03]))
     assert back.good.tolist() == [True, True]
 
 
@@ -69,11 +70,24 @@ def test_a_pose_without_rotation_is_marked_and_its_variance_is_no_infinity(run):
     back = read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6)
     assert back.good.tolist() == [False, True]
     assert np.allclose(np.diag(back.covariance[0])[:3], UNKNOWN_RAD2)
-    assert np.allclose(np.diag(back.covariance[0])[3:], [0.1, 0.2, 0.3])
+    assert np.allclose(np.diag(back.covariance[0])[3:], [0.01, 0.02, 0.03])
     rows = list(csv.DictReader((folder / POSE_COVARIANCE_FILE).open()))
     assert [row["state"] for row in rows] == ["POSITION_ONLY", "FULL"]
     assert rows[0]["measured_s"] == "2.000000000"
     assert (folder / POSE_FILE).read_text().splitlines()[1].endswith(" 0 0 0 1")
+
+
+def test_a_pose_is_good_when_the_autopilots_gate_lets_it_out(tmp_path):
+    R, wide, askew = rotation_z(0.5), (0.001,) * 3 + (0.01, 0.01, 0.16), (0.001, 0.001, 0.01, 0.01, 0.01, 0.01)
+    for limits, expected in ((Limits(), [True, False, False]), (Limits(position_sigma_m=0.5), [True, True, False])):
+        results = Results(limits=limits)
+        results.open(Run(tmp_path, "made", "", ""))
+        for message in (made(1.0, R), made(1.02, R, variances=wide), made(1.04, R, variances=askew)):
+            results.see("fuse.relative_pose", message, message.stamp_ns)
+        results.close()
+        rows = list(csv.DictReader((tmp_path / POSE_COVARIANCE_FILE).open()))
+        assert [row["good"] == "1" for row in rows] == expected
+        assert [row["rotation"] for row in rows] == ["1"] * 3
 
 
 def test_a_lost_drone_has_no_line_and_the_log_tells_each_change(run):

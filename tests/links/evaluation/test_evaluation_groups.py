@@ -17,7 +17,7 @@ from links.evaluation.no_drone import alarms
 from links.evaluation.summaries import group_summary
 from links.evaluation.tables import median_columns
 from tests.links.command import grd
-from tests.links.evaluation.made_runs import add_pose, make_run, truth_at
+from tests.links.evaluation.made_runs import add_pose, make_run, truth_at, yaw_quaternion
 
 T_S = np.arange(0.0, 10.0, 0.1)
 
@@ -152,6 +152,20 @@ def test_found_of_seen_weighs_time_and_not_searches_of_which_finding_makes_more(
     assert whole.seen == pytest.approx((30, 30))
 
 
+def test_what_was_good_enough_for_the_autopilot_is_summed_up(tmp_path):
+    half = T_S < 5.0
+    for name, off_m, good in (("a-10m-s1", 0.3, half), ("b-10m-s1", 0.6, half & False)):
+        folder = make_run(tmp_path / name, T_S, truth_at(T_S), recording=name)
+        off = np.where(half, off_m, 4.0)[:, None] * np.array([0.0, 0.0, 1.0])
+        add_pose(folder, T_S, truth_at(T_S) + off, yaw_quaternion(0 * T_S), np.eye(6) * 0.01, good)
+    poses = [evaluate(run, run.outputs[0]) for run in (read_run(folder) for folder in sorted(tmp_path.iterdir()))]
+    (group,) = groups(poses, ())
+    assert group.good_share == pytest.approx(25.0, abs=0.5)
+    assert group.good_max_m == pytest.approx(0.3)
+    summary = group_summary([group], ())
+    assert summary.rows[0][summary.heads.index("sent:\nmax [m]")] == "0.30"
+
+
 def test_one_row_for_each_configuration_is_the_table_of_ablations(two_configs):
     summary = group_summary(groups(judge(*two_configs), ()), ())
     assert summary.heads[:2] == ["config", "runs"]
@@ -159,7 +173,9 @@ def test_one_row_for_each_configuration_is_the_table_of_ablations(two_configs):
     column = summary.heads.index("first\n95 % [s]")
     assert [row[column] for row in summary.rows] == [">10", "0.0"]
     assert "back" not in summary.heads
-    assert summary.note.endswith("Nothing to tell: back, back median [s], back max [s].")
+    assert summary.note.endswith(
+        "Nothing to tell: back, back median [s], back max [s], sent [%], sent: max [m], sent: max [deg]."
+    )
 
 
 @pytest.mark.parametrize(

@@ -285,6 +285,39 @@ def test_rotation_is_judged_for_the_fused_pose_and_a_wrong_branch_is_timed(tmp_p
     assert judge(folder, which=1).output.name == "fix"
 
 
+def test_what_the_autopilot_may_have_is_judged_apart_from_what_it_may_not(tmp_path):
+    folder = make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ))
+    times = np.arange(0, 10.005, 0.01)
+    (folder / "truth_vehicle_drone.tum").write_text("# full pose\n" + lines(times, truth_at(times)))
+    good = (EIGHT_HZ >= 1.0) & (EIGHT_HZ < 6.0)
+    off_m = np.where(good, 0.2, 7.0)
+    off_m[good.nonzero()[0][3]] = 1.5
+    yaw = np.where(good, math.radians(3.0), math.pi)
+    xyz = truth_at(EIGHT_HZ) + off_m[:, None] * np.array([0.0, 0.0, 1.0])
+    add_pose(folder, EIGHT_HZ, xyz, yaw_quaternion(yaw), np.eye(6) * 0.01, good)
+    e = judge(folder)
+    assert value(e, "good_share") == pytest.approx(50.0, abs=0.5)
+    assert value(e, "good_max_m") == pytest.approx(1.5)
+    assert value(e, "good_rmse_m") == pytest.approx(math.sqrt((39 * 0.2**2 + 1.5**2) / 40))
+    assert value(e, "good_max_deg") == pytest.approx(3.0)
+    assert value(e, "good_false") == 1
+    assert "1 of 40 poses good enough for the autopilot are farther than 1 m from the drone" in e.findings
+    add_pose(folder, EIGHT_HZ, xyz, yaw_quaternion(yaw), np.eye(6) * 0.01, good & False)
+    none = judge(folder)
+    assert (value(none, "good_share"), value(none, "good_false")) == (0, 0)
+    assert none.values["good_max_m"].failed
+    fix = judge(folder, which=1)
+    assert not fix.values["good_share"].applies
+
+
+def test_a_pose_that_the_autopilot_would_get_of_no_drone_is_a_finding(tmp_path):
+    folder = make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ))
+    add_pose(folder, EIGHT_HZ, truth_at(EIGHT_HZ), yaw_quaternion(0 * EIGHT_HZ), np.eye(6) * 0.01, EIGHT_HZ >= 9.0)
+    e = evaluate((run := read_run(folder, no_drone=True)), run.outputs[0])
+    assert value(e, "good_false") == 8
+    assert "8 of 80 poses good enough for the autopilot are of no drone: there was none" in e.findings
+
+
 def test_a_run_that_never_knew_the_rotation_has_failed_there_and_is_not_left_out_of_medians(tmp_path):
     folder = make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ))
     (folder / "truth_vehicle_drone.tum").write_text("# full pose\n" + lines(EIGHT_HZ, truth_at(EIGHT_HZ)))

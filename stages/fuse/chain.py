@@ -17,7 +17,7 @@ from stages.fuse.correlated import Worth, inflation
 from stages.fuse.positions import GATE, Positions
 from stages.fuse.rejected import Rejected
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64
+from stages.geometry import Array64, heading_rad
 from stages.rigid import carried_covariance, distance2, position_covariance
 from stages.rotation import log_rotation
 
@@ -52,6 +52,8 @@ class Chain:
             self._positions.begin_left_over(xyz_m, covariance_m2)
         turn = self._positions.step(stamp_ns, at_ns, R)
         R_start_drone = R @ turn.R
+        if self.running:
+            self._tell_turned(self.back.R_start_drone, R_start_drone)
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = turn.R.T @ covariance_rad2 @ turn.R + turn.covariance[:3, :3]
         covariance[3:, 3:] = R_start_drone.T @ covariance_m2 @ R_start_drone
@@ -63,8 +65,14 @@ class Chain:
     def extend(self, next_ns: int, R_own_drone: Array64 | None) -> None:
         """One pose more; `R_own_drone`: the autopilot's attitude there, of which the vertical is used."""
         step = self._positions.step(self.back.stamp_ns, next_ns, self.back.R_start_drone)
+        R_expected = self.back.R_start_drone @ step.R
         tilt_rad2 = math.radians(self._errors.tilt_deg) ** 2 * inflation(1e-9 * PERIOD_NS, self._errors.tilt_time_s)
         self.back.extend(next_ns, step, None if R_own_drone is None else R_own_drone[2], tilt_rad2)
+        self._tell_turned(R_expected, self.back.R_start_drone)
+
+    def _tell_turned(self, R_before: Array64, R_after: Array64) -> None:
+        """The newest pose is believed to be turned otherwise than it was believed before."""
+        self._positions.left.turn_ways(heading_rad(R_after @ R_before.T))
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64, Array64]:
         """R_start_drone, position and covariance (6, 6), carried from the nearest pose of the chain."""
@@ -77,7 +85,9 @@ class Chain:
         """A LiDAR position at its own time; R_start_drone as the chain has it there."""
         key_ns, R_key, _ = self.back.near(stamp_ns)
         step = self._positions.step(key_ns, stamp_ns, R_key)
+        before = self.back.R_start_drone
         self.back.add_position(key_ns, step, z, covariance_m2 + position_covariance(step.covariance, R_start_drone))
+        self._tell_turned(before, self.back.R_start_drone)
 
     def fits(self, stamp_ns: int, R: Array64, covariance_rad2: Array64) -> bool | None:
         """Whether a rotation is within the gate; None: it is not; False: nor were those before, and they agree."""
@@ -94,7 +104,9 @@ class Chain:
         worth = (1.0 - self._errors.rotation_lasting) * self._worth.factor(stamp_ns)
         key_ns, R_key, _ = self.back.near(stamp_ns)
         step = self._positions.step(key_ns, stamp_ns, R_key)
+        before = self.back.R_start_drone
         self.back.add_rotation(key_ns, step, R, worth * covariance_rad2 + step.covariance[:3, :3])
+        self._tell_turned(before, self.back.R_start_drone)
 
     @property
     def yaw_sigma_rad(self) -> float:

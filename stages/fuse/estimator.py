@@ -191,6 +191,7 @@ class Estimator:
         worth = self.positions.worth(stamp_ns)
         if R is not None:
             self.chain.add_position(stamp_ns, R, z, worth * self.positions.fix_covariance_m2)
+            R = self.chain.at(stamp_ns)[0]  # as it is believed now: what it explains is no drift
         self.positions.follow(stamp_ns, z, worth, R)
         self._witness.see_fix(fix)
         self._watch_motion(stamp_ns, z, told.whole_m2)

@@ -191,8 +191,8 @@ class Estimator:
         worth = self.positions.worth(stamp_ns)
         if R is not None:
             self.chain.add_position(stamp_ns, R, z, worth * self.positions.fix_covariance_m2)
-            R = self.chain.at(stamp_ns)[0]  # as it is believed now: what it explains is no drift
-        self.positions.follow(stamp_ns, z, worth, R)
+        R_after = None if R is None else self.chain.at(stamp_ns)[0]  # what it explains now is no drift
+        self.positions.follow(stamp_ns, z, worth, R_after)
         self._witness.see_fix(fix)
         self._watch_motion(stamp_ns, z, told.whole_m2)
 

@@ -11,6 +11,7 @@ from links.evaluation.associate import newest
 from links.evaluation.catalogue import Value, failure
 from links.evaluation.judged import NO_DRONE, Evaluation, no_error, no_truth, rms, share
 
+POSE = "pose"  # output of that name (run_data.py): the fused one
 NONE_GOOD = "no pose was good enough for the autopilot"
 
 
@@ -19,6 +20,8 @@ def for_autopilot(judged: Evaluation) -> None:
     errors = ("good_rmse_m", "good_max_m", "good_max_deg")
     keys = ("good_share", *errors, "good_false")
     at, over, good, values = judged.at, judged.over, judged.output.good, judged.values
+    if good is None and judged.output.name == POSE and not len(judged.output.poses):
+        good = np.zeros(0, dtype=np.bool_)  # the drone was never found: nothing was sent
     if good is None:
         judged.does_not_apply("the run does not mark what the autopilot may have", *keys)
         return

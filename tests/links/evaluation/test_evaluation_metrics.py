@@ -308,6 +308,11 @@ def test_what_the_autopilot_may_have_is_judged_apart_from_what_it_may_not(tmp_pa
     assert none.values["good_max_m"].failed
     fix = judge(folder, which=1)
     assert not fix.values["good_share"].applies
+    (folder / "pose_vehicle_drone.tum").write_text("# never found\n")
+    (folder / "pose_covariance.csv").write_text((folder / "pose_covariance.csv").read_text().splitlines()[0] + "\n")
+    mute = judge(folder)
+    assert value(mute, "good_share") == 0
+    assert mute.values["good_max_m"].failed
 
 
 def test_a_pose_that_the_autopilot_would_get_of_no_drone_is_a_finding(tmp_path):

@@ -1,6 +1,7 @@
 """The scenario matrix: range x motion x vehicle x scene, an occlusion and a flight out of sight and back, by seed.
 
-Beside it stand the cells of single goals: an empty sky, two drones, a drone to be searched for, drones at 50 m.
+Beside it stand the cells of single goals: an empty sky, an occlusion nearer by, two drones, a drone to be searched for,
+drones at 50 m.
 
 A cell says what happens (`links/simulated/matrix_flights.py`), a seed where: it draws the scene and the side.
 
@@ -10,10 +11,10 @@ Source: ours, after the cases of issue "A simulated rig".
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 
@@ -39,8 +40,9 @@ VEHICLES = ("parked", "driving", "turning")
 SCENES: tuple[Kind, ...] = ("manhattan", "atlanta", "campus", "park_edge", "open_lot")
 OPEN: Kind = "open_lot"  # nothing to hide behind
 SPECIALS = {"occlusion": 35, "return": 20}  # at which range
-GOALS = (  # range, motion, vehicles; in every scene
+GOALS = (  # range, motion, vehicles; in every scene that has a place for it
     (0, "empty", VEHICLES),
+    (20, "occlusion", ("parked",)),
     (20, "two", ("parked",)),
     (40, "search", ("parked",)),
     (50, "hover", ("parked",)),
@@ -84,10 +86,17 @@ def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
         if not pairs or (v == (r + m) % len(VEHICLES) and s == (r + 3 * m) % len(SCENES)):
             found.append(Cell(scene, range_m, motion, vehicle))
     found += [Cell(scene, SPECIALS["return"], "return", "parked") for scene in SCENES]
-    found += [Cell(scene, SPECIALS["occlusion"], "occlusion", "parked") for scene in SCENES if scene != OPEN]
+    found.extend(_in_every_scene(SPECIALS["occlusion"], "occlusion", ("parked",)))
     if not pairs:
-        found += [Cell(s, range_m, motion, v) for range_m, motion, vehicles in GOALS for s in SCENES for v in vehicles]
+        found.extend(chain.from_iterable(_in_every_scene(*goal) for goal in GOALS))
     return [cell for cell in found if any(fnmatch(cell.name, pattern) for pattern in only)]
+
+
+def _in_every_scene(range_m: int, motion: str, vehicles: Sequence[str]) -> Iterator[Cell]:
+    """One is hidden where there is something to hide behind."""
+    for scene, vehicle in product(SCENES, vehicles):
+        if not (motion == "occlusion" and scene == OPEN):
+            yield Cell(scene, range_m, motion, vehicle)
 
 
 def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> Scenario:

@@ -55,7 +55,7 @@ def seen(scenario: Scenario) -> np.ndarray:
 
 def test_the_matrix_is_the_whole_product_with_the_special_flights_and_no_name_twice() -> None:
     names = [cell.name for cell in cells()]
-    goals = 5 * 3 + 5 + 5 + 2 * 5  # empty, two, search, 50 m
+    goals = 5 * 3 + 4 + 5 + 5 + 2 * 5  # empty, occlusion at 20 m, two, search, 50 m
     assert len(names) == len(set(names)) == 5 * 6 * 3 * 5 + 5 + 4 + goals
     assert min(RANGES_M) == 10
     assert max(RANGES_M) == 60

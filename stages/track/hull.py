@@ -30,6 +30,7 @@ STRAY = 0.005  # eps: a return that is none of the drone's
 A, B, KIND, DEPTH, WHEN_S, LASER = range(6)
 COLUMNS = 6
 MISS, HIT, NEARER = 0.0, 1.0, 2.0  # NEARER says nothing: what is behind is hidden, or nobody knows what it is
+GLIMPSE = 3.0  # a hit through a gap: nobody knows how far it goes on behind
 CELLS = 25
 
 

@@ -1,7 +1,8 @@
 """What a beam keeps meeting for longer than the drone is wide is a wall, and none of its returns is the drone's.
 
 The pulses of one laser follow each other 0.2 deg apart. Returns in a row at much the same range are one run; a drone's
-are short, also where it hangs before a wall, because the range steps at its edge.
+are short, also where it hangs before a wall, because the range steps at its edge. A run with something nearer at both
+ends is a glimpse through a gap, between leaves say: nobody knows how far it goes on behind.
 
 Source: ours, for P III.C; runs end as the detector's chords do (`stages/detect/chords.py`).
 """
@@ -15,31 +16,43 @@ import numpy as np
 from stages.compiled import compiled
 from stages.geometry import Array64
 from stages.pulses import HOLE, LONGEST, STEP
-from stages.track.hull import DEPTH, HIT, KIND, LASER, NEARER, A, B
+from stages.track.hull import DEPTH, GLIMPSE, HIT, KIND, LASER, NEARER, A, B
 
 LASERS = 256
 
 
 @compiled
 def leave_out_walls(pulses: Array64, span_m: float) -> None:
-    """Hits among a look's pulses (n, COLUMNS), in order of time, that belong to a long run become NEARER: no word."""
-    first, last = np.full(LASERS, -1), np.full(LASERS, -1)
+    """Of the hits of a look's pulses (n, COLUMNS), in order of time, those of a long run become NEARER: no word.
+
+    Those of a short one hidden at both ends become GLIMPSE.
+    """
+    first, last, newest = np.full(LASERS, -1), np.full(LASERS, -1), np.full(LASERS, -1)
     run = np.full(pulses.shape[0], -1)  # row at which each row's run began
-    long = np.zeros(pulses.shape[0], dtype=np.bool_)  # by that row
+    long = np.zeros(pulses.shape[0], dtype=np.bool_)  # by that row, as are these: what is beside it is nearer
+    hidden_before, hidden_after = np.zeros_like(long), np.zeros_like(long)
     for i in range(pulses.shape[0]):
-        if not math.isfinite(pulses[i, DEPTH]):
-            continue
         k = int(pulses[i, LASER])
-        j = last[k]
+        before, newest[k], j = newest[k], i, last[k]
         goes_on = (
             j >= 0
             and abs(pulses[i, DEPTH] - pulses[j, DEPTH]) <= STEP * span_m
             and math.hypot(pulses[i, A] - pulses[j, A], pulses[i, B] - pulses[j, B]) <= HOLE * span_m
         )
+        if j >= 0 and before == j:
+            hidden_after[first[k]] = not goes_on and pulses[i, KIND] == NEARER
+        if not math.isfinite(pulses[i, DEPTH]):
+            continue
         if not goes_on:
             first[k] = i
+            hidden_before[i] = before >= 0 and pulses[before, KIND] == NEARER
         last[k], run[i], j = i, first[k], first[k]
+        hidden_after[j] = False
         long[j] |= math.hypot(pulses[i, A] - pulses[j, A], pulses[i, B] - pulses[j, B]) > LONGEST * span_m
     for i in range(pulses.shape[0]):
-        if pulses[i, KIND] == HIT and long[run[i]]:
-            pulses[i, KIND] = NEARER
+        if pulses[i, KIND] == HIT:
+            j = run[i]
+            if long[j]:
+                pulses[i, KIND] = NEARER
+            elif hidden_before[j] and hidden_after[j]:
+                pulses[i, KIND] = GLIMPSE

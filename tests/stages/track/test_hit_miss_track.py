@@ -14,7 +14,7 @@ from stages.geometry import LidarMount
 from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
 from stages.track import HitMissTrack
 from stages.track.hit_miss_track import LOOK_OVER_NS
-from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, A, B
+from stages.track.hull import COLUMNS, DEPTH, GLIMPSE, HIT, KIND, A, B
 from stages.track.look import drone_hits
 from tests.stages.caster import Box, Drone, During, Way, dithering, flying, pulses_seen, still
 from tests.stages.made import START_NS
@@ -462,6 +462,20 @@ def test_the_group_near_the_prediction_is_the_drones_and_strays_are_not():
     nothing = look([(0.0, 0.0, 0.0)])
     nothing[:, KIND] = 0.0
     assert drone_hits(nothing, 0.5, 0.3) is None
+
+
+def test_what_is_met_farther_off_than_a_drone_ever_is_is_something_else():
+    """As behind a tree: a wall through its leaves, .7 m behind where the drone is expected within .13 m."""
+    assert drone_hits(look([(-0.57, -0.23, 0.68), (-0.57, -0.16, 0.68), (-0.57, -0.09, 0.67)]), 0.5, 0.13) is None
+    assert drone_hits(look([(0.25, -0.1, 0.15), (0.25, -0.03, 0.15)]), 0.5, 0.13).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(("depth_m", "taken"), [(0.05, True), (0.3, False)])
+def test_a_glimpse_through_a_gap_has_to_be_where_a_drone_nearly_always_is(depth_m, taken):
+    pulses = look([(0.05, 0.0, depth_m), (0.05, 0.07, depth_m)])
+    assert drone_hits(pulses, 0.5, 0.1) is not None
+    pulses[:, KIND] = GLIMPSE
+    assert (drone_hits(pulses, 0.5, 0.1) is not None) == taken
 
 
 def test_returns_with_many_more_beside_them_belong_to_something_bigger():

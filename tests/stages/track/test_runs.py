@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from stages.track.hull import COLUMNS, DEPTH, HIT, KIND, LASER, MISS, NEARER, A
+from stages.track.hull import COLUMNS, DEPTH, GLIMPSE, HIT, KIND, LASER, MISS, NEARER, A
 from stages.track.runs import leave_out_walls
 
 SPAN_M = 0.5
@@ -57,6 +57,29 @@ def test_each_laser_has_runs_of_its_own_and_the_order_of_pulses_is_that_of_time(
     leave_out_walls(both, SPAN_M)
     assert set(both[both[:, KIND] == HIT][:, LASER]) == {5.0}
     assert (both[:, KIND] == HIT).sum() == 4
+
+
+@pytest.mark.parametrize(
+    ("left_m", "right_m", "kind"),
+    [(-5.0, -4.0, GLIMPSE), (-5.0, 6.0, HIT), (math.inf, -4.0, HIT), (math.inf, math.inf, HIT)],
+)
+def test_what_shows_through_a_gap_is_a_glimpse_and_beside_an_edge_a_hit(left_m, right_m, kind):
+    depths = [-5.0] * 6 + [left_m] + [0.3] * 3 + [right_m] + [-4.0] * 6
+    pulses = look(depths)
+    pulses[np.array(depths) < -0.6, KIND] = NEARER
+    leave_out_walls(pulses, SPAN_M)
+    assert set(pulses[7:10, KIND]) == {kind}
+
+
+def test_a_glimpse_with_a_hole_in_it_is_one_and_a_long_one_is_a_wall():
+    for depths, kind in (
+        ([-5.0, 0.1, 0.1, math.inf, 0.1, -5.0], GLIMPSE),
+        ([-5.0] + [0.1] * 20 + [-5.0], NEARER),
+    ):
+        pulses = look(depths)
+        pulses[[0, -1], KIND] = NEARER
+        leave_out_walls(pulses, SPAN_M)
+        assert set(pulses[1:-1, KIND]) - {MISS} == {kind}
 
 
 def test_nothing_in_nothing_out():

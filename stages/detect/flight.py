@@ -24,6 +24,11 @@ HELD_RANGE_M, HELD_M = (15.0, 25.0), (0.25, 1.5)
 """How far it must have been followed, over range: a beam walks along a lamp's arm, too; nearby its pole is seen."""
 
 
+def arm_m(range_m: float) -> float:
+    """How far what stands may seem to have gone from look to look."""
+    return float(np.interp(range_m, HELD_RANGE_M, HELD_M))
+
+
 class Motion(NamedTuple):
     """How a candidate flew lately."""
 
@@ -109,8 +114,7 @@ def moves(path_ns: list[int], path_m: list[Array64], range_m: float, motion_know
     first = int(pauses[-1]) + 1 if len(pauses) else 0
     x = np.array(path_m)[:, slice(0, 3) if motion_known else slice(2, 3)]
     speed, sigma, lasted = _straight(t[first:], x[first:], range_m)
-    arm_m = float(np.interp(range_m, HELD_RANGE_M, HELD_M))
-    if len(t) - first >= 6 and lasted > 0.6 and speed > 4.0 * sigma and speed * lasted > arm_m:
+    if len(t) - first >= 6 and lasted > 0.6 and speed > 4.0 * sigma and speed * lasted > arm_m(range_m):
         return True
     speed, sigma, lasted = _straight(t, x, range_m)
     return lasted > 1.0 and speed > 4.0 * sigma and speed * lasted > 1.5

@@ -53,6 +53,7 @@ class Heard(NamedTuple):
     over_balloon: float
     over_wire: float  # over what is met farther and farther along it, at any speed: the aim looks where it expects
     misfit: float = 0.0  # by how many squared sigmas a coordinate it is off the drone's way at the best yaw
+    way_m: float = 0.0  # how far from where it was at first the drone says it has been, over the same time
 
     @property
     def denied(self) -> bool:
@@ -85,11 +86,12 @@ def hear(
         return None
     rows, told = list(places), np.array(list(places.values()))
     t = (np.array([path_ns[k] for k in rows]) - path_ns[rows[-1]]) * 1e-9
-    heard = Heard(*weigh(t, np.array([path_m[k] for k in rows]), told, sigma_m, level_known))
+    way_m = float(np.sqrt(((told - told[0]) ** 2).sum(axis=1).max()))
+    heard = Heard(*weigh(t, np.array([path_m[k] for k in rows]), told, sigma_m, level_known), way_m)
     if heard.misfit <= MOST_MISFIT:
         return heard
     still, bird, balloon, wire = (min(ratio, 0.0) for ratio in heard[:4])
-    return Heard(still, bird, balloon, wire, heard.misfit)
+    return Heard(still, bird, balloon, wire, heard.misfit, way_m)
 
 
 @compiled

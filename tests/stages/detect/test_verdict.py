@@ -24,7 +24,15 @@ from stages.detect.verdict import (
 from tests.stages.detect.test_candidate import candidate, sighting, way
 
 E = Evidence()
-NOTHING = Heard(0.0, 0.0, 0.0, 0.0)
+FAR_M = 9.0
+
+
+def heard_so(*nats, way_m=FAR_M):
+    """Over what stands, a bird, a balloon, a wire: the drone has been so far away from where it was."""
+    return Heard(*nats, way_m=way_m)
+
+
+NOTHING = heard_so(0.0, 0.0, 0.0, 0.0)
 
 
 def hanging(heard=None, range_m=20.0):
@@ -43,15 +51,15 @@ def test_a_share_of_what_is_told_counts_within_its_caps(told, counts):
 def test_over_a_bird_only_what_is_told_counts_as_soon_as_something_is():
     calm = hanging()
     assert over_bird(calm, E) > 3.0  # it hung still for a second
-    calm.heard = Heard(0.0, 2.0, 0.0, 0.0)
+    calm.heard = heard_so(0.0, 2.0, 0.0, 0.0)
     fast = candidate(*way((14.0, 0.0, 0.0)))
-    fast.heard = Heard(0.0, 2.0, 0.0, 0.0)
+    fast.heard = heard_so(0.0, 2.0, 0.0, 0.0)
     assert over_bird(fast, E) == pytest.approx(over_bird(calm, E))
 
 
 def test_what_is_smaller_than_a_drone_is_met_nearby_so_far_off_it_is_less_likely_a_bird_or_a_stray_return():
     ranges_m = (5.0, E.small_m, 0.5 * (E.small_m + E.unseen_m), E.unseen_m, 50.0)
-    told = [over_bird(hanging(Heard(0.0, 2.0, 0.0, 0.0), range_m=r), E) - E.told * 2.0 for r in ranges_m]
+    told = [over_bird(hanging(heard_so(0.0, 2.0, 0.0, 0.0), range_m=r), E) - E.told * 2.0 for r in ranges_m]
     between = 0.5 * (E.birds + E.birds_far)
     assert told == pytest.approx([E.birds, E.birds, between, E.birds_far, E.birds_far])
     once = [candidate(sighting(0.0, hits=2, range_m=r)) for r in ranges_m]
@@ -69,7 +77,7 @@ def test_what_is_smaller_than_a_drone_is_met_nearby_so_far_off_it_is_less_likely
 def test_what_hangs_still_where_what_would_hold_it_is_unseen_is_less_likely_a_drone_the_farther():
     plain = E.model_copy(update={"hung": 0.0})
     for range_m, share in ((15.0, 0.0), (25.0, 0.5), (30.0, 1.0)):
-        still, flew = hanging(NOTHING, range_m), hanging(Heard(20.0, 20.0, 20.0, 20.0), range_m)
+        still, flew = hanging(NOTHING, range_m), hanging(heard_so(20.0, 20.0, 20.0, 20.0), range_m)
         odds = [over_clutter(still, e, True, True)[0] for e in (E, plain)]
         assert odds[1] - odds[0] == pytest.approx(share * E.hung)
         assert over_clutter(flew, E, True, True) == over_clutter(flew, plain, True, True)
@@ -77,7 +85,7 @@ def test_what_hangs_still_where_what_would_hold_it_is_unseen_is_less_likely_a_dr
 
 def test_from_28_m_on_what_may_stand_still_is_never_sure_enough_to_be_accepted_and_what_flew_is():
     for range_m, still_accepted in ((20.0, True), (27.0, True), (29.0, False), (31.0, False)):
-        for told, moves in ((NOTHING, False), (Heard(20.0, 20.0, 20.0, 20.0), True)):
+        for told, moves in ((NOTHING, False), (heard_so(20.0, 20.0, 20.0, 20.0), True)):
             c = hanging(told, range_m)
             c.alone, c.free, c.few = 30.0, np.full(SECTORS, 12.0), 30.0
             c.rugged = 5
@@ -92,8 +100,11 @@ def test_over_a_balloon_it_is_added_to_how_round_it_is():
     c = hanging()
     c.balls = 2
     assert over_balloon(c, E) == pytest.approx(E.balloon_untold - 2 * E.ball)
-    c.heard = Heard(0.0, 0.0, -3.0, 0.0)
+    c.heard = heard_so(0.0, 0.0, -3.0, 0.0)
     assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball - 3.0 * E.told)
+    for way_m, counts in ((2.0, 5.0), (0.5, 0.0)):  # a balloon on its string swings as far as a drone that hangs
+        c.heard = heard_so(0.0, 0.0, 5.0, 0.0, way_m=way_m)
+        assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball + counts * E.told)
 
 
 def test_a_drone_whose_sides_look_round_now_and_then_is_no_balloon_however_long_it_is_seen():
@@ -128,8 +139,22 @@ def test_one_more_look_at_the_same_thing_tells_less_against_a_stray_return_far_o
     assert E.look_far < E.look
 
 
+@pytest.mark.parametrize(
+    ("range_m", "way_m", "went"), [(20.0, 0.6, False), (20.0, 1.2, True), (31.0, 1.2, False), (31.0, 2.0, True)]
+)
+def test_a_drone_that_has_gone_no_farther_than_a_lamp_is_long_has_not_moved(range_m, way_m, went):
+    """Of a lamp 31 m away, met here and there, that seemed to swing as the drone did, which hung elsewhere."""
+    c = hanging(heard_so(20.0, 20.0, 20.0, 20.0, way_m=way_m), range_m=range_m)
+    assert ("it may stand still" in over_clutter(c, E, True, True)[1]) != went
+    c.beside = 0.0
+    c.hear(c.heard)
+    assert (c.flown > 0.0) == went
+    near = hanging(heard_so(20.0, 20.0, 20.0, 20.0, way_m=0.6), range_m=9.0)
+    assert "it may stand still" not in over_clutter(near, E, True, True)[1]
+
+
 def test_over_what_stands_it_replaces_whether_it_moved():
-    silent, nothing, flew = hanging(), hanging(NOTHING), hanging(Heard(20.0, 0.0, 0.0, 20.0))
+    silent, nothing, flew = hanging(), hanging(NOTHING), hanging(heard_so(20.0, 0.0, 0.0, 20.0))
     (odds, said), (same, same_said), (more, more_said) = (
         over_clutter(c, E, False, True) for c in (silent, nothing, flew)
     )
@@ -145,7 +170,7 @@ def test_over_what_stands_it_replaces_whether_it_moved():
 
 
 def test_what_returns_little_is_taken_for_a_wire_that_was_looked_along():
-    flew = Heard(20.0, 9.0, 9.0, 1.0)
+    flew = heard_so(20.0, 9.0, 9.0, 1.0)
     many, little = hanging(flew), candidate(*(sighting(0.1 * k, hits=1, range_m=10.0) for k in range(12)))
     little.heard = flew
     assert "it may stand still" not in over_clutter(many, E, False, True)[1]
@@ -153,7 +178,7 @@ def test_what_returns_little_is_taken_for_a_wire_that_was_looked_along():
 
 
 def test_nearby_a_path_that_a_wire_followed_by_the_aim_would_show_is_no_flight_however_much_it_returns():
-    followed = Heard(20.0, 9.0, 9.0, 1.0)
+    followed = heard_so(20.0, 9.0, 9.0, 1.0)
     for range_m, still in ((11.0, True), (25.0, False)):
         c = candidate(*(sighting(0.1 * k, hits=12, range_m=range_m) for k in range(12)))
         c.heard = followed
@@ -197,7 +222,7 @@ def test_nearby_looks_with_nothing_beside_it_count_more_once_every_sector_was_cr
 
 
 def test_a_refused_neighbour_counts_only_against_what_may_stand():
-    for heard, counts in ((None, E.among), (NOTHING, E.among), (Heard(20.0, 0.0, 0.0, 20.0), 0.0)):
+    for heard, counts in ((None, E.among), (NOTHING, E.among), (heard_so(20.0, 0.0, 0.0, 20.0), 0.0)):
         c = hanging(heard)
         apart, _ = over_clutter(c, E, False, True)
         c.among = True
@@ -210,12 +235,12 @@ def test_what_stands_where_something_was_refused_counts_little_while_the_drone_f
     beside, _ = over_clutter(c, E, False, True)
     c.again = True
     assert over_clutter(c, E, False, True)[0] == pytest.approx(beside - E.again)
-    c.heard = Heard(20.0, 0.0, 0.0, 20.0)
+    c.heard = heard_so(20.0, 0.0, 0.0, 20.0)
     assert over_clutter(c, E, False, True)[0] > beside  # it moved
 
 
 def test_far_off_a_wire_returns_nothing_so_what_moved_as_the_drone_says_is_none():
-    flew = Heard(20.0, 9.0, 9.0, 1.0)
+    flew = heard_so(20.0, 9.0, 9.0, 1.0)
     for range_m, still in ((10.0, True), (45.0, False)):
         little = candidate(*(sighting(0.1 * k, hits=1, range_m=range_m) for k in range(40)))
         little.heard = flew
@@ -233,7 +258,7 @@ def come_to_a_wall(*told_on_the_way):
 
 
 def test_what_flew_through_the_open_as_the_drone_says_is_not_what_stands_where_it_comes_to():
-    open_flight, denied = Heard(20.0, 9.0, 9.0, 15.0), Heard(-20.0, 9.0, 9.0, -20.0)
+    open_flight, denied = heard_so(20.0, 9.0, 9.0, 15.0), heard_so(-20.0, 9.0, 9.0, -20.0)
     alone, flew = come_to_a_wall(), come_to_a_wall(open_flight)
     less, _ = over_clutter(alone, E, True, True)
     odds, said = over_clutter(flew, E, True, True)
@@ -248,12 +273,12 @@ def test_what_flew_through_the_open_as_the_drone_says_is_not_what_stands_where_i
 def test_what_had_something_beside_it_all_along_has_not_flown_through_the_open():
     c = hanging()
     c.beside = 1.0
-    c.hear(Heard(20.0, 9.0, 9.0, 15.0))
+    c.hear(heard_so(20.0, 9.0, 9.0, 15.0))
     assert c.flown == 0.0
 
 
 def test_a_drone_that_falls_silent_beside_a_wall_has_nothing_to_show():
-    c = come_to_a_wall(Heard(20.0, 9.0, 9.0, 15.0))
+    c = come_to_a_wall(heard_so(20.0, 9.0, 9.0, 15.0))
     c.hear(None)
     assert over_clutter(c, E, True, True)[0] < -8.0
 
@@ -261,12 +286,15 @@ def test_a_drone_that_falls_silent_beside_a_wall_has_nothing_to_show():
 def test_the_words_say_whether_it_flies_as_the_drone_says():
     assert "the drone says" not in judge(hanging(), E, True, True)[1]
     assert "the drone says" not in judge(hanging(NOTHING), E, True, True)[1]
-    assert "it flies as the drone says" in judge(hanging(Heard(9.0, 4.0, 4.0, 9.0)), E, True, True)[1]
-    assert "it does not fly as the drone says" in judge(hanging(Heard(30.0, -9.0, 4.0, 30.0)), E, True, True)[1]
+    assert "it flies as the drone says" in judge(hanging(heard_so(9.0, 4.0, 4.0, 9.0)), E, True, True)[1]
+    assert "it does not fly as the drone says" in judge(hanging(heard_so(30.0, -9.0, 4.0, 30.0)), E, True, True)[1]
 
 
 def test_what_it_is_if_it_is_no_drone_is_noted():
-    for heard, suspect in ((Heard(-50.0, 20.0, 20.0, -50.0), STANDING), (Heard(20.0, -50.0, 20.0, 20.0), "a bird")):
+    for heard, suspect in (
+        (heard_so(-50.0, 20.0, 20.0, -50.0), STANDING),
+        (heard_so(20.0, -50.0, 20.0, 20.0), "a bird"),
+    ):
         c = hanging(heard)
         _, words = judge(c, E, True, True)
         assert c.suspect == suspect

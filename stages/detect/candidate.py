@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.compiled import compiled
-from stages.detect.flight import Motion, arm_m, fit_motion, moves
+from stages.detect.flight import Motion, fit_motion, lamp_m, moves
 from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
 from stages.detect.telemetry import DENIED, Heard
 from stages.geometry import Array64
@@ -158,7 +158,7 @@ class Candidate:
             return
         if heard.over_still < DENIED:
             self.flown = 0.0
-        elif self.beside < OPEN_BESIDE and heard.way_m > arm_m(self.range_m):
+        elif self.beside < OPEN_BESIDE and heard.way_m > lamp_m(self.range_m):
             self.flown = max(self.flown, heard.over_wire)
 
     def _note_flight(self) -> None:

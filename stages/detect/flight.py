@@ -20,13 +20,14 @@ SLOW_MPS = 2.0
 STEADY_MPS2 = 2.0
 RECENT_NS = 1_200_000_000
 PAUSE_S = 0.45  # without a sighting
+LAMP_RANGE_M, LAMP_M = (25.0, 28.0), (0.0, 1.5)
 HELD_RANGE_M, HELD_M = (15.0, 25.0), (0.25, 1.5)
 """How far it must have been followed, over range: a beam walks along a lamp's arm, too; nearby its pole is seen."""
 
 
-def arm_m(range_m: float) -> float:
-    """How far what stands may seem to have gone from look to look."""
-    return float(np.interp(range_m, HELD_RANGE_M, HELD_M))
+def lamp_m(range_m: float) -> float:
+    """How far a lamp may seem to swing from look to look, where what holds it is not seen; nearer 0: it is."""
+    return float(np.interp(range_m, LAMP_RANGE_M, LAMP_M))
 
 
 class Motion(NamedTuple):
@@ -114,7 +115,8 @@ def moves(path_ns: list[int], path_m: list[Array64], range_m: float, motion_know
     first = int(pauses[-1]) + 1 if len(pauses) else 0
     x = np.array(path_m)[:, slice(0, 3) if motion_known else slice(2, 3)]
     speed, sigma, lasted = _straight(t[first:], x[first:], range_m)
-    if len(t) - first >= 6 and lasted > 0.6 and speed > 4.0 * sigma and speed * lasted > arm_m(range_m):
+    arm_m = float(np.interp(range_m, HELD_RANGE_M, HELD_M))
+    if len(t) - first >= 6 and lasted > 0.6 and speed > 4.0 * sigma and speed * lasted > arm_m:
         return True
     speed, sigma, lasted = _straight(t, x, range_m)
     return lasted > 1.0 and speed > 4.0 * sigma and speed * lasted > 1.5

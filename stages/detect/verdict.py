@@ -35,12 +35,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from stages.detect.candidate import OPEN_BESIDE, Candidate
-from stages.detect.flight import arm_m
+from stages.detect.flight import lamp_m
 from stages.detect.surroundings import SECTORS
 from stages.detect.telemetry import SWAY_M
 
 STANDING = "a lamp, wire or edge"
-MOVED = 3.0  # nats by its telemetry, from which on it has clearly moved as the drone says
+MOVED = 3.0  # nats by its telemetry, from which on it has clearly moved as the drone says; less far, it says no more
 UNSURE = 2.7  # ln of odds, below which it is said what else it may be
 
 # ln of how much likelier a drone flies so than a bird, by the speed it reaches; of birds there are several
@@ -180,7 +180,7 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     if c.heard is not None:
         wire = c.range_m < (e.unseen_m if few < -1.0 else e.wire_m)  # farther off a wire returns little, then nothing
         told = c.heard.over_wire if wire else c.heard.over_still
-        if c.heard.way_m <= arm_m(c.range_m):  # a lamp is as long: met here and there it seems to go as far
+        if c.heard.way_m <= lamp_m(c.range_m):  # a lamp met here and there seems to go as far
             told = min(told, MOVED / e.told)
         told = max(told, c.flown)
         moved = e.told * told > MOVED
@@ -253,7 +253,9 @@ def over_balloon(c: Candidate, e: Evidence) -> float:
         round_ *= min(e.most_round / (c.balls + c.rugged), 1.0)
     if c.heard is None:
         return e.balloon_untold - round_
-    told = c.heard.over_balloon if c.heard.way_m > SWAY_M else min(c.heard.over_balloon, 0.0)  # it swings as far
+    told = c.heard.over_balloon
+    if c.heard.way_m <= SWAY_M:  # one on its string swings as far
+        told = min(told, MOVED / e.told)
     return e.balloon - round_ + believed(told, e)
 
 

@@ -102,9 +102,12 @@ def test_over_a_balloon_it_is_added_to_how_round_it_is():
     assert over_balloon(c, E) == pytest.approx(E.balloon_untold - 2 * E.ball)
     c.heard = heard_so(0.0, 0.0, -3.0, 0.0)
     assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball - 3.0 * E.told)
-    for way_m, counts in ((2.0, 5.0), (0.5, 0.0)):  # a balloon on its string swings as far as a drone that hangs
-        c.heard = heard_so(0.0, 0.0, 5.0, 0.0, way_m=way_m)
-        assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball + counts * E.told)
+    for way_m, counts in (
+        (2.0, 9.0 * E.told),
+        (0.5, 3.0),
+    ):  # a balloon on its string swings as far as a drone that hangs
+        c.heard = heard_so(0.0, 0.0, 9.0, 0.0, way_m=way_m)
+        assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball + counts)
 
 
 def test_a_drone_whose_sides_look_round_now_and_then_is_no_balloon_however_long_it_is_seen():
@@ -140,7 +143,8 @@ def test_one_more_look_at_the_same_thing_tells_less_against_a_stray_return_far_o
 
 
 @pytest.mark.parametrize(
-    ("range_m", "way_m", "went"), [(20.0, 0.6, False), (20.0, 1.2, True), (31.0, 1.2, False), (31.0, 2.0, True)]
+    ("range_m", "way_m", "went"),
+    [(20.0, 0.3, True), (26.5, 0.6, False), (26.5, 0.9, True), (31.0, 1.2, False), (31.0, 2.0, True)],
 )
 def test_a_drone_that_has_gone_no_farther_than_a_lamp_is_long_has_not_moved(range_m, way_m, went):
     """Of a lamp 31 m away, met here and there, that seemed to swing as the drone did, which hung elsewhere."""

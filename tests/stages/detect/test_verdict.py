@@ -102,10 +102,7 @@ def test_over_a_balloon_it_is_added_to_how_round_it_is():
     assert over_balloon(c, E) == pytest.approx(E.balloon_untold - 2 * E.ball)
     c.heard = heard_so(0.0, 0.0, -3.0, 0.0)
     assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball - 3.0 * E.told)
-    for way_m, counts in (
-        (2.0, 9.0 * E.told),
-        (0.5, 3.0),
-    ):  # a balloon on its string swings as far as a drone that hangs
+    for way_m, counts in ((2.0, E.most_told), (0.5, 3.0)):  # one on its string swings as far as a drone that hangs
         c.heard = heard_so(0.0, 0.0, 9.0, 0.0, way_m=way_m)
         assert over_balloon(c, E) == pytest.approx(E.balloon - 2 * E.ball + counts)
 

@@ -18,7 +18,7 @@ Source: ours.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,10 +46,17 @@ class Graph:
     edges: tuple[Edge, ...]
     replay: Path | None  # recording named by the configuration
     values: dict[str, Any]  # the merged configuration
+    left_out: dict[str, str] = field(default_factory=dict[str, str])  # nodes, and what each lacks
 
     def settings_yaml(self) -> str:
         """The merged configuration as YAML text: includes, overlays and --set applied."""
         return yaml.safe_dump(self.values, sort_keys=False, width=120)
+
+    def said_left_out(self) -> list[str]:
+        """`left out, as nothing stands for $rig.cameras: vp_drone, align`, a line for each thing that is missing."""
+        needed = dict.fromkeys(self.left_out.values())
+        names = {needs: ", ".join(n for n, other in self.left_out.items() if other == needs) for needs in needed}
+        return [f"left out, as nothing stands for {needs}: {which}" for needs, which in names.items()]
 
     def outputs(self) -> Iterator[tuple[str, str, type[Message]]]:
         """(node, output, message type) of every output, wired or not."""
@@ -77,15 +84,16 @@ def check(tree: Tree, file: Path) -> Graph:
             tree.problem(
                 (key,), f"unknown section '{key}'; there is {one_of(TOP_LEVEL)}.{did_you_mean(key, TOP_LEVEL)}"
             )
-    nodes = {spec.name: spec for kind in KINDS for spec in read_nodes(tree, kind)}
+    left: dict[str, str] = {}
+    nodes = {spec.name: spec for kind in KINDS for spec in read_nodes(tree, kind, left)}
     if not tree.values.get("stages"):
         tree.problem(("stages",), "no stages: a graph needs at least one.")
-    edges = tuple(edge for spec in nodes.values() for edge in read_edges(tree, nodes, spec))
+    edges = tuple(edge for spec in nodes.values() for edge in read_edges(tree, nodes, spec, left))
     _check_threads(tree, nodes, edges)
     _check_processes(tree, nodes)
     _check_topics(tree, nodes)
     order = _rank(tree, nodes, edges)
-    return Graph({name: nodes[name] for name in order}, edges, _recording(tree, file), tree.values)
+    return Graph({name: nodes[name] for name in order}, edges, _recording(tree, file), tree.values, left)
 
 
 def recording_named(file: Path, overlays: Sequence[Path] = (), sets: Sequence[str] = ()) -> Path | None:

@@ -20,8 +20,8 @@ from flow.tree import Path_, Tree, resolve
 OnError = Literal["restart", "skip", "stop"]
 ON_ERROR: tuple[str, ...] = get_args(OnError)
 NODE_KEYS = {
-    "stages": ("use", "config", "inputs", "on_error", "thread", "process", "yields"),
-    "links": ("use", "config", "inputs"),
+    "stages": ("use", "config", "inputs", "needs", "on_error", "thread", "process", "yields"),
+    "links": ("use", "config", "inputs", "needs"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
 
@@ -45,11 +45,17 @@ class NodeSpec:
         return self.cls.model_validate(self.config)
 
 
-def read_nodes(tree: Tree, kind: str) -> Iterator[NodeSpec]:
-    """Every node of a kind ("stages", "links") that has a class; a setting that is wrong is a problem in `tree`."""
+def read_nodes(tree: Tree, kind: str, left: dict[str, str]) -> Iterator[NodeSpec]:
+    """Every node of a kind ("stages", "links") that has a class; a setting that is wrong is a problem in `tree`.
+
+    A node whose `needs:` the configuration does not have is noted in `left`, with what it needs, and left out.
+    """
     for name, declared in _declared(tree, kind):
         path = (kind, name)
         _check_keys(tree, path, declared)
+        if unmet := _unmet(tree, path, declared):
+            left[name] = unmet
+            continue
         on_error, yields = _on_error(tree, path, declared), _yields(tree, path, declared)
         thread, process = _thread(tree, path, declared), _process(tree, path, declared)
         cls = named_class(tree, kind, path, declared.get("use"))
@@ -62,7 +68,7 @@ def read_nodes(tree: Tree, kind: str) -> Iterator[NodeSpec]:
 
 
 def _declared(tree: Tree, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Name and mapping of each entry of a section that is well formed."""
+    """Name and mapping of each entry of a section that is well formed; what is not is a problem in `tree`."""
     section = tree.values.get(kind)
     if section is None:
         return
@@ -79,6 +85,17 @@ def _declared(tree: Tree, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
             tree.problem(path, "must be a mapping with 'use:', and 'config:' and 'inputs:' where needed.")
         else:
             yield name, cast("dict[str, Any]", declared)
+
+
+def _unmet(tree: Tree, path: Path_, declared: dict[str, Any]) -> str:
+    """What a node `needs:` that the configuration does not have; empty where it needs nothing, or has it."""
+    needs: Any = declared.get("needs")
+    if needs is None:
+        return ""
+    if not (isinstance(needs, str) and needs.startswith("$")):
+        tree.problem((*path, "needs"), f"must name a value of the configuration, as $rig.cameras, got {needs!r}.")
+        return ""
+    return needs if resolve(tree, (*path, "needs"), f"{needs} or null") is None else ""
 
 
 def _check_keys(tree: Tree, path: Path_, declared: dict[str, Any]) -> None:

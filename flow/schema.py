@@ -40,6 +40,7 @@ _THREAD = {"type": "string", "description": "live: stages of one name share a th
 _PROCESS = {"type": "string", "description": "it works in a process of this name, with others that say so"}
 _YIELDS = {"type": "boolean", "description": "live: fewer pictures are taken while others' queues run over"}
 _ON_ERROR = {"enum": list(ON_ERROR), "description": "live, when it raises: a fresh one, skip the message, or stop"}
+_NEEDS = {**_REFERENCE, "description": "left out, and said so, where nothing stands there, as $rig.cameras"}
 _OF_STAGES = {"on_error": _ON_ERROR, "thread": _THREAD, "process": _PROCESS, "yields": _YIELDS}
 
 
@@ -79,6 +80,7 @@ def _section(kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
             "use": {"type": "string", "examples": list(classes), "description": "module.Class"},
             "config": {"type": "object"},
             "inputs": {"type": "object", "additionalProperties": _EDGE},
+            "needs": _NEEDS,
             **(_OF_STAGES if kind == "stages" else {}),
         },
         "allOf": [

@@ -17,8 +17,11 @@ from flow.stage import input_ports, output_ports
 from flow.tree import Path_, Tree
 
 
-def read_edges(tree: Tree, nodes: Mapping[str, NodeSpec], spec: NodeSpec) -> Iterator[Edge]:
-    """The edges into one node; a port that must be wired and is not is a problem in `tree`."""
+def read_edges(tree: Tree, nodes: Mapping[str, NodeSpec], spec: NodeSpec, left: Mapping[str, str]) -> Iterator[Edge]:
+    """The edges into one node; a port that must be wired and is not is a problem in `tree`.
+
+    `left`: nodes left out, with what each of them needs. A port that need not be wired does without such a one.
+    """
     path = (spec.kind, spec.name, "inputs")
     ports = input_ports(spec.cls)
     declared: Any = tree.values[spec.kind][spec.name].get("inputs") or {}
@@ -27,7 +30,13 @@ def read_edges(tree: Tree, nodes: Mapping[str, NodeSpec], spec: NodeSpec) -> Ite
         return
     wires = {port: wire for port, wire in cast("dict[str, Any]", declared).items() if wire is not None}  # null: unwired
     for port, declaration in wires.items():
-        if port in ports:
+        producer = _producer(declaration)
+        if port in ports and producer in left:
+            if port not in spec.cls.optional_inputs:
+                needs = left[producer]
+                why = f"'{producer}' is left out, as nothing stands for {needs}"
+                tree.problem((*path, port), f"{why}: say 'needs: {needs}' here, too.")
+        elif port in ports:
             yield from _edge(tree, nodes, spec, port, declaration)
         else:
             cls = spec.cls.__name__
@@ -36,6 +45,12 @@ def read_edges(tree: Tree, nodes: Mapping[str, NodeSpec], spec: NodeSpec) -> Ite
     for port, wanted in ports.items():
         if port not in wires and port not in spec.cls.optional_inputs:
             tree.problem(path, f"port '{port}' ({wanted.__name__}) is not wired.{_whence(nodes, wanted)}")
+
+
+def _producer(declaration: Any) -> str:
+    """The node that a wire, `node.output` or `{from: node.output, ...}`, comes from; empty where it is no wire."""
+    source = cast("dict[str, Any]", declaration).get("from") if isinstance(declaration, dict) else declaration
+    return source.partition(".")[0] if isinstance(source, str) else ""
 
 
 def _edge(tree: Tree, nodes: Mapping[str, NodeSpec], spec: NodeSpec, port: str, declaration: Any) -> Iterator[Edge]:

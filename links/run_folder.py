@@ -264,7 +264,7 @@ def holds_run(folder: Path, recording: Path, graph: Graph) -> bool:
 
 def _remarks(graph: Graph, report: RunReport) -> list[str]:
     """What went wrong, and in a replay what was not used, so that a silent port is not taken for a quiet sensor."""
-    remarks = [str(incident) for incident in report.incidents]
+    remarks = [*graph.said_left_out(), *(str(incident) for incident in report.incidents)]
     if isinstance(report, LiveReport):
         return remarks
     remarks += [f"{count} records on {topic} are wired to nothing" for topic, count in report.unwired_topics.items()]

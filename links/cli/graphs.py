@@ -51,6 +51,8 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
         raise typer.Exit(FINDING) from None
     stages = sum(spec.kind == "stages" for spec in graph.nodes.values())
     out.print(f"{config}: {stages} stages, {len(graph.nodes) - stages} links, {len(graph.edges)} edges, no problems")
+    for text in graph.said_left_out():
+        out.print(text, markup=False)
     if placed is not None:
         _tell_hosts(placed)
 

@@ -87,8 +87,8 @@ def run(
         graph = host_graph(graph, hosts, host, to_run=True)
     with progress_bar("warm up") as step:
         rough = warm_up(graph, step) if warm else None
-    if rough:
-        warn(rough)
+    for text in (*graph.said_left_out(), *([rough] if rough else ())):
+        warn(text)
     with LiveView() as watch:
         finished = run_live(folder, asked, graph, watch.show, for_s, (watch.newest,))
     _tell(finished)

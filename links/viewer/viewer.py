@@ -52,7 +52,7 @@ class Viewer(Tap):
     max_points_per_slice: int = Field(6000, ge=1)
     trail_s: float = Field(20.0, ge=0)  # how much of the drone's path is visible at a time
     mount: LidarMount | None = None  # shows the turntable, the LiDAR and the fan of its beams where they are
-    cameras: Cameras = Cameras()  # the rig's: puts lines on the pictures
+    cameras: Cameras | None = None  # the rig's: puts lines on the pictures
 
     _box: Mailbox[Message] | None = PrivateAttr(None)
     _thread: threading.Thread | None = PrivateAttr(None)
@@ -186,7 +186,7 @@ class Viewer(Tap):
     def _vision(self, run: Run) -> Vision:
         """What of the cameras and the fused pose there is to show."""
         directions = _made(run, "vanishing_directions")
-        pictures = self.cameras.named() or [f"camera_{carrier.value}" for carrier in Carrier]
+        pictures = (self.cameras and self.cameras.named()) or [f"camera_{carrier.value}" for carrier in Carrier]
         return Vision(
             pictures=pictures if directions or _made(run, "image") else [],
             directions=directions,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flow.graph import load_graph
+from flow.graph import Graph, load_graph
 from flow.problem import ConfigError, Place
 from tests.flow.toys import GRAPH
 
@@ -91,7 +91,7 @@ CASES = {
     ),
     "unknown key": (
         ("inputs: {number", "input: {number"),
-        "x.yaml:4: stages.double.input: unknown key 'input'; there is 'use', 'config', 'inputs', 'on_error', 'thread', 'process' or 'yields'. Did you mean 'inputs'?",
+        "x.yaml:4: stages.double.input: unknown key 'input'; there is 'use', 'config', 'inputs', 'needs', 'on_error', 'thread', 'process' or 'yields'. Did you mean 'inputs'?",
     ),
     "unknown port": (
         ("left: numbers.number", "left: numbers.number\n      lef: numbers.number"),
@@ -331,3 +331,52 @@ def test_a_recordings_rig_replaces_the_files_own_and_set_changes_both(tmp_path):
     assert (graph.nodes["add"].build().name, graph.values["rig"]) == ("recorded", {"a": "recorded"})
     graph = load_graph(tmp_path / "x.yaml", sections=sections, sets=["rig.a=by hand"])
     assert graph.nodes["add"].build().name == "by hand"
+
+
+NEEDY = GRAPH.replace("use: tests.flow.toys.Double\n", "use: tests.flow.toys.Double\n    needs: $rig.cameras\n")
+
+
+def load(tmp_path: Path, text: str) -> Graph:
+    (tmp_path / "x.yaml").write_text(text, encoding="utf-8")
+    return load_graph(tmp_path / "x.yaml")
+
+
+def test_a_node_that_needs_what_is_there_is_as_any_other(tmp_path):
+    graph = load(tmp_path, NEEDY + "rig: {cameras: {drone: {}}}\n")
+    assert graph.nodes == load(tmp_path, GRAPH).nodes
+    assert graph.said_left_out() == []
+
+
+def test_nodes_that_need_what_is_not_there_are_left_out_and_said(tmp_path):
+    text = NEEDY.replace("use: tests.flow.toys.Add\n", "use: tests.flow.toys.Add\n    needs: $rig.cameras\n")
+    text = text.replace("stages:", "stages:\n  third: {use: tests.flow.toys.Double, inputs: {number: numbers.number}}")
+    graph = load(tmp_path, text)
+    assert list(graph.nodes) == ["numbers", "third"]
+    assert [edge.consumer for edge in graph.edges] == ["third"]
+    assert graph.said_left_out() == ["left out, as nothing stands for $rig.cameras: double, add"]
+
+
+def test_what_must_be_wired_to_a_node_that_is_left_out_is_said(tmp_path):
+    assert only_problem(tmp_path, NEEDY) == (
+        "x.yaml:11: stages.add.inputs.right: 'double' is left out, as nothing stands for $rig.cameras: "
+        "say 'needs: $rig.cameras' here, too."
+    )
+
+
+def test_what_need_not_be_wired_does_without_a_node_that_is_left_out(tmp_path):
+    text = GRAPH.replace("double.number\n", "double.number\n      words: words.text\n")
+    graph = load(tmp_path, text + "  words: {use: tests.flow.toys.Words, needs: $rig.radio}\n")
+    assert [edge.port for edge in graph.edges] == ["number", "left", "right"]
+
+
+@pytest.mark.parametrize(
+    ("needs", "told"),
+    [
+        ("rig.cameras", "must name a value of the configuration, as $rig.cameras, got 'rig.cameras'."),
+        ("[1]", "must name a value of the configuration, as $rig.cameras, got [1]."),
+        ("$rig.camera", "'$rig.camera or null' stands for nothing: rig has no 'camera'. Did you mean 'cameras'?"),
+    ],
+)
+def test_a_need_that_is_mistyped_is_a_problem(tmp_path, needs, told):
+    text = NEEDY.replace("$rig.cameras", needs) + "rig: {cameras: {}}\n"
+    assert f"x.yaml:4: stages.double.needs: {told}" in problems_of(tmp_path, text)

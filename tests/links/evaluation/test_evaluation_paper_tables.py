@@ -63,14 +63,14 @@ def test_the_rotation_is_the_poses_and_else_the_cameras(tmp_path):
     ours = run(tmp_path, "experiment_4-s1", "vision")
     covariance = np.diag([1e-4] * 3 + [1e-2] * 3)
     add_pose(ours, T_S, truth_at(T_S), yaw_quaternion(np.full(len(T_S), np.radians(2.0))), covariance)
-    paper = run(tmp_path, "experiment_4-s1", "paper_vision")
+    paper = run(tmp_path, "experiment_4-s1", "paper")
     add_rotations(paper, T_S, yaw_quaternion(np.full(len(T_S), np.radians(10.0))))
     for folder in (ours, paper):
         add_true_rotations(folder, level, level)
     _, rotation = paper_tables(judge([paper, ours]))
     rows = {row[1]: row[4:] for row in rotation.rows}
     assert rows["published"][:3] == ["1.40", "3.00", "3.40"]
-    assert rows["paper_vision"] == ["0.00", "0.00", "10.00", "10.00", "-"]
+    assert rows["paper"] == ["0.00", "0.00", "10.00", "10.00", "-"]
     assert rows["vision"] == ["0.00", "0.00", "2.00", "2.00", "5.0"]
 
 

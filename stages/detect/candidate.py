@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.compiled import compiled
-from stages.detect.flight import Motion, fit_motion, lamp_m, moves
+from stages.detect.flight import Motion, fit_motion, lamp_m, moves, wire_m
 from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
 from stages.detect.telemetry import DENIED, Heard
 from stages.geometry import Array64
@@ -28,6 +28,7 @@ ALONE_PER_M = 0.0165  # share of looks at a drone that find one return alone (ne
 WIRE_ALONE = 0.75  # and of those at a wire
 FEW_M = 24.0  # over range: so few returns are few even nearby; a sixth of those of a beam across a drone of 0.5 m
 SOME_M = 36.0  # over range: up to so many tell nothing, a wire returns them, too
+SINGLE = -1.0  # nats, of `Candidate.few`
 SIGMA_M = 0.15  # of a sighting
 STANDING_M = 0.6  # what stands is met again within this
 ACCELERATION_MPS2 = 4.0
@@ -151,6 +152,16 @@ class Candidate:
             del self.path_ns[0], self.path_m[0], self.beside_m[0]
         self._note_flight()
 
+    @property
+    def single(self) -> bool:
+        """Whether its looks returned one pulse each more often than a drone's would."""
+        return self.few < SINGLE
+
+    @property
+    def swings_m(self) -> float:
+        """How far it may seem to swing though it stands: a lamp whose pole is not seen, or a wire."""
+        return max(lamp_m(self.range_m), wire_m(self.range_m) if self.single else 0.0)
+
     def hear(self, heard: Heard | None) -> None:
         """What its path says by now; what flew in the open is not what stands where it comes to, unless denied."""
         self.heard = heard
@@ -158,7 +169,7 @@ class Candidate:
             return
         if heard.over_still < DENIED:
             self.flown = 0.0
-        elif self.beside < OPEN_BESIDE and heard.way_m > lamp_m(self.range_m):
+        elif self.beside < OPEN_BESIDE and heard.way_m > self.swings_m:
             self.flown = max(self.flown, heard.over_wire)
 
     def _note_flight(self) -> None:

@@ -21,6 +21,7 @@ STEADY_MPS2 = 2.0
 RECENT_NS = 1_200_000_000
 PAUSE_S = 0.45  # without a sighting
 LAMP_RANGE_M, LAMP_M = (25.0, 28.0), (0.0, 1.5)
+WIRE_RANGE_M, WIRE_M = (16.0, 19.0), (1.5, 0.0)
 HELD_RANGE_M, HELD_M = (15.0, 25.0), (0.25, 1.5)
 """How far it must have been followed, over range: a beam walks along a lamp's arm, too; nearby its pole is seen."""
 
@@ -28,6 +29,11 @@ HELD_RANGE_M, HELD_M = (15.0, 25.0), (0.25, 1.5)
 def lamp_m(range_m: float) -> float:
     """How far a lamp may seem to swing from look to look, where what holds it is not seen; nearer 0: it is."""
     return float(np.interp(range_m, LAMP_RANGE_M, LAMP_M))
+
+
+def wire_m(range_m: float) -> float:
+    """How far what returns single pulses may seem to swing: looks wander along a wire; farther off drones do so, too."""
+    return float(np.interp(range_m, WIRE_RANGE_M, WIRE_M))
 
 
 class Motion(NamedTuple):

@@ -35,7 +35,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from stages.detect.candidate import OPEN_BESIDE, Candidate
-from stages.detect.flight import lamp_m
 from stages.detect.surroundings import SECTORS
 from stages.detect.telemetry import SWAY_M
 
@@ -173,14 +172,14 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
             said.append("something beside it" + (", to which it flew through the open" if flew else ""))
     few = min(max(c.few, -e.most_few), e.most_many)
     odds += few - e.long * min(c.long_looks, 4)
-    if few < -1.0:
+    if c.single:
         said.append("single returns")
     if c.long_looks:
         said.append("longer than a drone")
     if c.heard is not None:
-        wire = c.range_m < (e.unseen_m if few < -1.0 else e.wire_m)  # farther off a wire returns little, then nothing
+        wire = c.range_m < (e.unseen_m if c.single else e.wire_m)  # farther off a wire returns little, then nothing
         told = c.heard.over_wire if wire else c.heard.over_still
-        if c.heard.way_m <= lamp_m(c.range_m):  # a lamp met here and there seems to go as far
+        if c.heard.way_m <= c.swings_m:  # what stands, met here and there, seems to go as far
             told = min(told, MOVED / e.told)
         told = max(told, c.flown)
         moved = e.told * told > MOVED

@@ -154,6 +154,18 @@ def test_a_drone_that_has_gone_no_farther_than_a_lamp_is_long_has_not_moved(rang
     assert "it may stand still" not in over_clutter(near, E, True, True)[1]
 
 
+@pytest.mark.parametrize(
+    ("range_m", "hits", "way_m", "went"),
+    [(12.0, 1, 0.6, False), (12.0, 1, 2.0, True), (12.0, 5, 0.6, True), (20.0, 1, 0.6, True)],
+)
+def test_single_returns_nearby_wander_along_a_wire_as_a_drone_swings_that_hangs_elsewhere(range_m, hits, way_m, went):
+    """Of wires 12 to 14 m away, whose looks seemed to go as the drone did, which hung 40 m away."""
+    c = candidate(*(sighting(0.1 * k, hits=hits, range_m=range_m) for k in range(12)))
+    c.hear(heard_so(20.0, 20.0, 20.0, 20.0, way_m=way_m))
+    assert ("it may stand still" in over_clutter(c, E, True, True)[1]) != went
+    assert (c.flown > 0.0) == went
+
+
 def test_over_what_stands_it_replaces_whether_it_moved():
     silent, nothing, flew = hanging(), hanging(NOTHING), hanging(heard_so(20.0, 0.0, 0.0, 20.0))
     (odds, said), (same, same_said), (more, more_said) = (

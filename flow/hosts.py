@@ -101,7 +101,7 @@ def part_of(hosts: Hosts, name: str, ends: Ends) -> Graph:
     edges = [edge for edge in graph.edges if edge.consumer in own]
     for to, hops in sent.items():
         edges += [Edge(h.producer, h.output, sender_name(to), port_of(h), h.message, h.waiting) for h in hops]
-    return Graph(nodes, tuple(edges), None, _values(graph, name, own))
+    return Graph(nodes, tuple(edges), None, _values(graph, name, own), graph.left_out)
 
 
 def _grouped(hops: Iterator[Hop], by: str) -> dict[str, list[Hop]]:

@@ -102,6 +102,8 @@ def _place(tree: Tree, graph: Graph, hosts: dict[str, Any]) -> dict[str, str]:
     place: dict[str, str] = {}
     for node, host in _section(tree, "place").items():
         path = ("place", node)
+        if node in graph.left_out:
+            continue  # on other rigs it runs
         if node not in graph.nodes:
             tree.problem(path, f"no stage or link '{node}'.{did_you_mean(node, graph.nodes)}")
         elif not isinstance(host, str) or host not in hosts:

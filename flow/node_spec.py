@@ -24,6 +24,7 @@ NODE_KEYS = {
     "links": ("use", "config", "inputs", "needs"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
+_NEEDED = re.compile(r"\$[^\s$]+\Z")  # a reference, without what would hold where nothing stands
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +54,12 @@ def read_nodes(tree: Tree, kind: str, left: dict[str, str]) -> Iterator[NodeSpec
     for name, declared in _declared(tree, kind):
         path = (kind, name)
         _check_keys(tree, path, declared)
-        if unmet := _unmet(tree, path, declared):
-            left[name] = unmet
-            continue
         on_error, yields = _on_error(tree, path, declared), _yields(tree, path, declared)
         thread, process = _thread(tree, path, declared), _process(tree, path, declared)
         cls = named_class(tree, kind, path, declared.get("use"))
-        if cls is not None:
+        if unmet := _unmet(tree, path, declared):
+            left[name] = unmet
+        elif cls is not None:
             before = len(tree.problems)
             config = resolve(tree, (*path, "config"), declared.get("config") or {})
             if len(tree.problems) == before:  # a reference to nothing is said already
@@ -92,7 +92,7 @@ def _unmet(tree: Tree, path: Path_, declared: dict[str, Any]) -> str:
     needs: Any = declared.get("needs")
     if needs is None:
         return ""
-    if not (isinstance(needs, str) and needs.startswith("$")):
+    if not (isinstance(needs, str) and _NEEDED.match(needs)):
         tree.problem((*path, "needs"), f"must name a value of the configuration, as $rig.cameras, got {needs!r}.")
         return ""
     return needs if resolve(tree, (*path, "needs"), f"{needs} or null") is None else ""

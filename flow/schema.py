@@ -40,7 +40,11 @@ _THREAD = {"type": "string", "description": "live: stages of one name share a th
 _PROCESS = {"type": "string", "description": "it works in a process of this name, with others that say so"}
 _YIELDS = {"type": "boolean", "description": "live: fewer pictures are taken while others' queues run over"}
 _ON_ERROR = {"enum": list(ON_ERROR), "description": "live, when it raises: a fresh one, skip the message, or stop"}
-_NEEDS = {**_REFERENCE, "description": "left out, and said so, where nothing stands there, as $rig.cameras"}
+_NEEDS = {
+    "type": "string",
+    "pattern": r"^\$\S+$",
+    "description": "left out, and said so, where nothing stands there, as $rig.cameras",
+}
 _OF_STAGES = {"on_error": _ON_ERROR, "thread": _THREAD, "process": _PROCESS, "yields": _YIELDS}
 
 

@@ -30,7 +30,7 @@ def read_edges(tree: Tree, nodes: Mapping[str, NodeSpec], spec: NodeSpec, left: 
         return
     wires = {port: wire for port, wire in cast("dict[str, Any]", declared).items() if wire is not None}  # null: unwired
     for port, declaration in wires.items():
-        producer = _producer(declaration)
+        producer = _source(declaration)[1]
         if port in ports and producer in left:
             if port not in spec.cls.optional_inputs:
                 needs = left[producer]
@@ -47,18 +47,18 @@ def read_edges(tree: Tree, nodes: Mapping[str, NodeSpec], spec: NodeSpec, left: 
             tree.problem(path, f"port '{port}' ({wanted.__name__}) is not wired.{_whence(nodes, wanted)}")
 
 
-def _producer(declaration: Any) -> str:
-    """The node that a wire, `node.output` or `{from: node.output, ...}`, comes from; empty where it is no wire."""
+def _source(declaration: Any) -> tuple[Any, str, str]:
+    """What a wire, `node.output` or `{from: node.output, ...}`, says: as written, its node, its output; else empty."""
     source = cast("dict[str, Any]", declaration).get("from") if isinstance(declaration, dict) else declaration
-    return source.partition(".")[0] if isinstance(source, str) else ""
+    node, _, output = source.partition(".") if isinstance(source, str) else ("", "", "")
+    return source, node, output
 
 
 def _edge(tree: Tree, nodes: Mapping[str, NodeSpec], spec: NodeSpec, port: str, declaration: Any) -> Iterator[Edge]:
     """The edge that `node.output`, or `{from: node.output, ...}`, declares; none where it is wrong."""
     here = (spec.kind, spec.name, "inputs", port)
     waiting = cast("dict[str, Any]", declaration) if isinstance(declaration, dict) else {}
-    source = waiting.get("from") if isinstance(declaration, dict) else declaration
-    node, _, output = source.partition(".") if isinstance(source, str) else ("", "", "")
+    source, node, output = _source(declaration)
     if not (node and output):
         form = "say 'from: node.output'" if waiting else "read node.output"
         tree.problem(here, f"must {form}, got {source!r}.")

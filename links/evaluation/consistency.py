@@ -48,7 +48,7 @@ def rotation(judged: Evaluation) -> None:
         wrong_s, note = _branch_wrong(judged, at, at.euler_error_rad[:, 2])
         judged.values["branch_wrong_s"] = Value(wrong_s, n, note=note)
         if wrong_s > 0:
-            judged.findings.append(f"yaw wrong by more than 45 deg for {wrong_s:.1f} s while marked good")
+            judged.findings.append(f"yaw wrong by more than 45 deg for {wrong_s:.1f} s while told as known")
 
 
 def _rotation_told(judged: Evaluation, at: AtOutputs) -> NDArray[np.bool_]:
@@ -63,9 +63,10 @@ def _branch_wrong(judged: Evaluation, at: AtOutputs, yaw_error_rad: Array64) -> 
     end = np.append(stamps[1:], np.iinfo(np.int64).max // 2)
     serves_s = np.minimum((end - stamps) / 1e9, judged.limits.max_age_s)[at.index]
     wrong = np.abs(yaw_error_rad) > BRANCH_RAD
-    if judged.output.good is None:
-        return float(serves_s[wrong].sum()), "the run does not mark its outputs: all count as good"
-    return float(serves_s[wrong & judged.output.good[at.index]].sum()), ""
+    told = judged.output.good if judged.output.rotated is None else judged.output.rotated
+    if told is None:
+        return float(serves_s[wrong].sum()), "the run does not mark its outputs: all count as told"
+    return float(serves_s[wrong & told[at.index]].sum()), ""
 
 
 def covariance(judged: Evaluation) -> None:

@@ -35,8 +35,11 @@ def for_autopilot(judged: Evaluation) -> None:
     if not len(at.index) and len(good):
         judged.cannot(no_error(judged, at).note, *keys)
         return
-    last = newest(over.at_ns, judged.output.poses.stamps_ns)
-    values["good_share"] = share(over.fresh & (last >= 0) & np.append(good, False)[last])
+    if len(over.at_ns):
+        last = newest(over.at_ns, judged.output.poses.stamps_ns)
+        values["good_share"] = share(over.fresh & (last >= 0) & np.append(good, False)[last])
+    else:
+        judged.cannot("truth knows no moment of the recording with a drone in reach", "good_share")
     sent = good[at.index]
     far = int(np.count_nonzero(sent & (at.distance_m > judged.limits.wrong_m)))
     _false(judged, far, int(sent.sum()), f"farther than {judged.limits.wrong_m:g} m from the drone")

@@ -32,7 +32,7 @@ def lamp_m(range_m: float) -> float:
 
 
 def wire_m(range_m: float) -> float:
-    """How far what returns single pulses may seem to swing: looks wander along a wire; farther off drones do so, too."""
+    """How far what returns single pulses may seem to swing: looks wander along a wire; farther off drones do, too."""
     return float(np.interp(range_m, WIRE_RANGE_M, WIRE_M))
 
 

@@ -52,8 +52,9 @@ class Heard(NamedTuple):
     over_bird: float
     over_balloon: float
     over_wire: float  # over what is met farther and farther along it, at any speed: the aim looks where it expects
-    misfit: float = 0.0  # by how many squared sigmas a coordinate it is off the drone's way at the best yaw
-    way_m: float = 0.0  # how far from where it was at first the drone says it has been, over the same time
+    misfit: float  # by how many squared sigmas a coordinate it is off the drone's way at the best yaw
+    way_m: float  # how far the drone says it has been from where it was at first; up, where only heights are compared
+    # are compared
 
     @property
     def denied(self) -> bool:
@@ -86,7 +87,8 @@ def hear(
         return None
     rows, told = list(places), np.array(list(places.values()))
     t = (np.array([path_ns[k] for k in rows]) - path_ns[rows[-1]]) * 1e-9
-    way_m = float(np.sqrt(((told - told[0]) ** 2).sum(axis=1).max()))
+    compared_m = told if level_known else told[:, 2:]
+    way_m = float(np.sqrt(((compared_m - compared_m[0]) ** 2).sum(axis=1).max()))
     heard = Heard(*weigh(t, np.array([path_m[k] for k in rows]), told, sigma_m, level_known), way_m)
     if heard.misfit <= MOST_MISFIT:
         return heard
@@ -98,7 +100,7 @@ def hear(
 def weigh(
     t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_known: bool
 ) -> tuple[float, float, float, float, float]:
-    """What Heard holds, of a path x (n, 3) at times t (n,) against what the drone told of itself (n, 3)."""
+    """What Heard holds but for its way: a path x (n, 3) at times t (n,) against what the drone told of itself."""
     x, d = x_m.copy(), told_m.copy()
     for axis in range(3):
         x[:, axis] -= x[:, axis].mean()

@@ -139,8 +139,9 @@ def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tu
         words.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
     if c.heard is not None and c.heard.denied:
         words.append("it does not fly as the drone says")
-    elif c.heard is not None and max(c.heard[:3]) > 3.0:
-        words.append("it flies as the drone says")
+    elif c.heard is not None and max(c.heard[:3]) > MOVED:
+        far = c.heard.way_m > c.swings_m
+        words.append("it flies as the drone says" if far else f"the drone says it went {c.heard.way_m:.1f} m only")
     elif c.heard is None and flew_as_bird(c, e):
         words.append("flew as a bird does")
     if c.heard is None:
@@ -179,11 +180,10 @@ def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool
     if c.heard is not None:
         wire = c.range_m < (e.unseen_m if c.single else e.wire_m)  # farther off a wire returns little, then nothing
         told = c.heard.over_wire if wire else c.heard.over_still
-        if c.heard.way_m <= c.swings_m:  # what stands, met here and there, seems to go as far
-            told = min(told, MOVED / e.told)
-        told = max(told, c.flown)
-        moved = e.told * told > MOVED
-        odds += believed(told, e)
+        shown = c.heard.way_m > c.swings_m  # what stands, met here and there, seems to go as far
+        nats = max(believed(told, e, shown), believed(c.flown, e))
+        moved = nats > MOVED
+        odds += nats
     else:
         moved = c.moves(motion_known)
         odds += e.moves if moved else 0.0
@@ -252,15 +252,13 @@ def over_balloon(c: Candidate, e: Evidence) -> float:
         round_ *= min(e.most_round / (c.balls + c.rugged), 1.0)
     if c.heard is None:
         return e.balloon_untold - round_
-    told = c.heard.over_balloon
-    if c.heard.way_m <= SWAY_M:  # one on its string swings as far
-        told = min(told, MOVED / e.told)
-    return e.balloon - round_ + believed(told, e)
+    shown = c.heard.way_m > SWAY_M  # one on its string swings as far
+    return e.balloon - round_ + believed(c.heard.over_balloon, e, shown)
 
 
-def believed(told: float, e: Evidence) -> float:
-    """What a comparison with the drone's telemetry counts [nats]."""
-    return min(max(e.told * told, e.least_told), e.most_told)
+def believed(told: float, e: Evidence, shown: bool = True) -> float:
+    """What a comparison with the drone's telemetry counts [nats]; not `shown` that the drone flies: MOVED at most."""
+    return min(max(e.told * told, e.least_told), e.most_told if shown else min(e.most_told, MOVED))
 
 
 def flew_as_bird(c: Candidate, e: Evidence) -> bool:

@@ -6,9 +6,11 @@ With odometry b is its drift, a Gauss-Markov velocity that lasts for seconds: kn
 it makes a gap without fixes less bad. Without odometry u = 0 and b is the drone's whole velocity, with white
 acceleration, and with as much more as the drone says its velocity has changed, in whatever direction.
 
-The ways u seen so far were turned by the yaw as it was believed then. Where that proves wrong by a little, what was
-learnt of b is made good (`turn_ways`), else the same error would count as yaw and as drift: x is linear in u, so that
-its derivative s by the yaw is carried along, s' = F s + (z x u, 0) - K (s'_p + z x u).
+The ways u seen so far were turned by the yaw as it was believed then. Where that proves wrong, what was learnt of b is
+made good (`turn_ways`), else the same error would count as yaw and as drift: x is linear in u, so that what the ways
+turned by a quarter, s, and their level part, c, have to do with it is carried along,
+
+    s' = F s + (z x u, 0) - K (F s + z x u)_p,     x(a) = x + sin(a) s + (cos(a) - 1) c
 
     V(T) = T^2 P_b + q T^3 / 3
 
@@ -18,6 +20,8 @@ Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking an
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -36,7 +40,7 @@ class Drift:
         self._errors, self.odometry = errors, odometry
         self._x = np.zeros(6)
         self._covariance = np.eye(6)
-        self._by_yaw = np.zeros(6)  # s, per rad
+        self._of_ways = np.zeros((6, 2))  # s, c
         self.stamp_ns: int | None = None  # of the newest fix
         self.q = 2 * errors.drift_mps**2 / errors.drift_time_s if odometry else errors.manoeuvre
 
@@ -60,7 +64,7 @@ class Drift:
         self.stamp_ns = stamp_ns
         known = np.zeros(3) if self.odometry or velocity_mps is None else velocity_mps
         sigma = START_MPS if velocity_mps is not None else UNKNOWN_MPS
-        self._x, self._by_yaw = np.concatenate([xyz_m, known]), np.zeros(6)
+        self._x, self._of_ways = np.concatenate([xyz_m, known]), np.zeros((6, 2))
         self._covariance = np.zeros((6, 6))
         self._covariance[:3, :3] = covariance_m2
         self._covariance[3:, 3:] = (self._errors.drift_mps if self.odometry else sigma) ** 2 * np.eye(3)
@@ -80,17 +84,19 @@ class Drift:
         keep = float(np.exp(-dt / e.drift_time_s)) if self.odometry else 1.0
         walk = e.walk_m_per_sqrt_s**2 * dt if self.odometry else 0.0
         fresh = ((e.drift_scale if self.odometry else 0.7) * turned_mps) ** 2
-        both = np.column_stack([self._x, self._by_yaw])
-        moved_both = np.array([[moved[0], -moved[1]], [moved[1], moved[0]], [moved[2], 0.0]])
-        both, P = _step(both, self._covariance, moved_both, dt, keep, self.q, walk, fresh)
-        residual = np.column_stack([xyz_m, np.zeros(3)]) - both[:3]
-        both, self._covariance = _correct(both, P, residual, covariance_m2)
-        self._x, self._by_yaw = both[:, 0].copy(), both[:, 1].copy()
+        x = np.column_stack([self._x, self._of_ways])
+        u = np.array([[moved[0], -moved[1], moved[0]], [moved[1], moved[0], moved[1]], [moved[2], 0.0, 0.0]])
+        x, P = _step(x, self._covariance, u, dt, keep, self.q, walk, fresh)
+        residual = np.column_stack([xyz_m, np.zeros((3, 2))]) - x[:3]
+        x, self._covariance = _correct(x, P, residual, covariance_m2)
+        self._x, self._of_ways = x[:, 0].copy(), x[:, 1:].copy()
         self.stamp_ns = stamp_ns
 
     def turn_ways(self, yaw_rad: float) -> None:
-        """The ways seen so far had been turned too little by so much, a small angle."""
-        self._x = self._x + yaw_rad * self._by_yaw
+        """The ways seen so far had been turned too little by so much."""
+        sin, cos = math.sin(yaw_rad), math.cos(yaw_rad)
+        self._x = self._x + self._of_ways @ np.array([sin, cos - 1.0])
+        self._of_ways = self._of_ways @ np.array([[cos, sin], [-sin, cos]])
 
     def turn(self, R: Array64, t_m: Array64) -> None:
         """The start frame is another one now: p <- R p + t."""
@@ -98,12 +104,12 @@ class Drift:
         whole[:3, :3] = whole[3:, 3:] = R
         self._x = whole @ self._x
         self._x[:3] += t_m
-        self._by_yaw = whole @ self._by_yaw
+        self._of_ways = whole @ self._of_ways
         self._covariance = whole @ self._covariance @ whole.T
 
     def forget_velocity(self, guess_mps: Array64) -> None:
         """What was known of b counts no more; it is guessed."""
-        self._x[3:], self._by_yaw[3:] = guess_mps, 0.0
+        self._x[3:], self._of_ways[3:] = guess_mps, 0.0
         self._covariance[3:, :] = self._covariance[:, 3:] = 0.0
         self._covariance[3:, 3:] = UNKNOWN_MPS**2 * np.eye(3)
 
@@ -115,7 +121,7 @@ class Drift:
         return x[:3], P[:3, :3]
 
     def look_along(self, direction_start: Array64, sigma_rad: float) -> None:
-        """The drone flies this way, says its camera, at whatever speed: v across it is none."""
+        """The drone flies this way, says its camera, at whatever speed: v across it is none. Without odometry."""
         speed = float(np.linalg.norm(self._x[3:]))
         across = np.eye(3) - np.outer(direction_start, direction_start)
         self._x, self._covariance = _across(self._x, self._covariance, across, (speed * sigma_rad) ** 2 + 0.05**2)

@@ -40,11 +40,9 @@ FURTHEST_M = 6.0  # beside the prediction pulses are collected
 RANGE_NOISE = 0.1  # of one return about the body's middle, one sigma, over the span: it is as deep
 RANGE_FLOOR_M = 0.02
 MOST_ROWS = 256
-OFF_SPAN = np.array(
-    [0.3, 0.3, 0.2]
-)  # of returns about the prediction, beside its own sigma, over the span: a, b, depth
-FARTHEST = -6.0  # score of a group: of 3498 looks at drones followed in 25 flights as built none was worse than -4.8,
-NEAR = -1.5  # and one in a hundred worse than this
+OFF_SPAN = np.array([0.3, 0.3, 0.2])  # a, b, depth: of returns about the prediction beside its own sigma, over the span
+LEAST_SCORE = -6.0  # of a group: of 3498 looks at drones followed in 25 flights as built none was worse than -4.8,
+LEAST_GLIMPSED = -1.5  # and one in a hundred worse than this
 
 
 @dataclass(slots=True, eq=False)
@@ -205,7 +203,7 @@ def drone_hits(pulses: Array64, span_m: float, sigma_m: float) -> NDArray[np.int
     score = np.log(near.sum(axis=1)) - 0.5 * np.sum(place**2 / variance_m2, axis=1)
     best = int(score.argmax())
     glimpsed = (pulses[rows[near[best]], KIND] == GLIMPSE).all()
-    if score[best] < (NEAR if glimpsed else FARTHEST):
+    if score[best] < (LEAST_GLIMPSED if glimpsed else LEAST_SCORE):
         return None
     centre = place[near[best]].mean(axis=0)
     away = np.linalg.norm(place - centre, axis=1)

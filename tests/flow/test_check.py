@@ -356,6 +356,11 @@ def test_nodes_that_need_what_is_not_there_are_left_out_and_said(tmp_path):
     assert graph.said_left_out() == ["left out, as nothing stands for $rig.cameras: double, add"]
 
 
+def test_the_class_of_a_node_that_is_left_out_is_checked_too(tmp_path):
+    text = NEEDY.replace("toys.Double", "toys.Dubble").replace("toys.Add\n", "toys.Add\n    needs: $rig.cameras\n")
+    assert "unknown stage 'tests.flow.toys.Dubble'" in only_problem(tmp_path, text)
+
+
 def test_what_must_be_wired_to_a_node_that_is_left_out_is_said(tmp_path):
     assert only_problem(tmp_path, NEEDY) == (
         "x.yaml:11: stages.add.inputs.right: 'double' is left out, as nothing stands for $rig.cameras: "
@@ -374,6 +379,7 @@ def test_what_need_not_be_wired_does_without_a_node_that_is_left_out(tmp_path):
     [
         ("rig.cameras", "must name a value of the configuration, as $rig.cameras, got 'rig.cameras'."),
         ("[1]", "must name a value of the configuration, as $rig.cameras, got [1]."),
+        ("$rig.c or 1", "must name a value of the configuration, as $rig.cameras, got '$rig.c or 1'."),
         ("$rig.camera", "'$rig.camera or null' stands for nothing: rig has no 'camera'. Did you mean 'cameras'?"),
     ],
 )

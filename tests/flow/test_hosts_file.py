@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flow.graph import load_graph
+from flow.hosts import part_of
 from flow.hosts_file import load_hosts
 from flow.problem import ConfigError
 
@@ -36,6 +37,15 @@ def load(tmp_path):
         return load_hosts(file, load_graph(tmp_path / "config.yaml"))
 
     return load
+
+
+class NoEnds:
+    """Some node stands for what sends and receives."""
+
+    def receiver(self, hosts, name, hops):
+        return hosts.graph.nodes["add"]
+
+    sender = receiver
 
 
 def problems(load, text, config=CONFIG):
@@ -116,3 +126,11 @@ def test_a_file_that_is_no_hosts_file_is_refused_in_words(load):
         "1: hosts: must be a mapping.",
         "1: hosts: one host must say 'listen: tls/ADDRESS:PORT', best the vehicle; none does.",
     ]
+
+
+def test_a_node_that_is_left_out_may_be_placed_and_the_parts_say_so(load):
+    config = CONFIG.replace("words: {use: toys.Words}", "words: {use: toys.Words, needs: $rig.radio}")
+    hosts = load(GOOD, config)
+    assert "words" not in hosts.place
+    assert hosts.graph.said_left_out() == ["left out, as nothing stands for $rig.radio: words"]
+    assert part_of(hosts, "vehicle", NoEnds()).said_left_out() == hosts.graph.said_left_out()

@@ -277,11 +277,11 @@ def test_rotation_is_judged_for_the_fused_pose_and_a_wrong_branch_is_timed(tmp_p
     assert value(e, "rmse_yaw_deg") == pytest.approx(math.sqrt((16 * 90**2 + 64 * 3**2) / 80), rel=1e-6)
     assert value(e, "rmse_angle_deg") == pytest.approx(value(e, "rmse_yaw_deg"), rel=1e-6)
     assert value(e, "branch_wrong_s") == pytest.approx(1.0)
-    assert any("yaw wrong by more than 45 deg for 1.0 s while marked good" in text for text in e.findings)
+    assert any("yaw wrong by more than 45 deg for 1.0 s while told as known" in text for text in e.findings)
     add_pose(folder, EIGHT_HZ, truth_at(EIGHT_HZ), yaw_quaternion(yaw), np.eye(6) * 0.01)
     unmarked = judge(folder)
     assert value(unmarked, "branch_wrong_s") == pytest.approx(2.0)
-    assert unmarked.values["branch_wrong_s"].note == "the run does not mark its outputs: all count as good"
+    assert unmarked.values["branch_wrong_s"].note == "the run does not mark its outputs: all count as told"
     assert judge(folder, which=1).output.name == "fix"
 
 
@@ -313,6 +313,19 @@ def test_what_the_autopilot_may_have_is_judged_apart_from_what_it_may_not(tmp_pa
     mute = judge(folder)
     assert value(mute, "good_share") == 0
     assert mute.values["good_max_m"].failed
+
+
+def test_of_a_drone_that_was_out_of_reach_no_share_of_time_is_told_and_the_errors_are(tmp_path):
+    folder = make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ))
+    times = np.arange(0, 10.005, 0.01)
+    far = np.array([500.0, 0.0, 0.0])
+    (folder / "truth_vehicle_drone.tum").write_text("# full pose\n" + lines(times, truth_at(times) + far))
+    xyz = truth_at(EIGHT_HZ) + far + [0.0, 0.0, 0.2]
+    level = yaw_quaternion(np.zeros(len(EIGHT_HZ)))
+    add_pose(folder, EIGHT_HZ, xyz, level, np.eye(6) * 0.01, np.ones(len(EIGHT_HZ), dtype=bool))
+    e = judge(folder)
+    assert reason(e, "good_share") == "truth knows no moment of the recording with a drone in reach"
+    assert value(e, "good_max_m") == pytest.approx(0.2)
 
 
 def test_a_pose_that_the_autopilot_would_get_of_no_drone_is_a_finding(tmp_path):

@@ -52,7 +52,7 @@ def noise(seed=0, sigma_m=0.1, n=14):
 
 
 def against(path_m, told_m, level_known=True, t_s=T_S, sigma_m=SIGMA_M):
-    return Heard(*weigh(t_s, np.asarray(path_m), np.asarray(told_m), sigma_m, level_known))
+    return Heard(*weigh(t_s, np.asarray(path_m), np.asarray(told_m), sigma_m, level_known), way_m=math.inf)
 
 
 # formula by hand
@@ -465,6 +465,17 @@ def test_only_heights_are_heard_of_when_the_vehicle_does_not_say_how_it_drives()
     assert hear(telling(circle), stamps, path, SIGMA_M, False).over_bird > -1.0
 
 
+def test_how_far_the_drone_went_is_its_farthest_from_where_it_was_at_first_and_only_up_where_heights_are_compared():
+    def out_and_back(t):
+        return np.array([4.0 * math.sin(math.pi * (t - 1.0) / 2.0), 0.0, 10.0 + 0.7 * math.sin(math.pi * (t - 1.0))])
+
+    stamps, path = path_of(out_and_back, np.linspace(1.0, 3.0, 9))
+    assert hear(telling(out_and_back), stamps, path, SIGMA_M, True).way_m == pytest.approx(4.0, abs=0.1)
+    assert hear(telling(out_and_back), stamps, path, SIGMA_M, False).way_m == pytest.approx(0.7, abs=0.1)
+    hanging = hear(telling(lambda t: [3.0, 4.0, 10.0]), stamps, path, SIGMA_M, True)
+    assert hanging.way_m == pytest.approx(0.0, abs=1e-6)
+
+
 def test_silence_and_a_single_sighting_say_nothing():
     stamps, path = path_of(circle, np.linspace(1.0, 3.0, 9))
     assert hear(DroneTelemetry(), stamps, path, SIGMA_M, True) is None
@@ -496,7 +507,7 @@ def test_after_a_reset_a_path_from_before_it_is_not_compared():
 def test_only_the_latest_ten_seconds_and_so_many_points_of_them_are_compared(monkeypatch):
     asked = []
     monkeypatch.setattr(
-        telemetry, "weigh", lambda t, x, d, sigma_m, level: asked.append((t, x)) or (0.0, 0.0, 0.0, 0.0)
+        telemetry, "weigh", lambda t, x, d, sigma_m, level: asked.append((t, x)) or (0.0, 0.0, 0.0, 0.0, 0.0)
     )
     told = telling(circle, seconds=20.0)
     stamps, path = path_of(circle, np.linspace(1.0, 19.0, 181))

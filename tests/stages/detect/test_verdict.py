@@ -10,6 +10,7 @@ from stages.detect.surroundings import SECTORS
 from stages.detect.telemetry import Heard
 from stages.detect.telling import odds_of
 from stages.detect.verdict import (
+    MOVED,
     STANDING,
     Evidence,
     believed,
@@ -29,7 +30,7 @@ FAR_M = 9.0
 
 def heard_so(*nats, way_m=FAR_M):
     """Over what stands, a bird, a balloon, a wire: the drone has been so far away from where it was."""
-    return Heard(*nats, way_m=way_m)
+    return Heard(*nats, misfit=0.0, way_m=way_m)
 
 
 NOTHING = heard_so(0.0, 0.0, 0.0, 0.0)
@@ -164,6 +165,17 @@ def test_single_returns_nearby_wander_along_a_wire_as_a_drone_swings_that_hangs_
     c.hear(heard_so(20.0, 20.0, 20.0, 20.0, way_m=way_m))
     assert ("it may stand still" in over_clutter(c, E, True, True)[1]) != went
     assert (c.flown > 0.0) == went
+
+
+@pytest.mark.parametrize("told", [0.0, 0.59, 0.9, 1.29])
+def test_whatever_share_of_its_word_counts_what_a_hanging_drone_says_is_no_motion(told):
+    e = E.model_copy(update={"told": told})
+    c = hanging(heard_so(20.0, 20.0, 20.0, 20.0, way_m=0.6), range_m=31.0)
+    assert "it may stand still" in over_clutter(c, e, True, True)[1]
+    assert over_balloon(c, e) <= e.balloon + MOVED
+    said = judge(c, e, True, True)[1]
+    assert "it flies as the drone says" not in said
+    assert "the drone says it went 0.6 m only" in said
 
 
 def test_over_what_stands_it_replaces_whether_it_moved():

@@ -126,12 +126,15 @@ def flown_askew(yaw_rad, until=12, mps=11.0):
     return drift
 
 
-def test_what_a_wrong_yaw_was_taken_for_is_no_drift_once_it_is_known():
-    right, askew = flown_askew(0.0), flown_askew(0.04)
+@pytest.mark.parametrize("parts_rad", [(0.04,), (0.5,), (math.pi / 2,), (0.3, -1.0, 0.4)])
+def test_what_a_wrong_yaw_was_taken_for_is_no_drift_once_it_is_known(parts_rad):
+    """However wrong it was, and however often it is made good."""
+    right, askew = flown_askew(0.0), flown_askew(sum(parts_rad))
     assert np.linalg.norm(askew.velocity_mps - right.velocity_mps) > 0.3
-    askew.turn_ways(-0.04)
-    assert np.allclose(askew.velocity_mps, right.velocity_mps, atol=0.02)
-    assert np.allclose(askew.xyz_start_m, right.xyz_start_m, atol=0.02)
+    for part_rad in parts_rad:
+        askew.turn_ways(-part_rad)
+    assert np.allclose(askew.velocity_mps, right.velocity_mps, atol=1e-9)
+    assert np.allclose(askew.xyz_start_m, right.xyz_start_m, atol=1e-9)
     free = drifting(False, [0.0, 0.0, 0.0])
     before = free.velocity_mps.copy()
     free.turn_ways(0.1)  # whose ways nobody tells

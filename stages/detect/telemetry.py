@@ -54,7 +54,6 @@ class Heard(NamedTuple):
     over_wire: float  # over what is met farther and farther along it, at any speed: the aim looks where it expects
     misfit: float  # by how many squared sigmas a coordinate it is off the drone's way at the best yaw
     way_m: float  # how far the drone says it has been from where it was at first; up, where only heights are compared
-    # are compared
 
     @property
     def denied(self) -> bool:

@@ -109,7 +109,7 @@ def test_what_a_stage_does_when_it_raises_is_declared_and_checked(tmp_path):
         load_graph(tmp_path / "x.yaml")
     assert [str(p).replace(f"{tmp_path}/", "") for p in caught.value.problems] == [
         "x.yaml:3: stages.double.on_error: must be 'restart', 'skip' or 'stop', got 'restrat'. Did you mean 'restart'?",
-        "x.yaml:13: links.numbers.on_error: unknown key 'on_error'; there is 'use', 'config' or 'inputs'.",
+        "x.yaml:13: links.numbers.on_error: unknown key 'on_error'; there is 'use', 'config', 'inputs' or 'needs'.",
     ]
 
 

@@ -319,8 +319,8 @@ def test_which_way_its_autopilots_axes_point_does_not_matter():
 @pytest.mark.parametrize("tilt_deg", [(0.0, 0.0, 0.0), (20.0, -10.0, 130.0)])
 def test_an_autopilot_that_tells_its_odometry_is_understood_however_the_drone_is_turned(tilt_deg):
     R = rotation_from_rpy_deg(tilt_deg)
-    by_position, _ = run([Drone(MOVING)], 2.0, say=saying(MOVING))
-    by_odometry, detections = run([Drone(MOVING)], 2.0, say=lambda s, t: s.on_drone_odometry(odometry(MOVING, t, R)))
+    by_position, _ = run([Drone(MOVING)], say=saying(MOVING))
+    by_odometry, detections = run([Drone(MOVING)], say=lambda s, t: s.on_drone_odometry(odometry(MOVING, t, R)))
     assert "it flies as the drone says" in detections[-1].reasons[0]
     for a, b in zip(by_position, by_odometry, strict=True):
         np.testing.assert_allclose(a.probability, b.probability, atol=1e-9)

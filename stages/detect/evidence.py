@@ -50,7 +50,7 @@ AMONG_M = 1.5
 AMONG_NS = 20_000_000_000
 SAME_PLACE_M = 0.5
 MOST_STANDING = 64
-KEPT_NATS = 2.3  # so much less than it takes to accept it, and it is accepted no more
+KEPT_NATS = 1.65  # so much less than it takes to accept it, and it is accepted no more
 STILL_MPS = np.zeros(3)
 STANDING_NS = 60_000_000_000  # for so long it is known that something stands there
 
@@ -96,7 +96,7 @@ class EvidenceDetect(Stage):
     nearest_m: float = Field(1.5, ge=0.3)
     furthest_m: float = Field(65.0, gt=1)
     clear_m: float = Field(2.0, gt=0.2)  # a lamp hangs this far from its pole; so near nothing may stand
-    accept_probability: float = Field(0.975, gt=0.5, lt=1)
+    accept_probability: float = Field(0.95, gt=0.5, lt=1)
     look_again_probability: float = Field(0.014, gt=0, lt=0.5)
     report_s: float = Field(1.0, gt=0.05)
     settle_s: float = Field(0.15, ge=0)  # what was seen just before the end of a pass is judged with it

@@ -22,7 +22,7 @@ from stages.track.told_motion import ToldMotion, Word
 GIVES_WAY_NS = 1_000_000_000  # so long without a hit, another that was accepted takes its place
 STALE_NS = 150_000_000  # a sighting so much older than a track's own hits says nothing of it
 START_SIGMA_M = 0.2
-ACCEPTED_NATS = math.log(0.975 / 0.025)  # at which the detector accepts something, wherever it is
+ACCEPTED_NATS = math.log(0.95 / 0.05)  # at which the detector accepts something, wherever it is
 SKY_M3 = 2.0 / 3.0 * math.pi * 35.0**3  # in which it finds drones
 
 

@@ -43,12 +43,12 @@ def test_each_thing_counts_once_in_a_row_and_is_a_drone_within_a_metre(tmp_path)
     rows = rows_of(run_that_said(tmp_path / "a", said))
     assert rows[(0.0, 0.02)] == (1, 0.01, 1)
     assert rows[(0.3, 0.5)] == (2, pytest.approx(0.375), 1)  # the second look at thing 1 in this row does not count
-    assert rows[(0.975, 1.0)] == (1, 0.997, 1)
+    assert rows[(0.95, 1.0)] == (1, 0.997, 1)
     assert len(rows) == 3
 
 
 def test_what_is_certain_is_in_the_last_row(tmp_path):
-    assert rows_of(run_that_said(tmp_path / "a", [(1.0, 1, 1.0, 0.0)])) == {(0.975, 1.0): (1, 1.0, 1)}
+    assert rows_of(run_that_said(tmp_path / "a", [(1.0, 1, 1.0, 0.0)])) == {(0.95, 1.0): (1, 1.0, 1)}
 
 
 def test_without_a_drone_nothing_is_one_and_where_truth_is_silent_nothing_counts(tmp_path):

@@ -155,7 +155,7 @@ def test_a_small_thing_that_moves_in_the_free_sky_is_a_drone_after_a_second_or_t
     assert 0.4 < accepted_after_s(detections) < 2.3
     last = detections[-1]
     assert last.accepted.tolist() == [True]
-    assert last.probability[0] >= 0.99
+    assert last.probability[0] >= 0.98
     assert last.score[0] == pytest.approx(math.log(last.probability[0] / (1 - last.probability[0])))
     truth = MOVING(np.array([(last.seen_ns[0] - START_NS) * 1e-9]))[0]
     np.testing.assert_allclose(last.xyz_vehicle_m[0], truth, atol=0.3)
@@ -178,7 +178,7 @@ def test_its_probability_is_told_from_the_first_looks_on_and_grows():
     candidates, _ = run([Drone(MOVING)])
     assert (candidates[0].stamp_ns - START_NS) * 1e-9 < 0.6
     probability = [float(c.probability[0]) for c in candidates]
-    assert probability[0] < 0.5 < 0.99 < probability[-1]
+    assert probability[0] < 0.5 < 0.98 < probability[-1]
     assert candidates[-1].looks[0] > 15
 
 
@@ -205,7 +205,7 @@ def test_far_away_it_stays_a_candidate_because_a_wire_would_not_be_seen():
     far_m = 2.6 * np.array(PLACE_M)
     candidates, detections = run([Drone(still(*far_m), span_m=0.9)], 4.2, span_m=0.9)
     assert accepted_after_s(detections) == math.inf
-    assert 0.5 < max(c.probability.max() for c in candidates if c.probability.size) < 0.975
+    assert 0.5 < max(c.probability.max() for c in candidates if c.probability.size) < 0.95
 
 
 BESIDE = {
@@ -366,7 +366,7 @@ def test_a_lamp_is_refused_while_the_drone_flies_and_not_while_it_hangs():
     assert candidates[-1].candidate_id.size == 0 or candidates[-1].probability.max() < 0.02
     candidates, detections = run([hanging()], say=saying(still(0.0, 0.0, 0.0)))
     assert accepted_after_s(detections) < 3.0
-    assert candidates[-1].probability.max() > 0.975
+    assert candidates[-1].probability.max() > 0.95
 
 
 def test_a_balloon_is_refused_though_it_drifts_as_the_drone_says_because_it_is_smooth():

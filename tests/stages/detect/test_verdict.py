@@ -13,6 +13,7 @@ from stages.detect.verdict import (
     MOVED,
     STANDING,
     Evidence,
+    as_often,
     believed,
     each_alone,
     judge,
@@ -232,7 +233,19 @@ def test_where_the_drone_tells_nothing_the_odds_are_a_share_of_the_evidence_and_
 def test_without_the_drones_word_what_is_accepted_and_looked_at_again_has_the_evidence_that_the_numbers_were_made_for():
     for default, evidence in (("accept_probability", 5.3), ("look_again_probability", -5.1)):
         asked = odds_of(EvidenceDetect.model_fields[default].default)
-        assert asked == pytest.approx(E.weight_untold * evidence + E.offset_untold, abs=0.03)
+        assert asked == pytest.approx(as_often(E.weight_untold * evidence + E.offset_untold, E), abs=0.05)
+
+
+def test_what_is_likely_a_drone_is_one_less_often_than_its_odds_and_what_is_not_just_as_often():
+    for odds in (-8.0, 0.0, E.sure):
+        assert as_often(odds, E) == odds
+    assert as_often(E.sure + 2.0, E) == pytest.approx(E.sure + 2.0 * E.weight_sure)
+    plain = E.model_copy(update={"weight_sure": 1.0})
+    c = hanging(heard_so(20.0, 20.0, 20.0, 20.0))
+    c.alone, c.free, c.few, c.rugged = 30.0, np.full(SECTORS, 12.0), 30.0, 5
+    sure, _ = judge(c, plain, True, True)
+    assert sure > E.sure
+    assert judge(c, E, True, True)[0] == pytest.approx(as_often(sure, E))
 
 
 def test_nearby_looks_with_nothing_beside_it_count_more_once_every_sector_was_crossed():

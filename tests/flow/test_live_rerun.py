@@ -41,7 +41,7 @@ def race(graph, seconds_of=300):
     for sender in senders:
         sender.join()
     report = live.report
-    while min(link.records for link in report().links.values()) < seconds_of:
+    while report().links["line"].records < seconds_of + 52 or report().links["other"].records < seconds_of:
         threading.Event().wait(0.01)
     return live.stop(), digest.hexdigest(), memory._records
 

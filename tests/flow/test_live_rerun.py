@@ -41,7 +41,7 @@ def race(graph, seconds_of=300):
     for sender in senders:
         sender.join()
     report = live.report
-    while report().links["line"].records < seconds_of + 52 or report().links["other"].records < seconds_of:
+    while report().links["line"].records < seconds_of + 53 or report().links["other"].records < seconds_of:
         threading.Event().wait(0.01)
     return live.stop(), digest.hexdigest(), memory._records
 
@@ -120,7 +120,7 @@ def test_a_run_that_was_killed_is_repeated_as_far_as_its_recording_goes(tmp_path
             cut.append(record)
     _, second, _ = again(graph, cut)
     assert 0 < second.messages["order.number"] < report.messages["order.number"]
-    assert second.nodes["order"].calls <= 30
+    assert second.nodes["order"].calls < report.nodes["order"].calls
 
 
 def test_what_a_recording_lacks_is_told(tmp_path):

@@ -116,7 +116,7 @@ def test_a_stage_that_hangs_elsewhere_keeps_no_run_from_ending(tmp_path):
         threading.Event().wait(0.01)
     begin_s = time.monotonic()
     live.stop()
-    assert time.monotonic() - begin_s < 2.0
+    assert time.monotonic() - begin_s < 4.0
     assert not runs(pid)
 
 

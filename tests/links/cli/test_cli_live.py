@@ -236,7 +236,7 @@ def test_a_terminal_that_takes_no_more_ends_no_run(grd, tmp_path, trouble):
         raise trouble
 
     asked = Asked(Path("ticks.yaml"), (), ())
-    finished = run_live(tmp_path / "run", asked, live_graph(asked), show, 0.8)
+    finished = run_live(tmp_path / "run", asked, live_graph(asked), show, 2.0)
     assert any("cannot be shown on the terminal (" in str(incident) for incident in finished.report.incidents)
     assert finished.report.records > 40
     assert "cannot be shown" in (tmp_path / "run" / "run.log").read_text()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import socket
 import subprocess
 import sys
 import threading
@@ -22,6 +21,7 @@ from links.recording import RecordingReader
 from links.simulated import LiveRig
 from links.velodyne import Lidar
 from stages.messages import ServoGoal
+from tests.links.ports import free_ports
 
 ROOT = Path(__file__).resolve().parents[3]
 PATIENCE_S = 120.0
@@ -39,13 +39,7 @@ vehicle_odometry: {}
 
 @pytest.fixture
 def ports():
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as two,
-    ):
-        for probe in (one, two):
-            probe.bind(("127.0.0.1", 0))
-        return one.getsockname()[1], two.getsockname()[1]
+    return tuple(free_ports(2))
 
 
 def run_of(folder: Path, live: bool = True) -> Run:

@@ -126,7 +126,7 @@ def test_with_clock_utc_no_pulse_counts_before_the_sensor_is_locked(ports):
     [((), "no position packet has come"), ((position(pps=3),), "its PPS is error, its GPS knows the time")],
 )
 def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_that_says_why(ports, told, words):
-    lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc", timeout_s=0.1)
+    lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc", timeout_s=0.5)
     with lidar.listen() as records:
         send(ports[1], *told)
         for _ in told:

@@ -20,6 +20,7 @@ from flow.message import Message, message
 from links.viewer import Viewer
 from links.viewer.mailbox import Mailbox
 from links.viewer.slices import Slicer, join, thin
+from tests.links.ports import free_port
 
 
 def a_run(folder: Path) -> Run:
@@ -271,12 +272,6 @@ def test_a_logging_thread_that_dies_does_not_hold_up_the_run(tmp_path, monkeypat
     assert viewer.dropped["clock.tick"] > 0
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def listeners(port: int) -> set[str]:
     """Addresses (hex, as /proc has them) that listen on a port."""
     found = set()
@@ -291,7 +286,7 @@ def listeners(port: int) -> set[str]:
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="reads listening sockets from Linux's /proc")
 def test_a_serving_run_listens_on_loopback_only(tmp_path):
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     viewer = Viewer(serve=True, port=port, lossless=True)
     viewer.open(a_run(tmp_path))
     for _ in range(100):

@@ -85,7 +85,7 @@ class HostProcess:
             self._news.put(json.loads(line))
         self._news.put(None)
 
-    def until(self, wanted: Callable[[dict[str, Any]], bool], within_s: float = 15.0) -> dict[str, Any]:
+    def until(self, wanted: Callable[[dict[str, Any]], bool], within_s: float = 60.0) -> dict[str, Any]:
         """The first new line that is wanted."""
         end_s = time.monotonic() + within_s
         while True:
@@ -104,7 +104,7 @@ class HostProcess:
         """Lines of one kind so far."""
         return [line for line in self.lines if line["kind"] == kind]
 
-    def wait_for(self, kind: str, count: int = 1, within_s: float = 15.0) -> list[dict[str, Any]]:
+    def wait_for(self, kind: str, count: int = 1, within_s: float = 60.0) -> list[dict[str, Any]]:
         """The next `count` lines of a kind."""
         return [self.until(lambda line: line["kind"] == kind, within_s) for _ in range(count)]
 
@@ -115,7 +115,7 @@ class HostProcess:
         self._process.stdin.flush()
         return self.wait_for("report")[0]
 
-    def until_trouble(self, node: str, wanted: str | None, within_s: float = 15.0) -> str | None:
+    def until_trouble(self, node: str, wanted: str | None, within_s: float = 60.0) -> str | None:
         """A node's trouble, once it has the words `wanted`; None: once it has none."""
         end_s = time.monotonic() + within_s
         while True:

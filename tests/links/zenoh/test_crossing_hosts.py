@@ -56,8 +56,8 @@ def test_a_cycle_through_two_hosts_whose_clocks_are_an_hour_apart(folder):
         assert abs(there["clock offset [us]"] + 3_600_000_000) < 2_000_000
         assert abs(back["clock offset [us]"] - 3_600_000_000) < 2_000_000
         assert there["lost"] == back["lost"] == 0
-        assert vehicle.stop() < 2.0
-        assert drone.stop() < 2.0
+        assert vehicle.stop() < 4.0
+        assert drone.stop() < 4.0
 
 
 def test_the_hub_hands_on_between_two_others(folder):
@@ -89,7 +89,7 @@ def test_a_certificate_of_another_authority_is_not_taken_in(folder):
         assert vehicle.of("beat") == []
         with HostProcess(config, honest, "drone"):  # and the hub is as well as before
             vehicle.wait_for("beat", 3)
-        assert intruder.stop() < 2.0
+        assert intruder.stop() < 4.0
 
 
 def test_a_host_cannot_say_what_another_one_s_nodes_say(folder):
@@ -137,7 +137,7 @@ def test_a_line_that_was_cut_comes_back(folder):
             numbers = [line["number"] for line in vehicle.of("beat")]
             assert numbers == sorted(set(numbers))
             vehicle.until_trouble("beats", None)
-            assert drone.stop() < 2.0
+            assert drone.stop() < 4.0
 
 
 def test_a_host_that_starts_anew_is_heard_anew(folder):

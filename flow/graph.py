@@ -8,9 +8,10 @@
         on_error: restart                  # live, when it raises: a fresh one takes over; or skip; or stop the run
         thread: lidar                      # live: shared with others that say so; without it, it has its own
         process: pictures                  # in that, live (flow/stage_process.py) and replayed (flow/apart.py)
+        needs: $rig.cameras                # left out, which is said, where nothing stands there
         yields: true                       # live: takes fewer pictures while others' queues run over (flow/yielding.py)
     links:
-      lidar: {use: links.velodyne.Lidar}   # sources and sinks; the first three keys
+      lidar: {use: links.velodyne.Lidar}   # sources and sinks; use, config, inputs, needs
 
 Source: ours.
 """

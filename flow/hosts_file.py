@@ -102,14 +102,12 @@ def _place(tree: Tree, graph: Graph, hosts: dict[str, Any]) -> dict[str, str]:
     place: dict[str, str] = {}
     for node, host in _section(tree, "place").items():
         path = ("place", node)
-        if node in graph.left_out:
-            continue  # on other rigs it runs
-        if node not in graph.nodes:
+        if node not in graph.nodes and node not in graph.left_out:
             tree.problem(path, f"no stage or link '{node}'.{did_you_mean(node, graph.nodes)}")
         elif not isinstance(host, str) or host not in hosts:
             near = did_you_mean(host, hosts) if isinstance(host, str) else ""
             tree.problem(path, f"no host {host!r}; there is {one_of(hosts)}.{near}")
-        else:
+        elif node in graph.nodes:  # what this rig leaves out runs on others
             place[node] = host
     missing = [node for node in graph.nodes if node not in _section(tree, "place")]
     if missing:

@@ -24,7 +24,7 @@ NODE_KEYS = {
     "links": ("use", "config", "inputs", "needs"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
-_NEEDED = re.compile(r"\$[^\s$]+\Z")  # a reference, without what would hold where nothing stands
+NEEDED = r"^\$[^\s$]+$"  # a reference, without what would hold where nothing stands
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ def _unmet(tree: Tree, path: Path_, declared: dict[str, Any]) -> str:
     needs: Any = declared.get("needs")
     if needs is None:
         return ""
-    if not (isinstance(needs, str) and _NEEDED.match(needs)):
+    if not (isinstance(needs, str) and re.fullmatch(NEEDED, needs)):
         tree.problem((*path, "needs"), f"must name a value of the configuration, as $rig.cameras, got {needs!r}.")
         return ""
     return needs if resolve(tree, (*path, "needs"), f"{needs} or null") is None else ""

@@ -134,3 +134,5 @@ def test_a_node_that_is_left_out_may_be_placed_and_the_parts_say_so(load):
     assert "words" not in hosts.place
     assert hosts.graph.said_left_out() == ["left out, as nothing stands for $rig.radio: words"]
     assert part_of(hosts, "vehicle", NoEnds()).said_left_out() == hosts.graph.said_left_out()
+    nowhere = problems(load, GOOD.replace("words: base", "words: moon"), config)
+    assert nowhere == ["6: place.words: no host 'moon'; there is 'vehicle', 'drone' or 'base'."]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from links.evaluation.probabilities import EDGES
 from stages.detect import EvidenceDetect
 from stages.detect.surroundings import SECTORS
 from stages.detect.telemetry import Heard
@@ -23,6 +24,7 @@ from stages.detect.verdict import (
     over_clutter,
     over_stray,
 )
+from stages.track.hypotheses import ACCEPTED_NATS
 from tests.stages.detect.test_candidate import candidate, sighting, way
 
 E = Evidence()
@@ -234,6 +236,12 @@ def test_without_the_drones_word_what_is_accepted_and_looked_at_again_has_the_ev
     for default, evidence in (("accept_probability", 5.3), ("look_again_probability", -5.1)):
         asked = odds_of(EvidenceDetect.model_fields[default].default)
         assert asked == pytest.approx(as_often(E.weight_untold * evidence + E.offset_untold, E), abs=0.05)
+
+
+def test_tracker_and_evaluation_know_from_where_on_the_detector_accepts():
+    accepts = EvidenceDetect.model_fields["accept_probability"].default
+    assert pytest.approx(odds_of(accepts)) == ACCEPTED_NATS
+    assert EDGES[-2] == accepts
 
 
 def test_what_is_likely_a_drone_is_one_less_often_than_its_odds_and_what_is_not_just_as_often():

@@ -157,7 +157,7 @@ def _catalogue() -> dict[str, Metric]:
         ("rmse_pitch_deg", "RMSE pitch", "deg", "low"),
         ("rmse_yaw_deg", "RMSE yaw", "deg", "low"),
         ("rmse_angle_deg", "RMSE of the whole angle", "deg", "low"),
-        ("branch_wrong_s", "yaw branch wrong, marked good", "s", "low"),
+        ("branch_wrong_s", "yaw branch wrong, told as known", "s", "low"),
     )
     add(
         CAMERAS,

@@ -336,13 +336,30 @@ def test_a_pose_that_the_autopilot_would_get_of_no_drone_is_a_finding(tmp_path):
     assert "8 of 80 poses good enough for the autopilot are of no drone: there was none" in e.findings
 
 
+def test_a_wrong_yaw_counts_wherever_a_rotation_is_told_though_the_autopilot_would_not_get_it(tmp_path):
+    folder = make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ))
+    (folder / "truth_vehicle_drone.tum").write_text("# full pose\n" + lines(EIGHT_HZ, truth_at(EIGHT_HZ)))
+    yaw = np.where(EIGHT_HZ < 2, math.pi / 2, 0.0)
+    add_pose(folder, EIGHT_HZ, truth_at(EIGHT_HZ), yaw_quaternion(yaw), np.eye(6) * 0.01, EIGHT_HZ >= 9.0)
+    say_rotation(folder, EIGHT_HZ >= 1.0)
+    e = judge(folder)
+    assert value(e, "branch_wrong_s") == pytest.approx(1.0)
+    assert value(e, "good_max_deg") == pytest.approx(0.0, abs=1e-4)
+
+
+def say_rotation(folder, told):
+    """A column more: whether each pose's rotation is known."""
+    file = folder / "pose_covariance.csv"
+    head, *rows = file.read_text().splitlines()
+    rows = [f"{row},{int(known)}" for row, known in zip(rows, told, strict=True)]
+    file.write_text("\n".join([f"{head},rotation", *rows]) + "\n")
+
+
 def test_a_run_that_never_knew_the_rotation_has_failed_there_and_is_not_left_out_of_medians(tmp_path):
     folder = make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ))
     (folder / "truth_vehicle_drone.tum").write_text("# full pose\n" + lines(EIGHT_HZ, truth_at(EIGHT_HZ)))
     add_pose(folder, EIGHT_HZ, truth_at(EIGHT_HZ), yaw_quaternion(0 * EIGHT_HZ), np.eye(6) * 0.01)
-    file = folder / "pose_covariance.csv"
-    head, *rows = file.read_text().splitlines()
-    file.write_text("\n".join([f"{head},rotation", *(f"{row},0" for row in rows)]) + "\n")
+    say_rotation(folder, 0 * EIGHT_HZ)
     e = judge(folder)
     assert e.values["rmse_angle_deg"].failed
     assert e.values["rmse_angle_deg"].note == "the run never knew the rotation"

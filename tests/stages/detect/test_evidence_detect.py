@@ -18,9 +18,9 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.detect import EvidenceDetect
 from stages.detect.candidate import Sighting
-from stages.detect.evidence import AMONG_M, AMONG_NS, STANDING_NS
+from stages.detect.evidence import AMONG_M, AMONG_NS, KEPT_NATS, STANDING_NS
 from stages.detect.surroundings import FREE_0, SECTORS, TALLY
-from stages.detect.telling import detections_message
+from stages.detect.telling import detections_message, odds_of
 from stages.detect.verdict import Evidence, over_clutter
 from stages.geometry import rotation_from_rpy_deg, rotation_z
 from stages.messages import Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
@@ -172,6 +172,19 @@ def test_four_packets_together_tell_the_same_as_one_by_one():
     assert together_4[-1].looks[0] == candidates[-1].looks[0]
     assert together_4[-1].seen_ns[0] == pytest.approx(candidates[-1].seen_ns[0], abs=6e6)
     np.testing.assert_allclose(together_4[-1].xyz_vehicle_m[0], candidates[-1].xyz_vehicle_m[0], atol=0.05)
+
+
+def test_what_was_accepted_stays_so_until_much_less_speaks_for_it(monkeypatch):
+    stage, c = EvidenceDetect(), candidate(sighting(0.0, np.array(PLACE_M)))
+    accept = odds_of(stage.accept_probability)
+    verdicts = []
+    for odds in (accept - 0.1, accept + 0.1, accept - KEPT_NATS + 0.1, accept - KEPT_NATS - 0.1, accept - 0.1):
+        monkeypatch.setattr("stages.detect.evidence.judge", lambda *_, odds=odds: (odds, "so it is"))
+        stage._weigh(stage._now, c)
+        verdicts.append(c.accepted)
+    assert verdicts == [False, True, True, False, False]
+    assert accept - KEPT_NATS > 0.0  # a drone rather than not
+    assert KEPT_NATS > 1.0
 
 
 def test_its_probability_is_told_from_the_first_looks_on_and_grows():

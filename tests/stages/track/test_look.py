@@ -9,7 +9,8 @@ import pytest
 
 from stages.messages import SweptPulses
 from stages.rotation import exp_rotation
-from stages.track.look import collect_into, evaluate
+from stages.track.hull import COLUMNS, DEPTH, GLIMPSE, HIT, KIND, A
+from stages.track.look import collect_into, drone_hits, evaluate
 from tests.stages.made import START_NS
 
 SPAN_M = 0.5
@@ -48,3 +49,15 @@ def test_a_drone_beside_the_prediction_is_found_on_its_own_side_however_the_vehi
     assert seen is not None
     assert seen.hits > 10
     assert math.dist(seen.x[:2], drone_m[:2]) < 0.03
+
+
+@pytest.mark.parametrize(("behind_m", "kinds"), [(0.1, {HIT, GLIMPSE}), (0.4, {HIT}), (0.7, set())])
+def test_what_is_seen_through_a_gap_has_to_be_nearer_to_the_prediction(behind_m, kinds):
+    """Three returns behind it; one sigma there is .14 m: .7, 2.8 and 5 of them."""
+    found = set()
+    for kind in (HIT, GLIMPSE):
+        pulses = np.zeros((3, COLUMNS))
+        pulses[:, A], pulses[:, DEPTH], pulses[:, KIND] = (-0.05, 0.0, 0.05), behind_m, kind
+        if drone_hits(pulses, SPAN_M, 0.1) is not None:
+            found.add(kind)
+    assert found == kinds

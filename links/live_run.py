@@ -22,7 +22,7 @@ from flow.link import LinkError, Source, Tap
 from flow.live import Live
 from flow.live_report import LiveReport
 from flow.taps import Digest
-from links import host_time
+from links.clock import host_time
 from links.recording import Recorder
 from links.run_folder import Asked, Finished, RunFolder
 from links.usage import Usage

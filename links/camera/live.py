@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from flow.link import LinkError
-from links import host_time
 from links.camera.capture import Capture, CaptureEnded, CaptureLost, CaptureSettings, Frame, is_device, is_url, shown
+from links.clock import host_time
 
 PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0  # between attempts to open it again
 END_S = 1.0  # how long the end waits for a read that hangs in a driver

@@ -10,7 +10,7 @@ Source: ours; RFC 3550, 5.1 (RTP's time stamps, which FFmpeg gives as CAP_PROP_P
 
 from __future__ import annotations
 
-from links.device_clock import DeviceClock
+from links.clock.device_clock import DeviceClock
 
 AS_FAST = 0.97  # handed out in this share of the time between two pictures, or more: nothing waits any more
 STEADY = 3  # pictures in a row: one that takes long to decode does not show it

@@ -4,7 +4,7 @@ A tick's stamp is the moment that was meant, its arrival when the thread came to
 The moments are whole multiples of the period, as those of the fused poses are: a pose does not wait for the next tick.
 Ticks that it missed altogether are left out, not made up for. A replay takes the recorded ticks.
 
-Source: ours; links/host_time.py (a wall clock that is set moves no tick).
+Source: ours; links/clock/host_time.py (a wall clock that is set moves no tick).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pydantic import Field, PrivateAttr
 
 from flow.link import Record, Source
-from links import host_time
+from links.clock import host_time
 from stages.messages import Tick
 
 

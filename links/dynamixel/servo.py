@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field, PrivateAttr, model_validator
 
 from flow.link import LinkError, Record, Source
-from links import host_time
+from links.clock import host_time
 from links.dynamixel import wire
 from links.dynamixel.drive import DriveSettings
 from links.dynamixel.mx28 import (

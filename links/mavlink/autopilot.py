@@ -19,8 +19,8 @@ from typing import ClassVar
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from flow.link import LinkError, Record, Source
-from links import host_time
-from links.device_clock import DeviceClock
+from links.clock import host_time
+from links.clock.device_clock import DeviceClock
 from links.mavlink.connection import Udp, parse_connection
 from links.mavlink.gate import Limits
 from links.mavlink.lines import open_connection

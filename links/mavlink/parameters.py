@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from links import host_time
+from links.clock import host_time
 from links.mavlink.connection import Connection
 from links.mavlink.signing import Signer
 from links.mavlink.wire import V1, FrameSplitter, dialect, header, packed

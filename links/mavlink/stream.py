@@ -12,7 +12,7 @@ from collections import Counter
 from typing import Any
 
 from flow.link import Record
-from links.device_clock import DeviceClock
+from links.clock.device_clock import DeviceClock
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
 from links.mavlink.wire import SEQUENCE, header, known, parse_frame, timesync_target
 from stages.messages import AutopilotStatus

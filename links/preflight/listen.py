@@ -16,7 +16,7 @@ from flow.link import TRUTH_TOPICS, Run, Source
 from flow.live import Live
 from flow.live_report import LiveReport
 from flow.replay import Replay
-from links import host_time
+from links.clock import host_time
 from links.preflight.heard import KEPT, AllHeard, Ear, Heard
 from links.recording import Progress, Session
 from links.simulated import LiveRig

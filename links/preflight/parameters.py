@@ -6,7 +6,7 @@ Source: `links.mavlink.profiles`, which says why each.
 from __future__ import annotations
 
 from flow.link import LinkError
-from links import host_time
+from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.connection import parse_connection
 from links.mavlink.lines import open_connection

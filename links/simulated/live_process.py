@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from flow.metrics import Latency
 from flow.problem import ConfigError
-from links import host_time
+from links.clock import host_time
 from links.mavlink.profiles import ARDUPILOT
 from links.mavlink.stream import ARMED
 from links.recording import RecordingWriter

@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from flow.link import LinkError, Record
-from links import datagram_time
+from links.clock import datagram_time
 
 DATAGRAM_BYTES = 4096
 WAKE_S = 0.2  # how often a waiting listener looks whether it was closed

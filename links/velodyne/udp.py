@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from flow.link import LinkError, Record
-from links import datagram_time
+from links.clock import datagram_time
 from links.velodyne import vlp16
 
 RECEIVE_BUFFER_BYTES = 1 << 20  # 0.6 s of packets, where the host's net.core.rmem_max allows it

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from flow.link import LinkError
-from links.host_time import now_ns
+from links.clock.host_time import now_ns
 from links.zenoh.peer_clock import PeerClock
 from links.zenoh.session import Session, clock_key, config_of
 from links.zenoh.wire import RUN, TIME_ANSWER

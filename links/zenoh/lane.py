@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from flow.codec import encode
 from flow.codec_fields import CodecError
 from flow.message import Message, array_fields
-from links.host_time import now_ns
+from links.clock.host_time import now_ns
 from links.zenoh.connection import Connection
 from links.zenoh.wire import RUN, Envelope
 

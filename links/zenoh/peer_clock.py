@@ -1,7 +1,7 @@
 """Another host's timeline told in ours, with what it may be wrong by.
 
 Each message bounds the difference from above (it cannot arrive before it was sent), each answer to "what time is it?"
-from below; `links.device_clock` has the reasoning. Nothing is told before there was an answer, and nothing when the
+from below; see `links.clock.device_clock`. Nothing is told before there was an answer, and nothing when the
 bounds are further apart than `MAX_UNCERTAINTY_NS`: 25 ms are 25 cm at 10 m/s.
 
 Source: ours.
@@ -12,7 +12,7 @@ from __future__ import annotations
 import threading
 from typing import NamedTuple
 
-from links.device_clock import DeviceClock
+from links.clock.device_clock import DeviceClock
 
 MAX_UNCERTAINTY_NS = 25_000_000
 

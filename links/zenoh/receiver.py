@@ -23,7 +23,7 @@ from flow.hosts import Hop
 from flow.link import LinkError, Record
 from flow.message import Message
 from flow.timeline import in_our_time
-from links.host_time import now_ns
+from links.clock.host_time import now_ns
 from links.zenoh.connection import Connection, Opened, connected
 from links.zenoh.peer_clock import PeerClock
 from links.zenoh.session import Session, key_of

@@ -22,7 +22,7 @@ from flow.link import TRUTH_TOPICS, Record, Source
 from flow.live import Live
 from flow.replay import Replay
 from flow.taps import Digest
-from links import host_time
+from links.clock import host_time
 from links.recording import RecordingReader
 from links.run_folder import Asked
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links import host_time
+from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.gate import Limits, refusal
 from links.mavlink.pose_frames import odometry

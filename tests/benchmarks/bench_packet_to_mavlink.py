@@ -26,7 +26,7 @@ from pydantic import PrivateAttr
 
 from flow.link import Tap
 from flow.replay import Replay
-from links import host_time
+from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.wire import parse_frame
 from links.recording import RecordingReader

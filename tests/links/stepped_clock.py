@@ -26,8 +26,8 @@ def look() -> None:
 
 time.time_ns = lambda: really_ns() + ahead_ns
 
-from links import datagram_time  # noqa: E402 (after the clock is ours)
 from links.cli import main  # noqa: E402
+from links.clock import datagram_time  # noqa: E402 (after the clock is ours)
 
 kernel_ns = datagram_time.kernel_time_ns
 

@@ -13,7 +13,7 @@ import struct
 import threading
 from contextlib import suppress
 
-from links import host_time
+from links.clock import host_time
 from tests.links.camera import h264_by_hand as h264
 
 PACKET = 1400  # bytes of a NAL unit in one packet, as on Ethernet

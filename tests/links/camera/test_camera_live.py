@@ -13,9 +13,9 @@ import pytest
 from pydantic import ValidationError
 
 from flow.link import LinkError
-from links import host_time
 from links.camera import Camera
 from links.camera.capture import Capture, CaptureSettings, shown
+from links.clock import host_time
 from links.recording import decode_compressed_image
 
 PERIOD_S = 0.04

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError
-from links import host_time
 from links.camera import Camera
 from links.camera.capture import MOST_DAMAGED, Capture, CaptureLost, CaptureSettings
+from links.clock import host_time
 from links.recording import decode_compressed_image
 
 DEVICE = "/dev/null"  # a device that is there

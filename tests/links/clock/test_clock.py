@@ -9,8 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from flow.link import Record
-from links import host_time
-from links.clock import Clock
+from links.clock import Clock, host_time
 
 
 def test_ticks_lie_evenly_in_time_and_are_never_early():

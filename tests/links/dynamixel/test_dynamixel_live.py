@@ -16,7 +16,7 @@ import pytest
 from pydantic import ValidationError
 
 from flow.link import LinkError
-from links import host_time
+from links.clock import host_time
 from links.dynamixel import Servo, mx28
 from links.simulated.dynamixel_emulator import DynamixelEmulator
 from links.simulated.servo import ServoSettings

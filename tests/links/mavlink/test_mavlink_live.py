@@ -23,7 +23,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import LinkError, Record
 from flow.stage import input_ports
-from links import host_time
+from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.session import Session
 from links.mavlink.signing import AHEAD_TICKS

@@ -28,7 +28,7 @@ from mavlink_poses import good_pose
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
-from links import host_time
+from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.wire import packed, parse_frame
 from links.recording import RecordingReader, RecordingWriter

@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
-from links import host_time
+from links.clock import host_time
 from links.mavlink import Autopilot as Receiver
 from links.mavlink.connection import Endpoint, Udp
 from links.mavlink.wire import packed, parse_frame

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError, Record, Run
-from links import host_time
 from links.camera import Camera
+from links.clock import host_time
 from links.recording import CompressedImage, decode_compressed_image, encode_compressed_image
 from links.simulated import LiveRig
 from links.simulated.live_pictures import MOST_CLIENTS, PictureServer, PicturesInTime

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from flow.link import LinkError, Run
-from links import host_time
+from links.clock import host_time
 from links.dynamixel import Servo
 from links.recording import RecordingReader
 from links.simulated import LiveRig

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from flow.link import LinkError
-from links import host_time
+from links.clock import host_time
 from links.vehicle_odometry import VehicleOdometry
 from links.vehicle_odometry.udp import age_s
 from tests.links import ports

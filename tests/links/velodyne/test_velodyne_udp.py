@@ -8,7 +8,7 @@ from hand_built import DUAL, SINGLE_PACKET_NS, packet
 from pydantic import ValidationError
 
 from flow.link import LinkError
-from links import host_time
+from links.clock import host_time
 from links.velodyne import Lidar
 from links.velodyne.vlp16 import first_pulse_ns
 from tests.links.ports import free_port, send

@@ -17,7 +17,7 @@ from pydantic import PrivateAttr
 from flow.link import Link, Record, Source
 from flow.message import Message, Shape, message
 from flow.stage import Stage
-from links.host_time import now_ns
+from links.clock.host_time import now_ns
 
 
 @message

@@ -16,7 +16,7 @@ time.time_ns = lambda: wall_ns() + ahead_ns  # before anything reads it: this ho
 
 from flow.graph import load_graph  # noqa: E402
 from flow.live import Live  # noqa: E402
-from links.host_time import now_ns  # noqa: E402
+from links.clock.host_time import now_ns  # noqa: E402
 from links.zenoh import host_graph  # noqa: E402
 
 

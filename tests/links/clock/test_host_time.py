@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from links.host_time import MAX_AGE_NS, HostTime, from_wall_ns, now_ns
+from links.clock.host_time import MAX_AGE_NS, HostTime, from_wall_ns, now_ns
 
 START_NS = 1_750_000_000_000_000_000
 MS = 1_000_000

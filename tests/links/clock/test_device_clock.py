@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from links.device_clock import BACKLOG_NS, DISAGREEMENTS, DeviceClock
+from links.clock.device_clock import BACKLOG_NS, DISAGREEMENTS, DeviceClock
 
 MS, S = 1_000_000, 1_000_000_000
 HOST0 = 1_748_773_230 * S

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from links.clock_drift import FEWEST_WINDOWS, SIGMA_PPM, WINDOW_NS, ClockDrift
-from links.device_clock import DeviceClock
+from links.clock.clock_drift import FEWEST_WINDOWS, SIGMA_PPM, WINDOW_NS, ClockDrift
+from links.clock.device_clock import DeviceClock
 
 S = 1_000_000_000
 

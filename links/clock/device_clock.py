@@ -19,7 +19,7 @@ Source: ours; https://mavlink.io/en/services/timesync.html for the exchange.
 
 from __future__ import annotations
 
-from links.clock_drift import ClockDrift
+from links.clock.clock_drift import ClockDrift
 
 DISAGREEMENTS = 5  # in a row, then the device's clock was set and not the message damaged
 BACKLOG_NS = 10_000_000_000  # what waited is through by then: who is still as late was off, or has another clock now

@@ -1,6 +1,6 @@
 """When a datagram arrived, as the kernel stamped it: a thread that comes late does not make it later.
 
-The kernel stamps with the wall clock; `links/host_time.py` makes of it a time that a step of that clock does not move.
+The kernel stamps with the wall clock; `host_time.py` makes of it a time that a step of that clock does not move.
 Where the kernel does not stamp, it is when the datagram was read; so it is in the first moments after it was asked to:
 a worker of its own turns that on.
 
@@ -13,7 +13,7 @@ import socket
 import struct
 import sys
 
-from links import host_time
+from links.clock import host_time
 
 ANCILLARY_BYTES = 64  # room for the stamp, for `recvmsg`
 _SO_TIMESTAMPNS = 35 if sys.platform == "linux" else None  # asm-generic/socket.h; Python does not name it

@@ -44,7 +44,7 @@ class Link(Node):
         return ()
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """What does not work now, in words, where the link cannot raise it; the live runner says it when it changes."""
         return None
 
@@ -61,7 +61,7 @@ class Source(Link):
     """
 
     topic: str
-    silent_after_s: ClassVar[float | None] = None  # one that has spoken and then says nothing for so long is in trouble
+    silent_after_s: ClassVar[float | None] = None  # one that has spoken and then says nothing for so long has a status
 
     def decode(self, record: Record) -> Any:
         """Messages of one record: None, one message, or an iterable of messages."""

@@ -60,7 +60,7 @@ class Live:
         self._wiring = Wiring(graph, taps, self._shared)
         self.incidents.tell = self._wiring.tell_incident
         self._names = list(graph.nodes)
-        self._troubles: dict[str, str | None] = {}
+        self._statuses: dict[str, str | None] = {}
         self._ended = threading.Event()
         self._house = threading.Thread(target=self._keep_house, name="housekeeping", daemon=True)
         self._switch_s = sys.getswitchinterval()
@@ -126,7 +126,7 @@ class Live:
                 self.incidents.report("run", f"the thread '{thread.name}' did not end in time")
 
     def _keep_house(self) -> None:
-        """Until the end: the order goes to the recorders, the edges' status to the taps, links' troubles are said."""
+        """Until the end: the order goes to the recorders, edges' status to the taps, links' statuses are reported."""
         status_s = time.monotonic()
         while not self._ended.wait(HOUSE_S):
             self._keep_orders()
@@ -137,10 +137,10 @@ class Live:
                 edge.tell(self._shared.now_ns())
             silent = {source.node: source.silence() for source in self._wiring.sources}
             for name, link in self._wiring.links.items():
-                trouble = link.trouble or silent.get(name)
-                if trouble != self._troubles.get(name):
-                    self._troubles[name] = trouble
-                    self.incidents.report(name, trouble or "works again", mended=not trouble)
+                status = link.status or silent.get(name)
+                if status != self._statuses.get(name):
+                    self._statuses[name] = status
+                    self.incidents.report(name, status or "works again", mended=not status)
 
     def _keep_orders(self) -> None:
         for order in self._wiring.orders:

@@ -42,14 +42,14 @@ class SourceThread(Worker):
             records_before = self.report.records
             try:
                 self._listen()
-                trouble = "its records have ended"
+                status = "its records have ended"
             except (LinkError, RunError) as error:
-                trouble = str(error)
+                status = str(error)
             if stopping.is_set():
                 break
-            self.report.state = trouble
+            self.report.state = status
             pause_s = FIRST_PAUSE_S if self.report.records > records_before else min(2 * pause_s, LONGEST_PAUSE_S)
-            self.shared.incidents.report(self.node, f"{trouble}; it is opened again")
+            self.shared.incidents.report(self.node, f"{status}; it is opened again")
             stopping.wait(pause_s)
         self.report.state = "closed"
 

@@ -115,7 +115,7 @@ class Servo(Source):
         return {**told, **here, "goals_lost": told["goals_lost"] + here.get("goals_lost", 0)}
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """That it is not driven, though it was before: it has shut down, or does not answer."""
         health = self._health
         if self._process is None or health is None or health.connected:

@@ -57,7 +57,7 @@ class Recorder(Tap):
     _part_s: float = PrivateAttr(default=0.0)  # when it was opened, monotonic
     _stopped_s: float = PrivateAttr(default=0.0)
     _before: tuple[int, int] = PrivateAttr(default=(0, 0))  # written and dropped in earlier parts
-    _trouble: str | None = PrivateAttr(default=None)
+    _status: str | None = PrivateAttr(default=None)
 
     def wants(self, message: type[Message]) -> bool:
         """Records only."""
@@ -73,12 +73,12 @@ class Recorder(Tap):
         return {"written": written, "dropped": dropped, "missed": self._intake.missed, "parts": self._parts}
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """Why nothing is recorded now, in words; None: it is."""
-        return self._trouble
+        return self._status
 
     def open(self, run: Run) -> None:
-        """Begin the first part. That nothing can be recorded is `trouble`, and does not stop a run."""
+        """Begin the first part. That nothing can be recorded is its `status`, and does not stop a run."""
         if not run.live:
             return
         self._run, self._session = run, uuid.uuid4().hex
@@ -118,8 +118,8 @@ class Recorder(Tap):
         if writer is None:
             if now_s >= self._stopped_s + AGAIN_S and self._free_bytes() > 2 * self.reserve_mb * MB:
                 self._begin_part()
-        elif writer.trouble is not None:
-            self._give_up(writer.trouble)
+        elif writer.status is not None:
+            self._give_up(writer.status)
         elif self._free_bytes() < self.reserve_mb * MB:
             self._give_up(f"less than {self.reserve_mb:g} MB are free at {writer.path.parent}: make room")
         elif now_s - self._part_s >= self.split_s or self._intake.part_bytes >= self.split_mb * MB:
@@ -151,7 +151,7 @@ class Recorder(Tap):
             return
         self._parts += 1
         before = self._swap(writer)
-        self._part_s, self._trouble = time.monotonic(), None
+        self._part_s, self._status = time.monotonic(), None
         self._end_part(before)
 
     def _path(self, folder: Path, part: int) -> Path:
@@ -171,11 +171,11 @@ class Recorder(Tap):
         try:
             writer.close()
         except LinkError as error:
-            self._trouble = self._trouble or str(error)
+            self._status = self._status or str(error)
         self._before = self._before[0] + writer.written, self._before[1] + writer.dropped
 
     def _give_up(self, why: str) -> None:
-        self._trouble = f"{why}; nothing is recorded now, the run goes on"
+        self._status = f"{why}; nothing is recorded now, the run goes on"
         self._stopped_s = time.monotonic()
         self._end_part(self._swap(None))
 

@@ -155,9 +155,9 @@ class Receiver(link.Source):
         return counts
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """What is wrong on the way from the other host."""
-        return None if self._connection is None else self._connection.trouble_with(self.sender)
+        return None if self._connection is None else self._connection.status_of(self.sender)
 
 
 def _until(closing: threading.Event, records: queue.Queue[Record]) -> Iterator[Record]:

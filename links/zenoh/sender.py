@@ -90,17 +90,17 @@ class Sender(link.Source):
         return totals
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """What is wrong on the way to the other host."""
         if self._connection is None:
             return None
-        wrong = self._connection.trouble_with(self.to)
+        wrong = self._connection.status_of(self.to)
         if wrong is not None or self._connection.clocks[self.to].answered_ns is None:
             return wrong
         unheard = [lane.key for lane in self._lanes.values() if not lane.heard]
         if unheard:
             return f"{self.to} does not listen to {', '.join(unheard)}: is it running, with the same hosts file?"
-        return next((lane.trouble for lane in self._lanes.values() if lane.trouble), None)
+        return next((lane.status for lane in self._lanes.values() if lane.status), None)
 
 
 def _nothing_until(closing: threading.Event) -> Iterator[Record]:

@@ -228,12 +228,12 @@ def test_from_ctrl_c_to_the_end_of_the_process_it_takes_less_than_two_seconds(tm
     assert min(took_s) < 2.0, took_s
 
 
-@pytest.mark.parametrize("trouble", [OSError(28, "No space left on device"), SystemExit(1)])
-def test_a_terminal_that_takes_no_more_ends_no_run(grd, tmp_path, trouble):
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), SystemExit(1)])
+def test_a_terminal_that_takes_no_more_ends_no_run(grd, tmp_path, error):
     """A log on a full disk, or a pipe whose reader has gone (rich ends the program then)."""
 
     def show(look):
-        raise trouble
+        raise error
 
     asked = Asked(Path("ticks.yaml"), (), ())
     finished = run_live(tmp_path / "run", asked, live_graph(asked), show, 2.0)

@@ -33,7 +33,7 @@ def main(folder: Path) -> None:
     live.start()
     collector = live.nodes["collector"]
     numbers = 0
-    while recorder.trouble is None:  # a number is a record of 1 to 1000 digits; they do not shrink to nothing
+    while recorder.status is None:  # a number is a record of 1 to 1000 digits; they do not shrink to nothing
         for _ in range(50):
             numbers += 1
             live.nodes["line"].put(f"{numbers}.{hash(('a', numbers)) ** 40}"[:1000])

@@ -177,7 +177,7 @@ def test_a_lossless_recording_has_the_same_bytes_each_time(tmp_path: Path):
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
-# ---- writing into trouble
+# ---- writing that fails
 
 
 def test_an_existing_file_is_kept_unless_overwriting_is_allowed(tmp_path: Path):
@@ -305,7 +305,7 @@ def test_a_disk_that_fills_up_is_told_at_close_and_what_is_on_it_can_be_read(tmp
         writer.write(lidar(i, T0 + i))
     with pytest.raises(LinkError, match=r"No space left on device after .* free space; `grd recover"):
         writer.close()
-    assert writer.trouble
+    assert writer.status
     assert writer.written + writer.dropped == 5000
     report = recover(path)
     assert report.records < 5000

@@ -93,7 +93,7 @@ def test_on_a_line_too_narrow_the_newest_picture_comes_and_small_messages_overta
         assert max(abs(b["late_ms"] - b["true_late_ms"]) for b in beats) < 25.0
 
         ip("-n", drone_side, "link", "set", end, "down")
-        vehicle.until_trouble("beats", "has not answered for")
+        vehicle.until_status("beats", "has not answered for")
         ip("-n", drone_side, "link", "set", end, "up")
         vehicle.until(lambda said: said["kind"] == "picture" and said["late_ms"] < 8 * PICTURE_MS)
-        vehicle.until_trouble("beats", None)
+        vehicle.until_status("beats", None)

@@ -18,7 +18,9 @@ from flow.link import LinkError
 from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
 from links.cli.run import Overlay, Sets
 from links.live_run import live_graph
-from links.preflight import OUT_DIR, Level, Step, Verdict, is_go, preflight_live, preflight_recording
+from links.preflight.check_result import CheckResult, Level, is_go
+from links.preflight.hand_motion import HandMotion
+from links.preflight.preflight import OUT_DIR, preflight_live, preflight_recording
 from links.recording import Session
 from links.run_folder import Asked
 
@@ -59,41 +61,39 @@ def preflight(
     """
     asked = Asked(config, tuple(overlay or ()), tuple(sets or ()))
     if recording is None:
-        verdicts = _told(preflight_live(live_graph(asked), for_s, _wait, _ask if motion else None, step_s, out_dir))
+        results = _told(preflight_live(live_graph(asked), for_s, _wait, _ask if motion else None, step_s, out_dir))
     else:
-        verdicts = _on_recording(asked, recording, motion)
-    failed = [v for v in verdicts if v.level is Level.FAIL]
-    looks = sum(v.level is Level.WARNING for v in verdicts)
+        results = _on_recording(asked, recording, motion)
+    failed = [v for v in results if v.level is Level.FAIL]
+    looks = sum(v.level is Level.WARNING for v in results)
     more = f"; {looks} to look at" if looks else ""
-    if is_go(verdicts):
-        out.print(Text(f"GO: {len(verdicts)} checks, none forbids the flight{more}", style="bold green"))
+    if is_go(results):
+        out.print(Text(f"GO: {len(results)} checks, none forbids the flight{more}", style="bold green"))
         return
     names = ", ".join(v.name for v in failed)
-    out.print(Text(f"NO-GO: {len(failed)} of {len(verdicts)} checks failed ({names}){more}", style="bold red"))
+    out.print(Text(f"NO-GO: {len(failed)} of {len(results)} checks failed ({names}){more}", style="bold red"))
     raise typer.Exit(FINDING)
 
 
-def _on_recording(asked: Asked, recording: Path, motion: bool) -> list[Verdict]:
+def _on_recording(asked: Asked, recording: Path, motion: bool) -> list[CheckResult]:
     session = Session(recording)
     graph = asked.graph(session.rig_yaml, f"{recording} (rig.yaml)")
     with progress_bar(f"look through {recording.name}") as step:
-        verdicts = list(preflight_recording(graph, session, motion, step))
+        results = list(preflight_recording(graph, session, motion, step))
     for text in session.warnings:
         warn(text)
     if len(session.parts) > 1:
         out.print(f"{len(session.parts)} parts of the recording, looked through together")
-    return _told(iter(verdicts))
+    return _told(iter(results))
 
 
-def _told(verdicts: Iterator[Verdict]) -> list[Verdict]:
-    """Each verdict in a line, as it is known."""
-    told: list[Verdict] = []
-    for verdict in verdicts:
-        line = Text(f"{WORDS[verdict.level]:<6}", style=COLOURS[verdict.level]).append(
-            f"{verdict.name}: ", style="bold"
-        )
-        out.print(line.append(verdict.sentence, style="default"))
-        told.append(verdict)
+def _told(results: Iterator[CheckResult]) -> list[CheckResult]:
+    """Each result in a line, as it is known."""
+    told: list[CheckResult] = []
+    for result in results:
+        line = Text(f"{WORDS[result.level]:<6}", style=COLOURS[result.level]).append(f"{result.name}: ", style="bold")
+        out.print(line.append(result.sentence, style="default"))
+        told.append(result)
     if not told:
         raise LinkError("this configuration has nothing to check")
     return told
@@ -103,8 +103,8 @@ def _wait(seconds: float) -> None:
     time.sleep(seconds)
 
 
-def _ask(step: Step) -> None:
+def _ask(motion: HandMotion) -> None:
     """Say what to do; a person at a terminal says when they begin."""
-    err.print(step.ask, markup=False, style="bold")
+    err.print(motion.ask, markup=False, style="bold")
     if sys.stdin.isatty():
         typer.prompt("Enter when you begin", default="", show_default=False, err=True)

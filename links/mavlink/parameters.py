@@ -11,8 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from flow.link import LinkError
 from links.clock import host_time
-from links.mavlink.connection import Connection
+from links.mavlink.autopilot import Autopilot
+from links.mavlink.connection import Connection, parse_connection
+from links.mavlink.lines import open_connection
+from links.mavlink.profiles import PROFILES
 from links.mavlink.signing import Signer
 from links.mavlink.wire import V1, FrameSplitter, dialect, header, packed
 
@@ -29,6 +33,31 @@ class Answers:
     values: dict[str, float] = field(default_factory=dict[str, float])
     missing: list[str] = field(default_factory=list[str])
     heard: int = 0  # frames from it at all: 0, and it is not there
+
+
+def ask_parameters(link: Autopilot, timeout_s: float = 5.0) -> Answers:
+    """Ask for what the profile wants, over a connection of its own: `link` must not be listening. LinkError."""
+    if link.connection is None:
+        raise LinkError("no connection to the autopilot: set `connection`, as in udpin:127.0.0.1:14550")
+    profile = PROFILES[link.profile]
+    signer = None if link.signing_key is None else Signer(link.signing_key, host_time.now_ns())
+    if signer is not None and signer.status is not None:
+        raise LinkError(signer.status)
+    connection = open_connection(parse_connection(link.connection), link.sender)
+    try:
+        return read_parameters(
+            connection,
+            [wanted.name for wanted in profile.wanted],
+            (link.system_id, link.component_id),
+            (link.own_system_id or link.system_id, link.own_component_id),
+            integers_bytewise=profile.integers_bytewise,
+            timeout_s=timeout_s,
+            signer=signer,
+        )
+    finally:
+        connection.close()
+        if signer is not None:
+            signer.close()
 
 
 def read_parameters(

@@ -13,7 +13,7 @@ from flow.stage import output_ports
 from stages.messages import DroneFix, RelativePose
 
 
-def listening(graph: Graph) -> Graph:
+def sources_only(graph: Graph) -> Graph:
     """The sources alone: nothing moves, nothing is computed."""
     return replace(graph, nodes={n: s for n, s in graph.nodes.items() if issubclass(s.cls, Source)}, edges=())
 
@@ -24,7 +24,7 @@ def tracking(graph: Graph) -> Graph:
     wanted = {name for name, spec in graph.nodes.items() if DroneFix in output_ports(spec.cls).values()}
     while more := {edge.producer for edge in edges if edge.consumer in wanted} - wanted:
         wanted |= more
-    wanted |= set(listening(graph).nodes)
+    wanted |= set(sources_only(graph).nodes)
     nodes = {name: spec for name, spec in graph.nodes.items() if name in wanted}
     return replace(graph, nodes=nodes, edges=tuple(e for e in edges if {e.producer, e.consumer} <= set(nodes)))
 

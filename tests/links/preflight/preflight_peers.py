@@ -15,7 +15,6 @@ from flow.link import Record
 from flow.stage import Stage
 from links.mavlink.profiles import PROFILES
 from links.mavlink.wire import packed, parse_frame
-from links.preflight.heard import Ear, Heard
 from links.simulated.autopilot import Autopilot, AutopilotSettings
 from links.simulated.flight import Flight
 from links.simulated.path import Path, Waypoint
@@ -175,15 +174,3 @@ def film(file, seconds: float = 12.0, size: int = 64, fps: int = 15) -> None:
     for number in range(int(seconds * fps)):
         video.write(np.full((size, size, 3), number % 200, np.uint8))
     video.release()
-
-
-def hear(link, records, *, counters=None, status=None, live=True, end_ns=None) -> Heard:
-    """What a preflight has of one link after these records, each decoded."""
-    ear = Ear()
-    ear.attach({"it": link})
-    for record in records:
-        ear.record(record)
-        link.decode(record)
-    last_ns = records[-1].arrival_ns if records else 0
-    told = dict(link.counters) | (counters or {})
-    return Heard("it", link, ear.seen("it"), told, status, last_ns if end_ns is None else end_ns, live)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from links.preflight.axes import compare, compare_paths
-from links.preflight.by_hand import STEPS, hand_check
-from links.preflight.heard import AllHeard
-from links.preflight.motion import (
+from links.preflight.check_result import Level
+from links.preflight.hand_motion import MOTIONS, check_motion
+from links.preflight.motion_checks import (
     gravity_check,
     heading_check,
     motion_checks,
@@ -18,7 +18,7 @@ from links.preflight.motion import (
     turning_check,
     velocity_check,
 )
-from links.preflight.verdict import Level
+from links.preflight.observations import Observations
 from stages.geometry import rotation_from_rpy_deg, rotation_z
 from stages.messages import DroneAttitude, DroneFix, DroneImu, DroneLocalPosition, DroneOdometry, VehicleMotion
 
@@ -218,7 +218,7 @@ def test_a_vehicle_that_drives_needs_its_odometry():
 
 
 def test_nothing_heard_is_said_and_nothing_is_judged():
-    found = list(motion_checks(AllHeard((), {}, live=True)))
+    found = list(motion_checks(Observations((), {}, live=True)))
     assert found
     assert {v.level for v in found} == {Level.WARNING}
     assert all("not checked" in v.sentence for v in found)
@@ -234,24 +234,24 @@ def held(roll=0.0, pitch=0.0, yaw=0.0, frame=None):
     ]
 
 
-MOTIONS = {"nose down": {"pitch": 30}, "right side down": {"roll": 30}, "turn left": {"yaw": 80}}
+TURNS = {"nose down": {"pitch": 30}, "right side down": {"roll": 30}, "turn left": {"yaw": 80}}
 
 
-@pytest.mark.parametrize("step", [s for s in STEPS if s.measure], ids=lambda s: s.what)
+@pytest.mark.parametrize("step", [s for s in MOTIONS if s.measure], ids=lambda s: s.what)
 def test_a_motion_by_hand_is_told_with_its_sign(step):
-    right = MOTIONS[step.what]
-    assert hand_check(step, held(**right)).level is Level.OK
-    opposite = hand_check(step, held(**{axis: -angle for axis, angle in right.items()}))
+    right = TURNS[step.what]
+    assert check_motion(step, held(**right)).level is Level.OK
+    opposite = check_motion(step, held(**{axis: -angle for axis, angle in right.items()}))
     assert opposite.level is Level.FAIL
     assert "the opposite" in opposite.sentence
-    assert "no such motion" in hand_check(step, held()).sentence
-    assert hand_check(step, []).level is Level.FAIL
-    other = next(s.what for s in STEPS if s is not step)
-    assert f"'{other}'" in hand_check(step, held(**MOTIONS[other])).sentence
+    assert "no such motion" in check_motion(step, held()).sentence
+    assert check_motion(step, []).level is Level.FAIL
+    other = next(s.what for s in MOTIONS if s is not step)
+    assert f"'{other}'" in check_motion(step, held(**TURNS[other])).sentence
 
 
 def test_an_autopilot_mounted_a_quarter_turn_off_is_found_by_hand_alone():
-    nose, right_side = STEPS[0], STEPS[1]
+    nose, right_side = MOTIONS[0], MOTIONS[1]
     quarter = rotation_z(math.pi / 2)
-    assert "'right side down'" in hand_check(nose, held(pitch=30, frame=quarter)).sentence
-    assert "'nose down'" in hand_check(right_side, held(roll=30, frame=quarter)).sentence
+    assert "'right side down'" in check_motion(nose, held(pitch=30, frame=quarter)).sentence
+    assert "'nose down'" in check_motion(right_side, held(roll=30, frame=quarter)).sentence

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from flow.graph import Graph, load_graph
 from links.cli.app import app
-from links.preflight import Level, is_go, preflight_live
+from links.preflight.check_result import Level, is_go
+from links.preflight.preflight import preflight_live
 from links.simulated.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot_socket import AutopilotSocket
 from links.simulated.dynamixel_emulator import DynamixelEmulator

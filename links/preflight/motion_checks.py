@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from flow.message import Message
 from links.preflight.axes import Agreement, compare, compare_paths
-from links.preflight.heard import AllHeard
-from links.preflight.verdict import Verdict, fail, ok, warning
+from links.preflight.check_result import CheckResult, fail, ok, warning
+from links.preflight.observations import Observations
 from stages.geometry import Array64
 from stages.messages import (
     DroneAttitude,
@@ -50,10 +50,10 @@ N = TypeVar("N", bound=Message)
 Rotated = DroneAttitude | DroneOdometry
 
 
-def motion_checks(heard: AllHeard) -> Iterator[Verdict]:
+def motion_checks(observations: Observations) -> Iterator[CheckResult]:
     """All comparisons; each says where there was too little to tell."""
-    attitudes, odometry = heard.all(DroneAttitude), heard.all(DroneOdometry)
-    imu, positions = heard.all(DroneImu), heard.all(DroneLocalPosition)
+    attitudes, odometry = observations.all(DroneAttitude), observations.all(DroneOdometry)
+    imu, positions = observations.all(DroneImu), observations.all(DroneLocalPosition)
     rotated: Sequence[Rotated] = attitudes or odometry
     yield gravity_check(rotated, imu)
     yield turning_check("attitude's turn rates", rotated, rotated)
@@ -63,10 +63,10 @@ def motion_checks(heard: AllHeard) -> Iterator[Verdict]:
         yield heading_check(attitudes, odometry)
         yield velocity_check(odometry)
     path = positions or odometry
-    yield path_check(heard.all(DroneFix), heard.all(VehicleMotion), path)
+    yield path_check(observations.all(DroneFix), observations.all(VehicleMotion), path)
 
 
-def gravity_check(rotated: Sequence[Rotated], imu: Sequence[DroneImu]) -> Verdict:
+def gravity_check(rotated: Sequence[Rotated], imu: Sequence[DroneImu]) -> CheckResult:
     """At rest an accelerometer measures the vertical, upwards: f = R_local_drone^T (0, 0, g)."""
     name = "axes: accelerometer"
     at_rest = [m for m in imu if abs(float(np.linalg.norm(m.acceleration_drone_mps2)) - G_MPS2) < REST_MPS2]
@@ -88,7 +88,7 @@ def gravity_check(rotated: Sequence[Rotated], imu: Sequence[DroneImu]) -> Verdic
     return ok(name, f"agrees with the attitude to {np.degrees(off_rad):.1f} deg{_along(agreed.seen)}")
 
 
-def turning_check(what: str, rotated: Sequence[Rotated], rates: Sequence[DroneImu | Rotated]) -> Verdict:
+def turning_check(what: str, rotated: Sequence[Rotated], rates: Sequence[DroneImu | Rotated]) -> CheckResult:
     """Turn rates [rad/s], averaged over a step, against log(R_before^T R_after) / time, drone axes."""
     name = f"axes: {what}"
     steps = _steps(rotated)
@@ -106,7 +106,7 @@ def turning_check(what: str, rotated: Sequence[Rotated], rates: Sequence[DroneIm
     return _judged(name, compare(np.array(changed), np.array(told), LEAST_RADPS), "how the attitude changes", "turned")
 
 
-def heading_check(attitudes: Sequence[DroneAttitude], odometry: Sequence[DroneOdometry]) -> Verdict:
+def heading_check(attitudes: Sequence[DroneAttitude], odometry: Sequence[DroneOdometry]) -> CheckResult:
     """ODOMETRY and ATTITUDE tell one rotation."""
     name = "axes: odometry's rotation"
     off = [
@@ -121,7 +121,7 @@ def heading_check(attitudes: Sequence[DroneAttitude], odometry: Sequence[DroneOd
     return ok(name, f"agrees with ATTITUDE to {off_deg:.1f} deg")
 
 
-def velocity_check(odometry: Sequence[DroneOdometry]) -> Verdict:
+def velocity_check(odometry: Sequence[DroneOdometry]) -> CheckResult:
     """R_local_drone v_drone against the change of position, local axes."""
     name = "axes: odometry's velocity"
     changed, told = [], []
@@ -137,7 +137,7 @@ def velocity_check(odometry: Sequence[DroneOdometry]) -> Verdict:
 
 def path_check(
     fixes: Sequence[DroneFix], motions: Sequence[VehicleMotion], positions: Sequence[DroneLocalPosition | DroneOdometry]
-) -> Verdict:
+) -> CheckResult:
     """Where the LiDAR saw the drone, in the vehicle's start frame, against the autopilot's own positions."""
     name = "axes: LiDAR and autopilot"
     seen, told = [], []
@@ -159,7 +159,7 @@ def path_check(
     return _judged(name, agreed, "the autopilot's path", "carried along a curve")
 
 
-def _judged(name: str, agreed: Agreement, other: str, done: str) -> Verdict:
+def _judged(name: str, agreed: Agreement, other: str, done: str) -> CheckResult:
     if agreed.wrong:
         return fail(name, f"does not agree with {other} along {', '.join(agreed.wrong)}{_told(agreed)}")
     if not agreed.seen:

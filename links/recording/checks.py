@@ -6,22 +6,39 @@ Source: ours; the LiDAR's rate is measured on live recordings of an hour.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
-from links.camera import Camera
-from links.preflight.heard import AllHeard, Heard
-from links.preflight.verdict import Verdict, fail, ok, warning
-from links.recording import Recorder
-from links.velodyne import Lidar
+from flow.graph import Graph
+from links.preflight.check_result import CheckResult, fail, ok, warning
+from links.preflight.link_checks import LinkChecks, declares
+from links.preflight.observations import Observations
+from links.recording.recorder import Recorder
 
 FLIGHT_H = 1.0  # a flight that shall fit
-LIDAR_KEPT = 0.43  # of the packets' bytes, zstd: 0.91 MB/s come, 1.4 GB an hour stay
-LIDAR_GB_H, CAMERA_GB_H = 1.4, 5.0  # of one that was not heard; a 720 px fisheye at 10 Hz, JPEG
 LEAST_GB_H = 0.1  # orders, results and what else a run writes
 GB, MB = 1e9, 1e6
 
 
-def disk_check(recorder: Recorder, heard: AllHeard, out_dir: Path) -> Verdict:
+class RecorderChecks(LinkChecks):
+    """Checks of the recorder."""
+
+    link_class = Recorder
+
+    def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
+        """A recorder is optional."""
+        if not declares(graph, Recorder):
+            yield warning("recorder", "not in this configuration: the flight will not be recorded")
+
+    def check_device(self, graph: Graph, observations: Observations, out_dir: Path) -> Iterator[CheckResult]:
+        """Free disk space of a live run."""
+        if observations.live:
+            for recorder in (spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Recorder)):
+                assert isinstance(recorder, Recorder)
+                yield disk_check(recorder, observations, out_dir)
+
+
+def disk_check(recorder: Recorder, observations: Observations, out_dir: Path) -> CheckResult:
     """The free room where a run's folder would be, against what the recorder keeps free and what an hour takes."""
     name, folder = "disk", existing(out_dir)
     try:
@@ -35,7 +52,8 @@ def disk_check(recorder: Recorder, heard: AllHeard, out_dir: Path) -> Verdict:
             f"{free} free at {folder}, and the recorder leaves {_amount(MB * recorder.reserve_mb)} free (reserve_mb): "
             "nothing would be recorded; make room, or give another disk with --out",
         )
-    rates_gb_h = {part.name: rate_gb_h(part) for part in heard.of(Lidar) + heard.of(Camera)}
+    rates = {source.name: source.observation.recorded_gb_per_hour for source in observations.sources}
+    rates_gb_h = {name: rate for name, rate in rates.items() if rate is not None}
     told = ", ".join(f"{source} {rate:.1f}" for source, rate in rates_gb_h.items())
     if not rates_gb_h:
         return ok(name, f"{free} free at {folder}; no LiDAR and no camera fills it")
@@ -47,16 +65,6 @@ def disk_check(recorder: Recorder, heard: AllHeard, out_dir: Path) -> Verdict:
             name, f"{text}, so it is full after {60 * hours:.0f} min: make room, or give another disk with --out"
         )
     return ok(name, f"{text}, so it lasts {hours:.1f} h")
-
-
-def rate_gb_h(part: Heard) -> float:
-    """What a source's records take on the disk in an hour [GB]: as heard, or as taken of its kind."""
-    lidar, arrivals = isinstance(part.link, Lidar), part.seen.arrivals
-    span_ns = arrivals.last_ns - arrivals.first_ns
-    if arrivals.count < 2 or span_ns <= 0:
-        return LIDAR_GB_H if lidar else CAMERA_GB_H
-    came_gb_h = arrivals.data_bytes * (arrivals.count - 1) / arrivals.count / GB * 3600e9 / span_ns
-    return LIDAR_KEPT * came_gb_h if lidar else came_gb_h
 
 
 def existing(folder: Path) -> Path:

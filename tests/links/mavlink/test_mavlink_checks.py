@@ -1,29 +1,24 @@
-"""The autopilot's checks by frames made by hand, and what a configuration lacks."""
+"""The autopilot's checks by frames made by hand."""
 
 from __future__ import annotations
 
 import dataclasses
 import errno
 import os
-from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as m
 
-from flow.graph import load_graph
 from flow.link import LinkError, Record
 from links.mavlink import Autopilot
-from links.mavlink.parameters import Answers
+from links.mavlink.checks import autopilot_checks, parameter_check
+from links.mavlink.parameters import Answers, ask_parameters
 from links.mavlink.wire import packed
-from links.preflight.autopilot import autopilot_checks
-from links.preflight.graphs import listening, tracking
-from links.preflight.parameters import ask_parameters, parameter_check
-from links.preflight.preflight import absences
-from links.preflight.verdict import Level
+from links.preflight.check_result import Level
 from stages.messages import AutopilotEstimator, AutopilotStatus
-from tests.links.preflight.preflight_peers import good_parameters, hear
+from tests.links.preflight.observed import observe
+from tests.links.preflight.preflight_peers import good_parameters
 
-CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 BEGIN_NS, S, MS = 1_748_773_230_000_000_000, 1_000_000_000, 1_000_000
 
 
@@ -81,8 +76,8 @@ SAID, ESTIMATORS = status(), (estimator(),)
 
 
 def check(records, *, said=SAID, estimators=ESTIMATORS, **kinds):
-    heard = hear(Autopilot(), records, **kinds)
-    return {v.name: v for v in autopilot_checks(heard, [said] if records else [], estimators)}
+    source = observe(Autopilot(), records, **kinds)
+    return {v.name: v for v in autopilot_checks(source, [said] if records else [], estimators)}
 
 
 def test_an_autopilot_that_says_all_we_need_is_good():
@@ -194,38 +189,6 @@ def test_a_disk_that_takes_no_signing_time_is_no_go_on_the_ground(tmp_path, monk
     monkeypatch.setattr("links.mavlink.signing.os.fsync", full)
     with pytest.raises(LinkError, match="signing time cannot be written: No space left"):
         ask_parameters(Autopilot(connection="udpin:127.0.0.1:0", signing_key=key))
-
-
-def test_what_a_configuration_lacks_is_said():
-    field = load_graph(CONFIGS / "field.yaml")
-    assert list(absences(field, field.values["rig"])) == []
-    names = ("lidar", "servo", "odometry", "autopilot", "recorder", "camera_vehicle", "camera_drone")
-    bare = field.__class__(
-        {n: s for n, s in field.nodes.items() if n not in names and s.kind == "links"}, (), None, field.values
-    )
-    found = {v.name: v.level.value for v in absences(bare, field.values["rig"])}
-    assert found == {
-        "lidar": "fail",
-        "servo": "fail",
-        "stages": "fail",
-        "cameras": "warning",
-        "autopilot": "warning",
-        "vehicle odometry": "warning",
-        "recorder": "warning",
-    }
-    bolted = {v.name: v.level.value for v in absences(bare, {"lidar": {"mount": {"turns": False}}})}
-    assert bolted["servo"] == "ok"
-
-
-def test_no_pose_goes_out_and_while_listening_nothing_moves():
-    field = load_graph(CONFIGS / "field.yaml")
-    assert listening(field).edges == ()
-    assert all(spec.kind == "links" for spec in listening(field).nodes.values())
-    seeing = tracking(field)
-    assert "fuse" not in seeing.nodes
-    assert not any(edge.consumer == "autopilot" for edge in seeing.edges)
-    assert any((edge.producer, edge.consumer) == ("aim", "servo") for edge in seeing.edges)
-    assert {"lidar", "servo", "camera_drone", "detect", "track"} <= set(seeing.nodes)
 
 
 def test_how_fast_its_clock_runs_away_is_told_where_it_is_known():

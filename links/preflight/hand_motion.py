@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from links.preflight.verdict import Verdict, fail, ok
+from links.preflight.check_result import CheckResult, fail, ok
 from stages.geometry import Array64
 from stages.messages import DroneAttitude, DroneOdometry
 
@@ -37,7 +37,7 @@ def turned_left_rad(rotations: Array64) -> Array64:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class HandMotion:
     """One motion that is asked for."""
 
     ask: str
@@ -45,29 +45,33 @@ class Step:
     measure: Callable[[Array64], Array64] | None  # grows with the motion; None: judged by the paths
 
 
-STEPS = (
-    Step("Tip the drone's nose DOWN by about 30 degrees, then level it again.", "nose down", nose_down_rad),
-    Step("Tip its RIGHT side down by about 30 degrees, then level it again.", "right side down", right_down_rad),
-    Step("Turn it to the LEFT by about 90 degrees (counter-clockwise seen from above).", "turn left", turned_left_rad),
-    Step("Carry it in a circle 3 m across where the LiDAR sees it, and lift it by 1 m on the way.", "carry", None),
+MOTIONS = (
+    HandMotion("Tip the drone's nose DOWN by about 30 degrees, then level it again.", "nose down", nose_down_rad),
+    HandMotion("Tip its RIGHT side down by about 30 degrees, then level it again.", "right side down", right_down_rad),
+    HandMotion(
+        "Turn it to the LEFT by about 90 degrees (counter-clockwise seen from above).", "turn left", turned_left_rad
+    ),
+    HandMotion(
+        "Carry it in a circle 3 m across where the LiDAR sees it, and lift it by 1 m on the way.", "carry", None
+    ),
 )
 
 
-def hand_check(step: Step, rotated: Sequence[Rotated]) -> Verdict:
-    """Whether the attitudes during a step tell the motion that was asked for, against where they began."""
-    name = f"by hand: {step.what}"
-    assert step.measure is not None
+def check_motion(motion: HandMotion, rotated: Sequence[Rotated]) -> CheckResult:
+    """Whether the attitudes during a motion tell the motion that was asked for, against where they began."""
+    name = f"by hand: {motion.what}"
+    assert motion.measure is not None
     if len(rotated) < 2:
         return fail(name, "no attitude came meanwhile: check the autopilot's link")
     rotations = np.array([m.R_local_drone for m in rotated])
-    right, wrong = _peaks(step.measure(rotations))
+    right, wrong = _peaks(motion.measure(rotations))
     if max(right, wrong) >= ENOUGH_RAD:
         told = np.degrees(right if right >= wrong else -wrong)
         if right >= wrong:
             return ok(name, f"it told {told:.0f} deg")
         return fail(name, f"it told {told:.0f} deg, the opposite: check AHRS_ORIENTATION (PX4: SENS_BOARD_ROT)")
-    for other in STEPS:
-        if other.measure is not None and other is not step:
+    for other in MOTIONS:
+        if other.measure is not None and other is not motion:
             peak = max(_peaks(other.measure(rotations)))
             if peak >= ENOUGH_RAD:
                 return fail(

@@ -9,29 +9,29 @@ import pytest
 
 from flow.link import Record, Source
 from links.camera import Camera
-from links.preflight import Level
-from links.preflight.disk import disk_check, existing, rate_gb_h
-from links.preflight.heard import AllHeard, Heard
-from links.preflight.seen import Seen
+from links.preflight.check_result import Level
+from links.preflight.devices import checks_for
+from links.preflight.observations import Observations, ObservedSource
 from links.recording import Recorder
+from links.recording.checks import disk_check, existing
 from links.velodyne import Lidar
 
 LIDAR, CAMERA = Lidar.model_validate({}), Camera.model_validate({"topic": "/camera/drone"})
 
 
-def heard_of(link: Source, name: str, size: int = 0, rate_hz: float = 10.0, count: int = 0) -> Heard:
-    seen = Seen(link.topic)
+def observed(link: Source, name: str, size: int = 0, rate_hz: float = 10.0, count: int = 0) -> ObservedSource:
+    observation = checks_for(link).observation(link)
     for number in range(count):
         at_ns = round(1e9 * number / rate_hz)
-        seen.take(Record(link.topic, at_ns, at_ns, bytes(size)))
-    return Heard(name, link, seen, {}, None, 0, live=True)
+        observation.add(Record(link.topic, at_ns, at_ns, bytes(size)))
+    return ObservedSource(name, link, observation, {}, None, 0, live=True)
 
 
-def all_heard(*heard: Heard) -> AllHeard:
-    return AllHeard(heard, {}, live=True)
+def observations(*sources: ObservedSource) -> Observations:
+    return Observations(sources, {}, live=True)
 
 
-BOTH = all_heard(heard_of(LIDAR, "lidar"), heard_of(CAMERA, "camera_drone"))
+BOTH = observations(observed(LIDAR, "lidar"), observed(CAMERA, "camera_drone"))
 
 
 @pytest.fixture
@@ -45,24 +45,24 @@ def free(monkeypatch):
 
 
 def test_what_comes_from_a_source_tells_how_much_it_takes():
-    lidar = heard_of(LIDAR, "lidar", size=1206, rate_hz=754, count=1509)
-    assert rate_gb_h(lidar) == pytest.approx(0.43 * 1206 * 754 * 3600 / 1e9)
-    assert rate_gb_h(lidar) == pytest.approx(1.4, abs=0.02)
-    camera = heard_of(CAMERA, "camera_drone", size=100_000, rate_hz=20, count=41)
-    assert rate_gb_h(camera) == pytest.approx(100_000 * 20 * 3600 / 1e9)
+    lidar = observed(LIDAR, "lidar", size=1206, rate_hz=754, count=1509)
+    assert lidar.observation.recorded_gb_per_hour == pytest.approx(0.43 * 1206 * 754 * 3600 / 1e9)
+    assert lidar.observation.recorded_gb_per_hour == pytest.approx(1.4, abs=0.02)
+    camera = observed(CAMERA, "camera_drone", size=100_000, rate_hz=20, count=41)
+    assert camera.observation.recorded_gb_per_hour == pytest.approx(100_000 * 20 * 3600 / 1e9)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_source_that_was_not_heard_is_taken_as_the_usual_one(count):
-    assert rate_gb_h(heard_of(LIDAR, "lidar", 1206, count=count)) == 1.4
-    assert rate_gb_h(heard_of(CAMERA, "camera_drone", 9, count=count)) == 5.0
+    assert observed(LIDAR, "lidar", 1206, count=count).observation.recorded_gb_per_hour == 1.4
+    assert observed(CAMERA, "camera_drone", 9, count=count).observation.recorded_gb_per_hour == 5.0
 
 
 def test_less_than_the_recorder_leaves_free_is_no_go(free, tmp_path):
     free(199e6)
-    verdict = disk_check(Recorder(), BOTH, tmp_path)
-    assert verdict.level is Level.FAIL
-    assert verdict.sentence == (
+    result = disk_check(Recorder(), BOTH, tmp_path)
+    assert result.level is Level.FAIL
+    assert result.sentence == (
         f"199 MB free at {tmp_path}, and the recorder leaves 200 MB free (reserve_mb): nothing would be recorded; "
         "make room, or give another disk with --out"
     )
@@ -73,9 +73,9 @@ def test_less_than_the_recorder_leaves_free_is_no_go(free, tmp_path):
 
 def test_less_than_an_hour_takes_is_to_look_at_with_the_rate_and_the_minutes(free, tmp_path):
     free(3.4e9)
-    verdict = disk_check(Recorder(), BOTH, tmp_path)
-    assert verdict.level is Level.WARNING
-    assert verdict.sentence == (
+    result = disk_check(Recorder(), BOTH, tmp_path)
+    assert result.level is Level.WARNING
+    assert result.sentence == (
         f"3.4 GB free at {tmp_path}; a flight takes 6.4 GB an hour (lidar 1.4, camera_drone 5.0), so it is full after "
         "30 min: make room, or give another disk with --out"
     )
@@ -89,7 +89,7 @@ def test_room_for_an_hour_is_right_and_says_for_how_long(free, tmp_path):
     free(13e9)
     assert disk_check(Recorder(), BOTH, tmp_path).sentence.endswith("(lidar 1.4, camera_drone 5.0), so it lasts 2.0 h")
     free(1e9)
-    assert disk_check(Recorder(), all_heard(), tmp_path).level is Level.OK
+    assert disk_check(Recorder(), observations(), tmp_path).level is Level.OK
 
 
 def test_the_disk_is_that_of_the_folder_to_be_made(monkeypatch, tmp_path):
@@ -106,6 +106,6 @@ def test_a_disk_that_is_gone_is_no_go(monkeypatch, tmp_path):
         raise OSError(errno.ESTALE, "Stale file handle")
 
     monkeypatch.setattr("shutil.disk_usage", gone)
-    verdict = disk_check(Recorder(), BOTH, tmp_path)
-    assert verdict.level is Level.FAIL
-    assert "Stale file handle: is the disk there?" in verdict.sentence
+    result = disk_check(Recorder(), BOTH, tmp_path)
+    assert result.level is Level.FAIL
+    assert "Stale file handle: is the disk there?" in result.sentence

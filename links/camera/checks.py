@@ -1,0 +1,161 @@
+"""Is a camera as it must be: frames, their size against the rig's lens, their rate, and when they were exposed.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from flow.graph import Graph
+from flow.link import LinkError, Record, Source
+from links.camera.camera import Camera, jpeg_size
+from links.camera.capture import is_device, is_url
+from links.preflight.check_result import CheckResult, fail, ok, warning
+from links.preflight.link_checks import LinkChecks, declares
+from links.preflight.observations import Observation, Observations, ObservedSource
+from links.recording import decode_compressed_image
+
+LEAST_HZ = 1.0
+SILENT_S = 1.0  # a camera that gave pictures and then none for so long has died
+FULL_RATE = 0.5  # of what was asked of the device
+
+DEFAULT_GB_PER_HOUR = 5.0  # of a camera that sent nothing: a 720 px fisheye at 10 Hz, JPEG
+
+
+class CameraObservation(Observation):
+    """Sizes of the images."""
+
+    def __init__(self, topic: str) -> None:
+        super().__init__(topic)
+        self.sizes_px: Counter[tuple[int, int]] = Counter()
+
+    @property
+    def recorded_gb_per_hour(self) -> float:
+        """See Observation."""
+        received = self.records.data_gb_per_hour
+        return DEFAULT_GB_PER_HOUR if received is None else received
+
+    def add(self, record: Record) -> None:
+        """See Observation. Records that hold no image are counted by the link."""
+        super().add(record)
+        try:
+            self.sizes_px[jpeg_size(decode_compressed_image(record.data).data)] += 1
+        except (ValueError, LinkError):
+            return
+
+
+class CameraChecks(LinkChecks):
+    """Checks of a fisheye camera."""
+
+    link_class = Camera
+
+    def observation(self, source: Source) -> CameraObservation:
+        """See LinkChecks."""
+        return CameraObservation(source.topic)
+
+    def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
+        """Cameras are optional."""
+        if not declares(graph, Camera):
+            yield warning("cameras", "not in this configuration: the drone's rotation comes from its motion alone")
+
+    def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
+        """See LinkChecks."""
+        link, rig = source.link, observations.rig
+        assert isinstance(link, Camera)
+        return camera_checks(source, rig_size_px(rig, link), rig_readout_ms(rig, link))
+
+
+def rig_size_px(rig: Mapping[str, Any], link: Camera) -> tuple[int, int] | None:
+    """Width and height that a camera's lens was calibrated for: its own setting, or the rig's; None: neither is set."""
+    size: Any = link.size_px or _rig_camera(rig, link).get("size_px")
+    if size is None:
+        return None
+    return (size, size) if isinstance(size, int) else (int(size[0]), int(size[1]))
+
+
+def rig_readout_ms(rig: Mapping[str, Any], link: Camera) -> float | None:
+    """Readout time of a camera's rows: its own setting, or the rig's; None: neither is set (0 in a link: not set)."""
+    return link.readout_ms or _rig_camera(rig, link).get("readout_ms")
+
+
+def _rig_camera(rig: Mapping[str, Any], link: Camera) -> Mapping[str, Any]:
+    """The rig's entry for a camera: that with the last name of its topic."""
+    cameras: Mapping[str, Any] = rig.get("cameras") or {}
+    return cameras.get(link.topic.rpartition("/")[2]) or {}
+
+
+def camera_checks(
+    source: ObservedSource, rig_px: tuple[int, int] | None, readout_ms: float | None
+) -> Iterator[CheckResult]:
+    """All checks of one camera; `rig_px`: width, height that the lens was calibrated for; None: the rig is silent."""
+    link, observation = source.link, source.observation
+    assert isinstance(link, Camera)
+    assert isinstance(observation, CameraObservation)
+    if not observation.sizes_px:
+        refused = (
+            f"{observation.records.count} records came that hold no picture; " if observation.records.count else ""
+        )
+        yield fail(f"{source.name} frames", f"{refused}{source.no_data_reason}")
+        return
+    yield _rate(source, link)
+    yield _size(source.name, observation, rig_px)
+    yield _readout(source.name, link, readout_ms)
+    if source.live and link.source is not None and (is_device(link.source) or is_url(link.source)):
+        yield _latency(source.name, link)
+
+
+def _rate(source: ObservedSource, link: Camera) -> CheckResult:
+    name, arrivals = f"{source.name} frames", source.observation.records
+    refused = source.counters.get("refused", 0)
+    told = f"{arrivals.rate_hz:.1f} a second" if arrivals.count > 1 else "one frame"
+    text = told + (f", {refused} of {arrivals.count} damaged" if refused else "")
+    if not arrivals.rate_hz >= LEAST_HZ or (source.live and source.status):
+        why = source.status or "too slow for any motion"
+        return fail(name, f"{text}: {why}")
+    silent_s = arrivals.longest_silence_s(source.end_ns)
+    if source.live and silent_s > max(SILENT_S, 3.0 / arrivals.rate_hz):
+        return fail(name, f"{text}; then none came for {silent_s:.1f} s: check its cable and power")
+    if refused > 0.01 * arrivals.count:
+        return warning(name, f"{text}: check cable and hub")
+    if source.live and arrivals.rate_hz < FULL_RATE * link.fps:
+        return warning(
+            name, f"{text}, {link.fps:g} were asked for: is it too dark, the bus shared, this host too busy?"
+        )
+    return ok(name, text)
+
+
+def _size(name: str, observation: CameraObservation, rig_px: tuple[int, int] | None) -> CheckResult:
+    name = f"{name} size"
+    found = ", ".join(f"{w} x {h}" for w, h in observation.sizes_px)
+    if rig_px is None:
+        return warning(name, f"{found}; the rig does not say what the lens was calibrated for (size_px)")
+    if set(observation.sizes_px) != {rig_px}:
+        return fail(
+            name,
+            f"{found}, but the lens is calibrated for {rig_px[0]} x {rig_px[1]}: set the camera's mode, or calibrate "
+            "the lens in this one",
+        )
+    return ok(name, f"{found}, as the rig says")
+
+
+def _readout(name: str, link: Camera, readout_ms: float | None) -> CheckResult:
+    name = f"{name} readout"
+    if readout_ms is None:
+        key = f"cameras.{link.topic.rpartition('/')[2]}.readout_ms"
+        return warning(
+            name, f"the rig does not say how long the rows take: most shutters roll; set {key} in it (0: all at once)"
+        )
+    return ok(name, f"{readout_ms:g} ms from the first row to the last" if readout_ms else "all rows at once")
+
+
+def _latency(name: str, link: Camera) -> CheckResult:
+    if link.latency_s:
+        return ok(f"{name} latency", f"{1e3 * link.latency_s:g} ms from a picture's exposure to its arrival")
+    return warning(
+        f"{name} latency",
+        "latency_s is 0: pictures count as exposed when they arrive, and 80 ms of it cost 18 cm and 1 deg; film a "
+        f"clock on this host's screen, and set {name}.latency_s to how far its picture is behind (configs/field.yaml)",
+    )

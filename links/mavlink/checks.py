@@ -1,0 +1,270 @@
+"""Is the autopilot's link as it must be: heartbeat, clock, rates, losses, and what its EKF says it fuses.
+
+Source: https://mavlink.io/en/messages/common.html; ArduPilot and PX4 by `links.mavlink.profiles`; the limits are ours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from flow.graph import Graph
+from flow.link import LinkError, Record, Source
+from links.mavlink.autopilot import Autopilot
+from links.mavlink.parameters import Answers, ask_parameters
+from links.mavlink.profiles import PROFILES, ProfileName, findings
+from links.mavlink.wire import header, parse_frame
+from links.preflight.check_result import CheckResult, fail, ok, warning
+from links.preflight.link_checks import LinkChecks, declares
+from links.preflight.observations import Observation, Observations, ObservedSource
+from links.preflight.record_statistics import RecordStatistics
+from stages.drone_trail import BRIDGED_NS
+from stages.messages import AutopilotEstimator, AutopilotStatus, RelativePose
+
+KINDS = {"ardupilot": 3, "px4": 12}  # MAV_AUTOPILOT
+HEARTBEAT_GAP_S = 3.0
+SOME_LOSS, WORST_LOSS = 0.01, 0.2
+UNSURE_MS, USELESS_MS = 10.0, 50.0  # at 5 m/s 10 ms are 5 cm
+LEAST_HZ, GOOD_HZ = 4.0, 10.0
+MOST_GAP_S = 1e-9 * BRIDGED_NS
+NEAR_GATE = 0.5  # an innovation test ratio; at 1 the EKF refuses what it is told
+STEADY = "is the radio too far, or too slow for what is asked of it?"
+ASK = "ask for more (SRn_EXTRA1, SRn_POSITION of that port; PX4: its mavlink mode)"
+
+
+class AutopilotObservation(Observation):
+    """Message types of one autopilot, other senders on its connection, and its MAV_AUTOPILOT."""
+
+    def __init__(self, topic: str, sender: tuple[int, int]) -> None:
+        super().__init__(topic)
+        self._sender = sender
+        self.kinds: defaultdict[str, RecordStatistics] = defaultdict(RecordStatistics)
+        self.others: Counter[tuple[int, int]] = Counter()  # (system, component)
+        self.autopilot: int | None = None  # MAV_AUTOPILOT
+
+    def add(self, record: Record) -> None:
+        """See Observation. Damaged frames are counted by the link."""
+        super().add(record)
+        if record.topic != self.topic:
+            return
+        try:
+            frame: Any = parse_frame(record.data)
+        except ValueError:
+            return
+        sender, _ = header(record.data)
+        if sender != self._sender:
+            self.others[sender] += 1
+            return
+        self.kinds[frame.get_type()].add(record)
+        if frame.get_type() == "HEARTBEAT":
+            self.autopilot = int(frame.autopilot)
+
+
+class AutopilotChecks(LinkChecks):
+    """Checks of a MAVLink autopilot."""
+
+    link_class = Autopilot
+
+    def observation(self, source: Source) -> AutopilotObservation:
+        """See LinkChecks."""
+        assert isinstance(source, Autopilot)
+        return AutopilotObservation(source.topic, (source.system_id, source.component_id))
+
+    def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
+        """An autopilot is optional; one that gets no pose is reported."""
+        if not declares(graph, Autopilot):
+            yield warning("autopilot", "not in this configuration: nobody is told the pose, and the drone says nothing")
+        elif not any(
+            e.message is RelativePose and issubclass(graph.nodes[e.consumer].cls, Autopilot) for e in graph.edges
+        ):
+            yield warning("autopilot pose", "not wired (inputs: {pose: fuse.relative_pose}): the drone is told no pose")
+
+    def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
+        """See LinkChecks."""
+        return autopilot_checks(source, observations.all(AutopilotStatus), observations.all(AutopilotEstimator))
+
+    def check_device(self, graph: Graph, observations: Observations, out_dir: Path) -> Iterator[CheckResult]:
+        """The parameters of each autopilot that sent anything."""
+        for source in observations.of(Autopilot):
+            if not observations.live:
+                yield warning(f"{source.name} parameters", "a recording does not tell them: not checked")
+            elif isinstance(source.link, Autopilot) and source.observation.records.count:
+                yield _parameters(source.name, source.link)
+
+
+def autopilot_checks(
+    source: ObservedSource, statuses: Sequence[AutopilotStatus], estimators: Sequence[AutopilotEstimator]
+) -> Iterator[CheckResult]:
+    """All checks of one autopilot but its parameters and its axes."""
+    link, observation = source.link, source.observation
+    assert isinstance(link, Autopilot)
+    assert isinstance(observation, AutopilotObservation)
+    who = f"system {link.system_id}, component {link.component_id}"
+    if not observation.kinds["HEARTBEAT"].count or not statuses:
+        yield _silent(source, observation, who)
+        return
+    yield _heartbeat(source, link, observation, statuses[-1])
+    yield _losses(source)
+    yield _clock(source, statuses[-1])
+    yield _rates(source, observation)
+    yield _estimate(source.name, estimators)
+
+
+def _silent(source: ObservedSource, observation: AutopilotObservation, who: str) -> CheckResult:
+    name = f"{source.name} heartbeat"
+    if observation.others:
+        others = ", ".join(f"system {s} component {c}" for s, c in observation.others)
+        return fail(name, f"none from {who}, but {others} speak here: set system_id and component_id")
+    if sum(kind.count for kind in observation.kinds.values()):
+        return fail(
+            name, f"none from {who}, though it sends other messages: is its link set to MAVLink 2, is it booting?"
+        )
+    unsigned = source.counters.get("not signed with our key", 0)
+    if unsigned:
+        return fail(name, f"{unsigned} frames came that are not signed with our key: check signing_key on both sides")
+    old = source.counters.get("signed with our key, but not new", 0)
+    if old:
+        return fail(name, f"{old} frames came that are signed with an old time: does it hear us? Check both directions")
+    return fail(name, source.no_data_reason if source.status else f"no word from {who}: {source.no_data_reason}")
+
+
+def _heartbeat(
+    source: ObservedSource, link: Autopilot, observation: AutopilotObservation, status: AutopilotStatus
+) -> CheckResult:
+    name, beats = f"{source.name} heartbeat", observation.kinds["HEARTBEAT"]
+    silent_s = beats.longest_silence_s(source.end_ns)
+    wanted = KINDS[link.profile]
+    if (
+        observation.autopilot is not None
+        and observation.autopilot in KINDS.values()
+        and observation.autopilot != wanted
+    ):
+        says = next(kind for kind, number in KINDS.items() if number == observation.autopilot)
+        return fail(name, f"it says it is {says}, the configuration {link.profile}: set profile: {says}")
+    if status.failsafe:
+        return fail(name, "it says critical, emergency or termination: look at its own messages")
+    if source.live and status.armed:
+        return fail(name, "it is armed: disarm it before a preflight")
+    if source.live and silent_s > HEARTBEAT_GAP_S:
+        return fail(name, f"none for {silent_s:.1f} s: check the radio and its range")
+    rate = "one" if beats.count == 1 else f"{beats.rate_hz:.1f} a second"
+    if observation.autopilot not in KINDS.values():
+        return warning(name, f"{rate}, of MAV_AUTOPILOT {observation.autopilot}: only ArduPilot and PX4 are known")
+    return ok(name, f"{rate}, {link.profile}" + (", armed" if status.armed else ", disarmed"))
+
+
+def _losses(source: ObservedSource) -> CheckResult:
+    name, counters = f"{source.name} frames", source.counters
+    lost, came = counters.get("lost", 0), max(counters.get("decoded", 0) + counters.get("of no use here", 0), 1)
+    foreign = counters.get("from other senders", 0)
+    share = lost / (lost + came)
+    text = f"{lost} of {lost + came} lost" + (f", {foreign} datagrams from other senders ignored" if foreign else "")
+    if share > WORST_LOSS:
+        return fail(name, f"{text}: is the line too slow for what is asked of it, or the radio too far?")
+    return warning(name, text) if share > SOME_LOSS or foreign else ok(name, text)
+
+
+def _clock(source: ObservedSource, status: AutopilotStatus) -> CheckResult:
+    """TIMESYNC: the offset, and by how much it may be wrong at most."""
+    name = f"{source.name} clock"
+    restarts = source.counters.get("clock restarts", 0)
+    if restarts:
+        return fail(name, f"its clock began anew {restarts} times: did it reboot, or do two autopilots share one id?")
+    if status.clock_offset_ns is None:
+        return fail(name, "no message carried its time: ask for ATTITUDE")
+    if status.clock_uncertainty_ns is None:
+        named = source.counters.get("refused: timesync for another", 0)
+        why = "does it hear us (both ways)?" if not named else f"{named} name another: own_system_id, own_component_id?"
+        return warning(name, f"no TIMESYNC reply: a constant delay of the link stays unknown; {why}")
+    unsure_ms = 1e-6 * status.clock_uncertainty_ns
+    text = f"offset {1e-9 * status.clock_offset_ns:.3f} s to its time since boot, known to {unsure_ms:.1f} ms"
+    if status.clock_drift_ppm is not None and status.clock_drift_sigma_ppm is not None:
+        text += f", drifting by {status.clock_drift_ppm:.1f} +- {status.clock_drift_sigma_ppm:.1f} ppm"
+    if unsure_ms > USELESS_MS:
+        return fail(name, f"{text}: the link is too slow or too full; lower its rates or use a wire")
+    return (
+        warning(name, f"{text}: at 5 m/s that is {5 * unsure_ms / 10:.0f} cm")
+        if unsure_ms > UNSURE_MS
+        else ok(name, text)
+    )
+
+
+def _rates(source: ObservedSource, observation: AutopilotObservation) -> CheckResult:
+    """How often it tells what we need; a rate hides gaps, so the longest is looked at, too."""
+    name = f"{source.name} rates"
+
+    def hz(kind: str) -> float:
+        arrivals: RecordStatistics = observation.kinds[kind]
+        return 0.0 if math.isnan(arrivals.rate_hz) else arrivals.rate_hz
+
+    def gap(what: str, *kinds: str) -> str | None:
+        gap_s = min(observation.kinds[kind].longest_silence_s(source.end_ns) for kind in kinds)
+        return (
+            f"{text}; no {what} for {gap_s:.1f} s, {MOST_GAP_S:g} s at most: {STEADY}" if gap_s > MOST_GAP_S else None
+        )
+
+    kinds = ("ATTITUDE", "ODOMETRY", "LOCAL_POSITION_NED")
+    attitude, odometry, position = (hz(kind) for kind in kinds)
+    text = ", ".join(f"{kind} {hz(kind):.0f} Hz" for kind in kinds)
+    if max(attitude, odometry) < LEAST_HZ:
+        return fail(name, f"{text}: its attitude is needed at {GOOD_HZ:.0f} Hz or more: {ASK}")
+    turned = gap("attitude", "ATTITUDE", "ODOMETRY")
+    if turned is not None:
+        return fail(name, turned) if source.live else warning(name, turned)
+    if max(odometry, position) < LEAST_HZ:
+        return warning(
+            name, f"{text}: without its odometry the pose ends where the LiDAR does not see the drone: {ASK}"
+        )
+    moved = gap("odometry or position", "ODOMETRY", "LOCAL_POSITION_NED")
+    if moved is not None:
+        return warning(name, moved)
+    slow = max(attitude, odometry) < GOOD_HZ or max(odometry, position) < GOOD_HZ
+    return warning(name, f"{text}: slow; {ASK}") if slow else ok(name, text)
+
+
+def _estimate(name: str, estimators: Sequence[AutopilotEstimator]) -> CheckResult:
+    """What the EKF says of itself, as told last."""
+    name = f"{name} estimate"
+    if not estimators:
+        return warning(name, "its EKF does not report (EKF_STATUS_REPORT, ESTIMATOR_STATUS): " + ASK)
+    newest = estimators[-1]
+    ratios = {
+        "velocity": newest.velocity_ratio,
+        "position": newest.horizontal_ratio,
+        "height": newest.height_ratio,
+        "compass": newest.compass_ratio,
+    }
+    refused = [f"{what} ({ratio:.1f})" for what, ratio in ratios.items() if ratio > 1]
+    if not newest.attitude_good:
+        return fail(name, "its EKF has no attitude yet: keep it still and wait, then look at its own messages")
+    if refused:
+        return fail(name, f"its EKF refuses {', '.join(refused)}: is another source wrong, as its compass or GPS?")
+    if newest.constant_position or not newest.position_good:
+        return warning(name, "attitude good, no position: right before poses are sent; look again once grd run sends")
+    near = [f"{what} ({ratio:.1f})" for what, ratio in ratios.items() if ratio > NEAR_GATE]
+    if near:
+        return warning(name, f"{', '.join(near)} nearly refused by its EKF")
+    return ok(name, "attitude and position good, nothing near its gates")
+
+
+def _parameters(name: str, link: Autopilot) -> CheckResult:
+    try:
+        return parameter_check(name, link.profile, ask_parameters(link))
+    except LinkError as error:
+        return fail(f"{name} parameters", str(error))
+
+
+def parameter_check(name: str, profile: ProfileName, answers: Answers) -> CheckResult:
+    """One result that names every parameter that is wrong or did not answer."""
+    name = f"{name} parameters"
+    if not answers.heard:
+        return fail(name, "the autopilot did not answer")
+    if not answers.values:
+        return fail(name, "none was told: does it hear us, and may this link read parameters?")
+    wrong = findings(PROFILES[profile], answers.values)
+    if wrong:
+        return fail(name, "; ".join(wrong))
+    return ok(name, f"all {len(PROFILES[profile].wanted)} as {profile} needs them")

@@ -1,0 +1,44 @@
+"""The list of LinkChecks that a preflight applies. A new driver with checks of its own is added here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from flow.link import Link
+from links.camera.checks import CameraChecks
+from links.clock import Clock
+from links.dynamixel.checks import ServoChecks
+from links.mavlink.checks import AutopilotChecks
+from links.preflight.check_result import CheckResult
+from links.preflight.link_checks import LinkChecks
+from links.preflight.observations import Observations, ObservedSource
+from links.recording.checks import RecorderChecks
+from links.vehicle_odometry.checks import VehicleOdometryChecks
+from links.velodyne.checks import LidarChecks
+
+
+class ClockChecks(LinkChecks):
+    """The host's clock needs no check: it is not a device."""
+
+    link_class = Clock
+
+    def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
+        """No results."""
+        yield from ()
+
+
+DEVICES: tuple[LinkChecks, ...] = (
+    LidarChecks(),
+    ServoChecks(),
+    CameraChecks(),
+    AutopilotChecks(),
+    VehicleOdometryChecks(),
+    ClockChecks(),
+    RecorderChecks(),
+)
+_UNKNOWN = LinkChecks()
+
+
+def checks_for(link: Link) -> LinkChecks:
+    """The checks of a link's class."""
+    return next((checks for checks in DEVICES if isinstance(link, checks.link_class)), _UNKNOWN)

@@ -1,0 +1,51 @@
+"""Preflight checks of the vehicle's own odometry: rate, age, and records that hold no pose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from flow.graph import Graph
+from links.preflight.check_result import CheckResult, fail, ok, warning
+from links.preflight.link_checks import LinkChecks, declares
+from links.preflight.observations import Observations, ObservedSource
+from links.vehicle_odometry.odometry import VehicleOdometry
+
+OLD_MS = 200.0  # age of a pose
+ODOMETRY_HZ = 5.0
+ODOMETRY_SILENT_S = 1.0  # a sender that is silent for longer has stopped
+
+
+class VehicleOdometryChecks(LinkChecks):
+    """Checks of the vehicle's own odometry."""
+
+    link_class = VehicleOdometry
+
+    def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
+        """Vehicle odometry is optional."""
+        if not declares(graph, VehicleOdometry):
+            yield warning("vehicle odometry", "not in this configuration: the vehicle is taken to be parked")
+
+    def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
+        """See LinkChecks."""
+        assert isinstance(source.link, VehicleOdometry)
+        yield odometry_check(source, source.link)
+
+
+def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult:
+    """The vehicle's own odometry, where it has one."""
+    if source.live and link.port is None:
+        return warning(source.name, "it has no port: the vehicle is taken to be parked")
+    records = source.observation.records
+    if not records.count:
+        text = f"{source.no_data_reason}: the vehicle would be taken to be parked"
+        return fail(source.name, f"{text}; start it, or set port: null") if source.live else warning(source.name, text)
+    refused, age_ms = source.counters.get("refused", 0), 1e-6 * records.max_age_ns
+    text = f"{records.rate_hz:.0f} a second, at most {age_ms:.0f} ms old" + (f", {refused} refused" if refused else "")
+    if refused >= records.count:
+        return fail(source.name, f"{text}: none holds a pose (recordings/README.md, /vehicle/odometry)")
+    silent_s = records.longest_silence_s(source.end_ns)
+    if source.live and silent_s > ODOMETRY_SILENT_S:
+        return fail(source.name, f"{text}; then none came for {silent_s:.1f} s: is its sender still running?")
+    if not records.rate_hz >= ODOMETRY_HZ or age_ms > OLD_MS or refused:
+        return warning(source.name, f"{text}: check its rate, and that its age_s and clock are right")
+    return ok(source.name, text)

@@ -1,0 +1,193 @@
+"""Is the LiDAR as it must be: packets, losses, foreign senders, return mode, its clock, GPS and PPS.
+
+Source: VLP-16 User Manual 63-9243 Rev. E, chapter 9 (rates, return modes); the limits are ours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+
+from flow.graph import Graph
+from flow.link import Record, Source
+from links.preflight.check_result import CheckResult, fail, ok, warning
+from links.preflight.link_checks import LinkChecks, declares
+from links.preflight.observations import Observation, Observations, ObservedSource
+from links.velodyne import vlp16
+from links.velodyne.lidar import POSITION_TOPIC, Lidar
+from links.velodyne.position import PpsWatch
+
+MODES = {vlp16.STRONGEST: "strongest", vlp16.LAST: "last", vlp16.DUAL: "dual"}
+WORST_LOSS, SOME_LOSS = 0.02, 0.001  # share of packets
+RATE_SLACK = 0.2  # losses are judged by themselves; this finds a second lidar, and a host that stalls
+MOST_DRIFT_PPM = 500.0
+DRIFT_OVER_S = 2.0  # a shorter time tells no drift: the fastest packets differ by tens of microseconds
+
+DISK_SHARE = 0.43  # of the packets' bytes, after zstd: 0.91 MB/s arrive, 1.4 GB/h are stored
+DEFAULT_GB_PER_HOUR = 1.4  # of a LiDAR that sent nothing
+MAX_DEVICE_TIMES = 100_000
+
+
+class LidarObservation(Observation):
+    """Return modes, GPS/PPS status, and the sensor's clock against the host's."""
+
+    def __init__(self, topic: str) -> None:
+        super().__init__(topic)
+        self.return_modes: Counter[int] = Counter()
+        self.pps = PpsWatch()
+        self.device_ns: list[tuple[int, int]] = []
+        """(host stamp, sensor's time of the hour), both in ns, of each packet of the first minute."""
+
+    @property
+    def recorded_gb_per_hour(self) -> float:
+        """See Observation."""
+        received = self.records.data_gb_per_hour
+        return DEFAULT_GB_PER_HOUR if received is None else DISK_SHARE * received
+
+    def add(self, record: Record) -> None:
+        """See Observation."""
+        super().add(record)
+        if record.topic == POSITION_TOPIC:
+            self.pps.see(record.data)
+        elif record.topic == self.topic and len(record.data) == vlp16.PACKET_BYTES:
+            self.return_modes[record.data[vlp16.RETURN_MODE_AT]] += 1
+            if len(self.device_ns) < MAX_DEVICE_TIMES:
+                at = vlp16.TIMESTAMP_AT
+                self.device_ns.append((record.stamp_ns, 1_000 * int.from_bytes(record.data[at : at + 4], "little")))
+
+
+class LidarChecks(LinkChecks):
+    """Checks of a VLP-16."""
+
+    link_class = Lidar
+
+    def observation(self, source: Source) -> LidarObservation:
+        """See LinkChecks."""
+        return LidarObservation(source.topic)
+
+    def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
+        """A LiDAR is required."""
+        if not declares(graph, Lidar):
+            yield fail("lidar", "not in this configuration: nothing sees the drone; add links.velodyne.Lidar")
+
+    def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
+        """See LinkChecks."""
+        return lidar_checks(source)
+
+
+def lidar_checks(source: ObservedSource) -> Iterator[CheckResult]:
+    """All checks of one LiDAR."""
+    link, observation = source.link, source.observation
+    assert isinstance(link, Lidar)
+    assert isinstance(observation, LidarObservation)
+    name, decoded = source.name, source.counters.get("decoded", 0)
+    if not observation.records.count:
+        yield fail(f"{name} packets", _sentence(source.no_data_reason))
+        return
+    if not decoded:
+        why = source.status or _refused(source) or "none was usable"
+        yield fail(f"{name} packets", f"{observation.records.count} packets came, and {_sentence(why)}")
+        return
+    yield _rate(source, observation, link.timeout_s)
+    yield _losses(source, decoded)
+    foreign = source.counters.get("from other senders", 0)
+    if foreign:
+        yield warning(
+            f"{name} sender", f"{foreign} packets from other senders were ignored: is a second lidar on this network?"
+        )
+    yield _mode(name, observation)
+    yield _clock(name, link, source, observation)
+    if link.position_port is not None or observation.topics[POSITION_TOPIC].count:
+        yield _position(link, name, observation)
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith((".", "?")) else f"{text}: is the lidar powered, and is this host on its subnet?"
+
+
+def _refused(source: ObservedSource) -> str:
+    prefix = "refused: "
+    return ", ".join(
+        f"{n} {what.removeprefix(prefix)}" for what, n in source.counters.items() if what.startswith(prefix) and n
+    )
+
+
+def _rate(source: ObservedSource, observation: LidarObservation, timeout_s: float) -> CheckResult:
+    """A packet each 1.327 ms, or 0.664 ms with dual return."""
+    name = f"{source.name} rate"
+    mode = observation.return_modes.most_common(1)[0][0] if observation.return_modes else vlp16.STRONGEST
+    wanted_hz, rate_hz = 1e9 / vlp16.packet_ns(mode), observation.records.rate_hz
+    silent_s = observation.records.longest_silence_s(source.end_ns)
+    text = f"{rate_hz:.0f} packets a second, {wanted_hz:.0f} are sent"
+    if source.live and silent_s > timeout_s:
+        return fail(name, f"{text}; then none came for {silent_s:.1f} s: check its cable and power")
+    if not rate_hz >= (1 - RATE_SLACK) * wanted_hz:
+        return fail(name, f"{text}: is the network too slow, or this host too busy?")
+    if rate_hz > (1 + RATE_SLACK) * wanted_hz:
+        return fail(name, f"{text}: do two lidars send to this port? Set `sender`")
+    return ok(name, text)
+
+
+def _losses(source: ObservedSource, decoded: int) -> CheckResult:
+    name, lost = f"{source.name} losses", source.counters.get("lost", 0)
+    share = lost / (lost + decoded)
+    refused = _refused(source)
+    text = f"{lost} of {lost + decoded} packets lost" + (f"; refused: {refused}" if refused else "")
+    if share > WORST_LOSS:
+        return fail(name, f"{text}: is the network shared, or this host too busy (net.core.rmem_max)?")
+    return warning(name, text) if share > SOME_LOSS or refused else ok(name, text)
+
+
+def _mode(name: str, observation: LidarObservation) -> CheckResult:
+    name = f"{name} return mode"
+    modes = [MODES.get(mode, f"0x{mode:02X}") for mode in observation.return_modes]
+    if len(modes) != 1:
+        return fail(name, f"it changes ({', '.join(modes)}): does somebody else set it, or do two lidars send?")
+    if modes[0] not in MODES.values():
+        return fail(name, f"{modes[0]} is none that is known: is this a VLP-16?")
+    if modes[0] == "last":
+        return warning(name, "last return: a drone before a wall is told by its edges alone; set strongest or dual")
+    return ok(name, modes[0])
+
+
+def _clock(name: str, link: Lidar, source: ObservedSource, observation: LidarObservation) -> CheckResult:
+    name = f"{name} clock"
+    disagreed = source.counters.get("clock disagreements", 0)
+    if disagreed:
+        advice = "is it locked to GPS, and the host's clock right?" if link.clock == "utc" else "was it restarted?"
+        return fail(name, f"its clock and the host's disagreed {disagreed} times: {advice}")
+    drift_ppm = clock_drift_ppm(observation.device_ns)
+    if math.isnan(drift_ppm):
+        return ok(name, f"{link.clock}, no disagreement; too short to tell a drift")
+    text = f"{link.clock}, it goes {abs(drift_ppm):.0f} millionths {'slow' if drift_ppm > 0 else 'fast'}"
+    if abs(drift_ppm) > MOST_DRIFT_PPM:
+        return warning(name, f"{text} by the fastest packets: is the host's clock being set, or the network busy?")
+    return ok(name, text)
+
+
+def clock_drift_ppm(pairs: list[tuple[int, int]]) -> float:
+    """How fast host - device grows [1e-6], by the fastest packet of the first third and of the last; NaN: too short."""
+    if len(pairs) < 3 or pairs[-1][0] - pairs[0][0] < 1e9 * DRIFT_OVER_S:
+        return math.nan
+    hour_ns = 1_000 * vlp16.HOUR_US
+    begin = pairs[0][0] - pairs[0][1]
+    third_ns = (pairs[-1][0] - pairs[0][0]) / 3
+    late = [(host, (host - device - begin + hour_ns // 2) % hour_ns - hour_ns // 2) for host, device in pairs]
+    first = min((offset, host) for host, offset in late if host <= pairs[0][0] + third_ns)
+    last = min((offset, host) for host, offset in late if host >= pairs[-1][0] - third_ns)
+    return 1e6 * (last[0] - first[0]) / (last[1] - first[1])
+
+
+def _position(link: Lidar, name: str, observation: LidarObservation) -> CheckResult:
+    """GPS and PPS as the position packets told last; where the clock is free they are for information."""
+    name, needed = f"{name} PPS", link.clock == "utc"
+    if observation.pps.locked:
+        return ok(name, observation.pps.in_words())
+    if not observation.topics[POSITION_TOPIC].count:
+        text = f"no position packet on UDP {link.position_port}: check `position_port`, or set it to null"
+        return fail(name, text) if needed else warning(name, text)
+    text = observation.pps.in_words()
+    return (
+        fail(name, f"{text}: check GPS and PPS wire, or set clock: free") if needed else ok(name, f"{text}; not used")
+    )

@@ -1,0 +1,45 @@
+"""What a configuration lacks, and which parts of it a preflight runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from flow.graph import load_graph
+from links.preflight.graphs import sources_only, tracking
+from links.preflight.preflight import configuration_checks
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+
+
+def test_what_a_configuration_lacks_is_said():
+    field = load_graph(CONFIGS / "field.yaml")
+    assert list(configuration_checks(field)) == []
+    names = ("lidar", "servo", "odometry", "autopilot", "recorder", "camera_vehicle", "camera_drone")
+    bare = field.__class__(
+        {n: s for n, s in field.nodes.items() if n not in names and s.kind == "links"}, (), None, field.values
+    )
+    found = {v.name: v.level.value for v in configuration_checks(bare)}
+    assert found == {
+        "lidar": "fail",
+        "servo": "fail",
+        "stages": "fail",
+        "cameras": "warning",
+        "autopilot": "warning",
+        "vehicle odometry": "warning",
+        "recorder": "warning",
+    }
+    fixed = dataclasses.replace(bare, values={"rig": {"lidar": {"mount": {"turns": False}}}})
+    bolted = {v.name: v.level.value for v in configuration_checks(fixed)}
+    assert bolted["servo"] == "ok"
+
+
+def test_no_pose_goes_out_and_while_listening_nothing_moves():
+    field = load_graph(CONFIGS / "field.yaml")
+    assert sources_only(field).edges == ()
+    assert all(spec.kind == "links" for spec in sources_only(field).nodes.values())
+    seeing = tracking(field)
+    assert "fuse" not in seeing.nodes
+    assert not any(edge.consumer == "autopilot" for edge in seeing.edges)
+    assert any((edge.producer, edge.consumer) == ("aim", "servo") for edge in seeing.edges)
+    assert {"lidar", "servo", "camera_drone", "detect", "track"} <= set(seeing.nodes)

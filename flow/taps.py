@@ -15,10 +15,11 @@ from typing import Any, TextIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from flow.link import Run, Tap
 from flow.message import Message, array_fields, hash_into
+from flow.stage import Settings
 
 FORMULA_STARTERS = ("=", "+", "-", "@")  # a spreadsheet would run such a text
 
@@ -32,8 +33,10 @@ class Digest(Tap):
     different outputs.
     """
 
-    _hashes: dict[str, tuple[str, Any, Any]] = PrivateAttr(default_factory=dict[str, tuple[str, Any, Any]])
-    _joined: dict[str, str] = PrivateAttr(default_factory=dict[str, str])
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._hashes: dict[str, tuple[str, Any, Any]] = {}
+        self._joined: dict[str, str] = {}
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Hash the run's clock and the whole message."""
@@ -65,13 +68,20 @@ class Digest(Tap):
         return "-".join(hashlib.blake2b(repr(sorted(half)).encode(), digest_size=8).hexdigest() for half in halves)
 
 
-class Csv(Tap):
-    """Each output's numbers and texts as `csv/<node>.<output>.csv`; arrays without a fixed size give their shape."""
+class CsvSettings(Settings):
+    """Settings of `Csv`."""
 
     max_array: int = Field(16, ge=0, le=10_000)
-    _folder: Path = PrivateAttr(default=Path())
-    _files: dict[str, TextIO] = PrivateAttr(default_factory=dict[str, TextIO])
-    _writers: dict[str, Any] = PrivateAttr(default_factory=dict[str, Any])
+
+
+class Csv(Tap[CsvSettings]):
+    """Each output's numbers and texts as `csv/<node>.<output>.csv`; arrays without a fixed size give their shape."""
+
+    def __init__(self, settings: CsvSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._folder = Path()
+        self._files: dict[str, TextIO] = {}
+        self._writers: dict[str, Any] = {}
 
     def open(self, run: Run) -> None:
         """Make the folder `csv` in the run's."""
@@ -93,7 +103,7 @@ class Csv(Tap):
             value = getattr(message, field.name)
             if isinstance(value, np.ndarray):
                 array = cast("NDArray[Any]", value)
-                if field.name in fixed and array.size <= self.max_array:
+                if field.name in fixed and array.size <= self.settings.max_array:
                     for index in np.ndindex(array.shape):
                         yield f"{field.name}[{','.join(map(str, index))}]", array[index]
                 else:

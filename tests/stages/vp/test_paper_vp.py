@@ -19,7 +19,7 @@ from tests.stages.vp.paper_rooms import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, cou
 
 def vp(mount=LOOKS_UP, carrier="vehicle", **settings):
     base = {"carrier": carrier, "T_carrier_camera": mount, "lens": LENS, "size_px": SIZE_PX, "view_px": 300}
-    return PaperVp.model_validate(base | settings)
+    return PaperVp(**base | settings)
 
 
 def directions(R_room_carrier, mount=LOOKS_UP, carrier="vehicle", **settings):

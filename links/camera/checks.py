@@ -70,7 +70,7 @@ class CameraChecks(LinkChecks):
 
 def rig_size_px(rig: Mapping[str, Any], link: Camera) -> tuple[int, int] | None:
     """Width and height that a camera's lens was calibrated for: its own setting, or the rig's; None: neither is set."""
-    size: Any = link.size_px or _rig_camera(rig, link).get("size_px")
+    size: Any = link.settings.size_px or _rig_camera(rig, link).get("size_px")
     if size is None:
         return None
     return (size, size) if isinstance(size, int) else (int(size[0]), int(size[1]))
@@ -78,7 +78,7 @@ def rig_size_px(rig: Mapping[str, Any], link: Camera) -> tuple[int, int] | None:
 
 def rig_readout_ms(rig: Mapping[str, Any], link: Camera) -> float | None:
     """Readout time of a camera's rows: its own setting, or the rig's; None: neither is set (0 in a link: not set)."""
-    return link.readout_ms or _rig_camera(rig, link).get("readout_ms")
+    return link.settings.readout_ms or _rig_camera(rig, link).get("readout_ms")
 
 
 def _rig_camera(rig: Mapping[str, Any], link: Camera) -> Mapping[str, Any]:
@@ -103,7 +103,11 @@ def camera_checks(
     yield _rate(source, link)
     yield _size(source.name, observation, rig_px)
     yield _readout(source.name, link, readout_ms)
-    if source.live and link.source is not None and (is_device(link.source) or is_url(link.source)):
+    if (
+        source.live
+        and link.settings.source is not None
+        and (is_device(link.settings.source) or is_url(link.settings.source))
+    ):
         yield _latency(source.name, link)
 
 
@@ -120,9 +124,9 @@ def _rate(source: ObservedSource, link: Camera) -> CheckResult:
         return fail(name, f"{text}; then none came for {silent_s:.1f} s: check its cable and power")
     if refused > 0.01 * arrivals.count:
         return warning(name, f"{text}: check cable and hub")
-    if source.live and arrivals.rate_hz < FULL_RATE * link.fps:
+    if source.live and arrivals.rate_hz < FULL_RATE * link.settings.fps:
         return warning(
-            name, f"{text}, {link.fps:g} were asked for: is it too dark, the bus shared, this host too busy?"
+            name, f"{text}, {link.settings.fps:g} were asked for: is it too dark, the bus shared, this host too busy?"
         )
     return ok(name, text)
 
@@ -152,8 +156,8 @@ def _readout(name: str, link: Camera, readout_ms: float | None) -> CheckResult:
 
 
 def _latency(name: str, link: Camera) -> CheckResult:
-    if link.latency_s:
-        return ok(f"{name} latency", f"{1e3 * link.latency_s:g} ms from a picture's exposure to its arrival")
+    if link.settings.latency_s:
+        return ok(f"{name} latency", f"{1e3 * link.settings.latency_s:g} ms from a picture's exposure to its arrival")
     return warning(
         f"{name} latency",
         "latency_s is 0: pictures count as exposed when they arrive, and 80 ms of it cost 18 cm and 1 deg; film a "

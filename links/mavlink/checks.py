@@ -71,7 +71,7 @@ class AutopilotChecks(LinkChecks):
     def observation(self, source: Source) -> AutopilotObservation:
         """See LinkChecks."""
         assert isinstance(source, Autopilot)
-        return AutopilotObservation(source.topic, (source.system_id, source.component_id))
+        return AutopilotObservation(source.topic, (source.settings.system_id, source.settings.component_id))
 
     def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
         """An autopilot is optional; one that gets no pose is reported."""
@@ -102,7 +102,7 @@ def autopilot_checks(
     link, observation = source.link, source.observation
     assert isinstance(link, Autopilot)
     assert isinstance(observation, AutopilotObservation)
-    who = f"system {link.system_id}, component {link.component_id}"
+    who = f"system {link.settings.system_id}, component {link.settings.component_id}"
     if not observation.kinds["HEARTBEAT"].count or not statuses:
         yield _silent(source, observation, who)
         return
@@ -136,14 +136,14 @@ def _heartbeat(
 ) -> CheckResult:
     name, beats = f"{source.name} heartbeat", observation.kinds["HEARTBEAT"]
     silent_s = beats.longest_silence_s(source.end_ns)
-    wanted = KINDS[link.profile]
+    wanted = KINDS[link.settings.profile]
     if (
         observation.autopilot is not None
         and observation.autopilot in KINDS.values()
         and observation.autopilot != wanted
     ):
         says = next(kind for kind, number in KINDS.items() if number == observation.autopilot)
-        return fail(name, f"it says it is {says}, the configuration {link.profile}: set profile: {says}")
+        return fail(name, f"it says it is {says}, the configuration {link.settings.profile}: set profile: {says}")
     if status.failsafe:
         return fail(name, "it says critical, emergency or termination: look at its own messages")
     if source.live and status.armed:
@@ -153,7 +153,7 @@ def _heartbeat(
     rate = "one" if beats.count == 1 else f"{beats.rate_hz:.1f} a second"
     if observation.autopilot not in KINDS.values():
         return warning(name, f"{rate}, of MAV_AUTOPILOT {observation.autopilot}: only ArduPilot and PX4 are known")
-    return ok(name, f"{rate}, {link.profile}" + (", armed" if status.armed else ", disarmed"))
+    return ok(name, f"{rate}, {link.settings.profile}" + (", armed" if status.armed else ", disarmed"))
 
 
 def _losses(source: ObservedSource) -> CheckResult:
@@ -252,7 +252,7 @@ def _estimate(name: str, estimators: Sequence[AutopilotEstimator]) -> CheckResul
 
 def _parameters(name: str, link: Autopilot) -> CheckResult:
     try:
-        return parameter_check(name, link.profile, ask_parameters(link))
+        return parameter_check(name, link.settings.profile, ask_parameters(link))
     except LinkError as error:
         return fail(f"{name} parameters", str(error))
 

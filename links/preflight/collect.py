@@ -12,8 +12,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from pydantic import PrivateAttr
-
 from flow.draw import mermaid
 from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, Record, Run, Source, Tap
@@ -46,11 +44,11 @@ M = TypeVar("M", bound=Message)
 class ObservationTap(Tap):
     """Collects every record and the messages of the types in KEPT. Called from many threads, per topic from one."""
 
-    _by_topic: dict[str, Observation] = PrivateAttr(default_factory=dict[str, Observation])
-    _topics: dict[str, str] = PrivateAttr(default_factory=dict[str, str])  # of the sources, by name
-    _messages: defaultdict[type[Message], deque[Message]] = PrivateAttr(
-        default_factory=lambda: defaultdict(lambda: deque(maxlen=MAX_MESSAGES))
-    )
+    def __init__(self) -> None:
+        super().__init__()
+        self._by_topic: dict[str, Observation] = {}
+        self._topics: dict[str, str] = {}  # of the sources, by name
+        self._messages: defaultdict[type[Message], deque[Message]] = defaultdict(lambda: deque(maxlen=MAX_MESSAGES))
 
     def attach(self, sources: Mapping[str, Source]) -> None:
         """Set the sources whose records will arrive, by node name."""
@@ -150,7 +148,7 @@ def simulated_rig(graph: Graph) -> Iterator[None]:
                 folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="grd-preflight-")))
                 rig = spec.build()
                 assert isinstance(rig, LiveRig)
-                rig = rig.model_copy(update={"armed": False})
+                rig = LiveRig(rig.settings.model_copy(update={"armed": False}))
                 rig.open(Run(folder, spec.name, mermaid(graph), graph.settings_yaml(), live=True))
                 stack.callback(rig.close)
         yield

@@ -33,7 +33,7 @@ class VehicleOdometryChecks(LinkChecks):
 
 def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult:
     """The vehicle's own odometry, where it has one."""
-    if source.live and link.port is None:
+    if source.live and link.settings.port is None:
         return warning(source.name, "it has no port: the vehicle is taken to be parked")
     records = source.observation.records
     if not records.count:

@@ -20,7 +20,7 @@ from flow.link import Run, Tap
 from flow.message import Message
 from flow.stage import Settings
 from links.fix_log import FixLog
-from links.mavlink.gate import Limits, refusal
+from links.mavlink.gate import PoseLimits, reject_reason
 from links.result_file import ResultFile
 from stages.geometry import quaternions_xyzw
 from stages.messages import (
@@ -87,7 +87,7 @@ class Transition:
 class ResultsSettings(Settings):
     """Settings of `Results`."""
 
-    limits: Limits = Limits()  # of the autopilot's gate: which poses are good
+    limits: PoseLimits = PoseLimits()  # of the autopilot's gate: which poses are good
 
 
 class Results(Tap[ResultsSettings]):
@@ -284,7 +284,7 @@ class Results(Tap[ResultsSettings]):
         upper[np.isinf(upper)] = UNKNOWN_RAD2
         measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
-        good = refusal(message, message.stamp_ns, self.settings.limits) is None
+        good = reject_reason(message, message.stamp_ns, self.settings.limits) is None
         told = [message.state.name, int(good), int(R is not None), message.resets, nis, measured, message.track_id]
         self._poses.writerow([stamp_s(message.stamp_ns), *_digits(upper), *told])
 

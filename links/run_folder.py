@@ -30,13 +30,13 @@ from flow.stage import Stage
 from flow.taps import Digest
 from flow.tree import Section
 from links.mavlink.autopilot import Autopilot
-from links.mavlink.gate import Limits
+from links.mavlink.gate import PoseLimits
 from links.recording import Progress, RecordingReader, Session
 from links.result_file import ResultFile
 from links.results import SUMMARY_FILE, Results, stamp_s
 from links.truth import TRUTH_RECORDING, FixErrors, TruthLog
 from links.usage import Usage
-from links.velodyne import Lidar, flown_lidars
+from links.velodyne import Lidar, recorded_lidars
 from stages.messages import Detections, DroneFix, RelativePose
 
 CONFIG_FILE = "config.yaml"
@@ -183,10 +183,10 @@ def _ran_instead(graph: Graph, report: RunReport) -> str:
     return "; ".join(f"{n} ({graph.nodes[n].cls.__name__}: {', '.join(t) or 'tells nothing'})" for n, t in told.items())
 
 
-def _limits(graph: Graph) -> Limits:
+def _limits(graph: Graph) -> PoseLimits:
     """Of the autopilot's gate, as configured."""
     links = (spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Autopilot))
-    return next((link.settings.limits for link in links if isinstance(link, Autopilot)), Limits())
+    return next((link.settings.limits for link in links if isinstance(link, Autopilot)), PoseLimits())
 
 
 def _senders(graph: Graph) -> dict[str, dict[str, str]]:
@@ -225,7 +225,7 @@ def other_clocks(graph: Graph, flown_yaml: str | None) -> list[str]:
     `flown_yaml` is the configuration in the recording. Free, a LiDAR's stamps are late by a packet's shortest way: a
     `servo_time_offset_s` found with the one clock is wrong with the other.
     """
-    flown = dict(_topic_and_clock(config) for config in flown_lidars(flown_yaml))
+    flown = dict(_topic_and_clock(config) for config in recorded_lidars(flown_yaml))
     warnings: list[str] = []
     for name, spec in graph.nodes.items():
         topic, clock = _topic_and_clock(spec.config)

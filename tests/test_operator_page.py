@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from links.dynamixel.wire import Health
-from links.mavlink.gate import Refusal as GateRefusal
+from links.mavlink.gate import RejectReason as GateRejectReason
 from links.recording import Recorder
 from links.recording.writer import CLOSE_TIMEOUT_S
 from links.velodyne.position import Pps
-from links.velodyne.refusal import Refusal
+from links.velodyne.reject_reason import RejectReason
 from stages.messages import BranchState, PoseState, TrackingState
 from tests.links.fault_bounds import KEPT_S, KILLED, MUST, POSES_AGAIN_S, POSITION_AGAIN_S, REST_S
 from tests.unit_file import unit_file
@@ -33,9 +33,9 @@ EXPLAINED = {
     "state of the pose": [state.name for state in PoseState],
     "state of the track (shown while there is no pose yet)": [state.name for state in TrackingState],
     "state of the rotation by cameras": [state.name for state in BranchState],
-    "why no pose goes out": [why.value for why in GateRefusal],
+    "why no pose goes out": [why.value for why in GateRejectReason],
     "LiDAR": ["decoded", "lost", "from other senders", *(f"PPS {pps.name.lower()}" for pps in Pps), "PPS locks lost"],
-    "LiDAR, `refused: ` and why": [why.value for why in Refusal],
+    "LiDAR, `refused: ` and why": [why.value for why in RejectReason],
     "servo": list(Health._fields),
 }
 SAID = {  # where it is said, and what
@@ -63,7 +63,7 @@ SAID = {  # where it is said, and what
     ],
     "links/camera/camera.py": ["but the lens is calibrated for"],
     "links/camera/capture.py": ["cannot be opened as a camera", "gives no more frames", "stale", "damaged"],
-    "links/camera/live.py": ["overtaken", "lost", "opened again"],
+    "links/camera/live_camera.py": ["overtaken", "lost", "opened again"],
     "links/dynamixel/drive.py": ["the servo is not set up for grd: "],
     "links/dynamixel/worker.py": ["does not answer at"],
     "links/dynamixel/servo.py": [
@@ -74,10 +74,18 @@ SAID = {  # where it is said, and what
         "process restarts",
         "stopped: nobody aims",
     ],
-    "links/mavlink/session.py": ["no word from the autopilot", "answers no TIMESYNC: late is not seen", "stray bytes"],
-    "links/mavlink/speaker.py": ["sending poses", "STOPPED: ", "no pose goes out"],
-    "links/mavlink/lines.py": ["is gone: is it plugged in and powered?", "Trying again", "and was dropped with it"],
-    "links/mavlink/round_trip.py": [
+    "links/mavlink/autopilot_session.py": [
+        "no word from the autopilot",
+        "answers no TIMESYNC: late is not seen",
+        "stray bytes",
+    ],
+    "links/mavlink/pose_sender.py": ["sending poses", "STOPPED: ", "no pose goes out"],
+    "links/mavlink/transport/stream_connection.py": [
+        "is gone: is it plugged in and powered?",
+        "Trying again",
+        "and was dropped with it",
+    ],
+    "links/mavlink/timesync_monitor.py": [
         "answers to TIMESYNC take longer than",
         "the autopilot has answered TIMESYNC and does no more",
     ],

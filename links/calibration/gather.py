@@ -20,7 +20,7 @@ from links.dynamixel import Servo
 from links.dynamixel.servo import TICK_RAD
 from links.recording import Progress, Session
 from links.vehicle_odometry import VehicleOdometry
-from links.velodyne import Lidar, flown_lidars
+from links.velodyne import Lidar, recorded_lidars
 from stages.calibration.looks import Returns, ServoTrace
 from stages.geometry import LidarMount
 from stages.messages import LidarFirings
@@ -109,7 +109,7 @@ def lidar_of(config_yaml: str | None) -> Lidar:
 
     Free, a sensor's clock is set by the packets that come soonest: late by the shortest way, in the simulated rig 2 ms.
     """
-    config = next(reversed(flown_lidars(config_yaml)), {})
+    config = next(reversed(recorded_lidars(config_yaml)), {})
     clock = {name: config[name] for name in ("clock", "clock_limit_s") if name in config}
     return Lidar(**clock)
 

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.camera.capture import CaptureSettings, Frame
-from links.camera.live import LiveCamera
+from links.camera.live_camera import LiveCamera
 from links.recording import CompressedImage, decode_compressed_image, encode_compressed_image
 from stages.messages import Image
 

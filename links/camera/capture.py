@@ -8,7 +8,7 @@ waiting for an unknown time: after opening those are thrown away until one had t
 row, so that a host that is too slow sees every second frame.
 
 What comes by RTSP has times of its own: by them a picture is freed of what it waited for the decoder
-(`links/camera/picture_clock.py`), however long that takes, and what is later than on a host that keeps up is thrown
+(`links/camera/image_clock.py`), however long that takes, and what is later than on a host that keeps up is thrown
 away, nine in a row at most.
 
 FFmpeg decodes with one thread. With n it hands a picture out when the n - 1 after it have come (one a core is its rule:
@@ -31,7 +31,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from links.camera.picture_clock import PictureClock
+from links.camera.image_clock import ImageClock
 
 WAITED_SHARE = 0.25  # of a frame's period: a grab that took less found the frame waiting
 DECODED_SHARE = 0.5  # the same where a grab decodes: on a small host that takes 10 ms of 33
@@ -103,7 +103,7 @@ class Capture:
         self._dropped_last = False
         self._damaged_in_a_row = self._late_in_a_row = 0
         tells = not self._raw and settings.source.lower().startswith(RTSP)
-        self._pictures = PictureClock() if tells else None
+        self._pictures = ImageClock() if tells else None
 
     def close(self) -> None:
         """Give the device or connection back."""

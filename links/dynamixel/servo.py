@@ -34,7 +34,7 @@ from links.dynamixel.mx28 import (
     VELOCITY_UNIT_RPM,
     named_errors,
 )
-from links.dynamixel.process import ProcessEnded, ServoProcess
+from links.dynamixel.servo_process import ProcessEnded, ServoProcess
 from stages.messages import ServoGoal, ServoState
 
 MAX_STATE_BYTES = 1_000

@@ -21,9 +21,9 @@ import time
 from collections import Counter
 
 from links.dynamixel import mx28, wire
-from links.dynamixel.belief import Belief
 from links.dynamixel.bus import Bus, BusError, Gone, Refused
 from links.dynamixel.drive import ARRIVED_TICKS, Drive, DriveSettings, Measured, SetupError, Shutdown
+from links.dynamixel.reading_filter import ReadingFilter
 
 MS_NS = 1_000_000
 S_NS = 1_000_000_000
@@ -56,7 +56,7 @@ class Worker:
         self._error = 0
         self._counts: Counter[str] = Counter()
         self._faults: Counter[str] = Counter()
-        self._belief = Belief()
+        self._filter = ReadingFilter()
         self._supply = 0, 0
         self._began_ns = self._next_ns = self._healthy_ns = time.monotonic_ns()
         self._failing_ns = 0  # since when nothing succeeded; 0: all is well
@@ -230,7 +230,7 @@ class Worker:
         """Tell a reading that may be believed."""
         assert self._drive is not None
         self._counts["reads"] += 1
-        doubt = self._belief.doubt(measured)
+        doubt = self._filter.reject_reason(measured)
         if doubt is not None:
             self._counts[doubt] += 1
             return

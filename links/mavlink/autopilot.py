@@ -20,16 +20,16 @@ from pydantic import Field, field_validator, model_validator
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.clock import host_time
 from links.clock.device_clock import DeviceClock
-from links.mavlink.connection import Udp, parse_connection
-from links.mavlink.gate import Limits
-from links.mavlink.lines import open_connection
-from links.mavlink.origin import GlobalOrigin, OriginGiver
+from links.mavlink.autopilot_session import AutopilotSession
+from links.mavlink.frame_decoder import FrameDecoder
+from links.mavlink.gate import PoseLimits
+from links.mavlink.origin import GlobalOrigin, OriginSender
+from links.mavlink.pose_sender import Kind, PoseSender
 from links.mavlink.profiles import PROFILES, ProfileName
 from links.mavlink.readers import AutopilotMessage
-from links.mavlink.session import Session
 from links.mavlink.signing import Signer
-from links.mavlink.speaker import Kind, PoseSpeaker
-from links.mavlink.stream import FrameStream
+from links.mavlink.transport.connection import Udp, parse_connection
+from links.mavlink.transport.stream_connection import open_connection
 from stages.messages import RelativePose
 
 VISUAL_INERTIAL_ODOMETRY = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY: who we are
@@ -48,7 +48,7 @@ class AutopilotSettings(SourceSettings):
     sender: IPv4Address | None = None  # the autopilot's address, where udpin listens beyond loopback
     profile: ProfileName = "ardupilot"
     send: tuple[Kind, ...] = ("odometry",)  # of each good pose
-    limits: Limits = Limits()
+    limits: PoseLimits = PoseLimits()
     own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as part of its vehicle
     own_component_id: int = Field(VISUAL_INERTIAL_ODOMETRY, ge=1, le=255)
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
@@ -96,8 +96,8 @@ class Autopilot(Source[AutopilotSettings]):
         super().__init__(settings, **values)
         settings = self.settings
         clock = DeviceClock(settings.clock_drift_limit_ppm, round(1e9 * settings.clock_jump_limit_s))
-        self._stream = FrameStream((settings.system_id, settings.component_id), settings.own_id, clock)
-        self._session: Session | None = None
+        self._stream = FrameDecoder((settings.system_id, settings.component_id), settings.own_id, clock)
+        self._session: AutopilotSession | None = None
         self._signer: Signer | None = None  # of all sessions
         self._missed: int = 0
 
@@ -131,12 +131,12 @@ class Autopilot(Source[AutopilotSettings]):
         if settings.signing_key is not None and self._signer is None:
             self._signer = Signer(settings.signing_key, host_time.now_ns())
         connection = open_connection(parse_connection(settings.connection), settings.sender)
-        session = Session(
+        session = AutopilotSession(
             connection,
             target,
             settings.own_id,
-            PoseSpeaker(settings.send, settings.limits, reset_counter=host_time.now_ns() // 1_000_000_000),
-            OriginGiver(settings.global_origin, target),
+            PoseSender(settings.send, settings.limits, reset_counter=host_time.now_ns() // 1_000_000_000),
+            OriginSender(settings.global_origin, target),
             self._signer,
             host_time.now_ns,
             (settings.topic, SENT_TOPIC),

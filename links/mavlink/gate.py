@@ -25,7 +25,7 @@ SENDABLE = (PoseState.FULL, PoseState.COASTING)
 ROTATION_ERROR = 1e-6  # of R^T R - 1
 
 
-class Refusal(enum.Enum):
+class RejectReason(enum.Enum):
     """Why a pose does not go out, for counters and people."""
 
     LOST = "no position"
@@ -44,7 +44,7 @@ class Refusal(enum.Enum):
     LINE_LATE = "line too slow"
 
 
-class Limits(BaseModel):
+class PoseLimits(BaseModel):
     """How good a pose must be to go out. One sigma, worst axis."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -55,31 +55,31 @@ class Limits(BaseModel):
     age_s: float = Field(default=0.15, gt=0, le=0.3)  # of the pose when it is to go out
 
 
-def refusal(pose: RelativePose, now_ns: int, limits: Limits) -> Refusal | None:
+def reject_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> RejectReason | None:
     """Why the pose may not go out now; None: it may."""
     if pose.state not in SENDABLE:
-        return Refusal[pose.state.name]
+        return RejectReason[pose.state.name]
     rotations = pose.R_vehicle_drone, pose.R_start_drone
     vectors = (pose.xyz_vehicle_m, pose.xyz_start_m, *rotations, pose.covariance, pose.start_covariance)
     given = [vector.ravel() for vector in vectors if vector is not None]
     if len(given) < len(vectors):
-        return Refusal.INCOMPLETE
+        return RejectReason.INCOMPLETE
     if not np.isfinite(np.concatenate(given)).all():
-        return Refusal.NOT_FINITE
+        return RejectReason.NOT_FINITE
     if not all([_is_rotation(R) for R in rotations if R is not None]):
-        return Refusal.NO_ROTATION
+        return RejectReason.NO_ROTATION
     worst = worst_sigmas(pose)
     if worst is None:
-        return Refusal.COVARIANCE
+        return RejectReason.COVARIANCE
     rotation_rad, position_m = worst
     if position_m > limits.position_sigma_m:
-        return Refusal.POSITION_SIGMA
+        return RejectReason.POSITION_SIGMA
     if math.degrees(rotation_rad) > limits.rotation_sigma_deg:
-        return Refusal.ROTATION_SIGMA
+        return RejectReason.ROTATION_SIGMA
     age_ns = now_ns - pose.stamp_ns
     if age_ns > 1e9 * limits.age_s:
-        return Refusal.OLD
-    return Refusal.AHEAD if age_ns < -AHEAD_NS else None
+        return RejectReason.OLD
+    return RejectReason.AHEAD if age_ns < -AHEAD_NS else None
 
 
 @lru_cache(maxsize=1)  # the gate asks, and the message tells its quality
@@ -106,7 +106,7 @@ def pose_sigmas(*covariances: NDArray[np.float64]) -> tuple[float, float] | None
     return math.sqrt(max(worst[: len(C)])), math.sqrt(max(worst[len(C) :]))
 
 
-def velocity_to_send(pose: RelativePose, limits: Limits) -> NDArray[np.float64] | None:
+def velocity_to_send(pose: RelativePose, limits: PoseLimits) -> NDArray[np.float64] | None:
     """The drone's velocity over ground, start axes, where it is known well enough; None: it goes out as not known."""
     velocity, covariance = pose.velocity_start_mps, pose.velocity_covariance
     if velocity is None or covariance is None or not (np.isfinite(velocity).all() and np.isfinite(covariance).all()):

@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from links.mavlink.wire import dialect
+from links.mavlink.framing import dialect
 
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN = 512, 49  # MAV_CMD, message id
 HAS_NONE = (0, 2, 4)  # MAV_RESULT accepted (and sends nothing), denied, failed: it knows the message
@@ -32,7 +32,7 @@ class GlobalOrigin(BaseModel):
     altitude_m: float = Field(ge=-1000, le=10_000)
 
 
-class OriginGiver:
+class OriginSender:
     """Asks, and gives the origin where there is none. `state` says in words how far it is."""
 
     def __init__(self, origin: GlobalOrigin | None, target: tuple[int, int]) -> None:

@@ -14,11 +14,11 @@ from typing import Any
 from flow.link import LinkError
 from links.clock import host_time
 from links.mavlink.autopilot import Autopilot
-from links.mavlink.connection import Connection, parse_connection
-from links.mavlink.lines import open_connection
+from links.mavlink.framing import V1, FrameSplitter, dialect, header, packed
 from links.mavlink.profiles import PROFILES
 from links.mavlink.signing import Signer
-from links.mavlink.wire import V1, FrameSplitter, dialect, header, packed
+from links.mavlink.transport.connection import Connection, parse_connection
+from links.mavlink.transport.stream_connection import open_connection
 
 AGAIN_S = 0.3  # until a parameter that has not answered is asked again
 AT_ONCE = 8  # parameters asked at a time: a slow line holds no more

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from links.mavlink.frames import (
+from links.mavlink.ned_frd import (
     R_local_drone_from_rpy,
     R_local_drone_from_wxyz,
     pose_covariance_from_upper,
@@ -45,7 +45,7 @@ HEIGHT, CONSTANT_POSITION = 32, 128
 def _vector(frame: Any, *names: str, unit: float = 1.0) -> NDArray[np.float64]:
     """Fields as a vector in our axes. ValueError when one is NaN or infinite."""
     x, y, z = _numbers(frame, *names)
-    return np.array([unit * x, -(unit * y), -(unit * z)])  # `turned_over`, without its arrays
+    return np.array([unit * x, -(unit * y), -(unit * z)])  # `flip_yz`, without its arrays
 
 
 def _numbers(frame: Any, *names: str) -> list[float]:

@@ -25,9 +25,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
-from links.mavlink.frames import (
+from links.mavlink.ned_frd import (
+    flip_yz,
     rpy_from_R_local_drone,
-    turned_over,
     upper_from_pose_covariance,
     upper_from_velocity_covariance,
     wxyz_from_R_local_drone,
@@ -164,12 +164,12 @@ class Autopilot:
     def _attitudes(self, time_s: Array64, device_ns: NDArray[np.int64]) -> list[Any]:
         rotations, rates = self._attitude(time_s)
         return [
-            mavlink.MAVLink_attitude_message(ns // 1_000_000, *rpy_from_R_local_drone(R), *turned_over(rate))
+            mavlink.MAVLink_attitude_message(ns // 1_000_000, *rpy_from_R_local_drone(R), *flip_yz(rate))
             for ns, R, rate in zip(device_ns.tolist(), rotations, rates, strict=True)
         ]
 
     def _positions(self, time_s: Array64, device_ns: NDArray[np.int64]) -> list[Any]:
-        position, velocity = turned_over(self._estimate.position_m(time_s)), turned_over(self._velocity(time_s))
+        position, velocity = flip_yz(self._estimate.position_m(time_s)), flip_yz(self._velocity(time_s))
         return [
             mavlink.MAVLink_local_position_ned_message(ns // 1_000_000, *p, *v)
             for ns, p, v in zip(device_ns.tolist(), position, velocity, strict=True)
@@ -190,10 +190,10 @@ class Autopilot:
                     ns // 1_000,
                     mavlink.MAV_FRAME_LOCAL_FRD,
                     mavlink.MAV_FRAME_BODY_FRD,
-                    *turned_over(position[i]),
+                    *flip_yz(position[i]),
                     wxyz_from_R_local_drone(R),
-                    *turned_over(R.T @ velocity[i]),
-                    *turned_over(rates[i]),
+                    *flip_yz(R.T @ velocity[i]),
+                    *flip_yz(rates[i]),
                     upper_from_pose_covariance(covariances[i], R),
                     velocity_upper,
                     0,
@@ -212,7 +212,7 @@ class Autopilot:
         )
         rate = rate + gyro_bias + self._rng.normal(0.0, np.radians(s.gyro_noise_degps), rate.shape)
         force = force + force_bias + self._rng.normal(0.0, s.accelerometer_noise_mps2, force.shape)
-        counts = np.hstack([turned_over(force) / STANDARD_GRAVITY_MPS2, turned_over(rate)]) * 1e3  # mg, mrad/s
+        counts = np.hstack([flip_yz(force) / STANDARD_GRAVITY_MPS2, flip_yz(rate)]) * 1e3  # mg, mrad/s
         counts = np.clip(np.rint(counts), -INT16, INT16).astype(int).tolist()
         return [
             mavlink.MAVLink_raw_imu_message(ns // 1_000, *six, 0, 0, 0)  # no magnetometer

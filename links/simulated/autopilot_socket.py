@@ -23,7 +23,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.wire import FrameSplitter, header, packed, parse_frame
+from links.mavlink.framing import FrameSplitter, header, packed, parse_frame
 from links.simulated.autopilot import Autopilot
 from links.simulated.autopilot_rules import Rules
 from links.simulated.px4_rules import Px4Rules

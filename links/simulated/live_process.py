@@ -27,8 +27,8 @@ from flow.link import TRUTH_TOPICS, LinkError, Record
 from flow.metrics import Latency
 from flow.problem import ConfigError
 from links.clock import host_time
+from links.mavlink.frame_decoder import ARMED
 from links.mavlink.profiles import ARDUPILOT
-from links.mavlink.stream import ARMED
 from links.recording import RecordingWriter
 from links.simulated.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot import Autopilot

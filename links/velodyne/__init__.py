@@ -1,7 +1,7 @@
 """Velodyne VLP-16: packets from UDP or a recording -> LidarFirings."""
 
-from links.velodyne.flown import flown_lidars
 from links.velodyne.lidar import Lidar
 from links.velodyne.position import parse_position
+from links.velodyne.recorded_rig import recorded_lidars
 
-__all__ = ["Lidar", "flown_lidars", "parse_position"]
+__all__ = ["Lidar", "parse_position", "recorded_lidars"]

@@ -16,7 +16,7 @@ from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource
 from links.velodyne import vlp16
 from links.velodyne.lidar import POSITION_TOPIC, Lidar
-from links.velodyne.position import PpsWatch
+from links.velodyne.position import PpsMonitor
 
 MODES = {vlp16.STRONGEST: "strongest", vlp16.LAST: "last", vlp16.DUAL: "dual"}
 WORST_LOSS, SOME_LOSS = 0.02, 0.001  # share of packets
@@ -35,7 +35,7 @@ class LidarObservation(Observation):
     def __init__(self, topic: str) -> None:
         super().__init__(topic)
         self.return_modes: Counter[int] = Counter()
-        self.pps = PpsWatch()
+        self.pps = PpsMonitor()
         self.device_ns: list[tuple[int, int]] = []
         """(host stamp, sensor's time of the hour), both in ns, of each packet of the first minute."""
 
@@ -49,7 +49,7 @@ class LidarObservation(Observation):
         """See Observation."""
         super().add(record)
         if record.topic == POSITION_TOPIC:
-            self.pps.see(record.data)
+            self.pps.add(record.data)
         elif record.topic == self.topic and len(record.data) == vlp16.PACKET_BYTES:
             self.return_modes[record.data[vlp16.RETURN_MODE_AT]] += 1
             if len(self.device_ns) < MAX_DEVICE_TIMES:
@@ -185,11 +185,11 @@ def _position(link: Lidar, name: str, observation: LidarObservation) -> CheckRes
     """GPS and PPS as the position packets told last; where the clock is free they are for information."""
     name, needed = f"{name} PPS", link.settings.clock == "utc"
     if observation.pps.locked:
-        return ok(name, observation.pps.in_words())
+        return ok(name, observation.pps.describe())
     if not observation.topics[POSITION_TOPIC].count:
         text = f"no position packet on UDP {link.settings.position_port}: check `position_port`, or set it to null"
         return fail(name, text) if needed else warning(name, text)
-    text = observation.pps.in_words()
+    text = observation.pps.describe()
     return (
         fail(name, f"{text}: check GPS and PPS wire, or set clock: free") if needed else ok(name, f"{text}; not used")
     )

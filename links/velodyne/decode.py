@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from links.velodyne import vlp16
-from links.velodyne.refusal import Refusal
+from links.velodyne.reject_reason import RejectReason
 from stages.compiled import compiled
 from stages.messages import LidarFirings
 
@@ -155,18 +155,18 @@ def timestamp_us(data: bytes) -> int:
     return int.from_bytes(data[vlp16.TIMESTAMP_AT : vlp16.TIMESTAMP_AT + 4], "little")
 
 
-def refusal_of(data: bytes) -> Refusal | None:
+def reject_reason(data: bytes) -> RejectReason | None:
     """Why these bytes cannot be a VLP-16 data packet, by length, factory bytes, flags and time. None: they can."""
     if len(data) != vlp16.PACKET_BYTES:
-        return Refusal.POSITION if len(data) == vlp16.POSITION_BYTES else Refusal.LENGTH
+        return RejectReason.POSITION if len(data) == vlp16.POSITION_BYTES else RejectReason.LENGTH
     if data[vlp16.PRODUCT_ID_AT] != vlp16.PRODUCT_ID:
-        return Refusal.MODEL
+        return RejectReason.MODEL
     if not vlp16.STRONGEST <= data[vlp16.RETURN_MODE_AT] <= vlp16.DUAL:
-        return Refusal.RETURN_MODE
+        return RejectReason.RETURN_MODE
     blocks_end, block_bytes = vlp16.TIMESTAMP_AT, vlp16.BLOCK_BYTES
     if data[0:blocks_end:block_bytes] != _FLAG_LOW or data[1:blocks_end:block_bytes] != _FLAG_HIGH:
-        return Refusal.FLAG
-    return Refusal.TIMESTAMP if timestamp_us(data) >= vlp16.HOUR_US else None
+        return RejectReason.FLAG
+    return RejectReason.TIMESTAMP if timestamp_us(data) >= vlp16.HOUR_US else None
 
 
 class FiringRows:
@@ -194,7 +194,7 @@ class FiringRows:
         return self.packets == self._most
 
     def add(self, data: bytes, stamp_ns: int, lost_packets: int) -> bool:
-        """Every pulse of a packet that passed `refusal_of` and whose first laser fired at stamp_ns.
+        """Every pulse of a packet that passed `reject_reason` and whose first laser fired at stamp_ns.
 
         384 rows in single return, 192 to 384 in dual return, in firing order: one row of kind 0 for each pulse, with
         range 0 and xyz (0, 0, 0) where nothing returned. In dual return it is followed by one of kind 1 and the same

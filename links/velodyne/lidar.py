@@ -20,10 +20,10 @@ from pydantic import Field, model_validator
 
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.velodyne import vlp16
-from links.velodyne.clock import ClockMode, DeviceClock
-from links.velodyne.decode import FiringRows, compile_kernels, refusal_of, timestamp_us
-from links.velodyne.position import PpsWatch
-from links.velodyne.refusal import Refusal
+from links.velodyne.decode import FiringRows, compile_kernels, reject_reason, timestamp_us
+from links.velodyne.lidar_clock import ClockMode, LidarClock
+from links.velodyne.position import PpsMonitor
+from links.velodyne.reject_reason import RejectReason
 from links.velodyne.udp import Channel, UdpCounters, listen_udp
 from stages.messages import LidarFirings
 
@@ -61,11 +61,11 @@ class Lidar(Source[LidarSettings]):
     def __init__(self, settings: LidarSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         settings = self.settings
-        clock = DeviceClock(settings.clock, round(1e9 * settings.clock_limit_s))
+        clock = LidarClock(settings.clock, round(1e9 * settings.clock_limit_s))
         self._stream = PacketStream(settings.topic, clock, settings.packets)
         self._locked_once: bool = False  # utc, since it listens: data packets are taken
         self._position_s: float = 0.0  # when the newest position packet came
-        self._pps = PpsWatch()
+        self._pps = PpsMonitor()
         self._udp = UdpCounters()
 
     def decode(self, record: Record) -> LidarFirings | None:
@@ -111,14 +111,14 @@ class Lidar(Source[LidarSettings]):
         waits, deadline_s = settings.clock == "utc", time.monotonic() + settings.timeout_s
         for record in records:
             if record.topic == POSITION_TOPIC:
-                self._pps.see(record.data)
+                self._pps.add(record.data)
                 waits = waits and not self._pps.locked
                 self._position_s = time.monotonic()
                 self._locked_once = settings.clock == "utc" and not waits
             elif waits:
                 if time.monotonic() > deadline_s:
                     raise LinkError(
-                        f"clock: utc, but the sensor's clock is not locked to UTC: {self._pps.in_words()}. Check its "
+                        f"clock: utc, but the sensor's clock is not locked to UTC: {self._pps.describe()}. Check its "
                         "GPS receiver and PPS wire (the sensor's web page shows both), or set clock: free"
                     )
                 continue
@@ -136,7 +136,7 @@ class Lidar(Source[LidarSettings]):
             f"no position packet comes any more on UDP {self.settings.position_port}, so whether the sensor's clock is "
             "locked to UTC is not known"
             if silent
-            else f"the sensor's clock is locked to UTC no more: {self._pps.in_words()}"
+            else f"the sensor's clock is locked to UTC no more: {self._pps.describe()}"
         )
         return (
             f"clock: utc, and {lost}. Its packets are taken on, and their times may drift away by some millionths. "
@@ -165,12 +165,12 @@ class PacketStream:
     A message holds packets that follow one another: a gap ends it early.
     """
 
-    def __init__(self, topic: str, clock: DeviceClock, together: int = 1) -> None:
+    def __init__(self, topic: str, clock: LidarClock, together: int = 1) -> None:
         """`together`: packets in a message."""
         self.clock = clock
         self.decoded = 0
         self.lost = 0
-        self.refused: Counter[Refusal] = Counter()
+        self.refused: Counter[RejectReason] = Counter()
         self._topic = topic
         self._refused_in_a_row = 0
         self._lost_before = 0
@@ -180,11 +180,11 @@ class PacketStream:
     def decode(self, record: Record) -> LidarFirings | None:
         """See `Lidar.decode`."""
         data = record.data
-        refusal = refusal_of(data)
-        if refusal is not None:
-            return self._refuse(refusal, data)
+        reason = reject_reason(data)
+        if reason is not None:
+            return self._refuse(reason, data)
         tick = self.clock.read(timestamp_us(data), record.stamp_ns)
-        if isinstance(tick, Refusal):
+        if isinstance(tick, RejectReason):
             return self._refuse(tick, data)
         stamp_ns, gap_ns = tick
         # The packet before lasted _packet_ns: when this one is later than its end, others are missing between.
@@ -194,7 +194,7 @@ class PacketStream:
         rows = self._rows if follows or not self._rows.packets else FiringRows(self._together)
         if not rows.add(data, stamp_ns, lost):
             self._lost_before = lost + 1
-            return self._refuse(Refusal.AZIMUTH, data)
+            return self._refuse(RejectReason.AZIMUTH, data)
         self.lost += lost
         self._lost_before = 0
         self.decoded += 1
@@ -204,11 +204,11 @@ class PacketStream:
             return rows.take()
         return before.take() if rows is not before else None
 
-    def _refuse(self, refusal: Refusal, data: bytes) -> None:
-        self.refused[refusal] += 1
+    def _refuse(self, reason: RejectReason, data: bytes) -> None:
+        self.refused[reason] += 1
         self._refused_in_a_row += 1
         stuck = self._refused_in_a_row % REFUSED_IN_A_ROW == 0
-        if refusal is Refusal.MODEL and (self.decoded == 0 or stuck):
+        if reason is RejectReason.MODEL and (self.decoded == 0 or stuck):
             model = vlp16.other_model(data)
             if model is not None:
                 raise LinkError(

@@ -39,7 +39,7 @@ class Position:
     gps_valid: bool  # the receiver says its fix is valid (status A)
 
 
-class PpsWatch:
+class PpsMonitor:
     """What position packets have told of the sensor's clock since the start."""
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class PpsWatch:
         """Whether the sensor's clock is locked to UTC: to the pulse per second, with a GPS that knows the time."""
         return self.pps is Pps.LOCKED and self._gps_valid
 
-    def see(self, data: bytes) -> None:
+    def add(self, data: bytes) -> None:
         """One packet; what is no position packet is counted and tells nothing."""
         try:
             position = parse_position(data)
@@ -73,7 +73,7 @@ class PpsWatch:
         state = {f"PPS {pps.name.lower()}": int(pps is self.pps) for pps in Pps}
         return {**self._seen, **state, "GPS time valid": int(self._gps_valid)}
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """The state, to be put into a sentence."""
         if self.pps is None:
             return "no position packet has come"

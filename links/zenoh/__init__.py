@@ -14,9 +14,9 @@ from flow.link import LinkError
 from flow.node_spec import NodeSpec
 from links.zenoh.receiver import Receiver, receiver_class
 from links.zenoh.sender import Sender, sender_class
-from links.zenoh.session import Session, session_of
+from links.zenoh.session_settings import SessionSettings, session_of
 
-__all__ = ["Receiver", "Sender", "Session", "ZenohEnds", "host_graph", "session_of"]
+__all__ = ["Receiver", "Sender", "SessionSettings", "ZenohEnds", "host_graph", "session_of"]
 
 TOPIC = "/hosts/"
 

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING
 
 from flow.link import LinkError
 from links.clock.host_time import now_ns
+from links.zenoh.envelope import RUN, TIME_ANSWER
 from links.zenoh.peer_clock import PeerClock
-from links.zenoh.session import Session, clock_key, config_of
-from links.zenoh.wire import RUN, TIME_ANSWER
+from links.zenoh.session_settings import SessionSettings, clock_key, config_of
 
 if TYPE_CHECKING:
     import zenoh
@@ -36,7 +36,7 @@ CLOSE_S = 0.5  # a session whose line is stuck closes when it can; the run does 
 
 
 @dataclass(eq=False, slots=True)
-class Opened:
+class OpenSession:
     """An open session, and whether it is given up. What is declared on it is declared anew on the next one."""
 
     session: zenoh.Session
@@ -46,12 +46,12 @@ class Opened:
 class Connection:
     """Opens the session in a thread of its own and keeps asking for the time."""
 
-    def __init__(self, settings: Session) -> None:
+    def __init__(self, settings: SessionSettings) -> None:
         self.settings = settings
         self.clocks = {other: PeerClock() for other in settings.others}
         self._closing = threading.Event()
         self._news = threading.Condition()
-        self._opened: Opened | None = None
+        self._opened: OpenSession | None = None
         self._refused: str | None = None
         self._taken_in = False  # the hub has answered on the newest session
         self._begun_ns = now_ns()
@@ -61,7 +61,7 @@ class Connection:
         """Begin to open."""
         self._thread.start()
 
-    def opened(self, timeout_s: float) -> Opened | None:
+    def opened(self, timeout_s: float) -> OpenSession | None:
         """The open session; None when there is none within timeout_s."""
         with self._news:
             self._news.wait_for(lambda: self._opened is not None, timeout_s)
@@ -107,7 +107,7 @@ class Connection:
 
     def _use(self, session: zenoh.Session) -> None:
         """From the opening of a session to its end."""
-        opened = Opened(session, threading.Event())
+        opened = OpenSession(session, threading.Event())
         try:
             for other in self.settings.others:
                 session.declare_queryable(clock_key(self.settings.host, other), _tell_time)
@@ -128,7 +128,7 @@ class Connection:
             enough = answers >= FIRST_ANSWERS * len(self.clocks)
             self._closing.wait(ASK_S if enough else ASK_FIRST_S)
 
-    def _tell(self, opened: Opened | None) -> None:
+    def _tell(self, opened: OpenSession | None) -> None:
         with self._news:
             self._opened = opened
             self._news.notify_all()
@@ -176,11 +176,11 @@ def _ask(session: zenoh.Session, host: str, other: str, clock: PeerClock) -> int
 
 
 _lock = threading.Lock()
-_in_use: dict[Session, tuple[Connection, int]] = {}
+_in_use: dict[SessionSettings, tuple[Connection, int]] = {}
 
 
 @contextmanager
-def connected(settings: Session) -> Iterator[Connection]:
+def connected(settings: SessionSettings) -> Iterator[Connection]:
     """The connection of these settings, opened for the first who wants it, closed after the last."""
     check_ready(settings)
     with _lock:
@@ -199,7 +199,7 @@ def connected(settings: Session) -> Iterator[Connection]:
             connection.close()
 
 
-def check_ready(settings: Session) -> None:
+def check_ready(settings: SessionSettings) -> None:
     """LinkError when the library or a file is missing."""
     if importlib.util.find_spec("zenoh") is None:
         raise LinkError("hosts need Eclipse Zenoh: pip install -e '.[hosts]'")

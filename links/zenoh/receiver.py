@@ -22,10 +22,10 @@ from flow.link import LinkError, Record, SourceSettings
 from flow.message import Message
 from flow.timeline import in_our_time
 from links.clock.host_time import now_ns
-from links.zenoh.connection import Connection, Opened, connected
+from links.zenoh.connection import Connection, OpenSession, connected
+from links.zenoh.envelope import RECORD_HEAD, read_envelope
 from links.zenoh.peer_clock import PeerClock
-from links.zenoh.session import Session, key_of
-from links.zenoh.wire import RECORD_HEAD, read_envelope
+from links.zenoh.session_settings import SessionSettings, key_of
 
 if TYPE_CHECKING:
     import zenoh
@@ -39,7 +39,7 @@ RING = 256  # messages that wait for Python: more than the usual deadline of a L
 class ReceiverSettings(SourceSettings):
     """Settings of `Receiver`."""
 
-    session: Session
+    session: SessionSettings
     sender: str  # host
 
 
@@ -104,7 +104,7 @@ class Receiver(link.Source[ReceiverSettings]):
     def _hear_on(
         self,
         connection: Connection,
-        opened: Opened,
+        opened: OpenSession,
         hop: Hop,
         records: queue.Queue[Record],
         closing: threading.Event,

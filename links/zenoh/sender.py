@@ -15,8 +15,8 @@ from flow.hosts import Hop, port_of
 from flow.link import Record, SourceSettings
 from flow.message import Message
 from links.zenoh.connection import Connection, connected
-from links.zenoh.lane import Lane
-from links.zenoh.session import Session, key_of
+from links.zenoh.output_queue import OutputQueue
+from links.zenoh.session_settings import SessionSettings, key_of
 
 JOIN_S = 0.2  # a thread whose line is stuck ends when Zenoh lets it go; the run does not wait for it
 
@@ -24,7 +24,7 @@ JOIN_S = 0.2  # a thread whose line is stuck ends when Zenoh lets it go; the run
 class SenderSettings(SourceSettings):
     """Settings of `Sender`."""
 
-    session: Session
+    session: SessionSettings
     to: str
 
 
@@ -38,19 +38,19 @@ class Sender(link.Source[SenderSettings]):
 
     def __init__(self, settings: SenderSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._lanes: dict[str, Lane] = {}
+        self._queues: dict[str, OutputQueue] = {}
         self._connection: Connection | None = None
         self._unopened: int = 0
         for hop in self.hops:
             deadline_ns = round(hop.waiting.deadline_ms * 1e6)
-            self._lanes[port_of(hop)] = Lane(key_of(hop), hop.message, hop.waiting.depth, deadline_ns)
+            self._queues[port_of(hop)] = OutputQueue(key_of(hop), hop.message, hop.waiting.depth, deadline_ns)
 
     def send(self, port: str, message: Message) -> None:
-        """Let a message wait on its lane; before the link is open it is dropped."""
+        """Let a message wait on its output_queue; before the link is open it is dropped."""
         if self._connection is None:
             self._unopened += 1
         else:
-            self._lanes[port].put(message)
+            self._queues[port].put(message)
 
     def decode(self, record: Record) -> None:
         """Nothing comes in here."""
@@ -62,8 +62,10 @@ class Sender(link.Source[SenderSettings]):
         with connected(self.settings.session) as connection:
             self._connection = connection
             threads = [
-                threading.Thread(target=lane.send_on, args=(connection, closing), name=f"send {lane.key}", daemon=True)
-                for lane in self._lanes.values()
+                threading.Thread(
+                    target=queue.send_on, args=(connection, closing), name=f"send {queue.key}", daemon=True
+                )
+                for queue in self._queues.values()
             ]
             for thread in threads:
                 thread.start()
@@ -78,7 +80,7 @@ class Sender(link.Source[SenderSettings]):
     @property
     def counters(self) -> dict[str, int]:
         """Totals since the start over all outputs; dropped, late and failed by output, too, where there were any."""
-        counts = {lane.key.split("/", 3)[3].replace("/", "."): lane.counts for lane in self._lanes.values()}
+        counts = {queue.key.split("/", 3)[3].replace("/", "."): queue.counts for queue in self._queues.values()}
         totals = {
             "sent": sum(c.sent for c in counts.values()),
             "sent bytes": sum(c.sent_bytes for c in counts.values()),
@@ -99,10 +101,10 @@ class Sender(link.Source[SenderSettings]):
         wrong = self._connection.status_of(settings.to)
         if wrong is not None or self._connection.clocks[settings.to].answered_ns is None:
             return wrong
-        unheard = [lane.key for lane in self._lanes.values() if not lane.heard]
+        unheard = [queue.key for queue in self._queues.values() if not queue.heard]
         if unheard:
             return f"{settings.to} does not listen to {', '.join(unheard)}: is it running, with the same hosts file?"
-        return next((lane.status for lane in self._lanes.values() if lane.status), None)
+        return next((queue.status for queue in self._queues.values() if queue.status), None)
 
 
 def _nothing_until(closing: threading.Event) -> Iterator[Record]:

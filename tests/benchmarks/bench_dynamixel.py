@@ -20,7 +20,7 @@ from dynamixel_sdk import PortHandler, Protocol2PacketHandler
 from links.dynamixel import wire
 from links.dynamixel.bus import Bus
 from links.dynamixel.drive import DriveSettings
-from links.dynamixel.process import ServoProcess
+from links.dynamixel.servo_process import ServoProcess
 
 BAUD = 1_000_000
 

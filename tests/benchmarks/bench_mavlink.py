@@ -20,19 +20,19 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.clock import host_time
 from links.mavlink import Autopilot
-from links.mavlink.gate import Limits, refusal
-from links.mavlink.pose_frames import odometry
-from links.mavlink.wire import FrameSplitter, packed
+from links.mavlink.framing import FrameSplitter, packed
+from links.mavlink.gate import PoseLimits, reject_reason
+from links.mavlink.pose_messages import odometry
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))
 from mavlink_poses import HOST0, good_pose
 
 mavlink: Any = ardupilotmega
-LIMITS = Limits()
+LIMITS = PoseLimits()
 
 
 def test_the_gate(benchmark: Any):
-    assert benchmark(refusal, good_pose(), HOST0, LIMITS) is None
+    assert benchmark(reject_reason, good_pose(), HOST0, LIMITS) is None
 
 
 def test_a_pose_to_a_frame(benchmark: Any):

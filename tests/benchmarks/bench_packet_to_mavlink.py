@@ -27,7 +27,7 @@ from flow.link import Tap
 from flow.replay import Replay
 from links.clock import host_time
 from links.mavlink import Autopilot
-from links.mavlink.wire import parse_frame
+from links.mavlink.framing import parse_frame
 from links.recording import RecordingReader
 from links.run_folder import Asked
 from links.simulated.matrix import Conditions, scenario_of

@@ -38,13 +38,13 @@ from links.camera import Camera
 from links.dynamixel.bus import BlockingPort, Bus, BusError
 from links.dynamixel.servo import Servo
 from links.mavlink import Autopilot
-from links.mavlink.wire import FrameSplitter, dialect, frame_bytes
+from links.mavlink.framing import FrameSplitter, dialect, frame_bytes
 from links.recording import CompressedImage, RecordingReader, RecordingWriter, encode_compressed_image
 from links.simulated.protocol2 import status
 from links.vehicle_odometry import VehicleOdometry
 from links.velodyne import Lidar
-from links.velodyne.position import PpsWatch
-from links.zenoh.wire import read_envelope
+from links.velodyne.position import PpsMonitor
+from links.zenoh.envelope import read_envelope
 from stages import messages
 
 pytestmark = pytest.mark.slow
@@ -146,7 +146,7 @@ def vlp16() -> Door:
 def position() -> Door:
     told = b"$GPRMC,101112,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A\r\n"
     packet = bytes(198) + struct.pack("<I", 5) + b"\x03" + bytes(3) + told.ljust(306, b"\0")
-    return Door("position packets", 90_000, PpsWatch().see, (), Hand([packet[:512].ljust(512, b"\0")]))
+    return Door("position packets", 90_000, PpsMonitor().add, (), Hand([packet[:512].ljust(512, b"\0")]))
 
 
 def mavlink_seal(data: bytes) -> bytes:

@@ -10,7 +10,7 @@ import pytest
 
 from flow.link import Run
 from links.evaluation.output import read_output
-from links.mavlink.gate import Limits
+from links.mavlink.gate import PoseLimits
 from links.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
 from stages.fuse.motions import Motions
 from stages.fuse.settings import FuseErrors
@@ -79,7 +79,10 @@ def test_a_pose_without_rotation_is_marked_and_its_variance_is_no_infinity(run):
 
 def test_a_pose_is_good_when_the_autopilots_gate_lets_it_out(tmp_path):
     R, wide, askew = rotation_z(0.5), (0.001,) * 3 + (0.01, 0.01, 0.16), (0.001, 0.001, 0.01, 0.01, 0.01, 0.01)
-    for limits, expected in ((Limits(), [True, False, False]), (Limits(position_sigma_m=0.5), [True, True, False])):
+    for limits, expected in (
+        (PoseLimits(), [True, False, False]),
+        (PoseLimits(position_sigma_m=0.5), [True, True, False]),
+    ):
         results = Results(limits=limits)
         results.open(Run(tmp_path, "made", "", ""))
         for message in (made(1.0, R), made(1.02, R, variances=wide), made(1.04, R, variances=askew)):

@@ -13,13 +13,13 @@ import pytest
 from mavlink_poses import HOST0, good_pose
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.connection import Connection, Source_
-from links.mavlink.gate import Limits
-from links.mavlink.lines import StreamConnection
-from links.mavlink.origin import OriginGiver
-from links.mavlink.session import Session
-from links.mavlink.speaker import PoseSpeaker
-from links.mavlink.wire import packed, parse_frame
+from links.mavlink.autopilot_session import AutopilotSession
+from links.mavlink.framing import packed, parse_frame
+from links.mavlink.gate import PoseLimits
+from links.mavlink.origin import OriginSender
+from links.mavlink.pose_sender import PoseSender
+from links.mavlink.transport.connection import Connection, Source_
+from links.mavlink.transport.stream_connection import StreamConnection
 
 mavlink: Any = ardupilotmega
 STEP_NS = 5_000_000
@@ -135,16 +135,16 @@ class SlowFlight:
         self.late_since_s: list[float] = []
         """When poses began to be held back as late."""
         self.got: list[Any] = []
-        monkeypatch.setattr("links.mavlink.lines.time.monotonic", lambda: self.s)
-        monkeypatch.setattr(Session, "_keep", lambda session: None)  # its steps are ours
+        monkeypatch.setattr("links.mavlink.transport.stream_connection.time.monotonic", lambda: self.s)
+        monkeypatch.setattr(AutopilotSession, "_keep", lambda session: None)  # its steps are ours
         self.connection: Connection = RatedBridge(self.line) if bridge else StreamConnection(self.line)
-        speaker = PoseSpeaker(("odometry",), Limits())
-        self.session = Session(
+        speaker = PoseSender(("odometry",), PoseLimits())
+        self.session = AutopilotSession(
             self.connection,
             (1, 1),
             (1, 197),
             speaker,
-            OriginGiver(None, (1, 1)),
+            OriginSender(None, (1, 1)),
             None,
             lambda: self.now_ns,
             ("/autopilot/rx", "/autopilot/tx"),

@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as m
 from flow.link import LinkError, Record
 from links.mavlink import Autopilot
 from links.mavlink.checks import autopilot_checks, parameter_check
+from links.mavlink.framing import packed
 from links.mavlink.parameters import Answers, ask_parameters
-from links.mavlink.wire import packed
 from links.preflight.check_result import Level
 from stages.messages import AutopilotEstimator, AutopilotStatus
 from tests.links.preflight.observed import observe

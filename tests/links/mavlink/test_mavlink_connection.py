@@ -19,10 +19,10 @@ from ipaddress import IPv4Address
 import pytest
 
 from flow.link import LinkError
-from links.mavlink.connection import Connection, Endpoint, Udp, parse_connection
-from links.mavlink.lines import STALL_S, StreamConnection, open_connection
-from links.mavlink.serial_line import SERIAL_BACKLOG_BYTES
-from links.mavlink.tcp_line import TCP_BACKLOG_BYTES
+from links.mavlink.transport.connection import Connection, Endpoint, Udp, parse_connection
+from links.mavlink.transport.serial_line import SERIAL_BACKLOG_BYTES
+from links.mavlink.transport.stream_connection import STALL_S, StreamConnection, open_connection
+from links.mavlink.transport.tcp_line import TCP_BACKLOG_BYTES
 
 FRAME = bytes(244)
 UNSHARE = ("unshare", "-n") if os.geteuid() == 0 else ("unshare", "-rn")
@@ -118,7 +118,7 @@ def test_udp_out_hears_nobody_but_whom_it_sends_to_and_bears_a_closed_port():
 
 
 SLOW_NETWORK = """
-from links.mavlink.connection import Endpoint, Udp
+from links.mavlink.transport.connection import Endpoint, Udp
 link = Udp(Endpoint("udpout", "10.9.9.2", 14550), None)
 print(sum(link.send(bytes(244)) for _ in range(500)))
 """
@@ -305,7 +305,7 @@ def test_a_line_that_stands_still_is_dropped_and_says_so_and_one_that_moves_is_n
     room: int, monkeypatch: pytest.MonkeyPatch
 ):
     now_s = 0.0
-    monkeypatch.setattr("links.mavlink.lines.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("links.mavlink.transport.stream_connection.time.monotonic", lambda: now_s)
     line = SlowLine()
     link = StreamConnection(line)
     for _ in range(100):  # never empty, and never still: each frame is through 0.3 s after it was sent
@@ -350,7 +350,7 @@ def poses_for_20_s(
 ) -> tuple[int, StreamConnection, list[str | None]]:
     """How many went out of 50 a second, and each new word of trouble, looked at once a second as `flow.live` does."""
     now_s = 0.0
-    monkeypatch.setattr("links.mavlink.lines.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("links.mavlink.transport.stream_connection.time.monotonic", lambda: now_s)
     line, sent, said = MeteredLine(kbit_per_s, backlog_bytes), 0, list[str | None]()
     link = StreamConnection(line)
     for tick in range(1000):
@@ -382,7 +382,7 @@ def test_a_line_too_slow_for_any_use_says_once_what_it_needs(monkeypatch: pytest
 
 def test_a_stall_shorter_than_between_two_looks_is_said_and_then_that_all_works(monkeypatch: pytest.MonkeyPatch):
     now_s = 0.0
-    monkeypatch.setattr("links.mavlink.lines.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("links.mavlink.transport.stream_connection.time.monotonic", lambda: now_s)
     line, seen = SlowLine(), list[bool]()
     link = StreamConnection(line)
     link.send(FRAME)  # never taken

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from mavlink_poses import HOST0, MS, good_pose
 from pydantic import ValidationError
 
-from links.mavlink.gate import Limits, Refusal, pose_sigmas, refusal
-from links.mavlink.speaker import PoseSpeaker
+from links.mavlink.gate import PoseLimits, RejectReason, pose_sigmas, reject_reason
+from links.mavlink.pose_sender import PoseSender
 from stages.geometry import rotation_z
 from stages.messages import PoseState
 
-LIMITS = Limits()
+LIMITS = PoseLimits()
 
 
 def covariance(rotation_deg: float = 1.0, position_m: float = 0.1) -> Any:
@@ -32,45 +32,45 @@ def nan_at(array: Any, value: float = math.nan) -> Any:
 
 @pytest.mark.parametrize("state", [PoseState.FULL, PoseState.COASTING])
 def test_a_good_pose_passes_in_both_states_that_have_a_rotation(state: PoseState):
-    assert refusal(good_pose(state=state), HOST0, LIMITS) is None
+    assert reject_reason(good_pose(state=state), HOST0, LIMITS) is None
 
 
 @pytest.mark.parametrize("state", [PoseState.LOST, PoseState.POSITION_ONLY, PoseState.AMBIGUOUS])
 def test_no_other_state_passes_even_if_the_pose_looks_whole(state: PoseState):
-    why = refusal(good_pose(state=state), HOST0, LIMITS)
+    why = reject_reason(good_pose(state=state), HOST0, LIMITS)
     assert why is not None
     assert why.name == state.name
 
 
 SPOILED = [
-    ({"R_vehicle_drone": None}, Refusal.INCOMPLETE),
-    ({"R_start_drone": None}, Refusal.INCOMPLETE),
-    ({"xyz_start_m": None}, Refusal.INCOMPLETE),
-    ({"covariance": None}, Refusal.INCOMPLETE),
-    ({"start_covariance": None}, Refusal.INCOMPLETE),
-    ({"xyz_start_m": nan_at(np.ones(3))}, Refusal.NOT_FINITE),
-    ({"xyz_vehicle_m": nan_at(np.ones(3), math.inf)}, Refusal.NOT_FINITE),
-    ({"R_start_drone": nan_at(np.eye(3))}, Refusal.NOT_FINITE),
-    ({"start_covariance": nan_at(covariance())}, Refusal.NOT_FINITE),
-    ({"covariance": np.diag([math.inf] * 3 + [0.01] * 3)}, Refusal.NOT_FINITE),  # a rotation that is not known
-    ({"R_start_drone": np.diag([1.0, 1.0, -1.0])}, Refusal.NO_ROTATION),  # a mirror
-    ({"R_vehicle_drone": 1.01 * np.eye(3)}, Refusal.NO_ROTATION),
-    ({"R_start_drone": np.zeros((3, 3))}, Refusal.NO_ROTATION),
-    ({"start_covariance": np.zeros((6, 6))}, Refusal.COVARIANCE),
-    ({"covariance": -covariance()}, Refusal.COVARIANCE),
-    ({"covariance": covariance() + 0.1 * np.triu(np.ones((6, 6)), 1)}, Refusal.COVARIANCE),  # not symmetric
-    ({"start_covariance": covariance(position_m=0.51)}, Refusal.POSITION_SIGMA),
-    ({"covariance": covariance(position_m=0.51)}, Refusal.POSITION_SIGMA),
-    ({"start_covariance": covariance(rotation_deg=5.1)}, Refusal.ROTATION_SIGMA),
-    ({"covariance": covariance(rotation_deg=60.0)}, Refusal.ROTATION_SIGMA),
+    ({"R_vehicle_drone": None}, RejectReason.INCOMPLETE),
+    ({"R_start_drone": None}, RejectReason.INCOMPLETE),
+    ({"xyz_start_m": None}, RejectReason.INCOMPLETE),
+    ({"covariance": None}, RejectReason.INCOMPLETE),
+    ({"start_covariance": None}, RejectReason.INCOMPLETE),
+    ({"xyz_start_m": nan_at(np.ones(3))}, RejectReason.NOT_FINITE),
+    ({"xyz_vehicle_m": nan_at(np.ones(3), math.inf)}, RejectReason.NOT_FINITE),
+    ({"R_start_drone": nan_at(np.eye(3))}, RejectReason.NOT_FINITE),
+    ({"start_covariance": nan_at(covariance())}, RejectReason.NOT_FINITE),
+    ({"covariance": np.diag([math.inf] * 3 + [0.01] * 3)}, RejectReason.NOT_FINITE),  # a rotation that is not known
+    ({"R_start_drone": np.diag([1.0, 1.0, -1.0])}, RejectReason.NO_ROTATION),  # a mirror
+    ({"R_vehicle_drone": 1.01 * np.eye(3)}, RejectReason.NO_ROTATION),
+    ({"R_start_drone": np.zeros((3, 3))}, RejectReason.NO_ROTATION),
+    ({"start_covariance": np.zeros((6, 6))}, RejectReason.COVARIANCE),
+    ({"covariance": -covariance()}, RejectReason.COVARIANCE),
+    ({"covariance": covariance() + 0.1 * np.triu(np.ones((6, 6)), 1)}, RejectReason.COVARIANCE),  # not symmetric
+    ({"start_covariance": covariance(position_m=0.51)}, RejectReason.POSITION_SIGMA),
+    ({"covariance": covariance(position_m=0.51)}, RejectReason.POSITION_SIGMA),
+    ({"start_covariance": covariance(rotation_deg=5.1)}, RejectReason.ROTATION_SIGMA),
+    ({"covariance": covariance(rotation_deg=60.0)}, RejectReason.ROTATION_SIGMA),
 ]
 
 
 @pytest.mark.parametrize(("spoiling", "why"), SPOILED)
-def test_a_spoiled_pose_is_refused_by_its_reason_and_nothing_goes_out(spoiling: Any, why: Refusal):
+def test_a_spoiled_pose_is_refused_by_its_reason_and_nothing_goes_out(spoiling: Any, why: RejectReason):
     pose = good_pose(**spoiling)
-    assert refusal(pose, HOST0, LIMITS) is why
-    speaker = PoseSpeaker(("odometry", "landing_target"), LIMITS)
+    assert reject_reason(pose, HOST0, LIMITS) is why
+    speaker = PoseSender(("odometry", "landing_target"), LIMITS)
     assert speaker.speak(pose, HOST0) == []
     assert speaker.refused == {why: 1}
 
@@ -81,19 +81,22 @@ def test_sigmas_are_the_worst_direction_not_the_worst_axis():
     sigmas = pose_sigmas(turned @ flat @ turned.T)
     assert sigmas is not None
     np.testing.assert_allclose(sigmas, [0.02, 0.6])
-    assert refusal(good_pose(start_covariance=turned @ flat @ turned.T), HOST0, LIMITS) is Refusal.POSITION_SIGMA
+    assert (
+        reject_reason(good_pose(start_covariance=turned @ flat @ turned.T), HOST0, LIMITS)
+        is RejectReason.POSITION_SIGMA
+    )
 
 
 @pytest.mark.parametrize(
-    ("age_ms", "why"), [(0, None), (149, None), (151, Refusal.OLD), (-49, None), (-51, Refusal.AHEAD)]
+    ("age_ms", "why"), [(0, None), (149, None), (151, RejectReason.OLD), (-49, None), (-51, RejectReason.AHEAD)]
 )
-def test_an_old_pose_and_one_from_the_future_are_refused(age_ms: int, why: Refusal | None):
-    assert refusal(good_pose(), HOST0 + age_ms * MS, LIMITS) is why
+def test_an_old_pose_and_one_from_the_future_are_refused(age_ms: int, why: RejectReason | None):
+    assert reject_reason(good_pose(), HOST0 + age_ms * MS, LIMITS) is why
 
 
 def test_a_quarter_turn_that_is_not_resolved_never_goes_out_whatever_its_covariance_says():
     """Fusion in any of its states, 100 poses a state, each a quarter turn wrong and very sure of it."""
-    speaker = PoseSpeaker(("odometry",), LIMITS)
+    speaker = PoseSender(("odometry",), LIMITS)
     wrong = rotation_z(math.pi / 2)
     sent = 0
     for i in range(300):
@@ -126,7 +129,7 @@ def test_whatever_one_number_becomes_what_goes_out_is_finite_sure_and_fresh(
     spoiled = np.array(getattr(good_pose(), field))
     spoiled.flat[at % spoiled.size] = value
     pose = good_pose(state=state, **{field: spoiled})
-    messages = PoseSpeaker(("odometry",), LIMITS).speak(pose, HOST0 + age_ms * MS)
+    messages = PoseSender(("odometry",), LIMITS).speak(pose, HOST0 + age_ms * MS)
     for message in messages:
         assert state in (PoseState.FULL, PoseState.COASTING)
         assert -50 <= age_ms <= 150
@@ -143,4 +146,4 @@ def test_whatever_one_number_becomes_what_goes_out_is_finite_sure_and_fresh(
 )
 def test_limits_that_let_everything_pass_cannot_be_set(wrong: Any):
     with pytest.raises(ValidationError):
-        Limits(**wrong)
+        PoseLimits(**wrong)

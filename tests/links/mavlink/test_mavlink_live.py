@@ -25,9 +25,9 @@ from flow.link import LinkError, Record
 from flow.stage import input_ports
 from links.clock import host_time
 from links.mavlink import Autopilot
-from links.mavlink.session import Session
+from links.mavlink.autopilot_session import AutopilotSession
+from links.mavlink.framing import header, packed, parse_frame
 from links.mavlink.signing import AHEAD_TICKS
-from links.mavlink.wire import header, packed, parse_frame
 from links.simulated.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot_rules import Fate
 from links.simulated.autopilot_socket import AutopilotSocket
@@ -384,7 +384,7 @@ def test_a_disk_that_takes_its_time_with_the_signatures_time_holds_no_pose_up(
 def test_each_time_that_a_link_opens_the_signing_time_is_written_ahead_before_it_signs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(Session, "_keep", lambda session: None)  # the thread comes too late
+    monkeypatch.setattr(AutopilotSession, "_keep", lambda session: None)  # the thread comes too late
     key, _ = signing_drone(tmp_path)
     link = Autopilot(connection="udpin:127.0.0.1:0", signing_key=key)
     for _ in range(2):

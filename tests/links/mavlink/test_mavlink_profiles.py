@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from links.mavlink.connection import Endpoint, Udp
-from links.mavlink.lines import open_connection
 from links.mavlink.parameters import read_parameters
 from links.mavlink.profiles import ARDUPILOT, PROFILES, PX4, Profile, Wanted, findings
+from links.mavlink.transport.connection import Endpoint, Udp
+from links.mavlink.transport.stream_connection import open_connection
 from links.simulated.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot_socket import AutopilotSocket
 from links.simulated.px4_rules import Px4Rules

@@ -16,8 +16,8 @@ from mavlink_poses import HOST0, MS
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import LinkError
+from links.mavlink.framing import packed
 from links.mavlink.signing import AHEAD_TICKS, RETRY_S, Signer, ticks_of
-from links.mavlink.wire import packed
 
 mavlink: Any = ardupilotmega
 SECRET = bytes(range(32))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from mavlink_bridges import SlowFlight
 
-from links.mavlink.round_trip import LATE_NS
+from links.mavlink.timesync_monitor import LATE_NS
 
 LATE_S = 1e-9 * LATE_NS
 

@@ -25,7 +25,7 @@ from flow.link import LinkError
 from flow.message import array_fields, check_arrays
 from flow.replay import replay
 from links.velodyne import Lidar
-from links.velodyne.refusal import Refusal
+from links.velodyne.reject_reason import RejectReason
 
 SWEEP = """\
 stages:
@@ -83,7 +83,7 @@ def test_repeated_and_overtaken_packets_are_ignored_and_counted():
     answers = [lidar.decode(r) for r in (a, c, b, c, d)]
     assert [answer is not None for answer in answers] == [True, True, False, False, True]
     assert [answers[k].lost_packets for k in (0, 1, 4)] == [0, 1, 0]
-    assert refused(lidar, Refusal.ORDER) == 2
+    assert refused(lidar, RejectReason.ORDER) == 2
 
 
 def told(records, packets):
@@ -136,15 +136,15 @@ def damaged(**change):
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", Refusal.LENGTH),
-        (packet()[:-1], Refusal.LENGTH),
-        (bytes(512), Refusal.POSITION),
-        (damaged(flag=(700, b"\xff\xdd")), Refusal.FLAG),
-        (damaged(azimuth=(602, (36_000).to_bytes(2, "little"))), Refusal.AZIMUTH),
-        (damaged(azimuth=(602, (9_000).to_bytes(2, "little"))), Refusal.AZIMUTH),
-        (damaged(mode=(1204, b"\x36")), Refusal.RETURN_MODE),
-        (damaged(product=(1205, b"\x00")), Refusal.MODEL),
-        (damaged(time=(1200, (3_600_000_000).to_bytes(4, "little"))), Refusal.TIMESTAMP),
+        (b"", RejectReason.LENGTH),
+        (packet()[:-1], RejectReason.LENGTH),
+        (bytes(512), RejectReason.POSITION),
+        (damaged(flag=(700, b"\xff\xdd")), RejectReason.FLAG),
+        (damaged(azimuth=(602, (36_000).to_bytes(2, "little"))), RejectReason.AZIMUTH),
+        (damaged(azimuth=(602, (9_000).to_bytes(2, "little"))), RejectReason.AZIMUTH),
+        (damaged(mode=(1204, b"\x36")), RejectReason.RETURN_MODE),
+        (damaged(product=(1205, b"\x00")), RejectReason.MODEL),
+        (damaged(time=(1200, (3_600_000_000).to_bytes(4, "little"))), RejectReason.TIMESTAMP),
     ],
 )
 def test_a_bad_packet_in_a_good_stream_is_ignored_counted_and_missed(data, reason):
@@ -162,7 +162,7 @@ def test_dual_return_blocks_of_one_pulse_share_their_azimuth():
     data[102] += 1
     lidar = Lidar()
     assert lidar.decode(record(bytes(data))) is None
-    assert refused(lidar, Refusal.AZIMUTH) == 1
+    assert refused(lidar, RejectReason.AZIMUTH) == 1
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from flow.link import LinkError, Record, Source
 from flow.problem import ConfigError
 from flow.stage import input_ports, output_ports
 from links.zenoh import Receiver, Sender, host_graph
-from links.zenoh.session import Session, access_control, config_of
-from links.zenoh.wire import RECORD_HEAD
+from links.zenoh.envelope import RECORD_HEAD
+from links.zenoh.session_settings import SessionSettings, access_control, config_of
 
 PLACE = {"beats": "drone", "echo": "vehicle", "teller": "base"}
 
@@ -172,4 +172,4 @@ def test_a_session_s_settings_are_what_connections_are_shared_by(files):
     graph, hosts = files
     sessions = {spec.config["session"] for n, spec in host_graph(graph, hosts, "vehicle").nodes.items() if n != "echo"}
     assert len(sessions) == 1
-    assert isinstance(sessions.pop(), Session)
+    assert isinstance(sessions.pop(), SessionSettings)

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from links.zenoh.envelope import Envelope
 from links.zenoh.peer_clock import PeerClock
 from links.zenoh.receiver import Receiver, ReceiverSettings
-from links.zenoh.wire import Envelope
 
 
 @pytest.fixture

@@ -17,9 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from links.mavlink.gate import Limits, Refusal, refusal
-from links.mavlink.pose_frames import landing_target, odometry, vision_position_estimate
-from links.mavlink.wire import SEQUENCE, dialect
+from links.mavlink.framing import SEQUENCE, dialect
+from links.mavlink.gate import PoseLimits, RejectReason, reject_reason
+from links.mavlink.pose_messages import landing_target, odometry, vision_position_estimate
 from stages.messages import PoseState, RelativePose
 
 Kind = Literal["odometry", "vision_position_estimate", "landing_target"]
@@ -42,11 +42,11 @@ class Sent:
     track_id: int
 
 
-class PoseSpeaker:
+class PoseSender:
     """Turns poses into messages, or refuses them and says so. Ask for `texts` between them, some ten times a second."""
 
-    def __init__(self, kinds: Sequence[Kind], limits: Limits, reset_counter: int = 0) -> None:
-        self.refused: Counter[Refusal] = Counter()
+    def __init__(self, kinds: Sequence[Kind], limits: PoseLimits, reset_counter: int = 0) -> None:
+        self.refused: Counter[RejectReason] = Counter()
         self.reset_counter = reset_counter % SEQUENCE
         self._kinds, self._limits = tuple(kinds), limits
         self._sent: Sent | None = None
@@ -62,18 +62,18 @@ class PoseSpeaker:
         """Whether poses are going out now."""
         return self._sending
 
-    def speak(self, pose: RelativePose, now_ns: int, line: Refusal | None = None) -> list[Any]:
+    def speak(self, pose: RelativePose, now_ns: int, line: RejectReason | None = None) -> list[Any]:
         """Messages for one pose: those chosen; none where it, or `line`, is refused. Say `went_out` when they have."""
         if pose.state is not self._state:
             self._state = pose.state
             self._texts["state"] = SEVERITY.get(pose.state, WARNING), f"{pose.state.name}: {pose.reason}"
-        why = refusal(pose, now_ns, self._limits)
+        why = reject_reason(pose, now_ns, self._limits)
         if why is None and self._sent is not None and pose.stamp_ns <= self._sent.stamp_ns:
-            why = Refusal.NOT_NEWER
+            why = RejectReason.NOT_NEWER
         why = why or line
         if why is not None:
             self.refused[why] += 1
-            if why is not Refusal.NOT_NEWER:  # the newer one went out
+            if why is not RejectReason.NOT_NEWER:  # the newer one went out
                 self._stop(why.value)
             return []
         self._count_reset(pose, now_ns)

@@ -32,7 +32,7 @@ PROVEN = 240  # prompt answers while poses go out: a minute
 WAITING = 64  # requests: a quarter of a minute
 
 
-class RoundTrips:
+class TimesyncMonitor:
     """`asked`, `heard` and `answered` in turn; `late`: whether poses would come late."""
 
     def __init__(self) -> None:

@@ -20,7 +20,7 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 from links.velodyne import vlp16
-from links.velodyne.refusal import Refusal
+from links.velodyne.reject_reason import RejectReason
 
 ClockMode = Literal["free", "utc"]
 
@@ -29,14 +29,14 @@ HALF_WINDOW_NS = 500_000_000
 REORDER_US = 50_000  # a step back within this is a late or repeated packet, beyond it the clock was set
 
 
-class Tick(NamedTuple):
+class PacketTime(NamedTuple):
     """One packet's time."""
 
     stamp_ns: int  # of its first pulse, on the host's timeline
     gap_ns: int  # device time since the packet before; 0 when unknown
 
 
-class DeviceClock:
+class LidarClock:
     """Turns device times into host times, packet by packet. Pure: the same packets give the same stamps."""
 
     def __init__(self, mode: ClockMode = "free", limit_ns: int = 500_000_000) -> None:
@@ -51,11 +51,11 @@ class DeviceClock:
         self.disagreements = 0
         """Times that device and host differed by more than the limit: in `free` each one began a new offset."""
 
-    def read(self, device_us: int, host_ns: int) -> Tick | Refusal:
+    def read(self, device_us: int, host_ns: int) -> PacketTime | RejectReason:
         """Time of a packet from its device time [us of the hour] and the host's idea of it [ns]."""
         return self._read(device_us, host_ns)
 
-    def _read_free(self, device_us: int, host_ns: int) -> Tick | Refusal:
+    def _read_free(self, device_us: int, host_ns: int) -> PacketTime | RejectReason:
         if self._last_us is None:
             return self._anchor(device_us, host_ns)
         step_us = _wrap(device_us - self._last_us, vlp16.HOUR_US)
@@ -65,7 +65,7 @@ class DeviceClock:
             self.disagreements += 1
             return self._anchor(device_us, host_ns)
         if step_us <= 0:
-            return Refusal.ORDER
+            return RejectReason.ORDER
         if device_ns >= self._half_ends_ns:
             long_ago = device_ns >= self._half_ends_ns + HALF_WINDOW_NS
             self._least_before_ns = offset_ns if long_ago else self._least_ns
@@ -75,25 +75,25 @@ class DeviceClock:
         self._device_ns = device_ns
         self._least_ns = min(self._least_ns, offset_ns)
         least_ns = min(self._least_ns, self._least_before_ns)
-        return Tick(host_ns if offset_ns - least_ns <= RESOLUTION_NS else device_ns + least_ns, 1_000 * step_us)
+        return PacketTime(host_ns if offset_ns - least_ns <= RESOLUTION_NS else device_ns + least_ns, 1_000 * step_us)
 
-    def _anchor(self, device_us: int, host_ns: int) -> Tick:
+    def _anchor(self, device_us: int, host_ns: int) -> PacketTime:
         self._last_us = device_us
         self._device_ns = 0
         self._least_ns = self._least_before_ns = host_ns
         self._half_ends_ns = HALF_WINDOW_NS
-        return Tick(host_ns, 0)
+        return PacketTime(host_ns, 0)
 
-    def _read_utc(self, device_us: int, host_ns: int) -> Tick | Refusal:
+    def _read_utc(self, device_us: int, host_ns: int) -> PacketTime | RejectReason:
         early_ns = _wrap(1_000 * device_us - host_ns, 1_000 * vlp16.HOUR_US)
         if abs(early_ns) > self._limit_ns:
             self.disagreements += 1
-            return Refusal.CLOCK
+            return RejectReason.CLOCK
         step_us = 0 if self._last_us is None else _wrap(device_us - self._last_us, vlp16.HOUR_US)
         if self._last_us is not None and -REORDER_US <= step_us <= 0:
-            return Refusal.ORDER
+            return RejectReason.ORDER
         self._last_us = device_us
-        return Tick(host_ns if abs(early_ns) <= RESOLUTION_NS else host_ns + early_ns, 1_000 * max(step_us, 0))
+        return PacketTime(host_ns if abs(early_ns) <= RESOLUTION_NS else host_ns + early_ns, 1_000 * max(step_us, 0))
 
 
 def _wrap(difference: int, turn: int) -> int:

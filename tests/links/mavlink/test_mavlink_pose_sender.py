@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from mavlink_poses import HOST0, MS, good_pose
 
-from links.mavlink.gate import Limits
-from links.mavlink.speaker import TEXT_BYTES, PoseSpeaker
+from links.mavlink.gate import PoseLimits
+from links.mavlink.pose_sender import TEXT_BYTES, PoseSender
 from stages.messages import PoseState
 
 
@@ -16,7 +16,7 @@ class Line:
     """Speaks poses at a rate and keeps what went out."""
 
     def __init__(self, **settings: Any) -> None:
-        self.speaker = PoseSpeaker(("odometry",), Limits(), **settings)
+        self.speaker = PoseSender(("odometry",), PoseLimits(), **settings)
         self.now_ns = HOST0
         self.counters: list[int] = []
         self.texts: list[tuple[int, str]] = []
@@ -155,7 +155,7 @@ def test_a_text_that_the_line_did_not_take_waits_unless_a_newer_one_does():
 
 
 def test_nothing_to_send_is_no_sending_and_no_stop():
-    speaker = PoseSpeaker((), Limits())
+    speaker = PoseSender((), PoseLimits())
     assert speaker.speak(good_pose(), HOST0) == []
     assert not speaker.sending
     texts = [m.text for i in range(40) for m in speaker.texts(HOST0 + 100 * i * MS)]

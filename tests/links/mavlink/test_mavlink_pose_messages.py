@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from mavlink_poses import good_pose
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.gate import Limits
-from links.mavlink.pose_frames import landing_target, odometry, quality_percent, vision_position_estimate
+from links.mavlink.framing import packed, parse_frame
+from links.mavlink.gate import PoseLimits
+from links.mavlink.pose_messages import landing_target, odometry, quality_percent, vision_position_estimate
 from links.mavlink.readers import read_odometry
-from links.mavlink.wire import packed, parse_frame
 from stages.geometry import rotation_from_rpy_deg
 
 mavlink: Any = ardupilotmega
-LIMITS = Limits()
+LIMITS = PoseLimits()
 
 
 def over_the_wire(message: Any) -> Any:

@@ -12,7 +12,7 @@ import struct
 import termios
 
 from flow.link import LinkError
-from links.mavlink.connection import Endpoint
+from links.mavlink.transport.connection import Endpoint
 
 CHUNK_BYTES = 4096
 TCP_BACKLOG_BYTES = 512  # not through yet: two poses more

@@ -8,7 +8,7 @@ the start, not north: LOCAL_FRD. LANDING_TARGET tells where the vehicle is, in t
 
 What is not known is NaN, never 0: a velocity of zero is believed, and the drone flies away.
 
-quality: 100 for a pose that is known exactly, 1 at the limit (`gate.Limits`), by the worse of position and rotation;
+quality: 100 for a pose that is known exactly, 1 at the limit (`PoseLimits`), by the worse of position and rotation;
 0 would mean unknown. time_usec is the host's time (microseconds since 1970), the time that TIMESYNC tells, too.
 
 Source: https://mavlink.io/en/messages/common.html#ODOMETRY, #VISION_POSITION_ESTIMATE, #LANDING_TARGET;
@@ -23,15 +23,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from links.mavlink.frames import (
+from links.mavlink.framing import SEQUENCE, dialect
+from links.mavlink.gate import PoseLimits, velocity_to_send, worst_sigmas
+from links.mavlink.ned_frd import (
+    flip_yz,
     rpy_from_R_local_drone,
-    turned_over,
     upper_from_pose_covariance,
     upper_from_velocity_covariance,
     wxyz_from_R_local_drone,
 )
-from links.mavlink.gate import Limits, velocity_to_send, worst_sigmas
-from links.mavlink.wire import SEQUENCE, dialect
 from stages.messages import RelativePose
 
 LOCAL_FRD, BODY_FRD = 20, 12  # MAV_FRAME: ArduPilot takes ODOMETRY in these two alone
@@ -40,7 +40,7 @@ VISION_OTHER = 3  # LANDING_TARGET_TYPE
 NO_NUMBERS = [math.nan] * 3
 
 
-def quality_percent(pose: RelativePose, limits: Limits) -> int:
+def quality_percent(pose: RelativePose, limits: PoseLimits) -> int:
     """1 (at the limit) to 100 (exact), linear in the worse of the two sigmas over their limits."""
     sigmas = worst_sigmas(pose)
     if sigmas is None:
@@ -49,7 +49,7 @@ def quality_percent(pose: RelativePose, limits: Limits) -> int:
     return max(1, min(100, round(100 * (1 - worst))))
 
 
-def odometry(pose: RelativePose, reset_counter: int, limits: Limits) -> Any:
+def odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits) -> Any:
     """ODOMETRY of a pose that the gate let through."""
     xyz_m, R, covariance = _start_pose(pose)
     velocity = velocity_to_send(pose, limits)
@@ -57,9 +57,9 @@ def odometry(pose: RelativePose, reset_counter: int, limits: Limits) -> Any:
         pose.stamp_ns // 1000,
         LOCAL_FRD,
         BODY_FRD,
-        *turned_over(xyz_m),
+        *flip_yz(xyz_m),
         wxyz_from_R_local_drone(R),
-        *(NO_NUMBERS if velocity is None else turned_over(R.T @ velocity)),
+        *(NO_NUMBERS if velocity is None else flip_yz(R.T @ velocity)),
         *NO_NUMBERS,  # turn rates: the autopilot's gyros know better
         upper_from_pose_covariance(covariance, R),
         _velocity_upper(pose.velocity_covariance if velocity is not None else None, R),
@@ -74,7 +74,7 @@ def vision_position_estimate(pose: RelativePose, reset_counter: int) -> Any:
     xyz_m, R, covariance = _start_pose(pose)
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
-        *turned_over(xyz_m),
+        *flip_yz(xyz_m),
         *rpy_from_R_local_drone(R),
         upper_from_pose_covariance(covariance, R),
         reset_counter % SEQUENCE,
@@ -89,7 +89,7 @@ def landing_target(pose: RelativePose) -> Any:
     """
     if pose.xyz_vehicle_m is None or pose.R_vehicle_drone is None:
         raise ValueError("a landing target needs the drone's rotation")
-    x, y, z = turned_over(-pose.R_vehicle_drone.T @ pose.xyz_vehicle_m).tolist()
+    x, y, z = flip_yz(-pose.R_vehicle_drone.T @ pose.xyz_vehicle_m).tolist()
     angles = (math.atan2(y, z), math.atan2(-x, z)) if z > 0 else (math.nan, math.nan)
     R_drone_vehicle = pose.R_vehicle_drone.T
     return dialect().MAVLink_landing_target_message(

@@ -13,8 +13,8 @@ from typing import Any
 
 from flow.link import Record
 from links.clock.device_clock import DeviceClock
+from links.mavlink.framing import SEQUENCE, header, known, parse_frame, timesync_target
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
-from links.mavlink.wire import SEQUENCE, header, known, parse_frame, timesync_target
 from stages.messages import AutopilotStatus
 
 HALF_MS_NS = 500_000  # time_boot_ms is cut off, not rounded: on average half a millisecond early
@@ -23,7 +23,7 @@ CRITICAL = 5  # MAV_STATE_CRITICAL; above: emergency, poweroff, termination
 LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost ones
 
 
-class FrameStream:
+class FrameDecoder:
     """Decodes frames in turn; keeps the clock, the sequence and the counts."""
 
     def __init__(self, sender: tuple[int, int], own: tuple[int, int], clock: DeviceClock) -> None:

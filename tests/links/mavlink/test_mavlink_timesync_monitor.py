@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from links.mavlink.round_trip import (
+from links.mavlink.timesync_monitor import (
     ASK_NS,
     FIRST_WAIT_NS,
     GIVEN_UP,
@@ -17,7 +17,7 @@ from links.mavlink.round_trip import (
     PROVEN,
     UNANSWERED,
     WAITING,
-    RoundTrips,
+    TimesyncMonitor,
 )
 
 MS = 1_000_000
@@ -29,7 +29,7 @@ class Asking:
     """Requests in turn; the autopilot is heard in between unless it is said otherwise."""
 
     def __init__(self) -> None:
-        self.trips = RoundTrips()
+        self.trips = TimesyncMonitor()
         self.now_ns = 10**12
 
     def late_after(self, took_ms: Iterable[int | None], heard: bool = True, sending: bool = True) -> list[bool]:
@@ -135,7 +135,7 @@ def test_after_a_silence_it_need_not_answer_and_a_wait_goes_on_to_its_end():
 
 
 def test_two_frames_within_a_second_that_left_late_are_late_though_nobody_answers():
-    trips = RoundTrips()
+    trips = TimesyncMonitor()
     trips.left_late(0)
     trips.left_late(LEFT_LATE_NS + 1)
     assert not trips.late
@@ -149,7 +149,7 @@ def test_two_frames_within_a_second_that_left_late_are_late_though_nobody_answer
 
 
 def test_only_the_first_answer_to_a_request_of_ours_counts():
-    trips = RoundTrips()
+    trips = TimesyncMonitor()
     trips.asked(5)
     assert not trips.answered(4, 10, sending=True)
     assert trips.answered(5, 10, sending=True)

@@ -33,7 +33,7 @@ OPENING = {"open_timeout": 2000, "accept_timeout": 2000}  # ms; a greeting that 
 MAX_MESSAGE_BYTES = 20 * 2**20  # more than flow.codec.MAX_BYTES
 
 
-class Session(BaseModel):
+class SessionSettings(BaseModel):
     """One host's session: how to open it, and which keys go which way."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -59,11 +59,11 @@ class Session(BaseModel):
         return tuple(dict.fromkeys(host for pair in self.keys for host in pair[:2] if host != self.host))
 
 
-def session_of(hosts: Hosts, name: str) -> Session:
+def session_of(hosts: Hosts, name: str) -> SessionSettings:
     """The session of one of the hosts."""
     host = hosts.hosts[name]
     hops = [hop for hop in hosts.hops if name in (hop.sender, hop.receiver)]
-    return Session(
+    return SessionSettings(
         host=name,
         hub=hosts.hub,
         endpoint=host.endpoint,
@@ -84,7 +84,7 @@ def clock_key(asked: str, asker: str) -> str:
     return f"{ROOT}/clock/{asked}/{asker}"
 
 
-def config_of(session: Session) -> dict[str, Any]:
+def config_of(session: SessionSettings) -> dict[str, Any]:
     """Zenoh's configuration."""
     certificate, key = str(session.certificate), str(session.key)
     tls = {
@@ -119,7 +119,7 @@ def config_of(session: Session) -> dict[str, Any]:
     return config
 
 
-def access_control(session: Session) -> dict[str, Any]:
+def access_control(session: SessionSettings) -> dict[str, Any]:
     """Who may say what on this host's lines: nothing that is not named here."""
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []

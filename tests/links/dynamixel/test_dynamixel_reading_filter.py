@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from links.dynamixel.belief import Belief, reachable
 from links.dynamixel.drive import Measured
+from links.dynamixel.reading_filter import ReadingFilter, reachable
 
 MS = 1_000_000
 
@@ -19,24 +19,24 @@ def test_the_servo_comes_as_far_as_100_rpm_take_it():
 
 
 def test_a_jump_is_doubted_once_and_believed_when_it_is_told_again():
-    belief = Belief()
-    said = [belief.doubt(reading(4 * k, t)) for k, t in enumerate([1000, 3000, 1001, 3000, 3000, 3001, 1000])]
+    belief = ReadingFilter()
+    said = [belief.reject_reason(reading(4 * k, t)) for k, t in enumerate([1000, 3000, 1001, 3000, 3000, 3001, 1000])]
     assert said == [None, "implausible", None, "implausible", None, None, "implausible"]
 
 
 def test_an_exchange_that_takes_long_is_left_out_until_that_is_usual():
-    belief = Belief()
-    assert [belief.doubt(reading(4 * k, 1000)) for k in range(40)] == [None] * 40
-    assert belief.doubt(reading(160, 1000, took_ms=1.0)) is None  # 2 * 0.3 + 0.5 = 1.1 ms
-    assert belief.doubt(reading(164, 1000, took_ms=1.2)) == "slow"
-    later = [belief.doubt(reading(168 + 4 * k, 1000, took_ms=3.0)) for k in range(30)]
+    belief = ReadingFilter()
+    assert [belief.reject_reason(reading(4 * k, 1000)) for k in range(40)] == [None] * 40
+    assert belief.reject_reason(reading(160, 1000, took_ms=1.0)) is None  # 2 * 0.3 + 0.5 = 1.1 ms
+    assert belief.reject_reason(reading(164, 1000, took_ms=1.2)) == "slow"
+    later = [belief.reject_reason(reading(168 + 4 * k, 1000, took_ms=3.0)) for k in range(30)]
     assert later[0] == "slow"
     assert later[-1] is None
     assert later.count("slow") * 4 < 100  # the sweep bridges 100 ms
 
 
 def test_a_slow_reading_says_nothing_of_where_the_servo_is():
-    belief = Belief()
-    belief.doubt(reading(0, 1000))
-    assert belief.doubt(reading(4, 1040, took_ms=5)) == "slow"
-    assert belief.doubt(reading(8, 1000)) is None
+    belief = ReadingFilter()
+    belief.reject_reason(reading(0, 1000))
+    assert belief.reject_reason(reading(4, 1040, took_ms=5)) == "slow"
+    assert belief.reject_reason(reading(8, 1000)) is None

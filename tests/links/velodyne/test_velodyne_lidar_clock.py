@@ -5,8 +5,8 @@ import pytest
 from hand_built import HOUR_NS, SINGLE_PACKET_NS, captured_records
 
 from links.velodyne import Lidar
-from links.velodyne.clock import DeviceClock, Tick
-from links.velodyne.refusal import Refusal
+from links.velodyne.lidar_clock import LidarClock, PacketTime
+from links.velodyne.reject_reason import RejectReason
 
 START_NS = 1_700_000_000_000_000_123
 
@@ -17,7 +17,7 @@ def device_us(true_ns, phase_ns=0):
 
 def stamps_of(clock, true_ns, late_ns, phase_ns=0):
     ticks = [clock.read(device_us(t, phase_ns), t + late) for t, late in zip(true_ns, late_ns, strict=True)]
-    assert all(isinstance(tick, Tick) for tick in ticks)
+    assert all(isinstance(tick, PacketTime) for tick in ticks)
     return np.array([tick.stamp_ns for tick in ticks])
 
 
@@ -25,7 +25,7 @@ def stamps_of(clock, true_ns, late_ns, phase_ns=0):
 def test_exact_stamps_stay_exact_to_the_ns_through_the_hour(mode):
     start_ns = START_NS // HOUR_NS * HOUR_NS + HOUR_NS - 500 * SINGLE_PACKET_NS + 77
     true_ns = [start_ns + k * SINGLE_PACKET_NS for k in range(1_000)]
-    clock = DeviceClock(mode)
+    clock = LidarClock(mode)
     assert stamps_of(clock, true_ns, [0] * 1_000).tolist() == true_ns
     assert clock.disagreements == 0
 
@@ -35,7 +35,7 @@ def test_a_free_clock_follows_the_fastest_packets_not_the_first():
     true_ns = [START_NS + k * SINGLE_PACKET_NS for k in range(2_000)]
     late_ns = random.exponential(200_000, 2_000).astype(int).tolist()
     late_ns[0] = 5_000_000
-    errors_ns = stamps_of(DeviceClock(), true_ns, late_ns, phase_ns=987_654_321) - np.array(true_ns)
+    errors_ns = stamps_of(LidarClock(), true_ns, late_ns, phase_ns=987_654_321) - np.array(true_ns)
     assert errors_ns[0] == 5_000_000
     assert abs(errors_ns[100:]).max() < 50_000
 
@@ -45,11 +45,11 @@ def test_a_free_clock_that_drifts_is_followed(drift):
     random = np.random.default_rng(4)
     true_ns = [START_NS + k * SINGLE_PACKET_NS for k in range(20_000)]
     late_ns = random.exponential(100_000, 20_000).astype(int)
-    clock = DeviceClock()
+    clock = LidarClock()
     errors_ns = []
     for k, t in enumerate(true_ns):
         tick = clock.read(device_us(t + int(drift * k * SINGLE_PACKET_NS)), t + int(late_ns[k]))
-        assert isinstance(tick, Tick)
+        assert isinstance(tick, PacketTime)
         errors_ns.append(tick.stamp_ns - t)
     assert abs(np.array(errors_ns[100:])).max() < 120_000  # 26 s at 100 ppm would be 2.6 ms
 
@@ -57,71 +57,71 @@ def test_a_free_clock_that_drifts_is_followed(drift):
 def test_a_packet_held_up_on_the_way_keeps_its_own_time():
     true_ns = [START_NS + k * SINGLE_PACKET_NS for k in range(100)]
     late_ns = [0] * 50 + [300_000_000] + [0] * 49
-    errors_ns = stamps_of(DeviceClock(), true_ns, late_ns) - np.array(true_ns)
+    errors_ns = stamps_of(LidarClock(), true_ns, late_ns) - np.array(true_ns)
     assert abs(errors_ns).max() < 3_000
 
 
 def test_a_small_step_of_the_hosts_clock_is_followed_within_a_second():
     true_ns = [START_NS + k * SINGLE_PACKET_NS for k in range(2_000)]
-    errors_ns = stamps_of(DeviceClock(), true_ns, [0] * 500 + [100_000_000] * 1_500) - np.array(true_ns)
+    errors_ns = stamps_of(LidarClock(), true_ns, [0] * 500 + [100_000_000] * 1_500) - np.array(true_ns)
     assert (errors_ns[500 + 754 :] == 100_000_000).all()
 
 
 def test_a_pause_is_bridged_by_the_device_clock_and_old_offsets_are_forgotten():
-    clock = DeviceClock()
+    clock = LidarClock()
     clock.read(device_us(START_NS), START_NS)
     after_ns = START_NS + 60_000_000_000
-    assert clock.read(device_us(after_ns), after_ns + 3_000_000) == Tick(after_ns + 3_000_000, 60_000_000_000)
+    assert clock.read(device_us(after_ns), after_ns + 3_000_000) == PacketTime(after_ns + 3_000_000, 60_000_000_000)
     assert clock.disagreements == 0
 
 
 @pytest.mark.parametrize("jump_ns", [2_000_000_000, -2_000_000_000, 900_000_000_000])
 def test_a_device_clock_that_was_set_is_anchored_anew_and_counted(jump_ns):
-    clock = DeviceClock()
+    clock = LidarClock()
     clock.read(device_us(START_NS), START_NS)
     after_ns = START_NS + SINGLE_PACKET_NS
     tick = clock.read(device_us(after_ns, jump_ns), after_ns)
-    assert tick == Tick(after_ns, 0)
+    assert tick == PacketTime(after_ns, 0)
     assert clock.disagreements == 1
     later_ns = after_ns + SINGLE_PACKET_NS
     assert clock.read(device_us(later_ns, jump_ns), later_ns).stamp_ns == later_ns
 
 
 def test_a_small_step_back_of_the_device_clock_does_not_stop_the_stream():
-    clock = DeviceClock()
+    clock = LidarClock()
     clock.read(device_us(START_NS), START_NS)
     after_ns = START_NS + SINGLE_PACKET_NS
-    assert clock.read(device_us(after_ns, -200_000_000), after_ns) == Tick(after_ns, 0)
+    assert clock.read(device_us(after_ns, -200_000_000), after_ns) == PacketTime(after_ns, 0)
     assert clock.disagreements == 1
 
 
 @pytest.mark.parametrize("mode", ["free", "utc"])
 def test_repeated_and_overtaken_packets_are_out_of_order(mode):
-    clock = DeviceClock(mode)
+    clock = LidarClock(mode)
     first, second = START_NS, START_NS + SINGLE_PACKET_NS
     clock.read(device_us(first), first)
     clock.read(device_us(second), second)
-    assert clock.read(device_us(second), second + 90_000) is Refusal.ORDER
-    assert clock.read(device_us(first), second + 90_000) is Refusal.ORDER
+    assert clock.read(device_us(second), second + 90_000) is RejectReason.ORDER
+    assert clock.read(device_us(first), second + 90_000) is RejectReason.ORDER
 
 
 @pytest.mark.parametrize("late_ns", [400_000_000, -400_000_000])
 def test_utc_takes_the_devices_time_in_the_hosts_nearest_hour(late_ns):
     for true_ns in (START_NS // HOUR_NS * HOUR_NS + 1_000, START_NS // HOUR_NS * HOUR_NS - 1_000):
-        tick = DeviceClock("utc").read(device_us(true_ns), true_ns + late_ns)
-        assert tick == Tick(true_ns, 0)
+        tick = LidarClock("utc").read(device_us(true_ns), true_ns + late_ns)
+        assert tick == PacketTime(true_ns, 0)
 
 
 def test_utc_refuses_times_that_the_host_does_not_share():
-    clock = DeviceClock("utc", limit_ns=500_000_000)
-    assert clock.read(device_us(START_NS), START_NS + 600_000_000) is Refusal.CLOCK
+    clock = LidarClock("utc", limit_ns=500_000_000)
+    assert clock.read(device_us(START_NS), START_NS + 600_000_000) is RejectReason.CLOCK
     assert clock.disagreements == 1
 
 
 def test_the_gap_counts_device_time_through_the_hour():
-    clock = DeviceClock()
+    clock = LidarClock()
     clock.read(3_599_999_000, START_NS)
-    assert clock.read(327, START_NS + 1_327_000) == Tick(START_NS + 1_327_000, 1_327_000)
+    assert clock.read(327, START_NS + 1_327_000) == PacketTime(START_NS + 1_327_000, 1_327_000)
 
 
 def test_a_real_sensor_and_host_agree_to_their_network_jitter():

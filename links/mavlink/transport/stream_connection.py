@@ -19,11 +19,11 @@ from ipaddress import IPv4Address
 from typing import Protocol
 
 from flow.link import LinkError
-from links.mavlink.connection import Connection, Endpoint, Source_, Udp
-from links.mavlink.round_trip import LATE_NS
-from links.mavlink.serial_line import SerialLine
-from links.mavlink.tcp_line import TcpLine
-from links.mavlink.wire import MAX_FRAME_BYTES
+from links.mavlink.framing import MAX_FRAME_BYTES
+from links.mavlink.timesync_monitor import LATE_NS
+from links.mavlink.transport.connection import Connection, Endpoint, Source_, Udp
+from links.mavlink.transport.serial_line import SerialLine
+from links.mavlink.transport.tcp_line import TcpLine
 
 CLOSE_S = 0.1
 RETRY_S = (0.1, 2.0)  # first and last wait before the next try

@@ -12,7 +12,7 @@ import termios
 from typing import Any
 
 from flow.link import LinkError
-from links.mavlink.connection import Endpoint
+from links.mavlink.transport.connection import Endpoint
 
 CHUNK_BYTES = 4096
 SERIAL_BACKLOG_BYTES = 512  # not through yet: two poses more, 6 ms at 921600 baud

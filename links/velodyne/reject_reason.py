@@ -8,7 +8,7 @@ from __future__ import annotations
 import enum
 
 
-class Refusal(enum.Enum):
+class RejectReason(enum.Enum):
     """One reason to ignore a packet."""
 
     LENGTH = "not 1206 bytes long"

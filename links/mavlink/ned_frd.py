@@ -36,7 +36,7 @@ _VARIANCES = np.diagonal(_NUMBER).tolist()
 _EYE6 = np.eye(6)
 
 
-def turned_over(vector: Array64) -> Array64:
+def flip_yz(vector: Array64) -> Array64:
     """(x, -y, -z): NED <-> local, FRD <-> drone, for vectors and turn rates (..., 3)."""
     return vector * FLIP
 

@@ -19,7 +19,7 @@ REMEMBERED = 33  # exchanges; half of them outvote a change of what is usual: 70
 FASTEST_TICKS_PER_S = 100 / 60 * mx28.STEPS_PER_TURN  # 100 rpm; without load it does 67 at 14.8 V
 
 
-class Belief:
+class ReadingFilter:
     """Looks at every reading, in order."""
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class Belief:
         self._believed: Measured | None = None  # the newest
         self._doubted: Measured | None = None  # the one before, when it was not believed for its place
 
-    def doubt(self, measured: Measured) -> str | None:
+    def reject_reason(self, measured: Measured) -> str | None:
         """Why a reading is not to be told, "implausible" or "slow"; None when it is."""
         believed, doubted = self._believed, self._doubted
         self._doubted = None

@@ -7,9 +7,9 @@ from crossing_toys import Beat, Picture
 from hypothesis import given
 from hypothesis import strategies as st
 
-from links.zenoh import lane
-from links.zenoh.lane import Lane
-from links.zenoh.wire import Envelope, read_envelope
+from links.zenoh import output_queue
+from links.zenoh.envelope import Envelope, read_envelope
+from links.zenoh.output_queue import OutputQueue
 
 
 def beat(number):
@@ -19,12 +19,12 @@ def beat(number):
 @pytest.fixture
 def clock(monkeypatch):
     now = [0]
-    monkeypatch.setattr(lane, "now_ns", lambda: now[0])
+    monkeypatch.setattr(output_queue, "now_ns", lambda: now[0])
     return now
 
 
 def test_the_newest_only_waits_and_what_it_replaced_is_counted(clock):
-    newest = Lane("grd/a/b/c/d", Picture, 1, 10**8)
+    newest = OutputQueue("grd/a/b/c/d", Picture, 1, 10**8)
     for number in range(5):
         newest.put(beat(number))
     assert newest._take().number == 4
@@ -32,7 +32,7 @@ def test_the_newest_only_waits_and_what_it_replaced_is_counted(clock):
 
 
 def test_what_waited_longer_than_its_deadline_is_dropped_but_never_the_newest(clock):
-    queue = Lane("grd/a/b/c/d", Beat, 100, 50)
+    queue = OutputQueue("grd/a/b/c/d", Beat, 100, 50)
     for number, at_ns in enumerate((0, 10, 60, 70)):
         clock[0] = at_ns
         queue.put(beat(number))
@@ -45,8 +45,8 @@ def test_what_waited_longer_than_its_deadline_is_dropped_but_never_the_newest(cl
 
 
 def test_messages_of_a_fixed_size_overtake_the_others():
-    assert Lane("k", Beat, 1, 1)._small
-    assert not Lane("k", Picture, 1, 1)._small
+    assert OutputQueue("k", Beat, 1, 1)._small
+    assert not OutputQueue("k", Picture, 1, 1)._small
 
 
 @given(st.binary(max_size=64))

@@ -25,13 +25,13 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from flow.link import LinkError, Record
-from links.mavlink.connection import Connection
-from links.mavlink.gate import Refusal
-from links.mavlink.origin import OriginGiver
-from links.mavlink.round_trip import ASK_NS, RoundTrips
+from links.mavlink.framing import FrameSplitter, dialect, header, packed
+from links.mavlink.gate import RejectReason
+from links.mavlink.origin import OriginSender
+from links.mavlink.pose_sender import PoseSender
 from links.mavlink.signing import Signer
-from links.mavlink.speaker import PoseSpeaker
-from links.mavlink.wire import FrameSplitter, dialect, header, packed
+from links.mavlink.timesync_monitor import ASK_NS, TimesyncMonitor
+from links.mavlink.transport.connection import Connection
 from stages.messages import RelativePose
 
 WAKE_S = 0.05  # how often the housekeeper looks, and a waiting listener whether it was closed
@@ -44,7 +44,7 @@ STANDBY, ACTIVE = 3, 4  # MAV_STATE
 SENT_RECORDS = 4096  # kept for the recording until it asks
 
 
-class Session:
+class AutopilotSession:
     """One connection's life. `records` from one thread, `pose` and `sent` from others."""
 
     def __init__(
@@ -52,8 +52,8 @@ class Session:
         connection: Connection,
         target: tuple[int, int],
         own: tuple[int, int],
-        speaker: PoseSpeaker,
-        origin: OriginGiver,
+        speaker: PoseSender,
+        origin: OriginSender,
         signer: Signer | None,
         now_ns: Callable[[], int],
         topics: tuple[str, str],
@@ -70,7 +70,7 @@ class Session:
         self._lock = threading.Lock()  # over what numbers, signs and sends
         self._closed = threading.Event()
         self._second_ns = self._asked_ns = 0
-        self._trips = RoundTrips()
+        self._trips = TimesyncMonitor()
         self._left_late = 0  # frames, of those that the connection counts
         self._target_ns = now_ns()  # when the autopilot was heard last, or the session began
         self._heard_on: int | None = None  # the connection, by `reconnects`; NOWHERE: only with an old signature
@@ -212,11 +212,11 @@ class Session:
             return self.connection.datagrams
         return self._heard_on == self.connection.reconnects and now_ns - self._target_ns < QUIET_NS
 
-    def _refusal(self, now_ns: int) -> Refusal | None:
+    def _refusal(self, now_ns: int) -> RejectReason | None:
         """Why no pose may go out on this line now, however good it is. The lock is held."""
         if not self._hears(now_ns):
-            return Refusal.NOT_HEARD
-        return Refusal.LINE_LATE if self._trips.late else None
+            return RejectReason.NOT_HEARD
+        return RejectReason.LINE_LATE if self._trips.late else None
 
     def _keep(self) -> None:
         while not self._closed.wait(WAKE_S):

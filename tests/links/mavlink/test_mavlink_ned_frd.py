@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from links.mavlink.frames import (
+from links.mavlink.ned_frd import (
     UPPER,
     R_local_drone_from_rpy,
     R_local_drone_from_wxyz,
+    flip_yz,
     pose_covariance_from_upper,
     rpy_from_R_local_drone,
-    turned_over,
     upper_from_pose_covariance,
     upper_from_velocity_covariance,
     velocity_covariance_from_upper,
@@ -25,8 +25,8 @@ ATTITUDES = [(0, 0, 0), (10, -20, 30), (-5, 3, 179), (60, 40, -120), (170, 10, 9
 
 
 def test_east_and_down_become_minus_y_and_minus_z():
-    np.testing.assert_array_equal(turned_over(np.array([[1.0, 2.0, 3.0]])), [[1.0, -2.0, -3.0]])
-    np.testing.assert_array_equal(turned_over(turned_over(np.array([1.0, 2.0, 3.0]))), [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(flip_yz(np.array([[1.0, 2.0, 3.0]])), [[1.0, -2.0, -3.0]])
+    np.testing.assert_array_equal(flip_yz(flip_yz(np.array([1.0, 2.0, 3.0]))), [1.0, 2.0, 3.0])
 
 
 def test_a_drone_heading_east_looks_along_minus_y_and_its_left_is_north():

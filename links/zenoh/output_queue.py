@@ -21,18 +21,18 @@ from flow.codec_fields import CodecError
 from flow.message import Message, array_fields
 from links.clock.host_time import now_ns
 from links.zenoh.connection import Connection
-from links.zenoh.wire import RUN, Envelope
+from links.zenoh.envelope import RUN, Envelope
 
 if TYPE_CHECKING:
     import zenoh
 
-WAKE_S = 0.2  # a lane without messages looks this often whether it was closed
+WAKE_S = 0.2  # a output_queue without messages looks this often whether it was closed
 LISTENER_S = 0.02  # and one with messages, whether somebody listens
 
 
 @dataclass(slots=True)
 class Counts:
-    """What became of the messages of a lane."""
+    """What became of the messages of a output_queue."""
 
     sent: int = 0
     sent_bytes: int = 0
@@ -41,7 +41,7 @@ class Counts:
     failed: int = 0  # not what its class declares
 
 
-class Lane:
+class OutputQueue:
     """One output to one host."""
 
     def __init__(self, key: str, message: type[Message], depth: int, deadline_ns: int) -> None:
@@ -57,7 +57,7 @@ class Lane:
         self._number = 0  # of the next message
 
     def put(self, message: Message) -> None:
-        """Let a message wait; a full lane drops its oldest."""
+        """Let a message wait; a full output_queue drops its oldest."""
         with self._changed:
             if len(self._waiting) >= self._depth:
                 self._waiting.popleft()
@@ -66,7 +66,7 @@ class Lane:
             self._changed.notify()
 
     def send_on(self, connection: Connection, closing: threading.Event) -> None:
-        """Send until closed; the lane's thread runs this."""
+        """Send until closed; the output_queue's thread runs this."""
         import zenoh
 
         while not closing.is_set():

@@ -5,7 +5,7 @@ A message is its `flow.codec` bytes; beside it (Zenoh's attachment) stands an en
 | envelope | |
 | --- | --- |
 | u64 | the sender's run: a number drawn when its process started; its clock and its counting begin anew with it |
-| u64 | number of the message on this lane, from 0: a gap is what was lost |
+| u64 | number of the message on this output_queue, from 0: a gap is what was lost |
 | i64 | when it was sent [ns], sender's timeline |
 | i64 | stamp_ns of the message, sender's timeline |
 

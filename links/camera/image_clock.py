@@ -16,7 +16,7 @@ AS_FAST = 0.97  # handed out in this share of the time between two pictures, or 
 STEADY = 3  # pictures in a row: one that takes long to decode does not show it
 
 
-class PictureClock:
+class ImageClock:
     """Of one open stream. Pure: the same positions and arrivals give the same times."""
 
     def __init__(self) -> None:

@@ -12,7 +12,7 @@ import yaml
 USE = "links.velodyne.Lidar"
 
 
-def flown_lidars(config_yaml: str | None) -> list[dict[str, Any]]:
+def recorded_lidars(config_yaml: str | None) -> list[dict[str, Any]]:
     """The settings of each, as written; none where the recording has no configuration that can be read."""
     try:
         tree = yaml.safe_load(config_yaml or "")

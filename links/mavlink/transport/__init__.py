@@ -1,0 +1,1 @@
+"""Transport of MAVLink bytes: UDP, TCP and serial connections to an autopilot."""

@@ -357,7 +357,7 @@ def _run_part(
         out.append(Refusals(runner.hopeless()))
         for _ in runner.finishing():
             out.append(Told(teller.given()))
-        out.append(PartReport(runner.sum_up(), digest.told))
+        out.append(PartReport(runner.sum_up(), digest.outputs))
     except Exception as error:  # noqa: BLE001 - told, and raised there
         failed = runner.running.partition(".")[0] if runner is not None else next(iter(graph.nodes))
         cause = error.__cause__

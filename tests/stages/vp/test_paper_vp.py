@@ -98,7 +98,7 @@ def test_the_same_picture_gives_the_same_bits():
     digests = []
     for _ in range(2):
         digest = hashlib.sha256()
-        hash_into(digest, directions(rotation_from_rpy_deg((0, 0, 20))))
+        hash_into(digest, digest, directions(rotation_from_rpy_deg((0, 0, 20))))
         digests.append(digest.hexdigest())
     assert digests[0] == digests[1]
 

@@ -21,8 +21,8 @@ from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource
 from links.preflight.record_statistics import RecordStatistics
-from stages.drone_trail import BRIDGED_NS
 from stages.messages import AutopilotEstimator, AutopilotStatus, RelativePose
+from stages.odometry.drone.trajectory import BRIDGED_NS
 
 KINDS = {"ardupilot": 3, "px4": 12}  # MAV_AUTOPILOT
 HEARTBEAT_GAP_S = 3.0

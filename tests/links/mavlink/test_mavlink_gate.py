@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from links.mavlink.gate import PoseLimits, RejectReason, pose_sigmas, reject_reason
 from links.mavlink.pose_sender import PoseSender
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import PoseState
 
 LIMITS = PoseLimits()

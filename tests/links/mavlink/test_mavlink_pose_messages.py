@@ -16,7 +16,7 @@ from links.mavlink.framing import packed, parse_frame
 from links.mavlink.gate import PoseLimits
 from links.mavlink.pose_messages import landing_target, odometry, quality_percent, vision_position_estimate
 from links.mavlink.readers import read_odometry
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 
 mavlink: Any = ardupilotmega
 LIMITS = PoseLimits()

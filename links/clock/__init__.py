@@ -1,7 +1,4 @@
-"""The host's clock as a link.
-
-Source: ours.
-"""
+"""Clocks: the host's timeline, the `Clock` source of ticks, and estimators of other devices' clocks."""
 
 from links.clock.clock import Clock
 

@@ -1,10 +1,10 @@
-"""The host's clock as a source: a tick so many times a second, so that a run goes on though every sensor is silent.
+"""The host's clock as a source: periodic ticks, so that a run continues when every sensor is silent.
 
-A tick's stamp is the moment that was meant, its arrival when the thread came to it; a busy machine makes them differ.
-The moments are whole multiples of the period, as those of the fused poses are: a pose does not wait for the next tick.
-Ticks that it missed altogether are left out, not made up for. A replay takes the recorded ticks.
+A tick's stamp is its nominal time, its arrival the time when the thread woke up; on a busy machine they differ. Nominal
+times are integer multiples of the period, like the stamps of fused poses, so that a pose does not wait for the next
+tick. Missed ticks are skipped. A replay uses the recorded ticks.
 
-Source: ours; links/clock/host_time.py (a wall clock that is set moves no tick).
+Source: ours; `links.clock.host_time` (a step of the wall clock moves no tick).
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class Clock(Source[ClockSettings]):
 
     @property
     def counters(self) -> dict[str, int]:
-        """Ticks left out because the machine was busy."""
+        """Ticks skipped because the machine was busy."""
         return {"missed": self._missed}
 
     def decode(self, record: Record) -> Tick:
-        """The time of a tick."""
+        """The Tick of one record."""
         return Tick(stamp_ns=record.stamp_ns)
 
     @contextmanager

@@ -1,8 +1,8 @@
-"""When a datagram arrived, as the kernel stamped it: a thread that comes late does not make it later.
+"""Arrival time of a datagram by the kernel's stamp, so that a delayed reader thread does not delay the stamp.
 
-The kernel stamps with the wall clock; `host_time.py` makes of it a time that a step of that clock does not move.
-Where the kernel does not stamp, it is when the datagram was read; so it is in the first moments after it was asked to:
-a worker of its own turns that on.
+The kernel stamps with the wall clock; `host_time.py` converts that to the host's timeline, which no step of the wall
+clock changes. Where the kernel gives no stamp, the time of reading is used. That is also the case for a short time
+after the stamps are enabled: a kernel worker enables them asynchronously.
 
 Source: socket(7), SO_TIMESTAMPNS; Linux, net/core/dev.c, net_enable_timestamp.
 """
@@ -15,25 +15,25 @@ import sys
 
 from links.clock import host_time
 
-ANCILLARY_BYTES = 64  # room for the stamp, for `recvmsg`
-_SO_TIMESTAMPNS = 35 if sys.platform == "linux" else None  # asm-generic/socket.h; Python does not name it
+ANCILLARY_BYTES = 64  # buffer size for the stamp, an argument of `recvmsg`
+_SO_TIMESTAMPNS = 35 if sys.platform == "linux" else None  # asm-generic/socket.h; not in Python's socket module
 _TIMESPEC = struct.Struct("@ll")
 
 
-def ask_for_stamps(udp: socket.socket) -> None:
-    """Have the kernel stamp what arrives. OSError when it will not."""
+def enable_stamps(udp: socket.socket) -> None:
+    """Make the kernel stamp arriving datagrams. Raises OSError when the kernel refuses."""
     if _SO_TIMESTAMPNS is not None:
         udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
 
 def arrival_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
-    """When a datagram just read arrived, host time, by the ancillary data of its `recvmsg`."""
+    """Arrival of a datagram that was just read, in host time, by the ancillary data of its `recvmsg`."""
     stamp_ns = kernel_time_ns(ancillary)
     return host_time.now_ns() if stamp_ns is None else host_time.from_wall_ns(stamp_ns)
 
 
 def kernel_time_ns(ancillary: list[tuple[int, int, bytes]]) -> int | None:
-    """The kernel's stamp, wall clock; None: it gave none."""
+    """The kernel's stamp on the wall clock; None: it gave none."""
     for level, kind, value in ancillary:
         if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(value) == _TIMESPEC.size:
             seconds, nanoseconds = _TIMESPEC.unpack(value)

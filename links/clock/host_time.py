@@ -1,8 +1,8 @@
-"""One timeline of the host: nanoseconds since 1970 that only ever go forward.
+"""Host time: a monotonic timeline in nanoseconds since 1970.
 
-The wall clock is read once, when the process starts; from then on the monotonic clock counts. NTP, a GPS fix or a hand
-on the clock may set the wall clock while a run goes on: nothing here moves. What the kernel stamps with the wall clock
-(SO_TIMESTAMPNS) is mapped by `from_wall_ns`, which notices such a step.
+The wall clock is read once, when the process starts; after that the monotonic clock counts. When NTP, a GPS fix or an
+operator sets the wall clock during a run, host time does not change. Stamps that the kernel takes from the wall clock
+(SO_TIMESTAMPNS) are converted by `from_wall_ns`, which detects such a step.
 
 Source: ours; clock_gettime(2), socket(7).
 """
@@ -13,60 +13,60 @@ import threading
 import time
 from collections.abc import Callable
 
-STEP_NS = 1_000_000  # wall against monotonic since the call before; NTP slews by at most 0.5 ms in a second
-PROMPT_NS, LOOKS = 20_000, 5  # two clocks read together
-MAX_AGE_NS = 60_000_000_000  # a stamp further back says nothing; at 20 Hz a socket's buffer of 256 holds 13 s
+STEP_NS = 1_000_000  # of the wall clock against the monotonic clock between two calls; NTP slews by at most 0.5 ms/s
+PROMPT_NS, MAX_READINGS = 20_000, 5  # two clocks are read together when the reads take less than PROMPT_NS
+MAX_AGE_NS = 60_000_000_000  # older stamps are invalid; a socket's buffer of 256 datagrams holds 13 s at 20 Hz
 
 
 class HostTime:
-    """The monotonic clock, counted from the wall clock's reading at the start."""
+    """The monotonic clock plus the wall clock's reading at the start."""
 
     def __init__(
         self, wall_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self._wall_ns, self._monotonic_ns = wall_ns, monotonic_ns
         self._start_ns = wall_ns() - monotonic_ns()
-        self._wall_ahead_ns = 0  # wall - host at the newest look
-        self._doubt_ns = 0  # of that look
-        self._looked_ns = self._stepped_ns = self.now_ns()
+        self._wall_ahead_ns = 0  # wall - host at the newest reading
+        self._error_ns = 0  # bound of that reading's error
+        self._read_ns = self._stepped_ns = self.now_ns()
         self._lock = threading.Lock()
         self.steps = 0
-        """Times the wall clock was seen to be set."""
+        """How often a step of the wall clock was detected."""
 
     def now_ns(self) -> int:
-        """Now; never less than the call before gave."""
+        """Current host time; never less than the previous call returned."""
         return self._start_ns + self._monotonic_ns()
 
     def from_wall_ns(self, stamp_ns: int) -> int:
-        """The host time of a moment just gone by that the kernel stamped with the wall clock.
+        """Host time of a recent kernel stamp of the wall clock.
 
-        Where the wall clock was set after the stamp was taken, nobody knows how old the stamp is: then it is now.
-        Too late, never too early: a sensor's clock that is read from the promptest packets stays right.
+        If the wall clock was set after the stamp was taken, the stamp's age is unknown and the result is the current
+        time. The result can be late but not early, so an offset estimated from minimum delays stays correct.
         """
         with self._lock:
-            now_ns, ahead_ns, doubt_ns = self._look()
-            slack_ns = STEP_NS + (now_ns - self._looked_ns) // 1000  # the clocks may drift apart by 1000 ppm
-            slack_ns += doubt_ns + self._doubt_ns
-            if abs(ahead_ns - self._wall_ahead_ns) > slack_ns:
+            now_ns, ahead_ns, error_ns = self._read_clocks()
+            tolerance_ns = STEP_NS + (now_ns - self._read_ns) // 1000  # the clocks may drift by 1000 ppm
+            tolerance_ns += error_ns + self._error_ns
+            if abs(ahead_ns - self._wall_ahead_ns) > tolerance_ns:
                 self.steps += 1
                 self._stepped_ns = now_ns
-            self._wall_ahead_ns, self._looked_ns, self._doubt_ns = ahead_ns, now_ns, doubt_ns
+            self._wall_ahead_ns, self._read_ns, self._error_ns = ahead_ns, now_ns, error_ns
             host_ns = stamp_ns - ahead_ns
-            believed = max(self._stepped_ns, now_ns - MAX_AGE_NS) <= host_ns <= now_ns
-            return host_ns if believed else now_ns
+            valid = max(self._stepped_ns, now_ns - MAX_AGE_NS) <= host_ns <= now_ns
+            return host_ns if valid else now_ns
 
-    def _look(self) -> tuple[int, int, int]:
-        """(now, wall - host, how much the latter may be off), by the promptest of a few readings.
+    def _read_clocks(self) -> tuple[int, int, int]:
+        """(now, wall - host, bound of the latter's error), by the fastest of up to MAX_READINGS readings.
 
-        A reading that no other thread or process came between ends it; on a machine so loaded that there is none, what
-        came between is not taken for a clock that was set.
+        A reading that took less than PROMPT_NS ends the loop. On a loaded machine without such a reading, the error
+        bound covers the interruption, so that it is not mistaken for a step of the wall clock.
         """
-        looks = []
-        while not looks or (looks[-1][0] >= PROMPT_NS and len(looks) < LOOKS):
+        readings = []
+        while not readings or (readings[-1][0] >= PROMPT_NS and len(readings) < MAX_READINGS):
             before_ns, wall_ns, after_ns = self.now_ns(), self._wall_ns(), self.now_ns()
-            looks.append((after_ns - before_ns, wall_ns - after_ns))  # a stamp may come out late by that, never early
-        doubt_ns, ahead_ns = min(looks)
-        return after_ns, ahead_ns, doubt_ns
+            readings.append((after_ns - before_ns, wall_ns - after_ns))  # late by at most the duration, never early
+        error_ns, ahead_ns = min(readings)
+        return after_ns, ahead_ns, error_ns
 
 
 _HOST = HostTime()

@@ -109,7 +109,7 @@ class FrameDecoder:
         matches = record.stamp_ns == frame.ts1
         if matches and not self._matched:
             self._matched = True
-            self.clock.forget_answers()
+            self.clock.forget_replies()
         named = zip(timesync_target(record.data), self._own, strict=True)
         if not matches and (self._matched or any(name not in (0, ours) for name, ours in named)):
             self._refuse("timesync for another")

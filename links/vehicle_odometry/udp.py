@@ -35,7 +35,7 @@ def listen_udp(
     closed = threading.Event()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         try:
-            datagram_time.ask_for_stamps(udp)
+            datagram_time.enable_stamps(udp)
             udp.bind((bind, port))
         except OSError as error:
             raise LinkError(

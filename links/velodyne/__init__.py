@@ -1,4 +1,4 @@
-"""Velodyne VLP-16: packets from UDP or a recording -> LidarFirings."""
+"""Velodyne VLP-16: UDP or recorded packets to LidarFirings."""
 
 from links.velodyne.lidar import Lidar
 from links.velodyne.position import parse_position

@@ -1,4 +1,4 @@
-"""Is the LiDAR as it must be: packets, losses, foreign senders, return mode, its clock, GPS and PPS.
+"""Preflight checks of the LiDAR: packets, losses, foreign senders, return mode, clock, GPS and PPS.
 
 Source: VLP-16 User Manual 63-9243 Rev. E, chapter 9 (rates, return modes); the limits are ours.
 """
@@ -19,10 +19,10 @@ from links.velodyne.lidar import POSITION_TOPIC, Lidar
 from links.velodyne.position import PpsMonitor
 
 MODES = {vlp16.STRONGEST: "strongest", vlp16.LAST: "last", vlp16.DUAL: "dual"}
-WORST_LOSS, SOME_LOSS = 0.02, 0.001  # share of packets
-RATE_SLACK = 0.2  # losses are judged by themselves; this finds a second lidar, and a host that stalls
-MOST_DRIFT_PPM = 500.0
-DRIFT_OVER_S = 2.0  # a shorter time tells no drift: the fastest packets differ by tens of microseconds
+FAIL_LOSS, WARN_LOSS = 0.02, 0.001  # share of packets
+RATE_TOLERANCE = 0.2  # losses are checked separately; this finds a second LiDAR, or a host that stalls
+MAX_DRIFT_PPM = 500.0
+MIN_DRIFT_TIME_S = 2.0  # over less time, the jitter of tens of microseconds hides the drift
 
 DISK_SHARE = 0.43  # of the packets' bytes, after zstd: 0.91 MB/s arrive, 1.4 GB/h are stored
 DEFAULT_GB_PER_HOUR = 1.4  # of a LiDAR that sent nothing
@@ -86,15 +86,15 @@ def lidar_checks(source: ObservedSource) -> Iterator[CheckResult]:
         yield fail(f"{name} packets", _sentence(source.no_data_reason))
         return
     if not decoded:
-        why = source.status or _refused(source) or "none was usable"
-        yield fail(f"{name} packets", f"{observation.records.count} packets came, and {_sentence(why)}")
+        why = source.status or _refused(source) or "none was valid"
+        yield fail(f"{name} packets", f"{observation.records.count} packets arrived, and {_sentence(why)}")
         return
     yield _rate(source, observation, link.settings.timeout_s)
     yield _losses(source, decoded)
     foreign = source.counters.get("from other senders", 0)
     if foreign:
         yield warning(
-            f"{name} sender", f"{foreign} packets from other senders were ignored: is a second lidar on this network?"
+            f"{name} sender", f"{foreign} packets from other senders were ignored: is a second LiDAR on this network?"
         )
     yield _mode(name, observation)
     yield _clock(name, link, source, observation)
@@ -103,7 +103,7 @@ def lidar_checks(source: ObservedSource) -> Iterator[CheckResult]:
 
 
 def _sentence(text: str) -> str:
-    return text if text.endswith((".", "?")) else f"{text}: is the lidar powered, and is this host on its subnet?"
+    return text if text.endswith((".", "?")) else f"{text}: is the LiDAR powered, and is this host on its subnet?"
 
 
 def _refused(source: ObservedSource) -> str:
@@ -114,18 +114,18 @@ def _refused(source: ObservedSource) -> str:
 
 
 def _rate(source: ObservedSource, observation: LidarObservation, timeout_s: float) -> CheckResult:
-    """A packet each 1.327 ms, or 0.664 ms with dual return."""
+    """Packet rate: one per 1.327 ms, or 0.664 ms with dual return."""
     name = f"{source.name} rate"
     mode = observation.return_modes.most_common(1)[0][0] if observation.return_modes else vlp16.STRONGEST
-    wanted_hz, rate_hz = 1e9 / vlp16.packet_ns(mode), observation.records.rate_hz
+    expected_hz, rate_hz = 1e9 / vlp16.packet_ns(mode), observation.records.rate_hz
     silent_s = observation.records.longest_silence_s(source.end_ns)
-    text = f"{rate_hz:.0f} packets a second, {wanted_hz:.0f} are sent"
+    text = f"{rate_hz:.0f} packets/s, expected {expected_hz:.0f}"
     if source.live and silent_s > timeout_s:
-        return fail(name, f"{text}; then none came for {silent_s:.1f} s: check its cable and power")
-    if not rate_hz >= (1 - RATE_SLACK) * wanted_hz:
+        return fail(name, f"{text}; then none for {silent_s:.1f} s: check its cable and power")
+    if not rate_hz >= (1 - RATE_TOLERANCE) * expected_hz:
         return fail(name, f"{text}: is the network too slow, or this host too busy?")
-    if rate_hz > (1 + RATE_SLACK) * wanted_hz:
-        return fail(name, f"{text}: do two lidars send to this port? Set `sender`")
+    if rate_hz > (1 + RATE_TOLERANCE) * expected_hz:
+        return fail(name, f"{text}: do two LiDARs send to this port? Set `sender`")
     return ok(name, text)
 
 
@@ -134,20 +134,22 @@ def _losses(source: ObservedSource, decoded: int) -> CheckResult:
     share = lost / (lost + decoded)
     refused = _refused(source)
     text = f"{lost} of {lost + decoded} packets lost" + (f"; refused: {refused}" if refused else "")
-    if share > WORST_LOSS:
+    if share > FAIL_LOSS:
         return fail(name, f"{text}: is the network shared, or this host too busy (net.core.rmem_max)?")
-    return warning(name, text) if share > SOME_LOSS or refused else ok(name, text)
+    return warning(name, text) if share > WARN_LOSS or refused else ok(name, text)
 
 
 def _mode(name: str, observation: LidarObservation) -> CheckResult:
     name = f"{name} return mode"
     modes = [MODES.get(mode, f"0x{mode:02X}") for mode in observation.return_modes]
     if len(modes) != 1:
-        return fail(name, f"it changes ({', '.join(modes)}): does somebody else set it, or do two lidars send?")
+        return fail(name, f"it changes ({', '.join(modes)}): does another program set it, or do two LiDARs send?")
     if modes[0] not in MODES.values():
-        return fail(name, f"{modes[0]} is none that is known: is this a VLP-16?")
+        return fail(name, f"{modes[0]} is not a known mode: is this a VLP-16?")
     if modes[0] == "last":
-        return warning(name, "last return: a drone before a wall is told by its edges alone; set strongest or dual")
+        return warning(
+            name, "last return: of a drone in front of a wall only the edges are measured; set strongest or dual"
+        )
     return ok(name, modes[0])
 
 
@@ -156,33 +158,35 @@ def _clock(name: str, link: Lidar, source: ObservedSource, observation: LidarObs
     disagreed = source.counters.get("clock disagreements", 0)
     if disagreed:
         advice = (
-            "is it locked to GPS, and the host's clock right?" if link.settings.clock == "utc" else "was it restarted?"
+            "is it locked to GPS, and is the host's clock correct?"
+            if link.settings.clock == "utc"
+            else "was it restarted?"
         )
-        return fail(name, f"its clock and the host's disagreed {disagreed} times: {advice}")
+        return fail(name, f"sensor clock and host clock disagreed {disagreed} times: {advice}")
     drift_ppm = clock_drift_ppm(observation.device_ns)
     if math.isnan(drift_ppm):
-        return ok(name, f"{link.settings.clock}, no disagreement; too short to tell a drift")
-    text = f"{link.settings.clock}, it goes {abs(drift_ppm):.0f} millionths {'slow' if drift_ppm > 0 else 'fast'}"
-    if abs(drift_ppm) > MOST_DRIFT_PPM:
-        return warning(name, f"{text} by the fastest packets: is the host's clock being set, or the network busy?")
+        return ok(name, f"{link.settings.clock}, no disagreement; too short to measure the drift")
+    text = f"{link.settings.clock}, {abs(drift_ppm):.0f} ppm {'slow' if drift_ppm > 0 else 'fast'}"
+    if abs(drift_ppm) > MAX_DRIFT_PPM:
+        return warning(name, f"{text} by the fastest packets: is the host's clock being adjusted, or the network busy?")
     return ok(name, text)
 
 
 def clock_drift_ppm(pairs: list[tuple[int, int]]) -> float:
-    """How fast host - device grows [1e-6], by the fastest packet of the first third and of the last; NaN: too short."""
-    if len(pairs) < 3 or pairs[-1][0] - pairs[0][0] < 1e9 * DRIFT_OVER_S:
+    """Rate of host - device [ppm], by the fastest packet of the first third and of the last third; NaN: too short."""
+    if len(pairs) < 3 or pairs[-1][0] - pairs[0][0] < 1e9 * MIN_DRIFT_TIME_S:
         return math.nan
     hour_ns = 1_000 * vlp16.HOUR_US
-    begin = pairs[0][0] - pairs[0][1]
+    first_offset = pairs[0][0] - pairs[0][1]
     third_ns = (pairs[-1][0] - pairs[0][0]) / 3
-    late = [(host, (host - device - begin + hour_ns // 2) % hour_ns - hour_ns // 2) for host, device in pairs]
-    first = min((offset, host) for host, offset in late if host <= pairs[0][0] + third_ns)
-    last = min((offset, host) for host, offset in late if host >= pairs[-1][0] - third_ns)
+    offsets = [(host, (host - device - first_offset + hour_ns // 2) % hour_ns - hour_ns // 2) for host, device in pairs]
+    first = min((offset, host) for host, offset in offsets if host <= pairs[0][0] + third_ns)
+    last = min((offset, host) for host, offset in offsets if host >= pairs[-1][0] - third_ns)
     return 1e6 * (last[0] - first[0]) / (last[1] - first[1])
 
 
 def _position(link: Lidar, name: str, observation: LidarObservation) -> CheckResult:
-    """GPS and PPS as the position packets told last; where the clock is free they are for information."""
+    """GPS and PPS of the newest position packet; with `clock: free` for information only."""
     name, needed = f"{name} PPS", link.settings.clock == "utc"
     if observation.pps.locked:
         return ok(name, observation.pps.describe())

@@ -1,11 +1,12 @@
-"""One VLP-16 data packet -> every laser pulse with its time, azimuth, range and xyz in the lidar frame.
+"""Decoder of VLP-16 data packets: every laser pulse with its time, azimuth, range and xyz in the lidar frame.
 
     azimuth = azimuth_block + rate * (time since the block's first pulse)
     x = r cos(el) sin(az)    y = r cos(el) cos(az)    z = r sin(el) + vertical offset of the laser
 
-The rate is the packet's mean, (azimuth of its last block - first) / (time between them): a block's azimuth jitters by
-0.01 to 0.02 deg, so a rate from two neighbours would put 0.4 mrad on the block's last pulses; the mean keeps 0.1 mrad.
-sin and cos are computed for the 12 blocks and the 32 pulse delays alone and joined by the addition theorems.
+`rate` is the packet's mean rate, (azimuth of the last block - azimuth of the first) / (time between them). A block's
+azimuth jitters by 0.01 to 0.02 deg: a rate from two neighbouring blocks gives an error of 0.4 mrad at the block's last
+pulses, the mean rate 0.1 mrad. sin and cos are computed only for the 12 blocks and the 32 pulse delays, and combined by
+the addition theorems. The compiled functions are in `stages/kernels/velodyne.py`.
 
 Source: VLP-16 User Manual 63-9243 Rev. E, sections 9.3 to 9.5; the mean rate is ours.
 """
@@ -15,42 +16,20 @@ from __future__ import annotations
 import numpy as np
 
 from links.velodyne import vlp16
-from links.velodyne.reject_reason import RejectReason
 from stages.kernels.velodyne import LASER_ELEVATION_RAD, PULSES, decode, decode_dual
 from stages.messages import LidarFirings
 
-_FLAG_LOW, _FLAG_HIGH = (vlp16.BLOCK_FLAG[k : k + 1] * vlp16.BLOCKS for k in (0, 1))
-
-
-def timestamp_us(data: bytes) -> int:
-    """Microseconds after the hour when the packet's first laser fired."""
-    return int.from_bytes(data[vlp16.TIMESTAMP_AT : vlp16.TIMESTAMP_AT + 4], "little")
-
-
-def reject_reason(data: bytes) -> RejectReason | None:
-    """Why these bytes cannot be a VLP-16 data packet, by length, factory bytes, flags and time. None: they can."""
-    if len(data) != vlp16.PACKET_BYTES:
-        return RejectReason.POSITION if len(data) == vlp16.POSITION_BYTES else RejectReason.LENGTH
-    if data[vlp16.PRODUCT_ID_AT] != vlp16.PRODUCT_ID:
-        return RejectReason.MODEL
-    if not vlp16.STRONGEST <= data[vlp16.RETURN_MODE_AT] <= vlp16.DUAL:
-        return RejectReason.RETURN_MODE
-    blocks_end, block_bytes = vlp16.TIMESTAMP_AT, vlp16.BLOCK_BYTES
-    if data[0:blocks_end:block_bytes] != _FLAG_LOW or data[1:blocks_end:block_bytes] != _FLAG_HIGH:
-        return RejectReason.FLAG
-    return RejectReason.TIMESTAMP if timestamp_us(data) >= vlp16.HOUR_US else None
-
 
 class FiringRows:
-    """The pulses of up to so many data packets in a row, as one message."""
+    """Collects the pulses of consecutive data packets into one LidarFirings message."""
 
-    def __init__(self, most: int) -> None:
-        """`most`: packets in a message."""
-        self._most = most
+    def __init__(self, max_packets: int) -> None:
+        """`max_packets`: packets in a message."""
+        self._max_packets = max_packets
         self._start()
 
     def _start(self) -> None:
-        rows = self._most * PULSES
+        rows = self._max_packets * PULSES
         self.packets = self._rows = self._stamp_ns = self._lost_packets = 0
         self._pulse_stamp_ns = np.empty(rows, np.int64)
         self._laser = np.empty(rows, np.uint8)
@@ -62,16 +41,16 @@ class FiringRows:
 
     @property
     def full(self) -> bool:
-        """Whether it takes no more."""
-        return self.packets == self._most
+        """Whether `max_packets` packets are in it."""
+        return self.packets == self._max_packets
 
     def add(self, data: bytes, stamp_ns: int, lost_packets: int) -> bool:
-        """Every pulse of a packet that passed `reject_reason` and whose first laser fired at stamp_ns.
+        """Add every pulse of a packet that `reject_reason` accepts and whose first laser fired at stamp_ns.
 
-        384 rows in single return, 192 to 384 in dual return, in firing order: one row of kind 0 for each pulse, with
-        range 0 and xyz (0, 0, 0) where nothing returned. In dual return it is followed by one of kind 1 and the same
-        time where the last return differs from the strongest (or second strongest, which the sensor sends when the
-        strongest came last). False, and nothing is taken, when the azimuths cannot be right.
+        Single return gives 384 rows, dual return 192 to 384, in firing order: one row of kind 0 per pulse, with range 0
+        and xyz (0, 0, 0) where nothing returned. In dual return mode a row of kind 1 with the same time follows where
+        the last return differs from the strongest (or from the second strongest, which the sensor sends when the last
+        return is the strongest). Returns False and adds nothing when the azimuths are invalid.
         """
         free = slice(self._rows, self._rows + PULSES)
         kernel = decode_dual if data[vlp16.RETURN_MODE_AT] == vlp16.DUAL else decode
@@ -95,7 +74,7 @@ class FiringRows:
         return True
 
     def take(self) -> LidarFirings:
-        """What was added since the call before."""
+        """The message of all packets added since the previous call."""
         filled = slice(0, self._rows)
         firings = LidarFirings(
             stamp_ns=self._stamp_ns,
@@ -114,6 +93,6 @@ class FiringRows:
 
 
 def compile_kernels() -> None:
-    """Compile the kernels, or load them from numba's cache, before packets wait for it."""
+    """Compile the kernels, or load them from numba's cache, before the first packet arrives."""
     for mode in (vlp16.STRONGEST, vlp16.DUAL):
         FiringRows(1).add(bytes(vlp16.RETURN_MODE_AT) + bytes([mode, vlp16.PRODUCT_ID]), 0, 0)

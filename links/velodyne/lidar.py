@@ -1,10 +1,11 @@
-"""The VLP-16 as a source: UDP packets live, recorded packets in replay, one decoder for both.
+"""The VLP-16 as a source: UDP packets live, recorded packets in replay, the same decoder for both.
 
-Live it can listen to the sensor's position packets, too: they are recorded under /lidar/position, and what they say of
-GPS and PPS is counted. With `clock: utc` nothing is taken before they say that the sensor's clock is locked to UTC; a
-lock that is lost later is counted and said, and the sensor's clock drifts on by some millionths.
+Live it can also receive the sensor's position packets: they are recorded on /lidar/position, and their GPS and PPS
+states are counted. With `clock: utc` no data packet is accepted until they report that the sensor's clock is locked to
+UTC. A lock that is lost later is counted and reported; the packets are still accepted, and the sensor's clock drifts by
+a few ppm.
 
-Source: VLP-16 User Manual 63-9243 Rev. E, chapter 9. What to do about bad, lost and repeated packets is ours.
+Source: VLP-16 User Manual 63-9243 Rev. E, chapter 9. The handling of damaged, lost and repeated packets is ours.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from pydantic import Field, model_validator
 
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.velodyne import vlp16
-from links.velodyne.decode import FiringRows, compile_kernels, reject_reason, timestamp_us
+from links.velodyne.decode import FiringRows, compile_kernels
 from links.velodyne.lidar_clock import ClockMode, LidarClock
 from links.velodyne.position import PpsMonitor
-from links.velodyne.reject_reason import RejectReason
+from links.velodyne.reject_reason import RejectReason, reject_reason, timestamp_us
 from links.velodyne.udp import Channel, UdpCounters, listen_udp
 from stages.messages import LidarFirings
 
 POSITION_TOPIC = "/lidar/position"
-REFUSED_IN_A_ROW = 100
-POSITION_SILENT_S = 3.0  # a sensor sends some of them each second
+MAX_CONSECUTIVE_REFUSED = 100
+POSITION_TIMEOUT_S = 3.0  # a sensor sends several per second
 
 
 class LidarSettings(SourceSettings):
@@ -38,46 +39,46 @@ class LidarSettings(SourceSettings):
     topic: str = "/lidar/packets"
     clock: ClockMode = "free"  # utc: sensor and host are both locked to UTC
     clock_limit_s: float = Field(0.5, gt=0, le=1800)
-    bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address; 0.0.0.0 when the lidar broadcasts
+    bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address; 0.0.0.0 for a LiDAR that broadcasts
     port: int = Field(vlp16.DATA_PORT, ge=1, le=65535)
-    sender: IPv4Address | None = None  # the lidar's address, 192.168.1.201 from the factory
-    position_port: int | None = Field(None, ge=1, le=65535)  # 8308 from the factory; None: do not listen to it
+    sender: IPv4Address | None = None  # the LiDAR's address, 192.168.1.201 from the factory
+    position_port: int | None = Field(None, ge=1, le=65535)  # 8308 from the factory; None: not received
     timeout_s: float = Field(2.0, gt=0, le=60)
-    packets: int = Field(1, ge=1, le=16)  # in a message, 1.3 ms each: fewer messages cost less, and come later
+    packets: int = Field(1, ge=1, le=16)  # per message, 1.3 ms each: fewer messages need less CPU time and add latency
 
     @model_validator(mode="after")
     def _sender_is_known(self) -> LidarSettings:
         if self.sender is None and not self.bind.is_loopback:
             raise ValueError(
-                f"sender: give the lidar's address (192.168.1.201 from the factory) when binding to {self.bind}, "
+                f"sender: set the LiDAR's address (192.168.1.201 from the factory) when binding to {self.bind}, "
                 "so that packets from other machines are ignored"
             )
         return self
 
 
 class Lidar(Source[LidarSettings]):
-    """One VLP-16 or Puck LITE. Give `sender` (the lidar's address) to listen beyond loopback."""
+    """One VLP-16 or Puck LITE. Set `sender` (the LiDAR's address) to listen beyond loopback."""
 
     def __init__(self, settings: LidarSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         settings = self.settings
         clock = LidarClock(settings.clock, round(1e9 * settings.clock_limit_s))
         self._stream = PacketStream(settings.topic, clock, settings.packets)
-        self._locked_once: bool = False  # utc, since it listens: data packets are taken
-        self._position_s: float = 0.0  # when the newest position packet came
+        self._locked_once: bool = False  # clock: utc, since the start of `listen`: data packets are accepted
+        self._position_s: float = 0.0  # arrival of the newest position packet, monotonic
         self._pps = PpsMonitor()
         self._udp = UdpCounters()
 
     def decode(self, record: Record) -> LidarFirings | None:
-        """Pulses of a packet, or of `packets` once the last of them has come; None before, and when it is refused.
+        """Pulses of one packet, or of `packets` packets with the last of them; None before that, or when refused.
 
-        LinkError for another model, or 100 refused in a row.
+        Raises LinkError for another LiDAR model, or after 100 consecutive refused packets.
         """
         return self._stream.decode(record)
 
     @property
     def senders(self) -> dict[str, dict[str, str]]:
-        """Model, port, and the sensor's address where it is given."""
+        """Model, port, and the sensor's address if `sender` is set."""
         settings = self.settings
         known = {"model": "VLP-16"} | ({} if settings.sender is None else {"sender": str(settings.sender)})
         ports = {settings.topic: settings.port} | (
@@ -87,13 +88,13 @@ class Lidar(Source[LidarSettings]):
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
-        """Receive packets from the network: `with lidar.listen() as records`. LinkError: see `listen_udp`, or utc's."""
+        """Receive packets: `with lidar.listen() as records`. LinkError as `listen_udp`, or without UTC lock."""
         settings = self.settings
         compile_kernels()
         if settings.clock == "utc" and settings.position_port is None:
             raise LinkError(
-                f"clock: utc needs to know that the sensor is locked to UTC: set position_port: {vlp16.POSITION_PORT} "
-                "(its position packets), or clock: free"
+                f"clock: utc needs the sensor's position packets: set position_port: {vlp16.POSITION_PORT}, or "
+                "clock: free"
             )
         channels = [Channel(settings.topic, settings.port)]
         if settings.position_port is not None:
@@ -101,21 +102,21 @@ class Lidar(Source[LidarSettings]):
         sender = None if settings.sender is None else str(settings.sender)
         with listen_udp(channels, str(settings.bind), sender, settings.timeout_s, self._udp) as records:
             try:
-                yield self._watched(records) if settings.position_port is not None else records
+                yield self._with_lock_check(records) if settings.position_port is not None else records
             finally:
                 self._locked_once = False
 
-    def _watched(self, records: Iterator[Record]) -> Iterator[Record]:
-        """The records, with an eye on the sensor's clock; for utc no data packet before it is locked."""
+    def _with_lock_check(self, records: Iterator[Record]) -> Iterator[Record]:
+        """All records, position packets monitored; with `clock: utc` no data packet before the clock is locked."""
         settings = self.settings
-        waits, deadline_s = settings.clock == "utc", time.monotonic() + settings.timeout_s
+        waiting, deadline_s = settings.clock == "utc", time.monotonic() + settings.timeout_s
         for record in records:
             if record.topic == POSITION_TOPIC:
                 self._pps.add(record.data)
-                waits = waits and not self._pps.locked
+                waiting = waiting and not self._pps.locked
                 self._position_s = time.monotonic()
-                self._locked_once = settings.clock == "utc" and not waits
-            elif waits:
+                self._locked_once = settings.clock == "utc" and not waiting
+            elif waiting:
                 if time.monotonic() > deadline_s:
                     raise LinkError(
                         f"clock: utc, but the sensor's clock is not locked to UTC: {self._pps.describe()}. Check its "
@@ -126,27 +127,27 @@ class Lidar(Source[LidarSettings]):
 
     @property
     def status(self) -> str | None:
-        """See Link: with `clock: utc`, the sensor's clock is not locked to UTC any more, or does not tell."""
+        """See Link: with `clock: utc`, that the lock to UTC was lost, or that position packets stopped."""
         if not self._locked_once:
             return None
-        silent = time.monotonic() - self._position_s > max(self.settings.timeout_s, POSITION_SILENT_S)
+        silent = time.monotonic() - self._position_s > max(self.settings.timeout_s, POSITION_TIMEOUT_S)
         if self._pps.locked and not silent:
             return None
         lost = (
-            f"no position packet comes any more on UDP {self.settings.position_port}, so whether the sensor's clock is "
-            "locked to UTC is not known"
+            f"no position packet arrives on UDP {self.settings.position_port}, so the lock of the sensor's clock "
+            "to UTC is unknown"
             if silent
-            else f"the sensor's clock is locked to UTC no more: {self._pps.describe()}"
+            else f"the sensor's clock lost its lock to UTC: {self._pps.describe()}"
         )
         return (
-            f"clock: utc, and {lost}. Its packets are taken on, and their times may drift away by some millionths. "
-            "Check its GPS antenna's view of the sky and the PPS wire; if it does not come back, set clock: free "
-            "before the next flight"
+            f"clock: utc, and {lost}. Its packets are still accepted, and their times may drift by a few ppm. Check "
+            "the GPS antenna's view of the sky and the PPS wire; if the lock does not return, set clock: free before "
+            "the next flight"
         )
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals since the start: packets decoded, lost, refused by reason, clock disagreements, foreign packets."""
+        """Totals since the start: packets decoded, lost, refused by reason, from other senders; clock disagreements."""
         stream = self._stream
         refused = {f"refused: {reason.value}": count for reason, count in stream.refused.items()}
         return {
@@ -160,22 +161,21 @@ class Lidar(Source[LidarSettings]):
 
 
 class PacketStream:
-    """Decodes packets in turn, and counts what was lost between them and what was refused.
+    """Decodes packets in order and counts lost and refused ones.
 
-    A message holds packets that follow one another: a gap ends it early.
+    A message holds consecutive packets: a gap ends it early.
     """
 
-    def __init__(self, topic: str, clock: LidarClock, together: int = 1) -> None:
-        """`together`: packets in a message."""
+    def __init__(self, topic: str, clock: LidarClock, packets_per_message: int = 1) -> None:
         self.clock = clock
         self.decoded = 0
         self.lost = 0
         self.refused: Counter[RejectReason] = Counter()
         self._topic = topic
-        self._refused_in_a_row = 0
+        self._consecutive_refused = 0
         self._lost_before = 0
         self._packet_ns = vlp16.packet_ns(vlp16.STRONGEST)
-        self._together, self._rows = together, FiringRows(together)
+        self._packets_per_message, self._rows = packets_per_message, FiringRows(packets_per_message)
 
     def decode(self, record: Record) -> LidarFirings | None:
         """See `Lidar.decode`."""
@@ -183,42 +183,42 @@ class PacketStream:
         reason = reject_reason(data)
         if reason is not None:
             return self._refuse(reason, data)
-        tick = self.clock.read(timestamp_us(data), record.stamp_ns)
-        if isinstance(tick, RejectReason):
-            return self._refuse(tick, data)
-        stamp_ns, gap_ns = tick
-        # The packet before lasted _packet_ns: when this one is later than its end, others are missing between.
+        time_or_reason = self.clock.read(timestamp_us(data), record.stamp_ns)
+        if isinstance(time_or_reason, RejectReason):
+            return self._refuse(time_or_reason, data)
+        stamp_ns, gap_ns = time_or_reason
+        # The previous packet lasted _packet_ns: if this one begins later than its end, packets are missing in between.
         follows = abs(gap_ns - self._packet_ns) <= self._packet_ns // 2 and not self._lost_before
         lost = self._lost_before + max((gap_ns + self._packet_ns // 2) // self._packet_ns - 1, 0)
         self._packet_ns = vlp16.packet_ns(data[vlp16.RETURN_MODE_AT])
-        rows = self._rows if follows or not self._rows.packets else FiringRows(self._together)
+        rows = self._rows if follows or not self._rows.packets else FiringRows(self._packets_per_message)
         if not rows.add(data, stamp_ns, lost):
             self._lost_before = lost + 1
             return self._refuse(RejectReason.AZIMUTH, data)
         self.lost += lost
         self._lost_before = 0
         self.decoded += 1
-        self._refused_in_a_row = 0
-        before, self._rows = self._rows, rows
+        self._consecutive_refused = 0
+        previous, self._rows = self._rows, rows
         if rows.full:
             return rows.take()
-        return before.take() if rows is not before else None
+        return previous.take() if rows is not previous else None
 
     def _refuse(self, reason: RejectReason, data: bytes) -> None:
         self.refused[reason] += 1
-        self._refused_in_a_row += 1
-        stuck = self._refused_in_a_row % REFUSED_IN_A_ROW == 0
+        self._consecutive_refused += 1
+        stuck = self._consecutive_refused % MAX_CONSECUTIVE_REFUSED == 0
         if reason is RejectReason.MODEL and (self.decoded == 0 or stuck):
             model = vlp16.other_model(data)
             if model is not None:
                 raise LinkError(
-                    f"{self._topic}: these packets come from a Velodyne {model}, and grd reads the VLP-16 and Puck "
-                    f"LITE (0x{vlp16.PRODUCT_ID:02X}). Use a recording of one of those, or check `sender` and `port`."
+                    f"{self._topic}: these packets come from a Velodyne {model}; grd supports the VLP-16 and Puck LITE "
+                    f"(0x{vlp16.PRODUCT_ID:02X}). Use a recording of one of those, or check `sender` and `port`."
                 )
         if stuck:
             reasons = ", ".join(f"{count} {reason.value}" for reason, count in self.refused.most_common())
             raise LinkError(
-                f"{self._topic}: {REFUSED_IN_A_ROW} packets in a row are no use (refused so far: {reasons}). Is this "
-                f"VLP-16 data (UDP {vlp16.DATA_PORT}, {vlp16.PACKET_BYTES} bytes)? Check `sender`, `port` and the "
+                f"{self._topic}: {MAX_CONSECUTIVE_REFUSED} consecutive packets are invalid (refused so far: {reasons}). "
+                f"Is this VLP-16 data (UDP {vlp16.DATA_PORT}, {vlp16.PACKET_BYTES} bytes)? Check `sender`, `port` and the "
                 "sensor's settings."
             )

@@ -1,6 +1,6 @@
-"""The LiDARs of the configuration that a recording was flown with, of which its clock matters afterwards.
+"""Settings of the LiDARs in the configuration that a recording contains.
 
-Source: ours.
+The clock mode of the recorded run decides how its packets are stamped in a replay.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ USE = "links.velodyne.Lidar"
 
 
 def recorded_lidars(config_yaml: str | None) -> list[dict[str, Any]]:
-    """The settings of each, as written; none where the recording has no configuration that can be read."""
+    """The `config` of each LiDAR node, as written; empty where the recording holds no readable configuration."""
     try:
         tree = yaml.safe_load(config_yaml or "")
     except yaml.YAMLError:

@@ -1,7 +1,7 @@
-"""Live VLP-16 packets from UDP sockets, from one sender, stamped by the kernel when they arrived.
+"""Live VLP-16 packets from UDP sockets, from one sender, with the kernel's arrival stamps.
 
-Nothing is queued here: what the consumer does not take in time waits in the socket's bounded buffer, then the kernel
-drops it, and the decoder counts it from the gap in device time.
+Nothing is queued here. Packets that the consumer does not take in time wait in the socket's bounded buffer; when it is
+full the kernel drops them, and the decoder counts them from the gap in device time.
 
 Source: VLP-16 User Manual 63-9243 Rev. E, section 9.3 (ports).
 """
@@ -22,23 +22,23 @@ from flow.link import LinkError, Record
 from links.clock import datagram_time
 from links.velodyne import vlp16
 
-RECEIVE_BUFFER_BYTES = 1 << 20  # 0.6 s of packets, where the host's net.core.rmem_max allows it
+RECEIVE_BUFFER_BYTES = 1 << 20  # 0.6 s of packets, if the host's net.core.rmem_max allows it
 _DATAGRAM_BYTES = 2048
-_BURST = 16  # datagrams taken at once where several wait: each look whether one does costs as much as the datagram
-_WAKE_S = 0.2  # how often a waiting listener looks whether it was closed
+_BURST = 16  # datagrams read per `select`: a call of `select` costs as much as reading a datagram
+_WAKE_S = 0.2  # how often a waiting listener checks whether it was closed
 
 
 @dataclass(slots=True)
 class UdpCounters:
-    """What a listener saw."""
+    """Counters of a listener."""
 
     received: int = 0
-    foreign: int = 0  # ignored: not from the expected sender
+    foreign: int = 0  # ignored, not from the expected sender
     last_foreign: str = ""
 
 
 class Channel(NamedTuple):
-    """What comes on one port."""
+    """One UDP port and the topic of its records."""
 
     topic: str
     port: int
@@ -48,10 +48,10 @@ class Channel(NamedTuple):
 def listen_udp(
     channels: Sequence[Channel], bind: str, sender: str | None, timeout_s: float, counters: UdpCounters
 ) -> Iterator[Iterator[Record]]:
-    """Open a socket for each channel and yield an iterator of records. LinkError when one cannot open, or nothing
-    comes on the first one for timeout_s.
+    """Open a socket per channel and yield an iterator of records.
 
-    `record.stamp_ns` is when the packet's first laser fired as far as its arrival tells (`vlp16.first_pulse_ns`).
+    Raises LinkError when a socket cannot be opened, or when nothing arrives on the first channel for timeout_s.
+    `record.stamp_ns` is when the packet's first laser fired, estimated from its arrival (`vlp16.first_pulse_ns`).
     The iterator ends when the context is left, also from another thread.
     """
     closed = threading.Event()
@@ -67,7 +67,7 @@ def _open(bind: str, port: int) -> socket.socket:
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        datagram_time.ask_for_stamps(udp)
+        datagram_time.enable_stamps(udp)
         udp.bind((bind, port))
     except OSError as error:
         udp.close()
@@ -97,7 +97,7 @@ def _records(
     while not closed.is_set():
         try:
             ready, _, _ = select.select(list(sockets), [], [], min(_WAKE_S, timeout_s))
-            received = [(sockets[udp], datagram) for udp in ready for datagram in _waiting(udp)]
+            received = [(sockets[udp], datagram) for udp in ready for datagram in _pending(udp)]
         except (OSError, ValueError) as error:
             if closed.is_set():
                 return
@@ -116,11 +116,11 @@ def _records(
                 foreign_before = counters.foreign
         if time.monotonic() > deadline_s:
             foreign = counters.foreign - foreign_before
-            raise LinkError(_silence(first.port, sender, timeout_s, foreign, counters.last_foreign))
+            raise LinkError(_timeout_text(first.port, sender, timeout_s, foreign, counters.last_foreign))
 
 
-def _waiting(udp: socket.socket) -> Iterator[Any]:
-    """The datagrams that wait, as `recvmsg` gives them; none where the kernel found the announced one damaged."""
+def _pending(udp: socket.socket) -> Iterator[Any]:
+    """The datagrams in the buffer, as `recvmsg` returns them; none if the kernel discarded a damaged one."""
     try:
         for _ in range(_BURST):
             yield udp.recvmsg(_DATAGRAM_BYTES, datagram_time.ANCILLARY_BYTES)
@@ -128,10 +128,10 @@ def _waiting(udp: socket.socket) -> Iterator[Any]:
         return
 
 
-def _silence(port: int, sender: str | None, timeout_s: float, foreign: int, last_foreign: str) -> str:
+def _timeout_text(port: int, sender: str | None, timeout_s: float, foreign: int, last_foreign: str) -> str:
     if foreign:
         return (
             f"no packet from {sender} on UDP {port} for {timeout_s:g} s, but {foreign} from others "
-            f"(last {last_foreign}): is `sender` the lidar's address?"
+            f"(last {last_foreign}): is `sender` the LiDAR's address?"
         )
-    return f"no packet on UDP {port} for {timeout_s:g} s: is the lidar powered, and is this host on its subnet?"
+    return f"no packet on UDP {port} for {timeout_s:g} s: is the LiDAR powered, and is this host on its subnet?"

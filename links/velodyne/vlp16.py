@@ -1,4 +1,4 @@
-"""The VLP-16 (and Puck LITE) as its datasheet describes it: angles, timing and packet layout, in the datasheet's units.
+"""Datasheet of the VLP-16 and Puck LITE: angles, timing and packet layout, in the datasheet's units.
 
 Source: Velodyne VLP-16 User Manual 63-9243 Rev. E, chapter 9 (tables 9-1 to 9-4, figures 9-2 to 9-9).
 https://velodynelidar.com/wp-content/uploads/2019/12/63-9243-Rev-E-VLP-16-User-Manual.pdf
@@ -56,15 +56,15 @@ WIRE_NS = 101_760
 
 
 def packet_ns(return_mode: int) -> int:
-    """How long one packet's pulses take [ns]: 24 firing sequences, or 12 when each is sent twice (dual return)."""
+    """Duration of one packet's pulses [ns]: 24 firing sequences, or 12 when each is sent twice (dual return)."""
     return SEQUENCE_NS * (BLOCKS if return_mode == DUAL else 2 * BLOCKS)
 
 
 def first_pulse_ns(arrival_ns: int, data: bytes) -> int:
-    """When the first laser of a packet fired, from when the packet arrived: arrival - firing time - wire time [ns].
+    """When the first laser of a packet fired [ns]: arrival - duration of its pulses - transmission time.
 
-    Late by what the sensor and the host's network stack add (tens to hundreds of microseconds). Data that is not a
-    VLP-16 packet keeps its arrival time.
+    The result is late by the delay in the sensor and in the host's network stack (tens to hundreds of microseconds).
+    A payload that is not a VLP-16 packet keeps its arrival time.
     """
     if len(data) != PACKET_BYTES:
         return arrival_ns
@@ -72,7 +72,7 @@ def first_pulse_ns(arrival_ns: int, data: bytes) -> int:
 
 
 def other_model(data: bytes) -> str | None:
-    """Name of the Velodyne model that is not a VLP-16 but sent this packet; None when the packet does not tell."""
+    """Name of the other Velodyne model that sent this packet; None: a VLP-16, or unknown."""
     flags = {data[at : at + 2] for at in range(0, BLOCKS * BLOCK_BYTES, BLOCK_BYTES)}
     product_id = data[PRODUCT_ID_AT]
     if BLOCK_FLAG not in flags or product_id == PRODUCT_ID:

@@ -14,16 +14,16 @@ from links.clock import Clock, host_time
 
 def test_ticks_lie_evenly_in_time_and_are_never_early():
     clock = Clock(rate_hz=200)
-    began_ns = host_time.now_ns()
+    start_ns = host_time.now_ns()
     with clock.listen() as records:
         ticks = [next(records) for _ in range(20)]
-    assert {tick.stamp_ns % 5_000_000 for tick in ticks} == {0}, "on whole periods; one that was missed is left out"
+    assert {tick.stamp_ns % 5_000_000 for tick in ticks} == {0}, "on whole periods; a missed one is skipped"
     assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(ticks))
-    assert all(began_ns < tick.stamp_ns <= tick.arrival_ns <= host_time.now_ns() for tick in ticks)
+    assert all(start_ns < tick.stamp_ns <= tick.arrival_ns <= host_time.now_ns() for tick in ticks)
     assert {(tick.topic, tick.data) for tick in ticks} == {("/clock", b"")}
 
 
-def test_a_machine_that_stood_still_gives_the_newest_tick_and_counts_the_others(monkeypatch):
+def test_after_a_standstill_the_newest_tick_comes_and_the_missed_ones_are_counted(monkeypatch):
     times = iter([0, 20, 20, 1007, 1007])  # ms: start; wait, tick; wait, tick after a standstill
     monkeypatch.setattr(host_time, "now_ns", lambda: next(times) * 1_000_000)
     clock = Clock(rate_hz=50)

@@ -1,4 +1,4 @@
-"""The autopilot's clock: bounds, drift, TIMESYNC, reboots."""
+"""Clock of another device: bounds, drift, replies, reboots."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def _device(host_ns: int, ppm: float = 0.0) -> int:
     return BOOT + since + round(since * ppm * 1e-6)
 
 
-def test_the_promptest_message_gives_the_offset_and_no_stamp_is_after_arrival():
+def test_the_fastest_message_gives_the_offset_and_no_stamp_is_after_arrival():
     clock = DeviceClock(drift_limit_ppm=0.0)
     stamps = [clock.read(_device(HOST0 + i * S), HOST0 + i * S + late * MS) for i, late in enumerate([30, 10, 20, 50])]
     assert [s - HOST0 - i * S for i, s in enumerate(stamps) if s is not None] == [30 * MS, 10 * MS, 10 * MS, 10 * MS]
-    assert clock.uncertainty_ns is None  # one-way messages do not tell how late the promptest was
+    assert clock.uncertainty_ns is None  # one-way messages do not bound the smallest delay
     assert clock.offset_ns == HOST0 - BOOT + 10 * MS
 
 
@@ -45,9 +45,9 @@ def test_the_offset_is_known_within_the_latency_while_the_clocks_drift(ppm: floa
         last = max(last, host + 6 * MS + round(rng.exponential(4 * MS)))
         stamp = clock.read(_device(host, ppm), last)
         if timesync and i % 50 == 0:
-            asked, heard = last, last + 6 * MS + round(rng.exponential(4 * MS))
-            last = heard + 6 * MS + round(rng.exponential(4 * MS))
-            assert clock.round_trip(asked, _device(heard, ppm), last)
+            requested, replied = last, last + 6 * MS + round(rng.exponential(4 * MS))
+            last = replied + 6 * MS + round(rng.exponential(4 * MS))
+            assert clock.round_trip(requested, _device(replied, ppm), last)
         if i > 500 and stamp is not None:
             errors.append(stamp - host)
             uncertain.append(clock.uncertainty_ns)
@@ -55,11 +55,11 @@ def test_the_offset_is_known_within_the_latency_while_the_clocks_drift(ppm: floa
         assert np.abs(errors).max() < 2.5 * MS
         assert (np.abs(errors) <= uncertain).all()
     else:
-        assert min(errors) >= 6 * MS - 1  # never earlier than the least latency allows
+        assert min(errors) >= 6 * MS - 1  # never earlier than the smallest latency allows
         assert max(errors) < 8.5 * MS
 
 
-def test_timesync_sees_a_delay_that_one_way_messages_cannot():
+def test_replies_reveal_a_delay_that_one_way_messages_cannot():
     one_way, both = DeviceClock(), DeviceClock()
     for i in range(20):
         host = HOST0 + i * S
@@ -71,17 +71,17 @@ def test_timesync_sees_a_delay_that_one_way_messages_cannot():
     assert both.uncertainty_ns == 200 * MS
 
 
-def test_replies_to_others_or_from_the_past_are_refused():
+def test_foreign_and_late_replies_are_rejected():
     clock = DeviceClock()
     assert not clock.round_trip(HOST0, _device(HOST0), HOST0 + MS)  # before any message
     clock.read(_device(HOST0), HOST0 + 5 * MS)
-    assert not clock.round_trip(HOST0 + 9 * MS, _device(HOST0), HOST0 + 8 * MS)  # asked after the answer
+    assert not clock.round_trip(HOST0 + 9 * MS, _device(HOST0), HOST0 + 8 * MS)  # request after the reply
     assert not clock.round_trip(HOST0 - 3 * S, _device(HOST0), HOST0 + 8 * MS)  # too slow
-    assert not clock.round_trip(12345, _device(HOST0), HOST0 + 8 * MS)  # another's clock
+    assert not clock.round_trip(12345, _device(HOST0), HOST0 + 8 * MS)  # the clock of another device
     assert clock.round_trips == 0
 
 
-def test_one_wild_time_is_refused_and_a_reboot_begins_anew():
+def test_one_outlier_is_rejected_and_a_reboot_resets_the_estimate():
     clock = DeviceClock()
     clock.read(_device(HOST0), HOST0 + 5 * MS)
     assert clock.read(2**63, HOST0 + S) is None
@@ -92,20 +92,20 @@ def test_one_wild_time_is_refused_and_a_reboot_begins_anew():
     assert clock.restarts == 1
 
 
-def test_what_waited_longer_than_the_jump_limit_is_never_stamped_as_new():
+def test_a_message_buffered_for_longer_than_the_jump_limit_is_never_stamped_as_new():
     clock = DeviceClock()
     for i in range(10):
         clock.read(_device(HOST0 + i * 100 * MS), HOST0 + i * 100 * MS + 5 * MS)
-    end = HOST0 + 9 * S  # the line stood still for 8 s; what was sent meanwhile comes at once
+    end = HOST0 + 9 * S  # the link was blocked for 8 s; the buffered messages arrive at once
     for i in range(80):
-        said = HOST0 + S + i * 100 * MS
-        stamp = clock.read(_device(said), end + i * MS)
-        assert stamp is None or abs(stamp - said) < 10 * MS
+        sent = HOST0 + S + i * 100 * MS
+        stamp = clock.read(_device(sent), end + i * MS)
+        assert stamp is None or abs(stamp - sent) < 10 * MS
     assert clock.read(_device(end + S), end + S + 5 * MS) == pytest.approx(end + S + 5 * MS, abs=2 * MS)
     assert clock.restarts == 0
 
 
-def test_a_device_that_was_off_for_longer_than_it_had_been_on_begins_anew_in_a_while():
+def test_a_device_that_was_off_for_longer_than_on_is_reset_after_the_backlog_time():
     clock = DeviceClock()
     clock.read(3 * S, HOST0)
     stamps = [clock.read(4 * S + i * 100 * MS, HOST0 + 60 * S + i * 100 * MS) for i in range(150)]
@@ -116,7 +116,7 @@ def test_a_device_that_was_off_for_longer_than_it_had_been_on_begins_anew_in_a_w
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**64), st.integers(0, 2**62), st.integers(-(2**63), 2**63)), max_size=30))
-def test_no_times_make_it_fail(times: list[tuple[int, int, int]]):
+def test_no_input_raises(times: list[tuple[int, int, int]]):
     clock = DeviceClock()
     for device, arrival, ts1 in times:
         stamp = clock.read(device, arrival)

@@ -1,4 +1,4 @@
-"""The host's timeline goes on evenly whatever is done to the wall clock."""
+"""Host time is continuous although the wall clock is set."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def host(clocks):
     return HostTime(clocks.wall, clocks.monotonic)
 
 
-def test_it_starts_at_the_wall_clocks_time_and_counts_the_monotonic_clock(clocks, host):
-    began = host.now_ns()
-    assert began == START_NS + 5_000 * MS
+def test_host_time_starts_at_the_wall_clock_and_follows_the_monotonic_clock(clocks, host):
+    start = host.now_ns()
+    assert start == START_NS + 5_000 * MS
     clocks.monotonic_ns += 7 * MS
-    assert host.now_ns() == began + 7 * MS
+    assert host.now_ns() == start + 7 * MS
 
 
 @pytest.mark.parametrize("step_ns", [3_600_000 * MS, -3_600_000 * MS, 300 * MS, -40 * MS])
-def test_a_wall_clock_that_is_set_does_not_move_it(clocks, host, step_ns):
+def test_setting_the_wall_clock_does_not_change_host_time(clocks, host, step_ns):
     before = host.now_ns()
     clocks.offset_ns += step_ns
     assert host.now_ns() == before
@@ -53,8 +53,8 @@ def test_a_kernel_stamp_keeps_its_age(clocks, host):
     assert host.from_wall_ns(stamp) == host.now_ns() - 3 * MS
 
 
-def test_what_waited_while_the_process_stood_still_keeps_its_age(clocks, host):
-    """20 poses a second fill a socket's buffer in 13 s; stamped as of now they put the vehicle where it was."""
+def test_datagrams_buffered_during_a_standstill_keep_their_age(clocks, host):
+    """20 poses/s fill a socket's buffer in 13 s; with the current time as stamp they would be wrong positions."""
     host.from_wall_ns(clocks.wall())
     stamps = []
     for _ in range(256):
@@ -64,11 +64,11 @@ def test_what_waited_while_the_process_stood_still_keeps_its_age(clocks, host):
 
 
 @pytest.mark.parametrize("step_ns", [3_600_000 * MS, -3_600_000 * MS, 300 * MS, -40 * MS, 2 * MS])
-def test_a_stamp_from_before_the_clock_was_set_is_taken_as_now_and_later_ones_are_right_again(clocks, host, step_ns):
+def test_a_stamp_from_before_a_step_is_replaced_by_now_and_later_stamps_are_correct(clocks, host, step_ns):
     clocks.monotonic_ns += 20 * MS
     host.from_wall_ns(clocks.wall())
     clocks.monotonic_ns += 20 * MS
-    old = [clocks.wall() - 2 * MS, clocks.wall() - MS]  # still in the socket's buffer when the clock is set
+    old = [clocks.wall() - 2 * MS, clocks.wall() - MS]  # in the socket's buffer when the clock is set
     clocks.offset_ns += step_ns
     for stamp in old:
         clocks.monotonic_ns += 100_000
@@ -78,7 +78,7 @@ def test_a_stamp_from_before_the_clock_was_set_is_taken_as_now_and_later_ones_ar
     assert host.from_wall_ns(clocks.wall() - MS) == host.now_ns() - MS
 
 
-def test_a_wall_clock_that_is_slewed_is_followed(clocks, host):
+def test_a_slewed_wall_clock_is_followed(clocks, host):
     for _ in range(100):
         clocks.monotonic_ns += 1_000 * MS
         clocks.offset_ns += MS // 2  # 500 ppm
@@ -86,8 +86,8 @@ def test_a_wall_clock_that_is_slewed_is_followed(clocks, host):
     assert host.steps == 0
 
 
-def test_a_machine_that_is_slow_to_read_its_clocks_did_not_set_them(clocks):
-    """Another process comes between the readings every time, the longest the last time."""
+def test_a_slow_reading_of_the_clocks_is_not_a_step(clocks):
+    """Another process interrupts every reading, the last one longest."""
     slow_ns = iter([9 * MS, 4 * MS, 3 * MS, 5 * MS, 40 * MS] * 2)
 
     def wall():
@@ -105,13 +105,13 @@ def test_a_machine_that_is_slow_to_read_its_clocks_did_not_set_them(clocks):
     assert host.steps == 0
 
 
-def test_a_stamp_from_the_future_or_from_long_ago_is_taken_as_now(clocks, host):
+def test_a_stamp_from_the_future_or_far_past_is_replaced_by_now(clocks, host):
     clocks.monotonic_ns += 10 * MAX_AGE_NS
     assert host.from_wall_ns(clocks.wall() + MS) == host.now_ns()
     assert host.from_wall_ns(clocks.wall() - MAX_AGE_NS - 1) == host.now_ns()
 
 
-def test_the_process_has_one_timeline():
+def test_all_functions_share_one_timeline():
     before = now_ns()
     between = from_wall_ns(0)
     assert before <= between <= now_ns()

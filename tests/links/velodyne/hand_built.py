@@ -48,10 +48,10 @@ def exact_records(count: int, start_ns: int = 0, interval_ns: int = SINGLE_PACKE
 
 @functools.cache
 def captured(name: str) -> tuple[tuple[int, bytes], ...]:
-    """(host stamp [ns], UDP payload) of a real capture; skips the test when it is not there."""
+    """(host stamp [ns], UDP payload) of a real capture; skips the test when the file is missing."""
     path = CAPTURES / f"{name}.pcap"
     if not path.exists():
-        pytest.skip(f"real capture {name}.pcap is not here (../shared/data/lidar)")
+        pytest.skip(f"real capture {name}.pcap is missing (../shared/data/lidar)")
     return tuple((round(1e9 * stamp), bytes(data)) for stamp, data in velodyne_decoder.util.iter_pcap(str(path)))
 
 

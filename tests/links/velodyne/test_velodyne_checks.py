@@ -27,7 +27,7 @@ def packets(count, *, skip=(), mode="strongest", drift=0.0, step_ns=PACKET_NS):
     return records
 
 
-def test_a_lidar_that_sends_all_its_packets_is_good():
+def test_a_lidar_that_sends_all_its_packets_passes():
     found = levels(lidar_checks(observe(Lidar(), packets(800))))
     assert found == {"rate": "ok", "losses": "ok", "return mode": "ok", "clock": "ok"}
 
@@ -37,37 +37,37 @@ def test_a_dual_return_lidar_is_expected_to_send_twice_as_often():
     assert levels(lidar_checks(observe(Lidar(), packets(800, mode="dual", step_ns=dual_ns))))["rate"] == "ok"
     slow = by_name(lidar_checks(observe(Lidar(), packets(800, mode="dual"))))
     assert slow["rate"].level is Level.FAIL
-    assert "1507 are sent" in slow["rate"].sentence
+    assert "expected 1507" in slow["rate"].sentence
 
 
-def test_an_absent_lidar_says_what_its_link_says():
-    told = "no packet on UDP 2368 for 2 s: is the lidar powered, and is this host on its subnet?"
-    (result,) = lidar_checks(observe(Lidar(), [], status=told))
-    assert (result.level, result.sentence) == (Level.FAIL, told)
+def test_an_absent_lidar_reports_the_status_of_its_link():
+    status = "no packet on UDP 2368 for 2 s: is the LiDAR powered, and is this host on its subnet?"
+    (result,) = lidar_checks(observe(Lidar(), [], status=status))
+    assert (result.level, result.sentence) == (Level.FAIL, status)
     (result,) = lidar_checks(observe(Lidar(), [], live=False))
     assert "the recording holds nothing on /lidar/packets" in result.sentence
 
 
-def test_packets_that_are_no_lidars_are_named_as_refused():
+def test_packets_of_another_device_are_reported_as_refused():
     noise = [Record("/lidar/packets", BEGIN_NS + k * PACKET_NS, BEGIN_NS + k * PACKET_NS, b"x" * 9) for k in range(50)]
     (result,) = lidar_checks(observe(Lidar(), noise))
     assert result.level is Level.FAIL
-    assert "50 packets came" in result.sentence
+    assert "50 packets arrived" in result.sentence
 
 
 @pytest.mark.parametrize(("lost", "level"), [(0, "ok"), (3, "warning"), (40, "fail")])
-def test_lost_packets_are_judged_by_their_share(lost, level):
+def test_lost_packets_are_rated_by_their_share(lost, level):
     found = by_name(lidar_checks(observe(Lidar(), packets(800, skip=range(100, 100 + lost)))))["losses"]
     assert found.level.value == level
     assert f"{lost} of 800 packets lost" in found.sentence
 
 
-def test_foreign_packets_two_lidars_and_a_cable_pulled_are_noticed():
+def test_foreign_packets_two_lidars_and_a_pulled_cable_are_reported():
     assert (
         levels(lidar_checks(observe(Lidar(), packets(800), counters={"from other senders": 7})))["sender"] == "warning"
     )
     found = by_name(lidar_checks(observe(Lidar(), packets(800, step_ns=PACKET_NS // 2))))["rate"]
-    assert "do two lidars send" in found.sentence
+    assert "do two LiDARs send" in found.sentence
     late = observe(Lidar(), packets(800), end_ns=BEGIN_NS + 5_000_000_000)
     assert by_name(lidar_checks(late))["rate"].level is Level.FAIL
     mixed = observe(Lidar(), packets(400) + packets(800, mode="last")[400:])
@@ -75,7 +75,7 @@ def test_foreign_packets_two_lidars_and_a_cable_pulled_are_noticed():
     assert levels(lidar_checks(observe(Lidar(), packets(400, mode="last"))))["return mode"] == "warning"
 
 
-def test_a_clock_that_runs_away_is_told_in_millionths():
+def test_the_drift_of_the_sensor_clock_is_reported_in_ppm():
     steady = [(k * 10_000_000, k * 10_000_000 % 3_600_000_000_000) for k in range(300)]
     assert clock_drift_ppm(steady) == 0
     assert math.isnan(clock_drift_ppm(steady[:100]))

@@ -1,4 +1,4 @@
-"""Bytes to pulses: formula by hand, symmetries, dual return, and the oracle on real captures."""
+"""Bytes to pulses: the formula by hand, symmetries, dual return, and velodyne-decoder on real captures."""
 
 import math
 
@@ -27,7 +27,7 @@ def one_return(block, channel, range_2mm):
     return ranges
 
 
-def test_a_return_is_placed_by_the_datasheets_formula():
+def test_a_return_is_at_the_datasheets_position():
     # 10 m on laser 0 (-15 deg, 11.2 mm), seen at azimuth 90 deg: along +x, below the scanner.
     firings = decode(packet(one_return(0, 0, 5_000), azimuth=9_000, reflectivity=77))
     assert firings.xyz_lidar_m[0] == pytest.approx(
@@ -37,7 +37,7 @@ def test_a_return_is_placed_by_the_datasheets_formula():
     assert (firings.range_m[0], firings.reflectivity[0], firings.laser[0]) == (10.0, 77, 0)
 
 
-def test_the_second_firing_sequence_has_turned_on_by_half_a_block():
+def test_the_second_firing_sequence_is_rotated_by_half_a_block():
     # Block 3, channel 19: laser 3 (+3 deg, -2.2 mm) of the second sequence, 55.296 + 3 * 2.304 us after the block's
     # azimuth; the head turns 0.40 deg in a block's 110.592 us.
     firings = decode(packet(one_return(3, 19, 10_000), azimuth=0, step=40))
@@ -68,7 +68,7 @@ def test_lasers_fire_in_order_every_2304_ns_and_sequences_every_55296_ns():
     assert (firings.laser.reshape(24, 16) == np.arange(16)).all()
 
 
-def test_turning_the_head_a_quarter_turns_the_cloud_a_quarter():
+def test_turning_the_head_by_90_deg_turns_the_cloud_by_90_deg():
     ranges = np.random.default_rng(1).integers(200, 40_000, (12, 32))
     x, y, z = decode(packet(ranges, azimuth=1_234)).xyz_lidar_m.T
     quarter = decode(packet(ranges, azimuth=1_234 + 9_000)).xyz_lidar_m
@@ -76,8 +76,8 @@ def test_turning_the_head_a_quarter_turns_the_cloud_a_quarter():
 
 
 @pytest.mark.parametrize("step", [39, 0, -39])
-def test_azimuth_passes_north_without_a_jump(step):
-    first = -6 * step - step // 2  # north is passed within a block
+def test_azimuth_passes_zero_without_a_jump(step):
+    first = -6 * step - step // 2  # zero is passed within a block
     firings = decode(packet(azimuth=first, step=step))
     azimuth = firings.azimuth_rad.astype(np.float64)
     expected = np.radians(0.01 * (first + step * firings.pulse_stamp_ns / 110_592))
@@ -91,7 +91,7 @@ def test_an_azimuth_that_rounds_to_a_whole_turn_is_zero():
     assert azimuth.min() == 0
 
 
-def test_one_jittering_block_does_not_bend_the_azimuth_rate():
+def test_one_jittering_block_does_not_change_the_azimuth_rate():
     raw = np.frombuffer(packet(azimuth=9_000, step=40), PACKET).copy()
     raw["block"]["azimuth"][0, 6] += 2
     smooth, jittered = decode(packet(azimuth=9_000, step=40)).azimuth_rad, decode(raw.tobytes()).azimuth_rad
@@ -126,7 +126,7 @@ def test_dual_return_does_not_repeat_an_only_return():
     assert set(firings.return_kind.tolist()) == {0}
 
 
-def test_dual_return_keeps_pulses_that_saw_nothing_once():
+def test_dual_return_keeps_pulses_without_return_once():
     ranges = np.zeros((12, 32), np.uint16)
     ranges[0, 4], ranges[1, 4] = 7_000, 5_000  # two returns
     ranges[3, 9] = 4_000  # strongest alone
@@ -144,7 +144,7 @@ def difference_to_oracle(data):
 
     velodyne-decoder points x forward (our y) and y left (our -x), rounds azimuths to 0.01 deg and lists returns only;
     its vertical offsets have more digits than the datasheet's table. Number of returns, laser, reflectivity and kind of
-    return (which our single return modes do not tell) must agree exactly.
+    return (which our single return modes do not contain) must agree exactly.
     """
     decoder = velodyne_decoder.ScanDecoder(velodyne_decoder.Config(min_range=0.0, max_range=200.0))
     one = velodyne_decoder.PacketVector([velodyne_decoder.VelodynePacket(0.0, data)])

@@ -1,4 +1,4 @@
-"""Device time to host time: exact where it can be, bounded where it cannot, and never silently wrong."""
+"""Device time to host time: exact where possible, otherwise with a bounded error; disagreements are counted."""
 
 import numpy as np
 import pytest
@@ -16,9 +16,9 @@ def device_us(true_ns, phase_ns=0):
 
 
 def stamps_of(clock, true_ns, late_ns, phase_ns=0):
-    ticks = [clock.read(device_us(t, phase_ns), t + late) for t, late in zip(true_ns, late_ns, strict=True)]
-    assert all(isinstance(tick, PacketTime) for tick in ticks)
-    return np.array([tick.stamp_ns for tick in ticks])
+    times = [clock.read(device_us(t, phase_ns), t + late) for t, late in zip(true_ns, late_ns, strict=True)]
+    assert all(isinstance(time, PacketTime) for time in times)
+    return np.array([time.stamp_ns for time in times])
 
 
 @pytest.mark.parametrize("mode", ["free", "utc"])
@@ -48,13 +48,13 @@ def test_a_free_clock_that_drifts_is_followed(drift):
     clock = LidarClock()
     errors_ns = []
     for k, t in enumerate(true_ns):
-        tick = clock.read(device_us(t + int(drift * k * SINGLE_PACKET_NS)), t + int(late_ns[k]))
-        assert isinstance(tick, PacketTime)
-        errors_ns.append(tick.stamp_ns - t)
+        time = clock.read(device_us(t + int(drift * k * SINGLE_PACKET_NS)), t + int(late_ns[k]))
+        assert isinstance(time, PacketTime)
+        errors_ns.append(time.stamp_ns - t)
     assert abs(np.array(errors_ns[100:])).max() < 120_000  # 26 s at 100 ppm would be 2.6 ms
 
 
-def test_a_packet_held_up_on_the_way_keeps_its_own_time():
+def test_a_delayed_packet_keeps_its_own_time():
     true_ns = [START_NS + k * SINGLE_PACKET_NS for k in range(100)]
     late_ns = [0] * 50 + [300_000_000] + [0] * 49
     errors_ns = stamps_of(LidarClock(), true_ns, late_ns) - np.array(true_ns)
@@ -67,7 +67,7 @@ def test_a_small_step_of_the_hosts_clock_is_followed_within_a_second():
     assert (errors_ns[500 + 754 :] == 100_000_000).all()
 
 
-def test_a_pause_is_bridged_by_the_device_clock_and_old_offsets_are_forgotten():
+def test_a_gap_is_bridged_by_the_device_clock_and_old_offsets_are_dropped():
     clock = LidarClock()
     clock.read(device_us(START_NS), START_NS)
     after_ns = START_NS + 60_000_000_000
@@ -76,18 +76,18 @@ def test_a_pause_is_bridged_by_the_device_clock_and_old_offsets_are_forgotten():
 
 
 @pytest.mark.parametrize("jump_ns", [2_000_000_000, -2_000_000_000, 900_000_000_000])
-def test_a_device_clock_that_was_set_is_anchored_anew_and_counted(jump_ns):
+def test_a_step_of_the_device_clock_resets_the_offset_and_is_counted(jump_ns):
     clock = LidarClock()
     clock.read(device_us(START_NS), START_NS)
     after_ns = START_NS + SINGLE_PACKET_NS
-    tick = clock.read(device_us(after_ns, jump_ns), after_ns)
-    assert tick == PacketTime(after_ns, 0)
+    time = clock.read(device_us(after_ns, jump_ns), after_ns)
+    assert time == PacketTime(after_ns, 0)
     assert clock.disagreements == 1
     later_ns = after_ns + SINGLE_PACKET_NS
     assert clock.read(device_us(later_ns, jump_ns), later_ns).stamp_ns == later_ns
 
 
-def test_a_small_step_back_of_the_device_clock_does_not_stop_the_stream():
+def test_a_small_backward_step_of_the_device_clock_does_not_stop_the_stream():
     clock = LidarClock()
     clock.read(device_us(START_NS), START_NS)
     after_ns = START_NS + SINGLE_PACKET_NS
@@ -106,13 +106,13 @@ def test_repeated_and_overtaken_packets_are_out_of_order(mode):
 
 
 @pytest.mark.parametrize("late_ns", [400_000_000, -400_000_000])
-def test_utc_takes_the_devices_time_in_the_hosts_nearest_hour(late_ns):
+def test_utc_uses_the_device_time_in_the_hour_nearest_to_the_host(late_ns):
     for true_ns in (START_NS // HOUR_NS * HOUR_NS + 1_000, START_NS // HOUR_NS * HOUR_NS - 1_000):
-        tick = LidarClock("utc").read(device_us(true_ns), true_ns + late_ns)
-        assert tick == PacketTime(true_ns, 0)
+        time = LidarClock("utc").read(device_us(true_ns), true_ns + late_ns)
+        assert time == PacketTime(true_ns, 0)
 
 
-def test_utc_refuses_times_that_the_host_does_not_share():
+def test_utc_rejects_times_that_disagree_with_the_host():
     clock = LidarClock("utc", limit_ns=500_000_000)
     assert clock.read(device_us(START_NS), START_NS + 600_000_000) is RejectReason.CLOCK
     assert clock.disagreements == 1

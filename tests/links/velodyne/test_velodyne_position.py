@@ -20,7 +20,7 @@ def position(nmea=GPRMC, time_us=1_082_500_000, pps=2):
     return bytes(198) + time_us.to_bytes(4, "little") + bytes([pps, 0, 0, 0]) + nmea.encode().ljust(306, b"\0")
 
 
-def test_time_pps_and_sentence_stand_where_the_datasheet_says():
+def test_time_pps_and_sentence_are_read_at_the_datasheets_offsets():
     read = parse_position(position(GPRMC + "\r\n"))
     assert (read.timestamp_us, read.pps, read.nmea) == (1_082_500_000, Pps.LOCKED, GPRMC)
     assert read.gps_utc == datetime(2016, 1, 21, 8, 18, 2, 500_000, tzinfo=UTC)
@@ -45,7 +45,7 @@ def test_a_missing_or_damaged_sentence_gives_no_time(nmea):
 @pytest.mark.parametrize(
     ("data", "words"), [(bytes(1206), "512 bytes"), (position(pps=9), "PPS"), (position(time_us=2**32 - 1), "time")]
 )
-def test_what_is_no_position_packet_is_an_error(data, words):
+def test_a_payload_that_is_no_position_packet_is_an_error(data, words):
     with pytest.raises(LinkError, match=words):
         parse_position(data)
 
@@ -66,8 +66,8 @@ def test_all_real_position_packets_are_read_as_velodyne_decoder_reads_them():
 
 def test_the_data_topic_ignores_and_counts_position_packets():
     lidar = Lidar()
-    answers = [lidar.decode(record(data, stamp_ns)) for stamp_ns, data in captured("vlp16_strongest_gps_mrpt")]
-    assert sum(answer is not None for answer in answers) == lidar.counters["decoded"] == 293
+    messages = [lidar.decode(record(data, stamp_ns)) for stamp_ns, data in captured("vlp16_strongest_gps_mrpt")]
+    assert sum(message is not None for message in messages) == lidar.counters["decoded"] == 293
     assert sum(count for name, count in lidar.counters.items() if "position packet" in name) == 57
     assert lidar.counters["lost"] == 0
 
@@ -77,11 +77,11 @@ def ports():
     return free_ports(2)
 
 
-def test_live_position_packets_are_records_of_their_own_and_their_state_is_counted(ports):
+def test_live_position_packets_are_recorded_separately_and_their_state_is_counted(ports):
     lidar = Lidar(port=ports[0], position_port=ports[1], sender="127.0.0.1")
     with lidar.listen() as records:
         assert "PPS locked" not in lidar.counters  # nothing is known yet
-        send(ports[1], position(pps=1), host="127.0.0.2")  # somebody else's
+        send(ports[1], position(pps=1), host="127.0.0.2")  # from another sender
         send(ports[1], position(pps=0))
         assert next(records).data == position(pps=0)
         assert (lidar.counters["PPS absent"], lidar.counters["PPS locked"]) == (1, 0)
@@ -98,7 +98,7 @@ def test_live_position_packets_are_records_of_their_own_and_their_state_is_count
     assert (counters["PPS locks lost"], counters["GPS time valid"], counters["from other senders"]) == (1, 1, 1)
 
 
-def test_silence_on_the_position_port_alone_is_no_error_and_on_the_data_port_it_is(ports):
+def test_a_timeout_on_the_data_port_is_an_error_and_on_the_position_port_it_is_not(ports):
     lidar = Lidar(port=ports[0], position_port=ports[1], timeout_s=0.1)
     with lidar.listen() as records:
         send(ports[1], position())
@@ -107,7 +107,7 @@ def test_silence_on_the_position_port_alone_is_no_error_and_on_the_data_port_it_
             next(records)
 
 
-def test_with_clock_utc_no_pulse_counts_before_the_sensor_is_locked(ports):
+def test_with_clock_utc_no_data_packet_is_accepted_before_the_sensor_is_locked(ports):
     lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc")
     with lidar.listen() as records:
         send(ports[0], packet(azimuth=1))
@@ -122,14 +122,14 @@ def test_with_clock_utc_no_pulse_counts_before_the_sensor_is_locked(ports):
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
-    [((), "no position packet has come"), ((position(pps=3),), "its PPS is error, its GPS knows the time")],
+    ("position_packets", "words"),
+    [((), "no position packet has arrived"), ((position(pps=3),), "its PPS is error, its GPS time is valid")],
 )
-def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_that_says_why(ports, told, words):
+def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_with_the_reason(ports, position_packets, words):
     lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc", timeout_s=0.5)
     with lidar.listen() as records:
-        send(ports[1], *told)
-        for _ in told:
+        send(ports[1], *position_packets)
+        for _ in position_packets:
             next(records)
         stop = threading.Event()
         sending = threading.Thread(
@@ -147,33 +147,33 @@ def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_that_says_why(po
 @pytest.mark.parametrize(
     ("lost", "words"),
     [
-        (position(pps=0), "its PPS is absent, its GPS knows the time"),
-        (position(GPRMC.replace("A", "V", 1)), "its PPS is locked, its GPS does not know the time"),
+        (position(pps=0), "its PPS is absent, its GPS time is valid"),
+        (position(GPRMC.replace("A", "V", 1)), "its PPS is locked, its GPS time is not valid"),
     ],
 )
-def test_with_clock_utc_a_lock_that_is_lost_is_said_until_it_is_back_and_the_packets_are_taken_on(ports, lost, words):
+def test_with_clock_utc_a_lost_lock_is_reported_until_it_returns_and_packets_are_still_accepted(ports, lost, words):
     lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc")
-    said = []
+    statuses = []
     with lidar.listen() as records:
-        for told in (lost, position(), lost, position(pps=1), position(pps=7), position()):  # the 7 is damaged
-            said.append(lidar.status)
-            send(ports[1], told)
-            assert next(records).data == told
+        for data in (lost, position(), lost, position(pps=1), position(pps=7), position()):  # the 7 is damaged
+            statuses.append(lidar.status)
+            send(ports[1], data)
+            assert next(records).data == data
             if lidar.counters.get("PPS locks lost"):
                 send(ports[0], packet())
                 assert next(records).data == packet()
-        said.append(lidar.status)
-    before, not_yet, locked, lost_now, still, unheard, again = said
-    assert (before, not_yet, locked, again) == (None,) * 4, "a lock that never was is an error of its own, later"
+        statuses.append(lidar.status)
+    before, not_yet, locked, lost_now, still_lost, after_damaged, locked_again = statuses
+    assert (before, not_yet, locked, locked_again) == (None,) * 4, "a lock that never existed is another error, later"
     assert words in lost_now
     assert "GPS antenna" in lost_now
     assert "set clock: free" in lost_now
-    assert "PPS is synchronizing" in still
-    assert unheard == still
+    assert "PPS is synchronizing" in still_lost
+    assert after_damaged == still_lost
 
 
-def test_with_clock_utc_position_packets_that_end_are_said(ports, monkeypatch):
-    monkeypatch.setattr("links.velodyne.lidar.POSITION_SILENT_S", 0.15)
+def test_with_clock_utc_the_end_of_position_packets_is_reported(ports, monkeypatch):
+    monkeypatch.setattr("links.velodyne.lidar.POSITION_TIMEOUT_S", 0.15)
     lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc", timeout_s=0.15)
     with lidar.listen() as records:
         send(ports[1], position())
@@ -182,21 +182,21 @@ def test_with_clock_utc_position_packets_that_end_are_said(ports, monkeypatch):
         while lidar.status is None and time.monotonic() < end_s:
             send(ports[0], packet())
             next(records)
-        assert "no position packet comes any more" in lidar.status
+        assert "no position packet arrives" in lidar.status
         send(ports[1], position())
         next(records)
         assert lidar.status is None
         send(ports[1], position(pps=0))
         next(records)
         assert lidar.status is not None
-    assert lidar.status is None, "nobody listens any more"
+    assert lidar.status is None, "not listening any more"
 
 
-def test_with_a_free_clock_a_lost_lock_is_no_trouble(ports):
+def test_with_a_free_clock_a_lost_lock_is_not_reported(ports):
     lidar = Lidar(port=ports[0], position_port=ports[1])
     with lidar.listen() as records:
-        for told in (position(), position(pps=0)):
-            send(ports[1], told)
+        for data in (position(), position(pps=0)):
+            send(ports[1], data)
             next(records)
         assert lidar.counters["PPS locks lost"] == 1
         assert lidar.status is None

@@ -1,4 +1,4 @@
-"""A stream of packets: lost, repeated, damaged, foreign; and anything at all."""
+"""A stream of packets: lost, repeated, damaged, foreign, and random bytes."""
 
 import random
 
@@ -47,7 +47,7 @@ def refused(lidar, reason):
 
 
 @pytest.mark.parametrize("start_ns", [0, HOUR_NS - 20 * SINGLE_PACKET_NS])
-def test_packets_missing_from_the_stream_are_counted_where_they_miss(start_ns):
+def test_lost_packets_are_counted_at_the_gap(start_ns):
     records = exact_records(40, start_ns)
     assert lost_in(records) == [0] * 40
     assert lost_in(records[:10] + records[13:19] + records[20:]) == [0] * 10 + [3] + [0] * 5 + [1] + [0] * 19
@@ -65,13 +65,13 @@ def test_a_change_of_return_mode_loses_nothing():
     assert sum(lost_in(single + dual + again)) == 0
 
 
-def test_losses_are_told_by_the_sensors_clock_not_by_late_arrival():
+def test_losses_are_counted_by_the_sensors_clock_not_by_late_arrival():
     records = exact_records(40)
     assert sum(lost_in(records[:20] + [record(r.data, r.stamp_ns + 30_000_000) for r in records[20:]])) == 0
 
 
 @pytest.mark.parametrize("capture", ["vlp16_strongest_einride", "vlp16_strongest_gps_mrpt"])
-def test_a_real_stream_loses_nothing_until_packets_are_taken_away(capture):
+def test_a_real_stream_loses_nothing_until_packets_are_removed(capture):
     records = list(captured_records(capture))
     assert sum(lost_in(records)) == 0
     assert sum(lost_in(records[:100] + records[107:])) == 7
@@ -80,50 +80,50 @@ def test_a_real_stream_loses_nothing_until_packets_are_taken_away(capture):
 def test_repeated_and_overtaken_packets_are_ignored_and_counted():
     lidar = Lidar()
     a, b, c, d = exact_records(4)
-    answers = [lidar.decode(r) for r in (a, c, b, c, d)]
-    assert [answer is not None for answer in answers] == [True, True, False, False, True]
-    assert [answers[k].lost_packets for k in (0, 1, 4)] == [0, 1, 0]
+    messages = [lidar.decode(r) for r in (a, c, b, c, d)]
+    assert [message is not None for message in messages] == [True, True, False, False, True]
+    assert [messages[k].lost_packets for k in (0, 1, 4)] == [0, 1, 0]
     assert refused(lidar, RejectReason.ORDER) == 2
 
 
-def told(records, packets):
+def decoded(records, packets):
     lidar = Lidar(packets=packets)
     return [lidar.decode(r) for r in records]
 
 
-def packets_of(answers):
-    return [0 if answer is None else answer.pulse_stamp_ns.size // 384 for answer in answers]
+def packets_of(messages):
+    return [0 if message is None else message.pulse_stamp_ns.size // 384 for message in messages]
 
 
 @pytest.mark.parametrize("mode", [STRONGEST, DUAL])
-def test_packets_told_together_are_those_told_alone_in_a_row(mode):
+def test_several_packets_in_a_message_equal_the_single_packets_concatenated(mode):
     interval_ns = SINGLE_PACKET_NS // (2 if mode == DUAL else 1)
     ranges = np.random.default_rng(1).integers(0, 30_000, (12, 32))
     records = exact_records(9, interval_ns=interval_ns, mode=mode, ranges=ranges)
-    alone, three = told(records, 1), told(records, 3)
-    assert [answer is not None for answer in three] == 3 * [False, False, True]
+    single, three = decoded(records, 1), decoded(records, 3)
+    assert [message is not None for message in three] == 3 * [False, False, True]
     for k, group in enumerate(three[2::3]):
         check_arrays(group)
-        assert group.stamp_ns == alone[3 * k].stamp_ns
+        assert group.stamp_ns == single[3 * k].stamp_ns
         for name, _, shape in array_fields(type(group)):
             if "n" in shape.dims:
-                parts = [getattr(one, name) for one in alone[3 * k : 3 * k + 3]]
+                parts = [getattr(one, name) for one in single[3 * k : 3 * k + 3]]
                 np.testing.assert_array_equal(getattr(group, name), np.concatenate(parts), err_msg=name)
 
 
-def test_a_gap_ends_a_message_and_the_next_one_tells_what_was_lost():
+def test_a_gap_ends_a_message_and_the_next_one_holds_the_number_of_lost_packets():
     records = exact_records(12)
-    answers = told(records[:2] + records[5:11], 4)
-    assert packets_of(answers) == [0, 0, 2, 0, 0, 4, 0, 0]
-    assert [answer.lost_packets for answer in answers if answer] == [0, 3]
+    messages = decoded(records[:2] + records[5:11], 4)
+    assert packets_of(messages) == [0, 0, 2, 0, 0, 4, 0, 0]
+    assert [message.lost_packets for message in messages if message] == [0, 3]
 
 
-def test_a_packet_that_is_refused_ends_a_message_but_loses_nothing_of_it():
+def test_a_refused_packet_ends_a_message_and_keeps_the_packets_before_it():
     records = exact_records(6)
-    spoilt = [*records[:2], record(packet(step=3_000, time_us=2_654), 2_654_208), *records[3:]]
-    answers = told(spoilt, 3)
-    assert packets_of(answers) == [0, 0, 0, 2, 0, 3]
-    assert [answer.lost_packets for answer in answers if answer] == [0, 1]
+    with_bad = [*records[:2], record(packet(step=3_000, time_us=2_654), 2_654_208), *records[3:]]
+    messages = decoded(with_bad, 3)
+    assert packets_of(messages) == [0, 0, 0, 2, 0, 3]
+    assert [message.lost_packets for message in messages if message] == [0, 1]
 
 
 def damaged(**change):
@@ -147,7 +147,7 @@ def damaged(**change):
         (damaged(time=(1200, (3_600_000_000).to_bytes(4, "little"))), RejectReason.TIMESTAMP),
     ],
 )
-def test_a_bad_packet_in_a_good_stream_is_ignored_counted_and_missed(data, reason):
+def test_a_bad_packet_in_a_good_stream_is_ignored_and_counted_as_lost(data, reason):
     lidar = Lidar()
     first, _, third = exact_records(3)
     assert lidar.decode(first) is not None
@@ -169,11 +169,11 @@ def test_dual_return_blocks_of_one_pulse_share_their_azimuth():
     ("product", "name"), [(HDL32E, "HDL-32E"), (PUCK_HI_RES, "Puck Hi-Res"), (0x28, "VLP-32C"), (0xA1, "VLS-128")]
 )
 def test_another_model_is_refused_by_name_at_its_first_packet(product, name):
-    with pytest.raises(LinkError, match=rf"Velodyne {name}.*grd reads the VLP-16"):
+    with pytest.raises(LinkError, match=rf"Velodyne {name}.*grd supports the VLP-16"):
         Lidar().decode(record(packet(product=product)))
 
 
-def test_an_hdl64_is_known_by_its_lower_blocks():
+def test_an_hdl64_is_recognised_by_its_lower_blocks():
     data = bytearray(packet(product=0x07))
     for block in range(1, 12, 2):
         data[100 * block + 1] = 0xDD
@@ -186,14 +186,14 @@ def test_a_real_hdl32_capture_is_refused_by_name():
         Lidar().decode(record(captured("hdl32_mrpt_WRONG_MODEL")[0][1]))
 
 
-def test_a_hundred_bad_packets_in_a_row_are_an_error_that_gives_the_reasons():
+def test_a_hundred_consecutive_bad_packets_are_an_error_with_the_reasons():
     lidar = Lidar()
     lidar.decode(exact_records(1)[0])
     for _ in range(60):
         assert lidar.decode(record(bytes(1206))) is None
     for _ in range(39):
         assert lidar.decode(record(bytes(100))) is None
-    with pytest.raises(LinkError, match=r"100 packets in a row.*60 not the VLP-16's product id, 40 not 1206 bytes"):
+    with pytest.raises(LinkError, match=r"100 consecutive packets.*60 not the VLP-16's product id, 40 not 1206 bytes"):
         lidar.decode(record(bytes(100)))
 
 
@@ -202,12 +202,12 @@ def test_a_recording_with_a_burst_of_bad_packets_is_replayed_to_its_end(tmp_path
     good = exact_records(4)
     report = replay(load_graph(tmp_path / "x.yaml"), [*good[:2], *[record(bytes(1206))] * 250, *good[2:]])
     assert report.messages["lidar.lidar_firings"] == 4
-    (said,) = report.incidents
-    assert (said.node, said.count) == ("lidar", 2)
-    assert "100 packets in a row are no use" in said.text
+    (incident,) = report.incidents
+    assert (incident.node, incident.count) == ("lidar", 2)
+    assert "100 consecutive packets are invalid" in incident.text
 
 
-def test_one_good_packet_ends_a_row_of_bad_ones():
+def test_one_good_packet_resets_the_count_of_bad_ones():
     lidar = Lidar()
     good = exact_records(2)
     for r in (good[0], good[1]):
@@ -237,7 +237,7 @@ anything = st.one_of(
 
 @given(st.lists(st.tuples(anything, st.integers(-(2**62), 2**62)), max_size=6), st.sampled_from(["free", "utc"]))
 @settings(max_examples=300, deadline=None)
-def test_no_bytes_make_decode_fail_or_return_what_is_not_finite(packets, clock):
+def test_no_bytes_make_decode_raise_or_return_non_finite_values(packets, clock):
     lidar = Lidar(clock=clock)
     for data, stamp_ns in packets:
         try:
@@ -252,7 +252,7 @@ def test_no_bytes_make_decode_fail_or_return_what_is_not_finite(packets, clock):
             assert firings.lost_packets >= 0
 
 
-def test_the_same_stream_gives_the_same_answer_twice():
+def test_the_same_stream_gives_the_same_messages_twice():
     shuffled = exact_records(200)
     random.Random(5).shuffle(shuffled)
 

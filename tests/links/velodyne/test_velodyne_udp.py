@@ -51,16 +51,16 @@ def test_packets_from_other_senders_are_ignored_and_counted(port):
     assert lidar.counters["from other senders"] == 2
 
 
-def test_silence_is_an_error_that_says_what_to_check(port):
+def test_a_timeout_is_an_error_that_names_what_to_check(port):
     lidar = Lidar(port=port, timeout_s=0.05)
     with (
         lidar.listen() as records,
-        pytest.raises(LinkError, match=rf"no packet on UDP {port} for 0.05 s: is the lidar powered, and is this host"),
+        pytest.raises(LinkError, match=rf"no packet on UDP {port} for 0.05 s: is the LiDAR powered, and is this host"),
     ):
         next(records)
 
 
-def test_packets_from_others_alone_do_not_hide_the_silence(port):
+def test_foreign_packets_do_not_prevent_the_timeout(port):
     lidar = Lidar(port=port, sender="127.0.0.3", timeout_s=0.05)
     with lidar.listen() as records:
         send(port, packet(), packet(), host="127.0.0.2")
@@ -68,7 +68,7 @@ def test_packets_from_others_alone_do_not_hide_the_silence(port):
             next(records)
 
 
-def test_a_port_in_use_is_an_error_that_says_so(port):
+def test_a_port_in_use_is_an_error_that_names_it(port):
     with (
         Lidar(port=port).listen(),
         pytest.raises(LinkError, match=rf"cannot listen on UDP 127.0.0.1:{port}: Address already in use.*another grd"),
@@ -77,7 +77,7 @@ def test_a_port_in_use_is_an_error_that_says_so(port):
         pass
 
 
-def test_an_address_of_another_machine_is_an_error_that_says_so(port):
+def test_an_address_of_another_machine_is_an_error_that_names_it(port):
     lidar = Lidar(port=port, bind="203.0.113.7", sender="203.0.113.8")
     with pytest.raises(LinkError, match=r"Set `bind` to an address of this host"), lidar.listen():
         pass
@@ -106,7 +106,7 @@ def test_leaving_the_context_ends_a_waiting_listener_and_frees_the_port(port):
 
 
 def test_listening_beyond_loopback_needs_the_lidars_address():
-    with pytest.raises(ValidationError, match=r"sender: give the lidar's address .* when binding to 0.0.0.0"):
+    with pytest.raises(ValidationError, match=r"sender: set the LiDAR's address .* when binding to 0.0.0.0"):
         Lidar(bind="0.0.0.0")
     assert str(Lidar(bind="0.0.0.0", sender="192.168.1.201").settings.sender) == "192.168.1.201"
 

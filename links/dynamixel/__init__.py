@@ -1,6 +1,6 @@
-"""The turntable's servo, a DYNAMIXEL MX-28AR: states in, goals out; live through a process of its own.
+"""The turntable's servo, a DYNAMIXEL MX-28AR: states in, goals out; live in a separate process.
 
-Source: ours; recording format in recordings/README.md (/servo/state).
+Source: recording format in recordings/README.md (/servo/state).
 """
 
 from links.dynamixel.servo import Servo

@@ -1,4 +1,4 @@
-"""Is the turntable's servo as it must be: answers, place within its limits, error bits, supply.
+"""Preflight checks of the servo: replies, position within its limits, error bits, supply.
 
 Source: ROBOTIS e-manual, MX-28AR(2.0): 10.0 to 14.8 V, up to 80 deg C; the other limits are ours.
 """
@@ -17,12 +17,12 @@ from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource
 
-LEAST_HZ, FULL_RATE = 50.0, 0.8  # of the configured rate
-MOST_SILENCE_S = 0.1  # at 55 rpm the table turns 33 deg meanwhile
-SOME_BAD = 0.01  # share of the exchanges
-LEAST_V, MOST_V = 10.0, 14.8
-HOT_C, TOO_HOT_C = 60, 75
-SLACK_DEG = 1.0  # outside the limits: the servo's play and rounding
+MIN_HZ, MIN_RATE_SHARE = 50.0, 0.8  # the share is of the configured rate
+MAX_GAP_S = 0.1  # at 55 rpm the table turns 33 deg in this time
+MAX_BAD_SHARE = 0.01  # of the exchanges
+MIN_V, MAX_V = 10.0, 14.8
+WARM_C, MAX_C = 60, 75
+TOLERANCE_DEG = 1.0  # outside the limits: the servo's play, and rounding
 BAD = ("no_reply", "damaged", "wrong", "slow", "implausible")  # `links.dynamixel.wire.Health`
 
 
@@ -77,12 +77,14 @@ def servo_checks(source: ObservedSource) -> Iterator[CheckResult]:
     assert isinstance(link, Servo)
     assert isinstance(observation, ServoObservation)
     if not observation.errors:
-        refused = f"{observation.records.count} records came that hold no state; " if observation.records.count else ""
+        refused = (
+            f"{observation.records.count} records without a valid state arrived; " if observation.records.count else ""
+        )
         advice = "" if source.status else ": is it powered (12 V) and wired?"
-        yield fail(f"{source.name} answers", f"{refused}{source.no_data_reason}{advice}")
+        yield fail(f"{source.name} replies", f"{refused}{source.no_data_reason}{advice}")
         return
     yield _rate(source, link)
-    yield _place(source.name, link, observation)
+    yield _position(source.name, link, observation)
     yield _errors(source.name, observation)
     if "reads" in source.counters and source.live:
         yield _exchanges(source)
@@ -90,29 +92,33 @@ def servo_checks(source: ObservedSource) -> Iterator[CheckResult]:
 
 
 def _rate(source: ObservedSource, link: Servo) -> CheckResult:
-    name, arrivals = f"{source.name} answers", source.observation.records
-    silent_s = arrivals.longest_silence_s(source.end_ns)
-    text = f"{arrivals.rate_hz:.0f} a second, longest gap {1e-6 * arrivals.longest_gap_ns:.0f} ms"
+    name, records = f"{source.name} replies", source.observation.records
+    silent_s = records.longest_silence_s(source.end_ns)
+    text = f"{records.rate_hz:.0f} replies/s, longest gap {1e-6 * records.longest_gap_ns:.0f} ms"
     if source.live and silent_s > 1.0:
-        return fail(name, f"it fell silent for {silent_s:.1f} s: check its supply and plug")
-    if not arrivals.rate_hz >= LEAST_HZ:
-        return fail(name, f"{text}; {LEAST_HZ:.0f} are needed: is the baud rate low, or this host too busy?")
-    slow = source.live and arrivals.rate_hz < FULL_RATE * link.settings.rate_hz
-    if slow or arrivals.longest_gap_ns > 1e9 * MOST_SILENCE_S:
-        return warning(name, f"{text}; rate_hz is {link.settings.rate_hz:g}: is this host too busy, the adapter slow?")
+        return fail(name, f"no reply for {silent_s:.1f} s: check its supply and plug")
+    if not records.rate_hz >= MIN_HZ:
+        return fail(
+            name, f"{text}; at least {MIN_HZ:.0f}/s are needed: is the baud rate too low, or this host too busy?"
+        )
+    slow = source.live and records.rate_hz < MIN_RATE_SHARE * link.settings.rate_hz
+    if slow or records.longest_gap_ns > 1e9 * MAX_GAP_S:
+        return warning(
+            name, f"{text}; rate_hz is {link.settings.rate_hz:g}: is this host too busy, or the adapter slow?"
+        )
     return ok(name, text)
 
 
-def _place(name: str, link: Servo, observation: ServoObservation) -> CheckResult:
+def _position(name: str, link: Servo, observation: ServoObservation) -> CheckResult:
     name = f"{name} position"
     low, high = link.settings.limits_deg
     least, most = math.degrees(observation.min_rad), math.degrees(observation.max_rad)
     text = f"{least:.1f} deg" if most - least < 0.5 else f"{least:.1f} to {most:.1f} deg"
-    if least < low - SLACK_DEG or most > high + SLACK_DEG:
+    if least < low - TOLERANCE_DEG or most > high + TOLERANCE_DEG:
         return fail(
             name,
             f"{text} is outside limits_deg {low:g} to {high:g}: turn the table back by hand with the power off, and "
-            "look after its cable; or is the horn mounted turned, or limits_deg wrong?",
+            "check its cable; or is the horn mounted with an offset, or limits_deg wrong?",
         )
     return ok(name, f"{text}, within {low:g} to {high:g}")
 
@@ -124,29 +130,29 @@ def _errors(name: str, observation: ServoObservation) -> CheckResult:
     if not bits:
         return ok(f"{name} errors", "no error bits")
     times = sum(count for error, count in observation.errors.items() if error)
-    words = mx28.named_errors(bits)
+    names = mx28.named_errors(bits)
     return fail(
-        f"{name} errors", f"{words} in {times} of {observation.errors.total()} answers: check supply, load and cable"
+        f"{name} errors", f"{names} in {times} of {observation.errors.total()} replies: check supply, load and cable"
     )
 
 
 def _exchanges(source: ObservedSource) -> CheckResult:
     name, counters = f"{source.name} exchanges", source.counters
     bad = {kind: counters.get(kind, 0) for kind in BAD if counters.get(kind, 0)}
-    told = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in bad.items()) or "all good"
+    summary = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in bad.items()) or "all good"
     if not counters.get("connected", 0):
-        return fail(name, f"the servo is read but does not hold ({told}): has it shut down? Check supply and load")
-    if sum(bad.values()) > SOME_BAD * max(counters["reads"], 1):
-        return warning(name, f"{told} of {counters['reads']} reads: check the bus wiring and its ground")
-    return ok(name, told)
+        return fail(name, f"the servo replies but has no torque ({summary}): has it shut down? Check supply and load")
+    if sum(bad.values()) > MAX_BAD_SHARE * max(counters["reads"], 1):
+        return warning(name, f"{summary} of {counters['reads']} reads: check the bus wiring and its ground")
+    return ok(name, summary)
 
 
 def _supply(source: ObservedSource) -> CheckResult:
     name = f"{source.name} supply"
     volts, celsius = 1e-3 * source.counters.get("voltage_mv", 0), source.counters.get("temperature_c", 0)
     if not volts:
-        return warning(name, "voltage and temperature were not told yet: listen for longer (--for)")
+        return warning(name, "voltage and temperature are not known yet: listen for longer (--for)")
     text = f"{volts:.1f} V, {celsius} deg C"
-    if not LEAST_V <= volts <= MOST_V or celsius > TOO_HOT_C:
-        return fail(name, f"{text}; it wants {LEAST_V:g} to {MOST_V:g} V and less than {TOO_HOT_C} deg C")
-    return warning(name, f"{text}: let it cool") if celsius > HOT_C else ok(name, text)
+    if not MIN_V <= volts <= MAX_V or celsius > MAX_C:
+        return fail(name, f"{text}; allowed are {MIN_V:g} to {MAX_V:g} V and up to {MAX_C} deg C")
+    return warning(name, f"{text}: let it cool down") if celsius > WARM_C else ok(name, text)

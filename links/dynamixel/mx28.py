@@ -1,4 +1,4 @@
-"""The DYNAMIXEL MX-28AR as its maker describes it: control table, units, errors.
+"""Datasheet of the DYNAMIXEL MX-28AR: control table, units, errors.
 
 Source: ROBOTIS e-manual, MX-28AR/AT(2.0), https://emanual.robotis.com/docs/en/dxl/mx/mx-28-2/ (control table, limits,
 shutdown, bus watchdog); DYNAMIXEL Protocol 2.0, https://emanual.robotis.com/docs/en/dxl/protocol2/ (status packet).
@@ -20,16 +20,16 @@ class Register(NamedTuple):
     signed: bool = False
 
     def value(self, data: bytes, start: int = 0) -> int:
-        """Its value in a block that was read from address `start` on."""
+        """Its value in a block read from address `start` on."""
         at = self.address - start
         return int.from_bytes(data[at : at + self.size], "little", signed=self.signed)
 
     def bytes(self, value: int) -> bytes:
-        """A value as it is written."""
+        """A value as written to the servo."""
         return value.to_bytes(self.size, "little", signed=self.signed)
 
 
-# EEPROM: kept without power, written only while torque is off
+# EEPROM: non-volatile, writable only while torque is off
 MODEL_NUMBER = Register(0, 2, "Model Number", 30)
 FIRMWARE_VERSION = Register(6, 1, "Firmware Version")
 ID = Register(7, 1, "ID", 1)
@@ -44,7 +44,7 @@ MIN_POSITION_LIMIT = Register(52, 4, "Min Position Limit", 0)
 SHUTDOWN = Register(63, 1, "Shutdown", 52)
 EEPROM_END = 64
 
-# RAM: back to its initial value at power-on
+# RAM: reset to its initial value at power-on
 TORQUE_ENABLE = Register(64, 1, "Torque Enable", 0)
 STATUS_RETURN_LEVEL = Register(68, 1, "Status Return Level", 2)
 HARDWARE_ERROR_STATUS = Register(70, 1, "Hardware Error Status", 0)
@@ -63,16 +63,16 @@ TABLE_END = 662
 
 REGISTERS = tuple(r for r in globals().values() if isinstance(r, Register))
 
-# what the values mean
-MODEL = 30  # MX-28 with the 2.0 firmware; the 1.0 firmware says 29
-WATCHDOG_FIRMWARE = 38  # the bus watchdog exists from this version on
+# values and units
+MODEL = 30  # MX-28 with the 2.0 firmware; 29 with the 1.0 firmware
+WATCHDOG_FIRMWARE = 38  # first version with the bus watchdog
 BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
 POSITION_CONTROL = 3  # Operating Mode: one turn, 0..4095
 NORMAL_VELOCITY_PROFILE = 0  # Drive Mode: not reversed, profile by velocity (not by time)
-ALL_INSTRUCTIONS = 2  # Status Return Level: every instruction is answered
+ALL_INSTRUCTIONS = 2  # Status Return Level: a reply to every instruction
 WATCHDOG_UNIT_MS = 20
 WATCHDOG_MOST = 127
-WATCHDOG_TRIPPED = 255  # -1: it stopped the servo; the goal is read-only until 0 is written
+WATCHDOG_TRIPPED = 255  # -1: it has stopped the servo; the goal is read-only until 0 is written
 STEPS_PER_TURN = 4096
 TICK_RAD = math.tau / STEPS_PER_TURN
 VELOCITY_UNIT_RPM = 0.229
@@ -90,20 +90,20 @@ HARDWARE_ERRORS = {
 }
 OVERLOAD = 0x20
 
-# Protocol 2.0, error field of a status packet: bit 7 says that Hardware Error Status is not 0, the rest is a number
+# Protocol 2.0, error field of a status packet: bit 7: Hardware Error Status is not 0, the rest is a number
 ALERT = 0x80
 RESULT_FAIL, INSTRUCTION_ERROR, CRC_ERROR, DATA_RANGE, DATA_LENGTH, DATA_LIMIT, ACCESS_ERROR = range(1, 8)
-REFUSALS = {
-    RESULT_FAIL: "it failed to carry it out",
-    INSTRUCTION_ERROR: "it does not know the instruction",
-    CRC_ERROR: "the packet reached it damaged",
-    DATA_RANGE: "the value is out of range, or its bus watchdog has stopped it",
+ERRORS = {
+    RESULT_FAIL: "the instruction failed",
+    INSTRUCTION_ERROR: "unknown instruction",
+    CRC_ERROR: "the servo received a damaged packet",
+    DATA_RANGE: "the value is out of range, or the bus watchdog has stopped the servo",
     DATA_LENGTH: "too few bytes",
-    DATA_LIMIT: "the value is beyond its own limit",
-    ACCESS_ERROR: "the register cannot be written now (torque on?)",
+    DATA_LIMIT: "the value is beyond the servo's limit",
+    ACCESS_ERROR: "the register is not writable now (torque on?)",
 }
 
 
 def named_errors(bits: int) -> str:
-    """Hardware error bits in words."""
+    """Names of hardware error bits, or "none"."""
     return ", ".join(name for bit, name in HARDWARE_ERRORS.items() if bits & bit) or "none"

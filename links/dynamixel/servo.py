@@ -1,10 +1,10 @@
-"""The servo as a link: its states come in, one JSON object per exchange, and goals go out in its own units.
+"""The servo as a link: states in, one JSON object per exchange, and goals out in the servo's units.
 
-Live a process of its own talks to the servo (`links.dynamixel.worker`); a state's stamp is mid-exchange. A goal beyond
-the soft limits or faster than the servo goes at the limit, and is counted. In replay nothing goes out: the recorded
-states are used. In closed loop the simulated servo obeys `take_command`.
+Live, a separate process communicates with the servo (`links.dynamixel.worker`); a state's stamp is the middle of the
+exchange. A goal beyond the soft limits, or faster than the speed limit, is clamped and counted. In replay nothing is
+sent: the recorded states are used. In closed loop the simulated servo executes `take_command`.
 
-Source: ours; recording format in recordings/README.md (/servo/state). Units: ROBOTIS e-manual, MX-28AR(2.0), see
+Source: recording format in recordings/README.md (/servo/state). Units: ROBOTIS e-manual, MX-28AR(2.0), see
 links/dynamixel/mx28.py (goal position 4096 steps a turn, profile velocity in units of 0.229 rpm, 0 means no limit).
 """
 
@@ -38,27 +38,27 @@ from links.dynamixel.servo_process import ProcessEnded, ServoProcess
 from stages.messages import ServoGoal, ServoState
 
 MAX_STATE_BYTES = 1_000
-WAKE_S = 0.2  # how often a waiting listener looks whether it was closed
-RESTART_S, MOST_STARTS = 0.1, 4  # a process that died is started again, so often before it has to read the servo
+WAKE_S = 0.2  # how often a waiting listener checks whether it was closed
+RESTART_S, MAX_STARTS = 0.1, 4  # pause before a restart of the process, times its number; starts without a reading
 
 Baud = Literal[57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000]
 
 
 @dataclass(frozen=True, slots=True)
 class GoalCommand:
-    """What is written to the servo: its registers Goal Position and Profile Velocity."""
+    """Values of the registers Goal Position and Profile Velocity."""
 
     position_ticks: int  # 0..4095, position control mode
     velocity_units: int  # 1..1023
 
     @property
     def position_rad(self) -> float:
-        """The goal that the servo understands."""
+        """The goal after rounding to the servo's units."""
         return self.position_ticks * TICK_RAD
 
     @property
     def speed_radps(self) -> float:
-        """The speed that the servo understands."""
+        """The speed after rounding to the servo's units."""
         return self.velocity_units * VELOCITY_UNIT_RADPS
 
 
@@ -66,78 +66,82 @@ class ServoSettings(SourceSettings):
     """Settings of `Servo`."""
 
     topic: str = "/servo/state"
-    port: str = "/dev/ttyUSB0"  # better a name that stays: /dev/serial/by-id/...
+    port: str = "/dev/ttyUSB0"  # better a persistent name: /dev/serial/by-id/...
     baud: Baud = 1_000_000
     servo_id: int = Field(1, ge=0, le=252)
     rate_hz: float = Field(250.0, ge=10, le=500)  # block reads
-    limits_deg: tuple[float, float] = (0.0, 180.0)  # goals stay within, in the servo's own angle
-    speed_limit_rpm: float = Field(NO_LOAD_RPM, ge=1, le=200)  # an MX-28 does 55 rpm at 12 V
-    goal_slack_s: float = Field(0.5, gt=0, le=10)  # a goal not reached so long after it could be: stop
-    watchdog_s: float = Field(0.1, ge=0.02, le=2.5)  # the servo stops by itself when nobody talks to it for so long
+    limits_deg: tuple[float, float] = (0.0, 180.0)  # soft limits of goals, in the servo's own angle
+    speed_limit_rpm: float = Field(NO_LOAD_RPM, ge=1, le=200)  # an MX-28 reaches 55 rpm at 12 V
+    goal_slack_s: float = Field(0.5, gt=0, le=10)  # a goal not reached this long after its expected travel time: stop
+    watchdog_s: float = Field(0.1, ge=0.02, le=2.5)  # the servo stops by itself after this time without a request
     reply_timeout_s: float = Field(0.02, ge=0.002, le=0.1)
-    start_timeout_s: float = Field(3.0, gt=0, le=60)  # until the first answer; later ones are waited for without end
-    write_settings: bool = False  # correct the servo's EEPROM (return delay, modes) rather than refuse it
-    reboot: bool = True  # a servo that has shut down, as by overload
+    start_timeout_s: float = Field(3.0, gt=0, le=60)  # until the first reply; later interruptions may last for any time
+    write_settings: bool = False  # correct the servo's EEPROM (return delay, modes) instead of raising an error
+    reboot: bool = True  # a servo that has shut down, for example after overload
 
     @model_validator(mode="after")
     def _settings_agree(self) -> ServoSettings:
         low, high = self.limits_deg
         if self.watchdog_s * self.rate_hz < 4:
-            raise ValueError("watchdog_s: give it four periods of rate_hz, or it stops a servo that is read in time")
+            raise ValueError(
+                "watchdog_s: must be at least four periods of rate_hz, or it stops a servo that is read in time"
+            )
         if not 0.0 <= low < high <= 360.0:
-            raise ValueError("limits_deg: give two growing angles within 0..360, the servo's one turn")
+            raise ValueError("limits_deg: must be two increasing angles within 0..360, one turn of the servo")
         return self
 
 
 class Servo(Source[ServoSettings]):
-    """States of the turntable's servo, and goals to it. An unreadable state is counted in `refused` and left out."""
+    """The turntable's servo. A record without a valid state is counted in `refused` and skipped."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"goal"})
-    silent_after_s: ClassVar[float | None] = 2.0  # a link of its own mends what it can, and says nothing meanwhile
+    silent_after_s: ClassVar[float | None] = (
+        2.0  # the process recovers from faults by itself, without records meanwhile
+    )
 
     def __init__(self, settings: ServoSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._counts: Counter[str] = Counter()
-        self._waiting: GoalCommand | None = None
+        self._pending: GoalCommand | None = None
         self._process: ServoProcess | None = None
-        self._lock = threading.Lock()  # over who replaces the process
-        self._ended: Counter[str] = Counter()  # totals of processes that are no more
+        self._lock = threading.Lock()  # for replacing the process
+        self._ended: Counter[str] = Counter()  # totals of processes that have ended
         self._health: wire.Health | None = None
-        self._error: int = 0  # Hardware Error Status as read last
+        self._error: int = 0  # newest Hardware Error Status
 
     @property
     def refused(self) -> int:
-        """Records that held no servo state."""
+        """Number of records without a valid servo state."""
         return self._counts["refused: no servo state"]
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals since the start; `connected`, voltage and temperature are as told last."""
+        """Totals since the start, and the newest `connected`, voltage and temperature."""
         now = {} if self._health is None else self._health._asdict()
-        told = {name: now.get(name, 0) + self._ended[name] for name in TOTALS} | {
-            name: now.get(name, 0) for name in NOW
+        totals = {name: now.get(name, 0) + self._ended[name] for name in TOTALS} | {
+            name: now.get(name, 0) for name in STATES
         }
-        here = dict(self._counts)
-        return {**told, **here, "goals_lost": told["goals_lost"] + here.get("goals_lost", 0)}
+        own = dict(self._counts)
+        return {**totals, **own, "goals_lost": totals["goals_lost"] + own.get("goals_lost", 0)}
 
     @property
     def status(self) -> str | None:
-        """That it is not driven, though it was before: it has shut down, or does not answer."""
+        """See Link: that the servo has shut down or does not reply, after it had been set up."""
         health = self._health
         if self._process is None or health is None or health.connected:
             return None
-        if not self._ended["set_ups"] + health.set_ups:  # it begins
+        if not self._ended["set_ups"] + health.set_ups:  # not set up yet
             return None
-        why = f"has shut down ({named_errors(self._error)})" if self._error else "does not answer as one that is set up"
-        mends = (
-            "it is set up again by itself"
+        why = f"has shut down ({named_errors(self._error)})" if self._error else "does not reply, or lost its setup"
+        action = (
+            "it is set up again automatically"
             if self.settings.reboot or not self._error
-            else "it is to be rebooted (`reboot: false`)"
+            else "it needs a reboot (`reboot: false`)"
         )
-        return f"the servo {why} and stands still: {mends}; check its supply, its cable, and what its axis has to turn"
+        return f"the servo {why} and does not move: {action}; check its supply, its cable, and the load on its axis"
 
     def decode(self, record: Record) -> ServoState | None:
-        """A message of `{"position_rad": 1.2, "velocity_radps": 0.0, "goal_rad": 1.3, "error": 0}`, else None."""
+        """The state in `{"position_rad": 1.2, "velocity_radps": 0.0, "goal_rad": 1.3, "error": 0}`; None: invalid."""
         try:
             return parse_state(record.stamp_ns, record.data)
         except ValueError:
@@ -145,35 +149,35 @@ class Servo(Source[ServoSettings]):
             return None
 
     def on_goal(self, goal: ServoGoal) -> None:
-        """Live it goes out at once, within the limits. Else it waits to be taken; a newer one takes its place."""
+        """Live: send a goal at once, clamped to the limits. Otherwise keep the newest for `take_command`."""
         process = self._process
         if process is None:
-            self._waiting = goal_command(goal)
+            self._pending = goal_command(goal)
             self._counts[NOT_LIVE] += 1
         elif not (math.isfinite(goal.position_rad) and math.isfinite(goal.speed_radps)):
-            self._counts["goals refused: no number"] += 1
+            self._counts["goals refused: not finite"] += 1
         elif not process.send(self._within_limits(goal)):
             self._counts["goals_lost"] += 1
 
     def orphaned(self, port: str) -> str | None:
-        """Nobody aims any more: the servo stops where it is, rather than finish a sweep that nobody follows."""
+        """See Link: the aim stage has stopped; stop the servo instead of finishing its travel."""
         process = self._process
         if process is None:
             return None
-        self._counts["stopped: nobody aims"] += 1
-        return "the servo stays where it is" if process.send(wire.Stop()) else "the servo could not be told to stop"
+        self._counts["stops: no aim stage"] += 1
+        return "the servo is stopped" if process.send(wire.Stop()) else "the servo could not be stopped"
 
     def take_command(self) -> GoalCommand | None:
-        """The newest goal not yet sent, once."""
-        command, self._waiting = self._waiting, None
+        """The newest goal that was not taken yet; None: none."""
+        command, self._pending = self._pending, None
         return command
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
-        """Start the servo's process: `with servo.listen() as records`; the end of the context stops the servo.
+        """Start the servo process: `with servo.listen() as records`; the end of the context stops the servo.
 
-        LinkError when the servo does not answer, or is not one that may be driven. Later faults are mended there and
-        counted; no record comes meanwhile. While the records are not taken for half a second it goes to no goal.
+        Raises LinkError when the servo does not reply, or must not be driven. The process recovers from later faults
+        and counts them; no records come meanwhile. When the records are not consumed for 0.5 s the servo is stopped.
         """
         closed = threading.Event()
         try:
@@ -188,7 +192,7 @@ class Servo(Source[ServoSettings]):
 
     def _records(self, closed: threading.Event) -> Iterator[Record]:
         host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
-        starts, sequence = 1, 0  # starts: of a process, since the last reading
+        starts, sequence = 1, 0  # starts: of the process, since the newest reading
         while not closed.is_set():
             process = self._process
             if process is None:
@@ -198,16 +202,16 @@ class Servo(Source[ServoSettings]):
             except ProcessEnded as ended:
                 if closed.wait(RESTART_S * starts):
                     return
-                if starts == MOST_STARTS:
+                if starts == MAX_STARTS:
                     raise LinkError(
-                        f"the servo's process ended {starts} times before it read the servo ({ended}): see its own "
-                        "message above; is the memory full, or is something else wrong with this installation?"
+                        f"the servo process ended {starts} times before it read the servo ({ended}): see its own "
+                        "message above; is the memory full, or is this installation damaged?"
                     ) from None
                 self._restart(process, closed)
                 starts += 1
                 continue
             except (OSError, ValueError):
-                if closed.is_set():  # the socket went away under the wait
+                if closed.is_set():  # the socket was closed during the wait
                     return
                 raise
             if isinstance(packet, wire.Health):
@@ -218,7 +222,7 @@ class Servo(Source[ServoSettings]):
                 starts, sequence = 0, sequence + 1
 
     def _restart(self, ended: ServoProcess, closed: threading.Event) -> None:
-        """Another process in the place of one that died; the servo stopped by itself meanwhile."""
+        """Replace a process that has ended; the servo's watchdog has stopped it meanwhile."""
         ended.close()
         if self._health is not None:
             self._ended += Counter({name: getattr(self._health, name) for name in TOTALS})
@@ -229,21 +233,23 @@ class Servo(Source[ServoSettings]):
                 self._process = ServoProcess(self._drive_settings())
 
     def _within_limits(self, goal: ServoGoal) -> wire.Goal:
-        """What is sent for a goal: at the limit where it lies beyond, and then it is counted."""
+        """The packet of a goal, clamped to the limits; a clamped goal is counted."""
         low, high = (math.radians(angle) for angle in self.settings.limits_deg)
         if not low - 0.5 * TICK_RAD <= goal.position_rad <= high + 0.5 * TICK_RAD:
-            self._counts["goals kept within limits_deg"] += 1
+            self._counts["goals clamped to limits_deg"] += 1
         low_ticks, high_ticks = self._limit_ticks()
         command = goal_command(goal)
-        fastest = self._fastest_units()
-        self._counts["goals slowed to speed_limit_rpm"] += command.velocity_units > fastest
-        return wire.Goal(min(max(command.position_ticks, low_ticks), high_ticks), min(command.velocity_units, fastest))
+        max_units = self._max_velocity_units()
+        self._counts["goals clamped to speed_limit_rpm"] += command.velocity_units > max_units
+        return wire.Goal(
+            min(max(command.position_ticks, low_ticks), high_ticks), min(command.velocity_units, max_units)
+        )
 
     def _limit_ticks(self) -> tuple[int, int]:
         low, high = (math.radians(angle) / TICK_RAD for angle in self.settings.limits_deg)
         return math.ceil(low - 1e-6), min(math.floor(high + 1e-6), STEPS_PER_TURN - 1)
 
-    def _fastest_units(self) -> int:
+    def _max_velocity_units(self) -> int:
         return max(math.floor(self.settings.speed_limit_rpm / VELOCITY_UNIT_RPM), 1)
 
     def _drive_settings(self) -> DriveSettings:
@@ -253,7 +259,7 @@ class Servo(Source[ServoSettings]):
             servo_id=settings.servo_id,
             baud=settings.baud,
             limit_ticks=self._limit_ticks(),
-            fastest_units=self._fastest_units(),
+            max_velocity_units=self._max_velocity_units(),
             watchdog_ms=round(1e3 * settings.watchdog_s),
             reply_timeout_ms=1e3 * settings.reply_timeout_s,
             goal_slack_ms=1e3 * settings.goal_slack_s,
@@ -265,18 +271,23 @@ class Servo(Source[ServoSettings]):
 
 
 NOT_LIVE = "goals while not live"
-NOW = ("connected", "low_latency", "voltage_mv", "temperature_c")  # of wire.Health: not totals, but how it is
-TOTALS = tuple(name for name in wire.Health._fields if name not in NOW)
+STATES = (
+    "connected",
+    "low_latency",
+    "voltage_mv",
+    "temperature_c",
+)  # fields of wire.Health that are states, not totals
+TOTALS = tuple(name for name in wire.Health._fields if name not in STATES)
 
 
 def goal_command(goal: ServoGoal) -> GoalCommand:
-    """A goal in the servo's units: the nearest step of one turn, and the nearest speed but never 0, its 'no limit'."""
+    """A goal in the servo's units, within one turn; the speed is at least 1 unit, because 0 means no limit."""
     ticks = min(max(round(goal.position_rad / TICK_RAD), 0), 4095)
     return GoalCommand(ticks, min(max(round(goal.speed_radps / VELOCITY_UNIT_RADPS), 1), 1023))
 
 
 def reading_record(topic: str, reading: wire.Reading, host_ahead_ns: int, sequence: int) -> Record:
-    """A block read as it is recorded: stamped mid-exchange, arrived with the reply; host_ahead_ns: host - monotonic."""
+    """Record of a reading: stamp mid-exchange, arrival with the reply. host_ahead_ns: host time - monotonic time."""
     state = {
         "position_rad": round(reading.position_ticks * TICK_RAD, 9),
         "velocity_radps": round(reading.velocity_units * VELOCITY_UNIT_RADPS, 9),
@@ -288,7 +299,7 @@ def reading_record(topic: str, reading: wire.Reading, host_ahead_ns: int, sequen
 
 
 def parse_state(stamp_ns: int, data: bytes) -> ServoState:
-    """One recorded state. Raises ValueError when it is no JSON object, or a field is missing or no finite number."""
+    """Parse one recorded state. Raises ValueError for invalid JSON and for missing or non-finite fields."""
     if len(data) > MAX_STATE_BYTES:
         raise ValueError(f"a servo state of {len(data)} bytes")
     try:

@@ -1,7 +1,4 @@
-"""The parent's side of the servo's process: starts it, hands it goals, takes its readings, ends it.
-
-Source: ours.
-"""
+"""Parent side of the servo process: starts and ends it, sends goals, receives readings."""
 
 from __future__ import annotations
 
@@ -19,26 +16,26 @@ from flow.link import LinkError
 from links.dynamixel import wire
 from links.dynamixel.drive import DriveSettings
 
-ROOT = Path(__file__).resolve().parents[2]  # where `links` lies, also when it is not installed
-ALIVE_S = 0.05  # so often it is told that its readings are taken, at most
-END_S = 1.0  # the process needs some milliseconds to stop the servo
+ROOT = Path(__file__).resolve().parents[2]  # the folder of `links`, also when grd is not installed
+ALIVE_S = 0.05  # minimum interval of Alive packets to the process
+END_S = 1.0  # timeout of ending the process, which takes some milliseconds
 
 
 class ProcessEnded(Exception):
-    """The process is gone without last words: it was killed, or it crashed. The text says with what code."""
+    """The process ended without a Fatal packet: it was killed or it crashed. The text holds the exit code."""
 
 
 class ServoProcess:
-    """One running process, from construction to `close`; closing it stops the servo where it is."""
+    """One running process, from construction to `close`; closing it stops the servo."""
 
     def __init__(self, settings: DriveSettings) -> None:
-        self._alive_s = 0.0  # when it was told last
-        self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._alive_s = 0.0  # time of the newest Alive packet, monotonic
+        self._socket, process_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-        with theirs:
+        with process_end:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "links.dynamixel.worker", str(theirs.fileno()), settings.text()],
-                pass_fds=[theirs.fileno()],
+                [sys.executable, "-m", "links.dynamixel.worker", str(process_end.fileno()), settings.text()],
+                pass_fds=[process_end.fileno()],
                 stdin=subprocess.DEVNULL,
                 env={**os.environ, "PYTHONPATH": path},
             )
@@ -53,28 +50,28 @@ class ServoProcess:
 
     @property
     def pid(self) -> int:
-        """The process's id."""
+        """Process id."""
         return self._process.pid
 
     def send(self, packet: wire.Goal | wire.Stop | wire.Alive) -> bool:
-        """Hand a goal over, that it shall stop, or that all is well; False when that could not be."""
+        """Send a packet without waiting; False: it could not be sent."""
         try:
-            self._line.send(wire.pack(packet), socket.MSG_DONTWAIT)
+            self._socket.send(wire.pack(packet), socket.MSG_DONTWAIT)
         except OSError:
             return False
         return True
 
     def receive(self, timeout_s: float) -> wire.Packet | None:
-        """The next packet, None when none came in time. LinkError with its last words, or ProcessEnded.
+        """The next packet, None after timeout_s. Raises LinkError with the text of a Fatal packet, or ProcessEnded.
 
-        Call it again and again: the process stops the servo for a parent that takes nothing any more.
+        To be called continuously: the process stops the servo when its parent does not receive.
         """
         now_s = time.monotonic()
         if now_s >= self._alive_s + ALIVE_S:
             self._alive_s = now_s
             self.send(wire.Alive())
         try:
-            if not select.select([self._line], [], [], timeout_s)[0]:
+            if not select.select([self._socket], [], [], timeout_s)[0]:
                 return None
             data = self._received()
         except ConnectionError:
@@ -87,17 +84,17 @@ class ServoProcess:
         return packet
 
     def _received(self) -> bytes:
-        """The next bytes. One that ended without reading all is told first, and its last words wait behind that."""
+        """The next packet's bytes. The reset by a process that left packets unread precedes its Fatal packet."""
         try:
-            return self._line.recv(wire.MAX_BYTES)
+            return self._socket.recv(wire.MAX_BYTES)
         except ConnectionResetError:
-            return self._line.recv(wire.MAX_BYTES)
+            return self._socket.recv(wire.MAX_BYTES)
 
     def close(self) -> None:
-        """End of the line: the process stops the servo and ends; one that hangs is killed."""
+        """Close the socket: the process stops the servo and ends. A process that hangs is killed."""
         with contextlib.suppress(OSError):
-            self._line.shutdown(socket.SHUT_RDWR)
-        self._line.close()
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
         try:
             self._process.wait(END_S)
         except subprocess.TimeoutExpired:

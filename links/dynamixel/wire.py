@@ -1,9 +1,10 @@
-"""What the servo's process and its parent say to each other: small packets of fixed size on a local socket.
+"""Packets between the servo process and its parent: fixed size, on a local socket.
 
-Each packet is one datagram of a SOCK_SEQPACKET pair: whole or not at all, and the end of either process ends it.
+Each packet is one datagram of a SOCK_SEQPACKET pair: it arrives complete or not at all. The end of either process
+closes the socket.
 Times are CLOCK_MONOTONIC, which all processes of a host share.
 
-Source: ours; unix(7), SOCK_SEQPACKET.
+Source: unix(7), SOCK_SEQPACKET.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ MAX_BYTES = 1024
 
 
 class Goal(NamedTuple):
-    """To the process: go there."""
+    """To the process: a new goal."""
 
     position_ticks: int
     velocity_units: int  # profile velocity, never 0
@@ -24,7 +25,7 @@ class Goal(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """From the process: one block read."""
+    """From the process: one accepted reading of the servo."""
 
     request_ns: int
     reply_ns: int
@@ -37,28 +38,28 @@ class Reading(NamedTuple):
 
 
 class Health(NamedTuple):
-    """From the process, some times a second: totals since it started, and how it is now."""
+    """From the process, periodically: totals since it started, and the present state."""
 
-    connected: int  # 1: set up and answering
+    connected: int  # 1: set up and replying
     reads: int
     goals_sent: int
-    goals_expired: int  # not reached in time: the servo was told to stay where it was
-    goals_lost: int  # came while the servo could not be told
-    parent_hangs: int  # times the servo was told to stay where it was in mid-travel: the parent said nothing any more
+    goals_expired: int  # not reached in time: the servo was stopped
+    goals_lost: int  # arrived while no goal could be sent to the servo
+    parent_hangs: int  # stops in mid-travel because the parent sent no packet
     no_reply: int
     damaged: int
-    wrong: int  # late or foreign replies, thrown away
-    refused: int  # instructions that the servo refused
-    unplugged: int  # times the serial port went away
-    set_ups: int  # start, and after each power cycle, reboot, torque off, watchdog stop or return of the cable
+    wrong: int  # late or foreign replies, discarded
+    refused: int  # instructions that the servo rejected with an error
+    unplugged: int  # how often the serial port disappeared
+    set_ups: int  # at the start, and after each power cycle, reboot, torque loss, watchdog stop or replugged cable
     reboots: int
     torque_losses: int
     watchdog_stops: int
     late_cycles: int
-    unsent: int  # readings that the parent did not take in time
-    slow: int  # readings left out: the exchange took too long to tell when the servo measured
-    implausible: int  # readings left out: the servo cannot have come there
-    low_latency: int  # 1: the serial driver sends bytes on at once
+    unsent: int  # readings that the parent did not receive in time
+    slow: int  # readings rejected: the exchange took so long that the time of measurement is uncertain
+    implausible: int  # readings rejected: the servo cannot have reached the position
+    low_latency: int  # 1: the serial driver is in low latency mode
     voltage_mv: int
     temperature_c: int
 
@@ -66,7 +67,7 @@ class Health(NamedTuple):
 
 
 class Fatal(NamedTuple):
-    """From the process, its last words: what a person has to mend."""
+    """From the process, its last packet: an error that an operator has to correct."""
 
     text: bytes
 
@@ -74,13 +75,13 @@ class Fatal(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """To the process: stay where you are."""
+    """To the process: stop the servo."""
 
     layout = struct.Struct("<B")
 
 
 class Alive(NamedTuple):
-    """To the process: who takes the readings is at work."""
+    """To the process: the parent is receiving readings."""
 
     layout = struct.Struct("<B")
 
@@ -95,18 +96,18 @@ def pack(packet: Packet) -> bytes:
 
 
 def unpack(data: bytes) -> Packet:
-    """A packet from its bytes. ValueError when they are none."""
+    """A packet from its bytes. Raises ValueError for other bytes."""
     kind = _KINDS[data[0]] if data and data[0] < len(_KINDS) else None
     if kind is None or len(data) != kind.layout.size:
-        raise ValueError(f"no packet of the servo's process: {len(data)} bytes")
+        raise ValueError(f"not a packet of the servo process: {len(data)} bytes")
     return kind(*kind.layout.unpack(data)[1:])
 
 
 def fatal(text: str) -> Fatal:
-    """Last words, cut to what fits."""
+    """A Fatal packet with a text, truncated to its size."""
     return Fatal(text.encode()[:800])
 
 
 def text_of(packet: Fatal) -> str:
-    """The words."""
+    """The text of a Fatal packet."""
     return packet.text.rstrip(b"\0").decode(errors="replace")

@@ -218,7 +218,7 @@ class PacketStream:
         if stuck:
             reasons = ", ".join(f"{count} {reason.value}" for reason, count in self.refused.most_common())
             raise LinkError(
-                f"{self._topic}: {MAX_CONSECUTIVE_REFUSED} consecutive packets are invalid (refused so far: {reasons}). "
-                f"Is this VLP-16 data (UDP {vlp16.DATA_PORT}, {vlp16.PACKET_BYTES} bytes)? Check `sender`, `port` and the "
-                "sensor's settings."
+                f"{self._topic}: {MAX_CONSECUTIVE_REFUSED} consecutive packets are invalid (refused so far: "
+                f"{reasons}). Is this VLP-16 data (UDP {vlp16.DATA_PORT}, {vlp16.PACKET_BYTES} bytes)? Check "
+                "`sender`, `port` and the sensor's settings."
             )

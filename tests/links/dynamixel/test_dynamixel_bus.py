@@ -1,4 +1,4 @@
-"""The real SDK against the emulated servo: good exchanges, and every way in which one can go wrong."""
+"""The real SDK against the emulated servo: good exchanges and every failure."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def position(reply):
     return mx28.PRESENT_POSITION.value(reply.data, POSITION_BLOCK)
 
 
-def test_a_block_read_brings_position_velocity_and_load_at_once(emulator, bus):
+def test_a_block_read_returns_position_velocity_and_load_together(emulator, bus):
     before_ns = time.monotonic_ns()
     reply = bus.read(126, 10)
     assert len(reply.data) == 10
@@ -52,22 +52,22 @@ def test_a_block_read_brings_position_velocity_and_load_at_once(emulator, bus):
     assert not reply.alert
 
 
-def test_ping_tells_the_model_and_a_write_is_read_back(emulator, bus):
+def test_ping_returns_the_model_and_a_write_is_read_back(emulator, bus):
     assert bus.ping() == 30
     bus.write(mx28.PROFILE_VELOCITY, 50, 2000)
     assert bus.read(112, 8).data == (50).to_bytes(4, "little") + (2000).to_bytes(4, "little")
 
 
-def test_a_write_that_the_servo_refuses_says_why(emulator, bus):
-    with pytest.raises(Refused, match=r"write 4096 to Goal Position \(116\): the value is beyond its own limit"):
+def test_a_write_that_the_servo_rejects_raises_with_the_reason(emulator, bus):
+    with pytest.raises(Refused, match=r"write 4096 to Goal Position \(116\): the value is beyond the servo's limit"):
         bus.write(mx28.GOAL_POSITION, 4096)
     bus.write(mx28.TORQUE_ENABLE, 1)
     with pytest.raises(Refused, match=r"Return Delay Time \(9\).*torque on"):
         bus.write(mx28.RETURN_DELAY_TIME, 3)
 
 
-def test_the_sdk_alone_takes_a_late_reply_for_the_next_answer(emulator):
-    """What the wrapping is for: the SDK reads a position as the profile velocity, and 0 where there was no answer."""
+def test_the_sdk_alone_mistakes_a_late_reply_for_the_next_one(emulator):
+    """Why Bus wraps it: the SDK returns a position as the profile velocity, and 0 where there was no reply."""
     port, handler = PortHandler(str(emulator.path)), Protocol2PacketHandler()
     port.openPort()
     emulator.hold_back()
@@ -77,16 +77,16 @@ def test_the_sdk_alone_takes_a_late_reply_for_the_next_answer(emulator):
     port.closePort()
 
 
-def test_a_late_reply_is_not_taken_for_the_next_answer(emulator, bus):
+def test_a_late_reply_is_not_mistaken_for_the_next_one(emulator, bus):
     emulator.hold_back()
     with pytest.raises(NoReply):
         bus.read(126, 10)
-    with pytest.raises(WrongReply, match="an answer of 10 bytes, not 11"):
+    with pytest.raises(WrongReply, match="a reply of 10 bytes, not 11"):
         bus.read(126, 11)
     assert position(bus.read(126, 12)) == 1024
 
 
-def test_a_late_reply_is_not_taken_for_a_ping_of_another_model(emulator, bus):
+def test_a_late_reply_is_not_mistaken_for_a_ping_of_another_model(emulator, bus):
     emulator.hold_back()
     with pytest.raises(NoReply):
         bus.write(mx28.PROFILE_VELOCITY, 50)
@@ -95,7 +95,7 @@ def test_a_late_reply_is_not_taken_for_a_ping_of_another_model(emulator, bus):
     assert bus.ping() == 30
 
 
-def test_bytes_before_an_answer_are_skipped(emulator, bus):
+def test_bytes_before_a_reply_are_skipped(emulator, bus):
     emulator.garbage(b"\x00\xff\xff\xfd\xff\xff" * 5)
     assert position(bus.read(126, 10)) == 1024
 
@@ -125,7 +125,7 @@ def test_bytes_before_an_answer_are_skipped(emulator, bus):
         "babble",
     ],
 )
-def test_a_spoilt_answer_is_an_error_and_the_next_one_is_right(emulator, bus, fault, error):
+def test_a_corrupted_reply_is_an_error_and_the_next_one_is_correct(emulator, bus, fault, error):
     fault(emulator)
     with pytest.raises(error):
         bus.read(126, 10)
@@ -134,7 +134,7 @@ def test_a_spoilt_answer_is_an_error_and_the_next_one_is_right(emulator, bus, fa
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_no_answer_whatsoever_hangs_crashes_or_is_believed(data):
+def test_no_random_reply_hangs_crashes_or_is_accepted(data):
     with DynamixelEmulator() as emulator:
         bus = Bus.open(str(emulator.path), BAUD, 1, 0.005)
         pieces = st.sampled_from([b"\xff\xff\xfd\x00", b"\xff\xff\xfd\x00\x01", b"\x55", b"\x0e\x00", b"\xff"])
@@ -144,48 +144,48 @@ def test_no_answer_whatsoever_hangs_crashes_or_is_believed(data):
         bus.close()
 
 
-def test_a_line_that_never_stops_talking_does_not_hold_it_up():
+def test_a_line_that_never_stops_sending_does_not_block_the_bus():
     host, servo = os.openpty()
     tty.setraw(servo)
-    enough, talked = threading.Event(), threading.Event()
+    stop, started = threading.Event(), threading.Event()
 
     os.set_blocking(host, False)
 
     def babble():
         end_s = time.monotonic() + 10
-        while not enough.is_set() and time.monotonic() < end_s:
+        while not stop.is_set() and time.monotonic() < end_s:
             with contextlib.suppress(BlockingIOError):  # the line is full
                 os.write(host, b"\xff\xff\xfd\x00\x01\x55" * 20)
-            talked.set()
+            started.set()
 
     thread = threading.Thread(target=babble)
     thread.start()
     bus = Bus.open(os.ttyname(servo), BAUD, 1, 0.03)
-    talked.wait(5)
+    started.wait(5)
     with pytest.raises(BusError):
         bus.read(126, 10)
-    still_talking = thread.is_alive()
-    enough.set()
+    still_sending = thread.is_alive()
+    stop.set()
     thread.join()
     bus.close()
     os.close(host)
     os.close(servo)
-    assert still_talking
+    assert still_sending
 
 
 class Scripted(BlockingPort):
-    """A port on which the answers are given."""
+    """A port with scripted replies."""
 
     def __init__(self):
         super().__init__("", BAUD, 0.02)
-        self.answer = bytearray()
+        self.reply = bytearray()
 
     def readPort(self, length):
-        said = bytes(self.answer[: max(length, 0)])
-        del self.answer[: len(said)]
-        if not said:
+        data = bytes(self.reply[: max(length, 0)])
+        del self.reply[: len(data)]
+        if not data:
             self.packet_timeout = -1.0  # the deadline passes
-        return said
+        return data
 
     def writePort(self, packet):
         return len(packet)
@@ -194,13 +194,13 @@ class Scripted(BlockingPort):
         pass
 
     def drain(self, quiet_s, limit_s):
-        dropped = len(self.answer)
-        self.answer.clear()
+        dropped = len(self.reply)
+        self.reply.clear()
         return dropped
 
 
-def made_answer(random, whole):
-    """Answers that are nearly right: a good one with bytes changed, cut, repeated, or mixed with others."""
+def corrupted(random, whole):
+    """An almost valid reply: a good one with bytes changed, cut, repeated or inserted."""
     data = bytearray(whole)
     for _ in range(int(random.integers(0, 4))):
         at = int(random.integers(0, len(data) + 1))
@@ -217,36 +217,36 @@ def made_answer(random, whole):
 
 
 def fuzz(count):
-    """Of so many spoilt answers: how many were believed, and how many of those had false bytes in them."""
-    random, port, believed, false = np.random.default_rng(7), Scripted(), 0, 0
+    """(accepted, accepted with wrong data) of `count` corrupted replies."""
+    random, port, accepted, wrong = np.random.default_rng(7), Scripted(), 0, 0
     bus, data = Bus(port, 1), bytes(range(10))
     whole = status(1, 0, data)
     for _ in range(count):
-        port.answer += made_answer(random, whole)
+        port.reply += corrupted(random, whole)
         try:
             reply = bus.read(126, 10)
         except BusError:
-            port.answer.clear()
+            port.reply.clear()
             continue
-        believed += 1
-        false += reply.data != data
+        accepted += 1
+        wrong += reply.data != data
         assert len(reply.data) == 10
-    return believed, false
+    return accepted, wrong
 
 
-def test_spoilt_answers_are_refused_or_right():
-    believed, false = fuzz(3_000)
-    assert 200 < believed < 2_500
-    assert false == 0
+def test_corrupted_replies_are_rejected_or_correct():
+    accepted, wrong = fuzz(3_000)
+    assert 200 < accepted < 2_500
+    assert wrong == 0
 
 
 @pytest.mark.slow
-def test_of_a_million_spoilt_answers_a_few_pass_a_checksum_of_16_bits():
-    _, false = fuzz(1_000_000)
-    assert false < 20  # some 500 000 are damaged within an answer of the right length; the worker doubts jumps
+def test_of_a_million_corrupted_replies_a_few_pass_the_16_bit_checksum():
+    _, wrong = fuzz(1_000_000)
+    assert wrong < 20  # about 500 000 are damaged within a reply of the right length; the worker's filter rejects jumps
 
 
-def test_a_servo_that_says_nothing_costs_its_timeout_and_no_more(emulator, bus):
+def test_a_silent_servo_costs_one_timeout(emulator, bus):
     emulator.silence()
     with pytest.raises(NoReply, match=r"read 126..135: no reply"):
         bus.read(126, 10)
@@ -254,19 +254,19 @@ def test_a_servo_that_says_nothing_costs_its_timeout_and_no_more(emulator, bus):
     assert position(bus.read(126, 10)) == 1024
 
 
-def test_an_unplugged_adapter_is_gone_and_a_new_line_finds_it_again(emulator, bus):
+def test_an_unplugged_adapter_is_gone_and_a_new_bus_finds_it_again(emulator, bus):
     emulator.unplug()
     with pytest.raises(Gone):
         bus.read(126, 10)
     with pytest.raises(Gone, match="cannot open"):
         Bus.open(str(emulator.path), BAUD, 1, 0.03)
     emulator.plug_in()
-    again = Bus.open(str(emulator.path), BAUD, 1, 0.03)
-    assert position(again.read(126, 10)) == 1024
-    again.close()
+    reopened = Bus.open(str(emulator.path), BAUD, 1, 0.03)
+    assert position(reopened.read(126, 10)) == 1024
+    reopened.close()
 
 
-def test_at_another_rate_the_servo_hears_nothing(emulator):
+def test_at_another_baud_rate_the_servo_does_not_reply(emulator):
     line = Bus.open(str(emulator.path), 57_600, 1, 0.03)
     with pytest.raises(NoReply):
         line.ping()
@@ -280,7 +280,7 @@ def settings_of(emulator, **changed):
             "servo_id": 1,
             "baud": BAUD,
             "limit_ticks": (0, 2048),
-            "fastest_units": 240,
+            "max_velocity_units": 240,
             "watchdog_ms": 100,
             "reply_timeout_ms": 30,
             "goal_slack_ms": 500,
@@ -293,7 +293,7 @@ def settings_of(emulator, **changed):
     )
 
 
-def test_setting_up_holds_the_servo_where_it_is_whatever_its_goal_was(emulator, bus):
+def test_set_up_holds_the_servo_at_its_position_whatever_its_goal_was(emulator, bus):
     emulator.set(mx28.GOAL_POSITION, 3000)
     Drive(bus, settings_of(emulator)).set_up()
     assert emulator.get(mx28.TORQUE_ENABLE) == 1
@@ -303,7 +303,7 @@ def test_setting_up_holds_the_servo_where_it_is_whatever_its_goal_was(emulator, 
     assert emulator.position_rad(np.array([time.monotonic_ns()]))[0] == pytest.approx(math.pi / 2, abs=mx28.TICK_RAD)
 
 
-def test_a_servo_that_answers_pings_alone_is_made_to_answer_everything(emulator, bus):
+def test_a_servo_that_replies_to_pings_only_is_set_to_reply_to_everything(emulator, bus):
     emulator.set(mx28.STATUS_RETURN_LEVEL, 0)
     Drive(bus, settings_of(emulator)).set_up()
     assert emulator.get(mx28.STATUS_RETURN_LEVEL) == 2

@@ -23,39 +23,39 @@ def states(count=500, *, position_deg=90.0, error=0, step_ns=4_000_000):
 HEALTH = {"reads": 500, "connected": 1, "voltage_mv": 12_000, "temperature_c": 35}
 
 
-def test_a_healthy_servo_is_good():
+def test_a_healthy_servo_passes():
     found = levels(servo_checks(observe(Servo(), states(), counters=HEALTH)))
-    assert found == {"answers": "ok", "position": "ok", "errors": "ok", "exchanges": "ok", "supply": "ok"}
+    assert found == {"replies": "ok", "position": "ok", "errors": "ok", "exchanges": "ok", "supply": "ok"}
 
 
 @pytest.mark.parametrize(
     ("records", "counters", "check", "words"),
     [
-        (states(step_ns=50_000_000), {}, "answers", "20 a second"),
+        (states(step_ns=50_000_000), {}, "replies", "20 replies/s"),
         (states(position_deg=200.0), {}, "position", "outside limits_deg 0 to 180"),
         (states(error=0x20), {}, "errors", "overload in 500 of 500"),
-        (states(), {"connected": 0}, "exchanges", "does not hold"),
+        (states(), {"connected": 0}, "exchanges", "has no torque"),
         (states(), {"voltage_mv": 9_000}, "supply", "9.0 V"),
         (states(), {"temperature_c": 79}, "supply", "79 deg C"),
     ],
 )
-def test_a_servo_that_is_not_fit_to_fly_is_no_go(records, counters, check, words):
+def test_a_servo_that_is_not_ready_fails(records, counters, check, words):
     found = by_name(servo_checks(observe(Servo(), records, counters=HEALTH | counters)))[check]
     assert found.level is Level.FAIL
     assert words in found.sentence
 
 
-def test_a_servo_that_fell_silent_is_no_go_and_damaged_answers_are_to_look_at():
+def test_a_silent_servo_fails_and_damaged_replies_are_a_warning():
     source = observe(Servo(), states(), counters=HEALTH, end_ns=BEGIN_NS + 5_000_000_000)
-    assert "fell silent for 3.0 s" in by_name(servo_checks(source))["answers"].sentence
+    assert "no reply for 3.0 s" in by_name(servo_checks(source))["replies"].sentence
     damaged = observe(Servo(), states(), counters=HEALTH | {"damaged": 20})
     assert by_name(servo_checks(damaged))["exchanges"].level is Level.WARNING
     slow = observe(Servo(), states(step_ns=8_000_000), counters=HEALTH)
-    assert by_name(servo_checks(slow))["answers"].level is Level.WARNING
+    assert by_name(servo_checks(slow))["replies"].level is Level.WARNING
 
 
-def test_an_absent_servo_says_what_its_link_says():
-    (result,) = servo_checks(observe(Servo(), [], status="/dev/ttyUSB0: the servo does not answer"))
-    assert (result.level, result.sentence) == (Level.FAIL, "/dev/ttyUSB0: the servo does not answer")
+def test_an_absent_servo_reports_the_status_of_its_link():
+    (result,) = servo_checks(observe(Servo(), [], status="/dev/ttyUSB0: the servo does not reply"))
+    assert (result.level, result.sentence) == (Level.FAIL, "/dev/ttyUSB0: the servo does not reply")
     (result,) = servo_checks(observe(Servo(), [Record("/servo/state", 1, 1, b"{}")]))
-    assert "1 records came that hold no state" in result.sentence
+    assert "1 records without a valid state arrived" in result.sentence

@@ -1,4 +1,4 @@
-"""The servo live: a process of its own, the real SDK, and the emulated servo on a pty, healthy and with every fault."""
+"""The servo live: the servo process, the real SDK, and the emulated servo on a pty, healthy and with every fault."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def goal(position_deg, speed_rpm=20.0):
 
 
 def until(records, wanted):
-    """The states up to the first one that is wanted, which is the last."""
-    seen, deadline_s = [], time.monotonic() + PATIENCE_S
+    """The states up to and including the first one for which `wanted` is true."""
+    states, deadline_s = [], time.monotonic() + PATIENCE_S
     for record in records:
-        seen.append(json.loads(record.data))
-        if wanted(seen[-1]):
-            return seen
-        assert time.monotonic() < deadline_s, f"not within {PATIENCE_S} s; last: {seen[-1]}"
+        states.append(json.loads(record.data))
+        if wanted(states[-1]):
+            return states
+        assert time.monotonic() < deadline_s, f"not within {PATIENCE_S} s; last: {states[-1]}"
     raise AssertionError("the records ended")
 
 
@@ -63,7 +63,7 @@ def at(position_deg):
 
 
 def travel(servo, records, position_deg, speed_rpm):
-    """(record, state) until the servo is there; a goal that a busy machine made it forget is sent again."""
+    """(record, state) until the servo is there; a goal that was dropped on a busy machine is sent again."""
     deadline_s = time.monotonic() + PATIENCE_S
     for number, record in enumerate(records):
         state = servo.decode(record)
@@ -75,7 +75,7 @@ def travel(servo, records, position_deg, speed_rpm):
         assert time.monotonic() < deadline_s, f"not within {PATIENCE_S} s; last: {state}; {servo.counters}"
 
 
-def test_states_are_stamped_when_the_servo_stood_there(emulator):
+def test_states_are_stamped_when_the_servo_was_at_that_position(emulator):
     servo = live(emulator)
     host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
     with servo.listen() as records:
@@ -91,25 +91,25 @@ def test_states_are_stamped_when_the_servo_stood_there(emulator):
     assert state.goal_rad == pytest.approx(math.radians(150), abs=mx28.TICK_RAD)
 
 
-def test_with_answers_that_come_late_a_stamp_is_still_in_the_middle_of_the_exchange(emulator):
-    """The emulated servo measures when it is asked and says so 8 ms later: 2 stamp - arrival is when it was asked."""
+def test_with_late_replies_a_stamp_is_still_in_the_middle_of_the_exchange(emulator):
+    """The emulated servo measures at the request and replies 8 ms later: 2 stamp - arrival is the request time."""
     emulator.late(0.008, 100_000)
     servo = live(emulator, rate_hz=80.0)
     host_ahead_ns = host_time.now_ns() - time.monotonic_ns()
-    off_ticks, half_ms = [], []
+    errors_ticks, half_ms = [], []
     with servo.listen() as records:
         for record, state in travel(servo, records, 175, 20):
-            asked_ns = 2 * record.stamp_ns - record.arrival_ns - host_ahead_ns
-            truth = emulator.position_rad(np.array([asked_ns]))[0]
+            request_ns = 2 * record.stamp_ns - record.arrival_ns - host_ahead_ns
+            truth = emulator.position_rad(np.array([request_ns]))[0]
             if abs(state.velocity_radps) > 1.5:
-                off_ticks.append((state.position_rad - truth) / mx28.TICK_RAD)
+                errors_ticks.append((state.position_rad - truth) / mx28.TICK_RAD)
                 half_ms.append(1e-6 * (record.arrival_ns - record.stamp_ns))
-    assert len(off_ticks) > 10
+    assert len(errors_ticks) > 10
     assert np.median(half_ms) > 4
-    assert abs(np.median(off_ticks)) < 3  # a stamp at the request would be off by 11 ticks, 1.4 in each millisecond
+    assert abs(np.median(errors_ticks)) < 3  # a stamp at the request would be off by 11 ticks, 1.4 in each millisecond
 
 
-def test_it_is_read_at_least_200_times_a_second(emulator):
+def test_the_servo_is_read_at_least_200_times_per_second(emulator):
     """By default, with goals in between. On a busy machine not always: the best of three windows counts."""
     servo, rates_hz = live(emulator), []
     with servo.listen() as records:
@@ -124,19 +124,19 @@ def test_it_is_read_at_least_200_times_a_second(emulator):
     assert max(rates_hz) >= 200.0, rates_hz
 
 
-def test_a_healthy_servo_is_never_in_trouble_from_its_start_to_its_end(emulator):
+def test_a_healthy_servo_has_no_status_from_start_to_end(emulator):
     servo = live(emulator, watchdog_s=2.5)  # a busy machine may be late
-    told = [servo.status]
+    statuses = [servo.status]
     with servo.listen() as records:
-        told.append(servo.status)
+        statuses.append(servo.status)
         next(records)
         servo.on_goal(goal(120, 40))
-        until(records, lambda state: told.append(servo.status) or at(120)(state))
-        until(records, lambda _: told.append(servo.status) or servo.counters["reads"] > 200)
-    assert {*told, servo.status} == {None}
+        until(records, lambda state: statuses.append(servo.status) or at(120)(state))
+        until(records, lambda _: statuses.append(servo.status) or servo.counters["reads"] > 200)
+    assert {*statuses, servo.status} == {None}
 
 
-def test_the_newest_goal_is_obeyed_at_its_speed(emulator):
+def test_the_newest_goal_is_reached_at_its_speed(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
@@ -147,24 +147,24 @@ def test_the_newest_goal_is_obeyed_at_its_speed(emulator):
     assert servo.counters["goals_sent"] + servo.counters["goals_lost"] <= 2
 
 
-def test_a_servo_that_nobody_aims_any_more_stops_in_mid_sweep_and_obeys_the_next_goal(emulator):
+def test_without_the_aim_stage_the_servo_stops_in_mid_sweep_and_follows_the_next_goal(emulator):
     servo = live(emulator)
     assert servo.orphaned("goal") is None, "it is not live yet"
     with servo.listen() as records:
         next(records)
         servo.on_goal(goal(170, 10))
         until(records, lambda state: math.degrees(state["position_rad"]) > 100)
-        assert servo.orphaned("goal") == "the servo stays where it is"
+        assert servo.orphaned("goal") == "the servo is stopped"
         stopped = until(records, lambda state: math.degrees(state["goal_rad"]) < 165)[-1]
         until(records, lambda state: abs(state["velocity_radps"]) < 0.01)
         assert math.degrees(emulator.position_rad(np.array([time.monotonic_ns()]))[0]) < 160
         assert math.degrees(stopped["goal_rad"]) < 160
-        assert servo.counters["stopped: nobody aims"] == 1
+        assert servo.counters["stops: no aim stage"] == 1
         servo.on_goal(goal(60, 40))
         until(records, at(60))
 
 
-def test_a_goal_beyond_the_soft_limits_goes_to_the_limit_and_is_counted(emulator):
+def test_a_goal_beyond_the_soft_limits_is_clamped_and_counted(emulator):
     servo = live(emulator, limits_deg=(60.0, 110.0))
     with servo.listen() as records:
         next(records)
@@ -172,31 +172,31 @@ def test_a_goal_beyond_the_soft_limits_goes_to_the_limit_and_is_counted(emulator
         states = until(records, at(110))
         servo.on_goal(goal(-20, 40))
         states += until(records, at(60))
-    assert servo.counters["goals kept within limits_deg"] == 2
+    assert servo.counters["goals clamped to limits_deg"] == 2
     assert all(math.radians(59.8) < s["goal_rad"] < math.radians(110.1) for s in states)
 
 
-def test_a_goal_faster_than_the_servo_is_slowed_and_counted(emulator):
+def test_a_goal_faster_than_the_servo_is_clamped_and_counted(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
         servo.on_goal(goal(120, 57.2))
         until(records, at(120))
     assert emulator.get(mx28.PROFILE_VELOCITY) == 240  # 54.96 rpm
-    assert servo.counters["goals slowed to speed_limit_rpm"] == 1
+    assert servo.counters["goals clamped to speed_limit_rpm"] == 1
 
 
-def test_a_goal_that_is_no_number_moves_nothing(emulator):
+def test_a_goal_that_is_not_finite_moves_nothing(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
         servo.on_goal(ServoGoal(stamp_ns=0, position_rad=math.nan, speed_radps=1.0))
         servo.on_goal(ServoGoal(stamp_ns=0, position_rad=1.0, speed_radps=math.inf))
         assert {next(records).data for _ in range(20)} == {next(records).data}
-    assert servo.counters["goals refused: no number"] == 2
+    assert servo.counters["goals refused: not finite"] == 2
 
 
-def test_leaving_the_context_stops_a_moving_servo_where_it_is(emulator):
+def test_leaving_the_context_stops_a_moving_servo(emulator):
     servo = live(emulator, watchdog_s=2.5)  # which is too slow to have done it
     with servo.listen() as records:
         next(records)
@@ -211,7 +211,7 @@ def test_leaving_the_context_stops_a_moving_servo_where_it_is(emulator):
     assert servo.counters["goals while not live"] == before.get("goals while not live", 0) + 1
 
 
-def test_a_goal_that_is_not_reached_in_time_is_given_up(emulator):
+def test_a_goal_that_is_not_reached_in_time_is_abandoned(emulator):
     servo = live(emulator, goal_slack_s=0.1)
     with servo.listen() as records:
         next(records)
@@ -226,13 +226,13 @@ def test_a_goal_that_is_not_reached_in_time_is_given_up(emulator):
     assert all(at(90)(s) for s in states)  # it does not go on when it could
 
 
-def test_a_goal_that_is_reached_in_time_is_kept_when_its_time_is_over(emulator):
+def test_a_goal_that_was_reached_in_time_is_kept_after_its_time(emulator):
     servo = live(emulator, goal_slack_s=0.1)
     with servo.listen() as records:
         next(records)
         servo.on_goal(goal(100, 55))
         until(records, at(100))
-        states = [json.loads(next(records).data) for _ in range(100)]  # .4 s
+        states = [json.loads(next(records).data) for _ in range(100)]  # 0.4 s
         until(records, lambda _: servo.counters["reads"] > 100)
     assert all(at(100)(s) for s in states)
     assert {round(s["goal_rad"] / mx28.TICK_RAD) for s in states} == {round(math.radians(100) / mx28.TICK_RAD)}
@@ -244,15 +244,15 @@ def test_a_newer_goal_has_its_own_time(emulator):
     with servo.listen() as records:
         next(records)
         emulator.stall()
-        for position_deg in (100, 101, 100, 101):  # each a moment before the one before it would be given up
+        for position_deg in (100, 101, 100, 101):  # each shortly before the previous one would be abandoned
             servo.on_goal(goal(position_deg, 55))
-            states = [json.loads(next(records).data) for _ in range(150)]  # .6 s
+            states = [json.loads(next(records).data) for _ in range(150)]  # 0.6 s
             assert math.degrees(states[-1]["goal_rad"]) == pytest.approx(position_deg, abs=0.1)
         assert servo.counters["goals_expired"] == 0
         until(records, lambda s: s["goal_rad"] < math.radians(91))
 
 
-def test_after_an_overload_it_is_rebooted_and_set_up_and_its_angle_is_told_meanwhile(emulator):
+def test_after_an_overload_the_servo_is_rebooted_and_set_up_and_its_angle_is_read_meanwhile(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
@@ -261,27 +261,27 @@ def test_after_an_overload_it_is_rebooted_and_set_up_and_its_angle_is_told_meanw
         assert servo.status is None
         until(records, lambda s: s["error"] == mx28.OVERLOAD)
         until(
-            records, lambda _: "has shut down (overload) and stands still: it is set up again" in (servo.status or "")
+            records, lambda _: "has shut down (overload) and does not move: it is set up again" in (servo.status or "")
         )
         emulator.free()
         states = until(records, lambda s: s["error"] == 0)
         until(records, lambda _: servo.counters["connected"] == 1)
         assert servo.status is None
-        assert at(90)(states[-1])  # the goal from before does not come back
+        assert at(90)(states[-1])  # the previous goal does not return
         servo.on_goal(goal(120))
         until(records, at(120))
     assert servo.counters["reboots"] >= 1
     assert servo.counters["set_ups"] == 2
 
 
-def test_without_leave_to_reboot_it_stays_down_and_says_so(emulator):
+def test_with_reboot_disabled_the_servo_stays_down_and_this_is_reported(emulator):
     servo = live(emulator, reboot=False)
     with servo.listen() as records:
         next(records)
         emulator.overload()
         until(records, lambda s: s["error"] == mx28.OVERLOAD)
         until(records, lambda _: servo.counters["connected"] == 0)
-        assert "to be rebooted (`reboot: false`)" in (servo.status or "")
+        assert "it needs a reboot (`reboot: false`)" in (servo.status or "")
         servo.on_goal(goal(120))
         states = until(records, lambda _: servo.counters["goals_lost"] == 1)
     assert at(90)(states[-1])
@@ -289,11 +289,11 @@ def test_without_leave_to_reboot_it_stays_down_and_says_so(emulator):
     assert emulator.get(mx28.TORQUE_ENABLE) == 0
 
 
-def test_an_error_that_it_does_not_shut_down_for_is_told_and_it_is_driven_on(emulator):
+def test_an_error_without_shutdown_is_reported_and_the_servo_still_moves(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
-        emulator.overload(0x01)  # the supply's voltage; not among what it shuts down for from the factory
+        emulator.overload(0x01)  # input voltage; causes no shutdown with the factory setting
         until(records, lambda s: s["error"] == 0x01)
         servo.on_goal(goal(120))
         assert until(records, at(120))[-1]["error"] == 0x01
@@ -313,7 +313,7 @@ def test_an_error_that_it_does_not_shut_down_for_is_told_and_it_is_driven_on(emu
     ],
     ids=["torque off", "power cycle", "watchdog"],
 )
-def test_a_servo_that_let_go_is_set_up_again_where_it_stands(emulator, fault, counter):
+def test_a_servo_without_torque_is_set_up_again_at_its_position(emulator, fault, counter):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
@@ -321,14 +321,14 @@ def test_a_servo_that_let_go_is_set_up_again_where_it_stands(emulator, fault, co
         until(records, lambda s: math.degrees(s["position_rad"]) > 93)
         fault(emulator)
         states = until(records, lambda _: servo.counters["set_ups"] == 2 and servo.counters["connected"] == 1)
-        assert math.degrees(states[-1]["goal_rad"]) < 110  # it stands; the old goal is forgotten
+        assert math.degrees(states[-1]["goal_rad"]) < 110  # it stops; the old goal is dropped
         servo.on_goal(goal(60, 40))
         until(records, at(60))
         assert emulator.get(mx28.BUS_WATCHDOG) == 5
     assert servo.counters[counter] >= 1
 
 
-def test_a_cable_that_is_pulled_and_put_back_is_found_again(emulator):
+def test_an_unplugged_and_replugged_cable_is_found_again(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
@@ -355,7 +355,7 @@ def test_a_cable_that_is_pulled_and_put_back_is_found_again(emulator):
     ],
     ids=["crc", "late", "short", "lie", "garbage"],
 )
-def test_spoilt_answers_are_counted_and_no_false_angle_comes_of_them(emulator, fault, counter):
+def test_corrupted_replies_are_counted_and_give_no_wrong_angle(emulator, fault, counter):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
@@ -366,7 +366,7 @@ def test_spoilt_answers_are_counted_and_no_false_angle_comes_of_them(emulator, f
     assert servo.counters["set_ups"] == 1
 
 
-def test_a_place_that_is_told_twice_is_believed(emulator):
+def test_a_confirmed_jump_is_accepted(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
@@ -375,7 +375,7 @@ def test_a_place_that_is_told_twice_is_believed(emulator):
         until(records, lambda _: servo.counters["implausible"] >= 1)
 
 
-def test_when_its_process_is_killed_the_servo_stops_by_itself_and_another_process_takes_over(emulator):
+def test_when_the_servo_process_is_killed_the_watchdog_stops_the_servo_and_a_new_process_starts(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
@@ -414,7 +414,7 @@ def alive(pid):
     return "Z" not in open(f"/proc/{pid}/stat").read().rsplit(")", 1)[1].split()[0]
 
 
-def test_when_its_parent_is_killed_the_servo_is_stopped_and_its_process_ends(emulator):
+def test_when_the_parent_is_killed_the_servo_is_stopped_and_its_process_ends(emulator):
     parent = subprocess.Popen([sys.executable, "-c", PARENT, str(emulator.path)], stdout=subprocess.PIPE, text=True)
     with parent:
         worker = int(parent.stdout.readline())
@@ -426,7 +426,7 @@ def test_when_its_parent_is_killed_the_servo_is_stopped_and_its_process_ends(emu
     eventually(lambda: abs(math.degrees(emulator.position_rad(np.array([time.monotonic_ns()]))[0]) - goal_deg) < 0.2)
 
 
-def test_when_its_parent_hangs_the_servo_stays_where_it_is(emulator):
+def test_when_the_parent_hangs_the_servo_is_stopped(emulator):
     parent = subprocess.Popen([sys.executable, "-c", PARENT, str(emulator.path)], stdout=subprocess.PIPE, text=True)
     with parent:
         worker = int(parent.stdout.readline())
@@ -440,7 +440,7 @@ def test_when_its_parent_hangs_the_servo_stays_where_it_is(emulator):
     assert emulator.get(mx28.GOAL_POSITION) * 360 / 4096 > 94
 
 
-def test_whoever_takes_no_readings_for_long_is_counted_and_heard_again(emulator):
+def test_a_parent_that_does_not_receive_is_counted_and_followed_again(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
@@ -449,14 +449,14 @@ def test_whoever_takes_no_readings_for_long_is_counted_and_heard_again(emulator)
         until(records, lambda _: servo.counters["parent_hangs"] == 1)
         servo.on_goal(goal(120, 20))
         assert until(records, at(120))
-        time.sleep(1.2)  # nothing is under way any more
+        time.sleep(1.2)  # no goal is active
         until(records, lambda _: servo.counters["reads"] > 0)
         for _ in range(100):
             next(records)
     assert servo.counters["parent_hangs"] == 1
 
 
-def refusal(servo):
+def error_text(servo):
     with pytest.raises(LinkError) as caught, servo.listen() as records:
         next(records)
     return str(caught.value)
@@ -466,27 +466,27 @@ def refusal(servo):
     ("register", "value", "words"),
     [
         (mx28.MODEL_NUMBER, 29, "model number 29.*1.0 firmware.*DYNAMIXEL Wizard"),
-        (mx28.FIRMWARE_VERSION, 37, "firmware is version 37; from 38 on"),
+        (mx28.FIRMWARE_VERSION, 37, "firmware is version 37; version 38 is needed"),
         (mx28.RETURN_DELAY_TIME, 250, r"Return Delay Time \(9\) is 250, not 0.*write_settings: true"),
         (mx28.OPERATING_MODE, 4, r"Operating Mode \(11\) is 4, not 3"),
         (mx28.DRIVE_MODE, 4, r"Drive Mode \(10\) is 4, not 0"),
-        (mx28.VELOCITY_LIMIT, 239, r"Velocity Limit \(44\) is 239, not 240.*a lower `speed_limit_rpm`"),
+        (mx28.VELOCITY_LIMIT, 239, r"Velocity Limit \(44\) is 239, not 240.*lower `speed_limit_rpm`"),
         (mx28.MAX_POSITION_LIMIT, 1500, r"Max Position Limit \(48\) is 1500, not 2048"),
     ],
 )
-def test_a_servo_that_may_not_be_driven_is_an_error_that_says_what_to_change(emulator, register, value, words):
+def test_a_servo_that_must_not_be_driven_is_an_error_that_names_the_setting(emulator, register, value, words):
     emulator.set(register, value)
     servo = live(emulator)
     with pytest.raises(LinkError, match=words), servo.listen() as records:
-        until(records, lambda _: False)  # on a busy machine it is read before the first look at its settings succeeds
+        until(records, lambda _: False)  # on a busy machine it is read before its settings are checked
     assert emulator.get(mx28.TORQUE_ENABLE) == 0
 
 
-def test_with_leave_to_write_its_settings_are_corrected_and_kept(emulator):
+def test_with_write_settings_the_settings_are_corrected_and_kept(emulator):
     emulator.set(mx28.RETURN_DELAY_TIME, 250)
     emulator.set(mx28.OPERATING_MODE, 4)
     emulator.set(mx28.VELOCITY_LIMIT, 230)
-    emulator.set(mx28.TORQUE_ENABLE, 1)  # a run before was killed
+    emulator.set(mx28.TORQUE_ENABLE, 1)  # the previous run was killed
     with live(emulator, write_settings=True).listen() as records:
         next(records)
     assert emulator.get(mx28.RETURN_DELAY_TIME) == 0
@@ -494,11 +494,11 @@ def test_with_leave_to_write_its_settings_are_corrected_and_kept(emulator):
     assert emulator.get(mx28.VELOCITY_LIMIT) == 240
 
 
-def test_no_servo_and_no_port_are_errors_that_say_what_to_check(emulator, tmp_path):
-    words = refusal(live(emulator, servo_id=7, start_timeout_s=0.2))
-    assert "the servo with id 7 does not answer at 1000000 baud" in words
+def test_no_servo_and_no_port_are_errors_that_name_what_to_check(emulator, tmp_path):
+    words = error_text(live(emulator, servo_id=7, start_timeout_s=0.2))
+    assert "the servo with id 7 does not reply at 1000000 baud" in words
     assert "Is it powered (12 V) and wired" in words
-    words = refusal(Servo(port=str(tmp_path / "none"), start_timeout_s=0.2))
+    words = error_text(Servo(port=str(tmp_path / "none"), start_timeout_s=0.2))
     assert "cannot open" in words
     assert "Is the USB adapter plugged in" in words
 

@@ -48,7 +48,7 @@ def test_a_state_keeps_its_own_time_and_every_field():
         json.dumps(GOOD | {"more": "x" * 2000}).encode(),
     ],
 )
-def test_what_is_no_state_is_counted_and_left_out(data):
+def test_a_record_without_a_valid_state_is_counted_and_skipped(data):
     servo = Servo()
     assert servo.decode(record(data)) is None
     assert servo.refused == 1
@@ -56,12 +56,17 @@ def test_what_is_no_state_is_counted_and_left_out(data):
 
 def test_a_reading_is_stamped_in_the_middle_of_its_exchange_and_arrives_with_the_reply():
     reading = wire.Reading(0, 10_000_000, 1024, 10, 1030, 32)
-    told = reading_record("/servo/state", reading, host_ahead_ns=0, sequence=7)
-    assert (told.stamp_ns, told.arrival_ns, told.sequence, told.topic) == (5_000_000, 10_000_000, 7, "/servo/state")
-    moved = reading_record("/servo/state", reading, host_ahead_ns=1_748_773_230_000_000_000, sequence=7)
-    assert moved.stamp_ns == 1_748_773_230_005_000_000
-    assert moved.arrival_ns == 1_748_773_230_010_000_000
-    state = Servo().decode(told)
+    at_zero = reading_record("/servo/state", reading, host_ahead_ns=0, sequence=7)
+    assert (at_zero.stamp_ns, at_zero.arrival_ns, at_zero.sequence, at_zero.topic) == (
+        5_000_000,
+        10_000_000,
+        7,
+        "/servo/state",
+    )
+    later = reading_record("/servo/state", reading, host_ahead_ns=1_748_773_230_000_000_000, sequence=7)
+    assert later.stamp_ns == 1_748_773_230_005_000_000
+    assert later.arrival_ns == 1_748_773_230_010_000_000
+    state = Servo().decode(at_zero)
     assert (state.stamp_ns, state.error) == (5_000_000, 32)
     assert (state.position_rad, state.goal_rad) == pytest.approx((math.pi / 2, 1030 * math.tau / 4096))
     assert state.velocity_radps == pytest.approx(10 * 0.229 * math.tau / 60)
@@ -85,7 +90,7 @@ def test_a_goal_stays_within_one_turn_and_never_means_no_speed_limit():
     assert goal_command(goal(0.0, 1e3)).velocity_units == 1023
 
 
-def test_the_newest_goal_waits_for_the_line_and_is_taken_once():
+def test_the_newest_goal_is_kept_and_taken_once():
     servo = Servo()
     assert servo.take_command() is None
     servo.on_goal(goal(1.0, 1.0))

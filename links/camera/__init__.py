@@ -1,4 +1,4 @@
-"""Fisheye cameras: JPEG frames, recorded or live from a device, a stream or a file, to images."""
+"""Fisheye cameras: JPEG frames, recorded or live from a device, a stream or a file, decoded to images."""
 
 from links.camera.camera import Camera
 

@@ -1,8 +1,8 @@
 """A camera as a source: one foxglove.CompressedImage per frame, JPEG. Live from a device, a stream or a video file.
 
-A frame is stamped when it came (by RTSP without what it waited for the decoder), less `latency_s`: how long after the
-middle of its middle row's exposure it comes. That is the camera's, and measured once (a clock filmed beside its own
-picture); nothing here can know it.
+A frame's stamp is its reception (for RTSP without the delay of the decoder) minus `latency_s`, the time from the middle
+of the middle row's exposure to reception. `latency_s` depends on the camera and is measured once, by filming a clock
+next to the live image of the clock.
 
 Source: recording format in recordings/README.md (/camera/*); ITU-T T.81, B.1.1 and B.2.2 (markers, frame header).
 """
@@ -25,8 +25,8 @@ from links.camera.live_camera import LiveCamera
 from links.recording import CompressedImage, decode_compressed_image, encode_compressed_image
 from stages.messages import Image
 
-MAX_PIXELS = 4096 * 4096  # of a frame; a larger one is refused before it takes memory
-SLOW_TOLD_S = 5.0  # after the last sign of it
+MAX_PIXELS = 4096 * 4096  # of a frame; a larger one is rejected before memory is allocated
+SLOW_STATUS_S = 5.0  # how long the status "too slow" is kept after its last event
 FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive
 
 
@@ -35,56 +35,59 @@ class CameraSettings(SourceSettings):
 
     topic: str
     source: str | None = None  # live: /dev/video0 (better /dev/v4l/by-id/...), rtsp://..., http://..., a video file
-    frame_id: str | None = None  # None: by the topic, /camera/vehicle is camera_vehicle
-    size_px: int | tuple[int, int] | None = None  # what the lens was calibrated for: `$rig.cameras.vehicle.size_px`
-    fps: float = Field(30.0, ge=1, le=240)  # asked of a device
-    latency_s: float = Field(0.0, ge=0, le=1)  # from the exposure of the middle row to the frame's arrival
+    frame_id: str | None = None  # None: from the topic, /camera/vehicle becomes camera_vehicle
+    size_px: int | tuple[int, int] | None = None  # the lens is calibrated for this size: `$rig.cameras.vehicle.size_px`
+    fps: float = Field(30.0, ge=1, le=240)  # requested from a device
+    latency_s: float = Field(0.0, ge=0, le=1)  # from the exposure of the middle row to reception
     readout_ms: float = Field(0.0, ge=0, le=100)  # from the first row's exposure to the last's: a rolling shutter
-    timeout_s: float = Field(3.0, gt=0, le=30)  # of a stream: to open it, and between two frames
-    jpeg_quality: int = Field(90, ge=30, le=100)  # where frames do not come as JPEG
+    timeout_s: float = Field(3.0, gt=0, le=30)  # of a stream: for opening it, and between two frames
+    jpeg_quality: int = Field(90, ge=30, le=100)  # for frames that do not arrive as JPEG
 
 
 class Camera(Source[CameraSettings]):
-    """Frames of one camera, in grey. A frame that cannot be decoded is counted in `refused` and left out."""
+    """One camera, greyscale. A frame that cannot be decoded is counted in `refused` and skipped."""
 
-    silent_after_s: ClassVar[float | None] = 4.0  # `timeout_s` is 3 s, and it is tried again at once
+    silent_after_s: ClassVar[float | None] = 4.0  # `timeout_s` is 3 s, and reopening starts immediately
 
     def __init__(self, settings: CameraSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._refused: int = 0
         self._counts: Counter[str] = Counter()
-        self._slow: tuple[int, float] = (0, 0.0)  # "too slow" as counted last, and when it had grown
+        self._slow: tuple[int, float] = (0, 0.0)  # newest count of "too slow", and when it increased
 
     @property
     def refused(self) -> int:
-        """Records that held no whole JPEG image."""
+        """Number of records without a complete JPEG image."""
         return self._refused
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals: frames refused, damaged, stale (waiting when asked for), late (the decoder
-        does not keep up), too slow (ten late in a row), overtaken; times lost and opened again."""
+        """Totals since the start.
+
+        Frames: refused, damaged, stale (buffered for an unknown time), late (slow decoder), too slow (ten consecutive
+        late ones), overtaken (replaced by a newer one). Times: lost, opened again.
+        """
         return {"refused": self._refused, **self._counts}
 
     @property
     def status(self) -> str | None:
-        """That this host does not decode the stream as fast as it comes."""
+        """See Link: this host decodes the stream more slowly than it arrives."""
         slow, now_s = self._counts["too slow"], time.monotonic()
         if slow > self._slow[0]:
             self._slow = slow, now_s
-        if not slow or now_s > self._slow[1] + SLOW_TOLD_S:
+        if not slow or now_s > self._slow[1] + SLOW_STATUS_S:
             return None
-        return "this host decodes its stream more slowly than it comes: fewer or smaller pictures, or MJPEG"
+        return "this host decodes the stream more slowly than it arrives: use fewer or smaller images, or MJPEG"
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
-        """Open the camera: `with camera.listen() as records`. LinkError when it cannot, or frames have another size.
+        """Open the camera: `with camera.listen() as records`. LinkError: it cannot be opened, or has another size.
 
-        One that is lost later is opened again, for ever; a video file comes at its own pace, and ends.
+        A camera that is lost later is reopened, without a limit of attempts. A video file plays in real time, and ends.
         """
         settings = self.settings
         if settings.source is None:
-            raise LinkError(f"{settings.topic}: give `source` to run live: /dev/video0, a URL, or a video file")
+            raise LinkError(f"{settings.topic}: set `source` to run live: /dev/video0, a URL, or a video file")
         size_px = (settings.size_px, settings.size_px) if isinstance(settings.size_px, int) else settings.size_px
         capture = CaptureSettings(settings.source, size_px, settings.fps, settings.timeout_s, settings.jpeg_quality)
         with LiveCamera(capture, self._counts).open() as frames:
@@ -95,7 +98,7 @@ class Camera(Source[CameraSettings]):
         frame_id = settings.frame_id or settings.topic.strip("/").replace("/", "_")
         for sequence, frame in enumerate(frames):
             self._check_size(frame.jpeg, size_px)
-            stamp_ns = frame.came_ns - round(1e9 * settings.latency_s)
+            stamp_ns = frame.received_ns - round(1e9 * settings.latency_s)
             data = encode_compressed_image(CompressedImage(stamp_ns, frame_id, frame.jpeg))
             yield Record(settings.topic, frame.arrival_ns, stamp_ns, data, sequence)
 
@@ -103,7 +106,7 @@ class Camera(Source[CameraSettings]):
         try:
             found_px = jpeg_size(jpeg)
         except ValueError:
-            return  # decoding counts it
+            return  # `decode` counts it
         if wanted_px is not None and found_px != wanted_px:
             raise LinkError(
                 f"{self.topic}: frames of {found_px[0]} x {found_px[1]} pixels, but the lens is calibrated for "
@@ -111,7 +114,7 @@ class Camera(Source[CameraSettings]):
             )
 
     def decode(self, record: Record) -> Image | None:
-        """The image of one record, stamped as the record is."""
+        """The image of one record, with the record's stamp; None: invalid."""
         try:
             return decode_image(record.stamp_ns, decode_compressed_image(record.data), 1e-3 * self.settings.readout_ms)
         except (ValueError, LinkError):
@@ -120,14 +123,14 @@ class Camera(Source[CameraSettings]):
 
 
 def decode_image(stamp_ns: int, frame: CompressedImage, readout_s: float = 0.0) -> Image:
-    """A frame in grey. Raises ValueError when it is no JPEG, is cut off, or has more than MAX_PIXELS pixels."""
+    """Decode a frame to grey. Raises ValueError for a frame that is no JPEG, incomplete, or above MAX_PIXELS pixels."""
     if frame.format not in ("jpeg", "jpg"):
-        raise ValueError(f"a frame in format {frame.format!r}; record JPEG")
+        raise ValueError(f"a frame in format {frame.format!r}, not JPEG")
     width, height = jpeg_size(frame.data)
     if width * height > MAX_PIXELS:
         raise ValueError(f"a frame of {width} x {height} pixels")
     if not frame.data.rstrip(b"\0").endswith(b"\xff\xd9"):
-        raise ValueError("a JPEG that is cut off")
+        raise ValueError("an incomplete JPEG")
     grey = cv2.imdecode(np.frombuffer(frame.data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise ValueError("a damaged JPEG")
@@ -136,11 +139,11 @@ def decode_image(stamp_ns: int, frame: CompressedImage, readout_s: float = 0.0) 
 
 
 def jpeg_size(data: bytes) -> tuple[int, int]:
-    """(width, height) from a JPEG's frame header; ValueError when there is none."""
+    """(width, height) from a JPEG's frame header. Raises ValueError without one."""
     at = 2
     if data[:2] == b"\xff\xd8":
         while at + 9 <= len(data) and data[at] == 0xFF:
             if data[at + 1] in FRAME_HEADERS:
                 return int.from_bytes(data[at + 7 : at + 9]), int.from_bytes(data[at + 5 : at + 7])
             at += 2 + int.from_bytes(data[at + 2 : at + 4])
-    raise ValueError("no JPEG")
+    raise ValueError("not a JPEG")

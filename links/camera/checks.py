@@ -1,7 +1,4 @@
-"""Is a camera as it must be: frames, their size against the rig's lens, their rate, and when they were exposed.
-
-Source: ours.
-"""
+"""Preflight checks of a camera: frames, their rate, their size against the rig's lens, readout and latency."""
 
 from __future__ import annotations
 
@@ -18,9 +15,9 @@ from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource
 from links.recording import decode_compressed_image
 
-LEAST_HZ = 1.0
-SILENT_S = 1.0  # a camera that gave pictures and then none for so long has died
-FULL_RATE = 0.5  # of what was asked of the device
+MIN_HZ = 1.0
+SILENT_S = 1.0  # a camera without frames for longer has failed
+MIN_RATE_SHARE = 0.5  # of the requested rate
 
 DEFAULT_GB_PER_HOUR = 5.0  # of a camera that sent nothing: a 720 px fisheye at 10 Hz, JPEG
 
@@ -90,14 +87,12 @@ def _rig_camera(rig: Mapping[str, Any], link: Camera) -> Mapping[str, Any]:
 def camera_checks(
     source: ObservedSource, rig_px: tuple[int, int] | None, readout_ms: float | None
 ) -> Iterator[CheckResult]:
-    """All checks of one camera; `rig_px`: width, height that the lens was calibrated for; None: the rig is silent."""
+    """All checks of one camera. `rig_px`: width and height of the lens calibration; None: not set in the rig."""
     link, observation = source.link, source.observation
     assert isinstance(link, Camera)
     assert isinstance(observation, CameraObservation)
     if not observation.sizes_px:
-        refused = (
-            f"{observation.records.count} records came that hold no picture; " if observation.records.count else ""
-        )
+        refused = f"{observation.records.count} records without an image arrived; " if observation.records.count else ""
         yield fail(f"{source.name} frames", f"{refused}{source.no_data_reason}")
         return
     yield _rate(source, link)
@@ -112,21 +107,21 @@ def camera_checks(
 
 
 def _rate(source: ObservedSource, link: Camera) -> CheckResult:
-    name, arrivals = f"{source.name} frames", source.observation.records
+    name, records = f"{source.name} frames", source.observation.records
     refused = source.counters.get("refused", 0)
-    told = f"{arrivals.rate_hz:.1f} a second" if arrivals.count > 1 else "one frame"
-    text = told + (f", {refused} of {arrivals.count} damaged" if refused else "")
-    if not arrivals.rate_hz >= LEAST_HZ or (source.live and source.status):
+    rate = f"{records.rate_hz:.1f} frames/s" if records.count > 1 else "one frame"
+    text = rate + (f", {refused} of {records.count} damaged" if refused else "")
+    if not records.rate_hz >= MIN_HZ or (source.live and source.status):
         why = source.status or "too slow for any motion"
         return fail(name, f"{text}: {why}")
-    silent_s = arrivals.longest_silence_s(source.end_ns)
-    if source.live and silent_s > max(SILENT_S, 3.0 / arrivals.rate_hz):
-        return fail(name, f"{text}; then none came for {silent_s:.1f} s: check its cable and power")
-    if refused > 0.01 * arrivals.count:
+    silent_s = records.longest_silence_s(source.end_ns)
+    if source.live and silent_s > max(SILENT_S, 3.0 / records.rate_hz):
+        return fail(name, f"{text}; then none for {silent_s:.1f} s: check its cable and power")
+    if refused > 0.01 * records.count:
         return warning(name, f"{text}: check cable and hub")
-    if source.live and arrivals.rate_hz < FULL_RATE * link.settings.fps:
+    if source.live and records.rate_hz < MIN_RATE_SHARE * link.settings.fps:
         return warning(
-            name, f"{text}, {link.settings.fps:g} were asked for: is it too dark, the bus shared, this host too busy?"
+            name, f"{text}, {link.settings.fps:g} requested: is it too dark, is the bus shared, or this host too busy?"
         )
     return ok(name, text)
 
@@ -135,14 +130,14 @@ def _size(name: str, observation: CameraObservation, rig_px: tuple[int, int] | N
     name = f"{name} size"
     found = ", ".join(f"{w} x {h}" for w, h in observation.sizes_px)
     if rig_px is None:
-        return warning(name, f"{found}; the rig does not say what the lens was calibrated for (size_px)")
+        return warning(name, f"{found}; the rig has no size_px of the lens calibration")
     if set(observation.sizes_px) != {rig_px}:
         return fail(
             name,
             f"{found}, but the lens is calibrated for {rig_px[0]} x {rig_px[1]}: set the camera's mode, or calibrate "
             "the lens in this one",
         )
-    return ok(name, f"{found}, as the rig says")
+    return ok(name, f"{found}, as in the rig")
 
 
 def _readout(name: str, link: Camera, readout_ms: float | None) -> CheckResult:
@@ -150,16 +145,17 @@ def _readout(name: str, link: Camera, readout_ms: float | None) -> CheckResult:
     if readout_ms is None:
         key = f"cameras.{link.topic.rpartition('/')[2]}.readout_ms"
         return warning(
-            name, f"the rig does not say how long the rows take: most shutters roll; set {key} in it (0: all at once)"
+            name,
+            f"no readout time in the rig, and most cameras have a rolling shutter: set {key} (0: global shutter)",
         )
-    return ok(name, f"{readout_ms:g} ms from the first row to the last" if readout_ms else "all rows at once")
+    return ok(name, f"{readout_ms:g} ms from the first row to the last" if readout_ms else "global shutter")
 
 
 def _latency(name: str, link: Camera) -> CheckResult:
     if link.settings.latency_s:
-        return ok(f"{name} latency", f"{1e3 * link.settings.latency_s:g} ms from a picture's exposure to its arrival")
+        return ok(f"{name} latency", f"{1e3 * link.settings.latency_s:g} ms from exposure to reception")
     return warning(
         f"{name} latency",
-        "latency_s is 0: pictures count as exposed when they arrive, and 80 ms of it cost 18 cm and 1 deg; film a "
-        f"clock on this host's screen, and set {name}.latency_s to how far its picture is behind (configs/field.yaml)",
+        "latency_s is 0: images are stamped as exposed at reception, and an error of 80 ms costs 18 cm and 1 deg; film "
+        f"a clock on this host's screen, and set {name}.latency_s to the delay of the image (configs/field.yaml)",
     )

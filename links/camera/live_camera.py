@@ -1,7 +1,4 @@
-"""A camera live: its own thread takes every frame as it comes, the newest waits to be fetched, a lost one is reopened.
-
-Source: ours.
-"""
+"""Live camera: a thread reads every frame, keeps the newest for the consumer, and reopens a lost camera."""
 
 from __future__ import annotations
 
@@ -11,11 +8,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from flow.link import LinkError
-from links.camera.capture import Capture, CaptureEnded, CaptureLost, CaptureSettings, Frame, is_device, is_url, shown
+from links.camera.capture import (
+    Capture,
+    CaptureEnded,
+    CaptureLost,
+    CaptureSettings,
+    Frame,
+    is_device,
+    is_url,
+    without_password,
+)
 from links.clock import host_time
 
-PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0  # between attempts to open it again
-END_S = 1.0  # how long the end waits for a read that hangs in a driver
+PAUSE_S, MAX_PAUSE_S = 0.25, 5.0  # between two attempts to open the camera
+END_S = 1.0  # limit of waiting for a read that hangs in a driver
 _WAKE_S = 0.2
 
 
@@ -26,14 +32,14 @@ class LiveCamera:
         self._settings, self._counters = settings, counters
         self._changed = threading.Condition()
         self._newest: Frame | None = None
-        self._ended = False  # no more frames will come: the file is over
-        self._lost: CaptureLost | None = None  # why there is no frame now
+        self._ended = False  # the video file has ended
+        self._lost: CaptureLost | None = None  # why no frame arrives
         self._delivered = False
         self._closed = threading.Event()
 
     @contextmanager
     def open(self) -> Iterator[Iterator[Frame]]:
-        """An iterator of its newest frames, which raises LinkError when the first one does not come."""
+        """An iterator of the newest frames; it raises LinkError when the first frame does not arrive."""
         thread = threading.Thread(target=self._run, name="camera", daemon=True)
         thread.start()
         try:
@@ -59,7 +65,7 @@ class LiveCamera:
                 raise LinkError(f"{self._lost}. {self._advice()}")
 
     def _run(self) -> None:
-        """The thread: open, read, and after a loss open again, until the end."""
+        """Thread: open, read, and reopen after a loss, until the end."""
         pause_s = PAUSE_S
         capture: Capture | None = None
         while not self._closed.is_set():
@@ -78,7 +84,7 @@ class LiveCamera:
                     capture.close()
                 capture = None
                 self._closed.wait(pause_s)
-                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+                pause_s = min(2 * pause_s, MAX_PAUSE_S)
         if capture is not None:
             capture.close()
 
@@ -102,5 +108,6 @@ class LiveCamera:
                 "user in the group video, and does another program use it (`fuser -v /dev/video0`)?"
             )
         if is_url(source):
-            return f"Does it play elsewhere, as by `ffplay {shown(source)}`? Check address, port, name and password."
+            command = f"ffplay {without_password(source)}"
+            return f"Does another player open it (`{command}`)? Check address, port, name and password."
         return "Is `source` the path of a video file that FFmpeg reads, or did you mean /dev/video0 or a URL?"

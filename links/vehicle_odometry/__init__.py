@@ -1,6 +1,6 @@
-"""The vehicle's own odometry, where it has one: recorded poses to vehicle motion.
+"""The vehicle's own odometry, if it has one: recorded or UDP poses to VehicleMotion.
 
-Source: ours; recording format in recordings/README.md (/vehicle/odometry).
+Source: recording format in recordings/README.md (/vehicle/odometry).
 """
 
 from links.vehicle_odometry.odometry import VehicleOdometry

@@ -23,7 +23,7 @@ class VehicleOdometryChecks(LinkChecks):
     def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
         """Vehicle odometry is optional."""
         if not declares(graph, VehicleOdometry):
-            yield warning("vehicle odometry", "not in this configuration: the vehicle is taken to be parked")
+            yield warning("vehicle odometry", "not in this configuration: the vehicle is assumed parked")
 
     def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
         """See LinkChecks."""
@@ -32,20 +32,20 @@ class VehicleOdometryChecks(LinkChecks):
 
 
 def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult:
-    """The vehicle's own odometry, where it has one."""
+    """The result of one vehicle odometry source."""
     if source.live and link.settings.port is None:
-        return warning(source.name, "it has no port: the vehicle is taken to be parked")
+        return warning(source.name, "no port is set: the vehicle is assumed parked")
     records = source.observation.records
     if not records.count:
-        text = f"{source.no_data_reason}: the vehicle would be taken to be parked"
+        text = f"{source.no_data_reason}: the vehicle would be assumed parked"
         return fail(source.name, f"{text}; start it, or set port: null") if source.live else warning(source.name, text)
     refused, age_ms = source.counters.get("refused", 0), 1e-6 * records.max_age_ns
-    text = f"{records.rate_hz:.0f} a second, at most {age_ms:.0f} ms old" + (f", {refused} refused" if refused else "")
+    text = f"{records.rate_hz:.0f} poses/s, at most {age_ms:.0f} ms old" + (f", {refused} refused" if refused else "")
     if refused >= records.count:
-        return fail(source.name, f"{text}: none holds a pose (recordings/README.md, /vehicle/odometry)")
+        return fail(source.name, f"{text}: none is a valid pose (recordings/README.md, /vehicle/odometry)")
     silent_s = records.longest_silence_s(source.end_ns)
     if source.live and silent_s > ODOMETRY_SILENT_S:
-        return fail(source.name, f"{text}; then none came for {silent_s:.1f} s: is its sender still running?")
+        return fail(source.name, f"{text}; then none for {silent_s:.1f} s: is its sender still running?")
     if not records.rate_hz >= ODOMETRY_HZ or age_ms > OLD_MS or refused:
-        return warning(source.name, f"{text}: check its rate, and that its age_s and clock are right")
+        return warning(source.name, f"{text}: check its rate, its age_s and its clock")
     return ok(source.name, text)

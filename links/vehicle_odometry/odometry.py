@@ -1,8 +1,8 @@
 """The vehicle's own odometry as a source: one JSON object per pose, T_start_vehicle; live by UDP (`udp.py`).
 
-A recording without it is no error: the source stays silent, and the run says so once.
+A recording without it is no error: the source has no records, and the run reports that once.
 
-Source: ours; recording format in recordings/README.md (/vehicle/odometry).
+Source: recording format in recordings/README.md (/vehicle/odometry).
 """
 
 from __future__ import annotations
@@ -25,27 +25,29 @@ from stages.messages import VehicleMotion
 
 MAX_BYTES = 4_000
 MAX_M = 1e7
-LENGTH_SLACK = 1e-3  # of a quaternion
-CORRELATION_SLACK = 1e-4  # what rounding to six digits does to a covariance
+NORM_TOLERANCE = 1e-3  # of a quaternion
+CORRELATION_TOLERANCE = 1e-4  # effect of rounding a covariance to six digits
 
 
 class VehicleOdometrySettings(SourceSettings):
     """Settings of `VehicleOdometry`."""
 
     topic: str = "/vehicle/odometry"
-    port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: there is none, or it is in recordings only
+    port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: no live odometry
     bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address
-    sender: IPv4Address | None = None  # who tells it; others are ignored
+    sender: IPv4Address | None = None  # the sender's address; others are ignored
 
     @model_validator(mode="after")
     def _sender_is_known(self) -> VehicleOdometrySettings:
         if self.sender is None and not self.bind.is_loopback:
-            raise ValueError(f"sender: say who tells the odometry when binding to {self.bind}: others are ignored")
+            raise ValueError(
+                f"sender: set the odometry's sender when binding to {self.bind}, so that others are ignored"
+            )
         return self
 
 
 class VehicleOdometry(Source[VehicleOdometrySettings]):
-    """Where the vehicle has driven. A record that holds no pose is counted in `refused` and left out."""
+    """The vehicle's motion. A record without a valid pose is counted in `refused` and skipped."""
 
     silent_after_s: ClassVar[float | None] = 2.0
 
@@ -56,7 +58,7 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
 
     @property
     def refused(self) -> int:
-        """Records that held no pose, or one that cannot be true."""
+        """Number of records without a valid pose."""
         return self._refused
 
     @property
@@ -65,15 +67,15 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
         return {"refused": self._refused, **self._udp}
 
     def listen(self) -> AbstractContextManager[Iterator[Record]]:
-        """Receive poses: `with odometry.listen() as records`. LinkError without a port, or when it cannot be opened."""
+        """Receive poses: `with odometry.listen() as records`. LinkError without `port`, or when it cannot be opened."""
         settings = self.settings
         if settings.port is None:
-            raise LinkError(f"{settings.topic}: give `port` to hear the vehicle's odometry, or take the link out")
+            raise LinkError(f"{settings.topic}: set `port` to receive the vehicle's odometry, or remove the link")
         sender = None if settings.sender is None else str(settings.sender)
         return listen_udp(settings.topic, str(settings.bind), settings.port, sender, self._udp)
 
     def decode(self, record: Record) -> VehicleMotion | None:
-        """A message of `{"xyz_m": [...], "quaternion_xyzw": [...], "covariance": [36 numbers] or null}`, else None."""
+        """The pose in `{"xyz_m": [...], "quaternion_xyzw": [...], "covariance": [36] or null}`; None: invalid."""
         try:
             return parse_pose(record.stamp_ns, record.data)
         except ValueError:
@@ -82,7 +84,7 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
 
 
 def parse_pose(stamp_ns: int, data: bytes) -> VehicleMotion:
-    """One recorded pose. Raises ValueError when it is none: fields missing, not finite, no rotation, no covariance."""
+    """Parse one pose. Raises ValueError for missing or non-finite fields, an invalid rotation or covariance."""
     if len(data) > MAX_BYTES:
         raise ValueError(f"a pose of {len(data)} bytes")
     try:
@@ -91,11 +93,11 @@ def parse_pose(stamp_ns: int, data: bytes) -> VehicleMotion:
         qx, qy, qz, qw = (float(v) for v in fields["quaternion_xyzw"])
         rows = fields.get("covariance")
         covariance = None if rows is None else checked_covariance(np.asarray(rows, dtype=np.float64))
-    except (TypeError, KeyError, AttributeError, OverflowError, RecursionError) as problem:
-        raise ValueError(f"no pose: {problem!r}") from None
+    except (TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"no pose: {error!r}") from None
     if xyz_m.shape != (3,) or not (np.abs(xyz_m) < MAX_M).all():  # NaN compares false
         raise ValueError(f"a pose at {xyz_m.tolist()}")
-    if not abs(math.hypot(qx, qy, qz, qw) - 1) < LENGTH_SLACK:
+    if not abs(math.hypot(qx, qy, qz, qw) - 1) < NORM_TOLERANCE:
         raise ValueError(f"no rotation: {[qx, qy, qz, qw]}")
     return VehicleMotion(
         stamp_ns=stamp_ns,
@@ -106,14 +108,14 @@ def parse_pose(stamp_ns: int, data: bytes) -> VehicleMotion:
 
 
 def checked_covariance(rows: Array64) -> Array64:
-    """(6, 6) of 36 numbers by rows. Raises ValueError when it is not symmetric or has a negative eigenvalue."""
+    """(6, 6) of 36 numbers by rows. Raises ValueError if it is not symmetric or has a negative eigenvalue."""
     if rows.shape != (36,) or not np.isfinite(rows).all():
         raise ValueError("a covariance without 36 finite numbers")
     covariance = rows.reshape(6, 6)
     sigmas = np.array([math.sqrt(variance) if variance > 0 else 1.0 for variance in rows[::7].tolist()])
     correlation = covariance / (sigmas[:, None] * sigmas)
-    if np.abs(correlation - correlation.T).max() > CORRELATION_SLACK:
+    if np.abs(correlation - correlation.T).max() > CORRELATION_TOLERANCE:
         raise ValueError("a covariance that is not symmetric")
-    if np.linalg.eigvalsh(correlation)[0] < -CORRELATION_SLACK:
+    if np.linalg.eigvalsh(correlation)[0] < -CORRELATION_TOLERANCE:
         raise ValueError("a covariance with a negative variance")
     return (covariance + covariance.T) / 2

@@ -1,12 +1,11 @@
-"""The vehicle's odometry live: a JSON object in each UDP datagram, from one sender.
+"""Live vehicle odometry: one JSON object per UDP datagram, from one sender.
 
     {"xyz_m": [x, y, z], "quaternion_xyzw": [x, y, z, w], "covariance": [36 numbers] or null, "age_s": 0.004}
 
-`age_s`: how long before it was sent the pose was true, to be told at the moment of sending; 0 when it does not say.
-One that is older than a second is left out and counted: stamped as new it would put the vehicle where it was.
-What it says else is as recorded.
+`age_s`: age of the pose at the time of sending; 0 when it is missing. A pose older than one second is skipped and
+counted. The other fields are those of the recording format.
 
-Source: ours; recording format in recordings/README.md (/vehicle/odometry).
+Source: recording format in recordings/README.md (/vehicle/odometry).
 """
 
 from __future__ import annotations
@@ -23,15 +22,15 @@ from flow.link import LinkError, Record
 from links.clock import datagram_time
 
 DATAGRAM_BYTES = 4096
-WAKE_S = 0.2  # how often a waiting listener looks whether it was closed
-MOST_AGE_S = 1.0
+WAKE_S = 0.2  # how often a waiting listener checks whether it was closed
+MAX_AGE_S = 1.0
 
 
 @contextmanager
 def listen_udp(
     topic: str, bind: str, port: int, sender: str | None, counters: Counter[str]
 ) -> Iterator[Iterator[Record]]:
-    """Open the socket and yield an iterator of records; it ends when the context is left. LinkError: it cannot open."""
+    """Open the socket and yield an iterator of records, which ends with the context. LinkError: it cannot be opened."""
     closed = threading.Event()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         try:
@@ -67,16 +66,16 @@ def _records(
             continue
         age = age_s(data)
         if age is None:
-            counters["too old, or of no age"] += 1
+            counters["age_s invalid or too large"] += 1
             continue
         yield Record(topic, arrival_ns, arrival_ns - round(1e9 * age), data)
 
 
 def age_s(data: bytes) -> float | None:
-    """What a datagram says of its age, 0 when it does not; None: it cannot be true, or it is too old to be of use."""
+    """`age_s` of a datagram, 0 without it; None: invalid or above MAX_AGE_S."""
     try:
         fields: Any = json.loads(data)
         age = float(fields.get("age_s", 0.0))
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
-        return 0.0 if b"age_s" not in data else None  # decoding looks at the rest
-    return age if 0.0 <= age <= MOST_AGE_S else None
+        return 0.0 if b"age_s" not in data else None  # `decode` rejects invalid JSON
+    return age if 0.0 <= age <= MAX_AGE_S else None

@@ -1,7 +1,7 @@
-"""An H.264 stream without an encoder: pictures of numbers, each macroblock stored as it is (I_PCM).
+"""An H.264 stream without an encoder: images that encode numbers, with uncompressed macroblocks (I_PCM).
 
-A picture is 64 x 48: twelve macroblocks, each black or white, which are the number's bits, the lowest first. Every tenth
-picture can be read alone (IDR), those between refer to it (P slices), as a camera's do.
+An image is 64 x 48: twelve macroblocks, black or white, are the number's bits, the lowest first. Every tenth image is an
+IDR; the others refer to it (P slices), as in a camera's stream.
 
 Source: ITU-T H.264, 7.3.2.1.1 (sequence parameter set), 7.3.2.2 (picture parameter set), 7.3.3 (slice header),
 7.3.5 (macroblock), 7.4.1.1 (emulation prevention), 9.1 (Exp-Golomb codes).
@@ -14,13 +14,13 @@ import re
 import numpy as np
 
 COLUMNS, ROWS = 4, 3  # macroblocks of 16 x 16
-GROUP = 10  # pictures from one IDR to the next
+GROUP = 10  # images from one IDR to the next
 BLACK, WHITE = 16, 235
-P_SLICE, I_SLICE = 5, 7  # slice types: all of a picture's slices are of that type
+P_SLICE, I_SLICE = 5, 7  # slice types: all slices of the image have that type
 
 
 class Bits:
-    """Bits written one after another; each method returns self."""
+    """A bit writer; each method returns self."""
 
     def __init__(self):
         self.text = ""
@@ -39,7 +39,7 @@ class Bits:
         return self
 
     def unit(self, header):
-        """The NAL unit: its header's byte, these bits with their stop bit, and no start code inside."""
+        """The NAL unit: header byte, these bits with the stop bit, and emulation prevention."""
         body = self.u(1, 1).align().text
         data = int(body, 2).to_bytes(len(body) // 8)
         return bytes([header]) + re.sub(rb"\0\0(?=[\0-\3])", b"\0\0\3", data)
@@ -56,27 +56,27 @@ def picture_parameters():
     return Bits().ue(0, 0).u(2, 0).ue(0, 0, 0).u(3, 0).ue(0, 0, 0).u(3, 0).unit(0x68)
 
 
-def picture(number):
-    """The NAL units of one picture; before an IDR come the parameter sets."""
-    place = number % GROUP
-    alone = place == 0
-    bits = Bits().ue(0, I_SLICE if alone else P_SLICE, 0).u(4, place)
-    if alone:
-        bits.ue(number // GROUP % 2).u(2, 0)  # two IDRs in a row differ; nothing is kept of before
+def image(number):
+    """The NAL units of one image; the parameter sets precede an IDR."""
+    frame = number % GROUP
+    is_idr = frame == 0
+    bits = Bits().ue(0, I_SLICE if is_idr else P_SLICE, 0).u(4, frame)
+    if is_idr:
+        bits.ue(number // GROUP % 2).u(2, 0)  # consecutive IDRs differ; no earlier references
     else:
-        bits.u(2, 0).u(1, 0)  # the references as they are; the oldest falls out
+        bits.u(2, 0).u(1, 0)  # default references; sliding window
     bits.ue(0)
     for at in range(COLUMNS * ROWS):
         luma = WHITE if number >> at & 1 else BLACK
-        if not alone:
+        if not is_idr:
             bits.ue(0)  # no macroblock is skipped
-        bits.ue(25 if alone else 30).align()  # I_PCM
+        bits.ue(25 if is_idr else 30).align()  # I_PCM
         bits.text += f"{luma:08b}" * 256 + f"{128:08b}" * 128
-    slice_unit = bits.unit(0x65 if alone else 0x61)
-    return [sequence(), picture_parameters(), slice_unit] if alone else [slice_unit]
+    slice_unit = bits.unit(0x65 if is_idr else 0x61)
+    return [sequence(), picture_parameters(), slice_unit] if is_idr else [slice_unit]
 
 
 def number_of(grey):
-    """What a picture of 48 rows and 64 columns says."""
+    """The number that an image of 48 rows and 64 columns encodes."""
     white = np.asarray(grey).reshape(ROWS, 16, COLUMNS, 16).mean(axis=(1, 3)).ravel() > 128
     return int(sum(1 << at for at in range(COLUMNS * ROWS) if white[at]))

@@ -1,4 +1,4 @@
-"""A network camera: RTSP on a socket of this machine, numbered H.264 pictures as RTP between its answers.
+"""A fake network camera: RTSP on a local socket, with numbered H.264 images as RTP between its replies.
 
 Source: RFC 2326, 10 (methods) and 10.12 (RTP inside the connection); RFC 3550, 5.1 (RTP's header); RFC 6184, 5.6 and 5.8
 (one NAL unit in a packet, and in pieces, FU-A), 8.1 (parameter sets in the description); RFC 7617 (Basic).
@@ -21,11 +21,11 @@ CLOCK_HZ = 90_000
 
 
 class RtspCamera:
-    """Sends to one client at a time; `stop` cuts the connection, `start` takes the same port again."""
+    """Sends to one client at a time. `stop` closes the connection, `start` uses the same port again."""
 
     def __init__(self, period_s, user=None):
-        self.began_ns, self.asked, self.port = {}, [], 0  # pictures' times of sending; the methods of each connection
-        self.silent = False  # connected, and sends nothing
+        self.start_ns, self.requests, self.port = {}, [], 0  # send time per image; methods of each connection
+        self.silent = False  # connected, but sends nothing
         self._period_s, self._user, self._number = period_s, user, 0
         self.start()
 
@@ -54,65 +54,65 @@ class RtspCamera:
                     continue
                 with client:
                     client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    self.asked.append([])
+                    self.requests.append([])
                     with suppress(OSError):  # the client went away
-                        Session(client, self._user, self._period_s, self.asked[-1]).run(self._pictures())
+                        ClientConnection(client, self._user, self._period_s, self.requests[-1]).run(self._images())
 
-    def _pictures(self):
-        """(number, NAL units) one a period, None between; a client begins with a picture that can be read alone."""
+    def _images(self):
+        """(number, NAL units) once per period, None between; the first image of a client is an IDR."""
         self._number += -self._number % h264.GROUP
         due_ns = host_time.now_ns()
         while self._running:
             if self.silent or host_time.now_ns() < due_ns:
                 yield None
                 continue
-            units = h264.picture(self._number)
-            self.began_ns[self._number] = host_time.now_ns()
+            units = h264.image(self._number)
+            self.start_ns[self._number] = host_time.now_ns()
             yield self._number, units
             self._number += 1
             due_ns += round(1e9 * self._period_s)
 
 
-class Session:
-    """One client's connection."""
+class ClientConnection:
+    """The connection of one client."""
 
-    def __init__(self, client, user, period_s, asked):
-        self._client, self._user, self._period_s, self._asked = client, user, period_s, asked
-        self._waiting, self._sequence, self._playing = b"", 0, False
+    def __init__(self, client, user, period_s, requests):
+        self._client, self._user, self._period_s, self._requests = client, user, period_s, requests
+        self._received, self._sequence, self._playing = b"", 0, False
 
-    def run(self, pictures):
-        """Answer and, from PLAY to TEARDOWN, send; until either side ends it."""
-        for picture in pictures:
-            while select.select([self._client], [], [], 0 if picture else 0.002)[0]:
-                got = self._client.recv(65536)
-                self._waiting += got
-                if not got or not self._answer_all():
+    def run(self, images):
+        """Reply, and send between PLAY and TEARDOWN, until either side closes."""
+        for image in images:
+            while select.select([self._client], [], [], 0 if image else 0.002)[0]:
+                data = self._client.recv(65536)
+                self._received += data
+                if not data or not self._reply_all():
                     return
-            if picture and self._playing:
-                number, units = picture
+            if image and self._playing:
+                number, units = image
                 for unit in units:
                     self._send(unit, number, last=unit is units[-1])
 
-    def _answer_all(self):
-        while self._waiting:
-            if self._waiting[:1] == b"$":  # the client's RTCP
-                size = 4 + int.from_bytes(self._waiting[2:4].ljust(2, b"\xff"))
-                if len(self._waiting) < size:
+    def _reply_all(self):
+        while self._received:
+            if self._received[:1] == b"$":  # the client's RTCP
+                size = 4 + int.from_bytes(self._received[2:4].ljust(2, b"\xff"))
+                if len(self._received) < size:
                     return True
-                self._waiting = self._waiting[size:]
+                self._received = self._received[size:]
                 continue
-            head, ended, rest = self._waiting.partition(b"\r\n\r\n")
+            head, ended, rest = self._received.partition(b"\r\n\r\n")
             if not ended:
                 return True
-            self._waiting = rest
-            if not self._answer(head.decode().split("\r\n")):
+            self._received = rest
+            if not self._reply(head.decode().split("\r\n")):
                 return False
         return True
 
-    def _answer(self, lines):
+    def _reply(self, lines):
         method = lines[0].split()[0]
         fields = dict(line.split(": ", 1) for line in lines[1:])
-        self._asked.append(method)
+        self._requests.append(method)
         status, head, body = "200 OK", {"CSeq": fields["CSeq"], "Session": "7"}, ""
         if self._user and fields.get("Authorization") != f"Basic {base64.b64encode(self._user.encode()).decode()}":
             status, head["WWW-Authenticate"] = "401 Unauthorized", 'Basic realm="camera"'
@@ -149,7 +149,7 @@ class Session:
 
 
 def description():
-    """SDP: what is sent."""
+    """SDP description of the stream."""
     sets = ",".join(base64.b64encode(unit).decode() for unit in (h264.sequence(), h264.picture_parameters()))
     lines = [
         "v=0",

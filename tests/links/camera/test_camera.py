@@ -1,4 +1,4 @@
-"""Recorded frames to images: whole ones are decoded, anything else is counted."""
+"""Recorded frames to images: complete ones are decoded, others are counted."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ def test_a_frame_is_decoded_in_grey_at_the_records_time(progressive):
     assert camera.refused == 0
 
 
-def test_how_long_the_rows_take_goes_with_the_image():
+def test_an_image_contains_its_readout_time():
     image = Camera(topic="/camera/vehicle", readout_ms=23.5).decode(record(jpeg(48, 64)[1]))
     assert image is not None
     assert image.readout_s == pytest.approx(0.0235)
     assert image.rows_after_s() == pytest.approx(0.0235 / 47)
 
 
-def test_the_size_is_read_before_anything_is_decoded():
+def test_the_size_is_read_without_decoding():
     assert jpeg_size(jpeg(48, 64)[1]) == (64, 48)
-    with pytest.raises(ValueError, match="no JPEG"):
+    with pytest.raises(ValueError, match="not a JPEG"):
         jpeg_size(b"\x89PNG....")
 
 
-def test_a_huge_frame_is_refused_before_it_takes_memory():
+def test_a_huge_frame_is_rejected_before_memory_is_allocated():
     _, data = jpeg()
     at = data.index(b"\xff\xc0") + 5
     huge = data[:at] + b"\xff\xff\xff\xff" + data[at + 4 :]
@@ -58,13 +58,13 @@ def test_a_huge_frame_is_refused_before_it_takes_memory():
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8", b"\xff\xd8\xff\xe0\x00\x00" * 3, jpeg()[1][:-30], b"GIF89a"])
-def test_a_damaged_frame_is_counted_and_left_out(data):
+def test_a_damaged_frame_is_counted_and_skipped(data):
     camera = Camera(topic="/camera/vehicle")
     assert camera.decode(record(data)) is None
     assert camera.refused == 1
 
 
-def test_another_format_or_no_protobuf_is_counted_and_left_out():
+def test_another_format_or_no_protobuf_is_counted_and_skipped():
     camera = Camera(topic="/camera/vehicle")
     assert camera.decode(record(jpeg()[1], "png")) is None
     assert camera.decode(Record("/camera/vehicle", 2, 1, b"\xff\xff\xff")) is None

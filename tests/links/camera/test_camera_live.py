@@ -1,4 +1,4 @@
-"""Cameras live: an MJPEG server on this machine, dying and coming back, and video files."""
+"""Live cameras: an MJPEG server on this machine that stops and restarts, and video files."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pydantic import ValidationError
 
 from flow.link import LinkError
 from links.camera import Camera
-from links.camera.capture import Capture, CaptureSettings, shown
+from links.camera.capture import Capture, CaptureSettings, without_password
 from links.clock import host_time
 from links.recording import decode_compressed_image
 
 PERIOD_S = 0.04
 
 
-def picture(number, size_px=(64, 48)):
+def jpeg(number, size_px=(64, 48)):
     return cv2.imencode(".jpg", np.full((size_px[1], size_px[0], 3), number % 250, np.uint8))[1].tobytes()
 
 
@@ -47,7 +47,7 @@ class Server:
                 number = 0
                 while outer.running:
                     number += 1
-                    data = picture(number)
+                    data = jpeg(number)
                     head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                     try:
                         self.wfile.write(head.encode() + data + b"\r\n")
@@ -82,7 +82,7 @@ def number_of(record):
     return int(np.median(cv2.imdecode(np.frombuffer(decode_compressed_image(record.data).data, np.uint8), 0)))
 
 
-def test_frames_of_a_stream_are_passed_on_untouched_and_stamped_when_they_came(server):
+def test_frames_of_a_stream_are_passed_through_and_stamped_at_reception(server):
     camera = Camera(topic="/camera/vehicle", source=server.url, size_px=(64, 48), latency_s=0.25, fps=1 / PERIOD_S)
     with camera.listen() as records:
         taken = [next(records) for _ in range(8)]
@@ -90,17 +90,17 @@ def test_frames_of_a_stream_are_passed_on_untouched_and_stamped_when_they_came(s
     assert numbers == sorted(set(numbers))
     for number, record in zip(numbers, taken, strict=True):
         frame = decode_compressed_image(record.data)
-        assert frame.data == picture(number)  # JPEG as it was sent
+        assert frame.data == jpeg(number)  # the JPEG that was sent
         assert (frame.frame_id, frame.stamp_ns) == ("camera_vehicle", record.stamp_ns)
         assert record.arrival_ns - record.stamp_ns == 250_000_000
         assert record.topic == "/camera/vehicle"
     assert [r.sequence for r in taken] == list(range(8))
     lateness = [r.arrival_ns - server.sent_ns[n] for n, r in zip(numbers, taken, strict=True)]
-    assert np.median(lateness) < 1e9 * PERIOD_S  # none had been waiting
+    assert np.median(lateness) < 1e9 * PERIOD_S  # none was buffered
     assert camera.decode(taken[0]).grey.shape == (48, 64)
 
 
-def test_what_waited_in_the_connection_is_thrown_away():
+def test_frames_buffered_in_the_connection_are_dropped():
     http = Server(burst=10)
     camera = Camera(topic="/camera/drone", source=http.url, fps=1 / PERIOD_S)
     with camera.listen() as records:
@@ -119,7 +119,7 @@ def test_a_slow_reader_gets_the_newest_frame_and_the_others_are_counted(server):
         assert number_of(next(records)) >= before + 5
 
 
-def test_a_server_that_dies_and_comes_back_is_opened_again(server):
+def test_a_server_that_stops_and_restarts_is_reopened(server):
     camera = Camera(topic="/camera/vehicle", source=server.url, fps=1 / PERIOD_S, timeout_s=1)
     with camera.listen() as records:
         next(records)
@@ -149,7 +149,7 @@ def test_leaving_the_context_ends_a_waiting_reader(server):
     assert ended.is_set()
 
 
-def test_frames_of_another_size_than_the_lens_was_calibrated_for_are_an_error(server):
+def test_frames_of_another_size_than_the_lens_calibration_are_an_error(server):
     camera = Camera(topic="/camera/vehicle", source=server.url, size_px=720)
     with (
         pytest.raises(LinkError, match="64 x 48 pixels, but the lens is calibrated for 720 x 720"),
@@ -168,13 +168,13 @@ def video_file(path, codec, frames=6, fps=25.0):
 
 
 @pytest.mark.parametrize(("name", "codec"), [("a.avi", "MJPG"), ("b.mp4", "mp4v")])
-def test_a_video_file_comes_at_its_own_pace_and_ends(tmp_path, name, codec):
+def test_a_video_file_plays_in_real_time_and_ends(tmp_path, name, codec):
     camera = Camera(topic="/camera/drone", source=str(video_file(tmp_path / name, codec)))
     with camera.listen() as records:
         taken = list(records)
     greys = [int(np.median(camera.decode(r).grey)) for r in taken]
     assert greys == pytest.approx(sorted(greys))
-    assert abs(greys[-1] - 100) < 8  # the last frame came
+    assert abs(greys[-1] - 100) < 8  # the last frame arrived
     assert len(greys) >= 4  # on a busy machine one may be overtaken
     steps = np.diff([r.stamp_ns for r in taken]) / (20e6 * np.diff(greys) / 10)
     assert np.allclose(steps, 1.0, atol=0.35)  # 40 ms for each step of 20 in grey
@@ -193,11 +193,11 @@ def test_a_files_frames_are_stamped_by_its_own_timeline(tmp_path):
     [
         ("/dev/video-none", "there is no /dev/video-none. Is the camera plugged in and in webcam mode"),
         ("missing.mp4", "there is no file missing.mp4.*did you mean /dev/video0 or a URL"),
-        ("http://user:secret@127.0.0.1:9/x", r"http://127.0.0.1:9/x cannot be opened. Does it play elsewhere"),
-        (None, "give `source` to run live"),
+        ("http://user:secret@127.0.0.1:9/x", r"http://127.0.0.1:9/x cannot be opened. Does another player open it"),
+        (None, "set `source` to run live"),
     ],
 )
-def test_a_source_that_cannot_be_opened_is_an_error_that_says_what_to_check(source, words):
+def test_a_source_that_cannot_be_opened_is_an_error_that_names_what_to_check(source, words):
     camera = Camera(topic="/camera/vehicle", source=source, timeout_s=1)
     with pytest.raises(LinkError, match=words) as caught, camera.listen() as records:
         next(records)
@@ -205,16 +205,16 @@ def test_a_source_that_cannot_be_opened_is_an_error_that_says_what_to_check(sour
 
 
 def test_a_file_that_is_no_video_is_an_error(tmp_path):
-    (tmp_path / "no.avi").write_bytes(b"nothing of the kind" * 50)
+    (tmp_path / "no.avi").write_bytes(b"not a video" * 50)
     camera = Camera(topic="/camera/vehicle", source=str(tmp_path / "no.avi"))
     words = r"no.avi cannot be opened. Is `source` the path of a video file"
     with pytest.raises(LinkError, match=words), camera.listen() as records:
         next(records)
 
 
-def test_names_and_passwords_are_not_shown():
-    assert shown("rtsp://crew:pass@192.168.1.9/live") == "rtsp://192.168.1.9/live"
-    assert shown("/dev/video0") == "/dev/video0"
+def test_names_and_passwords_are_not_printed():
+    assert without_password("rtsp://crew:pass@192.168.1.9/live") == "rtsp://192.168.1.9/live"
+    assert without_password("/dev/video0") == "/dev/video0"
 
 
 @pytest.mark.parametrize("setting", [{"fps": 0}, {"latency_s": -0.1}, {"jpeg_quality": 10}, {"timeout_s": 0}])

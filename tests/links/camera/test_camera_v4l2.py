@@ -1,7 +1,7 @@
-"""Webcams on V4L2, which no CI has: OpenCV's V4L2 capture is played by a stand-in that does as its source says.
+"""V4L2 webcams, which CI does not have: a fake of OpenCV's V4L2 capture that follows its source code.
 
-It reads the driver's own answers: a driver that has not the format or size that is asked for sets another; a picture is
-the used part of a buffer, one row of bytes, unless it is to be converted.
+A driver without the requested format or size selects another one. An unconverted image is the used part of a buffer, one
+row of bytes.
 
 Source: OpenCV, modules/videoio/src/cap_v4l.cpp (setProperty, autosetup_capture_mode_v4l2, retrieveFrame).
 """
@@ -17,17 +17,17 @@ import pytest
 
 from flow.link import LinkError
 from links.camera import Camera
-from links.camera.capture import MOST_DAMAGED, Capture, CaptureLost, CaptureSettings
+from links.camera.capture import MAX_DAMAGED, Capture, CaptureLost, CaptureSettings
 from links.clock import host_time
 from links.recording import decode_compressed_image
 
-DEVICE = "/dev/null"  # a device that is there
+DEVICE = "/dev/null"  # a device that exists
 PERIOD_NS = 20_000_000
-CODING_NS = 15_000_000  # to take a picture out of the buffer
+CODING_NS = 15_000_000  # to decode an image from the buffer
 
 
 class Webcam:
-    """What is plugged in: its formats, its only size, what its buffers end with, and its clock."""
+    """The plugged-in camera: its formats, its only size, the padding of its buffers, and its clock."""
 
     def __init__(self, formats=("MJPG", "YUYV"), size_px=(64, 48), padding=b"", real_time=False):
         self.formats, self.size_px, self.padding, self.plugged = formats, size_px, padding, True
@@ -42,16 +42,16 @@ class Webcam:
         else:
             self._now_ns += ns
 
-    def picture(self, number):
+    def image(self, number):
         return np.full((self.size_px[1], self.size_px[0], 3), number % 250, np.uint8)
 
     def jpeg(self, number):
-        whole = cv2.imencode(".jpg", self.picture(number))[1].tobytes()
+        whole = cv2.imencode(".jpg", self.image(number))[1].tobytes()
         return whole[:-40] if number in self.damaged else whole
 
 
 class Video:
-    """cv2.VideoCapture of that webcam."""
+    """cv2.VideoCapture of a Webcam."""
 
     def __init__(self, webcam, source, api, asked):
         assert (source, api) == (DEVICE, cv2.CAP_V4L2)
@@ -82,8 +82,8 @@ class Video:
         webcam = self._webcam
         webcam.wait(CODING_NS if not self._raw else 0)
         if not self._raw:
-            return True, webcam.picture(webcam.number)
-        assert self._format == "MJPG", "a raw picture in another format is no JPEG"
+            return True, webcam.image(webcam.number)
+        assert self._format == "MJPG", "an unconverted image in another format is no JPEG"
         return True, np.frombuffer(webcam.jpeg(webcam.number) + webcam.padding, np.uint8)[None]
 
 
@@ -103,7 +103,7 @@ def camera_of(size_px=(64, 48)):
 
 
 @pytest.mark.parametrize("padding", [b"", b"\0" * 500, b"\0" * 7 + b"old bytes"])
-def test_mjpg_is_handed_through_as_the_cameras_own_jpeg_cut_at_its_end(monkeypatch, padding):
+def test_mjpg_is_passed_through_without_padding(monkeypatch, padding):
     webcam = plug_in(monkeypatch, padding=padding)
     capture = capture_of(webcam)
     for number in (1, 2, 3):
@@ -122,52 +122,52 @@ def test_mjpg_is_handed_through_as_the_cameras_own_jpeg_cut_at_its_end(monkeypat
     assert not video.isOpened()
 
 
-def test_a_camera_without_mjpg_is_opened_again_decoded_and_its_pictures_are_coded(monkeypatch):
+def test_a_camera_without_mjpg_is_reopened_with_decoding_and_its_images_are_encoded(monkeypatch):
     webcam = plug_in(monkeypatch, formats=("YUYV",))
     capture = capture_of(webcam)
     first, second = capture.read(), capture.read()
-    assert first.arrival_ns == PERIOD_NS  # when it came, not when it was coded
+    assert first.arrival_ns == PERIOD_NS  # reception, not the end of encoding
     assert second.arrival_ns == 2 * PERIOD_NS + CODING_NS
     raw, decoded = webcam.opened
-    assert not raw.isOpened()  # a device is one's alone
+    assert not raw.isOpened()  # a device can be opened once
     assert cv2.CAP_PROP_CONVERT_RGB not in decoded.asked
     grey = cv2.imdecode(np.frombuffer(second.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert grey.shape == (48, 64)
     assert np.abs(grey.astype(int) - 2).max() <= 2
 
 
-def test_without_a_size_the_camera_keeps_its_own(monkeypatch):
+def test_without_a_size_the_camera_keeps_its_default(monkeypatch):
     webcam = plug_in(monkeypatch)
     capture_of(webcam, size_px=None).read()
     assert not {cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT} & set(webcam.opened[0].asked)
 
 
-def test_a_damaged_picture_is_left_out_and_counted_and_the_camera_stays_open(monkeypatch):
-    """The first one after opening is damaged with many cameras: to open it again would never end."""
+def test_a_damaged_image_is_skipped_and_counted_and_the_camera_stays_open(monkeypatch):
+    """With many cameras the first image after opening is damaged: reopening would never end."""
     webcam, counters = plug_in(monkeypatch), Counter()
-    webcam.damaged = set(range(1, 4 * MOST_DAMAGED, 2))
+    webcam.damaged = set(range(1, 4 * MAX_DAMAGED, 2))
     capture = capture_of(webcam, counters)
     assert [capture.read().jpeg for _ in range(20)] == [webcam.jpeg(number) for number in range(2, 42, 2)]
     assert counters["damaged"] == 20
     assert len(webcam.opened) == 1
 
 
-def test_a_camera_that_gives_damaged_pictures_only_is_lost(monkeypatch):
+def test_a_camera_that_delivers_only_damaged_images_is_lost(monkeypatch):
     webcam = plug_in(monkeypatch)
     webcam.damaged = set(range(1000))
-    with pytest.raises(CaptureLost, match="/dev/null gives frames that are no JPEG"):
+    with pytest.raises(CaptureLost, match="/dev/null delivers frames that are not JPEG"):
         capture_of(webcam).read()
-    assert webcam.number == MOST_DAMAGED + 1
+    assert webcam.number == MAX_DAMAGED + 1
 
 
-def test_a_camera_of_another_size_is_an_error_in_words(monkeypatch):
+def test_a_camera_of_another_size_is_an_error(monkeypatch):
     plug_in(monkeypatch, real_time=True)
     words = "frames of 64 x 48 pixels, but the lens is calibrated for 720 x 720: set the camera's mode"
     with pytest.raises(LinkError, match=words), camera_of(size_px=(720, 720)).listen() as records:
         next(records)
 
 
-def test_a_camera_that_is_unplugged_is_opened_again_when_it_is_back(monkeypatch):
+def test_an_unplugged_camera_is_reopened_when_it_returns(monkeypatch):
     webcam, camera = plug_in(monkeypatch, real_time=True), camera_of()
     with camera.listen() as records:
         first = next(records)
@@ -185,7 +185,7 @@ def test_a_camera_that_is_unplugged_is_opened_again_when_it_is_back(monkeypatch)
         assert decode_compressed_image(record.data).stamp_ns == record.stamp_ns
 
 
-def test_a_camera_that_another_program_holds_is_an_error_that_says_what_to_check(monkeypatch):
+def test_a_camera_used_by_another_program_is_an_error_that_names_what_to_check(monkeypatch):
     plug_in(monkeypatch).plugged = False
     words = "/dev/null cannot be opened as a camera. Is the camera plugged in.*does another program use it"
     with pytest.raises(LinkError, match=words), camera_of().listen() as records:

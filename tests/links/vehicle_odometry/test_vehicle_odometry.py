@@ -1,4 +1,4 @@
-"""Recorded vehicle odometry, and a configuration that wires it over a recording that has none."""
+"""Recorded vehicle odometry, and a configuration with it on a recording without it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flow.graph import load_graph
 from flow.link import Record
 from flow.replay import replay
 from flow.stage import output_ports
-from links.simulated.path import Path as Way
+from links.simulated.path import Path as SimulatedPath
 from links.simulated.path import Waypoint
 from links.simulated.vehicle_odometry import VehicleOdometry as Simulated
 from links.simulated.vehicle_odometry import VehicleOdometrySettings
@@ -94,14 +94,14 @@ def changed(row: int, column: int, value: float) -> list[float]:
         ),
     ],
 )
-def test_what_is_no_pose_is_counted_and_left_out(data: bytes) -> None:
+def test_a_record_without_a_valid_pose_is_counted_and_skipped(data: bytes) -> None:
     odometry = VehicleOdometry()
     assert odometry.decode(record(data)) is None
     assert odometry.refused == 1
 
 
-def test_the_simulated_vehicle_is_understood_with_its_covariance() -> None:
-    bend = Way(
+def test_the_simulated_odometry_is_decoded_with_its_covariance() -> None:
+    bend = SimulatedPath(
         waypoints=(
             Waypoint(t_s=0, xyz_m=(0, 0, 0), yaw_deg=30),
             Waypoint(t_s=4, xyz_m=(15, 9, 0), yaw_deg=70),
@@ -120,7 +120,7 @@ def test_the_simulated_vehicle_is_understood_with_its_covariance() -> None:
     assert motion.R_start_vehicle == pytest.approx(rotation_z(math.radians(40)), abs=0.03)
 
 
-def test_a_recording_without_odometry_leaves_the_source_silent(tmp_path: Path) -> None:
+def test_a_recording_without_odometry_gives_no_messages(tmp_path: Path) -> None:
     overlay = tmp_path / "with_odometry.yaml"
     source = "odometry: {use: links.vehicle_odometry.VehicleOdometry}"
     overlay.write_text(f"links: {{viewer: null, {source}}}\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The vehicle's odometry live, on real loopback sockets."""
+"""Live vehicle odometry on loopback sockets."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_a_pose_arrives_stamped_by_its_age_and_decodes(port):
     assert motion.xyz_start_m.tolist() == [1.0, 2.0, 3.0]
 
 
-def test_a_pose_that_is_read_late_did_not_arrive_late(port):
-    """The kernel begins to stamp a moment after it was asked to; where the wall clock was set it is tried again, too."""
+def test_a_pose_that_is_read_late_has_its_true_arrival(port):
+    """The kernel starts to stamp with a delay, hence several attempts; also for a step of the wall clock."""
     with VehicleOdometry(port=port).listen() as records:
         for _ in range(5):
             send(port, POSE)
@@ -54,7 +54,7 @@ def test_a_pose_that_is_read_late_did_not_arrive_late(port):
         assert late_ns < 200_000_000
 
 
-def test_others_are_ignored_and_counted(port):
+def test_other_senders_are_ignored_and_counted(port):
     odometry = VehicleOdometry(port=port, sender="127.0.0.1")
     with odometry.listen() as records:
         send(port, POSE, POSE, host="127.0.0.2")
@@ -75,21 +75,21 @@ def test_others_are_ignored_and_counted(port):
         b'{"age_s": []}',
     ],
 )
-def test_an_age_that_cannot_be_true_or_is_too_great_is_none(data):
+def test_an_invalid_or_too_large_age_is_none(data):
     assert age_s(data) is None
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"7", b"\xff", b"{}"])
-def test_what_says_no_age_is_new_and_decoding_looks_at_the_rest(data):
+def test_a_datagram_without_age_has_age_zero(data):
     assert age_s(data) == 0.0
 
 
-def test_a_pose_that_says_it_is_old_is_left_out_and_counted(port):
+def test_an_old_pose_is_skipped_and_counted(port):
     odometry = VehicleOdometry(port=port)
     with odometry.listen() as records:
         send(port, POSE | {"age_s": 1.5}, POSE)
         assert next(records).data == json.dumps(POSE).encode()
-    assert odometry.counters["too old, or of no age"] == 1
+    assert odometry.counters["age_s invalid or too large"] == 1
 
 
 def test_leaving_the_context_ends_a_waiting_listener(port):
@@ -105,8 +105,8 @@ def test_leaving_the_context_ends_a_waiting_listener(port):
     assert ended.wait(60)
 
 
-def test_what_cannot_be_opened_is_an_error_that_says_what_to_check(port):
-    with pytest.raises(LinkError, match="give `port` to hear"):
+def test_a_port_that_cannot_be_opened_is_an_error_that_names_what_to_check(port):
+    with pytest.raises(LinkError, match="set `port` to receive"):
         VehicleOdometry().listen()
     with (
         VehicleOdometry(port=port).listen(),
@@ -116,6 +116,6 @@ def test_what_cannot_be_opened_is_an_error_that_says_what_to_check(port):
         pass
 
 
-def test_beyond_loopback_the_sender_is_named():
-    with pytest.raises(ValidationError, match="sender: say who tells"):
+def test_beyond_loopback_the_sender_is_required():
+    with pytest.raises(ValidationError, match="sender: set the odometry's sender"):
         VehicleOdometry(bind="0.0.0.0", port=5000)

@@ -1,4 +1,4 @@
-"""MAVLink: what the drone's autopilot says, and the poses it is told."""
+"""MAVLink: messages from the drone's autopilot, and poses sent to it."""
 
 from links.mavlink.autopilot import Autopilot
 

@@ -1,10 +1,11 @@
-"""The drone's autopilot: MAVLink frames in, one a record, and our poses out to it.
+"""The drone's autopilot as a link: MAVLink frames in, one per record, and poses out.
 
-What it says becomes messages on the host's timeline; live and in replay alike, by the same decoder. Poses go out only
-while they are good (`gate.py`), in the frames and with the NaNs that its kind wants (`pose_frames.py`), and loudly not
-at all otherwise (`speaker.py`). Frames are authenticated live, where `signing_key` is set; a recording's are not.
+Its frames are decoded to messages on the host's timeline, live and in replay by the same decoder. Only poses that pass
+the gate (`gate.py`) are sent, as the messages of the autopilot's profile (`pose_messages.py`); when sending stops, the
+reason is reported by STATUSTEXT (`pose_sender.py`). Live frames are authenticated if `signing_key` is set; recorded
+frames are not.
 
-Source: https://mavlink.io/en/; what each kind of autopilot takes: `profiles.py`.
+Source: https://mavlink.io/en/; requirements of each autopilot: `profiles.py`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from links.mavlink.autopilot_session import AutopilotSession
 from links.mavlink.frame_decoder import FrameDecoder
 from links.mavlink.gate import PoseLimits
 from links.mavlink.origin import GlobalOrigin, OriginSender
-from links.mavlink.pose_sender import Kind, PoseSender
+from links.mavlink.pose_sender import PoseMessage, PoseSender
 from links.mavlink.profiles import PROFILES, ProfileName
 from links.mavlink.readers import AutopilotMessage
 from links.mavlink.signing import Signer
@@ -32,7 +33,7 @@ from links.mavlink.transport.connection import Udp, parse_connection
 from links.mavlink.transport.stream_connection import open_connection
 from stages.messages import RelativePose
 
-VISUAL_INERTIAL_ODOMETRY = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY: who we are
+VISUAL_INERTIAL_ODOMETRY = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY: our component id
 SENT_TOPIC = "/autopilot/tx"
 
 
@@ -45,14 +46,14 @@ class AutopilotSettings(SourceSettings):
     clock_drift_limit_ppm: float = Field(100.0, ge=0, le=10_000)
     clock_jump_limit_s: float = Field(5.0, gt=0, le=3600)
     connection: str | None = None  # udpin:127.0.0.1:14550, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD
-    sender: IPv4Address | None = None  # the autopilot's address, where udpin listens beyond loopback
+    sender: IPv4Address | None = None  # the autopilot's address, required when udpin listens beyond loopback
     profile: ProfileName = "ardupilot"
-    send: tuple[Kind, ...] = ("odometry",)  # of each good pose
+    send: tuple[PoseMessage, ...] = ("odometry",)  # messages per pose
     limits: PoseLimits = PoseLimits()
-    own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as part of its vehicle
+    own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as a component of its vehicle
     own_component_id: int = Field(VISUAL_INERTIAL_ODOMETRY, ge=1, le=255)
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
-    global_origin: GlobalOrigin | None = None  # given to an autopilot that has none
+    global_origin: GlobalOrigin | None = None  # sent to an autopilot without an origin
 
     @property
     def own_id(self) -> tuple[int, int]:
@@ -69,26 +70,26 @@ class AutopilotSettings(SourceSettings):
     @model_validator(mode="after")
     def _fits_together(self) -> AutopilotSettings:
         if len(set(self.send)) != len(self.send):
-            raise ValueError("send: each message once")
+            raise ValueError("send: each message at most once")
         if {"odometry", "vision_position_estimate"} <= set(self.send):
             raise ValueError("send: odometry or vision_position_estimate, not both: it would be fused twice")
         for kind in self.send:
-            reason = PROFILES[self.profile].refuses.get(kind)
+            reason = PROFILES[self.profile].unsupported.get(kind)
             if reason:
-                raise ValueError(f"send: {kind} is not for profile {self.profile}: {reason}")
+                raise ValueError(f"send: {kind} is not supported by profile {self.profile}: {reason}")
         if self.own_id == (self.system_id, self.component_id):
-            raise ValueError("own_component_id: we cannot be the autopilot itself")
+            raise ValueError("own_component_id: must differ from the autopilot's component_id")
         if self.connection is not None and self.connection.startswith("udpin:"):
             host = IPv4Address(parse_connection(self.connection).host)
             if self.sender is None and not host.is_loopback:
                 raise ValueError(
-                    f"sender: give the autopilot's address when listening on {host}, so that others are not heard"
+                    f"sender: set the autopilot's address when listening on {host}, so that other senders are ignored"
                 )
         return self
 
 
 class Autopilot(Source[AutopilotSettings]):
-    """One autopilot, chosen by system and component id. Without `connection` it is read from recordings alone."""
+    """One autopilot, selected by system and component id. Without `connection` it is read only from recordings."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"pose"})
 
@@ -96,30 +97,30 @@ class Autopilot(Source[AutopilotSettings]):
         super().__init__(settings, **values)
         settings = self.settings
         clock = DeviceClock(settings.clock_drift_limit_ppm, round(1e9 * settings.clock_jump_limit_s))
-        self._stream = FrameDecoder((settings.system_id, settings.component_id), settings.own_id, clock)
+        self._decoder = FrameDecoder((settings.system_id, settings.component_id), settings.own_id, clock)
         self._session: AutopilotSession | None = None
-        self._signer: Signer | None = None  # of all sessions
-        self._missed: int = 0
+        self._signer: Signer | None = None  # used by all sessions
+        self._not_connected: int = 0
 
     def decode(self, record: Record) -> AutopilotMessage | None:
-        """The message of one frame; None when it says nothing of use here or is refused (see `counters`)."""
-        return self._stream.decode(record)
+        """The message of one frame; None for an unused or refused frame (see `counters`)."""
+        return self._decoder.decode(record)
 
     def on_pose(self, pose: RelativePose) -> None:
-        """Send a pose if it is good. Before the link is open, and in replay, nothing is sent."""
+        """Send a pose if the gate accepts it. Nothing is sent before the link is open, or in replay."""
         session = self._session
         if session is None or session.closed:
-            self._missed += 1
+            self._not_connected += 1
         else:
-            session.pose(pose)
+            session.send_pose(pose)
 
     def sent(self) -> Iterable[Record]:
-        """See Link: what went out, heartbeats and all."""
+        """See Link: all sent frames, including heartbeats."""
         session = self._session
         return () if session is None else session.sent()
 
     def listen(self) -> AbstractContextManager[Iterator[Record]]:
-        """Open the connection: `with autopilot.listen() as records`. LinkError says what to check."""
+        """Open the connection: `with autopilot.listen() as records`. Raises LinkError."""
         return self._listen()
 
     @contextmanager
@@ -149,40 +150,40 @@ class Autopilot(Source[AutopilotSettings]):
 
     @property
     def port(self) -> int | None:
-        """Our own UDP port while listening; None otherwise."""
+        """Local UDP port while listening; None otherwise."""
         connection = None if self._session is None else self._session.connection
         return connection.port if isinstance(connection, Udp) else None
 
     @property
     def status(self) -> str | None:
-        """See Link: the line is gone, or nothing is heard on it."""
+        """See Link: the connection is lost, the autopilot is silent, or replies are late."""
         return None if self._session is None else self._session.status
 
     @property
     def counters(self) -> dict[str, int]:
         """Totals since the start: decoded, lost, refused by reason; live: sent, not sent, received, foreign."""
-        stream = self._stream
-        refused = {f"refused: {reason}": count for reason, count in dict(stream.refused).items()}
+        decoder = self._decoder
+        refused = {f"refused: {reason}": count for reason, count in dict(decoder.refused).items()}
         decoded = {
-            "decoded": stream.decoded,
-            "of no use here": stream.unused,
-            "lost": stream.lost,
-            "clock restarts": stream.clock.restarts,
-            "timesync replies": stream.clock.round_trips,
-            **_known_of(stream.clock),
+            "decoded": decoder.decoded,
+            "unused": decoder.unused,
+            "lost": decoder.lost,
+            "clock restarts": decoder.clock.restarts,
+            "timesync replies": decoder.clock.round_trips,
+            **_clock_counters(decoder.clock),
             **refused,
         }
         live = {} if self._session is None else self._session.counters
-        missed = {"poses while not connected": self._missed} if self._missed else {}
-        return decoded | live | missed
+        not_connected = {"poses while not connected": self._not_connected} if self._not_connected else {}
+        return decoded | live | not_connected
 
 
-def _known_of(clock: DeviceClock) -> dict[str, int]:
-    """What is known of the autopilot's clock, once it is."""
-    told: dict[str, int] = {}
+def _clock_counters(clock: DeviceClock) -> dict[str, int]:
+    """State of the estimate of the autopilot's clock, as far as it is known."""
+    counters: dict[str, int] = {}
     if clock.uncertainty_ns is not None:
-        told["clock uncertainty [us]"] = clock.uncertainty_ns // 1000
+        counters["clock uncertainty [us]"] = clock.uncertainty_ns // 1000
     if clock.drift.ppm is not None:
         drift_ppm, sigma_ppm = clock.drift.ppm
-        told |= {"clock drift [ppb]": round(1e3 * drift_ppm), "clock drift's sigma [ppb]": round(1e3 * sigma_ppm)}
-    return told
+        counters |= {"clock drift [ppb]": round(1e3 * drift_ppm), "clock drift sigma [ppb]": round(1e3 * sigma_ppm)}
+    return counters

@@ -1,6 +1,6 @@
-"""Is the autopilot's link as it must be: heartbeat, clock, rates, losses, and what its EKF says it fuses.
+"""Preflight checks of the autopilot: heartbeat, losses, clock, rates, EKF status and parameters.
 
-Source: https://mavlink.io/en/messages/common.html; ArduPilot and PX4 by `links.mavlink.profiles`; the limits are ours.
+Source: https://mavlink.io/en/messages/common.html; parameters: `links.mavlink.profiles`; the limits are ours.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from flow.graph import Graph
 from flow.link import LinkError, Record, Source
 from links.mavlink.autopilot import Autopilot
 from links.mavlink.framing import header, parse_frame
-from links.mavlink.parameters import Answers, ask_parameters
+from links.mavlink.parameters import ParameterValues, ask_parameters
 from links.mavlink.profiles import PROFILES, ProfileName, findings
 from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
@@ -24,15 +24,15 @@ from links.preflight.record_statistics import RecordStatistics
 from stages.messages import AutopilotEstimator, AutopilotStatus, RelativePose
 from stages.odometry.drone.trajectory import BRIDGED_NS
 
-KINDS = {"ardupilot": 3, "px4": 12}  # MAV_AUTOPILOT
+MAV_AUTOPILOT = {"ardupilot": 3, "px4": 12}
 HEARTBEAT_GAP_S = 3.0
-SOME_LOSS, WORST_LOSS = 0.01, 0.2
-UNSURE_MS, USELESS_MS = 10.0, 50.0  # at 5 m/s 10 ms are 5 cm
-LEAST_HZ, GOOD_HZ = 4.0, 10.0
-MOST_GAP_S = 1e-9 * BRIDGED_NS
-NEAR_GATE = 0.5  # an innovation test ratio; at 1 the EKF refuses what it is told
-STEADY = "is the radio too far, or too slow for what is asked of it?"
-ASK = "ask for more (SRn_EXTRA1, SRn_POSITION of that port; PX4: its mavlink mode)"
+WARN_LOSS, FAIL_LOSS = 0.01, 0.2  # share of frames
+WARN_MS, FAIL_MS = 10.0, 50.0  # clock uncertainty; at 5 m/s, 10 ms are 5 cm
+MIN_HZ, GOOD_HZ = 4.0, 10.0
+MAX_GAP_S = 1e-9 * BRIDGED_NS
+WARN_RATIO = 0.5  # innovation test ratio; above 1 the EKF rejects the measurement
+LINK_HINT = "is the radio out of range, or too slow for the requested messages?"
+RATE_HINT = "increase its rate (SRn_EXTRA1, SRn_POSITION of that port; PX4: its mavlink mode)"
 
 
 class AutopilotObservation(Observation):
@@ -76,11 +76,13 @@ class AutopilotChecks(LinkChecks):
     def check_configuration(self, graph: Graph) -> Iterator[CheckResult]:
         """An autopilot is optional; one that gets no pose is reported."""
         if not declares(graph, Autopilot):
-            yield warning("autopilot", "not in this configuration: nobody is told the pose, and the drone says nothing")
+            yield warning("autopilot", "not in this configuration: no pose is sent, and no telemetry is received")
         elif not any(
             e.message is RelativePose and issubclass(graph.nodes[e.consumer].cls, Autopilot) for e in graph.edges
         ):
-            yield warning("autopilot pose", "not wired (inputs: {pose: fuse.relative_pose}): the drone is told no pose")
+            yield warning(
+                "autopilot pose", "not wired (inputs: {pose: fuse.relative_pose}): no pose is sent to the drone"
+            )
 
     def check_source(self, source: ObservedSource, observations: Observations) -> Iterator[CheckResult]:
         """See LinkChecks."""
@@ -90,7 +92,7 @@ class AutopilotChecks(LinkChecks):
         """The parameters of each autopilot that sent anything."""
         for source in observations.of(Autopilot):
             if not observations.live:
-                yield warning(f"{source.name} parameters", "a recording does not tell them: not checked")
+                yield warning(f"{source.name} parameters", "not in a recording: not checked")
             elif isinstance(source.link, Autopilot) and source.observation.records.count:
                 yield _parameters(source.name, source.link)
 
@@ -117,18 +119,16 @@ def _silent(source: ObservedSource, observation: AutopilotObservation, who: str)
     name = f"{source.name} heartbeat"
     if observation.others:
         others = ", ".join(f"system {s} component {c}" for s, c in observation.others)
-        return fail(name, f"none from {who}, but {others} speak here: set system_id and component_id")
+        return fail(name, f"none from {who}, but from {others}: set system_id and component_id")
     if sum(kind.count for kind in observation.kinds.values()):
-        return fail(
-            name, f"none from {who}, though it sends other messages: is its link set to MAVLink 2, is it booting?"
-        )
+        return fail(name, f"none from {who}, but other messages: is its link set to MAVLink 2, is it booting?")
     unsigned = source.counters.get("not signed with our key", 0)
     if unsigned:
-        return fail(name, f"{unsigned} frames came that are not signed with our key: check signing_key on both sides")
+        return fail(name, f"{unsigned} frames without a valid signature: check signing_key on both sides")
     old = source.counters.get("signed with our key, but not new", 0)
     if old:
-        return fail(name, f"{old} frames came that are signed with an old time: does it hear us? Check both directions")
-    return fail(name, source.no_data_reason if source.status else f"no word from {who}: {source.no_data_reason}")
+        return fail(name, f"{old} frames signed with an old time: does it receive our frames? Check both directions")
+    return fail(name, source.no_data_reason if source.status else f"no frame from {who}: {source.no_data_reason}")
 
 
 def _heartbeat(
@@ -136,100 +136,108 @@ def _heartbeat(
 ) -> CheckResult:
     name, beats = f"{source.name} heartbeat", observation.kinds["HEARTBEAT"]
     silent_s = beats.longest_silence_s(source.end_ns)
-    wanted = KINDS[link.settings.profile]
+    expected = MAV_AUTOPILOT[link.settings.profile]
     if (
         observation.autopilot is not None
-        and observation.autopilot in KINDS.values()
-        and observation.autopilot != wanted
+        and observation.autopilot in MAV_AUTOPILOT.values()
+        and observation.autopilot != expected
     ):
-        says = next(kind for kind, number in KINDS.items() if number == observation.autopilot)
-        return fail(name, f"it says it is {says}, the configuration {link.settings.profile}: set profile: {says}")
+        reported = next(kind for kind, number in MAV_AUTOPILOT.items() if number == observation.autopilot)
+        return fail(
+            name, f"the autopilot is {reported}, the configuration has {link.settings.profile}: set profile: {reported}"
+        )
     if status.failsafe:
-        return fail(name, "it says critical, emergency or termination: look at its own messages")
+        return fail(name, "its state is critical, emergency or termination: read its own messages")
     if source.live and status.armed:
         return fail(name, "it is armed: disarm it before a preflight")
     if source.live and silent_s > HEARTBEAT_GAP_S:
         return fail(name, f"none for {silent_s:.1f} s: check the radio and its range")
-    rate = "one" if beats.count == 1 else f"{beats.rate_hz:.1f} a second"
-    if observation.autopilot not in KINDS.values():
-        return warning(name, f"{rate}, of MAV_AUTOPILOT {observation.autopilot}: only ArduPilot and PX4 are known")
+    rate = "one heartbeat" if beats.count == 1 else f"{beats.rate_hz:.1f} Hz"
+    if observation.autopilot not in MAV_AUTOPILOT.values():
+        return warning(name, f"{rate}, of MAV_AUTOPILOT {observation.autopilot}: only ArduPilot and PX4 are supported")
     return ok(name, f"{rate}, {link.settings.profile}" + (", armed" if status.armed else ", disarmed"))
 
 
 def _losses(source: ObservedSource) -> CheckResult:
     name, counters = f"{source.name} frames", source.counters
-    lost, came = counters.get("lost", 0), max(counters.get("decoded", 0) + counters.get("of no use here", 0), 1)
+    lost, received = counters.get("lost", 0), max(counters.get("decoded", 0) + counters.get("unused", 0), 1)
     foreign = counters.get("from other senders", 0)
-    share = lost / (lost + came)
-    text = f"{lost} of {lost + came} lost" + (f", {foreign} datagrams from other senders ignored" if foreign else "")
-    if share > WORST_LOSS:
-        return fail(name, f"{text}: is the line too slow for what is asked of it, or the radio too far?")
-    return warning(name, text) if share > SOME_LOSS or foreign else ok(name, text)
+    share = lost / (lost + received)
+    text = f"{lost} of {lost + received} lost" + (
+        f", {foreign} datagrams from other senders ignored" if foreign else ""
+    )
+    if share > FAIL_LOSS:
+        return fail(name, f"{text}: is the line too slow for the requested messages, or the radio out of range?")
+    return warning(name, text) if share > WARN_LOSS or foreign else ok(name, text)
 
 
 def _clock(source: ObservedSource, status: AutopilotStatus) -> CheckResult:
-    """TIMESYNC: the offset, and by how much it may be wrong at most."""
+    """Clock offset by TIMESYNC, and the bound of its error."""
     name = f"{source.name} clock"
     restarts = source.counters.get("clock restarts", 0)
     if restarts:
-        return fail(name, f"its clock began anew {restarts} times: did it reboot, or do two autopilots share one id?")
+        return fail(name, f"its clock was reset {restarts} times: did it reboot, or do two autopilots share one id?")
     if status.clock_offset_ns is None:
-        return fail(name, "no message carried its time: ask for ATTITUDE")
+        return fail(name, "no message has a time stamp: request ATTITUDE")
     if status.clock_uncertainty_ns is None:
-        named = source.counters.get("refused: timesync for another", 0)
-        why = "does it hear us (both ways)?" if not named else f"{named} name another: own_system_id, own_component_id?"
-        return warning(name, f"no TIMESYNC reply: a constant delay of the link stays unknown; {why}")
-    unsure_ms = 1e-6 * status.clock_uncertainty_ns
-    text = f"offset {1e-9 * status.clock_offset_ns:.3f} s to its time since boot, known to {unsure_ms:.1f} ms"
+        foreign = source.counters.get("refused: TIMESYNC for another component", 0)
+        why = (
+            "does it receive our frames?"
+            if not foreign
+            else f"{foreign} were for another component: check own_system_id, own_component_id"
+        )
+        return warning(name, f"no TIMESYNC reply: a constant delay of the link is unknown; {why}")
+    error_ms = 1e-6 * status.clock_uncertainty_ns
+    text = f"offset {1e-9 * status.clock_offset_ns:.3f} s to its time since boot, +- {error_ms:.1f} ms"
     if status.clock_drift_ppm is not None and status.clock_drift_sigma_ppm is not None:
-        text += f", drifting by {status.clock_drift_ppm:.1f} +- {status.clock_drift_sigma_ppm:.1f} ppm"
-    if unsure_ms > USELESS_MS:
-        return fail(name, f"{text}: the link is too slow or too full; lower its rates or use a wire")
+        text += f", drift {status.clock_drift_ppm:.1f} +- {status.clock_drift_sigma_ppm:.1f} ppm"
+    if error_ms > FAIL_MS:
+        return fail(name, f"{text}: the link is too slow or overloaded; lower its rates or use a cable")
     return (
-        warning(name, f"{text}: at 5 m/s that is {5 * unsure_ms / 10:.0f} cm")
-        if unsure_ms > UNSURE_MS
-        else ok(name, text)
+        warning(name, f"{text}: at 5 m/s that is {5 * error_ms / 10:.0f} cm") if error_ms > WARN_MS else ok(name, text)
     )
 
 
 def _rates(source: ObservedSource, observation: AutopilotObservation) -> CheckResult:
-    """How often it tells what we need; a rate hides gaps, so the longest is looked at, too."""
+    """Rates of the messages that grd needs, and their longest gaps."""
     name = f"{source.name} rates"
 
     def hz(kind: str) -> float:
-        arrivals: RecordStatistics = observation.kinds[kind]
-        return 0.0 if math.isnan(arrivals.rate_hz) else arrivals.rate_hz
+        rate_hz = observation.kinds[kind].rate_hz
+        return 0.0 if math.isnan(rate_hz) else rate_hz
 
     def gap(what: str, *kinds: str) -> str | None:
         gap_s = min(observation.kinds[kind].longest_silence_s(source.end_ns) for kind in kinds)
         return (
-            f"{text}; no {what} for {gap_s:.1f} s, {MOST_GAP_S:g} s at most: {STEADY}" if gap_s > MOST_GAP_S else None
+            f"{text}; no {what} for {gap_s:.1f} s, at most {MAX_GAP_S:g} s allowed: {LINK_HINT}"
+            if gap_s > MAX_GAP_S
+            else None
         )
 
     kinds = ("ATTITUDE", "ODOMETRY", "LOCAL_POSITION_NED")
     attitude, odometry, position = (hz(kind) for kind in kinds)
     text = ", ".join(f"{kind} {hz(kind):.0f} Hz" for kind in kinds)
-    if max(attitude, odometry) < LEAST_HZ:
-        return fail(name, f"{text}: its attitude is needed at {GOOD_HZ:.0f} Hz or more: {ASK}")
-    turned = gap("attitude", "ATTITUDE", "ODOMETRY")
-    if turned is not None:
-        return fail(name, turned) if source.live else warning(name, turned)
-    if max(odometry, position) < LEAST_HZ:
+    if max(attitude, odometry) < MIN_HZ:
+        return fail(name, f"{text}: attitude is needed at {GOOD_HZ:.0f} Hz or more: {RATE_HINT}")
+    attitude_gap = gap("attitude", "ATTITUDE", "ODOMETRY")
+    if attitude_gap is not None:
+        return fail(name, attitude_gap) if source.live else warning(name, attitude_gap)
+    if max(odometry, position) < MIN_HZ:
         return warning(
-            name, f"{text}: without its odometry the pose ends where the LiDAR does not see the drone: {ASK}"
+            name, f"{text}: without odometry there is no pose while the LiDAR does not measure the drone: {RATE_HINT}"
         )
-    moved = gap("odometry or position", "ODOMETRY", "LOCAL_POSITION_NED")
-    if moved is not None:
-        return warning(name, moved)
+    position_gap = gap("odometry or position", "ODOMETRY", "LOCAL_POSITION_NED")
+    if position_gap is not None:
+        return warning(name, position_gap)
     slow = max(attitude, odometry) < GOOD_HZ or max(odometry, position) < GOOD_HZ
-    return warning(name, f"{text}: slow; {ASK}") if slow else ok(name, text)
+    return warning(name, f"{text}: low rate; {RATE_HINT}") if slow else ok(name, text)
 
 
 def _estimate(name: str, estimators: Sequence[AutopilotEstimator]) -> CheckResult:
-    """What the EKF says of itself, as told last."""
+    """Newest status of the EKF."""
     name = f"{name} estimate"
     if not estimators:
-        return warning(name, "its EKF does not report (EKF_STATUS_REPORT, ESTIMATOR_STATUS): " + ASK)
+        return warning(name, "no EKF status (EKF_STATUS_REPORT, ESTIMATOR_STATUS): " + RATE_HINT)
     newest = estimators[-1]
     ratios = {
         "velocity": newest.velocity_ratio,
@@ -237,17 +245,17 @@ def _estimate(name: str, estimators: Sequence[AutopilotEstimator]) -> CheckResul
         "height": newest.height_ratio,
         "compass": newest.compass_ratio,
     }
-    refused = [f"{what} ({ratio:.1f})" for what, ratio in ratios.items() if ratio > 1]
+    rejected = [f"{what} ({ratio:.1f})" for what, ratio in ratios.items() if ratio > 1]
     if not newest.attitude_good:
-        return fail(name, "its EKF has no attitude yet: keep it still and wait, then look at its own messages")
-    if refused:
-        return fail(name, f"its EKF refuses {', '.join(refused)}: is another source wrong, as its compass or GPS?")
+        return fail(name, "its EKF has no attitude yet: keep it still and wait, then read its own messages")
+    if rejected:
+        return fail(name, f"its EKF rejects {', '.join(rejected)}: is another sensor wrong, such as compass or GPS?")
     if newest.constant_position or not newest.position_good:
-        return warning(name, "attitude good, no position: right before poses are sent; look again once grd run sends")
-    near = [f"{what} ({ratio:.1f})" for what, ratio in ratios.items() if ratio > NEAR_GATE]
+        return warning(name, "attitude good, no position: normal before poses are sent; check again when grd run sends")
+    near = [f"{what} ({ratio:.1f})" for what, ratio in ratios.items() if ratio > WARN_RATIO]
     if near:
-        return warning(name, f"{', '.join(near)} nearly refused by its EKF")
-    return ok(name, "attitude and position good, nothing near its gates")
+        return warning(name, f"{', '.join(near)} close to rejection by its EKF")
+    return ok(name, "attitude and position good, all test ratios small")
 
 
 def _parameters(name: str, link: Autopilot) -> CheckResult:
@@ -257,14 +265,14 @@ def _parameters(name: str, link: Autopilot) -> CheckResult:
         return fail(f"{name} parameters", str(error))
 
 
-def parameter_check(name: str, profile: ProfileName, answers: Answers) -> CheckResult:
-    """One result that names every parameter that is wrong or did not answer."""
+def parameter_check(name: str, profile: ProfileName, received: ParameterValues) -> CheckResult:
+    """One result that names every wrong or missing parameter."""
     name = f"{name} parameters"
-    if not answers.heard:
-        return fail(name, "the autopilot did not answer")
-    if not answers.values:
-        return fail(name, "none was told: does it hear us, and may this link read parameters?")
-    wrong = findings(PROFILES[profile], answers.values)
+    if not received.frames:
+        return fail(name, "the autopilot does not reply")
+    if not received.values:
+        return fail(name, "none was received: does it receive our frames, and may this link read parameters?")
+    wrong = findings(PROFILES[profile], received.values)
     if wrong:
         return fail(name, "; ".join(wrong))
-    return ok(name, f"all {len(PROFILES[profile].wanted)} as {profile} needs them")
+    return ok(name, f"all {len(PROFILES[profile].required)} as required for {profile}")

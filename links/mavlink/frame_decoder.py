@@ -1,9 +1,9 @@
-"""One autopilot's frames in turn: sequence, clock and counts; each frame that says something becomes a message.
+"""Decoder of one autopilot's frames to messages, with its clock, sequence numbers and counters.
 
-Each frame stands alone, so a damaged one cannot take the next with it. What is damaged, foreign or makes no sense is
-counted and left out; nothing here raises over a radio's bytes.
+Each frame is decoded on its own, so a damaged one does not affect the next. Damaged, foreign and invalid frames are
+counted and skipped; no received bytes raise an exception.
 
-Source: https://mavlink.io/en/messages/common.html; what to do about late, lost and repeated frames is ours.
+Source: https://mavlink.io/en/messages/common.html; the handling of late, lost and repeated frames is ours.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from links.mavlink.framing import SEQUENCE, header, known, parse_frame, timesync
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
 from stages.messages import AutopilotStatus
 
-HALF_MS_NS = 500_000  # time_boot_ms is cut off, not rounded: on average half a millisecond early
+HALF_MS_NS = 500_000  # time_boot_ms is truncated, on average half a millisecond early
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 CRITICAL = 5  # MAV_STATE_CRITICAL; above: emergency, poweroff, termination
-LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost ones
+LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost frames
 
 
 class FrameDecoder:
-    """Decodes frames in turn; keeps the clock, the sequence and the counts."""
+    """Decodes frames in order; holds the clock, the sequence number and the counters."""
 
     def __init__(self, sender: tuple[int, int], own: tuple[int, int], clock: DeviceClock) -> None:
         self.clock = clock
@@ -32,12 +32,12 @@ class FrameDecoder:
         self.refused: Counter[str] = Counter()
         self._sender, self._own = sender, own
         self._sequence: int | None = None
-        self._last_ns: dict[str, int] = {}  # stamp of the last message of a kind
-        self._late: int | None = None  # a number from the past, seen just before
-        self._matched = False  # answers to our TIMESYNC come with its time as their stamp
+        self._last_ns: dict[str, int] = {}  # stamp of the newest message per type
+        self._late: int | None = None  # an older sequence number, received immediately before
+        self._matched = False  # replies to our TIMESYNC are recorded with the request's time as stamp
 
     def decode(self, record: Record) -> AutopilotMessage | None:
-        """The message of one frame; None when it says nothing of use here or is refused (see `refused`)."""
+        """The message of one frame; None for an unused or refused frame (see `refused`)."""
         try:
             frame = parse_frame(record.data)
         except ValueError:
@@ -46,7 +46,7 @@ class FrameDecoder:
         if sender != self._sender:
             return self._refuse("from another system")
         kind = frame.get_type()
-        if not known(frame):  # without its checksum: believed only where the number fits
+        if not known(frame):  # its checksum is unknown: its number is used only if it is the expected one
             if self._sequence is not None and number == (self._sequence + 1) % SEQUENCE:
                 self._sequence = number
             return self._refuse("unknown message")
@@ -67,9 +67,9 @@ class FrameDecoder:
             return None
         stamp_ns = self._stamp(frame, record.arrival_ns)
         if stamp_ns is None:
-            return self._refuse("time disagrees")
-        if stamp_ns <= self._last_ns.get(kind, -1):  # a prompter message has shown that those before were late
-            return self._refuse("not after the one before")
+            return self._refuse("inconsistent time")
+        if stamp_ns <= self._last_ns.get(kind, -1):  # a faster message has corrected the clock
+            return self._refuse("not newer than the last one")
         try:
             message = reader(frame, stamp_ns)
         except ValueError as error:
@@ -79,7 +79,7 @@ class FrameDecoder:
         return message
 
     def _stamp(self, frame: Any, arrival_ns: int) -> int | None:
-        """When it was true, on the host's timeline; None while the device's clock disagrees with itself."""
+        """Time of the measurement on the host's timeline; None while the device's clock is inconsistent."""
         in_ms = hasattr(frame, "time_boot_ms")
         device_ns = frame.time_boot_ms * 1_000_000 if in_ms else frame.time_usec * 1_000
         stamp_ns = self.clock.read(device_ns, arrival_ns)
@@ -99,27 +99,27 @@ class FrameDecoder:
         return True
 
     def _timesync(self, frame: Any, record: Record) -> None:
-        """The session matches answers with our own requests; what was recorded without that is taken by who is named.
+        """Use a TIMESYNC reply that the session matched to a request; in other recordings, use its target field.
 
-        One that names nobody is then taken for ours when its times may be: behind a router it can be another's still.
+        A reply without target is then accepted if its times are plausible; behind a router it can still be foreign.
         """
         if frame.tc1 == 0:
-            self.unused += 1  # the autopilot asks; answering is the sender's part
+            self.unused += 1  # a request of the autopilot; the session replies to it
             return
         matches = record.stamp_ns == frame.ts1
         if matches and not self._matched:
             self._matched = True
             self.clock.forget_replies()
-        named = zip(timesync_target(record.data), self._own, strict=True)
-        if not matches and (self._matched or any(name not in (0, ours) for name, ours in named)):
-            self._refuse("timesync for another")
+        targets = zip(timesync_target(record.data), self._own, strict=True)
+        if not matches and (self._matched or any(name not in (0, ours) for name, ours in targets)):
+            self._refuse("TIMESYNC for another component")
         elif not self.clock.round_trip(frame.ts1, frame.tc1, record.arrival_ns):
-            self._refuse("timesync of another's or too slow")
+            self._refuse("TIMESYNC foreign or too slow")
 
     def _status(self, frame: Any, arrival_ns: int) -> AutopilotStatus:
         drift_ppm, drift_sigma_ppm = self.clock.drift.ppm or (None, None)
         return AutopilotStatus(
-            stamp_ns=arrival_ns,  # a heartbeat carries no time
+            stamp_ns=arrival_ns,  # HEARTBEAT has no time stamp
             armed=bool(frame.base_mode & ARMED),
             custom_mode=frame.custom_mode,
             failsafe=frame.system_status >= CRITICAL,

@@ -1,7 +1,7 @@
-"""MAVLink frames as bytes: taken out of datagrams and byte streams, read one by one, packed.
+"""MAVLink framing: split datagrams and byte streams into frames, parse and pack frames.
 
-A datagram is taken for itself, so what is damaged in it cannot take the next with it; on a byte stream (TCP, serial)
-the reader falls into step again at the next frame whose checksum is right. Bytes that are no frame are counted.
+Each datagram is split on its own, so that damage does not affect the next one. On a byte stream (TCP, serial) the
+splitter resynchronises at the next frame with a correct checksum. Bytes outside frames are counted.
 
 Source: https://mavlink.io/en/guide/serialization.html (frames, checksum); pymavlink's dialect for the messages.
 """
@@ -12,7 +12,7 @@ import functools
 from typing import Any
 
 V1, V2 = 0xFE, 0xFD
-SIGNED = 0x01  # the one incompatibility flag that is defined
+SIGNED = 0x01  # the only defined incompatibility flag
 SIGNATURE_BYTES = 13
 V1_EXTRA_BYTES, V2_EXTRA_BYTES = 8, 12  # header and checksum
 MIN_FRAME_BYTES, MAX_FRAME_BYTES = 8, 280
@@ -21,15 +21,15 @@ SEQUENCE = 256
 
 @functools.cache
 def dialect() -> Any:
-    """pymavlink's ArduPilot dialect: `common` and what ArduPilot adds."""
-    from pymavlink.dialects.v20 import ardupilotmega  # here: it takes 0.2 s, and most commands need none of it
+    """pymavlink's ArduPilot dialect: `common` and ArduPilot's messages."""
+    from pymavlink.dialects.v20 import ardupilotmega  # imported here: it takes 0.2 s, and most commands do not need it
 
     return ardupilotmega
 
 
 @functools.cache
 def _parser() -> tuple[Any, type[Exception]]:
-    """pymavlink's parser and the error it raises. Used frame by frame, it remembers nothing that matters."""
+    """pymavlink's parser and its exception. Used per frame, it has no relevant state."""
     return dialect().MAVLink(None), dialect().MAVError
 
 
@@ -40,9 +40,9 @@ def header(data: bytes) -> tuple[tuple[int, int], int]:
 
 
 def timesync_target(data: bytes) -> tuple[int, int]:
-    """(system id, component id) that a TIMESYNC reply names; 0: it names none, as older autopilots do.
+    """(system id, component id) of a TIMESYNC reply's target; 0: none, as from older autopilots.
 
-    An extension of MAVLink 2 that pymavlink's ArduPilot dialect does not have; zeros at the end are not sent.
+    A MAVLink 2 extension that is missing in pymavlink's ArduPilot dialect; trailing zeros are not sent.
     """
     payload = data[10 : 10 + data[1]] if data[0] == V2 else b""
     system, component = payload[16:18].ljust(2, b"\0")
@@ -50,14 +50,14 @@ def timesync_target(data: bytes) -> tuple[int, int]:
 
 
 def is_signed(data: bytes) -> bool:
-    """Whether a frame says that it ends with a signature."""
+    """Whether a frame's header announces a signature."""
     return data[0] == V2 and bool(data[2] & SIGNED)
 
 
 def parse_frame(data: bytes) -> Any:
-    """pymavlink's message of exactly one frame, "UNKNOWN_..." beyond its dialect. ValueError: damaged, or no frame."""
+    """pymavlink's message of one frame, "UNKNOWN_..." outside its dialect. Raises ValueError for an invalid frame."""
     if not MIN_FRAME_BYTES <= len(data) <= MAX_FRAME_BYTES or data[0] not in (V1, V2):
-        raise ValueError("no MAVLink frame")
+        raise ValueError("not a MAVLink frame")
     if data[0] == V2 and data[2] & ~SIGNED:
         raise ValueError("unknown incompatibility flags")
     parser, parser_error = _parser()
@@ -68,14 +68,14 @@ def parse_frame(data: bytes) -> Any:
 
 
 def packed(message: Any, sender: Any) -> bytes:
-    """The frame of a message, numbered after the last one of `sender` (pymavlink's MAVLink)."""
+    """The frame of a message with the next sequence number of `sender` (pymavlink's MAVLink)."""
     frame = bytes(message.pack(sender))
     sender.seq = (sender.seq + 1) % SEQUENCE
     return frame
 
 
 def frame_bytes(data: bytes | bytearray, at: int = 0) -> int | None:
-    """Length of the frame that begins at `at`, by its header; None: too little is here to tell. 0: none begins."""
+    """Length of the frame that begins at `at`, by its header; None: incomplete header. 0: no frame begins here."""
     if at >= len(data):
         return None
     if data[at] == V1:
@@ -90,17 +90,17 @@ def frame_bytes(data: bytes | bytearray, at: int = 0) -> int | None:
 
 
 def known(message: Any) -> bool:
-    """Whether our dialect has the message, and so its checksum was looked at."""
+    """Whether the dialect contains the message, so that its checksum was verified."""
     return not message.get_type().startswith("UNKNOWN")
 
 
 def _begins(data: bytes | bytearray, at: int) -> bool:
-    """Whether a frame may begin at `at`, or the data end there: what stands for a frame without checksum."""
+    """Whether a frame may begin at `at`, or the data ends there: the check of a frame with unknown checksum."""
     return at == len(data) or data[at] in (V1, V2)
 
 
 class FrameSplitter:
-    """Takes whole frames out of what arrives. `stray_bytes` counts what is no frame."""
+    """Extracts complete frames from received bytes. `stray_bytes` counts bytes outside frames."""
 
     def __init__(self) -> None:
         self.stray_bytes = 0
@@ -111,12 +111,12 @@ class FrameSplitter:
         return self._frames(data, whole=True)
 
     def stream(self, data: bytes) -> list[tuple[bytes, Any]]:
-        """(bytes, message) of each frame that these bytes complete; the beginning of the next one is kept."""
+        """(bytes, message) of each frame that these bytes complete; an incomplete frame is kept."""
         self._rest += data
         return self._frames(self._rest, whole=False)
 
-    def begin_anew(self) -> None:
-        """The stream was opened again: what was kept of the one before never becomes a frame."""
+    def reset(self) -> None:
+        """Discard the kept bytes, after the stream was reopened."""
         self.stray_bytes += len(self._rest)
         self._rest.clear()
 
@@ -127,7 +127,7 @@ class FrameSplitter:
             length = frame_bytes(data, at)
             if length is None or (length and at + length > len(data)):
                 if not whole:
-                    break  # the rest of it is still to come
+                    break  # the rest of the frame has not arrived
                 length = 0
             frame = bytes(data[at : at + length])
             message = self._message(frame)

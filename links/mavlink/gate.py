@@ -1,11 +1,11 @@
-"""Whether a pose may go to the autopilot: everything that would make it fly wrong is a refusal with its reason.
+"""Gate of poses to the autopilot: a pose that could cause a wrong flight is rejected with a reason.
 
-All messages need the rotation, LANDING_TARGET too: it tells the vehicle's place in the drone's own axes. So nothing
-goes out of a position alone. A pose that is a quarter turn wrong arms happily and crashes, so an unresolved branch is
-refused whatever its covariance says. The rotation's sigma is the worst about any axis: the autopilot takes roll and
-pitch from its own gyros, but a tilt that is not known is a sign that nothing is.
+All messages need the rotation, including LANDING_TARGET, which contains the vehicle's position in the drone's axes.
+Therefore a position without rotation is never sent. An autopilot arms with a pose that has a wrong yaw branch (90 deg)
+and crashes, so an unresolved branch is rejected regardless of its covariance. The rotation sigma is the largest about
+any axis: the autopilot takes roll and pitch from its own gyros, but an uncertain tilt indicates an invalid rotation.
 
-Source: ours; what ArduPilot and PX4 believe: `profiles.py`.
+Source: ours; what ArduPilot and PX4 accept: `profiles.py`.
 """
 
 from __future__ import annotations
@@ -20,43 +20,43 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from stages.messages import PoseState, RelativePose
 
-AHEAD_NS = 50_000_000  # a pose predicted further ahead than this has another clock than ours
+AHEAD_NS = 50_000_000  # a pose further in the future has another clock
 SENDABLE = (PoseState.FULL, PoseState.COASTING)
-ROTATION_ERROR = 1e-6  # of R^T R - 1
+ROTATION_ERROR = 1e-6  # limit of |R^T R - 1|
 
 
 class RejectReason(enum.Enum):
-    """Why a pose does not go out, for counters and people."""
+    """Why a pose is not sent; the value is the text in counters and STATUSTEXT."""
 
     LOST = "no position"
-    POSITION_ONLY = "rotation not known"
+    POSITION_ONLY = "rotation unknown"
     AMBIGUOUS = "ambiguous rotation"
     INCOMPLETE = "pose without rotation or covariance"
     NOT_FINITE = "not finite"
-    NO_ROTATION = "its rotation is none"
-    COVARIANCE = "its covariance is none"
-    POSITION_SIGMA = "position too uncertain"
-    ROTATION_SIGMA = "rotation too uncertain"
-    OLD = "too old"
-    AHEAD = "from the future"
-    NOT_NEWER = "not newer than the one before"
-    NOT_HEARD = "autopilot not heard"
-    LINE_LATE = "line too slow"
+    INVALID_ROTATION = "invalid rotation matrix"
+    INVALID_COVARIANCE = "invalid covariance"
+    POSITION_SIGMA = "position sigma too large"
+    ROTATION_SIGMA = "rotation sigma too large"
+    OLD = "pose too old"
+    FUTURE = "pose from the future"
+    NOT_NEWER = "not newer than the last sent pose"
+    AUTOPILOT_SILENT = "autopilot silent"
+    LINK_LATE = "link too slow"
 
 
 class PoseLimits(BaseModel):
-    """How good a pose must be to go out. One sigma, worst axis."""
+    """Limits for sending a pose: one sigma of the worst axis, and age."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     position_sigma_m: float = Field(default=0.35, gt=0, le=5)  # 95 % are within 2.8 sigma, 1 m
     rotation_sigma_deg: float = Field(default=5.0, gt=0, le=15)
-    velocity_sigma_mps: float = Field(default=0.5, gt=0, le=5)  # beyond it the pose goes out without velocity
-    age_s: float = Field(default=0.15, gt=0, le=0.3)  # of the pose when it is to go out
+    velocity_sigma_mps: float = Field(default=0.5, gt=0, le=5)  # above it the pose is sent without velocity
+    age_s: float = Field(default=0.15, gt=0, le=0.3)  # of the pose at the time of sending
 
 
 def reject_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> RejectReason | None:
-    """Why the pose may not go out now; None: it may."""
+    """Why the pose must not be sent now; None: it may be sent."""
     if pose.state not in SENDABLE:
         return RejectReason[pose.state.name]
     rotations = pose.R_vehicle_drone, pose.R_start_drone
@@ -67,10 +67,10 @@ def reject_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> Reject
     if not np.isfinite(np.concatenate(given)).all():
         return RejectReason.NOT_FINITE
     if not all([_is_rotation(R) for R in rotations if R is not None]):
-        return RejectReason.NO_ROTATION
+        return RejectReason.INVALID_ROTATION
     worst = worst_sigmas(pose)
     if worst is None:
-        return RejectReason.COVARIANCE
+        return RejectReason.INVALID_COVARIANCE
     rotation_rad, position_m = worst
     if position_m > limits.position_sigma_m:
         return RejectReason.POSITION_SIGMA
@@ -79,21 +79,21 @@ def reject_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> Reject
     age_ns = now_ns - pose.stamp_ns
     if age_ns > 1e9 * limits.age_s:
         return RejectReason.OLD
-    return RejectReason.AHEAD if age_ns < -AHEAD_NS else None
+    return RejectReason.FUTURE if age_ns < -AHEAD_NS else None
 
 
-@lru_cache(maxsize=1)  # the gate asks, and the message tells its quality
+@lru_cache(maxsize=1)  # used by the gate and for the message's quality
 def worst_sigmas(pose: RelativePose) -> tuple[float, float] | None:
-    """`pose_sigmas` of both covariances of a pose; None: one is missing, or none."""
+    """`pose_sigmas` of both covariances of a pose; None: one is missing or invalid."""
     if pose.covariance is None or pose.start_covariance is None:
         return None
     return pose_sigmas(pose.covariance, pose.start_covariance)
 
 
 def pose_sigmas(*covariances: NDArray[np.float64]) -> tuple[float, float] | None:
-    """(rotation [rad], position [m]): the worst sigma in any direction; None: one is no covariance.
+    """(rotation [rad], position [m]): the largest sigma in any direction; None: an invalid covariance.
 
-    A covariance of zeros is none: nothing is known exactly, and an autopilot would believe it.
+    A covariance with a zero variance is invalid: no estimate is exact, and an autopilot would trust it fully.
     """
     C = np.array(covariances)  # (n, 6, 6)
     if not _is_symmetric(C):
@@ -107,7 +107,7 @@ def pose_sigmas(*covariances: NDArray[np.float64]) -> tuple[float, float] | None
 
 
 def velocity_to_send(pose: RelativePose, limits: PoseLimits) -> NDArray[np.float64] | None:
-    """The drone's velocity over ground, start axes, where it is known well enough; None: it goes out as not known."""
+    """The drone's velocity over ground in start axes; None: unknown, invalid, or its sigma exceeds the limit."""
     velocity, covariance = pose.velocity_start_mps, pose.velocity_covariance
     if velocity is None or covariance is None or not (np.isfinite(velocity).all() and np.isfinite(covariance).all()):
         return None
@@ -119,7 +119,7 @@ def velocity_to_send(pose: RelativePose, limits: PoseLimits) -> NDArray[np.float
 
 
 def _is_symmetric(covariances: NDArray[np.float64]) -> bool:
-    """Whether matrices (..., n, n) are, to a millionth."""
+    """Whether matrices (..., n, n) are symmetric within 1e-6 relative."""
     turned = np.swapaxes(covariances, -1, -2)
     return bool((np.abs(covariances - turned) <= 1e-12 + 1e-6 * np.abs(turned)).all())
 

@@ -1,15 +1,17 @@
-"""Where on earth the local frame begins: given to an autopilot that has no such origin, never put over one it has.
+"""Global origin of the local frame: sent to an autopilot that has none, and never to one that has one.
 
-An EKF without GPS wants an origin before it fuses a position. It is asked for its own first (GPS_GLOBAL_ORIGIN); only
-when it answers that request and still shows none, three times, is ours sent; a second answer to one request is
-somebody else's. An autopilot that cannot be asked gets none: nobody knows what it has.
+An EKF without GPS needs an origin before it fuses a position. The autopilot is asked for its origin first
+(GPS_GLOBAL_ORIGIN). Ours is sent only after three requests that it acknowledged without reporting an origin; a second
+acknowledgement of one request belongs to another requester. An autopilot that does not support the request gets no
+origin, because its state is unknown.
 
-Source: https://mavlink.io/en/messages/common.html#SET_GPS_GLOBAL_ORIGIN; ArduPilot NavEKF3_core::setOrigin (refuses a
-second one; older versions did not).
+Source: https://mavlink.io/en/messages/common.html#SET_GPS_GLOBAL_ORIGIN; ArduPilot NavEKF3_core::setOrigin (rejects a
+second origin; older versions did not).
 """
 
 from __future__ import annotations
 
+import enum
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -17,13 +19,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from links.mavlink.framing import dialect
 
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN = 512, 49  # MAV_CMD, message id
-HAS_NONE = (0, 2, 4)  # MAV_RESULT accepted (and sends nothing), denied, failed: it knows the message
-ASK_NS = 1_000_000_000
-ASKED_OFTEN = 3
+HAS_NONE = (0, 2, 4)  # MAV_RESULT accepted (and sends nothing), denied, failed: it supports the message
+REQUEST_NS = 1_000_000_000  # period of requests
+REQUESTS = 3
 
 
 class GlobalOrigin(BaseModel):
-    """A place on earth (WGS84, altitude over mean sea level)."""
+    """A WGS84 position; altitude above mean sea level."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -32,29 +34,39 @@ class GlobalOrigin(BaseModel):
     altitude_m: float = Field(ge=-1000, le=10_000)
 
 
+class OriginState(enum.Enum):
+    """Progress of an OriginSender."""
+
+    NOT_CONFIGURED = "no origin configured"
+    REQUESTING = "requesting the autopilot's origin"
+    SENT = "origin sent"
+    PRESENT = "the autopilot has an origin"
+    UNSUPPORTED = "the autopilot does not report its origin"
+
+
 class OriginSender:
-    """Asks, and gives the origin where there is none. `state` says in words how far it is."""
+    """Requests the autopilot's origin, and sends ours if it has none."""
 
     def __init__(self, origin: GlobalOrigin | None, target: tuple[int, int]) -> None:
-        self.state = "none configured" if origin is None else "asking"
+        self.state = OriginState.NOT_CONFIGURED if origin is None else OriginState.REQUESTING
         self._origin, self._target = origin, target
-        self._asked_ns: int | None = None
-        self._answers = 0
-        self._answered = False  # since it was asked last
+        self._requested_ns: int | None = None
+        self._replies = 0
+        self._replied = False  # to the newest request
 
     @property
     def done(self) -> bool:
-        """Whether there is nothing left to do."""
-        return self.state != "asking"
+        """Whether nothing remains to be sent."""
+        return self.state is not OriginState.REQUESTING
 
     def due(self, now_ns: int) -> list[Any]:
-        """What is to be sent now."""
+        """Messages to send now."""
         if self.done or self._origin is None:
             return []
-        if self._asked_ns is not None and now_ns - self._asked_ns < ASK_NS:
+        if self._requested_ns is not None and now_ns - self._requested_ns < REQUEST_NS:
             return []
-        if self._answers >= ASKED_OFTEN:
-            self.state = "given"
+        if self._replies >= REQUESTS:
+            self.state = OriginState.SENT
             return [
                 dialect().MAVLink_set_gps_global_origin_message(
                     self._target[0],
@@ -64,7 +76,7 @@ class OriginSender:
                     now_ns // 1000,
                 )
             ]
-        self._asked_ns, self._answered = now_ns, False
+        self._requested_ns, self._replied = now_ns, False
         return [
             dialect().MAVLink_command_long_message(
                 *self._target, REQUEST_MESSAGE, 0, float(GPS_GLOBAL_ORIGIN), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -72,25 +84,25 @@ class OriginSender:
         ]
 
     def restart(self) -> None:
-        """The autopilot was away: it may have been started again, and have none."""
+        """Start again: the autopilot was silent, and may have rebooted without an origin."""
         if self._origin is not None:
-            self.state, self._answers, self._answered, self._asked_ns = "asking", 0, False, None
+            self.state, self._replies, self._replied, self._requested_ns = OriginState.REQUESTING, 0, False, None
 
-    def unsent(self) -> None:
-        """What was due could not be sent."""
-        if self.state == "given":
-            self.state = "asking"
+    def on_not_sent(self) -> None:
+        """The messages of `due` could not be sent."""
+        if self.state is OriginState.SENT:
+            self.state = OriginState.REQUESTING
 
-    def hear(self, message: Any) -> None:
-        """Take note of the autopilot's answers."""
+    def on_message(self, message: Any) -> None:
+        """Take a message of the autopilot."""
         if self.done:
             return
         kind = message.get_type()
         if kind == "GPS_GLOBAL_ORIGIN":
-            self.state = "it has one"
-        elif kind == "COMMAND_ACK" and message.command == REQUEST_MESSAGE and self._asked_ns is not None:
+            self.state = OriginState.PRESENT
+        elif kind == "COMMAND_ACK" and message.command == REQUEST_MESSAGE and self._requested_ns is not None:
             if message.result in HAS_NONE:
-                self._answers += not self._answered  # what else comes answers somebody else's request
-                self._answered = True
+                self._replies += not self._replied  # further ones reply to another requester
+                self._replied = True
             else:
-                self.state = "it cannot be asked"
+                self.state = OriginState.UNSUPPORTED

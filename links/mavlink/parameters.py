@@ -1,4 +1,4 @@
-"""Reads parameters of an autopilot over its own connection, for preflight. Nothing is ever set.
+"""Read parameters of an autopilot over a separate connection, for preflight. No parameter is ever written.
 
 Source: https://mavlink.io/en/services/parameter.html (PARAM_REQUEST_READ, bytewise and C-cast integers).
 """
@@ -20,23 +20,23 @@ from links.mavlink.signing import Signer
 from links.mavlink.transport.connection import Connection, parse_connection
 from links.mavlink.transport.stream_connection import open_connection
 
-AGAIN_S = 0.3  # until a parameter that has not answered is asked again
-AT_ONCE = 8  # parameters asked at a time: a slow line holds no more
+RETRY_S = 0.3  # period of requests for missing parameters
+BATCH = 8  # parameters per request burst, limited for slow lines
 V1_HEADER_BYTES, V2_HEADER_BYTES = 6, 10
 FORMATS = {1: "B", 2: "b", 3: "H", 4: "h", 5: "I", 6: "i", 9: "f"}  # MAV_PARAM_TYPE
 
 
 @dataclass(slots=True)
-class Answers:
-    """What an autopilot told."""
+class ParameterValues:
+    """Parameters received from an autopilot."""
 
     values: dict[str, float] = field(default_factory=dict[str, float])
     missing: list[str] = field(default_factory=list[str])
-    heard: int = 0  # frames from it at all: 0, and it is not there
+    frames: int = 0  # frames of any kind from it; 0: it is not connected
 
 
-def ask_parameters(link: Autopilot, timeout_s: float = 5.0) -> Answers:
-    """Ask for what the profile wants, over a connection of its own: `link` must not be listening. LinkError."""
+def ask_parameters(link: Autopilot, timeout_s: float = 5.0) -> ParameterValues:
+    """Read the parameters of the link's profile over a new connection; `link` must not be listening. LinkError."""
     if link.settings.connection is None:
         raise LinkError("no connection to the autopilot: set `connection`, as in udpin:127.0.0.1:14550")
     profile = PROFILES[link.settings.profile]
@@ -47,7 +47,7 @@ def ask_parameters(link: Autopilot, timeout_s: float = 5.0) -> Answers:
     try:
         return read_parameters(
             connection,
-            [wanted.name for wanted in profile.wanted],
+            [required.name for required in profile.required],
             (link.settings.system_id, link.settings.component_id),
             link.settings.own_id,
             integers_bytewise=profile.integers_bytewise,
@@ -69,40 +69,40 @@ def read_parameters(
     integers_bytewise: bool = False,
     timeout_s: float = 5.0,
     signer: Signer | None = None,
-) -> Answers:
-    """Ask for each name until it answers or timeout_s is over; what did not answer is `missing`.
+) -> ParameterValues:
+    """Request each parameter until it arrives or timeout_s has passed; the others are `missing`.
 
     integers_bytewise: as PX4 sends them (`profiles.Profile.integers_bytewise`).
     """
-    answers, splitter = Answers(), FrameSplitter()
+    received, splitter = ParameterValues(), FrameSplitter()
     mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
-    end_s, again_s = time.monotonic() + timeout_s, 0.0
-    while (waiting := [name for name in names if name not in answers.values]) and time.monotonic() < end_s:
-        if time.monotonic() >= again_s:
-            again_s = time.monotonic() + AGAIN_S
-            beat = dialect().MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
-            asks = [
+    end_s, retry_s = time.monotonic() + timeout_s, 0.0
+    while (missing := [name for name in names if name not in received.values]) and time.monotonic() < end_s:
+        if time.monotonic() >= retry_s:
+            retry_s = time.monotonic() + RETRY_S
+            heartbeat = dialect().MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
+            requests = [
                 dialect().MAVLink_param_request_read_message(*target, name.encode("ascii"), -1)
-                for name in waiting[:AT_ONCE]
+                for name in missing[:BATCH]
             ]
-            for message in [beat, *asks]:
+            for message in [heartbeat, *requests]:
                 if signer is not None:
                     signer.sign_for(mav, host_time.now_ns())
                 connection.send(packed(message, mav))
-        received = connection.receive(0.05)
-        if received is None:
+        packet = connection.receive(0.05)
+        if packet is None:
             continue
-        data, source = received
+        data, source = packet
         for frame, message in splitter.datagram(data) if connection.datagrams else splitter.stream(data):
             if header(frame)[0] != target or (signer is not None and not signer.verify(frame)):
                 continue
-            answers.heard += 1
-            connection.answer_to(source)
-            if message.get_type() == "PARAM_VALUE" and message.param_id in waiting:
-                answers.values[message.param_id] = _value(frame, message, integers_bytewise)
-                again_s = again_s if set(waiting[:AT_ONCE]) - set(answers.values) else 0.0
-    answers.missing = [name for name in names if name not in answers.values]
-    return answers
+            received.frames += 1
+            connection.reply_to(source)
+            if message.get_type() == "PARAM_VALUE" and message.param_id in missing:
+                received.values[message.param_id] = _value(frame, message, integers_bytewise)
+                retry_s = retry_s if set(missing[:BATCH]) - set(received.values) else 0.0
+    received.missing = [name for name in names if name not in received.values]
+    return received
 
 
 def _value(frame: bytes, message: Any, bytewise: bool) -> float:

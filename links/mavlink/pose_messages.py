@@ -1,15 +1,15 @@
-"""A relative pose as the MAVLink messages that an autopilot takes.
+"""MAVLink messages of a relative pose: ODOMETRY, VISION_POSITION_ESTIMATE and LANDING_TARGET.
 
-ODOMETRY and VISION_POSITION_ESTIMATE tell where the drone is in the vehicle's *start* frame, which stands still in
-the world though the vehicle drives: an EKF wants a frame that stands still. Its x axis is where the vehicle looked at
-the start, not north: LOCAL_FRD. LANDING_TARGET tells where the vehicle is, in the drone's body frame.
+ODOMETRY and VISION_POSITION_ESTIMATE contain the drone's pose in the vehicle's *start* frame, which is static while the
+vehicle drives, as an EKF requires. Its x axis is the vehicle's forward direction at the start, not north: LOCAL_FRD.
+LANDING_TARGET contains the vehicle's position in the drone's body frame.
 
     p_drone_vehicle = -R_vehicle_drone^T t_vehicle_drone
 
-What is not known is NaN, never 0: a velocity of zero is believed, and the drone flies away.
+Unknown values are NaN, never 0: an EKF fuses a velocity of zero, and the drone drifts away.
 
-quality: 100 for a pose that is known exactly, 1 at the limit (`PoseLimits`), by the worse of position and rotation;
-0 would mean unknown. time_usec is the host's time (microseconds since 1970), the time that TIMESYNC tells, too.
+quality: 100 for a sigma of 0, 1 at the limits (`PoseLimits`), by the worse of position and rotation; 0 would mean
+unknown. time_usec is host time (microseconds since 1970), the same as in TIMESYNC replies.
 
 Source: https://mavlink.io/en/messages/common.html#ODOMETRY, #VISION_POSITION_ESTIMATE, #LANDING_TARGET;
 https://ardupilot.org/dev/docs/mavlink-nongps-position-estimation.html; ArduPilot AC_PrecLand_MAVLink::handle_msg.
@@ -34,14 +34,14 @@ from links.mavlink.ned_frd import (
 )
 from stages.messages import RelativePose
 
-LOCAL_FRD, BODY_FRD = 20, 12  # MAV_FRAME: ArduPilot takes ODOMETRY in these two alone
-VIO = 3  # MAV_ESTIMATOR_TYPE_VIO: PX4 takes it, and not LIDAR
+LOCAL_FRD, BODY_FRD = 20, 12  # MAV_FRAME: the only ones that ArduPilot accepts in ODOMETRY
+VIO = 3  # MAV_ESTIMATOR_TYPE_VIO: accepted by PX4, unlike LIDAR
 VISION_OTHER = 3  # LANDING_TARGET_TYPE
-NO_NUMBERS = [math.nan] * 3
+UNKNOWN = [math.nan] * 3
 
 
 def quality_percent(pose: RelativePose, limits: PoseLimits) -> int:
-    """1 (at the limit) to 100 (exact), linear in the worse of the two sigmas over their limits."""
+    """Quality, 1 (at the limit) to 100 (sigma 0), linear in the larger of the two ratios of sigma to limit."""
     sigmas = worst_sigmas(pose)
     if sigmas is None:
         return 1
@@ -50,7 +50,7 @@ def quality_percent(pose: RelativePose, limits: PoseLimits) -> int:
 
 
 def odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits) -> Any:
-    """ODOMETRY of a pose that the gate let through."""
+    """ODOMETRY of a pose that the gate has accepted."""
     xyz_m, R, covariance = _start_pose(pose)
     velocity = velocity_to_send(pose, limits)
     return dialect().MAVLink_odometry_message(
@@ -59,8 +59,8 @@ def odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits) -> Any:
         BODY_FRD,
         *flip_yz(xyz_m),
         wxyz_from_R_local_drone(R),
-        *(NO_NUMBERS if velocity is None else flip_yz(R.T @ velocity)),
-        *NO_NUMBERS,  # turn rates: the autopilot's gyros know better
+        *(UNKNOWN if velocity is None else flip_yz(R.T @ velocity)),
+        *UNKNOWN,  # angular velocity: the autopilot's gyros are better
         upper_from_pose_covariance(covariance, R),
         _velocity_upper(pose.velocity_covariance if velocity is not None else None, R),
         reset_counter % SEQUENCE,
@@ -70,7 +70,7 @@ def odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits) -> Any:
 
 
 def vision_position_estimate(pose: RelativePose, reset_counter: int) -> Any:
-    """VISION_POSITION_ESTIMATE of a pose that the gate let through; for ArduPilot alone, PX4 takes it for north."""
+    """VISION_POSITION_ESTIMATE of a pose that the gate has accepted; for ArduPilot only, PX4 assumes north."""
     xyz_m, R, covariance = _start_pose(pose)
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
@@ -82,10 +82,10 @@ def vision_position_estimate(pose: RelativePose, reset_counter: int) -> Any:
 
 
 def landing_target(pose: RelativePose) -> Any:
-    """LANDING_TARGET of a pose that the gate let through: the vehicle in the drone's body frame.
+    """LANDING_TARGET of a pose that the gate has accepted: the vehicle in the drone's body frame.
 
-    The angles are those of the line of sight about the body's x and y from straight down, as ArduPilot reads them
-    where the position is not valid: (-tan angle_y, tan angle_x, 1). NaN when the vehicle is not below the drone.
+    The angles are those of the line of sight from straight down about the body's x and y axes, as ArduPilot reads them
+    when the position is not valid: (-tan angle_y, tan angle_x, 1). NaN when the vehicle is not below the drone.
     """
     if pose.xyz_vehicle_m is None or pose.R_vehicle_drone is None:
         raise ValueError("a landing target needs the drone's rotation")
@@ -111,12 +111,12 @@ def landing_target(pose: RelativePose) -> Any:
 
 def _start_pose(pose: RelativePose) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     if pose.xyz_start_m is None or pose.R_start_drone is None or pose.start_covariance is None:
-        raise ValueError("the pose is not complete: the gate must refuse it")
+        raise ValueError("incomplete pose: the gate must reject it")
     return pose.xyz_start_m, pose.R_start_drone, pose.start_covariance
 
 
 def _velocity_upper(covariance_start: NDArray[np.float64] | None, R_start_drone: NDArray[np.float64]) -> list[float]:
-    """21 numbers, drone axes; the turn rates' are NaN, and all where the velocity is not known."""
+    """21 numbers, drone axes; those of the angular velocity are NaN, and all if the velocity is unknown."""
     if covariance_start is None:
         return [math.nan] * 21
     covariance = np.full((6, 6), np.nan)

@@ -1,7 +1,7 @@
-"""What an autopilot's messages say, in our axes and units: one function for each message.
+"""Conversion of an autopilot's MAVLink messages to grd's messages, axes and units: one function per message.
 
-RAW_IMU is read in ArduPilot's units (mg, mrad/s), HIGHRES_IMU (PX4) is SI; an autopilot sends one of them. Numbers
-that are not finite are refused with ValueError, never passed on.
+RAW_IMU is read in ArduPilot's units (mg, mrad/s), HIGHRES_IMU (PX4) in SI units; an autopilot sends one of them. The
+functions raise ValueError for non-finite values.
 
 Source: https://mavlink.io/en/messages/common.html; ArduPilot GCS_MAVLINK::send_raw_imu for RAW_IMU's units,
 NavEKF3_core::send_status_report and getVariances for EKF_STATUS_REPORT.
@@ -37,15 +37,15 @@ STANDARD_GRAVITY_MPS2 = 9.80665
 LOCAL_FRAMES = (1, 20)  # MAV_FRAME_LOCAL_NED, MAV_FRAME_LOCAL_FRD
 BODY_FRD = 12
 
-# EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS agree in these
+# bits common to EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS
 ATTITUDE, VELOCITY_HORIZONTAL, VELOCITY_VERTICAL, HORIZONTAL_RELATIVE = 1, 2, 4, 8
 HEIGHT, CONSTANT_POSITION = 32, 128
 
 
 def _vector(frame: Any, *names: str, unit: float = 1.0) -> NDArray[np.float64]:
-    """Fields as a vector in our axes. ValueError when one is NaN or infinite."""
+    """Fields as a vector in grd's axes. Raises ValueError when one is not finite."""
     x, y, z = _numbers(frame, *names)
-    return np.array([unit * x, -(unit * y), -(unit * z)])  # `flip_yz`, without its arrays
+    return np.array([unit * x, -(unit * y), -(unit * z)])  # as `flip_yz`, but faster
 
 
 def _numbers(frame: Any, *names: str) -> list[float]:
@@ -74,12 +74,12 @@ def read_local_position(frame: Any, stamp_ns: int) -> DroneLocalPosition:
 
 
 def read_odometry(frame: Any, stamp_ns: int) -> DroneOdometry:
-    """ODOMETRY of a local frame with the velocity in the body's; others are refused, not guessed."""
+    """ODOMETRY in a local frame with the velocity in the body frame; other frames raise ValueError."""
     if frame.frame_id not in LOCAL_FRAMES or frame.child_frame_id != BODY_FRD:
         raise ValueError("odometry in other frames")
     length = math.hypot(*frame.q)
     if not abs(length - 1.0) < 0.01:  # NaN compares false
-        raise ValueError("no rotation")
+        raise ValueError("invalid rotation")
     R_local_drone = R_local_drone_from_wxyz(frame.q)
     return DroneOdometry(
         stamp_ns=stamp_ns,
@@ -95,7 +95,7 @@ def read_odometry(frame: Any, stamp_ns: int) -> DroneOdometry:
 
 
 def read_raw_imu(frame: Any, stamp_ns: int) -> DroneImu:
-    """RAW_IMU as ArduPilot fills it: mg and mrad/s."""
+    """RAW_IMU in ArduPilot's units: mg and mrad/s."""
     return DroneImu(
         stamp_ns=stamp_ns,
         acceleration_drone_mps2=_vector(frame, "xacc", "yacc", "zacc", unit=1e-3 * STANDARD_GRAVITY_MPS2),
@@ -113,7 +113,7 @@ def read_highres_imu(frame: Any, stamp_ns: int) -> DroneImu:
 
 
 def read_ekf_status(frame: Any, stamp_ns: int) -> AutopilotEstimator:
-    """EKF_STATUS_REPORT (ArduPilot). What it calls variances are innovation test ratios, the square root taken."""
+    """EKF_STATUS_REPORT (ArduPilot). Its "variances" are square roots of innovation test ratios."""
     names = ("velocity_variance", "pos_horiz_variance", "pos_vert_variance", "compass_variance")
     return _estimator(frame.flags, stamp_ns, [getattr(frame, name) for name in names])
 
@@ -125,7 +125,7 @@ def read_estimator_status(frame: Any, stamp_ns: int) -> AutopilotEstimator:
 
 
 def _estimator(flags: int, stamp_ns: int, ratios: list[float]) -> AutopilotEstimator:
-    """A ratio that is no number or negative is told as NaN, not said."""
+    """A ratio that is not finite or negative becomes NaN (unknown)."""
     velocity, horizontal, height, compass = (float(r) if math.isfinite(r) and r >= 0 else math.nan for r in ratios)
     moving = VELOCITY_HORIZONTAL | VELOCITY_VERTICAL
     return AutopilotEstimator(
@@ -153,7 +153,7 @@ READERS: dict[str, Reader] = {
     "HIGHRES_IMU": read_highres_imu,
     "ESTIMATOR_STATUS": read_estimator_status,
 }
-"""Messages that carry the autopilot's time."""
+"""Readers of messages with a time stamp."""
 
 TIMELESS_READERS: dict[str, Reader] = {"EKF_STATUS_REPORT": read_ekf_status}
-"""Messages without a time: they are true when they arrive."""
+"""Readers of messages without a time stamp, which are stamped at arrival."""

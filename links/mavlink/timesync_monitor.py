@@ -1,124 +1,124 @@
-"""Our TIMESYNC requests that wait for an answer, and whether poses would come late.
+"""Monitor of TIMESYNC round trips: whether poses would arrive late.
 
-A radio or a bridge behind a faster line takes poses at once and hands them on late, and no system here knows of it:
-only the answers tell. How much of a round trip is the way there is not known, so all of it may be. It is slow where
+A radio or bridge behind a fast line accepts poses immediately and forwards them late, which only the replies to
+TIMESYNC reveal. The forward part of a round trip is unknown, so all of it is assumed. The link is slow when
 
-    two of the last three answers were late, or
-    eight requests in a row found no answer while the autopilot was heard: a bridge that hangs on the way there, or
-    two frames within a second left our own line late
+    two of the last three replies were late, or
+    eight consecutive requests had no reply while the autopilot sent frames (a bridge blocked in forward direction), or
+    two frames within one second left the local send buffer late.
 
-and late from then until it has not been slow for three seconds. What fills a bridge may be the poses themselves: then
-a line that nobody sends on is soon prompt, and late again. So each time that lateness comes back before a minute of
-answers was prompt while poses went out, the wait doubles, up to a minute.
+It counts as late from then until it has not been slow for three seconds. The poses themselves may be what fills a
+bridge: then an unused link soon has short round trips and becomes late again. Therefore the waiting time doubles, up to
+one minute, each time lateness returns before a minute of prompt replies while poses were sent.
 
-An answer that is lost says nothing, and an autopilot that never answers is never late. One that has answered, is heard
-and answers no more for 27 seconds is taken for one that never did when its wait is over: `unseen`.
+A lost reply has no effect, and an autopilot that never replies is never late. One that has replied, sends frames, and
+has not replied for 27 seconds is treated like one that never did once its waiting time is over: `latency_unknown`.
 
-Source: ours; https://mavlink.io/en/services/timesync.html; DESIGN: ArduPilot's health ends after 300 ms.
+Source: ours; https://mavlink.io/en/services/timesync.html; ArduPilot's health timeout of 300 ms.
 """
 
 from __future__ import annotations
 
 from collections import deque
 
-ASK_NS = 250_000_000  # between two requests
-LATE_NS = 300_000_000  # what comes later, the autopilot would have taken for silence
-LATEST, LATE_OF_LATEST = 3, 2
-LEFT_LATE_NS = 1_000_000_000  # between two that left late
-UNANSWERED = 8  # for 2 s; where a fifth of all frames is lost that is once in a quarter of an hour
-GIVEN_UP = 108  # 27 seconds; with the first wait half a minute
-FIRST_WAIT_NS, LONGEST_WAIT_NS = 3_000_000_000, 60_000_000_000
-PROVEN = 240  # prompt answers while poses go out: a minute
-WAITING = 64  # requests: a quarter of a minute
+REQUEST_NS = 250_000_000  # period of requests
+LATE_NS = 300_000_000  # the autopilot treats a longer delay as a timeout
+WINDOW, LATE_IN_WINDOW = 3, 2
+LATE_FRAMES_NS = 1_000_000_000  # between two frames that left late
+UNANSWERED = 8  # 2 s; with 20 % frame loss this happens once per quarter of an hour
+GIVEN_UP = 108  # 27 s; half a minute with the first waiting time
+FIRST_WAIT_NS, MAX_WAIT_NS = 3_000_000_000, 60_000_000_000
+PROVEN = 240  # prompt replies while poses are sent: one minute
+MAX_PENDING = 64  # requests: a quarter of a minute
 
 
 class TimesyncMonitor:
-    """`asked`, `heard` and `answered` in turn; `late`: whether poses would come late."""
+    """Evaluates requests (`on_request`), frames (`on_frame`) and replies (`on_reply`) in order."""
 
     def __init__(self) -> None:
-        self.late = False
-        self.unseen = False  # it has answered and does no more: lateness is not seen
-        self._waiting: deque[int] = deque(maxlen=WAITING)
-        self._took_ns: deque[int] = deque(maxlen=LATEST)  # empty: it does not answer
-        self._open = False  # the newest request waits for its answer
-        self._heard = False  # since the newest request
-        self._unanswered = 0  # requests since the newest answer after which it was heard
-        self._left_late_ns: int | None = None  # when a frame left late, last
-        self._slow_ns = 0  # when it was slow last
+        self.late = False  # poses would arrive late
+        self.latency_unknown = False  # the autopilot has stopped replying
+        self._pending: deque[int] = deque(maxlen=MAX_PENDING)
+        self._round_trips_ns: deque[int] = deque(maxlen=WINDOW)  # empty: the autopilot does not reply
+        self._open = False  # the newest request has no reply yet
+        self._active = False  # a frame has arrived since the newest request
+        self._unanswered = 0  # requests with frames but without a reply, since the newest reply
+        self._late_frame_ns: int | None = None  # when a frame last left late
+        self._slow_ns = 0  # when the link was last slow
         self._wait_ns = FIRST_WAIT_NS
-        self._unproven = 0  # prompt answers that are missing until the wait is short again
+        self._unproven = 0  # prompt replies that are missing until the waiting time is short again
 
     @property
     def newest_ns(self) -> int | None:
-        """The round trip of the answer that came last."""
-        return self._took_ns[-1] if self._took_ns else None
+        """Round trip of the newest reply."""
+        return self._round_trips_ns[-1] if self._round_trips_ns else None
 
     @property
     def status(self) -> str | None:
-        """In words, while poses would come late, or it is no longer seen whether they do."""
+        """Error text while poses would arrive late, or the latency is unknown."""
         if self.late:
             return (
-                f"answers to TIMESYNC take longer than {1e-9 * LATE_NS:g} s or do not come, or our own line is that "
-                "slow: no poses are sent, they would come late. Is a radio, bridge or line too slow for them "
-                "(clock.rate_hz), or for what the autopilot sends (SRn_...)?"
+                f"TIMESYNC replies take longer than {1e-9 * LATE_NS:g} s or are missing, or the local line is that "
+                "slow: no poses are sent, they would arrive late. Is a radio, bridge or line too slow for the poses "
+                "(clock.rate_hz), or for the autopilot's messages (SRn_...)?"
             )
-        if self.unseen:
+        if self.latency_unknown:
             return (
-                "the autopilot has answered TIMESYNC and does no more: poses are sent, and whether they come late is "
-                "not seen. Does a router or bridge keep our frames back?"
+                "the autopilot no longer replies to TIMESYNC: poses are sent, but their latency is unknown. Does a "
+                "router or bridge drop our frames?"
             )
         return None
 
-    def asked(self, at_ns: int) -> bool:
-        """A request has gone out; `at_ns` is what it holds. True: with it, answers are no longer waited for."""
-        self._waiting.append(at_ns)
-        if self._took_ns and self._open and self._heard:
+    def on_request(self, request_ns: int) -> bool:
+        """A request was sent with this time. True: with it, the monitor gives up waiting for replies."""
+        self._pending.append(request_ns)
+        if self._round_trips_ns and self._open and self._active:
             self._unanswered += 1
-        self._open, self._heard = True, False
+        self._open, self._active = True, False
         given_up = self._unanswered >= GIVEN_UP
         if given_up:
-            self.begin_anew()
-            self.unseen = True
-        self._judge(at_ns)
+            self.reset()
+            self.latency_unknown = True
+        self._update(request_ns)
         return given_up
 
-    def heard(self) -> None:
-        """The autopilot has said something."""
-        self._heard = True
+    def on_frame(self) -> None:
+        """The autopilot has sent a frame."""
+        self._active = True
 
-    def answered(self, asked_ns: int, arrival_ns: int, sending: bool) -> bool:
-        """Whether an answer is to a request of ours, and the first to it; `sending`: poses go out now."""
-        if asked_ns not in self._waiting:
+    def on_reply(self, request_ns: int, arrival_ns: int, sending: bool) -> bool:
+        """Use a reply; False: it is not the first one to a request of ours. `sending`: poses are being sent."""
+        if request_ns not in self._pending:
             return False
-        self._waiting.remove(asked_ns)
-        self._open = self.unseen = False
+        self._pending.remove(request_ns)
+        self._open = self.latency_unknown = False
         self._unanswered = 0
-        if sending and not self.late and arrival_ns - asked_ns <= LATE_NS:
+        if sending and not self.late and arrival_ns - request_ns <= LATE_NS:
             self._unproven = max(0, self._unproven - 1)
-        self._took_ns.append(arrival_ns - asked_ns)
-        self._judge(arrival_ns)
+        self._round_trips_ns.append(arrival_ns - request_ns)
+        self._update(arrival_ns)
         return True
 
-    def left_late(self, now_ns: int) -> None:
-        """A frame, or some at once, took longer than LATE_NS to leave our own line."""
-        again = self._left_late_ns is not None and now_ns - self._left_late_ns <= LEFT_LATE_NS
-        self._left_late_ns = now_ns
-        self._judge(now_ns, again)
+    def on_late_frame(self, now_ns: int) -> None:
+        """One or several frames took longer than LATE_NS to leave the local send buffer."""
+        repeated = self._late_frame_ns is not None and now_ns - self._late_frame_ns <= LATE_FRAMES_NS
+        self._late_frame_ns = now_ns
+        self._update(now_ns, repeated)
 
-    def begin_anew(self) -> None:
-        """Another connection, or heard after a silence: it may be another autopilot, or one that answers no more.
+    def reset(self) -> None:
+        """Forget the replies: after a reconnect or a silence it may be another autopilot, or one that never replies.
 
-        A wait goes on: what was late may be so still.
+        A waiting time continues: the link may still be late.
         """
-        self._took_ns.clear()
+        self._round_trips_ns.clear()
         self._unanswered = 0
-        self.unseen = False
+        self.latency_unknown = False
 
-    def _judge(self, now_ns: int, left_late: bool = False) -> None:
-        late = [took_ns > LATE_NS for took_ns in self._took_ns]
-        if sum(late) >= LATE_OF_LATEST or left_late or self._unanswered >= UNANSWERED:
+    def _update(self, now_ns: int, late_frames: bool = False) -> None:
+        late = [round_trip_ns > LATE_NS for round_trip_ns in self._round_trips_ns]
+        if sum(late) >= LATE_IN_WINDOW or late_frames or self._unanswered >= UNANSWERED:
             if not self.late:
-                self._wait_ns = min(2 * self._wait_ns, LONGEST_WAIT_NS) if self._unproven else FIRST_WAIT_NS
+                self._wait_ns = min(2 * self._wait_ns, MAX_WAIT_NS) if self._unproven else FIRST_WAIT_NS
             self.late, self._slow_ns = True, now_ns
         elif self.late and now_ns - self._slow_ns >= self._wait_ns and not (late and late[-1]):
             self.late, self._unproven = False, PROVEN

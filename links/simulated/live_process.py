@@ -172,7 +172,7 @@ class RigInTime:
             send_to=send_to,
             flight=flight,
             scenario_ns=simulation.now_ns,
-            parameters={w.name: w.values[0] if w.values else w.at_least for w in ARDUPILOT.wanted},
+            parameters={w.name: w.values[0] if w.values else w.at_least for w in ARDUPILOT.required},
         )
         autopilot.armed = self._rig.armed
         return autopilot

@@ -1,15 +1,15 @@
-"""Where the autopilot is, and the bytes to and from it: UDP, TCP, serial.
+"""Connection to the autopilot: the protocol of all transports, the parser of connection strings, and UDP.
 
-    udpin:127.0.0.1:14550        wait for it on a port of this host; beyond loopback only `sender` is heard
-    udpout:192.168.1.5:14550     send to it there; nobody else is heard
-    tcp:127.0.0.1:5760           connect to it
-    serial:/dev/ttyUSB0:921600   baud rate after the device
+    udpin:127.0.0.1:14550        listen on a local port; beyond loopback only `sender` is accepted
+    udpout:192.168.1.5:14550     send to this address; other senders are ignored
+    tcp:127.0.0.1:5760           TCP client
+    serial:/dev/ttyUSB0:921600   device and baud rate
 
-Sending never waits, and little of what was sent waits for the line: a pose that comes late is taken for new. UDP is
-here, TCP and serial are in `lines.py`.
+Sending never blocks, and send buffers are small: the autopilot would treat a pose that arrives late as current. TCP and
+serial are in `stream_connection.py`.
 
-Source: ours; mavutil's names for connections. mavutil's own connections answer whoever spoke last, wait while they
-reconnect and print.
+Source: mavutil's syntax of connection strings. mavutil's own connections are not used: they reply to the newest sender,
+block while they reconnect, and print.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from typing import Literal, Protocol
 from flow.link import LinkError
 
 DATAGRAM_BYTES = 2048
-UDP_BACKLOG_BYTES = 4096  # Linux doubles it: some six frames may wait for a slow radio, or for who does not answer ARP
+UDP_BACKLOG_BYTES = 4096  # doubled by Linux: about six frames can wait for a slow radio or an unanswered ARP request
 DEFAULT_BAUD = 921_600
 
-Source_ = tuple[str, int]
+Address = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """One connection as it is written in a configuration."""
+    """A parsed connection string."""
 
     kind: Literal["udpin", "udpout", "tcp", "serial"]
     host: str  # or the device
@@ -39,52 +39,52 @@ class Endpoint:
 
 
 def parse_connection(text: str) -> Endpoint:
-    """What a connection's text says. ValueError with the way to write it."""
+    """Parse a connection string. Raises ValueError with the syntax."""
     kind, _, rest = text.partition(":")
     host, colon, number = rest.rpartition(":")
     if kind == "serial" and rest and not number.isdigit():
         return Endpoint("serial", rest, DEFAULT_BAUD)
     if kind not in ("udpin", "udpout", "tcp", "serial") or not colon or not host or not number.isdigit():
         raise ValueError(
-            f"write it as udpin:127.0.0.1:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyUSB0:921600, "
+            f"must be udpin:127.0.0.1:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyUSB0:921600, "
             f"not {text!r}"
         )
     if kind == "serial":
         return Endpoint("serial", host, int(number))
     if not 0 <= int(number) <= 65_535 or (kind != "udpin" and number == "0"):
-        raise ValueError(f"{number} is no port")
+        raise ValueError(f"{number} is not a port")
     if kind == "udpin":
-        IPv4Address(host)  # an address of this host, not a name
+        IPv4Address(host)  # a local address, not a name
     return Endpoint("udpin" if kind == "udpin" else "udpout" if kind == "udpout" else "tcp", host, int(number))
 
 
 class Connection(Protocol):
-    """Bytes to and from the autopilot. `receive` is called from one thread, `send` from others."""
+    """Bytes to and from the autopilot. `receive` is called by one thread, `send` by others."""
 
     datagrams: bool
     reconnects: int
-    foreign: int  # datagrams from others, not read
-    stalls: int  # times it stood still and was dropped
-    left_late: int  # frames that waited longer for the line than LATE_NS, as far as is known
+    foreign: int  # datagrams from other senders, ignored
+    stalls: int  # how often it was closed because it was blocked
+    left_late: int  # frames that were sent more than LATE_NS late, as far as is known
 
     @property
     def status(self) -> str | None:
-        """What is wrong with it, in words; None: nothing."""
+        """Error text; None: it works."""
         ...
 
-    def receive(self, timeout_s: float) -> tuple[bytes, Source_] | None:
-        """What has arrived and from where; None: nothing within timeout_s."""
+    def receive(self, timeout_s: float) -> tuple[bytes, Address] | None:
+        """Received bytes and their source; None: nothing within timeout_s."""
         ...
 
-    def answer_to(self, source: Source_) -> None:
-        """The autopilot spoke from there."""
+    def reply_to(self, source: Address) -> None:
+        """Set the destination: the source of the autopilot's frames."""
 
     def send(self, frame: bytes) -> bool:
-        """Send a frame now or not at all. False: nobody is there, or the line is slower than we send."""
+        """Send a frame now or not at all. False: no destination, or the send buffer is full."""
         ...
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close it."""
 
 
 class Udp:
@@ -96,7 +96,7 @@ class Udp:
     def __init__(self, endpoint: Endpoint, sender: IPv4Address | None) -> None:
         self.reconnects = self.foreign = self.stalls = self.left_late = 0
         self._only = None if sender is None else str(sender)
-        self._peer: Source_ | None = None
+        self._peer: Address | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, UDP_BACKLOG_BYTES)
         try:
@@ -117,10 +117,10 @@ class Udp:
 
     @property
     def port(self) -> int:
-        """Our own port."""
+        """Local port."""
         return self._socket.getsockname()[1]
 
-    def receive(self, timeout_s: float) -> tuple[bytes, Source_] | None:
+    def receive(self, timeout_s: float) -> tuple[bytes, Address] | None:
         """See Connection."""
         try:
             ready, _, _ = select.select([self._socket], [], [], timeout_s)
@@ -128,7 +128,7 @@ class Udp:
                 return None
             data, source = self._socket.recvfrom(DATAGRAM_BYTES)
         except (BlockingIOError, ConnectionRefusedError):
-            return None  # the other side's port is closed just now
+            return None  # the destination port is closed
         except (OSError, ValueError) as error:  # closed by another thread
             raise LinkError(f"UDP: {error}: is the network interface still up?") from None
         if (self._only is not None and source[0] != self._only) or (self._fixed and source != self._peer):
@@ -136,7 +136,7 @@ class Udp:
             return None
         return data, source
 
-    def answer_to(self, source: Source_) -> None:
+    def reply_to(self, source: Address) -> None:
         """See Connection."""
         if not self._fixed:
             self._peer = source
@@ -147,7 +147,7 @@ class Udp:
             return False
         try:
             return self._socket.sendto(frame, self._peer) == len(frame)
-        except OSError:  # full, unreachable, or closed: the next frame may pass
+        except OSError:  # full, unreachable, or closed: the next frame may succeed
             return False
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""A serial device as a line. Closing it throws away what it has not sent.
+"""Serial line. Closing it discards the bytes that were not transmitted.
 
-Source: ours; tty_ioctl(4) TIOCOUTQ for what that is; pyserial sets up the device.
+Source: tty_ioctl(4), TIOCOUTQ; pyserial configures the device.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from flow.link import LinkError
 from links.mavlink.transport.connection import Endpoint
 
 CHUNK_BYTES = 4096
-SERIAL_BACKLOG_BYTES = 512  # not through yet: two poses more, 6 ms at 921600 baud
+SERIAL_BACKLOG_BYTES = 512  # limit before a new frame: two poses, 6 ms at 921600 baud
 
 
 class SerialLine:
@@ -29,40 +29,40 @@ class SerialLine:
         self._port: Any = None  # serial.Serial
 
     def open(self) -> None:
-        """Open the device for us alone. LinkError."""
-        import serial  # here: a UDP link needs none of it
+        """Open the device exclusively. Raises LinkError."""
+        import serial  # imported here: not needed for UDP
 
         try:
             self._port = serial.Serial(self.name, self._baud, timeout=0.0, write_timeout=0.0, exclusive=True)
         except (OSError, ValueError) as error:  # serial.SerialException is an OSError
             raise LinkError(
-                f"cannot open {self.name} at {self._baud} baud: {error}. Is it plugged in, is no other program using "
-                "it, and may you use it (group dialout)? Check `connection`."
+                f"cannot open {self.name} at {self._baud} baud: {error}. Is it plugged in, not used by another "
+                "program, and are you in the group dialout? Check `connection`."
             ) from None
 
     def read(self, timeout_s: float) -> bytes:
-        """What has arrived. OSError: it is gone."""
-        port = self._there()
+        """Received bytes. Raises OSError when the line is lost."""
+        port = self._opened()
         if not select.select([port], [], [], timeout_s)[0]:
             return b""
         data = os.read(port.fileno(), CHUNK_BYTES)
-        if not data:  # readable, and nothing to read: unplugged
+        if not data:  # readable but empty: unplugged
             raise ConnectionResetError("unplugged")
         return data
 
     def write(self, data: bytes) -> int:
-        """Bytes taken."""
+        """Write without blocking; returns the number of accepted bytes."""
         try:
-            return os.write(self._there().fileno(), data)  # pyserial's own write spins while the line is full
+            return os.write(self._opened().fileno(), data)  # pyserial's own write busy-waits while the buffer is full
         except BlockingIOError:
             return 0
 
-    def waiting_bytes(self) -> int:
-        """Bytes that the line has not sent."""
-        return self._there().out_waiting
+    def buffered_bytes(self) -> int:
+        """Bytes that were not transmitted yet."""
+        return self._opened().out_waiting
 
     def close(self) -> None:
-        """Let go of the device. What it has not sent is thrown away."""
+        """Close the device and discard its send buffer."""
         if self._port is not None:
             with contextlib.suppress(OSError, termios.error):
                 self._port.reset_output_buffer()
@@ -70,7 +70,7 @@ class SerialLine:
                 self._port.close()
             self._port = None
 
-    def _there(self) -> Any:
+    def _opened(self) -> Any:
         if self._port is None:
             raise ConnectionResetError("not open")
         return self._port

@@ -1,6 +1,6 @@
-"""A TCP client as a line. Closing it throws away what the other side has not acknowledged.
+"""TCP client line. Closing it discards the bytes that the peer has not acknowledged.
 
-Source: ours; tcp(7) SIOCOUTQ for what has not been; socket(7) SO_LINGER.
+Source: tcp(7), SIOCOUTQ; socket(7), SO_LINGER.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from flow.link import LinkError
 from links.mavlink.transport.connection import Endpoint
 
 CHUNK_BYTES = 4096
-TCP_BACKLOG_BYTES = 512  # not through yet: two poses more
-CONNECT_S, RECONNECT_S = 2.0, 0.4  # the first time, and while a listener may be waiting to be closed
-THROWN_AWAY = struct.pack("ii", 1, 0)  # struct linger: closing ends it at once
+TCP_BACKLOG_BYTES = 512  # limit before a new frame: two poses
+CONNECT_S, RECONNECT_S = 2.0, 0.4  # at the start, and when a reader reopens the line
+DISCARD = struct.pack("ii", 1, 0)  # struct linger: closing resets the connection
 
 
 class TcpLine:
@@ -32,48 +32,48 @@ class TcpLine:
         self._connect_s = CONNECT_S
 
     def open(self) -> None:
-        """Connect. LinkError."""
+        """Connect. Raises LinkError."""
         try:
             self._socket = socket.create_connection(self._address, self._connect_s)
         except OSError as error:
             reason = error.strerror or str(error)
             raise LinkError(
-                f"cannot connect to TCP {self.name}: {reason}. Does the autopilot's bridge or simulator run there? "
+                f"cannot connect to TCP {self.name}: {reason}. Is the autopilot's bridge or simulator running there? "
                 "Check `connection`."
             ) from None
         self._connect_s = RECONNECT_S
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, THROWN_AWAY)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, DISCARD)
         self._socket.setblocking(False)
 
     def read(self, timeout_s: float) -> bytes:
-        """What has arrived. OSError: it is gone."""
-        line = self._there()
+        """Received bytes. Raises OSError when the line is lost."""
+        line = self._opened()
         if not select.select([line], [], [], timeout_s)[0]:
             return b""
         data = line.recv(CHUNK_BYTES)
         if not data:
-            raise ConnectionResetError("closed by the other side")
+            raise ConnectionResetError("closed by the peer")
         return data
 
     def write(self, data: bytes) -> int:
-        """Bytes taken."""
+        """Write without blocking; returns the number of accepted bytes."""
         try:
-            return self._there().send(data)
+            return self._opened().send(data)
         except BlockingIOError:
             return 0
 
-    def waiting_bytes(self) -> int:
-        """Bytes that the other side has not acknowledged."""
-        return struct.unpack("i", fcntl.ioctl(self._there(), termios.TIOCOUTQ, b"\0\0\0\0"))[0]
+    def buffered_bytes(self) -> int:
+        """Bytes that the peer has not acknowledged."""
+        return struct.unpack("i", fcntl.ioctl(self._opened(), termios.TIOCOUTQ, b"\0\0\0\0"))[0]
 
     def close(self) -> None:
-        """Disconnect. What the other side has not acknowledged is thrown away."""
+        """Disconnect and discard unacknowledged bytes."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
-    def _there(self) -> socket.socket:
+    def _opened(self) -> socket.socket:
         if self._socket is None:
             raise ConnectionResetError("not connected")
         return self._socket

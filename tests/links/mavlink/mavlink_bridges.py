@@ -18,7 +18,7 @@ from links.mavlink.framing import packed, parse_frame
 from links.mavlink.gate import PoseLimits
 from links.mavlink.origin import OriginSender
 from links.mavlink.pose_sender import PoseSender
-from links.mavlink.transport.connection import Connection, Source_
+from links.mavlink.transport.connection import Address, Connection
 from links.mavlink.transport.stream_connection import StreamConnection
 
 mavlink: Any = ardupilotmega
@@ -84,7 +84,7 @@ class RatedLine:
         self._frames.append((data, len(data)))
         return len(data)
 
-    def waiting_bytes(self) -> int:
+    def buffered_bytes(self) -> int:
         return round(sum(left for _, left in self._frames))
 
     def close(self) -> None: ...
@@ -111,9 +111,9 @@ class RatedBridge:
     def __init__(self, line: RatedLine) -> None:
         self.line = line
 
-    def receive(self, timeout_s: float) -> tuple[bytes, Source_] | None: ...
+    def receive(self, timeout_s: float) -> tuple[bytes, Address] | None: ...
 
-    def answer_to(self, source: Source_) -> None: ...
+    def reply_to(self, source: Address) -> None: ...
 
     def send(self, frame: bytes) -> bool:
         return self.line.write(frame) > 0
@@ -136,14 +136,14 @@ class SlowFlight:
         """When poses began to be held back as late."""
         self.got: list[Any] = []
         monkeypatch.setattr("links.mavlink.transport.stream_connection.time.monotonic", lambda: self.s)
-        monkeypatch.setattr(AutopilotSession, "_keep", lambda session: None)  # its steps are ours
+        monkeypatch.setattr(AutopilotSession, "_run", lambda session: None)  # its steps are ours
         self.connection: Connection = RatedBridge(self.line) if bridge else StreamConnection(self.line)
-        speaker = PoseSender(("odometry",), PoseLimits())
+        pose_sender = PoseSender(("odometry",), PoseLimits())
         self.session = AutopilotSession(
             self.connection,
             (1, 1),
             (1, 197),
-            speaker,
+            pose_sender,
             OriginSender(None, (1, 1)),
             None,
             lambda: self.now_ns,
@@ -165,13 +165,13 @@ class SlowFlight:
             if self.speaks and self._steps % SPEAK_EACH == 0:
                 self._say(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
             if self._steps % self.pose_each == 0:
-                self.session.pose(good_pose(self.now_ns))
+                self.session.send_pose(good_pose(self.now_ns))
             if self._steps % TICK_EACH == 3:
                 self.session._tick(self.now_ns)
             for frame in self.line.pass_on(1e-9 * STEP_NS):
                 self._hand_on(parse_frame(frame))
             self.connection.receive(0.0)
-            late = self.session._trips.late
+            late = self.session._timesync.late
             if late and not self._was_late:
                 self.late_since_s.append(self.s)
             self._was_late = late
@@ -185,7 +185,7 @@ class SlowFlight:
 
     def _say(self, message: Any) -> None:
         frame = packed(message, self._mav)
-        self.session._hear(frame, parse_frame(frame), ("127.0.0.1", 1), self.now_ns)
+        self.session._on_frame(frame, parse_frame(frame), ("127.0.0.1", 1), self.now_ns)
 
     def count(self, kind: str) -> int:
         """Messages of a kind that were handed on."""

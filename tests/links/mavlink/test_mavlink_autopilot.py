@@ -1,4 +1,4 @@
-"""MAVLink frames into messages: fields by hand, sequence, foreign and damaged frames, a real flight's log."""
+"""MAVLink frames to messages: fields by hand, sequence, foreign and damaged frames, the log of a real flight."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_the_outputs_are_the_six_messages():
 
 
 @pytest.mark.parametrize("v1", [False, True])
-def test_attitude_and_position_come_in_our_axes(v1: bool):
+def test_attitude_and_position_are_converted_to_grds_axes(v1: bool):
     sender, link = Sender(v1=v1), Autopilot()
     attitude = link.decode(record(sender.attitude(7000, 0.0, 0.0, math.pi / 2)))
     assert isinstance(attitude, DroneAttitude)
@@ -104,7 +104,7 @@ def test_odometry_has_the_velocity_in_the_body_and_rotation_first_in_its_covaria
     assert (message.reset_counter, message.quality_percent) == (9, 80)
 
 
-def test_an_odometry_without_covariance_or_quality_says_so():
+def test_an_odometry_without_covariance_or_quality_has_none():
     message = Autopilot().decode(record(Sender().frame(odometry(upper=[math.nan] * 21, quality=0))))
     assert isinstance(message, DroneOdometry)
     assert (message.pose_covariance, message.quality_percent) == (None, None)
@@ -118,20 +118,20 @@ def test_an_odometry_without_covariance_or_quality_says_so():
     [
         (odometry(frame=0), "odometry in other frames"),
         (odometry(child=1), "odometry in other frames"),
-        (odometry(q=(0, 0, 0, 0)), "no rotation"),
-        (odometry(q=(math.nan, 0, 0, 0)), "no rotation"),
+        (odometry(q=(0, 0, 0, 0)), "invalid rotation"),
+        (odometry(q=(math.nan, 0, 0, 0)), "invalid rotation"),
         (odometry(x=math.inf), "not finite"),
         (mavlink.MAVLink_attitude_message(1, math.nan, 0, 0, 0, 0, 0), "not finite"),
         (mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, math.inf, 0), "not finite"),
     ],
 )
-def test_what_makes_no_sense_is_counted_by_reason(message: Any, reason: str):
+def test_invalid_messages_are_counted_by_reason(message: Any, reason: str):
     link = Autopilot()
     assert link.decode(record(Sender().frame(message))) is None
     assert link.counters[f"refused: {reason}"] == 1
 
 
-def test_both_imus_are_si_in_drone_axes_and_gravity_is_felt_upwards():
+def test_both_imus_are_si_in_drone_axes_and_gravity_is_measured_upwards():
     raw = mavlink.MAVLink_raw_imu_message(7_000_000, 100, 200, -1000, 10, 20, 30, 0, 0, 0)
     highres = mavlink.MAVLink_highres_imu_message(
         7_000_000, 0.980665, 1.96133, -9.80665, 0.01, 0.02, 0.03, 0, 0, 0, math.nan, 0, 0, 0, 63
@@ -145,24 +145,24 @@ def test_both_imus_are_si_in_drone_axes_and_gravity_is_felt_upwards():
 
 
 @pytest.mark.parametrize(("mode", "state", "armed", "failsafe"), [(128 + 1, 4, True, False), (1, 5, False, True)])
-def test_a_heartbeat_tells_armed_mode_and_failsafe(mode: int, state: int, armed: bool, failsafe: bool):
+def test_a_heartbeat_gives_armed_mode_and_failsafe(mode: int, state: int, armed: bool, failsafe: bool):
     status = Autopilot().decode(record(Sender().frame(mavlink.MAVLink_heartbeat_message(2, 3, mode, 5, state, 3))))
     assert isinstance(status, AutopilotStatus)
     assert (status.armed, status.custom_mode, status.failsafe) == (armed, 5, failsafe)
     assert (status.clock_offset_ns, status.clock_uncertainty_ns) == (None, None)
 
 
-def test_both_estimator_reports_tell_what_is_fused():
+def test_both_estimator_reports_give_the_fused_states():
     flags = 1 | 2 | 4 | 8 | 32
     ardupilot = mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.2, 0.3, 0.4, 0.0, 0.0)
     px4 = mavlink.MAVLink_estimator_status_message(7_000_000, flags, 0.1, 0.2, 0.3, 0.4, 0, 0, 1.0, 1.0)
     for message in (ardupilot, px4):
-        told = Autopilot().decode(record(Sender().frame(message)))
-        assert isinstance(told, AutopilotEstimator)
-        assert (told.stamp_ns, told.flags) == (HOST0, flags)
-        assert (told.attitude_good, told.velocity_good, told.position_good, told.height_good) == (True,) * 4
-        assert not told.constant_position
-        ratios = [told.velocity_ratio, told.horizontal_ratio, told.height_ratio, told.compass_ratio]
+        report = Autopilot().decode(record(Sender().frame(message)))
+        assert isinstance(report, AutopilotEstimator)
+        assert (report.stamp_ns, report.flags) == (HOST0, flags)
+        assert (report.attitude_good, report.velocity_good, report.position_good, report.height_good) == (True,) * 4
+        assert not report.constant_position
+        ratios = [report.velocity_ratio, report.horizontal_ratio, report.height_ratio, report.compass_ratio]
         np.testing.assert_allclose(ratios, [0.1, 0.2, 0.3, 0.4], rtol=1e-6)
 
 
@@ -172,16 +172,16 @@ def test_both_estimator_reports_tell_what_is_fused():
 )
 def test_each_flag_of_the_estimator_means_its_own(bit: int, lost: str):
     frame = mavlink.MAVLink_ekf_status_report_message((1 | 2 | 4 | 8 | 32 | 128) & ~bit, math.nan, -1.0, 0, 0, 0, 0)
-    told = Autopilot().decode(record(Sender().frame(frame)))
-    assert isinstance(told, AutopilotEstimator)
-    good = {n: getattr(told, n) for n in ("attitude_good", "velocity_good", "position_good", "height_good")}
+    report = Autopilot().decode(record(Sender().frame(frame)))
+    assert isinstance(report, AutopilotEstimator)
+    good = {n: getattr(report, n) for n in ("attitude_good", "velocity_good", "position_good", "height_good")}
     assert good == {name: name != lost for name in good}
-    assert told.constant_position
-    assert math.isnan(told.velocity_ratio)
-    assert math.isnan(told.horizontal_ratio)
+    assert report.constant_position
+    assert math.isnan(report.velocity_ratio)
+    assert math.isnan(report.horizontal_ratio)
 
 
-def test_a_stamp_in_milliseconds_is_taken_in_their_middle_and_never_after_arrival():
+def test_a_stamp_in_milliseconds_is_their_middle_and_never_after_arrival():
     sender, link = Sender(), Autopilot(clock_drift_limit_ppm=0.0)
     prompt = link.decode(record(sender.attitude(7000), 10.0))
     late = link.decode(record(sender.attitude(7020), 80.0))
@@ -191,20 +191,20 @@ def test_a_stamp_in_milliseconds_is_taken_in_their_middle_and_never_after_arriva
     assert late.stamp_ns == HOST0 + 30 * MS + MS // 2
 
 
-def test_after_a_long_stall_of_the_line_what_waited_is_not_told_as_true_now():
+def test_after_a_long_stall_buffered_messages_are_not_stamped_as_current():
     sender, link = Sender(), Autopilot()
     for i in range(50):
         link.decode(record(sender.attitude(20 * i), 20.0 * i))
-    for i in range(50, 400):  # 7 s of them come together
+    for i in range(50, 400):  # 7 s of messages arrive together
         message = link.decode(record(sender.attitude(20 * i), 8000.0 + 0.1 * i))
         assert message is None or abs(message.stamp_ns - HOST0 - 20 * i * MS) < 10 * MS
     assert link.counters["clock restarts"] == 0
     assert link.decode(record(sender.attitude(8100), 8100.0)) is not None
 
 
-def timesync_reply(sender: Sender, asked_ns: int, tc1_ns: int, target: tuple[int, int] | None) -> bytes:
+def timesync_reply(sender: Sender, request_ns: int, tc1_ns: int, target: tuple[int, int] | None) -> bytes:
     """A reply with the target that newer autopilots add: an extension, which our dialect does not know."""
-    frame = sender.frame(mavlink.MAVLink_timesync_message(tc1_ns, asked_ns))
+    frame = sender.frame(mavlink.MAVLink_timesync_message(tc1_ns, request_ns))
     if target is None:
         return frame
     payload = frame[10:-2].ljust(16, b"\0") + bytes(target)
@@ -216,28 +216,28 @@ def timesync_reply(sender: Sender, asked_ns: int, tc1_ns: int, target: tuple[int
 @pytest.mark.parametrize(
     ("target", "used"), [(None, 1), ((0, 0), 1), ((1, 197), 1), ((1, 0), 1), ((1, 191), 0), ((255, 190), 0)]
 )
-def test_a_timesync_reply_that_names_another_is_not_ours(target: tuple[int, int] | None, used: int):
+def test_a_timesync_reply_for_another_component_is_ignored(target: tuple[int, int] | None, used: int):
     sender, link = Sender(), Autopilot()
     link.decode(record(sender.attitude(7000)))
     reply = timesync_reply(sender, HOST0 + 5 * MS, 7_010 * MS, target)
     assert link.decode(record(reply, 20.0)) is None
     assert link.counters["timesync replies"] == used
-    assert link.counters.get("refused: timesync for another", 0) == 1 - used
+    assert link.counters.get("refused: TIMESYNC for another component", 0) == 1 - used
     assert link.counters["lost"] == 0
 
 
-def asked(reply: bytes, asked_ms: float, at_ms: float) -> Record:
-    """As the session records an answer to our own request."""
-    return Record("/autopilot/rx", HOST0 + round(at_ms * MS), HOST0 + round(asked_ms * MS), reply)
+def matched(reply: bytes, request_ms: float, at_ms: float) -> Record:
+    """A reply to our own request, as the session records it."""
+    return Record("/autopilot/rx", HOST0 + round(at_ms * MS), HOST0 + round(request_ms * MS), reply)
 
 
-def test_once_an_answer_was_matched_with_our_request_no_other_is_believed():
-    """The way takes 50 ms there and back; another requester's clock is 90 ms ahead: by its times it may be ours."""
+def test_after_a_matched_reply_other_replies_are_ignored():
+    """One-way delay 50 ms; another requester's clock is 90 ms ahead, so that its reply is plausible."""
     sender, link = Sender(), Autopilot(clock_drift_limit_ppm=0.0)
-    beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
+    heartbeat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
 
     def offset_and_uncertainty_ms(at_ms: float) -> tuple[float, float]:
-        status = link.decode(record(sender.frame(beat), at_ms))
+        status = link.decode(record(sender.frame(heartbeat), at_ms))
         assert isinstance(status, AutopilotStatus)
         assert status.clock_offset_ns is not None
         assert status.clock_uncertainty_ns is not None
@@ -245,22 +245,22 @@ def test_once_an_answer_was_matched_with_our_request_no_other_is_believed():
 
     link.decode(record(sender.frame(mavlink.MAVLink_highres_imu_message(7_000_000, *[0.0] * 13, 63)), 50.0))
     link.decode(record(timesync_reply(sender, HOST0 + 40 * MS, 7_000 * MS, None), 50.0))
-    assert offset_and_uncertainty_ms(60.0) == (45, 5)  # nothing tells yet that it was another's
-    link.decode(asked(timesync_reply(sender, HOST0 + 950 * MS, 8_000 * MS, None), 950.0, 1050.0))
+    assert offset_and_uncertainty_ms(60.0) == (45, 5)  # not yet known to be foreign
+    link.decode(matched(timesync_reply(sender, HOST0 + 950 * MS, 8_000 * MS, None), 950.0, 1050.0))
     assert offset_and_uncertainty_ms(1060.0) == (0, 50)
     link.decode(record(timesync_reply(sender, HOST0 + 1040 * MS, 8_000 * MS, (1, 197)), 1050.0))
     assert offset_and_uncertainty_ms(1070.0) == (0, 50)
-    assert (link.counters["timesync replies"], link.counters["refused: timesync for another"]) == (2, 1)
+    assert (link.counters["timesync replies"], link.counters["refused: TIMESYNC for another component"]) == (2, 1)
 
 
-def test_a_replay_under_another_id_still_knows_the_answers_that_were_ours():
+def test_a_replay_with_another_id_still_recognises_our_replies():
     sender, link = Sender(), Autopilot(own_component_id=191, own_system_id=7)
     link.decode(record(sender.attitude(7000)))
-    link.decode(asked(timesync_reply(sender, HOST0 + 5 * MS, 7_010 * MS, (1, 197)), 5.0, 20.0))
+    link.decode(matched(timesync_reply(sender, HOST0 + 5 * MS, 7_010 * MS, (1, 197)), 5.0, 20.0))
     assert link.counters["timesync replies"] == 1
 
 
-def test_missing_frames_are_counted_over_the_wrap_of_the_number():
+def test_missing_frames_are_counted_across_the_wrap_of_the_number():
     sender, link = Sender(), Autopilot()
     for i in range(600):
         data = sender.attitude(20 * i)
@@ -270,14 +270,14 @@ def test_missing_frames_are_counted_over_the_wrap_of_the_number():
     assert link.counters["decoded"] == 595
 
 
-def test_a_repeated_or_late_frame_is_refused_and_a_numbering_begun_anew_is_not():
+def test_a_repeated_or_late_frame_is_refused_and_a_restarted_sequence_is_not():
     sender, link = Sender(), Autopilot()
     frames = [sender.attitude(20 * i) for i in range(200)]
     for i in (0, 1, 2, 2, 4, 3, *range(5, 200)):
         link.decode(record(frames[i], 20.0 * i))
     assert link.counters["refused: repeated or late"] == 2
-    again = Sender()
-    kept = [link.decode(record(again.attitude(4000 + 20 * i), 4000.0 + 20 * i)) for i in range(3)]
+    restarted = Sender()
+    kept = [link.decode(record(restarted.attitude(4000 + 20 * i), 4000.0 + 20 * i)) for i in range(3)]
     assert [message is None for message in kept] == [False, False, False]
     assert link.counters["lost"] == 1 + 56  # 3 was missing when 4 came; 199 -> 0 looks like 56 missing
     far = Sender()
@@ -285,7 +285,7 @@ def test_a_repeated_or_late_frame_is_refused_and_a_numbering_begun_anew_is_not()
     assert [message is None for message in kept] == [True, False, False, False, False]
 
 
-def test_other_systems_neither_speak_nor_disturb_the_sequence():
+def test_other_systems_are_ignored_and_do_not_affect_the_sequence():
     ours, radio, link = Sender(), Sender(51, 68), Autopilot()
     for i in range(10):
         link.decode(record(ours.attitude(20 * i), 20.0 * i))
@@ -296,7 +296,7 @@ def test_other_systems_neither_speak_nor_disturb_the_sequence():
     assert isinstance(other.decode(record(radio.attitude(1))), DroneAttitude)
 
 
-def test_a_message_beyond_our_dialect_counts_as_a_frame_and_is_no_loss():
+def test_a_message_outside_the_dialect_counts_as_a_frame_and_is_no_loss():
     sender, link = Sender(), Autopilot()
     link.decode(record(sender.attitude(0)))
     private = bytearray(sender.attitude(20))
@@ -307,7 +307,7 @@ def test_a_message_beyond_our_dialect_counts_as_a_frame_and_is_no_loss():
 
 
 @pytest.mark.parametrize("cut", [0, 1, 7, 8, 20])
-def test_a_damaged_frame_takes_no_other_with_it(cut: int):
+def test_a_damaged_frame_does_not_affect_the_others(cut: int):
     sender, link = Sender(), Autopilot()
     whole = [sender.attitude(20 * i) for i in range(3)]
     assert link.decode(record(whole[0])) is not None
@@ -317,7 +317,7 @@ def test_a_damaged_frame_takes_no_other_with_it(cut: int):
 
 
 @given(st.binary(max_size=300))
-def test_no_bytes_make_it_fail(data: bytes):
+def test_no_bytes_raise(data: bytes):
     Autopilot().decode(record(data))
 
 
@@ -341,7 +341,7 @@ def test_flipped_and_cut_bytes_are_counted_never_raised(frame: bytes, changes: l
     link = Autopilot()
     link.decode(record(bytes(data[:length])))
     counters = link.counters
-    used = counters["decoded"] + counters["of no use here"] + counters["timesync replies"]
+    used = counters["decoded"] + counters["unused"] + counters["timesync replies"]
     assert used + sum(n for name, n in counters.items() if name.startswith("refused")) == 1
 
 
@@ -351,7 +351,7 @@ FLOATS = st.floats(width=32)
 @given(
     st.lists(FLOATS, min_size=13, max_size=13), st.lists(FLOATS, min_size=42, max_size=42), st.integers(0, 2**64 - 1)
 )
-def test_odometry_with_a_right_checksum_and_any_numbers_is_finite_or_refused(
+def test_odometry_with_a_correct_checksum_and_any_numbers_is_finite_or_refused(
     state: list[float], covariances: list[float], time_usec: int
 ):
     message = mavlink.MAVLink_odometry_message(
@@ -366,9 +366,12 @@ def test_odometry_with_a_right_checksum_and_any_numbers_is_finite_or_refused(
 
 @pytest.mark.parametrize(
     ("name", "attitudes", "restarts", "damaged"),
-    [("copter_flight_part1.tlog", 2002, 1, 729), ("plane_bench_disarmed.tlog", 270, 0, 0)],  # 729: its ground station's
+    [
+        ("copter_flight_part1.tlog", 2002, 1, 729),
+        ("plane_bench_disarmed.tlog", 270, 0, 0),
+    ],  # 729: from its ground station
 )
-def test_a_real_log_decodes_with_growing_stamps_before_arrival(
+def test_a_real_log_decodes_with_increasing_stamps_before_arrival(
     name: str, attitudes: int, restarts: int, damaged: int, tmp_path: Path
 ):
     if not (SHARED / name).exists():

@@ -1,4 +1,4 @@
-"""The autopilot's checks by frames made by hand."""
+"""Preflight checks of the autopilot on frames made by hand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flow.link import LinkError, Record
 from links.mavlink import Autopilot
 from links.mavlink.checks import autopilot_checks, parameter_check
 from links.mavlink.framing import packed
-from links.mavlink.parameters import Answers, ask_parameters
+from links.mavlink.parameters import ParameterValues, ask_parameters
 from links.preflight.check_result import Level
 from stages.messages import AutopilotEstimator, AutopilotStatus
 from tests.links.preflight.observed import observe
@@ -25,8 +25,8 @@ BEGIN_NS, S, MS = 1_748_773_230_000_000_000, 1_000_000_000, 1_000_000
 def frames(
     seconds=4.0, *, system=1, autopilot=3, beats=True, attitude_hz=50, odometry_hz=30, base_mode=0, lose=0, quiet=None
 ):
-    """What an autopilot says, in order. `quiet`: which message stays away for 1.5 s, a second before the end."""
-    mav, said = m.MAVLink(None, srcSystem=system, srcComponent=1), []
+    """Frames of an autopilot, in order. `quiet`: a message that is missing for 1.5 s, one second before the end."""
+    mav, records = m.MAVLink(None, srcSystem=system, srcComponent=1), []
     for k in range(int(seconds * 100)):
         at_ms = k * 10
         now = []
@@ -40,11 +40,11 @@ def frames(
             if message.get_type() == quiet and 0 < 1000 * (seconds - 1) - at_ms <= 1500:
                 continue
             at_ns = BEGIN_NS + at_ms * MS
-            said.append(Record("/autopilot/rx", at_ns, at_ns, packed(message, mav)))
-    return said[: len(said) // 2] + said[len(said) // 2 + lose :]
+            records.append(Record("/autopilot/rx", at_ns, at_ns, packed(message, mav)))
+    return records[: len(records) // 2] + records[len(records) // 2 + lose :]
 
 
-def status(offset_ns=S, unsure_ns=2 * MS, armed=False, failsafe=False):
+def status(offset_ns=S, error_ns=2 * MS, armed=False, failsafe=False):
     return AutopilotStatus(
         stamp_ns=BEGIN_NS,
         armed=armed,
@@ -52,7 +52,7 @@ def status(offset_ns=S, unsure_ns=2 * MS, armed=False, failsafe=False):
         failsafe=failsafe,
         lost_frames=0,
         clock_offset_ns=offset_ns,
-        clock_uncertainty_ns=unsure_ns,
+        clock_uncertainty_ns=error_ns,
     )
 
 
@@ -72,19 +72,19 @@ def estimator(ratio=0.1, position=True, attitude=True, constant=False):
     )
 
 
-SAID, ESTIMATORS = status(), (estimator(),)
+STATUS, ESTIMATORS = status(), (estimator(),)
 
 
-def check(records, *, said=SAID, estimators=ESTIMATORS, **kinds):
+def check(records, *, newest=STATUS, estimators=ESTIMATORS, **kinds):
     source = observe(Autopilot(), records, **kinds)
-    return {v.name: v for v in autopilot_checks(source, [said] if records else [], estimators)}
+    return {v.name: v for v in autopilot_checks(source, [newest] if records else [], estimators)}
 
 
-def test_an_autopilot_that_says_all_we_need_is_good():
+def test_an_autopilot_that_sends_all_needed_messages_passes():
     found = check(frames())
     assert {v.level for v in found.values()} == {Level.OK}
     assert set(found) == {f"it {what}" for what in ("heartbeat", "frames", "clock", "rates", "estimate")}
-    assert "1.0 a second, ardupilot, disarmed" in found["it heartbeat"].sentence
+    assert "1.0 Hz, ardupilot, disarmed" in found["it heartbeat"].sentence
     assert "ATTITUDE 50 Hz" in found["it rates"].sentence
 
 
@@ -92,19 +92,19 @@ def test_an_autopilot_that_says_all_we_need_is_good():
     ("records", "given", "name", "words"),
     [
         (frames(autopilot=12), {}, "heartbeat", "set profile: px4"),
-        (frames(), {"said": status(armed=True)}, "heartbeat", "disarm it"),
-        (frames(), {"said": status(failsafe=True)}, "heartbeat", "emergency"),
+        (frames(), {"newest": status(armed=True)}, "heartbeat", "disarm it"),
+        (frames(), {"newest": status(failsafe=True)}, "heartbeat", "emergency"),
         (frames(), {"end_ns": BEGIN_NS + 9 * S}, "heartbeat", "none for 6.0 s"),
         (frames(lose=100), {}, "frames", "100 of"),
-        (frames(), {"said": status(unsure_ns=80 * MS)}, "clock", "known to 80.0 ms"),
-        (frames(), {"said": status(offset_ns=None, unsure_ns=None)}, "clock", "no message carried its time"),
-        (frames(), {"counters": {"clock restarts": 2}}, "clock", "began anew 2 times"),
-        (frames(attitude_hz=0), {}, "rates", "its attitude is needed"),
+        (frames(), {"newest": status(error_ns=80 * MS)}, "clock", "+- 80.0 ms"),
+        (frames(), {"newest": status(offset_ns=None, error_ns=None)}, "clock", "no message has a time stamp"),
+        (frames(), {"counters": {"clock restarts": 2}}, "clock", "was reset 2 times"),
+        (frames(attitude_hz=0), {}, "rates", "attitude is needed"),
         (frames(), {"estimators": [estimator(attitude=False)]}, "estimate", "no attitude yet"),
-        (frames(), {"estimators": [estimator(ratio=1.6)]}, "estimate", "refuses velocity (1.6)"),
+        (frames(), {"estimators": [estimator(ratio=1.6)]}, "estimate", "rejects velocity (1.6)"),
     ],
 )
-def test_an_autopilot_that_is_not_fit_to_fly_is_no_go(records, given, name, words):
+def test_an_autopilot_that_is_not_ready_fails(records, given, name, words):
     found = check(records, **given)[f"it {name}"]
     assert found.level is Level.FAIL
     assert words in found.sentence
@@ -115,8 +115,8 @@ def test_an_autopilot_that_is_not_fit_to_fly_is_no_go(records, given, name, word
     [
         (frames(lose=10), {}, "frames"),
         (frames(), {"counters": {"from other senders": 3}}, "frames"),
-        (frames(), {"said": status(unsure_ns=None)}, "clock"),
-        (frames(), {"said": status(unsure_ns=20 * MS)}, "clock"),
+        (frames(), {"newest": status(error_ns=None)}, "clock"),
+        (frames(), {"newest": status(error_ns=20 * MS)}, "clock"),
         (frames(odometry_hz=0), {}, "rates"),
         (frames(attitude_hz=5), {}, "rates"),
         (frames(), {"estimators": []}, "estimate"),
@@ -124,62 +124,64 @@ def test_an_autopilot_that_is_not_fit_to_fly_is_no_go(records, given, name, word
         (frames(), {"estimators": [estimator(ratio=0.8)]}, "estimate"),
     ],
 )
-def test_what_is_for_a_person_to_judge_is_a_warning(records, given, name):
+def test_degraded_states_are_warnings(records, given, name):
     assert check(records, **given)[f"it {name}"].level is Level.WARNING
 
 
-def test_gaps_that_the_rate_does_not_show_are_told_with_what_they_may_be():
+def test_gaps_that_the_rate_hides_are_reported():
     gaps = check(frames(8.0, quiet="ATTITUDE"))["it rates"]
     assert gaps.level is Level.FAIL
-    assert "no attitude for 1.5 s, 1 s at most" in gaps.sentence
-    flown = check(frames(8.0, quiet="ATTITUDE"), live=False)["it rates"]
-    assert flown.level is Level.WARNING
-    still = check(frames(8.0, quiet="LOCAL_POSITION_NED"))["it rates"]
-    assert still.level is Level.WARNING
-    assert "no odometry or position for 1.5 s, 1 s at most" in still.sentence
-    died = check(frames(), end_ns=BEGIN_NS + 6 * S)["it rates"]
-    assert died.level is Level.FAIL
-    assert "no attitude for 2.0 s" in died.sentence
+    assert "no attitude for 1.5 s, at most 1 s allowed" in gaps.sentence
+    recorded = check(frames(8.0, quiet="ATTITUDE"), live=False)["it rates"]
+    assert recorded.level is Level.WARNING
+    no_position = check(frames(8.0, quiet="LOCAL_POSITION_NED"))["it rates"]
+    assert no_position.level is Level.WARNING
+    assert "no odometry or position for 1.5 s, at most 1 s allowed" in no_position.sentence
+    stopped = check(frames(), end_ns=BEGIN_NS + 6 * S)["it rates"]
+    assert stopped.level is Level.FAIL
+    assert "no attitude for 2.0 s" in stopped.sentence
 
 
-def test_timesync_replies_that_name_another_are_told_apart_from_none():
-    none = check(frames(), said=status(unsure_ns=None))["it clock"]
-    assert "does it hear us" in none.sentence
-    named = check(frames(), said=status(unsure_ns=None), counters={"refused: timesync for another": 7})["it clock"]
-    assert "7 name another: own_system_id, own_component_id?" in named.sentence
+def test_timesync_replies_for_another_component_are_distinguished_from_none():
+    none = check(frames(), newest=status(error_ns=None))["it clock"]
+    assert "does it receive our frames" in none.sentence
+    foreign = check(frames(), newest=status(error_ns=None), counters={"refused: TIMESYNC for another component": 7})[
+        "it clock"
+    ]
+    assert "7 were for another component: check own_system_id, own_component_id" in foreign.sentence
 
 
-def test_a_silent_autopilot_and_one_with_another_id_are_told_apart():
-    assert "no word from system 1, component 1" in check([])["it heartbeat"].sentence
+def test_a_silent_autopilot_and_one_with_another_id_are_distinguished():
+    assert "no frame from system 1, component 1" in check([])["it heartbeat"].sentence
     other = check(frames(system=9))["it heartbeat"]
     assert other.level is Level.FAIL
-    assert "system 9 component 1 speak here" in other.sentence
+    assert "from system 9 component 1" in other.sentence
     mute = check(frames(beats=False))["it heartbeat"]
-    assert "though it sends other messages" in mute.sentence
+    assert "but other messages" in mute.sentence
     old = check([], counters={"signed with our key, but not new": 8})["it heartbeat"]
-    assert "8 frames came that are signed with an old time: does it hear us?" in old.sentence
+    assert "8 frames signed with an old time: does it receive our frames?" in old.sentence
     unsigned = check([], counters={"not signed with our key": 8})["it heartbeat"]
-    assert "8 frames came that are not signed" in unsigned.sentence
+    assert "8 frames without a valid signature" in unsigned.sentence
 
 
-def test_a_flight_that_was_recorded_may_be_armed():
-    assert check(frames(), said=status(armed=True), live=False)["it heartbeat"].level is Level.OK
+def test_a_recorded_flight_may_be_armed():
+    assert check(frames(), newest=status(armed=True), live=False)["it heartbeat"].level is Level.OK
 
 
 @pytest.mark.parametrize("profile", ["ardupilot", "px4"])
 def test_parameters_are_compared_with_the_profile(profile):
     good = good_parameters(profile)
-    assert parameter_check("it", profile, Answers(good, [], 40)).level is Level.OK
+    assert parameter_check("it", profile, ParameterValues(good, [], 40)).level is Level.OK
     first, second = list(good)[:2]
-    bad = parameter_check("it", profile, Answers({**good, first: 99.0} | {second: 98.0}, [], 40))
+    bad = parameter_check("it", profile, ParameterValues({**good, first: 99.0} | {second: 98.0}, [], 40))
     assert bad.level is Level.FAIL
     assert f"{first} is 99" in bad.sentence
     assert f"{second} is 98" in bad.sentence
-    assert "did not answer" in parameter_check("it", profile, Answers({}, list(good), 0)).sentence
-    assert "none was told" in parameter_check("it", profile, Answers({}, list(good), 9)).sentence
+    assert "does not reply" in parameter_check("it", profile, ParameterValues({}, list(good), 0)).sentence
+    assert "none was received" in parameter_check("it", profile, ParameterValues({}, list(good), 9)).sentence
 
 
-def test_a_disk_that_takes_no_signing_time_is_no_go_on_the_ground(tmp_path, monkeypatch):
+def test_a_full_disk_for_the_signing_time_is_an_error_in_preflight(tmp_path, monkeypatch):
     def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -191,7 +193,7 @@ def test_a_disk_that_takes_no_signing_time_is_no_go_on_the_ground(tmp_path, monk
         ask_parameters(Autopilot(connection="udpin:127.0.0.1:0", signing_key=key))
 
 
-def test_how_fast_its_clock_runs_away_is_told_where_it_is_known():
+def test_the_clock_drift_is_reported_if_known():
     drifting = dataclasses.replace(status(), clock_drift_ppm=-18.04, clock_drift_sigma_ppm=1.4)
-    assert "drifting by -18.0 +- 1.4 ppm" in check(frames(), said=drifting)["it clock"].sentence
-    assert "drifting" not in check(frames())["it clock"].sentence
+    assert "drift -18.0 +- 1.4 ppm" in check(frames(), newest=drifting)["it clock"].sentence
+    assert "drift" not in check(frames())["it clock"].sentence

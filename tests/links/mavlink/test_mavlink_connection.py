@@ -76,7 +76,7 @@ def test_udp_answers_the_autopilot_and_nobody_before_it_spoke():
     drone.sendto(b"hello", ("127.0.0.1", link.port))
     received = link.receive(5.0)
     assert received == (b"hello", drone.getsockname())
-    link.answer_to(received[1])
+    link.reply_to(received[1])
     assert link.send(b"pose")
     assert drone.recv(100) == b"pose"
     link.close()
@@ -107,7 +107,7 @@ def test_udp_out_hears_nobody_but_whom_it_sends_to_and_bears_a_closed_port():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.sendto(b"land now", source)
             assert link.receive(5.0) is None
-            link.answer_to(stranger.getsockname())
+            link.reply_to(stranger.getsockname())
         drone.sendto(b"hello", source)
         assert link.receive(5.0) == (b"hello", drone.getsockname())
     assert link.foreign == 1
@@ -185,7 +185,7 @@ def test_while_tcp_is_down_nothing_is_sent_and_it_says_so():
         link.receive(0.02)
     assert not link.send(FRAME)
     assert link.status is not None
-    assert "Trying again" in link.status
+    assert "Reopening" in link.status
     link.close()
 
 
@@ -282,7 +282,7 @@ class SlowLine:
         self.room -= size
         return size
 
-    def waiting_bytes(self) -> int:
+    def buffered_bytes(self) -> int:
         return self.waiting
 
     def close(self) -> None: ...
@@ -322,7 +322,7 @@ def test_a_line_that_stands_still_is_dropped_and_says_so_and_one_that_moves_is_n
     now_s += STALL_S + 0.01
     link.receive(0.0)
     assert link.stalls == 1
-    assert "did not take what was sent within 0.5 s" in (link.status or "")
+    assert "did not transmit within 0.5 s" in (link.status or "")
     line.room = 100
     assert not link.send(b"CCCC")
 

@@ -39,7 +39,7 @@ mavlink: Any = ardupilotmega
 TICK_S = 0.02
 
 
-class Heard:
+class Listener:
     """A listening link, its records and messages, and a clock of poses."""
 
     def __init__(self, link: Autopilot, records: Iterator[Record]) -> None:
@@ -80,23 +80,23 @@ def bound_port(udp: socket.socket) -> int:
 
 
 @contextmanager
-def listening(**config: Any) -> Iterator[Heard]:
+def listening(**config: Any) -> Iterator[Listener]:
     link = Autopilot(**{"connection": "udpin:127.0.0.1:0", **config})
     with link.listen() as records:
-        heard = Heard(link, records)
+        listener = Listener(link, records)
         try:
-            yield heard
+            yield listener
         finally:
             pass
-    heard.thread.join(5)
-    assert not heard.thread.is_alive(), "the records did not end when the link was closed"
+    listener.thread.join(5)
+    assert not listener.thread.is_alive(), "the records did not end when the link was closed"
 
 
 @contextmanager
-def drone_for(heard: Heard, rules: Any, **settings: Any) -> Iterator[AutopilotSocket]:
-    assert heard.link.port is not None
-    with AutopilotSocket(rules, send_to=("127.0.0.1", heard.link.port), **settings) as drone:
-        heard.rest(lambda: len(heard.records) > 0)  # it has spoken: poses have somewhere to go
+def drone_for(listener: Listener, rules: Any, **settings: Any) -> Iterator[AutopilotSocket]:
+    assert listener.link.port is not None
+    with AutopilotSocket(rules, send_to=("127.0.0.1", listener.link.port), **settings) as drone:
+        listener.rest(lambda: len(listener.records) > 0)  # it has spoken: poses have somewhere to go
         yield drone
 
 
@@ -107,24 +107,24 @@ def test_the_pose_is_an_optional_input():
 
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
 def test_good_poses_are_fused_and_the_autopilot_says_so(rules: Any):
-    with listening() as heard, drone_for(heard, rules()) as drone:
-        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 40)
+    with listening() as listener, drone_for(listener, rules()) as drone:
+        listener.fly(lambda: drone.rules.fates[Fate.FUSED] >= 40)
         assert set(drone.rules.fates) <= {Fate.FUSED, Fate.RESET, Fate.NOT_FOR_IT, Fate.NOT_STARTED, Fate.TOO_SOON}
         assert drone.rules.fates[Fate.RESET] == 1  # the beginning
         assert drone.rules.estimate is not None
         np.testing.assert_allclose(drone.rules.estimate.xyz_m, [101, -2, -10], atol=0.5)
-        told = [m for m in heard.messages if isinstance(m, AutopilotEstimator)]
-        heard.fly(lambda: any(m.position_good for m in heard.messages if isinstance(m, AutopilotEstimator)))
+        told = [m for m in listener.messages if isinstance(m, AutopilotEstimator)]
+        listener.fly(lambda: any(m.position_good for m in listener.messages if isinstance(m, AutopilotEstimator)))
         assert told[0].constant_position
-        sent = [parse_frame(r.data).get_type() for r in heard.link.sent()]
-        assert sent.count("ODOMETRY") == heard.link.counters["sent: ODOMETRY"]
-    assert heard.link.counters["lost"] == 0
+        sent = [parse_frame(r.data).get_type() for r in listener.link.sent()]
+        assert sent.count("ODOMETRY") == listener.link.counters["sent: ODOMETRY"]
+    assert listener.link.counters["lost"] == 0
 
 
 def test_what_was_sent_is_recorded_byte_for_byte_with_our_own_component():
-    with listening() as heard, drone_for(heard, ArduPilotRules()) as drone:
-        heard.fly(lambda: len(drone.messages("ODOMETRY")) >= 10)
-        records = list(heard.link.sent())
+    with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
+        listener.fly(lambda: len(drone.messages("ODOMETRY")) >= 10)
+        records = list(listener.link.sent())
         assert {r.topic for r in records} == {"/autopilot/tx"}
         assert {header(r.data)[0] for r in records} == {(1, 197)}
         numbers = [header(r.data)[1] for r in records]
@@ -132,71 +132,71 @@ def test_what_was_sent_is_recorded_byte_for_byte_with_our_own_component():
         assert set(first) == {1}  # none missing, in order
         arrived = {bytes(m.get_msgbuf()) for m in drone.messages("ODOMETRY")}
         assert arrived <= {r.data for r in records}
-        assert list(heard.link.sent()) == [] or heard.link.counters["sent: HEARTBEAT"]  # told once
+        assert list(listener.link.sent()) == [] or listener.link.counters["sent: HEARTBEAT"]  # told once
 
 
 def test_an_unresolved_branch_never_reaches_the_autopilot_and_it_is_told_why():
-    with listening() as heard, drone_for(heard, ArduPilotRules()) as drone:
+    with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
         wrong = rotation_z(np.pi / 2)
-        heard.fly(
+        listener.fly(
             lambda: any("AMBIGUOUS" in m.text for m in drone.messages("STATUSTEXT")),
             lambda ns: good_pose(ns, state=PoseState.AMBIGUOUS, R_start_drone=wrong, R_vehicle_drone=wrong),
         )
         assert drone.messages("ODOMETRY") == []
         assert drone.rules.estimate is None
-        assert heard.link.counters["pose held back: ambiguous rotation"] > 0
+        assert listener.link.counters["pose rejected: ambiguous rotation"] > 0
 
 
 def test_it_stops_loudly_keeps_its_heartbeat_and_resets_when_it_goes_on():
-    with listening() as heard, drone_for(heard, ArduPilotRules()) as drone:
-        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+    with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
+        listener.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         beats = len(drone.messages("HEARTBEAT"))
-        heard.rest(lambda: any(m.severity == 2 for m in drone.messages("STATUSTEXT")))
-        heard.rest(lambda: len(drone.messages("HEARTBEAT")) >= beats + 2)
+        listener.rest(lambda: any(m.severity == 2 for m in drone.messages("STATUSTEXT")))
+        listener.rest(lambda: len(drone.messages("HEARTBEAT")) >= beats + 2)
         assert drone.messages("HEARTBEAT")[-1].system_status == mavlink.MAV_STATE_STANDBY
         assert not drone.rules.healthy(drone.device_ns())
         resets = drone.rules.fates[Fate.RESET]
-        heard.fly(lambda: drone.rules.fates[Fate.RESET] > resets)
+        listener.fly(lambda: drone.rules.fates[Fate.RESET] > resets)
         assert drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256
         beat = drone.messages("HEARTBEAT")[0]
         assert (beat.type, beat.autopilot) == (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
 
 
 def test_an_autopilot_that_stands_still_gets_no_poses_that_it_would_take_for_new_later():
-    with listening() as heard, drone_for(heard, ArduPilotRules()) as drone:
-        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+    with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
+        listener.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         drone.silent = True
-        heard.fly(lambda: heard.link.counters.get("pose held back: autopilot not heard", 0) >= 1, most=150)
-        sent = heard.link.counters["sent: ODOMETRY"]
-        heard.fly(lambda: heard.link.counters["pose held back: autopilot not heard"] >= 25)
-        assert heard.link.counters["sent: ODOMETRY"] == sent
+        listener.fly(lambda: listener.link.counters.get("pose rejected: autopilot silent", 0) >= 1, most=150)
+        sent = listener.link.counters["sent: ODOMETRY"]
+        listener.fly(lambda: listener.link.counters["pose rejected: autopilot silent"] >= 25)
+        assert listener.link.counters["sent: ODOMETRY"] == sent
         drone.silent = False
-        heard.fly(lambda: drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256)
+        listener.fly(lambda: drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256)
 
 
 def test_by_tcp_poses_go_to_whom_was_heard_on_this_connection():
     beat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mavlink.MAVLink(None, 1, 1))
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
-        listening(connection=f"tcp:127.0.0.1:{server.getsockname()[1]}") as heard,
+        listening(connection=f"tcp:127.0.0.1:{server.getsockname()[1]}") as listener,
     ):
 
         def held() -> int:
-            return heard.link.counters.get("pose held back: autopilot not heard", 0)
+            return listener.link.counters.get("pose rejected: autopilot silent", 0)
 
         def sent() -> int:
-            return heard.link.counters.get("sent: ODOMETRY", 0)
+            return listener.link.counters.get("sent: ODOMETRY", 0)
 
         for connection in range(2):  # nobody need have accepted it: the system takes what is sent
             held_before, sent_before = held(), sent()
-            heard.fly(lambda before=held_before: held() >= before + 5)
+            listener.fly(lambda before=held_before: held() >= before + 5)
             assert sent() == sent_before
             with server.accept()[0] as peer:
                 peer.sendall(beat)
-                heard.fly(lambda before=sent_before: sent() > before)
-            heard.rest(lambda connection=connection: heard.link.counters["reconnects"] > connection)
+                listener.fly(lambda before=sent_before: sent() > before)
+            listener.rest(lambda connection=connection: listener.link.counters["reconnects"] > connection)
 
 
 def test_half_a_frame_of_the_line_before_holds_up_none_of_the_new_one():
@@ -206,75 +206,75 @@ def test_half_a_frame_of_the_line_before_holds_up_none_of_the_new_one():
     beat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mav)
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
-        listening(connection=f"tcp:127.0.0.1:{server.getsockname()[1]}") as heard,
+        listening(connection=f"tcp:127.0.0.1:{server.getsockname()[1]}") as listener,
     ):
         with server.accept()[0] as peer:
             peer.sendall(beat + long[:20])
-            heard.rest(lambda: len(heard.records) == 1)
-        heard.rest(lambda: heard.link.counters["reconnects"] == 1)
+            listener.rest(lambda: len(listener.records) == 1)
+        listener.rest(lambda: listener.link.counters["reconnects"] == 1)
         with server.accept()[0] as peer:
             peer.sendall(beat)
-            heard.rest(lambda: len(heard.records) == 2, most=100)
-        assert heard.link.counters["stray bytes"] == 20
+            listener.rest(lambda: len(listener.records) == 2, most=100)
+        assert listener.link.counters["stray bytes"] == 20
 
 
 def test_timesync_is_answered_and_asked_for():
-    with listening() as heard, drone_for(heard, Px4Rules()) as drone:
+    with listening() as listener, drone_for(listener, Px4Rules()) as drone:
         before_ns = host_time.now_ns()
-        heard.rest(lambda: any(m.tc1 != 0 for m in drone.messages("TIMESYNC")))
+        listener.rest(lambda: any(m.tc1 != 0 for m in drone.messages("TIMESYNC")))
         answer = next(m for m in drone.messages("TIMESYNC") if m.tc1 != 0)
         assert before_ns - 10**10 < answer.tc1 <= host_time.now_ns()  # our clock
         assert 0 < answer.ts1 <= drone.device_ns()  # its own, given back
-        heard.rest(
-            lambda: heard.link.counters["timesync replies"] >= 1
+        listener.rest(
+            lambda: listener.link.counters["timesync replies"] >= 1
         )  # ours, answered; ESTIMATOR_STATUS has its time
 
 
 def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
     with (
-        listening() as heard,
-        Bridge(heard.link.port or 0) as bridge,
+        listening() as listener,
+        Bridge(listener.link.port or 0) as bridge,
         AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", bridge.port)) as drone,
     ):
-        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        listener.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         bridge.delay_s = 0.6
-        heard.fly(lambda: heard.link.counters.get("pose held back: line too slow", 0) >= 1)
-        sent = heard.link.counters["sent: ODOMETRY"]
-        heard.fly(lambda: heard.link.counters["pose held back: line too slow"] >= 25)
-        assert heard.link.counters["sent: ODOMETRY"] == sent
-        assert heard.link.counters["round trip [ms]"] >= 600
-        assert "answers to TIMESYNC take longer than 0.3 s" in (heard.link.status or "")
-        told = "grd: STOPPED: line too slow"
-        heard.rest(lambda: any((m.severity, m.text) == (2, told) for m in drone.messages("STATUSTEXT")))
-        assert heard.link.counters["sent: ODOMETRY"] == sent
+        listener.fly(lambda: listener.link.counters.get("pose rejected: link too slow", 0) >= 1)
+        sent = listener.link.counters["sent: ODOMETRY"]
+        listener.fly(lambda: listener.link.counters["pose rejected: link too slow"] >= 25)
+        assert listener.link.counters["sent: ODOMETRY"] == sent
+        assert listener.link.counters["round trip [ms]"] >= 600
+        assert "TIMESYNC replies take longer than 0.3 s" in (listener.link.status or "")
+        told = "grd: STOPPED: link too slow"
+        listener.rest(lambda: any((m.severity, m.text) == (2, told) for m in drone.messages("STATUSTEXT")))
+        assert listener.link.counters["sent: ODOMETRY"] == sent
         prompt_us = host_time.now_ns() // 1000
         bridge.delay_s = 0.0
-        heard.fly(lambda: drone.messages("ODOMETRY")[-1].time_usec > prompt_us)
+        listener.fly(lambda: drone.messages("ODOMETRY")[-1].time_usec > prompt_us)
         assert next(m for m in drone.messages("ODOMETRY") if m.time_usec > prompt_us).reset_counter != counter
-        heard.rest(lambda: heard.link.status is None)
+        listener.rest(lambda: listener.link.status is None)
 
 
 def test_an_answer_that_we_did_not_ask_for_is_not_believed_though_it_names_nobody():
-    with listening() as heard, drone_for(heard, Px4Rules()) as drone:
-        heard.rest(lambda: heard.link.counters["timesync replies"] >= 2)
+    with listening() as listener, drone_for(listener, Px4Rules()) as drone:
+        listener.rest(lambda: listener.link.counters["timesync replies"] >= 2)
         drone.say(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
-        heard.rest(lambda: heard.link.counters.get("refused: timesync for another", 0) == 1)
-        before = heard.link.counters["timesync replies"]
-        heard.rest(lambda: heard.link.counters["timesync replies"] > before)
+        listener.rest(lambda: listener.link.counters.get("refused: TIMESYNC for another component", 0) == 1)
+        before = listener.link.counters["timesync replies"]
+        listener.rest(lambda: listener.link.counters["timesync replies"] > before)
     replayed = Autopilot(own_component_id=191)
-    for record in heard.records:
+    for record in listener.records:
         replayed.decode(record)
-    assert replayed.counters["timesync replies"] == heard.link.counters["timesync replies"]
+    assert replayed.counters["timesync replies"] == listener.link.counters["timesync replies"]
 
 
 def test_an_origin_is_given_to_who_has_none_and_never_over_another():
     origin = {"latitude_deg": 47.3977, "longitude_deg": 8.5456, "altitude_m": 488.0}
     ours, theirs = (473977000, 85456000, 488000), (1, 2, 3)
-    with listening(global_origin=origin) as heard, drone_for(heard, ArduPilotRules()) as drone:
-        heard.rest(lambda: drone.origin == ours)
-    with listening(global_origin=origin) as heard, drone_for(heard, ArduPilotRules(), origin=theirs) as drone:
-        heard.rest(lambda: len(drone.messages("TIMESYNC")) >= 3)  # two seconds later
+    with listening(global_origin=origin) as listener, drone_for(listener, ArduPilotRules()) as drone:
+        listener.rest(lambda: drone.origin == ours)
+    with listening(global_origin=origin) as listener, drone_for(listener, ArduPilotRules(), origin=theirs) as drone:
+        listener.rest(lambda: len(drone.messages("TIMESYNC")) >= 3)  # two seconds later
         assert drone.messages("SET_GPS_GLOBAL_ORIGIN") == []
         assert len(drone.messages("COMMAND_LONG")) == 1
         assert drone.origin == theirs
@@ -284,20 +284,20 @@ def test_both_sides_of_a_signed_link_understand_each_other_and_unsigned_words_ar
     key = tmp_path / "key"
     key.write_bytes(b"k" * 32)
     key.chmod(0o600)
-    with listening(signing_key=str(key)) as heard:
+    with listening(signing_key=str(key)) as listener:
         drone = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         drone.signing.timestamp = (host_time.now_ns() - 1_420_070_400 * 10**9) // 10_000
         beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
             udp.bind(("127.0.0.1", 0))
             udp.settimeout(5.0)
-            udp.sendto(packed(beat, drone), ("127.0.0.1", heard.link.port))
-            heard.rest(lambda: heard.link.counters.get("not signed with our key", 0) == 1)
-            assert heard.records == []
+            udp.sendto(packed(beat, drone), ("127.0.0.1", listener.link.port))
+            listener.rest(lambda: listener.link.counters.get("not signed with our key", 0) == 1)
+            assert listener.records == []
             drone.signing.secret_key, drone.signing.sign_outgoing = b"k" * 32, True
-            udp.sendto(packed(beat, drone), ("127.0.0.1", heard.link.port))
-            heard.rest(lambda: len(heard.records) == 1)
-            heard.link.on_pose(good_pose(host_time.now_ns()))
+            udp.sendto(packed(beat, drone), ("127.0.0.1", listener.link.port))
+            listener.rest(lambda: len(listener.records) == 1)
+            listener.link.on_pose(good_pose(host_time.now_ns()))
             assert drone.decode(bytearray(udp.recv(300))).get_signed()  # pymavlink looks at the signature
     assert (tmp_path / "key.timestamp").exists()
 
@@ -318,35 +318,35 @@ def test_an_autopilot_without_a_clock_is_told_the_time_before_it_is_heard_and_ge
     """ArduPilot begins with the time it signed with last, and takes that of a signed frame that is newer."""
     key, drone = signing_drone(tmp_path, days_ago=10)
     beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
-    with listening(signing_key=str(key)) as heard, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+    with listening(signing_key=str(key)) as listener, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.bind(("127.0.0.1", 0))
         udp.settimeout(3.0)
-        udp.sendto(packed(beat, drone), ("127.0.0.1", heard.link.port))
-        heard.rest(lambda: heard.link.counters.get("signed with our key, but not new", 0) == 1)
-        heard.link.on_pose(good_pose(host_time.now_ns()))
+        udp.sendto(packed(beat, drone), ("127.0.0.1", listener.link.port))
+        listener.rest(lambda: listener.link.counters.get("signed with our key, but not new", 0) == 1)
+        listener.link.on_pose(good_pose(host_time.now_ns()))
         assert drone.decode(bytearray(udp.recv(300))).get_type() in ("HEARTBEAT", "TIMESYNC", "STATUSTEXT")
-        assert heard.records == []
-        assert heard.link.counters["pose held back: autopilot not heard"] == 1
-        udp.sendto(packed(beat, drone), ("127.0.0.1", heard.link.port))
-        heard.rest(lambda: len(heard.records) == 1)
-        heard.link.on_pose(good_pose(host_time.now_ns()))
-        assert heard.link.counters["sent: ODOMETRY"] == 1
+        assert listener.records == []
+        assert listener.link.counters["pose rejected: autopilot silent"] == 1
+        udp.sendto(packed(beat, drone), ("127.0.0.1", listener.link.port))
+        listener.rest(lambda: len(listener.records) == 1)
+        listener.link.on_pose(good_pose(host_time.now_ns()))
+        assert listener.link.counters["sent: ODOMETRY"] == 1
 
 
 def test_an_old_signed_frame_sent_again_does_not_draw_the_poses_away(tmp_path: Path):
     key, drone = signing_drone(tmp_path)
     frame = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), drone)
     with (
-        listening(signing_key=str(key)) as heard,
+        listening(signing_key=str(key)) as listener,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
     ):
         udp.settimeout(3.0)
-        udp.sendto(frame, ("127.0.0.1", heard.link.port))
-        heard.rest(lambda: len(heard.records) == 1)
-        other.sendto(frame, ("127.0.0.1", heard.link.port))
-        heard.rest(lambda: heard.link.counters.get("signed with our key, but not new", 0) == 1)
-        heard.link.on_pose(good_pose(host_time.now_ns()))
+        udp.sendto(frame, ("127.0.0.1", listener.link.port))
+        listener.rest(lambda: len(listener.records) == 1)
+        other.sendto(frame, ("127.0.0.1", listener.link.port))
+        listener.rest(lambda: listener.link.counters.get("signed with our key, but not new", 0) == 1)
+        listener.link.on_pose(good_pose(host_time.now_ns()))
         while parse_frame(udp.recv(300)).get_type() != "ODOMETRY":
             pass
 
@@ -365,18 +365,18 @@ def test_a_disk_that_takes_its_time_with_the_signatures_time_holds_no_pose_up(
 
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
-        listening(connection=f"udpout:127.0.0.1:{bound_port(udp)}", signing_key=str(key)) as heard,
+        listening(connection=f"udpout:127.0.0.1:{bound_port(udp)}", signing_key=str(key)) as listener,
     ):
-        session = heard.link._session
+        session = listener.link._session
         assert session is not None
         assert session._signer is not None
         monkeypatch.setattr("links.mavlink.signing.os.fsync", slow)
         session._signer._reserved = session._signer._used + AHEAD_TICKS // 4  # it is time to write, not to wait for it
-        heard.rest(writing.is_set)
-        heard.link.on_pose(good_pose(host_time.now_ns()))
+        listener.rest(writing.is_set)
+        listener.link.on_pose(good_pose(host_time.now_ns()))
         session._signer._reserved = 0  # it hangs for so long that all is used up
-        heard.link.on_pose(good_pose(host_time.now_ns()))
-        assert heard.link.counters["sent: ODOMETRY"] == 2
+        listener.link.on_pose(good_pose(host_time.now_ns()))
+        assert listener.link.counters["sent: ODOMETRY"] == 2
         release.set()
     assert all(released)
 
@@ -384,7 +384,7 @@ def test_a_disk_that_takes_its_time_with_the_signatures_time_holds_no_pose_up(
 def test_each_time_that_a_link_opens_the_signing_time_is_written_ahead_before_it_signs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(AutopilotSession, "_keep", lambda session: None)  # the thread comes too late
+    monkeypatch.setattr(AutopilotSession, "_run", lambda session: None)  # the thread comes too late
     key, _ = signing_drone(tmp_path)
     link = Autopilot(connection="udpin:127.0.0.1:0", signing_key=key)
     for _ in range(2):
@@ -400,79 +400,79 @@ def test_a_disk_that_takes_no_signing_time_ends_no_flight(tmp_path: Path, monkey
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, listening(signing_key=str(key)) as heard:
-        session = heard.link._session
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, listening(signing_key=str(key)) as listener:
+        session = listener.link._session
         assert session is not None
         signer = session._signer
         assert signer is not None
         monkeypatch.setattr("links.mavlink.signing.os.fsync", full)
         signer._reserved = 0
-        heard.rest(lambda: heard.link.counters.get("signing time not written", 0) == 1)
-        assert "signing time cannot be written" in (heard.link.status or "")
-        udp.sendto(beat, ("127.0.0.1", heard.link.port))
-        heard.rest(lambda: len(heard.records) == 1)
-        heard.link.on_pose(good_pose(host_time.now_ns()))
-        assert heard.link.counters["sent: ODOMETRY"] == 1
-    with heard.link.listen():  # opened again in the same run: its times never go back
-        assert heard.link._session is not None
-        assert heard.link._session._signer is signer
+        listener.rest(lambda: listener.link.counters.get("signing time not written", 0) == 1)
+        assert "signing time cannot be written" in (listener.link.status or "")
+        udp.sendto(beat, ("127.0.0.1", listener.link.port))
+        listener.rest(lambda: len(listener.records) == 1)
+        listener.link.on_pose(good_pose(host_time.now_ns()))
+        assert listener.link.counters["sent: ODOMETRY"] == 1
+    with listener.link.listen():  # opened again in the same run: its times never go back
+        assert listener.link._session is not None
+        assert listener.link._session._signer is signer
 
 
 def test_strangers_on_the_port_are_decoded_by_no_one_and_get_no_poses():
-    with listening(sender="127.0.0.9") as heard:
+    with listening(sender="127.0.0.9") as listener:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             frame = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mavlink.MAVLink(None, 1, 1))
-            stranger.sendto(frame, ("127.0.0.1", heard.link.port))
-            heard.rest(lambda: heard.link.counters["from other senders"] == 1)
-        heard.link.on_pose(good_pose(host_time.now_ns()))
-        assert heard.link.counters["not sent: ODOMETRY"] == 1
-    assert heard.records == []
+            stranger.sendto(frame, ("127.0.0.1", listener.link.port))
+            listener.rest(lambda: listener.link.counters["from other senders"] == 1)
+        listener.link.on_pose(good_pose(host_time.now_ns()))
+        assert listener.link.counters["not sent: ODOMETRY"] == 1
+    assert listener.records == []
 
 
 def test_another_system_on_the_same_address_is_recorded_and_does_not_get_the_poses():
     station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    with listening() as heard, drone_for(heard, ArduPilotRules()) as drone, station:
+    with listening() as listener, drone_for(listener, ArduPilotRules()) as drone, station:
         station.settimeout(0.1)
         frame = packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), mavlink.MAVLink(None, 255, 190))
-        station.sendto(frame, ("127.0.0.1", heard.link.port))
-        heard.rest(lambda: any(r.data == frame for r in heard.records))
-        heard.fly(lambda: len(drone.messages("ODOMETRY")) >= 5)
+        station.sendto(frame, ("127.0.0.1", listener.link.port))
+        listener.rest(lambda: any(r.data == frame for r in listener.records))
+        listener.fly(lambda: len(drone.messages("ODOMETRY")) >= 5)
         with pytest.raises(TimeoutError):
             station.recv(300)
-    assert heard.link.counters["refused: from another system"] == 1
+    assert listener.link.counters["refused: from another system"] == 1
 
 
 def test_our_own_frames_that_come_back_are_not_heard():
-    with listening() as heard:
+    with listening() as listener:
         ours = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
             beat = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
-            radio.sendto(packed(beat, ours), ("127.0.0.1", heard.link.port))
-            heard.rest(lambda: heard.link.counters.get("our own, come back", 0) == 1)
-    assert heard.records == []
+            radio.sendto(packed(beat, ours), ("127.0.0.1", listener.link.port))
+            listener.rest(lambda: listener.link.counters.get("echo of our own", 0) == 1)
+    assert listener.records == []
 
 
 def test_a_silent_autopilot_is_trouble_in_words(monkeypatch: pytest.MonkeyPatch):
-    with listening() as heard:
-        assert heard.link.status is None
+    with listening() as listener:
+        assert listener.link.status is None
         real = host_time.now_ns()
-        session = heard.link._session  # the clock of the session, set ahead
+        session = listener.link._session  # the clock of the session, set ahead
         assert session is not None
         monkeypatch.setattr(session, "_now_ns", lambda: real + 10**10)
-        assert "no word from the autopilot (system 1, component 1)" in (heard.link.status or "")
-    assert heard.link.status is None
+        assert "no frame from the autopilot (system 1, component 1)" in (listener.link.status or "")
+    assert listener.link.status is None
 
 
 @given(datagrams=st.lists(st.binary(min_size=1, max_size=400), min_size=1, max_size=20))
 @settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
 def test_no_datagram_stops_the_link(datagrams: list[bytes]):
-    with listening() as heard, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as anyone:
+    with listening() as listener, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as anyone:
         for data in datagrams:
-            anyone.sendto(data, ("127.0.0.1", heard.link.port))
+            anyone.sendto(data, ("127.0.0.1", listener.link.port))
         beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
-        anyone.sendto(packed(beat, mavlink.MAVLink(None, 1, 1)), ("127.0.0.1", heard.link.port))
-        heard.rest(lambda: any(m is not None for m in heard.messages))
-    counted = heard.link.counters["stray bytes"] + sum(len(r.data) for r in heard.records)
+        anyone.sendto(packed(beat, mavlink.MAVLink(None, 1, 1)), ("127.0.0.1", listener.link.port))
+        listener.rest(lambda: any(m is not None for m in listener.messages))
+    counted = listener.link.counters["stray bytes"] + sum(len(r.data) for r in listener.records)
     assert counted == sum(map(len, datagrams)) + 21
 
 
@@ -499,9 +499,9 @@ def test_without_a_connection_it_cannot_listen_and_says_what_to_set():
         ({"connection": "udpin:0.0.0.0:14550"}, "sender"),
         ({"send": ["odometry", "vision_position_estimate"]}, "fused twice"),
         ({"send": ["odometry", "odometry"]}, "once"),
-        ({"profile": "px4", "send": ["vision_position_estimate"]}, "north-oriented"),
+        ({"profile": "px4", "send": ["vision_position_estimate"]}, "north-aligned"),
         ({"profile": "px4", "send": ["landing_target"]}, "local NED"),
-        ({"own_component_id": 1}, "cannot be the autopilot itself"),
+        ({"own_component_id": 1}, "must differ from the autopilot's component_id"),
     ],
 )
 def test_settings_that_would_fly_wrong_are_refused_with_the_reason(config: Any, says: str):

@@ -1,4 +1,4 @@
-"""The origin on earth: asked for, given once, never over another, never to who cannot be asked."""
+"""Global origin: requested, sent once, never over an existing one, never to an autopilot that cannot be asked."""
 
 from __future__ import annotations
 
@@ -9,97 +9,102 @@ from mavlink_poses import HOST0, MS
 from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.origin import GlobalOrigin, OriginSender
+from links.mavlink.origin import GlobalOrigin, OriginSender, OriginState
 
 mavlink: Any = ardupilotmega
-PLACE = GlobalOrigin(latitude_deg=-33.8568, longitude_deg=151.2153, altitude_m=-4.25)
+ORIGIN = GlobalOrigin(latitude_deg=-33.8568, longitude_deg=151.2153, altitude_m=-4.25)
 
 
 def ack(result: int, command: int = 512) -> Any:
     return mavlink.MAVLink_command_ack_message(command, result)
 
 
-def run(giver: OriginSender, seconds: int, *answers: Any) -> list[Any]:
-    """What is sent within some seconds, each request answered so."""
+def run(sender: OriginSender, seconds: int, *replies: Any) -> list[Any]:
+    """Messages sent within some seconds, with these replies to each request."""
     out: list[Any] = []
     for i in range(10 * seconds):
-        sent = giver.due(HOST0 + 100 * i * MS)
+        sent = sender.due(HOST0 + 100 * i * MS)
         out += sent
         for message in sent:
             if message.get_type() == "COMMAND_LONG":
-                for answer in answers:
-                    giver.hear(answer)
+                for reply in replies:
+                    sender.on_message(reply)
     return out
 
 
 @pytest.mark.parametrize("result", [0, 2, 4])
-def test_it_is_given_once_after_three_answers_without_an_origin(result: int):
-    giver = OriginSender(PLACE, (1, 1))
-    sent = run(giver, 30, ack(result))
+def test_the_origin_is_sent_once_after_three_replies_without_an_origin(result: int):
+    sender = OriginSender(ORIGIN, (1, 1))
+    sent = run(sender, 30, ack(result))
     assert [m.get_type() for m in sent] == ["COMMAND_LONG"] * 3 + ["SET_GPS_GLOBAL_ORIGIN"]
     assert (sent[0].command, sent[0].param1, sent[0].target_system) == (512, 49.0, 1)
-    given = sent[-1]
-    assert (given.target_system, given.latitude, given.longitude, given.altitude) == (1, -338568000, 1512153000, -4250)
-    assert giver.state == "given"
+    origin = sent[-1]
+    assert (origin.target_system, origin.latitude, origin.longitude, origin.altitude) == (
+        1,
+        -338568000,
+        1512153000,
+        -4250,
+    )
+    assert sender.state is OriginState.SENT
 
 
-def test_an_autopilot_that_has_one_keeps_it():
-    giver = OriginSender(PLACE, (1, 1))
-    sent = run(giver, 30, ack(0), mavlink.MAVLink_gps_global_origin_message(1, 2, 3))
+def test_an_autopilot_keeps_its_origin():
+    sender = OriginSender(ORIGIN, (1, 1))
+    sent = run(sender, 30, ack(0), mavlink.MAVLink_gps_global_origin_message(1, 2, 3))
     assert [m.get_type() for m in sent] == ["COMMAND_LONG"]
-    assert giver.state == "it has one"
+    assert sender.state is OriginState.PRESENT
 
 
-@pytest.mark.parametrize("answers", [(), (ack(3),), (ack(1),), (ack(0, command=511),)])
-def test_who_does_not_answer_or_cannot_gets_none(answers: Any):
-    giver = OriginSender(PLACE, (1, 1))
-    assert {m.get_type() for m in run(giver, 30, *answers)} == {"COMMAND_LONG"}
+@pytest.mark.parametrize("replies", [(), (ack(3),), (ack(1),), (ack(0, command=511),)])
+def test_an_autopilot_that_does_not_reply_gets_no_origin(replies: Any):
+    sender = OriginSender(ORIGIN, (1, 1))
+    assert {m.get_type() for m in run(sender, 30, *replies)} == {"COMMAND_LONG"}
 
 
-def test_an_answer_before_it_was_asked_is_anothers():
-    giver = OriginSender(PLACE, (1, 1))
+def test_a_reply_before_the_request_is_ignored():
+    sender = OriginSender(ORIGIN, (1, 1))
     for _ in range(5):
-        giver.hear(ack(0))
-    assert [m.get_type() for m in giver.due(HOST0)] == ["COMMAND_LONG"]
+        sender.on_message(ack(0))
+    assert [m.get_type() for m in sender.due(HOST0)] == ["COMMAND_LONG"]
 
 
-def test_answers_to_somebody_elses_requests_count_for_one_at_most():
-    giver = OriginSender(PLACE, (1, 1))
-    assert len(giver.due(HOST0)) == 1
+def test_replies_to_another_requester_count_once_at_most():
+    sender = OriginSender(ORIGIN, (1, 1))
+    assert len(sender.due(HOST0)) == 1
     for _ in range(5):
-        giver.hear(ack(0))
-    assert [m.get_type() for m in giver.due(HOST0 + 1_100 * MS)] == ["COMMAND_LONG"]
+        sender.on_message(ack(0))
+    assert [m.get_type() for m in sender.due(HOST0 + 1_100 * MS)] == ["COMMAND_LONG"]
 
 
-def test_an_origin_that_the_line_did_not_take_is_given_later():
-    giver = OriginSender(PLACE, (1, 1))
+def test_an_origin_that_was_not_sent_is_sent_later():
+    sender = OriginSender(ORIGIN, (1, 1))
     for i in range(3):
-        giver.due(HOST0 + 1_100 * i * MS)
-        giver.hear(ack(0))
-    (lost,) = giver.due(HOST0 + 4_000 * MS)
-    giver.unsent()
-    (given,) = giver.due(HOST0 + 4_100 * MS) or giver.due(HOST0 + 6_000 * MS)
-    assert given.get_type() == lost.get_type() == "SET_GPS_GLOBAL_ORIGIN"
-    assert giver.state == "given"
+        sender.due(HOST0 + 1_100 * i * MS)
+        sender.on_message(ack(0))
+    (lost,) = sender.due(HOST0 + 4_000 * MS)
+    sender.on_not_sent()
+    (sent,) = sender.due(HOST0 + 4_100 * MS) or sender.due(HOST0 + 6_000 * MS)
+    assert sent.get_type() == lost.get_type() == "SET_GPS_GLOBAL_ORIGIN"
+    assert sender.state is OriginState.SENT
 
 
-def test_an_autopilot_that_was_away_is_asked_again():
-    giver = OriginSender(PLACE, (1, 1))
-    run(giver, 30, ack(0))
-    assert giver.state == "given"
-    giver.restart()
-    sent = run(giver, 30, ack(0), mavlink.MAVLink_gps_global_origin_message(1, 2, 3))
+def test_an_autopilot_that_was_silent_is_asked_again():
+    sender = OriginSender(ORIGIN, (1, 1))
+    run(sender, 30, ack(0))
+    assert sender.state is OriginState.SENT
+    sender.restart()
+    sent = run(sender, 30, ack(0), mavlink.MAVLink_gps_global_origin_message(1, 2, 3))
     assert [m.get_type() for m in sent] == ["COMMAND_LONG"]
-    assert giver.state == "it has one"
+    assert sender.state is OriginState.PRESENT
     none = OriginSender(None, (1, 1))
     none.restart()
-    assert none.state == "none configured"
+    assert none.state is OriginState.NOT_CONFIGURED
 
 
-def test_without_an_origin_nothing_is_asked():
+def test_without_an_origin_nothing_is_requested():
     assert run(OriginSender(None, (1, 1)), 30, ack(0)) == []
 
 
-def test_a_place_off_the_earth_is_refused():
+def test_an_invalid_position_is_rejected():
     with pytest.raises(ValidationError):
         GlobalOrigin(latitude_deg=91, longitude_deg=0, altitude_m=0)

@@ -16,7 +16,7 @@ class Line:
     """Speaks poses at a rate and keeps what went out."""
 
     def __init__(self, **settings: Any) -> None:
-        self.speaker = PoseSender(("odometry",), PoseLimits(), **settings)
+        self.pose_sender = PoseSender(("odometry",), PoseLimits(), **settings)
         self.now_ns = HOST0
         self.counters: list[int] = []
         self.texts: list[tuple[int, str]] = []
@@ -24,9 +24,9 @@ class Line:
     def pose(self, after_ms: int = 20, through: bool = True, **changes: Any) -> int:
         self.now_ns += after_ms * MS
         pose = good_pose(self.now_ns, **changes)
-        messages = self.speaker.speak(pose, self.now_ns)
+        messages = self.pose_sender.messages(pose, self.now_ns)
         if messages and through:
-            self.speaker.went_out(pose, self.now_ns)
+            self.pose_sender.on_sent(pose, self.now_ns)
             self.counters += [m.reset_counter for m in messages]
         self.listen()
         return len(messages)
@@ -37,7 +37,7 @@ class Line:
             self.listen()
 
     def listen(self) -> None:
-        self.texts += [(m.severity, m.text) for m in self.speaker.texts(self.now_ns)]
+        self.texts += [(m.severity, m.text) for m in self.pose_sender.due_texts(self.now_ns)]
 
 
 def test_the_counter_stays_while_poses_come_without_a_gap_or_jump():
@@ -94,7 +94,7 @@ def test_a_pose_that_is_not_newer_does_not_go_out_and_stops_nothing():
     line = Line()
     line.pose()
     assert line.pose(after_ms=0) == 0
-    assert line.speaker.sending
+    assert line.pose_sender.sending
 
 
 def test_it_stops_loudly_and_says_when_it_goes_on():
@@ -112,15 +112,15 @@ def test_it_stops_loudly_and_says_when_it_goes_on():
     assert [text for _, text in line.texts].index(
         "grd: STOPPED: ambiguous rotation"
     ) == 2  # before the state's own text
-    assert line.speaker.sending
+    assert line.pose_sender.sending
 
 
 def test_poses_that_stop_coming_are_noticed_without_a_pose():
     line = Line()
     line.pose()
     line.wait(2000)
-    assert (2, "grd: STOPPED: no pose goes out") in line.texts
-    assert not line.speaker.sending
+    assert (2, "grd: STOPPED: no poses sent") in line.texts
+    assert not line.pose_sender.sending
 
 
 def test_flapping_says_no_more_than_two_texts_a_second_and_ends_with_the_truth():
@@ -142,23 +142,23 @@ def test_a_text_that_the_line_did_not_take_waits_unless_a_newer_one_does():
     line.wait(1000)
     line.pose()
     line.wait(250)
-    speaker, now_ns = line.speaker, line.now_ns + 600 * MS
-    (first,) = speaker.texts(now_ns)
-    assert first.text == "grd: STOPPED: no pose goes out"
-    speaker.unsaid()
-    (again,) = speaker.texts(now_ns + MS)  # at once
+    pose_sender, now_ns = line.pose_sender, line.now_ns + 600 * MS
+    (first,) = pose_sender.due_texts(now_ns)
+    assert first.text == "grd: STOPPED: no poses sent"
+    pose_sender.on_text_not_sent()
+    (again,) = pose_sender.due_texts(now_ns + MS)  # at once
     assert again.text == first.text
-    speaker.unsaid()
+    pose_sender.on_text_not_sent()
     line.now_ns = now_ns
     line.pose()
     assert line.texts[-1][1] == "grd: sending poses"
 
 
 def test_nothing_to_send_is_no_sending_and_no_stop():
-    speaker = PoseSender((), PoseLimits())
-    assert speaker.speak(good_pose(), HOST0) == []
-    assert not speaker.sending
-    texts = [m.text for i in range(40) for m in speaker.texts(HOST0 + 100 * i * MS)]
+    pose_sender = PoseSender((), PoseLimits())
+    assert pose_sender.messages(good_pose(), HOST0) == []
+    assert not pose_sender.sending
+    texts = [m.text for i in range(40) for m in pose_sender.due_texts(HOST0 + 100 * i * MS)]
     assert texts == ["grd: FULL: lidar and both cameras"]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from links.mavlink.parameters import read_parameters
-from links.mavlink.profiles import ARDUPILOT, PROFILES, PX4, Profile, Wanted, findings
+from links.mavlink.profiles import ARDUPILOT, PROFILES, PX4, Profile, RequiredParameter, findings
 from links.mavlink.transport.connection import Endpoint, Udp
 from links.mavlink.transport.stream_connection import open_connection
 from links.simulated.ardupilot_rules import ArduPilotRules
@@ -18,45 +18,45 @@ from links.simulated.px4_rules import Px4Rules
 
 def right(profile: Profile) -> dict[str, float]:
     """Values that fit."""
-    return {w.name: w.values[0] if w.values else float(w.bits) if w.bits else w.at_least for w in profile.wanted}
+    return {w.name: w.values[0] if w.values else float(w.bits) if w.bits else w.at_least for w in profile.required}
 
 
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 def test_names_fit_the_wire_and_each_has_a_reason(profile: Profile):
-    names = [wanted.name for wanted in profile.wanted]
+    names = [wanted.name for wanted in profile.required]
     assert len(set(names)) == len(names)
     assert all(0 < len(name) <= 16 for name in names)
-    assert all(wanted.why for wanted in profile.wanted)
+    assert all(wanted.why for wanted in profile.required)
     assert findings(profile, right(profile)) == []
 
 
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 def test_what_is_wrong_or_missing_is_one_sentence_each(profile: Profile):
     values = right(profile)
-    first, second = profile.wanted[0].name, profile.wanted[1].name
+    first, second = profile.required[0].name, profile.required[1].name
     values[first] = 99.0
     del values[second]
     found = findings(profile, values)
     assert len(found) == 2
-    assert found[0].startswith(f"{first} is 99, and must be")
-    assert found[1].startswith(f"{second} did not answer")
+    assert found[0].startswith(f"{first} is 99, but must be")
+    assert found[1].startswith(f"{second} was not received")
 
 
 def test_a_compass_heading_is_found_in_either_kind():
     ardupilot, px4 = right(ARDUPILOT) | {"EK3_SRC1_YAW": 1.0}, right(PX4) | {"EKF2_EV_CTRL": 7.0}
-    assert "a compass would turn it" in findings(ARDUPILOT, ardupilot)[0]
+    assert "a compass would rotate it" in findings(ARDUPILOT, ardupilot)[0]
     assert "8: yaw" in findings(PX4, px4)[0]
 
 
 @pytest.mark.parametrize(
     ("wanted", "fits", "fails"),
     [
-        (Wanted("A", (6.0, 0.0)), [6.0, 0.0], [1.0, 5.9, 6.01]),
-        (Wanted("B", at_least=0.05, at_most=0.3), [0.05, 0.3, 0.30000001192], [0.04, 0.31]),
-        (Wanted("C", bits=9), [9.0, 11.0, 15.0], [1.0, 8.0, 6.0]),
+        (RequiredParameter("A", (6.0, 0.0)), [6.0, 0.0], [1.0, 5.9, 6.01]),
+        (RequiredParameter("B", at_least=0.05, at_most=0.3), [0.05, 0.3, 0.30000001192], [0.04, 0.31]),
+        (RequiredParameter("C", bits=9), [9.0, 11.0, 15.0], [1.0, 8.0, 6.0]),
     ],
 )
-def test_values_ranges_and_bits(wanted: Wanted, fits: list[float], fails: list[float]):
+def test_values_ranges_and_bits(wanted: RequiredParameter, fits: list[float], fails: list[float]):
     assert all(wanted.fits(v) for v in fits)
     assert not any(wanted.fits(v) for v in [*fails, float("nan"), float("inf")])
 
@@ -66,18 +66,18 @@ def test_values_ranges_and_bits(wanted: Wanted, fits: list[float], fails: list[f
 )
 def test_parameters_are_read_over_a_socket_and_missing_ones_are_named(rules: Any, profile: Profile):
     values = right(profile)
-    absent = profile.wanted[-1].name
+    absent = profile.required[-1].name
     told = {name: value for name, value in values.items() if name != absent}
     with AutopilotSocket(rules, parameters=told) as drone:
         connection = open_connection(Endpoint("udpout", "127.0.0.1", drone.port))
-        names = [wanted.name for wanted in profile.wanted]
+        names = [wanted.name for wanted in profile.required]
         answers = read_parameters(
             connection, names, (1, 1), (1, 197), integers_bytewise=profile.integers_bytewise, timeout_s=1.0
         )
         connection.close()
     assert answers.missing == [absent]
     assert answers.values == pytest.approx(told)
-    assert answers.heard >= len(told)
+    assert answers.frames >= len(told)
     assert len(findings(profile, answers.values)) == 1
 
 
@@ -97,4 +97,4 @@ def test_nobody_there_is_heard_as_nobody():
         assert isinstance(connection, Udp)
         answers = read_parameters(connection, ["A"], (1, 1), (1, 197), timeout_s=0.2)
         connection.close()
-    assert (answers.heard, answers.values, answers.missing) == (0, {}, ["A"])
+    assert (answers.frames, answers.values, answers.missing) == (0, {}, ["A"])

@@ -43,7 +43,7 @@ def signed_for_minutes(signer: Signer) -> list[int]:
     times = list[int]()
     for second in range(200):
         times.append(ticks(signed(signer, HOST0 + second * 1000 * MS)))
-        signer.keep()
+        signer.write_timestamp()
     return times
 
 
@@ -148,7 +148,7 @@ def test_a_disk_that_takes_no_more_is_said_and_counted_and_times_go_on_growing(
         times += [ticks(signed(signer, HOST0)) for _ in range(3)]  # the link again, and the clock set back
         assert all(b > a for a, b in itertools.pairwise(times))
     now_s += RETRY_S
-    signer.keep()
+    signer.write_timestamp()
     assert signer.status is None
     assert ticks(signed(Signer(key_file, HOST0))) > times[-1]
 
@@ -170,7 +170,7 @@ def test_a_disk_that_takes_its_time_and_then_fails_holds_up_none_that_signs(
     times = [ticks(signed(signer, late_ns))]  # nobody writes: the disk is not asked
     assert not writing.is_set()
     with ThreadPoolExecutor(1) as pool:
-        keeping = pool.submit(signer.keep)
+        keeping = pool.submit(signer.write_timestamp)
         assert writing.wait(20)
         times += [ticks(signed(signer, late_ns)) for _ in range(100)]
         assert not keeping.done()
@@ -184,7 +184,7 @@ def test_a_disk_that_takes_its_time_and_then_fails_holds_up_none_that_signs(
 def test_a_signer_that_was_closed_and_goes_on_reserves_its_times_anew(key_file: Path):
     signer = Signer(key_file, HOST0)
     signer.close()
-    signer.keep()  # a session opens
+    signer.write_timestamp()  # a session opens
     last = max(ticks(signed(signer, HOST0)) for _ in range(5))  # then it is killed
     assert ticks(signed(Signer(key_file, HOST0))) > last
 
@@ -226,5 +226,5 @@ def test_a_bad_key_file_says_what_to_do_and_never_what_it_holds(
 
 def test_a_spoiled_timestamp_file_stops_it_with_advice(key_file: Path):
     key_file.with_name("mavlink.key.timestamp").write_text("yesterday")
-    with pytest.raises(LinkError, match="delete it only when the host's clock is right"):
+    with pytest.raises(LinkError, match="delete it only when the host's clock is correct"):
         Signer(key_file, HOST0)

@@ -1,4 +1,4 @@
-"""Answers to our TIMESYNC: whose they are, when they are late, and for how long nothing goes out then."""
+"""ParameterValues to our TIMESYNC: whose they are, when they are late, and for how long nothing goes out then."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from collections.abc import Iterable
 import pytest
 
 from links.mavlink.timesync_monitor import (
-    ASK_NS,
     FIRST_WAIT_NS,
     GIVEN_UP,
+    LATE_FRAMES_NS,
     LATE_NS,
-    LEFT_LATE_NS,
-    LONGEST_WAIT_NS,
+    MAX_PENDING,
+    MAX_WAIT_NS,
     PROVEN,
+    REQUEST_NS,
     UNANSWERED,
-    WAITING,
     TimesyncMonitor,
 )
 
 MS = 1_000_000
 LATE_MS = LATE_NS // MS + 1
-WAIT = FIRST_WAIT_NS // ASK_NS  # requests
+WAIT = FIRST_WAIT_NS // REQUEST_NS  # requests
 
 
 class Asking:
@@ -36,12 +36,12 @@ class Asking:
         """Whether it is late after each request, whose answer takes so long; None: it is lost."""
         told: list[bool] = []
         for took in took_ms:
-            self.now_ns += ASK_NS
-            self.trips.asked(self.now_ns)
+            self.now_ns += REQUEST_NS
+            self.trips.on_request(self.now_ns)
             if heard:
-                self.trips.heard()
+                self.trips.on_frame()
             if took is not None:
-                assert self.trips.answered(self.now_ns, self.now_ns + took * MS, sending)
+                assert self.trips.on_reply(self.now_ns, self.now_ns + took * MS, sending)
             told.append(self.trips.late)
         return told
 
@@ -82,7 +82,7 @@ def test_lateness_that_comes_back_doubles_the_wait_up_to_a_minute():
         waits.append(asking.prompt_until_good())
         asking.late_after([20] * (PROVEN - 2))
     assert waits == pytest.approx([k * WAIT for k in (1, 2, 4, 8, 16, 20, 20)], abs=3)
-    assert LONGEST_WAIT_NS == 20 * FIRST_WAIT_NS
+    assert MAX_WAIT_NS == 20 * FIRST_WAIT_NS
 
 
 def test_the_wait_is_short_again_after_a_minute_of_prompt_answers_while_poses_went_out_and_not_without():
@@ -112,13 +112,13 @@ def test_who_is_heard_and_answers_no_more_gets_poses_again_after_half_a_minute_a
     asking.late_after([20])
     begun_ns, told = asking.now_ns, 0
     while asking.now_ns - begun_ns < 60_000 * MS:
-        asking.now_ns += ASK_NS
-        told += asking.trips.asked(asking.now_ns)
-        asking.trips.heard()
+        asking.now_ns += REQUEST_NS
+        told += asking.trips.on_request(asking.now_ns)
+        asking.trips.on_frame()
         waited_ns = asking.now_ns - begun_ns
-        assert asking.trips.late == ((UNANSWERED + 1) * ASK_NS <= waited_ns < GIVEN_UP * ASK_NS + FIRST_WAIT_NS)
+        assert asking.trips.late == ((UNANSWERED + 1) * REQUEST_NS <= waited_ns < GIVEN_UP * REQUEST_NS + FIRST_WAIT_NS)
     assert told == 1
-    assert "whether they come late is not seen" in (asking.trips.status or "")
+    assert "their latency is unknown" in (asking.trips.status or "")
     asking.late_after([20])
     assert asking.trips.status is None
     assert asking.late_after([None] * (UNANSWERED + 1))[-1]  # it has answered again
@@ -127,7 +127,7 @@ def test_who_is_heard_and_answers_no_more_gets_poses_again_after_half_a_minute_a
 def test_after_a_silence_it_need_not_answer_and_a_wait_goes_on_to_its_end():
     asking = Asking()
     assert asking.late_after([1000, 1000])[-1]
-    asking.trips.begin_anew()
+    asking.trips.reset()
     told = asking.late_after([None] * (WAIT + 4))
     assert told[: WAIT - 1] == [True] * (WAIT - 1)
     assert not told[-1]
@@ -136,25 +136,25 @@ def test_after_a_silence_it_need_not_answer_and_a_wait_goes_on_to_its_end():
 
 def test_two_frames_within_a_second_that_left_late_are_late_though_nobody_answers():
     trips = TimesyncMonitor()
-    trips.left_late(0)
-    trips.left_late(LEFT_LATE_NS + 1)
+    trips.on_late_frame(0)
+    trips.on_late_frame(LATE_FRAMES_NS + 1)
     assert not trips.late
-    trips.left_late(2 * LEFT_LATE_NS)
+    trips.on_late_frame(2 * LATE_FRAMES_NS)
     assert trips.late
-    for asked_ns in range(2 * LEFT_LATE_NS, 2 * LEFT_LATE_NS + FIRST_WAIT_NS, ASK_NS):
-        trips.asked(asked_ns)
+    for asked_ns in range(2 * LATE_FRAMES_NS, 2 * LATE_FRAMES_NS + FIRST_WAIT_NS, REQUEST_NS):
+        trips.on_request(asked_ns)
         assert trips.late
-    trips.asked(2 * LEFT_LATE_NS + FIRST_WAIT_NS)
+    trips.on_request(2 * LATE_FRAMES_NS + FIRST_WAIT_NS)
     assert not trips.late
 
 
 def test_only_the_first_answer_to_a_request_of_ours_counts():
     trips = TimesyncMonitor()
-    trips.asked(5)
-    assert not trips.answered(4, 10, sending=True)
-    assert trips.answered(5, 10, sending=True)
-    assert not trips.answered(5, 11, sending=True)
-    for number in range(WAITING + 1):
-        trips.asked(100 + number)
-    assert not trips.answered(100, 1000, sending=True)  # long ago
+    trips.on_request(5)
+    assert not trips.on_reply(4, 10, sending=True)
+    assert trips.on_reply(5, 10, sending=True)
+    assert not trips.on_reply(5, 11, sending=True)
+    for number in range(MAX_PENDING + 1):
+        trips.on_request(100 + number)
+    assert not trips.on_reply(100, 1000, sending=True)  # long ago
     assert trips.newest_ns == 5

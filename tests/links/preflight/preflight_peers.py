@@ -64,7 +64,7 @@ def good_parameters(profile="ardupilot") -> dict[str, float]:
     """What a profile wants, the best value of each."""
     return {
         w.name: w.values[0] if w.values else float(w.bits) or (w.at_least + w.at_most) / 2
-        for w in PROFILES[profile].wanted
+        for w in PROFILES[profile].required
     }
 
 

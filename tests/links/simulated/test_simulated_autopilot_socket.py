@@ -84,7 +84,7 @@ def test_a_silent_radio_says_and_hears_nothing(line: Udp):
         received = line.receive(5.0)
         assert received is not None
         assert parse_frame(received[0]).get_type() in ("HEARTBEAT", "EKF_STATUS_REPORT")
-        line.answer_to(received[1])
+        line.reply_to(received[1])
         line.send(beat)
         assert drone.wait_for(lambda: len(drone.heard) == 1)
         drone.silent = True
@@ -101,7 +101,7 @@ def test_its_own_frames_and_broken_ones_are_not_heard(line: Udp):
     other = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=197)
     beat = ardupilotmega.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
     with AutopilotSocket(ArduPilotRules()) as drone:
-        line.answer_to(("127.0.0.1", drone.port))
+        line.reply_to(("127.0.0.1", drone.port))
         for data in (b"\xfd\x00noise", packed(beat, own), packed(beat, other)):
             line.send(data)
         assert drone.wait_for(lambda: len(drone.heard) == 1)

@@ -1,4 +1,4 @@
-"""Lines that keep frames back: a real one between two sockets, and two with a rate, in simulated time."""
+"""Bridges and lines that delay frames: a real one between two sockets, and two with a rate, in simulated time."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from links.mavlink.transport.stream_connection import StreamConnection
 
 mavlink: Any = ardupilotmega
 STEP_NS = 5_000_000
-TICK_EACH = 10  # steps: the housekeeper's 50 ms
-SPEAK_EACH = 20  # steps: the autopilot: 10 frames a second
+TICK_STEPS = 10  # the session thread's 50 ms
+FRAME_STEPS = 20  # the autopilot's 10 frames/s
 
 
 class Bridge:
-    """UDP between us and the autopilot: takes all at once, and hands on what is for the autopilot after a while."""
+    """UDP bridge to the autopilot: accepts everything, and forwards frames to the autopilot after delay_s."""
 
-    def __init__(self, ours: int) -> None:
+    def __init__(self, grd_port: int) -> None:
         self.delay_s = 0.0
-        self._ours = "127.0.0.1", ours
-        self._theirs: tuple[str, int] | None = None
+        self._grd = "127.0.0.1", grd_port
+        self._autopilot: tuple[str, int] | None = None
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
@@ -55,24 +55,24 @@ class Bridge:
         while not self._closed.is_set():
             with contextlib.suppress(TimeoutError, ConnectionRefusedError):
                 data, source = self._socket.recvfrom(2048)
-                if source == self._ours:
+                if source == self._grd:
                     self._waiting.append((time.monotonic() + self.delay_s, data))
                 else:
-                    self._theirs = source
-                    self._socket.sendto(data, self._ours)
-            while self._theirs is not None and self._waiting and self._waiting[0][0] <= time.monotonic():
-                self._socket.sendto(self._waiting.popleft()[1], self._theirs)
+                    self._autopilot = source
+                    self._socket.sendto(data, self._grd)
+            while self._autopilot is not None and self._waiting and self._waiting[0][0] <= time.monotonic():
+                self._socket.sendto(self._waiting.popleft()[1], self._autopilot)
 
 
 class RatedLine:
-    """A line that takes all and passes it on at a rate; `backlog_bytes` as of a TCP or serial line."""
+    """A line that accepts everything and transmits at a rate; `backlog_bytes` as of a TCP or serial line."""
 
     name, backlog_bytes = "rated", 512
 
     def __init__(self, kbit_per_s: float) -> None:
         self.kbit_per_s = kbit_per_s
-        self.hangs = False
-        self._frames: deque[tuple[bytes, float]] = deque()  # and how much of it has not left
+        self.blocked = False
+        self._frames: deque[tuple[bytes, float]] = deque()  # (frame, bytes not transmitted)
 
     def open(self) -> None:
         self._frames.clear()
@@ -89,21 +89,21 @@ class RatedLine:
 
     def close(self) -> None: ...
 
-    def pass_on(self, seconds: float) -> list[bytes]:
-        """Frames that have left meanwhile."""
-        room, whole = 125 * self.kbit_per_s * seconds * (not self.hangs), list[bytes]()
-        while self._frames and room > 0:
+    def transmit(self, seconds: float) -> list[bytes]:
+        """Frames that were transmitted completely in this time."""
+        capacity, whole = 125 * self.kbit_per_s * seconds * (not self.blocked), list[bytes]()
+        while self._frames and capacity > 0:
             data, left = self._frames.popleft()
-            if left > room:
-                self._frames.appendleft((data, left - room))
+            if left > capacity:
+                self._frames.appendleft((data, left - capacity))
             else:
                 whole.append(data)
-            room -= left
+            capacity -= left
         return whole
 
 
 class RatedBridge:
-    """A bridge behind a faster line: takes every datagram."""
+    """A bridge behind a fast line: accepts every datagram."""
 
     datagrams, status = True, None
     reconnects = foreign = stalls = left_late = 0
@@ -122,21 +122,21 @@ class RatedBridge:
 
 
 class SlowFlight:
-    """A session over a slow line to an autopilot that speaks ten times a second and answers TIMESYNC, by our clock."""
+    """A session over a slow line to an autopilot with ten frames/s that replies to TIMESYNC, on a simulated clock."""
 
     def __init__(self, kbit_per_s: float, monkeypatch: pytest.MonkeyPatch, bridge: bool) -> None:
         self.now_ns = HOST0
         self.line = RatedLine(kbit_per_s)
-        self.pose_each = 4  # steps: 50 a second
-        self.answers = self.speaks = True
+        self.pose_steps = 4  # 50 poses/s
+        self.replies = self.active = True
         self._was_late = False
         self.ages_s: list[float] = []
-        """Of each pose when it was handed on."""
+        """Age of each pose when it was forwarded."""
         self.late_since_s: list[float] = []
-        """When poses began to be held back as late."""
-        self.got: list[Any] = []
+        """When the link became late."""
+        self.received: list[Any] = []
         monkeypatch.setattr("links.mavlink.transport.stream_connection.time.monotonic", lambda: self.s)
-        monkeypatch.setattr(AutopilotSession, "_run", lambda session: None)  # its steps are ours
+        monkeypatch.setattr(AutopilotSession, "_run", lambda session: None)  # the test calls its steps
         self.connection: Connection = RatedBridge(self.line) if bridge else StreamConnection(self.line)
         pose_sender = PoseSender(("odometry",), PoseLimits())
         self.session = AutopilotSession(
@@ -154,39 +154,39 @@ class SlowFlight:
 
     @property
     def s(self) -> float:
-        """Since the beginning."""
+        """Time since the start."""
         return 1e-9 * (self.now_ns - HOST0)
 
     def fly(self, seconds: float) -> None:
-        """Poses, housekeeping, answers."""
+        """Run poses, the session thread's steps, and replies."""
         for _ in range(round(1e9 * seconds / STEP_NS)):
             self.now_ns += STEP_NS
             self._steps += 1
-            if self.speaks and self._steps % SPEAK_EACH == 0:
-                self._say(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
-            if self._steps % self.pose_each == 0:
+            if self.active and self._steps % FRAME_STEPS == 0:
+                self._reply(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
+            if self._steps % self.pose_steps == 0:
                 self.session.send_pose(good_pose(self.now_ns))
-            if self._steps % TICK_EACH == 3:
+            if self._steps % TICK_STEPS == 3:
                 self.session._tick(self.now_ns)
-            for frame in self.line.pass_on(1e-9 * STEP_NS):
-                self._hand_on(parse_frame(frame))
+            for frame in self.line.transmit(1e-9 * STEP_NS):
+                self._forward(parse_frame(frame))
             self.connection.receive(0.0)
             late = self.session._timesync.late
             if late and not self._was_late:
                 self.late_since_s.append(self.s)
             self._was_late = late
 
-    def _hand_on(self, message: Any) -> None:
-        self.got.append(message)
+    def _forward(self, message: Any) -> None:
+        self.received.append(message)
         if message.get_type() == "ODOMETRY":
             self.ages_s.append(1e-6 * (self.now_ns // 1000 - message.time_usec))
-        elif message.get_type() == "TIMESYNC" and message.tc1 == 0 and self.answers and self.speaks:
-            self._say(mavlink.MAVLink_timesync_message(self.now_ns, message.ts1))
+        elif message.get_type() == "TIMESYNC" and message.tc1 == 0 and self.replies and self.active:
+            self._reply(mavlink.MAVLink_timesync_message(self.now_ns, message.ts1))
 
-    def _say(self, message: Any) -> None:
+    def _reply(self, message: Any) -> None:
         frame = packed(message, self._mav)
         self.session._on_frame(frame, parse_frame(frame), ("127.0.0.1", 1), self.now_ns)
 
     def count(self, kind: str) -> int:
-        """Messages of a kind that were handed on."""
-        return sum(message.get_type() == kind for message in self.got)
+        """Number of forwarded messages of a kind."""
+        return sum(message.get_type() == kind for message in self.received)

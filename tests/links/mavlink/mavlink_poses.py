@@ -13,7 +13,7 @@ HOST0, MS = 1_748_773_230_000_000_000, 1_000_000
 
 
 def good_pose(stamp_ns: int = HOST0, **changes: Any) -> RelativePose:
-    """A pose that may go out: drone level, 10 m over the vehicle, 1 m/s forward over ground."""
+    """A pose that the gate accepts: drone level, 10 m above the vehicle, 1 m/s forward over ground."""
     pose = RelativePose(
         stamp_ns=stamp_ns,
         state=PoseState.FULL,

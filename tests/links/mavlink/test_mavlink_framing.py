@@ -1,4 +1,4 @@
-"""Frames out of datagrams and byte streams, whatever else is in them."""
+"""Frames from datagrams and byte streams with arbitrary other bytes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def frames(count: int = 5, v1: bool = False) -> list[bytes]:
     return out
 
 
-def taken(splitter: FrameSplitter, data: bytes, chunk: int) -> list[bytes]:
+def split(splitter: FrameSplitter, data: bytes, chunk: int) -> list[bytes]:
     found: list[bytes] = []
     for at in range(0, len(data), chunk):
         found += [frame for frame, _ in splitter.stream(data[at : at + chunk])]
@@ -36,43 +36,43 @@ def taken(splitter: FrameSplitter, data: bytes, chunk: int) -> list[bytes]:
 
 @pytest.mark.parametrize("v1", [False, True])
 @pytest.mark.parametrize("chunk", [1, 7, 1000])
-def test_a_stream_gives_its_frames_however_it_is_cut(v1: bool, chunk: int):
+def test_a_stream_gives_its_frames_for_any_chunk_size(v1: bool, chunk: int):
     sent, splitter = frames(v1=v1), FrameSplitter()
-    assert taken(splitter, b"".join(sent), chunk) == sent
+    assert split(splitter, b"".join(sent), chunk) == sent
     assert splitter.stray_bytes == 0
 
 
-def test_noise_between_frames_is_counted_and_costs_none():
+def test_noise_between_frames_is_counted_and_loses_none():
     sent, splitter = frames(), FrameSplitter()
     noise = b"\x00\x11login: \r\n"
-    assert taken(splitter, noise + noise.join(sent) + noise, 13) == sent
+    assert split(splitter, noise + noise.join(sent) + noise, 13) == sent
     assert splitter.stray_bytes == 6 * len(noise)
 
 
-def test_noise_that_looks_like_a_header_does_not_take_the_frames_after_it():
+def test_noise_that_looks_like_a_header_does_not_lose_the_next_frames():
     sent, splitter = frames(20), FrameSplitter()
     data = b"".join([sent[0], b"\xfd\xff\x00\x00", *sent[1:]])
-    assert taken(splitter, data, 50) == sent
+    assert split(splitter, data, 50) == sent
     assert splitter.stray_bytes == 4
 
 
-def test_a_damaged_frame_costs_itself_alone():
+def test_a_damaged_frame_loses_only_itself():
     sent = frames(20)
     damaged = bytearray(sent[3])
     damaged[12] ^= 0x40
     splitter = FrameSplitter()
-    assert taken(splitter, b"".join([*sent[:3], bytes(damaged), *sent[4:]]), 64) == sent[:3] + sent[4:]
+    assert split(splitter, b"".join([*sent[:3], bytes(damaged), *sent[4:]]), 64) == sent[:3] + sent[4:]
     assert splitter.stray_bytes == len(damaged)
 
 
-def test_a_datagram_stands_for_itself():
+def test_each_datagram_is_split_on_its_own():
     one, two, splitter = *frames(2), FrameSplitter()
     assert splitter.datagram(one[:20]) == []
     assert [frame for frame, _ in splitter.datagram(two + one)] == [two, one]
     assert splitter.stray_bytes == 20
 
 
-def test_a_message_beyond_the_dialect_is_a_frame_where_another_follows_or_it_ends():
+def test_a_message_outside_the_dialect_is_a_frame_if_another_follows_or_the_data_ends():
     one, two, splitter = *frames(2), FrameSplitter()
     private = bytearray(one)
     private[7:10] = b"\xf0\xff\x00"
@@ -83,18 +83,18 @@ def test_a_message_beyond_the_dialect_is_a_frame_where_another_follows_or_it_end
 
 @given(st.lists(st.one_of(st.binary(max_size=60), st.sampled_from(frames(4)), st.sampled_from(frames(4, v1=True)))))
 @settings(max_examples=150, deadline=None)
-def test_no_bytes_make_it_fail_and_every_byte_is_a_frames_or_counted(parts: list[bytes]):
+def test_no_bytes_raise_and_every_byte_is_in_a_frame_or_counted(parts: list[bytes]):
     data, splitter = b"".join(parts), FrameSplitter()
     found = splitter.datagram(data)
     assert sum(len(frame) for frame, _ in found) + splitter.stray_bytes == len(data)
     stream = FrameSplitter()
-    taken(stream, data, 17)
+    split(stream, data, 17)
     assert stream.stray_bytes <= len(data)
 
 
 @given(st.binary(max_size=3000))
 @settings(max_examples=50, deadline=None)
-def test_what_is_kept_of_a_stream_is_never_more_than_a_frame(data: bytes):
+def test_at_most_one_frame_of_a_stream_is_kept(data: bytes):
     splitter = FrameSplitter()
-    found = taken(splitter, data, 100)
+    found = split(splitter, data, 100)
     assert len(data) - sum(map(len, found)) - splitter.stray_bytes <= 280

@@ -1,4 +1,4 @@
-"""Nothing goes out as good that is not: each spoiled pose by its reason, and any spoiling at all."""
+"""The gate: each invalid pose is rejected with its reason, and no random change passes unnoticed."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def covariance(rotation_deg: float = 1.0, position_m: float = 0.1) -> Any:
 
 
 def nan_at(array: Any, value: float = math.nan) -> Any:
-    spoiled = np.array(array, dtype=np.float64)
-    spoiled.flat[-1] = value
-    return spoiled
+    changed = np.array(array, dtype=np.float64)
+    changed.flat[-1] = value
+    return changed
 
 
 @pytest.mark.parametrize("state", [PoseState.FULL, PoseState.COASTING])
@@ -36,13 +36,13 @@ def test_a_good_pose_passes_in_both_states_that_have_a_rotation(state: PoseState
 
 
 @pytest.mark.parametrize("state", [PoseState.LOST, PoseState.POSITION_ONLY, PoseState.AMBIGUOUS])
-def test_no_other_state_passes_even_if_the_pose_looks_whole(state: PoseState):
+def test_no_other_state_passes_even_if_the_pose_is_complete(state: PoseState):
     why = reject_reason(good_pose(state=state), HOST0, LIMITS)
     assert why is not None
     assert why.name == state.name
 
 
-SPOILED = [
+INVALID = [
     ({"R_vehicle_drone": None}, RejectReason.INCOMPLETE),
     ({"R_start_drone": None}, RejectReason.INCOMPLETE),
     ({"xyz_start_m": None}, RejectReason.INCOMPLETE),
@@ -52,8 +52,8 @@ SPOILED = [
     ({"xyz_vehicle_m": nan_at(np.ones(3), math.inf)}, RejectReason.NOT_FINITE),
     ({"R_start_drone": nan_at(np.eye(3))}, RejectReason.NOT_FINITE),
     ({"start_covariance": nan_at(covariance())}, RejectReason.NOT_FINITE),
-    ({"covariance": np.diag([math.inf] * 3 + [0.01] * 3)}, RejectReason.NOT_FINITE),  # a rotation that is not known
-    ({"R_start_drone": np.diag([1.0, 1.0, -1.0])}, RejectReason.INVALID_ROTATION),  # a mirror
+    ({"covariance": np.diag([math.inf] * 3 + [0.01] * 3)}, RejectReason.NOT_FINITE),  # an unknown rotation
+    ({"R_start_drone": np.diag([1.0, 1.0, -1.0])}, RejectReason.INVALID_ROTATION),  # a reflection
     ({"R_vehicle_drone": 1.01 * np.eye(3)}, RejectReason.INVALID_ROTATION),
     ({"R_start_drone": np.zeros((3, 3))}, RejectReason.INVALID_ROTATION),
     ({"start_covariance": np.zeros((6, 6))}, RejectReason.INVALID_COVARIANCE),
@@ -69,16 +69,16 @@ SPOILED = [
 ]
 
 
-@pytest.mark.parametrize(("spoiling", "why"), SPOILED)
-def test_a_spoiled_pose_is_refused_by_its_reason_and_nothing_goes_out(spoiling: Any, why: RejectReason):
-    pose = good_pose(**spoiling)
+@pytest.mark.parametrize(("change", "why"), INVALID)
+def test_an_invalid_pose_is_rejected_with_its_reason_and_nothing_is_sent(change: Any, why: RejectReason):
+    pose = good_pose(**change)
     assert reject_reason(pose, HOST0, LIMITS) is why
     pose_sender = PoseSender(("odometry", "landing_target"), LIMITS)
     assert pose_sender.messages(pose, HOST0) == []
     assert pose_sender.rejected == {why: 1}
 
 
-def test_sigmas_are_the_worst_direction_not_the_worst_axis():
+def test_sigmas_are_of_the_worst_direction_not_the_worst_axis():
     turned = np.kron(np.eye(2), rotation_z(math.pi / 4))
     flat = np.diag([1e-4, 4e-4, 1e-4, 0.01, 0.36, 0.01])
     sigmas = pose_sigmas(turned @ flat @ turned.T)
@@ -93,12 +93,12 @@ def test_sigmas_are_the_worst_direction_not_the_worst_axis():
 @pytest.mark.parametrize(
     ("age_ms", "why"), [(0, None), (149, None), (151, RejectReason.OLD), (-49, None), (-51, RejectReason.FUTURE)]
 )
-def test_an_old_pose_and_one_from_the_future_are_refused(age_ms: int, why: RejectReason | None):
+def test_an_old_pose_and_one_from_the_future_are_rejected(age_ms: int, why: RejectReason | None):
     assert reject_reason(good_pose(), HOST0 + age_ms * MS, LIMITS) is why
 
 
-def test_a_quarter_turn_that_is_not_resolved_never_goes_out_whatever_its_covariance_says():
-    """Fusion in any of its states, 100 poses a state, each a quarter turn wrong and very sure of it."""
+def test_an_unresolved_yaw_branch_is_never_sent_whatever_its_covariance():
+    """100 poses per state, each with a yaw error of 90 deg and a small covariance."""
     pose_sender = PoseSender(("odometry",), LIMITS)
     wrong = rotation_z(math.pi / 2)
     sent = 0
@@ -126,12 +126,12 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
     age_ms=st.integers(-500, 500),
 )
 @settings(max_examples=200, deadline=None)
-def test_whatever_one_number_becomes_what_goes_out_is_finite_sure_and_fresh(
+def test_whatever_one_number_becomes_sent_poses_are_finite_certain_and_recent(
     state: PoseState, field: str, at: int, value: float, age_ms: int
 ):
-    spoiled = np.array(getattr(good_pose(), field))
-    spoiled.flat[at % spoiled.size] = value
-    pose = good_pose(state=state, **{field: spoiled})
+    changed = np.array(getattr(good_pose(), field))
+    changed.flat[at % changed.size] = value
+    pose = good_pose(state=state, **{field: changed})
     messages = PoseSender(("odometry",), LIMITS).messages(pose, HOST0 + age_ms * MS)
     for message in messages:
         assert state in (PoseState.FULL, PoseState.COASTING)
@@ -147,6 +147,6 @@ def test_whatever_one_number_becomes_what_goes_out_is_finite_sure_and_fresh(
 @pytest.mark.parametrize(
     "wrong", [{"age_s": 0.0}, {"age_s": 1.0}, {"rotation_sigma_deg": 45.0}, {"position_sigma_m": 0.0}]
 )
-def test_limits_that_let_everything_pass_cannot_be_set(wrong: Any):
+def test_limits_that_accept_everything_cannot_be_set(wrong: Any):
     with pytest.raises(ValidationError):
         PoseLimits(**wrong)

@@ -1,4 +1,4 @@
-"""The link against a simulated autopilot on real sockets: what arrives, what is fused, what stops and how it is told."""
+"""The link against a simulated autopilot on real sockets: received, fused and rejected poses, and their reports."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ TICK_S = 0.02
 
 
 class Listener:
-    """A listening link, its records and messages, and a clock of poses."""
+    """A listening link, its records and messages; sends poses."""
 
     def __init__(self, link: Autopilot, records: Iterator[Record]) -> None:
         self.link = link
@@ -56,22 +56,24 @@ class Listener:
             self.records.append(record)
             self.messages.append(self.link.decode(record))
 
-    def fly(self, done: Callable[[], bool], pose: Callable[[int], RelativePose] = good_pose, most: int = 500) -> None:
-        """Send poses of now, some 50 a second, until something is true."""
-        for _ in range(most):
+    def send_poses(
+        self, done: Callable[[], bool], pose: Callable[[int], RelativePose] = good_pose, max_poses: int = 500
+    ) -> None:
+        """Send current poses at about 50 Hz until `done`."""
+        for _ in range(max_poses):
             if done():
                 return
             self.link.on_pose(pose(host_time.now_ns()))
             self._pause.wait(TICK_S)
-        pytest.fail(f"not within {most} poses: {self.link.counters}")
+        pytest.fail(f"not within {max_poses} poses: {self.link.counters}")
 
-    def rest(self, done: Callable[[], bool], most: int = 500) -> None:
-        """Wait without poses until something is true."""
-        for _ in range(most):
+    def wait(self, done: Callable[[], bool], max_poses: int = 500) -> None:
+        """Wait without poses until `done`."""
+        for _ in range(max_poses):
             if done():
                 return
             self._pause.wait(TICK_S)
-        pytest.fail(f"not within {most * TICK_S:g} s: {self.link.counters}")
+        pytest.fail(f"not within {max_poses * TICK_S:g} s: {self.link.counters}")
 
 
 def bound_port(udp: socket.socket) -> int:
@@ -96,7 +98,7 @@ def listening(**config: Any) -> Iterator[Listener]:
 def drone_for(listener: Listener, rules: Any, **settings: Any) -> Iterator[AutopilotSocket]:
     assert listener.link.port is not None
     with AutopilotSocket(rules, send_to=("127.0.0.1", listener.link.port), **settings) as drone:
-        listener.rest(lambda: len(listener.records) > 0)  # it has spoken: poses have somewhere to go
+        listener.wait(lambda: len(listener.records) > 0)  # its first frame: poses have a destination
         yield drone
 
 
@@ -106,24 +108,26 @@ def test_the_pose_is_an_optional_input():
 
 
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
-def test_good_poses_are_fused_and_the_autopilot_says_so(rules: Any):
+def test_good_poses_are_fused_and_the_autopilot_reports_it(rules: Any):
     with listening() as listener, drone_for(listener, rules()) as drone:
-        listener.fly(lambda: drone.rules.fates[Fate.FUSED] >= 40)
+        listener.send_poses(lambda: drone.rules.fates[Fate.FUSED] >= 40)
         assert set(drone.rules.fates) <= {Fate.FUSED, Fate.RESET, Fate.NOT_FOR_IT, Fate.NOT_STARTED, Fate.TOO_SOON}
-        assert drone.rules.fates[Fate.RESET] == 1  # the beginning
+        assert drone.rules.fates[Fate.RESET] == 1  # the initial one
         assert drone.rules.estimate is not None
         np.testing.assert_allclose(drone.rules.estimate.xyz_m, [101, -2, -10], atol=0.5)
-        told = [m for m in listener.messages if isinstance(m, AutopilotEstimator)]
-        listener.fly(lambda: any(m.position_good for m in listener.messages if isinstance(m, AutopilotEstimator)))
-        assert told[0].constant_position
+        statuses = [m for m in listener.messages if isinstance(m, AutopilotEstimator)]
+        listener.send_poses(
+            lambda: any(m.position_good for m in listener.messages if isinstance(m, AutopilotEstimator))
+        )
+        assert statuses[0].constant_position
         sent = [parse_frame(r.data).get_type() for r in listener.link.sent()]
         assert sent.count("ODOMETRY") == listener.link.counters["sent: ODOMETRY"]
     assert listener.link.counters["lost"] == 0
 
 
-def test_what_was_sent_is_recorded_byte_for_byte_with_our_own_component():
+def test_sent_frames_are_recorded_unchanged_with_our_component_id():
     with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
-        listener.fly(lambda: len(drone.messages("ODOMETRY")) >= 10)
+        listener.send_poses(lambda: len(drone.messages("ODOMETRY")) >= 10)
         records = list(listener.link.sent())
         assert {r.topic for r in records} == {"/autopilot/tx"}
         assert {header(r.data)[0] for r in records} == {(1, 197)}
@@ -132,13 +136,13 @@ def test_what_was_sent_is_recorded_byte_for_byte_with_our_own_component():
         assert set(first) == {1}  # none missing, in order
         arrived = {bytes(m.get_msgbuf()) for m in drone.messages("ODOMETRY")}
         assert arrived <= {r.data for r in records}
-        assert list(listener.link.sent()) == [] or listener.link.counters["sent: HEARTBEAT"]  # told once
+        assert list(listener.link.sent()) == [] or listener.link.counters["sent: HEARTBEAT"]  # returned once
 
 
-def test_an_unresolved_branch_never_reaches_the_autopilot_and_it_is_told_why():
+def test_an_unresolved_branch_is_never_sent_and_the_reason_is_reported():
     with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
         wrong = rotation_z(np.pi / 2)
-        listener.fly(
+        listener.send_poses(
             lambda: any("AMBIGUOUS" in m.text for m in drone.messages("STATUSTEXT")),
             lambda ns: good_pose(ns, state=PoseState.AMBIGUOUS, R_start_drone=wrong, R_vehicle_drone=wrong),
         )
@@ -147,163 +151,168 @@ def test_an_unresolved_branch_never_reaches_the_autopilot_and_it_is_told_why():
         assert listener.link.counters["pose rejected: ambiguous rotation"] > 0
 
 
-def test_it_stops_loudly_keeps_its_heartbeat_and_resets_when_it_goes_on():
+def test_stopping_is_reported_heartbeats_continue_and_resuming_resets():
     with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
-        listener.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        listener.send_poses(lambda: drone.rules.fates[Fate.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
-        beats = len(drone.messages("HEARTBEAT"))
-        listener.rest(lambda: any(m.severity == 2 for m in drone.messages("STATUSTEXT")))
-        listener.rest(lambda: len(drone.messages("HEARTBEAT")) >= beats + 2)
+        heartbeats = len(drone.messages("HEARTBEAT"))
+        listener.wait(lambda: any(m.severity == 2 for m in drone.messages("STATUSTEXT")))
+        listener.wait(lambda: len(drone.messages("HEARTBEAT")) >= heartbeats + 2)
         assert drone.messages("HEARTBEAT")[-1].system_status == mavlink.MAV_STATE_STANDBY
         assert not drone.rules.healthy(drone.device_ns())
         resets = drone.rules.fates[Fate.RESET]
-        listener.fly(lambda: drone.rules.fates[Fate.RESET] > resets)
+        listener.send_poses(lambda: drone.rules.fates[Fate.RESET] > resets)
         assert drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256
-        beat = drone.messages("HEARTBEAT")[0]
-        assert (beat.type, beat.autopilot) == (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
+        heartbeat = drone.messages("HEARTBEAT")[0]
+        assert (heartbeat.type, heartbeat.autopilot) == (
+            mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+            mavlink.MAV_AUTOPILOT_INVALID,
+        )
 
 
-def test_an_autopilot_that_stands_still_gets_no_poses_that_it_would_take_for_new_later():
+def test_a_blocked_autopilot_gets_no_poses():
     with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
-        listener.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        listener.send_poses(lambda: drone.rules.fates[Fate.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         drone.silent = True
-        listener.fly(lambda: listener.link.counters.get("pose rejected: autopilot silent", 0) >= 1, most=150)
+        listener.send_poses(
+            lambda: listener.link.counters.get("pose rejected: autopilot silent", 0) >= 1, max_poses=150
+        )
         sent = listener.link.counters["sent: ODOMETRY"]
-        listener.fly(lambda: listener.link.counters["pose rejected: autopilot silent"] >= 25)
+        listener.send_poses(lambda: listener.link.counters["pose rejected: autopilot silent"] >= 25)
         assert listener.link.counters["sent: ODOMETRY"] == sent
         drone.silent = False
-        listener.fly(lambda: drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256)
+        listener.send_poses(lambda: drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256)
 
 
-def test_by_tcp_poses_go_to_whom_was_heard_on_this_connection():
-    beat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mavlink.MAVLink(None, 1, 1))
+def test_over_tcp_poses_are_sent_after_a_frame_on_this_connection():
+    heartbeat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mavlink.MAVLink(None, 1, 1))
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         listening(connection=f"tcp:127.0.0.1:{server.getsockname()[1]}") as listener,
     ):
 
-        def held() -> int:
+        def rejected() -> int:
             return listener.link.counters.get("pose rejected: autopilot silent", 0)
 
         def sent() -> int:
             return listener.link.counters.get("sent: ODOMETRY", 0)
 
-        for connection in range(2):  # nobody need have accepted it: the system takes what is sent
-            held_before, sent_before = held(), sent()
-            listener.fly(lambda before=held_before: held() >= before + 5)
+        for connection in range(2):  # the kernel accepts bytes before the peer has accepted the connection
+            rejected_before, sent_before = rejected(), sent()
+            listener.send_poses(lambda before=rejected_before: rejected() >= before + 5)
             assert sent() == sent_before
             with server.accept()[0] as peer:
-                peer.sendall(beat)
-                listener.fly(lambda before=sent_before: sent() > before)
-            listener.rest(lambda connection=connection: listener.link.counters["reconnects"] > connection)
+                peer.sendall(heartbeat)
+                listener.send_poses(lambda before=sent_before: sent() > before)
+            listener.wait(lambda connection=connection: listener.link.counters["reconnects"] > connection)
 
 
-def test_half_a_frame_of_the_line_before_holds_up_none_of_the_new_one():
-    """A frame that is announced as longer than what comes would wait for the rest, and be stamped then."""
+def test_half_a_frame_of_the_previous_connection_does_not_delay_the_new_one():
+    """An incomplete frame would wait for its rest, and be stamped at its arrival."""
     mav = mavlink.MAVLink(None, 1, 1)
     long = packed(mavlink.MAVLink_statustext_message(6, b"x" * 50), mav)
-    beat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mav)
+    heartbeat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mav)
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         listening(connection=f"tcp:127.0.0.1:{server.getsockname()[1]}") as listener,
     ):
         with server.accept()[0] as peer:
-            peer.sendall(beat + long[:20])
-            listener.rest(lambda: len(listener.records) == 1)
-        listener.rest(lambda: listener.link.counters["reconnects"] == 1)
+            peer.sendall(heartbeat + long[:20])
+            listener.wait(lambda: len(listener.records) == 1)
+        listener.wait(lambda: listener.link.counters["reconnects"] == 1)
         with server.accept()[0] as peer:
-            peer.sendall(beat)
-            listener.rest(lambda: len(listener.records) == 2, most=100)
+            peer.sendall(heartbeat)
+            listener.wait(lambda: len(listener.records) == 2, max_poses=100)
         assert listener.link.counters["stray bytes"] == 20
 
 
-def test_timesync_is_answered_and_asked_for():
+def test_timesync_is_requested_and_answered():
     with listening() as listener, drone_for(listener, Px4Rules()) as drone:
         before_ns = host_time.now_ns()
-        listener.rest(lambda: any(m.tc1 != 0 for m in drone.messages("TIMESYNC")))
-        answer = next(m for m in drone.messages("TIMESYNC") if m.tc1 != 0)
-        assert before_ns - 10**10 < answer.tc1 <= host_time.now_ns()  # our clock
-        assert 0 < answer.ts1 <= drone.device_ns()  # its own, given back
-        listener.rest(
+        listener.wait(lambda: any(m.tc1 != 0 for m in drone.messages("TIMESYNC")))
+        reply = next(m for m in drone.messages("TIMESYNC") if m.tc1 != 0)
+        assert before_ns - 10**10 < reply.tc1 <= host_time.now_ns()  # host time
+        assert 0 < reply.ts1 <= drone.device_ns()  # its own time, returned
+        listener.wait(
             lambda: listener.link.counters["timesync replies"] >= 1
-        )  # ours, answered; ESTIMATOR_STATUS has its time
+        )  # replies to ours; ESTIMATOR_STATUS has a time stamp
 
 
-def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
+def test_no_poses_over_a_bridge_that_forwards_them_late_and_stopping_is_reported():
     with (
         listening() as listener,
         Bridge(listener.link.port or 0) as bridge,
         AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", bridge.port)) as drone,
     ):
-        listener.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        listener.send_poses(lambda: drone.rules.fates[Fate.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         bridge.delay_s = 0.6
-        listener.fly(lambda: listener.link.counters.get("pose rejected: link too slow", 0) >= 1)
+        listener.send_poses(lambda: listener.link.counters.get("pose rejected: link too slow", 0) >= 1)
         sent = listener.link.counters["sent: ODOMETRY"]
-        listener.fly(lambda: listener.link.counters["pose rejected: link too slow"] >= 25)
+        listener.send_poses(lambda: listener.link.counters["pose rejected: link too slow"] >= 25)
         assert listener.link.counters["sent: ODOMETRY"] == sent
         assert listener.link.counters["round trip [ms]"] >= 600
         assert "TIMESYNC replies take longer than 0.3 s" in (listener.link.status or "")
-        told = "grd: STOPPED: link too slow"
-        listener.rest(lambda: any((m.severity, m.text) == (2, told) for m in drone.messages("STATUSTEXT")))
+        text = "grd: STOPPED: link too slow"
+        listener.wait(lambda: any((m.severity, m.text) == (2, text) for m in drone.messages("STATUSTEXT")))
         assert listener.link.counters["sent: ODOMETRY"] == sent
         prompt_us = host_time.now_ns() // 1000
         bridge.delay_s = 0.0
-        listener.fly(lambda: drone.messages("ODOMETRY")[-1].time_usec > prompt_us)
+        listener.send_poses(lambda: drone.messages("ODOMETRY")[-1].time_usec > prompt_us)
         assert next(m for m in drone.messages("ODOMETRY") if m.time_usec > prompt_us).reset_counter != counter
-        listener.rest(lambda: listener.link.status is None)
+        listener.wait(lambda: listener.link.status is None)
 
 
-def test_an_answer_that_we_did_not_ask_for_is_not_believed_though_it_names_nobody():
+def test_an_unrequested_timesync_reply_is_ignored_although_it_has_no_target():
     with listening() as listener, drone_for(listener, Px4Rules()) as drone:
-        listener.rest(lambda: listener.link.counters["timesync replies"] >= 2)
+        listener.wait(lambda: listener.link.counters["timesync replies"] >= 2)
         drone.say(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
-        listener.rest(lambda: listener.link.counters.get("refused: TIMESYNC for another component", 0) == 1)
+        listener.wait(lambda: listener.link.counters.get("refused: TIMESYNC for another component", 0) == 1)
         before = listener.link.counters["timesync replies"]
-        listener.rest(lambda: listener.link.counters["timesync replies"] > before)
+        listener.wait(lambda: listener.link.counters["timesync replies"] > before)
     replayed = Autopilot(own_component_id=191)
     for record in listener.records:
         replayed.decode(record)
     assert replayed.counters["timesync replies"] == listener.link.counters["timesync replies"]
 
 
-def test_an_origin_is_given_to_who_has_none_and_never_over_another():
+def test_an_origin_is_sent_to_an_autopilot_without_one_and_never_over_another():
     origin = {"latitude_deg": 47.3977, "longitude_deg": 8.5456, "altitude_m": 488.0}
-    ours, theirs = (473977000, 85456000, 488000), (1, 2, 3)
+    own, existing = (473977000, 85456000, 488000), (1, 2, 3)
     with listening(global_origin=origin) as listener, drone_for(listener, ArduPilotRules()) as drone:
-        listener.rest(lambda: drone.origin == ours)
-    with listening(global_origin=origin) as listener, drone_for(listener, ArduPilotRules(), origin=theirs) as drone:
-        listener.rest(lambda: len(drone.messages("TIMESYNC")) >= 3)  # two seconds later
+        listener.wait(lambda: drone.origin == own)
+    with listening(global_origin=origin) as listener, drone_for(listener, ArduPilotRules(), origin=existing) as drone:
+        listener.wait(lambda: len(drone.messages("TIMESYNC")) >= 3)  # two seconds later
         assert drone.messages("SET_GPS_GLOBAL_ORIGIN") == []
         assert len(drone.messages("COMMAND_LONG")) == 1
-        assert drone.origin == theirs
+        assert drone.origin == existing
 
 
-def test_both_sides_of_a_signed_link_understand_each_other_and_unsigned_words_are_not_heard(tmp_path: Path):
+def test_both_sides_of_a_signed_link_accept_each_other_and_unsigned_frames_are_ignored(tmp_path: Path):
     key = tmp_path / "key"
     key.write_bytes(b"k" * 32)
     key.chmod(0o600)
     with listening(signing_key=str(key)) as listener:
         drone = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         drone.signing.timestamp = (host_time.now_ns() - 1_420_070_400 * 10**9) // 10_000
-        beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
+        heartbeat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
             udp.bind(("127.0.0.1", 0))
             udp.settimeout(5.0)
-            udp.sendto(packed(beat, drone), ("127.0.0.1", listener.link.port))
-            listener.rest(lambda: listener.link.counters.get("not signed with our key", 0) == 1)
+            udp.sendto(packed(heartbeat, drone), ("127.0.0.1", listener.link.port))
+            listener.wait(lambda: listener.link.counters.get("not signed with our key", 0) == 1)
             assert listener.records == []
             drone.signing.secret_key, drone.signing.sign_outgoing = b"k" * 32, True
-            udp.sendto(packed(beat, drone), ("127.0.0.1", listener.link.port))
-            listener.rest(lambda: len(listener.records) == 1)
+            udp.sendto(packed(heartbeat, drone), ("127.0.0.1", listener.link.port))
+            listener.wait(lambda: len(listener.records) == 1)
             listener.link.on_pose(good_pose(host_time.now_ns()))
-            assert drone.decode(bytearray(udp.recv(300))).get_signed()  # pymavlink looks at the signature
+            assert drone.decode(bytearray(udp.recv(300))).get_signed()  # pymavlink verifies the signature
     assert (tmp_path / "key.timestamp").exists()
 
 
 def signing_drone(folder: Path, days_ago: int = 0) -> tuple[Path, mavlink.MAVLink]:
-    """Our key's file, and a peer that signs with it, its clock so late."""
+    """A key file, and a peer that signs with it and whose clock is late."""
     key = folder / "key"
     key.write_bytes(b"k" * 32)
     key.chmod(0o600)
@@ -314,26 +323,26 @@ def signing_drone(folder: Path, days_ago: int = 0) -> tuple[Path, mavlink.MAVLin
     return key, drone
 
 
-def test_an_autopilot_without_a_clock_is_told_the_time_before_it_is_heard_and_gets_no_poses_until_then(tmp_path: Path):
-    """ArduPilot begins with the time it signed with last, and takes that of a signed frame that is newer."""
+def test_an_autopilot_without_a_clock_gets_the_time_first_and_no_poses_until_it_signs_correctly(tmp_path: Path):
+    """ArduPilot starts with its last time stamp and adopts that of a newer signed frame."""
     key, drone = signing_drone(tmp_path, days_ago=10)
-    beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
+    heartbeat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
     with listening(signing_key=str(key)) as listener, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.bind(("127.0.0.1", 0))
         udp.settimeout(3.0)
-        udp.sendto(packed(beat, drone), ("127.0.0.1", listener.link.port))
-        listener.rest(lambda: listener.link.counters.get("signed with our key, but not new", 0) == 1)
+        udp.sendto(packed(heartbeat, drone), ("127.0.0.1", listener.link.port))
+        listener.wait(lambda: listener.link.counters.get("signed with our key, but not new", 0) == 1)
         listener.link.on_pose(good_pose(host_time.now_ns()))
         assert drone.decode(bytearray(udp.recv(300))).get_type() in ("HEARTBEAT", "TIMESYNC", "STATUSTEXT")
         assert listener.records == []
         assert listener.link.counters["pose rejected: autopilot silent"] == 1
-        udp.sendto(packed(beat, drone), ("127.0.0.1", listener.link.port))
-        listener.rest(lambda: len(listener.records) == 1)
+        udp.sendto(packed(heartbeat, drone), ("127.0.0.1", listener.link.port))
+        listener.wait(lambda: len(listener.records) == 1)
         listener.link.on_pose(good_pose(host_time.now_ns()))
         assert listener.link.counters["sent: ODOMETRY"] == 1
 
 
-def test_an_old_signed_frame_sent_again_does_not_draw_the_poses_away(tmp_path: Path):
+def test_a_replayed_signed_frame_does_not_redirect_the_poses(tmp_path: Path):
     key, drone = signing_drone(tmp_path)
     frame = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), drone)
     with (
@@ -343,17 +352,15 @@ def test_an_old_signed_frame_sent_again_does_not_draw_the_poses_away(tmp_path: P
     ):
         udp.settimeout(3.0)
         udp.sendto(frame, ("127.0.0.1", listener.link.port))
-        listener.rest(lambda: len(listener.records) == 1)
+        listener.wait(lambda: len(listener.records) == 1)
         other.sendto(frame, ("127.0.0.1", listener.link.port))
-        listener.rest(lambda: listener.link.counters.get("signed with our key, but not new", 0) == 1)
+        listener.wait(lambda: listener.link.counters.get("signed with our key, but not new", 0) == 1)
         listener.link.on_pose(good_pose(host_time.now_ns()))
         while parse_frame(udp.recv(300)).get_type() != "ODOMETRY":
             pass
 
 
-def test_a_disk_that_takes_its_time_with_the_signatures_time_holds_no_pose_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_slow_disk_for_the_signing_time_delays_no_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     key = tmp_path / "key"
     key.write_bytes(b"k" * 32)
     key.chmod(0o600)
@@ -371,20 +378,18 @@ def test_a_disk_that_takes_its_time_with_the_signatures_time_holds_no_pose_up(
         assert session is not None
         assert session._signer is not None
         monkeypatch.setattr("links.mavlink.signing.os.fsync", slow)
-        session._signer._reserved = session._signer._used + AHEAD_TICKS // 4  # it is time to write, not to wait for it
-        listener.rest(writing.is_set)
+        session._signer._reserved = session._signer._used + AHEAD_TICKS // 4  # a write is due, but not urgent
+        listener.wait(writing.is_set)
         listener.link.on_pose(good_pose(host_time.now_ns()))
-        session._signer._reserved = 0  # it hangs for so long that all is used up
+        session._signer._reserved = 0  # it hangs until all reserved times are used
         listener.link.on_pose(good_pose(host_time.now_ns()))
         assert listener.link.counters["sent: ODOMETRY"] == 2
         release.set()
     assert all(released)
 
 
-def test_each_time_that_a_link_opens_the_signing_time_is_written_ahead_before_it_signs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(AutopilotSession, "_run", lambda session: None)  # the thread comes too late
+def test_each_opening_of_a_link_writes_the_signing_time_before_signing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(AutopilotSession, "_run", lambda session: None)  # without the thread
     key, _ = signing_drone(tmp_path)
     link = Autopilot(connection="udpin:127.0.0.1:0", signing_key=key)
     for _ in range(2):
@@ -393,9 +398,9 @@ def test_each_time_that_a_link_opens_the_signing_time_is_written_ahead_before_it
             assert int((tmp_path / "key.timestamp").read_text()) > link._signer._used + AHEAD_TICKS // 2
 
 
-def test_a_disk_that_takes_no_signing_time_ends_no_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_for_the_signing_time_stops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     key, drone = signing_drone(tmp_path)
-    beat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), drone)
+    heartbeat = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), drone)
 
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -407,52 +412,52 @@ def test_a_disk_that_takes_no_signing_time_ends_no_flight(tmp_path: Path, monkey
         assert signer is not None
         monkeypatch.setattr("links.mavlink.signing.os.fsync", full)
         signer._reserved = 0
-        listener.rest(lambda: listener.link.counters.get("signing time not written", 0) == 1)
+        listener.wait(lambda: listener.link.counters.get("signing time not written", 0) == 1)
         assert "signing time cannot be written" in (listener.link.status or "")
-        udp.sendto(beat, ("127.0.0.1", listener.link.port))
-        listener.rest(lambda: len(listener.records) == 1)
+        udp.sendto(heartbeat, ("127.0.0.1", listener.link.port))
+        listener.wait(lambda: len(listener.records) == 1)
         listener.link.on_pose(good_pose(host_time.now_ns()))
         assert listener.link.counters["sent: ODOMETRY"] == 1
-    with listener.link.listen():  # opened again in the same run: its times never go back
+    with listener.link.listen():  # reopened in the same run: times never decrease
         assert listener.link._session is not None
         assert listener.link._session._signer is signer
 
 
-def test_strangers_on_the_port_are_decoded_by_no_one_and_get_no_poses():
+def test_other_senders_on_the_port_are_ignored_and_get_no_poses():
     with listening(sender="127.0.0.9") as listener:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             frame = packed(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3), mavlink.MAVLink(None, 1, 1))
-            stranger.sendto(frame, ("127.0.0.1", listener.link.port))
-            listener.rest(lambda: listener.link.counters["from other senders"] == 1)
+            other.sendto(frame, ("127.0.0.1", listener.link.port))
+            listener.wait(lambda: listener.link.counters["from other senders"] == 1)
         listener.link.on_pose(good_pose(host_time.now_ns()))
         assert listener.link.counters["not sent: ODOMETRY"] == 1
     assert listener.records == []
 
 
-def test_another_system_on_the_same_address_is_recorded_and_does_not_get_the_poses():
+def test_another_system_on_the_same_address_is_recorded_and_gets_no_poses():
     station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     with listening() as listener, drone_for(listener, ArduPilotRules()) as drone, station:
         station.settimeout(0.1)
         frame = packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), mavlink.MAVLink(None, 255, 190))
         station.sendto(frame, ("127.0.0.1", listener.link.port))
-        listener.rest(lambda: any(r.data == frame for r in listener.records))
-        listener.fly(lambda: len(drone.messages("ODOMETRY")) >= 5)
+        listener.wait(lambda: any(r.data == frame for r in listener.records))
+        listener.send_poses(lambda: len(drone.messages("ODOMETRY")) >= 5)
         with pytest.raises(TimeoutError):
             station.recv(300)
     assert listener.link.counters["refused: from another system"] == 1
 
 
-def test_our_own_frames_that_come_back_are_not_heard():
+def test_echoes_of_our_own_frames_are_ignored():
     with listening() as listener:
-        ours = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
+        own = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
-            beat = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
-            radio.sendto(packed(beat, ours), ("127.0.0.1", listener.link.port))
-            listener.rest(lambda: listener.link.counters.get("echo of our own", 0) == 1)
+            heartbeat = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
+            radio.sendto(packed(heartbeat, own), ("127.0.0.1", listener.link.port))
+            listener.wait(lambda: listener.link.counters.get("echo of our own", 0) == 1)
     assert listener.records == []
 
 
-def test_a_silent_autopilot_is_trouble_in_words(monkeypatch: pytest.MonkeyPatch):
+def test_a_silent_autopilot_is_reported_by_the_status(monkeypatch: pytest.MonkeyPatch):
     with listening() as listener:
         assert listener.link.status is None
         real = host_time.now_ns()
@@ -469,14 +474,14 @@ def test_no_datagram_stops_the_link(datagrams: list[bytes]):
     with listening() as listener, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as anyone:
         for data in datagrams:
             anyone.sendto(data, ("127.0.0.1", listener.link.port))
-        beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
-        anyone.sendto(packed(beat, mavlink.MAVLink(None, 1, 1)), ("127.0.0.1", listener.link.port))
-        listener.rest(lambda: any(m is not None for m in listener.messages))
+        heartbeat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3)
+        anyone.sendto(packed(heartbeat, mavlink.MAVLink(None, 1, 1)), ("127.0.0.1", listener.link.port))
+        listener.wait(lambda: any(m is not None for m in listener.messages))
     counted = listener.link.counters["stray bytes"] + sum(len(r.data) for r in listener.records)
     assert counted == sum(map(len, datagrams)) + 21
 
 
-def test_poses_before_and_after_the_link_is_open_are_counted_and_go_nowhere():
+def test_poses_while_the_link_is_closed_are_counted_and_not_sent():
     link = Autopilot(connection="udpin:127.0.0.1:0")
     link.on_pose(good_pose())
     assert link.counters["poses while not connected"] == 1
@@ -487,23 +492,23 @@ def test_poses_before_and_after_the_link_is_open_are_counted_and_go_nowhere():
     assert link.counters["poses while not connected"] == 2
 
 
-def test_without_a_connection_it_cannot_listen_and_says_what_to_set():
+def test_without_a_connection_listening_is_an_error_that_names_the_setting():
     with pytest.raises(LinkError, match="set `connection`"), Autopilot().listen():
         pass
 
 
 @pytest.mark.parametrize(
-    ("config", "says"),
+    ("config", "words"),
     [
         ({"connection": "udp:14550"}, "udpin:127.0.0.1:14550"),
         ({"connection": "udpin:0.0.0.0:14550"}, "sender"),
         ({"send": ["odometry", "vision_position_estimate"]}, "fused twice"),
-        ({"send": ["odometry", "odometry"]}, "once"),
+        ({"send": ["odometry", "odometry"]}, "at most once"),
         ({"profile": "px4", "send": ["vision_position_estimate"]}, "north-aligned"),
         ({"profile": "px4", "send": ["landing_target"]}, "local NED"),
         ({"own_component_id": 1}, "must differ from the autopilot's component_id"),
     ],
 )
-def test_settings_that_would_fly_wrong_are_refused_with_the_reason(config: Any, says: str):
-    with pytest.raises(ValidationError, match=says):
+def test_dangerous_settings_are_rejected_with_the_reason(config: Any, words: str):
+    with pytest.raises(ValidationError, match=words):
         Autopilot(**config)

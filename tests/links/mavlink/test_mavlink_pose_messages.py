@@ -1,4 +1,4 @@
-"""Poses as messages: axes by hand, NaN where nothing is known, and back through the reader of an autopilot's odometry."""
+"""Poses as messages: axes by hand, NaN for unknown values, and the round trip through the reader of ODOMETRY."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def test_odometry_is_the_drone_in_the_start_frame_forward_right_down():
     assert (message.reset_counter, message.time_usec) == (7, good_pose().stamp_ns // 1000)
 
 
-def test_a_drone_that_looks_left_has_turned_by_minus_90_deg_and_its_velocity_is_its_own():
-    R = rotation_from_rpy_deg((0.0, 0.0, 90.0))  # counter-clockwise seen from above
+def test_a_drone_facing_left_has_yaw_minus_90_deg_and_its_velocity_is_in_its_body():
+    R = rotation_from_rpy_deg((0.0, 0.0, 90.0))  # counter-clockwise positions from above
     message = over_the_wire(odometry(good_pose(R_start_drone=R, R_vehicle_drone=R), 0, LIMITS))
     np.testing.assert_allclose(message.q, [math.sqrt(0.5), 0, 0, -math.sqrt(0.5)], atol=1e-6)
     np.testing.assert_allclose([message.vx, message.vy, message.vz], [0, 1, 0], atol=1e-6)  # 1 m/s to its right
@@ -45,8 +45,8 @@ def test_a_drone_that_looks_left_has_turned_by_minus_90_deg_and_its_velocity_is_
     assert (estimate.x, estimate.y, estimate.z, estimate.reset_counter) == (101.0, -2.0, -10.0, 3)
 
 
-def test_a_nose_that_goes_up_is_a_positive_pitch():
-    R = rotation_from_rpy_deg((0.0, -20.0, 0.0))  # ours: y is left, so nose up is negative
+def test_nose_up_is_a_positive_pitch():
+    R = rotation_from_rpy_deg((0.0, -20.0, 0.0))  # y is left, so nose up is negative
     estimate = over_the_wire(vision_position_estimate(good_pose(R_start_drone=R), 0))
     assert math.degrees(estimate.pitch) == pytest.approx(20.0, abs=1e-4)
 
@@ -57,7 +57,7 @@ SPOTS = st.tuples(*[st.floats(-200, 200)] * 3)
 
 @given(ANGLES, SPOTS, SPOTS, st.integers(0, 10_000))
 @settings(max_examples=50, deadline=None)
-def test_what_is_sent_reads_as_what_was_meant(rpy_deg: Any, xyz: Any, velocity: Any, seed: int):
+def test_a_sent_pose_is_read_back_unchanged(rpy_deg: Any, xyz: Any, velocity: Any, seed: int):
     rng = np.random.default_rng(seed)
     root = rng.normal(0, 0.05, (6, 6))
     covariance = root @ root.T + 1e-4 * np.eye(6)
@@ -68,7 +68,7 @@ def test_what_is_sent_reads_as_what_was_meant(rpy_deg: Any, xyz: Any, velocity: 
         velocity_start_mps=np.array(velocity),
     )
     message = over_the_wire(odometry(pose, 0, LIMITS))
-    message.rollspeed = message.pitchspeed = message.yawspeed = 0.0  # the reader wants numbers
+    message.rollspeed = message.pitchspeed = message.yawspeed = 0.0  # the reader needs finite values
     read = read_odometry(message, pose.stamp_ns)
     np.testing.assert_allclose(read.xyz_local_m, xyz, rtol=1e-6, atol=1e-5)
     assert pose.R_start_drone is not None
@@ -78,13 +78,13 @@ def test_what_is_sent_reads_as_what_was_meant(rpy_deg: Any, xyz: Any, velocity: 
     np.testing.assert_allclose(read.pose_covariance, covariance, rtol=1e-4, atol=1e-6)
 
 
-def test_the_local_frame_stands_still_while_the_vehicle_drives_under_a_drone_that_hovers():
-    seen = set()
+def test_the_local_frame_is_static_while_the_vehicle_drives_below_a_hovering_drone():
+    positions = set()
     for driven_m in (0.0, 3.0, 50.0):
         pose = good_pose(xyz_vehicle_m=np.array([5.0 - driven_m, 0.0, 10.0]), xyz_start_m=np.array([5.0, 0.0, 10.0]))
         message = odometry(pose, 0, LIMITS)
-        seen.add((message.x, message.y, message.z))
-    assert seen == {(5.0, 0.0, -10.0)}
+        positions.add((message.x, message.y, message.z))
+    assert positions == {(5.0, 0.0, -10.0)}
 
 
 @pytest.mark.parametrize(
@@ -93,30 +93,30 @@ def test_the_local_frame_stands_still_while_the_vehicle_drives_under_a_drone_tha
         {"velocity_start_mps": None},
         {"velocity_covariance": None},
         {"velocity_start_mps": np.array([1.0, math.nan, 0.0])},
-        {"velocity_covariance": np.diag([1.0, 0.01, 0.01])},  # 1 m/s: beyond the limit
+        {"velocity_covariance": np.diag([1.0, 0.01, 0.01])},  # 1 m/s: above the limit
         {"velocity_covariance": np.zeros((3, 3))},
         {"velocity_covariance": np.diag([math.inf] * 3)},
         {"velocity_covariance": np.array([[0.01, 0.1, 0], [0.1, 0.01, 0], [0, 0, 0.01]])},  # not positive
     ],
 )
-def test_a_velocity_that_is_not_known_is_nan_and_never_zero(unknown: Any):
+def test_an_unknown_velocity_is_nan_and_never_zero(unknown: Any):
     message = over_the_wire(odometry(good_pose(**unknown), 0, LIMITS))
     assert all(math.isnan(v) for v in (message.vx, message.vy, message.vz))
     assert math.isnan(message.velocity_covariance[0])
     assert np.isfinite(message.pose_covariance).all()
 
 
-def test_turn_rates_are_never_said_and_the_velocitys_variances_are():
+def test_angular_velocity_is_never_sent_and_velocity_variances_are():
     R = rotation_from_rpy_deg((0.0, 0.0, 90.0))
     pose = good_pose(R_start_drone=R, velocity_covariance=np.diag([0.01, 0.04, 0.09]))
     message = over_the_wire(odometry(pose, 0, LIMITS))
     assert all(math.isnan(v) for v in (message.rollspeed, message.pitchspeed, message.yawspeed))
     variances = [message.velocity_covariance[i] for i in (0, 6, 11)]
-    np.testing.assert_allclose(variances, [0.04, 0.01, 0.09], rtol=1e-6)  # along its own forward and right
+    np.testing.assert_allclose(variances, [0.04, 0.01, 0.09], rtol=1e-6)  # along the body's forward and right
     assert all(math.isnan(message.velocity_covariance[i]) for i in (15, 18, 20))
 
 
-def test_quality_falls_from_100_to_1_at_the_limit_by_the_worse_of_the_two():
+def test_quality_decreases_from_100_to_1_at_the_limit_by_the_worse_sigma():
     exact = np.diag([1e-12] * 6)
     half = np.diag([1e-12] * 3 + [(0.5 * LIMITS.position_sigma_m) ** 2] * 3)
     turned = np.diag([math.radians(4.0) ** 2] + [1e-12] * 5)  # 4 deg of 5
@@ -140,12 +140,12 @@ def test_the_landing_target_is_the_vehicle_in_the_drones_body():
     np.testing.assert_allclose(10.0 * line, [-1, 2, 10], rtol=1e-5)
 
 
-def test_a_drone_that_looks_left_and_leans_sees_the_vehicle_turned_and_leaned():
+def test_a_yawed_and_tilted_drone_has_the_vehicle_in_its_rotated_body_frame():
     yaw = rotation_from_rpy_deg((0.0, 0.0, 90.0))
     message = over_the_wire(landing_target(good_pose(R_vehicle_drone=yaw)))
     np.testing.assert_allclose([message.x, message.y, message.z], [-2, -1, 10], atol=1e-5)
-    leaned = over_the_wire(landing_target(good_pose(R_vehicle_drone=rotation_from_rpy_deg((0.0, 10.0, 0.0)))))
-    assert leaned.x == pytest.approx(-math.cos(math.radians(10)) + 10 * math.sin(math.radians(10)), abs=1e-5)
+    tilted = over_the_wire(landing_target(good_pose(R_vehicle_drone=rotation_from_rpy_deg((0.0, 10.0, 0.0)))))
+    assert tilted.x == pytest.approx(-math.cos(math.radians(10)) + 10 * math.sin(math.radians(10)), abs=1e-5)
 
 
 def test_a_vehicle_above_the_drone_has_a_position_and_no_angles():
@@ -160,7 +160,7 @@ def test_the_reset_counter_is_one_byte():
 
 
 @pytest.mark.parametrize("missing", ["xyz_start_m", "R_start_drone", "start_covariance"])
-def test_a_pose_without_its_start_frame_is_an_error_of_the_caller(missing: str):
+def test_a_pose_without_its_start_frame_raises(missing: str):
     with pytest.raises(ValueError, match="gate"):
         odometry(good_pose(**{missing: None}), 0, LIMITS)
     with pytest.raises(ValueError, match="rotation"):

@@ -1,4 +1,4 @@
-"""Signatures: pymavlink's peers accept ours, forgeries and repeats are refused, times grow over restarts and crashes."""
+"""Signing: pymavlink accepts our signatures, forgeries and replays are rejected, time stamps always increase."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from links.mavlink.signing import AHEAD_TICKS, RETRY_S, Signer, ticks_of
 
 mavlink: Any = ardupilotmega
 SECRET = bytes(range(32))
-BEAT = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
+HEARTBEAT = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
 
 
 @pytest.fixture
@@ -35,11 +35,11 @@ def key_file(tmp_path: Path) -> Path:
 def signed(signer: Signer, now_ns: int = HOST0, system: int = 1, component: int = 1) -> bytes:
     mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
     signer.sign_for(mav, now_ns)
-    return packed(BEAT, mav)
+    return packed(HEARTBEAT, mav)
 
 
 def signed_for_minutes(signer: Signer) -> list[int]:
-    """Times of a frame a second for 200 s, kept as a session does."""
+    """Time stamps of one frame per second for 200 s, written as a session does."""
     times = list[int]()
     for second in range(200):
         times.append(ticks(signed(signer, HOST0 + second * 1000 * MS)))
@@ -58,59 +58,59 @@ def other_key(tmp_path: Path) -> Path:
     return path
 
 
-def test_pymavlink_takes_what_we_sign_and_not_without_the_key(key_file: Path):
+def test_pymavlink_accepts_our_signature_only_with_the_key(key_file: Path):
     frame = signed(Signer(key_file, HOST0))
-    for secret, taken in ((SECRET, True), (b"x" * 32, False)):
+    for secret, accepted in ((SECRET, True), (b"x" * 32, False)):
         receiver = mavlink.MAVLink(None)
         receiver.signing.secret_key = secret
         receiver.signing.timestamp = ticks_of(HOST0)
-        if taken:
+        if accepted:
             assert receiver.decode(bytearray(frame)).get_signed()
         else:
             with pytest.raises(mavlink.MAVError):
                 receiver.decode(bytearray(frame))
 
 
-def test_we_take_what_pymavlink_signs_once(key_file: Path):
+def test_a_frame_signed_by_pymavlink_is_accepted_once(key_file: Path):
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     sender.signing.secret_key, sender.signing.sign_outgoing = SECRET, True
     sender.signing.timestamp = ticks_of(HOST0)
-    first, second = packed(BEAT, sender), packed(BEAT, sender)
+    first, second = packed(HEARTBEAT, sender), packed(HEARTBEAT, sender)
     signer = Signer(key_file, HOST0)
     assert signer.verify(first)
-    assert not signer.verify(first)  # heard before
+    assert not signer.verify(first)  # replayed
     assert signer.verify(second)
     assert not signer.verify(first)  # older
 
 
-def test_what_is_unsigned_changed_or_of_another_key_is_refused(key_file: Path, tmp_path: Path):
-    ours, theirs = Signer(key_file, HOST0), Signer(other_key(tmp_path), HOST0)
-    assert not ours.verify(signed(theirs))
-    assert not ours.verify(packed(BEAT, mavlink.MAVLink(None, srcSystem=1, srcComponent=1)))
+def test_unsigned_changed_and_foreign_frames_are_rejected(key_file: Path, tmp_path: Path):
+    own, foreign = Signer(key_file, HOST0), Signer(other_key(tmp_path), HOST0)
+    assert not own.verify(signed(foreign))
+    assert not own.verify(packed(HEARTBEAT, mavlink.MAVLink(None, srcSystem=1, srcComponent=1)))
     frame = signed(Signer(key_file, HOST0))
     for at in range(len(frame)):
         changed = bytearray(frame)
         changed[at] ^= 1
-        assert not ours.verify(bytes(changed))
-    assert ours.verify(frame)
+        assert not own.verify(bytes(changed))
+    assert own.verify(frame)
 
 
-def test_a_forged_frame_with_a_far_time_does_not_silence_the_true_sender(key_file: Path, tmp_path: Path):
-    ours, forger = Signer(key_file, HOST0), Signer(other_key(tmp_path), HOST0)
-    assert not ours.verify(signed(forger, HOST0 + 10**9 * MS))
-    assert ours.verify(signed(Signer(key_file, HOST0)))
+def test_a_forged_frame_with_a_future_time_does_not_block_the_true_sender(key_file: Path, tmp_path: Path):
+    own, forger = Signer(key_file, HOST0), Signer(other_key(tmp_path), HOST0)
+    assert not own.verify(signed(forger, HOST0 + 10**9 * MS))
+    assert own.verify(signed(Signer(key_file, HOST0)))
 
 
 def test_a_new_sender_may_be_a_minute_behind_and_no_more(key_file: Path):
-    ours = Signer(key_file, HOST0)
+    own = Signer(key_file, HOST0)
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     sender.signing.secret_key, sender.signing.sign_outgoing = SECRET, True
     sender.signing.timestamp = ticks_of(HOST0) - AHEAD_TICKS
-    assert not ours.verify(packed(BEAT, sender))
-    assert ours.verify(packed(BEAT, sender))
+    assert not own.verify(packed(HEARTBEAT, sender))
+    assert own.verify(packed(HEARTBEAT, sender))
 
 
-def test_times_follow_the_clock_and_grow_though_it_stands_or_goes_back(key_file: Path):
+def test_times_follow_the_clock_and_increase_although_it_stops_or_steps_back(key_file: Path):
     signer = Signer(key_file, HOST0)
     times = [ticks(signed(signer, at)) for at in (HOST0, HOST0, HOST0 - 10**6 * MS, HOST0 + 5000 * MS)]
     assert all(b > a for a, b in itertools.pairwise(times))
@@ -121,10 +121,10 @@ def test_times_follow_the_clock_and_grow_though_it_stands_or_goes_back(key_file:
 def test_after_a_restart_with_a_wrong_clock_no_time_is_used_again(key_file: Path, closed: bool):
     signer = Signer(key_file, HOST0)
     last = max(signed_for_minutes(signer))
-    if closed:  # else it was killed
+    if closed:  # otherwise it was killed
         signer.close()
-    again = Signer(key_file, HOST0 - 10**9 * MS)
-    first = ticks(signed(again, HOST0 - 10**9 * MS))
+    restarted = Signer(key_file, HOST0 - 10**9 * MS)
+    first = ticks(signed(restarted, HOST0 - 10**9 * MS))
     assert last < first
     assert first <= last + (2 if closed else AHEAD_TICKS + 1)
 
@@ -133,19 +133,17 @@ def full_disk(descriptor: int) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_a_disk_that_takes_no_more_is_said_and_counted_and_times_go_on_growing(
-    key_file: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_full_disk_is_reported_and_counted_and_times_still_increase(key_file: Path, monkeypatch: pytest.MonkeyPatch):
     now_s = 0.0
     monkeypatch.setattr("links.mavlink.signing.time.monotonic", lambda: now_s)
     signer = Signer(key_file, HOST0)
     with monkeypatch.context() as full:
         full.setattr("links.mavlink.signing.os.fsync", full_disk)
         times = signed_for_minutes(signer)
-        assert signer.unwritten == 1  # it is not tried each time
+        assert signer.unwritten == 1  # not tried each time
         assert "cannot be written: No space left on device" in (signer.status or "")
         signer.close()
-        times += [ticks(signed(signer, HOST0)) for _ in range(3)]  # the link again, and the clock set back
+        times += [ticks(signed(signer, HOST0)) for _ in range(3)]  # the link is reopened, with the clock set back
         assert all(b > a for a, b in itertools.pairwise(times))
     now_s += RETRY_S
     signer.write_timestamp()
@@ -153,35 +151,33 @@ def test_a_disk_that_takes_no_more_is_said_and_counted_and_times_go_on_growing(
     assert ticks(signed(Signer(key_file, HOST0))) > times[-1]
 
 
-def test_a_disk_that_takes_its_time_and_then_fails_holds_up_none_that_signs(
-    key_file: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_slow_and_failing_disk_does_not_block_signing(key_file: Path, monkeypatch: pytest.MonkeyPatch):
     signer = Signer(key_file, HOST0)
     writing, release = threading.Event(), threading.Event()
 
     def slow(descriptor: int) -> None:
         writing.set()
         if not release.wait(20):
-            pytest.fail("it waited for the disk")
+            pytest.fail("signing waited for the disk")
         full_disk(descriptor)
 
     monkeypatch.setattr("links.mavlink.signing.os.fsync", slow)
-    late_ns = HOST0 + 61_000 * MS  # all that was written ahead is used up
-    times = [ticks(signed(signer, late_ns))]  # nobody writes: the disk is not asked
+    late_ns = HOST0 + 61_000 * MS  # all reserved times are used
+    times = [ticks(signed(signer, late_ns))]  # signing does not write
     assert not writing.is_set()
     with ThreadPoolExecutor(1) as pool:
-        keeping = pool.submit(signer.write_timestamp)
+        write = pool.submit(signer.write_timestamp)
         assert writing.wait(20)
         times += [ticks(signed(signer, late_ns)) for _ in range(100)]
-        assert not keeping.done()
+        assert not write.done()
         release.set()
-        keeping.result(20)
-    times += [ticks(signed(signer, late_ns + 60_000 * MS)) for _ in range(100)]  # long after RETRY_S: still not asked
+        write.result(20)
+    times += [ticks(signed(signer, late_ns + 60_000 * MS)) for _ in range(100)]  # long after RETRY_S: still no write
     assert signer.unwritten == 1
     assert all(b > a for a, b in itertools.pairwise(times))
 
 
-def test_a_signer_that_was_closed_and_goes_on_reserves_its_times_anew(key_file: Path):
+def test_a_closed_and_reused_signer_reserves_new_times(key_file: Path):
     signer = Signer(key_file, HOST0)
     signer.close()
     signer.write_timestamp()  # a session opens
@@ -189,7 +185,7 @@ def test_a_signer_that_was_closed_and_goes_on_reserves_its_times_anew(key_file: 
     assert ticks(signed(Signer(key_file, HOST0))) > last
 
 
-def test_the_key_may_be_written_in_hexadecimal_and_its_files_are_ours_alone(key_file: Path, tmp_path: Path):
+def test_the_key_may_be_hexadecimal_and_its_files_are_private(key_file: Path, tmp_path: Path):
     hexadecimal = tmp_path / "hex.key"
     hexadecimal.write_text(SECRET.hex() + "\n")
     hexadecimal.chmod(0o600)
@@ -198,7 +194,7 @@ def test_the_key_may_be_written_in_hexadecimal_and_its_files_are_ours_alone(key_
 
 
 @pytest.mark.parametrize(
-    ("content", "mode", "says"),
+    ("content", "mode", "words"),
     [
         (SECRET, 0o640, "chmod 600"),
         (SECRET, 0o604, "chmod 600"),
@@ -209,14 +205,14 @@ def test_the_key_may_be_written_in_hexadecimal_and_its_files_are_ours_alone(key_
         (None, 0o600, "signing_key"),
     ],
 )
-def test_a_bad_key_file_says_what_to_do_and_never_what_it_holds(
-    tmp_path: Path, content: bytes | None, mode: int, says: str, caplog: pytest.LogCaptureFixture
+def test_a_bad_key_file_is_an_error_without_its_content(
+    tmp_path: Path, content: bytes | None, mode: int, words: str, caplog: pytest.LogCaptureFixture
 ):
     path = tmp_path / "bad.key"
     if content is not None:
         path.write_bytes(content)
         path.chmod(mode)
-    with caplog.at_level(logging.DEBUG), pytest.raises(LinkError, match=says) as error:
+    with caplog.at_level(logging.DEBUG), pytest.raises(LinkError, match=words) as error:
         Signer(path, HOST0)
     if content:
         assert content.hex() not in str(error.value) + caplog.text
@@ -224,7 +220,7 @@ def test_a_bad_key_file_says_what_to_do_and_never_what_it_holds(
         assert error.value.__cause__ is None
 
 
-def test_a_spoiled_timestamp_file_stops_it_with_advice(key_file: Path):
+def test_an_invalid_timestamp_file_is_an_error_with_advice(key_file: Path):
     key_file.with_name("mavlink.key.timestamp").write_text("yesterday")
     with pytest.raises(LinkError, match="delete it only when the host's clock is correct"):
         Signer(key_file, HOST0)

@@ -25,7 +25,7 @@ from links.mavlink.gate import PoseLimits, reject_reason
 from links.mavlink.pose_messages import odometry
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))
-from mavlink_poses import HOST0, good_pose
+from tests.links.mavlink.mavlink_poses import HOST0, good_pose
 
 mavlink: Any = ardupilotmega
 LIMITS = PoseLimits()

@@ -36,7 +36,7 @@ from links.simulated.run import simulate_records
 from stages.messages import RelativePose
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))
-from mavlink_poses import good_pose
+from tests.links.mavlink.mavlink_poses import good_pose
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "estimate.yaml"
 ODOMETRY = 331

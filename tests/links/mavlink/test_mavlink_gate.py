@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mavlink_poses import HOST0, MS, good_pose
 from pydantic import ValidationError
 
 from links.mavlink.gate import PoseLimits, RejectReason, pose_sigmas, reject_reason
 from links.mavlink.pose_sender import PoseSender
 from stages.geometry.frames import rotation_z
 from stages.messages import PoseState
+from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
 
 LIMITS = PoseLimits()
 

@@ -16,8 +16,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mavlink_bridges import Bridge
-from mavlink_poses import good_pose
 from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega
 
@@ -34,6 +32,8 @@ from links.simulated.autopilot_socket import AutopilotSocket
 from links.simulated.px4_rules import Px4Rules
 from stages.geometry.frames import rotation_z
 from stages.messages import AutopilotEstimator, PoseState, RelativePose
+from tests.links.mavlink.mavlink_poses import good_pose
+from tests.links.mavlink.transport.mavlink_bridges import Bridge
 
 mavlink: Any = ardupilotmega
 TICK_S = 0.02

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from mavlink_poses import HOST0, MS
 from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink.origin import GlobalOrigin, OriginSender, OriginState
+from tests.links.mavlink.mavlink_poses import HOST0, MS
 
 mavlink: Any = ardupilotmega
 ORIGIN = GlobalOrigin(latitude_deg=-33.8568, longitude_deg=151.2153, altitude_m=-4.25)

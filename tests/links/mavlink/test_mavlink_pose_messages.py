@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mavlink_poses import good_pose
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink.framing import packed, parse_frame
@@ -17,6 +16,7 @@ from links.mavlink.gate import PoseLimits
 from links.mavlink.pose_messages import landing_target, odometry, quality_percent, vision_position_estimate
 from links.mavlink.readers import read_odometry
 from stages.geometry.frames import rotation_from_rpy_deg
+from tests.links.mavlink.mavlink_poses import good_pose
 
 mavlink: Any = ardupilotmega
 LIMITS = PoseLimits()

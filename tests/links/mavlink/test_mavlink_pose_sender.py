@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from mavlink_poses import HOST0, MS, good_pose
 
 from links.mavlink.gate import PoseLimits
 from links.mavlink.pose_sender import TEXT_BYTES, PoseSender
 from stages.messages import PoseState
+from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
 
 
 class Output:

@@ -1,4 +1,4 @@
-"""MAVSDK 4.1 and MAVProxy, each in its own virtual environment, receive our stream on loopback and read what we meant.
+"""MAVSDK 4.1 and MAVProxy, each in its own virtual environment, receive grd's stream on loopback and decode it correctly.
 
     python3 -m venv mavsdk && mavsdk/bin/pip install mavsdk==4.1.0
     python3 -m venv mavproxy && mavproxy/bin/pip install MAVProxy==1.8.75
@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mavlink_poses import good_pose
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
@@ -34,18 +33,19 @@ from links.mavlink.framing import packed, parse_frame
 from links.recording import RecordingReader, RecordingWriter
 from stages.geometry.frames import rotation_from_rpy_deg
 from stages.messages import PoseState, RelativePose
+from tests.links.mavlink.mavlink_poses import good_pose
 from tests.links.ports import free_port
 
 mavlink: Any = ardupilotmega
 MAVSDK, MAVPROXY = os.environ.get("GRD_MAVSDK_PYTHON"), os.environ.get("GRD_MAVPROXY_PYTHON")
-needs_mavsdk = pytest.mark.skipif(not MAVSDK, reason="GRD_MAVSDK_PYTHON names no Python that has mavsdk 4.1")
-needs_mavproxy = pytest.mark.skipif(not MAVPROXY, reason="GRD_MAVPROXY_PYTHON names no Python that has MAVProxy")
+needs_mavsdk = pytest.mark.skipif(not MAVSDK, reason="GRD_MAVSDK_PYTHON is not a Python with mavsdk 4.1")
+needs_mavproxy = pytest.mark.skipif(not MAVPROXY, reason="GRD_MAVPROXY_PYTHON is not a Python with MAVProxy")
 PEER = Path(__file__).parent / "peers" / "mavsdk_peer.py"
-TICK_S, MOST_TICKS = 0.02, 1500
+TICK_S, MAX_TICKS = 0.02, 1500
 
 
 class Peer:
-    """A program that prints lines."""
+    """A subprocess that prints lines."""
 
     def __init__(self, *command: str, folder: Path) -> None:
         self.process = subprocess.Popen(
@@ -65,14 +65,14 @@ class Peer:
         for line in self.process.stdout:
             self._queue.put(line.rstrip("\n"))
 
-    def look(self) -> list[str]:
+    def output(self) -> list[str]:
         while not self._queue.empty():
             self.lines.append(self._queue.get())
         assert self.process.poll() is None, "\n".join(self.lines)
         return self.lines
 
-    def said(self) -> list[dict[str, Any]]:
-        return [json.loads(line) for line in self.look() if line.startswith("{")]
+    def json_lines(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.output() if line.startswith("{")]
 
     def end(self) -> None:
         assert self.process.stdin is not None
@@ -91,7 +91,7 @@ def peer(*command: str, folder: Path) -> Iterator[Peer]:
 
 
 def varied(stamp_ns: int) -> RelativePose:
-    """A pose that moves, turns and leans, so that no two messages are alike."""
+    """A pose that moves, turns and tilts, so that no two messages are equal."""
     t = (stamp_ns % 10**11) * 1e-9
     R = rotation_from_rpy_deg((5.0 * np.sin(t), 8.0 * np.cos(t), 10.0 * t))
     return good_pose(
@@ -103,18 +103,18 @@ def varied(stamp_ns: int) -> RelativePose:
     )
 
 
-def fly(
+def send_poses(
     link: Autopilot, sent: list[Record], done: Callable[[], bool], pose: Callable[[int], RelativePose] = varied
 ) -> None:
-    """Poses of now, some 50 a second, until something is true."""
+    """Send current poses at about 50 Hz until `done`."""
     pause = threading.Event()
-    for _ in range(MOST_TICKS):
+    for _ in range(MAX_TICKS):
         link.on_pose(pose(host_time.now_ns()))
         sent += link.sent()
         if done():
             return
         pause.wait(TICK_S)
-    pytest.fail(f"not within {MOST_TICKS * TICK_S:g} s: {link.counters}")
+    pytest.fail(f"not within {MAX_TICKS * TICK_S:g} s: {link.counters}")
 
 
 def sent_by_time(sent: list[Record], kind: str) -> dict[int, Any]:
@@ -122,16 +122,16 @@ def sent_by_time(sent: list[Record], kind: str) -> dict[int, Any]:
     return {m.time_usec: m for m in messages if m.get_type() == kind}
 
 
-def assert_same(theirs: dict[str, Any], ours: Any) -> None:
-    """Each field as we packed it; JSON's null is NaN."""
-    for name in ours.get_fieldnames():
-        mine = np.array(getattr(ours, name), dtype=np.float64)
-        yours = np.array(theirs[name], dtype=np.float64)
-        np.testing.assert_array_equal(yours.astype(np.float32), mine.astype(np.float32), err_msg=name)
+def assert_same(received: dict[str, Any], sent: Any) -> None:
+    """Assert that each field is as packed; JSON's null is NaN."""
+    for name in sent.get_fieldnames():
+        expected = np.array(getattr(sent, name), dtype=np.float64)
+        actual = np.array(received[name], dtype=np.float64)
+        np.testing.assert_array_equal(actual.astype(np.float32), expected.astype(np.float32), err_msg=name)
 
 
 @needs_mavsdk
-def test_mavsdk_decodes_odometry_and_landing_target_as_they_were_meant(tmp_path: Path):
+def test_mavsdk_decodes_odometry_and_landing_target_correctly(tmp_path: Path):
     port = free_port()
     link = Autopilot(connection=f"udpout:127.0.0.1:{port}", send=("odometry", "landing_target"))
     wanted = ("ODOMETRY", "LANDING_TARGET", "STATUSTEXT", "HEARTBEAT", "TIMESYNC")
@@ -139,27 +139,27 @@ def test_mavsdk_decodes_odometry_and_landing_target_as_they_were_meant(tmp_path:
     assert MAVSDK is not None
     with peer(MAVSDK, str(PEER), str(port), *wanted, folder=tmp_path) as sdk, link.listen():
 
-        def heard(kind: str) -> list[dict[str, Any]]:
-            return [line for line in sdk.said() if line.get("name") == kind]
+        def received(kind: str) -> list[dict[str, Any]]:
+            return [line for line in sdk.json_lines() if line.get("name") == kind]
 
-        fly(link, sent, lambda: all(len(heard(kind)) >= 60 for kind in wanted[:2]))
-        fly(
+        send_poses(link, sent, lambda: all(len(received(kind)) >= 60 for kind in wanted[:2]))
+        send_poses(
             link,
             sent,
-            lambda: any("STOPPED: ambiguous" in line["fields"] for line in heard("STATUSTEXT")),
+            lambda: any("STOPPED: ambiguous" in line["fields"] for line in received("STATUSTEXT")),
             lambda ns: good_pose(ns, state=PoseState.AMBIGUOUS),
         )
-        said = sdk.said()
-        counts = Counter(line["name"] for line in said if "name" in line)
+        lines = sdk.json_lines()
+        counts = Counter(line["name"] for line in lines if "name" in line)
         for kind in ("ODOMETRY", "LANDING_TARGET"):
-            ours = sent_by_time(sent, kind)
-            for line in heard(kind):
+            sent_messages = sent_by_time(sent, kind)
+            for line in received(kind):
                 fields = json.loads(line["fields"])
                 assert line["sender"] == [1, 197]
-                assert_same(fields, ours[fields["time_usec"]])
-    assert said[0]["version"].lstrip("v").startswith("4.1")
-    assert next(line["components"] for line in said if "components" in line) == [197]
-    sys.stdout.write(f"\nMAVSDK {said[0]['version']}: {dict(counts)}, every field equal to ours\n")
+                assert_same(fields, sent_messages[fields["time_usec"]])
+    assert lines[0]["version"].lstrip("v").startswith("4.1")
+    assert next(line["components"] for line in lines if "components" in line) == [197]
+    sys.stdout.write(f"\nMAVSDK {lines[0]['version']}: {dict(counts)}, every field equal\n")
 
 
 @contextmanager
@@ -170,8 +170,8 @@ def mavproxy(folder: Path, port: int, *more: str) -> Iterator[Peer]:
     modules = ("--state-basedir", str(folder), "--default-modules", "signing,link")
     with peer(MAVPROXY, "-u", program, *options, *modules, *more, folder=folder) as proxy:
         pause = threading.Event()
-        for _ in range(MOST_TICKS):
-            if any("Waiting for heartbeat" in line for line in proxy.look()):
+        for _ in range(MAX_TICKS):
+            if any("Waiting for heartbeat" in line for line in proxy.output()):
                 break
             pause.wait(TICK_S)
         yield proxy
@@ -187,49 +187,49 @@ def logdump(tlog: Path, kind: str) -> list[dict[str, Any]]:
 
 
 @needs_mavproxy
-def test_mavproxy_meets_us_shows_our_texts_and_logs_every_odometry_as_it_was_sent(tmp_path: Path):
+def test_mavproxy_detects_grd_shows_its_texts_and_logs_every_odometry_unchanged(tmp_path: Path):
     port = free_port()
     link = Autopilot(connection=f"udpout:127.0.0.1:{port}", send=("odometry", "landing_target"))
     sent: list[Record] = []
     with mavproxy(tmp_path, port) as proxy, link.listen():
 
         def shows(text: str) -> bool:
-            return any(text in line for line in proxy.look())
+            return any(text in line for line in proxy.output())
 
-        fly(link, sent, lambda: shows("grd: sending poses") and len(sent_by_time(sent, "ODOMETRY")) >= 100)
-        fly(link, sent, lambda: shows("STOPPED: no position"), lambda ns: good_pose(ns, state=PoseState.LOST))
+        send_poses(link, sent, lambda: shows("grd: sending poses") and len(sent_by_time(sent, "ODOMETRY")) >= 100)
+        send_poses(link, sent, lambda: shows("STOPPED: no position"), lambda ns: good_pose(ns, state=PoseState.LOST))
         assert shows("Detected vehicle 1:197")
-        shown = [line for line in proxy.look() if "grd:" in line or "Detected" in line]
+        shown = [line for line in proxy.output() if "grd:" in line or "Detected" in line]
     counts = Counter()
     for kind in ("ODOMETRY", "LANDING_TARGET"):
-        ours, logged = sent_by_time(sent, kind), logdump(tmp_path / "flight.tlog", kind)
+        sent_messages, logged = sent_by_time(sent, kind), logdump(tmp_path / "flight.tlog", kind)
         counts[kind] = len(logged)
-        assert len(logged) >= 0.95 * len(ours)  # those of the last moment may not be on the disk
+        assert len(logged) >= 0.95 * len(sent_messages)  # the last ones may not be on the disk
         for fields in logged:
-            assert_same(fields, ours[fields["time_usec"]])
-    sys.stdout.write(f"\nMAVProxy: {dict(counts)} of {len(ours)} sent, every field equal to ours; it shows {shown}\n")
+            assert_same(fields, sent_messages[fields["time_usec"]])
+    sys.stdout.write(f"\nMAVProxy: {dict(counts)} of {len(sent_messages)} sent, every field equal; it shows {shown}\n")
 
 
 @needs_mavproxy
-def test_mavproxy_takes_our_signature_and_refuses_another(tmp_path: Path):
-    """MAVProxy's `signing key` hashes a phrase with SHA-256; pymavlink in it looks at each frame."""
+def test_mavproxy_accepts_the_right_signature_and_rejects_another(tmp_path: Path):
+    """MAVProxy's `signing key` hashes a phrase with SHA-256; its pymavlink verifies each frame."""
     key = tmp_path / "key"
     key.write_bytes(hashlib.sha256(b"overthestreet").digest())
     key.chmod(0o600)
-    for phrase, taken in (("overthestreet", True), ("elsewhere", False)):
+    for phrase, accepted in (("overthestreet", True), ("otherstreet", False)):
         folder = tmp_path / phrase
         folder.mkdir()
         port = free_port()
         link = Autopilot(connection=f"udpout:127.0.0.1:{port}", signing_key=key)
         sent: list[Record] = []
         with mavproxy(folder, port, "--cmd", f"set allow_unsigned False; signing key {phrase}") as proxy, link.listen():
-            fly(link, sent, lambda sent=sent: len(sent_by_time(sent, "ODOMETRY")) >= 150)
-            assert any("Detected vehicle 1:197" in line for line in proxy.look()) == taken
+            send_poses(link, sent, lambda sent=sent: len(sent_by_time(sent, "ODOMETRY")) >= 150)
+            assert any("Detected vehicle 1:197" in line for line in proxy.output()) == accepted
 
 
 @pytest.fixture
 def session(tmp_path: Path) -> list[Record]:
-    """What went over a link in both directions, written to a recording and read back."""
+    """Frames of a link in both directions, written to a recording and read back."""
     link = Autopilot(connection="udpin:127.0.0.1:0")
     drone, pause = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), threading.Event()
     records: list[Record] = []
@@ -253,29 +253,29 @@ def test_a_recorded_session_is_a_telemetry_log_that_mavproxys_tools_read(session
     tlog = tmp_path / "session.tlog"
     tlog.write_bytes(b"".join((r.arrival_ns // 1000).to_bytes(8, "big") + r.data for r in session))
     assert len(logdump(tlog, "ATTITUDE")) == 40
-    ours, logged = sent_by_time(session, "ODOMETRY"), logdump(tlog, "ODOMETRY")
-    assert len(logged) == len(ours) == 40
+    sent_messages, logged = sent_by_time(session, "ODOMETRY"), logdump(tlog, "ODOMETRY")
+    assert len(logged) == len(sent_messages) == 40
     for fields in logged:
-        assert_same(fields, ours[fields["time_usec"]])
+        assert_same(fields, sent_messages[fields["time_usec"]])
 
 
 @needs_mavsdk
 def test_a_recorded_session_sent_again_is_read_by_mavsdk(session: list[Record], tmp_path: Path):
     port, pause = free_port(), threading.Event()
-    ours = sent_by_time(session, "ODOMETRY")
-    heard: dict[int, dict[str, Any]] = {}
+    sent_messages = sent_by_time(session, "ODOMETRY")
+    decoded: dict[int, dict[str, Any]] = {}
     assert MAVSDK is not None
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     with udp, peer(MAVSDK, str(PEER), str(port), "ODOMETRY", folder=tmp_path) as sdk:
-        for _ in range(MOST_TICKS // 50):
+        for _ in range(MAX_TICKS // 50):
             for record in session:
                 if record.topic == "/autopilot/tx":
                     udp.sendto(record.data, ("127.0.0.1", port))
                     pause.wait(0.005)
-            lines = [json.loads(line["fields"]) for line in sdk.said() if line.get("name") == "ODOMETRY"]
-            heard = {fields["time_usec"]: fields for fields in lines}
-            if len(heard) == len(ours):
+            lines = [json.loads(line["fields"]) for line in sdk.json_lines() if line.get("name") == "ODOMETRY"]
+            decoded = {fields["time_usec"]: fields for fields in lines}
+            if len(decoded) == len(sent_messages):
                 break
-    assert heard.keys() == ours.keys()
-    for time_usec, fields in heard.items():
-        assert_same(fields, ours[time_usec])
+    assert decoded.keys() == sent_messages.keys()
+    for time_usec, fields in decoded.items():
+        assert_same(fields, sent_messages[time_usec])

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mavlink_poses import HOST0, MS
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import LinkError
 from links.mavlink.framing import packed
 from links.mavlink.signing import AHEAD_TICKS, RETRY_S, Signer, ticks_of
+from tests.links.mavlink.mavlink_poses import HOST0, MS
 
 mavlink: Any = ardupilotmega
 SECRET = bytes(range(32))

@@ -1,4 +1,4 @@
-"""Run by MAVSDK's own Python: prints each message of the first system it meets as one JSON line, until its input ends.
+"""Run by MAVSDK's Python: prints each message of the first detected system as one JSON line, until its input ends.
 
 mavsdk_peer.py PORT MESSAGE...
 """
@@ -16,27 +16,27 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect
 _lock = threading.Lock()
 
 
-def say(**line: object) -> None:
-    """One JSON line; MAVSDK calls back from a thread of its own."""
+def write(**line: object) -> None:
+    """Print one JSON line; MAVSDK calls back from its own thread."""
     with _lock:
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
 
 
 def main() -> None:
-    """Listen, tell, until the input ends."""
+    """Listen and print until the input ends."""
     sdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
     sdk.add_any_connection(f"udpin://127.0.0.1:{sys.argv[1]}")
-    say(version=sdk.version())
+    write(version=sdk.version())
     while not sdk.get_systems():
         time.sleep(0.05)
     system = sdk.get_systems()[0]
     direct = MavlinkDirect(system)
     for name in sys.argv[2:]:
         direct.subscribe_message(
-            name, lambda m, _: say(name=m.message_name, sender=[m.system_id, m.component_id], fields=m.fields_json)
+            name, lambda m, _: write(name=m.message_name, sender=[m.system_id, m.component_id], fields=m.fields_json)
         )
-    say(system=system.get_system_id(), components=system.component_ids())
+    write(system=system.get_system_id(), components=system.component_ids())
     sys.stdin.read()
     sdk.destroy()
 

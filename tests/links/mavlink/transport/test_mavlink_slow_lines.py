@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from mavlink_bridges import SlowFlight
 
 from links.mavlink.timesync_monitor import LATE_NS
+from tests.links.mavlink.transport.mavlink_bridges import SlowFlight
 
 LATE_S = 1e-9 * LATE_NS
 

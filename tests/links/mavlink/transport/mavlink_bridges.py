@@ -10,7 +10,6 @@ from collections import deque
 from typing import Any
 
 import pytest
-from mavlink_poses import HOST0, good_pose
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink.autopilot_session import AutopilotSession
@@ -20,6 +19,7 @@ from links.mavlink.origin import OriginSender
 from links.mavlink.pose_sender import PoseSender
 from links.mavlink.transport.connection import Address, Connection
 from links.mavlink.transport.stream_connection import StreamConnection
+from tests.links.mavlink.mavlink_poses import HOST0, good_pose
 
 mavlink: Any = ardupilotmega
 STEP_NS = 5_000_000

@@ -158,7 +158,7 @@ class RigInTime:
 
     def _cameras(self, simulation: LiveSimulation) -> PicturesInTime:
         seen = () if self._rig.pictures is None else self._rig.camera_ports.items()
-        ports = {f"/camera/{carrier}": port for carrier, port in seen}
+        ports = {f"/camera/{camera_mount}": port for camera_mount, port in seen}
         end_ns = self._scenario.start_ns + round(1e9 * self._scenario.duration_s)
         return PicturesInTime(simulation.kept_cameras, ports, simulation.now_ns, end_ns)
 

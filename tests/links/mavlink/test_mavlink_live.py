@@ -140,7 +140,7 @@ def test_an_unresolved_branch_never_reaches_the_autopilot_and_it_is_told_why():
         wrong = rotation_z(np.pi / 2)
         heard.fly(
             lambda: any("AMBIGUOUS" in m.text for m in drone.messages("STATUSTEXT")),
-            lambda ns: good_pose(ns, state=PoseState.AMBIGUOUS, R_start_drone=wrong, R_vehicle_drone=wrong),
+            lambda ns: good_pose(ns, state=PoseState.AMBIGUOUS, R_map_drone=wrong, R_vehicle_drone=wrong),
         )
         assert drone.messages("ODOMETRY") == []
         assert drone.rules.estimate is None

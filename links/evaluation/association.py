@@ -1,0 +1,108 @@
+"""Association with truth: truth interpolated to given times, and the drone that each track follows.
+
+Source: grd. Truth is interpolated, but never over a gap. This file needs nothing but numpy: links/truth.py uses it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from links.evaluation.text_files import Flags, Stamps
+from stages.geometry import Array64
+
+NEAR_M = 1.0  # a track this near to one drone alone is on that drone
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationLimits:
+    """Thresholds of an evaluation. The report states all of them."""
+
+    max_gap_s: float = 0.15  # truth is not interpolated over longer gaps
+    max_age_s: float = 0.3  # an output is current for this long; an autopilot drops out after a longer silence
+    false_m: float = 1.0  # an output farther from the drone is false
+    overconfident_sigmas: float = 3.0  # a false output farther than this many of its own sigmas is overconfident
+    reach_m: float = 100.0  # no output is expected beyond this range: VLP-16 data sheet 63-9229, range
+    min_returns: int = 4  # a search with this many returns of the drone should detect it
+
+    @property
+    def max_gap_ns(self) -> int:
+        """`max_gap_s` [ns]."""
+        return round(self.max_gap_s * 1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class Brackets:
+    """The samples before and after each of m times."""
+
+    known: Flags  # (m,) False outside the samples and inside gaps
+    before: NDArray[np.int64]  # (m,) indices; where `known` is False they mean nothing
+    after: NDArray[np.int64]
+    weight: Array64  # (m,) of the sample after, 0 to 1
+
+
+def bracket(at_ns: Stamps, stamps_ns: Stamps, max_gap_ns: int) -> Brackets:
+    """Bracket the times `at_ns` by samples at most `max_gap_ns` apart. A sample itself is always known."""
+    after = np.clip(np.searchsorted(stamps_ns, at_ns, side="left"), 0, len(stamps_ns) - 1)
+    exact = stamps_ns[after] == at_ns
+    before = np.where(exact, after, np.maximum(after - 1, 0))
+    step_ns = stamps_ns[after] - stamps_ns[before]
+    inside = (at_ns >= stamps_ns[0]) & (at_ns <= stamps_ns[-1])
+    known = exact | (inside & (step_ns <= max_gap_ns))
+    weight = np.where(known & ~exact, (at_ns - stamps_ns[before]) / np.maximum(step_ns, 1), 0.0)
+    return Brackets(known, before, after, weight)
+
+
+def interpolate(at_ns: Stamps, stamps_ns: Stamps, xyz_m: Array64, max_gap_ns: int) -> tuple[Flags, Array64]:
+    """Linear interpolation of positions: known (m,) and xyz (m, 3) [m], whose unknown rows mean nothing."""
+    if not len(stamps_ns):
+        return np.zeros(len(at_ns), dtype=np.bool_), np.zeros((len(at_ns), 3))
+    b = bracket(at_ns, stamps_ns, max_gap_ns)
+    w = b.weight[:, None]
+    return b.known, (1 - w) * xyz_m[b.before] + w * xyz_m[b.after]
+
+
+def newest(at_ns: Stamps, stamps_ns: Stamps) -> NDArray[np.int64]:
+    """Index of the newest sample at or before each time; -1 before the first."""
+    return np.searchsorted(stamps_ns, at_ns, side="right") - 1
+
+
+@dataclass(frozen=True, slots=True)
+class TrackAssociation:
+    """The drone that each track of a run follows."""
+
+    drone: NDArray[np.int64]  # (n,) of each output: index of the drone that its track follows
+    switches: dict[int, int]  # by track: how often it changed to another drone
+
+
+def follow(
+    stamps_ns: Stamps,
+    xyz_m: Array64,
+    tracks: NDArray[np.int64],
+    paths: Sequence[tuple[Stamps, Array64]],
+    max_gap_ns: int,
+) -> TrackAssociation:
+    """Associate the tracks of n outputs with drones, whose true stamps and positions are `paths`.
+
+    A track follows the drone that is nearest to most of its outputs, the first one when truth covers none of them. It
+    switches when it is within NEAR_M of one drone alone and was so of another before.
+    """
+    distance_m = np.full((len(stamps_ns), len(paths)), np.inf)
+    for index, (true_ns, true_m) in enumerate(paths):
+        known, at_m = interpolate(stamps_ns, true_ns, true_m, max_gap_ns)
+        distance_m[known, index] = np.linalg.norm(xyz_m[known] - at_m[known], axis=1)
+    covered = np.isfinite(distance_m).any(axis=1)
+    nearest = np.argmin(distance_m, axis=1)
+    near_one = (distance_m < NEAR_M).sum(axis=1) == 1
+    drone = np.zeros(len(stamps_ns), dtype=np.int64)
+    switches: dict[int, int] = {}
+    for track in np.unique(tracks).tolist():
+        own = tracks == track
+        drone[own] = int(np.argmax(np.bincount(nearest[own & covered], minlength=len(paths))))
+        certain = np.nonzero(own & near_one)[0]
+        in_time = certain[np.argsort(stamps_ns[certain], kind="stable")]
+        switches[track] = int(np.count_nonzero(np.diff(nearest[in_time])))
+    return TrackAssociation(drone, switches)

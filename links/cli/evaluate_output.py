@@ -13,22 +13,28 @@ from pathlib import Path
 from flow.link import LinkError
 from links.cli.console import err, out, progress_bar, show_table, warn
 from links.evaluation.association import EvaluationLimits
-from links.evaluation.comparison import Pair, by_config, pair_up, some_of, uneven_warnings
+from links.evaluation.comparison import (
+    Pair,
+    comparison_table,
+    markdown,
+    pair_up,
+    paper_tables,
+    uneven_warnings,
+)
 from links.evaluation.evaluation import Evaluation
 from links.evaluation.groups import Key, false_track_table, group_table, reliability_table, rotation_table
 from links.evaluation.metrics import evaluate
-from links.evaluation.paper_tables import markdown, paper_tables
-from links.evaluation.report import write_report
+from links.evaluation.report import as_json, write_report
 from links.evaluation.run_data import per_drone, read_run
 from links.evaluation.tables import (
     MAX_COLUMNS,
     Table,
-    as_json,
-    comparison_table,
+    by_config,
     headline_table,
     label,
     metrics_table,
     not_evaluated_names,
+    some_of,
     write_csv,
 )
 

@@ -1,19 +1,24 @@
-"""Association with truth: truth interpolated to given times, and the drone that each track follows.
+"""Truth of the drones and the association with it: truth at given times, and the drone that each track follows.
 
-Source: grd. Truth is interpolated, but never over a gap. This file needs nothing but numpy: links/truth.py uses it.
+Source: grd; links/truth.py writes the files. Truth is interpolated, but never over a gap. This file needs no package of
+the extra `evaluate`: links/truth.py uses it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from links.evaluation.text_files import Flags, Stamps
+from links import results
+from links.evaluation.text_files import NO_DRONE, Flags, Stamps, TextTable, Trajectory, read_tum
 from stages.geometry import Array64
 
+NEVER_NS = np.iinfo(np.int64).max // 2  # the end of a span that did not end
 NEAR_M = 1.0  # a track this near to one drone alone is on that drone
 
 
@@ -32,6 +37,71 @@ class EvaluationLimits:
     def max_gap_ns(self) -> int:
         """`max_gap_s` [ns]."""
         return round(self.max_gap_s * 1e9)
+
+
+class Source(Enum):
+    """An input of an evaluation that a run may lack."""
+
+    TRUTH = auto()
+    RETURNS = auto()  # which returns came from the drone
+    VISIBILITY = auto()  # when the drone was occluded
+    SEARCHES = auto()
+    COMPUTE = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class DroneTruth:
+    """Truth about one drone. `missing` has the reason for what is None."""
+
+    path: Trajectory | None = None
+    returns_ns: Stamps | None = None  # when a pulse returned from it, rising
+    occluded_ns: Stamps | None = None  # (m, 2) begin and end of occlusions, rising
+    missing: dict[Source, str] = field(default_factory=dict)
+
+
+def read_true_drones(folder: Path, truth_file: Path | None) -> tuple[tuple[DroneTruth, ...], bool]:
+    """Truth of every drone, at least one, and whether truth states that there was none."""
+    path = folder / results.TRUTH_FILE
+    first, why, empty_sky = None, "", False
+    if truth_file is not None:
+        first = read_tum(truth_file)
+    elif not path.exists():
+        why = "the recording holds no truth (real flight?); give one with --truth FILE.tum"
+    elif not len(first := read_tum(path, may_be_empty=True)):
+        empty_sky = NO_DRONE in first.header
+        first, why = None, "there was no drone" if empty_sky else f"{path} is empty"
+    drones = [_read_drone(folder, 1, first, why)]
+    while truth_file is None and (more := folder / results.of_drone(results.TRUTH_FILE, len(drones) + 1)).exists():
+        drones.append(_read_drone(folder, len(drones) + 1, read_tum(more), ""))
+    return tuple(drones), empty_sky
+
+
+def _read_drone(folder: Path, number: int, path: Trajectory | None, why_no_path: str) -> DroneTruth:
+    missing = {
+        Source.TRUTH: why_no_path,
+        Source.RETURNS: "the recording does not hold which returns came from the drone",
+        Source.VISIBILITY: "the recording does not hold when the drone was occluded",
+    }
+    returns, visible = (
+        folder / results.of_drone(name, number) for name in (results.TRUTH_HITS_FILE, results.TRUTH_VISIBLE_FILE)
+    )
+    return DroneTruth(path, _read_returns(returns), _read_occlusions(visible), missing)
+
+
+def _read_returns(path: Path) -> Stamps | None:
+    if not path.exists():
+        return None
+    return np.sort(TextTable(path, ("stamp_s",)).stamps_ns("stamp_s"))
+
+
+def _read_occlusions(path: Path) -> Stamps | None:
+    """Begin and end (m, 2) of each occlusion; one that did not end ends at NEVER_NS."""
+    if not path.exists():
+        return None
+    table = TextTable(path, ("stamp_s", "visible"))
+    stamps_ns, visible = table.stamps_ns("stamp_s"), np.concatenate([[True], table.equals("visible", "1")])
+    begin, end = stamps_ns[visible[:-1] & ~visible[1:]], stamps_ns[~visible[:-1] & visible[1:]]
+    return np.column_stack([begin, np.append(end, NEVER_NS)[: len(begin)]])
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,13 +1,21 @@
-"""Several runs together: the table of all runs, medians over them, and pairs of runs of one recording.
+"""Runs against other runs of the same recording, and against the published tables of the paper.
 
-Source: DESIGN, evaluate. Runs are compared by recording: medians over different recordings compare the recordings.
+Runs are paired by recording: medians over different recordings would compare the recordings.
+
+The paper's Tables I and II are next to runs of recordings named `experiment_J` or `experiment_J-...`, with medians over
+the runs of each configuration. As in the paper, the RMSE is over the outputs of a run: the track accuracy is in the
+table, too, because a run without outputs has no error. The paper's flights are not published; those of grd are
+simulated, with similar distance, speed and initial yaw. A fair comparison is with `paper.yaml` over the same flights.
+
+Source: DESIGN, evaluate; P VI, Tables I and II.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -17,71 +25,36 @@ import pandas as pd
 from flow.link import LinkError
 from links.evaluation.errors import rms
 from links.evaluation.evaluation import Evaluation
-from links.evaluation.metrics import CATALOGUE, Better, metric_of, rank
+from links.evaluation.metrics import Better, metric_of
+from links.evaluation.tables import (
+    NOTHING,
+    Table,
+    by_config,
+    in_terminal,
+    keys_of,
+    label,
+    median_cell,
+    medians,
+    ranks,
+    runs_table,
+    some_of,
+    text_frame,
+)
 
-MAX_NAMED = 4  # names in a warning
-OBJECT = "evaluation"  # column of `runs_table` with the Evaluation itself
-TIMED_SHARES = ("detection_rate", "observable_detection_rate", "return_share", "observable_share")
-COUNTED_SHARES = (*TIMED_SHARES, "inside_95_share", "rotation_accepted_share", "rotation_inside_95_share")
-
-
-def keys_of(evaluations: list[Evaluation]) -> list[str]:
-    """Every metric of any evaluation, in the order of the catalogue, compute times last."""
-    return [*CATALOGUE, *dict.fromkeys(key for e in evaluations for key in e.values if key not in CATALOGUE)]
-
-
-def runs_table(evaluations: list[Evaluation]) -> pd.DataFrame:
-    """One row for each evaluation with all metrics; a failure is the worst value (inf or -inf), other gaps are NaN.
-
-    A share that can be pooled over runs has its counts in `KEY_count` and `KEY_of`, one of time also its seconds in
-    `KEY_s` and `KEY_of_s`: the counts are of searches, which differ in length.
-    """
-    keys = keys_of(evaluations)
-    rows: list[dict[str, object]] = []
-    for e in evaluations:
-        row: dict[str, object] = {"recording": e.run.recording, "config": e.run.config, "output": e.output.kind.value}
-        row |= {"drone": e.run.drone, "run": e.run.name, "no_drone": int(e.run.no_drone)}
-        row["span_s"] = math.nan if e.span_ns is None else (e.span_ns[1] - e.span_ns[0]) / 1e9
-        row["outputs"] = len(e.output.poses)
-        row |= {key: rank(e.values.get(key), metric_of(key).better) for key in keys}
-        for key in COUNTED_SHARES:
-            row[f"{key}_count"], row[f"{key}_of"] = e.counts.get(key, (None, None))
-        for key in TIMED_SHARES:
-            row[f"{key}_s"], row[f"{key}_of_s"] = e.seconds.get(key, (math.nan, math.nan))
-        rows.append(row | {OBJECT: e})
-    return pd.DataFrame(rows).astype({f"{key}_{what}": "Int64" for key in COUNTED_SHARES for what in ("count", "of")})
-
-
-@dataclass(frozen=True, slots=True)
-class Pooled:
-    """Median of a metric over runs."""
-
-    median: float  # +-inf when half of the runs or more failed, NaN when no run has a value
-    runs: int  # in the median, failures among them
-    failed: int
-    not_evaluated: int
-
-
-def pooled(ranks: pd.Series) -> Pooled:
-    """Median of a column of `runs_table`."""
-    return Pooled(float(ranks.median()), int(ranks.count()), int(np.isinf(ranks).sum()), int(ranks.isna().sum()))
-
-
-def by_config(evaluations: list[Evaluation]) -> dict[str, list[Evaluation]]:
-    """Evaluations by configuration, in the order in which they were given."""
-    return _by(evaluations, lambda e: e.run.config)
-
-
-def pools(evaluations: list[Evaluation]) -> dict[str, list[Evaluation]]:
-    """Evaluations that may be pooled: of one configuration, and of one output where runs have several."""
-    return _by(evaluations, lambda e: f"{e.run.config} {e.output.kind if len(e.run.outputs) > 1 else ''}".strip())
-
-
-def _by(evaluations: list[Evaluation], name: Callable[[Evaluation], str]) -> dict[str, list[Evaluation]]:
-    found: dict[str, list[Evaluation]] = {}
-    for e in evaluations:
-        found.setdefault(name(e), []).append(e)
-    return found
+COMMON = "3D RMSE in the time in which both have an output"
+EXPERIMENT = re.compile(r"experiment_([1-4])(?:-.*)?")
+PAPER_CONFIGS = "paper"  # prefix of configurations of the paper's method
+POSITION = ["rmse_x_m", "rmse_y_m", "rmse_z_m", "rmse_m"]
+ROTATION = ["rmse_roll_deg", "rmse_pitch_deg", "rmse_yaw_deg", "rmse_angle_deg"]
+BY_CAMERAS = [f"rotation_published_rmse_{name}deg" for name in ("roll_", "pitch_", "yaw_", "")]
+PUBLISHED_M = {1: (0.150, 0.151, 0.087), 2: (0.250, 0.310, 0.137), 3: (0.291, 0.412, 0.232), 4: (0.552, 0.448, 0.240)}
+PUBLISHED_DEG = {1: (3.6, 1.6, 5.5), 2: (2.1, 1.8, 5.9), 3: (2.4, 2.1, 5.3), 4: (1.4, 3.0, 3.4)}
+NOTE = (
+    "Medians over runs; a run without outputs counts as infinite ('none'). RMSE over the outputs of a run. Track "
+    "accuracy: share of the time with a current output within 1 m. Accurate outputs: RMSE of the outputs within 1 m "
+    "alone, of runs that have any. Factor: RMSE of the paper's method over the same experiments divided by this one, "
+    "both of the whole error; it is large where that method follows something else. Published: the paper's own flights."
+)
 
 
 def uneven_warnings(evaluations: list[Evaluation]) -> list[str]:
@@ -96,12 +69,6 @@ def uneven_warnings(evaluations: list[Evaluation]) -> list[str]:
             if recordings:
                 warnings.append(f"{name or 'a configuration without a name'}: {what} {some_of(recordings)}")
     return warnings
-
-
-def some_of(names: list[str]) -> str:
-    """`a, b, c, d and 3 more`."""
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return ", ".join(names[:MAX_NAMED]) + more
 
 
 def _flight(e: Evaluation) -> tuple[str, str, int]:
@@ -190,26 +157,22 @@ def verdict(own: float, other: float, better: Better) -> Verdict:
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
-    """A metric over the pairs in which both sides have a value or failed."""
+class Comparison:
+    """Metrics over the pairs in which both sides have a value or failed; one row for each metric with such pairs."""
 
-    own: Pooled
-    other: Pooled
-    ratio: float | None  # median of own / other over the pairs in which both have a value
+    own: pd.DataFrame  # `medians`
+    other: pd.DataFrame
+    ratio: pd.Series  # median of own / other over the pairs in which both have a value; NaN without such a pair
 
 
-def compare(pairs: list[Pair]) -> dict[str, Compared]:
-    """Every metric that some pair has on both sides."""
+def compare(pairs: list[Pair]) -> Comparison:
+    """Compare all metrics."""
     keys = keys_of([e for pair in pairs for e in (pair.own, pair.other)])
-    own, other = runs_table([pair.own for pair in pairs]), runs_table([pair.other for pair in pairs])
-    found: dict[str, Compared] = {}
-    for key in (key for key in keys if key in own and key in other):
-        a, b = own.loc[:, key], other.loc[:, key]
-        both, measured = a.notna() & b.notna(), np.isfinite(a) & np.isfinite(b) & (b > 0)
-        if both.any():
-            ratio = float((a / b).loc[measured].median()) if measured.any() else None
-            found[key] = Compared(pooled(a.loc[both]), pooled(b.loc[both]), ratio)
-    return found
+    a, b = ranks([pair.own for pair in pairs], keys), ranks([pair.other for pair in pairs], keys)
+    both = a.notna() & b.notna()
+    ratio = (a / b).where(np.isfinite(a) & np.isfinite(b) & (b > 0)).median()
+    own, other = (medians(side.where(both)).assign(not_evaluated=0).loc[both.any()] for side in (a, b))
+    return Comparison(own, other, ratio.loc[both.any()])
 
 
 def common_rmse_m(pairs: list[Pair]) -> tuple[float, float] | None:
@@ -219,3 +182,100 @@ def common_rmse_m(pairs: list[Pair]) -> tuple[float, float] | None:
         return None
     own, other = (sorted(side)[len(both) // 2] for side in zip(*both, strict=True))
     return own, other
+
+
+def comparison_table(pairs: list[Pair]) -> Table:
+    """RUN next to OTHER: medians over the pairs, the median ratio, and which side is better."""
+    one = len(pairs) == 1
+    names = [label(pairs[0].own), label(pairs[0].other)] if one else ["RUN", "OTHER"]
+    title = "against the other run" if one else f"against the other runs, medians of {len(pairs)} pairs"
+    compared = compare(pairs)
+    rows: list[list[str]] = []
+    sections: list[str] = []
+    for key in filter(in_terminal, map(str, compared.ratio.index)):
+        metric, own, other = metric_of(key), compared.own.loc[key], compared.other.loc[key]
+        result = verdict(own["median"], other["median"], metric.better)
+        rows.append(
+            [metric.title, median_cell(own, metric), median_cell(other, metric), _ratio(compared.ratio.loc[key]), result]
+        )
+        sections.append(metric.group)
+    common = common_rmse_m(pairs)
+    if common is not None:
+        a, b = common
+        rows.append(
+            [f"{COMMON} [m]", f"{a:.3f}", f"{b:.3f}", _ratio(a / b if b else math.nan), verdict(a, b, Better.LOW)]
+        )
+        sections.append("common time")
+    frame = text_frame(rows, ["metric", *names, "ratio", ""])
+    return Table(title, frame, sections=sections, classes=[row[-1] for row in rows])
+
+
+def _ratio(ratio: float) -> str:
+    return NOTHING if math.isnan(ratio) else f"{ratio:.2g}"
+
+
+def paper_tables(evaluations: Sequence[Evaluation]) -> list[Table]:
+    """Table I (position) and II (rotation); empty without runs of the experiments."""
+    found: dict[int, list[Evaluation]] = {}
+    for e in evaluations:
+        named = EXPERIMENT.fullmatch(e.run.recording)
+        if named and e.output is e.run.outputs[0]:
+            found.setdefault(int(named[1]), []).append(e)
+    if not found:
+        return []
+    position_heads, rotation_heads = ["x", "y", "z", "3D", "accurate\noutputs"], ["roll", "pitch", "yaw", "angle"]
+    experiments = sorted(found.items())
+    position = [row for number, own in experiments for row in _rows(number, own, _position, PUBLISHED_M[number], 3)]
+    rotation = [row for number, own in experiments for row in _rows(number, own, _rotation, PUBLISHED_DEG[number], 2)]
+    return [
+        _table("Table I: RMSE of the position in m", position_heads, position),
+        _table("Table II: RMSE of the rotation in deg", rotation_heads, rotation),
+    ]
+
+
+def markdown(tables: Sequence[Table]) -> str:
+    """The tables for a README."""
+    return "\n\n".join([*(table.markdown() for table in tables), NOTE, ""])
+
+
+def _position(runs: pd.DataFrame, own: list[Evaluation]) -> list[float]:
+    """Medians of x, y, z and the whole error, and of the whole error of accurate outputs."""
+    accurate = [e.errors.distance[~e.errors.false] for e in own if e.errors is not None]
+    return [*runs[POSITION].median(), pd.Series([rms(m) for m in accurate if m.size], dtype=float).median()]
+
+
+def _rotation(runs: pd.DataFrame, own: list[Evaluation]) -> list[float]:
+    """Medians of roll, pitch, yaw and the angle: of the pose, or by both cameras when no pose has a rotation."""
+    of_pose = runs[ROTATION].median()
+    return list(runs[BY_CAMERAS].median() if of_pose.isna().all() else of_pose)
+
+
+def _rows(number: int, own: list[Evaluation], medians, published: tuple[float, ...], decimals: int) -> list[list[str]]:
+    """The published row and one row for each configuration."""
+    tables = {config: (runs_table(runs), runs) for config, runs in by_config(own).items()}
+    errors = {config: medians(*table) for config, table in tables.items()}
+    whole = {config: values[3] for config, values in errors.items()}
+    papers = [value for config, value in whole.items() if config.startswith(PAPER_CONFIGS) and not math.isnan(value)]
+    width = len(next(iter(errors.values())))
+    cells = [_text(value, decimals) for value in published]
+    rows = [[str(number), "published", "1", NOTHING, *cells, *[NOTHING] * (width - len(cells) + 1)]]
+    for config, values in errors.items():
+        factor = math.nan
+        if papers and math.isfinite(whole[config]) and whole[config] and not config.startswith(PAPER_CONFIGS):
+            factor = min(papers) / whole[config]
+        runs, _ = tables[config]
+        accuracy = _text(runs.track_accuracy.median(), 0)
+        cells = [_text(value, decimals) for value in values]
+        rows.append([str(number), config or "run", str(len(runs)), accuracy, *cells, _text(factor, 1)])
+    return rows
+
+
+def _table(title: str, axes: list[str], rows: list[list[str]]) -> Table:
+    heads = ["experiment", "method", "runs", "track\naccuracy [%]", *axes, "factor"]
+    return Table(title, pd.DataFrame(rows, columns=pd.Index(heads)), 2, NOTE)
+
+
+def _text(value: float, decimals: int) -> str:
+    if math.isnan(value):
+        return NOTHING
+    return f"{value:.{decimals}f}" if math.isfinite(value) else "none"

@@ -13,9 +13,9 @@ from enum import Enum
 import numpy as np
 import pandas as pd
 
-from links.evaluation.association import EvaluationLimits
+from links.evaluation.association import EvaluationLimits, Source
 from links.evaluation.errors import GRID_NS, wilson_interval
-from links.evaluation.run_data import Output, RunData, Source
+from links.evaluation.run_data import Output, RunData
 from links.evaluation.text_files import Flags, Stamps
 from stages.geometry import Array64
 

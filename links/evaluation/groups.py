@@ -17,12 +17,11 @@ import numpy as np
 import pandas as pd
 
 from flow.link import LinkError
-from links.evaluation.comparison import OBJECT, by_config, runs_table
 from links.evaluation.errors import inside_95, p95, poisson_upper, rms, wilson_interval
 from links.evaluation.evaluation import Evaluation
 from links.evaluation.metrics import CAMERAS
 from links.evaluation.stage_metrics import PROBABILITY_EDGES, probability_outcomes
-from links.evaluation.tables import Table, number_text
+from links.evaluation.tables import OBJECT, Table, by_config, number_text, runs_table
 
 CONFIG, ALL = "config", "all"
 Key = tuple[int, ...]  # fields of the recording's name that a table is grouped by; none: all runs are one group

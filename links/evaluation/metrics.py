@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from links.evaluation import pose_metrics, stage_metrics, track_metrics
-from links.evaluation.association import EvaluationLimits
+from links.evaluation.association import EvaluationLimits, Source
 from links.evaluation.errors import GRID_NS, held_errors, output_errors, time_span
 from links.evaluation.evaluation import NO_SPAN, Evaluation, Value
 from links.evaluation.pose_metrics import BANDS_M, band_key, band_name
-from links.evaluation.run_data import Output, RunData, Source
+from links.evaluation.run_data import Output, RunData
 from links.evaluation.stage_metrics import MODULO_90, PUBLISHED
 
 
@@ -43,30 +43,21 @@ class Metric:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
-@dataclass(frozen=True, slots=True)
-class Section:
-    """Metrics that one function computes; it returns why those that it left out are missing."""
-
-    group: str
-    compute: Callable[[Evaluation], Value | None]
-    metrics: tuple[tuple[str, str, str, Better], ...]
-
-
 LOW, HIGH, NEITHER = Better.LOW, Better.HIGH, Better.NEITHER
 CAMERAS = "rotation by both cameras"
+Row = tuple[str, str, str, Better]  # key, name, unit
+Compute = Callable[[Evaluation], Value | None]  # stores values of metrics; returns why the other ones are missing
 
 
-def _angles(prefix: str, name: str) -> tuple[tuple[str, str, str, Better], ...]:
+def _angles(prefix: str, name: str) -> list[Row]:
     rows = ("rmse", "RMSE"), ("median", "median"), ("p95", "95 %")
-    axes = tuple((f"rmse_{axis}", f"RMSE {axis}") for axis in ("roll", "pitch", "yaw"))
-    return tuple((f"{prefix}_{key}_deg", f"{name}: {text}", "deg", LOW) for key, text in (*rows, *axes))
+    axes = ((f"rmse_{axis}", f"RMSE {axis}") for axis in ("roll", "pitch", "yaw"))
+    return [(f"{prefix}_{key}_deg", f"{name}: {text}", "deg", LOW) for key, text in (*rows, *axes)]
 
 
-SECTIONS = (
-    Section(
-        "over all time",
-        pose_metrics.track_accuracy,
-        (
+SECTIONS: dict[str, dict[Compute, list[Row]]] = {
+    "over all time": {
+        pose_metrics.track_accuracy: [
             ("track_accuracy", "track accuracy (time with an output within 1 m)", "%", HIGH),
             ("availability", "time with an output", "%", NEITHER),
             ("held_rmse_m", "3D RMSE, last output held", "m", LOW),
@@ -75,21 +66,15 @@ SECTIONS = (
             ("before_first_s", "time before any output", "s", NEITHER),
             ("first_accurate_s", "time to the first accurate output", "s", LOW),
             ("longest_inaccurate_s", "longest time without an accurate output", "s", LOW),
-        ),
-    ),
-    Section(
-        "over all time",
-        pose_metrics.timing,
-        (
+        ],
+        pose_metrics.timing: [
             ("first_output_s", "time to the first output", "s", NEITHER),
             ("longest_gap_s", "longest gap between outputs", "s", NEITHER),
             ("rate_hz", "output rate", "Hz", NEITHER),
-        ),
-    ),
-    Section(
-        "position error of the outputs",
-        pose_metrics.position_error,
-        (
+        ],
+    },
+    "position error of the outputs": {
+        pose_metrics.position_error: [
             ("rmse_x_m", "RMSE x", "m", LOW),
             ("rmse_y_m", "RMSE y", "m", LOW),
             ("rmse_z_m", "RMSE z", "m", LOW),
@@ -100,91 +85,73 @@ SECTIONS = (
             ("evo_ape_rmse_m", "evo APE, RMSE", "m", LOW),
             ("evo_rpe_rmse_m", "evo RPE to the next output, RMSE", "m", LOW),
             ("evo_rpe_max_m", "evo RPE to the next output, max", "m", LOW),
-        ),
-    ),
-    Section(
-        "by true range",
-        pose_metrics.error_by_range,
-        tuple(
+        ],
+    },
+    "by true range": {
+        pose_metrics.error_by_range: [
             row
             for low, high in BANDS_M
             for row in (
                 (band_key("rmse_m", low), f"{band_name(low, high)}: 3D RMSE", "m", LOW),
                 (band_key("track_accuracy", low), f"{band_name(low, high)}: track accuracy", "%", HIGH),
             )
-        ),
-    ),
-    Section(
-        "track continuity",
-        track_metrics.track_continuity,
-        (
+        ],
+    },
+    "track continuity": {
+        track_metrics.track_continuity: [
             ("track_losses", "track losses in sight", "", LOW),
             ("reacquisition_s", "longest time to reacquire after an occlusion", "s", LOW),
             ("longest_return_gap_s", "longest gap between returns, while tracked", "s", LOW),
             ("longest_return_gap_total_s", "longest gap between returns, all time", "s", LOW),
-        ),
-    ),
-    Section(
-        "track continuity",
-        track_metrics.identity_switches,
-        (("identity_switches", "identity switches to another drone", "", LOW),),
-    ),
-    Section(
-        "false outputs",
-        track_metrics.false_outputs,
-        (
+        ],
+        track_metrics.identity_switches: [
+            ("identity_switches", "identity switches to another drone", "", LOW),
+        ],
+    },
+    "false outputs": {
+        track_metrics.false_outputs: [
             ("false_outputs", "false outputs", "", LOW),
             ("false_per_min", "false outputs", "/min", LOW),
             ("overconfident_false_outputs", "overconfident false outputs (beyond 3 of their sigmas)", "", LOW),
             ("false_share", "outputs off by more than 1 m", "%", LOW),
-        ),
-    ),
-    Section(
-        "without a drone",
-        track_metrics.false_alarms,
-        (
+        ],
+    },
+    "without a drone": {
+        track_metrics.false_alarms: [
             ("false_alarms_per_h", "false alarms", "/h", LOW),
             ("false_tracks", "false tracks", "", LOW),
-        ),
-    ),
-    Section(
-        "searches",
-        stage_metrics.searches,
-        (
+        ],
+    },
+    "searches": {
+        stage_metrics.searches: [
             ("detection_rate", "detection rate (of the time searched)", "%", HIGH),
             ("observable_detection_rate", "detection rate in searches with 4+ returns", "%", HIGH),
             ("missed_searches", "missed searches with 4+ returns", "", LOW),
             ("return_share", "time of searches with a return of the drone", "%", NEITHER),
             ("observable_share", "time of searches with 4+ returns", "%", NEITHER),
             ("false_detections_per_min", "false detections", "/min", LOW),
-        ),
-    ),
-    Section(
-        "poses that the autopilot gate accepts",
-        track_metrics.autopilot_gate,
-        (
+        ],
+    },
+    "poses that the autopilot gate accepts": {
+        track_metrics.autopilot_gate: [
             ("sendable_share", "time with an accepted pose", "%", HIGH),
             ("sendable_rmse_m", "3D RMSE of accepted poses", "m", LOW),
             ("sendable_max_m", "largest error of accepted poses", "m", LOW),
             ("sendable_max_deg", "largest rotation error of accepted poses", "deg", LOW),
             ("sendable_false", "accepted poses off by more than 1 m", "", LOW),
-        ),
-    ),
-    Section(
-        "rotation of the pose",
-        pose_metrics.pose_rotation,
-        (
+        ],
+    },
+    "rotation of the pose": {
+        pose_metrics.pose_rotation: [
             ("rmse_roll_deg", "RMSE roll", "deg", LOW),
             ("rmse_pitch_deg", "RMSE pitch", "deg", LOW),
             ("rmse_yaw_deg", "RMSE yaw", "deg", LOW),
             ("rmse_angle_deg", "RMSE of the whole angle", "deg", LOW),
             ("wrong_yaw_branch_s", "time with a wrong yaw branch in valid outputs", "s", LOW),
-        ),
-    ),
-    Section(
-        CAMERAS,
-        stage_metrics.camera_rotation,
-        (
+        ],
+    },
+    CAMERAS: {
+        stage_metrics.camera_rotation: [
             ("rotation_images", "images of the drone's camera", "", NEITHER),
             ("rotation_accepted_share", "images with a rotation", "%", HIGH),
             *_angles(PUBLISHED, "published branch"),
@@ -197,19 +164,19 @@ SECTIONS = (
             ("rotation_resolved_m", "path to it, relative to the vehicle", "m", LOW),
             ("rotation_resolved_ground_m", "path to it, over ground", "m", LOW),
             ("rotation_switches", "changes of the yaw branch", "", LOW),
-        ),
-    ),
-    Section(
-        "consistency of the covariance",
-        pose_metrics.covariance_consistency,
-        (
+        ],
+    },
+    "consistency of the covariance": {
+        pose_metrics.covariance_consistency: [
             ("nees_mean", "mean NEES, position (ideal: 3)", "", NEITHER),
             ("inside_95_share", "in the 95 % ellipsoid (ideal: 95)", "%", NEITHER),
             ("pose_nees_mean", "mean NEES, pose (ideal: 6)", "", NEITHER),
-        ),
-    ),
-)
-CATALOGUE = {row[0]: Metric(*row, section.group) for section in SECTIONS for row in section.metrics}
+        ],
+    },
+}
+CATALOGUE = {
+    row[0]: Metric(*row, group) for group, parts in SECTIONS.items() for rows in parts.values() for row in rows
+}
 COMPUTE_NAMES = {"p50": "p50 of a call", "p99": "p99 of a call", "load": "share of one core"}
 
 
@@ -241,9 +208,9 @@ def evaluate(run: RunData, output: Output, limits: EvaluationLimits | None = Non
         held = held_errors(output, run.truth, span_ns, e.limits)
         e.held, e.out_of_reach_ns = held.loc[held.in_reach], held.stamp_ns[~held.in_reach].to_numpy()
         _remark_on_coverage(e, len(e.errors), (span_ns[1] - span_ns[0]) // GRID_NS + 1 - len(held))
-    for section in SECTIONS:
-        why = section.compute(e)
-        absent = [key for key, *_ in section.metrics if key not in e.values]
+    for compute, rows in (item for parts in SECTIONS.values() for item in parts.items()):
+        why = compute(e)
+        absent = [key for key, *_ in rows if key not in e.values]
         assert why is not None or not absent, absent
         if why is not None:
             e.put_none(why, *absent)

@@ -1,4 +1,4 @@
-"""The HTML report: one file without external resources. Figures first, then tables. Every text in it is escaped.
+"""The report as HTML (one file, figures first, then tables, every text escaped) and as JSON.
 
 Source: grd.
 """
@@ -6,22 +6,30 @@ Source: grd.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
+from typing import Any
 
-from links.evaluation.comparison import Pair
+import numpy as np
+import pandas as pd
+
+from links.evaluation.comparison import Pair, common_rmse_m, compare, comparison_table
 from links.evaluation.evaluation import Evaluation, Value
 from links.evaluation.figures import reliability_figure, run_figures
 from links.evaluation.groups import reliability
 from links.evaluation.metrics import Metric, metric_of
 from links.evaluation.tables import (
     Table,
-    comparison_table,
     headline_table,
+    keys_of,
     label,
+    medians,
     metrics_table,
     not_evaluated_names,
     number,
+    pools,
+    ranks,
 )
 
 MAX_RUNS = 40  # runs with figures: a browser takes no larger file
@@ -74,7 +82,7 @@ def write_report(
     if pairs:
         parts.append(comparison_table(pairs).html())
     if len(own) > 1:
-        parts.append(headline_table(own, medians=True).html())
+        parts.append(headline_table(own, with_medians=True).html())
         parts.append(metrics_table("all metrics, medians over the runs", own, []).html())
     for e in shown:
         parts.append(metrics_table(f"all metrics, {label(e)}", [e], [e], detailed=True).html())
@@ -125,3 +133,63 @@ def _list(title: str, texts: list[str], css: str = "note") -> str:
         return ""
     items = "".join(f"<li>{escape(text)}</li>" for text in texts)
     return f'<h3>{escape(title)}</h3><ul class="{css}">{items}</ul>'
+
+
+def as_json(evaluations: list[Evaluation], pairs: list[Pair], warnings: list[str]) -> dict[str, Any]:
+    """Everything for programs. No NaN: a metric without a value has `null`, a status and a reason."""
+    tree: dict[str, Any] = {
+        "format": 2,
+        "limits": asdict(evaluations[0].limits),
+        "warnings": warnings,
+        "runs": [_run_json(e) for e in evaluations],
+    }
+    keys = keys_of(evaluations)
+    pooled = {name: _medians_json(medians(ranks(several, keys))) for name, several in pools(evaluations).items()}
+    if len(pooled) > 1:
+        tree["median_by_config"] = pooled
+    elif len(evaluations) > 1:
+        tree["median"] = next(iter(pooled.values()))
+    if pairs:
+        compared = compare(pairs)
+        own, other = _medians_json(compared.own), _medians_json(compared.other)
+        ratio = {key: value if np.isfinite(value) else None for key, value in compared.ratio.items()}
+        tree["against"] = {
+            "pairs": [
+                {"recording": p.own.run.recording, "run": p.own.run.name, "other": p.other.run.name} for p in pairs
+            ],
+            "others": [_run_json(pair.other) for pair in pairs],
+            "metrics": {key: {"run": own[key], "other": other[key], "ratio": ratio[key]} for key in own},
+            "rmse_m_while_both_have_output": common_rmse_m(pairs),
+        }
+    return tree
+
+
+def _run_json(e: Evaluation) -> dict[str, Any]:
+    return {
+        "name": e.run.name,
+        "recording": e.run.recording,
+        "config": e.run.config,
+        "drone": e.run.drone,
+        "output": e.output.kind.value,
+        "outputs": len(e.output.poses),
+        "span_s": None if e.span_ns is None else [t / 1e9 for t in e.span_ns],
+        "metrics": {key: _value_json(key, value) for key, value in e.values.items()},
+        "findings": e.findings,
+        "remarks": e.remarks,
+        "not_evaluated": not_evaluated_names(e),
+    }
+
+
+def _value_json(key: str, value: Value) -> dict[str, Any]:
+    tree = {"value": value.value, "unit": metric_of(key).unit, "status": value.status.value}
+    optional = {"samples": value.samples, "low": value.low, "high": value.high, "note": value.note or None}
+    return tree | {name: content for name, content in optional.items() if content is not None}
+
+
+def _medians_json(pooled: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    named = pooled.rename(columns={"failed": "runs_failed", "not_evaluated": "runs_not_evaluated"})
+    named.insert(1, "failed", np.isinf(named["median"]))
+    return {
+        str(key): row | {"median": row["median"] if np.isfinite(row["median"]) else None}
+        for key, row in zip(named.index, named.to_dict("records"), strict=True)
+    }

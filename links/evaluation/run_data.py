@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from enum import Enum, StrEnum, auto
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from flow.link import LinkError
 from links import results
-from links.evaluation.association import EvaluationLimits, follow
-from links.evaluation.text_files import NO_DRONE, Flags, Rows, Stamps, TextTable, Trajectory, read_stamp_ns, read_tum
+from links.evaluation.association import DroneTruth, EvaluationLimits, Source, follow, read_true_drones
+from links.evaluation.text_files import Flags, Rows, Stamps, TextTable, Trajectory, read_stamp_ns, read_tum
 from stages.geometry import Array64, rotations_from_xyzw
 from stages.messages import BranchState
 
-NEVER_NS = np.iinfo(np.int64).max // 2  # the end of a span that did not end
 T = TypeVar("T")
 XYZ = ("x_m", "y_m", "z_m")
 NOT_A_RUN = {".mcap", ".rrd", ".html", ".json", ".yaml"}  # files that are given by mistake
@@ -37,16 +36,6 @@ class OutputKind(StrEnum):
     POSE = "pose"  # fused
     FIX = "fix"  # of the LiDAR
     FILE = "file"  # a TUM file without a run
-
-
-class Source(Enum):
-    """An input of an evaluation that a run may lack."""
-
-    TRUTH = auto()
-    RETURNS = auto()  # which returns came from the drone
-    VISIBILITY = auto()  # when the drone was occluded
-    SEARCHES = auto()
-    COMPUTE = auto()
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,16 +81,6 @@ class RotationLog:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
-
-
-@dataclass(frozen=True, slots=True)
-class DroneTruth:
-    """Truth about one drone. `missing` has the reason for what is None."""
-
-    path: Trajectory | None = None
-    returns_ns: Stamps | None = None  # when a pulse returned from it, rising
-    occluded_ns: Stamps | None = None  # (m, 2) begin and end of occlusions, rising
-    missing: dict[Source, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,10 +262,10 @@ def read_output(kind: OutputKind, folder: Path) -> Output:
         kind,
         poses,
         covariance[rows],
-        sendable=table.flags("good")[rows] if "good" in table else None,
+        sendable=table.equals("good", "1")[rows] if "good" in table else None,
         returns=table.whole_numbers("hits")[rows] if "hits" in table else None,
         track=None if track is None else track[rows],
-        has_rotation=table.flags("rotation")[rows] if "rotation" in table else None,
+        has_rotation=table.equals("rotation", "1")[rows] if "rotation" in table else None,
     )
 
 
@@ -303,7 +282,7 @@ def _occurrences(stamps_ns: Iterable[int]) -> list[tuple[int, int]]:
 def _read_searches(path: Path) -> tuple[Search, ...]:
     """The searches of a run: rows of one span are candidates of one search; one without a position has none."""
     table = TextTable(path, ("start_s", "end_s", *XYZ))
-    accepted = np.array([cell != "" for cell in table.text("x_m")], dtype=np.bool_)
+    accepted = table.filled("x_m")
     xyz_m = table.numbers(XYZ, accepted)
     spans = np.column_stack([table.stamps_ns("start_s"), table.stamps_ns("end_s")]).tolist()
     rows_of: dict[tuple[int, int], list[int]] = {}
@@ -325,62 +304,15 @@ def read_rotations(path: Path) -> RotationLog:
     """Read the rotations by both cameras. LinkError names the first wrong line."""
     upper = results.ROTATION_UPPER
     table = TextTable(path, ("stamp_s", "accepted", *results.QUATERNION, *upper, "state", "switches"))
-    accepted = table.flags("accepted")
-    state = table.one_of("state", list(BranchState.__members__))
+    accepted = table.equals("accepted", "1")
+    resolved = table.equals("state", BranchState.RESOLVED.name, list(BranchState.__members__))
     quaternion = table.numbers(results.QUATERNION, accepted)
     quaternion[~accepted] = [0.0, 0.0, 0.0, 1.0]
     if not np.linalg.norm(quaternion, axis=1).all():
         raise LinkError(f"{path}: a quaternion is 0 0 0 0, which is not a rotation")
-    measured = accepted & np.array([cell != "" for cell in table.text(upper[0])], dtype=np.bool_)
-    return RotationLog(
-        table.stamps_ns("stamp_s"),
-        accepted,
-        rotations_from_xyzw(quaternion),
-        table.symmetric(upper, measured),
-        np.array([name == BranchState.RESOLVED.name for name in state], dtype=np.bool_),
-        table.whole_numbers("switches"),
-    )
-
-
-def read_true_drones(folder: Path, truth_file: Path | None) -> tuple[tuple[DroneTruth, ...], bool]:
-    """Truth of every drone, at least one, and whether truth states that there was none."""
-    path = folder / results.TRUTH_FILE
-    first, why, empty_sky = None, "", False
-    if truth_file is not None:
-        first = read_tum(truth_file)
-    elif not path.exists():
-        why = "the recording holds no truth (real flight?); give one with --truth FILE.tum"
-    elif not len(first := read_tum(path, may_be_empty=True)):
-        empty_sky = NO_DRONE in first.header
-        first, why = None, "there was no drone" if empty_sky else f"{path} is empty"
-    drones = [_read_drone(folder, 1, first, why)]
-    while truth_file is None and (more := folder / results.of_drone(results.TRUTH_FILE, len(drones) + 1)).exists():
-        drones.append(_read_drone(folder, len(drones) + 1, read_tum(more), ""))
-    return tuple(drones), empty_sky
-
-
-def _read_drone(folder: Path, number: int, path: Trajectory | None, why_no_path: str) -> DroneTruth:
-    missing = {
-        Source.TRUTH: why_no_path,
-        Source.RETURNS: "the recording does not hold which returns came from the drone",
-        Source.VISIBILITY: "the recording does not hold when the drone was occluded",
-    }
-    returns, visible = (
-        folder / results.of_drone(name, number) for name in (results.TRUTH_HITS_FILE, results.TRUTH_VISIBLE_FILE)
-    )
-    return DroneTruth(path, _if_exists(returns, _read_returns), _if_exists(visible, _read_occlusions), missing)
-
-
-def _read_returns(path: Path) -> Stamps:
-    return np.sort(TextTable(path, ("stamp_s",)).stamps_ns("stamp_s"))
-
-
-def _read_occlusions(path: Path) -> Stamps:
-    """Begin and end (m, 2) of each occlusion; one that did not end ends at NEVER_NS."""
-    table = TextTable(path, ("stamp_s", "visible"))
-    stamps_ns, visible = table.stamps_ns("stamp_s"), np.concatenate([[True], table.flags("visible")])
-    begin, end = stamps_ns[visible[:-1] & ~visible[1:]], stamps_ns[~visible[:-1] & visible[1:]]
-    return np.column_stack([begin, np.append(end, NEVER_NS)[: len(begin)]])
+    R, covariance = rotations_from_xyzw(quaternion), table.symmetric(upper, accepted & table.filled(upper[0]))
+    stamps_ns, switches = table.stamps_ns("stamp_s"), table.whole_numbers("switches")
+    return RotationLog(stamps_ns, accepted, R, covariance, resolved, switches)
 
 
 def _check_overlap(run: RunData, truth: Trajectory) -> None:

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from links.evaluation.association import Source
 from links.evaluation.errors import EULER, GRID_NS, p95, path_length_m, position_at, rms, rotation_errors
 from links.evaluation.evaluation import (
     NO_SPAN,
@@ -25,7 +26,7 @@ from links.evaluation.evaluation import (
     not_evaluated,
 )
 from links.evaluation.pose_metrics import BRANCH_RAD, MIN_FOR_NEES, MIN_FOR_P95, mean_nees, put_inside_95
-from links.evaluation.run_data import XYZ, RotationLog, Search, Source
+from links.evaluation.run_data import XYZ, RotationLog, Search
 from links.evaluation.text_files import Flags, Trajectory
 from stages.geometry import Array64
 

@@ -1,42 +1,32 @@
-"""Tables for people and programs: text tables for the terminal, HTML and Markdown, CSV, JSON.
+"""The table of all runs with medians over them, and tables of text for the terminal, HTML and Markdown.
 
-Source: grd.
+Source: grd. No value is ever filled in: in a median a failed run counts as the worst value, other missing ones are left
+out.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from links.evaluation.comparison import (
-    OBJECT,
-    Pair,
-    Pooled,
-    common_rmse_m,
-    compare,
-    keys_of,
-    pooled,
-    pools,
-    runs_table,
-    verdict,
-)
 from links.evaluation.evaluation import Evaluation, Status, Value
-from links.evaluation.metrics import Better, Metric, metric_of
+from links.evaluation.metrics import CATALOGUE, Metric, metric_of, rank
 
 NOTHING = "-"
-HTML_COLUMNS = 13  # without the labels, so that a page is not wider than a screen
+MAX_NAMED = 4  # names in a text
 MAX_COLUMNS = 4  # a terminal shows the metrics of so many runs in columns, of more as rows of headlines
-COMMON = "3D RMSE in the time in which both have an output"
+HTML_COLUMNS = 13  # without the labels, so that a page is not wider than a screen
+OBJECT = "evaluation"  # column of `runs_table` with the Evaluation itself
+TIMED_SHARES = ("detection_rate", "observable_detection_rate", "return_share", "observable_share")
+COUNTED_SHARES = (*TIMED_SHARES, "inside_95_share", "rotation_accepted_share", "rotation_inside_95_share")
 HEADLINES = {
     "track_accuracy": "track accuracy %",
     "availability": "output %",
@@ -55,6 +45,74 @@ HEADLINES = {
 }
 
 
+def keys_of(evaluations: Sequence[Evaluation]) -> list[str]:
+    """Every metric of any evaluation, in the order of the catalogue, compute times last."""
+    return [*CATALOGUE, *dict.fromkeys(key for e in evaluations for key in e.values if key not in CATALOGUE)]
+
+
+def ranks(evaluations: Sequence[Evaluation], keys: Sequence[str] = ()) -> pd.DataFrame:
+    """Metrics across, runs down; a failure is the worst value (inf or -inf), other missing values are NaN."""
+    betters = {key: metric_of(key).better for key in keys or keys_of(evaluations)}
+    return pd.DataFrame(
+        [{key: rank(e.values.get(key), better) for key, better in betters.items()} for e in evaluations]
+    )
+
+
+def runs_table(evaluations: Sequence[Evaluation]) -> pd.DataFrame:
+    """One row for each evaluation: what it is of, all metrics (`ranks`), and what shares are pooled by over runs.
+
+    `KEY_count` and `KEY_of` are the counts of a share, `KEY_s` and `KEY_of_s` the seconds of a share of time, whose
+    counts are of searches, which differ in length.
+    """
+    about = pd.DataFrame({"recording": [e.run.recording for e in evaluations]})
+    about["config"] = [e.run.config for e in evaluations]
+    about["output"] = [e.output.kind.value for e in evaluations]
+    about["drone"] = [e.run.drone for e in evaluations]
+    about["run"] = [e.run.name for e in evaluations]
+    about["no_drone"] = [int(e.run.no_drone) for e in evaluations]
+    about["span_s"] = [math.nan if e.duration_s is None else e.duration_s for e in evaluations]
+    about["outputs"] = [len(e.output.poses) for e in evaluations]
+    pooled: dict[str, object] = {}
+    for key in COUNTED_SHARES:
+        for index, what in enumerate(("count", "of")):
+            pooled[f"{key}_{what}"] = pd.array([e.counts.get(key, (None, None))[index] for e in evaluations], "Int64")
+    for key in TIMED_SHARES:
+        for index, what in enumerate(("s", "of_s")):
+            pooled[f"{key}_{what}"] = [e.seconds.get(key, (math.nan, math.nan))[index] for e in evaluations]
+    return pd.concat([about, ranks(evaluations), pd.DataFrame(pooled | {OBJECT: list(evaluations)})], axis=1)
+
+
+def medians(values: pd.DataFrame) -> pd.DataFrame:
+    """Median of each column of `ranks`, and how many runs are in it, failed, or were not evaluated.
+
+    The median is +-inf when half of the runs or more failed, NaN when no run has a value.
+    """
+    counts = {"runs": values.count(), "failed": np.isinf(values).sum(), "not_evaluated": values.isna().sum()}
+    return pd.DataFrame({"median": values.median()} | counts)
+
+
+def by_config(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
+    """Evaluations by configuration, in the order in which they were given."""
+    return _by(evaluations, lambda e: e.run.config)
+
+
+def pools(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
+    """Evaluations that may be pooled: of one configuration, and of one output where runs have several."""
+    return _by(evaluations, lambda e: f"{e.run.config} {e.output.kind if len(e.run.outputs) > 1 else ''}".strip())
+
+
+def _by(evaluations: Sequence[Evaluation], name: Callable[[Evaluation], str]) -> dict[str, list[Evaluation]]:
+    found: dict[str, list[Evaluation]] = {}
+    for e in evaluations:
+        found.setdefault(name(e), []).append(e)
+    return found
+
+
+def write_csv(path: Path, evaluations: list[Evaluation]) -> None:
+    """Write the metrics of all runs, one line for each. `inf` or `-inf` is a failure, empty is not evaluated."""
+    runs_table(evaluations).drop(columns=OBJECT).to_csv(path, index=False, float_format="%.12g")
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """A table of text."""
@@ -63,8 +121,8 @@ class Table:
     frame: pd.DataFrame  # of str, headings may have line breaks
     labels: int = 1  # columns at the left that name the row
     note: str = ""
-    sections: Sequence[str] | None = None  # (rows,) rows of one section follow each other
-    classes: Sequence[str] | None = None  # (rows,) CSS class of each row
+    sections: Sequence[str] = ()  # (rows,) rows of one section follow each other
+    classes: Sequence[str] = ()  # (rows,) CSS class of each row
 
     def rich(self) -> RichTable:
         """For a terminal."""
@@ -84,8 +142,8 @@ class Table:
         """For a page: everything is escaped. A wide table is split into parts that each have the labels."""
         labels, rest = list(range(self.labels)), list(range(self.labels, self.frame.shape[1]))
         parts = [rest[i : i + HTML_COLUMNS] for i in range(0, len(rest), HTML_COLUMNS)]
-        note = f'<p class="note">{escape(self.note)}</p>' if self.note else ""
         tables = "".join(self._html_part([*labels, *columns]) for columns in parts)
+        note = f'<p class="note">{escape(self.note)}</p>' if self.note else ""
         return f"<h3>{escape(self.title)}</h3>{tables}{note}"
 
     def _html_part(self, columns: list[int]) -> str:
@@ -94,12 +152,9 @@ class Table:
         for row, (cells, section) in enumerate(self._rows()):
             if section:
                 rows.append(f'<tr class="section"><td colspan="{len(columns)}">{escape(section)}</td></tr>')
-            css = "" if self.classes is None else self.classes[row]
-            tds = "".join(
-                f"<td{' class=label' if column < self.labels else ''}>{escape(cells[column])}</td>"
-                for column in columns
-            )
-            rows.append(f'<tr class="{css}">{tds}</tr>')
+            kinds = ["label" if column < self.labels else "" for column in columns]
+            tds = (f'<td class="{kind}">{escape(cells[c])}</td>' for kind, c in zip(kinds, columns, strict=True))
+            rows.append(f'<tr class="{self.classes[row] if self.classes else ""}">{"".join(tds)}</tr>')
         return f"<table><tr>{head}</tr>{''.join(rows)}</table>"
 
     def markdown(self) -> str:
@@ -110,18 +165,20 @@ class Table:
 
     def _rows(self) -> list[tuple[list[str], str]]:
         """Cells of each row and, in the first row of a section, its name."""
-        names = [""] * len(self.frame) if self.sections is None else list(self.sections)
+        names = [*self.sections] or [""] * len(self.frame)
         first = [name if row == 0 or names[row - 1] != name else "" for row, name in enumerate(names)]
         return list(zip(self.frame.to_numpy().tolist(), first, strict=True))
 
 
-def number_text(value: float, decimals: int, longer_than: float | None = None) -> str:
-    """A number; NaN is NOTHING, inf is "never", or longer than a time [s] when that is given."""
-    if math.isnan(value):
-        return NOTHING
-    if math.isinf(value):
-        return "never" if longer_than is None else f">{longer_than:.0f}"
-    return f"{value:.{decimals}f}"
+def text_frame(rows: list[list[str]], heads: list[str]) -> pd.DataFrame:
+    """Rows of text as a frame; headings may be equal."""
+    return pd.DataFrame(rows, columns=range(len(heads)), dtype=object).set_axis(heads, axis=1)
+
+
+def some_of(names: list[str]) -> str:
+    """`a, b, c, d and 3 more`."""
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return ", ".join(names[:MAX_NAMED]) + more
 
 
 def label(e: Evaluation) -> str:
@@ -133,17 +190,24 @@ def label(e: Evaluation) -> str:
     return name + (f" drone {run.drone}" if len(run.drones) > 1 else "")
 
 
-def number(value: float, metric: Metric) -> str:
-    """A value with the decimals of its unit; three significant digits for times and counts."""
+def number_text(value: float, decimals: int, longer_than: float | None = None) -> str:
+    """A number; NaN is NOTHING, inf is "never", or longer than a time [s] when that is given."""
     if math.isnan(value):
         return NOTHING
     if math.isinf(value):
-        return "failed"
+        return "never" if longer_than is None else f">{longer_than:.0f}"
+    return f"{value:.{decimals}f}"
+
+
+def number(value: float, metric: Metric) -> str:
+    """A value with the decimals of its unit; three significant digits for times and counts."""
+    if math.isnan(value) or math.isinf(value):
+        return NOTHING if math.isnan(value) else "failed"
     decimals = {"%": 1, "Hz": 1, "deg": 2, "m": 3}.get(metric.unit)
+    if decimals is None and metric.unit == "" and value == round(value):
+        decimals = 0
     if decimals is not None:
         return f"{value:.{decimals}f}"
-    if metric.unit == "" and value == round(value):
-        return f"{value:.0f}"
     return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
 
 
@@ -157,13 +221,13 @@ def cell(value: Value | None, metric: Metric) -> str:
     return text
 
 
-def pooled_cell(pool: Pooled, metric: Metric) -> str:
-    """`0.12`, `failed (3 of 5 failed)`, `0.12 (2 not evaluated)`."""
-    if math.isnan(pool.median):
+def median_cell(pool: pd.Series, metric: Metric) -> str:
+    """A row of `medians`: `0.12`, `failed (3 of 5 failed)`, `0.12 (2 not evaluated)`."""
+    if math.isnan(pool.loc["median"]):
         return NOTHING
-    details = [f"{pool.failed} of {pool.runs} failed"] if pool.failed and pool.runs > 1 else []
-    details += [f"{pool.not_evaluated} not evaluated"] if pool.not_evaluated else []
-    return number(pool.median, metric) + (f" ({', '.join(details)})" if details else "")
+    details = [f"{pool.failed:.0f} of {pool.runs:.0f} failed"] if pool.failed and pool.runs > 1 else []
+    details += [f"{pool.not_evaluated:.0f} not evaluated"] if pool.not_evaluated else []
+    return number(pool.loc["median"], metric) + (f" ({', '.join(details)})" if details else "")
 
 
 def median_columns(evaluations: list[Evaluation]) -> dict[str, list[Evaluation]]:
@@ -181,133 +245,45 @@ def metrics_table(title: str, own: list[Evaluation], shown: list[Evaluation], de
 
     `detailed`, for a single run: all compute times, samples and notes.
     """
-    medians = {name: runs for name, runs in median_columns(own).items() if len(runs) > 1 or not shown}
-    tables = [runs_table(runs) for runs in medians.values()]
+    keys = keys_of(own)
+    columns = {name: runs for name, runs in median_columns(own).items() if len(runs) > 1 or not shown}
+    pooled = [medians(ranks(runs, keys)) for runs in columns.values()]
     rows: list[list[str]] = []
     sections: list[str] = []
     classes: list[str] = []
-    for key in keys_of(own):
+    for key in keys:
         values = [value for e in own if (value := e.values.get(key)) is not None]
-        if not any(value.failed or value.value is not None for value in values) or not (detailed or _in_terminal(key)):
+        if not any(value.failed or value.value is not None for value in values) or not (detailed or in_terminal(key)):
             continue
         metric = metric_of(key)
         cells = [cell(e.values.get(key), metric) for e in shown]
-        cells += [pooled_cell(pooled(table.loc[:, key]), metric) if key in table else NOTHING for table in tables]
+        cells += [median_cell(pool.loc[key], metric) for pool in pooled]
         if detailed:
-            cells += ["" if values[0].samples is None else str(values[0].samples)]
-            cells += ["" if values[0].failed else values[0].note]
+            samples = "" if values[0].samples is None else str(values[0].samples)
+            cells += [samples, "" if values[0].failed else values[0].note]
         rows.append([metric.title, *cells])
         sections.append(metric.group)
         classes.append("failed" if any(value.failed for value in values) else "")
-    heads = ["metric", *map(label, shown), *medians, *(["samples", "note"] if detailed else [])]
-    return Table(title, _frame(rows, heads), sections=sections, classes=classes)
+    heads = ["metric", *map(label, shown), *columns, *(["samples", "note"] if detailed else [])]
+    return Table(title, text_frame(rows, heads), sections=sections, classes=classes)
 
 
-def _in_terminal(key: str) -> bool:
+def in_terminal(key: str) -> bool:
+    """Whether a terminal shows a metric: of compute times the long ones alone."""
     return not key.endswith("_p50")
 
 
-def headline_table(evaluations: list[Evaluation], medians: bool = False) -> Table:
+def headline_table(evaluations: list[Evaluation], with_medians: bool = False) -> Table:
     """Runs down, the most important metrics across; medians last."""
-    rows: list[list[str]] = []
-    for e in evaluations:
-        values = [(e.values[key], metric_of(key)) for key in HEADLINES]
-        rows.append(
-            [
-                label(e),
-                *("none" if v.failed else number(math.nan if v.value is None else v.value, m) for v, m in values),
-            ]
-        )
-    for name, several in median_columns(evaluations).items() if medians else []:
-        table = runs_table(several)
-        rows.append([name, *(number(pooled(table.loc[:, key]).median, metric_of(key)) for key in HEADLINES)])
-    return Table("runs", _frame(rows, ["run", *HEADLINES.values()]))
-
-
-def comparison_table(pairs: list[Pair]) -> Table:
-    """RUN next to OTHER: medians over the pairs, the median ratio, and which side is better."""
-    one = len(pairs) == 1
-    names = [label(pairs[0].own), label(pairs[0].other)] if one else ["RUN", "OTHER"]
-    title = "against the other run" if one else f"against the other runs, medians of {len(pairs)} pairs"
-    rows: list[list[str]] = []
-    sections: list[str] = []
-    for key, compared in compare(pairs).items():
-        metric = metric_of(key)
-        if _in_terminal(key):
-            ratio = NOTHING if compared.ratio is None else f"{compared.ratio:.2g}"
-            sides = [pooled_cell(side, metric) for side in (compared.own, compared.other)]
-            rows.append(
-                [metric.title, *sides, ratio, verdict(compared.own.median, compared.other.median, metric.better)]
-            )
-            sections.append(metric.group)
-    common = common_rmse_m(pairs)
-    if common is not None:
-        own, other = common
-        ratio = f"{own / other:.2g}" if other > 0 else NOTHING
-        rows.append([f"{COMMON} [m]", f"{own:.3f}", f"{other:.3f}", ratio, verdict(own, other, Better.LOW)])
-        sections.append("common time")
-    return Table(
-        title, _frame(rows, ["metric", *names, "ratio", ""]), sections=sections, classes=[row[-1] for row in rows]
-    )
-
-
-def _frame(rows: list[list[str]], heads: list[str]) -> pd.DataFrame:
-    frame = pd.DataFrame(rows, columns=range(len(heads)), dtype=object)
-    frame.columns = pd.Index(heads)
-    return frame
-
-
-def write_csv(path: Path, evaluations: list[Evaluation]) -> None:
-    """Write the metrics of all runs, one line for each. `inf` or `-inf` is a failure, empty is not evaluated."""
-    runs_table(evaluations).drop(columns=OBJECT).to_csv(path, index=False, float_format="%.12g")
-
-
-def as_json(evaluations: list[Evaluation], pairs: list[Pair], warnings: list[str]) -> dict[str, Any]:
-    """Everything for programs. No NaN: a metric without a value has `null`, a status and a reason."""
-    tree: dict[str, Any] = {
-        "format": 2,
-        "limits": dataclasses.asdict(evaluations[0].limits),
-        "warnings": warnings,
-        "runs": [_run_json(e) for e in evaluations],
-    }
-    keys = keys_of(evaluations)
-    medians = {
-        name: {key: _pooled_json(pooled(column)) for key, column in runs_table(several).reindex(columns=keys).items()}
-        for name, several in pools(evaluations).items()
-    }
-    if len(medians) > 1:
-        tree["median_by_config"] = medians
-    elif len(evaluations) > 1:
-        tree["median"] = next(iter(medians.values()))
-    if pairs:
-        tree["against"] = {
-            "pairs": [
-                {"recording": p.own.run.recording, "run": p.own.run.name, "other": p.other.run.name} for p in pairs
-            ],
-            "others": [_run_json(pair.other) for pair in pairs],
-            "metrics": {
-                key: {"run": _pooled_json(row.own), "other": _pooled_json(row.other), "ratio": row.ratio}
-                for key, row in compare(pairs).items()
-            },
-            "rmse_m_while_both_have_output": common_rmse_m(pairs),
-        }
-    return tree
-
-
-def _run_json(e: Evaluation) -> dict[str, Any]:
-    return {
-        "name": e.run.name,
-        "recording": e.run.recording,
-        "config": e.run.config,
-        "drone": e.run.drone,
-        "output": e.output.kind.value,
-        "outputs": len(e.output.poses),
-        "span_s": None if e.span_ns is None else [t / 1e9 for t in e.span_ns],
-        "metrics": {key: _value_json(key, value) for key, value in e.values.items()},
-        "findings": e.findings,
-        "remarks": e.remarks,
-        "not_evaluated": not_evaluated_names(e),
-    }
+    metrics = [metric_of(key) for key in HEADLINES]
+    rows = [
+        [label(e), *("none" if math.isinf(v) else number(v, m) for v, m in zip(values, metrics, strict=True))]
+        for e, values in zip(evaluations, ranks(evaluations, list(HEADLINES)).to_numpy(), strict=True)
+    ]
+    for name, several in median_columns(evaluations).items() if with_medians else ():
+        values = medians(ranks(several, list(HEADLINES)))["median"]
+        rows.append([name, *(number(v, m) for v, m in zip(values, metrics, strict=True))])
+    return Table("runs", text_frame(rows, ["run", *HEADLINES.values()]))
 
 
 def not_evaluated_names(e: Evaluation) -> dict[str, list[str]]:
@@ -317,15 +293,3 @@ def not_evaluated_names(e: Evaluation) -> dict[str, list[str]]:
         if value.status is Status.NOT_EVALUATED:
             reasons.setdefault(value.note, []).append(metric_of(key).name)
     return reasons
-
-
-def _value_json(key: str, value: Value) -> dict[str, Any]:
-    tree = {"value": value.value, "unit": metric_of(key).unit, "status": value.status.value}
-    optional = {"samples": value.samples, "low": value.low, "high": value.high, "note": value.note or None}
-    return tree | {name: content for name, content in optional.items() if content is not None}
-
-
-def _pooled_json(pool: Pooled) -> dict[str, Any]:
-    median = pool.median if np.isfinite(pool.median) else None
-    counts = {"runs": pool.runs, "runs_failed": pool.failed, "runs_not_evaluated": pool.not_evaluated}
-    return {"median": median, "failed": math.isinf(pool.median), **counts}

@@ -118,18 +118,22 @@ class TextTable:
         """A column as it is in the file."""
         return self._columns[name]
 
+    def filled(self, name: str) -> Flags:
+        """The rows (n,) in which a column is not empty."""
+        return np.array([cell != "" for cell in self._columns[name]], dtype=np.bool_)
+
     def stamps_ns(self, name: str) -> Stamps:
         """A column of decimal seconds (n,) [ns]."""
         return np.array([read_stamp_ns(cell, where) for cell, where in self._cells(name)], dtype=np.int64)
 
     def numbers(self, names: Sequence[str], rows: Flags | None = None) -> Array64:
         """Columns of finite numbers (n, k); where `rows` is False the result is zero and the file is not read."""
-        read = np.ones(len(self._where), dtype=np.bool_) if rows is None else rows
-        columns = [
-            [_number(cell, where) if use else 0.0 for (cell, where), use in zip(self._cells(name), read, strict=True)]
-            for name in names
-        ]
-        return np.array(columns, dtype=np.float64).reshape(len(names), len(read)).T
+        result = np.zeros((len(self._where), len(names)))
+        for column, name in enumerate(names):
+            for row, (cell, where) in enumerate(self._cells(name)):
+                if rows is None or rows[row]:
+                    result[row, column] = _number(cell, where)
+        return result
 
     def symmetric(self, names: Sequence[str], rows: Flags | None = None) -> Array64:
         """Symmetric matrices (n, size, size) from the columns of their upper triangles by rows."""
@@ -147,16 +151,12 @@ class TextTable:
                 raise LinkError(f"{where}: {name} '{cell[:20]}' is not a whole number")
         return np.array(self._columns[name], dtype=np.int64)
 
-    def flags(self, name: str) -> Flags:
-        """A column of 0 and 1 (n,)."""
-        return np.array(self.one_of(name, ("0", "1")), dtype=np.str_) == "1"
-
-    def one_of(self, name: str, allowed: Sequence[str]) -> list[str]:
-        """A column that holds nothing but the allowed texts."""
+    def equals(self, name: str, value: str, allowed: Sequence[str] = ("0", "1")) -> Flags:
+        """Where a column (n,) that holds nothing but the allowed texts has a value."""
         for cell, where in self._cells(name):
             if cell not in allowed:
                 raise LinkError(f"{where}: {name} is '{cell[:20]}', not one of {', '.join(allowed)}")
-        return self._columns[name]
+        return np.array([cell == value for cell in self._columns[name]], dtype=np.bool_)
 
     def _cells(self, name: str) -> Iterator[tuple[str, str]]:
         return zip(self._columns[name], self._where, strict=True)

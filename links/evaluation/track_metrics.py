@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from links.evaluation.association import Source
 from links.evaluation.errors import GRID_NS, rms
 from links.evaluation.evaluation import (
     NO_OUTPUT,
@@ -25,7 +26,7 @@ from links.evaluation.evaluation import (
     not_evaluated,
 )
 from links.evaluation.pose_metrics import NO_MOMENT
-from links.evaluation.run_data import OutputKind, Source
+from links.evaluation.run_data import OutputKind
 from links.evaluation.text_files import Stamps
 from stages.messages import TrackingState
 

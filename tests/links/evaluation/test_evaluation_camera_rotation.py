@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError, Record, Run
-from links.evaluation.comparison import runs_table
 from links.evaluation.evaluation import Evaluation
 from links.evaluation.groups import ROTATION_COLUMNS, group_numbers, grouped
 from links.evaluation.metrics import CAMERAS, CATALOGUE
 from links.evaluation.run_data import read_rotations
+from links.evaluation.tables import runs_table
 from links.evaluation.text_files import read_tum
 from links.results import Results
 from links.truth import TruthLog

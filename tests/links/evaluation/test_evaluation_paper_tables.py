@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from links.cli.app import app
-from links.evaluation.paper_tables import markdown, paper_tables
+from links.evaluation.comparison import markdown, paper_tables
 from tests.links.evaluation.made_runs import (
     add_pose,
     add_rotations,

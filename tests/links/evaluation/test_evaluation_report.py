@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError
-from links.evaluation.comparison import pair_up, pooled, runs_table
+from links.evaluation.comparison import pair_up
 from links.evaluation.figures import MAX_POINTS, worst_of_each
+from links.evaluation.tables import medians, ranks
 from tests.links.command import grd
 from tests.links.evaluation.made_runs import add_pose, evaluated, lines, make_run, truth_at
 
@@ -29,16 +30,16 @@ def fly(folder, offset_m=0.1, recording="flight", t=EIGHT_HZ, **settings):
 def test_a_run_that_failed_counts_as_the_worst_in_a_median(tmp_path):
     runs = [evaluated(fly(tmp_path / str(i), offset)) for i, offset in enumerate([0.1, 0.2, 0.3])]
     runs += [evaluated(make_run(tmp_path / f"none{i}", [], [])) for i in range(2)]
-    found = pooled(runs_table(runs).rmse_m)
-    assert (found.median, found.runs, found.failed, found.not_evaluated) == (pytest.approx(0.3), 5, 2, 0)
-    assert pooled(runs_table(runs[2:]).rmse_m).median == float("inf")
-    assert pooled(runs_table(runs).track_accuracy).median == pytest.approx(100.0)
+    found = medians(ranks(runs)).loc["rmse_m"]
+    assert (found["median"], found.runs, found.failed, found.not_evaluated) == (pytest.approx(0.3), 5, 2, 0)
+    assert medians(ranks(runs[2:]))["median"].rmse_m == float("inf")
+    assert medians(ranks(runs))["median"].track_accuracy == pytest.approx(100.0)
 
 
 def test_a_run_without_truth_is_left_out_of_a_median_and_counted(tmp_path):
     runs = [evaluated(fly(tmp_path / "a")), evaluated(fly(tmp_path / "b", truth="none"))]
-    found = pooled(runs_table(runs).rmse_m)
-    assert (found.median, found.runs, found.not_evaluated) == (pytest.approx(0.1), 1, 1)
+    found = medians(ranks(runs)).loc["rmse_m"]
+    assert (found["median"], found.runs, found.not_evaluated) == (pytest.approx(0.1), 1, 1)
 
 
 def test_runs_are_paired_by_recording(tmp_path):

@@ -8,10 +8,10 @@ from typer.testing import CliRunner
 
 from flow.link import LinkError
 from links.cli.app import app
-from links.evaluation.association import follow
+from links.evaluation.association import Source, follow
 from links.evaluation.comparison import pair_up
 from links.evaluation.evaluation import Status
-from links.evaluation.run_data import Source, read_run
+from links.evaluation.run_data import read_run
 from links.evaluation.tables import label
 from tests.links.evaluation.made_runs import START_NS, all_evaluated, lines, make_run, stamp, truth_at
 

@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flow.link import LinkError, Record, Run
-from links.evaluation.run_data import NEVER_NS, read_run, read_true_drones
+from links.evaluation.association import NEVER_NS, read_true_drones
+from links.evaluation.run_data import read_run
 from links.evaluation.text_files import read_tum
 from links.results import Results
 from links.truth import TruthLog

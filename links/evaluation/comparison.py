@@ -196,7 +196,13 @@ def comparison_table(pairs: list[Pair]) -> Table:
         metric, own, other = metric_of(key), compared.own.loc[key], compared.other.loc[key]
         result = verdict(own["median"], other["median"], metric.better)
         rows.append(
-            [metric.title, median_cell(own, metric), median_cell(other, metric), _ratio(compared.ratio.loc[key]), result]
+            [
+                metric.title,
+                median_cell(own, metric),
+                median_cell(other, metric),
+                _ratio(compared.ratio.loc[key]),
+                result,
+            ]
         )
         sections.append(metric.group)
     common = common_rmse_m(pairs)

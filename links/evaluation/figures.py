@@ -50,7 +50,7 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "grid.color": "#e3e7ee",
-    "text.parse_math": False,
+    "text.parse_math": False,  # names of states and configurations are data
     "legend.frameon": False,
 }
 Draw = Callable[[Axes], None]
@@ -106,6 +106,7 @@ def _compress(axes: Axes, e: Evaluation, *values) -> None:
     """Logarithmic beyond `false_m` where errors are so large that small ones could not be read."""
     if any((np.abs(series) > 5 * e.limits.false_m).any() for series in values):
         axes.set_yscale("symlog", linthresh=e.limits.false_m)
+        axes.yaxis.set_major_formatter("{x:g}")
 
 
 def _trajectory(e: Evaluation) -> Figure:
@@ -310,6 +311,7 @@ def reliability_figure(rows: pd.DataFrame) -> str:
             shares.errorbar(own["mean"], own.share, error, fmt="o-", markersize=4, linewidth=1, capsize=2, label=name)
             counts.plot((own.low + own.high) / 2 + 0.008 * index, own.candidates, "o", markersize=4, label=name)
         counts.set_yscale("log")
-        _finish(shares, "reliability of the detector's probabilities", "mean probability", "share of drones")
+        counts.yaxis.set_major_formatter("{x:g}")
+        _finish(shares, "reliability", "mean probability", "share of drones")
         _finish(counts, "candidates in each bin", "probability", "candidates")
         return svg(figure)

@@ -37,8 +37,8 @@ STYLE = """
 body{font:14px/1.45 system-ui,sans-serif;color:#223;background:#f6f7f9;margin:0 auto;max-width:1180px;padding:24px}
 h1{font-size:24px;margin:0 0 4px}h2{font-size:19px;margin:36px 0 6px;border-bottom:2px solid #223;padding-bottom:3px}
 h3{font-size:15px;margin:18px 0 4px}table{border-collapse:collapse;background:#fff;margin:8px 0;max-width:100%}
-th,td{padding:3px 7px;border:1px solid #dde2ea;text-align:right;overflow-wrap:anywhere}
-th{font-size:12px;vertical-align:bottom;overflow-wrap:normal}td.label{text-align:left}
+th,td{padding:3px 7px;border:1px solid #dde2ea;text-align:right}
+th{font-size:12px;vertical-align:bottom;overflow-wrap:break-word}td.label{text-align:left;overflow-wrap:anywhere}
 tr.section td{background:#eef1f6;font-weight:600;text-align:left}.note{color:#667}
 .bad,tr.failed td,tr.worse td:last-child{color:#b01818}tr.better td:last-child{color:#1b7f4b}
 .cards{display:flex;gap:12px;flex-wrap:wrap}ul{margin:4px 0;padding-left:20px}

@@ -50,8 +50,8 @@ SAID = {  # where it is said, and what
     "flow/live_threads.py": ["works no more", "takes fewer pictures: this host is too slow for all"],
     "flow/live_wiring.py": ["cannot run live: it stays silent"],
     "flow/stage_life.py": ["this message is skipped", "the run stops", "starts afresh", "stays off"],
-    "links/live_run.py": ["cannot be shown on the terminal"],
-    "links/results.py": ["results are being lost"],
+    "links/runs/live_run.py": ["cannot be shown on the terminal"],
+    "links/runs/results.py": ["results are being lost"],
     "links/recording/recorder.py": ["nothing is recorded now"],
     "links/velodyne/udp.py": ["cannot listen on UDP", "is the network interface still up?", "no packet on UDP"],
     "links/velodyne/lidar.py": [
@@ -110,7 +110,7 @@ def test_what_is_said_in_sentences_stands_on_the_page_and_in_its_source(source: 
 
 
 def test_what_is_not_recorded_for_want_of_room_is_told_in_figures() -> None:
-    assert f"Below {Recorder().reserve_mb:g} MB" in PAGE
+    assert f"Below {Recorder().settings.reserve_mb:g} MB" in PAGE
 
 
 def test_each_fault_stands_with_its_bounds() -> None:

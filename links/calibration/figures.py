@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from stages.calibration.calibrate import Calibration
 from stages.calibration.patches import Patches
-from stages.calibration.verdict import CURVE, CURVE_POINTS, curve_rows
-from stages.geometry import Array64
+from stages.calibration.result import CURVE, CURVE_POINTS, curve_rows
+from stages.geometry.frames import Array64
 
 SIZE_IN = (13.0, 6.2)
 MAX_POINTS = 2500

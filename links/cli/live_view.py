@@ -10,7 +10,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from pydantic import PrivateAttr
 from rich.console import Console, Group
 from rich.live import Live as Screen
 from rich.table import Table
@@ -20,7 +19,7 @@ from flow.link import Tap
 from flow.live_report import LiveReport
 from flow.message import Message
 from links.cli.console import err, out
-from links.live_run import Look
+from links.runs.live_run import Look
 from stages.messages import DroneFix, RelativePose, TrackState
 
 SCREEN_S, LINE_S = 0.25, 5.0
@@ -30,7 +29,9 @@ SHOWN = (RelativePose, DroneFix, TrackState)
 class Newest(Tap):
     """Keeps the newest message of each kind that the console shows."""
 
-    _messages: dict[type[Message], Any] = PrivateAttr(default_factory=dict)
+    def __init__(self) -> None:
+        super().__init__()
+        self._messages: dict[type[Message], Any] = {}
 
     def wants(self, message: type[Message]) -> bool:
         """The kinds that are shown."""

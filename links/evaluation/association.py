@@ -1,7 +1,7 @@
 """Truth of the drones and the association with it: truth at given times, and the drone that each track follows.
 
-Source: grd; links/truth.py writes the files. Truth is interpolated, but never over a gap. This file needs no package of
-the extra `evaluate`: links/truth.py uses it.
+Source: grd; links/runs/truth.py writes the files. Truth is interpolated, but never over a gap. This file needs no
+package of the extra `evaluate`: links/runs/truth.py uses it.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from links import results
 from links.evaluation.text_files import NO_DRONE, Flags, Stamps, TextTable, Trajectory, read_tum
-from stages.geometry import Array64
+from links.runs import results
+from stages.geometry.frames import Array64
 
 NEVER_NS = np.iinfo(np.int64).max // 2  # the end of a span that did not end
 NEAR_M = 1.0  # a track this near to one drone alone is on that drone

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from links.evaluation.association import EvaluationLimits, bracket, interpolate, newest
 from links.evaluation.run_data import Output, RotationLog, RunData
 from links.evaluation.text_files import Flags, Stamps, Trajectory
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 GRID_NS = 20_000_000  # period at which the newest output is evaluated
 EULER = ["roll", "pitch", "yaw"]

@@ -17,7 +17,7 @@ from links.evaluation.association import EvaluationLimits, Source
 from links.evaluation.errors import GRID_NS, wilson_interval
 from links.evaluation.run_data import Output, RunData
 from links.evaluation.text_files import Flags, Stamps
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 SLOWEST_HZ = 4.0  # ArduPilot's EKF drops external poses that come slower
 WITHOUT_DRONE = "there was no drone"

@@ -23,7 +23,7 @@ from links.evaluation.errors import GRID_NS, rms
 from links.evaluation.evaluation import Evaluation
 from links.evaluation.pose_metrics import BANDS_M, BRANCH_RAD
 from links.evaluation.text_files import Flags
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 MAX_POINTS = 1000
 MAX_LANES = 8  # tracks whose states are drawn

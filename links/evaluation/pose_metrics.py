@@ -34,7 +34,7 @@ from links.evaluation.evaluation import (
     not_applicable,
     not_evaluated,
 )
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 BANDS_M: tuple[tuple[float, float], ...] = ((0, 10), (10, 20), (20, 30), (30, 50), (50, math.inf))
 BRANCH_RAD = math.radians(45.0)  # an error beyond this is another yaw branch

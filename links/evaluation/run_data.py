@@ -1,6 +1,6 @@
 """Everything an evaluation reads: the folder of a run, or a TUM file, with the truth that belongs to it.
 
-Source: DESIGN, Outputs of a run; links/results.py and links/truth.py write the files.
+Source: DESIGN, Outputs of a run; links/runs/results.py and links/runs/truth.py write the files.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from flow.link import LinkError
-from links import results
 from links.evaluation.association import DroneTruth, EvaluationLimits, Source, follow, read_true_drones
 from links.evaluation.text_files import Flags, Rows, Stamps, TextTable, Trajectory, read_stamp_ns, read_tum
-from stages.geometry import Array64, rotations_from_xyzw
+from links.runs import results
+from stages.geometry.frames import Array64, rotations_from_xyzw
 from stages.messages import BranchState
 
 T = TypeVar("T")

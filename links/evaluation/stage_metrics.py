@@ -28,7 +28,7 @@ from links.evaluation.evaluation import (
 from links.evaluation.pose_metrics import BRANCH_RAD, MIN_FOR_NEES, MIN_FOR_P95, mean_nees, put_inside_95
 from links.evaluation.run_data import XYZ, RotationLog, Search
 from links.evaluation.text_files import Flags, Trajectory
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 PROBABILITY_EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.0)  # the detector accepts from 0.95 on
 FALSE_DETECTIONS = "false_detections_per_min"

@@ -1,6 +1,6 @@
 """Strict readers of TUM trajectories and CSV tables: an error names the file, the line and the cell.
 
-Source: TUM RGB-D benchmark, file formats (`stamp_s tx ty tz qx qy qz qw`); the CSV columns are in links/results.py.
+Source: TUM RGB-D benchmark, file formats (`stamp_s tx ty tz qx qy qz qw`); CSV columns in links/runs/results.py.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.link import LinkError
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 COLUMNS = "stamp_s tx ty tz qx qy qz qw"
 POSITION_ONLY, FULL_POSE, NO_DRONE = "position only", "full pose", "no drone"  # marks in the header of a TUM file

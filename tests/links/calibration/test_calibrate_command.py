@@ -59,7 +59,7 @@ def test_the_new_rig_can_be_laid_over_a_configuration(calibrated):
     folder, _ = calibrated
     rig = folder / "street.rig.yaml"
     graph = load_graph(ROOT / "configs" / "replay.yaml", overlays=[rig])
-    mount = graph.nodes["sweep"].build().mount  # pyright: ignore[reportAttributeAccessIssue]
+    mount = graph.nodes["sweep"].build().settings.mount
     written = yaml.safe_load(rig.read_text())["rig"]["lidar"]["mount"]
     assert mount.servo_time_offset_s == written["servo_time_offset_s"]
     assert abs(mount.servo_time_offset_s) < 2e-4  # this simulated servo has no error: none is invented
@@ -138,9 +138,9 @@ def test_the_lidars_clock_is_the_recorded_runs():
     run = (
         "links: {front: {use: links.velodyne.Lidar, config: {clock: utc, port: 2400}}, cam: {use: links.camera.Camera}}"
     )
-    assert lidar_of(run).clock == "utc"
+    assert lidar_of(run).settings.clock == "utc"
     for other in (None, "seed: 3", "links: null", "links: {front: {use: links.velodyne.Lidar}}", "- 1"):
-        assert lidar_of(other).clock == "free"
+        assert lidar_of(other).settings.clock == "free"
 
 
 def test_a_rig_goes_into_a_yaml_file_only(tmp_path):

@@ -17,11 +17,11 @@ from links.evaluation.metrics import CAMERAS, CATALOGUE
 from links.evaluation.run_data import read_rotations
 from links.evaluation.tables import runs_table
 from links.evaluation.text_files import read_tum
-from links.results import Results
-from links.truth import TruthLog
-from stages.geometry import quaternions_xyzw, rotation_from_rpy_deg, rotation_z
+from links.runs.results import Results
+from links.runs.truth import TruthLog
+from stages.geometry.frames import quaternions_xyzw, rotation_from_rpy_deg, rotation_z
+from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import BranchState, RelativeRotation
-from stages.rotation import exp_rotation
 from tests.links.command import grd
 from tests.links.evaluation.made_runs import (
     add_rotations,

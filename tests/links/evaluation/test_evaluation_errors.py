@@ -23,7 +23,7 @@ from links.evaluation.errors import (
     slerp,
     wilson_interval,
 )
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 from tests.links.evaluation.made_runs import yaw_quaternion
 
 

@@ -8,7 +8,7 @@ import pytest
 from flow.link import LinkError, Run
 from links.evaluation.groups import reliability, reliability_table
 from links.evaluation.run_data import read_run
-from links.results import CANDIDATES_FILE, Results
+from links.runs.results import CANDIDATES_FILE, Results
 from stages.messages import Candidates
 from tests.links.command import grd
 from tests.links.evaluation.made_runs import all_evaluated, lines, make_run, stamp, truth_at

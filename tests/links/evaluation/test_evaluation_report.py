@@ -228,6 +228,6 @@ def test_without_the_extra_the_command_fails_with_its_name(tmp_path, monkeypatch
 
 def test_the_commands_start_without_the_extra():
     """Packages of the extra `evaluate`, one of which is GPL, are imported by `grd evaluate` alone."""
-    code = "import sys, links.cli.app, links.truth; print(sorted({'pandas', 'matplotlib', 'evo'} & sys.modules.keys()))"
+    code = "import sys, links.cli.app, links.runs.truth; print(sorted({'pandas', 'matplotlib', 'evo'} & sys.modules.keys()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -11,7 +11,7 @@ from flow.link import LinkError
 from links.evaluation.association import Source
 from links.evaluation.run_data import read_run
 from links.evaluation.text_files import read_stamp_ns, read_tum
-from links.results import tum_line
+from links.runs.results import tum_line
 from tests.links.evaluation.made_runs import START_NS, evaluated, make_run, truth_at
 
 FINE = "10.0 1 2 3 0 0 0 1\n"

@@ -12,8 +12,8 @@ from flow.link import LinkError, Record, Run
 from links.evaluation.association import NEVER_NS, read_true_drones
 from links.evaluation.run_data import read_run
 from links.evaluation.text_files import read_tum
-from links.results import Results
-from links.truth import TruthLog
+from links.runs.results import Results
+from links.runs.truth import TruthLog
 from stages.messages import DepthImage, Detections, DroneFix, TrackingState, TrackState
 from tests.links.evaluation.made_runs import yaw_quaternion
 

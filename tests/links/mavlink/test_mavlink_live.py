@@ -32,7 +32,7 @@ from links.simulated.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot_rules import Fate
 from links.simulated.autopilot_socket import AutopilotSocket
 from links.simulated.px4_rules import Px4Rules
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import AutopilotEstimator, PoseState, RelativePose
 
 mavlink: Any = ardupilotmega
@@ -81,7 +81,7 @@ def bound_port(udp: socket.socket) -> int:
 
 @contextmanager
 def listening(**config: Any) -> Iterator[Heard]:
-    link = Autopilot.model_validate({"connection": "udpin:127.0.0.1:0", **config})
+    link = Autopilot(**{"connection": "udpin:127.0.0.1:0", **config})
     with link.listen() as records:
         heard = Heard(link, records)
         try:
@@ -506,4 +506,4 @@ def test_without_a_connection_it_cannot_listen_and_says_what_to_set():
 )
 def test_settings_that_would_fly_wrong_are_refused_with_the_reason(config: Any, says: str):
     with pytest.raises(ValidationError, match=says):
-        Autopilot.model_validate(config)
+        Autopilot(**config)

@@ -14,7 +14,7 @@ from flow.stage import input_ports, output_ports
 from stages.aim import BeamAim
 from stages.aim.beam_aim import INNER_RAD
 from stages.aim.targets import Targets
-from stages.geometry import Harmonic, LidarMount
+from stages.geometry.frames import Harmonic, LidarMount
 from stages.messages import Candidates, ServoGoal, TrackingState, TrackState
 from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Way, beams_lidar, beams_vehicle, flying, packet, still
 from tests.stages.made import MS, ON_ITS_SIDE, PACKET_NS, START_NS, servo
@@ -67,8 +67,8 @@ Tell = Callable[[BeamAim, float], None]
 
 def fly(aim: BeamAim, seconds: float, tell: Tell, start_rad=0.3, rotor=True, latency_s=LATENCY_S) -> Flight:
     """Let the aim drive a servo that obeys after the latency, at most at 55 rpm."""
-    flight, position, orders, packets = Flight(aim.mount), start_rad, [], 0
-    low, high = (math.radians(v) for v in aim.travel_deg)
+    flight, position, orders, packets = Flight(aim.settings.mount), start_rad, [], 0
+    low, high = (math.radians(v) for v in aim.settings.travel_deg)
     goal: ServoGoal | None = None
     for stamp_ns in range(START_NS, START_NS + round(seconds * 1e9), TICK_NS):
         t_s = (stamp_ns - START_NS) * 1e-9

@@ -13,19 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import PrivateAttr
 
 from flow.graph import Graph
 from flow.link import Tap
 from flow.replay import Replay
 from flow.stage import input_ports
 from links.recording import RecordingReader
-from links.run_folder import Asked
-from links.truth import TruthLog
+from links.runs.run_folder import Asked
+from links.runs.truth import TruthLog
 from stages.fuse import Fuse
-from stages.geometry import rotation_from_quaternion_xyzw
+from stages.geometry.frames import rotation_from_quaternion_xyzw
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import DroneFix, PoseState, RelativePose, RelativeRotation
-from stages.rotation import exp_rotation, log_rotation
 from tests.stages.fuse.made_drone_flight import Errors, add_errors, gauss_markov, rotation
 
 GRID_S = 0.02
@@ -98,6 +97,7 @@ class Hearing(Tap):
         order = list(input_ports(graph.nodes[consumer].cls))
         edges = [e for e in graph.edges if e.consumer == consumer]
         self._ports = {f"{e.producer}.{e.output}": (order.index(e.port), e.port) for e in edges}
+        self._heard: list[tuple[int, int, int, Event]] = []
 
     def see(self, output, message, arrival_ns) -> None:
         if output in self._ports:
@@ -106,9 +106,6 @@ class Hearing(Tap):
 
     def all(self) -> list[Event]:
         return [event for *_, event in sorted(self._heard, key=lambda e: e[:3])]
-
-    _ports: dict[str, tuple[int, str]] = PrivateAttr(default_factory=dict)
-    _heard: list[tuple[int, int, int, Event]] = PrivateAttr(default_factory=list)
 
 
 # faults

@@ -13,9 +13,9 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays, hash_into
 from flow.stage import input_ports, output_ports
-from stages.detect.kernel import KernelDetect
+from stages.detect.kernel_detect import KernelDetect
 from stages.messages import DepthImage, Detections, DroneFix, SweptPoints, TrackingState, TrackState
-from stages.sweep import Sweep
+from stages.sweep.sweep import Sweep
 from stages.track.mean_shift_track import MeanShiftTrack
 from tests.stages.caster import Ball, flying, seen
 from tests.stages.made import MS, ON_ITS_SIDE, START_NS, detections, swept
@@ -116,7 +116,7 @@ def test_how_points_are_sliced_does_not_matter():
         slices = [swept(points[i], stamps[i]) for i in np.array_split(np.arange(400), pieces)]
         fixes, states = run(stage, [empty(0), detections(T0), *slices])
         for message in [*fixes, *states]:
-            hash_into(hasher, message)
+            hash_into(hasher, hasher, message)
         return hasher.hexdigest()
 
     assert digest(3) == digest(37) == digest(400)

@@ -1,4 +1,4 @@
-"""From a recording's truth to the files that an evaluation reads: nothing is lost or turned on the way."""
+"""From the truth of a recording to the files that an evaluation reads: nothing is lost or rotated."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from flow.link import LinkError, Record, Run
-from links.evaluation import read_run
-from links.evaluation.errors import euler_rpy
-from links.evaluation.true_drone import NEVER_NS, read_true_drones
-from links.evaluation.tum import read_tum
+from links.evaluation.association import NEVER_NS, read_true_drones
+from links.evaluation.run_data import read_run
+from links.evaluation.text_files import read_tum
 from links.runs.results import Results
 from links.runs.truth import TruthLog
-from stages.geometry.frames import rotations_from_xyzw
 from stages.messages import DepthImage, Detections, DroneFix, TrackingState, TrackState
 from tests.links.evaluation.made_runs import yaw_quaternion
 
@@ -25,7 +24,7 @@ def pose(topic: str, stamp_ns: int, xyz, yaw_deg: float) -> Record:
 
 
 def test_truth_is_written_as_the_drone_in_the_vehicle_with_its_rotation(tmp_path):
-    """The vehicle at (10, 0, 0) looks left (yaw 90 deg); the drone 5 m to its left-hand world side looks back (180)."""
+    """The vehicle is at (10, 0, 0) with yaw 90 deg, the drone at (10, 5, 7) of the world with yaw 180 deg."""
     log = TruthLog()
     records = [
         pose("/truth/vehicle", 1_000_000_000, [10.0, 0, 0], 90),
@@ -40,11 +39,12 @@ def test_truth_is_written_as_the_drone_in_the_vehicle_with_its_rotation(tmp_path
     assert truth.stamps_ns.tolist() == [1_000_000_000]
     assert truth.xyz_m[0] == pytest.approx([5, 0, 7])
     assert truth.quaternion_xyzw is not None
-    assert np.degrees(euler_rpy(rotations_from_xyzw(truth.quaternion_xyzw)))[0] == pytest.approx([0, 0, 90], abs=1e-3)
+    yaw_pitch_roll = Rotation.from_quat(truth.quaternion_xyzw).as_euler("ZYX", degrees=True)
+    assert yaw_pitch_roll[0] == pytest.approx([90, 0, 0], abs=1e-3)
     assert (tmp_path / "truth_hits.csv").read_text() == "stamp_s\n0.000000002\n3.000000001\n"
 
 
-def test_a_recording_without_a_drone_says_so_and_one_without_truth_says_nothing(tmp_path):
+def test_a_recording_without_a_drone_is_marked_and_one_without_truth_has_no_file(tmp_path):
     log = TruthLog()
     list(log.aside([pose("/truth/vehicle", 5, [0, 0, 0], 0)]))
     log.write(tmp_path)
@@ -56,7 +56,7 @@ def test_a_recording_without_a_drone_says_so_and_one_without_truth_says_nothing(
 
 
 def test_each_drone_has_its_own_files_of_truth(tmp_path):
-    """Drone 2 is 3 m over drone 1; nothing hides drone 1, drone 2 is hidden after 1 s."""
+    """Drone 2 is 3 m above drone 1; drone 1 is never occluded, drone 2 is after 1 s."""
     log = TruthLog()
     records = [pose("/truth/vehicle", 7, [1.0, 0, 0], 0), pose("/truth/drone", 7, [1.0, 0, 5], 0)]
     records += [pose("/truth/drone_2", 7, [1.0, 0, 8], 0), Record("/truth/hits_2", 0, 0, b'{"pulse_stamp_ns": [7]}')]
@@ -67,18 +67,18 @@ def test_each_drone_has_its_own_files_of_truth(tmp_path):
     records += [Record("/truth/visible_2", 1_000_000_000, 1_000_000_000, b'{"visible": false}')]
     assert list(log.aside(records)) == []
     log.write(tmp_path)
-    drones, said_empty = read_true_drones(tmp_path, None)
-    assert not said_empty
+    drones, empty_sky = read_true_drones(tmp_path, None)
+    assert not empty_sky
     one, two = drones
     assert one.path is not None
     assert two.path is not None
     assert (one.path.xyz_m.tolist(), two.path.xyz_m.tolist()) == ([[0, 0, 5]], [[0, 0, 8]])
-    assert one.hits_ns is None
-    assert two.hits_ns is not None
-    assert two.hits_ns.tolist() == [7]
-    assert one.hidden_ns is not None
-    assert two.hidden_ns is not None
-    assert (one.hidden_ns.tolist(), two.hidden_ns.tolist()) == ([], [[1_000_000_000, NEVER_NS]])
+    assert one.returns_ns is None
+    assert two.returns_ns is not None
+    assert two.returns_ns.tolist() == [7]
+    assert one.occluded_ns is not None
+    assert two.occluded_ns is not None
+    assert (one.occluded_ns.tolist(), two.occluded_ns.tolist()) == ([], [[1_000_000_000, NEVER_NS]])
 
 
 def test_fixes_are_compared_with_the_drone_their_track_follows():
@@ -115,7 +115,7 @@ def fix(stamp_ns: int, z_m: float, track_id: int) -> DroneFix:
     )
 
 
-def test_hits_that_are_none_are_refused():
+def test_invalid_hits_are_rejected():
     with pytest.raises(LinkError, match="holds no pulses"):
         list(TruthLog().aside([Record("/truth/hits", 0, 0, b"{}")]))
 
@@ -135,10 +135,10 @@ def test_fixes_of_all_tracks_are_written_with_their_number(tmp_path):
     assert (output.track.tolist(), output.poses.xyz_m[:, 2].tolist()) == ([2, 1, 2], [2.0, 1.0, 2.0])
 
 
-def test_each_track_tells_its_own_changes_of_state(tmp_path):
+def test_each_track_logs_its_own_changes_of_state(tmp_path):
     results = Results()
     results.open(Run(tmp_path, "", "", ""))
-    told = [
+    states = [
         (1, "SEARCHING"),
         (1, "TRACKING"),
         (2, "CANDIDATE"),
@@ -147,7 +147,7 @@ def test_each_track_tells_its_own_changes_of_state(tmp_path):
         (2, "TRACKING"),
         (1, "COASTING"),
     ]
-    for second, (track, state) in enumerate(told):
+    for second, (track, state) in enumerate(states):
         message = TrackState(
             stamp_ns=second * 1_000_000_000,
             state=TrackingState[state],
@@ -158,7 +158,7 @@ def test_each_track_tells_its_own_changes_of_state(tmp_path):
         )
         results.see("track.track_state", message, 0)
     results.close()
-    assert [(t.track_id, t.state) for t in results.transitions] == [told[i] for i in (0, 1, 2, 5, 6)]
+    assert [(t.track_id, t.state) for t in results.transitions] == [states[i] for i in (0, 1, 2, 5, 6)]
     assert (tmp_path / "run.log").read_text().splitlines() == [
         "0.000000000 track.track_state: SEARCHING: why",
         "1.000000000 track.track_state: TRACKING: why",
@@ -168,7 +168,7 @@ def test_each_track_tells_its_own_changes_of_state(tmp_path):
     ]
 
 
-def test_a_search_that_says_when_it_began_is_believed(tmp_path):
+def test_a_search_with_a_start_time_keeps_it(tmp_path):
     results = Results()
     results.open(Run(tmp_path, "", "", ""))
     for start, end in ((1_000_000_000, 2_000_000_000), (2_000_000_000, 2_500_000_000), (None, 3_000_000_000)):

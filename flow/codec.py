@@ -103,13 +103,12 @@ def decode(data: bytes, expected: Mapping[str, type[Message]], start: int = 0) -
         raise CodecError(f"{cls.__name__} has other fields at the sender: both hosts must run the same version of grd")
     reader = Reader(data, body_at + name_length)
     sizes: Sizes = {}
-    values = {name: _read(reader, cls, name, field, sizes) for name, field in plan.fields}
-    reader.end()
-    return cls(**values)
-
-
-def _read(reader: Reader, cls: type[Message], name: str, field: Field, sizes: Sizes) -> Any:
+    values: dict[str, Any] = {}
+    name = ""
     try:
-        return field.read(reader, sizes)
+        for name, field in plan.fields:
+            values[name] = field.read(reader, sizes)
     except CodecError as error:
         raise CodecError(f"{cls.__name__}.{name}: {error}") from None
+    reader.end()
+    return cls(**values)

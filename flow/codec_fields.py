@@ -30,24 +30,25 @@ class CodecError(ValueError):
 
 
 class Reader:
-    """Bytes with a place in them; it never reads beyond the end."""
+    """Bytes and a position in them; it never reads beyond the end."""
 
     def __init__(self, data: bytes, at: int) -> None:
         self._data, self._at = data, at
+        self.size = len(data)
+        """Bytes in all."""
 
     @property
     def left(self) -> int:
         """Bytes not read yet."""
-        return len(self._data) - self._at
-
-    @property
-    def size(self) -> int:
-        """Bytes in all."""
-        return len(self._data)
+        return self.size - self._at
 
     def number(self, form: struct.Struct) -> Any:
         """One number."""
         return form.unpack_from(self._data, self._skip(form.size))[0]
+
+    def numbers(self, form: struct.Struct) -> tuple[Any, ...]:
+        """As many numbers as `form` has."""
+        return form.unpack_from(self._data, self._skip(form.size))
 
     def take(self, length: int) -> bytes:
         """The next bytes."""
@@ -64,10 +65,11 @@ class Reader:
             raise CodecError(f"{self.left} bytes too many")
 
     def _skip(self, length: int) -> int:
-        if length > self.left:
+        at = self._at
+        if at + length > self.size:
             raise CodecError(f"ends too early: {length} bytes wanted, {self.left} left")
-        self._at += length
-        return self._at - length
+        self._at = at + length
+        return at
 
 
 class Field(Protocol):
@@ -219,8 +221,9 @@ class _Array:
     def __init__(self, dtype: np.dtype[Any], shape: Shape) -> None:
         if dtype.kind not in "iufb":
             raise TypeError(f"an array of {dtype}")
-        self._dtype, self._shape = dtype, shape
+        self._dtype, self._shape, self._dims = dtype, shape, shape.dims
         self._wire = dtype.newbyteorder("<")
+        self._head = struct.Struct(f"<{len(shape.dims)}I")
         self.told = f"{self._wire.str}{shape}"
         self.least = 4 * len(shape.dims)
 
@@ -229,22 +232,25 @@ class _Array:
         if array is not value or array.dtype != self._dtype or array.ndim != len(self._shape.dims):
             raise CodecError(f"declared {self._dtype} {self._shape}, got {array.dtype} {array.shape}")
         self._check(array.shape, sizes)
-        out += (_U32.pack(size) for size in array.shape)
+        out.append(self._head.pack(*array.shape))
         if array.size:
             out.append(np.ascontiguousarray(array, self._wire).data.cast("B"))
 
     def read(self, reader: Reader, sizes: Sizes) -> NDArray[Any]:
-        shape = tuple(int(reader.number(_U32)) for _ in self._shape.dims)
+        shape = reader.numbers(self._head)
         self._check(shape, sizes)
         if max(shape, default=0) > max(reader.size, EMPTY_DIM):
             raise CodecError(f"an array of {shape} cannot be in {reader.left} bytes")
-        raw = reader.array(self._wire, math.prod(shape))
-        if self._dtype.kind == "b" and raw.size and raw.view(np.uint8).max() > 1:
+        count = math.prod(shape)
+        if not count:
+            return np.empty(shape, self._dtype)
+        array = np.array(reader.array(self._wire, count), self._dtype).reshape(shape)
+        if self._dtype.kind == "b" and array.view(np.uint8).max() > 1:
             raise CodecError("a byte that is neither true nor false")
-        return raw.astype(self._dtype, copy=True).reshape(shape)
+        return array
 
     def _check(self, shape: tuple[int, ...], sizes: Sizes) -> None:
-        for declared, size in zip(self._shape.dims, shape, strict=True):
+        for declared, size in zip(self._dims, shape, strict=True):
             wanted = sizes.setdefault(declared, size) if isinstance(declared, str) else declared
             if size != wanted:
                 bound = f" with {declared} = {wanted}" if isinstance(declared, str) else ""

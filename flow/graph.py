@@ -7,7 +7,7 @@
         inputs: {points: sweep.swept_points}  # how messages wait in a live run: flow/edge.py
         on_error: restart                  # live, when it raises: a fresh one takes over; or skip; or stop the run
         thread: lidar                      # live: shared with others that say so; without it, it has its own
-        process: pictures                  # in that, live (flow/stage_process.py) and replayed (flow/apart.py)
+        process: images                    # runs in that: flow/stage_process.py; replayed: flow/subprocess_replay.py
         needs: $rig.cameras                # left out, which is said, where nothing stands there
         yields: true                       # live: takes fewer pictures while others' queues run over (flow/yielding.py)
     links:
@@ -18,8 +18,8 @@ Source: ours.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,36 @@ class Graph:
             for output, message_type in output_ports(spec.cls).items():
                 yield spec.name, output, message_type
 
+    def partitions(self) -> list[frozenset[str]]:
+        """The nodes that a replay runs in processes of their own, in rank order of their first stage with a `process`.
+
+        A partition is a stage that names a process, with every node that feeds it, directly or through others.
+        Partitions that share a node, or name the same process, are one.
+        """
+        producers: dict[str, set[str]] = {name: set() for name in self.nodes}
+        for edge in self.edges:
+            if self.nodes[edge.consumer].kind == "stages":  # a sink's inputs are for live runs
+                producers[edge.consumer].add(edge.producer)
+        partitions: list[frozenset[str]] = []
+        for spec in self.nodes.values():
+            if not spec.process:
+                continue
+            nodes, open_nodes = {spec.name}, [spec.name]
+            while open_nodes:
+                new = producers[open_nodes.pop()] - nodes
+                nodes |= new
+                open_nodes += new
+            related = nodes | {other.name for other in self.nodes.values() if other.process == spec.process}
+            shared = [other for other in partitions if other & related]
+            partitions = [other for other in partitions if not other & related] + [frozenset(nodes).union(*shared)]
+        return partitions
+
+    def part(self, nodes: Collection[str]) -> Graph:
+        """The graph of these nodes alone, with the edges among them; they are ranked as in the whole."""
+        specs = {name: spec for name, spec in self.nodes.items() if name in nodes}
+        edges = tuple(edge for edge in self.edges if edge.consumer in nodes and edge.producer in nodes)
+        return replace(self, nodes=specs, edges=edges)
+
 
 def load_graph(
     file: Path, overlays: Sequence[Path] = (), sets: Sequence[str] = (), sections: Mapping[str, Section] | None = None
@@ -91,10 +121,11 @@ def check(tree: Tree, file: Path) -> Graph:
         tree.problem(("stages",), "no stages: a graph needs at least one.")
     edges = tuple(edge for spec in nodes.values() for edge in read_edges(tree, nodes, spec, left))
     _check_threads(tree, nodes, edges)
-    _check_processes(tree, nodes)
     _check_topics(tree, nodes)
     order = _rank(tree, nodes, edges)
-    return Graph({name: nodes[name] for name in order}, edges, _recording(tree, file), tree.values, left)
+    graph = Graph({name: nodes[name] for name in order}, edges, _recording(tree, file), tree.values, left)
+    _check_processes(tree, graph)
+    return graph
 
 
 def recording_named(file: Path, overlays: Sequence[Path] = (), sets: Sequence[str] = ()) -> Path | None:
@@ -134,14 +165,19 @@ def _check_threads(tree: Tree, nodes: dict[str, NodeSpec], edges: tuple[Edge, ..
             tree.problem(("stages", edge.consumer, "inputs", edge.port, "policy"), text)
 
 
-def _check_processes(tree: Tree, nodes: dict[str, NodeSpec]) -> None:
-    """What goes to and from another process must be messages that travel."""
-    for spec in nodes.values():
-        for message in (*input_ports(spec.cls).values(), *output_ports(spec.cls).values()) if spec.process else ():
+def _check_processes(tree: Tree, graph: Graph) -> None:
+    """What goes to and from another process must be messages that can be encoded."""
+    partitions = graph.partitions()
+    for spec in graph.nodes.values():
+        if not spec.process:
+            continue
+        (nodes,) = (nodes for nodes in partitions if spec.name in nodes)
+        messages = dict.fromkeys(message for _, _, message in graph.part(nodes).outputs())
+        for message in messages | dict.fromkeys(input_ports(spec.cls).values()):
             try:
                 plan_of(message)
             except TypeError as error:
-                text = f"{error}: leave it out, the stage can work in the run's own process only."
+                text = f"{error}: leave it out, the stage can run in the run's own process only."
                 tree.problem(("stages", spec.name, "process"), text)
 
 

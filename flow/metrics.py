@@ -43,3 +43,15 @@ class Latency:
     def mean_ns(self) -> float:
         """Mean duration [ns]; 0 without data."""
         return self.total_ns / self.count if self.count else 0.0
+
+    def to_list(self) -> list[int]:
+        """All counts as plain numbers, for `of_list`."""
+        return [self.count, self.total_ns, self.max_ns, *self._bins]
+
+    @staticmethod
+    def of_list(counts: list[int]) -> Latency:
+        """The histogram that `to_list` wrote."""
+        latency = Latency()
+        latency.count, latency.total_ns, latency.max_ns = counts[:3]
+        latency._bins = array("q", counts[3:])
+        return latency

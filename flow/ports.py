@@ -19,8 +19,8 @@ class RunError(Exception):
     """A stage or link raised while the graph ran. The text names node, port and time; the cause is chained."""
 
 
-class RaisedElsewhereError(Exception):
-    """What a stage in another process raised, with its type's name, as text."""
+class RemoteError(Exception):
+    """What a node in another process raised, with its type's name, as text."""
 
 
 class Output(Generic[F]):
@@ -47,11 +47,11 @@ def call(name: str, handler: Callable[[Any], Any], message: Any, arrival_ns: int
     """What a handler gives for one message. RunError says what it raised; a link's own LinkError passes as it is."""
     try:
         return messages_of(handler, message)
-    except LinkError:
-        raise  # says itself what to check
+    except (LinkError, RunError):
+        raise  # its text is complete
     except Exception as error:
-        told = str(error) if isinstance(error, RaisedElsewhereError) else f"{type(error).__name__}: {error}"
-        raise RunError(f"{name} failed at {arrival_ns / 1e9:.6f} s: {told}") from error
+        text = str(error) if isinstance(error, RemoteError) else f"{type(error).__name__}: {error}"
+        raise RunError(f"{name} failed at {arrival_ns / 1e9:.6f} s: {text}") from error
 
 
 @contextmanager

@@ -4,8 +4,9 @@ An event is keyed by (arrival, rank, port, sequence): arrival of the record that
 it (producers before consumers), index of the port, and one running number. Two replays of one recording take the same
 steps in the same order, so their messages hash to the same value.
 
-Nodes may run elsewhere, ahead of this runner (`Parts`; in processes: `flow.apart`): what they told of a record takes
-the place that their own steps have in the heap, by their ranks, so that nothing of a run shows it.
+Some nodes may run in other processes, ahead of this runner (`RemoteNodes`, `flow.subprocess_replay`). What they give
+for a record takes the position that their own steps have in the heap, by their ranks: outputs, order and report are
+those of one process.
 
 A record that a source cannot decode (`LinkError`) is told and left out, as in a live run. Where a source gives nothing
 else, in HOPELESS records or in the whole recording, this is not its recording, and the replay ends with that error.
@@ -22,7 +23,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from time import perf_counter_ns
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 from flow.graph import Graph
 from flow.incidents import Incident, Incidents
@@ -30,6 +31,7 @@ from flow.link import RUN_TOPICS, LinkError, Record, Source, Tap
 from flow.message import Message
 from flow.metrics import Latency
 from flow.ports import Output, admit, call
+from flow.remote_nodes import Refusal, RemoteFailure, RemoteNodes, RemoteOutputs
 from flow.stage import Node, Stage, input_ports
 from flow.taps import Digest
 
@@ -77,58 +79,6 @@ class _Port:
         self.outputs, self.compute = outputs, compute
 
 
-class Failure(NamedTuple):
-    """What a node that runs elsewhere raised."""
-
-    node: str
-    error: Exception
-    cause: BaseException | None  # of the error
-
-
-class Told(NamedTuple):
-    """What nodes that run elsewhere gave for one record, or as one of them finished, in order."""
-
-    messages: list[tuple[str, Message | None]]  # output, message; None: one that nobody here takes
-    failure: Failure | None = None  # after the last of them
-
-
-class Refusal(NamedTuple):
-    """Of a source that gave nothing but refusals, the first of them."""
-
-    arrival_ns: int
-    error: LinkError
-
-
-class PartReport(NamedTuple):
-    """What nodes that ran elsewhere did, in the whole run."""
-
-    report: RunReport
-    hashes: dict[str, str]  # of their outputs, as `Digest` makes them
-
-
-class Parts(Protocol):
-    """The nodes that run elsewhere: all that one of them needs is among them."""
-
-    nodes: frozenset[str]
-    topics: frozenset[str]  # of the sources among them
-
-    def told(self, topic: str) -> Told:
-        """What they gave for the next record of one of their topics."""
-        ...
-
-    def end(self, last_ns: int) -> list[Refusal]:
-        """There are no more records; the sources that gave nothing but refusals."""
-        ...
-
-    def finished(self, node: str) -> Told:
-        """What they gave as a stage finished: asked of each, in order."""
-        ...
-
-    def reports(self) -> list[PartReport]:
-        """Asked last."""
-        ...
-
-
 class Replay:
     """A graph's nodes wired together, fed with records one by one: `feed` each record, then `finish`.
 
@@ -137,32 +87,33 @@ class Replay:
     """
 
     def __init__(
-        self, graph: Graph, taps: Sequence[Tap] = (), *, strict: bool = False, parts: Parts | None = None
+        self, graph: Graph, taps: Sequence[Tap] = (), *, strict: bool = False, remote: RemoteNodes | None = None
     ) -> None:
-        """`parts`: the nodes that others run; a digest among the taps is told the hashes of their outputs."""
+        """`remote`: nodes that other processes run; a digest among the taps receives the hashes of their outputs."""
         self.report = RunReport()
-        self._strict, self._parts = strict, parts
+        self._strict, self._remote = strict, remote
         self._digests = [tap for tap in taps if isinstance(tap, Digest)]
-        self._heap: list[tuple[int, int, int, int, _Port | None, Any]] = []  # no port: told by the parts
+        self._heap: list[tuple[int, int, int, int, _Port | None, Any]] = []  # no port: from a remote node
         self._sequence = 0
         self._incidents = Incidents(lambda: self.report.last_ns)
         self._refusals: dict[str, Refusal] = {}  # by source, the first of each
         self._refused: Counter[str] = Counter()  # how many
         self.running = ""
         """The port whose message was taken last."""
-        elsewhere = parts.nodes if parts else frozenset[str]()
+        remote_nodes = remote.nodes if remote else frozenset[str]()
         self.nodes: dict[str, Node] = {
-            spec.name: spec.build() for spec in graph.nodes.values() if spec.name not in elsewhere
+            spec.name: spec.build() for spec in graph.nodes.values() if spec.name not in remote_nodes
         }
         self._ranks = {name: rank for rank, name in enumerate(graph.nodes, 1)}
         self._outputs: dict[str, dict[type[Message], Output[_Port]]] = {name: {} for name in graph.nodes}
         for name, output, message in graph.outputs():
-            taken = [tap.see for tap in taps if tap.wants(message) and not (name in elsewhere and tap in self._digests)]
-            self._outputs[name][message] = Output(f"{name}.{output}", [], tuple(taken))
+            hashed_there = self._digests if name in remote_nodes else ()
+            seen_by = tuple(tap.see for tap in taps if tap.wants(message) and tap not in hashed_there)
+            self._outputs[name][message] = Output(f"{name}.{output}", [], seen_by)
         self._by_name = {output.name: output for outputs in self._outputs.values() for output in outputs.values()}
         self.report.nodes = {name: NodeReport(0, Latency()) for name in graph.nodes}
         self._topics: dict[str, _Port] = {}
-        self._finishers: list[tuple[str, _Port | None]] = []  # None: one of the parts
+        self._finishers: list[tuple[str, _Port | None]] = []  # None: of a remote node
         for name, spec in graph.nodes.items():
             node = self.nodes.get(name)
             if isinstance(node, Source):
@@ -190,8 +141,8 @@ class Replay:
         report.last_ns = record.arrival_ns
         port = self._topics.get(record.topic)
         if port is None:
-            if self._parts is not None and record.topic in self._parts.topics:
-                self._hear(self._parts.told(record.topic), record.arrival_ns)
+            if self._remote is not None and record.topic in self._remote.topics:
+                self._add_remote(self._remote.outputs_of(record.topic), record.arrival_ns)
                 self._settle()
             elif not record.topic.startswith(RUN_TOPICS):
                 report.unwired_topics[record.topic] += 1
@@ -209,54 +160,61 @@ class Replay:
         self._send(port, record.arrival_ns, given)
         self._settle()
 
+    def deliver(self, node: str, port: str, message: Message, arrival_ns: int) -> None:
+        """Hand a stage a message that no node of this graph gave, and run everything that follows from it."""
+        handler = getattr(self.nodes[node], f"on_{port}")
+        target = self._port(node, port, 0, handler)
+        self._send(target, arrival_ns, self._run(target, arrival_ns, message))
+        self._settle()
+
     def _settle(self) -> None:
         """Run all that follows from what was sent."""
         heap = self._heap
         while heap:
             arrival_ns, _, _, _, port, message = heappop(heap)
             if port is None:
-                self._pass_on(message, arrival_ns)
+                self._give_remote(message, arrival_ns)
             else:
                 self._send(port, arrival_ns, self._run(port, arrival_ns, message))
 
-    def _hear(self, told: Told, arrival_ns: int) -> None:
-        """What the parts told takes its turn."""
-        for name, message in told.messages:
+    def _add_remote(self, outputs: RemoteOutputs, arrival_ns: int) -> None:
+        """Put what remote nodes gave at its position in the heap."""
+        for name, message in outputs.messages:
             self._sequence += 1
             output = self._by_name[name]
             rank = self._ranks[name.partition(".")[0]]
             heappush(self._heap, (arrival_ns, rank, -1, self._sequence, None, (output, message)))
-        if told.failure is not None:
+        if (failure := outputs.failure) is not None:
             self._sequence += 1
-            heappush(self._heap, (arrival_ns, self._ranks[told.failure.node], -1, self._sequence, None, told.failure))
+            heappush(self._heap, (arrival_ns, self._ranks[failure.node], -1, self._sequence, None, failure))
 
-    def _pass_on(self, told: tuple[Output[_Port], Message | None] | Failure, arrival_ns: int) -> None:
-        """A message that the parts told; or what one of their nodes raised."""
-        if isinstance(told, Failure):
-            raise told.error from told.cause
-        output, message = told
+    def _give_remote(self, given: tuple[Output[_Port], Message | None] | RemoteFailure, arrival_ns: int) -> None:
+        """Hand on a remote node's message, or raise what it raised."""
+        if isinstance(given, RemoteFailure):
+            raise given.error from given.cause
+        output, message = given
         if message is None:
             output.count += 1
         else:
             self._give(output, message, arrival_ns)
 
     def _gave(self, source: str) -> bool:
-        """Whether a source has told anything yet."""
+        """Whether a source has given any message yet."""
         return any(output.count for output in self._outputs[source].values())
 
     def finish(self) -> RunReport:
         """Let every stage give out what it still holds; producers first. LinkError of a source that gave nothing."""
-        hopeless = self.hopeless()
-        if self._parts is not None:
-            hopeless += self._parts.end(self.report.last_ns)
-        if hopeless:
-            raise min(hopeless, key=lambda refusal: refusal.arrival_ns).error
+        refusals = self.sources_without_data()
+        if self._remote is not None:
+            refusals += self._remote.end(self.report.last_ns)
+        if refusals:
+            raise min(refusals, key=lambda refusal: refusal.arrival_ns).error
         for _ in self.finishing():
             pass
         return self.sum_up()
 
-    def hopeless(self) -> list[Refusal]:
-        """The sources that gave nothing but refusals."""
+    def sources_without_data(self) -> list[Refusal]:
+        """The first refusal of each source that gave nothing but refusals."""
         return [refusal for source, refusal in self._refusals.items() if not self._gave(source)]
 
     def finishing(self) -> Iterator[str]:
@@ -265,8 +223,8 @@ class Replay:
         for name, port in self._finishers:
             if port is not None:
                 self._send(port, last_ns, self._run(port, last_ns, None))
-            elif self._parts is not None:
-                self._hear(self._parts.finished(name), last_ns)
+            elif self._remote is not None:
+                self._add_remote(self._remote.finish(name), last_ns)
             self._settle()
             yield name
 
@@ -275,19 +233,23 @@ class Replay:
         report = self.report
         report.messages = {name: output.count for name, output in self._by_name.items()}
         report.incidents = self._incidents.all
-        counters = {name: dict(node.counters) for name, node in self.nodes.items()}
-        for part, hashes in self._parts.reports() if self._parts is not None else ():
-            report.events += part.events
-            report.nodes |= part.nodes
-            report.incidents += part.incidents
-            counters |= part.counters
+        counters = self.counters()
+        for partition in self._remote.reports() if self._remote is not None else ():
+            report.events += partition.events
+            report.nodes |= {name: NodeReport(latency.count, latency) for name, latency in partition.compute.items()}
+            report.incidents += partition.incidents
+            counters |= partition.counters
             for digest in self._digests:
-                digest.join(hashes)
+                digest.join(partition.hashes)
         for node in report.nodes.values():
             node.calls = node.compute.count
         report.incidents.sort(key=lambda incident: incident.first_ns)
-        report.counters = {name: told for name in report.nodes if (told := counters.get(name))}
+        report.counters = {name: counts for name in report.nodes if (counts := counters.get(name))}
         return report
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Each node's counters."""
+        return {name: dict(node.counters) for name, node in self.nodes.items()}
 
     def _run(self, port: _Port, arrival_ns: int, message: Any) -> tuple[Message, ...]:
         """What a port gives for a message."""

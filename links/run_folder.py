@@ -19,7 +19,6 @@ from typing import Any
 
 import yaml
 
-from flow.apart import can_run_apart, replay_apart
 from flow.draw import mermaid
 from flow.graph import Graph, load_graph
 from flow.link import LinkError, Run, Source, Tap
@@ -27,6 +26,7 @@ from flow.live_report import LiveReport
 from flow.problem import Place
 from flow.replay import RunReport, replay
 from flow.stage import Stage
+from flow.subprocess_replay import can_use_subprocesses, replay_in_subprocesses
 from flow.taps import Digest
 from flow.tree import Section
 from links.mavlink.autopilot import Autopilot
@@ -213,7 +213,7 @@ def replay_into(
     truth, digest = truth_beside(recording), Digest()
     clocks = other_clocks(graph, session.config_yaml)
     with RunFolder(folder, recording, asked, graph, began_s) as run:
-        run_all = replay if together or not can_run_apart() else replay_apart
+        run_all = replay if together or not can_use_subprocesses() else replay_in_subprocesses
         report = run_all(graph, truth.aside(session.records(progress=progress)), (digest, *run.taps))
         warnings = [*session.warnings, *clocks]
         return run.finish(report, digest.hexdigest(), truth, warnings, parts=len(session.parts))

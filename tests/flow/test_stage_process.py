@@ -103,7 +103,9 @@ def test_a_process_that_is_killed_is_said_and_a_fresh_one_takes_over_for_all_its
     report = live.stop()
     assert report.restarts == {"brittle": 1, "second": 1}
     texts = [str(incident) for incident in report.incidents]
-    assert sum("the process 'aside' has ended by signal 9; " in t and "starts afresh" in t for t in texts) == 2, texts
+    assert (
+        sum("the process 'aside' has ended by signal 9 (Killed); " in t and "starts afresh" in t for t in texts) == 2
+    ), texts
     assert not runs(other)
 
 

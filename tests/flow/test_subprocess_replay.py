@@ -1,4 +1,4 @@
-"""A replay in several processes: what is apart, and that outputs, order and errors are those of one process."""
+"""A replay in several processes: its partitions, and that outputs, order and errors are those of one process."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pathlib import Path
 import pytest
 from pydantic import Field, PrivateAttr
 
-from flow import apart
-from flow.apart import parts_of, replay_apart
+from flow import subprocess_replay
 from flow.graph import load_graph
 from flow.link import LinkError, Record, Tap
 from flow.message import Message
-from flow.ports import RunError
+from flow.ports import RemoteError, RunError
 from flow.replay import replay
 from flow.stage import Stage
+from flow.subprocess_replay import replay_in_subprocesses
 from flow.taps import Digest
 from tests.flow.toys import Number, Numbers, Text
 
@@ -80,10 +80,10 @@ class Log(Tap):
 
 GRAPH = """\
 stages:
-  first: {use: tests.flow.test_apart.Slow, inputs: {number: numbers.number}}
-  near: {use: tests.flow.test_apart.Slow, inputs: {number: first.number}, process: near}
-  far: {use: tests.flow.test_apart.Slow, inputs: {number: numbers2.number}, process: far}
-  home: {use: tests.flow.test_apart.Slow, inputs: {number: first.number}}
+  first: {use: tests.flow.test_subprocess_replay.Slow, inputs: {number: numbers.number}}
+  near: {use: tests.flow.test_subprocess_replay.Slow, inputs: {number: first.number}, process: near}
+  far: {use: tests.flow.test_subprocess_replay.Slow, inputs: {number: numbers2.number}, process: far}
+  home: {use: tests.flow.test_subprocess_replay.Slow, inputs: {number: first.number}}
   join:
     use: tests.flow.toys.Add
     config: {name: joined}
@@ -94,7 +94,7 @@ stages:
     inputs: {left: home.number, right: near.number}
 links:
   numbers: {use: tests.flow.toys.Numbers}
-  numbers2: {use: tests.flow.test_apart.Numbers2}
+  numbers2: {use: tests.flow.test_subprocess_replay.Numbers2}
   words: {use: tests.flow.toys.Words}
 """
 
@@ -110,8 +110,8 @@ def graph_of(folder, *changes: tuple[str, str]):
 
 def setting(stage: str, text: str) -> tuple[str, str]:
     return (
-        f"  {stage}: {{use: tests.flow.test_apart.Slow",
-        f"  {stage}: {{use: tests.flow.test_apart.Slow, config: {{{text}}}",
+        f"  {stage}: {{use: tests.flow.test_subprocess_replay.Slow",
+        f"  {stage}: {{use: tests.flow.test_subprocess_replay.Slow, config: {{{text}}}",
     )
 
 
@@ -132,21 +132,21 @@ def ran(run, graph, given, **kwargs):
     return digest.hexdigest(), log._seen, (*told, calls, report.counters, [str(i) for i in report.incidents])
 
 
-def test_a_part_is_a_stage_with_all_that_it_needs_and_parts_that_share_a_node_are_one(tmp_path):
-    assert set(parts_of(graph_of(tmp_path))) == {
+def test_a_partition_is_a_stage_with_all_that_feeds_it_and_partitions_that_share_a_node_are_one(tmp_path):
+    assert set(graph_of(tmp_path).partitions()) == {
         frozenset({"numbers", "first", "near"}),
         frozenset({"numbers2", "far"}),
     }
-    both = graph_of(tmp_path, ("far: {use: tests.flow.test_apart.Slow, inputs: {number: numbers2", "far: {use: tests.flow.test_apart.Slow, inputs: {number: numbers"))  # fmt: skip
-    assert parts_of(both) == [{"numbers", "first", "near", "far"}]
-    assert parts_of(graph_of(tmp_path, ("process: far", "process: near"))) == [
+    both = graph_of(tmp_path, ("far: {use: tests.flow.test_subprocess_replay.Slow, inputs: {number: numbers2", "far: {use: tests.flow.test_subprocess_replay.Slow, inputs: {number: numbers"))  # fmt: skip
+    assert both.partitions() == [{"numbers", "first", "near", "far"}]
+    assert graph_of(tmp_path, ("process: far", "process: near")).partitions() == [
         {"numbers", "first", "near", "numbers2", "far"}
     ]
-    assert parts_of(load_graph(CONFIGS / "estimate.yaml")) == []
+    assert load_graph(CONFIGS / "estimate.yaml").partitions() == []
 
 
-def test_with_both_fisheyes_the_pictures_of_each_camera_are_apart():
-    drone, vehicle = sorted(parts_of(load_graph(CONFIGS / "vision.yaml")), key=len)
+def test_with_both_fisheyes_the_images_of_each_camera_have_a_partition():
+    drone, vehicle = sorted(load_graph(CONFIGS / "vision.yaml").partitions(), key=len)
     assert drone == {"camera_drone", "autopilot", "vp_drone", "drone_odometry"}
     assert {"camera_vehicle", "vp_vehicle", "sweep", "lidar"} < vehicle
     assert not vehicle & {"detect", "track", "align", "fuse"}
@@ -156,25 +156,25 @@ def test_with_both_fisheyes_the_pictures_of_each_camera_are_apart():
 def test_outputs_their_order_and_the_report_are_those_of_one_process_whatever_takes_how_long(
     tmp_path, seed, monkeypatch
 ):
-    monkeypatch.setattr(apart, "MOST_RECORDS", 40)
-    monkeypatch.setattr(apart, "AT_ONCE", 1 + 3 * seed)
+    monkeypatch.setattr(subprocess_replay, "MOST_RECORDS", 40)
+    monkeypatch.setattr(subprocess_replay, "BATCH_RECORDS", 1 + 3 * seed)
     given = records(400, seed)
     wanted = ran(replay, graph_of(tmp_path), given)
     slow = [
         setting(name, "longest_s: 0.002") for name in random.Random(seed).sample(["first", "near", "far", "home"], 2)
     ]
-    assert ran(replay_apart, graph_of(tmp_path, *slow), given) == wanted
+    assert ran(replay_in_subprocesses, graph_of(tmp_path, *slow), given) == wanted
     assert len(wanted[1]) > 1000
 
 
-def test_a_configuration_without_apart_runs_as_ever(tmp_path):
+def test_a_configuration_without_processes_runs_in_one(tmp_path):
     (tmp_path / "y.yaml").write_text(GRAPH.replace(", process: near", "").replace(", process: far", ""))
     plain = load_graph(tmp_path / "y.yaml")
-    assert ran(replay_apart, plain, records(50)) == ran(replay, graph_of(tmp_path), records(50))
+    assert ran(replay_in_subprocesses, plain, records(50)) == ran(replay, graph_of(tmp_path), records(50))
 
 
 def test_an_empty_recording_runs_to_its_end(tmp_path):
-    assert ran(replay_apart, graph_of(tmp_path), []) == ran(replay, graph_of(tmp_path), [])
+    assert ran(replay_in_subprocesses, graph_of(tmp_path), []) == ran(replay, graph_of(tmp_path), [])
 
 
 @pytest.mark.parametrize("how", ["raises_at", "lies_at"])
@@ -186,11 +186,13 @@ def test_a_stage_that_raises_does_so_in_its_turn_with_the_same_words(tmp_path, h
     if stage != "far":
         given = [r for r in given if r.topic != "/numbers" or r.data == b"205"]  # first adds how many came before
     seen = []
-    for run in (replay, replay_apart):
+    for run in (replay, replay_in_subprocesses):
         log = Log()
         with pytest.raises(RunError) as caught:
             run(graph, given, (log,))
-        seen.append((str(caught.value), type(caught.value.__cause__), log._seen))
+        cause = caught.value.__cause__
+        text = str(cause) if isinstance(cause, RemoteError) else f"{type(cause).__name__}: {cause}"
+        seen.append((str(caught.value), text, log._seen))
     assert seen[0] == seen[1]
     assert stage in seen[0][0]
 
@@ -198,8 +200,8 @@ def test_a_stage_that_raises_does_so_in_its_turn_with_the_same_words(tmp_path, h
 def test_a_process_that_dies_is_named_with_the_signal(tmp_path):
     graph = graph_of(tmp_path, setting("far", "dies_at: 7"))
     given = [Record("/numbers2", 1000 + i, i, str(i).encode(), i) for i in range(2000)]
-    with pytest.raises(RunError, match=r"^the process of far ended by signal 9 \(Killed\)"):
-        replay_apart(graph, given)
+    with pytest.raises(RunError, match=r"^the process 'far' has ended by signal 9 \(Killed\): is there enough memory"):
+        replay_in_subprocesses(graph, given)
 
 
 def test_what_a_source_refuses_is_told_and_one_that_refuses_all_ends_the_replay(tmp_path, monkeypatch):
@@ -208,15 +210,15 @@ def test_what_a_source_refuses_is_told_and_one_that_refuses_all_ends_the_replay(
         Record(r.topic, r.arrival_ns, r.stamp_ns, b"refuse" if i % 7 == 0 else r.data, i) for i, r in enumerate(given)
     ]
     wanted = ran(replay, graph_of(tmp_path), some)
-    assert ran(replay_apart, graph_of(tmp_path), some) == wanted
+    assert ran(replay_in_subprocesses, graph_of(tmp_path), some) == wanted
     assert any("plugged in" in text for text in wanted[2][-1])
     every = [Record("/numbers2", 1000 + i, i, b"refuse", i) for i in range(9)]
     with pytest.raises(LinkError, match=r"^no numbers here: is the counter plugged in\?$"):
-        replay_apart(graph_of(tmp_path), every)
+        replay_in_subprocesses(graph_of(tmp_path), every)
     monkeypatch.setattr("flow.replay.HOPELESS", 3)
     log = Log()
     with pytest.raises(LinkError, match="no numbers here"):
-        replay_apart(graph_of(tmp_path), [*every[:3], *given], (log,))
+        replay_in_subprocesses(graph_of(tmp_path), [*every[:3], *given], (log,))
     assert not log._seen
 
 
@@ -226,7 +228,7 @@ def test_a_recording_that_cannot_be_read_on_ends_the_replay_after_what_was_read(
         raise LinkError("the disk is gone")
 
     seen = []
-    for run in (replay, replay_apart):
+    for run in (replay, replay_in_subprocesses):
         log = Log()
         with pytest.raises(LinkError, match="the disk is gone"):
             run(graph_of(tmp_path), broken(), (log,))
@@ -242,7 +244,7 @@ def test_a_tap_that_cannot_work_ends_a_replay_and_its_processes(tmp_path):
 
     before = children()
     with pytest.raises(LinkError, match="full"):
-        replay_apart(graph_of(tmp_path), records(50), (Broken(),))
+        replay_in_subprocesses(graph_of(tmp_path), records(50), (Broken(),))
     assert children() == before
 
 
@@ -251,8 +253,8 @@ def children() -> set[int]:
 
 
 def test_no_more_than_so_many_records_and_bytes_are_sent_ahead_of_their_turn(tmp_path, monkeypatch):
-    monkeypatch.setattr(apart, "MOST_RECORDS", 50)
-    monkeypatch.setattr(apart, "MOST_BYTES", 1000)
+    monkeypatch.setattr(subprocess_replay, "MOST_RECORDS", 50)
+    monkeypatch.setattr(subprocess_replay, "MOST_BYTES", 1000)
     taken = 0
 
     class Watch(Tap):
@@ -267,24 +269,24 @@ def test_no_more_than_so_many_records_and_bytes_are_sent_ahead_of_their_turn(tmp
 
     for size, most in ((3, 50), (100, 11)):
         ahead: list[int] = []
-        replay_apart(graph_of(tmp_path), counted(size), (Watch(),))
+        replay_in_subprocesses(graph_of(tmp_path), counted(size), (Watch(),))
         sources = ahead[: 300 * 3]
         assert most - 5 <= max(sources) <= most
 
 
 def test_a_message_crosses_only_where_it_is_taken(tmp_path, monkeypatch):
-    told: list[tuple[str, Message | None]] = []
-    hear = apart._PartProcess.next
+    received: list[tuple[str, Message | None]] = []
+    outputs = subprocess_replay._Partition.outputs
 
-    def listening(self, kind):
-        given = hear(self, kind)
-        told.extend(getattr(given, "messages", ()))
+    def listening(self):
+        given = outputs(self)
+        received.extend(given.messages)
         return given
 
-    monkeypatch.setattr(apart._PartProcess, "next", listening)
+    monkeypatch.setattr(subprocess_replay._Partition, "outputs", listening)
     log = Log(only="Sum")
-    report = replay_apart(graph_of(tmp_path), records(100), (Digest(), log))
-    assert {name for name, message in told if message is None} == {"numbers.number", "numbers2.number"}
-    assert {name for name, message in told if message is not None} == {"first.number", "near.number", "far.number"}
+    report = replay_in_subprocesses(graph_of(tmp_path), records(100), (Digest(), log))
+    assert {name for name, message in received if message is None} == {"numbers.number", "numbers2.number"}
+    assert {name for name, message in received if message is not None} == {"first.number", "near.number", "far.number"}
     assert {name for name, _, _ in log._seen} == {"join.sum", "end.sum"}
     assert report.messages["numbers.number"] == sum(r.topic == "/numbers" for r in records(100))

@@ -24,8 +24,6 @@ from collections.abc import Iterator
 from queue import SimpleQueue
 from typing import Any
 
-from pydantic import PrivateAttr
-
 from flow.codec import decode, encode
 from flow.edge import Edge, usual_waiting
 from flow.graph import Graph
@@ -63,14 +61,12 @@ SWITCH_S = 0.0002  # a thread that reads or writes waits at most so long for Pyt
 class Collector(Tap):
     """Encodes what the nodes of a partition give."""
 
-    _indices: dict[str, int] = PrivateAttr(default_factory=dict[str, int])
-    _wanted: frozenset[str] = PrivateAttr(default=frozenset())
-    _given: list[Encoded] = PrivateAttr(default_factory=list[Encoded])
-
-    def set_outputs(self, names: list[str], wanted: frozenset[str]) -> None:
+    def __init__(self, names: list[str], wanted: frozenset[str]) -> None:
         """The outputs in order, and those whose messages the parent wants; of others only the number counts."""
+        super().__init__()
         self._indices = {name: index for index, name in enumerate(names)}
         self._wanted = wanted
+        self._given: list[Encoded] = []
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Add a message."""
@@ -89,8 +85,8 @@ class Partition:
         spec: dict[str, Any] = json.loads(start)
         self.graph = _graph_of(spec)
         names = [f"{node}.{output}" for node, output, _ in self.graph.outputs()]
-        self._collector, self._digest = Collector(), Digest()
-        self._collector.set_outputs(names, frozenset(names if spec["wanted"] is None else spec["wanted"]))
+        wanted = names if spec["wanted"] is None else spec["wanted"]
+        self._collector, self._digest = Collector(names, frozenset(wanted)), Digest()
         taps = (self._collector, self._digest) if spec["digest"] else (self._collector,)
         self._runner = Replay(self.graph, taps, strict=spec["strict"])
         self._finishing = self._runner.finishing()
@@ -123,7 +119,7 @@ class Partition:
     def _report(self) -> PartitionReport:
         report = self._runner.sum_up()
         compute = {name: node.compute for name, node in report.nodes.items()}
-        return PartitionReport(report.events, compute, report.incidents, report.counters, self._digest.told)
+        return PartitionReport(report.events, compute, report.incidents, report.counters, self._digest.outputs)
 
     def failed(self, error: Exception) -> bytes:
         """The answer that tells of an error, as a frame."""

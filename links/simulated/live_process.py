@@ -37,7 +37,7 @@ from links.simulated.camera import CamerasSettings
 from links.simulated.dynamixel_emulator import DynamixelEmulator
 from links.simulated.kept_pictures import KeptCamera, KeptPictures
 from links.simulated.live_pictures import PicturesInTime
-from links.simulated.live_rig import READY, RIG_REPORT, LiveRig
+from links.simulated.live_rig import READY, RIG_REPORT, LiveRigSettings
 from links.simulated.mesh import Array64
 from links.simulated.run import Simulation
 from links.simulated.scenario import Scenario, load_scenario
@@ -119,7 +119,7 @@ class LiveAutopilot(AutopilotSocket):
 class RigInTime:
     """Sends until it is told to stop, or the scenario is over."""
 
-    def __init__(self, rig: LiveRig, folder: Path) -> None:
+    def __init__(self, rig: LiveRigSettings, folder: Path) -> None:
         scenario = load_scenario(rig.scenario)
         asked = {"seed": rig.seed, "duration_s": rig.duration_s}
         scenario = scenario.changed(**{name: value for name, value in asked.items() if value is not None})
@@ -246,7 +246,7 @@ def main(settings: str) -> int:
     folder = Path(given.pop("folder"))
     sys.setswitchinterval(SWITCH_S)
     try:
-        rig = RigInTime(LiveRig.model_validate(given), folder)
+        rig = RigInTime(LiveRigSettings.model_validate(given), folder)
         ready = threading.Event()
         sending = threading.Thread(target=rig.run, args=(ready,), daemon=True)
         sending.start()

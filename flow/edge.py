@@ -4,9 +4,9 @@
       points: sweep.swept_points                                                 # as suits the message, see below
       pulses: {from: sweep.swept_pulses, policy: drop_oldest, depth: 64, deadline_ms: 50}
 
-`latest`: only the newest waits. `drop_oldest`: up to `depth` wait, then the oldest is dropped. `block`: up to `depth`
-wait, then the producer does. What is dropped is counted. A message that was `deadline_ms` old (by the arrival of the
-record that caused it) when its consumer had done with it has missed its deadline and is counted, too.
+`latest`: only the newest waits. `drop_oldest`: up to `depth` wait, then the oldest is dropped. What is dropped is
+counted. A message that was `deadline_ms` old (by the arrival of the record that caused it) when its consumer had done
+with it has missed its deadline and is counted, too.
 A replay keeps every message: it has the time.
 
 Source: ours.
@@ -21,7 +21,7 @@ from typing import Any, Literal, cast, get_args
 from flow.message import Message, array_fields
 from flow.problem import did_you_mean, one_of
 
-Policy = Literal["latest", "drop_oldest", "block"]
+Policy = Literal["latest", "drop_oldest"]
 POLICIES: tuple[str, ...] = get_args(Policy)
 KEYS = ("from", "policy", "depth", "deadline_ms")
 DEPTH = 512  # 0.7 s of a VLP-16's packets: a hiccup of the machine loses none, and what waits is not too old

@@ -5,7 +5,6 @@
         use: stages.track.Track            # module.Class
         config: {radius_m: 0.8}            # the class's settings
         inputs: {points: sweep.swept_points}  # how messages wait in a live run: flow/edge.py
-        on_error: restart                  # live, when it raises: a fresh one takes over; or skip; or stop the run
         thread: lidar                      # live: shared with others that say so; without it, it has its own
         process: images                    # runs in that: flow/stage_process.py; replayed: flow/subprocess_replay.py
         needs: $rig.cameras                # left out, which is said, where nothing stands there
@@ -120,7 +119,7 @@ def check(tree: Tree, file: Path) -> Graph:
     if not tree.values.get("stages"):
         tree.problem(("stages",), "no stages: a graph needs at least one.")
     edges = tuple(edge for spec in nodes.values() for edge in read_edges(tree, nodes, spec, left))
-    _check_threads(tree, nodes, edges)
+    _check_threads(tree, nodes)
     _check_topics(tree, nodes)
     order = _rank(tree, nodes, edges)
     graph = Graph({name: nodes[name] for name in order}, edges, _recording(tree, file), tree.values, left)
@@ -149,20 +148,14 @@ def _recording(tree: Tree, file: Path) -> Path | None:
     return recording
 
 
-def _check_threads(tree: Tree, nodes: dict[str, NodeSpec], edges: tuple[Edge, ...]) -> None:
-    """A thread must not wait for itself, and yields with all of its stages."""
+def _check_threads(tree: Tree, nodes: dict[str, NodeSpec]) -> None:
+    """A thread yields with all of its stages, or with none."""
     yields = {spec.thread: spec for spec in nodes.values() if spec.kind == "stages" and spec.yields}
     for spec in nodes.values():
         if spec.kind == "stages" and not spec.yields and spec.thread in yields:
             other = yields[spec.thread].name
             text = f"'{other}' works in the same thread, '{spec.thread}', and yields: both would rest."
             tree.problem(("stages", spec.name, "thread"), text)
-    for edge in edges:
-        producer, consumer = nodes[edge.producer], nodes[edge.consumer]
-        both = producer.kind == consumer.kind == "stages" and producer.thread == consumer.thread
-        if both and edge.waiting.policy == "block":
-            text = f"'block' would wait for ever: '{edge.producer}' works in the same thread, '{consumer.thread}'."
-            tree.problem(("stages", edge.consumer, "inputs", edge.port, "policy"), text)
 
 
 def _check_processes(tree: Tree, graph: Graph) -> None:

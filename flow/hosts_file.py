@@ -157,12 +157,6 @@ def _hops(
         home, there = place.get(edge.producer), place.get(edge.consumer)
         if home is None or there is None or home == there:
             continue
-        if edge.waiting.policy == "block":
-            tree.problem(
-                ("place", edge.consumer),
-                f"'{edge.name}' has policy 'block', and {edge.producer} runs on {home}: a lost network would stop it. "
-                "Take 'drop_oldest' or 'latest'.",
-            )
         for stop in _way(home, there, hub):
             wanted.setdefault((edge.producer, edge.output, stop), []).append(edge.waiting)
     for tap, outputs in seen.items():

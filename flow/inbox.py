@@ -47,24 +47,18 @@ class Inbox:
     def __init__(self, ports: Sequence[Waiting], bell: Bell | None = None) -> None:
         self._ports: list[deque[Item]] = [deque() for _ in ports]
         self._depths = [port.depth for port in ports]
-        self._blocks = [port.policy == "block" for port in ports]
         self._order = 0
         self.bell = bell or Bell()
         self._changed = self.bell.changed
-        self._blocked = 0
         self._closed = False
         self._told = False  # that it is closed
         self.dropped = [0] * len(self._ports)
         """Messages of each port that were never taken."""
 
     def put(self, port: int, number: int, arrival_ns: int, message: Message) -> None:
-        """Add a message. A full port drops its oldest, or makes the caller wait (`block`)."""
+        """Add a message. A full port drops its oldest."""
         with self._changed:
             waiting = self._ports[port]
-            while self._blocks[port] and len(waiting) >= self._depths[port] and not self._closed:
-                self._blocked += 1
-                self._changed.wait()
-                self._blocked -= 1
             if self._closed:
                 self.dropped[port] += 1
                 return
@@ -80,11 +74,7 @@ class Inbox:
         """The message put first of those that wait; None: none does."""
         with self._changed:
             port = self._first()
-            if port is None:
-                return None
-            if self._blocked:
-                self._changed.notify_all()
-            return port.popleft()
+            return None if port is None else port.popleft()
 
     def take_all(self) -> list[Item]:
         """All that waits, in the order of putting."""
@@ -92,8 +82,6 @@ class Inbox:
             items = sorted(item for port in self._ports for item in port)
             for port in self._ports:
                 port.clear()
-            if self._blocked:
-                self._changed.notify_all()
         return items
 
     def _first(self) -> deque[Item] | None:

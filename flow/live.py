@@ -5,7 +5,7 @@ inbox (`flow.edge`: how messages wait). Stages that do little for each of many m
 Python lets one thread work at a time, and going from one to the next for each packet costs as much as the work. Those
 that do much for each of few messages may work in a process of their own (`process: NAME`, `flow.stage_process`).
 
-What goes wrong is reported, handled as configured, and the rest flies on: a stage that raises (`flow.stage_life`), a
+What goes wrong is reported and handled, and the rest flies on: a stage that raises (`flow.stage_life`), a
 link that dies (it is opened again, with pauses that grow), a tap that is slow (it misses messages). With a recorder
 among the taps, the order in which each stage took its inputs is recorded (`flow.consumption`), and `flow.rerun` takes
 the same steps again: the same messages, the same hash.
@@ -69,11 +69,6 @@ class Live:
     def nodes(self) -> dict[str, Link]:
         """Links by name; stages are in their threads' hands."""
         return self._wiring.links
-
-    @property
-    def running(self) -> bool:
-        """Nobody asked for the end: neither `stop` nor a stage whose `on_error` does."""
-        return not self._shared.stopping.is_set()
 
     @property
     def processes(self) -> list[int]:
@@ -179,5 +174,4 @@ class Live:
             off=[name for name, life in lives.items() if life.gave_up],
             tap_drops={tap.node: sum(tap.inbox.dropped) for tap in threads.taps},
             incidents=self.incidents.all,
-            stopped_by=self._shared.stopped_by,
         )

@@ -67,7 +67,6 @@ class LiveReport(RunReport):
     failures: dict[str, int] = field(default_factory=dict[str, int])
     off: list[str] = field(default_factory=list[str])  # stages that take nothing any more, because they raised
     tap_drops: dict[str, int] = field(default_factory=dict[str, int])
-    stopped_by: str | None = None  # a stage whose on_error stopped the run
 
     @property
     def dropped(self) -> int:

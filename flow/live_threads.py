@@ -46,7 +46,6 @@ class Shared:
     digest: Digest | None
     strict: bool
     stopping: threading.Event = field(default_factory=threading.Event)
-    stopped_by: str | None = None
 
     def send(self, output: Output[Feed], message: Message, arrival_ns: int) -> None:
         """Hand a message to all that take it. Each output is sent by one thread only."""
@@ -119,9 +118,6 @@ class StageRun:
                 self._shared.send(output, message, self.life.last_ns)
         else:
             self._tell_gave_up()
-            if self.life.stops_run:
-                self._shared.stopped_by = self.life.name
-                self._shared.stopping.set()
         self.ended.set()
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, cast, get_args
+from typing import Any, cast
 
 from pydantic import ValidationError
 
@@ -17,10 +17,8 @@ from flow.problem import did_you_mean, one_of
 from flow.stage import Node
 from flow.tree import Path_, Tree, resolve
 
-OnError = Literal["restart", "skip", "stop"]
-ON_ERROR: tuple[str, ...] = get_args(OnError)
 NODE_KEYS = {
-    "stages": ("use", "config", "inputs", "needs", "on_error", "thread", "process", "yields"),
+    "stages": ("use", "config", "inputs", "needs", "thread", "process", "yields"),
     "links": ("use", "config", "inputs", "needs"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
@@ -36,7 +34,6 @@ class NodeSpec:
     use: str  # import path as declared
     cls: type[Node[Any]]
     config: dict[str, Any]
-    on_error: OnError = "restart"  # of a stage that raises in a live run
     thread: str = ""  # of a stage in a live run; stages of one name share it
     process: str = ""  # of a stage, not the run's own; stages of one name share it
     yields: bool = False  # of a stage in a live run, to others that do not keep up
@@ -54,7 +51,7 @@ def read_nodes(tree: Tree, kind: str, left: dict[str, str]) -> Iterator[NodeSpec
     for name, declared in _declared(tree, kind):
         path = (kind, name)
         _check_keys(tree, path, declared)
-        on_error, yields = _on_error(tree, path, declared), _yields(tree, path, declared)
+        yields = _yields(tree, path, declared)
         thread, process = _thread(tree, path, declared), _process(tree, path, declared)
         cls = named_class(tree, kind, path, declared.get("use"))
         if unmet := _unmet(tree, path, declared):
@@ -64,7 +61,7 @@ def read_nodes(tree: Tree, kind: str, left: dict[str, str]) -> Iterator[NodeSpec
             config = resolve(tree, (*path, "config"), declared.get("config") or {})
             if len(tree.problems) == before:  # a reference to nothing is said already
                 config = _settings(tree, path, cls, config)
-            yield NodeSpec(name, kind, declared["use"], cls, config, on_error, thread, process, yields)
+            yield NodeSpec(name, kind, declared["use"], cls, config, thread, process, yields)
 
 
 def _declared(tree: Tree, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -103,14 +100,6 @@ def _check_keys(tree: Tree, path: Path_, declared: dict[str, Any]) -> None:
     for key in declared:
         if key not in known:
             tree.problem((*path, key), f"unknown key '{key}'; there is {one_of(known)}.{did_you_mean(key, known)}")
-
-
-def _on_error(tree: Tree, path: Path_, declared: dict[str, Any]) -> OnError:
-    on_error: Any = declared.get("on_error", "restart")
-    if on_error not in ON_ERROR:
-        near = did_you_mean(on_error, ON_ERROR) if isinstance(on_error, str) else ""
-        tree.problem((*path, "on_error"), f"must be {one_of(ON_ERROR)}, got {on_error!r}.{near}")
-    return cast(OnError, on_error)
 
 
 def _thread(tree: Tree, path: Path_, declared: dict[str, Any]) -> str:

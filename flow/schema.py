@@ -14,7 +14,7 @@ from typing import Any
 from flow.classes import HOMES, KINDS, known_classes
 from flow.edge import MAX_DEADLINE_MS, MAX_DEPTH, POLICIES
 from flow.graph import TOP_LEVEL
-from flow.node_spec import NEEDED, ON_ERROR
+from flow.node_spec import NEEDED
 from flow.stage import Node, input_ports, output_ports
 
 _REFERENCE = {
@@ -39,13 +39,12 @@ _EDGE = {"$ref": "#/$defs/edge"}
 _THREAD = {"type": "string", "description": "live: stages of one name share a thread; else each has its own"}
 _PROCESS = {"type": "string", "description": "it works in a process of this name, with others that say so"}
 _YIELDS = {"type": "boolean", "description": "live: fewer pictures are taken while others' queues run over"}
-_ON_ERROR = {"enum": list(ON_ERROR), "description": "live, when it raises: a fresh one, skip the message, or stop"}
 _NEEDS = {
     "type": "string",
     "pattern": NEEDED,
     "description": "left out, and said so, where nothing stands there, as $rig.cameras",
 }
-_OF_STAGES = {"on_error": _ON_ERROR, "thread": _THREAD, "process": _PROCESS, "yields": _YIELDS}
+_OF_STAGES = {"thread": _THREAD, "process": _PROCESS, "yields": _YIELDS}
 
 
 def schema() -> dict[str, Any]:

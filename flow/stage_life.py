@@ -1,4 +1,4 @@
-"""A stage with what is done when it raises: skip the message, start a fresh stage, or stop.
+"""A stage with what is done when it raises: a fresh stage starts, until that does not help.
 
 The rules know no clock but the messages' arrival, so that a live run and its repetition go the same way.
 
@@ -40,8 +40,6 @@ class StageLife:
         """It takes nothing any more."""
         self.gave_up = False
         """It stopped because it raised."""
-        self.stops_run = False
-        """And so shall the whole run (`on_error: stop`)."""
         self.failures = self.restarts = 0
         self.last_ns = 0
         """Arrival of the newest message taken."""
@@ -86,12 +84,7 @@ class StageLife:
 
     def _failed(self, error: RunError, arrival_ns: int) -> None:
         self.failures += 1
-        if self._spec.on_error == "stop":
-            self.stopped = self.gave_up = self.stops_run = True
-            self._tell("the run stops, as on_error says", error)
-        elif self._spec.on_error == "skip":
-            self._tell("this message is skipped", error)
-        elif len(self._failed_ns) == MAX_RESTARTS and arrival_ns - self._failed_ns[0] <= WITHIN_NS:
+        if len(self._failed_ns) == MAX_RESTARTS and arrival_ns - self._failed_ns[0] <= WITHIN_NS:
             self.stopped = self.gave_up = True
             self._tell(
                 f"{MAX_RESTARTS} fresh starts in {WITHIN_NS // 10**9} s did not help: {self.name} stays off", error

@@ -72,15 +72,14 @@ def run_live(
         live.start()
         started_s, usage = time.monotonic(), Usage()
         try:
-            while live.running and not stop.wait(LOOK_S) and (for_s is None or time.monotonic() < started_s + for_s):
+            while not stop.wait(LOOK_S) and (for_s is None or time.monotonic() < started_s + for_s):
                 _show(live, started_s, show, run)
                 usage.look(live.processes)
         finally:
             report = live.stop()
         _show(live, started_s, show, run)
         gc.unfreeze()
-        warnings = [] if report.stopped_by is None else [f"'{report.stopped_by}' stopped the run"]
-        return run.finish(report, digest.hexdigest(), None, warnings, usage)
+        return run.finish(report, digest.hexdigest(), None, [], usage)
 
 
 def _show(live: Live, started_s: float, show: Show, run: RunFolder) -> None:

@@ -334,7 +334,6 @@ def _live(report: LiveReport, usage: Usage | None) -> dict[str, Any]:
         "restarts": report.restarts,
         "failures": report.failures,
         "switched_off": report.off,
-        "stopped_by": report.stopped_by,
         "not_shown": report.tap_drops,
         "incidents": [
             {

@@ -49,7 +49,7 @@ SAID = {  # where it is said, and what
     ],
     "flow/live_threads.py": ["works no more", "takes fewer pictures: this host is too slow for all"],
     "flow/live_wiring.py": ["cannot run live: it stays silent"],
-    "flow/stage_life.py": ["this message is skipped", "the run stops", "starts afresh", "stays off"],
+    "flow/stage_life.py": ["starts afresh", "stays off"],
     "links/live_run.py": ["cannot be shown on the terminal"],
     "links/results.py": ["results are being lost"],
     "links/recording/recorder.py": ["nothing is recorded now"],

@@ -97,8 +97,7 @@ def run(
         _open_viewer(finished.out_dir)
     report = finished.report
     if isinstance(report, LiveReport) and report.off:
-        what = "stopped the run" if report.stopped_by else "did not work to the end: it kept raising"
-        err.print(f"'{report.stopped_by or report.off[0]}' {what}", markup=False, style="red")
+        err.print(f"'{report.off[0]}' did not work to the end: it kept raising", markup=False, style="red")
         raise typer.Exit(FINDING)
 
 

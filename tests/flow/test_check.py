@@ -91,7 +91,7 @@ CASES = {
     ),
     "unknown key": (
         ("inputs: {number", "input: {number"),
-        "x.yaml:4: stages.double.input: unknown key 'input'; there is 'use', 'config', 'inputs', 'needs', 'on_error', 'thread', 'process' or 'yields'. Did you mean 'inputs'?",
+        "x.yaml:4: stages.double.input: unknown key 'input'; there is 'use', 'config', 'inputs', 'needs', 'thread', 'process' or 'yields'. Did you mean 'inputs'?",
     ),
     "unknown port": (
         ("left: numbers.number", "left: numbers.number\n      lef: numbers.number"),

@@ -111,16 +111,6 @@ def test_a_name_that_a_sender_needs_is_not_taken(load):
     assert found == ["4: hosts.drone: a node is called 'to_drone' already: rename it or the host."]
 
 
-def test_an_edge_that_crosses_cannot_stop_its_producer(load):
-    config = CONFIG.replace("{number: numbers.number}", "{number: {from: numbers.number, policy: block}}")
-    assert load(GOOD, config).hops  # it does not cross
-    found = problems(load, GOOD.replace("numbers: drone", "numbers: vehicle"), config)
-    assert found == [
-        "6: place.double: 'double.number' has policy 'block', and numbers runs on vehicle: a lost network would stop it. "
-        "Take 'drop_oldest' or 'latest'."
-    ]
-
-
 def test_a_file_that_is_no_hosts_file_is_refused_in_words(load):
     assert problems(load, "hosts: [a]\nplace: 3\n")[:2] == [
         "1: hosts: must be a mapping.",

@@ -29,7 +29,7 @@ def waiting_of(tmp_path, left: str) -> Waiting:
         ("numbers.number", Waiting("drop_oldest", DEPTH, 100.0)),
         ("{from: numbers.number}", Waiting("drop_oldest", DEPTH, 100.0)),
         ("{from: numbers.number, policy: latest}", Waiting("latest", 1, 100.0)),
-        ("{from: numbers.number, policy: block, depth: 7}", Waiting("block", 7, 100.0)),
+        ("{from: numbers.number, policy: drop_oldest, depth: 7}", Waiting("drop_oldest", 7, 100.0)),
         ("{from: numbers.number, depth: 64, deadline_ms: 20}", Waiting("drop_oldest", 64, 20.0)),
     ],
 )
@@ -50,11 +50,11 @@ def test_only_the_newest_picture_waits_and_no_slice_of_the_lidar_is_lost_lightly
         ("{policy: latest}", "x.yaml:9: stages.add.inputs.left: must say 'from: node.output', got None."),
         (
             "{from: numbers.number, policy: newest}",
-            "x.yaml:9: stages.add.inputs.left.policy: must be 'latest', 'drop_oldest' or 'block', got 'newest'.",
+            "x.yaml:9: stages.add.inputs.left.policy: must be 'latest' or 'drop_oldest', got 'newest'.",
         ),
         (
             "{from: numbers.number, policy: drop_oldst}",
-            "x.yaml:9: stages.add.inputs.left.policy: must be 'latest', 'drop_oldest' or 'block', got 'drop_oldst'. "
+            "x.yaml:9: stages.add.inputs.left.policy: must be 'latest' or 'drop_oldest', got 'drop_oldst'. "
             "Did you mean 'drop_oldest'?",
         ),
         (
@@ -99,30 +99,8 @@ def test_what_an_edge_cannot_say_is_an_error_at_its_place(tmp_path, declared, pr
     assert [str(p).replace(f"{tmp_path}/", "") for p in caught.value.problems] == [problem]
 
 
-def test_what_a_stage_does_when_it_raises_is_declared_and_checked(tmp_path):
-    text = GRAPH.replace("  double:\n", "  double:\n    on_error: skip\n")
-    (tmp_path / "x.yaml").write_text(text)
-    nodes = load_graph(tmp_path / "x.yaml").nodes
-    assert (nodes["double"].on_error, nodes["add"].on_error) == ("skip", "restart")
-    (tmp_path / "x.yaml").write_text(text.replace("skip", "restrat").replace("Numbers}", "Numbers, on_error: stop}"))
-    with pytest.raises(ConfigError) as caught:
-        load_graph(tmp_path / "x.yaml")
-    assert [str(p).replace(f"{tmp_path}/", "") for p in caught.value.problems] == [
-        "x.yaml:3: stages.double.on_error: must be 'restart', 'skip' or 'stop', got 'restrat'. Did you mean 'restart'?",
-        "x.yaml:13: links.numbers.on_error: unknown key 'on_error'; there is 'use', 'config', 'inputs' or 'needs'.",
-    ]
-
-
-def test_a_thread_cannot_wait_for_itself(tmp_path):
-    text = GRAPH.replace("  double:\n", "  double:\n    thread: one\n").replace("  add:\n", "  add:\n    thread: one\n")
-    blocking = text.replace("right: double.number", "right: {from: double.number, policy: block}")
-    (tmp_path / "x.yaml").write_text(blocking)
-    with pytest.raises(ConfigError) as caught:
-        load_graph(tmp_path / "x.yaml")
-    assert [str(p).replace(f"{tmp_path}/", "") for p in caught.value.problems] == [
-        "x.yaml:12: stages.add.inputs.right.policy: 'block' would wait for ever: 'double' works in the same thread, 'one'."
-    ]
-    (tmp_path / "x.yaml").write_text(text.replace("thread: one", "thread: No 1"))
+def test_a_thread_has_a_name_as_stages_have(tmp_path):
+    (tmp_path / "x.yaml").write_text(GRAPH.replace("  double:\n", "  double:\n    thread: No 1\n"))
     with pytest.raises(
         ConfigError, match=r"x\.yaml:3: stages\.double\.thread: must be a name as stages have, got 'No 1'"
     ):
@@ -171,27 +149,6 @@ def test_a_flood_on_one_port_drops_nothing_of_another():
         inbox.put(0, value, 0, number(value))
     assert taken(inbox) == [(1, -1), (0, 7), (0, 8), (0, 9)]
     assert inbox.dropped == [7, 0]
-
-
-def test_who_puts_on_a_blocking_port_waits_for_room_and_ends_when_the_inbox_closes():
-    inbox = Inbox([Waiting("block", 2)])
-    done = [threading.Event(), threading.Event()]
-
-    def put():
-        for value in range(3):
-            inbox.put(0, value, 0, number(value))
-        done[0].set()
-        for value in range(3, 6):
-            inbox.put(0, value, 0, number(value))
-        done[1].set()
-
-    threading.Thread(target=put, daemon=True).start()
-    assert awaited(inbox).message.value == 0
-    assert done[0].wait(PATIENCE_S)
-    inbox.close()
-    assert done[1].wait(PATIENCE_S)
-    assert [value for _, value in taken(inbox)] == [1, 2]
-    assert inbox.dropped == [3]
 
 
 def test_who_takes_waits_for_a_message_or_the_end():

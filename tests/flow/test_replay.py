@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from flow.graph import load_graph
-from flow.link import LinkError, Record, Run, Tap
+from flow.link import LinkError, Record, Tap
 from flow.message import Message
 from flow.ports import RunError
 from flow.replay import replay
-from flow.taps import Csv, Digest
+from flow.taps import Digest
 from tests.flow.toys import GRAPH
 
 
@@ -147,19 +147,3 @@ def test_compute_time_is_counted_per_node(tmp_path):
     report = replay(graph_of(tmp_path), numbers(1, 2, 3))
     assert report.nodes["add"].calls == 7  # left and right three times, finish once
     assert 0 < report.nodes["add"].compute.percentile_ns(50) <= report.nodes["add"].compute.max_ns
-
-
-def test_the_csv_tap_writes_every_output_with_flat_columns(tmp_path):
-    tap = Csv()
-    tap.open(Run(tmp_path, "x", "", ""))
-    replay(graph_of(tmp_path), numbers(1, 2), [tap])
-    tap.close()
-    assert (
-        tmp_path / "csv" / "double.number.csv"
-    ).read_text() == "arrival_ns,stamp_ns,value\n1000,500,2.0\n1010,510,4.0\n"
-    assert sorted(p.name for p in (tmp_path / "csv").iterdir()) == [
-        "add.sum.csv",
-        "add.text.csv",
-        "double.number.csv",
-        "numbers.number.csv",
-    ]

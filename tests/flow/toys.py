@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from flow.link import Link, LinkError, Record, Source, SourceSettings
+from flow.link import Link, LinkError, Record, Run, Source, SourceSettings, Tap
 from flow.message import Message, PerPointF32, message
 from flow.stage import Settings, Stage
 
@@ -75,6 +75,19 @@ class DoubleSettings(Settings):
 
     factor: float = Field(2.0, gt=0)
     unused_option: bool = False
+
+
+class Stamps(Tap):
+    """Writes the stamp of every message to a file in the run's folder."""
+
+    def open(self, run: Run) -> None:
+        self._file = (run.out_dir / "stamps.txt").open("w", encoding="utf-8")
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        self._file.write(f"{output} {message.stamp_ns} {arrival_ns}\n")
+
+    def close(self) -> None:
+        self._file.close()
 
 
 class Double(Stage[DoubleSettings]):

@@ -8,20 +8,20 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import pkgutil
-import re
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any, cast
 
-from flow.link import Link
+from flow.link import Link, Tap
 from flow.problem import did_you_mean
 from flow.stage import Node, PortError, Stage, input_ports, output_ports
 from flow.tree import Path_, Tree
 
 KINDS: dict[str, type[Node[Any]]] = {"stages": Stage, "links": Link}
-HOMES = {"stages": "stages", "links": "links"}  # package in which classes of a kind are looked for when suggesting
+PACKAGES = {"stages": "stages", "links": "links"}  # packages whose classes are suggested, by kind
 
 
-def named_class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node] | None:
+def named_class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node[Any]] | None:
     """The class an import path (`use:` of the node at `path`) names, or None with the problem noted in `tree`."""
     here = (*path, "use")
     word = kind.removesuffix("s")
@@ -45,13 +45,14 @@ def named_class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node] | No
         hint = f"; it belongs under '{right}:'" if right else ""
         tree.problem(here, f"'{use}' is no {word}{hint}.")
     else:
+        node = cast("type[Node[Any]]", cls)
         try:
-            input_ports(cls)
-            output_ports(cls)
+            input_ports(node)
+            output_ports(node)
         except PortError as error:
             tree.problem(here, f"'{use}' is written wrongly: {error}.")
         else:
-            return cls
+            return node
     return None
 
 
@@ -62,23 +63,48 @@ def _exists(module_name: str) -> bool:
         return False
 
 
-def known_classes(kind: str) -> list[str]:
-    """Import paths of the usable classes of a kind, for suggestions and the schema.
+def known_classes(kind: str) -> dict[str, type[Node[Any]]]:
+    """Usable classes of a kind by import path, in alphabetical order: for suggestions and the schema.
 
-    The text of the home package is read, not run: a suggestion must not import every driver.
+    A package within PACKAGES offers its own classes that `__all__` names, or without that those that its `__init__`
+    imports or defines; `stages/x.py` offers the classes that it defines. What cannot be imported (a driver without its
+    library) is left out.
     """
-    spec = importlib.util.find_spec(HOMES[kind])
-    found: list[str] = []
-    for folder in (spec.submodule_search_locations or []) if spec else []:
-        for module in pkgutil.walk_packages([folder], f"{HOMES[kind]}."):
-            file = Path(folder, *module.name.split(".")[1:])
-            source = file / "__init__.py" if module.ispkg else file.with_suffix(".py")
-            classes = re.findall(
-                r"^class (\w+)\((?:\w+, )*(?:Stage|Source|Link|Tap)\b", source.read_text("utf-8"), re.M
-            )
-            # a class in a private room of a package is used through the front door, a stages/x.py as it is
-            private = not module.ispkg and (kind != "stages" or module.name.count(".") > 1)
-            home = module.name.rpartition(".")[0] if private else module.name
-            door = (file.parent / "__init__.py").read_text("utf-8") if private else source.read_text("utf-8")
-            found += [f"{home}.{name}" for name in classes if re.search(rf"\b{name}\b", door)]
-    return sorted(dict.fromkeys(found))
+    found: dict[type[Node[Any]], str] = {}
+    for module in _public_modules(PACKAGES[kind]):
+        names: list[str] = getattr(module, "__all__", None) or [name for name in vars(module) if name[0] != "_"]
+        for name in names:
+            value: Any = getattr(module, name, None)
+            if isinstance(value, type) and issubclass(value, KINDS[kind]):
+                cls = cast("type[Node[Any]]", value)
+                if f"{cls.__module__}.".startswith(f"{module.__name__}.") and _is_usable(cls):
+                    found.setdefault(cls, f"{module.__name__}.{name}")
+    return {path: cls for cls, path in sorted(found.items(), key=lambda item: item[1])}
+
+
+def _public_modules(package: str) -> Iterator[ModuleType]:
+    """A package's modules from which configurations may take classes: the packages within, and stages/x.py."""
+    parent = _imported(package)
+    for info in pkgutil.iter_modules(parent.__path__, f"{package}.") if parent else ():
+        if not info.ispkg and package != "stages":
+            continue
+        module = _imported(info.name)
+        if module is not None:
+            yield module
+        if info.ispkg:
+            yield from _public_modules(info.name)
+
+
+def _imported(name: str) -> ModuleType | None:
+    try:
+        return importlib.import_module(name)
+    except Exception:  # noqa: BLE001 - whatever a driver's library raises
+        return None
+
+
+def _is_usable(cls: type[Node[Any]]) -> bool:
+    """Whether a node of this class does anything as it is: a base class of others has no ports."""
+    try:
+        return bool(issubclass(cls, Tap) or input_ports(cls) or output_ports(cls))
+    except PortError:
+        return False

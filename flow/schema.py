@@ -8,10 +8,9 @@ Source: ours; JSON Schema draft 2020-12.
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
-from flow.classes import HOMES, KINDS, known_classes
+from flow.classes import KINDS, known_classes
 from flow.edge import MAX_DEADLINE_MS, MAX_DEPTH, POLICIES
 from flow.graph import TOP_LEVEL
 from flow.node_spec import NEEDED
@@ -50,7 +49,7 @@ _OF_STAGES = {"thread": _THREAD, "process": _PROCESS, "yields": _YIELDS}
 def schema() -> dict[str, Any]:
     """The schema of a configuration file with all stages and links that the home packages hold."""
     definitions: dict[str, Any] = {"edge": _ANY_EDGE}
-    sections = {kind: _section(kind, definitions) for kind in HOMES}
+    sections = {kind: _section(kind, definitions) for kind in KINDS}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "grd configuration",
@@ -70,12 +69,7 @@ def schema() -> dict[str, Any]:
 
 
 def _section(kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
-    classes: dict[str, type[Node]] = {}
-    for use in known_classes(kind):
-        module, _, name = use.rpartition(".")
-        cls = getattr(importlib.import_module(module), name, None)
-        if isinstance(cls, type) and issubclass(cls, KINDS[kind]):
-            classes[use] = cls
+    classes = known_classes(kind)
     node: dict[str, Any] = {
         "type": ["object", "null"],
         "additionalProperties": False,

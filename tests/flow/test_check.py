@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 
+from flow.classes import known_classes
 from flow.graph import Graph, load_graph
 from flow.problem import ConfigError, Place
 from tests.flow.toys import GRAPH
@@ -227,6 +229,20 @@ def test_a_file_that_is_no_configuration(content, text, tmp_path):
     with pytest.raises(ConfigError) as caught:
         load_graph(tmp_path / "x.yaml")
     assert text in str(caught.value)
+
+
+def test_a_driver_that_cannot_be_imported_is_suggested_no_more_and_all_others_are(monkeypatch):
+    before = known_classes("links")
+    for name in [name for name in sys.modules if name == "links.camera" or name.startswith("links.camera.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "links.camera", None)  # importing it raises ImportError
+    assert before.keys() - known_classes("links").keys() == {"links.camera.Camera"}
+
+
+def test_a_class_that_only_the_engine_makes_is_not_suggested():
+    classes = known_classes("links")
+    assert classes["links.velodyne.Lidar"].__name__ == "Lidar"
+    assert not [path for path in classes if path.startswith("links.zenoh.")]  # a hosts file makes these
 
 
 def test_set_changes_a_setting_by_the_stages_name(tmp_path):

@@ -3,7 +3,7 @@
 A partition (`Graph.partitions`) needs nothing but its own records. Its process receives them before their turn and
 sends back what each of them gave; the runner (`flow.replay`) takes that in at the position of those steps. Outputs,
 order and errors are those of a replay in one process, however fast or slow each process is. What is sent ahead of its
-turn, and so what waits for the runner, is bounded (MOST_RECORDS, MOST_BYTES).
+turn, and so what waits for the runner, is bounded (MAX_RECORDS, MAX_BYTES).
 
 Processes, not threads: half of the work, that of the LiDAR, is many short numpy calls, which hold Python's lock.
 A message is sent back only where a tap or a node of another process takes it. The process hashes its outputs itself.
@@ -22,13 +22,13 @@ from types import TracebackType
 from flow.graph import Graph
 from flow.link import LinkError, Record, Source, Tap
 from flow.ports import RemoteError, RunError
-from flow.remote_nodes import PartitionReport, Refusal, RemoteFailure, RemoteOutputs
-from flow.replay import Replay, RunReport, modules_at_rest, replay
-from flow.stage_process import RemotePartition, WorkerProcess
-from flow.stage_wire import END, FAILED, FINISH, RECORDS, REPORT, TIME, Answer, record_bytes
+from flow.remote.nodes import PartitionReport, Refusal, RemoteFailure, RemoteOutputs
+from flow.remote.stage_process import RemotePartition, WorkerProcess
+from flow.remote.stage_wire import TIME, Answer, Reply, Request, record_bytes
+from flow.replay import Replay, RunReport, gc_frozen, replay
 from flow.taps import Digest
 
-MOST_RECORDS, MOST_BYTES = 1024, 32 * 2**20  # that are sent ahead of their turn
+MAX_RECORDS, MAX_BYTES = 1024, 32 * 2**20  # that are sent ahead of their turn
 BATCH_RECORDS, BATCH_BYTES = 16, 2**18  # records that are sent together
 
 
@@ -44,7 +44,7 @@ def replay_in_subprocesses(
     partitions = graph.partitions()
     if not partitions:
         return replay(graph, records, taps, strict=strict)
-    with modules_at_rest(), _Partitions(graph, partitions, taps, strict) as remote:
+    with gc_frozen(), _Partitions(graph, partitions, taps, strict) as remote:
         runner = Replay(graph, taps, strict=strict, remote=remote)
         for record in remote.sent_ahead(records):
             runner.feed(record)
@@ -52,7 +52,7 @@ def replay_in_subprocesses(
 
 
 class _Partitions:
-    """All partitions, as the runner asks them: `flow.remote_nodes.RemoteNodes`."""
+    """All partitions, as the runner asks them: `flow.remote.nodes.RemoteNodes`."""
 
     def __init__(self, graph: Graph, partitions: Sequence[frozenset[str]], taps: Sequence[Tap], strict: bool) -> None:
         self.nodes = frozenset[str]().union(*partitions)
@@ -64,7 +64,7 @@ class _Partitions:
             if (name, message) in taken or any(tap.wants(message) for tap in others)
         ]
         digest = len(others) < len(taps)
-        self._partitions = [_Partition(graph.part(nodes), wanted, digest, strict) for nodes in partitions]
+        self._partitions = [_Partition(graph.restricted_to(nodes), wanted, digest, strict) for nodes in partitions]
         self._by_topic = {topic: partition for partition in self._partitions for topic in partition.topics}
         self._by_node = {name: partition for partition in self._partitions for name in partition.graph.nodes}
         self.topics = frozenset(self._by_topic)
@@ -91,7 +91,7 @@ class _Partitions:
         source, waiting = iter(records), deque[tuple[Record, int]]()
         waiting_bytes, ended, failure = 0, False, None
         while True:
-            while not ended and len(waiting) < MOST_RECORDS and waiting_bytes < MOST_BYTES:
+            while not ended and len(waiting) < MAX_RECORDS and waiting_bytes < MAX_BYTES:
                 try:
                     record = next(source, None)
                 except Exception as error:  # noqa: BLE001 - raised in its turn
@@ -121,20 +121,20 @@ class _Partitions:
     def end(self, last_ns: int) -> list[Refusal]:
         """See `RemoteNodes`."""
         for partition in self._partitions:
-            partition.send(END, TIME.pack(last_ns))
+            partition.send(Request.END, TIME.pack(last_ns))
         heads = [partition.answer().head for partition in self._partitions]
         return [Refusal(arrival_ns, LinkError(text)) for head in heads for arrival_ns, text in head["refusals"]]
 
     def finish(self, node: str) -> RemoteOutputs:
         """See `RemoteNodes`."""
         partition = self._by_node[node]
-        partition.send(FINISH)
+        partition.send(Request.FINISH)
         return partition.outputs()
 
     def reports(self) -> list[PartitionReport]:
         """See `RemoteNodes`."""
         for partition in self._partitions:
-            partition.send(REPORT)
+            partition.send(Request.REPORT)
         return [PartitionReport.of_json(partition.answer().head) for partition in self._partitions]
 
 
@@ -176,12 +176,12 @@ class _Partition:
     def outputs(self) -> RemoteOutputs:
         """What the nodes gave for the next record, or as one finished. RunError: the process has ended."""
         answer = self._next()
-        return RemoteOutputs(self._remote.messages(answer), _failure(answer) if answer.kind == FAILED else None)
+        return RemoteOutputs(self._remote.messages(answer), _failure(answer) if answer.kind == Reply.FAILED else None)
 
     def answer(self) -> Answer:
         """The answer to another request than records. Raises what a node raised."""
         answer = self._next()
-        if answer.kind == FAILED:
+        if answer.kind == Reply.FAILED:
             failure = _failure(answer)
             raise failure.error from failure.cause
         return answer
@@ -196,7 +196,7 @@ class _Partition:
 
     def _flush(self) -> None:
         if self._batch:
-            self._remote.send(RECORDS, *self._batch)
+            self._remote.send(Request.RECORDS, *self._batch)
             self._batch, self._batch_bytes = [], 0
 
 

@@ -61,7 +61,7 @@ def test_stages_called_by_hand(benchmark):
 
 def test_stages_in_the_engine(benchmark, graph):
     report = benchmark.pedantic(by_engine, (graph,), rounds=15, warmup_rounds=2)
-    assert report.events == EVENTS + 2  # and a finish for each stage
+    assert report.steps == EVENTS + 2  # and a finish for each stage
 
 
 def test_stages_in_the_engine_with_the_hash_of_every_message(benchmark, graph):

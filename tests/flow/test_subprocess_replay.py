@@ -33,13 +33,13 @@ class SlowSettings(Settings):
     """Settings of `Slow`."""
 
     longest_s: float = Field(0.0, ge=0)
-    dies_at: float | None = None
+    killed_at: float | None = None
     raises_at: float | None = None
-    lies_at: float | None = None
+    undeclared_at: float | None = None
 
 
 class Slow(Stage[SlowSettings]):
-    """Gives a number on, and its negative, after a random while; remembers how many there were."""
+    """Passes a number on, and its negative, after a random delay; counts them."""
 
     def __init__(self, settings: SlowSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -49,13 +49,13 @@ class Slow(Stage[SlowSettings]):
         settings = self.settings
         if settings.longest_s:
             time.sleep(random.random() * settings.longest_s)
-        if number.value == settings.dies_at:
+        if number.value == settings.killed_at:
             os.kill(os.getpid(), signal.SIGKILL)
         yield Number(stamp_ns=number.stamp_ns, value=number.value + self._count)
         if number.value == settings.raises_at:
-            raise ZeroDivisionError("asked to")
-        if number.value == settings.lies_at:
-            yield Text(stamp_ns=0, words="not promised")  # type: ignore[misc]
+            raise ZeroDivisionError("on request")
+        if number.value == settings.undeclared_at:
+            yield Text(stamp_ns=0, words="not declared")  # type: ignore[misc]
         yield Number(stamp_ns=number.stamp_ns, value=-number.value)
         self._count += 1
 
@@ -86,7 +86,7 @@ class LogSettings(Settings):
 
 
 class Log(Tap[LogSettings]):
-    """Keeps what it sees, in order; of some kinds of messages only, if so asked."""
+    """Keeps its messages in order; of one type only, if `only` is set."""
 
     def __init__(self, settings: LogSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -138,7 +138,7 @@ def setting(stage: str, text: str) -> tuple[str, str]:
 
 
 def records(count: int, seed: int = 0) -> list[Record]:
-    """Of all topics in a random order, also several at one time, and of one that nobody takes."""
+    """Records of all topics in random order, some at equal times, and of one topic that no source takes."""
     draw = random.Random(seed)
     topics = ("/numbers", "/numbers2", "/words", "/nobody")
     made = [(draw.choice(topics), 1000 + 10 * (i // 3), i) for i in range(count)]
@@ -146,12 +146,12 @@ def records(count: int, seed: int = 0) -> list[Record]:
 
 
 def ran(run, graph, given, **kwargs):
-    """(hash, what a tap saw in order, report without times) of a run."""
+    """(hash, messages of a tap in order, report without times) of a run."""
     digest, log = Digest(), Log()
     report = run(graph, given, (digest, log), **kwargs)
-    told = (report.records, report.first_ns, report.last_ns, report.events, report.messages, report.unwired_topics)
+    counts = (report.records, report.first_ns, report.last_ns, report.steps, report.messages, report.unwired_topics)
     calls = {name: node.calls for name, node in report.nodes.items()}
-    return digest.hexdigest(), log._seen, (*told, calls, report.counters, [str(i) for i in report.incidents])
+    return digest.hexdigest(), log._seen, (*counts, calls, report.counters, [str(i) for i in report.events])
 
 
 def test_a_partition_is_a_stage_with_all_that_feeds_it_and_partitions_that_share_a_node_are_one(tmp_path):
@@ -175,10 +175,8 @@ def test_with_both_fisheyes_the_images_of_each_camera_have_a_partition():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_outputs_their_order_and_the_report_are_those_of_one_process_whatever_takes_how_long(
-    tmp_path, seed, monkeypatch
-):
-    monkeypatch.setattr(subprocess_replay, "MOST_RECORDS", 40)
+def test_outputs_their_order_and_the_report_are_those_of_one_process_at_any_speed(tmp_path, seed, monkeypatch):
+    monkeypatch.setattr(subprocess_replay, "MAX_RECORDS", 40)
     monkeypatch.setattr(subprocess_replay, "BATCH_RECORDS", 1 + 3 * seed)
     given = records(400, seed)
     wanted = ran(replay, graph_of(tmp_path), given)
@@ -199,9 +197,9 @@ def test_an_empty_recording_runs_to_its_end(tmp_path):
     assert ran(replay_in_subprocesses, graph_of(tmp_path), []) == ran(replay, graph_of(tmp_path), [])
 
 
-@pytest.mark.parametrize("how", ["raises_at", "lies_at"])
+@pytest.mark.parametrize("how", ["raises_at", "undeclared_at"])
 @pytest.mark.parametrize("stage", ["near", "far", "home"])
-def test_a_stage_that_raises_does_so_in_its_turn_with_the_same_words(tmp_path, how, stage):
+def test_an_exception_of_a_stage_comes_in_its_turn_with_the_same_text(tmp_path, how, stage):
     graph, given = graph_of(tmp_path, setting(stage, f"{how}: 205")), records(400, 3)
     given = [Record("/numbers2" if stage == "far" else "/numbers", r.arrival_ns, r.stamp_ns, r.data, r.sequence)
              if r.data == b"205" else r for r in given]  # fmt: skip
@@ -219,14 +217,14 @@ def test_a_stage_that_raises_does_so_in_its_turn_with_the_same_words(tmp_path, h
     assert stage in seen[0][0]
 
 
-def test_a_process_that_dies_is_named_with_the_signal(tmp_path):
-    graph = graph_of(tmp_path, setting("far", "dies_at: 7"))
+def test_a_process_that_is_killed_is_named_with_the_signal(tmp_path):
+    graph = graph_of(tmp_path, setting("far", "killed_at: 7"))
     given = [Record("/numbers2", 1000 + i, i, str(i).encode(), i) for i in range(2000)]
     with pytest.raises(RunError, match=r"^the process 'far' has ended by signal 9 \(Killed\): is there enough memory"):
         replay_in_subprocesses(graph, given)
 
 
-def test_what_a_source_refuses_is_told_and_one_that_refuses_all_ends_the_replay(tmp_path, monkeypatch):
+def test_refused_records_are_reported_and_a_source_that_refuses_all_ends_the_replay(tmp_path, monkeypatch):
     given = records(60, 1)
     some = [
         Record(r.topic, r.arrival_ns, r.stamp_ns, b"refuse" if i % 7 == 0 else r.data, i) for i, r in enumerate(given)
@@ -237,14 +235,14 @@ def test_what_a_source_refuses_is_told_and_one_that_refuses_all_ends_the_replay(
     every = [Record("/numbers2", 1000 + i, i, b"refuse", i) for i in range(9)]
     with pytest.raises(LinkError, match=r"^no numbers here: is the counter plugged in\?$"):
         replay_in_subprocesses(graph_of(tmp_path), every)
-    monkeypatch.setattr("flow.replay.HOPELESS", 3)
+    monkeypatch.setattr("flow.replay.MAX_REFUSALS", 3)
     log = Log()
     with pytest.raises(LinkError, match="no numbers here"):
         replay_in_subprocesses(graph_of(tmp_path), [*every[:3], *given], (log,))
     assert not log._seen
 
 
-def test_a_recording_that_cannot_be_read_on_ends_the_replay_after_what_was_read(tmp_path):
+def test_a_read_error_of_the_recording_ends_the_replay_after_the_records_before_it(tmp_path):
     def broken():
         yield from records(90, 2)
         raise LinkError("the disk is gone")
@@ -259,7 +257,7 @@ def test_a_recording_that_cannot_be_read_on_ends_the_replay_after_what_was_read(
     assert len(seen[0]) > 200
 
 
-def test_a_tap_that_cannot_work_ends_a_replay_and_its_processes(tmp_path):
+def test_a_tap_that_raises_ends_a_replay_and_its_processes(tmp_path):
     class Broken(Tap):
         def see(self, output: str, message: Message, arrival_ns: int) -> None:
             raise LinkError("full")
@@ -274,9 +272,9 @@ def children() -> set[int]:
     return {child.pid or 0 for child in multiprocessing.active_children()}
 
 
-def test_no_more_than_so_many_records_and_bytes_are_sent_ahead_of_their_turn(tmp_path, monkeypatch):
-    monkeypatch.setattr(subprocess_replay, "MOST_RECORDS", 50)
-    monkeypatch.setattr(subprocess_replay, "MOST_BYTES", 1000)
+def test_records_and_bytes_sent_ahead_of_their_turn_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(subprocess_replay, "MAX_RECORDS", 50)
+    monkeypatch.setattr(subprocess_replay, "MAX_BYTES", 1000)
     taken = 0
 
     class Watch(Tap):
@@ -296,7 +294,7 @@ def test_no_more_than_so_many_records_and_bytes_are_sent_ahead_of_their_turn(tmp
         assert most - 5 <= max(sources) <= most
 
 
-def test_a_message_crosses_only_where_it_is_taken(tmp_path, monkeypatch):
+def test_only_messages_that_are_taken_are_sent_back(tmp_path, monkeypatch):
     received: list[tuple[str, Message | None]] = []
     outputs = subprocess_replay._Partition.outputs
 

@@ -10,8 +10,8 @@ import pytest
 from fast_loop import GRAPH
 from typer.testing import CliRunner
 
+from flow.config_error import ConfigError
 from flow.link import LinkError
-from flow.problem import ConfigError
 from links.cli.app import app
 from links.recording import RecordingReader
 from links.run_folder import Asked

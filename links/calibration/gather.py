@@ -21,8 +21,8 @@ from links.dynamixel.servo import TICK_RAD
 from links.recording import Progress, Session
 from links.vehicle_odometry import VehicleOdometry
 from links.velodyne import Lidar, flown_lidars
-from stages.calibration.looks import Returns, ServoTrace
-from stages.geometry import LidarMount
+from stages.calibration.scan_passes import Returns, ServoTrace
+from stages.geometry.frames import LidarMount
 from stages.messages import LidarFirings
 
 MOST_RETURNS = 300_000  # more add seconds and no accuracy: firing sequences are left out evenly

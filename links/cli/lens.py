@@ -14,7 +14,7 @@ import yaml
 from flow.link import LinkError
 from links.cli.console import in_words, out
 from links.cli.files import Overwrite
-from stages.lens_files import CalibratedLens, LensFileError, lens_from_kalibr, lens_from_ocamcalib
+from stages.geometry.lens_files import CalibratedLens, LensFileError, lens_from_kalibr, lens_from_ocamcalib
 from stages.messages import Carrier
 
 MAX_BYTES = 1_000_000

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stages.geometry import Array64, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
+from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
 
 FLIP = np.array([1.0, -1.0, -1.0])
 F_AND_F = np.outer(FLIP, FLIP)  # F M F is M times this, number by number

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from links.preflight.verdict import Verdict, fail, ok
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 from stages.messages import DroneAttitude, DroneOdometry
 
 ENOUGH_RAD = np.radians(15.0)

@@ -24,7 +24,7 @@ from flow.message import Message
 from links.preflight.axes import Agreement, compare, compare_paths
 from links.preflight.heard import AllHeard
 from links.preflight.verdict import Verdict, fail, ok, warning
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 from stages.messages import (
     DroneAttitude,
     DroneFix,

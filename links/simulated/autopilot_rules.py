@@ -19,7 +19,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.simulated.mesh import Array64
-from stages.geometry import rotation_from_quaternion_xyzw, rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_quaternion_xyzw, rotation_from_rpy_deg
 
 mavlink: Any = ardupilotmega
 

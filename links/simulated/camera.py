@@ -25,8 +25,8 @@ from links.simulated.camera_view import PixelRays, Shutter, View, mean_radiance,
 from links.simulated.mesh import Array64, Mesh, RayScene
 from links.simulated.scene import Scene
 from links.simulated.weather import Weather
-from stages.geometry import Pose, Vector3, quaternions_xyzw, rotation_from_rpy_deg
-from stages.lens import Equidistant, KannalaBrandt, Lens, OCam
+from stages.geometry.frames import Pose, Vector3, quaternions_xyzw, rotation_from_rpy_deg
+from stages.geometry.lens import Equidistant, KannalaBrandt, Lens, OCam
 
 LOOKS_UP = Pose(rpy_deg=(0.0, 0.0, 90.0))  # the image's top is forward, its right is left
 LOOKS_DOWN_RPY_DEG = (180.0, 0.0, -90.0)  # the image's top is forward, its right is right

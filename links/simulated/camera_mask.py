@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from links.simulated.mesh import Mesh, RayScene
-from stages.geometry import Pose
-from stages.lens import Lens
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Lens
 
 GRID = 360  # rays across the picture
 REACH_M = 5.0

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from links.simulated.camera_sky import LOWEST_SKY_DEG, SKY_PX, Light, cloud_noise
 from links.simulated.mesh import SURFACES, Array32, Array64, Mesh
 from links.simulated.world import SceneSettings
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 _PLAIN, _BRICK, _RENDERED, _GLASS, _ROAD, _SLABS, _LEAF, _PAINT, _GRASS = range(9)
 

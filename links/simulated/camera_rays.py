@@ -17,7 +17,7 @@ from links.simulated.camera_paint import Faces, Street, faces_of, radiance
 from links.simulated.camera_sky import Light
 from links.simulated.mesh import SURFACES, Array32, Array64, Mesh, RayScene
 from links.simulated.scene import Body
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 FAR_M = 400.0
 SHADOW_REACH_M = 120.0

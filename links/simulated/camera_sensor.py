@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from links.simulated.mesh import Array32, Array64
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 GREY = 0.22  # where auto exposure puts the mean, of saturation
 ELECTRONS_PER_S = 1e7  # of radiance 1, white in full sun: full well in 1 ms

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from links.simulated.camera_rays import WORLD, CameraScene, Samples, edges, image_motion
 from links.simulated.mesh import Array32, Array64
-from stages.compiled import compiled
-from stages.lens import Equidistant, KannalaBrandt, OCam
+from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
+from stages.kernels.compiled import compiled
 
 BATCH_RAYS = 262_144
 FEW, MANY = 3, 16  # further rays through a pixel that needs them

@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from links.simulated.mesh import Array64
 from links.simulated.path import DRAG_PER_S, GRAVITY_MPS2, Path
 from links.simulated.series import between_steps, gauss_markov
-from stages.compiled import compiled
-from stages.geometry import quaternions_xyzw, rotations_from_xyzw
+from stages.geometry.frames import quaternions_xyzw, rotations_from_xyzw
+from stages.kernels.compiled import compiled
 
 STEP_S = 1 / 400
 BEYOND_S = 1.0  # the flight goes on this long after the scenario: sensors look a little ahead

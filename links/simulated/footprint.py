@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from links.simulated.mesh import Array32, Array64
 from links.velodyne import vlp16
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 ELEVATION_RAD = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))
 VERTICAL_OFFSET_M = 1e-3 * np.array(vlp16.VERTICAL_OFFSET_MM)

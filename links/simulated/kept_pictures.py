@@ -33,7 +33,7 @@ from links.simulated.mesh import Array64, Mesh
 from links.simulated.scenario import Scenario
 from links.simulated.scene import Truth
 from links.simulated.world import World, build_world
-from stages.geometry import quaternions_xyzw
+from stages.geometry.frames import quaternions_xyzw
 
 NEAR_M = 1e-3  # the same place, on whichever computer
 NEAR_QUATERNION = 1e-4

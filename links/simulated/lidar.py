@@ -26,7 +26,7 @@ from links.simulated.footprint import (
 from links.simulated.mesh import Array32, Array64
 from links.simulated.weather import RainClutter, Weather
 from links.velodyne import vlp16
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 RANGE_STEP_M = 1e-3 * vlp16.RANGE_UNIT_MM
 PULSE_LENGTH_M = 1.0  # two surfaces closer than this in range give one, blended return

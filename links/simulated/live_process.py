@@ -30,6 +30,7 @@ from links import host_time
 from links.mavlink.profiles import ARDUPILOT
 from links.mavlink.stream import ARMED
 from links.recording import RecordingWriter
+from links.runs.truth import TRUTH_RECORDING
 from links.simulated.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot import Autopilot
 from links.simulated.autopilot_socket import AutopilotSocket
@@ -44,7 +45,6 @@ from links.simulated.scenario import Scenario, load_scenario
 from links.simulated.vehicle_odometry import VehicleOdometry
 from links.simulated.vlp16_packets import firings_per_packet
 from links.simulated.vlp16_position import encode_position
-from links.truth import TRUTH_RECORDING
 from links.velodyne import vlp16
 
 WARM_PACKETS = 75  # a turn of the rotor

@@ -21,14 +21,14 @@ from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, LinkError
 from flow.ports import RunError
 from links.recording import RecordingReader
-from links.run_folder import Asked, RunFolder, holds_run, replay_into
+from links.runs.run_folder import Asked, RunFolder, holds_run, replay_into
+from links.runs.truth import TruthLog
 from links.simulated.closed_loop import ClosedLoop, made_with, servo_edge
 from links.simulated.jobs import run_all
 from links.simulated.matrix import Conditions, scenario_of
 from links.simulated.matrix_flights import Cell
 from links.simulated.run import simulate_into
 from links.simulated.scenario import Scenario
-from links.truth import TruthLog
 
 VIEWER = "links.viewer.Viewer"
 PLAIN = Cell("open_lot", 20, "hover", "parked")  # the rig is the same in all cells with a drone

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flow.link import LinkError
-from stages.compiled import compiled
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
 
 try:
     from embreex.mesh_construction import TriangleMesh

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.interpolate import CubicSpline
 
 from links.simulated.mesh import Array64
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 GRAVITY_MPS2 = 9.81
 DRAG_PER_S = 0.3  # drag acceleration per speed of a small quadrotor

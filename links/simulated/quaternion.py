@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from links.simulated.mesh import Array64
-from stages.geometry import rotations_from_xyzw
+from stages.geometry.frames import rotations_from_xyzw
 
 
 def rotations_from_vectors(vectors_rad: Array64) -> Array64:

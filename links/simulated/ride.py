@@ -19,7 +19,7 @@ from links.simulated.mesh import Array64
 from links.simulated.path import Path, rotations_z
 from links.simulated.quaternion import rotations_from_vectors
 from links.simulated.series import between_steps, gauss_markov
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 STEP_S = 0.0025
 BEYOND_S = 1.0

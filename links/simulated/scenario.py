@@ -29,7 +29,7 @@ from links.simulated.vehicle import vehicle_mesh_from_camera
 from links.simulated.vehicle_odometry import VehicleOdometrySettings
 from links.simulated.weather import Weather
 from links.simulated.world import SceneSettings
-from stages.geometry import LidarMount, Pose
+from stages.geometry.frames import LidarMount, Pose
 
 CLEARANCE_M = 0.3  # a path may not come nearer to the road
 WHEELS_M = 0.15  # a vehicle bounces on its springs by no more

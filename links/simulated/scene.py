@@ -20,7 +20,7 @@ from links.simulated.mesh import Array32, Array64, Mesh, RayScene
 from links.simulated.movers import Mover
 from links.simulated.path import Path
 from links.simulated.ride import Ride
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 ROTOR_HZ = 95.0
 ROTOR_STEPS = 8  # standing positions of the blades within half a turn

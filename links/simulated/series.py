@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from links.simulated.mesh import Array64
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 
 def between_steps(rows: Array64, step_s: float, time_s: Array64) -> Array64:

@@ -19,7 +19,7 @@ from links.simulated.clearance import visible
 from links.simulated.lidar import Pulses
 from links.simulated.mesh import Array64, RayScene
 from links.simulated.scene import Truth
-from stages.geometry import quaternions_xyzw
+from stages.geometry.frames import quaternions_xyzw
 
 POSE_PERIOD_NS = 10_000_000
 SIGHT_PERIOD_NS = 50_000_000

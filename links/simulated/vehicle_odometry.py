@@ -17,7 +17,7 @@ from flow.link import Record
 from links.simulated.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.path import Path
 from links.simulated.ride import Ride
-from stages.geometry import quaternions_xyzw
+from stages.geometry.frames import quaternions_xyzw
 
 NS = 1_000_000_000
 

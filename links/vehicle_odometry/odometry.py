@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.vehicle_odometry.udp import listen_udp
-from stages.geometry import Array64, rotation_from_quaternion_xyzw
+from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw
 from stages.messages import VehicleMotion
 
 MAX_BYTES = 4_000

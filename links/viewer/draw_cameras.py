@@ -18,7 +18,7 @@ from links.viewer import colours
 from links.viewer.lenses import arcs, pixels_of, strips
 from links.viewer.marks import Marks, lane_of, plot, say, stage_of, state, strip_batch
 from links.viewer.scene import Mark, Picture, Scene, sphere_frame
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 from stages.messages import FollowedFeatures, Image, VanishingDirections
 
 PICTURE_PX = 480  # longer side of a picture in the viewer

@@ -13,7 +13,7 @@ import rerun as rr
 from links.viewer import colours
 from links.viewer.marks import Marks, clear, lane_of, plot, say, stage_of, state
 from links.viewer.scene import DRONE_FRAME, Mark, Scene, drone_sphere, sphere_frame
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 from stages.messages import BranchState, Carrier, DroneMotion, RelativeRotation
 
 BRANCHES = ["as given", "turned by 90 deg", "by 180 deg", "by 270 deg", "none of them"]

@@ -1,6 +1,6 @@
 """The cameras as the viewer needs them, and great-circle arcs as strips: on the unit sphere, and through a lens.
 
-Source: ours; lenses: stages/lens.py; a line of the world is a great circle of rays, P IV.
+Source: ours; lenses: stages/geometry/lens.py; a line of the world is a great circle of rays, P IV.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.geometry import Array64, Pose
-from stages.lens import Lens
+from stages.geometry.frames import Array64, Pose
+from stages.geometry.lens import Lens
 from stages.messages import Carrier
 
 STEP_RAD = np.deg2rad(4.0)  # between points of an arc; a fisheye bends it by less than a tenth of a pixel within that

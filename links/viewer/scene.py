@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from links.viewer import colours
 from links.viewer.lenses import Cameras
-from stages.geometry import Array64, LidarMount, rotation_z, transform
+from stages.geometry.frames import Array64, LidarMount, rotation_z, transform
 from stages.messages import Candidates, Carrier, DepthImage, DroneFix, TrackingState, TrackState
 
 TIMELINE = "sensor_time"

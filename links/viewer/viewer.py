@@ -27,7 +27,7 @@ from links.viewer.mailbox import Mailbox
 from links.viewer.scene import Mark, Scene, drone_sphere, opening, scenery, spheres
 from links.viewer.slices import Slicer
 from links.viewer.stream import LOOPBACK, Stream
-from stages.geometry import LidarMount
+from stages.geometry.frames import LidarMount
 from stages.messages import Carrier
 
 PATIENCE_S = 10.0  # a lossless run waits this long for a stalled viewer

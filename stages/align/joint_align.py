@@ -26,14 +26,15 @@ from typing import Any, ClassVar
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.align.answers import Answers
-from stages.align.by_motion import ByMotion, Prior
-from stages.align.lock import YawLock
+from stages.align.dead_reckoning import Reckoning
+from stages.align.innovation_gate import Surprise
+from stages.align.motion_branch import ByMotion, Prior
 from stages.align.pairing import Pair, Pairing
-from stages.align.reckoning import Reckoning
+from stages.align.publisher import Answers
 from stages.align.refine import Tolerances, refine, street_directions
 from stages.align.spectra import level_lines, spectrum
-from stages.align.surprise import Surprise
+from stages.align.yaw_tracker import YawLock
+from stages.heading.hypothesis_bank import BranchSettings
 from stages.messages import (
     Carrier,
     DroneAttitude,
@@ -45,7 +46,6 @@ from stages.messages import (
     VanishingDirections,
     VehicleMotion,
 )
-from stages.yaw_branches.bank import BranchSettings
 
 
 @dataclass

@@ -38,7 +38,7 @@ from stages.align.pairing import Pairing
 from stages.align.paper_correction import CorrectionRule, MotionCorrection
 from stages.align.paper_filter import RotationFilter
 from stages.align.paper_match import angle_between_rad, match
-from stages.geometry import Array64, rotation_z
+from stages.geometry.frames import Array64, rotation_z
 from stages.messages import (
     BranchState,
     Carrier,

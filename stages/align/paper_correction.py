@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.geometry.trajectory import VehicleTrail
+from stages.kernels.geometry.so3 import nearest_rotation
 from stages.messages import DroneFix, DroneMotion, VehicleMotion
-from stages.rotation import nearest_rotation
-from stages.trail import VehicleTrail
 
 KEPT = 256  # pictures, fixes, motions
 FIX_GAP_NS = 500_000_000  # between fixes further apart nothing is interpolated

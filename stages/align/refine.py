@@ -20,9 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.align.spectra import BIN_RAD, LevelLines
-from stages.geometry import Array64, rotation_z
-from stages.rotation import exp_rotation
+from stages.align.spectra import LevelLines
+from stages.geometry.frames import Array64, rotation_z
+from stages.kernels.align.spectra import BIN_RAD
+from stages.kernels.geometry.so3 import exp_rotation
 
 TILTS_AND_YAW = 5  # the first unknowns: tilt x, y of the vehicle, of the drone, yaw
 MOST_DIRECTIONS = 6

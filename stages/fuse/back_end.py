@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from stages.fuse.carried import Step
-from stages.geometry import Array64
+from stages.fuse.propagated import Step
+from stages.geometry.frames import Array64
 
 HUBER = 1.345  # beyond so many sigmas a residual's weight falls: 95 % efficient where all is Gaussian
 

@@ -17,9 +17,9 @@ from stages.fuse.correlated import Worth, inflation
 from stages.fuse.positions import GATE, Positions
 from stages.fuse.rejected import Rejected
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64, heading_rad
-from stages.rigid import carried_covariance, distance2, position_covariance
-from stages.rotation import log_rotation
+from stages.geometry.frames import Array64, heading_rad
+from stages.geometry.se3 import carried_covariance, distance2, position_covariance
+from stages.kernels.geometry.so3 import log_rotation
 
 PERIOD_NS = 100_000_000  # of the chain's poses
 

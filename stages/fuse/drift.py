@@ -26,7 +26,7 @@ import math
 import numpy as np
 
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 START_MPS = 1.0  # a tracker's velocity, one sigma
 UNKNOWN_MPS = 6.0  # nobody's

@@ -17,10 +17,10 @@ import math
 import numpy as np
 
 from stages.fuse.back_end import HUBER
-from stages.fuse.carried import Step
-from stages.geometry import Array64
-from stages.rigid import carried_covariance
-from stages.rotation import exp_rotation, hat, log_rotation
+from stages.fuse.propagated import Step
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import carried_covariance
+from stages.kernels.geometry.so3 import exp_rotation, hat, log_rotation
 
 
 class Ekf:

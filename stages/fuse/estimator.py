@@ -16,17 +16,17 @@ import math
 import numpy as np
 
 from stages.fuse.back_end import BackEnd
+from stages.fuse.branch_check import Witness
 from stages.fuse.chain import PERIOD_NS, Chain
-from stages.fuse.motion_yaw import DOUBT, Point
 from stages.fuse.motions import WAIT_NS, Motions
-from stages.fuse.north import North
 from stages.fuse.positions import GATE, Positions, Told
 from stages.fuse.settings import FuseErrors, FuseLimits
-from stages.fuse.witness import Witness
-from stages.fuse.yaw import apart_rad
-from stages.geometry import Array64, heading_rad, rotation_z
+from stages.geometry.frames import Array64, heading_rad, rotation_z
+from stages.geometry.se3 import distance2, position_covariance
+from stages.heading.motion_yaw import DOUBT, Point
+from stages.heading.odometry_yaw import North
+from stages.heading.yaw_fit import apart_rad
 from stages.messages import DroneAttitude, DroneFix, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
-from stages.rigid import distance2, position_covariance
 
 LEAST_MPS = 0.5  # slower, a camera's direction of flight says nothing
 BRANCH_RAD, BRANCHES = math.radians(30.0), 3  # so many rotations in a row so far off are another branch

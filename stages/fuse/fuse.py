@@ -30,12 +30,13 @@ from stages.fuse.back_end import BackEnd
 from stages.fuse.chain import yaw_sigma_rad
 from stages.fuse.ekf import Ekf
 from stages.fuse.estimator import Estimator
-from stages.fuse.following import Following
 from stages.fuse.intake import Intake
+from stages.fuse.measurement_covariance import Known, Verdict, lost, pose
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
-from stages.fuse.told import Known, Verdict, lost, pose
-from stages.fuse.verdict import Jumps, state_of, why_unbacked
+from stages.fuse.status import Jumps, state_of, why_unbacked
+from stages.fuse.track_continuity import Following
+from stages.geometry.se3 import position_covariance
 from stages.messages import (
     BranchState,
     DroneAttitude,
@@ -51,7 +52,6 @@ from stages.messages import (
     TrackState,
     VehicleMotion,
 )
-from stages.rigid import position_covariance
 
 GRID_NS = 20_000_000
 AMBIGUOUS_NS = 1_000_000_000  # a rotation up to quarter turns counts for so long

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.fuse.carried import Carrier
+from stages.fuse.propagated import Carrier
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.geometry.trajectory import VehicleTrail
 from stages.messages import VehicleMotion
-from stages.trail import VehicleTrail
 
 WAIT_NS = 350_000_000  # for an odometry that is late
 SOON_NS, VEHICLE_SOON_NS = 60_000_000, 200_000_000  # so far the drone's and the vehicle's are extrapolated instead

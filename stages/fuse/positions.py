@@ -13,15 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.fuse.carried import Step
 from stages.fuse.correlated import Worth
 from stages.fuse.drift import Drift
 from stages.fuse.motions import Motions
+from stages.fuse.propagated import Step
 from stages.fuse.rejected import Rejected
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import distance2
 from stages.messages import DroneFix
-from stages.rigid import distance2
 
 HELD_MPS = 0.1  # noise of the autopilot's velocity beside its drift, and of its age
 GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %

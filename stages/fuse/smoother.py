@@ -23,9 +23,9 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from stages.fuse.back_end import HUBER
-from stages.fuse.carried import Step
-from stages.geometry import Array64
-from stages.rigid import carried_covariance, good_covariance
+from stages.fuse.propagated import Step
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import carried_covariance, good_covariance
 
 RAISED = (RuntimeError, IndexError, ValueError)  # what GTSAM's wrapper makes of C++ exceptions
 FLOOR = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)  # a step of no length is known no better

@@ -1,4 +1,4 @@
-"""Every message of the method. Frames: see `stages/geometry.py`. In the order data flows:
+"""Every message of the method. Frames: see `stages/geometry/frames.py`. In the order data flows:
 
     sensors -> sweep -> drone;  sensors -> cameras;  autopilot;  all of them -> pose
 

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.lens import Array64, Lens
+from stages.geometry.lens import Array64, Lens
+from stages.kernels.vp.arcs import STEP_PX
 
 RIM_PX = 7  # the image circle's edge is no line of the world; more than the diagonal of a cell of the table
-STEP_PX = 4  # of the table of rays
 Polygon = tuple[tuple[float, float], ...]
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stages.lens import Array64
+from stages.geometry.lens import Array64
 from stages.messages import DroneAttitude
 
 KEPT = 100  # attitudes: one or two seconds

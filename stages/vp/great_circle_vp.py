@@ -20,10 +20,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.geometry import Pose
-from stages.lens import Array64, Lens
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Array64, Lens
+from stages.geometry.trajectory import VehicleTrail
 from stages.messages import Carrier, DroneAttitude, Image, VanishingDirections, VehicleMotion
-from stages.trail import VehicleTrail
 from stages.vp.arcs import fit_arcs
 from stages.vp.clustering import cluster
 from stages.vp.directions import lines_of

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.geometry import Array64
-from stages.lens import Equidistant, KannalaBrandt, OCam
+from stages.geometry.frames import Array64
+from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
 
 END_NOISE_PX = 0.5  # of a line's end, across the line
 RIM_PX = 6  # so near the edge of what the lens sees, a line is that edge

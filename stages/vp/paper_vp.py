@@ -27,11 +27,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.geometry import Array64, Pose
-from stages.lens import Lens
+from stages.geometry.frames import Array64, Pose
+from stages.geometry.lens import Lens
+from stages.kernels.vp.paper_vote import fullest, vote
 from stages.messages import Carrier, Image, VanishingDirections
 from stages.vp.paper_views import RectifiedView, ViewDirection, great_circles, segment_length_px
-from stages.vp.paper_vote import completed, fullest, most_orthogonal, vote
+from stages.vp.paper_vote import completed, most_orthogonal
 
 SEEN_AT_LEAST = 0.5  # of each view by the lens
 ON_DIRECTION_DEG = 2.0  # a line within this of a direction is counted as its

@@ -13,8 +13,8 @@ import pytest
 from stages.align import JointAlign, PaperAlign
 from stages.align.refine import Tolerances, refine, street_directions
 from stages.align.spectra import level_lines, overlap, peaks, spectrum
+from stages.heading.hypothesis_bank import ASKEW, BranchBank, BranchSettings, Displacement
 from stages.messages import Carrier
-from stages.yaw_branches.bank import ASKEW, BranchBank, BranchSettings, Displacement
 from tests.stages.align.made_joint_flight import START_NS, S
 from tests.stages.align.made_lines import ATLANTA, MANHATTAN, MS, seen, turned
 

@@ -15,11 +15,11 @@ import numpy as np
 import poselib
 import pytest
 
-from stages.ego import VehicleEgo
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import DroneMotion, Image
-from stages.odometry import FisheyeOdometry
-from stages.pictures.two_view import Noise, relative_motion
-from stages.rotation import exp_rotation, log_rotation
+from stages.odometry.drone import FisheyeOdometry
+from stages.odometry.vehicle import VehicleEgo
+from stages.odometry.visual.two_view import Noise, relative_motion
 from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, degrees_between, lidar_slice, of, picture, point_rays
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -18,14 +18,15 @@ import yaml
 from links.dynamixel import Servo
 from links.recording import RecordingReader
 from links.velodyne import Lidar
-from stages.depth_image import focal_length_px
 from stages.detect import EvidenceDetect, KernelDetect
-from stages.detect.kernel_score import inner_half_px, kernel_terms, score_image
-from stages.geometry import LidarMount
+from stages.detect.kernel_score import inner_half_px, score_image
+from stages.geometry.frames import LidarMount
+from stages.kernels.detect.kernel_score import kernel_terms
+from stages.kernels.track.mean_shift import mean_shift
 from stages.messages import Candidates, DepthImage, Detections, SweptPoints, SweptPulses
-from stages.sweep import Sweep
+from stages.sweep.depth_image import focal_length_px
+from stages.sweep.sweep import Sweep
 from stages.track import HitMissTrack, MeanShiftTrack
-from stages.track.mean_shift import mean_shift
 from tests.stages.made import MS, START_NS, depth_image, detections, street_depth, swept
 
 RECORDING = Path(__file__).resolve().parents[2] / "recordings" / "street_sweep.mcap"

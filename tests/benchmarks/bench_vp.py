@@ -26,8 +26,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.geometry import Pose
-from stages.lens import Equidistant, OCam
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Equidistant, OCam
 from stages.messages import Carrier, Image
 from stages.vp import GreatCircleVp, PaperVp
 

@@ -8,10 +8,10 @@ import math
 import cv2
 import numpy as np
 
-from stages.geometry import Pose
-from stages.lens import Equidistant, KannalaBrandt
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Equidistant, KannalaBrandt
+from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import Image, SweptPoints
-from stages.rotation import exp_rotation
 
 SIZE_PX = 400
 HALF_M = np.array([9.0, 7.0, 5.0])

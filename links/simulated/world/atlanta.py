@@ -12,7 +12,7 @@ from links.simulated.mesh import Array64, Mesh, box
 from links.simulated.world.parts import dashes, grove, house_row
 from links.simulated.world.settings import HALF_LENGTH_M, KERB_HEIGHT_M, Clear, SceneSettings
 from links.simulated.world.street import ground, parked_cars, poles_and_wires, road_marks, with_parking
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 
 FAMILIES = 4
 APART_DEG = 14.0  # two families, and a family and the road, differ by at least this

@@ -19,7 +19,7 @@ from links.simulated.world.open_scenes import campus, open_lot, park_edge
 from links.simulated.world.parts import car
 from links.simulated.world.settings import HALF_LENGTH_M, Clear, Kind, SceneSettings
 from links.simulated.world.street import manhattan, street
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 
 KINDS: dict[Kind, Callable[[SceneSettings, Clear, Generator], list[Mesh]]] = {
     "street": street,

@@ -25,7 +25,7 @@ from links.simulated.world.parts import (
 )
 from links.simulated.world.settings import HALF_LENGTH_M, KERB_HEIGHT_M, Clear, SceneSettings
 from links.simulated.world.street import ground, parked_cars, poles_and_wires, road_marks, with_parking
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 
 FAR = (-HALF_LENGTH_M, HALF_LENGTH_M)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.random import Generator
 
 from links.simulated.mesh import Array64, Mesh, box, merge, quads, rod
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 
 LEAST_M = 1e-6  # nothing is built that is shorter
 MARK_ABOVE_M = 0.004  # marks lie this far above the road, so that rays tell them apart

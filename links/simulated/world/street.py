@@ -13,7 +13,7 @@ from numpy.random import Generator
 from links.simulated.mesh import Mesh, box, merge, quads
 from links.simulated.world.parts import MARK_ABOVE_M, building, car, dashes, lamp_pole, strip, tree, wire
 from links.simulated.world.settings import HALF_LENGTH_M, KERB_HEIGHT_M, Clear, SceneSettings
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 
 PARKING_M = 2.2  # beside the carriageway, on each side
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[3]
 CONFIG = """\
 replay: drive.mcap
 stages:
-  motion: {use: stages.ego.VehicleMotionChoice, inputs: {odometry: odometry.vehicle_motion}}
+  motion: {use: stages.odometry.vehicle.VehicleMotionChoice, inputs: {odometry: odometry.vehicle_motion}}
 links:
   odometry: {use: links.vehicle_odometry.VehicleOdometry}
 """
@@ -70,7 +70,7 @@ def test_a_run_that_left_nothing_out_has_no_such_line(drive):
 
 LIDAR = """\
 stages:
-  motion: {use: stages.ego.VehicleMotionChoice, inputs: {odometry: odometry.vehicle_motion}}
+  motion: {use: stages.odometry.vehicle.VehicleMotionChoice, inputs: {odometry: odometry.vehicle_motion}}
 links:
   odometry: {use: links.vehicle_odometry.VehicleOdometry}
   front: {use: links.velodyne.Lidar, config: {clock: CLOCK}}

@@ -12,7 +12,7 @@ from flow.config.edge import Edge, QueueSettings
 from flow.live.report import EdgeCount, LinkReport, LiveReport, edge_report
 from flow.taps import Digest
 from links.cli.live_view import LiveView
-from links.live_run import Look
+from links.runs.live_run import Look
 from stages.messages import DroneFix, Image, PoseState, RelativePose, SweptPulses, TrackingState, TrackState
 
 

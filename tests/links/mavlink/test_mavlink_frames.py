@@ -19,7 +19,7 @@ from links.mavlink.frames import (
     velocity_covariance_from_upper,
     wxyz_from_R_local_drone,
 )
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 
 ATTITUDES = [(0, 0, 0), (10, -20, 30), (-5, 3, 179), (60, 40, -120), (170, 10, 90), (0, 89, 0), (180, 0, 180)]
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from links.mavlink.gate import Limits, Refusal, pose_sigmas, refusal
 from links.mavlink.speaker import PoseSpeaker
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import PoseState
 
 LIMITS = Limits()

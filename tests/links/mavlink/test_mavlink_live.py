@@ -32,7 +32,7 @@ from links.simulated.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot_rules import Fate
 from links.simulated.autopilot_socket import AutopilotSocket
 from links.simulated.px4_rules import Px4Rules
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import AutopilotEstimator, PoseState, RelativePose
 
 mavlink: Any = ardupilotmega

@@ -16,7 +16,7 @@ from links.mavlink.gate import Limits
 from links.mavlink.pose_frames import landing_target, odometry, quality_percent, vision_position_estimate
 from links.mavlink.readers import read_odometry
 from links.mavlink.wire import packed, parse_frame
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 
 mavlink: Any = ardupilotmega
 LIMITS = Limits()

@@ -32,7 +32,7 @@ from links import host_time
 from links.mavlink import Autopilot
 from links.mavlink.wire import packed, parse_frame
 from links.recording import RecordingReader, RecordingWriter
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 from stages.messages import PoseState, RelativePose
 from tests.links.ports import free_port
 

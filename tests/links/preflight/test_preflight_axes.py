@@ -19,7 +19,7 @@ from links.preflight.motion import (
     velocity_check,
 )
 from links.preflight.verdict import Level
-from stages.geometry import rotation_from_rpy_deg, rotation_z
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.messages import DroneAttitude, DroneFix, DroneImu, DroneLocalPosition, DroneOdometry, VehicleMotion
 
 RNG = np.random.default_rng(7)

@@ -20,7 +20,7 @@ from links.simulated.flight import Flight
 from links.simulated.path import GRAVITY_MPS2, Path, Waypoint
 from links.simulated.run import simulate_records
 from links.simulated.scenario import Scenario, load_scenario
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import AutopilotStatus, DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry
 from tests.links.simulated.test_simulated_drift import NO_DRIFT
 

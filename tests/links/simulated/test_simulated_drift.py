@@ -12,7 +12,12 @@ from links.simulated.path import Path, Waypoint, rotations_z
 from links.simulated.quaternion import rotations_from_vectors
 from links.simulated.series import between_steps, gauss_markov, random_walk
 from links.simulated.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
-from stages.geometry import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg, rotations_from_xyzw
+from stages.geometry.frames import (
+    quaternions_xyzw,
+    rotation_from_quaternion_xyzw,
+    rotation_from_rpy_deg,
+    rotations_from_xyzw,
+)
 
 NO_DRIFT = DriftSettings(
     scale=0,

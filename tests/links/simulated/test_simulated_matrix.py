@@ -33,8 +33,8 @@ from links.simulated.scenario import Scenario
 from links.simulated.servo import Turned
 from links.simulated.world import build_world
 from links.simulated.world.settings import Kind
-from stages.geometry import Pose
-from stages.rotation import log_rotation
+from stages.geometry.frames import Pose
+from stages.kernels.geometry.so3 import log_rotation
 
 LIDAR_UP = np.array([0.0, 0.0, 0.35])
 

@@ -14,7 +14,7 @@ from flow.config_error import ConfigError
 from flow.link import LinkError
 from links.cli.app import app
 from links.recording import RecordingReader
-from links.run_folder import Asked
+from links.runs.run_folder import Asked
 from links.simulated import matrix_flights, matrix_making
 from links.simulated.closed_loop import ClosedLoop, made_with
 from links.simulated.matrix import Conditions, cells, scenario_of

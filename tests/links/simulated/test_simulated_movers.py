@@ -10,7 +10,7 @@ from links.simulated.movers import FLAP_STEPS, Balloon, Bird, Car, balloon_mesh,
 from links.simulated.path import Path, Waypoint
 from links.simulated.scene import Scene, Truth
 from links.simulated.vehicle import vehicle_mesh
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 
 STILL = Path(waypoints=(Waypoint(t_s=0, xyz_m=(0, 0, -50)),))
 TIMES = np.arange(0.0, 60.0, 0.02)

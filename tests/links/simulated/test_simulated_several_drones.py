@@ -11,7 +11,8 @@ import pytest
 from pydantic import ValidationError
 
 from flow.link import LinkError, Record
-from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
+from links.runs.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
+from links.runs.truth import TruthLog
 from links.simulated import run
 from links.simulated.drone import DroneModel
 from links.simulated.lidar import echoes
@@ -22,7 +23,6 @@ from links.simulated.scenario import Scenario, load_scenario
 from links.simulated.scene import Scene, Truth, drone_shapes
 from links.simulated.truth_records import TruthRecords
 from links.simulated.vehicle import vehicle_mesh
-from links.truth import TruthLog
 from links.velodyne import Lidar
 
 STREET = FilePath(__file__).parents[3] / "configs/scenarios/street_sweep.yaml"

@@ -12,7 +12,7 @@ from links.simulated.scene import Body, Scene, Truth, drone_shapes, into_body
 from links.simulated.vehicle import vehicle_mesh
 from links.simulated.world import SceneSettings, world_mesh
 from links.simulated.world.parts import dashes, house_row
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 
 
 def _rays(origin, directions):

@@ -18,7 +18,7 @@ from links.simulated.path import Waypoint
 from links.simulated.vehicle_odometry import VehicleOdometry as Simulated
 from links.simulated.vehicle_odometry import VehicleOdometrySettings
 from links.vehicle_odometry import VehicleOdometry
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import VehicleMotion
 
 COVARIANCE = np.diag([1e-4, 1e-4, 4e-4, 0.01, 0.01, 0.04])

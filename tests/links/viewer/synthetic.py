@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from flow.message import Message
-from stages.geometry import LidarMount, Pose, rotation_z
+from stages.geometry.frames import LidarMount, Pose, rotation_z
 from stages.messages import (
     Candidates,
     DepthImage,

@@ -10,7 +10,7 @@ import synthetic
 
 from flow.message import Message
 from links.viewer.lenses import Cameras
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import BranchState, Carrier, DroneMotion, Image, RelativeRotation, VanishingDirections
 
 SIZE_PX = 720

@@ -11,7 +11,7 @@ from shown import drawn, numbers, page, scene
 
 from links.viewer.layout import Vision, layout
 from links.viewer.stream import Stream
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 from stages.messages import AutopilotEstimator, PoseState, RelativePose, ServoOffset
 
 NAME = "fuse/relative_pose"

@@ -13,7 +13,7 @@ from synthetic_vision import motion, rotation
 from links.viewer.draw import draw
 from links.viewer.draw_rotation import rpy_deg
 from links.viewer.layout import Vision, layout
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 from stages.messages import BranchState, DroneFix
 
 NAME = "align/relative_rotation"

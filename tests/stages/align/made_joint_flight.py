@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.align.joint_align import JointAlign
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import (
     BranchState,
     Carrier,
@@ -20,7 +21,6 @@ from stages.messages import (
     RelativeRotation,
     VehicleMotion,
 )
-from stages.rotation import exp_rotation, log_rotation
 from tests.stages.align.made_lines import MANHATTAN, seen
 
 S = 1_000_000_000

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from stages.geometry import rotation_from_rpy_deg, rotation_z
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.messages import Carrier, VanishingDirections
 
 MANHATTAN = (0.0, 90.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry import rotation_from_rpy_deg, rotation_z
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.messages import Carrier, DroneFix, DroneMotion, VanishingDirections, VehicleMotion
 
 START_NS = 1_700_000_000 * 10**9

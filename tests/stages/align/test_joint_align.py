@@ -10,6 +10,7 @@ import pytest
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.align.joint_align import JointAlign
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import (
     BranchState,
     Carrier,
@@ -18,7 +19,6 @@ from stages.messages import (
     VanishingDirections,
     VehicleMotion,
 )
-from stages.rotation import exp_rotation, log_rotation
 from tests.stages.align.made_joint_flight import START_NS, Flight, S, wrong_and_resolved
 from tests.stages.align.made_lines import ATLANTA, CAMPUS, MS, nothing, seen, turned
 

@@ -13,7 +13,7 @@ from flow.message import check_arrays, hash_into
 from flow.stage import input_ports, output_ports
 from stages.align import PaperAlign
 from stages.align.paper_match import angle_between_rad
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import BranchState, Carrier
 from tests.stages.align.paper_flight import START_NS, Flight, picture_ns, vanishing
 

@@ -9,9 +9,9 @@ import pytest
 
 from stages.align.refine import Refined, Tolerances, from_square, half_turn_difference, refine, street_directions
 from stages.align.spectra import level_lines, overlap, peaks, spectrum
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
+from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import Carrier
-from stages.rotation import log_rotation
 from tests.stages.align.made_lines import ATLANTA, CAMPUS, MANHATTAN, seen, turned
 
 STRAIGHT = math.radians(0.25)

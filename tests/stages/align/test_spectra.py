@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from stages.align.spectra import (
-    BIN_RAD,
-    BINS,
     QUARTER,
     LevelLines,
     level_axes,
@@ -22,6 +20,7 @@ from stages.align.spectra import (
     shared_directions,
     spectrum,
 )
+from stages.kernels.align.spectra import BIN_RAD, BINS
 from stages.messages import Carrier
 from tests.stages.align.made_lines import ATLANTA, CAMPUS, MANHATTAN, nothing, seen, turned
 

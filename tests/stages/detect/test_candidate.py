@@ -7,18 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from stages.detect.candidate import (
-    ALONE_PER_M,
-    FADING,
-    FEW_M,
-    OPEN_LOOKS,
-    SOME_M,
-    STANDING_M,
-    WIRE_ALONE,
-    Candidate,
-    Sighting,
-)
-from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, TALLY
+from stages.detect.candidate import ALONE_PER_M, FADING, FEW_M, SOME_M, STANDING_M, WIRE_ALONE, Candidate, Sighting
+from stages.kernels.detect.candidate import OPEN_LOOKS
+from stages.kernels.detect.isolation import FARTHER_0, FREE_0, OCCUPIED_0, TALLY
 from tests.stages.made import START_NS
 
 PLACE_M = np.array([3.0, 15.0, 12.0])

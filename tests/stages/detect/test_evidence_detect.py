@@ -18,13 +18,13 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.detect import EvidenceDetect
 from stages.detect.candidate import Sighting
-from stages.detect.evidence import AMONG_M, AMONG_NS, KEPT_NATS, STANDING_NS
-from stages.detect.surroundings import FREE_0, SECTORS, TALLY
-from stages.detect.telling import detections_message, odds_of
-from stages.detect.verdict import Evidence, over_clutter
-from stages.geometry import rotation_from_rpy_deg, rotation_z
+from stages.detect.candidate_messages import detections_message, odds_of
+from stages.detect.classifier import Evidence, over_clutter
+from stages.detect.evidence_detect import AMONG_M, AMONG_NS, KEPT_NATS, STANDING_NS
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
+from stages.geometry.trajectory import VehicleTrail
+from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
 from stages.messages import Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
-from stages.trail import VehicleTrail
 from tests.stages.caster import (
     Ball,
     Box,
@@ -179,7 +179,7 @@ def test_what_was_accepted_stays_so_until_much_less_speaks_for_it(monkeypatch):
     accept = odds_of(stage.settings.accept_probability)
     verdicts = []
     for odds in (accept - 0.1, accept + 0.1, accept - KEPT_NATS + 0.1, accept - KEPT_NATS - 0.1, accept - 0.1):
-        monkeypatch.setattr("stages.detect.evidence.judge", lambda *_, odds=odds: (odds, "so it is"))
+        monkeypatch.setattr("stages.detect.evidence_detect.judge", lambda *_, odds=odds: (odds, "so it is"))
         stage._weigh(stage._now, c)
         verdicts.append(c.accepted)
     assert verdicts == [False, True, True, False, False]

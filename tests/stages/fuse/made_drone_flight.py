@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.fuse import Fuse
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import (
     BranchState,
     DroneAttitude,
@@ -28,7 +29,6 @@ from stages.messages import (
     TrackState,
     VehicleMotion,
 )
-from stages.rotation import exp_rotation, log_rotation
 
 S = 1_000_000_000
 START_NS = 1_700_000_000 * S

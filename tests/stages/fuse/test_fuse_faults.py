@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from links.run_folder import Asked
+from links.runs.run_folder import Asked
+from links.runs.truth import TruthLog
 from links.simulated.closed_loop import ClosedLoop
 from links.simulated.matrix import Conditions, scenario_of
 from links.simulated.matrix_flights import Cell
 from links.simulated.run import Simulation
-from links.truth import TruthLog
 from stages.messages import PoseState
 from tests.stages.fuse.flown import (
     Fault,

@@ -7,25 +7,25 @@ import math
 import numpy as np
 import pytest
 
-from stages.drone_trail import AutopilotTrail
-from stages.fuse.carried import Carrier
 from stages.fuse.correlated import MOST, Worth, inflation
 from stages.fuse.drift import Drift
 from stages.fuse.ekf import Ekf
 from stages.fuse.estimator import Estimator
-from stages.fuse.following import Following
-from stages.fuse.heading import Heading
-from stages.fuse.motion_yaw import Point
 from stages.fuse.motions import Motions
-from stages.fuse.north import North
 from stages.fuse.positions import Positions, Told
+from stages.fuse.propagated import Carrier
 from stages.fuse.rejected import ENOUGH, Rejected
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
-from stages.fuse.yaw import DRIFT_RAD_PER_S, Yaw
-from stages.geometry import heading_rad, rotation_z
+from stages.fuse.track_continuity import Following
+from stages.geometry.frames import heading_rad, rotation_z
+from stages.geometry.se3 import good_covariance
+from stages.heading.fused_heading import Heading
+from stages.heading.motion_yaw import Point
+from stages.heading.odometry_yaw import North
+from stages.heading.yaw_fit import DRIFT_RAD_PER_S, Yaw
 from stages.messages import DroneAttitude, DroneLocalPosition, TrackingState, TrackState
-from stages.rigid import good_covariance
+from stages.odometry.drone.trajectory import AutopilotTrail
 from tests.stages.fuse.made_drone_flight import S, fix, gauss_markov, ns, track
 
 ERRORS = FuseErrors()

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 
-from stages.fuse.carried import Step
 from stages.fuse.ekf import Ekf
+from stages.fuse.propagated import Step
 from stages.fuse.smoother import Smoother
-from stages.geometry import rotation_z
-from stages.rigid import carried_covariance
-from stages.rotation import exp_rotation, log_rotation
+from stages.geometry.frames import rotation_z
+from stages.geometry.se3 import carried_covariance
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 
 TENTH = 100_000_000
 TILT = 0.2

@@ -11,7 +11,7 @@ import pytest
 from stages.fuse import Fuse
 from stages.fuse.motions import Motions
 from stages.fuse.settings import FuseErrors
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import PoseState, VehicleMotion
 from tests.stages.fuse.flown import late, spoilt, without
 from tests.stages.fuse.made_drone_flight import Made, ns, rms

@@ -9,13 +9,13 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import DroneImu, DroneMotion, FollowedFeatures, Image
-from stages.odometry import FisheyeOdometry
-from stages.odometry.fisheye_odometry import drone_motion, turned
-from stages.pictures.features import Tracks
-from stages.pictures.motion_link import Link
-from stages.pictures.two_view import TwoView
-from stages.rotation import exp_rotation, log_rotation
+from stages.odometry.drone import FisheyeOdometry
+from stages.odometry.drone.fisheye_odometry import drone_motion, turned
+from stages.odometry.visual.features import Tracks
+from stages.odometry.visual.image_motion import Link
+from stages.odometry.visual.two_view import TwoView
 from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, PIXEL_RAD, SIZE_PX, STEP_NS, degrees_between, image, of
 
 YAW = np.array([0.0, 0.0, 1.0])

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.geometry import Pose
+from stages.geometry.frames import Pose
+from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import DroneMotion, Image
-from stages.odometry import FisheyeOdometry
-from stages.rotation import log_rotation
+from stages.odometry.drone import FisheyeOdometry
 from tests.stages.seen import degrees_between, of, pinhole
 
 DRIVE = Path(__file__).resolve().parents[4] / "shared" / "data" / "vo_kitti00"

@@ -32,7 +32,7 @@ import numpy as np
 import pytest
 
 from stages.messages import Detections, DroneFix, SweptPulses, TrackingState, TrackState
-from stages.track.hit_miss_track import HitMissTrack
+from stages.track.likelihood_track import HitMissTrack
 
 CLOUDS = Path(__file__).resolve().parents[4] / "shared" / "data" / "drone_lidar"
 MID_360, AVIA, TRACK = (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry import Pose
-from stages.lens import Equidistant
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Equidistant
 from stages.messages import Image
 
 SIZE_PX = 480

@@ -7,8 +7,8 @@ import pytest
 from pydantic import ValidationError
 from streets import LOOKS_DOWN, LOOKS_UP, fisheye, foliage, street
 
-from stages.geometry import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
-from stages.lens import KannalaBrandt
+from stages.geometry.frames import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
+from stages.geometry.lens import KannalaBrandt
 from stages.messages import Carrier, DroneAttitude, Image, VehicleMotion
 from stages.vp import GreatCircleVp
 

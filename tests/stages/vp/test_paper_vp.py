@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays, hash_into
 from flow.stage import input_ports, output_ports
-from stages.geometry import Pose, rotation_from_rpy_deg
+from stages.geometry.frames import Pose, rotation_from_rpy_deg
 from stages.messages import Carrier, Image
 from stages.vp import PaperVp
 from stages.vp.paper_vp import lines_of

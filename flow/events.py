@@ -42,7 +42,7 @@ class EventMessage(Message):
 
     node: str
     text: str
-    resolved: bool  # it tells that the node works again
+    resolved: bool  # the node works again
 
 
 class Events:

@@ -35,7 +35,7 @@ class Record:
 
 
 class LinkError(Exception):
-    """A link cannot work. The text tells the user what to check; it is shown without a traceback."""
+    """A link cannot work. Its text, shown without a traceback, names what to check."""
 
 
 class Link(Node[S]):
@@ -67,7 +67,7 @@ SourceS = TypeVar("SourceS", bound=SourceSettings, default=SourceSettings, covar
 class Source(Link[SourceS]):
     """A link that brings records in.
 
-    Live, `listen` opens the hardware and yields records; in replay they come from a recording by `topic`.
+    Live, `listen` opens the hardware and iterates over records; in replay they come from a recording by `topic`.
     Both go through the same `decode`, whose annotation declares the outputs.
     """
 

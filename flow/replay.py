@@ -222,7 +222,7 @@ class Replay:
         return [refusal for source, refusal in self._refusals.items() if not self._gave(source)]
 
     def finishing(self) -> Iterator[str]:
-        """Finish stage after stage; yields its name when every step that follows has been run."""
+        """Finish stage after stage; gives its name when every step that follows has been run."""
         last_ns = self.report.last_ns
         for name, port in self._finishers:
             if port is not None:

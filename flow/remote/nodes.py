@@ -65,7 +65,7 @@ class PartitionReport(NamedTuple):
 
 
 class RemoteNodes(Protocol):
-    """Nodes that run in other processes, in partitions: whatever feeds one of these nodes is one of them."""
+    """Nodes that run in other processes, in partitions: each node that feeds one of them is one of them too."""
 
     nodes: frozenset[str]
     topics: frozenset[str]  # of the sources among them

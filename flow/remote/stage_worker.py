@@ -116,7 +116,7 @@ class Partition:
         return PartitionReport(report.steps, compute, report.events, report.counters, self._digest.outputs)
 
     def failed(self, error: Exception) -> bytes:
-        """The answer that tells of an error, as a frame."""
+        """The answer that reports an error, as a frame."""
         node = self._runner.running.partition(".")[0] or next(iter(self.graph.nodes))
         head = {**_described(error), "node": node, "counters": self._runner.counters()}
         return answer_frame(Reply.FAILED, self._collector.take(), head)
@@ -171,7 +171,7 @@ class PartitionThread(threading.Thread):
         self._outbox.put(b"")
 
     def _answers(self, frames: Frames) -> Iterator[bytes]:
-        """All answers; the last one tells of an error. DisconnectedError: the parent needs no more."""
+        """All answers; the last one reports an error. DisconnectedError: the parent has closed the stream."""
         partition: Partition | None = None
         try:
             partition = Partition(frames.next()[1])

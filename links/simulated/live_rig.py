@@ -63,7 +63,7 @@ class LiveRig(Tap[LiveRigSettings]):
         return False
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """That the rig has ended, by itself or not."""
         process = self._process
         if process is None or process.poll() is None:

@@ -159,7 +159,7 @@ class Servo(Source[ServoSettings]):
         elif not process.send(self._within_limits(goal)):
             self._counts["goals_lost"] += 1
 
-    def orphaned(self, port: str) -> str | None:
+    def upstream_lost(self, port: str) -> str | None:
         """See Link: the aim stage has stopped; stop the servo instead of finishing its travel."""
         process = self._process
         if process is None:

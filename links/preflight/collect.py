@@ -12,11 +12,11 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from flow.draw import mermaid
+from flow.config.draw import mermaid
 from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, Record, Run, Source, Tap
 from flow.live import Live
-from flow.live_report import LiveReport
+from flow.live.report import LiveReport
 from flow.message import Message
 from flow.replay import Replay
 from links.clock import host_time
@@ -112,7 +112,7 @@ def _status(name: str, link: Source, report: LiveReport) -> str | None:
     reported = report.links[name]
     if link.status is not None or reported.state not in ("open", "closed"):
         return link.status or reported.state
-    raised = [incident.text for incident in report.incidents if incident.node == name]
+    raised = [event.text for event in report.events if event.node == name]
     return raised[-1] if reported.undecoded and raised else None
 
 

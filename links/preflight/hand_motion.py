@@ -22,7 +22,7 @@ Rotated = DroneAttitude | DroneOdometry
 
 
 def nose_down_rad(rotations: Array64) -> Array64:
-    """How far the nose points below the horizon, for rotations R_local_drone (n, 3, 3)."""
+    """How far the nose points below the horizon, for rotations R_odom_drone (n, 3, 3)."""
     return np.arcsin(np.clip(-rotations[:, 2, 0], -1.0, 1.0))
 
 
@@ -63,7 +63,7 @@ def check_motion(motion: HandMotion, rotated: Sequence[Rotated]) -> CheckResult:
     assert motion.measure is not None
     if len(rotated) < 2:
         return fail(name, "no attitude came meanwhile: check the autopilot's link")
-    rotations = np.array([m.R_local_drone for m in rotated])
+    rotations = np.array([m.R_odom_drone for m in rotated])
     right, wrong = _peaks(motion.measure(rotations))
     if max(right, wrong) >= ENOUGH_RAD:
         told = np.degrees(right if right >= wrong else -wrong)

@@ -86,7 +86,7 @@ class Recorder(Tap[RecorderSettings]):
         return self._status
 
     def open(self, run: Run) -> None:
-        """Begin the first part. That nothing can be recorded is its `status`, and does not stop a run."""
+        """Begin the first part. That nothing can be recorded is `status`, and does not stop a run."""
         if not run.live:
             return
         self._run, self._session = run, uuid.uuid4().hex

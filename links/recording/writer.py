@@ -100,7 +100,7 @@ class RecordingWriter:
             if not overwrite and self.path.is_file():  # nothing is in it, and it would be in the way of the next try
                 with suppress(OSError):
                     self.path.unlink()
-            raise LinkError(self._disk_error(error)) from None
+            raise LinkError(self._disk_status(error)) from None
         self._threads = [threading.Thread(target=self._write_all, name="recording", daemon=True)]
         if not lossless:
             self._sync_fd = os.dup(self._stream.fileno())  # its own: the writer thread closes the stream
@@ -186,7 +186,7 @@ class RecordingWriter:
                     os.fsync(self._stream.fileno())
             status = None
         except OSError as error:
-            status = self._disk_error(error)
+            status = self._disk_status(error)
         finally:
             self._stopped.set()
             if status:
@@ -221,7 +221,7 @@ class RecordingWriter:
             while not self._stopped.wait(SYNC_S):
                 os.fsync(self._sync_fd)
         except OSError as error:
-            self._fail(self._disk_error(error))
+            self._fail(self._disk_status(error))
         finally:
             os.close(self._sync_fd)
 
@@ -232,7 +232,7 @@ class RecordingWriter:
             self._queue.clear()
             self._changed.notify_all()
 
-    def _disk_error(self, error: OSError) -> str:
+    def _disk_status(self, error: OSError) -> str:
         return (
             f"{self.path}: {error.strerror or error} after {self._written} records: check the disk and its free space;"
             f" `grd recover {self.path}` saves what is on it"

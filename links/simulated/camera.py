@@ -31,7 +31,7 @@ from stages.geometry.lens import Equidistant, KannalaBrandt, Lens, OCam
 LOOKS_UP = Pose(rpy_deg=(0.0, 0.0, 90.0))  # the image's top is forward, its right is left
 LOOKS_DOWN_RPY_DEG = (180.0, 0.0, -90.0)  # the image's top is forward, its right is right
 BELOW_BODY_M = 0.02
-Carrier = Literal["vehicle", "drone"]
+CameraMount = Literal["vehicle", "drone"]
 AnyLens = Equidistant | KannalaBrandt | OCam
 
 
@@ -46,7 +46,7 @@ class _Settings(BaseModel):
 class CameraError(_Settings):
     """How far what the rig file says of a camera is from how it is."""
 
-    turned_deg: Vector3 = (0.0, 0.0, 0.0)  # roll, pitch, yaw about the carrier's axes
+    turned_deg: Vector3 = (0.0, 0.0, 0.0)  # roll, pitch, yaw about the camera_mount's axes
     focal_share: float = Field(default=0.0, ge=-0.1, le=0.1)  # of the focal length, too long
     centre_share: tuple[float, float] = (0.0, 0.0)  # of the picture's size, to the right and down
 
@@ -109,9 +109,9 @@ class CamerasSettings(_Settings):
 class FrameTimes:
     """When a camera's frames are taken: known before any is made."""
 
-    def __init__(self, carrier: Carrier, settings: CameraSettings, start_ns: int, seed: int) -> None:
+    def __init__(self, camera_mount: CameraMount, settings: CameraSettings, start_ns: int, seed: int) -> None:
         self._settings = settings
-        self.seed = [seed, 21 if carrier == "vehicle" else 22]
+        self.seed = [seed, 21 if camera_mount == "vehicle" else 22]
         timing = np.random.default_rng([*self.seed, 0])
         self._first_ns = start_ns + round(timing.uniform(0.2, 1.0) * 1e9 / settings.rate_hz)
 
@@ -141,20 +141,26 @@ class Camera:
     """A camera in the scene. `records` gives its frames as they are measured."""
 
     def __init__(
-        self, carrier: Carrier, settings: CameraSettings, mount: Pose, scene: CameraScene, start_ns: int, seed: int
+        self,
+        camera_mount: CameraMount,
+        settings: CameraSettings,
+        mount: Pose,
+        scene: CameraScene,
+        start_ns: int,
+        seed: int,
     ) -> None:
-        """`mount` is T_carrier_camera; the carrier is one of the scene's bodies."""
+        """`mount` is T_mount_camera; the camera_mount is one of the scene's bodies."""
         self.settings = settings
-        self._topic, self._frame_id = f"/camera/{carrier}", f"camera_{carrier}"
-        own = next(i for i, body in enumerate(scene.bodies) if body.name == carrier)
+        self._topic, self._frame_id = f"/camera/{camera_mount}", f"camera_{camera_mount}"
+        own = next(i for i, body in enumerate(scene.bodies) if body.name == camera_mount)
         self._carrier = scene.bodies[own]
-        self._T_carrier_camera = T = mount.matrix()
+        self._T_mount_camera = T = mount.matrix()
         self._pixels = PixelRays(settings.true_lens, settings.size_px)
         covered = scene.always_hit(own, T[:3, 3], self._pixels.direction @ T[:3, :3].T)
         self._view = View(scene, self._pixels, self.T_world_camera, own, covered)
         limit_rad = math.radians(settings.true_lens.max_off_axis_deg)
         self._transmission = transmission(self._pixels.off_axis_rad, limit_rad, settings.sensor.vignetting)
-        self._times = FrameTimes(carrier, settings, start_ns, seed)
+        self._times = FrameTimes(camera_mount, settings, start_ns, seed)
         self._frame = 0
 
     def records(self, until_ns: int) -> list[Record]:
@@ -168,7 +174,7 @@ class Camera:
     def T_world_camera(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """Rotations (n, 3, 3) and positions (n, 3) [m]."""
         R, t = self._carrier.pose(stamp_ns)
-        T = self._T_carrier_camera
+        T = self._T_mount_camera
         return R @ T[:3, :3], t + R @ T[:3, 3]
 
     def image(self, stamp_ns: int, frame: int = 0) -> NDArray[np.uint8]:
@@ -199,22 +205,22 @@ def build_cameras(
 ) -> list[Camera]:
     """The scenario's cameras. The vehicle's camera sits inside the vehicle's mesh: it sees another one instead."""
     cameras: list[Camera] = []
-    for carrier, one in wanted_cameras(settings, any(body.name == "drone" for body in scene.bodies)):
+    for camera_mount, one in wanted_cameras(settings, any(body.name == "drone" for body in scene.bodies)):
         bodies = list(scene.bodies)
-        if carrier == "vehicle":
-            own = next(i for i, body in enumerate(bodies) if body.name == carrier)
+        if camera_mount == "vehicle":
+            own = next(i for i, body in enumerate(bodies) if body.name == camera_mount)
             bodies[own] = dataclasses.replace(bodies[own], meshes=(vehicle_from_camera,))
         around = CameraScene(scene.world, scene.world_mesh, bodies, street, light(weather, seed))
         drone = next((body.meshes[0] for body in bodies if body.name == "drone"), None)
-        cameras.append(Camera(carrier, one, mount_of(carrier, one, drone), around, start_ns, seed))
+        cameras.append(Camera(camera_mount, one, mount_of(camera_mount, one, drone), around, start_ns, seed))
     return cameras
 
 
-def mount_of(carrier: Carrier, settings: CameraSettings, drone: Mesh | None) -> Pose:
+def mount_of(camera_mount: CameraMount, settings: CameraSettings, drone: Mesh | None) -> Pose:
     """T_vehicle_camera or T_drone_camera. By default a drone's camera hangs right under the front of its body."""
     if settings.mount is not None:
         return settings.mount
-    if carrier == "vehicle" or drone is None:
+    if camera_mount == "vehicle" or drone is None:
         return LOOKS_UP
     x = 0.2 * float(drone.vertices_m[:, 0].max())
     up = np.array([[0.0, 0.0, 1.0]], dtype=np.float32)
@@ -226,15 +232,15 @@ def mount_of(carrier: Carrier, settings: CameraSettings, drone: Mesh | None) -> 
 def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Sequence[Mesh]) -> dict[str, Any]:
     """The rig file's `cameras:`; empty without cameras. `drone`: how its blades may stand; nothing without a drone."""
     tree: dict[str, Any] = {}
-    for carrier, one in wanted_cameras(settings, len(drone) > 0):
-        mount = mount_of(carrier, one, drone[0] if drone else None)
-        meshes = [vehicle_from_camera] if carrier == "vehicle" else drone
+    for camera_mount, one in wanted_cameras(settings, len(drone) > 0):
+        mount = mount_of(camera_mount, one, drone[0] if drone else None)
+        meshes = [vehicle_from_camera] if camera_mount == "vehicle" else drone
         masked_px, max_off_axis_deg = own_body(one.true_lens, one.size_px, mount, meshes)
         told, lens = mount, one.true_lens
         if one.error is not None:
             told, lens = one.error.mount(mount), one.error.lens(lens, one.size_px)
-        tree[carrier] = {
-            f"T_{carrier}_camera": told.model_dump(mode="json", exclude_none=True),
+        tree[camera_mount] = {
+            f"T_{camera_mount}_camera": told.model_dump(mode="json", exclude_none=True),
             "lens": lens.model_dump(mode="json"),
             "size_px": one.size_px,
             "readout_ms": one.readout_ms,
@@ -244,9 +250,9 @@ def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Seq
     return tree
 
 
-def wanted_cameras(settings: CamerasSettings, drone: bool) -> list[tuple[Carrier, CameraSettings]]:
+def wanted_cameras(settings: CamerasSettings, drone: bool) -> list[tuple[CameraMount, CameraSettings]]:
     """The cameras there are, by what carries them: an empty sky has no drone to carry one."""
-    wanted: list[tuple[Carrier, CameraSettings]] = []
+    wanted: list[tuple[CameraMount, CameraSettings]] = []
     if settings.vehicle is not None:
         wanted.append(("vehicle", settings.vehicle))
     if settings.drone is not None and drone:

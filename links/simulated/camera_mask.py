@@ -1,9 +1,9 @@
-"""Where a camera sees its own carrier: what a crew would mark in a picture, for the rig file.
+"""Where a camera sees its own camera_mount: what a crew would mark in a picture, for the rig file.
 
     masked_px           polygons (column, row) around what stands in the view: mast, LiDAR, landing gear
-    max_off_axis_deg    where the carrier fills most of the ring: no farther out is anything else to be seen
+    max_off_axis_deg    where the camera_mount fills most of the ring: no farther out is anything else to be seen
 
-Source: ours. A carrier's roof is mistaken for a street otherwise: it is straight, near and always there.
+Source: ours. A camera_mount's roof is mistaken for a street otherwise: it is straight, near and always there.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ MARGIN_DEG = 1.0
 
 
 def own_body(
-    lens: Lens, size_px: int, T_carrier_camera: Pose, meshes: Iterable[Mesh]
+    lens: Lens, size_px: int, T_mount_camera: Pose, meshes: Iterable[Mesh]
 ) -> tuple[list[list[list[float]]], float]:
-    """(masked_px, max_off_axis_deg) of a square picture; the meshes are the carrier in its own frame, as it moves."""
+    """(masked_px, max_off_axis_deg) of a square picture; the meshes are the camera_mount in its own frame, as it
+    moves."""
     step = size_px / GRID
     at = (np.arange(GRID) + 0.5) * step - 0.5
     column, row = np.meshgrid(at, at)
     rays = lens.unproject(np.column_stack([column.ravel(), row.ravel()]).astype(np.float64))
     inside = np.isfinite(rays[:, 0])
-    T = T_carrier_camera.matrix()
+    T = T_mount_camera.matrix()
     directions = (rays[inside] @ T[:3, :3].T).astype(np.float32)
     origins = np.tile(T[:3, 3], (len(directions), 1)).astype(np.float32)
     own = np.zeros(GRID * GRID, dtype=np.uint8)

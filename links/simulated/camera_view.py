@@ -114,7 +114,7 @@ def render(view: View, shutter: Shutter, rng: Generator) -> Array32:
 
 
 def mean_radiance(view: View, stamp_ns: int, step: int = 13) -> float:
-    """What a light meter sees: the mean over every `step`-th pixel each way, without the camera's own carrier.
+    """What a light meter sees: the mean over every `step`-th pixel each way, without the camera's own camera_mount.
 
     No part counts more than white in sun.
     """

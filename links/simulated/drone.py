@@ -1,7 +1,8 @@
 """The drone as a mesh with open arms: a body, arms, motors, spinning blades and legs; air in between.
 
 Source: ours. `x4` after the proportions of a 0.5 m class quadrotor; `folding` after a 0.35 m class camera drone with a
-full, long body; `hexa` after a 0.8 m class carrier with six arms, tall legs and a load. Any model may have any span.
+full, long body; `hexa` after a 0.8 m class camera_mount with six arms, tall legs and a load. Any model may have any
+span.
 Frame: drone (x forward, y left, z up).
 """
 

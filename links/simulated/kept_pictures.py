@@ -49,10 +49,12 @@ class KeptPictures:
         self._file, self._scenario = file, scenario
         with RecordingReader(file) as reader:
             recorded = _scenario_of(reader)
-            carriers = [carrier for carrier, _ in wanted_cameras(scenario.cameras, scenario.drone is not None)]
+            carriers = [
+                camera_mount for camera_mount, _ in wanted_cameras(scenario.cameras, scenario.drone is not None)
+            ]
             if not carriers:
                 raise LinkError(f"{scenario.name} has no cameras: leave --pictures out")
-            for topic in (f"/camera/{carrier}" for carrier in carriers):
+            for topic in (f"/camera/{camera_mount}" for camera_mount in carriers):
                 if topic not in reader.topics:
                     raise LinkError(f"{file} has nothing on {topic}: {NOT_THESE}")
         difference = first_difference(pictured(recorded), pictured(scenario))
@@ -80,9 +82,12 @@ class KeptPictures:
         start_ns, seed = self._scenario.start_ns, self._scenario.seed
         return [
             KeptCamera(
-                self._file, f"/camera/{carrier}", FrameTimes(carrier, settings, start_ns, seed), self._frames(settings)
+                self._file,
+                f"/camera/{camera_mount}",
+                FrameTimes(camera_mount, settings, start_ns, seed),
+                self._frames(settings),
             )
-            for carrier, settings in wanted_cameras(self._scenario.cameras, truth.drone is not None)
+            for camera_mount, settings in wanted_cameras(self._scenario.cameras, truth.drone is not None)
         ]
 
     def _frames(self, settings: CameraSettings) -> int | None:

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flow.config_error import ConfigError
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from flow.metrics import Latency
-from flow.problem import ConfigError
 from links.clock import host_time
 from links.mavlink.frame_decoder import ARMED
 from links.mavlink.profiles import ARDUPILOT
@@ -158,7 +158,7 @@ class RigInTime:
 
     def _cameras(self, simulation: LiveSimulation) -> PicturesInTime:
         seen = () if self._rig.pictures is None else self._rig.camera_ports.items()
-        ports = {f"/camera/{carrier}": port for carrier, port in seen}
+        ports = {f"/camera/{camera_mount}": port for camera_mount, port in seen}
         end_ns = self._scenario.start_ns + round(1e9 * self._scenario.duration_s)
         return PicturesInTime(simulation.kept_cameras, ports, simulation.now_ns, end_ns)
 

@@ -28,7 +28,7 @@ START_S = 120.0  # to build the world and, once, to compile
 END_S = 1.0
 READY, RIG_REPORT = "ready", "rig.json"
 
-Carrier = Literal["vehicle", "drone"]
+CameraMount = Literal["vehicle", "drone"]
 Port = Annotated[int, Field(ge=1, le=65535)]
 
 
@@ -45,7 +45,9 @@ class LiveRigSettings(Settings):
     armed: bool = True  # False: its autopilot says disarmed, as before a flight (`grd preflight` asks for that)
     odometry_port: int | None = Field(None, ge=1, le=65535)  # where grd hears the vehicle; None: it has no odometry
     pictures: Path | None = None  # a recording of the scenario, made by `grd simulate`; None: no cameras
-    camera_ports: dict[Carrier, Port] = Field(default_factory=dict[Carrier, Port])  # http://127.0.0.1:PORT/ of each
+    camera_ports: dict[CameraMount, Port] = Field(
+        default_factory=dict[CameraMount, Port]
+    )  # http://127.0.0.1:PORT/ of each
     batch_packets: int = Field(8, ge=1, le=64)  # cast together: fewer come sooner, more cost less
 
 

@@ -1,4 +1,4 @@
-"""The vehicle's own odometry, where it has one: T_start_vehicle with covariance, drifting, on /vehicle/odometry.
+"""The vehicle's own odometry, where it has one: T_map_vehicle with covariance, drifting, on /vehicle/odometry.
 
 The pose is that of wheels and a gyro: in the frame in which the vehicle stood when the scenario began, smooth, and
 wrong by more the farther it drove (see `drift`).

@@ -1,4 +1,4 @@
-"""The vehicle's own odometry as a source: one JSON object per pose, T_start_vehicle; live by UDP (`udp.py`).
+"""The vehicle's own odometry as a source: one JSON object per pose, T_map_vehicle; live by UDP (`udp.py`).
 
 A recording without it is no error: the source has no records, and the run reports that once.
 
@@ -101,8 +101,8 @@ def parse_pose(stamp_ns: int, data: bytes) -> VehicleMotion:
         raise ValueError(f"no rotation: {[qx, qy, qz, qw]}")
     return VehicleMotion(
         stamp_ns=stamp_ns,
-        xyz_start_m=xyz_m,
-        R_start_vehicle=rotation_from_quaternion_xyzw((qx, qy, qz, qw)),
+        xyz_map_m=xyz_m,
+        R_map_vehicle=rotation_from_quaternion_xyzw((qx, qy, qz, qw)),
         covariance=covariance,
     )
 

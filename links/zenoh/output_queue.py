@@ -16,9 +16,9 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from flow.codec import encode
-from flow.codec_fields import CodecError
 from flow.message import Message, array_fields
+from flow.remote.codec import encode
+from flow.remote.codec_fields import CodecError
 from links.clock.host_time import now_ns
 from links.zenoh.connection import Connection
 from links.zenoh.envelope import RUN, Envelope

@@ -1,4 +1,4 @@
-"""The sending end: a link that takes messages and sends them to one other host. `flow.hosts` puts it into a graph.
+"""The sending end of a hop: a link that sends messages to one other host (`flow.config.hosts`).
 
 Source: ours.
 """
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Any, ClassVar
 
 from flow import link
-from flow.hosts import Hop, port_of
+from flow.config.hosts import Hop, port_of
 from flow.link import Record, SourceSettings
 from flow.message import Message
 from links.zenoh.connection import Connection, connected
@@ -42,8 +42,8 @@ class Sender(link.Source[SenderSettings]):
         self._connection: Connection | None = None
         self._unopened: int = 0
         for hop in self.hops:
-            deadline_ns = round(hop.waiting.deadline_ms * 1e6)
-            self._queues[port_of(hop)] = OutputQueue(key_of(hop), hop.message, hop.waiting.depth, deadline_ns)
+            deadline_ns = round(hop.queue.deadline_ms * 1e6)
+            self._queues[port_of(hop)] = OutputQueue(key_of(hop), hop.message, hop.queue.depth, deadline_ns)
 
     def send(self, port: str, message: Message) -> None:
         """Let a message wait on its output_queue; before the link is open it is dropped."""

@@ -1,6 +1,6 @@
 """Dead reckoning of the drone's rotation in the vehicle's start frame, from picture to picture.
 
-    R_start_drone(t) = R_start_drone(t0) R_drone(t0)_drone(t),  R_vehicle_drone = R_start_vehicle(t)^T R_start_drone(t)
+    R_map_drone(t) = R_map_drone(t0) R_drone(t0)_drone(t),  R_vehicle_drone = R_map_vehicle(t)^T R_map_drone(t)
 
 The drone's own turn comes from its autopilot or its pictures, the vehicle's from its motion. Yaw is told between the
 two cameras' level axes, the one number that pictures add an offset to (lock.py).
@@ -21,9 +21,9 @@ import numpy as np
 from stages.align.refine import Refined
 from stages.align.spectra import LevelLines
 from stages.geometry.frames import Array64, heading_rad, rotation_z
-from stages.geometry.trajectory import FURTHEST_NS, VehicleTrail
+from stages.geometry.trajectory import FURTHEST_NS, VehicleTrajectory
 from stages.kernels.geometry.so3 import log_rotation
-from stages.messages import DroneAttitude, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
+from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry, VehicleMotion, VisualMotion
 from stages.odometry.drone.trajectory import AutopilotTrail, PictureTrail, turn_between
 
 VEHICLE_RAD_PER_S = math.radians(20.0)  # a vehicle that does not tell its turns may turn like this
@@ -51,10 +51,10 @@ class Reckoning:
     def __init__(self, parked: bool) -> None:
         """`parked`: the vehicle stands, whether it says so or not."""
         self._parked = parked
-        self.vehicle = VehicleTrail()
+        self.vehicle = VehicleTrajectory()
         self.autopilot = AutopilotTrail()
         self.pictures = PictureTrail()
-        self._R_start_drone = np.eye(3)
+        self._R_map_drone = np.eye(3)
         self._stamp_ns: int | None = None
         self._silences = 0
         self._silent_rad2 = 0.0  # `_vehicle_silent_rad2` at the pair before; a half turn's where the frame is another
@@ -75,7 +75,7 @@ class Reckoning:
         """What the autopilot says of itself."""
         self.autopilot.hear(word)
 
-    def add_drone_motion(self, motion: DroneMotion) -> None:
+    def add_drone_motion(self, motion: VisualMotion) -> None:
         """A step of the odometry by pictures."""
         self.pictures.add(motion)
 
@@ -91,51 +91,51 @@ class Reckoning:
 
     def advance(self, vehicle_ns: int, drone_ns: int, vehicle: LevelLines, drone: LevelLines) -> Reckoned:
         """Turn on to a pair's moments."""
-        R_start_vehicle = self.vehicle.at(vehicle_ns)[0]
+        R_map_vehicle = self.vehicle.at(vehicle_ns)[0]
         variance, silent_rad2 = 0.0, self._vehicle_silent_rad2(vehicle_ns)
         if self._stamp_ns is None:
-            self._R_start_drone = R_start_vehicle @ vehicle.R_carrier_level @ drone.R_carrier_level.T
+            self._R_map_drone = R_map_vehicle @ vehicle.R_carrier_level @ drone.R_carrier_level.T
         else:
             dt = abs(drone_ns - self._stamp_ns) * 1e-9
             turn = turn_between(self.autopilot, self.pictures, self._stamp_ns, drone_ns)
-            self._R_start_drone = self._R_start_drone @ turn.R_from_to
+            self._R_map_drone = self._R_map_drone @ turn.R_from_to
             variance = turn.variance_rad2 + self._vehicle_variance_rad2(vehicle_ns, dt)
             variance += abs(silent_rad2 - self._silent_rad2)
         self._silent_rad2 = silent_rad2
         self._stamp_ns = drone_ns
         return Reckoned(
             drone_ns,
-            heading_rad(R_start_vehicle @ vehicle.R_carrier_level),
-            heading_rad(self._R_start_drone @ drone.R_carrier_level),
+            heading_rad(R_map_vehicle @ vehicle.R_carrier_level),
+            heading_rad(self._R_map_drone @ drone.R_carrier_level),
             variance,
         )
 
     def correct(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> None:
         """Take the tilts that the pictures tell; the yaw stays the dead reckoned one."""
-        self._R_start_drone = self._told(vehicle_ns, refined, reckoned_rad)
+        self._R_map_drone = self._told(vehicle_ns, refined, reckoned_rad)
 
     def tilt_off(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> Array64:
         """How far (3,) [rad] the tilts that the pictures tell are from the dead reckoned ones, the drone's axes."""
         R = self._told(vehicle_ns, refined, reckoned_rad)
-        off, up = log_rotation(np.ascontiguousarray(self._R_start_drone.T @ R)), R[2]
+        off, up = log_rotation(np.ascontiguousarray(self._R_map_drone.T @ R)), R[2]
         return off - (off @ up) * up
 
     def _told(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> Array64:
         level = refined.R_vehicle_level @ rotation_z(reckoned_rad) @ refined.R_drone_level.T
         return self.vehicle.at(vehicle_ns)[0] @ level
 
-    def R_start_own(self, offset_rad: float) -> Array64 | None:
+    def R_map_own(self, offset_rad: float) -> Array64 | None:
         """How the autopilot's frame `own` is turned in the start frame; None: it has no attitude now."""
         if self._stamp_ns is None:
             return None
         R_own_drone = self.autopilot.R_own_drone(self._stamp_ns)
-        return None if R_own_drone is None else rotation_z(offset_rad) @ self._R_start_drone @ R_own_drone.T
+        return None if R_own_drone is None else rotation_z(offset_rad) @ self._R_map_drone @ R_own_drone.T
 
-    def R_start_drone(self, offset_rad: float, stamps_ns: list[int]) -> dict[int, Array64]:
+    def R_map_drone(self, offset_rad: float, stamps_ns: list[int]) -> dict[int, Array64]:
         """The drone's rotation at those moments of which it is known."""
         if self._stamp_ns is None:
             return {}
-        R = rotation_z(offset_rad) @ self._R_start_drone
+        R = rotation_z(offset_rad) @ self._R_map_drone
         turns = {ns: turn_between(self.autopilot, self.pictures, self._stamp_ns, ns) for ns in stamps_ns}
         return {ns: R @ turn.R_from_to for ns, turn in turns.items() if turn.sure}
 

@@ -21,7 +21,7 @@ from stages.geometry.frames import Array64
 from stages.heading.heading_bank import Heading, HeadingBank
 from stages.heading.hypothesis_bank import NONE, BranchBank, BranchSettings
 from stages.heading.windows import Windows
-from stages.messages import DroneFix, DroneMotion
+from stages.messages import DroneFix, VisualMotion
 
 SILENCE_SHARE = 1e-4  # chance that the autopilot's heading jumped while it was not heard
 NONSENSE = 0.99  # that none of the branches is right, from which all is begun anew
@@ -51,7 +51,7 @@ class ByMotion:
         self._heading_windows = Windows(settings.baseline_m, HeadingBank.HYPOTHESES)
         self._frames = 0  # of the vehicle, as `reckoning` counts
 
-    def hear_pictures(self, motion: DroneMotion) -> None:
+    def hear_pictures(self, motion: VisualMotion) -> None:
         """A step of the drone's odometry by its camera."""
         self._windows.add_step(motion)
 
@@ -71,12 +71,12 @@ class ByMotion:
         if lock.offset_rad is None:
             return False
         bearing_rad = math.hypot(math.sqrt(lock.variance_rad2), BEARING_RAD)
-        R_start_own = reckoning.R_start_own(lock.offset_rad)
-        if R_start_own is not None and by_places:
-            moved = self._windows.close_metric(R_start_own, bearing_rad)
+        R_map_own = reckoning.R_map_own(lock.offset_rad)
+        if R_map_own is not None and by_places:
+            moved = self._windows.close_metric(R_map_own, bearing_rad)
         else:
             stamps_ns = self._windows.steps_since_start()
-            moved = self._windows.close_bearing(reckoning.R_start_drone(lock.offset_rad, stamps_ns), bearing_rad)
+            moved = self._windows.close_bearing(reckoning.R_map_drone(lock.offset_rad, stamps_ns), bearing_rad)
         if moved is None:
             return False
         self.bank.see(moved)
@@ -87,10 +87,10 @@ class ByMotion:
 
     def _weigh_headings(self, by_places: bool) -> None:
         """The way that the autopilot tells, laid on the LiDAR's: its heading, without a street."""
-        R_start_own = self._reckoning.R_start_own(0.0)
-        if R_start_own is None or not by_places:
+        R_map_own = self._reckoning.R_map_own(0.0)
+        if R_map_own is None or not by_places:
             return
-        moved = self._heading_windows.close_metric(R_start_own, 0.0)
+        moved = self._heading_windows.close_metric(R_map_own, 0.0)
         if moved is not None:
             self._headings.see(moved)
 
@@ -125,13 +125,13 @@ class ByMotion:
         """The word of people or of a compass, once."""
         if self._prior_weighed:
             return
-        R_start_own = self._reckoning.R_start_own(self._lock.offset_rad or 0.0)
+        R_map_own = self._reckoning.R_map_own(self._lock.offset_rad or 0.0)
         off_rad = None
         if self._prior.initial_yaw_rad is not None:
             R = refined.R_vehicle_drone(0)
             off_rad = math.atan2(R[1, 0], R[0, 0]) - self._prior.initial_yaw_rad
-        elif self._prior.compass_rad is not None and R_start_own is not None:
-            off_rad = math.atan2(R_start_own[1, 0], R_start_own[0, 0]) - self._prior.compass_rad
+        elif self._prior.compass_rad is not None and R_map_own is not None:
+            off_rad = math.atan2(R_map_own[1, 0], R_map_own[0, 0]) - self._prior.compass_rad
         if off_rad is not None:
             self.bank.expect_yaw(off_rad, self._prior.sigma_rad, self._prior.trust)
             self._prior_weighed = True

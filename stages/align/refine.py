@@ -102,7 +102,7 @@ class _Eye:
     """One camera's share: its lines by direction, and its level axes as refined so far."""
 
     R: Array64  # R_carrier_level
-    normal: Array64  # (m, 3) carrier axes
+    normal: Array64  # (m, 3) camera_mount axes
     sigma: Array64  # (m,)
     k: NDArray[np.int64]  # (m,) which direction
     azimuth: Array64  # (K,) as this camera has it, in its own level axes

@@ -36,7 +36,7 @@ DIRECTION_SHARE = 0.04  # of all lines: a direction from which on it counts full
 
 @dataclass(frozen=True)
 class LevelLines:
-    """A camera's lines that may be horizontal, in level axes: z is up, x the carrier's forward."""
+    """A camera's lines that may be horizontal, in level axes: z is up, x the camera_mount's forward."""
 
     R_carrier_level: Array64  # (3, 3)
     tilt_sigma_rad: float  # of up, each of two axes
@@ -48,7 +48,7 @@ class LevelLines:
 
 
 def level_axes(up: Array64) -> Array64:
-    """R_carrier_level (3, 3): z is `up` (3,), x the carrier's x made level (its y where x is upright)."""
+    """R_carrier_level (3, 3): z is `up` (3,), x the camera_mount's x made level (its y where x is upright)."""
     z = up / np.linalg.norm(up)
     forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = forward - (forward @ z) * z
@@ -62,7 +62,7 @@ def level_lines(seen: VanishingDirections, sharpest_rad: float) -> LevelLines | 
     if upright.size == 0:
         return None
     up = seen.direction[upright[0]]
-    R = level_axes(up if up[2] >= 0 else -up)  # a carrier does not fly upside down
+    R = level_axes(up if up[2] >= 0 else -up)  # a camera_mount does not fly upside down
     chosen = np.flatnonzero(seen.line_direction >= 0)
     chosen = chosen[~seen.is_vertical[seen.line_direction[chosen]]]
     normal = seen.line_normal[chosen] @ R

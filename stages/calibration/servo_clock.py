@@ -103,7 +103,7 @@ class ServoClock(Stage[ServoClockSettings]):
         """Where the vehicle is."""
         if motion.stamp_ns < self._resting_until_ns:
             self._places.clear()
-        self._places.append(motion.xyz_start_m)
+        self._places.append(motion.xyz_map_m)
         del self._places[:-MOST_PLACES]
 
     def on_servo(self, servo: ServoState) -> None:

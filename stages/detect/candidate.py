@@ -38,8 +38,8 @@ class Sighting:
     """One look's returns on one small thing."""
 
     stamp_ns: int
-    xyz_local_m: Array64  # (3,)
-    vehicle_local_m: Array64  # (3,) where the vehicle was then
+    xyz_map_m: Array64  # (3,)
+    vehicle_map_m: Array64  # (3,) where the vehicle was then
     range_m: float
     hits: int
     too_long: bool  # its returns extend farther than a drone
@@ -115,7 +115,7 @@ class Candidate:
         a, b, c = a + 2 * dt * b + dt * dt * c + q * dt**4 / 4, b + dt * c + q * dt**3 / 2, c + q * dt * dt
         x = self.xyz_m + dt * self.velocity_mps
         gain_x, gain_v = a / (a + SIGMA_M**2), b / (a + SIGMA_M**2)
-        innovation = s.xyz_local_m - x
+        innovation = s.xyz_map_m - x
         self.xyz_m = x + gain_x * innovation
         self.velocity_mps = self.velocity_mps + gain_v * innovation
         self.p = (1 - gain_x) * a, (1 - gain_x) * b, c - gain_v * b
@@ -137,14 +137,14 @@ class Candidate:
         standing, measured = what_stands_beside(s.around, self.free)
         self.held = [(place_m, FADING * sure) for place_m, sure in self.held[-HISTORY:]]
         if standing > 0.0:
-            self.held.append((s.xyz_local_m, standing))
-        self.beside = sum([sure for place_m, sure in self.held if math.dist(place_m, s.xyz_local_m) < HELD_M])
+            self.held.append((s.xyz_map_m, standing))
+        self.beside = sum([sure for place_m, sure in self.held if math.dist(place_m, s.xyz_map_m) < HELD_M])
         self.alone = FADING * self.alone + (measured and standing == 0.0)
         self.big_m = s.big_m
         self.big_looks += math.isfinite(s.big_m)
         self.path_ns.append(s.stamp_ns)
-        self.path_m.append(s.xyz_local_m)
-        self.beside_m.append(s.xyz_local_m - s.vehicle_local_m)
+        self.path_m.append(s.xyz_map_m)
+        self.beside_m.append(s.xyz_map_m - s.vehicle_map_m)
         if len(self.path_ns) > HISTORY:
             del self.path_ns[0], self.path_m[0], self.beside_m[0]
         self._note_flight()

@@ -13,7 +13,7 @@ import numpy as np
 
 from stages.detect.candidate import Candidate
 from stages.geometry.frames import Array64
-from stages.geometry.trajectory import VehicleTrail
+from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import Candidates, Detections
 
 
@@ -29,7 +29,7 @@ def odds_of(p: float) -> float:
 
 def candidates_message(
     bank: list[Candidate],
-    trail: VehicleTrail,
+    trail: VehicleTrajectory,
     now_ns: int,
     detector_life: int,
     at_most: int,
@@ -61,7 +61,7 @@ def candidates_message(
 
 
 def detections_message(
-    bank: Iterable[Candidate], trail: VehicleTrail, start_ns: int, end_ns: int, refused: Counter[str], at_most: int
+    bank: Iterable[Candidate], trail: VehicleTrajectory, start_ns: int, end_ns: int, refused: Counter[str], at_most: int
 ) -> Detections:
     """The answer of a search from start_ns to end_ns: its candidates where each was last seen, accepted ones first.
 

@@ -60,7 +60,7 @@ class Bank:
     def fitting(self, s: Sighting, joined: bool = False) -> Candidate | None:
         """The candidate that a sighting is most likely of, of the joined or of the others; None: of none."""
         rows = len(self._candidates)
-        row = nearest_row(self._state, self._ns, self._joined, rows, joined, s.stamp_ns, s.xyz_local_m)
+        row = nearest_row(self._state, self._ns, self._joined, rows, joined, s.stamp_ns, s.xyz_map_m)
         return self._candidates[row] if row >= 0 else None
 
     def looked_at(

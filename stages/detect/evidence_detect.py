@@ -33,7 +33,7 @@ from stages.detect.observations import Limits, SightingFinder, Slice
 from stages.detect.reacquire import joined, without_twins
 from stages.detect.telemetry import DroneWord
 from stages.geometry.frames import Array64
-from stages.geometry.trajectory import VehicleTrail
+from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.candidate_table import first_within
 from stages.kernels.sweep.pulses import looking_along
@@ -73,7 +73,7 @@ class _Now:
 
     finder: SightingFinder
     travel: Travel
-    trail: VehicleTrail = field(default_factory=VehicleTrail)
+    trail: VehicleTrajectory = field(default_factory=VehicleTrajectory)
     word: DroneWord = field(default_factory=DroneWord)
     bank: Bank = field(default_factory=Bank)
     standing: deque[Candidate] = field(default_factory=lambda: deque[Candidate](maxlen=MOST_STANDING))
@@ -176,7 +176,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         if best is not None:
             return self._see(now, best, s) or both is not None
         since_ns = s.stamp_ns - (AMONG_NS if self._motion_known(s.stamp_ns) else AMONG_NS // 20)
-        refused_m = now.refused_places.nearest_m(s.xyz_local_m, 0.0, AMONG_M, since_ns)
+        refused_m = now.refused_places.nearest_m(s.xyz_map_m, 0.0, AMONG_M, since_ns)
         among = math.isfinite(refused_m)
         if both is None and not among and not math.isfinite(s.big_m):  # in a tree something lies everywhere
             self._join(now, s)
@@ -185,7 +185,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             number=now.number,
             stamp_ns=s.stamp_ns,
             seen_ns=s.stamp_ns,
-            xyz_m=s.xyz_local_m,
+            xyz_m=s.xyz_map_m,
             velocity_mps=STILL_MPS,
             range_m=s.range_m,
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
@@ -222,7 +222,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
 
     def _wake(self, now: _Now, s: Sighting) -> Candidate | None:
         """Something that was looked at before and stood there: it goes on where it was, and is not looked at anew."""
-        place = first_within(now.standing_m, s.xyz_local_m, STANDING_M)
+        place = first_within(now.standing_m, s.xyz_map_m, STANDING_M)
         if place < 0:
             return None
         c = now.standing[place]

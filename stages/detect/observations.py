@@ -34,7 +34,7 @@ class Slice(NamedTuple):
     """A packet's pulses, or those of a few in a row, and where the vehicle was."""
 
     pulses: SweptPulses
-    R: Array64  # R_local_vehicle, t_local_vehicle
+    R: Array64  # R_map_vehicle, t_map_vehicle
     t: Array64
     axis: Array64  # mean direction, unit
 
@@ -123,8 +123,8 @@ class SightingFinder:
         since_ns = stamp_ns - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
         return Sighting(
             stamp_ns=stamp_ns,
-            xyz_local_m=local,
-            vehicle_local_m=then.t,
+            xyz_map_m=local,
+            vehicle_map_m=then.t,
             range_m=range_m,
             hits=hits,
             too_long=extent_m > 1.3 * span_m,

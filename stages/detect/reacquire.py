@@ -47,7 +47,7 @@ def met_again(
         then = telemetry.state(c.seen_ns)
         if then is None:
             continue
-        way, said = s.xyz_local_m - c.path_m[-1], now[0] - then[0]
+        way, said = s.xyz_map_m - c.path_m[-1], now[0] - then[0]
         level_m, said_m = math.hypot(way[0], way[1]), math.hypot(said[0], said[1])
         if said_m < LEAST_M:
             continue
@@ -81,7 +81,7 @@ def joined(c: Candidate, number: int, s: Sighting, velocity_mps: Array64) -> Can
         number=number,
         stamp_ns=s.stamp_ns,
         seen_ns=s.stamp_ns,
-        xyz_m=s.xyz_local_m,
+        xyz_m=s.xyz_map_m,
         velocity_mps=velocity_mps,
         range_m=s.range_m,
         p=(SIGMA_M**2, 0.0, SPEED_SIGMA_MPS**2),

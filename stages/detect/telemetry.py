@@ -16,7 +16,7 @@ from stages.detect.flight import scatter_m
 from stages.detect.motion_log_ratios import Heard, hear
 from stages.detect.reacquire import met_again
 from stages.geometry.frames import Array64
-from stages.geometry.trajectory import VehicleTrail
+from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import DroneLocalPosition, DroneOdometry
 from stages.odometry.drone.telemetry import DroneTelemetry
 
@@ -70,7 +70,7 @@ class DroneWord:
         speeds = [told.speed_mps(stamp_ns) for told in self._both]
         return any(speed is not None and math.hypot(*speed) > MOVES_MPS for speed in speeds)
 
-    def usual_flight(self, trail: VehicleTrail, now_ns: int) -> tuple[Array64, float, float]:
+    def usual_flight(self, trail: VehicleTrajectory, now_ns: int) -> tuple[Array64, float, float]:
         """How a drone flies now (3,), one sigma on each axis: as fast as it says; else it comes along with the vehicle.
 
         And the level speed that it says it has, 0 when it is silent.

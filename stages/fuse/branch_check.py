@@ -19,7 +19,7 @@ from stages.geometry.frames import Array64
 from stages.heading.hypothesis_bank import BranchBank, BranchSettings
 from stages.heading.windows import Windows
 from stages.kernels.geometry.so3 import log_rotation
-from stages.messages import DroneFix, DroneMotion
+from stages.messages import DroneFix, VisualMotion
 from stages.odometry.drone.trajectory import turn_between
 
 BEARING_RAD = 0.05  # of the lever between the drone's camera and its middle, and of the streets
@@ -34,7 +34,7 @@ class Witness:
         self._motions = motions
         self._bank = BranchBank(BranchSettings())
         self._windows = Windows(BranchSettings().baseline_m)
-        self._told: tuple[int, Array64] | None = None  # the streets' R_start_drone at a time
+        self._told: tuple[int, Array64] | None = None  # the streets' R_map_drone at a time
 
     @property
     def windows(self) -> int:
@@ -51,17 +51,17 @@ class Witness:
         self._windows.restart()
         self._told = None
 
-    def hear_pictures(self, motion: DroneMotion) -> None:
+    def hear_pictures(self, motion: VisualMotion) -> None:
         """A step of the drone's odometry by its camera."""
         self._windows.add_step(motion)
 
-    def hear_streets(self, stamp_ns: int, R_start_drone: Array64) -> None:
+    def hear_streets(self, stamp_ns: int, R_map_drone: Array64) -> None:
         """A rotation that is RESOLVED."""
         if self._told is not None:
             before = self._carried(stamp_ns)
-            if before is None or float(np.linalg.norm(log_rotation(before.T @ R_start_drone))) > JUMP_RAD:
+            if before is None or float(np.linalg.norm(log_rotation(before.T @ R_map_drone))) > JUMP_RAD:
                 self.restart()
-        self._told = stamp_ns, R_start_drone
+        self._told = stamp_ns, R_map_drone
 
     def see_fix(self, fix: DroneFix) -> None:
         """Where the LiDAR saw the drone."""
@@ -69,7 +69,7 @@ class Witness:
         if not motions.still(fix.stamp_ns):
             self._windows.restart()
             return
-        self._windows.add_fix(fix, *motions.vehicle.at(fix.stamp_ns), motions.carrier.autopilot)
+        self._windows.add_fix(fix, *motions.vehicle.at(fix.stamp_ns), motions.motion_model.autopilot)
         if self._told is None or fix.stamp_ns - self._told[0] > LONG_NS:
             return
         at = {stamp_ns: self._carried(stamp_ns) for stamp_ns in self._windows.steps_since_start()}
@@ -81,5 +81,7 @@ class Witness:
         """The streets' rotation, by the drone's own turn since; None: nobody told that."""
         assert self._told is not None
         from_ns, R = self._told
-        turn = turn_between(self._motions.carrier.autopilot, self._motions.carrier.pictures, from_ns, stamp_ns)
+        turn = turn_between(
+            self._motions.motion_model.autopilot, self._motions.motion_model.pictures, from_ns, stamp_ns
+        )
         return R @ turn.R_from_to if turn.sure else None

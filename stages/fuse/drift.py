@@ -45,7 +45,7 @@ class Drift:
         self.q = 2 * errors.drift_mps**2 / errors.drift_time_s if odometry else errors.manoeuvre
 
     @property
-    def xyz_start_m(self) -> Array64:
+    def xyz_map_m(self) -> Array64:
         """At the newest fix."""
         return self._x[:3]
 

@@ -23,10 +23,10 @@ class Known:
     """The drone in the start frame at one moment."""
 
     stamp_ns: int
-    R_start_drone: Array64 | None
-    xyz_start_m: Array64
+    R_map_drone: Array64 | None
+    xyz_map_m: Array64
     covariance: Array64  # (6, 6); without a rotation only its position block counts, start axes
-    velocity_start_mps: Array64
+    velocity_map_mps: Array64
     velocity_covariance: Array64
 
 
@@ -54,10 +54,10 @@ def lost(stamp_ns: int, verdict: Verdict) -> RelativePose:
         R_vehicle_drone=None,
         covariance=None,
         velocity_vehicle_mps=None,
-        xyz_start_m=None,
-        R_start_drone=None,
-        start_covariance=None,
-        velocity_start_mps=None,
+        xyz_map_m=None,
+        R_map_drone=None,
+        map_covariance=None,
+        velocity_map_mps=None,
         velocity_covariance=None,
         resets=verdict.resets,
         nis=math.nan,
@@ -67,17 +67,17 @@ def lost(stamp_ns: int, verdict: Verdict) -> RelativePose:
 def pose(known: Known, verdict: Verdict, motions: Motions) -> RelativePose:
     """The pose, in both frames. Relative to the vehicle it is no better than the vehicle's own place is known."""
     vehicle = motions.vehicle
-    R_start_vehicle, _ = vehicle.at(known.stamp_ns)
-    xyz, velocity = vehicle.to_vehicle(known.stamp_ns, known.xyz_start_m, known.velocity_start_mps)
-    R = known.R_start_drone
+    R_map_vehicle, _ = vehicle.at(known.stamp_ns)
+    xyz, velocity = vehicle.to_vehicle(known.stamp_ns, known.xyz_map_m, known.velocity_map_mps)
+    R = known.R_map_drone
     if R is None:
         start = np.diag([math.inf] * 3 + [0.0] * 3)
         relative = start.copy()
         start[3:, 3:] = known.covariance[3:, 3:]
-        relative[3:, 3:] = R_start_vehicle.T @ known.covariance[3:, 3:] @ R_start_vehicle
+        relative[3:, 3:] = R_map_vehicle.T @ known.covariance[3:, 3:] @ R_map_vehicle
     else:
         start = relative = known.covariance  # tangent at the drone: the same seen from either frame
-    relative = relative + _vehicle_ahead(motions, known.stamp_ns, xyz, None if R is None else R_start_vehicle.T @ R)
+    relative = relative + _vehicle_ahead(motions, known.stamp_ns, xyz, None if R is None else R_map_vehicle.T @ R)
     return RelativePose(
         stamp_ns=known.stamp_ns,
         state=verdict.state,
@@ -85,13 +85,13 @@ def pose(known: Known, verdict: Verdict, motions: Motions) -> RelativePose:
         measured_ns=verdict.measured_ns,
         track_id=verdict.track_id,
         xyz_vehicle_m=xyz,
-        R_vehicle_drone=None if R is None else R_start_vehicle.T @ R,
+        R_vehicle_drone=None if R is None else R_map_vehicle.T @ R,
         covariance=relative,
         velocity_vehicle_mps=velocity,
-        xyz_start_m=known.xyz_start_m,
-        R_start_drone=R,
-        start_covariance=start,
-        velocity_start_mps=known.velocity_start_mps,
+        xyz_map_m=known.xyz_map_m,
+        R_map_drone=R,
+        map_covariance=start,
+        velocity_map_mps=known.velocity_map_mps,
         velocity_covariance=known.velocity_covariance,
         resets=verdict.resets,
         nis=verdict.nis,

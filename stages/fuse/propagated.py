@@ -1,7 +1,7 @@
 """How the drone moved between two moments, from whatever tells it, with the covariance of that.
 
     D = O(t0)^-1 O(t1) with b dt:   R = R_own_drone(t0)^T R_own_drone(t1)
-                                     t = R_own_drone(t0)^T (p_own(t1) - p_own(t0)) + R_start_drone(t0)^T b dt
+                                     t = R_own_drone(t0)^T (p_own(t1) - p_own(t0)) + R_map_drone(t0)^T b dt
 
 O is the autopilot's pose in its frame `own` (stages/odometry/drone/trajectory.py), b what it creeps away by (drift.py).
 Without its positions b is the drone's whole velocity; without its attitude the turn is the drone's pictures', or
@@ -39,7 +39,7 @@ class Step:
     turn_told: bool
 
 
-class Carrier:
+class MotionModel:
     """All that carries a pose through time."""
 
     def __init__(self, errors: FuseErrors) -> None:
@@ -48,9 +48,9 @@ class Carrier:
         self.pictures = PictureTrail()
 
     def step(
-        self, from_ns: int, to_ns: int, R_start_drone: Array64, left: Drift, free: Drift, still: bool, since_ns: int
+        self, from_ns: int, to_ns: int, R_map_drone: Array64, left: Drift, free: Drift, still: bool, since_ns: int
     ) -> Step:
-        """From one moment to another; R_start_drone at the first.
+        """From one moment to another; R_map_drone at the first.
 
         left, free: what is left over by the autopilot's odometry, and the motion without it. `still`: the start frame
         is known to stand still; else an odometry over ground tells nothing in it. `since_ns`: time of the newest fix.
@@ -67,15 +67,15 @@ class Carrier:
         ago, then = (from_ns - since_ns) * 1e-9, (to_ns - since_ns) * 1e-9
         gathered = drift.gathered(then) - drift.gathered(ago) if then >= ago else drift.gathered(abs(dt))
         spread = gathered + e.walk_m_per_sqrt_s**2 * abs(dt) * np.eye(3)
-        t = dt * (R_start_drone.T @ drift.velocity_mps)
+        t = dt * (R_map_drone.T @ drift.velocity_mps)
         if own is not None and R_own is not None:
             way_m, beyond_s = own
             t = t + R_own.T @ way_m
             spread = spread + (0.5 * BEYOND_MPS2 * beyond_s**2) ** 2 * np.eye(3)
-        R_start_after = R_start_drone @ R
+        R_map_after = R_map_drone @ R
         Q = np.zeros((6, 6))
         Q[:3, :3] = turn_rad2 * np.eye(3)
-        Q[3:, 3:] = R_start_after.T @ spread @ R_start_after
+        Q[3:, 3:] = R_map_after.T @ spread @ R_map_after
         return Step(R, t, Q, by_odometry, told)
 
     def R_own_drone(self, stamp_ns: int) -> Array64 | None:

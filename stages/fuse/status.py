@@ -42,7 +42,7 @@ def state_of(
     if not worst_m <= limits.lost_sigma_m:
         return PoseState.LOST, f"position known to {worst_m:.1f} m only, {age_s:.1f} s after the last by LiDAR"
     unseen = f"; the LiDAR has not seen it for {age_s:.1f} s" if age_s > limits.coast_after_s else ""
-    if known.R_start_drone is None:
+    if known.R_map_drone is None:
         if e.north.heading.contradiction:
             return PoseState.AMBIGUOUS, e.north.heading.contradiction + unseen
         if doubt:
@@ -93,9 +93,9 @@ class Jumps:
         if last is None or resets > told:
             return
         dt = (known.stamp_ns - last.stamp_ns) * 1e-9
-        off_m = float(np.linalg.norm(known.xyz_start_m - last.xyz_start_m - dt * last.velocity_start_mps))
+        off_m = float(np.linalg.norm(known.xyz_map_m - last.xyz_map_m - dt * last.velocity_map_mps))
         jumped = off_m > self._limits.jump_m + JUMP_MPS2 * dt**2
-        if known.R_start_drone is not None and last.R_start_drone is not None:
-            turned = float(np.linalg.norm(log_rotation(last.R_start_drone.T @ known.R_start_drone)))
+        if known.R_map_drone is not None and last.R_map_drone is not None:
+            turned = float(np.linalg.norm(log_rotation(last.R_map_drone.T @ known.R_map_drone)))
             jumped |= turned > math.radians(self._limits.jump_deg) + JUMP_RAD_PER_S * dt
         self.number += jumped

@@ -5,10 +5,13 @@
 Its speed is that of a tenth of a second or more: words that arrive together would make a parked vehicle race.
 Three go on past a word, each as far as an error of its own costs:
 
-    VehicleTrail (trail.py)     TRAIL_S, straight on; USUAL. Asked at every slice, and the next word, which comes soon,
+    VehicleTrajectory (trail.py)     TRAIL_S, straight on; USUAL. Asked at every slice, and the next word, which
+    comes soon,
                                 takes the error back
-    VehicleMotionChoice (ego)   JOINT_S, along its bend; UNTOLD. Another source is laid on there: the error stays
-    VehicleEgo (ego)            to the next picture, straight on; UNTOLD, and a turn at any usual rate: how it turned is
+    VehicleMotionSelector (ego)   JOINT_S, along its bend; UNTOLD. Another source is laid on there: the error
+    stays
+    VisualLidarOdometry (ego)            to the next picture, straight on; UNTOLD, and a turn at any usual rate: how
+    it turned is
                                 what its pictures would have told
 
 A word that is farther off than HARD lets it be is false, or its start frame has jumped, as when an odometry is started
@@ -107,7 +110,7 @@ class BelievedWords:
     def _leads_to(self, motion: VehicleMotion) -> bool:
         words, last_ns = list(self._words), self._words[-1].stamp_ns
         at = along_its_bend(words, motion.stamp_ns, until_s=math.inf)
-        expected, told = ((m.R_start_vehicle, m.xyz_start_m) for m in (at, motion))
+        expected, told = ((m.R_map_vehicle, m.xyz_map_m) for m in (at, motion))
         return leads_to(expected, told, (motion.stamp_ns - last_ns) * 1e-9, speed_mps(words))
 
 
@@ -135,8 +138,8 @@ def _go_on(words: tuple[VehicleMotion, ...]) -> bool:
     if min(first_s, second_s) <= 0.0:
         return False
     share, longer_s = second_s / first_s, max(first_s, second_s)
-    off_m = c.xyz_start_m - b.xyz_start_m - share * (b.xyz_start_m - a.xyz_start_m)
-    turns = log_rotation(a.R_start_vehicle.T @ b.R_start_vehicle), log_rotation(b.R_start_vehicle.T @ c.R_start_vehicle)
+    off_m = c.xyz_map_m - b.xyz_map_m - share * (b.xyz_map_m - a.xyz_map_m)
+    turns = log_rotation(a.R_map_vehicle.T @ b.R_map_vehicle), log_rotation(b.R_map_vehicle.T @ c.R_map_vehicle)
     near = float(np.linalg.norm(off_m)) <= OFF_M + 2.0 * HARD.place_m(longer_s)
     return near and float(np.linalg.norm(turns[1] - share * turns[0])) <= OFF_RAD + 2.0 * HARD.turn_rad(longer_s)
 
@@ -151,14 +154,14 @@ def along_its_bend(told: list[VehicleMotion], stamp_ns: int, until_s: float = JO
     untold_s = (stamp_ns - last.stamp_ns) * 1e-9
     span_ns, before = _speed_span(told)
     share = min(untold_s, until_s) / (span_ns * 1e-9) if span_ns else 0.0
-    R = last.R_start_vehicle
-    turn = log_rotation(np.ascontiguousarray(before.R_start_vehicle.T @ R))
-    way_m = exp_rotation(-0.5 * turn) @ before.R_start_vehicle.T @ (last.xyz_start_m - before.xyz_start_m)  # own axes
+    R = last.R_map_vehicle
+    turn = log_rotation(np.ascontiguousarray(before.R_map_vehicle.T @ R))
+    way_m = exp_rotation(-0.5 * turn) @ before.R_map_vehicle.T @ (last.xyz_map_m - before.xyz_map_m)  # own axes
     unsure = np.diag([UNTOLD.turn_rad(untold_s) ** 2] * 3 + [UNTOLD.place_m(untold_s) ** 2] * 3)
     return VehicleMotion(
         stamp_ns=stamp_ns,
-        xyz_start_m=last.xyz_start_m + R @ exp_rotation(0.5 * share * turn) @ (share * way_m),
-        R_start_vehicle=R @ exp_rotation(share * turn),
+        xyz_map_m=last.xyz_map_m + R @ exp_rotation(0.5 * share * turn) @ (share * way_m),
+        R_map_vehicle=R @ exp_rotation(share * turn),
         covariance=None if last.covariance is None else last.covariance + unsure,
     )
 
@@ -166,7 +169,7 @@ def along_its_bend(told: list[VehicleMotion], stamp_ns: int, until_s: float = JO
 def speed_mps(told: list[VehicleMotion]) -> float | None:
     """The speed that the words tell; None: they tell none."""
     span_ns, before = _speed_span(told)
-    return float(np.linalg.norm(told[-1].xyz_start_m - before.xyz_start_m)) / (span_ns * 1e-9) if span_ns else None
+    return float(np.linalg.norm(told[-1].xyz_map_m - before.xyz_map_m)) / (span_ns * 1e-9) if span_ns else None
 
 
 def _speed_span(told: list[VehicleMotion]) -> tuple[int, VehicleMotion]:

@@ -1,12 +1,12 @@
 """The vehicle's trail: where it was at each moment, so that what stands still in the world stands still in memory.
 
-Frame local: the vehicle's own odometry frame (T_local_vehicle = T_start_vehicle). Without VehicleMotion it is the
+Frame local: the vehicle's own odometry frame (T_map_vehicle) without its jumps. Without VehicleMotion it is the
 vehicle's frame itself: right for a parked vehicle; then what stands still seems to move with a driving one.
 
 The odometry's start frame may jump, as when it is started afresh (vehicle_onward.py says how that is told from a false
 pose). The new one is then laid on where the trail had the vehicle: the local frame goes on, and no jump is a speed.
 
-    T_local_vehicle = T_local_start T_start_vehicle,   T_local_start = T_local_vehicle(t) T_start_vehicle(t)^-1
+    T_map_vehicle = T_map_source T_source_vehicle,   T_map_source = T_map_vehicle(t) T_source_vehicle(t)^-1
 
 Source: DESIGN, sweep "ego-motion compensated"; ours.
 """
@@ -31,8 +31,8 @@ AFRESH_NS = 2_000_000_000  # in so long a silence an odometry may have been star
 FURTHEST_NS = round(1e9 * TRAIL_S)  # beyond the newest pose
 
 
-class VehicleTrail:
-    """T_local_vehicle over time: linear between two poses; a little beyond the newest as it went in the last 0.1 s."""
+class VehicleTrajectory:
+    """T_map_vehicle over time: linear between two poses; a little beyond the newest as it went in the last 0.1 s."""
 
     def __init__(self, joined: bool = True) -> None:
         """`joined`: a start frame that jumped is laid on the one before; else another local frame begins."""
@@ -93,9 +93,9 @@ class VehicleTrail:
     def _local(self, motion: VehicleMotion) -> tuple[Array64, Array64]:
         """A pose in the local frame."""
         if self._local_start is None:
-            return motion.R_start_vehicle, motion.xyz_start_m
+            return motion.R_map_vehicle, motion.xyz_map_m
         R, t = self._local_start
-        return R @ motion.R_start_vehicle, R @ motion.xyz_start_m + t
+        return R @ motion.R_map_vehicle, R @ motion.xyz_map_m + t
 
     def _append(self, motion: VehicleMotion) -> None:
         self._known.clear()
@@ -106,12 +106,12 @@ class VehicleTrail:
         """From this pose on the start frame is another one: how it went before says nothing."""
         if self._joined:
             R, t = self.at(first.stamp_ns)
-            R_local_start = nearest_rotation(R @ first.R_start_vehicle.T)
-            self._local_start = R_local_start, t - R_local_start @ first.xyz_start_m
+            R_map_source = nearest_rotation(R @ first.R_map_vehicle.T)
+            self._local_start = R_map_source, t - R_map_source @ first.xyz_map_m
         self._begun_ns = first.stamp_ns
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64]:
-        """R_local_vehicle (3, 3) and t_local_vehicle (3,) [m]."""
+        """R_map_vehicle (3, 3) and t_map_vehicle (3,) [m]."""
         poses = self._poses
         if stamp_ns in self._known:
             return self._known[stamp_ns]

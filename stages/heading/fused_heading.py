@@ -25,7 +25,7 @@ FORGET_NS = 30_000_000_000
 
 
 class Heading:
-    """Remembers what both said of the yaw of R_start_own, and judges."""
+    """Remembers what both said of the yaw of R_map_own, and judges."""
 
     def __init__(self) -> None:
         self._motion: Yaw | None = None

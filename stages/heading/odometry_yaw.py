@@ -27,7 +27,7 @@ SILENT_RAD = math.radians(1.0)  # what a shorter silence costs
 
 
 class North:
-    """What is known of R_start_own, from whom, and whether they agree."""
+    """What is known of R_map_own, from whom, and whether they agree."""
 
     def __init__(self, errors: FuseErrors, sigma_rad: float) -> None:
         """`sigma_rad`: a yaw known worse is of no use."""
@@ -86,10 +86,10 @@ class North:
         """The yaw, if it is of use and nobody objects."""
         return None if self.heading.contradiction else self.useful(stamp_ns)
 
-    def remember(self, stamp_ns: int, R_start_own: Array64, variance_rad2: float) -> None:
+    def remember(self, stamp_ns: int, R_map_own: Array64, variance_rad2: float) -> None:
         """What the pose tells of it, unless it is known better."""
         if self.yaw is None or math.sqrt(variance_rad2) <= self.yaw.sigma_at(stamp_ns):
-            self.yaw = Yaw(stamp_ns, heading_rad(R_start_own), variance_rad2)
+            self.yaw = Yaw(stamp_ns, heading_rad(R_map_own), variance_rad2)
 
     def forget(self) -> None:
         """Nothing said so far counts any more."""

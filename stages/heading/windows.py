@@ -17,7 +17,7 @@ import numpy as np
 
 from stages.geometry.frames import Array64
 from stages.heading.hypothesis_bank import ASKEW, Displacement, turns
-from stages.messages import DroneFix, DroneMotion
+from stages.messages import DroneFix, VisualMotion
 from stages.odometry.drone.trajectory import AutopilotTrail
 
 HANDFUL = 3  # fixes
@@ -34,7 +34,7 @@ SLACK_M = 0.6  # the LiDAR may see so much more way than the odometry before tha
 @dataclass(frozen=True)
 class _Fix:
     stamp_ns: int
-    xyz_start_m: Array64
+    xyz_map_m: Array64
     covariance_m2: Array64  # (2, 2) start frame, horizontal
     own: tuple[Array64, int] | None  # where the odometry had the drone
 
@@ -62,27 +62,27 @@ class Windows:
         self._start: _Handful | None = None
         self._waiting: _Handful | None = None  # the end of a window whose pictures are still to come
         self._track: int | None = None
-        self._steps: deque[DroneMotion] = deque(maxlen=512)
+        self._steps: deque[VisualMotion] = deque(maxlen=512)
 
     def restart(self) -> None:
         """Nothing before now counts."""
         self._recent.clear()
         self._start = self._waiting = None
 
-    def add_step(self, motion: DroneMotion) -> None:
+    def add_step(self, motion: VisualMotion) -> None:
         """A step of the odometry by pictures: its direction."""
         self._steps.append(motion)
 
-    def add_fix(self, fix: DroneFix, R_start_vehicle: Array64, t_start_vehicle_m: Array64, own: AutopilotTrail) -> None:
+    def add_fix(self, fix: DroneFix, R_map_vehicle: Array64, t_map_vehicle_m: Array64, own: AutopilotTrail) -> None:
         """A fix, with where the vehicle was; one of another track starts anew."""
         if fix.track_id != self._track or (self._recent and fix.stamp_ns <= self._recent[-1].stamp_ns):
             self.restart()
         self._track = fix.track_id
-        covariance = R_start_vehicle @ fix.covariance_m2 @ R_start_vehicle.T
+        covariance = R_map_vehicle @ fix.covariance_m2 @ R_map_vehicle.T
         self._recent.append(
             _Fix(
                 fix.stamp_ns,
-                R_start_vehicle @ fix.xyz_vehicle_m + t_start_vehicle_m,
+                R_map_vehicle @ fix.xyz_vehicle_m + t_map_vehicle_m,
                 covariance[:2, :2],
                 own.place(fix.stamp_ns),
             )
@@ -90,8 +90,8 @@ class Windows:
         if self._start is None and len(self._recent) == HANDFUL:
             self._start = self._handful()
 
-    def close_metric(self, R_start_own: Array64, bearing_rad: float) -> Displacement | None:
-        """The window since the last, told by the autopilot's positions; R_start_own is branch 0's."""
+    def close_metric(self, R_map_own: Array64, bearing_rad: float) -> Displacement | None:
+        """The window since the last, told by the autopilot's positions; R_map_own is branch 0's."""
         start, end = self._ends()
         if start is None or end is None:
             return None
@@ -100,11 +100,11 @@ class Windows:
             self._begin_at(end)
             return None
         anchor = own_m(start.fixes[0])
-        told = [[(R_start_own @ (own_m(f) - anchor))[:2] for f in h.fixes] for h in (start, end)]
+        told = [[(R_map_own @ (own_m(f) - anchor))[:2] for f in h.fixes] for h in (start, end)]
         middle = [np.mean(t, axis=0) for t in told]
         odometry = middle[1] - middle[0]
         left = [  # of the fixes, when the way told is taken off as each hypothesis turns it
-            np.median(np.array([f.xyz_start_m[:2] for f in h.fixes]) - np.array(t) @ np.swapaxes(self._R, 1, 2), axis=1)
+            np.median(np.array([f.xyz_map_m[:2] for f in h.fixes]) - np.array(t) @ np.swapaxes(self._R, 1, 2), axis=1)
             for h, t in zip((start, end), told, strict=True)
         ]
         lidar = left[1] - left[0] + self._R @ odometry
@@ -117,8 +117,8 @@ class Windows:
         self._begin_at(end)
         return Displacement(start.stamp_ns, end.stamp_ns, lidar, noise, odometry, bearing_rad, True)
 
-    def close_bearing(self, R_start_drone: dict[int, Array64], bearing_rad: float) -> Displacement | None:
-        """The window since the last, told by directions between pictures; R_start_drone by from_ns is branch 0's."""
+    def close_bearing(self, R_map_drone: dict[int, Array64], bearing_rad: float) -> Displacement | None:
+        """The window since the last, told by directions between pictures; R_map_drone by from_ns is branch 0's."""
         start, end = self._ends()
         if start is None or end is None:
             return None
@@ -134,11 +134,11 @@ class Windows:
         self._begin_at(end)
         flown, covered, flew, sigma = np.zeros(3), 0.0, 0.0, 0.0
         for step, overlap in self._keys_steps(start.stamp_ns, end.stamp_ns):
-            if step.from_ns not in R_start_drone:
+            if step.from_ns not in R_map_drone:
                 continue
             covered += overlap
             if step.direction_from is not None and step.direction_sigma_rad is not None:
-                flown += overlap * (R_start_drone[step.from_ns] @ step.direction_from)
+                flown += overlap * (R_map_drone[step.from_ns] @ step.direction_from)
                 flew += overlap
                 sigma = max(sigma, step.direction_sigma_rad)
         flat = float(np.linalg.norm(flown[:2]))
@@ -149,9 +149,9 @@ class Windows:
             start.stamp_ns, end.stamp_ns, lidar, noise, flown[:2] / flat, math.hypot(sigma, bearing_rad), False
         )
 
-    def _keys_steps(self, start_ns: int, end_ns: int) -> list[tuple[DroneMotion, int]]:
+    def _keys_steps(self, start_ns: int, end_ns: int) -> list[tuple[VisualMotion, int]]:
         """One step of each key picture, with how much of the window [ns] it covers: most, and as little else."""
-        best: dict[int, tuple[DroneMotion, int]] = {}
+        best: dict[int, tuple[VisualMotion, int]] = {}
         for step in self._steps:  # those of one key from short to long: each covers what those before it do
             overlap = min(step.stamp_ns, end_ns) - max(step.from_ns, start_ns)
             if overlap > 0 and (step.from_ns not in best or overlap > best[step.from_ns][1]):
@@ -195,4 +195,4 @@ def own_m(fix: _Fix) -> Array64:
 
 def median_m(handful: _Handful) -> Array64:
     """(2,) horizontal."""
-    return np.median([f.xyz_start_m[:2] for f in handful.fixes], axis=0)
+    return np.median([f.xyz_map_m[:2] for f in handful.fixes], axis=0)

@@ -1,4 +1,4 @@
-"""The yaw of the autopilot's own frame in the start frame, as somebody told it once: R_start_own = Rz(yaw).
+"""The yaw of the autopilot's own frame in the start frame, as somebody told it once: R_map_own = Rz(yaw).
 
 Source: ours; sizes of the drift: links' and autopilots' usual degrees a minute.
 """

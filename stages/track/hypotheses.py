@@ -54,7 +54,8 @@ class Hypotheses:
     def __init__(
         self, manoeuvre: float, told_manoeuvre: float, start_sigma_mps: float, own_sigma_m: float, max_drones: int
     ) -> None:
-        """Densities of the acceleration without and with the drone's word [m^2/s^3]; see `HitMissTrack`'s settings."""
+        """Densities of the acceleration without and with the drone's word [m^2/s^3]; see `LikelihoodTrack`'s
+        settings."""
         self._manoeuvre, self._told_manoeuvre = manoeuvre, told_manoeuvre
         self._start_sigma_mps, self._own_sigma_m, self._max_drones = start_sigma_mps, own_sigma_m, max_drones
         self._all: list[Hypothesis] = []

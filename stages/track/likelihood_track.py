@@ -24,7 +24,7 @@ from pydantic import Field
 
 from flow.stage import Settings, Stage
 from stages.geometry.frames import Array64, LidarMount
-from stages.geometry.trajectory import VehicleTrail
+from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.sweep.pulses import mean_direction
 from stages.kernels.track.scan_pass import largest_sigma_m
 from stages.messages import (
@@ -46,8 +46,8 @@ LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
 CANDIDATE_S = 1.5  # one that was not accepted is forgotten so long after its last hit
 
 
-class HitMissTrackSettings(Settings):
-    """Settings of `HitMissTrack`."""
+class LikelihoodTrackSettings(Settings):
+    """Settings of `LikelihoodTrack`."""
 
     mount: LidarMount = LidarMount()  # of it, how well the servo's angle is known
     span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
@@ -70,14 +70,14 @@ class HitMissTrackSettings(Settings):
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
 
 
-class HitMissTrack(Stage[HitMissTrackSettings]):
+class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
     """Hits and misses of every look, de-skewed, on as many drones as there are."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion", "drone_position", "drone_odometry"})
 
-    def __init__(self, settings: HitMissTrackSettings | None = None, /, **values: Any) -> None:
+    def __init__(self, settings: LikelihoodTrackSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._trail = VehicleTrail()
+        self._trail = VehicleTrajectory()
         self._detector_life: int | None = None  # that counts the candidates
         self._next_number: int = 1
         self._idle_ns: int = 0
@@ -281,17 +281,17 @@ class HitMissTrack(Stage[HitMissTrackSettings]):
         x, P = self._known.at(track, track.last_hit_ns)
         R, _ = self._trail.at(track.last_hit_ns)
         xyz, velocity = self._trail.to_vehicle(track.last_hit_ns, x[:3], x[3:])
-        lasting_m2 = self._lasting_covariance(xyz)
+        bias_covariance_m2 = self._lasting_covariance(xyz)
         return DroneFix(
             stamp_ns=track.last_hit_ns,
             xyz_vehicle_m=xyz,
-            covariance_m2=R.T @ P[:3, :3] @ R + lasting_m2,
+            covariance_m2=R.T @ P[:3, :3] @ R + bias_covariance_m2,
             hits=track.hits,
             iterations=1,
             shift_m=0.0,
             track_id=track.number,
             velocity_vehicle_mps=velocity,
-            lasting_m2=lasting_m2,
+            bias_covariance_m2=bias_covariance_m2,
         )
 
     def _lasting_covariance(self, xyz_vehicle_m: Array64) -> Array64:

@@ -82,7 +82,7 @@ class ToldMotion:
         """Probability that the track flies as told."""
         return self._sure
 
-    def learn(self, number: int, stamp_ns: int, xyz_local_m: Array64, sigma_m: float) -> None:
+    def learn(self, number: int, stamp_ns: int, xyz_map_m: Array64, sigma_m: float) -> None:
         """Where confirmed track `number` was, and how well that is known, one sigma an axis."""
         self._of_this_frame()
         if number != self._number:
@@ -95,7 +95,7 @@ class ToldMotion:
             return
         if self.told.state(stamp_ns) is None:
             return
-        self._places.append((stamp_ns, xyz_local_m, sigma_m))
+        self._places.append((stamp_ns, xyz_map_m, sigma_m))
         while stamp_ns - self._places[0][0] > WINDOW_NS:
             self._places.popleft()
         self._weigh()

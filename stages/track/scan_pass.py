@@ -73,7 +73,7 @@ def collect_into(
 ) -> Look | None:
     """The look with this slice's pulses near the drone, a new one if there was none; None while there are none.
 
-    R, t are T_local_vehicle of the slice, `axis` (3,) its mean direction; x, P the state predicted at the look's start.
+    R, t are T_map_vehicle of the slice, `axis` (3,) its mean direction; x, P the state predicted at the look's start.
     """
     origin = np.array(pulses.origin_vehicle_m)
     away, range_m, here = seen_from(R, t, origin, x, axis)

@@ -29,7 +29,7 @@ ROUNDS = 8
 
 @dataclass(frozen=True)
 class Lines:
-    """What the search needs to know of lines; vectors in the carrier's axes."""
+    """What the search needs to know of lines; vectors in the camera_mount's axes."""
 
     normal: Array64  # (m, 3)
     tangent: Array64  # (m, 3) along the circle at the line's middle

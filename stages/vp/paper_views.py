@@ -91,7 +91,7 @@ class RectifiedView:
         return found[kept[order]]
 
     def ends(self, segments: Array64) -> Array64:
-        """Unit rays (n, 2, 3) of the ends of segments (n, 4), in the carrier's axes."""
+        """Unit rays (n, 2, 3) of the ends of segments (n, 4), in the camera_mount's axes."""
         rays = self._rays(segments.reshape(-1, 2)) @ self.R_carrier_view.T
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         return rays.reshape(-1, 2, 3)

@@ -71,7 +71,7 @@ def picture(R_world_camera: np.ndarray, p_world_m: np.ndarray, seed: int = 0, si
 def image(
     stamp_ns: int, R_world_carrier: np.ndarray, p_world_m: np.ndarray, mount: Pose, name: str = "camera"
 ) -> Image:
-    """The picture of a camera mounted at its carrier's origin."""
+    """The picture of a camera mounted at its camera_mount's origin."""
     R = R_world_carrier @ mount.matrix()[:3, :3]
     return Image(stamp_ns=stamp_ns, frame_id=name, grey=picture(R, np.asarray(p_world_m, float), stamp_ns % 2**31))
 

@@ -87,7 +87,7 @@ def look_at_all(
 ) -> int:
     """Fill found (rows, 3) with NOTHING, NEAR or ELSEWHERE, and the pulses of a slice that hit and passed each middle.
 
-    Returns of how many there is something to say. R, t are T_local_vehicle of the slice, axis (3,) its mean direction,
+    Returns of how many there is something to say. R, t are T_map_vehicle of the slice, axis (3,) its mean direction,
     direction (k, 3) and range (k,) its pulses.
     """
     tally, away, centre = np.zeros(TALLY, dtype=np.int64), np.empty(3), np.empty(3)

@@ -32,7 +32,7 @@ def misfit(xyz_m: Array64, x: Array64, P: Array64) -> float:
 def seen_from(R: Array64, t: Array64, origin_m: Array64, x: Array64, axis: Array64) -> tuple[Array64, float, bool]:
     """(line to a state's place (3,) [m], its length, whether a slice looks there), all in the vehicle frame.
 
-    R, t are T_local_vehicle of the slice, origin (3,) and axis (3,) its beams' start and mean direction.
+    R, t are T_map_vehicle of the slice, origin (3,) and axis (3,) its beams' start and mean direction.
     """
     away = R.T @ (x[:3] - t) - origin_m
     range_m = math.sqrt(away @ away)

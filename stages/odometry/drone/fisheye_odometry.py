@@ -1,6 +1,6 @@
 """The drone's motion from its fisheye: rotation, and the direction of travel without its length.
 
-Each picture gives one DroneMotion, from the key picture to it. Chaining: a key picture stays for several pictures, so
+Each picture gives one VisualMotion, from the key picture to it. Chaining: a key picture stays for several pictures, so
 motions with the same `from_ns` share it; the last of them ends in the next key, and the next motion's `from_ns` is its
 `stamp_ns`. Rotations multiply along the keys, R_a_c = R_a_b R_b_c; directions add once each is given its length:
 t_a_c = t_a_b + R_a_b t_b_c. Between two pictures of one key R_i_j = R_k_i^T R_k_j. Errors of motions of the same key
@@ -24,7 +24,7 @@ from flow.stage import Settings, Stage
 from stages.geometry.frames import Array64, Pose
 from stages.geometry.lens import Lens
 from stages.kernels.geometry.so3 import exp_rotation
-from stages.messages import DroneImu, DroneMotion, FollowedFeatures, Image
+from stages.messages import DroneImu, FollowedFeatures, Image, VisualMotion
 from stages.odometry.visual.features import FeatureSettings
 from stages.odometry.visual.image_motion import Link, LinkSettings, MotionLinks, followed
 from stages.odometry.visual.two_view import backwards
@@ -60,7 +60,7 @@ class FisheyeOdometry(Stage[FisheyeOdometrySettings]):
         if not self._gyro or imu.stamp_ns > self._gyro[-1][0]:
             self._gyro.append((imu.stamp_ns, imu.angular_velocity_drone_radps))
 
-    def on_image(self, image: Image) -> Iterator[DroneMotion | FollowedFeatures]:
+    def on_image(self, image: Image) -> Iterator[VisualMotion | FollowedFeatures]:
         """The motion since the key picture, and from what. Nothing: the first picture, or nothing to follow."""
         gyro, before_ns = self._gyro, self._links.newest_ns
         while len(gyro) > 1 and gyro[1][0] <= before_ns:
@@ -72,14 +72,14 @@ class FisheyeOdometry(Stage[FisheyeOdometrySettings]):
             return
         yield followed(link, image.frame_id)
         if np.count_nonzero(link.motion.inlier) >= self.settings.least_matches:
-            yield drone_motion(link, C)
+            yield visual_motion(link, C)
 
 
-def drone_motion(link: Link, R_drone_camera: Array64) -> DroneMotion:
+def visual_motion(link: Link, R_drone_camera: Array64) -> VisualMotion:
     """The camera's motion in the drone's axes: R_from_to = C R C^T, direction = C d, covariance C P C^T."""
     C, back = R_drone_camera, backwards(link.motion)
     t = back.t_hat_earlier
-    return DroneMotion(
+    return VisualMotion(
         stamp_ns=link.now.stamp_ns,
         from_ns=link.key.stamp_ns,
         R_from_to=C @ back.R_earlier_later @ C.T,

@@ -56,14 +56,14 @@ class DroneTelemetry:
 
     def add_position(self, position: DroneLocalPosition) -> None:
         """LOCAL_POSITION_NED and its like."""
-        self.add(position.stamp_ns, position.xyz_local_m, position.velocity_local_mps)
+        self.add(position.stamp_ns, position.xyz_odom_m, position.velocity_odom_mps)
 
     def add_odometry(self, odometry: DroneOdometry) -> None:
         """ODOMETRY: its velocity is in the drone's axes, and it counts its own jumps; one called failed is not used."""
         if odometry.quality_percent == 0:
             return
-        velocity_mps = odometry.R_local_drone @ odometry.velocity_drone_mps
-        self.add(odometry.stamp_ns, odometry.xyz_local_m, velocity_mps, odometry.reset_counter)
+        velocity_mps = odometry.R_odom_drone @ odometry.velocity_drone_mps
+        self.add(odometry.stamp_ns, odometry.xyz_odom_m, velocity_mps, odometry.reset_counter)
 
     @property
     def heard_ns(self) -> tuple[int, int] | None:

@@ -23,7 +23,7 @@ import numpy as np
 
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
-from stages.messages import DroneAttitude, DroneLocalPosition, DroneMotion, DroneOdometry
+from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry, VisualMotion
 
 KEPT = 1024
 AHEAD_NS = 250_000_000  # beyond its newest word a source is believed this long
@@ -87,18 +87,18 @@ class AutopilotTrail:
                 return
             self._odometry_ns = word.stamp_ns
             self.reset(word.reset_counter)
-            self.add_attitude(word.stamp_ns, word.R_local_drone, word.angular_velocity_drone_radps)
-            self.add_position(word.stamp_ns, word.xyz_local_m, word.R_local_drone @ word.velocity_drone_mps)
+            self.add_attitude(word.stamp_ns, word.R_odom_drone, word.angular_velocity_drone_radps)
+            self.add_position(word.stamp_ns, word.xyz_odom_m, word.R_odom_drone @ word.velocity_drone_mps)
         elif self._odometry_ns is not None and word.stamp_ns - self._odometry_ns < ODOMETRY_NS:
             return
         elif isinstance(word, DroneAttitude):
-            self.add_attitude(word.stamp_ns, word.R_local_drone, word.angular_velocity_drone_radps)
+            self.add_attitude(word.stamp_ns, word.R_odom_drone, word.angular_velocity_drone_radps)
         else:
-            self.add_position(word.stamp_ns, word.xyz_local_m, word.velocity_local_mps)
+            self.add_position(word.stamp_ns, word.xyz_odom_m, word.velocity_odom_mps)
 
-    def add_attitude(self, stamp_ns: int, R_local_drone: Array64, rate_drone_radps: Array64) -> None:
+    def add_attitude(self, stamp_ns: int, R_odom_drone: Array64, rate_drone_radps: Array64) -> None:
         """One more attitude; one that is not newer than the last is ignored."""
-        R_own_drone = self._R_own_local @ R_local_drone
+        R_own_drone = self._R_own_local @ R_odom_drone
         if self._nodes:
             last = self._nodes[-1]
             dt = (stamp_ns - last.stamp_ns) * 1e-9
@@ -111,15 +111,15 @@ class AutopilotTrail:
                 self.silences += 1
             elif off > JUMP_RAD + 0.3 * float(np.linalg.norm(turn)):
                 self.jumps += 1
-                self._R_own_local = expected @ R_local_drone.T
+                self._R_own_local = expected @ R_odom_drone.T
                 self._break_places()
                 R_own_drone = expected
         self._nodes.append(_Node(stamp_ns, R_own_drone, rate_drone_radps))
 
-    def add_position(self, stamp_ns: int, xyz_local_m: Array64, velocity_local_mps: Array64) -> None:
+    def add_position(self, stamp_ns: int, xyz_odom_m: Array64, velocity_odom_mps: Array64) -> None:
         """One more position with its velocity, of the same estimate as the attitude."""
-        xyz = self._R_own_local @ xyz_local_m + self._offset_m
-        velocity = self._R_own_local @ velocity_local_mps
+        xyz = self._R_own_local @ xyz_odom_m + self._offset_m
+        velocity = self._R_own_local @ velocity_odom_mps
         stretch = 0
         if self._places:
             last = self._places[-1]
@@ -218,7 +218,7 @@ class PictureTrail:
     def __init__(self) -> None:
         self._nodes: deque[tuple[int, Array64, float, int]] = deque(maxlen=KEPT)  # stamp, R, variance so far, chain
 
-    def add(self, motion: DroneMotion) -> None:
+    def add(self, motion: VisualMotion) -> None:
         """One more step; one that does not begin where a known one ended begins a new chain."""
         if self._nodes and motion.stamp_ns <= self._nodes[-1][0]:
             return

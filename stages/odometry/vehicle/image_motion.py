@@ -55,9 +55,9 @@ def believable(found: Length, expected: Length) -> bool:
     return found.features >= MANY or abs(found.m - expected.m) < 3.0 * math.hypot(found.sigma_m, expected.sigma_m)
 
 
-def carrier_pose(at: Pose6, T_carrier_camera: Array64) -> Pose6:
-    """T_start_carrier = M T_start_camera M^-1 with M = T_carrier_camera, and its covariance Ad(M) P Ad(M)^T."""
-    M = T_carrier_camera
+def carrier_pose(at: Pose6, T_mount_camera: Array64) -> Pose6:
+    """T_start_carrier = M T_map_camera M^-1 with M = T_mount_camera, and its covariance Ad(M) P Ad(M)^T."""
+    M = T_mount_camera
     T = M @ transform(at.R, at.p) @ np.linalg.inv(M)
     A = adjoint(M[:3, :3], M[:3, 3])
     return Pose6(T[:3, :3].copy(), T[:3, 3].copy(), A @ at.covariance @ A.T)

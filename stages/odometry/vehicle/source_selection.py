@@ -7,11 +7,11 @@
 Each source has a start frame of its own, and one that went away may come back with another. So at every change the new
 source is laid on the old one's end:
 
-    T_start_vehicle = T_start_source T_source_vehicle,   T_start_source = T_start_vehicle(t) T_source_vehicle(t)^-1
+    T_map_vehicle = T_map_source T_source_vehicle,   T_map_source = T_map_vehicle(t) T_source_vehicle(t)^-1
 
 with t the new source's first stamp, to where the vehicle went on (vehicle_onward.py). So it is, too, where a source's
 own frame jumps: its words are left out until three tell of one smooth way elsewhere. The start frame stays that of the
-first source heard. Consumers take T_start_vehicle for smooth: they never see a jump, but drift.
+first source heard. Consumers take T_map_vehicle for smooth: they never see a jump, but drift.
 
 Source: ours; P V.B for the camera's motion.
 """
@@ -42,18 +42,18 @@ class Teller(Enum):
     EGO = "ego"
 
 
-class VehicleMotionChoiceSettings(Settings):
-    """Settings of `VehicleMotionChoice`."""
+class VehicleMotionSelectorSettings(Settings):
+    """Settings of `VehicleMotionSelector`."""
 
     silent_s: float = Field(SILENT_S, gt=0, le=10)  # two periods of the odometry at least
 
 
-class VehicleMotionChoice(Stage[VehicleMotionChoiceSettings]):
-    """T_start_vehicle without a jump, whoever tells it. Both inputs are optional, each may go and come back."""
+class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
+    """T_map_vehicle without a jump, whoever tells it. Both inputs are optional, each may go and come back."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry", "ego"})
 
-    def __init__(self, settings: VehicleMotionChoiceSettings | None = None, /, **values: Any) -> None:
+    def __init__(self, settings: VehicleMotionSelectorSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._teller: Teller | None = None
         self._words: dict[Teller, BelievedWords] = {t: BelievedWords() for t in Teller}
@@ -104,11 +104,11 @@ class VehicleMotionChoice(Stage[VehicleMotionChoiceSettings]):
 
     def _in_start(self, motion: VehicleMotion) -> VehicleMotion:
         """A source's word, in the start frame."""
-        T = self._T_start_source @ transform(motion.R_start_vehicle, motion.xyz_start_m)
+        T = self._T_start_source @ transform(motion.R_map_vehicle, motion.xyz_map_m)
         return VehicleMotion(
             stamp_ns=motion.stamp_ns,
-            xyz_start_m=T[:3, 3].copy(),
-            R_start_vehicle=nearest_rotation(np.ascontiguousarray(T[:3, :3])),
+            xyz_map_m=T[:3, 3].copy(),
+            R_map_vehicle=nearest_rotation(np.ascontiguousarray(T[:3, :3])),
             covariance=self._covariance(motion),
         )
 
@@ -117,8 +117,8 @@ class VehicleMotionChoice(Stage[VehicleMotionChoiceSettings]):
         if not self._told:
             return
         at = along_its_bend(list(self._told), motion.stamp_ns)
-        there = transform(motion.R_start_vehicle, motion.xyz_start_m)
-        self._T_start_source = transform(at.R_start_vehicle, at.xyz_start_m) @ np.linalg.inv(there)
+        there = transform(motion.R_map_vehicle, motion.xyz_map_m)
+        self._T_start_source = transform(at.R_map_vehicle, at.xyz_map_m) @ np.linalg.inv(there)
         self._joint = motion, at.covariance
         self._told.clear()  # its speed is told by the new source alone
 
@@ -129,8 +129,8 @@ class VehicleMotionChoice(Stage[VehicleMotionChoiceSettings]):
         first, P = self._joint
         if P is None or first.covariance is None:
             return None
-        T_now_first = np.linalg.inv(transform(motion.R_start_vehicle, motion.xyz_start_m)) @ transform(
-            first.R_start_vehicle, first.xyz_start_m
+        T_now_first = np.linalg.inv(transform(motion.R_map_vehicle, motion.xyz_map_m)) @ transform(
+            first.R_map_vehicle, first.xyz_map_m
         )
         A = adjoint(np.ascontiguousarray(T_now_first[:3, :3]), T_now_first[:3, 3])
         worse, axes = np.linalg.eigh(motion.covariance - A @ first.covariance @ A.T)

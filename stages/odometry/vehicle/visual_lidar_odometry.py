@@ -1,4 +1,4 @@
-"""The vehicle's own motion from its camera, in metres by the LiDAR: T_start_vehicle, smooth and drifting.
+"""The vehicle's own motion from its camera, in metres by the LiDAR: T_map_vehicle, smooth and drifting.
 
     picture   the motion since the key picture, 5-DoF (stages/odometry/visual/image_motion.py); standing keeps the pose
     LiDAR     points, each placed by where the vehicle was at its time, give depths to the key's features
@@ -62,7 +62,7 @@ class _Key:
 class _Now:
     key: _Key | None = None
     window: list[KeyPicture] = field(default_factory=lambda: list[KeyPicture]())
-    poses: deque[tuple[int, Array64, Array64]] = field(  # the last two: stamp, T_start_camera
+    poses: deque[tuple[int, Array64, Array64]] = field(  # the last two: stamp, T_map_camera
         default_factory=lambda: deque[tuple[int, Array64, Array64]](maxlen=2)
     )
     waiting: deque[tuple[int, Array64]] = field(  # LiDAR slices not yet placed, camera frame
@@ -80,8 +80,8 @@ class _Now:
         return self.lengths >= LEAST_LENGTHS
 
 
-class VehicleEgoSettings(Settings):
-    """Settings of `VehicleEgo`."""
+class VisualLidarOdometrySettings(Settings):
+    """Settings of `VisualLidarOdometry`."""
 
     lens: Lens
     T_vehicle_camera: Pose
@@ -93,12 +93,12 @@ class VehicleEgoSettings(Settings):
     silent_s: float = Field(SILENT_S, gt=0, le=10)  # of the odometry: two of its periods at least
 
 
-class VehicleEgo(Stage[VehicleEgoSettings]):
-    """T_start_vehicle at every picture, by camera and LiDAR; nothing while the vehicle's own odometry is heard."""
+class VisualLidarOdometry(Stage[VisualLidarOdometrySettings]):
+    """T_map_vehicle at every picture, by camera and LiDAR; nothing while the vehicle's own odometry is heard."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry"})
 
-    def __init__(self, settings: VehicleEgoSettings | None = None, /, **values: Any) -> None:
+    def __init__(self, settings: VisualLidarOdometrySettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._now = _Now()
         self._odometry = BelievedWords()
@@ -282,7 +282,7 @@ class VehicleEgo(Stage[VehicleEgoSettings]):
     def _told(self, stamp_ns: int, at: Pose6) -> VehicleMotion:
         vehicle = carrier_pose(at, self._mount)
         return VehicleMotion(
-            stamp_ns=stamp_ns, xyz_start_m=vehicle.p, R_start_vehicle=vehicle.R, covariance=vehicle.covariance
+            stamp_ns=stamp_ns, xyz_map_m=vehicle.p, R_map_vehicle=vehicle.R, covariance=vehicle.covariance
         )
 
 

@@ -6,7 +6,7 @@
     solved     Gauss-Newton, Cauchy weights, depths eliminated (Schur), the two oldest pictures held: they keep place
                and, where no LiDAR reaches, length
 
-Poses are T_start_camera; increments R exp(phi), p + R rho.
+Poses are T_map_camera; increments R exp(phi), p + R rho.
 
 Source: P V.B (windowed bundle adjustment); Triggs et al., Bundle adjustment (2000), section 6.
 """
@@ -29,7 +29,7 @@ LEAST_FEATURES = 15
 class KeyPicture:
     """What a key picture saw, by growing track number."""
 
-    R: Array64  # R_start_camera
+    R: Array64  # R_map_camera
     p: Array64  # (3,) [m]
     number: NDArray[np.int64]
     ray: Array64  # (n, 3)

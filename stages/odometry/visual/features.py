@@ -91,7 +91,7 @@ class FeatureTracker:
         self._before: Grey | None = None
         self._usable: Grey = np.zeros((0, 0), np.uint8)  # half size, 0: no corner wanted here
         self._next = 0
-        self._R_start_now: Array64 = np.eye(3)
+        self._R_map_now: Array64 = np.eye(3)
         self._restart()
 
     def _restart(self) -> None:
@@ -109,7 +109,7 @@ class FeatureTracker:
                 raise ValueError(f"a picture of {size} pixels is too small to follow anything in")
             self._restart()
             self._usable = usable_pixels(self._lens, self._settings, grey.shape)
-        self._R_start_now = self._R_start_now @ R_now_before.T
+        self._R_map_now = self._R_map_now @ R_now_before.T
         kept, pixel = self._found_again(grey, R_now_before)
         ray = self._lens.unproject(pixel)
         seen = np.isfinite(ray[:, 0])
@@ -124,7 +124,7 @@ class FeatureTracker:
         `R_correction` (3, 3), on the left of the expected rotation, makes it the one found.
         """
         assert self._before is not None, "follow a picture first"
-        self._R_start_now = self._R_start_now @ R_correction.T
+        self._R_map_now = self._R_map_now @ R_correction.T
         t, s = self._tracks, self._settings
         worn = np.nonzero(self._worn)[0]
         if s.count - len(t.number) > REFILL * s.count or len(t.number) == 0:
@@ -157,13 +157,13 @@ class FeatureTracker:
     def _taken(self, pixel: Array64) -> _Templates:
         assert self._before is not None
         ray = np.stack([self._lens.unproject(pixel + step) for step in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))], axis=1)
-        return _Templates(patches.take(self._before, pixel), ray @ self._R_start_now.T)
+        return _Templates(patches.take(self._before, pixel), ray @ self._R_map_now.T)
 
     def _found_again(self, grey: Grey, R_now_before: Array64) -> tuple[NDArray[np.intp], Array64]:
         t, s = self._tracks, self._settings
         self._worn = np.zeros(0, np.bool_)
         guess = self._lens.project(t.ray @ R_now_before.T)
-        warped = self._lens.project((self._templates.ray @ self._R_start_now).reshape(-1, 3)).reshape(-1, 3, 2)
+        warped = self._lens.project((self._templates.ray @ self._R_map_now).reshape(-1, 3)).reshape(-1, 3, 2)
         rows = np.nonzero(np.isfinite(guess[:, 0]) & np.isfinite(warped).all(axis=(1, 2)))[0]
         if self._before is None or len(rows) == 0:
             return np.zeros(0, np.intp), np.zeros((0, 2))

@@ -149,12 +149,12 @@ def test_the_newest_goal_is_reached_at_its_speed(emulator):
 
 def test_without_the_aim_stage_the_servo_stops_in_mid_sweep_and_follows_the_next_goal(emulator):
     servo = live(emulator)
-    assert servo.orphaned("goal") is None, "it is not live yet"
+    assert servo.upstream_lost("goal") is None, "it is not live yet"
     with servo.listen() as records:
         next(records)
         servo.on_goal(goal(170, 10))
         until(records, lambda state: math.degrees(state["position_rad"]) > 100)
-        assert servo.orphaned("goal") == "the servo is stopped"
+        assert servo.upstream_lost("goal") == "the servo is stopped"
         stopped = until(records, lambda state: math.degrees(state["goal_rad"]) < 165)[-1]
         until(records, lambda state: abs(state["velocity_radps"]) < 0.01)
         assert math.degrees(emulator.position_rad(np.array([time.monotonic_ns()]))[0]) < 160

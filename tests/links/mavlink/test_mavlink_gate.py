@@ -44,27 +44,27 @@ def test_no_other_state_passes_even_if_the_pose_is_complete(state: PoseState):
 
 INVALID = [
     ({"R_vehicle_drone": None}, RejectReason.INCOMPLETE),
-    ({"R_start_drone": None}, RejectReason.INCOMPLETE),
-    ({"xyz_start_m": None}, RejectReason.INCOMPLETE),
+    ({"R_map_drone": None}, RejectReason.INCOMPLETE),
+    ({"xyz_map_m": None}, RejectReason.INCOMPLETE),
     ({"covariance": None}, RejectReason.INCOMPLETE),
-    ({"start_covariance": None}, RejectReason.INCOMPLETE),
-    ({"xyz_start_m": nan_at(np.ones(3))}, RejectReason.NOT_FINITE),
+    ({"map_covariance": None}, RejectReason.INCOMPLETE),
+    ({"xyz_map_m": nan_at(np.ones(3))}, RejectReason.NOT_FINITE),
     ({"xyz_vehicle_m": nan_at(np.ones(3), math.inf)}, RejectReason.NOT_FINITE),
-    ({"R_start_drone": nan_at(np.eye(3))}, RejectReason.NOT_FINITE),
-    ({"start_covariance": nan_at(covariance())}, RejectReason.NOT_FINITE),
+    ({"R_map_drone": nan_at(np.eye(3))}, RejectReason.NOT_FINITE),
+    ({"map_covariance": nan_at(covariance())}, RejectReason.NOT_FINITE),
     ({"covariance": np.diag([math.inf] * 3 + [0.01] * 3)}, RejectReason.NOT_FINITE),  # an unknown rotation
-    ({"R_start_drone": np.diag([1.0, 1.0, -1.0])}, RejectReason.INVALID_ROTATION),  # a reflection
+    ({"R_map_drone": np.diag([1.0, 1.0, -1.0])}, RejectReason.INVALID_ROTATION),  # a reflection
     ({"R_vehicle_drone": 1.01 * np.eye(3)}, RejectReason.INVALID_ROTATION),
-    ({"R_start_drone": np.zeros((3, 3))}, RejectReason.INVALID_ROTATION),
-    ({"start_covariance": np.zeros((6, 6))}, RejectReason.INVALID_COVARIANCE),
+    ({"R_map_drone": np.zeros((3, 3))}, RejectReason.INVALID_ROTATION),
+    ({"map_covariance": np.zeros((6, 6))}, RejectReason.INVALID_COVARIANCE),
     ({"covariance": -covariance()}, RejectReason.INVALID_COVARIANCE),
     (
         {"covariance": covariance() + 0.1 * np.triu(np.ones((6, 6)), 1)},
         RejectReason.INVALID_COVARIANCE,
     ),  # not symmetric
-    ({"start_covariance": covariance(position_m=0.51)}, RejectReason.POSITION_SIGMA),
+    ({"map_covariance": covariance(position_m=0.51)}, RejectReason.POSITION_SIGMA),
     ({"covariance": covariance(position_m=0.51)}, RejectReason.POSITION_SIGMA),
-    ({"start_covariance": covariance(rotation_deg=5.1)}, RejectReason.ROTATION_SIGMA),
+    ({"map_covariance": covariance(rotation_deg=5.1)}, RejectReason.ROTATION_SIGMA),
     ({"covariance": covariance(rotation_deg=60.0)}, RejectReason.ROTATION_SIGMA),
 ]
 
@@ -85,8 +85,7 @@ def test_sigmas_are_of_the_worst_direction_not_the_worst_axis():
     assert sigmas is not None
     np.testing.assert_allclose(sigmas, [0.02, 0.6])
     assert (
-        reject_reason(good_pose(start_covariance=turned @ flat @ turned.T), HOST0, LIMITS)
-        is RejectReason.POSITION_SIGMA
+        reject_reason(good_pose(map_covariance=turned @ flat @ turned.T), HOST0, LIMITS) is RejectReason.POSITION_SIGMA
     )
 
 
@@ -105,9 +104,7 @@ def test_an_unresolved_yaw_branch_is_never_sent_whatever_its_covariance():
     for i in range(300):
         state = (PoseState.AMBIGUOUS, PoseState.POSITION_ONLY, PoseState.LOST)[i % 3]
         at_ns = HOST0 + 20 * i * MS
-        pose = good_pose(
-            at_ns, state=state, R_vehicle_drone=wrong, R_start_drone=wrong, covariance=covariance(0.1, 0.01)
-        )
+        pose = good_pose(at_ns, state=state, R_vehicle_drone=wrong, R_map_drone=wrong, covariance=covariance(0.1, 0.01))
         sent += len(pose_sender.messages(pose, at_ns))
     assert sent == 0
     assert sum(pose_sender.rejected.values()) == 300
@@ -119,7 +116,7 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
 @given(
     state=st.sampled_from(PoseState),
     field=st.sampled_from(
-        ["xyz_vehicle_m", "xyz_start_m", "R_vehicle_drone", "R_start_drone", "covariance", "start_covariance"]
+        ["xyz_vehicle_m", "xyz_map_m", "R_vehicle_drone", "R_map_drone", "covariance", "map_covariance"]
     ),
     at=st.integers(0, 35),
     value=NUMBERS,

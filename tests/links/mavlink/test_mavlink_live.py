@@ -144,7 +144,7 @@ def test_an_unresolved_branch_is_never_sent_and_the_reason_is_reported():
         wrong = rotation_z(np.pi / 2)
         listener.send_poses(
             lambda: any("AMBIGUOUS" in m.text for m in drone.messages("STATUSTEXT")),
-            lambda ns: good_pose(ns, state=PoseState.AMBIGUOUS, R_start_drone=wrong, R_vehicle_drone=wrong),
+            lambda ns: good_pose(ns, state=PoseState.AMBIGUOUS, R_map_drone=wrong, R_vehicle_drone=wrong),
         )
         assert drone.messages("ODOMETRY") == []
         assert drone.rules.estimate is None

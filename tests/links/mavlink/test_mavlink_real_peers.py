@@ -97,9 +97,9 @@ def varied(stamp_ns: int) -> RelativePose:
     return good_pose(
         stamp_ns,
         xyz_vehicle_m=np.array([np.sin(t), np.cos(t), 10.0 + 0.1 * t]),
-        xyz_start_m=np.array([t, np.cos(t), 10.0 + 0.1 * t]),
+        xyz_map_m=np.array([t, np.cos(t), 10.0 + 0.1 * t]),
         R_vehicle_drone=R,
-        R_start_drone=R,
+        R_map_drone=R,
     )
 
 

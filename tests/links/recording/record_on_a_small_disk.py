@@ -40,11 +40,11 @@ def main(folder: Path) -> None:
         collector.take(50)
     live.nodes["line"].put(7)
     (after,) = collector.take(1)
-    while not any("nothing is recorded now" in str(incident) for incident in live.report().incidents):
+    while not any("nothing is recorded now" in str(event) for event in live.report().events):
         threading.Event().wait(0.01)
     report = live.stop()
     recorder.close()
-    said = [str(incident) for incident in report.incidents]
+    said = [str(event) for event in report.events]
     told = {
         "after": after,
         "said": said,

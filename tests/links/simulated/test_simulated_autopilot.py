@@ -108,9 +108,9 @@ def test_without_errors_the_local_frame_is_the_world_turned_by_the_heading(exact
     p0 = exact.flight.flying_poses(np.zeros(1))[1][0]
     rate = exact.flight.felt(time_s)[0]
     for i, m in enumerate(odometry):
-        np.testing.assert_allclose(m.xyz_local_m, R_local_world @ (p[i] - p0), atol=0.02)  # 4 m/s, few ms
-        np.testing.assert_allclose(m.R_local_drone, R_local_world @ R[i], atol=0.01)
-        np.testing.assert_allclose(m.R_local_drone @ m.velocity_drone_mps, R_local_world @ v[i], atol=0.03)
+        np.testing.assert_allclose(m.xyz_odom_m, R_local_world @ (p[i] - p0), atol=0.02)  # 4 m/s, few ms
+        np.testing.assert_allclose(m.R_odom_drone, R_local_world @ R[i], atol=0.01)
+        np.testing.assert_allclose(m.R_odom_drone @ m.velocity_drone_mps, R_local_world @ v[i], atol=0.03)
         np.testing.assert_allclose(m.angular_velocity_drone_radps, rate[i], atol=0.05)
 
 
@@ -118,13 +118,13 @@ def test_attitude_position_and_odometry_tell_the_same(exact: Flown) -> None:
     odometry = exact.messages(DroneOdometry, after_s=2.0)
     time_s = exact.seconds(odometry)
     position, attitude = exact.messages(DroneLocalPosition), exact.messages(DroneAttitude)
-    xyz = np.array([m.xyz_local_m for m in position])
+    xyz = np.array([m.xyz_odom_m for m in position])
     for axis in range(3):
         there = np.interp(time_s, exact.seconds(position), xyz[:, axis])
-        np.testing.assert_allclose([m.xyz_local_m[axis] for m in odometry], there, atol=0.02)
-    columns = np.array([m.R_local_drone[:, 2] for m in attitude])
+        np.testing.assert_allclose([m.xyz_odom_m[axis] for m in odometry], there, atol=0.02)
+    columns = np.array([m.R_odom_drone[:, 2] for m in attitude])
     there = np.interp(time_s, exact.seconds(attitude), columns[:, 0])
-    np.testing.assert_allclose([m.R_local_drone[0, 2] for m in odometry], there, atol=0.01)
+    np.testing.assert_allclose([m.R_odom_drone[0, 2] for m in odometry], there, atol=0.01)
 
 
 def test_the_imu_feels_thrust_and_turns_rounded_to_mg_and_mrad(exact: Flown) -> None:
@@ -160,7 +160,7 @@ def test_the_estimate_drifts_as_its_covariance_says(drifting: Flown) -> None:
         m = flown.messages(DroneOdometry)[-1]
         p = flown.flight.flying_poses(flown.seconds([m]))[1]
         p0 = flown.flight.flying_poses(np.zeros(1))[1][0]
-        error_drone = m.R_local_drone.T @ (m.xyz_local_m - rotation_z(np.radians(-57.0)) @ (p[0] - p0))
+        error_drone = m.R_odom_drone.T @ (m.xyz_odom_m - rotation_z(np.radians(-57.0)) @ (p[0] - p0))
         assert m.pose_covariance is not None
         nees.append(error_drone @ np.linalg.solve(m.pose_covariance[3:, 3:], error_drone))
     assert 1.5 < np.mean(nees) < 5.0
@@ -173,7 +173,7 @@ def test_the_attitude_is_off_by_the_lean_as_configured() -> None:
             AutopilotSettings(drift=NO_DRIFT.model_copy(update={"lean_deg": 1.0}), imu_hz=0, odometry_hz=0), seed, 4.0
         )
         m = lean.messages(DroneAttitude)[-1]
-        up = lean.flight.flying_poses(lean.seconds([m]))[0][0] @ (m.R_local_drone.T @ [0.0, 0.0, 1.0])
+        up = lean.flight.flying_poses(lean.seconds([m]))[0][0] @ (m.R_odom_drone.T @ [0.0, 0.0, 1.0])
         squares.append(np.degrees(np.arccos(up[2])) ** 2)
     assert np.sqrt(np.mean(squares)) == pytest.approx(np.sqrt(2.0), rel=0.35)  # roll and pitch, 1 deg each
 

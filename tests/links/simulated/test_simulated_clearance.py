@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
+from flow.config_error import ConfigError
 from flow.link import LinkError
-from flow.problem import ConfigError
 from links.simulated.clearance import check_path, fits, room_m, sample_times_s, under_open_sky, visible
 from links.simulated.mesh import RayScene, box, merge
 from links.simulated.run import Simulation

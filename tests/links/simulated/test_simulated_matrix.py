@@ -243,23 +243,26 @@ def test_a_rig_as_built_is_off_and_its_drone_one_of_several_while_the_file_tells
     assert rig["lidar"] == was["lidar"]
     assert third.drone is not None
     assert rig["drone"] == {"span_m": third.drone.span_m}
-    for carrier, one in (("vehicle", third.cameras.vehicle), ("drone", third.cameras.drone)):
+    for camera_mount, one in (("vehicle", third.cameras.vehicle), ("drone", third.cameras.drone)):
         assert one is not None
-        told, true = Pose(**rig["cameras"][carrier][f"T_{carrier}_camera"]).matrix()[:3, :3], rig_mount(carrier, third)
+        told, true = (
+            Pose(**rig["cameras"][camera_mount][f"T_{camera_mount}_camera"]).matrix()[:3, :3],
+            rig_mount(camera_mount, third),
+        )
         turned_deg = np.degrees(np.linalg.norm(log_rotation(told @ true.T)))
         assert 0.005 < turned_deg < 0.3
-        lens = rig["cameras"][carrier]["lens"]
+        lens = rig["cameras"][camera_mount]["lens"]
         assert 0 < abs(lens["focal_px"] / one.true_lens.focal_px - 1) < 0.003  # pyright: ignore
         assert 0 < np.abs(np.subtract(lens["centre_px"], one.true_lens.centre_px)).max() < 1.0
     other = scenario_of(Cell("campus", 20, "hover", "driving"), 3, asked)
     assert other.mount.servo_zero_deg != third.mount.servo_zero_deg
 
 
-def rig_mount(carrier, scenario: Scenario) -> np.ndarray:
+def rig_mount(camera_mount, scenario: Scenario) -> np.ndarray:
     """How the camera really sits (3, 3): the rig file of the same rig without its errors."""
     one = {c: getattr(scenario.cameras, c).model_copy(update={"error": None}) for c in ("vehicle", "drone")}
     rig = yaml.safe_load(scenario.changed(cameras=CamerasSettings(**one)).rig_yaml())
-    return Pose(**rig["cameras"][carrier][f"T_{carrier}_camera"]).matrix()[:3, :3]
+    return Pose(**rig["cameras"][camera_mount][f"T_{camera_mount}_camera"]).matrix()[:3, :3]
 
 
 def test_a_seed_makes_one_scenario_and_another_seed_another() -> None:

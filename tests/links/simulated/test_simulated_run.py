@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
+from flow.config_error import ConfigError
 from flow.link import LinkError, Record
-from flow.problem import ConfigError
 from links.recording import RecordingReader
 from links.simulated import run
 from links.simulated.path import Path, Waypoint

@@ -42,8 +42,8 @@ def test_a_pose_keeps_its_own_time_and_every_field() -> None:
     motion = decoded()
     assert motion is not None
     assert motion.stamp_ns == 10
-    assert motion.xyz_start_m.tolist() == [1.0, -2.0, 0.5]
-    assert motion.R_start_vehicle == pytest.approx(rotation_z(0.4))
+    assert motion.xyz_map_m.tolist() == [1.0, -2.0, 0.5]
+    assert motion.R_map_vehicle == pytest.approx(rotation_z(0.4))
     assert motion.covariance is not None
     assert np.array_equal(motion.covariance, COVARIANCE)
     assert output_ports(VehicleOdometry) == {"vehicle_motion": VehicleMotion}
@@ -116,8 +116,8 @@ def test_the_simulated_odometry_is_decoded_with_its_covariance() -> None:
         before_ns = motion.stamp_ns
     assert link.refused == 0
     expected_m = np.array([15 * math.cos(math.pi / 6) + 9 / 2, -15 / 2 + 9 * math.cos(math.pi / 6), 0.0])
-    assert motion.xyz_start_m == pytest.approx(expected_m, abs=0.5)
-    assert motion.R_start_vehicle == pytest.approx(rotation_z(math.radians(40)), abs=0.03)
+    assert motion.xyz_map_m == pytest.approx(expected_m, abs=0.5)
+    assert motion.R_map_vehicle == pytest.approx(rotation_z(math.radians(40)), abs=0.03)
 
 
 def test_a_recording_without_odometry_gives_no_messages(tmp_path: Path) -> None:

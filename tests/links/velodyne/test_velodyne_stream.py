@@ -202,9 +202,9 @@ def test_a_recording_with_a_burst_of_bad_packets_is_replayed_to_its_end(tmp_path
     good = exact_records(4)
     report = replay(load_graph(tmp_path / "x.yaml"), [*good[:2], *[record(bytes(1206))] * 250, *good[2:]])
     assert report.messages["lidar.lidar_firings"] == 4
-    (incident,) = report.incidents
-    assert (incident.node, incident.count) == ("lidar", 2)
-    assert "100 consecutive packets are invalid" in incident.text
+    (event,) = report.events
+    assert (event.node, event.count) == ("lidar", 2)
+    assert "100 consecutive packets are invalid" in event.text
 
 
 def test_one_good_packet_resets_the_count_of_bad_ones():

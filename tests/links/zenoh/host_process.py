@@ -36,8 +36,8 @@ def main() -> None:
         if line.strip() == "report":
             report = live.report()
             statuses = {name: link.status for name, link in live.nodes.items() if link.status}
-            incidents = [str(incident) for incident in report.incidents]
-            say(kind="report", counters=report.counters, statuses=statuses, incidents=incidents)
+            events = [str(event) for event in report.events]
+            say(kind="report", counters=report.counters, statuses=statuses, events=events)
     begin_s = time.monotonic()
     live.stop()
     say(kind="stopped", took_s=time.monotonic() - begin_s)

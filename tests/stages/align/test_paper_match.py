@@ -18,7 +18,7 @@ TRUE = rotation_from_rpy_deg((5.0, -8.0, 40.0))
 
 
 def streets(R_carrier_world):
-    """The world's axes in a carrier's axes, a row each."""
+    """The world's axes in a camera_mount's axes, a row each."""
     return R_carrier_world.T.copy()
 
 

@@ -80,7 +80,7 @@ def test_a_sweep_one_way_tells_nothing(recorded):
 
 
 def driven(x_m):
-    return VehicleMotion(stamp_ns=0, xyz_start_m=np.array([x_m, 0.0, 0.0]), R_start_vehicle=np.eye(3), covariance=None)
+    return VehicleMotion(stamp_ns=0, xyz_map_m=np.array([x_m, 0.0, 0.0]), R_map_vehicle=np.eye(3), covariance=None)
 
 
 def test_a_vehicle_that_moves_tells_nothing(recorded):

@@ -379,8 +379,8 @@ def test_an_odometry_that_calls_itself_failed_is_not_heard():
         told.add_odometry(
             DroneOdometry(
                 stamp_ns=START_NS + k * 100 * MS,
-                xyz_local_m=np.full(3, 0.1 * k),
-                R_local_drone=np.eye(3),
+                xyz_odom_m=np.full(3, 0.1 * k),
+                R_odom_drone=np.eye(3),
                 velocity_drone_mps=np.ones(3),
                 angular_velocity_drone_radps=np.zeros(3),
                 pose_covariance=None,

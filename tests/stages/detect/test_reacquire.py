@@ -91,7 +91,7 @@ def test_the_joined_one_has_both_pasts_and_the_old_one_goes_on_as_it_was():
     new = joined(old, 99, now, SAID_MPS)
     assert (new.number, new.hit_looks, new.joined_at, new.hits) == (99, 2, 1, 7)
     assert len(new.path_m) == 2
-    np.testing.assert_array_equal(new.xyz_m, now.xyz_local_m)
+    np.testing.assert_array_equal(new.xyz_m, now.xyz_map_m)
     np.testing.assert_array_equal(new.velocity_mps, SAID_MPS)
     assert (old.number, old.hit_looks, old.joined_at, old.hits, len(old.path_m)) == (1, 1, 0, 3, 1)
     new.free += 1
@@ -121,7 +121,7 @@ def test_what_flies_otherwise_since_it_was_met_again_is_denied_though_its_whole_
     for k in range(60):
         word.add_position(
             DroneLocalPosition(
-                stamp_ns=begun_ns + k * 100_000_000, xyz_local_m=0.1 * k * SAID_MPS, velocity_local_mps=SAID_MPS
+                stamp_ns=begun_ns + k * 100_000_000, xyz_odom_m=0.1 * k * SAID_MPS, velocity_odom_mps=SAID_MPS
             )
         )
     drone, bird = followed_on(SAID_MPS), followed_on((8.0, 2.0, 0.5))

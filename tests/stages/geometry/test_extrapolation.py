@@ -24,8 +24,8 @@ def word(time_s, at=bend, covariance=True):
     R, xyz_m = at(time_s)
     return VehicleMotion(
         stamp_ns=round(time_s * S),
-        xyz_start_m=xyz_m,
-        R_start_vehicle=R,
+        xyz_map_m=xyz_m,
+        R_map_vehicle=R,
         covariance=np.diag([1e-4] * 3 + [4e-4] * 3) if covariance else None,
     )
 
@@ -50,14 +50,14 @@ def test_it_goes_on_along_the_bend_that_it_drove(untold_s, turned):
         [word(m.stamp_ns / S, lambda s: (frame @ bend(s)[0], frame @ bend(s)[1])) for m in WORDS],
         round((0.9 + untold_s) * S),
     )
-    np.testing.assert_allclose(told.xyz_start_m, frame @ xyz_m, atol=0.006)
-    np.testing.assert_allclose(told.R_start_vehicle, frame @ R, atol=1e-6)
+    np.testing.assert_allclose(told.xyz_map_m, frame @ xyz_m, atol=0.006)
+    np.testing.assert_allclose(told.R_map_vehicle, frame @ R, atol=1e-6)
 
 
 def test_after_a_second_it_stands_and_is_ever_less_sure():
     one, many = (along_its_bend(WORDS, WORDS[-1].stamp_ns + round(s * S)) for s in (JOINT_S, 5 * JOINT_S))
-    np.testing.assert_allclose(one.xyz_start_m, many.xyz_start_m)
-    np.testing.assert_allclose(one.R_start_vehicle, many.R_start_vehicle)
+    np.testing.assert_allclose(one.xyz_map_m, many.xyz_map_m)
+    np.testing.assert_allclose(one.R_map_vehicle, many.R_map_vehicle)
     assert np.trace(many.covariance) > 100 * np.trace(one.covariance)
     sigma = np.sqrt(np.diag(many.covariance - WORDS[-1].covariance))
     np.testing.assert_allclose(sigma, [0.5 * 0.5 * 5**2] * 3 + [0.5 * 3.0 * 5**2] * 3)
@@ -66,8 +66,8 @@ def test_after_a_second_it_stands_and_is_ever_less_sure():
 def test_one_word_alone_and_words_from_long_ago_tell_no_speed():
     for words in (WORDS[-1:], [word(-5.0), WORDS[-1]]):
         told = along_its_bend(words, 2 * S)
-        np.testing.assert_allclose(told.xyz_start_m, WORDS[-1].xyz_start_m)
-        np.testing.assert_allclose(told.R_start_vehicle, WORDS[-1].R_start_vehicle)
+        np.testing.assert_allclose(told.xyz_map_m, WORDS[-1].xyz_map_m)
+        np.testing.assert_allclose(told.R_map_vehicle, WORDS[-1].R_map_vehicle)
 
 
 def test_who_does_not_say_how_sure_it_is_is_not_made_sure():

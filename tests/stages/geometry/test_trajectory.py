@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
-from stages.geometry.trajectory import FURTHEST_NS, KEPT, STILL_NS, VehicleTrail
+from stages.geometry.trajectory import FURTHEST_NS, KEPT, STILL_NS, VehicleTrajectory
 from stages.kernels.geometry.trajectory import STEP_NS
 from stages.messages import VehicleMotion
 from tests.stages.made import MS, START_NS
@@ -15,14 +15,14 @@ from tests.stages.made import MS, START_NS
 def motion(t_ns, xyz_m, R=None):
     return VehicleMotion(
         stamp_ns=START_NS + t_ns,
-        xyz_start_m=np.asarray(xyz_m, dtype=np.float64),
-        R_start_vehicle=np.eye(3) if R is None else R,
+        xyz_map_m=np.asarray(xyz_m, dtype=np.float64),
+        R_map_vehicle=np.eye(3) if R is None else R,
         covariance=None,
     )
 
 
 def trail(*motions):
-    made = VehicleTrail()
+    made = VehicleTrajectory()
     for one in motions:
         made.add(one)
     return made
@@ -99,7 +99,7 @@ def test_two_words_are_a_speed_when_they_did_not_arrive_together():
 
 
 def test_a_speed_is_taken_in_one_frame_only():
-    made = VehicleTrail(joined=False)
+    made = VehicleTrajectory(joined=False)
     new = [made.add(motion(20 * k * MS, (0.1 * k + (3 if k >= 6 else 0), 0, 0))) for k in range(9)]  # 5 m/s
     assert [k for k, another in enumerate(new) if another] == [0, 8]
     np.testing.assert_allclose(made.at(START_NS + 200 * MS)[1], (4, 0, 0))
@@ -115,12 +115,12 @@ def driving(k, jumped=False):
 
 
 def test_a_start_frame_that_jumps_is_laid_on_the_old_one_and_is_no_speed():
-    made = VehicleTrail()
+    made = VehicleTrajectory()
     assert not any(made.add(driving(k, jumped=k >= 30)) for k in range(60))
     for k in range(60):
         R, t = made.at(driving(k).stamp_ns)
-        np.testing.assert_allclose(t, driving(k).xyz_start_m, atol=0.08)
-        np.testing.assert_allclose(R, driving(k).R_start_vehicle, atol=0.002)
+        np.testing.assert_allclose(t, driving(k).xyz_map_m, atol=0.08)
+        np.testing.assert_allclose(R, driving(k).R_map_vehicle, atol=0.002)
         speed_mps = np.linalg.norm(made.velocity_mps(driving(k).stamp_ns - STEP_NS))
         assert k == 0 or speed_mps < np.hypot(10, 0.1 * k) + 0.3
 
@@ -129,13 +129,13 @@ def test_while_it_is_not_clear_that_the_start_frame_jumped_the_vehicle_goes_on()
     made = trail(*(driving(k) for k in range(30)))
     for k in (30, 31):
         made.add(driving(k, jumped=True))
-        np.testing.assert_allclose(made.at(driving(k).stamp_ns)[1], driving(k).xyz_start_m, atol=0.05)
+        np.testing.assert_allclose(made.at(driving(k).stamp_ns)[1], driving(k).xyz_map_m, atol=0.05)
 
 
 def test_a_false_pose_is_left_out():
     made = trail(*(driving(k, jumped=k in (7, 20, 21, 40)) for k in range(50)))
     for k in range(50):
-        np.testing.assert_allclose(made.at(driving(k).stamp_ns)[1], driving(k).xyz_start_m, atol=0.01)
+        np.testing.assert_allclose(made.at(driving(k).stamp_ns)[1], driving(k).xyz_map_m, atol=0.01)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -146,7 +146,7 @@ def test_nonsense_that_goes_on_is_never_believed_and_the_true_words_after_it_are
     assert made.newest_ns == driving(29).stamp_ns
     for k in range(430, 460):
         made.add(driving(k))
-    np.testing.assert_allclose(made.at(driving(459).stamp_ns)[1], driving(459).xyz_start_m, atol=1e-9)
+    np.testing.assert_allclose(made.at(driving(459).stamp_ns)[1], driving(459).xyz_map_m, atol=1e-9)
 
 
 def test_a_fast_vehicles_second_pose_is_no_jump_and_the_first_real_one_after_zeros_is():

@@ -11,7 +11,7 @@ import pytest
 from stages.geometry.frames import rotation_z
 from stages.heading.hypothesis_bank import ASKEW, turns
 from stages.heading.windows import Windows
-from stages.messages import DroneFix, DroneMotion
+from stages.messages import DroneFix, VisualMotion
 from stages.odometry.drone.trajectory import AutopilotTrail
 
 MS = 1_000_000
@@ -39,12 +39,12 @@ def autopilot(turned_rad=0.0, until_ms=6000, v=V) -> AutopilotTrail:
     return trail
 
 
-def metric(windows, own, until_ms, at=lambda ms: V * ms * 1e-3, R_start_own=SAME, from_ms=100, **kwargs):
+def metric(windows, own, until_ms, at=lambda ms: V * ms * 1e-3, R_map_own=SAME, from_ms=100, **kwargs):
     """Displacements closed by fixes each 100 ms."""
     out = []
     for ms in range(from_ms, until_ms, 100):
         windows.add_fix(fix(ms, at(ms), **kwargs), np.eye(3), np.zeros(3), own)
-        moved = windows.close_metric(R_start_own, 0.03)
+        moved = windows.close_metric(R_map_own, 0.03)
         out += [moved] if moved else []
     return out
 
@@ -61,7 +61,7 @@ def test_windows_follow_each_other_and_are_as_long_as_they_must():
 
 
 def test_the_odometry_is_told_in_the_start_frame_by_branch_0():
-    moved = metric(Windows(0.4), autopilot(turned_rad=1.1), 2000, R_start_own=rotation_z(-1.1))
+    moved = metric(Windows(0.4), autopilot(turned_rad=1.1), 2000, R_map_own=rotation_z(-1.1))
     np.testing.assert_allclose(moved[0].odometry_m, V[:2] * moved[0].seconds, atol=1e-9)
 
 
@@ -136,7 +136,7 @@ def by_pictures(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms
     So many steps share a key; pictures come so late, and none of after `lost_ms`.
     """
     windows = Windows(0.4)
-    R_start_drone = rotation_z(0.9)
+    R_map_drone = rotation_z(0.9)
     out = []
     for ms in range(100, round(1000 * reach_s), 100):
         seen_ms = ms - late_ms
@@ -144,12 +144,12 @@ def by_pictures(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms
         direction = directions(i)
         if 0 < seen_ms < lost_ms and (hole is None or not hole[0] <= seen_ms < hole[1]):
             windows.add_step(
-                DroneMotion(
+                VisualMotion(
                     stamp_ns=seen_ms * MS,
                     from_ns=(seen_ms - 100 - 100 * (i % of_key)) * MS,
                     R_from_to=np.eye(3),
                     covariance_rad2=1e-6 * np.eye(3),
-                    direction_from=None if direction is None else R_start_drone.T @ direction,
+                    direction_from=None if direction is None else R_map_drone.T @ direction,
                     direction_sigma_rad=None if direction is None else 0.1,
                     matches=9,
                     reason="",
@@ -157,7 +157,7 @@ def by_pictures(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms
             )
         windows.add_fix(fix(ms, V * ms * 1e-3), np.eye(3), np.zeros(3), AutopilotTrail())
         stamps = windows.steps_since_start()
-        moved = windows.close_bearing(dict.fromkeys(stamps, R_start_drone), 0.03)
+        moved = windows.close_bearing(dict.fromkeys(stamps, R_map_drone), 0.03)
         out += [moved] if moved else []
     return out
 

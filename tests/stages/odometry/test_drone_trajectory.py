@@ -9,7 +9,7 @@ import pytest
 
 from stages.geometry.frames import rotation_z
 from stages.kernels.geometry.so3 import exp_rotation
-from stages.messages import DroneMotion
+from stages.messages import VisualMotion
 from stages.odometry.drone.trajectory import AutopilotTrail, PictureTrail, turn_between
 
 MS = 1_000_000
@@ -23,8 +23,8 @@ def turning(count=40, step_ms=20, rate=RATE) -> AutopilotTrail:
     return trail
 
 
-def step(from_ms, to_ms, R=None, sigma=0.001) -> DroneMotion:
-    return DroneMotion(
+def step(from_ms, to_ms, R=None, sigma=0.001) -> VisualMotion:
+    return VisualMotion(
         stamp_ns=to_ms * MS,
         from_ns=from_ms * MS,
         R_from_to=exp_rotation((to_ms - from_ms) * 1e-3 * RATE) if R is None else R,

@@ -14,7 +14,7 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.geometry.frames import rotation_z, transform
 from stages.messages import VehicleMotion
-from stages.odometry.vehicle import VehicleMotionChoice
+from stages.odometry.vehicle import VehicleMotionSelector
 
 S = 1_000_000_000
 
@@ -29,9 +29,7 @@ def word(time_s, T_source_world=None, sigma=0.0):
     """A source's word; its start frame is its own. `sigma`: metres and rad, each axis."""
     T = (np.eye(4) if T_source_world is None else T_source_world) @ at(time_s)
     covariance = None if sigma is None else sigma**2 * np.eye(6)
-    return VehicleMotion(
-        stamp_ns=round(time_s * S), xyz_start_m=T[:3, 3], R_start_vehicle=T[:3, :3], covariance=covariance
-    )
+    return VehicleMotion(stamp_ns=round(time_s * S), xyz_map_m=T[:3, 3], R_map_vehicle=T[:3, :3], covariance=covariance)
 
 
 ELSEWHERE = transform(rotation_z(2.0), np.array([40.0, -7.0, 1.0]))
@@ -50,8 +48,8 @@ def told(choice, odometry=(), ego=()):
 def off(motion, T_start_world):
     """Metres and rad between a motion and the truth."""
     T = T_start_world @ at(motion.stamp_ns / S)
-    turned = motion.R_start_vehicle.T @ T[:3, :3]
-    return np.linalg.norm(motion.xyz_start_m - T[:3, 3]), math.acos(min(1.0, (np.trace(turned) - 1) / 2))
+    turned = motion.R_map_vehicle.T @ T[:3, :3]
+    return np.linalg.norm(motion.xyz_map_m - T[:3, 3]), math.acos(min(1.0, (np.trace(turned) - 1) / 2))
 
 
 def seconds(first, last, step):
@@ -60,24 +58,24 @@ def seconds(first, last, step):
 
 def test_odometry_alone_is_passed_on_as_it_comes():
     words = [word(t, ELSEWHERE) for t in seconds(0, 1, 0.02)]
-    out = told(VehicleMotionChoice(), odometry=words)
+    out = told(VehicleMotionSelector(), odometry=words)
     assert [m.stamp_ns for m in out] == [m.stamp_ns for m in words]
     for m, w in zip(out, words, strict=True):
-        np.testing.assert_allclose(m.xyz_start_m, w.xyz_start_m, atol=1e-12)
-        np.testing.assert_allclose(m.R_start_vehicle, w.R_start_vehicle, atol=1e-12)
+        np.testing.assert_allclose(m.xyz_map_m, w.xyz_map_m, atol=1e-12)
+        np.testing.assert_allclose(m.R_map_vehicle, w.R_map_vehicle, atol=1e-12)
         np.testing.assert_allclose(m.covariance, w.covariance)
         check_arrays(m)
 
 
 def test_the_camera_alone_is_passed_on():
     words = [word(t, ELSEWHERE) for t in seconds(0, 2, 0.2)]
-    out = told(VehicleMotionChoice(), ego=words)
+    out = told(VehicleMotionSelector(), ego=words)
     assert len(out) == len(words)
-    np.testing.assert_allclose(out[-1].xyz_start_m, words[-1].xyz_start_m, atol=1e-12)
+    np.testing.assert_allclose(out[-1].xyz_map_m, words[-1].xyz_map_m, atol=1e-12)
 
 
 def test_the_camera_is_not_heard_while_the_odometry_is():
-    choice = VehicleMotionChoice()
+    choice = VehicleMotionSelector()
     out = told(choice, odometry=[word(t) for t in seconds(0, 2, 0.02)], ego=[word(t, ANEW) for t in seconds(0, 2, 0.2)])
     assert len(out) == 100
     assert max(off(m, np.eye(4))[0] for m in out) < 1e-9
@@ -86,7 +84,7 @@ def test_the_camera_is_not_heard_while_the_odometry_is():
 def test_odometry_that_goes_and_comes_back_elsewhere_leaves_one_path_in_its_first_frame():
     odometry = [word(t, ELSEWHERE) for t in seconds(0, 3, 0.02)] + [word(t, ANEW) for t in seconds(6, 9, 0.02)]
     ego = [word(t) for t in seconds(3.3, 6.0, 0.2)]
-    out = told(VehicleMotionChoice(), odometry, ego)
+    out = told(VehicleMotionSelector(), odometry, ego)
     stamps = np.array([m.stamp_ns for m in out]) / S
     assert ((stamps > 3.2) & (stamps < 6.0)).sum() == len(ego) - 1  # the last one is heard when the odometry is back
     assert np.diff(stamps).max() < 0.5
@@ -97,7 +95,7 @@ def test_odometry_that_goes_and_comes_back_elsewhere_leaves_one_path_in_its_firs
 
 def test_the_camera_first_then_odometry_keeps_the_cameras_frame():
     out = told(
-        VehicleMotionChoice(),
+        VehicleMotionSelector(),
         odometry=[word(t, ANEW) for t in seconds(2.05, 3, 0.02)],
         ego=[word(t, ELSEWHERE) for t in seconds(0, 2, 0.2)],
     )
@@ -112,16 +110,16 @@ def test_a_source_whose_own_frame_jumps_leaves_one_path(port, gap_s):
     step_s = 0.02 if port == "odometry" else 0.2
     words = [word(t, ELSEWHERE) for t in seconds(0, 3, step_s)]
     words += [word(t, FAR) for t in seconds(3 + gap_s, 8, step_s)]
-    out = told(VehicleMotionChoice(), **{port: words})
+    out = told(VehicleMotionSelector(), **{port: words})
     errors = np.array([off(m, ELSEWHERE) for m in out])
     assert errors[:, 0].max() < (5.0 if gap_s == 2.0 else 1e-3)  # after a second nobody knows where it went
     assert errors[:, 1].max() < (0.5 if gap_s == 2.0 else 1e-3)
     assert len(words) - len(out) == 2  # are left out
-    assert max(np.linalg.norm(b.xyz_start_m - a.xyz_start_m) for a, b in pairwise(out)) < 4.5
+    assert max(np.linalg.norm(b.xyz_map_m - a.xyz_map_m) for a, b in pairwise(out)) < 4.5
 
 
 def test_an_uncertain_join_makes_its_words_less_sure():
-    choice = VehicleMotionChoice()
+    choice = VehicleMotionSelector()
     words = [word(t, sigma=0.01) for t in seconds(0, 1, 0.02)] + [word(t, ANEW, 0.01) for t in seconds(1.4, 2, 0.02)]
     out = told(choice, odometry=words)
     place_m = math.hypot(0.01, 0.5 * 3.0 * (1.4 - 0.98) ** 2)
@@ -130,7 +128,7 @@ def test_an_uncertain_join_makes_its_words_less_sure():
 
 def test_a_false_word_is_left_out():
     words = [word(t, ANEW if 40 <= k < 42 else None) for k, t in enumerate(seconds(0, 2, 0.02))]
-    out = told(VehicleMotionChoice(), odometry=words)
+    out = told(VehicleMotionSelector(), odometry=words)
     assert len(out) == len(words) - 2
     assert max(off(m, np.eye(4))[0] for m in out) < 1e-9
 
@@ -145,7 +143,7 @@ def nonsense(times, seed=0, spread_m=30.0):
 
 
 def test_the_camera_goes_on_while_the_odometry_tells_nonsense_and_what_is_left_out_is_counted():
-    choice = VehicleMotionChoice()
+    choice = VehicleMotionSelector()
     mad, ego = nonsense(seconds(2, 6, 0.02)), [word(t, ELSEWHERE) for t in seconds(2.4, 6, 0.2)]
     out = told(choice, [word(t) for t in seconds(0, 2, 0.02)] + mad, ego)
     assert np.diff([m.stamp_ns for m in out]).max() < 0.5 * S
@@ -159,7 +157,7 @@ def test_the_camera_goes_on_while_the_odometry_tells_nonsense_and_what_is_left_o
 
 @pytest.mark.parametrize("seed", range(5))
 def test_nonsense_is_not_believed_however_long_it_lasts_where_no_camera_tells(seed):
-    choice = VehicleMotionChoice()
+    choice = VehicleMotionSelector()
     out = told(choice, [word(t) for t in seconds(0, 2, 0.02)] + nonsense(seconds(2, 12, 0.02), seed))
     assert len(out) == 100
     sane = [choice.on_odometry(word(t)) for t in seconds(12, 13, 0.02)]
@@ -169,15 +167,13 @@ def test_nonsense_is_not_believed_however_long_it_lasts_where_no_camera_tells(se
 
 def test_a_fast_vehicles_odometry_that_was_silent_is_not_taken_for_one_that_jumped():
     times = [*seconds(0, 1, 0.02), *seconds(3, 4, 0.02)]
-    words = [
-        dataclasses.replace(word(t), xyz_start_m=np.array([30 * t, 0, 0]), R_start_vehicle=np.eye(3)) for t in times
-    ]
-    out = told(VehicleMotionChoice(), odometry=words)
-    assert [m.xyz_start_m[0] for m in out] == pytest.approx([30 * t for t in times])
+    words = [dataclasses.replace(word(t), xyz_map_m=np.array([30 * t, 0, 0]), R_map_vehicle=np.eye(3)) for t in times]
+    out = told(VehicleMotionSelector(), odometry=words)
+    assert [m.xyz_map_m[0] for m in out] == pytest.approx([30 * t for t in times])
 
 
 def test_what_is_not_newer_than_what_was_told_is_left_out():
-    choice = VehicleMotionChoice()
+    choice = VehicleMotionSelector()
     assert choice.on_odometry(word(1.0)) is not None
     assert choice.on_odometry(word(1.0)) is None
     assert choice.on_odometry(word(0.9)) is None
@@ -185,7 +181,7 @@ def test_what_is_not_newer_than_what_was_told_is_left_out():
 
 
 def test_uncertainty_grows_over_a_gap_and_then_as_the_new_source_says():
-    choice = VehicleMotionChoice()
+    choice = VehicleMotionSelector()
     for t in seconds(0, 1, 0.02):
         choice.on_odometry(word(t, sigma=0.01))
     first = choice.on_ego(word(2.0, ANEW, sigma=0.5))
@@ -199,14 +195,14 @@ def test_uncertainty_grows_over_a_gap_and_then_as_the_new_source_says():
 
 
 def test_a_source_that_does_not_say_how_sure_it_is_makes_nobody_sure():
-    choice = VehicleMotionChoice()
+    choice = VehicleMotionSelector()
     assert choice.on_odometry(word(0.0, sigma=None)).covariance is None
     assert choice.on_ego(word(1.0)).covariance is None
     assert choice.on_odometry(word(1.1, sigma=0.1)).covariance is None
 
 
 def test_its_ports_are_the_two_sources_and_one_motion():
-    assert set(input_ports(VehicleMotionChoice)) == {"odometry", "ego"}
-    assert set(output_ports(VehicleMotionChoice)) == {"vehicle_motion"}
+    assert set(input_ports(VehicleMotionSelector)) == {"odometry", "ego"}
+    assert set(output_ports(VehicleMotionSelector)) == {"vehicle_motion"}
     with pytest.raises(ValidationError):
-        VehicleMotionChoice(silent_s=0.0)
+        VehicleMotionSelector(silent_s=0.0)

@@ -12,7 +12,7 @@ from flow.stage import input_ports, output_ports
 from stages.geometry.frames import Pose
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import Image, VehicleMotion
-from stages.odometry.vehicle import VehicleEgo
+from stages.odometry.vehicle import VisualLidarOdometry
 from tests.stages.seen import LENS, LOOKS_UP, SIZE_PX, STEP_NS, image, lidar_slice, of
 
 START_NS = 1_000_000_000
@@ -30,7 +30,7 @@ def even(turn_radps, velocity_mps, from_s=0.0):
 
 def driven(at, count, mount=LOOKS_UP, lidar=True, settings=None, blank=()):
     """Motions told, by picture, None where none was."""
-    ego = VehicleEgo(lens=LENS, T_vehicle_camera=mount, **(settings or {}))
+    ego = VisualLidarOdometry(lens=LENS, T_vehicle_camera=mount, **(settings or {}))
     told = []
     for k in range(count):
         for part in range(6) if lidar else ():
@@ -50,13 +50,13 @@ def errors(at, told):
     out = []
     first = next(m for m in told if m is not None)
     R, p = at((first.stamp_ns - START_NS) * 1e-9)
-    R_start = R @ first.R_start_vehicle.T
-    p_start = p - R_start @ first.xyz_start_m
+    R_start = R @ first.R_map_vehicle.T
+    p_start = p - R_start @ first.xyz_map_m
     for m in told:
         if m is not None:
             R, p = at((m.stamp_ns - START_NS) * 1e-9)
-            turn = log_rotation(m.R_start_vehicle.T @ R_start.T @ R)
-            out.append([*turn, *(m.R_start_vehicle.T @ (R_start.T @ (p - p_start) - m.xyz_start_m))])
+            turn = log_rotation(m.R_map_vehicle.T @ R_start.T @ R)
+            out.append([*turn, *(m.R_map_vehicle.T @ (R_start.T @ (p - p_start) - m.xyz_map_m))])
     return np.array(out)
 
 
@@ -85,8 +85,8 @@ def test_a_standing_vehicle_stands():
     told = driven(even((0, 0, 0), (0, 0, 0)), 8)
     assert told[0] is None
     for m in told[1:]:
-        assert np.abs(m.xyz_start_m).max() == 0.0
-        assert np.linalg.norm(log_rotation(m.R_start_vehicle)) < 1e-3
+        assert np.abs(m.xyz_map_m).max() == 0.0
+        assert np.linalg.norm(log_rotation(m.R_map_vehicle)) < 1e-3
         assert np.sqrt(np.diag(m.covariance)).max() < 0.02
 
 
@@ -95,7 +95,7 @@ def test_driving_off_after_standing_keeps_the_start_frame():
     told = driven(at, 20)
     assert all(m is not None for m in told[1:])
     truth = at(told[-1].stamp_ns * 1e-9 - 1.0)[1]
-    assert np.linalg.norm(told[-1].xyz_start_m - truth) < 0.05 * truth[0]
+    assert np.linalg.norm(told[-1].xyz_map_m - truth) < 0.05 * truth[0]
 
 
 def test_the_covariance_grows_and_covers_the_errors():
@@ -121,7 +121,7 @@ def test_after_a_blank_picture_it_goes_on_less_sure():
 
 
 def test_a_picture_that_is_not_newer_is_left_out():
-    ego = VehicleEgo(lens=LENS, T_vehicle_camera=LOOKS_UP)
+    ego = VisualLidarOdometry(lens=LENS, T_vehicle_camera=LOOKS_UP)
     seen = image(START_NS, np.eye(3), np.zeros(3), LOOKS_UP)
     assert of(ego.on_image(seen), VehicleMotion) is None
     assert of(ego.on_image(seen), VehicleMotion) is None
@@ -132,13 +132,11 @@ def test_a_picture_that_is_not_newer_is_left_out():
 def odometry(at, stamp_ns):
     """The vehicle's own word."""
     R, p = at((stamp_ns - START_NS) * 1e-9)
-    return VehicleMotion(
-        stamp_ns=stamp_ns, xyz_start_m=p + np.array([5.0, 0.0, 0.0]), R_start_vehicle=R, covariance=None
-    )
+    return VehicleMotion(stamp_ns=stamp_ns, xyz_map_m=p + np.array([5.0, 0.0, 0.0]), R_map_vehicle=R, covariance=None)
 
 
 def test_it_rests_while_odometry_is_heard_and_goes_on_at_once_with_its_speed():
-    at, ego, told = even((0, 0, 0.2), (3, 0, 0)), VehicleEgo(lens=LENS, T_vehicle_camera=LOOKS_UP), []
+    at, ego, told = even((0, 0, 0.2), (3, 0, 0)), VisualLidarOdometry(lens=LENS, T_vehicle_camera=LOOKS_UP), []
     silent_from = START_NS + 6 * STEP_NS
     for k in range(24):
         for part in range(6):
@@ -150,7 +148,7 @@ def test_it_rests_while_odometry_is_heard_and_goes_on_at_once_with_its_speed():
         told.append(of(ego.on_image(seen), VehicleMotion))
     awake = next(k for k, m in enumerate(told) if m is not None)
     assert awake == math.ceil((silent_from - START_NS) / STEP_NS - 1 / 6 + ego.settings.silent_s * 1e9 / STEP_NS)
-    assert told[awake].xyz_start_m.tolist() == [0.0, 0.0, 0.0]
+    assert told[awake].xyz_map_m.tolist() == [0.0, 0.0, 0.0]
     assert all(m is not None for m in told[awake:])
     off_m = np.linalg.norm(errors(at, told)[:, 3:], axis=1)
     assert off_m.max() < 0.03 * 3 * (23 - awake) * STEP_NS * 1e-9
@@ -159,14 +157,14 @@ def test_it_rests_while_odometry_is_heard_and_goes_on_at_once_with_its_speed():
 
 
 def test_it_works_while_the_odometry_tells_nonsense():
-    at, ego, told = even((0, 0, 0.2), (3, 0, 0)), VehicleEgo(lens=LENS, T_vehicle_camera=LOOKS_UP), []
+    at, ego, told = even((0, 0, 0.2), (3, 0, 0)), VisualLidarOdometry(lens=LENS, T_vehicle_camera=LOOKS_UP), []
     mad_from, rng = START_NS + 6 * STEP_NS, np.random.default_rng(0)
     for k in range(20):
         for part in range(6):
             stamp_ns = START_NS + (k - 1) * STEP_NS + part * STEP_NS // 6
             word = odometry(at, stamp_ns)
             if stamp_ns >= mad_from:
-                word = dataclasses.replace(word, xyz_start_m=rng.uniform(-90, 90, 3))
+                word = dataclasses.replace(word, xyz_map_m=rng.uniform(-90, 90, 3))
             ego.on_odometry(word)
             ego.on_points(lidar_slice(stamp_ns, *at((stamp_ns - START_NS) * 1e-9), seed=10 * k + part))
         seen = image(START_NS + k * STEP_NS, *at(k * STEP_NS * 1e-9), LOOKS_UP)
@@ -181,11 +179,11 @@ def test_it_works_while_the_odometry_tells_nonsense():
 
 
 def test_its_ports_are_image_points_and_odometry_and_it_tells_the_vehicles_motion():
-    assert set(input_ports(VehicleEgo)) == {"image", "points", "odometry"}
-    assert set(output_ports(VehicleEgo)) == {"vehicle_motion", "followed_features"}
+    assert set(input_ports(VisualLidarOdometry)) == {"image", "points", "odometry"}
+    assert set(output_ports(VisualLidarOdometry)) == {"vehicle_motion", "followed_features"}
 
 
 @pytest.mark.parametrize("wrong", [{"window_keys": 2}, {"every_nth_point": 0}, {"reach_deg": 0.0}, {"scale": 1.0}])
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(ValidationError):
-        VehicleEgo(lens=LENS, T_vehicle_camera=LOOKS_UP, **wrong)
+        VisualLidarOdometry(lens=LENS, T_vehicle_camera=LOOKS_UP, **wrong)

@@ -1,4 +1,4 @@
-"""HitMissTrack on made-up skies: its states over time, what misses are worth, identities, and drones that were none."""
+"""LikelihoodTrack on made-up skies: its states over time, what misses are worth, identities, and drones that were none."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flow.stage import input_ports, output_ports
 from stages.geometry.frames import LidarMount
 from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, A, B
 from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
-from stages.track import HitMissTrack
+from stages.track import LikelihoodTrack
 from stages.track.hull import COLUMNS
 from stages.track.likelihood_track import LOOK_OVER_NS
 from stages.track.scan_pass import drone_hits
@@ -66,12 +66,12 @@ def run(things, told, seconds=2.0, drives_mps=(0.0, 0.0, 0.0), jump=(math.inf, 0
 
     `jump`: when the start frame of the vehicle's odometry jumps, and by how many metres on each axis.
     """
-    stage, out, waiting, next_s = HitMissTrack(**settings), [], sorted(told, key=lambda m: m.stamp_ns), 0.0
+    stage, out, waiting, next_s = LikelihoodTrack(**settings), [], sorted(told, key=lambda m: m.stamp_ns), 0.0
     for pulses in pulses_seen(things, WATCHING, seconds):
         while any(drives_mps) and at_s(next_s) <= pulses.point_stamp_ns[-1]:
             place = next_s * np.asarray(drives_mps, dtype=np.float64) + (jump[1] if next_s >= jump[0] else 0.0)
             stage.on_motion(
-                VehicleMotion(stamp_ns=at_s(next_s), xyz_start_m=place, R_start_vehicle=np.eye(3), covariance=None)
+                VehicleMotion(stamp_ns=at_s(next_s), xyz_map_m=place, R_map_vehicle=np.eye(3), covariance=None)
             )
             next_s += 0.02
         while waiting and waiting[0].stamp_ns <= pulses.point_stamp_ns[-1]:
@@ -106,7 +106,7 @@ def here(way: Way, t_s=0.0):
 
 
 def test_ports_are_what_the_graph_wires():
-    assert set(input_ports(HitMissTrack)) == {
+    assert set(input_ports(LikelihoodTrack)) == {
         "candidates",
         "detections",
         "motion",
@@ -114,8 +114,8 @@ def test_ports_are_what_the_graph_wires():
         "drone_position",
         "drone_odometry",
     }
-    assert set(output_ports(HitMissTrack)) == {"drone_fix", "track_state"}
-    assert HitMissTrack.optional_inputs == {"candidates", "motion", "drone_position", "drone_odometry"}
+    assert set(output_ports(LikelihoodTrack)) == {"drone_fix", "track_state"}
+    assert LikelihoodTrack.optional_inputs == {"candidates", "motion", "drone_position", "drone_odometry"}
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -192,7 +192,7 @@ def test_a_drone_out_of_sight_of_a_vehicle_that_is_not_heard_is_where_neither_te
     """It may have braked meanwhile."""
     sigmas_m = {}
     for heard_s in (1.0, 3.0):
-        stage, states = HitMissTrack(), []
+        stage, states = LikelihoodTrack(), []
         stage.on_motion(driven(0.0))
         states += stage.on_detections(accepted((0.0, 8.0, 10.0)))
         told = [driven(t) for t in np.arange(0.02, heard_s, 0.02)]
@@ -211,7 +211,7 @@ def test_a_drone_out_of_sight_of_a_vehicle_that_is_not_heard_is_where_neither_te
 
 def driven(t_s) -> VehicleMotion:
     place = np.array([8.0 * t_s, 0.0, 0.0])
-    return VehicleMotion(stamp_ns=at_s(t_s), xyz_start_m=place, R_start_vehicle=np.eye(3), covariance=None)
+    return VehicleMotion(stamp_ns=at_s(t_s), xyz_map_m=place, R_map_vehicle=np.eye(3), covariance=None)
 
 
 @pytest.mark.parametrize(("accepted_s", "numbers"), [(2.0, {1, 2}), (1.4, {1})])
@@ -249,7 +249,7 @@ CERTAIN = {"shape_share": 0.0, "range_sigma_m": 0.0, "mount": LidarMount(pointin
 
 
 def lasting(place, **sigmas):
-    return HitMissTrack(**{**CERTAIN, **sigmas})._lasting_covariance(np.array(place))
+    return LikelihoodTrack(**{**CERTAIN, **sigmas})._lasting_covariance(np.array(place))
 
 
 def test_pointing_makes_it_less_sure_the_farther_away_and_only_about_the_axis():
@@ -273,8 +273,8 @@ def test_a_fix_tells_what_of_its_covariance_is_the_same_in_the_next_one():
     fixes = fixes_of(run([Drone(way)], [accepted(here(way))], 1.5))
     assert fixes
     for fix in fixes:
-        np.testing.assert_array_equal(fix.lasting_m2, HitMissTrack()._lasting_covariance(fix.xyz_vehicle_m))
-        assert np.linalg.eigvalsh(fix.covariance_m2 - fix.lasting_m2).min() > 0
+        np.testing.assert_array_equal(fix.bias_covariance_m2, LikelihoodTrack()._lasting_covariance(fix.xyz_vehicle_m))
+        assert np.linalg.eigvalsh(fix.covariance_m2 - fix.bias_covariance_m2).min() > 0
 
 
 def test_the_lidars_range_is_as_unsure_as_its_data_sheet_says_along_the_line_of_sight_alone():
@@ -394,7 +394,7 @@ def test_a_drone_close_before_a_wall_is_kept_and_when_it_has_gone_the_wall_is_no
 
 def test_of_two_that_became_one_the_younger_says_no_more():
     """What is dropped in mid-look gives no fix after its LOST."""
-    stage, out = HitMissTrack(max_drones=2), []
+    stage, out = LikelihoodTrack(max_drones=2), []
     elder, younger = still(-1.0, 8.0, 10.0), still(1.0, 8.0, 10.0)
     for message in (accepted(here(elder), number=5), accepted(here(younger), number=9)):
         out += stage.on_detections(message)
@@ -489,4 +489,4 @@ def test_returns_with_many_more_beside_them_belong_to_something_bigger():
 )
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValidationError):
-        HitMissTrack(**settings)
+        LikelihoodTrack(**settings)

@@ -9,7 +9,7 @@ import pytest
 
 from stages.geometry.frames import rotation_z
 from stages.messages import Detections, DroneFix, DroneLocalPosition, TrackingState, TrackState
-from stages.track import HitMissTrack
+from stages.track import LikelihoodTrack
 from stages.track.kalman import predicted
 from stages.track.odometry_motion_model import NONE, ToldMotion, Word
 from tests.stages.caster import Box, Drone, During, dithering, pulses_seen
@@ -202,7 +202,7 @@ def swinging(t_s):
 
 def followed(tells):
     """All the tracker says of a drone that something hides for 3 s."""
-    stage, out, next_s = HitMissTrack(), [], 0.0
+    stage, out, next_s = LikelihoodTrack(), [], 0.0
 
     def way(t_s):
         return np.array([swinging(t)[0] for t in np.atleast_1d(t_s)])
@@ -229,7 +229,7 @@ def followed(tells):
             place, velocity = told(next_s, swinging)
             out += (
                 stage.on_drone_position(
-                    DroneLocalPosition(stamp_ns=at_ns(next_s), xyz_local_m=place, velocity_local_mps=velocity)
+                    DroneLocalPosition(stamp_ns=at_ns(next_s), xyz_odom_m=place, velocity_odom_mps=velocity)
                 )
                 or ()
             )

@@ -18,7 +18,7 @@ SPAN_M = 0.5
 EXPECTED_M = np.array([0.3, 0.4, 12.0])  # nearly overhead
 
 
-def fan(R_local_vehicle, drone_m):
+def fan(R_map_vehicle, drone_m):
     """Pulses each 3 cm over a square metre about the prediction, from the vehicle's origin; the drone returns some."""
     side = np.linspace(-0.5, 0.5, 34)
     places = EXPECTED_M + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2) @ np.eye(2, 3)
@@ -27,7 +27,7 @@ def fan(R_local_vehicle, drone_m):
     return SweptPulses(
         stamp_ns=START_NS,
         point_stamp_ns=START_NS + np.arange(len(places)),
-        direction_vehicle=(places / length[:, None] @ R_local_vehicle).astype(np.float32),
+        direction_vehicle=(places / length[:, None] @ R_map_vehicle).astype(np.float32),
         range_m=np.where(hit, length, 0.0).astype(np.float32),
         laser=(np.arange(len(places)) % 16).astype(np.uint8),
         reflectivity=np.full(len(places), 30, dtype=np.uint8),

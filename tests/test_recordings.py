@@ -33,7 +33,7 @@ def run(folder: Path, recording: str, config: str, sets: list[str] | None = None
         sections = {"rig": (yaml.safe_load(reader.rig_yaml or ""), Location(recording, 0))}
         graph = load_graph(ROOT / "configs" / f"{config}.yaml", [overlay], sets or [], sections)
         results.open(Run(folder, recording, "", ""))
-        replay(graph, truth.aside(reader.records()), [results, digest], strict=True)
+        replay(graph, truth.without_truth(reader.records()), [results, digest], strict=True)
         results.close()
         assert reader.warnings == []
     return results, digest.hexdigest(), truth
@@ -45,7 +45,7 @@ def test_the_simulated_drone_is_found_and_followed(tmp_path):
     assert [t.state for t in results.transitions] == ["SEARCHING", "TRACKING"]
     assert 17 <= len(results.fixes) <= 21
     errors = fix_errors(results.fixes, *truth.drone_in_vehicle())
-    assert errors.not_covered == 0
+    assert errors.without_truth == 0
     assert errors.rmse_m < 0.2
     assert np.abs(errors.error_m).max() < 0.4
     # the covariance may be careful, it may not promise too much
@@ -69,7 +69,7 @@ def test_the_paper_literally_takes_a_building_for_the_drone(tmp_path):
 @pytest.mark.parametrize("config", ["replay", "paper"])
 def test_a_real_lidar_that_does_not_look_up_sees_no_drone_and_says_why(tmp_path, recording, verdict, config):
     results, _, _ = run(tmp_path, recording, config)
-    assert results.verdicts == [verdict]
+    assert results.search_results == [verdict]
     assert not results.fixes
     assert [t.state for t in results.transitions] == ["SEARCHING"]
 
@@ -79,7 +79,7 @@ def test_a_real_room_seen_from_its_floor_holds_no_drone(tmp_path, mount):
     """The same returns as if the LiDAR lay on its side: a whole room fills the image, and no drone is in it."""
     results, _, _ = run(tmp_path, "einride_vlp16", "replay", ON_ITS_SIDE[mount])
     assert (results.sweeps, results.sweeps_with_drone, len(results.fixes)) == (13, 0, 0)
-    assert all(verdict.startswith("no drone: ") for verdict, _ in results.verdicts)
+    assert all(text.startswith("no drone: ") for text, _ in results.search_results)
 
 
 @pytest.mark.parametrize("mount", ON_ITS_SIDE)

@@ -13,14 +13,14 @@ import yaml
 from pydantic import ValidationError
 
 from flow.link import LinkError
-from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
 from stages.geometry.frames import LidarMount
 
 MAX_RIG_BYTES = 100_000
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
 
-@in_words
+@report_errors
 def import_recording(
     file: Annotated[Path, typer.Argument(help="A VLP-16 capture (.pcap) or a MAVLink log (.tlog).")],
     out_file: Annotated[
@@ -75,7 +75,7 @@ def read_rig(file: Path) -> str:
     return yaml.safe_dump(rig, sort_keys=False)
 
 
-@in_words
+@report_errors
 def recover_recording(
     file: Annotated[Path, typer.Argument(help="An unfinished or damaged recording.")],
     out_file: Annotated[
@@ -98,10 +98,10 @@ def recover_recording(
     topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())
     out.print(f"{report.path}: {topics}", markup=False)
     if report.warnings:
-        raise typer.Exit(FINDING)
+        raise typer.Exit(EXIT_FAILED)
 
 
-@in_words
+@report_errors
 def view(
     rrd: Annotated[Path, typer.Argument(help="The run.rrd of a run.")],
     picture: Annotated[
@@ -128,4 +128,4 @@ def view(
         err.print(text, markup=False, style="red")
     out.print(f"wrote {picture}", markup=False)
     if complaints:
-        raise typer.Exit(FINDING)
+        raise typer.Exit(EXIT_FAILED)

@@ -18,7 +18,7 @@ from flow.config.hosts_file import load_hosts
 from flow.config.schema import schema as schema_of
 from flow.config_error import ConfigError
 from flow.graph import Graph, load_graph
-from links.cli.console import FINDING, WRONG_USE, err, in_words, out
+from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, report_errors
 from links.cli.run import Overlay, Sets
 from links.zenoh import host_graph
 
@@ -34,7 +34,7 @@ class Format(StrEnum):
     SVG = "svg"
 
 
-@in_words
+@report_errors
 def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: HostsFile = None) -> None:
     """Say everything that is wrong with CONFIG, and with the hosts file where one is given.
 
@@ -48,7 +48,7 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
     except ConfigError as error:
         for problem in error.errors:
             err.print(str(problem), markup=False, style="red")
-        raise typer.Exit(FINDING) from None
+        raise typer.Exit(EXIT_FAILED) from None
     stages = sum(spec.kind == "stages" for spec in graph.nodes.values())
     out.print(f"{config}: {stages} stages, {len(graph.nodes) - stages} links, {len(graph.edges)} edges, no problems")
     for text in graph.left_out_texts():
@@ -68,7 +68,7 @@ def _tell_hosts(hosts: Hosts) -> None:
                 out.print(f"  to {hop.receiver}: {hop.producer}.{hop.output} ({hop.queue})", markup=False)
 
 
-@in_words
+@report_errors
 def graph(
     config: Config,
     format: Annotated[Format, typer.Option("--format", help="Mermaid text or an SVG picture.")] = Format.MERMAID,
@@ -85,10 +85,10 @@ def graph(
     checked = load_graph(config, overlay or (), sets or ())
     if host is not None and hosts is None:
         err.print("--host NAME needs --hosts FILE")
-        raise typer.Exit(WRONG_USE)
+        raise typer.Exit(EXIT_USAGE)
     if hosts is not None and host is None and format is Format.SVG:
         err.print("an SVG shows one host: say --host NAME, or draw all of them as mermaid")
-        raise typer.Exit(WRONG_USE)
+        raise typer.Exit(EXIT_USAGE)
     if hosts is not None and host is not None:
         checked = host_graph(checked, hosts, host)
     boxes = _boxes(checked, load_hosts(hosts, checked)) if hosts is not None and host is None else ""
@@ -104,7 +104,7 @@ def _boxes(graph: Graph, hosts: Hosts) -> str:
     return "\n".join(lines) + "\n"
 
 
-@in_words
+@report_errors
 def schema(out_file: OutFile = None) -> None:
     """Write the JSON Schema of the YAML files, for editors.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flow.link import LinkError
-from links.cli.console import FINDING, WRONG_USE, err, in_words, out, progress_bar, warn
+from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, progress_bar, report_errors, warn
 from links.cli.files import Overwrite
 
 if TYPE_CHECKING:  # what simulates is installed where it is wanted
@@ -24,7 +24,7 @@ ClosedLoop = Annotated[
 ]
 
 
-@in_words
+@report_errors
 def simulate_recording(
     scenario: Annotated[Path, typer.Argument(help="Scenario file, as in configs/scenarios/.")],
     out_file: Annotated[Path, typer.Option("--out", "-o", help="Recording to write.")],
@@ -73,7 +73,7 @@ def simulate_recording(
     out.print(str(report), markup=False)
 
 
-@in_words
+@report_errors
 def simulate_matrix(
     folder: Annotated[Path, typer.Argument(help="Where the recordings go, one for each cell and seed.")],
     seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Make so many seeds of each cell.")] = 1,
@@ -199,9 +199,9 @@ def _tell(folder: Path, report: MatrixReport) -> None:
     text = f"{folder}: {report.made} made, {report.kept} were there already"
     out.print(f"{text}; {report.replayed} of them replayed" if report.replayed else text, markup=False)
     if any(not failure.stage_failed for failure in report.failed):
-        raise typer.Exit(WRONG_USE)
+        raise typer.Exit(EXIT_USAGE)
     if report.impossible or report.failed:
-        raise typer.Exit(FINDING)
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _not_installed(missing: ModuleNotFoundError) -> LinkError:

@@ -27,7 +27,7 @@ from flow.replay import Replay, RunReport
 from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import NOT_LIVE, GoalCommand
-from links.runs.run_folder import Asked
+from links.runs.request import RunRequest
 from links.simulated.servo import STEP_NS
 from stages.messages import ServoGoal
 
@@ -132,5 +132,5 @@ def made_with(config: Path, graph: Graph) -> dict[str, str]:
 
 def load_loop(config: Path, rig_yaml: str, scenario: str, settings: ClosedLoopSettings) -> ClosedLoop:
     """A configuration as a closed loop on a scenario's rig. Raises ConfigError with every problem, or LinkError."""
-    graph = Asked(config).graph(rig_yaml, scenario)
+    graph = RunRequest(config).graph(rig_yaml, scenario)
     return ClosedLoop(graph, settings, made_with(config, graph))

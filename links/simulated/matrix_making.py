@@ -21,7 +21,8 @@ from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, LinkError
 from flow.ports import RunError
 from links.recording import RecordingReader
-from links.runs.run_folder import Asked, RunFolder, holds_run, replay_into
+from links.runs.request import RunRequest
+from links.runs.run_folder import RunFolder, holds_run, replay_into
 from links.runs.truth import TruthLog
 from links.simulated.closed_loop import ClosedLoop, made_with, servo_edge
 from links.simulated.jobs import run_all
@@ -39,7 +40,7 @@ class Making:
     """How all recordings of one run over the matrix are made."""
 
     folder: Path
-    closed_loop: Asked | None
+    closed_loop: RunRequest | None
     results: Path | None  # where the closed loop's runs go, if they are wanted
     conditions: Conditions
     pictures: Path | None = None  # recordings of the same names, whose pictures are taken instead of painted
@@ -119,13 +120,13 @@ def make_matrix(
     )
 
 
-def _asked(closed_loop: Path, conditions: Conditions, for_results: bool) -> Asked:
+def _asked(closed_loop: Path, conditions: Conditions, for_results: bool) -> RunRequest:
     """The configuration of all closed loops, tried on a plain cell's rig; runs that are kept have no viewer file."""
     rig_yaml = scenario_of(PLAIN, 1, conditions).rig_yaml()
-    graph = Asked(closed_loop).graph(rig_yaml, "the matrix's rig")
+    graph = RunRequest(closed_loop).graph(rig_yaml, "the matrix's rig")
     servo_edge(graph)
     viewers = [spec.name for spec in graph.nodes.values() if spec.use == VIEWER]
-    return Asked(closed_loop, sets=tuple(f"{name}.file=null" for name in viewers) if for_results else ())
+    return RunRequest(closed_loop, sets=tuple(f"{name}.file=null" for name in viewers) if for_results else ())
 
 
 def make_one(task: Task, progress: Callable[[float], None]) -> Outcome:
@@ -171,7 +172,7 @@ def _simulate_and_keep_run(
     file: Path,
     scenario: Scenario,
     folder: Path,
-    asked: Asked,
+    asked: RunRequest,
     graph: Graph,
     progress: Callable[[float], None],
 ) -> None:
@@ -185,7 +186,7 @@ def _simulate_and_keep_run(
         undo.pop_all()
         truth = TruthLog()
         with RecordingReader(file) as reader:
-            truth.take(reader.records([topic for topic in reader.topics if topic.startswith(TRUTH_TOPICS)]))
+            truth.add_all(reader.records([topic for topic in reader.topics if topic.startswith(TRUTH_TOPICS)]))
             run.finish(loop.report, loop.output_hash, truth, reader.warnings)
 
 

@@ -66,7 +66,7 @@ def test_quickstart_says_where_the_drone_is_and_where_to_look(grd, tmp_path):
         "run.log",
         "run.rrd",
         "summary.json",
-        "truth_hits.csv",
+        "truth_returns.csv",
         "truth_vehicle_drone.tum",
         "truth_world_vehicle.tum",
     }
@@ -97,7 +97,7 @@ def test_a_replay_in_several_processes_leaves_the_files_of_one(grd, tmp_path, mo
     )
     (tmp_path / "processes.yaml").write_text("stages: {sweep: {process: lidar}}\nlinks: {viewer: null}\n")
     both = ("replay", STREET, "--config", ROOT / "configs" / "estimate.yaml", "--overlay", "processes.yaml")
-    grd(*both, "--out", "together", "--together")
+    grd(*both, "--out", "together", "--single-process")
     assert not started
     grd(*both, "--out", "processes")
     assert [sorted(topics) for topics in started] == [["/lidar/packets", "/servo/state"]]

@@ -18,7 +18,8 @@ import pytest
 from flow.link import Record
 from links.recording import Recorder, RecordingReader, recover
 from links.runs.live_run import live_graph, run_live
-from links.runs.run_folder import Asked, RunFolder
+from links.runs.request import RunRequest
+from links.runs.run_folder import RunFolder
 from tests.links import command
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -91,7 +92,7 @@ def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_pat
 def test_a_live_recording_says_with_the_channel_who_sent(tmp_path):
     lidar = "  lidar: {use: links.velodyne.Lidar, config: {port: 42368, sender: 127.0.0.9}}\n"
     (tmp_path / "lidar.yaml").write_text(CONFIG.replace("  recorder: {use: links.recording.Recorder}\n", lidar))
-    asked = Asked(tmp_path / "lidar.yaml")
+    asked = RunRequest(tmp_path / "lidar.yaml")
     heard = RunFolder(tmp_path / "run", tmp_path / "flight.mcap", asked, live_graph(asked), live=True)
     recorder = Recorder()
     heard.taps.append(recorder)
@@ -228,7 +229,7 @@ def test_a_terminal_that_takes_no_more_ends_no_run(grd, tmp_path, status):
     def show(look):
         raise status
 
-    asked = Asked(Path("ticks.yaml"), (), ())
+    asked = RunRequest(Path("ticks.yaml"), (), ())
     finished = run_live(tmp_path / "run", asked, live_graph(asked), show, 2.0)
     assert any("cannot be shown on the terminal (" in str(event) for event in finished.report.events)
     assert finished.report.records > 40

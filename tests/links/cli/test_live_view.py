@@ -12,7 +12,7 @@ from flow.config.edge import Edge, QueueSettings
 from flow.live.report import EdgeCount, LinkReport, LiveReport, edge_report
 from flow.taps import Digest
 from links.cli.live_view import LiveView
-from links.runs.live_run import Look
+from links.runs.live_run import RunStatus
 from stages.messages import DroneFix, Image, PoseState, RelativePose, SweptPulses, TrackingState, TrackState
 
 
@@ -62,7 +62,7 @@ def shown(report, *messages, terminal=False, news=()):
     with LiveView(console) as view:
         for message in messages:
             view.newest.see("x", message, 0)
-        view.show(Look(12.34, lambda: report, list(news)))
+        view.show(RunStatus(12.34, lambda: report, list(news)))
     return stream.getvalue()
 
 
@@ -100,8 +100,8 @@ def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():
 def test_news_are_told_at_once_even_between_two_lines(capsys):
     stream = io.StringIO()
     with LiveView(Console(file=stream, width=160, soft_wrap=True)) as view:
-        view.show(Look(0.0, report_of, ["lidar: first"]))
-        view.show(Look(0.1, report_of, ["lidar: second"]))
+        view.show(RunStatus(0.0, report_of, ["lidar: first"]))
+        view.show(RunStatus(0.1, report_of, ["lidar: second"]))
     assert stream.getvalue().count("\n") == 1
     assert capsys.readouterr().err == "lidar: first\nlidar: second\n"
 
@@ -118,5 +118,5 @@ def test_a_terminal_shows_every_edge_and_link():
 
 @pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (Image, False)])
 def test_the_view_takes_only_what_it_shows(kind, wanted):
-    assert LiveView().newest.wants(kind) is wanted
+    assert LiveView().latest.wants(kind) is wanted
     assert Digest().wants(kind)

@@ -86,7 +86,7 @@ def test_a_pose_is_good_when_the_autopilots_gate_lets_it_out(tmp_path):
             results.see("fuse.relative_pose", message, message.stamp_ns)
         results.close()
         rows = list(csv.DictReader((tmp_path / POSE_COVARIANCE_FILE).open()))
-        assert [row["good"] == "1" for row in rows] == expected
+        assert [row["accepted"] == "1" for row in rows] == expected
         assert [row["rotation"] for row in rows] == ["1"] * 3
 
 

@@ -14,7 +14,7 @@ from flow.config_error import ConfigError
 from flow.link import LinkError
 from links.cli.app import app
 from links.recording import RecordingReader
-from links.runs.run_folder import Asked
+from links.runs.request import RunRequest
 from links.simulated import matrix_flights, matrix_making
 from links.simulated.closed_loop import ClosedLoop, made_with
 from links.simulated.matrix import Conditions, cells, scenario_of
@@ -103,7 +103,7 @@ def test_the_closed_loop_leaves_the_run_that_a_replay_leaves(tmp_path, monkeypat
     assert left.keys() == replayed.keys()
     assert {file for file, data in left.items() if data != replayed[file]} == set()
     assert {
-        "truth_hits.csv",
+        "truth_returns.csv",
         "truth_visible.csv",
         "truth_vehicle_drone.tum",
         "stamps.txt",
@@ -111,7 +111,7 @@ def test_the_closed_loop_leaves_the_run_that_a_replay_leaves(tmp_path, monkeypat
     assert not [file for file in left if file.endswith(".rrd")]
     summary = json.loads(left["summary.json"])
     assert summary["sweeps"] >= 1
-    assert summary["against_truth"]["fixes"] > 0
+    assert summary["truth_errors"]["fixes"] > 0
     assert summary["set"] == ["look.file=null"]
 
 
@@ -191,7 +191,7 @@ def test_a_changed_configuration_is_noticed_and_a_comment_or_a_viewer_is_none(tm
 
 def test_a_recording_that_knows_its_configuration_by_name_only_is_not_made_alike(tmp_path, short, config: Path) -> None:
     scenario, file = scenario_of(HOVER, 1), tmp_path / "old.mcap"
-    graph = Asked(config).graph(scenario.rig_yaml(), "test")
+    graph = RunRequest(config).graph(scenario.rig_yaml(), "test")
     made_by = made_with(config, graph)
     simulate_into(file, scenario, loop=ClosedLoop(graph, scenario.closed_loop, {"closed_loop": "fast.yaml"}))
     assert not is_made(file, scenario, made_by)

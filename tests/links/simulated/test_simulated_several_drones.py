@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from flow.link import LinkError, Record
-from links.runs.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
+from links.runs.results import TRUTH_FILE, TRUTH_RETURNS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
 from links.runs.truth import TruthLog
 from links.simulated import run
 from links.simulated.drone import DroneModel
@@ -180,12 +180,12 @@ def test_the_line_of_sight_is_told_at_the_start_and_at_each_change() -> None:
 
 def test_what_is_told_is_what_a_run_is_judged_by(pair: Scenario, tmp_path: FilePath) -> None:
     log = TruthLog()
-    assert not [r for r in log.aside(Simulation(pair).records()) if r.topic.startswith("/truth")]
+    assert not [r for r in log.without_truth(Simulation(pair).records()) if r.topic.startswith("/truth")]
     log.write(tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
     of_a_drone = {
         name.replace(".", f"{number}.")
-        for name in (TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VISIBLE_FILE)
+        for name in (TRUTH_FILE, TRUTH_RETURNS_FILE, TRUTH_VISIBLE_FILE)
         for number in ("", "_2")
     }
     assert names == {TRUTH_VEHICLE_FILE} | of_a_drone

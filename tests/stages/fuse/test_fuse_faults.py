@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from links.runs.run_folder import Asked
+from links.runs.request import RunRequest
 from links.runs.truth import TruthLog
 from links.simulated.closed_loop import ClosedLoop
 from links.simulated.matrix import Conditions, scenario_of
@@ -65,9 +65,9 @@ WITH_ROTATION = (PoseState.FULL, PoseState.COASTING)
 def made(cell: Cell, seed: int = 1) -> Flown:
     """A flight of the matrix, flown for this test."""
     scenario = scenario_of(cell, seed, Conditions(calibrated=True, odometry=True, autopilot=True))
-    graph = Asked(CONFIGS / "estimate.yaml", sets=("viewer.file=null",)).graph(scenario.rig_yaml(), cell.name)
+    graph = RunRequest(CONFIGS / "estimate.yaml", sets=("viewer.file=null",)).graph(scenario.rig_yaml(), cell.name)
     tap, truth = Hearing(graph, "fuse"), TruthLog()
-    truth.take(Simulation(scenario, loop=ClosedLoop(graph, scenario.closed_loop, {}, (tap,))).records())
+    truth.add_all(Simulation(scenario, loop=ClosedLoop(graph, scenario.closed_loop, {}, (tap,))).records())
     return with_rotations(flown(cell.name, tap, truth))
 
 

@@ -60,7 +60,7 @@ def rerun_into(folder: Path, recording: Path, progress: Progress | None = None) 
         result = run.finish(report, digest.hexdigest(), truth, warnings, parts=len(session.parts))
     if live_hash is None:
         return RerunResult(result, True, "the live run was interrupted, so its hash is not known")
-    same_hash = live_hash == result.digest
+    same_hash = live_hash == result.output_hash
     return RerunResult(result, same_hash, f"the live run's hash is {'the same' if same_hash else live_hash}")
 
 

@@ -27,7 +27,7 @@ def summary(run: RunResult, request: RunRequest) -> dict[str, Any]:
         "config": request.config.name,
         "overlays": [path.name for path in request.overlays],
         "set": list(request.sets),
-        "output_hash": run.digest,
+        "output_hash": run.output_hash,
         "records": report.records,
         "start_s": stamp_s(report.first_ns),
         "end_s": stamp_s(report.last_ns),

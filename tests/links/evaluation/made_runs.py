@@ -83,7 +83,7 @@ def make_run(
         variances = np.broadcast_to(np.asarray(sigma_m, dtype=float), len(t_s)) ** 2
         ends = [""] * len(t_s) if tracks is None else [f",{track}" for track in tracks]
         rows = [f"{stamp(t)},{v},0,0,{v},0,{v},5,3{end}\n" for t, v, end in zip(t_s, variances, ends, strict=True)]
-        head = f"stamp_s,cxx_m2,cxy_m2,cxz_m2,cyy_m2,cyz_m2,czz_m2,hits,iterations{'' if tracks is None else ',track_id'}\n"
+        head = f"stamp_s,cxx_m2,cxy_m2,cxz_m2,cyy_m2,cyz_m2,czz_m2,returns,iterations{'' if tracks is None else ',track_id'}\n"
         (folder / "fix_covariance.csv").write_text(head + "".join(rows))
     if isinstance(truth, str):
         if truth == "no drone":

@@ -61,12 +61,12 @@ def test_other_processes_count_while_they_run(clock):
     finally:
         child.kill()
         child.wait()
-    assert used.others_cpu_s >= 0.3
+    assert used.subprocesses_cpu_s >= 0.3
     clock(1.0)
     used.sample([child.pid])
     with_it, alone = used.columns["rss_mb"]
     assert alone < with_it - 45
-    assert used.others_cpu_s == 0.0
+    assert used.subprocesses_cpu_s == 0.0
 
 
 def test_without_a_look_there_is_nothing_to_tell(clock):

@@ -85,7 +85,7 @@ def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_p
     hashes = {json.loads((tmp_path / "out" / name / "summary.json").read_text())["output_hash"] for name in names}
     assert len(hashes) == 1
     again = grd("replay", STREET, "--out", tmp_path / "out" / names[0], code=2)
-    assert "holds a run already" in again
+    assert "has a run already" in again
 
 
 @pytest.mark.skipif(not can_use_subprocesses(), reason="one core, or no fork: there is one process anyway")

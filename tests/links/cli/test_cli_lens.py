@@ -9,7 +9,7 @@ from flow.graph import load_graph
 from tests.links import command
 from tests.stages.geometry.test_lens import KANNALA_BRANDT, OCAM
 from tests.stages.geometry.test_lens_files import KALIBR, OCAMCALIB
-from tests.test_house import ROOT
+from tests.test_architecture import ROOT
 
 
 @pytest.fixture

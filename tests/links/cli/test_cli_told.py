@@ -42,7 +42,7 @@ def drive(tmp_path, monkeypatch):
 @pytest.mark.parametrize("words", [("run", "drive.yaml"), ("replay", "drive.mcap", "--config", "drive.yaml")])
 def test_a_configuration_that_seeks_no_drone_says_what_it_ran_instead(drive, words):
     lines = command.grd(*words).splitlines()
-    assert lines[0].endswith("no stage seeks a drone")
+    assert lines[0].endswith("no stage searches for a drone")
     assert lines[1] == "ran: motion (VehicleMotionSelector: 47 vehicle_motion)"
     assert not any("drone accepted" in line or "no drone:" in line or line.startswith("positions") for line in lines)
     assert any(line.startswith("summary") for line in lines)
@@ -51,12 +51,12 @@ def test_a_configuration_that_seeks_no_drone_says_what_it_ran_instead(drive, wor
 def test_a_configuration_that_seeks_one_says_nothing_of_the_kind(drive):
     text = command.grd("replay", "drive.mcap", "--config", ROOT / "configs/replay.yaml", "--set", "viewer.file=null")
     assert "no drone: no sweep was completed" in " ".join(text.split())
-    assert "no stage seeks a drone" not in text
+    assert "no stage searches for a drone" not in text
 
 
 def test_what_links_and_stages_left_out_is_told_with_its_reason(drive):
     text = " ".join(command.grd("run", "drive.yaml").split())
-    told = "left out: odometry: 2 refused; motion: 1 refused: odometry: not where the words before lead"
+    told = "rejected: odometry: 2 refused; motion: 1 refused: odometry: not where the words before lead"
     assert told in text
 
 
@@ -94,7 +94,7 @@ def test_a_lidar_replayed_with_another_clock_than_flown_is_warned_of(drive, flow
         writer.write(Record("/vehicle/odometry", 10**9, 10**9, json.dumps(pose).encode(), 0))
     (drive / "again.yaml").write_text(LIDAR.replace("CLOCK", replayed))
     text = " ".join(command.grd("replay", "flight.mcap", "--config", "again.yaml", "--out", "again").split())
-    told = f"front: flown with `clock: {flown}`, replayed with `clock: {replayed}`"
+    told = f"front: recorded with `clock: {flown}`, replayed with `clock: {replayed}`"
     assert (told in text) is warned
     summary = json.loads((drive / "again" / "summary.json").read_text())
     assert any(told in warning for warning in summary["warnings"]) is warned
@@ -107,7 +107,7 @@ def test_a_flight_that_names_no_clock_was_flown_with_the_free_one(drive, clock):
         writer.write(Record("/vehicle/odometry", 10**9, 10**9, json.dumps(pose).encode(), 0))
     (drive / "again.yaml").write_text(LIDAR.replace("CLOCK", clock))
     text = command.grd("replay", "flight.mcap", "--config", "again.yaml")
-    assert ("flown with `clock: free`" in " ".join(text.split())) is (clock == "utc")
+    assert ("recorded with `clock: free`" in " ".join(text.split())) is (clock == "utc")
 
 
 @pytest.mark.parametrize("config", ["links: [", "links: 3", "links: {front: {use: links.velodyne.Lidar, config: 3}}"])
@@ -116,4 +116,4 @@ def test_a_recording_with_a_broken_configuration_is_replayed_without_a_word_of_c
         pose = {"xyz_m": [0.0] * 3, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
         writer.write(Record("/vehicle/odometry", 10**9, 10**9, json.dumps(pose).encode(), 0))
     (drive / "again.yaml").write_text(LIDAR.replace("CLOCK", "free"))
-    assert "flown with" not in command.grd("replay", "flight.mcap", "--config", "again.yaml")
+    assert "recorded with `clock" not in command.grd("replay", "flight.mcap", "--config", "again.yaml")

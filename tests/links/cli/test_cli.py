@@ -55,7 +55,7 @@ def test_every_command_explains_itself_with_an_example(grd, command):
 def test_quickstart_says_where_the_drone_is_and_where_to_look(grd, tmp_path):
     text = grd("run", ROOT / "configs" / "quickstart.yaml")
     folder = tmp_path / "out" / "street_sweep-quickstart"
-    for words in ("x forward [m]", "output hash", "run.rrd", "fix_vehicle_drone.tum", "against the simulation's truth"):
+    for words in ("x forward [m]", "output hash", "run.rrd", "fix_vehicle_drone.tum", "errors against the truth"):
         assert words in text
     names = {path.name for path in folder.iterdir()}
     assert names == {

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: what it prints, writes and returns."""
+"""The command line from the outside: output, files and exit codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`grd lens` as a user meets it: a calibration program's file becomes part of a rig, or is refused with its line."""
+"""`grd lens`: a file of a calibration program becomes part of a rig, or is rejected with its line."""
 
 from __future__ import annotations
 

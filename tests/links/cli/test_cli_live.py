@@ -1,4 +1,4 @@
-"""`grd run` live as a user meets it: started, stopped, killed, and taken again from its recording."""
+"""`grd run` live: start, stop, kill, and re-run from the recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the console shows of a live run, on a terminal and in a log."""
+"""Console display of a live run, on a terminal and in a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fused poses in a run's folder: a line each, the rotation marked where it is not known, states in the log."""
+"""Fused poses in the folder of a run: a line per pose, unknown rotations marked, states in the log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a long run uses."""
+"""Samples of the resources of a run."""
 
 from __future__ import annotations
 

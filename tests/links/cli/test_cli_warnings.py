@@ -1,4 +1,4 @@
-"""What the end of a run tells: of a configuration that seeks no drone, and of what links and stages left out."""
+"""Summary of a run: configurations without drone search, rejected messages, warnings of clocks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ links:
 
 @pytest.fixture
 def drive(tmp_path, monkeypatch):
-    """A drive at 5 m/s, told 50 times a second: two of the words are no pose, one is 40 m off."""
+    """Odometry of a drive at 5 m/s at 50 Hz: two messages are no pose, one is off by 40 m."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "drive.yaml").write_text(CONFIG)
     with RecordingWriter(tmp_path / "drive.mcap") as writer:
@@ -40,7 +40,7 @@ def drive(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("words", [("run", "drive.yaml"), ("replay", "drive.mcap", "--config", "drive.yaml")])
-def test_a_configuration_that_seeks_no_drone_says_what_it_ran_instead(drive, words):
+def test_a_configuration_without_drone_search_lists_the_outputs_of_its_stages(drive, words):
     lines = command.grd(*words).splitlines()
     assert lines[0].endswith("no stage searches for a drone")
     assert lines[1] == "ran: motion (VehicleMotionSelector: 47 vehicle_motion)"
@@ -48,13 +48,13 @@ def test_a_configuration_that_seeks_no_drone_says_what_it_ran_instead(drive, wor
     assert any(line.startswith("summary") for line in lines)
 
 
-def test_a_configuration_that_seeks_one_says_nothing_of_the_kind(drive):
+def test_a_configuration_with_drone_search_does_not_list_them(drive):
     text = command.grd("replay", "drive.mcap", "--config", ROOT / "configs/replay.yaml", "--set", "viewer.file=null")
     assert "no drone: no sweep was completed" in " ".join(text.split())
     assert "no stage searches for a drone" not in text
 
 
-def test_what_links_and_stages_left_out_is_told_with_its_reason(drive):
+def test_rejected_messages_of_links_and_stages_are_reported_with_reasons(drive):
     text = " ".join(command.grd("run", "drive.yaml").split())
     told = "rejected: odometry: 2 refused; motion: 1 refused: odometry: not where the words before lead"
     assert told in text
@@ -87,7 +87,7 @@ links:
         (None, "utc", False),
     ],
 )
-def test_a_lidar_replayed_with_another_clock_than_flown_is_warned_of(drive, flown, replayed, warned):
+def test_a_lidar_replayed_with_another_clock_than_recorded_gives_a_warning(drive, flown, replayed, warned):
     config = None if flown is None else LIDAR.replace("CLOCK", flown)
     with RecordingWriter(drive / "flight.mcap", config_yaml=config) as writer:
         pose = {"xyz_m": [0.0] * 3, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
@@ -101,7 +101,7 @@ def test_a_lidar_replayed_with_another_clock_than_flown_is_warned_of(drive, flow
 
 
 @pytest.mark.parametrize("clock", ["free", "utc"])
-def test_a_flight_that_names_no_clock_was_flown_with_the_free_one(drive, clock):
+def test_a_recording_without_a_clock_setting_was_made_with_the_free_clock(drive, clock):
     with RecordingWriter(drive / "flight.mcap", config_yaml=LIDAR.replace(", config: {clock: CLOCK}", "")) as writer:
         pose = {"xyz_m": [0.0] * 3, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
         writer.write(Record("/vehicle/odometry", 10**9, 10**9, json.dumps(pose).encode(), 0))
@@ -111,7 +111,7 @@ def test_a_flight_that_names_no_clock_was_flown_with_the_free_one(drive, clock):
 
 
 @pytest.mark.parametrize("config", ["links: [", "links: 3", "links: {front: {use: links.velodyne.Lidar, config: 3}}"])
-def test_a_recording_with_a_broken_configuration_is_replayed_without_a_word_of_clocks(drive, config):
+def test_a_recording_with_an_invalid_configuration_is_replayed_without_clock_warning(drive, config):
     with RecordingWriter(drive / "flight.mcap", config_yaml=config) as writer:
         pose = {"xyz_m": [0.0] * 3, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "covariance": None}
         writer.write(Record("/vehicle/odometry", 10**9, 10**9, json.dumps(pose).encode(), 0))

@@ -61,7 +61,7 @@ def shown(report, *messages, terminal=False, news=()):
     console = Console(file=stream, force_terminal=terminal, width=160, highlight=False, soft_wrap=True)
     with LiveView(console) as view:
         for message in messages:
-            view.newest.see("x", message, 0)
+            view.latest.see("x", message, 0)
         view.show(RunStatus(12.34, lambda: report, list(news)))
     return stream.getvalue()
 

@@ -116,7 +116,7 @@ def fix(stamp_ns: int, z_m: float, track_id: int) -> DroneFix:
 
 
 def test_invalid_hits_are_rejected():
-    with pytest.raises(LinkError, match="holds no pulses"):
+    with pytest.raises(LinkError, match="has no pulse stamps"):
         list(TruthLog().without_truth([Record("/truth/hits", 0, 0, b"{}")]))
 
 
@@ -127,7 +127,7 @@ def test_fixes_of_all_tracks_are_written_with_their_number(tmp_path):
         results.see("track.drone_fix", fix(stamp, float(track), track), 0)
     results.close()
     rows = (tmp_path / "fix_covariance.csv").read_text().splitlines()
-    assert rows[0].endswith(",hits,iterations,track_id")
+    assert rows[0].endswith(",returns,iterations,track_id")
     assert [row.split(",")[-1] for row in rows[1:]] == ["1", "2", "2"]
     (tmp_path / "summary.json").write_text("{}")
     output = read_run(tmp_path).outputs[0]

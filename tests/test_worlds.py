@@ -102,7 +102,8 @@ def test_how_often_a_sweep_finds_the_drone():
                 if false:
                     failures.append(f"{name}, seed {seed}, {flight}: {false} false")
     lines = ["", "| drone | worlds | visible | paper: found, false | with gates: found, false |", "| --- " * 5 + "|"]
-    for flight, row in table.items():
+    for flight in FLIGHTS:
+        row = table[flight]
         what = "none" if flight is None else f"{flight[0]:g} m, {flight[1]:g} m/s"
         cells = [f"{row[f'{name} found']}, {row[f'{name} false']}" for name in configs]
         lines.append(f"| {what} | {row['worlds']} | {row['visible']} | {cells[0]} | {cells[1]} |")

@@ -80,5 +80,7 @@ def known_classes(kind: str) -> list[str]:
             private = not module.ispkg and (kind != "stages" or module.name.count(".") > 1)
             home = module.name.rpartition(".")[0] if private else module.name
             door = (file.parent / "__init__.py").read_text("utf-8") if private else source.read_text("utf-8")
+            if home.count(".") > 1 and not module.ispkg:  # a folder of a package: the package exports it
+                home, door = home.rpartition(".")[0], (file.parents[1] / "__init__.py").read_text("utf-8")
             found += [f"{home}.{name}" for name in classes if re.search(rf"\b{name}\b", door)]
     return sorted(dict.fromkeys(found))

@@ -15,8 +15,8 @@ from links.cli.console import FINDING, WRONG_USE, err, in_words, out, progress_b
 from links.cli.files import Overwrite
 
 if TYPE_CHECKING:  # what simulates is installed where it is wanted
-    from links.simulated.matrix_flights import Cell
-    from links.simulated.matrix_making import MatrixReport
+    from links.simulated.matrix.flights import Cell
+    from links.simulated.matrix.making import MatrixReport
 
 ClosedLoop = Annotated[
     Path | None,
@@ -55,7 +55,7 @@ def simulate_recording(
     Example: grd simulate configs/scenarios/experiment_1.yaml -o flight.mcap --closed-loop configs/sim.yaml --seed 3
     """
     try:
-        from links.simulated.run import simulate
+        from links.simulated.rig.run import simulate
     except ModuleNotFoundError as missing:
         raise _not_installed(missing) from None
 
@@ -154,8 +154,8 @@ def simulate_matrix(
     Example: grd matrix out/matrix --only '*-empty-*' --closed-loop configs/sim.yaml --results out/runs --jobs 2
     """
     try:
-        from links.simulated.matrix import Conditions
-        from links.simulated.matrix_making import make_matrix
+        from links.simulated.matrix.making import make_matrix
+        from links.simulated.matrix.matrix import Conditions
     except ModuleNotFoundError as missing:
         raise _not_installed(missing) from None
 
@@ -180,7 +180,7 @@ def simulate_matrix(
 
 def _cells(folder: Path, patterns: list[str], pairs: bool) -> list[Cell]:
     """Those of the matrix that are called so. LinkError: none is."""
-    from links.simulated.matrix import cells
+    from links.simulated.matrix.matrix import cells
 
     wanted = cells(patterns, pairs)
     if not wanted:

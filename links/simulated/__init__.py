@@ -3,6 +3,6 @@
 Source: ours.
 """
 
-from links.simulated.live_rig import LiveRig
+from links.simulated.rig.live_rig import LiveRig
 
 __all__ = ["LiveRig"]

@@ -17,10 +17,10 @@ import pytest
 from flow.link import Record
 from links.camera import Camera as CameraLink
 from links.recording import CompressedImage, encode_compressed_image
-from links.simulated.camera import Camera
-from links.simulated.camera_sensor import encode_jpeg
-from links.simulated.run import Simulation
-from links.simulated.scenario import Scenario, load_scenario
+from links.simulated.rig.run import Simulation
+from links.simulated.rig.scenario import Scenario, load_scenario
+from links.simulated.sensors.camera import Camera
+from links.simulated.sensors.camera_sensor import encode_jpeg
 from stages.lens import Equidistant, KannalaBrandt, OCam
 
 SCENARIO = Path(__file__).resolve().parents[2] / "configs" / "scenarios" / "street_sweep.yaml"

@@ -11,8 +11,8 @@ import sys
 import threading
 from pathlib import Path
 
-from links.simulated.live_process import SWITCH_S, LiveAutopilot, RigInTime
-from links.simulated.live_rig import LiveRig
+from links.simulated.rig.live_process import SWITCH_S, LiveAutopilot, RigInTime
+from links.simulated.rig.live_rig import LiveRig
 
 
 class RestartedAutopilot(LiveAutopilot):

@@ -57,9 +57,9 @@ def wave_deg(error_rad: np.ndarray) -> float:
 def found(tmp_path_factory):
     """(axis [deg], time [s], encoder before, after, its sigma [deg], play [deg]) of each scene."""
     from links.calibration import gather
-    from links.simulated.run import simulate_into
-    from links.simulated.scenario import load_scenario
-    from links.simulated.servo import Turned
+    from links.simulated.rig.run import simulate_into
+    from links.simulated.rig.scenario import load_scenario
+    from links.simulated.sensors.servo import Turned
     from stages.calibration.calibrate import calibrate
 
     rows = []

@@ -18,8 +18,8 @@ from pydantic import ValidationError
 from flow.link import LinkError
 from links import host_time
 from links.dynamixel import Servo, mx28
-from links.simulated.dynamixel_emulator import DynamixelEmulator
-from links.simulated.servo import ServoSettings
+from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
+from links.simulated.sensors.servo import ServoSettings
 from stages.messages import ServoGoal
 
 RPM = math.tau / 60

@@ -28,10 +28,10 @@ from links.mavlink import Autopilot
 from links.mavlink.session import Session
 from links.mavlink.signing import AHEAD_TICKS
 from links.mavlink.wire import header, packed, parse_frame
-from links.simulated.ardupilot_rules import ArduPilotRules
-from links.simulated.autopilot_rules import Fate
-from links.simulated.autopilot_socket import AutopilotSocket
-from links.simulated.px4_rules import Px4Rules
+from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
+from links.simulated.autopilot.autopilot_socket import AutopilotSocket
+from links.simulated.autopilot.px4_rules import Px4Rules
+from links.simulated.autopilot.rules import Fate
 from stages.geometry import rotation_z
 from stages.messages import AutopilotEstimator, PoseState, RelativePose
 

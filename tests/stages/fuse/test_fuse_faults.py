@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from links.run_folder import Asked
-from links.simulated.closed_loop import ClosedLoop
-from links.simulated.matrix import Conditions, scenario_of
-from links.simulated.matrix_flights import Cell
-from links.simulated.run import Simulation
+from links.simulated.matrix.flights import Cell
+from links.simulated.matrix.matrix import Conditions, scenario_of
+from links.simulated.rig.closed_loop import ClosedLoop
+from links.simulated.rig.run import Simulation
 from links.truth import TruthLog
 from stages.messages import PoseState
 from tests.stages.fuse.flown import (

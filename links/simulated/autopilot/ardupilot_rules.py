@@ -1,0 +1,129 @@
+"""What ArduPilot takes of an external pose: VISO_TYPE 1, EKF3 with position and yaw from it.
+
+Source: https://github.com/ArduPilot/ardupilot, libraries/AP_VisualOdom (AP_VisualOdom_MAV.cpp, _Backend.cpp),
+GCS_MAVLink (GCS_MAVLINK::handle_odometry), AP_NavEKF3 (writeExtNavData; gates and retry times of AP_NavEKF3.h), AP_RTC
+(JitterCorrection.cpp).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega
+
+from links.simulated.autopilot.rules import (
+    BODY_FRD,
+    LOCAL_FRD,
+    MS,
+    US,
+    Fate,
+    Reading,
+    Rules,
+    pose_of,
+    variances_of,
+    yaw_of,
+)
+
+mavlink: Any = ardupilotmega
+
+
+@dataclass(slots=True)
+class JitterCorrection:
+    """ArduPilot's map from a sender's clock to its own [us]: the promptest message came without delay."""
+
+    max_lag_us: int = 500_000
+    convergence_loops: int = 100
+    _offset_us: int | None = None
+    _least_us: int = 0
+    _count: int = 0
+
+    def local_us(self, sent_us: int, arrival_us: int) -> int:
+        """When it was sent, on our clock."""
+        lag_us = arrival_us - sent_us
+        if self._offset_us is None or lag_us < self._offset_us:
+            self._offset_us = lag_us
+        if lag_us - self._offset_us > self.max_lag_us:
+            self._offset_us = lag_us - self.max_lag_us
+        local_us = sent_us + self._offset_us
+        self._least_us = lag_us if self._count == 0 else min(self._least_us, lag_us)
+        self._count += 1
+        if self._count == self.convergence_loops:
+            self._offset_us, self._count = max(self._offset_us, self._least_us), 0
+        return local_us
+
+
+@dataclass(slots=True)
+class ArduPilotRules(Rules):
+    """ArduPilot with VISO_TYPE 1 and EKF3 taking position and yaw from it. Parameters by their names."""
+
+    viso_pos_m_nse: float = 0.2
+    viso_yaw_m_nse: float = 0.2
+    viso_qual_min: int = 0
+    viso_delay_ms: int = 10
+    gate: float = 5.0  # EK3_POS_I_GATE 500
+    interval_ms: int = 20  # extNavIntervalMin_ms
+    health_ms: int = 300  # AP_VISUALODOM_TIMEOUT_MS
+    retry_s: float = 7.0  # posRetryTimeNoVel_ms: gated that long, it starts anew from the pose
+    _jitter: JitterCorrection = field(default_factory=JitterCorrection)
+    _last_ms: int | None = None
+
+    def healthy(self, now_ns: int) -> bool:
+        """AP_VisualOdom_Backend::healthy: also of messages that are not fused."""
+        return self._heard_ns is not None and now_ns - self._heard_ns < self.health_ms * MS
+
+    def fusing(self, now_ns: int) -> bool:
+        """Not in constant position mode."""
+        return self._fused_ns is not None and now_ns - self._fused_ns < self.retry_s * 1e9
+
+    def report(self, now_ns: int) -> Any:
+        """EKF_STATUS_REPORT."""
+        position, yaw = self.ratios
+        return mavlink.MAVLink_ekf_status_report_message(self._flags(now_ns), 0.0, position, position, yaw, 0.0, 0.0)
+
+    def _take(self, message: Any, now_ns: int) -> Fate:
+        odometry = message.get_type() == "ODOMETRY"
+        if odometry and (message.frame_id != LOCAL_FRD or message.child_frame_id != BODY_FRD):
+            return Fate.WRONG_FRAME  # a bare return: not even health
+        sent_us = message.time_usec if odometry else message.usec
+        time_ms = self._jitter.local_us(sent_us, now_ns // US) // 1000
+        xyz, R, velocity, upper = pose_of(message)
+        self._heard_ns = now_ns
+        quality = message.quality if odometry else 0
+        if quality < self.viso_qual_min:
+            return Fate.LOW_QUALITY
+        position_error, angle_error = (0.0, 0.0) if math.isnan(upper[0]) else map(_cube_root, variances_of(upper))
+        if not np.isfinite(xyz).all() or math.isnan(position_error):
+            return Fate.NOT_FINITE
+        if self._last_ms is not None and time_ms - self._last_ms < self.interval_ms:
+            return Fate.TOO_SOON
+        self._last_ms = time_ms
+        reading = Reading(
+            time_ms * MS - self.viso_delay_ms * MS,
+            xyz,
+            yaw_of(R),
+            velocity,
+            min(max(position_error, self.viso_pos_m_nse), 100.0),
+            max(min(max(angle_error, self.viso_yaw_m_nse), 1.5), math.radians(5.0)),
+            message.reset_counter,
+            quality,
+        )
+        return self._fuse(reading, now_ns)
+
+    def _fuse(self, reading: Reading, now_ns: int) -> Fate:
+        was, self._reset_counter = self._reset_counter, reading.reset_counter
+        if self.estimate is None or was != reading.reset_counter or not math.isfinite(reading.yaw_rad):
+            return self._reset_to(reading, now_ns) if math.isfinite(reading.yaw_rad) else Fate.NOT_FINITE
+        self.ratios = self.estimate.ratios(reading, self.gate)
+        if max(self.ratios) > 1:
+            return Fate.GATED if self.fusing(now_ns) else self._reset_to(reading, now_ns)
+        self.estimate.fuse(reading)
+        self._fused_ns = now_ns
+        return Fate.FUSED
+
+
+def _cube_root(variances: list[float]) -> float:
+    """handle_odometry's error of three variances: cbrt(a^2 + b^2 + c^2)."""
+    return math.cbrt(sum(v * v for v in variances))

@@ -1,0 +1,167 @@
+"""What an autopilot does with an external pose: what the rules of ArduPilot and PX4 share.
+
+`ardupilot_rules.py` and `px4_rules.py` have what their sources say: frames, NaNs, gaps, gates, resets, health. Filters
+they are not: position and yaw are a constant-velocity prediction with a variance that grows by `DRIFT_MPS` and
+`DRIFT_RADPS`, enough to tell what passes a gate. Nothing of the airframe, the IMU or the barometer is here.
+
+Source: ours; the messages' fields: https://mavlink.io/en/messages/common.html#ODOMETRY.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega
+
+from links.simulated.world.mesh import Array64
+from stages.geometry import rotation_from_quaternion_xyzw, rotation_from_rpy_deg
+
+mavlink: Any = ardupilotmega
+
+DRIFT_MPS, DRIFT_RADPS = 1.0, 0.02  # one sigma of the prediction, growing with the gap
+LOCAL_NED, LOCAL_FRD, BODY_FRD = 1, 20, 12
+MS, US = 1_000_000, 1_000
+
+
+class Fate(enum.Enum):
+    """What became of a message."""
+
+    FUSED = "fused"
+    RESET = "state reset to it"
+    GATED = "outside the gate"
+    WRONG_FRAME = "frames not supported"
+    WRONG_ESTIMATOR = "estimator type not supported"
+    NOT_FINITE = "not finite"
+    TOO_SOON = "too soon after the one before"
+    LOW_QUALITY = "quality too low"
+    NOT_STARTED = "waits for messages without gaps"
+    NOT_FOR_IT = "not a pose"
+
+
+@dataclass(slots=True)
+class Reading:
+    """An external pose as an autopilot reads it: local axes (north or forward, right, down)."""
+
+    time_ns: int  # on its own clock
+    xyz_m: Array64
+    yaw_rad: float
+    velocity_mps: Array64 | None
+    position_sigma_m: float
+    yaw_sigma_rad: float
+    reset_counter: int
+    quality: int
+
+
+@dataclass(slots=True)
+class Estimate:
+    """Position and yaw, predicted with constant velocity."""
+
+    time_ns: int
+    xyz_m: Array64
+    velocity_mps: Array64
+    yaw_rad: float
+    position_var: float
+    yaw_var: float
+
+    def ratios(self, reading: Reading, gate: float) -> tuple[float, float]:
+        """Innovation over gate, position and yaw; 1 is at the gate. Predicts to the reading first."""
+        dt_s = max((reading.time_ns - self.time_ns) * 1e-9, 0.0)
+        self.time_ns = max(self.time_ns, reading.time_ns)
+        self.xyz_m = self.xyz_m + dt_s * self.velocity_mps
+        self.position_var += (DRIFT_MPS * dt_s) ** 2
+        self.yaw_var += (DRIFT_RADPS * dt_s) ** 2
+        position = float(np.abs(reading.xyz_m - self.xyz_m).max())
+        turned = abs(math.remainder(reading.yaw_rad - self.yaw_rad, math.tau))
+        return (
+            position / (gate * math.sqrt(self.position_var + reading.position_sigma_m**2)),
+            turned / (gate * math.sqrt(self.yaw_var + reading.yaw_sigma_rad**2)),
+        )
+
+    def fuse(self, reading: Reading) -> None:
+        """Kalman's update, the axes apart."""
+        gain = self.position_var / (self.position_var + reading.position_sigma_m**2)
+        yaw_gain = self.yaw_var / (self.yaw_var + reading.yaw_sigma_rad**2)
+        self.xyz_m = self.xyz_m + gain * (reading.xyz_m - self.xyz_m)
+        self.yaw_rad += yaw_gain * math.remainder(reading.yaw_rad - self.yaw_rad, math.tau)
+        self.position_var *= 1 - gain
+        self.yaw_var *= 1 - yaw_gain
+        if reading.velocity_mps is not None:
+            self.velocity_mps = reading.velocity_mps
+
+
+def begun(reading: Reading) -> Estimate:
+    """The estimate that a reset to a reading gives."""
+    velocity = np.zeros(3) if reading.velocity_mps is None else reading.velocity_mps
+    variances = reading.position_sigma_m**2, reading.yaw_sigma_rad**2
+    return Estimate(reading.time_ns, reading.xyz_m, velocity, reading.yaw_rad, *variances)
+
+
+def pose_of(message: Any) -> tuple[Array64, Array64, Array64 | None, Any]:
+    """(position, R_local_body, velocity in local axes or None, 21 covariances) of a message."""
+    xyz = np.array([message.x, message.y, message.z], dtype=np.float64)
+    if message.get_type() == "ODOMETRY":
+        w, x, y, z = message.q
+        length = math.hypot(w, x, y, z)
+        finite = math.isfinite(length) and length > 0
+        R = rotation_from_quaternion_xyzw((x, y, z, w)) if finite else np.full((3, 3), np.nan)
+        velocity = R @ np.array([message.vx, message.vy, message.vz])
+        return xyz, R, velocity if np.isfinite(velocity).all() else None, message.pose_covariance
+    degrees = [math.degrees(a) for a in (message.roll, message.pitch, message.yaw)]
+    R = rotation_from_rpy_deg((degrees[0], degrees[1], degrees[2]))
+    return xyz, R, None, message.covariance
+
+
+def yaw_of(R: Array64) -> float:
+    return math.atan2(R[1, 0], R[0, 0])
+
+
+def variances_of(upper: Any) -> tuple[list[float], list[float]]:
+    """Position's and angles' three variances of MAVLink's 21 numbers."""
+    return [upper[i] for i in (0, 6, 11)], [upper[i] for i in (15, 18, 20)]
+
+
+@dataclass(slots=True)
+class Rules:
+    """What both kinds share: counts of fates, the estimate, and when a pose was taken last."""
+
+    fates: Counter[Fate] = field(default_factory=Counter[Fate])
+    estimate: Estimate | None = None
+    ratios: tuple[float, float] = (0.0, 0.0)  # of the newest reading
+    _heard_ns: int | None = None  # newest message that counts for health
+    _fused_ns: int | None = None
+    _reset_counter: int | None = None
+
+    def hear(self, message: Any, now_ns: int) -> Fate:
+        """What the autopilot does with a message that arrives now (its own clock)."""
+        pose = message.get_type() in ("ODOMETRY", "VISION_POSITION_ESTIMATE")
+        fate = self._take(message, now_ns) if pose else Fate.NOT_FOR_IT
+        self.fates[fate] += 1
+        return fate
+
+    def healthy(self, now_ns: int) -> bool:
+        """Whether it says that external poses arrive."""
+        raise NotImplementedError
+
+    def fusing(self, now_ns: int) -> bool:
+        """Whether its position rests on them."""
+        raise NotImplementedError
+
+    def report(self, now_ns: int) -> Any:
+        """The message in which it says so."""
+        raise NotImplementedError
+
+    def _take(self, message: Any, now_ns: int) -> Fate:
+        raise NotImplementedError
+
+    def _flags(self, now_ns: int) -> int:
+        """EKF_STATUS_FLAGS: attitude; velocities, relative position and height, or constant position."""
+        return 1 | (2 | 4 | 8 | 32 | 256 if self.fusing(now_ns) else 128 | 32)
+
+    def _reset_to(self, reading: Reading, now_ns: int) -> Fate:
+        self.estimate, self._fused_ns = begun(reading), now_ns
+        return Fate.RESET

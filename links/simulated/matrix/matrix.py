@@ -1,0 +1,161 @@
+"""The scenario matrix: range x motion x vehicle x scene, an occlusion and a flight out of sight and back, by seed.
+
+Beside it stand the cells of single goals: an empty sky, an occlusion nearer by, two drones, a drone to be searched for,
+drones at 50 m.
+
+A cell says what happens (`links/simulated/matrix/flights.py`), a seed where: it draws the scene and the side.
+
+Source: ours, after the cases of issue "A simulated rig".
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from itertools import chain, product
+
+import numpy as np
+
+from links.simulated.autopilot.autopilot import AutopilotSettings
+from links.simulated.matrix.flights import CAMERA_HEIGHT_M, Cell, drone_path, two_paths, vehicle_path
+from links.simulated.rig.perturbed_rig import AsBuilt, as_built
+from links.simulated.rig.scenario import DroneSettings, RigLidar, Scenario
+from links.simulated.rig.scripted_servo import Sweep, Vibrate
+from links.simulated.sensors.camera import CameraSettings, CamerasSettings
+from links.simulated.sensors.lidar import LidarSettings
+from links.simulated.sensors.servo import ServoSettings, Turned
+from links.simulated.sensors.vehicle_odometry import VehicleOdometrySettings
+from links.simulated.world.clearance import sample_times_s
+from links.simulated.world.drone import DroneModel
+from links.simulated.world.procedural import SceneSettings
+from links.simulated.world.procedural.settings import Kind
+from links.simulated.world.weather import Weather
+from stages.calibration.calibrate import ZERO_SIGMA_DEG
+
+RANGES_M = (10, 20, 30, 45, 60)
+MOTIONS = ("hover", "orbit", "cross", "fast", "overhead", "climb")
+VEHICLES = ("parked", "driving", "turning")
+SCENES: tuple[Kind, ...] = ("manhattan", "atlanta", "campus", "park_edge", "open_lot")
+OPEN: Kind = "open_lot"  # nothing to hide behind
+SPECIALS = {"occlusion": 35, "return": 20}  # at which range
+GOALS = (  # range, motion, vehicles; in every scene that has a place for it
+    (0, "empty", VEHICLES),
+    (20, "occlusion", ("parked",)),
+    (20, "two", ("parked",)),
+    (40, "search", ("parked",)),
+    (50, "hover", ("parked",)),
+    (50, "orbit", ("parked",)),
+)
+SEARCHING = ("empty", "two", "search")  # without a closed loop the servo sweeps all along
+LIDAR_UP_M = 0.35  # over the camera, as in the standard rig
+DRONE = DroneModel(surface="grey_shell")  # the LiDAR sees half of it at 45 m, nothing at 70 m
+SERVO = ServoSettings(command_latency_s=0.002, command_jitter_s=5e-4, encoder_error_deg=0.3, backlash_deg=0.33)
+SWEEPS = (Sweep(times=100),)
+SWEEP_THEN_FOLLOW = (Sweep(), Vibrate(duration_s=60.0, follow_drone=True))
+RAIN = Weather(rain_mmph=5.0)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What holds in all cells of one run over the matrix."""
+
+    calibrated: bool = (
+        False  # the rig knows the servo encoder's own error and the gear's play, as `grd calibrate` finds
+    )
+    odometry: bool = False  # the vehicle tells where it drives
+    rain: bool = False  # 5 mm/h
+    autopilot: bool = False  # the drone tells how it flies, over a radio
+    cameras_hz: float | None = None  # two fisheyes; None: none
+    cameras_px: int = 720  # their size, square
+    readout_ms: float = 0.0  # their rolling shutter, first to last row; 0: all rows at once
+    as_built: bool = False  # the rig is not quite as its file says, each flight is of its own kind of drone
+
+
+def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
+    """All cells whose name matches one of the patterns (`campus-*-parked`).
+
+    With `pairs` a small part in which each two values of range, motion, vehicle and scene still meet at least once; the
+    goals' cells are not in it.
+    """
+    found: list[Cell] = []
+    for (r, range_m), (m, motion), (v, vehicle), (s, scene) in product(
+        enumerate(RANGES_M), enumerate(MOTIONS), enumerate(VEHICLES), enumerate(SCENES)
+    ):
+        if not pairs or (v == (r + m) % len(VEHICLES) and s == (r + 3 * m) % len(SCENES)):
+            found.append(Cell(scene, range_m, motion, vehicle))
+    found += [Cell(scene, SPECIALS["return"], "return", "parked") for scene in SCENES]
+    found.extend(_in_every_scene(SPECIALS["occlusion"], "occlusion", ("parked",)))
+    if not pairs:
+        found.extend(chain.from_iterable(_in_every_scene(*goal) for goal in GOALS))
+    return [cell for cell in found if any(fnmatch(cell.name, pattern) for pattern in only)]
+
+
+def _in_every_scene(range_m: int, motion: str, vehicles: Sequence[str]) -> Iterator[Cell]:
+    """One is hidden where there is something to hide behind."""
+    for scene, vehicle in product(SCENES, vehicles):
+        if not (motion == "occlusion" and scene == OPEN):
+            yield Cell(scene, range_m, motion, vehicle)
+
+
+def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> Scenario:
+    """The scenario of a cell. LinkError when the seed's scene has no place for it (no building to hide behind)."""
+    conditions = conditions or Conditions()
+    rng = np.random.default_rng([seed, 42])
+    times = sample_times_s(cell.duration_s)
+    vehicle, world = vehicle_path(cell, seed, rng, times)
+    lidar_m = vehicle.at(times)[0] + [0.0, 0.0, LIDAR_UP_M]
+    if cell.motion == "empty":
+        flown = ()
+    elif cell.motion == "two":
+        flown = two_paths(cell, world, rng, times, lidar_m)
+    else:
+        flown = (drone_path(cell, world, rng, times, lidar_m),)
+    built = as_built(cell.name, seed) if conditions.as_built else None
+    look = {"model": DRONE} if built is None else {"model": built.model, "span_m": built.span_m}
+    drones = tuple(DroneSettings.model_validate({"path": path} | look) for path in flown)
+    what = f"{cell.motion} at {cell.range_m} m" if drones else "no drone"
+    straight = RigLidar()
+    found = {
+        "servo_harmonics": Turned(SERVO, seed).harmonics(),
+        "servo_play_deg": SERVO.backlash_deg,
+        "pointing_sigma_deg": ZERO_SIGMA_DEG,  # as `grd calibrate` writes it
+    }
+    known = straight.mount.model_copy(update=found)
+    true_mount = straight.mount if conditions.calibrated else None
+    if built is not None:
+        true_mount = built.mount(straight.mount)
+    return Scenario(
+        name=cell.name,
+        description=f"{what}, vehicle {cell.vehicle}, {cell.scene}",
+        seed=seed,
+        start_utc=datetime.datetime(2025, 6, 1, 10, 20, 30, tzinfo=datetime.UTC),
+        duration_s=cell.duration_s,
+        scene=SceneSettings(kind=cell.scene),
+        vehicle={"camera_height_m": CAMERA_HEIGHT_M, "path": vehicle},  # pyright: ignore[reportArgumentType]
+        drone=drones[0] if drones else None,
+        other_drones=drones[1:],
+        servo=SERVO,
+        script=SWEEPS if cell.motion in SEARCHING else SWEEP_THEN_FOLLOW,
+        truth_visible=bool(drones),
+        autopilot=AutopilotSettings() if conditions.autopilot and drones else None,
+        lidar=LidarSettings() if built is None else LidarSettings(range_offset_m=built.range_offset_m),
+        cameras=_cameras(conditions, bool(drones), built),
+        weather=RAIN if conditions.rain else Weather(),
+        vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,
+        rig=RigLidar(mount=known) if conditions.calibrated else straight,
+        true_mount=true_mount,
+    )
+
+
+def _cameras(conditions: Conditions, drone: bool, built: AsBuilt | None) -> CamerasSettings:
+    """The vehicle's and, where there is a drone to carry it, the drone's."""
+    if conditions.cameras_hz is None:
+        return CamerasSettings()
+    one = CameraSettings(rate_hz=conditions.cameras_hz, size_px=conditions.cameras_px, readout_ms=conditions.readout_ms)
+    vehicle = drones = one
+    if built is not None:
+        vehicle = one.model_copy(update={"error": built.camera_vehicle})
+        drones = one.model_copy(update={"error": built.camera_drone})
+    return CamerasSettings(vehicle=vehicle, drone=drones if drone else None)

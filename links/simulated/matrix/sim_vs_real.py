@@ -1,0 +1,306 @@
+"""The simulated VLP-16 beside the real captures, and our drones beside a real one: where does the simulation differ?
+
+    python -m links.simulated.matrix.sim_vs_real            prints the table of recordings/README.md
+
+Every number of a cloud comes from decoded packets by the same function, real or simulated. The real captures were made
+in rooms, so the simulated one stands in a room, too. The real drone (UG2+/MMAUD) was seen by a Livox Mid-360, another
+scanner: hits are compared as an effective area, hits / (pulses per steradian) * range^2, which no longer holds the
+scanner's density. Its 20 000 pulses a frame are taken as spread evenly over its view.
+
+Source: ours; Livox Mid-360 user manual v1.2 (200 000 points/s, 360 deg x -7..52 deg).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.link import Record
+from links.recording import RecordingReader
+from links.simulated.sensors.footprint import FINE, sub_rays
+from links.simulated.sensors.lidar import Lidar, LidarSettings, echoes
+from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
+from links.simulated.world.drone import DroneModel, drone_mesh
+from links.simulated.world.mesh import Array32, Array64, Mesh, RayScene
+from links.simulated.world.procedural.room import room_mesh
+from links.velodyne import Lidar as Decoder
+from links.velodyne import vlp16
+from stages.messages import LidarFirings
+
+START_NS = 1_748_773_230_000_000_000
+WINDOW = 15  # firings of one laser, 3 deg: short enough for a wall to be a parabola in range
+FLAT_M = 0.03  # a window with a larger residual is no flat patch
+UPPER_LASERS = np.arange(1, vlp16.LASERS, 2)  # at and above +1 deg: free of table and vehicle
+MID360_PULSES = 20_000  # a frame of 0.1 s
+MID360_VIEW_SR = 2 * np.pi * (np.sin(np.radians(52)) - np.sin(np.radians(-7)))
+NEAR_DRONE_M = 0.6
+DRONES = ((0.35, "folding"), (0.5, "x4"), (0.8, "hexa"))
+
+
+@dataclass(frozen=True)
+class CloudFigures:
+    """What is measured on a capture."""
+
+    pulses_per_turn: float
+    returns_per_turn: float
+    upper_returned: float  # share of the pulses at and above +1 deg that came back
+    spacing_mrad: float  # between neighbours on one surface, seen from the sensor
+    lost_alone: float  # share of pulses without return between two returns of one surface
+    between: float  # share of returns hanging in the air between their two neighbours
+    noise_m: float  # median residual on flat patches
+    noise_90_m: float
+    patches: int
+    laser_bias_m: float  # spread of the lasers' mean residuals on planes
+    reflectivity: tuple[float, float, float]  # 5, 50, 95 %
+
+
+def measure(firings: Iterable[LidarFirings]) -> CloudFigures:
+    """Figures of a capture in strongest mode."""
+    packets = list(firings)
+    ranges, azimuth = (
+        np.concatenate([getattr(p, name) for p in packets]).astype(np.float64).reshape(-1, vlp16.LASERS)
+        for name in ("range_m", "azimuth_rad")
+    )
+    shade = np.concatenate([p.reflectivity for p in packets]).reshape(-1, vlp16.LASERS)
+    points = np.concatenate([p.xyz_lidar_m for p in packets]).reshape(-1, vlp16.LASERS, 3).astype(np.float64)
+    turns = float(np.ptp(np.unwrap(azimuth[:, 0]))) / (2 * np.pi)
+    seen = ranges > 0
+    before, here, after = ranges[:-2], ranges[1:-1], ranges[2:]
+    one_surface = (before > 0) & (after > 0) & (np.abs(after - before) < 0.05)
+    low, high = np.minimum(before, after), np.maximum(before, after)
+    hanging = (before > 0) & (after > 0) & (here > low + 0.1) & (here < high - 0.1)
+    step = np.linalg.norm(points[1:] - points[:-1], axis=2)
+    level = (ranges[1:] > 0) & (ranges[:-1] > 0) & (np.abs(ranges[1:] - ranges[:-1]) < 0.004)
+    residual = _patch_residuals(ranges)
+    return CloudFigures(
+        pulses_per_turn=ranges.size / turns,
+        returns_per_turn=float(seen.sum()) / turns,
+        upper_returned=float(seen[:, UPPER_LASERS].mean()),
+        spacing_mrad=1e3 * float(np.median(step[level] / ranges[1:][level])),
+        lost_alone=float((here[one_surface] == 0).mean()),
+        between=float(hanging.sum() / seen.sum()),
+        noise_m=float(np.median(residual)),
+        noise_90_m=float(np.quantile(residual, 0.9)),
+        patches=len(residual),
+        laser_bias_m=_laser_bias_m(points, seen),
+        reflectivity=tuple(np.quantile(shade[seen], [0.05, 0.5, 0.95]).tolist()),
+    )
+
+
+def _patch_residuals(ranges: Array64) -> Array64:
+    """Residual (p,) of a parabola through each full, flat window of one laser; degrees of freedom counted."""
+    t = np.linspace(-1, 1, WINDOW)
+    basis = np.linalg.qr(np.column_stack([np.ones(WINDOW), t, t**2]))[0]
+    whole = ranges[: len(ranges) // WINDOW * WINDOW].reshape(-1, WINDOW, vlp16.LASERS).transpose(0, 2, 1)
+    windows = whole.reshape(-1, WINDOW)
+    windows = windows[(windows > 0).all(axis=1) & (np.ptp(windows, axis=1) < 0.3)]
+    left = windows - windows @ basis @ basis.T
+    residual = np.sqrt((left**2).sum(axis=1) / (WINDOW - 3))
+    return residual[residual < FLAT_M]
+
+
+def _laser_bias_m(points: Array64, seen: NDArray[np.bool_]) -> float:
+    """Spread over the lasers of their mean distance from planes through patches of 2 windows and all lasers."""
+    offsets: list[list[float]] = [[] for _ in range(vlp16.LASERS)]
+    size = 2 * WINDOW
+    for first in range(0, len(points) - size, size):
+        patch, there = points[first : first + size], seen[first : first + size]
+        if there.all(axis=0).sum() < 6:
+            continue
+        lasers = np.nonzero(there.all(axis=0))[0]
+        cloud = patch[:, lasers]
+        centre = cloud.reshape(-1, 3).mean(axis=0)
+        normal = np.linalg.svd(cloud.reshape(-1, 3) - centre, full_matrices=False)[2][2]
+        away = (cloud - centre) @ normal
+        if away.std() < FLAT_M and np.abs(centre @ normal) > 0.8 * np.linalg.norm(centre):
+            for laser, mean in zip(lasers, away.mean(axis=0) / np.abs(normal @ centre) * np.linalg.norm(centre),
+                                   strict=True):  # fmt: skip
+                offsets[laser].append(float(mean))
+    means = [float(np.median(o)) for o in offsets if len(o) >= 5]
+    return float(np.std(means)) if len(means) >= 4 else float("nan")
+
+
+def recorded(path: Path) -> Iterator[LidarFirings]:
+    """The decoded packets of a recording."""
+    decoder = Decoder.model_validate({})
+    with RecordingReader(path) as reader:
+        for record in reader.records():
+            if record.topic == "/lidar/packets" and (firings := decoder.decode(record)) is not None:
+                yield firings
+
+
+class Still:
+    """A scene in which nothing moves."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._scene = RayScene(mesh)
+
+    def cast(
+        self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32, max_range_m: float
+    ) -> tuple[Array32, Array32, NDArray[np.uint8]]:
+        """See `lidar.Surroundings`."""
+        rays = directions_world.shape[:2]
+        found = self._scene.cast(origins_world_m.reshape(-1, 3), directions_world.reshape(-1, 3), max_range_m)
+        return found[0].reshape(rays), found[1].reshape(rays), np.zeros(rays, dtype=np.uint8)
+
+    def near_small_body(
+        self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32
+    ) -> NDArray[np.bool_]:
+        """See `lidar.Surroundings`."""
+        return np.zeros(len(pulse_ns), dtype=np.bool_)
+
+
+def simulated_room(turns: float, seed: int = 1) -> Iterator[LidarFirings]:
+    """An upright LiDAR 1 m over the floor of the room, through packets and decoder as the real one."""
+    lidar, around, decoder = (
+        Lidar(LidarSettings(), START_NS, seed),
+        Still(room_mesh(1.0, seed)),
+        Decoder.model_validate({}),
+    )
+    firings = firings_per_packet("strongest")
+    for packet in range(int(turns * 1e8 / (firings * vlp16.SEQUENCE_NS))):
+        first_ns = START_NS + packet * firings * vlp16.SEQUENCE_NS
+        sequence_ns = first_ns + vlp16.SEQUENCE_NS * np.arange(firings, dtype=np.int64)
+        pulse_ns = (sequence_ns[:, None] + vlp16.PULSE_NS * np.arange(vlp16.LASERS)).ravel()
+        level = np.broadcast_to(np.eye(3), (len(pulse_ns), 3, 3)).copy()
+        pulses = lidar.fire(pulse_ns, level, np.zeros((len(pulse_ns), 3)), around)
+        shape = (1, firings, vlp16.LASERS)
+        azimuth = lidar.azimuth_rad(sequence_ns[::FIRINGS_PER_BLOCK])
+        data = encode_packet(
+            first_ns, azimuth, pulses.range_m.reshape(shape), pulses.reflectivity.reshape(shape), "strongest"
+        )
+        record = Record("/lidar/packets", arrival_ns=first_ns + 2_000_000, stamp_ns=first_ns, data=data)
+        decoded = decoder.decode(record)
+        if decoded is not None:
+            yield decoded
+
+
+def drone_area_m2(mesh: Mesh, from_m: Array64, step_rad: float = 4e-3) -> float:
+    """Effective area: solid angle of the pulses that a VLP-16 gets back from the drone, times range^2.
+
+    Pulses on a square grid of directions about the drone at the origin, from a place (3,).
+    """
+    away_m = float(np.linalg.norm(from_m))
+    forward = -from_m / away_m
+    side = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.95 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    up = np.cross(side, forward)
+    half = np.arctan2(1.2 * np.linalg.norm(mesh.vertices_m, axis=1).max(), away_m)
+    u, v = (g.ravel() for g in np.meshgrid(*2 * [np.arange(-half, half, step_rad)]))
+    axis = forward + np.tan(u)[:, None] * side + np.tan(v)[:, None] * up
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    across = np.cross(axis, up)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    aim = np.stack([across, axis, np.cross(across, axis)], axis=2)  # the laser's own axis is +y, but for its 1 deg
+    origin = np.tile(from_m, (len(axis), 1))
+    elevated = np.radians(1.0)
+    tilt = np.array([[1, 0, 0], [0, np.cos(elevated), np.sin(elevated)], [0, -np.sin(elevated), np.cos(elevated)]])
+    laser = np.full(len(axis), 1)
+    origins, directions = sub_rays(np.zeros(len(axis)), laser, aim @ tilt, origin, FINE.offsets)
+    shape = directions.shape[:2]
+    ranges, fractions = RayScene(mesh).cast(origins.reshape(-1, 3), directions.reshape(-1, 3), 200.0)
+    settings = LidarSettings()
+    threshold = np.full(len(axis), 0.10 / settings.range_at_10_percent_m**2)
+    seen = (ranges.reshape(shape), fractions.reshape(shape), np.zeros(shape, dtype=np.uint8))
+    found = echoes(*seen, FINE.shares, threshold, settings.min_range_m, "strongest")[0][0] > 0
+    return float(found.sum()) * step_rad**2 * away_m**2
+
+
+@dataclass(frozen=True)
+class DroneFigures:
+    """A real drone as the Mid-360 saw it."""
+
+    frames: int
+    range_m: tuple[float, float]
+    hits: float  # median a frame
+    area_m2: tuple[float, float, float]  # 10, 50, 90 % over frames
+    extent_m: float  # median over frames of the cloud's widest direction, 5 to 95 %
+    places_m: Array64  # (frames, 3) drone minus sensor
+
+
+def real_drone(folder: Path) -> DroneFigures:
+    """Hit counts of the real drone about its (unofficial) track."""
+    track = np.genfromtxt(folder / "track_by_ug2_winner_NOT_official_gt.csv", delimiter=",", skip_header=1)
+    clouds = np.load(folder / "ug2_val_seq1_lidar_360.npz")
+    hits, extents, places = [], [], []
+    for key in clouds:
+        if track[0, 0] <= float(key) <= track[-1, 0]:
+            place = np.array([np.interp(float(key), track[:, 0], track[:, i]) for i in (1, 2, 3)])
+            cloud = clouds[key][np.linalg.norm(clouds[key] - place, axis=1) < NEAR_DRONE_M]
+            places.append(place)
+            hits.append(len(cloud))
+            widest = np.linalg.svd(cloud - cloud.mean(axis=0), full_matrices=False)[2][0]
+            extents.append(float(np.ptp(np.quantile(cloud @ widest, [0.05, 0.95]))))
+    away = np.linalg.norm(places, axis=1)
+    area = np.array(hits) * MID360_VIEW_SR / MID360_PULSES * away**2
+    low, middle, high = np.quantile(area, [0.1, 0.5, 0.9]).tolist()
+    return DroneFigures(
+        frames=len(hits),
+        range_m=(float(away.min()), float(away.max())),
+        hits=float(np.median(hits)),
+        area_m2=(low, middle, high),
+        extent_m=float(np.median(extents)),
+        places_m=np.array(places),
+    )
+
+
+def cloud_table(captures: dict[str, CloudFigures]) -> str:
+    """The captures side by side, in Markdown."""
+    rows = {
+        "pulses per revolution": [f"{c.pulses_per_turn:.0f}" for c in captures.values()],
+        "returns per revolution": [f"{c.returns_per_turn:.0f}" for c in captures.values()],
+        "returned, lasers at +1 deg and above": [f"{100 * c.upper_returned:.1f} %" for c in captures.values()],
+        "spacing of neighbours on a surface [mrad]": [f"{c.spacing_mrad:.2f}" for c in captures.values()],
+        "lost alone within a surface": [f"{100 * c.lost_alone:.2f} %" for c in captures.values()],
+        "hanging between two surfaces": [f"{100 * c.between:.2f} %" for c in captures.values()],
+        "range noise on flat patches, median [mm]": [f"{1e3 * c.noise_m:.1f}" for c in captures.values()],
+        "the same, 90 % [mm]": [f"{1e3 * c.noise_90_m:.1f}" for c in captures.values()],
+        "flat patches": [str(c.patches) for c in captures.values()],
+        "bias between lasers, 1 sigma [mm]": [f"{1e3 * c.laser_bias_m:.1f}" for c in captures.values()],
+        "reflectivity 5, 50, 95 %": ["{:.0f}, {:.0f}, {:.0f}".format(*c.reflectivity) for c in captures.values()],
+    }
+    head = ["", *captures]
+    lines = [head, ["---"] * len(head), *([name, *cells] for name, cells in rows.items())]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def drone_table(real: DroneFigures) -> str:
+    """Effective areas of the real drone and of ours from the same directions, in Markdown."""
+    lines = [
+        "| drone | effective area 10, 50, 90 % [cm^2] |",
+        "| --- | --- |",
+        f"| real, {real.frames} frames at {real.range_m[0]:.1f} to {real.range_m[1]:.1f} m, "
+        f"{real.hits:.0f} hits a frame, {real.extent_m:.2f} m wide | {_cm2(real.area_m2)} |",
+    ]
+    for span_m, shape in DRONES:
+        mesh = drone_mesh(span_m, 0.4, DroneModel.model_validate({"shape": shape}))
+        areas = [drone_area_m2(mesh, -place, 8e-3) for place in real.places_m[::4]]
+        low, middle, high = np.quantile(areas, [0.1, 0.5, 0.9]).tolist()
+        lines.append(f"| simulated, {span_m} m {shape} | {_cm2((low, middle, high))} |")
+    return "\n".join(lines)
+
+
+def _cm2(area_m2: tuple[float, float, float]) -> str:
+    return ", ".join(f"{1e4 * a:.0f}" for a in area_m2)
+
+
+def reality_table(recordings: Path, shared: Path) -> str:
+    """Both tables; without the shared drone clouds (`drone_lidar`) the second says so."""
+    captures = {
+        "einride (real)": measure(recorded(recordings / "einride_vlp16.mcap")),
+        "mrpt (real)": measure(recorded(recordings / "mrpt_vlp16_gps.mcap")),
+        "room (simulated)": measure(simulated_room(13.0)),
+    }
+    folder = shared / "drone_lidar"
+    drones = drone_table(real_drone(folder)) if folder.exists() else f"The real drone clouds are not here ({folder})."
+    return cloud_table(captures) + "\n\n" + drones + "\n"
+
+
+if __name__ == "__main__":
+    root = Path(__file__).resolve().parents[3]
+    sys.stdout.write(reality_table(root / "recordings", root.parent / "shared" / "data"))

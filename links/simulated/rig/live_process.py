@@ -1,0 +1,275 @@
+"""The process of the simulated rig in real time: `python -m links.simulated.rig.live_process SETTINGS`, see `live_rig`.
+
+Pulses can be cast once the servo has stood where it stood, so packets leave some milliseconds after their last pulse:
+the time of a batch and of its casting. Their own clock is right (a VLP-16 locked to the host's time: `clock: utc`).
+Nothing waits for the graph. When the machine is too busy packets come later, or not at all: `rig.json` tells.
+
+Source: ours; the parts are those of `links.simulated.rig.run`, the servo is
+`links.simulated.sensors.dynamixel_emulator`.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import resource
+import socket
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.link import TRUTH_TOPICS, LinkError, Record
+from flow.metrics import Latency
+from flow.problem import ConfigError
+from links import host_time
+from links.mavlink.profiles import ARDUPILOT
+from links.mavlink.stream import ARMED
+from links.recording import RecordingWriter
+from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
+from links.simulated.autopilot.autopilot import Autopilot
+from links.simulated.autopilot.autopilot_socket import AutopilotSocket
+from links.simulated.rig.image_cache import KeptCamera, KeptPictures
+from links.simulated.rig.live_images import PicturesInTime
+from links.simulated.rig.live_rig import READY, RIG_REPORT, LiveRig
+from links.simulated.rig.run import Simulation
+from links.simulated.rig.scenario import Scenario, load_scenario
+from links.simulated.sensors.camera import CamerasSettings
+from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
+from links.simulated.sensors.vehicle_odometry import VehicleOdometry
+from links.simulated.sensors.vlp16_packets import firings_per_packet
+from links.simulated.sensors.vlp16_position import encode_position
+from links.simulated.world.mesh import Array64
+from links.truth import TRUTH_RECORDING
+from links.velodyne import vlp16
+
+WARM_PACKETS = 75  # a turn of the rotor
+SKIP_NS = 200_000_000  # so far behind, it leaves out what it cannot send in time: packets are lost
+LOOPBACK = "127.0.0.1"
+POSITION_NS = 100_000_000  # between two of the LiDAR's position packets
+TRUTH_NS = 100_000_000  # where all was is told so often: nobody waits for it, and told one by one it costs more
+SWITCH_S = 5e-4  # the servo's thread must not wait long for the one that casts
+
+
+class LiveSimulation(Simulation):
+    """A scenario that begins when it is told to, with an emulated servo. Its own times are the scenario's."""
+
+    def __init__(self, scenario: Scenario, pictures: KeptPictures | None = None) -> None:
+        super().__init__(scenario, pictures=pictures)
+        self.packet_ns = firings_per_packet(scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
+        self.ahead_ns = 0
+        self.emulator: DynamixelEmulator | None = None
+        self._servo.advance(scenario.start_ns + WARM_PACKETS * self.packet_ns)
+        self.lidar_records(scenario.start_ns, WARM_PACKETS, self.packet_ns)  # compiles what it uses first
+
+    def begin(self, servo: Path) -> DynamixelEmulator:
+        """The scenario's first moment is now. The servo, not yet on its pty."""
+        self.ahead_ns = self.lidar_clock_ns = host_time.now_ns() - self.scenario.start_ns
+        self.emulator = DynamixelEmulator(self.scenario.servo, self.seed, servo, self.now_ns)
+        return self.emulator
+
+    @property
+    def kept_cameras(self) -> list[KeptCamera]:
+        """Cameras with their pictures from a recording; no other can keep up."""
+        return [camera for camera in self._cameras if isinstance(camera, KeptCamera)]
+
+    def now_ns(self) -> int:
+        """The scenario's time."""
+        return host_time.now_ns() - self.ahead_ns
+
+    def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
+        """See Simulation."""
+        if self.emulator is None:
+            return super().T_world_lidar(stamp_ns)
+        return self.T_world_lidar_at(stamp_ns, self.emulator.turned_rad(stamp_ns))
+
+    def batch(self, first_ns: int, packets: int) -> tuple[list[Record], list[Record]]:
+        """LiDAR packets from a moment on that is past; and what was true of them, in the host's time."""
+        records = self.lidar_records(first_ns, packets, self.packet_ns)
+        true = [self._on_host(record) for record in records if record.topic.startswith(TRUTH_TOPICS)]
+        return [record for record in records if not record.topic.startswith(TRUTH_TOPICS)], true
+
+    def was_true(self, until_ns: int) -> list[Record]:
+        """What was true before a time and since the call before, in the host's time."""
+        return [self._on_host(record) for record in self.truth_records(until_ns)]
+
+    def _on_host(self, record: Record) -> Record:
+        data = record.data
+        if record.topic.startswith("/truth/hits"):
+            pulse_ns = [stamp + self.ahead_ns for stamp in json.loads(data)["pulse_stamp_ns"]]
+            data = json.dumps({"pulse_stamp_ns": pulse_ns}).encode()
+        return Record(record.topic, record.arrival_ns + self.ahead_ns, record.stamp_ns + self.ahead_ns, data)
+
+
+class LiveAutopilot(AutopilotSocket):
+    """Set up as it must be; can say that it is disarmed, though its drone hangs in the air."""
+
+    armed = True
+
+    def _send(self, message: Any) -> None:
+        if not self.armed and message.get_type() == "HEARTBEAT":
+            message.base_mode &= ~ARMED
+        super()._send(message)
+
+
+class RigInTime:
+    """Sends until it is told to stop, or the scenario is over."""
+
+    def __init__(self, rig: LiveRig, folder: Path) -> None:
+        scenario = load_scenario(rig.scenario)
+        asked = {"seed": rig.seed, "duration_s": rig.duration_s}
+        scenario = scenario.changed(**{name: value for name, value in asked.items() if value is not None})
+        self._rig, self._folder = rig, folder
+        if rig.pictures is None:  # nobody sees what its cameras would
+            self._scenario = scenario.changed(cameras=CamerasSettings())
+            self.simulation = LiveSimulation(self._scenario)
+        else:
+            self._scenario = scenario
+            self.simulation = LiveSimulation(scenario, KeptPictures(rig.pictures, scenario))
+        self.late = Latency()  # a packet's sending after its last pulse
+        self.stop = threading.Event()
+        self.packets = self.skipped = self.heard = self.pictures = 0
+
+    def run(self, ready: threading.Event) -> None:
+        """The whole flight, in real time."""
+        rig, scenario, simulation = self._rig, self._scenario, self.simulation
+        with ExitStack() as open_parts:
+            rig.servo.parent.mkdir(parents=True, exist_ok=True)
+            open_parts.enter_context(simulation.begin(rig.servo))
+            truth = RecordingWriter(self._folder / TRUTH_RECORDING, rig_yaml=scenario.rig_yaml())
+            open_parts.enter_context(truth)
+            udp = open_parts.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            autopilot = self._autopilot(simulation)
+            if autopilot is not None:
+                open_parts.enter_context(autopilot)
+            pictures = open_parts.enter_context(self._cameras(simulation))
+            ready.set()
+            sent_ns = self._send(simulation, udp, truth)
+            for record in simulation.was_true(sent_ns):
+                truth.write(record)
+            self.pictures = pictures.shown
+            if autopilot is not None:
+                self.heard = len(autopilot.heard)
+        self._report()
+
+    def _cameras(self, simulation: LiveSimulation) -> PicturesInTime:
+        seen = () if self._rig.pictures is None else self._rig.camera_ports.items()
+        ports = {f"/camera/{carrier}": port for carrier, port in seen}
+        end_ns = self._scenario.start_ns + round(1e9 * self._scenario.duration_s)
+        return PicturesInTime(simulation.kept_cameras, ports, simulation.now_ns, end_ns)
+
+    def _autopilot(self, simulation: LiveSimulation) -> AutopilotSocket | None:
+        flight = next((talker for talker in simulation.talkers if isinstance(talker, Autopilot)), None)
+        if flight is None or self._rig.autopilot_port is None:
+            return None
+        send_to = LOOPBACK, self._rig.autopilot_port
+        autopilot = LiveAutopilot(
+            ArduPilotRules(),
+            send_to=send_to,
+            flight=flight,
+            scenario_ns=simulation.now_ns,
+            parameters={w.name: w.values[0] if w.values else w.at_least for w in ARDUPILOT.wanted},
+        )
+        autopilot.armed = self._rig.armed
+        return autopilot
+
+    def _send(self, simulation: LiveSimulation, udp: socket.socket, truth: RecordingWriter) -> int:
+        """Packet after packet, to the end; up to when they were sent."""
+        rig, scenario = self._rig, self._scenario
+        odometry = next((talker for talker in simulation.talkers if isinstance(talker, VehicleOdometry)), None)
+        batch_ns = rig.batch_packets * simulation.packet_ns
+        first_ns, end_ns = scenario.start_ns, scenario.start_ns + round(1e9 * scenario.duration_s)
+        poses: list[tuple[int, int, bytes]] = []  # when it is to arrive, when it was true
+        position_ns = 0  # when the next position packet is due
+        true_ns = first_ns  # when all that was true is told next
+        while first_ns + batch_ns <= end_ns:
+            behind_ns = simulation.now_ns() - first_ns
+            if behind_ns > SKIP_NS:
+                skipped = behind_ns // simulation.packet_ns - rig.batch_packets
+                self.skipped += skipped
+                first_ns += skipped * simulation.packet_ns
+            next_ns = first_ns + batch_ns
+            if self.stop.wait(max(0, next_ns - simulation.now_ns()) * 1e-9):
+                return first_ns
+            if rig.position_port is not None and next_ns >= position_ns:
+                udp.sendto(encode_position(host_time.now_ns()), (LOOPBACK, rig.position_port))
+                position_ns = next_ns + POSITION_NS
+            packets, true = simulation.batch(first_ns, rig.batch_packets)
+            for packet in packets:
+                udp.sendto(packet.data, (LOOPBACK, rig.lidar_port))
+                self.late.add(max(simulation.now_ns() - packet.stamp_ns - simulation.packet_ns, 1))
+            self.packets += len(packets)
+            if next_ns >= true_ns:
+                true += simulation.was_true(next_ns)
+                true_ns = next_ns + TRUTH_NS
+            for record in true:
+                truth.write(record)
+            for pose in odometry.records(next_ns) if odometry is not None else ():
+                heapq.heappush(poses, (pose.arrival_ns, pose.stamp_ns, pose.data))
+            while poses and poses[0][0] <= simulation.now_ns():
+                _, stamp_ns, pose_json = heapq.heappop(poses)
+                if rig.odometry_port is not None:
+                    udp.sendto(_with_age(pose_json, simulation.now_ns() - stamp_ns), (LOOPBACK, rig.odometry_port))
+            first_ns = next_ns
+        return first_ns
+
+    def _report(self) -> None:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        late = self.late
+        report = {
+            "packets": self.packets,
+            "packets_skipped": self.skipped,
+            "sent_after_last_pulse_ms": {
+                "p50": round(late.percentile_ns(50) / 1e6, 3),
+                "p99": round(late.percentile_ns(99) / 1e6, 3),
+                "max": round(late.max_ns / 1e6, 3),
+            },
+            "mavlink_heard": self.heard,
+            "pictures": self.pictures,
+            "cpu_s": round(used.ru_utime + used.ru_stime, 2),
+            "max_rss_mb": round(used.ru_maxrss / 1024, 1),
+        }
+        (self._folder / RIG_REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+
+
+def _with_age(pose_json: bytes, age_ns: int) -> bytes:
+    return json.dumps({**json.loads(pose_json), "age_s": age_ns * 1e-9}).encode()
+
+
+def main(settings: str) -> int:
+    """Run the rig until standard input ends. Says READY when it sends."""
+    given = json.loads(settings)
+    folder = Path(given.pop("folder"))
+    sys.setswitchinterval(SWITCH_S)
+    try:
+        rig = RigInTime(LiveRig.model_validate(given), folder)
+        ready = threading.Event()
+        sending = threading.Thread(target=rig.run, args=(ready,), daemon=True)
+        sending.start()
+        while sending.is_alive() and not ready.wait(0.05):
+            pass
+        if not ready.is_set():
+            return 1
+        sys.stdout.write(f"{READY}\n")
+        sys.stdout.flush()
+        threading.Thread(target=_until_input_ends, args=(rig.stop,), daemon=True).start()
+        sending.join()
+    except (ConfigError, LinkError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+def _until_input_ends(stop: threading.Event) -> None:
+    while sys.stdin.read(1):
+        time.sleep(0.1)
+    stop.set()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

@@ -1,0 +1,78 @@
+"""How a rig differs from what its file says, and which drone flies: as somebody builds and measures it, by flight.
+
+| what | one sigma | why |
+| --- | --- | --- |
+| the servo's zero against the vehicle's axes | 0.1 deg | `grd calibrate` cannot tell it: 2 mm in a metre |
+| the turntable's tilt, each axis | 0.05 deg | the same against the vehicle camera's level |
+| the LiDAR's range, all lasers alike | 0.017 m | VLP-16 data sheet 63-9229: +-3 cm, taken as even within that |
+| a camera's mount, each axis | 0.05 deg | what Kalibr gives again from calibration to calibration |
+| its focal length; its centre, each axis | 0.05 %; 0.15 px at 720 px | the same: some tenths of a pixel at the rim |
+
+The drone is any of the models in its own size, and of any surface. Its span is known: somebody measured it.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from links.simulated.sensors.camera import CameraError, turned
+from links.simulated.world.drone import SPAN_M, DroneModel, Shape, Surface
+from stages.geometry import LidarMount
+
+ZERO_DEG, TILT_DEG = 0.1, 0.05
+RANGE_M = 0.017
+CAMERA_DEG, FOCAL_SHARE, CENTRE_SHARE = 0.05, 5e-4, 2e-4  # of the focal length, of the picture's size
+
+
+@dataclass(frozen=True)
+class AsBuilt:
+    """One rig and its drone."""
+
+    zero_deg: float
+    tilt_deg: tuple[float, float]
+    range_offset_m: float
+    camera_vehicle: CameraError
+    camera_drone: CameraError
+    model: DroneModel
+
+    @property
+    def span_m(self) -> float:
+        """The drone's."""
+        return SPAN_M[self.model.shape]
+
+    def mount(self, told: LidarMount) -> LidarMount:
+        """How the LiDAR really sits, where the rig file says `told`."""
+        turntable = turned(told.T_vehicle_turntable, (*self.tilt_deg, 0.0))
+        zero_deg = told.servo_zero_deg + self.zero_deg
+        return told.model_copy(update={"T_vehicle_turntable": turntable, "servo_zero_deg": zero_deg})
+
+
+def as_built(flight: str, seed: int) -> AsBuilt:
+    """The rig and the drone of a flight."""
+    rng = np.random.default_rng([seed, 50, *flight.encode()])
+    tilt = rng.normal(0.0, TILT_DEG, 2).tolist()
+    return AsBuilt(
+        zero_deg=float(rng.normal(0.0, ZERO_DEG)),
+        tilt_deg=(tilt[0], tilt[1]),
+        range_offset_m=float(rng.normal(0.0, RANGE_M)),
+        camera_vehicle=_camera_error(rng),
+        camera_drone=_camera_error(rng),
+        model=DroneModel(
+            shape=get_args(Shape)[rng.integers(len(get_args(Shape)))],
+            surface=get_args(Surface)[rng.integers(len(get_args(Surface)))],
+        ),
+    )
+
+
+def _camera_error(rng: np.random.Generator) -> CameraError:
+    turn, centre = rng.normal(0.0, CAMERA_DEG, 3).tolist(), rng.normal(0.0, CENTRE_SHARE, 2).tolist()
+    return CameraError(
+        turned_deg=(turn[0], turn[1], turn[2]),
+        focal_share=float(rng.normal(0.0, FOCAL_SHARE)),
+        centre_share=(centre[0], centre[1]),
+    )

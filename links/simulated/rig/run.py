@@ -1,0 +1,295 @@
+"""Runs a scenario: records in order of arrival, or a recording on disk.
+
+Source: ours. The same scenario and seed give the same bytes. Truth goes to /truth/* and nowhere else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path as FilePath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.link import TRUTH_TOPICS, LinkError, Record
+from links.recording import RecordingWriter
+from links.simulated.autopilot.autopilot import Autopilot
+from links.simulated.rig.closed_loop import ClosedLoop, load_loop
+from links.simulated.rig.image_cache import KeptCamera, KeptPictures, world_of
+from links.simulated.rig.scenario import Scenario, load_scenario
+from links.simulated.rig.scripted_servo import ScriptedOperator
+from links.simulated.rig.truth_records import TruthRecords
+from links.simulated.sensors.camera import Camera, build_cameras
+from links.simulated.sensors.camera_paint import Street
+from links.simulated.sensors.lidar import Lidar, turned_poses
+from links.simulated.sensors.servo import ServoBus
+from links.simulated.sensors.vehicle_odometry import VehicleOdometry
+from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
+from links.simulated.world.clearance import check_travel
+from links.simulated.world.flight import Flight
+from links.simulated.world.mesh import Array64
+from links.simulated.world.path import Path
+from links.simulated.world.scene import Scene, Truth, drone_shapes
+from links.simulated.world.suspension import Ride
+from links.simulated.world.vehicle import vehicle_mesh, vehicle_mesh_from_camera
+from links.velodyne import vlp16
+
+BATCH_PACKETS = 32  # pulses are cast in batches; how many does not change a byte
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationReport:
+    """What a simulation made."""
+
+    seed: int
+    records: int
+    pulses: int
+    returns: int
+    drone_returns: int  # pulses with a return that has most of its power from a drone
+    wall_s: float
+    size_bytes: int
+    output_hash: str | None = None  # of the closed loop; a replay with the same configuration gives it again
+
+    def __str__(self) -> str:
+        text = (
+            f"seed {self.seed}: {self.records} records, {self.pulses} pulses, {self.returns} with a return, "
+            f"{self.drone_returns} from the drone; {self.size_bytes / 1e6:.2f} MB in {self.wall_s:.1f} s"
+        )
+        return text if self.output_hash is None else f"{text}; closed loop's output hash {self.output_hash}"
+
+
+class Simulation:
+    """One run of a scenario. Iterate `records()` once; the counts and `drone_return_ns` fill as it goes."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int | None = None,
+        loop: ClosedLoop | None = None,
+        pictures: KeptPictures | None = None,
+    ) -> None:
+        """With a `loop` the pipeline in it commands the servo, and the scenario's script is not used.
+
+        With `pictures` of the same scenario the cameras' are not painted.
+        """
+        self._loop = loop
+        self.scenario = scenario if seed is None else scenario.changed(seed=seed)
+        self.seed = self.scenario.seed
+        drone = scenario.drone
+        start_ns, duration_s = scenario.start_ns, scenario.duration_s
+        flown: Path | Flight | None = drone.path if drone else None
+        self.talkers: list[Autopilot | VehicleOdometry] = []
+        if drone is not None and scenario.autopilot is not None:
+            flown = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
+            self.talkers.append(Autopilot(scenario.autopilot, flown, start_ns, duration_s, self.seed))
+        vehicle = scenario.vehicle
+        ridden = Ride(vehicle.path, vehicle.ride, duration_s, self.seed) if vehicle.ride else vehicle.path
+        if scenario.vehicle_odometry is not None:
+            odometry = VehicleOdometry(scenario.vehicle_odometry, ridden, start_ns, duration_s, self.seed)
+            self.talkers.append(odometry)
+        others = scenario.other_drones
+        self.truth = Truth(start_ns, ridden, flown, tuple(other.path for other in others))
+        height = scenario.vehicle.camera_height_m
+        world = world_of(self.scenario)
+        self._scene = Scene(
+            world.mesh,
+            vehicle_mesh(height),
+            drone_shapes(drone.span_m, drone.model) if drone else (),
+            self.truth,
+            world.movers,
+            scenario.weather.wetness,
+            [drone_shapes(other.span_m, other.model) for other in others],
+        )
+        spans_m = [flying.span_m for flying in (drone, *others) if flying is not None]
+        check_travel(self._scene.world, self.truth, scenario.duration_s, spans_m)
+        self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
+        script = scenario.script if loop is None else ()
+        operator = ScriptedOperator(script, self.drone_servo_rad if drone else None, self.seed)
+        shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)
+        self._servo = ServoBus(scenario.servo, operator, scenario.start_ns, shift_ns, self.seed)
+        self._arrival = np.random.default_rng([self.seed, 5])
+        self._cameras: Sequence[Camera | KeptCamera] = (
+            self._painting_cameras() if pictures is None else pictures.cameras(self.truth)
+        )
+        lidar_at = (lambda stamp_ns: self.T_world_lidar(stamp_ns)[1]) if scenario.truth_visible else None
+        self._true = TruthRecords(self.truth, self._scene.world, lidar_at)
+        self.lidar_clock_ns = 0  # how far the LiDAR's clock is ahead of the scenario's
+        self.pulses = 0
+        self.returns = 0
+        self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from drones
+
+    def _painting_cameras(self) -> list[Camera]:
+        scenario, height = self.scenario, self.scenario.vehicle.camera_height_m
+        return build_cameras(
+            scenario.cameras,
+            self._scene,
+            Street.of(scenario.scene, height),
+            scenario.weather,
+            vehicle_mesh_from_camera(height, scenario.mount),
+            scenario.start_ns,
+            self.seed,
+        )
+
+    def records(self) -> Iterator[Record]:
+        """All records in order of arrival, numbered."""
+        waiting: list[tuple[int, int, Record]] = []
+        made = sent = 0
+        start_ns = self.scenario.start_ns
+        end_ns = start_ns + round(self.scenario.duration_s * 1e9)
+        packet_ns = firings_per_packet(self.scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
+        first_ns = start_ns
+        most = BATCH_PACKETS if self._loop is None else max(1, self._loop.longest_batch_ns() // packet_ns)
+        while first_ns < end_ns:
+            packets = min(most, -(-(end_ns - first_ns) // packet_ns))
+            next_ns = first_ns + packets * packet_ns
+            records = self._servo.advance(next_ns)
+            records += self.lidar_records(first_ns, packets, packet_ns)
+            for camera in self._cameras:
+                records += camera.records(next_ns)
+            for talker in self.talkers:
+                records += talker.records(next_ns)
+            records += self.truth_records(next_ns)
+            for record in records:
+                heapq.heappush(waiting, (record.arrival_ns, made, record))
+                made += 1
+            first_ns = next_ns
+            while waiting and (waiting[0][0] < next_ns or first_ns >= end_ns):
+                record = dataclasses.replace(heapq.heappop(waiting)[2], sequence=sent)
+                self._tell_loop(record)
+                yield record
+                sent += 1
+        if self._loop is not None:
+            self._loop.finish()
+
+    def _tell_loop(self, record: Record) -> None:
+        """Records reach the pipeline as they arrive, truth never; its goals go to the servo."""
+        if self._loop is None or record.topic.startswith(TRUTH_TOPICS):
+            return
+        sent = self._loop.take(record)
+        if sent is not None:
+            left_ns, command = sent
+            self._servo.command(left_ns, command.position_rad, command.speed_radps)
+
+    def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
+        """Where the LiDAR truly is: rotations (n, 3, 3), positions (n, 3) [m]."""
+        return self.T_world_lidar_at(stamp_ns, self._servo.turned_rad(stamp_ns))
+
+    def T_world_lidar_at(self, stamp_ns: NDArray[np.int64], turned_rad: Array64) -> tuple[Array64, Array64]:
+        """The same where the servo has turned the turntable by so much (n,): T_wv T_vt Rz(angle) T_tl."""
+        mount = self.scenario.mount
+        T_vehicle_turntable, T_turntable_lidar = mount.T_vehicle_turntable.matrix(), mount.T_turntable_lidar.matrix()
+        R_world_vehicle, t_world_vehicle = self.truth.T_world_vehicle(stamp_ns)
+        angle_rad = mount.turntable_rad(turned_rad)
+        return turned_poses(R_world_vehicle, t_world_vehicle, T_vehicle_turntable, angle_rad, T_turntable_lidar)
+
+    def drone_servo_rad(self, time_s: float) -> float:
+        """Servo position at which the drone lies in the plane through the turntable's axis and azimuth 0."""
+        stamp = np.array([self.scenario.start_ns + round(max(time_s, 0.0) * 1e9)])
+        R, t = (part[0] for part in self.truth.T_world_vehicle(stamp))
+        drone = R.T @ (self.truth.T_world_drone(stamp)[1][0] - t)
+        mount = self.scenario.mount
+        T = mount.T_vehicle_turntable.matrix()
+        x, y, _ = T[:3, :3].T @ (drone - T[:3, 3])
+        return mount.servo_sign * float(np.mod(np.arctan2(y, x), np.pi)) + np.radians(mount.servo_zero_deg)
+
+    def truth_records(self, until_ns: int) -> list[Record]:
+        """What was true before a time and since the call before."""
+        return self._true.records(until_ns)
+
+    def lidar_records(self, first_ns: int, packets: int, packet_ns: int) -> list[Record]:
+        """The LiDAR's packets from a time on, in order of time; and which pulses of them the drones returned."""
+        firings = firings_per_packet(self.scenario.lidar.return_mode)
+        sequence_ns = first_ns + vlp16.SEQUENCE_NS * np.arange(packets * firings, dtype=np.int64)
+        pulse_ns = (sequence_ns[:, None] + vlp16.PULSE_NS * np.arange(vlp16.LASERS)).ravel()
+        pulses = self._lidar.fire(pulse_ns, *self.T_world_lidar(pulse_ns), self._scene)
+        self.pulses += len(pulse_ns)
+        self.returns += int(np.count_nonzero(pulses.range_m))
+        self.drone_return_ns += pulse_ns[(pulses.drone_share > 0.5).any(axis=0)].tolist()
+        azimuth = self._lidar.azimuth_rad(sequence_ns[::FIRINGS_PER_BLOCK]).reshape(packets, -1)
+        ranges = pulses.range_m.reshape(-1, packets, firings, vlp16.LASERS)
+        shades = pulses.reflectivity.reshape(ranges.shape)
+        jitter_ns = self._arrival.uniform(3e5, 8e5, packets).astype(np.int64)
+        last_pulse_ns = pulse_ns.reshape(packets, -1)[:, -1]
+        records: list[Record] = []
+        for i in range(packets):
+            at = first_ns + i * packet_ns
+            mode = self.scenario.lidar.return_mode
+            data = encode_packet(at + self.lidar_clock_ns, azimuth[i], ranges[:, i], shades[:, i], mode)
+            arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
+            records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
+        return records + self._true.hits(pulse_ns.reshape(packets, -1), pulses)
+
+
+def simulate_records(scenario: Scenario, seed: int | None = None) -> Iterator[Record]:
+    """All records of a scenario, in order of arrival, without a file."""
+    return Simulation(scenario, seed).records()
+
+
+def simulate(
+    scenario: FilePath,
+    out: FilePath,
+    seed: int | None = None,
+    progress: Callable[[float], None] | None = None,
+    overwrite: bool = False,
+    closed_loop: FilePath | None = None,
+    duration_s: float | None = None,
+    pictures: FilePath | None = None,
+) -> SimulationReport:
+    """Run a scenario file into a recording, in closed loop with a configuration if one is given.
+
+    `pictures` is a recording of the same flight whose pictures are taken instead of painted; not a byte differs.
+    `progress` is told the share done, 0 to 1. Errors are LinkError, and ConfigError for the configuration's.
+    """
+    asked = {"seed": seed, "duration_s": duration_s}
+    checked = load_scenario(scenario).changed(**{name: value for name, value in asked.items() if value is not None})
+    loop = None
+    if closed_loop is not None:
+        loop = load_loop(closed_loop, checked.rig_yaml(), f"{checked.name} (rig)", checked.closed_loop)
+    return simulate_into(out, checked, progress, overwrite, loop, pictures)
+
+
+def simulate_into(
+    out: FilePath,
+    checked: Scenario,
+    progress: Callable[[float], None] | None = None,
+    overwrite: bool = False,
+    loop: ClosedLoop | None = None,
+    pictures: FilePath | None = None,
+) -> SimulationReport:
+    """The same for a scenario in memory. The recording keeps the whole scenario, with every setting, as its config."""
+    if pictures is not None and out.exists() and out.samefile(pictures):
+        raise LinkError(f"{out} is both what is written and where pictures come from: take another name for one")
+    began = time.perf_counter()
+    simulation = Simulation(checked, loop=loop, pictures=pictures and KeptPictures(pictures, checked))
+    metadata = {"made_by": "grd simulate", "scenario": checked.name, "seed": str(simulation.seed)}
+    if loop is not None:
+        metadata |= loop.made_with
+    count = 0
+    with RecordingWriter(
+        out,
+        rig_yaml=checked.rig_yaml(),
+        config_yaml=checked.as_yaml(),
+        metadata=metadata,
+        lossless=True,
+        overwrite=overwrite,
+    ) as writer:
+        for record in simulation.records():
+            writer.write(record)
+            count += 1
+            if progress is not None and count % 100 == 0:
+                progress(min(1.0, (record.arrival_ns - checked.start_ns) * 1e-9 / checked.duration_s))
+    if progress is not None:
+        progress(1.0)
+    return SimulationReport(
+        seed=simulation.seed,
+        records=count,
+        pulses=simulation.pulses,
+        returns=simulation.returns,
+        drone_returns=len(simulation.drone_return_ns),
+        wall_s=time.perf_counter() - began,
+        size_bytes=out.stat().st_size,
+        output_hash=None if loop is None else loop.output_hash,
+    )

@@ -1,0 +1,90 @@
+"""From radiance to JPEG: vignetting, exposure, photon and read noise, gamma.
+
+Source: EMVA Standard 1288 release 4.0, section 2 (electrons are Poisson, so their variance is their mean; read noise
+adds; full well clips); ITU-R BT.709-style power of 1/2.2 for gamma. Numbers of a small global-shutter sensor.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from links.simulated.world.mesh import Array32, Array64
+from stages.compiled import compiled
+
+GREY = 0.22  # where auto exposure puts the mean, of saturation
+ELECTRONS_PER_S = 1e7  # of radiance 1, white in full sun: full well in 1 ms
+GAMMA = 2.2
+STEPS = 4096  # of the analogue-to-digital converter
+EDGE_RAD = math.radians(1.5)  # the lens's own rim is not sharp
+
+
+class SensorSettings(BaseModel):
+    """The sensor behind the lens."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    exposure_ms: float | None = Field(default=None, gt=0, le=60)  # null: automatic
+    max_exposure_ms: float = Field(default=15.0, gt=0, le=60)  # of the automatic exposure; beyond it, gain
+    max_gain: float = Field(default=16.0, ge=1)
+    full_well_e: float = Field(default=10_000, ge=500)
+    read_noise_e: float = Field(default=4.0, ge=0)
+    shot_noise: bool = True
+    vignetting: float = Field(default=0.4, ge=0, lt=1)  # light lost at the rim
+    jpeg_quality: int = Field(default=90, ge=10, le=100)
+
+
+def auto_exposure(settings: SensorSettings, mean_radiance: float) -> tuple[float, float]:
+    """Exposure [s] and gain that bring the mean radiance to GREY of saturation, the longest exposure before gain."""
+    wanted_s = GREY * settings.full_well_e / (max(mean_radiance, 1e-6) * ELECTRONS_PER_S)
+    if settings.exposure_ms is not None:
+        exposure_s = 1e-3 * settings.exposure_ms
+    else:
+        exposure_s = min(max(wanted_s, 2e-5), 1e-3 * settings.max_exposure_ms)
+    return exposure_s, min(max(wanted_s / exposure_s, 1.0), settings.max_gain)
+
+
+def transmission(off_axis_rad: Array64, limit_rad: float, vignetting: float) -> Array32:
+    """Share of light (n,) that passes the lens: 1 - vignetting (theta / limit)^2, and a soft rim."""
+    rim = np.clip((limit_rad - off_axis_rad) / EDGE_RAD, 0.0, 1.0)
+    return ((1 - vignetting * (off_axis_rad / limit_rad) ** 2) * rim).astype(np.float32)
+
+
+def develop(
+    radiance: Array32, settings: SensorSettings, exposure_s: float, gain: float, rng: Generator
+) -> NDArray[np.uint8]:
+    """8-bit image (h, w, 3) of a radiance image that has passed the lens."""
+    noise = rng.standard_normal(radiance.shape, dtype=np.float32)
+    code = np.rint(255 * (np.arange(STEPS) / (STEPS - 1)) ** (1 / GAMMA)).astype(np.uint8)
+    return _develop(
+        radiance, noise, ELECTRONS_PER_S * exposure_s, settings.full_well_e, settings.read_noise_e,
+        1.0 if settings.shot_noise else 0.0, gain, code,
+    )  # fmt: skip
+
+
+@compiled
+def _develop(radiance, noise, electrons, full_well, read_noise, shot, gain, code):
+    """e = L S t; measured e + N(0, e + read^2); value = gain e / full well, quantised, through gamma."""
+    height, width, channels = radiance.shape
+    out = np.empty(radiance.shape, dtype=np.uint8)
+    for i in range(height):
+        for j in range(width):
+            for k in range(channels):
+                e = min(radiance[i, j, k] * electrons, full_well)
+                e += noise[i, j, k] * math.sqrt(shot * e + read_noise * read_noise)
+                value = int(e * gain / full_well * (STEPS - 1) + 0.5)
+                out[i, j, k] = code[min(max(value, 0), STEPS - 1)]
+    return out
+
+
+def encode_jpeg(image_rgb: NDArray[np.uint8], quality: int) -> bytes:
+    """The image as JPEG."""
+    ok, data = cv2.imencode(".jpg", image_rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not ok:
+        raise ValueError(f"OpenCV could not encode an image of shape {image_rgb.shape}")
+    return data.tobytes()

@@ -1,0 +1,211 @@
+"""What moves through the scene besides vehicle and drone: cars, birds that flap, a balloon on its string.
+
+Source: ours; speeds of birds: Alerstam et al., PLoS Biology 5 (2007) e197 (crows and gulls: 9 to 14 m/s in still air).
+A mover is cast in its own frame with the rays of each moment, as vehicle and drone are. All paths are closed, so that
+a mover stays near however long a scenario lasts. Movers pass through each other; they do not know the drone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from links.simulated.world.mesh import Array64, Mesh, box, merge, quads, rod
+from links.simulated.world.path import rotations_z
+
+FLAP_STEPS = 8
+
+
+class Mover(Protocol):
+    """A body with a pose and a shape at every time."""
+
+    @property
+    def name(self) -> str:
+        """What it is: vehicle, drone, car, bird, balloon."""
+        ...
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        """Its shapes, in its own frame; one for a stiff body."""
+        ...
+
+    @property
+    def speed_mps(self) -> float:
+        """No point of its path is passed faster than this."""
+        ...
+
+    @property
+    def small(self) -> bool:
+        """Whether a LiDAR pulse that passes near must be looked at finely."""
+        ...
+
+    def poses(self, time_s: Array64) -> tuple[Array64, Array64]:
+        """T_world_body at times (n,) after the start: rotations (n, 3, 3), positions (n, 3) [m]."""
+        ...
+
+    def shape(self, time_s: Array64) -> NDArray[np.int64]:
+        """Which of `meshes` it has at times (n,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Car:
+    """Drives along a straight line at constant speed, and starts again from its beginning."""
+
+    mesh: Mesh
+    start_m: Array64  # (3,) world
+    end_m: Array64
+    speed_mps: float
+    head_start_s: float
+    name: str = "car"
+    small: bool = False
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        return (self.mesh,)
+
+    def poses(self, time_s: Array64) -> tuple[Array64, Array64]:
+        along = self.end_m - self.start_m
+        length_m = float(np.linalg.norm(along))
+        share = np.mod((time_s + self.head_start_s) * self.speed_mps / length_m, 1.0)
+        yaw = np.full(len(share), np.arctan2(along[1], along[0]))
+        return rotations_z(yaw), self.start_m + share[:, None] * along
+
+    def shape(self, time_s: Array64) -> NDArray[np.int64]:
+        return np.zeros(len(time_s), dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Bird:
+    """Flies round an ellipse that rises and falls, banked a little, beating its wings."""
+
+    span_m: float
+    centre_m: Array64  # (3,) world
+    radii_m: Array64  # (3,): along, across, up and down
+    heading_rad: float  # of the ellipse's long side
+    turn_s: float  # once round
+    beat_hz: float
+    phase: float  # 0..1
+    name: str = "bird"
+    small: bool = True
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        return tuple(bird_mesh(self.span_m, 2 * np.pi * step / FLAP_STEPS) for step in range(FLAP_STEPS))
+
+    @property
+    def speed_mps(self) -> float:
+        along, across, up = self.radii_m
+        return float(2 * np.pi / self.turn_s * np.hypot(max(along, across), 2 * up))
+
+    def poses(self, time_s: Array64) -> tuple[Array64, Array64]:
+        angle = 2 * np.pi * (time_s / self.turn_s + self.phase)
+        place = np.column_stack([np.cos(angle), np.sin(angle), np.sin(2 * angle)]) * self.radii_m
+        flown = np.column_stack([-np.sin(angle), np.cos(angle)]) * self.radii_m[:2]
+        turn = rotations_z(np.full(1, self.heading_rad))[0]
+        yaw = np.arctan2(flown[:, 1], flown[:, 0]) + self.heading_rad
+        return rotations_z(yaw) @ _BANK, place @ turn.T + self.centre_m
+
+    def shape(self, time_s: Array64) -> NDArray[np.int64]:
+        return np.floor(np.mod(time_s * self.beat_hz + self.phase, 1.0) * FLAP_STEPS).astype(np.int64)
+
+
+_BANK = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(0.3), np.sin(0.3)], [0.0, -np.sin(0.3), np.cos(0.3)]])  # into the turn
+
+
+@dataclass(frozen=True)
+class Balloon:
+    """Sways on its string in the wind."""
+
+    diameter_m: float
+    anchor_m: Array64  # (3,) world: where it hangs on average
+    sway_m: float
+    period_s: float
+    phase: float
+    name: str = "balloon"
+    small: bool = True
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        return (balloon_mesh(self.diameter_m),)
+
+    @property
+    def speed_mps(self) -> float:
+        return 2 * np.pi * self.sway_m / self.period_s * 1.7
+
+    def poses(self, time_s: Array64) -> tuple[Array64, Array64]:
+        angle = 2 * np.pi * (time_s / self.period_s + self.phase)
+        sway = self.sway_m * np.column_stack([np.sin(angle), 0.6 * np.sin(1.6 * angle), 0.2 * np.cos(2 * angle)])
+        return rotations_z(0.3 * np.sin(angle)), self.anchor_m + sway
+
+    def shape(self, time_s: Array64) -> NDArray[np.int64]:
+        return np.zeros(len(time_s), dtype=np.int64)
+
+
+def bird_mesh(span_m: float, beat_rad: float) -> Mesh:
+    """Body, tail and two wings, raised by 35 deg * cos(beat) with hands that lag behind."""
+    b = 0.5 * span_m
+    raised, lag = 0.6 * np.cos(beat_rad), 0.6 * np.cos(beat_rad - 0.9)
+    parts = [
+        box((-0.30 * b, -0.09 * b, -0.08 * b), (0.35 * b, 0.09 * b, 0.10 * b), "feather", taper=0.3),
+        quads([[(-0.3 * b, -0.05 * b, 0), (-0.3 * b, 0.05 * b, 0), (-0.7 * b, 0.14 * b, 0), (-0.7 * b, -0.14 * b, 0)]],
+              "feather"),
+    ]  # fmt: skip
+    for side in (-1.0, 1.0):
+        wrist = b * np.array([0.08, side * 0.5 * np.cos(raised), 0.5 * np.sin(raised)])
+        tip = wrist + b * np.array([-0.10, side * 0.5 * np.cos(lag), 0.5 * np.sin(lag)])
+        root = b * np.array([0.12, side * 0.06, 0.05])
+        chord = b * np.array([-0.34, 0.0, 0.0])
+        parts.append(quads([[root, wrist, wrist + 0.95 * chord, root + chord]], "feather"))
+        parts.append(quads([[wrist, tip, tip + 0.35 * chord, wrist + 0.95 * chord]], "feather"))
+    return merge(parts)
+
+
+def balloon_mesh(diameter_m: float) -> Mesh:
+    """A pear of 8 rings of 12 quads, its centre at the origin, and half a metre of string."""
+    up = np.linspace(-1, 1, 9)
+    radius = np.sqrt(np.maximum(1 - up**2, 0)) * (1 - 0.12 * (1 - up) / 2)
+    turn = np.linspace(0, 2 * np.pi, 13)
+    ring = radius[:, None]
+    grid = np.stack([ring * np.cos(turn), ring * np.sin(turn), np.tile(1.15 * up[:, None], 13)], axis=2)
+    grid *= diameter_m / 2
+    skin = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2).reshape(-1, 4, 3)
+    low = -0.575 * diameter_m
+    return merge([quads(skin, "latex"), rod((0, 0, low), (0, 0, low - 0.5), 0.002, "wire", sides=3)])
+
+
+def draw_bird(
+    rng: Generator, low_m: float, high_m: float, along_m: float, across_m: float, R_world_scene: Array64
+) -> Bird:
+    """A bird about the vehicle's start, small to gull-sized, 7 to 12 m/s; the box lies along the road, half sizes."""
+    radii = np.array([rng.uniform(0.4, 1.0) * along_m, rng.uniform(0.3, 0.8) * across_m, rng.uniform(0.2, 1.2)])
+    height = rng.uniform(low_m, high_m)
+    drift = (along_m - radii[0]) * rng.uniform(-1, 1)
+    round_m = 2 * np.pi * np.sqrt((radii[0] ** 2 + radii[1] ** 2) / 2)
+    return Bird(
+        span_m=rng.uniform(0.3, 1.1),
+        centre_m=R_world_scene @ np.array([drift, 0.2 * across_m * rng.uniform(-1, 1), height]),
+        radii_m=radii,
+        heading_rad=float(np.arctan2(R_world_scene[1, 0], R_world_scene[0, 0])),
+        turn_s=round_m / rng.uniform(7, 12),
+        beat_hz=rng.uniform(3.0, 6.0),
+        phase=rng.uniform(),
+    )
+
+
+def draw_balloon(
+    rng: Generator, low_m: float, high_m: float, along_m: float, across_m: float, R_world_scene: Array64
+) -> Balloon:
+    """A party balloon somewhere in a box along the road (half sizes)."""
+    place = np.array([rng.uniform(-1, 1) * along_m, rng.uniform(-1, 1) * across_m, rng.uniform(low_m, high_m)])
+    return Balloon(
+        diameter_m=rng.uniform(0.28, 0.6),
+        anchor_m=R_world_scene @ place,
+        sway_m=rng.uniform(0.2, 0.8),
+        period_s=rng.uniform(3, 7),
+        phase=rng.uniform(),
+    )

@@ -1,0 +1,271 @@
+"""Everything rays can meet: the fixed world, the moving vehicle's body, the flying drone and other movers.
+
+Source: ours. A moving body is cast in its own frame with the rays of each moment, so it moves within a revolution.
+Only rays that meet its bounding box are, so a body costs by the rays near it, however many rays there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from links.simulated.world.drone import BLADES, DroneModel, drone_mesh
+from links.simulated.world.flight import Flight
+from links.simulated.world.mesh import Array32, Array64, Mesh, RayScene
+from links.simulated.world.movers import Mover
+from links.simulated.world.path import Path
+from links.simulated.world.suspension import Ride
+from stages.compiled import compiled
+
+ROTOR_HZ = 95.0
+ROTOR_STEPS = 8  # standing positions of the blades within half a turn
+TOP_SPEED_MPS = 50.0  # neither drone nor vehicle is faster
+BOX_MARGIN_M = 0.01
+BEAM_SPREAD = 0.002  # a beam's half width, a little more, per metre
+BEAM_START_M = 0.01  # and where it leaves the sensor
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Where vehicle and drones are at any moment; `drone` is None in an empty sky."""
+
+    start_ns: int
+    vehicle: Path | Ride  # a path is driven level, a ride on springs
+    drone: Path | Flight | None  # a path is flown exactly, a flight with its own dynamics
+    others: tuple[Path, ...] = ()  # drones 2, 3, ...
+
+    def seconds(self, stamp_ns: NDArray[np.int64]) -> Array64:
+        """Time since the start [s]."""
+        return ((stamp_ns - self.start_ns) * 1e-9).astype(np.float64)
+
+    def T_world_vehicle(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
+        """Rotations (n, 3, 3) and positions (n, 3) [m]."""
+        return self.vehicle.level_poses(self.seconds(stamp_ns))
+
+    @property
+    def drones(self) -> range:
+        """Numbers of the drones, from 1."""
+        return range(1, 1 if self.drone is None else 2 + len(self.others))
+
+    def T_world_drone(self, stamp_ns: NDArray[np.int64], number: int = 1) -> tuple[Array64, Array64]:
+        """Rotations (n, 3, 3) and positions (n, 3) [m]; a LookupError when there is no such drone."""
+        flown = (self.drone, *self.others)[number - 1] if number in self.drones else None
+        if flown is None:
+            raise LookupError(f"this scenario has no drone {number}")
+        return flown.flying_poses(self.seconds(stamp_ns))
+
+
+@dataclass(frozen=True)
+class Body:
+    """Something that moves: its shapes, and where it is when."""
+
+    name: str  # vehicle, drone, drone_2, car, bird, balloon
+    meshes: tuple[Mesh, ...]  # in its own frame
+    pose: Callable[[NDArray[np.int64]], tuple[Array64, Array64]]  # T_world_body at times (n,) [ns]
+    shape: Callable[[NDArray[np.int64]], NDArray[np.int64]] | None  # which mesh it has at times (n,); None: the first
+    speed_mps: float  # never faster
+    small: bool  # a pulse that passes near is looked at finely
+    wetness: float = 0.0
+    drone: int = 0  # which drone it is, from 1; 0: none
+
+    @cached_property
+    def scenes(self) -> tuple[RayScene, ...]:
+        """The shapes, ready for rays."""
+        return tuple(RayScene(mesh, self.wetness) for mesh in self.meshes)
+
+    @cached_property
+    def radius_m(self) -> float:
+        """All shapes lie this near the body's origin."""
+        return max(scene.radius_m for scene in self.scenes)
+
+    @cached_property
+    def box_m(self) -> tuple[Array64, Array64]:
+        """Lowest and highest corner of all shapes."""
+        low = np.min([mesh.vertices_m.min(axis=0) for mesh in self.meshes], axis=0)
+        high = np.max([mesh.vertices_m.max(axis=0) for mesh in self.meshes], axis=0)
+        return low - BOX_MARGIN_M, high + BOX_MARGIN_M
+
+    def near(
+        self, pulse_ns: NDArray[np.int64], origins_m: Array32, directions: Array32
+    ) -> tuple[NDArray[np.intp], Array64, Array64]:
+        """Pulses (of n, axes (n, 3)) that may light some of the body, and its poses then (m, 3, 3), (m, 3).
+
+        Which pulses these are does not depend on how they are batched.
+        """
+        middle = pulse_ns[len(pulse_ns) // 2 : len(pulse_ns) // 2 + 1]
+        away_s = 1e-9 * max(int(pulse_ns.max() - middle[0]), int(middle[0] - pulse_ns.min()))
+        reach_m = self.radius_m + BEAM_START_M
+        maybe = passes(self.pose(middle)[1], origins_m, directions, reach_m + self.speed_mps * away_s)
+        if len(maybe) == 0:
+            return maybe, np.empty((0, 3, 3)), np.empty((0, 3))
+        R, t = self.pose(pulse_ns[maybe])
+        if self.small:
+            close = passes(t, origins_m[maybe], directions[maybe], reach_m)
+            maybe, R, t = maybe[close], R[close], t[close]
+        return maybe, R, t
+
+
+class Scene:
+    """The surroundings a simulated sensor looks into. `world` and `bodies` are for sensors with rays of their own."""
+
+    def __init__(
+        self,
+        world: Mesh,
+        vehicle: Mesh,
+        drone: tuple[Mesh, ...],
+        truth: Truth,
+        movers: Sequence[Mover] = (),
+        wetness: float = 0.0,
+        others: Sequence[tuple[Mesh, ...]] = (),
+    ) -> None:
+        """`drone` and `others` are the meshes of `drone_shapes` for drones 1 and 2, 3, ...; none in an empty sky."""
+        self.world_mesh = world
+        self.world = RayScene(world, wetness)
+        self._truth = truth
+        self.bodies = [Body("vehicle", (vehicle,), truth.T_world_vehicle, None, TOP_SPEED_MPS, False, wetness)]
+        for number, shapes in zip(truth.drones, (drone, *others), strict=False):
+            name = "drone" if number == 1 else f"drone_{number}"
+            flown = partial(truth.T_world_drone, number=number)
+            self.bodies.append(Body(name, shapes, flown, self._rotor_step, TOP_SPEED_MPS, True, drone=number))
+        for mover in movers:
+            self.bodies.append(
+                Body(
+                    mover.name,
+                    mover.meshes,
+                    partial(self._at_seconds, mover.poses),
+                    partial(self._at_seconds, mover.shape),
+                    mover.speed_mps,
+                    mover.small,
+                    wetness,
+                )
+            )
+
+    def _at_seconds(self, function: Callable[[Array64], Any], stamp_ns: NDArray[np.int64]) -> Any:
+        return function(self._truth.seconds(stamp_ns))
+
+    def _rotor_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        turns = self._truth.seconds(stamp_ns) * ROTOR_HZ
+        return (turns * BLADES * ROTOR_STEPS).astype(np.int64) % ROTOR_STEPS
+
+    def cast(
+        self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32, max_range_m: float
+    ) -> tuple[Array32, Array32, NDArray[np.uint8]]:
+        """See `lidar.Surroundings`."""
+        rays = directions_world.shape[1]
+        flat_o, flat_d = origins_world_m.reshape(-1, 3), directions_world.reshape(-1, 3)
+        ranges = np.full(len(flat_o), np.inf, dtype=np.float32)
+        fractions = np.zeros(len(flat_o), dtype=np.float32)
+        drone = np.zeros(len(flat_o), dtype=np.uint8)
+        for body in self.bodies:
+            pick, R, t = body.near(pulse_ns, origins_world_m[:, 0], directions_world[:, 0])
+            if len(pick) == 0:
+                continue
+            origins, directions, ray = into_body(R, t, origins_world_m, directions_world, pick, *body.box_m)
+            shape = None if body.shape is None else body.shape(pulse_ns[ray // rays])
+            for index, scene in enumerate(body.scenes):
+                of_shape = slice(None) if shape is None else np.nonzero(shape == index)[0]
+                target = ray[of_shape]
+                if len(target):
+                    found = scene.cast(origins[of_shape], directions[of_shape], max_range_m)
+                    nearer = _keep_nearer(target, *found, ranges, fractions)
+                    drone[nearer] = body.drone
+        limit = np.minimum(ranges, np.float32(max_range_m))  # embree is quick about rays that end near
+        drone[_keep_nearer(None, *self.world.cast(flat_o, flat_d, limit), ranges, fractions)] = 0
+        return ranges.reshape(-1, rays), fractions.reshape(-1, rays), drone.reshape(-1, rays)
+
+    def near_small_body(
+        self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32
+    ) -> NDArray[np.bool_]:
+        """See `lidar.Surroundings`."""
+        near = np.zeros(len(pulse_ns), dtype=np.bool_)
+        for body in self.bodies:
+            if body.small:
+                near[body.near(pulse_ns, origins_world_m, directions_world)[0]] = True
+        return near
+
+
+def drone_shapes(span_m: float, model: DroneModel) -> tuple[Mesh, ...]:
+    """The drone with its blades in each of their standing positions."""
+    steps = np.arange(ROTOR_STEPS) * 2 * np.pi / BLADES / ROTOR_STEPS
+    return tuple(drone_mesh(span_m, float(step), model) for step in steps)
+
+
+@compiled
+def _keep_nearer(
+    target: NDArray[np.intp] | None, found_m: Array32, fraction: Array32, ranges_m: Array32, fractions: Array32
+) -> NDArray[np.intp]:
+    """Write hits of the target rays (all rays: None) over farther ones; which rays (m,) that were."""
+    written = np.empty(len(found_m), dtype=np.intp)
+    count = 0
+    for i in range(len(found_m)):
+        ray = i if target is None else target[i]
+        if found_m[i] < np.inf and found_m[i] <= ranges_m[ray]:
+            ranges_m[ray], fractions[ray] = found_m[i], fraction[i]
+            written[count] = ray
+            count += 1
+    return written[:count]
+
+
+@compiled
+def passes(target_m: Array64, origins_m: Array32, directions: Array32, reach_m: float) -> NDArray[np.intp]:
+    """Rays (n, 3) that pass the target, one (1, 3) or each its own (n, 3), within the reach and the beam's spread.
+
+    A ray that starts within the reach passes it, too.
+    """
+    found = np.empty(len(directions), dtype=np.intp)
+    count, step = 0, 1 if len(target_m) > 1 else 0
+    for i in range(len(directions)):
+        x = target_m[step * i, 0] - origins_m[i, 0]
+        y = target_m[step * i, 1] - origins_m[i, 1]
+        z = target_m[step * i, 2] - origins_m[i, 2]
+        ahead = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
+        away_squared = x * x + y * y + z * z
+        reach = reach_m + BEAM_SPREAD * abs(ahead)
+        if away_squared - ahead * ahead < reach * reach and (ahead > 0 or away_squared < reach * reach):
+            found[count] = i
+            count += 1
+    return found[:count]
+
+
+@compiled
+def into_body(
+    R_world_body: Array64,
+    t_world_body_m: Array64,
+    origins_world_m: Array32,
+    directions_world: Array32,
+    pick: NDArray[np.intp],
+    low_m: Array64,
+    high_m: Array64,
+) -> tuple[Array32, Array32, NDArray[np.intp]]:
+    """Sub-rays of the picked pulses in the body's frame, R^T (p - t), those that meet its box, and their flat number.
+
+    Poses are one for each picked pulse, or one for all; rays are (n, k, 3), the flat number counts in (n, k).
+    """
+    rays = origins_world_m.shape[1]
+    origins = np.empty((len(pick) * rays, 3), dtype=np.float32)
+    directions = np.empty((len(pick) * rays, 3), dtype=np.float32)
+    number = np.empty(len(pick) * rays, dtype=np.intp)
+    o, d = np.empty(3), np.empty(3)
+    count, step = 0, 1 if len(t_world_body_m) > 1 else 0
+    for i in range(len(pick)):
+        R, t = R_world_body[step * i], t_world_body_m[step * i]
+        for k in range(rays):
+            p, q = origins_world_m[pick[i], k], directions_world[pick[i], k]
+            enter, leave = 0.0, np.inf
+            for j in range(3):
+                o[j] = R[0, j] * (p[0] - t[0]) + R[1, j] * (p[1] - t[1]) + R[2, j] * (p[2] - t[2])
+                d[j] = R[0, j] * q[0] + R[1, j] * q[1] + R[2, j] * q[2]
+                slope = d[j] if abs(d[j]) > 1e-12 else 1e-12
+                a, b = (low_m[j] - o[j]) / slope, (high_m[j] - o[j]) / slope
+                enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+            if enter <= leave:
+                for j in range(3):
+                    origins[count, j], directions[count, j] = o[j], d[j]
+                number[count] = pick[i] * rays + k
+                count += 1
+    return origins[:count], directions[:count], number[:count]

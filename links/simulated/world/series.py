@@ -1,0 +1,51 @@
+"""Values on an even time grid: random processes along it and what lies between its steps.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from links.simulated.world.mesh import Array64
+from stages.compiled import compiled
+
+
+def between_steps(rows: Array64, step_s: float, time_s: Array64) -> Array64:
+    """Rows (k,) or (k, d), one each `step_s`, linearly at times (n,); the first and last row hold beyond the ends."""
+    at = np.clip(time_s / step_s, 0.0, len(rows) - 1.0)
+    step = np.minimum(at.astype(np.int64), len(rows) - 2)
+    share = (at - step).reshape(-1, *[1] * (rows.ndim - 1))
+    return (1 - share) * rows[step] + share * rows[step + 1]
+
+
+def random_walk(white: Array64, sigma_per_sqrt_s: float, step_s: float) -> Array64:
+    """Starts at zero; after t seconds its sigma is sigma_per_sqrt_s sqrt(t)."""
+    total = np.cumsum(white, axis=0)
+    return sigma_per_sqrt_s * np.sqrt(step_s) * (total - total[:1])
+
+
+def gauss_markov(white: Array64, sigma: Array64, time_s: float, step_s: float) -> Array64:
+    """First-order Gauss-Markov, stationary from the start, of white noise (n, d) and sigma (d,).
+
+    x_0 = sigma w_0,  x_k = a x_{k-1} + sigma sqrt(1 - a^2) w_k,  a = exp(-step / time).
+    """
+    return _recursion(np.ascontiguousarray(white) * sigma, float(np.exp(-step_s / time_s)))
+
+
+def smoothed(rows: Array64, time_s: float, step_s: float) -> Array64:
+    """First-order low-pass of rows (n, d), started at the first: y_k = a y_{k-1} + (1 - a) x_k, a = exp(-step/time)."""
+    keep = float(np.exp(-step_s / time_s))
+    white = (1 - keep) / np.sqrt(1 - keep * keep) * rows
+    white[0] = rows[0]
+    return _recursion(white, keep)
+
+
+@compiled
+def _recursion(white: Array64, keep: float) -> Array64:
+    fresh = np.sqrt(1.0 - keep * keep)
+    out = white.copy()
+    for k in range(1, len(white)):
+        for axis in range(white.shape[1]):
+            out[k, axis] = keep * out[k - 1, axis] + fresh * white[k, axis]
+    return out

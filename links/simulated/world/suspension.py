@@ -1,0 +1,78 @@
+"""A vehicle on springs: it pitches when it brakes, rolls in a bend and shakes on the road.
+
+Pitch and roll each follow a damped oscillator driven by the acceleration in the vehicle's own axes,
+
+    angle'' = w^2 (target - angle) - 2 d w angle',   w = 2 pi natural_hz
+    target pitch = -sway a_forward,   target roll = sway a_left   (nose up when it speeds up, outwards in a bend)
+
+with road roughness added to the target while it rolls. It turns about a point `lever_m` under the camera.
+
+Source: ours; sway and frequency of a passenger car's body (about 3 to 6 deg per g, 1 to 1.5 Hz).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from links.simulated.world.mesh import Array64
+from links.simulated.world.path import Path, rotations_z
+from links.simulated.world.quaternion import rotations_from_vectors
+from links.simulated.world.series import between_steps, gauss_markov
+from stages.compiled import compiled
+
+STEP_S = 0.0025
+BEYOND_S = 1.0
+ROUGHNESS_TIME_S = 0.1
+ROLLING_MPS = 3.0  # from this speed on the road shakes it fully
+
+
+class RideSettings(BaseModel):
+    """The vehicle's springs and the road."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    sway_deg_per_mps2: float = Field(default=0.45, ge=0, le=5)
+    natural_hz: float = Field(default=1.3, gt=0.1, le=10)
+    damping: float = Field(default=0.35, gt=0.05, le=2)
+    roughness_deg: float = Field(default=0.4, ge=0, le=5)  # one sigma of the target; the springs pass about half
+    lever_m: float = Field(default=1.3, ge=0, le=4)
+
+
+class Ride:
+    """A driven path with pitch and roll. Times outside it take its first or last state."""
+
+    def __init__(self, path: Path, settings: RideSettings, duration_s: float, seed: int) -> None:
+        self.path = path
+        self._lever_m = settings.lever_m
+        time_s: Array64 = np.arange(round((duration_s + BEYOND_S) / STEP_S) + 1, dtype=np.float64) * STEP_S
+        _, velocity, acceleration, yaw = path.at(time_s)
+        own = np.einsum("nji,nj->ni", rotations_z(yaw), acceleration)
+        white = np.random.default_rng([seed, 36]).standard_normal((len(time_s), 2))
+        rolling = np.minimum(np.linalg.norm(velocity, axis=1) / ROLLING_MPS, 1.0)[:, None]
+        sigma = np.full(2, np.radians(settings.roughness_deg))
+        sway = np.radians(settings.sway_deg_per_mps2)
+        target = np.column_stack([sway * own[:, 1], -sway * own[:, 0]])  # about x, about y
+        target += rolling * gauss_markov(white, sigma, ROUGHNESS_TIME_S, STEP_S)
+        self._tilt = oscillate(target, 2 * np.pi * settings.natural_hz, settings.damping)
+
+    def level_poses(self, time_s: Array64) -> tuple[Array64, Array64]:
+        """T_world_vehicle: rotations (n, 3, 3) and positions (n, 3) [m]; `Path.level_poses` with the tilt."""
+        level, position = self.path.level_poses(time_s)
+        tilt = between_steps(self._tilt, STEP_S, time_s)
+        rotations = level @ rotations_from_vectors(np.pad(tilt, ((0, 0), (0, 1))))
+        return rotations, position + self._lever_m * (rotations[:, :, 2] - [0.0, 0.0, 1.0])
+
+
+@compiled
+def oscillate(target: Array64, frequency_radps: float, damping: float) -> Array64:
+    """Damped oscillators following targets (n, d) one STEP_S each, from rest at the first."""
+    out = np.empty_like(target)
+    for axis in range(target.shape[1]):
+        angle, speed = target[0, axis], 0.0
+        for k in range(target.shape[0]):
+            out[k, axis] = angle
+            pull = frequency_radps**2 * (target[k, axis] - angle) - 2 * damping * frequency_radps * speed
+            speed += STEP_S * pull
+            angle += STEP_S * speed
+    return out

@@ -1,0 +1,76 @@
+"""Paths and the attitude along them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from links.simulated.world.path import DRAG_PER_S, GRAVITY_MPS2, Path, Waypoint, natural_spline
+
+
+def _path(*points: tuple[float, float, float, float], yaw_deg: float = 0.0) -> Path:
+    return Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(x, y, z), yaw_deg=yaw_deg) for t, x, y, z in points))
+
+
+def test_the_spline_meets_its_knots_and_its_derivatives_are_derivatives() -> None:
+    knot_s, knots = np.array([0.0, 1.0, 2.5, 4.0]), np.array([[0.0, 1], [2, 0], [1, 5], [3, 3]])
+    np.testing.assert_allclose(natural_spline(knot_s, knots, knot_s)[0], knots, atol=1e-12)
+    t, d = np.array([0.3, 1.7, 3.2]), 1e-5
+    _, slope, curve = natural_spline(knot_s, knots, t)
+    before, after = natural_spline(knot_s, knots, t - d), natural_spline(knot_s, knots, t + d)
+    np.testing.assert_allclose(slope, (after[0] - before[0]) / (2 * d), atol=1e-6)
+    np.testing.assert_allclose(curve, (after[1] - before[1]) / (2 * d), atol=1e-6)
+    np.testing.assert_allclose(natural_spline(knot_s, knots, np.array([0.0, 4.0]))[2], 0.0, atol=1e-12)
+
+
+def test_a_straight_path_is_flown_at_constant_speed() -> None:
+    position, velocity, acceleration, _ = _path((0, 0, 0, 5), (1, 2, 0, 5), (3, 6, 0, 5)).at(np.array([0.5, 2.0]))
+    np.testing.assert_allclose(position, [[1, 0, 5], [4, 0, 5]], atol=1e-12)
+    np.testing.assert_allclose(velocity, [[2, 0, 0], [2, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(acceleration, 0.0, atol=1e-12)
+
+
+def test_a_hovering_drone_is_level_and_a_flying_one_leans_into_its_drag() -> None:
+    hover, _ = _path((0, 1, 2, 3), yaw_deg=90.0).flying_poses(np.zeros(1))
+    np.testing.assert_allclose(hover[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    lean, _ = _path((0, 0, 0, 5), (4, 32, 0, 5)).flying_poses(np.array([2.0]))
+    assert np.arctan2(lean[0, 0, 2], lean[0, 2, 2]) == pytest.approx(np.arctan2(8 * DRAG_PER_S, GRAVITY_MPS2))
+    np.testing.assert_allclose(lean[0].T @ lean[0], np.eye(3), atol=1e-12)
+    assert np.linalg.det(lean[0]) == pytest.approx(1.0)
+
+
+def test_beyond_its_waypoints_it_stands_still() -> None:
+    position, velocity, _, _ = _path((1, 0, 0, 5), (2, 2, 0, 5)).at(np.array([0.0, 9.0]))
+    np.testing.assert_allclose(position, [[0, 0, 5], [2, 0, 5]])
+    np.testing.assert_allclose(velocity, 0.0)
+
+
+def test_times_that_do_not_grow_are_refused() -> None:
+    with pytest.raises(ValidationError, match="t_s must grow"):
+        _path((0, 0, 0, 1), (0, 1, 0, 1))
+
+
+def test_a_round_closes_smoothly_and_its_yaw_goes_on_by_whole_turns() -> None:
+    corners = [(5, 0), (0, 5), (-5, 0), (0, -5)]
+    points = tuple(Waypoint(t_s=2.0 + 4 * k, xyz_m=(*xy, 6), yaw_deg=90 * k) for k, xy in enumerate(corners))
+    path = Path(waypoints=points, round_s=16.0)
+    t = np.linspace(0.0, 16.0, 50)
+    one, third = path.at(t), path.at(t + 32.0)
+    for a, b in zip(one[:3], third[:3], strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+    np.testing.assert_allclose(third[3] - one[3], 4 * np.pi, atol=1e-9)
+    np.testing.assert_allclose(path.at(np.array([p.t_s for p in points]))[0], [p.xyz_m for p in points], atol=1e-9)
+    seam = path.at(np.array([18.0 - 1e-7, 18.0 + 1e-7]))
+    for values in seam:
+        np.testing.assert_allclose(values[0], values[1], atol=1e-5)
+    still = Path(waypoints=points[:1], round_s=1.0).at(t)
+    np.testing.assert_allclose(still[0], [[5, 0, 6]] * 50)
+
+
+@pytest.mark.parametrize(
+    ("round_s", "says"), [(14.0, "before the first one comes again"), (20.04, "tenths of a second")]
+)
+def test_a_round_that_cannot_be_gone_is_refused(round_s: float, says: str) -> None:
+    with pytest.raises(ValidationError, match=says):
+        Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(t, 0, 5)) for t in (0.0, 14.0)), round_s=round_s)

@@ -35,7 +35,7 @@ from links.mavlink.frames import (
 from links.simulated.autopilot.radio import Radio, RadioSettings
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.world.flight import Flight, FlightSettings
-from links.simulated.world.mesh import Array64
+from stages.geometry import Array64
 
 mavlink: Any = ardupilotmega  # its constructors are spread with starred vectors, which no checker can count
 

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from flow.link import LinkError
 from links.simulated.world.clearance import fits, visible
-from links.simulated.world.mesh import Array64, RayScene
+from links.simulated.world.mesh import RayScene
 from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.procedural import SceneSettings, build_world
 from links.simulated.world.procedural.settings import Kind
+from stages.geometry import Array64
 
 CAMERA_HEIGHT_M = 1.8
 DURATION_S = {"occlusion": 16.0, "return": 24.0, "empty": 30.0}

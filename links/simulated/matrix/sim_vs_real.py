@@ -22,14 +22,17 @@ from numpy.typing import NDArray
 
 from flow.link import Record
 from links.recording import RecordingReader
+from links.simulated.kernels.lidar import echoes
+from links.simulated.kernels.ray_casting import Array32
 from links.simulated.sensors.footprint import FINE, sub_rays
-from links.simulated.sensors.lidar import Lidar, LidarSettings, echoes
+from links.simulated.sensors.lidar import Lidar, LidarSettings
 from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world.drone import DroneModel, drone_mesh
-from links.simulated.world.mesh import Array32, Array64, Mesh, RayScene
+from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.procedural.room import room_mesh
 from links.velodyne import Lidar as Decoder
 from links.velodyne import vlp16
+from stages.geometry import Array64
 from stages.messages import LidarFirings
 
 START_NS = 1_748_773_230_000_000_000

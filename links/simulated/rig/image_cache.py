@@ -30,10 +30,10 @@ from flow.link import LinkError, Record
 from links.recording import CompressedImage, RecordingReader, decode_compressed_image, encode_compressed_image
 from links.simulated.rig.scenario import Scenario
 from links.simulated.sensors.camera import CameraSettings, FrameTimes, wanted_cameras
-from links.simulated.world.mesh import Array64, Mesh
+from links.simulated.world.mesh import Mesh
 from links.simulated.world.procedural import World, build_world
 from links.simulated.world.scene import Truth
-from stages.geometry import quaternions_xyzw
+from stages.geometry import Array64, quaternions_xyzw
 
 NEAR_M = 1e-3  # the same place, on whichever computer
 NEAR_QUATERNION = 1e-4

@@ -42,11 +42,10 @@ from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.sensors.camera import CamerasSettings
 from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry
-from links.simulated.sensors.vlp16_packets import firings_per_packet
-from links.simulated.sensors.vlp16_position import encode_position
-from links.simulated.world.mesh import Array64
+from links.simulated.sensors.vlp16_packets import encode_position, firings_per_packet
 from links.truth import TRUTH_RECORDING
 from links.velodyne import vlp16
+from stages.geometry import Array64
 
 WARM_PACKETS = 75  # a turn of the rotor
 SKIP_NS = 200_000_000  # so far behind, it leaves out what it cannot send in time: packets are lost

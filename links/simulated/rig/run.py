@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.recording import RecordingWriter
 from links.simulated.autopilot.autopilot import Autopilot
+from links.simulated.kernels.lidar import turned_poses
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
 from links.simulated.rig.image_cache import KeptCamera, KeptPictures, world_of
 from links.simulated.rig.scenario import Scenario, load_scenario
@@ -24,18 +25,18 @@ from links.simulated.rig.scripted_servo import ScriptedOperator
 from links.simulated.rig.truth_records import TruthRecords
 from links.simulated.sensors.camera import Camera, build_cameras
 from links.simulated.sensors.camera_paint import Street
-from links.simulated.sensors.lidar import Lidar, turned_poses
+from links.simulated.sensors.lidar import Lidar
 from links.simulated.sensors.servo import ServoBus
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry
 from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world.clearance import check_travel
 from links.simulated.world.flight import Flight
-from links.simulated.world.mesh import Array64
 from links.simulated.world.path import Path
 from links.simulated.world.scene import Scene, Truth, drone_shapes
 from links.simulated.world.suspension import Ride
 from links.simulated.world.vehicle import vehicle_mesh, vehicle_mesh_from_camera
 from links.velodyne import vlp16
+from stages.geometry import Array64
 
 BATCH_PACKETS = 32  # pulses are cast in batches; how many does not change a byte
 

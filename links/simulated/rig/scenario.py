@@ -23,13 +23,12 @@ from links.simulated.sensors.lidar import LidarSettings
 from links.simulated.sensors.servo import ServoSettings
 from links.simulated.sensors.vehicle_odometry import VehicleOdometrySettings
 from links.simulated.world.drone import DroneModel, drone_mesh
-from links.simulated.world.mesh import Array64
 from links.simulated.world.path import Path
 from links.simulated.world.procedural import SceneSettings
 from links.simulated.world.suspension import RideSettings
 from links.simulated.world.vehicle import vehicle_mesh_from_camera
 from links.simulated.world.weather import Weather
-from stages.geometry import LidarMount, Pose
+from stages.geometry import Array64, LidarMount, Pose
 
 CLEARANCE_M = 0.3  # a path may not come nearer to the road
 WHEELS_M = 0.15  # a vehicle bounces on its springs by no more

@@ -21,11 +21,11 @@ from links.simulated.sensors.camera_paint import Street
 from links.simulated.sensors.camera_rays import CameraScene
 from links.simulated.sensors.camera_sensor import SensorSettings, auto_exposure, develop, encode_jpeg, transmission
 from links.simulated.sensors.camera_view import PixelRays, Shutter, View, mean_radiance, render
-from links.simulated.world.mesh import Array64, Mesh, RayScene
+from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.scene import Scene
 from links.simulated.world.sky import light
 from links.simulated.world.weather import Weather
-from stages.geometry import Pose, Vector3, quaternions_xyzw, rotation_from_rpy_deg
+from stages.geometry import Array64, Pose, Vector3, quaternions_xyzw, rotation_from_rpy_deg
 from stages.lens import Equidistant, KannalaBrandt, Lens, OCam
 
 LOOKS_UP = Pose(rpy_deg=(0.0, 0.0, 90.0))  # the image's top is forward, its right is left

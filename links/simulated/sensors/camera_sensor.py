@@ -14,13 +14,13 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from links.simulated.world.mesh import Array32, Array64
-from stages.compiled import compiled
+from links.simulated.kernels.camera_image import STEPS, digitise
+from links.simulated.kernels.ray_casting import Array32
+from stages.geometry import Array64
 
 GREY = 0.22  # where auto exposure puts the mean, of saturation
 ELECTRONS_PER_S = 1e7  # of radiance 1, white in full sun: full well in 1 ms
 GAMMA = 2.2
-STEPS = 4096  # of the analogue-to-digital converter
 EDGE_RAD = math.radians(1.5)  # the lens's own rim is not sharp
 
 
@@ -61,25 +61,10 @@ def develop(
     """8-bit image (h, w, 3) of a radiance image that has passed the lens."""
     noise = rng.standard_normal(radiance.shape, dtype=np.float32)
     code = np.rint(255 * (np.arange(STEPS) / (STEPS - 1)) ** (1 / GAMMA)).astype(np.uint8)
-    return _develop(
+    return digitise(
         radiance, noise, ELECTRONS_PER_S * exposure_s, settings.full_well_e, settings.read_noise_e,
         1.0 if settings.shot_noise else 0.0, gain, code,
     )  # fmt: skip
-
-
-@compiled
-def _develop(radiance, noise, electrons, full_well, read_noise, shot, gain, code):
-    """e = L S t; measured e + N(0, e + read^2); value = gain e / full well, quantised, through gamma."""
-    height, width, channels = radiance.shape
-    out = np.empty(radiance.shape, dtype=np.uint8)
-    for i in range(height):
-        for j in range(width):
-            for k in range(channels):
-                e = min(radiance[i, j, k] * electrons, full_well)
-                e += noise[i, j, k] * math.sqrt(shot * e + read_noise * read_noise)
-                value = int(e * gain / full_well * (STEPS - 1) + 0.5)
-                out[i, j, k] = code[min(max(value, 0), STEPS - 1)]
-    return out
 
 
 def encode_jpeg(image_rgb: NDArray[np.uint8], quality: int) -> bytes:

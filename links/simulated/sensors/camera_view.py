@@ -15,14 +15,15 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from links.simulated.sensors.camera_rays import WORLD, CameraScene, Samples, edges, image_motion
-from links.simulated.world.mesh import Array32, Array64
-from stages.compiled import compiled
+from links.simulated.kernels.camera_image import FEW, pixel_rays
+from links.simulated.kernels.camera_rays import edges, image_motion
+from links.simulated.kernels.ray_casting import Array32
+from links.simulated.sensors.camera_rays import LEAF_ROW, WORLD, CameraScene, Samples
+from stages.geometry import Array64
 from stages.lens import Equidistant, KannalaBrandt, OCam
 
 BATCH_RAYS = 262_144
-FEW, MANY = 3, 16  # further rays through a pixel that needs them
-RING_PX = 0.36  # the few lie on a circle about the pixel's middle, whose ray counts with them
+MANY = 16  # rays through a pixel that needs more than FEW
 BLUR_PX = 0.5  # a pixel that moves farther than this during the exposure is averaged over it
 LONG_BLUR_PX = 2.0
 TINY_PX = 16.0  # a small body that appears smaller than this across its radius may slip between the first rays
@@ -139,7 +140,7 @@ def _where_more(
     pixels = view.pixels
     few = edges(
         pixels.rows, pixels.columns, pixels.index,
-        seen.normals, seen.points, seen.ranges, seen.body, seen.surface, seen.lit, colours,
+        seen.normals, seen.points, seen.ranges, seen.body, seen.surface, seen.lit, colours, LEAF_ROW,
     )  # fmt: skip
     own = seen.body == view.own + 1
     few |= (seen.body > WORLD) & ~own
@@ -196,33 +197,4 @@ def world_rays(
     Kensler, Correlated multi-jittered sampling, Pixar 13-01 (2013), the canonical arrangement.
     """
     placed = np.full((len(pick), 1, 2), 0.5, dtype=np.float32) if jitter is None else jitter
-    return _world_rays(pick, placed, moment, R, t, pixels.direction, pixels.per_column, pixels.per_row)
-
-
-@compiled
-def _world_rays(pick, jitter, moment, R, t, direction, per_column, per_row):
-    rays_each = jitter.shape[1]
-    grid = round(math.sqrt(rays_each))
-    origins = np.empty((len(pick) * rays_each, 3), dtype=np.float32)
-    directions = np.empty((len(pick) * rays_each, 3), dtype=np.float32)
-    d = np.empty(3)
-    for i in range(len(pick)):
-        p = pick[i]
-        for k in range(rays_each):
-            if rays_each == FEW:
-                turn = 2.0 * math.pi * (k + jitter[i, k, 0]) / FEW
-                x, y = RING_PX * math.cos(turn), RING_PX * math.sin(turn)
-            else:
-                x = (k % grid + (k // grid + jitter[i, k, 0]) / grid) / grid - 0.5
-                y = (k // grid + (k % grid + jitter[i, k, 1]) / grid) / grid - 0.5
-            square = 0.0
-            for j in range(3):
-                d[j] = direction[p, j] + x * per_column[p, j] + y * per_row[p, j]
-                square += d[j] * d[j]
-            scale = 1.0 / math.sqrt(square)
-            n = i * rays_each + k
-            r = R[moment[n]]
-            for j in range(3):
-                directions[n, j] = scale * (r[j, 0] * d[0] + r[j, 1] * d[1] + r[j, 2] * d[2])
-                origins[n, j] = t[moment[n], j]
-    return origins, directions
+    return pixel_rays(pick, placed, moment, R, t, pixels.direction, pixels.per_column, pixels.per_row)

@@ -17,10 +17,9 @@ from __future__ import annotations
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from links.simulated.world.mesh import Array64
-from links.simulated.world.path import rotations_z
-from links.simulated.world.quaternion import rotations_from_vectors
-from links.simulated.world.series import between_steps, gauss_markov, random_walk, smoothed
+from links.simulated.kernels.motion import rotations_z
+from links.simulated.world.motion import between_steps, gauss_markov, random_walk, rotations_from_vectors, smoothed
+from stages.geometry import Array64
 
 STEP_S = 0.01
 SMOOTH_S = 1.0  # a filter passes no error on faster than this

@@ -33,7 +33,7 @@ from links.dynamixel import mx28
 from links.simulated.sensors import protocol2
 from links.simulated.sensors.mx28 import SimulatedMx28
 from links.simulated.sensors.servo import ServoSettings
-from links.simulated.world.mesh import Array64
+from stages.geometry import Array64
 
 IDLE_S = 0.02  # how often the servo moves on without being asked
 MOST_WAITING = 4096  # bytes of a packet that does not end

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from links.simulated.world.mesh import Array32, Array64
+from links.simulated.kernels import lidar as kernels
+from links.simulated.kernels.ray_casting import Array32
 from links.velodyne import vlp16
-from stages.compiled import compiled
+from stages.geometry import Array64
 
 ELEVATION_RAD = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))
 VERTICAL_OFFSET_M = 1e-3 * np.array(vlp16.VERTICAL_OFFSET_MM)
-FOOTPRINT_RAD = (3.0e-3, 1.5e-3)  # full width along the scan, across it
-APERTURE_M = (12.7e-3, 9.5e-3)  # the beam where it leaves the sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,19 +46,6 @@ FOOTPRINTS = {"dense": (COARSE, FINE), "sparse": (DIAGONAL, MEDIUM)}
 COARSE_SPREAD_M = 0.3  # a pulse whose coarse sub-rays differ by more sees an edge and is cast again, finely
 
 
-@compiled
-def sees_edge(ranges_m: Array32, spread_m: float) -> NDArray[np.bool_]:
-    """Pulses (n,) whose sub-rays (n, k) differ by more than the spread, or of which only some meet anything."""
-    found = np.zeros(len(ranges_m), dtype=np.bool_)
-    for i in range(len(ranges_m)):
-        lowest = highest = ranges_m[i, 0]
-        for r in ranges_m[i]:
-            lowest, highest = min(lowest, r), max(highest, r)
-        found[i] = np.isfinite(lowest) and highest > lowest + np.float32(spread_m)
-    return found
-
-
-@compiled
 def sub_rays(
     azimuth_rad: Array64,
     laser: NDArray[np.intp],
@@ -67,31 +53,6 @@ def sub_rays(
     t_world_lidar_m: Array64,
     offsets: Array64,
 ) -> tuple[Array32, Array32]:
-    """Origins and unit directions (n, k, 3) in the world of the sub-rays of pulses (n,).
-
-    Axis in the lidar frame: (cos w sin a, cos w cos a, sin w), from (0, 0, vertical offset of the laser).
-    """
-    count, rays = len(azimuth_rad), len(offsets)
-    origins = np.empty((count, rays, 3), dtype=np.float32)
-    directions = np.empty((count, rays, 3), dtype=np.float32)
-    ray, start = np.empty(3), np.empty(3)
-    for i in range(count):
-        ca, sa = np.cos(azimuth_rad[i]), np.sin(azimuth_rad[i])
-        cw, sw = np.cos(ELEVATION_RAD[laser[i]]), np.sin(ELEVATION_RAD[laser[i]])
-        R = R_world_lidar[i]
-        for k in range(rays):
-            u, v = offsets[k]
-            turn, lift = u * FOOTPRINT_RAD[0] / 2, v * FOOTPRINT_RAD[1] / 2
-            across, up = u * APERTURE_M[0] / 2, v * APERTURE_M[1] / 2
-            # axis + turn * e_across + lift * e_up, with e_across = (ca, -sa, 0) and e_up = (-sw sa, -sw ca, cw)
-            ray[0] = cw * sa + turn * ca - lift * sw * sa
-            ray[1] = cw * ca - turn * sa - lift * sw * ca
-            ray[2] = sw + lift * cw
-            ray /= np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-            start[0] = across * ca - up * sw * sa
-            start[1] = -across * sa - up * sw * ca
-            start[2] = VERTICAL_OFFSET_M[laser[i]] + up * cw
-            for j in range(3):
-                directions[i, k, j] = R[j, 0] * ray[0] + R[j, 1] * ray[1] + R[j, 2] * ray[2]
-                origins[i, k, j] = t_world_lidar_m[i, j] + R[j, 0] * start[0] + R[j, 1] * start[1] + R[j, 2] * start[2]
-    return origins, directions
+    """Origins and unit directions (n, k, 3) in the world of the sub-rays of pulses (n,)."""
+    elevation_rad, offset_m = ELEVATION_RAD[laser], VERTICAL_OFFSET_M[laser]
+    return kernels.sub_rays(azimuth_rad, elevation_rad, offset_m, R_world_lidar, t_world_lidar_m, offsets)

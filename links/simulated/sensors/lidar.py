@@ -14,22 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from links.simulated.sensors.footprint import (
-    APERTURE_M,
-    COARSE_SPREAD_M,
-    FINE,
-    FOOTPRINT_RAD,
-    FOOTPRINTS,
-    sees_edge,
-    sub_rays,
-)
-from links.simulated.world.mesh import Array32, Array64
+from links.simulated.kernels.lidar import APERTURE_M, FOOTPRINT_RAD, PULSE_LENGTH_M, echoes, sees_edge
+from links.simulated.kernels.ray_casting import Array32
+from links.simulated.sensors.footprint import COARSE_SPREAD_M, FINE, FOOTPRINTS, sub_rays
 from links.simulated.world.weather import RainClutter, Weather
 from links.velodyne import vlp16
-from stages.compiled import compiled
+from stages.geometry import Array64
 
 RANGE_STEP_M = 1e-3 * vlp16.RANGE_UNIT_MM
-PULSE_LENGTH_M = 1.0  # two surfaces closer than this in range give one, blended return
 
 
 def _is_dense(footprint: str) -> bool:
@@ -173,104 +165,3 @@ class Lidar:
             drone = np.column_stack([drone, np.zeros(len(drone), dtype=np.uint8)])
             shares = np.append(shares, 1.0)
         return echoes(ranges, fractions, drone, shares, threshold, s.min_range_m, s.return_mode)
-
-
-@compiled
-def turned_poses(
-    R_world_vehicle: Array64,
-    t_world_vehicle_m: Array64,
-    T_vehicle_turntable: Array64,
-    turned_rad: Array64,
-    T_turntable_lidar: Array64,
-) -> tuple[Array64, Array64]:
-    """T_world_lidar = T_world_vehicle T_vehicle_turntable Rz(turned) T_turntable_lidar: (n, 3, 3) and (n, 3)."""
-    count = len(turned_rad)
-    rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))
-    turned, mounted = np.empty((3, 4)), np.empty((3, 4))
-    for n in range(count):
-        c, s = np.cos(turned_rad[n]), np.sin(turned_rad[n])
-        for j in range(4):
-            x, y, z = T_turntable_lidar[0, j], T_turntable_lidar[1, j], T_turntable_lidar[2, j]
-            turned[0, j], turned[1, j], turned[2, j] = c * x - s * y, s * x + c * y, z
-        for i in range(3):
-            for j in range(4):
-                mounted[i, j] = T_vehicle_turntable[i, 3] if j == 3 else 0.0
-                for k in range(3):
-                    mounted[i, j] += T_vehicle_turntable[i, k] * turned[k, j]
-        for i in range(3):
-            for j in range(3):
-                rotations[n, i, j] = 0.0
-                for k in range(3):
-                    rotations[n, i, j] += R_world_vehicle[n, i, k] * mounted[k, j]
-            positions[n, i] = t_world_vehicle_m[n, i]
-            for k in range(3):
-                positions[n, i] += R_world_vehicle[n, i, k] * mounted[k, 3]
-    return rotations, positions
-
-
-@compiled
-def echoes(
-    ranges_m: Array32,
-    fractions: Array32,
-    drone: NDArray[np.uint8],
-    shares: Array64,
-    threshold: Array64,
-    min_range_m: float,
-    return_mode: str,
-) -> tuple[Array64, Array64, Array64, NDArray[np.uint8]]:
-    """What pulses (of n, with k sub-rays) return: range, power, power from a drone, and from which (0: none; of two in
-    one echo the farther), each (1, n), in dual mode (2, n).
-
-    Sub-rays sorted by range join into one echo while the next is within the pulse length of the one before; its range
-    is the mean weighted by power = share * fraction / range^2. Echoes weaker than the pulse's threshold (n,), and
-    those nearer than the shortest range, are not seen. Dual mode gives the strongest echo, then the last one; when the
-    strongest is the last, the second strongest, then the last; with one echo, that one twice (user manual, 9.3).
-    """
-    count, rays = ranges_m.shape
-    rows = 2 if return_mode == "dual" else 1
-    result = np.zeros((rows, count))
-    power = np.zeros((rows, count))
-    from_drone = np.zeros((rows, count))
-    which = np.zeros((rows, count), dtype=np.uint8)
-    order = np.empty(rays, dtype=np.int64)
-    echo_range, echo_power, echo_drone = np.empty(rays), np.empty(rays), np.empty(rays)
-    echo_which = np.empty(rays, dtype=np.uint8)
-    for i in range(count):
-        for k in range(rays):  # insertion sort: few, and mostly sorted
-            j = k
-            while j > 0 and ranges_m[i, order[j - 1]] > ranges_m[i, k]:
-                order[j] = order[j - 1]
-                j -= 1
-            order[j] = k
-        found, previous = -1, -np.inf
-        for k in order:
-            r = float(ranges_m[i, k])
-            if not np.isfinite(r):
-                break
-            if r - previous > PULSE_LENGTH_M:
-                if found < 0 or echo_power[found] >= threshold[i]:  # a weaker echo's place is used again
-                    found += 1
-                echo_range[found], echo_power[found], echo_drone[found], echo_which[found] = 0.0, 0.0, 0.0, 0
-            previous = r
-            if r >= min_range_m:
-                p = shares[k] * fractions[i, k] / (r * r)
-                echo_range[found] += p * r
-                echo_power[found] += p
-                if drone[i, k]:
-                    echo_drone[found] += p
-                    echo_which[found] = drone[i, k]
-        if found >= 0 and echo_power[found] < threshold[i]:
-            found -= 1
-        if found < 0:
-            continue
-        last, strongest = found, np.argmax(echo_power[: found + 1])
-        if return_mode == "dual" and strongest == last and last > 0:
-            strongest = np.argmax(echo_power[:last])
-        first = last if return_mode == "last" else strongest
-        for row in range(rows):
-            e = first if row == 0 else last
-            result[row, i] = echo_range[e] / echo_power[e]
-            power[row, i] = echo_power[e]
-            from_drone[row, i] = echo_drone[e]
-            which[row, i] = echo_which[e]
-    return result, power, from_drone, which

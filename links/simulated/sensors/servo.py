@@ -23,8 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from flow.link import Record
 from links.dynamixel.servo import TICK_RAD, VELOCITY_UNIT_RADPS
-from links.simulated.world.mesh import Array64
-from stages.geometry import Harmonic
+from stages.geometry import Array64, Harmonic
 
 RPM_RADPS = 2 * math.pi / 60
 STEP_NS = 1_000_000

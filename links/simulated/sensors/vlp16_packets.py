@@ -6,12 +6,16 @@ links/velodyne/vlp16.py. Written from the manual with numpy's structured types, 
 
 from __future__ import annotations
 
+import datetime
+
 import numpy as np
 from numpy.typing import NDArray
 
 from links.velodyne import vlp16
 
 FIRINGS_PER_BLOCK = 2
+TIMESTAMP_AT, PPS_AT, NMEA_AT = 198, 202, 206  # in a position packet's payload
+LOCKED = 2  # PPS status
 RETURN_MODE_BYTE = {"strongest": vlp16.STRONGEST, "last": vlp16.LAST, "dual": vlp16.DUAL}
 
 _CHANNEL = [("range", "<u2"), ("reflectivity", "u1")]
@@ -57,3 +61,18 @@ def encode_packet(
     packet["mode"] = RETURN_MODE_BYTE[mode]
     packet["product"] = vlp16.PRODUCT_ID
     return packet.tobytes()
+
+
+def encode_position(at_ns: int) -> bytes:
+    """What the sensor sends at a UTC [ns since 1970]: its microsecond past the hour, PPS locked, the second's GPRMC."""
+    second = datetime.datetime.fromtimestamp(at_ns // 1_000_000_000, datetime.UTC)
+    body = f"GPRMC,{second:%H%M%S},A,3542.1234,N,13946.1234,E,000.0,000.0,{second:%d%m%y},,,A"
+    parity = 0
+    for character in body:
+        parity ^= ord(character)
+    packet = bytearray(vlp16.POSITION_BYTES)
+    packet[TIMESTAMP_AT : TIMESTAMP_AT + 4] = (at_ns // 1000 % vlp16.HOUR_US).to_bytes(4, "little")
+    packet[PPS_AT] = LOCKED
+    sentence = f"${body}*{parity:02X}\r\n".encode("ascii")
+    packet[NMEA_AT : NMEA_AT + len(sentence)] = sentence
+    return bytes(packet)

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.link import LinkError
-from links.simulated.world.mesh import Array64, RayScene
+from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
+from stages.geometry import Array64
 
 SAMPLE_S = 0.05
 SKY_M = 300.0  # nothing in a scene is higher or wider

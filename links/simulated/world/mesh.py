@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flow.link import LinkError
-from stages.compiled import compiled
+from links.simulated.kernels.ray_casting import Array32, ranges_and_fractions
 from stages.geometry import Array64
 
 try:
@@ -20,10 +20,6 @@ try:
     from embreex.rtcore_scene import EmbreeScene
 except ImportError as error:
     raise LinkError("the simulator needs embreex: pip install -e '.[simulate]'") from error
-
-Array32 = NDArray[np.float32]
-
-GLOSS_EXPONENT = 60  # a glossy lobe a few degrees wide around normal incidence
 
 SURFACES: dict[str, tuple[float, float]] = {  # name: (diffuse reflectivity, mirror-like part)
     "asphalt": (0.16, 0.0),
@@ -147,7 +143,7 @@ class RayScene:
         """
         limit = np.broadcast_to(np.asarray(max_range_m, dtype=np.float32), len(origins)).copy()
         hit = self._scene.run(origins, directions, dists=limit, output=True)
-        return _answers(directions, hit["tfar"], hit["primID"], hit["Ng"], self._diffuse, self._gloss)
+        return ranges_and_fractions(directions, hit["tfar"], hit["primID"], hit["Ng"], self._diffuse, self._gloss)
 
     def hits(
         self, origins: Array32, directions: Array32, max_range_m: float
@@ -161,25 +157,3 @@ class RayScene:
         """Whether rays (n, 3) meet anything at all."""
         limit = np.full(len(origins), max_range_m, dtype=np.float32)
         return self._scene.run(origins, directions, dists=limit, query="OCCLUDED") != -1
-
-
-@compiled
-def _answers(
-    directions: Array32,
-    hit_m: Array32,
-    face: NDArray[np.int32],
-    normal: Array32,
-    diffuse: Array32,
-    gloss: Array32,
-) -> tuple[Array32, Array32]:
-    ranges = np.full(len(face), np.inf, dtype=np.float32)
-    fractions = np.zeros(len(face), dtype=np.float32)
-    for i in range(len(face)):
-        if face[i] < 0:
-            continue
-        n, d = normal[i], directions[i]
-        along = abs(n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
-        cosine = along / max(np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2), 1e-20)
-        ranges[i] = hit_m[i]
-        fractions[i] = diffuse[face[i]] * cosine + gloss[face[i]] * cosine**GLOSS_EXPONENT
-    return ranges, fractions

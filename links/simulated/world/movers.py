@@ -14,8 +14,9 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from links.simulated.world.mesh import Array64, Mesh, box, merge, quads, rod
-from links.simulated.world.path import rotations_z
+from links.simulated.kernels.motion import rotations_z
+from links.simulated.world.mesh import Mesh, box, merge, quads, rod
+from stages.geometry import Array64
 
 FLAP_STEPS = 8
 

@@ -13,11 +13,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.interpolate import CubicSpline
 
-from links.simulated.world.mesh import Array64
-from stages.compiled import compiled
-
-GRAVITY_MPS2 = 9.81
-DRAG_PER_S = 0.3  # drag acceleration per speed of a small quadrotor
+from links.simulated.kernels.motion import DRAG_PER_S, GRAVITY_MPS2, evaluate_cubics, rotations_z
+from stages.geometry import Array64
 
 
 class Waypoint(BaseModel):
@@ -79,18 +76,6 @@ class Path(BaseModel):
         return np.stack([np.cross(left, up), left, up], axis=2), position
 
 
-@compiled
-def rotations_z(angle_rad: Array64) -> Array64:
-    """Rz for each angle: (n, 3, 3)."""
-    rotations = np.zeros((len(angle_rad), 3, 3))
-    for i in range(len(angle_rad)):
-        c, s = np.cos(angle_rad[i]), np.sin(angle_rad[i])
-        rotations[i, 0, 0], rotations[i, 0, 1] = c, -s
-        rotations[i, 1, 0], rotations[i, 1, 1] = s, c
-        rotations[i, 2, 2] = 1.0
-    return rotations
-
-
 def natural_spline(knot_s: Array64, knots: Array64, time_s: Array64) -> tuple[Array64, Array64, Array64]:
     """Value, first and second derivative (n, d) at `time_s` of the natural cubic spline through knots (k, d).
 
@@ -113,7 +98,7 @@ def natural_spline(knot_s: Array64, knots: Array64, time_s: Array64) -> tuple[Ar
     M = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
     linear = chord - h * (2 * M[:-1] + M[1:]) / 6
     cubic = (M[1:] - M[:-1]) / (6 * h)
-    return _along(knot_s, knots, linear, M, cubic, time_s)
+    return evaluate_cubics(knot_s, knots, linear, M, cubic, time_s)
 
 
 def round_spline(knot_s: Array64, knots: Array64, round_s: float, time_s: Array64) -> tuple[Array64, Array64, Array64]:
@@ -125,22 +110,3 @@ def round_spline(knot_s: Array64, knots: Array64, round_s: float, time_s: Array6
     closed[-1] = closed[0]  # to the last bit
     spline = CubicSpline(closed_s, closed, bc_type="periodic")
     return spline(time_s) + drift * time_s[:, None], spline(time_s, 1) + drift, spline(time_s, 2)
-
-
-@compiled
-def _along(
-    knot_s: Array64, knots: Array64, linear: Array64, M: Array64, cubic: Array64, time_s: Array64
-) -> tuple[Array64, Array64, Array64]:
-    """y_i + s (linear_i + s (M_i / 2 + s cubic_i)) with s = t - t_i, and its derivatives."""
-    shape = (len(time_s), knots.shape[1])
-    value, slope, curve = np.empty(shape), np.zeros(shape), np.zeros(shape)
-    for n in range(len(time_s)):
-        t = min(max(time_s[n], knot_s[0]), knot_s[-1])
-        i = min(max(np.searchsorted(knot_s, t, side="right") - 1, 0), len(knot_s) - 2)
-        s = t - knot_s[i]
-        for d in range(knots.shape[1]):
-            value[n, d] = knots[i, d] + s * (linear[i, d] + s * (M[i, d] / 2 + s * cubic[i, d]))
-            if t == time_s[n]:
-                slope[n, d] = linear[i, d] + s * (M[i, d] + 3 * s * cubic[i, d])
-                curve[n, d] = M[i, d] + 6 * s * cubic[i, d]
-    return value, slope, curve

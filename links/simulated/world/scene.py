@@ -14,19 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from links.simulated.kernels.ray_casting import Array32, into_body, keep_nearer, rays_near
 from links.simulated.world.drone import BLADES, DroneModel, drone_mesh
 from links.simulated.world.flight import Flight
-from links.simulated.world.mesh import Array32, Array64, Mesh, RayScene
+from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.movers import Mover
 from links.simulated.world.path import Path
 from links.simulated.world.suspension import Ride
-from stages.compiled import compiled
+from stages.geometry import Array64
 
 ROTOR_HZ = 95.0
 ROTOR_STEPS = 8  # standing positions of the blades within half a turn
 TOP_SPEED_MPS = 50.0  # neither drone nor vehicle is faster
 BOX_MARGIN_M = 0.01
-BEAM_SPREAD = 0.002  # a beam's half width, a little more, per metre
 BEAM_START_M = 0.01  # and where it leaves the sensor
 
 
@@ -100,12 +100,12 @@ class Body:
         middle = pulse_ns[len(pulse_ns) // 2 : len(pulse_ns) // 2 + 1]
         away_s = 1e-9 * max(int(pulse_ns.max() - middle[0]), int(middle[0] - pulse_ns.min()))
         reach_m = self.radius_m + BEAM_START_M
-        maybe = passes(self.pose(middle)[1], origins_m, directions, reach_m + self.speed_mps * away_s)
+        maybe = rays_near(self.pose(middle)[1], origins_m, directions, reach_m + self.speed_mps * away_s)
         if len(maybe) == 0:
             return maybe, np.empty((0, 3, 3)), np.empty((0, 3))
         R, t = self.pose(pulse_ns[maybe])
         if self.small:
-            close = passes(t, origins_m[maybe], directions[maybe], reach_m)
+            close = rays_near(t, origins_m[maybe], directions[maybe], reach_m)
             maybe, R, t = maybe[close], R[close], t[close]
         return maybe, R, t
 
@@ -172,10 +172,10 @@ class Scene:
                 target = ray[of_shape]
                 if len(target):
                     found = scene.cast(origins[of_shape], directions[of_shape], max_range_m)
-                    nearer = _keep_nearer(target, *found, ranges, fractions)
+                    nearer = keep_nearer(target, *found, ranges, fractions)
                     drone[nearer] = body.drone
         limit = np.minimum(ranges, np.float32(max_range_m))  # embree is quick about rays that end near
-        drone[_keep_nearer(None, *self.world.cast(flat_o, flat_d, limit), ranges, fractions)] = 0
+        drone[keep_nearer(None, *self.world.cast(flat_o, flat_d, limit), ranges, fractions)] = 0
         return ranges.reshape(-1, rays), fractions.reshape(-1, rays), drone.reshape(-1, rays)
 
     def near_small_body(
@@ -193,79 +193,3 @@ def drone_shapes(span_m: float, model: DroneModel) -> tuple[Mesh, ...]:
     """The drone with its blades in each of their standing positions."""
     steps = np.arange(ROTOR_STEPS) * 2 * np.pi / BLADES / ROTOR_STEPS
     return tuple(drone_mesh(span_m, float(step), model) for step in steps)
-
-
-@compiled
-def _keep_nearer(
-    target: NDArray[np.intp] | None, found_m: Array32, fraction: Array32, ranges_m: Array32, fractions: Array32
-) -> NDArray[np.intp]:
-    """Write hits of the target rays (all rays: None) over farther ones; which rays (m,) that were."""
-    written = np.empty(len(found_m), dtype=np.intp)
-    count = 0
-    for i in range(len(found_m)):
-        ray = i if target is None else target[i]
-        if found_m[i] < np.inf and found_m[i] <= ranges_m[ray]:
-            ranges_m[ray], fractions[ray] = found_m[i], fraction[i]
-            written[count] = ray
-            count += 1
-    return written[:count]
-
-
-@compiled
-def passes(target_m: Array64, origins_m: Array32, directions: Array32, reach_m: float) -> NDArray[np.intp]:
-    """Rays (n, 3) that pass the target, one (1, 3) or each its own (n, 3), within the reach and the beam's spread.
-
-    A ray that starts within the reach passes it, too.
-    """
-    found = np.empty(len(directions), dtype=np.intp)
-    count, step = 0, 1 if len(target_m) > 1 else 0
-    for i in range(len(directions)):
-        x = target_m[step * i, 0] - origins_m[i, 0]
-        y = target_m[step * i, 1] - origins_m[i, 1]
-        z = target_m[step * i, 2] - origins_m[i, 2]
-        ahead = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
-        away_squared = x * x + y * y + z * z
-        reach = reach_m + BEAM_SPREAD * abs(ahead)
-        if away_squared - ahead * ahead < reach * reach and (ahead > 0 or away_squared < reach * reach):
-            found[count] = i
-            count += 1
-    return found[:count]
-
-
-@compiled
-def into_body(
-    R_world_body: Array64,
-    t_world_body_m: Array64,
-    origins_world_m: Array32,
-    directions_world: Array32,
-    pick: NDArray[np.intp],
-    low_m: Array64,
-    high_m: Array64,
-) -> tuple[Array32, Array32, NDArray[np.intp]]:
-    """Sub-rays of the picked pulses in the body's frame, R^T (p - t), those that meet its box, and their flat number.
-
-    Poses are one for each picked pulse, or one for all; rays are (n, k, 3), the flat number counts in (n, k).
-    """
-    rays = origins_world_m.shape[1]
-    origins = np.empty((len(pick) * rays, 3), dtype=np.float32)
-    directions = np.empty((len(pick) * rays, 3), dtype=np.float32)
-    number = np.empty(len(pick) * rays, dtype=np.intp)
-    o, d = np.empty(3), np.empty(3)
-    count, step = 0, 1 if len(t_world_body_m) > 1 else 0
-    for i in range(len(pick)):
-        R, t = R_world_body[step * i], t_world_body_m[step * i]
-        for k in range(rays):
-            p, q = origins_world_m[pick[i], k], directions_world[pick[i], k]
-            enter, leave = 0.0, np.inf
-            for j in range(3):
-                o[j] = R[0, j] * (p[0] - t[0]) + R[1, j] * (p[1] - t[1]) + R[2, j] * (p[2] - t[2])
-                d[j] = R[0, j] * q[0] + R[1, j] * q[1] + R[2, j] * q[2]
-                slope = d[j] if abs(d[j]) > 1e-12 else 1e-12
-                a, b = (low_m[j] - o[j]) / slope, (high_m[j] - o[j]) / slope
-                enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
-            if enter <= leave:
-                for j in range(3):
-                    origins[count, j], directions[count, j] = o[j], d[j]
-                number[count] = pick[i] * rays + k
-                count += 1
-    return origins[:count], directions[:count], number[:count]

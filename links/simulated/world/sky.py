@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from links.simulated.world.mesh import Array32, Array64
+from links.simulated.kernels.camera_paint import LOWEST_SKY_DEG, SKY_PX
+from links.simulated.kernels.ray_casting import Array32
 from links.simulated.world.weather import Weather
+from stages.geometry import Array64
 
-SKY_PX = 768  # side of the sky map; its middle is the zenith, its inner circle reaches LOWEST_SKY_DEG below the horizon
-LOWEST_SKY_DEG = 6.0
 WAVELENGTH_NM = 550.0
 DAWN_DEG = (-8.0, 12.0)  # sun elevations between which daylight grows from near nothing to full
 

@@ -15,13 +15,11 @@ from __future__ import annotations
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from links.simulated.world.mesh import Array64
-from links.simulated.world.path import Path, rotations_z
-from links.simulated.world.quaternion import rotations_from_vectors
-from links.simulated.world.series import between_steps, gauss_markov
-from stages.compiled import compiled
+from links.simulated.kernels.motion import STEP_S, oscillate, rotations_z
+from links.simulated.world.motion import between_steps, gauss_markov, rotations_from_vectors
+from links.simulated.world.path import Path
+from stages.geometry import Array64
 
-STEP_S = 0.0025
 BEYOND_S = 1.0
 ROUGHNESS_TIME_S = 0.1
 ROLLING_MPS = 3.0  # from this speed on the road shakes it fully
@@ -62,17 +60,3 @@ class Ride:
         tilt = between_steps(self._tilt, STEP_S, time_s)
         rotations = level @ rotations_from_vectors(np.pad(tilt, ((0, 0), (0, 1))))
         return rotations, position + self._lever_m * (rotations[:, :, 2] - [0.0, 0.0, 1.0])
-
-
-@compiled
-def oscillate(target: Array64, frequency_radps: float, damping: float) -> Array64:
-    """Damped oscillators following targets (n, d) one STEP_S each, from rest at the first."""
-    out = np.empty_like(target)
-    for axis in range(target.shape[1]):
-        angle, speed = target[0, axis], 0.0
-        for k in range(target.shape[0]):
-            out[k, axis] = angle
-            pull = frequency_radps**2 * (target[k, axis] - angle) - 2 * damping * frequency_radps * speed
-            speed += STEP_S * pull
-            angle += STEP_S * speed
-    return out

@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.random import Generator
 
-from links.simulated.world.mesh import Array64, Mesh, box
+from links.simulated.world.mesh import Mesh, box
 from links.simulated.world.procedural.parts import dashes, grove, house_row
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, Clear, SceneSettings
 from links.simulated.world.procedural.street import ground, parked_cars, poles_and_wires, road_marks, with_parking
-from stages.geometry import rotation_z
+from stages.geometry import Array64, rotation_z
 
 FAMILIES = 4
 APART_DEG = 14.0  # two families, and a family and the road, differ by at least this

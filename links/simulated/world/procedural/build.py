@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
-from links.simulated.world.mesh import Array64, Mesh, merge
+from links.simulated.world.mesh import Mesh, merge
 from links.simulated.world.movers import Car, Mover, draw_balloon, draw_bird
 from links.simulated.world.procedural.atlanta import atlanta
 from links.simulated.world.procedural.open_scenes import campus, open_lot, park_edge
 from links.simulated.world.procedural.parts import car
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, Clear, Kind, SceneSettings
 from links.simulated.world.procedural.street import manhattan, street
-from stages.geometry import rotation_z
+from stages.geometry import Array64, rotation_z
 
 KINDS: dict[Kind, Callable[[SceneSettings, Clear, Generator], list[Mesh]]] = {
     "street": street,

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.random import Generator
 
-from links.simulated.world.mesh import Array64, Mesh, box, rod
+from links.simulated.world.mesh import Mesh, box, rod
 from links.simulated.world.procedural.parts import (
     MARK_ABOVE_M,
     building,
@@ -25,7 +25,7 @@ from links.simulated.world.procedural.parts import (
 )
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, Clear, SceneSettings
 from links.simulated.world.procedural.street import ground, parked_cars, poles_and_wires, road_marks, with_parking
-from stages.geometry import rotation_z
+from stages.geometry import Array64, rotation_z
 
 FAR = (-HALF_LENGTH_M, HALF_LENGTH_M)
 

@@ -10,8 +10,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.random import Generator
 
-from links.simulated.world.mesh import Array64, Mesh, box, merge, quads, rod
-from stages.geometry import rotation_z
+from links.simulated.world.mesh import Mesh, box, merge, quads, rod
+from stages.geometry import Array64, rotation_z
 
 LEAST_M = 1e-6  # nothing is built that is shorter
 MARK_ABOVE_M = 0.004  # marks lie this far above the road, so that rays tell them apart

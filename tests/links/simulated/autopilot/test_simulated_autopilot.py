@@ -15,11 +15,12 @@ from pymavlink.dialects.v20 import ardupilotmega
 from flow.link import Record
 from links.mavlink import Autopilot as Receiver
 from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
+from links.simulated.kernels.motion import GRAVITY_MPS2
 from links.simulated.rig.run import simulate_records
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.sensors.drift import DriftSettings
 from links.simulated.world.flight import Flight
-from links.simulated.world.path import GRAVITY_MPS2, Path, Waypoint
+from links.simulated.world.path import Path, Waypoint
 from stages.geometry import rotation_z
 from stages.messages import AutopilotStatus, DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry
 from tests.links.simulated.sensors.test_simulated_drift import NO_DRIFT

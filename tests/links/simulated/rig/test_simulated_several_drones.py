@@ -12,11 +12,11 @@ from pydantic import ValidationError
 
 from flow.link import LinkError, Record
 from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
+from links.simulated.kernels.lidar import echoes
 from links.simulated.rig import run
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.rig.truth_records import TruthRecords
-from links.simulated.sensors.lidar import echoes
 from links.simulated.world.drone import DroneModel
 from links.simulated.world.mesh import RayScene, box
 from links.simulated.world.path import Path, Waypoint

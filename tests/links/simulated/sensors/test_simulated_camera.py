@@ -10,9 +10,10 @@ from camera_scenes import QUIET, START_NS, centroid, cube, moving, pixel_of, red
 from pydantic import ValidationError
 
 from links.camera import Camera as CameraLink
+from links.simulated.kernels.camera_paint import _overlap, _stripes
 from links.simulated.rig.scenario import load_scenario
 from links.simulated.sensors.camera import CameraSettings, CamerasSettings
-from links.simulated.sensors.camera_paint import LOOKS, _looks, _overlap, _stripes, faces_of
+from links.simulated.sensors.camera_paint import LOOKS, _looks, faces_of
 from links.simulated.sensors.camera_sensor import ELECTRONS_PER_S, GAMMA, GREY, SensorSettings, auto_exposure, develop
 from links.simulated.sensors.camera_view import Shutter
 from links.simulated.world.mesh import SURFACES, box, quads

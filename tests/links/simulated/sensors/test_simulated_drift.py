@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from links.simulated.kernels.motion import rotations_z
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
-from links.simulated.world.path import Path, Waypoint, rotations_z
-from links.simulated.world.quaternion import rotations_from_vectors
-from links.simulated.world.series import between_steps, gauss_markov, random_walk
+from links.simulated.world.motion import between_steps, gauss_markov, random_walk, rotations_from_vectors
+from links.simulated.world.path import Path, Waypoint
 from stages.geometry import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg, rotations_from_xyzw
 
 NO_DRIFT = DriftSettings(

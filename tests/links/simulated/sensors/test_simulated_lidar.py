@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from links.simulated.kernels.lidar import echoes
 from links.simulated.sensors.footprint import COARSE, FINE, FOOTPRINTS, sub_rays
-from links.simulated.sensors.lidar import Lidar, LidarSettings, echoes
+from links.simulated.sensors.lidar import Lidar, LidarSettings
 from links.simulated.world.mesh import RayScene, box, merge, quads
 from links.velodyne import vlp16
 from stages.geometry import rotation_from_rpy_deg, rotation_z

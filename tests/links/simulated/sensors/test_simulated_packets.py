@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flow.link import Record
-from links.simulated.sensors.vlp16_packets import encode_packet, firings_per_packet
-from links.simulated.sensors.vlp16_position import encode_position
+from links.simulated.sensors.vlp16_packets import encode_packet, encode_position, firings_per_packet
 from links.velodyne import Lidar, vlp16
 from links.velodyne.position import Pps, parse_position
 from stages.messages import LidarFirings

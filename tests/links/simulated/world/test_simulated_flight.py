@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from links.simulated.kernels.motion import DRAG_PER_S, GRAVITY_MPS2
 from links.simulated.world.flight import Flight, FlightSettings
-from links.simulated.world.path import DRAG_PER_S, GRAVITY_MPS2, Path, Waypoint
+from links.simulated.world.path import Path, Waypoint
 
 HOVER = Path(waypoints=(Waypoint(t_s=0, xyz_m=(5, 3, 10), yaw_deg=90),))
 DASH = Path(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from links.simulated.world.path import DRAG_PER_S, GRAVITY_MPS2, Path, Waypoint, natural_spline
+from links.simulated.kernels.motion import DRAG_PER_S, GRAVITY_MPS2
+from links.simulated.world.path import Path, Waypoint, natural_spline
 
 
 def _path(*points: tuple[float, float, float, float], yaw_deg: float = 0.0) -> Path:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from links.simulated.kernels.lidar import APERTURE_M, FOOTPRINT_RAD
 from links.simulated.matrix.sim_vs_real import Still
-from links.simulated.sensors.footprint import APERTURE_M, FOOTPRINT_RAD
 from links.simulated.sensors.lidar import Lidar, LidarSettings
 from links.simulated.world.mesh import RayScene, quads
 from links.simulated.world.weather import CLUTTER_REACH_M, RainClutter, Weather, haze_extinction_per_m

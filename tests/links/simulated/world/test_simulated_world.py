@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from links.simulated.kernels.ray_casting import into_body
 from links.simulated.matrix.sim_vs_real import drone_area_m2
 from links.simulated.world.drone import DroneModel, drone_mesh
 from links.simulated.world.mesh import SURFACE_NAMES, RayScene, box, merge, rod
 from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.procedural import SceneSettings, world_mesh
 from links.simulated.world.procedural.parts import dashes, house_row
-from links.simulated.world.scene import Body, Scene, Truth, drone_shapes, into_body
+from links.simulated.world.scene import Body, Scene, Truth, drone_shapes
 from links.simulated.world.vehicle import vehicle_mesh
 from stages.geometry import rotation_from_rpy_deg
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from links.simulated.world.mesh import Array64
-from stages.compiled import compiled
+from links.simulated.kernels.motion import first_order_recursion
+from stages.geometry import Array64, rotations_from_xyzw
 
 
 def between_steps(rows: Array64, step_s: float, time_s: Array64) -> Array64:
@@ -30,7 +30,7 @@ def gauss_markov(white: Array64, sigma: Array64, time_s: float, step_s: float) -
 
     x_0 = sigma w_0,  x_k = a x_{k-1} + sigma sqrt(1 - a^2) w_k,  a = exp(-step / time).
     """
-    return _recursion(np.ascontiguousarray(white) * sigma, float(np.exp(-step_s / time_s)))
+    return first_order_recursion(np.ascontiguousarray(white) * sigma, float(np.exp(-step_s / time_s)))
 
 
 def smoothed(rows: Array64, time_s: float, step_s: float) -> Array64:
@@ -38,14 +38,10 @@ def smoothed(rows: Array64, time_s: float, step_s: float) -> Array64:
     keep = float(np.exp(-step_s / time_s))
     white = (1 - keep) / np.sqrt(1 - keep * keep) * rows
     white[0] = rows[0]
-    return _recursion(white, keep)
+    return first_order_recursion(white, keep)
 
 
-@compiled
-def _recursion(white: Array64, keep: float) -> Array64:
-    fresh = np.sqrt(1.0 - keep * keep)
-    out = white.copy()
-    for k in range(1, len(white)):
-        for axis in range(white.shape[1]):
-            out[k, axis] = keep * out[k - 1, axis] + fresh * white[k, axis]
-    return out
+def rotations_from_vectors(vectors_rad: Array64) -> Array64:
+    """Rotations (n, 3, 3) about vectors (n, 3) by their length [rad]."""
+    half = 0.5 * np.linalg.norm(vectors_rad, axis=1, keepdims=True)
+    return rotations_from_xyzw(np.hstack([0.5 * vectors_rad * np.sinc(half / np.pi), np.cos(half)]))

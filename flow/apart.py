@@ -32,8 +32,6 @@ from queue import SimpleQueue
 from types import TracebackType
 from typing import Any, TypeVar
 
-from pydantic import PrivateAttr
-
 from flow.graph import Graph
 from flow.link import Record, Source, Tap
 from flow.message import Message
@@ -261,8 +259,10 @@ class _PartProcess:
 class _Teller(Tap):
     """Keeps what the part's nodes gave since it was asked last."""
 
-    _wanted: frozenset[str] = PrivateAttr(default=frozenset())
-    _given: list[tuple[str, Message | None]] = PrivateAttr(default_factory=list[tuple[str, Message | None]])
+    def __init__(self) -> None:
+        super().__init__()
+        self._wanted: frozenset[str] = frozenset()
+        self._given: list[tuple[str, Message | None]] = []
 
     def want(self, outputs: frozenset[str]) -> None:
         """The outputs whose messages are taken elsewhere; of others only their number is told."""
@@ -357,7 +357,7 @@ def _run_part(
         out.append(Refusals(runner.hopeless()))
         for _ in runner.finishing():
             out.append(Told(teller.given()))
-        out.append(PartReport(runner.sum_up(), digest.told))
+        out.append(PartReport(runner.sum_up(), digest.outputs))
     except Exception as error:  # noqa: BLE001 - told, and raised there
         failed = runner.running.partition(".")[0] if runner is not None else next(iter(graph.nodes))
         cause = error.__cause__

@@ -17,7 +17,7 @@ from flow.problem import did_you_mean
 from flow.stage import Node, PortError, Stage, input_ports, output_ports
 from flow.tree import Path_, Tree
 
-KINDS: dict[str, type[Node]] = {"stages": Stage, "links": Link}
+KINDS: dict[str, type[Node[Any]]] = {"stages": Stage, "links": Link}
 HOMES = {"stages": "stages", "links": "links"}  # package in which classes of a kind are looked for when suggesting
 
 

@@ -149,7 +149,7 @@ def _check_topics(tree: Tree, nodes: dict[str, NodeSpec]) -> None:
     taken: dict[str, str] = {}
     for spec in nodes.values():
         if issubclass(spec.cls, Source):
-            topic = str(spec.config.get("topic", spec.cls.model_fields["topic"].default))
+            topic = str(spec.config.get("topic", spec.cls.settings_type.model_fields["topic"].default))
             path = (spec.kind, spec.name, "config", "topic")
             if topic.startswith(TRUTH_TOPICS):
                 tree.problem(path, f"truth is for evaluation only: no source may bring in '{topic}'.")

@@ -11,8 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+from typing_extensions import TypeVar
+
 from flow.message import Message
-from flow.stage import Node
+from flow.stage import Node, S, Settings
 
 TRUTH_TOPICS = "/truth"
 """Topics that start so hold what an evaluation compares with; no source may bring them in (`flow.graph` refuses)."""
@@ -36,7 +38,7 @@ class LinkError(Exception):
     """A link cannot do its work. The text says what to check; it is shown to the user without a traceback."""
 
 
-class Link(Node):
+class Link(Node[S]):
     """Base of all links: sources (records in), sinks (`on_<port>`), or both, as a servo is."""
 
     def sent(self) -> Iterable[Record]:
@@ -53,15 +55,28 @@ class Link(Node):
         return None
 
 
-class Source(Link):
+class SourceSettings(Settings):
+    """Settings that every source has."""
+
+    topic: str
+
+
+SourceS = TypeVar("SourceS", bound=SourceSettings, default=SourceSettings, covariant=True)
+
+
+class Source(Link[SourceS]):
     """A link that brings records in.
 
     Live, `listen` opens the hardware and yields records; in replay they come from a recording by `topic`.
     Both go through the same `decode`, whose annotation declares the outputs.
     """
 
-    topic: str
     silent_after_s: ClassVar[float | None] = None  # one that has spoken and then says nothing for so long is in trouble
+
+    @property
+    def topic(self) -> str:
+        """Topic of its records, `settings.topic`."""
+        return self.settings.topic
 
     def decode(self, record: Record) -> Any:
         """Messages of one record: None, one message, or an iterable of messages."""
@@ -92,7 +107,7 @@ class Run:
     senders: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])  # by topic, of live sources
 
 
-class Tap(Link):
+class Tap(Link[S]):
     """A link that sees every message on every edge, in the order of the run, without the stages knowing.
 
     It is declared in YAML beside the other links, without inputs. It may not change a message, and what it

@@ -14,7 +14,19 @@ import functools
 import re
 import struct
 from collections.abc import Callable
-from typing import Annotated, Any, Protocol, TypeVar, cast, dataclass_transform, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Protocol,
+    TypeVar,
+    cast,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +34,39 @@ from numpy.typing import NDArray
 C = TypeVar("C", bound=type)
 
 
+def port_name(message_type: type[Any]) -> str:
+    """Output port of a message type: `DroneFix` -> `drone_fix`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", message_type.__name__).lower()
+
+
+@overload
+def message(cls: C, /) -> C: ...
+@overload
+def message(*, schema: int) -> Callable[[C], C]: ...
+
+
 @dataclass_transform(frozen_default=True, eq_default=False, kw_only_default=True)
-def message(cls: C) -> C:
-    """Make a `Message` subclass a frozen, slotted, keyword-only dataclass (identity equality: it holds arrays)."""
-    return cast(C, dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)(cls))
+def message(cls: C | None = None, /, *, schema: int | None = None) -> C | Callable[[C], C]:
+    """Make a `Message` subclass a frozen, slotted, keyword-only dataclass (identity equality: it holds arrays).
+
+    `schema` is the message type's number in output hashes. It stays when the class or a field is renamed; a type whose
+    fields change in number, order or meaning gets a new one. A type without a number is hashed under its own name.
+    """
+
+    def make(cls: C) -> C:
+        made = cast(Any, dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)(cls))
+        made.schema = port_name(made) if schema is None else str(schema)
+        return made
+
+    return make if cls is None else make(cls)
 
 
 @message
 class Message:
     """Base of all messages. `stamp_ns` is when the content was true [ns], never when it arrived."""
+
+    schema: ClassVar[str] = ""
+    """What output hashes call this type: see `message`."""
 
     stamp_ns: int
 
@@ -61,11 +97,6 @@ PerPointF64 = Annotated[NDArray[np.float64], Shape("n")]
 PerPointI64 = Annotated[NDArray[np.int64], Shape("n")]
 PerPointU8 = Annotated[NDArray[np.uint8], Shape("n")]
 PerPointBool = Annotated[NDArray[np.bool_], Shape("n")]
-
-
-def port_name(message_type: type[Message]) -> str:
-    """Output port of a message type: `DroneFix` -> `drone_fix`."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", message_type.__name__).lower()
 
 
 @functools.cache
@@ -105,36 +136,51 @@ class Hasher(Protocol):
 
 
 _pack_float = struct.Struct("<d").pack
-_heads: dict[tuple[np.dtype[Any], tuple[int, ...]], bytes] = {}  # of arrays: few kinds and sizes, written often
-MOST_HEADS = 4096
+_array_headers: dict[tuple[np.dtype[Any], tuple[int, ...]], bytes] = {}  # few types and shapes, hashed often
+MAX_ARRAY_HEADERS = 4096
 
 
-def _head(array: NDArray[Any]) -> bytes:
+def _array_header(array: NDArray[Any]) -> bytes:
     """An array's type and shape, as they are hashed."""
-    kind = array.dtype, array.shape
-    head = _heads.get(kind)
-    if head is None:
-        if len(_heads) >= MOST_HEADS:
-            _heads.clear()
-        head = _heads[kind] = f"[{array.dtype.str}{array.shape}".encode()
-    return head
+    key = array.dtype, array.shape
+    header = _array_headers.get(key)
+    if header is None:
+        if len(_array_headers) >= MAX_ARRAY_HEADERS:
+            _array_headers.clear()
+        header = _array_headers[key] = f"[{array.dtype.str}{array.shape}".encode()
+    return header
 
 
-def hash_into(hasher: Hasher, value: Any) -> None:
-    """Feed a message, to the last bit and with its types, into a hashlib object. Unknown types are an error.
+class _Parts:
+    """The bytes of one message: its values with their types, and its texts."""
 
-    In one piece: hashlib lets go of Python's lock at each piece beyond 2 kB, and then has to wait for it.
+    __slots__ = ("texts", "values")
+
+    def __init__(self) -> None:
+        self.values: list[Any] = []
+        self.texts: list[bytes] = []
+
+
+def hash_into(values: Hasher, texts: Hasher, value: Any) -> None:
+    """Feed a message's values, to the last bit and with their types, into one hash, and its texts into another.
+
+    Names of classes, fields and enum members are not hashed: a message type counts by its `schema`, a field by its
+    position, an enum member by its value. TypeError for a type that a message may not hold.
+
+    Each hash is updated once: hashlib releases Python's lock for each buffer beyond 2 kB, and has to wait for it again.
     """
-    parts: list[Any] = []
+    parts = _Parts()
     _add(parts, value)
-    hasher.update(b"".join(parts))
+    values.update(b"".join(parts.values))
+    if parts.texts:
+        texts.update(b"".join(parts.texts))
 
 
-Adder = Callable[[list[Any], Any], None]
-_adders: dict[type[Any], Adder] = {}  # by type: asked for each field of each message
+Adder = Callable[[_Parts, Any], None]
+_adders: dict[type[Any], Adder] = {}  # by type: needed for each field of each message
 
 
-def _add(parts: list[Any], value: Any) -> None:
+def _add(parts: _Parts, value: Any) -> None:
     cls: Any = value.__class__
     (_adders.get(cls) or _adder_of(value, cls))(parts, value)
 
@@ -152,41 +198,47 @@ def _adder_of(value: Any, cls: type[Any]) -> Adder:
 
 
 def _fields_adder(cls: type[Any]) -> Adder:
-    head, names = b"{" + cls.__name__.encode(), [field.name for field in dataclasses.fields(cls)]
+    header, names = b"{" + getattr(cls, "schema", "").encode(), [field.name for field in dataclasses.fields(cls)]
 
-    def add(parts: list[Any], value: Any) -> None:
-        parts.append(head)
+    def add(parts: _Parts, value: Any) -> None:
+        parts.values.append(header)
         for name in names:
             _add(parts, getattr(value, name))
-        parts.append(b"}")
+        parts.values.append(b"}")
 
     return add
 
 
-def _add_array(parts: list[Any], array: NDArray[Any]) -> None:
-    parts.append(_head(array))
+def _add_array(parts: _Parts, array: NDArray[Any]) -> None:
+    parts.values.append(_array_header(array))
     if array.size:
-        parts.append(array.data if array.flags.c_contiguous else np.ascontiguousarray(array).data)
+        parts.values.append(array.data if array.flags.c_contiguous else np.ascontiguousarray(array).data)
 
 
-def _add_text(parts: list[Any], value: str) -> None:
-    parts.append(b"s%d:" % len(value) + value.encode())
+def _add_enum(parts: _Parts, member: enum.Enum) -> None:
+    parts.values.append(b"e%s;" % str(member.value).encode())
 
 
-def _add_tuple(parts: list[Any], value: tuple[Any, ...]) -> None:
-    parts.append(b"(%d:" % len(value))
-    for item in value:
+def _add_text(parts: _Parts, text: str) -> None:
+    data = text.encode()
+    parts.values.append(b"s")
+    parts.texts.append(b"%d:" % len(data) + data)
+
+
+def _add_tuple(parts: _Parts, items: tuple[Any, ...]) -> None:
+    parts.values.append(b"(%d:" % len(items))
+    for item in items:
         _add(parts, item)
 
 
 _KINDS: tuple[tuple[Any, Adder], ...] = (
     (np.ndarray, _add_array),
-    (enum.Enum, lambda parts, value: parts.append(b"e" + value.name.encode() + b";")),
-    (bool | np.bool_, lambda parts, value: parts.append(b"T" if value else b"F")),
-    (int | np.integer, lambda parts, value: parts.append(b"i%d;" % int(value))),
-    (float | np.floating, lambda parts, value: parts.append(b"d" + _pack_float(float(value)))),
+    (enum.Enum, _add_enum),
+    (bool | np.bool_, lambda parts, value: parts.values.append(b"T" if value else b"F")),
+    (int | np.integer, lambda parts, value: parts.values.append(b"i%d;" % int(value))),
+    (float | np.floating, lambda parts, value: parts.values.append(b"d" + _pack_float(float(value)))),
     (str, _add_text),
-    (bytes, lambda parts, value: parts.extend((b"b%d:" % len(value), value))),
-    (type(None), lambda parts, _: parts.append(b"N")),
+    (bytes, lambda parts, value: parts.values.extend((b"b%d:" % len(value), value))),
+    (type(None), lambda parts, _: parts.values.append(b"N")),
     (tuple, _add_tuple),
 )

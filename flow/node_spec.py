@@ -34,16 +34,16 @@ class NodeSpec:
     name: str
     kind: str  # "stages" or "links"
     use: str  # import path as declared
-    cls: type[Node]
+    cls: type[Node[Any]]
     config: dict[str, Any]
     on_error: OnError = "restart"  # of a stage that raises in a live run
     thread: str = ""  # of a stage in a live run; stages of one name share it
     process: str = ""  # of a stage, not the run's own; stages of one name share it
     yields: bool = False  # of a stage in a live run, to others that do not keep up
 
-    def build(self) -> Node:
+    def build(self) -> Node[Any]:
         """A fresh instance with empty memory."""
-        return self.cls.model_validate(self.config)
+        return self.cls(self.cls.settings_type.model_validate(self.config))
 
 
 def read_nodes(tree: Tree, kind: str, left: dict[str, str]) -> Iterator[NodeSpec]:
@@ -143,11 +143,11 @@ def _settings(tree: Tree, path: Path_, cls: type[Node], config: Any) -> dict[str
         return {}
     settings = cast("dict[str, Any]", config)
     try:
-        cls.model_validate(settings)
+        cls.settings_type.model_validate(settings)
     except ValidationError as errors:
         for error in errors.errors(include_url=False):
             where = (*here, *(str(part) for part in error["loc"]))
-            known = cls.model_fields if len(error["loc"]) == 1 else ()
+            known = cls.settings_type.model_fields if len(error["loc"]) == 1 else ()
             tree.problem(where, _said(error, cls.__name__, known))
     return settings
 

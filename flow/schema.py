@@ -98,7 +98,7 @@ def _section(kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
 
 
 def _node(cls: type[Node], definitions: dict[str, Any]) -> dict[str, Any]:
-    settings = cls.model_json_schema(ref_template="#/$defs/{model}")
+    settings = cls.settings_type.model_json_schema(ref_template="#/$defs/{model}")
     definitions.update({name: _settings(part) for name, part in settings.pop("$defs", {}).items()})
     inputs = {port: {**_EDGE, "description": f"takes {message.__name__}"} for port, message in input_ports(cls).items()}
     gives = ", ".join(output_ports(cls)) or "nothing"

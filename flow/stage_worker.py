@@ -48,7 +48,7 @@ class Worker(threading.Thread):
         spec = json.loads(receive(self._line)[1])
         module, _, name = spec["use"].rpartition(".")
         cls: type[Stage] = getattr(importlib.import_module(module), name)
-        stage = cls.model_validate(spec["config"])
+        stage = cls(cls.settings_type.model_validate(spec["config"]))
         gc.freeze()
         send(self._line, GAVE, packed({}, ()))
         ports = [(getattr(stage, f"on_{port}"), {m.__name__: m}) for port, m in input_ports(cls).items()]

@@ -15,54 +15,73 @@ from typing import Any, TextIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from flow.link import Run, Tap
 from flow.message import Message, array_fields, hash_into
+from flow.stage import Settings
 
 FORMULA_STARTERS = ("=", "+", "-", "@")  # a spreadsheet would run such a text
 
 
 class Digest(Tap):
-    """One BLAKE2b hash over every message of every output, each output's in order: equal for two replays.
+    """The output hash of a run: every message of every output, each output's in order. Equal for two equal runs.
 
-    How messages of different outputs lie in time does not matter, so that a live run, in which many threads send, and
-    its repetition have one hash. Threads may call `see` at the same time, for different outputs.
+    It has two halves, `values-texts`: all values, and the texts for people. Neither depends on the names of classes,
+    fields, nodes and outputs. How messages of different outputs interleave does not matter, so that a live run, in
+    which many threads publish, and its repetition have one hash. Threads may call `see` at the same time, for
+    different outputs.
     """
 
-    _hashes: dict[str, Any] = PrivateAttr(default_factory=dict[str, Any])
-    _joined: dict[str, str] = PrivateAttr(default_factory=dict[str, str])
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._hashes: dict[str, tuple[str, Any, Any]] = {}
+        self._joined: dict[str, str] = {}
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Hash the run's clock and the whole message."""
-        hasher = self._hashes.get(output)
-        if hasher is None:
-            hasher = self._hashes[output] = hashlib.blake2b(digest_size=16)
-        hasher.update(b"@%d" % arrival_ns)
-        hash_into(hasher, message)
+        known = self._hashes.get(output)
+        if known is None:
+            hashers = hashlib.blake2b(digest_size=16), hashlib.blake2b(digest_size=16)
+            known = self._hashes[output] = (type(message).schema, *hashers)
+        _, values, texts = known
+        values.update(b"@%d" % arrival_ns)
+        hash_into(values, texts, message)
 
     @property
-    def told(self) -> dict[str, str]:
-        """Each output's hash so far."""
-        return {name: hasher.hexdigest() for name, hasher in self._hashes.items()} | self._joined
+    def outputs(self) -> dict[str, str]:
+        """Each output's message type and hashes so far: `schema values texts`."""
+        seen = {
+            name: f"{schema} {values.hexdigest()} {texts.hexdigest()}"
+            for name, (schema, values, texts) in self._hashes.items()
+        }
+        return seen | self._joined
 
-    def join(self, told: dict[str, str]) -> None:
-        """Take in the hashes of outputs that another digest saw."""
-        self._joined |= told
+    def join(self, outputs: dict[str, str]) -> None:
+        """Take in the outputs that another digest saw."""
+        self._joined |= outputs
 
     def hexdigest(self) -> str:
-        """32 hex digits, of the outputs' names and hashes."""
-        parts = [f"{name} {told}" for name, told in sorted(self.told.items())]
-        return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
+        """`values-texts`, 16 hex digits each."""
+        outputs = [hashes.split(" ") for hashes in self.outputs.values()]
+        halves = ((schema, values) for schema, values, _ in outputs), ((schema, texts) for schema, _, texts in outputs)
+        return "-".join(hashlib.blake2b(repr(sorted(half)).encode(), digest_size=8).hexdigest() for half in halves)
 
 
-class Csv(Tap):
-    """Each output's numbers and texts as `csv/<node>.<output>.csv`; arrays without a fixed size give their shape."""
+class CsvSettings(Settings):
+    """Settings of `Csv`."""
 
     max_array: int = Field(16, ge=0, le=10_000)
-    _folder: Path = PrivateAttr(default=Path())
-    _files: dict[str, TextIO] = PrivateAttr(default_factory=dict[str, TextIO])
-    _writers: dict[str, Any] = PrivateAttr(default_factory=dict[str, Any])
+
+
+class Csv(Tap[CsvSettings]):
+    """Each output's numbers and texts as `csv/<node>.<output>.csv`; arrays without a fixed size give their shape."""
+
+    def __init__(self, settings: CsvSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._folder = Path()
+        self._files: dict[str, TextIO] = {}
+        self._writers: dict[str, Any] = {}
 
     def open(self, run: Run) -> None:
         """Make the folder `csv` in the run's."""
@@ -84,7 +103,7 @@ class Csv(Tap):
             value = getattr(message, field.name)
             if isinstance(value, np.ndarray):
                 array = cast("NDArray[Any]", value)
-                if field.name in fixed and array.size <= self.max_array:
+                if field.name in fixed and array.size <= self.settings.max_array:
                     for index in np.ndindex(array.shape):
                         yield f"{field.name}[{','.join(map(str, index))}]", array[index]
                 else:

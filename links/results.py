@@ -11,15 +11,14 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PrivateAttr
 
 from flow.link import Run, Tap
 from flow.message import Message
+from flow.stage import Settings
 from links.fix_log import FixLog
 from links.mavlink.gate import Limits, refusal
 from links.result_file import ResultFile
@@ -85,36 +84,41 @@ class Transition:
     track_id: int = 1
 
 
-class Results(Tap):
+class ResultsSettings(Settings):
+    """Settings of `Results`."""
+
+    limits: Limits = Limits()  # of the autopilot's gate: which poses are good
+
+
+class Results(Tap[ResultsSettings]):
     """Collects fixes, verdicts and state changes; writes each as it comes, so that a stopped run keeps what it had.
 
     What no stage of a run tells has no file: rotations, fused poses, candidates.
     """
 
-    limits: Limits = Limits()  # of the autopilot's gate: which poses are good
-
-    _files: dict[str, ResultFile] = PrivateAttr(default_factory=dict)
-    _live: bool = PrivateAttr(default=False)
-    _covariance: Any = PrivateAttr(default=None)
-    _detections: Any = PrivateAttr(default=None)
-    _candidates: Any = PrivateAttr(default=None)
-    _looks: dict[int, int] = PrivateAttr(default_factory=dict)  # of the candidates told last, by number
-    _detector_life: int = PrivateAttr(default=0)
-    _rotations: Any = PrivateAttr(default=None)
-    _poses: Any = PrivateAttr(default=None)
-    _folder: Path = PrivateAttr()
-    _sweep_start_ns: dict[int, int] = PrivateAttr(default_factory=dict)  # of the newest depth image, by its stamp
-    _last_sweep_ns: int | None = PrivateAttr(default=None)
-    _fixes: FixLog = PrivateAttr(default_factory=FixLog)
-    _sweeps: Counter[str] = PrivateAttr(default_factory=Counter)
-    _examples: dict[str, str] = PrivateAttr(default_factory=dict)
-    _found: int = PrivateAttr(default=0)
-    _transitions: list[Transition] = PrivateAttr(default_factory=list)
-    _state: dict[int, str] = PrivateAttr(default_factory=dict)  # of each track
-    _pose_state: PoseState | None = PrivateAttr(default=None)
-    _pose_states: Counter[str] = PrivateAttr(default_factory=Counter)
-    _resets: int = PrivateAttr(default=0)
-    _branch: tuple[str, int] | None = PrivateAttr(default=None)  # state and switches of the newest rotation
+    def __init__(self, settings: ResultsSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._files: dict[str, ResultFile] = {}
+        self._live: bool = False
+        self._covariance: Any = None
+        self._detections: Any = None
+        self._candidates: Any = None
+        self._looks: dict[int, int] = {}  # of the candidates told last, by number
+        self._detector_life: int = 0
+        self._rotations: Any = None
+        self._poses: Any = None
+        self._sweep_start_ns: dict[int, int] = {}  # of the newest depth image, by its stamp
+        self._last_sweep_ns: int | None = None
+        self._fixes = FixLog()
+        self._sweeps: Counter[str] = Counter()
+        self._examples: dict[str, str] = {}
+        self._found: int = 0
+        self._transitions: list[Transition] = []
+        self._state: dict[int, str] = {}  # of each track
+        self._pose_state: PoseState | None = None
+        self._pose_states: Counter[str] = Counter()
+        self._resets: int = 0
+        self._branch: tuple[str, int] | None = None  # state and switches of the newest rotation
 
     @property
     def fixes(self) -> Sequence[DroneFix]:
@@ -280,7 +284,7 @@ class Results(Tap):
         upper[np.isinf(upper)] = UNKNOWN_RAD2
         measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
-        good = refusal(message, message.stamp_ns, self.limits) is None
+        good = refusal(message, message.stamp_ns, self.settings.limits) is None
         told = [message.state.name, int(good), int(R is not None), message.resets, nis, measured, message.track_id]
         self._poses.writerow([stamp_s(message.stamp_ns), *_digits(upper), *told])
 

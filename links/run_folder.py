@@ -186,7 +186,7 @@ def _ran_instead(graph: Graph, report: RunReport) -> str:
 def _limits(graph: Graph) -> Limits:
     """Of the autopilot's gate, as configured."""
     links = (spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Autopilot))
-    return next((link.limits for link in links if isinstance(link, Autopilot)), Limits())
+    return next((link.settings.limits for link in links if isinstance(link, Autopilot)), Limits())
 
 
 def _senders(graph: Graph) -> dict[str, dict[str, str]]:
@@ -240,7 +240,7 @@ def other_clocks(graph: Graph, flown_yaml: str | None) -> list[str]:
 
 def _topic_and_clock(config: dict[str, Any]) -> tuple[str, str]:
     """Of a LiDAR's settings."""
-    topic, clock = (str(config.get(key, Lidar.model_fields[key].default)) for key in ("topic", "clock"))
+    topic, clock = (str(config.get(key, Lidar.settings_type.model_fields[key].default)) for key in ("topic", "clock"))
     return topic, clock
 
 

@@ -20,15 +20,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.calibration.looks import Returns, ServoTrace
 from stages.calibration.parameters import PARAMETERS
-from stages.calibration.servo_mount import ServoMount, servo_mount
+from stages.calibration.servo_mount import servo_mount
 from stages.calibration.solve import (
     COARSE_RAD,
     FINE_RAD,
@@ -57,10 +57,8 @@ OUTLIER = 5.0  # sigmas of a window from what the others say
 WALK_S = 5e-6  # of the offset in a second, one sigma
 
 
-class ServoClock(Stage):
-    """The servo's time offset with its sigma, window by window. Wire `motion` where the vehicle has odometry."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion"})
+class ServoClockSettings(Settings):
+    """Settings of `ServoClock`."""
 
     mount: LidarMount
     window_s: float = Field(3.0, ge=1, le=20)
@@ -75,24 +73,29 @@ class ServoClock(Stage):
     moved_m: float = Field(0.03, gt=0)  # a vehicle that moved farther in a window was not parked
     max_servo_gap_s: float = Field(0.1, gt=0)
 
-    _firings: list[LidarFirings] = PrivateAttr(default_factory=list[LidarFirings])
-    _states: list[ServoState] = PrivateAttr(default_factory=list[ServoState])
-    _places: list[Array64] = PrivateAttr(default_factory=list[Array64])
-    _packets: int = PrivateAttr(default=0)
-    _offset_s: float = PrivateAttr(default=0.0)  # beyond the rig's
-    _variance_s2: float = PrivateAttr(default=START_SIGMA_S**2)
-    _shared_s: float = PrivateAttr(default=0.0)  # sigma of what all windows have in common
-    _windows: int = PrivateAttr(default=0)
-    _known_ns: int | None = PrivateAttr(default=None)
-    _resting_until_ns: int = PrivateAttr(default=0)
-    _prior: Array64 = PrivateAttr()
-    _rig: ServoMount = PrivateAttr()
 
-    def model_post_init(self, context: object, /) -> None:
-        angle_rad = math.radians(self.angle_sigma_deg)
+class ServoClock(Stage[ServoClockSettings]):
+    """The servo's time offset with its sigma, window by window. Wire `motion` where the vehicle has odometry."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion"})
+
+    def __init__(self, settings: ServoClockSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._firings: list[LidarFirings] = []
+        self._states: list[ServoState] = []
+        self._places: list[Array64] = []
+        self._packets: int = 0
+        self._offset_s: float = 0.0  # beyond the rig's
+        self._variance_s2: float = START_SIGMA_S**2
+        self._shared_s: float = 0.0  # sigma of what all windows have in common
+        self._windows: int = 0
+        self._known_ns: int | None = None
+        self._resting_until_ns: int = 0
+        settings = self.settings
+        angle_rad = math.radians(settings.angle_sigma_deg)
         sigmas = {"axis_x": AXIS_SIGMA_M, "axis_y": AXIS_SIGMA_M, "time": START_SIGMA_S}
-        sigmas["play"] = math.radians(self.play_sigma_deg)
-        self._prior, self._rig = PRIOR.copy(), servo_mount(self.mount)
+        sigmas["play"] = math.radians(settings.play_sigma_deg)
+        self._prior, self._rig = PRIOR.copy(), servo_mount(settings.mount)
         for i, parameter in enumerate(PARAMETERS):
             self._prior[i, i] = sigmas.get(parameter.name, angle_rad) ** -2.0
 
@@ -109,39 +112,41 @@ class ServoClock(Stage):
             return
         if not self._states or servo.stamp_ns > self._states[-1].stamp_ns:
             self._states.append(servo)
-        if self._states[-1].stamp_ns - self._states[0].stamp_ns > 3.0 * self.window_s * 1e9 + 2 * TRACE_NS:
+        if self._states[-1].stamp_ns - self._states[0].stamp_ns > 3.0 * self.settings.window_s * 1e9 + 2 * TRACE_NS:
             self._states, self._firings, self._places = [], [], self._places[-1:]  # the LiDAR is silent: begin anew
 
     def on_firings(self, firings: LidarFirings) -> Iterator[ServoOffset]:
         """Collect; with a whole window, what it says."""
-        if not self.mount.turns or firings.pulse_stamp_ns.size == 0 or firings.stamp_ns < self._resting_until_ns:
+        settings = self.settings
+        if not settings.mount.turns or firings.pulse_stamp_ns.size == 0 or firings.stamp_ns < self._resting_until_ns:
             return
         self._packets += 1
-        if self._packets % self.every_packet == 0:
+        if self._packets % settings.every_packet == 0:
             self._firings.append(firings)
-        if self._firings and firings.stamp_ns - self._firings[0].stamp_ns > self.window_s * 1e9:
+        if self._firings and firings.stamp_ns - self._firings[0].stamp_ns > settings.window_s * 1e9:
             reason = self._take_window()
             if self._known_ns == self._firings[-1].stamp_ns and self._variance_s2 < CLOSE_S**2:
-                self._resting_until_ns = firings.stamp_ns + round((self.every_window - 1) * self.window_s * 1e9)
+                self._resting_until_ns = firings.stamp_ns + round((settings.every_window - 1) * settings.window_s * 1e9)
             self._firings, self._places = [], self._places[-1:]
             self._states = [s for s in self._states if s.stamp_ns > firings.stamp_ns - TRACE_NS]
             yield self._told(firings.stamp_ns, reason)
 
     def _told(self, stamp_ns: int, reason: str) -> ServoOffset:
+        settings = self.settings
         known = self._windows > 0
-        sigma_s = math.sqrt(self._variance_s2 + self._shared_s**2 + self.floor_s**2)
+        sigma_s = math.sqrt(self._variance_s2 + self._shared_s**2 + settings.floor_s**2)
         return ServoOffset(
             stamp_ns=stamp_ns,
-            offset_s=self.mount.servo_time_offset_s + self._offset_s if known else None,
+            offset_s=settings.mount.servo_time_offset_s + self._offset_s if known else None,
             sigma_s=sigma_s if known else None,
-            rig_s=self.mount.servo_time_offset_s,
+            rig_s=settings.mount.servo_time_offset_s,
             windows=self._windows,
             reason=reason,
         )
 
     def _take_window(self) -> str:
         """Use what was collected; why not, or what it said, in words."""
-        if len(self._places) > 1 and np.ptp(np.stack(self._places), axis=0).max() > self.moved_m:
+        if len(self._places) > 1 and np.ptp(np.stack(self._places), axis=0).max() > self.settings.moved_m:
             return "the vehicle moved"
         states = self._states
         if len(states) < 10:
@@ -149,7 +154,7 @@ class ServoClock(Stage):
         stamp_ns = np.array([s.stamp_ns for s in states])
         position_rad = np.array([s.position_rad for s in states])
         both_rad = both_ways_rad(stamp_ns, position_rad)
-        if both_rad < math.radians(self.both_ways_deg):
+        if both_rad < math.radians(self.settings.both_ways_deg):
             return f"the servo passed {math.degrees(both_rad):.1f} deg in both directions, less than both_ways_deg"
         found = self._solve(ServoTrace.of(stamp_ns, position_rad, STEP_RAD))
         if found is None:
@@ -172,7 +177,7 @@ class ServoClock(Stage):
             x[TIME], mount = self._offset_s, mount.moved({"time": self._offset_s})
         variance_s2, common_s2 = math.inf, 0.0
         for tolerance_rad in (*(COARSE_RAD[2:] if close else COARSE_RAD), FINE_RAD, FINE_RAD):
-            system = linearise(returns, trace, mount, x[len(NAMES) :], tolerance_rad, self.max_servo_gap_s)
+            system = linearise(returns, trace, mount, x[len(NAMES) :], tolerance_rad, self.settings.max_servo_gap_s)
             if system is None or len(system.patches.first) < FEWEST_PATCHES:
                 return None
             step = one_step(system, x, self._prior)
@@ -189,10 +194,12 @@ class ServoClock(Stage):
         if self._known_ns is not None:
             self._variance_s2 += WALK_S**2 * (now_ns - self._known_ns) * 1e-9
         self._known_ns = now_ns
-        alone_s, sigma_s = self.mount.servo_time_offset_s + found_s, math.hypot(own_s, shared_s)
+        alone_s, sigma_s = self.settings.mount.servo_time_offset_s + found_s, math.hypot(own_s, shared_s)
         said = f"{1e3 * alone_s:.2f} ms, sigma {1e3 * sigma_s:.2f} ms"
         total_s2 = self._variance_s2 + own_s**2
-        if self._windows and (found_s - self._offset_s) ** 2 > OUTLIER**2 * (total_s2 + shared_s**2 + self.floor_s**2):
+        if self._windows and (found_s - self._offset_s) ** 2 > OUTLIER**2 * (
+            total_s2 + shared_s**2 + self.settings.floor_s**2
+        ):
             self._variance_s2 += (found_s - self._offset_s) ** 2 / OUTLIER**2  # if it stays there it will be believed
             return f"this window disagrees: {said}"
         gain = self._variance_s2 / total_s2

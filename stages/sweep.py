@@ -18,24 +18,22 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field, model_validator
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.depth_image import DepthCanvas
 from stages.geometry import LidarMount
 from stages.messages import DepthImage, LidarFirings, ServoState, SweptPoints, SweptPulses
 from stages.turntable import Turntable
 
 
-class Sweep(Stage):
-    """P III.A: swept points per packet, a depth image per sweep.
+class SweepSettings(Settings):
+    """Settings of `Sweep`.
 
     `tolerance_deg`: a sweep counts as whole this much short of `sweep_deg`, because a position servo stops short of its
     goal (an MX-28 under load by about 1 deg, encoder step 0.088 deg). The fan is 30 deg wide, so nothing stays unseen.
     `reversal_deg`: going back by less than this is encoder jitter; vibration (+-5 deg) goes back by far more.
     """
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"servo"})
 
     mount: LidarMount
     image_size_px: int = Field(512, ge=16, le=4096)  # N
@@ -47,19 +45,29 @@ class Sweep(Stage):
     max_servo_gap_s: float = Field(0.1, ge=0.005)  # between two states; longer is not interpolated
     max_wait_s: float = Field(0.34, gt=0)  # for a servo state; then the oldest packet goes without an angle
 
-    _waiting: deque[LidarFirings] = PrivateAttr(default_factory=lambda: deque[LidarFirings]())
-    _turntable: Turntable = PrivateAttr()
-    _canvas: DepthCanvas = PrivateAttr()
-    _travel: Travel | Revolution = PrivateAttr()
-
-    def model_post_init(self, context: Any, /) -> None:
+    @model_validator(mode="after")
+    def _settings_agree(self) -> SweepSettings:
         if self.tolerance_deg >= self.sweep_deg:
             raise ValueError("tolerance_deg must be smaller than sweep_deg")
-        self._turntable = Turntable(self.mount, self.max_servo_gap_s, self.min_range_m)
-        self._canvas = DepthCanvas(self.image_size_px, self.fov_deg, self._turntable.T_vehicle_turntable[:3, 3].copy())
-        if self.mount.turns:
-            whole_rad = math.radians(self.sweep_deg - self.tolerance_deg)
-            self._travel = Travel(whole_rad, math.radians(self.reversal_deg))
+        return self
+
+
+class Sweep(Stage[SweepSettings]):
+    """P III.A: swept points per packet, a depth image per sweep."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"servo"})
+
+    def __init__(self, settings: SweepSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._waiting: deque[LidarFirings] = deque()
+        settings = self.settings
+        self._turntable = Turntable(settings.mount, settings.max_servo_gap_s, settings.min_range_m)
+        self._canvas = DepthCanvas(
+            settings.image_size_px, settings.fov_deg, self._turntable.T_vehicle_turntable[:3, 3].copy()
+        )
+        if settings.mount.turns:
+            whole_rad = math.radians(settings.sweep_deg - settings.tolerance_deg)
+            self._travel: Travel | Revolution = Travel(whole_rad, math.radians(settings.reversal_deg))
         else:
             self._travel = Revolution()
 
@@ -70,7 +78,7 @@ class Sweep(Stage):
         waiting = self._waiting
         waiting.append(firings)
         yield from self._release()
-        if waiting and firings.stamp_ns - waiting[0].stamp_ns >= self.max_wait_s * 1e9:
+        if waiting and firings.stamp_ns - waiting[0].stamp_ns >= self.settings.max_wait_s * 1e9:
             yield from self._place(waiting.popleft())
 
     def on_servo(self, servo: ServoState) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
@@ -84,7 +92,7 @@ class Sweep(Stage):
             yield from self._place(self._waiting.popleft())
 
     def _release(self) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
-        waiting, turntable, turns = self._waiting, self._turntable, self.mount.turns
+        waiting, turntable, turns = self._waiting, self._turntable, self.settings.mount.turns
         while waiting:
             known_ns = turntable.known_until_ns
             if turns and (known_ns is None or known_ns < waiting[0].pulse_stamp_ns[-1]):
@@ -92,7 +100,7 @@ class Sweep(Stage):
             yield from self._place(waiting.popleft())
 
     def _place(self, firings: LidarFirings) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
-        turntable, travel, canvas = self._turntable, self._travel, self._canvas  # a private attribute costs 2 us a look
+        turntable, travel, canvas = self._turntable, self._travel, self._canvas
         pulse_ns = firings.pulse_stamp_ns
         first_ns, last_ns = int(pulse_ns[0]), int(pulse_ns[-1])
         turns = turntable.turns(pulse_ns)

@@ -110,7 +110,7 @@ def test_what_is_said_in_sentences_stands_on_the_page_and_in_its_source(source: 
 
 
 def test_what_is_not_recorded_for_want_of_room_is_told_in_figures() -> None:
-    assert f"Below {Recorder().reserve_mb:g} MB" in PAGE
+    assert f"Below {Recorder().settings.reserve_mb:g} MB" in PAGE
 
 
 def test_each_fault_stands_with_its_bounds() -> None:

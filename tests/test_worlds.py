@@ -35,15 +35,16 @@ RIGHT_M = 1.0  # of where the drone was when it returned a pulse
 class Last(Tap):
     """Keeps detections and counts fixes."""
 
-    def model_post_init(self, _):
-        object.__setattr__(self, "detections", [])
-        object.__setattr__(self, "fixes", 0)
+    def __init__(self) -> None:
+        super().__init__()
+        self.detections = []
+        self.fixes = 0
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         if isinstance(message, Detections):
-            self.detections.append(message)  # type: ignore[attr-defined]
+            self.detections.append(message)
         elif isinstance(message, DroneFix):
-            object.__setattr__(self, "fixes", self.fixes + 1)  # type: ignore[attr-defined]
+            self.fixes += 1
 
 
 def world(seed: int, flight: tuple[float, float] | None) -> Simulation:

@@ -52,7 +52,7 @@ def gather(
 
     It is read twice, to count the returns and to take some: an hour of them all would not fit into the memory.
     """
-    servo, odometry = Servo.model_validate({}), VehicleOdometry.model_validate({})
+    servo, odometry = Servo(), VehicleOdometry()
     session = Session(recording)
     text = rig_yaml or session.rig_yaml
     if text is None:
@@ -111,7 +111,7 @@ def lidar_of(config_yaml: str | None) -> Lidar:
     """
     config = next(reversed(flown_lidars(config_yaml)), {})
     clock = {name: config[name] for name in ("clock", "clock_limit_s") if name in config}
-    return Lidar.model_validate(clock)
+    return Lidar(**clock)
 
 
 def returns_of(packets: Iterable[LidarFirings], step: int) -> Returns:

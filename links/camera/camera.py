@@ -13,13 +13,13 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.link import LinkError, Record, Source
+from flow.link import LinkError, Record, Source, SourceSettings
 from links.camera.capture import CaptureSettings, Frame
 from links.camera.live import LiveCamera
 from links.recording import CompressedImage, decode_compressed_image, encode_compressed_image
@@ -30,10 +30,8 @@ SLOW_TOLD_S = 5.0  # after the last sign of it
 FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive
 
 
-class Camera(Source):
-    """Frames of one camera, in grey. A frame that cannot be decoded is counted in `refused` and left out."""
-
-    silent_after_s: ClassVar[float | None] = 4.0  # `timeout_s` is 3 s, and it is tried again at once
+class CameraSettings(SourceSettings):
+    """Settings of `Camera`."""
 
     topic: str
     source: str | None = None  # live: /dev/video0 (better /dev/v4l/by-id/...), rtsp://..., http://..., a video file
@@ -44,9 +42,18 @@ class Camera(Source):
     readout_ms: float = Field(0.0, ge=0, le=100)  # from the first row's exposure to the last's: a rolling shutter
     timeout_s: float = Field(3.0, gt=0, le=30)  # of a stream: to open it, and between two frames
     jpeg_quality: int = Field(90, ge=30, le=100)  # where frames do not come as JPEG
-    _refused: int = PrivateAttr(default=0)
-    _counts: Counter[str] = PrivateAttr(default_factory=Counter[str])
-    _slow: tuple[int, float] = PrivateAttr(default=(0, 0.0))  # "too slow" as counted last, and when it had grown
+
+
+class Camera(Source[CameraSettings]):
+    """Frames of one camera, in grey. A frame that cannot be decoded is counted in `refused` and left out."""
+
+    silent_after_s: ClassVar[float | None] = 4.0  # `timeout_s` is 3 s, and it is tried again at once
+
+    def __init__(self, settings: CameraSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._refused: int = 0
+        self._counts: Counter[str] = Counter()
+        self._slow: tuple[int, float] = (0, 0.0)  # "too slow" as counted last, and when it had grown
 
     @property
     def refused(self) -> int:
@@ -75,20 +82,22 @@ class Camera(Source):
 
         One that is lost later is opened again, for ever; a video file comes at its own pace, and ends.
         """
-        if self.source is None:
-            raise LinkError(f"{self.topic}: give `source` to run live: /dev/video0, a URL, or a video file")
-        size_px = (self.size_px, self.size_px) if isinstance(self.size_px, int) else self.size_px
-        settings = CaptureSettings(self.source, size_px, self.fps, self.timeout_s, self.jpeg_quality)
-        with LiveCamera(settings, self._counts).open() as frames:
+        settings = self.settings
+        if settings.source is None:
+            raise LinkError(f"{settings.topic}: give `source` to run live: /dev/video0, a URL, or a video file")
+        size_px = (settings.size_px, settings.size_px) if isinstance(settings.size_px, int) else settings.size_px
+        capture = CaptureSettings(settings.source, size_px, settings.fps, settings.timeout_s, settings.jpeg_quality)
+        with LiveCamera(capture, self._counts).open() as frames:
             yield self._records(frames, size_px)
 
     def _records(self, frames: Iterator[Frame], size_px: tuple[int, int] | None) -> Iterator[Record]:
-        frame_id = self.frame_id or self.topic.strip("/").replace("/", "_")
+        settings = self.settings
+        frame_id = settings.frame_id or settings.topic.strip("/").replace("/", "_")
         for sequence, frame in enumerate(frames):
             self._check_size(frame.jpeg, size_px)
-            stamp_ns = frame.came_ns - round(1e9 * self.latency_s)
+            stamp_ns = frame.came_ns - round(1e9 * settings.latency_s)
             data = encode_compressed_image(CompressedImage(stamp_ns, frame_id, frame.jpeg))
-            yield Record(self.topic, frame.arrival_ns, stamp_ns, data, sequence)
+            yield Record(settings.topic, frame.arrival_ns, stamp_ns, data, sequence)
 
     def _check_size(self, jpeg: bytes, wanted_px: tuple[int, int] | None) -> None:
         try:
@@ -104,7 +113,7 @@ class Camera(Source):
     def decode(self, record: Record) -> Image | None:
         """The image of one record, stamped as the record is."""
         try:
-            return decode_image(record.stamp_ns, decode_compressed_image(record.data), 1e-3 * self.readout_ms)
+            return decode_image(record.stamp_ns, decode_compressed_image(record.data), 1e-3 * self.settings.readout_ms)
         except (ValueError, LinkError):
             self._refused += 1
             return None

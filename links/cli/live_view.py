@@ -10,7 +10,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from pydantic import PrivateAttr
 from rich.console import Console, Group
 from rich.live import Live as Screen
 from rich.table import Table
@@ -30,7 +29,9 @@ SHOWN = (RelativePose, DroneFix, TrackState)
 class Newest(Tap):
     """Keeps the newest message of each kind that the console shows."""
 
-    _messages: dict[type[Message], Any] = PrivateAttr(default_factory=dict)
+    def __init__(self) -> None:
+        super().__init__()
+        self._messages: dict[type[Message], Any] = {}
 
     def wants(self, message: type[Message]) -> bool:
         """The kinds that are shown."""

@@ -18,6 +18,7 @@ from flow.live_report import LiveReport
 from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table, warn
 from links.cli.live_view import LiveView
 from links.live_run import live_graph, run_live
+from links.output_hashes import hash_matches
 from links.repeat import repeat_into
 from links.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
 from links.run_folder import Asked, Finished, replay_into
@@ -126,10 +127,15 @@ def replay_recording(
             "The outcome is the same.",
         ),
     ] = False,
+    expect: Annotated[
+        str | None,
+        typer.Option("--expect", metavar="HASH", help="Exit code 1 unless the output hash is this one."),
+    ] = None,
     view: View = False,
 ) -> None:
     """Replay RECORDING: deterministic, as fast as possible; of a live run's first part all parts, of a later one that.
 
+    --expect takes a whole output hash, or its first 16 digits: those cover the values, the rest the texts for people.
     With --as-live each stage takes what it took in the live run, in that order; exit code 1 when the hash is not the
     live run's.
 
@@ -140,9 +146,13 @@ def replay_recording(
             raise LinkError(
                 "--as-live takes the recording's own configuration: leave out --config, --overlay and --set"
             )
-        _repeat(recording, out_dir, view)
-        return
-    _run(recording, config or DEFAULT_REPLAY_CONFIG, out_dir, overlay or [], sets or [], view, together)
+        digest = _repeat(recording, out_dir, view)
+    else:
+        chosen = config or DEFAULT_REPLAY_CONFIG
+        digest = _run(recording, chosen, out_dir, overlay or [], sets or [], view, together).digest
+    if expect is not None and not hash_matches(expect, digest):
+        err.print(f"the output hash is {digest}, and {expect} was expected", markup=False, style="red")
+        raise typer.Exit(FINDING)
 
 
 def _run(
@@ -153,7 +163,7 @@ def _run(
     sets: list[str],
     view: bool,
     together: bool = False,
-) -> None:
+) -> Finished:
     folder = _new_folder(out_dir, f"{recording.stem}-{config.stem}")
     with progress_bar(f"replay {recording.name}") as step:
         asked = Asked(config, tuple(overlays), tuple(sets))
@@ -161,9 +171,10 @@ def _run(
     _tell(finished)
     if view:
         _open_viewer(finished.out_dir)
+    return finished
 
 
-def _repeat(recording: Path, out_dir: Path | None, view: bool) -> None:
+def _repeat(recording: Path, out_dir: Path | None, view: bool) -> str:
     folder = _new_folder(out_dir, f"{recording.stem}-as-live")
     with progress_bar(f"replay {recording.name} as live") as step:
         repeated = repeat_into(folder, recording, step)
@@ -173,6 +184,7 @@ def _repeat(recording: Path, out_dir: Path | None, view: bool) -> None:
         _open_viewer(folder)
     if not repeated.same:
         raise typer.Exit(FINDING)
+    return repeated.finished.digest
 
 
 def _new_folder(wanted: Path | None, name: str) -> Path:

@@ -12,20 +12,28 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.link import Record, Source
+from flow.link import Record, Source, SourceSettings
 from links import host_time
 from stages.messages import Tick
 
 
-class Clock(Source):
-    """Ticks at `rate_hz`."""
+class ClockSettings(SourceSettings):
+    """Settings of `Clock`."""
 
     topic: str = "/clock"
     rate_hz: float = Field(50.0, ge=0.1, le=1000)
-    _missed: int = PrivateAttr(default=0)
+
+
+class Clock(Source[ClockSettings]):
+    """Ticks at `rate_hz`."""
+
+    def __init__(self, settings: ClockSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._missed: int = 0
 
     @property
     def counters(self) -> dict[str, int]:
@@ -46,7 +54,7 @@ class Clock(Source):
             closed.set()
 
     def _ticks(self, closed: threading.Event) -> Iterator[Record]:
-        period_ns = round(1e9 / self.rate_hz)
+        period_ns = round(1e9 / self.settings.rate_hz)
         due_ns = (host_time.now_ns() // period_ns + 1) * period_ns
         while not closed.wait(max(0, due_ns - host_time.now_ns()) * 1e-9):
             now_ns = host_time.now_ns()
@@ -55,5 +63,5 @@ class Clock(Source):
             missed = (now_ns - due_ns) // period_ns
             self._missed += missed
             due_ns += missed * period_ns
-            yield Record(self.topic, now_ns, due_ns, b"")
+            yield Record(self.settings.topic, now_ns, due_ns, b"")
             due_ns += period_ns

@@ -20,9 +20,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, model_validator
 
-from flow.link import LinkError, Record, Source
+from flow.link import LinkError, Record, Source, SourceSettings
 from links import host_time
 from links.dynamixel import wire
 from links.dynamixel.drive import DriveSettings
@@ -62,11 +62,8 @@ class GoalCommand:
         return self.velocity_units * VELOCITY_UNIT_RADPS
 
 
-class Servo(Source):
-    """States of the turntable's servo, and goals to it. An unreadable state is counted in `refused` and left out."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"goal"})
-    silent_after_s: ClassVar[float | None] = 2.0  # a link of its own mends what it can, and says nothing meanwhile
+class ServoSettings(SourceSettings):
+    """Settings of `Servo`."""
 
     topic: str = "/servo/state"
     port: str = "/dev/ttyUSB0"  # better a name that stays: /dev/serial/by-id/...
@@ -82,22 +79,31 @@ class Servo(Source):
     write_settings: bool = False  # correct the servo's EEPROM (return delay, modes) rather than refuse it
     reboot: bool = True  # a servo that has shut down, as by overload
 
-    _counts: Counter[str] = PrivateAttr(default_factory=Counter[str])
-    _waiting: GoalCommand | None = PrivateAttr(default=None)
-    _process: ServoProcess | None = PrivateAttr(default=None)
-    _lock: threading.Lock = PrivateAttr(default_factory=threading.Lock)  # over who replaces the process
-    _ended: Counter[str] = PrivateAttr(default_factory=Counter[str])  # totals of processes that are no more
-    _health: wire.Health | None = PrivateAttr(default=None)
-    _error: int = PrivateAttr(default=0)  # Hardware Error Status as read last
-
     @model_validator(mode="after")
-    def _settings_agree(self) -> Servo:
+    def _settings_agree(self) -> ServoSettings:
         low, high = self.limits_deg
         if self.watchdog_s * self.rate_hz < 4:
             raise ValueError("watchdog_s: give it four periods of rate_hz, or it stops a servo that is read in time")
         if not 0.0 <= low < high <= 360.0:
             raise ValueError("limits_deg: give two growing angles within 0..360, the servo's one turn")
         return self
+
+
+class Servo(Source[ServoSettings]):
+    """States of the turntable's servo, and goals to it. An unreadable state is counted in `refused` and left out."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"goal"})
+    silent_after_s: ClassVar[float | None] = 2.0  # a link of its own mends what it can, and says nothing meanwhile
+
+    def __init__(self, settings: ServoSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._counts: Counter[str] = Counter()
+        self._waiting: GoalCommand | None = None
+        self._process: ServoProcess | None = None
+        self._lock = threading.Lock()  # over who replaces the process
+        self._ended: Counter[str] = Counter()  # totals of processes that are no more
+        self._health: wire.Health | None = None
+        self._error: int = 0  # Hardware Error Status as read last
 
     @property
     def refused(self) -> int:
@@ -125,7 +131,7 @@ class Servo(Source):
         why = f"has shut down ({named_errors(self._error)})" if self._error else "does not answer as one that is set up"
         mends = (
             "it is set up again by itself"
-            if self.reboot or not self._error
+            if self.settings.reboot or not self._error
             else "it is to be rebooted (`reboot: false`)"
         )
         return f"the servo {why} and stands still: {mends}; check its supply, its cable, and what its axis has to turn"
@@ -208,7 +214,7 @@ class Servo(Source):
                 self._health = packet
             elif isinstance(packet, wire.Reading):
                 self._error = packet.error
-                yield reading_record(self.topic, packet, host_ahead_ns, sequence)
+                yield reading_record(self.settings.topic, packet, host_ahead_ns, sequence)
                 starts, sequence = 0, sequence + 1
 
     def _restart(self, ended: ServoProcess, closed: threading.Event) -> None:
@@ -224,7 +230,7 @@ class Servo(Source):
 
     def _within_limits(self, goal: ServoGoal) -> wire.Goal:
         """What is sent for a goal: at the limit where it lies beyond, and then it is counted."""
-        low, high = (math.radians(angle) for angle in self.limits_deg)
+        low, high = (math.radians(angle) for angle in self.settings.limits_deg)
         if not low - 0.5 * TICK_RAD <= goal.position_rad <= high + 0.5 * TICK_RAD:
             self._counts["goals kept within limits_deg"] += 1
         low_ticks, high_ticks = self._limit_ticks()
@@ -234,26 +240,27 @@ class Servo(Source):
         return wire.Goal(min(max(command.position_ticks, low_ticks), high_ticks), min(command.velocity_units, fastest))
 
     def _limit_ticks(self) -> tuple[int, int]:
-        low, high = (math.radians(angle) / TICK_RAD for angle in self.limits_deg)
+        low, high = (math.radians(angle) / TICK_RAD for angle in self.settings.limits_deg)
         return math.ceil(low - 1e-6), min(math.floor(high + 1e-6), STEPS_PER_TURN - 1)
 
     def _fastest_units(self) -> int:
-        return max(math.floor(self.speed_limit_rpm / VELOCITY_UNIT_RPM), 1)
+        return max(math.floor(self.settings.speed_limit_rpm / VELOCITY_UNIT_RPM), 1)
 
     def _drive_settings(self) -> DriveSettings:
+        settings = self.settings
         return DriveSettings(
-            port=self.port,
-            servo_id=self.servo_id,
-            baud=self.baud,
+            port=settings.port,
+            servo_id=settings.servo_id,
+            baud=settings.baud,
             limit_ticks=self._limit_ticks(),
             fastest_units=self._fastest_units(),
-            watchdog_ms=round(1e3 * self.watchdog_s),
-            reply_timeout_ms=1e3 * self.reply_timeout_s,
-            goal_slack_ms=1e3 * self.goal_slack_s,
-            rate_hz=self.rate_hz,
-            start_s=self.start_timeout_s,
-            write_settings=self.write_settings,
-            reboot=self.reboot,
+            watchdog_ms=round(1e3 * settings.watchdog_s),
+            reply_timeout_ms=1e3 * settings.reply_timeout_s,
+            goal_slack_ms=1e3 * settings.goal_slack_s,
+            rate_hz=settings.rate_hz,
+            start_s=settings.start_timeout_s,
+            write_settings=settings.write_settings,
+            reboot=settings.reboot,
         )
 
 

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from functools import cached_property
 from ipaddress import IPv4Address
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from pydantic import Field, PrivateAttr, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from flow.link import LinkError, Record, Source
+from flow.link import LinkError, Record, Source, SourceSettings
 from links import host_time
 from links.device_clock import DeviceClock
 from links.mavlink.connection import Udp, parse_connection
@@ -37,10 +36,8 @@ VISUAL_INERTIAL_ODOMETRY = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY: who we a
 SENT_TOPIC = "/autopilot/tx"
 
 
-class Autopilot(Source):
-    """One autopilot, chosen by system and component id. Without `connection` it is read from recordings alone."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"pose"})
+class AutopilotSettings(SourceSettings):
+    """Settings of `Autopilot`."""
 
     topic: str = "/autopilot/rx"
     system_id: int = Field(1, ge=1, le=255)
@@ -57,9 +54,10 @@ class Autopilot(Source):
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
     global_origin: GlobalOrigin | None = None  # given to an autopilot that has none
 
-    _session: Session | None = PrivateAttr(default=None)
-    _signer: Signer | None = PrivateAttr(default=None)  # of all sessions
-    _missed: int = PrivateAttr(default=0)
+    @property
+    def own_id(self) -> tuple[int, int]:
+        """Our system id and component id."""
+        return self.own_system_id or self.system_id, self.own_component_id
 
     @field_validator("connection")
     @classmethod
@@ -69,7 +67,7 @@ class Autopilot(Source):
         return value
 
     @model_validator(mode="after")
-    def _fits_together(self) -> Autopilot:
+    def _fits_together(self) -> AutopilotSettings:
         if len(set(self.send)) != len(self.send):
             raise ValueError("send: each message once")
         if {"odometry", "vision_position_estimate"} <= set(self.send):
@@ -78,7 +76,7 @@ class Autopilot(Source):
             reason = PROFILES[self.profile].refuses.get(kind)
             if reason:
                 raise ValueError(f"send: {kind} is not for profile {self.profile}: {reason}")
-        if self._own == (self.system_id, self.component_id):
+        if self.own_id == (self.system_id, self.component_id):
             raise ValueError("own_component_id: we cannot be the autopilot itself")
         if self.connection is not None and self.connection.startswith("udpin:"):
             host = IPv4Address(parse_connection(self.connection).host)
@@ -88,14 +86,20 @@ class Autopilot(Source):
                 )
         return self
 
-    @property
-    def _own(self) -> tuple[int, int]:
-        return self.own_system_id or self.system_id, self.own_component_id
 
-    @cached_property  # not a private attribute: decoding asks for it at every frame
-    def _stream(self) -> FrameStream:
-        clock = DeviceClock(self.clock_drift_limit_ppm, round(1e9 * self.clock_jump_limit_s))
-        return FrameStream((self.system_id, self.component_id), self._own, clock)
+class Autopilot(Source[AutopilotSettings]):
+    """One autopilot, chosen by system and component id. Without `connection` it is read from recordings alone."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"pose"})
+
+    def __init__(self, settings: AutopilotSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        settings = self.settings
+        clock = DeviceClock(settings.clock_drift_limit_ppm, round(1e9 * settings.clock_jump_limit_s))
+        self._stream = FrameStream((settings.system_id, settings.component_id), settings.own_id, clock)
+        self._session: Session | None = None
+        self._signer: Signer | None = None  # of all sessions
+        self._missed: int = 0
 
     def decode(self, record: Record) -> AutopilotMessage | None:
         """The message of one frame; None when it says nothing of use here or is refused (see `counters`)."""
@@ -120,21 +124,22 @@ class Autopilot(Source):
 
     @contextmanager
     def _listen(self) -> Iterator[Iterator[Record]]:
-        if self.connection is None:
+        settings = self.settings
+        if settings.connection is None:
             raise LinkError("no connection to the autopilot: set `connection`, as in udpin:127.0.0.1:14550")
-        target = self.system_id, self.component_id
-        if self.signing_key is not None and self._signer is None:
-            self._signer = Signer(self.signing_key, host_time.now_ns())
-        connection = open_connection(parse_connection(self.connection), self.sender)
+        target = settings.system_id, settings.component_id
+        if settings.signing_key is not None and self._signer is None:
+            self._signer = Signer(settings.signing_key, host_time.now_ns())
+        connection = open_connection(parse_connection(settings.connection), settings.sender)
         session = Session(
             connection,
             target,
-            self._own,
-            PoseSpeaker(self.send, self.limits, reset_counter=host_time.now_ns() // 1_000_000_000),
-            OriginGiver(self.global_origin, target),
+            settings.own_id,
+            PoseSpeaker(settings.send, settings.limits, reset_counter=host_time.now_ns() // 1_000_000_000),
+            OriginGiver(settings.global_origin, target),
             self._signer,
             host_time.now_ns,
-            (self.topic, SENT_TOPIC),
+            (settings.topic, SENT_TOPIC),
         )
         self._session = session
         try:

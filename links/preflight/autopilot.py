@@ -34,7 +34,7 @@ def autopilot_checks(
     link, seen = heard.link, heard.seen
     assert isinstance(link, Autopilot)
     assert isinstance(seen, AutopilotSeen)
-    who = f"system {link.system_id}, component {link.component_id}"
+    who = f"system {link.settings.system_id}, component {link.settings.component_id}"
     if not seen.kinds["HEARTBEAT"].count or not statuses:
         yield _silent(heard, seen, who)
         return
@@ -66,10 +66,10 @@ def _silent(heard: Heard, seen: AutopilotSeen, who: str) -> Verdict:
 def _heartbeat(heard: Heard, link: Autopilot, seen: AutopilotSeen, status: AutopilotStatus) -> Verdict:
     name, beats = f"{heard.name} heartbeat", seen.kinds["HEARTBEAT"]
     silent_s = beats.longest_silence_s(heard.end_ns)
-    wanted = KINDS[link.profile]
+    wanted = KINDS[link.settings.profile]
     if seen.autopilot is not None and seen.autopilot in KINDS.values() and seen.autopilot != wanted:
         says = next(kind for kind, number in KINDS.items() if number == seen.autopilot)
-        return fail(name, f"it says it is {says}, the configuration {link.profile}: set profile: {says}")
+        return fail(name, f"it says it is {says}, the configuration {link.settings.profile}: set profile: {says}")
     if status.failsafe:
         return fail(name, "it says critical, emergency or termination: look at its own messages")
     if heard.live and status.armed:
@@ -79,7 +79,7 @@ def _heartbeat(heard: Heard, link: Autopilot, seen: AutopilotSeen, status: Autop
     rate = "one" if beats.count == 1 else f"{beats.rate_hz:.1f} a second"
     if seen.autopilot not in KINDS.values():
         return warning(name, f"{rate}, of MAV_AUTOPILOT {seen.autopilot}: only ArduPilot and PX4 are known")
-    return ok(name, f"{rate}, {link.profile}" + (", armed" if status.armed else ", disarmed"))
+    return ok(name, f"{rate}, {link.settings.profile}" + (", armed" if status.armed else ", disarmed"))
 
 
 def _losses(heard: Heard) -> Verdict:

@@ -30,7 +30,11 @@ def camera_checks(heard: Heard, rig_px: tuple[int, int] | None, readout_ms: floa
     yield _rate(heard, link)
     yield _size(heard.name, seen, rig_px)
     yield _readout(heard.name, link, readout_ms)
-    if heard.live and link.source is not None and (is_device(link.source) or is_url(link.source)):
+    if (
+        heard.live
+        and link.settings.source is not None
+        and (is_device(link.settings.source) or is_url(link.settings.source))
+    ):
         yield _latency(heard.name, link)
 
 
@@ -47,9 +51,9 @@ def _rate(heard: Heard, link: Camera) -> Verdict:
         return fail(name, f"{text}; then none came for {silent_s:.1f} s: check its cable and power")
     if refused > 0.01 * arrivals.count:
         return warning(name, f"{text}: check cable and hub")
-    if heard.live and arrivals.rate_hz < FULL_RATE * link.fps:
+    if heard.live and arrivals.rate_hz < FULL_RATE * link.settings.fps:
         return warning(
-            name, f"{text}, {link.fps:g} were asked for: is it too dark, the bus shared, this host too busy?"
+            name, f"{text}, {link.settings.fps:g} were asked for: is it too dark, the bus shared, this host too busy?"
         )
     return ok(name, text)
 
@@ -79,8 +83,8 @@ def _readout(name: str, link: Camera, readout_ms: float | None) -> Verdict:
 
 
 def _latency(name: str, link: Camera) -> Verdict:
-    if link.latency_s:
-        return ok(f"{name} latency", f"{1e3 * link.latency_s:g} ms from a picture's exposure to its arrival")
+    if link.settings.latency_s:
+        return ok(f"{name} latency", f"{1e3 * link.settings.latency_s:g} ms from a picture's exposure to its arrival")
     return warning(
         f"{name} latency",
         "latency_s is 0: pictures count as exposed when they arrive, and 80 ms of it cost 18 cm and 1 deg; film a "

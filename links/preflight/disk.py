@@ -29,10 +29,11 @@ def disk_check(recorder: Recorder, heard: AllHeard, out_dir: Path) -> Verdict:
     except OSError as error:
         return fail(name, f"{folder}: {error.strerror or error}: is the disk there? Nothing could be recorded")
     free = _amount(free_bytes)
-    if free_bytes < MB * recorder.reserve_mb:
+    reserve_bytes = MB * recorder.settings.reserve_mb
+    if free_bytes < reserve_bytes:
         return fail(
             name,
-            f"{free} free at {folder}, and the recorder leaves {_amount(MB * recorder.reserve_mb)} free (reserve_mb): "
+            f"{free} free at {folder}, and the recorder leaves {_amount(reserve_bytes)} free (reserve_mb): "
             "nothing would be recorded; make room, or give another disk with --out",
         )
     rates_gb_h = {part.name: rate_gb_h(part) for part in heard.of(Lidar) + heard.of(Camera)}
@@ -40,7 +41,7 @@ def disk_check(recorder: Recorder, heard: AllHeard, out_dir: Path) -> Verdict:
     if not rates_gb_h:
         return ok(name, f"{free} free at {folder}; no LiDAR and no camera fills it")
     rate = max(sum(rates_gb_h.values()), LEAST_GB_H)
-    hours = (free_bytes - MB * recorder.reserve_mb) / GB / rate
+    hours = (free_bytes - reserve_bytes) / GB / rate
     text = f"{free} free at {folder}; a flight takes {rate:.1f} GB an hour ({told})"
     if hours < FLIGHT_H:
         return warning(

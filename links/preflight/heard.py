@@ -10,8 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
-from pydantic import PrivateAttr
-
 from flow.link import Link, Record, Source, Tap
 from flow.message import Message
 from links.preflight.seen import Seen, seen_for
@@ -35,11 +33,11 @@ M = TypeVar("M", bound=Message)
 class Ear(Tap):
     """Hears every record and the messages of interest; from many threads, each topic from one."""
 
-    _by_topic: dict[str, Seen] = PrivateAttr(default_factory=dict[str, Seen])
-    _topics: dict[str, str] = PrivateAttr(default_factory=dict[str, str])  # of the sources, by name
-    _messages: defaultdict[type[Message], deque[Message]] = PrivateAttr(
-        default_factory=lambda: defaultdict(lambda: deque(maxlen=MOST_MESSAGES))
-    )
+    def __init__(self) -> None:
+        super().__init__()
+        self._by_topic: dict[str, Seen] = {}
+        self._topics: dict[str, str] = {}  # of the sources, by name
+        self._messages: defaultdict[type[Message], deque[Message]] = defaultdict(lambda: deque(maxlen=MOST_MESSAGES))
 
     def attach(self, sources: Mapping[str, Source]) -> None:
         """Say whose records will come."""

@@ -34,7 +34,7 @@ def lidar_checks(heard: Heard) -> Iterator[Verdict]:
         why = heard.trouble or _refused(heard) or "none was usable"
         yield fail(f"{name} packets", f"{seen.arrivals.count} packets came, and {_sentence(why)}")
         return
-    yield _rate(heard, seen, link.timeout_s)
+    yield _rate(heard, seen, link.settings.timeout_s)
     yield _losses(heard, decoded)
     foreign = heard.counters.get("from other senders", 0)
     if foreign:
@@ -43,7 +43,7 @@ def lidar_checks(heard: Heard) -> Iterator[Verdict]:
         )
     yield _mode(name, seen)
     yield _clock(name, link, heard, seen)
-    if link.position_port is not None or seen.topics[POSITION_TOPIC].count:
+    if link.settings.position_port is not None or seen.topics[POSITION_TOPIC].count:
         yield _position(link, name, seen)
 
 
@@ -100,12 +100,14 @@ def _clock(name: str, link: Lidar, heard: Heard, seen: LidarSeen) -> Verdict:
     name = f"{name} clock"
     disagreed = heard.counters.get("clock disagreements", 0)
     if disagreed:
-        advice = "is it locked to GPS, and the host's clock right?" if link.clock == "utc" else "was it restarted?"
+        advice = (
+            "is it locked to GPS, and the host's clock right?" if link.settings.clock == "utc" else "was it restarted?"
+        )
         return fail(name, f"its clock and the host's disagreed {disagreed} times: {advice}")
     drift_ppm = clock_drift_ppm(seen.device_ns)
     if math.isnan(drift_ppm):
-        return ok(name, f"{link.clock}, no disagreement; too short to tell a drift")
-    text = f"{link.clock}, it goes {abs(drift_ppm):.0f} millionths {'slow' if drift_ppm > 0 else 'fast'}"
+        return ok(name, f"{link.settings.clock}, no disagreement; too short to tell a drift")
+    text = f"{link.settings.clock}, it goes {abs(drift_ppm):.0f} millionths {'slow' if drift_ppm > 0 else 'fast'}"
     if abs(drift_ppm) > MOST_DRIFT_PPM:
         return warning(name, f"{text} by the fastest packets: is the host's clock being set, or the network busy?")
     return ok(name, text)
@@ -126,11 +128,11 @@ def clock_drift_ppm(pairs: list[tuple[int, int]]) -> float:
 
 def _position(link: Lidar, name: str, seen: LidarSeen) -> Verdict:
     """GPS and PPS as the position packets told last; where the clock is free they are for information."""
-    name, needed = f"{name} PPS", link.clock == "utc"
+    name, needed = f"{name} PPS", link.settings.clock == "utc"
     if seen.pps.locked:
         return ok(name, seen.pps.in_words())
     if not seen.topics[POSITION_TOPIC].count:
-        text = f"no position packet on UDP {link.position_port}: check `position_port`, or set it to null"
+        text = f"no position packet on UDP {link.settings.position_port}: check `position_port`, or set it to null"
         return fail(name, text) if needed else warning(name, text)
     text = seen.pps.in_words()
     return (

@@ -81,7 +81,7 @@ def simulated_rig(graph: Graph) -> Iterator[None]:
                 folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="grd-preflight-")))
                 rig = spec.build()
                 assert isinstance(rig, LiveRig)
-                rig = rig.model_copy(update={"armed": False})
+                rig = LiveRig(rig.settings.model_copy(update={"armed": False}))
                 rig.open(Run(folder, spec.name, mermaid(graph), graph.settings_yaml(), live=True))
                 stack.callback(rig.close)
         yield

@@ -20,19 +20,19 @@ TIMEOUT_S = 5.0
 
 def ask_parameters(link: Autopilot, timeout_s: float = TIMEOUT_S) -> Answers:
     """Ask for what the profile wants, over a connection of its own: `link` must not be listening. LinkError."""
-    if link.connection is None:
+    if link.settings.connection is None:
         raise LinkError("no connection to the autopilot: set `connection`, as in udpin:127.0.0.1:14550")
-    profile = PROFILES[link.profile]
-    signer = None if link.signing_key is None else Signer(link.signing_key, host_time.now_ns())
+    profile = PROFILES[link.settings.profile]
+    signer = None if link.settings.signing_key is None else Signer(link.settings.signing_key, host_time.now_ns())
     if signer is not None and signer.trouble is not None:
         raise LinkError(signer.trouble)
-    connection = open_connection(parse_connection(link.connection), link.sender)
+    connection = open_connection(parse_connection(link.settings.connection), link.settings.sender)
     try:
         return read_parameters(
             connection,
             [wanted.name for wanted in profile.wanted],
-            (link.system_id, link.component_id),
-            (link.own_system_id or link.system_id, link.own_component_id),
+            (link.settings.system_id, link.settings.component_id),
+            link.settings.own_id,
             integers_bytewise=profile.integers_bytewise,
             timeout_s=timeout_s,
             signer=signer,

@@ -145,7 +145,7 @@ def absences(graph: Graph, rig: dict[str, Any]) -> Iterator[Verdict]:
 
 def rig_size_px(rig: dict[str, Any], link: Camera) -> tuple[int, int] | None:
     """What a camera's lens was calibrated for: its own setting, or the rig's."""
-    size: Any = link.size_px or rig_camera(rig, link).get("size_px")
+    size: Any = link.settings.size_px or rig_camera(rig, link).get("size_px")
     if size is None:
         return None
     return (size, size) if isinstance(size, int) else (int(size[0]), int(size[1]))
@@ -153,7 +153,7 @@ def rig_size_px(rig: dict[str, Any], link: Camera) -> tuple[int, int] | None:
 
 def rig_readout_ms(rig: dict[str, Any], link: Camera) -> float | None:
     """How long a camera's rows take: its own setting, or the rig's; None: neither says (a link's 0 is the default)."""
-    return link.readout_ms or rig_camera(rig, link).get("readout_ms")
+    return link.settings.readout_ms or rig_camera(rig, link).get("readout_ms")
 
 
 def rig_camera(rig: dict[str, Any], link: Camera) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def rig_camera(rig: dict[str, Any], link: Camera) -> dict[str, Any]:
 
 def odometry_check(heard: Heard, link: VehicleOdometry) -> Verdict:
     """The vehicle's own odometry, where it has one."""
-    if heard.live and link.port is None:
+    if heard.live and link.settings.port is None:
         return warning(heard.name, "it has no port: the vehicle is taken to be parked")
     arrivals = heard.seen.arrivals
     if not arrivals.count:
@@ -193,7 +193,7 @@ def other_check(heard: Heard) -> Verdict:
 
 def _parameters(name: str, link: Autopilot) -> Verdict:
     try:
-        return parameter_check(name, link.profile, ask_parameters(link))
+        return parameter_check(name, link.settings.profile, ask_parameters(link))
     except LinkError as error:
         return fail(f"{name} parameters", str(error))
 

@@ -128,6 +128,6 @@ class AutopilotSeen(Seen):
 def seen_for(source: Source) -> Seen:
     """The accumulator for a source's records."""
     if isinstance(source, Autopilot):
-        return AutopilotSeen(source.topic, (source.system_id, source.component_id))
+        return AutopilotSeen(source.topic, (source.settings.system_id, source.settings.component_id))
     kinds: dict[type[Source], type[Seen]] = {Lidar: LidarSeen, Servo: ServoSeen, Camera: CameraSeen}
     return next((seen for kind, seen in kinds.items() if isinstance(source, kind)), Seen)(source.topic)

@@ -48,15 +48,15 @@ def _rate(heard: Heard, link: Servo) -> Verdict:
         return fail(name, f"it fell silent for {silent_s:.1f} s: check its supply and plug")
     if not arrivals.rate_hz >= LEAST_HZ:
         return fail(name, f"{text}; {LEAST_HZ:.0f} are needed: is the baud rate low, or this host too busy?")
-    slow = heard.live and arrivals.rate_hz < FULL_RATE * link.rate_hz
+    slow = heard.live and arrivals.rate_hz < FULL_RATE * link.settings.rate_hz
     if slow or arrivals.longest_gap_ns > 1e9 * MOST_SILENCE_S:
-        return warning(name, f"{text}; rate_hz is {link.rate_hz:g}: is this host too busy, the adapter slow?")
+        return warning(name, f"{text}; rate_hz is {link.settings.rate_hz:g}: is this host too busy, the adapter slow?")
     return ok(name, text)
 
 
 def _place(name: str, link: Servo, seen: ServoSeen) -> Verdict:
     name = f"{name} position"
-    low, high = link.limits_deg
+    low, high = link.settings.limits_deg
     least, most = math.degrees(seen.least_rad), math.degrees(seen.most_rad)
     text = f"{least:.1f} deg" if most - least < 0.5 else f"{least:.1f} to {most:.1f} deg"
     if least < low - SLACK_DEG or most > high + SLACK_DEG:

@@ -15,12 +15,14 @@ import threading
 import time
 import uuid
 from pathlib import Path
+from typing import Any
 
 import yaml
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from flow.link import LinkError, Record, Run, Tap
 from flow.message import Message
+from flow.stage import Settings
 from links.recording.writer import RecordingWriter
 
 LOOK_S = 0.25  # how often size, age and disk are looked at
@@ -40,24 +42,30 @@ class _Intake:
         self.missed = 0  # while nothing was recorded
 
 
-class Recorder(Tap):
-    """Records a live run into its folder. Replays it ignores: they have their recording."""
+class RecorderSettings(Settings):
+    """Settings of `Recorder`."""
 
     file: str = Field("flight.mcap", pattern=r"^[\w.-]+\.mcap$")
     split_s: float = Field(900.0, ge=1)  # a part is this long at most
     split_mb: float = Field(2000.0, ge=1)  # and holds so much, before compression
     reserve_mb: float = Field(200.0, ge=0)  # is left free on the disk, for the results
 
-    _intake: _Intake = PrivateAttr(default_factory=_Intake)
-    _run: Run | None = PrivateAttr(default=None)
-    _thread: threading.Thread | None = PrivateAttr(default=None)
-    _closing: threading.Event = PrivateAttr(default_factory=threading.Event)
-    _session: str = PrivateAttr(default="")
-    _parts: int = PrivateAttr(default=0)
-    _part_s: float = PrivateAttr(default=0.0)  # when it was opened, monotonic
-    _stopped_s: float = PrivateAttr(default=0.0)
-    _before: tuple[int, int] = PrivateAttr(default=(0, 0))  # written and dropped in earlier parts
-    _trouble: str | None = PrivateAttr(default=None)
+
+class Recorder(Tap[RecorderSettings]):
+    """Records a live run into its folder. Replays it ignores: they have their recording."""
+
+    def __init__(self, settings: RecorderSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._intake = _Intake()
+        self._run: Run | None = None
+        self._thread: threading.Thread | None = None
+        self._closing = threading.Event()
+        self._session: str = ""
+        self._parts: int = 0
+        self._part_s: float = 0.0  # when it was opened, monotonic
+        self._stopped_s: float = 0.0
+        self._before: tuple[int, int] = (0, 0)  # written and dropped in earlier parts
+        self._trouble: str | None = None
 
     def wants(self, message: type[Message]) -> bool:
         """Records only."""
@@ -114,15 +122,16 @@ class Recorder(Tap):
                 self._give_up(str(error))
 
     def _look(self) -> None:
+        settings = self.settings
         writer, now_s = self._intake.writer, time.monotonic()
         if writer is None:
-            if now_s >= self._stopped_s + AGAIN_S and self._free_bytes() > 2 * self.reserve_mb * MB:
+            if now_s >= self._stopped_s + AGAIN_S and self._free_bytes() > 2 * settings.reserve_mb * MB:
                 self._begin_part()
         elif writer.trouble is not None:
             self._give_up(writer.trouble)
-        elif self._free_bytes() < self.reserve_mb * MB:
-            self._give_up(f"less than {self.reserve_mb:g} MB are free at {writer.path.parent}: make room")
-        elif now_s - self._part_s >= self.split_s or self._intake.part_bytes >= self.split_mb * MB:
+        elif self._free_bytes() < settings.reserve_mb * MB:
+            self._give_up(f"less than {settings.reserve_mb:g} MB are free at {writer.path.parent}: make room")
+        elif now_s - self._part_s >= settings.split_s or self._intake.part_bytes >= settings.split_mb * MB:
             self._begin_part()
 
     def _begin_part(self) -> None:
@@ -132,8 +141,8 @@ class Recorder(Tap):
         values = yaml.safe_load(self._run.settings_yaml) or {}
         rig_yaml = yaml.safe_dump(values["rig"], sort_keys=False) if "rig" in values else None
         try:
-            if self._free_bytes() < self.reserve_mb * MB:
-                raise LinkError(f"less than {self.reserve_mb:g} MB are free at {path.parent}: make room")
+            if self._free_bytes() < self.settings.reserve_mb * MB:
+                raise LinkError(f"less than {self.settings.reserve_mb:g} MB are free at {path.parent}: make room")
             writer = RecordingWriter(
                 path,
                 rig_yaml=rig_yaml,
@@ -155,7 +164,7 @@ class Recorder(Tap):
         self._end_part(before)
 
     def _path(self, folder: Path, part: int) -> Path:
-        file = folder / self.file
+        file = folder / self.settings.file
         return file if part == 1 else file.with_stem(f"{file.stem}-{part}")
 
     def _swap(self, writer: RecordingWriter | None) -> RecordingWriter | None:

@@ -16,9 +16,9 @@ from ipaddress import IPv4Address
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, model_validator
 
-from flow.link import LinkError, Record, Source
+from flow.link import LinkError, Record, Source, SourceSettings
 from links.vehicle_odometry.udp import listen_udp
 from stages.geometry import Array64, rotation_from_quaternion_xyzw
 from stages.messages import VehicleMotion
@@ -29,23 +29,30 @@ LENGTH_SLACK = 1e-3  # of a quaternion
 CORRELATION_SLACK = 1e-4  # what rounding to six digits does to a covariance
 
 
-class VehicleOdometry(Source):
-    """Where the vehicle has driven. A record that holds no pose is counted in `refused` and left out."""
-
-    silent_after_s: ClassVar[float | None] = 2.0
+class VehicleOdometrySettings(SourceSettings):
+    """Settings of `VehicleOdometry`."""
 
     topic: str = "/vehicle/odometry"
     port: int | None = Field(None, ge=1, le=65535)  # UDP, live; None: there is none, or it is in recordings only
     bind: IPv4Address = IPv4Address("127.0.0.1")  # this host's address
     sender: IPv4Address | None = None  # who tells it; others are ignored
-    _refused: int = PrivateAttr(default=0)
-    _udp: Counter[str] = PrivateAttr(default_factory=Counter[str])
 
     @model_validator(mode="after")
-    def _sender_is_known(self) -> VehicleOdometry:
+    def _sender_is_known(self) -> VehicleOdometrySettings:
         if self.sender is None and not self.bind.is_loopback:
             raise ValueError(f"sender: say who tells the odometry when binding to {self.bind}: others are ignored")
         return self
+
+
+class VehicleOdometry(Source[VehicleOdometrySettings]):
+    """Where the vehicle has driven. A record that holds no pose is counted in `refused` and left out."""
+
+    silent_after_s: ClassVar[float | None] = 2.0
+
+    def __init__(self, settings: VehicleOdometrySettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._refused: int = 0
+        self._udp: Counter[str] = Counter()
 
     @property
     def refused(self) -> int:
@@ -59,10 +66,11 @@ class VehicleOdometry(Source):
 
     def listen(self) -> AbstractContextManager[Iterator[Record]]:
         """Receive poses: `with odometry.listen() as records`. LinkError without a port, or when it cannot be opened."""
-        if self.port is None:
-            raise LinkError(f"{self.topic}: give `port` to hear the vehicle's odometry, or take the link out")
-        sender = None if self.sender is None else str(self.sender)
-        return listen_udp(self.topic, str(self.bind), self.port, sender, self._udp)
+        settings = self.settings
+        if settings.port is None:
+            raise LinkError(f"{settings.topic}: give `port` to hear the vehicle's odometry, or take the link out")
+        sender = None if settings.sender is None else str(settings.sender)
+        return listen_udp(settings.topic, str(settings.bind), settings.port, sender, self._udp)
 
     def decode(self, record: Record) -> VehicleMotion | None:
         """A message of `{"xyz_m": [...], "quaternion_xyzw": [...], "covariance": [36 numbers] or null}`, else None."""

@@ -13,12 +13,12 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cached_property
 from ipaddress import IPv4Address
+from typing import Any
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, model_validator
 
-from flow.link import LinkError, Record, Source
+from flow.link import LinkError, Record, Source, SourceSettings
 from links.velodyne import vlp16
 from links.velodyne.clock import ClockMode, DeviceClock
 from links.velodyne.decode import FiringRows, compile_kernels, refusal_of, timestamp_us
@@ -32,8 +32,8 @@ REFUSED_IN_A_ROW = 100
 POSITION_SILENT_S = 3.0  # a sensor sends some of them each second
 
 
-class Lidar(Source):
-    """One VLP-16 or Puck LITE. Give `sender` (the lidar's address) to listen beyond loopback."""
+class LidarSettings(SourceSettings):
+    """Settings of `Lidar`."""
 
     topic: str = "/lidar/packets"
     clock: ClockMode = "free"  # utc: sensor and host are both locked to UTC
@@ -45,13 +45,8 @@ class Lidar(Source):
     timeout_s: float = Field(2.0, gt=0, le=60)
     packets: int = Field(1, ge=1, le=16)  # in a message, 1.3 ms each: fewer messages cost less, and come later
 
-    _locked_once: bool = PrivateAttr(default=False)  # utc, since it listens: data packets are taken
-    _position_s: float = PrivateAttr(default=0.0)  # when the newest position packet came
-    _pps: PpsWatch = PrivateAttr(default_factory=PpsWatch)
-    _udp: UdpCounters = PrivateAttr(default_factory=UdpCounters)
-
     @model_validator(mode="after")
-    def _sender_is_known(self) -> Lidar:
+    def _sender_is_known(self) -> LidarSettings:
         if self.sender is None and not self.bind.is_loopback:
             raise ValueError(
                 f"sender: give the lidar's address (192.168.1.201 from the factory) when binding to {self.bind}, "
@@ -59,9 +54,19 @@ class Lidar(Source):
             )
         return self
 
-    @cached_property  # a private attribute would cost 1.7 us at every packet
-    def _stream(self) -> PacketStream:
-        return PacketStream(self.topic, DeviceClock(self.clock, round(1e9 * self.clock_limit_s)), self.packets)
+
+class Lidar(Source[LidarSettings]):
+    """One VLP-16 or Puck LITE. Give `sender` (the lidar's address) to listen beyond loopback."""
+
+    def __init__(self, settings: LidarSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        settings = self.settings
+        clock = DeviceClock(settings.clock, round(1e9 * settings.clock_limit_s))
+        self._stream = PacketStream(settings.topic, clock, settings.packets)
+        self._locked_once: bool = False  # utc, since it listens: data packets are taken
+        self._position_s: float = 0.0  # when the newest position packet came
+        self._pps = PpsWatch()
+        self._udp = UdpCounters()
 
     def decode(self, record: Record) -> LidarFirings | None:
         """Pulses of a packet, or of `packets` once the last of them has come; None before, and when it is refused.
@@ -73,38 +78,43 @@ class Lidar(Source):
     @property
     def senders(self) -> dict[str, dict[str, str]]:
         """Model, port, and the sensor's address where it is given."""
-        known = {"model": "VLP-16"} | ({} if self.sender is None else {"sender": str(self.sender)})
-        ports = {self.topic: self.port} | ({} if self.position_port is None else {POSITION_TOPIC: self.position_port})
+        settings = self.settings
+        known = {"model": "VLP-16"} | ({} if settings.sender is None else {"sender": str(settings.sender)})
+        ports = {settings.topic: settings.port} | (
+            {} if settings.position_port is None else {POSITION_TOPIC: settings.position_port}
+        )
         return {topic: {**known, "port": str(port)} for topic, port in ports.items()}
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
         """Receive packets from the network: `with lidar.listen() as records`. LinkError: see `listen_udp`, or utc's."""
+        settings = self.settings
         compile_kernels()
-        if self.clock == "utc" and self.position_port is None:
+        if settings.clock == "utc" and settings.position_port is None:
             raise LinkError(
                 f"clock: utc needs to know that the sensor is locked to UTC: set position_port: {vlp16.POSITION_PORT} "
                 "(its position packets), or clock: free"
             )
-        channels = [Channel(self.topic, self.port)]
-        if self.position_port is not None:
-            channels.append(Channel(POSITION_TOPIC, self.position_port))
-        sender = None if self.sender is None else str(self.sender)
-        with listen_udp(channels, str(self.bind), sender, self.timeout_s, self._udp) as records:
+        channels = [Channel(settings.topic, settings.port)]
+        if settings.position_port is not None:
+            channels.append(Channel(POSITION_TOPIC, settings.position_port))
+        sender = None if settings.sender is None else str(settings.sender)
+        with listen_udp(channels, str(settings.bind), sender, settings.timeout_s, self._udp) as records:
             try:
-                yield self._watched(records) if self.position_port is not None else records
+                yield self._watched(records) if settings.position_port is not None else records
             finally:
                 self._locked_once = False
 
     def _watched(self, records: Iterator[Record]) -> Iterator[Record]:
         """The records, with an eye on the sensor's clock; for utc no data packet before it is locked."""
-        waits, deadline_s = self.clock == "utc", time.monotonic() + self.timeout_s
+        settings = self.settings
+        waits, deadline_s = settings.clock == "utc", time.monotonic() + settings.timeout_s
         for record in records:
             if record.topic == POSITION_TOPIC:
                 self._pps.see(record.data)
                 waits = waits and not self._pps.locked
                 self._position_s = time.monotonic()
-                self._locked_once = self.clock == "utc" and not waits
+                self._locked_once = settings.clock == "utc" and not waits
             elif waits:
                 if time.monotonic() > deadline_s:
                     raise LinkError(
@@ -119,12 +129,12 @@ class Lidar(Source):
         """See Link: with `clock: utc`, the sensor's clock is not locked to UTC any more, or does not tell."""
         if not self._locked_once:
             return None
-        silent = time.monotonic() - self._position_s > max(self.timeout_s, POSITION_SILENT_S)
+        silent = time.monotonic() - self._position_s > max(self.settings.timeout_s, POSITION_SILENT_S)
         if self._pps.locked and not silent:
             return None
         lost = (
-            f"no position packet comes any more on UDP {self.position_port}, so whether the sensor's clock is locked "
-            "to UTC is not known"
+            f"no position packet comes any more on UDP {self.settings.position_port}, so whether the sensor's clock is "
+            "locked to UTC is not known"
             if silent
             else f"the sensor's clock is locked to UTC no more: {self._pps.in_words()}"
         )

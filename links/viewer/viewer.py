@@ -12,12 +12,14 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import rerun as rr
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from flow.link import Run, Tap
 from flow.message import Message
+from flow.stage import Settings
 from links.viewer.draw import draw
 from links.viewer.layout import Vision, layout
 from links.viewer.lenses import Cameras
@@ -38,8 +40,8 @@ DRAWING_ERRORS = (ArithmeticError, AttributeError, LookupError, RuntimeError, Ty
 _log = logging.getLogger("grd.viewer")
 
 
-class Viewer(Tap):
-    """Log every edge to Rerun. `lossless: true`: a replay waits for the viewer, dropping nothing; a live run never."""
+class ViewerSettings(Settings):
+    """Settings of `Viewer`."""
 
     file: str | None = "run.rrd"  # in the run's folder; null: no file
     serve: bool = False  # to viewers on this host; binds 127.0.0.1 only
@@ -54,11 +56,17 @@ class Viewer(Tap):
     mount: LidarMount | None = None  # shows the turntable, the LiDAR and the fan of its beams where they are
     cameras: Cameras | None = None  # the rig's: puts lines on the pictures
 
-    _box: Mailbox[Message] | None = PrivateAttr(None)
-    _thread: threading.Thread | None = PrivateAttr(None)
-    _errors: Counter[str] = PrivateAttr(default_factory=Counter)
-    _finished: bool = PrivateAttr(False)
-    _waits: bool = PrivateAttr(False)  # lossless, and not live
+
+class Viewer(Tap[ViewerSettings]):
+    """Log every edge to Rerun. `lossless: true`: a replay waits for the viewer, dropping nothing; a live run never."""
+
+    def __init__(self, settings: ViewerSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._box: Mailbox[Message] | None = None
+        self._thread: threading.Thread | None = None
+        self._errors: Counter[str] = Counter()
+        self._finished: bool = False
+        self._waits: bool = False  # lossless, and not live
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -83,26 +91,27 @@ class Viewer(Tap):
     @property
     def url(self) -> str:
         """Where a viewer finds a serving run: `rerun --connect URL`."""
-        return f"rerun+http://{LOOPBACK}:{self.port}/proxy"
+        return f"rerun+http://{LOOPBACK}:{self.settings.port}/proxy"
 
     def open(self, run: Run) -> None:
         """Start the logging thread; Rerun is first touched there, which takes half a second.
 
         Without file and server there is nothing to draw for, and no thread.
         """
+        settings = self.settings
         self._errors.clear()
         self._finished = False
         self._box = None
-        if self.file is None and not self.serve:
+        if settings.file is None and not settings.serve:
             return
-        self._waits = self.lossless and not run.live
-        self._box = Mailbox(self.queue_size, lossless=self._waits, patience_s=PATIENCE_S)
+        self._waits = settings.lossless and not run.live
+        self._box = Mailbox(settings.queue_size, lossless=self._waits, patience_s=PATIENCE_S)
         self._thread = threading.Thread(target=self._work, args=(run, self._box), name="viewer", daemon=True)
         self._thread.start()
 
     def wants(self, message: type[Message]) -> bool:
         """All, where there is a file or a server to draw for."""
-        return self.file is not None or self.serve
+        return self.settings.file is not None or self.settings.serve
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """Put the message into the box; the time that counts is its stamp, not its arrival."""
@@ -117,7 +126,7 @@ class Viewer(Tap):
         patience_s = CLOSE_S[self._waits]
         self._thread.join(patience_s)
         if self._thread.is_alive():
-            self._errors[f"the viewer needs over {patience_s} s: the end of {self.file} is missing"] += 1
+            self._errors[f"the viewer needs over {patience_s} s: the end of {self.settings.file} is missing"] += 1
         elif not self._finished:
             self._errors["the logging thread died, see its traceback; nothing after that is shown"] += 1
         for output, count in self.dropped.items():
@@ -134,12 +143,13 @@ class Viewer(Tap):
             box.close()
 
     def _log_all(self, run: Run, box: Mailbox[Message]) -> None:
+        settings = self.settings
         rr.set_strict_mode(True)  # what Rerun refuses is raised and counted, not warned about
         vision = self._vision(run)
         stream = Stream(
-            run.out_dir / self.file if self.file is not None else None,
-            self.port if self.serve else None,
-            self.memory_limit,
+            run.out_dir / settings.file if settings.file is not None else None,
+            settings.port if settings.serve else None,
+            settings.memory_limit,
             self._errors,
             layout(
                 images=_wired(run, "depth_image"),
@@ -147,19 +157,19 @@ class Viewer(Tap):
                 vision=vision,
             ),
         )
-        for mark in (*_about(run), *scenery(self.mount), *(spheres() if vision.directions else ())):
+        for mark in (*_about(run), *scenery(settings.mount), *(spheres() if vision.directions else ())):
             stream.put(mark, static=True)
         scene = Scene(
-            mount=self.mount,
-            history_s=self.history_s,
-            slice_s=self.slice_s,
-            max_points=self.max_points_per_slice,
-            trail_s=self.trail_s,
-            cameras=self.cameras,
+            mount=settings.mount,
+            history_s=settings.history_s,
+            slice_s=settings.slice_s,
+            max_points=settings.max_points_per_slice,
+            trail_s=settings.trail_s,
+            cameras=settings.cameras,
             picture_every_s=PICTURE_EVERY_S[self._waits],
         )
-        opens = [*opening(self.mount), *(drone_sphere(None) if vision.directions else ())]
-        slicer = Slicer(self.slice_s)
+        opens = [*opening(settings.mount), *(drone_sphere(None) if vision.directions else ())]
+        slicer = Slicer(settings.slice_s)
         dropped = 0
         while (batch := box.take()) is not None:
             for output, message in batch:
@@ -186,7 +196,9 @@ class Viewer(Tap):
     def _vision(self, run: Run) -> Vision:
         """What of the cameras and the fused pose there is to show."""
         directions = _made(run, "vanishing_directions")
-        pictures = (self.cameras and self.cameras.named()) or [f"camera_{carrier.value}" for carrier in Carrier]
+        pictures = (self.settings.cameras and self.settings.cameras.named()) or [
+            f"camera_{carrier.value}" for carrier in Carrier
+        ]
         return Vision(
             pictures=pictures if directions or _made(run, "image") else [],
             directions=directions,

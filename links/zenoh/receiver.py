@@ -14,13 +14,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar, Union
 
-from pydantic import PrivateAttr
-
 from flow import link
 from flow.codec import decode
 from flow.codec_fields import CodecError
 from flow.hosts import Hop
-from flow.link import LinkError, Record
+from flow.link import LinkError, Record, SourceSettings
 from flow.message import Message
 from flow.timeline import in_our_time
 from links.host_time import now_ns
@@ -38,7 +36,14 @@ COUNTED = ("received", "lost", "before the clock was known", "without an envelop
 RING = 256  # messages that wait for Python: more than the usual deadline of a LiDAR's packets, a bound on memory
 
 
-class Receiver(link.Source):
+class ReceiverSettings(SourceSettings):
+    """Settings of `Receiver`."""
+
+    session: Session
+    sender: str  # host
+
+
+class Receiver(link.Source[ReceiverSettings]):
     """Brings in what a node of another host gives, told in this host's time.
 
     Not for YAML (`receiver_class` makes its outputs), and so not in the schema, which knows `class Name(Source)`.
@@ -47,14 +52,13 @@ class Receiver(link.Source):
     hops: ClassVar[tuple[Hop, ...]] = ()
     expected: ClassVar[Mapping[str, type[Message]]] = {}
 
-    session: Session
-    sender: str  # host
-
-    _connection: Connection | None = PrivateAttr(default=None)
-    _clock: PeerClock | None = PrivateAttr(default=None)
-    _counts: Counter[str] = PrivateAttr(default_factory=Counter)
-    _counting: Any = PrivateAttr(default_factory=threading.Lock)
-    _newest: dict[str, tuple[int, int]] = PrivateAttr(default_factory=dict)  # key -> run and number of the newest
+    def __init__(self, settings: ReceiverSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._connection: Connection | None = None
+        self._clock: PeerClock | None = None
+        self._counts: Counter[str] = Counter()
+        self._counting: Any = threading.Lock()
+        self._newest: dict[str, tuple[int, int]] = {}  # key -> run and number of the newest
 
     def decode(self, record: Record) -> Message:
         """The message of one record. LinkError: it is none that this receiver expects."""
@@ -63,15 +67,15 @@ class Receiver(link.Source):
             message = decode(record.data, self.expected, RECORD_HEAD.size)
             return in_our_time(message, offset_ns, uncertainty_ns)
         except (CodecError, OverflowError, struct.error) as error:
-            raise LinkError(f"{self.topic}: what {self.sender} sent is refused: {error}") from None
+            raise LinkError(f"{self.settings.topic}: what {self.settings.sender} sent is refused: {error}") from None
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
         """Hear the other host. LinkError: a certificate or the library is missing."""
         closing = threading.Event()
         records: queue.Queue[Record] = queue.Queue(len(self.hops))
-        with connected(self.session) as connection:
-            self._connection, self._clock = connection, connection.clocks[self.sender]
+        with connected(self.settings.session) as connection:
+            self._connection, self._clock = connection, connection.clocks[self.settings.sender]
             threads = [
                 threading.Thread(target=self._hear, args=(connection, hop, records, closing), daemon=True)
                 for hop in self.hops
@@ -128,7 +132,7 @@ class Receiver(link.Source):
         if run == envelope.run:
             self._count("lost", max(envelope.number - number - 1, 0))
         self._newest[key] = envelope.run, envelope.number
-        difference = connection.clocks[self.sender].heard(envelope.run, envelope.sent_ns, arrival_ns)
+        difference = connection.clocks[self.settings.sender].heard(envelope.run, envelope.sent_ns, arrival_ns)
         if difference is None:
             self._count("before the clock was known")
             return None
@@ -137,7 +141,9 @@ class Receiver(link.Source):
             self._count("at no possible time")
             return None
         self._count("received")
-        return Record(self.topic, arrival_ns, stamp_ns, RECORD_HEAD.pack(*difference) + sample.payload.to_bytes())
+        return Record(
+            self.settings.topic, arrival_ns, stamp_ns, RECORD_HEAD.pack(*difference) + sample.payload.to_bytes()
+        )
 
     def _count(self, what: str, by: int = 1) -> None:
         with self._counting:
@@ -157,7 +163,7 @@ class Receiver(link.Source):
     @property
     def trouble(self) -> str | None:
         """What is wrong on the way from the other host."""
-        return None if self._connection is None else self._connection.trouble_with(self.sender)
+        return None if self._connection is None else self._connection.trouble_with(self.settings.sender)
 
 
 def _until(closing: threading.Event, records: queue.Queue[Record]) -> Iterator[Record]:

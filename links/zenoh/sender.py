@@ -10,11 +10,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
-from pydantic import PrivateAttr
-
 from flow import link
 from flow.hosts import Hop, port_of
-from flow.link import Record
+from flow.link import Record, SourceSettings
 from flow.message import Message
 from links.zenoh.connection import Connection, connected
 from links.zenoh.lane import Lane
@@ -23,7 +21,14 @@ from links.zenoh.session import Session, key_of
 JOIN_S = 0.2  # a thread whose line is stuck ends when Zenoh lets it go; the run does not wait for it
 
 
-class Sender(link.Source):
+class SenderSettings(SourceSettings):
+    """Settings of `Sender`."""
+
+    session: Session
+    to: str
+
+
+class Sender(link.Source[SenderSettings]):
     """Sends to one host. It brings no records in: `listen` is the time for which it is connected.
 
     Not for YAML (`sender_class` makes its ports), and so not in the schema, which knows `class Name(Source)`.
@@ -31,15 +36,11 @@ class Sender(link.Source):
 
     hops: ClassVar[tuple[Hop, ...]] = ()
 
-    session: Session
-    to: str
-
-    _lanes: dict[str, Lane] = PrivateAttr(default_factory=dict)
-    _connection: Connection | None = PrivateAttr(default=None)
-    _unopened: int = PrivateAttr(default=0)
-
-    def model_post_init(self, context: Any) -> None:
-        """A lane for each hop."""
+    def __init__(self, settings: SenderSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._lanes: dict[str, Lane] = {}
+        self._connection: Connection | None = None
+        self._unopened: int = 0
         for hop in self.hops:
             deadline_ns = round(hop.waiting.deadline_ms * 1e6)
             self._lanes[port_of(hop)] = Lane(key_of(hop), hop.message, hop.waiting.depth, deadline_ns)
@@ -58,7 +59,7 @@ class Sender(link.Source):
     def listen(self) -> Iterator[Iterator[Record]]:
         """Connected to the other host. LinkError: a certificate or the library is missing."""
         closing = threading.Event()
-        with connected(self.session) as connection:
+        with connected(self.settings.session) as connection:
             self._connection = connection
             threads = [
                 threading.Thread(target=lane.send_on, args=(connection, closing), name=f"send {lane.key}", daemon=True)
@@ -92,14 +93,15 @@ class Sender(link.Source):
     @property
     def trouble(self) -> str | None:
         """What is wrong on the way to the other host."""
+        settings = self.settings
         if self._connection is None:
             return None
-        wrong = self._connection.trouble_with(self.to)
-        if wrong is not None or self._connection.clocks[self.to].answered_ns is None:
+        wrong = self._connection.trouble_with(settings.to)
+        if wrong is not None or self._connection.clocks[settings.to].answered_ns is None:
             return wrong
         unheard = [lane.key for lane in self._lanes.values() if not lane.heard]
         if unheard:
-            return f"{self.to} does not listen to {', '.join(unheard)}: is it running, with the same hosts file?"
+            return f"{settings.to} does not listen to {', '.join(unheard)}: is it running, with the same hosts file?"
         return next((lane.trouble for lane in self._lanes.values() if lane.trouble), None)
 
 

@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field, model_validator
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.aim.beams import Rotor, cheapest, low_discrepancy, nearest, rotor_azimuth_rad, sweep_step_rad
 from stages.aim.beside import Look, best_offset_m
 from stages.aim.sweeping import Sweeping
@@ -64,10 +64,8 @@ class _Now:
         return (w[-1] - w[0]) / (len(w) - 1) if len(w) > 1 else math.tau
 
 
-class BeamAim(Stage):
-    """Keeps a beam on the drone; searches when there is none."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates"})
+class BeamAimSettings(Settings):
+    """Settings of `BeamAim`."""
 
     mount: LidarMount
     span_m: float = Field(0.5, gt=0, le=10)
@@ -89,16 +87,25 @@ class BeamAim(Stage):
     beams: bool = True  # ablation: without, the middle of the fan is put on the drone
     coast_sigma_m: float = Field(3.0, gt=0)  # less known while coasting, the whole travel is swept
 
-    _now: _Now = PrivateAttr()
-
-    def model_post_init(self, context: Any, /) -> None:
+    @model_validator(mode="after")
+    def _settings_agree(self) -> BeamAimSettings:
         if self.travel_deg[1] <= self.travel_deg[0]:
             raise ValueError("travel_deg must be two growing angles")
-        self._now = _Now(Sweeping(*self._travel_rad), GearPlay(self.mount))
+        return self
+
+
+class BeamAim(Stage[BeamAimSettings]):
+    """Keeps a beam on the drone; searches when there is none."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates"})
+
+    def __init__(self, settings: BeamAimSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._now = _Now(Sweeping(*self._travel_rad), GearPlay(self.settings.mount))
 
     @property
     def _travel_rad(self) -> tuple[float, float]:
-        return math.radians(self.travel_deg[0]), math.radians(self.travel_deg[1])
+        return math.radians(self.settings.travel_deg[0]), math.radians(self.settings.travel_deg[1])
 
     def on_firings(self, firings: LidarFirings) -> None:
         """Keep track of the rotor."""
@@ -108,7 +115,7 @@ class BeamAim(Stage):
 
     def on_candidates(self, candidates: Candidates) -> None:
         """What is worth another look now."""
-        self._now.targets.hear_candidates(candidates, self.candidate_probability)
+        self._now.targets.hear_candidates(candidates, self.settings.candidate_probability)
 
     def on_state(self, state: TrackState) -> None:
         """Where each track is predicted."""
@@ -117,7 +124,7 @@ class BeamAim(Stage):
     def on_servo(self, servo: ServoState) -> ServoGoal | None:
         """A new goal when the last look is over, or at once when something else is to be done."""
         now = self._now
-        if not self.mount.turns:
+        if not self.settings.mount.turns:
             return None
         if now.servo_rad is not None:
             now.play.move(math.remainder(servo.position_rad - now.servo_rad, math.tau))
@@ -136,23 +143,25 @@ class BeamAim(Stage):
     # what to look at
 
     def _choose(self, servo: ServoState) -> Target | None:
+        settings = self.settings
         now = self._now
-        now.targets.tidy(servo.stamp_ns, self.candidate_looks, self.candidate_rest_s)
-        tracks = now.targets.tracks(self.coast_sigma_m)
-        if not tracks or len(tracks) >= self.max_drones:
+        now.targets.tidy(servo.stamp_ns, settings.candidate_looks, settings.candidate_rest_s)
+        tracks = now.targets.tracks(settings.coast_sigma_m)
+        if not tracks or len(tracks) >= settings.max_drones:
             now.searching, now.served, now.sweeping.left_off_rad = False, 0, None
         elif self._searches_on(len(tracks), servo):
             return self._candidate(servo.stamp_ns)
         if not tracks:
             return self._candidate(servo.stamp_ns)
         current = now.targets.get(now.current)
-        if current in tracks and (len(tracks) == 1 or now.turns < self.turns_each):
+        if current in tracks and (len(tracks) == 1 or now.turns < settings.turns_each):
             return current
         after = [t for t in tracks if now.current is not None and t.key > now.current]
         return (after or tracks)[0]
 
     def _searches_on(self, tracks: int, servo: ServoState) -> bool:
         """Whether each track has had its turns: time for a piece of the sweep, from where the last one ended."""
+        settings = self.settings
         now = self._now
         if now.searching and servo.stamp_ns < now.search_until_ns:
             return True
@@ -160,23 +169,26 @@ class BeamAim(Stage):
         if now.searching:
             now.searching, now.served = False, 0
             now.sweeping.left_off_rad = left_off = servo.position_rad
-        if now.served >= self.turns_each * tracks and servo.stamp_ns >= now.hold_until_ns:
+        if now.served >= settings.turns_each * tracks and servo.stamp_ns >= now.hold_until_ns:
             way_rad = 0.0 if left_off is None else abs(left_off - servo.position_rad)
             now.searching = True
-            now.search_until_ns = servo.stamp_ns + round((self.search_s + way_rad / (self.limit_rpm * RPM_RADPS)) * 1e9)
+            now.search_until_ns = servo.stamp_ns + round(
+                (settings.search_s + way_rad / (settings.limit_rpm * RPM_RADPS)) * 1e9
+            )
         return now.searching
 
     def _candidate(self, now_ns: int) -> Target | None:
         """The one to stop at, else the one to glance at in passing; None: sweep on."""
+        settings = self.settings
         now = self._now
         maybe = now.targets.candidates(now_ns)
         current = now.targets.get(now.current)
-        worth = [t for t in maybe if t.probability >= self.stop_probability and t.seen_looks >= self.stop_looks]
+        worth = [t for t in maybe if t.probability >= settings.stop_probability and t.seen_looks >= settings.stop_looks]
         if current in worth and not current.glance:
-            doubtful = 0.5 * self.stop_probability  # so improbable it has none
-            if len(current.tried) < self.patience * (current.probability - doubtful) / (1.0 - doubtful):
+            doubtful = 0.5 * settings.stop_probability  # so improbable it has none
+            if len(current.tried) < settings.patience * (current.probability - doubtful) / (1.0 - doubtful):
                 return current
-            now.targets.leave(current, now_ns, self.candidate_rest_s)  # not there, or most likely something else
+            now.targets.leave(current, now_ns, settings.candidate_rest_s)  # not there, or most likely something else
             worth.remove(current)
             maybe.remove(current)
         if worth:
@@ -184,7 +196,7 @@ class BeamAim(Stage):
             best.glance = False
             return best
         # the sweep goes on by steps: each turn of the rotor a beam is put on something that was met a moment ago
-        fresh = [t for t in maybe if t.looks < self.glances and now_ns - t.heard_ns < FRESH_NS]
+        fresh = [t for t in maybe if t.looks < settings.glances and now_ns - t.heard_ns < FRESH_NS]
         for target in fresh:
             target.glance = True
         return max(fresh, key=lambda t: (t.probability / (1.0 + t.looks), t.key), default=None)
@@ -192,6 +204,7 @@ class BeamAim(Stage):
     # one look
 
     def _look(self, servo: ServoState, target: Target) -> ServoGoal | None:
+        settings = self.settings
         now = self._now
         now.turns = now.turns + 1 if now.current == target.key else 0
         now.current = target.key
@@ -202,27 +215,27 @@ class BeamAim(Stage):
             centre_rad, inner_rad = now.sweeping.glance_from(servo.position_rad, step_rad), math.inf
         else:
             now.sweeping.beside_rad = None
-        T, T_tl = self.mount.T_vehicle_turntable.matrix(), self.mount.T_turntable_lidar.matrix()
-        speed_radps, travel_rad = self.limit_rpm * RPM_RADPS, self._travel_rad
-        elevations_rad = now.elevations_rad if self.beams else (0.0,)
-        offset_m, goal_rad, pass_ns = 0.0, 0.0, servo.stamp_ns + round((self.lead_s + FIRST_GUESS_S) * 1e9)
+        T, T_tl = settings.mount.T_vehicle_turntable.matrix(), settings.mount.T_turntable_lidar.matrix()
+        speed_radps, travel_rad = settings.limit_rpm * RPM_RADPS, self._travel_rad
+        elevations_rad = now.elevations_rad if settings.beams else (0.0,)
+        offset_m, goal_rad, pass_ns = 0.0, 0.0, servo.stamp_ns + round((settings.lead_s + FIRST_GUESS_S) * 1e9)
         for _ in range(2):  # the place at the pass depends on when that is
             place = T[:3, :3].T @ (target.at(pass_ns) - T[:3, 3])
             range_m = max(float(np.linalg.norm(place - T_tl[:3, 3])), 0.5)
             offset_m = self._offset_m(target, range_m, pass_ns)
             offset_rad = offset_m / range_m
-            best = cheapest(self.mount, travel_rad, elevations_rad, centre_rad, place, offset_rad, inner_rad)
-            if best is None and self.beams:
-                best = nearest(self.mount, travel_rad, place)
+            best = cheapest(settings.mount, travel_rad, elevations_rad, centre_rad, place, offset_rad, inner_rad)
+            if best is None and settings.beams:
+                best = nearest(settings.mount, travel_rad, place)
             if best is None:
                 return self._sweep(servo)
             goal_rad = now.play.goal_rad(servo.position_rad, best.servo_rad)
             goal_rad = min(max(goal_rad, travel_rad[0]), travel_rad[1])
             if target.glance and abs(best.servo_rad - centre_rad) > GLANCE_RAD:
-                target.looks = self.glances  # the fan has passed it
+                target.looks = settings.glances  # the fan has passed it
                 return self._sweep(servo)
             way_s = abs(goal_rad - servo.position_rad) / speed_radps
-            ready_ns = servo.stamp_ns + round((self.lead_s + self.settle_s + way_s) * 1e9)
+            ready_ns = servo.stamp_ns + round((settings.lead_s + settings.settle_s + way_s) * 1e9)
             pass_ns = now.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, place, best.table_rad), ready_ns)
         target.tried.append(Look(target.reach_m(pass_ns), offset_m))
         del target.tried[:-MOST_TRIED]
@@ -238,19 +251,20 @@ class BeamAim(Stage):
         same edge for ever, and a wire along the beam's way would seem to fly. One that was missed, or was met only
         once: where it most likely is by now.
         """
+        settings = self.settings
         if not target.tried and (target.sure or (target.looks and not target.wander_mps)):
-            wide_m = 0.175 * self.span_m * min(1.0, 20.0 / range_m)
+            wide_m = 0.175 * settings.span_m * min(1.0, 20.0 / range_m)
             if target.sure:
-                wide_m = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * self.span_m + 0.35 * target.sigma_m
+                wide_m = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * settings.span_m + 0.35 * target.sigma_m
             return wide_m * low_discrepancy(target.looks % 16)
         reach_m, headed = target.reach_m(pass_ns), target.wander_mps > 0.0
         spacing_m = self._now.spacing_rad * range_m
-        return best_offset_m(reach_m, headed, target.tried, spacing_m, HALF_SHARE * self.span_m)
+        return best_offset_m(reach_m, headed, target.tried, spacing_m, HALF_SHARE * settings.span_m)
 
     # search
 
     def _sweep(self, servo: ServoState) -> ServoGoal | None:
-        back_radps = self.limit_rpm * RPM_RADPS if self._now.searching else None
+        back_radps = self.settings.limit_rpm * RPM_RADPS if self._now.searching else None
         goal = self._now.sweeping.goal(servo.stamp_ns, servo.position_rad, self._search_radps(), back_radps)
         if goal is None:
             return None
@@ -258,7 +272,7 @@ class BeamAim(Stage):
 
     def _search_radps(self) -> float:
         now = self._now
-        limit_radps, wanted_radps = self.limit_rpm * RPM_RADPS, self.search_rpm * RPM_RADPS
+        limit_radps, wanted_radps = self.settings.limit_rpm * RPM_RADPS, self.settings.search_rpm * RPM_RADPS
         if now.rotor.rate_radps <= 0 or len(now.elevations_rad) < 2:
             return min(wanted_radps, limit_radps)
         turn_s = math.tau / now.rotor.rate_radps

@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, model_validator
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.aim.sweeping import Sweeping
 from stages.aim.vibrate import RPM_RADPS
 from stages.geometry import LidarMount
@@ -22,27 +22,36 @@ from stages.messages import ServoGoal, ServoState
 Rpm = Annotated[float, Field(gt=0, le=120)]
 
 
-class CalibrationSweep(Stage):
-    """To each end of the travel in turn; a servo that comes no nearer, at a limit or in a stall, turns round there."""
+class CalibrationSweepSettings(Settings):
+    """Settings of `CalibrationSweep`."""
 
     mount: LidarMount
     travel_deg: tuple[float, float] = (0.0, 180.0)  # servo positions
     speeds_rpm: tuple[Rpm, ...] = Field((11.4, 45.0), min_length=1)  # each for a way there and back
 
-    _sweeping: Sweeping = PrivateAttr()
-    _ways: int = PrivateAttr(default=0)
-
-    def model_post_init(self, context: Any, /) -> None:
+    @model_validator(mode="after")
+    def _settings_agree(self) -> CalibrationSweepSettings:
         low, high = self.travel_deg
         if not low < high:
             raise ValueError("travel_deg must be two growing angles")
+        return self
+
+
+class CalibrationSweep(Stage[CalibrationSweepSettings]):
+    """To each end of the travel in turn; a servo that comes no nearer, at a limit or in a stall, turns round there."""
+
+    def __init__(self, settings: CalibrationSweepSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._ways: int = 0
+        low, high = self.settings.travel_deg
         self._sweeping = Sweeping(math.radians(low), math.radians(high))
 
     def on_servo(self, servo: ServoState) -> ServoGoal | None:
         """The other end once this one is reached, else None. Never a goal for a LiDAR bolted down."""
-        if not self.mount.turns:
+        settings = self.settings
+        if not settings.mount.turns:
             return None
-        radps = self.speeds_rpm[self._ways // 2 % len(self.speeds_rpm)] * RPM_RADPS
+        radps = settings.speeds_rpm[self._ways // 2 % len(settings.speeds_rpm)] * RPM_RADPS
         goal = self._sweeping.goal(servo.stamp_ns, servo.position_rad, radps, None)
         if goal is None:
             return None

@@ -21,9 +21,9 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, model_validator
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.geometry import Array64, LidarMount
 from stages.messages import Detections, DroneFix, ServoGoal, ServoState, TrackingState, TrackState
 
@@ -43,10 +43,8 @@ class _Now:
     nearer_ns: int = 0  # when it last came nearer
 
 
-class SweepVibrateAim(Stage):
-    """P III.A and III.C: sweep until the track is TRACKING, vibrate about the drone while it is, sweep again."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"detections"})
+class SweepVibrateAimSettings(Settings):
+    """Settings of `SweepVibrateAim`."""
 
     mount: LidarMount
     travel_deg: tuple[float, float] = (0.0, 180.0)  # servo positions between which to sweep and vibrate
@@ -57,11 +55,21 @@ class SweepVibrateAim(Stage):
     patience_s: float = Field(0.3, gt=0)  # so does one that has come no nearer for so long: a limit, a stall
     end_slack_deg: float = Field(5.0, ge=0, le=15)
 
-    _now: _Now = PrivateAttr(default_factory=lambda: _Now())
-
-    def model_post_init(self, context: Any, /) -> None:
+    @model_validator(mode="after")
+    def _settings_agree(self) -> SweepVibrateAimSettings:
         if self.travel_deg[1] - self.travel_deg[0] < 2 * self.half_angle_deg:
             raise ValueError("travel_deg must be two growing angles at least twice half_angle_deg apart")
+        return self
+
+
+class SweepVibrateAim(Stage[SweepVibrateAimSettings]):
+    """P III.A and III.C: sweep until the track is TRACKING, vibrate about the drone while it is, sweep again."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"detections"})
+
+    def __init__(self, settings: SweepVibrateAimSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._now = _Now()
 
     def on_detections(self, detections: Detections) -> None:
         """Before the first fix the drone is where the best accepted detection has it."""
@@ -80,8 +88,9 @@ class SweepVibrateAim(Stage):
 
     def on_servo(self, servo: ServoState) -> ServoGoal | None:
         """A new goal when the last one is reached or out of date, else None. Never one for a LiDAR bolted down."""
+        settings = self.settings
         now, position_rad = self._now, servo.position_rad
-        if not self.mount.turns:
+        if not settings.mount.turns:
             return None
         vibrate = now.tracking and now.drone_vehicle_m is not None
         started = now.goal_rad is None or vibrate != (now.centre_rad is not None)
@@ -91,14 +100,14 @@ class SweepVibrateAim(Stage):
         if not vibrate:
             now.centre_rad = None
         near, far = sorted((low_rad, high_rad), key=lambda end: abs(end - position_rad))
-        now.goal_rad = near if started and abs(near - position_rad) > math.radians(self.arrived_deg) else far
+        now.goal_rad = near if started and abs(near - position_rad) > math.radians(settings.arrived_deg) else far
         now.nearest_rad, now.nearer_ns = math.inf, servo.stamp_ns
-        speed_rpm = self.vibrate_rpm if vibrate else self.sweep_rpm
+        speed_rpm = settings.vibrate_rpm if vibrate else settings.sweep_rpm
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=now.goal_rad, speed_radps=speed_rpm * RPM_RADPS)
 
     @property
     def _travel_rad(self) -> tuple[float, float]:
-        return math.radians(self.travel_deg[0]), math.radians(self.travel_deg[1])
+        return math.radians(self.settings.travel_deg[0]), math.radians(self.settings.travel_deg[1])
 
     def _reached(self, servo: ServoState) -> bool:
         """Whether the servo is at the goal, or has given up on it."""
@@ -107,17 +116,21 @@ class SweepVibrateAim(Stage):
         left_rad = abs(now.goal_rad - servo.position_rad)
         if left_rad < now.nearest_rad:
             now.nearest_rad, now.nearer_ns = left_rad, servo.stamp_ns
-        return left_rad < math.radians(self.arrived_deg) or servo.stamp_ns - now.nearer_ns > self.patience_s * 1e9
+        return (
+            left_rad < math.radians(self.settings.arrived_deg)
+            or servo.stamp_ns - now.nearer_ns > self.settings.patience_s * 1e9
+        )
 
     def _ends_rad(self, position_rad: float) -> tuple[float, float]:
         """Between which servo positions to vibrate now."""
+        settings = self.settings
         now = self._now
         assert now.drone_vehicle_m is not None
-        slack_rad = 0.0 if now.centre_rad is None else math.radians(self.end_slack_deg)
+        slack_rad = 0.0 if now.centre_rad is None else math.radians(settings.end_slack_deg)
         near_rad = position_rad if now.centre_rad is None else now.centre_rad
-        angles = servo_angles_rad(self.mount, now.drone_vehicle_m)
+        angles = servo_angles_rad(settings.mount, now.drone_vehicle_m)
         now.centre_rad = nearest_within(angles, near_rad, self._travel_rad, slack_rad)
-        return swing_rad(now.centre_rad, math.radians(self.half_angle_deg), self._travel_rad)
+        return swing_rad(now.centre_rad, math.radians(settings.half_angle_deg), self._travel_rad)
 
 
 def plane_angles_rad(T_turntable_lidar: Array64, p_turntable_m: Array64) -> tuple[float, ...]:

@@ -23,9 +23,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, model_validator
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.align.answers import Answers
 from stages.align.by_motion import ByMotion, Prior
 from stages.align.lock import YawLock
@@ -60,12 +60,8 @@ class _Parts:
     answers: Answers
 
 
-class JointAlign(Stage):
-    """Both cameras' lines laid on each other; four branches with probabilities."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"motion", "drone_motion", "attitude", "position", "odometry", "fix"}
-    )
+class JointAlignSettings(Settings):
+    """Settings of `JointAlign`."""
 
     max_apart_s: float = Field(0.1, gt=0, le=1)  # between the pictures of a pair; half the slower camera's period
     straight_deg: float = Field(0.25, gt=0, le=5)  # how straight and parallel streets are, one sigma of a line
@@ -82,20 +78,32 @@ class JointAlign(Stage):
     prior_trust: float = Field(0.95, gt=0, lt=1)  # that it is right at all: alone it never resolves
     branches: BranchSettings = BranchSettings()
 
-    _parts: _Parts = PrivateAttr()
-
-    def model_post_init(self, context: Any, /) -> None:
+    @model_validator(mode="after")
+    def _settings_agree(self) -> JointAlignSettings:
         if self.initial_yaw_deg is not None and self.compass_deg is not None:
             raise ValueError("give initial_yaw_deg or compass_deg, not both")
-        reckoning, lock = Reckoning(self.parked), YawLock()
-        motion = ByMotion(self.branches, self._prior(), reckoning, lock)
+        return self
+
+
+class JointAlign(Stage[JointAlignSettings]):
+    """Both cameras' lines laid on each other; four branches with probabilities."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset(
+        {"motion", "drone_motion", "attitude", "position", "odometry", "fix"}
+    )
+
+    def __init__(self, settings: JointAlignSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        settings = self.settings
+        reckoning, lock = Reckoning(settings.parked), YawLock()
+        motion = ByMotion(settings.branches, self._prior(), reckoning, lock)
         self._parts = _Parts(
-            Pairing(round(1e9 * self.max_apart_s)),
+            Pairing(round(1e9 * settings.max_apart_s)),
             reckoning,
             lock,
             motion,
             Surprise(reckoning, lock),
-            Answers(motion.bank, reckoning, self.resolve_probability),
+            Answers(motion.bank, reckoning, settings.resolve_probability),
         )
 
     def on_motion(self, motion: VehicleMotion) -> None:
@@ -141,17 +149,18 @@ class JointAlign(Stage):
 
     def _align(self, pair: Pair) -> RelativeRotation:
         """One answer for a pair of pictures."""
+        settings = self.settings
         parts = self._parts
         seen_by_vehicle, seen_by_drone = pair
         drone_ns = seen_by_drone.stamp_ns
         if seen_by_vehicle is None:
-            return parts.answers.none(drone_ns, f"no picture of the vehicle's within {self.max_apart_s:g} s")
+            return parts.answers.none(drone_ns, f"no picture of the vehicle's within {settings.max_apart_s:g} s")
         vehicle_ns = seen_by_vehicle.stamp_ns
-        straight_rad = math.radians(self.straight_deg)
+        straight_rad = math.radians(settings.straight_deg)
         vehicle, drone = level_lines(seen_by_vehicle, straight_rad), level_lines(seen_by_drone, straight_rad)
-        if vehicle is None or drone is None or min(len(vehicle.weight), len(drone.weight)) < self.min_lines:
+        if vehicle is None or drone is None or min(len(vehicle.weight), len(drone.weight)) < settings.min_lines:
             both = ((seen_by_vehicle, vehicle), (seen_by_drone, drone))
-            few = (seen for seen, lines in both if lines is None or len(lines.weight) < self.min_lines)
+            few = (seen for seen, lines in both if lines is None or len(lines.weight) < settings.min_lines)
             return parts.answers.none(
                 drone_ns, "; ".join(f"{seen.carrier.value}: {seen.reason or 'too few level lines'}" for seen in few)
             )
@@ -166,7 +175,7 @@ class JointAlign(Stage):
             return parts.answers.none(drone_ns, match.reason)
         streets = street_directions(a, b, match.yaw_rad)
         refined = refine(vehicle, drone, streets, match.yaw_rad, self._tolerances())
-        if refined.directions == 0 or min(refined.vehicle_lines, refined.drone_lines) < self.min_lines:
+        if refined.directions == 0 or min(refined.vehicle_lines, refined.drone_lines) < settings.min_lines:
             return parts.answers.none(drone_ns, "too few lines run along the same streets")
         if parts.lock.relocked:
             self._begin_anew("the lines match elsewhere for long now, all is begun anew there")
@@ -182,15 +191,19 @@ class JointAlign(Stage):
         self._parts.motion.begin_anew()
 
     def _prior(self) -> Prior:
-        initial, compass = (None if d is None else math.radians(d) for d in (self.initial_yaw_deg, self.compass_deg))
-        return Prior(initial, compass, math.radians(self.prior_sigma_deg), self.prior_trust)
+        settings = self.settings
+        initial, compass = (
+            None if d is None else math.radians(d) for d in (settings.initial_yaw_deg, settings.compass_deg)
+        )
+        return Prior(initial, compass, math.radians(settings.prior_sigma_deg), settings.prior_trust)
 
     def _tolerances(self) -> Tolerances:
+        settings = self.settings
         return Tolerances(
-            straight_rad=math.radians(self.straight_deg),
-            direction_rad=math.radians(self.direction_sigma_deg),
-            square_rad=math.radians(self.square_sigma_deg),
-            tilt_rad=math.radians(self.tilt_sigma_deg),
+            straight_rad=math.radians(settings.straight_deg),
+            direction_rad=math.radians(settings.direction_sigma_deg),
+            square_rad=math.radians(settings.square_sigma_deg),
+            tilt_rad=math.radians(settings.tilt_sigma_deg),
         )
 
 

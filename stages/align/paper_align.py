@@ -31,9 +31,9 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.align.pairing import Pairing
 from stages.align.paper_correction import CorrectionRule, MotionCorrection
 from stages.align.paper_filter import RotationFilter
@@ -52,10 +52,8 @@ from stages.messages import (
 OTHER_BRANCH_RAD = math.radians(45.0)
 
 
-class PaperAlign(Stage):
-    """P IV and V.C-V.E: smallest-angle matching, EKF, and the branch put right by the drone's motion."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"fix", "drone_motion", "motion"})
+class PaperAlignSettings(Settings):
+    """Settings of `PaperAlign`."""
 
     initial_yaw_deg: float = Field(0.0, ge=-360, le=360)  # the drone's heading in the vehicle's axes at the start
     initial_sigma_deg: float = Field(30.0, gt=0)
@@ -69,22 +67,28 @@ class PaperAlign(Stage):
     cone_deg: float = Field(30.0, gt=0, lt=90)
     wrong_share: float = Field(0.033, ge=0, lt=0.75)  # of corrections that leave or make a wrong branch
 
-    _pairing: Pairing = PrivateAttr()
-    _filter: RotationFilter = PrivateAttr()
-    _correction: MotionCorrection = PrivateAttr()
-    _observed: bool = PrivateAttr(default=False)
-    _corrected: bool = PrivateAttr(default=False)
-    _switches: int = PrivateAttr(default=0)
 
-    def model_post_init(self, context: Any, /) -> None:
-        self._pairing = Pairing(round(self.max_apart_s * 1e9))
-        rule = CorrectionRule(self.pictures_apart, self.shortest_m, self.last, math.radians(self.cone_deg))
+class PaperAlign(Stage[PaperAlignSettings]):
+    """P IV and V.C-V.E: smallest-angle matching, EKF, and the branch put right by the drone's motion."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"fix", "drone_motion", "motion"})
+
+    def __init__(self, settings: PaperAlignSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._observed: bool = False
+        self._corrected: bool = False
+        self._switches: int = 0
+        settings = self.settings
+        self._pairing = Pairing(round(settings.max_apart_s * 1e9))
+        rule = CorrectionRule(
+            settings.pictures_apart, settings.shortest_m, settings.last, math.radians(settings.cone_deg)
+        )
         self._correction = MotionCorrection(rule)
         self._filter = RotationFilter(
-            rotation_z(math.radians(self.initial_yaw_deg)),
-            math.radians(self.initial_sigma_deg),
-            math.radians(self.rate_sigma_dps),
-            math.radians(self.rate_noise_dps),
+            rotation_z(math.radians(settings.initial_yaw_deg)),
+            math.radians(settings.initial_sigma_deg),
+            math.radians(settings.rate_sigma_dps),
+            math.radians(settings.rate_noise_dps),
         )
 
     def on_fix(self, fix: DroneFix) -> None:
@@ -130,12 +134,12 @@ class PaperAlign(Stage):
     def _absence(self, vehicle: VanishingDirections | None, drone: VanishingDirections) -> str:
         """Why there is nothing to match; empty when there is."""
         if vehicle is None:
-            return f"no picture of the vehicle's within {self.max_apart_s:g} s of the drone's"
+            return f"no picture of the vehicle's within {self.settings.max_apart_s:g} s of the drone's"
         return "; ".join(f"{one.carrier.value}: {one.reason}" for one in (vehicle, drone) if len(one.direction) < 2)
 
     def _observe(self, vehicle: Array64, drone: Array64, now_ns: int) -> str:
         """Match, correct the branch if motion says so, update the filter. Returns what was done, in words."""
-        estimate, sigma_rad = self._filter, math.radians(self.observation_deg)
+        estimate, sigma_rad = self._filter, math.radians(self.settings.observation_deg)
         found = match(vehicle, drone, estimate.rotation)
         turn_rad = self._correction.turn_rad()
         if turn_rad is not None:
@@ -155,7 +159,7 @@ class PaperAlign(Stage):
     def _message(self, stamp_ns: int, R: Array64 | None, reason: str) -> RelativeRotation:
         probability = np.full(4, 0.25)
         if self._corrected:
-            probability = np.array([1.0 - self.wrong_share] + [self.wrong_share / 3] * 3)
+            probability = np.array([1.0 - self.settings.wrong_share] + [self.settings.wrong_share / 3] * 3)
         state = BranchState.RESOLVED if self._corrected else BranchState.AMBIGUOUS
         return RelativeRotation(
             stamp_ns=stamp_ns,

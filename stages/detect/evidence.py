@@ -21,9 +21,9 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field, model_validator
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.detect.bank import Bank, first_within, places_of
 from stages.detect.candidate import SAME_LOOK_NS, SIGMA_M, STANDING_M, START_SPEED_MPS, Candidate, Sighting
 from stages.detect.drone_word import DroneWord
@@ -86,10 +86,8 @@ class _Now:
     end_ns: int | None = None  # of a pass that is over, not yet reported
 
 
-class EvidenceDetect(Stage):
-    """Small, alone, seen to be free all around, again and again: a drone. What is refused is refused with a reason."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion", "drone_position", "drone_odometry"})
+class EvidenceDetectSettings(Settings):
+    """Settings of `EvidenceDetect`."""
 
     span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
     lowest_deg: float = Field(4.0, ge=-30, le=80)  # candidates are this far above the LiDAR's horizon
@@ -107,13 +105,29 @@ class EvidenceDetect(Stage):
     free_space: bool = True  # False: what was measured around a candidate counts for nothing, to see what it is worth
     evidence: Evidence = Evidence()
 
-    _now: _Now = PrivateAttr()
-
-    def model_post_init(self, context: Any, /) -> None:
+    @model_validator(mode="after")
+    def _settings_agree(self) -> EvidenceDetectSettings:
         if self.furthest_m <= self.nearest_m:
             raise ValueError("furthest_m must be larger than nearest_m")
-        limits = Limits(self.span_m, math.radians(self.lowest_deg), self.nearest_m, self.furthest_m, self.clear_m)
-        self._now = _Now(SightingFinder(limits), Travel(math.radians(self.sweep_deg - 3.0), math.radians(0.5)))
+        return self
+
+
+class EvidenceDetect(Stage[EvidenceDetectSettings]):
+    """Small, alone, seen to be free all around, again and again: a drone. What is refused is refused with a reason."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion", "drone_position", "drone_odometry"})
+
+    def __init__(self, settings: EvidenceDetectSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        settings = self.settings
+        limits = Limits(
+            settings.span_m,
+            math.radians(settings.lowest_deg),
+            settings.nearest_m,
+            settings.furthest_m,
+            settings.clear_m,
+        )
+        self._now = _Now(SightingFinder(limits), Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5)))
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Where the vehicle is. Without it nothing is taken to move but what rises or sinks, unless `parked` is set."""
@@ -148,7 +162,7 @@ class EvidenceDetect(Stage):
 
     def _motion_known(self, stamp_ns: int) -> bool:
         """Whether it is told how the vehicle moves: what stands still in the world is known then."""
-        return self.parked or self._now.trail.known_at(stamp_ns)
+        return self.settings.parked or self._now.trail.known_at(stamp_ns)
 
     def _take(self, now: _Now, s: Sighting) -> bool:
         """Give a sighting to the candidate it fits, or make one of it. True when that is news."""
@@ -216,19 +230,22 @@ class EvidenceDetect(Stage):
 
     def _weigh(self, now: _Now, c: Candidate) -> bool:
         """Judge it anew. True when that is news."""
+        settings = self.settings
         motion_known = self._motion_known(c.seen_ns)
         c.hear(now.word.of(c, motion_known))
-        c.odds, c.why = judge(c, self.evidence, self.free_space, motion_known)
-        accept = odds_of(self.accept_probability)
+        c.odds, c.why = judge(c, settings.evidence, settings.free_space, motion_known)
+        accept = odds_of(settings.accept_probability)
         c.accepted = c.odds >= accept or (c.accepted and c.odds >= accept - KEPT_NATS)
-        was, c.told = c.told, c.odds >= odds_of(self.look_again_probability)
+        was, c.told = c.told, c.odds >= odds_of(settings.look_again_probability)
         c.worth |= c.told
         return c.worth or was != c.told
 
     def _look_for_misses(self, now: _Now, part: Slice, now_ns: int) -> None:
         """Count the pulses that went through where a candidate should be, look by look."""
-        origin_m, disc_m = np.array(part.pulses.origin_vehicle_m), 0.22 * self.span_m
-        for c, hits, passes, elsewhere in now.bank.looked_at(part, origin_m, now_ns, disc_m, (0.5 * self.span_m) ** 2):
+        origin_m, disc_m = np.array(part.pulses.origin_vehicle_m), 0.22 * self.settings.span_m
+        for c, hits, passes, elsewhere in now.bank.looked_at(
+            part, origin_m, now_ns, disc_m, (0.5 * self.settings.span_m) ** 2
+        ):
             if not elsewhere:
                 watch = now.watches.setdefault(c.number, _Watch())
                 watch.hits += hits
@@ -278,10 +295,11 @@ class EvidenceDetect(Stage):
     def _kept_ns(self, c: Candidate) -> float:
         """How long a candidate is followed without a sighting."""
         if c.told:
-            return self.forget_s * 1e9
+            return self.settings.forget_s * 1e9
         return 1.5e9 if c.hit_looks >= 3 else 0.35e9
 
     def _report(self, now: _Now, now_ns: int, turntable_rad: float, changed: bool) -> Iterator[Candidates | Detections]:
+        settings = self.settings
         if not math.isnan(turntable_rad):
             now.travel.advance(turntable_rad, 0.0)
             if now.travel.whole:
@@ -292,20 +310,20 @@ class EvidenceDetect(Stage):
         if changed or new:
             told = [c for c in now.bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
             flight = now.word.usual_flight(now.trail, now_ns)
-            yield candidates_message(told, now.trail, now_ns, now.detector_life, self.max_candidates, *flight)
+            yield candidates_message(told, now.trail, now_ns, now.detector_life, settings.max_candidates, *flight)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9
         here = any(c.seen_ns >= now.start_ns for c in accepted)
         if now.end_ns is not None and not new:
-            if now_ns - now.end_ns < self.settle_s * 1e9 and not (here and since_s > self.report_s):
+            if now_ns - now.end_ns < settings.settle_s * 1e9 and not (here and since_s > settings.report_s):
                 return
-            end_ns = now.end_ns if now_ns - now.end_ns >= self.settle_s * 1e9 else now_ns
-        elif new or (here and since_s > self.report_s) or since_s > 3.0 * self.report_s:
+            end_ns = now.end_ns if now_ns - now.end_ns >= settings.settle_s * 1e9 else now_ns
+        elif new or (here and since_s > settings.report_s) or since_s > 3.0 * settings.report_s:
             end_ns = now_ns
         else:
             return
         refused = now.refused + now.finder.hidden
-        yield detections_message(now.bank, now.trail, now.start_ns, end_ns, refused, self.max_candidates)
+        yield detections_message(now.bank, now.trail, now.start_ns, end_ns, refused, settings.max_candidates)
         for c in new:
             c.announced = True
         now.start_ns, now.end_ns = end_ns + 1, None

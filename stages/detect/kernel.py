@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.depth_image import unproject
 from stages.detect.candidates import Gates, Pixel, local_minima, refusal
 from stages.detect.kernel_score import inner_half_px, kernel_terms, score_image
@@ -34,8 +34,8 @@ class Candidate(NamedTuple):
     reason: str
 
 
-class KernelDetect(Stage):
-    """P III.B: the two-box kernel. Accepted detections come from at most `max_minima` minima, best score first.
+class KernelDetectSettings(Settings):
+    """Settings of `KernelDetect`.
 
     `nearest_m`: nothing nearer is a candidate (the vehicle's own roof); it also bounds the inner box.
     """
@@ -48,28 +48,40 @@ class KernelDetect(Stage):
     max_minima: int = Field(128, ge=1)  # looked at
     max_candidates: int = Field(12, ge=1)  # given out
 
-    def model_post_init(self, context: Any, /) -> None:
+    @model_validator(mode="after")
+    def _settings_agree(self) -> KernelDetectSettings:
         if self.gates is not None and self.gates.company_m <= self.span_m:
             raise ValueError("gates.company_m must be larger than span_m: it is where a drone has nothing beside it")
+        return self
+
+
+class KernelDetect(Stage[KernelDetectSettings]):
+    """P III.B: the two-box kernel. Accepted detections come from at most `max_minima` minima, best score first."""
 
     def on_image(self, image: DepthImage) -> Iterator[ScoreImage | Detections]:
         """Score every pixel, then judge the minima."""
-        score = score_image(image.depth_m, image.focal_px, self.span_m, self.outer_side_px, self.eps_m, self.nearest_m)
+        settings = self.settings
+        score = score_image(
+            image.depth_m, image.focal_px, settings.span_m, settings.outer_side_px, settings.eps_m, settings.nearest_m
+        )
         yield ScoreImage(stamp_ns=image.stamp_ns, score=score)
-        half_outer = self.outer_side_px // 2
-        minima = local_minima(score, image.depth_m, half_outer, self.span_m, self.max_minima)
+        half_outer = settings.outer_side_px // 2
+        minima = local_minima(score, image.depth_m, half_outer, settings.span_m, settings.max_minima)
         judged = [self._judge(image, pixel, rank) for rank, pixel in enumerate(minima)]
         yield self._detections(image, judged)
 
     def _judge(self, image: DepthImage, pixel: Pixel, rank: int) -> Candidate:
-        if self.gates is None:
+        settings = self.settings
+        if settings.gates is None:
             return Candidate(pixel, rank == 0, "lowest score" if rank == 0 else "not the lowest score")
-        why = refusal(image, pixel, self.span_m, self.outer_side_px, self.gates)
+        why = refusal(image, pixel, settings.span_m, settings.outer_side_px, settings.gates)
         return Candidate(pixel, why is None, why or "small, alone, and seen whole")
 
     def _detections(self, image: DepthImage, judged: list[Candidate]) -> Detections:
         # accepted ones first in line for a place, then the list in the order of their scores again
-        places = sorted(range(len(judged)), key=lambda rank: (not judged[rank].accepted, rank))[: self.max_candidates]
+        places = sorted(range(len(judged)), key=lambda rank: (not judged[rank].accepted, rank))[
+            : self.settings.max_candidates
+        ]
         listed = [judged[rank] for rank in sorted(places)]
         xyz_vehicle_m = np.array([unproject(image, *c.pixel) for c in listed], dtype=np.float64).reshape(-1, 3)
         terms = np.array([self._terms(image, c.pixel) for c in listed], dtype=np.float64).reshape(-1, 2)
@@ -94,13 +106,14 @@ class KernelDetect(Stage):
         )
 
     def _terms(self, image: DepthImage, pixel: Pixel) -> tuple[float, float]:
-        half_inner = inner_half_px(float(image.depth_m[pixel]), image.focal_px, self.span_m)
-        return kernel_terms(image.depth_m, *pixel, half_inner, self.outer_side_px // 2, self.eps_m)
+        settings = self.settings
+        half_inner = inner_half_px(float(image.depth_m[pixel]), image.focal_px, settings.span_m)
+        return kernel_terms(image.depth_m, *pixel, half_inner, settings.outer_side_px // 2, settings.eps_m)
 
     def _why_none(self, image: DepthImage, judged: list[Candidate]) -> str:
         if not judged:
             view_deg = math.degrees(math.atan(image.depth_m.shape[1] / 2 / image.focal_px))
-            near = f", none of them {self.nearest_m:g} m or more above the turntable" if image.points else ""
+            near = f", none of them {self.settings.nearest_m:g} m or more above the turntable" if image.points else ""
             return f"{image.points} of {image.returns} returns lie within {view_deg:.0f} deg of straight up{near}"
-        limit = f" (the {len(judged)} lowest scores)" if len(judged) == self.max_minima else ""
+        limit = f" (the {len(judged)} lowest scores)" if len(judged) == self.settings.max_minima else ""
         return f"all {len(judged)} candidates refused{limit}; the best: {judged[0].reason}"

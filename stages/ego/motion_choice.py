@@ -20,12 +20,12 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from enum import Enum
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.geometry import Array64, transform
 from stages.messages import VehicleMotion
 from stages.rigid import adjoint
@@ -42,19 +42,25 @@ class Teller(Enum):
     EGO = "ego"
 
 
-class VehicleMotionChoice(Stage):
+class VehicleMotionChoiceSettings(Settings):
+    """Settings of `VehicleMotionChoice`."""
+
+    silent_s: float = Field(SILENT_S, gt=0, le=10)  # two periods of the odometry at least
+
+
+class VehicleMotionChoice(Stage[VehicleMotionChoiceSettings]):
     """T_start_vehicle without a jump, whoever tells it. Both inputs are optional, each may go and come back."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry", "ego"})
 
-    silent_s: float = Field(SILENT_S, gt=0, le=10)  # two periods of the odometry at least
-
-    _teller: Teller | None = PrivateAttr(default=None)
-    _words: dict[Teller, BelievedWords] = PrivateAttr(default_factory=lambda: {t: BelievedWords() for t in Teller})
-    _told: deque[VehicleMotion] = PrivateAttr(default_factory=lambda: deque[VehicleMotion](maxlen=64))
-    _T_start_source: Array64 = PrivateAttr(default_factory=lambda: np.eye(4))
-    _joint: tuple[VehicleMotion, Array64 | None] | None = PrivateAttr(default=None)  # the source's word at the change
-    _refused: Counter[str] = PrivateAttr(default_factory=Counter[str])
+    def __init__(self, settings: VehicleMotionChoiceSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._teller: Teller | None = None
+        self._words: dict[Teller, BelievedWords] = {t: BelievedWords() for t in Teller}
+        self._told: deque[VehicleMotion] = deque(maxlen=64)
+        self._T_start_source: Array64 = np.eye(4)
+        self._joint: tuple[VehicleMotion, Array64 | None] | None = None  # the source's word at the change
+        self._refused: Counter[str] = Counter()
 
     @property
     def refused(self) -> Counter[str]:
@@ -73,7 +79,7 @@ class VehicleMotionChoice(Stage):
     def on_ego(self, motion: VehicleMotion) -> VehicleMotion | None:
         """The camera's motion; None while the odometry is heard and believed."""
         odometry_ns = self._words[Teller.ODOMETRY].newest_ns
-        if odometry_ns is not None and motion.stamp_ns - odometry_ns < self.silent_s * 1e9:
+        if odometry_ns is not None and motion.stamp_ns - odometry_ns < self.settings.silent_s * 1e9:
             return None
         if self._teller is not Teller.EGO:
             self._words[Teller.EGO] = BelievedWords()  # it has begun anew

@@ -24,9 +24,9 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.ego.lidar_depth import Depths, RayDepths
 from stages.ego.motion_choice import SILENT_S
 from stages.ego.scale import Length, length_of, parallax_ratio
@@ -80,10 +80,8 @@ class _Now:
         return self.lengths >= LEAST_LENGTHS
 
 
-class VehicleEgo(Stage):
-    """T_start_vehicle at every picture, by camera and LiDAR; nothing while the vehicle's own odometry is heard."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry"})
+class VehicleEgoSettings(Settings):
+    """Settings of `VehicleEgo`."""
 
     lens: Lens
     T_vehicle_camera: Pose
@@ -94,15 +92,20 @@ class VehicleEgo(Stage):
     reach_deg: float = Field(2.0, gt=0.1, le=10)  # LiDAR points this near a feature tell its depth
     silent_s: float = Field(SILENT_S, gt=0, le=10)  # of the odometry: two of its periods at least
 
-    _links: MotionLinks = PrivateAttr()
-    _mount: Array64 = PrivateAttr()
-    _now: _Now = PrivateAttr(default_factory=_Now)
-    _odometry: BelievedWords = PrivateAttr(default_factory=BelievedWords)
-    _resting: bool = PrivateAttr(default=False)
 
-    def model_post_init(self, context: Any, /) -> None:
-        self._links = MotionLinks(self.lens, self.features, self.link)
-        self._mount = self.T_vehicle_camera.matrix()
+class VehicleEgo(Stage[VehicleEgoSettings]):
+    """T_start_vehicle at every picture, by camera and LiDAR; nothing while the vehicle's own odometry is heard."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry"})
+
+    def __init__(self, settings: VehicleEgoSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._now = _Now()
+        self._odometry = BelievedWords()
+        self._resting: bool = False
+        settings = self.settings
+        self._links = MotionLinks(settings.lens, settings.features, settings.link)
+        self._mount: Array64 = settings.T_vehicle_camera.matrix()
 
     def on_odometry(self, motion: VehicleMotion) -> None:
         """The vehicle tells its motion itself: nothing is to be done here."""
@@ -114,7 +117,7 @@ class VehicleEgo(Stage):
         """LiDAR returns wait until a picture has told where the vehicle was."""
         if self._resting:
             return
-        n = self.every_nth_point
+        n = self.settings.every_nth_point
         xyz = points.xyz_vehicle_m[::n].astype(np.float64)
         if len(xyz):
             stamp_ns = int(points.point_stamp_ns[len(points.point_stamp_ns) // 2])
@@ -126,7 +129,7 @@ class VehicleEgo(Stage):
         Nothing as long as no length is known, where nothing is followed, and while its own odometry is heard.
         """
         if self._resting:
-            if image.stamp_ns - (self._odometry.newest_ns or 0) < self.silent_s * 1e9:
+            if image.stamp_ns - (self._odometry.newest_ns or 0) < self.settings.silent_s * 1e9:
                 return
             self._wake()
         link = self._links.feed(image.stamp_ns, image.grey)
@@ -160,8 +163,9 @@ class VehicleEgo(Stage):
 
     def _wake(self) -> None:
         """Begin anew at this picture; how fast the vehicle drives is known from its odometry."""
+        settings = self.settings
         self._resting = False
-        self._links = MotionLinks(self.lens, self.features, self.link)
+        self._links = MotionLinks(settings.lens, settings.features, settings.link)
         speed_mps = self._odometry.speed_mps
         self._now = _Now() if speed_mps is None else _Now(lengths=LEAST_LENGTHS, told=True, speed_mps=speed_mps)
 
@@ -171,7 +175,7 @@ class VehicleEgo(Stage):
         known = self._known_after(key, link, step)
         if now.metric and not step.standing:
             done = _seen(key.tracks, key.at, key.lidar.depths())
-            keys = [*now.window, done, _seen(tracks, at, _nothing(tracks))][-self.window_keys :]
+            keys = [*now.window, done, _seen(tracks, at, _nothing(tracks))][-self.settings.window_keys :]
             keys = adjusted(keys, link.motion.sigma_rad)
             now.window, at = keys[:-1], Pose6(keys[-1].R, keys[-1].p, at.covariance)
         elif not now.told and not step.standing:  # it drove off and nobody knows how far: start here
@@ -205,7 +209,7 @@ class VehicleEgo(Stage):
             now.speed_mps = found.m / span_s
             now.lengths += 1
             if now.lengths == 1:  # its points were placed as if the vehicle stood
-                key.lidar = RayDepths(key.tracks.ray, math.radians(self.reach_deg))
+                key.lidar = RayDepths(key.tracks.ray, math.radians(self.settings.reach_deg))
                 now.cloud.clear()
         d = back.t_hat_earlier
         along = np.outer(d, d)
@@ -246,7 +250,7 @@ class VehicleEgo(Stage):
             now.key.lidar.add((cloud - now.key.at.p) @ now.key.at.R)
 
     def _key_picture(self, tracks: Tracks, at: Pose6, before: tuple[Tracks, Depths] | None) -> _Key:
-        lidar = RayDepths(tracks.ray, math.radians(self.reach_deg))
+        lidar = RayDepths(tracks.ray, math.radians(self.settings.reach_deg))
         if self._now.cloud:
             lidar.add((np.vstack(list(self._now.cloud)) - at.p) @ at.R)
         known = _nothing(tracks)

@@ -22,10 +22,10 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from flow.message import Message
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.fuse.back_end import BackEnd
 from stages.fuse.chain import yaw_sigma_rad
 from stages.fuse.ekf import Ekf
@@ -58,12 +58,8 @@ AMBIGUOUS_NS = 1_000_000_000  # a rotation up to quarter turns counts for so lon
 Told = Iterator[RelativePose]
 
 
-class Fuse(Stage):
-    """The smoother."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"rotation", "motion", "position", "odometry", "attitude", "drone_motion", "track", "servo", "tick"}
-    )
+class FuseSettings(Settings):
+    """Settings of `Fuse`."""
 
     parked: bool = False  # the vehicle stands, whether it says so or not
     track_id: int | None = Field(None, ge=1)  # follow this drone; None: the lowest number that is TRACKING
@@ -71,24 +67,27 @@ class Fuse(Stage):
     errors: FuseErrors = FuseErrors()
     limits: FuseLimits = FuseLimits()
 
-    _estimator: Estimator = PrivateAttr()
-    _following: Following = PrivateAttr()
-    _intake: Intake = PrivateAttr()
-    _jumps: Jumps = PrivateAttr()
-    _told_ns: int = PrivateAttr(default=0)
-    _waiting: list[DroneFix | RelativeRotation] = PrivateAttr(
-        default_factory=lambda: list[DroneFix | RelativeRotation]()
-    )
-    _ambiguous_ns: int | None = PrivateAttr(default=None)
-    _rotation_reason: str = PrivateAttr(default="no rotation heard")
 
-    def model_post_init(self, context: Any, /) -> None:
-        self._estimator = Estimator(self._back_end(), self.errors, self.limits, self.parked)
-        self._following = Following(self.track_id)
-        self._intake, self._jumps = Intake(round(self.lag_s * 1e9)), Jumps(self.limits)
+class Fuse(Stage[FuseSettings]):
+    """The smoother."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset(
+        {"rotation", "motion", "position", "odometry", "attitude", "drone_motion", "track", "servo", "tick"}
+    )
+
+    def __init__(self, settings: FuseSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._told_ns: int = 0
+        self._waiting: list[DroneFix | RelativeRotation] = []
+        self._ambiguous_ns: int | None = None
+        self._rotation_reason: str = "no rotation heard"
+        settings = self.settings
+        self._estimator = Estimator(self._back_end(), settings.errors, settings.limits, settings.parked)
+        self._following = Following(settings.track_id)
+        self._intake, self._jumps = Intake(round(settings.lag_s * 1e9)), Jumps(settings.limits)
 
     def _back_end(self) -> BackEnd:
-        return Smoother(self.lag_s)
+        return Smoother(self.settings.lag_s)
 
     @property
     def refused(self) -> Counter[str]:
@@ -209,7 +208,7 @@ class Fuse(Stage):
     def _pose(self, now_ns: int) -> RelativePose:
         e = self._estimator
         known = self._known(now_ns) if e.positions.known else None
-        state, reason = state_of(known, e, self.limits, now_ns, self._following.reason, self._doubt(now_ns))
+        state, reason = state_of(known, e, self.settings.limits, now_ns, self._following.reason, self._doubt(now_ns))
         if state is PoseState.LOST or known is None:
             if known is not None:
                 e.lose()
@@ -236,12 +235,12 @@ class Fuse(Stage):
         e = self._estimator
         R, xyz_m, covariance = e.at(now_ns)
         lasting = e.positions.lasting_m2
-        unsure = R is not None and yaw_sigma_rad(R, covariance) > math.radians(self.limits.yaw_sigma_deg)
+        unsure = R is not None and yaw_sigma_rad(R, covariance) > math.radians(self.settings.limits.yaw_sigma_deg)
         whole = covariance.copy()
         if R is None or unsure:
             whole[3:, 3:] = lasting + (covariance[3:, 3:] if R is None else position_covariance(covariance, R))
         else:
-            whole[:3, :3] += self.errors.rotation_lasting * e.chain.rotation_covariance_rad2
+            whole[:3, :3] += self.settings.errors.rotation_lasting * e.chain.rotation_covariance_rad2
             whole[3:, 3:] += R.T @ lasting @ R
         R_known = None if unsure else R
         yaw_sigma = 0.0 if R_known is None else yaw_sigma_rad(R_known, whole)

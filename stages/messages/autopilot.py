@@ -6,7 +6,7 @@ from flow.message import Mat3, Message, Vec3, message
 from stages.messages.shapes import Mat6
 
 
-@message
+@message(schema=51)
 class DroneAttitude(Message):
     """The autopilot's attitude. Frame local is the autopilot's own: x its north, z up; its yaw is unrelated to ours."""
 
@@ -14,7 +14,7 @@ class DroneAttitude(Message):
     angular_velocity_drone_radps: Vec3
 
 
-@message
+@message(schema=52)
 class DroneLocalPosition(Message):
     """The autopilot's position and velocity in its local frame (see DroneAttitude), origin where it began."""
 
@@ -22,7 +22,7 @@ class DroneLocalPosition(Message):
     velocity_local_mps: Vec3
 
 
-@message
+@message(schema=53)
 class DroneOdometry(Message):
     """The autopilot's whole estimate: T_local_drone and how it changes. Covariances are rotation first, drone axes."""
 
@@ -36,7 +36,7 @@ class DroneOdometry(Message):
     quality_percent: int | None  # None: unknown; a failed estimate is 0
 
 
-@message
+@message(schema=54)
 class DroneImu(Message):
     """One inertial sample, drone axes."""
 
@@ -44,7 +44,7 @@ class DroneImu(Message):
     angular_velocity_drone_radps: Vec3
 
 
-@message
+@message(schema=55)
 class AutopilotStatus(Message):
     """The autopilot's heartbeat, with what its link and clock do."""
 
@@ -58,7 +58,7 @@ class AutopilotStatus(Message):
     clock_drift_sigma_ppm: float | None = None
 
 
-@message
+@message(schema=56)
 class AutopilotEstimator(Message):
     """What the drone's EKF says it fuses right now: EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (both)."""
 

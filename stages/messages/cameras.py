@@ -18,7 +18,7 @@ class Carrier(enum.Enum):
     DRONE = "drone"
 
 
-@message
+@message(schema=41)
 class VanishingDirections(Message):
     """Directions in which a picture's straight lines run, and the lines; stamp_ns is the picture's. P IV, V.C.
 
@@ -48,7 +48,7 @@ class BranchState(enum.Enum):
     RESOLVED = 2
 
 
-@message
+@message(schema=42)
 class RelativeRotation(Message):
     """How the drone is turned in the vehicle's axes, up to the street's symmetry; stamp_ns is the pictures'. P IV.
 
@@ -64,7 +64,7 @@ class RelativeRotation(Message):
     reason: str
 
 
-@message
+@message(schema=43)
 class DroneMotion(Message):
     """How the drone's camera moved from one picture to a later one, told in the drone's axes. P V.E.
 
@@ -80,7 +80,7 @@ class DroneMotion(Message):
     reason: str
 
 
-@message
+@message(schema=44)
 class FollowedFeatures(Message):
     """Features of a camera followed from an earlier picture to this one; stamp_ns is this picture's. P V.B, V.E."""
 

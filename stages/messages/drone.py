@@ -7,7 +7,7 @@ import enum
 from flow.message import Mat3, Message, PerPointBool, PerPointF64, PerPointI64, Points64, Vec3, message
 
 
-@message
+@message(schema=31)
 class Detections(Message):
     """Drone candidates of one search, best first. A list that is empty or wholly refused is a normal answer.
 
@@ -31,7 +31,7 @@ class Detections(Message):
     candidate_id: PerPointI64 | None = None  # the same thing keeps its number
 
 
-@message
+@message(schema=32)
 class Candidates(Message):
     """What may be a drone right now and is worth another look, most probable first; told when it changes."""
 
@@ -56,7 +56,7 @@ class TrackingState(enum.Enum):
     LOST = 4  # had one, has none
 
 
-@message
+@message(schema=33)
 class DroneFix(Message):
     """Where the LiDAR saw the drone; stamp_ns is the weighted mean time of the returns used. P III.C."""
 
@@ -70,7 +70,7 @@ class DroneFix(Message):
     lasting_m2: Mat3 | None = None  # what of covariance_m2 is the same from fix to fix: calibration; None: not told
 
 
-@message
+@message(schema=34)
 class TrackState(Message):
     """A track's state after each frame, with the reason for it in words, and where it is predicted at stamp_ns."""
 

@@ -18,7 +18,7 @@ class PoseState(enum.Enum):
     COASTING = 4  # as FULL, but the LiDAR has not seen the drone for a while, its odometry carries the pose
 
 
-@message
+@message(schema=61)
 class RelativePose(Message):
     """T_vehicle_drone and how well it is known, predicted to stamp_ns; and the same in the vehicle's start frame.
 

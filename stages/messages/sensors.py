@@ -11,7 +11,7 @@ from flow.message import Mat3, Message, PerPointF32, PerPointI64, PerPointU8, Po
 from stages.messages.shapes import Mat6
 
 
-@message
+@message(schema=11)
 class LidarFirings(Message):
     """One decoded LiDAR packet, or a few in a row, every laser pulse: also those that saw nothing (range_m = 0).
 
@@ -29,7 +29,7 @@ class LidarFirings(Message):
     laser_elevation_rad: Annotated[NDArray[np.float64], Shape("lasers")]  # where each laser points, over z_lidar = 0
 
 
-@message
+@message(schema=12)
 class Image(Message):
     """One camera frame in grey; stamp_ns is the middle of its middle row's exposure. Lens: the rig's."""
 
@@ -42,7 +42,7 @@ class Image(Message):
         return self.readout_s / max(self.grey.shape[0] - 1, 1)
 
 
-@message
+@message(schema=13)
 class ServoState(Message):
     """The turntable's servo as it answered; stamp_ns is mid-exchange."""
 
@@ -52,7 +52,7 @@ class ServoState(Message):
     error: int  # the servo's own error bits, 0 is healthy
 
 
-@message
+@message(schema=14)
 class ServoOffset(Message):
     """How early the servo's stamps are against the LiDAR's, as what was seen tells; stamp_ns is the newest packet's."""
 
@@ -63,7 +63,7 @@ class ServoOffset(Message):
     reason: str  # what the newest window said, or why it said nothing
 
 
-@message
+@message(schema=15)
 class ServoGoal(Message):
     """Where the turntable's servo shall go; stamp_ns is that of the servo state it was decided on."""
 
@@ -71,7 +71,7 @@ class ServoGoal(Message):
     speed_radps: float  # at most; the servo keeps to what its motor can do
 
 
-@message
+@message(schema=16)
 class VehicleMotion(Message):
     """Where the vehicle has driven since it started: T_start_vehicle, smooth and drifting, by its own odometry."""
 
@@ -80,6 +80,6 @@ class VehicleMotion(Message):
     covariance: Mat6 | None  # rotation [rad] before translation [m]; None: the source does not say
 
 
-@message
+@message(schema=17)
 class Tick(Message):
     """The host's clock, live: time goes on though every sensor is silent. stamp_ns is now."""

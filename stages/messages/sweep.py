@@ -12,7 +12,7 @@ from flow.message import Message, PerPointF32, PerPointI64, PerPointU8, Points32
 DepthPixels = Annotated[NDArray[np.float32], Shape("h", "w")]
 
 
-@message
+@message(schema=21)
 class SweptPoints(Message):
     """Returns in the vehicle frame, each at its own time; stamp_ns is the first pulse's of the slice."""
 
@@ -27,7 +27,7 @@ class SweptPoints(Message):
     reason: str = ""  # why returns were left out; empty when none were
 
 
-@message
+@message(schema=22)
 class SweptPulses(Message):
     """Every laser pulse of a slice in the vehicle frame, also those that saw nothing: what flew free is evidence too.
 
@@ -44,7 +44,7 @@ class SweptPulses(Message):
     origin_vehicle_m: tuple[float, float, float]  # where the beams start, mid-slice
 
 
-@message
+@message(schema=23)
 class DepthImage(Message):
     """One whole sweep seen from the turntable as a pinhole image looking up; stamp_ns is the sweep's end. P III.A.
 
@@ -62,7 +62,7 @@ class DepthImage(Message):
     lost_packets: int = 0  # LiDAR packets missing within the sweep
 
 
-@message
+@message(schema=24)
 class ScoreImage(Message):
     """The detector's score per pixel of a DepthImage: lower is more like a drone, NaN is no candidate. P III.B."""
 

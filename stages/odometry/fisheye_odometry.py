@@ -18,9 +18,9 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.geometry import Array64, Pose
 from stages.lens import Lens
 from stages.messages import DroneImu, DroneMotion, FollowedFeatures, Image
@@ -33,10 +33,8 @@ IMU_KEPT = 2000
 LONGEST_IMU_GAP_NS = 60_000_000
 
 
-class FisheyeOdometry(Stage):
-    """Rotation and direction of the drone's camera since its key picture, at every picture."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"imu"})
+class FisheyeOdometrySettings(Settings):
+    """Settings of `FisheyeOdometry`."""
 
     lens: Lens
     T_drone_camera: Pose
@@ -44,13 +42,18 @@ class FisheyeOdometry(Stage):
     link: LinkSettings = LinkSettings()
     least_matches: int = Field(30, ge=12, le=1000)  # with fewer that agree the motion is not told
 
-    _links: MotionLinks = PrivateAttr()
-    _R_drone_camera: Array64 = PrivateAttr()
-    _gyro: deque[tuple[int, Array64]] = PrivateAttr(default_factory=lambda: deque[tuple[int, Array64]](maxlen=IMU_KEPT))
 
-    def model_post_init(self, context: Any, /) -> None:
-        self._links = MotionLinks(self.lens, self.features, self.link)
-        self._R_drone_camera = self.T_drone_camera.matrix()[:3, :3]
+class FisheyeOdometry(Stage[FisheyeOdometrySettings]):
+    """Rotation and direction of the drone's camera since its key picture, at every picture."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"imu"})
+
+    def __init__(self, settings: FisheyeOdometrySettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._gyro: deque[tuple[int, Array64]] = deque(maxlen=IMU_KEPT)
+        settings = self.settings
+        self._links = MotionLinks(settings.lens, settings.features, settings.link)
+        self._R_drone_camera: Array64 = settings.T_drone_camera.matrix()[:3, :3]
 
     def on_imu(self, imu: DroneImu) -> None:
         """The drone's gyro: where to look for the features of the next picture. Nothing else is taken from it."""
@@ -68,7 +71,7 @@ class FisheyeOdometry(Stage):
         if link is None:
             return
         yield followed(link, image.frame_id)
-        if np.count_nonzero(link.motion.inlier) >= self.least_matches:
+        if np.count_nonzero(link.motion.inlier) >= self.settings.least_matches:
             yield drone_motion(link, C)
 
 

@@ -20,9 +20,9 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.geometry import Array64, LidarMount
 from stages.messages import (
     Candidates,
@@ -44,10 +44,8 @@ LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
 CANDIDATE_S = 1.5  # one that was not accepted is forgotten so long after its last hit
 
 
-class HitMissTrack(Stage):
-    """Hits and misses of every look, de-skewed, on as many drones as there are."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion", "drone_position", "drone_odometry"})
+class HitMissTrackSettings(Settings):
+    """Settings of `HitMissTrack`."""
 
     mount: LidarMount = LidarMount()  # of it, how well the servo's angle is known
     span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
@@ -69,16 +67,26 @@ class HitMissTrack(Stage):
     misses: bool = True  # ablation: without, only hits count
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
 
-    _trail: VehicleTrail = PrivateAttr(default_factory=VehicleTrail)
-    _known: Hypotheses = PrivateAttr()
-    _detector_life: int | None = PrivateAttr(default=None)  # that counts the candidates
-    _next_number: int = PrivateAttr(default=1)
-    _idle_ns: int = PrivateAttr(default=0)
-    _why_idle: str = PrivateAttr(default="nothing found yet")
 
-    def model_post_init(self, context: Any, /) -> None:
+class HitMissTrack(Stage[HitMissTrackSettings]):
+    """Hits and misses of every look, de-skewed, on as many drones as there are."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion", "drone_position", "drone_odometry"})
+
+    def __init__(self, settings: HitMissTrackSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._trail = VehicleTrail()
+        self._detector_life: int | None = None  # that counts the candidates
+        self._next_number: int = 1
+        self._idle_ns: int = 0
+        self._why_idle: str = "nothing found yet"
+        settings = self.settings
         self._known = Hypotheses(
-            self.manoeuvre, self.told_manoeuvre, self.start_sigma_mps, self.own_sigma_m, self.max_drones
+            settings.manoeuvre,
+            settings.told_manoeuvre,
+            settings.start_sigma_mps,
+            settings.own_sigma_m,
+            settings.max_drones,
         )
 
     def on_motion(self, motion: VehicleMotion) -> None:
@@ -119,7 +127,7 @@ class HitMissTrack(Stage):
                     yield from self._lose(
                         known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}"
                     )
-            elif P >= 0.5 and len(self._known) - len(self._known.confirmed) < self.max_hypotheses:
+            elif P >= 0.5 and len(self._known) - len(self._known.confirmed) < self.settings.max_hypotheses:
                 self._known.start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
 
     def on_detections(self, detections: Detections) -> Iterator[TrackState | DroneFix]:
@@ -137,10 +145,10 @@ class HitMissTrack(Stage):
             if drone is None and (old := self._known.gives_way(seen_ns)):
                 yield from self._lose(old, seen_ns, "not hit, while the detector accepted a drone elsewhere")
             if track is None:
-                if len(self._known.confirmed) >= self.max_drones:
+                if len(self._known.confirmed) >= self.settings.max_drones:
                     continue
                 track = self._known.start(number, xyz, v, seen_ns, seen_ns)
-            if not track.confirmed and len(self._known.confirmed) < self.max_drones:
+            if not track.confirmed and len(self._known.confirmed) < self.settings.max_drones:
                 track.confirmed = True
                 track.number, self._next_number = self._next_number, self._next_number + 1
                 track.candidate = number
@@ -155,7 +163,7 @@ class HitMissTrack(Stage):
         now_ns = int(pulses.point_stamp_ns[-1])
         R, t = self._trail.at(middle_ns(pulses))
         axis = mean_direction(pulses.direction_vehicle)
-        hypotheses, span_m, de_skew = self._known, self.span_m, self.de_skew  # a private attribute costs a look each
+        hypotheses, span_m, de_skew = self._known, self.settings.span_m, self.settings.de_skew
         for track in hypotheses:
             if track not in hypotheses:  # dropped a moment ago as the same as another
                 continue
@@ -186,22 +194,23 @@ class HitMissTrack(Stage):
 
     def _watch(self, track: Hypothesis, now_ns: int) -> Iterator[TrackState]:
         """Coasting and losing are told without a look."""
+        settings = self.settings
         silent_s = (now_ns - track.last_hit_ns) * 1e-9
-        gone = silent_s > (self.lost_after_s if track.confirmed else CANDIDATE_S)
+        gone = silent_s > (settings.lost_after_s if track.confirmed else CANDIDATE_S)
         if track.confirmed and gone:
             known = self._known.word(now_ns) is not None
-            gone = not (known and largest_sigma_m(self._known.at(track, now_ns)[1]) < self.lost_sigma_m)
+            gone = not (known and largest_sigma_m(self._known.at(track, now_ns)[1]) < settings.lost_sigma_m)
         if gone or track.odds < -4.0:
             why = f"not hit for {silent_s:.1f} s" if silent_s > 1.0 else "looked at again and again, not hit"
             yield from self._lose(track, now_ns, why)
         elif track.confirmed:
             for other in self._known:  # two that became one
-                if other is not track and np.linalg.norm(other.x[:3] - track.x[:3]) < self.span_m:
+                if other is not track and np.linalg.norm(other.x[:3] - track.x[:3]) < settings.span_m:
                     younger = other if not other.confirmed or other.number > track.number else track
                     if younger is not track:
                         yield from self._lose(other, now_ns, f"is the same as drone {track.number}")
             if now_ns - track.told_ns > 100_000_000:
-                if silent_s > self.coast_after_s:
+                if silent_s > settings.coast_after_s:
                     track.reason = f"not hit for {silent_s:.1f} s"
                 yield self._state(track, now_ns)
         elif now_ns - track.told_ns > 100_000_000:
@@ -211,12 +220,12 @@ class HitMissTrack(Stage):
         silent_s = (now_ns - track.last_hit_ns) * 1e-9
         state = TrackingState.CANDIDATE
         if track.confirmed:
-            state = TrackingState.COASTING if silent_s > self.coast_after_s else TrackingState.TRACKING
+            state = TrackingState.COASTING if silent_s > self.settings.coast_after_s else TrackingState.TRACKING
         x, P = self._known.at(track, now_ns)
         R, _ = self._trail.at(now_ns)
         xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
         covariance = R.T @ P[:3, :3] @ R + self._lasting_covariance(xyz)
-        if silent_s > self.coast_after_s:  # what is seen is seen from the vehicle, wherever that is
+        if silent_s > self.settings.coast_after_s:  # what is seen is seen from the vehicle, wherever that is
             covariance += self._unsure_vehicle_m2(now_ns, xyz)
         track.told_ns = now_ns
         return TrackState(
@@ -240,7 +249,15 @@ class HitMissTrack(Stage):
     # one look
 
     def _close(self, track: Hypothesis, look: Look) -> Iterator[DroneFix | TrackState]:
-        seen = evaluate(look, self.span_m, self.hull_share * self.span_m, track.p_0, self.misses, self.own_sigma_m)
+        settings = self.settings
+        seen = evaluate(
+            look,
+            settings.span_m,
+            settings.hull_share * settings.span_m,
+            track.p_0,
+            settings.misses,
+            settings.own_sigma_m,
+        )
         track.hits = 0 if seen is None else seen.hits
         if seen is None:
             return
@@ -280,9 +297,10 @@ class HitMissTrack(Stage):
 
         Axes of the vehicle; the line of sight is taken from its origin, decimetres beside the LiDAR's.
         """
-        along = xyz_vehicle_m * (self.range_sigma_m / max(float(np.linalg.norm(xyz_vehicle_m)), 1e-9))
-        level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * math.radians(self.mount.pointing_sigma_deg)
-        x, y, z = xyz_vehicle_m * math.radians(self.tilt_deg)
+        settings = self.settings
+        along = xyz_vehicle_m * (settings.range_sigma_m / max(float(np.linalg.norm(xyz_vehicle_m)), 1e-9))
+        level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * math.radians(settings.mount.pointing_sigma_deg)
+        x, y, z = xyz_vehicle_m * math.radians(settings.tilt_deg)
         tilted = np.outer([0.0, -z, y], [0.0, -z, y]) + np.outer([z, 0.0, -x], [z, 0.0, -x])
-        outline = (self.shape_share * self.span_m) ** 2 * np.eye(3)
+        outline = (settings.shape_share * settings.span_m) ** 2 * np.eye(3)
         return np.outer(level, level) + tilted + np.outer(along, along) + outline

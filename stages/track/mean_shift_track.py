@@ -21,11 +21,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.geometry import Array64
 from stages.messages import Detections, DroneFix, SweptPoints, TrackingState, TrackState
 from stages.track.mean_shift import crossings, fix_covariance_m2, mean_shift, within
@@ -45,8 +46,8 @@ class _Now:
     near: list[SweptPoints] = field(default_factory=lambda: list[SweptPoints]())  # F, slice by slice
 
 
-class MeanShiftTrack(Stage):
-    """P III.C: mean shift on the returns around the last position. One fix per frame with at least `min_hits`."""
+class MeanShiftTrackSettings(Settings):
+    """Settings of `MeanShiftTrack`."""
 
     radius_m: float = Field(1.0, gt=0, le=10)  # r
     acquire_radius_m: float = Field(3.0, gt=0, le=10)  # in place of r until the first hits; the paper's is r
@@ -61,21 +62,28 @@ class MeanShiftTrack(Stage):
     pointing_deg: float = Field(0.1, ge=0)  # encoder, calibration and servo time together, one sigma
     beam_deg: float = Field(0.17, ge=0)  # VLP-16 divergence, 3 mrad
 
-    _now: _Now = PrivateAttr(default_factory=lambda: _Now())
+
+class MeanShiftTrack(Stage[MeanShiftTrackSettings]):
+    """P III.C: mean shift on the returns around the last position. One fix per frame with at least `min_hits`."""
+
+    def __init__(self, settings: MeanShiftTrackSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._now = _Now()
 
     def on_detections(self, detections: Detections) -> None:
         """Start from the best accepted detection; while tracking, count rivals."""
+        settings = self.settings
         now = self._now
         accepted = detections.xyz_vehicle_m[detections.accepted]
         if now.t_hat is None:
             if len(accepted):
                 self._start(detections.stamp_ns, accepted[0], "started at a detection")
             return
-        here = len(accepted) and (np.linalg.norm(accepted - now.t_hat, axis=1) <= self.radius_m).any()
+        here = len(accepted) and (np.linalg.norm(accepted - now.t_hat, axis=1) <= settings.radius_m).any()
         now.rivals = 0 if here or not len(accepted) else now.rivals + 1
         unsupported = not now.hit_since_sweep
         now.hit_since_sweep = False
-        if self.rival_sweeps is not None and now.rivals and (unsupported or now.rivals >= self.rival_sweeps):
+        if settings.rival_sweeps is not None and now.rivals and (unsupported or now.rivals >= settings.rival_sweeps):
             distance_m = float(np.linalg.norm(accepted[0] - now.t_hat))
             why = "the last sweep had no hit here" if unsupported else f"{now.rivals} sweeps in a row saw it there"
             self._start(detections.stamp_ns, accepted[0], f"moved {distance_m:.1f} m to a detection: {why}")
@@ -106,7 +114,7 @@ class MeanShiftTrack(Stage):
 
     @property
     def _frame_ns(self) -> int:
-        return round(self.frame_s * 1e9)
+        return round(self.settings.frame_s * 1e9)
 
     def _start(self, stamp_ns: int, xyz_vehicle_m: Array64, why: str) -> None:
         now = self._now
@@ -122,7 +130,7 @@ class MeanShiftTrack(Stage):
         now = self._now
         if now.t_hat is None or start >= end:
             return
-        radius_m = self.radius_m if now.acquired else self.acquire_radius_m
+        radius_m = self.settings.radius_m if now.acquired else self.settings.acquire_radius_m
         near = start + within(points.xyz_vehicle_m[start:end], now.t_hat, radius_m)
         if near.size:
             now.near.append(
@@ -139,6 +147,7 @@ class MeanShiftTrack(Stage):
             )
 
     def _close_frame(self) -> Iterator[DroneFix | TrackState]:
+        settings = self.settings
         now = self._now
         assert now.frame_end_ns is not None
         near, now.near = now.near, []
@@ -146,38 +155,39 @@ class MeanShiftTrack(Stage):
         state, reason = TrackingState.SEARCHING, now.why
         if now.t_hat is not None:
             silent_s = (now.frame_end_ns - now.last_hit_ns) / 1e9
-            if hits >= self.min_hits:
+            if hits >= settings.min_hits:
                 fix = self._fix(near, now.t_hat)
                 now.t_hat = fix.xyz_vehicle_m
                 now.last_hit_ns = fix.stamp_ns
                 now.acquired = now.hit_since_sweep = True
                 state, reason = TrackingState.TRACKING, f"{hits} hits"
                 yield fix
-            elif silent_s > self.lost_after_s:
-                state, reason = TrackingState.LOST, f"fewer than {self.min_hits} hits a frame for {silent_s:.1f} s"
+            elif silent_s > settings.lost_after_s:
+                state, reason = TrackingState.LOST, f"fewer than {settings.min_hits} hits a frame for {silent_s:.1f} s"
                 now.t_hat, now.why = None, "lost the drone, waiting for a detection"
             else:
                 few = f"{hits} hits" if hits else "no hit"
                 state, reason = TrackingState.TRACKING, f"{few}, {silent_s:.2f} s since the last fix or detection"
             if now.why and now.t_hat is not None:
                 reason, now.why = f"{now.why}; {reason}", ""
-        yield TrackState(stamp_ns=now.frame_end_ns, state=state, reason=reason, hits=hits, frame_s=self.frame_s)
+        yield TrackState(stamp_ns=now.frame_end_ns, state=state, reason=reason, hits=hits, frame_s=settings.frame_s)
 
     def _fix(self, near: list[SweptPoints], t_0: Array64) -> DroneFix:
+        settings = self.settings
         points_m = np.concatenate([part.xyz_vehicle_m for part in near]).astype(np.float64)
         stamps_ns = np.concatenate([part.point_stamp_ns for part in near])
         laser = np.concatenate([part.laser for part in near])
-        t, weights, iterations, shift_m = mean_shift(points_m, t_0, self.max_iterations, self.tolerance_m)
+        t, weights, iterations, shift_m = mean_shift(points_m, t_0, settings.max_iterations, settings.tolerance_m)
         since_ns = stamps_ns - stamps_ns[0]
         covariance_m2 = fix_covariance_m2(
             points_m,
             weights,
             crossings(stamps_ns, laser),
             np.array(near[0].origin_vehicle_m),
-            self.span_m,
-            self.range_noise_m,
-            math.radians(self.pointing_deg),
-            math.radians(self.beam_deg),
+            settings.span_m,
+            settings.range_noise_m,
+            math.radians(settings.pointing_deg),
+            math.radians(settings.beam_deg),
         )
         return DroneFix(
             stamp_ns=int(stamps_ns[0]) + round(float(np.average(since_ns, weights=weights))),

@@ -17,9 +17,9 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field, model_validator
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.geometry import Pose
 from stages.lens import Array64, Lens
 from stages.messages import Carrier, DroneAttitude, Image, VanishingDirections, VehicleMotion
@@ -39,10 +39,8 @@ LEAST_SCATTER = 0.3  # of lines against `line_sigma_deg`: no world is straighter
 SEARCH_DEG = {Carrier.VEHICLE: 0.0, Carrier.DRONE: 35.0}
 
 
-class GreatCircleVp(Stage):
-    """The directions in which a street runs, as one fisheye sees them, and how well they are known."""
-
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude", "motion"})
+class GreatCircleVpSettings(Settings):
+    """Settings of `GreatCircleVp`."""
 
     carrier: Carrier
     T_carrier_camera: Pose
@@ -63,66 +61,79 @@ class GreatCircleVp(Stage):
     min_score: float = Field(7.0, gt=0)  # standard deviations over lines in random directions
     least_sigma_deg: float = Field(0.1, gt=0, le=5)  # no direction is known better
 
-    _eye: Eye | None = PrivateAttr(default=None)
-    _edges: EdgeFinder = PrivateAttr()
-    _gravity: GravityTrail = PrivateAttr(default_factory=GravityTrail)
-    _vehicle: VehicleTrail = PrivateAttr(default_factory=VehicleTrail)
-
-    def model_post_init(self, context: Any, /) -> None:
+    @model_validator(mode="after")
+    def _settings_agree(self) -> GreatCircleVpSettings:
         if any(len(polygon) < 3 for polygon in self.masked_px):
             raise ValueError("masked_px: a polygon has at least three corners (column, row)")
+        return self
+
+
+class GreatCircleVp(Stage[GreatCircleVpSettings]):
+    """The directions in which a street runs, as one fisheye sees them, and how well they are known."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude", "motion"})
+
+    def __init__(self, settings: GreatCircleVpSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._eye: Eye | None = None
+        self._edges: EdgeFinder | None = None
+        self._gravity = GravityTrail()
+        self._vehicle = VehicleTrail()
 
     def on_attitude(self, attitude: DroneAttitude) -> None:
         """Roll, pitch and turning of the drone; its yaw is not used."""
-        if self.carrier is not Carrier.DRONE:
+        if self.settings.carrier is not Carrier.DRONE:
             raise ValueError("attitude is the drone's: wire it to the stage whose carrier is the drone")
         self._gravity.add(attitude)
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """How the vehicle turns; nothing else of it is used."""
-        if self.carrier is not Carrier.VEHICLE:
+        if self.settings.carrier is not Carrier.VEHICLE:
             raise ValueError("motion is the vehicle's: wire it to the stage whose carrier is the vehicle")
         self._vehicle.add(motion)
 
     def on_image(self, image: Image) -> VanishingDirections:
         """One picture's directions and lines."""
-        if image.frame_id != f"camera_{self.carrier.value}":
-            raise ValueError(f"image comes from {image.frame_id}, this stage's carrier is the {self.carrier.value}")
-        if self._eye is None or self._eye.usable.shape != image.grey.shape:
-            self._eye = make_eye(self.lens, image.grey.shape, self.max_off_axis_deg, self.masked_px)
-            self._edges = EdgeFinder(self._eye.usable, self.min_contrast, MIN_POINTS)
+        settings = self.settings
+        if image.frame_id != f"camera_{settings.carrier.value}":
+            raise ValueError(f"image comes from {image.frame_id}, this stage's carrier is the {settings.carrier.value}")
+        if self._eye is None or self._edges is None or self._eye.usable.shape != image.grey.shape:
+            self._eye = make_eye(settings.lens, image.grey.shape, settings.max_off_axis_deg, settings.masked_px)
+            self._edges = EdgeFinder(self._eye.usable, settings.min_contrast, MIN_POINTS)
         eye = self._eye
         chains = self._edges.find(image.grey)
-        R = self.T_carrier_camera.matrix()[:3, :3]
+        R = settings.T_carrier_camera.matrix()[:3, :3]
         turn = image.rows_after_s() * (self._rate_radps(image.stamp_ns) @ R)
-        arcs = cluster(fit_arcs(chains, eye, self.tolerance_px, self.min_extent_px, turn), eye, MOST_LINES)
+        arcs = cluster(fit_arcs(chains, eye, settings.tolerance_px, settings.min_extent_px, turn), eye, MOST_LINES)
         lines = lines_of(arcs, R, WIDE_RAD)
         found = find_structure(lines, self._prior(image.stamp_ns), self._limits())
         return self._message(image.stamp_ns, found, lines.normal, arcs.ends @ R.T, arcs.sigma_rad)
 
     def _rate_radps(self, stamp_ns: int) -> Array64:
         """How the carrier turns (3,), its own axes; zero where nothing tells."""
-        if self.carrier is Carrier.DRONE:
-            rate = self._gravity.rate_radps(stamp_ns, self.attitude_age_s)
+        if self.settings.carrier is Carrier.DRONE:
+            rate = self._gravity.rate_radps(stamp_ns, self.settings.attitude_age_s)
             return np.zeros(3) if rate is None else rate
         return self._vehicle.rate_radps(stamp_ns) if self._vehicle.known_at(stamp_ns) else np.zeros(3)
 
     def _prior(self, stamp_ns: int) -> Prior:
-        up = self._gravity.at(stamp_ns, self.attitude_age_s)
+        settings = self.settings
+        up = self._gravity.at(stamp_ns, settings.attitude_age_s)
         if up is not None:
-            return Prior(up, math.radians(self.attitude_sigma_deg), 0.0)
-        search_deg = SEARCH_DEG[self.carrier] if self.search_deg is None else self.search_deg
-        sigma_deg = max(self.vertical_sigma_deg, search_deg)
+            return Prior(up, math.radians(settings.attitude_sigma_deg), 0.0)
+        search_deg = SEARCH_DEG[settings.carrier] if settings.search_deg is None else settings.search_deg
+        sigma_deg = max(settings.vertical_sigma_deg, search_deg)
         return Prior(np.array([0.0, 0.0, 1.0]), math.radians(sigma_deg), math.radians(search_deg))
 
     def _limits(self) -> Limits:
+        settings = self.settings
         return Limits(
-            math.radians(self.line_sigma_deg),
-            math.radians(self.least_sigma_deg),
+            math.radians(settings.line_sigma_deg),
+            math.radians(settings.least_sigma_deg),
             LEAST_SCATTER,
-            self.max_frames,
-            self.min_lines,
-            self.min_score,
+            settings.max_frames,
+            settings.min_lines,
+            settings.min_score,
         )
 
     def _message(
@@ -130,7 +141,7 @@ class GreatCircleVp(Stage):
     ) -> VanishingDirections:
         return VanishingDirections(
             stamp_ns=stamp_ns,
-            carrier=self.carrier,
+            carrier=self.settings.carrier,
             direction=found.direction,
             sigma_rad=found.sigma_rad,
             is_vertical=found.frame < 0,

@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field, model_validator
 
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.geometry import Array64, Pose
 from stages.lens import Lens
 from stages.messages import Carrier, Image, VanishingDirections
@@ -47,8 +47,8 @@ class _Lines:
     point: Array64 | None  # (3,) the view's vanishing point
 
 
-class PaperVp(Stage):
-    """P IV: one vanishing point from each of three views; the best two and their cross product."""
+class PaperVpSettings(Settings):
+    """Settings of `PaperVp`."""
 
     carrier: Carrier
     T_carrier_camera: Pose
@@ -74,24 +74,36 @@ class PaperVp(Stage):
     vertical_deg: float = Field(30.0, gt=0, le=45)
     sigma_deg: float = Field(1.0, gt=0)
 
-    _views: list[RectifiedView] = PrivateAttr()
-
-    def model_post_init(self, context: Any, /) -> None:
+    def rectified_views(self) -> list[RectifiedView]:
+        """The views, each with its map from the fisheye."""
         R = self.T_carrier_camera.matrix()[:3, :3]
-        self._views = [RectifiedView(view, self.lens, R, self.view_px, self.fov_deg) for view in self.views]
-        for k, view in enumerate(self._views):
+        return [RectifiedView(view, self.lens, R, self.view_px, self.fov_deg) for view in self.views]
+
+    @model_validator(mode="after")
+    def _lens_sees_views(self) -> PaperVpSettings:
+        for k, view in enumerate(self.rectified_views()):
             if view.seen < SEEN_AT_LEAST:
                 raise ValueError(
                     f"views.{k}: the lens sees {view.seen:.0%} of it; make off_axis_deg or fov_deg smaller "
                     f"(the lens ends at {self.lens.max_off_axis_deg:g} deg)"
                 )
+        return self
+
+
+class PaperVp(Stage[PaperVpSettings]):
+    """P IV: one vanishing point from each of three views; the best two and their cross product."""
+
+    def __init__(self, settings: PaperVpSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._views = self.settings.rectified_views()
 
     def on_image(self, image: Image) -> VanishingDirections:
         """The picture's directions; none, with the reason, where the views hold too little."""
-        if image.grey.shape != (self.size_px, self.size_px):
+        settings = self.settings
+        if image.grey.shape != (settings.size_px, settings.size_px):
             height, width = image.grey.shape
             raise ValueError(
-                f"a picture of {width} x {height} px, but size_px is {self.size_px}: give the lens of this camera"
+                f"a picture of {width} x {height} px, but size_px is {settings.size_px}: give the lens of this camera"
             )
         lines: list[_Lines] = []
         points: list[Array64] = []
@@ -103,24 +115,25 @@ class PaperVp(Stage):
             reason = f"{len(points)} of {len(lines)} views have a vanishing point"
             return self._message(image.stamp_ns, lines, None, reason)
         i, j, angle_rad = most_orthogonal(np.stack(points))
-        if math.degrees(angle_rad) < self.min_angle_deg:
+        if math.degrees(angle_rad) < settings.min_angle_deg:
             reason = f"no two vanishing points are at a right angle: {math.degrees(angle_rad):.0f} deg at most"
             return self._message(image.stamp_ns, lines, None, reason)
         reason = f"{len(points)} vanishing points, two at {math.degrees(angle_rad):.1f} deg"
         return self._message(image.stamp_ns, lines, completed(points[i], points[j]), reason)
 
     def _look(self, view: RectifiedView, image: Image, taken: list[Array64]) -> _Lines:
-        segments = view.segments(view.picture(image.grey), self.min_length_px, self.max_lines)
+        settings = self.settings
+        segments = view.segments(view.picture(image.grey), settings.min_length_px, settings.max_lines)
         ends = view.ends(segments)
         normal = great_circles(ends)
         point = None
-        if len(segments) >= self.min_lines:
+        if len(segments) >= settings.min_lines:
             angles = np.arctan2(segments[:, 3] - segments[:, 1], segments[:, 2] - segments[:, 0])
             lengths, others = segment_length_px(segments), np.array(taken).reshape(-1, 3)
-            votes = vote(normal, lengths, angles, self.cells, others, math.radians(self.apart_deg))
+            votes = vote(normal, lengths, angles, settings.cells, others, math.radians(settings.apart_deg))
             found, share = fullest(*votes)
             through = np.count_nonzero(np.abs(normal @ found) <= math.sin(math.radians(ON_DIRECTION_DEG)))
-            point = found if share > 0 and through >= self.min_lines else None
+            point = found if share > 0 and through >= settings.min_lines else None
         return _Lines(ends, normal, view.normal_sigma_rad(segments), point)
 
     def _message(
@@ -130,9 +143,9 @@ class PaperVp(Stage):
         normal = np.concatenate([part.normal for part in lines])
         return VanishingDirections(
             stamp_ns=stamp_ns,
-            carrier=self.carrier,
+            carrier=self.settings.carrier,
             direction=found,
-            sigma_rad=np.full(len(found), math.radians(self.sigma_deg)),
+            sigma_rad=np.full(len(found), math.radians(self.settings.sigma_deg)),
             is_vertical=vertical,
             frame=np.where(vertical, -1, 0).astype(np.int64),
             line_normal=normal,
@@ -146,7 +159,7 @@ class PaperVp(Stage):
         """Directions with the one nearest to up first, and which is vertical."""
         order = np.argsort(-np.abs(directions[:, 2]), kind="stable")
         found = directions[order]
-        vertical = np.abs(found[:, 2]) > math.cos(math.radians(self.vertical_deg))
+        vertical = np.abs(found[:, 2]) > math.cos(math.radians(self.settings.vertical_deg))
         vertical[1:] = False
         return found, vertical
 

@@ -22,7 +22,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydantic import PrivateAttr
 
 from flow.link import Tap
 from flow.replay import Replay
@@ -47,6 +46,10 @@ FLIGHT = os.environ.get("GRD_FLIGHT")
 class ToAutopilot(Tap):
     """Hands each fused pose to a live autopilot link, as good and of now, and waits for its datagram at the peer."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._out: list[int] = []
+
     def wire(self, link: Autopilot, peer: socket.socket) -> None:
         self._link, self._peer = link, peer
 
@@ -61,10 +64,6 @@ class ToAutopilot(Tap):
         """When the newest pose since the call before was read; None: none went out."""
         newest, self._out = (self._out[-1] if self._out else None), []
         return newest
-
-    _link: Autopilot = PrivateAttr()
-    _peer: socket.socket = PrivateAttr()
-    _out: list[int] = PrivateAttr(default_factory=list)
 
 
 def told(name: str, took_ms: list[float]) -> None:

@@ -11,26 +11,31 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pydantic import PrivateAttr
-
 from flow.graph import Graph, load_graph
-from flow.link import Link, LinkError, Record, Run, Source, Tap
+from flow.link import Link, LinkError, Record, Run, Source, SourceSettings, Tap
 from flow.live import Live
 from flow.message import Message
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from stages.messages import Tick
 from tests.flow.toys import Number, Sum
 
 PATIENCE_S = 60.0  # for what surely comes, on however busy a machine
 
 
-class Line(Source):
-    """A source whose bytes a test puts in; it can be cut."""
+class LineSettings(SourceSettings):
+    """Settings of `Line`."""
 
     topic: str = "/numbers"
-    _queue: queue.SimpleQueue = PrivateAttr(default_factory=queue.SimpleQueue)
-    _openings: list[threading.Event] = PrivateAttr(default_factory=list)
-    _arrival_ns: int = PrivateAttr(default=1_000)
+
+
+class Line(Source[LineSettings]):
+    """A source whose bytes a test puts in; it can be cut."""
+
+    def __init__(self, settings: LineSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._queue = queue.SimpleQueue()
+        self._openings: list[threading.Event] = []
+        self._arrival_ns: int = 1_000
 
     def decode(self, record: Record) -> Number | None:
         if record.data == b"refuse":
@@ -55,7 +60,7 @@ class Line(Source):
                 if data == b"end":
                     return
                 self._arrival_ns += 10
-                yield Record(self.topic, self._arrival_ns, self._arrival_ns - 5, data)
+                yield Record(self.settings.topic, self._arrival_ns, self._arrival_ns - 5, data)
 
         try:
             yield records()
@@ -67,16 +72,24 @@ class Line(Source):
             self._queue.put(str(value).encode())
 
 
+class OtherLineSettings(LineSettings):
+    """Settings of `OtherLine`."""
+
+    topic: str = "/others"
+
+
 class OtherLine(Line):
     """A second one."""
 
-    topic: str = "/others"
+    settings_type = OtherLineSettings
 
 
 class Clinging(Line):
     """A line that can be closed only when a test lets it go."""
 
-    _go: threading.Event = PrivateAttr(default_factory=threading.Event)
+    def __init__(self, settings: LineSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._go = threading.Event()
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
@@ -90,8 +103,10 @@ class Clinging(Line):
 class Jam(Link):
     """A sink that hangs at its first number until a test lets it go."""
 
-    _go: threading.Event = PrivateAttr(default_factory=threading.Event)
-    _entered: threading.Event = PrivateAttr(default_factory=threading.Event)
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._go = threading.Event()
+        self._entered = threading.Event()
 
     def on_number(self, number: Number) -> None:
         self._entered.set()
@@ -101,8 +116,10 @@ class Jam(Link):
 class Collector(Link):
     """A sink that keeps what it is given, and tells what it sent."""
 
-    _got: queue.SimpleQueue = PrivateAttr(default_factory=queue.SimpleQueue)
-    _sent: list[Record] = PrivateAttr(default_factory=list)
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._got = queue.SimpleQueue()
+        self._sent: list[Record] = []
 
     def on_number(self, number: Number) -> None:
         if number.value == 13:
@@ -125,7 +142,9 @@ class Collector(Link):
 class Brittle(Stage):
     """Doubles; breaks at 666, and again at each 999; counts what this object took."""
 
-    _taken: int = PrivateAttr(default=0)
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._taken: int = 0
 
     def on_number(self, number: Number) -> Number:
         self._taken += 1
@@ -141,8 +160,10 @@ class Brittle(Stage):
 class Gate(Stage):
     """Passes numbers on, but stands still in each until a test opens it."""
 
-    _open: threading.Event = PrivateAttr(default_factory=threading.Event)
-    _entered: threading.Event = PrivateAttr(default_factory=threading.Event)
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._open = threading.Event()
+        self._entered = threading.Event()
 
     def on_number(self, number: Number) -> Number:
         self._entered.set()
@@ -153,7 +174,9 @@ class Gate(Stage):
 class Order(Stage):
     """Its output tells in which order it took its inputs."""
 
-    _value: float = PrivateAttr(default=0.0)
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._value: float = 0.0
 
     def on_left(self, number: Number) -> Number:
         self._value = (3 * self._value + number.value) % 1_000_003
@@ -170,8 +193,10 @@ class Order(Stage):
 class Memory(Tap):
     """Keeps records and messages."""
 
-    _records: list[Record] = PrivateAttr(default_factory=list)
-    _seen: list[tuple[str, int, Message]] = PrivateAttr(default_factory=list)
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._records: list[Record] = []
+        self._seen: list[tuple[str, int, Message]] = []
 
     def record(self, record: Record) -> None:
         self._records.append(record)
@@ -184,7 +209,9 @@ class Memory(Tap):
 class Stuck(Tap):
     """A viewer that hangs at the first message until a test lets it go."""
 
-    _go: threading.Event = PrivateAttr(default_factory=threading.Event)
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._go = threading.Event()
 
     def wants(self, message: type[Message]) -> bool:
         return issubclass(message, Number | Sum)
@@ -205,32 +232,46 @@ def run_live(graph: Graph, taps=(), **kwargs) -> Live:
     return live
 
 
-class Ticker(Stage):
-    """Counts ticks."""
+class TickerSettings(Settings):
+    """Settings of `Ticker`."""
 
     raise_at: int | None = None
-    _count: int = PrivateAttr(default=0)
+
+
+class Ticker(Stage[TickerSettings]):
+    """Counts ticks."""
+
+    def __init__(self, settings: TickerSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._count: int = 0
 
     def on_tick(self, tick: Tick) -> Number:
         self._count += 1
-        if self._count == self.raise_at:
+        if self._count == self.settings.raise_at:
             raise ArithmeticError(f"asked to at {self._count}")
         return Number(stamp_ns=tick.stamp_ns, value=self._count)
 
 
-class Judge(Tap):
-    """Keeps the newest record's arrival in a mapped file, which outlives the process."""
+class JudgeSettings(Settings):
+    """Settings of `Judge`."""
 
     file: Path
-    _map: Any = PrivateAttr(default=None)
+
+
+class Judge(Tap[JudgeSettings]):
+    """Keeps the newest record's arrival in a mapped file, which outlives the process."""
+
+    def __init__(self, settings: JudgeSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._map: Any = None
 
     def wants(self, message: type[Message]) -> bool:
         return False
 
     def open(self, run: Run) -> None:
         if run.live:
-            self.file.write_bytes(bytes(8))
-            with self.file.open("r+b") as stream:
+            self.settings.file.write_bytes(bytes(8))
+            with self.settings.file.open("r+b") as stream:
                 self._map = mmap.mmap(stream.fileno(), 8)
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:

@@ -9,9 +9,10 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from flow import apart
 from flow.apart import parts_of, replay_apart
@@ -20,32 +21,40 @@ from flow.link import LinkError, Record, Tap
 from flow.message import Message
 from flow.ports import RunError
 from flow.replay import replay
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from flow.taps import Digest
-from tests.flow.toys import Number, Numbers, Text
+from tests.flow.toys import Number, Numbers, NumbersSettings, Text
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked, and this system has no fork")
 
 
-class Slow(Stage):
-    """Gives a number on, and its negative, after a random while; remembers how many there were."""
+class SlowSettings(Settings):
+    """Settings of `Slow`."""
 
     longest_s: float = Field(0.0, ge=0)
     dies_at: float | None = None
     raises_at: float | None = None
     lies_at: float | None = None
-    _count: int = PrivateAttr(default=0)
+
+
+class Slow(Stage[SlowSettings]):
+    """Gives a number on, and its negative, after a random while; remembers how many there were."""
+
+    def __init__(self, settings: SlowSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._count: int = 0
 
     def on_number(self, number: Number) -> Iterator[Number]:
-        if self.longest_s:
-            time.sleep(random.random() * self.longest_s)
-        if number.value == self.dies_at:
+        settings = self.settings
+        if settings.longest_s:
+            time.sleep(random.random() * settings.longest_s)
+        if number.value == settings.dies_at:
             os.kill(os.getpid(), signal.SIGKILL)
         yield Number(stamp_ns=number.stamp_ns, value=number.value + self._count)
-        if number.value == self.raises_at:
+        if number.value == settings.raises_at:
             raise ZeroDivisionError("asked to")
-        if number.value == self.lies_at:
+        if number.value == settings.lies_at:
             yield Text(stamp_ns=0, words="not promised")  # type: ignore[misc]
         yield Number(stamp_ns=number.stamp_ns, value=-number.value)
         self._count += 1
@@ -58,20 +67,33 @@ class Slow(Stage):
         return {"taken": self._count}
 
 
-class Numbers2(Numbers):
-    """Numbers by another topic."""
+class Numbers2Settings(NumbersSettings):
+    """Settings of `Numbers2`."""
 
     topic: str = "/numbers2"
 
 
-class Log(Tap):
-    """Keeps what it sees, in order; of some kinds of messages only, if so asked."""
+class Numbers2(Numbers):
+    """Numbers by another topic."""
+
+    settings_type = Numbers2Settings
+
+
+class LogSettings(Settings):
+    """Settings of `Log`."""
 
     only: str | None = None
-    _seen: list[tuple[str, int, str]] = PrivateAttr(default_factory=list)
+
+
+class Log(Tap[LogSettings]):
+    """Keeps what it sees, in order; of some kinds of messages only, if so asked."""
+
+    def __init__(self, settings: LogSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._seen: list[tuple[str, int, str]] = []
 
     def wants(self, message: type[Message]) -> bool:
-        return self.only is None or message.__name__ == self.only
+        return self.settings.only is None or message.__name__ == self.settings.only
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         content = [getattr(message, name) for name in ("value", "total", "words") if hasattr(message, name)]

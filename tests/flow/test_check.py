@@ -232,8 +232,8 @@ def test_a_file_that_is_no_configuration(content, text, tmp_path):
 def test_set_changes_a_setting_by_the_stages_name(tmp_path):
     (tmp_path / "x.yaml").write_text(GRAPH)
     graph = load_graph(tmp_path / "x.yaml", sets=["add.window=7", "stages.double.config.factor=0.5"])
-    assert graph.nodes["add"].build().window == 7
-    assert graph.nodes["double"].build().factor == 0.5
+    assert graph.nodes["add"].build().settings.window == 7
+    assert graph.nodes["double"].build().settings.factor == 0.5
 
 
 @pytest.mark.parametrize(
@@ -296,13 +296,13 @@ def test_an_include_lies_below_and_its_errors_name_its_own_file(tmp_path):
 def test_a_reference_stands_for_a_value_elsewhere(tmp_path):
     text = "rig: {names: {a: anna}, other: $rig.names.a}\n" + GRAPH.replace("adder", "$rig.other")
     (tmp_path / "x.yaml").write_text(text)
-    assert load_graph(tmp_path / "x.yaml").nodes["add"].build().name == "anna"
+    assert load_graph(tmp_path / "x.yaml").nodes["add"].build().settings.name == "anna"
 
 
 @pytest.mark.parametrize(("rig", "name"), [("{title: anna}", "anna"), ("{}", "bert")])
 def test_a_reference_may_say_what_holds_where_nothing_stands(tmp_path, rig, name):
     (tmp_path / "x.yaml").write_text(f"rig: {rig}\n" + GRAPH.replace("{name: adder}", "{name: $rig.title or bert}"))
-    assert load_graph(tmp_path / "x.yaml").nodes["add"].build().name == name
+    assert load_graph(tmp_path / "x.yaml").nodes["add"].build().settings.name == name
 
 
 @pytest.mark.parametrize(
@@ -328,9 +328,9 @@ def test_a_recordings_rig_replaces_the_files_own_and_set_changes_both(tmp_path):
     (tmp_path / "x.yaml").write_text("rig: {a: own, b: own}\n" + GRAPH.replace("{name: adder}", "{name: $rig.a}"))
     sections = {"rig": ({"a": "recorded"}, Place("street.mcap rig.yaml", 0))}
     graph = load_graph(tmp_path / "x.yaml", sections=sections)
-    assert (graph.nodes["add"].build().name, graph.values["rig"]) == ("recorded", {"a": "recorded"})
+    assert (graph.nodes["add"].build().settings.name, graph.values["rig"]) == ("recorded", {"a": "recorded"})
     graph = load_graph(tmp_path / "x.yaml", sections=sections, sets=["rig.a=by hand"])
-    assert graph.nodes["add"].build().name == "by hand"
+    assert graph.nodes["add"].build().settings.name == "by hand"
 
 
 NEEDY = GRAPH.replace("use: tests.flow.toys.Double\n", "use: tests.flow.toys.Double\n    needs: $rig.cameras\n")

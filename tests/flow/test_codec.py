@@ -42,7 +42,7 @@ A_FIX = DroneFix(
 
 def hash_of(value: Message) -> bytes:
     hasher = hashlib.sha256()
-    hash_into(hasher, value)
+    hash_into(hasher, hasher, value)
     return hasher.digest()
 
 

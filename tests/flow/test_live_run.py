@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
+from typing import Any
 
 import pytest
-from pydantic import PrivateAttr
 
 from flow.incidents import IncidentTold
 from flow.link import Tap
 from flow.message import Message
+from flow.stage import Settings
 from tests.flow.live_toys import PATIENCE_S, Collector, Line, Memory, Stuck, graph_of, run_live
 
 ROOM = "tests.flow.live_toys"
@@ -84,7 +85,9 @@ def test_a_link_that_dies_is_said_and_opened_again_and_nothing_else_stops(tmp_pa
 class Listener(Tap):
     """Keeps the incidents it is told."""
 
-    _told: list[IncidentTold] = PrivateAttr(default_factory=list)
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._told: list[IncidentTold] = []
 
     def wants(self, message: type[Message]) -> bool:
         return message is IncidentTold

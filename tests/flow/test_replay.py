@@ -16,11 +16,12 @@ from tests.flow.toys import GRAPH
 class Log(Tap):
     """Keeps what it sees."""
 
-    def model_post_init(self, _):
-        object.__setattr__(self, "seen", [])
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen = []
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
-        self.seen.append((output, arrival_ns, message))  # type: ignore[attr-defined]
+        self.seen.append((output, arrival_ns, message))
 
 
 def graph_of(tmp_path, text=GRAPH):

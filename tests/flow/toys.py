@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
-from flow.link import Link, LinkError, Record, Source
+from flow.link import Link, LinkError, Record, Source, SourceSettings
 from flow.message import Message, PerPointF32, message
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 
 
 @message
@@ -34,10 +35,14 @@ class Text(Message):
     words: str
 
 
-class Numbers(Source):
-    """Brings in numbers written as text."""
+class NumbersSettings(SourceSettings):
+    """Settings of `Numbers`."""
 
     topic: str = "/numbers"
+
+
+class Numbers(Source[NumbersSettings]):
+    """Brings in numbers written as text."""
 
     def decode(self, record: Record) -> Number | None:
         if record.data == b"refuse":
@@ -45,10 +50,14 @@ class Numbers(Source):
         return Number(stamp_ns=record.stamp_ns, value=float(record.data)) if record.data else None
 
 
-class Words(Source):
-    """Brings in words."""
+class WordsSettings(SourceSettings):
+    """Settings of `Words`."""
 
     topic: str = "/words"
+
+
+class Words(Source[WordsSettings]):
+    """Brings in words."""
 
     def decode(self, record: Record) -> Text:
         return Text(stamp_ns=record.stamp_ns, words=record.data.decode())
@@ -61,33 +70,48 @@ class Printer(Link):
         raise AssertionError("a replay sends nothing out")
 
 
-class Double(Stage):
-    """Doubles, by a factor if asked."""
+class DoubleSettings(Settings):
+    """Settings of `Double`."""
 
     factor: float = Field(2.0, gt=0)
     unused_option: bool = False
-    _doubled: int = PrivateAttr(default=0)
+
+
+class Double(Stage[DoubleSettings]):
+    """Doubles, by a factor if asked."""
+
+    def __init__(self, settings: DoubleSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._doubled: int = 0
 
     def on_number(self, number: Number) -> Number:
         self._doubled += 1
-        return Number(stamp_ns=number.stamp_ns, value=number.value * self.factor)
+        return Number(stamp_ns=number.stamp_ns, value=number.value * self.settings.factor)
 
     @property
     def counters(self) -> dict[str, int]:
         return {"doubled": self._doubled}
 
 
-class Add(Stage):
+class AddSettings(Settings):
+    """Settings of `Add`."""
+
+    window: int = Field(3, ge=1, le=100)
+    name: str
+
+
+class Add(Stage[AddSettings]):
     """Adds two streams; gives a sum for each number and a word when it ends."""
 
     optional_inputs = frozenset({"words"})
-    window: int = Field(3, ge=1, le=100)
-    name: str
-    _seen: list[float] = PrivateAttr(default_factory=list)
+
+    def __init__(self, settings: AddSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._seen: list[float] = []
 
     def on_left(self, number: Number) -> Iterator[Sum]:
         self._seen.append(number.value)
-        tail = np.asarray(self._seen[-self.window :], dtype=np.float32)
+        tail = np.asarray(self._seen[-self.settings.window :], dtype=np.float32)
         yield Sum(stamp_ns=number.stamp_ns, total=sum(self._seen), last=tail)
 
     def on_right(self, number: Number) -> Iterator[Sum]:
@@ -98,7 +122,7 @@ class Add(Stage):
             raise ZeroDivisionError("asked to")
 
     def finish(self) -> Text:
-        return Text(stamp_ns=0, words=f"{self.name} ends with {sum(self._seen)}")
+        return Text(stamp_ns=0, words=f"{self.settings.name} ends with {sum(self._seen)}")
 
 
 class Liar(Stage):

@@ -12,7 +12,7 @@ import threading
 from pathlib import Path
 
 from links.simulated.rig.live_process import SWITCH_S, LiveAutopilot, RigInTime
-from links.simulated.rig.live_rig import LiveRig
+from links.simulated.rig.live_rig import LiveRigSettings
 
 
 class RestartedAutopilot(LiveAutopilot):
@@ -38,7 +38,7 @@ class RestartedAutopilot(LiveAutopilot):
 class FaultyRig(RigInTime):
     """`do("lidar off")` and so on, from any thread."""
 
-    def __init__(self, rig: LiveRig, folder: Path) -> None:
+    def __init__(self, rig: LiveRigSettings, folder: Path) -> None:
         super().__init__(rig, folder)
         self.lidar_off = False
         self.radio: RestartedAutopilot | None = None
@@ -79,7 +79,7 @@ def main(settings: str) -> None:
     given = json.loads(settings)
     folder = Path(given.pop("folder"))
     sys.setswitchinterval(SWITCH_S)
-    rig, ready = FaultyRig(LiveRig.model_validate(given), folder), threading.Event()
+    rig, ready = FaultyRig(LiveRigSettings.model_validate(given), folder), threading.Event()
     sending = threading.Thread(target=rig.run, args=(ready,))
     sending.start()
     ready.wait()

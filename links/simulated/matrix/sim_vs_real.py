@@ -130,7 +130,7 @@ def _laser_bias_m(points: Array64, seen: NDArray[np.bool_]) -> float:
 
 def recorded(path: Path) -> Iterator[LidarFirings]:
     """The decoded packets of a recording."""
-    decoder = Decoder.model_validate({})
+    decoder = Decoder()
     with RecordingReader(path) as reader:
         for record in reader.records():
             if record.topic == "/lidar/packets" and (firings := decoder.decode(record)) is not None:
@@ -163,7 +163,7 @@ def simulated_room(turns: float, seed: int = 1) -> Iterator[LidarFirings]:
     lidar, around, decoder = (
         Lidar(LidarSettings(), START_NS, seed),
         Still(room_mesh(1.0, seed)),
-        Decoder.model_validate({}),
+        Decoder(),
     )
     firings = firings_per_packet("strongest")
     for packet in range(int(turns * 1e8 / (firings * vlp16.SEQUENCE_NS))):

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
+from pydantic import BaseModel, ConfigDict, Field
 
 from flow.graph import Graph
 from flow.link import LinkError, Record, Tap
@@ -45,8 +45,10 @@ class ClosedLoopSettings(BaseModel):
 class GoalTap(Tap):
     """Hands each goal that is wired to the servo over to it, as a live run does."""
 
-    _output: str = PrivateAttr()
-    _servo: Servo = PrivateAttr()
+    def __init__(self) -> None:
+        super().__init__()
+        self._output: str | None = None
+        self._servo: Servo | None = None
 
     def watch(self, output: str, servo: Servo) -> None:
         """Which goals go to which servo."""
@@ -54,7 +56,7 @@ class GoalTap(Tap):
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         """A goal on its way."""
-        if output == self._output and isinstance(message, ServoGoal):
+        if self._servo is not None and output == self._output and isinstance(message, ServoGoal):
             self._servo.on_goal(message)
 
 

@@ -36,7 +36,7 @@ from links.simulated.autopilot.autopilot import Autopilot
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.rig.image_cache import KeptCamera, KeptPictures
 from links.simulated.rig.live_images import PicturesInTime
-from links.simulated.rig.live_rig import READY, RIG_REPORT, LiveRig
+from links.simulated.rig.live_rig import READY, RIG_REPORT, LiveRigSettings
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.sensors.camera import CamerasSettings
@@ -119,7 +119,7 @@ class LiveAutopilot(AutopilotSocket):
 class RigInTime:
     """Sends until it is told to stop, or the scenario is over."""
 
-    def __init__(self, rig: LiveRig, folder: Path) -> None:
+    def __init__(self, rig: LiveRigSettings, folder: Path) -> None:
         scenario = load_scenario(rig.scenario)
         asked = {"seed": rig.seed, "duration_s": rig.duration_s}
         scenario = scenario.changed(**{name: value for name, value in asked.items() if value is not None})
@@ -246,7 +246,7 @@ def main(settings: str) -> int:
     folder = Path(given.pop("folder"))
     sys.setswitchinterval(SWITCH_S)
     try:
-        rig = RigInTime(LiveRig.model_validate(given), folder)
+        rig = RigInTime(LiveRigSettings.model_validate(given), folder)
         ready = threading.Event()
         sending = threading.Thread(target=rig.run, args=(ready,), daemon=True)
         sending.start()

@@ -17,12 +17,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from flow.link import LinkError, Run, Tap
 from flow.message import Message
+from flow.stage import Settings
 
 START_S = 120.0  # to build the world and, once, to compile
 END_S = 1.0
@@ -32,8 +33,8 @@ Carrier = Literal["vehicle", "drone"]
 Port = Annotated[int, Field(ge=1, le=65535)]
 
 
-class LiveRig(Tap):
-    """A simulated rig, for the time of a live run."""
+class LiveRigSettings(Settings):
+    """Settings of `LiveRig`."""
 
     scenario: Path  # as in configs/scenarios/, as seen from where grd is started
     seed: int | None = Field(None, ge=0)  # None: the scenario's
@@ -48,7 +49,13 @@ class LiveRig(Tap):
     camera_ports: dict[Carrier, Port] = Field(default_factory=dict[Carrier, Port])  # http://127.0.0.1:PORT/ of each
     batch_packets: int = Field(8, ge=1, le=64)  # cast together: fewer come sooner, more cost less
 
-    _process: subprocess.Popen[str] | None = PrivateAttr(default=None)
+
+class LiveRig(Tap[LiveRigSettings]):
+    """A simulated rig, for the time of a live run."""
+
+    def __init__(self, settings: LiveRigSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._process: subprocess.Popen[str] | None = None
 
     def wants(self, message: type[Message]) -> bool:
         """Nothing."""
@@ -66,15 +73,16 @@ class LiveRig(Tap):
         """Start the rig and wait until it is ready. LinkError when it does not come up; nothing in a replay."""
         if not run.live:
             return
-        if not self.scenario.is_file():
-            raise LinkError(f"{self.scenario}: no such scenario; its name is as seen from here, {Path.cwd()}")
-        if self.pictures is not None and not self.pictures.is_file():
+        settings = self.settings
+        if not settings.scenario.is_file():
+            raise LinkError(f"{settings.scenario}: no such scenario; its name is as seen from here, {Path.cwd()}")
+        if settings.pictures is not None and not settings.pictures.is_file():
             raise LinkError(
-                f"{self.pictures}: no such recording, and fisheyes cannot be painted in real time. Paint them once, "
-                f"in some minutes: grd simulate {self.scenario} -o {self.pictures}"
+                f"{settings.pictures}: no such recording, and fisheyes cannot be painted in real time. Paint them "
+                f"once, in some minutes: grd simulate {settings.scenario} -o {settings.pictures}"
             )
-        settings = json.dumps({**self.model_dump(mode="json"), "folder": str(run.out_dir)})
-        command = [sys.executable, "-m", "links.simulated.rig.live_process", settings]
+        asked = json.dumps({**settings.model_dump(mode="json"), "folder": str(run.out_dir)})
+        command = [sys.executable, "-m", "links.simulated.rig.live_process", asked]
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -90,7 +98,7 @@ class LiveRig(Tap):
                     return
                 break
         self.close()
-        raise LinkError(f"the simulated rig for {self.scenario} did not start; see its message above")
+        raise LinkError(f"the simulated rig for {settings.scenario} did not start; see its message above")
 
     def close(self) -> None:
         """End the rig: its standard input ends, and it writes what was true."""

@@ -128,9 +128,9 @@ def test_the_lidars_clock_is_the_recorded_runs():
     run = (
         "links: {front: {use: links.velodyne.Lidar, config: {clock: utc, port: 2400}}, cam: {use: links.camera.Camera}}"
     )
-    assert lidar_of(run).clock == "utc"
+    assert lidar_of(run).settings.clock == "utc"
     for other in (None, "seed: 3", "links: null", "links: {front: {use: links.velodyne.Lidar}}", "- 1"):
-        assert lidar_of(other).clock == "free"
+        assert lidar_of(other).settings.clock == "free"
 
 
 def test_a_rig_goes_into_a_yaml_file_only(tmp_path):

@@ -81,7 +81,7 @@ def bound_port(udp: socket.socket) -> int:
 
 @contextmanager
 def listening(**config: Any) -> Iterator[Heard]:
-    link = Autopilot.model_validate({"connection": "udpin:127.0.0.1:0", **config})
+    link = Autopilot(**{"connection": "udpin:127.0.0.1:0", **config})
     with link.listen() as records:
         heard = Heard(link, records)
         try:
@@ -506,4 +506,4 @@ def test_without_a_connection_it_cannot_listen_and_says_what_to_set():
 )
 def test_settings_that_would_fly_wrong_are_refused_with_the_reason(config: Any, says: str):
     with pytest.raises(ValidationError, match=says):
-        Autopilot.model_validate(config)
+        Autopilot(**config)

@@ -12,7 +12,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
-from flow.stage import Stage
+from flow.stage import Settings, Stage
 from links.mavlink.profiles import PROFILES
 from links.mavlink.wire import packed, parse_frame
 from links.preflight.heard import Ear, Heard
@@ -149,16 +149,20 @@ class HandHeld:
         return ardupilotmega.MAVLink_local_position_ned_message(self.device_ns(at_ns) // 1_000_000, x, y, z, 0, 0, 0)
 
 
-class Eye(Stage):
-    """Sees the drone where the hand carries it, in a vehicle frame that is turned by 30 deg."""
+class EyeSettings(Settings):
+    """Settings of `Eye`."""
 
     mirror: float = 1.0  # -1: it and the autopilot do not agree on left and right
+
+
+class Eye(Stage[EyeSettings]):
+    """Sees the drone where the hand carries it, in a vehicle frame that is turned by 30 deg."""
 
     def on_position(self, position: DroneLocalPosition) -> DroneFix:
         """A fix where it is."""
         c, s = math.cos(0.5), math.sin(0.5)
         x, y, z = position.xyz_local_m
-        y = y * self.mirror
+        y = y * self.settings.mirror
         return DroneFix(
             stamp_ns=position.stamp_ns,
             xyz_vehicle_m=np.array([c * x - s * y + 3, s * x + c * y, z + 5]),

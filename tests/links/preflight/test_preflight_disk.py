@@ -16,7 +16,7 @@ from links.preflight.seen import Seen
 from links.recording import Recorder
 from links.velodyne import Lidar
 
-LIDAR, CAMERA = Lidar.model_validate({}), Camera.model_validate({"topic": "/camera/drone"})
+LIDAR, CAMERA = Lidar(), Camera(topic="/camera/drone")
 
 
 def heard_of(link: Source, name: str, size: int = 0, rate_hz: float = 10.0, count: int = 0) -> Heard:

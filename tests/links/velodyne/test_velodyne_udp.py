@@ -108,7 +108,7 @@ def test_leaving_the_context_ends_a_waiting_listener_and_frees_the_port(port):
 def test_listening_beyond_loopback_needs_the_lidars_address():
     with pytest.raises(ValidationError, match=r"sender: give the lidar's address .* when binding to 0.0.0.0"):
         Lidar(bind="0.0.0.0")
-    assert str(Lidar(bind="0.0.0.0", sender="192.168.1.201").sender) == "192.168.1.201"
+    assert str(Lidar(bind="0.0.0.0", sender="192.168.1.201").settings.sender) == "192.168.1.201"
 
 
 @pytest.mark.parametrize(

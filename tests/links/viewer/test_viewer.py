@@ -309,7 +309,7 @@ def test_a_taken_port_is_said_and_the_file_is_written_all_the_same(tmp_path):
         viewer.see("clock.tick", ticks(1)[0], 0)
         viewer.close()
     (text,) = viewer.errors
-    assert text.startswith(f"port {viewer.port} is taken")
+    assert text.startswith(f"port {viewer.settings.port} is taken")
     assert rows(tmp_path / "run.rrd")["/plots/other/clock/tick/count"] == 1
 
 

@@ -8,13 +8,12 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PrivateAttr
 
-from flow.link import Link, Record, Source
+from flow.link import Link, Record, Source, SourceSettings
 from flow.message import Message, Shape, message
 from flow.stage import Stage
 from links.host_time import now_ns
@@ -37,17 +36,24 @@ class Picture(Message):
     grey: Annotated[NDArray[np.uint8], Shape("h", "w")]
 
 
-class Beats(Source):
-    """Gives a beat, and each `every` beats a picture."""
+class BeatsSettings(SourceSettings):
+    """Settings of `Beats`."""
 
     topic: str = "/beats"
     rate_hz: float = 100.0
     every: int = 10
     size_px: int = 64
 
-    _number: int = PrivateAttr(default=0)
+
+class Beats(Source[BeatsSettings]):
+    """Gives a beat, and each `every` beats a picture."""
+
+    def __init__(self, settings: BeatsSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._number: int = 0
 
     def decode(self, record: Record) -> Iterator[Beat | Picture]:
+        settings = self.settings
         self._number += 1
         yield Beat(
             stamp_ns=record.stamp_ns,
@@ -55,8 +61,8 @@ class Beats(Source):
             monotonic=int(record.data),
             earlier_ns=record.stamp_ns - 1_000_000,
         )
-        if self._number % self.every == 0:
-            noise = np.random.default_rng(self._number).integers(0, 255, (self.size_px, self.size_px), np.uint8)
+        if self._number % settings.every == 0:
+            noise = np.random.default_rng(self._number).integers(0, 255, (settings.size_px, settings.size_px), np.uint8)
             yield Picture(stamp_ns=record.stamp_ns, number=self._number, grey=noise)
 
     @contextmanager
@@ -66,9 +72,9 @@ class Beats(Source):
         def beats() -> Iterator[Record]:
             next_s = time.monotonic()
             while not closing.wait(max(next_s - time.monotonic(), 0.0)):
-                next_s += 1.0 / self.rate_hz
+                next_s += 1.0 / self.settings.rate_hz
                 stamp_ns, monotonic = now_ns(), time.monotonic_ns()
-                yield Record(self.topic, stamp_ns, stamp_ns, str(monotonic).encode())
+                yield Record(self.settings.topic, stamp_ns, stamp_ns, str(monotonic).encode())
 
         try:
             yield beats()

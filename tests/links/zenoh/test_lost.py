@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import pytest
 
 from links.zenoh.peer_clock import PeerClock
-from links.zenoh.receiver import Receiver
+from links.zenoh.receiver import Receiver, ReceiverSettings
 from links.zenoh.wire import Envelope
 
 
 @pytest.fixture
 def receiver():
-    return Receiver.model_construct(topic="/zenoh/beats", sender="drone", session=None)
+    return Receiver(ReceiverSettings.model_construct(topic="/zenoh/beats", sender="drone", session=None))
 
 
 def hear(receiver, *numbers, run=1, key="beat"):

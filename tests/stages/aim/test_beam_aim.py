@@ -67,8 +67,8 @@ Tell = Callable[[BeamAim, float], None]
 
 def fly(aim: BeamAim, seconds: float, tell: Tell, start_rad=0.3, rotor=True, latency_s=LATENCY_S) -> Flight:
     """Let the aim drive a servo that obeys after the latency, at most at 55 rpm."""
-    flight, position, orders, packets = Flight(aim.mount), start_rad, [], 0
-    low, high = (math.radians(v) for v in aim.travel_deg)
+    flight, position, orders, packets = Flight(aim.settings.mount), start_rad, [], 0
+    low, high = (math.radians(v) for v in aim.settings.travel_deg)
     goal: ServoGoal | None = None
     for stamp_ns in range(START_NS, START_NS + round(seconds * 1e9), TICK_NS):
         t_s = (stamp_ns - START_NS) * 1e-9

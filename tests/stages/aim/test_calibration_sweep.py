@@ -76,4 +76,4 @@ def test_a_lidar_bolted_down_is_not_turned_and_nonsense_is_refused():
     assert driven(CalibrationSweep(mount=LidarMount(turns=False)), 1.0, from_deg=0.0)[1] == []
     for wrong in ({"travel_deg": (90.0, 90.0)}, {"speeds_rpm": ()}, {"speeds_rpm": (0.0,)}):
         with pytest.raises(ValidationError):
-            CalibrationSweep.model_validate({"mount": LidarMount(), **wrong})
+            CalibrationSweep(**{"mount": LidarMount(), **wrong})

@@ -26,7 +26,7 @@ RPM = math.tau / 60
 
 
 def aim(**settings) -> SweepVibrateAim:
-    return SweepVibrateAim.model_validate({"mount": MOUNT} | settings)
+    return SweepVibrateAim(**{"mount": MOUNT} | settings)
 
 
 def servo(position_deg: float, t_s: float = 0.0) -> ServoState:

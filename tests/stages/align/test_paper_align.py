@@ -182,7 +182,7 @@ def test_the_same_inputs_give_the_same_bits():
     for _ in range(2):
         digest = hashlib.sha256()
         for message in run(PaperAlign(), Flight(drone_yaw_deg=95), 40):
-            hash_into(digest, message)
+            hash_into(digest, digest, message)
         digests.append(digest.hexdigest())
     assert digests[0] == digests[1]
 

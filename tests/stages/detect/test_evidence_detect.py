@@ -176,7 +176,7 @@ def test_four_packets_together_tell_the_same_as_one_by_one():
 
 def test_what_was_accepted_stays_so_until_much_less_speaks_for_it(monkeypatch):
     stage, c = EvidenceDetect(), candidate(sighting(0.0, np.array(PLACE_M)))
-    accept = odds_of(stage.accept_probability)
+    accept = odds_of(stage.settings.accept_probability)
     verdicts = []
     for odds in (accept - 0.1, accept + 0.1, accept - KEPT_NATS + 0.1, accept - KEPT_NATS - 0.1, accept - 0.1):
         monkeypatch.setattr("stages.detect.evidence.judge", lambda *_, odds=odds: (odds, "so it is"))

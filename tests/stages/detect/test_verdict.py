@@ -96,7 +96,7 @@ def test_from_28_m_on_what_may_stand_still_is_never_sure_enough_to_be_accepted_a
             sure = E.model_copy(update={"clutter": 0.0, "birds_far": 9.0, "birds": 9.0})
             odds, words = judge(c, sure, True, True)
             assert ("it may stand still" in words) != moves
-            accepted = odds >= odds_of(EvidenceDetect.model_fields["accept_probability"].default)
+            accepted = odds >= odds_of(EvidenceDetect.settings_type.model_fields["accept_probability"].default)
             assert accepted == (moves or still_accepted), (range_m, told, odds)
 
 
@@ -234,12 +234,12 @@ def test_where_the_drone_tells_nothing_the_odds_are_a_share_of_the_evidence_and_
 
 def test_without_the_drones_word_what_is_accepted_and_looked_at_again_has_the_evidence_that_the_numbers_were_made_for():
     for default, evidence in (("accept_probability", 5.3), ("look_again_probability", -5.1)):
-        asked = odds_of(EvidenceDetect.model_fields[default].default)
+        asked = odds_of(EvidenceDetect.settings_type.model_fields[default].default)
         assert asked == pytest.approx(as_often(E.weight_untold * evidence + E.offset_untold, E), abs=0.05)
 
 
 def test_tracker_and_evaluation_know_from_where_on_the_detector_accepts():
-    accepts = EvidenceDetect.model_fields["accept_probability"].default
+    accepts = EvidenceDetect.settings_type.model_fields["accept_probability"].default
     assert pytest.approx(odds_of(accepts)) == ACCEPTED_NATS
     assert EDGES[-2] == accepts
 

@@ -149,7 +149,7 @@ def test_it_rests_while_odometry_is_heard_and_goes_on_at_once_with_its_speed():
         seen = image(START_NS + k * STEP_NS, *at(k * STEP_NS * 1e-9), LOOKS_UP)
         told.append(of(ego.on_image(seen), VehicleMotion))
     awake = next(k for k, m in enumerate(told) if m is not None)
-    assert awake == math.ceil((silent_from - START_NS) / STEP_NS - 1 / 6 + ego.silent_s * 1e9 / STEP_NS)
+    assert awake == math.ceil((silent_from - START_NS) / STEP_NS - 1 / 6 + ego.settings.silent_s * 1e9 / STEP_NS)
     assert told[awake].xyz_start_m.tolist() == [0.0, 0.0, 0.0]
     assert all(m is not None for m in told[awake:])
     off_m = np.linalg.norm(errors(at, told)[:, 3:], axis=1)
@@ -172,7 +172,7 @@ def test_it_works_while_the_odometry_tells_nonsense():
         seen = image(START_NS + k * STEP_NS, *at(k * STEP_NS * 1e-9), LOOKS_UP)
         told.append(of(ego.on_image(seen), VehicleMotion))
     awake = next(k for k, m in enumerate(told) if m is not None)
-    assert awake == math.ceil((mad_from - START_NS) / STEP_NS - 1 / 6 + ego.silent_s * 1e9 / STEP_NS)
+    assert awake == math.ceil((mad_from - START_NS) / STEP_NS - 1 / 6 + ego.settings.silent_s * 1e9 / STEP_NS)
     assert all(m is not None for m in told[awake:])
     assert np.linalg.norm(errors(at, told)[:, 3:], axis=1).max() < 0.03 * 3 * (19 - awake) * STEP_NS * 1e-9
     for part in range(3):  # sane again: three that agree

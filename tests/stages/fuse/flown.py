@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import PrivateAttr
 
 from flow.graph import Graph
 from flow.link import Tap
@@ -98,6 +97,7 @@ class Hearing(Tap):
         order = list(input_ports(graph.nodes[consumer].cls))
         edges = [e for e in graph.edges if e.consumer == consumer]
         self._ports = {f"{e.producer}.{e.output}": (order.index(e.port), e.port) for e in edges}
+        self._heard: list[tuple[int, int, int, Event]] = []
 
     def see(self, output, message, arrival_ns) -> None:
         if output in self._ports:
@@ -106,9 +106,6 @@ class Hearing(Tap):
 
     def all(self) -> list[Event]:
         return [event for *_, event in sorted(self._heard, key=lambda e: e[:3])]
-
-    _ports: dict[str, tuple[int, str]] = PrivateAttr(default_factory=dict)
-    _heard: list[tuple[int, int, int, Event]] = PrivateAttr(default_factory=list)
 
 
 # faults

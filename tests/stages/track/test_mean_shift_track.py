@@ -116,7 +116,7 @@ def test_how_points_are_sliced_does_not_matter():
         slices = [swept(points[i], stamps[i]) for i in np.array_split(np.arange(400), pieces)]
         fixes, states = run(stage, [empty(0), detections(T0), *slices])
         for message in [*fixes, *states]:
-            hash_into(hasher, message)
+            hash_into(hasher, hasher, message)
         return hasher.hexdigest()
 
     assert digest(3) == digest(37) == digest(400)

@@ -19,7 +19,7 @@ from tests.stages.vp.paper_rooms import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, cou
 
 def vp(mount=LOOKS_UP, carrier="vehicle", **settings):
     base = {"carrier": carrier, "T_carrier_camera": mount, "lens": LENS, "size_px": SIZE_PX, "view_px": 300}
-    return PaperVp.model_validate(base | settings)
+    return PaperVp(**base | settings)
 
 
 def directions(R_room_carrier, mount=LOOKS_UP, carrier="vehicle", **settings):
@@ -98,7 +98,7 @@ def test_the_same_picture_gives_the_same_bits():
     digests = []
     for _ in range(2):
         digest = hashlib.sha256()
-        hash_into(digest, directions(rotation_from_rpy_deg((0, 0, 20))))
+        hash_into(digest, digest, directions(rotation_from_rpy_deg((0, 0, 20))))
         digests.append(digest.hexdigest())
     assert digests[0] == digests[1]
 

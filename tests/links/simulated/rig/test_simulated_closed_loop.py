@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from pydantic import PrivateAttr
 
 from flow.graph import load_graph
 from flow.link import LinkError, Record, Tap
 from flow.message import Message
 from flow.problem import ConfigError, Place
 from flow.replay import replay
+from flow.stage import Settings
 from flow.taps import Digest
 from links.recording import RecordingReader
 from links.simulated.rig import closed_loop
@@ -67,7 +68,9 @@ def states(records: list[Record]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 class Goals(Tap):
     """Collects the goals of a replay with the time of the record that caused them."""
 
-    _seen: list[tuple[int, float]] = PrivateAttr(default_factory=list)
+    def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._seen: list[tuple[int, float]] = []
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
         if isinstance(message, ServoGoal):

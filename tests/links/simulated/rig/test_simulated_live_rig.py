@@ -65,10 +65,11 @@ def test_a_scenario_that_is_not_there_or_wrong_is_an_error(tmp_path, capfd):
 def test_the_rig_sends_packets_of_now_and_its_rays_go_where_the_servo_was_sent(tmp_path, ports):
     pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
     from links.simulated.rig.live_process import RigInTime
+    from links.simulated.rig.live_rig import LiveRigSettings
 
     (tmp_path / "small.yaml").write_text(SCENARIO)
     lidar_port, odometry_port = ports
-    settings = LiveRig(
+    settings = LiveRigSettings(
         scenario=tmp_path / "small.yaml", servo=tmp_path / "servo", lidar_port=lidar_port, odometry_port=odometry_port
     )
     rig, ready = RigInTime(settings, tmp_path), threading.Event()

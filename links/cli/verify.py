@@ -1,0 +1,62 @@
+"""`grd verify`: whether the committed recordings still give the output hashes that are pinned for them.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from links.cli.console import FINDING, in_words, out, progress_bar
+from links.output_hashes import Outcome, measure, read_pins, write_pins
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+@in_words
+def verify(
+    recordings: Annotated[
+        list[str] | None, typer.Argument(help="Names in recordings/, without .mcap [default: all].")
+    ] = None,
+    values: Annotated[
+        bool, typer.Option("--values", help="Compare values alone; texts for people may differ.")
+    ] = False,
+    update: Annotated[
+        bool, typer.Option("--update", help="Pin the hashes as they are now, in recordings/hashes.json.")
+    ] = False,
+    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="Replays at a time [default: one a core].")] = None,
+) -> None:
+    """Replay the committed recordings and compare their output hashes with recordings/hashes.json.
+
+    Exit code 1 when one differs, or is not pinned.
+
+    Example: grd verify street_sweep
+    """
+    folder = REPOSITORY / "recordings"
+    pins = read_pins(folder, REPOSITORY / "configs", tuple(recordings or ()))
+    outcomes: list[Outcome] = []
+    with progress_bar("verify") as step:
+        for outcome in measure(pins, jobs or os.cpu_count() or 1):
+            outcomes.append(outcome)
+            step(len(outcomes), len(pins))
+    outcomes.sort(key=lambda outcome: (outcome.pin.recording.name, outcome.pin.config.name))
+    for outcome in outcomes:
+        out.print(f"{outcome.pin.recording.stem:20} {outcome.pin.config.stem:10} {_in_words(outcome)}", markup=False)
+    if update:
+        write_pins(folder, outcomes)
+        out.print(f"pinned in {folder / 'hashes.json'}", markup=False)
+    elif not all(outcome.values_match if values else outcome.matches for outcome in outcomes):
+        raise typer.Exit(FINDING)
+
+
+def _in_words(outcome: Outcome) -> str:
+    if outcome.matches:
+        return f"{outcome.actual}  same"
+    if outcome.pin.expected is None:
+        return f"{outcome.actual}  not pinned"
+    what = "texts differ" if outcome.values_match else "VALUES DIFFER"
+    return f"{outcome.actual}  {what}, pinned {outcome.pin.expected}"

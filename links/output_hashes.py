@@ -1,0 +1,142 @@
+"""Pinned output hashes: what each committed recording gives under each configuration, in `recordings/hashes.json`.
+
+    {"street_sweep.mcap": {"replay": "0123456789abcdef-fedcba9876543210", ...}, ...}
+
+The half before the dash covers every value of every message, the half after it the texts for people (`flow.taps`).
+
+Source: ours; openpilot's process replay has reference hashes for the same purpose.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flow.graph import load_graph
+from flow.link import TRUTH_TOPICS, LinkError, Tap
+from flow.problem import Place
+from flow.replay import replay
+from flow.taps import Digest
+from links.recording import Session
+
+HASHES_FILE = "hashes.json"
+CONFIGS = ("replay", "paper", "estimate")  # of configs/; pinned for every recording
+CAMERA_CONFIGS = ("vision",)  # also pinned for recordings with cameras
+HASH_FORM = "16 hex digits, a dash and 16 hex digits"
+
+
+@dataclass(frozen=True, slots=True)
+class Pin:
+    """The output hash that one recording has under one configuration; None: not pinned."""
+
+    recording: Path
+    config: Path
+    expected: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A pin and what its replay gave."""
+
+    pin: Pin
+    actual: str
+
+    @property
+    def values_match(self) -> bool:
+        """Every value of every message is as pinned."""
+        return self.pin.expected is not None and values_half(self.pin.expected) == values_half(self.actual)
+
+    @property
+    def matches(self) -> bool:
+        """So are the texts."""
+        return self.pin.expected == self.actual
+
+
+def values_half(output_hash: str) -> str:
+    """The half of an output hash that covers values."""
+    return output_hash.partition("-")[0]
+
+
+def hash_matches(expected: str, actual: str) -> bool:
+    """Whether a run has an expected hash: a whole one, or its first half for the values alone. LinkError: neither."""
+    if not expected or len(expected) not in (16, 33) or set(expected) - set("0123456789abcdef-"):
+        raise LinkError(f"'{expected}' is not an output hash: give {HASH_FORM}, or the first 16 for the values alone")
+    return expected == (actual if "-" in expected else values_half(actual))
+
+
+def read_pins(folder: Path, configs: Path, only: tuple[str, ...] = ()) -> list[Pin]:
+    """The pins of a folder of recordings, also those that are missing in its `hashes.json`.
+
+    `only`: names of recordings, without `.mcap`. LinkError when there is none of that name, or the file is damaged.
+    """
+    recordings = sorted(folder.glob("*.mcap"))
+    known = {file.stem for file in recordings}
+    if unknown := sorted(set(only) - known):
+        raise LinkError(f"no recording '{unknown[0]}' in {folder}; there is {', '.join(sorted(known)) or 'none'}")
+    pinned = _read(folder / HASHES_FILE)
+    return [
+        Pin(file, configs / f"{name}.yaml", pinned.get(file.name, {}).get(name))
+        for file in recordings
+        if not only or file.stem in only
+        for name in (*CONFIGS, *(CAMERA_CONFIGS if _has_cameras(file) else ()))
+    ]
+
+
+def write_pins(folder: Path, outcomes: list[Outcome]) -> None:
+    """Pin what was measured; pins of other recordings stay."""
+    pinned = _read(folder / HASHES_FILE)
+    for outcome in outcomes:
+        pinned.setdefault(outcome.pin.recording.name, {})[outcome.pin.config.stem] = outcome.actual
+    text = json.dumps({name: pinned[name] for name in sorted(pinned)}, indent=2)
+    (folder / HASHES_FILE).write_text(text + "\n", encoding="utf-8")
+
+
+def measure(pins: list[Pin], jobs: int) -> Iterator[Outcome]:
+    """Replay each pin, `jobs` at a time; outcomes as they come. ConfigError, LinkError, RunError of a replay."""
+    if jobs == 1:
+        yield from (Outcome(pin, output_hash(pin.recording, pin.config)) for pin in pins)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        futures = {pool.submit(output_hash, pin.recording, pin.config): pin for pin in pins}
+        for future in as_completed(futures):
+            yield Outcome(futures[future], future.result())
+
+
+def output_hash(recording: Path, config: Path) -> str:
+    """Replay a recording through a configuration without its taps, in one process, every array checked."""
+    session = Session(recording)
+    sections = None
+    if session.rig_yaml is not None:
+        sections = {"rig": (yaml.safe_load(session.rig_yaml), Place(f"{recording} (rig.yaml)", 0))}
+    graph = load_graph(config, [], _without_taps(config), sections)
+    digest = Digest()
+    records = (record for record in session.records() if not record.topic.startswith(TRUTH_TOPICS))
+    replay(graph, records, [digest], strict=True)
+    return digest.hexdigest()
+
+
+def _without_taps(config: Path) -> list[str]:
+    """Settings that switch a configuration's taps off: the viewer takes half of a replay's time."""
+    graph = load_graph(config, [], [], None)
+    return [f"links.{spec.name}=null" for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
+
+
+def _has_cameras(recording: Path) -> bool:
+    rig: Any = yaml.safe_load(Session(recording).rig_yaml or "") or {}
+    return bool(rig.get("cameras"))
+
+
+def _read(file: Path) -> dict[str, dict[str, str]]:
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except ValueError as error:
+        raise LinkError(f"{file} is not JSON: {error}") from None

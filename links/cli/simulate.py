@@ -36,13 +36,13 @@ def simulate_recording(
         float | None,
         typer.Option("--duration", min=0.1, max=3600, help="Seconds to simulate [default: the scenario's]."),
     ] = None,
-    pictures: Annotated[
+    images: Annotated[
         Path | None,
         typer.Option(
-            "--pictures",
+            "--images",
             metavar="FROM.mcap",
-            help="Take the cameras' pictures from a recording of the same flight instead of painting them, which takes "
-            "most of the time. LiDAR, servo, radio and CONFIG may differ; what pictures show may not.",
+            help="Take the cameras' images from a recording of the same flight instead of painting them, which takes "
+            "most of the time. LiDAR, servo, radio and CONFIG may differ; what images show may not.",
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -68,7 +68,7 @@ def simulate_recording(
             progress=lambda done: step(done, 1.0),
             closed_loop=closed_loop,
             duration_s=duration_s,
-            pictures=pictures,
+            images=images,
         )
     out.print(str(report), markup=False)
 
@@ -89,10 +89,10 @@ def simulate_matrix(
     calibrated: Annotated[
         bool, typer.Option("--calibrated", help="The rig knows the error of the servo's encoder and its play.")
     ] = False,
-    as_built: Annotated[
+    perturbed: Annotated[
         bool,
         typer.Option(
-            "--as-built", help="Each flight's rig is not quite as its file says, its drone one of several kinds."
+            "--perturbed", help="Each flight's rig is not quite as its file says, its drone one of several kinds."
         ),
     ] = False,
     odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle has odometry.")] = False,
@@ -112,7 +112,7 @@ def simulate_matrix(
     ] = None,
     cameras_px: Annotated[
         int | None,
-        typer.Option("--pixels", min=64, max=1440, help="The fisheyes' pictures are this large. [default: 720]"),
+        typer.Option("--pixels", min=64, max=1440, help="The fisheyes' images are this large. [default: 720]"),
     ] = None,
     readout_ms: Annotated[
         float | None,
@@ -120,13 +120,13 @@ def simulate_matrix(
             "--readout", metavar="MS", min=0, max=60, help="Their rolling shutter, first to last row. [default: 0]"
         ),
     ] = None,
-    pictures: Annotated[
+    images: Annotated[
         Path | None,
         typer.Option(
-            "--pictures",
+            "--images",
             metavar="DIR",
-            help="Take the pictures from DIR's recordings of the same names; where one is missing or of another flight "
-            "that is an error (the same command without --pictures then paints what is left).",
+            help="Take the images from DIR's recordings of the same names; where one is missing or of another flight "
+            "that is an error (the same command without --images then paints what is left).",
         ),
     ] = None,
     results: Annotated[
@@ -161,7 +161,7 @@ def simulate_matrix(
 
     if results is not None and closed_loop is None:
         raise LinkError("--results keeps the closed loop's runs: say whose with --closed-loop CONFIG")
-    of_cameras = {"--pictures": pictures, "--pixels": cameras_px, "--readout": readout_ms}
+    of_cameras = {"--images": images, "--pixels": cameras_px, "--readout": readout_ms}
     for option, value in of_cameras.items():
         if value is not None and cameras_hz is None:
             raise LinkError(f"{option} is for recordings with cameras: say at which rate with --cameras HZ")
@@ -171,10 +171,10 @@ def simulate_matrix(
             out.print(cell.name, markup=False)
         return
     size_px = cameras_px or Conditions.cameras_px
-    conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, as_built)
+    conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, perturbed)
     several = range(first_seed, first_seed + seeds)
     with progress_bar(f"{len(wanted) * seeds} recordings") as step:
-        report = make_matrix(folder, wanted, several, closed_loop, step, conditions, results, jobs, pictures)
+        report = make_matrix(folder, wanted, several, closed_loop, step, conditions, results, jobs, images)
     _tell(folder, report)
 
 

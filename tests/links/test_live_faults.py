@@ -28,7 +28,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.recording import RecordingReader
-from links.simulated.rig.live_images import PictureServer
+from links.simulated.rig.live_images import MjpegServer
 from links.truth import TruthLog
 from tests.links.fault_bounds import KEPT_S, KILLED, MUST, POSES_AGAIN_S, POSITION_AGAIN_S, REST_S
 from tests.links.ports import free_ports
@@ -177,7 +177,7 @@ class Camera:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            with PictureServer(self._port) as server:
+            with MjpegServer(self._port) as server:
                 while not self.off and not self._stop.wait(0.1):
                     server.show(self._jpeg)
             while self.off and not self._stop.wait(0.05):

@@ -19,8 +19,8 @@ from links.simulated.autopilot.rules import (
     LOCAL_FRD,
     MS,
     US,
-    Fate,
-    Reading,
+    ExternalPose,
+    PoseResult,
     Rules,
     pose_of,
     variances_of,
@@ -72,35 +72,35 @@ class ArduPilotRules(Rules):
 
     def healthy(self, now_ns: int) -> bool:
         """AP_VisualOdom_Backend::healthy: also of messages that are not fused."""
-        return self._heard_ns is not None and now_ns - self._heard_ns < self.health_ms * MS
+        return self._last_received_ns is not None and now_ns - self._last_received_ns < self.health_ms * MS
 
     def fusing(self, now_ns: int) -> bool:
         """Not in constant position mode."""
-        return self._fused_ns is not None and now_ns - self._fused_ns < self.retry_s * 1e9
+        return self._last_fused_ns is not None and now_ns - self._last_fused_ns < self.retry_s * 1e9
 
     def report(self, now_ns: int) -> Any:
         """EKF_STATUS_REPORT."""
         position, yaw = self.ratios
         return mavlink.MAVLink_ekf_status_report_message(self._flags(now_ns), 0.0, position, position, yaw, 0.0, 0.0)
 
-    def _take(self, message: Any, now_ns: int) -> Fate:
+    def _process(self, message: Any, now_ns: int) -> PoseResult:
         odometry = message.get_type() == "ODOMETRY"
         if odometry and (message.frame_id != LOCAL_FRD or message.child_frame_id != BODY_FRD):
-            return Fate.WRONG_FRAME  # a bare return: not even health
+            return PoseResult.WRONG_FRAME  # a bare return: not even health
         sent_us = message.time_usec if odometry else message.usec
         time_ms = self._jitter.local_us(sent_us, now_ns // US) // 1000
         xyz, R, velocity, upper = pose_of(message)
-        self._heard_ns = now_ns
+        self._last_received_ns = now_ns
         quality = message.quality if odometry else 0
         if quality < self.viso_qual_min:
-            return Fate.LOW_QUALITY
+            return PoseResult.LOW_QUALITY
         position_error, angle_error = (0.0, 0.0) if math.isnan(upper[0]) else map(_cube_root, variances_of(upper))
         if not np.isfinite(xyz).all() or math.isnan(position_error):
-            return Fate.NOT_FINITE
+            return PoseResult.NOT_FINITE
         if self._last_ms is not None and time_ms - self._last_ms < self.interval_ms:
-            return Fate.TOO_SOON
+            return PoseResult.TOO_SOON
         self._last_ms = time_ms
-        reading = Reading(
+        pose = ExternalPose(
             time_ms * MS - self.viso_delay_ms * MS,
             xyz,
             yaw_of(R),
@@ -110,18 +110,18 @@ class ArduPilotRules(Rules):
             message.reset_counter,
             quality,
         )
-        return self._fuse(reading, now_ns)
+        return self._fuse(pose, now_ns)
 
-    def _fuse(self, reading: Reading, now_ns: int) -> Fate:
-        was, self._reset_counter = self._reset_counter, reading.reset_counter
-        if self.estimate is None or was != reading.reset_counter or not math.isfinite(reading.yaw_rad):
-            return self._reset_to(reading, now_ns) if math.isfinite(reading.yaw_rad) else Fate.NOT_FINITE
-        self.ratios = self.estimate.ratios(reading, self.gate)
+    def _fuse(self, pose: ExternalPose, now_ns: int) -> PoseResult:
+        was, self._reset_counter = self._reset_counter, pose.reset_counter
+        if self.estimate is None or was != pose.reset_counter or not math.isfinite(pose.yaw_rad):
+            return self._reset_to(pose, now_ns) if math.isfinite(pose.yaw_rad) else PoseResult.NOT_FINITE
+        self.ratios = self.estimate.ratios(pose, self.gate)
         if max(self.ratios) > 1:
-            return Fate.GATED if self.fusing(now_ns) else self._reset_to(reading, now_ns)
-        self.estimate.fuse(reading)
-        self._fused_ns = now_ns
-        return Fate.FUSED
+            return PoseResult.GATED if self.fusing(now_ns) else self._reset_to(pose, now_ns)
+        self.estimate.fuse(pose)
+        self._last_fused_ns = now_ns
+        return PoseResult.FUSED
 
 
 def _cube_root(variances: list[float]) -> float:

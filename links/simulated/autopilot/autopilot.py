@@ -151,10 +151,10 @@ class Autopilot:
             asked_ns = self._start_ns + round(1e9 * at_s)
             frame = _packed(mavlink.MAVLink_timesync_message(0, asked_ns), self._host)
             self._requests.append((asked_ns, frame))
-            heard_ns = uplink.arrival_ns(asked_ns, len(frame))
-            if heard_ns is not None:
-                reply = mavlink.MAVLink_timesync_message(self.device_ns(heard_ns), asked_ns)
-                self._waiting.append((heard_ns + round(1e9 * self._rng.uniform(0.05, 1.0) * LOOP_S), reply))
+            received_ns = uplink.arrival_ns(asked_ns, len(frame))
+            if received_ns is not None:
+                reply = mavlink.MAVLink_timesync_message(self.device_ns(received_ns), asked_ns)
+                self._waiting.append((received_ns + round(1e9 * self._rng.uniform(0.05, 1.0) * LOOP_S), reply))
 
     def _heartbeats(self, time_s: Array64, device_ns: NDArray[np.int64]) -> list[Any]:
         armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -205,7 +205,7 @@ class Autopilot:
 
     def _raw_imus(self, time_s: Array64, device_ns: NDArray[np.int64]) -> list[Any]:
         s = self._settings
-        rate, force = self._flight.felt(time_s)
+        rate, force = self._flight.imu(time_s)
         gyro_bias, force_bias = (
             np.radians(s.gyro_bias_degps) * self._biases[0],
             s.accelerometer_bias_mps2 * self._biases[1],
@@ -224,7 +224,7 @@ class Autopilot:
 
     def _attitude(self, time_s: Array64) -> tuple[Array64, Array64]:
         """Estimated R_local_drone (n, 3, 3) and turn rate (n, 3), drone axes."""
-        rate = self._flight.felt(time_s)[0]
+        rate = self._flight.imu(time_s)[0]
         noise = self._rng.normal(0.0, np.radians(self._settings.rate_noise_degps), rate.shape)
         return self._estimate.rotations(time_s, self._flight.flying_poses(time_s)[0]), rate + noise
 

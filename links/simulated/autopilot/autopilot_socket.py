@@ -5,7 +5,7 @@ it stands on the ground and says HEARTBEAT alone. It answers TIMESYNC, PARAM_REQ
 origin, takes an origin where it has none, and reports its estimator five times a second as `rules` says.
 
     with AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", port)) as drone:
-        drone.wait_for(lambda: drone.rules.fates[Fate.FUSED] > 10)
+        drone.wait_for(lambda: drone.rules.results[PoseResult.FUSED] > 10)
 
 Source: ours; https://mavlink.io/en/services/timesync.html, /parameter.html; ArduPilot GCS_MAVLINK for who answers what.
 """
@@ -37,7 +37,7 @@ REPORT_HZ = 5.0
 PX4_TIMESYNC_HZ = 10.0
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN, UNSUPPORTED = 512, 49, 3
 REAL32, INT32 = 9, 6  # MAV_PARAM_TYPE
-HEARD = 10_000  # messages kept
+MAX_RECEIVED = 10_000  # messages kept
 
 
 class AutopilotSocket:
@@ -58,10 +58,10 @@ class AutopilotSocket:
     ) -> None:
         self.rules, self.origin = rules, origin
         self.parameters = dict(parameters or {})
-        self.heard: deque[tuple[int, Any]] = deque(maxlen=HEARD)
+        self.received: deque[tuple[int, Any]] = deque(maxlen=MAX_RECEIVED)
         self.silent = False
         """Says and hears nothing while set: a radio in a shadow."""
-        self._to_say: deque[Any] = deque()
+        self._to_send: deque[Any] = deque()
         self._flight, self._scenario_ns = flight, scenario_ns
         self._begin_ns = scenario_ns()
         self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
@@ -100,16 +100,16 @@ class AutopilotSocket:
     def messages(self, kind: str) -> list[Any]:
         """What was heard of one type."""
         with self._changed:
-            return [message for _, message in self.heard if message.get_type() == kind]
+            return [message for _, message in self.received if message.get_type() == kind]
 
     def wait_for(self, predicate: Callable[[], bool], timeout_s: float = 10.0) -> bool:
         """Wait until something is true; looked at with each message that comes."""
         with self._changed:
             return self._changed.wait_for(predicate, timeout_s)
 
-    def say(self, message: Any) -> None:
+    def send(self, message: Any) -> None:
         """Send a message, from its own thread."""
-        self._to_say.append(message)
+        self._to_send.append(message)
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -121,7 +121,7 @@ class AutopilotSocket:
                     continue
                 if not self.silent:
                     self._receive(data, source)
-            self._speak()
+            self._send_due()
 
     def _receive(self, data: bytes, source: Address) -> None:
         self._peer = self._peer or source
@@ -130,8 +130,8 @@ class AutopilotSocket:
                 continue
             with self._changed:
                 now_ns = self.device_ns()
-                self.heard.append((now_ns, message))
-                self.rules.hear(message, now_ns)
+                self.received.append((now_ns, message))
+                self.rules.receive(message, now_ns)
                 self._changed.notify_all()
             self._answer(message)
 
@@ -145,12 +145,12 @@ class AutopilotSocket:
             asked = message.command == REQUEST_MESSAGE and message.param1 == GPS_GLOBAL_ORIGIN
             self._send(mavlink.MAVLink_command_ack_message(message.command, 0 if asked else UNSUPPORTED))
             if asked:
-                self._tell_origin()
+                self._send_origin()
         elif kind == "SET_GPS_GLOBAL_ORIGIN" and self.origin is None:
             self.origin = message.latitude, message.longitude, message.altitude
-            self._tell_origin()
+            self._send_origin()
 
-    def _tell_origin(self) -> None:
+    def _send_origin(self) -> None:
         if self.origin is not None:
             self._send(mavlink.MAVLink_gps_global_origin_message(*self.origin, self.device_ns() // 1000))
 
@@ -162,9 +162,9 @@ class AutopilotSocket:
             return mavlink.MAVLink_param_value_message(place[0], held, INT32, *place[1:])
         return mavlink.MAVLink_param_value_message(place[0], float(value), REAL32, *place[1:])
 
-    def _speak(self) -> None:
-        while self._to_say:
-            self._send(self._to_say.popleft())
+    def _send_due(self) -> None:
+        while self._to_send:
+            self._send(self._to_send.popleft())
         if self._flight is not None:
             for record in self._flight.records(self._scenario_ns()):
                 if record.topic == "/autopilot/rx":

@@ -20,8 +20,8 @@ from links.simulated.autopilot.rules import (
     LOCAL_NED,
     MS,
     US,
-    Fate,
-    Reading,
+    ExternalPose,
+    PoseResult,
     Rules,
     pose_of,
     variances_of,
@@ -53,7 +53,7 @@ class Px4Rules(Rules):
 
     def fusing(self, now_ns: int) -> bool:
         """Started, and not stopped by 400 ms of nothing."""
-        if self._heard_ns is None or now_ns - self._heard_ns > 2 * self.interval_ms * MS:
+        if self._last_received_ns is None or now_ns - self._last_received_ns > 2 * self.interval_ms * MS:
             self._fusing = False
         return self._fusing
 
@@ -64,18 +64,18 @@ class Px4Rules(Rules):
             now_ns // US, self._flags(now_ns), 0.0, position, position, yaw, 0.0, 0.0, 0.1, 0.1
         )
 
-    def _take(self, message: Any, now_ns: int) -> Fate:
+    def _process(self, message: Any, now_ns: int) -> PoseResult:
         if message.get_type() != "ODOMETRY":
-            return Fate.WRONG_FRAME  # read as north-oriented, and without a compass its yaw is not aligned
+            return PoseResult.WRONG_FRAME  # read as north-oriented, and without a compass its yaw is not aligned
         if message.estimator_type not in (0, 1, 2, 3):
-            return Fate.WRONG_ESTIMATOR
+            return PoseResult.WRONG_ESTIMATOR
         if message.frame_id not in (LOCAL_NED, LOCAL_FRD):
-            return Fate.WRONG_FRAME
+            return PoseResult.WRONG_FRAME
         xyz, R, velocity, upper = pose_of(message)
         position_var, angle_var = variances_of(upper)
         if not (np.isfinite(xyz).all() and np.isfinite(R).all()):
-            return Fate.NOT_FINITE
-        reading = Reading(
+            return PoseResult.NOT_FINITE
+        pose = ExternalPose(
             now_ns - self.ekf2_ev_delay_ms * MS,
             xyz,
             yaw_of(R),
@@ -85,37 +85,37 @@ class Px4Rules(Rules):
             message.reset_counter,
             message.quality,
         )
-        return self._fuse(reading, now_ns)
+        return self._fuse(pose, now_ns)
 
-    def _fuse(self, reading: Reading, now_ns: int) -> Fate:
+    def _fuse(self, pose: ExternalPose, now_ns: int) -> PoseResult:
         fusing = self.fusing(now_ns)
-        gap_ns = None if self._last_ns is None else reading.time_ns - self._last_ns
-        good = self.ekf2_ev_qmin <= 0 or min(reading.quality, self._last_quality) >= self.ekf2_ev_qmin
-        self._last_quality = reading.quality
-        was, self._reset_counter = self._reset_counter, reading.reset_counter
-        self._heard_ns = now_ns
-        if self.ekf2_ev_qmin > 0 and reading.quality < self.ekf2_ev_qmin:
-            return Fate.LOW_QUALITY
-        self._last_ns = reading.time_ns
+        gap_ns = None if self._last_ns is None else pose.time_ns - self._last_ns
+        good = self.ekf2_ev_qmin <= 0 or min(pose.quality, self._last_quality) >= self.ekf2_ev_qmin
+        self._last_quality = pose.quality
+        was, self._reset_counter = self._reset_counter, pose.reset_counter
+        self._last_received_ns = now_ns
+        if self.ekf2_ev_qmin > 0 and pose.quality < self.ekf2_ev_qmin:
+            return PoseResult.LOW_QUALITY
+        self._last_ns = pose.time_ns
         if not fusing or self.estimate is None:
             if not good or gap_ns is None or gap_ns >= self.interval_ms * MS:
-                return Fate.NOT_STARTED
+                return PoseResult.NOT_STARTED
             self._fusing, self.resets_left = True, 5
-            return self._reset_to(reading, now_ns)
-        if was != reading.reset_counter:
-            return self._reset_to(reading, now_ns)
-        self.ratios = self.estimate.ratios(reading, self.gate)
+            return self._reset_to(pose, now_ns)
+        if was != pose.reset_counter:
+            return self._reset_to(pose, now_ns)
+        self.ratios = self.estimate.ratios(pose, self.gate)
         if max(self.ratios) <= 1:
-            self.estimate.fuse(reading)
-            self._fused_ns = now_ns
-            return Fate.FUSED
-        if self._fused_ns is None or now_ns - self._fused_ns <= self.failing_s * 1e9:
-            return Fate.GATED
+            self.estimate.fuse(pose)
+            self._last_fused_ns = now_ns
+            return PoseResult.FUSED
+        if self._last_fused_ns is None or now_ns - self._last_fused_ns <= self.failing_s * 1e9:
+            return PoseResult.GATED
         if self.resets_left == 0:
             self._fusing = False
-            return Fate.GATED
+            return PoseResult.GATED
         self.resets_left -= 1
-        return self._reset_to(reading, now_ns)
+        return self._reset_to(pose, now_ns)
 
 
 def _at_least(variance: float, floor: float) -> float:

@@ -25,7 +25,7 @@ class RadioSettings(BaseModel):
     latency_s: float = Field(default=0.006, ge=0, le=5)  # the least there is
     jitter_s: float = Field(default=0.004, ge=0, le=5)  # mean of what comes on top
     bitrate_bps: float = Field(default=921_600.0, ge=9_600)
-    loss_share: float = Field(default=0.0, ge=0, lt=1)
+    loss_fraction: float = Field(default=0.0, ge=0, lt=1)
     loss_burst_frames: float = Field(default=3.0, ge=1)  # mean length of a burst
     outages_s: tuple[tuple[float, float], ...] = ()  # (from, to) since the start
 
@@ -51,7 +51,7 @@ class Radio:
         s = self._settings
         jitter_s = self._rng.exponential(s.jitter_s) if s.jitter_s else 0.0
         end = 1 / s.loss_burst_frames
-        begin = min(1.0, end * s.loss_share / (1 - s.loss_share))
+        begin = min(1.0, end * s.loss_fraction / (1 - s.loss_fraction))
         self._losing = bool(self._rng.random() < (1 - end if self._losing else begin))
         if self._losing or any(a <= sent_ns < b for a, b in self._outages):
             return None

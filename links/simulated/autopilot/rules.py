@@ -27,7 +27,7 @@ LOCAL_NED, LOCAL_FRD, BODY_FRD = 1, 20, 12
 MS, US = 1_000_000, 1_000
 
 
-class Fate(enum.Enum):
+class PoseResult(enum.Enum):
     """What became of a message."""
 
     FUSED = "fused"
@@ -39,11 +39,11 @@ class Fate(enum.Enum):
     TOO_SOON = "too soon after the one before"
     LOW_QUALITY = "quality too low"
     NOT_STARTED = "waits for messages without gaps"
-    NOT_FOR_IT = "not a pose"
+    NOT_A_POSE = "not a pose"
 
 
 @dataclass(slots=True)
-class Reading:
+class ExternalPose:
     """An external pose as an autopilot reads it: local axes (north or forward, right, down)."""
 
     time_ns: int  # on its own clock
@@ -57,7 +57,7 @@ class Reading:
 
 
 @dataclass(slots=True)
-class Estimate:
+class PoseEstimate:
     """Position and yaw, predicted with constant velocity."""
 
     time_ns: int
@@ -67,37 +67,37 @@ class Estimate:
     position_var: float
     yaw_var: float
 
-    def ratios(self, reading: Reading, gate: float) -> tuple[float, float]:
-        """Innovation over gate, position and yaw; 1 is at the gate. Predicts to the reading first."""
-        dt_s = max((reading.time_ns - self.time_ns) * 1e-9, 0.0)
-        self.time_ns = max(self.time_ns, reading.time_ns)
+    def ratios(self, pose: ExternalPose, gate: float) -> tuple[float, float]:
+        """Innovation over gate, position and yaw; 1 is at the gate. Predicts to the pose first."""
+        dt_s = max((pose.time_ns - self.time_ns) * 1e-9, 0.0)
+        self.time_ns = max(self.time_ns, pose.time_ns)
         self.xyz_m = self.xyz_m + dt_s * self.velocity_mps
         self.position_var += (DRIFT_MPS * dt_s) ** 2
         self.yaw_var += (DRIFT_RADPS * dt_s) ** 2
-        position = float(np.abs(reading.xyz_m - self.xyz_m).max())
-        turned = abs(math.remainder(reading.yaw_rad - self.yaw_rad, math.tau))
+        position = float(np.abs(pose.xyz_m - self.xyz_m).max())
+        turned = abs(math.remainder(pose.yaw_rad - self.yaw_rad, math.tau))
         return (
-            position / (gate * math.sqrt(self.position_var + reading.position_sigma_m**2)),
-            turned / (gate * math.sqrt(self.yaw_var + reading.yaw_sigma_rad**2)),
+            position / (gate * math.sqrt(self.position_var + pose.position_sigma_m**2)),
+            turned / (gate * math.sqrt(self.yaw_var + pose.yaw_sigma_rad**2)),
         )
 
-    def fuse(self, reading: Reading) -> None:
+    def fuse(self, pose: ExternalPose) -> None:
         """Kalman's update, the axes apart."""
-        gain = self.position_var / (self.position_var + reading.position_sigma_m**2)
-        yaw_gain = self.yaw_var / (self.yaw_var + reading.yaw_sigma_rad**2)
-        self.xyz_m = self.xyz_m + gain * (reading.xyz_m - self.xyz_m)
-        self.yaw_rad += yaw_gain * math.remainder(reading.yaw_rad - self.yaw_rad, math.tau)
+        gain = self.position_var / (self.position_var + pose.position_sigma_m**2)
+        yaw_gain = self.yaw_var / (self.yaw_var + pose.yaw_sigma_rad**2)
+        self.xyz_m = self.xyz_m + gain * (pose.xyz_m - self.xyz_m)
+        self.yaw_rad += yaw_gain * math.remainder(pose.yaw_rad - self.yaw_rad, math.tau)
         self.position_var *= 1 - gain
         self.yaw_var *= 1 - yaw_gain
-        if reading.velocity_mps is not None:
-            self.velocity_mps = reading.velocity_mps
+        if pose.velocity_mps is not None:
+            self.velocity_mps = pose.velocity_mps
 
 
-def begun(reading: Reading) -> Estimate:
-    """The estimate that a reset to a reading gives."""
-    velocity = np.zeros(3) if reading.velocity_mps is None else reading.velocity_mps
-    variances = reading.position_sigma_m**2, reading.yaw_sigma_rad**2
-    return Estimate(reading.time_ns, reading.xyz_m, velocity, reading.yaw_rad, *variances)
+def initial_estimate(pose: ExternalPose) -> PoseEstimate:
+    """The estimate that a reset to a pose gives."""
+    velocity = np.zeros(3) if pose.velocity_mps is None else pose.velocity_mps
+    variances = pose.position_sigma_m**2, pose.yaw_sigma_rad**2
+    return PoseEstimate(pose.time_ns, pose.xyz_m, velocity, pose.yaw_rad, *variances)
 
 
 def pose_of(message: Any) -> tuple[Array64, Array64, Array64 | None, Any]:
@@ -126,20 +126,20 @@ def variances_of(upper: Any) -> tuple[list[float], list[float]]:
 
 @dataclass(slots=True)
 class Rules:
-    """What both kinds share: counts of fates, the estimate, and when a pose was taken last."""
+    """What both kinds share: counts of results, the estimate, and when a pose was taken last."""
 
-    fates: Counter[Fate] = field(default_factory=Counter[Fate])
-    estimate: Estimate | None = None
-    ratios: tuple[float, float] = (0.0, 0.0)  # of the newest reading
-    _heard_ns: int | None = None  # newest message that counts for health
-    _fused_ns: int | None = None
+    results: Counter[PoseResult] = field(default_factory=Counter[PoseResult])
+    estimate: PoseEstimate | None = None
+    ratios: tuple[float, float] = (0.0, 0.0)  # of the newest pose
+    _last_received_ns: int | None = None  # newest message that counts for health
+    _last_fused_ns: int | None = None
     _reset_counter: int | None = None
 
-    def hear(self, message: Any, now_ns: int) -> Fate:
+    def receive(self, message: Any, now_ns: int) -> PoseResult:
         """What the autopilot does with a message that arrives now (its own clock)."""
         pose = message.get_type() in ("ODOMETRY", "VISION_POSITION_ESTIMATE")
-        fate = self._take(message, now_ns) if pose else Fate.NOT_FOR_IT
-        self.fates[fate] += 1
+        fate = self._process(message, now_ns) if pose else PoseResult.NOT_A_POSE
+        self.results[fate] += 1
         return fate
 
     def healthy(self, now_ns: int) -> bool:
@@ -154,13 +154,13 @@ class Rules:
         """The message in which it says so."""
         raise NotImplementedError
 
-    def _take(self, message: Any, now_ns: int) -> Fate:
+    def _process(self, message: Any, now_ns: int) -> PoseResult:
         raise NotImplementedError
 
     def _flags(self, now_ns: int) -> int:
         """EKF_STATUS_FLAGS: attitude; velocities, relative position and height, or constant position."""
         return 1 | (2 | 4 | 8 | 32 | 256 if self.fusing(now_ns) else 128 | 32)
 
-    def _reset_to(self, reading: Reading, now_ns: int) -> Fate:
-        self.estimate, self._fused_ns = begun(reading), now_ns
-        return Fate.RESET
+    def _reset_to(self, pose: ExternalPose, now_ns: int) -> PoseResult:
+        self.estimate, self._last_fused_ns = initial_estimate(pose), now_ns
+        return PoseResult.RESET

@@ -19,19 +19,19 @@ PULSE_LENGTH_M = 1.0  # two surfaces closer than this in range give one blended 
 
 
 @compiled
-def turned_poses(
+def lidar_poses(
     R_world_vehicle: Array64,
     t_world_vehicle_m: Array64,
     T_vehicle_turntable: Array64,
-    turned_rad: Array64,
+    output_rad: Array64,
     T_turntable_lidar: Array64,
 ) -> tuple[Array64, Array64]:
     """T_world_lidar = T_world_vehicle T_vehicle_turntable Rz(turned) T_turntable_lidar: (n, 3, 3) and (n, 3)."""
-    count = len(turned_rad)
+    count = len(output_rad)
     rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))
     turned, mounted = np.empty((3, 4)), np.empty((3, 4))
     for n in range(count):
-        c, s = np.cos(turned_rad[n]), np.sin(turned_rad[n])
+        c, s = np.cos(output_rad[n]), np.sin(output_rad[n])
         for j in range(4):
             x, y, z = T_turntable_lidar[0, j], T_turntable_lidar[1, j], T_turntable_lidar[2, j]
             turned[0, j], turned[1, j], turned[2, j] = c * x - s * y, s * x + c * y, z

@@ -36,7 +36,7 @@ MUST_SEE = 0.95  # of the time
 HIDDEN_S = 3.0
 FARTHEST_M = 75.0  # half way to where a scene ends: no vehicle drives on
 FAR_M = 105.0  # beyond the LiDAR's reach
-APART_DEG = (40.0, 60.0)  # between two drones at the start; they come no nearer
+SEPARATION_DEG = (40.0, 60.0)  # between two drones at the start; they come no nearer
 
 Motion = Callable[[Array64], Array64]  # times (n,) -> offset (n, 3) from the LiDAR, world axes [m]
 
@@ -101,13 +101,13 @@ def drone_path(cell: Cell, world: RayScene, rng: Generator, times: Array64, lida
 def two_paths(cell: Cell, world: RayScene, rng: Generator, times: Array64, lidar_m: Array64) -> tuple[Path, Path]:
     """One drone that orbits and one that hovers where the first one came from, both free and in sight."""
     hover = replace(cell, motion="hover")
-    behind = np.radians([50.0, 45.0, 55.0, *APART_DEG])
+    behind = np.radians([50.0, 45.0, 55.0, *SEPARATION_DEG])
     for orbit, azimuth, elevation in _flights(cell, world, rng, times, lidar_m):
         orbit_m = orbit.at(times)[0]
         for height, aside in product((elevation, *ELEVATIONS_RAD), behind):
             path, flown_m = _flown(hover, next(motions(hover, azimuth - float(aside), height)), times, lidar_m)
             apart = _azimuths_apart(orbit_m - lidar_m, flown_m - lidar_m).min()
-            if apart > np.radians(APART_DEG[0] - 2.0) and _is_possible(hover, world, lidar_m, flown_m):
+            if apart > np.radians(SEPARATION_DEG[0] - 2.0) and _is_possible(hover, world, lidar_m, flown_m):
                 return orbit, path
     raise _no_flight(cell)
 

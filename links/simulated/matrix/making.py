@@ -25,7 +25,7 @@ from links.run_folder import Asked, RunFolder, holds_run, replay_into
 from links.simulated.matrix.flights import Cell
 from links.simulated.matrix.jobs import run_all
 from links.simulated.matrix.matrix import Conditions, scenario_of
-from links.simulated.rig.closed_loop import ClosedLoop, made_with, servo_edge
+from links.simulated.rig.closed_loop import ClosedLoop, loop_metadata, servo_edge
 from links.simulated.rig.run import simulate_into
 from links.simulated.rig.scenario import Scenario
 from links.truth import TruthLog
@@ -42,7 +42,7 @@ class Making:
     closed_loop: Asked | None
     results: Path | None  # where the closed loop's runs go, if they are wanted
     conditions: Conditions
-    pictures: Path | None = None  # recordings of the same names, whose pictures are taken instead of painted
+    images: Path | None = None  # recordings of the same names, whose images are taken instead of painted
 
 
 @dataclass(frozen=True)
@@ -89,18 +89,18 @@ def make_matrix(
     conditions: Conditions | None = None,
     results: Path | None = None,
     jobs: int = 1,
-    pictures: Path | None = None,
+    images: Path | None = None,
 ) -> MatrixReport:
     """Make what is missing: `folder/<cell>-s<seed>.mcap`, `results/<cell>-s<seed>-<configuration>`.
 
-    With `pictures` those of its `<cell>-s<seed>.mcap` are taken; where that is missing or of another flight the
-    recording fails (painting is slow, and a second call without `pictures` paints just what is missing).
+    With `images` those of its `<cell>-s<seed>.mcap` are taken; where that is missing or of another flight the
+    recording fails (painting is slow, and a second call without `images` paints just what is missing).
     `progress` is told simulated seconds done and in all. Raises ConfigError, or LinkError, for a configuration that
     closes no loop; what goes wrong with one recording is in the report, and the others are made.
     """
     conditions = conditions or Conditions()
     asked = None if closed_loop is None else _asked(closed_loop, conditions, results is not None)
-    making = Making(folder, asked, results, conditions, pictures)
+    making = Making(folder, asked, results, conditions, images)
     tasks = [Task(making, cell, seed) for seed, cell in product(seeds, wanted)]
     whole_s = sum(task.cell.duration_s for task in tasks)
 
@@ -151,7 +151,7 @@ def _make(task: Task, scenario: Scenario, progress: Callable[[float], None]) -> 
         _simulate(task, file, scenario, None, progress)
         return Outcome("made")
     graph = asked.graph(scenario.rig_yaml(), f"{scenario.name} (rig)")
-    made_by = made_with(asked.config, graph)
+    made_by = loop_metadata(asked.config, graph)
     results = task.making.results
     folder = results and results / f"{task.name}-{asked.config.stem}"
     if is_made(file, scenario, made_by):
@@ -180,7 +180,7 @@ def _simulate_and_keep_run(
     with ExitStack() as undo, RunFolder(folder, file, asked, graph) as run:
         if is_new:  # a flight that cannot be made leaves no folder that looks like a run
             undo.callback(shutil.rmtree, folder)
-        loop = ClosedLoop(graph, scenario.closed_loop, made_with(asked.config, graph), run.taps)
+        loop = ClosedLoop(graph, scenario.closed_loop, loop_metadata(asked.config, graph), run.taps)
         _simulate(task, file, scenario, loop, progress)
         undo.pop_all()
         truth = TruthLog()
@@ -193,17 +193,17 @@ def _simulate(
     task: Task, file: Path, scenario: Scenario, loop: ClosedLoop | None, progress: Callable[[float], None]
 ) -> None:
     """Make a recording; it has its name only when it is complete."""
-    pictures = task.making.pictures and task.making.pictures / file.name
+    images = task.making.images and task.making.images / file.name
     part = file.with_name(f"{file.name}.part")
     try:
-        simulate_into(part, scenario, progress, overwrite=True, loop=loop, pictures=pictures)
+        simulate_into(part, scenario, progress, overwrite=True, loop=loop, images=images)
         part.replace(file)
     finally:
         part.unlink(missing_ok=True)
 
 
 def is_made(file: Path, scenario: Scenario, made_by: dict[str, str]) -> bool:
-    """Whether a file is the complete recording of this scenario, `made_with` the same configuration or without any."""
+    """Whether a file is the complete recording of this scenario, `loop_metadata` the same configuration or without any."""
     if not file.is_file():
         return False
     try:

@@ -20,12 +20,12 @@ import numpy as np
 
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.matrix.flights import CAMERA_HEIGHT_M, Cell, drone_path, two_paths, vehicle_path
-from links.simulated.rig.perturbed_rig import AsBuilt, as_built
+from links.simulated.rig.perturbed_rig import PerturbedRig, draw_perturbed_rig
 from links.simulated.rig.scenario import DroneSettings, RigLidar, Scenario
-from links.simulated.rig.scripted_servo import Sweep, Vibrate
+from links.simulated.rig.scripted_servo import SweepSegment, VibrateSegment
 from links.simulated.sensors.camera import CameraSettings, CamerasSettings
 from links.simulated.sensors.lidar import LidarSettings
-from links.simulated.sensors.servo import ServoSettings, Turned
+from links.simulated.sensors.servo import GearTrain, ServoSettings
 from links.simulated.sensors.vehicle_odometry import VehicleOdometrySettings
 from links.simulated.world.clearance import sample_times_s
 from links.simulated.world.drone import DroneModel
@@ -52,8 +52,8 @@ SEARCHING = ("empty", "two", "search")  # without a closed loop the servo sweeps
 LIDAR_UP_M = 0.35  # over the camera, as in the standard rig
 DRONE = DroneModel(surface="grey_shell")  # the LiDAR sees half of it at 45 m, nothing at 70 m
 SERVO = ServoSettings(command_latency_s=0.002, command_jitter_s=5e-4, encoder_error_deg=0.3, backlash_deg=0.33)
-SWEEPS = (Sweep(times=100),)
-SWEEP_THEN_FOLLOW = (Sweep(), Vibrate(duration_s=60.0, follow_drone=True))
+SWEEPS = (SweepSegment(times=100),)
+SWEEP_THEN_FOLLOW = (SweepSegment(), VibrateSegment(duration_s=60.0, follow_drone=True))
 RAIN = Weather(rain_mmph=5.0)
 
 
@@ -70,7 +70,7 @@ class Conditions:
     cameras_hz: float | None = None  # two fisheyes; None: none
     cameras_px: int = 720  # their size, square
     readout_ms: float = 0.0  # their rolling shutter, first to last row; 0: all rows at once
-    as_built: bool = False  # the rig is not quite as its file says, each flight is of its own kind of drone
+    perturbed: bool = False  # the rig is not quite as its file says, each flight is of its own kind of drone
 
 
 def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
@@ -112,13 +112,13 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         flown = two_paths(cell, world, rng, times, lidar_m)
     else:
         flown = (drone_path(cell, world, rng, times, lidar_m),)
-    built = as_built(cell.name, seed) if conditions.as_built else None
+    built = draw_perturbed_rig(cell.name, seed) if conditions.perturbed else None
     look = {"model": DRONE} if built is None else {"model": built.model, "span_m": built.span_m}
     drones = tuple(DroneSettings.model_validate({"path": path} | look) for path in flown)
     what = f"{cell.motion} at {cell.range_m} m" if drones else "no drone"
     straight = RigLidar()
     found = {
-        "servo_harmonics": Turned(SERVO, seed).harmonics(),
+        "servo_harmonics": GearTrain(SERVO, seed).harmonics(),
         "servo_play_deg": SERVO.backlash_deg,
         "pointing_sigma_deg": ZERO_SIGMA_DEG,  # as `grd calibrate` writes it
     }
@@ -149,7 +149,7 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
     )
 
 
-def _cameras(conditions: Conditions, drone: bool, built: AsBuilt | None) -> CamerasSettings:
+def _cameras(conditions: Conditions, drone: bool, built: PerturbedRig | None) -> CamerasSettings:
     """The vehicle's and, where there is a drone to carry it, the drone's."""
     if conditions.cameras_hz is None:
         return CamerasSettings()

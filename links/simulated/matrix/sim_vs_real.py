@@ -29,7 +29,7 @@ from links.simulated.sensors.lidar import Lidar, LidarSettings
 from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world.drone import DroneModel, drone_mesh
 from links.simulated.world.mesh import Mesh, RayScene
-from links.simulated.world.procedural.room import room_mesh
+from links.simulated.world.procedural.room import indoor_mesh
 from links.velodyne import Lidar as Decoder
 from links.velodyne import vlp16
 from stages.geometry import Array64
@@ -53,7 +53,7 @@ class CloudFigures:
     returns_per_turn: float
     upper_returned: float  # share of the pulses at and above +1 deg that came back
     spacing_mrad: float  # between neighbours on one surface, seen from the sensor
-    lost_alone: float  # share of pulses without return between two returns of one surface
+    isolated_dropouts: float  # share of pulses without return between two returns of one surface
     between: float  # share of returns hanging in the air between their two neighbours
     noise_m: float  # median residual on flat patches
     noise_90_m: float
@@ -85,7 +85,7 @@ def measure(firings: Iterable[LidarFirings]) -> CloudFigures:
         returns_per_turn=float(seen.sum()) / turns,
         upper_returned=float(seen[:, UPPER_LASERS].mean()),
         spacing_mrad=1e3 * float(np.median(step[level] / ranges[1:][level])),
-        lost_alone=float((here[one_surface] == 0).mean()),
+        isolated_dropouts=float((here[one_surface] == 0).mean()),
         between=float(hanging.sum() / seen.sum()),
         noise_m=float(np.median(residual)),
         noise_90_m=float(np.quantile(residual, 0.9)),
@@ -137,7 +137,7 @@ def recorded(path: Path) -> Iterator[LidarFirings]:
                 yield firings
 
 
-class Still:
+class StaticScene:
     """A scene in which nothing moves."""
 
     def __init__(self, mesh: Mesh) -> None:
@@ -146,7 +146,7 @@ class Still:
     def cast(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32, max_range_m: float
     ) -> tuple[Array32, Array32, NDArray[np.uint8]]:
-        """See `lidar.Surroundings`."""
+        """See `lidar.Environment`."""
         rays = directions_world.shape[:2]
         found = self._scene.cast(origins_world_m.reshape(-1, 3), directions_world.reshape(-1, 3), max_range_m)
         return found[0].reshape(rays), found[1].reshape(rays), np.zeros(rays, dtype=np.uint8)
@@ -154,15 +154,15 @@ class Still:
     def near_small_body(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32
     ) -> NDArray[np.bool_]:
-        """See `lidar.Surroundings`."""
+        """See `lidar.Environment`."""
         return np.zeros(len(pulse_ns), dtype=np.bool_)
 
 
-def simulated_room(turns: float, seed: int = 1) -> Iterator[LidarFirings]:
+def simulated_indoor_scene(turns: float, seed: int = 1) -> Iterator[LidarFirings]:
     """An upright LiDAR 1 m over the floor of the room, through packets and decoder as the real one."""
     lidar, around, decoder = (
         Lidar(LidarSettings(), START_NS, seed),
-        Still(room_mesh(1.0, seed)),
+        StaticScene(indoor_mesh(1.0, seed)),
         Decoder(),
     )
     firings = firings_per_packet("strongest")
@@ -259,7 +259,7 @@ def cloud_table(captures: dict[str, CloudFigures]) -> str:
         "returns per revolution": [f"{c.returns_per_turn:.0f}" for c in captures.values()],
         "returned, lasers at +1 deg and above": [f"{100 * c.upper_returned:.1f} %" for c in captures.values()],
         "spacing of neighbours on a surface [mrad]": [f"{c.spacing_mrad:.2f}" for c in captures.values()],
-        "lost alone within a surface": [f"{100 * c.lost_alone:.2f} %" for c in captures.values()],
+        "lost alone within a surface": [f"{100 * c.isolated_dropouts:.2f} %" for c in captures.values()],
         "hanging between two surfaces": [f"{100 * c.between:.2f} %" for c in captures.values()],
         "range noise on flat patches, median [mm]": [f"{1e3 * c.noise_m:.1f}" for c in captures.values()],
         "the same, 90 % [mm]": [f"{1e3 * c.noise_90_m:.1f}" for c in captures.values()],
@@ -292,12 +292,12 @@ def _cm2(area_m2: tuple[float, float, float]) -> str:
     return ", ".join(f"{1e4 * a:.0f}" for a in area_m2)
 
 
-def reality_table(recordings: Path, shared: Path) -> str:
+def comparison_table(recordings: Path, shared: Path) -> str:
     """Both tables; without the shared drone clouds (`drone_lidar`) the second says so."""
     captures = {
         "einride (real)": measure(recorded(recordings / "einride_vlp16.mcap")),
         "mrpt (real)": measure(recorded(recordings / "mrpt_vlp16_gps.mcap")),
-        "room (simulated)": measure(simulated_room(13.0)),
+        "room (simulated)": measure(simulated_indoor_scene(13.0)),
     }
     folder = shared / "drone_lidar"
     drones = drone_table(real_drone(folder)) if folder.exists() else f"The real drone clouds are not here ({folder})."
@@ -306,4 +306,4 @@ def reality_table(recordings: Path, shared: Path) -> str:
 
 if __name__ == "__main__":
     root = Path(__file__).resolve().parents[3]
-    sys.stdout.write(reality_table(root / "recordings", root.parent / "shared" / "data"))
+    sys.stdout.write(comparison_table(root / "recordings", root.parent / "shared" / "data"))

@@ -64,10 +64,10 @@ class ClosedLoop:
     """A graph that is fed with the simulation's records and commands its servo."""
 
     def __init__(
-        self, graph: Graph, settings: ClosedLoopSettings, made_with: dict[str, str], taps: Sequence[Tap] = ()
+        self, graph: Graph, settings: ClosedLoopSettings, loop_metadata: dict[str, str], taps: Sequence[Tap] = ()
     ) -> None:
-        """`made_with` is what recordings keep of the graph's origin; `taps` are open and see every message."""
-        self.made_with = made_with
+        """`loop_metadata` is what recordings keep of the graph's origin; `taps` are open and see every message."""
+        self.loop_metadata = loop_metadata
         self._digest, goals = Digest(), GoalTap()
         self._replay = Replay(graph, (self._digest, goals, *taps))
         name, output = servo_edge(graph)
@@ -119,7 +119,7 @@ def servo_edge(graph: Graph) -> tuple[str, str]:
     return found[0]
 
 
-def made_with(config: Path, graph: Graph) -> dict[str, str]:
+def loop_metadata(config: Path, graph: Graph) -> dict[str, str]:
     """What a recording keeps of the configuration that closed its loop: the file's name and a hash of all it says.
 
     Includes are in the hash and so is the rig; taps are not: they change no message.
@@ -133,4 +133,4 @@ def made_with(config: Path, graph: Graph) -> dict[str, str]:
 def load_loop(config: Path, rig_yaml: str, scenario: str, settings: ClosedLoopSettings) -> ClosedLoop:
     """A configuration as a closed loop on a scenario's rig. Raises ConfigError with every problem, or LinkError."""
     graph = Asked(config).graph(rig_yaml, scenario)
-    return ClosedLoop(graph, settings, made_with(config, graph))
+    return ClosedLoop(graph, settings, loop_metadata(config, graph))

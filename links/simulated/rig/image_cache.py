@@ -1,14 +1,14 @@
-"""The pictures of an earlier recording of the same flight, instead of painting them again.
+"""The images of an earlier recording of the same flight, instead of painting them again.
 
 A closed loop run again with another LiDAR stage or setting sees the same street, and painting is most of its time (176
 of 286 s of a core for 40 s with two 720 px cameras at 5 Hz).
-What the pictures show must be the same: seed, start, scene, weather, vehicle and drones with how they ride and fly,
+What the images show must be the same: seed, start, scene, weather, vehicle and drones with how they ride and fly,
 cameras, and the turntable, of which the vehicle's camera sees the LiDAR. All else may differ. The flight may be shorter
-than the recorded one; longer only where a drone goes round and round (`path.round_s`) past a world that stands still:
-the pictures of the first round are those of the next ones, each so much later.
+than the recorded one; longer only where a drone goes round and round (`path.period_s`) past a world that stands still:
+the images of the first round are those of the next ones, each so much later.
 
 The recording tells all that as its config. Code is not in it: that vehicle and drones were where they are now is asked
-of the truth recorded, and every picture must have the stamp that it would get now.
+of the truth recorded, and every image must have the stamp that it would get now.
 
 Source: ours.
 """
@@ -38,11 +38,11 @@ from stages.geometry import Array64, quaternions_xyzw
 NEAR_M = 1e-3  # the same place, on whichever computer
 NEAR_QUATERNION = 1e-4
 WAY_STEP_S = 0.25
-NOT_THESE = "take a recording of the same flight, or leave --pictures out and have them painted"
+NOT_THESE = "take a recording of the same flight, or leave --images out and have them painted"
 
 
-class KeptPictures:
-    """A recording whose pictures are what a scenario's cameras would make. LinkError says why they are not."""
+class ImageCache:
+    """A recording whose images are what a scenario's cameras would make. LinkError says why they are not."""
 
     def __init__(self, file: Path, scenario: Scenario) -> None:
         """Compares what the recording says of its flight; `cameras` compares the flight itself."""
@@ -51,19 +51,19 @@ class KeptPictures:
             recorded = _scenario_of(reader)
             carriers = [carrier for carrier, _ in wanted_cameras(scenario.cameras, scenario.drone is not None)]
             if not carriers:
-                raise LinkError(f"{scenario.name} has no cameras: leave --pictures out")
+                raise LinkError(f"{scenario.name} has no cameras: leave --images out")
             for topic in (f"/camera/{carrier}" for carrier in carriers):
                 if topic not in reader.topics:
                     raise LinkError(f"{file} has nothing on {topic}: {NOT_THESE}")
-        difference = first_difference(pictured(recorded), pictured(scenario))
+        difference = first_difference(image_settings(recorded), image_settings(scenario))
         longer = scenario.duration_s > recorded.duration_s
-        self._round_s = round_of(scenario) if longer else None  # what was painted to its end needs no round again
+        self._round_s = image_period_s(scenario) if longer else None  # what was painted to its end needs no round again
         if difference is None and longer and self._round_s is None:
             difference = "duration_s", f"{recorded.duration_s:g}", f"{scenario.duration_s:g}"
         if (
             difference is None
             and scenario.duration_s < recorded.duration_s
-            and not _same(world_of(recorded), world_of(scenario))
+            and not _same(scenario_world(recorded), scenario_world(scenario))
         ):
             difference = (
                 "duration_s",
@@ -74,25 +74,25 @@ class KeptPictures:
             where, there, here = difference
             raise LinkError(f"{file} shows another flight: {where} is {there} there, {here} here; {NOT_THESE}")
 
-    def cameras(self, truth: Truth) -> list[KeptCamera]:
-        """The scenario's cameras, each giving the pictures of the recording."""
+    def cameras(self, truth: Truth) -> list[CachedCamera]:
+        """The scenario's cameras, each giving the images of the recording."""
         self._compare_flown(truth)
         start_ns, seed = self._scenario.start_ns, self._scenario.seed
         return [
-            KeptCamera(
+            CachedCamera(
                 self._file, f"/camera/{carrier}", FrameTimes(carrier, settings, start_ns, seed), self._frames(settings)
             )
             for carrier, settings in wanted_cameras(self._scenario.cameras, truth.drone is not None)
         ]
 
     def _frames(self, settings: CameraSettings) -> int | None:
-        """Pictures in a round; None where none comes again."""
+        """Images in a round; None where none comes again."""
         if self._round_s is None:
             return None
         frames = self._round_s * settings.rate_hz
         if abs(frames - round(frames)) > 1e-6:
             raise LinkError(
-                f"{settings.rate_hz:g} Hz are {frames:.2f} pictures in a round of {self._round_s:g} s: "
+                f"{settings.rate_hz:g} Hz are {frames:.2f} images in a round of {self._round_s:g} s: "
                 "take a rate that makes a whole number of them"
             )
         return round(frames)
@@ -113,7 +113,7 @@ class KeptPictures:
                     told[record.topic].append((record.stamp_ns, [*pose["xyz_m"], *pose["quaternion_xyzw"]]))
         for topic, poses in told.items():
             if not poses:
-                raise LinkError(f"{self._file} has nothing on {topic}, so its pictures cannot be judged: {NOT_THESE}")
+                raise LinkError(f"{self._file} has nothing on {topic}, so its images cannot be judged: {NOT_THESE}")
             stamps = np.array([stamp for stamp, _ in poses], dtype=np.int64)
             there = np.array([pose for _, pose in poses])
             R, t = topics[topic](stamps)
@@ -128,21 +128,21 @@ class KeptPictures:
                 )
 
 
-class KeptCamera:
-    """A camera whose pictures are there already; `records` as `links.simulated.sensors.camera.Camera` gives them."""
+class CachedCamera:
+    """A camera whose images are there already; `records` as `links.simulated.sensors.camera.Camera` gives them."""
 
     def __init__(self, file: Path, topic: str, times: FrameTimes, frames: int | None = None) -> None:
         """`frames`: so many make a round, after which they come again; None: they do not."""
         self._file, self._topic, self._times, self._frames = file, topic, times, frames
         self._frame = 0  # of this round
-        self._later_ns = 0  # than in the first round
+        self._delay_ns = 0  # than in the first round
         self._coming = self._read()
-        self._early: dict[int, Record] = {}  # by stamp: latencies differ, so a later picture may arrive first
+        self._early: dict[int, Record] = {}  # by stamp: latencies differ, so a later image may arrive first
 
     def records(self, until_ns: int) -> list[Record]:
         """Frames whose readout ended before `until_ns`, each once."""
         records: list[Record] = []
-        while self._times.ends_ns(self._frame) + self._later_ns < until_ns:
+        while self._times.ends_ns(self._frame) + self._delay_ns < until_ns:
             records.append(self._picture(self._times.stamp_ns(self._frame)))
             self._frame += 1
             if self._frame == self._frames:
@@ -150,7 +150,7 @@ class KeptCamera:
         return records
 
     def _begin_again(self) -> None:
-        self._later_ns += self._times.lasts_ns(self._frame)
+        self._delay_ns += self._times.lasts_ns(self._frame)
         self._frame = 0
         self._coming, self._early = self._read(), {}
 
@@ -162,22 +162,22 @@ class KeptCamera:
         while stamp_ns not in self._early:
             record = next(self._coming, None)
             if record is None:
-                raise LinkError(f"{self._file} has no picture on {self._topic} stamped {stamp_ns}: {NOT_THESE}")
+                raise LinkError(f"{self._file} has no image on {self._topic} stamped {stamp_ns}: {NOT_THESE}")
             self._early[record.stamp_ns] = record
-        return _so_much_later(self._early.pop(stamp_ns), self._later_ns)
+        return _delayed(self._early.pop(stamp_ns), self._delay_ns)
 
 
-def _so_much_later(picture: Record, later_ns: int) -> Record:
-    if later_ns == 0:
-        return picture
-    image = decode_compressed_image(picture.data)
-    stamp_ns = picture.stamp_ns + later_ns
+def _delayed(record: Record, delay_ns: int) -> Record:
+    if delay_ns == 0:
+        return record
+    image = decode_compressed_image(record.data)
+    stamp_ns = record.stamp_ns + delay_ns
     data = encode_compressed_image(CompressedImage(stamp_ns, image.frame_id, image.data))
-    return Record(picture.topic, picture.arrival_ns + later_ns, stamp_ns, data)
+    return Record(record.topic, record.arrival_ns + delay_ns, stamp_ns, data)
 
 
-def pictured(scenario: Scenario) -> dict[str, Any]:
-    """All settings that a picture can show, and those of when pictures are taken; the mount is the true one."""
+def image_settings(scenario: Scenario) -> dict[str, Any]:
+    """All settings that a image can show, and those of when images are taken; the mount is the true one."""
     said = scenario.model_dump(mode="json")
     same = ("seed", "start_utc", "scene", "weather", "vehicle", "drone", "other_drones", "cameras")
     mount = scenario.mount.model_dump(mode="json")
@@ -186,10 +186,10 @@ def pictured(scenario: Scenario) -> dict[str, Any]:
     return {name: said[name] for name in same} | {"autopilot": {"flight": flown}, "mount": turntable}
 
 
-def round_of(scenario: Scenario) -> float | None:
-    """After so long every picture is the same again [s]; None: never, or not for all that a camera sees."""
+def image_period_s(scenario: Scenario) -> float | None:
+    """After so long every image is the same again [s]; None: never, or not for all that a camera sees."""
     flown = () if scenario.drone is None else (scenario.drone, *scenario.other_drones)
-    rounds = {drone.path.round_s for drone in flown}
+    rounds = {drone.path.period_s for drone in flown}
     parked = len(scenario.vehicle.path.waypoints) == 1 and scenario.vehicle.ride is None
     return rounds.pop() if len(rounds) == 1 and parked and not any(scenario.scene.movers()) else None
 
@@ -208,7 +208,7 @@ def first_difference(there: Any, here: Any, where: str = "") -> tuple[str, str, 
     return next((difference for difference in found if difference is not None), None)
 
 
-def world_of(scenario: Scenario) -> World:
+def scenario_world(scenario: Scenario) -> World:
     """What stands and moves about the vehicle's way; how far it drives says what has to stand clear of it."""
     driven = scenario.vehicle.path.at(np.arange(0.0, scenario.duration_s, WAY_STEP_S))[0]
     return build_world(scenario.scene, scenario.vehicle.camera_height_m, scenario.seed, driven[:, :2])
@@ -238,7 +238,7 @@ def _brief(value: Any) -> str:
 def _scenario_of(reader: RecordingReader) -> Scenario:
     """The scenario that a recording was made of."""
     if reader.metadata.get("made_by") != "grd simulate" or reader.config_yaml is None:
-        raise LinkError(f"{reader.path} is no simulated recording: --pictures takes one that `grd simulate` made")
+        raise LinkError(f"{reader.path} is no simulated recording: --images takes one that `grd simulate` made")
     if not reader.finished:
         raise LinkError(f"{reader.path} was cut off: {NOT_THESE}")
     try:

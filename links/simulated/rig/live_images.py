@@ -1,6 +1,6 @@
-"""The simulated cameras in real time: pictures painted before, served by HTTP as a network camera does (MJPEG).
+"""The simulated cameras in real time: images painted before, served by HTTP as a network camera does (MJPEG).
 
-Painting two fisheyes takes eight times as long as they see; a recording of the same flight has their pictures already
+Painting two fisheyes takes eight times as long as they see; a recording of the same flight has their images already
 (`kept_pictures` makes sure that it is the same). Each leaves at the moment at which it arrived there, some 60 ms after
 its exposure. A client gets the newest one, and none twice; one that is slow misses some.
 
@@ -17,16 +17,16 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
 
 from links.recording import decode_compressed_image
-from links.simulated.rig.image_cache import KeptCamera
+from links.simulated.rig.image_cache import CachedCamera
 
 LOOPBACK = "127.0.0.1"
-AHEAD_NS = 200_000_000  # pictures are read so long before they leave
+AHEAD_NS = 200_000_000  # images are read so long before they leave
 LOOK_S = 0.05  # how often the next ones are read, and a client's thread looks for the end
 MOST_CLIENTS = 4
 
 
-class PictureServer:
-    """One camera's port on this host. `with PictureServer(8091) as server: server.show(jpeg)`."""
+class MjpegServer:
+    """One camera's port on this host. `with MjpegServer(8091) as server: server.show(jpeg)`."""
 
     def __init__(self, port: int) -> None:
         """`port` 0: any that is free. OSError when it is taken."""
@@ -55,7 +55,7 @@ class PictureServer:
         """Where it listens."""
         return self._http.server_port
 
-    def __enter__(self) -> PictureServer:
+    def __enter__(self) -> MjpegServer:
         self._thread.start()
         return self
 
@@ -69,13 +69,13 @@ class PictureServer:
         self._http.server_close()
 
     def show(self, jpeg: bytes) -> None:
-        """The newest picture."""
+        """The newest image."""
         with self._changed:
             self._newest, self._number = jpeg, self._number + 1
             self._changed.notify_all()
 
     def serve(self, client: BaseHTTPRequestHandler) -> None:
-        """Picture after picture to one client."""
+        """Picture after image to one client."""
         with self._changed:
             if self._clients >= MOST_CLIENTS:
                 client.send_error(503, "too many clients")
@@ -86,8 +86,8 @@ class PictureServer:
             client.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
             client.end_headers()
             sent = self._number
-            while (picture := self._after(sent)) is not None:
-                sent, jpeg = picture
+            while (image := self._after(sent)) is not None:
+                sent, jpeg = image
                 head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
                 client.wfile.write(head.encode() + jpeg + b"\r\n")
         except OSError:  # it left
@@ -97,30 +97,30 @@ class PictureServer:
                 self._clients -= 1
 
     def _after(self, sent: int) -> tuple[int, bytes] | None:
-        """Number and bytes of a picture newer than one; None at the end."""
+        """Number and bytes of a image newer than one; None at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._number > sent)
             return None if self._closed or self._newest is None else (self._number, self._newest)
 
 
-class PicturesInTime:
-    """Serves the pictures of kept cameras when they are due: `with PicturesInTime(...)`."""
+class TimedImageServer:
+    """Serves the images of kept cameras when they are due: `with TimedImageServer(...)`."""
 
     def __init__(
-        self, cameras: Sequence[KeptCamera], ports: Mapping[str, int], now_ns: Callable[[], int], end_ns: int
+        self, cameras: Sequence[CachedCamera], ports: Mapping[str, int], now_ns: Callable[[], int], end_ns: int
     ) -> None:
         """`ports` by topic; `now_ns` is the scenario's time, `end_ns` its end. Entering: OSError, a port is taken."""
         self._cameras, self._ports, self._now_ns, self._end_ns = cameras, ports, now_ns, end_ns
-        self._servers: dict[str, PictureServer] = {}
+        self._servers: dict[str, MjpegServer] = {}
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="pictures", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="images", daemon=True)
         self._open = ExitStack()
         self.shown = 0
 
-    def __enter__(self) -> PicturesInTime:
+    def __enter__(self) -> TimedImageServer:
         with ExitStack() as opening:
             for topic, port in self._ports.items():
-                self._servers[topic] = opening.enter_context(PictureServer(port))
+                self._servers[topic] = opening.enter_context(MjpegServer(port))
             self._open = opening.pop_all()
         self._thread.start()
         return self

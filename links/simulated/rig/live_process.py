@@ -34,8 +34,8 @@ from links.recording import RecordingWriter
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot import Autopilot
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
-from links.simulated.rig.image_cache import KeptCamera, KeptPictures
-from links.simulated.rig.live_images import PicturesInTime
+from links.simulated.rig.image_cache import CachedCamera, ImageCache
+from links.simulated.rig.live_images import TimedImageServer
 from links.simulated.rig.live_rig import READY, RIG_REPORT, LiveRigSettings
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import Scenario, load_scenario
@@ -58,8 +58,8 @@ SWITCH_S = 5e-4  # the servo's thread must not wait long for the one that casts
 class LiveSimulation(Simulation):
     """A scenario that begins when it is told to, with an emulated servo. Its own times are the scenario's."""
 
-    def __init__(self, scenario: Scenario, pictures: KeptPictures | None = None) -> None:
-        super().__init__(scenario, pictures=pictures)
+    def __init__(self, scenario: Scenario, images: ImageCache | None = None) -> None:
+        super().__init__(scenario, images=images)
         self.packet_ns = firings_per_packet(scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
         self.ahead_ns = 0
         self.emulator: DynamixelEmulator | None = None
@@ -73,9 +73,9 @@ class LiveSimulation(Simulation):
         return self.emulator
 
     @property
-    def kept_cameras(self) -> list[KeptCamera]:
-        """Cameras with their pictures from a recording; no other can keep up."""
-        return [camera for camera in self._cameras if isinstance(camera, KeptCamera)]
+    def cached_cameras(self) -> list[CachedCamera]:
+        """Cameras with their images from a recording; no other can keep up."""
+        return [camera for camera in self._cameras if isinstance(camera, CachedCamera)]
 
     def now_ns(self) -> int:
         """The scenario's time."""
@@ -85,7 +85,7 @@ class LiveSimulation(Simulation):
         """See Simulation."""
         if self.emulator is None:
             return super().T_world_lidar(stamp_ns)
-        return self.T_world_lidar_at(stamp_ns, self.emulator.turned_rad(stamp_ns))
+        return self.T_world_lidar_at(stamp_ns, self.emulator.output_rad(stamp_ns))
 
     def batch(self, first_ns: int, packets: int) -> tuple[list[Record], list[Record]]:
         """LiDAR packets from a moment on that is past; and what was true of them, in the host's time."""
@@ -124,15 +124,15 @@ class RigInTime:
         asked = {"seed": rig.seed, "duration_s": rig.duration_s}
         scenario = scenario.changed(**{name: value for name, value in asked.items() if value is not None})
         self._rig, self._folder = rig, folder
-        if rig.pictures is None:  # nobody sees what its cameras would
+        if rig.images is None:  # nobody sees what its cameras would
             self._scenario = scenario.changed(cameras=CamerasSettings())
             self.simulation = LiveSimulation(self._scenario)
         else:
             self._scenario = scenario
-            self.simulation = LiveSimulation(scenario, KeptPictures(rig.pictures, scenario))
+            self.simulation = LiveSimulation(scenario, ImageCache(rig.images, scenario))
         self.late = Latency()  # a packet's sending after its last pulse
         self.stop = threading.Event()
-        self.packets = self.skipped = self.heard = self.pictures = 0
+        self.packets = self.skipped = self.received = self.images = 0
 
     def run(self, ready: threading.Event) -> None:
         """The whole flight, in real time."""
@@ -146,24 +146,24 @@ class RigInTime:
             autopilot = self._autopilot(simulation)
             if autopilot is not None:
                 open_parts.enter_context(autopilot)
-            pictures = open_parts.enter_context(self._cameras(simulation))
+            images = open_parts.enter_context(self._cameras(simulation))
             ready.set()
             sent_ns = self._send(simulation, udp, truth)
             for record in simulation.was_true(sent_ns):
                 truth.write(record)
-            self.pictures = pictures.shown
+            self.images = images.shown
             if autopilot is not None:
-                self.heard = len(autopilot.heard)
+                self.received = len(autopilot.received)
         self._report()
 
-    def _cameras(self, simulation: LiveSimulation) -> PicturesInTime:
-        seen = () if self._rig.pictures is None else self._rig.camera_ports.items()
+    def _cameras(self, simulation: LiveSimulation) -> TimedImageServer:
+        seen = () if self._rig.images is None else self._rig.camera_ports.items()
         ports = {f"/camera/{carrier}": port for carrier, port in seen}
         end_ns = self._scenario.start_ns + round(1e9 * self._scenario.duration_s)
-        return PicturesInTime(simulation.kept_cameras, ports, simulation.now_ns, end_ns)
+        return TimedImageServer(simulation.cached_cameras, ports, simulation.now_ns, end_ns)
 
     def _autopilot(self, simulation: LiveSimulation) -> AutopilotSocket | None:
-        flight = next((talker for talker in simulation.talkers if isinstance(talker, Autopilot)), None)
+        flight = next((talker for talker in simulation.telemetry_sources if isinstance(talker, Autopilot)), None)
         if flight is None or self._rig.autopilot_port is None:
             return None
         send_to = LOOPBACK, self._rig.autopilot_port
@@ -180,7 +180,9 @@ class RigInTime:
     def _send(self, simulation: LiveSimulation, udp: socket.socket, truth: RecordingWriter) -> int:
         """Packet after packet, to the end; up to when they were sent."""
         rig, scenario = self._rig, self._scenario
-        odometry = next((talker for talker in simulation.talkers if isinstance(talker, VehicleOdometry)), None)
+        odometry = next(
+            (talker for talker in simulation.telemetry_sources if isinstance(talker, VehicleOdometry)), None
+        )
         batch_ns = rig.batch_packets * simulation.packet_ns
         first_ns, end_ns = scenario.start_ns, scenario.start_ns + round(1e9 * scenario.duration_s)
         poses: list[tuple[int, int, bytes]] = []  # when it is to arrive, when it was true
@@ -228,8 +230,8 @@ class RigInTime:
                 "p99": round(late.percentile_ns(99) / 1e6, 3),
                 "max": round(late.max_ns / 1e6, 3),
             },
-            "mavlink_heard": self.heard,
-            "pictures": self.pictures,
+            "mavlink_received": self.received,
+            "images": self.images,
             "cpu_s": round(used.ru_utime + used.ru_stime, 2),
             "max_rss_mb": round(used.ru_maxrss / 1024, 1),
         }

@@ -4,7 +4,7 @@ The process (`links.simulated.rig.live_process`) sends what the hardware would: 
 odometry by UDP, the servo on a pty, the autopilot's MAVLink by UDP, all on this host. It hears nothing of the graph but
 the
 servo's goals and the poses that go to the autopilot. What was true goes to `truth.mcap` in the run's folder, how well
-it kept up to `rig.json`. Cameras it cannot paint in time: it serves the pictures of a recording of the same flight.
+it kept up to `rig.json`. Cameras it cannot paint in time: it serves the images of a recording of the same flight.
 
 Source: ours.
 """
@@ -45,7 +45,7 @@ class LiveRigSettings(Settings):
     autopilot_port: int | None = Field(None, ge=1, le=65535)  # where grd hears it; None: the drone has no radio
     armed: bool = True  # False: its autopilot says disarmed, as before a flight (`grd preflight` asks for that)
     odometry_port: int | None = Field(None, ge=1, le=65535)  # where grd hears the vehicle; None: it has no odometry
-    pictures: Path | None = None  # a recording of the scenario, made by `grd simulate`; None: no cameras
+    images: Path | None = None  # a recording of the scenario, made by `grd simulate`; None: no cameras
     camera_ports: dict[Carrier, Port] = Field(default_factory=dict[Carrier, Port])  # http://127.0.0.1:PORT/ of each
     batch_packets: int = Field(8, ge=1, le=64)  # cast together: fewer come sooner, more cost less
 
@@ -76,10 +76,10 @@ class LiveRig(Tap[LiveRigSettings]):
         settings = self.settings
         if not settings.scenario.is_file():
             raise LinkError(f"{settings.scenario}: no such scenario; its name is as seen from here, {Path.cwd()}")
-        if settings.pictures is not None and not settings.pictures.is_file():
+        if settings.images is not None and not settings.images.is_file():
             raise LinkError(
-                f"{settings.pictures}: no such recording, and fisheyes cannot be painted in real time. Paint them "
-                f"once, in some minutes: grd simulate {settings.scenario} -o {settings.pictures}"
+                f"{settings.images}: no such recording, and fisheyes cannot be painted in real time. Paint them "
+                f"once, in some minutes: grd simulate {settings.scenario} -o {settings.images}"
             )
         asked = json.dumps({**settings.model_dump(mode="json"), "folder": str(run.out_dir)})
         command = [sys.executable, "-m", "links.simulated.rig.live_process", asked]

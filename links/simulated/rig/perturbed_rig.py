@@ -20,24 +20,24 @@ from typing import get_args
 
 import numpy as np
 
-from links.simulated.sensors.camera import CameraError, turned
+from links.simulated.sensors.camera import CameraMiscalibration, turned
 from links.simulated.world.drone import SPAN_M, DroneModel, Shape, Surface
 from stages.geometry import LidarMount
 
 ZERO_DEG, TILT_DEG = 0.1, 0.05
 RANGE_M = 0.017
-CAMERA_DEG, FOCAL_SHARE, CENTRE_SHARE = 0.05, 5e-4, 2e-4  # of the focal length, of the picture's size
+CAMERA_DEG, FOCAL_SHARE, CENTRE_SHARE = 0.05, 5e-4, 2e-4  # of the focal length, of the image's size
 
 
 @dataclass(frozen=True)
-class AsBuilt:
+class PerturbedRig:
     """One rig and its drone."""
 
     zero_deg: float
     tilt_deg: tuple[float, float]
     range_offset_m: float
-    camera_vehicle: CameraError
-    camera_drone: CameraError
+    camera_vehicle: CameraMiscalibration
+    camera_drone: CameraMiscalibration
     model: DroneModel
 
     @property
@@ -52,11 +52,11 @@ class AsBuilt:
         return told.model_copy(update={"T_vehicle_turntable": turntable, "servo_zero_deg": zero_deg})
 
 
-def as_built(flight: str, seed: int) -> AsBuilt:
+def draw_perturbed_rig(flight: str, seed: int) -> PerturbedRig:
     """The rig and the drone of a flight."""
     rng = np.random.default_rng([seed, 50, *flight.encode()])
     tilt = rng.normal(0.0, TILT_DEG, 2).tolist()
-    return AsBuilt(
+    return PerturbedRig(
         zero_deg=float(rng.normal(0.0, ZERO_DEG)),
         tilt_deg=(tilt[0], tilt[1]),
         range_offset_m=float(rng.normal(0.0, RANGE_M)),
@@ -69,9 +69,9 @@ def as_built(flight: str, seed: int) -> AsBuilt:
     )
 
 
-def _camera_error(rng: np.random.Generator) -> CameraError:
+def _camera_error(rng: np.random.Generator) -> CameraMiscalibration:
     turn, centre = rng.normal(0.0, CAMERA_DEG, 3).tolist(), rng.normal(0.0, CENTRE_SHARE, 2).tolist()
-    return CameraError(
+    return CameraMiscalibration(
         turned_deg=(turn[0], turn[1], turn[2]),
         focal_share=float(rng.normal(0.0, FOCAL_SHARE)),
         centre_share=(centre[0], centre[1]),

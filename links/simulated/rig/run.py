@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.recording import RecordingWriter
 from links.simulated.autopilot.autopilot import Autopilot
-from links.simulated.kernels.lidar import turned_poses
+from links.simulated.kernels.lidar import lidar_poses
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
-from links.simulated.rig.image_cache import KeptCamera, KeptPictures, world_of
+from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
 from links.simulated.rig.scenario import Scenario, load_scenario
-from links.simulated.rig.scripted_servo import ScriptedOperator
+from links.simulated.rig.scripted_servo import ServoScript
 from links.simulated.rig.truth_records import TruthRecords
 from links.simulated.sensors.camera import Camera, build_cameras
 from links.simulated.sensors.camera_paint import Street
@@ -29,11 +29,11 @@ from links.simulated.sensors.lidar import Lidar
 from links.simulated.sensors.servo import ServoBus
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry
 from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
-from links.simulated.world.clearance import check_travel
+from links.simulated.world.clearance import check_paths
 from links.simulated.world.flight import Flight
 from links.simulated.world.path import Path
 from links.simulated.world.scene import Scene, Truth, drone_shapes
-from links.simulated.world.suspension import Ride
+from links.simulated.world.suspension import SuspendedPath
 from links.simulated.world.vehicle import vehicle_mesh, vehicle_mesh_from_camera
 from links.velodyne import vlp16
 from stages.geometry import Array64
@@ -70,11 +70,11 @@ class Simulation:
         scenario: Scenario,
         seed: int | None = None,
         loop: ClosedLoop | None = None,
-        pictures: KeptPictures | None = None,
+        images: ImageCache | None = None,
     ) -> None:
         """With a `loop` the pipeline in it commands the servo, and the scenario's script is not used.
 
-        With `pictures` of the same scenario the cameras' are not painted.
+        With `images` of the same scenario the cameras' are not painted.
         """
         self._loop = loop
         self.scenario = scenario if seed is None else scenario.changed(seed=seed)
@@ -82,19 +82,19 @@ class Simulation:
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
         flown: Path | Flight | None = drone.path if drone else None
-        self.talkers: list[Autopilot | VehicleOdometry] = []
+        self.telemetry_sources: list[Autopilot | VehicleOdometry] = []
         if drone is not None and scenario.autopilot is not None:
             flown = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
-            self.talkers.append(Autopilot(scenario.autopilot, flown, start_ns, duration_s, self.seed))
+            self.telemetry_sources.append(Autopilot(scenario.autopilot, flown, start_ns, duration_s, self.seed))
         vehicle = scenario.vehicle
-        ridden = Ride(vehicle.path, vehicle.ride, duration_s, self.seed) if vehicle.ride else vehicle.path
+        ridden = SuspendedPath(vehicle.path, vehicle.ride, duration_s, self.seed) if vehicle.ride else vehicle.path
         if scenario.vehicle_odometry is not None:
             odometry = VehicleOdometry(scenario.vehicle_odometry, ridden, start_ns, duration_s, self.seed)
-            self.talkers.append(odometry)
+            self.telemetry_sources.append(odometry)
         others = scenario.other_drones
         self.truth = Truth(start_ns, ridden, flown, tuple(other.path for other in others))
         height = scenario.vehicle.camera_height_m
-        world = world_of(self.scenario)
+        world = scenario_world(self.scenario)
         self._scene = Scene(
             world.mesh,
             vehicle_mesh(height),
@@ -105,15 +105,15 @@ class Simulation:
             [drone_shapes(other.span_m, other.model) for other in others],
         )
         spans_m = [flying.span_m for flying in (drone, *others) if flying is not None]
-        check_travel(self._scene.world, self.truth, scenario.duration_s, spans_m)
+        check_paths(self._scene.world, self.truth, scenario.duration_s, spans_m)
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
         script = scenario.script if loop is None else ()
-        operator = ScriptedOperator(script, self.drone_servo_rad if drone else None, self.seed)
+        operator = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)
         shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)
         self._servo = ServoBus(scenario.servo, operator, scenario.start_ns, shift_ns, self.seed)
         self._arrival = np.random.default_rng([self.seed, 5])
-        self._cameras: Sequence[Camera | KeptCamera] = (
-            self._painting_cameras() if pictures is None else pictures.cameras(self.truth)
+        self._cameras: Sequence[Camera | CachedCamera] = (
+            self._rendered_cameras() if images is None else images.cameras(self.truth)
         )
         lidar_at = (lambda stamp_ns: self.T_world_lidar(stamp_ns)[1]) if scenario.truth_visible else None
         self._true = TruthRecords(self.truth, self._scene.world, lidar_at)
@@ -122,7 +122,7 @@ class Simulation:
         self.returns = 0
         self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from drones
 
-    def _painting_cameras(self) -> list[Camera]:
+    def _rendered_cameras(self) -> list[Camera]:
         scenario, height = self.scenario, self.scenario.vehicle.camera_height_m
         return build_cameras(
             scenario.cameras,
@@ -150,7 +150,7 @@ class Simulation:
             records += self.lidar_records(first_ns, packets, packet_ns)
             for camera in self._cameras:
                 records += camera.records(next_ns)
-            for talker in self.talkers:
+            for talker in self.telemetry_sources:
                 records += talker.records(next_ns)
             records += self.truth_records(next_ns)
             for record in records:
@@ -176,15 +176,15 @@ class Simulation:
 
     def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """Where the LiDAR truly is: rotations (n, 3, 3), positions (n, 3) [m]."""
-        return self.T_world_lidar_at(stamp_ns, self._servo.turned_rad(stamp_ns))
+        return self.T_world_lidar_at(stamp_ns, self._servo.output_rad(stamp_ns))
 
-    def T_world_lidar_at(self, stamp_ns: NDArray[np.int64], turned_rad: Array64) -> tuple[Array64, Array64]:
+    def T_world_lidar_at(self, stamp_ns: NDArray[np.int64], output_rad: Array64) -> tuple[Array64, Array64]:
         """The same where the servo has turned the turntable by so much (n,): T_wv T_vt Rz(angle) T_tl."""
         mount = self.scenario.mount
         T_vehicle_turntable, T_turntable_lidar = mount.T_vehicle_turntable.matrix(), mount.T_turntable_lidar.matrix()
         R_world_vehicle, t_world_vehicle = self.truth.T_world_vehicle(stamp_ns)
-        angle_rad = mount.turntable_rad(turned_rad)
-        return turned_poses(R_world_vehicle, t_world_vehicle, T_vehicle_turntable, angle_rad, T_turntable_lidar)
+        angle_rad = mount.turntable_rad(output_rad)
+        return lidar_poses(R_world_vehicle, t_world_vehicle, T_vehicle_turntable, angle_rad, T_turntable_lidar)
 
     def drone_servo_rad(self, time_s: float) -> float:
         """Servo position at which the drone lies in the plane through the turntable's axis and azimuth 0."""
@@ -237,11 +237,11 @@ def simulate(
     overwrite: bool = False,
     closed_loop: FilePath | None = None,
     duration_s: float | None = None,
-    pictures: FilePath | None = None,
+    images: FilePath | None = None,
 ) -> SimulationReport:
     """Run a scenario file into a recording, in closed loop with a configuration if one is given.
 
-    `pictures` is a recording of the same flight whose pictures are taken instead of painted; not a byte differs.
+    `images` is a recording of the same flight whose images are taken instead of painted; not a byte differs.
     `progress` is told the share done, 0 to 1. Errors are LinkError, and ConfigError for the configuration's.
     """
     asked = {"seed": seed, "duration_s": duration_s}
@@ -249,7 +249,7 @@ def simulate(
     loop = None
     if closed_loop is not None:
         loop = load_loop(closed_loop, checked.rig_yaml(), f"{checked.name} (rig)", checked.closed_loop)
-    return simulate_into(out, checked, progress, overwrite, loop, pictures)
+    return simulate_into(out, checked, progress, overwrite, loop, images)
 
 
 def simulate_into(
@@ -258,16 +258,16 @@ def simulate_into(
     progress: Callable[[float], None] | None = None,
     overwrite: bool = False,
     loop: ClosedLoop | None = None,
-    pictures: FilePath | None = None,
+    images: FilePath | None = None,
 ) -> SimulationReport:
     """The same for a scenario in memory. The recording keeps the whole scenario, with every setting, as its config."""
-    if pictures is not None and out.exists() and out.samefile(pictures):
-        raise LinkError(f"{out} is both what is written and where pictures come from: take another name for one")
+    if images is not None and out.exists() and out.samefile(images):
+        raise LinkError(f"{out} is both what is written and where images come from: take another name for one")
     began = time.perf_counter()
-    simulation = Simulation(checked, loop=loop, pictures=pictures and KeptPictures(pictures, checked))
+    simulation = Simulation(checked, loop=loop, images=images and ImageCache(images, checked))
     metadata = {"made_by": "grd simulate", "scenario": checked.name, "seed": str(simulation.seed)}
     if loop is not None:
-        metadata |= loop.made_with
+        metadata |= loop.loop_metadata
     count = 0
     with RecordingWriter(
         out,

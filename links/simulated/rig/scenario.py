@@ -17,7 +17,7 @@ from flow.problem import ConfigError, did_you_mean
 from flow.tree import load_tree, resolve
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.rig.closed_loop import ClosedLoopSettings
-from links.simulated.rig.scripted_servo import Segment, Vibrate
+from links.simulated.rig.scripted_servo import Segment, VibrateSegment
 from links.simulated.sensors.camera import CamerasSettings, rig_cameras
 from links.simulated.sensors.lidar import LidarSettings
 from links.simulated.sensors.servo import ServoSettings
@@ -25,7 +25,7 @@ from links.simulated.sensors.vehicle_odometry import VehicleOdometrySettings
 from links.simulated.world.drone import DroneModel, drone_mesh
 from links.simulated.world.path import Path
 from links.simulated.world.procedural import SceneSettings
-from links.simulated.world.suspension import RideSettings
+from links.simulated.world.suspension import SuspensionSettings
 from links.simulated.world.vehicle import vehicle_mesh_from_camera
 from links.simulated.world.weather import Weather
 from stages.geometry import Array64, LidarMount, Pose
@@ -45,7 +45,7 @@ class VehicleSettings(_Settings):
 
     camera_height_m: float = Field(default=1.8, ge=1.0, le=5.0)
     path: Path = Path(waypoints=({"t_s": 0.0, "xyz_m": (0.0, 0.0, 0.0)},))  # pyright: ignore[reportArgumentType]
-    ride: RideSettings | None = None  # with one it pitches and rolls; without, it drives level
+    ride: SuspensionSettings | None = None  # with one it pitches and rolls; without, it drives level
 
 
 class DroneSettings(_Settings):
@@ -114,7 +114,7 @@ class Scenario(_Settings):
     def _can_be_flown(self) -> Self:
         if self.drone is None and self.autopilot is not None:
             raise ValueError("autopilot: the scenario has no drone for it; add one, or leave the autopilot out")
-        if self.drone is None and any(isinstance(s, Vibrate) and s.follow_drone for s in self.script):
+        if self.drone is None and any(isinstance(s, VibrateSegment) and s.follow_drone for s in self.script):
             raise ValueError("script: follow_drone is set but the scenario has no drone; give an azimuth_table")
         if self.drone is None and (self.other_drones or self.truth_visible):
             word = "other_drones" if self.other_drones else "truth_visible"

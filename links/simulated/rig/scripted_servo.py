@@ -19,7 +19,7 @@ from links.simulated.sensors.servo import RPM_RADPS
 ARRIVED_RAD = np.radians(0.5)  # the operator turns round when the encoder is this near the goal
 
 
-class Sweep(BaseModel):
+class SweepSegment(BaseModel):
     """Turn from one end of the travel to the other, `times` times."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -30,7 +30,7 @@ class Sweep(BaseModel):
     ends_deg: tuple[float, float] = (0.0, 180.0)
 
 
-class Vibrate(BaseModel):
+class VibrateSegment(BaseModel):
     """Swing about an azimuth: the drone's, or a table of (t_s since the segment began, azimuth_deg)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -54,10 +54,10 @@ class Vibrate(BaseModel):
         return self
 
 
-Segment = Annotated[Sweep | Vibrate, Field(discriminator="do")]
+Segment = Annotated[SweepSegment | VibrateSegment, Field(discriminator="do")]
 
 
-class ScriptedOperator:
+class ServoScript:
     """Works through the script's segments; after the last one it leaves the servo where it is."""
 
     def __init__(
@@ -72,14 +72,14 @@ class ScriptedOperator:
         self._swings = 0
 
     def decide(self, time_s: float, position_rad: float) -> tuple[float, float] | None:
-        """See `servo.Operator`."""
+        """See `servo.ServoCommander`."""
         if self._script and self._finished(time_s, position_rad):
             self._script.pop(0)
             self._goal_rad, self._began_s, self._swings = None, time_s, 0
         if not self._script or (self._goal_rad is not None and not self._arrived(position_rad)):
             return None
         segment = self._script[0]
-        if isinstance(segment, Sweep):
+        if isinstance(segment, SweepSegment):
             ends = np.radians(segment.ends_deg)
             if self._swings == 0 and abs(position_rad - ends[1]) < abs(position_rad - ends[0]):
                 ends = ends[::-1]
@@ -96,11 +96,11 @@ class ScriptedOperator:
 
     def _finished(self, time_s: float, position_rad: float) -> bool:
         segment = self._script[0]
-        if isinstance(segment, Sweep):
+        if isinstance(segment, SweepSegment):
             return self._swings >= segment.times and self._arrived(position_rad)
         return time_s - self._began_s >= segment.duration_s
 
-    def _aim(self, segment: Vibrate, time_s: float) -> float:
+    def _aim(self, segment: VibrateSegment, time_s: float) -> float:
         if not segment.follow_drone:
             table = np.array(segment.azimuth_table)
             return float(np.radians(np.interp(time_s - self._began_s, table[:, 0], table[:, 1])))

@@ -43,12 +43,12 @@ class _Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class CameraError(_Settings):
+class CameraMiscalibration(_Settings):
     """How far what the rig file says of a camera is from how it is."""
 
     turned_deg: Vector3 = (0.0, 0.0, 0.0)  # roll, pitch, yaw about the carrier's axes
     focal_share: float = Field(default=0.0, ge=-0.1, le=0.1)  # of the focal length, too long
-    centre_share: tuple[float, float] = (0.0, 0.0)  # of the picture's size, to the right and down
+    centre_share: tuple[float, float] = (0.0, 0.0)  # of the image's size, to the right and down
 
     def lens(self, true: AnyLens, size_px: int) -> AnyLens:
         """The lens that the rig file has."""
@@ -79,7 +79,7 @@ class CameraSettings(_Settings):
     readout_ms: float = Field(default=0.0, ge=0, le=60)  # first to last row; 0: a global shutter
     latency_ms: tuple[float, float] = (30.0, 80.0)  # from the end of readout to arrival
     sensor: SensorSettings = SensorSettings()
-    error: Annotated[CameraError | None, Field(exclude_if=_is_none)] = None  # null: it is as the rig file says
+    error: Annotated[CameraMiscalibration | None, Field(exclude_if=_is_none)] = None  # null: it is as the rig file says
 
     @model_validator(mode="after")
     def _fits_its_period(self) -> Self:
@@ -172,7 +172,7 @@ class Camera:
         return R @ T[:3, :3], t + R @ T[:3, 3]
 
     def image(self, stamp_ns: int, frame: int = 0) -> NDArray[np.uint8]:
-        """The picture (size, size, 3), RGB, of a frame whose middle is `stamp_ns`."""
+        """The image (size, size, 3), RGB, of a frame whose middle is `stamp_ns`."""
         rng = np.random.default_rng([*self._times.seed, 1, frame])
         exposure_s, gain = auto_exposure(self.settings.sensor, mean_radiance(self._view, stamp_ns))
         row_s = 1e-3 * self.settings.readout_ms / self.settings.size_px

@@ -1,4 +1,4 @@
-"""Where a camera sees its own carrier: what a crew would mark in a picture, for the rig file.
+"""Where a camera sees its own carrier: what a crew would mark in a image, for the rig file.
 
     masked_px           polygons (column, row) around what stands in the view: mast, LiDAR, landing gear
     max_off_axis_deg    where the carrier fills most of the ring: no farther out is anything else to be seen
@@ -17,7 +17,7 @@ from links.simulated.world.mesh import Mesh, RayScene
 from stages.geometry import Pose
 from stages.lens import Lens
 
-GRID = 360  # rays across the picture
+GRID = 360  # rays across the image
 REACH_M = 5.0
 MARGIN = 2  # of the grid, for what moves or was marked loosely
 MOST_OF_A_RING = 0.6
@@ -29,7 +29,7 @@ MARGIN_DEG = 1.0
 def own_body(
     lens: Lens, size_px: int, T_carrier_camera: Pose, meshes: Iterable[Mesh]
 ) -> tuple[list[list[list[float]]], float]:
-    """(masked_px, max_off_axis_deg) of a square picture; the meshes are the carrier in its own frame, as it moves."""
+    """(masked_px, max_off_axis_deg) of a square image; the meshes are the carrier in its own frame, as it moves."""
     step = size_px / GRID
     at = (np.arange(GRID) + 0.5) * step - 0.5
     column, row = np.meshgrid(at, at)

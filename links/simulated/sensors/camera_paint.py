@@ -19,10 +19,10 @@ from links.simulated.kernels.camera_paint import BRICK, GLASS, GRASS, LEAF, PAIN
 from links.simulated.kernels.ray_casting import Array32
 from links.simulated.world.mesh import SURFACES, Mesh
 from links.simulated.world.procedural import SceneSettings
-from links.simulated.world.sky import Light, cloud_noise
+from links.simulated.world.sky import Light, noise_tile
 from stages.geometry import Array64
 
-LOOKS: dict[str, tuple[int, tuple[float, float, float], tuple[float, float, float]]] = {
+MATERIALS: dict[str, tuple[int, tuple[float, float, float], tuple[float, float, float]]] = {
     # name in SURFACES: texture, colour, the colour it varies towards from one object to the next (linear RGB)
     "asphalt": (ROAD, (0.10, 0.10, 0.11), (0.10, 0.10, 0.11)),
     "paving": (SLABS, (0.34, 0.32, 0.29), (0.34, 0.32, 0.29)),
@@ -48,24 +48,24 @@ LOOKS: dict[str, tuple[int, tuple[float, float, float], tuple[float, float, floa
     "marking": (PLAIN, (0.75, 0.75, 0.72), (0.75, 0.75, 0.72)),
 }
 _OBJECT_ENDS = ("roof", "rubber")  # a run of these faces ends an object in a mesh: a house, a car
-_NOISE = cloud_noise(np.random.default_rng([20, 1]), falloff=1.1).astype(np.float32)
+_NOISE = noise_tile(np.random.default_rng([20, 1]), falloff=1.1).astype(np.float32)
 
 Look = tuple[NDArray[np.int64], Array32, Array32]
 
 
-def _looks(surfaces: dict[str, tuple[float, float]]) -> Look:
+def _material_table(surfaces: dict[str, tuple[float, float]]) -> Look:
     """Rows of texture, colour and other colour as `surfaces` has them; one without a look is a plain grey."""
     kinds, colours, others = [], [], []
     for name, (diffuse, _) in surfaces.items():
         grey = (diffuse, diffuse, diffuse)
-        kind, colour, other = LOOKS.get(name, (PLAIN, grey, grey))
+        kind, colour, other = MATERIALS.get(name, (PLAIN, grey, grey))
         kinds.append(kind)
         colours.append(colour)
         others.append(other)
     return np.array(kinds), np.array(colours, dtype=np.float32), np.array(others, dtype=np.float32)
 
 
-_KIND, _COLOUR, _OTHER = _looks(SURFACES)
+_KIND, _COLOUR, _OTHER = _material_table(SURFACES)
 
 
 @dataclass(frozen=True)

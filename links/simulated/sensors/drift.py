@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from links.simulated.kernels.motion import rotations_z
-from links.simulated.world.motion import between_steps, gauss_markov, random_walk, rotations_from_vectors, smoothed
+from links.simulated.world.motion import gauss_markov, interpolate, low_pass, random_walk, rotations_from_vectors
 from stages.geometry import Array64
 
 STEP_S = 0.01
@@ -32,14 +32,14 @@ class DriftSettings(BaseModel):
 
     scale: float = Field(default=0.01, ge=-0.5, le=0.5)  # distances come out this much too long
     yaw_rate_deg_per_min: float = Field(default=1.0, ge=-600, le=600)
-    yaw_walk_deg_per_sqrt_s: float = Field(default=0.05, ge=0, le=10)
-    position_walk_m_per_sqrt_s: float = Field(default=0.02, ge=0, le=10)
+    yaw_random_walk_deg_per_sqrt_s: float = Field(default=0.05, ge=0, le=10)
+    position_random_walk_m_per_sqrt_s: float = Field(default=0.02, ge=0, le=10)
     velocity_mps: float = Field(default=0.08, ge=0, le=10)
     velocity_time_s: float = Field(default=10.0, gt=0.05)
     height_m: float = Field(default=0.25, ge=0, le=20)
     height_time_s: float = Field(default=40.0, gt=0.05)
-    lean_deg: float = Field(default=0.4, ge=0, le=20)
-    lean_time_s: float = Field(default=20.0, gt=0.05)
+    tilt_deg: float = Field(default=0.4, ge=0, le=20)
+    tilt_time_s: float = Field(default=20.0, gt=0.05)
 
 
 class DriftingEstimate:
@@ -57,11 +57,11 @@ class DriftingEstimate:
         self._travelled_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position_m, axis=0), axis=1))])
         white = rng.standard_normal((steps, 8))
         self._yaw = yaw_local_rad + np.radians(s.yaw_rate_deg_per_min) / 60 * STEP_S * np.arange(steps)
-        self._yaw += _walk(white[:, :1], float(np.radians(s.yaw_walk_deg_per_sqrt_s)))[:, 0]
-        self._lean = smoothed(_errors(white[:, 1:3], float(np.radians(s.lean_deg)), s.lean_time_s), SMOOTH_S, STEP_S)
+        self._yaw += _walk(white[:, :1], float(np.radians(s.yaw_random_walk_deg_per_sqrt_s)))[:, 0]
+        self._lean = low_pass(_errors(white[:, 1:3], float(np.radians(s.tilt_deg)), s.tilt_time_s), SMOOTH_S, STEP_S)
         velocity_error = _errors(white[:, 3:5], s.velocity_mps, s.velocity_time_s)
-        walk = _walk(white[:, 6:8], s.position_walk_m_per_sqrt_s)
-        height_error = smoothed(_errors(white[:, 5:6], s.height_m, s.height_time_s), SMOOTH_S, STEP_S)
+        walk = _walk(white[:, 6:8], s.position_random_walk_m_per_sqrt_s)
+        height_error = low_pass(_errors(white[:, 5:6], s.height_m, s.height_time_s), SMOOTH_S, STEP_S)
 
         step_local = np.einsum("nij,nj->ni", rotations_z(self._yaw[:-1]), np.diff(position_m, axis=0))
         moved = (1 + s.scale) * step_local[:, :2] + STEP_S * velocity_error[:-1]
@@ -74,17 +74,17 @@ class DriftingEstimate:
 
     def position_m(self, time_s: Array64) -> Array64:
         """In the local frame (n, 3) [m]."""
-        return between_steps(self._position, STEP_S, time_s)
+        return interpolate(self._position, STEP_S, time_s)
 
     def velocity_mps(self, time_s: Array64, velocity_world_mps: Array64) -> Array64:
         """The estimate (n, 3), local frame, of a true velocity (n, 3), world."""
         turned = np.einsum("nij,nj->ni", self._turn(time_s), velocity_world_mps)
         stretch = 1 + self._settings.scale
-        return turned * [stretch, stretch, 1.0] + between_steps(self._velocity_error, STEP_S, time_s)
+        return turned * [stretch, stretch, 1.0] + interpolate(self._velocity_error, STEP_S, time_s)
 
     def rotations(self, time_s: Array64, R_world_body: Array64) -> Array64:
         """The estimate R_local_body (n, 3, 3) of a true R_world_body (n, 3, 3)."""
-        lean = between_steps(self._lean, STEP_S, time_s)
+        lean = interpolate(self._lean, STEP_S, time_s)
         return rotations_from_vectors(np.pad(lean, ((0, 0), (0, 1)))) @ self._turn(time_s) @ R_world_body
 
     def covariances(self, time_s: Array64, R_local_body: Array64) -> Array64:
@@ -93,11 +93,11 @@ class DriftingEstimate:
         The integral of a Gauss-Markov velocity error has the variance 2 s^2 T (t - T (1 - exp(-t / T))).
         """
         s, t, T = self._settings, np.maximum(time_s, 0.0), self._settings.velocity_time_s
-        lean = np.full(len(t), np.radians(s.lean_deg) ** 2)
-        yaw = np.radians(s.yaw_rate_deg_per_min / 60 * t) ** 2 + np.radians(s.yaw_walk_deg_per_sqrt_s) ** 2 * t
+        lean = np.full(len(t), np.radians(s.tilt_deg) ** 2)
+        yaw = np.radians(s.yaw_rate_deg_per_min / 60 * t) ** 2 + np.radians(s.yaw_random_walk_deg_per_sqrt_s) ** 2 * t
         coasted = 2 * s.velocity_mps**2 * T * (t - T * (1 - np.exp(-t / T)))
-        along = (s.scale**2 + yaw / 3) * between_steps(self._travelled_m, STEP_S, t) ** 2
-        horizontal = s.position_walk_m_per_sqrt_s**2 * t + coasted + along
+        along = (s.scale**2 + yaw / 3) * interpolate(self._travelled_m, STEP_S, t) ** 2
+        horizontal = s.position_random_walk_m_per_sqrt_s**2 * t + coasted + along
         height = 2 * s.height_m**2 * (1 - np.exp(-t / s.height_time_s))
         covariances = np.zeros((len(t), 6, 6))
         for at, variances in ((0, (lean, lean, yaw)), (3, (horizontal, horizontal, height))):
@@ -106,11 +106,11 @@ class DriftingEstimate:
         return covariances
 
     def _turn(self, time_s: Array64) -> Array64:
-        return rotations_z(between_steps(self._yaw, STEP_S, time_s))
+        return rotations_z(interpolate(self._yaw, STEP_S, time_s))
 
 
 def _walk(white: Array64, sigma_per_sqrt_s: float) -> Array64:
-    return smoothed(random_walk(white, sigma_per_sqrt_s, STEP_S), SMOOTH_S, STEP_S)
+    return low_pass(random_walk(white, sigma_per_sqrt_s, STEP_S), SMOOTH_S, STEP_S)
 
 
 def _errors(white: Array64, sigma: float, time_s: float) -> Array64:

@@ -2,7 +2,7 @@
 
     with DynamixelEmulator() as servo:
         Servo(port=servo.path) ...                      # links.dynamixel
-        servo.turned_rad(stamp_ns)                      # where the turntable truly stood, for a simulated LiDAR
+        servo.output_rad(stamp_ns)                      # where the turntable truly stood, for a simulated LiDAR
 
 The emulator has a thread of its own; alone in a process: `python -m links.simulated.sensors.dynamixel_emulator --help`,
 where faults are lines on standard input. `path` is a link that leads to the pty and outlives an unplugged cable.
@@ -92,11 +92,11 @@ class DynamixelEmulator:
             self._servo.advance(self._now_ns())
             return self._servo.position_rad(stamp_ns)
 
-    def turned_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
+    def output_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
         """The turntable's true angle at such times: with the encoder's error and the play."""
         with self._lock:
             self._servo.advance(self._now_ns())
-            return self._servo.turned_rad(stamp_ns)
+            return self._servo.output_rad(stamp_ns)
 
     def get(self, register: mx28.Register) -> int:
         """A register as it stands."""
@@ -145,7 +145,7 @@ class DynamixelEmulator:
         """The next answers are whole, but their data is one byte short."""
         self._spoil(lambda answer: protocol2.status(answer[4], answer[8], answer[9:-3]), count)
 
-    def lie(self, position_ticks: int, count: int = 1) -> None:
+    def false_position(self, position_ticks: int, count: int = 1) -> None:
         """The next position blocks (from 126 on) tell another position, with the right checksum."""
 
         def told(answer: bytes) -> bytes:
@@ -288,7 +288,7 @@ FAULTS = (
     "bad_crc",
     "cut_off",
     "short_data",
-    "lie",
+    "false_position",
     "silence",
     "stall",
     "free",

@@ -51,7 +51,7 @@ class LidarSettings(BaseModel):
     max_range_m: float = 105.0
 
 
-class Surroundings(Protocol):
+class Environment(Protocol):
     """What the LiDAR stands in. Rays come in pulses: (n, k, 3) with one time each."""
 
     def cast(
@@ -107,7 +107,7 @@ class Lidar:
         return np.mod(self._rotor_phase_rad + self._rotor_radps * t + wander, 2 * np.pi)
 
     def fire(
-        self, pulse_ns: NDArray[np.int64], R_world_lidar: Array64, t_world_lidar_m: Array64, around: Surroundings
+        self, pulse_ns: NDArray[np.int64], R_world_lidar: Array64, t_world_lidar_m: Array64, around: Environment
     ) -> Pulses:
         """Fire pulses at times (n,), lasers 0..15 in turn, from poses (n, 3, 3), (n, 3)."""
         s, count = self.settings, len(pulse_ns)

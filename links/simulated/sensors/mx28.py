@@ -18,7 +18,7 @@ from links.dynamixel import mx28
 from links.dynamixel.mx28 import Register
 from links.simulated.sensors import protocol2
 from links.simulated.sensors.protocol2 import Instruction
-from links.simulated.sensors.servo import STEP_NS, Servo, ServoSettings, Turned
+from links.simulated.sensors.servo import STEP_NS, GearTrain, Servo, ServoSettings
 from stages.geometry import Array64
 
 KEPT_STEPS = 8192  # of the trace: 8 s
@@ -43,7 +43,7 @@ class SimulatedMx28:
 
     def __init__(self, settings: ServoSettings, seed: int, start_ns: int, firmware: int = 45) -> None:
         self._servo = Servo(settings)
-        self._turned = Turned(settings, seed)
+        self._gear_train = GearTrain(settings, seed)
         self._table = bytearray(mx28.TABLE_END)
         for register in mx28.REGISTERS:
             self._set(register, register.initial)
@@ -56,7 +56,7 @@ class SimulatedMx28:
         self._set(mx28.BAUD_RATE, mx28.BAUD_CODES[1_000_000])
         self._start_ns, self._steps = start_ns, 0
         self._trace_rad: Array64 = np.full(KEPT_STEPS, self._servo.position_rad)
-        self._turned_rad: Array64 = np.full(KEPT_STEPS, self._turned.follow(self._servo.position_rad))
+        self._output_rad: Array64 = np.full(KEPT_STEPS, self._gear_train.follow(self._servo.position_rad))
         self._heard_ns = self._booted_ns = self._powered_ns = start_ns
         self._blocked_since_ns: int | None = None
         self._overload_ns: int | None = None  # how long it may be blocked before it shuts down
@@ -127,9 +127,9 @@ class SimulatedMx28:
         """The encoder's position before quantisation at times (n,) of the last 8 s that `advance` has covered."""
         return self._at(stamp_ns, self._trace_rad)
 
-    def turned_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
+    def output_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
         """Where the turntable truly stood at such times."""
-        return self._at(stamp_ns, self._turned_rad)
+        return self._at(stamp_ns, self._output_rad)
 
     def _at(self, stamp_ns: NDArray[np.int64], trace_rad: Array64) -> Array64:
         since_ns = stamp_ns - self._start_ns
@@ -156,7 +156,7 @@ class SimulatedMx28:
                 self._set(mx28.TORQUE_ENABLE, 0)
         self._steps += 1
         self._trace_rad[self._steps % KEPT_STEPS] = servo.position_rad
-        self._turned_rad[self._steps % KEPT_STEPS] = self._turned.follow(servo.position_rad)
+        self._output_rad[self._steps % KEPT_STEPS] = self._gear_train.follow(servo.position_rad)
 
     def _watch(self, now_ns: int) -> None:
         """The bus watchdog: silence for so long stops it."""

@@ -78,7 +78,7 @@ class Servo:
         self.position_rad += 0.5 * (before + self.velocity_radps) * dt_s
 
 
-class Turned:
+class GearTrain:
     """From the encoder's position to the turntable's: the encoder's own error, then the play."""
 
     def __init__(self, settings: ServoSettings, seed: int) -> None:
@@ -111,7 +111,7 @@ class Turned:
         return self._turntable_rad
 
 
-class Operator(Protocol):
+class ServoCommander(Protocol):
     """Who commands the servo from what it answers: the script. A pipeline in closed loop uses `ServoBus.command`."""
 
     def decide(self, time_s: float, position_rad: float) -> tuple[float, float] | None:
@@ -123,7 +123,7 @@ class ServoBus:
     """The servo on its serial line: moves in 1 ms steps, is read about 200 times a second, obeys commands."""
 
     def __init__(
-        self, settings: ServoSettings, operator: Operator, start_ns: int, stamp_shift_ns: int, seed: int
+        self, settings: ServoSettings, operator: ServoCommander, start_ns: int, stamp_shift_ns: int, seed: int
     ) -> None:
         self._servo = Servo(settings)
         self._operator = operator
@@ -136,9 +136,9 @@ class ServoBus:
         self._rng = np.random.default_rng([seed, 3])
         self._command_rng = np.random.default_rng([seed, 41])
         self._commands: deque[tuple[int, float, float]] = deque()  # (obeyed at, goal, speed), in order
-        self._turned = Turned(settings, seed)
+        self._gear_train = GearTrain(settings, seed)
         self._trace_rad = [self._servo.position_rad]  # one a millisecond
-        self._turned_rad = [self._turned.follow(self._servo.position_rad)]
+        self._output_rad = [self._gear_train.follow(self._servo.position_rad)]
         self._reads = 0
         self._exchange = self._next_exchange()
 
@@ -151,7 +151,7 @@ class ServoBus:
                 self._servo.command(*self._commands.popleft()[1:])
             self._servo.step(STEP_NS * 1e-9)
             self._trace_rad.append(self._servo.position_rad)
-            self._turned_rad.append(self._turned.follow(self._servo.position_rad))
+            self._output_rad.append(self._gear_train.follow(self._servo.position_rad))
             now_ns += STEP_NS
             if self._exchange[2] <= now_ns:
                 records.append(self._read())
@@ -173,9 +173,9 @@ class ServoBus:
         """The encoder's position before quantisation, at growing times (n,) that `advance` has covered."""
         return self._at(stamp_ns, self._trace_rad)
 
-    def turned_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
+    def output_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
         """Where the turntable truly stands: the position that an encoder without error, on it, would show."""
-        return self._at(stamp_ns, self._turned_rad)
+        return self._at(stamp_ns, self._output_rad)
 
     def _at(self, stamp_ns: NDArray[np.int64], trace_rad: list[float]) -> Array64:
         since = stamp_ns - self._start_ns

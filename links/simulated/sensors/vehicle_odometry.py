@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from flow.link import Record
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.world.path import Path
-from links.simulated.world.suspension import Ride
+from links.simulated.world.suspension import SuspendedPath
 from stages.geometry import quaternions_xyzw
 
 NS = 1_000_000_000
@@ -27,11 +27,11 @@ class WheelDriftSettings(DriftSettings):
 
     scale: float = Field(default=0.005, ge=-0.5, le=0.5)
     yaw_rate_deg_per_min: float = Field(default=0.5, ge=-600, le=600)
-    yaw_walk_deg_per_sqrt_s: float = Field(default=0.03, ge=0, le=10)
-    position_walk_m_per_sqrt_s: float = Field(default=0.005, ge=0, le=10)
+    yaw_random_walk_deg_per_sqrt_s: float = Field(default=0.03, ge=0, le=10)
+    position_random_walk_m_per_sqrt_s: float = Field(default=0.005, ge=0, le=10)
     velocity_mps: float = Field(default=0.0, ge=0, le=10)
     height_m: float = Field(default=0.05, ge=0, le=20)
-    lean_deg: float = Field(default=0.2, ge=0, le=20)
+    tilt_deg: float = Field(default=0.2, ge=0, le=20)
 
 
 class VehicleOdometrySettings(BaseModel):
@@ -49,7 +49,7 @@ class VehicleOdometry:
     """Readings in order of measurement; stamps are the host's, without clock error."""
 
     def __init__(
-        self, settings: VehicleOdometrySettings, path: Path | Ride, start_ns: int, duration_s: float, seed: int
+        self, settings: VehicleOdometrySettings, path: Path | SuspendedPath, start_ns: int, duration_s: float, seed: int
     ) -> None:
         rng = np.random.default_rng([seed, 35])
         rotations, positions = path.level_poses(np.arange(0.0, duration_s + 2 * STEP_S, STEP_S))

@@ -19,9 +19,9 @@ from stages.geometry import Array64
 SAMPLE_S = 0.05
 SKY_M = 300.0  # nothing in a scene is higher or wider
 _GRID = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
-AROUND = _GRID / np.linalg.norm(_GRID, axis=1, keepdims=True)  # (26, 3)
+DIRECTIONS = _GRID / np.linalg.norm(_GRID, axis=1, keepdims=True)  # (26, 3)
 _RING_RAD = np.arange(12) * np.pi / 6
-UPWARDS = np.array(
+UPWARD_DIRECTIONS = np.array(
     [(0.0, 0.0, 1.0)]
     + [(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)) for e in np.radians([25, 50, 75]) for a in _RING_RAD]
 )  # (37, 3)
@@ -33,14 +33,14 @@ def sample_times_s(duration_s: float) -> Array64:
     return np.arange(0.0, duration_s, SAMPLE_S)
 
 
-def room_m(world: RayScene, points_world_m: Array64, reach_m: float) -> Array64:
+def clearance_m(world: RayScene, points_world_m: Array64, reach_m: float) -> Array64:
     """Distance (n,) to the nearest surface found around each point (n, 3); inf when farther than reach_m."""
-    return _cast(world, points_world_m, AROUND, reach_m).min(axis=1)
+    return _cast(world, points_world_m, DIRECTIONS, reach_m).min(axis=1)
 
 
 def under_open_sky(world: RayScene, points_world_m: Array64) -> NDArray[np.bool_]:
     """Whether some direction from each point (n, 3) is free up to the sky: nowhere inside a building is one."""
-    return np.any(np.isinf(_cast(world, points_world_m, UPWARDS, SKY_M)), axis=1)
+    return np.any(np.isinf(_cast(world, points_world_m, UPWARD_DIRECTIONS, SKY_M)), axis=1)
 
 
 def visible(world: RayScene, from_world_m: Array64, to_world_m: Array64) -> NDArray[np.bool_]:
@@ -58,13 +58,13 @@ def _cast(world: RayScene, points_m: Array64, directions: Array64, reach_m: floa
     return world.cast(origins, rays, reach_m)[0].astype(np.float64).reshape(len(points_m), len(directions))
 
 
-def fits(world: RayScene, points_world_m: Array64, room_needed_m: float) -> bool:
+def fits(world: RayScene, points_world_m: Array64, required_m: float) -> bool:
     """Whether a path's samples (n, 3) all have room, in the open."""
-    near = room_m(world, points_world_m, room_needed_m)
+    near = clearance_m(world, points_world_m, required_m)
     return bool(np.isinf(near).all() and under_open_sky(world, points_world_m).all())
 
 
-def check_travel(world: RayScene, truth: Truth, duration_s: float, spans_m: Sequence[float]) -> None:
+def check_paths(world: RayScene, truth: Truth, duration_s: float, spans_m: Sequence[float]) -> None:
     """LinkError when the vehicle's camera or a drone (of these spans) cannot go where it is told in this scene."""
     times = sample_times_s(duration_s)
     stamps = truth.start_ns + np.rint(times * 1e9).astype(np.int64)
@@ -74,13 +74,13 @@ def check_travel(world: RayScene, truth: Truth, duration_s: float, spans_m: Sequ
         check_path(world, times, truth.T_world_drone(stamps, number)[1], span_m / 2, name)
 
 
-def check_path(world: RayScene, time_s: Array64, points_world_m: Array64, room_needed_m: float, name: str) -> None:
+def check_path(world: RayScene, time_s: Array64, points_world_m: Array64, required_m: float, name: str) -> None:
     """LinkError when a path's samples (n, 3) run into something or through the inside of a building."""
     hidden = ~under_open_sky(world, points_world_m)
-    near = room_m(world, points_world_m, room_needed_m)
+    near = clearance_m(world, points_world_m, required_m)
     for wrong, text in (
         (hidden, "inside a building or under a roof, without a way to the sky"),
-        (near < room_needed_m, f"{{near:.2f}} m from something, less than {room_needed_m:.2f} m"),
+        (near < required_m, f"{{near:.2f}} m from something, less than {required_m:.2f} m"),
     ):
         if wrong.any():
             first = int(wrong.argmax())

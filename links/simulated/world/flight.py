@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from links.simulated.kernels.motion import GRAVITY_MPS2, STEP_S, fly
-from links.simulated.world.motion import between_steps, gauss_markov
+from links.simulated.world.motion import gauss_markov, interpolate
 from links.simulated.world.path import Path
 from stages.geometry import Array64, quaternions_xyzw, rotations_from_xyzw
 
@@ -36,7 +36,7 @@ class FlightSettings(BaseModel):
     yaw_rate_limit_degps: float = Field(default=90.0, gt=0, le=1000)
     rate_lag_s: float = Field(default=0.05, gt=STEP_S, le=1)
     thrust_lag_s: float = Field(default=0.04, gt=STEP_S, le=1)
-    lean_limit_deg: float = Field(default=40.0, gt=0, le=80)
+    tilt_limit_deg: float = Field(default=40.0, gt=0, le=80)
     wind_world_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gust_mps: float = Field(default=0.5, ge=0, le=20)  # one sigma, each horizontal axis; half of it vertically
     gust_time_s: float = Field(default=1.5, gt=0.05, le=60)
@@ -45,17 +45,17 @@ class FlightSettings(BaseModel):
 class Flight:
     """A flown path. Times outside the flight take its first or last state; one that goes round has no outside.
 
-    It goes round in the same gusts, so that one round's pictures are the next one's.
+    It goes round in the same gusts, so that one round's images are the next one's.
     """
 
     def __init__(self, path: Path, settings: FlightSettings, duration_s: float, seed: int) -> None:
         self.path = path
-        if path.round_s is None:
+        if path.period_s is None:
             steps = int(np.ceil((duration_s + BEYOND_S) / STEP_S)) + 1
             round_steps = steps
         else:
-            round_steps = round(path.round_s / STEP_S)
-            steps = (int(np.ceil(SETTLED_S / path.round_s)) + 1) * round_steps + 1
+            round_steps = round(path.period_s / STEP_S)
+            steps = (int(np.ceil(SETTLED_S / path.period_s)) + 1) * round_steps + 1
         time_s: Array64 = np.arange(steps, dtype=np.float64) * STEP_S
         position, velocity, acceleration, yaw = (np.ascontiguousarray(part) for part in path.at(time_s))
         mean_wind = np.array(settings.wind_world_mps)
@@ -69,11 +69,11 @@ class Flight:
                 np.radians(settings.yaw_rate_limit_degps),
                 settings.rate_lag_s,
                 settings.thrust_lag_s,
-                np.tan(np.radians(settings.lean_limit_deg)),
+                np.tan(np.radians(settings.tilt_limit_deg)),
             ]
         )
         state = fly(position, velocity, acceleration, headings, wind, mean_wind, start, limits)
-        if path.round_s is not None:
+        if path.period_s is not None:
             state = state[-round_steps - 1 :]
         self._p, self._v, self._q, self._w, self._f = np.split(state, [3, 6, 10, 13], axis=1)
 
@@ -90,13 +90,13 @@ class Flight:
         q = self._mix(self._q, time_s)
         return rotations_from_xyzw(q), self._mix(self._p, time_s)
 
-    def felt(self, time_s: Array64) -> tuple[Array64, Array64]:
+    def imu(self, time_s: Array64) -> tuple[Array64, Array64]:
         """What the drone's own IMU feels, drone axes: turn rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2]."""
         return self._mix(self._w, time_s), self._mix(self._f, time_s)
 
     def _mix(self, rows: Array64, time_s: Array64) -> Array64:
-        in_round_s = time_s if self.path.round_s is None else np.mod(time_s, self.path.round_s)
-        return between_steps(rows, STEP_S, in_round_s)  # 2.5 ms bend less than 0.1 mm and 0.01 deg
+        in_round_s = time_s if self.path.period_s is None else np.mod(time_s, self.path.period_s)
+        return interpolate(rows, STEP_S, in_round_s)  # 2.5 ms bend less than 0.1 mm and 0.01 deg
 
 
 def _gusts(settings: FlightSettings, steps: int, round_steps: int, rng: np.random.Generator) -> Array64:

@@ -11,7 +11,7 @@ from links.simulated.kernels.motion import first_order_recursion
 from stages.geometry import Array64, rotations_from_xyzw
 
 
-def between_steps(rows: Array64, step_s: float, time_s: Array64) -> Array64:
+def interpolate(rows: Array64, step_s: float, time_s: Array64) -> Array64:
     """Rows (k,) or (k, d), one each `step_s`, linearly at times (n,); the first and last row hold beyond the ends."""
     at = np.clip(time_s / step_s, 0.0, len(rows) - 1.0)
     step = np.minimum(at.astype(np.int64), len(rows) - 2)
@@ -33,7 +33,7 @@ def gauss_markov(white: Array64, sigma: Array64, time_s: float, step_s: float) -
     return first_order_recursion(np.ascontiguousarray(white) * sigma, float(np.exp(-step_s / time_s)))
 
 
-def smoothed(rows: Array64, time_s: float, step_s: float) -> Array64:
+def low_pass(rows: Array64, time_s: float, step_s: float) -> Array64:
     """First-order low-pass of rows (n, d), started at the first: y_k = a y_{k-1} + (1 - a) x_k, a = exp(-step/time)."""
     keep = float(np.exp(-step_s / time_s))
     white = (1 - keep) / np.sqrt(1 - keep * keep) * rows

@@ -30,34 +30,34 @@ class Waypoint(BaseModel):
 class Path(BaseModel):
     """A natural cubic spline through the waypoints; one waypoint stands still.
 
-    With `round_s` the way is gone round and round: so long after the first waypoint it is back there, at the yaw of the
+    With `period_s` the way is gone round and round: so long after the first waypoint it is back there, at the yaw of the
     first up to the whole turns that bring it nearest to the last one's.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     waypoints: tuple[Waypoint, ...] = Field(min_length=1)
-    round_s: float | None = Field(default=None, ge=1)
+    period_s: float | None = Field(default=None, ge=1)
 
     @model_validator(mode="after")
     def _times_grow(self) -> Self:
         times = [w.t_s for w in self.waypoints]
         if any(b <= a for a, b in pairwise(times)):
             raise ValueError("waypoints: t_s must grow from one to the next")
-        if self.round_s is not None and not times[-1] - times[0] < self.round_s:
-            raise ValueError("round_s: the last waypoint must come before the first one comes again")
-        if self.round_s is not None and abs(10 * self.round_s - round(10 * self.round_s)) > 1e-6:
-            raise ValueError("round_s: give whole tenths of a second")
+        if self.period_s is not None and not times[-1] - times[0] < self.period_s:
+            raise ValueError("period_s: the last waypoint must come before the first one comes again")
+        if self.period_s is not None and abs(10 * self.period_s - round(10 * self.period_s)) > 1e-6:
+            raise ValueError("period_s: give whole tenths of a second")
         return self
 
     def at(self, time_s: Array64) -> tuple[Array64, Array64, Array64, Array64]:
         """Position (n, 3), velocity (n, 3), acceleration (n, 3) and yaw (n,) [rad] at times (n,)."""
         knot_s = np.array([w.t_s for w in self.waypoints])
         knots = np.array([[*w.xyz_m, np.radians(w.yaw_deg)] for w in self.waypoints])
-        if self.round_s is None:
+        if self.period_s is None:
             value, slope, curve = natural_spline(knot_s, knots, time_s)
         else:
-            value, slope, curve = round_spline(knot_s, knots, self.round_s, time_s)
+            value, slope, curve = periodic_spline(knot_s, knots, self.period_s, time_s)
         return value[:, :3], slope[:, :3], curve[:, :3], value[:, 3]
 
     def level_poses(self, time_s: Array64) -> tuple[Array64, Array64]:
@@ -101,12 +101,14 @@ def natural_spline(knot_s: Array64, knots: Array64, time_s: Array64) -> tuple[Ar
     return evaluate_cubics(knot_s, knots, linear, M, cubic, time_s)
 
 
-def round_spline(knot_s: Array64, knots: Array64, round_s: float, time_s: Array64) -> tuple[Array64, Array64, Array64]:
-    """As `natural_spline`, through knots (k, 4) that come again each `round_s`, the yaw grown by whole turns."""
+def periodic_spline(
+    knot_s: Array64, knots: Array64, period_s: float, time_s: Array64
+) -> tuple[Array64, Array64, Array64]:
+    """As `natural_spline`, through knots (k, 4) that come again each `period_s`, the yaw grown by whole turns."""
     turned = 2 * np.pi * np.round((knots[-1, 3] - knots[0, 3]) / (2 * np.pi))
-    drift = np.array([0.0, 0.0, 0.0, turned / round_s])
-    closed_s = np.append(knot_s, knot_s[0] + round_s)
-    closed = np.vstack([knots, knots[0] + drift * round_s]) - drift * closed_s[:, None]
+    drift = np.array([0.0, 0.0, 0.0, turned / period_s])
+    closed_s = np.append(knot_s, knot_s[0] + period_s)
+    closed = np.vstack([knots, knots[0] + drift * period_s]) - drift * closed_s[:, None]
     closed[-1] = closed[0]  # to the last bit
     spline = CubicSpline(closed_s, closed, bc_type="periodic")
     return spline(time_s) + drift * time_s[:, None], spline(time_s, 1) + drift, spline(time_s, 2)

@@ -20,7 +20,7 @@ from links.simulated.world.flight import Flight
 from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.movers import Mover
 from links.simulated.world.path import Path
-from links.simulated.world.suspension import Ride
+from links.simulated.world.suspension import SuspendedPath
 from stages.geometry import Array64
 
 ROTOR_HZ = 95.0
@@ -35,7 +35,7 @@ class Truth:
     """Where vehicle and drones are at any moment; `drone` is None in an empty sky."""
 
     start_ns: int
-    vehicle: Path | Ride  # a path is driven level, a ride on springs
+    vehicle: Path | SuspendedPath  # a path is driven level, a ride on springs
     drone: Path | Flight | None  # a path is flown exactly, a flight with its own dynamics
     others: tuple[Path, ...] = ()  # drones 2, 3, ...
 
@@ -155,7 +155,7 @@ class Scene:
     def cast(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32, max_range_m: float
     ) -> tuple[Array32, Array32, NDArray[np.uint8]]:
-        """See `lidar.Surroundings`."""
+        """See `lidar.Environment`."""
         rays = directions_world.shape[1]
         flat_o, flat_d = origins_world_m.reshape(-1, 3), directions_world.reshape(-1, 3)
         ranges = np.full(len(flat_o), np.inf, dtype=np.float32)
@@ -181,7 +181,7 @@ class Scene:
     def near_small_body(
         self, pulse_ns: NDArray[np.int64], origins_world_m: Array32, directions_world: Array32
     ) -> NDArray[np.bool_]:
-        """See `lidar.Surroundings`."""
+        """See `lidar.Environment`."""
         near = np.zeros(len(pulse_ns), dtype=np.bool_)
         for body in self.bodies:
             if body.small:

@@ -88,7 +88,7 @@ def _sky_map(
     glow = 0.35 * np.exp(-to_sun / 0.12) + 0.12 * np.exp(-to_sun / 0.6)
     sky = sky + glow[:, :, None] * sun_rgb
     plane = 1.2 / (height + 0.18)  # clouds lie on a flat layer: smaller towards the horizon
-    noise = cloud_noise(rng)
+    noise = noise_tile(rng)
     clouds = _lookup(noise, direction[:, :, 0] * plane, direction[:, :, 1] * plane)
     cover = _smooth((clouds - 0.50 + 0.25 * overcast) / 0.22) * _smooth(height / 0.12)
     white = level * (0.55 + 0.30 * (1 - overcast)) * (1.15 - 0.5 * clouds)
@@ -99,7 +99,7 @@ def _sky_map(
     return sky.astype(np.float32)
 
 
-def cloud_noise(rng: np.random.Generator, size: int = 256, falloff: float = 1.7) -> Array64:
+def noise_tile(rng: np.random.Generator, size: int = 256, falloff: float = 1.7) -> Array64:
     """A periodic tile of 1/f^falloff noise, scaled to [0, 1]: cloud, stains, asphalt."""
     f = np.fft.fftfreq(size)[:, None] ** 2 + np.fft.fftfreq(size)[None, :] ** 2
     f[0, 0] = np.inf

@@ -17,11 +17,11 @@ from links.simulated.world.movers import Car, Mover, draw_balloon, draw_bird
 from links.simulated.world.procedural.atlanta import atlanta
 from links.simulated.world.procedural.open_scenes import campus, open_lot, park_edge
 from links.simulated.world.procedural.parts import car
-from links.simulated.world.procedural.settings import HALF_LENGTH_M, Clear, Kind, SceneSettings
+from links.simulated.world.procedural.settings import HALF_LENGTH_M, Kind, SceneSettings, VehicleCorridor
 from links.simulated.world.procedural.street import manhattan, street
 from stages.geometry import Array64, rotation_z
 
-KINDS: dict[Kind, Callable[[SceneSettings, Clear, Generator], list[Mesh]]] = {
+KINDS: dict[Kind, Callable[[SceneSettings, VehicleCorridor, Generator], list[Mesh]]] = {
     "street": street,
     "manhattan": manhattan,
     "atlanta": atlanta,
@@ -44,10 +44,10 @@ def build_world(settings: SceneSettings, camera_height_m: float, seed: int, vehi
     """The scene. Same settings, seed and vehicle path (n, 2) in the world: the same scene."""
     yaw = np.radians(settings.vehicle_yaw_deg)
     start = np.array([0.0, settings.vehicle_lane_y_m])
-    clear = Clear(vehicle_xy_m @ rotation_z(yaw)[:2, :2].T + start)
-    parts = KINDS[settings.kind](settings, clear, np.random.default_rng([seed, 1]))
+    corridor = VehicleCorridor(vehicle_xy_m @ rotation_z(yaw)[:2, :2].T + start)
+    parts = KINDS[settings.kind](settings, corridor, np.random.default_rng([seed, 1]))
     mesh = merge(parts).moved((0.0, -settings.vehicle_lane_y_m, -camera_height_m)).moved(rotation=rotation_z(-yaw))
-    return World(mesh, _movers(settings, camera_height_m, clear, np.random.default_rng([seed, 10])))
+    return World(mesh, _movers(settings, camera_height_m, corridor, np.random.default_rng([seed, 10])))
 
 
 def world_mesh(settings: SceneSettings, camera_height_m: float, seed: int) -> Mesh:
@@ -55,7 +55,9 @@ def world_mesh(settings: SceneSettings, camera_height_m: float, seed: int) -> Me
     return build_world(settings, camera_height_m, seed).mesh
 
 
-def _movers(settings: SceneSettings, camera_height_m: float, clear: Clear, rng: Generator) -> tuple[Mover, ...]:
+def _movers(
+    settings: SceneSettings, camera_height_m: float, corridor: VehicleCorridor, rng: Generator
+) -> tuple[Mover, ...]:
     cars, birds, balloons = settings.movers()
     turn = rotation_z(-np.radians(settings.vehicle_yaw_deg))
     found: list[Mover] = []
@@ -65,7 +67,7 @@ def _movers(settings: SceneSettings, camera_height_m: float, clear: Clear, rng: 
         ends = np.array([[-ahead, lane_y, 0.0], [ahead, lane_y, 0.0]]) * [HALF_LENGTH_M, 1.0, 1.0]
         ends = (ends - [0.0, settings.vehicle_lane_y_m, camera_height_m]) @ turn.T
         driver = Car(car(rng), ends[0], ends[1], rng.uniform(5, 14), rng.uniform(0, 60))
-        if clear.allows(np.arange(-HALF_LENGTH_M, HALF_LENGTH_M, 1.0), lane_y, 1.0):
+        if corridor.allows(np.arange(-HALF_LENGTH_M, HALF_LENGTH_M, 1.0), lane_y, 1.0):
             found.append(driver)
     road = settings.road_width_m / 2
     for _ in range(birds):

@@ -23,14 +23,14 @@ from links.simulated.world.procedural.parts import (
     scattered,
     strip,
 )
-from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, Clear, SceneSettings
+from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, SceneSettings, VehicleCorridor
 from links.simulated.world.procedural.street import ground, parked_cars, poles_and_wires, road_marks, with_parking
 from stages.geometry import Array64, rotation_z
 
 FAR = (-HALF_LENGTH_M, HALF_LENGTH_M)
 
 
-def campus(settings: SceneSettings, clear: Clear, rng: Generator) -> list[Mesh]:
+def campus(settings: SceneSettings, corridor: VehicleCorridor, rng: Generator) -> list[Mesh]:
     """Large buildings far apart, in two directions; lawns, footpaths, trees, lamps."""
     half = settings.road_width_m / 2
     parts = [plain(FAR, (-half, half), "asphalt"), *dashes((-HALF_LENGTH_M, 0), (HALF_LENGTH_M, 0))]
@@ -59,14 +59,14 @@ def campus(settings: SceneSettings, clear: Clear, rng: Generator) -> list[Mesh]:
     return parts
 
 
-def park_edge(settings: SceneSettings, clear: Clear, rng: Generator) -> list[Mesh]:
+def park_edge(settings: SceneSettings, corridor: VehicleCorridor, rng: Generator) -> list[Mesh]:
     """Trees, hedges and lawn on one side, a few houses set back on the other: hardly any straight line."""
     wide = with_parking(settings)
     half = wide.road_width_m / 2
     front = half + wide.pavement_width_m
     parts = [ground(wide), *road_marks(settings, rng), *poles_and_wires(wide, rng)]
     park = float(rng.choice([-1, 1]))
-    parts += parked_cars(wide, int(-park), clear, rng)
+    parts += parked_cars(wide, int(-park), corridor, rng)
     parts.append(plain(FAR, _between(park * front, park * HALF_LENGTH_M), "grass", KERB_HEIGHT_M + 0.01))
     for x in np.arange(-75.0, 76.0, 50.0):
         house = building(rng.uniform(10, 14), rng.uniform(9, 12), rng.uniform(5, 8), "plaster", rng)
@@ -82,7 +82,7 @@ def park_edge(settings: SceneSettings, clear: Clear, rng: Generator) -> list[Mes
     return parts
 
 
-def open_lot(settings: SceneSettings, clear: Clear, rng: Generator) -> list[Mesh]:
+def open_lot(settings: SceneSettings, corridor: VehicleCorridor, rng: Generator) -> list[Mesh]:
     """Asphalt with parking bays, some cars, tall lamps and a fence; buildings only far away."""
     parts = [plain(FAR, FAR, "asphalt")]
     for row in np.arange(-48.0, 49.0, 16.0):
@@ -94,12 +94,12 @@ def open_lot(settings: SceneSettings, clear: Clear, rng: Generator) -> list[Mesh
                 if rng.uniform() < 0.4 * settings.parked_cars:
                     place = (x + 1.25, y + side * 2.5)
                     parked = car(rng).moved((*place, 0), rotation_z(np.pi / 2))
-                    if clear.allows(*place, 2.4):
+                    if corridor.allows(*place, 2.4):
                         parts.append(parked)
     for x in np.arange(-48.75, 50, 32.5):
         for y in (-24.0, 24.0):
             place = (float(x), y + 0.1 + settings.vehicle_lane_y_m)
-            if clear.allows(*place, 0.3):
+            if corridor.allows(*place, 0.3):
                 parts += [p.moved((*place, 0)) for p in lamp_pole(10.0, 1.0)]
     fence = np.array([(-62.0, -62.0), (62.0, -62.0), (62.0, 62.0), (-62.0, 62.0), (-62.0, -62.0)])
     for a, b in pairwise(fence):

@@ -147,7 +147,7 @@ def dashes(start_m: tuple[float, float], end_m: tuple[float, float], z_m: float 
     ]
 
 
-def house_row(width_m: float, depth_m: float, heights_m: tuple[float, float], rng: Generator) -> Mesh:
+def building_row(width_m: float, depth_m: float, heights_m: tuple[float, float], rng: Generator) -> Mesh:
     """Houses wall to wall, front on y = 0 facing -y, from x = 0 to the width."""
     parts: list[Mesh] = []
     x = 0.0

@@ -12,7 +12,7 @@ from links.simulated.world.mesh import Mesh, box, merge
 LENGTH_M, WIDTH_M, HEIGHT_M = 12.0, 6.0, 2.7
 
 
-def room_mesh(sensor_height_m: float, seed: int) -> Mesh:
+def indoor_mesh(sensor_height_m: float, seed: int) -> Mesh:
     """The room about a sensor at the origin, its floor `sensor_height_m` below."""
     rng = np.random.default_rng([seed, 1])
     x, y = LENGTH_M / 2, WIDTH_M / 2

@@ -61,7 +61,7 @@ class SceneSettings(BaseModel):
 
 
 @dataclass(frozen=True)
-class Clear:
+class VehicleCorridor:
     """The ground the vehicle passes over: places that stay free of cars, trees and poles."""
 
     xy_m: Array64  # (n, 2) the vehicle's path in the scene frame

@@ -12,25 +12,25 @@ from numpy.random import Generator
 
 from links.simulated.world.mesh import Mesh, box, merge, quads
 from links.simulated.world.procedural.parts import MARK_ABOVE_M, building, car, dashes, lamp_pole, strip, tree, wire
-from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, Clear, SceneSettings
+from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, SceneSettings, VehicleCorridor
 from stages.geometry import rotation_z
 
 PARKING_M = 2.2  # beside the carriageway, on each side
 
 
-def street(settings: SceneSettings, clear: Clear, rng: Generator) -> list[Mesh]:
+def street(settings: SceneSettings, corridor: VehicleCorridor, rng: Generator) -> list[Mesh]:
     """The plain street; cars park on the carriageway's edge."""
     parts = [ground(settings)]
     for side in (-1, 1):
         parts += _buildings(settings, side, rng)
         parts += _trees(settings, side, rng)
-        parts += parked_cars(settings, side, clear, rng)
+        parts += parked_cars(settings, side, corridor, rng)
     return parts + poles_and_wires(settings, rng)
 
 
-def manhattan(settings: SceneSettings, clear: Clear, rng: Generator) -> list[Mesh]:
+def manhattan(settings: SceneSettings, corridor: VehicleCorridor, rng: Generator) -> list[Mesh]:
     """The street with a parking lane on each side and marks on the road."""
-    return [*street(with_parking(settings), clear, rng), *road_marks(settings, rng)]
+    return [*street(with_parking(settings), corridor, rng), *road_marks(settings, rng)]
 
 
 def with_parking(settings: SceneSettings) -> SceneSettings:
@@ -117,9 +117,9 @@ def poles_and_wires(settings: SceneSettings, rng: Generator) -> list[Mesh]:
     return parts
 
 
-def parked_cars(settings: SceneSettings, side: int, clear: Clear, rng: Generator) -> list[Mesh]:
+def parked_cars(settings: SceneSettings, side: int, corridor: VehicleCorridor, rng: Generator) -> list[Mesh]:
     """Cars along the kerb, none in the vehicle's way."""
     y = side * (settings.road_width_m / 2 - 1.0)
     places = [x for x in np.arange(-95.0, 95.0, 6.0) if abs(x) > 6.0]
     cars = [(x, car(rng)) for x in places if rng.uniform() < settings.parked_cars]
-    return [parked.moved((x, y, 0)) for x, parked in cars if clear.allows(np.array([x - 1.5, x, x + 1.5]), y, 0.95)]
+    return [parked.moved((x, y, 0)) for x, parked in cars if corridor.allows(np.array([x - 1.5, x, x + 1.5]), y, 0.95)]

@@ -46,14 +46,14 @@ class Flown:
         self.autopilot = Autopilot(settings, self.flight, START, seconds, seed)
         self.records = self.autopilot.records(START + round(1.1 * seconds * S))
         self.receiver = Receiver()
-        self.heard = [
+        self.received = [
             (r, m)
             for r in sorted(self.records, key=lambda r: r.arrival_ns)
             if r.topic == "/autopilot/rx" and (m := self.receiver.decode(r)) is not None
         ]
 
     def messages(self, kind: type[M], after_s: float = 0.0) -> list[M]:
-        return [m for _, m in self.heard if isinstance(m, kind) and m.stamp_ns > START + after_s * S]
+        return [m for _, m in self.received if isinstance(m, kind) and m.stamp_ns > START + after_s * S]
 
     def seconds(self, messages: list[Any]) -> np.ndarray:
         return np.array([(m.stamp_ns - START) / S for m in messages])
@@ -107,7 +107,7 @@ def test_without_errors_the_local_frame_is_the_world_turned_by_the_heading(exact
     R, p = exact.flight.flying_poses(time_s)
     v = exact.flight.at(time_s)[1]
     p0 = exact.flight.flying_poses(np.zeros(1))[1][0]
-    rate = exact.flight.felt(time_s)[0]
+    rate = exact.flight.imu(time_s)[0]
     for i, m in enumerate(odometry):
         np.testing.assert_allclose(m.xyz_local_m, R_local_world @ (p[i] - p0), atol=0.02)  # 4 m/s, few ms
         np.testing.assert_allclose(m.R_local_drone, R_local_world @ R[i], atol=0.01)
@@ -130,7 +130,7 @@ def test_attitude_position_and_odometry_tell_the_same(exact: Flown) -> None:
 
 def test_the_imu_feels_thrust_and_turns_rounded_to_mg_and_mrad(exact: Flown) -> None:
     imu = exact.messages(DroneImu, after_s=2.0)
-    rate, force = exact.flight.felt(exact.seconds(imu))
+    rate, force = exact.flight.imu(exact.seconds(imu))
     felt = np.array([m.acceleration_drone_mps2 for m in imu])
     turned = np.array([m.angular_velocity_drone_radps for m in imu])
     assert np.sqrt(np.mean((felt - force) ** 2, axis=0)).max() < 0.05
@@ -142,7 +142,7 @@ def test_the_imu_feels_thrust_and_turns_rounded_to_mg_and_mrad(exact: Flown) -> 
 def test_imu_noise_and_bias_are_as_configured() -> None:
     noisy = Flown(AutopilotSettings(gyro_noise_degps=2.0, gyro_bias_degps=1.0, accelerometer_noise_mps2=0.5))
     imu = noisy.messages(DroneImu, after_s=2.0)
-    rate, force = noisy.flight.felt(noisy.seconds(imu))
+    rate, force = noisy.flight.imu(noisy.seconds(imu))
     turned = np.degrees(np.array([m.angular_velocity_drone_radps for m in imu]) - rate)
     felt = np.array([m.acceleration_drone_mps2 for m in imu]) - force
     np.testing.assert_allclose(turned.std(axis=0), 2.0, rtol=0.1)
@@ -171,7 +171,7 @@ def test_the_attitude_is_off_by_the_lean_as_configured() -> None:
     squares = []
     for seed in range(25):
         lean = Flown(
-            AutopilotSettings(drift=NO_DRIFT.model_copy(update={"lean_deg": 1.0}), imu_hz=0, odometry_hz=0), seed, 4.0
+            AutopilotSettings(drift=NO_DRIFT.model_copy(update={"tilt_deg": 1.0}), imu_hz=0, odometry_hz=0), seed, 4.0
         )
         m = lean.messages(DroneAttitude)[-1]
         up = lean.flight.flying_poses(lean.seconds([m]))[0][0] @ (m.R_local_drone.T @ [0.0, 0.0, 1.0])
@@ -207,7 +207,7 @@ def test_stamps_grow_within_a_kind_and_never_pass_the_arrival(drifting: Flown) -
 
 
 def test_losses_and_outages_show_as_gaps_in_the_sequence() -> None:
-    radio: Any = {"loss_share": 0.05, "loss_burst_frames": 2.0, "outages_s": ((5.0, 5.3),)}
+    radio: Any = {"loss_fraction": 0.05, "loss_burst_frames": 2.0, "outages_s": ((5.0, 5.3),)}
     lossy = Flown(AutopilotSettings(downlink=radio))
     sent = len([r for r in Flown(AutopilotSettings()).records if r.topic == "/autopilot/rx"])
     heard = len([r for r in lossy.records if r.topic == "/autopilot/rx"])
@@ -219,7 +219,7 @@ def test_losses_and_outages_show_as_gaps_in_the_sequence() -> None:
 
 def test_the_same_seed_gives_the_same_bytes_in_any_batches() -> None:
     def run(step_ns: int, seed: int = 1) -> list[Record]:
-        settings = AutopilotSettings.model_validate({"downlink": {"loss_share": 0.02}})
+        settings = AutopilotSettings.model_validate({"downlink": {"loss_fraction": 0.02}})
         part, records = Autopilot(settings, Flight(ORBIT, settings.flight, 3.0, seed), START, 3.0, seed), []
         for until in range(START, START + 4 * S, step_ns):
             records += part.records(until)

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules, JitterCorrection
 from links.simulated.autopilot.px4_rules import Px4Rules
-from links.simulated.autopilot.rules import Fate, Rules
+from links.simulated.autopilot.rules import PoseResult, Rules
 
 mavlink: Any = ardupilotmega
 MS = 1_000_000
@@ -64,27 +64,27 @@ def estimate(at_ms: float, **fields: Any) -> Any:
     )
 
 
-def hear(rules: Rules, at_ms: float, x: float = 0.0, **fields: Any) -> Fate:
-    return rules.hear(odometry(at_ms, x, **fields), round(at_ms * MS))
+def receive(rules: Rules, at_ms: float, x: float = 0.0, **fields: Any) -> PoseResult:
+    return rules.receive(odometry(at_ms, x, **fields), round(at_ms * MS))
 
 
-def fly(rules: Rules, from_ms: int, to_ms: int, every_ms: int = 25, **fields: Any) -> Fate:
-    fate = Fate.NOT_FOR_IT
+def fly(rules: Rules, from_ms: int, to_ms: int, every_ms: int = 25, **fields: Any) -> PoseResult:
+    fate = PoseResult.NOT_A_POSE
     for at_ms in range(from_ms, to_ms, every_ms):
-        fate = hear(rules, at_ms, **fields)
+        fate = receive(rules, at_ms, **fields)
     return fate
 
 
 @pytest.mark.parametrize("frames", [(1, 12), (20, 1), (20, 8), (0, 0), (12, 20)])
 def test_ardupilot_drops_other_frames_and_its_health_does_not_even_notice(frames: tuple[int, int]):
     rules = ArduPilotRules()
-    assert hear(rules, 100, frame_id=frames[0], child_frame_id=frames[1]) is Fate.WRONG_FRAME
+    assert receive(rules, 100, frame_id=frames[0], child_frame_id=frames[1]) is PoseResult.WRONG_FRAME
     assert not rules.healthy(100 * MS)
 
 
 def test_ardupilot_is_healthy_for_300_ms_after_a_message_and_not_one_longer():
     rules = ArduPilotRules()
-    hear(rules, 100)
+    receive(rules, 100)
     assert rules.healthy(399 * MS)
     assert not rules.healthy(400 * MS)
 
@@ -92,7 +92,7 @@ def test_ardupilot_is_healthy_for_300_ms_after_a_message_and_not_one_longer():
 def test_ardupilot_arms_on_a_pose_that_is_a_quarter_turn_wrong():
     """Why an unresolved branch must never be sent: nothing here refuses it."""
     rules = ArduPilotRules()
-    assert fly(rules, 0, 1000, yaw_deg=90.0) is Fate.FUSED
+    assert fly(rules, 0, 1000, yaw_deg=90.0) is PoseResult.FUSED
     assert rules.healthy(1000 * MS)
     assert rules.fusing(1000 * MS)
 
@@ -101,8 +101,8 @@ def test_ardupilot_believes_a_velocity_of_zero_and_skips_nan():
     believing, skipping = ArduPilotRules(), ArduPilotRules()
     fly(believing, 0, 100, vx=2.0)
     fly(skipping, 0, 100, vx=2.0)
-    hear(believing, 100, vx=0.0)
-    hear(skipping, 100, vx=math.nan)
+    receive(believing, 100, vx=0.0)
+    receive(skipping, 100, vx=math.nan)
     assert believing.estimate is not None
     assert skipping.estimate is not None
     assert believing.estimate.velocity_mps[0] == 0.0
@@ -111,25 +111,25 @@ def test_ardupilot_believes_a_velocity_of_zero_and_skips_nan():
 
 def test_ardupilot_turns_the_bodys_velocity_into_its_local_frame():
     rules = ArduPilotRules()
-    hear(rules, 0, yaw_deg=90.0, vx=3.0)
+    receive(rules, 0, yaw_deg=90.0, vx=3.0)
     assert rules.estimate is not None
     np.testing.assert_allclose(rules.estimate.velocity_mps, [0, 3, 0], atol=1e-6)
 
 
 def test_ardupilot_fuses_at_most_one_each_20_ms():
     rules = ArduPilotRules()
-    fates = [hear(rules, at_ms) for at_ms in (0, 10, 20, 39, 40)]
-    assert [f is Fate.TOO_SOON for f in fates] == [False, True, False, True, False]
+    results = [receive(rules, at_ms) for at_ms in (0, 10, 20, 39, 40)]
+    assert [f is PoseResult.TOO_SOON for f in results] == [False, True, False, True, False]
     assert rules.healthy(100 * MS)
 
 
 def test_ardupilot_reads_the_covariance_as_a_cube_root_and_not_below_its_floors():
     rules = ArduPilotRules(viso_pos_m_nse=0.05)
-    hear(rules, 0, pose_covariance=upper(position=0.25))
+    receive(rules, 0, pose_covariance=upper(position=0.25))
     assert rules.estimate is not None
     assert math.sqrt(rules.estimate.position_var) == pytest.approx(math.cbrt(3 * 0.25**2))
     rules = ArduPilotRules()
-    hear(rules, 0, pose_covariance=NAN21)
+    receive(rules, 0, pose_covariance=NAN21)
     assert rules.estimate is not None
     assert math.sqrt(rules.estimate.position_var) == pytest.approx(0.2)
     assert math.sqrt(rules.estimate.yaw_var) == pytest.approx(0.2)
@@ -138,13 +138,15 @@ def test_ardupilot_reads_the_covariance_as_a_cube_root_and_not_below_its_floors(
 def test_ardupilot_refuses_a_covariance_that_is_nan_in_part():
     partly = upper()
     partly[6] = math.nan
-    assert hear(ArduPilotRules(), 0, pose_covariance=partly) is Fate.NOT_FINITE
+    assert receive(ArduPilotRules(), 0, pose_covariance=partly) is PoseResult.NOT_FINITE
 
 
-@pytest.mark.parametrize(("quality", "fate"), [(-1, Fate.LOW_QUALITY), (0, Fate.RESET), (1, Fate.RESET)])
-def test_ardupilot_keeps_its_health_by_failed_poses_too(quality: int, fate: Fate):
+@pytest.mark.parametrize(
+    ("quality", "fate"), [(-1, PoseResult.LOW_QUALITY), (0, PoseResult.RESET), (1, PoseResult.RESET)]
+)
+def test_ardupilot_keeps_its_health_by_failed_poses_too(quality: int, fate: PoseResult):
     rules = ArduPilotRules()
-    assert hear(rules, 0, quality=quality) is fate
+    assert receive(rules, 0, quality=quality) is fate
     assert rules.healthy(0)
 
 
@@ -152,10 +154,10 @@ def test_ardupilot_keeps_its_health_by_failed_poses_too(quality: int, fate: Fate
 def test_a_jump_is_gated_and_taken_at_once_where_the_reset_counter_changes(rules: Any):
     told, untold = rules(), rules()
     for r in (told, untold):
-        assert fly(r, 0, 1000) is Fate.FUSED
-    assert hear(untold, 1000, x=8.0) is Fate.GATED
-    assert hear(told, 1000, x=8.0, reset_counter=1) is Fate.RESET
-    assert hear(told, 1025, x=8.0, reset_counter=1) is Fate.FUSED
+        assert fly(r, 0, 1000) is PoseResult.FUSED
+    assert receive(untold, 1000, x=8.0) is PoseResult.GATED
+    assert receive(told, 1000, x=8.0, reset_counter=1) is PoseResult.RESET
+    assert receive(told, 1025, x=8.0, reset_counter=1) is PoseResult.FUSED
     assert told.estimate is not None
     assert told.estimate.xyz_m[0] == pytest.approx(8.0)
 
@@ -164,7 +166,7 @@ def test_a_jump_is_gated_and_taken_at_once_where_the_reset_counter_changes(rules
 def test_a_quarter_turn_in_flight_is_gated(rules: Any):
     r = rules()
     fly(r, 0, 1000)
-    assert hear(r, 1000, yaw_deg=90.0) is Fate.GATED
+    assert receive(r, 1000, yaw_deg=90.0) is PoseResult.GATED
 
 
 def test_ardupilot_stands_still_in_its_mind_after_7_s_without_a_pose_it_takes():
@@ -187,24 +189,24 @@ def test_ardupilots_clock_is_that_of_the_promptest_message():
 
 def test_px4_starts_with_two_messages_less_than_200_ms_apart_and_stops_after_400_ms_of_none():
     rules = Px4Rules()
-    assert [hear(rules, at) for at in (0, 250, 500)] == [Fate.NOT_STARTED] * 3
-    assert hear(rules, 690) is Fate.RESET
+    assert [receive(rules, at) for at in (0, 250, 500)] == [PoseResult.NOT_STARTED] * 3
+    assert receive(rules, 690) is PoseResult.RESET
     assert rules.fusing(1090 * MS)
     assert not rules.fusing(1091 * MS)
-    assert hear(rules, 1100) is Fate.NOT_STARTED  # 410 ms after the one before
-    assert hear(rules, 1200) is Fate.RESET
+    assert receive(rules, 1100) is PoseResult.NOT_STARTED  # 410 ms after the one before
+    assert receive(rules, 1200) is PoseResult.RESET
 
 
 @pytest.mark.parametrize(("kind", "taken"), [(0, True), (2, True), (3, True), (6, False), (7, False), (8, False)])
 def test_px4_takes_vision_and_not_lidar_or_mocap_estimators(kind: int, taken: bool):
-    fate = hear(Px4Rules(), 0, estimator_type=kind)
-    assert (fate is not Fate.WRONG_ESTIMATOR) == taken
+    fate = receive(Px4Rules(), 0, estimator_type=kind)
+    assert (fate is not PoseResult.WRONG_ESTIMATOR) == taken
 
 
 def test_px4_does_not_take_a_north_oriented_estimate_without_a_compass_and_ardupilot_does():
-    assert Px4Rules().hear(estimate(0), 0) is Fate.WRONG_FRAME
+    assert Px4Rules().receive(estimate(0), 0) is PoseResult.WRONG_FRAME
     rules = ArduPilotRules()
-    assert rules.hear(estimate(0), 0) is Fate.RESET
+    assert rules.receive(estimate(0), 0) is PoseResult.RESET
     assert rules.estimate is not None
     np.testing.assert_allclose(rules.estimate.xyz_m, [1, 2, 3])
     assert math.degrees(rules.estimate.yaw_rad) == pytest.approx(30.0, abs=1e-4)
@@ -212,9 +214,9 @@ def test_px4_does_not_take_a_north_oriented_estimate_without_a_compass_and_ardup
 
 def test_px4_wants_its_quality_before_it_starts_and_while_it_fuses():
     rules = Px4Rules(ekf2_ev_qmin=50)
-    assert fly(rules, 0, 500, quality=49) is Fate.LOW_QUALITY
+    assert fly(rules, 0, 500, quality=49) is PoseResult.LOW_QUALITY
     assert not rules.fusing(500 * MS)
-    assert fly(rules, 500, 1000, quality=50) is Fate.FUSED
+    assert fly(rules, 500, 1000, quality=50) is PoseResult.FUSED
 
 
 def test_px4_starts_anew_from_poses_it_gated_for_a_second_five_times_and_then_stops():
@@ -223,8 +225,8 @@ def test_px4_starts_anew_from_poses_it_gated_for_a_second_five_times_and_then_st
     began_at: list[int] = []
     at_ms = 1000
     while at_ms < 12_000 and rules.fusing(at_ms * MS):
-        fate = hear(rules, at_ms, x=0.4 * at_ms)  # flees at 400 m/s: nothing passes the gate
-        began_at += [at_ms] if fate is Fate.RESET else []
+        fate = receive(rules, at_ms, x=0.4 * at_ms)  # flees at 400 m/s: nothing passes the gate
+        began_at += [at_ms] if fate is PoseResult.RESET else []
         at_ms += 25
     assert len(began_at) == 5
     assert all(b - a > 1000 for a, b in itertools.pairwise([975, *began_at]))
@@ -234,7 +236,7 @@ def test_px4_starts_anew_from_poses_it_gated_for_a_second_five_times_and_then_st
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_no_rule_takes_a_position_that_is_not_finite(rules: Any, bad: float):
-    assert hear(rules(), 0, x=bad) is Fate.NOT_FINITE
+    assert receive(rules(), 0, x=bad) is PoseResult.NOT_FINITE
 
 
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
@@ -245,4 +247,4 @@ def test_the_report_says_what_is_fused(rules: Any):
     flags = r.report(500 * MS).flags
     assert flags & 8
     assert not flags & 128
-    assert r.hear(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3), 0) is Fate.NOT_FOR_IT
+    assert r.receive(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3), 0) is PoseResult.NOT_A_POSE

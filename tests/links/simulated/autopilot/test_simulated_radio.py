@@ -30,7 +30,7 @@ def test_a_slow_line_queues_what_it_cannot_carry() -> None:
 
 
 def test_losses_have_their_share_and_come_in_bursts() -> None:
-    lost = np.array([a is None for a in _send(RadioSettings(loss_share=0.1, loss_burst_frames=4), 60_000)])
+    lost = np.array([a is None for a in _send(RadioSettings(loss_fraction=0.1, loss_burst_frames=4), 60_000)])
     assert lost.mean() == pytest.approx(0.1, rel=0.1)
     bursts = np.count_nonzero(np.diff(lost.astype(int)) == 1)
     assert lost.sum() / bursts == pytest.approx(4.0, rel=0.1)

@@ -125,7 +125,7 @@ def test_an_interrupt_is_for_the_first_process_alone() -> None:
 
 
 def test_an_interrupt_ends_all_processes_in_order_without_a_traceback(tmp_path: Path) -> None:
-    """As Ctrl-C in a terminal, to the whole group: each piece of work tidies up, what waits is not begun."""
+    """As Ctrl-C in a terminal, to the whole group: each piece of work tidies up, what waits is not initial_estimate."""
     run, workers = start(tmp_path)
     os.killpg(run.pid, signal.SIGINT)
     _, said = run.communicate(timeout=PATIENCE_S)

@@ -28,7 +28,7 @@ from links.simulated.matrix.matrix import (
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import Scenario
 from links.simulated.sensors.camera import CamerasSettings
-from links.simulated.sensors.servo import Turned
+from links.simulated.sensors.servo import GearTrain
 from links.simulated.world.clearance import sample_times_s, visible
 from links.simulated.world.mesh import RayScene, box, merge
 from links.simulated.world.procedural import build_world
@@ -189,7 +189,7 @@ def test_a_calibrated_rig_knows_the_encoders_error_and_its_play_and_the_world_st
     assert (known.mount.servo_harmonics, known.mount.servo_play_deg) == ((), 0.0)
     assert known.rig.mount.servo_play_deg == SERVO.backlash_deg
     tight = SERVO.model_copy(update={"backlash_deg": 0.0})
-    turned = Turned(tight, 3)
+    turned = GearTrain(tight, 3)
     encoder = np.linspace(0.0, np.pi, 50)
     truly = np.array([turned.follow(p) for p in encoder])
     assert known.rig.mount.turntable_rad(encoder) == pytest.approx(truly, abs=1e-7)
@@ -225,16 +225,16 @@ def test_cameras_are_added_to_a_cell_and_change_nothing_else() -> None:
 
 
 def test_a_rig_as_built_is_off_and_its_drone_one_of_several_while_the_file_tells_what_was_meant() -> None:
-    cell, asked = Cell("open_lot", 20, "hover", "driving"), Conditions(calibrated=True, cameras_hz=4.0, as_built=True)
+    cell, asked = Cell("open_lot", 20, "hover", "driving"), Conditions(calibrated=True, cameras_hz=4.0, perturbed=True)
     ideal = scenario_of(cell, 3, Conditions(calibrated=True, cameras_hz=4.0))
     built = [scenario_of(cell, seed, asked) for seed in range(1, 60)]
     third = built[2]
     assert third.rig == ideal.rig
     assert Scenario.model_validate(yaml.safe_load(third.as_yaml())) == third
     zero_deg = [s.mount.servo_zero_deg for s in built]
-    lean_deg = [np.degrees(np.arccos(s.mount.T_vehicle_turntable.matrix()[2, 2])) for s in built]
+    tilt_deg = [np.degrees(np.arccos(s.mount.T_vehicle_turntable.matrix()[2, 2])) for s in built]
     assert 0.07 < np.std(zero_deg) < 0.13
-    assert 0.05 < np.sqrt(np.mean(np.square(lean_deg))) < 0.09  # of two axes
+    assert 0.05 < np.sqrt(np.mean(np.square(tilt_deg))) < 0.09  # of two axes
     assert 0.012 < np.std([s.lidar.range_offset_m for s in built]) < 0.022
     drones = [s.drone for s in built if s.drone is not None]
     assert {(d.model.shape, d.span_m) for d in drones} == {("x4", 0.5), ("folding", 0.35), ("hexa", 0.8)}

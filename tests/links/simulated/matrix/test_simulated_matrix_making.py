@@ -18,7 +18,7 @@ from links.simulated.matrix import flights, making
 from links.simulated.matrix.flights import Cell
 from links.simulated.matrix.making import Outcome, Task, is_made, make_matrix, make_one
 from links.simulated.matrix.matrix import Conditions, cells, scenario_of
-from links.simulated.rig.closed_loop import ClosedLoop, made_with
+from links.simulated.rig.closed_loop import ClosedLoop, loop_metadata
 from links.simulated.rig.run import simulate_into
 from tests.links.simulated.fast_loop import GRAPH
 
@@ -192,7 +192,7 @@ def test_a_changed_configuration_is_noticed_and_a_comment_or_a_viewer_is_none(tm
 def test_a_recording_that_knows_its_configuration_by_name_only_is_not_made_alike(tmp_path, short, config: Path) -> None:
     scenario, file = scenario_of(HOVER, 1), tmp_path / "old.mcap"
     graph = Asked(config).graph(scenario.rig_yaml(), "test")
-    made_by = made_with(config, graph)
+    made_by = loop_metadata(config, graph)
     simulate_into(file, scenario, loop=ClosedLoop(graph, scenario.closed_loop, {"closed_loop": "fast.yaml"}))
     assert not is_made(file, scenario, made_by)
     assert not is_made(file, scenario, {})

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from links.simulated.matrix.sim_vs_real import (
+    comparison_table,
     drone_area_m2,
     drone_table,
     measure,
     real_drone,
-    reality_table,
     recorded,
-    simulated_room,
+    simulated_indoor_scene,
 )
 from links.simulated.world.mesh import box
 
@@ -24,7 +24,7 @@ DRONES = ROOT.parent / "shared/data/drone_lidar"
 
 @pytest.fixture(scope="module")
 def room():
-    return measure(simulated_room(4.0))
+    return measure(simulated_indoor_scene(4.0))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def einride():
 
 def test_the_measures_find_what_the_simulation_was_told(room) -> None:
     assert room.noise_m == pytest.approx(0.008, abs=0.0005)
-    assert room.lost_alone == pytest.approx(0.005, abs=0.001)
+    assert room.isolated_dropouts == pytest.approx(0.005, abs=0.001)
     assert room.spacing_mrad == pytest.approx(1e3 * 2 * np.pi * 10 * 55.296e-6, rel=0.02)  # 10 turns a second
     assert room.pulses_per_turn == pytest.approx(1e8 / 55.296 / 1000 * 16, rel=2e-3)
     assert 0.003 < room.laser_bias_m < 0.02  # 1 cm over 16 draws, less what planes take up
@@ -44,7 +44,7 @@ def test_the_simulated_sensor_measures_like_the_real_one(room, einride) -> None:
     assert room.pulses_per_turn == pytest.approx(einride.pulses_per_turn, rel=2e-3)
     assert room.noise_m == pytest.approx(einride.noise_m, abs=0.002)
     assert room.spacing_mrad == pytest.approx(einride.spacing_mrad, rel=0.05)
-    assert room.lost_alone == pytest.approx(einride.lost_alone, abs=0.006)
+    assert room.isolated_dropouts == pytest.approx(einride.isolated_dropouts, abs=0.006)
 
 
 def test_the_effective_area_of_a_large_near_plate_is_its_own() -> None:
@@ -63,6 +63,6 @@ def test_real_drone_hits_lie_between_our_smallest_and_largest_drone() -> None:
 
 
 def test_the_table_names_every_capture_and_says_when_the_drone_clouds_are_absent(tmp_path: Path) -> None:
-    table = reality_table(ROOT / "recordings", tmp_path)
+    table = comparison_table(ROOT / "recordings", tmp_path)
     assert "| einride (real) | mrpt (real) | room (simulated) |" in table
     assert "are not here" in table

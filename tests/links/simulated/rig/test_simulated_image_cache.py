@@ -1,4 +1,4 @@
-"""Pictures of an earlier recording stand for painted ones, to the byte, or are refused by name."""
+"""Images of an earlier recording stand for painted ones, to the byte, or are refused by name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from flow.link import LinkError, Record
 from links.cli.app import app
 from links.recording import RecordingReader, RecordingWriter, decode_compressed_image
-from links.simulated.rig.image_cache import KeptPictures, first_difference
+from links.simulated.rig.image_cache import ImageCache, first_difference
 from links.simulated.rig.run import Simulation, simulate_into
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.sensors import camera_view
@@ -23,7 +23,7 @@ STREET = FilePath(__file__).parents[4] / "configs/scenarios/street_sweep.yaml"
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    """0.5 s, two 64 px cameras whose pictures may overtake each other, a drone that flies by its dynamics."""
+    """0.5 s, two 64 px cameras whose images may overtake each other, a drone that flies by its dynamics."""
     drone = Path(waypoints=(Waypoint(t_s=0, xyz_m=(4.0, 3.0, 6.0)), Waypoint(t_s=1.0, xyz_m=(6.0, 3.0, 6.0))))
     vehicle = Path(waypoints=(Waypoint(t_s=0, xyz_m=(0, 0, 0)), Waypoint(t_s=1.0, xyz_m=(3.0, 0, 0))))
     one = CameraSettings(size_px=64, rate_hz=15, latency_ms=(5.0, 200.0))
@@ -61,11 +61,11 @@ def records_of(file: FilePath) -> list[Record]:
 def test_the_same_flight_is_the_same_file_to_the_byte_and_nothing_is_painted(
     scenario, painted, tmp_path, no_painting
 ) -> None:
-    simulate_into(tmp_path / "again.mcap", scenario, pictures=painted)
+    simulate_into(tmp_path / "again.mcap", scenario, images=painted)
     assert (tmp_path / "again.mcap").read_bytes() == painted.read_bytes()
-    pictures = [record for record in records_of(painted) if record.topic.startswith("/camera/")]
-    assert len(pictures) >= 12
-    per_camera = [[r.stamp_ns for r in pictures if r.topic == f"/camera/{c}"] for c in ("vehicle", "drone")]
+    images = [record for record in records_of(painted) if record.topic.startswith("/camera/")]
+    assert len(images) >= 12
+    per_camera = [[r.stamp_ns for r in images if r.topic == f"/camera/{c}"] for c in ("vehicle", "drone")]
     assert any(stamps != sorted(stamps) for stamps in per_camera), "none was overtaken: the test asks too little"
 
 
@@ -77,20 +77,20 @@ def test_another_servo_lidar_or_radio_keeps_every_picture(scenario, painted, tmp
         script=({"do": "sweep", "times": 3},),
         name="other",
     )
-    simulate_into(tmp_path / "other.mcap", other, pictures=painted)
+    simulate_into(tmp_path / "other.mcap", other, images=painted)
     there, here = records_of(painted), records_of(tmp_path / "other.mcap")
-    pictures = [
+    images = [
         [(r.topic, r.arrival_ns, r.stamp_ns, r.data) for r in records if r.topic.startswith("/camera/")]
         for records in (there, here)
     ]
-    assert pictures[0] == pictures[1]
+    assert images[0] == images[1]
     packets = [[r.data for r in records if r.topic == "/lidar/packets"] for records in (there, here)]
     assert packets[0] != packets[1]
 
 
 def test_a_shorter_flight_takes_the_pictures_that_it_would_have_painted(scenario, painted) -> None:
     shorter = scenario.changed(duration_s=0.3)
-    assert list(Simulation(shorter, pictures=KeptPictures(painted, shorter)).records()) == list(
+    assert list(Simulation(shorter, images=ImageCache(painted, shorter)).records()) == list(
         Simulation(shorter).records()
     )
 
@@ -99,7 +99,7 @@ def test_a_shorter_flight_takes_the_pictures_that_it_would_have_painted(scenario
 def round_about(scenario: Scenario) -> Scenario:
     """A parked vehicle, a drone that is back after a second; two of its rounds."""
     way = [{"t_s": t, "xyz_m": (4.0 + x, 3.0, 6.0)} for t, x in ((0.0, 0.0), (0.5, 0.4))]
-    drone = {"path": {"round_s": 1.0, "waypoints": way}}
+    drone = {"path": {"period_s": 1.0, "waypoints": way}}
     one = CameraSettings(size_px=64, rate_hz=5, latency_ms=(5.0, 300.0))
     return scenario.changed(
         vehicle={}, drone=drone, duration_s=2.6, cameras=CamerasSettings(vehicle=one, drone=one), vehicle_odometry=None
@@ -108,8 +108,8 @@ def round_about(scenario: Scenario) -> Scenario:
 
 def test_round_and_round_the_first_rounds_pictures_come_again_so_much_later(round_about, tmp_path) -> None:
     simulate_into(tmp_path / "first.mcap", round_about.changed(duration_s=1.4))
-    kept = KeptPictures(tmp_path / "first.mcap", round_about)
-    records = [r for r in Simulation(round_about, pictures=kept).records() if r.topic.startswith("/camera/")]
+    kept = ImageCache(tmp_path / "first.mcap", round_about)
+    records = [r for r in Simulation(round_about, images=kept).records() if r.topic.startswith("/camera/")]
     for topic in ("/camera/vehicle", "/camera/drone"):
         seen = sorted((r for r in records if r.topic == topic), key=lambda r: r.stamp_ns)
         assert len(seen) >= 11
@@ -126,7 +126,7 @@ def test_a_flight_no_longer_than_the_recorded_one_takes_its_own_pictures_beyond_
 ) -> None:
     once = round_about.changed(duration_s=1.5, cameras={"vehicle": {"size_px": 64, "rate_hz": 4.5}})
     simulate_into(tmp_path / "first.mcap", once)
-    simulate_into(tmp_path / "again.mcap", once, pictures=tmp_path / "first.mcap")
+    simulate_into(tmp_path / "again.mcap", once, images=tmp_path / "first.mcap")
     assert (tmp_path / "again.mcap").read_bytes() == (tmp_path / "first.mcap").read_bytes()
 
 
@@ -135,14 +135,14 @@ def test_a_flight_no_longer_than_the_recorded_one_takes_its_own_pictures_beyond_
     [
         ({"vehicle": {"ride": {}}}, "duration_s is 1.4 there, 2.6 here"),
         ({"scene": {"birds": 1}}, "duration_s is 1.4 there, 2.6 here"),
-        ({"cameras": {"vehicle": {"size_px": 64, "rate_hz": 4.5}}}, "4.5 Hz are 4.50 pictures in a round of 1 s"),
+        ({"cameras": {"vehicle": {"size_px": 64, "rate_hz": 4.5}}}, "4.5 Hz are 4.50 images in a round of 1 s"),
     ],
 )
 def test_pictures_do_not_come_again_where_something_else_would_be_seen(round_about, tmp_path, change, says) -> None:
     longer = round_about.changed(**change)
     simulate_into(tmp_path / "first.mcap", longer.changed(duration_s=1.4))
     with pytest.raises(LinkError, match=says.replace(".", r"\.")):
-        Simulation(longer, pictures=KeptPictures(tmp_path / "first.mcap", longer))
+        Simulation(longer, images=ImageCache(tmp_path / "first.mcap", longer))
 
 
 @pytest.mark.parametrize(
@@ -160,14 +160,14 @@ def test_pictures_do_not_come_again_where_something_else_would_be_seen(round_abo
             {"true_mount": {"T_vehicle_turntable": {"xyz_m": (0, 0, 0.5)}, "T_turntable_lidar": {}}},
             "mount.T_vehicle_turntable.xyz_m.2 is 0.25 there, 0.5 here",
         ),
-        ({"cameras": {}}, "has no cameras: leave --pictures out"),
+        ({"cameras": {}}, "has no cameras: leave --images out"),
     ],
 )
 def test_pictures_of_another_flight_are_refused_and_the_first_difference_is_named(
     scenario, painted, change, says
 ) -> None:
     with pytest.raises(LinkError, match=says.replace(".", r"\.")):
-        KeptPictures(painted, scenario.changed(**change))
+        ImageCache(painted, scenario.changed(**change))
 
 
 def rewritten(painted: FilePath, file: FilePath, keep, made_by: str = "grd simulate") -> FilePath:
@@ -197,7 +197,7 @@ def test_a_recording_that_flew_otherwise_with_the_same_settings_is_refused(scena
 
     file = rewritten(painted, tmp_path / "pushed.mcap", pushed)
     with pytest.raises(LinkError, match=r"drone was elsewhere at 0\.20 s"):
-        Simulation(scenario, pictures=KeptPictures(file, scenario))
+        Simulation(scenario, images=ImageCache(file, scenario))
 
 
 def test_a_picture_that_is_missing_ends_the_simulation_with_its_stamp(scenario, painted, tmp_path) -> None:
@@ -206,21 +206,21 @@ def test_a_picture_that_is_missing_ends_the_simulation_with_its_stamp(scenario, 
     file = rewritten(
         painted, tmp_path / "lost.mcap", lambda r: None if (r.topic, r.stamp_ns) == ("/camera/drone", lost) else r
     )
-    with pytest.raises(LinkError, match=f"no picture on /camera/drone stamped {lost}"):
-        list(Simulation(scenario, pictures=KeptPictures(file, scenario)).records())
+    with pytest.raises(LinkError, match=f"no image on /camera/drone stamped {lost}"):
+        list(Simulation(scenario, images=ImageCache(file, scenario)).records())
     blind = rewritten(painted, tmp_path / "blind.mcap", lambda r: None if r.topic == "/camera/vehicle" else r)
     with pytest.raises(LinkError, match="has nothing on /camera/vehicle"):
-        KeptPictures(blind, scenario)
+        ImageCache(blind, scenario)
 
 
 def test_no_simulation_no_pictures_and_never_the_file_that_is_written(scenario, painted, tmp_path) -> None:
     flown = rewritten(painted, tmp_path / "flown.mcap", lambda record: record, made_by="grd run")
     with pytest.raises(LinkError, match="is no simulated recording"):
-        KeptPictures(flown, scenario)
+        ImageCache(flown, scenario)
     with pytest.raises(LinkError, match="no such file"):
-        KeptPictures(tmp_path / "nothing.mcap", scenario)
-    with pytest.raises(LinkError, match="both what is written and where pictures come from"):
-        simulate_into(painted, scenario, overwrite=True, pictures=painted)
+        ImageCache(tmp_path / "nothing.mcap", scenario)
+    with pytest.raises(LinkError, match="both what is written and where images come from"):
+        simulate_into(painted, scenario, overwrite=True, images=painted)
 
 
 def test_a_list_of_other_length_is_a_difference_and_an_equal_tree_none() -> None:
@@ -233,11 +233,11 @@ def test_a_list_of_other_length_is_a_difference_and_an_equal_tree_none() -> None
 def test_the_commands_take_pictures_and_say_what_is_missing(scenario, painted, tmp_path) -> None:
     file = tmp_path / "scenario.yaml"
     file.write_text(scenario.as_yaml(), encoding="utf-8")
-    asked = ["simulate", file, "-o", tmp_path / "again.mcap", "--pictures", painted]
+    asked = ["simulate", file, "-o", tmp_path / "again.mcap", "--images", painted]
     again = CliRunner().invoke(app, [str(word) for word in asked])
     assert again.exit_code == 0, again.output
     assert (tmp_path / "again.mcap").read_bytes() == painted.read_bytes()
-    matrix = ["matrix", tmp_path / "m", "--only", "open_lot-10m-hover-parked", "--pictures", tmp_path]
+    matrix = ["matrix", tmp_path / "m", "--only", "open_lot-10m-hover-parked", "--images", tmp_path]
     blind = CliRunner().invoke(app, [str(word) for word in matrix])
     assert blind.exit_code == 2
     assert "--cameras HZ" in blind.output

@@ -1,4 +1,4 @@
-"""Pictures painted before, served in time: what a camera link reads, when each leaves, and who is turned away."""
+"""Images painted before, served in time: what a camera link reads, when each leaves, and who is turned away."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from links import host_time
 from links.camera import Camera
 from links.recording import CompressedImage, decode_compressed_image, encode_compressed_image
 from links.simulated import LiveRig
-from links.simulated.rig.live_images import MOST_CLIENTS, PictureServer, PicturesInTime
+from links.simulated.rig.live_images import MOST_CLIENTS, MjpegServer, TimedImageServer
 
 PATIENCE_S = 60.0
 MS = 1_000_000
@@ -27,7 +27,7 @@ def jpeg(number: int) -> bytes:
 
 
 class Kept:
-    """A camera whose pictures are there: ten a second, each arrives 60 ms after its stamp."""
+    """A camera whose images are there: ten a second, each arrives 60 ms after its stamp."""
 
     def __init__(self, topic: str, count: int) -> None:
         self.topic, self.count, self.given = topic, count, 0
@@ -46,7 +46,7 @@ class Kept:
 
 def test_a_camera_link_reads_what_is_shown_untouched():
     stop = threading.Event()
-    with PictureServer(0) as server:
+    with MjpegServer(0) as server:
 
         def show() -> None:
             number = 0
@@ -67,7 +67,7 @@ def test_a_camera_link_reads_what_is_shown_untouched():
 
 
 def test_too_many_clients_are_turned_away():
-    with PictureServer(0) as server:
+    with MjpegServer(0) as server:
         server.show(jpeg(1))
         url = f"http://127.0.0.1:{server.port}/"
         stop, clients = threading.Event(), []
@@ -90,7 +90,7 @@ def test_each_picture_leaves_when_it_arrived_and_none_is_asked_for_beyond_the_en
     shown: list[tuple[bytes, int]] = []
     camera, end_ns = Kept("/camera/drone", 5), 450 * MS
     late_ns = host_time.now_ns
-    in_time = PicturesInTime([camera], {"/camera/drone": 0}, lambda: late_ns() - began_ns, end_ns)
+    in_time = TimedImageServer([camera], {"/camera/drone": 0}, lambda: late_ns() - began_ns, end_ns)
     with in_time:
         server = in_time._servers["/camera/drone"]
         show = server.show
@@ -108,6 +108,6 @@ def test_each_picture_leaves_when_it_arrived_and_none_is_asked_for_beyond_the_en
 def test_without_the_pictures_it_says_how_to_paint_them(tmp_path):
     scenario = tmp_path / "small.yaml"
     scenario.write_text("version: 1\n")
-    rig = LiveRig(scenario=scenario, servo=tmp_path / "servo", pictures=tmp_path / "none.mcap")
+    rig = LiveRig(scenario=scenario, servo=tmp_path / "servo", images=tmp_path / "none.mcap")
     with pytest.raises(LinkError, match=r"none.mcap: no such recording.*grd simulate .*small.yaml -o .*none.mcap"):
         rig.open(Run(tmp_path, "sim", "", "", live=True))

@@ -90,13 +90,13 @@ def test_the_rig_sends_packets_of_now_and_its_rays_go_where_the_servo_was_sent(t
                     servo.on_goal(goal)
                 assert told_s < began_s + PATIENCE_S
             now_ns = rig.simulation.now_ns()
-            angle_rad = rig.simulation.emulator.turned_rad(np.array([now_ns]))
+            angle_rad = rig.simulation.emulator.output_rad(np.array([now_ns]))
             R_now, _ = rig.simulation.T_world_lidar(np.array([now_ns]))
     rig.stop.set()
     sending.join(PATIENCE_S)
     R_start, _ = rig.simulation.T_world_lidar_at(np.array([now_ns]), np.zeros(1))
-    turned_rad = math.acos((np.trace(R_start[0].T @ R_now[0]) - 1) / 2)
-    assert turned_rad == pytest.approx(math.pi / 2, abs=0.02)
+    output_rad = math.acos((np.trace(R_start[0].T @ R_now[0]) - 1) / 2)
+    assert output_rad == pytest.approx(math.pi / 2, abs=0.02)
     assert angle_rad[0] == pytest.approx(math.pi / 2, abs=0.02)
     told = json.loads((tmp_path / "rig.json").read_text())
     assert told["packets"] >= 30
@@ -120,7 +120,7 @@ def test_the_fields_stack_flies_against_the_simulated_rig_and_is_repeated_to_its
     assert summary["messages"]["servo.servo_state"] > 0
     assert live["switched_off"] == []
     assert live["edges"]["track.pulses"]["taken"] > 0
-    assert json.loads((flight / "rig.json").read_text())["mavlink_heard"] > 0
+    assert json.loads((flight / "rig.json").read_text())["mavlink_received"] > 0
     again = [*grd, "replay", str(flight / "flight.mcap"), "--as-live", "--out", str(tmp_path / "again")]
     done = subprocess.run(again, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
     assert "the live run's hash was the same" in done.stdout, done.stdout + done.stderr

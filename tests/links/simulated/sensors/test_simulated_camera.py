@@ -13,7 +13,7 @@ from links.camera import Camera as CameraLink
 from links.simulated.kernels.camera_paint import _overlap, _stripes
 from links.simulated.rig.scenario import load_scenario
 from links.simulated.sensors.camera import CameraSettings, CamerasSettings
-from links.simulated.sensors.camera_paint import LOOKS, _looks, faces_of
+from links.simulated.sensors.camera_paint import MATERIALS, _material_table, faces_of
 from links.simulated.sensors.camera_sensor import ELECTRONS_PER_S, GAMMA, GREY, SensorSettings, auto_exposure, develop
 from links.simulated.sensors.camera_view import Shutter
 from links.simulated.world.mesh import SURFACES, box, quads
@@ -257,7 +257,7 @@ def test_a_recorded_frame_decodes_to_the_image_that_was_made():
     assert message is not None
     assert (message.stamp_ns, message.frame_id, message.grey.shape) == (record.stamp_ns, "camera_drone", (120, 120))
     made = camera.image(record.stamp_ns, 0) @ [0.299, 0.587, 0.114]
-    assert np.abs(message.grey - made).mean() < 6  # noise, smoothed by the compression
+    assert np.abs(message.grey - made).mean() < 6  # noise, low_pass by the compression
 
 
 def test_the_rig_names_each_camera_with_its_pose_and_lens(tmp_path):
@@ -297,6 +297,6 @@ def test_a_default_camera_sees_235_deg_in_its_image():
 
 
 def test_a_surface_without_a_look_of_its_own_is_as_grey_as_its_reflectivity():
-    assert set(LOOKS) <= set(SURFACES)
-    kinds, colours, others = _looks({"moss": (0.25, 0.1)})
+    assert set(MATERIALS) <= set(SURFACES)
+    kinds, colours, others = _material_table({"moss": (0.25, 0.1)})
     assert (kinds.tolist(), colours.tolist(), others.tolist()) == ([0], [[0.25] * 3], [[0.25] * 3])

@@ -10,18 +10,18 @@ import pytest
 from links.simulated.kernels.motion import rotations_z
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
-from links.simulated.world.motion import between_steps, gauss_markov, random_walk, rotations_from_vectors
+from links.simulated.world.motion import gauss_markov, interpolate, random_walk, rotations_from_vectors
 from links.simulated.world.path import Path, Waypoint
 from stages.geometry import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg, rotations_from_xyzw
 
 NO_DRIFT = DriftSettings(
     scale=0,
     yaw_rate_deg_per_min=0,
-    yaw_walk_deg_per_sqrt_s=0,
-    position_walk_m_per_sqrt_s=0,
+    yaw_random_walk_deg_per_sqrt_s=0,
+    position_random_walk_m_per_sqrt_s=0,
     velocity_mps=0,
     height_m=0,
-    lean_deg=0,
+    tilt_deg=0,
 )
 TIMES = np.arange(0.0, 60.0 + STEP_S / 2, STEP_S)
 STRAIGHT = np.column_stack([2.0 + 3.0 * TIMES, np.full_like(TIMES, 1.0), 5.0 + 0.1 * TIMES])
@@ -57,11 +57,11 @@ def test_scale_lengthens_and_a_yaw_rate_bends_what_was_travelled() -> None:
 @pytest.mark.parametrize(
     ("errors", "block", "row"),
     [
-        ({"position_walk_m_per_sqrt_s": 0.05}, 3, 0),
+        ({"position_random_walk_m_per_sqrt_s": 0.05}, 3, 0),
         ({"velocity_mps": 0.1, "velocity_time_s": 10.0}, 3, 1),
         ({"height_m": 0.3, "height_time_s": 40.0}, 3, 2),
-        ({"lean_deg": 0.5}, 0, 0),
-        ({"yaw_walk_deg_per_sqrt_s": 0.1}, 0, 2),
+        ({"tilt_deg": 0.5}, 0, 0),
+        ({"yaw_random_walk_deg_per_sqrt_s": 0.1}, 0, 2),
     ],
 )
 def test_errors_have_the_size_that_the_covariance_says(errors: dict[str, float], block: int, row: int) -> None:
@@ -82,8 +82,8 @@ def test_the_velocity_is_the_slope_of_the_position() -> None:
         scale=0.03,
         yaw_rate_deg_per_min=3.0,
         height_m=0.5,
-        position_walk_m_per_sqrt_s=0.1,
-        yaw_walk_deg_per_sqrt_s=0.2,
+        position_random_walk_m_per_sqrt_s=0.1,
+        yaw_random_walk_deg_per_sqrt_s=0.2,
     )
     v = estimate.velocity_mps(TIMES, np.tile([3.0, 0, 0.1], (len(TIMES), 1)))
     slope = np.gradient(estimate.position_m(TIMES), STEP_S, axis=0)
@@ -105,7 +105,7 @@ def test_covariances_turn_with_the_body() -> None:
 
 def test_series_by_hand() -> None:
     np.testing.assert_allclose(
-        between_steps(np.array([0.0, 1.0, 4.0]), 0.5, np.array([-1, 0.25, 0.75, 9])), [0, 0.5, 2.5, 4]
+        interpolate(np.array([0.0, 1.0, 4.0]), 0.5, np.array([-1, 0.25, 0.75, 9])), [0, 0.5, 2.5, 4]
     )
     np.testing.assert_allclose(random_walk(np.array([5.0, 1.0, 1.0]), 2.0, 0.25), [0, 1, 2])
     x = gauss_markov(np.random.default_rng(1).standard_normal((200_000, 1)), np.array([3.0]), 0.5, 0.01)[:, 0]

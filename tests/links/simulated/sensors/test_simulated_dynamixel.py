@@ -188,7 +188,7 @@ def test_the_true_angle_has_the_encoders_error_and_the_play_in_it():
     host.wait(1.0)
     host.servo.advance(host.now_ns)
     at = np.array([host.now_ns - 500 * MS, host.now_ns])
-    difference_deg = np.degrees(host.servo.position_rad(at) - host.servo.turned_rad(at))
+    difference_deg = np.degrees(host.servo.position_rad(at) - host.servo.output_rad(at))
     assert (np.abs(difference_deg) > 0.01).any()
     assert (np.abs(difference_deg) < 1.3).all()
 
@@ -196,7 +196,7 @@ def test_the_true_angle_has_the_encoders_error_and_the_play_in_it():
 def test_it_can_be_asked_where_it_stood_at_any_time_of_the_last_seconds():
     with DynamixelEmulator(ServoSettings(travel_deg=(0, 360), start_deg=45)) as emulator:
         now = time.monotonic_ns()
-        assert np.degrees(emulator.turned_rad(np.array([now - 10 * MS, now]))) == pytest.approx([45, 45], abs=1e-6)
+        assert np.degrees(emulator.output_rad(np.array([now - 10 * MS, now]))) == pytest.approx([45, 45], abs=1e-6)
 
 
 def fails(ask):

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from links.simulated.rig.scripted_servo import ScriptedOperator, Sweep, Vibrate
-from links.simulated.sensors.servo import RPM_RADPS, TICK_RAD, Servo, ServoBus, ServoSettings, Turned
+from links.simulated.rig.scripted_servo import ServoScript, SweepSegment, VibrateSegment
+from links.simulated.sensors.servo import RPM_RADPS, TICK_RAD, GearTrain, Servo, ServoBus, ServoSettings
 
 START_NS = 1_748_773_230_000_000_000
 
 
 def _bus(*script, drone=None, shift_ns: int = 0, **settings) -> ServoBus:
-    return ServoBus(ServoSettings(**settings), ScriptedOperator(script, drone, 1), START_NS, shift_ns, 1)
+    return ServoBus(ServoSettings(**settings), ServoScript(script, drone, 1), START_NS, shift_ns, 1)
 
 
 def _run(bus: ServoBus, seconds: float):
@@ -40,21 +40,21 @@ def test_a_profile_keeps_to_speed_and_acceleration_and_stops_at_the_goal() -> No
 
 
 def test_no_command_makes_it_faster_than_its_motor_or_leave_its_travel() -> None:
-    bus = _bus(Sweep(speed_rpm=57.2, ends_deg=(0.0, 300.0)))
+    bus = _bus(SweepSegment(speed_rpm=57.2, ends_deg=(0.0, 300.0)))
     _, _, position = _run(bus, 2.0)
     assert np.diff(position).max() / 1e-3 == pytest.approx(55 * RPM_RADPS, rel=1e-3)
     assert position.max() < math.radians(180.0) + TICK_RAD
 
 
 def test_a_sweep_at_11_4_rpm_takes_2_63_s() -> None:
-    _, times, position = _run(_bus(Sweep(times=2)), 5.6)
+    _, times, position = _run(_bus(SweepSegment(times=2)), 5.6)
     assert times[np.argmax(position > math.radians(179.0))] == pytest.approx(179.0 / (11.4 * 6), abs=0.03)
     assert position.max() == pytest.approx(math.pi, abs=math.radians(0.6))
     assert position[-1] == pytest.approx(0.0, abs=math.radians(0.6))
 
 
 def test_vibration_swings_five_degrees_about_the_table_slower_than_asked() -> None:
-    vibrate = Vibrate(duration_s=5.0, azimuth_table=((0.0, 40.0),))
+    vibrate = VibrateSegment(duration_s=5.0, azimuth_table=((0.0, 40.0),))
     _, times, position = _run(_bus(vibrate), 2.0)
     settled = np.degrees(position[times > 0.5])
     assert settled.max() == pytest.approx(45.0, abs=0.6)
@@ -71,13 +71,15 @@ def test_following_aims_where_the_drone_was_before_the_latency() -> None:
         asked.append(time_s)
         return math.radians(60.0)
 
-    _, times, position = _run(_bus(Vibrate(duration_s=5.0, follow_drone=True, aim_error_deg=0.0), drone=drone), 1.5)
+    _, times, position = _run(
+        _bus(VibrateSegment(duration_s=5.0, follow_drone=True, aim_error_deg=0.0), drone=drone), 1.5
+    )
     assert np.degrees(position[times > 0.7]).mean() == pytest.approx(60.0, abs=1.0)
     assert asked[0] < -0.1
 
 
 def test_readings_are_whole_encoder_steps_near_the_truth_at_their_stamp() -> None:
-    bus = _bus(Sweep())
+    bus = _bus(SweepSegment())
     records, _, _ = _run(bus, 2.0)
     states = [json.loads(r.data) for r in records]
     ticks = np.array([s["position_rad"] for s in states]) / TICK_RAD
@@ -92,8 +94,8 @@ def test_readings_are_whole_encoder_steps_near_the_truth_at_their_stamp() -> Non
 
 
 def test_a_clock_error_moves_the_stamps_alone() -> None:
-    plain, _, _ = _run(_bus(Sweep()), 0.5)
-    early, _, _ = _run(_bus(Sweep(), shift_ns=1_000_000), 0.5)
+    plain, _, _ = _run(_bus(SweepSegment()), 0.5)
+    early, _, _ = _run(_bus(SweepSegment(), shift_ns=1_000_000), 0.5)
     assert [a.stamp_ns - b.stamp_ns for a, b in zip(plain, early, strict=True)] == [1_000_000] * len(plain)
     assert [a.data for a in plain] == [b.data for b in early]
 
@@ -106,27 +108,27 @@ def test_without_a_script_it_stays() -> None:
 def test_a_vibration_needs_exactly_one_aim() -> None:
     for wrong in ({}, {"follow_drone": True, "azimuth_table": ((0.0, 1.0),)}):
         with pytest.raises(ValidationError, match="give either follow_drone: true or an azimuth_table"):
-            Vibrate(duration_s=1.0, **wrong)
+            VibrateSegment(duration_s=1.0, **wrong)
 
 
 def test_play_holds_the_turntable_until_the_shaft_takes_it_along() -> None:
-    turned = Turned(ServoSettings(backlash_deg=0.4), 1)
+    turned = GearTrain(ServoSettings(backlash_deg=0.4), 1)
     degrees = [0.0, 0.1, 0.3, 5.0, 4.9, 4.6, 4.5, 0.0]
     seen = [math.degrees(turned.follow(math.radians(d))) for d in degrees]
     assert seen == pytest.approx([0.0, 0.0, 0.1, 4.8, 4.8, 4.8, 4.7, 0.2])
 
 
 def test_without_errors_the_turntable_stands_where_the_encoder_is() -> None:
-    bus = _bus(Sweep())
+    bus = _bus(SweepSegment())
     _, times, position = _run(bus, 1.0)
-    np.testing.assert_array_equal(bus.turned_rad(START_NS + np.rint(times * 1e9).astype(np.int64)), position)
+    np.testing.assert_array_equal(bus.output_rad(START_NS + np.rint(times * 1e9).astype(np.int64)), position)
 
 
 def test_the_encoders_error_is_harmonic_has_the_peak_asked_for_and_its_shape_by_seed() -> None:
     around = np.linspace(0, 2 * math.pi, 3601)
     shapes = []
     for seed in (1, 2):
-        turned = Turned(ServoSettings(encoder_error_deg=0.5), seed)
+        turned = GearTrain(ServoSettings(encoder_error_deg=0.5), seed)
         error = np.degrees([turned.encoder_error_rad(p) for p in around])
         spectrum = np.abs(np.fft.rfft(error[:-1])) / 1800
         assert 0.3 < np.abs(error).max() <= 0.5 + 1e-9

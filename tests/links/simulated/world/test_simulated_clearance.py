@@ -12,7 +12,7 @@ from flow.link import LinkError
 from flow.problem import ConfigError
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import load_scenario
-from links.simulated.world.clearance import check_path, fits, room_m, sample_times_s, under_open_sky, visible
+from links.simulated.world.clearance import check_path, clearance_m, fits, sample_times_s, under_open_sky, visible
 from links.simulated.world.mesh import RayScene, box, merge
 
 STREET = FilePath(__file__).parents[4] / "configs/scenarios/street_sweep.yaml"
@@ -27,7 +27,7 @@ def house() -> RayScene:
 
 def test_room_is_the_distance_to_the_nearest_surface_around(house: RayScene) -> None:
     points = np.array([(4.0, 0.0, 4.0), (0.0, 0.0, 1.5), (0.0, 0.0, 9.0), (10.0, 0.0, 8.4)])
-    assert room_m(house, points, 2.0) == pytest.approx([1.0, 1.5, np.inf, 0.4], abs=1e-4)
+    assert clearance_m(house, points, 2.0) == pytest.approx([1.0, 1.5, np.inf, 0.4], abs=1e-4)
 
 
 def test_inside_a_house_there_is_no_way_to_the_sky_and_beside_it_there_is(house: RayScene) -> None:

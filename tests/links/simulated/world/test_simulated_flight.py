@@ -72,7 +72,7 @@ def test_velocity_turn_rate_and_force_are_those_of_the_poses(settings: FlightSet
     flight = Flight(DASH, settings, 14.0, 2)
     R, p = flight.flying_poses(TIMES)
     _, v, a, yaw = flight.at(TIMES)
-    rate, force = flight.felt(TIMES)
+    rate, force = flight.imu(TIMES)
     np.testing.assert_allclose(np.diff(p, axis=0) / 0.005, 0.5 * (v[1:] + v[:-1]), atol=0.01)
     np.testing.assert_allclose(_turns(R), 0.5 * (rate[1:] + rate[:-1]), atol=0.03)
     np.testing.assert_allclose(np.diff(v, axis=0) / 0.005, 0.5 * (a[1:] + a[:-1]), atol=0.3)
@@ -82,7 +82,7 @@ def test_velocity_turn_rate_and_force_are_those_of_the_poses(settings: FlightSet
 
 
 def test_limits_of_rate_and_lean_are_kept() -> None:
-    hard = CALM.model_copy(update={"rate_limit_degps": 30.0, "lean_limit_deg": 15.0, "yaw_rate_limit_degps": 20.0})
+    hard = CALM.model_copy(update={"rate_limit_degps": 30.0, "tilt_limit_deg": 15.0, "yaw_rate_limit_degps": 20.0})
     spin = Path(waypoints=(*DASH.waypoints[:-1], Waypoint(t_s=16, xyz_m=(40, 0, 10), yaw_deg=300)))
     R, _ = Flight(spin, hard, 14.0, 1).flying_poses(TIMES)
     rate_degps = np.degrees(np.abs(_turns(R)))
@@ -109,7 +109,7 @@ def test_outside_its_time_it_holds_its_ends() -> None:
 
 
 def test_an_impossible_drone_is_refused() -> None:
-    for wrong in ({"rate_lag_s": 0.001}, {"lean_limit_deg": 90.0}, {"gusts": 1.0}):
+    for wrong in ({"rate_lag_s": 0.001}, {"tilt_limit_deg": 90.0}, {"gusts": 1.0}):
         with pytest.raises(ValidationError):
             FlightSettings.model_validate(wrong)
 
@@ -119,7 +119,7 @@ def test_a_flight_that_goes_round_flies_each_round_like_the_first_and_its_seam_i
         Waypoint(t_s=4.0 * k, xyz_m=(5 * x, 5 * y, 8), yaw_deg=90 * k)
         for k, (x, y) in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)])
     )
-    flight = Flight(Path(waypoints=square, round_s=16.0), FlightSettings(gust_mps=1.0), 1.0, 3)
+    flight = Flight(Path(waypoints=square, period_s=16.0), FlightSettings(gust_mps=1.0), 1.0, 3)
     t = np.linspace(0.0, 15.99, 400)
     for now, later in zip(flight.flying_poses(t), flight.flying_poses(t + 48.0), strict=True):
         np.testing.assert_allclose(now, later, atol=1e-9)

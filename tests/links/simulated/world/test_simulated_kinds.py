@@ -7,9 +7,9 @@ import pytest
 
 from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.procedural import SceneSettings, build_world
-from links.simulated.world.procedural.atlanta import APART_DEG, odd_angles_deg
+from links.simulated.world.procedural.atlanta import MIN_SEPARATION_DEG, odd_angles_deg
 from links.simulated.world.procedural.build import KINDS
-from links.simulated.world.procedural.settings import Clear
+from links.simulated.world.procedural.settings import VehicleCorridor
 
 HEIGHT_M = 1.8
 BIN_DEG = 5.0
@@ -82,7 +82,7 @@ def test_odd_angles_stay_apart_from_each_other_and_from_the_road() -> None:
     for seed in range(20):
         angles = np.append(odd_angles_deg(np.random.default_rng(seed)), 0.0)
         apart = np.abs(angles[:, None] - angles)[np.triu_indices(len(angles), 1)] % 90
-        assert np.minimum(apart, 90 - apart).min() >= APART_DEG - 1e-9
+        assert np.minimum(apart, 90 - apart).min() >= MIN_SEPARATION_DEG - 1e-9
 
 
 def test_a_campus_has_two_pairs_lawns_and_room() -> None:
@@ -132,12 +132,12 @@ def test_nothing_parks_or_drives_where_the_vehicle_goes() -> None:
 
 
 def test_a_way_is_as_wide_as_the_vehicle_and_as_long() -> None:
-    clear = Clear(np.column_stack([np.linspace(0, 10, 11), np.zeros(11)]))
-    assert not clear.allows(5.0 - 2.0, 0.0, 0.5)
-    assert not clear.allows(0.0, 1.4, 0.5)
-    assert clear.allows(0.0, 1.6, 0.5)
-    assert not clear.allows(12.8, 0.0, 0.5)
-    assert clear.allows(13.0, 0.0, 0.5)
+    corridor = VehicleCorridor(np.column_stack([np.linspace(0, 10, 11), np.zeros(11)]))
+    assert not corridor.allows(5.0 - 2.0, 0.0, 0.5)
+    assert not corridor.allows(0.0, 1.4, 0.5)
+    assert corridor.allows(0.0, 1.6, 0.5)
+    assert not corridor.allows(12.8, 0.0, 0.5)
+    assert corridor.allows(13.0, 0.0, 0.5)
 
 
 def test_turning_the_vehicle_turns_the_scene_the_other_way() -> None:

@@ -55,7 +55,7 @@ def test_times_that_do_not_grow_are_refused() -> None:
 def test_a_round_closes_smoothly_and_its_yaw_goes_on_by_whole_turns() -> None:
     corners = [(5, 0), (0, 5), (-5, 0), (0, -5)]
     points = tuple(Waypoint(t_s=2.0 + 4 * k, xyz_m=(*xy, 6), yaw_deg=90 * k) for k, xy in enumerate(corners))
-    path = Path(waypoints=points, round_s=16.0)
+    path = Path(waypoints=points, period_s=16.0)
     t = np.linspace(0.0, 16.0, 50)
     one, third = path.at(t), path.at(t + 32.0)
     for a, b in zip(one[:3], third[:3], strict=True):
@@ -65,13 +65,13 @@ def test_a_round_closes_smoothly_and_its_yaw_goes_on_by_whole_turns() -> None:
     seam = path.at(np.array([18.0 - 1e-7, 18.0 + 1e-7]))
     for values in seam:
         np.testing.assert_allclose(values[0], values[1], atol=1e-5)
-    still = Path(waypoints=points[:1], round_s=1.0).at(t)
+    still = Path(waypoints=points[:1], period_s=1.0).at(t)
     np.testing.assert_allclose(still[0], [[5, 0, 6]] * 50)
 
 
 @pytest.mark.parametrize(
-    ("round_s", "says"), [(14.0, "before the first one comes again"), (20.04, "tenths of a second")]
+    ("period_s", "says"), [(14.0, "before the first one comes again"), (20.04, "tenths of a second")]
 )
-def test_a_round_that_cannot_be_gone_is_refused(round_s: float, says: str) -> None:
+def test_a_round_that_cannot_be_gone_is_refused(period_s: float, says: str) -> None:
     with pytest.raises(ValidationError, match=says):
-        Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(t, 0, 5)) for t in (0.0, 14.0)), round_s=round_s)
+        Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(t, 0, 5)) for t in (0.0, 14.0)), period_s=period_s)

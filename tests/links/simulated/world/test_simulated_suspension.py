@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from links.simulated.world.path import Path, Waypoint
-from links.simulated.world.suspension import Ride, RideSettings, oscillate
+from links.simulated.world.suspension import SuspendedPath, SuspensionSettings, oscillate
 
-SMOOTH = RideSettings(roughness_deg=0.0)
+SMOOTH = SuspensionSettings(roughness_deg=0.0)
 TIMES = np.arange(0.0, 6.0, 0.01)
 
 
@@ -22,7 +22,7 @@ class Steady(Path):
 
 def _steady(*acceleration: float) -> np.ndarray:
     path = Steady(waypoints=(Waypoint(t_s=0, xyz_m=(acceleration[0], acceleration[1], 0.0)),))
-    return Ride(path, SMOOTH, 6.0, 1).level_poses(np.array([5.0]))[0][0]
+    return SuspendedPath(path, SMOOTH, 6.0, 1).level_poses(np.array([5.0]))[0][0]
 
 
 def test_speeding_up_lifts_the_nose_and_braking_drops_it() -> None:
@@ -40,7 +40,7 @@ def test_in_a_bend_to_the_left_the_left_side_rises() -> None:
 def test_a_parked_vehicle_is_level_whatever_the_road() -> None:
     parked = Path(waypoints=(Waypoint(t_s=0, xyz_m=(1, 2, 0), yaw_deg=30),))
     for got, wanted in zip(
-        Ride(parked, RideSettings(), 6.0, 1).level_poses(TIMES), parked.level_poses(TIMES), strict=True
+        SuspendedPath(parked, SuspensionSettings(), 6.0, 1).level_poses(TIMES), parked.level_poses(TIMES), strict=True
     ):
         np.testing.assert_allclose(got, wanted, atol=1e-12)
 
@@ -53,10 +53,10 @@ def test_the_springs_overshoot_and_settle() -> None:
 
 def test_the_road_shakes_a_driven_vehicle_and_the_camera_swings_with_it() -> None:
     drive = Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(8 * t, 0, 0)) for t in (0, 10, 20)))
-    R, p = Ride(drive, RideSettings(), 20.0, 1).level_poses(np.arange(0, 20, 0.01))
+    R, p = SuspendedPath(drive, SuspensionSettings(), 20.0, 1).level_poses(np.arange(0, 20, 0.01))
     roll = np.degrees(np.arctan2(R[:, 2, 1], R[:, 2, 2]))
     assert 0.1 < roll.std() < 0.6
     np.testing.assert_allclose(p[:, 1], 1.3 * R[:, 1, 2], atol=1e-9)
-    same, other = (Ride(drive, RideSettings(), 20.0, seed).level_poses(TIMES)[0] for seed in (1, 2))
-    np.testing.assert_array_equal(same, Ride(drive, RideSettings(), 20.0, 1).level_poses(TIMES)[0])
+    same, other = (SuspendedPath(drive, SuspensionSettings(), 20.0, seed).level_poses(TIMES)[0] for seed in (1, 2))
+    np.testing.assert_array_equal(same, SuspendedPath(drive, SuspensionSettings(), 20.0, 1).level_poses(TIMES)[0])
     assert np.abs(same - other).max() > 1e-3

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from links.simulated.kernels.lidar import APERTURE_M, FOOTPRINT_RAD
-from links.simulated.matrix.sim_vs_real import Still
+from links.simulated.matrix.sim_vs_real import StaticScene
 from links.simulated.sensors.lidar import Lidar, LidarSettings
 from links.simulated.world.mesh import RayScene, quads
 from links.simulated.world.weather import CLUTTER_REACH_M, RainClutter, Weather, haze_extinction_per_m
@@ -26,7 +26,7 @@ def _fire(mesh, sequences: int, weather: Weather, batches: int = 1, **settings):
     lidar = Lidar(LidarSettings(laser_bias_m=0.0, dropout=0.0, **settings), START_NS, 1, weather)
     stamps = START_NS + vlp16.SEQUENCE_NS * np.arange(sequences)[:, None] + vlp16.PULSE_NS * np.arange(16)
     stamps = stamps.ravel().astype(np.int64)
-    eye, around, found = np.eye(3), Still(mesh), []
+    eye, around, found = np.eye(3), StaticScene(mesh), []
     for part in np.split(stamps, batches):
         pulses = lidar.fire(part, np.broadcast_to(eye, (len(part), 3, 3)).copy(), np.zeros((len(part), 3)), around)
         found.append((pulses.range_m[0], pulses.reflectivity[0]))

@@ -10,7 +10,7 @@ from links.simulated.world.drone import DroneModel, drone_mesh
 from links.simulated.world.mesh import SURFACE_NAMES, RayScene, box, merge, rod
 from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.procedural import SceneSettings, world_mesh
-from links.simulated.world.procedural.parts import dashes, house_row
+from links.simulated.world.procedural.parts import building_row, dashes
 from links.simulated.world.scene import Body, Scene, Truth, drone_shapes
 from links.simulated.world.vehicle import vehicle_mesh
 from stages.geometry import rotation_from_rpy_deg
@@ -150,7 +150,7 @@ def test_a_face_knows_its_normal_and_its_surface() -> None:
 def test_a_row_of_houses_has_none_of_no_width() -> None:
     for seed in range(190, 240):
         rng = np.random.default_rng(seed)
-        row = house_row(float(rng.uniform(18, 42)), 12.0, (9.0, 20.0), rng)
+        row = building_row(float(rng.uniform(18, 42)), 12.0, (9.0, 20.0), rng)
         a, b, c = (row.vertices_m[row.faces[:, i]] for i in range(3))
         assert np.linalg.norm(np.cross(b - a, c - a), axis=1).min() > 1e-3
 

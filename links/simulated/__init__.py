@@ -1,4 +1,4 @@
-"""A simulated world and sensors that give the same bytes as the hardware.
+"""Simulator of the rig: world, sensors, servo and autopilot. It produces the bytes that the hardware sends.
 
 Source: ours.
 """

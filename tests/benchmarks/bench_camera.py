@@ -43,10 +43,10 @@ def cameras(kind: str, size_px: int) -> tuple[Camera, Camera]:
 
 
 @pytest.mark.parametrize("kind", ["street", "manhattan", "park_edge"])
-@pytest.mark.parametrize("carrier", ["vehicle", "drone"])
+@pytest.mark.parametrize("platform", ["vehicle", "drone"])
 @pytest.mark.parametrize("size_px", [720, 1440])
-def test_one_frame(benchmark, kind, carrier, size_px):
-    camera = dict(zip(("vehicle", "drone"), cameras(kind, size_px), strict=True))[carrier]
+def test_one_frame(benchmark, kind, platform, size_px):
+    camera = dict(zip(("vehicle", "drone"), cameras(kind, size_px), strict=True))[platform]
     stamp_ns = load_scenario(SCENARIO).start_ns + 10**9
     benchmark.pedantic(camera.image, args=(stamp_ns,), rounds=4, warmup_rounds=1)
 

@@ -1,1 +1,1 @@
-"""The simulated autopilot: its MAVLink messages, its radio link, and how it treats external poses."""
+"""The simulated autopilot: its MAVLink messages, its radio link, and its use of external poses."""

@@ -1,4 +1,4 @@
-"""What ArduPilot takes of an external pose: VISO_TYPE 1, EKF3 with position and yaw from it.
+"""How ArduPilot uses an external pose: VISO_TYPE 1, EKF3 with position and yaw from it.
 
 Source: https://github.com/ArduPilot/ardupilot, libraries/AP_VisualOdom (AP_VisualOdom_MAV.cpp, _Backend.cpp),
 GCS_MAVLink (GCS_MAVLINK::handle_odometry), AP_NavEKF3 (writeExtNavData; gates and retry times of AP_NavEKF3.h), AP_RTC
@@ -32,7 +32,7 @@ mavlink: Any = ardupilotmega
 
 @dataclass(slots=True)
 class JitterCorrection:
-    """ArduPilot's map from a sender's clock to its own [us]: the promptest message came without delay."""
+    """ArduPilot's map from the sender's clock to its own [us]: the message with the least lag has no delay."""
 
     max_lag_us: int = 500_000
     convergence_loops: int = 100
@@ -41,7 +41,7 @@ class JitterCorrection:
     _count: int = 0
 
     def local_us(self, sent_us: int, arrival_us: int) -> int:
-        """When it was sent, on our clock."""
+        """The time of sending on the receiver's clock."""
         lag_us = arrival_us - sent_us
         if self._offset_us is None or lag_us < self._offset_us:
             self._offset_us = lag_us
@@ -57,7 +57,7 @@ class JitterCorrection:
 
 @dataclass(slots=True)
 class ArduPilotRules(Rules):
-    """ArduPilot with VISO_TYPE 1 and EKF3 taking position and yaw from it. Parameters by their names."""
+    """ArduPilot with VISO_TYPE 1 and EKF3 with external position and yaw. Parameters have their ArduPilot names."""
 
     viso_pos_m_nse: float = 0.2
     viso_yaw_m_nse: float = 0.2
@@ -66,16 +66,16 @@ class ArduPilotRules(Rules):
     gate: float = 5.0  # EK3_POS_I_GATE 500
     interval_ms: int = 20  # extNavIntervalMin_ms
     health_ms: int = 300  # AP_VISUALODOM_TIMEOUT_MS
-    retry_s: float = 7.0  # posRetryTimeNoVel_ms: gated that long, it starts anew from the pose
+    retry_s: float = 7.0  # posRetryTimeNoVel_ms: after this time outside the gate it resets to the pose
     _jitter: JitterCorrection = field(default_factory=JitterCorrection)
     _last_ms: int | None = None
 
     def healthy(self, now_ns: int) -> bool:
-        """AP_VisualOdom_Backend::healthy: also of messages that are not fused."""
+        """AP_VisualOdom_Backend::healthy; messages that are not fused count too."""
         return self._last_received_ns is not None and now_ns - self._last_received_ns < self.health_ms * MS
 
     def fusing(self, now_ns: int) -> bool:
-        """Not in constant position mode."""
+        """Whether it is not in constant position mode."""
         return self._last_fused_ns is not None and now_ns - self._last_fused_ns < self.retry_s * 1e9
 
     def report(self, now_ns: int) -> Any:
@@ -86,7 +86,7 @@ class ArduPilotRules(Rules):
     def _process(self, message: Any, now_ns: int) -> PoseResult:
         odometry = message.get_type() == "ODOMETRY"
         if odometry and (message.frame_id != LOCAL_FRD or message.child_frame_id != BODY_FRD):
-            return PoseResult.WRONG_FRAME  # a bare return: not even health
+            return PoseResult.WRONG_FRAME  # returns early: does not count for health
         sent_us = message.time_usec if odometry else message.usec
         time_ms = self._jitter.local_us(sent_us, now_ns // US) // 1000
         xyz, R, velocity, upper = pose_of(message)
@@ -113,8 +113,8 @@ class ArduPilotRules(Rules):
         return self._fuse(pose, now_ns)
 
     def _fuse(self, pose: ExternalPose, now_ns: int) -> PoseResult:
-        was, self._reset_counter = self._reset_counter, pose.reset_counter
-        if self.estimate is None or was != pose.reset_counter or not math.isfinite(pose.yaw_rad):
+        previous_counter, self._reset_counter = self._reset_counter, pose.reset_counter
+        if self.estimate is None or previous_counter != pose.reset_counter or not math.isfinite(pose.yaw_rad):
             return self._reset_to(pose, now_ns) if math.isfinite(pose.yaw_rad) else PoseResult.NOT_FINITE
         self.ratios = self.estimate.ratios(pose, self.gate)
         if max(self.ratios) > 1:
@@ -125,5 +125,5 @@ class ArduPilotRules(Rules):
 
 
 def _cube_root(variances: list[float]) -> float:
-    """handle_odometry's error of three variances: cbrt(a^2 + b^2 + c^2)."""
+    """Error that handle_odometry computes from three variances: cbrt(a^2 + b^2 + c^2)."""
     return math.cbrt(sum(v * v for v in variances))

@@ -1,17 +1,17 @@
-"""The drone's autopilot: flies, estimates, and says so in MAVLink 2, on its own clock and over a radio.
+"""The drone's autopilot: it flies, estimates its motion, and sends MAVLink 2, with its own clock, over a radio link.
 
-The estimate is the truth with `drift`'s errors, in a local frame of its own: origin where the scenario begins, north
-anywhere. Like ArduPilot it sends HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, ODOMETRY (LOCAL_FRD, BODY_FRD), RAW_IMU (mg,
-mrad/s), a TIMESYNC request each 10 s, and answers the host's; the host's own requests go to /autopilot/tx.
-A frame is sampled on the autopilot's clock, leaves a little later with its main loop, and takes the radio.
+Its estimate is the truth with the errors of `drift`, in a local frame with its origin at the start of the scenario and
+any north. Like ArduPilot it sends HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, ODOMETRY (LOCAL_FRD, BODY_FRD), RAW_IMU (mg,
+mrad/s) and a TIMESYNC request every 10 s, and replies to those of the host, which are recorded on /autopilot/tx. A
+message is sampled on the autopilot's clock, sent by its main loop a little later, and delayed by the radio.
 
-Where a real flight differs (dronekit's copter log over a SiK telemetry radio; ours is a companion's link):
-  MAVLink 1; each message at 2.7 Hz, no ODOMETRY, no TIMESYNC; 45 gaps, the longest 18.8 s; a reboot in mid-log
-  ATTITUDE heard 356 / 723 / 1460 ms late (p50 / p90 / p99, over its promptest); ours 11 / 18 / 26 ms
+Differences to a real flight (copter log of dronekit over a SiK telemetry radio; ours is the link of a companion):
+  MAVLink 1; each message at 2.7 Hz, no ODOMETRY, no TIMESYNC; 45 gaps, the longest 18.8 s; a reboot during the log
+  delay of ATTITUDE over its minimum 356 / 723 / 1460 ms (p50 / p90 / p99); ours 11 / 18 / 26 ms
   vibration of 9 / 19 / 34 m/s^2 (x / y / z, mean in flight); ours 0.6
 
-Source: https://mavlink.io/en/messages/common.html; ArduPilot 4.5 GCS_MAVLINK (fields, units, TIMESYNC); sizes of the
-errors are ours.
+Source: https://mavlink.io/en/messages/common.html; ArduPilot 4.5 GCS_MAVLINK (fields, units, TIMESYNC). The sizes of
+the errors are ours.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSetting
 from links.simulated.world.flight import Flight, FlightSettings
 from stages.geometry import Array64
 
-mavlink: Any = ardupilotmega  # its constructors are spread with starred vectors, which no checker can count
+mavlink: Any = ardupilotmega  # Any: starred vectors fill its constructors, which a type checker cannot count
 
 STANDARD_GRAVITY_MPS2 = 9.80665
-GUIDED = 4  # ArduCopter's mode number
-LOOP_S = 1 / 400  # a sample leaves within one main loop
+GUIDED = 4  # mode number of ArduCopter
+LOOP_S = 1 / 400  # period of the main loop, within which a sample is sent
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the host
 OWN_TIMESYNC_S = 10.0
 QUALITY_PERCENT = 100
@@ -49,31 +49,31 @@ INT16 = 32767
 
 
 class AutopilotSettings(BaseModel):
-    """The autopilot: how it flies, what it sends how often, and how wrong it is."""
+    """Flight, message rates and errors of the autopilot."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     flight: FlightSettings = FlightSettings()
     drift: DriftSettings = DriftSettings()
-    heading_of_world_x_deg: float = Field(default=57.0, ge=-360, le=360)  # on its compass: clockwise from its north
+    heading_of_world_x_deg: float = Field(default=57.0, ge=-360, le=360)  # clockwise from its north
     attitude_hz: float = Field(default=50.0, ge=0, le=400)  # 0: not sent
     position_hz: float = Field(default=30.0, ge=0, le=400)
     odometry_hz: float = Field(default=30.0, ge=0, le=400)
     imu_hz: float = Field(default=100.0, ge=0, le=400)
-    timesync_hz: float = Field(default=1.0, ge=0, le=50)  # the host's requests
-    gyro_noise_degps: float = Field(default=0.5, ge=0)  # each RAW_IMU sample, vibration included
-    gyro_bias_degps: float = Field(default=0.3, ge=0)  # one sigma, drawn once
+    timesync_hz: float = Field(default=1.0, ge=0, le=50)  # requests of the host
+    gyro_noise_degps: float = Field(default=0.5, ge=0)  # per RAW_IMU sample, with vibration
+    gyro_bias_degps: float = Field(default=0.3, ge=0)  # one sigma, constant in a run
     accelerometer_noise_mps2: float = Field(default=0.6, ge=0)
     accelerometer_bias_mps2: float = Field(default=0.08, ge=0)
     rate_noise_degps: float = Field(default=0.2, ge=0)  # of the estimated turn rate
-    boot_s: float = Field(default=312.25, ge=1, le=4_000_000)  # time since boot when the scenario begins
-    clock_ppm: float = Field(default=18.0, ge=-1000, le=1000)  # fast against the host's clock
+    boot_s: float = Field(default=312.25, ge=1, le=4_000_000)  # time since boot at the start of the scenario
+    clock_ppm: float = Field(default=18.0, ge=-1000, le=1000)  # positive: faster than the host's clock
     downlink: RadioSettings = RadioSettings()
     uplink: RadioSettings = RadioSettings()
 
 
 class Autopilot:
-    """Everything the autopilot sends, and the host's TIMESYNC requests, in the order of sending."""
+    """All messages of the autopilot, and the TIMESYNC requests of the host, in the order of sending."""
 
     def __init__(
         self, settings: AutopilotSettings, flight: Flight, start_ns: int, duration_s: float, seed: int
@@ -114,7 +114,7 @@ class Autopilot:
         return round(1e9 * self._settings.boot_s) + since_ns + round(1e-6 * self._settings.clock_ppm * since_ns)
 
     def records(self, until_ns: int) -> list[Record]:
-        """What was sent before `until_ns` and since the call before; /autopilot/rx is stamped with its arrival."""
+        """Messages sent before `until_ns` that were not returned yet; /autopilot/rx is stamped with its arrival."""
         records: list[Record] = []
         while self._requests and self._requests[-1][0] < until_ns:
             at_ns, frame = self._requests.pop()
@@ -134,11 +134,11 @@ class Autopilot:
         duration_s: float,
         messages: Callable[[Array64, NDArray[np.int64]], list[Any]],
     ) -> None:
-        """Sample at even times of the autopilot's clock, send with the main loop."""
+        """Schedule messages: sampled at a constant rate on the autopilot's clock, sent by the main loop."""
         if rate_hz == 0:
             return
         ratio = 1 + 1e-6 * self._settings.clock_ppm
-        first_s = (-self._settings.boot_s) % (1 / rate_hz) + phase_s  # even times are counted from boot
+        first_s = (-self._settings.boot_s) % (1 / rate_hz) + phase_s  # sample times are multiples of the period
         time_s = np.arange(first_s / ratio, duration_s, 1 / rate_hz / ratio)
         host_ns = self._start_ns + np.rint(1e9 * time_s).astype(np.int64)
         device_ns = np.array([self.device_ns(ns) for ns in host_ns.tolist()], dtype=np.int64)
@@ -148,12 +148,12 @@ class Autopilot:
     def _plan_timesync(self, duration_s: float, uplink: Radio) -> None:
         rate_hz = self._settings.timesync_hz
         for at_s in np.arange(0.3 / rate_hz, duration_s, 1 / rate_hz) if rate_hz else ():
-            asked_ns = self._start_ns + round(1e9 * at_s)
-            frame = _packed(mavlink.MAVLink_timesync_message(0, asked_ns), self._host)
-            self._requests.append((asked_ns, frame))
-            received_ns = uplink.arrival_ns(asked_ns, len(frame))
+            request_ns = self._start_ns + round(1e9 * at_s)
+            frame = _packed(mavlink.MAVLink_timesync_message(0, request_ns), self._host)
+            self._requests.append((request_ns, frame))
+            received_ns = uplink.arrival_ns(request_ns, len(frame))
             if received_ns is not None:
-                reply = mavlink.MAVLink_timesync_message(self.device_ns(received_ns), asked_ns)
+                reply = mavlink.MAVLink_timesync_message(self.device_ns(received_ns), request_ns)
                 self._waiting.append((received_ns + round(1e9 * self._rng.uniform(0.05, 1.0) * LOOP_S), reply))
 
     def _heartbeats(self, time_s: Array64, device_ns: NDArray[np.int64]) -> list[Any]:
@@ -233,7 +233,7 @@ class Autopilot:
 
 
 def _packed(message: Any, sender: Any) -> bytes:
-    """The frame of a message, numbered after the sender's last one."""
+    """The frame of a message, with the next sequence number of the sender."""
     frame = bytes(message.pack(sender))
     sender.seq = (sender.seq + 1) % 256
     return frame

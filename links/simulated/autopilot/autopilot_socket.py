@@ -1,13 +1,13 @@
-"""The simulated autopilot on a UDP socket, in real time: speaks, answers, and takes or leaves our poses by its rules.
+"""The simulated autopilot on a UDP socket, in real time: it sends, replies, and uses external poses by its rules.
 
-What it says of its flight comes from `links.simulated.autopilot.autopilot.Autopilot`, sent when it is due; without one
-it stands on the ground and says HEARTBEAT alone. It answers TIMESYNC, PARAM_REQUEST_READ and the request for its
-origin, takes an origin where it has none, and reports its estimator five times a second as `rules` says.
+The messages about its flight come from `links.simulated.autopilot.autopilot.Autopilot`, each sent at its time. Without
+a flight it is on the ground and sends HEARTBEAT alone. It replies to TIMESYNC, PARAM_REQUEST_READ and requests for its
+origin, accepts an origin if it has none, and reports its estimator five times a second according to `rules`.
 
     with AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", port)) as drone:
         drone.wait_for(lambda: drone.rules.results[PoseResult.FUSED] > 10)
 
-Source: ours; https://mavlink.io/en/services/timesync.html, /parameter.html; ArduPilot GCS_MAVLINK for who answers what.
+Source: ours; https://mavlink.io/en/services/timesync.html, /parameter.html; ArduPilot GCS_MAVLINK for the replies.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from links.simulated.autopilot.rules import Rules
 mavlink: Any = ardupilotmega
 
 Address = tuple[str, int]
-STEP_S = 0.002  # how exactly a frame leaves when it is due
-BOOT_NS = 100_000_000_000  # since boot when it begins, without a flight
+STEP_S = 0.002  # resolution of the send times
+BOOT_NS = 100_000_000_000  # time since boot at the start, without a flight
 REPORT_HZ = 5.0
 PX4_TIMESYNC_HZ = 10.0
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN, UNSUPPORTED = 512, 49, 3
 REAL32, INT32 = 9, 6  # MAV_PARAM_TYPE
-MAX_RECEIVED = 10_000  # messages kept
+MAX_RECEIVED = 10_000  # received messages that are kept
 
 
 class AutopilotSocket:
-    """One autopilot. `heard` has (its clock [ns], message) of what came; `origin` is (lat, lon, alt) as MAVLink's."""
+    """One autopilot. `received`: (time on its clock [ns], message); `origin`: (lat, lon, alt) in MAVLink's units."""
 
     def __init__(
         self,
         rules: Rules,
         *,
-        send_to: Address | None = None,  # None: whoever speaks first is answered
+        send_to: Address | None = None,  # None: the sender of the first message
         bind: Address = ("127.0.0.1", 0),
         flight: Autopilot | None = None,
-        scenario_ns: Callable[[], int] = time.monotonic_ns,  # time in the flight's scenario
+        scenario_ns: Callable[[], int] = time.monotonic_ns,  # time in the scenario of the flight
         parameters: Mapping[str, float] | None = None,
         origin: tuple[int, int, int] | None = None,
         system_id: int = 1,
@@ -60,7 +60,7 @@ class AutopilotSocket:
         self.parameters = dict(parameters or {})
         self.received: deque[tuple[int, Any]] = deque(maxlen=MAX_RECEIVED)
         self.silent = False
-        """Says and hears nothing while set: a radio in a shadow."""
+        """While set it sends and receives nothing, as in a radio shadow."""
         self._to_send: deque[Any] = deque()
         self._flight, self._scenario_ns = flight, scenario_ns
         self._begin_ns = scenario_ns()
@@ -88,27 +88,27 @@ class AutopilotSocket:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The port on which it listens."""
         return self._socket.getsockname()[1]
 
     def device_ns(self) -> int:
-        """Its time since boot, now."""
+        """Its current time since boot."""
         if self._flight is not None:
             return self._flight.device_ns(self._scenario_ns())
         return BOOT_NS + self._scenario_ns() - self._begin_ns
 
     def messages(self, kind: str) -> list[Any]:
-        """What was heard of one type."""
+        """The received messages of one type."""
         with self._changed:
             return [message for _, message in self.received if message.get_type() == kind]
 
     def wait_for(self, predicate: Callable[[], bool], timeout_s: float = 10.0) -> bool:
-        """Wait until something is true; looked at with each message that comes."""
+        """Wait until a condition holds; it is checked with each received message."""
         with self._changed:
             return self._changed.wait_for(predicate, timeout_s)
 
     def send(self, message: Any) -> None:
-        """Send a message, from its own thread."""
+        """Send a message, from the thread of the socket."""
         self._to_send.append(message)
 
     def _run(self) -> None:
@@ -117,7 +117,7 @@ class AutopilotSocket:
             if ready:
                 try:
                     data, source = self._socket.recvfrom(2048)
-                except OSError:  # the other side's port is closed just now
+                except OSError:  # the port of the other side is closed
                     continue
                 if not self.silent:
                     self._receive(data, source)
@@ -133,18 +133,18 @@ class AutopilotSocket:
                 self.received.append((now_ns, message))
                 self.rules.receive(message, now_ns)
                 self._changed.notify_all()
-            self._answer(message)
+            self._handle(message)
 
-    def _answer(self, message: Any) -> None:
+    def _handle(self, message: Any) -> None:
         kind = message.get_type()
         if kind == "TIMESYNC" and message.tc1 == 0:
             self._send(mavlink.MAVLink_timesync_message(self.device_ns(), message.ts1))
         elif kind == "PARAM_REQUEST_READ" and message.param_id in self.parameters:
             self._send(self._parameter(message.param_id))
         elif kind == "COMMAND_LONG":
-            asked = message.command == REQUEST_MESSAGE and message.param1 == GPS_GLOBAL_ORIGIN
-            self._send(mavlink.MAVLink_command_ack_message(message.command, 0 if asked else UNSUPPORTED))
-            if asked:
+            is_origin_request = message.command == REQUEST_MESSAGE and message.param1 == GPS_GLOBAL_ORIGIN
+            self._send(mavlink.MAVLink_command_ack_message(message.command, 0 if is_origin_request else UNSUPPORTED))
+            if is_origin_request:
                 self._send_origin()
         elif kind == "SET_GPS_GLOBAL_ORIGIN" and self.origin is None:
             self.origin = message.latitude, message.longitude, message.altitude
@@ -156,11 +156,11 @@ class AutopilotSocket:
 
     def _parameter(self, name: str) -> Any:
         value = self.parameters[name]
-        place = name.encode(), len(self.parameters), list(self.parameters).index(name)
+        count, index = len(self.parameters), list(self.parameters).index(name)
         if self._px4 and value == int(value):
-            held = struct.unpack("<f", struct.pack("<i", int(value)))[0]
-            return mavlink.MAVLink_param_value_message(place[0], held, INT32, *place[1:])
-        return mavlink.MAVLink_param_value_message(place[0], float(value), REAL32, *place[1:])
+            as_float = struct.unpack("<f", struct.pack("<i", int(value)))[0]
+            return mavlink.MAVLink_param_value_message(name.encode(), as_float, INT32, count, index)
+        return mavlink.MAVLink_param_value_message(name.encode(), float(value), REAL32, count, index)
 
     def _send_due(self) -> None:
         while self._to_send:
@@ -168,9 +168,9 @@ class AutopilotSocket:
         if self._flight is not None:
             for record in self._flight.records(self._scenario_ns()):
                 if record.topic == "/autopilot/rx":
-                    self._pass_on(record.data)
+                    self._forward(record.data)
         elif self._due("beat", 1.0):
-            beat = (2, 12 if self._px4 else 3, 0, 0, 3, 3)  # quadrotor, kind of autopilot, standby
+            beat = (2, 12 if self._px4 else 3, 0, 0, 3, 3)  # quadrotor, autopilot type, standby
             self._send(mavlink.MAVLink_heartbeat_message(*beat))
         if self._due("report", REPORT_HZ):
             with self._changed:
@@ -179,8 +179,8 @@ class AutopilotSocket:
         if self._px4 and self._due("timesync", PX4_TIMESYNC_HZ):
             self._send(mavlink.MAVLink_timesync_message(0, self.device_ns()))
 
-    def _pass_on(self, frame: bytes) -> None:
-        """A frame of the flight, numbered with what is sent here; its answers to the simulated host are not ours."""
+    def _forward(self, frame: bytes) -> None:
+        """Send a message of the flight with a sequence number of this socket, but no reply to the simulated host."""
         message = parse_frame(frame)
         if not (message.get_type() == "TIMESYNC" and message.tc1 != 0):
             self._send(message)
@@ -197,5 +197,5 @@ class AutopilotSocket:
             return
         try:
             self._socket.sendto(packed(message, self._mav), self._peer)
-        except OSError:  # nobody is there, or the buffer is full: as on a radio
+        except OSError:  # no receiver, or the buffer is full: lost, as on a radio
             return

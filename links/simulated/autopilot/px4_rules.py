@@ -1,6 +1,6 @@
-"""What PX4 takes of an external pose: EKF2_EV_CTRL position and yaw, without GPS and compass.
+"""How PX4 uses an external pose: EKF2_EV_CTRL position and yaw, without GPS and compass.
 
-A message is true when it arrives here: the filter over TIMESYNC replies, by which PX4 maps times, is not modelled.
+A message has the time of its arrival: PX4's filter over TIMESYNC replies, which maps times, is not modelled.
 
 Source: https://github.com/PX4/PX4-Autopilot, src/modules/mavlink/mavlink_receiver.cpp (handle_message_odometry),
 src/modules/ekf2/EKF/aid_sources/external_vision (ev_control.cpp, ev_pos_control.cpp, ev_yaw_control.cpp), common.h.
@@ -33,7 +33,7 @@ mavlink: Any = ardupilotmega
 
 @dataclass(slots=True)
 class Px4Rules(Rules):
-    """PX4 with EKF2_EV_CTRL position and yaw, without GPS and compass. Parameters by their names."""
+    """PX4 with EKF2_EV_CTRL position and yaw, without GPS and compass. Parameters have their PX4 names."""
 
     ekf2_evp_noise: float = 0.1
     ekf2_eva_noise: float = 0.1
@@ -44,7 +44,7 @@ class Px4Rules(Rules):
     failing_s: float = 1.0  # no_aid_timeout_max
     resets_left: int = 5  # _nb_ev_pos_reset_available, in the air
     _fusing: bool = False
-    _last_ns: int | None = None  # newest sample's time
+    _last_ns: int | None = None  # time of the newest sample
     _last_quality: int = 0
 
     def healthy(self, now_ns: int) -> bool:
@@ -52,7 +52,7 @@ class Px4Rules(Rules):
         return self.fusing(now_ns)
 
     def fusing(self, now_ns: int) -> bool:
-        """Started, and not stopped by 400 ms of nothing."""
+        """Whether it has started and was not stopped by 400 ms without messages."""
         if self._last_received_ns is None or now_ns - self._last_received_ns > 2 * self.interval_ms * MS:
             self._fusing = False
         return self._fusing
@@ -66,7 +66,7 @@ class Px4Rules(Rules):
 
     def _process(self, message: Any, now_ns: int) -> PoseResult:
         if message.get_type() != "ODOMETRY":
-            return PoseResult.WRONG_FRAME  # read as north-oriented, and without a compass its yaw is not aligned
+            return PoseResult.WRONG_FRAME  # taken as north-oriented, and without a compass its yaw is not aligned
         if message.estimator_type not in (0, 1, 2, 3):
             return PoseResult.WRONG_ESTIMATOR
         if message.frame_id not in (LOCAL_NED, LOCAL_FRD):
@@ -92,7 +92,7 @@ class Px4Rules(Rules):
         gap_ns = None if self._last_ns is None else pose.time_ns - self._last_ns
         good = self.ekf2_ev_qmin <= 0 or min(pose.quality, self._last_quality) >= self.ekf2_ev_qmin
         self._last_quality = pose.quality
-        was, self._reset_counter = self._reset_counter, pose.reset_counter
+        previous_counter, self._reset_counter = self._reset_counter, pose.reset_counter
         self._last_received_ns = now_ns
         if self.ekf2_ev_qmin > 0 and pose.quality < self.ekf2_ev_qmin:
             return PoseResult.LOW_QUALITY
@@ -102,7 +102,7 @@ class Px4Rules(Rules):
                 return PoseResult.NOT_STARTED
             self._fusing, self.resets_left = True, 5
             return self._reset_to(pose, now_ns)
-        if was != pose.reset_counter:
+        if previous_counter != pose.reset_counter:
             return self._reset_to(pose, now_ns)
         self.ratios = self.estimate.ratios(pose, self.gate)
         if max(self.ratios) <= 1:
@@ -119,5 +119,5 @@ class Px4Rules(Rules):
 
 
 def _at_least(variance: float, floor: float) -> float:
-    """Sigma of a variance, not below a floor; the floor where the message does not say."""
+    """Sigma of a variance, at least the floor; the floor where the message has no variance."""
     return max(math.sqrt(variance), floor) if variance > 0 else floor

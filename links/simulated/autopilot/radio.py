@@ -1,8 +1,8 @@
-"""A radio or serial line: what is sent comes late, in order, and sometimes not at all.
+"""A radio or serial link: frames arrive late, in order, and are sometimes lost.
 
     arrival_k = max(sent_k + latency + jitter, arrival_{k-1} + bytes_k * 10 / bitrate)
 
-jitter is exponential. Losses come in bursts (Gilbert): within a burst every frame is lost; outages lose all of a time.
+The jitter is exponential. Losses come in bursts (Gilbert): within a burst all frames are lost, as in an outage.
 
 Source: ours.
 """
@@ -22,8 +22,8 @@ class RadioSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    latency_s: float = Field(default=0.006, ge=0, le=5)  # the least there is
-    jitter_s: float = Field(default=0.004, ge=0, le=5)  # mean of what comes on top
+    latency_s: float = Field(default=0.006, ge=0, le=5)  # minimum
+    jitter_s: float = Field(default=0.004, ge=0, le=5)  # mean of the delay above the minimum
     bitrate_bps: float = Field(default=921_600.0, ge=9_600)
     loss_fraction: float = Field(default=0.0, ge=0, lt=1)
     loss_burst_frames: float = Field(default=3.0, ge=1)  # mean length of a burst
@@ -43,17 +43,17 @@ class Radio:
         self._settings = settings
         self._outages = [(start_ns + round(1e9 * a), start_ns + round(1e9 * b)) for a, b in settings.outages_s]
         self._rng = rng
-        self._losing = False
+        self._in_burst = False
         self._last_ns = start_ns
 
     def arrival_ns(self, sent_ns: int, size_bytes: int) -> int | None:
-        """When a frame arrives; None: it is lost."""
+        """Arrival time of a frame; None: it is lost."""
         s = self._settings
         jitter_s = self._rng.exponential(s.jitter_s) if s.jitter_s else 0.0
         end = 1 / s.loss_burst_frames
         begin = min(1.0, end * s.loss_fraction / (1 - s.loss_fraction))
-        self._losing = bool(self._rng.random() < (1 - end if self._losing else begin))
-        if self._losing or any(a <= sent_ns < b for a, b in self._outages):
+        self._in_burst = bool(self._rng.random() < (1 - end if self._in_burst else begin))
+        if self._in_burst or any(a <= sent_ns < b for a, b in self._outages):
             return None
         least_ns = self._last_ns + round(size_bytes * BITS_PER_BYTE / s.bitrate_bps * 1e9)
         self._last_ns = max(sent_ns + round(1e9 * (s.latency_s + jitter_s)), least_ns)

@@ -1,4 +1,4 @@
-"""Pixels of a camera: their rays in the world, and their values after noise, gain and gamma.
+"""Pixels of a camera: their rays in the world, and their values after noise, gain and gamma correction.
 
 Source: Kensler, Correlated multi-jittered sampling, Pixar 13-01 (2013); EMVA Standard 1288 release 4.0, section 2.
 """
@@ -18,6 +18,7 @@ STEPS = 4096  # of the analogue-to-digital converter
 
 @compiled
 def pixel_rays(pick, jitter, moment, R, t, direction, per_column, per_row):
+    """Origins and unit directions (n * rays_each, 3) in the world; see `camera_view.world_rays`."""
     rays_each = jitter.shape[1]
     grid = round(math.sqrt(rays_each))
     origins = np.empty((len(pick) * rays_each, 3), dtype=np.float32)
@@ -47,7 +48,7 @@ def pixel_rays(pick, jitter, moment, R, t, direction, per_column, per_row):
 
 @compiled
 def digitise(radiance, noise, electrons, full_well, read_noise, shot, gain, code):
-    """e = L S t; measured e + N(0, e + read^2); value = gain e / full well, quantised, through gamma."""
+    """8-bit values: e = L S t; measured e + N(0, e + read^2); value = gain e / full well, quantised, through gamma."""
     height, width, channels = radiance.shape
     out = np.empty(radiance.shape, dtype=np.uint8)
     for i in range(height):

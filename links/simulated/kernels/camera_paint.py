@@ -16,7 +16,7 @@ from stages.compiled import compiled
 
 PLAIN, BRICK, RENDERED, GLASS, ROAD, SLABS, LEAF, PAINT, GRASS = range(9)  # textures
 FRAME_M = 0.07  # width of a window frame
-SKY_PX = 768  # side of the sky map; its middle is the zenith, its inner circle reaches LOWEST_SKY_DEG below the horizon
+SKY_PX = 768  # side of the sky map: the zenith is its centre, the inscribed circle is LOWEST_SKY_DEG below the horizon
 LOWEST_SKY_DEG = 6.0
 
 
@@ -25,14 +25,15 @@ def shade(
     directions, points, normals, ranges, surface, tint, window, lit, pixel_rad, street,
     kinds, colours, others, noise, sun, sun_rgb, above, below, haze, extinction, sky,
 ):  # fmt: skip
+    """Linear RGB (n, 3) of samples; see `links.simulated.sensors.camera_paint.radiance`."""
     out = np.empty((len(surface), 3), dtype=np.float32)
-    colour, seen = np.empty(3), np.empty(3)
+    colour, emitted = np.empty(3), np.empty(3)
     for i in range(len(surface)):
         d = directions[i]
         s = surface[i]
         if s < 0:
-            _sky(d[0], d[1], d[2], sky, haze, seen)
-            out[i, 0], out[i, 1], out[i, 2] = seen[0], seen[1], seen[2]
+            _sky(d[0], d[1], d[2], sky, haze, emitted)
+            out[i, 0], out[i, 1], out[i, 2] = emitted[0], emitted[1], emitted[2]
             continue
         n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
         facing = -(n0 * d[0] + n1 * d[1] + n2 * d[2])
@@ -47,25 +48,25 @@ def shade(
         towards = n0 * sun[0] + n1 * sun[1] + n2 * sun[2]
         direct = max(towards, 0.0) if lit[i] else 0.0
         if kind == LEAF and lit[i]:
-            direct = max(direct, 0.5 * abs(towards))  # light comes through leaves
+            direct = max(direct, 0.5 * abs(towards))  # leaves transmit light
         up = 0.5 * (1.0 + n2)
         for j in range(3):
-            seen[j] = colour[j] * (direct * sun_rgb[j] + up * above[j] + (1.0 - up) * below[j])
+            emitted[j] = colour[j] * (direct * sun_rgb[j] + up * above[j] + (1.0 - up) * below[j])
         if gloss > 0.0:
-            mirror = gloss * (0.08 + 0.92 * (1.0 - facing) ** 5)  # Schlick, two faces of a pane
+            mirror = gloss * (0.08 + 0.92 * (1.0 - facing) ** 5)  # Schlick, both faces of a pane
             r0, r1, r2 = d[0] + 2 * facing * n0, d[1] + 2 * facing * n1, d[2] + 2 * facing * n2
             _sky(r0, r1, r2, sky, haze, colour)
             for j in range(3):
-                seen[j] = (1.0 - mirror) * seen[j] + mirror * min(colour[j], 4.0)
+                emitted[j] = (1.0 - mirror) * emitted[j] + mirror * min(colour[j], 4.0)
         clear = math.exp(-extinction * ranges[i])
         for j in range(3):
-            out[i, j] = clear * seen[j] + (1.0 - clear) * haze[j]
+            out[i, j] = clear * emitted[j] + (1.0 - clear) * haze[j]
     return out
 
 
 @compiled
 def _texture(kind, colour, p, n0, n1, n2, width, window, street, noise):
-    """Changes `colour` in place; returns how glossy the surface is (1: window glass)."""
+    """Modulates `colour` in place; returns the gloss of the surface (1: window glass)."""
     x = street[0] * p[0] - street[1] * p[1]
     y = street[1] * p[0] + street[0] * p[1] + street[2]
     z = p[2] - street[3]
@@ -112,7 +113,7 @@ def _texture(kind, colour, p, n0, n1, n2, width, window, street, noise):
 
 @compiled
 def _glass(colour, width, window):
-    """A frame around the pane and a mullion in its middle. window: place (2) and sides (2) of the pane [m]."""
+    """A frame around the pane and a mullion in its middle. window: position (2) on the pane and its sides (2) [m]."""
     w, h = window[2], window[3]
     if w <= 0.0:
         return 1.0
@@ -128,7 +129,7 @@ def _glass(colour, width, window):
 
 @compiled
 def _lane_marks(x, y, z, width, half):
-    """Share of paint: dashes in the middle, lines along the edges, a zebra crossing every 60 m. Street frame."""
+    """Fraction of paint: centre dashes, edge lines, a zebra crossing every 60 m. Street frame."""
     if half <= 0.0 or abs(y) > half or abs(z) > 0.05:
         return 0.0
     dash = _overlap(y, -0.06, 0.06, width) * _stripes(x, 9.0, 3.0, width)
@@ -140,7 +141,7 @@ def _lane_marks(x, y, z, width, half):
 
 @compiled
 def _overlap(x, low, high, width):
-    """Share of [x - width / 2, x + width / 2] that lies in [low, high]."""
+    """Fraction of [x - width / 2, x + width / 2] that lies in [low, high]."""
     return max(0.0, min(x + 0.5 * width, high) - max(x - 0.5 * width, low)) / width
 
 
@@ -155,7 +156,7 @@ def _stripes(x, period, stripe, width):
 
 @compiled
 def _noise(x, y, width, tile):
-    """The noise tile (one a unit) at (x, y), faded to its mean 0.5 when the sample is wider than its grain."""
+    """The noise tile (period 1) at (x, y), faded to its mean 0.5 when the sample is wider than the grain."""
     size = len(tile)
     fade = max(0.0, 1.0 - 6.0 * width)
     if fade == 0.0:
@@ -172,7 +173,7 @@ def _noise(x, y, width, tile):
 
 @compiled
 def _sky(x, y, z, sky, haze, rgb):
-    """Sky radiance along a unit direction, bilinear in the sky map; below the map, the distant ground's haze."""
+    """Sky radiance along a unit direction, bilinear in the sky map; below the map, the haze of the distant ground."""
     lowest = 0.5 * math.pi + math.radians(LOWEST_SKY_DEG)
     off = math.acos(min(max(z, -1.0), 1.0))
     if off >= lowest:

@@ -18,7 +18,7 @@ LIFT_M = 0.01  # offset of a shadow ray's origin from the surface
 
 @compiled
 def describe_hits(pick, face, u, v, normal, surface, tint, half, side, normals_out, surface_out, tint_out, window_out):
-    """Copy what is known of each hit face to samples pick[i]; the place on a quadrilateral from the barycentrics."""
+    """Copy attributes of each hit face to samples pick[i]; the position on a quadrilateral is from the barycentrics."""
     for i in range(len(pick)):
         f, k = face[i], pick[i]
         if f < 0:
@@ -37,7 +37,7 @@ def describe_hits(pick, face, u, v, normal, surface, tint, half, side, normals_o
 
 @compiled
 def rotate_normals(pick, moment, R, normals):
-    """Normals of samples `pick` from the body's frame to the world's."""
+    """Rotate the normals of samples `pick` from the frame of the body to the world frame."""
     for k in pick:
         a, b, c = normals[k, 0], normals[k, 1], normals[k, 2]
         r = R[moment[k]]
@@ -47,6 +47,7 @@ def rotate_normals(pick, moment, R, normals):
 
 @compiled
 def hit_points(origins, directions, ranges, points):
+    """Write the hit points (n, 3); a ray without a hit ends at FAR_M."""
     for i in range(len(ranges)):
         reach = ranges[i] if ranges[i] < FAR_M else np.float32(FAR_M)
         for j in range(3):
@@ -54,16 +55,16 @@ def hit_points(origins, directions, ranges, points):
 
 
 @compiled
-def rays_into_body(among, origins, directions, moment, right, R, t, low_m, high_m, reach_m, limit_m):
-    """Rays of `among` at moments of the right shape that meet the body's box before their limit, in its frame."""
-    pick = np.empty(len(among), dtype=np.int64)
-    local_o = np.empty((len(among), 3), dtype=np.float32)
-    local_d = np.empty((len(among), 3), dtype=np.float32)
+def rays_into_body(candidates, origins, directions, moment, active, R, t, low_m, high_m, reach_m, limit_m):
+    """Candidate rays at active moments that meet the bounding box before their limit, in the frame of the body."""
+    pick = np.empty(len(candidates), dtype=np.int64)
+    local_o = np.empty((len(candidates), 3), dtype=np.float32)
+    local_d = np.empty((len(candidates), 3), dtype=np.float32)
     o, d = np.empty(3), np.empty(3)
     count = 0
-    for i in among:
+    for i in candidates:
         m = moment[i]
-        if not right[m]:
+        if not active[m]:
             continue
         a0, a1, a2 = t[m, 0] - origins[i, 0], t[m, 1] - origins[i, 1], t[m, 2] - origins[i, 2]
         ahead = a0 * directions[i, 0] + a1 * directions[i, 1] + a2 * directions[i, 2]
@@ -92,7 +93,7 @@ def rays_into_body(among, origins, directions, moment, right, R, t, low_m, high_
 
 @compiled
 def shadow_rays(points, normals, directions, surface, ranges, sun):
-    """Samples whose seen side faces the sun, and where their shadow rays start."""
+    """Samples whose visible side faces the sun, and the origins of their shadow rays."""
     pick = np.empty(len(surface), dtype=np.int64)
     origins = np.empty((len(surface), 3), dtype=np.float32)
     count = 0
@@ -116,7 +117,7 @@ def shadow_rays(points, normals, directions, surface, ranges, sun):
 def edges(rows, columns, index, normals, points, ranges, body, surface, lit, colours, leaf):
     """Pixels (n,) that differ from one of their four neighbours in body, surface, plane or light, and in colour.
 
-    Leaf beside leaf is no edge: every pixel would be one.
+    Two neighbouring leaf pixels are no edge: every leaf pixel would be one.
     """
     found = np.zeros(len(rows), dtype=np.bool_)
     for i in range(len(rows)):
@@ -145,7 +146,7 @@ def edges(rows, columns, index, normals, points, ranges, body, surface, lit, col
 
 @compiled
 def image_motion(points, moment, R0, t0, R1, t1):
-    """Angle (n,) [rad] by which standing points turn in the camera between two poses per moment."""
+    """Angle (n,) [rad] by which static points move in the camera between two poses per moment."""
     angle = np.empty(len(moment))
     for i in range(len(moment)):
         m = moment[i]

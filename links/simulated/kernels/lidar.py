@@ -26,7 +26,7 @@ def lidar_poses(
     output_rad: Array64,
     T_turntable_lidar: Array64,
 ) -> tuple[Array64, Array64]:
-    """T_world_lidar = T_world_vehicle T_vehicle_turntable Rz(turned) T_turntable_lidar: (n, 3, 3) and (n, 3)."""
+    """T_world_lidar = T_world_vehicle T_vehicle_turntable Rz(angle) T_turntable_lidar: (n, 3, 3) and (n, 3)."""
     count = len(output_rad)
     rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))
     turned, mounted = np.empty((3, 4)), np.empty((3, 4))
@@ -60,9 +60,10 @@ def sub_rays(
     t_world_lidar_m: Array64,
     offsets: Array64,
 ) -> tuple[Array32, Array32]:
-    """Origins and unit directions (n, k, 3) in the world of the sub-rays of pulses (n,).
+    """Origins and unit directions (n, k, 3), world frame, of the sub-rays of pulses (n,).
 
-    Axis in the lidar frame: (cos w sin a, cos w cos a, sin w), from (0, 0, vertical offset of the laser).
+    The axis of a pulse in the lidar frame is (cos w sin a, cos w cos a, sin w), from (0, 0, vertical offset of the
+    laser). `offsets` (k, 2) are in half footprints, along and across the scan.
     """
     count, rays = len(azimuth_rad), len(offsets)
     origins = np.empty((count, rays, 3), dtype=np.float32)
@@ -92,7 +93,7 @@ def sub_rays(
 
 @compiled
 def sees_edge(ranges_m: Array32, spread_m: float) -> NDArray[np.bool_]:
-    """Pulses (n,) whose sub-rays (n, k) differ by more than the spread, or of which only some meet anything."""
+    """Pulses (n,) whose sub-rays (n, k) differ in range by more than the spread, or of which only some hit."""
     found = np.zeros(len(ranges_m), dtype=np.bool_)
     for i in range(len(ranges_m)):
         lowest = highest = ranges_m[i, 0]
@@ -112,13 +113,14 @@ def echoes(
     min_range_m: float,
     return_mode: str,
 ) -> tuple[Array64, Array64, Array64, NDArray[np.uint8]]:
-    """What pulses (of n, with k sub-rays) return: range, power, power from a drone, and from which (0: none; of two in
-    one echo the farther), each (1, n), in dual mode (2, n).
+    """Returns of pulses (n,) with k sub-rays: range, power, power from a drone, and number of that drone.
 
-    Sub-rays sorted by range join into one echo while the next is within the pulse length of the one before; its range
-    is the mean weighted by power = share * fraction / range^2. Echoes weaker than the pulse's threshold (n,), and
-    those nearer than the shortest range, are not seen. Dual mode gives the strongest echo, then the last one; when the
-    strongest is the last, the second strongest, then the last; with one echo, that one twice (user manual, 9.3).
+    Each is (1, n), in dual mode (2, n). Drone 0 means none; of two drones in one echo it is the farther.
+
+    Sub-rays, sorted by range, join one echo while the next is within the pulse length of the one before. The range of
+    an echo is the mean weighted by power = share * fraction / range^2. Echoes below the threshold (n,) of the pulse and
+    below the minimum range are not detected. Dual mode returns the strongest echo, then the last; when the strongest is
+    the last, the second strongest, then the last; a single echo is returned twice (user manual, section 9.3).
     """
     count, rays = ranges_m.shape
     rows = 2 if return_mode == "dual" else 1
@@ -130,7 +132,7 @@ def echoes(
     echo_range, echo_power, echo_drone = np.empty(rays), np.empty(rays), np.empty(rays)
     echo_which = np.empty(rays, dtype=np.uint8)
     for i in range(count):
-        for k in range(rays):  # insertion sort: few, and mostly sorted
+        for k in range(rays):  # insertion sort: short and nearly sorted
             j = k
             while j > 0 and ranges_m[i, order[j - 1]] > ranges_m[i, k]:
                 order[j] = order[j - 1]
@@ -142,7 +144,7 @@ def echoes(
             if not np.isfinite(r):
                 break
             if r - previous > PULSE_LENGTH_M:
-                if found < 0 or echo_power[found] >= threshold[i]:  # a weaker echo's place is used again
+                if found < 0 or echo_power[found] >= threshold[i]:  # a weaker echo is overwritten
                     found += 1
                 echo_range[found], echo_power[found], echo_drone[found], echo_which[found] = 0.0, 0.0, 0.0, 0
             previous = r

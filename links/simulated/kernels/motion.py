@@ -51,25 +51,29 @@ def evaluate_cubics(
 
 
 @compiled
-def first_order_recursion(white: Array64, keep: float) -> Array64:
-    fresh = np.sqrt(1.0 - keep * keep)
+def first_order_recursion(white: Array64, decay: float) -> Array64:
+    """y_0 = x_0, y_k = decay y_{k-1} + sqrt(1 - decay^2) x_k for rows x (n, d): keeps the variance of white noise."""
+    gain = np.sqrt(1.0 - decay * decay)
     out = white.copy()
     for k in range(1, len(white)):
         for axis in range(white.shape[1]):
-            out[k, axis] = keep * out[k - 1, axis] + fresh * white[k, axis]
+            out[k, axis] = decay * out[k - 1, axis] + gain * white[k, axis]
     return out
 
 
 @compiled
 def oscillate(target: Array64, frequency_radps: float, damping: float) -> Array64:
-    """Damped oscillators following targets (n, d) one STEP_S each, from rest at the first."""
+    """Damped oscillators that follow targets (n, d), one row per STEP_S, starting at rest on the first target.
+
+    angle'' = w^2 (target - angle) - 2 d w angle', w the angular frequency and d the damping ratio.
+    """
     out = np.empty_like(target)
     for axis in range(target.shape[1]):
         angle, speed = target[0, axis], 0.0
         for k in range(target.shape[0]):
             out[k, axis] = angle
-            pull = frequency_radps**2 * (target[k, axis] - angle) - 2 * damping * frequency_radps * speed
-            speed += STEP_S * pull
+            acceleration = frequency_radps**2 * (target[k, axis] - angle) - 2 * damping * frequency_radps * speed
+            speed += STEP_S * acceleration
             angle += STEP_S * speed
     return out
 
@@ -79,22 +83,22 @@ def fly(
     position: Array64,
     velocity: Array64,
     acceleration: Array64,
-    headings: Array64,
+    yaw: Array64,
     wind: Array64,
     mean_wind: Array64,
-    start: Array64,
+    attitude: Array64,
     limits: Array64,
 ) -> Array64:
-    """States (n, 16), one a step: p, v (world), q (x, y, z, w), turn rate and specific force (drone axes).
+    """States (n, 16), one per STEP_S: p, v (world), q (x, y, z, w), turn rate and specific force (drone axes).
 
-    The path is position, velocity, acceleration (n, 3), heading and its rate (n, 2); wind (n, 3) blows about a mean
-    that the drone has learned. It starts on the path, leaning as in still air (quaternion `start`).
+    The reference path is position, velocity, acceleration (n, 3), yaw and its rate (n, 2). The controller knows the
+    mean of the wind (n, 3). The flight starts on the path with the attitude for still air (quaternion `attitude`).
     """
     gain, max_rate, max_yaw_rate, rate_lag, thrust_lag, max_slope = limits
     states = np.empty((position.shape[0], 16))
-    p, v, q = position[0].copy(), velocity[0].copy(), start.copy()
+    p, v, q = position[0].copy(), velocity[0].copy(), attitude.copy()
     rate, integral = np.zeros(3), -DRAG_PER_S * mean_wind
-    asked, felt, R = np.empty(3), np.empty(3), np.empty((3, 3))
+    desired, force, R = np.empty(3), np.empty(3), np.empty((3, 3))
     thrust = np.sqrt(np.sum((acceleration[0] + DRAG_PER_S * v + np.array([0.0, 0.0, GRAVITY_MPS2])) ** 2))
     for k in range(position.shape[0]):
         x, y, z, w = q
@@ -103,39 +107,39 @@ def fly(
         R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
         drag = -DRAG_PER_S * (v - wind[k])
         for i in range(3):
-            felt[i] = R[0, i] * drag[0] + R[1, i] * drag[1] + R[2, i] * drag[2]
-        felt[2] += thrust
-        states[k, 0:3], states[k, 3:6], states[k, 6:10], states[k, 10:13], states[k, 13:16] = p, v, q, rate, felt
+            force[i] = R[0, i] * drag[0] + R[1, i] * drag[1] + R[2, i] * drag[2]
+        force[2] += thrust
+        states[k, 0:3], states[k, 3:6], states[k, 6:10], states[k, 10:13], states[k, 13:16] = p, v, q, rate, force
 
         for i in range(3):
             stiff = VERTICAL_STIFFER if i == 2 else 1.0
-            off = position[k, i] - p[i]
-            integral[i] = min(max(integral[i] + KI_PER_S3 * off * STEP_S, -MAX_INTEGRAL_MPS2), MAX_INTEGRAL_MPS2)
-            back = stiff * (KP_PER_S2 * off + KD_PER_S * (velocity[k, i] - v[i])) + integral[i]
-            asked[i] = acceleration[k, i] + DRAG_PER_S * velocity[k, i] + back
-        asked[2] = max(asked[2] + GRAVITY_MPS2, 0.3 * GRAVITY_MPS2)
-        slope = np.sqrt(asked[0] ** 2 + asked[1] ** 2) / asked[2]
+            error = position[k, i] - p[i]
+            integral[i] = min(max(integral[i] + KI_PER_S3 * error * STEP_S, -MAX_INTEGRAL_MPS2), MAX_INTEGRAL_MPS2)
+            feedback = stiff * (KP_PER_S2 * error + KD_PER_S * (velocity[k, i] - v[i])) + integral[i]
+            desired[i] = acceleration[k, i] + DRAG_PER_S * velocity[k, i] + feedback
+        desired[2] = max(desired[2] + GRAVITY_MPS2, 0.3 * GRAVITY_MPS2)
+        slope = np.sqrt(desired[0] ** 2 + desired[1] ** 2) / desired[2]
         if slope > max_slope:
-            asked[0] *= max_slope / slope
-            asked[1] *= max_slope / slope
-        size = np.sqrt(asked[0] ** 2 + asked[1] ** 2 + asked[2] ** 2)
-        along = asked[0] * R[0, 2] + asked[1] * R[1, 2] + asked[2] * R[2, 2]
+            desired[0] *= max_slope / slope
+            desired[1] *= max_slope / slope
+        size = np.sqrt(desired[0] ** 2 + desired[1] ** 2 + desired[2] ** 2)
+        along = desired[0] * R[0, 2] + desired[1] * R[1, 2] + desired[2] * R[2, 2]
         thrust += (max(along, 0.1 * GRAVITY_MPS2) - thrust) * STEP_S / thrust_lag
 
-        # the turn about the body's axes that takes its z to the asked direction is z x asked = (-body_y, body_x, 0)
-        body_x = (R[0, 0] * asked[0] + R[1, 0] * asked[1] + R[2, 0] * asked[2]) / size
-        body_y = (R[0, 1] * asked[0] + R[1, 1] * asked[1] + R[2, 1] * asked[2]) / size
-        turn = headings[k, 0] - np.arctan2(R[1, 0], R[0, 0])
-        turn = np.arctan2(np.sin(turn), np.cos(turn))
-        wanted = (-gain * body_y, gain * body_x, headings[k, 1] + YAW_GAIN_PER_S * turn)
+        # the rotation vector, in body axes, from body z to the desired direction: z x desired = (-body_y, body_x, 0)
+        body_x = (R[0, 0] * desired[0] + R[1, 0] * desired[1] + R[2, 0] * desired[2]) / size
+        body_y = (R[0, 1] * desired[0] + R[1, 1] * desired[1] + R[2, 1] * desired[2]) / size
+        yaw_error = yaw[k, 0] - np.arctan2(R[1, 0], R[0, 0])
+        yaw_error = np.arctan2(np.sin(yaw_error), np.cos(yaw_error))
+        rate_command = (-gain * body_y, gain * body_x, yaw[k, 1] + YAW_GAIN_PER_S * yaw_error)
         for i in range(3):
             limit = max_yaw_rate if i == 2 else max_rate
-            rate[i] += (min(max(wanted[i], -limit), limit) - rate[i]) * STEP_S / rate_lag
+            rate[i] += (min(max(rate_command[i], -limit), limit) - rate[i]) * STEP_S / rate_lag
 
         for i in range(3):
-            pull = R[i, 2] * thrust + drag[i] - (GRAVITY_MPS2 if i == 2 else 0.0)
-            p[i] += STEP_S * (v[i] + 0.5 * STEP_S * pull)
-            v[i] += STEP_S * pull
+            net = R[i, 2] * thrust + drag[i] - (GRAVITY_MPS2 if i == 2 else 0.0)
+            p[i] += STEP_S * (v[i] + 0.5 * STEP_S * net)
+            v[i] += STEP_S * net
         a, b, c = 0.5 * STEP_S * rate[0], 0.5 * STEP_S * rate[1], 0.5 * STEP_S * rate[2]
         q[0], q[1], q[2], q[3] = (
             x + a * w + c * y - b * z,

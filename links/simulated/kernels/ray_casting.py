@@ -1,4 +1,4 @@
-"""Rays against meshes and moving bodies: which rays come near a body, rays in its frame, and what a hit returns.
+"""Ray casting against meshes and moving bodies: reflected fractions, nearest hits, rays in the frame of a body.
 
 Source: ours.
 """
@@ -27,6 +27,7 @@ def ranges_and_fractions(
     gloss: Array32,
 ) -> tuple[Array32, Array32]:
     ranges = np.full(len(face), np.inf, dtype=np.float32)
+    """Range (n,) [m] (inf: no hit) and returned fraction (n,) of hits; see `RayScene.cast`."""
     fractions = np.zeros(len(face), dtype=np.float32)
     for i in range(len(face)):
         if face[i] < 0:
@@ -43,7 +44,7 @@ def ranges_and_fractions(
 def keep_nearer(
     target: NDArray[np.intp] | None, found_m: Array32, fraction: Array32, ranges_m: Array32, fractions: Array32
 ) -> NDArray[np.intp]:
-    """Write hits of the target rays (all rays: None) over farther ones; which rays (m,) that were."""
+    """Overwrite farther ranges of the target rays (None: all rays) with these hits; returns the rays written (m,)."""
     written = np.empty(len(found_m), dtype=np.intp)
     count = 0
     for i in range(len(found_m)):
@@ -57,9 +58,9 @@ def keep_nearer(
 
 @compiled
 def rays_near(target_m: Array64, origins_m: Array32, directions: Array32, reach_m: float) -> NDArray[np.intp]:
-    """Rays (n, 3) that pass the target, one (1, 3) or each its own (n, 3), within the reach and the beam's spread.
+    """Rays (n, 3) that pass a target, one (1, 3) or one per ray (n, 3), within reach plus the spread of the beam.
 
-    A ray that starts within the reach rays_near it, too.
+    A ray that starts within reach counts.
     """
     found = np.empty(len(directions), dtype=np.intp)
     count, step = 0, 1 if len(target_m) > 1 else 0
@@ -86,9 +87,10 @@ def into_body(
     low_m: Array64,
     high_m: Array64,
 ) -> tuple[Array32, Array32, NDArray[np.intp]]:
-    """Sub-rays of the picked pulses in the body's frame, R^T (p - t), those that meet its box, and their flat number.
+    """Sub-rays of the picked pulses in the frame of the body, R^T (p - t): those that meet its bounding box.
 
-    Poses are one for each picked pulse, or one for all; rays are (n, k, 3), the flat number counts in (n, k).
+    There is one pose per picked pulse, or one for all. Rays are (n, k, 3). The last result is the flat index of each
+    sub-ray in (n, k).
     """
     rays = origins_world_m.shape[1]
     origins = np.empty((len(pick) * rays, 3), dtype=np.float32)

@@ -1,7 +1,7 @@
-"""Independent pieces of work in several processes: the results come in the order of the work, whoever did it.
+"""Runs independent tasks in several processes; the results are in the order of the tasks.
 
-An interrupt (Ctrl-C) reaches this process alone. It asks the others to stop, which they do where their work next tells
-how far it is, and waits until they have. They end by themselves when this process is killed.
+An interrupt (Ctrl-C) reaches the parent process only. It asks the others to stop, which they do at their next progress
+report, and waits for them. They end by themselves when the parent is killed.
 
 Source: ours.
 """
@@ -21,61 +21,61 @@ from typing import Any, TypeVar
 
 from flow.link import LinkError
 
-LOOK_S = 0.2  # between two looks at how far the others are
+POLL_S = 0.2  # period of progress reports
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 Work = Callable[[Task, Callable[[float], None]], Result]
-Shares = Any  # done of each task, 0 to 1: a list, or an array that the processes share
+Shares = Any  # completed fraction of each task: a list, or an array in shared memory
 
-_shared: tuple[Shares, Event]  # in a process that works for another one
+_shared: tuple[Shares, Event]  # in a worker process
 
 
 class Stopped(Exception):
-    """The work was asked to stop."""
+    """The task was asked to stop."""
 
 
 def run_all(
     work: Work[Task, Result], tasks: Sequence[Task], jobs: int, progress: Callable[[Sequence[float]], None]
 ) -> list[Result]:
-    """`work(task, tell)` for each task, in `jobs` processes of their own if that is more than one.
+    """`work(task, report)` for each task, in `jobs` processes of their own if that is more than one.
 
-    `tell` takes the share of a task that is done, `progress` those of all. What `work` raises stops everything. With
-    several processes `work` is a function of a module, and tasks and results can be pickled.
+    `report` takes the completed fraction of a task, `progress` those of all tasks. An exception in `work` stops
+    everything. With several processes `work` must be a function of a module, and tasks and results picklable.
     """
     if jobs > 1 and len(tasks) > 1:
         return _in_processes(work, tasks, min(jobs, len(tasks)), progress)
     shares = [0.0] * len(tasks)
 
-    def tell(index: int, share: float) -> None:
+    def report(index: int, share: float) -> None:
         shares[index] = share
         progress(shares)
 
     results: list[Result] = []
     for index, task in enumerate(tasks):
-        results.append(work(task, lambda share, index=index: tell(index, share)))
-        tell(index, 1.0)
+        results.append(work(task, lambda share, index=index: report(index, share)))
+        report(index, 1.0)
     return results
 
 
 def _in_processes(
     work: Work[Task, Result], tasks: Sequence[Task], jobs: int, progress: Callable[[Sequence[float]], None]
 ) -> list[Result]:
-    context = multiprocessing.get_context("spawn")  # a fork would copy locks of threads that it does not copy
+    context = multiprocessing.get_context("spawn")  # fork would copy locks without the threads that hold them
     shares, stop = context.RawArray("d", len(tasks)), context.Event()
-    with ProcessPoolExecutor(jobs, context, _begin, (shares, stop)) as pool:
+    with ProcessPoolExecutor(jobs, context, _initialise, (shares, stop)) as pool:
         try:
-            with _interrupts_ignored():  # as the processes that start here will
+            with _interrupts_ignored():  # inherited by the processes that start here
                 futures = [pool.submit(_work, work, index, task) for index, task in enumerate(tasks)]
             waiting: set[Future[Result]] = set(futures)
             while waiting:
-                done, waiting = wait(waiting, LOOK_S, FIRST_COMPLETED)
+                done, waiting = wait(waiting, POLL_S, FIRST_COMPLETED)
                 progress(shares)
                 for future in done:
                     future.result()
             return [future.result() for future in futures]
         except BrokenProcessPool:
-            raise LinkError(f"one of {jobs} processes was killed: if memory was short, take fewer --jobs") from None
+            raise LinkError(f"one of {jobs} processes was killed: if memory is short, use fewer --jobs") from None
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
@@ -90,8 +90,8 @@ def _interrupts_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _begin(shares: Shares, stop: Event) -> None:
-    """What a process does first."""
+def _initialise(shares: Shares, stop: Event) -> None:
+    """Initialise a worker process."""
     global _shared
     _shared = shares, stop
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -107,12 +107,12 @@ def _end_with_parent() -> None:
 def _work(work: Work[Task, Result], index: int, task: Task) -> Result:
     shares, stop = _shared
 
-    def tell(share: float) -> None:
+    def report(share: float) -> None:
         shares[index] = share
         if stop.is_set():
             raise Stopped
 
-    tell(0.0)
-    result = work(task, tell)
+    report(0.0)
+    result = work(task, report)
     shares[index] = 1.0
     return result

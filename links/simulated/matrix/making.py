@@ -1,20 +1,20 @@
-"""Makes the recordings of the scenario matrix and, in closed loop, the runs that go with them.
+"""Makes the recordings of the scenario matrix and, in closed loop, the runs that belong to them.
 
-What is there, complete and made alike is kept. A recording gets its name when it is complete, a run its summary last:
-what was stopped is made again.
+Existing recordings and runs are kept if they are complete and made in the same way. A recording gets its name when it
+is complete, a run gets its summary last; whatever was interrupted is made again.
 
 Source: ours.
 """
 
 from __future__ import annotations
 
+import enum
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Literal
 
 from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, LinkError
@@ -31,18 +31,18 @@ from links.simulated.rig.scenario import Scenario
 from links.truth import TruthLog
 
 VIEWER = "links.viewer.Viewer"
-PLAIN = Cell("open_lot", 20, "hover", "parked")  # the rig is the same in all cells with a drone
+PLAIN = Cell("open_lot", 20, "hover", "parked")  # all cells with a drone have the same rig
 
 
 @dataclass(frozen=True)
 class Making:
-    """How all recordings of one run over the matrix are made."""
+    """How the recordings of one run over the matrix are made."""
 
     folder: Path
     closed_loop: Asked | None
-    results: Path | None  # where the closed loop's runs go, if they are wanted
+    results: Path | None  # folder for the runs of the closed loop; None: they are not kept
     conditions: Conditions
-    images: Path | None = None  # recordings of the same names, whose images are taken instead of painted
+    images: Path | None = None  # folder of recordings of the same names, whose images are used
 
 
 @dataclass(frozen=True)
@@ -59,30 +59,39 @@ class Task:
         return f"{self.cell.name}-s{self.seed}"
 
 
+class Status(enum.Enum):
+    """What was done for a task."""
+
+    MADE = enum.auto()
+    KEPT = enum.auto()
+    IMPOSSIBLE = enum.auto()  # the scene of the seed does not allow the cell
+    FAILED = enum.auto()
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a task."""
+    """Result of a task."""
 
-    what: Literal["made", "kept", "impossible", "failed"]
-    text: str = ""  # why not
-    stage_failed: bool = False  # a stage raised; else something outside is to be mended
-    replayed: bool = False  # it was kept, and its run was missing
+    status: Status
+    text: str = ""  # reason, unless it was made or kept
+    stage_failed: bool = False  # a stage raised an exception; otherwise the cause is outside the graph
+    replayed: bool = False  # the recording was kept, its run was missing
 
 
 @dataclass(frozen=True)
 class MatrixReport:
-    """What a run over the matrix did."""
+    """Summary of a run over the matrix."""
 
     made: int
-    kept: int  # were there, complete and the same
-    replayed: int  # of those kept: had no run yet
-    impossible: tuple[str, ...]  # cells that a seed's scene has no place for, in words
+    kept: int  # existing recordings
+    replayed: int  # of those kept: their run was missing
+    impossible: tuple[str, ...]  # cells that do not fit into the scene of a seed, with the reason
     failed: tuple[Outcome, ...]
 
 
 def make_matrix(
     folder: Path,
-    wanted: list[Cell],
+    selected: list[Cell],
     seeds: range,
     closed_loop: Path | None,
     progress: Callable[[float, float], None],
@@ -93,34 +102,34 @@ def make_matrix(
 ) -> MatrixReport:
     """Make what is missing: `folder/<cell>-s<seed>.mcap`, `results/<cell>-s<seed>-<configuration>`.
 
-    With `images` those of its `<cell>-s<seed>.mcap` are taken; where that is missing or of another flight the
-    recording fails (painting is slow, and a second call without `images` paints just what is missing).
-    `progress` is told simulated seconds done and in all. Raises ConfigError, or LinkError, for a configuration that
-    closes no loop; what goes wrong with one recording is in the report, and the others are made.
+    With `images` the images of its `<cell>-s<seed>.mcap` are used; a recording fails where that is missing or shows
+    another flight (a second call without `images` renders only what is missing). `progress` takes completed and total
+    simulated seconds. ConfigError, or LinkError, for a configuration that closes no loop. A failure of one recording is
+    in the report and does not stop the others.
     """
     conditions = conditions or Conditions()
-    asked = None if closed_loop is None else _asked(closed_loop, conditions, results is not None)
-    making = Making(folder, asked, results, conditions, images)
-    tasks = [Task(making, cell, seed) for seed, cell in product(seeds, wanted)]
-    whole_s = sum(task.cell.duration_s for task in tasks)
+    request = None if closed_loop is None else _checked_request(closed_loop, conditions, results is not None)
+    making = Making(folder, request, results, conditions, images)
+    tasks = [Task(making, cell, seed) for seed, cell in product(seeds, selected)]
+    total_s = sum(task.cell.duration_s for task in tasks)
 
-    def told(shares: Sequence[float]) -> None:
+    def report(shares: Sequence[float]) -> None:
         done_s = sum(share * task.cell.duration_s for share, task in zip(shares, tasks, strict=True))
-        progress(done_s, whole_s)
+        progress(done_s, total_s)
 
     folder.mkdir(parents=True, exist_ok=True)
-    outcomes = run_all(make_one, tasks, jobs, told)
+    outcomes = run_all(make_one, tasks, jobs, report)
     return MatrixReport(
-        made=sum(outcome.what == "made" for outcome in outcomes),
-        kept=sum(outcome.what == "kept" for outcome in outcomes),
+        made=sum(outcome.status is Status.MADE for outcome in outcomes),
+        kept=sum(outcome.status is Status.KEPT for outcome in outcomes),
         replayed=sum(outcome.replayed for outcome in outcomes),
-        impossible=tuple(outcome.text for outcome in outcomes if outcome.what == "impossible"),
-        failed=tuple(outcome for outcome in outcomes if outcome.what == "failed"),
+        impossible=tuple(outcome.text for outcome in outcomes if outcome.status is Status.IMPOSSIBLE),
+        failed=tuple(outcome for outcome in outcomes if outcome.status is Status.FAILED),
     )
 
 
-def _asked(closed_loop: Path, conditions: Conditions, for_results: bool) -> Asked:
-    """The configuration of all closed loops, tried on a plain cell's rig; runs that are kept have no viewer file."""
+def _checked_request(closed_loop: Path, conditions: Conditions, for_results: bool) -> Asked:
+    """The configuration of all closed loops, checked with the rig of a plain cell; runs that are kept have no .rrd."""
     rig_yaml = scenario_of(PLAIN, 1, conditions).rig_yaml()
     graph = Asked(closed_loop).graph(rig_yaml, "the matrix's rig")
     servo_edge(graph)
@@ -129,41 +138,41 @@ def _asked(closed_loop: Path, conditions: Conditions, for_results: bool) -> Aske
 
 
 def make_one(task: Task, progress: Callable[[float], None]) -> Outcome:
-    """Make a task's recording and its run, where they are missing."""
+    """Make the recording and the run of a task, where they are missing."""
     try:
         scenario = scenario_of(task.cell, task.seed, task.making.conditions)
     except LinkError as error:
-        return Outcome("impossible", f"seed {task.seed}: {error}")
+        return Outcome(Status.IMPOSSIBLE, f"seed {task.seed}: {error}")
     try:
         return _make(task, scenario, progress)
     except (LinkError, ConfigError, OSError) as error:
-        return Outcome("failed", f"{task.name}: {error}")
+        return Outcome(Status.FAILED, f"{task.name}: {error}")
     except RunError as error:
-        return Outcome("failed", f"{task.name}: {error}", stage_failed=True)
+        return Outcome(Status.FAILED, f"{task.name}: {error}", stage_failed=True)
 
 
 def _make(task: Task, scenario: Scenario, progress: Callable[[float], None]) -> Outcome:
     file = task.making.folder / f"{task.name}.mcap"
-    asked = task.making.closed_loop
-    if asked is None:
+    request = task.making.closed_loop
+    if request is None:
         if is_made(file, scenario, {}):
-            return Outcome("kept")
+            return Outcome(Status.KEPT)
         _simulate(task, file, scenario, None, progress)
-        return Outcome("made")
-    graph = asked.graph(scenario.rig_yaml(), f"{scenario.name} (rig)")
-    made_by = loop_metadata(asked.config, graph)
+        return Outcome(Status.MADE)
+    graph = request.graph(scenario.rig_yaml(), f"{scenario.name} (rig)")
+    metadata = loop_metadata(request.config, graph)
     results = task.making.results
-    folder = results and results / f"{task.name}-{asked.config.stem}"
-    if is_made(file, scenario, made_by):
+    folder = results and results / f"{task.name}-{request.config.stem}"
+    if is_made(file, scenario, metadata):
         if folder is None or holds_run(folder, file, graph):
-            return Outcome("kept")
-        replay_into(folder, file, asked, lambda done, whole: progress(done / whole))
-        return Outcome("kept", replayed=True)
+            return Outcome(Status.KEPT)
+        replay_into(folder, file, request, lambda done, whole: progress(done / whole))
+        return Outcome(Status.KEPT, replayed=True)
     if folder is None:
-        _simulate(task, file, scenario, ClosedLoop(graph, scenario.closed_loop, made_by), progress)
+        _simulate(task, file, scenario, ClosedLoop(graph, scenario.closed_loop, metadata), progress)
     else:
-        _simulate_and_keep_run(task, file, scenario, folder, asked, graph, progress)
-    return Outcome("made")
+        _simulate_and_keep_run(task, file, scenario, folder, request, graph, progress)
+    return Outcome(Status.MADE)
 
 
 def _simulate_and_keep_run(
@@ -171,16 +180,16 @@ def _simulate_and_keep_run(
     file: Path,
     scenario: Scenario,
     folder: Path,
-    asked: Asked,
+    request: Asked,
     graph: Graph,
     progress: Callable[[float], None],
 ) -> None:
-    """The closed loop runs the very graph that a replay of its recording would: it leaves the same run."""
+    """Simulate in closed loop with the graph that a replay of the recording would have, and keep its run."""
     is_new = not folder.exists()
-    with ExitStack() as undo, RunFolder(folder, file, asked, graph) as run:
-        if is_new:  # a flight that cannot be made leaves no folder that looks like a run
+    with ExitStack() as undo, RunFolder(folder, file, request, graph) as run:
+        if is_new:  # an impossible flight must not leave an empty run folder
             undo.callback(shutil.rmtree, folder)
-        loop = ClosedLoop(graph, scenario.closed_loop, loop_metadata(asked.config, graph), run.taps)
+        loop = ClosedLoop(graph, scenario.closed_loop, loop_metadata(request.config, graph), run.taps)
         _simulate(task, file, scenario, loop, progress)
         undo.pop_all()
         truth = TruthLog()
@@ -192,7 +201,7 @@ def _simulate_and_keep_run(
 def _simulate(
     task: Task, file: Path, scenario: Scenario, loop: ClosedLoop | None, progress: Callable[[float], None]
 ) -> None:
-    """Make a recording; it has its name only when it is complete."""
+    """Make a recording; it gets its name when it is complete."""
     images = task.making.images and task.making.images / file.name
     part = file.with_name(f"{file.name}.part")
     try:
@@ -202,13 +211,13 @@ def _simulate(
         part.unlink(missing_ok=True)
 
 
-def is_made(file: Path, scenario: Scenario, made_by: dict[str, str]) -> bool:
-    """Whether a file is the complete recording of this scenario, `loop_metadata` the same configuration or without any."""
+def is_made(file: Path, scenario: Scenario, metadata: dict[str, str]) -> bool:
+    """Whether a file is the complete recording of this scenario with this `loop_metadata` (empty: no closed loop)."""
     if not file.is_file():
         return False
     try:
         with RecordingReader(file) as reader:
-            how = {key: value for key, value in reader.metadata.items() if key.startswith("closed_loop")}
-            return reader.config_yaml == scenario.as_yaml() and how == made_by and reader.finished
+            found = {key: value for key, value in reader.metadata.items() if key.startswith("closed_loop")}
+            return reader.config_yaml == scenario.as_yaml() and found == metadata and reader.finished
     except LinkError:
         return False

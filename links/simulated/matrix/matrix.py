@@ -1,11 +1,9 @@
-"""The scenario matrix: range x motion x vehicle x scene, an occlusion and a flight out of sight and back, by seed.
+"""The scenario matrix: range x motion x vehicle x scene, an occlusion, and a flight out of range and back, by seed.
 
-Beside it stand the cells of single goals: an empty sky, an occlusion nearer by, two drones, a drone to be searched for,
-drones at 50 m.
+Special cells are added: an empty sky, an occlusion at a shorter range, two drones, a drone to search for, drones at
+50 m. A cell determines what happens (`links/simulated/matrix/flights.py`), a seed where: it draws scene and direction.
 
-A cell says what happens (`links/simulated/matrix/flights.py`), a seed where: it draws the scene and the side.
-
-Source: ours, after the cases of issue "A simulated rig".
+Source: ours.
 """
 
 from __future__ import annotations
@@ -38,9 +36,9 @@ RANGES_M = (10, 20, 30, 45, 60)
 MOTIONS = ("hover", "orbit", "cross", "fast", "overhead", "climb")
 VEHICLES = ("parked", "driving", "turning")
 SCENES: tuple[Kind, ...] = ("manhattan", "atlanta", "campus", "park_edge", "open_lot")
-OPEN: Kind = "open_lot"  # nothing to hide behind
-SPECIALS = {"occlusion": 35, "return": 20}  # at which range
-GOALS = (  # range, motion, vehicles; in every scene that has a place for it
+OPEN: Kind = "open_lot"  # has no obstacle that could hide a drone
+SPECIALS = {"occlusion": 35, "return": 20}  # motion: range
+SPECIAL_CELLS = (  # range, motion, vehicles; in every scene where they are possible
     (0, "empty", VEHICLES),
     (20, "occlusion", ("parked",)),
     (20, "two", ("parked",)),
@@ -48,9 +46,9 @@ GOALS = (  # range, motion, vehicles; in every scene that has a place for it
     (50, "hover", ("parked",)),
     (50, "orbit", ("parked",)),
 )
-SEARCHING = ("empty", "two", "search")  # without a closed loop the servo sweeps all along
-LIDAR_UP_M = 0.35  # over the camera, as in the standard rig
-DRONE = DroneModel(surface="grey_shell")  # the LiDAR sees half of it at 45 m, nothing at 70 m
+SEARCHING = ("empty", "two", "search")  # without a closed loop the servo only sweeps
+LIDAR_UP_M = 0.35  # above the camera, as in the standard rig
+DRONE = DroneModel(surface="grey_shell")  # the LiDAR gets half of the returns at 45 m, none at 70 m
 SERVO = ServoSettings(command_latency_s=0.002, command_jitter_s=5e-4, encoder_error_deg=0.3, backlash_deg=0.33)
 SWEEPS = (SweepSegment(times=100),)
 SWEEP_THEN_FOLLOW = (SweepSegment(), VibrateSegment(duration_s=60.0, follow_drone=True))
@@ -59,25 +57,23 @@ RAIN = Weather(rain_mmph=5.0)
 
 @dataclass(frozen=True)
 class Conditions:
-    """What holds in all cells of one run over the matrix."""
+    """Conditions common to all cells of one run over the matrix."""
 
-    calibrated: bool = (
-        False  # the rig knows the servo encoder's own error and the gear's play, as `grd calibrate` finds
-    )
-    odometry: bool = False  # the vehicle tells where it drives
+    calibrated: bool = False  # the rig file has the encoder's error and the backlash, as `grd calibrate` writes it
+    odometry: bool = False  # the vehicle sends odometry
     rain: bool = False  # 5 mm/h
-    autopilot: bool = False  # the drone tells how it flies, over a radio
-    cameras_hz: float | None = None  # two fisheyes; None: none
-    cameras_px: int = 720  # their size, square
-    readout_ms: float = 0.0  # their rolling shutter, first to last row; 0: all rows at once
-    perturbed: bool = False  # the rig is not quite as its file says, each flight is of its own kind of drone
+    autopilot: bool = False  # the drone sends telemetry over a radio, and obeys flight dynamics
+    cameras_hz: float | None = None  # rate of two fisheyes; None: no cameras
+    cameras_px: int = 720  # size of their square images
+    readout_ms: float = 0.0  # of their rolling shutter, first to last row; 0: global shutter
+    perturbed: bool = False  # the rig differs from its file, and the kind of drone varies between flights
 
 
 def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
     """All cells whose name matches one of the patterns (`campus-*-parked`).
 
-    With `pairs` a small part in which each two values of range, motion, vehicle and scene still meet at least once; the
-    goals' cells are not in it.
+    With `pairs` a small subset in which any two values of range, motion, vehicle and scene occur together at least
+    once; it has no special cells.
     """
     found: list[Cell] = []
     for (r, range_m), (m, motion), (v, vehicle), (s, scene) in product(
@@ -88,44 +84,44 @@ def cells(only: Sequence[str] = ("*",), pairs: bool = False) -> list[Cell]:
     found += [Cell(scene, SPECIALS["return"], "return", "parked") for scene in SCENES]
     found.extend(_in_every_scene(SPECIALS["occlusion"], "occlusion", ("parked",)))
     if not pairs:
-        found.extend(chain.from_iterable(_in_every_scene(*goal) for goal in GOALS))
+        found.extend(chain.from_iterable(_in_every_scene(*special) for special in SPECIAL_CELLS))
     return [cell for cell in found if any(fnmatch(cell.name, pattern) for pattern in only)]
 
 
 def _in_every_scene(range_m: int, motion: str, vehicles: Sequence[str]) -> Iterator[Cell]:
-    """One is hidden where there is something to hide behind."""
+    """The cell in every scene; an occlusion only where there are obstacles."""
     for scene, vehicle in product(SCENES, vehicles):
         if not (motion == "occlusion" and scene == OPEN):
             yield Cell(scene, range_m, motion, vehicle)
 
 
 def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> Scenario:
-    """The scenario of a cell. LinkError when the seed's scene has no place for it (no building to hide behind)."""
+    """The scenario of a cell. LinkError when the scene of the seed does not allow it (no building to hide behind)."""
     conditions = conditions or Conditions()
     rng = np.random.default_rng([seed, 42])
     times = sample_times_s(cell.duration_s)
     vehicle, world = vehicle_path(cell, seed, rng, times)
     lidar_m = vehicle.at(times)[0] + [0.0, 0.0, LIDAR_UP_M]
     if cell.motion == "empty":
-        flown = ()
+        paths = ()
     elif cell.motion == "two":
-        flown = two_paths(cell, world, rng, times, lidar_m)
+        paths = two_paths(cell, world, rng, times, lidar_m)
     else:
-        flown = (drone_path(cell, world, rng, times, lidar_m),)
-    built = draw_perturbed_rig(cell.name, seed) if conditions.perturbed else None
-    look = {"model": DRONE} if built is None else {"model": built.model, "span_m": built.span_m}
-    drones = tuple(DroneSettings.model_validate({"path": path} | look) for path in flown)
+        paths = (drone_path(cell, world, rng, times, lidar_m),)
+    perturbed = draw_perturbed_rig(cell.name, seed) if conditions.perturbed else None
+    appearance = {"model": DRONE} if perturbed is None else {"model": perturbed.model, "span_m": perturbed.span_m}
+    drones = tuple(DroneSettings.model_validate({"path": path} | appearance) for path in paths)
     what = f"{cell.motion} at {cell.range_m} m" if drones else "no drone"
-    straight = RigLidar()
+    nominal = RigLidar()
     found = {
         "servo_harmonics": GearTrain(SERVO, seed).harmonics(),
         "servo_play_deg": SERVO.backlash_deg,
         "pointing_sigma_deg": ZERO_SIGMA_DEG,  # as `grd calibrate` writes it
     }
-    known = straight.mount.model_copy(update=found)
-    true_mount = straight.mount if conditions.calibrated else None
-    if built is not None:
-        true_mount = built.mount(straight.mount)
+    calibrated = nominal.mount.model_copy(update=found)
+    true_mount = nominal.mount if conditions.calibrated else None
+    if perturbed is not None:
+        true_mount = perturbed.mount(nominal.mount)
     return Scenario(
         name=cell.name,
         description=f"{what}, vehicle {cell.vehicle}, {cell.scene}",
@@ -140,22 +136,22 @@ def scenario_of(cell: Cell, seed: int, conditions: Conditions | None = None) -> 
         script=SWEEPS if cell.motion in SEARCHING else SWEEP_THEN_FOLLOW,
         truth_visible=bool(drones),
         autopilot=AutopilotSettings() if conditions.autopilot and drones else None,
-        lidar=LidarSettings() if built is None else LidarSettings(range_offset_m=built.range_offset_m),
-        cameras=_cameras(conditions, bool(drones), built),
+        lidar=LidarSettings() if perturbed is None else LidarSettings(range_offset_m=perturbed.range_offset_m),
+        cameras=_cameras(conditions, bool(drones), perturbed),
         weather=RAIN if conditions.rain else Weather(),
         vehicle_odometry=VehicleOdometrySettings() if conditions.odometry else None,
-        rig=RigLidar(mount=known) if conditions.calibrated else straight,
+        rig=RigLidar(mount=calibrated) if conditions.calibrated else nominal,
         true_mount=true_mount,
     )
 
 
-def _cameras(conditions: Conditions, drone: bool, built: PerturbedRig | None) -> CamerasSettings:
-    """The vehicle's and, where there is a drone to carry it, the drone's."""
+def _cameras(conditions: Conditions, drone: bool, perturbed: PerturbedRig | None) -> CamerasSettings:
+    """The cameras of vehicle and, if there is one, drone."""
     if conditions.cameras_hz is None:
         return CamerasSettings()
     one = CameraSettings(rate_hz=conditions.cameras_hz, size_px=conditions.cameras_px, readout_ms=conditions.readout_ms)
     vehicle = drones = one
-    if built is not None:
-        vehicle = one.model_copy(update={"error": built.camera_vehicle})
-        drones = one.model_copy(update={"error": built.camera_drone})
+    if perturbed is not None:
+        vehicle = one.model_copy(update={"miscalibration": perturbed.camera_vehicle})
+        drones = one.model_copy(update={"miscalibration": perturbed.camera_drone})
     return CamerasSettings(vehicle=vehicle, drone=drones if drone else None)

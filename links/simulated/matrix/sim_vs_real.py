@@ -1,11 +1,11 @@
-"""The simulated VLP-16 beside the real captures, and our drones beside a real one: where does the simulation differ?
+"""Compares the simulated VLP-16 with real captures, and the simulated drones with a real one.
 
     python -m links.simulated.matrix.sim_vs_real            prints the table of recordings/README.md
 
-Every number of a cloud comes from decoded packets by the same function, real or simulated. The real captures were made
-in rooms, so the simulated one stands in a room, too. The real drone (UG2+/MMAUD) was seen by a Livox Mid-360, another
-scanner: hits are compared as an effective area, hits / (pulses per steradian) * range^2, which no longer holds the
-scanner's density. Its 20 000 pulses a frame are taken as spread evenly over its view.
+All figures of a cloud are computed from decoded packets by the same function, real or simulated. The real captures were
+made indoors, so the simulated one is, too. The real drone (UG2+/MMAUD) was recorded with a Livox Mid-360, another
+scanner: hits are compared as an effective area, hits / (pulses per steradian) * range^2, which does not depend on the
+density of the scanner. Its 20 000 pulses per frame are assumed uniform over its field of view.
 
 Source: ours; Livox Mid-360 user manual v1.2 (200 000 points/s, 360 deg x -7..52 deg).
 """
@@ -24,22 +24,21 @@ from flow.link import Record
 from links.recording import RecordingReader
 from links.simulated.kernels.lidar import echoes
 from links.simulated.kernels.ray_casting import Array32
-from links.simulated.sensors.footprint import FINE, sub_rays
-from links.simulated.sensors.lidar import Lidar, LidarSettings
+from links.simulated.sensors.lidar import FINE, Lidar, LidarSettings, sub_rays
 from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world.drone import DroneModel, drone_mesh
 from links.simulated.world.mesh import Mesh, RayScene
-from links.simulated.world.procedural.room import indoor_mesh
+from links.simulated.world.procedural.indoor import indoor_mesh
 from links.velodyne import Lidar as Decoder
 from links.velodyne import vlp16
 from stages.geometry import Array64
 from stages.messages import LidarFirings
 
 START_NS = 1_748_773_230_000_000_000
-WINDOW = 15  # firings of one laser, 3 deg: short enough for a wall to be a parabola in range
-FLAT_M = 0.03  # a window with a larger residual is no flat patch
-UPPER_LASERS = np.arange(1, vlp16.LASERS, 2)  # at and above +1 deg: free of table and vehicle
-MID360_PULSES = 20_000  # a frame of 0.1 s
+WINDOW = 15  # firings of one laser, 3 deg: within it the range of a wall is a parabola
+FLAT_M = 0.03  # largest residual of a flat patch
+UPPER_LASERS = np.arange(1, vlp16.LASERS, 2)  # at +1 deg and above: clear of table and vehicle
+MID360_PULSES = 20_000  # per frame of 0.1 s
 MID360_VIEW_SR = 2 * np.pi * (np.sin(np.radians(52)) - np.sin(np.radians(-7)))
 NEAR_DRONE_M = 0.6
 DRONES = ((0.35, "folding"), (0.5, "x4"), (0.8, "hexa"))
@@ -47,18 +46,18 @@ DRONES = ((0.35, "folding"), (0.5, "x4"), (0.8, "hexa"))
 
 @dataclass(frozen=True)
 class CloudFigures:
-    """What is measured on a capture."""
+    """Figures of a capture."""
 
     pulses_per_turn: float
     returns_per_turn: float
-    upper_returned: float  # share of the pulses at and above +1 deg that came back
-    spacing_mrad: float  # between neighbours on one surface, seen from the sensor
-    isolated_dropouts: float  # share of pulses without return between two returns of one surface
-    between: float  # share of returns hanging in the air between their two neighbours
+    upper_returned: float  # fraction of the pulses at +1 deg and above with a return
+    spacing_mrad: float  # between neighbours on one surface
+    isolated_dropouts: float  # fraction of pulses without return between two returns of one surface
+    mixed: float  # fraction of returns between the surfaces of their two neighbours
     noise_m: float  # median residual on flat patches
     noise_90_m: float
     patches: int
-    laser_bias_m: float  # spread of the lasers' mean residuals on planes
+    laser_bias_m: float  # spread of the mean residuals of the lasers on planes
     reflectivity: tuple[float, float, float]  # 5, 50, 95 %
 
 
@@ -72,31 +71,31 @@ def measure(firings: Iterable[LidarFirings]) -> CloudFigures:
     shade = np.concatenate([p.reflectivity for p in packets]).reshape(-1, vlp16.LASERS)
     points = np.concatenate([p.xyz_lidar_m for p in packets]).reshape(-1, vlp16.LASERS, 3).astype(np.float64)
     turns = float(np.ptp(np.unwrap(azimuth[:, 0]))) / (2 * np.pi)
-    seen = ranges > 0
+    returned = ranges > 0
     before, here, after = ranges[:-2], ranges[1:-1], ranges[2:]
     one_surface = (before > 0) & (after > 0) & (np.abs(after - before) < 0.05)
     low, high = np.minimum(before, after), np.maximum(before, after)
-    hanging = (before > 0) & (after > 0) & (here > low + 0.1) & (here < high - 0.1)
+    mixed = (before > 0) & (after > 0) & (here > low + 0.1) & (here < high - 0.1)
     step = np.linalg.norm(points[1:] - points[:-1], axis=2)
     level = (ranges[1:] > 0) & (ranges[:-1] > 0) & (np.abs(ranges[1:] - ranges[:-1]) < 0.004)
     residual = _patch_residuals(ranges)
     return CloudFigures(
         pulses_per_turn=ranges.size / turns,
-        returns_per_turn=float(seen.sum()) / turns,
-        upper_returned=float(seen[:, UPPER_LASERS].mean()),
+        returns_per_turn=float(returned.sum()) / turns,
+        upper_returned=float(returned[:, UPPER_LASERS].mean()),
         spacing_mrad=1e3 * float(np.median(step[level] / ranges[1:][level])),
         isolated_dropouts=float((here[one_surface] == 0).mean()),
-        between=float(hanging.sum() / seen.sum()),
+        mixed=float(mixed.sum() / returned.sum()),
         noise_m=float(np.median(residual)),
         noise_90_m=float(np.quantile(residual, 0.9)),
         patches=len(residual),
-        laser_bias_m=_laser_bias_m(points, seen),
-        reflectivity=tuple(np.quantile(shade[seen], [0.05, 0.5, 0.95]).tolist()),
+        laser_bias_m=_laser_bias_m(points, returned),
+        reflectivity=tuple(np.quantile(shade[returned], [0.05, 0.5, 0.95]).tolist()),
     )
 
 
 def _patch_residuals(ranges: Array64) -> Array64:
-    """Residual (p,) of a parabola through each full, flat window of one laser; degrees of freedom counted."""
+    """Residual (p,) of a parabola through each full, flat window of one laser, with its degrees of freedom."""
     t = np.linspace(-1, 1, WINDOW)
     basis = np.linalg.qr(np.column_stack([np.ones(WINDOW), t, t**2]))[0]
     whole = ranges[: len(ranges) // WINDOW * WINDOW].reshape(-1, WINDOW, vlp16.LASERS).transpose(0, 2, 1)
@@ -107,12 +106,12 @@ def _patch_residuals(ranges: Array64) -> Array64:
     return residual[residual < FLAT_M]
 
 
-def _laser_bias_m(points: Array64, seen: NDArray[np.bool_]) -> float:
+def _laser_bias_m(points: Array64, returned: NDArray[np.bool_]) -> float:
     """Spread over the lasers of their mean distance from planes through patches of 2 windows and all lasers."""
     offsets: list[list[float]] = [[] for _ in range(vlp16.LASERS)]
     size = 2 * WINDOW
     for first in range(0, len(points) - size, size):
-        patch, there = points[first : first + size], seen[first : first + size]
+        patch, there = points[first : first + size], returned[first : first + size]
         if there.all(axis=0).sum() < 6:
             continue
         lasers = np.nonzero(there.all(axis=0))[0]
@@ -138,7 +137,7 @@ def recorded(path: Path) -> Iterator[LidarFirings]:
 
 
 class StaticScene:
-    """A scene in which nothing moves."""
+    """A scene without motion."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._scene = RayScene(mesh)
@@ -159,8 +158,8 @@ class StaticScene:
 
 
 def simulated_indoor_scene(turns: float, seed: int = 1) -> Iterator[LidarFirings]:
-    """An upright LiDAR 1 m over the floor of the room, through packets and decoder as the real one."""
-    lidar, around, decoder = (
+    """An upright LiDAR 1 m above the floor of the room, through packets and decoder like the real one."""
+    lidar, environment, decoder = (
         Lidar(LidarSettings(), START_NS, seed),
         StaticScene(indoor_mesh(1.0, seed)),
         Decoder(),
@@ -171,7 +170,7 @@ def simulated_indoor_scene(turns: float, seed: int = 1) -> Iterator[LidarFirings
         sequence_ns = first_ns + vlp16.SEQUENCE_NS * np.arange(firings, dtype=np.int64)
         pulse_ns = (sequence_ns[:, None] + vlp16.PULSE_NS * np.arange(vlp16.LASERS)).ravel()
         level = np.broadcast_to(np.eye(3), (len(pulse_ns), 3, 3)).copy()
-        pulses = lidar.fire(pulse_ns, level, np.zeros((len(pulse_ns), 3)), around)
+        pulses = lidar.fire(pulse_ns, level, np.zeros((len(pulse_ns), 3)), environment)
         shape = (1, firings, vlp16.LASERS)
         azimuth = lidar.azimuth_rad(sequence_ns[::FIRINGS_PER_BLOCK])
         data = encode_packet(
@@ -186,20 +185,20 @@ def simulated_indoor_scene(turns: float, seed: int = 1) -> Iterator[LidarFirings
 def drone_area_m2(mesh: Mesh, from_m: Array64, step_rad: float = 4e-3) -> float:
     """Effective area: solid angle of the pulses that a VLP-16 gets back from the drone, times range^2.
 
-    Pulses on a square grid of directions about the drone at the origin, from a place (3,).
+    The pulses form a square grid of directions around the drone at the origin, from a position (3,).
     """
-    away_m = float(np.linalg.norm(from_m))
-    forward = -from_m / away_m
+    range_m = float(np.linalg.norm(from_m))
+    forward = -from_m / range_m
     side = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.95 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     up = np.cross(side, forward)
-    half = np.arctan2(1.2 * np.linalg.norm(mesh.vertices_m, axis=1).max(), away_m)
+    half = np.arctan2(1.2 * np.linalg.norm(mesh.vertices_m, axis=1).max(), range_m)
     u, v = (g.ravel() for g in np.meshgrid(*2 * [np.arange(-half, half, step_rad)]))
     axis = forward + np.tan(u)[:, None] * side + np.tan(v)[:, None] * up
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     across = np.cross(axis, up)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    aim = np.stack([across, axis, np.cross(across, axis)], axis=2)  # the laser's own axis is +y, but for its 1 deg
+    aim = np.stack([across, axis, np.cross(across, axis)], axis=2)  # the laser's axis is +y, except for its 1 deg
     origin = np.tile(from_m, (len(axis), 1))
     elevated = np.radians(1.0)
     tilt = np.array([[1, 0, 0], [0, np.cos(elevated), np.sin(elevated)], [0, -np.sin(elevated), np.cos(elevated)]])
@@ -209,37 +208,37 @@ def drone_area_m2(mesh: Mesh, from_m: Array64, step_rad: float = 4e-3) -> float:
     ranges, fractions = RayScene(mesh).cast(origins.reshape(-1, 3), directions.reshape(-1, 3), 200.0)
     settings = LidarSettings()
     threshold = np.full(len(axis), 0.10 / settings.range_at_10_percent_m**2)
-    seen = (ranges.reshape(shape), fractions.reshape(shape), np.zeros(shape, dtype=np.uint8))
-    found = echoes(*seen, FINE.shares, threshold, settings.min_range_m, "strongest")[0][0] > 0
-    return float(found.sum()) * step_rad**2 * away_m**2
+    returned = (ranges.reshape(shape), fractions.reshape(shape), np.zeros(shape, dtype=np.uint8))
+    found = echoes(*returned, FINE.shares, threshold, settings.min_range_m, "strongest")[0][0] > 0
+    return float(found.sum()) * step_rad**2 * range_m**2
 
 
 @dataclass(frozen=True)
 class DroneFigures:
-    """A real drone as the Mid-360 saw it."""
+    """A real drone in clouds of the Mid-360."""
 
     frames: int
     range_m: tuple[float, float]
-    hits: float  # median a frame
+    hits: float  # median per frame
     area_m2: tuple[float, float, float]  # 10, 50, 90 % over frames
-    extent_m: float  # median over frames of the cloud's widest direction, 5 to 95 %
-    places_m: Array64  # (frames, 3) drone minus sensor
+    extent_m: float  # median over frames of the extent along the widest direction, 5 to 95 %
+    positions_m: Array64  # (frames, 3) drone minus sensor
 
 
 def real_drone(folder: Path) -> DroneFigures:
-    """Hit counts of the real drone about its (unofficial) track."""
+    """Hits on the real drone, around its (unofficial) track."""
     track = np.genfromtxt(folder / "track_by_ug2_winner_NOT_official_gt.csv", delimiter=",", skip_header=1)
     clouds = np.load(folder / "ug2_val_seq1_lidar_360.npz")
-    hits, extents, places = [], [], []
+    hits, extents, positions = [], [], []
     for key in clouds:
         if track[0, 0] <= float(key) <= track[-1, 0]:
-            place = np.array([np.interp(float(key), track[:, 0], track[:, i]) for i in (1, 2, 3)])
-            cloud = clouds[key][np.linalg.norm(clouds[key] - place, axis=1) < NEAR_DRONE_M]
-            places.append(place)
+            position = np.array([np.interp(float(key), track[:, 0], track[:, i]) for i in (1, 2, 3)])
+            cloud = clouds[key][np.linalg.norm(clouds[key] - position, axis=1) < NEAR_DRONE_M]
+            positions.append(position)
             hits.append(len(cloud))
             widest = np.linalg.svd(cloud - cloud.mean(axis=0), full_matrices=False)[2][0]
             extents.append(float(np.ptp(np.quantile(cloud @ widest, [0.05, 0.95]))))
-    away = np.linalg.norm(places, axis=1)
+    away = np.linalg.norm(positions, axis=1)
     area = np.array(hits) * MID360_VIEW_SR / MID360_PULSES * away**2
     low, middle, high = np.quantile(area, [0.1, 0.5, 0.9]).tolist()
     return DroneFigures(
@@ -248,19 +247,19 @@ def real_drone(folder: Path) -> DroneFigures:
         hits=float(np.median(hits)),
         area_m2=(low, middle, high),
         extent_m=float(np.median(extents)),
-        places_m=np.array(places),
+        positions_m=np.array(positions),
     )
 
 
 def cloud_table(captures: dict[str, CloudFigures]) -> str:
-    """The captures side by side, in Markdown."""
+    """The figures of all captures, as a Markdown table."""
     rows = {
         "pulses per revolution": [f"{c.pulses_per_turn:.0f}" for c in captures.values()],
         "returns per revolution": [f"{c.returns_per_turn:.0f}" for c in captures.values()],
         "returned, lasers at +1 deg and above": [f"{100 * c.upper_returned:.1f} %" for c in captures.values()],
         "spacing of neighbours on a surface [mrad]": [f"{c.spacing_mrad:.2f}" for c in captures.values()],
-        "lost alone within a surface": [f"{100 * c.isolated_dropouts:.2f} %" for c in captures.values()],
-        "hanging between two surfaces": [f"{100 * c.between:.2f} %" for c in captures.values()],
+        "isolated dropouts within a surface": [f"{100 * c.isolated_dropouts:.2f} %" for c in captures.values()],
+        "mixed pixels between two surfaces": [f"{100 * c.mixed:.2f} %" for c in captures.values()],
         "range noise on flat patches, median [mm]": [f"{1e3 * c.noise_m:.1f}" for c in captures.values()],
         "the same, 90 % [mm]": [f"{1e3 * c.noise_90_m:.1f}" for c in captures.values()],
         "flat patches": [str(c.patches) for c in captures.values()],
@@ -273,16 +272,16 @@ def cloud_table(captures: dict[str, CloudFigures]) -> str:
 
 
 def drone_table(real: DroneFigures) -> str:
-    """Effective areas of the real drone and of ours from the same directions, in Markdown."""
+    """Effective areas of the real drone and of simulated ones from the same directions, as a Markdown table."""
     lines = [
         "| drone | effective area 10, 50, 90 % [cm^2] |",
         "| --- | --- |",
         f"| real, {real.frames} frames at {real.range_m[0]:.1f} to {real.range_m[1]:.1f} m, "
-        f"{real.hits:.0f} hits a frame, {real.extent_m:.2f} m wide | {_cm2(real.area_m2)} |",
+        f"{real.hits:.0f} hits per frame, {real.extent_m:.2f} m wide | {_cm2(real.area_m2)} |",
     ]
     for span_m, shape in DRONES:
         mesh = drone_mesh(span_m, 0.4, DroneModel.model_validate({"shape": shape}))
-        areas = [drone_area_m2(mesh, -place, 8e-3) for place in real.places_m[::4]]
+        areas = [drone_area_m2(mesh, -position, 8e-3) for position in real.positions_m[::4]]
         low, middle, high = np.quantile(areas, [0.1, 0.5, 0.9]).tolist()
         lines.append(f"| simulated, {span_m} m {shape} | {_cm2((low, middle, high))} |")
     return "\n".join(lines)
@@ -293,14 +292,14 @@ def _cm2(area_m2: tuple[float, float, float]) -> str:
 
 
 def comparison_table(recordings: Path, shared: Path) -> str:
-    """Both tables; without the shared drone clouds (`drone_lidar`) the second says so."""
+    """Both tables; without the shared drone clouds (`drone_lidar`), a note instead of the second."""
     captures = {
         "einride (real)": measure(recorded(recordings / "einride_vlp16.mcap")),
         "mrpt (real)": measure(recorded(recordings / "mrpt_vlp16_gps.mcap")),
         "room (simulated)": measure(simulated_indoor_scene(13.0)),
     }
     folder = shared / "drone_lidar"
-    drones = drone_table(real_drone(folder)) if folder.exists() else f"The real drone clouds are not here ({folder})."
+    drones = drone_table(real_drone(folder)) if folder.exists() else f"The real drone clouds are missing ({folder})."
     return cloud_table(captures) + "\n\n" + drones + "\n"
 
 

@@ -1,12 +1,11 @@
-"""Closed loop: the pipeline's own goals drive the simulated servo, in virtual time.
+"""Closed loop: goals of the pipeline drive the simulated servo, in virtual time.
 
-Each record that the simulation makes is fed to the graph when it has arrived. A goal that the graph gives leaves the
-host `compute_s` after the arrival of the record that caused it, whatever the computer that simulates needs, and the
-servo obeys its command latency later. The simulation never runs further ahead of the graph than `compute_s`, so no
-goal comes too late to be obeyed in time: the same scenario, seed and configuration give the same bytes, and it does not
-matter how pulses are batched.
+Each record of the simulation is fed to the graph at its arrival. A goal that follows from it leaves the host
+`compute_s` later, whatever the simulating computer needs, and the servo executes it after its command latency. The
+simulation never runs further ahead of the graph than `compute_s`, so no goal is late. Therefore the same scenario, seed
+and configuration give the same bytes, however pulses are batched.
 
-A replay of the recording with the same configuration takes the same steps: its output hash is the one given here.
+A replay of the recording with the same configuration takes the same steps and has the same output hash.
 
 Source: ours; conservative look-ahead as in parallel discrete event simulation (Chandy and Misra, 1979).
 """
@@ -31,19 +30,19 @@ from links.run_folder import Asked
 from links.simulated.sensors.servo import STEP_NS
 from stages.messages import ServoGoal
 
-LONGEST_BATCH_NS = 40_000_000  # a longer one saves no more time
+LONGEST_BATCH_NS = 40_000_000  # longer batches are not faster
 
 
 class ClosedLoopSettings(BaseModel):
-    """How the host on the vehicle keeps up."""
+    """Compute time of the host on the vehicle."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    compute_s: float = Field(default=0.02, ge=0.003, le=1)  # arrival of a record to the goal it causes leaving the host
+    compute_s: float = Field(default=0.02, ge=0.003, le=1)  # from arrival of a record to the goal leaving the host
 
 
 class GoalTap(Tap):
-    """Hands each goal that is wired to the servo over to it, as a live run does."""
+    """Passes each goal that is wired to the servo on to it, as a live run does."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -51,22 +50,22 @@ class GoalTap(Tap):
         self._servo: Servo | None = None
 
     def watch(self, output: str, servo: Servo) -> None:
-        """Which goals go to which servo."""
+        """Set the output that commands the servo, and the servo."""
         self._output, self._servo = output, servo
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
-        """A goal on its way."""
+        """Pass on a goal."""
         if self._servo is not None and output == self._output and isinstance(message, ServoGoal):
             self._servo.on_goal(message)
 
 
 class ClosedLoop:
-    """A graph that is fed with the simulation's records and commands its servo."""
+    """A graph that is fed with the records of the simulation and commands its servo."""
 
     def __init__(
         self, graph: Graph, settings: ClosedLoopSettings, loop_metadata: dict[str, str], taps: Sequence[Tap] = ()
     ) -> None:
-        """`loop_metadata` is what recordings keep of the graph's origin; `taps` are open and see every message."""
+        """`loop_metadata` is for the recording, names the configuration; `taps` are open and see all messages."""
         self.loop_metadata = loop_metadata
         self._digest, goals = Digest(), GoalTap()
         self._replay = Replay(graph, (self._digest, goals, *taps))
@@ -78,34 +77,34 @@ class ClosedLoop:
         self._compute_ns = round(settings.compute_s * 1e9)
 
     def take(self, record: Record) -> tuple[int, GoalCommand] | None:
-        """Run all that follows from a record that has arrived: when which command leaves the host, or None."""
+        """Process a record that has arrived; returns the time at which a command leaves the host, and the command."""
         self._replay.feed(record)
         command = self._servo.take_command()
         return None if command is None else (record.arrival_ns + self._compute_ns, command)
 
     def longest_batch_ns(self) -> int:
-        """How far the simulation may run ahead of the newest record that the graph has seen."""
+        """How far the simulation may run ahead of the newest record fed to the graph."""
         return min(LONGEST_BATCH_NS, self._compute_ns - STEP_NS)
 
     def finish(self) -> RunReport:
-        """Let the stages give out what they hold."""
+        """Let the stages emit what they hold."""
         report = self._replay.finish()
-        report.counters[self._servo_name].pop(NOT_LIVE, None)  # they went to the simulated servo
+        report.counters[self._servo_name].pop(NOT_LIVE, None)  # these commands went to the simulated servo
         return report
 
     @property
     def report(self) -> RunReport:
-        """What the graph did so far."""
+        """Report of the graph up to now."""
         return self._replay.report
 
     @property
     def output_hash(self) -> str:
-        """Hash over every message so far, as `grd replay` writes it."""
+        """Hash over all messages up to now, as `grd replay` writes it."""
         return self._digest.hexdigest()
 
 
 def servo_edge(graph: Graph) -> tuple[str, str]:
-    """Name of the servo link that the graph commands, and the output wired to it. LinkError when there is none."""
+    """Name of the servo link that the graph commands, and the output wired to it. LinkError unless there is one."""
     found = [
         (edge.consumer, f"{edge.producer}.{edge.output}")
         for edge in graph.edges
@@ -113,24 +112,27 @@ def servo_edge(graph: Graph) -> tuple[str, str]:
     ]
     if len(found) != 1:
         raise LinkError(
-            f"closed loop needs one servo that the graph commands, this graph has {len(found)}: wire it as "
-            "'servo: {use: links.dynamixel.Servo, inputs: {goal: aim.servo_goal}}'; configs/sim.yaml does"
+            f"closed loop needs exactly one servo that the graph commands, this graph has {len(found)}: wire it as "
+            "'servo: {use: links.dynamixel.Servo, inputs: {goal: aim.servo_goal}}', as in configs/sim.yaml"
         )
     return found[0]
 
 
 def loop_metadata(config: Path, graph: Graph) -> dict[str, str]:
-    """What a recording keeps of the configuration that closed its loop: the file's name and a hash of all it says.
+    """Metadata of a recording made in closed loop: name of the configuration and hash of its content.
 
-    Includes are in the hash and so is the rig; taps are not: they change no message.
+    The hash includes included files and the rig, but not the taps, which change no message.
     """
     taps = {name for name, spec in graph.nodes.items() if issubclass(spec.cls, Tap)}
     links = {name: link for name, link in graph.values.get("links", {}).items() if name not in taps}
-    said = yaml.safe_dump(graph.values | {"links": links}, sort_keys=False)
-    return {"closed_loop": config.name, "closed_loop_hash": hashlib.blake2b(said.encode(), digest_size=16).hexdigest()}
+    content = yaml.safe_dump(graph.values | {"links": links}, sort_keys=False)
+    return {
+        "closed_loop": config.name,
+        "closed_loop_hash": hashlib.blake2b(content.encode(), digest_size=16).hexdigest(),
+    }
 
 
 def load_loop(config: Path, rig_yaml: str, scenario: str, settings: ClosedLoopSettings) -> ClosedLoop:
-    """A configuration as a closed loop on a scenario's rig. Raises ConfigError with every problem, or LinkError."""
+    """A configuration as a closed loop on the rig of a scenario. ConfigError has all problems of the configuration."""
     graph = Asked(config).graph(rig_yaml, scenario)
     return ClosedLoop(graph, settings, loop_metadata(config, graph))

@@ -1,14 +1,13 @@
-"""The images of an earlier recording of the same flight, instead of painting them again.
+"""Images of an earlier recording of the same flight, so that they are not rendered again.
 
-A closed loop run again with another LiDAR stage or setting sees the same street, and painting is most of its time (176
-of 286 s of a core for 40 s with two 720 px cameras at 5 Hz).
-What the images show must be the same: seed, start, scene, weather, vehicle and drones with how they ride and fly,
-cameras, and the turntable, of which the vehicle's camera sees the LiDAR. All else may differ. The flight may be shorter
-than the recorded one; longer only where a drone goes round and round (`path.period_s`) past a world that stands still:
-the images of the first round are those of the next ones, each so much later.
+Rendering is most of the time of a closed loop, while another LiDAR stage or setting leaves the images as they are.
+The images are the same if seed, start, scene, weather, vehicle and drones with their motion, cameras, and the turntable
+(the vehicle's camera sees the LiDAR) are. All other settings may differ. The flight may be shorter than the recorded
+one. It may be longer only if all drones fly closed paths of one period (`path.period_s`) in a static scene: the images
+of the first lap then repeat, delayed.
 
-The recording tells all that as its config. Code is not in it: that vehicle and drones were where they are now is asked
-of the truth recorded, and every image must have the stamp that it would get now.
+The config attached to the recording states these settings. Changes of code show in the recorded ground truth, with
+which the motion of vehicle and drones must agree, and in the stamps of the images.
 
 Source: ours.
 """
@@ -29,140 +28,143 @@ from pydantic import ValidationError
 from flow.link import LinkError, Record
 from links.recording import CompressedImage, RecordingReader, decode_compressed_image, encode_compressed_image
 from links.simulated.rig.scenario import Scenario
-from links.simulated.sensors.camera import CameraSettings, FrameTimes, wanted_cameras
+from links.simulated.sensors.camera import CameraSettings, FrameTimes, enabled_cameras
 from links.simulated.world.mesh import Mesh
 from links.simulated.world.procedural import World, build_world
 from links.simulated.world.scene import Truth
 from stages.geometry import Array64, quaternions_xyzw
 
-NEAR_M = 1e-3  # the same place, on whichever computer
+NEAR_M = 1e-3  # tolerance between computers
 NEAR_QUATERNION = 1e-4
-WAY_STEP_S = 0.25
-NOT_THESE = "take a recording of the same flight, or leave --images out and have them painted"
+PATH_STEP_S = 0.25
+OTHER_FLIGHT = "use a recording of the same flight, or leave out --images to render them"
 
 
 class ImageCache:
-    """A recording whose images are what a scenario's cameras would make. LinkError says why they are not."""
+    """A recording that has the images of a scenario's cameras. LinkError states why it has not."""
 
     def __init__(self, file: Path, scenario: Scenario) -> None:
-        """Compares what the recording says of its flight; `cameras` compares the flight itself."""
+        """Compares the settings of the recording; `cameras` compares its motion."""
         self._file, self._scenario = file, scenario
         with RecordingReader(file) as reader:
             recorded = _scenario_of(reader)
-            carriers = [carrier for carrier, _ in wanted_cameras(scenario.cameras, scenario.drone is not None)]
-            if not carriers:
-                raise LinkError(f"{scenario.name} has no cameras: leave --images out")
-            for topic in (f"/camera/{carrier}" for carrier in carriers):
+            platforms = [platform for platform, _ in enabled_cameras(scenario.cameras, scenario.drone is not None)]
+            if not platforms:
+                raise LinkError(f"{scenario.name} has no cameras: leave out --images")
+            for topic in (f"/camera/{platform}" for platform in platforms):
                 if topic not in reader.topics:
-                    raise LinkError(f"{file} has nothing on {topic}: {NOT_THESE}")
+                    raise LinkError(f"{file} has nothing on {topic}: {OTHER_FLIGHT}")
         difference = first_difference(image_settings(recorded), image_settings(scenario))
         longer = scenario.duration_s > recorded.duration_s
-        self._round_s = image_period_s(scenario) if longer else None  # what was painted to its end needs no round again
-        if difference is None and longer and self._round_s is None:
+        self._period_s = image_period_s(scenario) if longer else None  # a recorded flight needs no repetition
+        if difference is None and longer and self._period_s is None:
             difference = "duration_s", f"{recorded.duration_s:g}", f"{scenario.duration_s:g}"
         if (
             difference is None
             and scenario.duration_s < recorded.duration_s
-            and not _same(scenario_world(recorded), scenario_world(scenario))
+            and not _same_world(scenario_world(recorded), scenario_world(scenario))
         ):
             difference = (
                 "duration_s",
                 f"{recorded.duration_s:g}",
-                f"{scenario.duration_s:g}, which leaves room for more",
+                f"{scenario.duration_s:g}, which adds objects to the scene",
             )
         if difference is not None:
             where, there, here = difference
-            raise LinkError(f"{file} shows another flight: {where} is {there} there, {here} here; {NOT_THESE}")
+            raise LinkError(f"{file} shows another flight: {where} is {there} in it, {here} now; {OTHER_FLIGHT}")
 
     def cameras(self, truth: Truth) -> list[CachedCamera]:
-        """The scenario's cameras, each giving the images of the recording."""
-        self._compare_flown(truth)
+        """The cameras of the scenario, with the images of the recording."""
+        self._compare_motion(truth)
         start_ns, seed = self._scenario.start_ns, self._scenario.seed
         return [
             CachedCamera(
-                self._file, f"/camera/{carrier}", FrameTimes(carrier, settings, start_ns, seed), self._frames(settings)
+                self._file,
+                f"/camera/{platform}",
+                FrameTimes(platform, settings, start_ns, seed),
+                self._frames(settings),
             )
-            for carrier, settings in wanted_cameras(self._scenario.cameras, truth.drone is not None)
+            for platform, settings in enabled_cameras(self._scenario.cameras, truth.drone is not None)
         ]
 
     def _frames(self, settings: CameraSettings) -> int | None:
-        """Images in a round; None where none comes again."""
-        if self._round_s is None:
+        """Images per lap; None when they do not repeat."""
+        if self._period_s is None:
             return None
-        frames = self._round_s * settings.rate_hz
+        frames = self._period_s * settings.rate_hz
         if abs(frames - round(frames)) > 1e-6:
             raise LinkError(
-                f"{settings.rate_hz:g} Hz are {frames:.2f} images in a round of {self._round_s:g} s: "
-                "take a rate that makes a whole number of them"
+                f"{settings.rate_hz:g} Hz are {frames:.2f} images in a lap of {self._period_s:g} s: "
+                "choose a rate with a whole number of them"
             )
         return round(frames)
 
-    def _compare_flown(self, truth: Truth) -> None:
-        """LinkError where vehicle or drones were elsewhere than they are now."""
+    def _compare_motion(self, truth: Truth) -> None:
+        """LinkError if the recorded motion of vehicle or drones differs from the present one."""
         end_ns = self._scenario.start_ns + round(self._scenario.duration_s * 1e9)
         topics: dict[str, Callable[[NDArray[np.int64]], tuple[Array64, Array64]]]
         topics = {"/truth/vehicle": truth.T_world_vehicle}
         for number in truth.drones:
             name = "/truth/drone" if number == 1 else f"/truth/drone_{number}"
             topics[name] = partial(truth.T_world_drone, number=number)
-        told: dict[str, list[tuple[int, list[float]]]] = {topic: [] for topic in topics}
+        recorded_poses: dict[str, list[tuple[int, list[float]]]] = {topic: [] for topic in topics}
         with RecordingReader(self._file) as reader:
             for record in reader.records(topics):
                 if record.stamp_ns < end_ns:
                     pose = json.loads(record.data)
-                    told[record.topic].append((record.stamp_ns, [*pose["xyz_m"], *pose["quaternion_xyzw"]]))
-        for topic, poses in told.items():
+                    recorded_poses[record.topic].append((record.stamp_ns, [*pose["xyz_m"], *pose["quaternion_xyzw"]]))
+        for topic, poses in recorded_poses.items():
             if not poses:
-                raise LinkError(f"{self._file} has nothing on {topic}, so its images cannot be judged: {NOT_THESE}")
+                raise LinkError(f"{self._file} has nothing on {topic}, so its images cannot be checked: {OTHER_FLIGHT}")
             stamps = np.array([stamp for stamp, _ in poses], dtype=np.int64)
             there = np.array([pose for _, pose in poses])
             R, t = topics[topic](stamps)
-            turned = 1.0 - np.abs(np.einsum("ni,ni->n", quaternions_xyzw(R), there[:, 3:]))
-            off = (np.linalg.norm(t - there[:, :3], axis=1) > NEAR_M) | (turned > NEAR_QUATERNION**2)
+            rotation_error = 1.0 - np.abs(np.einsum("ni,ni->n", quaternions_xyzw(R), there[:, 3:]))
+            off = (np.linalg.norm(t - there[:, :3], axis=1) > NEAR_M) | (rotation_error > NEAR_QUATERNION**2)
             if off.any():
                 at_s = (stamps[off.argmax()] - self._scenario.start_ns) * 1e-9
                 who = topic.removeprefix("/truth/")
                 raise LinkError(
-                    f"{self._file} shows another flight: {who} was elsewhere at {at_s:.2f} s though every setting is "
-                    f"the same (code that moves it has changed since); {NOT_THESE}"
+                    f"{self._file} shows another flight: {who} has another pose at {at_s:.2f} s although all settings "
+                    f"are the same (the code has changed since); {OTHER_FLIGHT}"
                 )
 
 
 class CachedCamera:
-    """A camera whose images are there already; `records` as `links.simulated.sensors.camera.Camera` gives them."""
+    """A camera with recorded images; `records` is that of `links.simulated.sensors.camera.Camera`."""
 
     def __init__(self, file: Path, topic: str, times: FrameTimes, frames: int | None = None) -> None:
-        """`frames`: so many make a round, after which they come again; None: they do not."""
+        """`frames`: number of images in a lap, after which they repeat; None: they do not."""
         self._file, self._topic, self._times, self._frames = file, topic, times, frames
-        self._frame = 0  # of this round
-        self._delay_ns = 0  # than in the first round
-        self._coming = self._read()
-        self._early: dict[int, Record] = {}  # by stamp: latencies differ, so a later image may arrive first
+        self._frame = 0  # of this lap
+        self._delay_ns = 0  # since the first lap
+        self._records = self._read()
+        self._early: dict[int, Record] = {}  # by stamp: a later image may arrive first
 
     def records(self, until_ns: int) -> list[Record]:
         """Frames whose readout ended before `until_ns`, each once."""
         records: list[Record] = []
-        while self._times.ends_ns(self._frame) + self._delay_ns < until_ns:
-            records.append(self._picture(self._times.stamp_ns(self._frame)))
+        while self._times.end_ns(self._frame) + self._delay_ns < until_ns:
+            records.append(self._image_record(self._times.stamp_ns(self._frame)))
             self._frame += 1
             if self._frame == self._frames:
-                self._begin_again()
+                self._restart_lap()
         return records
 
-    def _begin_again(self) -> None:
-        self._delay_ns += self._times.lasts_ns(self._frame)
+    def _restart_lap(self) -> None:
+        self._delay_ns += self._times.duration_ns(self._frame)
         self._frame = 0
-        self._coming, self._early = self._read(), {}
+        self._records, self._early = self._read(), {}
 
     def _read(self) -> Iterator[Record]:
         with RecordingReader(self._file) as reader:
             yield from reader.records([self._topic])
 
-    def _picture(self, stamp_ns: int) -> Record:
+    def _image_record(self, stamp_ns: int) -> Record:
         while stamp_ns not in self._early:
-            record = next(self._coming, None)
+            record = next(self._records, None)
             if record is None:
-                raise LinkError(f"{self._file} has no image on {self._topic} stamped {stamp_ns}: {NOT_THESE}")
+                raise LinkError(f"{self._file} has no image on {self._topic} with stamp {stamp_ns}: {OTHER_FLIGHT}")
             self._early[record.stamp_ns] = record
         return _delayed(self._early.pop(stamp_ns), self._delay_ns)
 
@@ -177,21 +179,21 @@ def _delayed(record: Record, delay_ns: int) -> Record:
 
 
 def image_settings(scenario: Scenario) -> dict[str, Any]:
-    """All settings that a image can show, and those of when images are taken; the mount is the true one."""
-    said = scenario.model_dump(mode="json")
+    """All settings that affect the images and their times; the mount is the true one."""
+    settings = scenario.model_dump(mode="json")
     same = ("seed", "start_utc", "scene", "weather", "vehicle", "drone", "other_drones", "cameras")
     mount = scenario.mount.model_dump(mode="json")
-    flown = None if scenario.autopilot is None else said["autopilot"]["flight"]
+    flight = None if scenario.autopilot is None else settings["autopilot"]["flight"]
     turntable = {name: mount[name] for name in ("T_vehicle_turntable", "T_turntable_lidar")}
-    return {name: said[name] for name in same} | {"autopilot": {"flight": flown}, "mount": turntable}
+    return {name: settings[name] for name in same} | {"autopilot": {"flight": flight}, "mount": turntable}
 
 
 def image_period_s(scenario: Scenario) -> float | None:
-    """After so long every image is the same again [s]; None: never, or not for all that a camera sees."""
-    flown = () if scenario.drone is None else (scenario.drone, *scenario.other_drones)
-    rounds = {drone.path.period_s for drone in flown}
-    parked = len(scenario.vehicle.path.waypoints) == 1 and scenario.vehicle.ride is None
-    return rounds.pop() if len(rounds) == 1 and parked and not any(scenario.scene.movers()) else None
+    """Period [s] after which all images repeat; None when they never do."""
+    flight = () if scenario.drone is None else (scenario.drone, *scenario.other_drones)
+    periods = {drone.path.period_s for drone in flight}
+    parked = len(scenario.vehicle.path.waypoints) == 1 and scenario.vehicle.suspension is None
+    return periods.pop() if len(periods) == 1 and parked and not any(scenario.scene.movers()) else None
 
 
 def first_difference(there: Any, here: Any, where: str = "") -> tuple[str, str, str] | None:
@@ -203,19 +205,19 @@ def first_difference(there: Any, here: Any, where: str = "") -> tuple[str, str, 
     elif isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
         pairs = [(str(index), a, b) for index, (a, b) in enumerate(zip(there, here, strict=True))]
     else:
-        return None if there == here else (where, _brief(there), _brief(here))
+        return None if there == here else (where, _summary(there), _summary(here))
     found = (first_difference(a, b, f"{where}.{name}" if where else name) for name, a, b in pairs)
     return next((difference for difference in found if difference is not None), None)
 
 
 def scenario_world(scenario: Scenario) -> World:
-    """What stands and moves about the vehicle's way; how far it drives says what has to stand clear of it."""
-    driven = scenario.vehicle.path.at(np.arange(0.0, scenario.duration_s, WAY_STEP_S))[0]
+    """Static scene and movers of a scenario; the driven path is kept free of objects."""
+    driven = scenario.vehicle.path.at(np.arange(0.0, scenario.duration_s, PATH_STEP_S))[0]
     return build_world(scenario.scene, scenario.vehicle.camera_height_m, scenario.seed, driven[:, :2])
 
 
-def _same(one: World, other: World) -> bool:
-    """The fixed world, and how many things move: which ones follows from seed and settings."""
+def _same_world(one: World, other: World) -> bool:
+    """Whether the static meshes and the number of movers agree; seed and settings determine the movers."""
     return _same_mesh(one.mesh, other.mesh) and len(one.movers) == len(other.movers)
 
 
@@ -227,7 +229,7 @@ def _same_mesh(one: Mesh, other: Mesh) -> bool:
     )
 
 
-def _brief(value: Any) -> str:
+def _summary(value: Any) -> str:
     if value is None:
         return "not given"
     if isinstance(value, list):
@@ -236,12 +238,12 @@ def _brief(value: Any) -> str:
 
 
 def _scenario_of(reader: RecordingReader) -> Scenario:
-    """The scenario that a recording was made of."""
+    """The scenario of a recording."""
     if reader.metadata.get("made_by") != "grd simulate" or reader.config_yaml is None:
-        raise LinkError(f"{reader.path} is no simulated recording: --images takes one that `grd simulate` made")
+        raise LinkError(f"{reader.path} is no simulated recording: --images takes one made by `grd simulate`")
     if not reader.finished:
-        raise LinkError(f"{reader.path} was cut off: {NOT_THESE}")
+        raise LinkError(f"{reader.path} is incomplete: {OTHER_FLIGHT}")
     try:
         return Scenario.model_validate(yaml.safe_load(reader.config_yaml))
     except (yaml.YAMLError, ValidationError):
-        raise LinkError(f"{reader.path}: its scenario is not one of this version of grd: {NOT_THESE}") from None
+        raise LinkError(f"{reader.path}: its scenario does not fit this version of grd: {OTHER_FLIGHT}") from None

@@ -1,8 +1,8 @@
-"""The simulated cameras in real time: images painted before, served by HTTP as a network camera does (MJPEG).
+"""The simulated cameras in real time: recorded images, served over HTTP as network cameras do (MJPEG).
 
-Painting two fisheyes takes eight times as long as they see; a recording of the same flight has their images already
-(`kept_pictures` makes sure that it is the same). Each leaves at the moment at which it arrived there, some 60 ms after
-its exposure. A client gets the newest one, and none twice; one that is slow misses some.
+Rendering two fisheyes takes eight times as long as the flight, so the images come from a recording of the same flight
+(`image_cache` checks it). Each is served at its recorded arrival, about 60 ms after its exposure. A client gets the
+newest image and none twice; a slow client misses some.
 
 Source: ours; multipart/x-mixed-replace as network cameras send it (RFC 2046, 5.1).
 """
@@ -20,16 +20,16 @@ from links.recording import decode_compressed_image
 from links.simulated.rig.image_cache import CachedCamera
 
 LOOPBACK = "127.0.0.1"
-AHEAD_NS = 200_000_000  # images are read so long before they leave
-LOOK_S = 0.05  # how often the next ones are read, and a client's thread looks for the end
+AHEAD_NS = 200_000_000  # images are read this long before they are due
+POLL_S = 0.05  # period of reading ahead, and of checks for the end
 MOST_CLIENTS = 4
 
 
 class MjpegServer:
-    """One camera's port on this host. `with MjpegServer(8091) as server: server.show(jpeg)`."""
+    """One camera on a port of this host. `with MjpegServer(8091) as server: server.show(jpeg)`."""
 
     def __init__(self, port: int) -> None:
-        """`port` 0: any that is free. OSError when it is taken."""
+        """`port` 0: any free port. OSError when the port is in use."""
         self._changed = threading.Condition()
         self._newest: bytes | None = None
         self._number = self._clients = 0
@@ -37,22 +37,22 @@ class MjpegServer:
         shown = self
 
         class Handler(BaseHTTPRequestHandler):
-            """One client, until it leaves or the server closes."""
+            """One client, until it disconnects or the server closes."""
 
             def log_message(self, format: str, *args: object) -> None:
-                """Nothing: there is no log."""
+                """Do not log."""
 
             def do_GET(self) -> None:
-                """The stream, whatever the path."""
+                """The stream, for any path."""
                 shown.serve(self)
 
         self._http = ThreadingHTTPServer((LOOPBACK, port), Handler)
         self._http.daemon_threads = True
-        self._thread = threading.Thread(target=self._http.serve_forever, args=(LOOK_S,), daemon=True)
+        self._thread = threading.Thread(target=self._http.serve_forever, args=(POLL_S,), daemon=True)
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The port on which it listens."""
         return self._http.server_port
 
     def __enter__(self) -> MjpegServer:
@@ -69,13 +69,13 @@ class MjpegServer:
         self._http.server_close()
 
     def show(self, jpeg: bytes) -> None:
-        """The newest image."""
+        """Publish the newest image."""
         with self._changed:
             self._newest, self._number = jpeg, self._number + 1
             self._changed.notify_all()
 
     def serve(self, client: BaseHTTPRequestHandler) -> None:
-        """Picture after image to one client."""
+        """Send images to one client."""
         with self._changed:
             if self._clients >= MOST_CLIENTS:
                 client.send_error(503, "too many clients")
@@ -90,26 +90,26 @@ class MjpegServer:
                 sent, jpeg = image
                 head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
                 client.wfile.write(head.encode() + jpeg + b"\r\n")
-        except OSError:  # it left
+        except OSError:  # it disconnected
             return
         finally:
             with self._changed:
                 self._clients -= 1
 
     def _after(self, sent: int) -> tuple[int, bytes] | None:
-        """Number and bytes of a image newer than one; None at the end."""
+        """Number and bytes of an image newer than `sent`; None at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._number > sent)
             return None if self._closed or self._newest is None else (self._number, self._newest)
 
 
 class TimedImageServer:
-    """Serves the images of kept cameras when they are due: `with TimedImageServer(...)`."""
+    """Serves the images of cached cameras at their arrival times: `with TimedImageServer(...)`."""
 
     def __init__(
         self, cameras: Sequence[CachedCamera], ports: Mapping[str, int], now_ns: Callable[[], int], end_ns: int
     ) -> None:
-        """`ports` by topic; `now_ns` is the scenario's time, `end_ns` its end. Entering: OSError, a port is taken."""
+        """`ports` by topic; `now_ns` is the scenario's time, `end_ns` its end. OSError on entry: a port is in use."""
         self._cameras, self._ports, self._now_ns, self._end_ns = cameras, ports, now_ns, end_ns
         self._servers: dict[str, MjpegServer] = {}
         self._stop = threading.Event()
@@ -138,8 +138,8 @@ class TimedImageServer:
             for camera in self._cameras:
                 for record in camera.records(min(self._now_ns() + AHEAD_NS, self._end_ns)):
                     heapq.heappush(waiting, (record.arrival_ns, record.topic, record.data))
-            due_s = (waiting[0][0] - self._now_ns()) * 1e-9 if waiting else LOOK_S
-            if self._stop.wait(min(max(due_s, 0.0), LOOK_S)):
+            due_s = (waiting[0][0] - self._now_ns()) * 1e-9 if waiting else POLL_S
+            if self._stop.wait(min(max(due_s, 0.0), POLL_S)):
                 return
             while waiting and waiting[0][0] <= self._now_ns():
                 _, topic, data = heapq.heappop(waiting)

@@ -1,11 +1,10 @@
-"""The process of the simulated rig in real time: `python -m links.simulated.rig.live_process SETTINGS`, see `live_rig`.
+"""Process of the simulated rig in real time: `python -m links.simulated.rig.live_process SETTINGS`; see `live_rig`.
 
-Pulses can be cast once the servo has stood where it stood, so packets leave some milliseconds after their last pulse:
-the time of a batch and of its casting. Their own clock is right (a VLP-16 locked to the host's time: `clock: utc`).
-Nothing waits for the graph. When the machine is too busy packets come later, or not at all: `rig.json` tells.
+Pulses are cast once the servo position at their time is known, so a packet is sent some milliseconds after its last
+pulse: the duration of a batch and of its casting. Packet stamps are exact (a VLP-16 locked to the host: `clock: utc`).
+Nothing waits for the graph. On a busy machine packets are late or lost, as `rig.json` reports.
 
-Source: ours; the parts are those of `links.simulated.rig.run`, the servo is
-`links.simulated.sensors.dynamixel_emulator`.
+Source: ours; parts of `links.simulated.rig.run`, with the servo of `links.simulated.sensors.dynamixel_emulator`.
 """
 
 from __future__ import annotations
@@ -47,16 +46,16 @@ from links.truth import TRUTH_RECORDING
 from links.velodyne import vlp16
 from stages.geometry import Array64
 
-WARM_PACKETS = 75  # a turn of the rotor
-SKIP_NS = 200_000_000  # so far behind, it leaves out what it cannot send in time: packets are lost
+WARM_PACKETS = 75  # one revolution of the rotor
+SKIP_NS = 200_000_000  # when it is this late, it skips packets: they are lost
 LOOPBACK = "127.0.0.1"
-POSITION_NS = 100_000_000  # between two of the LiDAR's position packets
-TRUTH_NS = 100_000_000  # where all was is told so often: nobody waits for it, and told one by one it costs more
-SWITCH_S = 5e-4  # the servo's thread must not wait long for the one that casts
+POSITION_NS = 100_000_000  # period of the LiDAR's position packets
+TRUTH_NS = 100_000_000  # period of the ground truth, which nobody waits for: batches cost less
+SWITCH_S = 5e-4  # thread switch interval: the thread of the servo must not wait for the one that casts
 
 
 class LiveSimulation(Simulation):
-    """A scenario that begins when it is told to, with an emulated servo. Its own times are the scenario's."""
+    """A scenario that starts on demand, with an emulated servo. Its internal times are those of the scenario."""
 
     def __init__(self, scenario: Scenario, images: ImageCache | None = None) -> None:
         super().__init__(scenario, images=images)
@@ -64,21 +63,21 @@ class LiveSimulation(Simulation):
         self.ahead_ns = 0
         self.emulator: DynamixelEmulator | None = None
         self._servo.advance(scenario.start_ns + WARM_PACKETS * self.packet_ns)
-        self.lidar_records(scenario.start_ns, WARM_PACKETS, self.packet_ns)  # compiles what it uses first
+        self.lidar_records(scenario.start_ns, WARM_PACKETS, self.packet_ns)  # compiles all that it uses
 
     def begin(self, servo: Path) -> DynamixelEmulator:
-        """The scenario's first moment is now. The servo, not yet on its pty."""
+        """Start the scenario now; returns the servo, not yet on its pty."""
         self.ahead_ns = self.lidar_clock_ns = host_time.now_ns() - self.scenario.start_ns
         self.emulator = DynamixelEmulator(self.scenario.servo, self.seed, servo, self.now_ns)
         return self.emulator
 
     @property
     def cached_cameras(self) -> list[CachedCamera]:
-        """Cameras with their images from a recording; no other can keep up."""
+        """Cameras with recorded images; rendering cannot keep up."""
         return [camera for camera in self._cameras if isinstance(camera, CachedCamera)]
 
     def now_ns(self) -> int:
-        """The scenario's time."""
+        """Current time of the scenario."""
         return host_time.now_ns() - self.ahead_ns
 
     def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
@@ -88,13 +87,13 @@ class LiveSimulation(Simulation):
         return self.T_world_lidar_at(stamp_ns, self.emulator.output_rad(stamp_ns))
 
     def batch(self, first_ns: int, packets: int) -> tuple[list[Record], list[Record]]:
-        """LiDAR packets from a moment on that is past; and what was true of them, in the host's time."""
+        """LiDAR packets from a past time on, and their ground truth on the host's clock."""
         records = self.lidar_records(first_ns, packets, self.packet_ns)
-        true = [self._on_host(record) for record in records if record.topic.startswith(TRUTH_TOPICS)]
-        return [record for record in records if not record.topic.startswith(TRUTH_TOPICS)], true
+        truth = [self._on_host(record) for record in records if record.topic.startswith(TRUTH_TOPICS)]
+        return [record for record in records if not record.topic.startswith(TRUTH_TOPICS)], truth
 
-    def was_true(self, until_ns: int) -> list[Record]:
-        """What was true before a time and since the call before, in the host's time."""
+    def host_truth_records(self, until_ns: int) -> list[Record]:
+        """Ground truth before `until_ns` that was not returned yet, on the host's clock."""
         return [self._on_host(record) for record in self.truth_records(until_ns)]
 
     def _on_host(self, record: Record) -> Record:
@@ -106,7 +105,7 @@ class LiveSimulation(Simulation):
 
 
 class LiveAutopilot(AutopilotSocket):
-    """Set up as it must be; can say that it is disarmed, though its drone hangs in the air."""
+    """An autopilot with the required parameters that can report disarmed in flight."""
 
     armed = True
 
@@ -116,54 +115,54 @@ class LiveAutopilot(AutopilotSocket):
         super()._send(message)
 
 
-class RigInTime:
-    """Sends until it is told to stop, or the scenario is over."""
+class RealTimeRig:
+    """Sends until it is stopped or the scenario is over."""
 
     def __init__(self, rig: LiveRigSettings, folder: Path) -> None:
         scenario = load_scenario(rig.scenario)
-        asked = {"seed": rig.seed, "duration_s": rig.duration_s}
-        scenario = scenario.changed(**{name: value for name, value in asked.items() if value is not None})
+        overrides = {"seed": rig.seed, "duration_s": rig.duration_s}
+        scenario = scenario.changed(**{name: value for name, value in overrides.items() if value is not None})
         self._rig, self._folder = rig, folder
-        if rig.images is None:  # nobody sees what its cameras would
+        if rig.images is None:  # nothing reads its cameras
             self._scenario = scenario.changed(cameras=CamerasSettings())
             self.simulation = LiveSimulation(self._scenario)
         else:
             self._scenario = scenario
             self.simulation = LiveSimulation(scenario, ImageCache(rig.images, scenario))
-        self.late = Latency()  # a packet's sending after its last pulse
+        self.late = Latency()  # from the last pulse of a packet to its sending
         self.stop = threading.Event()
         self.packets = self.skipped = self.received = self.images = 0
 
     def run(self, ready: threading.Event) -> None:
-        """The whole flight, in real time."""
+        """Run the whole flight, in real time."""
         rig, scenario, simulation = self._rig, self._scenario, self.simulation
         with ExitStack() as open_parts:
             rig.servo.parent.mkdir(parents=True, exist_ok=True)
             open_parts.enter_context(simulation.begin(rig.servo))
-            truth = RecordingWriter(self._folder / TRUTH_RECORDING, rig_yaml=scenario.rig_yaml())
-            open_parts.enter_context(truth)
+            truth_file = RecordingWriter(self._folder / TRUTH_RECORDING, rig_yaml=scenario.rig_yaml())
+            open_parts.enter_context(truth_file)
             udp = open_parts.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             autopilot = self._autopilot(simulation)
             if autopilot is not None:
                 open_parts.enter_context(autopilot)
             images = open_parts.enter_context(self._cameras(simulation))
             ready.set()
-            sent_ns = self._send(simulation, udp, truth)
-            for record in simulation.was_true(sent_ns):
-                truth.write(record)
+            sent_ns = self._send(simulation, udp, truth_file)
+            for record in simulation.host_truth_records(sent_ns):
+                truth_file.write(record)
             self.images = images.shown
             if autopilot is not None:
                 self.received = len(autopilot.received)
         self._report()
 
     def _cameras(self, simulation: LiveSimulation) -> TimedImageServer:
-        seen = () if self._rig.images is None else self._rig.camera_ports.items()
-        ports = {f"/camera/{carrier}": port for carrier, port in seen}
+        served = () if self._rig.images is None else self._rig.camera_ports.items()
+        ports = {f"/camera/{platform}": port for platform, port in served}
         end_ns = self._scenario.start_ns + round(1e9 * self._scenario.duration_s)
         return TimedImageServer(simulation.cached_cameras, ports, simulation.now_ns, end_ns)
 
     def _autopilot(self, simulation: LiveSimulation) -> AutopilotSocket | None:
-        flight = next((talker for talker in simulation.telemetry_sources if isinstance(talker, Autopilot)), None)
+        flight = next((source for source in simulation.telemetry_sources if isinstance(source, Autopilot)), None)
         if flight is None or self._rig.autopilot_port is None:
             return None
         send_to = LOOPBACK, self._rig.autopilot_port
@@ -177,17 +176,17 @@ class RigInTime:
         autopilot.armed = self._rig.armed
         return autopilot
 
-    def _send(self, simulation: LiveSimulation, udp: socket.socket, truth: RecordingWriter) -> int:
-        """Packet after packet, to the end; up to when they were sent."""
+    def _send(self, simulation: LiveSimulation, udp: socket.socket, truth_file: RecordingWriter) -> int:
+        """Send packets to the end; returns the time up to which they were sent."""
         rig, scenario = self._rig, self._scenario
         odometry = next(
-            (talker for talker in simulation.telemetry_sources if isinstance(talker, VehicleOdometry)), None
+            (source for source in simulation.telemetry_sources if isinstance(source, VehicleOdometry)), None
         )
         batch_ns = rig.batch_packets * simulation.packet_ns
         first_ns, end_ns = scenario.start_ns, scenario.start_ns + round(1e9 * scenario.duration_s)
-        poses: list[tuple[int, int, bytes]] = []  # when it is to arrive, when it was true
-        position_ns = 0  # when the next position packet is due
-        true_ns = first_ns  # when all that was true is told next
+        poses: list[tuple[int, int, bytes]] = []  # (arrival, stamp, data)
+        position_ns = 0  # due time of the next position packet
+        truth_ns = first_ns  # due time of the next ground truth
         while first_ns + batch_ns <= end_ns:
             behind_ns = simulation.now_ns() - first_ns
             if behind_ns > SKIP_NS:
@@ -200,16 +199,16 @@ class RigInTime:
             if rig.position_port is not None and next_ns >= position_ns:
                 udp.sendto(encode_position(host_time.now_ns()), (LOOPBACK, rig.position_port))
                 position_ns = next_ns + POSITION_NS
-            packets, true = simulation.batch(first_ns, rig.batch_packets)
+            packets, truth = simulation.batch(first_ns, rig.batch_packets)
             for packet in packets:
                 udp.sendto(packet.data, (LOOPBACK, rig.lidar_port))
                 self.late.add(max(simulation.now_ns() - packet.stamp_ns - simulation.packet_ns, 1))
             self.packets += len(packets)
-            if next_ns >= true_ns:
-                true += simulation.was_true(next_ns)
-                true_ns = next_ns + TRUTH_NS
-            for record in true:
-                truth.write(record)
+            if next_ns >= truth_ns:
+                truth += simulation.host_truth_records(next_ns)
+                truth_ns = next_ns + TRUTH_NS
+            for record in truth:
+                truth_file.write(record)
             for pose in odometry.records(next_ns) if odometry is not None else ():
                 heapq.heappush(poses, (pose.arrival_ns, pose.stamp_ns, pose.data))
             while poses and poses[0][0] <= simulation.now_ns():
@@ -243,12 +242,12 @@ def _with_age(pose_json: bytes, age_ns: int) -> bytes:
 
 
 def main(settings: str) -> int:
-    """Run the rig until standard input ends. Says READY when it sends."""
+    """Run the rig until standard input ends. Prints READY when it starts to send."""
     given = json.loads(settings)
     folder = Path(given.pop("folder"))
     sys.setswitchinterval(SWITCH_S)
     try:
-        rig = RigInTime(LiveRigSettings.model_validate(given), folder)
+        rig = RealTimeRig(LiveRigSettings.model_validate(given), folder)
         ready = threading.Event()
         sending = threading.Thread(target=rig.run, args=(ready,), daemon=True)
         sending.start()

@@ -1,14 +1,14 @@
-"""How a rig differs from what its file says, and which drone flies: as somebody builds and measures it, by flight.
+"""Perturbations of a rig: how it differs from its rig file, and which drone flies, drawn per flight.
 
-| what | one sigma | why |
+| quantity | one sigma | reason |
 | --- | --- | --- |
-| the servo's zero against the vehicle's axes | 0.1 deg | `grd calibrate` cannot tell it: 2 mm in a metre |
-| the turntable's tilt, each axis | 0.05 deg | the same against the vehicle camera's level |
-| the LiDAR's range, all lasers alike | 0.017 m | VLP-16 data sheet 63-9229: +-3 cm, taken as even within that |
-| a camera's mount, each axis | 0.05 deg | what Kalibr gives again from calibration to calibration |
-| its focal length; its centre, each axis | 0.05 %; 0.15 px at 720 px | the same: some tenths of a pixel at the rim |
+| servo zero against the vehicle axes | 0.1 deg | not observable by `grd calibrate`: 2 mm in a metre |
+| tilt of the turntable, per axis | 0.05 deg | the same, against the level of the vehicle camera |
+| range of the LiDAR, common to all lasers | 0.017 m | VLP-16 data sheet 63-9229: +-3 cm, taken as uniform |
+| mount of a camera, per axis | 0.05 deg | repeatability of Kalibr between calibrations |
+| its focal length; its centre, per axis | 0.05 %; 0.15 px at 720 px | the same: some tenths of a pixel at the rim |
 
-The drone is any of the models in its own size, and of any surface. Its span is known: somebody measured it.
+The drone has any of the shapes, in its nominal size, and any surface. Its span is known, as if measured.
 
 Source: ours.
 """
@@ -20,18 +20,18 @@ from typing import get_args
 
 import numpy as np
 
-from links.simulated.sensors.camera import CameraMiscalibration, turned
+from links.simulated.sensors.camera import CameraMiscalibration, rotated
 from links.simulated.world.drone import SPAN_M, DroneModel, Shape, Surface
 from stages.geometry import LidarMount
 
 ZERO_DEG, TILT_DEG = 0.1, 0.05
 RANGE_M = 0.017
-CAMERA_DEG, FOCAL_SHARE, CENTRE_SHARE = 0.05, 5e-4, 2e-4  # of the focal length, of the image's size
+CAMERA_DEG, FOCAL_SHARE, CENTRE_SHARE = 0.05, 5e-4, 2e-4  # fractions of the focal length and of the image size
 
 
 @dataclass(frozen=True)
 class PerturbedRig:
-    """One rig and its drone."""
+    """Perturbations of one rig, and its drone."""
 
     zero_deg: float
     tilt_deg: tuple[float, float]
@@ -45,15 +45,15 @@ class PerturbedRig:
         """The drone's."""
         return SPAN_M[self.model.shape]
 
-    def mount(self, told: LidarMount) -> LidarMount:
-        """How the LiDAR really sits, where the rig file says `told`."""
-        turntable = turned(told.T_vehicle_turntable, (*self.tilt_deg, 0.0))
-        zero_deg = told.servo_zero_deg + self.zero_deg
-        return told.model_copy(update={"T_vehicle_turntable": turntable, "servo_zero_deg": zero_deg})
+    def mount(self, stated: LidarMount) -> LidarMount:
+        """The true mount of the LiDAR, given the one in the rig file."""
+        turntable = rotated(stated.T_vehicle_turntable, (*self.tilt_deg, 0.0))
+        zero_deg = stated.servo_zero_deg + self.zero_deg
+        return stated.model_copy(update={"T_vehicle_turntable": turntable, "servo_zero_deg": zero_deg})
 
 
 def draw_perturbed_rig(flight: str, seed: int) -> PerturbedRig:
-    """The rig and the drone of a flight."""
+    """The perturbed rig and the drone of a flight."""
     rng = np.random.default_rng([seed, 50, *flight.encode()])
     tilt = rng.normal(0.0, TILT_DEG, 2).tolist()
     return PerturbedRig(
@@ -72,7 +72,7 @@ def draw_perturbed_rig(flight: str, seed: int) -> PerturbedRig:
 def _camera_error(rng: np.random.Generator) -> CameraMiscalibration:
     turn, centre = rng.normal(0.0, CAMERA_DEG, 3).tolist(), rng.normal(0.0, CENTRE_SHARE, 2).tolist()
     return CameraMiscalibration(
-        turned_deg=(turn[0], turn[1], turn[2]),
+        rotation_deg=(turn[0], turn[1], turn[2]),
         focal_share=float(rng.normal(0.0, FOCAL_SHARE)),
         centre_share=(centre[0], centre[1]),
     )

@@ -1,6 +1,6 @@
-"""Runs a scenario: records in order of arrival, or a recording on disk.
+"""Simulates a scenario: records in order of arrival, or a recording on disk.
 
-Source: ours. The same scenario and seed give the same bytes. Truth goes to /truth/* and nowhere else.
+Source: ours. The same scenario and seed give the same bytes. Ground truth goes to /truth/* only.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from links.simulated.world.vehicle import vehicle_mesh, vehicle_mesh_from_camera
 from links.velodyne import vlp16
 from stages.geometry import Array64
 
-BATCH_PACKETS = 32  # pulses are cast in batches; how many does not change a byte
+BATCH_PACKETS = 32  # pulses are cast in batches; their size changes no byte
 
 
 @dataclasses.dataclass(frozen=True)
 class SimulationReport:
-    """What a simulation made."""
+    """Statistics of a simulation."""
 
     seed: int
     records: int
@@ -52,7 +52,7 @@ class SimulationReport:
     drone_returns: int  # pulses with a return that has most of its power from a drone
     wall_s: float
     size_bytes: int
-    output_hash: str | None = None  # of the closed loop; a replay with the same configuration gives it again
+    output_hash: str | None = None  # of the closed loop; a replay with the same configuration has the same hash
 
     def __str__(self) -> str:
         text = (
@@ -63,7 +63,7 @@ class SimulationReport:
 
 
 class Simulation:
-    """One run of a scenario. Iterate `records()` once; the counts and `drone_return_ns` fill as it goes."""
+    """One run of a scenario. Iterate `records()` once; the counts and `drone_return_ns` are updated meanwhile."""
 
     def __init__(
         self,
@@ -72,27 +72,29 @@ class Simulation:
         loop: ClosedLoop | None = None,
         images: ImageCache | None = None,
     ) -> None:
-        """With a `loop` the pipeline in it commands the servo, and the scenario's script is not used.
+        """With a `loop` its pipeline commands the servo, and the scenario's script is not used.
 
-        With `images` of the same scenario the cameras' are not painted.
+        With `images`, a recording of the same flight, the cameras are not rendered.
         """
         self._loop = loop
         self.scenario = scenario if seed is None else scenario.changed(seed=seed)
         self.seed = self.scenario.seed
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
-        flown: Path | Flight | None = drone.path if drone else None
+        drone_motion: Path | Flight | None = drone.path if drone else None
         self.telemetry_sources: list[Autopilot | VehicleOdometry] = []
         if drone is not None and scenario.autopilot is not None:
-            flown = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
-            self.telemetry_sources.append(Autopilot(scenario.autopilot, flown, start_ns, duration_s, self.seed))
+            drone_motion = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
+            self.telemetry_sources.append(Autopilot(scenario.autopilot, drone_motion, start_ns, duration_s, self.seed))
         vehicle = scenario.vehicle
-        ridden = SuspendedPath(vehicle.path, vehicle.ride, duration_s, self.seed) if vehicle.ride else vehicle.path
+        vehicle_motion: Path | SuspendedPath = vehicle.path
+        if vehicle.suspension is not None:
+            vehicle_motion = SuspendedPath(vehicle.path, vehicle.suspension, duration_s, self.seed)
         if scenario.vehicle_odometry is not None:
-            odometry = VehicleOdometry(scenario.vehicle_odometry, ridden, start_ns, duration_s, self.seed)
+            odometry = VehicleOdometry(scenario.vehicle_odometry, vehicle_motion, start_ns, duration_s, self.seed)
             self.telemetry_sources.append(odometry)
         others = scenario.other_drones
-        self.truth = Truth(start_ns, ridden, flown, tuple(other.path for other in others))
+        self.truth = Truth(start_ns, vehicle_motion, drone_motion, tuple(other.path for other in others))
         height = scenario.vehicle.camera_height_m
         world = scenario_world(self.scenario)
         self._scene = Scene(
@@ -108,19 +110,19 @@ class Simulation:
         check_paths(self._scene.world, self.truth, scenario.duration_s, spans_m)
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
         script = scenario.script if loop is None else ()
-        operator = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)
+        commander = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)
         shift_ns = round(scenario.mount.servo_time_offset_s * 1e9)
-        self._servo = ServoBus(scenario.servo, operator, scenario.start_ns, shift_ns, self.seed)
+        self._servo = ServoBus(scenario.servo, commander, scenario.start_ns, shift_ns, self.seed)
         self._arrival = np.random.default_rng([self.seed, 5])
         self._cameras: Sequence[Camera | CachedCamera] = (
             self._rendered_cameras() if images is None else images.cameras(self.truth)
         )
         lidar_at = (lambda stamp_ns: self.T_world_lidar(stamp_ns)[1]) if scenario.truth_visible else None
-        self._true = TruthRecords(self.truth, self._scene.world, lidar_at)
-        self.lidar_clock_ns = 0  # how far the LiDAR's clock is ahead of the scenario's
+        self._truth_records = TruthRecords(self.truth, self._scene.world, lidar_at)
+        self.lidar_clock_ns = 0  # offset of the LiDAR's clock from the scenario's
         self.pulses = 0
         self.returns = 0
-        self.drone_return_ns: list[int] = []  # truth, for statistics: times of the returns from drones
+        self.drone_return_ns: list[int] = []  # truth, for statistics: times of returns from drones
 
     def _rendered_cameras(self) -> list[Camera]:
         scenario, height = self.scenario, self.scenario.vehicle.camera_height_m
@@ -135,7 +137,7 @@ class Simulation:
         )
 
     def records(self) -> Iterator[Record]:
-        """All records in order of arrival, numbered."""
+        """All records in order of arrival, with sequence numbers."""
         waiting: list[tuple[int, int, Record]] = []
         made = sent = 0
         start_ns = self.scenario.start_ns
@@ -150,8 +152,8 @@ class Simulation:
             records += self.lidar_records(first_ns, packets, packet_ns)
             for camera in self._cameras:
                 records += camera.records(next_ns)
-            for talker in self.telemetry_sources:
-                records += talker.records(next_ns)
+            for source in self.telemetry_sources:
+                records += source.records(next_ns)
             records += self.truth_records(next_ns)
             for record in records:
                 heapq.heappush(waiting, (record.arrival_ns, made, record))
@@ -159,14 +161,14 @@ class Simulation:
             first_ns = next_ns
             while waiting and (waiting[0][0] < next_ns or first_ns >= end_ns):
                 record = dataclasses.replace(heapq.heappop(waiting)[2], sequence=sent)
-                self._tell_loop(record)
+                self._feed_loop(record)
                 yield record
                 sent += 1
         if self._loop is not None:
             self._loop.finish()
 
-    def _tell_loop(self, record: Record) -> None:
-        """Records reach the pipeline as they arrive, truth never; its goals go to the servo."""
+    def _feed_loop(self, record: Record) -> None:
+        """Feed a record to the pipeline, except ground truth, and pass its command to the servo."""
         if self._loop is None or record.topic.startswith(TRUTH_TOPICS):
             return
         sent = self._loop.take(record)
@@ -175,11 +177,11 @@ class Simulation:
             self._servo.command(left_ns, command.position_rad, command.speed_radps)
 
     def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
-        """Where the LiDAR truly is: rotations (n, 3, 3), positions (n, 3) [m]."""
+        """True poses of the LiDAR: rotations (n, 3, 3), positions (n, 3) [m]."""
         return self.T_world_lidar_at(stamp_ns, self._servo.output_rad(stamp_ns))
 
     def T_world_lidar_at(self, stamp_ns: NDArray[np.int64], output_rad: Array64) -> tuple[Array64, Array64]:
-        """The same where the servo has turned the turntable by so much (n,): T_wv T_vt Rz(angle) T_tl."""
+        """The same for given output angles (n,) of the servo: T_wv T_vt Rz(angle) T_tl."""
         mount = self.scenario.mount
         T_vehicle_turntable, T_turntable_lidar = mount.T_vehicle_turntable.matrix(), mount.T_turntable_lidar.matrix()
         R_world_vehicle, t_world_vehicle = self.truth.T_world_vehicle(stamp_ns)
@@ -187,7 +189,7 @@ class Simulation:
         return lidar_poses(R_world_vehicle, t_world_vehicle, T_vehicle_turntable, angle_rad, T_turntable_lidar)
 
     def drone_servo_rad(self, time_s: float) -> float:
-        """Servo position at which the drone lies in the plane through the turntable's axis and azimuth 0."""
+        """Servo position at which the plane through the turntable's axis and azimuth 0 contains the drone."""
         stamp = np.array([self.scenario.start_ns + round(max(time_s, 0.0) * 1e9)])
         R, t = (part[0] for part in self.truth.T_world_vehicle(stamp))
         drone = R.T @ (self.truth.T_world_drone(stamp)[1][0] - t)
@@ -197,11 +199,11 @@ class Simulation:
         return mount.servo_sign * float(np.mod(np.arctan2(y, x), np.pi)) + np.radians(mount.servo_zero_deg)
 
     def truth_records(self, until_ns: int) -> list[Record]:
-        """What was true before a time and since the call before."""
-        return self._true.records(until_ns)
+        """Ground truth before `until_ns` that was not returned yet."""
+        return self._truth_records.records(until_ns)
 
     def lidar_records(self, first_ns: int, packets: int, packet_ns: int) -> list[Record]:
-        """The LiDAR's packets from a time on, in order of time; and which pulses of them the drones returned."""
+        """LiDAR packets from a time on, in order of time, and the records of pulses that drones returned."""
         firings = firings_per_packet(self.scenario.lidar.return_mode)
         sequence_ns = first_ns + vlp16.SEQUENCE_NS * np.arange(packets * firings, dtype=np.int64)
         pulse_ns = (sequence_ns[:, None] + vlp16.PULSE_NS * np.arange(vlp16.LASERS)).ravel()
@@ -221,7 +223,7 @@ class Simulation:
             data = encode_packet(at + self.lidar_clock_ns, azimuth[i], ranges[:, i], shades[:, i], mode)
             arrival_ns = int(last_pulse_ns[i] + jitter_ns[i])
             records.append(Record("/lidar/packets", arrival_ns=arrival_ns, stamp_ns=at // 1000 * 1000, data=data))
-        return records + self._true.hits(pulse_ns.reshape(packets, -1), pulses)
+        return records + self._truth_records.hits(pulse_ns.reshape(packets, -1), pulses)
 
 
 def simulate_records(scenario: Scenario, seed: int | None = None) -> Iterator[Record]:
@@ -239,40 +241,40 @@ def simulate(
     duration_s: float | None = None,
     images: FilePath | None = None,
 ) -> SimulationReport:
-    """Run a scenario file into a recording, in closed loop with a configuration if one is given.
+    """Simulate a scenario file into a recording, in closed loop if a configuration is given.
 
-    `images` is a recording of the same flight whose images are taken instead of painted; not a byte differs.
-    `progress` is told the share done, 0 to 1. Errors are LinkError, and ConfigError for the configuration's.
+    `images` is a recording of the same flight whose images are used; the result is the same to the byte. `progress`
+    gets the completed fraction, 0 to 1. Errors are LinkError, and ConfigError for the configuration.
     """
-    asked = {"seed": seed, "duration_s": duration_s}
-    checked = load_scenario(scenario).changed(**{name: value for name, value in asked.items() if value is not None})
+    overrides = {"seed": seed, "duration_s": duration_s}
+    loaded = load_scenario(scenario).changed(**{name: value for name, value in overrides.items() if value is not None})
     loop = None
     if closed_loop is not None:
-        loop = load_loop(closed_loop, checked.rig_yaml(), f"{checked.name} (rig)", checked.closed_loop)
-    return simulate_into(out, checked, progress, overwrite, loop, images)
+        loop = load_loop(closed_loop, loaded.rig_yaml(), f"{loaded.name} (rig)", loaded.closed_loop)
+    return simulate_into(out, loaded, progress, overwrite, loop, images)
 
 
 def simulate_into(
     out: FilePath,
-    checked: Scenario,
+    scenario: Scenario,
     progress: Callable[[float], None] | None = None,
     overwrite: bool = False,
     loop: ClosedLoop | None = None,
     images: FilePath | None = None,
 ) -> SimulationReport:
-    """The same for a scenario in memory. The recording keeps the whole scenario, with every setting, as its config."""
+    """The same for a scenario in memory. The recording has the scenario, with every setting, attached as its config."""
     if images is not None and out.exists() and out.samefile(images):
-        raise LinkError(f"{out} is both what is written and where images come from: take another name for one")
+        raise LinkError(f"{out} is both the output and the source of the images: choose another name for the output")
     began = time.perf_counter()
-    simulation = Simulation(checked, loop=loop, images=images and ImageCache(images, checked))
-    metadata = {"made_by": "grd simulate", "scenario": checked.name, "seed": str(simulation.seed)}
+    simulation = Simulation(scenario, loop=loop, images=images and ImageCache(images, scenario))
+    metadata = {"made_by": "grd simulate", "scenario": scenario.name, "seed": str(simulation.seed)}
     if loop is not None:
         metadata |= loop.loop_metadata
     count = 0
     with RecordingWriter(
         out,
-        rig_yaml=checked.rig_yaml(),
-        config_yaml=checked.as_yaml(),
+        rig_yaml=scenario.rig_yaml(),
+        config_yaml=scenario.as_yaml(),
         metadata=metadata,
         lossless=True,
         overwrite=overwrite,
@@ -281,7 +283,7 @@ def simulate_into(
             writer.write(record)
             count += 1
             if progress is not None and count % 100 == 0:
-                progress(min(1.0, (record.arrival_ns - checked.start_ns) * 1e-9 / checked.duration_s))
+                progress(min(1.0, (record.arrival_ns - scenario.start_ns) * 1e-9 / scenario.duration_s))
     if progress is not None:
         progress(1.0)
     return SimulationReport(

@@ -1,4 +1,4 @@
-"""Scenarios: one YAML file says what stands where, how it moves, and what the servo is told.
+"""Scenarios: one YAML file describes the scene, all motions, the sensors and the script of the servo.
 
 Source: ours.
 """
@@ -30,10 +30,10 @@ from links.simulated.world.vehicle import vehicle_mesh_from_camera
 from links.simulated.world.weather import Weather
 from stages.geometry import Array64, LidarMount, Pose
 
-CLEARANCE_M = 0.3  # a path may not come nearer to the road
-WHEELS_M = 0.15  # a vehicle bounces on its springs by no more
-BLADE_STEPS = 4  # of half a turn: how the blades stand when they hide the view
-YOUNG = ("other_drones", "truth_visible")  # settings that a scenario file holds only where they are used
+CLEARANCE_M = 0.3  # minimum height of a drone above the road
+WHEELS_M = 0.15  # maximum height of the vehicle's motion above or below the road
+BLADE_STEPS = 4  # blade angles within half a turn, for the camera mask
+OPTIONAL_KEYS = ("other_drones", "truth_visible")  # written to a scenario file only where used
 
 
 class _Settings(BaseModel):
@@ -45,11 +45,11 @@ class VehicleSettings(_Settings):
 
     camera_height_m: float = Field(default=1.8, ge=1.0, le=5.0)
     path: Path = Path(waypoints=({"t_s": 0.0, "xyz_m": (0.0, 0.0, 0.0)},))  # pyright: ignore[reportArgumentType]
-    ride: SuspensionSettings | None = None  # with one it pitches and rolls; without, it drives level
+    suspension: SuspensionSettings | None = None  # pitch and roll; without it the vehicle stays level
 
 
 class DroneSettings(_Settings):
-    """A drone and where it flies, world frame."""
+    """A drone and its path, world frame."""
 
     span_m: float = Field(default=0.5, ge=0.1, le=3.0)
     model: DroneModel = DroneModel()
@@ -57,7 +57,7 @@ class DroneSettings(_Settings):
 
 
 class RigLidar(_Settings):
-    """The LiDAR on its turntable, as the rig file writes it."""
+    """The LiDAR on its turntable, as in the rig file."""
 
     model: Literal["VLP-16"] = "VLP-16"
     mount: LidarMount = LidarMount(
@@ -67,7 +67,7 @@ class RigLidar(_Settings):
 
 
 class Scenario(_Settings):
-    """A whole scenario. `model_copy(update=...)` or the `with_*` methods make variants."""
+    """A complete scenario. `with_drone` and `changed` make variants."""
 
     version: Literal[1] = 1
     name: str
@@ -79,17 +79,17 @@ class Scenario(_Settings):
     weather: Weather = Weather()
     vehicle: VehicleSettings = VehicleSettings()
     drone: DroneSettings | None = None
-    other_drones: tuple[DroneSettings, ...] = Field(default=(), max_length=9)  # each flies exactly its path
+    other_drones: tuple[DroneSettings, ...] = Field(default=(), max_length=9)  # follow their paths exactly
     lidar: LidarSettings = LidarSettings()
     servo: ServoSettings = ServoSettings()
     cameras: CamerasSettings = CamerasSettings()
-    autopilot: AutopilotSettings | None = None  # with one the drone flies by its dynamics; without, exactly its path
+    autopilot: AutopilotSettings | None = None  # with it the drone obeys flight dynamics; without, it follows its path
     vehicle_odometry: VehicleOdometrySettings | None = None
     script: tuple[Segment, ...] = ()
-    closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # used instead of the script with --closed-loop
-    truth_visible: bool = False  # whether /truth/visible tells the LiDAR's line of sight to each drone
-    rig: RigLidar = RigLidar()  # what the rig attached to the recording says
-    true_mount: LidarMount | None = None  # how it really sits, when that differs from the rig
+    closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # replaces the script with --closed-loop
+    truth_visible: bool = False  # write /truth/visible: the LiDAR's line of sight to each drone
+    rig: RigLidar = RigLidar()  # the rig file attached to the recording
+    true_mount: LidarMount | None = None  # the true mount of the LiDAR, if it differs from the rig file
 
     @field_validator("start_utc")
     @classmethod
@@ -106,34 +106,34 @@ class Scenario(_Settings):
         if abs(lift[worst]) > WHEELS_M:
             raise ValueError(
                 f"vehicle.path: {lift[worst]:+.2f} m off the road at {times[worst]:.2f} s; "
-                "z is counted from the camera's height at the start and the road is flat: keep it 0"
+                "z is relative to the camera's height at the start and the road is flat: keep it 0"
             )
         return self
 
     @model_validator(mode="after")
     def _can_be_flown(self) -> Self:
         if self.drone is None and self.autopilot is not None:
-            raise ValueError("autopilot: the scenario has no drone for it; add one, or leave the autopilot out")
+            raise ValueError("autopilot: the scenario has no drone for it; add one, or leave out the autopilot")
         if self.drone is None and any(isinstance(s, VibrateSegment) and s.follow_drone for s in self.script):
             raise ValueError("script: follow_drone is set but the scenario has no drone; give an azimuth_table")
         if self.drone is None and (self.other_drones or self.truth_visible):
-            word = "other_drones" if self.other_drones else "truth_visible"
-            raise ValueError(f"{word}: the scenario has no drone; add 'drone', the first one, or leave {word} out")
+            key = "other_drones" if self.other_drones else "truth_visible"
+            raise ValueError(f"{key}: the scenario has no drone; add 'drone', the first one, or leave out {key}")
         times = np.arange(0.0, self.duration_s, 0.05)
-        flown: list[tuple[str, DroneSettings, Array64]] = []
+        checked: list[tuple[str, DroneSettings, Array64]] = []
         for name, drone in self._drones():
             at_m = drone.path.at(times)[0]
             height = at_m[:, 2] + self.vehicle.camera_height_m
             if height.min() < CLEARANCE_M:
                 raise ValueError(
                     f"{name}.path: {height.min():.2f} m above the road at {times[height.argmin()]:.2f} s, "
-                    f"less than {CLEARANCE_M} m; z is counted from the camera, {self.vehicle.camera_height_m} m up"
+                    f"less than {CLEARANCE_M} m; z is relative to the camera, {self.vehicle.camera_height_m} m up"
                 )
-            for other_name, other, other_m in flown:
-                apart = np.linalg.norm(at_m - other_m, axis=1)
-                if apart.min() < (drone.span_m + other.span_m) / 2:
-                    raise ValueError(f"{name}.path: runs into {other_name} at {times[apart.argmin()]:.2f} s")
-            flown.append((name, drone, at_m))
+            for other_name, other, other_m in checked:
+                separation = np.linalg.norm(at_m - other_m, axis=1)
+                if separation.min() < (drone.span_m + other.span_m) / 2:
+                    raise ValueError(f"{name}.path: collides with {other_name} at {times[separation.argmin()]:.2f} s")
+            checked.append((name, drone, at_m))
         return self
 
     def _drones(self) -> list[tuple[str, DroneSettings]]:
@@ -149,20 +149,20 @@ class Scenario(_Settings):
 
     @property
     def mount(self) -> LidarMount:
-        """How the LiDAR truly sits."""
+        """The true mount of the LiDAR."""
         return self.true_mount or self.rig.mount
 
     def with_drone(self, path: Path, span_m: float = 0.5) -> Scenario:
-        """The same scenario with another flight, checked again."""
+        """The same scenario with another flight, validated again."""
         return self.changed(drone={"span_m": span_m, "path": path})
 
     def changed(self, **settings: Any) -> Scenario:
-        """The same scenario with some settings replaced, checked again."""
+        """The same scenario with some settings replaced, validated again."""
         return Scenario.model_validate(dict(self) | settings)
 
     def as_yaml(self) -> str:
-        """The whole scenario as a scenario file, with every setting (`YOUNG` ones where used: files stay the same)."""
-        unused = {name for name in YOUNG if not getattr(self, name)}
+        """The scenario as a file, with every setting (`OPTIONAL_KEYS` where used)."""
+        unused = {name for name in OPTIONAL_KEYS if not getattr(self, name)}
         settings = self.model_dump(mode="json", exclude_none=True, exclude=unused)
         return yaml.safe_dump(settings, sort_keys=False, width=120)
 
@@ -179,7 +179,7 @@ class Scenario(_Settings):
 
 
 def load_scenario(path: FilePath) -> Scenario:
-    """Read and check a scenario file with what it includes. ConfigError lists everything wrong in it, file and line."""
+    """Load a scenario file with its includes. ConfigError lists all problems with file and line."""
     tree = load_tree(path)
     values = resolve(tree, (), tree.values)
     if not tree.problems:

@@ -1,6 +1,6 @@
-"""What is true, as records: poses, which pulses a drone returned, and whether the LiDAR has a line of sight to it.
+"""Ground truth records: poses, the pulses that a drone returned, and the LiDAR's line of sight to it.
 
-The first drone is told on /truth/drone, /truth/hits and /truth/visible, each other one on the same with its number:
+The first drone has /truth/drone, /truth/hits and /truth/visible; other drones have the same topics with their number:
 /truth/drone_2, /truth/hits_2, /truth/visible_2.
 
 Source: ours; recording format in recordings/README.md (/truth/*).
@@ -26,12 +26,12 @@ SIGHT_PERIOD_NS = 50_000_000
 
 
 class TruthRecords:
-    """Poses each 10 ms; lines of sight, where asked for, at the start and at each change seen every 50 ms."""
+    """Poses every 10 ms; lines of sight, where requested, at the start and at each change, checked every 50 ms."""
 
     def __init__(self, truth: Truth, world: RayScene, lidar_at: Callable[[NDArray[np.int64]], Array64] | None) -> None:
-        """`lidar_at`: where the LiDAR is (n, 3) at times (n,), world frame; None: lines of sight are not told.
+        """`lidar_at`: position of the LiDAR (n, 3) at times (n,), world frame; None: no lines of sight.
 
-        Only the fixed world hides a drone: no vehicle, no bird, and no distance.
+        Only the static scene blocks a line of sight, not the vehicle, a bird or the distance.
         """
         self._truth = truth
         self._world = world
@@ -40,7 +40,7 @@ class TruthRecords:
         self._in_sight: dict[int, bool] = {}
 
     def records(self, until_ns: int) -> list[Record]:
-        """What was true before `until_ns` and since the call before."""
+        """Ground truth before `until_ns` that was not returned yet."""
         stamps_ns, self._poses_ns = _due(self._poses_ns, until_ns, POSE_PERIOD_NS)
         records = self._poses(stamps_ns)
         if self._lidar_at is not None:
@@ -50,14 +50,14 @@ class TruthRecords:
         return records
 
     def hits(self, pulse_ns: NDArray[np.int64], pulses: Pulses) -> list[Record]:
-        """Which pulses (packets, n) each drone returned, by packet; the first packet tells it even of none."""
+        """Pulses (packets, n) that each drone returned: a record per packet with hits, and one for the first packet."""
         records: list[Record] = []
         for number in self._truth.drones:
             hit = pulses.hits(number).reshape(pulse_ns.shape)
             for stamps, is_hit in zip(pulse_ns, hit, strict=True):
                 if is_hit.any() or stamps[0] == self._truth.start_ns:
-                    told = {"pulse_stamp_ns": stamps[is_hit].tolist()}
-                    records.append(_record("/truth/hits", number, int(stamps[-1]), int(stamps[0]), told))
+                    content = {"pulse_stamp_ns": stamps[is_hit].tolist()}
+                    records.append(_record("/truth/hits", number, int(stamps[-1]), int(stamps[0]), content))
         return records
 
     def _poses(self, stamps_ns: NDArray[np.int64]) -> list[Record]:
@@ -74,20 +74,20 @@ class TruthRecords:
     def _sight(self, stamps_ns: NDArray[np.int64], lidar_m: Array64) -> list[Record]:
         records: list[Record] = []
         for number in self._truth.drones:
-            seen = visible(self._world, lidar_m, self._truth.T_world_drone(stamps_ns, number)[1])
-            for stamp, is_seen in zip(stamps_ns.tolist(), seen.tolist(), strict=True):
-                if is_seen != self._in_sight.get(number):
-                    self._in_sight[number] = is_seen
-                    records.append(_record("/truth/visible", number, stamp, stamp, {"visible": is_seen}))
+            in_sight = visible(self._world, lidar_m, self._truth.T_world_drone(stamps_ns, number)[1])
+            for stamp, is_visible in zip(stamps_ns.tolist(), in_sight.tolist(), strict=True):
+                if is_visible != self._in_sight.get(number):
+                    self._in_sight[number] = is_visible
+                    records.append(_record("/truth/visible", number, stamp, stamp, {"visible": is_visible}))
         return records
 
 
 def _due(first_ns: int, until_ns: int, period_ns: int) -> tuple[NDArray[np.int64], int]:
-    """Times from `first_ns` on and before `until_ns`, and the one after them."""
+    """Times from `first_ns` on and before `until_ns`, and the time after them."""
     count = -(-(until_ns - first_ns) // period_ns)
     return first_ns + period_ns * np.arange(count), first_ns + period_ns * max(count, 0)
 
 
-def _record(topic: str, number: int, arrival_ns: int, stamp_ns: int, told: dict[str, object]) -> Record:
+def _record(topic: str, number: int, arrival_ns: int, stamp_ns: int, content: dict[str, object]) -> Record:
     name = topic if number == 1 else f"{topic}_{number}"
-    return Record(name, arrival_ns=arrival_ns, stamp_ns=stamp_ns, data=json.dumps(told).encode())
+    return Record(name, arrival_ns=arrival_ns, stamp_ns=stamp_ns, data=json.dumps(content).encode())

@@ -1,6 +1,6 @@
-"""The two fisheyes: the vehicle's looks up, the drone's looks down. Settings, times and records of each.
+"""The two fisheyes: one on the vehicle faces up, one on the drone faces down. Settings, frame times and records.
 
-Source: ours. A frame's stamp is the middle of its middle row's exposure.
+Source: ours. The stamp of a frame is the middle of the exposure of its middle row.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from links.simulated.world.weather import Weather
 from stages.geometry import Array64, Pose, Vector3, quaternions_xyzw, rotation_from_rpy_deg
 from stages.lens import Equidistant, KannalaBrandt, Lens, OCam
 
-LOOKS_UP = Pose(rpy_deg=(0.0, 0.0, 90.0))  # the image's top is forward, its right is left
-LOOKS_DOWN_RPY_DEG = (180.0, 0.0, -90.0)  # the image's top is forward, its right is right
+UPWARD_MOUNT = Pose(rpy_deg=(0.0, 0.0, 90.0))  # the top of the image is forward, its right is left
+DOWNWARD_RPY_DEG = (180.0, 0.0, -90.0)  # the top of the image is forward, its right is right
 BELOW_BODY_M = 0.02
-Carrier = Literal["vehicle", "drone"]
+Platform = Literal["vehicle", "drone"]
 AnyLens = Equidistant | KannalaBrandt | OCam
 
 
 def _is_none(value: object) -> bool:
-    return value is None  # files of scenarios made before there was one stay the same
+    return value is None  # scenario files leave out a setting that they do not use
 
 
 class _Settings(BaseModel):
@@ -44,50 +44,52 @@ class _Settings(BaseModel):
 
 
 class CameraMiscalibration(_Settings):
-    """How far what the rig file says of a camera is from how it is."""
+    """How far the rig file is from the true camera."""
 
-    turned_deg: Vector3 = (0.0, 0.0, 0.0)  # roll, pitch, yaw about the carrier's axes
-    focal_share: float = Field(default=0.0, ge=-0.1, le=0.1)  # of the focal length, too long
-    centre_share: tuple[float, float] = (0.0, 0.0)  # of the image's size, to the right and down
+    rotation_deg: Vector3 = (0.0, 0.0, 0.0)  # error of the mount: roll, pitch, yaw about the axes of the platform
+    focal_share: float = Field(default=0.0, ge=-0.1, le=0.1)  # error of the focal length, as a fraction of it
+    centre_share: tuple[float, float] = (0.0, 0.0)  # error of the centre, right and down, as a fraction of the size
 
     def lens(self, true: AnyLens, size_px: int) -> AnyLens:
-        """The lens that the rig file has."""
-        told = true.scaled(1.0 + self.focal_share)
+        """The lens as the rig file states it."""
+        rig_mount = true.scaled(1.0 + self.focal_share)
         right, down = self.centre_share
         centre_px = true.centre_px[0] + right * size_px, true.centre_px[1] + down * size_px
-        return told.model_copy(update={"centre_px": centre_px})
+        return rig_mount.model_copy(update={"centre_px": centre_px})
 
     def mount(self, true: Pose) -> Pose:
-        """The mount that the rig file has."""
-        return turned(true, self.turned_deg)
+        """The mount as the rig file states it."""
+        return rotated(true, self.rotation_deg)
 
 
-def turned(pose: Pose, rpy_deg: Vector3) -> Pose:
-    """A pose turned where it stands, about its parent's axes."""
+def rotated(pose: Pose, rpy_deg: Vector3) -> Pose:
+    """A pose rotated in place, about the axes of its parent frame."""
     R = rotation_from_rpy_deg(rpy_deg) @ pose.matrix()[:3, :3]
     x, y, z, w = quaternions_xyzw(R[None])[0].tolist()
     return Pose(xyz_m=pose.xyz_m, quaternion_xyzw=(x, y, z, w))
 
 
 class CameraSettings(_Settings):
-    """One fisheye camera."""
+    """One fisheye camera. The image is square."""
 
-    size_px: int = Field(default=720, ge=64, le=1440)  # square
-    lens: Lens | None = None  # null: an equidistant one that fills the image with 235 deg
-    mount: Pose | None = None  # T_vehicle_camera or T_drone_camera; null: at the vehicle's origin, under the drone
+    size_px: int = Field(default=720, ge=64, le=1440)
+    lens: Lens | None = None  # null: an equidistant lens whose 235 deg fill the image
+    mount: Pose | None = None  # T_vehicle_camera or T_drone_camera; null: at the vehicle origin, under the drone
     rate_hz: float = Field(default=10.0, ge=1, le=15)
     readout_ms: float = Field(default=0.0, ge=0, le=60)  # first to last row; 0: a global shutter
-    latency_ms: tuple[float, float] = (30.0, 80.0)  # from the end of readout to arrival
+    latency_ms: tuple[float, float] = (30.0, 80.0)  # shortest and longest, from the end of the readout to arrival
     sensor: SensorSettings = SensorSettings()
-    error: Annotated[CameraMiscalibration | None, Field(exclude_if=_is_none)] = None  # null: it is as the rig file says
+    miscalibration: Annotated[CameraMiscalibration | None, Field(exclude_if=_is_none)] = (
+        None  # null: the rig file is exact
+    )
 
     @model_validator(mode="after")
     def _fits_its_period(self) -> Self:
         longest_ms = self.readout_ms + (self.sensor.exposure_ms or self.sensor.max_exposure_ms)
         if longest_ms > 1000 / self.rate_hz:
-            raise ValueError(f"exposure and readout take {longest_ms:g} ms, a period is {1000 / self.rate_hz:g} ms")
+            raise ValueError(f"exposure and readout take {longest_ms:g} ms, the period is {1000 / self.rate_hz:g} ms")
         if not 0 <= self.latency_ms[0] <= self.latency_ms[1]:
-            raise ValueError("latency_ms: give the shortest and the longest, both 0 or more")
+            raise ValueError("latency_ms: give the shortest and the longest latency, both 0 or more")
         return self
 
     @property
@@ -100,79 +102,79 @@ class CameraSettings(_Settings):
 
 
 class CamerasSettings(_Settings):
-    """The cameras of a scenario; none by default."""
+    """The cameras of a scenario; by default none."""
 
     vehicle: CameraSettings | None = None
     drone: CameraSettings | None = None
 
 
 class FrameTimes:
-    """When a camera's frames are taken: known before any is made."""
+    """Times of a camera's frames, which are known before the frames are rendered."""
 
-    def __init__(self, carrier: Carrier, settings: CameraSettings, start_ns: int, seed: int) -> None:
+    def __init__(self, platform: Platform, settings: CameraSettings, start_ns: int, seed: int) -> None:
         self._settings = settings
-        self.seed = [seed, 21 if carrier == "vehicle" else 22]
+        self.seed = [seed, 21 if platform == "vehicle" else 22]
         timing = np.random.default_rng([*self.seed, 0])
         self._first_ns = start_ns + round(timing.uniform(0.2, 1.0) * 1e9 / settings.rate_hz)
 
     def stamp_ns(self, frame: int) -> int:
-        """Frames are triggered at a steady rate, off by some 50 us."""
+        """Frames are triggered at a constant rate with a jitter of 50 us, one sigma."""
         jitter_ns = np.random.default_rng([*self.seed, 2, frame]).normal(0, 5e4)
         return self._first_ns + round(frame * 1e9 / self._settings.rate_hz + jitter_ns)
 
-    def lasts_ns(self, frames: int) -> int:
-        """So many frames."""
+    def duration_ns(self, frames: int) -> int:
+        """Duration of this many frame periods."""
         return round(frames * 1e9 / self._settings.rate_hz)
 
-    def ends_ns(self, frame: int) -> int:
-        """No exposure is longer than the longest: how long it is shows only when the frame is made."""
+    def end_ns(self, frame: int) -> int:
+        """End of the readout at the latest: the exposure itself is known only once the frame is rendered."""
         sensor = self._settings.sensor
         longest_ms = self._settings.readout_ms + (sensor.exposure_ms or sensor.max_exposure_ms)
         return self.stamp_ns(frame) + round(0.5e6 * longest_ms)
 
     def arrival_ns(self, frame: int) -> int:
-        """The host has it this much later."""
+        """Arrival at the host."""
         low, high = self._settings.latency_ms
         rng = np.random.default_rng([*self.seed, 3, frame])
-        return self.ends_ns(frame) + round(1e6 * rng.triangular(low, (2 * low + high) / 3, high + 1e-9))
+        return self.end_ns(frame) + round(1e6 * rng.triangular(low, (2 * low + high) / 3, high + 1e-9))
 
 
 class Camera:
-    """A camera in the scene. `records` gives its frames as they are measured."""
+    """A camera in the scene. `records` returns its frames as they are measured."""
 
     def __init__(
-        self, carrier: Carrier, settings: CameraSettings, mount: Pose, scene: CameraScene, start_ns: int, seed: int
+        self, platform: Platform, settings: CameraSettings, mount: Pose, scene: CameraScene, start_ns: int, seed: int
     ) -> None:
-        """`mount` is T_carrier_camera; the carrier is one of the scene's bodies."""
+        """`mount` is T_platform_camera; the platform is one of the bodies of the scene."""
         self.settings = settings
-        self._topic, self._frame_id = f"/camera/{carrier}", f"camera_{carrier}"
-        own = next(i for i, body in enumerate(scene.bodies) if body.name == carrier)
-        self._carrier = scene.bodies[own]
-        self._T_carrier_camera = T = mount.matrix()
+        self._topic, self._frame_id = f"/camera/{platform}", f"camera_{platform}"
+        own = next(i for i, body in enumerate(scene.bodies) if body.name == platform)
+        self._platform = scene.bodies[own]
+        self._T_platform_camera = T = mount.matrix()
         self._pixels = PixelRays(settings.true_lens, settings.size_px)
         covered = scene.always_hit(own, T[:3, 3], self._pixels.direction @ T[:3, :3].T)
         self._view = View(scene, self._pixels, self.T_world_camera, own, covered)
         limit_rad = math.radians(settings.true_lens.max_off_axis_deg)
         self._transmission = transmission(self._pixels.off_axis_rad, limit_rad, settings.sensor.vignetting)
-        self._times = FrameTimes(carrier, settings, start_ns, seed)
+        self._times = FrameTimes(platform, settings, start_ns, seed)
         self._frame = 0
 
     def records(self, until_ns: int) -> list[Record]:
         """Frames whose readout ended before `until_ns`, each once."""
         records: list[Record] = []
-        while self._times.ends_ns(self._frame) < until_ns:
+        while self._times.end_ns(self._frame) < until_ns:
             records.append(self._record(self._frame))
             self._frame += 1
         return records
 
     def T_world_camera(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """Rotations (n, 3, 3) and positions (n, 3) [m]."""
-        R, t = self._carrier.pose(stamp_ns)
-        T = self._T_carrier_camera
+        R, t = self._platform.pose(stamp_ns)
+        T = self._T_platform_camera
         return R @ T[:3, :3], t + R @ T[:3, 3]
 
     def image(self, stamp_ns: int, frame: int = 0) -> NDArray[np.uint8]:
-        """The image (size, size, 3), RGB, of a frame whose middle is `stamp_ns`."""
+        """The image (size, size, 3), RGB, of a frame with stamp `stamp_ns`."""
         rng = np.random.default_rng([*self._times.seed, 1, frame])
         exposure_s, gain = auto_exposure(self.settings.sensor, mean_radiance(self._view, stamp_ns))
         row_s = 1e-3 * self.settings.readout_ms / self.settings.size_px
@@ -197,44 +199,44 @@ def build_cameras(
     start_ns: int,
     seed: int,
 ) -> list[Camera]:
-    """The scenario's cameras. The vehicle's camera sits inside the vehicle's mesh: it sees another one instead."""
+    """The cameras of the scenario. The vehicle's camera is inside the vehicle mesh, so it gets another mesh."""
     cameras: list[Camera] = []
-    for carrier, one in wanted_cameras(settings, any(body.name == "drone" for body in scene.bodies)):
+    for platform, one in enabled_cameras(settings, any(body.name == "drone" for body in scene.bodies)):
         bodies = list(scene.bodies)
-        if carrier == "vehicle":
-            own = next(i for i, body in enumerate(bodies) if body.name == carrier)
+        if platform == "vehicle":
+            own = next(i for i, body in enumerate(bodies) if body.name == platform)
             bodies[own] = dataclasses.replace(bodies[own], meshes=(vehicle_from_camera,))
         around = CameraScene(scene.world, scene.world_mesh, bodies, street, light(weather, seed))
         drone = next((body.meshes[0] for body in bodies if body.name == "drone"), None)
-        cameras.append(Camera(carrier, one, mount_of(carrier, one, drone), around, start_ns, seed))
+        cameras.append(Camera(platform, one, camera_mount(platform, one, drone), around, start_ns, seed))
     return cameras
 
 
-def mount_of(carrier: Carrier, settings: CameraSettings, drone: Mesh | None) -> Pose:
-    """T_vehicle_camera or T_drone_camera. By default a drone's camera hangs right under the front of its body."""
+def camera_mount(platform: Platform, settings: CameraSettings, drone: Mesh | None) -> Pose:
+    """T_vehicle_camera or T_drone_camera. By default the drone's camera is below the front of its body."""
     if settings.mount is not None:
         return settings.mount
-    if carrier == "vehicle" or drone is None:
-        return LOOKS_UP
+    if platform == "vehicle" or drone is None:
+        return UPWARD_MOUNT
     x = 0.2 * float(drone.vertices_m[:, 0].max())
     up = np.array([[0.0, 0.0, 1.0]], dtype=np.float32)
     below = RayScene(drone).cast(np.array([[x, 0.0, -2.0]], dtype=np.float32), up, 4.0)[0][0]
     z = float(below) - 2.0 if np.isfinite(below) else 0.0
-    return Pose(xyz_m=(round(x, 4), 0.0, round(z - BELOW_BODY_M, 4)), rpy_deg=LOOKS_DOWN_RPY_DEG)
+    return Pose(xyz_m=(round(x, 4), 0.0, round(z - BELOW_BODY_M, 4)), rpy_deg=DOWNWARD_RPY_DEG)
 
 
 def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Sequence[Mesh]) -> dict[str, Any]:
-    """The rig file's `cameras:`; empty without cameras. `drone`: how its blades may stand; nothing without a drone."""
+    """`cameras:` of the rig file; empty without cameras. `drone`: its meshes over the blade angles, if there is one."""
     tree: dict[str, Any] = {}
-    for carrier, one in wanted_cameras(settings, len(drone) > 0):
-        mount = mount_of(carrier, one, drone[0] if drone else None)
-        meshes = [vehicle_from_camera] if carrier == "vehicle" else drone
+    for platform, one in enabled_cameras(settings, len(drone) > 0):
+        mount = camera_mount(platform, one, drone[0] if drone else None)
+        meshes = [vehicle_from_camera] if platform == "vehicle" else drone
         masked_px, max_off_axis_deg = own_body(one.true_lens, one.size_px, mount, meshes)
-        told, lens = mount, one.true_lens
-        if one.error is not None:
-            told, lens = one.error.mount(mount), one.error.lens(lens, one.size_px)
-        tree[carrier] = {
-            f"T_{carrier}_camera": told.model_dump(mode="json", exclude_none=True),
+        rig_mount, lens = mount, one.true_lens
+        if one.miscalibration is not None:
+            rig_mount, lens = one.miscalibration.mount(mount), one.miscalibration.lens(lens, one.size_px)
+        tree[platform] = {
+            f"T_{platform}_camera": rig_mount.model_dump(mode="json", exclude_none=True),
             "lens": lens.model_dump(mode="json"),
             "size_px": one.size_px,
             "readout_ms": one.readout_ms,
@@ -244,11 +246,11 @@ def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Seq
     return tree
 
 
-def wanted_cameras(settings: CamerasSettings, drone: bool) -> list[tuple[Carrier, CameraSettings]]:
-    """The cameras there are, by what carries them: an empty sky has no drone to carry one."""
-    wanted: list[tuple[Carrier, CameraSettings]] = []
+def enabled_cameras(settings: CamerasSettings, drone: bool) -> list[tuple[Platform, CameraSettings]]:
+    """The enabled cameras by platform. In an empty sky the drone's camera is left out."""
+    enabled: list[tuple[Platform, CameraSettings]] = []
     if settings.vehicle is not None:
-        wanted.append(("vehicle", settings.vehicle))
+        enabled.append(("vehicle", settings.vehicle))
     if settings.drone is not None and drone:
-        wanted.append(("drone", settings.drone))
-    return wanted
+        enabled.append(("drone", settings.drone))
+    return enabled

@@ -1,9 +1,9 @@
-"""Where a camera sees its own carrier: what a crew would mark in a image, for the rig file.
+"""Where a camera sees its own platform: the mask that a user would draw for the rig file.
 
-    masked_px           polygons (column, row) around what stands in the view: mast, LiDAR, landing gear
-    max_off_axis_deg    where the carrier fills most of the ring: no farther out is anything else to be seen
+    masked_px           polygons (column, row) around parts in the view: mast, LiDAR, landing gear
+    max_off_axis_deg    beyond this angle the platform fills most of the ring
 
-Source: ours. A carrier's roof is mistaken for a street otherwise: it is straight, near and always there.
+Source: ours. Without a mask the edges of the platform's roof count as lines of the street.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from stages.lens import Lens
 
 GRID = 360  # rays across the image
 REACH_M = 5.0
-MARGIN = 2  # of the grid, for what moves or was marked loosely
+MARGIN = 2  # grid cells, for moving parts and a coarse mask
 MOST_OF_A_RING = 0.6
-CORNER_PX = 1.0  # of the grid: polygons are simplified by so much
+CORNER_PX = 1.0  # grid cells: tolerance of the polygons
 RING_DEG = 0.5
 MARGIN_DEG = 1.0
 
 
 def own_body(
-    lens: Lens, size_px: int, T_carrier_camera: Pose, meshes: Iterable[Mesh]
+    lens: Lens, size_px: int, T_platform_camera: Pose, meshes: Iterable[Mesh]
 ) -> tuple[list[list[list[float]]], float]:
-    """(masked_px, max_off_axis_deg) of a square image; the meshes are the carrier in its own frame, as it moves."""
+    """(masked_px, max_off_axis_deg) of a square image; the meshes are the moving platform in its own frame."""
     step = size_px / GRID
     at = (np.arange(GRID) + 0.5) * step - 0.5
     column, row = np.meshgrid(at, at)
     rays = lens.unproject(np.column_stack([column.ravel(), row.ravel()]).astype(np.float64))
     inside = np.isfinite(rays[:, 0])
-    T = T_carrier_camera.matrix()
+    T = T_platform_camera.matrix()
     directions = (rays[inside] @ T[:3, :3].T).astype(np.float32)
     origins = np.tile(T[:3, 3], (len(directions), 1)).astype(np.float32)
     own = np.zeros(GRID * GRID, dtype=np.uint8)

@@ -1,9 +1,7 @@
-"""How surfaces look: colour and texture per sample, computed from where the sample lies, and light on it.
+"""Appearance of surfaces: material table, shading table of a mesh, and the radiance of camera samples.
 
-Textures are filtered by hand: every stripe (joint, mark, frame) is averaged over the sample's own width on the surface,
-so what a pixel cannot resolve fades to its mean instead of shimmering.
-
-Source: ours; brick and slab sizes are the usual ones, lane marks as German RMS (0.12 m lines, 3 m dashes, 6 m gaps).
+Source: ours; brick and slab sizes are common ones, lane marks follow the German RMS (0.12 m lines, 3 m dashes, 6 m
+gaps).
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from links.simulated.world.sky import Light, noise_tile
 from stages.geometry import Array64
 
 MATERIALS: dict[str, tuple[int, tuple[float, float, float], tuple[float, float, float]]] = {
-    # name in SURFACES: texture, colour, the colour it varies towards from one object to the next (linear RGB)
+    # name in SURFACES: texture, base colour, second colour; each object gets a colour between the two (linear RGB)
     "asphalt": (ROAD, (0.10, 0.10, 0.11), (0.10, 0.10, 0.11)),
     "paving": (SLABS, (0.34, 0.32, 0.29), (0.34, 0.32, 0.29)),
     "kerb": (PLAIN, (0.42, 0.41, 0.39), (0.42, 0.41, 0.39)),
@@ -47,14 +45,14 @@ MATERIALS: dict[str, tuple[int, tuple[float, float, float], tuple[float, float, 
     "light_shell": (PLAIN, (0.6, 0.6, 0.6), (0.6, 0.6, 0.6)),
     "marking": (PLAIN, (0.75, 0.75, 0.72), (0.75, 0.75, 0.72)),
 }
-_OBJECT_ENDS = ("roof", "rubber")  # a run of these faces ends an object in a mesh: a house, a car
+_OBJECT_ENDS = ("roof", "rubber")  # a run of these faces ends an object in a mesh: a building, a car
 _NOISE = noise_tile(np.random.default_rng([20, 1]), falloff=1.1).astype(np.float32)
 
 Look = tuple[NDArray[np.int64], Array32, Array32]
 
 
 def _material_table(surfaces: dict[str, tuple[float, float]]) -> Look:
-    """Rows of texture, colour and other colour as `surfaces` has them; one without a look is a plain grey."""
+    """Rows of texture, base and second colour in the order of `surfaces`; a surface without a material is grey."""
     kinds, colours, others = [], [], []
     for name, (diffuse, _) in surfaces.items():
         grey = (diffuse, diffuse, diffuse)
@@ -70,13 +68,13 @@ _KIND, _COLOUR, _OTHER = _material_table(SURFACES)
 
 @dataclass(frozen=True)
 class Faces:
-    """What shading needs of each triangle, in its body's frame."""
+    """What shading needs of each triangle, in the frame of its body."""
 
     normal: Array32  # (f, 3) unit
     surface: NDArray[np.uint8]  # (f,)
-    tint: Array32  # (f,) 0..1, one number for each object
+    tint: Array32  # (f,) 0 to 1, one value per object
     half: NDArray[np.int8]  # (f,) 0 and 1: first and second half of a quadrilateral; -1: none
-    side_m: Array32  # (f, 2) lengths of the quadrilateral's two sides
+    side_m: Array32  # (f, 2) side lengths of the quadrilateral
 
 
 def faces_of(mesh: Mesh) -> Faces:
@@ -109,22 +107,22 @@ def _hash01(number: NDArray[np.int64]) -> Array64:
 
 @dataclass(frozen=True)
 class Street:
-    """Where lane marks lie: the street's frame seen from the world. Half width 0: no marks."""
+    """Position of the lane marks: the pose of the street frame in the world. Half width 0: no marks."""
 
     yaw_rad: float
-    y_m: float  # the world's origin in the street frame
+    y_m: float  # y of the world origin in the street frame
     ground_z_m: float
     half_width_m: float
 
     @classmethod
     def of(cls, settings: SceneSettings, camera_height_m: float) -> Street:
-        """The street of a scene. Only the plain street has its marks painted here: other kinds have them as faces."""
+        """The street of a scene. Only the plain street has painted marks; those of other kinds are faces."""
         half_width_m = settings.road_width_m / 2 if settings.kind == "street" else 0.0
         yaw_rad = math.radians(settings.vehicle_yaw_deg)
         return cls(yaw_rad, settings.vehicle_lane_y_m, -camera_height_m, half_width_m)
 
     def numbers(self) -> Array64:
-        """For compiled code."""
+        """The values as an array, for compiled code."""
         return np.array([math.cos(self.yaw_rad), math.sin(self.yaw_rad), self.y_m, self.ground_z_m, self.half_width_m])
 
 
@@ -143,8 +141,8 @@ def radiance(
 ) -> Array32:
     """Linear RGB (n, 3) of samples: world directions, hit points and normals (n, 3), ranges (n,).
 
-    `surface` (n,) is the row of SURFACES, -1 for sky. `window` (n, 4): place on the quadrilateral and its sides [m].
-    `lit` says which samples see the sun.
+    `surface` (n,) is the row of SURFACES, -1 for sky. `window` (n, 4): position on the quadrilateral and its sides [m].
+    `lit` marks the samples in direct sun.
     """
     return kernels.shade(
         directions, points, normals, ranges, surface, tint, window, lit, pixel_rad, street.numbers(),

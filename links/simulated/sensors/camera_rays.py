@@ -1,6 +1,6 @@
-"""Rays of a camera against the world and everything that moves, each ray at its own moment.
+"""Camera rays against the world and the moving bodies, each ray at its own time.
 
-Source: ours. A body is cast in its own frame with the pose of each ray's moment, so it moves within an exposure and
+Source: ours. A body is cast in its own frame with its pose at the time of each ray, so it moves within an exposure and
 between the rows of a rolling shutter.
 """
 
@@ -29,26 +29,26 @@ from stages.geometry import Array64
 
 SHADOW_REACH_M = 120.0
 LEAF_ROW = list(SURFACES).index("leaf")
-SKY, WORLD = -1, 0  # bodies count from 1
+SKY, WORLD = -1, 0  # bodies are numbered from 1
 
 
 @dataclass
 class Samples:
-    """What rays (n,) met."""
+    """Hits of rays (n,)."""
 
     directions: Array32  # (n, 3) world
     points: Array32  # (n, 3) world
-    normals: Array32  # (n, 3) world, on either side
+    normals: Array32  # (n, 3) world, of either sign
     ranges: Array32  # (n,) inf: sky
     body: NDArray[np.int32]
     surface: NDArray[np.int64]  # row of SURFACES, -1: sky
     tint: Array32
-    window: Array32  # (n, 4) place on the quadrilateral and its sides [m]
+    window: Array32  # (n, 4) position on the quadrilateral and its sides [m]
     lit: NDArray[np.bool_]
 
     @classmethod
     def empty(cls, count: int) -> Samples:
-        """Room for `count` samples; each sees the sky."""
+        """`count` samples of the sky."""
         return cls(
             directions=np.zeros((count, 3), np.float32),
             points=np.zeros((count, 3), np.float32),
@@ -62,12 +62,12 @@ class Samples:
         )
 
     def put(self, pick: NDArray[np.intp], other: Samples) -> None:
-        """Set samples `pick` to all of another's, as far as finding edges needs them."""
+        """Set the attributes of samples `pick` that edge detection needs."""
         for name in ("points", "normals", "ranges", "body", "surface", "lit"):
             getattr(self, name)[pick] = getattr(other, name)
 
     def describe(self, pick: NDArray[np.intp], face: NDArray[np.int32], u: Array32, v: Array32, faces: Faces) -> None:
-        """Fill in what is known of the faces that samples `pick` met; normals stay in the body's frame."""
+        """Set the face attributes of samples `pick`; normals stay in the frame of the body."""
         describe_hits(
             pick, face, u, v, faces.normal, faces.surface, faces.tint, faces.half, faces.side_m,
             self.normals, self.surface, self.tint, self.window,
@@ -75,7 +75,7 @@ class Samples:
 
 
 class CameraScene:
-    """Everything a camera can see, ready for rays."""
+    """Everything a camera can see, prepared for ray casting."""
 
     def __init__(self, world: RayScene, world_mesh: Mesh, bodies: Sequence[Body], street: Street, light: Light) -> None:
         self.bodies = tuple(bodies)
@@ -86,7 +86,7 @@ class CameraScene:
         self._faces = [[faces_of(mesh) for mesh in body.meshes] for body in self.bodies]
 
     def always_hit(self, index: int, origin: Array64, directions: Array64) -> NDArray[np.bool_]:
-        """Rays (n, 3) in a body's own frame that meet it in whichever of its shapes."""
+        """Mask of the rays (n, 3), in the frame of a body, that hit it in all of its shapes."""
         origins = np.tile(origin.astype(np.float32), (len(directions), 1))
         hit = np.ones(len(directions), dtype=np.bool_)
         for scene in self.bodies[index].scenes:
@@ -101,7 +101,7 @@ class CameraScene:
         moment_ns: NDArray[np.int64],
         only: int | None = None,
     ) -> Samples:
-        """Cast rays (n, 3) in the world frame; ray i leaves at time moment_ns[moment[i]]. `only`: against one body."""
+        """Cast rays (n, 3) in the world frame; ray i has the time moment_ns[moment[i]]. `only`: against one body."""
         samples = Samples.empty(len(directions))
         samples.directions = directions
         if only is None:
@@ -110,12 +110,12 @@ class CameraScene:
             samples.body[face >= 0] = WORLD
             samples.describe(np.arange(len(face)), face, u, v, self._world_faces)
         if only is None:
-            self._meet_all(origins, samples, moment, moment_ns)
+            self._cast_bodies(origins, samples, moment, moment_ns)
         else:
-            self._meet(only, np.arange(len(directions)), origins, samples, moment, moment_ns)
+            self._cast_body(only, np.arange(len(directions)), origins, samples, moment, moment_ns)
         hit_points(origins, directions, samples.ranges, samples.points)
         if self.light.sun_rgb.any():
-            self._shine(samples, moment_ns)
+            self._light_samples(samples, moment_ns)
         return samples
 
     def radiance(self, samples: Samples, pixel_rad: float) -> Array32:
@@ -126,44 +126,53 @@ class CameraScene:
             pixel_rad, self.street, self.light,
         )  # fmt: skip
 
-    def _meet_all(
+    def _cast_bodies(
         self, origins: Array32, samples: Samples, moment: NDArray[np.int64], moment_ns: NDArray[np.int64]
     ) -> None:
-        """Every body against the rays that pass it: those within a cone that holds it at all moments."""
+        """Cast the rays that may hit a body: those within a cone that contains it at all times."""
         if not self.bodies or not len(origins):
             return
         low, high = origins.min(axis=0), origins.max(axis=0)
-        places = [body.pose(moment_ns)[1] for body in self.bodies]
-        middles = np.array([(t.min(axis=0) + t.max(axis=0)) / 2 for t in places])
-        spreads = np.array([np.linalg.norm(np.ptp(t, axis=0)) / 2 for t in places])
+        positions = [body.pose(moment_ns)[1] for body in self.bodies]
+        middles = np.array([(t.min(axis=0) + t.max(axis=0)) / 2 for t in positions])
+        spreads = np.array([np.linalg.norm(np.ptp(t, axis=0)) / 2 for t in positions])
         towards = middles - (low + high) / 2
         distance = np.maximum(np.linalg.norm(towards, axis=1), 1e-9)
         reach = np.array([body.radius_m for body in self.bodies]) + spreads + np.linalg.norm(high - low) / 2
         cosine = np.sqrt(np.maximum(1 - (reach / distance) ** 2, 0.0)) - 1e-5
-        cosine[reach >= distance] = -2.0  # the rays start within its reach
+        cosine[reach >= distance] = -2.0  # the rays start within its radius
         along = samples.directions @ (towards / distance[:, None]).T.astype(np.float32)
         for index in range(len(self.bodies)):
-            among = np.nonzero(along[:, index] > cosine[index])[0]
-            if len(among):
-                self._meet(index, among, origins, samples, moment, moment_ns)
+            candidates = np.nonzero(along[:, index] > cosine[index])[0]
+            if len(candidates):
+                self._cast_body(index, candidates, origins, samples, moment, moment_ns)
 
-    def _meet(
+    def _cast_body(
         self,
         index: int,
-        among: NDArray[np.intp],
+        candidates: NDArray[np.intp],
         origins: Array32,
         samples: Samples,
         moment: NDArray[np.int64],
         moment_ns: NDArray[np.int64],
     ) -> None:
-        """Nearer hits of the rays `among` on a body replace what was found."""
+        """Replace the hits of candidate rays by nearer ones on a body."""
         body = self.bodies[index]
         R, t = body.pose(moment_ns)
         shape_of_moment = np.zeros(len(moment_ns), dtype=np.int64) if body.shape is None else body.shape(moment_ns)
         for shape in np.unique(shape_of_moment):
-            right = shape_of_moment == shape
+            active = shape_of_moment == shape
             pick, local_o, local_d = rays_into_body(
-                among, origins, samples.directions, moment, right, R, t, *body.box_m, body.radius_m, samples.ranges
+                candidates,
+                origins,
+                samples.directions,
+                moment,
+                active,
+                R,
+                t,
+                *body.box_m,
+                body.radius_m,
+                samples.ranges,
             )
             if not len(pick):
                 continue
@@ -175,8 +184,8 @@ class CameraScene:
             samples.describe(pick, face[nearer], u[nearer], v[nearer], self._faces[index][shape])
             rotate_normals(pick, moment, R, samples.normals)
 
-    def _shine(self, samples: Samples, moment_ns: NDArray[np.int64]) -> None:
-        """Which samples see the sun: nothing stands between, bodies as they are in the middle of the exposure."""
+    def _light_samples(self, samples: Samples, moment_ns: NDArray[np.int64]) -> None:
+        """Mark the samples in direct sun; shadows use the poses of bodies in the middle of the exposure."""
         sun = self.light.sun_direction
         pick, origins = shadow_rays(
             samples.points, samples.normals, samples.directions, samples.surface, samples.ranges, sun
@@ -185,13 +194,13 @@ class CameraScene:
         dark = self._world.blocked(origins, towards, SHADOW_REACH_M)
         middle_ns = moment_ns[len(moment_ns) // 2 : len(moment_ns) // 2 + 1]
         now = np.zeros(len(pick), dtype=np.int64)
-        right, everything = np.ones(1, dtype=np.bool_), np.arange(len(pick))
+        active, everything = np.ones(1, dtype=np.bool_), np.arange(len(pick))
         for body in self.bodies:
             R, t = body.pose(middle_ns)
             shape = 0 if body.shape is None else int(body.shape(middle_ns)[0])
             limit = np.where(dark, 0.0, SHADOW_REACH_M).astype(np.float32)
             some, o, d = rays_into_body(
-                everything, origins, towards, now, right, R, t, *body.box_m, body.radius_m, limit
+                everything, origins, towards, now, active, R, t, *body.box_m, body.radius_m, limit
             )
             if len(some):
                 dark[some] |= body.scenes[shape].blocked(o, d, SHADOW_REACH_M)

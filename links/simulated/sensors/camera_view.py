@@ -1,7 +1,7 @@
-"""One frame of a camera as linear radiance: a ray through every pixel, more where one is not enough.
+"""One camera frame as linear radiance: one ray per pixel, more where one is not enough.
 
-Source: ours. Pixels on edges, on moving things and those that move during the exposure are averaged over 4 or 16
-jittered rays, spread over the exposure too: anti-aliasing and motion blur in one.
+Source: ours. Pixels on edges, on moving bodies, and pixels that move during the exposure are averaged over 4 or 16
+jittered rays, distributed over the exposure as well: anti-aliasing and motion blur in one step.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from stages.lens import Equidistant, KannalaBrandt, OCam
 
 BATCH_RAYS = 262_144
 MANY = 16  # rays through a pixel that needs more than FEW
-BLUR_PX = 0.5  # a pixel that moves farther than this during the exposure is averaged over it
+BLUR_PX = 0.5  # a pixel that moves more than this during the exposure is averaged over it
 LONG_BLUR_PX = 2.0
-TINY_PX = 16.0  # a small body that appears smaller than this across its radius may slip between the first rays
-SPEED_MPS = 15.0  # small bodies rarely pass faster: the margin kept around them
+TINY_PX = 16.0  # the first rays may miss a small body whose apparent radius is below this
+SPEED_MPS = 15.0  # speed bound of small bodies, for the margin around them
 
 Poses = Callable[
     [NDArray[np.int64]], tuple[Array64, Array64]
@@ -35,7 +35,7 @@ Poses = Callable[
 
 
 class PixelRays:
-    """Rays of all pixels within the lens's circle, in the camera frame, and how they change over a pixel."""
+    """Rays of all pixels within the lens circle, in the camera frame, and their derivatives over a pixel."""
 
     def __init__(self, lens: Equidistant | KannalaBrandt | OCam, size_px: int) -> None:
         column, row = np.meshgrid(np.arange(size_px, dtype=np.float64), np.arange(size_px, dtype=np.float64))
@@ -56,7 +56,7 @@ class PixelRays:
 
     @staticmethod
     def _slope(lens: Any, pixels: Array64, rays: Array64, step: tuple[float, float]) -> Array32:
-        """Change of the ray per pixel, from whichever neighbour lies within the circle."""
+        """Change of the ray per pixel, from a neighbour within the lens circle."""
         ahead, behind = lens.unproject(pixels + step) - rays, rays - lens.unproject(pixels - np.array(step))
         slope = np.where(np.isfinite(ahead), ahead, behind)
         return np.nan_to_num(slope).astype(np.float32)
@@ -67,14 +67,14 @@ class PixelRays:
 
 @dataclass(frozen=True)
 class Shutter:
-    """When each row is exposed: its middle is middle_ns + (row - (rows - 1) / 2) * row_s."""
+    """Exposure time of each row; its middle is middle_ns + (row - (rows - 1) / 2) * row_s."""
 
     middle_ns: int
     exposure_s: float
     row_s: float  # 0: a global shutter
 
     def moments(self, rows: int, parts: int) -> tuple[NDArray[np.int64], int]:
-        """Middles (m,) [ns] of `parts` equal parts of each row's exposure; moments per row (0: all rows alike)."""
+        """Middles (m,) [ns] of `parts` equal parts of each row's exposure; moments per row (0: common to all rows)."""
         within_s = ((np.arange(parts) + 0.5) / parts - 0.5) * self.exposure_s
         if self.row_s == 0.0:
             return self.middle_ns + np.rint(1e9 * within_s).astype(np.int64), 0
@@ -89,24 +89,24 @@ class View:
     scene: CameraScene
     pixels: PixelRays
     poses: Poses
-    own: int  # the body that carries the camera
-    covered: NDArray[np.bool_]  # (n,) pixels that see nothing but that body, ever
+    own: int  # index of the body that is the platform of the camera
+    covered: NDArray[np.bool_]  # (n,) pixels that always show that body
 
 
 def render(view: View, shutter: Shutter, rng: Generator) -> Array32:
-    """Linear RGB (size, size, 3); 0 outside the lens's circle."""
+    """Linear RGB (size, size, 3); 0 outside the lens circle."""
     pixels, scene = view.pixels, view.scene
     moment_ns, per_row = shutter.moments(pixels.size_px, 1)
     R, t = view.poses(moment_ns)
-    seen = Samples.empty(len(pixels))
+    centre = Samples.empty(len(pixels))
     colours = np.empty((len(pixels), 3), dtype=np.float32)
     for only, share in ((None, ~view.covered), (view.own, view.covered)):
         for pick in _batches(np.nonzero(share)[0], 1):
             moment = pixels.rows[pick] * per_row
             samples = scene.trace(*world_rays(pixels, pick, None, moment, R, t), moment, moment_ns, only)
             colours[pick] = scene.radiance(samples, pixels.pixel_rad)
-            seen.put(pick, samples)
-    few, many = _where_more(view, shutter, seen, colours)
+            centre.put(pick, samples)
+    few, many = _where_more(view, shutter, centre, colours)
     for pick, rays_each in ((np.nonzero(few & ~many)[0], FEW), (np.nonzero(many)[0], MANY)):
         _refine(view, shutter, pick, rays_each, rng, colours)
     image = np.zeros((pixels.size_px, pixels.size_px, 3), dtype=np.float32)
@@ -115,9 +115,9 @@ def render(view: View, shutter: Shutter, rng: Generator) -> Array32:
 
 
 def mean_radiance(view: View, stamp_ns: int, step: int = 13) -> float:
-    """What a light meter sees: the mean over every `step`-th pixel each way, without the camera's own carrier.
+    """Light meter: mean over every `step`-th pixel in both directions, without the platform of the camera.
 
-    No part counts more than white in sun.
+    Each pixel is limited to the radiance of white in full sun.
     """
     pixels, scene = view.pixels, view.scene
     pick = np.nonzero((pixels.rows % step == 0) & (pixels.columns % step == 0) & ~view.covered)[0]
@@ -134,20 +134,20 @@ def _batches(pick: NDArray[np.intp], rays_each: int) -> list[NDArray[np.intp]]:
 
 
 def _where_more(
-    view: View, shutter: Shutter, seen: Samples, colours: Array32
+    view: View, shutter: Shutter, centre: Samples, colours: Array32
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pixels that need FEW more rays, and those that need MANY."""
+    """Masks of the pixels that need FEW and MANY more rays."""
     pixels = view.pixels
     few = edges(
         pixels.rows, pixels.columns, pixels.index,
-        seen.normals, seen.points, seen.ranges, seen.body, seen.surface, seen.lit, colours, LEAF_ROW,
+        centre.normals, centre.points, centre.ranges, centre.body, centre.surface, centre.lit, colours, LEAF_ROW,
     )  # fmt: skip
-    own = seen.body == view.own + 1
-    few |= (seen.body > WORLD) & ~own
+    own = centre.body == view.own + 1
+    few |= (centre.body > WORLD) & ~own
     moment_ns, per_row = shutter.moments(pixels.size_px, 1)
     half = round(0.5e9 * shutter.exposure_s)
     first, last = view.poses(moment_ns - half), view.poses(moment_ns + half)
-    moved_px = image_motion(seen.points, pixels.rows * per_row, *first, *last) / pixels.pixel_rad
+    moved_px = image_motion(centre.points, pixels.rows * per_row, *first, *last) / pixels.pixel_rad
     moved_px[own] = 0.0
     few |= moved_px > BLUR_PX
     many = moved_px > LONG_BLUR_PX
@@ -159,7 +159,7 @@ def _where_more(
             distance = float(np.linalg.norm(towards))
             reach_m = body.radius_m + 0.5 * shutter.row_s * pixels.size_px * SPEED_MPS
             angle = math.atan2(reach_m, distance) + 3 * pixels.pixel_rad
-            if angle < TINY_PX * pixels.pixel_rad:  # a larger one is seen by the first rays, edges and all
+            if angle < TINY_PX * pixels.pixel_rad:  # the first rays cannot miss a larger one
                 many |= pixels.direction @ (towards / distance).astype(np.float32) > math.cos(angle)
     return few, many & ~view.covered
 
@@ -167,7 +167,7 @@ def _where_more(
 def _refine(
     view: View, shutter: Shutter, pick: NDArray[np.intp], rays_each: int, rng: Generator, colours: Array32
 ) -> None:
-    """Average picked pixels over more rays, each in its own slot of the exposure: FEW beside the first, or MANY."""
+    """Average picked pixels over more rays, each at its own time of the exposure: FEW plus the first one, or MANY."""
     moment_ns, per_row = shutter.moments(view.pixels.size_px, rays_each)
     R, t = view.poses(moment_ns)
     slots = rng.permutation(rays_each)
@@ -192,8 +192,8 @@ def world_rays(
 ) -> tuple[Array32, Array32]:
     """Origins and unit directions (n * rays_each, 3) in the world.
 
-    `jitter` (n, rays_each, 2) in [0, 1) moves each within its part of the pixel; None: one ray through the middle.
-    FEW rays lie on a ring about the middle; MANY are spread so that no two share a row or column of the pixel:
+    `jitter` (n, rays_each, 2) in [0, 1) moves each ray within its part of the pixel; None: one ray at the centre.
+    FEW rays lie on a ring around the centre; MANY are placed so that no two share a row or column of the pixel:
     Kensler, Correlated multi-jittered sampling, Pixar 13-01 (2013), the canonical arrangement.
     """
     placed = np.full((len(pick), 1, 2), 0.5, dtype=np.float32) if jitter is None else jitter

@@ -1,15 +1,15 @@
-"""How an estimate of one's own motion goes wrong: slowly and smoothly, never by jumps.
+"""A drifting estimate of a motion: its errors are slow and smooth, without jumps.
 
-A dead-reckoned position is the integral of an estimated velocity, so its error has the shape an EKF or wheel odometry
-shows: it grows with time and with distance.
+A dead-reckoned position is the integral of an estimated velocity. Its error grows with time and with distance, as that
+of an EKF or of wheel odometry:
 
-    v_local = Rz(yaw of the local frame + yaw error) (1 + scale) v_world + velocity error       horizontally
+    v_local = Rz(yaw of the local frame + yaw error) (1 + scale) v_world + velocity error       horizontal
     p_local = integral of v_local + random walk;   z_local = z - z_0 + height error
 
-yaw error = rate * t + random walk; velocity and height error, and the lean, are first-order Gauss-Markov. Walks and
-the height pass a 1 s low-pass, so that the position has a slope, and the velocity is that slope.
+yaw error = rate * t + random walk. Velocity, height and tilt errors are first-order Gauss-Markov processes. Random
+walks and height pass a 1 s low-pass, so that the position has a derivative; the velocity contains it.
 
-Source: ours; orders of magnitude of consumer-grade EKFs with GPS-less flow or wheel speed.
+Source: ours; orders of magnitude of consumer-grade EKFs with optical flow or wheel speed and without GPS.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from links.simulated.world.motion import gauss_markov, interpolate, low_pass, ra
 from stages.geometry import Array64
 
 STEP_S = 0.01
-SMOOTH_S = 1.0  # a filter passes no error on faster than this
+SMOOTH_S = 1.0  # time constant of the low-pass on the errors
 
 
 class DriftSettings(BaseModel):
-    """Sizes of the errors. Scale and yaw rate are values, the others one sigma; zero turns an error off."""
+    """Sizes of the errors. Scale and yaw rate are values, the others one sigma; zero disables an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    scale: float = Field(default=0.01, ge=-0.5, le=0.5)  # distances come out this much too long
+    scale: float = Field(default=0.01, ge=-0.5, le=0.5)  # relative error of distances
     yaw_rate_deg_per_min: float = Field(default=1.0, ge=-600, le=600)
     yaw_random_walk_deg_per_sqrt_s: float = Field(default=0.05, ge=0, le=10)
     position_random_walk_m_per_sqrt_s: float = Field(default=0.02, ge=0, le=10)
@@ -43,24 +43,24 @@ class DriftSettings(BaseModel):
 
 
 class DriftingEstimate:
-    """The estimate of a true motion; times outside it are held at its ends.
+    """The estimate of a true motion. Times outside it take its first or last value.
 
-    Frame local: z up, origin where the motion began; the world's x axis has the yaw `yaw_local_rad` in it.
+    Frame local: z up, origin at the start of the motion; the world x axis has the yaw `yaw_local_rad` in it.
     """
 
     def __init__(
         self, position_m: Array64, yaw_local_rad: float, settings: DriftSettings, rng: np.random.Generator
     ) -> None:
-        """position_m (n, 3): the true path, world, one row each STEP_S."""
+        """position_m (n, 3): the true path, world frame, one row per STEP_S."""
         s, steps = settings, len(position_m)
         self._settings = settings
         self._travelled_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position_m, axis=0), axis=1))])
         white = rng.standard_normal((steps, 8))
         self._yaw = yaw_local_rad + np.radians(s.yaw_rate_deg_per_min) / 60 * STEP_S * np.arange(steps)
-        self._yaw += _walk(white[:, :1], float(np.radians(s.yaw_random_walk_deg_per_sqrt_s)))[:, 0]
+        self._yaw += _random_walk(white[:, :1], float(np.radians(s.yaw_random_walk_deg_per_sqrt_s)))[:, 0]
         self._lean = low_pass(_errors(white[:, 1:3], float(np.radians(s.tilt_deg)), s.tilt_time_s), SMOOTH_S, STEP_S)
         velocity_error = _errors(white[:, 3:5], s.velocity_mps, s.velocity_time_s)
-        walk = _walk(white[:, 6:8], s.position_random_walk_m_per_sqrt_s)
+        walk = _random_walk(white[:, 6:8], s.position_random_walk_m_per_sqrt_s)
         height_error = low_pass(_errors(white[:, 5:6], s.height_m, s.height_time_s), SMOOTH_S, STEP_S)
 
         step_local = np.einsum("nij,nj->ni", rotations_z(self._yaw[:-1]), np.diff(position_m, axis=0))
@@ -73,31 +73,31 @@ class DriftingEstimate:
         self._velocity_error[:, :2] += velocity_error
 
     def position_m(self, time_s: Array64) -> Array64:
-        """In the local frame (n, 3) [m]."""
+        """Estimated position (n, 3) [m], local frame."""
         return interpolate(self._position, STEP_S, time_s)
 
     def velocity_mps(self, time_s: Array64, velocity_world_mps: Array64) -> Array64:
-        """The estimate (n, 3), local frame, of a true velocity (n, 3), world."""
+        """Estimate (n, 3), local frame, of a true velocity (n, 3), world frame."""
         turned = np.einsum("nij,nj->ni", self._turn(time_s), velocity_world_mps)
-        stretch = 1 + self._settings.scale
-        return turned * [stretch, stretch, 1.0] + interpolate(self._velocity_error, STEP_S, time_s)
+        scale = 1 + self._settings.scale
+        return turned * [scale, scale, 1.0] + interpolate(self._velocity_error, STEP_S, time_s)
 
     def rotations(self, time_s: Array64, R_world_body: Array64) -> Array64:
-        """The estimate R_local_body (n, 3, 3) of a true R_world_body (n, 3, 3)."""
+        """Estimate R_local_body (n, 3, 3) of a true R_world_body (n, 3, 3)."""
         lean = interpolate(self._lean, STEP_S, time_s)
         return rotations_from_vectors(np.pad(lean, ((0, 0), (0, 1)))) @ self._turn(time_s) @ R_world_body
 
     def covariances(self, time_s: Array64, R_local_body: Array64) -> Array64:
-        """What an honest filter would say of its pose (n, 6, 6): rotation [rad] then translation [m], body tangent.
+        """Consistent pose covariances (n, 6, 6): rotation [rad], then translation [m], tangent at the body.
 
         The integral of a Gauss-Markov velocity error has the variance 2 s^2 T (t - T (1 - exp(-t / T))).
         """
         s, t, T = self._settings, np.maximum(time_s, 0.0), self._settings.velocity_time_s
         lean = np.full(len(t), np.radians(s.tilt_deg) ** 2)
         yaw = np.radians(s.yaw_rate_deg_per_min / 60 * t) ** 2 + np.radians(s.yaw_random_walk_deg_per_sqrt_s) ** 2 * t
-        coasted = 2 * s.velocity_mps**2 * T * (t - T * (1 - np.exp(-t / T)))
+        integrated = 2 * s.velocity_mps**2 * T * (t - T * (1 - np.exp(-t / T)))
         along = (s.scale**2 + yaw / 3) * interpolate(self._travelled_m, STEP_S, t) ** 2
-        horizontal = s.position_random_walk_m_per_sqrt_s**2 * t + coasted + along
+        horizontal = s.position_random_walk_m_per_sqrt_s**2 * t + integrated + along
         height = 2 * s.height_m**2 * (1 - np.exp(-t / s.height_time_s))
         covariances = np.zeros((len(t), 6, 6))
         for at, variances in ((0, (lean, lean, yaw)), (3, (horizontal, horizontal, height))):
@@ -109,7 +109,7 @@ class DriftingEstimate:
         return rotations_z(interpolate(self._yaw, STEP_S, time_s))
 
 
-def _walk(white: Array64, sigma_per_sqrt_s: float) -> Array64:
+def _random_walk(white: Array64, sigma_per_sqrt_s: float) -> Array64:
     return low_pass(random_walk(white, sigma_per_sqrt_s, STEP_S), SMOOTH_S, STEP_S)
 
 

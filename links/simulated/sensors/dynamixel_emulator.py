@@ -1,13 +1,13 @@
-"""An MX-28AR on a pty: the real SDK, or any other host, talks to it as to the servo; faults come when asked for.
+"""An MX-28AR on a pty: the DYNAMIXEL SDK, or any other host, talks to it as to the servo. Faults on demand.
 
     with DynamixelEmulator() as servo:
         Servo(port=servo.path) ...                      # links.dynamixel
-        servo.output_rad(stamp_ns)                      # where the turntable truly stood, for a simulated LiDAR
+        servo.output_rad(stamp_ns)                      # true angle of the turntable, for a simulated LiDAR
 
-The emulator has a thread of its own; alone in a process: `python -m links.simulated.sensors.dynamixel_emulator --help`,
-where faults are lines on standard input. `path` is a link that leads to the pty and outlives an unplugged cable.
+The emulator runs in a thread of its own, or in a process (`python -m links.simulated.sensors.dynamixel_emulator
+--help`) where each line on standard input is a fault. `path` is a link to the pty; it outlives an unplugged cable.
 
-Source: ours; pty(7). What the servo does: links/simulated/sensors/mx28.py.
+Source: ours; pty(7). Behaviour of the servo: links/simulated/sensors/mx28.py.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from links.simulated.sensors.mx28 import SimulatedMx28
 from links.simulated.sensors.servo import ServoSettings
 from stages.geometry import Array64
 
-IDLE_S = 0.02  # how often the servo moves on without being asked
-MOST_WAITING = 4096  # bytes of a packet that does not end
+IDLE_S = 0.02  # period at which the servo moves without requests
+MOST_WAITING = 4096  # limit for the bytes of an incomplete packet
 
 
 class DynamixelEmulator:
-    """A servo on a pty, from `__enter__` to `__exit__`. Every method may be called from any thread."""
+    """A servo on a pty, from `__enter__` to `__exit__`. All methods are thread safe."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class DynamixelEmulator:
         now_ns: Callable[[], int] = time.monotonic_ns,
         firmware: int = 45,
     ) -> None:
-        """`path`: where the link to the pty is made, by default in a folder of its own. `now_ns`: its clock."""
+        """`path`: the link to the pty, by default in a temporary folder. `now_ns`: clock of the servo."""
         self._now_ns = now_ns
         self._servo = SimulatedMx28(settings or ServoSettings(travel_deg=(0.0, 360.0)), seed, now_ns(), firmware)
         self._lock = threading.RLock()
@@ -61,9 +61,9 @@ class DynamixelEmulator:
         self._thread = threading.Thread(target=self._serve, name="dynamixel emulator", daemon=True)
         self._running = False
         self._silent = False
-        self._spoilt: list[Callable[[bytes], bytes]] = []  # what becomes of the next answers
+        self._corruptions: list[Callable[[bytes], bytes]] = []  # applied to the next replies
         self._delays_s: list[float] = []
-        self._held = b""  # an answer that is not said yet
+        self._held = b""  # a reply that is not sent yet
         self.instructions = 0
 
     def __enter__(self) -> DynamixelEmulator:
@@ -84,121 +84,121 @@ class DynamixelEmulator:
         if self._folder is not None:
             self._folder.cleanup()
 
-    # what a simulation wants to know
+    # state, for a simulation
 
     def position_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
-        """The encoder's true position at times (n,) of its clock, within the last 8 s and not in the future."""
+        """The encoder's true position at times (n,) of its clock: in the last 8 s, not in the future."""
         with self._lock:
             self._servo.advance(self._now_ns())
             return self._servo.position_rad(stamp_ns)
 
     def output_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
-        """The turntable's true angle at such times: with the encoder's error and the play."""
+        """The true angle of the turntable at such times, with encoder error and backlash."""
         with self._lock:
             self._servo.advance(self._now_ns())
             return self._servo.output_rad(stamp_ns)
 
     def get(self, register: mx28.Register) -> int:
-        """A register as it stands."""
+        """Current value of a register."""
         with self._lock:
             self._servo.advance(self._now_ns())
             return self._servo.get(register)
 
     def set(self, register: mx28.Register, value: int) -> None:
-        """Change a register behind the host's back."""
+        """Write a register without the host."""
         with self._lock:
             self._servo.set(register, value)
 
     # faults
 
     def late(self, delay_s: float, count: int = 1) -> None:
-        """The next answers come so much later."""
+        """Delay the next replies."""
         with self._lock:
             self._delays_s += [delay_s] * count
 
     def hold_back(self, count: int = 1) -> None:
-        """The next answers come one instruction late: each just before the answer to the following one."""
+        """The next replies are one instruction late: each is sent just before the reply to the following one."""
 
-        def hold(answer: bytes) -> bytes:
-            said, self._held = self._held, answer
-            return said
+        def hold(reply: bytes) -> bytes:
+            held, self._held = self._held, reply
+            return held
 
-        self._spoil(hold, count)
+        self._corrupt_replies(hold, count)
 
     def garbage(self, data: bytes = b"\xff\xff\xfd\x55 garbage", count: int = 1) -> None:
-        """Bytes before the next answers."""
-        self._spoil(lambda answer: data + answer, count)
+        """Send bytes before the next replies."""
+        self._corrupt_replies(lambda reply: data + reply, count)
 
     def replace(self, data: bytes, count: int = 1) -> None:
-        """Other bytes in place of the next answers."""
-        self._spoil(lambda _: data, count)
+        """Send other bytes instead of the next replies."""
+        self._corrupt_replies(lambda _: data, count)
 
     def bad_crc(self, count: int = 1) -> None:
-        """The next answers have a bit flipped."""
-        self._spoil(lambda answer: answer[:-1] + bytes([answer[-1] ^ 0x10]), count)
+        """Flip a bit in the next replies."""
+        self._corrupt_replies(lambda reply: reply[:-1] + bytes([reply[-1] ^ 0x10]), count)
 
     def cut_off(self, kept_bytes: int, count: int = 1) -> None:
-        """The next answers end early."""
-        self._spoil(lambda answer: answer[:kept_bytes], count)
+        """Truncate the next replies."""
+        self._corrupt_replies(lambda reply: reply[:kept_bytes], count)
 
     def short_data(self, count: int = 1) -> None:
-        """The next answers are whole, but their data is one byte short."""
-        self._spoil(lambda answer: protocol2.status(answer[4], answer[8], answer[9:-3]), count)
+        """The next replies are complete packets, but their data is one byte short."""
+        self._corrupt_replies(lambda reply: protocol2.status(reply[4], reply[8], reply[9:-3]), count)
 
     def false_position(self, position_ticks: int, count: int = 1) -> None:
-        """The next position blocks (from 126 on) tell another position, with the right checksum."""
+        """The next position blocks (from address 126) report another position, with a valid checksum."""
 
-        def told(answer: bytes) -> bytes:
-            data = bytearray(answer[9:-2])
-            if not 10 <= len(data) <= 20:  # the answer to something else
-                self._spoilt.insert(0, told)
-                return answer
+        def replaced(reply: bytes) -> bytes:
+            data = bytearray(reply[9:-2])
+            if not 10 <= len(data) <= 20:  # the reply to another request
+                self._corruptions.insert(0, replaced)
+                return reply
             data[6:10] = position_ticks.to_bytes(4, "little", signed=True)
-            return protocol2.status(answer[4], answer[8], bytes(data))
+            return protocol2.status(reply[4], reply[8], bytes(data))
 
-        self._spoil(told, count)
+        self._corrupt_replies(replaced, count)
 
     def silence(self, silent: bool = True) -> None:
-        """It hears and says nothing: a broken wire."""
+        """Receive and send nothing: a broken wire."""
         with self._lock:
             self._silent = silent
 
     def stall(self, overload_s: float | None = None) -> None:
-        """Something holds the shaft; after overload_s of wanting to move the servo shuts down."""
+        """Block the shaft; after overload_s of trying to move, the servo shuts down."""
         with self._lock:
             self._servo.block(self._now_ns(), overload_s)
 
     def free(self) -> None:
-        """The shaft is free again."""
+        """Release the shaft."""
         with self._lock:
             self._servo.unblock(self._now_ns())
 
     def overload(self, errors: int = mx28.OVERLOAD) -> None:
-        """It has a hardware error now, and shuts down for most."""
+        """Set a hardware error; the servo shuts down for most of them."""
         with self._lock:
             self._servo.shut_down(self._now_ns(), errors)
 
     def torque_off(self) -> None:
-        """Somebody else switches its torque off."""
+        """Torque off, as by another host."""
         self.set(mx28.TORQUE_ENABLE, 0)
 
     def power_off(self) -> None:
-        """Its supply fails."""
+        """The supply fails."""
         with self._lock:
             self._servo.power(self._now_ns(), False)
 
     def power_on(self) -> None:
-        """Its supply is back: it boots."""
+        """The supply is back: the servo boots."""
         with self._lock:
             self._servo.power(self._now_ns(), True)
 
     def power_cycle(self) -> None:
-        """Its supply fails for a moment."""
+        """The supply fails briefly."""
         self.power_off()
         self.power_on()
 
     def unplug(self) -> None:
-        """The serial adapter is pulled out: the pty ends, the path leads nowhere."""
+        """The serial adapter is unplugged: the pty closes and the path is a dead link."""
         with self._lock:
             if self._ends is not None:
                 self.path.unlink(missing_ok=True)
@@ -207,24 +207,24 @@ class DynamixelEmulator:
                 self._ends = None
 
     def plug_in(self) -> None:
-        """It is back, on another pty, under the same path."""
+        """The adapter is plugged in again, on another pty, under the same path."""
         with self._lock:
             if self._ends is None:
                 host, servo = os.openpty()
                 tty.setraw(servo)
                 os.set_blocking(host, False)
-                self._ends = host, servo  # the servo's end stays open here, or the host's closing would end the pty
+                self._ends = host, servo  # the servo's end stays open; otherwise a closing host would close the pty
                 fresh = self.path.with_name(self.path.name + ".new")
                 fresh.unlink(missing_ok=True)
                 fresh.symlink_to(os.ttyname(servo))
                 fresh.replace(self.path)
         os.write(self._woken, b"x")
 
-    def _spoil(self, how: Callable[[bytes], bytes], count: int) -> None:
+    def _corrupt_replies(self, how: Callable[[bytes], bytes], count: int) -> None:
         with self._lock:
-            self._spoilt += [how] * count
+            self._corruptions += [how] * count
 
-    # its thread
+    # the servo's thread
 
     def _serve(self) -> None:
         stream = bytearray()
@@ -233,7 +233,7 @@ class DynamixelEmulator:
             watched = [self._wake] + ([ends[0]] if ends else [])
             try:
                 ready, _, _ = select.select(watched, [], [], IDLE_S)
-            except (OSError, ValueError):  # unplugged under the wait
+            except (OSError, ValueError):  # unplugged during the wait
                 continue
             if self._wake in ready:
                 os.read(self._wake, 64)
@@ -246,39 +246,39 @@ class DynamixelEmulator:
                 with contextlib.suppress(BlockingIOError):
                     stream += os.read(self._ends[0], MOST_WAITING)
                 del stream[:-MOST_WAITING]
-                answers = self._answers(stream, now_ns)
-            for delay_s, answer in answers:
+                replies = self._answers(stream, now_ns)
+            for delay_s, reply in replies:
                 if delay_s:
-                    threading.Timer(delay_s, self._say, (answer,)).start()
+                    threading.Timer(delay_s, self._reply, (reply,)).start()
                 else:
-                    self._say(answer)
+                    self._reply(reply)
 
     def _answers(self, stream: bytearray, now_ns: int) -> list[tuple[float, bytes]]:
-        """What is said to the instructions in a stream, each with its delay."""
+        """Replies to the instructions in a stream, each with its delay."""
         found: list[tuple[float, bytes]] = []
         while (instruction := protocol2.take(stream)) is not None:
-            if self._silent or not self._hears():
+            if self._silent or not self._baud_matches():
                 continue
             self.instructions += 1
-            answer = self._servo.answer(instruction, now_ns)
-            if answer is not None:
-                if self._spoilt:
-                    answer = self._spoilt.pop(0)(answer)
+            reply = self._servo.reply(instruction, now_ns)
+            if reply is not None:
+                if self._corruptions:
+                    reply = self._corruptions.pop(0)(reply)
                 else:
-                    answer, self._held = self._held + answer, b""
-                found.append((self._delays_s.pop(0) if self._delays_s else 0.0, answer))
+                    reply, self._held = self._held + reply, b""
+                found.append((self._delays_s.pop(0) if self._delays_s else 0.0, reply))
         return found
 
-    def _hears(self) -> bool:
-        """Whether the host talks at the servo's rate."""
+    def _baud_matches(self) -> bool:
+        """Whether the host uses the servo's baud rate."""
         assert self._ends is not None
         return termios.tcgetattr(self._ends[1])[5] == getattr(termios, f"B{self._servo.baud()}", None)
 
-    def _say(self, answer: bytes) -> None:
+    def _reply(self, reply: bytes) -> None:
         with self._lock:
             if self._ends is not None:
-                with contextlib.suppress(BlockingIOError, OSError):  # a host that does not read, or has gone
-                    os.write(self._ends[0], answer)
+                with contextlib.suppress(BlockingIOError, OSError):  # a host that does not read or is closed
+                    os.write(self._ends[0], reply)
 
 
 FAULTS = (
@@ -303,18 +303,18 @@ FAULTS = (
 
 
 def main() -> int:
-    """A servo alone in its process, until standard input ends. Each line is a fault and its numbers."""
+    """Run a servo in this process until standard input ends. Each line is a fault with its numbers."""
     parser = argparse.ArgumentParser(
         description=main.__doc__, epilog=f"faults: {', '.join(FAULTS)}; e.g. 'late 0.03 2'"
     )
-    parser.add_argument("path", type=Path, help="where the link to the pty is made")
+    parser.add_argument("path", type=Path, help="link to the pty that is created")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     with DynamixelEmulator(seed=options.seed, path=options.path) as emulator:
         for line in sys.stdin:
             name, *numbers = line.split() or [""]
             if name not in FAULTS:
-                sys.stderr.write(f"no such fault: {name!r}; there are {', '.join(FAULTS)}\n")
+                sys.stderr.write(f"no such fault: {name!r}; available: {', '.join(FAULTS)}\n")
                 continue
             try:
                 getattr(emulator, name)(*(float(n) if "." in n else int(n) for n in numbers))

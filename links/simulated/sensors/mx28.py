@@ -1,8 +1,8 @@
-"""An MX-28AR without its wire: control table, rules of access, motion, shutdown, bus watchdog, reboot.
+"""An MX-28AR without its bus: control table, access rules, motion, shutdown, bus watchdog, reboot.
 
-Time is given with every call, and motion is made up to it in steps of 1 ms by the physics of the simulated servo, so
-the same calls give the same answers. What the maker does not state is ours: half a second to boot; a servo whose torque
-is off stays where it is; the LED, indirect data and PID gains do nothing.
+Every call has a time, up to which the motion is simulated in steps of 1 ms with the physics of the simulated servo, so
+the same calls give the same replies. Ours, because the manufacturer does not state it: booting takes half a second; a
+servo without torque keeps its position; LED, indirect data and PID gains have no effect.
 
 Source: ROBOTIS e-manual, MX-28AR/AT(2.0), see links/dynamixel/mx28.py; motion: links/simulated/sensors/servo.py.
 """
@@ -21,7 +21,7 @@ from links.simulated.sensors.protocol2 import Instruction
 from links.simulated.sensors.servo import STEP_NS, GearTrain, Servo, ServoSettings
 from stages.geometry import Array64
 
-KEPT_STEPS = 8192  # of the trace: 8 s
+KEPT_STEPS = 8192  # length of the trace: 8 s
 BOOT_NS = 500_000_000
 READ_ONLY = {
     mx28.MODEL_NUMBER,
@@ -39,7 +39,7 @@ FULL_LOAD = 1000  # Present Load, in 0.1 %
 
 
 class SimulatedMx28:
-    """One servo. All times are nanoseconds of one clock that only goes forward."""
+    """One servo. All times are nanoseconds of one monotonic clock."""
 
     def __init__(self, settings: ServoSettings, seed: int, start_ns: int, firmware: int = 45) -> None:
         self._servo = Servo(settings)
@@ -51,66 +51,66 @@ class SimulatedMx28:
         self._set(mx28.MIN_POSITION_LIMIT, max(low, 0))
         self._set(mx28.MAX_POSITION_LIMIT, min(high, mx28.STEPS_PER_TURN - 1))
         self._set(mx28.FIRMWARE_VERSION, firmware)
-        self._set(mx28.RETURN_DELAY_TIME, 0)  # as grd wants it; a new one has 250
-        self._set(mx28.VELOCITY_LIMIT, 240)  # for 55 rpm; a new one has 230
+        self._set(mx28.RETURN_DELAY_TIME, 0)  # as grd requires; the factory setting is 250
+        self._set(mx28.VELOCITY_LIMIT, 240)  # for 55 rpm; the factory setting is 230
         self._set(mx28.BAUD_RATE, mx28.BAUD_CODES[1_000_000])
         self._start_ns, self._steps = start_ns, 0
         self._trace_rad: Array64 = np.full(KEPT_STEPS, self._servo.position_rad)
         self._output_rad: Array64 = np.full(KEPT_STEPS, self._gear_train.follow(self._servo.position_rad))
-        self._heard_ns = self._booted_ns = self._powered_ns = start_ns
+        self._last_instruction_ns = self._booted_ns = self._powered_ns = start_ns
         self._blocked_since_ns: int | None = None
-        self._overload_ns: int | None = None  # how long it may be blocked before it shuts down
+        self._overload_ns: int | None = None  # time of being blocked until it shuts down
         self.powered = True
 
-    # faults and settings, from outside
+    # faults and settings
 
     def set(self, register: Register, value: int) -> None:
-        """Write a register without asking the servo's rules: how it was set before."""
+        """Write a register without the access rules, as a configuration before the start."""
         self._set(register, value)
 
     def get(self, register: Register) -> int:
-        """A register as it stands."""
+        """Current value of a register."""
         return register.value(bytes(self._table))
 
     def block(self, now_ns: int, overload_s: float | None = None) -> None:
-        """Something holds the shaft, from now on; after overload_s of wanting to move the servo shuts down."""
+        """Block the shaft from now on; after overload_s of trying to move, the servo shuts down."""
         self.advance(now_ns)
         self._blocked_since_ns = now_ns
         self._overload_ns = None if overload_s is None else round(1e9 * overload_s)
 
     def unblock(self, now_ns: int) -> None:
-        """The shaft is free again."""
+        """Release the shaft."""
         self.advance(now_ns)
         self._blocked_since_ns = None
 
     def shut_down(self, now_ns: int, errors: int = mx28.OVERLOAD) -> None:
-        """A hardware error: torque off until a reboot, where it is one that it shuts down for."""
+        """Set hardware errors; torque stays off until a reboot if one of them is in the shutdown mask."""
         self.advance(now_ns)
         self._set(mx28.HARDWARE_ERROR_STATUS, errors)
         if errors & self.get(mx28.SHUTDOWN):
             self._set(mx28.TORQUE_ENABLE, 0)
 
     def power(self, now_ns: int, on: bool) -> None:
-        """Switch its supply; on again it boots with its RAM as from the factory."""
+        """Switch the supply; when it is on again, the servo boots with its RAM at factory settings."""
         self.advance(now_ns)
         self.powered = on
         self._boot(now_ns)
 
-    # what the host does
+    # requests of the host
 
     def baud(self) -> int:
-        """The rate at which it listens."""
+        """Its baud rate."""
         code = self.get(mx28.BAUD_RATE)
         return next(baud for baud, number in mx28.BAUD_CODES.items() if number == code)
 
-    def answer(self, instruction: Instruction, now_ns: int) -> bytes | None:
-        """What it answers to an instruction, None when it says nothing."""
+    def reply(self, instruction: Instruction, now_ns: int) -> bytes | None:
+        """The reply to an instruction; None when it sends none."""
         self.advance(now_ns)
         own = self.get(mx28.ID)
         if not self.powered or now_ns < self._booted_ns or instruction.servo_id not in (own, protocol2.BROADCAST):
             return None
-        self._heard_ns = now_ns
-        error, data = self._carry_out(instruction, now_ns)
+        self._last_instruction_ns = now_ns
+        error, data = self._execute(instruction, now_ns)
         level = self.get(mx28.STATUS_RETURN_LEVEL)
         asked_for = {protocol2.PING: 0, protocol2.READ: 1}.get(instruction.code, mx28.ALL_INSTRUCTIONS)
         if level < asked_for or (instruction.servo_id != own and instruction.code != protocol2.PING):
@@ -119,21 +119,21 @@ class SimulatedMx28:
         return protocol2.status(own, error | alert, data)
 
     def advance(self, now_ns: int) -> None:
-        """Move on until the trace covers a time: at most a step beyond it."""
+        """Simulate until the trace covers a time, at most one step beyond it."""
         while self._start_ns + STEP_NS * self._steps < now_ns:
             self._step(self._start_ns + STEP_NS * (self._steps + 1))
 
     def position_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
-        """The encoder's position before quantisation at times (n,) of the last 8 s that `advance` has covered."""
+        """The encoder's position before quantisation at times (n,): in the last 8 s and covered by `advance`."""
         return self._at(stamp_ns, self._trace_rad)
 
     def output_rad(self, stamp_ns: NDArray[np.int64]) -> Array64:
-        """Where the turntable truly stood at such times."""
+        """The true angle of the turntable at such times."""
         return self._at(stamp_ns, self._output_rad)
 
     def _at(self, stamp_ns: NDArray[np.int64], trace_rad: Array64) -> Array64:
         since_ns = stamp_ns - self._start_ns
-        oldest = max(self._steps - KEPT_STEPS + 1, 0)  # only what lies about the times is looked at: it is asked often
+        oldest = max(self._steps - KEPT_STEPS + 1, 0)  # only the steps around the times: this is called often
         first = min(max(int(since_ns.min()) // STEP_NS, oldest), self._steps)
         last = max(min(int(since_ns.max()) // STEP_NS + 1, self._steps), first)
         steps = np.arange(first, last + 1)
@@ -143,7 +143,7 @@ class SimulatedMx28:
         servo, before_rad = self._servo, self._servo.position_rad
         torque = self.powered and bool(self.get(mx28.TORQUE_ENABLE))
         if torque:
-            self._watch(now_ns)
+            self._check_watchdog(now_ns)
         else:
             servo.goal_rad = servo.position_rad
         servo.step(1e-9 * STEP_NS)
@@ -158,15 +158,18 @@ class SimulatedMx28:
         self._trace_rad[self._steps % KEPT_STEPS] = servo.position_rad
         self._output_rad[self._steps % KEPT_STEPS] = self._gear_train.follow(servo.position_rad)
 
-    def _watch(self, now_ns: int) -> None:
-        """The bus watchdog: silence for so long stops it."""
+    def _check_watchdog(self, now_ns: int) -> None:
+        """The bus watchdog stops the servo when no instruction comes for too long."""
         limit = self.get(mx28.BUS_WATCHDOG)
-        if 1 <= limit <= mx28.WATCHDOG_MOST and now_ns - self._heard_ns > limit * mx28.WATCHDOG_UNIT_MS * 1_000_000:
+        if (
+            1 <= limit <= mx28.WATCHDOG_MOST
+            and now_ns - self._last_instruction_ns > limit * mx28.WATCHDOG_UNIT_MS * 1_000_000
+        ):
             self._set(mx28.BUS_WATCHDOG, mx28.WATCHDOG_TRIPPED)
             self._servo.goal_rad = self._servo.position_rad
             self._set(mx28.GOAL_POSITION, round(self._servo.position_rad / mx28.TICK_RAD))
 
-    def _carry_out(self, instruction: Instruction, now_ns: int) -> tuple[int, bytes]:
+    def _execute(self, instruction: Instruction, now_ns: int) -> tuple[int, bytes]:
         parameters = instruction.parameters
         if instruction.code == protocol2.PING:
             return 0, bytes(self._table[0:2]) + bytes([self.get(mx28.FIRMWARE_VERSION)])
@@ -177,14 +180,14 @@ class SimulatedMx28:
             address, length = int.from_bytes(parameters[:2], "little"), int.from_bytes(parameters[2:], "little")
             if address + length > mx28.TABLE_END:
                 return mx28.DATA_LENGTH, b""
-            self._measure(now_ns)
+            self._update_measurements(now_ns)
             return 0, bytes(self._table[address : address + length])
         if instruction.code == protocol2.WRITE and len(parameters) > 2:
             return self._write(int.from_bytes(parameters[:2], "little"), parameters[2:]), b""
         return mx28.INSTRUCTION_ERROR, b""
 
     def _write(self, address: int, data: bytes) -> int:
-        """The error number of a write; nothing is written unless all of it may be."""
+        """The error number of a write; a write is done completely or not at all."""
         end = address + len(data)
         if end > mx28.TABLE_END:
             return mx28.DATA_LENGTH
@@ -205,17 +208,17 @@ class SimulatedMx28:
             return mx28.ACCESS_ERROR
         self._table[address:end] = data
         if values.keys() & {mx28.GOAL_POSITION, mx28.PROFILE_VELOCITY, mx28.TORQUE_ENABLE}:
-            self._obey()
+            self._apply_goal()
         return 0
 
-    def _obey(self) -> None:
+    def _apply_goal(self) -> None:
         if self.get(mx28.TORQUE_ENABLE):
             units = self.get(mx28.PROFILE_VELOCITY)
             speed_radps = units * mx28.VELOCITY_UNIT_RADPS if units else math.inf
             self._servo.command(self.get(mx28.GOAL_POSITION) * mx28.TICK_RAD, speed_radps)
 
-    def _measure(self, now_ns: int) -> None:
-        """Bring the registers that it measures up to date."""
+    def _update_measurements(self, now_ns: int) -> None:
+        """Update the registers that hold measurements."""
         servo = self._servo
         wants = self.get(mx28.TORQUE_ENABLE) and self._blocked_since_ns is not None
         left_rad = servo.goal_rad - servo.position_rad

@@ -1,6 +1,6 @@
-"""DYNAMIXEL Protocol 2.0 as a servo speaks it: instructions out of a stream of bytes, status packets into bytes.
+"""DYNAMIXEL Protocol 2.0 on the servo's side: instructions from a byte stream, status packets to bytes.
 
-Written from the specification and not with the SDK's code, so that the SDK is tested against it.
+Written from the specification and not from the code of the SDK, so that tests against the SDK are independent.
 
 Source: ROBOTIS e-manual, Protocol 2.0, https://emanual.robotis.com/docs/en/dxl/protocol2/ (packet, byte stuffing);
 https://emanual.robotis.com/docs/en/dxl/crc/ (CRC-16, polynomial 0x8005, initial 0, not reflected).
@@ -18,7 +18,7 @@ MOST_BYTES = 1024  # of a packet after its length field
 
 
 class Instruction(NamedTuple):
-    """One undamaged packet from the host."""
+    """One valid packet from the host."""
 
     servo_id: int
     code: int
@@ -36,7 +36,7 @@ _CRC = tuple(_crc_of_byte(byte) for byte in range(256))
 
 
 def crc16(data: bytes) -> int:
-    """The checksum over a packet from its header on."""
+    """Checksum of a packet, from its header on."""
     crc = 0
     for byte in data:
         crc = ((crc << 8) & 0xFF00) ^ _CRC[(crc >> 8) ^ byte]
@@ -44,19 +44,19 @@ def crc16(data: bytes) -> int:
 
 
 def packet(servo_id: int, code: int, body: bytes) -> bytes:
-    """A whole packet: header, id, length, code, body with byte stuffing, CRC."""
+    """A complete packet: header, id, length, code, body with byte stuffing, CRC."""
     stuffed = (bytes([code]) + body).replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
     data = HEADER + bytes([servo_id]) + (len(stuffed) + 2).to_bytes(2, "little") + stuffed
     return data + crc16(data).to_bytes(2, "little")
 
 
 def status(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
-    """A servo's answer."""
+    """A status packet: the servo's reply."""
     return packet(servo_id, STATUS, bytes([error]) + parameters)
 
 
 def take(stream: bytearray) -> Instruction | None:
-    """The next undamaged packet at the front of a stream, which is shortened; None: more bytes are needed."""
+    """Remove and return the next valid packet of a stream; None when more bytes are needed."""
     while True:
         start = stream.find(HEADER)
         del stream[: start if start >= 0 else max(len(stream) - len(HEADER) + 1, 0)]
@@ -71,7 +71,7 @@ def take(stream: bytearray) -> Instruction | None:
             return None
         whole = bytes(stream[:end])
         if crc16(whole[:-2]) != int.from_bytes(whole[-2:], "little"):
-            del stream[: len(HEADER)]  # it may have swallowed the next one
+            del stream[: len(HEADER)]  # the damaged packet may contain the next one
             continue
         del stream[:end]
         body = whole[INSTRUCTION_AT:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")

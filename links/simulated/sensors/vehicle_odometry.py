@@ -1,7 +1,7 @@
-"""The vehicle's own odometry, where it has one: T_start_vehicle with covariance, drifting, on /vehicle/odometry.
+"""The vehicle's own odometry, if it has one: T_start_vehicle with covariance, with drift, on /vehicle/odometry.
 
-The pose is that of wheels and a gyro: in the frame in which the vehicle stood when the scenario began, smooth, and
-wrong by more the farther it drove (see `drift`).
+The pose is that of wheels and a gyro, in the frame of the vehicle at the start of the scenario. It is smooth, and its
+error grows with the distance driven (see `drift`).
 
 Source: ours; recording format in recordings/README.md (/vehicle/odometry).
 """
@@ -23,7 +23,7 @@ NS = 1_000_000_000
 
 
 class WheelDriftSettings(DriftSettings):
-    """Wheels and a gyro drift less than a drone's dead reckoning."""
+    """Drift of wheels and a gyro: less than that of a drone's dead reckoning."""
 
     scale: float = Field(default=0.005, ge=-0.5, le=0.5)
     yaw_rate_deg_per_min: float = Field(default=0.5, ge=-600, le=600)
@@ -35,18 +35,18 @@ class WheelDriftSettings(DriftSettings):
 
 
 class VehicleOdometrySettings(BaseModel):
-    """How often the vehicle says where it thinks it is, and how wrong it is."""
+    """Rate, delay and drift of the vehicle's odometry."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     rate_hz: float = Field(default=50.0, ge=1, le=400)
     latency_s: float = Field(default=0.004, ge=0, le=1)
-    jitter_s: float = Field(default=0.001, ge=0, le=1)  # mean of an exponential
+    jitter_s: float = Field(default=0.001, ge=0, le=1)  # mean of an exponential distribution
     drift: WheelDriftSettings = WheelDriftSettings()
 
 
 class VehicleOdometry:
-    """Readings in order of measurement; stamps are the host's, without clock error."""
+    """Poses in order of measurement. Stamps are on the host's clock, without error."""
 
     def __init__(
         self, settings: VehicleOdometrySettings, path: Path | SuspendedPath, start_ns: int, duration_s: float, seed: int
@@ -66,7 +66,7 @@ class VehicleOdometry:
         self._sent = 0
 
     def records(self, until_ns: int) -> list[Record]:
-        """Readings measured before `until_ns` and since the call before."""
+        """Poses measured before `until_ns` that were not returned yet."""
         first, self._sent = self._sent, int(np.searchsorted(self._stamp_ns, until_ns))
         return [self._record(row) for row in range(first, self._sent)]
 

@@ -1,7 +1,10 @@
-"""Writes VLP-16 data packets: the 1206-byte UDP payload, byte for byte as the sensor sends it.
+"""Encodes VLP-16 packets as the sensor sends them: data packets of 1206 bytes, position packets of 512.
 
-Source: VLP-16 user manual 63-9243, section 9.3 (packet structure, return modes, factory bytes); table in
-links/velodyne/vlp16.py. Written from the manual with numpy's structured types, apart from the decoder it tests.
+The sensor's clock is locked to GPS.
+
+Source: VLP-16 User Manual 63-9243 Rev. E, section 9.3 (packet structure, return modes, factory bytes) and 9.3.3, tables
+9-3 and 9-4 (position packets; offsets into the payload are the manual's minus 42); table in links/velodyne/vlp16.py;
+NMEA 0183 for GPRMC and its checksum. Written from the manual, independently of the decoder under test.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from numpy.typing import NDArray
 from links.velodyne import vlp16
 
 FIRINGS_PER_BLOCK = 2
-TIMESTAMP_AT, PPS_AT, NMEA_AT = 198, 202, 206  # in a position packet's payload
+TIMESTAMP_AT, PPS_AT, NMEA_AT = 198, 202, 206  # offsets into the payload of a position packet
 LOCKED = 2  # PPS status
 RETURN_MODE_BYTE = {"strongest": vlp16.STRONGEST, "last": vlp16.LAST, "dual": vlp16.DUAL}
 
@@ -35,10 +38,10 @@ def encode_packet(
     reflectivity: NDArray[np.uint8],
     mode: str,
 ) -> bytes:
-    """One packet from a row of firing sequences.
+    """One data packet from a row of firing sequences.
 
-    first_pulse_ns: UTC of the first pulse; the packet carries its microsecond past the hour, rounded down.
-    azimuth_rad (blocks,): rotor angle at the first pulse of each block, 12 of them, or 6 in dual mode.
+    first_pulse_ns: UTC of the first pulse; the packet holds its microsecond past the hour, rounded down.
+    azimuth_rad (blocks,): rotor angle at the first pulse of each block, 12 blocks, or 6 in dual mode.
     range_m, reflectivity (returns, firings, 16): 0 m is no return. Dual mode has returns = 2: strongest (or second
     strongest), then last; they go into odd and even blocks.
     """
@@ -64,7 +67,7 @@ def encode_packet(
 
 
 def encode_position(at_ns: int) -> bytes:
-    """What the sensor sends at a UTC [ns since 1970]: its microsecond past the hour, PPS locked, the second's GPRMC."""
+    """The position packet of a UTC [ns since 1970]: microsecond past the hour, PPS locked, GPRMC of the second."""
     second = datetime.datetime.fromtimestamp(at_ns // 1_000_000_000, datetime.UTC)
     body = f"GPRMC,{second:%H%M%S},A,3542.1234,N,13946.1234,E,000.0,000.0,{second:%d%m%y},,,A"
     parity = 0

@@ -1,7 +1,7 @@
-"""The drone as a mesh with open arms: a body, arms, motors, spinning blades and legs; air in between.
+"""Meshes of drones: body, arms, motors, rotor blades and legs, with gaps that a beam passes through.
 
-Source: ours. `x4` after the proportions of a 0.5 m class quadrotor; `folding` after a 0.35 m class camera drone with a
-full, long body; `hexa` after a 0.8 m class carrier with six arms, tall legs and a load. Any model may have any span.
+Source: ours. `x4` has the proportions of a 0.5 m class quadrotor; `folding` those of a 0.35 m class camera drone with a
+long, closed body; `hexa` those of a 0.8 m class hexarotor with tall legs and a payload. Any shape may have any span.
 Frame: drone (x forward, y left, z up).
 """
 
@@ -17,21 +17,21 @@ from links.simulated.world.mesh import Mesh, box, merge, quads, rod
 BLADES = 2  # per rotor
 Shape = Literal["x4", "folding", "hexa"]
 Surface = Literal["carbon", "dark_shell", "grey_shell", "light_shell"]
-SPAN_M: dict[Shape, float] = {"x4": 0.5, "folding": 0.35, "hexa": 0.8}  # the models' own
+SPAN_M: dict[Shape, float] = {"x4": 0.5, "folding": 0.35, "hexa": 0.8}  # nominal span of each shape
 
 
 class DroneModel(BaseModel):
-    """What the drone looks like. Its span is set apart (`drone.span_m`); `SPAN_M` are the models' own."""
+    """Shape and surface of the drone. Its span is a separate setting, `drone.span_m`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     shape: Shape = "x4"
-    # at 903 nm: 0.12, 0.06, 0.20, 0.60; the LiDAR loses half of the hits near 40, 30, 45, 80 m
+    # reflectivity at 903 nm: 0.12, 0.06, 0.20, 0.60; the LiDAR loses half of the hits near 40, 30, 45, 80 m
     surface: Surface = "carbon"
 
 
 def drone_mesh(span_m: float, rotor_rad: float = 0.0, model: DroneModel | None = None) -> Mesh:
-    """The drone, `span_m` from blade tip to blade tip across; its blades stand at `rotor_rad`."""
+    """The drone, `span_m` across from blade tip to blade tip, with its blades at `rotor_rad`."""
     model = model or DroneModel()
     return {"x4": _x4, "folding": _folding, "hexa": _hexa}[model.shape](span_m, rotor_rad, model.surface)
 
@@ -62,7 +62,7 @@ def _folding(span_m: float, rotor_rad: float, surface: str) -> Mesh:
     parts = [
         _box(size, (-0.095, -0.042, -0.03), (0.09, 0.042, 0.03), surface),
         _box(size, (0.09, -0.022, -0.028), (0.125, 0.022, 0.012), surface),  # gimbal and camera
-        _box(size, (-0.08, -0.03, 0.03), (0.02, 0.03, 0.042), surface),  # battery's back
+        _box(size, (-0.08, -0.03, 0.03), (0.02, 0.03, 0.042), surface),  # top of the battery
     ]
     up = np.array([0.0, 0.0, size])
     for index, angle in enumerate(np.radians([48.0, 132.0, 228.0, 312.0])):
@@ -104,7 +104,7 @@ def _box(size: float, low_m: tuple[float, float, float], high_m: tuple[float, fl
 
 
 def _plate(radius_m: float, z_m: float, surface: str) -> Mesh:
-    """An octagon as four quads from its middle."""
+    """An octagon as four quads around its centre."""
     turn = 2 * np.pi * np.arange(9) / 8
     rim = np.column_stack([radius_m * np.cos(turn), radius_m * np.sin(turn), np.full(9, z_m)])
     middle = np.array([0.0, 0.0, z_m])
@@ -112,7 +112,7 @@ def _plate(radius_m: float, z_m: float, surface: str) -> Mesh:
 
 
 def _blades(hub_m: np.ndarray, length_m: float, angle_rad: float) -> Mesh:
-    """Two blades, pitched 12 deg and a fifth as wide as long: a rotor is mostly air."""
+    """Two blades, pitched 12 deg, a fifth as wide as long: a beam passes through most of a rotor."""
     along = np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]) * length_m
     across = np.array([-np.sin(angle_rad), np.cos(angle_rad), 0.0]) * 0.1 * length_m
     across[2] = 0.1 * length_m * np.tan(np.radians(12.0))

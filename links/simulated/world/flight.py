@@ -1,15 +1,16 @@
-"""A multirotor that flies a path by leaning: its attitude follows late, with limited rates, and the wind pushes it.
+"""Flight dynamics of a multirotor: it tilts to accelerate, with limited rates and lag, and the wind pushes it.
 
-The path is what the autopilot is asked to fly. What it does fly comes out of the dynamics, 400 steps a second:
+The path is the reference. The flown motion follows from the dynamics, at 400 Hz:
 
     acceleration = R_world_drone [0, 0, thrust] - DRAG (v - wind) - g
-    asked for:     path acceleration + Kp (p_path - p) + Kd (v_path - v) + Ki integral + DRAG v_path + g
-    attitude       turns the body's z towards it: turn rates proportional to the error, limited, and followed late
+    desired        path acceleration + Kp (p_path - p) + Kd (v_path - v) + Ki integral + DRAG v_path + g
+    attitude       rotates body z towards the desired direction: turn rates proportional to the error, limited, lagged
 
-so position, velocity, attitude, turn rate and what an accelerometer feels belong together. The wind is a mean and a
+Position, velocity, attitude, turn rate and specific force are therefore consistent. The wind is a mean plus a
 first-order Gauss-Markov gust per axis.
 
-Source: ours; the cascade is that of ArduPilot's and PX4's position and attitude controllers, gains for a 0.5 m drone.
+Source: ours. The cascade is that of the position and attitude controllers of ArduPilot and PX4, with gains for a
+0.5 m drone.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from links.simulated.world.motion import gauss_markov, interpolate
 from links.simulated.world.path import Path
 from stages.geometry import Array64, quaternions_xyzw, rotations_from_xyzw
 
-BEYOND_S = 1.0  # the flight goes on this long after the scenario: sensors look a little ahead
-SETTLED_S = 60.0  # after so long a flight that goes round flies each round like the one before
+BEYOND_S = 1.0  # the flight continues this long after the scenario: sensors sample ahead of it
+SETTLED_S = 60.0  # after this long, all laps of a closed path are flown alike
 
 
 class FlightSettings(BaseModel):
@@ -38,29 +39,29 @@ class FlightSettings(BaseModel):
     thrust_lag_s: float = Field(default=0.04, gt=STEP_S, le=1)
     tilt_limit_deg: float = Field(default=40.0, gt=0, le=80)
     wind_world_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    gust_mps: float = Field(default=0.5, ge=0, le=20)  # one sigma, each horizontal axis; half of it vertically
+    gust_mps: float = Field(default=0.5, ge=0, le=20)  # one sigma per horizontal axis, half of it vertically
     gust_time_s: float = Field(default=1.5, gt=0.05, le=60)
 
 
 class Flight:
-    """A flown path. Times outside the flight take its first or last state; one that goes round has no outside.
+    """A flown path. Times outside the flight take its first or last state; a closed path repeats for ever.
 
-    It goes round in the same gusts, so that one round's images are the next one's.
+    On a closed path the gusts repeat too, so that all laps have the same images.
     """
 
     def __init__(self, path: Path, settings: FlightSettings, duration_s: float, seed: int) -> None:
         self.path = path
         if path.period_s is None:
             steps = int(np.ceil((duration_s + BEYOND_S) / STEP_S)) + 1
-            round_steps = steps
+            lap_steps = steps
         else:
-            round_steps = round(path.period_s / STEP_S)
-            steps = (int(np.ceil(SETTLED_S / path.period_s)) + 1) * round_steps + 1
+            lap_steps = round(path.period_s / STEP_S)
+            steps = (int(np.ceil(SETTLED_S / path.period_s)) + 1) * lap_steps + 1
         time_s: Array64 = np.arange(steps, dtype=np.float64) * STEP_S
         position, velocity, acceleration, yaw = (np.ascontiguousarray(part) for part in path.at(time_s))
         mean_wind = np.array(settings.wind_world_mps)
-        wind = mean_wind + _gusts(settings, steps, round_steps, np.random.default_rng([seed, 30]))
-        headings = np.column_stack([yaw, np.gradient(yaw, STEP_S)])
+        wind = mean_wind + _gusts(settings, steps, lap_steps, np.random.default_rng([seed, 30]))
+        yaw_and_rate = np.column_stack([yaw, np.gradient(yaw, STEP_S)])
         start = quaternions_xyzw(path.flying_poses(np.zeros(1))[0])[0]
         limits = np.array(
             [
@@ -72,35 +73,35 @@ class Flight:
                 np.tan(np.radians(settings.tilt_limit_deg)),
             ]
         )
-        state = fly(position, velocity, acceleration, headings, wind, mean_wind, start, limits)
+        state = fly(position, velocity, acceleration, yaw_and_rate, wind, mean_wind, start, limits)
         if path.period_s is not None:
-            state = state[-round_steps - 1 :]
+            state = state[-lap_steps - 1 :]
         self._p, self._v, self._q, self._w, self._f = np.split(state, [3, 6, 10, 13], axis=1)
 
     def at(self, time_s: Array64) -> tuple[Array64, Array64, Array64, Array64]:
-        """Position, velocity, acceleration (n, 3), world, and yaw (n,) [rad] in [-pi, pi], as `Path.at` gives them."""
+        """Position, velocity, acceleration (n, 3), world, and yaw (n,) [rad] in [-pi, pi], as `Path.at` returns."""
         rotations, position = self.flying_poses(time_s)
-        felt = self._mix(self._f, time_s)
-        acceleration = np.einsum("nij,nj->ni", rotations, felt) - [0.0, 0.0, GRAVITY_MPS2]
+        force = self._interpolate(self._f, time_s)
+        acceleration = np.einsum("nij,nj->ni", rotations, force) - [0.0, 0.0, GRAVITY_MPS2]
         yaw = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
-        return position, self._mix(self._v, time_s), acceleration, yaw
+        return position, self._interpolate(self._v, time_s), acceleration, yaw
 
     def flying_poses(self, time_s: Array64) -> tuple[Array64, Array64]:
         """T_world_drone: rotations (n, 3, 3) and positions (n, 3) [m]."""
-        q = self._mix(self._q, time_s)
-        return rotations_from_xyzw(q), self._mix(self._p, time_s)
+        q = self._interpolate(self._q, time_s)
+        return rotations_from_xyzw(q), self._interpolate(self._p, time_s)
 
     def imu(self, time_s: Array64) -> tuple[Array64, Array64]:
-        """What the drone's own IMU feels, drone axes: turn rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2]."""
-        return self._mix(self._w, time_s), self._mix(self._f, time_s)
+        """Ideal IMU of the drone, drone axes: turn rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2]."""
+        return self._interpolate(self._w, time_s), self._interpolate(self._f, time_s)
 
-    def _mix(self, rows: Array64, time_s: Array64) -> Array64:
-        in_round_s = time_s if self.path.period_s is None else np.mod(time_s, self.path.period_s)
-        return interpolate(rows, STEP_S, in_round_s)  # 2.5 ms bend less than 0.1 mm and 0.01 deg
+    def _interpolate(self, rows: Array64, time_s: Array64) -> Array64:
+        in_lap_s = time_s if self.path.period_s is None else np.mod(time_s, self.path.period_s)
+        return interpolate(rows, STEP_S, in_lap_s)  # within 2.5 ms the error is below 0.1 mm and 0.01 deg
 
 
-def _gusts(settings: FlightSettings, steps: int, round_steps: int, rng: np.random.Generator) -> Array64:
-    """(steps, 3) [m/s], world; what drives them comes again after `round_steps`."""
+def _gusts(settings: FlightSettings, steps: int, lap_steps: int, rng: np.random.Generator) -> Array64:
+    """Gusts (steps, 3) [m/s], world frame; their white noise repeats after `lap_steps`."""
     sigma = settings.gust_mps * np.array([1.0, 1.0, 0.5])
-    white = np.resize(rng.standard_normal((round_steps, 3)), (steps, 3))
+    white = np.resize(rng.standard_normal((lap_steps, 3)), (steps, 3))
     return gauss_markov(white, sigma, settings.gust_time_s, STEP_S)

@@ -1,4 +1,4 @@
-"""Triangle meshes with a surface per triangle, and rays against them.
+"""Triangle meshes with a surface material per triangle, and ray casting against them.
 
 Source: ours; reflectivities at 903 nm are typical values of published spectral libraries (USGS, ECOSTRESS), rounded.
 """
@@ -21,7 +21,7 @@ try:
 except ImportError as error:
     raise LinkError("the simulator needs embreex: pip install -e '.[simulate]'") from error
 
-SURFACES: dict[str, tuple[float, float]] = {  # name: (diffuse reflectivity, mirror-like part)
+SURFACES: dict[str, tuple[float, float]] = {  # name: (diffuse reflectivity, specular part)
     "asphalt": (0.16, 0.0),
     "paving": (0.30, 0.0),
     "kerb": (0.35, 0.0),
@@ -46,7 +46,7 @@ SURFACES: dict[str, tuple[float, float]] = {  # name: (diffuse reflectivity, mir
     "grey_shell": (0.20, 0.05),
     "light_shell": (0.60, 0.10),
 }
-WET_DIFFUSE = 0.45  # a porous surface that is wet all over keeps this much of its diffuse reflectivity
+WET_DIFFUSE = 0.45  # fraction of its diffuse reflectivity that a fully wet, porous surface keeps
 POROUS = ("asphalt", "paving", "kerb", "brick", "plaster", "concrete", "roof", "bark", "grass", "marking")
 _ROW = {name: row for row, name in enumerate(SURFACES)}
 _DIFFUSE, _GLOSS = np.array(list(SURFACES.values()), dtype=np.float32).T
@@ -56,34 +56,34 @@ SURFACE_NAMES = tuple(SURFACES)
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles in metres; `surface` is the row of SURFACES of each face."""
+    """Triangles in metres; `surface` is the row of SURFACES per face."""
 
     vertices_m: Array64  # (v, 3)
     faces: NDArray[np.int32]  # (f, 3)
     surface: NDArray[np.uint8]  # (f,)
 
     def moved(self, xyz_m: ArrayLike = (0.0, 0.0, 0.0), rotation: Array64 | None = None) -> Mesh:
-        """The mesh turned by `rotation` (3, 3), then shifted."""
+        """The mesh rotated by `rotation` (3, 3), then translated."""
         turned = self.vertices_m if rotation is None else self.vertices_m @ rotation.T
         return Mesh(turned + np.asarray(xyz_m, dtype=np.float64), self.faces, self.surface)
 
     def normals(self) -> Array64:
-        """Unit normal of each face (f, 3); which side is out is not known."""
+        """Unit normal per face (f, 3). Its sign is arbitrary."""
         a, b, c = (self.vertices_m[self.faces[:, i]] for i in range(3))
         n = np.cross(b - a, c - a)
         return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-20)
 
     def only(self, faces: NDArray[np.bool_]) -> Mesh:
-        """The mesh of some of the faces (f,)."""
+        """The mesh of the selected faces (f,)."""
         return Mesh(self.vertices_m, self.faces[faces], self.surface[faces])
 
     def is_surface(self, *names: str) -> NDArray[np.bool_]:
-        """Which faces (f,) are of these surfaces."""
+        """Mask (f,) of the faces with one of these surfaces."""
         return np.isin(self.surface, [_ROW[name] for name in names])
 
 
 def merge(meshes: Iterable[Mesh]) -> Mesh:
-    """All meshes as one."""
+    """All meshes as one mesh."""
     parts = list(meshes)
     first = np.cumsum([0] + [len(part.vertices_m) for part in parts[:-1]])
     return Mesh(
@@ -94,7 +94,7 @@ def merge(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def quads(corners_m: ArrayLike, surface: str) -> Mesh:
-    """Plane quadrilaterals (q, 4, 3), corners in order around each."""
+    """Plane quadrilaterals (q, 4, 3), the corners of each in order around it."""
     corners = np.asarray(corners_m, dtype=np.float64).reshape(-1, 4, 3)
     start = 4 * np.arange(len(corners), dtype=np.int32)[:, None, None]
     faces = (start + np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)).reshape(-1, 3)
@@ -102,7 +102,7 @@ def quads(corners_m: ArrayLike, surface: str) -> Mesh:
 
 
 def box(low_m: ArrayLike, high_m: ArrayLike, surface: str, taper: float = 0.0) -> Mesh:
-    """An upright box between two corners; `taper` shrinks its top by that fraction in x and y."""
+    """A box between two corners, axes aligned; `taper` shrinks its top by that fraction in x and y."""
     low, high = np.asarray(low_m, dtype=np.float64), np.asarray(high_m, dtype=np.float64)
     middle = (low + high) / 2
     unit = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=np.float64)
@@ -124,10 +124,10 @@ def rod(start_m: ArrayLike, end_m: ArrayLike, radius_m: float, surface: str, sid
 
 
 class RayScene:
-    """A mesh that rays can be cast against (embree, single precision)."""
+    """A mesh prepared for ray casting (Embree, single precision)."""
 
     def __init__(self, mesh: Mesh, wetness: float = 0.0) -> None:
-        """`wetness` 0 to 1 darkens porous surfaces, as rain does."""
+        """`wetness`, 0 to 1, darkens porous surfaces, as rain does."""
         self._scene = EmbreeScene()
         self._mesh = TriangleMesh(self._scene, mesh.vertices_m.astype(np.float32), mesh.faces.astype(np.int32))
         darker = np.where(_POROUS, 1 - wetness * (1 - WET_DIFFUSE), 1.0).astype(np.float32)
@@ -138,8 +138,8 @@ class RayScene:
     def cast(self, origins: Array32, directions: Array32, max_range_m: float | Array32) -> tuple[Array32, Array32]:
         """First hit of rays (n, 3) with unit directions: range (n,) [m] (inf: none) and returned fraction (n,).
 
-        Rays end at one range or each at its own (n,). The fraction is what comes back towards the ray's origin:
-        diffuse cos(a) + gloss cos(a)^60 at incidence a.
+        The maximum range is common to all rays or one per ray (n,). The returned fraction is reflected back to the
+        origin of the ray: diffuse cos(a) + gloss cos(a)^60 at incidence angle a.
         """
         limit = np.broadcast_to(np.asarray(max_range_m, dtype=np.float32), len(origins)).copy()
         hit = self._scene.run(origins, directions, dists=limit, output=True)
@@ -154,6 +154,6 @@ class RayScene:
         return hit["tfar"], hit["primID"], hit["u"], hit["v"]
 
     def blocked(self, origins: Array32, directions: Array32, max_range_m: float) -> NDArray[np.bool_]:
-        """Whether rays (n, 3) meet anything at all."""
+        """Mask (n,) of the rays (n, 3) that hit anything."""
         limit = np.full(len(origins), max_range_m, dtype=np.float32)
         return self._scene.run(origins, directions, dists=limit, query="OCCLUDED") != -1

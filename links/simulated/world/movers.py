@@ -1,8 +1,9 @@
-"""What moves through the scene besides vehicle and drone: cars, birds that flap, a balloon on its string.
+"""Moving objects other than vehicle and drones: cars, birds that beat their wings, a balloon on its string.
+
+A mover is cast in its own frame, with its pose at the time of each ray, as vehicle and drones are. All paths are
+closed, so that a mover stays near however long a scenario lasts. Movers do not avoid each other or the drone.
 
 Source: ours; speeds of birds: Alerstam et al., PLoS Biology 5 (2007) e197 (crows and gulls: 9 to 14 m/s in still air).
-A mover is cast in its own frame with the rays of each moment, as vehicle and drone are. All paths are closed, so that
-a mover stays near however long a scenario lasts. Movers pass through each other; they do not know the drone.
 """
 
 from __future__ import annotations
@@ -26,22 +27,22 @@ class Mover(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is: vehicle, drone, car, bird, balloon."""
+        """Kind of object: car, bird, balloon."""
         ...
 
     @property
     def meshes(self) -> tuple[Mesh, ...]:
-        """Its shapes, in its own frame; one for a stiff body."""
+        """Its shapes, in its own frame; one for a rigid body."""
         ...
 
     @property
     def speed_mps(self) -> float:
-        """No point of its path is passed faster than this."""
+        """Upper bound of its speed."""
         ...
 
     @property
     def small(self) -> bool:
-        """Whether a LiDAR pulse that passes near must be looked at finely."""
+        """Whether pulses that pass near it are cast with the fine pattern."""
         ...
 
     def poses(self, time_s: Array64) -> tuple[Array64, Array64]:
@@ -49,13 +50,13 @@ class Mover(Protocol):
         ...
 
     def shape(self, time_s: Array64) -> NDArray[np.int64]:
-        """Which of `meshes` it has at times (n,)."""
+        """Index into `meshes` at times (n,)."""
         ...
 
 
 @dataclass(frozen=True)
 class Car:
-    """Drives along a straight line at constant speed, and starts again from its beginning."""
+    """Drives along a straight line at constant speed and restarts at its beginning."""
 
     mesh: Mesh
     start_m: Array64  # (3,) world
@@ -82,15 +83,15 @@ class Car:
 
 @dataclass(frozen=True)
 class Bird:
-    """Flies round an ellipse that rises and falls, banked a little, beating its wings."""
+    """Flies around an ellipse while it rises and falls, slightly banked, beating its wings."""
 
     span_m: float
     centre_m: Array64  # (3,) world
-    radii_m: Array64  # (3,): along, across, up and down
-    heading_rad: float  # of the ellipse's long side
-    turn_s: float  # once round
+    radii_m: Array64  # (3,): along, across, vertical
+    heading_rad: float  # of the major axis
+    lap_s: float
     beat_hz: float
-    phase: float  # 0..1
+    phase: float  # 0 to 1
     name: str = "bird"
     small: bool = True
 
@@ -101,21 +102,21 @@ class Bird:
     @property
     def speed_mps(self) -> float:
         along, across, up = self.radii_m
-        return float(2 * np.pi / self.turn_s * np.hypot(max(along, across), 2 * up))
+        return float(2 * np.pi / self.lap_s * np.hypot(max(along, across), 2 * up))
 
     def poses(self, time_s: Array64) -> tuple[Array64, Array64]:
-        angle = 2 * np.pi * (time_s / self.turn_s + self.phase)
-        place = np.column_stack([np.cos(angle), np.sin(angle), np.sin(2 * angle)]) * self.radii_m
-        flown = np.column_stack([-np.sin(angle), np.cos(angle)]) * self.radii_m[:2]
+        angle = 2 * np.pi * (time_s / self.lap_s + self.phase)
+        position = np.column_stack([np.cos(angle), np.sin(angle), np.sin(2 * angle)]) * self.radii_m
+        tangent = np.column_stack([-np.sin(angle), np.cos(angle)]) * self.radii_m[:2]
         turn = rotations_z(np.full(1, self.heading_rad))[0]
-        yaw = np.arctan2(flown[:, 1], flown[:, 0]) + self.heading_rad
-        return rotations_z(yaw) @ _BANK, place @ turn.T + self.centre_m
+        yaw = np.arctan2(tangent[:, 1], tangent[:, 0]) + self.heading_rad
+        return rotations_z(yaw) @ _BANK, position @ turn.T + self.centre_m
 
     def shape(self, time_s: Array64) -> NDArray[np.int64]:
         return np.floor(np.mod(time_s * self.beat_hz + self.phase, 1.0) * FLAP_STEPS).astype(np.int64)
 
 
-_BANK = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(0.3), np.sin(0.3)], [0.0, -np.sin(0.3), np.cos(0.3)]])  # into the turn
+_BANK = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(0.3), np.sin(0.3)], [0.0, -np.sin(0.3), np.cos(0.3)]])  # inwards
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ class Balloon:
     """Sways on its string in the wind."""
 
     diameter_m: float
-    anchor_m: Array64  # (3,) world: where it hangs on average
+    anchor_m: Array64  # (3,) world: its mean position
     sway_m: float
     period_s: float
     phase: float
@@ -148,7 +149,7 @@ class Balloon:
 
 
 def bird_mesh(span_m: float, beat_rad: float) -> Mesh:
-    """Body, tail and two wings, raised by 35 deg * cos(beat) with hands that lag behind."""
+    """Body, tail and two wings, raised by 35 deg * cos(beat); the outer wings lag behind."""
     b = 0.5 * span_m
     raised, lag = 0.6 * np.cos(beat_rad), 0.6 * np.cos(beat_rad - 0.9)
     parts = [
@@ -167,7 +168,7 @@ def bird_mesh(span_m: float, beat_rad: float) -> Mesh:
 
 
 def balloon_mesh(diameter_m: float) -> Mesh:
-    """A pear of 8 rings of 12 quads, its centre at the origin, and half a metre of string."""
+    """A pear of 8 rings of 12 quads, centred on the origin, with half a metre of string."""
     up = np.linspace(-1, 1, 9)
     radius = np.sqrt(np.maximum(1 - up**2, 0)) * (1 - 0.12 * (1 - up) / 2)
     turn = np.linspace(0, 2 * np.pi, 13)
@@ -182,17 +183,17 @@ def balloon_mesh(diameter_m: float) -> Mesh:
 def draw_bird(
     rng: Generator, low_m: float, high_m: float, along_m: float, across_m: float, R_world_scene: Array64
 ) -> Bird:
-    """A bird about the vehicle's start, small to gull-sized, 7 to 12 m/s; the box lies along the road, half sizes."""
+    """A bird near the vehicle's start, of small to gull size, 7 to 12 m/s, in a box along the road (half sizes)."""
     radii = np.array([rng.uniform(0.4, 1.0) * along_m, rng.uniform(0.3, 0.8) * across_m, rng.uniform(0.2, 1.2)])
     height = rng.uniform(low_m, high_m)
     drift = (along_m - radii[0]) * rng.uniform(-1, 1)
-    round_m = 2 * np.pi * np.sqrt((radii[0] ** 2 + radii[1] ** 2) / 2)
+    lap_m = 2 * np.pi * np.sqrt((radii[0] ** 2 + radii[1] ** 2) / 2)
     return Bird(
         span_m=rng.uniform(0.3, 1.1),
         centre_m=R_world_scene @ np.array([drift, 0.2 * across_m * rng.uniform(-1, 1), height]),
         radii_m=radii,
         heading_rad=float(np.arctan2(R_world_scene[1, 0], R_world_scene[0, 0])),
-        turn_s=round_m / rng.uniform(7, 12),
+        lap_s=lap_m / rng.uniform(7, 12),
         beat_hz=rng.uniform(3.0, 6.0),
         phase=rng.uniform(),
     )
@@ -201,11 +202,11 @@ def draw_bird(
 def draw_balloon(
     rng: Generator, low_m: float, high_m: float, along_m: float, across_m: float, R_world_scene: Array64
 ) -> Balloon:
-    """A party balloon somewhere in a box along the road (half sizes)."""
-    place = np.array([rng.uniform(-1, 1) * along_m, rng.uniform(-1, 1) * across_m, rng.uniform(low_m, high_m)])
+    """A party balloon in a box along the road (half sizes)."""
+    position = np.array([rng.uniform(-1, 1) * along_m, rng.uniform(-1, 1) * across_m, rng.uniform(low_m, high_m)])
     return Balloon(
         diameter_m=rng.uniform(0.28, 0.6),
-        anchor_m=R_world_scene @ place,
+        anchor_m=R_world_scene @ position,
         sway_m=rng.uniform(0.2, 0.8),
         period_s=rng.uniform(3, 7),
         phase=rng.uniform(),

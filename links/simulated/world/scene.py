@@ -1,7 +1,9 @@
-"""Everything rays can meet: the fixed world, the moving vehicle's body, the flying drone and other movers.
+"""Everything a ray can hit: the static world, the body of the moving vehicle, the drones and other movers.
 
-Source: ours. A moving body is cast in its own frame with the rays of each moment, so it moves within a revolution.
-Only rays that meet its bounding box are, so a body costs by the rays near it, however many rays there are.
+A moving body is cast in its own frame, with its pose at the time of each ray, so it moves within a revolution. Only
+rays that meet its bounding box are cast, so the cost of a body grows with the rays near it, not with all rays.
+
+Source: ours.
 """
 
 from __future__ import annotations
@@ -24,19 +26,19 @@ from links.simulated.world.suspension import SuspendedPath
 from stages.geometry import Array64
 
 ROTOR_HZ = 95.0
-ROTOR_STEPS = 8  # standing positions of the blades within half a turn
-TOP_SPEED_MPS = 50.0  # neither drone nor vehicle is faster
+ROTOR_STEPS = 8  # blade positions within half a turn
+TOP_SPEED_MPS = 50.0  # upper bound for drones and vehicle
 BOX_MARGIN_M = 0.01
-BEAM_START_M = 0.01  # and where it leaves the sensor
+BEAM_START_M = 0.01  # half width of a beam where it leaves the sensor
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Where vehicle and drones are at any moment; `drone` is None in an empty sky."""
+    """Poses of vehicle and drones at any time; `drone` is None in an empty sky."""
 
     start_ns: int
-    vehicle: Path | SuspendedPath  # a path is driven level, a ride on springs
-    drone: Path | Flight | None  # a path is flown exactly, a flight with its own dynamics
+    vehicle: Path | SuspendedPath  # a path stays level, a suspended path pitches and rolls
+    drone: Path | Flight | None  # a path is followed exactly, a flight obeys its own dynamics
     others: tuple[Path, ...] = ()  # drones 2, 3, ...
 
     def seconds(self, stamp_ns: NDArray[np.int64]) -> Array64:
@@ -53,7 +55,7 @@ class Truth:
         return range(1, 1 if self.drone is None else 2 + len(self.others))
 
     def T_world_drone(self, stamp_ns: NDArray[np.int64], number: int = 1) -> tuple[Array64, Array64]:
-        """Rotations (n, 3, 3) and positions (n, 3) [m]; a LookupError when there is no such drone."""
+        """Rotations (n, 3, 3) and positions (n, 3) [m]. LookupError when there is no such drone."""
         flown = (self.drone, *self.others)[number - 1] if number in self.drones else None
         if flown is None:
             raise LookupError(f"this scenario has no drone {number}")
@@ -62,30 +64,30 @@ class Truth:
 
 @dataclass(frozen=True)
 class Body:
-    """Something that moves: its shapes, and where it is when."""
+    """Something that moves: its shapes and its pose over time."""
 
     name: str  # vehicle, drone, drone_2, car, bird, balloon
-    meshes: tuple[Mesh, ...]  # in its own frame
+    meshes: tuple[Mesh, ...]  # in the frame of the body
     pose: Callable[[NDArray[np.int64]], tuple[Array64, Array64]]  # T_world_body at times (n,) [ns]
-    shape: Callable[[NDArray[np.int64]], NDArray[np.int64]] | None  # which mesh it has at times (n,); None: the first
-    speed_mps: float  # never faster
-    small: bool  # a pulse that passes near is looked at finely
+    shape: Callable[[NDArray[np.int64]], NDArray[np.int64]] | None  # index of its mesh at times (n,); None: always 0
+    speed_mps: float  # upper bound
+    small: bool  # pulses that pass near it are cast with the fine pattern
     wetness: float = 0.0
-    drone: int = 0  # which drone it is, from 1; 0: none
+    drone: int = 0  # number of the drone, from 1; 0: not a drone
 
     @cached_property
     def scenes(self) -> tuple[RayScene, ...]:
-        """The shapes, ready for rays."""
+        """The shapes, prepared for ray casting."""
         return tuple(RayScene(mesh, self.wetness) for mesh in self.meshes)
 
     @cached_property
     def radius_m(self) -> float:
-        """All shapes lie this near the body's origin."""
+        """Radius around the origin of the body that contains all shapes."""
         return max(scene.radius_m for scene in self.scenes)
 
     @cached_property
     def box_m(self) -> tuple[Array64, Array64]:
-        """Lowest and highest corner of all shapes."""
+        """Lower and upper corner of the bounding box of all shapes, with a margin."""
         low = np.min([mesh.vertices_m.min(axis=0) for mesh in self.meshes], axis=0)
         high = np.max([mesh.vertices_m.max(axis=0) for mesh in self.meshes], axis=0)
         return low - BOX_MARGIN_M, high + BOX_MARGIN_M
@@ -93,9 +95,9 @@ class Body:
     def near(
         self, pulse_ns: NDArray[np.int64], origins_m: Array32, directions: Array32
     ) -> tuple[NDArray[np.intp], Array64, Array64]:
-        """Pulses (of n, axes (n, 3)) that may light some of the body, and its poses then (m, 3, 3), (m, 3).
+        """Pulses (of n, axes (n, 3)) that may hit the body, and its poses at their times (m, 3, 3), (m, 3).
 
-        Which pulses these are does not depend on how they are batched.
+        The result does not depend on how the pulses are batched.
         """
         middle = pulse_ns[len(pulse_ns) // 2 : len(pulse_ns) // 2 + 1]
         away_s = 1e-9 * max(int(pulse_ns.max() - middle[0]), int(middle[0] - pulse_ns.min()))
@@ -111,7 +113,7 @@ class Body:
 
 
 class Scene:
-    """The surroundings a simulated sensor looks into. `world` and `bodies` are for sensors with rays of their own."""
+    """The environment of the simulated sensors. `world` and `bodies` are for sensors that cast rays of their own."""
 
     def __init__(
         self,
@@ -123,7 +125,7 @@ class Scene:
         wetness: float = 0.0,
         others: Sequence[tuple[Mesh, ...]] = (),
     ) -> None:
-        """`drone` and `others` are the meshes of `drone_shapes` for drones 1 and 2, 3, ...; none in an empty sky."""
+        """`drone` and `others` are the meshes of `drone_shapes` for drones 1, 2, 3, ...; empty in an empty sky."""
         self.world_mesh = world
         self.world = RayScene(world, wetness)
         self._truth = truth
@@ -174,7 +176,7 @@ class Scene:
                     found = scene.cast(origins[of_shape], directions[of_shape], max_range_m)
                     nearer = keep_nearer(target, *found, ranges, fractions)
                     drone[nearer] = body.drone
-        limit = np.minimum(ranges, np.float32(max_range_m))  # embree is quick about rays that end near
+        limit = np.minimum(ranges, np.float32(max_range_m))  # Embree is faster on short rays
         drone[keep_nearer(None, *self.world.cast(flat_o, flat_d, limit), ranges, fractions)] = 0
         return ranges.reshape(-1, rays), fractions.reshape(-1, rays), drone.reshape(-1, rays)
 
@@ -190,6 +192,6 @@ class Scene:
 
 
 def drone_shapes(span_m: float, model: DroneModel) -> tuple[Mesh, ...]:
-    """The drone with its blades in each of their standing positions."""
+    """The drone with its blades in each of their positions."""
     steps = np.arange(ROTOR_STEPS) * 2 * np.pi / BLADES / ROTOR_STEPS
     return tuple(drone_mesh(span_m, float(step), model) for step in steps)

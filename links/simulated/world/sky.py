@@ -1,7 +1,7 @@
-"""The sky and the light it gives, from the weather: sun, gradient, clouds, haze.
+"""Light of a scene from its weather: sun, sky gradient, clouds, haze.
 
-Source: ours. Radiances are relative: 1 is a white, matt surface in full sun. Haze dims and veils by the weather's own
-extinction at 550 nm.
+Source: ours. Radiances are relative: 1 is a white, matt surface in full sun. Haze attenuates and adds light with the
+extinction of the weather at 550 nm.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from links.simulated.world.weather import Weather
 from stages.geometry import Array64
 
 WAVELENGTH_NM = 550.0
-DAWN_DEG = (-8.0, 12.0)  # sun elevations between which daylight grows from near nothing to full
+DAWN_DEG = (-8.0, 12.0)  # sun elevations between which daylight grows from almost none to full
 
 
 @dataclass(frozen=True)
 class Light:
-    """What lights the scene."""
+    """Light sources of the scene."""
 
     sun_direction: Array64  # (3,) unit, world, towards the sun
     sun_rgb: Array64  # on a surface that faces it
-    above_rgb: Array64  # ambient on a surface that looks up
-    below_rgb: Array64  # ambient on a surface that looks down
+    above_rgb: Array64  # ambient on a surface that faces up
+    below_rgb: Array64  # ambient on a surface that faces down
     haze_rgb: Array64
     extinction_per_m: float
     sky: Array32  # (SKY_PX, SKY_PX, 3)
 
 
 def light(weather: Weather, seed: int) -> Light:
-    """The light of a weather; the clouds follow from the seed."""
+    """The light of a weather; the seed draws the clouds."""
     rng = np.random.default_rng([seed, 20])
     elevation = math.radians(weather.sun_elevation_deg)
     azimuth = math.radians(weather.sun_azimuth_deg)
@@ -73,7 +73,7 @@ def _sky_map(
     level: float,
     rng: np.random.Generator,
 ) -> Array32:
-    """Radiance over the hemisphere, equidistant about the zenith: column grows with x, row with y."""
+    """Radiance over the hemisphere, equidistant about the zenith: columns along x, rows along y."""
     grid = (np.arange(SKY_PX) + 0.5) / SKY_PX * 2 - 1
     x, y = np.meshgrid(grid, grid)
     off_zenith = np.minimum(np.hypot(x, y), 1.0) * math.radians(90 + LOWEST_SKY_DEG)
@@ -87,7 +87,7 @@ def _sky_map(
     to_sun = np.arccos(np.clip(direction @ sun, -1, 1))
     glow = 0.35 * np.exp(-to_sun / 0.12) + 0.12 * np.exp(-to_sun / 0.6)
     sky = sky + glow[:, :, None] * sun_rgb
-    plane = 1.2 / (height + 0.18)  # clouds lie on a flat layer: smaller towards the horizon
+    plane = 1.2 / (height + 0.18)  # clouds are a flat layer: smaller towards the horizon
     noise = noise_tile(rng)
     clouds = _lookup(noise, direction[:, :, 0] * plane, direction[:, :, 1] * plane)
     cover = _smooth((clouds - 0.50 + 0.25 * overcast) / 0.22) * _smooth(height / 0.12)
@@ -100,7 +100,7 @@ def _sky_map(
 
 
 def noise_tile(rng: np.random.Generator, size: int = 256, falloff: float = 1.7) -> Array64:
-    """A periodic tile of 1/f^falloff noise, scaled to [0, 1]: cloud, stains, asphalt."""
+    """A periodic tile of 1/f^falloff noise, scaled to [0, 1], for clouds, stains and asphalt."""
     f = np.fft.fftfreq(size)[:, None] ** 2 + np.fft.fftfreq(size)[None, :] ** 2
     f[0, 0] = np.inf
     spectrum = np.fft.fft2(rng.normal(size=(size, size))) * f ** (-falloff / 2)

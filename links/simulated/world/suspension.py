@@ -1,13 +1,14 @@
-"""A vehicle on springs: it pitches when it brakes, rolls in a bend and shakes on the road.
+"""A vehicle on its suspension: it pitches when braking, rolls in turns and shakes on a rough road.
 
-Pitch and roll each follow a damped oscillator driven by the acceleration in the vehicle's own axes,
+Pitch and roll are damped oscillators driven by the acceleration in vehicle axes,
 
     angle'' = w^2 (target - angle) - 2 d w angle',   w = 2 pi natural_hz
-    target pitch = -sway a_forward,   target roll = sway a_left   (nose up when it speeds up, outwards in a bend)
+    target pitch = -k a_forward,   target roll = k a_left   (nose up when accelerating, outwards in a turn)
 
-with road roughness added to the target while it rolls. It turns about a point `lever_m` under the camera.
+with k = tilt_deg_per_mps2. While the vehicle moves, road roughness is added to the target. The vehicle rotates about a
+point `lever_m` below the camera.
 
-Source: ours; sway and frequency of a passenger car's body (about 3 to 6 deg per g, 1 to 1.5 Hz).
+Source: ours; k and frequency of a passenger car's body (about 3 to 6 deg per g, 1 to 1.5 Hz).
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from stages.geometry import Array64
 
 BEYOND_S = 1.0
 ROUGHNESS_TIME_S = 0.1
-ROLLING_MPS = 3.0  # from this speed on the road shakes it fully
+ROLLING_MPS = 3.0  # from this speed on, the road roughness is at its full size
 
 
 class SuspensionSettings(BaseModel):
-    """The vehicle's springs and the road."""
+    """Suspension of the vehicle and roughness of the road."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     tilt_deg_per_mps2: float = Field(default=0.45, ge=0, le=5)
     natural_hz: float = Field(default=1.3, gt=0.1, le=10)
     damping: float = Field(default=0.35, gt=0.05, le=2)
-    roughness_deg: float = Field(default=0.4, ge=0, le=5)  # one sigma of the target; the springs pass about half
+    roughness_deg: float = Field(default=0.4, ge=0, le=5)  # one sigma of the target; the suspension passes about half
     lever_m: float = Field(default=1.3, ge=0, le=4)
 
 
@@ -49,8 +50,8 @@ class SuspendedPath:
         white = np.random.default_rng([seed, 36]).standard_normal((len(time_s), 2))
         rolling = np.minimum(np.linalg.norm(velocity, axis=1) / ROLLING_MPS, 1.0)[:, None]
         sigma = np.full(2, np.radians(settings.roughness_deg))
-        sway = np.radians(settings.tilt_deg_per_mps2)
-        target = np.column_stack([sway * own[:, 1], -sway * own[:, 0]])  # about x, about y
+        gain = np.radians(settings.tilt_deg_per_mps2)
+        target = np.column_stack([gain * own[:, 1], -gain * own[:, 0]])  # about x, about y
         target += rolling * gauss_markov(white, sigma, ROUGHNESS_TIME_S, STEP_S)
         self._tilt = oscillate(target, 2 * np.pi * settings.natural_hz, settings.damping)
 

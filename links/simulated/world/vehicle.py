@@ -1,4 +1,4 @@
-"""The ground vehicle's own body: what shadows the lower half of the LiDAR's view.
+"""Mesh of the ground vehicle, which blocks the lower half of the LiDAR's view.
 
 Source: ours, a compact estate car. Frame: vehicle (origin at the roof camera, x forward, y left, z up).
 """
@@ -15,7 +15,7 @@ LIDAR_RADIUS_M = 0.052
 
 
 def vehicle_mesh(camera_height_m: float) -> Mesh:
-    """Car body, roof rack and the turntable's mast; the road is `camera_height_m` below the camera."""
+    """Car body, roof rack and turntable mast; the road is `camera_height_m` below the camera."""
     roof = -ROOF_BELOW_CAMERA_M
     return merge(
         [
@@ -27,9 +27,9 @@ def vehicle_mesh(camera_height_m: float) -> Mesh:
 
 
 def vehicle_mesh_from_camera(camera_height_m: float, mount: LidarMount) -> Mesh:
-    """What the roof camera sees of its own vehicle: the LiDAR turns above it on an arm that reaches over from behind.
+    """The vehicle as its roof camera sees it: the LiDAR turns above the camera on an arm that comes from behind.
 
-    The LiDAR is drawn as the box within which it turns. Nothing encloses the camera itself.
+    The LiDAR is the box within which it turns. Nothing encloses the camera.
     """
     foot = np.array([-0.25, 0.0, -ROOF_BELOW_CAMERA_M])
     turntable = np.array(mount.T_vehicle_turntable.xyz_m)

@@ -1,10 +1,10 @@
-"""Weather: what rain, haze and the sun do to light. Settings for every sensor; the LiDAR's share of the physics.
+"""Weather: the effect of rain, haze and sun on light. Settings for every sensor, and the physics for the LiDAR.
 
 Source: haze: Kim, McArthur, Korevaar, Proc. SPIE 4214 (2001), extinction at a wavelength from visibility; rain: ITU-R
 P.1814, 1.076 R^0.67 dB/km; drop sizes: Marshall and Palmer (1948), N(D) = 8000 exp(-4.1 R^-0.21 D) per m^3 and mm.
-A drop sends back as a Lambertian disc of its own size and reflectivity 0.025 would: Fresnel's 0.02 at the front and,
-seen through the drop as a lens, at the back, 0.02 / 4 (1 + (n / (2 - n))^2) with n = 1.33. The share of a near drop's
-light that meets the receiver, which stands beside the laser, is assumed. Haze sends nothing back here, it only dims.
+A drop reflects like a Lambertian disc of its size with reflectivity 0.025: Fresnel's 0.02 at the front and, through
+the drop as a lens, 0.02 / 4 (1 + (n / (2 - n))^2) at the back, with n = 1.33. The overlap of a near drop's light with
+the receiver, which is next to the laser, is assumed. Haze attenuates; its backscatter is not modelled.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from stages.geometry import Array64
 LIDAR_NM = 903.0
 NEPER_PER_DB = math.log(10) / 10
 DROP_REFLECTIVITY = 0.025
-SOAKED_MMPH = 2.0  # from this rain on, surfaces are wet all over
-OVERLAP_M = 3.0  # assumed: nearer than this the receiver gets (range / this)^2 of the light
-CLUTTER_REACH_M = 12.0  # no drop is bright enough beyond
+SOAKED_MMPH = 2.0  # from this rain rate on, surfaces are fully wet
+OVERLAP_M = 3.0  # assumed: below this range the receiver gets (range / OVERLAP_M)^2 of the light
+CLUTTER_REACH_M = 12.0  # drops beyond this range are too weak to detect
 
 
 class Weather(BaseModel):
@@ -32,22 +32,22 @@ class Weather(BaseModel):
 
     rain_mmph: float = Field(default=0.0, ge=0, le=150)
     visibility_m: float | None = Field(default=None, ge=20)  # where contrast falls to 2 %; null: clear air
-    sun_elevation_deg: float = Field(default=45.0, ge=-18, le=90)  # 5 and less is dusk
-    sun_azimuth_deg: float = 120.0  # counter-clockwise from the world's x
+    sun_elevation_deg: float = Field(default=45.0, ge=-18, le=90)  # 5 and below is dusk
+    sun_azimuth_deg: float = 120.0  # counter-clockwise from the world x axis
 
     @property
     def wetness(self) -> float:
-        """How wet surfaces are: 0 dry, 1 wet all over."""
+        """How wet surfaces are: 0 dry, 1 fully wet."""
         return min(1.0, self.rain_mmph / SOAKED_MMPH)
 
     def extinction_per_m(self, wavelength_nm: float = LIDAR_NM) -> float:
-        """Share of light lost per metre of air, haze and rain together; Beer-Lambert: exp(-extinction * path)."""
+        """Extinction by haze and rain; a path transmits exp(-extinction * length) (Beer-Lambert)."""
         rain = 1.076 * self.rain_mmph**0.67 * NEPER_PER_DB / 1000 if self.rain_mmph > 0 else 0.0
         return rain + (0.0 if self.visibility_m is None else haze_extinction_per_m(self.visibility_m, wavelength_nm))
 
 
 def haze_extinction_per_m(visibility_m: float, wavelength_nm: float) -> float:
-    """3.91 / V (wavelength / 550 nm)^-q; q falls from 1.6 in clear air to 0 in fog: all colours lost alike."""
+    """3.91 / V (wavelength / 550 nm)^-q. q falls from 1.6 in clear air to 0 in fog, which is grey."""
     km = visibility_m / 1000
     if km > 50:
         q = 1.6
@@ -61,7 +61,7 @@ def haze_extinction_per_m(visibility_m: float, wavelength_nm: float) -> float:
 
 
 class RainClutter:
-    """Drops bright enough to be a return of their own, along one kind of beam."""
+    """Rain drops bright enough for a return of their own, along one kind of beam."""
 
     def __init__(
         self,
@@ -71,13 +71,13 @@ class RainClutter:
         aperture_m: tuple[float, float],
         spread_rad: tuple[float, float],
     ) -> None:
-        """`threshold`: least power that is seen, in reflectivity / range^2; `spread_rad`: the beam's full angles."""
+        """`threshold`: minimum detectable power, as reflectivity / range^2; `spread_rad`: full angles of the beam."""
         self._slope_per_mm = 4.1 * weather.rain_mmph**-0.21 if weather.rain_mmph > 0 else math.inf
         self._range_m = np.linspace(near_m, CLUTTER_REACH_M, 400)
         beam_m2 = (aperture_m[0] + spread_rad[0] * self._range_m) * (aperture_m[1] + spread_rad[1] * self._range_m)
         received = np.minimum(self._range_m / OVERLAP_M, 1) ** 2 * DROP_REFLECTIVITY / self._range_m**2
         received *= np.exp(-2 * weather.extinction_per_m() * self._range_m)
-        drop_m2 = threshold * beam_m2 / received  # the least that is seen
+        drop_m2 = threshold * beam_m2 / received  # the smallest detectable
         self._least_mm = 1000 * np.sqrt(4 * drop_m2 / math.pi)
         per_m = beam_m2 * 8000 / self._slope_per_mm * np.exp(-self._slope_per_mm * self._least_mm)
         steps = (per_m[1:] + per_m[:-1]) / 2 * np.diff(self._range_m)
@@ -92,9 +92,9 @@ class RainClutter:
     def draw(self, rng: Generator, pulses: int) -> tuple[Array64, Array64]:
         """The nearest bright drop in each pulse: range (n,) [m], inf without one, and received power (n,).
 
-        Drops come as a Poisson process in range, so the first one lies where the expected count reaches -ln(u).
+        Drops are a Poisson process in range, so the first one is where the expected count reaches -ln(u).
         """
-        draws = rng.uniform(size=(pulses, 2))  # the same number for every pulse, so batches do not matter
+        draws = rng.uniform(size=(pulses, 2))  # the same number per pulse, so that batching does not matter
         reached = -np.log1p(-draws[:, 0])
         hit = reached < self.expected
         range_m = np.where(hit, np.interp(reached, self._count, self._range_m), np.inf)

@@ -1,7 +1,7 @@
-"""Builds a scene by kind and seed: the fixed mesh, and what moves in it.
+"""Builds a scene by kind and seed: the static mesh and the movers.
 
-Source: ours. Scenes are made in their own frame, road axis along x, z = 0 on the carriageway, and handed out in the
-world frame, whose origin is the vehicle camera at the start. Nothing here knows about the method.
+Source: ours. Scenes are built in the scene frame, road axis along x, z = 0 on the carriageway, and returned in the
+world frame, whose origin is the vehicle camera at the start. Nothing here depends on the method.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ KINDS: dict[Kind, Callable[[SceneSettings, VehicleCorridor, Generator], list[Mes
     "park_edge": park_edge,
     "open_lot": open_lot,
 }
-STANDING = np.zeros((1, 2))
+PARKED = np.zeros((1, 2))
 
 
 @dataclass(frozen=True)
 class World:
-    """A scene in the world frame."""
+    """A scene in the world frame: its static mesh and its movers."""
 
     mesh: Mesh
     movers: tuple[Mover, ...]
 
 
-def build_world(settings: SceneSettings, camera_height_m: float, seed: int, vehicle_xy_m: Array64 = STANDING) -> World:
-    """The scene. Same settings, seed and vehicle path (n, 2) in the world: the same scene."""
+def build_world(settings: SceneSettings, camera_height_m: float, seed: int, vehicle_xy_m: Array64 = PARKED) -> World:
+    """The scene. The same settings, seed and vehicle path (n, 2), world frame, give the same scene."""
     yaw = np.radians(settings.vehicle_yaw_deg)
     start = np.array([0.0, settings.vehicle_lane_y_m])
     corridor = VehicleCorridor(vehicle_xy_m @ rotation_z(yaw)[:2, :2].T + start)
@@ -51,7 +51,7 @@ def build_world(settings: SceneSettings, camera_height_m: float, seed: int, vehi
 
 
 def world_mesh(settings: SceneSettings, camera_height_m: float, seed: int) -> Mesh:
-    """Only what stands still, about a parked vehicle."""
+    """The static mesh of the scene around a parked vehicle."""
     return build_world(settings, camera_height_m, seed).mesh
 
 
@@ -60,18 +60,18 @@ def _movers(
 ) -> tuple[Mover, ...]:
     cars, birds, balloons = settings.movers()
     turn = rotation_z(-np.radians(settings.vehicle_yaw_deg))
-    found: list[Mover] = []
+    movers: list[Mover] = []
     lane_y = -settings.vehicle_lane_y_m  # the other lane
     for _ in range(cars):
-        ahead = -np.sign(lane_y) or -1.0
-        ends = np.array([[-ahead, lane_y, 0.0], [ahead, lane_y, 0.0]]) * [HALF_LENGTH_M, 1.0, 1.0]
+        forward = -np.sign(lane_y) or -1.0
+        ends = np.array([[-forward, lane_y, 0.0], [forward, lane_y, 0.0]]) * [HALF_LENGTH_M, 1.0, 1.0]
         ends = (ends - [0.0, settings.vehicle_lane_y_m, camera_height_m]) @ turn.T
         driver = Car(car(rng), ends[0], ends[1], rng.uniform(5, 14), rng.uniform(0, 60))
         if corridor.allows(np.arange(-HALF_LENGTH_M, HALF_LENGTH_M, 1.0), lane_y, 1.0):
-            found.append(driver)
+            movers.append(driver)
     road = settings.road_width_m / 2
     for _ in range(birds):
-        found.append(draw_bird(rng, 3.0, 22.0, 28.0, road + 1.0, turn))
+        movers.append(draw_bird(rng, 3.0, 22.0, 28.0, road + 1.0, turn))
     for _ in range(balloons):
-        found.append(draw_balloon(rng, 4.0, 14.0, 18.0, road, turn))
-    return tuple(found)
+        movers.append(draw_balloon(rng, 4.0, 14.0, 18.0, road, turn))
+    return tuple(movers)

@@ -1,6 +1,6 @@
-"""What scenes are put together from: houses with recessed windows, trees, cars, lamp poles, wires, marks on the road.
+"""Parts of scenes: buildings with recessed windows, trees, cars, lamp poles, wires, road marks.
 
-Source: ours. Everything stands on z = 0 at the origin unless it says otherwise.
+Source: ours. Everything rests on z = 0 at the origin unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from numpy.random import Generator
 from links.simulated.world.mesh import Mesh, box, merge, quads, rod
 from stages.geometry import Array64, rotation_z
 
-LEAST_M = 1e-6  # nothing is built that is shorter
-MARK_ABOVE_M = 0.004  # marks lie this far above the road, so that rays tell them apart
+LEAST_M = 1e-6  # shortest part
+MARK_ABOVE_M = 0.004  # height of marks above the road, so that rays hit them first
 
 
 def building(width_m: float, depth_m: float, height_m: float, surface: str, rng: Generator) -> Mesh:
-    """One house: front at y = 0 (facing -y), x from 0 to width, with cornice, parapet and chimneys."""
+    """One building: front at y = 0 (facing -y), x from 0 to width, with cornice, parapet and chimneys."""
     floors = max(1, int(height_m // rng.uniform(2.9, 3.6)))
     recess = rng.uniform(0.08, 0.25)
     front = facade(width_m, height_m, floors, recess, surface, rng)
@@ -40,7 +40,7 @@ def building(width_m: float, depth_m: float, height_m: float, surface: str, rng:
 
 
 def facade(width_m: float, height_m: float, floors: int, recess_m: float, surface: str, rng: Generator) -> Mesh:
-    """A wall in the plane y = 0 facing -y, one row of recessed windows a floor; glass stands at y = recess."""
+    """A wall in the plane y = 0 facing -y, one row of recessed windows per floor; the glass is at y = recess."""
     columns = max(1, int(width_m // rng.uniform(2.4, 3.8)))
     pitch, storey = width_m / columns, height_m / floors
     window_w, window_h = pitch * rng.uniform(0.35, 0.6), storey * rng.uniform(0.45, 0.65)
@@ -68,7 +68,7 @@ def upright(x0: float, x1: float, z0: float, z1: float, y: float = 0.0) -> Array
 
 
 def tree(rng: Generator) -> Mesh:
-    """Trunk, a few boughs, and clusters of loose leaves: small quads facing anywhere, with air between."""
+    """Trunk, a few boughs, and clusters of loose leaves: small quads of random orientation with gaps between."""
     height, crown = rng.uniform(5.0, 10.0), rng.uniform(1.4, 2.6)
     centre = np.array([0.0, 0.0, height - crown])
     clusters = centre + in_ball(rng, int(rng.integers(20, 40))) * [crown, crown, crown * 1.2]
@@ -80,7 +80,7 @@ def tree(rng: Generator) -> Mesh:
 
 
 def leaves(middle_m: Array64, rng: Generator) -> Mesh:
-    """A small quad facing anywhere at each place (n, 3)."""
+    """A small quad of random orientation at each position (n, 3)."""
     half = rng.uniform(0.03, 0.07, (len(middle_m), 1))
     across = rng.normal(size=middle_m.shape)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -97,7 +97,7 @@ def in_ball(rng: Generator, count: int) -> Array64:
 
 
 def wire(start_m: Array64, end_m: Array64) -> list[Mesh]:
-    """A 16 mm wire hanging 1.5 % of its length."""
+    """A 16 mm wire with a sag of 1.5 % of its length."""
     t = np.linspace(0, 1, 9)[:, None]
     points = start_m + t * (end_m - start_m)
     points[:, 2] -= 4 * 0.015 * np.linalg.norm(end_m - start_m) * (t * (1 - t))[:, 0]
@@ -118,7 +118,7 @@ def car(rng: Generator) -> Mesh:
 
 
 def lamp_pole(height_m: float, reach_m: float) -> list[Mesh]:
-    """A pole at the origin whose arm carries a half-metre lamp head `reach_m` along y."""
+    """A pole at the origin whose arm holds a half-metre lamp head `reach_m` along y."""
     head = (-0.25, reach_m - 0.13, height_m), (0.25, reach_m + 0.13, height_m + 0.12)
     return [
         rod((0, 0, 0), (0, 0, height_m), 0.08, "metal"),
@@ -137,7 +137,7 @@ def strip(start_m: tuple[float, float], end_m: tuple[float, float], width_m: flo
 
 
 def dashes(start_m: tuple[float, float], end_m: tuple[float, float], z_m: float = MARK_ABOVE_M) -> list[Mesh]:
-    """A lane line: 0.12 m wide, 3 m long, 6 m apart."""
+    """A dashed lane line: 0.12 m wide, dashes of 3 m, gaps of 6 m."""
     a, b = np.array(start_m), np.array(end_m)
     length = float(np.linalg.norm(b - a))
     along = (b - a) / length
@@ -148,10 +148,10 @@ def dashes(start_m: tuple[float, float], end_m: tuple[float, float], z_m: float 
 
 
 def building_row(width_m: float, depth_m: float, heights_m: tuple[float, float], rng: Generator) -> Mesh:
-    """Houses wall to wall, front on y = 0 facing -y, from x = 0 to the width."""
+    """Terraced buildings, front on y = 0 facing -y, from x = 0 to the width."""
     parts: list[Mesh] = []
     x = 0.0
-    while width_m - x > LEAST_M:  # what is left by rounding is no house
+    while width_m - x > LEAST_M:  # ignores a remainder from rounding
         width = min(rng.uniform(10, 24), width_m - x)
         width = width_m - x if width_m - x - width < 6 else width
         surface = str(rng.choice(["brick", "plaster", "concrete"]))
@@ -166,17 +166,17 @@ def plain(x_m: tuple[float, float], y_m: tuple[float, float], surface: str, z_m:
     return quads([[(x0, y0, z_m), (x1, y0, z_m), (x1, y1, z_m), (x0, y1, z_m)]], surface)
 
 
-def grove(places_m: Array64, z_m: float, rng: Generator, kinds: int = 8) -> list[Mesh]:
-    """Trees at places (n, 2): a few kinds, each turned its own way."""
-    grown = [tree(rng) for _ in range(min(kinds, len(places_m)))]
+def grove(positions_m: Array64, z_m: float, rng: Generator, kinds: int = 8) -> list[Mesh]:
+    """Trees at positions (n, 2): a few kinds, each with a random yaw."""
+    grown = [tree(rng) for _ in range(min(kinds, len(positions_m)))]
     return [
         grown[i % len(grown)].moved((x, y, z_m), rotation_z(rng.uniform(0, 2 * np.pi)))
-        for i, (x, y) in enumerate(places_m)
+        for i, (x, y) in enumerate(positions_m)
     ]
 
 
 def hedge(start_m: tuple[float, float], end_m: tuple[float, float], rng: Generator) -> Mesh:
-    """A metre of leaves along a line, with air between."""
+    """Leaves up to about a metre high along a line, with gaps between."""
     a, b = np.array([*start_m, 0.0]), np.array([*end_m, 0.0])
     count = int(220 * np.linalg.norm(b - a))
     middle = a + rng.uniform(size=(count, 1)) * (b - a) + rng.uniform((-0.3, -0.3, 0.05), (0.3, 0.3, 1.1), (count, 3))
@@ -184,11 +184,11 @@ def hedge(start_m: tuple[float, float], end_m: tuple[float, float], rng: Generat
 
 
 def scattered(
-    rng: Generator, count: int, x_m: tuple[float, float], y_m: tuple[float, float], apart_m: float
+    rng: Generator, count: int, x_m: tuple[float, float], y_m: tuple[float, float], spacing_m: float
 ) -> Array64:
-    """Up to `count` places (n, 2) in a rectangle, none nearer to another than `apart_m`."""
-    places: list[Array64] = []
-    for place in rng.uniform((x_m[0], y_m[0]), (x_m[1], y_m[1]), (20 * count, 2)):
-        if len(places) < count and all(np.hypot(*(place - other)) >= apart_m for other in places):
-            places.append(place)
-    return np.array(places).reshape(-1, 2)
+    """Up to `count` positions (n, 2) in a rectangle, at least `spacing_m` from each other."""
+    positions: list[Array64] = []
+    for position in rng.uniform((x_m[0], y_m[0]), (x_m[1], y_m[1]), (20 * count, 2)):
+        if len(positions) < count and all(np.hypot(*(position - other)) >= spacing_m for other in positions):
+            positions.append(position)
+    return np.array(positions).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""A straight street between two rows of houses: `street` as first made, `manhattan` with parking, marks and crossings.
+"""A straight street between two rows of buildings: `street` is plain, `manhattan` has parking, marks and crossings.
 
 Source: ours. Scene frame: road axis along x, z = 0 on the carriageway.
 """
@@ -15,11 +15,11 @@ from links.simulated.world.procedural.parts import MARK_ABOVE_M, building, car, 
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, SceneSettings, VehicleCorridor
 from stages.geometry import rotation_z
 
-PARKING_M = 2.2  # beside the carriageway, on each side
+PARKING_M = 2.2  # width of the parking lane on each side
 
 
 def street(settings: SceneSettings, corridor: VehicleCorridor, rng: Generator) -> list[Mesh]:
-    """The plain street; cars park on the carriageway's edge."""
+    """The plain street; cars park at the edge of the carriageway."""
     parts = [ground(settings)]
     for side in (-1, 1):
         parts += _buildings(settings, side, rng)
@@ -34,7 +34,7 @@ def manhattan(settings: SceneSettings, corridor: VehicleCorridor, rng: Generator
 
 
 def with_parking(settings: SceneSettings) -> SceneSettings:
-    """The same street, its kerbs moved apart by two parking lanes."""
+    """The same street with its kerbs moved outwards for two parking lanes."""
     return settings.model_copy(update={"road_width_m": settings.road_width_m + 2 * PARKING_M})
 
 
@@ -74,13 +74,13 @@ def _buildings(settings: SceneSettings, side: int, rng: Generator) -> list[Mesh]
         height = rng.uniform(*settings.building_height_m)
         set_back = rng.choice([0.0, 0.0, rng.uniform(0.3, 2.5)])
         surface = str(rng.choice(["brick", "plaster", "concrete"]))
-        house = building(width, depth, height, surface, rng)
+        block = building(width, depth, height, surface, rng)
         if side < 0:
-            house = house.moved(rotation=rotation_z(np.pi)).moved((width, 0, 0))
-        parts.append(house.moved((x, side * (front + set_back), KERB_HEIGHT_M)))
+            block = block.moved(rotation=rotation_z(np.pi)).moved((width, 0, 0))
+        parts.append(block.moved((x, side * (front + set_back), KERB_HEIGHT_M)))
         x += width + (rng.uniform(4, 10) if rng.uniform() < settings.side_streets else 0.0)
     x = -HALF_LENGTH_M
-    while x < HALF_LENGTH_M:  # the next row, seen through the gaps
+    while x < HALF_LENGTH_M:  # second row, visible through the gaps
         width, height, y = rng.uniform(12, 30), rng.uniform(8, 30), front + rng.uniform(28, 40)
         parts.append(
             box((x, min(side * y, side * (y + 12)), 0), (x + width, max(side * y, side * (y + 12)), height), "concrete")
@@ -99,7 +99,7 @@ def _trees(settings: SceneSettings, side: int, rng: Generator) -> list[Mesh]:
 
 
 def poles_and_wires(settings: SceneSettings, rng: Generator) -> list[Mesh]:
-    """Lamp poles with half-metre heads over the road on one side, and a sagging wire along them and across."""
+    """Lamp poles with half-metre heads over the road on one side, and sagging wires along them and across."""
     parts: list[Mesh] = []
     side = float(rng.choice([-1, 1]))
     y = side * (settings.road_width_m / 2 + 0.5)
@@ -118,8 +118,8 @@ def poles_and_wires(settings: SceneSettings, rng: Generator) -> list[Mesh]:
 
 
 def parked_cars(settings: SceneSettings, side: int, corridor: VehicleCorridor, rng: Generator) -> list[Mesh]:
-    """Cars along the kerb, none in the vehicle's way."""
+    """Parked cars along the kerb, clear of the vehicle."""
     y = side * (settings.road_width_m / 2 - 1.0)
-    places = [x for x in np.arange(-95.0, 95.0, 6.0) if abs(x) > 6.0]
-    cars = [(x, car(rng)) for x in places if rng.uniform() < settings.parked_cars]
+    positions = [x for x in np.arange(-95.0, 95.0, 6.0) if abs(x) > 6.0]
+    cars = [(x, car(rng)) for x in positions if rng.uniform() < settings.parked_cars]
     return [parked.moved((x, y, 0)) for x, parked in cars if corridor.allows(np.array([x - 1.5, x, x + 1.5]), y, 0.95)]

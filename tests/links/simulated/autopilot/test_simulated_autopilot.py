@@ -1,4 +1,4 @@
-"""The autopilot's frames against the truth they were made from, read as the real ones are."""
+"""The autopilot's frames against the ground truth they were made from, read like real ones."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ STREET = FilePath(__file__).parents[4] / "configs/scenarios/street_sweep.yaml"
 
 
 class Flown:
-    """One flight's records, and what the receiver makes of them."""
+    """Records of one flight, and the messages decoded from them."""
 
     def __init__(self, settings: AutopilotSettings, seed: int = 1, seconds: float = SECONDS) -> None:
         self.flight = Flight(ORBIT, settings.flight, seconds, seed)
@@ -61,7 +61,7 @@ class Flown:
 
 @pytest.fixture(scope="module")
 def exact() -> Flown:
-    """No drift and no noise: frames and clocks alone."""
+    """No drift and no noise: frames and clocks only."""
     quiet = {"rate_noise_degps": 0, "gyro_noise_degps": 0, "gyro_bias_degps": 0}
     still = {"accelerometer_noise_mps2": 0, "accelerometer_bias_mps2": 0}
     return Flown(AutopilotSettings.model_validate({"drift": NO_DRIFT, **quiet, **still}))
@@ -92,15 +92,15 @@ def test_rates_kinds_and_sender_are_as_configured(drifting: Flown) -> None:
     assert [f.get_seq() for f in frames] == [i % 256 for i in range(len(frames))]
 
 
-def test_the_link_knows_nothing_earlier_than_the_arrival(drifting: Flown) -> None:
+def test_records_are_stamped_with_their_arrival(drifting: Flown) -> None:
     received = [r for r in drifting.records if r.topic == "/autopilot/rx"]
     assert all(r.stamp_ns == r.arrival_ns for r in received)
     arrivals = [r.arrival_ns for r in received]
     assert arrivals == sorted(arrivals)
 
 
-def test_without_errors_the_local_frame_is_the_world_turned_by_the_heading(exact: Flown) -> None:
-    """World x heads 57 deg on the compass: 57 deg clockwise of north, so at yaw -57 in a frame with z up."""
+def test_without_errors_the_local_frame_is_the_world_rotated_by_the_heading(exact: Flown) -> None:
+    """World x has a heading of 57 deg: clockwise from north, so its yaw is -57 deg in a frame with z up."""
     R_local_world = rotation_z(np.radians(-57.0))
     odometry = exact.messages(DroneOdometry, after_s=2.0)
     time_s = exact.seconds(odometry)
@@ -115,7 +115,7 @@ def test_without_errors_the_local_frame_is_the_world_turned_by_the_heading(exact
         np.testing.assert_allclose(m.angular_velocity_drone_radps, rate[i], atol=0.05)
 
 
-def test_attitude_position_and_odometry_tell_the_same(exact: Flown) -> None:
+def test_attitude_position_and_odometry_agree(exact: Flown) -> None:
     odometry = exact.messages(DroneOdometry, after_s=2.0)
     time_s = exact.seconds(odometry)
     position, attitude = exact.messages(DroneLocalPosition), exact.messages(DroneAttitude)
@@ -128,29 +128,31 @@ def test_attitude_position_and_odometry_tell_the_same(exact: Flown) -> None:
     np.testing.assert_allclose([m.R_local_drone[0, 2] for m in odometry], there, atol=0.01)
 
 
-def test_the_imu_feels_thrust_and_turns_rounded_to_mg_and_mrad(exact: Flown) -> None:
+def test_the_imu_measures_thrust_and_turn_rate_rounded_to_mg_and_mrad(exact: Flown) -> None:
     imu = exact.messages(DroneImu, after_s=2.0)
     rate, force = exact.flight.imu(exact.seconds(imu))
-    felt = np.array([m.acceleration_drone_mps2 for m in imu])
-    turned = np.array([m.angular_velocity_drone_radps for m in imu])
-    assert np.sqrt(np.mean((felt - force) ** 2, axis=0)).max() < 0.05
-    assert np.sqrt(np.mean((turned - rate) ** 2, axis=0)).max() < 0.02
-    assert felt[:, 2].mean() == pytest.approx(np.hypot(GRAVITY_MPS2, 0.16 * 10), rel=0.02)  # g and w^2 r of the orbit
-    np.testing.assert_allclose(turned * 1e3, np.rint(turned * 1e3), atol=1e-9)
+    force_measured = np.array([m.acceleration_drone_mps2 for m in imu])
+    turn_rate = np.array([m.angular_velocity_drone_radps for m in imu])
+    assert np.sqrt(np.mean((force_measured - force) ** 2, axis=0)).max() < 0.05
+    assert np.sqrt(np.mean((turn_rate - rate) ** 2, axis=0)).max() < 0.02
+    assert force_measured[:, 2].mean() == pytest.approx(
+        np.hypot(GRAVITY_MPS2, 0.16 * 10), rel=0.02
+    )  # g and w^2 r of the orbit
+    np.testing.assert_allclose(turn_rate * 1e3, np.rint(turn_rate * 1e3), atol=1e-9)
 
 
 def test_imu_noise_and_bias_are_as_configured() -> None:
     noisy = Flown(AutopilotSettings(gyro_noise_degps=2.0, gyro_bias_degps=1.0, accelerometer_noise_mps2=0.5))
     imu = noisy.messages(DroneImu, after_s=2.0)
     rate, force = noisy.flight.imu(noisy.seconds(imu))
-    turned = np.degrees(np.array([m.angular_velocity_drone_radps for m in imu]) - rate)
-    felt = np.array([m.acceleration_drone_mps2 for m in imu]) - force
-    np.testing.assert_allclose(turned.std(axis=0), 2.0, rtol=0.1)
-    np.testing.assert_allclose(felt.std(axis=0), 0.5, rtol=0.1)
-    assert 0.02 < np.abs(turned.mean(axis=0)).max() < 4.0
+    turn_rate = np.degrees(np.array([m.angular_velocity_drone_radps for m in imu]) - rate)
+    force_measured = np.array([m.acceleration_drone_mps2 for m in imu]) - force
+    np.testing.assert_allclose(turn_rate.std(axis=0), 2.0, rtol=0.1)
+    np.testing.assert_allclose(force_measured.std(axis=0), 0.5, rtol=0.1)
+    assert 0.02 < np.abs(turn_rate.mean(axis=0)).max() < 4.0
 
 
-def test_the_estimate_drifts_as_its_covariance_says(drifting: Flown) -> None:
+def test_the_drift_agrees_with_the_covariance(drifting: Flown) -> None:
     """Over seeds, at the end of the flight: the mean of error^T P^-1 error is its dimension."""
     nees = []
     for seed in range(16):
@@ -167,14 +169,14 @@ def test_the_estimate_drifts_as_its_covariance_says(drifting: Flown) -> None:
     assert 1.5 < np.mean(nees) < 5.0
 
 
-def test_the_attitude_is_off_by_the_lean_as_configured() -> None:
+def test_the_attitude_has_the_configured_tilt_error() -> None:
     squares = []
     for seed in range(25):
-        lean = Flown(
+        tilted = Flown(
             AutopilotSettings(drift=NO_DRIFT.model_copy(update={"tilt_deg": 1.0}), imu_hz=0, odometry_hz=0), seed, 4.0
         )
-        m = lean.messages(DroneAttitude)[-1]
-        up = lean.flight.flying_poses(lean.seconds([m]))[0][0] @ (m.R_local_drone.T @ [0.0, 0.0, 1.0])
+        m = tilted.messages(DroneAttitude)[-1]
+        up = tilted.flight.flying_poses(tilted.seconds([m]))[0][0] @ (m.R_local_drone.T @ [0.0, 0.0, 1.0])
         squares.append(np.degrees(np.arccos(up[2])) ** 2)
     assert np.sqrt(np.mean(squares)) == pytest.approx(np.sqrt(2.0), rel=0.35)  # roll and pitch, 1 deg each
 
@@ -186,11 +188,13 @@ def test_the_clock_offset_is_recovered_within_the_latency(ppm: float) -> None:
         true_ns = m.stamp_ns - flown.autopilot.device_ns(m.stamp_ns)
         assert m.clock_offset_ns is not None
         assert m.clock_uncertainty_ns is not None
-        assert abs(m.clock_offset_ns - true_ns) <= m.clock_uncertainty_ns + 2_000  # 2 us: drift while the frame flew
-        assert m.clock_uncertainty_ns < 12 * MS  # half of two times 6 ms and the jitter that the best had
+        assert (
+            abs(m.clock_offset_ns - true_ns) <= m.clock_uncertainty_ns + 2_000
+        )  # 2 us: clock drift during the transmission
+        assert m.clock_uncertainty_ns < 12 * MS  # half of two times 6 ms and the least jitter
 
 
-def test_without_timesync_stamps_are_late_by_the_least_latency() -> None:
+def test_without_timesync_stamps_are_late_by_the_minimum_latency() -> None:
     flown = Flown(AutopilotSettings(timesync_hz=0, imu_hz=0))
     m = flown.messages(AutopilotStatus)[-1]
     assert m.clock_uncertainty_ns is None
@@ -199,22 +203,22 @@ def test_without_timesync_stamps_are_late_by_the_least_latency() -> None:
     assert 6 * MS < late_ns < 9 * MS
 
 
-def test_stamps_grow_within_a_kind_and_never_pass_the_arrival(drifting: Flown) -> None:
+def test_stamps_increase_within_a_kind_and_are_before_the_arrival(drifting: Flown) -> None:
     for kind in (DroneAttitude, DroneLocalPosition, DroneOdometry, DroneImu):
         stamps = [m.stamp_ns for m in drifting.messages(kind)]
         assert (np.diff(stamps) > 0).all()
-    assert all(m.stamp_ns <= r.arrival_ns for r, m in drifting.heard)
+    assert all(m.stamp_ns <= r.arrival_ns for r, m in drifting.received)
 
 
 def test_losses_and_outages_show_as_gaps_in_the_sequence() -> None:
     radio: Any = {"loss_fraction": 0.05, "loss_burst_frames": 2.0, "outages_s": ((5.0, 5.3),)}
     lossy = Flown(AutopilotSettings(downlink=radio))
     sent = len([r for r in Flown(AutopilotSettings()).records if r.topic == "/autopilot/rx"])
-    heard = len([r for r in lossy.records if r.topic == "/autopilot/rx"])
+    received = len([r for r in lossy.records if r.topic == "/autopilot/rx"])
     lost = lossy.messages(AutopilotStatus)[-1].lost_frames
-    assert lost == pytest.approx(sent - heard, abs=220)  # those after the last heartbeat it has not seen
-    assert lossy.receiver.counters["lost"] == pytest.approx(sent - heard, abs=20)
-    assert (sent - heard) / sent == pytest.approx(0.05 + 0.3 / 20, abs=0.03)
+    assert lost == pytest.approx(sent - received, abs=220)  # frames after the last received heartbeat are not counted
+    assert lossy.receiver.counters["lost"] == pytest.approx(sent - received, abs=20)
+    assert (sent - received) / sent == pytest.approx(0.05 + 0.3 / 20, abs=0.03)
 
 
 def test_the_same_seed_gives_the_same_bytes_in_any_batches() -> None:
@@ -242,14 +246,14 @@ def test_a_scenario_with_autopilot_records_its_flight_and_not_the_path() -> None
     assert flown != [r.data for r in simulate_records(scenario) if r.topic == "/truth/drone"]
 
 
-def test_a_vehicle_on_springs_tilts_in_the_truth() -> None:
+def test_a_suspended_vehicle_tilts_in_the_ground_truth() -> None:
     drive = {"waypoints": [{"t_s": 0, "xyz_m": (0, 0, 0)}, {"t_s": 1, "xyz_m": (8, 0, 0)}]}
-    scenario = load_scenario(STREET).changed(duration_s=0.2, vehicle={"path": drive, "ride": {}})
+    scenario = load_scenario(STREET).changed(duration_s=0.2, vehicle={"path": drive, "suspension": {}})
     poses = [json.loads(r.data) for r in simulate_records(scenario) if r.topic == "/truth/vehicle"]
     assert np.abs([pose["quaternion_xyzw"][:2] for pose in poses]).max() > 1e-4
 
 
-def test_impossible_settings_are_refused() -> None:
+def test_impossible_settings_are_rejected() -> None:
     with pytest.raises(ValidationError, match="attitude_hz"):
         AutopilotSettings(attitude_hz=1000)
     without_drone = dict(load_scenario(STREET)) | {"drone": None, "script": (), "autopilot": {}}

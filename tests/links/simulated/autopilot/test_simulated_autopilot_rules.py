@@ -1,4 +1,4 @@
-"""The rules of ArduPilot and PX4, each as its source has it, on messages made by hand."""
+"""The rules of ArduPilot and PX4, each as in its source, on messages made by hand."""
 
 from __future__ import annotations
 
@@ -69,14 +69,14 @@ def receive(rules: Rules, at_ms: float, x: float = 0.0, **fields: Any) -> PoseRe
 
 
 def fly(rules: Rules, from_ms: int, to_ms: int, every_ms: int = 25, **fields: Any) -> PoseResult:
-    fate = PoseResult.NOT_A_POSE
+    result = PoseResult.NOT_A_POSE
     for at_ms in range(from_ms, to_ms, every_ms):
-        fate = receive(rules, at_ms, **fields)
-    return fate
+        result = receive(rules, at_ms, **fields)
+    return result
 
 
 @pytest.mark.parametrize("frames", [(1, 12), (20, 1), (20, 8), (0, 0), (12, 20)])
-def test_ardupilot_drops_other_frames_and_its_health_does_not_even_notice(frames: tuple[int, int]):
+def test_ardupilot_drops_other_frames_without_counting_them_for_health(frames: tuple[int, int]):
     rules = ArduPilotRules()
     assert receive(rules, 100, frame_id=frames[0], child_frame_id=frames[1]) is PoseResult.WRONG_FRAME
     assert not rules.healthy(100 * MS)
@@ -89,15 +89,15 @@ def test_ardupilot_is_healthy_for_300_ms_after_a_message_and_not_one_longer():
     assert not rules.healthy(400 * MS)
 
 
-def test_ardupilot_arms_on_a_pose_that_is_a_quarter_turn_wrong():
-    """Why an unresolved branch must never be sent: nothing here refuses it."""
+def test_ardupilot_arms_on_a_pose_with_a_yaw_error_of_90_deg():
+    """The reason why an unresolved yaw branch is never sent: the autopilot does not reject it."""
     rules = ArduPilotRules()
     assert fly(rules, 0, 1000, yaw_deg=90.0) is PoseResult.FUSED
     assert rules.healthy(1000 * MS)
     assert rules.fusing(1000 * MS)
 
 
-def test_ardupilot_believes_a_velocity_of_zero_and_skips_nan():
+def test_ardupilot_uses_a_velocity_of_zero_and_skips_nan():
     believing, skipping = ArduPilotRules(), ArduPilotRules()
     fly(believing, 0, 100, vx=2.0)
     fly(skipping, 0, 100, vx=2.0)
@@ -109,7 +109,7 @@ def test_ardupilot_believes_a_velocity_of_zero_and_skips_nan():
     assert skipping.estimate.velocity_mps[0] == 2.0
 
 
-def test_ardupilot_turns_the_bodys_velocity_into_its_local_frame():
+def test_ardupilot_rotates_body_velocity_into_its_local_frame():
     rules = ArduPilotRules()
     receive(rules, 0, yaw_deg=90.0, vx=3.0)
     assert rules.estimate is not None
@@ -135,41 +135,41 @@ def test_ardupilot_reads_the_covariance_as_a_cube_root_and_not_below_its_floors(
     assert math.sqrt(rules.estimate.yaw_var) == pytest.approx(0.2)
 
 
-def test_ardupilot_refuses_a_covariance_that_is_nan_in_part():
+def test_ardupilot_rejects_a_partly_nan_covariance():
     partly = upper()
     partly[6] = math.nan
     assert receive(ArduPilotRules(), 0, pose_covariance=partly) is PoseResult.NOT_FINITE
 
 
 @pytest.mark.parametrize(
-    ("quality", "fate"), [(-1, PoseResult.LOW_QUALITY), (0, PoseResult.RESET), (1, PoseResult.RESET)]
+    ("quality", "result"), [(-1, PoseResult.LOW_QUALITY), (0, PoseResult.RESET), (1, PoseResult.RESET)]
 )
-def test_ardupilot_keeps_its_health_by_failed_poses_too(quality: int, fate: PoseResult):
+def test_rejected_poses_count_for_the_health_of_ardupilot(quality: int, result: PoseResult):
     rules = ArduPilotRules()
-    assert receive(rules, 0, quality=quality) is fate
+    assert receive(rules, 0, quality=quality) is result
     assert rules.healthy(0)
 
 
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
-def test_a_jump_is_gated_and_taken_at_once_where_the_reset_counter_changes(rules: Any):
-    told, untold = rules(), rules()
-    for r in (told, untold):
+def test_a_jump_is_gated_unless_the_reset_counter_changes(rules: Any):
+    announced, unannounced = rules(), rules()
+    for r in (announced, unannounced):
         assert fly(r, 0, 1000) is PoseResult.FUSED
-    assert receive(untold, 1000, x=8.0) is PoseResult.GATED
-    assert receive(told, 1000, x=8.0, reset_counter=1) is PoseResult.RESET
-    assert receive(told, 1025, x=8.0, reset_counter=1) is PoseResult.FUSED
-    assert told.estimate is not None
-    assert told.estimate.xyz_m[0] == pytest.approx(8.0)
+    assert receive(unannounced, 1000, x=8.0) is PoseResult.GATED
+    assert receive(announced, 1000, x=8.0, reset_counter=1) is PoseResult.RESET
+    assert receive(announced, 1025, x=8.0, reset_counter=1) is PoseResult.FUSED
+    assert announced.estimate is not None
+    assert announced.estimate.xyz_m[0] == pytest.approx(8.0)
 
 
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
-def test_a_quarter_turn_in_flight_is_gated(rules: Any):
+def test_a_yaw_error_of_90_deg_in_flight_is_gated(rules: Any):
     r = rules()
     fly(r, 0, 1000)
     assert receive(r, 1000, yaw_deg=90.0) is PoseResult.GATED
 
 
-def test_ardupilot_stands_still_in_its_mind_after_7_s_without_a_pose_it_takes():
+def test_ardupilot_is_in_constant_position_mode_after_7_s_without_a_fused_pose():
     rules = ArduPilotRules()
     fly(rules, 0, 1000)
     assert rules.fusing(7900 * MS)
@@ -179,7 +179,7 @@ def test_ardupilot_stands_still_in_its_mind_after_7_s_without_a_pose_it_takes():
     assert not flags & mavlink.EKF_POS_HORIZ_REL
 
 
-def test_ardupilots_clock_is_that_of_the_promptest_message():
+def test_ardupilots_clock_is_that_of_the_message_with_the_least_lag():
     jitter = JitterCorrection()
     lags = [5000, 12000, 3000, 40000]
     local = [jitter.local_us(1_000_000 * i, 7_000_000 + 1_000_000 * i + lag) for i, lag in enumerate(lags)]
@@ -193,17 +193,17 @@ def test_px4_starts_with_two_messages_less_than_200_ms_apart_and_stops_after_400
     assert receive(rules, 690) is PoseResult.RESET
     assert rules.fusing(1090 * MS)
     assert not rules.fusing(1091 * MS)
-    assert receive(rules, 1100) is PoseResult.NOT_STARTED  # 410 ms after the one before
+    assert receive(rules, 1100) is PoseResult.NOT_STARTED  # 410 ms after the previous one
     assert receive(rules, 1200) is PoseResult.RESET
 
 
 @pytest.mark.parametrize(("kind", "taken"), [(0, True), (2, True), (3, True), (6, False), (7, False), (8, False)])
-def test_px4_takes_vision_and_not_lidar_or_mocap_estimators(kind: int, taken: bool):
-    fate = receive(Px4Rules(), 0, estimator_type=kind)
-    assert (fate is not PoseResult.WRONG_ESTIMATOR) == taken
+def test_px4_accepts_vision_and_not_lidar_or_mocap_estimators(kind: int, taken: bool):
+    result = receive(Px4Rules(), 0, estimator_type=kind)
+    assert (result is not PoseResult.WRONG_ESTIMATOR) == taken
 
 
-def test_px4_does_not_take_a_north_oriented_estimate_without_a_compass_and_ardupilot_does():
+def test_only_ardupilot_accepts_a_north_oriented_estimate_without_a_compass():
     assert Px4Rules().receive(estimate(0), 0) is PoseResult.WRONG_FRAME
     rules = ArduPilotRules()
     assert rules.receive(estimate(0), 0) is PoseResult.RESET
@@ -212,35 +212,35 @@ def test_px4_does_not_take_a_north_oriented_estimate_without_a_compass_and_ardup
     assert math.degrees(rules.estimate.yaw_rad) == pytest.approx(30.0, abs=1e-4)
 
 
-def test_px4_wants_its_quality_before_it_starts_and_while_it_fuses():
+def test_px4_requires_its_quality_before_it_starts_and_while_it_fuses():
     rules = Px4Rules(ekf2_ev_qmin=50)
     assert fly(rules, 0, 500, quality=49) is PoseResult.LOW_QUALITY
     assert not rules.fusing(500 * MS)
     assert fly(rules, 500, 1000, quality=50) is PoseResult.FUSED
 
 
-def test_px4_starts_anew_from_poses_it_gated_for_a_second_five_times_and_then_stops():
+def test_px4_resets_after_a_second_of_gated_poses_five_times_and_then_stops():
     rules = Px4Rules()
     fly(rules, 0, 1000)
-    began_at: list[int] = []
+    resets_at: list[int] = []
     at_ms = 1000
     while at_ms < 12_000 and rules.fusing(at_ms * MS):
-        fate = receive(rules, at_ms, x=0.4 * at_ms)  # flees at 400 m/s: nothing passes the gate
-        began_at += [at_ms] if fate is PoseResult.RESET else []
+        result = receive(rules, at_ms, x=0.4 * at_ms)  # moves at 400 m/s: nothing passes the gate
+        resets_at += [at_ms] if result is PoseResult.RESET else []
         at_ms += 25
-    assert len(began_at) == 5
-    assert all(b - a > 1000 for a, b in itertools.pairwise([975, *began_at]))
+    assert len(resets_at) == 5
+    assert all(b - a > 1000 for a, b in itertools.pairwise([975, *resets_at]))
     assert at_ms < 12_000
 
 
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_no_rule_takes_a_position_that_is_not_finite(rules: Any, bad: float):
+def test_no_rule_accepts_a_position_that_is_not_finite(rules: Any, bad: float):
     assert receive(rules(), 0, x=bad) is PoseResult.NOT_FINITE
 
 
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
-def test_the_report_says_what_is_fused(rules: Any):
+def test_the_report_states_what_is_fused(rules: Any):
     r = rules()
     assert r.report(0).flags & 128
     fly(r, 0, 500)

@@ -1,4 +1,4 @@
-"""The simulated autopilot in real time: a flight's frames on a socket, heard and stamped as those of a real one."""
+"""The simulated autopilot in real time: frames of a flight on a socket, received and stamped like real ones."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def flying() -> Autopilot:
     return Autopilot(settings, Flight(HOVER, settings.flight, SECONDS, 1), START_NS, SECONDS, 1)
 
 
-def test_a_flight_is_heard_live_and_its_clock_is_found():
+def test_a_flight_is_received_live_and_its_clock_is_found():
     link, began_ns = Receiver(connection="udpin:127.0.0.1:0"), time.monotonic_ns()
     scenario_ns = lambda: START_NS + time.monotonic_ns() - began_ns  # noqa: E731
-    heard: list[tuple[Record, object]] = []
+    received: list[tuple[Record, object]] = []
     enough = threading.Event()
 
     def listen() -> None:
         for record in records:
-            heard.append((record, link.decode(record)))
+            received.append((record, link.decode(record)))
             if link.counters["timesync replies"] >= 2:
                 enough.set()
 
@@ -56,17 +56,17 @@ def test_a_flight_is_heard_live_and_its_clock_is_found():
             assert enough.wait(20)
             offset_ns = host_time.now_ns() - drone.device_ns()
     listener.join(5)
-    kinds = Counter(type(message) for _, message in heard)
+    kinds = Counter(type(message) for _, message in received)
     assert all(kinds[kind] for kind in (DroneAttitude, DroneLocalPosition, DroneOdometry, DroneImu, AutopilotEstimator))
     assert link.counters["lost"] < 0.05 * link.counters["decoded"]  # a saturated host loses a few
     refused = {name: count for name, count in link.counters.items() if name.startswith("refused")}
-    assert set(refused) <= {"refused: not after the one before"}  # while the clock's bounds close in
+    assert set(refused) <= {"refused: not after the one before"}  # while the clock offset converges
     assert sum(refused.values()) < 0.1 * link.counters["decoded"]
     stream = link._stream.clock
     assert stream.offset_ns is not None
     assert stream.uncertainty_ns is not None
     assert abs(stream.offset_ns - offset_ns) <= stream.uncertainty_ns + 1_000_000
-    ages_ms = np.array([r.arrival_ns - m.stamp_ns for r, m in heard if isinstance(m, DroneAttitude)]) * 1e-6
+    ages_ms = np.array([r.arrival_ns - m.stamp_ns for r, m in received if isinstance(m, DroneAttitude)]) * 1e-6
     assert (ages_ms >= 0).all()
 
 
@@ -77,7 +77,7 @@ def line():
     connection.close()
 
 
-def test_a_silent_radio_says_and_hears_nothing(line: Udp):
+def test_a_silent_radio_sends_and_receives_nothing(line: Udp):
     sender = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=197)
     beat = packed(ardupilotmega.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3), sender)
     with AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", line.port)) as drone:
@@ -86,17 +86,17 @@ def test_a_silent_radio_says_and_hears_nothing(line: Udp):
         assert parse_frame(received[0]).get_type() in ("HEARTBEAT", "EKF_STATUS_REPORT")
         line.answer_to(received[1])
         line.send(beat)
-        assert drone.wait_for(lambda: len(drone.heard) == 1)
+        assert drone.wait_for(lambda: len(drone.received) == 1)
         drone.silent = True
         while line.receive(0.3) is not None:
-            pass  # what was under way
+            pass  # frames in transit
         line.send(beat)
-        assert not drone.wait_for(lambda: len(drone.heard) > 1, timeout_s=0.3)
+        assert not drone.wait_for(lambda: len(drone.received) > 1, timeout_s=0.3)
         drone.silent = False
         assert line.receive(5.0) is not None
 
 
-def test_its_own_frames_and_broken_ones_are_not_heard(line: Udp):
+def test_its_own_frames_and_damaged_ones_are_ignored(line: Udp):
     own = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
     other = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=197)
     beat = ardupilotmega.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)
@@ -104,5 +104,5 @@ def test_its_own_frames_and_broken_ones_are_not_heard(line: Udp):
         line.answer_to(("127.0.0.1", drone.port))
         for data in (b"\xfd\x00noise", packed(beat, own), packed(beat, other)):
             line.send(data)
-        assert drone.wait_for(lambda: len(drone.heard) == 1)
-        assert drone.heard[0][1].get_srcComponent() == 197
+        assert drone.wait_for(lambda: len(drone.received) == 1)
+        assert drone.received[0][1].get_srcComponent() == 197

@@ -1,4 +1,4 @@
-"""A radio: late, in order, lossy as configured."""
+"""A radio link: late, in order, lossy as configured."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def test_latency_and_jitter_are_as_configured_and_order_is_kept() -> None:
     assert (np.diff(arrivals) > 0).all()
 
 
-def test_a_slow_line_queues_what_it_cannot_carry() -> None:
+def test_a_slow_link_queues_frames() -> None:
     arrivals = _send(RadioSettings(latency_s=0, jitter_s=0, bitrate_bps=9600), 50, period_ns=10 * MS, size=24)
-    assert arrivals[-1] == 50 * 25 * MS  # 24 bytes take 25 ms, one frame each 10 ms is asked
+    assert arrivals[-1] == 50 * 25 * MS  # 24 bytes take 25 ms, a frame is sent every 10 ms
 
 
-def test_losses_have_their_share_and_come_in_bursts() -> None:
+def test_losses_have_their_fraction_and_come_in_bursts() -> None:
     lost = np.array([a is None for a in _send(RadioSettings(loss_fraction=0.1, loss_burst_frames=4), 60_000)])
     assert lost.mean() == pytest.approx(0.1, rel=0.1)
     bursts = np.count_nonzero(np.diff(lost.astype(int)) == 1)
@@ -42,6 +42,6 @@ def test_in_an_outage_nothing_arrives() -> None:
     assert [i for i, a in enumerate(arrivals) if a is None] == list(range(100, 200))
 
 
-def test_an_outage_that_ends_before_it_begins_is_refused() -> None:
+def test_an_outage_that_ends_before_it_begins_is_rejected() -> None:
     with pytest.raises(ValidationError, match="each is \\(from, to\\) with to after from"):
         RadioSettings(outages_s=((2.0, 1.0),))

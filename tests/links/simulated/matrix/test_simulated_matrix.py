@@ -1,4 +1,4 @@
-"""The matrix: every cell is what its name says, and making it is resumed where it stopped."""
+"""The matrix: the scenario of every cell fits its name."""
 
 from __future__ import annotations
 
@@ -40,30 +40,30 @@ LIDAR_UP = np.array([0.0, 0.0, 0.35])
 
 
 def flown(scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times, LiDAR and drone positions in the world."""
+    """Times, and positions of LiDAR and drones, world frame."""
     times = sample_times_s(scenario.duration_s)
     assert scenario.drone is not None
     return times, scenario.vehicle.path.at(times)[0] + LIDAR_UP, scenario.drone.path.at(times)[0]
 
 
-def seen(scenario: Scenario) -> np.ndarray:
+def visible_now(scenario: Scenario) -> np.ndarray:
     _, lidar, drone = flown(scenario)
-    way = scenario.vehicle.path.at(np.arange(0.0, scenario.duration_s, 0.25))[0][:, :2]
-    scene = build_world(scenario.scene, scenario.vehicle.camera_height_m, scenario.seed, way)
+    path = scenario.vehicle.path.at(np.arange(0.0, scenario.duration_s, 0.25))[0][:, :2]
+    scene = build_world(scenario.scene, scenario.vehicle.camera_height_m, scenario.seed, path)
     return visible(RayScene(scene.mesh), lidar, drone)
 
 
-def test_the_matrix_is_the_whole_product_with_the_special_flights_and_no_name_twice() -> None:
+def test_the_matrix_is_the_full_product_plus_special_cells_with_unique_names() -> None:
     names = [cell.name for cell in cells()]
-    goals = 5 * 3 + 4 + 5 + 5 + 2 * 5  # empty, occlusion at 20 m, two, search, 50 m
-    assert len(names) == len(set(names)) == 5 * 6 * 3 * 5 + 5 + 4 + goals
+    special = 5 * 3 + 4 + 5 + 5 + 2 * 5  # empty, occlusion at 20 m, two, search, 50 m
+    assert len(names) == len(set(names)) == 5 * 6 * 3 * 5 + 5 + 4 + special
     assert min(RANGES_M) == 10
     assert max(RANGES_M) == 60
     assert [cell.name for cell in cells(["campus-20m-orbit-*"])] == [f"campus-20m-orbit-{v}" for v in VEHICLES]
     assert cells(["nowhere-*"]) == []
 
 
-def test_in_pairs_each_two_values_meet_in_few_cells() -> None:
+def test_pairs_has_any_two_values_together_in_few_cells() -> None:
     assert len(cells(pairs=True)) == 39
     few = [cell for cell in cells(pairs=True) if cell.motion in MOTIONS]
     assert len(few) == 30
@@ -74,27 +74,27 @@ def test_in_pairs_each_two_values_meet_in_few_cells() -> None:
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_a_motion_stays_about_its_range_in_sight_at_its_own_speed(motion: str) -> None:
+def test_a_motion_stays_near_its_range_visible_and_at_its_speed(motion: str) -> None:
     scenario = scenario_of(Cell("manhattan", 20, motion, "parked"), 3)
     times, lidar, drone = flown(scenario)
     range_m = np.linalg.norm(drone - lidar, axis=1)
     speed = np.linalg.norm(np.diff(drone, axis=0), axis=1) / np.diff(times)
     assert 0.6 * 20 < range_m.min() <= 20.5
     assert range_m.max() < 20 * 1.45
-    assert seen(scenario).mean() > 0.94
+    assert visible_now(scenario).mean() > 0.94
     fastest = {"hover": 0.3, "orbit": 3.0, "cross": 3.0, "fast": 8.0, "overhead": 2.0, "climb": 2.0}[motion]
     assert speed.max() <= fastest * 1.05 + 0.05
     assert speed.max() > 0.3 * fastest
 
 
-def test_the_drone_goes_with_a_vehicle_that_drives_or_turns() -> None:
+def test_the_drone_follows_a_vehicle_that_drives_or_turns() -> None:
     for vehicle in ("driving", "turning"):
         scenario = scenario_of(Cell("manhattan", 20, "hover", vehicle), 2)
         times, lidar, drone = flown(scenario)
         assert np.linalg.norm(drone - lidar, axis=1) == pytest.approx(20.0, abs=0.6)
         moved = np.linalg.norm(lidar[-1] - lidar[0])
-        turned = np.ptp(scenario.vehicle.path.at(times)[3])
-        assert (moved > 15 and turned < 0.1) if vehicle == "driving" else (moved < 9 and turned > 3.5)
+        yaw_change = np.ptp(scenario.vehicle.path.at(times)[3])
+        assert (moved > 15 and yaw_change < 0.1) if vehicle == "driving" else (moved < 9 and yaw_change > 3.5)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
@@ -110,13 +110,13 @@ def test_a_vehicle_moves_where_it_heads(seed: int) -> None:
 
 def test_an_occlusion_hides_the_drone_once_for_three_seconds() -> None:
     scenario = scenario_of(Cell("manhattan", 35, "occlusion", "parked"), 1)
-    hidden = np.nonzero(~seen(scenario))[0]
+    hidden = np.nonzero(~visible_now(scenario))[0]
     assert (hidden[-1] - hidden[0]) * 0.05 == pytest.approx(3.0, abs=0.5)
     assert hidden[0] * 0.05 > 5
     assert hidden[-1] * 0.05 < scenario.duration_s - 2
 
 
-def test_a_drone_leaves_the_lidars_reach_and_returns() -> None:
+def test_a_drone_leaves_the_lidars_range_and_returns() -> None:
     _, lidar, drone = flown(scenario_of(Cell("open_lot", 20, "return", "parked"), 1))
     range_m = np.linalg.norm(drone - lidar, axis=1)
     assert range_m[0] == pytest.approx(20.0, abs=0.1)
@@ -124,7 +124,7 @@ def test_a_drone_leaves_the_lidars_reach_and_returns() -> None:
     assert range_m[-1] == pytest.approx(20.0, abs=0.1)
 
 
-def test_cells_of_the_goals_are_named_by_what_happens() -> None:
+def test_special_cells_are_named_after_their_motion() -> None:
     patterns = ["*-0m-empty-*", "*-20m-two-parked", "*-40m-search-parked", "*-50m-*"]
     names = {cell.name for cell in cells(patterns)}
     assert len(names) == 35
@@ -144,7 +144,7 @@ def test_an_empty_sky_has_no_drone_and_the_vehicle_stays_in_the_scene(vehicle: s
 
 
 @pytest.mark.parametrize("scene", ["manhattan", "open_lot"])
-def test_of_two_drones_one_orbits_and_one_hovers_and_they_stay_apart(scene: Kind) -> None:
+def test_of_two_drones_one_orbits_and_one_hovers_and_they_keep_their_separation(scene: Kind) -> None:
     scenario = scenario_of(Cell(scene, 20, "two", "parked"), 1)
     times, lidar, orbiting = flown(scenario)
     (other,) = scenario.other_drones
@@ -155,20 +155,22 @@ def test_of_two_drones_one_orbits_and_one_hovers_and_they_stay_apart(scene: Kind
     assert speeds[0][10:-10] == pytest.approx(3.0, rel=0.02)
     assert speeds[1].max() < 0.3
     azimuths = [np.degrees(np.arctan2(p[:, 1], p[:, 0])) for p in (orbiting, hovering)]
-    apart = np.abs((azimuths[0] - azimuths[1] + 180) % 360 - 180)
-    assert 38 < apart[0] < 62
-    assert apart.min() > 38
-    assert seen(scenario).mean() > 0.94
-    assert seen(scenario.changed(drone=other, other_drones=())).mean() > 0.94
+    separation = np.abs((azimuths[0] - azimuths[1] + 180) % 360 - 180)
+    assert 38 < separation[0] < 62
+    assert separation.min() > 38
+    assert visible_now(scenario).mean() > 0.94
+    assert visible_now(scenario.changed(drone=other, other_drones=())).mean() > 0.94
 
 
-def test_two_drones_that_would_have_to_meet_are_not_made() -> None:
-    """Between walls 8 m away only steep flights have room, and a steep orbit comes all the way round in 12 s."""
+def test_two_drones_that_would_meet_are_rejected() -> None:
+    """Between walls 8 m away only steep flights have room, and a steep orbit closes within 12 s."""
     walls = [box((x, y, -2), (x + dx, y + dy, 60), "brick") for x, y, dx, dy in ((-9, -9, 1, 18), (8, -9, 1, 18))]
     walls += [box((x, y, -2), (x + dx, y + dy, 60), "brick") for x, y, dx, dy in ((-9, -9, 18, 1), (-9, 8, 18, 1))]
     world, times = RayScene(merge(walls)), sample_times_s(12.0)
     lidar = np.tile(LIDAR_UP, (len(times), 1))
-    drone_path(Cell("manhattan", 20, "orbit", "parked"), world, np.random.default_rng(1), times, lidar)  # alone it may
+    drone_path(
+        Cell("manhattan", 20, "orbit", "parked"), world, np.random.default_rng(1), times, lidar
+    )  # possible on its own
     with pytest.raises(LinkError, match="manhattan-20m-two-parked: no free flight of this kind"):
         two_paths(Cell("manhattan", 20, "two", "parked"), world, np.random.default_rng(1), times, lidar)
 
@@ -182,16 +184,16 @@ def test_a_drone_to_search_for_hovers_high_at_40_m_while_the_servo_sweeps() -> N
     assert [segment.do for segment in scenario.script] == ["sweep"]
 
 
-def test_a_calibrated_rig_knows_the_encoders_error_and_its_play_and_the_world_stays_the_same() -> None:
+def test_a_calibrated_rig_file_has_encoder_error_and_backlash_and_the_world_is_unchanged() -> None:
     cell = Cell("open_lot", 20, "hover", "parked")
     plain, known = scenario_of(cell, 3), scenario_of(cell, 3, Conditions(calibrated=True))
     assert known.mount == plain.mount == plain.rig.mount
     assert (known.mount.servo_harmonics, known.mount.servo_play_deg) == ((), 0.0)
     assert known.rig.mount.servo_play_deg == SERVO.backlash_deg
     tight = SERVO.model_copy(update={"backlash_deg": 0.0})
-    turned = GearTrain(tight, 3)
+    yaw_change = GearTrain(tight, 3)
     encoder = np.linspace(0.0, np.pi, 50)
-    truly = np.array([turned.follow(p) for p in encoder])
+    truly = np.array([yaw_change.follow(p) for p in encoder])
     assert known.rig.mount.turntable_rad(encoder) == pytest.approx(truly, abs=1e-7)
     assert np.abs(plain.rig.mount.turntable_rad(encoder) - truly).max() > np.radians(0.1)
     sensed = [[(r.topic, r.data) for r in Simulation(s.changed(duration_s=0.2)).records()] for s in (plain, known)]
@@ -209,71 +211,77 @@ def test_odometry_and_rain_are_added_to_a_cell_and_change_nothing_else() -> None
 
 def test_cameras_are_added_to_a_cell_and_change_nothing_else() -> None:
     cell = Cell("open_lot", 20, "hover", "driving")
-    seen = scenario_of(cell, 3, Conditions(cameras_hz=4.0))
-    assert seen.cameras.vehicle is not None
-    assert seen.cameras.drone is not None
-    assert (seen.cameras.vehicle.rate_hz, seen.cameras.drone.rate_hz) == (4.0, 4.0)
+    visible_now = scenario_of(cell, 3, Conditions(cameras_hz=4.0))
+    assert visible_now.cameras.vehicle is not None
+    assert visible_now.cameras.drone is not None
+    assert (visible_now.cameras.vehicle.rate_hz, visible_now.cameras.drone.rate_hz) == (4.0, 4.0)
     large = scenario_of(cell, 3, Conditions(cameras_hz=4.0, cameras_px=1080, readout_ms=20.0)).cameras
     assert large.vehicle is not None
     assert large.drone is not None
     assert (large.vehicle.size_px, large.drone.size_px) == (1080, 1080)
     assert (large.vehicle.readout_ms, large.drone.readout_ms) == (20.0, 20.0)
-    assert seen.changed(cameras={}) == scenario_of(cell, 3)
+    assert visible_now.changed(cameras={}) == scenario_of(cell, 3)
     nobody = scenario_of(Cell("open_lot", 0, "empty", "parked"), 3, Conditions(cameras_hz=4.0))
     assert nobody.cameras.vehicle is not None
     assert nobody.cameras.drone is None
 
 
-def test_a_rig_as_built_is_off_and_its_drone_one_of_several_while_the_file_tells_what_was_meant() -> None:
-    cell, asked = Cell("open_lot", 20, "hover", "driving"), Conditions(calibrated=True, cameras_hz=4.0, perturbed=True)
+def test_a_perturbed_rig_differs_from_its_file_and_its_drone_is_one_of_several() -> None:
+    cell, conditions = (
+        Cell("open_lot", 20, "hover", "driving"),
+        Conditions(calibrated=True, cameras_hz=4.0, perturbed=True),
+    )
     ideal = scenario_of(cell, 3, Conditions(calibrated=True, cameras_hz=4.0))
-    built = [scenario_of(cell, seed, asked) for seed in range(1, 60)]
-    third = built[2]
+    perturbed = [scenario_of(cell, seed, conditions) for seed in range(1, 60)]
+    third = perturbed[2]
     assert third.rig == ideal.rig
     assert Scenario.model_validate(yaml.safe_load(third.as_yaml())) == third
-    zero_deg = [s.mount.servo_zero_deg for s in built]
-    tilt_deg = [np.degrees(np.arccos(s.mount.T_vehicle_turntable.matrix()[2, 2])) for s in built]
+    zero_deg = [s.mount.servo_zero_deg for s in perturbed]
+    tilt_deg = [np.degrees(np.arccos(s.mount.T_vehicle_turntable.matrix()[2, 2])) for s in perturbed]
     assert 0.07 < np.std(zero_deg) < 0.13
     assert 0.05 < np.sqrt(np.mean(np.square(tilt_deg))) < 0.09  # of two axes
-    assert 0.012 < np.std([s.lidar.range_offset_m for s in built]) < 0.022
-    drones = [s.drone for s in built if s.drone is not None]
+    assert 0.012 < np.std([s.lidar.range_offset_m for s in perturbed]) < 0.022
+    drones = [s.drone for s in perturbed if s.drone is not None]
     assert {(d.model.shape, d.span_m) for d in drones} == {("x4", 0.5), ("folding", 0.35), ("hexa", 0.8)}
     assert len({d.model.surface for d in drones}) == 4
     rig, was = (yaml.safe_load(s.rig_yaml()) for s in (third, ideal))
     assert rig["lidar"] == was["lidar"]
     assert third.drone is not None
     assert rig["drone"] == {"span_m": third.drone.span_m}
-    for carrier, one in (("vehicle", third.cameras.vehicle), ("drone", third.cameras.drone)):
+    for platform, one in (("vehicle", third.cameras.vehicle), ("drone", third.cameras.drone)):
         assert one is not None
-        told, true = Pose(**rig["cameras"][carrier][f"T_{carrier}_camera"]).matrix()[:3, :3], rig_mount(carrier, third)
-        turned_deg = np.degrees(np.linalg.norm(log_rotation(told @ true.T)))
-        assert 0.005 < turned_deg < 0.3
-        lens = rig["cameras"][carrier]["lens"]
+        stated, true = (
+            Pose(**rig["cameras"][platform][f"T_{platform}_camera"]).matrix()[:3, :3],
+            rig_mount(platform, third),
+        )
+        rotation_deg = np.degrees(np.linalg.norm(log_rotation(stated @ true.T)))
+        assert 0.005 < rotation_deg < 0.3
+        lens = rig["cameras"][platform]["lens"]
         assert 0 < abs(lens["focal_px"] / one.true_lens.focal_px - 1) < 0.003  # pyright: ignore
         assert 0 < np.abs(np.subtract(lens["centre_px"], one.true_lens.centre_px)).max() < 1.0
-    other = scenario_of(Cell("campus", 20, "hover", "driving"), 3, asked)
+    other = scenario_of(Cell("campus", 20, "hover", "driving"), 3, conditions)
     assert other.mount.servo_zero_deg != third.mount.servo_zero_deg
 
 
-def rig_mount(carrier, scenario: Scenario) -> np.ndarray:
-    """How the camera really sits (3, 3): the rig file of the same rig without its errors."""
-    one = {c: getattr(scenario.cameras, c).model_copy(update={"error": None}) for c in ("vehicle", "drone")}
+def rig_mount(platform, scenario: Scenario) -> np.ndarray:
+    """True rotation of the camera (3, 3): that of the rig file without perturbations."""
+    one = {c: getattr(scenario.cameras, c).model_copy(update={"miscalibration": None}) for c in ("vehicle", "drone")}
     rig = yaml.safe_load(scenario.changed(cameras=CamerasSettings(**one)).rig_yaml())
-    return Pose(**rig["cameras"][carrier][f"T_{carrier}_camera"]).matrix()[:3, :3]
+    return Pose(**rig["cameras"][platform][f"T_{platform}_camera"]).matrix()[:3, :3]
 
 
-def test_a_seed_makes_one_scenario_and_another_seed_another() -> None:
+def test_a_seed_determines_the_scenario() -> None:
     cell = Cell("park_edge", 30, "cross", "driving")
     assert scenario_of(cell, 1) == scenario_of(cell, 1)
     assert scenario_of(cell, 1).drone != scenario_of(cell, 2).drone
 
 
-def test_a_scenario_survives_its_own_yaml() -> None:
+def test_a_scenario_is_unchanged_by_its_yaml() -> None:
     scenario = scenario_of(Cell("atlanta", 10, "orbit", "turning"), 4)
     assert Scenario.model_validate(yaml.safe_load(scenario.as_yaml())) == scenario
 
 
-def test_the_command_names_cells_and_refuses_a_pattern_that_fits_none(tmp_path: FilePath) -> None:
+def test_the_command_lists_cells_and_rejects_a_pattern_without_a_match(tmp_path: FilePath) -> None:
     listed = CliRunner().invoke(app, ["matrix", str(tmp_path), "--only", "*-10m-climb-parked", "--list"])
     assert listed.exit_code == 0
     assert listed.stdout.split() == [f"{scene}-10m-climb-parked" for scene in SCENES]
@@ -287,8 +295,8 @@ def test_the_command_names_cells_and_refuses_a_pattern_that_fits_none(tmp_path: 
 
 def test_the_commands_conditions_reach_the_recording(tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(flights, "USUAL_DURATION_S", 0.2)
-    asked = ["--only", "open_lot-20m-two-parked", "--calibrated", "--odometry", "--rain"]
-    made = CliRunner().invoke(app, ["matrix", str(tmp_path), *asked])
+    conditions = ["--only", "open_lot-20m-two-parked", "--calibrated", "--odometry", "--rain"]
+    made = CliRunner().invoke(app, ["matrix", str(tmp_path), *conditions])
     assert made.exit_code == 0, made.output
     with RecordingReader(tmp_path / "open_lot-20m-two-parked-s1.mcap") as reader:
         scenario, rig = yaml.safe_load(reader.config_yaml), yaml.safe_load(reader.rig_yaml)

@@ -1,4 +1,4 @@
-"""Making the matrix: resumed where it stopped, the closed loop's runs kept, several processes with one outcome."""
+"""Making the matrix: resumed where interrupted, with the runs of the closed loop, the same in several processes."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from links.recording import RecordingReader
 from links.run_folder import Asked
 from links.simulated.matrix import flights, making
 from links.simulated.matrix.flights import Cell
-from links.simulated.matrix.making import Outcome, Task, is_made, make_matrix, make_one
+from links.simulated.matrix.making import Outcome, Status, Task, is_made, make_matrix, make_one
 from links.simulated.matrix.matrix import Conditions, cells, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop, loop_metadata
 from links.simulated.rig.run import simulate_into
 from tests.links.simulated.fast_loop import GRAPH
 
-VIEWER = "  look: {use: links.viewer.Viewer}\n"
+VIEWER = "  view: {use: links.viewer.Viewer}\n"
 TABLE = "  table: {use: flow.taps.Csv}\n"
 HOVER = Cell("open_lot", 10, "hover", "parked")
 SHORT_S = 0.2
@@ -43,11 +43,11 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def silent(done: float, whole: float) -> None:
-    """Progress that nobody looks at."""
+    """Ignored progress."""
 
 
 def make_short(task: Task, progress: Callable[[float], None]) -> Outcome:
-    """`make_one` in a process of its own, where nothing is patched; one cell's disk is broken."""
+    """`make_one` in a process of its own, where nothing is patched; the file of one cell cannot be written."""
     flights.USUAL_DURATION_S = SHORT_S
     if task.cell.vehicle == "turning":
         (task.making.folder / f"{task.name}.mcap.part").mkdir()
@@ -55,7 +55,7 @@ def make_short(task: Task, progress: Callable[[float], None]) -> Outcome:
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    """All files of a run with what is in them; of the summary all but times of the computer."""
+    """Content of all files of a run; of the summary all but computing times."""
     found = {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
     summary = json.loads(found["summary.json"])
     summary["wall_s"] = 0
@@ -63,26 +63,26 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return found | {"summary.json": json.dumps(summary).encode()}
 
 
-def test_what_is_there_and_whole_is_kept_and_all_else_made_again(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_complete_recordings_are_kept_and_others_made_again(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(flights, "USUAL_DURATION_S", 0.2)
-    wanted, told = cells(["open_lot-10m-hover-*"]), []
-    first = make_matrix(tmp_path, wanted, range(1, 2), None, lambda done, whole: told.append((done, whole)))
+    selected, progress = cells(["open_lot-10m-hover-*"]), []
+    first = make_matrix(tmp_path, selected, range(1, 2), None, lambda done, whole: progress.append((done, whole)))
     assert (first.made, first.kept, first.impossible) == (3, 0, ())
-    assert told[-1] == pytest.approx((0.6, 0.6))
+    assert progress[-1] == pytest.approx((0.6, 0.6))
     file = tmp_path / "open_lot-10m-hover-parked-s1.mcap"
     with RecordingReader(file) as reader:
         assert reader.metadata["scenario"] == "open_lot-10m-hover-parked"
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])
-    again = make_matrix(tmp_path, wanted, range(1, 2), None, lambda done, whole: None)
+    again = make_matrix(tmp_path, selected, range(1, 2), None, lambda done, whole: None)
     assert (again.made, again.kept) == (1, 2)
     assert file.read_bytes() == whole
     wet = Conditions(rain=True)
-    third = make_matrix(tmp_path, wanted[:1], range(1, 2), None, lambda done, whole: None, wet)
+    third = make_matrix(tmp_path, selected[:1], range(1, 2), None, lambda done, whole: None, wet)
     assert (third.made, third.kept) == (1, 0)
 
 
-def test_a_scene_without_a_place_is_told_and_the_rest_is_made(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_impossible_cell_is_reported_and_the_others_are_made(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(flights.DURATION_S, "occlusion", 0.3)
     report = make_matrix(
         tmp_path, [Cell("open_lot", 35, "occlusion", "parked")], range(1, 2), None, lambda done, whole: None
@@ -91,13 +91,15 @@ def test_a_scene_without_a_place_is_told_and_the_rest_is_made(tmp_path, monkeypa
     assert report.impossible[0].startswith("seed 1: open_lot-35m-occlusion-parked: no free flight of this kind")
 
 
-def test_the_closed_loop_leaves_the_run_that_a_replay_leaves(tmp_path, monkeypatch, config: Path) -> None:
+def test_the_run_of_the_closed_loop_is_that_of_a_replay(tmp_path, monkeypatch, config: Path) -> None:
     monkeypatch.setattr(flights, "USUAL_DURATION_S", 2.0)
     report = make_matrix(tmp_path / "m", [HOVER], range(1, 2), config, silent, results=tmp_path / "runs")
     assert (report.made, report.replayed, report.failed) == (1, 0, ())
     name = "open_lot-10m-hover-parked-s1"
-    asked = ["--config", config, "--out", tmp_path / "again", "--set", "look.file=null"]
-    again = CliRunner().invoke(app, [str(word) for word in ("replay", tmp_path / "m" / f"{name}.mcap", *asked)])
+    arguments = ["--config", config, "--out", tmp_path / "again", "--set", "view.file=null"]
+    again = CliRunner().invoke(
+        app, [str(argument) for argument in ("replay", tmp_path / "m" / f"{name}.mcap", *arguments)]
+    )
     assert again.exit_code == 0, again.output
     left, replayed = files_of(tmp_path / "runs" / f"{name}-fast"), files_of(tmp_path / "again")
     assert left.keys() == replayed.keys()
@@ -112,10 +114,10 @@ def test_the_closed_loop_leaves_the_run_that_a_replay_leaves(tmp_path, monkeypat
     summary = json.loads(left["summary.json"])
     assert summary["sweeps"] >= 1
     assert summary["against_truth"]["fixes"] > 0
-    assert summary["set"] == ["look.file=null"]
+    assert summary["set"] == ["view.file=null"]
 
 
-def test_a_run_that_is_missing_or_stopped_is_replayed_of_the_kept_recording(tmp_path, short, config: Path) -> None:
+def test_a_missing_or_interrupted_run_is_replayed_from_the_kept_recording(tmp_path, short, config: Path) -> None:
     runs, recordings = tmp_path / "runs", tmp_path / "m"
     make_matrix(recordings, [HOVER], range(1, 2), config, silent)  # without runs
     recording = recordings / "open_lot-10m-hover-parked-s1.mcap"
@@ -141,9 +143,7 @@ def test_a_run_that_is_missing_or_stopped_is_replayed_of_the_kept_recording(tmp_
     assert files_of(run) == whole
 
 
-def test_a_flight_that_cannot_be_made_leaves_no_folder_that_looks_like_a_run(
-    tmp_path, config: Path, monkeypatch
-) -> None:
+def test_a_failed_flight_leaves_no_run_folder(tmp_path, config: Path, monkeypatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise LinkError("the drone drifts into a building")
 
@@ -153,7 +153,7 @@ def test_a_flight_that_cannot_be_made_leaves_no_folder_that_looks_like_a_run(
     assert list((tmp_path / "runs").iterdir()) == []
 
 
-def test_a_configuration_with_cameras_is_taken_where_the_rig_has_them(tmp_path, monkeypatch) -> None:
+def test_a_configuration_with_cameras_needs_a_rig_with_cameras(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(flights, "USUAL_DURATION_S", 0.2)
     vision = Path(__file__).resolve().parents[4] / "configs" / "vision.yaml"
     with pytest.raises(ConfigError, match="rig has no 'cameras'"):
@@ -167,7 +167,7 @@ def test_a_configuration_with_cameras_is_taken_where_the_rig_has_them(tmp_path, 
 
 
 def test_a_run_of_an_older_recording_is_not_kept(tmp_path, short, config: Path) -> None:
-    """The recordings were made anew without runs, with rain; the run beside them is of the dry ones."""
+    """The recordings were made again without runs, with rain; the existing run is of the dry ones."""
     runs, recordings, wet = tmp_path / "runs", tmp_path / "m", Conditions(rain=True)
     make_matrix(recordings, [HOVER], range(1, 2), config, silent, results=runs)
     assert make_matrix(recordings, [HOVER], range(1, 2), config, silent, wet).made == 1
@@ -175,12 +175,12 @@ def test_a_run_of_an_older_recording_is_not_kept(tmp_path, short, config: Path) 
     assert (report.kept, report.replayed) == (1, 1)
 
 
-def test_a_changed_configuration_is_noticed_and_a_comment_or_a_viewer_is_none(tmp_path, short, config: Path) -> None:
+def test_a_changed_configuration_is_detected_but_not_a_comment_or_a_viewer(tmp_path, short, config: Path) -> None:
     def made() -> int:
         return make_matrix(tmp_path / "m", [HOVER], range(1, 2), config, silent).made
 
     assert made() == 1
-    config.write_text(config.read_text().replace("Viewer}", "Viewer, config: {slice_s: 0.2}}") + "# looks nicer\n")
+    config.write_text(config.read_text().replace("Viewer}", "Viewer, config: {slice_s: 0.2}}") + "# a comment\n")
     assert made() == 0
     (tmp_path / "stages.yaml").write_text(GRAPH.replace("sweep_rpm: 40", "sweep_rpm: 41"))
     assert made() == 1
@@ -189,7 +189,7 @@ def test_a_changed_configuration_is_noticed_and_a_comment_or_a_viewer_is_none(tm
     assert made() == 1
 
 
-def test_a_recording_that_knows_its_configuration_by_name_only_is_not_made_alike(tmp_path, short, config: Path) -> None:
+def test_a_recording_with_the_name_of_its_configuration_only_is_made_again(tmp_path, short, config: Path) -> None:
     scenario, file = scenario_of(HOVER, 1), tmp_path / "old.mcap"
     graph = Asked(config).graph(scenario.rig_yaml(), "test")
     made_by = loop_metadata(config, graph)
@@ -203,7 +203,7 @@ def test_a_recording_that_knows_its_configuration_by_name_only_is_not_made_alike
         assert len(reader.metadata["closed_loop_hash"]) == 32
 
 
-def test_what_is_stopped_leaves_no_recording_and_no_run_that_looks_whole(tmp_path, short, config: Path) -> None:
+def test_an_interruption_leaves_no_recording_and_no_complete_run(tmp_path, short, config: Path) -> None:
     def interrupt(done: float, whole: float) -> None:
         raise KeyboardInterrupt
 
@@ -215,19 +215,19 @@ def test_what_is_stopped_leaves_no_recording_and_no_run_that_looks_whole(tmp_pat
     assert (report.made, report.replayed) == (1, 0)
 
 
-def test_two_processes_make_what_one_makes_and_an_error_costs_its_own_cell_only(
+def test_two_processes_make_what_one_makes_and_an_error_affects_its_own_cell_only(
     tmp_path, monkeypatch, config: Path
 ) -> None:
     monkeypatch.setattr(making, "make_one", make_short)
     monkeypatch.setattr(flights, "USUAL_DURATION_S", SHORT_S)
-    wanted, told = cells(["open_lot-10m-hover-*"]), []
+    selected, progress = cells(["open_lot-10m-hover-*"]), []
     found = []
     for jobs in (1, 2):
         out, runs = tmp_path / f"m{jobs}", tmp_path / f"runs{jobs}"
-        report = make_matrix(out, wanted, range(1, 2), config, lambda *a: told.append(a), None, runs, jobs)
+        report = make_matrix(out, selected, range(1, 2), config, lambda *a: progress.append(a), None, runs, jobs)
         assert (report.made, len(report.failed)) == (2, 1)
         assert report.failed[0].text.startswith("open_lot-10m-hover-turning-s1: ")
-        assert told[-1] == pytest.approx((0.6, 0.6))
+        assert progress[-1] == pytest.approx((0.6, 0.6))
         recordings = {file.name: file.read_bytes() for file in out.glob("*.mcap")}
         found.append((recordings, {run.name: files_of(run) for run in runs.iterdir() if "turning" not in run.name}))
     assert len(found[0][0]) == len(found[0][1]) == 2
@@ -235,27 +235,27 @@ def test_two_processes_make_what_one_makes_and_an_error_costs_its_own_cell_only(
 
 
 @pytest.mark.parametrize(("stage_failed", "code"), [(False, 2), (True, 1)])
-def test_the_command_names_what_failed_and_returns_what_it_returned_before(
+def test_the_command_prints_failures_and_sets_its_exit_code(
     tmp_path, monkeypatch, stage_failed: bool, code: int
 ) -> None:
-    failed = Outcome("failed", "campus-10m-hover-parked-s1: the disk is full", stage_failed)
-    monkeypatch.setattr(making, "make_one", lambda task, tell: failed if task.seed == 1 else Outcome("made"))
+    failed = Outcome(Status.FAILED, "campus-10m-hover-parked-s1: the disk is full", stage_failed)
+    monkeypatch.setattr(making, "make_one", lambda task, report: failed if task.seed == 1 else Outcome(Status.MADE))
     words = ["matrix", str(tmp_path), "--only", "campus-10m-hover-parked", "--seeds", "3"]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == code
     assert "campus-10m-hover-parked-s1: the disk is full\n" in result.output
-    assert "2 made, 0 were there already\n" in result.output
+    assert "2 made, 0 kept\n" in result.output
 
 
-def test_seeds_begin_where_asked(tmp_path, monkeypatch) -> None:
+def test_seeds_start_at_first_seed(tmp_path, monkeypatch) -> None:
     made: list[int] = []
-    monkeypatch.setattr(making, "make_one", lambda task, tell: made.append(task.seed) or Outcome("made"))
+    monkeypatch.setattr(making, "make_one", lambda task, report: made.append(task.seed) or Outcome(Status.MADE))
     words = ["matrix", str(tmp_path), "--only", "campus-10m-hover-parked", "--seeds", "3", "--first-seed", "6"]
     assert CliRunner().invoke(app, words).exit_code == 0
     assert made == [6, 7, 8]
 
 
-def test_a_wrong_configuration_is_said_once_before_anything_is_made(tmp_path, config: Path) -> None:
+def test_a_wrong_configuration_is_reported_once_before_anything_is_made(tmp_path, config: Path) -> None:
     config.write_text(GRAPH.replace(", inputs: {goal: aim.servo_goal}", ""))
     with pytest.raises(LinkError, match="closed loop needs one servo"):
         make_matrix(tmp_path / "m", [HOVER], range(1, 3), config, silent)
@@ -265,4 +265,4 @@ def test_a_wrong_configuration_is_said_once_before_anything_is_made(tmp_path, co
     assert not (tmp_path / "m").exists()
     without = CliRunner().invoke(app, ["matrix", str(tmp_path / "m"), "--results", str(tmp_path / "runs")])
     assert without.exit_code == 2
-    assert "say whose with --closed-loop CONFIG" in without.output
+    assert "add --closed-loop CONFIG" in without.output

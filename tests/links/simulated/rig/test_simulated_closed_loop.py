@@ -59,7 +59,7 @@ def ran(scenario: Scenario, config: FilePath) -> tuple[list[Record], str]:
 
 
 def states(records: list[Record]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Arrival [ns], goal and position [rad] of the servo's answers."""
+    """Arrival [ns], goal and position [rad] of the servo's readings."""
     read = [(r.arrival_ns, json.loads(r.data)) for r in records if r.topic == "/servo/state"]
     goal, position = ([s[key] for _, s in read] for key in ("goal_rad", "position_rad"))
     return np.array([t for t, _ in read]), np.array(goal), np.array(position)
@@ -85,7 +85,7 @@ def replayed(records: list[Record], scenario: Scenario, config: FilePath) -> tup
     return digest.hexdigest(), goals._seen
 
 
-def test_the_graphs_own_goals_move_the_servo_to_the_drone(ran, scenario: Scenario) -> None:
+def test_goals_of_the_graph_move_the_servo_to_the_drone(ran, scenario: Scenario) -> None:
     """It sweeps to 180 deg, finds the drone in that sweep, and vibrates about azimuth atan2(3.4, 4.4) +- 5 deg."""
     arrival, _, position = states(ran[0])
     assert np.degrees(position).max() > 175
@@ -108,14 +108,14 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(scenario: Sc
     assert run(short.changed(seed=8), config)[1] != output_hash
 
 
-def test_how_far_it_runs_ahead_does_not_change_a_byte(scenario, config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_look_ahead_does_not_change_a_byte(scenario, config, monkeypatch: pytest.MonkeyPatch) -> None:
     short = scenario.changed(duration_s=0.9)
     records, output_hash = run(short, config)
     monkeypatch.setattr(closed_loop, "LONGEST_BATCH_NS", 1_400_000)
     assert run(short, config) == (records, output_hash)
 
 
-def test_no_goal_is_obeyed_before_its_cause_the_computing_and_the_line(ran, scenario: Scenario, config) -> None:
+def test_no_goal_is_executed_before_its_cause_plus_compute_time_and_latency(ran, scenario: Scenario, config) -> None:
     """Each change of the servo's goal comes 20 ms + 2 ms after the arrival that caused it, and at the next reading."""
     arrival, goal, _ = states(ran[0])
     changed = np.nonzero(np.diff(goal))[0] + 1
@@ -140,7 +140,7 @@ def test_a_slower_host_turns_the_servo_later(scenario: Scenario, config: FilePat
 
 
 def test_truth_reaches_no_stage_in_closed_loop(scenario: Scenario, config: FilePath) -> None:
-    """Moving what is only told as truth, the goals stay: here the drone is out of sight, and gone altogether."""
+    """A change of the ground truth alone changes no goal: here the drone is hidden, or missing."""
     far = Path(waypoints=(Waypoint(t_s=0, xyz_m=(0.0, 0.0, 500.0)),))
     short = scenario.changed(duration_s=0.5)
     with_truth = states(run(short.with_drone(far).changed(duration_s=0.5), config)[0])
@@ -149,7 +149,7 @@ def test_truth_reaches_no_stage_in_closed_loop(scenario: Scenario, config: FileP
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_recording_says_how_it_was_made_and_is_replayed_from_disk(tmp_path: FilePath, config: FilePath) -> None:
+def test_the_recording_states_how_it_was_made_and_is_replayed_from_disk(tmp_path: FilePath, config: FilePath) -> None:
     file = tmp_path / "loop.mcap"
     report = simulate(STREET, file, closed_loop=config, duration_s=0.3)
     assert report.output_hash is not None
@@ -161,7 +161,7 @@ def test_the_recording_says_how_it_was_made_and_is_replayed_from_disk(tmp_path: 
     assert replayed(written, load_scenario(STREET), config)[0] == report.output_hash
 
 
-def test_sim_yaml_closes_the_loop_and_a_graph_that_commands_no_servo_is_refused(tmp_path: FilePath) -> None:
+def test_sim_yaml_closes_the_loop_and_a_graph_without_servo_commands_is_rejected(tmp_path: FilePath) -> None:
     scenario = load_scenario(STREET)
     load_loop(SIM, scenario.rig_yaml(), "test", scenario.closed_loop)
     bare = tmp_path / "bare.yaml"
@@ -173,7 +173,7 @@ def test_sim_yaml_closes_the_loop_and_a_graph_that_commands_no_servo_is_refused(
 @pytest.mark.parametrize("topic", ["/truth/drone", "/truth/vehicle", "/truth"])
 @pytest.mark.parametrize("link", ["links.velodyne.Lidar", "links.dynamixel.Servo"])
 def test_no_stage_can_be_wired_to_truth(tmp_path: FilePath, topic: str, link: str) -> None:
-    """Every way from a record to a stage begins at a source, and no source may have such a topic."""
+    """Every path from a record to a stage starts at a source, and no source may have such a topic."""
     text = GRAPH.replace("links:\n", f"links:\n  spy: {{use: {link}, config: {{topic: {topic}}}}}\n")
     file = tmp_path / "spy.yaml"
     file.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Images painted before, served in time: what a camera link reads, when each leaves, and who is turned away."""
+"""Recorded images, served in time: what a camera link reads, when each is served, and who is rejected."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def jpeg(number: int) -> bytes:
 
 
 class Kept:
-    """A camera whose images are there: ten a second, each arrives 60 ms after its stamp."""
+    """A camera with recorded images: ten per second, each arrives 60 ms after its stamp."""
 
     def __init__(self, topic: str, count: int) -> None:
         self.topic, self.count, self.given = topic, count, 0
@@ -44,7 +44,7 @@ class Kept:
         return made
 
 
-def test_a_camera_link_reads_what_is_shown_untouched():
+def test_a_camera_link_reads_images_unchanged():
     stop = threading.Event()
     with MjpegServer(0) as server:
 
@@ -66,7 +66,7 @@ def test_a_camera_link_reads_what_is_shown_untouched():
     assert len(set(taken)) == 4, "none twice"
 
 
-def test_too_many_clients_are_turned_away():
+def test_too_many_clients_are_rejected():
     with MjpegServer(0) as server:
         server.show(jpeg(1))
         url = f"http://127.0.0.1:{server.port}/"
@@ -85,7 +85,7 @@ def test_too_many_clients_are_turned_away():
             keep.join()
 
 
-def test_each_picture_leaves_when_it_arrived_and_none_is_asked_for_beyond_the_end():
+def test_each_image_is_served_at_its_arrival_and_none_is_read_beyond_the_end():
     began_ns = host_time.now_ns()
     shown: list[tuple[bytes, int]] = []
     camera, end_ns = Kept("/camera/drone", 5), 450 * MS
@@ -105,7 +105,7 @@ def test_each_picture_leaves_when_it_arrived_and_none_is_asked_for_beyond_the_en
     assert max(camera.asked_ns) <= end_ns
 
 
-def test_without_the_pictures_it_says_how_to_paint_them(tmp_path):
+def test_without_the_images_the_error_states_how_to_render_them(tmp_path):
     scenario = tmp_path / "small.yaml"
     scenario.write_text("version: 1\n")
     rig = LiveRig(scenario=scenario, servo=tmp_path / "servo", images=tmp_path / "none.mcap")

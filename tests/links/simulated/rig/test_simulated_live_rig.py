@@ -1,4 +1,4 @@
-"""The simulated rig in real time: real packets, a real pty, and rays that go where the servo stands."""
+"""The simulated rig in real time: real packets, a real pty, and rays that follow the servo."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ def run_of(folder: Path, live: bool = True) -> Run:
     return Run(folder, "sim", "", "", live)
 
 
-def test_in_a_replay_there_is_no_rig(tmp_path):
+def test_a_replay_starts_no_rig(tmp_path):
     rig = LiveRig(scenario=tmp_path / "none.yaml", servo=tmp_path / "servo")
     rig.open(run_of(tmp_path, live=False))
     assert rig.trouble is None
     rig.close()
 
 
-def test_a_scenario_that_is_not_there_or_wrong_is_an_error(tmp_path, capfd):
+def test_a_missing_or_wrong_scenario_is_an_error(tmp_path, capfd):
     with pytest.raises(LinkError, match=r"none.yaml: no such scenario; its name is as seen from here"):
         LiveRig(scenario=tmp_path / "none.yaml", servo=tmp_path / "servo").open(run_of(tmp_path))
     (tmp_path / "bad.yaml").write_text(SCENARIO.replace("open_lot", "moon"))
@@ -62,9 +62,9 @@ def test_a_scenario_that_is_not_there_or_wrong_is_an_error(tmp_path, capfd):
     assert "scene.kind: Input should be" in capfd.readouterr().err
 
 
-def test_the_rig_sends_packets_of_now_and_its_rays_go_where_the_servo_was_sent(tmp_path, ports):
+def test_the_rig_sends_current_packets_and_its_rays_follow_the_servo(tmp_path, ports):
     pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
-    from links.simulated.rig.live_process import RigInTime
+    from links.simulated.rig.live_process import RealTimeRig
     from links.simulated.rig.live_rig import LiveRigSettings
 
     (tmp_path / "small.yaml").write_text(SCENARIO)
@@ -72,7 +72,7 @@ def test_the_rig_sends_packets_of_now_and_its_rays_go_where_the_servo_was_sent(t
     settings = LiveRigSettings(
         scenario=tmp_path / "small.yaml", servo=tmp_path / "servo", lidar_port=lidar_port, odometry_port=odometry_port
     )
-    rig, ready = RigInTime(settings, tmp_path), threading.Event()
+    rig, ready = RealTimeRig(settings, tmp_path), threading.Event()
     sending = threading.Thread(target=rig.run, args=(ready,), daemon=True)
     lidar, servo = Lidar(port=lidar_port, timeout_s=60), Servo(port=str(tmp_path / "servo"), start_timeout_s=60)
     with lidar.listen() as packets:
@@ -82,13 +82,13 @@ def test_the_rig_sends_packets_of_now_and_its_rays_go_where_the_servo_was_sent(t
         assert all(f is not None and len(f.pulse_stamp_ns) == 384 for f in firings)
         with servo.listen() as states:
             goal = ServoGoal(stamp_ns=0, position_rad=math.pi / 2, speed_radps=5.0)
-            began_s = told_s = time.monotonic()
+            began_s = sent_s = time.monotonic()
             servo.on_goal(goal)
             while abs(servo.decode(next(states)).position_rad - math.pi / 2) > 0.01:
-                if time.monotonic() > told_s + 1.0:  # a host too busy to talk to it stops the servo: told again
-                    told_s = time.monotonic()
+                if time.monotonic() > sent_s + 1.0:  # a busy host stops the servo by its watchdog: send again
+                    sent_s = time.monotonic()
                     servo.on_goal(goal)
-                assert told_s < began_s + PATIENCE_S
+                assert sent_s < began_s + PATIENCE_S
             now_ns = rig.simulation.now_ns()
             angle_rad = rig.simulation.emulator.output_rad(np.array([now_ns]))
             R_now, _ = rig.simulation.T_world_lidar(np.array([now_ns]))
@@ -98,16 +98,16 @@ def test_the_rig_sends_packets_of_now_and_its_rays_go_where_the_servo_was_sent(t
     output_rad = math.acos((np.trace(R_start[0].T @ R_now[0]) - 1) / 2)
     assert output_rad == pytest.approx(math.pi / 2, abs=0.02)
     assert angle_rad[0] == pytest.approx(math.pi / 2, abs=0.02)
-    told = json.loads((tmp_path / "rig.json").read_text())
-    assert told["packets"] >= 30
+    report = json.loads((tmp_path / "rig.json").read_text())
+    assert report["packets"] >= 30
     with RecordingReader(tmp_path / "truth.mcap") as truth:
         poses = list(truth.records(["/truth/drone"]))
-    assert abs(poses[-1].stamp_ns - host_time.now_ns()) < 3600 * 10**9, "truth is told in the host's time"
+    assert abs(poses[-1].stamp_ns - host_time.now_ns()) < 3600 * 10**9, "ground truth has the host's time"
     assert json.loads(poses[0].data)["xyz_m"] == [5.0, 2.0, 9.0]
 
 
 @pytest.mark.slow
-def test_the_fields_stack_flies_against_the_simulated_rig_and_is_repeated_to_its_hash(tmp_path):
+def test_the_field_stack_flies_with_the_simulated_rig_and_is_replayed_to_its_hash(tmp_path):
     pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
     grd = [sys.executable, "-c", "from links.cli import main; main()"]
     flight = tmp_path / "flight"
@@ -128,7 +128,7 @@ def test_the_fields_stack_flies_against_the_simulated_rig_and_is_repeated_to_its
 
 @pytest.mark.slow
 def test_the_sweep_of_a_real_servo_calibrates_the_rig(tmp_path):
-    """As the README says: the sweep is driven, recorded and calibrated from. The true rig is as its file says."""
+    """As in the README: the sweep is driven, recorded and used for a calibration. The rig file is exact."""
     pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")
     grd = [sys.executable, "-c", "from links.cli import main; main()"]
     sweep, rig = tmp_path / "sweep", tmp_path / "mine.yaml"

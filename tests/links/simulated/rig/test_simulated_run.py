@@ -1,4 +1,4 @@
-"""Whole scenarios: the bytes agree with the truth beside them, and come out the same every time."""
+"""Whole scenarios: the bytes agree with the ground truth and are reproducible."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _T(record: Record) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_bytes_put_the_drone_where_the_truth_has_it(short: Scenario) -> None:
-    """Decode packets, turn them by the recorded servo and the rig's mount, and compare: all frames, all times."""
+    """Decode packets, transform them with the recorded servo and the rig's mount, and compare: all frames, all times."""
     simulation = Simulation(short)
     records = list(simulation.records())
     mount = short.rig.mount
@@ -107,7 +107,7 @@ def test_how_pulses_are_batched_does_not_change_a_byte(short: Scenario, monkeypa
     assert _hash(list(simulate_records(short))) == whole
 
 
-def test_records_come_in_order_of_arrival_and_packets_carry_their_own_time(short: Scenario) -> None:
+def test_records_are_in_order_of_arrival_and_packets_have_their_own_time(short: Scenario) -> None:
     records = list(simulate_records(short))
     arrivals = [r.arrival_ns for r in records]
     assert arrivals == sorted(arrivals)
@@ -143,10 +143,10 @@ def test_an_empty_sky_has_no_drone_in_truth_or_returns() -> None:
 
 def test_a_simulation_is_written_with_its_rig_and_scenario(tmp_path: FilePath) -> None:
     text = STREET.read_text(encoding="utf-8").replace("\nduration_s: ", "\nduration_s: 0.1  # was ")
-    source, out, told = tmp_path / "s.yaml", tmp_path / "s.mcap", []
+    source, out, fractions = tmp_path / "s.yaml", tmp_path / "s.mcap", []
     source.write_text(text, encoding="utf-8")
-    report = simulate(source, out, seed=5, progress=told.append)
-    assert told[-1] == 1.0
+    report = simulate(source, out, seed=5, progress=fractions.append)
+    assert fractions[-1] == 1.0
     assert report.seed == 5
     with RecordingReader(out) as reader:
         assert reader.config_yaml == load_scenario(source).changed(seed=5).as_yaml()
@@ -168,7 +168,7 @@ def test_committed_scenarios_are_valid_and_named_after_their_file(path: FilePath
     assert load_scenario(path).name == path.stem
 
 
-def test_the_committed_recording_is_small_and_says_where_it_comes_from() -> None:
+def test_the_committed_recording_is_small_and_states_its_origin() -> None:
     path = ROOT / "recordings/street_sweep.mcap"
     assert path.stat().st_size < 3_000_000
     with RecordingReader(path) as reader:
@@ -194,7 +194,7 @@ def test_the_committed_recording_is_small_and_says_where_it_comes_from() -> None
         ({"script": [{"do": "spin"}]}, "script.0: Input tag 'spin'"),
     ],
 )
-def test_a_wrong_scenario_is_an_error_that_names_the_file_and_the_key(
+def test_a_wrong_scenario_is_an_error_with_the_file_and_the_key(
     change: dict[str, object], message: str, tmp_path: FilePath
 ) -> None:
     path = tmp_path / "wrong.yaml"
@@ -205,7 +205,7 @@ def test_a_wrong_scenario_is_an_error_that_names_the_file_and_the_key(
     assert message in str(caught.value)
 
 
-def test_a_file_that_is_missing_or_no_yaml_is_an_error(tmp_path: FilePath) -> None:
+def test_a_file_that_is_missing_or_not_yaml_is_an_error(tmp_path: FilePath) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: no such file\."):
         load_scenario(tmp_path / "none.yaml")
     (tmp_path / "bad.yaml").write_text("a: [1", encoding="utf-8")

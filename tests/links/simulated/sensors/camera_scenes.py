@@ -1,4 +1,4 @@
-"""Small scenes with known things in known places, for the camera's tests."""
+"""Small scenes with known objects at known positions, for the tests of the camera."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ def ground():
     return box((-80, -80, -HEIGHT_M - 0.1), (80, 80, -HEIGHT_M), "concrete")
 
 
-def scene_cameras(things, vehicle=None, drone=None, weather=None, seed=1, **settings) -> dict[str, Camera]:
-    """Both cameras (the drone's when there is one) in a world of `things` on flat ground."""
+def scene_cameras(objects, vehicle=None, drone=None, weather=None, seed=1, **settings) -> dict[str, Camera]:
+    """Both cameras (the drone's when there is one) in a world of `objects` on flat ground."""
     truth = Truth(START_NS, vehicle or still(), drone)
     shapes = drone_shapes(0.5, DroneModel()) if drone else ()
-    scene = Scene(merge([ground(), *things]), vehicle_mesh(HEIGHT_M), shapes, truth)
+    scene = Scene(merge([ground(), *objects]), vehicle_mesh(HEIGHT_M), shapes, truth)
     one = CameraSettings.model_validate({"size_px": 360, "sensor": QUIET} | settings)
     seen = vehicle_mesh_from_camera(HEIGHT_M, MOUNT)
     street = Street(0.0, 0.0, -HEIGHT_M, 0.0)
-    wanted = CamerasSettings(vehicle=one, drone=one if drone else None)
-    cameras = build_cameras(wanted, scene, street, weather or Weather(), seen, START_NS, seed)
+    settings = CamerasSettings(vehicle=one, drone=one if drone else None)
+    cameras = build_cameras(settings, scene, street, weather or Weather(), seen, START_NS, seed)
     return dict(zip(("vehicle", "drone"), cameras, strict=False))
 
 
 def pixel_of(camera, point_world_m, stamp_ns):
-    """Where the lens model says a point of the world is seen at a time."""
+    """Pixel of a world point at a time, by the lens model."""
     R, t = camera.T_world_camera(np.array([stamp_ns]))
     ray = R[0].T @ (np.asarray(point_world_m, dtype=np.float64) - t[0])
     return camera.settings.true_lens.project(ray[None])[0]
@@ -64,7 +64,7 @@ def centroid(weight):
 
 
 def redness(image):
-    """Share of a red thing in each pixel; 0 for what is grey, green or blue."""
+    """Fraction of a red object in each pixel; 0 for grey, green and blue."""
     red, green, blue = image.astype(np.float64).transpose(2, 0, 1)
     excess = red - np.maximum(green, blue)
     return np.where(excess > 25, excess, 0.0)

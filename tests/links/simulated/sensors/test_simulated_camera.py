@@ -1,4 +1,4 @@
-"""The fisheyes: what is where in the image, when it was seen, and how light becomes bytes."""
+"""The fisheyes: geometry and timing of images, and how light becomes bytes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from links.simulated.sensors.camera_view import Shutter
 from links.simulated.world.mesh import SURFACES, box, quads
 from links.simulated.world.weather import Weather
 
-OVERCAST = Weather(rain_mmph=2.0)  # no sun: things are lit alike from all sides
+OVERCAST = Weather(rain_mmph=2.0)  # no sun: light from all sides
 STAMP_NS = START_NS + 500_000_000
 LENSES = {
     "equidistant": None,
@@ -40,26 +40,26 @@ LENSES = {
 
 
 @pytest.mark.parametrize("lens", LENSES)
-@pytest.mark.parametrize("place", [(6, 0, 3), (0, 6, 2), (-4, -5, 2), (5, -4, 0.3), (3, 3, 9), (9, 1, -0.9)])
-def test_a_thing_is_seen_by_the_vehicle_where_the_lens_model_says(lens, place):
+@pytest.mark.parametrize("position", [(6, 0, 3), (0, 6, 2), (-4, -5, 2), (5, -4, 0.3), (3, 3, 9), (9, 1, -0.9)])
+def test_the_vehicle_sees_an_object_at_the_pixel_of_the_lens_model(lens, position):
     """Level and below the horizon too: (9, 1, -0.9) is 95.7 deg off the axis."""
-    camera = scene_cameras([cube(place, 0.1)], lens=LENSES[lens], weather=OVERCAST)["vehicle"]
+    camera = scene_cameras([cube(position, 0.1)], lens=LENSES[lens], weather=OVERCAST)["vehicle"]
     seen = centroid(redness(camera.image(STAMP_NS)))
-    np.testing.assert_allclose(seen, pixel_of(camera, place, STAMP_NS), atol=0.5)
+    np.testing.assert_allclose(seen, pixel_of(camera, position, STAMP_NS), atol=0.5)
 
 
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("yaw_deg", [0.0, 70.0, -135.0])
-def test_a_thing_is_seen_by_a_tilted_drone_where_the_lens_model_says(lens, yaw_deg):
-    place = (3.0, -2.5, -1.3)
+def test_a_tilted_drone_sees_an_object_at_the_pixel_of_the_lens_model(lens, yaw_deg):
+    position = (3.0, -2.5, -1.3)
     drone = moving((0, 0, 6), (6, -4, 7), (yaw_deg, yaw_deg + 20))  # accelerates: it is not level
-    camera = scene_cameras([cube(place, 0.1)], drone=drone, lens=LENSES[lens], weather=OVERCAST)["drone"]
+    camera = scene_cameras([cube(position, 0.1)], drone=drone, lens=LENSES[lens], weather=OVERCAST)["drone"]
     image = redness(camera.image(STAMP_NS))
-    np.testing.assert_allclose(centroid(image), pixel_of(camera, place, STAMP_NS), atol=0.5)
+    np.testing.assert_allclose(centroid(image), pixel_of(camera, position, STAMP_NS), atol=0.5)
 
 
 @pytest.mark.parametrize("at", [(5, 3, 8), (-6, 1, 5), (0.5, -7, 3), (2, -3, 12)])
-def test_the_vehicle_sees_the_drone_where_the_lens_model_says(at):
+def test_the_vehicle_sees_the_drone_at_the_pixel_of_the_lens_model(at):
     settings = {"size_px": 720, "sensor": QUIET | {"exposure_ms": 0.5, "max_gain": 1.0}, "weather": OVERCAST}
     camera, without = (scene_cameras([], drone=drone, **settings)["vehicle"] for drone in (still(at), None))
     difference = np.abs(camera.image(STAMP_NS).astype(float) - without.image(STAMP_NS)).sum(axis=2)
@@ -71,20 +71,20 @@ def test_the_drone_sees_the_vehicle_below():
     cameras = scene_cameras([], drone=still((2, 1, 6)))
     image = cameras["drone"].image(STAMP_NS)
     column, row = np.rint(pixel_of(cameras["drone"], (-0.9, 0.5, -0.15), STAMP_NS)).astype(int)  # on its roof
-    beside = np.rint(pixel_of(cameras["drone"], (-0.9, -4.0, -1.8), STAMP_NS)).astype(int)
-    assert image[row, column].mean() > image[beside[1], beside[0]].mean() + 15
+    next_to = np.rint(pixel_of(cameras["drone"], (-0.9, -4.0, -1.8), STAMP_NS)).astype(int)
+    assert image[row, column].mean() > image[next_to[1], next_to[0]].mean() + 15
 
 
 def test_the_vehicles_image_has_forward_at_the_top_and_left_on_the_right():
-    for place, expected in (((6, 0, 6), (0, -1)), ((0, 6, 6), (1, 0)), ((-6, 1.2, 6), (0.2, 1))):
-        camera = scene_cameras([cube(place)])["vehicle"]
+    for position, expected in (((6, 0, 6), (0, -1)), ((0, 6, 6), (1, 0)), ((-6, 1.2, 6), (0.2, 1))):
+        camera = scene_cameras([cube(position)])["vehicle"]
         offset = centroid(redness(camera.image(STAMP_NS))) - (360 - 1) / 2
         np.testing.assert_allclose(offset / np.linalg.norm(offset), expected / np.linalg.norm(expected), atol=0.02)
 
 
 def test_the_drones_image_has_forward_at_the_top_and_right_on_the_right():
-    for place, expected in (((6, 0, 0), (0, -1)), ((0, -6, 0), (1, 0)), ((0.3, 6, 0), (-1, 0))):
-        camera = scene_cameras([cube(place)], drone=still((0, 0, 6)))["drone"]
+    for position, expected in (((6, 0, 0), (0, -1)), ((0, -6, 0), (1, 0)), ((0.3, 6, 0), (-1, 0))):
+        camera = scene_cameras([cube(position)], drone=still((0, 0, 6)))["drone"]
         offset = centroid(redness(camera.image(STAMP_NS))) - (360 - 1) / 2
         np.testing.assert_allclose(offset / np.linalg.norm(offset), expected, atol=0.06)
 
@@ -92,7 +92,7 @@ def test_the_drones_image_has_forward_at_the_top_and_right_on_the_right():
 def test_the_cameras_see_their_own_mounts_and_nothing_outside_the_circle():
     cameras = scene_cameras([], drone=still((0, 0, 60)))
     up, down = (cameras[name].image(STAMP_NS).astype(float) for name in ("vehicle", "drone"))
-    assert up[180, 180].mean() < 0.75 * up[180, 120].mean()  # the LiDAR above stands dark before the sky
+    assert up[180, 180].mean() < 0.75 * up[180, 120].mean()  # the LiDAR above is dark against the sky
     legs = redness(down) * 0 + (down.mean(axis=2) < 40)
     row, column = np.mgrid[:360, :360]
     inside = np.hypot(row - 179.5, column - 179.5) < 150
@@ -102,23 +102,23 @@ def test_the_cameras_see_their_own_mounts_and_nothing_outside_the_circle():
 
 
 def test_a_rolling_shutter_sees_each_row_at_its_own_time():
-    """A vehicle that turns at 90 deg/s: a thing 120 px from the centre moves 188 px/s across; the top row is early."""
-    place, readout_ms = (8, 0, 1.2), 60.0
+    """A vehicle that turns at 90 deg/s: an object 120 px from the centre moves 188 px/s across; the top row is early."""
+    position, readout_ms = (8, 0, 1.2), 60.0
     turn = moving((0, 0, 0), (0, 0, 0), (-45, 45))
     sensor = QUIET | {"exposure_ms": 0.2}
     slow, fast = (
-        scene_cameras([cube(place, 0.3)], turn, readout_ms=r, sensor=sensor)["vehicle"] for r in (readout_ms, 0.0)
+        scene_cameras([cube(position, 0.3)], turn, readout_ms=r, sensor=sensor)["vehicle"] for r in (readout_ms, 0.0)
     )
     seen = {c: centroid(redness(c.image(STAMP_NS))) for c in (slow, fast)}
     at_ns = STAMP_NS
     for _ in range(5):  # the row depends on the time, the time on the row
-        expected = pixel_of(slow, place, at_ns)
+        expected = pixel_of(slow, position, at_ns)
         at_ns = STAMP_NS + round((expected[1] - 179.5) / 360 * readout_ms * 1e6)
-    np.testing.assert_allclose(seen[fast], pixel_of(fast, place, STAMP_NS), atol=0.5)
+    np.testing.assert_allclose(seen[fast], pixel_of(fast, position, STAMP_NS), atol=0.5)
     np.testing.assert_allclose(seen[slow], expected, atol=0.5)
     shift = np.linalg.norm(seen[slow] - seen[fast])
     assert shift > 2.0
-    assert shift == pytest.approx(np.linalg.norm(expected - pixel_of(fast, place, STAMP_NS)), abs=0.3)
+    assert shift == pytest.approx(np.linalg.norm(expected - pixel_of(fast, position, STAMP_NS)), abs=0.3)
 
 
 def test_rows_are_exposed_about_the_stamp_and_parts_fill_the_exposure():
@@ -129,7 +129,7 @@ def test_rows_are_exposed_about_the_stamp_and_parts_fill_the_exposure():
     assert Shutter(STAMP_NS, 4e-3, 0.0).moments(101, 1) == (np.array([STAMP_NS]), 0)
 
 
-def test_a_long_exposure_smears_what_moves():
+def test_a_long_exposure_blurs_moving_objects():
     turn = moving((0, 0, 0), (0, 0, 0), (-45, 45))
     variances = []
     for exposure_ms in (1.0, 30.0):
@@ -139,7 +139,7 @@ def test_a_long_exposure_smears_what_moves():
             for things in ([cube((8, 0, 2.2), 0.3)], [])
         )
         here, there = (c.image(STAMP_NS)[30:90, 150:210].astype(float) ** GAMMA for c in (cube_there, empty))
-        across = np.abs(here - there).sum(axis=(0, 2))  # the thing is at the top and moves sideways
+        across = np.abs(here - there).sum(axis=(0, 2))  # the object is at the top and moves sideways
         column = np.arange(60.0)
         mean = (across * column).sum() / across.sum()
         variances.append((across * (column - mean) ** 2).sum() / across.sum())
@@ -149,7 +149,7 @@ def test_a_long_exposure_smears_what_moves():
     assert variances[1] - variances[0] == pytest.approx(smear_px**2 / 12, rel=0.15)
 
 
-def test_a_sunlit_ground_has_the_things_shadow_away_from_the_sun():
+def test_an_object_casts_its_shadow_away_from_the_sun():
     weather = Weather(sun_elevation_deg=45.0, sun_azimuth_deg=90.0)  # from +y
     camera = scene_cameras([cube((0, 10, 0.0), 0.5)], drone=still((0, 10, 8)), weather=weather)["drone"]
     image = camera.image(STAMP_NS).astype(float).mean(axis=2)
@@ -159,7 +159,7 @@ def test_a_sunlit_ground_has_the_things_shadow_away_from_the_sun():
 
 
 def test_both_sides_of_a_face_can_be_lit():
-    """Which way round a triangle's corners go says nothing about where its outside is."""
+    """The order of a triangle's corners does not define its outside."""
     corners = [(-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1)]
     for face in (corners, corners[::-1]):
         scene = scene_cameras([quads([face], "plaster")])["vehicle"]._view.scene
@@ -170,7 +170,7 @@ def test_both_sides_of_a_face_can_be_lit():
         assert samples.lit.tolist() == [True, False]
 
 
-def test_haze_veils_what_is_far():
+def test_haze_hides_distant_objects():
     far, near = (40.0, 10.0, 2.0), (6.0, -2.0, 0.5)
     clear, hazy = (
         scene_cameras([cube(far, 2.0), cube(near, 0.5)], weather=Weather(visibility_m=v))["vehicle"]
@@ -213,7 +213,7 @@ def test_stripes_are_averaged_over_the_sample():
     assert _overlap(0.0, -0.5, 0.1, 0.4) == pytest.approx(0.75)
 
 
-def test_a_window_knows_its_sides_and_an_odd_triangle_has_none():
+def test_a_window_has_its_sides_and_an_odd_triangle_has_none():
     faces = faces_of(quads([[(0, 0, 0), (2, 0, 0), (2, 0, 1.5), (0, 0, 1.5)]], "glass"))
     assert faces.half.tolist() == [0, 1]
     np.testing.assert_allclose(faces.side_m, [[2, 1.5], [2, 1.5]])
@@ -226,7 +226,7 @@ def _drive():
     return scene_cameras([cube((6, 0, 3))], moving((0, 0, 0), (6, 0, 0)), moving((0, 0, 6), (5, 1, 6)), **settings)
 
 
-def test_frames_come_once_in_order_and_later_than_they_were_measured():
+def test_frames_come_once_in_order_and_after_their_stamp():
     whole, parts = _drive()["vehicle"], _drive()["vehicle"]
     records = whole.records(START_NS + 10**9)
     again = [r for until in range(0, 10**9 + 1, 43_000_000) for r in parts.records(START_NS + until)]
@@ -257,10 +257,10 @@ def test_a_recorded_frame_decodes_to_the_image_that_was_made():
     assert message is not None
     assert (message.stamp_ns, message.frame_id, message.grey.shape) == (record.stamp_ns, "camera_drone", (120, 120))
     made = camera.image(record.stamp_ns, 0) @ [0.299, 0.587, 0.114]
-    assert np.abs(message.grey - made).mean() < 6  # noise, low_pass by the compression
+    assert np.abs(message.grey - made).mean() < 6  # noise, smoothed by the compression
 
 
-def test_the_rig_names_each_camera_with_its_pose_and_lens(tmp_path):
+def test_the_rig_file_has_each_camera_with_pose_and_lens(tmp_path):
     base = "version: 1\nname: x\nstart_utc: 2025-06-01T10:20:30Z\nduration_s: 1\n"
     file = tmp_path / "s.yaml"
     file.write_text(base)
@@ -275,7 +275,7 @@ def test_the_rig_names_each_camera_with_its_pose_and_lens(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("settings", "text"),
     [
         ({"rate_hz": 15, "readout_ms": 60.0}, "exposure and readout take 75 ms, a period is 66.6667 ms"),
         ({"latency_ms": [80, 30]}, "shortest and the longest"),
@@ -284,8 +284,8 @@ def test_the_rig_names_each_camera_with_its_pose_and_lens(tmp_path):
         ({"lens": {"model": "fisheye"}}, "equidistant"),
     ],
 )
-def test_an_impossible_camera_is_refused(settings, says):
-    with pytest.raises(ValidationError, match=says):
+def test_an_impossible_camera_is_rejected(settings, text):
+    with pytest.raises(ValidationError, match=text):
         CamerasSettings.model_validate({"vehicle": settings})
 
 
@@ -296,7 +296,7 @@ def test_a_default_camera_sees_235_deg_in_its_image():
         assert size / 2 - 3 < lens.circle_px < size / 2
 
 
-def test_a_surface_without_a_look_of_its_own_is_as_grey_as_its_reflectivity():
+def test_a_surface_without_a_material_is_as_grey_as_its_reflectivity():
     assert set(MATERIALS) <= set(SURFACES)
     kinds, colours, others = _material_table({"moss": (0.25, 0.1)})
     assert (kinds.tolist(), colours.tolist(), others.tolist()) == ([0], [[0.25] * 3], [[0.25] * 3])

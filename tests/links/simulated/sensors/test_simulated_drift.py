@@ -1,4 +1,4 @@
-"""Drift as configured: each error alone, by hand; sizes over many seeds; the vehicle's odometry made of it."""
+"""Drift as configured: each error alone, by hand; sizes over many seeds; the vehicle's odometry."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _estimate(position: np.ndarray = STRAIGHT, yaw: float = 0.0, seed: int = 1, 
     return DriftingEstimate(position, yaw, NO_DRIFT.model_copy(update=errors), np.random.default_rng(seed))
 
 
-def test_without_errors_it_is_the_truth_in_a_frame_of_its_own() -> None:
+def test_without_errors_it_is_the_truth_in_the_local_frame() -> None:
     estimate = _estimate(yaw=np.radians(90.0))
     np.testing.assert_allclose(estimate.position_m(np.array([0.0, 10.0])), [[0, 0, 0], [0, 30, 1]], atol=1e-9)
     np.testing.assert_allclose(
@@ -44,7 +44,7 @@ def test_without_errors_it_is_the_truth_in_a_frame_of_its_own() -> None:
     )
 
 
-def test_scale_lengthens_and_a_yaw_rate_bends_what_was_travelled() -> None:
+def test_scale_lengthens_and_a_yaw_rate_bends_the_path() -> None:
     end = np.array([60.0])
     np.testing.assert_allclose(_estimate(scale=0.02).position_m(end), [[180 * 1.02, 0, 6]], atol=1e-6)
     bent = _estimate(yaw_rate_deg_per_min=6.0)
@@ -64,19 +64,19 @@ def test_scale_lengthens_and_a_yaw_rate_bends_what_was_travelled() -> None:
         ({"yaw_random_walk_deg_per_sqrt_s": 0.1}, 0, 2),
     ],
 )
-def test_errors_have_the_size_that_the_covariance_says(errors: dict[str, float], block: int, row: int) -> None:
-    still, end, squares, said = np.tile([1.0, 2.0, 3.0], (len(TIMES), 1)), np.array([60.0]), [], 0.0
+def test_errors_have_the_size_of_the_covariance(errors: dict[str, float], block: int, row: int) -> None:
+    still, end, squares, variance = np.tile([1.0, 2.0, 3.0], (len(TIMES), 1)), np.array([60.0]), [], 0.0
     for seed in range(300):
         estimate = _estimate(still, seed=seed, **errors)
         R = estimate.rotations(end, np.eye(3)[None])[0]
-        turned = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        error = np.concatenate([turned, estimate.position_m(end)[0]])
+        rotation = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+        error = np.concatenate([rotation, estimate.position_m(end)[0]])
         squares.append(error[block + row] ** 2)
-        said = estimate.covariances(end, np.eye(3)[None])[0, block + row, block + row]
-    assert np.mean(squares) / said == pytest.approx(1.0, abs=0.3)  # 300 draws: 8 % one sigma
+        variance = estimate.covariances(end, np.eye(3)[None])[0, block + row, block + row]
+    assert np.mean(squares) / variance == pytest.approx(1.0, abs=0.3)  # 300 draws: 8 % one sigma
 
 
-def test_the_velocity_is_the_slope_of_the_position() -> None:
+def test_the_velocity_is_the_derivative_of_the_position() -> None:
     estimate = _estimate(
         velocity_mps=0.2,
         scale=0.03,
@@ -95,7 +95,7 @@ def test_it_never_jumps() -> None:
     assert np.abs(np.diff(p - STRAIGHT, axis=0)).max() < 0.006  # 0.6 m/s within 10 ms
 
 
-def test_covariances_turn_with_the_body() -> None:
+def test_covariances_rotate_with_the_body() -> None:
     R = rotation_from_rpy_deg((20.0, 30.0, 40.0))[None]
     estimate = _estimate(velocity_mps=0.1, height_m=2.0)
     at = np.array([30.0])
@@ -113,7 +113,7 @@ def test_series_by_hand() -> None:
     assert np.corrcoef(x[:-50], x[50:])[0, 1] == pytest.approx(np.exp(-1), abs=0.05)
 
 
-def test_quaternions_are_stages_own() -> None:
+def test_quaternions_agree_with_stages_geometry() -> None:
     R = np.stack([rotation_from_rpy_deg(rpy) for rpy in [(0.0, 0, 0), (10.0, -20, 30), (180.0, 0, 0), (0.0, 0, 180)]])
     q = quaternions_xyzw(R)
     np.testing.assert_allclose(rotations_from_xyzw(q), R, atol=1e-12)
@@ -129,7 +129,7 @@ def test_quaternions_are_stages_own() -> None:
 DRIVE = Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(0, 8 * t, 0), yaw_deg=90) for t in (0, 10, 20)))
 
 
-def test_the_vehicles_odometry_starts_at_zero_and_drifts_with_the_way_driven() -> None:
+def test_the_vehicles_odometry_starts_at_zero_and_drifts_with_distance() -> None:
     exact = VehicleOdometry(VehicleOdometrySettings.model_validate({"drift": dict(NO_DRIFT)}), DRIVE, START_NS, 20.0, 1)
     records = exact.records(START_NS + 21_000_000_000)
     assert len(records) == 1000
@@ -145,7 +145,7 @@ def test_the_vehicles_odometry_starts_at_zero_and_drifts_with_the_way_driven() -
     assert error @ np.linalg.solve(covariance[3:, 3:], error) < 16.0
 
 
-def test_the_vehicles_odometry_comes_late_in_order_and_the_same_in_any_batches() -> None:
+def test_the_vehicles_odometry_is_late_in_order_and_the_same_in_any_batches() -> None:
     def run(step_ns: int) -> list:
         part, records = VehicleOdometry(VehicleOdometrySettings(jitter_s=0.02), DRIVE, START_NS, 2.0, 3), []
         for until in range(START_NS, START_NS + 2_100_000_000, step_ns):

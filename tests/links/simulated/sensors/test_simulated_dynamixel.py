@@ -1,4 +1,4 @@
-"""The emulated MX-28AR: its packets are the SDK's, its rules the e-manual's, its motion the simulated servo's."""
+"""The emulated MX-28AR: packets as in the SDK, rules as in the e-manual, motion of the simulated servo."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_the_checksum_of_the_manuals_own_example():
 
 
 @given(st.lists(st.tuples(st.integers(0, 252), st.binary(max_size=40)), max_size=5), st.binary(max_size=8), st.data())
-def test_packets_come_out_of_a_stream_as_they_went_in_however_it_is_cut(sent, noise, data):
+def test_packets_are_read_from_a_stream_however_it_is_cut(sent, noise, data):
     whole = noise.replace(b"\xff", b"") + b"".join(packet(i, protocol2.WRITE, p) for i, p in sent)
     stream, found = bytearray(), []
     for piece in whole[: (cut := data.draw(st.integers(0, len(whole))))], whole[cut:]:
@@ -43,7 +43,7 @@ def test_packets_come_out_of_a_stream_as_they_went_in_however_it_is_cut(sent, no
     assert found == [Instruction(i, protocol2.WRITE, p) for i, p in sent]
 
 
-def test_a_damaged_packet_is_passed_over_and_the_next_one_taken():
+def test_a_damaged_packet_is_skipped_and_the_next_one_read():
     good = packet(1, protocol2.PING, b"")
     damaged = bytearray(packet(1, protocol2.WRITE, bytes(8)))
     damaged[10] ^= 1
@@ -52,7 +52,7 @@ def test_a_damaged_packet_is_passed_over_and_the_next_one_taken():
 
 
 class Host:
-    """Talks to a servo without a wire, in its own time."""
+    """Sends instructions to a servo without a bus, on its own clock."""
 
     def __init__(self, **settings):
         self.now_ns = 0
@@ -60,10 +60,10 @@ class Host:
 
     def ask(self, code, parameters=b"", servo_id=1):
         self.now_ns += MS
-        return self.servo.answer(Instruction(servo_id, code, parameters), self.now_ns)
+        return self.servo.reply(Instruction(servo_id, code, parameters), self.now_ns)
 
     def write(self, register, value):
-        """The error number of the answer."""
+        """The error number of the reply."""
         return self.ask(protocol2.WRITE, register.address.to_bytes(2, "little") + register.bytes(value))[8]
 
     def read(self, register):
@@ -82,12 +82,12 @@ class Host:
         self.write(mx28.GOAL_POSITION, ticks)
 
 
-def test_it_goes_to_its_goal_at_its_profile_speed():
+def test_it_moves_to_its_goal_at_its_profile_speed():
     host = Host()
     host.drive(2048, 100)  # 22.9 rpm: 90 deg in 0.655 s
     host.wait(0.3)
     assert host.read(mx28.PRESENT_VELOCITY) == 100
-    lag_deg = 137.4**2 / (2 * 6000)  # while it gathers speed
+    lag_deg = 137.4**2 / (2 * 6000)  # while it accelerates
     assert host.read(mx28.PRESENT_POSITION) == pytest.approx(1024 + (0.302 * 137.4 - lag_deg) / 360 * 4096, abs=4)
     assert host.read(mx28.MOVING) == 1
     host.wait(0.5)
@@ -115,7 +115,7 @@ def test_without_torque_it_does_not_move_and_with_it_a_goal_from_before_counts()
         (mx28.PROFILE_VELOCITY, 30, 0),
     ],
 )
-def test_what_may_not_be_written_is_refused_and_not_written(register, value, error):
+def test_a_forbidden_write_is_rejected_and_changes_nothing(register, value, error):
     host = Host()
     host.servo.set(mx28.RETURN_DELAY_TIME, 250)
     host.write(mx28.TORQUE_ENABLE, 1)
@@ -124,7 +124,7 @@ def test_what_may_not_be_written_is_refused_and_not_written(register, value, err
     assert host.read(register) == (before if error else value)
 
 
-def test_half_a_register_and_a_block_beyond_the_table_are_refused():
+def test_half_a_register_and_a_block_beyond_the_table_are_rejected():
     host = Host()
     assert host.ask(protocol2.WRITE, bytes([117, 0, 1]))[8] == mx28.DATA_LENGTH
     assert host.ask(protocol2.READ, bytes([0, 2, 255, 0]))[8] == mx28.DATA_LENGTH
@@ -142,7 +142,7 @@ def test_other_ids_and_low_status_levels_are_not_answered():
     assert host.ask(protocol2.PING)[9:12] == bytes([30, 0, 45])
 
 
-def test_its_watchdog_stops_it_when_nobody_talks_and_locks_its_goal():
+def test_its_watchdog_stops_it_without_instructions_and_locks_its_goal():
     host = Host()
     host.drive(3000, 100)
     host.write(mx28.BUS_WATCHDOG, 5)
@@ -157,7 +157,7 @@ def test_its_watchdog_stops_it_when_nobody_talks_and_locks_its_goal():
     assert host.write(mx28.GOAL_POSITION, 2000) == 0
 
 
-def test_a_shutdown_lasts_until_a_reboot_which_takes_its_ram_and_some_time():
+def test_a_shutdown_lasts_until_a_reboot_which_resets_its_ram_and_takes_time():
     host = Host()
     host.drive(1100, 100)
     host.servo.shut_down(host.now_ns)
@@ -170,7 +170,7 @@ def test_a_shutdown_lasts_until_a_reboot_which_takes_its_ram_and_some_time():
     assert [host.read(r) for r in (mx28.TORQUE_ENABLE, mx28.PROFILE_VELOCITY, mx28.BUS_WATCHDOG)] == [0, 0, 0]
 
 
-def test_a_blocked_shaft_shows_load_and_shuts_down_only_while_it_wants_to_move():
+def test_a_blocked_shaft_shows_load_and_shuts_down_only_while_it_tries_to_move():
     host = Host()
     host.servo.block(0, overload_s=0.5)
     host.wait(1.0)
@@ -182,7 +182,7 @@ def test_a_blocked_shaft_shows_load_and_shuts_down_only_while_it_wants_to_move()
     assert host.read(mx28.TORQUE_ENABLE) == 0
 
 
-def test_the_true_angle_has_the_encoders_error_and_the_play_in_it():
+def test_the_output_angle_has_encoder_error_and_backlash():
     host = Host(encoder_error_deg=1.0, backlash_deg=0.5)
     host.drive(2048)
     host.wait(1.0)
@@ -193,7 +193,7 @@ def test_the_true_angle_has_the_encoders_error_and_the_play_in_it():
     assert (np.abs(difference_deg) < 1.3).all()
 
 
-def test_it_can_be_asked_where_it_stood_at_any_time_of_the_last_seconds():
+def test_its_position_is_available_for_any_time_of_the_last_seconds():
     with DynamixelEmulator(ServoSettings(travel_deg=(0, 360), start_deg=45)) as emulator:
         now = time.monotonic_ns()
         assert np.degrees(emulator.output_rad(np.array([now - 10 * MS, now]))) == pytest.approx([45, 45], abs=1e-6)
@@ -208,7 +208,7 @@ def fails(ask):
     return False
 
 
-def test_alone_in_its_process_it_takes_faults_from_standard_input(tmp_path):
+def test_in_its_own_process_it_reads_faults_from_standard_input(tmp_path):
     path = tmp_path / "servo"
     process = subprocess.Popen(
         [sys.executable, "-m", "links.simulated.sensors.dynamixel_emulator", str(path)],
@@ -225,16 +225,16 @@ def test_alone_in_its_process_it_takes_faults_from_standard_input(tmp_path):
         assert bus.ping() == 30
         process.stdin.write("nonsense\nlate one\nsilence 1\n")
         process.stdin.flush()
-        said = [process.stderr.readline(), process.stderr.readline()]
-        assert fails(bus.ping)  # the line after those that it complained about has been read, or soon will be
+        errors = [process.stderr.readline(), process.stderr.readline()]
+        assert fails(bus.ping)  # the line after the rejected ones is read now or soon
         bus.close()
         process.stdin.close()
         assert process.wait(10) == 0
-    assert "no such fault: 'nonsense'" in said[0]
-    assert said[1].startswith("late: ")
+    assert "no such fault: 'nonsense'" in errors[0]
+    assert errors[1].startswith("late: ")
 
 
-def test_a_status_packet_is_stuffed_where_its_data_looks_like_a_header():
+def test_a_status_packet_is_stuffed_where_its_data_contains_a_header():
     whole = status(1, 0, b"\xff\xff\xfd\x01")
     assert whole[9:14] == b"\xff\xff\xfd\xfd\x01"
     assert take(bytearray(whole)).parameters == b"\x00\xff\xff\xfd\x01"

@@ -1,4 +1,4 @@
-"""The simulated VLP-16 against walls whose answer is known."""
+"""The simulated VLP-16 against walls with known answers."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from links.simulated.kernels.lidar import echoes
-from links.simulated.sensors.footprint import COARSE, FINE, FOOTPRINTS, sub_rays
-from links.simulated.sensors.lidar import Lidar, LidarSettings
+from links.simulated.sensors.lidar import COARSE, FINE, FOOTPRINTS, Lidar, LidarSettings, sub_rays
 from links.simulated.world.mesh import RayScene, box, merge, quads
 from links.velodyne import vlp16
 from stages.geometry import rotation_from_rpy_deg, rotation_z
@@ -16,8 +15,8 @@ START_NS = 1_748_773_230_000_000_000
 SHARES = np.full(4, 0.25)
 
 
-class _Room:
-    """A fixed scene without a drone."""
+class _Scene:
+    """A static scene without a drone."""
 
     def __init__(self, mesh) -> None:
         self._scene = RayScene(mesh)
@@ -37,12 +36,12 @@ def _wall(x_m: float, surface: str = "plaster", half_m: float = 200.0):
     )
 
 
-def _fire(room, sequences: int, R=None, seed: int = 1, **settings):
+def _fire(scene, sequences: int, R=None, seed: int = 1, **settings):
     lidar = Lidar(LidarSettings(**settings), START_NS, seed)
     stamps = START_NS + vlp16.SEQUENCE_NS * np.arange(sequences)[:, None] + vlp16.PULSE_NS * np.arange(16)
     stamps = stamps.ravel().astype(np.int64)
     rotations = np.broadcast_to(np.eye(3) if R is None else R, (len(stamps), 3, 3)).copy()
-    pulses = lidar.fire(stamps, rotations, np.zeros((len(stamps), 3)), room)
+    pulses = lidar.fire(stamps, rotations, np.zeros((len(stamps), 3)), scene)
     return lidar, stamps, pulses
 
 
@@ -52,14 +51,14 @@ def _echo(ranges, fractions, threshold=1e-12, mode="dual", shares=SHARES):
     return [part[:, 0] for part in echoes(ranges, fractions, drone, shares, np.array([threshold]), 0.5, mode)]
 
 
-def test_an_echo_is_the_power_weighted_mean_of_what_lies_within_a_pulse_length() -> None:
+def test_an_echo_is_the_power_weighted_mean_within_a_pulse_length() -> None:
     ranges, power, _, _ = _echo([10.0, 10.5, 11.2, np.inf], [0.2, 0.4, 0.8, 0.0], mode="strongest")
     p = 0.25 * np.array([0.2, 0.4, 0.8]) / np.array([10.0, 10.5, 11.2]) ** 2  # 1.2 m in all, but no gap over 1 m
     assert power[0] == pytest.approx(p.sum(), rel=1e-6)
     assert ranges[0] == pytest.approx((p @ [10.0, 10.5, 11.2]) / p.sum(), abs=1e-5)
 
 
-def test_strongest_last_and_dual_choose_as_the_manual_says() -> None:
+def test_strongest_last_and_dual_choose_as_in_the_manual() -> None:
     seen = [5.0, 8.0, 20.0, np.inf], [0.1, 0.5, 0.5, 0.0]
     assert _echo(*seen, mode="strongest")[0] == pytest.approx([8.0])
     assert _echo(*seen, mode="last")[0] == pytest.approx([20.0])
@@ -77,7 +76,7 @@ def test_an_echo_below_the_threshold_is_neither_last_nor_strongest() -> None:
     assert _echo(*seen, mode="dual", threshold=np.inf)[0] == pytest.approx([0.0, 0.0])
 
 
-def test_what_is_too_near_hides_but_is_not_seen() -> None:
+def test_a_surface_that_is_too_near_hides_others_and_is_not_measured() -> None:
     assert _echo([0.3, 0.3, 9.0, 9.0], [0.5] * 4, mode="strongest")[0] == pytest.approx([9.0])
     assert _echo([0.3, 0.3, 0.4, 0.4], [0.5] * 4, mode="strongest")[0] == pytest.approx([0.0])
 
@@ -101,10 +100,10 @@ def test_the_footprint_is_3_by_1_5_mrad_and_its_shares_add_to_one() -> None:
     for pattern in {FINE, *FOOTPRINTS["dense"], *FOOTPRINTS["sparse"]}:
         assert pattern.shares.sum() == pytest.approx(1.0)
         assert len(pattern.shares) == len(pattern.offsets)
-        assert np.abs(pattern.shares @ pattern.offsets).max() < 1e-12  # its middle is the axis
+        assert np.abs(pattern.shares @ pattern.offsets).max() < 1e-12  # its centre is the axis
 
 
-def test_a_turned_and_shifted_lidar_sends_turned_and_shifted_rays_from_its_aperture() -> None:
+def test_a_rotated_and_shifted_lidar_sends_rotated_and_shifted_rays_from_its_aperture() -> None:
     azimuth, laser, corners = (
         np.array([0.3]),
         np.array([6]),
@@ -119,9 +118,9 @@ def test_a_turned_and_shifted_lidar_sends_turned_and_shifted_rays_from_its_apert
     np.testing.assert_allclose((origins[0, 3] - origins[0, 2]) / 9.5e-3, (rays[0, 3] - rays[0, 2]) / 1.5e-3, atol=1e-3)
 
 
-def test_a_wall_is_measured_where_it_stands_with_the_stated_noise() -> None:
-    room = _Room(_wall(8.0))
-    lidar, stamps, pulses = _fire(room, 1900, laser_bias_m=0.0, dropout=0.0)
+def test_a_wall_is_measured_at_its_range_with_the_stated_noise() -> None:
+    scene = _Scene(_wall(8.0))
+    lidar, stamps, pulses = _fire(scene, 1900, laser_bias_m=0.0, dropout=0.0)
     azimuth, laser = lidar.azimuth_rad(stamps), np.arange(len(stamps)) % 16
     elevation = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))[laser]
     facing = np.cos(elevation) * np.sin(azimuth)
@@ -134,19 +133,19 @@ def test_a_wall_is_measured_where_it_stands_with_the_stated_noise() -> None:
     assert not pulses.range_m[0, facing < 0].any()
 
 
-def test_turning_world_and_lidar_together_changes_nothing_but_rounding() -> None:
+def test_rotating_world_and_lidar_together_changes_rounding_only() -> None:
     mesh = merge([_wall(8.0), box((3, 1, -1), (4, 2, 1), "brick")])
     turn = rotation_z(0.7)
-    _, _, plain = _fire(_Room(mesh), 300)
-    _, _, turned = _fire(_Room(mesh.moved(rotation=turn)), 300, R=turn)
-    both = (plain.range_m > 0) & (turned.range_m > 0)
+    _, _, plain = _fire(_Scene(mesh), 300)
+    _, _, rotated = _fire(_Scene(mesh.moved(rotation=turn)), 300, R=turn)
+    both = (plain.range_m > 0) & (rotated.range_m > 0)
     assert both.sum() > 0.99 * (plain.range_m > 0).sum()
-    assert np.quantile(np.abs(plain.range_m - turned.range_m)[both], 0.98) < 0.0041
+    assert np.quantile(np.abs(plain.range_m - rotated.range_m)[both], 0.98) < 0.0041
 
 
-def test_a_dark_wall_fades_at_the_range_where_ten_percent_is_half_seen() -> None:
+def test_half_of_the_pulses_on_a_ten_percent_wall_return_at_the_stated_range() -> None:
     def share(x_m: float) -> float:
-        lidar, stamps, pulses = _fire(_Room(_wall(x_m, "wire")), 1900, dropout=0.0)
+        lidar, stamps, pulses = _fire(_Scene(_wall(x_m, "wire")), 1900, dropout=0.0)
         straight = (np.abs(lidar.azimuth_rad(stamps) - np.pi / 2) < 0.05) & (np.arange(len(stamps)) % 16 == 1)
         return float((pulses.range_m[0, straight] > 0).mean())
 
@@ -159,7 +158,7 @@ def test_a_dark_wall_fades_at_the_range_where_ten_percent_is_half_seen() -> None
 def test_an_edge_gives_mixed_returns_only_within_a_pulse_length() -> None:
     def between(gap_m: float) -> int:
         edge = quads([[(6.0, -50, -50), (6.0, 0.3, -50), (6.0, 0.3, 50), (6.0, -50, 50)]], "plaster")
-        lidar, stamps, pulses = _fire(_Room(merge([edge, _wall(6.0 + gap_m)])), 1900, laser_bias_m=0.0)
+        lidar, stamps, pulses = _fire(_Scene(merge([edge, _wall(6.0 + gap_m)])), 1900, laser_bias_m=0.0)
         elevation = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))[np.arange(len(stamps)) % 16]
         x = pulses.range_m[0] * np.cos(elevation) * np.sin(lidar.azimuth_rad(stamps))
         return int(np.count_nonzero((x > 6.1) & (x < 6.0 + gap_m - 0.1)))
@@ -168,11 +167,11 @@ def test_an_edge_gives_mixed_returns_only_within_a_pulse_length() -> None:
     assert between(3.0) == 0
 
 
-def test_a_sparse_footprint_sees_walls_alike_and_as_many_of_the_pulses_at_an_edge() -> None:
+def test_a_sparse_footprint_measures_walls_and_edges_like_a_dense_one() -> None:
     edge = quads([[(6.0, -50, -50), (6.0, 0.3, -50), (6.0, 0.3, 50), (6.0, -50, 50)]], "plaster")
-    room = _Room(merge([edge, _wall(9.0)]))
-    _, _, dense = _fire(room, 1900, footprint="dense")
-    _, _, sparse = _fire(room, 1900, footprint="sparse")
+    scene = _Scene(merge([edge, _wall(9.0)]))
+    _, _, dense = _fire(scene, 1900, footprint="dense")
+    _, _, sparse = _fire(scene, 1900, footprint="sparse")
     d, s = dense.range_m[0], sparse.range_m[0]
     alike = np.abs(d - s) < 0.02
     assert alike.mean() > 0.98
@@ -180,7 +179,7 @@ def test_a_sparse_footprint_sees_walls_alike_and_as_many_of_the_pulses_at_an_edg
     assert np.count_nonzero(s > 8.9) == pytest.approx(np.count_nonzero(d > 8.9), rel=0.01)
 
 
-def test_nothing_in_reach_is_no_return() -> None:
-    _, _, pulses = _fire(_Room(_wall(140.0)), 200)
+def test_nothing_in_range_is_no_return() -> None:
+    _, _, pulses = _fire(_Scene(_wall(140.0)), 200)
     assert not pulses.range_m.any()
     assert not pulses.reflectivity.any()

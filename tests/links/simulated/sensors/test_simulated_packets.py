@@ -1,4 +1,4 @@
-"""Our packets, read back by the product's decoder and byte by byte."""
+"""Encoded packets, read by grd's decoder and byte by byte."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _decode(data: bytes, stamp_ns: int) -> LidarFirings:
     mode=st.sampled_from(["strongest", "last"]),
     since_us=st.integers(0, 7_200_000_000),
 )
-def test_what_is_encoded_is_what_the_decoder_reads(seed: int, azimuth_deg: float, mode: str, since_us: int) -> None:
+def test_the_decoder_reads_what_was_encoded(seed: int, azimuth_deg: float, mode: str, since_us: int) -> None:
     rng = np.random.default_rng(seed)
     ticks = rng.integers(250, 52_500, (1, 24, 16)) * (rng.uniform(size=(1, 24, 16)) < 0.7)
     shade = rng.integers(1, 256, ticks.shape).astype(np.uint8)
@@ -72,7 +72,7 @@ def test_dual_packets_keep_the_last_return_in_even_blocks_and_the_strongest_in_o
     assert set(firings.range_m[firings.return_kind == 1].round(3)) == {12.0}
 
 
-def test_the_packets_ends_are_where_the_manual_puts_them() -> None:
+def test_the_ends_of_a_packet_are_as_in_the_manual() -> None:
     shape = (1, 24, 16)
     data = _packet("strongest", START_NS + 999, 359.996, np.full(shape, 1.5), np.full(shape, 77, dtype=np.uint8))
     assert len(data) == 1206
@@ -82,12 +82,12 @@ def test_the_packets_ends_are_where_the_manual_puts_them() -> None:
     assert data[1204:] == b"\x37\x22"
 
 
-def test_a_row_of_the_wrong_length_is_refused() -> None:
+def test_a_row_of_the_wrong_length_is_rejected() -> None:
     with pytest.raises(ValueError, match=r"dual packets take ranges \(2, 12, 16\), got \(1, 24, 16\)"):
         encode_packet(0, np.zeros(12), np.zeros((1, 24, 16)), np.zeros((1, 24, 16), dtype=np.uint8), "dual")
 
 
-def test_a_position_packet_tells_the_time_and_that_the_clock_is_locked_to_it():
+def test_a_position_packet_has_the_time_and_a_locked_clock():
     at_ns = 1_748_773_230_250_000_000  # 2025-06-01T10:20:30.25Z
     read = parse_position(encode_position(at_ns))
     assert read.gps_utc == datetime(2025, 6, 1, 10, 20, 30, tzinfo=UTC)

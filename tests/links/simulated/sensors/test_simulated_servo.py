@@ -53,7 +53,7 @@ def test_a_sweep_at_11_4_rpm_takes_2_63_s() -> None:
     assert position[-1] == pytest.approx(0.0, abs=math.radians(0.6))
 
 
-def test_vibration_swings_five_degrees_about_the_table_slower_than_asked() -> None:
+def test_vibration_swings_five_degrees_about_the_table_slower_than_commanded() -> None:
     vibrate = VibrateSegment(duration_s=5.0, azimuth_table=((0.0, 40.0),))
     _, times, position = _run(_bus(vibrate), 2.0)
     settled = np.degrees(position[times > 0.5])
@@ -64,18 +64,18 @@ def test_vibration_swings_five_degrees_about_the_table_slower_than_asked() -> No
     assert swing_s > 2 * math.sqrt(math.radians(10.0) / math.radians(6000.0)) - 0.01  # acceleration bound, not 29 ms
 
 
-def test_following_aims_where_the_drone_was_before_the_latency() -> None:
-    asked = []
+def test_following_aims_at_the_drone_before_the_latency() -> None:
+    query_s = []
 
     def drone(time_s: float) -> float:
-        asked.append(time_s)
+        query_s.append(time_s)
         return math.radians(60.0)
 
     _, times, position = _run(
         _bus(VibrateSegment(duration_s=5.0, follow_drone=True, aim_error_deg=0.0), drone=drone), 1.5
     )
     assert np.degrees(position[times > 0.7]).mean() == pytest.approx(60.0, abs=1.0)
-    assert asked[0] < -0.1
+    assert query_s[0] < -0.1
 
 
 def test_readings_are_whole_encoder_steps_near_the_truth_at_their_stamp() -> None:
@@ -93,14 +93,14 @@ def test_readings_are_whole_encoder_steps_near_the_truth_at_their_stamp() -> Non
     assert {s["error"] for s in states} == {0}
 
 
-def test_a_clock_error_moves_the_stamps_alone() -> None:
+def test_a_clock_error_moves_the_stamps_only() -> None:
     plain, _, _ = _run(_bus(SweepSegment()), 0.5)
     early, _, _ = _run(_bus(SweepSegment(), shift_ns=1_000_000), 0.5)
     assert [a.stamp_ns - b.stamp_ns for a, b in zip(plain, early, strict=True)] == [1_000_000] * len(plain)
     assert [a.data for a in plain] == [b.data for b in early]
 
 
-def test_without_a_script_it_stays() -> None:
+def test_without_a_script_it_does_not_move() -> None:
     _, _, position = _run(_bus(start_deg=30.0), 0.3)
     np.testing.assert_allclose(position, math.radians(30.0))
 
@@ -111,36 +111,36 @@ def test_a_vibration_needs_exactly_one_aim() -> None:
             VibrateSegment(duration_s=1.0, **wrong)
 
 
-def test_play_holds_the_turntable_until_the_shaft_takes_it_along() -> None:
-    turned = GearTrain(ServoSettings(backlash_deg=0.4), 1)
+def test_backlash_holds_the_turntable_until_the_shaft_moves_it() -> None:
+    gear_train = GearTrain(ServoSettings(backlash_deg=0.4), 1)
     degrees = [0.0, 0.1, 0.3, 5.0, 4.9, 4.6, 4.5, 0.0]
-    seen = [math.degrees(turned.follow(math.radians(d))) for d in degrees]
+    seen = [math.degrees(gear_train.follow(math.radians(d))) for d in degrees]
     assert seen == pytest.approx([0.0, 0.0, 0.1, 4.8, 4.8, 4.8, 4.7, 0.2])
 
 
-def test_without_errors_the_turntable_stands_where_the_encoder_is() -> None:
+def test_without_errors_turntable_and_encoder_agree() -> None:
     bus = _bus(SweepSegment())
     _, times, position = _run(bus, 1.0)
     np.testing.assert_array_equal(bus.output_rad(START_NS + np.rint(times * 1e9).astype(np.int64)), position)
 
 
-def test_the_encoders_error_is_harmonic_has_the_peak_asked_for_and_its_shape_by_seed() -> None:
+def test_the_encoders_error_is_harmonic_with_its_peak_and_drawn_by_seed() -> None:
     around = np.linspace(0, 2 * math.pi, 3601)
     shapes = []
     for seed in (1, 2):
-        turned = GearTrain(ServoSettings(encoder_error_deg=0.5), seed)
-        error = np.degrees([turned.encoder_error_rad(p) for p in around])
+        gear_train = GearTrain(ServoSettings(encoder_error_deg=0.5), seed)
+        error = np.degrees([gear_train.encoder_error_rad(p) for p in around])
         spectrum = np.abs(np.fft.rfft(error[:-1])) / 1800
         assert 0.3 < np.abs(error).max() <= 0.5 + 1e-9
         assert spectrum[1] + spectrum[2] == pytest.approx(0.5)
         assert spectrum[[0, 3, 4]].max() < 1e-9
         shapes.append(error)
         position = 1.0
-        assert turned.follow(position) == pytest.approx(position - turned.encoder_error_rad(position))
+        assert gear_train.follow(position) == pytest.approx(position - gear_train.encoder_error_rad(position))
     assert np.abs(shapes[0] - shapes[1]).max() > 0.1
 
 
-def test_a_command_is_obeyed_its_latency_after_it_was_sent_and_in_order() -> None:
+def test_a_command_is_executed_its_latency_after_it_was_sent_and_in_order() -> None:
     bus = _bus(command_latency_s=0.030, command_jitter_s=0.004)
     bus.command(START_NS + 100_000_000, math.radians(90.0), 1.0)
     bus.command(START_NS + 101_000_000, math.radians(20.0), 1.0)

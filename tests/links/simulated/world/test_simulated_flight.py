@@ -1,4 +1,4 @@
-"""The flown path: near what was asked, with an attitude of its own, and all of its parts belonging together."""
+"""The flown path: near its reference, with an attitude of its own, and consistent states."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ def test_in_calm_air_a_hover_stays_and_is_level() -> None:
     np.testing.assert_allclose(R, np.tile([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (len(TIMES), 1, 1)), atol=1e-6)
 
 
-def test_a_steady_wind_is_leaned_into_by_what_its_drag_takes() -> None:
+def test_a_steady_wind_tilts_the_drone_by_its_drag() -> None:
     flight = Flight(HOVER, CALM.model_copy(update={"wind_world_mps": (6.0, 0.0, 0.0)}), 40.0, 1)
     R, p = flight.flying_poses(np.array([39.0]))
     np.testing.assert_allclose(p[0], [5, 3, 10], atol=0.02)
     assert np.arctan2(-R[0, 0, 2], R[0, 2, 2]) == pytest.approx(np.arctan2(6 * DRAG_PER_S, GRAVITY_MPS2), rel=0.02)
 
 
-def test_the_attitude_is_not_the_paths_and_the_place_is_near_it() -> None:
+def test_the_attitude_differs_from_that_of_the_path_and_the_position_is_near_it() -> None:
     flight = Flight(DASH, CALM, 14.0, 1)
     R, p = flight.flying_poses(TIMES)
     R_path, p_path = DASH.flying_poses(TIMES)
     assert np.linalg.norm(p - p_path, axis=1).max() < 0.5
-    lean, lean_path = (np.degrees(np.arctan2(r[:, 0, 2], r[:, 2, 2])) for r in (R, R_path))
-    assert 0.2 < np.sqrt(np.mean((lean - lean_path) ** 2)) < 3.0
-    assert np.abs(lean - lean_path).max() > 1.0
+    tilt, tilt_path = (np.degrees(np.arctan2(r[:, 0, 2], r[:, 2, 2])) for r in (R, R_path))
+    assert 0.2 < np.sqrt(np.mean((tilt - tilt_path) ** 2)) < 3.0
+    assert np.abs(tilt - tilt_path).max() > 1.0
     R_gusty, _ = Flight(DASH, FlightSettings(), 14.0, 1).flying_poses(TIMES)
     assert np.degrees(np.sqrt(np.mean((R_gusty - R_path) ** 2))) > 0.5
 
 
 class Kick(Path):
-    """From rest to 3 m/s^2 at once, towards its waypoint: no drone can lean so suddenly."""
+    """From rest to 3 m/s^2 at once, towards its waypoint: no drone can tilt that fast."""
 
     def at(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         along, since = np.array(self.waypoints[0].xyz_m), np.maximum(time_s - 1.0, 0.0)[:, None]
@@ -59,12 +59,12 @@ class Kick(Path):
 
 
 @pytest.mark.parametrize("along", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)])  # pitches, rolls
-def test_a_lean_asked_at_once_comes_with_the_lag_of_both_loops(along: tuple[float, float, float]) -> None:
+def test_a_tilt_step_has_the_lag_of_both_loops(along: tuple[float, float, float]) -> None:
     R, _ = Flight(Kick(waypoints=(Waypoint(t_s=0, xyz_m=along),)), CALM, 3.0, 1).flying_poses(TIMES[:600])
-    lean = np.arctan2(R[:, :, 2] @ along, R[:, 2, 2])
-    assert np.abs(lean[:200]).max() < 1e-6
-    half_s = TIMES[np.argmax(lean > 0.5 * np.arctan2(3.0, GRAVITY_MPS2))] - 1.0
-    assert 0.08 < half_s < 0.2  # 1/8 s of the attitude loop, 0.05 s of the rate loop: half way at ln 2 of their sum
+    tilt = np.arctan2(R[:, :, 2] @ along, R[:, 2, 2])
+    assert np.abs(tilt[:200]).max() < 1e-6
+    half_s = TIMES[np.argmax(tilt > 0.5 * np.arctan2(3.0, GRAVITY_MPS2))] - 1.0
+    assert 0.08 < half_s < 0.2  # 1/8 s of the attitude loop, 0.05 s of the rate loop: half at ln 2 of their sum
 
 
 @pytest.mark.parametrize("settings", [CALM, FlightSettings(gust_mps=2.0, wind_world_mps=(4.0, -3.0, 0.0))])
@@ -81,7 +81,7 @@ def test_velocity_turn_rate_and_force_are_those_of_the_poses(settings: FlightSet
     np.testing.assert_allclose(yaw, np.arctan2(R[:, 1, 0], R[:, 0, 0]))
 
 
-def test_limits_of_rate_and_lean_are_kept() -> None:
+def test_limits_of_rate_and_tilt_are_kept() -> None:
     hard = CALM.model_copy(update={"rate_limit_degps": 30.0, "tilt_limit_deg": 15.0, "yaw_rate_limit_degps": 20.0})
     spin = Path(waypoints=(*DASH.waypoints[:-1], Waypoint(t_s=16, xyz_m=(40, 0, 10), yaw_deg=300)))
     R, _ = Flight(spin, hard, 14.0, 1).flying_poses(TIMES)
@@ -101,20 +101,20 @@ def test_gusts_move_it_more_when_stronger_and_differ_by_seed() -> None:
     assert rms(1.0, 1) != rms(1.0, 2)
 
 
-def test_outside_its_time_it_holds_its_ends() -> None:
+def test_outside_its_time_it_has_its_first_or_last_state() -> None:
     flight = Flight(DASH, CALM, 4.0, 1)
     p = flight.flying_poses(np.array([-5.0, 0.0, 5.0, 99.0]))[1]
     np.testing.assert_array_equal(p[0], p[1])
     np.testing.assert_array_equal(p[2], p[3])
 
 
-def test_an_impossible_drone_is_refused() -> None:
+def test_an_impossible_drone_is_rejected() -> None:
     for wrong in ({"rate_lag_s": 0.001}, {"tilt_limit_deg": 90.0}, {"gusts": 1.0}):
         with pytest.raises(ValidationError):
             FlightSettings.model_validate(wrong)
 
 
-def test_a_flight_that_goes_round_flies_each_round_like_the_first_and_its_seam_is_no_jump() -> None:
+def test_all_laps_of_a_closed_path_are_flown_alike_without_a_jump() -> None:
     square = tuple(
         Waypoint(t_s=4.0 * k, xyz_m=(5 * x, 5 * y, 8), yaw_deg=90 * k)
         for k, (x, y) in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)])

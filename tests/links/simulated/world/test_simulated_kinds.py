@@ -1,4 +1,4 @@
-"""Each kind of scene has what it says, follows from its seed, and leaves the vehicle its way."""
+"""Each kind of scene has its features, is determined by its seed, and keeps the vehicle's corridor free."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _surface_m2(mesh: Mesh, *names: str) -> float:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_scene_follows_from_its_kind_and_seed(kind: str) -> None:
+def test_kind_and_seed_determine_a_scene(kind: str) -> None:
     one, again, other = _world(kind), _world(kind), _world(kind, seed=4)
     np.testing.assert_array_equal(one.mesh.vertices_m, again.mesh.vertices_m)
     np.testing.assert_array_equal(one.mesh.surface, again.mesh.surface)
@@ -78,14 +78,14 @@ def test_atlanta_has_at_least_three_pairs_none_of_them_the_roads() -> None:
         assert families[0] < 0.02 * families.sum()
 
 
-def test_odd_angles_stay_apart_from_each_other_and_from_the_road() -> None:
+def test_odd_angles_are_separated_from_each_other_and_from_the_road() -> None:
     for seed in range(20):
         angles = np.append(odd_angles_deg(np.random.default_rng(seed)), 0.0)
-        apart = np.abs(angles[:, None] - angles)[np.triu_indices(len(angles), 1)] % 90
-        assert np.minimum(apart, 90 - apart).min() >= MIN_SEPARATION_DEG - 1e-9
+        separation = np.abs(angles[:, None] - angles)[np.triu_indices(len(angles), 1)] % 90
+        assert np.minimum(separation, 90 - separation).min() >= MIN_SEPARATION_DEG - 1e-9
 
 
-def test_a_campus_has_two_pairs_lawns_and_room() -> None:
+def test_a_campus_has_two_pairs_lawns_and_open_space() -> None:
     mesh = _world("campus", 2).mesh
     families = _wall_families(mesh)
     assert (families > 0.05 * families.sum()).sum() == 2
@@ -103,35 +103,35 @@ def test_a_park_has_leaves_instead_of_walls_and_a_lot_has_neither() -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"street"}))
-def test_every_kind_has_marks_trees_poles_cars_and_something_that_moves(kind: str) -> None:
+def test_every_kind_has_marks_trees_poles_cars_and_movers(kind: str) -> None:
     world = _world(kind)
     for surface in ("marking", "leaf", "metal"):
         assert world.mesh.is_surface(surface).any()
     assert {mover.name for mover in world.movers} == {"car", "bird", "balloon"}
 
 
-def test_how_many_things_move_is_a_setting() -> None:
+def test_the_number_of_movers_is_a_setting() -> None:
     assert _world("street").movers == ()
     world = _world("street", driving_cars=2, birds=1, balloons=0)
     assert [mover.name for mover in world.movers] == ["car", "car", "bird"]
     assert _world("manhattan", driving_cars=0, birds=0, balloons=0).movers == ()
 
 
-def test_nothing_parks_or_drives_where_the_vehicle_goes() -> None:
-    way = np.column_stack(
+def test_nothing_parks_or_drives_on_the_path_of_the_vehicle() -> None:
+    path = np.column_stack(
         [np.linspace(0, 60, 121), np.linspace(0, 6.5, 121)]
-    )  # over the other lane and the parked cars
-    free = build_world(SceneSettings(kind="manhattan", parked_cars=1.0), HEIGHT_M, 3, way)
+    )  # across the other lane and the parked cars
+    free = build_world(SceneSettings(kind="manhattan", parked_cars=1.0), HEIGHT_M, 3, path)
     full = _world("manhattan", parked_cars=1.0)
     assert len(free.mesh.faces) < len(full.mesh.faces)
     assert not [mover for mover in free.movers if mover.name == "car"]
     low = free.mesh.is_surface("rubber", "paint_dark", "paint_light")
     centre = free.mesh.vertices_m[free.mesh.faces].mean(axis=1)[low][:, :2]
-    away = np.linalg.norm(centre[:, None] - way, axis=2).min(axis=1)
+    away = np.linalg.norm(centre[:, None] - path, axis=2).min(axis=1)
     assert away.min() > 1.0
 
 
-def test_a_way_is_as_wide_as_the_vehicle_and_as_long() -> None:
+def test_the_corridor_is_as_wide_and_as_long_as_the_vehicle() -> None:
     corridor = VehicleCorridor(np.column_stack([np.linspace(0, 10, 11), np.zeros(11)]))
     assert not corridor.allows(5.0 - 2.0, 0.0, 0.5)
     assert not corridor.allows(0.0, 1.4, 0.5)
@@ -140,6 +140,6 @@ def test_a_way_is_as_wide_as_the_vehicle_and_as_long() -> None:
     assert corridor.allows(13.0, 0.0, 0.5)
 
 
-def test_turning_the_vehicle_turns_the_scene_the_other_way() -> None:
+def test_rotating_the_vehicle_rotates_the_scene_in_the_opposite_direction() -> None:
     ahead = _wall_families(_world("manhattan", vehicle_yaw_deg=20.0).mesh)
     assert ahead[round(70 / BIN_DEG)] > 0.99 * ahead.sum()  # -20 deg, modulo 90

@@ -1,4 +1,4 @@
-"""Cars, birds and balloons: they move, within their bounds, and rays meet them where they are."""
+"""Cars, birds and balloons: they move within their bounds, and rays hit them at their pose."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ MOVERS = [_car(), _bird(), _balloon()]
 
 
 @pytest.mark.parametrize("mover", MOVERS, ids=lambda m: m.name)
-def test_a_mover_moves_no_faster_than_it_says_and_its_pose_is_rigid(mover) -> None:
+def test_a_mover_is_no_faster_than_its_bound_and_its_pose_is_rigid(mover) -> None:
     R, t = mover.poses(TIMES)
     speed = np.linalg.norm(np.diff(t, axis=0), axis=1) / 0.02
     assert np.median(speed) > 0.1
-    moving = speed[speed < 1000] if mover.name == "car" else speed  # a car that starts again jumps
+    moving = speed[speed < 1000] if mover.name == "car" else speed  # a car that restarts jumps
     assert moving.max() <= mover.speed_mps * 1.001
     np.testing.assert_allclose(np.einsum("nij,nkj->nik", R, R), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(R), 1.0)
 
 
-def test_a_car_drives_forwards_and_starts_again() -> None:
+def test_a_car_drives_forwards_and_restarts() -> None:
     R, t = _car().poses(np.array([0.0, 3.0, 19.9, 20.1]))
     np.testing.assert_allclose(t[:, 0], [-100, -70, 99, -99])
     np.testing.assert_allclose(R[0] @ [1, 0, 0], [1, 0, 0], atol=1e-12)
 
 
-def test_a_bird_flies_ahead_and_flaps_through_all_its_shapes() -> None:
+def test_a_bird_flies_forwards_and_takes_all_its_shapes() -> None:
     bird = _bird()
     R, t = bird.poses(TIMES)
     flown = np.diff(t, axis=0)[:, :2]
@@ -83,7 +83,7 @@ def test_drawn_birds_and_balloons_stay_in_their_box() -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         for mover in (draw_bird(rng, 4.0, 20.0, 28.0, 5.0, turn), draw_balloon(rng, 4.0, 20.0, 28.0, 5.0, turn)):
-            scene_m = mover.poses(TIMES)[1] @ turn  # back into the road's frame
+            scene_m = mover.poses(TIMES)[1] @ turn  # into the frame of the road
             low, high = scene_m.min(axis=0), scene_m.max(axis=0)
             assert low[0] > -29.0
             assert high[0] < 29.0
@@ -92,23 +92,23 @@ def test_drawn_birds_and_balloons_stay_in_their_box() -> None:
             assert high[2] < 21.5
 
 
-def _ray(place) -> tuple[np.ndarray, np.ndarray]:
-    d = np.asarray(place, dtype=np.float64)
+def _ray(target) -> tuple[np.ndarray, np.ndarray]:
+    d = np.asarray(target, dtype=np.float64)
     return np.zeros((1, 1, 3), dtype=np.float32), (d / np.linalg.norm(d)).astype(np.float32).reshape(1, 1, 3)
 
 
-def test_a_ray_meets_a_mover_where_it_is_at_that_moment() -> None:
+def test_a_ray_hits_a_mover_at_its_pose_at_that_time() -> None:
     balloon = _balloon()
     scene = Scene(box((400, -1, -1), (401, 1, 1), "brick"), vehicle_mesh(1.8), (), Truth(0, STILL, None), [balloon])
     for time_s in (0.0, 1.0, 2.3):
-        place = balloon.poses(np.array([time_s]))[1][0]
+        target = balloon.poses(np.array([time_s]))[1][0]
         stamp = np.array([round(time_s * 1e9)])
-        origins, directions = _ray(place)
+        origins, directions = _ray(target)
         ranges, _, is_drone = scene.cast(stamp, origins, directions, 90.0)
-        assert ranges[0, 0] == pytest.approx(np.linalg.norm(place) - 0.2, abs=0.04)
+        assert ranges[0, 0] == pytest.approx(np.linalg.norm(target) - 0.2, abs=0.04)
         assert not is_drone.any()
         assert scene.near_small_body(stamp, origins[:, 0], directions[:, 0]).all()
-        aside = _ray(place + np.array([0.0, 4.0, 0.0]))
+        aside = _ray(target + np.array([0.0, 4.0, 0.0]))
         assert np.isinf(scene.cast(stamp, *aside, 90.0)[0]).all()
         assert not scene.near_small_body(stamp, aside[0][:, 0], aside[1][:, 0]).any()
 

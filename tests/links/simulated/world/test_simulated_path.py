@@ -14,7 +14,7 @@ def _path(*points: tuple[float, float, float, float], yaw_deg: float = 0.0) -> P
     return Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(x, y, z), yaw_deg=yaw_deg) for t, x, y, z in points))
 
 
-def test_the_spline_meets_its_knots_and_its_derivatives_are_derivatives() -> None:
+def test_the_spline_passes_its_knots_and_its_derivatives_are_consistent() -> None:
     knot_s, knots = np.array([0.0, 1.0, 2.5, 4.0]), np.array([[0.0, 1], [2, 0], [1, 5], [3, 3]])
     np.testing.assert_allclose(natural_spline(knot_s, knots, knot_s)[0], knots, atol=1e-12)
     t, d = np.array([0.3, 1.7, 3.2]), 1e-5
@@ -32,27 +32,27 @@ def test_a_straight_path_is_flown_at_constant_speed() -> None:
     np.testing.assert_allclose(acceleration, 0.0, atol=1e-12)
 
 
-def test_a_hovering_drone_is_level_and_a_flying_one_leans_into_its_drag() -> None:
+def test_a_hovering_drone_is_level_and_a_flying_one_tilts_against_its_drag() -> None:
     hover, _ = _path((0, 1, 2, 3), yaw_deg=90.0).flying_poses(np.zeros(1))
     np.testing.assert_allclose(hover[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
-    lean, _ = _path((0, 0, 0, 5), (4, 32, 0, 5)).flying_poses(np.array([2.0]))
-    assert np.arctan2(lean[0, 0, 2], lean[0, 2, 2]) == pytest.approx(np.arctan2(8 * DRAG_PER_S, GRAVITY_MPS2))
-    np.testing.assert_allclose(lean[0].T @ lean[0], np.eye(3), atol=1e-12)
-    assert np.linalg.det(lean[0]) == pytest.approx(1.0)
+    rotation, _ = _path((0, 0, 0, 5), (4, 32, 0, 5)).flying_poses(np.array([2.0]))
+    assert np.arctan2(rotation[0, 0, 2], rotation[0, 2, 2]) == pytest.approx(np.arctan2(8 * DRAG_PER_S, GRAVITY_MPS2))
+    np.testing.assert_allclose(rotation[0].T @ rotation[0], np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation[0]) == pytest.approx(1.0)
 
 
-def test_beyond_its_waypoints_it_stands_still() -> None:
+def test_before_and_after_its_waypoints_it_is_static() -> None:
     position, velocity, _, _ = _path((1, 0, 0, 5), (2, 2, 0, 5)).at(np.array([0.0, 9.0]))
     np.testing.assert_allclose(position, [[0, 0, 5], [2, 0, 5]])
     np.testing.assert_allclose(velocity, 0.0)
 
 
-def test_times_that_do_not_grow_are_refused() -> None:
+def test_times_that_do_not_increase_are_rejected() -> None:
     with pytest.raises(ValidationError, match="t_s must grow"):
         _path((0, 0, 0, 1), (0, 1, 0, 1))
 
 
-def test_a_round_closes_smoothly_and_its_yaw_goes_on_by_whole_turns() -> None:
+def test_a_closed_path_is_smooth_and_its_yaw_gains_whole_turns() -> None:
     corners = [(5, 0), (0, 5), (-5, 0), (0, -5)]
     points = tuple(Waypoint(t_s=2.0 + 4 * k, xyz_m=(*xy, 6), yaw_deg=90 * k) for k, xy in enumerate(corners))
     path = Path(waypoints=points, period_s=16.0)
@@ -70,8 +70,8 @@ def test_a_round_closes_smoothly_and_its_yaw_goes_on_by_whole_turns() -> None:
 
 
 @pytest.mark.parametrize(
-    ("period_s", "says"), [(14.0, "before the first one comes again"), (20.04, "tenths of a second")]
+    ("period_s", "text"), [(14.0, "longer than the time from the first to the last"), (20.04, "a multiple of 0.1 s")]
 )
-def test_a_round_that_cannot_be_gone_is_refused(period_s: float, says: str) -> None:
-    with pytest.raises(ValidationError, match=says):
+def test_an_impossible_period_is_rejected(period_s: float, text: str) -> None:
+    with pytest.raises(ValidationError, match=text):
         Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(t, 0, 5)) for t in (0.0, 14.0)), period_s=period_s)

@@ -1,4 +1,4 @@
-"""A vehicle on its springs: signs by hand, rest, shake, repeatability."""
+"""A vehicle on its suspension: signs by hand, rest, roughness, repeatability."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ def _steady(*acceleration: float) -> np.ndarray:
     return SuspendedPath(path, SMOOTH, 6.0, 1).level_poses(np.array([5.0]))[0][0]
 
 
-def test_speeding_up_lifts_the_nose_and_braking_drops_it() -> None:
+def test_accelerating_lifts_the_nose_and_braking_lowers_it() -> None:
     for a in (2.0, -3.0):
         nose = _steady(0.0, a) @ [1, 0, 0]
         assert np.degrees(np.arcsin(nose[2])) == pytest.approx(0.45 * a, rel=1e-3)
         assert nose[1] > 0.99
 
 
-def test_in_a_bend_to_the_left_the_left_side_rises() -> None:
+def test_in_a_left_turn_the_left_side_rises() -> None:
     left = _steady(-2.0, 0.0) @ [0, 1, 0]  # heading along y, left is -x
     assert np.degrees(np.arcsin(left[2])) == pytest.approx(0.9, rel=1e-3)
 
 
 def test_a_parked_vehicle_is_level_whatever_the_road() -> None:
     parked = Path(waypoints=(Waypoint(t_s=0, xyz_m=(1, 2, 0), yaw_deg=30),))
-    for got, wanted in zip(
+    for got, expected in zip(
         SuspendedPath(parked, SuspensionSettings(), 6.0, 1).level_poses(TIMES), parked.level_poses(TIMES), strict=True
     ):
-        np.testing.assert_allclose(got, wanted, atol=1e-12)
+        np.testing.assert_allclose(got, expected, atol=1e-12)
 
 
-def test_the_springs_overshoot_and_settle() -> None:
+def test_the_suspension_overshoots_and_settles() -> None:
     angle = oscillate(np.vstack([np.zeros((1, 1)), np.ones((2399, 1))]), 2 * np.pi * 1.3, 0.35)[:, 0]
     assert angle.max() == pytest.approx(1 + np.exp(-np.pi * 0.35 / np.sqrt(1 - 0.35**2)), abs=0.02)
     assert angle[-1] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_road_shakes_a_driven_vehicle_and_the_camera_swings_with_it() -> None:
+def test_the_road_shakes_a_moving_vehicle_and_its_camera() -> None:
     drive = Path(waypoints=tuple(Waypoint(t_s=t, xyz_m=(8 * t, 0, 0)) for t in (0, 10, 20)))
     R, p = SuspendedPath(drive, SuspensionSettings(), 20.0, 1).level_poses(np.arange(0, 20, 0.01))
     roll = np.degrees(np.arctan2(R[:, 2, 1], R[:, 2, 2]))

@@ -1,4 +1,4 @@
-"""Rain and haze do to light what their formulas say."""
+"""Rain and haze attenuate and reflect light by their formulas."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ def _fire(mesh, sequences: int, weather: Weather, batches: int = 1, **settings):
     return ranges, shade, cosine
 
 
-def test_extinction_is_koschmieders_corrected_for_the_wavelength_and_rain_is_the_itus() -> None:
+def test_extinction_is_koschmieders_at_the_wavelength_and_rain_that_of_the_itu() -> None:
     assert Weather().extinction_per_m() == 0.0
     assert haze_extinction_per_m(1000.0, 550.0) == pytest.approx(3.91e-3)
     assert haze_extinction_per_m(3000.0, 903.0) == pytest.approx(3.91 / 3000 * (903 / 550) ** -0.82)
-    assert haze_extinction_per_m(300.0, 903.0) == pytest.approx(3.91 / 300)  # fog takes all colours alike
+    assert haze_extinction_per_m(300.0, 903.0) == pytest.approx(3.91 / 300)  # fog attenuates all colours alike
     rain = Weather(rain_mmph=25.0).extinction_per_m()
     assert 10 * np.log10(np.exp(rain * 1000)) == pytest.approx(1.076 * 25**0.67)  # dB per km
     both = Weather(rain_mmph=25.0, visibility_m=1000.0).extinction_per_m()
     assert both == pytest.approx(rain + Weather(visibility_m=1000.0).extinction_per_m())
 
 
-def test_haze_takes_beer_lamberts_share_there_and_back() -> None:
+def test_haze_attenuates_by_beer_lambert_in_both_directions() -> None:
     weather = Weather(visibility_m=1000.0)
     clear = _fire(_wall(30.0), 1900, Weather())
     hazy = _fire(_wall(30.0), 1900, weather)
@@ -56,7 +56,7 @@ def test_haze_takes_beer_lamberts_share_there_and_back() -> None:
     assert share == pytest.approx(np.exp(-2 * weather.extinction_per_m() * 30.0), rel=0.03)
 
 
-def test_haze_shortens_the_reach() -> None:
+def test_haze_shortens_the_range() -> None:
     def seen(weather: Weather, x_m: float) -> float:
         ranges, _, cosine = _fire(_wall(x_m, "wire"), 1900, weather)
         return float((ranges[cosine > 0.995] > 0).mean())
@@ -66,7 +66,7 @@ def test_haze_shortens_the_reach() -> None:
     assert seen(Weather(visibility_m=400.0), 30.0) > 0.95
 
 
-def test_first_drops_come_as_often_as_poisson_says() -> None:
+def test_first_drops_are_a_poisson_process() -> None:
     weather = Weather(rain_mmph=25.0)
     drops = RainClutter(weather, THRESHOLD, 0.5, APERTURE_M, FOOTPRINT_RAD)
     range_m, power = drops.draw(np.random.default_rng(1), 200_000)
@@ -88,11 +88,11 @@ def test_more_rain_gives_more_clutter_and_no_rain_none() -> None:
     assert not _fire(sky, 500, Weather())[0].any()
     wet = _fire(sky, 3000, Weather(rain_mmph=25.0))[0]
     nominal = 1 - np.exp(-RainClutter(Weather(rain_mmph=25.0), THRESHOLD, 0.5, APERTURE_M, FOOTPRINT_RAD).expected)
-    assert (wet > 0).mean() == pytest.approx(nominal, rel=0.25)  # some drops sink below a pulse's own threshold
+    assert (wet > 0).mean() == pytest.approx(nominal, rel=0.25)  # some drops are below the threshold of a pulse
     assert np.median(wet[wet > 0]) < 4.0
 
 
-def test_a_near_wall_leaves_no_room_for_drops_and_a_bright_one_outshines_them() -> None:
+def test_a_near_wall_hides_drops_and_a_bright_one_is_stronger() -> None:
     ranges, _, cosine = _fire(_wall(1.0), 1900, Weather(rain_mmph=50.0))
     facing = cosine > 0.9
     assert (np.abs(ranges[facing] * cosine[facing] - 1.0) < 0.06).mean() > 0.995
@@ -121,6 +121,6 @@ def test_wet_asphalt_is_darker_and_wet_paint_is_not() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"rain_mmph": -1}, {"visibility_m": 5}, {"sun_elevation_deg": 91}, {"fog": 1}])
-def test_impossible_weather_is_refused(wrong: dict[str, float]) -> None:
+def test_impossible_weather_is_rejected(wrong: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
         Weather(**wrong)

@@ -21,7 +21,7 @@ def _rays(origin, directions):
     return np.tile(np.asarray(origin, dtype=np.float32), (len(d), 1)), d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def test_a_ray_meets_a_box_at_its_face_and_dims_with_incidence() -> None:
+def test_a_ray_hits_a_box_at_its_face_and_dims_with_incidence() -> None:
     scene = RayScene(box((2, -1, -1), (4, 1, 1), "plaster"))
     ranges, fraction = scene.cast(*_rays((0, 0, 0), [(1, 0, 0), (1, 0.3, 0), (-1, 0, 0)]), 50.0)
     np.testing.assert_allclose(ranges, [2.0, 2.0 * np.hypot(1, 0.3), np.inf], rtol=1e-6)
@@ -46,7 +46,7 @@ def test_merged_meshes_keep_their_faces_and_surfaces() -> None:
     assert set(both.surface[: len(a.faces)]) == set(a.surface)
 
 
-def test_the_drone_is_as_wide_as_its_span_and_mostly_air() -> None:
+def test_the_drone_is_as_wide_as_its_span_and_mostly_open() -> None:
     for span_m, shape in ((0.35, "folding"), (0.5, "x4"), (0.8, "hexa"), (0.4, "hexa")):
         blades = np.linspace(0, np.pi, 32)
         meshes = [drone_mesh(span_m, a, DroneModel(shape=shape)) for a in blades]
@@ -59,7 +59,7 @@ def test_the_drone_is_as_wide_as_its_span_and_mostly_air() -> None:
     assert 0.1 < hit.mean() < 0.25
 
 
-def test_the_street_stands_on_the_road_below_the_camera_with_walls_on_both_sides() -> None:
+def test_the_street_is_below_the_camera_with_walls_on_both_sides() -> None:
     scene = RayScene(world_mesh(SceneSettings(), 1.8, 3))
     ranges, _ = scene.cast(*_rays((0, 0, 0), [(0, 0, -1), (0, 0, 1)]), 200.0)
     assert abs(ranges[0] - 1.8) < 1e-3
@@ -69,7 +69,7 @@ def test_the_street_stands_on_the_road_below_the_camera_with_walls_on_both_sides
         assert np.isfinite(scene.cast(*_rays((0, 0, 0), level), 60.0)[0]).mean() > 0.7
 
 
-def test_a_scene_follows_from_its_seed() -> None:
+def test_a_seed_determines_the_scene() -> None:
     same, again, other = (world_mesh(SceneSettings(), 1.8, seed) for seed in (4, 4, 5))
     np.testing.assert_array_equal(same.vertices_m, again.vertices_m)
     assert same.vertices_m.shape != other.vertices_m.shape or not np.array_equal(same.vertices_m, other.vertices_m)
@@ -80,7 +80,7 @@ def _scene(drone: Path | None, vehicle: Path) -> Scene:
     return Scene(box((100, -1, -1), (101, 1, 1), "brick"), vehicle_mesh(1.8), shapes, Truth(0, vehicle, drone))
 
 
-def test_a_moving_drone_is_met_where_it_is_at_the_pulse() -> None:
+def test_a_moving_drone_is_hit_at_its_pose_at_the_pulse() -> None:
     drone = Path(waypoints=(Waypoint(t_s=0, xyz_m=(10, 0, 0)), Waypoint(t_s=1, xyz_m=(18, 0, 0))))
     scene = _scene(drone, Path(waypoints=(Waypoint(t_s=0, xyz_m=(0, 0, -9)),)))
     pulse_ns = np.array([0, 500_000_000, 1_000_000_000])
@@ -93,7 +93,7 @@ def test_a_moving_drone_is_met_where_it_is_at_the_pulse() -> None:
     assert not scene.cast(pulse_ns[:1], origins[:1, None], aside, 90.0)[2].any()
 
 
-def test_the_vehicle_shadows_what_lies_below_and_drives_along() -> None:
+def test_the_vehicle_blocks_rays_that_point_down_and_moves_along() -> None:
     scene = _scene(None, Path(waypoints=(Waypoint(t_s=0, xyz_m=(0, 0, 0)), Waypoint(t_s=1, xyz_m=(20, 0, 0)))))
     origins, directions = _rays((20.5, 0.5, 0.35), [(0, 0, -1)])
     start = scene.cast(np.array([0]), origins[:, None], directions[:, None], 90.0)[0]
@@ -102,8 +102,8 @@ def test_the_vehicle_shadows_what_lies_below_and_drives_along() -> None:
     assert abs(later[0, 0] - 0.5) < 1e-3
 
 
-def test_a_tilted_vehicle_is_met_by_rays_that_point_up_in_the_world() -> None:
-    """Culling goes by the body's own box, not by the world's downwards."""
+def test_a_tilted_vehicle_is_hit_by_rays_that_point_up_in_the_world() -> None:
+    """Culling uses the box of the body, not the world's down direction."""
     turn = rotation_from_rpy_deg((0.0, -40.0, 0.0))  # nose up
     body = Body("vehicle", (vehicle_mesh(1.8),), lambda ns: (np.tile(turn, (len(ns), 1, 1)), np.zeros((len(ns), 3))),
                 None, 50.0, False)  # fmt: skip
@@ -116,7 +116,7 @@ def test_a_tilted_vehicle_is_met_by_rays_that_point_up_in_the_world() -> None:
     assert np.isfinite(body.scenes[0].cast(o, d, 90.0)[0]).all()
 
 
-def test_only_rays_that_meet_a_bodys_box_are_cast() -> None:
+def test_only_rays_that_meet_the_box_of_a_body_are_cast() -> None:
     origins, directions = _rays((0, 0, 0), [(1, 0, 0), (0, 1, 0), (-1, 0, 0), (1, 0.01, 0)])
     low, high = np.array([4.0, -1.0, -1.0]), np.array([6.0, 1.0, 1.0])
     _, _, ray = into_body(
@@ -125,7 +125,7 @@ def test_only_rays_that_meet_a_bodys_box_are_cast() -> None:
     np.testing.assert_array_equal(ray, [0, 3])
 
 
-def test_a_dark_drone_fades_first_and_a_light_one_last() -> None:
+def test_a_dark_drone_is_lost_first_and_a_light_one_last() -> None:
     def hits(surface: str, range_m: float) -> float:
         mesh = drone_mesh(0.5, 0.4, DroneModel(surface=surface))
         return drone_area_m2(mesh, range_m * np.array([0.6, 0.0, -0.8]), 0.03 / range_m)
@@ -137,7 +137,7 @@ def test_a_dark_drone_fades_first_and_a_light_one_last() -> None:
     assert hits("light_shell", 62.0) > 0.5 * near
 
 
-def test_a_face_knows_its_normal_and_its_surface() -> None:
+def test_a_face_has_its_normal_and_its_surface() -> None:
     mesh = merge([box((0, 0, 0), (1, 2, 3), "brick"), box((5, 0, 0), (6, 1, 1), "marking")])
     normals = mesh.normals()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
@@ -147,7 +147,7 @@ def test_a_face_knows_its_normal_and_its_surface() -> None:
     assert mesh.is_surface("marking").sum() == 12
 
 
-def test_a_row_of_houses_has_none_of_no_width() -> None:
+def test_a_row_of_buildings_has_none_of_zero_width() -> None:
     for seed in range(190, 240):
         rng = np.random.default_rng(seed)
         row = building_row(float(rng.uniform(18, 42)), 12.0, (9.0, 20.0), rng)
@@ -155,7 +155,7 @@ def test_a_row_of_houses_has_none_of_no_width() -> None:
         assert np.linalg.norm(np.cross(b - a, c - a), axis=1).min() > 1e-3
 
 
-def test_a_lane_that_ends_with_a_dash_has_no_stub_of_no_length() -> None:
+def test_a_lane_that_ends_with_a_dash_has_no_dash_of_zero_length() -> None:
     lane = merge(dashes((1000.0, 0.0), (1009.0 + 2e-13, 0.0)))
     assert np.isfinite(lane.vertices_m).all()
     assert len(lane.faces) == len(merge(dashes((0.0, 0.0), (9.0, 0.0))).faces)

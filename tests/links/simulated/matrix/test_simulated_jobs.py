@@ -109,7 +109,7 @@ def test_an_exception_of_a_task_stops_all_and_is_raised(jobs: int) -> None:
 
 
 def test_a_killed_process_is_an_error_that_states_what_to_do() -> None:
-    with pytest.raises(LinkError, match="was killed: if memory was short, take fewer --jobs"):
+    with pytest.raises(LinkError, match="was killed: if memory is short, use fewer --jobs"):
         run_all(vanish, [0, 1], 2, lambda shares: None)
 
 

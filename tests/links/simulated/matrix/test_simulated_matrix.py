@@ -287,7 +287,7 @@ def test_the_command_lists_cells_and_rejects_a_pattern_without_a_match(tmp_path:
     assert listed.stdout.split() == [f"{scene}-10m-climb-parked" for scene in SCENES]
     wrong = CliRunner().invoke(app, ["matrix", str(tmp_path), "--only", "moon-*"])
     assert wrong.exit_code == 2
-    assert "no cell is called like 'moon-*'" in wrong.output
+    assert "no cell matches 'moon-*'" in wrong.output
     several = ["--only", "campus-0m-empty-parked", "--only", "campus-*-two-*", "--list"]
     listed = CliRunner().invoke(app, ["matrix", str(tmp_path), *several])
     assert listed.stdout.split() == ["campus-0m-empty-parked", "campus-20m-two-parked"]

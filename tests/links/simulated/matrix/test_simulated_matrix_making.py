@@ -257,7 +257,7 @@ def test_seeds_start_at_first_seed(tmp_path, monkeypatch) -> None:
 
 def test_a_wrong_configuration_is_reported_once_before_anything_is_made(tmp_path, config: Path) -> None:
     config.write_text(GRAPH.replace(", inputs: {goal: aim.servo_goal}", ""))
-    with pytest.raises(LinkError, match="closed loop needs one servo"):
+    with pytest.raises(LinkError, match="closed loop needs exactly one servo"):
         make_matrix(tmp_path / "m", [HOVER], range(1, 3), config, silent)
     config.write_text(GRAPH.replace("velodyne.Lidar", "velodyne.Radar"))
     with pytest.raises(ConfigError, match=r"fast.yaml:\d+: .*unknown link"):

@@ -54,7 +54,7 @@ def test_the_effective_area_of_a_large_near_plate_is_its_own() -> None:
 
 def test_real_drone_hits_are_between_the_smallest_and_largest_simulated_drone() -> None:
     if not DRONES.exists():
-        pytest.skip("the real drone clouds are not here (../shared/data/drone_lidar)")
+        pytest.skip("the real drone clouds are missing (../shared/data/drone_lidar)")
     real = real_drone(DRONES)
     assert real.frames == 48
     rows = [line.split("|")[2] for line in drone_table(real).splitlines()[3:]]
@@ -65,4 +65,4 @@ def test_real_drone_hits_are_between_the_smallest_and_largest_simulated_drone() 
 def test_the_table_has_every_capture_and_states_when_the_drone_clouds_are_missing(tmp_path: Path) -> None:
     table = comparison_table(ROOT / "recordings", tmp_path)
     assert "| einride (real) | mrpt (real) | room (simulated) |" in table
-    assert "are not here" in table
+    assert "are missing" in table

@@ -166,7 +166,7 @@ def test_sim_yaml_closes_the_loop_and_a_graph_without_servo_commands_is_rejected
     load_loop(SIM, scenario.rig_yaml(), "test", scenario.closed_loop)
     bare = tmp_path / "bare.yaml"
     bare.write_text(GRAPH.replace(", inputs: {goal: aim.servo_goal}", ""), encoding="utf-8")
-    with pytest.raises(LinkError, match=r"this graph has 0: wire it as 'servo: .*configs/sim.yaml does"):
+    with pytest.raises(LinkError, match=r"this graph has 0: wire it as 'servo: .*as in configs/sim.yaml"):
         load_loop(bare, scenario.rig_yaml(), "test", scenario.closed_loop)
 
 

@@ -54,7 +54,7 @@ def test_a_replay_starts_no_rig(tmp_path):
 
 
 def test_a_missing_or_wrong_scenario_is_an_error(tmp_path, capfd):
-    with pytest.raises(LinkError, match=r"none.yaml: no such scenario; its name is as seen from here"):
+    with pytest.raises(LinkError, match=r"none.yaml: no such scenario; the path is relative to"):
         LiveRig(scenario=tmp_path / "none.yaml", servo=tmp_path / "servo").open(run_of(tmp_path))
     (tmp_path / "bad.yaml").write_text(SCENARIO.replace("open_lot", "moon"))
     with pytest.raises(LinkError, match=r"the simulated rig for .*bad.yaml did not start; see its message above"):

@@ -148,7 +148,7 @@ def test_an_echo_has_the_number_of_the_drone_with_most_of_its_power() -> None:
             {"other_drones": [{"path": path_through((0, (6.0, 3.3, 9.2)))}]},
             r"other_drones\.0\.path: collides with drone at 0\.00 s",
         ),
-        ({"other_drones": [ASIDE, ASIDE]}, r"other_drones\.1\.path: runs into other_drones\.0 at"),
+        ({"other_drones": [ASIDE, ASIDE]}, r"other_drones\.1\.path: collides with other_drones\.0 at"),
     ],
 )
 def test_impossible_drones_are_rejected(pair: Scenario, change: dict[str, Any], text: str) -> None:

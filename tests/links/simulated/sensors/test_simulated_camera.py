@@ -277,7 +277,7 @@ def test_the_rig_file_has_each_camera_with_pose_and_lens(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        ({"rate_hz": 15, "readout_ms": 60.0}, "exposure and readout take 75 ms, a period is 66.6667 ms"),
+        ({"rate_hz": 15, "readout_ms": 60.0}, "exposure and readout take 75 ms, the period is 66.6667 ms"),
         ({"latency_ms": [80, 30]}, "shortest and the longest"),
         ({"size_px": 5000}, "less than or equal to 1440"),
         ({"fov_deg": 235}, "Extra inputs"),

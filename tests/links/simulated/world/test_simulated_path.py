@@ -48,7 +48,7 @@ def test_before_and_after_its_waypoints_it_is_static() -> None:
 
 
 def test_times_that_do_not_increase_are_rejected() -> None:
-    with pytest.raises(ValidationError, match="t_s must grow"):
+    with pytest.raises(ValidationError, match="t_s must increase"):
         _path((0, 0, 0, 1), (0, 1, 0, 1))
 
 

@@ -10,7 +10,7 @@ import importlib.util
 import pkgutil
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from flow.link import Link
 from flow.problem import did_you_mean
@@ -21,7 +21,7 @@ KINDS: dict[str, type[Node[Any]]] = {"stages": Stage, "links": Link}
 HOMES = {"stages": "stages", "links": "links"}  # package in which classes of a kind are looked for when suggesting
 
 
-def named_class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node] | None:
+def named_class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node[Any]] | None:
     """The class an import path (`use:` of the node at `path`) names, or None with the problem noted in `tree`."""
     here = (*path, "use")
     word = kind.removesuffix("s")
@@ -45,13 +45,14 @@ def named_class(tree: Tree, kind: str, path: Path_, use: Any) -> type[Node] | No
         hint = f"; it belongs under '{right}:'" if right else ""
         tree.problem(here, f"'{use}' is no {word}{hint}.")
     else:
+        node = cast("type[Node[Any]]", cls)
         try:
-            input_ports(cls)
-            output_ports(cls)
+            input_ports(node)
+            output_ports(node)
         except PortError as error:
             tree.problem(here, f"'{use}' is written wrongly: {error}.")
         else:
-            return cls
+            return node
     return None
 
 

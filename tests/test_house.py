@@ -102,7 +102,7 @@ def test_truth_is_read_only_where_runs_are_judged_or_made():
     readers = {
         str(f.relative_to(ROOT)) for r in ROOMS for f in sources(r) if "/truth/" in f.read_text(encoding="utf-8")
     }
-    allowed = ("links/truth.py", "links/recording/", "links/simulated/")
+    allowed = ("links/runs/truth.py", "links/recording/", "links/simulated/")
     assert all(name.startswith(allowed) for name in readers), readers
 
 

@@ -50,8 +50,8 @@ SAID = {  # where it is said, and what
     "flow/live_threads.py": ["works no more", "takes fewer pictures: this host is too slow for all"],
     "flow/live_wiring.py": ["cannot run live: it stays silent"],
     "flow/stage_life.py": ["this message is skipped", "the run stops", "starts afresh", "stays off"],
-    "links/live_run.py": ["cannot be shown on the terminal"],
-    "links/results.py": ["results are being lost"],
+    "links/runs/live_run.py": ["cannot be shown on the terminal"],
+    "links/runs/results.py": ["results are being lost"],
     "links/recording/recorder.py": ["nothing is recorded now"],
     "links/velodyne/udp.py": ["cannot listen on UDP", "is the network interface still up?", "no packet on UDP"],
     "links/velodyne/lidar.py": [

@@ -14,8 +14,8 @@ from flow.problem import Place
 from flow.replay import replay
 from flow.taps import Digest
 from links.recording import RecordingReader
-from links.results import Results
-from links.truth import TruthLog, fix_errors
+from links.runs.results import Results
+from links.runs.truth import TruthLog, fix_errors
 
 ROOT = Path(__file__).resolve().parents[1]
 ON_ITS_SIDE = {

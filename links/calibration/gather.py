@@ -21,8 +21,8 @@ from links.dynamixel.servo import TICK_RAD
 from links.recording import Progress, Session
 from links.vehicle_odometry import VehicleOdometry
 from links.velodyne import Lidar, flown_lidars
-from stages.calibration.looks import Returns, ServoTrace
-from stages.geometry import LidarMount
+from stages.calibration.scan_passes import Returns, ServoTrace
+from stages.geometry.frames import LidarMount
 from stages.messages import LidarFirings
 
 MOST_RETURNS = 300_000  # more add seconds and no accuracy: firing sequences are left out evenly
@@ -86,8 +86,8 @@ def gather(
                 servo_stamps_ns.append(state.stamp_ns)
                 servo_rad.append(state.position_rad)
         elif (motion := odometry.decode(record)) is not None:
-            start_m = motion.xyz_start_m if start_m is None else start_m
-            driven_m = max(driven_m or 0.0, float(np.linalg.norm(motion.xyz_start_m - start_m)))
+            start_m = motion.xyz_map_m if start_m is None else start_m
+            driven_m = max(driven_m or 0.0, float(np.linalg.norm(motion.xyz_map_m - start_m)))
     rig, mount = checked_rig(text, str(recording if rig_yaml is None else "--rig"))
     if not ends_ns:
         raise LinkError(f"{recording} holds no LiDAR packets in that time: is it the right recording, and the part?")

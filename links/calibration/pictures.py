@@ -12,8 +12,8 @@ import numpy as np
 from links.evaluation.svg import BAD, BAND, GOOD, SOFT, Chart, Series
 from stages.calibration.calibrate import Calibration
 from stages.calibration.patches import Patches
-from stages.calibration.verdict import CURVE, CURVE_POINTS, curve_rows
-from stages.geometry import Array64
+from stages.calibration.result import CURVE, CURVE_POINTS, curve_rows
+from stages.geometry.frames import Array64
 
 WIDTH, HEIGHT, GAP = 620, 280, 12
 MOST_POINTS = 2500

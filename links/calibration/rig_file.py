@@ -12,8 +12,8 @@ from typing import Any
 import yaml
 
 from stages.calibration.calibrate import Calibration
-from stages.calibration.verdict import Finding
-from stages.geometry import LidarMount, Pose
+from stages.calibration.result import Finding
+from stages.geometry.frames import LidarMount, Pose
 
 DIGITS = 7
 TAKEN_BACK = (

@@ -80,7 +80,7 @@ def calibrate_recording(
     """
     from links.calibration import gather, pictures, rig_text
     from stages.calibration.calibrate import CannotCalibrate
-    from stages.calibration.standing import Standing, stand
+    from stages.calibration.levelling import Standing, stand
 
     target = out_file or recording.with_suffix(".rig.yaml")
     if target.suffix not in (".yaml", ".yml"):

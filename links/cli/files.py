@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from flow.link import LinkError
 from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
-from stages.geometry import LidarMount
+from stages.geometry.frames import LidarMount
 
 MAX_RIG_BYTES = 100_000
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]

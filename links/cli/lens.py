@@ -14,8 +14,8 @@ import yaml
 from flow.link import LinkError
 from links.cli.console import in_words, out
 from links.cli.files import Overwrite
-from stages.lens_files import CalibratedLens, LensFileError, lens_from_kalibr, lens_from_ocamcalib
-from stages.messages import Carrier
+from stages.geometry.lens_files import CalibratedLens, LensFileError, lens_from_kalibr, lens_from_ocamcalib
+from stages.messages import CameraMount
 
 MAX_BYTES = 1_000_000
 
@@ -23,7 +23,7 @@ MAX_BYTES = 1_000_000
 @in_words
 def import_lens(
     file: Annotated[Path, typer.Argument(help="Kalibr's camchain.yaml, or OCamCalib's calib_results.txt.")],
-    carrier: Annotated[Carrier, typer.Argument(help="Which camera of the rig it is.")],
+    camera_mount: Annotated[CameraMount, typer.Argument(help="Which camera of the rig it is.")],
     out_file: Annotated[
         Path | None, typer.Option("--out", "-o", help="Rig file to write [default: FILE with .CARRIER.rig.yaml].")
     ] = None,
@@ -46,13 +46,13 @@ def import_lens(
 
     Example: grd lens camchain.yaml vehicle --camera cam0 -o configs/rigs/vehicle_lens.yaml
     """
-    target = out_file or file.with_suffix(f".{carrier.value}.rig.yaml")
+    target = out_file or file.with_suffix(f".{camera_mount.value}.rig.yaml")
     if target.suffix not in (".yaml", ".yml"):
         raise LinkError(f"{target}: a rig file ends in .yaml")
     if target.exists() and (not overwrite or target.samefile(file)):
         raise LinkError(f"{target} is there already: name another with --out, or give --overwrite")
     found = read_lens(file, camera, max_off_axis_deg)
-    target.write_text(lens_text(found, carrier, file.name), encoding="utf-8")
+    target.write_text(lens_text(found, camera_mount, file.name), encoding="utf-8")
     lens, size_px = found
     width, height = size_px or (None, None)
     size = f"{width} x {height} px" if size_px else "the file does not say for which size of pictures"
@@ -62,11 +62,12 @@ def import_lens(
     )
     if width != height:
         out.print(
-            f"size_px is left open: say size_px: [{width}, {height}] in the config of camera_{carrier.value}",
+            f"size_px is left open: say size_px: [{width}, {height}] in the config of camera_{camera_mount.value}",
             markup=False,
         )
     out.print(
-        f"check       cameras.{carrier.value}.masked_px, .max_off_axis_deg and .readout_ms (rolling shutter) are still "
+        f"check       cameras.{camera_mount.value}.masked_px, .max_off_axis_deg and .readout_ms (rolling shutter) are "
+        "still "
         "those of the rig below it",
         soft_wrap=True,
     )
@@ -91,13 +92,13 @@ def read_lens(file: Path, camera: str, max_off_axis_deg: float | None) -> Calibr
         raise LinkError(f"{file}:{error.line}: {error}" if error.line else f"{file}: {error}") from None
 
 
-def lens_text(found: CalibratedLens, carrier: Carrier, source: str) -> str:
+def lens_text(found: CalibratedLens, camera_mount: CameraMount, source: str) -> str:
     """The rig file. A size that is not known, or not square, is null: it hides that of the rig below."""
     width, height = found.size_px or (None, None)
     camera = {"size_px": width if width == height else None, "lens": found.lens.model_dump(mode="json")}
     head = [
-        f"# The lens of the {carrier.value}'s camera, by `grd lens {source} {carrier.value}`.",
+        f"# The lens of the {camera_mount.value}'s camera, by `grd lens {source} {camera_mount.value}`.",
         "# To fly: include it after the rig; to replay with it: grd replay RECORDING --overlay THIS_FILE.",
     ]
-    tree = {"rig": {"cameras": {carrier.value: camera}}}
+    tree = {"rig": {"cameras": {camera_mount.value: camera}}}
     return "\n".join([*head, yaml.safe_dump(tree, sort_keys=False, width=120)])

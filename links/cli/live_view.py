@@ -19,7 +19,7 @@ from flow.link import Tap
 from flow.live_report import LiveReport
 from flow.message import Message
 from links.cli.console import err, out
-from links.live_run import Look
+from links.runs.live_run import Look
 from stages.messages import DroneFix, RelativePose, TrackState
 
 SCREEN_S, LINE_S = 0.25, 5.0

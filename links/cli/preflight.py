@@ -17,10 +17,10 @@ from rich.text import Text
 from flow.link import LinkError
 from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
 from links.cli.run import Overlay, Sets
-from links.live_run import live_graph
 from links.preflight import OUT_DIR, Level, Step, Verdict, is_go, preflight_live, preflight_recording
 from links.recording import Session
-from links.run_folder import Asked
+from links.runs.live_run import live_graph
+from links.runs.run_folder import Asked
 
 COLOURS = {Level.OK: "green", Level.WARNING: "yellow", Level.FAIL: "red"}
 WORDS = {Level.OK: "ok", Level.WARNING: "look", Level.FAIL: "NO GO"}

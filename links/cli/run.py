@@ -17,12 +17,12 @@ from flow.link import LinkError
 from flow.live_report import LiveReport
 from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table, warn
 from links.cli.live_view import LiveView
-from links.live_run import live_graph, run_live
-from links.output_hashes import hash_matches
-from links.repeat import repeat_into
-from links.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
-from links.run_folder import Asked, Finished, replay_into
-from links.warm_up import warm_up
+from links.runs.as_live import repeat_into
+from links.runs.live_run import live_graph, run_live
+from links.runs.output_hashes import hash_matches
+from links.runs.results import FIX_FILE, POSE_FILE, SUMMARY_FILE, stamp_s
+from links.runs.run_folder import Asked, Finished, replay_into
+from links.runs.warm_up import warm_up
 from links.zenoh import host_graph
 
 TABLE_ROWS = 12

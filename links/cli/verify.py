@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from links.cli.console import FINDING, in_words, out, progress_bar
-from links.output_hashes import Outcome, measure, read_pins, write_pins
+from links.runs.output_hashes import Outcome, measure, read_pins, write_pins
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

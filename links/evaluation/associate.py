@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 Stamps = NDArray[np.int64]
 

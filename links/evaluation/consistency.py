@@ -14,7 +14,7 @@ from links.evaluation.catalogue import Value, failure
 from links.evaluation.errors import AtOutputs
 from links.evaluation.judged import Evaluation, no_error, no_truth, rms, too_few
 from links.evaluation.statistics import chi2_quantile, effective_samples, mean_nees_bounds, wilson_interval
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 MIN_FOR_NEES = 10
 BRANCH_RAD = math.radians(45.0)  # farther off is another branch

@@ -14,7 +14,7 @@ from links.evaluation.associate import interpolate, newest
 from links.evaluation.output import Output
 from links.evaluation.run_data import RunData
 from links.evaluation.tum import Trajectory
-from stages.geometry import Array64, rotations_from_xyzw
+from stages.geometry.frames import Array64, rotations_from_xyzw
 
 GRID_NS = 20_000_000  # time is looked at each 20 ms
 

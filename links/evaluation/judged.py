@@ -16,7 +16,7 @@ from links.evaluation.output import Output
 from links.evaluation.rotation_errors import RotationErrors
 from links.evaluation.run_data import RunData
 from links.evaluation.statistics import wilson_interval
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 SLOWEST_HZ = 4.0  # ArduPilot's EKF drops external poses that come slower
 NO_DRONE = "there was no drone"

@@ -1,6 +1,6 @@
 """One output of a run as its files tell it: poses, their covariances, which track each is of.
 
-Source: DESIGN, Outputs of a run; written by links/results.py.
+Source: DESIGN, Outputs of a run; written by links/runs/results.py.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flow.link import LinkError
 from links.evaluation.tum import MatrixRow, Trajectory, read_matrices, read_tum
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from links.evaluation.judged import Evaluation
 from links.evaluation.run_data import RunData
 from links.evaluation.said import Said
 from links.evaluation.statistics import wilson_interval
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.0)  # the detector accepts from .95 on
 

@@ -17,7 +17,7 @@ from links.evaluation.associate import Stamps, interpolate
 from links.evaluation.errors import euler_rpy, log_rotation, mahalanobis, wrap
 from links.evaluation.rotations import Rotations
 from links.evaluation.tum import Trajectory
-from stages.geometry import Array64, rotation_z, rotations_from_xyzw
+from stages.geometry.frames import Array64, rotation_z, rotations_from_xyzw
 
 
 @dataclass(frozen=True, slots=True)

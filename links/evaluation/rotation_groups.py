@@ -15,7 +15,7 @@ from links.evaluation.groups import Key, Spread, grouped, pooled, spread
 from links.evaluation.judged import Evaluation, p95, rms
 from links.evaluation.rotation_errors import Off
 from links.evaluation.statistics import chi2_quantile
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """The rotations that a run told of both cameras' pictures, as its table holds them.
 
-Source: stages/messages/cameras.py; written by links/results.py.
+Source: stages/messages/cameras.py; written by links/runs/results.py.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from flow.link import LinkError
 from links.evaluation.associate import Stamps
 from links.evaluation.tum import read_number, read_stamp_ns, read_table, symmetric
-from links.results import QUATERNION, ROTATION_UPPER
-from stages.geometry import Array64, rotations_from_xyzw
+from links.runs.results import QUATERNION, ROTATION_UPPER
+from stages.geometry.frames import Array64, rotations_from_xyzw
 from stages.messages import BranchState
 
 

@@ -1,6 +1,6 @@
 """What there is to judge: a run's folder, or a TUM file, with the truth that belongs to it.
 
-Source: DESIGN, Outputs of a run; file names in links/results.py.
+Source: DESIGN, Outputs of a run; file names in links/runs/results.py.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from links.evaluation.rotations import Rotations, read_rotations
 from links.evaluation.said import Said, read_said
 from links.evaluation.true_drone import TrueDrone, read_true_drones, read_true_vehicle
 from links.evaluation.tum import Trajectory, read_number, read_stamp_ns, read_table, read_tum
-from links.results import (
+from links.runs.results import (
     CANDIDATES_FILE,
     COVARIANCE_FILE,
     DETECTIONS_FILE,
@@ -30,7 +30,7 @@ from links.results import (
     ROTATION_FILE,
     SUMMARY_FILE,
 )
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """What a detector said may be a drone, and with what probability, look by look.
 
-Source: ours; the file's name and columns in links/results.py.
+Source: ours; the file's name and columns in links/runs/results.py.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from links.evaluation.tum import read_number, read_stamp_ns, read_table
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from links.evaluation.errors import GRID_NS
 from links.evaluation.judged import NO_DRONE, NO_SPAN, Evaluation, minutes, no_truth, timed_share
 from links.evaluation.run_data import Sweep
 from links.evaluation.tum import Trajectory
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 FOUND, BY_HITS = ("found_share",), ("found_when_seen_share", "missed_sweeps", "hit_share", "seen_share")
 FALSE = "false_detections_per_min"

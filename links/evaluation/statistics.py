@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 Z_95 = 1.959963984540054  # two-sided 95 % of the normal distribution
 

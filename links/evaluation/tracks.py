@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from links.evaluation.associate import Stamps, interpolate
 from links.evaluation.output import Output
 from links.evaluation.run_data import RunData
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 NEAR_M = 1.0
 OF_A_DRONE = ("truth", "hits", "visible")  # what may be missing for one drone and there for another

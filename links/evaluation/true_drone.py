@@ -1,6 +1,6 @@
 """What the truth beside a run says of the vehicle's way and of each drone: its path, its returns, what hid it.
 
-Source: links/truth.py, which writes it; file names in links/results.py.
+Source: links/runs/truth.py, which writes it; file names in links/runs/results.py.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flow.link import LinkError
 from links.evaluation.tum import NO_DRONE, Trajectory, read_stamp_ns, read_table, read_tum
-from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE, of_drone
+from links.runs.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE, of_drone
 
 NEVER_NS = np.iinfo(np.int64).max // 2  # the end of what did not end
 NO_HITS = "the recording does not say which returns came from the drone"

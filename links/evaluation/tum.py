@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.link import LinkError
-from links.results import UPPER
-from stages.geometry import Array64
+from links.runs.results import UPPER
+from stages.geometry.frames import Array64
 
 COLUMNS = "stamp_s tx ty tz qx qy qz qw"
 POSITION_ONLY, FULL_POSE, NO_DRONE = "position only", "full pose", "no drone"  # words of a header that say what it is

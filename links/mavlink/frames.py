@@ -3,7 +3,7 @@
 MAVLink's local frame has x north, y east, z down, its body x forward, y right, z down. Ours have y and z turned over:
 
     local: x north (the autopilot's north), y west, z up        drone: x forward, y left, z up
-    v_local = F v_ned,   v_drone = F v_frd,   R_local_drone = F R_ned_frd F,   F = diag(1, -1, -1) = F^-1
+    v_local = F v_ned,   v_drone = F v_frd,   R_odom_drone = F R_ned_frd F,   F = diag(1, -1, -1) = F^-1
 
 MAVLink's pose covariance has the states x, y, z, roll, pitch, yaw, its velocity covariance vx, vy, vz, rollspeed,
 pitchspeed, yawspeed, the upper triangle by rows. Ours has rotation first, tangent at the body (p_body = R^T p_local).
@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stages.geometry import Array64, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
+from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
 
 FLIP = np.array([1.0, -1.0, -1.0])
 F_AND_F = np.outer(FLIP, FLIP)  # F M F is M times this, number by number
@@ -46,27 +46,27 @@ def _both_turned_over(R: Array64) -> Array64:
     return R * F_AND_F + 0.0
 
 
-def R_local_drone_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array64:
-    """R_local_drone (3, 3) of ATTITUDE's angles: R_ned_frd = Rz(yaw) Ry(pitch) Rx(roll)."""
+def R_odom_drone_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array64:
+    """R_odom_drone (3, 3) of ATTITUDE's angles: R_ned_frd = Rz(yaw) Ry(pitch) Rx(roll)."""
     R_ned_frd = rotation_from_rpy_deg((math.degrees(roll_rad), math.degrees(pitch_rad), math.degrees(yaw_rad)))
     return _both_turned_over(R_ned_frd)
 
 
-def rpy_from_R_local_drone(R_local_drone: Array64) -> tuple[float, float, float]:
-    """ATTITUDE's roll, pitch, yaw [rad] of R_local_drone (3, 3)."""
-    (xx, _, _), (yx, _, _), (zx, zy, zz) = _both_turned_over(R_local_drone).tolist()
+def rpy_from_R_odom_drone(R_odom_drone: Array64) -> tuple[float, float, float]:
+    """ATTITUDE's roll, pitch, yaw [rad] of R_odom_drone (3, 3)."""
+    (xx, _, _), (yx, _, _), (zx, zy, zz) = _both_turned_over(R_odom_drone).tolist()
     return math.atan2(zy, zz), math.asin(min(max(-zx, -1.0), 1.0)), math.atan2(yx, xx)
 
 
-def R_local_drone_from_wxyz(quaternion_wxyz: Sequence[float]) -> Array64:
-    """R_local_drone (3, 3) of ODOMETRY's q = (w, x, y, z), the turn from FRD to NED."""
+def R_odom_drone_from_wxyz(quaternion_wxyz: Sequence[float]) -> Array64:
+    """R_odom_drone (3, 3) of ODOMETRY's q = (w, x, y, z), the turn from FRD to NED."""
     w, x, y, z = quaternion_wxyz
     return _both_turned_over(rotation_from_quaternion_xyzw((x, y, z, w)))
 
 
-def wxyz_from_R_local_drone(R_local_drone: Array64) -> list[float]:
-    """ODOMETRY's q = (w, x, y, z), w >= 0, of R_local_drone (3, 3)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = _both_turned_over(R_local_drone).tolist()
+def wxyz_from_R_odom_drone(R_odom_drone: Array64) -> list[float]:
+    """ODOMETRY's q = (w, x, y, z), w >= 0, of R_odom_drone (3, 3)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = _both_turned_over(R_odom_drone).tolist()
     # Each row is q times one of its components: the longest is the best conditioned.
     rows = (
         (1 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
@@ -81,13 +81,13 @@ def wxyz_from_R_local_drone(R_local_drone: Array64) -> list[float]:
     return [value / signed for value in row]
 
 
-def pose_covariance_from_upper(upper: Sequence[float], R_local_drone: Array64) -> Array64 | None:
+def pose_covariance_from_upper(upper: Sequence[float], R_odom_drone: Array64) -> Array64 | None:
     """Ours (6, 6) of MAVLink's 21 numbers; None where the autopilot gave none ([0] is NaN) or no covariance."""
     ours = _from_upper(upper)
     if ours is None:
         return None
     J = _EYE6.copy()
-    J[3:, 3:] = R_local_drone.T
+    J[3:, 3:] = R_odom_drone.T
     return J @ ours @ J.T
 
 
@@ -97,10 +97,10 @@ def velocity_covariance_from_upper(upper: Sequence[float]) -> Array64 | None:
     return None if ours is None else ours + 0.0  # as in `_both_turned_over`
 
 
-def upper_from_pose_covariance(covariance: Array64, R_local_drone: Array64) -> list[float]:
+def upper_from_pose_covariance(covariance: Array64, R_odom_drone: Array64) -> list[float]:
     """MAVLink's 21 numbers of ours (6, 6)."""
     J = _EYE6.copy()
-    J[3:, 3:] = R_local_drone
+    J[3:, 3:] = R_odom_drone
     return _to_upper(J @ covariance @ J.T)
 
 

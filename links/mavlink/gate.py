@@ -59,8 +59,8 @@ def refusal(pose: RelativePose, now_ns: int, limits: Limits) -> Refusal | None:
     """Why the pose may not go out now; None: it may."""
     if pose.state not in SENDABLE:
         return Refusal[pose.state.name]
-    rotations = pose.R_vehicle_drone, pose.R_start_drone
-    vectors = (pose.xyz_vehicle_m, pose.xyz_start_m, *rotations, pose.covariance, pose.start_covariance)
+    rotations = pose.R_vehicle_drone, pose.R_map_drone
+    vectors = (pose.xyz_vehicle_m, pose.xyz_map_m, *rotations, pose.covariance, pose.map_covariance)
     given = [vector.ravel() for vector in vectors if vector is not None]
     if len(given) < len(vectors):
         return Refusal.INCOMPLETE
@@ -85,9 +85,9 @@ def refusal(pose: RelativePose, now_ns: int, limits: Limits) -> Refusal | None:
 @lru_cache(maxsize=1)  # the gate asks, and the message tells its quality
 def worst_sigmas(pose: RelativePose) -> tuple[float, float] | None:
     """`pose_sigmas` of both covariances of a pose; None: one is missing, or none."""
-    if pose.covariance is None or pose.start_covariance is None:
+    if pose.covariance is None or pose.map_covariance is None:
         return None
-    return pose_sigmas(pose.covariance, pose.start_covariance)
+    return pose_sigmas(pose.covariance, pose.map_covariance)
 
 
 def pose_sigmas(*covariances: NDArray[np.float64]) -> tuple[float, float] | None:
@@ -108,7 +108,7 @@ def pose_sigmas(*covariances: NDArray[np.float64]) -> tuple[float, float] | None
 
 def velocity_to_send(pose: RelativePose, limits: Limits) -> NDArray[np.float64] | None:
     """The drone's velocity over ground, start axes, where it is known well enough; None: it goes out as not known."""
-    velocity, covariance = pose.velocity_start_mps, pose.velocity_covariance
+    velocity, covariance = pose.velocity_map_mps, pose.velocity_covariance
     if velocity is None or covariance is None or not (np.isfinite(velocity).all() and np.isfinite(covariance).all()):
         return None
     if min(np.diagonal(covariance).tolist()) <= 0 or not _is_symmetric(covariance):

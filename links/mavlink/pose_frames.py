@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from links.mavlink.frames import (
-    rpy_from_R_local_drone,
+    rpy_from_R_odom_drone,
     turned_over,
     upper_from_pose_covariance,
     upper_from_velocity_covariance,
-    wxyz_from_R_local_drone,
+    wxyz_from_R_odom_drone,
 )
 from links.mavlink.gate import Limits, velocity_to_send, worst_sigmas
 from links.mavlink.wire import SEQUENCE, dialect
@@ -58,7 +58,7 @@ def odometry(pose: RelativePose, reset_counter: int, limits: Limits) -> Any:
         LOCAL_FRD,
         BODY_FRD,
         *turned_over(xyz_m),
-        wxyz_from_R_local_drone(R),
+        wxyz_from_R_odom_drone(R),
         *(NO_NUMBERS if velocity is None else turned_over(R.T @ velocity)),
         *NO_NUMBERS,  # turn rates: the autopilot's gyros know better
         upper_from_pose_covariance(covariance, R),
@@ -75,7 +75,7 @@ def vision_position_estimate(pose: RelativePose, reset_counter: int) -> Any:
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
         *turned_over(xyz_m),
-        *rpy_from_R_local_drone(R),
+        *rpy_from_R_odom_drone(R),
         upper_from_pose_covariance(covariance, R),
         reset_counter % SEQUENCE,
     )
@@ -103,22 +103,22 @@ def landing_target(pose: RelativePose) -> Any:
         x,
         y,
         z,
-        wxyz_from_R_local_drone(R_drone_vehicle),
+        wxyz_from_R_odom_drone(R_drone_vehicle),
         VISION_OTHER,
         1,
     )
 
 
 def _start_pose(pose: RelativePose) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    if pose.xyz_start_m is None or pose.R_start_drone is None or pose.start_covariance is None:
+    if pose.xyz_map_m is None or pose.R_map_drone is None or pose.map_covariance is None:
         raise ValueError("the pose is not complete: the gate must refuse it")
-    return pose.xyz_start_m, pose.R_start_drone, pose.start_covariance
+    return pose.xyz_map_m, pose.R_map_drone, pose.map_covariance
 
 
-def _velocity_upper(covariance_start: NDArray[np.float64] | None, R_start_drone: NDArray[np.float64]) -> list[float]:
+def _velocity_upper(covariance_start: NDArray[np.float64] | None, R_map_drone: NDArray[np.float64]) -> list[float]:
     """21 numbers, drone axes; the turn rates' are NaN, and all where the velocity is not known."""
     if covariance_start is None:
         return [math.nan] * 21
     covariance = np.full((6, 6), np.nan)
-    covariance[3:, 3:] = R_start_drone.T @ covariance_start @ R_start_drone
+    covariance[3:, 3:] = R_map_drone.T @ covariance_start @ R_map_drone
     return upper_from_velocity_covariance(covariance)

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from links.mavlink.frames import (
-    R_local_drone_from_rpy,
-    R_local_drone_from_wxyz,
+    R_odom_drone_from_rpy,
+    R_odom_drone_from_wxyz,
     pose_covariance_from_upper,
     velocity_covariance_from_upper,
 )
@@ -59,7 +59,7 @@ def read_attitude(frame: Any, stamp_ns: int) -> DroneAttitude:
     """ATTITUDE."""
     return DroneAttitude(
         stamp_ns=stamp_ns,
-        R_local_drone=R_local_drone_from_rpy(*_numbers(frame, "roll", "pitch", "yaw")),
+        R_odom_drone=R_odom_drone_from_rpy(*_numbers(frame, "roll", "pitch", "yaw")),
         angular_velocity_drone_radps=_vector(frame, "rollspeed", "pitchspeed", "yawspeed"),
     )
 
@@ -68,8 +68,8 @@ def read_local_position(frame: Any, stamp_ns: int) -> DroneLocalPosition:
     """LOCAL_POSITION_NED."""
     return DroneLocalPosition(
         stamp_ns=stamp_ns,
-        xyz_local_m=_vector(frame, "x", "y", "z"),
-        velocity_local_mps=_vector(frame, "vx", "vy", "vz"),
+        xyz_odom_m=_vector(frame, "x", "y", "z"),
+        velocity_odom_mps=_vector(frame, "vx", "vy", "vz"),
     )
 
 
@@ -80,14 +80,14 @@ def read_odometry(frame: Any, stamp_ns: int) -> DroneOdometry:
     length = math.hypot(*frame.q)
     if not abs(length - 1.0) < 0.01:  # NaN compares false
         raise ValueError("no rotation")
-    R_local_drone = R_local_drone_from_wxyz(frame.q)
+    R_odom_drone = R_odom_drone_from_wxyz(frame.q)
     return DroneOdometry(
         stamp_ns=stamp_ns,
-        xyz_local_m=_vector(frame, "x", "y", "z"),
-        R_local_drone=R_local_drone,
+        xyz_odom_m=_vector(frame, "x", "y", "z"),
+        R_odom_drone=R_odom_drone,
         velocity_drone_mps=_vector(frame, "vx", "vy", "vz"),
         angular_velocity_drone_radps=_vector(frame, "rollspeed", "pitchspeed", "yawspeed"),
-        pose_covariance=pose_covariance_from_upper(frame.pose_covariance, R_local_drone),
+        pose_covariance=pose_covariance_from_upper(frame.pose_covariance, R_odom_drone),
         velocity_covariance=velocity_covariance_from_upper(frame.velocity_covariance),
         reset_counter=frame.reset_counter,
         quality_percent=None if frame.quality == 0 else max(frame.quality, 0),

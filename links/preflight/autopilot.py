@@ -13,8 +13,8 @@ from links.preflight.arrivals import Arrivals
 from links.preflight.heard import Heard
 from links.preflight.seen import AutopilotSeen
 from links.preflight.verdict import Verdict, fail, ok, warning
-from stages.drone_trail import BRIDGED_NS
 from stages.messages import AutopilotEstimator, AutopilotStatus
+from stages.odometry.drone.trajectory import BRIDGED_NS
 
 KINDS = {"ardupilot": 3, "px4": 12}  # MAV_AUTOPILOT
 HEARTBEAT_GAP_S = 3.0

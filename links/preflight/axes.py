@@ -17,7 +17,7 @@ from functools import cache
 
 import numpy as np
 
-from stages.geometry import Array64, rotation_z
+from stages.geometry.frames import Array64, rotation_z
 
 AXES = "xyz"
 SLOPE = (0.5, 2.0)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from links.preflight.verdict import Verdict, fail, ok
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 from stages.messages import DroneAttitude, DroneOdometry
 
 ENOUGH_RAD = np.radians(15.0)
@@ -22,7 +22,7 @@ Rotated = DroneAttitude | DroneOdometry
 
 
 def nose_down_rad(rotations: Array64) -> Array64:
-    """How far the nose points below the horizon, for rotations R_local_drone (n, 3, 3)."""
+    """How far the nose points below the horizon, for rotations R_odom_drone (n, 3, 3)."""
     return np.arcsin(np.clip(-rotations[:, 2, 0], -1.0, 1.0))
 
 
@@ -59,7 +59,7 @@ def hand_check(step: Step, rotated: Sequence[Rotated]) -> Verdict:
     assert step.measure is not None
     if len(rotated) < 2:
         return fail(name, "no attitude came meanwhile: check the autopilot's link")
-    rotations = np.array([m.R_local_drone for m in rotated])
+    rotations = np.array([m.R_odom_drone for m in rotated])
     right, wrong = _peaks(step.measure(rotations))
     if max(right, wrong) >= ENOUGH_RAD:
         told = np.degrees(right if right >= wrong else -wrong)

@@ -24,7 +24,7 @@ from flow.message import Message
 from links.preflight.axes import Agreement, compare, compare_paths
 from links.preflight.heard import AllHeard
 from links.preflight.verdict import Verdict, fail, ok, warning
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 from stages.messages import (
     DroneAttitude,
     DroneFix,
@@ -67,12 +67,12 @@ def motion_checks(heard: AllHeard) -> Iterator[Verdict]:
 
 
 def gravity_check(rotated: Sequence[Rotated], imu: Sequence[DroneImu]) -> Verdict:
-    """At rest an accelerometer measures the vertical, upwards: f = R_local_drone^T (0, 0, g)."""
+    """At rest an accelerometer measures the vertical, upwards: f = R_odom_drone^T (0, 0, g)."""
     name = "axes: accelerometer"
     at_rest = [m for m in imu if abs(float(np.linalg.norm(m.acceleration_drone_mps2)) - G_MPS2) < REST_MPS2]
     told, measured = [], []
     for sample, pose in _pairs(at_rest, rotated):
-        told.append(pose.R_local_drone[2])
+        told.append(pose.R_odom_drone[2])
         measured.append(sample.acceleration_drone_mps2 / np.linalg.norm(sample.acceleration_drone_mps2))
     if len(told) < FEWEST:
         return warning(name, "no attitude with an acceleration at rest beside it: not checked (ask for RAW_IMU)")
@@ -99,7 +99,7 @@ def turning_check(what: str, rotated: Sequence[Rotated], rates: Sequence[DroneIm
         between = rates[int(first) : int(end)]
         if between:
             passed_s = 1e-9 * (after.stamp_ns - before.stamp_ns)
-            changed.append(_log(before.R_local_drone.T @ after.R_local_drone) / passed_s)
+            changed.append(_log(before.R_odom_drone.T @ after.R_odom_drone) / passed_s)
             told.append(np.mean([m.angular_velocity_drone_radps for m in between], axis=0))
     if len(changed) < FEWEST:
         return warning(name, "too few to compare: not checked")
@@ -110,7 +110,7 @@ def heading_check(attitudes: Sequence[DroneAttitude], odometry: Sequence[DroneOd
     """ODOMETRY and ATTITUDE tell one rotation."""
     name = "axes: odometry's rotation"
     off = [
-        float(np.linalg.norm(_log(pose.R_local_drone.T @ attitude.R_local_drone)))
+        float(np.linalg.norm(_log(pose.R_odom_drone.T @ attitude.R_odom_drone)))
         for pose, attitude in _pairs(odometry, attitudes)
     ]
     if len(off) < FEWEST:
@@ -122,13 +122,13 @@ def heading_check(attitudes: Sequence[DroneAttitude], odometry: Sequence[DroneOd
 
 
 def velocity_check(odometry: Sequence[DroneOdometry]) -> Verdict:
-    """R_local_drone v_drone against the change of position, local axes."""
+    """R_odom_drone v_drone against the change of position, local axes."""
     name = "axes: odometry's velocity"
     changed, told = [], []
     for before, after in _steps(odometry):
         if before.reset_counter == after.reset_counter:
-            changed.append((after.xyz_local_m - before.xyz_local_m) * 1e9 / (after.stamp_ns - before.stamp_ns))
-            ends = [m.R_local_drone @ m.velocity_drone_mps for m in (before, after)]
+            changed.append((after.xyz_odom_m - before.xyz_odom_m) * 1e9 / (after.stamp_ns - before.stamp_ns))
+            ends = [m.R_odom_drone @ m.velocity_drone_mps for m in (before, after)]
             told.append(np.mean(ends, axis=0))
     if len(changed) < FEWEST:
         return warning(name, "too few to compare: not checked")
@@ -145,7 +145,7 @@ def path_check(
         at_start = _in_start_frame(fix, motions)
         if at_start is not None:
             seen.append(at_start)
-            told.append(position.xyz_local_m)
+            told.append(position.xyz_odom_m)
     if len(seen) < FEWEST:
         missing = f"the LiDAR saw the drone {len(fixes)} times, {len(seen)} with a position of the autopilot beside it"
         return warning(name, f"{missing}: not checked; carry the drone about where the LiDAR sees it")
@@ -179,11 +179,11 @@ def _along(seen: str) -> str:
 
 
 def _in_start_frame(fix: DroneFix, motions: Sequence[VehicleMotion]) -> Array64 | None:
-    """p_start = R_start_vehicle p_vehicle + t; without odometry the vehicle is taken to be parked."""
+    """p_start = R_map_vehicle p_vehicle + t; without odometry the vehicle is taken to be parked."""
     if not motions:
         return fix.xyz_vehicle_m
     near = next((pose for _, pose in _pairs([fix], motions)), None)
-    return None if near is None else near.R_start_vehicle @ fix.xyz_vehicle_m + near.xyz_start_m
+    return None if near is None else near.R_map_vehicle @ fix.xyz_vehicle_m + near.xyz_map_m
 
 
 def _stamps(messages: Sequence[Message]) -> NDArray[np.int64]:

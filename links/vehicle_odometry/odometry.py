@@ -1,4 +1,4 @@
-"""The vehicle's own odometry as a source: one JSON object per pose, T_start_vehicle; live by UDP (`udp.py`).
+"""The vehicle's own odometry as a source: one JSON object per pose, T_map_vehicle; live by UDP (`udp.py`).
 
 A recording without it is no error: the source stays silent, and the run says so once.
 
@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.vehicle_odometry.udp import listen_udp
-from stages.geometry import Array64, rotation_from_quaternion_xyzw
+from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw
 from stages.messages import VehicleMotion
 
 MAX_BYTES = 4_000
@@ -99,8 +99,8 @@ def parse_pose(stamp_ns: int, data: bytes) -> VehicleMotion:
         raise ValueError(f"no rotation: {[qx, qy, qz, qw]}")
     return VehicleMotion(
         stamp_ns=stamp_ns,
-        xyz_start_m=xyz_m,
-        R_start_vehicle=rotation_from_quaternion_xyzw((qx, qy, qz, qw)),
+        xyz_map_m=xyz_m,
+        R_map_vehicle=rotation_from_quaternion_xyzw((qx, qy, qz, qw)),
         covariance=covariance,
     )
 

@@ -6,37 +6,35 @@ https://velodynelidar.com/wp-content/uploads/2019/12/63-9243-Rev-E-VLP-16-User-M
 
 from __future__ import annotations
 
-LASERS = 16
-
-# Table 9-1, laser id 0..15: elevation [deg] and vertical correction [mm], which is added to z.
-ELEVATION_DEG = (-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15)
-VERTICAL_OFFSET_MM = (11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2)
-
-# Section 9.3.1.1 and 9.5: firing cycle. A firing sequence is 16 pulses and a recharge pause.
-PULSE_NS = 2_304
-SEQUENCE_NS = 55_296
+from stages.kernels.velodyne import AZIMUTH_TURN as AZIMUTH_TURN
+from stages.kernels.velodyne import BLOCK_BYTES as BLOCK_BYTES
+from stages.kernels.velodyne import BLOCK_HEAD_BYTES as BLOCK_HEAD_BYTES
+from stages.kernels.velodyne import BLOCK_PULSES as BLOCK_PULSES
+from stages.kernels.velodyne import BLOCKS as BLOCKS
+from stages.kernels.velodyne import CHANNEL_BYTES as CHANNEL_BYTES
+from stages.kernels.velodyne import DUAL as DUAL
+from stages.kernels.velodyne import ELEVATION_DEG as ELEVATION_DEG
+from stages.kernels.velodyne import LASERS as LASERS
+from stages.kernels.velodyne import LAST as LAST
+from stages.kernels.velodyne import MAX_SPIN_HZ as MAX_SPIN_HZ
+from stages.kernels.velodyne import PULSE_NS as PULSE_NS
+from stages.kernels.velodyne import RANGE_UNIT_MM as RANGE_UNIT_MM
+from stages.kernels.velodyne import RETURN_MODE_AT as RETURN_MODE_AT
+from stages.kernels.velodyne import SEQUENCE_NS as SEQUENCE_NS
+from stages.kernels.velodyne import STRONGEST as STRONGEST
+from stages.kernels.velodyne import VERTICAL_OFFSET_MM as VERTICAL_OFFSET_MM
 
 # Section 9.3.2: data packet (UDP payload), little endian.
 DATA_PORT = 2368
 PACKET_BYTES = 1206
-BLOCKS = 12
-BLOCK_BYTES = 100  # flag u16, azimuth u16, then 32 channels: two firing sequences of 16 lasers
-BLOCK_HEAD_BYTES = 4
-BLOCK_PULSES = 2 * LASERS
-CHANNEL_BYTES = 3  # range u16, reflectivity u8
 BLOCK_FLAG = b"\xff\xee"  # 0xEEFF
 LOWER_BLOCK_FLAG = b"\xff\xdd"  # 0xDDFF: sensors with more than 32 lasers only
 TIMESTAMP_AT = 1200  # u32: microseconds since the top of the hour, when the packet's first laser fired
-RETURN_MODE_AT = 1204
 PRODUCT_ID_AT = 1205
 
-RANGE_UNIT_MM = 2
-AZIMUTH_TURN = 36_000  # hundredths of a degree in a turn
 HOUR_US = 3_600_000_000
-MAX_SPIN_HZ = 20  # 300 to 1200 rpm
 
 # Table 9-2: factory bytes.
-STRONGEST, LAST, DUAL = 0x37, 0x38, 0x39
 PRODUCT_ID = 0x22  # VLP-16 and Puck LITE have the same angles, hence the same id
 OTHER_PRODUCTS = {
     0x21: "HDL-32E",

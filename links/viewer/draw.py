@@ -38,7 +38,6 @@ from stages.messages import (
     DepthImage,
     Detections,
     DroneFix,
-    DroneMotion,
     FollowedFeatures,
     Image,
     LidarFirings,
@@ -53,6 +52,7 @@ from stages.messages import (
     TrackState,
     VanishingDirections,
     VehicleMotion,
+    VisualMotion,
 )
 
 
@@ -86,7 +86,7 @@ draw.register(Image)(draw_cameras.image)
 draw.register(VanishingDirections)(draw_cameras.vanishing_directions)
 draw.register(FollowedFeatures)(draw_cameras.followed_features)
 draw.register(RelativeRotation)(draw_rotation.relative_rotation)
-draw.register(DroneMotion)(draw_rotation.drone_motion)
+draw.register(VisualMotion)(draw_rotation.visual_motion)
 draw.register(RelativePose)(draw_pose.relative_pose)
 draw.register(AutopilotEstimator)(draw_pose.autopilot_estimator)
 draw.register(ServoOffset)(draw_pose.servo_offset)

@@ -18,7 +18,7 @@ from links.viewer import colours
 from links.viewer.lenses import arcs, pixels_of, strips
 from links.viewer.marks import Marks, lane_of, plot, say, stage_of, state, strip_batch
 from links.viewer.scene import Mark, Picture, Scene, sphere_frame
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 from stages.messages import FollowedFeatures, Image, VanishingDirections
 
 PICTURE_PX = 480  # longer side of a picture in the viewer
@@ -88,8 +88,9 @@ def followed_features(message: FollowedFeatures, name: str, scene: Scene) -> Mar
 def direction_colours(message: VanishingDirections) -> NDArray[np.uint32]:
     """Packed colour (n,) of each direction: one for the vertical, a hue for each horizontal pair.
 
-    Of a pair the direction nearer to the carrier's x axis is the full one, the other the pale one: it keeps its colour
-    from picture to picture as long as its carrier turns little.
+    Of a pair the direction nearer to the camera_mount's x axis is the full one, the other the pale one: it keeps its
+    colour
+    from picture to picture as long as its camera_mount turns little.
     """
     packed = np.full(len(message.direction), colours.VERTICAL, dtype=np.uint32)
     for pair in np.unique(message.frame[~message.is_vertical]):
@@ -109,7 +110,7 @@ def _sphere(
     by_line: NDArray[np.uint32],
     by_direction: NDArray[np.uint32],
 ) -> Marks:
-    frame = sphere_frame(message.carrier)
+    frame = sphere_frame(message.camera_mount)
     drawn, lengths, owner = strips(points, arc)
     lines = rr.LineStrips3D(strip_batch(drawn, lengths), colors=by_line[owner], radii=rr.Radius.ui_points(1.0))
     yield Mark(f"{path}/lines", lines, frame=frame)
@@ -127,7 +128,7 @@ def _on_picture(
     by_direction: NDArray[np.uint32],
     scene: Scene,
 ) -> Marks:
-    frame_id = f"camera_{message.carrier.value}"
+    frame_id = f"camera_{message.camera_mount.value}"
     picture = scene.pictures.get(frame_id)
     if picture is None or picture.stamp_ns != message.stamp_ns:
         return
@@ -140,7 +141,7 @@ def _on_picture(
             picture.shown(at), labels=text, show_labels=True, colors=colours.COASTING, radii=0.0, draw_order=40
         ),
     )
-    camera = scene.cameras.of(message.carrier)
+    camera = scene.cameras.of(message.camera_mount)
     if camera is None:
         raise LookupError(
             f"no lens for the picture of {frame_id}, so no lines on it: give the viewer `cameras: $rig.cameras`"

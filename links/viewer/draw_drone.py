@@ -13,7 +13,7 @@ import rerun as rr
 from links.viewer import colours, images
 from links.viewer.marks import Marks, clear, ellipsoids, label, lane_of, plot, say, stage_of, state
 from links.viewer.scene import DRONE_FRAME, Mark, Scene, drone_transform
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState
 
 RING_PX = 14.0  # around a candidate in the images

@@ -13,8 +13,8 @@ import rerun as rr
 from links.viewer import colours
 from links.viewer.marks import Marks, clear, lane_of, plot, say, stage_of, state
 from links.viewer.scene import DRONE_FRAME, Mark, Scene, drone_sphere, sphere_frame
-from stages.geometry import Array64
-from stages.messages import BranchState, Carrier, DroneMotion, RelativeRotation
+from stages.geometry.frames import Array64
+from stages.messages import BranchState, CameraMount, RelativeRotation, VisualMotion
 
 BRANCHES = ["as given", "turned by 90 deg", "by 180 deg", "by 270 deg", "none of them"]
 BRANCH_COLOURS = np.array(
@@ -63,7 +63,7 @@ def relative_rotation(message: RelativeRotation, name: str, scene: Scene) -> Mar
     yield scene.now(7, stage_of(name), f"{words}; {message.reason}" if message.reason else words)
 
 
-def drone_motion(message: DroneMotion, name: str, scene: Scene) -> Marks:
+def visual_motion(message: VisualMotion, name: str, scene: Scene) -> Marks:
     """How many features agree, how sure rotation and direction of travel are; the direction on the drone's sphere."""
     yield plot(f"plots/matches/{name}", [message.matches], ["features that agree"], MATCHES_COLOUR)
     rotation_deg = math.degrees(math.sqrt(float(np.linalg.eigvalsh(message.covariance_rad2)[-1])))
@@ -79,7 +79,7 @@ def drone_motion(message: DroneMotion, name: str, scene: Scene) -> Marks:
         yield plot(f"plots/motion_sigma/{name}/direction", [direction_deg], ["direction of travel"], style)
         words += f", direction of travel +-{direction_deg:.1f} deg"
     travel = rr.Arrows3D(origins=origins, vectors=vectors, colors=0xFFFFFFFF, radii=rr.Radius.ui_points(2.5))
-    yield Mark(f"sphere/{name}/travel", travel, frame=sphere_frame(Carrier.DRONE))
+    yield Mark(f"sphere/{name}/travel", travel, frame=sphere_frame(CameraMount.DRONE))
     yield scene.now(8, stage_of(name), f"{words}; {message.reason}" if message.reason else words)
 
 

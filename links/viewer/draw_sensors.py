@@ -77,8 +77,8 @@ def swept_pulses(message: SweptPulses, name: str, scene: Scene) -> Marks:
 def vehicle_motion(message: VehicleMotion, name: str, scene: Scene) -> Marks:
     """Where the vehicle has come to."""
     del scene
-    R = message.R_start_vehicle
-    yield plot(f"plots/other/{name}/position", message.xyz_start_m, [f"vehicle {axis} [m]" for axis in "xyz"])
+    R = message.R_map_vehicle
+    yield plot(f"plots/other/{name}/position", message.xyz_map_m, [f"vehicle {axis} [m]" for axis in "xyz"])
     yield plot(f"plots/other/{name}/yaw", [math.degrees(math.atan2(R[1, 0], R[0, 0]))], ["vehicle yaw [deg]"])
 
 

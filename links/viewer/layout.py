@@ -12,7 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from links.viewer.scene import DRONE_FRAME, SPHERES_APART, TIMELINE, sphere_frame
-from stages.messages import Carrier
+from stages.messages import CameraMount
 
 _BACKGROUND = [12, 15, 22]
 _WHOLE_RUN = rrb.TimeAxis(
@@ -118,7 +118,7 @@ def _of_cameras(vision: Vision) -> list[tuple[int, rrb.View | rrb.Container]]:
         )
         name = "Directions and lines on the unit sphere: vertical blue, each horizontal pair its hue"
         contents = ["/sphere/**", "/frames/**"]
-        rows.append((24, _space(name, contents, frame=sphere_frame(Carrier.VEHICLE), eye=eye, grid_m=None)))
+        rows.append((24, _space(name, contents, frame=sphere_frame(CameraMount.VEHICLE), eye=eye, grid_m=None)))
     if vision.rotation:
         rows.append((13, _curves("Branch of the rotation [%]", "/plots/branch/**")))
     if vision.rotation or vision.pose:

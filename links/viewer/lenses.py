@@ -1,6 +1,6 @@
 """The cameras as the viewer needs them, and great-circle arcs as strips: on the unit sphere, and through a lens.
 
-Source: ours; lenses: stages/lens.py; a line of the world is a great circle of rays, P IV.
+Source: ours; lenses: stages/geometry/lens.py; a line of the world is a great circle of rays, P IV.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.geometry import Array64, Pose
-from stages.lens import Lens
-from stages.messages import Carrier
+from stages.geometry.frames import Array64, Pose
+from stages.geometry.lens import Lens
+from stages.messages import CameraMount
 
 STEP_RAD = np.deg2rad(4.0)  # between points of an arc; a fisheye bends it by less than a tenth of a pixel within that
 
@@ -34,7 +34,7 @@ class VehicleCamera(_Camera):
     T_vehicle_camera: Pose
 
     def pose(self) -> Pose:
-        """T_carrier_camera."""
+        """T_mount_camera."""
         return self.T_vehicle_camera
 
 
@@ -44,7 +44,7 @@ class DroneCamera(_Camera):
     T_drone_camera: Pose
 
     def pose(self) -> Pose:
-        """T_carrier_camera."""
+        """T_mount_camera."""
         return self.T_drone_camera
 
 
@@ -56,17 +56,17 @@ class Cameras(BaseModel):
     vehicle: VehicleCamera | None = None
     drone: DroneCamera | None = None
 
-    def of(self, carrier: Carrier) -> VehicleCamera | DroneCamera | None:
-        """The camera on this carrier."""
-        return self.vehicle if carrier is Carrier.VEHICLE else self.drone
+    def of(self, camera_mount: CameraMount) -> VehicleCamera | DroneCamera | None:
+        """The camera on this camera_mount."""
+        return self.vehicle if camera_mount is CameraMount.VEHICLE else self.drone
 
     def named(self) -> list[str]:
         """Frame ids of the pictures."""
-        return [f"camera_{carrier.value}" for carrier in Carrier if self.of(carrier) is not None]
+        return [f"camera_{camera_mount.value}" for camera_mount in CameraMount if self.of(camera_mount) is not None]
 
 
 def pixels_of(camera: VehicleCamera | DroneCamera, rays_carrier: Array64) -> Array64:
-    """Pixels (n, 2) of rays (n, 3) in the carrier's axes; NaN where the lens does not see them."""
+    """Pixels (n, 2) of rays (n, 3) in the camera_mount's axes; NaN where the lens does not see them."""
     R_carrier_camera = camera.pose().matrix()[:3, :3]
     return camera.lens.project(rays_carrier @ R_carrier_camera)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from links.viewer import colours
 from links.viewer.ellipsoid import ellipsoid
 from links.viewer.scene import Curve, Mark, Scene
-from stages.geometry import quaternions_xyzw
+from stages.geometry.frames import quaternions_xyzw
 
 Marks = Iterator[Mark]
 Colour = int | NDArray[np.uint32]

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from links.viewer import colours
 from links.viewer.lenses import Cameras
-from stages.geometry import Array64, LidarMount, rotation_z, transform
-from stages.messages import Candidates, Carrier, DepthImage, DroneFix, TrackingState, TrackState
+from stages.geometry.frames import Array64, LidarMount, rotation_z, transform
+from stages.messages import CameraMount, Candidates, DepthImage, DroneFix, TrackingState, TrackState
 
 TIMELINE = "sensor_time"
 DRONE_FRAME = "drone_position"  # axes as the vehicle's, origin at the latest fix: the close-up looks from there
@@ -248,38 +248,38 @@ def opening(mount: LidarMount | None) -> Iterator[Mark]:
 
 def spheres() -> Iterator[Mark]:
     """The unit spheres of both carriers' directions, side by side."""
-    for carrier in Carrier:
-        frame = sphere_frame(carrier)
+    for camera_mount in CameraMount:
+        frame = sphere_frame(camera_mount)
         ball = rr.Ellipsoids3D(
             half_sizes=[[1.0, 1.0, 1.0]],
             colors=0xFFFFFF18,
             line_radii=rr.Radius.ui_points(0.5),
             fill_mode=rr.components.FillMode.MajorWireframe,
         )
-        yield Mark(f"sphere/{carrier.value}/ball", ball, frame=frame)
+        yield Mark(f"sphere/{camera_mount.value}/ball", ball, frame=frame)
         axes = rr.Arrows3D(vectors=0.35 * np.eye(3), colors=colours.AXES, radii=rr.Radius.ui_points(1.5))
-        yield Mark(f"sphere/{carrier.value}/axes", axes, frame=frame)
-    yield _sphere_name(Carrier.VEHICLE, "vehicle")
+        yield Mark(f"sphere/{camera_mount.value}/axes", axes, frame=frame)
+    yield _sphere_name(CameraMount.VEHICLE, "vehicle")
 
 
-def sphere_frame(carrier: Carrier) -> str:
-    """The carrier's axes, at the middle of its unit sphere."""
-    return f"sphere_{carrier.value}"
+def sphere_frame(camera_mount: CameraMount) -> str:
+    """The camera_mount's axes, at the middle of its unit sphere."""
+    return f"sphere_{camera_mount.value}"
 
 
 def drone_sphere(R_vehicle_drone: Array64 | None, how: str = "own axes") -> Iterator[Mark]:
     """The drone's sphere beside the vehicle's, turned as the drone is; None: that is not known. `how` it is turned."""
     at = np.array([0.0, -SPHERES_APART, 0.0])
     R = np.eye(3) if R_vehicle_drone is None else R_vehicle_drone
-    vehicle, drone = sphere_frame(Carrier.VEHICLE), sphere_frame(Carrier.DRONE)
+    vehicle, drone = sphere_frame(CameraMount.VEHICLE), sphere_frame(CameraMount.DRONE)
     yield Mark(f"frames/{drone}", _transform(transform(R, at), vehicle, drone))
-    yield _sphere_name(Carrier.DRONE, f"drone, {how}")
+    yield _sphere_name(CameraMount.DRONE, f"drone, {how}")
 
 
-def _sphere_name(carrier: Carrier, text: str) -> Mark:
-    above = [[0.0, -SPHERES_APART * (carrier is Carrier.DRONE), 1.4]]
+def _sphere_name(camera_mount: CameraMount, text: str) -> Mark:
+    above = [[0.0, -SPHERES_APART * (camera_mount is CameraMount.DRONE), 1.4]]
     words = rr.Points3D(above, labels=[text], show_labels=True, colors=colours.NEUTRAL, radii=0.0)
-    return Mark(f"sphere/{carrier.value}/name", words, frame=sphere_frame(Carrier.VEHICLE))
+    return Mark(f"sphere/{camera_mount.value}/name", words, frame=sphere_frame(CameraMount.VEHICLE))
 
 
 def drone_transform(xyz_vehicle_m: NDArray[np.float64]) -> rr.Transform3D:

@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 
 from links.viewer.rrd_file import RrdFile
 from links.viewer.scene import TIMELINE, Curve, Mark
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 APPLICATION = "grd"
 LOOPBACK = "127.0.0.1"

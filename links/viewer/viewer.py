@@ -27,8 +27,8 @@ from links.viewer.mailbox import Mailbox
 from links.viewer.scene import Mark, Scene, drone_sphere, opening, scenery, spheres
 from links.viewer.slices import Slicer
 from links.viewer.stream import LOOPBACK, Stream
-from stages.geometry import LidarMount
-from stages.messages import Carrier
+from stages.geometry.frames import LidarMount
+from stages.messages import CameraMount
 
 PATIENCE_S = 10.0  # a lossless run waits this long for a stalled viewer
 PICTURE_EVERY_S = {True: 0.0, False: 0.2}  # lossless: each; live: enough to look at
@@ -197,14 +197,14 @@ class Viewer(Tap[ViewerSettings]):
         """What of the cameras and the fused pose there is to show."""
         directions = _made(run, "vanishing_directions")
         pictures = (self.settings.cameras and self.settings.cameras.named()) or [
-            f"camera_{carrier.value}" for carrier in Carrier
+            f"camera_{camera_mount.value}" for camera_mount in CameraMount
         ]
         return Vision(
             pictures=pictures if directions or _made(run, "image") else [],
             directions=directions,
             rotation=_made(run, "relative_rotation"),
             pose=_made(run, "relative_pose"),
-            odometry=_made(run, "drone_motion"),
+            odometry=_made(run, "visual_motion"),
         )
 
 

@@ -24,12 +24,12 @@ from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
 from stages.aim.beams import Rotor, cheapest, low_discrepancy, nearest, rotor_azimuth_rad, sweep_step_rad
-from stages.aim.beside import Look, best_offset_m
+from stages.aim.search_offset import Look, best_offset_m
 from stages.aim.sweeping import Sweeping
 from stages.aim.targets import Key, Target, Targets
-from stages.geometry import LidarMount
+from stages.geometry.frames import LidarMount
 from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, TrackState
-from stages.turntable import GearPlay
+from stages.sweep.turntable import GearPlay
 
 TOLD_NS = 12_000_000  # after its pass a look has been told of
 SHORTEST_LOOK_NS = 5_000_000

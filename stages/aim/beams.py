@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.geometry import Array64, LidarMount
+from stages.geometry.frames import Array64, LidarMount
 from stages.messages import LidarFirings
 
 

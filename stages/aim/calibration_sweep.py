@@ -1,7 +1,7 @@
 """Aim: there and back over the whole travel, slowly and fast by turns. What `grd calibrate` asks for.
 
 Seen on the way there and on the way back a wall tells the gear's play, at two speeds the servo's clock; see
-`stages/calibration/verdict.py`.
+`stages/calibration/result.py`.
 
 Source: ours, for P III.A.
 """
@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from flow.stage import Settings, Stage
 from stages.aim.sweeping import Sweeping
 from stages.aim.vibrate import RPM_RADPS
-from stages.geometry import LidarMount
+from stages.geometry.frames import LidarMount
 from stages.messages import ServoGoal, ServoState
 
 Rpm = Annotated[float, Field(gt=0, le=120)]

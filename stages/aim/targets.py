@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stages.aim.beside import Look
-from stages.geometry import Array64
+from stages.aim.search_offset import Look
+from stages.geometry.frames import Array64
 from stages.messages import Candidates, TrackingState, TrackState
 
 TRACK_OWN_M = 1.0  # the detector tells of what is tracked, too

@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.geometry import Array64, LidarMount
+from stages.geometry.frames import Array64, LidarMount
 from stages.messages import Detections, DroneFix, ServoGoal, ServoState, TrackingState, TrackState
 
 RPM_RADPS = math.tau / 60.0

@@ -26,26 +26,26 @@ from typing import Any, ClassVar
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.align.answers import Answers
-from stages.align.by_motion import ByMotion, Prior
-from stages.align.lock import YawLock
+from stages.align.dead_reckoning import Reckoning
+from stages.align.innovation_gate import Surprise
+from stages.align.motion_branch import ByMotion, Prior
 from stages.align.pairing import Pair, Pairing
-from stages.align.reckoning import Reckoning
+from stages.align.publisher import Answers
 from stages.align.refine import Tolerances, refine, street_directions
 from stages.align.spectra import level_lines, spectrum
-from stages.align.surprise import Surprise
+from stages.align.yaw_tracker import YawLock
+from stages.heading.hypothesis_bank import BranchSettings
 from stages.messages import (
-    Carrier,
+    CameraMount,
     DroneAttitude,
     DroneFix,
     DroneLocalPosition,
-    DroneMotion,
     DroneOdometry,
     RelativeRotation,
     VanishingDirections,
     VehicleMotion,
+    VisualMotion,
 )
-from stages.yaw_branches.bank import BranchSettings
 
 
 @dataclass
@@ -89,7 +89,7 @@ class JointAlign(Stage[JointAlignSettings]):
     """Both cameras' lines laid on each other; four branches with probabilities."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"motion", "drone_motion", "attitude", "position", "odometry", "fix"}
+        {"motion", "visual_motion", "attitude", "position", "odometry", "fix"}
     )
 
     def __init__(self, settings: JointAlignSettings | None = None, /, **values: Any) -> None:
@@ -122,7 +122,7 @@ class JointAlign(Stage[JointAlignSettings]):
         """Both at once."""
         self._parts.reckoning.add_autopilot(odometry)
 
-    def on_drone_motion(self, motion: DroneMotion) -> None:
+    def on_visual_motion(self, motion: VisualMotion) -> None:
         """Turn and direction from the drone's pictures."""
         self._parts.reckoning.add_drone_motion(motion)
         self._parts.motion.hear_pictures(motion)
@@ -134,12 +134,12 @@ class JointAlign(Stage[JointAlignSettings]):
 
     def on_vehicle(self, seen: VanishingDirections) -> Iterator[RelativeRotation]:
         """The vehicle's lines."""
-        for pair in self._parts.pairing.vehicle(_of(seen, Carrier.VEHICLE, "vehicle")):
+        for pair in self._parts.pairing.vehicle(_of(seen, CameraMount.VEHICLE, "vehicle")):
             yield self._align(pair)
 
     def on_drone(self, seen: VanishingDirections) -> Iterator[RelativeRotation]:
         """The drone's lines: one answer each, once the vehicle's nearest picture is known."""
-        for pair in self._parts.pairing.drone(_of(seen, Carrier.DRONE, "drone")):
+        for pair in self._parts.pairing.drone(_of(seen, CameraMount.DRONE, "drone")):
             yield self._align(pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
@@ -162,7 +162,8 @@ class JointAlign(Stage[JointAlignSettings]):
             both = ((seen_by_vehicle, vehicle), (seen_by_drone, drone))
             few = (seen for seen, lines in both if lines is None or len(lines.weight) < settings.min_lines)
             return parts.answers.none(
-                drone_ns, "; ".join(f"{seen.carrier.value}: {seen.reason or 'too few level lines'}" for seen in few)
+                drone_ns,
+                "; ".join(f"{seen.camera_mount.value}: {seen.reason or 'too few level lines'}" for seen in few),
             )
         a, b = spectrum(vehicle), spectrum(drone)
         reckoned = parts.reckoning.advance(vehicle_ns, drone_ns, vehicle, drone)
@@ -207,7 +208,7 @@ class JointAlign(Stage[JointAlignSettings]):
         )
 
 
-def _of(seen: VanishingDirections, carrier: Carrier, port: str) -> VanishingDirections:
-    if seen.carrier is not carrier:
-        raise ValueError(f"input {port!r} got the directions of the {seen.carrier.value}: wire the other camera")
+def _of(seen: VanishingDirections, camera_mount: CameraMount, port: str) -> VanishingDirections:
+    if seen.camera_mount is not camera_mount:
+        raise ValueError(f"input {port!r} got the directions of the {seen.camera_mount.value}: wire the other camera")
     return seen

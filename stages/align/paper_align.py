@@ -38,15 +38,15 @@ from stages.align.pairing import Pairing
 from stages.align.paper_correction import CorrectionRule, MotionCorrection
 from stages.align.paper_filter import RotationFilter
 from stages.align.paper_match import angle_between_rad, match
-from stages.geometry import Array64, rotation_z
+from stages.geometry.frames import Array64, rotation_z
 from stages.messages import (
     BranchState,
-    Carrier,
+    CameraMount,
     DroneFix,
-    DroneMotion,
     RelativeRotation,
     VanishingDirections,
     VehicleMotion,
+    VisualMotion,
 )
 
 OTHER_BRANCH_RAD = math.radians(45.0)
@@ -71,7 +71,7 @@ class PaperAlignSettings(Settings):
 class PaperAlign(Stage[PaperAlignSettings]):
     """P IV and V.C-V.E: smallest-angle matching, EKF, and the branch put right by the drone's motion."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"fix", "drone_motion", "motion"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"fix", "visual_motion", "motion"})
 
     def __init__(self, settings: PaperAlignSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -95,7 +95,7 @@ class PaperAlign(Stage[PaperAlignSettings]):
         """t_GD."""
         self._correction.add_fix(fix)
 
-    def on_drone_motion(self, motion: DroneMotion) -> None:
+    def on_visual_motion(self, motion: VisualMotion) -> None:
         """dt_DD(i, j), or a link of it."""
         self._correction.add_motion(motion)
 
@@ -105,12 +105,12 @@ class PaperAlign(Stage[PaperAlignSettings]):
 
     def on_vehicle(self, directions: VanishingDirections) -> Iterator[RelativeRotation]:
         """V_G."""
-        for pair in self._pairing.vehicle(_of(directions, Carrier.VEHICLE, "vehicle")):
+        for pair in self._pairing.vehicle(_of(directions, CameraMount.VEHICLE, "vehicle")):
             yield self._answer(*pair)
 
     def on_drone(self, directions: VanishingDirections) -> Iterator[RelativeRotation]:
         """V_D. One answer comes for each of the drone's pictures, once the vehicle's nearest one is known."""
-        for pair in self._pairing.drone(_of(directions, Carrier.DRONE, "drone")):
+        for pair in self._pairing.drone(_of(directions, CameraMount.DRONE, "drone")):
             yield self._answer(*pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
@@ -135,7 +135,9 @@ class PaperAlign(Stage[PaperAlignSettings]):
         """Why there is nothing to match; empty when there is."""
         if vehicle is None:
             return f"no picture of the vehicle's within {self.settings.max_apart_s:g} s of the drone's"
-        return "; ".join(f"{one.carrier.value}: {one.reason}" for one in (vehicle, drone) if len(one.direction) < 2)
+        return "; ".join(
+            f"{one.camera_mount.value}: {one.reason}" for one in (vehicle, drone) if len(one.direction) < 2
+        )
 
     def _observe(self, vehicle: Array64, drone: Array64, now_ns: int) -> str:
         """Match, correct the branch if motion says so, update the filter. Returns what was done, in words."""
@@ -172,7 +174,9 @@ class PaperAlign(Stage[PaperAlignSettings]):
         )
 
 
-def _of(directions: VanishingDirections, carrier: Carrier, port: str) -> VanishingDirections:
-    if directions.carrier is not carrier:
-        raise ValueError(f"input {port!r} got the directions of the {directions.carrier.value}: wire the other camera")
+def _of(directions: VanishingDirections, camera_mount: CameraMount, port: str) -> VanishingDirections:
+    if directions.camera_mount is not camera_mount:
+        raise ValueError(
+            f"input {port!r} got the directions of the {directions.camera_mount.value}: wire the other camera"
+        )
     return directions

@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from stages.geometry import Array64
-from stages.messages import DroneFix, DroneMotion, VehicleMotion
-from stages.rotation import nearest_rotation
-from stages.trail import VehicleTrail
+from stages.geometry.frames import Array64
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.kernels.geometry.so3 import nearest_rotation
+from stages.messages import DroneFix, VehicleMotion, VisualMotion
 
 KEPT = 256  # pictures, fixes, motions
 FIX_GAP_NS = 500_000_000  # between fixes further apart nothing is interpolated
@@ -49,13 +49,13 @@ class MotionCorrection:
 
     def __init__(self, rule: CorrectionRule) -> None:
         self._rule = rule
-        self.trail = VehicleTrail()
+        self.trail = VehicleTrajectory()
         self._fixes: deque[tuple[int, Array64]] = deque(maxlen=KEPT)
         self._track_id: int | None = None
         self._pictures: deque[int] = deque(maxlen=KEPT)  # stamps of the drone's
         self._rotations: dict[int, Array64] = {}  # R_GD0 at the drone's pictures
-        self._motions: dict[int, DroneMotion] = {}  # by the later picture
-        self._waiting: deque[DroneMotion] = deque(maxlen=KEPT)
+        self._motions: dict[int, VisualMotion] = {}  # by the later picture
+        self._waiting: deque[VisualMotion] = deque(maxlen=KEPT)
         self._pairs: deque[tuple[Array64, Array64]] = deque(maxlen=rule.last)  # f_hat, f
         self._news = False  # a pair since the last answer
 
@@ -71,7 +71,7 @@ class MotionCorrection:
         """Where the vehicle is."""
         self.trail.add(motion)
 
-    def add_motion(self, motion: DroneMotion) -> None:
+    def add_motion(self, motion: VisualMotion) -> None:
         """How the drone moved between two pictures."""
         self._motions[motion.stamp_ns] = motion
         _drop_oldest(self._motions)
@@ -121,7 +121,7 @@ class MotionCorrection:
                 self._pairs.append(pair)
                 self._news = True
 
-    def _pair(self, motion: DroneMotion) -> tuple[Array64, Array64] | None:
+    def _pair(self, motion: VisualMotion) -> tuple[Array64, Array64] | None:
         """(f_hat, f) of the chain of motions that ends with this one; None: unknown, or too short."""
         chain = self._chain(motion)
         if chain is None:
@@ -146,7 +146,7 @@ class MotionCorrection:
         f_hat = self.trail.at(first_ns)[0] @ R_GD0 @ dt
         return f_hat * float(np.linalg.norm(f)) / length, f
 
-    def _chain(self, motion: DroneMotion) -> list[DroneMotion] | None:
+    def _chain(self, motion: VisualMotion) -> list[VisualMotion] | None:
         """Motions, one after the other, over `pictures_apart` of the drone's pictures; None: a link is missing."""
         chain = [motion]
         while self._pictures_between(chain[0].from_ns, motion.stamp_ns) < self._rule.pictures_apart:

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry import Array64
-from stages.rotation import exp_rotation, log_rotation, nearest_rotation
+from stages.geometry.frames import Array64
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation, nearest_rotation
 
 FURTHEST_S = 1.0  # beyond the newest observation the rate turns the estimate no further
 

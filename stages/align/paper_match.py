@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry import Array64
-from stages.rotation import log_rotation, nearest_rotation
+from stages.geometry.frames import Array64
+from stages.kernels.geometry.so3 import log_rotation, nearest_rotation
 
 
 @dataclass(frozen=True, slots=True)

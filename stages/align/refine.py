@@ -20,9 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.align.spectra import BIN_RAD, LevelLines
-from stages.geometry import Array64, rotation_z
-from stages.rotation import exp_rotation
+from stages.align.spectra import LevelLines
+from stages.geometry.frames import Array64, rotation_z
+from stages.kernels.align.spectra import BIN_RAD
+from stages.kernels.geometry.so3 import exp_rotation
 
 TILTS_AND_YAW = 5  # the first unknowns: tilt x, y of the vehicle, of the drone, yaw
 MOST_DIRECTIONS = 6
@@ -101,7 +102,7 @@ class _Eye:
     """One camera's share: its lines by direction, and its level axes as refined so far."""
 
     R: Array64  # R_carrier_level
-    normal: Array64  # (m, 3) carrier axes
+    normal: Array64  # (m, 3) camera_mount axes
     sigma: Array64  # (m,)
     k: NDArray[np.int64]  # (m,) which direction
     azimuth: Array64  # (K,) as this camera has it, in its own level axes

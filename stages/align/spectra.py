@@ -23,13 +23,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.compiled import compiled
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.kernels.align.spectra import BIN_RAD, BINS, add_kernels
 from stages.messages import VanishingDirections
 
-BINS = 720  # of 180 deg
 QUARTER = BINS // 2
-BIN_RAD = math.pi / BINS
 BROAD_RAD = math.radians(4.0)  # a line whose azimuth is worse says nothing of yaw
 LONG_RAD = 0.5  # longer lines count no more
 NEAR_BINS = 4  # directions this near to each other are the same
@@ -38,7 +36,7 @@ DIRECTION_SHARE = 0.04  # of all lines: a direction from which on it counts full
 
 @dataclass(frozen=True)
 class LevelLines:
-    """A camera's lines that may be horizontal, in level axes: z is up, x the carrier's forward."""
+    """A camera's lines that may be horizontal, in level axes: z is up, x the camera_mount's forward."""
 
     R_carrier_level: Array64  # (3, 3)
     tilt_sigma_rad: float  # of up, each of two axes
@@ -50,7 +48,7 @@ class LevelLines:
 
 
 def level_axes(up: Array64) -> Array64:
-    """R_carrier_level (3, 3): z is `up` (3,), x the carrier's x made level (its y where x is upright)."""
+    """R_carrier_level (3, 3): z is `up` (3,), x the camera_mount's x made level (its y where x is upright)."""
     z = up / np.linalg.norm(up)
     forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = forward - (forward @ z) * z
@@ -64,7 +62,7 @@ def level_lines(seen: VanishingDirections, sharpest_rad: float) -> LevelLines | 
     if upright.size == 0:
         return None
     up = seen.direction[upright[0]]
-    R = level_axes(up if up[2] >= 0 else -up)  # a carrier does not fly upside down
+    R = level_axes(up if up[2] >= 0 else -up)  # a camera_mount does not fly upside down
     chosen = np.flatnonzero(seen.line_direction >= 0)
     chosen = chosen[~seen.is_vertical[seen.line_direction[chosen]]]
     normal = seen.line_normal[chosen] @ R
@@ -91,20 +89,8 @@ def spectrum(lines: LevelLines) -> Array64:
     """S (BINS,) over [0, 180) deg, bin k at k BIN_RAD; lines broader than BROAD_RAD are left out."""
     sharp = lines.azimuth_sigma_rad < BROAD_RAD
     out = np.zeros(BINS)
-    _add_kernels(lines.azimuth_rad[sharp], lines.azimuth_sigma_rad[sharp], lines.weight[sharp], out)
+    add_kernels(lines.azimuth_rad[sharp], lines.azimuth_sigma_rad[sharp], lines.weight[sharp], out)
     return out
-
-
-@compiled
-def _add_kernels(azimuth_rad: Array64, sigma_rad: Array64, weight: Array64, out: Array64) -> None:
-    """Add w / (sqrt(2 pi) s) exp(-(a - a_i)^2 / 2 s^2): the von Mises kernel where it is narrow, without its tails."""
-    for i in range(len(azimuth_rad)):
-        s = sigma_rad[i]
-        reach = int(4.0 * s / BIN_RAD) + 1
-        middle = round(azimuth_rad[i] / BIN_RAD)
-        for k in range(middle - reach, middle + reach + 1):
-            off = (k * BIN_RAD - azimuth_rad[i]) / s
-            out[k % BINS] += weight[i] / (math.sqrt(2 * math.pi) * s) * math.exp(-0.5 * off * off)
 
 
 def overlap(vehicle: Array64, drone: Array64) -> Array64:

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.calibration.columns import LASERS, Placed, place
-from stages.calibration.looks import Returns, ServoTrace, servo_at
 from stages.calibration.motion import drift, shift
 from stages.calibration.patches import Patches, thickness_m
+from stages.calibration.result import CURVE, Finding, Travel, accepted, curve_sigmas, judge
+from stages.calibration.scan_passes import Returns, ServoTrace, servo_at
 from stages.calibration.servo_mount import ServoMount, lidar_mount, servo_mount
 from stages.calibration.solve import COARSE_RAD, Solution, linearise, solve
-from stages.calibration.verdict import CURVE, Finding, Travel, accepted, curve_sigmas, judge
-from stages.geometry import Array64, LidarMount
+from stages.geometry.frames import Array64, LidarMount
 
 LEAST_TRAVEL_RAD = math.radians(40.0)  # the fan is 30 deg wide: less, and nothing is seen at two angles
 STILL_RAD = math.radians(0.5)  # what the encoder's steps may look like

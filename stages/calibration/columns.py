@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.calibration.looks import Returns, ServoAt
+from stages.calibration.scan_passes import Returns, ServoAt
 from stages.calibration.servo_mount import ORDERS, ServoMount
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 LASERS = 16
 

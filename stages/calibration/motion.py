@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.calibration.columns import drift_columns
-from stages.calibration.looks import Returns
+from stages.calibration.scan_passes import Returns
 from stages.calibration.solve import PRIOR, System, one_step, sandwich, without_planes
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 SURE = 5.0  # sigmas
 EXPECTED = np.array([5.0, 5.0, 0.5, 0.2, 0.2, 0.5])  # [m/s], [rad/s]: one sigma before anything is seen

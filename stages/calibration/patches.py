@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 CELLS_M = ((6.0, 0.5), (18.0, 1.0), (1e9, 2.0))  # up to which range, edge of the cube
 RANGE_NOISE_M = 0.012  # along the beam: what remains of a laser's noise

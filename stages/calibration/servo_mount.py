@@ -6,7 +6,7 @@
 `base` is the frame of the rig's T_vehicle_turntable: it stands still while the vehicle does. `lag` is the play of the
 gear: the turntable hangs back by half of it, on the side it comes from.
 
-Source: ours; the model of `stages/geometry.py` (LidarMount) and `stages/turntable.py`.
+Source: ours; the model of `stages/geometry/frames.py` (LidarMount) and `stages/sweep/turntable.py`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stages.geometry import Array64, Harmonic, LidarMount, Pose, quaternions_xyzw
-from stages.rotation import exp_rotation
+from stages.geometry.frames import Array64, Harmonic, LidarMount, Pose, quaternions_xyzw
+from stages.kernels.geometry.so3 import exp_rotation
 
 ORDERS = (1, 2)
 """Orders of the encoder's error that are sought: a magnet off centre shows once a turn, a tilted one twice."""

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.calibration.columns import LASERS, Placed, laser_columns, mount_columns, place
-from stages.calibration.looks import Returns, ServoTrace, servo_at
 from stages.calibration.parameters import PARAMETERS
 from stages.calibration.patches import Patches, find_patches
+from stages.calibration.scan_passes import Returns, ServoTrace, servo_at
 from stages.calibration.servo_mount import ServoMount
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 BIAS_SIGMA_M = 0.02  # of a laser's range (datasheet: +-3 cm)
 MEAN_BIAS_SIGMA_M = 1e-3  # one that all share bends planes by fractions of a mm: it is left out

@@ -1,7 +1,7 @@
 """One thing that may be a drone: where it goes, and what was noticed of it at each look.
 
 Position and velocity in the local frame by a Kalman filter whose axes are alike, and tallies. What it is say
-`stages/detect/verdict.py` with them.
+`stages/detect/classifier.py` with them.
 
 Source: ours; DESIGN, "evaluated as data arrives".
 """
@@ -13,15 +13,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stages.compiled import compiled
 from stages.detect.flight import Motion, fit_motion, lamp_m, moves, wire_m
-from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
-from stages.detect.telemetry import DENIED, Heard
-from stages.geometry import Array64
+from stages.detect.motion_log_ratios import DENIED, Heard
+from stages.geometry.frames import Array64
+from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M, what_stands_beside
+from stages.kernels.detect.isolation import SECTORS
 
 HISTORY = 40  # sightings
 SAME_LOOK_NS = 30_000_000
-OPEN_LOOKS = 3  # a sector free in so many looks holds nothing up: what stands behind it is something else
 FADING = 0.95  # what stood beside it counts less with each look since,
 HELD_M = 2.0  # and not at all once it is so far away: that does not hold it
 ALONE_PER_M = 0.0165  # share of looks at a drone that find one return alone (nearby: few), over range
@@ -29,9 +28,7 @@ WIRE_ALONE = 0.75  # and of those at a wire
 FEW_M = 24.0  # over range: so few returns are few even nearby; a sixth of those of a beam across a drone of 0.5 m
 SOME_M = 36.0  # over range: up to so many tell nothing, a wire returns them, too
 SINGLE = -1.0  # nats, of `Candidate.few`
-SIGMA_M = 0.15  # of a sighting
 STANDING_M = 0.6  # what stands is met again within this
-ACCELERATION_MPS2 = 4.0
 OPEN_BESIDE = 0.5  # of `Candidate.beside`: less, and it flies in the open
 START_SPEED_MPS = 6.0  # one sigma about the vehicle's own velocity
 
@@ -41,14 +38,14 @@ class Sighting:
     """One look's returns on one small thing."""
 
     stamp_ns: int
-    xyz_local_m: Array64  # (3,)
-    vehicle_local_m: Array64  # (3,) where the vehicle was then
+    xyz_map_m: Array64  # (3,)
+    vehicle_map_m: Array64  # (3,) where the vehicle was then
     range_m: float
     hits: int
     too_long: bool  # its returns extend farther than a drone
     balls: int  # chords that bulge smoothly
     rugged: int  # chords that could have and do not
-    around: Array64  # (TALLY,) of stages/detect/surroundings.py
+    around: Array64  # (TALLY,) of stages/detect/isolation.py
     big_m: float  # distance to the nearest big thing, inf: none
 
 
@@ -118,7 +115,7 @@ class Candidate:
         a, b, c = a + 2 * dt * b + dt * dt * c + q * dt**4 / 4, b + dt * c + q * dt**3 / 2, c + q * dt * dt
         x = self.xyz_m + dt * self.velocity_mps
         gain_x, gain_v = a / (a + SIGMA_M**2), b / (a + SIGMA_M**2)
-        innovation = s.xyz_local_m - x
+        innovation = s.xyz_map_m - x
         self.xyz_m = x + gain_x * innovation
         self.velocity_mps = self.velocity_mps + gain_v * innovation
         self.p = (1 - gain_x) * a, (1 - gain_x) * b, c - gain_v * b
@@ -140,14 +137,14 @@ class Candidate:
         standing, measured = what_stands_beside(s.around, self.free)
         self.held = [(place_m, FADING * sure) for place_m, sure in self.held[-HISTORY:]]
         if standing > 0.0:
-            self.held.append((s.xyz_local_m, standing))
-        self.beside = sum([sure for place_m, sure in self.held if math.dist(place_m, s.xyz_local_m) < HELD_M])
+            self.held.append((s.xyz_map_m, standing))
+        self.beside = sum([sure for place_m, sure in self.held if math.dist(place_m, s.xyz_map_m) < HELD_M])
         self.alone = FADING * self.alone + (measured and standing == 0.0)
         self.big_m = s.big_m
         self.big_looks += math.isfinite(s.big_m)
         self.path_ns.append(s.stamp_ns)
-        self.path_m.append(s.xyz_local_m)
-        self.beside_m.append(s.xyz_local_m - s.vehicle_local_m)
+        self.path_m.append(s.xyz_map_m)
+        self.beside_m.append(s.xyz_map_m - s.vehicle_map_m)
         if len(self.path_ns) > HISTORY:
             del self.path_ns[0], self.path_m[0], self.beside_m[0]
         self._note_flight()
@@ -208,21 +205,3 @@ class Candidate:
     def moves(self, motion_known: bool) -> bool:
         """Whether it has clearly moved in the world; see `stages/detect/flight.py`."""
         return moves(self.path_ns, self.path_m, self.range_m, motion_known)
-
-
-@compiled
-def what_stands_beside(around: Array64, free: Array64) -> tuple[float, bool]:
-    """How sure it is that something stands beside it, by one look (TALLY,), and whether half of the sectors were seen.
-
-    Adds the sectors that are free in this look to free (SECTORS,).
-    """
-    seen, taken, farther, behind = 0, False, False, False
-    for k in range(SECTORS):
-        free[k] += around[FREE_0 + k] >= 2
-        seen += around[FREE_0 + k] >= 1
-        taken |= around[OCCUPIED_0 + k] >= 1
-        if around[FARTHER_0 + k] >= 1 and free[k] < OPEN_LOOKS:
-            farther = True
-            behind |= around[FREE_0 + k] < 1
-    standing = 1.0 if taken else (0.5 if behind else (0.15 if farther else 0.0))
-    return standing, seen >= SECTORS // 2

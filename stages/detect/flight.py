@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 BIRD_TURN_S = 1.4  # of speed over acceleration: a turn in 9 s
 CALM_MPS = 6.5  # slower, with what a turn would add, no bird stays

@@ -1,16 +1,4 @@
-"""What the drone itself says of its flight, and how well a candidate's path fits it.
-
-The autopilot tells its position in a frame of its own: z up, north anywhere, drifting slowly. A candidate that is the
-drone moves as it says, turned by a yaw psi that nobody knows:
-
-    drone      x_i = c + Rz(psi) d_i + u t_i + noise           u: drift of both odometries, decimetres a second
-    still      x_i = c + u t_i + noise                         a lamp; or scattered, or met farther and farther along
-                                                               something long (a wire: as fast as one looks along it)
-    flier      x_i = c + v t_i + a t_i^2 / 2 + noise           v, a of a bird, or of a balloon, on a string or loose
-
-Each is a Gaussian over the path's n points, c and psi are integrated out; ln of the ratio of two marginal likelihoods
-is the evidence. Speeds and heights alone tell the drone from a bird in a few looks, whatever psi is. A drone that hangs
-still says nothing against a lamp.
+"""All that the drone says of its flight, by whichever messages its autopilot sends, as the detector asks for it.
 
 Source: ours; DESIGN, The graph: `odometry` ("autopilot odometry when present").
 """
@@ -19,143 +7,76 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from typing import NamedTuple
+from collections.abc import Iterable
 
 import numpy as np
 
-from stages.compiled import compiled
-from stages.drone_telemetry import KEPT_NS, DroneTelemetry
-from stages.geometry import Array64
-from stages.smooth_motion import log_p, misfit, model_of
+from stages.detect.candidate import START_SPEED_MPS, Candidate, Sighting
+from stages.detect.flight import scatter_m
+from stages.detect.motion_log_ratios import Heard, hear
+from stages.detect.reacquire import met_again
+from stages.geometry.frames import Array64
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.messages import DroneLocalPosition, DroneOdometry
+from stages.odometry.drone.telemetry import DroneTelemetry
 
-YAWS = 72  # steps of 5 deg: coarser, a fast straight flight fits none
-MOST_POINTS = 14
-SILENT_NS = 2_000_000_000  # by then a path may have gone over from one thing to another
-DRIFT_MPS = 0.3  # of the autopilot's velocity and the vehicle's, together, level
-DRIFT_UP_MPS = 0.1
-SCATTERED_M = 0.45  # sightings of something long
-SLIDING_MPS = 0.5  # or how fast looks at it wander along
-FOLLOWED_MPS = 5.0  # and along a wire, where each next look is aimed at as if it flew
-CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time, speed; else anything up to it
-BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
-BALLOON = (0.7, 0.7, 0.3, 0.4)  # the same, on a string
-SWAY_M = 1.0  # sigma of how far that comes in all, however long one looks
-LOOSE, LOOSE_MPS, LOOSE_MPS2 = 0.1, 2.0, 0.3  # assumed share of balloons that drift with the wind, their sigmas
-DENIED = -3.0  # nats
-MOST_MISFIT = 4.0  # beyond it is none of these, and nothing speaks for the drone; drones come to 1.3
+MOVES_MPS = 1.0
+LOOKS_SINCE = 3  # that a way tells anything
 
 
-class Heard(NamedTuple):
-    """ln of how much likelier a path is as the drone's than as something else's, psi not known."""
+class DroneWord:
+    """Its local position and its odometry; where both speak the first is asked first."""
 
-    over_still: float
-    over_bird: float
-    over_balloon: float
-    over_wire: float  # over what is met farther and farther along it, at any speed: the aim looks where it expects
-    misfit: float  # by how many squared sigmas a coordinate it is off the drone's way at the best yaw
-    way_m: float  # how far the drone says it has been from where it was at first; up, where only heights are compared
+    def __init__(self) -> None:
+        self._position, self._odometry = DroneTelemetry(), DroneTelemetry()
+        self._both = (self._position, self._odometry)
 
-    @property
-    def denied(self) -> bool:
-        """Whether it clearly does not fly as the drone says."""
-        return min(self.over_still, self.over_bird, self.over_balloon) < DENIED
+    def add_position(self, position: DroneLocalPosition) -> None:
+        """What its position filter tells."""
+        self._position.add_position(position)
 
+    def add_odometry(self, odometry: DroneOdometry) -> None:
+        """The same from an autopilot that sends this."""
+        self._odometry.add_odometry(odometry)
 
-def hear(
-    telemetry: DroneTelemetry, path_ns: list[int], path_m: list[Array64], sigma_m: float, level_known: bool
-) -> Heard | None:
-    """Compare a path (n, 3) in a frame that stands still and is level with what the drone says; None: nothing to say.
+    def of(self, c: Candidate, motion_known: bool) -> Heard | None:
+        """What it says for and against a candidate; None: nothing.
 
-    Sightings at which the drone was silent are left out; when it is silent by now it says nothing at all.
+        Of one that was met again elsewhere its way since then counts alone where that is denied: two things that by
+        chance lie as the drone flew, of which the second flies otherwise.
+        """
+        heard = self._of(c, 0, motion_known)
+        if heard is None or not c.joined_at or c.hit_looks - c.joined_at < LOOKS_SINCE:
+            return heard
+        since = self._of(c, bisect_left(c.path_ns, c.joined_ns), motion_known)
+        return since if since is not None and since.denied else heard
 
-    `level_known` False: the vehicle's motion is not known, so only heights are compared. sigma_m: of a sighting.
-    """
-    heard_ns = telemetry.heard_ns
-    if heard_ns is None or len(path_ns) < 2 or path_ns[-1] > heard_ns[1] + SILENT_NS:
-        return None
-    first = bisect_left(path_ns, max(path_ns[-1] - KEPT_NS // 2, heard_ns[0]))
-    if len(path_ns) - first < 2:
-        return None
-    rows = list(range(first, len(path_ns)))
-    if len(rows) > MOST_POINTS:
-        last = len(rows) - 1
-        rows = [rows[round(i * last / (MOST_POINTS - 1))] for i in range(MOST_POINTS)]
-    states = {k: telemetry.state(path_ns[k]) for k in rows}
-    places = {k: state[0] for k, state in states.items() if state is not None}
-    if len(places) < 2:
-        return None
-    rows, told = list(places), np.array(list(places.values()))
-    t = (np.array([path_ns[k] for k in rows]) - path_ns[rows[-1]]) * 1e-9
-    compared_m = told if level_known else told[:, 2:]
-    way_m = float(np.sqrt(((compared_m - compared_m[0]) ** 2).sum(axis=1).max()))
-    heard = Heard(*weigh(t, np.array([path_m[k] for k in rows]), told, sigma_m, level_known), way_m)
-    if heard.misfit <= MOST_MISFIT:
+    def _of(self, c: Candidate, first: int, motion_known: bool) -> Heard | None:
+        """The same of its sightings from number `first` on."""
+        path_ns, path_m, heard = c.path_ns[first:], c.path_m[first:], None
+        for told in self._both:
+            heard = heard or hear(told, path_ns, path_m, 0.03 + scatter_m(c.range_m), motion_known)
         return heard
-    still, bird, balloon, wire = (min(ratio, 0.0) for ratio in heard[:4])
-    return Heard(still, bird, balloon, wire, heard.misfit, way_m)
 
+    def met_again(self, candidates: Iterable[Candidate], s: Sighting) -> tuple[Candidate, Array64] | None:
+        """The candidate that a sighting elsewhere goes on with, and its velocity (3,); see `rejoin.py`."""
+        for told in self._both:
+            if met := met_again(candidates, s, told):
+                return met
+        return None
 
-@compiled
-def weigh(
-    t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_known: bool
-) -> tuple[float, float, float, float, float]:
-    """What Heard holds but for its way: a path x (n, 3) at times t (n,) against what the drone told of itself."""
-    x, d = x_m.copy(), told_m.copy()
-    for axis in range(3):
-        x[:, axis] -= x[:, axis].mean()
-        d[:, axis] -= d[:, axis].mean()
-    as_drone = model_of(t_s, sigma_m, DRIFT_MPS, 0.0)
-    as_long = model_of(t_s, SCATTERED_M, 0.0, 0.0)
-    as_sliding, as_followed = model_of(t_s, sigma_m, SLIDING_MPS, 0.0), model_of(t_s, sigma_m, FOLLOWED_MPS, 0.0)
-    up = x[:, 2].copy()
-    upright = model_of(t_s, sigma_m, DRIFT_UP_MPS, 0.0)
-    drone = log_p(upright, t_s, up - d[:, 2])
-    off2, coordinates = misfit(upright, t_s, up - d[:, 2]), 1.0
-    still, long = log_p(upright, t_s, up), log_p(as_long, t_s, up)  # what stands drifts alike
-    sliding = followed = still
-    bird = log_p(model_of(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
-    sway_mps = SWAY_M / max(t_s.max() - t_s.min(), 1e-3)
-    balloon = log_p(model_of(t_s, sigma_m, min(BALLOON[2], sway_mps), BALLOON[3]), t_s, up)
-    loose = log_p(model_of(t_s, sigma_m, LOOSE_MPS, LOOSE_MPS2), t_s, up)
-    if level_known:
-        as_cruising = model_of(t_s, sigma_m, CRUISE_SIGMA_MPS, BIRD[1])
-        as_wheeling = model_of(t_s, sigma_m, BIRD[0], BIRD[1])
-        as_balloon = model_of(t_s, sigma_m, min(BALLOON[0], sway_mps), BALLOON[1])
-        as_loose = model_of(t_s, sigma_m, LOOSE_MPS, LOOSE_MPS2)
-        turned, cruising, wheeling, level2 = np.empty(YAWS), np.empty(YAWS), 0.0, math.inf
-        for k in range(YAWS):
-            c, s = math.cos(math.tau * k / YAWS), math.sin(math.tau * k / YAWS)
-            ex, ey = x[:, 0] - c * d[:, 0] + s * d[:, 1], x[:, 1] - s * d[:, 0] - c * d[:, 1]
-            turned[k] = log_p(as_drone, t_s, ex) + log_p(as_drone, t_s, ey)
-            level2 = min(level2, misfit(as_drone, t_s, ex) + misfit(as_drone, t_s, ey))
-            cruising[k] = log_p(as_cruising, t_s, x[:, 0] - CRUISE_MPS * c * t_s)
-            cruising[k] += log_p(as_cruising, t_s, x[:, 1] - CRUISE_MPS * s * t_s)
-        drone += _log_mean(turned)
-        off2, coordinates = off2 + level2, 3.0
-        for axis in range(2):
-            e = x[:, axis].copy()
-            still += log_p(as_drone, t_s, e)
-            long += log_p(as_long, t_s, e)
-            sliding += log_p(as_sliding, t_s, e)
-            followed += log_p(as_followed, t_s, e)
-            wheeling += log_p(as_wheeling, t_s, e)
-            balloon += log_p(as_balloon, t_s, e)
-            loose += log_p(as_loose, t_s, e)
-        cruise = math.log(CRUISING) + _log_mean(cruising)
-        wheeling += math.log(1.0 - CRUISING)
-        bird += _log_sum(cruise, wheeling)
-    balloon = _log_sum(math.log(1.0 - LOOSE) + balloon, math.log(LOOSE) + loose)
-    over_still = drone - _log_mean(np.array([still, long, sliding]))
-    off2 /= coordinates * len(t_s)
-    return over_still, drone - bird, drone - balloon, min(over_still, drone - followed), off2
+    def moves(self, stamp_ns: int) -> bool:
+        """Whether it says that it flies: then it is not what stands where something stood."""
+        speeds = [told.speed_mps(stamp_ns) for told in self._both]
+        return any(speed is not None and math.hypot(*speed) > MOVES_MPS for speed in speeds)
 
+    def usual_flight(self, trail: VehicleTrajectory, now_ns: int) -> tuple[Array64, float, float]:
+        """How a drone flies now (3,), one sigma on each axis: as fast as it says; else it comes along with the vehicle.
 
-@compiled
-def _log_sum(a: float, b: float) -> float:
-    return max(a, b) + math.log1p(math.exp(-abs(a - b)))
-
-
-@compiled
-def _log_mean(values: Array64) -> float:
-    top = values.max()
-    return top + math.log(np.exp(values - top).mean())
+        And the level speed that it says it has, 0 when it is silent.
+        """
+        speeds = [told.speed_mps(now_ns) for told in self._both]
+        for speed in speeds:
+            if speed is not None:
+                return np.array([0.0, 0.0, speed[1]]), 0.3 + 0.7 * speed[0], speed[0]
+        return trail.velocity_mps(now_ns), START_SPEED_MPS / 2, 0.0

@@ -7,22 +7,22 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from stages.fuse.carried import Step
-from stages.geometry import Array64
+from stages.fuse.propagated import Step
+from stages.geometry.frames import Array64
 
 HUBER = 1.345  # beyond so many sigmas a residual's weight falls: 95 % efficient where all is Gaussian
 
 
 class BackEnd(Protocol):
-    """T_start_drone at `stamp_ns`; covariance (6, 6): rotation before translation, tangent at the body."""
+    """T_map_drone at `stamp_ns`; covariance (6, 6): rotation before translation, tangent at the body."""
 
     stamp_ns: int
-    R_start_drone: Array64
-    xyz_start_m: Array64
+    R_map_drone: Array64
+    xyz_map_m: Array64
     covariance: Array64
     recoveries: int  # how often it had to be begun anew after an error of its library
 
-    def start(self, stamp_ns: int, R_start_drone: Array64, xyz_start_m: Array64, covariance: Array64) -> None:
+    def start(self, stamp_ns: int, R_map_drone: Array64, xyz_map_m: Array64, covariance: Array64) -> None:
         """Begin here, nothing before counts."""
         ...
 
@@ -39,5 +39,5 @@ class BackEnd(Protocol):
         ...
 
     def add_rotation(self, key_ns: int, step: Step, R: Array64, covariance_rad2: Array64) -> bool:
-        """R_start_drone at the end of a step; covariance in the drone's axes there."""
+        """R_map_drone at the end of a step; covariance in the drone's axes there."""
         ...

@@ -17,9 +17,9 @@ from stages.fuse.correlated import Worth, inflation
 from stages.fuse.positions import GATE, Positions
 from stages.fuse.rejected import Rejected
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64, heading_rad
-from stages.rigid import carried_covariance, distance2, position_covariance
-from stages.rotation import log_rotation
+from stages.geometry.frames import Array64, heading_rad
+from stages.geometry.se3 import carried_covariance, distance2, position_covariance
+from stages.kernels.geometry.so3 import log_rotation
 
 PERIOD_NS = 100_000_000  # of the chain's poses
 
@@ -42,8 +42,8 @@ class Chain:
     def start(self, stamp_ns: int, R: Array64, covariance_rad2: Array64) -> None:
         """Begin with a rotation told for some moment, at the newest fix; or where the chain before had come."""
         if self.running:
-            at_ns, xyz_m = self.back.stamp_ns, self.back.xyz_start_m
-            covariance_m2 = position_covariance(self.back.covariance, self.back.R_start_drone)
+            at_ns, xyz_m = self.back.stamp_ns, self.back.xyz_map_m
+            covariance_m2 = position_covariance(self.back.covariance, self.back.R_map_drone)
         else:
             free = self._positions.free
             assert free.stamp_ns is not None
@@ -51,43 +51,43 @@ class Chain:
             xyz_m, covariance_m2 = free.ahead(at_ns)
             self._positions.begin_left_over(xyz_m, covariance_m2)
         turn = self._positions.step(stamp_ns, at_ns, R)
-        R_start_drone = R @ turn.R
+        R_map_drone = R @ turn.R
         if self.running:
-            self._tell_turned(self.back.R_start_drone, R_start_drone)
+            self._tell_turned(self.back.R_map_drone, R_map_drone)
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = turn.R.T @ covariance_rad2 @ turn.R + turn.covariance[:3, :3]
-        covariance[3:, 3:] = R_start_drone.T @ covariance_m2 @ R_start_drone
-        self.back.start(at_ns, R_start_drone, xyz_m, covariance)
+        covariance[3:, 3:] = R_map_drone.T @ covariance_m2 @ R_map_drone
+        self.back.start(at_ns, R_map_drone, xyz_m, covariance)
         self.running = True
         self.rotation_covariance_rad2 = covariance_rad2
         self._worth = Worth(self._errors.rotation_time_s)
 
     def extend(self, next_ns: int, R_own_drone: Array64 | None) -> None:
         """One pose more; `R_own_drone`: the autopilot's attitude there, of which the vertical is used."""
-        step = self._positions.step(self.back.stamp_ns, next_ns, self.back.R_start_drone)
-        R_expected = self.back.R_start_drone @ step.R
+        step = self._positions.step(self.back.stamp_ns, next_ns, self.back.R_map_drone)
+        R_expected = self.back.R_map_drone @ step.R
         tilt_rad2 = math.radians(self._errors.tilt_deg) ** 2 * inflation(1e-9 * PERIOD_NS, self._errors.tilt_time_s)
         self.back.extend(next_ns, step, None if R_own_drone is None else R_own_drone[2], tilt_rad2)
-        self._tell_turned(R_expected, self.back.R_start_drone)
+        self._tell_turned(R_expected, self.back.R_map_drone)
 
     def _tell_turned(self, R_before: Array64, R_after: Array64) -> None:
         """The newest pose is believed to be turned otherwise than it was believed before."""
         self._positions.left.turn_ways(heading_rad(R_after @ R_before.T))
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64, Array64]:
-        """R_start_drone, position and covariance (6, 6), carried from the nearest pose of the chain."""
+        """R_map_drone, position and covariance (6, 6), carried from the nearest pose of the chain."""
         key_ns, R, xyz_m = self.back.near(stamp_ns)
         step = self._positions.step(key_ns, stamp_ns, R)
         covariance = carried_covariance(self.back.covariance, step.R, step.t_m, step.covariance)
         return R @ step.R, xyz_m + R @ step.t_m, covariance
 
-    def add_position(self, stamp_ns: int, R_start_drone: Array64, z: Array64, covariance_m2: Array64) -> None:
-        """A LiDAR position at its own time; R_start_drone as the chain has it there."""
+    def add_position(self, stamp_ns: int, R_map_drone: Array64, z: Array64, covariance_m2: Array64) -> None:
+        """A LiDAR position at its own time; R_map_drone as the chain has it there."""
         key_ns, R_key, _ = self.back.near(stamp_ns)
         step = self._positions.step(key_ns, stamp_ns, R_key)
-        before = self.back.R_start_drone
-        self.back.add_position(key_ns, step, z, covariance_m2 + position_covariance(step.covariance, R_start_drone))
-        self._tell_turned(before, self.back.R_start_drone)
+        before = self.back.R_map_drone
+        self.back.add_position(key_ns, step, z, covariance_m2 + position_covariance(step.covariance, R_map_drone))
+        self._tell_turned(before, self.back.R_map_drone)
 
     def fits(self, stamp_ns: int, R: Array64, covariance_rad2: Array64) -> bool | None:
         """Whether a rotation is within the gate; None: it is not; False: nor were those before, and they agree."""
@@ -104,14 +104,14 @@ class Chain:
         worth = (1.0 - self._errors.rotation_lasting) * self._worth.factor(stamp_ns)
         key_ns, R_key, _ = self.back.near(stamp_ns)
         step = self._positions.step(key_ns, stamp_ns, R_key)
-        before = self.back.R_start_drone
+        before = self.back.R_map_drone
         self.back.add_rotation(key_ns, step, R, worth * covariance_rad2 + step.covariance[:3, :3])
-        self._tell_turned(before, self.back.R_start_drone)
+        self._tell_turned(before, self.back.R_map_drone)
 
     @property
     def yaw_sigma_rad(self) -> float:
         """Of the newest pose."""
-        return yaw_sigma_rad(self.back.R_start_drone, self.back.covariance)
+        return yaw_sigma_rad(self.back.R_map_drone, self.back.covariance)
 
 
 def yaw_sigma_rad(R: Array64, covariance: Array64) -> float:

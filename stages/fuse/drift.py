@@ -26,7 +26,7 @@ import math
 import numpy as np
 
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 START_MPS = 1.0  # a tracker's velocity, one sigma
 UNKNOWN_MPS = 6.0  # nobody's
@@ -45,7 +45,7 @@ class Drift:
         self.q = 2 * errors.drift_mps**2 / errors.drift_time_s if odometry else errors.manoeuvre
 
     @property
-    def xyz_start_m(self) -> Array64:
+    def xyz_map_m(self) -> Array64:
         """At the newest fix."""
         return self._x[:3]
 

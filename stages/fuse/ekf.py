@@ -17,10 +17,10 @@ import math
 import numpy as np
 
 from stages.fuse.back_end import HUBER
-from stages.fuse.carried import Step
-from stages.geometry import Array64
-from stages.rigid import carried_covariance
-from stages.rotation import exp_rotation, hat, log_rotation
+from stages.fuse.propagated import Step
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import carried_covariance
+from stages.kernels.geometry.so3 import exp_rotation, hat, log_rotation
 
 
 class Ekf:
@@ -28,41 +28,41 @@ class Ekf:
 
     def __init__(self) -> None:
         self.stamp_ns, self.recoveries = 0, 0
-        self.R_start_drone, self.xyz_start_m, self.covariance = np.eye(3), np.zeros(3), np.eye(6)
+        self.R_map_drone, self.xyz_map_m, self.covariance = np.eye(3), np.zeros(3), np.eye(6)
 
-    def start(self, stamp_ns: int, R_start_drone: Array64, xyz_start_m: Array64, covariance: Array64) -> None:
+    def start(self, stamp_ns: int, R_map_drone: Array64, xyz_map_m: Array64, covariance: Array64) -> None:
         """Begin here."""
         self.stamp_ns, self.covariance = stamp_ns, covariance
-        self.R_start_drone, self.xyz_start_m = R_start_drone, xyz_start_m
+        self.R_map_drone, self.xyz_map_m = R_map_drone, xyz_map_m
 
     def extend(self, stamp_ns: int, step: Step, up_drone: Array64 | None, tilt_rad2: float) -> None:
         """Move on; `up_drone`: where the autopilot has the vertical."""
-        self.xyz_start_m = self.xyz_start_m + self.R_start_drone @ step.t_m
-        self.R_start_drone = self.R_start_drone @ step.R
+        self.xyz_map_m = self.xyz_map_m + self.R_map_drone @ step.t_m
+        self.R_map_drone = self.R_map_drone @ step.R
         self.covariance = carried_covariance(self.covariance, step.R, step.t_m, step.covariance)
         self.stamp_ns = stamp_ns
         if up_drone is not None:
             H = np.zeros((3, 6))
-            H[:, :3] = hat(self.R_start_drone.T[:, 2].copy())  # of R^T z
-            self._correct(H, up_drone - self.R_start_drone.T[:, 2], tilt_rad2 * np.eye(3))
+            H[:, :3] = hat(self.R_map_drone.T[:, 2].copy())  # of R^T z
+            self._correct(H, up_drone - self.R_map_drone.T[:, 2], tilt_rad2 * np.eye(3))
 
     def near(self, stamp_ns: int) -> tuple[int, Array64, Array64]:
         """The moment whose pose is known that a measurement is told from, and that pose."""
-        return self.stamp_ns, self.R_start_drone, self.xyz_start_m
+        return self.stamp_ns, self.R_map_drone, self.xyz_map_m
 
     def add_position(self, key_ns: int, step: Step, xyz_m: Array64, covariance_m2: Array64) -> bool:
         """A position at the end of a step from the known moment."""
         H = np.zeros((3, 6))
-        H[:, :3] = -self.R_start_drone @ hat(step.t_m)
-        H[:, 3:] = self.R_start_drone
-        self._correct(H, xyz_m - self.xyz_start_m - self.R_start_drone @ step.t_m, covariance_m2)
+        H[:, :3] = -self.R_map_drone @ hat(step.t_m)
+        H[:, 3:] = self.R_map_drone
+        self._correct(H, xyz_m - self.xyz_map_m - self.R_map_drone @ step.t_m, covariance_m2)
         return True
 
     def add_rotation(self, key_ns: int, step: Step, R: Array64, covariance_rad2: Array64) -> bool:
         """A rotation at the end of a step."""
         H = np.zeros((3, 6))
         H[:, :3] = np.eye(3)
-        e = log_rotation(self.R_start_drone.T @ R @ step.R.T)
+        e = log_rotation(self.R_map_drone.T @ R @ step.R.T)
         self._correct(H, e, step.R @ covariance_rad2 @ step.R.T)
         return True
 
@@ -74,6 +74,6 @@ class Ekf:
         left = np.eye(6) - K @ H
         after = left @ self.covariance @ left.T + K @ noise @ K.T
         xi = K @ e
-        self.xyz_start_m = self.xyz_start_m + self.R_start_drone @ xi[3:]
-        self.R_start_drone = self.R_start_drone @ exp_rotation(xi[:3])
+        self.xyz_map_m = self.xyz_map_m + self.R_map_drone @ xi[3:]
+        self.R_map_drone = self.R_map_drone @ exp_rotation(xi[:3])
         self.covariance = 0.5 * (after + after.T)

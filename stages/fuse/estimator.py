@@ -16,17 +16,17 @@ import math
 import numpy as np
 
 from stages.fuse.back_end import BackEnd
+from stages.fuse.branch_check import Witness
 from stages.fuse.chain import PERIOD_NS, Chain
-from stages.fuse.motion_yaw import DOUBT, Point
 from stages.fuse.motions import WAIT_NS, Motions
-from stages.fuse.north import North
 from stages.fuse.positions import GATE, Positions, Told
 from stages.fuse.settings import FuseErrors, FuseLimits
-from stages.fuse.witness import Witness
-from stages.fuse.yaw import apart_rad
-from stages.geometry import Array64, heading_rad, rotation_z
-from stages.messages import DroneAttitude, DroneFix, DroneLocalPosition, DroneMotion, DroneOdometry, VehicleMotion
-from stages.rigid import distance2, position_covariance
+from stages.geometry.frames import Array64, heading_rad, rotation_z
+from stages.geometry.se3 import distance2, position_covariance
+from stages.heading.motion_yaw import DOUBT, Point
+from stages.heading.odometry_yaw import North
+from stages.heading.yaw_fit import apart_rad
+from stages.messages import DroneAttitude, DroneFix, DroneLocalPosition, DroneOdometry, VehicleMotion, VisualMotion
 
 LEAST_MPS = 0.5  # slower, a camera's direction of flight says nothing
 BRANCH_RAD, BRANCHES = math.radians(30.0), 3  # so many rotations in a row so far off are another branch
@@ -79,11 +79,11 @@ class Estimator:
 
     def hear_autopilot(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """The drone's own estimate."""
-        self.north.hear(self.motions.carrier.autopilot, word)
+        self.north.hear(self.motions.motion_model.autopilot, word)
 
-    def hear_pictures(self, motion: DroneMotion) -> None:
+    def hear_pictures(self, motion: VisualMotion) -> None:
         """The drone's odometry by its camera: its turn, and in which direction it flew if nothing better tells."""
-        self.motions.carrier.pictures.add(motion)
+        self.motions.motion_model.pictures.add(motion)
         self._witness.hear_pictures(motion)
         fix_ns, free = self.positions.fix_ns, self.positions.free
         fresh = fix_ns is not None and abs(motion.stamp_ns - fix_ns) < WAIT_NS
@@ -99,7 +99,7 @@ class Estimator:
     # where the drone is
 
     def at(self, stamp_ns: int) -> tuple[Array64 | None, Array64, Array64]:
-        """R_start_drone, position, covariance (6, 6) of a drone whose position is known.
+        """R_map_drone, position, covariance (6, 6) of a drone whose position is known.
 
         Without a chain R is None and of the covariance only the position's block counts, start axes.
         """
@@ -127,10 +127,10 @@ class Estimator:
             newest = self.motions.newest_ns(next_ns, now_ns)
             if newest is not None and newest < next_ns and now_ns - next_ns < WAIT_NS:
                 break
-            R_own = self.motions.carrier.R_own_drone(next_ns)
+            R_own = self.motions.motion_model.R_own_drone(next_ns)
             self.chain.extend(next_ns, R_own)
             if R_own is not None and self.motions.still(next_ns):
-                self.north.remember(next_ns, back.R_start_drone @ R_own.T, self.chain.yaw_sigma_rad**2)
+                self.north.remember(next_ns, back.R_map_drone @ R_own.T, self.chain.yaw_sigma_rad**2)
         if not self.chain.running and self.positions.free.stamp_ns is not None:
             self._resume(self.positions.free.stamp_ns)
         elif self.chain.running and self.chain.yaw_sigma_rad > self._yaw_sigma_rad:
@@ -157,10 +157,10 @@ class Estimator:
         """Whether a pose is known that was carried to where this fix is."""
         if not self.chain.running:
             return False
-        R_start_vehicle, t = self.motions.vehicle.at(fix.stamp_ns)
+        R_map_vehicle, t = self.motions.vehicle.at(fix.stamp_ns)
         R, expected_m, covariance = self.chain.at(fix.stamp_ns)
-        told_m2 = R_start_vehicle @ fix.covariance_m2 @ R_start_vehicle.T
-        off_m = R_start_vehicle @ fix.xyz_vehicle_m + t - expected_m
+        told_m2 = R_map_vehicle @ fix.covariance_m2 @ R_map_vehicle.T
+        off_m = R_map_vehicle @ fix.xyz_vehicle_m + t - expected_m
         return distance2(off_m, position_covariance(covariance, R) + told_m2) <= GATE
 
     def see_fix(self, fix: DroneFix) -> None:
@@ -169,13 +169,13 @@ class Estimator:
         if not self.motions.vehicle.in_this_frame(stamp_ns):
             return
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
-        R_start_vehicle, t = self.motions.vehicle.at(stamp_ns)
-        z = R_start_vehicle @ fix.xyz_vehicle_m + t
+        R_map_vehicle, t = self.motions.vehicle.at(stamp_ns)
+        z = R_map_vehicle @ fix.xyz_vehicle_m + t
         ahead_m2, _, _ = self.motions.vehicle_ahead_m2(stamp_ns, fix.xyz_vehicle_m)
-        lasting_m2 = fix.lasting_m2
+        bias_covariance_m2 = fix.bias_covariance_m2
         told = Told(
-            R_start_vehicle @ (fix.covariance_m2 + ahead_m2) @ R_start_vehicle.T,
-            None if lasting_m2 is None else R_start_vehicle @ lasting_m2 @ R_start_vehicle.T,
+            R_map_vehicle @ (fix.covariance_m2 + ahead_m2) @ R_map_vehicle.T,
+            None if bias_covariance_m2 is None else R_map_vehicle @ bias_covariance_m2 @ R_map_vehicle.T,
         )
         if not self.positions.known:
             self.positions.find(fix, z, told)
@@ -209,7 +209,7 @@ class Estimator:
 
     def _watch_motion(self, stamp_ns: int, z: Array64, told_m2: Array64) -> None:
         """A fix that fits, beside the autopilot's position: together they tell the heading."""
-        place = self.motions.carrier.autopilot.place(stamp_ns)
+        place = self.motions.motion_model.autopilot.place(stamp_ns)
         if place is None or not self.motions.still(stamp_ns):
             return
         if not self.north.watch(Point(stamp_ns, z, 0.5 * float(told_m2[0, 0] + told_m2[1, 1]), *place)):

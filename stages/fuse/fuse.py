@@ -30,18 +30,18 @@ from stages.fuse.back_end import BackEnd
 from stages.fuse.chain import yaw_sigma_rad
 from stages.fuse.ekf import Ekf
 from stages.fuse.estimator import Estimator
-from stages.fuse.following import Following
 from stages.fuse.intake import Intake
+from stages.fuse.measurement_covariance import Known, Verdict, lost, pose
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
-from stages.fuse.told import Known, Verdict, lost, pose
-from stages.fuse.verdict import Jumps, state_of, why_unbacked
+from stages.fuse.status import Jumps, state_of, why_unbacked
+from stages.fuse.track_continuity import Following
+from stages.geometry.se3 import position_covariance
 from stages.messages import (
     BranchState,
     DroneAttitude,
     DroneFix,
     DroneLocalPosition,
-    DroneMotion,
     DroneOdometry,
     PoseState,
     RelativePose,
@@ -50,8 +50,8 @@ from stages.messages import (
     Tick,
     TrackState,
     VehicleMotion,
+    VisualMotion,
 )
-from stages.rigid import position_covariance
 
 GRID_NS = 20_000_000
 AMBIGUOUS_NS = 1_000_000_000  # a rotation up to quarter turns counts for so long
@@ -72,7 +72,7 @@ class Fuse(Stage[FuseSettings]):
     """The smoother."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
-        {"rotation", "motion", "position", "odometry", "attitude", "drone_motion", "track", "servo", "tick"}
+        {"rotation", "motion", "position", "odometry", "attitude", "visual_motion", "track", "servo", "tick"}
     )
 
     def __init__(self, settings: FuseSettings | None = None, /, **values: Any) -> None:
@@ -107,30 +107,30 @@ class Fuse(Stage[FuseSettings]):
 
     def on_motion(self, motion: VehicleMotion) -> Told:
         """Where the vehicle is in the start frame."""
-        if self._intake.sound(motion, "vehicle motion", motion.xyz_start_m, motion.R_start_vehicle):
+        if self._intake.sound(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle):
             self._estimator.hear_vehicle(motion)
         yield from self._tell(motion)
 
     def on_odometry(self, odometry: DroneOdometry) -> Told:
         """The autopilot's whole estimate."""
-        numbers = (odometry.xyz_local_m, odometry.R_local_drone, odometry.velocity_drone_mps)
+        numbers = (odometry.xyz_odom_m, odometry.R_odom_drone, odometry.velocity_drone_mps)
         if self._intake.sound(odometry, "odometry", *numbers, odometry.angular_velocity_drone_radps):
             self._estimator.hear_autopilot(odometry)
         yield from self._tell(odometry)
 
     def on_attitude(self, attitude: DroneAttitude) -> Told:
         """The autopilot's attitude, used while its odometry is not heard."""
-        if self._intake.sound(attitude, "attitude", attitude.R_local_drone, attitude.angular_velocity_drone_radps):
+        if self._intake.sound(attitude, "attitude", attitude.R_odom_drone, attitude.angular_velocity_drone_radps):
             self._estimator.hear_autopilot(attitude)
         yield from self._tell(attitude)
 
     def on_position(self, position: DroneLocalPosition) -> Told:
         """The autopilot's position, in the same frame."""
-        if self._intake.sound(position, "position", position.xyz_local_m, position.velocity_local_mps):
+        if self._intake.sound(position, "position", position.xyz_odom_m, position.velocity_odom_mps):
             self._estimator.hear_autopilot(position)
         yield from self._tell(position)
 
-    def on_drone_motion(self, motion: DroneMotion) -> Told:
+    def on_visual_motion(self, motion: VisualMotion) -> Told:
         """The drone's odometry by its camera: turns, and directions without a scale."""
         direction, sigma_rad = motion.direction_from, np.array(motion.direction_sigma_rad or 0.0)
         numbers = (motion.R_from_to, motion.covariance_rad2, sigma_rad, *(() if direction is None else (direction,)))
@@ -146,9 +146,11 @@ class Fuse(Stage[FuseSettings]):
     def on_fix(self, fix: DroneFix) -> Told:
         """A LiDAR position."""
         velocity = () if fix.velocity_vehicle_mps is None else (fix.velocity_vehicle_mps,)
-        lasting_m2 = np.zeros((3, 3)) if fix.lasting_m2 is None else fix.lasting_m2
-        numbers = (fix.xyz_vehicle_m, fix.covariance_m2, lasting_m2, *velocity)
-        if self._intake.sound(fix, "fix", *numbers) and self._intake.covariant(fix.covariance_m2 - lasting_m2, "fix"):
+        bias_covariance_m2 = np.zeros((3, 3)) if fix.bias_covariance_m2 is None else fix.bias_covariance_m2
+        numbers = (fix.xyz_vehicle_m, fix.covariance_m2, bias_covariance_m2, *velocity)
+        if self._intake.sound(fix, "fix", *numbers) and self._intake.covariant(
+            fix.covariance_m2 - bias_covariance_m2, "fix"
+        ):
             self._waiting.append(fix)
         yield from self._tell(fix)
 
@@ -234,7 +236,7 @@ class Fuse(Stage[FuseSettings]):
         """The estimate carried to now, with what never averages out added."""
         e = self._estimator
         R, xyz_m, covariance = e.at(now_ns)
-        lasting = e.positions.lasting_m2
+        lasting = e.positions.bias_covariance_m2
         unsure = R is not None and yaw_sigma_rad(R, covariance) > math.radians(self.settings.limits.yaw_sigma_deg)
         whole = covariance.copy()
         if R is None or unsure:

@@ -12,8 +12,8 @@ from collections import Counter
 import numpy as np
 
 from flow.message import Message
-from stages.geometry import Array64
-from stages.rigid import good_covariance
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import good_covariance
 
 AHEAD_NS = 1_000_000_000
 BELIEVED = 5

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.fuse.carried import Carrier
+from stages.fuse.propagated import MotionModel
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import VehicleMotion
-from stages.trail import VehicleTrail
 
 WAIT_NS = 350_000_000  # for an odometry that is late
 SOON_NS, VEHICLE_SOON_NS = 60_000_000, 200_000_000  # so far the drone's and the vehicle's are extrapolated instead
@@ -26,8 +26,8 @@ class Motions:
     def __init__(self, errors: FuseErrors, parked: bool) -> None:
         """`parked`: the vehicle stands, whether it says so or not."""
         self._parked = parked
-        self.vehicle = VehicleTrail(joined=False)
-        self.carrier = Carrier(errors)
+        self.vehicle = VehicleTrajectory(joined=False)
+        self.motion_model = MotionModel(errors)
 
     def hear_vehicle(self, motion: VehicleMotion) -> bool:
         """Where the vehicle is; True: the start frame may be another one from now on."""
@@ -49,11 +49,11 @@ class Motions:
 
     def R_own_drone(self, stamp_ns: int) -> Array64 | None:
         """The autopilot's attitude, where a yaw between its frame and the start frame means something."""
-        return self.carrier.R_own_drone(stamp_ns) if self.still(stamp_ns) else None
+        return self.motion_model.R_own_drone(stamp_ns) if self.still(stamp_ns) else None
 
     def newest_ns(self, stamp_ns: int, now_ns: int) -> int | None:
         """Up to when the drone's motion has been told, to one who asks for a moment; None: nobody is heard."""
-        return self.carrier.newest_ns(now_ns, positions=self.still(stamp_ns))
+        return self.motion_model.newest_ns(now_ns, positions=self.still(stamp_ns))
 
     def must_wait(self, stamp_ns: int, now_ns: int) -> bool:
         """Whether the drone's odometry of that moment, or the vehicle's, is still to come."""

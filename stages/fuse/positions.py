@@ -13,15 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.fuse.carried import Step
 from stages.fuse.correlated import Worth
 from stages.fuse.drift import Drift
 from stages.fuse.motions import Motions
+from stages.fuse.propagated import Step
 from stages.fuse.rejected import Rejected
 from stages.fuse.settings import FuseErrors
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import distance2
 from stages.messages import DroneFix
-from stages.rigid import distance2
 
 HELD_MPS = 0.1  # noise of the autopilot's velocity beside its drift, and of its age
 GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
@@ -31,7 +31,7 @@ class Told(NamedTuple):
     """What a fix says of its error, start axes."""
 
     whole_m2: Array64  # (3, 3)
-    lasting_m2: Array64 | None  # what of it is the same from fix to fix
+    bias_covariance_m2: Array64 | None  # what of it is the same from fix to fix
 
 
 class Positions:
@@ -46,7 +46,7 @@ class Positions:
         self.free, self.left = Drift(self._errors, odometry=False), Drift(self._errors, odometry=True)
         self.fix_ns: int | None = None
         self.fix_covariance_m2 = np.zeros((3, 3))  # start axes, of the newest used: what averages out,
-        self.lasting_m2 = np.zeros((3, 3))  # and what never does
+        self.bias_covariance_m2 = np.zeros((3, 3))  # and what never does
         self.nis = math.nan
         self._refused = Rejected()
         self._worth = Worth(self._errors.fix_time_s)
@@ -77,33 +77,36 @@ class Positions:
 
     def _believe(self, told: Told) -> None:
         variance, share = self._errors.fix_variance, self._errors.fix_lasting
-        if told.lasting_m2 is None:
+        if told.bias_covariance_m2 is None:
             self.fix_covariance_m2 = (1.0 - share) * variance * told.whole_m2
-            self.lasting_m2 = share * variance * told.whole_m2
+            self.bias_covariance_m2 = share * variance * told.whole_m2
         else:
-            self.fix_covariance_m2, self.lasting_m2 = variance * (told.whole_m2 - told.lasting_m2), told.lasting_m2
+            self.fix_covariance_m2, self.bias_covariance_m2 = (
+                variance * (told.whole_m2 - told.bias_covariance_m2),
+                told.bias_covariance_m2,
+            )
 
     def worth(self, stamp_ns: int) -> float:
         """Factor for the variance of the fix just taken."""
         return self._worth.factor(stamp_ns)
 
-    def follow(self, stamp_ns: int, z: Array64, worth: float, R_start_drone: Array64 | None) -> None:
+    def follow(self, stamp_ns: int, z: Array64, worth: float, R_map_drone: Array64 | None) -> None:
         """A fix that was taken: velocity without odometry, and what odometry leaves over."""
-        covariance_m2, trail = self.fix_covariance_m2, self._motions.carrier.autopilot
+        covariance_m2, trail = self.fix_covariance_m2, self._motions.motion_model.autopilot
         v0 = None if self.free.stamp_ns is None else trail.velocity_own_mps(self.free.stamp_ns)
         v1 = trail.velocity_own_mps(stamp_ns)
         turned_mps = 0.0 if v0 is None or v1 is None else float(np.linalg.norm(v1 - v0))
         self.free.q = self._manoeuvre(stamp_ns)
-        self.free.see(stamp_ns, z, covariance_m2 + self.lasting_m2, None, turned_mps)
+        self.free.see(stamp_ns, z, covariance_m2 + self.bias_covariance_m2, None, turned_mps)
         self.fix_ns = max(stamp_ns, self.fix_ns or stamp_ns)
         R_own, last_ns = self._motions.R_own_drone(stamp_ns), self.left.stamp_ns
-        if R_start_drone is None or R_own is None:
+        if R_map_drone is None or R_own is None:
             return
-        way = None if last_ns is None else self._motions.carrier.way_own_m(last_ns, stamp_ns)
+        way = None if last_ns is None else self._motions.motion_model.way_own_m(last_ns, stamp_ns)
         if way is None:
             self.left.start(stamp_ns, z, worth * covariance_m2, None)
         else:
-            self.left.see(stamp_ns, z, worth * covariance_m2, R_start_drone @ R_own.T @ way[0], turned_mps)
+            self.left.see(stamp_ns, z, worth * covariance_m2, R_map_drone @ R_own.T @ way[0], turned_mps)
 
     def turn(self, R_new_old: Array64, t_m: Array64, velocity_mps: Array64) -> None:
         """The start frame is another one now: p <- R p + t, v <- R v + velocity, which is no more than a guess."""
@@ -121,11 +124,11 @@ class Positions:
         self.left = Drift(self._errors, odometry=True)
         self.left.start(self.free.stamp_ns, xyz_m, covariance_m2, None)
 
-    def step(self, from_ns: int, to_ns: int, R_start_drone: Array64) -> Step:
+    def step(self, from_ns: int, to_ns: int, R_map_drone: Array64) -> Step:
         """The drone's way between two moments."""
         since_ns = self.fix_ns if self.fix_ns is not None else from_ns
         still = self._motions.still(to_ns)
-        return self._motions.carrier.step(from_ns, to_ns, R_start_drone, self.left, self.free, still, since_ns)
+        return self._motions.motion_model.step(from_ns, to_ns, R_map_drone, self.left, self.free, still, since_ns)
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64]:
         """Position and covariance by the fixes' velocity; how far the drone says it left that is not known better.
@@ -137,25 +140,28 @@ class Positions:
         xyz_m, covariance_m2 = self.free.ahead(stamp_ns)
         covariance = np.zeros((6, 6))
         covariance[3:, 3:] += covariance_m2
-        bent_m = self._motions.carrier.bent_m(self.free.stamp_ns, stamp_ns)
+        bent_m = self._motions.motion_model.bent_m(self.free.stamp_ns, stamp_ns)
         if bent_m is not None:
             xyz_m = xyz_m + np.array([0.0, 0.0, bent_m[2]])
             aside_m2 = 0.5 * float(bent_m[:2] @ bent_m[:2])  # whichever way
             covariance[3:, 3:] += np.diag([aside_m2, aside_m2, 0.0])
         return xyz_m, covariance
 
-    def velocity(self, stamp_ns: int, R_start_drone: Array64 | None, yaw_sigma_rad: float) -> tuple[Array64, Array64]:
+    def velocity(self, stamp_ns: int, R_map_drone: Array64 | None, yaw_sigma_rad: float) -> tuple[Array64, Array64]:
         """Over ground (3,), start axes, and its covariance; by the autopilot's velocity where the rotation is known."""
         age_s = 0.0 if self.fix_ns is None else max((stamp_ns - self.fix_ns) * 1e-9, 0.0)
-        v_own, R_own = self._motions.carrier.autopilot.velocity_own_mps(stamp_ns), self._motions.R_own_drone(stamp_ns)
-        if R_start_drone is None or v_own is None or R_own is None or self.left.stamp_ns is None:
+        v_own, R_own = (
+            self._motions.motion_model.autopilot.velocity_own_mps(stamp_ns),
+            self._motions.R_own_drone(stamp_ns),
+        )
+        if R_map_drone is None or v_own is None or R_own is None or self.left.stamp_ns is None:
             return self.free.velocity_mps, self.free.velocity_covariance + self.free.q * age_s * np.eye(3)
-        told = R_start_drone @ R_own.T @ v_own
+        told = R_map_drone @ R_own.T @ v_own
         across = np.cross([0.0, 0.0, yaw_sigma_rad], told)
         spread = self.left.velocity_covariance + (self.left.q * age_s + HELD_MPS**2) * np.eye(3)
         return told + self.left.velocity_mps, spread + np.outer(across, across)
 
     def _manoeuvre(self, stamp_ns: int) -> float:
         """Density of the acceleration that nobody tells [m2/s3]."""
-        told = self._motions.carrier.autopilot.velocity_own_mps(stamp_ns) is not None
+        told = self._motions.motion_model.autopilot.velocity_own_mps(stamp_ns) is not None
         return self._errors.manoeuvre_told if told else self._errors.manoeuvre

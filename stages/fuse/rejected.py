@@ -9,8 +9,8 @@ from collections import deque
 
 import numpy as np
 
-from stages.geometry import Array64
-from stages.rigid import distance2
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import distance2
 
 ENOUGH = 8
 LONGEST_NS = 3_000_000_000

@@ -1,4 +1,4 @@
-"""The back end as a fixed-lag smoother: a chain of poses X_k = T_start_drone, ten a second, the last three seconds.
+"""The back end as a fixed-lag smoother: a chain of poses X_k = T_map_drone, ten a second, the last three seconds.
 
     X_k -- X_k+1     BetweenFactorPose3: the drone's own way (carried.py)
     X_k              GPSFactorArm: a LiDAR position, PoseRotationPrior3D: a rotation, each carried to its own time by
@@ -23,9 +23,9 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from stages.fuse.back_end import HUBER
-from stages.fuse.carried import Step
-from stages.geometry import Array64
-from stages.rigid import carried_covariance, good_covariance
+from stages.fuse.propagated import Step
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import carried_covariance, good_covariance
 
 RAISED = (RuntimeError, IndexError, ValueError)  # what GTSAM's wrapper makes of C++ exceptions
 FLOOR = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)  # a step of no length is known no better
@@ -49,22 +49,22 @@ class Smoother:
         self._first_ns, self._first_m = 0, np.zeros(3)
         self._smoother: Any = None
         self.stamp_ns, self.recoveries = 0, 0
-        self.R_start_drone, self.xyz_start_m, self.covariance = np.eye(3), np.zeros(3), np.eye(6)
+        self.R_map_drone, self.xyz_map_m, self.covariance = np.eye(3), np.zeros(3), np.eye(6)
 
-    def start(self, stamp_ns: int, R_start_drone: Array64, xyz_start_m: Array64, covariance: Array64) -> None:
+    def start(self, stamp_ns: int, R_map_drone: Array64, xyz_map_m: Array64, covariance: Array64) -> None:
         """A new smoother with one pose."""
         params: Any = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(0.01)
         params.relinearizeSkip = 1
         params.findUnusedFactorSlots = True  # else its list of factors grows for ever
         self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag_s + SLACK_S, params)
-        self._number, self._first_ns, self._first_m = self._number + 1, stamp_ns, xyz_start_m
+        self._number, self._first_ns, self._first_m = self._number + 1, stamp_ns, xyz_map_m
         self._keys.clear()
         self._keys.append((stamp_ns, self._number))
         self.stamp_ns, self.covariance = stamp_ns, covariance
-        self.R_start_drone, self.xyz_start_m = R_start_drone, xyz_start_m
+        self.R_map_drone, self.xyz_map_m = R_map_drone, xyz_map_m
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        pose = gtsam.Pose3(gtsam.Rot3(R_start_drone), xyz_start_m)
+        pose = gtsam.Pose3(gtsam.Rot3(R_map_drone), xyz_map_m)
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         graph.add(gtsam.PriorFactorPose3(X(self._number), pose, noise))
         values.insert(X(self._number), pose)
@@ -72,7 +72,7 @@ class Smoother:
 
     def extend(self, stamp_ns: int, step: Step, up_drone: Array64 | None, tilt_rad2: float) -> None:
         """One pose more."""
-        R, t_m = self.R_start_drone @ step.R, self.xyz_start_m + self.R_start_drone @ step.t_m
+        R, t_m = self.R_map_drone @ step.R, self.xyz_map_m + self.R_map_drone @ step.t_m
         P = carried_covariance(self.covariance, step.R, step.t_m, step.covariance + FLOOR)
         before, self._number = self._number, self._number + 1
         way = gtsam.Pose3(gtsam.Rot3(step.R), step.t_m)
@@ -105,8 +105,8 @@ class Smoother:
                 pose = self._smoother.calculateEstimatePose3(X(number))
                 return key_ns, pose.rotation().matrix(), pose.translation()
             except RAISED:
-                self._begin_anew(self.R_start_drone, self.xyz_start_m, self.covariance)
-        return self.stamp_ns, self.R_start_drone, self.xyz_start_m
+                self._begin_anew(self.R_map_drone, self.xyz_map_m, self.covariance)
+        return self.stamp_ns, self.R_map_drone, self.xyz_map_m
 
     def add_position(self, key_ns: int, step: Step, xyz_m: Array64, covariance_m2: Array64) -> bool:
         """GPSFactorArm: X t_step = xyz."""
@@ -133,7 +133,7 @@ class Smoother:
             return False
         graph = gtsam.NonlinearFactorGraph()
         graph.add(factor(X(number), _robust(covariance)))
-        now = self.R_start_drone, self.xyz_start_m, self.covariance
+        now = self.R_map_drone, self.xyz_map_m, self.covariance
         return self._guarded(lambda: self._smoother.update(graph, gtsam.Values(), {}), *now)
 
     def _guarded(self, update: Callable[[], Any], R: Array64, xyz_m: Array64, covariance: Array64) -> bool:
@@ -147,7 +147,7 @@ class Smoother:
         if newest is None:
             self._begin_anew(R, xyz_m, covariance)
             return False
-        self.R_start_drone, self.xyz_start_m, self.covariance = newest
+        self.R_map_drone, self.xyz_map_m, self.covariance = newest
         return True
 
     def _begin_anew(self, R: Array64, xyz_m: Array64, covariance: Array64) -> None:

@@ -1,4 +1,4 @@
-"""Every message of the method. Frames: see `stages/geometry.py`. In the order data flows:
+"""Every message of the method. Frames: see `stages/geometry/frames.py`. In the order data flows:
 
     sensors -> sweep -> drone;  sensors -> cameras;  autopilot;  all of them -> pose
 
@@ -12,11 +12,11 @@ from stages.messages.autopilot import DroneImu as DroneImu
 from stages.messages.autopilot import DroneLocalPosition as DroneLocalPosition
 from stages.messages.autopilot import DroneOdometry as DroneOdometry
 from stages.messages.cameras import BranchState as BranchState
-from stages.messages.cameras import Carrier as Carrier
-from stages.messages.cameras import DroneMotion as DroneMotion
+from stages.messages.cameras import CameraMount as CameraMount
 from stages.messages.cameras import FollowedFeatures as FollowedFeatures
 from stages.messages.cameras import RelativeRotation as RelativeRotation
 from stages.messages.cameras import VanishingDirections as VanishingDirections
+from stages.messages.cameras import VisualMotion as VisualMotion
 from stages.messages.drone import Candidates as Candidates
 from stages.messages.drone import Detections as Detections
 from stages.messages.drone import DroneFix as DroneFix

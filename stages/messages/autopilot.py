@@ -10,7 +10,7 @@ from stages.messages.shapes import Mat6
 class DroneAttitude(Message):
     """The autopilot's attitude. Frame local is the autopilot's own: x its north, z up; its yaw is unrelated to ours."""
 
-    R_local_drone: Mat3
+    R_odom_drone: Mat3
     angular_velocity_drone_radps: Vec3
 
 
@@ -18,16 +18,16 @@ class DroneAttitude(Message):
 class DroneLocalPosition(Message):
     """The autopilot's position and velocity in its local frame (see DroneAttitude), origin where it began."""
 
-    xyz_local_m: Vec3
-    velocity_local_mps: Vec3
+    xyz_odom_m: Vec3
+    velocity_odom_mps: Vec3
 
 
 @message(schema=53)
 class DroneOdometry(Message):
     """The autopilot's whole estimate: T_local_drone and how it changes. Covariances are rotation first, drone axes."""
 
-    xyz_local_m: Vec3
-    R_local_drone: Mat3
+    xyz_odom_m: Vec3
+    R_odom_drone: Mat3
     velocity_drone_mps: Vec3
     angular_velocity_drone_radps: Vec3
     pose_covariance: Mat6 | None  # [rad, m], tangent at the body; None: the autopilot does not say

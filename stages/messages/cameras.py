@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flow.message import Mat3, Message, PerPointBool, PerPointF64, PerPointI64, Points64, Shape, Vec3, message
 
 
-class Carrier(enum.Enum):
+class CameraMount(enum.Enum):
     """What a camera is mounted on, and in whose axes its directions are told."""
 
     VEHICLE = "vehicle"
@@ -22,11 +22,11 @@ class Carrier(enum.Enum):
 class VanishingDirections(Message):
     """Directions in which a picture's straight lines run, and the lines; stamp_ns is the picture's. P IV, V.C.
 
-    Axes are the carrier's (x forward, y left, z up), not the lens's. A direction's sign means nothing.
+    Axes are the camera_mount's (x forward, y left, z up), not the lens's. A direction's sign means nothing.
     No directions is a normal answer: `reason` says why.
     """
 
-    carrier: Carrier
+    camera_mount: CameraMount
     direction: Points64  # (n, 3) unit; the vertical first where there is one
     sigma_rad: PerPointF64  # (n,) of each direction, one axis, 1 sigma
     is_vertical: PerPointBool  # (n,)
@@ -65,7 +65,7 @@ class RelativeRotation(Message):
 
 
 @message(schema=43)
-class DroneMotion(Message):
+class VisualMotion(Message):
     """How the drone's camera moved from one picture to a later one, told in the drone's axes. P V.E.
 
     p_from = R_from_to p_to + |t| direction: the length is not known from one camera. stamp_ns is the later picture's.

@@ -67,7 +67,9 @@ class DroneFix(Message):
     shift_m: float  # last mean shift step
     track_id: int = 1  # which drone
     velocity_vehicle_mps: Vec3 | None = None  # relative to the vehicle; None: not estimated
-    lasting_m2: Mat3 | None = None  # what of covariance_m2 is the same from fix to fix: calibration; None: not told
+    bias_covariance_m2: Mat3 | None = (
+        None  # what of covariance_m2 is the same from fix to fix: calibration; None: not told
+    )
 
 
 @message(schema=34)

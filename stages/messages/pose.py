@@ -22,7 +22,7 @@ class PoseState(enum.Enum):
 class RelativePose(Message):
     """T_vehicle_drone and how well it is known, predicted to stamp_ns; and the same in the vehicle's start frame.
 
-    Frame start (W for the autopilot) stands still in the world: T_start_drone = T_start_vehicle T_vehicle_drone.
+    Frame start (W for the autopilot) stands still in the world: T_map_drone = T_map_vehicle T_vehicle_drone.
     Covariances are rotation [rad] before translation [m], tangent at the drone body: T exp(xi).
     """
 
@@ -36,10 +36,10 @@ class RelativePose(Message):
         Mat6 | None
     )  # of T_vehicle_drone; rotation rows are infinite variance (diagonal inf, else 0) where not known
     velocity_vehicle_mps: Vec3 | None  # of the drone relative to the vehicle, in the vehicle's axes; None: not known
-    xyz_start_m: Vec3 | None
-    R_start_drone: Mat3 | None
-    start_covariance: Mat6 | None  # of T_start_drone, without the drift of the vehicle's odometry
-    velocity_start_mps: Vec3 | None  # of the drone over ground, start's axes
-    velocity_covariance: Mat3 | None  # of velocity_start_mps [m2/s2]
+    xyz_map_m: Vec3 | None
+    R_map_drone: Mat3 | None
+    map_covariance: Mat6 | None  # of T_map_drone, without the drift of the vehicle's odometry
+    velocity_map_mps: Vec3 | None  # of the drone over ground, start's axes
+    velocity_covariance: Mat3 | None  # of velocity_map_mps [m2/s2]
     resets: int  # how often the pose jumped since the start: a new branch, a new drone, a restart
     nis: float  # normalised innovation squared of the newest accepted LiDAR position, 3 degrees of freedom; NaN: none

@@ -73,10 +73,10 @@ class ServoGoal(Message):
 
 @message(schema=16)
 class VehicleMotion(Message):
-    """Where the vehicle has driven since it started: T_start_vehicle, smooth and drifting, by its own odometry."""
+    """Where the vehicle has driven since it started: T_map_vehicle, smooth and drifting, by its own odometry."""
 
-    xyz_start_m: Vec3
-    R_start_vehicle: Mat3
+    xyz_map_m: Vec3
+    R_map_vehicle: Mat3
     covariance: Mat6 | None  # rotation [rad] before translation [m]; None: the source does not say
 
 

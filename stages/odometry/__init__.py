@@ -1,3 +1,1 @@
-"""P V.E: how the drone moved, from its camera."""
-
-from stages.odometry.fisheye_odometry import FisheyeOdometry as FisheyeOdometry
+"""P V.B and V.E: how the vehicle and the drone move, from their own odometry, their cameras and the LiDAR."""

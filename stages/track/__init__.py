@@ -1,4 +1,4 @@
 """P III.C: where the drone is, look by look. The paper's mean shift, and ours by hits and misses."""
 
-from stages.track.hit_miss_track import HitMissTrack as HitMissTrack
+from stages.track.likelihood_track import LikelihoodTrack as LikelihoodTrack
 from stages.track.mean_shift_track import MeanShiftTrack as MeanShiftTrack

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.kernels.track.scan_pass import largest_sigma_m, misfit
 from stages.messages import DroneLocalPosition, DroneOdometry
-from stages.track.look import Look, largest_sigma_m, misfit
-from stages.track.told_motion import ToldMotion, Word
+from stages.track.odometry_motion_model import ToldMotion, Word
+from stages.track.scan_pass import Look
 
 GIVES_WAY_NS = 1_000_000_000  # so long without a hit, another that was accepted takes its place
 STALE_NS = 150_000_000  # a sighting so much older than a track's own hits says nothing of it
@@ -53,7 +54,8 @@ class Hypotheses:
     def __init__(
         self, manoeuvre: float, told_manoeuvre: float, start_sigma_mps: float, own_sigma_m: float, max_drones: int
     ) -> None:
-        """Densities of the acceleration without and with the drone's word [m^2/s^3]; see `HitMissTrack`'s settings."""
+        """Densities of the acceleration without and with the drone's word [m^2/s^3]; see `LikelihoodTrack`'s
+        settings."""
         self._manoeuvre, self._told_manoeuvre = manoeuvre, told_manoeuvre
         self._start_sigma_mps, self._own_sigma_m, self._max_drones = start_sigma_mps, own_sigma_m, max_drones
         self._all: list[Hypothesis] = []

@@ -12,27 +12,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled import compiled
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.kernels.track.kalman import forward_kernel
 
 
 def predicted(x: Array64, P: Array64, dt_s: float, q: float) -> tuple[Array64, Array64]:
     """State (6,) and covariance (6, 6) after dt_s."""
     dt = abs(dt_s)
-    return _forward(x, P, dt_s, q * dt**3 / 3, q * dt**2 / 2, q * dt)
-
-
-@compiled
-def _forward(x: Array64, P: Array64, dt_s: float, q_p: float, q_pv: float, q_v: float) -> tuple[Array64, Array64]:
-    F = np.eye(6)
-    F[0, 3] = F[1, 4] = F[2, 5] = dt_s
-    forward = F @ P @ F.T
-    for axis in range(3):
-        forward[axis, axis] += q_p
-        forward[axis, axis + 3] += q_pv
-        forward[axis + 3, axis] += q_pv
-        forward[axis + 3, axis + 3] += q_v
-    return F @ x, forward
+    return forward_kernel(x, P, dt_s, q * dt**3 / 3, q * dt**2 / 2, q * dt)
 
 
 def condition(x: Array64, P: Array64, H: Array64, change: Array64, S_after: Array64) -> tuple[Array64, Array64]:

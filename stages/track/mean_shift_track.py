@@ -27,9 +27,10 @@ import numpy as np
 from pydantic import Field
 
 from flow.stage import Settings, Stage
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.kernels.track.mean_shift import mean_shift, within
 from stages.messages import Detections, DroneFix, SweptPoints, TrackingState, TrackState
-from stages.track.mean_shift import crossings, fix_covariance_m2, mean_shift, within
+from stages.track.mean_shift import crossings, fix_covariance_m2
 
 
 @dataclass(slots=True)

@@ -12,26 +12,16 @@ Source: ours. DESIGN, The graph: vp.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stages.compiled import compiled
-from stages.lens import Array64
+from stages.geometry.lens import Array64
+from stages.kernels.vp.arcs import EXTENT, FIRST, MOMENTS, NORMAL, SIGMA, split_all
 from stages.vp.edges import Chains
-from stages.vp.eye import STEP_PX, Eye
+from stages.vp.eye import Eye
 
-TRIMMED = 1  # points at each end of a piece that a corner has bent
-CORRELATED = 2.0  # neighbouring points that share their error
 LEAST_SIGMA_PX = 0.12  # of a point's place; blur, sampling, JPEG
-DEEPEST = 64  # splits waiting at once
-WIDEST_RAD = 2.9  # an arc of half a turn has no plane
-NORMAL, FIRST, LAST, SIGMA, EXTENT, MOMENTS = 0, 3, 6, 9, 10, 11  # columns of the table
-COLUMNS = MOMENTS + 7  # six moments of the rays and their number
-Vector = tuple[float, float, float]  # in compiled code: an array of three is fetched from afar
-Moments = tuple[float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -59,7 +49,7 @@ def fit_arcs(
     tolerance, extent = tolerance_px * eye.pixel_rad, min_extent_px * eye.pixel_rad
     least, middle = LEAST_SIGMA_PX * eye.pixel_rad, 0.5 * (eye.usable.shape[0] - 1)
     turn = np.zeros(3) if turn_rad_per_row is None else turn_rad_per_row
-    return arcs_of(_split_all(chains.points_px, chains.start, eye.rays, tolerance, extent, least, turn, middle))
+    return arcs_of(split_all(chains.points_px, chains.start, eye.rays, tolerance, extent, least, turn, middle))
 
 
 def arcs_of(rows: Array64) -> Arcs:
@@ -70,185 +60,4 @@ def arcs_of(rows: Array64) -> Arcs:
         sigma_rad=rows[:, SIGMA].copy(),
         extent_rad=rows[:, EXTENT].copy(),
         moments=np.ascontiguousarray(rows[:, MOMENTS:]),
-    )
-
-
-@compiled
-def _split_all(
-    points: NDArray[np.float32],
-    start: NDArray[np.int64],
-    table: NDArray[np.float32],
-    tolerance: float,
-    min_extent: float,
-    least_sigma: float,
-    turn_rad_per_row: Array64,
-    middle_row: float,
-) -> Array64:
-    rolls = bool(np.any(turn_rad_per_row != 0.0))
-    most = 0
-    for c in range(len(start) - 1):
-        most = max(most, start[c + 1] - start[c])
-    rays = np.empty((most, 3))
-    stack = np.empty((DEEPEST, 2), dtype=np.int64)
-    rows = np.empty((len(points) // (2 * TRIMMED + 3) + 1, COLUMNS))
-    count = 0
-    for c in range(len(start) - 1):
-        size = start[c + 1] - start[c]
-        for k in range(size):
-            _ray(table, points[start[c] + k, 0], points[start[c] + k, 1], rays, k)
-            if rolls:
-                _turn(rays[k], points[start[c] + k, 1] - middle_row, turn_rad_per_row)
-        stack[0, 0], stack[0, 1] = 0, size - 1
-        waiting = 1
-        while waiting > 0:
-            waiting -= 1
-            i, j = stack[waiting, 0], stack[waiting, 1]
-            if j - i < 2 * TRIMMED + 2 or waiting + 2 > DEEPEST:
-                continue
-            split = _worst(rays, i, j, tolerance)
-            if split >= 0:
-                stack[waiting, 0], stack[waiting, 1] = split, j
-                stack[waiting + 1, 0], stack[waiting + 1, 1] = i, split
-                waiting += 2
-            elif _fit_piece(rays, i + TRIMMED, j - TRIMMED, min_extent, least_sigma, rows[count]):
-                count += 1
-    return rows[:count].copy()
-
-
-@compiled
-def _ray(table: NDArray[np.float32], x: float, y: float, out: Array64, at: int) -> None:
-    """The ray at a place between pixels, a mean of the four of the table around it: off by 3e-5 rad at most."""
-    x, y = x / STEP_PX, y / STEP_PX
-    column, row = np.uint64(x), np.uint64(y)  # as these are never negative, no index is wound around
-    right, below = column + np.uint64(1), row + np.uint64(1)
-    u, v = x - column, y - row
-    square = 0.0
-    for k in range(3):
-        top = table[row, column, k] * (1.0 - u) + table[row, right, k] * u
-        low = table[below, column, k] * (1.0 - u) + table[below, right, k] * u
-        value = top * (1.0 - v) + low * v
-        out[at, k] = value
-        square += value * value
-    scale = 1.0 / math.sqrt(square)
-    for k in range(3):
-        out[at, k] *= scale
-
-
-@compiled
-def _turn(ray: Array64, rows: float, turn_rad: Array64) -> None:
-    """Turn a ray by `rows` times the angle (3,), some degrees at most, to its third power (Cayley's formula)."""
-    a, b, c = 0.5 * rows * turn_rad[0], 0.5 * rows * turn_rad[1], 0.5 * rows * turn_rad[2]
-    x, y, z = ray[0], ray[1], ray[2]
-    u, v, w = x + b * z - c * y, y + c * x - a * z, z + a * y - b * x  # the ray and h x ray
-    scale = 2.0 / (1.0 + a * a + b * b + c * c)
-    ray[0] = x + scale * (b * w - c * v)
-    ray[1] = y + scale * (c * u - a * w)
-    ray[2] = z + scale * (a * v - b * u)
-
-
-@compiled
-def _worst(rays: Array64, i: int, j: int, tolerance: float) -> int:
-    """The ray between i and j farthest from the circle through both, -1 when all are within the tolerance."""
-    nx = rays[i, 1] * rays[j, 2] - rays[i, 2] * rays[j, 1]
-    ny = rays[i, 2] * rays[j, 0] - rays[i, 0] * rays[j, 2]
-    nz = rays[i, 0] * rays[j, 1] - rays[i, 1] * rays[j, 0]
-    length = np.sqrt(nx * nx + ny * ny + nz * nz)
-    if length < 1e-9:
-        return (i + j) // 2
-    worst, at = tolerance * length, -1
-    for k in range(i + 1, j):
-        away = abs(nx * rays[k, 0] + ny * rays[k, 1] + nz * rays[k, 2])
-        if away > worst:
-            worst, at = away, k
-    return at
-
-
-@compiled
-def _fit_piece(rays: Array64, i: int, j: int, min_extent: float, least_sigma: float, row: Array64) -> bool:
-    """Fill a row of the table; False when the piece is too short."""
-    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(i, j + 1):
-        x, y, z = rays[k, 0], rays[k, 1], rays[k, 2]
-        xx += x * x
-        xy += x * y
-        xz += x * z
-        yy += y * y
-        yz += y * z
-        zz += z * z
-    moments = (xx, xy, xz, yy, yz, zz, float(j - i + 1))
-    first, last = (rays[i, 0], rays[i, 1], rays[i, 2]), (rays[j, 0], rays[j, 1], rays[j, 2])
-    return fit_moments(moments, first, last, min_extent, least_sigma, row)
-
-
-@compiled
-def fit_moments(
-    moments: Moments, first: Vector, last: Vector, min_extent: float, least_sigma: float, row: Array64
-) -> bool:
-    """The circle through rays of these moments, from about `first` to about `last`. False: shorter than min_extent."""
-    n = cross(first, last)
-    extent = math.atan2(_length(n), dot(first, last))
-    if not min_extent <= extent < WIDEST_RAD:
-        return False
-    n = _unit(n)
-    m = _unit((first[0] + last[0], first[1] + last[1], first[2] + last[2]))
-    t = cross(n, m)
-    tt, tm, mm = _form(moments, t, t), _form(moments, t, m), _form(moments, m, m)
-    tn, mn = _form(moments, t, n), _form(moments, m, n)
-    det = tt * mm - tm * tm
-    if det <= 1e-15:
-        return False
-    a, b = (tm * mn - mm * tn) / det, (tm * tn - tt * mn) / det
-    n = _unit((n[0] + (a * t[0] + b * m[0]), n[1] + (a * t[1] + b * m[1]), n[2] + (a * t[2] + b * m[2])))
-    count = moments[6]
-    variance = max(max(_form(moments, n, n), 0.0) / max(count - 2.0, 1.0), least_sigma * least_sigma)
-    row[SIGMA] = math.sqrt(variance * min(CORRELATED, 0.5 * count) * mm / det)
-    row[EXTENT] = extent
-    first, last = _onto(first, n), _onto(last, n)
-    for k in range(3):
-        row[NORMAL + k], row[FIRST + k], row[LAST + k] = n[k], first[k], last[k]
-    for k in range(7):
-        row[MOMENTS + k] = moments[k]
-    return True
-
-
-@compiled
-def dot(a: Vector, b: Vector) -> float:
-    """a . b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@compiled
-def cross(a: Vector, b: Vector) -> Vector:
-    """a x b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@compiled
-def _length(a: Vector) -> float:
-    return math.sqrt(dot(a, a))
-
-
-@compiled
-def _unit(a: Vector) -> Vector:
-    length = _length(a)
-    return a[0] / length, a[1] / length, a[2] / length
-
-
-@compiled
-def _onto(ray: Vector, n: Vector) -> Vector:
-    """The ray moved onto the circle of n."""
-    off = dot(n, ray)
-    return _unit((ray[0] - n[0] * off, ray[1] - n[1] * off, ray[2] - n[2] * off))
-
-
-@compiled
-def _form(moments: Moments, a: Vector, b: Vector) -> float:
-    """a^T M b of the symmetric matrix in `moments`."""
-    return (
-        moments[0] * a[0] * b[0]
-        + moments[1] * (a[0] * b[1] + a[1] * b[0])
-        + moments[2] * (a[0] * b[2] + a[2] * b[0])
-        + moments[3] * a[1] * b[1]
-        + moments[4] * (a[1] * b[2] + a[2] * b[1])
-        + moments[5] * a[2] * b[2]
     )

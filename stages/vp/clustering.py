@@ -8,29 +8,13 @@ Source: ours. DESIGN, Vision: cluster lines.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from stages.compiled import compiled
-from stages.lens import Array64
-from stages.vp.arcs import (
-    COLUMNS,
-    LEAST_SIGMA_PX,
-    WIDEST_RAD,
-    Arcs,
-    Moments,
-    Vector,
-    arcs_of,
-    cross,
-    dot,
-    fit_moments,
-)
+from stages.kernels.vp.clustering import gather
+from stages.vp.arcs import LEAST_SIGMA_PX, Arcs, arcs_of
 from stages.vp.eye import Eye
 
 TOGETHER_PX = 0.8  # how far an arc's ends may lie from a line's circle
-TOGETHER_SIGMAS = 2.0  # of the circle's own turn, if that is more
-GAP_RAD = 0.2  # between an arc's end and the line's
 
 
 def cluster(arcs: Arcs, eye: Eye, most: int) -> Arcs:
@@ -38,7 +22,7 @@ def cluster(arcs: Arcs, eye: Eye, most: int) -> Arcs:
     if len(arcs) == 0:
         return arcs
     order = np.argsort(-arcs.extent_rad, kind="stable")
-    rows = _gather(
+    rows = gather(
         arcs.normal[order],
         arcs.ends[order],
         arcs.sigma_rad[order],
@@ -52,70 +36,3 @@ def cluster(arcs: Arcs, eye: Eye, most: int) -> Arcs:
     return Arcs(
         lines.normal[keep], lines.ends[keep], lines.sigma_rad[keep], lines.extent_rad[keep], lines.moments[keep]
     )
-
-
-@compiled
-def _gather(
-    normal: Array64, ends: Array64, sigma: Array64, extent: Array64, moments: Array64, near: float, least_sigma: float
-) -> Array64:
-    """Take arcs in their order; each draws in the ones after it that lie on its circle."""
-    count = len(normal)
-    left = np.arange(count)  # indices not yet taken, in order
-    waiting = count
-    rows = np.empty((count, COLUMNS))
-    made = 0
-    while waiting > 0:
-        i = left[0]
-        n = (normal[i, 0], normal[i, 1], normal[i, 2])
-        x = _ray(ends, i, 0)
-        y = cross(n, x)  # angles along the circle are counted from its first end
-        low, high = 0.0, float(extent[i])
-        xx, xy, xz, yy, yz, zz, rays = _moments(moments, i)
-        slack = min(TOGETHER_SIGMAS * sigma[i], 2.0 * near)
-        kept = 0
-        for k in range(1, waiting):
-            j = left[k]
-            left[kept] = j
-            kept += 1
-            one, other = _ray(ends, j, 0), _ray(ends, j, 1)
-            if abs(dot(n, one)) > near + slack or abs(dot(n, other)) > near + slack:
-                continue
-            middle = 0.5 * (low + high)  # angles are wound about the middle of what is there
-            first, last = _wound(one, x, y, middle), _wound(other, x, y, middle)
-            if first > last:
-                first, last = last, first
-            wide = max(high, last) - min(low, first)
-            if first > high + GAP_RAD or last < low - GAP_RAD or wide > WIDEST_RAD:
-                continue
-            low, high = min(low, first), max(high, last)
-            more = _moments(moments, j)
-            xx, xy, xz = xx + more[0], xy + more[1], xz + more[2]
-            yy, yz, zz, rays = yy + more[3], yz + more[4], zz + more[5], rays + more[6]
-            kept -= 1
-        waiting = kept
-        total = (xx, xy, xz, yy, yz, zz, rays)
-        if fit_moments(total, _at(low, x, y), _at(high, x, y), 0.0, least_sigma, rows[made]):
-            made += 1
-    return rows[:made].copy()
-
-
-@compiled
-def _ray(ends: Array64, i: int, which: int) -> Vector:
-    return ends[i, which, 0], ends[i, which, 1], ends[i, which, 2]
-
-
-@compiled
-def _moments(m: Array64, i: int) -> Moments:
-    return m[i, 0], m[i, 1], m[i, 2], m[i, 3], m[i, 4], m[i, 5], m[i, 6]
-
-
-@compiled
-def _at(angle: float, x: Vector, y: Vector) -> Vector:
-    c, s = math.cos(angle), math.sin(angle)
-    return c * x[0] + s * y[0], c * x[1] + s * y[1], c * x[2] + s * y[2]
-
-
-@compiled
-def _wound(ray: Vector, x: Vector, y: Vector, middle: float) -> float:
-    angle = math.atan2(dot(ray, y), dot(ray, x))
-    return angle + 2.0 * math.pi * round((middle - angle) / (2.0 * math.pi))

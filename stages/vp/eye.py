@@ -1,4 +1,4 @@
-"""What a camera's pixels look at: a ray for each, and which of them see the world and not the carrier itself.
+"""What a camera's pixels look at: a ray for each, and which of them see the world and not the camera_mount itself.
 
 Source: ours.
 """
@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.lens import Array64, Lens
+from stages.geometry.lens import Array64, Lens
+from stages.kernels.vp.arcs import STEP_PX
 
 RIM_PX = 7  # the image circle's edge is no line of the world; more than the diagonal of a cell of the table
-STEP_PX = 4  # of the table of rays
 Polygon = tuple[tuple[float, float], ...]
 
 
@@ -29,7 +29,7 @@ class Eye:
 
 
 def make_eye(lens: Lens, shape: tuple[int, int], max_off_axis_deg: float | None, masked_px: tuple[Polygon, ...]) -> Eye:
-    """Tables for pictures of `shape` (h, w). Polygons (column, row) hide the carrier's own body."""
+    """Tables for pictures of `shape` (h, w). Polygons (column, row) hide the camera_mount's own body."""
     height, width = shape
     rays = _rays(lens, np.arange(height), np.arange(width))
     rim = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), dtype=np.uint8)

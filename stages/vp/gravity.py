@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stages.lens import Array64
+from stages.geometry.lens import Array64
 from stages.messages import DroneAttitude
 
 KEPT = 100  # attitudes: one or two seconds
@@ -31,7 +31,7 @@ class GravityTrail:
         nearest = self._nearest(stamp_ns, age_s)
         if nearest is None:
             return None
-        up = np.asarray(nearest.R_local_drone)[2]
+        up = np.asarray(nearest.R_odom_drone)[2]
         after_s = (stamp_ns - nearest.stamp_ns) * 1e-9
         up = up - after_s * np.cross(nearest.angular_velocity_drone_radps, up)  # up stands still, the axes turn
         return up / np.linalg.norm(up)

@@ -3,9 +3,10 @@
     picture -> chains of edge points (edges.py) -> great-circle arcs (arcs.py) -> lines (clustering.py)
             -> the vertical, by gravity or found; horizontal pairs, one or more (search.py) -> directions with sigma
 
-Gravity is the autopilot's attitude on the drone, and the carrier's own z within `vertical_sigma_deg` without it: right
+Gravity is the autopilot's attitude on the drone, and the camera_mount's own z within `vertical_sigma_deg` without
+it: right
 for a vehicle. Where the camera's rows are exposed one after another (`readout_ms` of its link), each point is told in
-the axes of the middle row, by the carrier's turning: `attitude` on the drone, `motion` on the vehicle. A picture
+the axes of the middle row, by the camera_mount's turning: `attitude` on the drone, `motion` on the vehicle. A picture
 without enough straight lines gives no directions and the reason.
 
 Source: ours, for P IV and V.C; DESIGN, The graph: vp.
@@ -20,10 +21,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.geometry import Pose
-from stages.lens import Array64, Lens
-from stages.messages import Carrier, DroneAttitude, Image, VanishingDirections, VehicleMotion
-from stages.trail import VehicleTrail
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Array64, Lens
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.messages import CameraMount, DroneAttitude, Image, VanishingDirections, VehicleMotion
 from stages.vp.arcs import fit_arcs
 from stages.vp.clustering import cluster
 from stages.vp.directions import lines_of
@@ -36,22 +37,22 @@ MIN_POINTS = 6  # of a chain
 MOST_LINES = 400
 WIDE_RAD = 0.35  # a line seen over so much counts fully
 LEAST_SCATTER = 0.3  # of lines against `line_sigma_deg`: no world is straighter than so much of it
-SEARCH_DEG = {Carrier.VEHICLE: 0.0, Carrier.DRONE: 35.0}
+SEARCH_DEG = {CameraMount.VEHICLE: 0.0, CameraMount.DRONE: 35.0}
 
 
 class GreatCircleVpSettings(Settings):
     """Settings of `GreatCircleVp`."""
 
-    carrier: Carrier
-    T_carrier_camera: Pose
+    camera_mount: CameraMount
+    T_mount_camera: Pose
     lens: Lens
-    masked_px: tuple[Polygon, ...] = ()  # where the carrier itself is seen: polygons of (column, row)
+    masked_px: tuple[Polygon, ...] = ()  # where the camera_mount itself is seen: polygons of (column, row)
     max_off_axis_deg: float | None = Field(None, gt=0, le=150)  # look no farther out; None: as far as the lens does
     min_contrast: float = Field(8.0, gt=0, le=100)  # grey levels, of an edge
     tolerance_px: float = Field(1.0, gt=0, le=10)  # how far a straight line may be from its great circle
     min_extent_px: float = Field(14.0, ge=5)  # shorter arcs are not used
     line_sigma_deg: float = Field(0.25, gt=0, le=5)  # how straight and parallel the world is, one sigma of a line
-    vertical_sigma_deg: float = Field(3.0, gt=0, le=60)  # how upright the carrier stands, without attitude
+    vertical_sigma_deg: float = Field(3.0, gt=0, le=60)  # how upright the camera_mount stands, without attitude
     attitude_sigma_deg: float = Field(1.0, gt=0, le=30)  # of the attitude's roll and pitch
     attitude_age_s: float = Field(0.2, gt=0)  # an older one is not used
     search_deg: float | None = Field(None, ge=0, le=90)  # without attitude the vertical is within this cone about z;
@@ -78,31 +79,33 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
         self._eye: Eye | None = None
         self._edges: EdgeFinder | None = None
         self._gravity = GravityTrail()
-        self._vehicle = VehicleTrail()
+        self._vehicle = VehicleTrajectory()
 
     def on_attitude(self, attitude: DroneAttitude) -> None:
         """Roll, pitch and turning of the drone; its yaw is not used."""
-        if self.settings.carrier is not Carrier.DRONE:
-            raise ValueError("attitude is the drone's: wire it to the stage whose carrier is the drone")
+        if self.settings.camera_mount is not CameraMount.DRONE:
+            raise ValueError("attitude is the drone's: wire it to the stage whose camera_mount is the drone")
         self._gravity.add(attitude)
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """How the vehicle turns; nothing else of it is used."""
-        if self.settings.carrier is not Carrier.VEHICLE:
-            raise ValueError("motion is the vehicle's: wire it to the stage whose carrier is the vehicle")
+        if self.settings.camera_mount is not CameraMount.VEHICLE:
+            raise ValueError("motion is the vehicle's: wire it to the stage whose camera_mount is the vehicle")
         self._vehicle.add(motion)
 
     def on_image(self, image: Image) -> VanishingDirections:
         """One picture's directions and lines."""
         settings = self.settings
-        if image.frame_id != f"camera_{settings.carrier.value}":
-            raise ValueError(f"image comes from {image.frame_id}, this stage's carrier is the {settings.carrier.value}")
+        if image.frame_id != f"camera_{settings.camera_mount.value}":
+            raise ValueError(
+                f"image comes from {image.frame_id}, this stage's camera_mount is the {settings.camera_mount.value}"
+            )
         if self._eye is None or self._edges is None or self._eye.usable.shape != image.grey.shape:
             self._eye = make_eye(settings.lens, image.grey.shape, settings.max_off_axis_deg, settings.masked_px)
             self._edges = EdgeFinder(self._eye.usable, settings.min_contrast, MIN_POINTS)
         eye = self._eye
         chains = self._edges.find(image.grey)
-        R = settings.T_carrier_camera.matrix()[:3, :3]
+        R = settings.T_mount_camera.matrix()[:3, :3]
         turn = image.rows_after_s() * (self._rate_radps(image.stamp_ns) @ R)
         arcs = cluster(fit_arcs(chains, eye, settings.tolerance_px, settings.min_extent_px, turn), eye, MOST_LINES)
         lines = lines_of(arcs, R, WIDE_RAD)
@@ -110,8 +113,8 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
         return self._message(image.stamp_ns, found, lines.normal, arcs.ends @ R.T, arcs.sigma_rad)
 
     def _rate_radps(self, stamp_ns: int) -> Array64:
-        """How the carrier turns (3,), its own axes; zero where nothing tells."""
-        if self.settings.carrier is Carrier.DRONE:
+        """How the camera_mount turns (3,), its own axes; zero where nothing tells."""
+        if self.settings.camera_mount is CameraMount.DRONE:
             rate = self._gravity.rate_radps(stamp_ns, self.settings.attitude_age_s)
             return np.zeros(3) if rate is None else rate
         return self._vehicle.rate_radps(stamp_ns) if self._vehicle.known_at(stamp_ns) else np.zeros(3)
@@ -121,7 +124,7 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
         up = self._gravity.at(stamp_ns, settings.attitude_age_s)
         if up is not None:
             return Prior(up, math.radians(settings.attitude_sigma_deg), 0.0)
-        search_deg = SEARCH_DEG[settings.carrier] if settings.search_deg is None else settings.search_deg
+        search_deg = SEARCH_DEG[settings.camera_mount] if settings.search_deg is None else settings.search_deg
         sigma_deg = max(settings.vertical_sigma_deg, search_deg)
         return Prior(np.array([0.0, 0.0, 1.0]), math.radians(sigma_deg), math.radians(search_deg))
 
@@ -141,7 +144,7 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
     ) -> VanishingDirections:
         return VanishingDirections(
             stamp_ns=stamp_ns,
-            carrier=self.settings.carrier,
+            camera_mount=self.settings.camera_mount,
             direction=found.direction,
             sigma_rad=found.sigma_rad,
             is_vertical=found.frame < 0,

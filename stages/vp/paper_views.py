@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.geometry import Array64
-from stages.lens import Equidistant, KannalaBrandt, OCam
+from stages.geometry.frames import Array64
+from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
 
 END_NOISE_PX = 0.5  # of a line's end, across the line
 RIM_PX = 6  # so near the edge of what the lens sees, a line is that edge
@@ -91,7 +91,7 @@ class RectifiedView:
         return found[kept[order]]
 
     def ends(self, segments: Array64) -> Array64:
-        """Unit rays (n, 2, 3) of the ends of segments (n, 4), in the carrier's axes."""
+        """Unit rays (n, 2, 3) of the ends of segments (n, 4), in the camera_mount's axes."""
         rays = self._rays(segments.reshape(-1, 2)) @ self.R_carrier_view.T
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         return rays.reshape(-1, 2, 3)

@@ -10,7 +10,8 @@ may be any of them, or two streets' mixed.
 A view takes another vanishing point than the views before it, `apart_deg` away from theirs: by themselves all three
 often choose the vertical (`apart_deg: 0`: no answer in 21 of 80 pictures of Manhattan streets, else in 4).
 
-`is_vertical` says which direction is within `vertical_deg` of the carrier's own up axis; the paper does not ask. Nor
+`is_vertical` says which direction is within `vertical_deg` of the camera_mount's own up axis; the paper does not
+ask. Nor
 does it give a sigma: on simulated streets it was 0.7 deg where the answer was right, and one answer in seven was wrong
 by more than 5 deg, which no sigma tells.
 
@@ -27,11 +28,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.geometry import Array64, Pose
-from stages.lens import Lens
-from stages.messages import Carrier, Image, VanishingDirections
+from stages.geometry.frames import Array64, Pose
+from stages.geometry.lens import Lens
+from stages.kernels.vp.paper_vote import fullest, vote
+from stages.messages import CameraMount, Image, VanishingDirections
 from stages.vp.paper_views import RectifiedView, ViewDirection, great_circles, segment_length_px
-from stages.vp.paper_vote import completed, fullest, most_orthogonal, vote
+from stages.vp.paper_vote import completed, most_orthogonal
 
 SEEN_AT_LEAST = 0.5  # of each view by the lens
 ON_DIRECTION_DEG = 2.0  # a line within this of a direction is counted as its
@@ -41,7 +43,7 @@ ON_DIRECTION_DEG = 2.0  # a line within this of a direction is counted as its
 class _Lines:
     """The lines of one view."""
 
-    ends: Array64  # (n, 2, 3) unit rays, carrier axes
+    ends: Array64  # (n, 2, 3) unit rays, camera_mount axes
     normal: Array64  # (n, 3)
     sigma_rad: Array64  # (n,)
     point: Array64 | None  # (3,) the view's vanishing point
@@ -50,8 +52,8 @@ class _Lines:
 class PaperVpSettings(Settings):
     """Settings of `PaperVp`."""
 
-    carrier: Carrier
-    T_carrier_camera: Pose
+    camera_mount: CameraMount
+    T_mount_camera: Pose
     lens: Lens
     size_px: int = Field(ge=64, le=4096)  # of the square picture that the lens belongs to
     views: tuple[ViewDirection, ...] = Field(
@@ -76,7 +78,7 @@ class PaperVpSettings(Settings):
 
     def rectified_views(self) -> list[RectifiedView]:
         """The views, each with its map from the fisheye."""
-        R = self.T_carrier_camera.matrix()[:3, :3]
+        R = self.T_mount_camera.matrix()[:3, :3]
         return [RectifiedView(view, self.lens, R, self.view_px, self.fov_deg) for view in self.views]
 
     @model_validator(mode="after")
@@ -143,7 +145,7 @@ class PaperVp(Stage[PaperVpSettings]):
         normal = np.concatenate([part.normal for part in lines])
         return VanishingDirections(
             stamp_ns=stamp_ns,
-            carrier=self.settings.carrier,
+            camera_mount=self.settings.camera_mount,
             direction=found,
             sigma_rad=np.full(len(found), math.radians(self.settings.sigma_deg)),
             is_vertical=vertical,

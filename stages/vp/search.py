@@ -11,9 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.lens import Array64
-from stages.vp.directions import Lines, Structure, all_directions, assign, refine, residual_sigma, upright
-from stages.vp.spectrum import APART_RAD, peaks, quarter, yaw_spectrum
+from stages.geometry.lens import Array64
+from stages.kernels.vp.directions import all_directions, upright
+from stages.kernels.vp.spectrum import APART_RAD
+from stages.vp.directions import Lines, Structure, assign, refine, residual_sigma
+from stages.vp.spectrum import peaks, quarter, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
 BINS = 180  # of the yaw spectrum: half a degree

@@ -8,13 +8,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stages.compiled import compiled, compiled_at_once
-from stages.lens import Array64
-from stages.vp.directions import CAUCHY, GATE, WELL, Lines, upright
+from stages.geometry.lens import Array64
+from stages.kernels.vp.verticals import meetings, picked, refine_vertical_kernel, votes_kernel
+from stages.vp.directions import Lines
 
-ROUNDS = 5
 LEAST_SINE = 0.05  # two lines that meet at less do not say where
 LEVEL_APART_RAD = math.radians(12.0)  # between level directions tried for the vertical at right angles to both
 
@@ -28,87 +26,26 @@ def propose_verticals(
     Pairs are drawn from the widest lines.
     """
     count = min(pairs, len(lines.normal))
-    meet = _meetings(lines.normal[:count], LEAST_SINE)
+    meet = meetings(lines.normal[:count], LEAST_SINE)
     meet *= np.where(meet @ about < 0, -1.0, 1.0)[:, None]
     inside = meet @ about > math.cos(cone_rad)
-    votes = _votes(meet, lines.normal, lines.tangent, lines.sigma_rad, lines.weight, 2.0 * sigma_model)
+    votes = votes_kernel(meet, lines.normal, lines.tangent, lines.sigma_rad, lines.weight, 2.0 * sigma_model)
     upright_ones = _best_apart(meet[inside], votes[inside], most, 6.0 * sigma_model)
     level = _best_apart(meet[~inside], votes[~inside], most, LEVEL_APART_RAD)
-    crossed = _meetings(level, math.sin(math.radians(80.0)))
+    crossed = meetings(level, math.sin(math.radians(80.0)))
     crossed *= np.where(crossed @ about < 0, -1.0, 1.0)[:, None]
     return np.vstack([upright_ones, crossed[crossed @ about > math.cos(cone_rad)]])
 
 
-@compiled_at_once("(float64[:, ::1], float64)")
-def _meetings(normal: Array64, least_sine: float) -> Array64:
-    """Cross products (k, 3), unit, of all pairs of (n, 3) that are not too parallel."""
-    out = np.empty((len(normal) * (len(normal) - 1) // 2, 3))
-    count = 0
-    for i in range(len(normal)):
-        for j in range(i + 1, len(normal)):
-            a, b = normal[i], normal[j]
-            x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-            length = math.sqrt(x * x + y * y + z * z)
-            if length > least_sine:
-                out[count, 0], out[count, 1], out[count, 2] = x / length, y / length, z / length
-                count += 1
-    return out[:count].copy()
-
-
 def _best_apart(directions: Array64, votes: Array64, most: int, apart_rad: float) -> Array64:
-    return _picked(directions, np.argsort(-votes, kind="stable"), most, math.cos(apart_rad))
-
-
-@compiled_at_once("(float64[:, ::1], int64[::1], int64, float64)")
-def _picked(directions: Array64, order: NDArray[np.int64], most: int, cos_apart: float) -> Array64:
-    out = np.empty((most, 3))
-    count = 0
-    for k in order:
-        d = directions[k]
-        near = False
-        for i in range(count):
-            near |= abs(d[0] * out[i, 0] + d[1] * out[i, 1] + d[2] * out[i, 2]) > cos_apart
-        if not near and count < most:
-            out[count] = d
-            count += 1
-    return out[:count].copy()
-
-
-@compiled_at_once("(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[::1], float64)")
-def _votes(
-    proposal: Array64, normal: Array64, tangent: Array64, sigma: Array64, weight: Array64, sigma_model: float
-) -> Array64:
-    out = np.zeros(len(proposal))
-    nx, ny, nz = normal[:, 0].copy(), normal[:, 1].copy(), normal[:, 2].copy()
-    far, beyond = np.empty(len(normal)), np.empty(len(normal))
-    near = np.empty(len(normal) + 1, dtype=np.int64)
-    for i in range(len(normal)):
-        far[i] = min(WELL * 3.0 * math.hypot(sigma[i], sigma_model), 0.2)
-    for p in range(len(proposal)):
-        x, y, z = proposal[p, 0], proposal[p, 1], proposal[p, 2]
-        for i in range(len(normal)):  # without a branch, so that several are done at once
-            beyond[i] = abs(nx[i] * x + ny[i] * y + nz[i] * z) - far[i]
-        count = 0
-        for i in range(len(normal)):
-            near[count] = i
-            count += 1 if beyond[i] < 0.0 else 0
-        total = 0.0
-        for k in range(count):
-            i = near[k]
-            r = nx[i] * x + ny[i] * y + nz[i] * z
-            s = sigma[i] * (tangent[i, 0] * x + tangent[i, 1] * y + tangent[i, 2] * z)
-            q = r * r / (s * s + sigma_model * sigma_model)
-            if q < 9.0:
-                total += weight[i] * (1.0 - q / 9.0) ** 2
-        out[p] = total
-    return out
+    return picked(directions, np.argsort(-votes, kind="stable"), most, math.cos(apart_rad))
 
 
 def refine_vertical(
     lines: Lines, vertical: Array64, prior: Array64, prior_sigma: float, sigma_model: float, gate_rad: float
 ) -> Array64:
     """The direction nearest to all lines within a gate that closes round by round, pulled by the prior."""
-    return _refine_vertical(
+    return refine_vertical_kernel(
         lines.normal,
         lines.tangent,
         lines.sigma_rad,
@@ -119,57 +56,3 @@ def refine_vertical(
         sigma_model,
         gate_rad,
     )
-
-
-@compiled
-def _refine_vertical(
-    normal: Array64,
-    tangent: Array64,
-    sigma: Array64,
-    weight: Array64,
-    vertical: Array64,
-    prior: Array64,
-    prior_sigma: float,
-    sigma_model: float,
-    gate: float,
-) -> Array64:
-    v = vertical
-    for _ in range(ROUNDS):
-        e = upright(v)
-        H, g = _vertical_step(normal, tangent, sigma, weight, e, sigma_model, gate)
-        p = prior @ e
-        a, b, c = H[0, 0] + 1 / prior_sigma**2, H[0, 1], H[1, 1] + 1 / prior_sigma**2
-        x, y = g[0] - p[0] / prior_sigma**2, g[1] - p[1] / prior_sigma**2
-        det = a * c - b * b
-        v = v - e[:, 0] * ((c * x - b * y) / det) - e[:, 1] * ((a * y - b * x) / det)
-        v = v / math.sqrt(np.sum(v * v))
-        gate = 0.5 * gate
-    return v
-
-
-@compiled
-def _vertical_step(
-    normal: Array64, tangent: Array64, sigma: Array64, weight: Array64, e: Array64, sigma_model: float, least: float
-) -> tuple[Array64, Array64]:
-    """Normal equations of the vertical e[:, 2] turned towards e[:, 0] and e[:, 1]; the gate is at least `least`."""
-    H, g = np.zeros((2, 2)), np.zeros(2)
-    for i in range(len(normal)):
-        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
-        r = nx * e[0, 2] + ny * e[1, 2] + nz * e[2, 2]
-        if abs(r) > WELL * max(GATE * (sigma[i] + sigma_model), least):
-            continue
-        s = math.hypot(
-            sigma[i] * (tangent[i, 0] * e[0, 2] + tangent[i, 1] * e[1, 2] + tangent[i, 2] * e[2, 2]), sigma_model
-        )
-        s = max(s, least / GATE)
-        if abs(r) < GATE * s:
-            w = weight[i] / (s * s * (1.0 + (r / (CAUCHY * s)) ** 2))
-            a = nx * e[0, 0] + ny * e[1, 0] + nz * e[2, 0]
-            b = nx * e[0, 1] + ny * e[1, 1] + nz * e[2, 1]
-            H[0, 0] += w * a * a
-            H[0, 1] += w * a * b
-            H[1, 0] += w * a * b
-            H[1, 1] += w * b * b
-            g[0] += w * a * r
-            g[1] += w * b * r
-    return H, g

@@ -13,8 +13,8 @@ import pytest
 from stages.align import JointAlign, PaperAlign
 from stages.align.refine import Tolerances, refine, street_directions
 from stages.align.spectra import level_lines, overlap, peaks, spectrum
-from stages.messages import Carrier
-from stages.yaw_branches.bank import ASKEW, BranchBank, BranchSettings, Displacement
+from stages.heading.hypothesis_bank import ASKEW, BranchBank, BranchSettings, Displacement
+from stages.messages import CameraMount
 from tests.stages.align.made_joint_flight import START_NS, S
 from tests.stages.align.made_lines import ATLANTA, MANHATTAN, MS, seen, turned
 
@@ -30,8 +30,8 @@ def pairs(streets, per_direction, count=200):
         made = {"per_direction": per_direction, "stamp_ns": START_NS + i * 100 * MS, "seed": i % 8}
         out.append(
             (
-                seen(Carrier.VEHICLE, turned(1, 2, 3), streets, **made),
-                seen(Carrier.DRONE, turned(4, -3, i), streets, **made),
+                seen(CameraMount.VEHICLE, turned(1, 2, 3), streets, **made),
+                seen(CameraMount.DRONE, turned(4, -3, i), streets, **made),
             )
         )
     return out

@@ -21,7 +21,7 @@ from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.sensors.camera import Camera
 from links.simulated.sensors.camera_sensor import encode_jpeg
-from stages.lens import Equidistant, KannalaBrandt, OCam
+from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
 
 SCENARIO = Path(__file__).resolve().parents[2] / "configs" / "scenarios" / "street_sweep.yaml"
 KANNALA_BRANDT = KannalaBrandt(focal_px=(170.0, 171.0), centre_px=(360.5, 359.0), k=(0.02, -0.01, 0.002, -0.0003))

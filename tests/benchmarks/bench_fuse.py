@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from stages.fuse import EkfFuse, Fuse
-from stages.fuse.carried import Step
 from stages.fuse.ekf import Ekf
-from stages.fuse.motion_yaw import weigh
+from stages.fuse.propagated import Step
 from stages.fuse.settings import FuseErrors
 from stages.fuse.smoother import Smoother
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
+from stages.heading.motion_yaw import weigh
 from tests.stages.fuse.made_drone_flight import Made
-from tests.stages.fuse.test_motion_yaw import circle, points
+from tests.stages.heading.test_motion_yaw import circle, points
 
 STAGES = {"smoother": Fuse, "ekf": EkfFuse}
 BACKS = {"smoother": lambda: Smoother(3.0), "ekf": Ekf}
@@ -75,7 +75,7 @@ def test_one_position(benchmark, name):
         back.extend(back.stamp_ns + TENTH, WAY, None, 0.1)
 
     def add():
-        back.add_position(back.stamp_ns, STAYS, back.xyz_start_m + 0.02, 0.0025 * np.eye(3))
+        back.add_position(back.stamp_ns, STAYS, back.xyz_map_m + 0.02, 0.0025 * np.eye(3))
 
     benchmark.pedantic(add, setup=setup, rounds=300, warmup_rounds=10)
 

@@ -24,7 +24,7 @@ from flow.replay import Replay
 from flow.taps import Digest
 from links import host_time
 from links.recording import RecordingReader
-from links.run_folder import Asked
+from links.runs.run_folder import Asked
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDING = ROOT / "recordings" / "experiment_2.mcap"

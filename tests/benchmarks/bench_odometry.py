@@ -15,11 +15,11 @@ import numpy as np
 import poselib
 import pytest
 
-from stages.ego import VehicleEgo
-from stages.messages import DroneMotion, Image
-from stages.odometry import FisheyeOdometry
-from stages.pictures.two_view import Noise, relative_motion
-from stages.rotation import exp_rotation, log_rotation
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
+from stages.messages import Image, VisualMotion
+from stages.odometry.drone import FisheyeOdometry
+from stages.odometry.vehicle import VisualLidarOdometry
+from stages.odometry.visual.two_view import Noise, relative_motion
 from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, degrees_between, lidar_slice, of, picture, point_rays
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -55,7 +55,7 @@ def test_ours(benchmark, size_px):
         return (
             k,
             at,
-            of(odometry.on_image(Image(stamp_ns=k * STEP_NS, frame_id="camera", grey=pictures[at])), DroneMotion),
+            of(odometry.on_image(Image(stamp_ns=k * STEP_NS, frame_id="camera", grey=pictures[at])), VisualMotion),
         )
 
     places = {}
@@ -130,7 +130,7 @@ def test_our_ransac(benchmark, outliers):
 @pytest.mark.benchmark(group="ego, a picture with its LiDAR")
 def test_ego(benchmark, size_px):
     pictures, k = flight(size_px, LOOKS_UP), iter(range(1, 100_000))
-    ego = VehicleEgo(lens=LENS.scaled(size_px / SIZE_PX), T_vehicle_camera=LOOKS_UP)
+    ego = VisualLidarOdometry(lens=LENS.scaled(size_px / SIZE_PX), T_vehicle_camera=LOOKS_UP)
 
     def place(number):
         there = (number - 1) % (2 * PICTURES - 2)

@@ -29,7 +29,7 @@ from links import host_time
 from links.mavlink import Autopilot
 from links.mavlink.wire import parse_frame
 from links.recording import RecordingReader
-from links.run_folder import Asked
+from links.runs.run_folder import Asked
 from links.simulated.matrix.flights import Cell
 from links.simulated.matrix.matrix import Conditions, scenario_of
 from links.simulated.rig.run import simulate_records

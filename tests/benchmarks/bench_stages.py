@@ -18,14 +18,15 @@ import yaml
 from links.dynamixel import Servo
 from links.recording import RecordingReader
 from links.velodyne import Lidar
-from stages.depth_image import focal_length_px
 from stages.detect import EvidenceDetect, KernelDetect
-from stages.detect.kernel_score import inner_half_px, kernel_terms, score_image
-from stages.geometry import LidarMount
+from stages.detect.kernel_score import inner_half_px, score_image
+from stages.geometry.frames import LidarMount
+from stages.kernels.detect.kernel_score import kernel_terms
+from stages.kernels.track.mean_shift import mean_shift
 from stages.messages import Candidates, DepthImage, Detections, SweptPoints, SweptPulses
-from stages.sweep import Sweep
-from stages.track import HitMissTrack, MeanShiftTrack
-from stages.track.mean_shift import mean_shift
+from stages.sweep.depth_image import focal_length_px
+from stages.sweep.sweep import Sweep
+from stages.track import LikelihoodTrack, MeanShiftTrack
 from tests.stages.made import MS, START_NS, depth_image, detections, street_depth, swept
 
 RECORDING = Path(__file__).resolve().parents[2] / "recordings" / "street_sweep.mcap"
@@ -202,7 +203,7 @@ def test_track_by_hits_and_misses(benchmark, street):
     mount, slices, drone = street
     sweep = Sweep(mount=mount)
     pulses = [of_kind(swept_by(sweep, part), SweptPulses) for part in slices]
-    stage = started(HitMissTrack(lost_after_s=60.0), drone, pulses[0][0].stamp_ns)
+    stage = started(LikelihoodTrack(lost_after_s=60.0), drone, pulses[0][0].stamp_ns)
     each_slice(benchmark, lambda part: fed(stage, "on_pulses", part), pulses)
     assert len(stage._known)
 
@@ -219,7 +220,7 @@ def test_track_by_mean_shift(benchmark, street):
 @pytest.mark.benchmark(group="10 ms of packets: all three")
 def test_ours_together(benchmark, street):
     mount, slices, drone = street
-    sweep, detect, track = Sweep(mount=mount), EvidenceDetect(), HitMissTrack(lost_after_s=60.0)
+    sweep, detect, track = Sweep(mount=mount), EvidenceDetect(), LikelihoodTrack(lost_after_s=60.0)
     started(track, drone, slices[0][0].stamp_ns)
 
     def run(part):

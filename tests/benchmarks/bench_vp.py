@@ -26,9 +26,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.geometry import Pose
-from stages.lens import Equidistant, OCam
-from stages.messages import Carrier, Image
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Equidistant, OCam
+from stages.messages import CameraMount, Image
 from stages.vp import GreatCircleVp, PaperVp
 
 YORK = Path(__file__).resolve().parents[3] / "shared" / "data" / "vp_york_urban"
@@ -74,7 +74,7 @@ def courtyard(size_px):
 @pytest.mark.parametrize("size_px", [720, 1080, 1440])
 def test_ours_whole_picture(benchmark, size_px):
     lens, grey = courtyard(size_px)
-    vp = GreatCircleVp(carrier=Carrier.VEHICLE, T_carrier_camera=Pose(rpy_deg=(0.0, 0.0, 90.0)), lens=lens)
+    vp = GreatCircleVp(camera_mount=CameraMount.VEHICLE, T_mount_camera=Pose(rpy_deg=(0.0, 0.0, 90.0)), lens=lens)
     picture = Image(stamp_ns=0, frame_id="camera_vehicle", grey=grey)
     assert len(vp.on_image(picture).direction) == 3
     benchmark(vp.on_image, picture)
@@ -85,7 +85,7 @@ def test_paper_whole_picture(benchmark, size_px):
     """The same pictures through three views of 428 px; most of it is LSD's."""
     lens, grey = courtyard(size_px)
     looks_up = Pose(rpy_deg=(0.0, 0.0, 90.0))
-    vp = PaperVp(carrier=Carrier.VEHICLE, T_carrier_camera=looks_up, lens=lens, size_px=size_px)
+    vp = PaperVp(camera_mount=CameraMount.VEHICLE, T_mount_camera=looks_up, lens=lens, size_px=size_px)
     picture = Image(stamp_ns=0, frame_id="camera_vehicle", grey=grey)
     assert len(vp.on_image(picture).line_normal) > 100
     benchmark(vp.on_image, picture)
@@ -113,8 +113,8 @@ def ours_on_york(folders):
     focal, column, row = york_camera()
     lens = OCam(polynomial=(-focal, 0.0, 0.0, 0.0, 0.0), centre_px=(column, row), max_off_axis_deg=60.0)  # a pinhole
     vp = GreatCircleVp(
-        carrier=Carrier.DRONE,
-        T_carrier_camera=Pose(quaternion_xyzw=(-0.5, 0.5, -0.5, 0.5)),
+        camera_mount=CameraMount.DRONE,
+        T_mount_camera=Pose(quaternion_xyzw=(-0.5, 0.5, -0.5, 0.5)),
         lens=lens,
         search_deg=45.0,
         vertical_sigma_deg=20.0,

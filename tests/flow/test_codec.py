@@ -21,7 +21,7 @@ from flow.message import Message, PerPointF64, PerPointI64, Points64, Shape, Vec
 from flow.timeline import in_our_time, time_fields
 from stages.messages import (
     AutopilotStatus,
-    Carrier,
+    CameraMount,
     Detections,
     DroneFix,
     Image,
@@ -104,7 +104,7 @@ def test_a_message_that_is_not_what_its_class_declares_is_not_sent():
         with pytest.raises(CodecError, match=text):
             encode(DroneFix(**values))
     with pytest.raises(CodecError, match=r"TrackState\.state"):
-        encode(TrackState(stamp_ns=1, state=Carrier.DRONE, reason="", hits=0, frame_s=0.1))
+        encode(TrackState(stamp_ns=1, state=CameraMount.DRONE, reason="", hits=0, frame_s=0.1))
 
 
 def test_a_class_whose_fields_do_not_travel_says_so():
@@ -257,7 +257,7 @@ def test_every_time_of_the_method_s_messages_is_known_as_one():
         "DepthImage.start_ns": False,
         "Detections.seen_ns": False,
         "Detections.start_ns": False,
-        "DroneMotion.from_ns": False,
+        "VisualMotion.from_ns": False,
         "FollowedFeatures.from_ns": False,
         "LidarFirings.pulse_stamp_ns": False,
         "RelativePose.measured_ns": False,

@@ -103,7 +103,7 @@ def test_while_another_stage_loses_messages_it_takes_fewer_pictures_and_that_is_
 def test_a_configuration_says_whether_a_stage_yields(tmp_path):
     assert {spec.name for spec in graph_of(tmp_path, LIVE).nodes.values() if spec.yields} == {"pictures"}
     (tmp_path / "x.yaml").write_text(LIVE.replace("yields: true", "yields: 3\n    thread: gate"))
-    with pytest.raises(ConfigError, match=r"x.yaml:8: stages.pictures.yields: must be true or false, got 3\."):
+    with pytest.raises(ConfigError, match=r"x.yaml:8: stages.odometry.visual.yields: must be true or false, got 3\."):
         load_graph(tmp_path / "x.yaml")
     (tmp_path / "x.yaml").write_text(LIVE.replace("yields: true", "yields: true\n    thread: gate"))
     with pytest.raises(ConfigError, match="'pictures' works in the same thread, 'gate', and yields: both would rest"):

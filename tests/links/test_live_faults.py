@@ -28,8 +28,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.recording import RecordingReader
+from links.runs.truth import TruthLog
 from links.simulated.rig.live_images import MjpegServer
-from links.truth import TruthLog
 from tests.links.fault_bounds import KEPT_S, KILLED, MUST, POSES_AGAIN_S, POSITION_AGAIN_S, REST_S
 from tests.links.ports import free_ports
 from tests.unit_file import unit_file

@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from stages.geometry import LidarMount
+from stages.geometry.frames import LidarMount
 from stages.messages import LidarFirings, ServoState, SweptPulses
 from tests.stages.made import ELEVATION_RAD, MS, ON_ITS_SIDE, PACKET_NS, START_NS, servo
 

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from stages.depth_image import focal_length_px, unproject
-from stages.geometry import LidarMount, Pose
+from stages.geometry.frames import LidarMount, Pose
 from stages.messages import DepthImage, Detections, LidarFirings, ServoState, SweptPoints
+from stages.sweep.depth_image import focal_length_px, unproject
 
 MS = 1_000_000
 PACKET_NS = 1_327_104  # 24 firings of 55.296 us

@@ -8,10 +8,10 @@ import math
 import cv2
 import numpy as np
 
-from stages.geometry import Pose
-from stages.lens import Equidistant, KannalaBrandt
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Equidistant, KannalaBrandt
+from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import Image, SweptPoints
-from stages.rotation import exp_rotation
 
 SIZE_PX = 400
 HALF_M = np.array([9.0, 7.0, 5.0])
@@ -71,7 +71,7 @@ def picture(R_world_camera: np.ndarray, p_world_m: np.ndarray, seed: int = 0, si
 def image(
     stamp_ns: int, R_world_carrier: np.ndarray, p_world_m: np.ndarray, mount: Pose, name: str = "camera"
 ) -> Image:
-    """The picture of a camera mounted at its carrier's origin."""
+    """The picture of a camera mounted at its camera_mount's origin."""
     R = R_world_carrier @ mount.matrix()[:3, :3]
     return Image(stamp_ns=stamp_ns, frame_id=name, grey=picture(R, np.asarray(p_world_m, float), stamp_ns % 2**31))
 

@@ -26,16 +26,16 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
 from links.mavlink.frames import (
-    rpy_from_R_local_drone,
+    rpy_from_R_odom_drone,
     turned_over,
     upper_from_pose_covariance,
     upper_from_velocity_covariance,
-    wxyz_from_R_local_drone,
+    wxyz_from_R_odom_drone,
 )
 from links.simulated.autopilot.radio import Radio, RadioSettings
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.world.flight import Flight, FlightSettings
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 mavlink: Any = ardupilotmega  # Any: starred vectors fill its constructors, which a type checker cannot count
 
@@ -164,7 +164,7 @@ class Autopilot:
     def _attitudes(self, time_s: Array64, device_ns: NDArray[np.int64]) -> list[Any]:
         rotations, rates = self._attitude(time_s)
         return [
-            mavlink.MAVLink_attitude_message(ns // 1_000_000, *rpy_from_R_local_drone(R), *turned_over(rate))
+            mavlink.MAVLink_attitude_message(ns // 1_000_000, *rpy_from_R_odom_drone(R), *turned_over(rate))
             for ns, R, rate in zip(device_ns.tolist(), rotations, rates, strict=True)
         ]
 
@@ -191,7 +191,7 @@ class Autopilot:
                     mavlink.MAV_FRAME_LOCAL_FRD,
                     mavlink.MAV_FRAME_BODY_FRD,
                     *turned_over(position[i]),
-                    wxyz_from_R_local_drone(R),
+                    wxyz_from_R_odom_drone(R),
                     *turned_over(R.T @ velocity[i]),
                     *turned_over(rates[i]),
                     upper_from_pose_covariance(covariances[i], R),
@@ -223,7 +223,7 @@ class Autopilot:
         return [mavlink.MAVLink_timesync_message(0, ns) for ns in device_ns.tolist()]
 
     def _attitude(self, time_s: Array64) -> tuple[Array64, Array64]:
-        """Estimated R_local_drone (n, 3, 3) and turn rate (n, 3), drone axes."""
+        """Estimated R_odom_drone (n, 3, 3) and turn rate (n, 3), drone axes."""
         rate = self._flight.imu(time_s)[0]
         noise = self._rng.normal(0.0, np.radians(self._settings.rate_noise_degps), rate.shape)
         return self._estimate.rotations(time_s, self._flight.flying_poses(time_s)[0]), rate + noise

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega
 
-from stages.geometry import Array64, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
+from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
 
 mavlink: Any = ardupilotmega
 

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 FEW = 3  # rays on a ring around the centre of a pixel; more than that are spread over the pixel
 RING_PX = 0.36  # radius of the ring

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 PLAIN, BRICK, RENDERED, GLASS, ROAD, SLABS, LEAF, PAINT, GRASS = range(9)  # textures
 FRAME_M = 0.07  # width of a window frame

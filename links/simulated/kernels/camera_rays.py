@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from stages.compiled import compiled
+from stages.kernels.compiled import compiled
 
 FAR_M = 400.0
 CONTRAST = 0.02  # half of the relative difference, linear, below which an edge is not refined

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from links.simulated.kernels.ray_casting import Array32
-from stages.compiled import compiled
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
 
 FOOTPRINT_RAD = (3.0e-3, 1.5e-3)  # full width along the scan, across it
 APERTURE_M = (12.7e-3, 9.5e-3)  # size of the beam where it leaves the sensor

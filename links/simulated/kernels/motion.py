@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled import compiled
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
 
 STEP_S = 1 / 400  # integration step of flight and suspension
 GRAVITY_MPS2 = 9.81

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.compiled import compiled
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
 
 Array32 = NDArray[np.float32]
 

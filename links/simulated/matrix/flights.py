@@ -22,7 +22,7 @@ from links.simulated.world.mesh import RayScene
 from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.procedural import SceneSettings, build_world
 from links.simulated.world.procedural.settings import Kind
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 CAMERA_HEIGHT_M = 1.8
 DURATION_S = {"occlusion": 16.0, "return": 24.0, "empty": 30.0}

@@ -21,14 +21,14 @@ from flow.link import TRUTH_TOPICS, LinkError
 from flow.ports import RunError
 from flow.problem import ConfigError
 from links.recording import RecordingReader
-from links.run_folder import Asked, RunFolder, holds_run, replay_into
+from links.runs.run_folder import Asked, RunFolder, holds_run, replay_into
+from links.runs.truth import TruthLog
 from links.simulated.matrix.flights import Cell
 from links.simulated.matrix.jobs import run_all
 from links.simulated.matrix.matrix import Conditions, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop, loop_metadata, servo_edge
 from links.simulated.rig.run import simulate_into
 from links.simulated.rig.scenario import Scenario
-from links.truth import TruthLog
 
 VIEWER = "links.viewer.Viewer"
 PLAIN = Cell("open_lot", 20, "hover", "parked")  # all cells with a drone have the same rig

@@ -31,7 +31,7 @@ from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.procedural.indoor import indoor_mesh
 from links.velodyne import Lidar as Decoder
 from links.velodyne import vlp16
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 from stages.messages import LidarFirings
 
 START_NS = 1_748_773_230_000_000_000

@@ -26,7 +26,7 @@ from flow.replay import Replay, RunReport
 from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import NOT_LIVE, GoalCommand
-from links.run_folder import Asked
+from links.runs.run_folder import Asked
 from links.simulated.sensors.servo import STEP_NS
 from stages.messages import ServoGoal
 

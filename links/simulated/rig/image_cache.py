@@ -32,7 +32,7 @@ from links.simulated.sensors.camera import CameraSettings, FrameTimes, enabled_c
 from links.simulated.world.mesh import Mesh
 from links.simulated.world.procedural import World, build_world
 from links.simulated.world.scene import Truth
-from stages.geometry import Array64, quaternions_xyzw
+from stages.geometry.frames import Array64, quaternions_xyzw
 
 NEAR_M = 1e-3  # tolerance between computers
 NEAR_QUATERNION = 1e-4

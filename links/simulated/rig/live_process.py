@@ -30,6 +30,7 @@ from links import host_time
 from links.mavlink.profiles import ARDUPILOT
 from links.mavlink.stream import ARMED
 from links.recording import RecordingWriter
+from links.runs.truth import TRUTH_RECORDING
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot import Autopilot
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
@@ -42,9 +43,8 @@ from links.simulated.sensors.camera import CamerasSettings
 from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry
 from links.simulated.sensors.vlp16_packets import encode_position, firings_per_packet
-from links.truth import TRUTH_RECORDING
 from links.velodyne import vlp16
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 WARM_PACKETS = 75  # one revolution of the rotor
 SKIP_NS = 200_000_000  # when it is this late, it skips packets: they are lost

@@ -29,7 +29,7 @@ START_S = 120.0  # limit for building the world and, once, compiling
 END_S = 1.0
 READY, RIG_REPORT = "ready", "rig.json"
 
-Platform = Literal["vehicle", "drone"]
+CameraMount = Literal["vehicle", "drone"]
 Port = Annotated[int, Field(ge=1, le=65535)]
 
 
@@ -46,7 +46,9 @@ class LiveRigSettings(Settings):
     armed: bool = True  # False: its autopilot reports disarmed, as before a flight (`grd preflight` requires that)
     odometry_port: int | None = Field(None, ge=1, le=65535)  # where grd receives odometry; None: none is sent
     images: Path | None = None  # a recording of the scenario, made by `grd simulate`; None: no cameras
-    camera_ports: dict[Platform, Port] = Field(default_factory=dict[Platform, Port])  # http://127.0.0.1:PORT/ of each
+    camera_ports: dict[CameraMount, Port] = Field(
+        default_factory=dict[CameraMount, Port]
+    )  # http://127.0.0.1:PORT/ of each
     batch_packets: int = Field(8, ge=1, le=64)  # cast together: small batches have less latency, large ones cost less
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from links.simulated.sensors.camera import CameraMiscalibration, rotated
 from links.simulated.world.drone import SPAN_M, DroneModel, Shape, Surface
-from stages.geometry import LidarMount
+from stages.geometry.frames import LidarMount
 
 ZERO_DEG, TILT_DEG = 0.1, 0.05
 RANGE_M = 0.017

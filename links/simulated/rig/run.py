@@ -36,7 +36,7 @@ from links.simulated.world.scene import Scene, Truth, drone_shapes
 from links.simulated.world.suspension import SuspendedPath
 from links.simulated.world.vehicle import vehicle_mesh, vehicle_mesh_from_camera
 from links.velodyne import vlp16
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 BATCH_PACKETS = 32  # pulses are cast in batches; their size changes no byte
 

@@ -28,7 +28,7 @@ from links.simulated.world.procedural import SceneSettings
 from links.simulated.world.suspension import SuspensionSettings
 from links.simulated.world.vehicle import vehicle_mesh_from_camera
 from links.simulated.world.weather import Weather
-from stages.geometry import Array64, LidarMount, Pose
+from stages.geometry.frames import Array64, LidarMount, Pose
 
 CLEARANCE_M = 0.3  # minimum height of a drone above the road
 WHEELS_M = 0.15  # maximum height of the vehicle's motion above or below the road

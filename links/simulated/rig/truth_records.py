@@ -19,7 +19,7 @@ from links.simulated.sensors.lidar import Pulses
 from links.simulated.world.clearance import visible
 from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
-from stages.geometry import Array64, quaternions_xyzw
+from stages.geometry.frames import Array64, quaternions_xyzw
 
 POSE_PERIOD_NS = 10_000_000
 SIGHT_PERIOD_NS = 50_000_000

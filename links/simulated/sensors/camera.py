@@ -25,13 +25,13 @@ from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.scene import Scene
 from links.simulated.world.sky import light
 from links.simulated.world.weather import Weather
-from stages.geometry import Array64, Pose, Vector3, quaternions_xyzw, rotation_from_rpy_deg
-from stages.lens import Equidistant, KannalaBrandt, Lens, OCam
+from stages.geometry.frames import Array64, Pose, Vector3, quaternions_xyzw, rotation_from_rpy_deg
+from stages.geometry.lens import Equidistant, KannalaBrandt, Lens, OCam
 
 UPWARD_MOUNT = Pose(rpy_deg=(0.0, 0.0, 90.0))  # the top of the image is forward, its right is left
 DOWNWARD_RPY_DEG = (180.0, 0.0, -90.0)  # the top of the image is forward, its right is right
 BELOW_BODY_M = 0.02
-Platform = Literal["vehicle", "drone"]
+CameraMount = Literal["vehicle", "drone"]
 AnyLens = Equidistant | KannalaBrandt | OCam
 
 
@@ -111,7 +111,7 @@ class CamerasSettings(_Settings):
 class FrameTimes:
     """Times of a camera's frames, which are known before the frames are rendered."""
 
-    def __init__(self, platform: Platform, settings: CameraSettings, start_ns: int, seed: int) -> None:
+    def __init__(self, platform: CameraMount, settings: CameraSettings, start_ns: int, seed: int) -> None:
         self._settings = settings
         self.seed = [seed, 21 if platform == "vehicle" else 22]
         timing = np.random.default_rng([*self.seed, 0])
@@ -143,14 +143,14 @@ class Camera:
     """A camera in the scene. `records` returns its frames as they are measured."""
 
     def __init__(
-        self, platform: Platform, settings: CameraSettings, mount: Pose, scene: CameraScene, start_ns: int, seed: int
+        self, platform: CameraMount, settings: CameraSettings, mount: Pose, scene: CameraScene, start_ns: int, seed: int
     ) -> None:
-        """`mount` is T_platform_camera; the platform is one of the bodies of the scene."""
+        """`mount` is T_mount_camera; the platform is one of the bodies of the scene."""
         self.settings = settings
         self._topic, self._frame_id = f"/camera/{platform}", f"camera_{platform}"
         own = next(i for i, body in enumerate(scene.bodies) if body.name == platform)
         self._platform = scene.bodies[own]
-        self._T_platform_camera = T = mount.matrix()
+        self._T_mount_camera = T = mount.matrix()
         self._pixels = PixelRays(settings.true_lens, settings.size_px)
         covered = scene.always_hit(own, T[:3, 3], self._pixels.direction @ T[:3, :3].T)
         self._view = View(scene, self._pixels, self.T_world_camera, own, covered)
@@ -170,7 +170,7 @@ class Camera:
     def T_world_camera(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """Rotations (n, 3, 3) and positions (n, 3) [m]."""
         R, t = self._platform.pose(stamp_ns)
-        T = self._T_platform_camera
+        T = self._T_mount_camera
         return R @ T[:3, :3], t + R @ T[:3, 3]
 
     def image(self, stamp_ns: int, frame: int = 0) -> NDArray[np.uint8]:
@@ -212,7 +212,7 @@ def build_cameras(
     return cameras
 
 
-def camera_mount(platform: Platform, settings: CameraSettings, drone: Mesh | None) -> Pose:
+def camera_mount(platform: CameraMount, settings: CameraSettings, drone: Mesh | None) -> Pose:
     """T_vehicle_camera or T_drone_camera. By default the drone's camera is below the front of its body."""
     if settings.mount is not None:
         return settings.mount
@@ -246,9 +246,9 @@ def rig_cameras(settings: CamerasSettings, vehicle_from_camera: Mesh, drone: Seq
     return tree
 
 
-def enabled_cameras(settings: CamerasSettings, drone: bool) -> list[tuple[Platform, CameraSettings]]:
+def enabled_cameras(settings: CamerasSettings, drone: bool) -> list[tuple[CameraMount, CameraSettings]]:
     """The enabled cameras by platform. In an empty sky the drone's camera is left out."""
-    enabled: list[tuple[Platform, CameraSettings]] = []
+    enabled: list[tuple[CameraMount, CameraSettings]] = []
     if settings.vehicle is not None:
         enabled.append(("vehicle", settings.vehicle))
     if settings.drone is not None and drone:

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from links.simulated.world.mesh import Mesh, RayScene
-from stages.geometry import Pose
-from stages.lens import Lens
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Lens
 
 GRID = 360  # rays across the image
 REACH_M = 5.0
@@ -27,7 +27,7 @@ MARGIN_DEG = 1.0
 
 
 def own_body(
-    lens: Lens, size_px: int, T_platform_camera: Pose, meshes: Iterable[Mesh]
+    lens: Lens, size_px: int, T_mount_camera: Pose, meshes: Iterable[Mesh]
 ) -> tuple[list[list[list[float]]], float]:
     """(masked_px, max_off_axis_deg) of a square image; the meshes are the moving platform in its own frame."""
     step = size_px / GRID
@@ -35,7 +35,7 @@ def own_body(
     column, row = np.meshgrid(at, at)
     rays = lens.unproject(np.column_stack([column.ravel(), row.ravel()]).astype(np.float64))
     inside = np.isfinite(rays[:, 0])
-    T = T_platform_camera.matrix()
+    T = T_mount_camera.matrix()
     directions = (rays[inside] @ T[:3, :3].T).astype(np.float32)
     origins = np.tile(T[:3, 3], (len(directions), 1)).astype(np.float32)
     own = np.zeros(GRID * GRID, dtype=np.uint8)

@@ -18,7 +18,7 @@ from links.simulated.kernels.ray_casting import Array32
 from links.simulated.world.mesh import SURFACES, Mesh
 from links.simulated.world.procedural import SceneSettings
 from links.simulated.world.sky import Light, noise_tile
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 MATERIALS: dict[str, tuple[int, tuple[float, float, float], tuple[float, float, float]]] = {
     # name in SURFACES: texture, base colour, second colour; each object gets a colour between the two (linear RGB)

@@ -25,7 +25,7 @@ from links.simulated.sensors.camera_paint import Faces, Street, faces_of, radian
 from links.simulated.world.mesh import SURFACES, Mesh, RayScene
 from links.simulated.world.scene import Body
 from links.simulated.world.sky import Light
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 SHADOW_REACH_M = 120.0
 LEAF_ROW = list(SURFACES).index("leaf")

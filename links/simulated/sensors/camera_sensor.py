@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from links.simulated.kernels.camera_image import STEPS, digitise
 from links.simulated.kernels.ray_casting import Array32
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 GREY = 0.22  # target of the auto exposure: mean as a fraction of saturation
 ELECTRONS_PER_S = 1e7  # at radiance 1, white in full sun: full well in 1 ms

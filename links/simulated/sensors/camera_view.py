@@ -19,8 +19,8 @@ from links.simulated.kernels.camera_image import FEW, pixel_rays
 from links.simulated.kernels.camera_rays import edges, image_motion
 from links.simulated.kernels.ray_casting import Array32
 from links.simulated.sensors.camera_rays import LEAF_ROW, WORLD, CameraScene, Samples
-from stages.geometry import Array64
-from stages.lens import Equidistant, KannalaBrandt, OCam
+from stages.geometry.frames import Array64
+from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
 
 BATCH_RAYS = 262_144
 MANY = 16  # rays through a pixel that needs more than FEW

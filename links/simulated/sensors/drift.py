@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from links.simulated.kernels.motion import rotations_z
 from links.simulated.world.motion import gauss_markov, interpolate, low_pass, random_walk, rotations_from_vectors
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 STEP_S = 0.01
 SMOOTH_S = 1.0  # time constant of the low-pass on the errors

@@ -33,7 +33,7 @@ from links.dynamixel import mx28
 from links.simulated.sensors import protocol2
 from links.simulated.sensors.mx28 import SimulatedMx28
 from links.simulated.sensors.servo import ServoSettings
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 IDLE_S = 0.02  # period at which the servo moves without requests
 MOST_WAITING = 4096  # limit for the bytes of an incomplete packet

@@ -20,7 +20,7 @@ from links.simulated.kernels.lidar import APERTURE_M, FOOTPRINT_RAD, PULSE_LENGT
 from links.simulated.kernels.ray_casting import Array32
 from links.simulated.world.weather import RainClutter, Weather
 from links.velodyne import vlp16
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 RANGE_STEP_M = 1e-3 * vlp16.RANGE_UNIT_MM
 ELEVATION_RAD = np.radians(np.array(vlp16.ELEVATION_DEG, dtype=np.float64))

@@ -19,7 +19,7 @@ from links.dynamixel.mx28 import Register
 from links.simulated.sensors import protocol2
 from links.simulated.sensors.protocol2 import Instruction
 from links.simulated.sensors.servo import STEP_NS, GearTrain, Servo, ServoSettings
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 KEPT_STEPS = 8192  # length of the trace: 8 s
 BOOT_NS = 500_000_000

@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from flow.link import Record
 from links.dynamixel.servo import TICK_RAD, VELOCITY_UNIT_RADPS
-from stages.geometry import Array64, Harmonic
+from stages.geometry.frames import Array64, Harmonic
 
 RPM_RADPS = 2 * math.pi / 60
 STEP_NS = 1_000_000

@@ -1,4 +1,4 @@
-"""The vehicle's own odometry, if it has one: T_start_vehicle with covariance, with drift, on /vehicle/odometry.
+"""The vehicle's own odometry, if it has one: T_map_vehicle with covariance, with drift, on /vehicle/odometry.
 
 The pose is that of wheels and a gyro, in the frame of the vehicle at the start of the scenario. It is smooth, and its
 error grows with the distance driven (see `drift`).
@@ -17,7 +17,7 @@ from flow.link import Record
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.world.path import Path
 from links.simulated.world.suspension import SuspendedPath
-from stages.geometry import quaternions_xyzw
+from stages.geometry.frames import quaternions_xyzw
 
 NS = 1_000_000_000
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from flow.link import LinkError
 from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 SAMPLE_S = 0.05
 SKY_M = 300.0  # larger than any scene

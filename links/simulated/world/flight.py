@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from links.simulated.kernels.motion import GRAVITY_MPS2, STEP_S, fly
 from links.simulated.world.motion import gauss_markov, interpolate
 from links.simulated.world.path import Path
-from stages.geometry import Array64, quaternions_xyzw, rotations_from_xyzw
+from stages.geometry.frames import Array64, quaternions_xyzw, rotations_from_xyzw
 
 BEYOND_S = 1.0  # the flight continues this long after the scenario: sensors sample ahead of it
 SETTLED_S = 60.0  # after this long, all laps of a closed path are flown alike

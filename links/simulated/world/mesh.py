@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flow.link import LinkError
 from links.simulated.kernels.ray_casting import Array32, ranges_and_fractions
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 try:
     from embreex.mesh_construction import TriangleMesh

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from links.simulated.kernels.motion import first_order_recursion
-from stages.geometry import Array64, rotations_from_xyzw
+from stages.geometry.frames import Array64, rotations_from_xyzw
 
 
 def interpolate(rows: Array64, step_s: float, time_s: Array64) -> Array64:

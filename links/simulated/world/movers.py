@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from links.simulated.kernels.motion import rotations_z
 from links.simulated.world.mesh import Mesh, box, merge, quads, rod
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 FLAP_STEPS = 8
 

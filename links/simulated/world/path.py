@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.interpolate import CubicSpline
 
 from links.simulated.kernels.motion import DRAG_PER_S, GRAVITY_MPS2, evaluate_cubics, rotations_z
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 
 class Waypoint(BaseModel):

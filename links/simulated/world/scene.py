@@ -23,7 +23,7 @@ from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.movers import Mover
 from links.simulated.world.path import Path
 from links.simulated.world.suspension import SuspendedPath
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 ROTOR_HZ = 95.0
 ROTOR_STEPS = 8  # blade positions within half a turn

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from links.simulated.kernels.camera_paint import LOWEST_SKY_DEG, SKY_PX
 from links.simulated.kernels.ray_casting import Array32
 from links.simulated.world.weather import Weather
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 WAVELENGTH_NM = 550.0
 DAWN_DEG = (-8.0, 12.0)  # sun elevations between which daylight grows from almost none to full

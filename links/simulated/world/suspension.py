@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from links.simulated.kernels.motion import STEP_S, oscillate, rotations_z
 from links.simulated.world.motion import gauss_markov, interpolate, rotations_from_vectors
 from links.simulated.world.path import Path
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 BEYOND_S = 1.0
 ROUGHNESS_TIME_S = 0.1

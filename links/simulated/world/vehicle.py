@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from links.simulated.world.mesh import Mesh, box, merge, rod
-from stages.geometry import LidarMount
+from stages.geometry.frames import LidarMount
 
 ROOF_BELOW_CAMERA_M = 0.15
 LIDAR_RADIUS_M = 0.052

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.random import Generator
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 LIDAR_NM = 903.0
 NEPER_PER_DB = math.log(10) / 10

@@ -59,7 +59,7 @@ def test_the_new_rig_can_be_laid_over_a_configuration(calibrated):
     folder, _ = calibrated
     rig = folder / "street.rig.yaml"
     graph = load_graph(ROOT / "configs" / "replay.yaml", overlays=[rig])
-    mount = graph.nodes["sweep"].build().mount  # pyright: ignore[reportAttributeAccessIssue]
+    mount = graph.nodes["sweep"].build().settings.mount
     written = yaml.safe_load(rig.read_text())["rig"]["lidar"]["mount"]
     assert mount.servo_time_offset_s == written["servo_time_offset_s"]
     assert abs(mount.servo_time_offset_s) < 2e-4  # this simulated servo has no error: none is invented

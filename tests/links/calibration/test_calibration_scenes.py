@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.geometry import LidarMount, Pose, quaternions_xyzw, rotation_from_rpy_deg
+from stages.geometry.frames import LidarMount, Pose, quaternions_xyzw, rotation_from_rpy_deg
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e '.[simulate]'")

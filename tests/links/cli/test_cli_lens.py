@@ -7,8 +7,8 @@ import yaml
 
 from flow.graph import load_graph
 from tests.links import command
-from tests.stages.test_lens import KANNALA_BRANDT, OCAM
-from tests.stages.test_lens_files import KALIBR, OCAMCALIB
+from tests.stages.geometry.test_lens import KANNALA_BRANDT, OCAM
+from tests.stages.geometry.test_lens_files import KALIBR, OCAMCALIB
 from tests.test_house import ROOT
 
 
@@ -30,9 +30,9 @@ def test_both_lenses_stand_in_the_rig_of_a_configuration_with_their_numbers(grd,
     (tmp_path / "camchain.yaml").unlink()  # the rig needs it no more
     assert "no problems" in grd("check", config)
     graph = load_graph(config)
-    assert graph.nodes["vp_vehicle"].build().lens == KANNALA_BRANDT  # pyright: ignore[reportAttributeAccessIssue]
-    assert graph.nodes["vp_drone"].build().lens == OCAM  # pyright: ignore[reportAttributeAccessIssue]
-    assert graph.nodes["camera_drone"].build().size_px == 1440  # pyright: ignore[reportAttributeAccessIssue]
+    assert graph.nodes["vp_vehicle"].build().settings.lens == KANNALA_BRANDT
+    assert graph.nodes["vp_drone"].build().settings.lens == OCAM
+    assert graph.nodes["camera_drone"].build().settings.size_px == 1440
     cameras = yaml.safe_load(graph.settings_yaml())["rig"]["cameras"]  # what a recording brings
     assert cameras["vehicle"]["lens"]["k"] == list(KANNALA_BRANDT.k)
     assert "focal_px" not in cameras["drone"]["lens"]  # of the equidistant lens that stood there

@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from flow.link import Record
-from links.live_run import live_graph, run_live
 from links.recording import Recorder, RecordingReader, recover
-from links.run_folder import Asked, RunFolder
+from links.runs.live_run import live_graph, run_live
+from links.runs.run_folder import Asked, RunFolder
 from tests.links import command
 
 ROOT = Path(__file__).resolve().parents[3]

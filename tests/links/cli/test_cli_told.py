@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[3]
 CONFIG = """\
 replay: drive.mcap
 stages:
-  motion: {use: stages.ego.VehicleMotionChoice, inputs: {odometry: odometry.vehicle_motion}}
+  motion: {use: stages.odometry.vehicle.VehicleMotionSelector, inputs: {odometry: odometry.vehicle_motion}}
 links:
   odometry: {use: links.vehicle_odometry.VehicleOdometry}
 """
@@ -43,7 +43,7 @@ def drive(tmp_path, monkeypatch):
 def test_a_configuration_that_seeks_no_drone_says_what_it_ran_instead(drive, words):
     lines = command.grd(*words).splitlines()
     assert lines[0].endswith("no stage seeks a drone")
-    assert lines[1] == "ran: motion (VehicleMotionChoice: 47 vehicle_motion)"
+    assert lines[1] == "ran: motion (VehicleMotionSelector: 47 vehicle_motion)"
     assert not any("drone accepted" in line or "no drone:" in line or line.startswith("positions") for line in lines)
     assert any(line.startswith("summary") for line in lines)
 
@@ -70,7 +70,7 @@ def test_a_run_that_left_nothing_out_has_no_such_line(drive):
 
 LIDAR = """\
 stages:
-  motion: {use: stages.ego.VehicleMotionChoice, inputs: {odometry: odometry.vehicle_motion}}
+  motion: {use: stages.odometry.vehicle.VehicleMotionSelector, inputs: {odometry: odometry.vehicle_motion}}
 links:
   odometry: {use: links.vehicle_odometry.VehicleOdometry}
   front: {use: links.velodyne.Lidar, config: {clock: CLOCK}}

@@ -12,7 +12,7 @@ from flow.edge import Edge, Waiting
 from flow.live_report import EdgeCount, LinkReport, LiveReport, edge_report
 from flow.taps import Digest
 from links.cli.live_view import LiveView
-from links.live_run import Look
+from links.runs.live_run import Look
 from stages.messages import DroneFix, Image, PoseState, RelativePose, SweptPulses, TrackingState, TrackState
 
 
@@ -45,10 +45,10 @@ def pose(state=PoseState.FULL, **changes):
         "R_vehicle_drone": quarter,
         "covariance": np.diag([1.0, 1.0, 1.0, 0.01, 0.02, 0.06]),
         "velocity_vehicle_mps": None,
-        "xyz_start_m": None,
-        "R_start_drone": None,
-        "start_covariance": None,
-        "velocity_start_mps": None,
+        "xyz_map_m": None,
+        "R_map_drone": None,
+        "map_covariance": None,
+        "velocity_map_mps": None,
         "velocity_covariance": None,
         "resets": 0,
         "nis": 1.0,

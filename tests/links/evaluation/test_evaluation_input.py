@@ -10,7 +10,7 @@ import pytest
 from flow.link import LinkError
 from links.evaluation import read_run
 from links.evaluation.tum import read_stamp_ns, read_tum
-from links.results import tum_line
+from links.runs.results import tum_line
 from tests.links.evaluation.made_runs import START_NS, make_run, truth_at
 
 FINE = "10.0 1 2 3 0 0 0 1\n"

@@ -19,7 +19,7 @@ from links.evaluation.statistics import (
     mean_nees_bounds,
     wilson_interval,
 )
-from stages.geometry import rotation_from_rpy_deg, rotations_from_xyzw
+from stages.geometry.frames import rotation_from_rpy_deg, rotations_from_xyzw
 from tests.links.evaluation.made_runs import yaw_quaternion
 
 

@@ -12,9 +12,9 @@ from links.evaluation import read_run
 from links.evaluation.errors import euler_rpy
 from links.evaluation.true_drone import NEVER_NS, read_true_drones
 from links.evaluation.tum import read_tum
-from links.results import Results
-from links.truth import TruthLog
-from stages.geometry import rotations_from_xyzw
+from links.runs.results import Results
+from links.runs.truth import TruthLog
+from stages.geometry.frames import rotations_from_xyzw
 from stages.messages import DepthImage, Detections, DroneFix, TrackingState, TrackState
 from tests.links.evaluation.made_runs import yaw_quaternion
 

@@ -9,7 +9,7 @@ from flow.link import LinkError, Run
 from links.evaluation import evaluate, read_run
 from links.evaluation.probabilities import reliabilities
 from links.evaluation.summaries import reliability_summary
-from links.results import CANDIDATES_FILE, Results
+from links.runs.results import CANDIDATES_FILE, Results
 from stages.messages import Candidates
 from tests.links.command import grd
 from tests.links.evaluation.made_runs import lines, make_run, stamp, truth_at

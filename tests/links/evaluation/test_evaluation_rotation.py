@@ -18,11 +18,11 @@ from links.evaluation.rotation_groups import rotation_groups
 from links.evaluation.rotations import read_rotations
 from links.evaluation.tracks import per_drone
 from links.evaluation.tum import read_tum
-from links.results import Results
-from links.truth import TruthLog
-from stages.geometry import quaternions_xyzw, rotation_from_rpy_deg, rotation_z
+from links.runs.results import Results
+from links.runs.truth import TruthLog
+from stages.geometry.frames import quaternions_xyzw, rotation_from_rpy_deg, rotation_z
+from stages.kernels.geometry.so3 import exp_rotation
 from stages.messages import BranchState, RelativeRotation
-from stages.rotation import exp_rotation
 from tests.links.command import grd
 from tests.links.evaluation.made_runs import (
     add_rotations,

@@ -80,14 +80,14 @@ def test_attitude_and_position_come_in_our_axes(v1: bool):
     attitude = link.decode(record(sender.attitude(7000, 0.0, 0.0, math.pi / 2)))
     assert isinstance(attitude, DroneAttitude)
     check_arrays(attitude)
-    np.testing.assert_allclose(attitude.R_local_drone @ [1, 0, 0], [0, -1, 0], atol=1e-6)
+    np.testing.assert_allclose(attitude.R_odom_drone @ [1, 0, 0], [0, -1, 0], atol=1e-6)
     np.testing.assert_allclose(attitude.angular_velocity_drone_radps, [1, -2, -3])
     moved = mavlink.MAVLink_local_position_ned_message(7001, 1.0, 2.0, -3.0, 4.0, 5.0, -6.0)
     position = link.decode(record(sender.frame(moved), 1.0))
     assert isinstance(position, DroneLocalPosition)
     check_arrays(position)
-    np.testing.assert_allclose(position.xyz_local_m, [1, -2, 3])
-    np.testing.assert_allclose(position.velocity_local_mps, [4, -5, 6])
+    np.testing.assert_allclose(position.xyz_odom_m, [1, -2, 3])
+    np.testing.assert_allclose(position.velocity_odom_mps, [4, -5, 6])
 
 
 def test_odometry_has_the_velocity_in_the_body_and_rotation_first_in_its_covariance():
@@ -95,10 +95,10 @@ def test_odometry_has_the_velocity_in_the_body_and_rotation_first_in_its_covaria
     message = Autopilot().decode(record(Sender().frame(odometry(upper=upper))))
     assert isinstance(message, DroneOdometry)
     check_arrays(message)
-    np.testing.assert_allclose(message.xyz_local_m, [1, -2, -3])
+    np.testing.assert_allclose(message.xyz_odom_m, [1, -2, -3])
     np.testing.assert_allclose(message.velocity_drone_mps, [4, -5, -6])
     np.testing.assert_allclose(message.angular_velocity_drone_radps, [0.1, -0.2, -0.3], rtol=1e-6)
-    np.testing.assert_allclose(message.R_local_drone, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(message.R_odom_drone, np.eye(3), atol=1e-12)
     assert message.pose_covariance is not None
     np.testing.assert_allclose(np.diagonal(message.pose_covariance), [4, 5, 6, 1, 2, 3])
     assert (message.reset_counter, message.quality_percent) == (9, 80)
@@ -360,7 +360,7 @@ def test_odometry_with_a_right_checksum_and_any_numbers_is_finite_or_refused(
     decoded = Autopilot().decode(record(Sender().frame(message)))
     if decoded is not None:
         assert isinstance(decoded, DroneOdometry)
-        for array in (decoded.xyz_local_m, decoded.R_local_drone, decoded.velocity_drone_mps):
+        for array in (decoded.xyz_odom_m, decoded.R_odom_drone, decoded.velocity_drone_mps):
             assert np.isfinite(array).all()
 
 

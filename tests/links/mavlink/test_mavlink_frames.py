@@ -9,17 +9,17 @@ import pytest
 
 from links.mavlink.frames import (
     UPPER,
-    R_local_drone_from_rpy,
-    R_local_drone_from_wxyz,
+    R_odom_drone_from_rpy,
+    R_odom_drone_from_wxyz,
     pose_covariance_from_upper,
-    rpy_from_R_local_drone,
+    rpy_from_R_odom_drone,
     turned_over,
     upper_from_pose_covariance,
     upper_from_velocity_covariance,
     velocity_covariance_from_upper,
-    wxyz_from_R_local_drone,
+    wxyz_from_R_odom_drone,
 )
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 
 ATTITUDES = [(0, 0, 0), (10, -20, 30), (-5, 3, 179), (60, 40, -120), (170, 10, 90), (0, 89, 0), (180, 0, 180)]
 
@@ -30,35 +30,35 @@ def test_east_and_down_become_minus_y_and_minus_z():
 
 
 def test_a_drone_heading_east_looks_along_minus_y_and_its_left_is_north():
-    R = R_local_drone_from_rpy(0.0, 0.0, math.radians(90.0))
+    R = R_odom_drone_from_rpy(0.0, 0.0, math.radians(90.0))
     np.testing.assert_allclose(R @ [1, 0, 0], [0, -1, 0], atol=1e-12)  # forward: east
     np.testing.assert_allclose(R @ [0, 1, 0], [1, 0, 0], atol=1e-12)  # left: north
     np.testing.assert_allclose(R @ [0, 0, 1], [0, 0, 1], atol=1e-12)
 
 
 def test_positive_pitch_lifts_the_nose_and_positive_roll_lowers_the_right_side():
-    nose_up = R_local_drone_from_rpy(0.0, math.radians(30.0), 0.0)
+    nose_up = R_odom_drone_from_rpy(0.0, math.radians(30.0), 0.0)
     np.testing.assert_allclose(nose_up @ [1, 0, 0], [math.cos(math.pi / 6), 0, 0.5], atol=1e-12)
-    right_down = R_local_drone_from_rpy(math.radians(30.0), 0.0, 0.0)
+    right_down = R_odom_drone_from_rpy(math.radians(30.0), 0.0, 0.0)
     np.testing.assert_allclose(right_down @ [0, -1, 0], [0, -math.cos(math.pi / 6), -0.5], atol=1e-12)
 
 
 @pytest.mark.parametrize("rpy_deg", ATTITUDES)
 def test_angles_and_quaternions_come_back_and_agree(rpy_deg: tuple[float, float, float]):
-    R = R_local_drone_from_rpy(*np.radians(rpy_deg))
+    R = R_odom_drone_from_rpy(*np.radians(rpy_deg))
     np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
-    np.testing.assert_allclose(R_local_drone_from_rpy(*rpy_from_R_local_drone(R)), R, atol=1e-7)
-    q = wxyz_from_R_local_drone(R)
+    np.testing.assert_allclose(R_odom_drone_from_rpy(*rpy_from_R_odom_drone(R)), R, atol=1e-7)
+    q = wxyz_from_R_odom_drone(R)
     assert math.hypot(*q) == pytest.approx(1.0)
     assert q[0] >= 0
-    np.testing.assert_allclose(R_local_drone_from_wxyz(q), R, atol=1e-12)
+    np.testing.assert_allclose(R_odom_drone_from_wxyz(q), R, atol=1e-12)
 
 
 def test_mavlinks_quaternion_of_a_turn_to_the_east_is_a_turn_about_down():
     half = math.radians(45.0)
-    expected = R_local_drone_from_rpy(0.0, 0.0, math.radians(90.0))
-    np.testing.assert_allclose(R_local_drone_from_wxyz([math.cos(half), 0, 0, math.sin(half)]), expected, atol=1e-12)
+    expected = R_odom_drone_from_rpy(0.0, 0.0, math.radians(90.0))
+    np.testing.assert_allclose(R_odom_drone_from_wxyz([math.cos(half), 0, 0, math.sin(half)]), expected, atol=1e-12)
 
 
 def _upper(theirs: np.ndarray) -> list[float]:
@@ -85,7 +85,7 @@ def test_mixed_terms_change_sign_with_their_axes():
 def test_position_covariance_turns_into_the_body():
     """1 m2 northwards and little else, drone heading east: in its body that is sideways."""
     theirs = np.diag([1.0, 0.01, 0.04, 0.1, 0.1, 0.1])
-    ours = pose_covariance_from_upper(_upper(theirs), R_local_drone_from_rpy(0.0, 0.0, math.radians(90.0)))
+    ours = pose_covariance_from_upper(_upper(theirs), R_odom_drone_from_rpy(0.0, 0.0, math.radians(90.0)))
     assert ours is not None
     np.testing.assert_allclose(np.diagonal(ours), [0.1, 0.1, 0.1, 0.01, 1.0, 0.04], atol=1e-12)
 

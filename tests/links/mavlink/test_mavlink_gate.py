@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from links.mavlink.gate import Limits, Refusal, pose_sigmas, refusal
 from links.mavlink.speaker import PoseSpeaker
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import PoseState
 
 LIMITS = Limits()
@@ -44,24 +44,24 @@ def test_no_other_state_passes_even_if_the_pose_looks_whole(state: PoseState):
 
 SPOILED = [
     ({"R_vehicle_drone": None}, Refusal.INCOMPLETE),
-    ({"R_start_drone": None}, Refusal.INCOMPLETE),
-    ({"xyz_start_m": None}, Refusal.INCOMPLETE),
+    ({"R_map_drone": None}, Refusal.INCOMPLETE),
+    ({"xyz_map_m": None}, Refusal.INCOMPLETE),
     ({"covariance": None}, Refusal.INCOMPLETE),
-    ({"start_covariance": None}, Refusal.INCOMPLETE),
-    ({"xyz_start_m": nan_at(np.ones(3))}, Refusal.NOT_FINITE),
+    ({"map_covariance": None}, Refusal.INCOMPLETE),
+    ({"xyz_map_m": nan_at(np.ones(3))}, Refusal.NOT_FINITE),
     ({"xyz_vehicle_m": nan_at(np.ones(3), math.inf)}, Refusal.NOT_FINITE),
-    ({"R_start_drone": nan_at(np.eye(3))}, Refusal.NOT_FINITE),
-    ({"start_covariance": nan_at(covariance())}, Refusal.NOT_FINITE),
+    ({"R_map_drone": nan_at(np.eye(3))}, Refusal.NOT_FINITE),
+    ({"map_covariance": nan_at(covariance())}, Refusal.NOT_FINITE),
     ({"covariance": np.diag([math.inf] * 3 + [0.01] * 3)}, Refusal.NOT_FINITE),  # a rotation that is not known
-    ({"R_start_drone": np.diag([1.0, 1.0, -1.0])}, Refusal.NO_ROTATION),  # a mirror
+    ({"R_map_drone": np.diag([1.0, 1.0, -1.0])}, Refusal.NO_ROTATION),  # a mirror
     ({"R_vehicle_drone": 1.01 * np.eye(3)}, Refusal.NO_ROTATION),
-    ({"R_start_drone": np.zeros((3, 3))}, Refusal.NO_ROTATION),
-    ({"start_covariance": np.zeros((6, 6))}, Refusal.COVARIANCE),
+    ({"R_map_drone": np.zeros((3, 3))}, Refusal.NO_ROTATION),
+    ({"map_covariance": np.zeros((6, 6))}, Refusal.COVARIANCE),
     ({"covariance": -covariance()}, Refusal.COVARIANCE),
     ({"covariance": covariance() + 0.1 * np.triu(np.ones((6, 6)), 1)}, Refusal.COVARIANCE),  # not symmetric
-    ({"start_covariance": covariance(position_m=0.51)}, Refusal.POSITION_SIGMA),
+    ({"map_covariance": covariance(position_m=0.51)}, Refusal.POSITION_SIGMA),
     ({"covariance": covariance(position_m=0.51)}, Refusal.POSITION_SIGMA),
-    ({"start_covariance": covariance(rotation_deg=5.1)}, Refusal.ROTATION_SIGMA),
+    ({"map_covariance": covariance(rotation_deg=5.1)}, Refusal.ROTATION_SIGMA),
     ({"covariance": covariance(rotation_deg=60.0)}, Refusal.ROTATION_SIGMA),
 ]
 
@@ -81,7 +81,7 @@ def test_sigmas_are_the_worst_direction_not_the_worst_axis():
     sigmas = pose_sigmas(turned @ flat @ turned.T)
     assert sigmas is not None
     np.testing.assert_allclose(sigmas, [0.02, 0.6])
-    assert refusal(good_pose(start_covariance=turned @ flat @ turned.T), HOST0, LIMITS) is Refusal.POSITION_SIGMA
+    assert refusal(good_pose(map_covariance=turned @ flat @ turned.T), HOST0, LIMITS) is Refusal.POSITION_SIGMA
 
 
 @pytest.mark.parametrize(
@@ -99,9 +99,7 @@ def test_a_quarter_turn_that_is_not_resolved_never_goes_out_whatever_its_covaria
     for i in range(300):
         state = (PoseState.AMBIGUOUS, PoseState.POSITION_ONLY, PoseState.LOST)[i % 3]
         at_ns = HOST0 + 20 * i * MS
-        pose = good_pose(
-            at_ns, state=state, R_vehicle_drone=wrong, R_start_drone=wrong, covariance=covariance(0.1, 0.01)
-        )
+        pose = good_pose(at_ns, state=state, R_vehicle_drone=wrong, R_map_drone=wrong, covariance=covariance(0.1, 0.01))
         sent += len(speaker.speak(pose, at_ns))
     assert sent == 0
     assert sum(speaker.refused.values()) == 300
@@ -113,7 +111,7 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
 @given(
     state=st.sampled_from(PoseState),
     field=st.sampled_from(
-        ["xyz_vehicle_m", "xyz_start_m", "R_vehicle_drone", "R_start_drone", "covariance", "start_covariance"]
+        ["xyz_vehicle_m", "xyz_map_m", "R_vehicle_drone", "R_map_drone", "covariance", "map_covariance"]
     ),
     at=st.integers(0, 35),
     value=NUMBERS,

@@ -32,7 +32,7 @@ from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.autopilot.px4_rules import Px4Rules
 from links.simulated.autopilot.rules import PoseResult
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import AutopilotEstimator, PoseState, RelativePose
 
 mavlink: Any = ardupilotmega
@@ -146,7 +146,7 @@ def test_an_unresolved_branch_never_reaches_the_autopilot_and_it_is_told_why():
         wrong = rotation_z(np.pi / 2)
         heard.fly(
             lambda: any("AMBIGUOUS" in m.text for m in drone.messages("STATUSTEXT")),
-            lambda ns: good_pose(ns, state=PoseState.AMBIGUOUS, R_start_drone=wrong, R_vehicle_drone=wrong),
+            lambda ns: good_pose(ns, state=PoseState.AMBIGUOUS, R_map_drone=wrong, R_vehicle_drone=wrong),
         )
         assert drone.messages("ODOMETRY") == []
         assert drone.rules.estimate is None

@@ -16,7 +16,7 @@ from links.mavlink.gate import Limits
 from links.mavlink.pose_frames import landing_target, odometry, quality_percent, vision_position_estimate
 from links.mavlink.readers import read_odometry
 from links.mavlink.wire import packed, parse_frame
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 
 mavlink: Any = ardupilotmega
 LIMITS = Limits()
@@ -37,17 +37,17 @@ def test_odometry_is_the_drone_in_the_start_frame_forward_right_down():
 
 def test_a_drone_that_looks_left_has_turned_by_minus_90_deg_and_its_velocity_is_its_own():
     R = rotation_from_rpy_deg((0.0, 0.0, 90.0))  # counter-clockwise seen from above
-    message = over_the_wire(odometry(good_pose(R_start_drone=R, R_vehicle_drone=R), 0, LIMITS))
+    message = over_the_wire(odometry(good_pose(R_map_drone=R, R_vehicle_drone=R), 0, LIMITS))
     np.testing.assert_allclose(message.q, [math.sqrt(0.5), 0, 0, -math.sqrt(0.5)], atol=1e-6)
     np.testing.assert_allclose([message.vx, message.vy, message.vz], [0, 1, 0], atol=1e-6)  # 1 m/s to its right
-    estimate = over_the_wire(vision_position_estimate(good_pose(R_start_drone=R), 3))
+    estimate = over_the_wire(vision_position_estimate(good_pose(R_map_drone=R), 3))
     np.testing.assert_allclose([estimate.roll, estimate.pitch, estimate.yaw], [0, 0, -math.pi / 2], atol=1e-6)
     assert (estimate.x, estimate.y, estimate.z, estimate.reset_counter) == (101.0, -2.0, -10.0, 3)
 
 
 def test_a_nose_that_goes_up_is_a_positive_pitch():
     R = rotation_from_rpy_deg((0.0, -20.0, 0.0))  # ours: y is left, so nose up is negative
-    estimate = over_the_wire(vision_position_estimate(good_pose(R_start_drone=R), 0))
+    estimate = over_the_wire(vision_position_estimate(good_pose(R_map_drone=R), 0))
     assert math.degrees(estimate.pitch) == pytest.approx(20.0, abs=1e-4)
 
 
@@ -62,18 +62,18 @@ def test_what_is_sent_reads_as_what_was_meant(rpy_deg: Any, xyz: Any, velocity: 
     root = rng.normal(0, 0.05, (6, 6))
     covariance = root @ root.T + 1e-4 * np.eye(6)
     pose = good_pose(
-        xyz_start_m=np.array(xyz),
-        R_start_drone=rotation_from_rpy_deg(rpy_deg),
-        start_covariance=covariance,
-        velocity_start_mps=np.array(velocity),
+        xyz_map_m=np.array(xyz),
+        R_map_drone=rotation_from_rpy_deg(rpy_deg),
+        map_covariance=covariance,
+        velocity_map_mps=np.array(velocity),
     )
     message = over_the_wire(odometry(pose, 0, LIMITS))
     message.rollspeed = message.pitchspeed = message.yawspeed = 0.0  # the reader wants numbers
     read = read_odometry(message, pose.stamp_ns)
-    np.testing.assert_allclose(read.xyz_local_m, xyz, rtol=1e-6, atol=1e-5)
-    assert pose.R_start_drone is not None
-    np.testing.assert_allclose(read.R_local_drone, pose.R_start_drone, atol=1e-6)
-    np.testing.assert_allclose(pose.R_start_drone @ read.velocity_drone_mps, velocity, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(read.xyz_odom_m, xyz, rtol=1e-6, atol=1e-5)
+    assert pose.R_map_drone is not None
+    np.testing.assert_allclose(read.R_odom_drone, pose.R_map_drone, atol=1e-6)
+    np.testing.assert_allclose(pose.R_map_drone @ read.velocity_drone_mps, velocity, rtol=1e-5, atol=1e-4)
     assert read.pose_covariance is not None
     np.testing.assert_allclose(read.pose_covariance, covariance, rtol=1e-4, atol=1e-6)
 
@@ -81,7 +81,7 @@ def test_what_is_sent_reads_as_what_was_meant(rpy_deg: Any, xyz: Any, velocity: 
 def test_the_local_frame_stands_still_while_the_vehicle_drives_under_a_drone_that_hovers():
     seen = set()
     for driven_m in (0.0, 3.0, 50.0):
-        pose = good_pose(xyz_vehicle_m=np.array([5.0 - driven_m, 0.0, 10.0]), xyz_start_m=np.array([5.0, 0.0, 10.0]))
+        pose = good_pose(xyz_vehicle_m=np.array([5.0 - driven_m, 0.0, 10.0]), xyz_map_m=np.array([5.0, 0.0, 10.0]))
         message = odometry(pose, 0, LIMITS)
         seen.add((message.x, message.y, message.z))
     assert seen == {(5.0, 0.0, -10.0)}
@@ -90,9 +90,9 @@ def test_the_local_frame_stands_still_while_the_vehicle_drives_under_a_drone_tha
 @pytest.mark.parametrize(
     "unknown",
     [
-        {"velocity_start_mps": None},
+        {"velocity_map_mps": None},
         {"velocity_covariance": None},
-        {"velocity_start_mps": np.array([1.0, math.nan, 0.0])},
+        {"velocity_map_mps": np.array([1.0, math.nan, 0.0])},
         {"velocity_covariance": np.diag([1.0, 0.01, 0.01])},  # 1 m/s: beyond the limit
         {"velocity_covariance": np.zeros((3, 3))},
         {"velocity_covariance": np.diag([math.inf] * 3)},
@@ -108,7 +108,7 @@ def test_a_velocity_that_is_not_known_is_nan_and_never_zero(unknown: Any):
 
 def test_turn_rates_are_never_said_and_the_velocitys_variances_are():
     R = rotation_from_rpy_deg((0.0, 0.0, 90.0))
-    pose = good_pose(R_start_drone=R, velocity_covariance=np.diag([0.01, 0.04, 0.09]))
+    pose = good_pose(R_map_drone=R, velocity_covariance=np.diag([0.01, 0.04, 0.09]))
     message = over_the_wire(odometry(pose, 0, LIMITS))
     assert all(math.isnan(v) for v in (message.rollspeed, message.pitchspeed, message.yawspeed))
     variances = [message.velocity_covariance[i] for i in (0, 6, 11)]
@@ -123,7 +123,7 @@ def test_quality_falls_from_100_to_1_at_the_limit_by_the_worse_of_the_two():
     limit = np.diag([1e-12] * 3 + [LIMITS.position_sigma_m**2] * 3)
 
     def quality(start: Any, relative: Any) -> int:
-        return quality_percent(good_pose(start_covariance=start, covariance=relative), LIMITS)
+        return quality_percent(good_pose(map_covariance=start, covariance=relative), LIMITS)
 
     assert quality(exact, exact) == 100
     assert quality(half, exact) == quality(exact, half) == 50
@@ -159,7 +159,7 @@ def test_the_reset_counter_is_one_byte():
     assert over_the_wire(odometry(good_pose(), 256 + 5, LIMITS)).reset_counter == 5
 
 
-@pytest.mark.parametrize("missing", ["xyz_start_m", "R_start_drone", "start_covariance"])
+@pytest.mark.parametrize("missing", ["xyz_map_m", "R_map_drone", "map_covariance"])
 def test_a_pose_without_its_start_frame_is_an_error_of_the_caller(missing: str):
     with pytest.raises(ValueError, match="gate"):
         odometry(good_pose(**{missing: None}), 0, LIMITS)

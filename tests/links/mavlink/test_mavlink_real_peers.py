@@ -32,7 +32,7 @@ from links import host_time
 from links.mavlink import Autopilot
 from links.mavlink.wire import packed, parse_frame
 from links.recording import RecordingReader, RecordingWriter
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 from stages.messages import PoseState, RelativePose
 from tests.links.ports import free_port
 
@@ -97,9 +97,9 @@ def varied(stamp_ns: int) -> RelativePose:
     return good_pose(
         stamp_ns,
         xyz_vehicle_m=np.array([np.sin(t), np.cos(t), 10.0 + 0.1 * t]),
-        xyz_start_m=np.array([t, np.cos(t), 10.0 + 0.1 * t]),
+        xyz_map_m=np.array([t, np.cos(t), 10.0 + 0.1 * t]),
         R_vehicle_drone=R,
-        R_start_drone=R,
+        R_map_drone=R,
     )
 
 

@@ -161,7 +161,7 @@ class Eye(Stage[EyeSettings]):
     def on_position(self, position: DroneLocalPosition) -> DroneFix:
         """A fix where it is."""
         c, s = math.cos(0.5), math.sin(0.5)
-        x, y, z = position.xyz_local_m
+        x, y, z = position.xyz_odom_m
         y = y * self.settings.mirror
         return DroneFix(
             stamp_ns=position.stamp_ns,

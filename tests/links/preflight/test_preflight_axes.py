@@ -19,7 +19,7 @@ from links.preflight.motion import (
     velocity_check,
 )
 from links.preflight.verdict import Level
-from stages.geometry import rotation_from_rpy_deg, rotation_z
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.messages import DroneAttitude, DroneFix, DroneImu, DroneLocalPosition, DroneOdometry, VehicleMotion
 
 RNG = np.random.default_rng(7)
@@ -82,7 +82,7 @@ def test_a_straight_line_does_not_tell_left_from_right():
 
 
 def attitude(stamp_ns, rotation):
-    return DroneAttitude(stamp_ns=stamp_ns, R_local_drone=rotation, angular_velocity_drone_radps=np.zeros(3))
+    return DroneAttitude(stamp_ns=stamp_ns, R_odom_drone=rotation, angular_velocity_drone_radps=np.zeros(3))
 
 
 def fix(stamp_ns, xyz_m):
@@ -101,7 +101,7 @@ def attitudes(seconds=6.0, rates_of=lambda w: w, rate_hz=50):
         turn = rotation.T @ later
         rates = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / (2 * dt)
         made.append(
-            DroneAttitude(stamp_ns=round(t * S), R_local_drone=rotation, angular_velocity_drone_radps=rates_of(rates))
+            DroneAttitude(stamp_ns=round(t * S), R_odom_drone=rotation, angular_velocity_drone_radps=rates_of(rates))
         )
     return made
 
@@ -111,7 +111,7 @@ def imu_of(poses, exchange=None):
     return [
         DroneImu(
             stamp_ns=p.stamp_ns + 1_000_000,
-            acceleration_drone_mps2=exchange @ p.R_local_drone.T @ [0, 0, 9.81],
+            acceleration_drone_mps2=exchange @ p.R_odom_drone.T @ [0, 0, 9.81],
             angular_velocity_drone_radps=exchange @ p.angular_velocity_drone_radps,
         )
         for p in poses
@@ -151,9 +151,9 @@ def odometry(turn=None, back=1.0):
         made.append(
             DroneOdometry(
                 stamp_ns=pose.stamp_ns,
-                xyz_local_m=np.array([2 * math.cos(t), 2 * math.sin(t), 0.3 * math.sin(2 * t)]),
-                R_local_drone=turn @ pose.R_local_drone,
-                velocity_drone_mps=back * (turn @ pose.R_local_drone).T @ velocity,
+                xyz_odom_m=np.array([2 * math.cos(t), 2 * math.sin(t), 0.3 * math.sin(2 * t)]),
+                R_odom_drone=turn @ pose.R_odom_drone,
+                velocity_drone_mps=back * (turn @ pose.R_odom_drone).T @ velocity,
                 angular_velocity_drone_radps=pose.angular_velocity_drone_radps,
                 pose_covariance=None,
                 velocity_covariance=None,
@@ -183,7 +183,7 @@ def path(exchange=None, at=lambda t: np.zeros(3)):
         local = exchange @ (rotation_z(0.7) @ xyz + [3, 4, 0])
         fixes.append(fix(round(t * S), xyz - at(t)))
         positions.append(
-            DroneLocalPosition(stamp_ns=round(t * S) + 10_000_000, xyz_local_m=local, velocity_local_mps=np.zeros(3))
+            DroneLocalPosition(stamp_ns=round(t * S) + 10_000_000, xyz_odom_m=local, velocity_odom_mps=np.zeros(3))
         )
     return fixes, positions
 
@@ -208,8 +208,8 @@ def test_a_vehicle_that_drives_needs_its_odometry():
     driven = [
         VehicleMotion(
             stamp_ns=f.stamp_ns,
-            xyz_start_m=np.array([2.0 * f.stamp_ns / S, 0, 0]),
-            R_start_vehicle=np.eye(3),
+            xyz_map_m=np.array([2.0 * f.stamp_ns / S, 0, 0]),
+            R_map_vehicle=np.eye(3),
             covariance=None,
         )
         for f in fixes

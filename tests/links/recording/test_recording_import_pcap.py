@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from flow.link import LinkError, Record
 from links.recording import ImportReport, RecordingReader, import_file
 from links.recording.importing import DEFAULT_RIG
-from stages.geometry import LidarMount
+from stages.geometry.frames import LidarMount
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "lidar"
 RECORDINGS = Path(__file__).resolve().parents[3] / "recordings"

@@ -18,7 +18,7 @@ from links.simulated.sensors.vehicle_odometry import VehicleOdometrySettings
 from links.simulated.world.path import Path as Way
 from links.simulated.world.path import Waypoint
 from links.vehicle_odometry import VehicleOdometry
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import VehicleMotion
 
 COVARIANCE = np.diag([1e-4, 1e-4, 4e-4, 0.01, 0.01, 0.04])
@@ -42,8 +42,8 @@ def test_a_pose_keeps_its_own_time_and_every_field() -> None:
     motion = decoded()
     assert motion is not None
     assert motion.stamp_ns == 10
-    assert motion.xyz_start_m.tolist() == [1.0, -2.0, 0.5]
-    assert motion.R_start_vehicle == pytest.approx(rotation_z(0.4))
+    assert motion.xyz_map_m.tolist() == [1.0, -2.0, 0.5]
+    assert motion.R_map_vehicle == pytest.approx(rotation_z(0.4))
     assert motion.covariance is not None
     assert np.array_equal(motion.covariance, COVARIANCE)
     assert output_ports(VehicleOdometry) == {"vehicle_motion": VehicleMotion}
@@ -116,8 +116,8 @@ def test_the_simulated_vehicle_is_understood_with_its_covariance() -> None:
         before_ns = motion.stamp_ns
     assert link.refused == 0
     expected_m = np.array([15 * math.cos(math.pi / 6) + 9 / 2, -15 / 2 + 9 * math.cos(math.pi / 6), 0.0])
-    assert motion.xyz_start_m == pytest.approx(expected_m, abs=0.5)
-    assert motion.R_start_vehicle == pytest.approx(rotation_z(math.radians(40)), abs=0.03)
+    assert motion.xyz_map_m == pytest.approx(expected_m, abs=0.5)
+    assert motion.R_map_vehicle == pytest.approx(rotation_z(math.radians(40)), abs=0.03)
 
 
 def test_a_recording_without_odometry_leaves_the_source_silent(tmp_path: Path) -> None:

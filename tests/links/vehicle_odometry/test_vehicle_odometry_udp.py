@@ -38,7 +38,7 @@ def test_a_pose_arrives_stamped_by_its_age_and_decodes(port):
     assert (aged.arrival_ns - aged.stamp_ns, plain.arrival_ns - plain.stamp_ns) == (250_000_000, 0)
     motion = odometry.decode(aged)
     assert motion.stamp_ns == aged.stamp_ns
-    assert motion.xyz_start_m.tolist() == [1.0, 2.0, 3.0]
+    assert motion.xyz_map_m.tolist() == [1.0, 2.0, 3.0]
 
 
 def test_a_pose_that_is_read_late_did_not_arrive_late(port):

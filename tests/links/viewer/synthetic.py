@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from flow.message import Message
-from stages.geometry import LidarMount, Pose, rotation_z
+from stages.geometry.frames import LidarMount, Pose, rotation_z
 from stages.messages import (
     Candidates,
     DepthImage,
@@ -305,9 +305,7 @@ def run_by_evidence(duration_s: float) -> Iterator[tuple[str, Message]]:
                 "aim.servo_goal",
                 ServoGoal(stamp_ns=stamp_ns, position_rad=1.0 + 0.1 * (k // 75 % 3), speed_radps=5.0),
             )
-            still = VehicleMotion(
-                stamp_ns=stamp_ns, xyz_start_m=np.zeros(3), R_start_vehicle=np.eye(3), covariance=None
-            )
+            still = VehicleMotion(stamp_ns=stamp_ns, xyz_map_m=np.zeros(3), R_map_vehicle=np.eye(3), covariance=None)
             yield "odometry.vehicle_motion", still
             yield "detect.candidates", candidates(stamp_ns, t_s)
             if t_s > 0.75 and not answered:

@@ -10,8 +10,8 @@ import synthetic
 
 from flow.message import Message
 from links.viewer.lenses import Cameras
-from stages.geometry import rotation_z
-from stages.messages import BranchState, Carrier, DroneMotion, Image, RelativeRotation, VanishingDirections
+from stages.geometry.frames import rotation_z
+from stages.messages import BranchState, CameraMount, Image, RelativeRotation, VanishingDirections, VisualMotion
 
 SIZE_PX = 720
 FOCAL_PX = 170.0
@@ -32,7 +32,7 @@ FRAMES = np.array([-1, 0, 0, 1, 1])
 MERMAID = (
     synthetic.EVIDENCE_MERMAID
     + "    camera_vehicle -- image --> vp_vehicle\n    vp_vehicle -- vanishing_directions --> align\n"
-    + "    drone_odometry -- drone_motion --> align\n    align -. relative_rotation .-> align_relative_rotation(( ))\n"
+    + "    drone_odometry -- visual_motion --> align\n    align -. relative_rotation .-> align_relative_rotation(( ))\n"
 )
 
 
@@ -48,16 +48,18 @@ def ends_along(direction: np.ndarray, seed: int, side: float) -> np.ndarray:
     return both / np.linalg.norm(both, axis=1, keepdims=True)
 
 
-def directions(stamp_ns: int = 0, carrier: Carrier = Carrier.VEHICLE, count: int = 5) -> VanishingDirections:
+def directions(
+    stamp_ns: int = 0, camera_mount: CameraMount = CameraMount.VEHICLE, count: int = 5
+) -> VanishingDirections:
     """The vertical and two horizontal pairs, or the first of them, with five lines each and five of none."""
-    side = 1.0 if carrier is Carrier.VEHICLE else -1.0
+    side = 1.0 if camera_mount is CameraMount.VEHICLE else -1.0
     other = np.array([0.5, -0.5, 0.7071])
     along = [*(d for d in DIRECTIONS[:count] for _ in range(5)), *([other] * 5)]
     ends = np.array([ends_along(d, k, side) for k, d in enumerate(along)])
     normal = np.cross(ends[:, 0], ends[:, 1])
     return VanishingDirections(
         stamp_ns=stamp_ns,
-        carrier=carrier,
+        camera_mount=camera_mount,
         direction=DIRECTIONS[:count],
         sigma_rad=np.deg2rad([0.1, 0.2, 0.3, 0.4, 0.5])[:count],
         is_vertical=FRAMES[:count] < 0,
@@ -70,9 +72,11 @@ def directions(stamp_ns: int = 0, carrier: Carrier = Carrier.VEHICLE, count: int
     )
 
 
-def one_line(ends: np.ndarray, stamp_ns: int = 0, carrier: Carrier = Carrier.VEHICLE) -> VanishingDirections:
+def one_line(
+    ends: np.ndarray, stamp_ns: int = 0, camera_mount: CameraMount = CameraMount.VEHICLE
+) -> VanishingDirections:
     """The vertical, and one line with these ends (2, 3) that runs along it."""
-    message = directions(stamp_ns, carrier, 1)
+    message = directions(stamp_ns, camera_mount, 1)
     return dataclasses.replace(
         message,
         line_end=ends[None],
@@ -95,8 +99,8 @@ def rotation(stamp_ns: int = 0, **changes) -> RelativeRotation:
     return dataclasses.replace(settled, **changes)
 
 
-def motion(stamp_ns: int = PERIOD_NS, **changes) -> DroneMotion:
-    moved = DroneMotion(
+def motion(stamp_ns: int = PERIOD_NS, **changes) -> VisualMotion:
+    moved = VisualMotion(
         stamp_ns=stamp_ns,
         from_ns=stamp_ns - PERIOD_NS,
         R_from_to=rotation_z(np.deg2rad(90.0)),
@@ -120,10 +124,10 @@ def run(duration_s: float) -> Iterator[tuple[str, Message]]:
         yield "camera_drone.image", picture(due_ns, "camera_drone")
         yield "vp_vehicle.vanishing_directions", directions(due_ns)
         blind = k % 5 == 4
-        yield "vp_drone.vanishing_directions", directions(due_ns, Carrier.DRONE, 0 if blind else 3)
+        yield "vp_drone.vanishing_directions", directions(due_ns, CameraMount.DRONE, 0 if blind else 3)
         if k:
             still = {"direction_from": None, "direction_sigma_rad": None, "reason": "no motion"}
-            yield "drone_odometry.drone_motion", motion(due_ns, **(still if k % 3 == 0 else {}))
+            yield "drone_odometry.visual_motion", motion(due_ns, **(still if k % 3 == 0 else {}))
         none = {"R_vehicle_drone": None, "covariance_rad2": None, "state": BranchState.NONE, "reason": "no structure"}
         yield "align.relative_rotation", rotation(due_ns, **(none if blind else {"switches": k // 6}))
         due_ns, k = due_ns + PERIOD_NS, k + 1

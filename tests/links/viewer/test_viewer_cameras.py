@@ -19,7 +19,7 @@ from links.viewer.draw import draw
 from links.viewer.draw_cameras import direction_colours
 from links.viewer.lenses import Cameras, arcs, strips
 from links.viewer.marks import strip_batch
-from stages.messages import Carrier, FollowedFeatures
+from stages.messages import CameraMount, FollowedFeatures
 
 VP, LINES = "vp_vehicle/vanishing_directions", "camera/camera_vehicle/vp_vehicle/vanishing_directions/lines"
 
@@ -112,9 +112,9 @@ def test_the_drones_camera_looks_down():
     where = seeing()
     drawn(picture(0, "camera_drone"), "camera_drone/image", where)
     ends = np.array([[0.0, 0.0, -1.0], [np.sin(0.5), 0.0, -np.cos(0.5)]])
-    marks = drawn(one_line(ends, carrier=Carrier.DRONE), "vp_drone/vanishing_directions", where)
+    marks = drawn(one_line(ends, camera_mount=CameraMount.DRONE), "vp_drone/vanishing_directions", where)
     (strip,) = numbers(marks["camera/camera_drone/vp_drone/vanishing_directions/lines"].parts[0].strips)
-    R = synthetic_vision.CAMERAS.of(Carrier.DRONE).pose().matrix()[:3, :3]
+    R = synthetic_vision.CAMERAS.of(CameraMount.DRONE).pose().matrix()[:3, :3]
     ahead = R.T @ [1.0, 0.0, 0.0]
     expected = 240.0 + (2 / 3) * synthetic_vision.FOCAL_PX * 0.5 * ahead[:2]
     np.testing.assert_allclose(strip[0], [240.0, 240.0], atol=1e-3)

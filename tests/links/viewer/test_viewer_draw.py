@@ -14,7 +14,7 @@ from flow.message import Mat3, Message, Points64, message
 from links.viewer import colours, images
 from links.viewer.ellipsoid import ellipsoid
 from links.viewer.scene import opening, scenery, turntable_transform
-from stages.geometry import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
+from stages.geometry.frames import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
 from stages.messages import DepthImage, Detections, DroneFix, ScoreImage, ServoState, TrackingState, TrackState
 
 

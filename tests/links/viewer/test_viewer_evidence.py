@@ -307,7 +307,7 @@ def test_what_the_aim_asks_for_stands_beside_the_servos_angle():
 
 def test_the_vehicles_way_is_three_curves_and_a_yaw():
     R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    motion = VehicleMotion(stamp_ns=0, xyz_start_m=np.array([1.0, 2.0, 0.5]), R_start_vehicle=R, covariance=None)
+    motion = VehicleMotion(stamp_ns=0, xyz_map_m=np.array([1.0, 2.0, 0.5]), R_map_vehicle=R, covariance=None)
     marks = drawn(motion, "odometry/vehicle_motion")
     values = {path: mark.values.tolist() for path, mark in marks.items()}
     assert values == {

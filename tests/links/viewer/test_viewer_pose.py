@@ -11,7 +11,7 @@ from shown import drawn, numbers, page, scene
 
 from links.viewer.layout import Vision, layout
 from links.viewer.stream import Stream
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 from stages.messages import AutopilotEstimator, PoseState, RelativePose, ServoOffset
 
 NAME = "fuse/relative_pose"
@@ -30,10 +30,10 @@ def pose(**changes) -> RelativePose:
         R_vehicle_drone=R,
         covariance=covariance,
         velocity_vehicle_mps=np.zeros(3),
-        xyz_start_m=np.array([1.0, 2.0, 10.0]),
-        R_start_drone=R,
-        start_covariance=covariance,
-        velocity_start_mps=np.zeros(3),
+        xyz_map_m=np.array([1.0, 2.0, 10.0]),
+        R_map_drone=R,
+        map_covariance=covariance,
+        velocity_map_mps=np.zeros(3),
         velocity_covariance=np.eye(3),
         resets=0,
         nis=2.5,

@@ -13,7 +13,7 @@ from synthetic_vision import motion, rotation
 from links.viewer.draw import draw
 from links.viewer.draw_rotation import rpy_deg
 from links.viewer.layout import Vision, layout
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 from stages.messages import BranchState, DroneFix
 
 NAME = "align/relative_rotation"
@@ -101,12 +101,12 @@ def test_a_switch_of_the_branch_is_said_once_as_a_warning():
 
 
 def test_a_motion_shows_matches_sigma_and_where_the_drone_goes_in_its_own_axes():
-    marks = drawn(motion(), "drone_odometry/drone_motion")
-    assert scalars(marks["plots/matches/drone_odometry/drone_motion"]) == [120.0]
-    sigma = "plots/motion_sigma/drone_odometry/drone_motion"
+    marks = drawn(motion(), "drone_odometry/visual_motion")
+    assert scalars(marks["plots/matches/drone_odometry/visual_motion"]) == [120.0]
+    sigma = "plots/motion_sigma/drone_odometry/visual_motion"
     np.testing.assert_allclose(scalars(marks[f"{sigma}/rotation"]), [0.3])
     np.testing.assert_allclose(scalars(marks[f"{sigma}/direction"]), [2.0])
-    travel = marks["sphere/drone_odometry/drone_motion/travel"]
+    travel = marks["sphere/drone_odometry/visual_motion/travel"]
     assert travel.frame == "sphere_drone"
     # it turned left by 90 deg meanwhile: what was ahead then is on its right now
     np.testing.assert_allclose(numbers(travel.parts[0].vectors), [[0.0, -1.4, 0.0]], atol=1e-6)
@@ -115,9 +115,9 @@ def test_a_motion_shows_matches_sigma_and_where_the_drone_goes_in_its_own_axes()
 
 def test_a_drone_that_only_turns_has_no_direction_and_no_old_arrow():
     still = dataclasses.replace(motion(), direction_from=None, direction_sigma_rad=None, reason="no motion seen")
-    marks = drawn(still, "drone_odometry/drone_motion")
-    assert len(marks["sphere/drone_odometry/drone_motion/travel"].parts[0].vectors.as_arrow_array()) == 0
-    assert "plots/motion_sigma/drone_odometry/drone_motion/direction" not in marks
+    marks = drawn(still, "drone_odometry/visual_motion")
+    assert len(marks["sphere/drone_odometry/visual_motion/travel"].parts[0].vectors.as_arrow_array()) == 0
+    assert "plots/motion_sigma/drone_odometry/visual_motion/direction" not in marks
     assert words(marks["states/drone_odometry"].parts[0].state) == ["no motion"]
     assert page(marks["now"]).endswith("no motion seen")
 

@@ -14,7 +14,7 @@ from flow.stage import input_ports, output_ports
 from stages.aim import BeamAim
 from stages.aim.beam_aim import INNER_RAD
 from stages.aim.targets import Targets
-from stages.geometry import Harmonic, LidarMount
+from stages.geometry.frames import Harmonic, LidarMount
 from stages.messages import Candidates, ServoGoal, TrackingState, TrackState
 from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Way, beams_lidar, beams_vehicle, flying, packet, still
 from tests.stages.made import MS, ON_ITS_SIDE, PACKET_NS, START_NS, servo

@@ -14,7 +14,7 @@ from stages.aim.beams import (
     sweep_step_rad,
     table_angles_rad,
 )
-from stages.geometry import Harmonic, LidarMount, Pose
+from stages.geometry.frames import Harmonic, LidarMount, Pose
 from tests.stages.caster import beams_vehicle
 from tests.stages.made import ELEVATION_RAD, ON_ITS_SIDE
 

@@ -10,8 +10,8 @@ import pytest
 from pydantic import ValidationError
 
 from stages.aim import CalibrationSweep
-from stages.calibration.verdict import Travel
-from stages.geometry import LidarMount
+from stages.calibration.result import Travel
+from stages.geometry.frames import LidarMount
 from stages.messages import ServoGoal, ServoState
 
 STEP_S = 0.004

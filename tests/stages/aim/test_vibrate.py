@@ -17,7 +17,7 @@ from stages.aim.vibrate import (
     servo_angles_rad,
     swing_rad,
 )
-from stages.geometry import Harmonic, LidarMount, Pose, rotation_z
+from stages.geometry.frames import Harmonic, LidarMount, Pose, rotation_z
 from stages.messages import Detections, DroneFix, ServoGoal, ServoState, TrackingState, TrackState
 
 ON_ITS_SIDE = Pose(xyz_m=(0.0, 0.0, 0.10), rpy_deg=(90.0, 0.0, 0.0))

@@ -8,19 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.align.joint_align import JointAlign
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import (
     BranchState,
-    Carrier,
+    CameraMount,
     DroneAttitude,
     DroneFix,
     DroneLocalPosition,
-    DroneMotion,
     DroneOdometry,
     RelativeRotation,
     VehicleMotion,
+    VisualMotion,
 )
-from stages.rotation import exp_rotation, log_rotation
 from tests.stages.align.made_lines import MANHATTAN, seen
 
 S = 1_000_000_000
@@ -39,7 +39,7 @@ class Flight:
     streets: tuple[float, ...] = MANHATTAN
     fixes: bool = True
     autopilot: str = "odometry"  # or "split": attitude and position; "attitude" alone; "none"
-    pictures: bool = False  # DroneMotion
+    pictures: bool = False  # VisualMotion
     tells_vehicle: bool = True
     vehicle_silent: tuple[float, float] = (math.inf, math.inf)  # no word of the vehicle
     vehicle_afresh_deg: float = 0.0  # its start frame is turned after that
@@ -88,15 +88,15 @@ class Flight:
         if self.tells_vehicle and not self.vehicle_silent[0] <= t < self.vehicle_silent[1]:
             afresh_deg = self.vehicle_afresh_deg if t >= self.vehicle_silent[1] else 0.0
             R = rotation_z(math.radians(afresh_deg)) @ self.R_world_vehicle(t)
-            stage.on_motion(VehicleMotion(stamp_ns=ns, xyz_start_m=np.zeros(3), R_start_vehicle=R, covariance=None))
+            stage.on_motion(VehicleMotion(stamp_ns=ns, xyz_map_m=np.zeros(3), R_map_vehicle=R, covariance=None))
         if self.silent[0] <= t < self.silent[1]:
             return
         if self.pictures and t > 0.04:
             a, b = self.R_world_drone(t - 0.05), self.R_world_drone(t)
             way = a.T @ (self.place_m(t) - self.place_m(t - 0.05))
             length = float(np.linalg.norm(way))
-            stage.on_drone_motion(
-                DroneMotion(
+            stage.on_visual_motion(
+                VisualMotion(
                     stamp_ns=ns,
                     from_ns=START_NS + round((t - 0.05) * S),
                     R_from_to=a.T @ b,
@@ -115,8 +115,8 @@ class Flight:
             stage.on_odometry(
                 DroneOdometry(
                     stamp_ns=ns,
-                    xyz_local_m=xyz,
-                    R_local_drone=R,
+                    xyz_odom_m=xyz,
+                    R_odom_drone=R,
                     velocity_drone_mps=R.T @ v,
                     angular_velocity_drone_radps=rate,
                     pose_covariance=None,
@@ -126,9 +126,9 @@ class Flight:
                 )
             )
         elif self.autopilot in ("split", "attitude"):
-            stage.on_attitude(DroneAttitude(stamp_ns=ns, R_local_drone=R, angular_velocity_drone_radps=rate))
+            stage.on_attitude(DroneAttitude(stamp_ns=ns, R_odom_drone=R, angular_velocity_drone_radps=rate))
             if self.autopilot == "split":
-                stage.on_position(DroneLocalPosition(stamp_ns=ns, xyz_local_m=xyz, velocity_local_mps=v))
+                stage.on_position(DroneLocalPosition(stamp_ns=ns, xyz_odom_m=xyz, velocity_odom_mps=v))
 
     def _fix(self, t: float, rng) -> DroneFix:
         xyz = self.place_m(t)
@@ -147,8 +147,10 @@ class Flight:
         streets = () if self.blind[0] <= t < self.blind[1] else self.streets
         made = dict(per_direction=self.per_direction, verticals=4, sigma_rad=0.003, seed=self.seed)
         tv = t - self.apart_s
-        vehicle = seen(Carrier.VEHICLE, self.R_world_vehicle(tv), streets, stamp_ns=START_NS + round(tv * S), **made)
-        drone = seen(Carrier.DRONE, self.R_world_drone(t), streets, stamp_ns=START_NS + round(t * S), **made)
+        vehicle = seen(
+            CameraMount.VEHICLE, self.R_world_vehicle(tv), streets, stamp_ns=START_NS + round(tv * S), **made
+        )
+        drone = seen(CameraMount.DRONE, self.R_world_drone(t), streets, stamp_ns=START_NS + round(t * S), **made)
         return [*stage.on_vehicle(vehicle), *stage.on_drone(drone)]
 
     def error_deg(self, told: RelativeRotation) -> float:

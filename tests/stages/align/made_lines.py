@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from stages.geometry import rotation_from_rpy_deg, rotation_z
-from stages.messages import Carrier, VanishingDirections
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
+from stages.messages import CameraMount, VanishingDirections
 
 MANHATTAN = (0.0, 90.0)
 ATLANTA = (0.0, 90.0, 34.0, 124.0)
@@ -21,7 +21,7 @@ def turned(roll_deg: float, pitch_deg: float, yaw_deg: float):
 
 
 def seen(
-    carrier: Carrier,
+    camera_mount: CameraMount,
     R_world_carrier,
     azimuths_deg=MANHATTAN,
     *,
@@ -39,8 +39,8 @@ def seen(
 
     `direction_error_rad` is common to all lines of a direction, `up_error_rad` to the vertical.
     """
-    rng = np.random.default_rng([seed, 1 if carrier is Carrier.DRONE else 0, stamp_ns % 2**31])
-    looks = 1.0 if carrier is Carrier.VEHICLE else -1.0
+    rng = np.random.default_rng([seed, 1 if camera_mount is CameraMount.DRONE else 0, stamp_ns % 2**31])
+    looks = 1.0 if camera_mount is CameraMount.VEHICLE else -1.0
     counts = per_direction if isinstance(per_direction, tuple) else (per_direction,) * len(azimuths_deg)
     roll, pitch = np.degrees(rng.normal(0, up_error_rad, 2)).tolist()
     up = rotation_from_rpy_deg((roll, pitch, 0.0))[:, 2]
@@ -68,7 +68,7 @@ def seen(
     n = len(directions)
     return VanishingDirections(
         stamp_ns=stamp_ns,
-        carrier=carrier,
+        camera_mount=camera_mount,
         direction=np.array(directions) @ R_world_carrier,
         sigma_rad=np.array([up_sigma_rad, *[0.003] * (n - 1)]),
         is_vertical=np.arange(n) == 0,
@@ -91,11 +91,11 @@ def line(direction, looks: float, rng):
             return normal / np.linalg.norm(normal), middle
 
 
-def nothing(carrier: Carrier, stamp_ns: int = 0, reason: str = "too few lines") -> VanishingDirections:
+def nothing(camera_mount: CameraMount, stamp_ns: int = 0, reason: str = "too few lines") -> VanishingDirections:
     """A picture without structure."""
     return VanishingDirections(
         stamp_ns=stamp_ns,
-        carrier=carrier,
+        camera_mount=camera_mount,
         direction=np.zeros((0, 3)),
         sigma_rad=np.zeros(0),
         is_vertical=np.zeros(0, dtype=bool),

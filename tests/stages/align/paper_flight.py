@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry import rotation_from_rpy_deg, rotation_z
-from stages.messages import Carrier, DroneFix, DroneMotion, VanishingDirections, VehicleMotion
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
+from stages.messages import CameraMount, DroneFix, VanishingDirections, VehicleMotion, VisualMotion
 
 START_NS = 1_700_000_000 * 10**9
 PERIOD_NS = 100_000_000
@@ -50,13 +50,13 @@ class Flight:
 
     def vehicle(self, k) -> VehicleMotion:
         return VehicleMotion(
-            stamp_ns=picture_ns(k), xyz_start_m=self.t_vehicle(k), R_start_vehicle=self.R_vehicle(k), covariance=None
+            stamp_ns=picture_ns(k), xyz_map_m=self.t_vehicle(k), R_map_vehicle=self.R_vehicle(k), covariance=None
         )
 
-    def motion(self, i, j) -> DroneMotion:
+    def motion(self, i, j) -> VisualMotion:
         step = self.R_drone(i).T @ (self.t_drone(j) - self.t_drone(i))
         length = np.linalg.norm(step)
-        return DroneMotion(
+        return VisualMotion(
             stamp_ns=picture_ns(j),
             from_ns=picture_ns(i),
             R_from_to=self.R_drone(i).T @ self.R_drone(j),
@@ -67,18 +67,18 @@ class Flight:
             reason="",
         )
 
-    def seen(self, carrier, k) -> VanishingDirections:
-        """The world's axes, a row each, in the carrier's."""
-        R = self.R_vehicle(k) if carrier is Carrier.VEHICLE else self.R_drone(k)
-        return vanishing(carrier, picture_ns(k), R)
+    def seen(self, camera_mount, k) -> VanishingDirections:
+        """The world's axes, a row each, in the camera_mount's."""
+        R = self.R_vehicle(k) if camera_mount is CameraMount.VEHICLE else self.R_drone(k)
+        return vanishing(camera_mount, picture_ns(k), R)
 
 
-def vanishing(carrier, stamp_ns, directions, reason="") -> VanishingDirections:
+def vanishing(camera_mount, stamp_ns, directions, reason="") -> VanishingDirections:
     found = np.asarray(directions, dtype=np.float64).reshape(-1, 3)
     n = len(found)
     return VanishingDirections(
         stamp_ns=stamp_ns,
-        carrier=carrier,
+        camera_mount=camera_mount,
         direction=found,
         sigma_rad=np.full(n, 0.01),
         is_vertical=np.zeros(n, dtype=np.bool_),

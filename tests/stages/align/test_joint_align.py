@@ -10,15 +10,15 @@ import pytest
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.align.joint_align import JointAlign
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import (
     BranchState,
-    Carrier,
+    CameraMount,
     DroneAttitude,
     RelativeRotation,
     VanishingDirections,
     VehicleMotion,
 )
-from stages.rotation import exp_rotation, log_rotation
 from tests.stages.align.made_joint_flight import START_NS, Flight, S, wrong_and_resolved
 from tests.stages.align.made_lines import ATLANTA, CAMPUS, MS, nothing, seen, turned
 
@@ -43,7 +43,7 @@ def angle_deg(A, B) -> float:
 
 def test_its_ports():
     assert set(input_ports(JointAlign)) == {
-        "motion", "attitude", "position", "odometry", "drone_motion", "fix", "vehicle", "drone",
+        "motion", "attitude", "position", "odometry", "visual_motion", "fix", "vehicle", "drone",
     }  # fmt: skip
     assert set(input_ports(JointAlign)) - JointAlign.optional_inputs == {"vehicle", "drone"}
     assert output_ports(JointAlign) == {"relative_rotation": RelativeRotation}
@@ -52,7 +52,7 @@ def test_its_ports():
 @pytest.mark.parametrize("streets", [(0.0, 90.0), ATLANTA, CAMPUS])
 def test_one_pair_gives_the_rotation_up_to_a_quarter_turn(streets):
     R_v, R_d = turned(1, -2, 30), turned(-6, 4, 251)
-    told = pair(seen(Carrier.VEHICLE, R_v, streets), seen(Carrier.DRONE, R_d, streets))
+    told = pair(seen(CameraMount.VEHICLE, R_v, streets), seen(CameraMount.DRONE, R_d, streets))
     check_arrays(told)
     assert told.state is BranchState.AMBIGUOUS
     np.testing.assert_allclose(told.branch_probability, 0.2375)
@@ -72,8 +72,8 @@ def test_the_stated_tilts_allow_for_cameras_that_do_not_sit_and_look_quite_as_th
     for seed in range(150):
         off_v, off_d = exp_rotation(rng.normal(0, off_rad)), exp_rotation(rng.normal(0, off_rad))
         answer = pair(
-            seen(Carrier.VEHICLE, R_vehicle @ off_v, ATLANTA, seed=seed),
-            seen(Carrier.DRONE, R_drone @ off_d, ATLANTA, seed=seed),
+            seen(CameraMount.VEHICLE, R_vehicle @ off_v, ATLANTA, seed=seed),
+            seen(CameraMount.DRONE, R_drone @ off_d, ATLANTA, seed=seed),
         )
         branches = (turned(0, 0, 25 + quarter).T @ answer.R_vehicle_drone for quarter in (0, 90, 180, 270))
         phi = min((log_rotation(np.ascontiguousarray(off)) for off in branches), key=np.linalg.norm)
@@ -83,7 +83,7 @@ def test_the_stated_tilts_allow_for_cameras_that_do_not_sit_and_look_quite_as_th
 
 
 def test_pictures_without_structure_give_no_rotation_and_the_reason():
-    some, none = seen(Carrier.VEHICLE, np.eye(3)), nothing(Carrier.DRONE, reason="6 lines only")
+    some, none = seen(CameraMount.VEHICLE, np.eye(3)), nothing(CameraMount.DRONE, reason="6 lines only")
     told = pair(some, none)
     assert told.R_vehicle_drone is None
     assert told.covariance_rad2 is None
@@ -97,15 +97,15 @@ def test_trees_in_all_directions_are_refused():
     angles = tuple(rng.uniform(0, 180, 25).tolist())
     others = tuple(rng.uniform(0, 180, 25).tolist())
     told = pair(
-        seen(Carrier.VEHICLE, np.eye(3), angles, per_direction=2),
-        seen(Carrier.DRONE, np.eye(3), others, per_direction=2),
+        seen(CameraMount.VEHICLE, np.eye(3), angles, per_direction=2),
+        seen(CameraMount.DRONE, np.eye(3), others, per_direction=2),
     )
     assert told.state is BranchState.NONE
 
 
 def test_one_street_of_the_vehicles_that_could_be_any_of_the_drones_is_refused():
     """Nothing tells whether the vehicle's only street is the drone's first or its second."""
-    told = pair(seen(Carrier.VEHICLE, np.eye(3), (34.0, 124.0)), seen(Carrier.DRONE, np.eye(3), ATLANTA))
+    told = pair(seen(CameraMount.VEHICLE, np.eye(3), (34.0, 124.0)), seen(CameraMount.DRONE, np.eye(3), ATLANTA))
     assert told.R_vehicle_drone is None
     assert "could be any street's" in told.reason or "fit" in told.reason
 
@@ -116,8 +116,8 @@ def test_what_one_picture_leaves_open_the_pictures_before_it_have_settled():
     told = flight.run(stage, 4.0)
     assert all(m.R_vehicle_drone is not None for m in told)
     t = 4.1
-    late = seen(Carrier.VEHICLE, flight.R_world_vehicle(t), (61.0,), stamp_ns=START_NS + round(t * S))
-    drone = seen(Carrier.DRONE, flight.R_world_drone(t), CAMPUS, stamp_ns=START_NS + round(t * S))
+    late = seen(CameraMount.VEHICLE, flight.R_world_vehicle(t), (61.0,), stamp_ns=START_NS + round(t * S))
+    drone = seen(CameraMount.DRONE, flight.R_world_drone(t), CAMPUS, stamp_ns=START_NS + round(t * S))
     message = only([*stage.on_vehicle(late), *stage.on_drone(drone)])
     assert message.R_vehicle_drone is not None
     assert flight.quarters_off(message) < 1.0
@@ -284,9 +284,9 @@ def test_pictures_apart_in_time_are_told_at_one_moment(vehicle_dps, tells):
 
 
 def test_pictures_too_far_apart_are_no_pair():
-    late = seen(Carrier.DRONE, np.eye(3), stamp_ns=300 * MS)
+    late = seen(CameraMount.DRONE, np.eye(3), stamp_ns=300 * MS)
     stage = JointAlign()
-    told = [*stage.on_vehicle(seen(Carrier.VEHICLE, np.eye(3))), *stage.on_drone(late), *stage.finish()]
+    told = [*stage.on_vehicle(seen(CameraMount.VEHICLE, np.eye(3))), *stage.on_drone(late), *stage.finish()]
     assert only(told).reason == "no picture of the vehicle's within 0.1 s"
 
 
@@ -299,7 +299,7 @@ def test_the_same_inputs_give_the_same_outputs():
 
 def test_the_wrong_camera_on_a_port_is_an_error():
     with pytest.raises(ValueError, match="wire the other camera"):
-        list(JointAlign().on_vehicle(nothing(Carrier.DRONE)))
+        list(JointAlign().on_vehicle(nothing(CameraMount.DRONE)))
 
 
 @pytest.mark.parametrize("wrong", [{"initial_yaw_deg": 0, "compass_deg": 0}, {"straight_deg": 0}, {"resolve": 0.9}])
@@ -335,13 +335,11 @@ def test_a_picture_that_contradicts_the_turns_felt_is_wrong_by_as_much_and_leads
     for i in range(12):
         now_ns = S + i * 200 * MS
         for ns in range(now_ns - 150 * MS, now_ns + 1, 50 * MS):
-            stage.on_attitude(DroneAttitude(stamp_ns=ns, R_local_drone=R_d, angular_velocity_drone_radps=np.zeros(3)))
-            stage.on_motion(
-                VehicleMotion(stamp_ns=ns, xyz_start_m=np.zeros(3), R_start_vehicle=np.eye(3), covariance=None)
-            )
+            stage.on_attitude(DroneAttitude(stamp_ns=ns, R_odom_drone=R_d, angular_velocity_drone_radps=np.zeros(3)))
+            stage.on_motion(VehicleMotion(stamp_ns=ns, xyz_map_m=np.zeros(3), R_map_vehicle=np.eye(3), covariance=None))
         R_seen = turned(5, -2, 42) if i == 8 else R_d
-        told += stage.on_vehicle(seen(Carrier.VEHICLE, np.eye(3), stamp_ns=now_ns))
-        told += stage.on_drone(seen(Carrier.DRONE, R_seen, stamp_ns=now_ns))
+        told += stage.on_vehicle(seen(CameraMount.VEHICLE, np.eye(3), stamp_ns=now_ns))
+        told += stage.on_drone(seen(CameraMount.DRONE, R_seen, stamp_ns=now_ns))
     wrong = log_rotation(told[8].R_vehicle_drone.T @ told[7].R_vehicle_drone)
     assert math.degrees(np.linalg.norm(wrong)) > 2.0
     assert wrong @ np.linalg.solve(told[8].covariance_rad2, wrong) < 7.8

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stages.align.pairing import Pairing
-from stages.messages import Carrier
+from stages.messages import CameraMount
 from tests.stages.align.made_lines import MS, nothing
 
 
@@ -11,8 +11,8 @@ def run(events, furthest_ms=100):
     """Events ("v" or "d", ms) -> pairs (vehicle ms or None, drone ms), each with how many events it took."""
     pairing, out = Pairing(furthest_ms * MS), []
     for count, (kind, ms) in enumerate(events, 1):
-        carrier = Carrier.VEHICLE if kind == "v" else Carrier.DRONE
-        seen = nothing(carrier, ms * MS)
+        camera_mount = CameraMount.VEHICLE if kind == "v" else CameraMount.DRONE
+        seen = nothing(camera_mount, ms * MS)
         ready = pairing.vehicle(seen) if kind == "v" else pairing.drone(seen)
         out += [(v and v.stamp_ns // MS, d.stamp_ns // MS, count) for v, d in ready]
     out += [(v and v.stamp_ns // MS, d.stamp_ns // MS, None) for v, d in pairing.rest()]

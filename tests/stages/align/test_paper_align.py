@@ -13,21 +13,21 @@ from flow.message import check_arrays, hash_into
 from flow.stage import input_ports, output_ports
 from stages.align import PaperAlign
 from stages.align.paper_match import angle_between_rad
-from stages.geometry import rotation_z
-from stages.messages import BranchState, Carrier
+from stages.geometry.frames import rotation_z
+from stages.messages import BranchState, CameraMount
 from tests.stages.align.paper_flight import START_NS, Flight, picture_ns, vanishing
 
-VEHICLE, DRONE = Carrier.VEHICLE, Carrier.DRONE
+VEHICLE, DRONE = CameraMount.VEHICLE, CameraMount.DRONE
 
 
-def run(stage, flight, pictures, motions=True, seen=lambda flight, carrier, k: flight.seen(carrier, k)):
+def run(stage, flight, pictures, motions=True, seen=lambda flight, camera_mount, k: flight.seen(camera_mount, k)):
     out = []
     for k in range(pictures):
         if motions:
             stage.on_motion(flight.vehicle(k))
             stage.on_fix(flight.fix(k))
             if k >= 14:
-                stage.on_drone_motion(flight.motion(k - 14, k))
+                stage.on_visual_motion(flight.motion(k - 14, k))
         out += list(stage.on_vehicle(seen(flight, VEHICLE, k)))
         out += list(stage.on_drone(seen(flight, DRONE, k)))
     out += list(stage.finish())
@@ -45,9 +45,9 @@ def errors_deg(out, flight):
 
 
 def test_ports_are_what_the_graph_wires():
-    assert set(input_ports(PaperAlign)) == {"vehicle", "drone", "fix", "drone_motion", "motion"}
+    assert set(input_ports(PaperAlign)) == {"vehicle", "drone", "fix", "visual_motion", "motion"}
     assert set(output_ports(PaperAlign)) == {"relative_rotation"}
-    assert PaperAlign.optional_inputs == {"fix", "drone_motion", "motion"}
+    assert PaperAlign.optional_inputs == {"fix", "visual_motion", "motion"}
 
 
 def test_one_answer_for_each_picture_of_the_drone_at_its_time():
@@ -107,7 +107,7 @@ def test_the_error_of_the_motions_direction_does_not_reach_the_rotation():
         stage.on_fix(flight.fix(k))
         stage.on_motion(flight.vehicle(k))
         if k >= 14:
-            stage.on_drone_motion(skewed.motion(k - 14, k))
+            stage.on_visual_motion(skewed.motion(k - 14, k))
         out = [*stage.on_vehicle(flight.seen(VEHICLE, k)), *stage.on_drone(flight.seen(DRONE, k))]
     assert out[-1].switches == 1
     assert errors_deg(out[-1:], flight)[0] < 0.5
@@ -151,10 +151,10 @@ def test_a_drone_without_a_vehicle_gets_answers_without_rotation():
 def test_pictures_without_directions_say_why_and_the_rest_goes_on():
     flight = Flight(drone_yaw_deg=10)
 
-    def gap(flight, carrier, k):
-        if carrier is DRONE and 10 <= k < 15:
+    def gap(flight, camera_mount, k):
+        if camera_mount is DRONE and 10 <= k < 15:
             return vanishing(DRONE, picture_ns(k), np.empty((0, 3)), "1 of 3 views have a vanishing point")
-        return flight.seen(carrier, k)
+        return flight.seen(camera_mount, k)
 
     out = run(PaperAlign(), flight, 30, seen=gap)
     assert [m.R_vehicle_drone is None for m in out] == [10 <= k < 15 for k in range(30)]

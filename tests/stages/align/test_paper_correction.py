@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.align.paper_correction import CorrectionRule, MotionCorrection, heading_change_rad
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from tests.stages.align.paper_flight import Flight
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from stages.align.paper_filter import FURTHEST_S, RotationFilter
-from stages.geometry import rotation_from_rpy_deg, rotation_z
-from stages.rotation import log_rotation
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
+from stages.kernels.geometry.so3 import log_rotation
 
 S = 1_000_000_000
 DEG = math.pi / 180

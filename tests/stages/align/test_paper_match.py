@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.align.paper_match import angle_between_rad, columns, match
-from stages.geometry import rotation_from_rpy_deg, rotation_z
-from stages.rotation import exp_rotation
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
+from stages.kernels.geometry.so3 import exp_rotation
 
 RNG = np.random.default_rng(8)
 TRUE = rotation_from_rpy_deg((5.0, -8.0, 40.0))
 
 
 def streets(R_carrier_world):
-    """The world's axes in a carrier's axes, a row each."""
+    """The world's axes in a camera_mount's axes, a row each."""
     return R_carrier_world.T.copy()
 
 

@@ -9,9 +9,9 @@ import pytest
 
 from stages.align.refine import Refined, Tolerances, from_square, half_turn_difference, refine, street_directions
 from stages.align.spectra import level_lines, overlap, peaks, spectrum
-from stages.geometry import rotation_z
-from stages.messages import Carrier
-from stages.rotation import log_rotation
+from stages.geometry.frames import rotation_z
+from stages.kernels.geometry.so3 import log_rotation
+from stages.messages import CameraMount
 from tests.stages.align.made_lines import ATLANTA, CAMPUS, MANHATTAN, seen, turned
 
 STRAIGHT = math.radians(0.25)
@@ -20,8 +20,8 @@ ALLOWED = Tolerances(STRAIGHT, math.radians(0.1), math.radians(0.5), 0.0)
 
 def aligned(R_world_vehicle, R_world_drone, streets=MANHATTAN, allowed=ALLOWED, **kwargs) -> Refined:
     """As the stage does it for one pair."""
-    vehicle = level_lines(seen(Carrier.VEHICLE, R_world_vehicle, streets, **kwargs), STRAIGHT)
-    drone = level_lines(seen(Carrier.DRONE, R_world_drone, streets, **kwargs), STRAIGHT)
+    vehicle = level_lines(seen(CameraMount.VEHICLE, R_world_vehicle, streets, **kwargs), STRAIGHT)
+    drone = level_lines(seen(CameraMount.DRONE, R_world_drone, streets, **kwargs), STRAIGHT)
     assert vehicle is not None
     assert drone is not None
     a, b = spectrum(vehicle), spectrum(drone)
@@ -122,8 +122,8 @@ def test_stray_lines_hardly_move_it():
 
 
 def test_cameras_on_different_streets_of_a_crossing_are_tied_by_its_right_angle():
-    vehicle = level_lines(seen(Carrier.VEHICLE, turned(0, 0, 0), (10.0,), sigma_rad=0.0), STRAIGHT)
-    drone = level_lines(seen(Carrier.DRONE, turned(0, 0, 25), (100.0,), sigma_rad=0.0), STRAIGHT)
+    vehicle = level_lines(seen(CameraMount.VEHICLE, turned(0, 0, 0), (10.0,), sigma_rad=0.0), STRAIGHT)
+    drone = level_lines(seen(CameraMount.DRONE, turned(0, 0, 25), (100.0,), sigma_rad=0.0), STRAIGHT)
     assert vehicle is not None
     assert drone is not None
     a, b = spectrum(vehicle), spectrum(drone)
@@ -135,8 +135,8 @@ def test_cameras_on_different_streets_of_a_crossing_are_tied_by_its_right_angle(
 
 
 def test_street_directions_are_the_strongest_of_both_and_not_too_many():
-    vehicle = level_lines(seen(Carrier.VEHICLE, turned(0, 0, 0), (0.0, 25.0, 50.0, 75.0), sigma_rad=0.0), STRAIGHT)
-    drone = level_lines(seen(Carrier.DRONE, turned(0, 0, 0), (100.0, 125.0, 150.0, 175.0), sigma_rad=0.0), STRAIGHT)
+    vehicle = level_lines(seen(CameraMount.VEHICLE, turned(0, 0, 0), (0.0, 25.0, 50.0, 75.0), sigma_rad=0.0), STRAIGHT)
+    drone = level_lines(seen(CameraMount.DRONE, turned(0, 0, 0), (100.0, 125.0, 150.0, 175.0), sigma_rad=0.0), STRAIGHT)
     assert vehicle is not None
     assert drone is not None
     found = np.degrees(street_directions(spectrum(vehicle), spectrum(drone), 0.0))

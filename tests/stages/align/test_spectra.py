@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from stages.align.spectra import (
-    BIN_RAD,
-    BINS,
     QUARTER,
     LevelLines,
     level_axes,
@@ -22,7 +20,8 @@ from stages.align.spectra import (
     shared_directions,
     spectrum,
 )
-from stages.messages import Carrier
+from stages.kernels.align.spectra import BIN_RAD, BINS
+from stages.messages import CameraMount
 from tests.stages.align.made_lines import ATLANTA, CAMPUS, MANHATTAN, nothing, seen, turned
 
 STRAIGHT = math.radians(0.25)
@@ -47,7 +46,7 @@ def yaw_between(vehicle, drone):
 
 def test_a_line_has_the_azimuth_of_its_direction_and_its_turn_as_sigma():
     """h = z x n / |z x n|, sigma |t . h| / |z x n| with t = n x m, and what streets are straight to."""
-    picture = seen(Carrier.VEHICLE, np.eye(3), (30.0,), per_direction=6, verticals=0, sigma_rad=0.006)
+    picture = seen(CameraMount.VEHICLE, np.eye(3), (30.0,), per_direction=6, verticals=0, sigma_rad=0.006)
     told = level_lines(picture, STRAIGHT)
     assert told is not None
     np.testing.assert_allclose(np.degrees(told.azimuth_rad), 30.0, atol=3.0)
@@ -153,7 +152,7 @@ def test_level_axes_keep_the_heading_and_stand_upright():
 
 
 def test_a_vertical_told_upside_down_is_the_same():
-    picture = seen(Carrier.DRONE, turned(4.0, 7.0, 33.0))
+    picture = seen(CameraMount.DRONE, turned(4.0, 7.0, 33.0))
     flipped = dataclasses.replace(picture, direction=-picture.direction)
     a, b = level_lines(picture, STRAIGHT), level_lines(flipped, STRAIGHT)
     assert a is not None
@@ -162,11 +161,11 @@ def test_a_vertical_told_upside_down_is_the_same():
 
 
 def test_a_picture_without_vertical_has_no_level_lines():
-    assert level_lines(nothing(Carrier.DRONE), STRAIGHT) is None
+    assert level_lines(nothing(CameraMount.DRONE), STRAIGHT) is None
 
 
 def test_verticals_and_lines_of_no_direction_are_left_out():
-    told = level_lines(seen(Carrier.DRONE, np.eye(3), per_direction=(3, 4), verticals=9), STRAIGHT)
+    told = level_lines(seen(CameraMount.DRONE, np.eye(3), per_direction=(3, 4), verticals=9), STRAIGHT)
     assert told is not None
     assert len(told.weight) == 7
 

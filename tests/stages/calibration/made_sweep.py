@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.calibration.columns import about_z
-from stages.calibration.looks import Returns, ServoTrace
+from stages.calibration.scan_passes import Returns, ServoTrace
 from stages.calibration.servo_mount import ServoMount, servo_mount
-from stages.geometry import LidarMount, Pose
+from stages.geometry.frames import LidarMount, Pose
 from tests.stages.made import ELEVATION_RAD, START_NS
 
 STEP_RAD = 2 * np.pi / 4096

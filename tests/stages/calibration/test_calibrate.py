@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from stages.calibration.calibrate import CannotCalibrate, calibrate
-from stages.calibration.looks import ServoTrace
 from stages.calibration.parameters import PARAMETERS
+from stages.calibration.result import CURVE, Finding, Travel, accepted, curve_rows, values_of
+from stages.calibration.scan_passes import ServoTrace
 from stages.calibration.servo_mount import servo_mount
 from stages.calibration.solve import NAMES
-from stages.calibration.verdict import CURVE, Finding, Travel, accepted, curve_rows, values_of
-from stages.geometry import UNCALIBRATED_DEG
+from stages.geometry.frames import UNCALIBRATED_DEG
 from tests.stages.calibration.made_sweep import FAST, GROUND, RIG, SLOW, STEP_RAD, YARD, sweep, wrong_mount
 from tests.stages.made import START_NS
 

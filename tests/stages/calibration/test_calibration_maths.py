@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from stages.calibration.columns import drift_columns, laser_columns, mount_columns, place
-from stages.calibration.looks import Returns, ServoAt, ServoTrace, hangs, servo_at, smoothed
 from stages.calibration.motion import shift
 from stages.calibration.patches import find_patches
+from stages.calibration.result import Travel, unseen
+from stages.calibration.scan_passes import Returns, ServoAt, ServoTrace, servo_at, smoothed
 from stages.calibration.servo_mount import harmonics, lidar_mount, servo_mount
 from stages.calibration.solve import NAMES, clustered, linearise, sandwich, surfaces, without_planes
-from stages.calibration.verdict import Travel, unseen
-from stages.geometry import Harmonic, LidarMount, Pose
+from stages.geometry.frames import Harmonic, LidarMount, Pose
+from stages.kernels.calibration.scan_passes import hangs
 from tests.stages.calibration.made_sweep import STEP_RAD, YARD, sweep, wrong_mount
 
 ASKEW = LidarMount(

@@ -7,18 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from stages.detect.candidate import (
-    ALONE_PER_M,
-    FADING,
-    FEW_M,
-    OPEN_LOOKS,
-    SOME_M,
-    STANDING_M,
-    WIRE_ALONE,
-    Candidate,
-    Sighting,
-)
-from stages.detect.surroundings import FARTHER_0, FREE_0, OCCUPIED_0, TALLY
+from stages.detect.candidate import ALONE_PER_M, FADING, FEW_M, SOME_M, STANDING_M, WIRE_ALONE, Candidate, Sighting
+from stages.kernels.detect.candidate import OPEN_LOOKS
+from stages.kernels.detect.isolation import FARTHER_0, FREE_0, OCCUPIED_0, TALLY
 from tests.stages.made import START_NS
 
 PLACE_M = np.array([3.0, 15.0, 12.0])
@@ -27,8 +18,8 @@ PLACE_M = np.array([3.0, 15.0, 12.0])
 def sighting(t_s, xyz_m=PLACE_M, hits=3, range_m=20.0):
     return Sighting(
         stamp_ns=START_NS + round(t_s * 1e9),
-        xyz_local_m=np.asarray(xyz_m, dtype=np.float64),
-        vehicle_local_m=np.zeros(3),
+        xyz_map_m=np.asarray(xyz_m, dtype=np.float64),
+        vehicle_map_m=np.zeros(3),
         range_m=range_m,
         hits=hits,
         too_long=False,
@@ -45,7 +36,7 @@ def candidate(*sightings):
         number=1,
         stamp_ns=first.stamp_ns,
         seen_ns=first.stamp_ns,
-        xyz_m=first.xyz_local_m,
+        xyz_m=first.xyz_map_m,
         velocity_mps=np.zeros(3),
         range_m=first.range_m,
         p=(0.15**2, 0.0, 6.0**2),
@@ -133,7 +124,7 @@ def test_what_goes_farther_than_a_lamp_is_long_along_any_axis_does_not_stand(axi
 
 def test_only_its_last_sightings_tell_whether_it_stands():
     arrived = way((3.0, 0.0, 0.0), looks=6)
-    stayed = [sighting(0.6 + 0.1 * k, arrived[-1].xyz_local_m) for k in range(8)]
+    stayed = [sighting(0.6 + 0.1 * k, arrived[-1].xyz_map_m) for k in range(8)]
     assert not candidate(*arrived, *stayed[:4]).stands
     assert candidate(*arrived, *stayed).stands
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from stages.detect import chords as chord
 from stages.detect.chords import ChordFinder
+from stages.kernels.detect import chords as chord
 from stages.messages import SweptPulses
 from tests.stages.caster import Ball, Box, Wire, cast, flying, pulses_seen, still, sweeping
 from tests.stages.made import START_NS

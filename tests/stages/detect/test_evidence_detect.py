@@ -18,13 +18,13 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.detect import EvidenceDetect
 from stages.detect.candidate import Sighting
-from stages.detect.evidence import AMONG_M, AMONG_NS, KEPT_NATS, STANDING_NS
-from stages.detect.surroundings import FREE_0, SECTORS, TALLY
-from stages.detect.telling import detections_message, odds_of
-from stages.detect.verdict import Evidence, over_clutter
-from stages.geometry import rotation_from_rpy_deg, rotation_z
+from stages.detect.candidate_messages import detections_message, odds_of
+from stages.detect.classifier import Evidence, over_clutter
+from stages.detect.evidence_detect import AMONG_M, AMONG_NS, KEPT_NATS, STANDING_NS
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
 from stages.messages import Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
-from stages.trail import VehicleTrail
 from tests.stages.caster import (
     Ball,
     Box,
@@ -55,8 +55,8 @@ def hanging(seed=0):
 def motion_at(t_s, velocity_mps=(0.0, 0.0, 0.0)):
     return VehicleMotion(
         stamp_ns=START_NS + round(t_s * 1e9),
-        xyz_start_m=t_s * np.asarray(velocity_mps, dtype=np.float64),
-        R_start_vehicle=np.eye(3),
+        xyz_map_m=t_s * np.asarray(velocity_mps, dtype=np.float64),
+        R_map_vehicle=np.eye(3),
         covariance=None,
     )
 
@@ -74,10 +74,10 @@ def test_what_was_just_accepted_is_told_though_it_was_seen_before_the_search_beg
     c = candidate(sighting(0.0, np.array(PLACE_M)))
     c.accepted, c.odds, c.why = True, 6.0, "made"
     later_ns = c.seen_ns + 5_000_000
-    told = detections_message([c], VehicleTrail(), later_ns, later_ns + 1, Counter(), 3)
+    told = detections_message([c], VehicleTrajectory(), later_ns, later_ns + 1, Counter(), 3)
     assert told.accepted.tolist() == [True]
     c.announced = True
-    told = detections_message([c], VehicleTrail(), later_ns, later_ns + 1, Counter(), 3)
+    told = detections_message([c], VehicleTrajectory(), later_ns, later_ns + 1, Counter(), 3)
     assert told.accepted.tolist() == []
 
 
@@ -87,19 +87,19 @@ def local_position(way, t_s, yaw_rad=0.9):
     place, soon = way(np.array([t_s, t_s + 0.01]))
     return DroneLocalPosition(
         stamp_ns=START_NS + round(t_s * 1e9),
-        xyz_local_m=R @ place + (30.0, -4.0, 5.0),
-        velocity_local_mps=R @ (soon - place) / 0.01,
+        xyz_map_m=R @ place + (30.0, -4.0, 5.0),
+        velocity_odom_mps=R @ (soon - place) / 0.01,
     )
 
 
-def odometry(way, t_s, R_local_drone):
+def odometry(way, t_s, R_odom_drone):
     """The same from an autopilot that tells its velocity in the drone's axes."""
     position = local_position(way, t_s)
     return DroneOdometry(
         stamp_ns=position.stamp_ns,
-        xyz_local_m=position.xyz_local_m,
-        R_local_drone=R_local_drone,
-        velocity_drone_mps=R_local_drone.T @ position.velocity_local_mps,
+        xyz_odom_m=position.xyz_map_m,
+        R_odom_drone=R_odom_drone,
+        velocity_drone_mps=R_odom_drone.T @ position.velocity_odom_mps,
         angular_velocity_drone_radps=np.zeros(3),
         pose_covariance=None,
         velocity_covariance=None,
@@ -179,7 +179,7 @@ def test_what_was_accepted_stays_so_until_much_less_speaks_for_it(monkeypatch):
     accept = odds_of(stage.settings.accept_probability)
     verdicts = []
     for odds in (accept - 0.1, accept + 0.1, accept - KEPT_NATS + 0.1, accept - KEPT_NATS - 0.1, accept - 0.1):
-        monkeypatch.setattr("stages.detect.evidence.judge", lambda *_, odds=odds: (odds, "so it is"))
+        monkeypatch.setattr("stages.detect.evidence_detect.judge", lambda *_, odds=odds: (odds, "so it is"))
         stage._weigh(stage._now, c)
         verdicts.append(c.accepted)
     assert verdicts == [False, True, True, False, False]
@@ -476,8 +476,8 @@ def sighting(t_s, xyz_m, free_sectors=SECTORS, hits=1):
     around[FREE_0 : FREE_0 + free_sectors] = 3
     return Sighting(
         stamp_ns=START_NS + round(t_s * 1e9),
-        xyz_local_m=np.asarray(xyz_m, dtype=np.float64),
-        vehicle_local_m=np.zeros(3),
+        xyz_map_m=np.asarray(xyz_m, dtype=np.float64),
+        vehicle_map_m=np.zeros(3),
         range_m=float(np.linalg.norm(xyz_m)),
         hits=hits,
         too_long=False,
@@ -537,7 +537,7 @@ def jumping(at_s, by_m, silent_until_s=0.0):
     def hear(stage, t_s):
         if not at_s <= t_s < silent_until_s:
             jump = motion_at(t_s)
-            stage.on_motion(dataclasses.replace(jump, xyz_start_m=np.asarray(by_m) * (t_s >= at_s)))
+            stage.on_motion(dataclasses.replace(jump, xyz_map_m=np.asarray(by_m) * (t_s >= at_s)))
 
     return hear
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.depth_image import focal_length_px
-from stages.detect.kernel_score import inner_half_px, kernel_terms, score_image
+from stages.detect.kernel_score import inner_half_px, score_image
+from stages.kernels.detect.kernel_score import kernel_terms
+from stages.sweep.depth_image import focal_length_px
 from tests.stages.made import street_depth
 
 FOCAL = focal_length_px(512, 120.0)  # h / res = 147.80

@@ -19,12 +19,12 @@ from flow.link import Tap
 from flow.replay import Replay
 from flow.stage import input_ports
 from links.recording import RecordingReader
-from links.run_folder import Asked
-from links.truth import TruthLog
+from links.runs.run_folder import Asked
+from links.runs.truth import TruthLog
 from stages.fuse import Fuse
-from stages.geometry import rotation_from_quaternion_xyzw
+from stages.geometry.frames import rotation_from_quaternion_xyzw
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import DroneFix, PoseState, RelativePose, RelativeRotation
-from stages.rotation import exp_rotation, log_rotation
 from tests.stages.fuse.made_drone_flight import Errors, add_errors, gauss_markov, rotation
 
 GRID_S = 0.02

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.fuse import Fuse
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import (
     BranchState,
     DroneAttitude,
     DroneFix,
     DroneLocalPosition,
-    DroneMotion,
     DroneOdometry,
     PoseState,
     RelativePose,
@@ -27,8 +27,8 @@ from stages.messages import (
     TrackingState,
     TrackState,
     VehicleMotion,
+    VisualMotion,
 )
-from stages.rotation import exp_rotation, log_rotation
 
 S = 1_000_000_000
 START_NS = 1_700_000_000 * S
@@ -136,7 +136,7 @@ class Made:
     def _vehicle(self):
         for t in np.arange(0, self.until_s, 0.02) if self.vehicle else ():
             R, x = self.T_world_vehicle(t)
-            yield t + 0.005, "motion", VehicleMotion(stamp_ns=ns(t), xyz_start_m=x, R_start_vehicle=R, covariance=None)
+            yield t + 0.005, "motion", VehicleMotion(stamp_ns=ns(t), xyz_map_m=x, R_map_vehicle=R, covariance=None)
 
     def _autopilot(self, rng):
         if self.autopilot == "none":
@@ -165,8 +165,8 @@ class Made:
                     "odometry",
                     DroneOdometry(
                         stamp_ns=ns(t),
-                        xyz_local_m=x,
-                        R_local_drone=R,
+                        xyz_odom_m=x,
+                        R_odom_drone=R,
                         velocity_drone_mps=R.T @ v,
                         angular_velocity_drone_radps=rate,
                         pose_covariance=None,
@@ -176,9 +176,9 @@ class Made:
                     ),
                 )
                 continue
-            yield at, "attitude", DroneAttitude(stamp_ns=ns(t), R_local_drone=R, angular_velocity_drone_radps=rate)
+            yield at, "attitude", DroneAttitude(stamp_ns=ns(t), R_odom_drone=R, angular_velocity_drone_radps=rate)
             if self.autopilot == "split":
-                yield at, "position", DroneLocalPosition(stamp_ns=ns(t), xyz_local_m=x, velocity_local_mps=v)
+                yield at, "position", DroneLocalPosition(stamp_ns=ns(t), xyz_odom_m=x, velocity_odom_mps=v)
 
     def _fixes(self, rng):
         times = np.arange(0.25, self.until_s, 0.1) + rng.uniform(-0.02, 0.02, len(np.arange(0.25, self.until_s, 0.1)))
@@ -197,7 +197,7 @@ class Made:
                     t,
                     xyz,
                     math.hypot(math.sqrt(self.told_variance) * self.fix_sigma_m, self.bias_m),
-                    lasting_m2=self._lasting_m2(),
+                    bias_covariance_m2=self._lasting_m2(),
                     velocity=R_world_vehicle.T @ (self.velocity_mps(t) - [self.vehicle_mps, 0, 0])
                     + rng.normal(0, 0.3, 3),
                 ),
@@ -232,8 +232,8 @@ class Made:
             far = float(np.linalg.norm(way)) > 0.05
             yield (
                 t + 0.04,
-                "drone_motion",
-                DroneMotion(
+                "visual_motion",
+                VisualMotion(
                     stamp_ns=ns(t),
                     from_ns=ns(t - 1 / 15),
                     R_from_to=a.T @ b @ exp_rotation(rng.normal(0, 4e-4, 3)),
@@ -306,7 +306,7 @@ def ns(t) -> int:
     return START_NS + round(float(t) * S)
 
 
-def fix(t, xyz, sigma=0.06, track_id=1, velocity=None, lasting_m2=None) -> DroneFix:
+def fix(t, xyz, sigma=0.06, track_id=1, velocity=None, bias_covariance_m2=None) -> DroneFix:
     return DroneFix(
         stamp_ns=ns(t),
         xyz_vehicle_m=np.asarray(xyz, dtype=float),
@@ -316,7 +316,7 @@ def fix(t, xyz, sigma=0.06, track_id=1, velocity=None, lasting_m2=None) -> Drone
         shift_m=0.0,
         track_id=track_id,
         velocity_vehicle_mps=velocity,
-        lasting_m2=lasting_m2,
+        bias_covariance_m2=bias_covariance_m2,
     )
 
 

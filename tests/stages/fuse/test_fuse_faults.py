@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from links.run_folder import Asked
+from links.runs.run_folder import Asked
+from links.runs.truth import TruthLog
 from links.simulated.matrix.flights import Cell
 from links.simulated.matrix.matrix import Conditions, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.run import Simulation
-from links.truth import TruthLog
 from stages.messages import PoseState
 from tests.stages.fuse.flown import (
     Fault,

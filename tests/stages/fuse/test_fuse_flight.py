@@ -50,16 +50,16 @@ def test_relative_pose_and_pose_in_the_start_frame_are_one():
     poses = [pose for pose in made.run(Fuse()) if pose.state is FULL]
     for pose in poses[::20]:
         R, x = made.T_world_vehicle((pose.stamp_ns - START_NS) / S)
-        assert np.allclose(R @ pose.xyz_vehicle_m + x, pose.xyz_start_m, atol=0.03)
-        assert np.allclose(R @ pose.R_vehicle_drone, pose.R_start_drone, atol=1e-2)
+        assert np.allclose(R @ pose.xyz_vehicle_m + x, pose.xyz_map_m, atol=0.03)
+        assert np.allclose(R @ pose.R_vehicle_drone, pose.R_map_drone, atol=1e-2)
         assert pose.covariance is not None
-        assert np.allclose(pose.covariance, pose.start_covariance)
+        assert np.allclose(pose.covariance, pose.map_covariance)
 
 
 def test_velocities_are_the_drones_over_ground_and_beside_the_vehicle():
     made = Made(until_s=8, vehicle_mps=3.0)
     poses = [pose for pose in made.run(Fuse()) if pose.stamp_ns > ns(4)]
-    over_ground = [np.linalg.norm(p.velocity_start_mps - made.velocity_mps((p.stamp_ns - START_NS) / S)) for p in poses]
+    over_ground = [np.linalg.norm(p.velocity_map_mps - made.velocity_mps((p.stamp_ns - START_NS) / S)) for p in poses]
     beside = [
         np.linalg.norm(p.velocity_vehicle_mps + np.array([3, 0, 0]) - made.velocity_mps((p.stamp_ns - START_NS) / S))
         for p in poses
@@ -192,7 +192,7 @@ def test_directions_without_a_scale_sharpen_the_velocity_of_a_drone_without_auto
         made = Made(autopilot="none", pictures=pictures, turn_dps=0.0, fix_sigma_m=0.15, seed=4)
         poses = [pose for pose in made.run(Fuse()) if pose.stamp_ns > ns(4)]
         errors.append(
-            rms([np.linalg.norm(p.velocity_start_mps - made.velocity_mps((p.stamp_ns - START_NS) / S)) for p in poses])
+            rms([np.linalg.norm(p.velocity_map_mps - made.velocity_mps((p.stamp_ns - START_NS) / S)) for p in poses])
         )
     assert errors[1] < 0.9 * errors[0]
 
@@ -212,7 +212,7 @@ def test_without_word_of_the_vehicle_its_frame_is_the_start_frame(parked):
     seen = made.judge(poses, after_s=4)
     assert set(seen.states) == {FULL if parked else AMBIGUOUS}
     assert parked or "how the vehicle moves is not told" in poses[-1].reason
-    assert np.allclose(poses[-1].xyz_start_m, poses[-1].xyz_vehicle_m)
+    assert np.allclose(poses[-1].xyz_map_m, poses[-1].xyz_vehicle_m)
     assert seen.rmse_m() < (0.12 if parked else 0.2)
 
 
@@ -350,8 +350,8 @@ def test_the_wanted_track_is_the_only_one_followed():
         (fix(0.5, [0, 0, 10], sigma=0.0), "fix: its covariance is not positive definite"),
         (fix(0.5, [0, 0, 10], sigma=math.nan), "fix: not finite"),
         (fix(0.5, [0, 0, 10], velocity=np.array([0, math.inf, 0])), "fix: not finite"),
-        (fix(0.5, [0, 0, 10], lasting_m2=np.full((3, 3), math.nan)), "fix: not finite"),
-        (fix(0.5, [0, 0, 10], lasting_m2=np.eye(3)), "fix: its covariance is not positive definite"),
+        (fix(0.5, [0, 0, 10], bias_covariance_m2=np.full((3, 3), math.nan)), "fix: not finite"),
+        (fix(0.5, [0, 0, 10], bias_covariance_m2=np.eye(3)), "fix: its covariance is not positive definite"),
         (fix(3000.0, [0, 0, 10]), "fix: from the future"),
         (fix(-30.0, [0, 0, 10]), "fix: older than the lag"),
     ],

@@ -7,25 +7,25 @@ import math
 import numpy as np
 import pytest
 
-from stages.drone_trail import AutopilotTrail
-from stages.fuse.carried import Carrier
 from stages.fuse.correlated import MOST, Worth, inflation
 from stages.fuse.drift import Drift
 from stages.fuse.ekf import Ekf
 from stages.fuse.estimator import Estimator
-from stages.fuse.following import Following
-from stages.fuse.heading import Heading
-from stages.fuse.motion_yaw import Point
 from stages.fuse.motions import Motions
-from stages.fuse.north import North
 from stages.fuse.positions import Positions, Told
+from stages.fuse.propagated import MotionModel
 from stages.fuse.rejected import ENOUGH, Rejected
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
-from stages.fuse.yaw import DRIFT_RAD_PER_S, Yaw
-from stages.geometry import heading_rad, rotation_z
+from stages.fuse.track_continuity import Following
+from stages.geometry.frames import heading_rad, rotation_z
+from stages.geometry.se3 import good_covariance
+from stages.heading.fused_heading import Heading
+from stages.heading.motion_yaw import Point
+from stages.heading.odometry_yaw import North
+from stages.heading.yaw_fit import DRIFT_RAD_PER_S, Yaw
 from stages.messages import DroneAttitude, DroneLocalPosition, TrackingState, TrackState
-from stages.rigid import good_covariance
+from stages.odometry.drone.trajectory import AutopilotTrail
 from tests.stages.fuse.made_drone_flight import S, fix, gauss_markov, ns, track
 
 ERRORS = FuseErrors()
@@ -100,9 +100,9 @@ def test_a_gap_costs_by_its_square_and_cube():
 
 def test_a_fix_that_is_older_than_the_newest_is_left_to_others():
     drift = drifting(True, [0, 0, 0])
-    x = drift.xyz_start_m.copy()
+    x = drift.xyz_map_m.copy()
     drift.see(S, np.array([99.0, 0, 0]), np.eye(3), np.zeros(3), 0.0)
-    assert np.array_equal(drift.xyz_start_m, x)
+    assert np.array_equal(drift.xyz_map_m, x)
 
 
 def test_a_direction_of_flight_turns_the_velocity_and_leaves_its_length_alone():
@@ -134,7 +134,7 @@ def test_what_a_wrong_yaw_was_taken_for_is_no_drift_once_it_is_known(parts_rad):
     for part_rad in parts_rad:
         askew.turn_ways(-part_rad)
     assert np.allclose(askew.velocity_mps, right.velocity_mps, atol=1e-9)
-    assert np.allclose(askew.xyz_start_m, right.xyz_start_m, atol=1e-9)
+    assert np.allclose(askew.xyz_map_m, right.xyz_map_m, atol=1e-9)
     free = drifting(False, [0.0, 0.0, 0.0])
     before = free.velocity_mps.copy()
     free.turn_ways(0.1)  # whose ways nobody tells
@@ -143,9 +143,9 @@ def test_what_a_wrong_yaw_was_taken_for_is_no_drift_once_it_is_known(parts_rad):
 
 def test_another_start_frame_takes_position_and_velocity_along():
     drift = drifting(False, [0, 0, 0])
-    x, v = drift.xyz_start_m.copy(), drift.velocity_mps.copy()
+    x, v = drift.xyz_map_m.copy(), drift.velocity_mps.copy()
     drift.turn(rotation_z(1.0), np.array([1.0, 2.0, 3.0]))
-    assert np.allclose(drift.xyz_start_m, rotation_z(1.0) @ x + [1, 2, 3])
+    assert np.allclose(drift.xyz_map_m, rotation_z(1.0) @ x + [1, 2, 3])
     assert np.allclose(drift.velocity_mps, rotation_z(1.0) @ v)
 
 
@@ -153,27 +153,27 @@ def test_another_start_frame_takes_position_and_velocity_along():
 
 
 def told(until_s=2.0, v=(1.0, 0.5, 0.0), rate=0.4, silent_after=math.inf):
-    carrier = Carrier(ERRORS)
+    motion_model = MotionModel(ERRORS)
     for t in np.arange(0, until_s, 0.05):
         if t < silent_after:
             ns, R = round(t * S), rotation_z(0.3 + rate * t)
-            carrier.autopilot.add_attitude(ns, R, np.array([0, 0, rate]))
-            carrier.autopilot.add_position(ns, t * np.asarray(v) + [5.0, 6.0, 7.0], np.asarray(v))
-    return carrier
+            motion_model.autopilot.add_attitude(ns, R, np.array([0, 0, rate]))
+            motion_model.autopilot.add_position(ns, t * np.asarray(v) + [5.0, 6.0, 7.0], np.asarray(v))
+    return motion_model
 
 
 def test_a_step_is_the_way_told_and_the_drift_in_the_drones_axes():
-    carrier, left, free = told(), Drift(ERRORS, True), Drift(ERRORS, False)
+    motion_model, left, free = told(), Drift(ERRORS, True), Drift(ERRORS, False)
     left.start(0, np.zeros(3), np.eye(3), None)
-    R_start_own = rotation_z(-1.1)
-    R0 = R_start_own @ rotation_z(0.3 + 0.4 * 0.5)
-    step = carrier.step(S // 2, 3 * S // 2, R0, left, free, True, S // 2)
+    R_map_own = rotation_z(-1.1)
+    R0 = R_map_own @ rotation_z(0.3 + 0.4 * 0.5)
+    step = motion_model.step(S // 2, 3 * S // 2, R0, left, free, True, S // 2)
     assert step.by_odometry
     assert step.turn_told
     assert np.allclose(step.R, rotation_z(0.4), atol=1e-6)
-    assert np.allclose(R0 @ step.t_m, R_start_own @ [1.0, 0.5, 0.0], atol=1e-6)
+    assert np.allclose(R0 @ step.t_m, R_map_own @ [1.0, 0.5, 0.0], atol=1e-6)
     assert good_covariance(step.covariance)
-    back = carrier.step(3 * S // 2, S // 2, R0 @ step.R, left, free, True, S // 2)
+    back = motion_model.step(3 * S // 2, S // 2, R0 @ step.R, left, free, True, S // 2)
     assert np.allclose(step.R @ back.R, np.eye(3), atol=1e-9)
     assert np.allclose(step.t_m + step.R @ back.t_m, 0, atol=1e-9)
 
@@ -192,13 +192,13 @@ def test_beyond_its_newest_word_an_odometry_is_believed_less_and_less():
     left, free = Drift(ERRORS, True), Drift(ERRORS, False)
     left.start(0, np.zeros(3), np.eye(3), None)
     free.start(0, np.zeros(3), np.eye(3), None)
-    carrier = told(silent_after=1.0)
+    motion_model = told(silent_after=1.0)
     spread = [
-        np.trace(carrier.step(9 * S // 10, round(t * S), np.eye(3), left, free, True, S).covariance)
+        np.trace(motion_model.step(9 * S // 10, round(t * S), np.eye(3), left, free, True, S).covariance)
         for t in (1.0, 1.2, 1.4, 1.8)
     ]
     assert spread[0] < spread[1] < spread[2] < spread[3]
-    assert not carrier.step(9 * S // 10, 2 * S, np.eye(3), left, free, True, S).turn_told
+    assert not motion_model.step(9 * S // 10, 2 * S, np.eye(3), left, free, True, S).turn_told
 
 
 @pytest.mark.parametrize("back", [Smoother, lambda lag_s: Ekf()])
@@ -208,8 +208,8 @@ def test_a_yaw_made_good_by_fixes_is_not_taken_for_drift_too(back):
     rng = np.random.default_rng(2)
     for i in range(21):
         at_ns, xyz_m = ns(0.1 * i), np.array([10.0 + 1.1 * i, 2.0, 12.0])
-        estimator.motions.carrier.autopilot.add_attitude(at_ns, np.eye(3), np.zeros(3))
-        estimator.motions.carrier.autopilot.add_position(at_ns, xyz_m, np.array([11.0, 0.0, 0.0]))
+        estimator.motions.motion_model.autopilot.add_attitude(at_ns, np.eye(3), np.zeros(3))
+        estimator.motions.motion_model.autopilot.add_position(at_ns, xyz_m, np.array([11.0, 0.0, 0.0]))
         estimator.advance(at_ns)
         if i < 3 or i > 17:
             seen = fix(0.1 * i, xyz_m + rng.normal(0, 0.05, 3), sigma=0.05)
@@ -340,7 +340,7 @@ def test_a_yaw_that_is_of_use_is_denied_by_motion():
 
 def attitude(t_s, yaw=0.0):
     return DroneAttitude(
-        stamp_ns=round(t_s * S), R_local_drone=rotation_z(yaw), angular_velocity_drone_radps=np.zeros(3)
+        stamp_ns=round(t_s * S), R_odom_drone=rotation_z(yaw), angular_velocity_drone_radps=np.zeros(3)
     )
 
 
@@ -419,9 +419,9 @@ def test_a_drone_that_tells_its_velocity_cannot_have_turned_unheard():
         for i in range(30):
             t = 0.1 * i
             if told:
-                motions.carrier.autopilot.hear(
+                motions.motion_model.autopilot.hear(
                     DroneLocalPosition(
-                        stamp_ns=ns(t), xyz_local_m=np.array([2 * t, 0, 9]), velocity_local_mps=np.array([2.0, 0, 0])
+                        stamp_ns=ns(t), xyz_odom_m=np.array([2 * t, 0, 9]), velocity_odom_mps=np.array([2.0, 0, 0])
                     )
                 )
             z = np.array([2 * t, 0.0, 9.0])

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 
-from stages.fuse.carried import Step
 from stages.fuse.ekf import Ekf
+from stages.fuse.propagated import Step
 from stages.fuse.smoother import Smoother
-from stages.geometry import rotation_z
-from stages.rigid import carried_covariance
-from stages.rotation import exp_rotation, log_rotation
+from stages.geometry.frames import rotation_z
+from stages.geometry.se3 import carried_covariance
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 
 TENTH = 100_000_000
 TILT = 0.2
@@ -48,8 +48,8 @@ def test_a_chain_of_steps_is_their_product_and_its_covariance_theirs(make):
         back.extend(k * TENTH, way(), None, TILT)
         P = carried_covariance(P, way().R, way().t_m, way().covariance)
     R, x = true_pose(10)
-    assert np.allclose(back.R_start_drone, R, atol=1e-6)
-    assert np.allclose(back.xyz_start_m, x, atol=1e-6)
+    assert np.allclose(back.R_map_drone, R, atol=1e-6)
+    assert np.allclose(back.xyz_map_m, x, atol=1e-6)
     assert np.allclose(back.covariance, P, rtol=0.02, atol=1e-7)
 
 
@@ -66,17 +66,17 @@ def test_smoother_and_filter_agree_while_all_is_well():
             assert back.add_position(k * TENTH, STAYS, z, 0.05**2 * np.eye(3))
             assert back.add_rotation(k * TENTH, STAYS, turned, 0.01**2 * np.eye(3))
     a, b = backs
-    assert np.linalg.norm(a.xyz_start_m - b.xyz_start_m) < 0.01
-    assert np.linalg.norm(log_rotation(a.R_start_drone.T @ b.R_start_drone)) < 0.002
+    assert np.linalg.norm(a.xyz_map_m - b.xyz_map_m) < 0.01
+    assert np.linalg.norm(log_rotation(a.R_map_drone.T @ b.R_map_drone)) < 0.002
     assert np.allclose(np.diag(a.covariance), np.diag(b.covariance), rtol=0.15)
-    assert np.linalg.norm(a.xyz_start_m - true_pose(59)[1]) < 0.06
+    assert np.linalg.norm(a.xyz_map_m - true_pose(59)[1]) < 0.06
 
 
 @pytest.mark.parametrize("make", [lambda: Smoother(3.0), Ekf])
 def test_a_late_fix_moves_the_pose_at_its_own_time(make):
     """Told where the drone was 0.5 s ago, with an offset: the pose now moves by the offset, not by the way flown."""
     back = started(make())
-    before = back.xyz_start_m.copy()
+    before = back.xyz_map_m.copy()
     key_ns, R, x = back.near(15 * TENTH)
     R_then, x_then = true_pose(15)
     if key_ns == 20 * TENTH:  # the filter keeps the newest pose alone
@@ -86,7 +86,7 @@ def test_a_late_fix_moves_the_pose_at_its_own_time(make):
         step = STAYS
     offset = np.array([0.02, -0.01, 0.03])
     assert back.add_position(key_ns, step, x_then + offset, 0.001**2 * np.eye(3))
-    moved = back.xyz_start_m - before
+    moved = back.xyz_map_m - before
     assert np.allclose(moved, offset, atol=0.015)
     assert moved @ offset > 0.5 * offset @ offset
 
@@ -115,9 +115,9 @@ def test_a_false_fix_is_weighed_down():
     pulled = []
     for off in (0.5, 5.0):
         back = started(Ekf())
-        before = back.xyz_start_m.copy()
+        before = back.xyz_map_m.copy()
         back.add_position(back.stamp_ns, STAYS, before + np.array([off, 0, 0]), 0.05**2 * np.eye(3))
-        pulled.append(back.xyz_start_m[0] - before[0])
+        pulled.append(back.xyz_map_m[0] - before[0])
     assert pulled[1] < 2.0 * pulled[0]
 
 
@@ -194,7 +194,7 @@ def _unreadable(back):
 
 
 def now(back):
-    return back.R_start_drone, back.xyz_start_m, back.covariance
+    return back.R_map_drone, back.xyz_map_m, back.covariance
 
 
 @pytest.mark.parametrize("spoil", [_marginalised, _nan, _indeterminate, _twice, _unknown, _unreadable])
@@ -203,14 +203,14 @@ def test_after_every_error_of_gtsam_it_goes_on_from_the_last_good_pose(spoil):
     R, xyz, P = (a.copy() for a in now(back))
     assert not spoil(back)
     assert back.recoveries == 1
-    assert np.allclose(back.R_start_drone, R)
-    assert np.allclose(back.xyz_start_m, xyz)
+    assert np.allclose(back.R_map_drone, R)
+    assert np.allclose(back.xyz_map_m, xyz)
     assert np.allclose(back.covariance, P)
     for k in range(41, 60):
         back.extend(k * TENTH, way(), UP, TILT)
         assert back.add_position(k * TENTH, STAYS, true_pose(k)[1], 0.05**2 * np.eye(3))
     assert back.recoveries == 1
-    assert np.linalg.norm(back.xyz_start_m - true_pose(59)[1]) < 0.03
+    assert np.linalg.norm(back.xyz_map_m - true_pose(59)[1]) < 0.03
 
 
 def test_the_smoothers_list_of_factors_does_not_grow():

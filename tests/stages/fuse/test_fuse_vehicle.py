@@ -11,7 +11,7 @@ import pytest
 from stages.fuse import Fuse
 from stages.fuse.motions import Motions
 from stages.fuse.settings import FuseErrors
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import PoseState, VehicleMotion
 from tests.stages.fuse.flown import late, spoilt, without
 from tests.stages.fuse.made_drone_flight import Made, ns, rms
@@ -30,7 +30,7 @@ def told(made, fault):
 
 def drive(t, x=0.0, yaw=0.0):
     return VehicleMotion(
-        stamp_ns=ns(t), xyz_start_m=np.array([6.0 * t + x, 0.0, 0.0]), R_start_vehicle=rotation_z(yaw), covariance=None
+        stamp_ns=ns(t), xyz_map_m=np.array([6.0 * t + x, 0.0, 0.0]), R_map_vehicle=rotation_z(yaw), covariance=None
     )
 
 
@@ -108,8 +108,8 @@ def jumped(from_s, deg=115.0, hz=50, silent_s=0.0):
     def fault(events):
         for at_ns, port, message in events:
             if port == "motion" and message.stamp_ns >= ns(from_s):
-                xyz_m = R @ message.xyz_start_m + np.array([200.0, 0.0, 0.0])
-                message = dataclasses.replace(message, xyz_start_m=xyz_m, R_start_vehicle=R @ message.R_start_vehicle)
+                xyz_m = R @ message.xyz_map_m + np.array([200.0, 0.0, 0.0])
+                message = dataclasses.replace(message, xyz_map_m=xyz_m, R_map_vehicle=R @ message.R_map_vehicle)
             left_out = round((message.stamp_ns - ns(0)) / 2e7) % (50 // hz) or ns(0) <= message.stamp_ns - round(
                 from_s * 1e9
             ) < ns(silent_s)
@@ -144,7 +144,7 @@ def test_an_odometry_that_tells_map_coordinates_serves_as_well():
     stage, poses = Fuse(), []
     for _, port, message in made.events():
         if port == "motion":
-            message = dataclasses.replace(message, xyz_start_m=message.xyz_start_m + far_m)
+            message = dataclasses.replace(message, xyz_map_m=message.xyz_map_m + far_m)
         poses += getattr(stage, f"on_{port}")(message)
     assert stage.recoveries == 0
     near, far = (made.judge(p, after_s=4) for p in (made.run(Fuse()), poses))

@@ -9,13 +9,13 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
-from stages.messages import DroneImu, DroneMotion, FollowedFeatures, Image
-from stages.odometry import FisheyeOdometry
-from stages.odometry.fisheye_odometry import drone_motion, turned
-from stages.pictures.features import Tracks
-from stages.pictures.motion_link import Link
-from stages.pictures.two_view import TwoView
-from stages.rotation import exp_rotation, log_rotation
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
+from stages.messages import DroneImu, FollowedFeatures, Image, VisualMotion
+from stages.odometry.drone import FisheyeOdometry
+from stages.odometry.drone.fisheye_odometry import turned, visual_motion
+from stages.odometry.visual.features import Tracks
+from stages.odometry.visual.image_motion import Link
+from stages.odometry.visual.two_view import TwoView
 from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, PIXEL_RAD, SIZE_PX, STEP_NS, degrees_between, image, of
 
 YAW = np.array([0.0, 0.0, 1.0])
@@ -38,7 +38,7 @@ def flown(turn_radps, velocity_mps, count, mount=LOOKS_DOWN, settings=None, imu=
                         angular_velocity_drone_radps=np.asarray(turn_radps, float),
                     )
                 )
-        motions.append(of(odometry.on_image(image(stamp_ns, *truth[stamp_ns], mount)), DroneMotion))
+        motions.append(of(odometry.on_image(image(stamp_ns, *truth[stamp_ns], mount)), VisualMotion))
     return motions, truth
 
 
@@ -121,7 +121,7 @@ def test_covariance_and_direction_are_turned_from_the_camera_into_the_drone():
     covariance = np.diag([1e-6, 4e-6, 9e-6, 1e-5, 1e-5, 0.0])
     seen = TwoView(np.eye(3), t, covariance, np.ones(40, bool), 1e-3, 40, 0.1)
     key, now = (Tracks(s, np.arange(40), np.zeros((40, 3)), np.zeros((40, 2))) for s in (5, 7))
-    motion = drone_motion(Link(key, now, key.number, key.ray, now.ray, seen, False), C)
+    motion = visual_motion(Link(key, now, key.number, key.ray, now.ray, seen, False), C)
     np.testing.assert_allclose(motion.covariance_rad2, np.diag([4e-6, 1e-6, 9e-6]), atol=1e-18)  # x is the camera's y
     np.testing.assert_allclose(motion.direction_from, [0, 0, 1], atol=1e-12)  # points sank away along the axis: it rose
     assert motion.direction_sigma_rad == pytest.approx(math.sqrt(1e-5 + 2.5e-6))
@@ -155,7 +155,7 @@ def test_a_blank_picture_ends_the_chain_and_the_next_begins_one():
         seen = image(stamp_ns, np.eye(3), np.array([0.2 * k, 0, 0]), LOOKS_DOWN)
         if k in (2, 3):
             seen = Image(stamp_ns=stamp_ns, frame_id="camera", grey=blank)
-        told.append(of(odometry.on_image(seen), DroneMotion))
+        told.append(of(odometry.on_image(seen), VisualMotion))
     assert [m is not None for m in told] == [False, True, False, False, False, True]
     assert told[5].from_ns == stamps[4]
 
@@ -163,10 +163,10 @@ def test_a_blank_picture_ends_the_chain_and_the_next_begins_one():
 def test_a_picture_that_is_not_newer_is_left_out():
     odometry = FisheyeOdometry(lens=LENS, T_drone_camera=LOOKS_DOWN)
     seen = image(1_000_000_000, np.eye(3), np.zeros(3), LOOKS_DOWN)
-    assert of(odometry.on_image(seen), DroneMotion) is None
-    assert of(odometry.on_image(seen), DroneMotion) is None
+    assert of(odometry.on_image(seen), VisualMotion) is None
+    assert of(odometry.on_image(seen), VisualMotion) is None
     later = image(1_000_000_000 + STEP_NS, np.eye(3), np.array([0.2, 0, 0]), LOOKS_DOWN)
-    assert of(odometry.on_image(later), DroneMotion).from_ns == 1_000_000_000
+    assert of(odometry.on_image(later), VisualMotion).from_ns == 1_000_000_000
 
 
 def test_it_shows_what_it_followed_between_which_pictures():
@@ -174,7 +174,7 @@ def test_it_shows_what_it_followed_between_which_pictures():
     shift = np.array([0.2, 0, 0])
     for k in range(3):
         told = list(odometry.on_image(image(1_000_000_000 + k * STEP_NS, np.eye(3), k * shift, LOOKS_DOWN)))
-        motion, followed = of(told, DroneMotion), of(told, FollowedFeatures)
+        motion, followed = of(told, VisualMotion), of(told, FollowedFeatures)
         if k == 0:
             assert told == []
             continue
@@ -200,7 +200,7 @@ def test_the_same_pictures_give_the_same_motions():
 def test_its_ports_are_image_and_a_gyro_that_may_be_missing():
     assert set(input_ports(FisheyeOdometry)) == {"image", "imu"}
     assert FisheyeOdometry.optional_inputs == {"imu"}
-    assert set(output_ports(FisheyeOdometry)) == {"drone_motion", "followed_features"}
+    assert set(output_ports(FisheyeOdometry)) == {"visual_motion", "followed_features"}
 
 
 @pytest.mark.parametrize(

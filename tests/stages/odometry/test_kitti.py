@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.geometry import Pose
-from stages.messages import DroneMotion, Image
-from stages.odometry import FisheyeOdometry
-from stages.rotation import log_rotation
+from stages.geometry.frames import Pose
+from stages.kernels.geometry.so3 import log_rotation
+from stages.messages import Image, VisualMotion
+from stages.odometry.drone import FisheyeOdometry
 from tests.stages.seen import degrees_between, of, pinhole
 
 DRIVE = Path(__file__).resolve().parents[4] / "shared" / "data" / "vo_kitti00"
@@ -28,7 +28,7 @@ def test_a_real_drive_is_followed_picture_by_picture():
     turn_deg, direction_deg = [], []
     for i, file in enumerate(sorted((DRIVE / "left").iterdir())):
         grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        motion = of(odometry.on_image(Image(stamp_ns=(i + 1) * STEP_NS, frame_id="camera", grey=grey)), DroneMotion)
+        motion = of(odometry.on_image(Image(stamp_ns=(i + 1) * STEP_NS, frame_id="camera", grey=grey)), VisualMotion)
         if i == 0:
             assert motion is None
             continue

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from stages.track.hull import (
+from stages.kernels.track.hull import (
     CELLS,
-    COLUMNS,
     DEPTH,
     HIT,
     KIND,
@@ -20,11 +19,11 @@ from stages.track.hull import (
     WHEN_S,
     A,
     B,
-    across,
     basis,
     collect,
     posterior,
 )
+from stages.track.hull import COLUMNS, across
 
 S_M = 0.1
 P_0 = 0.8

@@ -9,8 +9,9 @@ import math
 import numpy as np
 import pytest
 
-from stages.geometry import rotation_z
-from stages.track.mean_shift import crossings, fix_covariance_m2, mean_shift
+from stages.geometry.frames import rotation_z
+from stages.kernels.track.mean_shift import mean_shift
+from stages.track.mean_shift import crossings, fix_covariance_m2
 from tests.stages.made import MS
 
 RNG = np.random.default_rng(0)

@@ -32,7 +32,7 @@ import numpy as np
 import pytest
 
 from stages.messages import Detections, DroneFix, SweptPulses, TrackingState, TrackState
-from stages.track.hit_miss_track import HitMissTrack
+from stages.track.likelihood_track import LikelihoodTrack
 
 CLOUDS = Path(__file__).resolve().parents[4] / "shared" / "data" / "drone_lidar"
 MID_360, AVIA, TRACK = (
@@ -134,7 +134,7 @@ def found_at(frame: Frame) -> Detections:
 
 def track(name: str, span_m: float) -> tuple[list[DroneFix], list[TrackState]]:
     """All frames with a return on the drone through the tracker; the span is the one setting."""
-    stage = HitMissTrack(span_m=span_m)
+    stage = LikelihoodTrack(span_m=span_m)
     seen = [frame for frame in frames(name) if frame.on_drone.any()]
     out = list(stage.on_detections(found_at(seen[0])))
     for frame in seen:

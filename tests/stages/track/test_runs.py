@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from stages.track.hull import COLUMNS, DEPTH, GLIMPSE, HIT, KIND, LASER, MISS, NEARER, A
-from stages.track.runs import leave_out_walls
+from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, LASER, MISS, NEARER, A
+from stages.kernels.track.runs import leave_out_walls
+from stages.track.hull import COLUMNS
 
 SPAN_M = 0.5
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry import Pose
-from stages.lens import Equidistant
+from stages.geometry.frames import Pose
+from stages.geometry.lens import Equidistant
 from stages.messages import Image
 
 SIZE_PX = 480
@@ -16,7 +16,7 @@ LOOKS_UP = Pose(rpy_deg=(0.0, 0.0, 90.0))
 LOOKS_DOWN = Pose(rpy_deg=(180.0, 0.0, -90.0))
 
 
-def courtyard(R_yard_camera, stamp_ns=0, carrier="vehicle", seen_m=(0.7, 0.3, -0.2)) -> Image:
+def courtyard(R_yard_camera, stamp_ns=0, camera_mount="vehicle", seen_m=(0.7, 0.3, -0.2)) -> Image:
     """What a camera at `seen_m` sees of it, 3 x 3 samples a pixel."""
     offsets = np.linspace(-1 / 3, 1 / 3, 3)
     column, row = np.meshgrid(np.arange(SIZE_PX, dtype=np.float64), np.arange(SIZE_PX, dtype=np.float64))
@@ -26,7 +26,7 @@ def courtyard(R_yard_camera, stamp_ns=0, carrier="vehicle", seen_m=(0.7, 0.3, -0
             rays = LENS.unproject(np.stack([(column + dx).ravel(), (row + dy).ravel()], axis=1)) @ R_yard_camera.T
             total += _tiles(rays, np.asarray(seen_m))
     grey = (total / 9).reshape(SIZE_PX, SIZE_PX).astype(np.uint8)
-    return Image(stamp_ns=stamp_ns, frame_id=f"camera_{carrier}", grey=grey)
+    return Image(stamp_ns=stamp_ns, frame_id=f"camera_{camera_mount}", grey=grey)
 
 
 def _tiles(rays, at):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry import rotation_from_rpy_deg
-from stages.lens import Equidistant
-from stages.rotation import exp_rotation
+from stages.geometry.frames import rotation_from_rpy_deg
+from stages.geometry.lens import Equidistant
+from stages.kernels.geometry.so3 import exp_rotation
 
 SKY, WALL, WINDOW, ROAD, STRIPE = 180.0, 120.0, 50.0, 70.0, 150.0
 LOOKS_UP = rotation_from_rpy_deg((0.0, 0.0, 90.0))  # R_vehicle_camera: image top forward, right is left

@@ -8,8 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from stages.geometry import rotation_from_rpy_deg, rotation_z
-from stages.vp.directions import GATE, NONE, Lines, all_directions, assign, refine, residual_sigma, upright
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
+from stages.kernels.vp.directions import GATE, NONE, all_directions, upright
+from stages.vp.directions import Lines, assign, refine, residual_sigma
 from stages.vp.search import Limits, Prior, find_structure
 from stages.vp.spectrum import peaks, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.vp.edges import LEVELS, SOBEL_GAIN, EdgeFinder, thresholds
+from stages.kernels.vp.edges import LEVELS, SOBEL_GAIN, thresholds
+from stages.vp.edges import EdgeFinder
 
 
 def half_plane(angle_deg, offset_px, size=120, dark=60.0, light=140.0, noise=0.0, seed=0):

@@ -7,9 +7,9 @@ import pytest
 from pydantic import ValidationError
 from streets import LOOKS_DOWN, LOOKS_UP, fisheye, foliage, street
 
-from stages.geometry import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
-from stages.lens import KannalaBrandt
-from stages.messages import Carrier, DroneAttitude, Image, VehicleMotion
+from stages.geometry.frames import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
+from stages.geometry.lens import KannalaBrandt
+from stages.messages import CameraMount, DroneAttitude, Image, VehicleMotion
 from stages.vp import GreatCircleVp
 
 LENS = fisheye()
@@ -18,20 +18,20 @@ DOWN = Pose(rpy_deg=(180.0, 0.0, -90.0))
 STILL = np.zeros(3)
 
 
-def image(grey, stamp_ns=5, carrier="vehicle", readout_s=0.0):
-    return Image(stamp_ns=stamp_ns, frame_id=f"camera_{carrier}", grey=grey, readout_s=readout_s)
+def image(grey, stamp_ns=5, camera_mount="vehicle", readout_s=0.0):
+    return Image(stamp_ns=stamp_ns, frame_id=f"camera_{camera_mount}", grey=grey, readout_s=readout_s)
 
 
 def attitude(R, stamp_ns=5, rate_radps=STILL):
-    return DroneAttitude(stamp_ns=stamp_ns, R_local_drone=R, angular_velocity_drone_radps=rate_radps)
+    return DroneAttitude(stamp_ns=stamp_ns, R_odom_drone=R, angular_velocity_drone_radps=rate_radps)
 
 
 def vehicle_vp(**settings):
-    return GreatCircleVp(**{"carrier": Carrier.VEHICLE, "T_carrier_camera": UP, "lens": LENS} | settings)
+    return GreatCircleVp(**{"camera_mount": CameraMount.VEHICLE, "T_mount_camera": UP, "lens": LENS} | settings)
 
 
 def drone_vp(**settings):
-    return GreatCircleVp(**{"carrier": Carrier.DRONE, "T_carrier_camera": DOWN, "lens": LENS} | settings)
+    return GreatCircleVp(**{"camera_mount": CameraMount.DRONE, "T_mount_camera": DOWN, "lens": LENS} | settings)
 
 
 def off_deg(directions, truth):
@@ -47,7 +47,7 @@ def level():
 def test_a_street_gives_its_vertical_and_one_pair_in_the_vehicle_s_axes(level):
     found = vehicle_vp().on_image(image(level, stamp_ns=77))
     assert found.stamp_ns == 77
-    assert found.carrier is Carrier.VEHICLE
+    assert found.camera_mount is CameraMount.VEHICLE
     assert list(found.is_vertical) == [True, False, False]
     assert list(found.frame) == [-1, 0, 0]
     assert off_deg(found.direction[:1], [[0, 0, 1]]) < 0.15
@@ -84,7 +84,7 @@ def test_another_lens_and_mount_see_the_same_street():
     )
     tilted = rotation_from_rpy_deg((15.0, -10.0, 60.0))
     mount = Pose(quaternion_xyzw=tuple(quaternions_xyzw(tilted[None])[0]))
-    found = vehicle_vp(lens=lens, T_carrier_camera=mount).on_image(image(street(tilted, lens)))
+    found = vehicle_vp(lens=lens, T_mount_camera=mount).on_image(image(street(tilted, lens)))
     assert list(found.frame) == [-1, 0, 0]
     assert off_deg(found.direction, np.eye(3)).max() < 0.3
 
@@ -109,7 +109,7 @@ def test_a_drone_takes_roll_and_pitch_from_its_attitude_and_no_yaw():
     for heading_deg in (0.0, 123.0):
         vp = drone_vp()
         vp.on_attitude(attitude(rotation_z(np.radians(heading_deg)) @ R_world_drone))
-        answers.append(vp.on_image(image(grey, carrier="drone")))
+        answers.append(vp.on_image(image(grey, camera_mount="drone")))
         assert off_deg(answers[-1].direction @ R_world_drone.T, np.eye(3)).max() < 0.3
     np.testing.assert_allclose(answers[0].direction, answers[1].direction, atol=1e-6)
 
@@ -117,7 +117,7 @@ def test_a_drone_takes_roll_and_pitch_from_its_attitude_and_no_yaw():
 def test_a_drone_without_attitude_finds_the_vertical_by_itself():
     R_world_drone = rotation_from_rpy_deg((14.0, -20.0, 50.0))
     grey = street(R_world_drone @ LOOKS_DOWN, LENS, up_m=6.0)
-    found = drone_vp().on_image(image(grey, carrier="drone"))
+    found = drone_vp().on_image(image(grey, camera_mount="drone"))
     assert off_deg(found.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) < 0.3
     assert off_deg(found.direction @ R_world_drone.T, np.eye(3)).max() < 0.3
 
@@ -193,7 +193,7 @@ def test_a_mask_that_hides_everything_is_refused_with_what_to_do(level):
 
 def test_another_carrier_s_picture_or_attitude_is_refused(level):
     with pytest.raises(ValueError, match="image comes from camera_drone"):
-        vehicle_vp().on_image(image(level, carrier="drone"))
+        vehicle_vp().on_image(image(level, camera_mount="drone"))
     with pytest.raises(ValueError, match="attitude is the drone's"):
         vehicle_vp().on_attitude(attitude(np.eye(3)))
 
@@ -206,7 +206,7 @@ def test_a_rolling_shutter_is_taken_out_by_the_drones_turning(rate_dps):
     for readout_s in (0.03, 0.0):
         vp = drone_vp()
         vp.on_attitude(attitude(np.eye(3), rate_radps=rate))
-        found = vp.on_image(image(rolled, carrier="drone", readout_s=readout_s))
+        found = vp.on_image(image(rolled, camera_mount="drone", readout_s=readout_s))
         of.append(off_deg(found.direction[:3], np.eye(3)).max())
     assert of[0] < 0.15
     assert of[1] > 2 * of[0]
@@ -224,7 +224,7 @@ def test_a_rolling_shutter_is_taken_out_by_the_vehicles_turning():
             R = rotation_z((ms - 60) * 1e-3 * rate[2])
             vp.on_motion(
                 VehicleMotion(
-                    stamp_ns=ms * 1_000_000, R_start_vehicle=R, xyz_start_m=np.zeros(3), covariance=np.eye(6) * 1e-6
+                    stamp_ns=ms * 1_000_000, R_map_vehicle=R, xyz_map_m=np.zeros(3), covariance=np.eye(6) * 1e-6
                 )
             )
     assert of[1] < 0.2  # as of a picture without any turning
@@ -233,6 +233,4 @@ def test_a_rolling_shutter_is_taken_out_by_the_vehicles_turning():
 
 def test_motion_of_the_vehicle_is_refused_where_the_drone_carries_the_camera():
     with pytest.raises(ValueError, match="motion is the vehicle's"):
-        drone_vp().on_motion(
-            VehicleMotion(stamp_ns=1, R_start_vehicle=np.eye(3), xyz_start_m=STILL, covariance=np.eye(6))
-        )
+        drone_vp().on_motion(VehicleMotion(stamp_ns=1, R_map_vehicle=np.eye(3), xyz_map_m=STILL, covariance=np.eye(6)))

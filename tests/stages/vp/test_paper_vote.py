@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.vp.paper_vote import cell_of, completed, fullest, most_orthogonal, vote
+from stages.kernels.vp.paper_vote import cell_of, fullest, vote
+from stages.vp.paper_vote import completed, most_orthogonal
 
 RNG = np.random.default_rng(4)
 NONE, APART = np.empty((0, 3)), math.radians(20.0)

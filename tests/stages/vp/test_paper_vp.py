@@ -10,21 +10,23 @@ from pydantic import ValidationError
 
 from flow.message import check_arrays, hash_into
 from flow.stage import input_ports, output_ports
-from stages.geometry import Pose, rotation_from_rpy_deg
-from stages.messages import Carrier, Image
+from stages.geometry.frames import Pose, rotation_from_rpy_deg
+from stages.messages import CameraMount, Image
 from stages.vp import PaperVp
 from stages.vp.paper_vp import lines_of
 from tests.stages.vp.paper_rooms import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, courtyard, plain
 
 
-def vp(mount=LOOKS_UP, carrier="vehicle", **settings):
-    base = {"carrier": carrier, "T_carrier_camera": mount, "lens": LENS, "size_px": SIZE_PX, "view_px": 300}
+def vp(mount=LOOKS_UP, camera_mount="vehicle", **settings):
+    base = {"camera_mount": camera_mount, "T_mount_camera": mount, "lens": LENS, "size_px": SIZE_PX, "view_px": 300}
     return PaperVp(**base | settings)
 
 
-def directions(R_room_carrier, mount=LOOKS_UP, carrier="vehicle", **settings):
+def directions(R_room_carrier, mount=LOOKS_UP, camera_mount="vehicle", **settings):
     R_carrier_camera = mount.matrix()[:3, :3]
-    message = vp(mount, carrier, **settings).on_image(courtyard(R_room_carrier @ R_carrier_camera, 77, carrier))
+    message = vp(mount, camera_mount, **settings).on_image(
+        courtyard(R_room_carrier @ R_carrier_camera, 77, camera_mount)
+    )
     check_arrays(message)
     return message
 
@@ -41,7 +43,7 @@ def test_ports_are_what_the_graph_wires():
 
 
 @pytest.mark.parametrize(
-    ("rpy_deg", "mount", "carrier"),
+    ("rpy_deg", "mount", "camera_mount"),
     [
         ((0, 0, 20), LOOKS_UP, "vehicle"),
         ((4, -3, -65), LOOKS_UP, "vehicle"),
@@ -49,11 +51,11 @@ def test_ports_are_what_the_graph_wires():
         ((10, 0, 75), LOOKS_DOWN, "drone"),
     ],
 )
-def test_the_rooms_axes_are_found_in_the_carriers_axes(rpy_deg, mount, carrier):
+def test_the_rooms_axes_are_found_in_the_carriers_axes(rpy_deg, mount, camera_mount):
     R = rotation_from_rpy_deg(rpy_deg)
-    message = directions(R, mount, carrier)
+    message = directions(R, mount, camera_mount)
     assert message.stamp_ns == 77
-    assert message.carrier is Carrier(carrier)
+    assert message.camera_mount is CameraMount(camera_mount)
     assert len(message.direction) == 3, message.reason
     assert off_axes_deg(message, R).max() < 1.0
     np.testing.assert_allclose(np.linalg.norm(message.direction, axis=1), 1.0, atol=1e-12)
@@ -140,7 +142,7 @@ def test_a_picture_of_another_size_is_refused_with_what_to_do():
         ),
         ({"views": [{"azimuth_deg": 0, "off_axis_deg": 60}]}, "at least 2"),
         ({"fov_deg": 180.0}, "less than or equal to 120"),
-        ({"carrier": "truck"}, "'vehicle' or 'drone'"),
+        ({"camera_mount": "truck"}, "'vehicle' or 'drone'"),
         ({"min_lines": 1}, "greater than or equal to 2"),
         ({"polish": True}, "Extra inputs"),
     ],

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
-from stages.rotation import exp_rotation
+from stages.kernels.geometry.so3 import exp_rotation
+from stages.kernels.vp.spectrum import APART_RAD, WIDEST_RAD
 from stages.vp.directions import Lines
-from stages.vp.spectrum import APART_RAD, WIDEST_RAD, Spectrum, peaks, quarter, yaw_spectrum
+from stages.vp.spectrum import Spectrum, peaks, quarter, yaw_spectrum
 
 SIGMA = math.radians(0.25)
 

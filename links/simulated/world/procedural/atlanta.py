@@ -12,7 +12,7 @@ from links.simulated.world.mesh import Mesh, box
 from links.simulated.world.procedural.parts import building_row, dashes, grove
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, SceneSettings, VehicleCorridor
 from links.simulated.world.procedural.street import ground, parked_cars, poles_and_wires, road_marks, with_parking
-from stages.geometry import Array64, rotation_z
+from stages.geometry.frames import Array64, rotation_z
 
 FAMILIES = 4
 MIN_SEPARATION_DEG = 14.0  # between two families, and between a family and the road

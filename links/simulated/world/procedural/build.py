@@ -19,7 +19,7 @@ from links.simulated.world.procedural.open_scenes import campus, open_lot, park_
 from links.simulated.world.procedural.parts import car
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, Kind, SceneSettings, VehicleCorridor
 from links.simulated.world.procedural.street import manhattan, street
-from stages.geometry import Array64, rotation_z
+from stages.geometry.frames import Array64, rotation_z
 
 KINDS: dict[Kind, Callable[[SceneSettings, VehicleCorridor, Generator], list[Mesh]]] = {
     "street": street,

@@ -25,7 +25,7 @@ from links.simulated.world.procedural.parts import (
 )
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, SceneSettings, VehicleCorridor
 from links.simulated.world.procedural.street import ground, parked_cars, poles_and_wires, road_marks, with_parking
-from stages.geometry import Array64, rotation_z
+from stages.geometry.frames import Array64, rotation_z
 
 FAR = (-HALF_LENGTH_M, HALF_LENGTH_M)
 

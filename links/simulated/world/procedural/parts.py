@@ -11,7 +11,7 @@ import numpy as np
 from numpy.random import Generator
 
 from links.simulated.world.mesh import Mesh, box, merge, quads, rod
-from stages.geometry import Array64, rotation_z
+from stages.geometry.frames import Array64, rotation_z
 
 LEAST_M = 1e-6  # shortest part
 MARK_ABOVE_M = 0.004  # height of marks above the road, so that rays hit them first

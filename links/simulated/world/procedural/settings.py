@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.geometry import Array64
+from stages.geometry.frames import Array64
 
 HALF_LENGTH_M = 150.0  # beyond the LiDAR's range from the centre
 KERB_HEIGHT_M = 0.12

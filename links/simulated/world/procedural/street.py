@@ -13,7 +13,7 @@ from numpy.random import Generator
 from links.simulated.world.mesh import Mesh, box, merge, quads
 from links.simulated.world.procedural.parts import MARK_ABOVE_M, building, car, dashes, lamp_pole, strip, tree, wire
 from links.simulated.world.procedural.settings import HALF_LENGTH_M, KERB_HEIGHT_M, SceneSettings, VehicleCorridor
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 
 PARKING_M = 2.2  # width of the parking lane on each side
 

@@ -21,7 +21,7 @@ from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.sensors.drift import DriftSettings
 from links.simulated.world.flight import Flight
 from links.simulated.world.path import Path, Waypoint
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 from stages.messages import AutopilotStatus, DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry
 from tests.links.simulated.sensors.test_simulated_drift import NO_DRIFT
 
@@ -109,9 +109,9 @@ def test_without_errors_the_local_frame_is_the_world_rotated_by_the_heading(exac
     p0 = exact.flight.flying_poses(np.zeros(1))[1][0]
     rate = exact.flight.imu(time_s)[0]
     for i, m in enumerate(odometry):
-        np.testing.assert_allclose(m.xyz_local_m, R_local_world @ (p[i] - p0), atol=0.02)  # 4 m/s, few ms
-        np.testing.assert_allclose(m.R_local_drone, R_local_world @ R[i], atol=0.01)
-        np.testing.assert_allclose(m.R_local_drone @ m.velocity_drone_mps, R_local_world @ v[i], atol=0.03)
+        np.testing.assert_allclose(m.xyz_odom_m, R_local_world @ (p[i] - p0), atol=0.02)  # 4 m/s, few ms
+        np.testing.assert_allclose(m.R_odom_drone, R_local_world @ R[i], atol=0.01)
+        np.testing.assert_allclose(m.R_odom_drone @ m.velocity_drone_mps, R_local_world @ v[i], atol=0.03)
         np.testing.assert_allclose(m.angular_velocity_drone_radps, rate[i], atol=0.05)
 
 
@@ -119,13 +119,13 @@ def test_attitude_position_and_odometry_agree(exact: Flown) -> None:
     odometry = exact.messages(DroneOdometry, after_s=2.0)
     time_s = exact.seconds(odometry)
     position, attitude = exact.messages(DroneLocalPosition), exact.messages(DroneAttitude)
-    xyz = np.array([m.xyz_local_m for m in position])
+    xyz = np.array([m.xyz_odom_m for m in position])
     for axis in range(3):
         there = np.interp(time_s, exact.seconds(position), xyz[:, axis])
-        np.testing.assert_allclose([m.xyz_local_m[axis] for m in odometry], there, atol=0.02)
-    columns = np.array([m.R_local_drone[:, 2] for m in attitude])
+        np.testing.assert_allclose([m.xyz_odom_m[axis] for m in odometry], there, atol=0.02)
+    columns = np.array([m.R_odom_drone[:, 2] for m in attitude])
     there = np.interp(time_s, exact.seconds(attitude), columns[:, 0])
-    np.testing.assert_allclose([m.R_local_drone[0, 2] for m in odometry], there, atol=0.01)
+    np.testing.assert_allclose([m.R_odom_drone[0, 2] for m in odometry], there, atol=0.01)
 
 
 def test_the_imu_measures_thrust_and_turn_rate_rounded_to_mg_and_mrad(exact: Flown) -> None:
@@ -163,7 +163,7 @@ def test_the_drift_agrees_with_the_covariance(drifting: Flown) -> None:
         m = flown.messages(DroneOdometry)[-1]
         p = flown.flight.flying_poses(flown.seconds([m]))[1]
         p0 = flown.flight.flying_poses(np.zeros(1))[1][0]
-        error_drone = m.R_local_drone.T @ (m.xyz_local_m - rotation_z(np.radians(-57.0)) @ (p[0] - p0))
+        error_drone = m.R_odom_drone.T @ (m.xyz_odom_m - rotation_z(np.radians(-57.0)) @ (p[0] - p0))
         assert m.pose_covariance is not None
         nees.append(error_drone @ np.linalg.solve(m.pose_covariance[3:, 3:], error_drone))
     assert 1.5 < np.mean(nees) < 5.0
@@ -176,7 +176,7 @@ def test_the_attitude_has_the_configured_tilt_error() -> None:
             AutopilotSettings(drift=NO_DRIFT.model_copy(update={"tilt_deg": 1.0}), imu_hz=0, odometry_hz=0), seed, 4.0
         )
         m = tilted.messages(DroneAttitude)[-1]
-        up = tilted.flight.flying_poses(tilted.seconds([m]))[0][0] @ (m.R_local_drone.T @ [0.0, 0.0, 1.0])
+        up = tilted.flight.flying_poses(tilted.seconds([m]))[0][0] @ (m.R_odom_drone.T @ [0.0, 0.0, 1.0])
         squares.append(np.degrees(np.arccos(up[2])) ** 2)
     assert np.sqrt(np.mean(squares)) == pytest.approx(np.sqrt(2.0), rel=0.35)  # roll and pitch, 1 deg each
 

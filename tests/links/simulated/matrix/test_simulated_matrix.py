@@ -33,8 +33,8 @@ from links.simulated.world.clearance import sample_times_s, visible
 from links.simulated.world.mesh import RayScene, box, merge
 from links.simulated.world.procedural import build_world
 from links.simulated.world.procedural.settings import Kind
-from stages.geometry import Pose
-from stages.rotation import log_rotation
+from stages.geometry.frames import Pose
+from stages.kernels.geometry.so3 import log_rotation
 
 LIDAR_UP = np.array([0.0, 0.0, 0.35])
 

@@ -13,7 +13,7 @@ from flow.link import LinkError
 from flow.problem import ConfigError
 from links.cli.app import app
 from links.recording import RecordingReader
-from links.run_folder import Asked
+from links.runs.run_folder import Asked
 from links.simulated.matrix import flights, making
 from links.simulated.matrix.flights import Cell
 from links.simulated.matrix.making import Outcome, Status, Task, is_made, make_matrix, make_one

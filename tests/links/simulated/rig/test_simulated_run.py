@@ -18,7 +18,7 @@ from links.simulated.rig.run import Simulation, simulate, simulate_records
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.world.path import Path, Waypoint
 from links.velodyne import Lidar
-from stages.geometry import LidarMount, Pose, rotation_from_quaternion_xyzw, rotation_z
+from stages.geometry.frames import LidarMount, Pose, rotation_from_quaternion_xyzw, rotation_z
 
 ROOT = FilePath(__file__).parents[4]
 SCENARIOS = sorted((ROOT / "configs/scenarios").glob("*.yaml"))

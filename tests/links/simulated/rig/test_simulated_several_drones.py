@@ -11,7 +11,8 @@ import pytest
 from pydantic import ValidationError
 
 from flow.link import LinkError, Record
-from links.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
+from links.runs.results import TRUTH_FILE, TRUTH_HITS_FILE, TRUTH_VEHICLE_FILE, TRUTH_VISIBLE_FILE
+from links.runs.truth import TruthLog
 from links.simulated.kernels.lidar import echoes
 from links.simulated.rig import run
 from links.simulated.rig.run import Simulation
@@ -22,7 +23,6 @@ from links.simulated.world.mesh import RayScene, box
 from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.scene import Scene, Truth, drone_shapes
 from links.simulated.world.vehicle import vehicle_mesh
-from links.truth import TruthLog
 from links.velodyne import Lidar
 
 STREET = FilePath(__file__).parents[4] / "configs/scenarios/street_sweep.yaml"

@@ -12,7 +12,7 @@ from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.scene import Scene, Truth, drone_shapes
 from links.simulated.world.vehicle import vehicle_mesh, vehicle_mesh_from_camera
 from links.simulated.world.weather import Weather
-from stages.geometry import LidarMount, Pose
+from stages.geometry.frames import LidarMount, Pose
 
 START_NS = 1_750_000_000_000_000_000
 HEIGHT_M = 1.8

@@ -12,7 +12,12 @@ from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSetting
 from links.simulated.sensors.vehicle_odometry import VehicleOdometry, VehicleOdometrySettings
 from links.simulated.world.motion import gauss_markov, interpolate, random_walk, rotations_from_vectors
 from links.simulated.world.path import Path, Waypoint
-from stages.geometry import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg, rotations_from_xyzw
+from stages.geometry.frames import (
+    quaternions_xyzw,
+    rotation_from_quaternion_xyzw,
+    rotation_from_rpy_deg,
+    rotations_from_xyzw,
+)
 
 NO_DRIFT = DriftSettings(
     scale=0,

@@ -9,7 +9,7 @@ from links.simulated.kernels.lidar import echoes
 from links.simulated.sensors.lidar import COARSE, FINE, FOOTPRINTS, Lidar, LidarSettings, sub_rays
 from links.simulated.world.mesh import RayScene, box, merge, quads
 from links.velodyne import vlp16
-from stages.geometry import rotation_from_rpy_deg, rotation_z
+from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 
 START_NS = 1_748_773_230_000_000_000
 SHARES = np.full(4, 0.25)

@@ -19,7 +19,7 @@ from links.simulated.world.movers import (
 from links.simulated.world.path import Path, Waypoint
 from links.simulated.world.scene import Scene, Truth
 from links.simulated.world.vehicle import vehicle_mesh
-from stages.geometry import rotation_z
+from stages.geometry.frames import rotation_z
 
 STILL = Path(waypoints=(Waypoint(t_s=0, xyz_m=(0, 0, -50)),))
 TIMES = np.arange(0.0, 60.0, 0.02)

@@ -13,7 +13,7 @@ from links.simulated.world.procedural import SceneSettings, world_mesh
 from links.simulated.world.procedural.parts import building_row, dashes
 from links.simulated.world.scene import Body, Scene, Truth, drone_shapes
 from links.simulated.world.vehicle import vehicle_mesh
-from stages.geometry import rotation_from_rpy_deg
+from stages.geometry.frames import rotation_from_rpy_deg
 
 
 def _rays(origin, directions):

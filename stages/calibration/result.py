@@ -1,0 +1,196 @@
+"""What may be told of a solution, and what not and why.
+
+A number is told when its sigma is below its limit. One that is not keeps the rig's value; since all numbers were free
+together, those that are told do not depend on it. The encoder's error is told as one curve over the angles swept: its
+terms look alike over half a turn, and its mean there cannot be told from a zero.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.calibration.parameters import PARAMETERS
+from stages.calibration.servo_mount import ORDERS, ServoMount
+from stages.calibration.solve import NAMES
+from stages.geometry.frames import Array64
+
+CURVE = tuple(f"{part}_{order}" for order in ORDERS for part in ("sin", "cos"))
+CURVE_LIMIT_RAD = math.radians(0.03)  # sigma of the curve, its mean taken out, root mean square over the sweep
+BLIND = 0.5  # of what was expected beforehand: so large a sigma means that nothing was seen of a number
+ALIKE = 0.9  # correlation of two numbers that a sweep cannot tell apart
+CURVE_POINTS = 181
+SAME_SPEED = 1.5  # speeds that differ by less than this factor are one
+MANY = 0.02  # share of the moving time that makes a speed, or a way round, one that was used
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One number before and after, in its unit; `refused` says why it stays as it was."""
+
+    name: str
+    what: str
+    unit: str
+    before: float
+    after: float
+    sigma: float
+    refused: str = ""
+
+
+@dataclass(frozen=True)
+class Travel:
+    """How the servo went."""
+
+    low_rad: float
+    high_rad: float
+    both_ways: bool
+    two_speeds: bool
+
+    @staticmethod
+    def of(position_rad: Array64, rate_radps: Array64) -> Travel:
+        """Of the positions and rates at the returns (n,)."""
+        known = np.isfinite(position_rad)
+        position, rate = position_rad[known], rate_radps[known]
+        speed = np.abs(rate)
+        moving = speed > 0.05 * max(float(speed.max(initial=0.0)), 1e-9)
+        up, down = float((rate[moving] > 0).mean()), float((rate[moving] < 0).mean())
+        slow, fast = np.quantile(speed[moving], [MANY + 0.1, 1 - MANY]).tolist()
+        return Travel(
+            low_rad=float(position.min()),
+            high_rad=float(position.max()),
+            both_ways=min(up, down) > MANY,
+            two_speeds=fast > SAME_SPEED * slow,
+        )
+
+    @property
+    def angle_rad(self) -> float:
+        """From end to end."""
+        return self.high_rad - self.low_rad
+
+
+def curve_rows(travel: Travel) -> Array64:
+    """(CURVE_POINTS, 4): the curve over the sweep, per term of CURVE."""
+    at = np.linspace(travel.low_rad, travel.high_rad, CURVE_POINTS)
+    return np.column_stack([f(order * at) for order in ORDERS for f in (np.sin, np.cos)])
+
+
+def curve_sigmas(covariance: Array64, travel: Travel) -> tuple[float, float]:
+    """Sigma [rad] of the curve without its mean (root mean square over the sweep), and of its mean."""
+    rows = curve_rows(travel)
+    chosen = [NAMES.index(name) for name in CURVE]
+    inner = covariance[np.ix_(chosen, chosen)]
+    mean = rows.mean(axis=0)
+    bent = rows - mean
+    return math.sqrt(float(np.einsum("ij,jk,ik->i", bent, inner, bent).mean())), math.sqrt(float(mean @ inner @ mean))
+
+
+def judge(rig: ServoMount, found: ServoMount, covariance: Array64, travel: Travel) -> tuple[Finding, ...]:
+    """A finding for each number of PARAMETERS, with those of CURVE judged together."""
+    before, after = values_of(rig, rig), values_of(found, rig)
+    sigma = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sigma, sigma)
+    curve_rad, _ = curve_sigmas(covariance, travel)
+    blind = unseen(travel)
+    findings: list[Finding] = []
+    for i, parameter in enumerate(PARAMETERS):
+        if parameter.name in CURVE:
+            sure = curve_rad < CURVE_LIMIT_RAD
+            limit = f"the curve's sigma is {math.degrees(curve_rad):.3f} deg, more than 0.03 deg"
+        elif parameter.name in blind:
+            sure, sigma[i] = False, parameter.expected * parameter.per_unit
+            limit = f"taken as {parameter.expected:g} {parameter.unit} uncertain"
+        else:
+            sure = sigma[i] < parameter.limit * parameter.per_unit
+            told = sigma[i] / parameter.per_unit
+            limit = f"sigma is {told:.3g} {parameter.unit}, more than {parameter.limit:g} {parameter.unit}"
+        refused = "" if sure else f"{blind.get(parameter.name) or _why(i, sigma, correlation)} ({limit})"
+        scale = 1 / parameter.per_unit
+        findings.append(
+            Finding(
+                parameter.name,
+                parameter.what,
+                parameter.unit,
+                before[parameter.name] * scale,
+                (after if sure else before)[parameter.name] * scale,
+                float(sigma[i]) * scale,
+                refused,
+            )
+        )
+    return tuple(findings)
+
+
+def values_of(mount: ServoMount, rig: ServoMount) -> dict[str, float]:
+    """Values of PARAMETERS, inside units; tilts are counted from the rig's LiDAR, places from its axis."""
+    tilt = mount.R_turntable_lidar @ rig.R_turntable_lidar.T
+    terms = {
+        f"{part}_{order}": mount.sin_cos_rad.get(order, (0.0, 0.0))[side]
+        for order in ORDERS
+        for side, part in enumerate(("sin", "cos"))
+    }
+    return {
+        "tilt_x": float(tilt[2, 1] - tilt[1, 2]) / 2,
+        "tilt_y": float(tilt[0, 2] - tilt[2, 0]) / 2,
+        "axis_x": float(mount.t_turntable_lidar_m[0]),
+        "axis_y": float(mount.t_turntable_lidar_m[1]),
+        **terms,
+        "play": mount.play_rad,
+        "time": mount.time_offset_s,
+        "zero": mount.zero_rad,
+    }
+
+
+def accepted(
+    rig: ServoMount, found: ServoMount, findings: tuple[Finding, ...], covariance: Array64, travel: Travel
+) -> ServoMount:
+    """The rig with the numbers that are told.
+
+    The curve's mean over the sweep turns everything as a zero does; where it is not sure, the zero takes it back, so
+    that the sweep as a whole points where it pointed before.
+    """
+    before, after = values_of(rig, rig), values_of(found, rig)
+    told = {f.name for f in findings if not f.refused}
+    step = {name: after[name] - before[name] for name in NAMES if name in told}
+    step["play"] = max(step.get("play", 0.0), -before["play"])  # less than none is none
+    _, mean_sigma = curve_sigmas(covariance, travel)
+    limit = next(p.limit * p.per_unit for p in PARAMETERS if p.name == "zero")
+    if told.issuperset(CURVE) and "zero" not in told and mean_sigma > limit:
+        turn = float(curve_rows(travel).mean(axis=0) @ np.array([step[name] for name in CURVE]))
+        step["zero"] = -rig.sign * turn
+    return rig.moved(step)
+
+
+def unseen(travel: Travel) -> dict[str, str]:
+    """What no scene can tell after such a travel, with the reason, for a person who can do something about it.
+
+    The few milliseconds in which a servo starts and stops are no second speed: the clock would be taken from how it
+    brakes.
+    """
+    found = {
+        "zero": "a turn of everything about the servo's axis leaves every surface thin, so no scene tells it: "
+        "measure it at the vehicle, or park parallel to a wall and say so (--parallel)"
+    }
+    if not travel.both_ways:
+        found["time"] = "the servo turned one way only, so a late clock looks like a zero: sweep there and back"
+        found["play"] = "the servo turned one way only, so the play never changed sides: sweep there and back"
+    elif not travel.two_speeds:
+        found["time"] = found["play"] = (
+            "the servo turned at one speed only, so a late clock and the play of the gear look alike: sweep at another "
+            "speed as well, or vibrate"
+        )
+    return found
+
+
+def _why(i: int, sigma: Array64, correlation: Array64) -> str:
+    """The reason why the scene does not show a number."""
+    if sigma[i] > BLIND * PARAMETERS[i].expected * PARAMETERS[i].per_unit:
+        if NAMES[i] in ("play", "time", *CURVE):
+            return "too little that stands upright was seen more than once, and level ground does not show a turn"
+        return "the surfaces seen more than once do not show it: walls in two directions would"
+    other = max((k for k in range(len(NAMES)) if k != i), key=lambda k: abs(float(correlation[i, k])))
+    if abs(float(correlation[i, other])) > ALIKE:
+        return f"in this scene it cannot be told from the {PARAMETERS[other].what}"
+    return "too few surfaces were seen more than once from angles that show it"

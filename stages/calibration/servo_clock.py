@@ -1,0 +1,232 @@
+"""How much the servo's clock is off the LiDAR's, while it runs, from surfaces that are seen in both directions.
+
+Where the servo's stamps are early by dt, a surface passed at the rate w is placed w dt away from where it is; passed
+back it is placed as far on the other side. Of some seconds in which the servo has passed the same angles both ways,
+the dt is taken under which what was seen twice is one thin surface: the least squares of `grd calibrate`
+(stages/calibration), with the mount's other numbers held near the rig's. Windows are then joined by a Kalman filter
+with a slow random walk. A window costs a fifth of a second of a core; so once the offset is known to 1 ms, only
+each `every_window`-th is taken.
+
+Told and not applied: people put it into the rig (`servo_time_offset_s`). Nothing is told of a window in which the
+vehicle moved, or the servo did not turn both ways. Play of the gear looks like a delay at one speed: the rig's
+`servo_play_deg` is believed to within `play_sigma_deg`. What the rig's numbers may be wrong by, all windows share: that
+part of sigma is kept apart, and no further window makes it smaller. Nor do windows with short, quick moves differ by
+chance alone: while our own aim moved the servo, simulated flights were off by .1 to .5 ms each, hence `floor_s`.
+
+Source: ours; the model is `stages/calibration/servo_mount.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from flow.stage import Settings, Stage
+from stages.calibration.parameters import PARAMETERS
+from stages.calibration.scan_passes import Returns, ServoTrace
+from stages.calibration.servo_mount import servo_mount
+from stages.calibration.solve import (
+    COARSE_RAD,
+    FINE_RAD,
+    INFLATION,
+    NAMES,
+    PRIOR,
+    System,
+    linearise,
+    one_step,
+    sandwich,
+)
+from stages.geometry.frames import Array64, LidarMount
+from stages.messages import LidarFirings, ServoOffset, ServoState, VehicleMotion
+
+TIME = NAMES.index("time")
+STEP_RAD = math.tau / 4096  # of the MX-28's encoder
+MOVING_RADPS = 0.1  # slower, a state says nothing of the direction
+BIN_RAD = math.radians(0.5)
+START_SIGMA_S = 0.02
+CLOSE_S = 1e-3  # with a sigma below, fewer rounds do, and fewer windows
+MOST_PLACES = 4096
+TRACE_NS = 500_000_000  # of servo states before a window
+AXIS_SIGMA_M = 3e-3
+FEWEST_PATCHES = 20
+OUTLIER = 5.0  # sigmas of a window from what the others say
+WALK_S = 5e-6  # of the offset in a second, one sigma
+
+
+class ServoClockSettings(Settings):
+    """Settings of `ServoClock`."""
+
+    mount: LidarMount
+    window_s: float = Field(3.0, ge=1, le=20)
+    every_packet: int = Field(12, ge=1, le=100)  # of the LiDAR's messages one in so many is taken
+    every_window: int = Field(
+        10, ge=1, le=1000
+    )  # of the windows this one is taken, once the offset is known to CLOSE_S
+    both_ways_deg: float = Field(5.0, gt=0)  # so much has to be passed in both directions
+    play_sigma_deg: float = Field(0.05, gt=0)  # how well the rig knows the gear's play
+    angle_sigma_deg: float = Field(0.05, gt=0)  # and the LiDAR's tilt and the encoder's error
+    floor_s: float = Field(3e-4, gt=0)  # no sigma is told below
+    moved_m: float = Field(0.03, gt=0)  # a vehicle that moved farther in a window was not parked
+    max_servo_gap_s: float = Field(0.1, gt=0)
+
+
+class ServoClock(Stage[ServoClockSettings]):
+    """The servo's time offset with its sigma, window by window. Wire `motion` where the vehicle has odometry."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion"})
+
+    def __init__(self, settings: ServoClockSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._firings: list[LidarFirings] = []
+        self._states: list[ServoState] = []
+        self._places: list[Array64] = []
+        self._packets: int = 0
+        self._offset_s: float = 0.0  # beyond the rig's
+        self._variance_s2: float = START_SIGMA_S**2
+        self._shared_s: float = 0.0  # sigma of what all windows have in common
+        self._windows: int = 0
+        self._known_ns: int | None = None
+        self._resting_until_ns: int = 0
+        settings = self.settings
+        angle_rad = math.radians(settings.angle_sigma_deg)
+        sigmas = {"axis_x": AXIS_SIGMA_M, "axis_y": AXIS_SIGMA_M, "time": START_SIGMA_S}
+        sigmas["play"] = math.radians(settings.play_sigma_deg)
+        self._prior, self._rig = PRIOR.copy(), servo_mount(settings.mount)
+        for i, parameter in enumerate(PARAMETERS):
+            self._prior[i, i] = sigmas.get(parameter.name, angle_rad) ** -2.0
+
+    def on_motion(self, motion: VehicleMotion) -> None:
+        """Where the vehicle is."""
+        if motion.stamp_ns < self._resting_until_ns:
+            self._places.clear()
+        self._places.append(motion.xyz_map_m)
+        del self._places[:-MOST_PLACES]
+
+    def on_servo(self, servo: ServoState) -> None:
+        """Where the servo is."""
+        if servo.stamp_ns < self._resting_until_ns - TRACE_NS:
+            return
+        if not self._states or servo.stamp_ns > self._states[-1].stamp_ns:
+            self._states.append(servo)
+        if self._states[-1].stamp_ns - self._states[0].stamp_ns > 3.0 * self.settings.window_s * 1e9 + 2 * TRACE_NS:
+            self._states, self._firings, self._places = [], [], self._places[-1:]  # the LiDAR is silent: begin anew
+
+    def on_firings(self, firings: LidarFirings) -> Iterator[ServoOffset]:
+        """Collect; with a whole window, what it says."""
+        settings = self.settings
+        if not settings.mount.turns or firings.pulse_stamp_ns.size == 0 or firings.stamp_ns < self._resting_until_ns:
+            return
+        self._packets += 1
+        if self._packets % settings.every_packet == 0:
+            self._firings.append(firings)
+        if self._firings and firings.stamp_ns - self._firings[0].stamp_ns > settings.window_s * 1e9:
+            reason = self._take_window()
+            if self._known_ns == self._firings[-1].stamp_ns and self._variance_s2 < CLOSE_S**2:
+                self._resting_until_ns = firings.stamp_ns + round((settings.every_window - 1) * settings.window_s * 1e9)
+            self._firings, self._places = [], self._places[-1:]
+            self._states = [s for s in self._states if s.stamp_ns > firings.stamp_ns - TRACE_NS]
+            yield self._told(firings.stamp_ns, reason)
+
+    def _told(self, stamp_ns: int, reason: str) -> ServoOffset:
+        settings = self.settings
+        known = self._windows > 0
+        sigma_s = math.sqrt(self._variance_s2 + self._shared_s**2 + settings.floor_s**2)
+        return ServoOffset(
+            stamp_ns=stamp_ns,
+            offset_s=settings.mount.servo_time_offset_s + self._offset_s if known else None,
+            sigma_s=sigma_s if known else None,
+            rig_s=settings.mount.servo_time_offset_s,
+            windows=self._windows,
+            reason=reason,
+        )
+
+    def _take_window(self) -> str:
+        """Use what was collected; why not, or what it said, in words."""
+        if len(self._places) > 1 and np.ptp(np.stack(self._places), axis=0).max() > self.settings.moved_m:
+            return "the vehicle moved"
+        states = self._states
+        if len(states) < 10:
+            return "too few servo states"
+        stamp_ns = np.array([s.stamp_ns for s in states])
+        position_rad = np.array([s.position_rad for s in states])
+        both_rad = both_ways_rad(stamp_ns, position_rad)
+        if both_rad < math.radians(self.settings.both_ways_deg):
+            return f"the servo passed {math.degrees(both_rad):.1f} deg in both directions, less than both_ways_deg"
+        found = self._solve(ServoTrace.of(stamp_ns, position_rad, STEP_RAD))
+        if found is None:
+            return "too few flat surfaces were seen"
+        return self._join(*found)
+
+    def _solve(self, trace: ServoTrace) -> tuple[float, float, float] | None:
+        """(offset beyond the rig's, its own sigma, and the one it shares with others) [s] of this window; None where
+        too little was seen.
+        """
+        hit = [(f, f.range_m > 0) for f in self._firings]
+        returns = Returns(
+            np.concatenate([f.pulse_stamp_ns[h] for f, h in hit]),
+            np.concatenate([f.laser[h] for f, h in hit]),
+            np.concatenate([f.xyz_lidar_m[h] for f, h in hit]).astype(np.float64),
+        )
+        close = self._variance_s2 < CLOSE_S**2
+        x, mount = np.zeros(len(self._prior)), self._rig
+        if close:  # from where the others say it is
+            x[TIME], mount = self._offset_s, mount.moved({"time": self._offset_s})
+        variance_s2, common_s2 = math.inf, 0.0
+        for tolerance_rad in (*(COARSE_RAD[2:] if close else COARSE_RAD), FINE_RAD, FINE_RAD):
+            system = linearise(returns, trace, mount, x[len(NAMES) :], tolerance_rad, self.settings.max_servo_gap_s)
+            if system is None or len(system.patches.first) < FEWEST_PATCHES:
+                return None
+            step = one_step(system, x, self._prior)
+            x, mount = x + step, mount.moved(dict(zip(NAMES, step.tolist(), strict=False)))
+            if tolerance_rad == FINE_RAD:
+                covariance = sandwich(system, returns.stamp_ns[system.chosen], self._prior)
+                common_s2 = shared_s2(system, self._prior)
+                variance_s2 = float(covariance[TIME, TIME]) - INFLATION**2 * common_s2
+        return float(x[TIME]), math.sqrt(variance_s2), math.sqrt(common_s2)
+
+    def _join(self, found_s: float, own_s: float, shared_s: float) -> str:
+        """x <- x + K (z - x), K = P / (P + R), after P <- P + q dt; P and R without what windows share."""
+        now_ns = self._firings[-1].stamp_ns
+        if self._known_ns is not None:
+            self._variance_s2 += WALK_S**2 * (now_ns - self._known_ns) * 1e-9
+        self._known_ns = now_ns
+        alone_s, sigma_s = self.settings.mount.servo_time_offset_s + found_s, math.hypot(own_s, shared_s)
+        said = f"{1e3 * alone_s:.2f} ms, sigma {1e3 * sigma_s:.2f} ms"
+        total_s2 = self._variance_s2 + own_s**2
+        if self._windows and (found_s - self._offset_s) ** 2 > OUTLIER**2 * (
+            total_s2 + shared_s**2 + self.settings.floor_s**2
+        ):
+            self._variance_s2 += (found_s - self._offset_s) ** 2 / OUTLIER**2  # if it stays there it will be believed
+            return f"this window disagrees: {said}"
+        gain = self._variance_s2 / total_s2
+        self._offset_s += gain * (found_s - self._offset_s)
+        self._shared_s += gain * (shared_s - self._shared_s)
+        self._variance_s2 *= 1.0 - gain
+        self._windows += 1
+        return f"this window alone: {said}"
+
+
+def shared_s2(system: System, prior: Array64) -> float:
+    """What of the offset's variance the rig's other numbers bring, which are as wrong in the next window.
+
+    Off by e ~ P^-1 they move the offset by (B P e)_t: variance (B P B)_tt with B = (J^T J / v + P)^-1; the time's own
+    P is none of them.
+    """
+    J, v = system.columns, system.variance_factor
+    others = prior.copy()
+    others[TIME, TIME] = 0.0
+    row = np.linalg.inv(J.T @ J / v + prior)[TIME]
+    return float(row @ others @ row)
+
+
+def both_ways_rad(stamp_ns: np.ndarray, position_rad: Array64) -> float:
+    """How many angles a servo passed upwards as well as downwards, from its states (n,)."""
+    position_rad = np.unwrap(position_rad)
+    rate = np.gradient(position_rad, stamp_ns * 1e-9)
+    number = np.floor(position_rad / BIN_RAD).astype(np.int64)
+    up, down = number[rate > MOVING_RADPS], number[rate < -MOVING_RADPS]
+    return BIN_RAD * len(np.intersect1d(up, down))

@@ -1,0 +1,142 @@
+"""From pulses to sightings: the short, free-ended chords of one look on one thing, and what was measured around it.
+
+A sighting is complete when the rotor has gone on: what stands around a place is known `DELAY_NS` later.
+
+Source: ours; DESIGN, The graph: detect.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from typing import NamedTuple
+
+import numpy as np
+
+from stages.detect.candidate import Sighting
+from stages.detect.chords import ChordFinder
+from stages.detect.isolation import BigThings
+from stages.detect.pulse_buffer import MOST_SLICES, Lately
+from stages.geometry.frames import Array64
+from stages.kernels.detect.observations import BIG, SMALL, kinds_of, one_thing, places_of_kind, round_and_rugged
+from stages.kernels.detect.pulse_buffer import WINDOW_NS
+from stages.kernels.sweep.pulses import HOLE, LONGEST, STEP
+from stages.messages import SweptPulses
+from stages.sweep.pulses import middle_ns
+
+BEAM_SPACING_RAD = math.radians(2.0)  # between two lasers of a VLP-16
+DELAY_NS = 3_300_000  # after which what stands around a sighting has been seen
+MEMORY_NS = 3_000_000_000  # of big things, when the vehicle tells how it moves
+SHORT_MEMORY_NS = 1_000_000_000  # when it does not
+
+
+class Slice(NamedTuple):
+    """A packet's pulses, or those of a few in a row, and where the vehicle was."""
+
+    pulses: SweptPulses
+    R: Array64  # R_map_vehicle, t_map_vehicle
+    t: Array64
+    axis: Array64  # mean direction, unit
+
+
+class Limits(NamedTuple):
+    """Where a sighting may be."""
+
+    span_m: float
+    lowest_rad: float  # over the LiDAR's horizon
+    nearest_m: float
+    furthest_m: float
+    clear_m: float
+
+
+class _Kept(NamedTuple):
+    middle_ns: int
+    end_ns: int
+    R: Array64
+    t: Array64
+
+
+class _Chord(NamedTuple):
+    found_ns: int  # the end of the slice it was found in
+    row: Array64
+    place_m: tuple[float, ...]  # its middle
+    stamp_ns: int
+
+
+class SightingFinder:
+    """Feed it slices in order of time; it keeps the last few, and where big things stand."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        span_m = limits.span_m
+        self._chords = ChordFinder(LONGEST * span_m, STEP * span_m, HOLE * span_m)
+        self._big = BigThings()
+        self._slices: deque[_Kept] = deque(maxlen=MOST_SLICES)
+        self._lately = Lately()
+        self._waiting: list[_Chord] = []
+        self.hidden: Counter[str] = Counter()  # short chords that were not free at both ends
+
+    def feed(self, part: Slice, motion_known: bool) -> list[Sighting]:
+        """The sightings that are complete with this slice."""
+        now_ns = int(part.pulses.point_stamp_ns[-1])
+        while self._slices and now_ns - self._slices[0].end_ns > WINDOW_NS:
+            self._slices.popleft()
+        self._slices.append(_Kept(middle_ns(part.pulses), now_ns, part.R, part.t))
+        self._lately.add(part.pulses, part.axis, now_ns)
+        self._find(part, now_ns)
+        if not self._waiting or now_ns - self._waiting[0].found_ns < DELAY_NS:
+            return []
+        ready = [c for c in self._waiting if now_ns - c.found_ns >= DELAY_NS]
+        self._waiting = self._waiting[len(ready) :]
+        found: list[Sighting] = []
+        while ready:
+            first = ready[0].place_m
+            near = [math.dist(c.place_m, first) <= 1.2 * self._limits.span_m for c in ready]
+            found.append(self._sighting([c for c, same in zip(ready, near, strict=True) if same], motion_known))
+            ready = [c for c, same in zip(ready, near, strict=True) if not same]
+        return found
+
+    def _find(self, part: Slice, now_ns: int) -> None:
+        limits, pulses = self._limits, part.pulses
+        found = self._chords.feed(pulses)
+        rows = found.rows
+        if not len(rows):
+            return
+        kinds = np.empty(len(rows), dtype=np.int64)
+        big, small, hidden = kinds_of(rows, pulses.origin_vehicle_m[2], *limits, kinds)
+        if big:
+            self._big.add(places_of_kind(rows, kinds, BIG, big, part.R, part.t), pulses.stamp_ns)
+        if hidden:
+            self.hidden["hidden at an end by something nearer"] += hidden
+        if small:
+            for i in np.nonzero(kinds == SMALL)[0].tolist():
+                half_way_ns = int(found.first_ns[i] + found.last_ns[i]) // 2
+                self._waiting.append(_Chord(now_ns, rows[i], tuple(rows[i, :3].tolist()), half_way_ns))
+
+    def _sighting(self, same: list[_Chord], motion_known: bool) -> Sighting:
+        span_m = self._limits.span_m
+        rows, stamp_ns = np.array([c.row for c in same]), same[0].stamp_ns
+        away_ns = [abs(kept.middle_ns - stamp_ns) for kept in self._slices]
+        then = self._slices[away_ns.index(min(away_ns))]
+        middle, local, hits, range_m, extent_m = one_thing(rows, then.R, then.t)
+        balls, rugged = round_and_rugged(rows)
+        since_ns = stamp_ns - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
+        return Sighting(
+            stamp_ns=stamp_ns,
+            xyz_map_m=local,
+            vehicle_map_m=then.t,
+            range_m=range_m,
+            hits=hits,
+            too_long=extent_m > 1.3 * span_m,
+            balls=balls,
+            rugged=rugged,
+            around=self._around(middle, range_m),
+            big_m=self._big.nearest_m(local, 1.1 * span_m, self._limits.clear_m, since_ns),
+        )
+
+    def _around(self, middle_m: Array64, range_m: float) -> Array64:
+        """What the last slices measured about a place of the vehicle frame: (TALLY,)."""
+        span_m = self._limits.span_m
+        close_m = max(2.4 * span_m, 1.15 * BEAM_SPACING_RAD * range_m)  # two beams wide at least
+        outer_m = max(self._limits.clear_m, 1.5 * BEAM_SPACING_RAD * range_m)
+        return self._lately.around(middle_m, 0.3 * span_m, 1.1 * span_m, close_m, outer_m, 0.5)

@@ -1,0 +1,101 @@
+"""What may be said of a pose: the state with its reason, and whether it jumped.
+
+    LOST            no position, or its sigma or age is beyond the limit
+    POSITION_ONLY   the LiDAR sees the drone, its yaw is not known
+    AMBIGUOUS       as before; a rotation is told, up to quarter turns, or two tell different ones
+    FULL            position and rotation
+    COASTING        the same, but the LiDAR has not seen the drone for a while: its odometry carries the pose
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.fuse.estimator import Estimator
+from stages.fuse.measurement_covariance import Known
+from stages.fuse.settings import FuseLimits
+from stages.heading.fused_heading import STREETS_NS
+from stages.kernels.geometry.so3 import log_rotation
+from stages.messages import PoseState
+
+JUMP_MPS2, JUMP_RAD_PER_S = 10.0, 4.0  # what a drone can do between two outputs
+
+
+def state_of(
+    known: Known | None, estimator: Estimator, limits: FuseLimits, now_ns: int, tracker: str, doubt: str
+) -> tuple[PoseState, str]:
+    """The state, and why. `tracker`: what it says; `doubt`: why a rotation that is told is not believed, or empty."""
+    e = estimator
+    fix_ns = e.positions.fix_ns
+    if known is None or fix_ns is None:
+        if e.newest_fix_ns is None:
+            return PoseState.LOST, tracker
+        return PoseState.LOST, f"no LiDAR position for {(now_ns - e.newest_fix_ns) * 1e-9:.1f} s; {tracker}"
+    age_s = (now_ns - fix_ns) * 1e-9
+    worst_m = math.sqrt(float(np.linalg.eigvalsh(known.covariance[3:, 3:])[-1]))
+    if age_s > limits.lost_after_s:
+        return PoseState.LOST, f"no LiDAR position for {age_s:.1f} s"
+    if not worst_m <= limits.lost_sigma_m:
+        return PoseState.LOST, f"position known to {worst_m:.1f} m only, {age_s:.1f} s after the last by LiDAR"
+    unseen = f"; the LiDAR has not seen it for {age_s:.1f} s" if age_s > limits.coast_after_s else ""
+    if known.R_map_drone is None:
+        if e.north.heading.contradiction:
+            return PoseState.AMBIGUOUS, e.north.heading.contradiction + unseen
+        if doubt:
+            return PoseState.AMBIGUOUS, doubt + unseen
+        if e.on_trial and e.north.known(now_ns) is not None:
+            return PoseState.POSITION_ONLY, f"found elsewhere: does it move as the drone says it does?{unseen}"
+        return PoseState.POSITION_ONLY, f"heading not known: {e.north.by_motion.reason}{unseen}"
+    if unseen:
+        return PoseState.COASTING, f"carried by odometry{unseen}"
+    return PoseState.FULL, _why_rotation(e)
+
+
+def _why_rotation(estimator: Estimator) -> str:
+    """Who tells the rotation."""
+    if estimator.from_streets:
+        return "rotation by both cameras"
+    streets_ns, seen = estimator.streets_ns, estimator.north.by_motion.reason
+    cameras = streets_ns is not None and estimator.chain.back.stamp_ns - streets_ns < STREETS_NS
+    return f"rotation by {'both cameras and ' if cameras else ''}the drone's motion; {seen}"
+
+
+def why_unbacked(estimator: Estimator, stamp_ns: int) -> str:
+    """Why the streets' rotation, RESOLVED, is not believed, and what helps."""
+    if not estimator.motions.still(stamp_ns):
+        return "the streets' rotation is not believed: how the vehicle moves is not told, so no motion can agree"
+    seen = estimator.north.by_motion.reason
+    return f"the streets' rotation waits for the drone's motion to agree: fly some metres, any way; {seen}"
+
+
+class Jumps:
+    """Counts poses that are not where the one before, carried on, would be: the autopilot has to be told."""
+
+    def __init__(self, limits: FuseLimits) -> None:
+        self._limits = limits
+        self._last: Known | None = None
+        self._resets_told = 0
+        self.number = 0
+
+    def lost(self) -> None:
+        """No pose any more: where it is found again is not where it was."""
+        self.number += self._last is not None
+        self._last = None
+
+    def see(self, known: Known, resets: int) -> None:
+        """One more pose; `resets` of the estimator are counted there already."""
+        last, told = self._last, self._resets_told
+        self._last, self._resets_told = known, resets
+        if last is None or resets > told:
+            return
+        dt = (known.stamp_ns - last.stamp_ns) * 1e-9
+        off_m = float(np.linalg.norm(known.xyz_map_m - last.xyz_map_m - dt * last.velocity_map_mps))
+        jumped = off_m > self._limits.jump_m + JUMP_MPS2 * dt**2
+        if known.R_map_drone is not None and last.R_map_drone is not None:
+            turned = float(np.linalg.norm(log_rotation(last.R_map_drone.T @ known.R_map_drone)))
+            jumped |= turned > math.radians(self._limits.jump_deg) + JUMP_RAD_PER_S * dt
+        self.number += jumped

@@ -1,0 +1,45 @@
+"""Rigid motions as (R, t) and their covariances: rotation before translation, tangent at the body: T exp(xi).
+
+Source: Sola, Deray, Atchuthan, A micro Lie theory (2018), III.C; ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.geometry.frames import Array64
+from stages.kernels.geometry.so3 import hat
+
+
+def adjoint(R: Array64, t: Array64) -> Array64:
+    """Ad (6, 6) of (R, t), rotation first: [[R, 0], [[t]x R, R]]."""
+    A = np.zeros((6, 6))
+    A[:3, :3], A[3:, 3:], A[3:, :3] = R, R, hat(np.ascontiguousarray(t)) @ R
+    return A
+
+
+def carried_covariance(P: Array64, R_step: Array64, t_step_m: Array64, Q: Array64) -> Array64:
+    """Covariance (6, 6) of T D, D = (R, t) with covariance Q, from that of T: Ad(D^-1) P Ad(D^-1)^T + Q."""
+    A = np.zeros((6, 6))
+    A[:3, :3] = R_step.T
+    A[3:, 3:] = R_step.T
+    A[3:, :3] = -R_step.T @ hat(t_step_m)
+    moved = A @ P @ A.T + Q
+    return 0.5 * (moved + moved.T)
+
+
+def position_covariance(P: Array64, R: Array64) -> Array64:
+    """(3, 3) of the position, in the axes that R leads to."""
+    return R @ P[3:, 3:] @ R.T
+
+
+def distance2(e: Array64, S: Array64) -> float:
+    """e^T S^-1 e: chi-square distributed where S is the covariance of e."""
+    return float(e @ np.linalg.solve(S, e))
+
+
+def good_covariance(P: Array64) -> bool:
+    """Whether a matrix is finite, symmetric and positive definite."""
+    if not np.isfinite(P).all() or np.abs(P - P.T).max() > 1e-6 * np.abs(P).max():
+        return False
+    return bool(np.linalg.eigvalsh(P)[0] > 0)

@@ -1,0 +1,53 @@
+"""How far the drone's odometry is turned, while no street is known: headings all round the circle.
+
+The windows that tell branches apart (bank.py) weigh them too. Where streets run at many angles, the heading by motion
+tells which of them both cameras see.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.frames import Array64
+from stages.heading.hypothesis_bank import BranchBank, BranchSettings
+
+HEADING_STEP_DEG = 2.5
+NONSENSE_LIKELY = 0.01
+WORST_HEADING_RAD = math.radians(4.0)  # one sigma: streets are 14 deg and more apart
+
+
+@dataclass(frozen=True)
+class Heading:
+    """How far the odometry has to be turned, on the whole circle."""
+
+    turn_rad: float
+    sigma_rad: float
+
+
+class HeadingBank(BranchBank):
+    """The same evidence while no street is known: any heading is alike at first, in steps of HEADING_STEP_DEG."""
+
+    HYPOTHESES = round(360 / HEADING_STEP_DEG)
+
+    def __init__(self, settings: BranchSettings) -> None:
+        super().__init__(settings, self.HYPOTHESES)
+
+    def _first(self, none: float) -> Array64:
+        """Weights (h + 1,): all headings, then nonsense."""
+        return np.append(np.full(len(self._R), (1 - none) / len(self._R)), none)
+
+    @property
+    def heading(self) -> Heading | None:
+        """Their mean; None while they are spread too far, too few windows have spoken, or nonsense is likely."""
+        weight = self._weight[:-1]
+        if self.windows < self.settings.least_windows or self._weight[-1] > NONSENSE_LIKELY:
+            return None
+        mean = complex((weight * np.exp(1j * self._turns_rad)).sum() / weight.sum())
+        sigma_rad = math.sqrt(-2.0 * math.log(min(abs(mean), 1.0))) if abs(mean) > 0.5 else math.inf
+        sigma_rad = math.hypot(sigma_rad, math.radians(HEADING_STEP_DEG) / math.sqrt(12.0))
+        return Heading(math.atan2(mean.imag, mean.real), sigma_rad) if sigma_rad < WORST_HEADING_RAD else None

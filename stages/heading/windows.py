@@ -1,0 +1,198 @@
+"""The drone's displacements told twice, by the LiDAR and by its own odometry, window by window without overlap.
+
+A window runs from one handful of fixes to a later one, as soon as the drone is `baseline_m` away and that is well
+above the fixes' noise. Fixes of a handful are brought together along the way the odometry tells, which each branch
+turns its own way, and their median is taken: one false fix does no harm.
+
+Source: ours; DESIGN, Yaw branch: non-overlapping windows, baseline >= 0.4 m.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.frames import Array64
+from stages.heading.hypothesis_bank import ASKEW, Displacement, turns
+from stages.messages import DroneFix, VisualMotion
+from stages.odometry.drone.trajectory import AutopilotTrail
+
+HANDFUL = 3  # fixes
+HANDFUL_NS = 400_000_000
+LONGEST_S = 20.0  # a drone that hardly moves starts a new window
+CLEAR = 3.0  # sigmas of the fixes' noise that a displacement must have
+FIX_FLOOR_M = 0.04  # no handful is placed better
+STRAIGHT = 0.7  # way told by directions alone: as the crow flies over flown
+COVERED = 0.8  # of a window, by pictures
+PICTURES_LATE_NS = 500_000_000  # a window that is long enough waits so long for the pictures of its end
+SLACK_M = 0.6  # the LiDAR may see so much more way than the odometry before that alone is a window
+
+
+@dataclass(frozen=True)
+class _Fix:
+    stamp_ns: int
+    xyz_map_m: Array64
+    covariance_m2: Array64  # (2, 2) start frame, horizontal
+    own: tuple[Array64, int] | None  # where the odometry had the drone
+
+
+@dataclass(frozen=True)
+class _Handful:
+    stamp_ns: int
+    fixes: tuple[_Fix, ...]
+
+    @property
+    def covariance_m2(self) -> Array64:
+        """(2, 2) of the median; errors of neighbouring fixes are alike, three are worth two."""
+        mean = np.mean([f.covariance_m2 for f in self.fixes], axis=0)
+        return mean / min(len(self.fixes), 2) + FIX_FLOOR_M**2 * np.eye(2)
+
+
+class Windows:
+    """Collects fixes and steps; `close` tells the displacement since the last window, once it is long enough."""
+
+    def __init__(self, baseline_m: float, hypotheses: int = ASKEW) -> None:
+        """`hypotheses` round the circle, as the bank has that is told."""
+        self._baseline_m = baseline_m
+        self._R = turns(hypotheses)
+        self._recent: deque[_Fix] = deque(maxlen=HANDFUL)
+        self._start: _Handful | None = None
+        self._waiting: _Handful | None = None  # the end of a window whose pictures are still to come
+        self._track: int | None = None
+        self._steps: deque[VisualMotion] = deque(maxlen=512)
+
+    def restart(self) -> None:
+        """Nothing before now counts."""
+        self._recent.clear()
+        self._start = self._waiting = None
+
+    def add_step(self, motion: VisualMotion) -> None:
+        """A step of the odometry by pictures: its direction."""
+        self._steps.append(motion)
+
+    def add_fix(self, fix: DroneFix, R_map_vehicle: Array64, t_map_vehicle_m: Array64, own: AutopilotTrail) -> None:
+        """A fix, with where the vehicle was; one of another track starts anew."""
+        if fix.track_id != self._track or (self._recent and fix.stamp_ns <= self._recent[-1].stamp_ns):
+            self.restart()
+        self._track = fix.track_id
+        covariance = R_map_vehicle @ fix.covariance_m2 @ R_map_vehicle.T
+        self._recent.append(
+            _Fix(
+                fix.stamp_ns,
+                R_map_vehicle @ fix.xyz_vehicle_m + t_map_vehicle_m,
+                covariance[:2, :2],
+                own.place(fix.stamp_ns),
+            )
+        )
+        if self._start is None and len(self._recent) == HANDFUL:
+            self._start = self._handful()
+
+    def close_metric(self, R_map_own: Array64, bearing_rad: float) -> Displacement | None:
+        """The window since the last, told by the autopilot's positions; R_map_own is branch 0's."""
+        start, end = self._ends()
+        if start is None or end is None:
+            return None
+        stretches = {f.own[1] if f.own else None for f in start.fixes + end.fixes}
+        if len(stretches) != 1 or None in stretches:
+            self._begin_at(end)
+            return None
+        anchor = own_m(start.fixes[0])
+        told = [[(R_map_own @ (own_m(f) - anchor))[:2] for f in h.fixes] for h in (start, end)]
+        middle = [np.mean(t, axis=0) for t in told]
+        odometry = middle[1] - middle[0]
+        left = [  # of the fixes, when the way told is taken off as each hypothesis turns it
+            np.median(np.array([f.xyz_map_m[:2] for f in h.fixes]) - np.array(t) @ np.swapaxes(self._R, 1, 2), axis=1)
+            for h, t in zip((start, end), told, strict=True)
+        ]
+        lidar = left[1] - left[0] + self._R @ odometry
+        noise = start.covariance_m2 + end.covariance_m2
+        length, sigma = float(np.linalg.norm(odometry)), math.sqrt(0.5 * float(np.trace(noise)))
+        seen = float(np.linalg.norm(lidar, axis=1).min())
+        long = length >= max(self._baseline_m, CLEAR * sigma)
+        if not long and seen < self._baseline_m + SLACK_M + CLEAR * sigma:
+            return None
+        self._begin_at(end)
+        return Displacement(start.stamp_ns, end.stamp_ns, lidar, noise, odometry, bearing_rad, True)
+
+    def close_bearing(self, R_map_drone: dict[int, Array64], bearing_rad: float) -> Displacement | None:
+        """The window since the last, told by directions between pictures; R_map_drone by from_ns is branch 0's."""
+        start, end = self._ends()
+        if start is None or end is None:
+            return None
+        newest_ns, end = end.stamp_ns, self._waiting or end
+        way = median_m(end) - median_m(start)
+        noise = start.covariance_m2 + end.covariance_m2
+        if float(np.linalg.norm(way)) < max(self._baseline_m, CLEAR * math.sqrt(0.5 * float(np.trace(noise)))):
+            return None
+        pictures_ns = self._steps[-1].stamp_ns if self._steps else 0
+        if pictures_ns < end.stamp_ns and newest_ns - end.stamp_ns < PICTURES_LATE_NS:
+            self._waiting = end
+            return None
+        self._begin_at(end)
+        flown, covered, flew, sigma = np.zeros(3), 0.0, 0.0, 0.0
+        for step, overlap in self._keys_steps(start.stamp_ns, end.stamp_ns):
+            if step.from_ns not in R_map_drone:
+                continue
+            covered += overlap
+            if step.direction_from is not None and step.direction_sigma_rad is not None:
+                flown += overlap * (R_map_drone[step.from_ns] @ step.direction_from)
+                flew += overlap
+                sigma = max(sigma, step.direction_sigma_rad)
+        flat = float(np.linalg.norm(flown[:2]))
+        if covered < COVERED * (end.stamp_ns - start.stamp_ns) or flat < STRAIGHT * max(flew, 1.0):
+            return None
+        lidar = np.tile(way, (len(self._R), 1))
+        return Displacement(
+            start.stamp_ns, end.stamp_ns, lidar, noise, flown[:2] / flat, math.hypot(sigma, bearing_rad), False
+        )
+
+    def _keys_steps(self, start_ns: int, end_ns: int) -> list[tuple[VisualMotion, int]]:
+        """One step of each key picture, with how much of the window [ns] it covers: most, and as little else."""
+        best: dict[int, tuple[VisualMotion, int]] = {}
+        for step in self._steps:  # those of one key from short to long: each covers what those before it do
+            overlap = min(step.stamp_ns, end_ns) - max(step.from_ns, start_ns)
+            if overlap > 0 and (step.from_ns not in best or overlap > best[step.from_ns][1]):
+                best[step.from_ns] = step, overlap
+        return list(best.values())
+
+    def steps_since_start(self) -> list[int]:
+        """from_ns of the steps that the open window may need."""
+        if self._start is None:
+            return []
+        return [step.from_ns for step in self._steps if step.stamp_ns > self._start.stamp_ns]
+
+    def _begin_at(self, handful: _Handful) -> None:
+        """The next window's start."""
+        self._start, self._waiting = handful, None
+
+    def _handful(self) -> _Handful:
+        fixes = tuple(self._recent)
+        return _Handful(fixes[len(fixes) // 2].stamp_ns, fixes)
+
+    def _ends(self) -> tuple[_Handful | None, _Handful | None]:
+        """The open window's start, and its end if there are enough new fixes close together."""
+        recent = self._recent
+        if self._start is None or len(recent) < HANDFUL:
+            return None, None
+        if recent[0].stamp_ns <= self._start.fixes[-1].stamp_ns:
+            return self._start, None
+        if recent[-1].stamp_ns - recent[0].stamp_ns > HANDFUL_NS:
+            return self._start, None
+        if (recent[-1].stamp_ns - self._start.stamp_ns) * 1e-9 > LONGEST_S:
+            self._begin_at(self._handful())
+            return self._start, None
+        return self._start, self._handful()
+
+
+def own_m(fix: _Fix) -> Array64:
+    """Where the odometry had the drone at a fix that it covers."""
+    assert fix.own is not None
+    return fix.own[0]
+
+
+def median_m(handful: _Handful) -> Array64:
+    """(2,) horizontal."""
+    return np.median([f.xyz_map_m[:2] for f in handful.fixes], axis=0)

@@ -1,0 +1,32 @@
+"""Compiled functions of `stages/detect/candidate.py`.
+
+Source: see there.
+"""
+
+from __future__ import annotations
+
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
+from stages.kernels.detect.isolation import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
+
+OPEN_LOOKS = 3  # a sector free in so many looks holds nothing up: what stands behind it is something else
+SIGMA_M = 0.15  # of a sighting
+ACCELERATION_MPS2 = 4.0
+
+
+@compiled
+def what_stands_beside(around: Array64, free: Array64) -> tuple[float, bool]:
+    """How sure it is that something stands beside it, by one look (TALLY,), and whether half of the sectors were seen.
+
+    Adds the sectors that are free in this look to free (SECTORS,).
+    """
+    seen, taken, farther, behind = 0, False, False, False
+    for k in range(SECTORS):
+        free[k] += around[FREE_0 + k] >= 2
+        seen += around[FREE_0 + k] >= 1
+        taken |= around[OCCUPIED_0 + k] >= 1
+        if around[FARTHER_0 + k] >= 1 and free[k] < OPEN_LOOKS:
+            farther = True
+            behind |= around[FREE_0 + k] < 1
+    standing = 1.0 if taken else (0.5 if behind else (0.15 if farther else 0.0))
+    return standing, seen >= SECTORS // 2

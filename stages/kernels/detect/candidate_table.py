@@ -1,0 +1,118 @@
+"""Compiled functions of `stages/detect/candidate_table.py`.
+
+Source: see there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
+from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M
+from stages.kernels.detect.isolation import INNER_HITS, INNER_PASSES, TALLY, look_around
+
+FURTHEST_STEP_M = 2.5  # from where it was expected
+MOST_COST = 9.0  # of a sighting: squared sigmas
+SEEN_LATELY_NS = 1_500_000_000  # later nobody knows where a miss would be
+FAN_COS = 0.93  # a slice covers less to each side of its middle
+X, Y, Z, VX, VY, VZ, P_X, P_XV, P_V = range(9)  # [m], [m/s] in the local frame, and their variances
+STAMP, SEEN = 0, 1  # [ns]
+NOTHING, NEAR, ELSEWHERE = 0, 1, 2  # of a candidate: nothing to say; pulses near its middle; the fan is elsewhere
+
+
+@compiled
+def first_within(places_m: Array64, xyz_m: Array64, reach_m: float) -> int:
+    """The first of places (n, 3) within reach of one (3,); -1 when none is."""
+    for k in range(places_m.shape[0]):
+        x, y, z = places_m[k, 0] - xyz_m[0], places_m[k, 1] - xyz_m[1], places_m[k, 2] - xyz_m[2]
+        if math.sqrt(x * x + y * y + z * z) < reach_m:
+            return k
+    return -1
+
+
+@compiled
+def predicted(state: Array64, dt_s: float) -> tuple[float, float, float, float]:
+    """Place x, y, z [m] and its variance [m^2] of a row of the table after dt_s."""
+    variance = state[P_X] + 2 * dt_s * state[P_XV] + dt_s * dt_s * state[P_V]
+    variance += (ACCELERATION_MPS2 * dt_s * dt_s) ** 2 / 4
+    return state[X] + dt_s * state[VX], state[Y] + dt_s * state[VY], state[Z] + dt_s * state[VZ], variance
+
+
+@compiled
+def nearest_row(
+    state: Array64,
+    ns: NDArray[np.int64],
+    joined: NDArray[np.bool_],
+    rows: int,
+    asked: bool,
+    stamp_ns: int,
+    xyz_m: Array64,
+) -> int:
+    """Row of the candidate, joined or not as asked, whose prediction is nearest to a sighting, in sigmas; -1: of none.
+
+    Of the table the first `rows` count.
+    """
+    best, least = -1, MOST_COST
+    for row in range(rows):
+        if joined[row] != asked or stamp_ns < ns[row, STAMP]:
+            continue
+        x, y, z, variance = predicted(state[row], (stamp_ns - ns[row, STAMP]) * 1e-9)
+        away2 = (xyz_m[0] - x) ** 2 + (xyz_m[1] - y) ** 2 + (xyz_m[2] - z) ** 2
+        cost = away2 / (variance + SIGMA_M**2)
+        if cost < least and away2 < FURTHEST_STEP_M**2:
+            best, least = row, cost
+    return best
+
+
+@compiled
+def look_at_all(
+    state: Array64,
+    ns: NDArray[np.int64],
+    told: NDArray[np.bool_],
+    rows: int,
+    now_ns: int,
+    R: Array64,
+    t: Array64,
+    axis: Array64,
+    origin_m: Array64,
+    direction: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    disc_m: float,
+    most_variance: float,
+    found: NDArray[np.int64],
+) -> int:
+    """Fill found (rows, 3) with NOTHING, NEAR or ELSEWHERE, and the pulses of a slice that hit and passed each middle.
+
+    Returns of how many there is something to say. R, t are T_map_vehicle of the slice, axis (3,) its mean direction,
+    direction (k, 3) and range (k,) its pulses.
+    """
+    tally, away, centre = np.zeros(TALLY, dtype=np.int64), np.empty(3), np.empty(3)
+    said = 0
+    for row in range(rows):
+        found[row] = 0
+        if not told[row] or now_ns - ns[row, SEEN] > SEEN_LATELY_NS:
+            continue
+        away[0], away[1], away[2], variance = predicted(state[row], (now_ns - ns[row, STAMP]) * 1e-9)
+        if variance > most_variance:
+            continue
+        away -= t
+        length2 = ahead = 0.0
+        for k in range(3):
+            along = R[0, k] * away[0] + R[1, k] * away[1] + R[2, k] * away[2] - origin_m[k]
+            centre[k] = along + origin_m[k]
+            length2 += along * along
+            ahead += along * axis[k]
+        length = math.sqrt(length2)
+        if length > 0.5 and ahead > length * FAN_COS:
+            tally[INNER_HITS] = tally[INNER_PASSES] = 0
+            look_around(direction, range_m, origin_m, centre, disc_m, math.inf, math.inf, disc_m, 1.0, tally)
+            found[row, 1], found[row, 2] = tally[INNER_HITS], tally[INNER_PASSES]
+            found[row, 0] = NEAR if tally[INNER_HITS] + tally[INNER_PASSES] > 0 else NOTHING
+        else:
+            found[row, 0] = ELSEWHERE
+        said += found[row, 0] != NOTHING
+    return said

@@ -1,0 +1,194 @@
+"""Compiled functions of `stages/detect/chords.py`.
+
+Source: see there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
+
+# What an open chord remembers, a row per laser.
+(
+    HITS,  # 0: no chord is open
+    SUM_X, SUM_Y, SUM_Z,  # of its points [m]
+    FIRST_X, FIRST_Y, FIRST_Z,
+    LAST_X, LAST_Y, LAST_Z,
+    LAST_RANGE,
+    LEAST_RANGE, MOST_RANGE,
+    REFLECTIVITY,  # sum
+    MISSED,  # pulses since the last hit
+    HOLES,  # pulses between hits that were no hits
+    FREE_BEFORE,  # 1: the pulse before the first went farther or returned nothing
+    TOLD,  # 1: too long, already told
+    BEFORE,  # range of the laser's last pulse [m]; inf: nothing, NaN: not known
+    U1, U2, U3, U4,  # sums of powers of u, the way across the line of sight since the first hit [m]
+    R1, RU1, RU2, R2,  # and with r, the range over the first hit's [m]
+    FIRST_RANGE,
+    MEMORY,
+) = range(29)  # fmt: skip
+# What is told of a chord: the columns of the result.
+X, Y, Z, RANGE, LENGTH, DEPTH, COUNT, GAPS, SHADE, FREE, LASER, LONG, BULGE, ROUGH = range(14)
+FIRST, LAST, NEWEST = range(3)  # times a laser remembers: its open chord's first and last hit, its newest pulse
+GAP_NS = 150_000  # a laser fires each 55.3 us (VLP-16); after a longer pause packets are lost, and it looks elsewhere
+
+
+@compiled
+def _tell(memory: Array64, free_after: bool, laser: int, long: bool, row: Array64) -> None:
+    hits = memory[HITS]
+    for axis in range(3):
+        row[X + axis] = memory[SUM_X + axis] / hits
+    row[RANGE] = memory[LAST_RANGE]
+    row[LENGTH] = math.sqrt(
+        (memory[LAST_X] - memory[FIRST_X]) ** 2
+        + (memory[LAST_Y] - memory[FIRST_Y]) ** 2
+        + (memory[LAST_Z] - memory[FIRST_Z]) ** 2
+    )
+    row[DEPTH] = memory[MOST_RANGE] - memory[LEAST_RANGE]
+    row[COUNT] = hits
+    row[GAPS] = memory[HOLES]
+    row[SHADE] = memory[REFLECTIVITY] / hits
+    row[FREE] = memory[FREE_BEFORE] + (1.0 if free_after else 0.0)
+    row[LASER] = laser
+    row[LONG] = 1.0 if long else 0.0
+    row[BULGE], row[ROUGH] = _profile(memory)
+
+
+@compiled
+def _profile(m: Array64) -> tuple[float, float]:
+    """(b, s) of the parabola r = a_0 + a_1 u + b u^2 through a chord's hits and their distance from it, RMS [m].
+
+    A ball of radius rho bulges by b = 1 / (2 rho). NaN with fewer than 4 hits.
+    """
+    n = m[HITS]
+    if n < 4.0:
+        return math.nan, math.nan
+    # normal equations about the means: u' = u - U1/n, v' = u^2 - U2/n
+    uu, uv, vv = m[U2] - m[U1] ** 2 / n, m[U3] - m[U1] * m[U2] / n, m[U4] - m[U2] ** 2 / n
+    ur, vr, rr = m[RU1] - m[U1] * m[R1] / n, m[RU2] - m[U2] * m[R1] / n, m[R2] - m[R1] ** 2 / n
+    determinant = uu * vv - uv * uv
+    if determinant <= 1e-9 * uu * vv:
+        return math.nan, math.nan
+    slope, bulge = (ur * vv - vr * uv) / determinant, (vr * uu - ur * uv) / determinant
+    left = rr - slope * ur - bulge * vr
+    return bulge, math.sqrt(max(left, 0.0) / (n - 3.0))
+
+
+@compiled
+def _begin(m: Array64, r: float, shade: float) -> None:
+    """Start the sums of a chord at its first hit."""
+    m[HITS], m[HOLES], m[REFLECTIVITY] = 1.0, 0.0, shade
+    m[FIRST_RANGE] = m[LAST_RANGE] = m[LEAST_RANGE] = m[MOST_RANGE] = r
+    for k in range(U1, R2 + 1):
+        m[k] = 0.0
+
+
+@compiled
+def _add_to_profile(m: Array64, r: float, u2: float) -> None:
+    """One more hit, u^2 [m^2] across from the first."""
+    u, dr = math.sqrt(u2), r - m[FIRST_RANGE]
+    m[U1] += u
+    m[U2] += u2
+    m[U3] += u2 * u
+    m[U4] += u2 * u2
+    m[R1] += dr
+    m[RU1] += dr * u
+    m[RU2] += dr * u2
+    m[R2] += dr * dr
+
+
+@compiled
+def find_chords(
+    stamp_ns: NDArray[np.int64],
+    direction: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    laser: NDArray[np.uint8],
+    reflectivity: NDArray[np.uint8],
+    origin_m: Array64,
+    longest_m: float,
+    jump_m: float,
+    hole_m: float,
+    memory: Array64,
+    times: NDArray[np.int64],
+    rows: Array64,
+    row_ns: NDArray[np.int64],
+) -> int:
+    """Go on with each laser's chord, pulse by pulse; fill rows and times of those told, and return how many."""
+    told = 0
+    point, before = np.empty(3), np.empty(3)
+    for i in range(range_m.size):
+        k = laser[i]
+        m = memory[k]
+        r = float(range_m[i])
+        seen = r > 0.0
+        ended = False
+        if stamp_ns[i] - times[k, NEWEST] > GAP_NS:
+            if m[HITS] > 0.0:  # how it went on nobody knows
+                _tell(m, m[MISSED] >= 2.0, k, m[TOLD] > 0.0, rows[told])
+                row_ns[told, 0], row_ns[told, 1] = times[k, FIRST], times[k, LAST]
+                told += 1
+                m[HITS] = 0.0
+            m[BEFORE] = math.nan
+        times[k, NEWEST] = stamp_ns[i]
+        if m[HITS] > 0.0:
+            if seen and abs(r - m[LAST_RANGE]) <= jump_m:
+                m[HOLES] += m[MISSED]
+                m[MISSED] = 0.0
+                for axis in range(3):
+                    point[axis] = origin_m[axis] + r * direction[i, axis]
+                    m[SUM_X + axis] += point[axis]
+                    m[LAST_X + axis] = point[axis]
+                across2 = 0.0
+                for axis in range(3):
+                    across2 += (m[FIRST_RANGE] * direction[i, axis] - (m[FIRST_X + axis] - origin_m[axis])) ** 2
+                _add_to_profile(m, r, across2)
+                m[HITS] += 1.0
+                m[REFLECTIVITY] += reflectivity[i]
+                m[LAST_RANGE] = r
+                m[LEAST_RANGE] = min(m[LEAST_RANGE], r)
+                m[MOST_RANGE] = max(m[MOST_RANGE], r)
+                times[k, LAST] = stamp_ns[i]
+                if across2 > longest_m * longest_m:  # a wall: told piece by piece
+                    _tell(m, False, k, True, rows[told])
+                    row_ns[told, 0], row_ns[told, 1] = times[k, FIRST], times[k, LAST]
+                    told += 1
+                    m[TOLD] = 1.0
+                    for axis in range(3):
+                        m[SUM_X + axis] = point[axis]
+                        m[FIRST_X + axis] = point[axis]
+                    _begin(m, r, reflectivity[i])
+                    times[k, FIRST] = stamp_ns[i]
+            elif seen and r < m[LAST_RANGE]:  # something nearer hides how it goes on, unless it had ended before
+                _tell(m, m[MISSED] >= 2.0, k, m[TOLD] > 0.0, rows[told])
+                ended = True
+            else:
+                m[MISSED] += 1.0
+                # how far the beam has moved away from the last hit, at the chord's range
+                away2 = 0.0
+                for axis in range(3):
+                    before[axis] = m[LAST_X + axis] - origin_m[axis]
+                    away2 += (m[LAST_RANGE] * direction[i, axis] - before[axis]) ** 2
+                if m[MISSED] >= 2.0 and away2 > hole_m * hole_m:
+                    _tell(m, True, k, m[TOLD] > 0.0, rows[told])
+                    ended = True
+            if ended:
+                row_ns[told, 0], row_ns[told, 1] = times[k, FIRST], times[k, LAST]
+                told += 1
+                m[HITS] = 0.0
+        if m[HITS] == 0.0 and seen:
+            for axis in range(3):
+                point[axis] = origin_m[axis] + r * direction[i, axis]
+                m[SUM_X + axis] = point[axis]
+                m[FIRST_X + axis] = point[axis]
+                m[LAST_X + axis] = point[axis]
+            _begin(m, r, reflectivity[i])
+            m[MISSED], m[TOLD] = 0.0, 0.0
+            m[FREE_BEFORE] = 1.0 if m[BEFORE] > r + jump_m else 0.0
+            times[k, FIRST] = times[k, LAST] = stamp_ns[i]
+        m[BEFORE] = r if seen else math.inf
+    return told

@@ -1,0 +1,92 @@
+"""Compiled functions of `stages/detect/motion_log_ratios.py`.
+
+Source: see there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
+from stages.kernels.geometry.smooth_motion import log_p, misfit, model_of
+
+YAWS = 72  # steps of 5 deg: coarser, a fast straight flight fits none
+DRIFT_MPS = 0.3  # of the autopilot's velocity and the vehicle's, together, level
+DRIFT_UP_MPS = 0.1
+SCATTERED_M = 0.45  # sightings of something long
+SLIDING_MPS = 0.5  # or how fast looks at it wander along
+FOLLOWED_MPS = 5.0  # and along a wire, where each next look is aimed at as if it flew
+CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time, speed; else anything up to it
+BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
+BALLOON = (0.7, 0.7, 0.3, 0.4)  # the same, on a string
+SWAY_M = 1.0  # sigma of how far that comes in all, however long one looks
+LOOSE, LOOSE_MPS, LOOSE_MPS2 = 0.1, 2.0, 0.3  # assumed share of balloons that drift with the wind, their sigmas
+
+
+@compiled
+def weigh(
+    t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_known: bool
+) -> tuple[float, float, float, float, float]:
+    """What Heard holds but for its way: a path x (n, 3) at times t (n,) against what the drone told of itself."""
+    x, d = x_m.copy(), told_m.copy()
+    for axis in range(3):
+        x[:, axis] -= x[:, axis].mean()
+        d[:, axis] -= d[:, axis].mean()
+    as_drone = model_of(t_s, sigma_m, DRIFT_MPS, 0.0)
+    as_long = model_of(t_s, SCATTERED_M, 0.0, 0.0)
+    as_sliding, as_followed = model_of(t_s, sigma_m, SLIDING_MPS, 0.0), model_of(t_s, sigma_m, FOLLOWED_MPS, 0.0)
+    up = x[:, 2].copy()
+    upright = model_of(t_s, sigma_m, DRIFT_UP_MPS, 0.0)
+    drone = log_p(upright, t_s, up - d[:, 2])
+    off2, coordinates = misfit(upright, t_s, up - d[:, 2]), 1.0
+    still, long = log_p(upright, t_s, up), log_p(as_long, t_s, up)  # what stands drifts alike
+    sliding = followed = still
+    bird = log_p(model_of(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
+    sway_mps = SWAY_M / max(t_s.max() - t_s.min(), 1e-3)
+    balloon = log_p(model_of(t_s, sigma_m, min(BALLOON[2], sway_mps), BALLOON[3]), t_s, up)
+    loose = log_p(model_of(t_s, sigma_m, LOOSE_MPS, LOOSE_MPS2), t_s, up)
+    if level_known:
+        as_cruising = model_of(t_s, sigma_m, CRUISE_SIGMA_MPS, BIRD[1])
+        as_wheeling = model_of(t_s, sigma_m, BIRD[0], BIRD[1])
+        as_balloon = model_of(t_s, sigma_m, min(BALLOON[0], sway_mps), BALLOON[1])
+        as_loose = model_of(t_s, sigma_m, LOOSE_MPS, LOOSE_MPS2)
+        turned, cruising, wheeling, level2 = np.empty(YAWS), np.empty(YAWS), 0.0, math.inf
+        for k in range(YAWS):
+            c, s = math.cos(math.tau * k / YAWS), math.sin(math.tau * k / YAWS)
+            ex, ey = x[:, 0] - c * d[:, 0] + s * d[:, 1], x[:, 1] - s * d[:, 0] - c * d[:, 1]
+            turned[k] = log_p(as_drone, t_s, ex) + log_p(as_drone, t_s, ey)
+            level2 = min(level2, misfit(as_drone, t_s, ex) + misfit(as_drone, t_s, ey))
+            cruising[k] = log_p(as_cruising, t_s, x[:, 0] - CRUISE_MPS * c * t_s)
+            cruising[k] += log_p(as_cruising, t_s, x[:, 1] - CRUISE_MPS * s * t_s)
+        drone += _log_mean(turned)
+        off2, coordinates = off2 + level2, 3.0
+        for axis in range(2):
+            e = x[:, axis].copy()
+            still += log_p(as_drone, t_s, e)
+            long += log_p(as_long, t_s, e)
+            sliding += log_p(as_sliding, t_s, e)
+            followed += log_p(as_followed, t_s, e)
+            wheeling += log_p(as_wheeling, t_s, e)
+            balloon += log_p(as_balloon, t_s, e)
+            loose += log_p(as_loose, t_s, e)
+        cruise = math.log(CRUISING) + _log_mean(cruising)
+        wheeling += math.log(1.0 - CRUISING)
+        bird += _log_sum(cruise, wheeling)
+    balloon = _log_sum(math.log(1.0 - LOOSE) + balloon, math.log(LOOSE) + loose)
+    over_still = drone - _log_mean(np.array([still, long, sliding]))
+    off2 /= coordinates * len(t_s)
+    return over_still, drone - bird, drone - balloon, min(over_still, drone - followed), off2
+
+
+@compiled
+def _log_sum(a: float, b: float) -> float:
+    return max(a, b) + math.log1p(math.exp(-abs(a - b)))
+
+
+@compiled
+def _log_mean(values: Array64) -> float:
+    top = values.max()
+    return top + math.log(np.exp(values - top).mean())

@@ -1,0 +1,84 @@
+"""Compiled functions of `stages/detect/pulse_buffer.py`.
+
+Source: see there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
+from stages.kernels.detect.isolation import TALLY, look_around
+
+WINDOW_NS = 8_600_000  # what is kept: 31 deg of a rotor at 600 rpm and the slice that is begun
+ROUNDED_RAD = 1e-3  # more than directions are rounded by
+
+
+@compiled
+def keep_slice(
+    direction: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    origin_m: Array64,
+    axis: Array64,
+    end_ns: int,
+    k: int,
+    directions: NDArray[np.float32],
+    ranges_m: NDArray[np.float32],
+    origins_m: Array64,
+    fans: Array64,
+    sizes: NDArray[np.int64],
+    ends_ns: NDArray[np.int64],
+) -> None:
+    """Write a slice into row k of what is kept, its `fan` with it; those before the window get the size 0."""
+    widest = 1.0
+    for i in range(range_m.size):
+        along = 0.0
+        for j in range(3):
+            directions[k, i, j] = direction[i, j]
+            along += direction[i, j] * axis[j]
+        ranges_m[k, i] = range_m[i]
+        widest = min(widest, along)
+    origins_m[k], fans[k, :3], fans[k, 3] = origin_m, axis, math.acos(max(widest, -1.0))
+    sizes[k], ends_ns[k] = range_m.size, end_ns
+    for row in range(sizes.size):
+        if end_ns - ends_ns[row] > WINDOW_NS:
+            sizes[row] = 0
+
+
+@compiled
+def passes_by(fan: Array64, origin_m: Array64, centre_m: Array64, outer_m: float) -> bool:
+    """Whether no pulse of a slice comes within `outer_m` of a place (3,), as `look_around` takes it."""
+    x, y, z = centre_m[0] - origin_m[0], centre_m[1] - origin_m[1], centre_m[2] - origin_m[2]
+    away_m = max(math.sqrt(x * x + y * y + z * z), 1e-9)
+    beside = math.acos(min(max((x * fan[0] + y * fan[1] + z * fan[2]) / away_m, -1.0), 1.0))
+    return beside > fan[3] + min(outer_m / away_m * 1.05, 1.5) + ROUNDED_RAD
+
+
+@compiled
+def look_around_all(
+    direction: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    origin_m: Array64,
+    fan: Array64,
+    sizes: NDArray[np.int64],
+    centre_m: Array64,
+    disc_m: float,
+    inner_m: float,
+    close_m: float,
+    outer_m: float,
+    depth_m: float,
+) -> Array64:
+    """The tally (TALLY,) of slices (k, most, 3), (k, most), of each the first `sizes` (k,) pulses."""
+    tally = np.zeros(TALLY, dtype=np.int64)
+    for k in range(sizes.size):
+        n = sizes[k]
+        if n == 0 or passes_by(fan[k], origin_m[k], centre_m, outer_m):
+            continue
+        look_around(
+            direction[k, :n], range_m[k, :n], origin_m[k], centre_m, disc_m, inner_m, close_m, outer_m, depth_m, tally
+        )
+    return tally.astype(np.float64)

@@ -1,0 +1,37 @@
+"""Compiled functions of `stages/sweep/pulses.py`.
+
+Source: see there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
+
+# A laser's returns in a row, as shares of a drone's span: so long, they are of something larger; a step in range, or a
+# hole, so wide ends them.
+LONGEST, STEP, HOLE = 1.6, 0.7, 0.6
+
+
+@compiled
+def mean_direction(direction: NDArray[np.float32]) -> Array64:
+    """The mean (3,) of directions (n, 3), n > 0, summed in single precision as numpy's mean does."""
+    x = y = z = np.float32(0.0)
+    for i in range(direction.shape[0]):
+        x += direction[i, 0]
+        y += direction[i, 1]
+        z += direction[i, 2]
+    n = np.float32(direction.shape[0])
+    return np.array([x / n, y / n, z / n], dtype=np.float64)
+
+
+@compiled
+def looking_along(direction: NDArray[np.float32]) -> Array64:
+    """`mean_direction` as a unit vector (3,); zero where there is none."""
+    mean = mean_direction(direction)
+    return mean / max(math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2), 1e-9)

@@ -1,0 +1,54 @@
+"""Compiled functions of `stages/track/runs.py`.
+
+Source: see there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.geometry.frames import Array64
+from stages.kernels.compiled import compiled
+from stages.kernels.sweep.pulses import HOLE, LONGEST, STEP
+from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, LASER, NEARER, A, B
+
+LASERS = 256
+
+
+@compiled
+def leave_out_walls(pulses: Array64, span_m: float) -> None:
+    """Of the hits of a look's pulses (n, COLUMNS), in order of time, those of a long run become NEARER: no word.
+
+    Those of a short one hidden at both ends become GLIMPSE.
+    """
+    first, last, newest = np.full(LASERS, -1), np.full(LASERS, -1), np.full(LASERS, -1)
+    run = np.full(pulses.shape[0], -1)  # row at which each row's run began
+    long = np.zeros(pulses.shape[0], dtype=np.bool_)  # by that row, as are these: what is beside it is nearer
+    hidden_before, hidden_after = np.zeros_like(long), np.zeros_like(long)
+    for i in range(pulses.shape[0]):
+        k = int(pulses[i, LASER])
+        before, newest[k], j = newest[k], i, last[k]
+        goes_on = (
+            j >= 0
+            and abs(pulses[i, DEPTH] - pulses[j, DEPTH]) <= STEP * span_m
+            and math.hypot(pulses[i, A] - pulses[j, A], pulses[i, B] - pulses[j, B]) <= HOLE * span_m
+        )
+        if j >= 0 and before == j:
+            hidden_after[first[k]] = not goes_on and pulses[i, KIND] == NEARER
+        if not math.isfinite(pulses[i, DEPTH]):
+            continue
+        if not goes_on:
+            first[k] = i
+            hidden_before[i] = before >= 0 and pulses[before, KIND] == NEARER
+        last[k], run[i], j = i, first[k], first[k]
+        hidden_after[j] = False
+        long[j] |= math.hypot(pulses[i, A] - pulses[j, A], pulses[i, B] - pulses[j, B]) > LONGEST * span_m
+    for i in range(pulses.shape[0]):
+        if pulses[i, KIND] == HIT:
+            j = run[i]
+            if long[j]:
+                pulses[i, KIND] = NEARER
+            elif hidden_before[j] and hidden_after[j]:
+                pulses[i, KIND] = GLIMPSE

@@ -1,0 +1,166 @@
+"""Compiled functions of `stages/vp/directions.py`.
+
+Source: see there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.lens import Array64
+from stages.kernels.compiled import compiled
+from stages.kernels.geometry.so3 import exp_rotation
+
+NONE, VERTICAL = -1, 0  # of a line's direction; frame f has directions 1 + 2 f and 2 + 2 f
+ENOUGH_RAD = 1e-5  # a smaller step is the last
+CAUCHY = 1.5  # sigmas
+NORMAL_MEDIAN = 0.6745  # of the absolute value, in sigmas
+FEW_LINES = 10  # what was expected counts as much as so many lines
+GATE = 4.0  # sigmas; a line farther from all directions has none
+WELL = 1.0 + 1e-9  # beyond a bound by so much: beyond it, however it was rounded
+
+
+@compiled
+def tangents(normal: Array64, ends: Array64) -> Array64:
+    """n x m (n, 3) of the middle rays m."""
+    out = np.empty((len(normal), 3))
+    for i in range(len(normal)):
+        n, first, last = normal[i], ends[i, 0], ends[i, 1]
+        x, y, z = first[0] + last[0], first[1] + last[1], first[2] + last[2]
+        length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
+        x, y, z = x / length, y / length, z / length
+        out[i, 0], out[i, 1], out[i, 2] = n[1] * z - n[2] * y, n[2] * x - n[0] * z, n[0] * y - n[1] * x
+    return out
+
+
+@compiled
+def all_directions(axes: Array64, yaw_rad: Array64) -> Array64:
+    """(1 + 2 k, 3): the vertical, then both of each frame, the second a quarter turn to the left of the first."""
+    out = np.empty((1 + 2 * len(yaw_rad), 3))
+    out[VERTICAL] = axes[:, 2]
+    for f in range(len(yaw_rad)):
+        c, s = math.cos(yaw_rad[f]), math.sin(yaw_rad[f])
+        out[1 + 2 * f] = c * axes[:, 0] + s * axes[:, 1]
+        out[2 + 2 * f] = c * axes[:, 1] - s * axes[:, 0]
+    return out
+
+
+@compiled
+def upright(vertical: Array64) -> Array64:
+    """Some axes (3, 3) whose third is the vertical."""
+    a, b, c = vertical[0], vertical[1], vertical[2]
+    x, y, z = (c, 0.0, -a) if abs(b) < 0.9 else (0.0, -c, b)
+    scale = 1.0 / math.sqrt(x * x + y * y + z * z)
+    x, y, z = x * scale, y * scale, z * scale
+    return np.array([[x, b * z - c * y, a], [y, c * x - a * z, b], [z, a * y - b * x, c]])
+
+
+@compiled
+def assign_kernel(
+    normal: Array64, tangent: Array64, sigma: Array64, directions: Array64, sigma_model: float
+) -> tuple[NDArray[np.int64], Array64, Array64]:
+    count = len(normal)
+    assigned = np.full(count, NONE)
+    residual, spread = np.zeros(count), np.ones(count)
+    for i in range(count):
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        least, far = np.inf, WELL * GATE * (sigma[i] + sigma_model)
+        for k in range(len(directions)):
+            dx, dy, dz = directions[k, 0], directions[k, 1], directions[k, 2]
+            r = nx * dx + ny * dy + nz * dz
+            if abs(r) > far:
+                continue
+            s = math.hypot(sigma[i] * (tangent[i, 0] * dx + tangent[i, 1] * dy + tangent[i, 2] * dz), sigma_model)
+            if abs(r) < least * s:
+                least, residual[i], spread[i] = abs(r) / s, r, s
+                assigned[i] = k
+        if least > GATE:
+            assigned[i] = NONE
+    return assigned, residual, spread
+
+
+@compiled
+def refine_kernel(
+    normal: Array64,
+    tangent: Array64,
+    sigma: Array64,
+    weight: Array64,
+    axes: Array64,
+    yaw_rad: Array64,
+    prior: Array64,
+    prior_sigma: float,
+    sigma_model: float,
+    rounds: int,
+) -> tuple[Array64, Array64, NDArray[np.int64], Array64, float, float]:
+    """The fields of Structure."""
+    yaw = yaw_rad.copy()
+    round_ = 0
+    while True:
+        directions = all_directions(axes, yaw)
+        assigned, r, spread = assign_kernel(normal, tangent, sigma, directions, sigma_model)
+        H, g, agreement = _normal_equations(normal, weight, axes, directions, assigned, r, spread)
+        up = prior @ axes  # the prior in frame 0's axes: v -> v + omega x v
+        H[0, 0] += 1 / prior_sigma**2
+        H[1, 1] += 1 / prior_sigma**2
+        g[0] += up[1] / prior_sigma**2
+        g[1] -= up[0] / prior_sigma**2
+        for k in range(len(H)):
+            H[k, k] += 1e-9
+        if round_ == rounds:
+            return axes, yaw, assigned, H, _scatter(assigned, r, spread), agreement
+        step: Array64 = -np.linalg.solve(H, g)  # pyright: ignore[reportAssignmentType]
+        axes = axes @ exp_rotation(step[:3])
+        yaw[1:] += step[3:]
+        round_ = rounds if np.abs(step).max() < ENOUGH_RAD else round_ + 1
+
+
+@compiled
+def _normal_equations(
+    normal: Array64,
+    weight: Array64,
+    axes: Array64,
+    directions: Array64,
+    assigned: NDArray[np.int64],
+    residual: Array64,
+    sigma: Array64,
+) -> tuple[Array64, Array64, float]:
+    """H, g of the turn omega of frame 0 about its own axes, then of each further yaw: d -> d + omega x d."""
+    size = 3 + (len(directions) - 1) // 2 - 1
+    H, g = np.zeros((size, size)), np.zeros(size)
+    J, at = np.zeros(4), np.zeros(4, dtype=np.int64)
+    agreement = 0.0
+    for i in range(len(normal)):
+        k = assigned[i]
+        if k == NONE:
+            continue
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        dx, dy, dz = directions[k, 0], directions[k, 1], directions[k, 2]
+        x, y, z = dy * nz - dz * ny, dz * nx - dx * nz, dx * ny - dy * nx
+        for a in range(3):  # n . (omega x d) = omega . (d x n)
+            J[a], at[a] = x * axes[0, a] + y * axes[1, a] + z * axes[2, a], a
+        frame = (k - 1) // 2 if k != VERTICAL else 0
+        terms = 3
+        if frame > 0:
+            J[3], at[3] = J[2], 2 + frame
+            terms = 4
+        q = (residual[i] / sigma[i]) ** 2
+        w = weight[i] / (sigma[i] ** 2 * (1.0 + q / CAUCHY**2))
+        agreement += weight[i] * max(1.0 - q / GATE**2, 0.0)
+        for a in range(terms):
+            g[at[a]] += w * J[a] * residual[i]
+            for b in range(terms):
+                H[at[a], at[b]] += w * J[a] * J[b]
+    return H, g, agreement
+
+
+@compiled
+def _scatter(assigned: NDArray[np.int64], residual: Array64, sigma: Array64) -> float:
+    """Sigma of residual / sigma of the lines that have a direction, by their median; near 1 when they are few."""
+    off = np.abs(residual / sigma)[assigned != NONE]
+    if len(off) == 0:
+        return 1.0
+    seen = (np.median(off) / NORMAL_MEDIAN) ** 2
+    return math.sqrt((len(off) * seen + FEW_LINES) / (len(off) + FEW_LINES))

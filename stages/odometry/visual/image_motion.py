@@ -1,0 +1,167 @@
+"""From picture to picture of one camera: what is followed, and the motion since a key picture. For odometry and ego.
+
+The key picture stays until the camera has moved enough for a good direction, too few of its tracks are left, or it is
+too old; then the newest picture becomes the key. So the motions key -> key link up without a gap, each over a baseline
+that is worth a direction, and a camera that stands keeps its key and does not drift.
+
+Source: ours; P V.B, V.E for what is computed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from stages.geometry.frames import Array64
+from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
+from stages.kernels.geometry.so3 import exp_rotation, log_rotation
+from stages.kernels.visual.epipolar import epipolar
+from stages.kernels.visual.patches import Grey
+from stages.messages import FollowedFeatures
+from stages.odometry.visual.features import FeatureSettings, FeatureTracker, Tracks
+from stages.odometry.visual.two_view import LEAST, Noise, TwoView, backwards, relative_motion
+
+RETURN_RAD = math.radians(1.0)  # a camera does not jump back to where this was seen from
+LONGEST_STEP_S = 1.0  # between two pictures; after a longer pause nothing is expected to be where it was
+
+
+class LinkSettings(BaseModel):
+    """When a picture becomes the key, and what a track is worth."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    key_parallax_deg: float = Field(default=4.0, gt=0, le=30)  # median of the tracks that moved beyond the rotation
+    key_share: float = Field(default=0.4, gt=0, lt=1)  # of its tracks left
+    key_age_s: float = Field(default=5.0, gt=0, le=60)
+    least_noise_px: float = Field(default=0.05, gt=0, le=2)  # of one track, at the picture's middle
+    shared_noise_px: float = Field(default=0.08, ge=0, le=2)  # of all tracks together: lens, JPEG, perspective
+    tries: int = Field(default=60, ge=1, le=2000)  # five-point hypotheses at most
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """The motion from the key picture to a later one, rays matched by row."""
+
+    key: Tracks
+    now: Tracks
+    number: NDArray[np.int64]  # (n,) of the tracks common to both
+    ray_key: Array64  # (n, 3)
+    ray_now: Array64  # (n, 3)
+    motion: TwoView
+    last: bool  # the next motion begins where this ends
+
+
+class MotionLinks:
+    """Feeds pictures to a tracker and links their motions."""
+
+    def __init__(
+        self, lens: Equidistant | KannalaBrandt | OCam, features: FeatureSettings, settings: LinkSettings
+    ) -> None:
+        self._tracker = FeatureTracker(lens, features)
+        self._settings = settings
+        pixel = pixel_rad(lens)
+        self._noise = Noise(settings.least_noise_px * pixel, settings.shared_noise_px * pixel)
+        self._key: Tracks | None = None
+        self._before_ns = 0
+        self._R_now_key: Array64 = np.eye(3)
+        self._t_hat_key: Array64 | None = None  # direction of the newest motion, the key's axes
+        self._rate_radps = np.zeros(3)  # of the camera, its own axes
+        self._parallax_rad = 0.0  # of the newest motion
+        self._most_clear = 0  # of the key's motions
+        self.reason = "no picture yet"
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest picture."""
+        return self._before_ns
+
+    @property
+    def key(self) -> Tracks | None:
+        """The key picture of the next motion, with all corners."""
+        return self._key
+
+    def feed(self, stamp_ns: int, grey: Grey, R_now_before: Array64 | None = None) -> Link | None:
+        """The motion since the key; None for the first picture and where nothing can be followed (`reason`).
+
+        `R_now_before`: the rotation a gyro has felt since the last picture; without, the last rate goes on.
+        """
+        key, s = self._key, self._settings
+        step_s = (stamp_ns - self._before_ns) * 1e-9
+        if key is not None and step_s <= 0.0:
+            self.reason = "the picture is not newer than the last"
+            return None
+        expected = exp_rotation(-self._rate_radps * step_s) if R_now_before is None else R_now_before
+        if key is None or step_s > LONGEST_STEP_S:
+            expected = np.eye(3)
+        now = self._tracker.follow(stamp_ns, grey, expected)
+        self._before_ns = stamp_ns
+        if key is None:
+            return self._begin("the first picture")
+        guess = expected @ self._R_now_key
+        rows_key, rows_now = key.common(now)
+        ray_key, ray_now = key.ray[rows_key], now.ray[rows_now]
+        t_guess = None if self._t_hat_key is None else -guess @ self._t_hat_key
+        motion = relative_motion(ray_key, ray_now, guess, t_guess, self._noise, s.tries)
+        if motion is None:
+            return self._begin(f"{len(rows_key)} tracks are left of the key picture's {len(key.number)}: too few agree")
+        if motion.t_hat_later is None and self._parallax_rad > RETURN_RAD:
+            return self._begin("the camera was moving, and nothing that shows it is left of the key picture")
+        self._parallax_rad = motion.parallax_rad
+        R_now_before = motion.R_later_earlier @ self._R_now_key.T
+        self._rate_radps = -log_rotation(R_now_before) / step_s
+        self._R_now_key, self._t_hat_key = motion.R_later_earlier, backwards(motion).t_hat_earlier
+        self._most_clear = max(self._most_clear, motion.clear)
+        spent = (
+            motion.parallax_rad > math.radians(s.key_parallax_deg)
+            or (motion.t_hat_later is not None and self._most_clear >= 3 * LEAST and motion.clear < 2 * LEAST)
+            or np.count_nonzero(motion.inlier) < max(s.key_share * len(key.number), 2 * LEAST)
+            or stamp_ns - key.stamp_ns > s.key_age_s * 1e9
+        )
+        number = key.number[rows_key]
+        link = Link(key, now, number, ray_key, ray_now, motion, bool(spent))
+        if spent:
+            self._tracker.forget(number[~motion.inlier])
+        complete = self._tracker.complete(motion.R_later_earlier @ guess.T)
+        if spent:
+            if self._t_hat_key is not None:
+                self._t_hat_key = motion.R_later_earlier @ self._t_hat_key  # on as it was, in the new key's axes
+            self._key, self._R_now_key, self._parallax_rad, self._most_clear = complete, np.eye(3), 0.0, 0
+        self.reason = ""
+        return link
+
+    def _begin(self, reason: str) -> None:
+        """The newest picture is the first of a new chain."""
+        self._key, self._R_now_key = self._tracker.complete(np.eye(3)), np.eye(3)
+        self._rate_radps, self._t_hat_key, self._parallax_rad, self._most_clear = np.zeros(3), None, 0.0, 0
+        self.reason = reason
+
+
+def followed(link: Link, frame_id: str) -> FollowedFeatures:
+    """What a motion was found from, for people to look at."""
+    motion = link.motion
+    if motion.t_hat_later is None:
+        parted = np.linalg.norm(link.ray_now - link.ray_key @ motion.R_later_earlier.T, axis=1)
+        residual = parted / math.sqrt(2.0)
+    else:
+        missed, _ = epipolar(link.ray_key, link.ray_now, motion.R_later_earlier, motion.t_hat_later, motion.sigma_rad)
+        residual = np.abs(missed)
+    return FollowedFeatures(
+        stamp_ns=link.now.stamp_ns,
+        frame_id=frame_id,
+        from_ns=link.key.stamp_ns,
+        pixel_from=link.key.pixel[np.searchsorted(link.key.number, link.number)],
+        pixel_to=link.now.pixel[np.searchsorted(link.now.number, link.number)],
+        residual_rad=residual,
+        agrees=motion.inlier,
+    )
+
+
+def pixel_rad(lens: Equidistant | KannalaBrandt | OCam) -> float:
+    """Angle between two pixels beside each other at the lens's middle."""
+    column, row = lens.centre_px
+    a, b = lens.unproject(np.array([[column, row], [column + 1.0, row]]))
+    return float(np.arccos(np.clip(a @ b, -1.0, 1.0)))

@@ -1,0 +1,196 @@
+"""How a camera moved between two pictures, from rays of the same points: rotation and direction, or rotation alone.
+
+    p_later = R_later_earlier p_earlier + |t| t_hat_later;   in formulas x = ray earlier, x' = ray later, y = R x
+
+    error      e = x' . (t x y) / sqrt(|t x y|^2 + |t x x'|^2): by how much both rays miss one plane with t [rad]
+    hypotheses five rays at a time (poselib.relpose_5pt), the lowest sum of log(1 + e^2 / sigma^2) wins; a point behind
+               either camera counts as a miss, and "behind" is asked of the rays: there is no image plane to be behind
+    refined    Gauss-Newton on rotation and direction, Cauchy weights, with the noise that the errors show
+    standing   rotation alone is kept unless a direction explains a dozen points that it does not, and is known
+               better than MAX_DIRECTION_SIGMA_RAD: most of a picture may be sky, which never tells of a motion
+
+poselib's and OpenCV's own RANSAC divide by z and lose what lies beyond 90 deg off axis.
+
+Source: P V.E (5-point); Nister (2004); the error is Sampson's on the sphere, as in Pagani and Stricker (2011).
+Ours: the logarithm, standing, and the error that all tracks share.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import poselib  # pyright: ignore[reportMissingTypeStubs]
+from numpy.typing import NDArray
+
+from stages.geometry.frames import Array64
+from stages.kernels.geometry.so3 import hat
+from stages.kernels.visual.epipolar import (
+    BEYOND_SIGMAS,
+    CAUCHY,
+    SAMPLE,
+    across,
+    cost_of,
+    direction_given,
+    epipolar,
+    refine,
+    rotation_between,
+    shown_noise,
+)
+
+LEAST = 12  # points for an answer
+CONFIDENCE = 0.99
+NARROWINGS = 2
+WORST_SIGMAS = 40.0  # of the least noise: rays that agree no better do not agree
+LIMIT_SIGMAS = 3.5  # an error beyond is an outlier's
+MAX_DIRECTION_SIGMA_RAD = math.radians(12.0)  # less certain is no direction
+CLEAR_SIGMAS = 5.0  # parted by more than noise
+PROOF = 12 * math.log(1.0 + 5.0**2)  # of motion: what a dozen points clearly parted cost a rotation
+
+_five_point = cast(Any, poselib).relpose_5pt
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What a ray is worth [rad], one axis, one sigma."""
+
+    least_rad: float  # of one track alone
+    shared_rad: float  # what all tracks may err by together: it does not average out
+
+
+@dataclass(frozen=True, slots=True)
+class TwoView:
+    """The motion between two pictures. `t_hat_later` None: no motion seen beyond the rotation."""
+
+    R_later_earlier: Array64
+    t_hat_later: Array64 | None
+    covariance: Array64  # (6, 6): w in exp(w) R, then t_hat, whose block is of rank 2; zero where there is none
+    inlier: NDArray[np.bool_]  # (n,)
+    sigma_rad: float  # noise of one ray, one axis, as the errors show it
+    clear: int  # inliers that moved clearly beyond the rotation
+    parallax_rad: float  # and by how much, their median
+
+    @property
+    def direction_sigma_rad(self) -> float:
+        """Of t_hat_later, one axis, the mean of both."""
+        return math.sqrt(0.5 * float(np.trace(self.covariance[3:, 3:])))
+
+
+@dataclass(frozen=True, slots=True)
+class Backwards:
+    """The same motion told from the earlier picture: p_earlier = R_earlier_later p_later + |t| t_hat_earlier."""
+
+    R_earlier_later: Array64
+    covariance_rad2: Array64  # (3, 3) of phi in R exp(phi), later axes
+    t_hat_earlier: Array64 | None
+    direction_sigma_rad: float | None
+
+
+def backwards(motion: TwoView) -> Backwards:
+    """R_earlier_later = R^T, t_hat_earlier = -R^T t_hat_later, with what the covariance makes of it."""
+    R, t, cov = motion.R_later_earlier, motion.t_hat_later, motion.covariance
+    if t is None:
+        return Backwards(R.T.copy(), cov[:3, :3].copy(), None, None)
+    J = np.hstack([hat(t), np.eye(3)])  # R t_hat_earlier <- -(t_hat + dt + t_hat x w)
+    sigma = math.sqrt(0.5 * float(np.trace(J @ cov @ J.T)))
+    return Backwards(R.T.copy(), cov[:3, :3].copy(), -R.T @ t, sigma)
+
+
+def relative_motion(
+    earlier: Array64, later: Array64, R_guess: Array64, t_guess: Array64 | None, noise: Noise, tries: int
+) -> TwoView | None:
+    """The motion from rays (n, 3) and (n, 3); None when fewer than LEAST agree on any.
+
+    A guess (R_later_earlier, t_hat_later) is one hypothesis more; `tries`: those of five rays, at most. The same rays
+    give the same answer.
+    """
+    if len(earlier) < LEAST:
+        return None
+    least = noise.least_rad
+    turn = _standing(earlier, later, R_guess, noise)
+    R_turn = turn.R_later_earlier if turn else R_guess
+    guesses = [(R_guess, t_guess), (R_turn, t_guess)] if t_guess is not None else []
+    guesses.append((R_turn, direction_given(earlier, later, R_turn, 5.0 * least)))
+    rotation, t = _best_hypothesis(earlier, later, guesses, least, tries)
+    sigma = shown_noise(earlier, later, rotation, t, least)
+    information = np.eye(5)
+    for _ in range(NARROWINGS):
+        rotation, t, information = refine(earlier, later, rotation, t, sigma)
+        sigma = shown_noise(earlier, later, rotation, t, least)
+    error, ahead = epipolar(earlier, later, rotation, t, sigma)
+    inlier = ahead & (np.abs(error) < LIMIT_SIGMAS * sigma)
+    agreed = sigma < WORST_SIGMAS * least and np.count_nonzero(inlier) >= LEAST
+    if not agreed or not np.linalg.cond(information) < 1e12:
+        return turn
+    parted = np.linalg.norm(later - earlier @ rotation.T, axis=1)
+    clearly = inlier & (parted > CLEAR_SIGMAS * sigma)
+    parallax = float(np.median(parted[clearly])) if clearly.any() else 1e-9
+    B = np.zeros((6, 5))
+    B[:3, :3], B[3:, 3:] = np.eye(3), across(t)
+    covariance = B @ np.linalg.inv(information) @ B.T * sigma**2
+    covariance[:3, :3] += noise.shared_rad**2 * np.eye(3)
+    covariance[3:, 3:] += (noise.shared_rad / parallax) ** 2 * (np.eye(3) - np.outer(t, t))
+    moved = TwoView(rotation, t, covariance, inlier, sigma, int(np.count_nonzero(clearly)), parallax)
+    if turn is None:
+        return moved
+    unproved = gain_over(turn, moved, earlier, later) < PROOF or moved.clear < LEAST
+    return turn if unproved or moved.direction_sigma_rad > MAX_DIRECTION_SIGMA_RAD else moved
+
+
+def gain_over(turn: TwoView, moved: TwoView, earlier: Array64, later: Array64) -> float:
+    """What a direction explains beyond the rotation: the difference of their sums of log(1 + e^2 / sigma^2).
+
+    For the rotation e is the mean of both axes, so that points that stand still cost both the same, but for 0.1 each.
+    """
+    assert moved.t_hat_later is not None
+    sigma = moved.sigma_rad
+    parted = np.linalg.norm(later - earlier @ turn.R_later_earlier.T, axis=1) / math.sqrt(2.0) / sigma
+    standing = float(np.log1p(np.minimum(parted, BEYOND_SIGMAS) ** 2).sum())
+    moving, _ = cost_of(earlier, later, moved.R_later_earlier, moved.t_hat_later, sigma)
+    return standing - moving - 0.1 * len(earlier)
+
+
+def _standing(earlier: Array64, later: Array64, R_guess: Array64, noise: Noise) -> TwoView | None:
+    """Rotation alone; None when too few agree with one."""
+    rotation = R_guess
+    sigma = 20.0 * noise.least_rad
+    parted = np.zeros(0)
+    for _ in range(3):  # each time with the noise that the one before has shown
+        rotation = rotation_between(earlier, later, rotation, CAUCHY * sigma)
+        parted = np.linalg.norm(later - earlier @ rotation.T, axis=1) / math.sqrt(2.0)
+        sigma = max(noise.least_rad, float(np.median(parted)) / 1.1774)  # the median of a Rayleigh's length
+    inlier = parted < LIMIT_SIGMAS * sigma
+    if sigma > WORST_SIGMAS * noise.least_rad or np.count_nonzero(inlier) < LEAST:
+        return None
+    y = earlier[inlier] @ rotation.T
+    H = (len(y) * np.eye(3) - y.T @ y) / 2.0  # both rays are noisy
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = np.linalg.inv(H) * sigma**2 + noise.shared_rad**2 * np.eye(3)
+    return TwoView(rotation, None, covariance, inlier, sigma, 0, 0.0)
+
+
+def _best_hypothesis(
+    earlier: Array64, later: Array64, guesses: list[tuple[Array64, Array64]], sigma_rad: float, tries: int
+) -> tuple[Array64, Array64]:
+    """R and t_hat of the lowest `cost_of`."""
+    rng = np.random.default_rng(0)  # the same rays, the same answer
+    n = len(earlier)
+    (least, agree), rotation, t = min(
+        ((cost_of(earlier, later, rotation, t, sigma_rad), rotation, t) for rotation, t in guesses),
+        key=lambda found: found[0][0],
+    )
+    for tried in range(tries):
+        share = min(agree / n, 0.999)
+        if agree >= LEAST and tried * math.log(1.0 - share**SAMPLE) < math.log(1.0 - CONFIDENCE):
+            break
+        pick = rng.choice(n, SAMPLE, replace=False)
+        for pose in _five_point(earlier[pick], later[pick]):
+            R_try, t_try = np.ascontiguousarray(pose.R), np.asarray(pose.t)
+            length = float(np.linalg.norm(t_try))
+            if length > 1e-9:
+                cost, count = cost_of(earlier, later, R_try, t_try / length, sigma_rad)
+                if cost < least:
+                    least, agree, rotation, t = cost, count, R_try, t_try / length
+    return rotation, t

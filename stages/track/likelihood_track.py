@@ -1,0 +1,308 @@
+"""Track by hits and misses: each look at a drone, hits and misses together, moves its position and velocity.
+
+    SEARCHING   no hypothesis
+    CANDIDATE   something worth another look is followed, silently
+    TRACKING    the detector accepted it, and it was hit lately: a DroneFix for every look with a hit
+    COASTING    not hit lately; predicted, the covariance grows
+    LOST        not hit for `lost_after_s`, nor known by its own word; or no longer taken for a drone
+
+A look is one passing of the rotor. Its pulses are measured against where the drone is at each pulse's own time
+(de-skew by its velocity and the vehicle's motion), those beside it count as misses (stages/track/hull.py). Several
+hypotheses are followed while doubtful, several drones as long as each is hit.
+
+Source: ours, for P III.C; DESIGN, The graph: track.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from flow.stage import Settings, Stage
+from stages.geometry.frames import Array64, LidarMount
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.kernels.sweep.pulses import mean_direction
+from stages.kernels.track.scan_pass import largest_sigma_m
+from stages.messages import (
+    Candidates,
+    Detections,
+    DroneFix,
+    DroneLocalPosition,
+    DroneOdometry,
+    SweptPulses,
+    TrackingState,
+    TrackState,
+    VehicleMotion,
+)
+from stages.sweep.pulses import middle_ns
+from stages.track.hypotheses import Hypotheses, Hypothesis
+from stages.track.scan_pass import Look, collect_into, evaluate
+
+LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
+CANDIDATE_S = 1.5  # one that was not accepted is forgotten so long after its last hit
+
+
+class LikelihoodTrackSettings(Settings):
+    """Settings of `LikelihoodTrack`."""
+
+    mount: LidarMount = LidarMount()  # of it, how well the servo's angle is known
+    span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
+    hull_share: float = Field(0.075, ge=-1, le=1)  # of its span: the centre lies so far behind the mean of its returns
+    max_drones: int = Field(1, ge=1, le=8)
+    max_hypotheses: int = Field(4, ge=0, le=16)  # candidates followed beside them
+    own_sigma_m: float = Field(0.8, gt=0)  # less known, only the detector finds it again
+    manoeuvre: float = Field(1.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
+    told_manoeuvre: float = Field(0.01, gt=0)  # and what is left of it where the drone tells how it flies
+    coast_after_s: float = Field(0.35, gt=0)
+    lost_after_s: float = Field(6.0, gt=0)  # later where the drone tells its flight, as long as
+    lost_sigma_m: float = Field(5.0, gt=0)  # it is known as well as this
+    start_sigma_mps: float = Field(1.5, gt=0)  # of the detector's velocity
+    tilt_deg: float = Field(0.05, ge=0)  # of the servo's axis against the vehicle's, about x and y, one sigma each
+    range_sigma_m: float = Field(
+        0.017, ge=0
+    )  # of the LiDAR, constant: VLP-16 data sheet 63-9229, +-3 cm, taken as even
+    shape_share: float = Field(0.03, ge=0, le=1)  # of its span: returns lie so far off its middle, one sigma, an axis
+    misses: bool = True  # ablation: without, only hits count
+    de_skew: bool = True  # ablation: without, a look is taken to be one moment
+
+
+class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
+    """Hits and misses of every look, de-skewed, on as many drones as there are."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion", "drone_position", "drone_odometry"})
+
+    def __init__(self, settings: LikelihoodTrackSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._trail = VehicleTrajectory()
+        self._detector_life: int | None = None  # that counts the candidates
+        self._next_number: int = 1
+        self._idle_ns: int = 0
+        self._why_idle: str = "nothing found yet"
+        settings = self.settings
+        self._known = Hypotheses(
+            settings.manoeuvre,
+            settings.told_manoeuvre,
+            settings.start_sigma_mps,
+            settings.own_sigma_m,
+            settings.max_drones,
+        )
+
+    def on_motion(self, motion: VehicleMotion) -> None:
+        """Where the vehicle is; without it, it is taken to be parked."""
+        self._trail.add(motion)
+
+    def on_drone_position(self, position: DroneLocalPosition) -> None:
+        """What the drone says of its flight: a track moves as it says."""
+        self._known.hear_position(position)
+
+    def on_drone_odometry(self, odometry: DroneOdometry) -> None:
+        """The same from an autopilot that sends this; taken where it sends both."""
+        self._known.hear_odometry(odometry)
+
+    def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
+        """Follow the promising ones; drop what is no longer taken for a drone."""
+        if self._detector_life not in (None, candidates.detector_life):
+            self._known.forget_numbers()
+        self._detector_life = candidates.detector_life
+        own = set(candidates.candidate_id[candidates.probability >= 0.5].tolist())
+        for i in range(len(candidates.candidate_id)):
+            number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])
+            xyz, v = self._trail.to_local(
+                candidates.stamp_ns, candidates.xyz_vehicle_m[i], candidates.velocity_vehicle_mps[i]
+            )
+            known = self._known.near(xyz, candidates.stamp_ns, number)
+            if known is None and P >= 0.5:
+                known = self._known.astray(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+            if known is not None:
+                seen_later = int(candidates.seen_ns[i]) > known.last_hit_ns
+                doubtful = known.confirmed and seen_later and self._known.doubtful(known, candidates.stamp_ns)
+                own_word = known.candidate == number  # the detector itself has followed it on
+                if doubtful and (0.5 if own_word else self._known.needed(known, candidates.stamp_ns)) <= P:
+                    self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+                # what is refused beside a track whose own candidate is taken for a drone is another one there
+                sure = known.candidate == number or (candidates.looks[i] >= 6 and known.candidate not in own)
+                if P < 0.2 and known.confirmed and sure:
+                    yield from self._lose(
+                        known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}"
+                    )
+            elif P >= 0.5 and len(self._known) - len(self._known.confirmed) < self.settings.max_hypotheses:
+                self._known.start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+
+    def on_detections(self, detections: Detections) -> Iterator[TrackState | DroneFix]:
+        """What the detector accepts becomes a track."""
+        for i in np.nonzero(detections.accepted)[0]:
+            seen_ns = detections.stamp_ns if detections.seen_ns is None else int(detections.seen_ns[i])
+            number = -1 if detections.candidate_id is None else int(detections.candidate_id[i])
+            velocity = detections.velocity_vehicle_mps
+            v = np.zeros(3) if velocity is None else velocity[i]
+            xyz, v = self._trail.to_local(seen_ns, detections.xyz_vehicle_m[i], v)
+            track = self._known.near(xyz, seen_ns, number) or self._known.astray(number, xyz, v, seen_ns, seen_ns)
+            drone = track if track is not None and track.confirmed else None
+            if drone is not None and seen_ns > drone.last_hit_ns and self._known.doubtful(drone, seen_ns):
+                self._known.move(drone, number, xyz, v, seen_ns, seen_ns)
+            if drone is None and (old := self._known.gives_way(seen_ns)):
+                yield from self._lose(old, seen_ns, "not hit, while the detector accepted a drone elsewhere")
+            if track is None:
+                if len(self._known.confirmed) >= self.settings.max_drones:
+                    continue
+                track = self._known.start(number, xyz, v, seen_ns, seen_ns)
+            if not track.confirmed and len(self._known.confirmed) < self.settings.max_drones:
+                track.confirmed = True
+                track.number, self._next_number = self._next_number, self._next_number + 1
+                track.candidate = number
+                track.reason = "accepted by the detector"
+                track.odds = max(track.odds, 4.0)
+                yield self._state(track, max(detections.stamp_ns, track.stamp_ns))
+
+    def on_pulses(self, pulses: SweptPulses) -> Iterator[DroneFix | TrackState]:
+        """Collect each track's pulses; close the looks that are over; tell who coasts or is lost."""
+        if pulses.range_m.size == 0:
+            return
+        now_ns = int(pulses.point_stamp_ns[-1])
+        R, t = self._trail.at(middle_ns(pulses))
+        axis = mean_direction(pulses.direction_vehicle)
+        hypotheses, span_m, de_skew = self._known, self.settings.span_m, self.settings.de_skew
+        for track in hypotheses:
+            if track not in hypotheses:  # dropped a moment ago as the same as another
+                continue
+            look = track.look
+            if look is not None and pulses.stamp_ns - look.last_ns > LOOK_OVER_NS:
+                track.look = None
+                yield from self._close(track, look)
+            before = track.look
+            state = hypotheses.at(track, pulses.stamp_ns) if before is None else (before.x, before.P)
+            track.look = collect_into(before, pulses, R, t, axis, *state, span_m, de_skew)
+            if before is None:
+                track.look_word = hypotheses.word(pulses.stamp_ns)
+            if track in hypotheses:
+                yield from self._watch(track, now_ns)
+        if not len(hypotheses) and now_ns - self._idle_ns > 500_000_000:
+            self._idle_ns = now_ns
+            yield TrackState(
+                stamp_ns=now_ns, state=TrackingState.SEARCHING, reason=self._why_idle, hits=0, frame_s=0.5, track_id=0
+            )
+
+    def _lose(self, track: Hypothesis, now_ns: int, why: str) -> Iterator[TrackState]:
+        self._known.drop(track)
+        if track.confirmed:
+            self._why_idle = f"lost drone {track.number}: {why}"
+            yield TrackState(
+                stamp_ns=now_ns, state=TrackingState.LOST, reason=why, hits=0, frame_s=0.1, track_id=track.number
+            )
+
+    def _watch(self, track: Hypothesis, now_ns: int) -> Iterator[TrackState]:
+        """Coasting and losing are told without a look."""
+        settings = self.settings
+        silent_s = (now_ns - track.last_hit_ns) * 1e-9
+        gone = silent_s > (settings.lost_after_s if track.confirmed else CANDIDATE_S)
+        if track.confirmed and gone:
+            known = self._known.word(now_ns) is not None
+            gone = not (known and largest_sigma_m(self._known.at(track, now_ns)[1]) < settings.lost_sigma_m)
+        if gone or track.odds < -4.0:
+            why = f"not hit for {silent_s:.1f} s" if silent_s > 1.0 else "looked at again and again, not hit"
+            yield from self._lose(track, now_ns, why)
+        elif track.confirmed:
+            for other in self._known:  # two that became one
+                if other is not track and np.linalg.norm(other.x[:3] - track.x[:3]) < settings.span_m:
+                    younger = other if not other.confirmed or other.number > track.number else track
+                    if younger is not track:
+                        yield from self._lose(other, now_ns, f"is the same as drone {track.number}")
+            if now_ns - track.told_ns > 100_000_000:
+                if silent_s > settings.coast_after_s:
+                    track.reason = f"not hit for {silent_s:.1f} s"
+                yield self._state(track, now_ns)
+        elif now_ns - track.told_ns > 100_000_000:
+            yield self._state(track, now_ns)
+
+    def _state(self, track: Hypothesis, now_ns: int) -> TrackState:
+        silent_s = (now_ns - track.last_hit_ns) * 1e-9
+        state = TrackingState.CANDIDATE
+        if track.confirmed:
+            state = TrackingState.COASTING if silent_s > self.settings.coast_after_s else TrackingState.TRACKING
+        x, P = self._known.at(track, now_ns)
+        R, _ = self._trail.at(now_ns)
+        xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
+        covariance = R.T @ P[:3, :3] @ R + self._lasting_covariance(xyz)
+        if silent_s > self.settings.coast_after_s:  # what is seen is seen from the vehicle, wherever that is
+            covariance += self._unsure_vehicle_m2(now_ns, xyz)
+        track.told_ns = now_ns
+        return TrackState(
+            stamp_ns=now_ns,
+            state=state,
+            reason=track.reason,
+            hits=track.hits,
+            frame_s=0.1,
+            track_id=track.number,
+            xyz_vehicle_m=xyz,
+            velocity_vehicle_mps=velocity,
+            covariance_m2=covariance,
+        )
+
+    def _unsure_vehicle_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> Array64:
+        """What a place beside a vehicle that is not heard any more is wrong by (3, 3), its axes."""
+        place_m, yaw_rad = self._trail.unsure(stamp_ns)
+        level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * yaw_rad
+        return place_m**2 * np.eye(3) + np.outer(level, level)
+
+    # one look
+
+    def _close(self, track: Hypothesis, look: Look) -> Iterator[DroneFix | TrackState]:
+        settings = self.settings
+        seen = evaluate(
+            look,
+            settings.span_m,
+            settings.hull_share * settings.span_m,
+            track.p_0,
+            settings.misses,
+            settings.own_sigma_m,
+        )
+        track.hits = 0 if seen is None else seen.hits
+        if seen is None:
+            return
+        self._known.update(track, look.start_ns, seen.x, seen.P, track.look_word)
+        track.odds = min(max(track.odds + seen.evidence, -8.0), 8.0)
+        if seen.hits == 0:
+            return
+        track.last_hit_ns = seen.hit_ns
+        if seen.expected > 0.5:
+            ratio = min(max(track.p_0 * seen.hits / seen.expected, 0.15), 0.95)
+            track.p_0 += 0.1 * (ratio - track.p_0)
+        track.reason = f"{seen.hits} hits, {seen.beside} pulses beside it"
+        if track.confirmed:
+            self._known.learn(track)
+            yield self._fix(track)
+        yield self._state(track, max(look.last_ns, track.last_hit_ns, track.told_ns))
+
+    def _fix(self, track: Hypothesis) -> DroneFix:
+        x, P = self._known.at(track, track.last_hit_ns)
+        R, _ = self._trail.at(track.last_hit_ns)
+        xyz, velocity = self._trail.to_vehicle(track.last_hit_ns, x[:3], x[3:])
+        bias_covariance_m2 = self._lasting_covariance(xyz)
+        return DroneFix(
+            stamp_ns=track.last_hit_ns,
+            xyz_vehicle_m=xyz,
+            covariance_m2=R.T @ P[:3, :3] @ R + bias_covariance_m2,
+            hits=track.hits,
+            iterations=1,
+            shift_m=0.0,
+            track_id=track.number,
+            velocity_vehicle_mps=velocity,
+            bias_covariance_m2=bias_covariance_m2,
+        )
+
+    def _lasting_covariance(self, xyz_vehicle_m: Array64) -> Array64:
+        """What does not average out (3, 3): the turntable's zero and tilt, the range, the drone's outline.
+
+        Axes of the vehicle; the line of sight is taken from its origin, decimetres beside the LiDAR's.
+        """
+        settings = self.settings
+        along = xyz_vehicle_m * (settings.range_sigma_m / max(float(np.linalg.norm(xyz_vehicle_m)), 1e-9))
+        level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * math.radians(settings.mount.pointing_sigma_deg)
+        x, y, z = xyz_vehicle_m * math.radians(settings.tilt_deg)
+        tilted = np.outer([0.0, -z, y], [0.0, -z, y]) + np.outer([z, 0.0, -x], [z, 0.0, -x])
+        outline = (settings.shape_share * settings.span_m) ** 2 * np.eye(3)
+        return np.outer(level, level) + tilted + np.outer(along, along) + outline

@@ -1,0 +1,172 @@
+"""The servo's clock against the LiDAR's, on a simulated recording whose servo stamps are moved."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from flow.message import check_arrays
+from links.dynamixel import Servo
+from links.recording import RecordingReader
+from links.velodyne import Lidar
+from stages.calibration.servo_clock import ServoClock, both_ways_rad
+from stages.calibration.servo_mount import servo_mount
+from stages.geometry.frames import LidarMount
+from stages.messages import LidarFirings, VehicleMotion
+from tests.stages.calibration.made_sweep import RIG, SLOW, sweep
+from tests.stages.made import servo
+
+RECORDING = Path(__file__).resolve().parents[3] / "recordings" / "street_sweep.mcap"
+VIBRATING_S = 2.65  # a sweep one way, then vibration
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """(mount, messages in the order of arrival): a parked vehicle, no error of the rig."""
+    lidar, servo = Lidar(), Servo()
+    with RecordingReader(RECORDING) as reader:
+        mount = LidarMount(**yaml.safe_load(reader.rig_yaml)["lidar"]["mount"])
+        records = reader.records({"/lidar/packets", "/servo/state"})
+        messages = [(lidar if r.topic == lidar.topic else servo).decode(r) for r in records]
+    return mount, [m for m in messages if m is not None]
+
+
+def told(recorded, late_s=0.0, from_s=VIBRATING_S, to_s=9.0, motion=(), **settings):
+    """What the stage says when the servo's stamps are late by so much."""
+    mount, messages = recorded
+    stage = ServoClock(mount=settings.pop("mount", mount), window_s=2.4, **settings)
+    for message in motion:
+        stage.on_motion(message)
+    said, start_ns = [], messages[0].stamp_ns
+    for message in messages:
+        if not from_s * 1e9 <= message.stamp_ns - start_ns < to_s * 1e9:
+            continue
+        if isinstance(message, LidarFirings):
+            said += stage.on_firings(message)
+        else:
+            stage.on_servo(dataclasses.replace(message, stamp_ns=message.stamp_ns + round(late_s * 1e9)))
+    return said
+
+
+@pytest.mark.parametrize("late_s", [-2e-3, 0.0, 5e-4])
+def test_stamps_that_are_late_are_found_with_an_honest_sigma(recorded, late_s):
+    (offset,) = told(recorded, late_s)
+    check_arrays(offset)
+    assert offset.sigma_s < 4e-4
+    assert abs(offset.offset_s + late_s) < 3 * offset.sigma_s
+    assert (offset.windows, offset.rig_s) == (1, 0.0)
+    assert "this window alone" in offset.reason
+
+
+def test_what_the_rig_says_already_is_counted_in(recorded):
+    mount = recorded[0].model_copy(update={"servo_time_offset_s": 1e-3})
+    (offset,) = told(recorded, late_s=-1e-3, mount=mount)
+    assert offset.rig_s == 1e-3
+    assert abs(offset.offset_s - 1e-3) < 3 * offset.sigma_s
+
+
+def test_a_sweep_one_way_tells_nothing(recorded):
+    (offset,) = told(recorded, late_s=1e-3, from_s=0.1, to_s=2.6)
+    assert (offset.offset_s, offset.sigma_s, offset.windows) == (None, None, 0)
+    assert "in both directions" in offset.reason
+
+
+def driven(x_m):
+    return VehicleMotion(stamp_ns=0, xyz_map_m=np.array([x_m, 0.0, 0.0]), R_map_vehicle=np.eye(3), covariance=None)
+
+
+def test_a_vehicle_that_moves_tells_nothing(recorded):
+    (offset,) = told(recorded, motion=[driven(0.0), driven(0.1)])
+    assert (offset.offset_s, offset.reason) == (None, "the vehicle moved")
+    (offset,) = told(recorded, motion=[driven(0.0), driven(0.01)])
+    assert offset.offset_s is not None
+
+
+def test_a_lidar_bolted_down_says_nothing(recorded):
+    assert told(recorded, mount=recorded[0].model_copy(update={"turns": False})) == []
+
+
+def test_windows_are_joined_and_one_that_disagrees_is_not():
+    stage = ServoClock(mount=LidarMount())
+    stage._firings = [LidarFirings.__new__(LidarFirings)]
+    object.__setattr__(stage._firings[0], "stamp_ns", 0)
+    stage._join(1e-3, 2e-4, 0.0)
+    assert "alone: 1.20 ms, sigma 0.20 ms" in stage._join(1.2e-3, 2e-4, 0.0)
+    first = stage._told(0, "")
+    assert first.offset_s == pytest.approx(1.1e-3, rel=1e-3)
+    assert first.sigma_s == pytest.approx(math.hypot(2e-4 / math.sqrt(2), 3e-4), rel=1e-3)
+    assert "disagrees: 9.00 ms" in stage._join(9e-3, 2e-4, 0.0)
+    doubtful = stage._told(0, "")
+    assert doubtful.offset_s == first.offset_s
+    assert doubtful.sigma_s > 4 * first.sigma_s
+
+
+def test_what_windows_share_does_not_shrink_with_their_number():
+    stage = ServoClock(mount=LidarMount())
+    stage._firings = [LidarFirings.__new__(LidarFirings)]
+    object.__setattr__(stage._firings[0], "stamp_ns", 0)
+    for _ in range(100):
+        said = stage._join(1e-3, 2e-4, 3e-4)
+    assert "sigma 0.36 ms" in said
+    assert stage._told(0, "").sigma_s == pytest.approx(math.hypot(2e-5, 3e-4, 3e-4), rel=1e-3)
+    assert "alone" in stage._join(2.5e-3, 2e-4, 3e-4)  # a window may be off by what it shares with itself only
+
+
+def test_a_play_that_the_rig_does_not_know_is_in_the_sigma_that_windows_share():
+    """Half of .1 deg of play at 68 deg/s is .7 ms, in each sweep there and back."""
+    true = replace(servo_mount(RIG), play_rad=math.radians(0.1))
+    made = sweep(true, legs=((30.0, 150.0, SLOW), (150.0, 30.0, SLOW)), count=20_000)
+    returns, stage = made.returns, ServoClock(mount=RIG)
+    range_m = np.linalg.norm(returns.xyz_lidar_m, axis=1)
+    seen = {"pulse_stamp_ns": returns.stamp_ns, "laser": returns.laser, "xyz_lidar_m": returns.xyz_lidar_m}
+    stage._firings = [SimpleNamespace(range_m=range_m, **seen)]
+    offset_s, own_s, shared_s = stage._solve(made.trace)
+    assert 4e-4 < abs(offset_s) < 1e-3
+    assert own_s < shared_s
+    assert shared_s == pytest.approx(abs(offset_s) / 2, rel=0.2)  # play_sigma_deg is .05
+
+
+def test_only_angles_passed_both_ways_count():
+    stamp_ns = np.arange(200) * 5_000_000
+    up = np.radians(np.linspace(0, 40, 100))
+    down = np.radians(np.linspace(40, 30, 100))
+    assert both_ways_rad(stamp_ns[:100], up) == 0
+    assert math.degrees(both_ways_rad(stamp_ns, np.concatenate([up, down]))) == pytest.approx(10, abs=1)
+    assert both_ways_rad(stamp_ns, np.full(200, 0.5)) == 0
+
+
+def test_once_it_is_known_it_rests_and_what_happens_meanwhile_does_not_count(recorded):
+    later = [dataclasses.replace(m, stamp_ns=m.stamp_ns + 7_000_000_000) for m in recorded[1]]
+    twice = recorded[0], [*recorded[1], *later]
+    each = told(twice, to_s=20.0, every_window=1)
+    stage_s = [(offset.stamp_ns - each[0].stamp_ns) * 1e-9 for offset in told(twice, to_s=20.0, every_window=3)]
+    assert len(each) > 2
+    assert len(stage_s) == 2
+    assert stage_s[1] > 3 * 2.4 - 0.1
+    moved = told(twice, to_s=20.0, every_window=3, motion=[driven(0.0), driven(0.1)])
+    assert moved[0].reason == "the vehicle moved"
+    assert moved[1].stamp_ns - moved[0].stamp_ns < 3e9  # nothing was known: it goes on at once
+
+
+@pytest.mark.parametrize(
+    "setting", [{"window_s": 0.1}, {"every_window": 0}, {"every_packet": 0}, {"floor_s": 0}, {"typo": 1}]
+)
+def test_impossible_clock_settings_are_errors(setting):
+    with pytest.raises(ValidationError):
+        ServoClock(mount=LidarMount(), **setting)
+
+
+def test_nothing_grows_while_the_lidar_is_silent():
+    clock = ServoClock(mount=LidarMount())
+    for k in range(20_000):
+        clock.on_servo(servo(k * 5_000_000, math.sin(0.01 * k)))
+        clock.on_motion(driven(0.0))
+    assert max(len(values) for values in vars(clock).values() if isinstance(values, list)) < 5000

@@ -1,0 +1,516 @@
+"""A path against what the drone tells of its own: likelihoods by hand, frames that do not matter, birds, lamps, silence."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from stages.detect import motion_log_ratios
+from stages.detect.motion_log_ratios import MOST_MISFIT, MOST_POINTS, Heard, hear
+from stages.geometry.frames import rotation_z
+from stages.kernels.detect.motion_log_ratios import (
+    BALLOON,
+    BIRD,
+    CRUISE_MPS,
+    CRUISE_SIGMA_MPS,
+    CRUISING,
+    DRIFT_MPS,
+    DRIFT_UP_MPS,
+    FOLLOWED_MPS,
+    LOOSE,
+    LOOSE_MPS,
+    LOOSE_MPS2,
+    SCATTERED_M,
+    SLIDING_MPS,
+    SWAY_M,
+    YAWS,
+    weigh,
+)
+from stages.kernels.geometry.smooth_motion import ANYWHERE_M
+from stages.messages import DroneOdometry
+from stages.odometry.drone.telemetry import AHEAD_NS, JUMP_M, KEPT_NS, DroneTelemetry
+from tests.stages.made import MS, START_NS
+
+SIGMA_M = 0.15
+T_S = np.linspace(-2.0, 0.0, 14)
+STRAIGHT_M = np.outer(T_S, (3.0, 1.0, 0.5))
+HANGING_M = np.zeros((14, 3))
+
+
+def turning(radius_m=5.0, speed_mps=4.0, t_s=T_S):
+    w = speed_mps / radius_m
+    return np.column_stack([radius_m * np.cos(w * t_s), radius_m * np.sin(w * t_s), 0.3 * t_s])
+
+
+def noise(seed=0, sigma_m=0.1, n=14):
+    return np.random.default_rng(seed).normal(0.0, sigma_m, (n, 3))
+
+
+def against(path_m, told_m, level_known=True, t_s=T_S, sigma_m=SIGMA_M):
+    return Heard(*weigh(t_s, np.asarray(path_m), np.asarray(told_m), sigma_m, level_known), way_m=math.inf)
+
+
+# formula by hand
+
+
+def log_normal(t, e, sigma, speed=0.0, acceleration=0.0):
+    """ln N(e; 0, sigma^2 I + B Q B') with the whole covariance (n, n), but for n ln(2 pi) / 2."""
+    B = np.column_stack([np.ones(len(t)), t, t * t / 2])
+    covariance = sigma**2 * np.eye(len(t)) + B @ np.diag([ANYWHERE_M**2, speed**2, acceleration**2]) @ B.T
+    return -0.5 * (e @ np.linalg.solve(covariance, e) + np.linalg.slogdet(covariance)[1])
+
+
+def log_mean(values):
+    return float(np.log(np.mean(np.exp(np.subtract(values, max(values))))) + max(values))
+
+
+def by_hand(t, x, d, sigma, axes):
+    x, d = x - x.mean(axis=0), d - d.mean(axis=0)
+
+    def all_axes(e, *model):
+        return sum(log_normal(t, e[:, axis], *model) for axis in axes)
+
+    def flier(level, up):
+        return all_axes(x[:, :2], sigma, *level) if axes == (0, 1) else log_normal(t, x[:, 2], sigma, *up)
+
+    yaws = math.tau * np.arange(YAWS) / YAWS
+    drift = DRIFT_MPS if axes == (0, 1) else DRIFT_UP_MPS
+    drone = log_mean([all_axes(x - d @ rotation_z(yaw).T, sigma, drift) for yaw in yaws])
+    still, long = all_axes(x, sigma, drift), all_axes(x, SCATTERED_M)
+    sliding = all_axes(x, sigma, SLIDING_MPS) if axes == (0, 1) else still  # level only
+    followed = all_axes(x, sigma, FOLLOWED_MPS) if axes == (0, 1) else still
+    sway_mps = SWAY_M / np.ptp(t)  # on its string
+    balloon = flier((min(BALLOON[0], sway_mps), BALLOON[1]), (min(BALLOON[2], sway_mps), BALLOON[3]))
+    loose = flier((LOOSE_MPS, LOOSE_MPS2), (LOOSE_MPS, LOOSE_MPS2))
+    bird = flier(BIRD[:2], BIRD[2:])
+    if axes == (0, 1):
+        headings = [CRUISE_MPS * np.array([math.cos(yaw), math.sin(yaw), 0.0]) for yaw in yaws]
+        cruising = log_mean([all_axes(x - np.outer(t, v), sigma, CRUISE_SIGMA_MPS, BIRD[1]) for v in headings])
+        bird = np.logaddexp(math.log(CRUISING) + cruising, math.log(1 - CRUISING) + bird)
+    return drone, still, long, sliding, bird, balloon, loose, followed
+
+
+def heard_by_hand(t, x, d, sigma, level_known):
+    parts = np.array(by_hand(t, x, d, sigma, (2,)))
+    if level_known:
+        parts = parts + np.array(by_hand(t, x, d, sigma, (0, 1)))
+    drone, still, long, sliding, bird, balloon, loose, followed = parts
+    balloon = np.logaddexp(math.log(1 - LOOSE) + balloon, math.log(LOOSE) + loose)
+    over_still = drone - log_mean([still, long, sliding])
+    return over_still, drone - bird, drone - balloon, min(over_still, drone - followed)
+
+
+@pytest.mark.parametrize("level_known", [True, False])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_evidence_is_the_ratio_of_the_dense_marginal_likelihoods(seed, level_known):
+    rng = np.random.default_rng(seed)
+    n = (2, 3, 8, 14)[seed]
+    t = np.sort(rng.uniform(-3.0, 0.0, n))
+    d = rng.normal(0.0, 2.0, (n, 3)) + np.outer(t, rng.normal(0.0, 4.0, 3))
+    x = d @ rotation_z(0.3 * seed).T + rng.normal(0.0, 0.3, (n, 3)) + rng.normal(0.0, 30.0, 3)
+    for sigma_m in (0.1, 0.4):
+        expected = heard_by_hand(t, x, d, sigma_m, level_known)
+        found = weigh(t, x, d, sigma_m, level_known)
+        np.testing.assert_allclose(found[:4], expected, rtol=1e-7, atol=1e-5)
+        assert found[4] == pytest.approx(misfit_by_hand(t, x, d, sigma_m, level_known), rel=1e-6)
+
+
+def misfit_by_hand(t, x, d, sigma, level_known):
+    """e' C^-1 e of the drone's own covariances, a coordinate."""
+    x, d = x - x.mean(axis=0), d - d.mean(axis=0)
+
+    def off2(e, drift):
+        C = sigma**2 * np.eye(len(t)) + ANYWHERE_M**2 + drift**2 * np.outer(t, t)
+        return e @ np.linalg.solve(C, e)
+
+    up = off2(x[:, 2] - d[:, 2], DRIFT_UP_MPS)
+    if not level_known:
+        return up / len(t)
+    level = [sum(off2(e, DRIFT_MPS) for e in (x - d @ rotation_z(math.tau * k / YAWS).T)[:, :2].T) for k in range(YAWS)]
+    return (up + min(level)) / (3 * len(t))
+
+
+def test_the_paths_that_are_given_stay_as_they_are():
+    x, d = STRAIGHT_M + 5.0, turning()
+    x_before, d_before = x.copy(), d.copy()
+    weigh(T_S, x, d, SIGMA_M, True)
+    np.testing.assert_array_equal(x, x_before)
+    np.testing.assert_array_equal(d, d_before)
+
+
+# symmetries
+
+FLIGHTS = {"straight": STRAIGHT_M, "turning": turning(), "hanging": HANGING_M}
+
+
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_which_way_the_autopilots_axes_point_does_not_matter(flight):
+    """Exactly for the yaws that are tried, and by a nat or two, whatever the flight, between them."""
+    told = FLIGHTS[flight]
+    path = told + noise()
+    straight = against(path, told)
+    for k in (1, 5, 12, 23):
+        turned = told @ rotation_z(math.tau * k / YAWS).T
+        np.testing.assert_allclose(against(path, turned), straight, atol=1e-6)
+    for yaw in np.linspace(0.0, math.tau / YAWS, 7):
+        np.testing.assert_allclose(against(path, told @ rotation_z(yaw + 1.0).T), straight, atol=6.0)
+
+
+def test_the_world_may_be_turned_too():
+    told, path = turning(), turning() + noise()
+    for k in (3, 7, 20):
+        turned = path @ rotation_z(math.tau * k / YAWS).T
+        np.testing.assert_allclose(against(turned, told), against(path, told), atol=1e-6)
+
+
+def test_where_the_two_frames_begin_does_not_matter():
+    told, path = turning(), turning() + noise()
+    moved = against(path + np.array([300.0, -20.0, 7.0]), told - np.array([4.0, 900.0, 50.0]))
+    np.testing.assert_allclose(moved, against(path, told), atol=1e-6)
+
+
+def test_swapped_or_mirrored_axes_of_both_change_nothing():
+    told, path = turning(), turning() + noise()
+    expected = against(path, told)
+    np.testing.assert_allclose(against(path[:, [1, 0, 2]], told[:, [1, 0, 2]]), expected, atol=1e-6)
+    np.testing.assert_allclose(against(path * [1, -1, 1], told * [1, -1, 1]), expected, atol=1e-6)
+    np.testing.assert_allclose(against(path * [1, 1, -1], told * [1, 1, -1]), expected, atol=1e-6)
+
+
+def test_up_is_not_swapped_with_level_and_a_mirrored_path_is_not_the_drones():
+    told = turning(3.0, 6.0)
+    path = told + noise()
+    assert against(path * [1, -1, 1], told).over_bird < against(path, told).over_bird - 50.0  # no yaw mirrors
+    rising = np.outer(T_S, (0.0, 0.0, 3.0))
+    assert against(rising, rising[:, [2, 0, 1]]).over_bird < 0 < against(rising, rising).over_bird
+
+
+def test_the_order_of_the_sightings_does_not_matter():
+    told, path = turning(), turning() + noise()
+    order = np.random.default_rng(1).permutation(14)
+    shuffled = against(path[order], told[order], t_s=T_S[order])
+    np.testing.assert_allclose(shuffled, against(path, told), atol=1e-6)
+
+
+# what flies
+
+
+@pytest.mark.parametrize("flight", ["straight", "turning"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_path_that_the_drone_tells_is_the_drones(flight, seed):
+    path = FLIGHTS[flight] @ rotation_z(0.4 + seed).T + noise(seed)
+    heard = against(path, FLIGHTS[flight])
+    assert heard.over_still > 15.0
+    assert heard.over_bird > 4.0
+    assert heard.over_balloon > 4.0
+
+
+def test_a_slow_drift_of_the_autopilots_velocity_is_forgiven_and_a_fast_one_is_not():
+    path = STRAIGHT_M + noise()
+    clean = against(path, STRAIGHT_M).over_bird
+    assert against(path + np.outer(T_S, (0.0, 0.3, 0.0)), STRAIGHT_M).over_bird > clean - 3.0
+    assert against(path + np.outer(T_S, (0.0, 0.0, 2.0)), STRAIGHT_M).over_bird < 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("velocity", [(11.0, 0.0, 0.0), (-5.0, 8.0, 0.5), (0.0, -4.0, 0.5)])
+def test_a_bird_is_no_drone_that_hangs_or_flies_otherwise(velocity, seed):
+    path = np.outer(T_S, velocity) + noise(seed)
+    assert against(path, HANGING_M).over_bird < -10.0
+    assert against(path, np.outer(T_S, (1.0, 1.0, 0.0))).over_bird < -5.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_lamp_is_no_drone_that_flies(seed):
+    path = noise(seed)
+    assert against(path, STRAIGHT_M).over_still < -30.0
+    assert against(path, np.outer(T_S, (0.0, 0.0, 1.0))).over_still < -3.0
+    scattered = noise(seed, sigma_m=0.4)  # a wire is met here and there
+    assert against(scattered, STRAIGHT_M).over_still < -10.0
+
+
+def test_a_wire_that_is_met_farther_and_farther_along_is_no_drone_that_flies_or_hangs():
+    slides = np.outer(T_S, (0.6, -0.5, 0.0)) + noise()
+    assert against(slides, STRAIGHT_M).over_still < -10.0
+    assert against(slides, HANGING_M).over_still < 1.0
+    rises = np.outer(T_S, (0.0, 0.0, 0.8)) + noise()  # none slides up
+    assert against(rises, np.outer(T_S, (0.0, 0.0, 0.8))).over_still > 10.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wire_looked_at_farther_along_as_fast_as_the_drone_flies_is_told_from_it_by_a_turn_alone(seed):
+    slides = np.outer(T_S, (2.0, -1.5, 0.0)) + noise(seed)
+    straight = against(slides, np.outer(T_S, (2.5, 0.0, 0.0)))
+    assert straight.over_still > 8.0  # what nobody looks along does not go so far
+    assert straight.over_wire < 4.0
+    turned = turning()
+    assert against(turned + noise(seed), turned).over_wire > 10.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_drone_that_hangs_still_says_nothing_against_a_lamp(seed):
+    heard = against(noise(seed), HANGING_M)
+    assert -1.5 < heard.over_still < 1.5
+    assert heard.over_bird > 5.0  # and much against birds
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_balloon_is_no_drone_that_flies_fast_and_nearly_one_that_drifts_as_it(seed):
+    path = np.outer(T_S, (0.8, 0.2, 0.2)) + noise(seed)
+    assert against(path, STRAIGHT_M).over_balloon < -10.0
+    assert -2.0 < against(path, np.outer(T_S, (0.8, 0.2, 0.2))).over_balloon < 12.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_flies_straight_on_for_metres_is_hardly_a_balloon_on_a_string(seed):
+    """Slow and straight as a balloon may drift for a second: a drone had to be looked at for six seconds."""
+
+    def over_balloon(seconds):
+        t_s = np.linspace(0.0, seconds, 14)
+        path = np.outer(t_s, (0.8, 0.3, 0.1))
+        return against(path + noise(seed), path, t_s=t_s).over_balloon
+
+    assert over_balloon(6.0) > over_balloon(1.0) + 3.0
+    swaying = 0.5 * np.sin(np.outer(np.linspace(0.0, 3.0, len(T_S)), (1.2, 1.9, 0.0)))
+    assert against(swaying + noise(seed), np.outer(T_S, (0.8, 0.3, 0.1))).over_balloon < -4.0
+
+
+def test_when_the_vehicles_motion_is_unknown_only_heights_are_compared():
+    told = turning()
+    passing = told + noise() + np.outer(T_S, (-12.0, 4.0, 0.0))  # seen from a vehicle that drives and does not say so
+    level, heights = against(passing, told), against(passing, told, level_known=False)
+    assert level.over_bird < -50.0
+    assert heights.over_bird > 0.0
+    elsewhere = passing * [0.0, 3.0, 1.0] + np.outer(T_S**2, (5.0, 1.0, 0.0))
+    np.testing.assert_allclose(against(elsewhere, told, level_known=False), heights, atol=1e-9)
+    assert against(passing * [1, 1, -8], told, level_known=False).over_bird < heights.over_bird - 5.0
+
+
+def test_more_looks_say_more():
+    told = turning()
+    path = told + noise(3)
+    heard = [against(path[-n:], told[-n:], t_s=T_S[-n:]).over_still for n in (2, 4, 8, 14)]
+    assert heard == sorted(heard)
+    assert heard[-1] > heard[0] + 20.0
+
+
+# what the drone tells
+
+
+def telling(way, seconds=4.0, step_s=0.1, start_ns=START_NS, into=None):
+    """A motion_log_ratios that was told of a flight p(t), with the velocity that it has."""
+    made = DroneTelemetry() if into is None else into
+    for k in range(round(seconds / step_s) + 1):
+        t = k * step_s
+        velocity = (np.asarray(way(t + 1e-4)) - way(t - 1e-4)) / 2e-4
+        made.add(start_ns + round(t * 1e9), np.asarray(way(t), dtype=np.float64), velocity)
+    return made
+
+
+def circle(t):
+    return np.array([5 * math.cos(t), 5 * math.sin(t), 10 + 0.5 * t])
+
+
+def shifted(after_s, by_m):
+    """The circle from a time on, at another place."""
+    return lambda t: circle(after_s + t) + by_m * np.array([0.6, 0.0, 0.8])
+
+
+def ns(*times_s):
+    return [START_NS + round(t * 1e9) for t in times_s]
+
+
+def places(told, stamps_ns):
+    """Where it says it was (n, 3); None: it was silent at one of these times."""
+    states = [told.state(stamp_ns) for stamp_ns in stamps_ns]
+    return None if any(state is None for state in states) else np.array([state[0] for state in states])
+
+
+def test_between_and_just_beyond_its_words_a_drone_flies_on():
+    told = telling(circle)
+    times = (0.0, 1.04, 2.5, 3.96, 4.05)
+    expected = np.array([circle(t) for t in times])
+    np.testing.assert_allclose(places(told, ns(*times)), expected, atol=0.01)
+    assert places(told, ns(1.04)).shape == (1, 3)
+
+
+def test_a_place_is_taken_from_the_nearer_of_two_words():
+    told = DroneTelemetry()
+    told.add(START_NS, np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+    told.add(START_NS + 400 * MS, np.array([0.0, 0.0, 0.0]), np.array([0.0, 2.0, 0.0]))
+    np.testing.assert_allclose(places(told, ns(0.1)), [[0.1, 0.0, 0.0]])
+    np.testing.assert_allclose(places(told, ns(0.3)), [[0.0, -0.2, 0.0]])
+
+
+@pytest.mark.parametrize(
+    "times", [(-0.1, 1.0), (1.0, 4.6), (3.0, 60.0)], ids=["before its first word", "long after its last", "later"]
+)
+def test_when_it_was_silent_nothing_is_known(times):
+    assert places(telling(circle), ns(*times)) is None
+
+
+def test_in_a_gap_nothing_is_known():
+    told = telling(lambda t: np.zeros(3), seconds=1.0)
+    telling(lambda t: np.zeros(3), seconds=1.0, start_ns=START_NS + 4_000 * MS, into=told)
+    assert places(told, ns(0.5, 4.5)) is not None
+    assert places(told, ns(0.5, 2.5, 4.5)) is None
+
+
+def test_one_word_is_not_enough_and_none_is_silence():
+    told = DroneTelemetry()
+    assert places(told, ns(0.0)) is None
+    assert told.speed_mps(START_NS) is None
+    told.add(START_NS, np.zeros(3), np.zeros(3))
+    assert places(told, ns(0.0)) is None
+
+
+def test_its_speed_is_level_and_up_while_it_is_heard():
+    told = DroneTelemetry()
+    told.add(START_NS, np.zeros(3), np.array([3.0, -4.0, -1.5]))
+    assert told.speed_mps(START_NS + AHEAD_NS) == pytest.approx((5.0, -1.5))
+    assert told.speed_mps(START_NS + AHEAD_NS + MS) is None
+
+
+def test_an_odometry_that_calls_itself_failed_is_not_heard():
+    told = DroneTelemetry()
+    for k, quality in enumerate((80, None, 0)):
+        told.add_odometry(
+            DroneOdometry(
+                stamp_ns=START_NS + k * 100 * MS,
+                xyz_odom_m=np.full(3, 0.1 * k),
+                R_odom_drone=np.eye(3),
+                velocity_drone_mps=np.ones(3),
+                angular_velocity_drone_radps=np.zeros(3),
+                pose_covariance=None,
+                velocity_covariance=None,
+                reset_counter=0,
+                quality_percent=quality,
+            )
+        )
+    assert told.heard_ns == (START_NS, START_NS + 100 * MS)
+
+
+def test_a_word_that_is_not_newer_is_ignored():
+    told = telling(circle)
+    told.add(START_NS + 2_000 * MS, np.full(3, 99.0), np.zeros(3))
+    told.add(START_NS + 4_000 * MS, np.full(3, 99.0), np.zeros(3))
+    np.testing.assert_allclose(places(told, ns(2.0, 4.0)), [circle(2.0), circle(4.0)], atol=1e-6)
+
+
+def test_a_jump_that_its_velocity_does_not_explain_is_a_reset_and_what_was_before_is_forgotten():
+    told = telling(circle)
+    telling(shifted(4.1, JUMP_M + 0.2), 1.0, start_ns=START_NS + 4_100 * MS, into=told)
+    assert places(told, ns(3.0, 4.5)) is None
+    assert places(told, ns(4.2, 4.5)) is not None
+
+
+def test_a_small_correction_and_a_fast_flight_are_no_resets():
+    told = telling(circle)
+    telling(shifted(4.1, JUMP_M - 0.2), 1.0, start_ns=START_NS + 4_100 * MS, into=told)
+    assert places(told, ns(3.0, 4.5)) is not None
+    assert places(telling(lambda t: np.array([15.0 * t, 0.0, 0.0]), step_s=0.4), ns(0.5, 3.5)) is not None
+
+
+def test_its_memory_is_bounded():
+    told = telling(lambda t: np.zeros(3), seconds=60.0)
+    assert len(told._ns) == len(told._xyz_m) == len(told._v_mps) == round(KEPT_NS * 1e-8) + 1
+    assert places(told, ns(39.0, 60.0)) is None
+    assert places(told, ns(40.0, 60.0)) is not None
+
+
+# a path and the motion_log_ratios together
+
+
+def path_of(way, times):
+    return ns(*times), [np.asarray(way(t)) for t in times]
+
+
+def test_a_path_is_compared_with_what_was_told_at_its_times():
+    times = np.linspace(1.0, 3.0, 9)
+    yaw = rotation_z(math.tau * 3 / YAWS)
+    stamps, path = path_of(lambda t: yaw @ circle(t) + [0.0, 40.0, -3.0], times)
+    heard = hear(telling(circle), stamps, path, SIGMA_M, True)
+    expected = weigh(times - times[-1], np.array(path), np.array([circle(t) for t in times]), SIGMA_M, True)
+    np.testing.assert_allclose(heard[:5], expected, atol=0.2)
+    assert heard.over_still > 30.0 < heard.over_balloon
+
+
+def test_nothing_speaks_for_a_drone_where_a_path_is_far_from_the_drones_though_all_else_is_farther():
+    """A thing that swings two metres to each side where the drone swings three: no lamp, no bird, and not the drone."""
+
+    def swinging(t, by_m=3.0):
+        return np.array([2.0 * t, by_m * math.sin(3.0 * t), 10.0])
+
+    times = np.linspace(1.0, 3.0, 9)
+    stamps, path = path_of(lambda t: swinging(t, 2.0), times)
+    told = np.array([swinging(t) for t in times])
+    assert min(weigh(times - times[-1], np.array(path), told, SIGMA_M, True)[:4]) > 5.0
+    heard = hear(telling(swinging), stamps, path, SIGMA_M, True)
+    assert heard.misfit > MOST_MISFIT
+    assert max(heard[:4]) == 0.0
+    stamps, path = path_of(swinging, times)
+    heard = hear(telling(swinging), stamps, path, SIGMA_M, True)
+    assert heard.misfit < 1.0
+    assert min(heard[:4]) > 5.0
+
+
+def test_only_heights_are_heard_of_when_the_vehicle_does_not_say_how_it_drives():
+    stamps, path = path_of(lambda t: [20.0 * t, 0.0, circle(t)[2]], np.linspace(1.0, 3.0, 9))
+    assert hear(telling(circle), stamps, path, SIGMA_M, True).over_bird < -50.0
+    assert hear(telling(circle), stamps, path, SIGMA_M, False).over_bird > -1.0
+
+
+def test_how_far_the_drone_went_is_its_farthest_from_where_it_was_at_first_and_only_up_where_heights_are_compared():
+    def out_and_back(t):
+        return np.array([4.0 * math.sin(math.pi * (t - 1.0) / 2.0), 0.0, 10.0 + 0.7 * math.sin(math.pi * (t - 1.0))])
+
+    stamps, path = path_of(out_and_back, np.linspace(1.0, 3.0, 9))
+    assert hear(telling(out_and_back), stamps, path, SIGMA_M, True).way_m == pytest.approx(4.0, abs=0.1)
+    assert hear(telling(out_and_back), stamps, path, SIGMA_M, False).way_m == pytest.approx(0.7, abs=0.1)
+    hanging = hear(telling(lambda t: [3.0, 4.0, 10.0]), stamps, path, SIGMA_M, True)
+    assert hanging.way_m == pytest.approx(0.0, abs=1e-6)
+
+
+def test_silence_and_a_single_sighting_say_nothing():
+    stamps, path = path_of(circle, np.linspace(1.0, 3.0, 9))
+    assert hear(DroneTelemetry(), stamps, path, SIGMA_M, True) is None
+    assert hear(telling(circle, seconds=0.9), stamps, path, SIGMA_M, True) is None  # it fell silent long ago
+    assert hear(telling(circle), stamps[:1], path[:1], SIGMA_M, True) is None
+
+
+def test_sightings_at_which_it_was_silent_are_left_out():
+    times = np.linspace(0.5, 3.5, 13)
+    late, early = telling(circle, start_ns=START_NS), telling(circle, seconds=1.5)
+    between = DroneTelemetry()
+    telling(lambda t: circle(1.4 + t), seconds=1.2, start_ns=START_NS + 1_400 * MS, into=between)
+    for told, heard in ((late, times >= 0.0), (early, times <= 2.0), (between, (times > 1.4) & (times < 3.1))):
+        expected = hear(told, *path_of(circle, times[heard]), SIGMA_M, True)
+        if heard[-1]:
+            np.testing.assert_allclose(hear(told, *path_of(circle, times), SIGMA_M, True), expected)
+        else:  # the same path, seen from a later moment
+            np.testing.assert_allclose(hear(told, *path_of(circle, times), SIGMA_M, True), expected, rtol=1e-6)
+
+
+def test_after_a_reset_a_path_from_before_it_is_not_compared():
+    told = telling(circle, seconds=2.0)
+    telling(shifted(2.1, 5.0), 2.0, start_ns=START_NS + 2_100 * MS, into=told)
+    assert hear(told, *path_of(circle, np.linspace(0.5, 2.0, 9)), SIGMA_M, True) is None
+    after = hear(told, *path_of(circle, np.linspace(2.25, 4.0, 8)), SIGMA_M, True)
+    np.testing.assert_allclose(hear(told, *path_of(circle, np.linspace(1.0, 4.0, 13)), SIGMA_M, True), after)
+
+
+def test_only_the_latest_ten_seconds_and_so_many_points_of_them_are_compared(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        motion_log_ratios, "weigh", lambda t, x, d, sigma_m, level: asked.append((t, x)) or (0.0, 0.0, 0.0, 0.0, 0.0)
+    )
+    told = telling(circle, seconds=20.0)
+    stamps, path = path_of(circle, np.linspace(1.0, 19.0, 181))
+    hear(told, stamps, path, SIGMA_M, True)
+    ((t, x),) = asked
+    assert len(t) == len(x) == MOST_POINTS
+    assert (t[0], t[-1]) == pytest.approx((-KEPT_NS / 2e9, 0.0))
+    np.testing.assert_allclose(x[[0, -1]], [circle(9.0), circle(19.0)])
+    assert np.diff(t) == pytest.approx(np.diff(t).mean(), abs=0.11)

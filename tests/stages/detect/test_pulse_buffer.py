@@ -1,0 +1,80 @@
+"""What was kept of the last slices is asked as a whole: as if every slice had been looked at by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.detect.pulse_buffer import MOST_SLICES, Lately
+from stages.kernels.detect.isolation import TALLY, look_around
+from stages.kernels.detect.pulse_buffer import WINDOW_NS
+from stages.messages import SweptPulses
+
+STEP_NS = 1_000_000
+AROUND = (0.3, 0.4, 1.2, 2.5, 0.8)  # disc, inner, close, outer, depth [m]
+
+
+def fan(rng: np.random.Generator, spread_rad: float) -> tuple[SweptPulses, np.ndarray]:
+    """A slice of 5 to 60 pulses within `spread_rad` about some direction, and its mean direction."""
+    middle = rng.standard_normal(3)
+    middle /= np.linalg.norm(middle)
+    n = int(rng.integers(5, 60))
+    off = rng.standard_normal((n, 3))
+    directions = middle + np.tan(rng.uniform(0, spread_rad, n))[:, None] * off / np.linalg.norm(off, axis=1)[:, None]
+    directions = (directions / np.linalg.norm(directions, axis=1)[:, None]).astype(np.float32)
+    mean = directions.sum(axis=0, dtype=np.float64)
+    return (
+        SweptPulses(
+            stamp_ns=0,
+            point_stamp_ns=np.zeros(n, dtype=np.int64),
+            direction_vehicle=directions,
+            range_m=np.where(rng.random(n) < 0.4, 0.0, rng.uniform(1, 40, n)).astype(np.float32),
+            laser=np.zeros(n, dtype=np.uint8),
+            reflectivity=np.zeros(n, dtype=np.uint8),
+            turntable_rad=0.0,
+            origin_vehicle_m=tuple(rng.uniform(-0.3, 0.3, 3)),
+        ),
+        mean / np.linalg.norm(mean),
+    )
+
+
+def one_by_one(slices: list[SweptPulses], centre_m: np.ndarray) -> np.ndarray:
+    tally = np.zeros(TALLY, dtype=np.int64)
+    for s in slices:
+        look_around(s.direction_vehicle, s.range_m, np.array(s.origin_vehicle_m), centre_m, *AROUND, tally)
+    return tally.astype(float)
+
+
+@pytest.mark.parametrize("spread_rad", [0.02, 0.3, 1.2])
+def test_a_place_gets_of_all_slices_together_what_each_found_around_it(spread_rad) -> None:
+    rng = np.random.default_rng(int(1000 * spread_rad))
+    found = 0.0
+    for _ in range(60):
+        lately, slices = Lately(), []
+        for k in range(int(rng.integers(1, 8))):
+            pulses, mean = fan(rng, spread_rad)
+            lately.add(pulses, mean, k * STEP_NS)
+            slices.append(pulses)
+        for slice_ in slices:  # a place some metres off one of its pulses: at the edge of what is looked at, too
+            along = slice_.direction_vehicle[int(rng.integers(len(slice_.range_m)))].astype(float)
+            centre_m = rng.uniform(1.5, 30.0) * along + rng.standard_normal(3) * rng.uniform(0.0, 3.0)
+            told = lately.around(centre_m, *AROUND)
+            np.testing.assert_array_equal(told, one_by_one(slices, centre_m))
+            found += told.sum()
+    assert found > 500
+
+
+def test_what_is_older_than_the_window_or_beyond_the_last_slices_is_forgotten() -> None:
+    rng = np.random.default_rng(7)
+    made = [fan(rng, 1.2) for _ in range(MOST_SLICES + 5)]
+    centre_m = 8.0 * made[0][1]
+    late, many = Lately(), Lately()
+    for k, (pulses, mean) in enumerate(made):
+        late.add(pulses, mean, 0 if k < 2 else WINDOW_NS + 1)
+        many.add(pulses, mean, 0)
+        if k == 4:
+            np.testing.assert_array_equal(
+                late.around(centre_m, *AROUND), one_by_one([s for s, _ in made[2:5]], centre_m)
+            )
+    last = [s for s, _ in made[-MOST_SLICES:]]
+    np.testing.assert_array_equal(many.around(centre_m, *AROUND), one_by_one(last, centre_m))

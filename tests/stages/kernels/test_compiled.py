@@ -1,0 +1,67 @@
+"""The cache of compiled code: it must not outlive any file whose code is in it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from numba.core import config
+
+from flow.compile_cache import cache_folder, cache_name
+from stages.kernels.compiled import CACHE_FOLDER, COMPILED
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+
+
+def test_the_name_changes_with_any_file_and_not_with_where_it_lies(tmp_path):
+    for name in ("one", "other"):
+        (tmp_path / name / "deep").mkdir(parents=True)
+        (tmp_path / name / "caller.py").write_text("x = 1\n")
+        (tmp_path / name / "deep" / "callee.py").write_text("y = 1\n")
+    first = cache_name([tmp_path / "one"])
+    assert first == cache_name([tmp_path / "other"])
+    (tmp_path / "one" / "deep" / "callee.py").write_text("y = 2\n")  # same size: content decides
+    assert cache_name([tmp_path / "one"]) != first
+
+
+def test_every_compiled_function_lies_where_the_name_looks():
+    users = [path for package in ("flow", "links", "stages") for path in (REPOSITORY / package).rglob("*.py")]
+    users = [path for path in users if "import compiled" in path.read_text(encoding="utf-8")]
+    assert len(users) > 20
+    assert [path for path in users if not any(REPOSITORY / folder in path.parents for folder in COMPILED)] == []
+
+
+def test_numba_uses_it_and_a_folder_that_cannot_be_made_is_no_error(tmp_path, monkeypatch):
+    assert str(CACHE_FOLDER) == config.CACHE_DIR
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
+    folder = cache_folder("abc")
+    assert folder.name == "abc"
+    assert tmp_path not in folder.parents
+
+
+CALLEE = "from stages.kernels.compiled import compiled\n@compiled\ndef inner(x):\n    return x + {}\n"
+CALLER = "from stages.kernels.compiled import compiled\nfrom callee import inner\n@compiled\ndef outer(x):\n    return inner(x)\n"
+
+
+def test_a_changed_callee_in_another_file_is_noticed(tmp_path):
+    """With the cache named after these files, as it is after ours; numba alone goes on with the old code."""
+    (tmp_path / "caller.py").write_text(CALLER)
+    program = (
+        "import sys, pathlib, stages.kernels.compiled, flow.compile_cache as c\n"
+        f"here = pathlib.Path({str(tmp_path)!r}); sys.path.insert(0, str(here))\n"
+        "c.config.CACHE_DIR = str(here / 'cache' / (c.cache_name([here]) if sys.argv[1] == 'ours' else 'one'))\n"
+        "from caller import outer\n"
+        "print(outer(1))\n"
+    )
+
+    def answer(number, kind):
+        (tmp_path / "callee.py").write_text(CALLEE.format(number))
+        done = subprocess.run(
+            [sys.executable, "-B", "-c", program, kind], cwd=REPOSITORY, capture_output=True, text=True, check=True
+        )
+        return int(done.stdout)
+
+    assert [answer(1, "ours"), answer(2, "ours")] == [2, 3]
+    assert [answer(1, "numba"), answer(2, "numba")] == [2, 2]

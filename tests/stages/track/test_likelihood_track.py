@@ -1,0 +1,492 @@
+"""LikelihoodTrack on made-up skies: its states over time, what misses are worth, identities, and drones that were none."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from flow.message import check_arrays
+from flow.stage import input_ports, output_ports
+from stages.geometry.frames import LidarMount
+from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, A, B
+from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
+from stages.track import LikelihoodTrack
+from stages.track.hull import COLUMNS
+from stages.track.likelihood_track import LOOK_OVER_NS
+from stages.track.scan_pass import drone_hits
+from tests.stages.caster import Box, Drone, During, Way, dithering, flying, pulses_seen, still
+from tests.stages.made import START_NS
+
+WATCHING = dithering(half_rad=math.radians(1.0))  # as the aim does: each turn a beam comes near
+PASSING = flying((0.0, 8.0, 10.0), (1.0, 0.0, 0.3))  # 12.7 m away
+
+
+def at_s(t_s):
+    return START_NS + round(t_s * 1e9)
+
+
+def accepted(xyz_m, velocity_mps=(0.0, 0.0, 0.0), t_s=0.0, number=1) -> Detections:
+    """What the detector says of a drone it has just seen."""
+    return Detections(
+        stamp_ns=at_s(t_s),
+        xyz_vehicle_m=np.array([xyz_m], dtype=np.float64),
+        score=np.array([5.0]),
+        e_inner=np.zeros(1),
+        e_outer=np.zeros(1),
+        accepted=np.array([True]),
+        reasons=("made",),
+        verdict="made",
+        start_ns=at_s(t_s) - 1,
+        seen_ns=np.array([at_s(t_s)]),
+        velocity_vehicle_mps=np.array([velocity_mps], dtype=np.float64),
+        probability=np.array([0.995]),
+        candidate_id=np.array([number]),
+    )
+
+
+def candidate(xyz_m, probability, t_s=0.0, number=1, looks=3, life_since_s=0.0) -> Candidates:
+    return Candidates(
+        stamp_ns=at_s(t_s),
+        detector_life=at_s(life_since_s),
+        candidate_id=np.array([number]),
+        xyz_vehicle_m=np.array([xyz_m], dtype=np.float64),
+        velocity_vehicle_mps=np.zeros((1, 3)),
+        probability=np.array([probability]),
+        seen_ns=np.array([at_s(t_s)]),
+        looks=np.array([looks]),
+        reasons=("flew as a bird does",),
+    )
+
+
+def run(things, told, seconds=2.0, drives_mps=(0.0, 0.0, 0.0), jump=(math.inf, 0.0), **settings):
+    """All the stage says when it is `told` messages at their own times and sees the things.
+
+    `jump`: when the start frame of the vehicle's odometry jumps, and by how many metres on each axis.
+    """
+    stage, out, waiting, next_s = LikelihoodTrack(**settings), [], sorted(told, key=lambda m: m.stamp_ns), 0.0
+    for pulses in pulses_seen(things, WATCHING, seconds):
+        while any(drives_mps) and at_s(next_s) <= pulses.point_stamp_ns[-1]:
+            place = next_s * np.asarray(drives_mps, dtype=np.float64) + (jump[1] if next_s >= jump[0] else 0.0)
+            stage.on_motion(
+                VehicleMotion(stamp_ns=at_s(next_s), xyz_map_m=place, R_map_vehicle=np.eye(3), covariance=None)
+            )
+            next_s += 0.02
+        while waiting and waiting[0].stamp_ns <= pulses.point_stamp_ns[-1]:
+            message = waiting.pop(0)
+            out += stage.on_candidates(message) if isinstance(message, Candidates) else stage.on_detections(message)
+        out += stage.on_pulses(pulses)
+    for message in out:
+        check_arrays(message)
+    return out
+
+
+def fixes_of(out, track_id=1):
+    return [m for m in out if isinstance(m, DroneFix) and m.track_id == track_id]
+
+
+def states_of(out):
+    return [m for m in out if isinstance(m, TrackState)]
+
+
+def story(out):
+    """The states in order, each once."""
+    names = [m.state.name for m in states_of(out)]
+    return [name for i, name in enumerate(names) if i == 0 or name != names[i - 1]]
+
+
+def errors_m(fixes, way: Way):
+    return np.array([f.xyz_vehicle_m for f in fixes]) - way(np.array([f.stamp_ns - START_NS for f in fixes]) * 1e-9)
+
+
+def here(way: Way, t_s=0.0):
+    return way(np.array([t_s]))[0]
+
+
+def test_ports_are_what_the_graph_wires():
+    assert set(input_ports(LikelihoodTrack)) == {
+        "candidates",
+        "detections",
+        "motion",
+        "pulses",
+        "drone_position",
+        "drone_odometry",
+    }
+    assert set(output_ports(LikelihoodTrack)) == {"drone_fix", "track_state"}
+    assert LikelihoodTrack.optional_inputs == {"candidates", "motion", "drone_position", "drone_odometry"}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_an_accepted_drone_is_followed_with_a_fix_for_every_turn_that_hit_it(seed):
+    out = run([Drone(PASSING, seed=seed)], [accepted(here(PASSING))])
+    fixes = fixes_of(out)
+    assert len(fixes) >= 14  # of 20 turns
+    assert np.sqrt(np.mean(np.sum(errors_m(fixes, PASSING) ** 2, axis=1))) < 0.15
+    np.testing.assert_allclose(fixes[-1].velocity_vehicle_mps, (1.0, 0.0, 0.3), atol=0.5)
+    assert all(f.hits >= 1 and np.all(np.linalg.eigvalsh(f.covariance_m2) > 0) for f in fixes)
+    assert "LOST" not in story(out)
+    stamps = [f.stamp_ns for f in fixes]
+    assert stamps == sorted(stamps)
+
+
+def test_a_drone_at_eight_metres_a_second_is_kept():
+    way = flying((0.0, 9.0, 3.0), (0.0, 0.0, 8.0))
+    fixes = fixes_of(run([Drone(way)], [accepted(here(way))], 2.0))
+    assert len(fixes) >= 10
+    assert fixes[-1].stamp_ns > at_s(1.7)
+    assert np.linalg.norm(errors_m(fixes, way)[-5:], axis=1).max() < 0.4
+
+
+def test_a_drone_that_goes_away_is_predicted_with_growing_covariance_and_then_lost_with_reasons():
+    gone = During(Drone(PASSING), 0.0, 1.5)
+    out = run([gone], [accepted(here(PASSING))], 5.0, lost_after_s=2.5)
+    assert story(out) == ["TRACKING", "COASTING", "LOST", "SEARCHING"]
+    coasting = [m for m in states_of(out) if m.state is TrackingState.COASTING]
+    traces = [float(np.trace(m.covariance_m2)) for m in coasting]
+    assert len(coasting) >= 15
+    assert all(np.diff(traces) > 0)
+    assert traces[-1] > 10 * traces[0]
+    assert all("not hit for" in m.reason for m in coasting)
+    # misses at where it should be draw the prediction off its straight way; it stays within three sigma
+    for m in coasting:
+        away = m.xyz_vehicle_m - here(PASSING, (m.stamp_ns - START_NS) * 1e-9)
+        assert away @ np.linalg.solve(m.covariance_m2, away) < 16.0
+    (lost,) = [m for m in states_of(out) if m.state is TrackingState.LOST]
+    assert lost.track_id == 1
+    assert "not hit for" in lost.reason
+    searching = states_of(out)[-1]
+    assert searching.xyz_vehicle_m is None
+    assert searching.reason.startswith("lost drone 1: not hit for")
+
+
+@pytest.mark.parametrize("gap_s", [0.5, 2.0])
+def test_a_drone_that_comes_back_is_the_same_one(gap_s):
+    """After half a second by itself; later, what is found is for the detector to judge."""
+    way = still(0.0, 8.0, 10.0)
+    with_gap = [During(Drone(way), 0.0, 1.0), During(Drone(way, seed=1), 1.0 + gap_s, 4.0)]
+    told = [accepted(here(way)), *([accepted(here(way), t_s=1.2 + gap_s, number=2)] if gap_s > 1 else [])]
+    out = run(with_gap, told, 2.0 + gap_s)
+    assert story(out)[:3] == ["TRACKING", "COASTING", "TRACKING"]
+    assert {m.track_id for m in out} == {1}
+    assert fixes_of(out)[-1].stamp_ns > at_s(1.6 + gap_s)
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "probability", "number", "taken"),
+    [(1.5, 0.4, 2, False), (1.5, 0.7, 2, True), (3.8, 0.7, 2, False), (3.8, 0.99, 2, True), (3.8, 0.7, 1, True)],
+)
+def test_what_is_met_where_a_drone_may_be_must_be_the_surer_one_the_less_that_is_known(
+    gap_s, probability, number, taken
+):
+    """After four seconds it may be anywhere within ten metres, and so may a bird; number 1 is the drone's own."""
+    way, other = still(0.0, 8.0, 10.0), still(0.6, 8.0, 10.4)
+    things = [During(Drone(way), 0.0, 1.0), During(Drone(other, seed=1), 1.0 + gap_s, 9.0)]
+    met = candidate(here(other), probability, t_s=1.1 + gap_s, number=number)
+    out = run(things, [accepted(here(way)), met], 1.6 + gap_s)
+    assert (fixes_of(out)[-1].stamp_ns > at_s(1.1 + gap_s)) == taken
+
+
+def test_a_drone_out_of_sight_of_a_vehicle_that_is_not_heard_is_where_neither_tells():
+    """It may have braked meanwhile."""
+    sigmas_m = {}
+    for heard_s in (1.0, 3.0):
+        stage, states = LikelihoodTrack(), []
+        stage.on_motion(driven(0.0))
+        states += stage.on_detections(accepted((0.0, 8.0, 10.0)))
+        told = [driven(t) for t in np.arange(0.02, heard_s, 0.02)]
+        for pulses in pulses_seen([During(Drone(flying((0.0, 8.0, 10.0), (-8.0, 0.0, 0.0))), 0.0, 0.7)], WATCHING, 2.6):
+            while told and told[0].stamp_ns <= pulses.point_stamp_ns[-1]:
+                stage.on_motion(told.pop(0))
+            states += stage.on_pulses(pulses)
+        last = states_of(states)[-1]
+        assert last.state is TrackingState.COASTING
+        assert last.stamp_ns > at_s(2.4)
+        assert last.covariance_m2 is not None
+        sigmas_m[heard_s] = np.sqrt(np.diag(last.covariance_m2))
+    added_m = np.sqrt(sigmas_m[1.0] ** 2 - sigmas_m[3.0] ** 2)
+    assert (added_m > 0.5 * 2.0 * 1.4**2 / 2).all()  # braking or not, at 2 m/s^2, one sigma
+
+
+def driven(t_s) -> VehicleMotion:
+    place = np.array([8.0 * t_s, 0.0, 0.0])
+    return VehicleMotion(stamp_ns=at_s(t_s), xyz_map_m=place, R_map_vehicle=np.eye(3), covariance=None)
+
+
+@pytest.mark.parametrize(("accepted_s", "numbers"), [(2.0, {1, 2}), (1.4, {1})])
+def test_a_drone_not_hit_for_a_second_gives_way_to_one_accepted_elsewhere(accepted_s, numbers):
+    first, second = still(-3.0, 8.0, 10.0), still(4.0, 8.0, 12.0)
+    things = [During(Drone(first), 0.0, 0.8), During(Drone(second), 1.0, 4.0)]
+    out = run(things, [accepted(here(first)), accepted(here(second), t_s=accepted_s, number=2)], 3.0)
+    assert {f.track_id for f in out if isinstance(f, DroneFix)} == numbers
+    lost = [m.reason for m in states_of(out) if m.state is TrackingState.LOST]
+    assert lost == (["not hit, while the detector accepted a drone elsewhere"] if 2 in numbers else [])
+
+
+def test_a_lost_drone_that_is_accepted_again_elsewhere_has_a_new_number():
+    first, second = still(-1.0, 8.0, 10.0), still(2.0, 8.0, 12.0)
+    things = [During(Drone(first), 0.0, 0.8), During(Drone(second), 2.0, 4.0)]
+    out = run(things, [accepted(here(first)), accepted(here(second), t_s=2.6, number=2)], 3.5, lost_after_s=1.0)
+    assert [m.track_id for m in states_of(out) if m.state is TrackingState.LOST] == [1]
+    assert len(fixes_of(out, 2)) >= 5
+
+
+def test_misses_make_the_estimate_better_and_its_covariance_truer():
+    square, nees = {True: [], False: []}, {True: [], False: []}
+    for misses in (True, False):
+        for seed in range(3):
+            fixes = fixes_of(run([Drone(PASSING, seed=seed)], [accepted(here(PASSING))], misses=misses))
+            errors = errors_m(fixes, PASSING)
+            square[misses] += np.sum(errors**2, axis=1).tolist()
+            nees[misses] += [e @ np.linalg.solve(f.covariance_m2, e) for e, f in zip(errors, fixes, strict=True)]
+    assert np.mean(square[True]) < 0.95 * np.mean(square[False])
+    assert np.mean(nees[True]) < np.mean(nees[False])
+    assert np.mean(nees[True]) < 4.0  # 3 would be as stated
+
+
+CERTAIN = {"shape_share": 0.0, "range_sigma_m": 0.0, "mount": LidarMount(pointing_sigma_deg=0.0), "tilt_deg": 0.0}
+
+
+def lasting(place, **sigmas):
+    return LikelihoodTrack(**{**CERTAIN, **sigmas})._lasting_covariance(np.array(place))
+
+
+def test_pointing_makes_it_less_sure_the_farther_away_and_only_about_the_axis():
+    added = lasting((0.0, 20.0, 5.0), mount=LidarMount(pointing_sigma_deg=1.0))
+    np.testing.assert_allclose(added, np.diag([(20 * math.radians(1)) ** 2, 0, 0]), atol=1e-12)
+
+
+def test_a_tilted_axis_moves_what_is_low_up_and_down_and_what_is_overhead_sideways():
+    arm = math.radians(1.0)
+    low, overhead = lasting((20.0, 0.0, 0.0), tilt_deg=1.0), lasting((0.0, 0.0, 20.0), tilt_deg=1.0)
+    np.testing.assert_allclose(low, np.diag([0, 0, (20 * arm) ** 2]), atol=1e-12)
+    np.testing.assert_allclose(overhead, np.diag([(20 * arm) ** 2, (20 * arm) ** 2, 0]), atol=1e-12)
+    place = np.array([7.0, -4.0, 9.0])  # as many tilts drawn give it
+    tilts = np.random.default_rng(1).normal(0.0, arm, (20_000, 2))
+    moved = np.cross(np.pad(tilts, ((0, 0), (0, 1))), place)
+    np.testing.assert_allclose(lasting(place, tilt_deg=1.0), moved.T @ moved / len(moved), rtol=0.05, atol=2e-4)
+
+
+def test_a_fix_tells_what_of_its_covariance_is_the_same_in_the_next_one():
+    way = still(0.0, 8.0, 10.0)
+    fixes = fixes_of(run([Drone(way)], [accepted(here(way))], 1.5))
+    assert fixes
+    for fix in fixes:
+        np.testing.assert_array_equal(fix.bias_covariance_m2, LikelihoodTrack()._lasting_covariance(fix.xyz_vehicle_m))
+        assert np.linalg.eigvalsh(fix.covariance_m2 - fix.bias_covariance_m2).min() > 0
+
+
+def test_the_lidars_range_is_as_unsure_as_its_data_sheet_says_along_the_line_of_sight_alone():
+    for place in ((0.0, 20.0, 0.0), (3.0, 0.0, 4.0)):
+        line = np.array(place) / np.linalg.norm(place)
+        added = lasting(place, range_sigma_m=0.03)
+        np.testing.assert_allclose(added, 0.03**2 * np.outer(line, line), atol=1e-15)
+
+
+def test_a_larger_drones_outline_tells_less_of_its_middle():
+    for span_m in (0.35, 0.8):
+        added = lasting((0.0, 20.0, 5.0), span_m=span_m, shape_share=0.05)
+        np.testing.assert_allclose(added, (0.05 * span_m) ** 2 * np.eye(3), atol=1e-15)
+
+
+def test_a_candidate_is_followed_silently_until_the_detector_accepts_it():
+    way = still(0.0, 8.0, 10.0)
+    out = run([Drone(way)], [candidate(here(way), 0.7), accepted(here(way), t_s=1.0)], 2.0)
+    assert story(out)[:2] == ["CANDIDATE", "TRACKING"]
+    assert next(m.track_id for m in states_of(out) if m.state is TrackingState.CANDIDATE) == 0
+    assert min(f.stamp_ns for f in fixes_of(out)) >= at_s(1.0)
+    assert story(run([Drone(way)], [candidate(here(way), 0.3)], 0.8)) == ["SEARCHING"]  # not promising enough
+
+
+@pytest.mark.parametrize("own", [0.99, 0.3])
+def test_what_is_refused_beside_a_track_costs_it_nothing_while_its_own_candidate_is_taken_for_a_drone(own):
+    """Overhead a drone is two candidates at times: one flies as the drone says, the other is thought a bird."""
+    way = still(0.0, 8.0, 10.0)
+    one, other = candidate(here(way), own, t_s=1.0, looks=30), candidate(here(way), 0.1, t_s=1.0, number=2, looks=6)
+    both = Candidates(
+        stamp_ns=one.stamp_ns,
+        reasons=one.reasons + other.reasons,
+        **{
+            name: np.concatenate([getattr(one, name), getattr(other, name)])
+            for name in ("candidate_id", "xyz_vehicle_m", "velocity_vehicle_mps", "probability", "seen_ns", "looks")
+        },
+    )
+    out = run([Drone(way)], [accepted(here(way)), both], 2.0)
+    assert ("LOST" in story(out)) == (own < 0.5)
+
+
+def test_a_track_whose_probability_falls_is_dropped_with_the_detectors_reason():
+    way = still(0.0, 8.0, 10.0)
+    out = run([Drone(way)], [accepted(here(way)), candidate(here(way), 0.1, t_s=1.0)], 2.0)
+    (lost,) = [m for m in states_of(out) if m.state is TrackingState.LOST]
+    assert lost.stamp_ns == at_s(1.0)
+    assert lost.reason == "no longer taken for a drone: flew as a bird does"
+    assert max(f.stamp_ns for f in fixes_of(out)) < at_s(1.0)
+
+
+@pytest.mark.parametrize(("life_since_s", "follows"), [(0.0, False), (0.9, True)])
+def test_a_detector_started_afresh_does_not_lead_a_track_away_by_its_new_numbers(life_since_s, follows):
+    """Its first candidate is another thing than the first it found before, though seen as often by now."""
+    way = still(0.0, 8.0, 10.0)
+    told = [
+        accepted(here(way)),
+        candidate(here(way), 0.99, 0.5, looks=6),
+        candidate((6.0, 8.0, 9.0), 0.9, 1.0, looks=9, life_since_s=life_since_s),
+    ]
+    states = [m for m in states_of(run([Drone(way)], told, 1.3)) if m.track_id == 1 and m.stamp_ns > at_s(1.05)]
+    assert all((np.linalg.norm(m.xyz_vehicle_m - here(way)) < 0.5) == follows for m in states)
+    assert states
+
+
+def test_looking_at_an_empty_place_again_and_again_refutes_a_candidate():
+    out = run([], [candidate((0.0, 8.0, 10.0), 0.7)], 3.0)
+    assert fixes_of(out) == []
+    assert story(out) == ["CANDIDATE", "SEARCHING"]
+
+
+def test_two_drones_keep_their_identities_while_they_pass_each_other():
+    low, high = flying((-1.0, 8.0, 10.0), (1.0, 0.0, 0.0)), flying((1.0, 8.0, 12.5), (-1.0, 0.0, 0.0))
+    told = [accepted(here(low), (1, 0, 0), number=5), accepted(here(high), (-1, 0, 0), number=9)]
+    out = run([Drone(low, seed=1), Drone(high, seed=2)], told, 2.5, max_drones=2)
+    for track_id, way in ((1, low), (2, high)):
+        fixes = fixes_of(out, track_id)
+        assert len(fixes) >= 14
+        assert np.linalg.norm(errors_m(fixes, way), axis=1).max() < 0.6
+    assert "LOST" not in story(out)
+
+
+def test_two_drones_two_metres_apart_keep_their_identities():
+    left, right = still(-1.0, 8.0, 10.0), still(1.0, 8.0, 10.0)
+    told = [accepted(here(left), number=5), accepted(here(right), number=9)]
+    out = run([Drone(left, seed=1), Drone(right, seed=2)], told, 2.0, max_drones=2)
+    for track_id, way in ((1, left), (2, right)):
+        assert np.linalg.norm(errors_m(fixes_of(out, track_id), way), axis=1).max() < 0.6
+    assert "LOST" not in story(out)
+
+
+def test_no_more_drones_are_tracked_than_asked_for():
+    first, second = still(-1.5, 8.0, 10.0), still(1.5, 8.0, 10.0)
+    told = [accepted(here(first), number=1), accepted(here(second), number=2)]
+    out = run([Drone(first, seed=1), Drone(second, seed=2)], told, 1.0, max_drones=1)
+    assert {m.track_id for m in out} == {1}
+
+
+def test_a_drone_in_front_of_a_wall_is_not_dragged_onto_it():
+    way = still(0.0, 8.0, 10.0)
+    wall = Box((-10.0, 11.0, 0.0), (10.0, 12.0, 24.0))
+    fixes = fixes_of(run([Drone(way), wall], [accepted(here(way))]))
+    assert len(fixes) >= 12
+    assert np.linalg.norm(errors_m(fixes, way), axis=1).max() < 0.4
+
+
+@pytest.mark.parametrize("gap_m", [0.3, 0.45, 0.7])
+def test_a_drone_close_before_a_wall_is_kept_and_when_it_has_gone_the_wall_is_not_taken_for_it(gap_m):
+    way = flying((0.0, 10.0, 8.0), (0.3, 0.0, 0.0))
+    wall = Box((-10.0, 10.0 + gap_m, 0.0), (10.0, 14.0, 24.0))
+    out = run([During(Drone(way), 0.0, 1.0), wall], [accepted(here(way), (0.3, 0.0, 0.0))], 3.0)
+    fixes = fixes_of(out)
+    assert len(fixes) >= 5
+    assert np.linalg.norm(errors_m(fixes, way), axis=1).max() < 0.3
+    assert fixes[-1].stamp_ns < at_s(1.05)
+    assert states_of(out)[-1].state is TrackingState.COASTING
+
+
+def test_of_two_that_became_one_the_younger_says_no_more():
+    """What is dropped in mid-look gives no fix after its LOST."""
+    stage, out = LikelihoodTrack(max_drones=2), []
+    elder, younger = still(-1.0, 8.0, 10.0), still(1.0, 8.0, 10.0)
+    for message in (accepted(here(elder), number=5), accepted(here(younger), number=9)):
+        out += stage.on_detections(message)
+    for pulses in pulses_seen([Drone(elder, seed=1), Drone(younger, seed=2)], WATCHING, 2.0):
+        both = [one for one in stage._known if one.look and pulses.stamp_ns - one.look.last_ns > LOOK_OVER_NS]
+        if len(both) == 2 and pulses.stamp_ns > at_s(1.0):  # both looks end now: the younger drifts onto the elder
+            both[1].x[:3] = both[0].x[:3]
+        out += stage.on_pulses(pulses)
+    (lost,) = [m for m in states_of(out) if m.state is TrackingState.LOST]
+    assert (lost.track_id, lost.reason) == (2, "is the same as drone 1")
+    assert all(m.track_id == 1 for m in out[out.index(lost) + 1 :])
+
+
+def test_from_a_driving_vehicle_a_drone_that_comes_along_is_kept_by_its_odometry():
+    way = still(0.0, 8.0, 10.0)  # in the vehicle frame
+    out = run([Drone(way)], [accepted(here(way))], 2.0, drives_mps=(8.0, 0.0, 0.0))
+    fixes = fixes_of(out)
+    assert len(fixes) >= 12
+    assert np.linalg.norm(errors_m(fixes, way)[4:], axis=1).max() < 0.4
+
+
+@pytest.mark.parametrize("by_m", [1.0, 200.0])
+def test_a_drone_is_kept_where_the_vehicles_start_frame_jumps(by_m):
+    way = still(0.0, 8.0, 10.0)
+    out = run([Drone(way)], [accepted(here(way))], 2.0, drives_mps=(8.0, 0.0, 0.0), jump=(1.0, by_m))
+    fixes = fixes_of(out)
+    assert len(fixes) >= 12
+    assert fixes[-1].stamp_ns > at_s(1.8)
+    assert np.linalg.norm(errors_m(fixes, way)[4:], axis=1).max() < 0.4
+    assert max(np.linalg.norm(f.velocity_vehicle_mps) for f in fixes[4:]) < 1.5
+    assert story(out) == ["TRACKING"]
+
+
+def test_the_velocity_told_is_relative_to_the_vehicle():
+    way = still(0.0, 8.0, 10.0)
+    out = run([Drone(way)], [accepted(here(way))], 2.0, drives_mps=(8.0, 0.0, 0.0))
+    np.testing.assert_allclose(fixes_of(out)[-1].velocity_vehicle_mps, 0.0, atol=1.0)
+
+
+def test_without_a_drone_it_says_twice_a_second_that_it_searches():
+    states = states_of(run([], [], 2.0))
+    assert 4 <= len(states) <= 5
+    assert all(m.state is TrackingState.SEARCHING and m.reason == "nothing found yet" for m in states)
+
+
+def test_the_same_pulses_give_the_same_fixes():
+    once, again = (fixes_of(run([Drone(PASSING, seed=7)], [accepted(here(PASSING))], 1.0)) for _ in range(2))
+    assert len(once) > 5
+    for a, b in zip(once, again, strict=True):
+        np.testing.assert_array_equal(a.xyz_vehicle_m, b.xyz_vehicle_m)
+        np.testing.assert_array_equal(a.covariance_m2, b.covariance_m2)
+
+
+def look(points):
+    """Hits of a look at (a, b, depth) [m]."""
+    pulses = np.zeros((len(points), COLUMNS))
+    pulses[:, [A, B, DEPTH]] = points
+    pulses[:, KIND] = HIT
+    return pulses
+
+
+def test_the_group_near_the_prediction_is_the_drones_and_strays_are_not():
+    points = [(0.0, 0.0, 0.0), (0.1, 0.0, 0.1), (0.05, 0.1, 0.0), (1.6, 0.0, 0.3)]
+    assert drone_hits(look(points), 0.5, 0.3).tolist() == [0, 1, 2]
+    assert drone_hits(look([(0.0, 0.0, 5.0)]), 0.5, 0.3) is None  # too far behind
+    nothing = look([(0.0, 0.0, 0.0)])
+    nothing[:, KIND] = 0.0
+    assert drone_hits(nothing, 0.5, 0.3) is None
+
+
+def test_what_is_met_farther_off_than_a_drone_ever_is_is_something_else():
+    """As behind a tree: a wall through its leaves, .7 m behind where the drone is expected within .13 m."""
+    assert drone_hits(look([(-0.57, -0.23, 0.68), (-0.57, -0.16, 0.68), (-0.57, -0.09, 0.67)]), 0.5, 0.13) is None
+    assert drone_hits(look([(0.25, -0.1, 0.15), (0.25, -0.03, 0.15)]), 0.5, 0.13).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(("depth_m", "taken"), [(0.05, True), (0.3, False)])
+def test_a_glimpse_through_a_gap_has_to_be_where_a_drone_nearly_always_is(depth_m, taken):
+    pulses = look([(0.05, 0.0, depth_m), (0.05, 0.07, depth_m)])
+    assert drone_hits(pulses, 0.5, 0.1) is not None
+    pulses[:, KIND] = GLIMPSE
+    assert (drone_hits(pulses, 0.5, 0.1) is not None) == taken
+
+
+def test_returns_with_many_more_beside_them_belong_to_something_bigger():
+    wall = [(0.1 * k, 0.0, 0.0) for k in range(-15, 16)]
+    assert drone_hits(look(wall), 0.5, 0.3) is None
+
+
+@pytest.mark.parametrize(
+    "settings", [{"span_m": 0.0}, {"max_drones": 0}, {"manoeuvre": 0.0}, {"lost_after_s": -1}, {"gate": 1}]
+)
+def test_impossible_settings_are_refused(settings):
+    with pytest.raises(ValidationError):
+        LikelihoodTrack(**settings)

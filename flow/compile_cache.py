@@ -1,7 +1,7 @@
-"""Where numba keeps compiled code: in a folder named after the source of all of it.
+"""The folder in which numba caches compiled code: its name depends on the source of all compiled functions.
 
-Numba looks at a function's own file to tell whether what it kept is stale, not at the files of the functions it calls,
-whose code is compiled in. With the name made of every file, all is compiled anew when any of them changes.
+Numba checks only a function's own file to detect a stale cache, not the files of the functions that are compiled into
+it. A folder name that depends on every file makes numba compile everything again when any of them changes.
 
 Source: ours; Numba manual, "Notes on Caching".
 """
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def cache_name(folders: Iterable[Path]) -> str:
-    """A name that changes with any Python file in these folders and below them, by content."""
+    """A name that depends on the content of every Python file in these folders and below them."""
     digest = hashlib.sha256()
     for folder in folders:
         for path in sorted(folder.rglob("*.py")):
@@ -30,19 +30,19 @@ def cache_name(folders: Iterable[Path]) -> str:
 
 
 def cache_folder(name: str) -> Path:
-    """Where code of this name is kept: $NUMBA_CACHE_DIR, the user's cache, or a temporary folder of this process."""
+    """The folder for this name in $NUMBA_CACHE_DIR, the user's cache, or a temporary folder of this process."""
     wanted = os.environ.get("NUMBA_CACHE_DIR")
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     folder = Path(wanted) if wanted else user / "grd"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:  # a service without a home, a full or read-only disk
-        folder = Path(tempfile.mkdtemp(prefix="grd-"))  # of this process: a known name could be prepared by others
+        folder = Path(tempfile.mkdtemp(prefix="grd-"))  # random: others could prepare a folder of known name
     return folder / name
 
 
 def keep_compiled(folders: Iterable[str]) -> Path:
-    """From now on numba keeps what it compiles where the source of these folders (from the project's root) says."""
+    """Make numba cache in the folder for the source of `folders` (relative to the project's root). That folder."""
     folder = cache_folder(cache_name(ROOT / name for name in folders))
     config.CACHE_DIR = str(folder)  # pyright: ignore
     return folder

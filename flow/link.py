@@ -1,4 +1,4 @@
-"""Link: one contact with the outside. Sources bring records in, sinks take messages out, taps see every edge.
+"""Links connect a graph to the outside. Sources bring records in, sinks send messages out, taps receive every message.
 
 Source: ours.
 """
@@ -17,41 +17,41 @@ from flow.message import Message
 from flow.stage import Node, S, Settings
 
 TRUTH_TOPICS = "/truth"
-"""Topics that start so hold what an evaluation compares with; no source may bring them in (`flow.graph` refuses)."""
+"""Prefix of topics that hold the truth, for evaluation; no source may bring them in (`flow.graph` checks it)."""
 
 RUN_TOPICS = "/run/"
-"""Topics that start so hold what a live run recorded of itself (`flow.consumption`); they are no node's either."""
+"""Prefix of topics that a live run records about itself (`flow.live.input_order`); no source may bring them in."""
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Raw bytes as they entered: what a recording keeps and what `Source.decode` takes."""
+    """Raw bytes as they entered: what a recording holds and what `Source.decode` takes."""
 
     topic: str
     arrival_ns: int  # on the host
-    stamp_ns: int  # when it was measured, on the host's timeline
+    stamp_ns: int  # of the measurement, on the host's clock
     data: bytes
     sequence: int = 0  # one counter over the whole recording
 
 
 class LinkError(Exception):
-    """A link cannot do its work. The text says what to check; it is shown to the user without a traceback."""
+    """A link cannot work. Its text, shown without a traceback, names what to check."""
 
 
 class Link(Node[S]):
     """Base of all links: sources (records in), sinks (`on_<port>`), or both, as a servo is."""
 
     def sent(self) -> Iterable[Record]:
-        """What went out since the call before, for the recording; the live runner asks after each `on_<port>`."""
+        """What was sent since the call before, for the recording; the live runner calls it after each `on_<port>`."""
         return ()
 
     @property
-    def trouble(self) -> str | None:
-        """What does not work now, in words, where the link cannot raise it; the live runner says it when it changes."""
+    def status(self) -> str | None:
+        """What does not work now, where the link cannot raise it; None: all works. A live run reports each change."""
         return None
 
-    def orphaned(self, port: str) -> str | None:
-        """The stage behind an input works no more (live): what was done about it, in words. None: nothing need be."""
+    def upstream_lost(self, port: str) -> str | None:
+        """React to the end of the stage behind an input (live). The reaction as text; None: no reaction is needed."""
         return None
 
 
@@ -67,11 +67,11 @@ SourceS = TypeVar("SourceS", bound=SourceSettings, default=SourceSettings, covar
 class Source(Link[SourceS]):
     """A link that brings records in.
 
-    Live, `listen` opens the hardware and yields records; in replay they come from a recording by `topic`.
+    Live, `listen` opens the hardware and iterates over records; in replay they come from a recording by `topic`.
     Both go through the same `decode`, whose annotation declares the outputs.
     """
 
-    silent_after_s: ClassVar[float | None] = None  # one that has spoken and then says nothing for so long is in trouble
+    silent_after_s: ClassVar[float | None] = None  # a source that has sent records and then none for so long has failed
 
     @property
     def topic(self) -> str:
@@ -84,7 +84,7 @@ class Source(Link[SourceS]):
 
     @property
     def senders(self) -> dict[str, dict[str, str]]:
-        """What is known of who sends, by topic: a live recording says it with the topic's channel."""
+        """Properties of the sender, by topic; a live recording stores them with the topic's channel."""
         return {}
 
     def listen(self) -> AbstractContextManager[Iterator[Record]]:
@@ -97,36 +97,36 @@ class Source(Link[SourceS]):
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a tap is told when a run starts."""
+    """The run that a tap is opened for."""
 
     out_dir: Path
     name: str
     mermaid: str  # the graph as text
-    settings_yaml: str  # the configuration as run
-    live: bool = False  # else it replays a recording
+    settings_yaml: str  # the merged configuration
+    live: bool = False  # False: a replay
     senders: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])  # by topic, of live sources
 
 
 class Tap(Link[S]):
-    """A link that sees every message on every edge, in the order of the run, without the stages knowing.
+    """A link that receives every message of every output, in the order of the run.
 
-    It is declared in YAML beside the other links, without inputs. It may not change a message, and what it
-    raises stops a replay: a tap that can fail for outside reasons (disk, viewer) handles that itself and counts it.
-    In a live run `see` is called from one thread of the tap's own, behind a queue that drops the oldest.
+    It is declared in YAML among the other links, without inputs. It must not change a message. What it raises stops a
+    replay, so a tap that can fail for outside reasons (disk, viewer) handles and counts such failures itself. In a live
+    run one thread of the tap's own calls `see`, behind a queue that drops the oldest message.
     """
 
     def open(self, run: Run) -> None:
         """Called once before the first message."""
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
-        """One message, once, as it leaves `output` ("track.drone_fix"); arrival_ns is the run's clock."""
+        """Take one message of `output` ("track.drone_fix"); arrival_ns is the run's clock."""
 
     def wants(self, message: type[Message]) -> bool:
-        """Whether a run shall hand over messages of this type; asked once for each output."""
+        """Whether the tap takes messages of this type; called once for each output."""
         return True
 
     def record(self, record: Record) -> None:
-        """One record of a live run as it came in, or as it was sent. Called from many threads; it may not wait."""
+        """Take one record of a live run, received or sent. Called from many threads; it must not block."""
 
     def close(self) -> None:
         """Called once after the last message, also when the run fails."""

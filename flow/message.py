@@ -87,7 +87,7 @@ class Shape:
         return "(" + ", ".join(str(d) for d in self.dims) + ("," if len(self.dims) == 1 else "") + ")"
 
 
-# Array types that messages use; the unit stands in the field's name.
+# Array types that messages use; the field's name has the unit.
 Vec3 = Annotated[NDArray[np.float64], Shape(3)]
 Mat3 = Annotated[NDArray[np.float64], Shape(3, 3)]
 Points32 = Annotated[NDArray[np.float32], Shape("n", 3)]

@@ -1,4 +1,4 @@
-"""Compute times in a fixed-size histogram: percentiles over hours without growing.
+"""Compute times in a histogram of fixed size: percentiles over hours of data.
 
 Source: ours; bins grow by 2^(1/8), so a percentile is within 9 % of the true one.
 """
@@ -15,7 +15,7 @@ _BINS = 40 * BINS_PER_OCTAVE  # 1 ns .. 1000 s
 
 
 class Latency:
-    """Counts durations [ns]; `percentile_ns` and `mean_ns` read them back."""
+    """A histogram of durations [ns]."""
 
     __slots__ = ("_bins", "count", "max_ns", "total_ns")
 
@@ -24,7 +24,7 @@ class Latency:
         self.count = self.total_ns = self.max_ns = 0
 
     def add(self, duration_ns: int) -> None:
-        """One duration [ns]."""
+        """Add one duration [ns]."""
         self.count += 1
         self.total_ns += duration_ns
         if duration_ns > self.max_ns:
@@ -32,7 +32,7 @@ class Latency:
         self._bins[min(int(BINS_PER_OCTAVE * log2(duration_ns)), _BINS - 1) if duration_ns > 1 else 0] += 1
 
     def percentile_ns(self, percent: float) -> float:
-        """Upper edge of the bin that holds the percentile, at most the largest seen; 0 without data."""
+        """Upper edge of the bin that holds the percentile, at most the maximum; 0 without data."""
         if not self.count:
             return 0.0
         up_to = np.cumsum(np.frombuffer(self._bins, np.int64))
@@ -43,3 +43,15 @@ class Latency:
     def mean_ns(self) -> float:
         """Mean duration [ns]; 0 without data."""
         return self.total_ns / self.count if self.count else 0.0
+
+    def to_list(self) -> list[int]:
+        """All counts as plain numbers, for `of_list`."""
+        return [self.count, self.total_ns, self.max_ns, *self._bins]
+
+    @staticmethod
+    def of_list(counts: list[int]) -> Latency:
+        """The histogram that `to_list` wrote."""
+        latency = Latency()
+        latency.count, latency.total_ns, latency.max_ns = counts[:3]
+        latency._bins = array("q", counts[3:])
+        return latency

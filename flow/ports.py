@@ -1,4 +1,4 @@
-"""What every runner does at a port: call the handler, check what it gives, name what went wrong.
+"""What every runner does at a port: call the handler, check its outputs, name its errors.
 
 Source: ours.
 """
@@ -19,12 +19,12 @@ class RunError(Exception):
     """A stage or link raised while the graph ran. The text names node, port and time; the cause is chained."""
 
 
-class RaisedElsewhereError(Exception):
-    """What a stage in another process raised, with its type's name, as text."""
+class RemoteError(Exception):
+    """What a node in another process raised, with its type's name, as text."""
 
 
 class Output(Generic[F]):
-    """One output of one running node: its name, its messages' number, the ports that it feeds, who else sees it."""
+    """One output of one running node: its name, the number of its messages, and the ports and taps that take them."""
 
     __slots__ = ("checked", "count", "feeds", "name", "seen_by")
 
@@ -44,19 +44,19 @@ def messages_of(handler: Callable[[Any], Any], message: Any) -> tuple[Message, .
 
 
 def call(name: str, handler: Callable[[Any], Any], message: Any, arrival_ns: int) -> tuple[Message, ...]:
-    """What a handler gives for one message. RunError says what it raised; a link's own LinkError passes as it is."""
+    """What a handler gives for one message. RunError: what it raised; a link's LinkError is raised as it is."""
     try:
         return messages_of(handler, message)
-    except LinkError:
-        raise  # says itself what to check
+    except (LinkError, RunError):
+        raise  # its text is complete
     except Exception as error:
-        told = str(error) if isinstance(error, RaisedElsewhereError) else f"{type(error).__name__}: {error}"
-        raise RunError(f"{name} failed at {arrival_ns / 1e9:.6f} s: {told}") from error
+        text = str(error) if isinstance(error, RemoteError) else f"{type(error).__name__}: {error}"
+        raise RunError(f"{name} failed at {arrival_ns / 1e9:.6f} s: {text}") from error
 
 
 @contextmanager
 def named(what: str) -> Generator[None]:
-    """`with named("lidar.listen"): ...`: what is raised within becomes a RunError, but a LinkError passes as it is."""
+    """`with named("lidar.listen"): ...`: an exception within becomes a RunError; a LinkError is raised as it is."""
     try:
         yield
     except (LinkError, RunError):
@@ -66,14 +66,14 @@ def named(what: str) -> Generator[None]:
 
 
 def admit(name: str, outputs: Mapping[type[Message], Output[F]], message: Message, strict: bool) -> Output[F]:
-    """The output that a message belongs to. RunError when its class promises none, or its arrays are not as declared.
+    """The output of a message. RunError: its class is not declared as an output, or its arrays are not as declared.
 
     Arrays are checked for the first message of each output, and always with `strict`.
     """
     output = outputs.get(type(message))
     if output is None:
         given = type(cast(Any, message)).__name__
-        raise RunError(f"{name} gave a {given}, which its annotation does not promise")
+        raise RunError(f"{name} gave a {given}, which its annotation does not declare")
     if strict or not output.checked:
         output.checked = True
         try:
@@ -86,7 +86,7 @@ def admit(name: str, outputs: Mapping[type[Message], Output[F]], message: Messag
 def decoded(
     name: str, source: Source, record: Record, outputs: dict[type[Message], Output[Any]], strict: bool
 ) -> list[tuple[Output[Any], Message]]:
-    """A record's messages, each with the output it belongs to. Raises LinkError or RunError, and then gives none."""
+    """A record's messages, each with its output. LinkError or RunError: the record cannot be decoded."""
     where = f"{name}.decode"
     given = call(where, source.decode, record, record.arrival_ns)
     return [(admit(where, outputs, message, strict), message) for message in given]

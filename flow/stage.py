@@ -1,4 +1,4 @@
-"""Stage: one step of the method. Its ports are read from its method signatures.
+"""Stages: the steps of the method. A stage's ports are read from its method signatures.
 
     class TrackSettings(Settings):
         radius_m: float = Field(1.0, gt=0)
@@ -10,8 +10,8 @@
 
         def on_points(self, points: SweptPoints) -> Iterator[DroneFix | TrackState]: ...
 
-declares an input port `points` and the outputs `drone_fix` and `track_state`. Nothing is declared twice.
-A stage has no thread, clock, socket, file or global: same inputs, same outputs.
+declares an input port `points` and the outputs `drone_fix` and `track_state`. A stage has no thread, clock, socket,
+file or global: its outputs depend only on its inputs.
 
 Source: ours.
 """
@@ -68,7 +68,7 @@ class Node(Generic[S]):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Totals since the start for people: lost, refused, foreign. A run shows them, and writes them in the end."""
+        """Totals since the start, for people: lost, refused, foreign. A run shows them and writes them at its end."""
         return {}
 
 
@@ -76,12 +76,12 @@ class Stage(Node[S]):
     """Base of all stages. `on_<port>(self, message: Type) -> outputs` is a port; `__init__` makes the state."""
 
     def finish(self) -> Iterable[Message] | Message | None:
-        """Called once after the last event; may return or yield outputs (annotate them), as a port does."""
+        """Called once after the last message; may return or yield annotated outputs, as a port does."""
         return None
 
 
 class PortError(TypeError):
-    """A stage's class is written wrongly (a port without annotation, two outputs of one name)."""
+    """A stage's class is invalid (a port without annotation, two outputs of one name)."""
 
 
 _CONTAINERS = (Union, types.UnionType, collections.abc.Iterator, collections.abc.Iterable, list, tuple)
@@ -89,7 +89,7 @@ _CONTAINERS = (Union, types.UnionType, collections.abc.Iterator, collections.abc
 
 def _message_types(annotation: Any, where: str) -> Iterator[type[Message]]:
     """Message types in an output annotation: a union, an Iterator/Iterable/list/tuple of them, or None."""
-    if annotation in (None, type(None), Ellipsis, Message):  # the bare base promises nothing
+    if annotation in (None, type(None), Ellipsis, Message):  # the bare base class declares nothing
         return
     origin = get_origin(annotation)
     if origin in _CONTAINERS:
@@ -112,7 +112,7 @@ def _hints(cls: type[Node], method: str) -> dict[str, Any]:
 
 @functools.cache
 def input_ports(cls: type[Node]) -> dict[str, type[Message]]:
-    """Input port -> message type, in the order the class writes them."""
+    """Input port -> message type, in the order of the class's methods."""
     ports: dict[str, type[Message]] = {}
     names = [name for base in reversed(cls.__mro__) for name in vars(base) if name.startswith("on_")]
     for name in dict.fromkeys(names):

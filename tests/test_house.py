@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from flow.classes import known_classes
+from flow.config.classes import known_classes
+from flow.config.schema import schema
 from flow.graph import load_graph
-from flow.schema import schema
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = {"flow": {"flow"}, "stages": {"flow", "stages"}, "links": {"flow", "stages", "links"}}

@@ -39,17 +39,17 @@ EXPLAINED = {
     "servo": list(Health._fields),
 }
 SAID = {  # where it is said, and what
-    "flow/incidents.py": ["more trouble of other kinds"],
-    "flow/live.py": ["works again", "did not end in time"],
-    "flow/live_source.py": [
-        "; it is opened again",
-        "records come again",
-        "has said nothing for",
+    "flow/events.py": ["more events of other kinds"],
+    "flow/live/live.py": ["works again", "did not end in time"],
+    "flow/live/source.py": [
+        "; it is reopened",
+        "records arrive again",
+        "has sent nothing for",
         "its records have ended",
     ],
-    "flow/live_threads.py": ["works no more", "takes fewer pictures: this host is too slow for all"],
-    "flow/live_wiring.py": ["cannot run live: it stays silent"],
-    "flow/stage_life.py": ["this message is skipped", "the run stops", "starts afresh", "stays off"],
+    "flow/live/threads.py": ["is switched off: ", "takes fewer images: this host is too slow for all stages"],
+    "flow/live/wiring.py": ["cannot run live: it gives nothing"],
+    "flow/live/supervised_stage.py": ["restarts", "stays off"],
     "links/runs/live_run.py": ["cannot be shown on the terminal"],
     "links/runs/results.py": ["results are being lost"],
     "links/recording/recorder.py": ["nothing is recorded now"],

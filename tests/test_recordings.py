@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
+from flow.config_error import Location
 from flow.graph import load_graph
 from flow.link import Run
-from flow.problem import Place
 from flow.replay import replay
 from flow.taps import Digest
 from links.recording import RecordingReader
@@ -30,7 +30,7 @@ def run(folder: Path, recording: str, config: str, sets: list[str] | None = None
     overlay = folder / "no_viewer.yaml"
     overlay.write_text("links: {viewer: null}\n")
     with RecordingReader(ROOT / "recordings" / f"{recording}.mcap") as reader:
-        sections = {"rig": (yaml.safe_load(reader.rig_yaml or ""), Place(recording, 0))}
+        sections = {"rig": (yaml.safe_load(reader.rig_yaml or ""), Location(recording, 0))}
         graph = load_graph(ROOT / "configs" / f"{config}.yaml", [overlay], sets or [], sections)
         results.open(Run(folder, recording, "", ""))
         replay(graph, truth.aside(reader.records()), [results, digest], strict=True)

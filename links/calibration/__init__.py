@@ -1,10 +1,9 @@
-"""Self-calibration as a job over a recording: what goes in, the new rig file, the pictures.
+"""Self-calibration of a recording: its inputs, the new rig file, figures (links/calibration/figures.py, by matplotlib).
 
-Source: ours; the maths is in `stages/calibration`.
+Source: grd; the maths is in `stages/calibration`.
 """
 
 from links.calibration.gather import Gathered as Gathered
 from links.calibration.gather import gather as gather
-from links.calibration.pictures import pictures as pictures
 from links.calibration.rig_file import rig_text as rig_text
 from links.calibration.rig_file import zero_told as zero_told

@@ -67,7 +67,7 @@ class Camera(Source[CameraSettings]):
         return {"refused": self._refused, **self._counts}
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """That this host does not decode the stream as fast as it comes."""
         slow, now_s = self._counts["too slow"], time.monotonic()
         if slow > self._slow[0]:

@@ -5,6 +5,7 @@ Source: DESIGN, Command line; the maths is in `stages/calibration`.
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -69,24 +70,24 @@ def calibrate_recording(
     """Find how the LiDAR sits on its servo, from surfaces that a sweep of RECORDING sees more than once.
 
     Tilt and place on the servo's axis, the encoder's error, the play of the gear and the servo's time offset, each with
-    a sigma; what the sweep or the scene cannot tell stays as it is, with the reason. Writes a new rig file and, beside
-    it, pictures (.svg). The vehicle must stand still. Best is a sweep there and back at two speeds near walls. Exit
-    code 1 when nothing could be told, then nothing is written.
+    a sigma; what the sweep or the scene cannot tell stays as it is, with the reason. Writes a new rig file and, where
+    matplotlib is installed, figures next to it (.svg). The vehicle must stand still. Best is a sweep there and back at
+    two speeds near walls. Exit code 1 when nothing could be told, then nothing is written.
 
     The servo's zero, and how its axis is tilted in the vehicle, no sweep tells by itself: say how the vehicle stands
     with --parallel and --level. Front and rear wheel equally far from a wall within 5 mm are parallel within .15 deg.
 
     Example: grd calibrate parked.mcap -o rig.yaml && grd replay flight.mcap --overlay rig.yaml
     """
-    from links.calibration import gather, pictures, rig_text
+    from links.calibration import gather, rig_text
     from stages.calibration.calibrate import CannotCalibrate
     from stages.calibration.levelling import Standing, stand
 
     target = out_file or recording.with_suffix(".rig.yaml")
     if target.suffix not in (".yaml", ".yml"):
         raise LinkError(f"{target}: a rig file ends in .yaml")
-    picture = target.with_suffix(".svg")
-    for file in (target, picture):
+    figures = target.with_suffix(".svg")
+    for file in (target, figures):
         if file.exists() and not overwrite:
             raise LinkError(f"{file} is there already: name another with --out, or give --overwrite")
     if to_s is not None and to_s <= from_s:
@@ -104,9 +105,14 @@ def calibrate_recording(
         raise typer.Exit(FINDING) from None
     _tell(recording.name, found, gathered)
     target.write_text(rig_text(gathered.rig, found, recording.name), encoding="utf-8")
-    picture.write_text(pictures(found), encoding="utf-8")
     out.print(f"rig         {target}   (use it: grd replay RECORDING --overlay {target})", markup=False)
-    out.print(f"pictures    {picture}", markup=False)
+    if importlib.util.find_spec("matplotlib") is None:
+        out.print("figures     none: matplotlib is not installed: pip install -e '.[evaluate]'", markup=False)
+        return
+    from links.calibration.figures import draw
+
+    figures.write_text(draw(found), encoding="utf-8")
+    out.print(f"figures     {figures}", markup=False)
 
 
 def _calibrated(gathered: Gathered, parked: bool) -> Calibration:

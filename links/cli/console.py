@@ -17,9 +17,9 @@ from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from flow.config_error import ConfigError
 from flow.link import LinkError
 from flow.ports import RunError
-from flow.problem import ConfigError
 
 FINDING, WRONG_USE = 1, 2
 BAR_AFTER_S = 1.0  # anything that takes longer than 2 s shows a bar before that
@@ -39,7 +39,7 @@ def in_words(command: F) -> F:
         try:
             return command(*args, **kwargs)
         except ConfigError as error:
-            for problem in error.problems:
+            for problem in error.errors:
                 err.print(str(problem), markup=False, style="red")
             raise typer.Exit(WRONG_USE) from None
         except LinkError as error:

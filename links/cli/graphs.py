@@ -12,12 +12,12 @@ from typing import Annotated
 
 import typer
 
-from flow.draw import mermaid, svg
+from flow.config.draw import mermaid, svg
+from flow.config.hosts import Hosts
+from flow.config.hosts_file import load_hosts
+from flow.config.schema import schema as schema_of
+from flow.config_error import ConfigError
 from flow.graph import Graph, load_graph
-from flow.hosts import Hosts
-from flow.hosts_file import load_hosts
-from flow.problem import ConfigError
-from flow.schema import schema as schema_of
 from links.cli.console import FINDING, WRONG_USE, err, in_words, out
 from links.cli.run import Overlay, Sets
 from links.zenoh import host_graph
@@ -46,12 +46,12 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
         graph = load_graph(config, overlay or (), sets or ())
         placed = load_hosts(hosts, graph) if hosts is not None else None
     except ConfigError as error:
-        for problem in error.problems:
+        for problem in error.errors:
             err.print(str(problem), markup=False, style="red")
         raise typer.Exit(FINDING) from None
     stages = sum(spec.kind == "stages" for spec in graph.nodes.values())
     out.print(f"{config}: {stages} stages, {len(graph.nodes) - stages} links, {len(graph.edges)} edges, no problems")
-    for text in graph.said_left_out():
+    for text in graph.left_out_texts():
         out.print(text, markup=False)
     if placed is not None:
         _tell_hosts(placed)
@@ -60,12 +60,12 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
 def _tell_hosts(hosts: Hosts) -> None:
     """What each host runs and sends."""
     for name in hosts.hosts:
-        nodes = [node for node in hosts.graph.nodes if hosts.place[node] == name]
+        nodes = [node for node in hosts.graph.nodes if hosts.placement[node] == name]
         hub = ", the hub" if name == hosts.hub else ""
         out.print(f"{name}{hub}: runs {', '.join(nodes) or 'nothing'}", markup=False)
         for hop in hosts.hops:
             if hop.sender == name:
-                out.print(f"  to {hop.receiver}: {hop.producer}.{hop.output} ({hop.waiting})", markup=False)
+                out.print(f"  to {hop.receiver}: {hop.producer}.{hop.output} ({hop.queue})", markup=False)
 
 
 @in_words
@@ -99,7 +99,7 @@ def _boxes(graph: Graph, hosts: Hosts) -> str:
     """Mermaid subgraphs: what each host runs."""
     lines: list[str] = []
     for name in hosts.hosts:
-        inside = [f"        {node}" for node in graph.nodes if hosts.place[node] == name]
+        inside = [f"        {node}" for node in graph.nodes if hosts.placement[node] == name]
         lines += [f"    subgraph {name}", *inside, "    end"] if inside else []
     return "\n".join(lines) + "\n"
 

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flow.link import Tap
-from flow.live_report import LiveReport
+from flow.live.report import LiveReport
 from flow.message import Message
 from links.cli.console import err, out
 from links.runs.live_run import Look
@@ -136,4 +136,4 @@ class LiveView:
 def _numbers(report: LiveReport) -> str:
     worst = max((edge.lag_p99_ms for edge in report.edges.values()), default=0.0)
     text = f"{report.records} records, worst lag p99 {worst:.1f} ms, {report.dropped} dropped, {report.missed} late"
-    return text + (f", OFF: {', '.join(report.off)}" if report.off else "")
+    return text + (f", OFF: {', '.join(report.switched_off)}" if report.switched_off else "")

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from flow.graph import recording_named
 from flow.link import LinkError
-from flow.live_report import LiveReport
+from flow.live.report import LiveReport
 from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table, warn
 from links.cli.live_view import LiveView
 from links.runs.as_live import repeat_into
@@ -88,7 +88,7 @@ def run(
         graph = host_graph(graph, hosts, host, to_run=True)
     with progress_bar("warm up") as step:
         rough = warm_up(graph, step) if warm else None
-    for text in (*graph.said_left_out(), *([rough] if rough else ())):
+    for text in (*graph.left_out_texts(), *([rough] if rough else ())):
         warn(text)
     with LiveView() as watch:
         finished = run_live(folder, asked, graph, watch.show, for_s, (watch.newest,))
@@ -96,9 +96,8 @@ def run(
     if view:
         _open_viewer(finished.out_dir)
     report = finished.report
-    if isinstance(report, LiveReport) and report.off:
-        what = "stopped the run" if report.stopped_by else "did not work to the end: it kept raising"
-        err.print(f"'{report.stopped_by or report.off[0]}' {what}", markup=False, style="red")
+    if isinstance(report, LiveReport) and report.switched_off:
+        err.print(f"'{report.switched_off[0]}' did not work to the end: it kept raising", markup=False, style="red")
         raise typer.Exit(FINDING)
 
 

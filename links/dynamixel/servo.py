@@ -121,7 +121,7 @@ class Servo(Source[ServoSettings]):
         return {**told, **here, "goals_lost": told["goals_lost"] + here.get("goals_lost", 0)}
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """That it is not driven, though it was before: it has shut down, or does not answer."""
         health = self._health
         if self._process is None or health is None or health.connected:
@@ -155,7 +155,7 @@ class Servo(Source[ServoSettings]):
         elif not process.send(self._within_limits(goal)):
             self._counts["goals_lost"] += 1
 
-    def orphaned(self, port: str) -> str | None:
+    def upstream_lost(self, port: str) -> str | None:
         """Nobody aims any more: the servo stops where it is, rather than finish a sweep that nobody follows."""
         process = self._process
         if process is None:

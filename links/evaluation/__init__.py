@@ -1,11 +1,13 @@
-"""Judges runs against truth: `grd evaluate`.
+"""Evaluation of runs against truth (`grd evaluate`).
 
-Source: DESIGN, Command line.
+Data flow:
+
+1. `text_files` (TUM, CSV) -> `run_data`: a run and its truth.
+2. `association`: truth at the times of the outputs, drones to tracks.
+3. `errors`: data frames of errors, and their statistics.
+4. `metrics`: the catalogue; `pose_metrics`, `track_metrics` and `stage_metrics` fill an `evaluation` with its values.
+5. `comparison` (medians, pairs of runs) and `groups` (by range, configuration, ...): many runs.
+6. `tables` (terminal, CSV, JSON), `paper_tables`, `figures` and `report` (HTML).
+
+This file imports nothing: `grd run` uses `association` without pandas and matplotlib.
 """
-
-from links.evaluation.errors import Limits
-from links.evaluation.evaluate import evaluate
-from links.evaluation.judged import Evaluation
-from links.evaluation.run_data import RunData, read_run
-
-__all__ = ["Evaluation", "Limits", "RunData", "evaluate", "read_run"]

@@ -1,193 +1,250 @@
-"""Where and how far an output was wrong: at its own stamps, and at every moment with the last output held.
+"""Errors of a run against truth, as data frames, and their statistics.
 
-Source: ours. Euler angles as the paper's tables: R = Rz(yaw) Ry(pitch) Rx(roll), differences wrapped to +-180 deg.
+Source: grd; Euler angles as in the paper's tables: R = Rz(yaw) Ry(pitch) Rx(roll), differences wrapped to +-180 deg;
+Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4 (NEES); Wilson, J. Am. Stat.
+Assoc. 22 (1927) (interval of a share).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
+import gtsam
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
+from scipy import signal, stats
+from scipy.spatial.transform import Rotation
 
-from links.evaluation.associate import interpolate, newest
-from links.evaluation.output import Output
-from links.evaluation.run_data import RunData
-from links.evaluation.tum import Trajectory
-from stages.geometry.frames import Array64, rotations_from_xyzw
+from links.evaluation.association import EvaluationLimits, bracket, interpolate, newest
+from links.evaluation.run_data import Output, RotationLog, RunData
+from links.evaluation.text_files import Flags, Stamps, Trajectory
+from stages.geometry.frames import Array64
 
-GRID_NS = 20_000_000  # time is looked at each 20 ms
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What counts as what. All are told in the report."""
-
-    max_gap_s: float = 0.15  # truth further apart is not interpolated over
-    max_age_s: float = 0.3  # an output serves for this long; an autopilot drops out when it waits longer
-    wrong_m: float = 1.0
-    wrong_sigmas: float = 3.0
-    reach_m: float = 100.0  # the drone is not asked for beyond this: VLP-16 data sheet 63-9229, range
-    min_hits: int = 4  # a sweep with this many returns of the drone should find it
+GRID_NS = 20_000_000  # period at which the newest output is evaluated
+EULER = ["roll", "pitch", "yaw"]
+Z_95 = float(stats.norm.ppf(0.975))  # two-sided 95 % of the normal distribution
 
 
-@dataclass(frozen=True, slots=True)
-class AtOutputs:
-    """Outputs against truth interpolated to their own stamps; `known` rows only."""
+def output_errors(output: Output, truth: Trajectory, limits: EvaluationLimits) -> pd.DataFrame:
+    """Errors of the outputs at their own stamps, one row for each output that truth covers; the index is the output.
 
-    index: NDArray[np.int64]  # (n,) which outputs
-    stamps_ns: NDArray[np.int64]
-    error_m: Array64  # (n, 3) output - truth, vehicle axes
-    distance_m: Array64  # (n,)
-    range_m: Array64  # (n,) true
-    covariance_m2: Array64 | None  # (n, 3, 3) of the position, vehicle axes
-    sigma_m: Array64 | None  # (n,) along the error; the largest where there is no error
-    nees: Array64 | None  # (n,) NaN where the covariance is not positive definite
-    nees6: Array64 | None
-    euler_error_rad: Array64 | None  # (n, 3) roll, pitch, yaw
-    angle_error_rad: Array64 | None  # (n,)
-    true_xyz_m: Array64
-    unknown: int  # outputs at times without truth
-
-
-def at_outputs(output: Output, truth: Trajectory, limits: Limits) -> AtOutputs:
-    """Errors of every output that truth covers."""
-    poses = output.poses
-    both = poses.quaternion_xyzw is not None and truth.quaternion_xyzw is not None
-    known, xyz, quaternion = interpolate(
-        poses.stamps_ns, truth.stamps_ns, truth.xyz_m, truth.quaternion_xyzw, round(limits.max_gap_s * 1e9)
-    )
+    Columns: stamp_ns; x, y, z and distance [m] of output - truth in vehicle axes; range [m] and true_x, true_y, true_z
+    of truth; false. With a covariance also sigma_x, sigma_y, sigma_z and sigma along the error [m] (the largest one
+    where there is no error) and nees; with rotations roll, pitch, yaw and angle [rad]; with both pose_nees. A NEES is
+    NaN where the covariance is not positive definite.
+    """
+    known, true_m = position_at(truth, output.poses.stamps_ns, limits)
     index = np.nonzero(known)[0]
-    error = poses.xyz_m[index] - xyz[index]
+    covered, true_m = output.take(index), true_m[index]
+    stamps_ns, xyz_m, covariance = covered.poses.stamps_ns, covered.poses.xyz_m, covered.covariance
+    error = xyz_m - true_m
     distance = np.linalg.norm(error, axis=1)
-    euler = angle = R_estimate = R_true = None
-    if poses.quaternion_xyzw is not None:
-        R_estimate = rotations_from_xyzw(poses.quaternion_xyzw[index])
-    if both and quaternion is not None and R_estimate is not None:
-        R_true = rotations_from_xyzw(quaternion[index])
-        euler = wrap(euler_rpy(R_estimate) - euler_rpy(R_true))
-        angle = np.linalg.norm(log_rotation(np.swapaxes(R_estimate, 1, 2) @ R_true), axis=1)
-    covariance = sigma = nees = nees6 = None
-    if output.covariance is not None:
-        covariance = output.covariance[index]
+    columns = {"stamp_ns": stamps_ns, "distance": distance, "range": np.linalg.norm(true_m, axis=1)}
+    frame = pd.DataFrame(columns | {"false": distance > limits.false_m}, index=index)
+    frame[["x", "y", "z"]], frame[["true_x", "true_y", "true_z"]] = error, true_m
+    R = R_true = None
+    if covered.poses.quaternion_xyzw is not None:
+        R = Rotation.from_quat(covered.poses.quaternion_xyzw)
+        if truth.quaternion_xyzw is not None:
+            R_true = _rotation_at(truth, stamps_ns, limits)[1]
+            frame[EULER], frame["angle"] = euler_error(R, R_true), (R.inv() * R_true).magnitude()
+    if covariance is not None:
         if covariance.shape[1:] == (6, 6):
-            if R_estimate is not None and R_true is not None:
-                nees6 = mahalanobis(pose_error(R_estimate, poses.xyz_m[index], R_true, xyz[index]), covariance)
-            R = np.broadcast_to(np.eye(3), (len(index), 3, 3)) if R_estimate is None else R_estimate
-            covariance = R @ covariance[:, 3:, 3:] @ np.swapaxes(R, 1, 2)
-        nees = mahalanobis(error, covariance)
-        sigma = sigma_along(error, covariance)
-    return AtOutputs(
-        index,
-        poses.stamps_ns[index],
-        error,
-        distance,
-        np.linalg.norm(xyz[index], axis=1),
-        covariance,
-        sigma,
-        nees,
-        nees6,
-        euler,
-        angle,
-        xyz[index],
-        len(poses) - len(index),
-    )
+            if R is not None and R_true is not None:
+                frame["pose_nees"] = mahalanobis(pose_error(R, xyz_m, R_true, true_m), covariance)
+            axes = np.broadcast_to(np.eye(3), (len(index), 3, 3)) if R is None else R.as_matrix()
+            covariance = axes @ covariance[:, 3:, 3:] @ np.swapaxes(axes, 1, 2)
+        frame["nees"], frame["sigma"] = mahalanobis(error, covariance), sigma_along(error, covariance)
+        variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0)
+        frame[["sigma_x", "sigma_y", "sigma_z"]] = np.sqrt(variance)
+    return frame
 
 
-@dataclass(frozen=True, slots=True)
-class OverTime:
-    """Every moment of the recording at which the drone was in reach and truth knows where."""
+def held_errors(output: Output, truth: Trajectory, span_ns: tuple[int, int], limits: EvaluationLimits) -> pd.DataFrame:
+    """Errors of the newest output each GRID_NS, one row for each time at which truth is known.
 
-    at_ns: NDArray[np.int64]  # (m,)
-    range_m: Array64
-    has_output: NDArray[np.bool_]  # an output came at or before
-    fresh: NDArray[np.bool_]  # and is not older than `max_age_s`
-    held_m: Array64  # (m,) distance of the newest output from the drone; NaN before the first
-    away_ns: NDArray[np.int64]  # moments at which the drone was known to be out of reach
-
-
-def over_time(output: Output, truth: Trajectory, span_ns: tuple[int, int], limits: Limits) -> OverTime:
-    """Look each 20 ms: how far is the newest output from where the drone is now?"""
+    Columns: stamp_ns; range [m] of truth; in_reach; last, the newest output, -1 before the first; distance [m] of it
+    from the drone, NaN before the first; current, when it is not older than `max_age_s`; accurate, when it is not
+    false, too.
+    """
     at_ns = np.arange(span_ns[0], span_ns[1] + 1, GRID_NS, dtype=np.int64)
-    known, xyz, _ = interpolate(at_ns, truth.stamps_ns, truth.xyz_m, None, round(limits.max_gap_s * 1e9))
-    away = known & (np.linalg.norm(xyz, axis=1) > limits.reach_m)
-    away_ns = at_ns[away]
-    at_ns, xyz = at_ns[known & ~away], xyz[known & ~away]
+    known, true_m = position_at(truth, at_ns, limits)
+    at_ns, true_m = at_ns[known], true_m[known]
     stamps = output.poses.stamps_ns
     last = newest(at_ns, stamps)
     has = last >= 0
-    held = np.full(len(at_ns), np.nan)
-    age_ns = np.full(len(at_ns), np.iinfo(np.int64).max)
-    held[has] = np.linalg.norm(output.poses.xyz_m[last[has]] - xyz[has], axis=1)
-    age_ns[has] = at_ns[has] - stamps[last[has]]
-    return OverTime(at_ns, np.linalg.norm(xyz, axis=1), has, age_ns <= limits.max_age_s * 1e9, held, away_ns)
+    distance = np.full(len(at_ns), np.nan)
+    distance[has] = np.linalg.norm(output.poses.xyz_m[last[has]] - true_m[has], axis=1)
+    current = has.copy()
+    current[has] = at_ns[has] - stamps[last[has]] <= limits.max_age_s * 1e9
+    frame = pd.DataFrame({"stamp_ns": at_ns, "range": np.linalg.norm(true_m, axis=1), "last": last})
+    frame = frame.assign(distance=distance, current=current, accurate=current & (distance <= limits.false_m))
+    return frame.assign(in_reach=~(frame["range"] > limits.reach_m))
 
 
-def span_of(run: RunData) -> tuple[tuple[int, int] | None, str]:
-    """The time a run is judged over, and where it comes from: the recording's, else truth's, never the output's own."""
+def time_span(run: RunData) -> tuple[tuple[int, int] | None, str]:
+    """Time that a run is evaluated over and where it comes from: the recording, else truth, never the output."""
     if run.start_ns is not None and run.end_ns is not None:
         return (run.start_ns, run.end_ns), "the recording"
     if run.truth is not None:
         return (int(run.truth.stamps_ns[0]), int(run.truth.stamps_ns[-1])), "the truth"
-    return None, "neither the recording's time nor truth is known"
+    return None, ""
 
 
-def euler_rpy(R: Array64) -> Array64:
-    """Roll, pitch, yaw (n, 3) [rad] of R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    roll = np.arctan2(R[:, 2, 1], R[:, 2, 2])
-    pitch = np.arcsin(np.clip(-R[:, 2, 0], -1, 1))
-    return np.column_stack([roll, pitch, np.arctan2(R[:, 1, 0], R[:, 0, 0])])
+def rotation_errors(
+    log: RotationLog, drone: Trajectory, vehicle: Trajectory | None, limits: EvaluationLimits
+) -> pd.DataFrame | None:
+    """Errors of the accepted rotations by both cameras at their own stamps, where truth is known.
+
+    Columns: stamp_ns; resolved; nees; angle, roll, pitch, yaw [rad] of the nearest of the four yaw branches, which are
+    turned by 90 deg about the vertical of the world (this is the accuracy of the measurement alone); published_angle,
+    published_roll, ... [rad] of the published branch. None when truth has no rotation of the drone. `vehicle` is
+    T_world_vehicle; None: the vehicle is assumed to be level.
+    """
+    if drone.quaternion_xyzw is None:
+        return None
+    at_ns = log.stamps_ns[log.accepted]
+    known, R_true = _rotation_at(drone, at_ns, limits)
+    R_world_vehicle = Rotation.from_matrix(np.broadcast_to(np.eye(3), (len(at_ns), 3, 3)))
+    if vehicle is not None:
+        known_vehicle, R_world_vehicle = _rotation_at(vehicle, at_ns, limits)
+        known = known & known_vehicle
+    R = Rotation.from_matrix(log.R_vehicle_drone[log.accepted][known])
+    R_true, R_world_vehicle = (Rotation.from_quat(r.as_quat()[known]) for r in (R_true, R_world_vehicle))
+    turns = [Rotation.from_euler("z", branch * math.pi / 2) for branch in range(4)]
+    branches = [R_world_vehicle.inv() * turn * R_world_vehicle * R_true for turn in turns]
+    phi = np.array([(R.inv() * branch).as_rotvec() for branch in branches])  # (4, n, 3)
+    angle, euler = np.linalg.norm(phi, axis=2), np.array([euler_error(R, branch) for branch in branches])
+    nearest, row = np.argmin(angle, axis=0), np.arange(len(R))
+    covariance = log.covariance_rad2[log.accepted][known]
+    frame = pd.DataFrame({"stamp_ns": at_ns[known], "resolved": log.resolved[log.accepted][known]})
+    frame["angle"], frame[EULER] = angle[nearest, row], euler[nearest, row]
+    frame["published_angle"], frame[[f"published_{axis}" for axis in EULER]] = angle[0], euler[0]
+    return frame.assign(nees=mahalanobis(phi[nearest, row], covariance))
 
 
-def wrap(angle_rad: Array64) -> Array64:
-    """To [-pi, pi)."""
-    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
+def path_length_m(
+    drone: Trajectory, vehicle: Trajectory, span_ns: tuple[int, int], limits: EvaluationLimits, over_ground: bool
+) -> float | None:
+    """Length [m] of the drone's path, over ground or relative to the vehicle in axes that do not turn with it.
+
+    None when truth has a gap in the span. A recording may begin a little before truth does.
+    """
+    begin_ns, end_ns = max(span_ns[0], int(drone.stamps_ns[0])), span_ns[1]
+    if begin_ns - span_ns[0] > limits.max_gap_ns:
+        return None
+    inside = (drone.stamps_ns > begin_ns) & (drone.stamps_ns < end_ns)
+    at_ns = np.concatenate([[begin_ns], drone.stamps_ns[inside], [end_ns]])
+    known, t_vehicle_drone = position_at(drone, at_ns, limits)
+    known_position, t_world_vehicle = position_at(vehicle, at_ns, limits)
+    known_rotation, R_world_vehicle = _rotation_at(vehicle, at_ns, limits)
+    if not (known & known_position & known_rotation).all():
+        return None
+    path = R_world_vehicle.apply(t_vehicle_drone) + (t_world_vehicle if over_ground else 0.0)
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
-def log_rotation(R: Array64) -> Array64:
-    """Rotation vectors (n, 3) [rad], also near half a turn."""
-    sine = 0.5 * np.column_stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]])
-    cosine = 0.5 * (np.trace(R, axis1=1, axis2=2) - 1)
-    length = np.linalg.norm(sine, axis=1)
-    angle = np.arctan2(length, cosine)
-    scale = np.where(length > 1e-9, angle / np.maximum(length, 1e-300), 1.0)
-    vectors = sine * scale[:, None]
-    for i in np.nonzero((length <= 1e-6) & (cosine < 0))[0]:  # half a turn: the axis is in the symmetric part
-        symmetric = 0.5 * (R[i] + np.eye(3))
-        axis = symmetric[:, int(np.argmax(np.diagonal(symmetric)))]
-        vectors[i] = np.pi * axis / np.linalg.norm(axis)
-    return vectors
+def position_at(path: Trajectory, at_ns: Stamps, limits: EvaluationLimits) -> tuple[Flags, Array64]:
+    """Positions of a trajectory at given times: known (m,) and xyz (m, 3) [m], whose unknown rows mean nothing."""
+    return interpolate(at_ns, path.stamps_ns, path.xyz_m, limits.max_gap_ns)
 
 
-def pose_error(R: Array64, xyz: Array64, R_true: Array64, xyz_true: Array64) -> Array64:
-    """Log of T_estimate^-1 T_true (n, 6), rotation before translation, tangent at the estimated drone (gtsam's)."""
-    R_inverse = np.swapaxes(R, 1, 2)
-    omega = log_rotation(R_inverse @ R_true)
-    t = np.einsum("nij,nj->ni", R_inverse, xyz_true - xyz)
-    # inverse of the left Jacobian of SO(3): J^-1 = I - [w]/2 + (1/a^2 - (1 + cos a) / (2 a sin a)) [w]^2
-    angle = np.linalg.norm(omega, axis=1)
-    small = angle < 1e-4
-    a = np.where(small, 1.0, angle)
-    half = a / 2
-    factor = np.where(small, 1 / 12, (1 - half / np.tan(half)) / a**2)
-    first = np.cross(omega, t)
-    v = t - 0.5 * first + factor[:, None] * np.cross(omega, first)
-    return np.column_stack([omega, v])
+def _rotation_at(path: Trajectory, at_ns: Stamps, limits: EvaluationLimits) -> tuple[Flags, Rotation]:
+    """Rotations of a trajectory at given times, by slerp: known (m,) and m rotations (unknown ones mean nothing)."""
+    if path.quaternion_xyzw is None:
+        return np.zeros(len(at_ns), dtype=np.bool_), Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (len(at_ns), 1)))
+    b = bracket(at_ns, path.stamps_ns, limits.max_gap_ns)
+    return b.known, slerp(path.quaternion_xyzw[b.before], path.quaternion_xyzw[b.after], b.weight)
+
+
+def slerp(before_xyzw: Array64, after_xyzw: Array64, weight: Array64) -> Rotation:
+    """Spherical linear interpolation between unit quaternions (m, 4), along the shorter arc (Shoemake 1985)."""
+    before = Rotation.from_quat(before_xyzw)
+    step = (before.inv() * Rotation.from_quat(after_xyzw)).as_rotvec()
+    return before * Rotation.from_rotvec(weight[:, None] * step)
+
+
+def euler_error(R: Rotation, R_true: Rotation) -> Array64:
+    """Differences of roll, pitch and yaw (n, 3) [rad] in [-pi, pi)."""
+    difference = (R.as_euler("ZYX") - R_true.as_euler("ZYX"))[:, ::-1]
+    return (difference + np.pi) % (2 * np.pi) - np.pi
+
+
+def pose_error(R: Rotation, xyz_m: Array64, R_true: Rotation, true_m: Array64) -> Array64:
+    """Log of T_estimate^-1 T_true (n, 6), rotation before translation, tangent at the estimated drone."""
+    estimate, truth = (
+        [gtsam.Pose3(gtsam.Rot3(r), t) for r, t in zip(rotations.as_matrix(), translations, strict=True)]
+        for rotations, translations in ((R, xyz_m), (R_true, true_m))
+    )
+    errors = [gtsam.Pose3.Logmap(a.between(b)) for a, b in zip(estimate, truth, strict=True)]
+    return np.array(errors, dtype=np.float64).reshape(-1, 6)
 
 
 def mahalanobis(error: Array64, covariance: Array64) -> Array64:
     """e^T C^-1 e (n,); NaN where C is not positive definite."""
     result = np.full(len(error), np.nan)
     if len(error):
-        fine = np.linalg.eigvalsh(covariance)[:, 0] > 0
-        result[fine] = np.sum(error[fine] * np.linalg.solve(covariance[fine], error[fine][..., None])[..., 0], axis=1)
+        valid = np.linalg.eigvalsh(covariance)[:, 0] > 0
+        solved = np.linalg.solve(covariance[valid], error[valid][..., None])[..., 0]
+        result[valid] = np.sum(error[valid] * solved, axis=1)
     return result
 
 
 def sigma_along(error: Array64, covariance: Array64) -> Array64:
-    """Standard deviation (n,) in the direction of the error; 0 for a covariance that gives none."""
+    """Standard deviation (n,) in the direction of the error, the largest one where there is no error."""
     length = np.linalg.norm(error, axis=1)
     unit = error / np.where(length > 0, length, 1)[:, None]
     variance = np.einsum("ni,nij,nj->n", unit, covariance, unit)
-    widest = np.linalg.eigvalsh(covariance)[:, -1] if len(error) else np.zeros(0)
-    return np.sqrt(np.maximum(np.where(length > 0, variance, widest), 0))
+    largest = np.linalg.eigvalsh(covariance)[:, -1] if len(error) else np.zeros(0)
+    return np.sqrt(np.maximum(np.where(length > 0, variance, largest), 0))
+
+
+def rms(values: Array64 | pd.Series) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def p95(values: Array64 | pd.Series) -> float:
+    """95 % point, interpolated."""
+    return float(np.percentile(values, 95))
+
+
+def inside_95(nees: Array64 | pd.Series, dof: int) -> Flags:
+    """Errors inside the 95 % ellipsoid; an invalid covariance (NaN) contains nothing."""
+    return np.nan_to_num(np.asarray(nees), nan=np.inf) <= stats.chi2.ppf(0.95, dof)
+
+
+def mean_nees_bounds(samples: float, dof: int) -> tuple[float, float]:
+    """Two-sided 95 % bounds of the mean NEES of a consistent estimator: chi2_{n dof}(2.5 %, 97.5 %) / n."""
+    n = max(samples, 1.0)
+    low, high = stats.chi2.ppf([0.025, 0.975], n * dof) / n
+    return float(low), float(high)
+
+
+def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
+    """95 % confidence interval of a share; `trials` may be an effective number of samples, which is not whole."""
+    share, z2 = successes / trials, Z_95**2
+    middle = (share + z2 / (2 * trials)) / (1 + z2 / trials)
+    half = Z_95 / (1 + z2 / trials) * math.sqrt(share * (1 - share) / trials + z2 / (4 * trials**2))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def poisson_upper(events: int) -> float:
+    """One-sided 95 % upper bound of a Poisson mean after so many events: chi2_{2 events + 2}(95 %) / 2."""
+    return float(stats.chi2.ppf(0.95, 2 * events + 2)) / 2
+
+
+def effective_samples(series: Array64) -> float:
+    """Number of independent samples in a series: n / (1 + 2 sum of its autocorrelation), from 1 to n.
+
+    The sum ends at the first lag with a correlation of 0 or less.
+    """
+    n = len(series)
+    centred = series - series.mean() if n else series
+    power = float(centred @ centred)
+    if n < 3 or power <= 1e-12 * n * float(np.square(series).mean()):
+        return float(min(n, 1))  # a constant series repeats one sample
+    correlation = signal.correlate(centred, centred, method="fft")[n : 2 * n - 2] / power
+    ends = np.nonzero(correlation <= 0)[0]
+    total = float(correlation[: ends[0] if len(ends) else None].sum())
+    return max(1.0, n / (1 + 2 * total))

@@ -1,180 +1,311 @@
-"""Many runs in few rows: grouped by words of the recording's name, as the matrix names them, and by configuration.
+"""Many runs in few rows: by fields of the recording's name and by configuration.
 
-`manhattan-20m-hover-parked-s1`: word 1 is the scene, 2 the range, 3 the motion, 4 the vehicle, 5 the seed.
+`manhattan-20m-hover-parked-s1`: field 1 is the scene, 2 the range, 3 the motion, 4 the vehicle, 5 the seed.
 
-Source: ours. Counts and shares are over all runs of a group, those of searches by their time (searches.py); one that
-failed counts as infinite in a median and a 95 % point, a maximum is over those that did not fail, and how many did
-stands beside it.
+Source: grd. Shares of time and counts are pooled over all runs of a group. A failed run counts as infinite in a median
+and a 95 % point; a maximum is over the runs that did not fail.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeVar, cast
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
 
 from flow.link import LinkError
-from links.evaluation.compare import by_config, median
-from links.evaluation.judged import Evaluation, minutes
+from links.evaluation.errors import inside_95, p95, poisson_upper, rms, wilson_interval
+from links.evaluation.evaluation import Evaluation
+from links.evaluation.metrics import CAMERAS
+from links.evaluation.stage_metrics import PROBABILITY_EDGES, probability_outcomes
+from links.evaluation.tables import OBJECT, Table, by_config, number_text, runs_table
 
 CONFIG, ALL = "config", "all"
-Key = tuple[int, ...]  # words of the recording's name that a table is grouped by; none: all runs are one group
-
-Amount = TypeVar("Amount", int, float)
-
-
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """A number of every run, where it could be measured."""
-
-    values: tuple[float, ...]  # rising; inf where the run failed
-
-    @property
-    def succeeded(self) -> tuple[float, ...]:
-        """Without the failures."""
-        return tuple(v for v in self.values if math.isfinite(v))
-
-    @property
-    def median(self) -> float | None:
-        """inf when half of the runs failed."""
-        return median(list(self.values))
-
-    @property
-    def p95(self) -> float | None:
-        """The smallest value that 95 % do not exceed."""
-        return self.values[math.ceil(0.95 * len(self.values) - 1e-9) - 1] if self.values else None
-
-    @property
-    def largest(self) -> float | None:
-        """Of the runs that succeeded."""
-        return max(self.succeeded, default=None)
+Key = tuple[int, ...]  # fields of the recording's name that a table is grouped by; none: all runs are one group
+Group = tuple[tuple[str, ...], str, list[Evaluation]]  # fields, configuration, runs
+Statistic = Callable[[pd.DataFrame], float]  # of the runs of a group (`runs_table`); NaN where there is none
+Columns = dict[str, tuple[int, Statistic]]  # by heading: decimals, statistic
 
 
-@dataclass(frozen=True, slots=True)
-class Group:
-    """Runs of one configuration that share words of their recordings' names, summed up. Shares are in percent."""
+def _mean(key: str) -> Statistic:
+    return lambda runs: runs.loc[:, key].mean()
 
-    words: tuple[str, ...]
-    config: str
-    runs: int
-    right_share: float | None  # mean over the runs
-    ever_right: int
-    silent: int  # runs without any output
-    mostly_false: int  # runs in which more than half of the outputs are false, whatever sigma they state
-    hit: tuple[float, float]  # seconds of searches with a return of the drone, of all
-    seen: tuple[float, float]  # of searches with 4 or more returns of the drone, of all
-    found: tuple[float, float]  # of searches in which the best candidate was the drone, of all
-    found_when_seen: tuple[float, float]  # of searches in which a candidate was, of those with 4 or more returns
-    first_right_s: Spread
-    shortest_failed_s: float | None  # length of the shortest run that never was right
-    hit_gap_s: Spread
-    reacquired_s: Spread  # one value for each time the drone came back in sight
-    lost: int | None  # times lost though in sight
-    rmse_m: Spread  # of the outputs of the runs that were right at least once
-    inside_95: tuple[int, int]  # outputs whose 95 % ellipsoid holds the truth
-    false_per_h: float | None
-    sure_false_per_h: float | None  # of those, beyond three of their own sigmas
-    good_share: float | None  # time with a pose good enough for the autopilot, mean over the runs
-    good_max_m: float | None  # largest errors of such poses
-    good_max_deg: float | None
+
+def _median(key: str) -> Statistic:
+    return lambda runs: runs.loc[:, key].median()
+
+
+def _largest(key: str) -> Statistic:
+    return lambda runs: runs.loc[np.isfinite(runs[key]), key].max()
+
+
+def _total(key: str) -> Statistic:
+    return lambda runs: runs.loc[np.isfinite(runs[key]), key].sum(min_count=1)
+
+
+def _percent(key: str, part: str = "s", whole: str = "of_s") -> Statistic:
+    def statistic(runs: pd.DataFrame) -> float:
+        count, of = float(runs.loc[:, f"{key}_{part}"].sum()), float(runs.loc[:, f"{key}_{whole}"].sum())
+        return 100 * count / of if of else math.nan
+
+    return statistic
+
+
+def _per_h(key: str) -> Statistic:
+    def statistic(runs: pd.DataFrame) -> float:
+        counted = runs.loc[runs[key].notna() & runs.span_s.notna()]
+        return counted[key].sum() / (counted.span_s.sum() / 3600) if len(counted) else math.nan
+
+    return statistic
+
+
+def _reacquisition(statistic: Callable[[pd.Series], float]) -> Statistic:
+    """A statistic of the times to reacquire of all occlusions."""
+
+    def of_runs(runs: pd.DataFrame) -> float:
+        times_s = pd.Series([t for e in runs[OBJECT] for t in e.reacquisition_s], dtype=float)
+        return statistic(times_s) if len(times_s) else math.nan
+
+    return of_runs
+
+
+def _rotations(column: str, statistic: Callable[[np.ndarray], float]) -> Statistic:
+    """A statistic of the rotations of all runs as one series: a run that accepts few weighs less."""
+
+    def of_runs(runs: pd.DataFrame) -> float:
+        values = [e.rotation_errors[column] for e in runs[OBJECT] if e.rotation_errors is not None]
+        series = np.concatenate(values) if values else np.zeros(0)
+        return statistic(series) if len(series) else math.nan
+
+    return of_runs
+
+
+def _degrees(statistic: Callable[[np.ndarray], float]) -> Callable[[np.ndarray], float]:
+    return lambda angles_rad: statistic(np.degrees(angles_rad))
+
+
+def quantile_95(ranks: pd.Series) -> float:
+    """The smallest value that 95 % do not exceed; NaN without values."""
+    values = ranks.dropna().to_numpy()
+    return float(np.quantile(values, 0.95, method="inverted_cdf")) if len(values) else math.nan
+
+
+COLUMNS: Columns = {
+    "runs": (0, len),
+    "track\naccuracy [%]": (1, _mean("track_accuracy")),
+    "ever\naccurate": (0, lambda runs: (runs.track_accuracy > 0).sum()),
+    "no\noutput": (0, lambda runs: (runs.outputs == 0).sum()),
+    "mostly\nfalse": (0, lambda runs: (runs.false_outputs > 0.5 * runs.outputs).sum()),
+    "any return\n[%]": (1, _percent("return_share")),
+    "observable\n[%]": (1, _percent("observable_share")),
+    "detection\nrate [%]": (1, _percent("detection_rate")),
+    "of observable\n[%]": (1, _percent("observable_detection_rate")),
+    "first accurate\nmedian [s]": (1, _median("first_accurate_s")),
+    "first accurate\n95 % [s]": (1, lambda runs: quantile_95(runs.first_accurate_s)),
+    "return gap\nmedian [s]": (2, _median("longest_return_gap_s")),
+    "return gap\nmax [s]": (2, _largest("longest_return_gap_s")),
+    "reacquired": (0, _reacquisition(lambda times_s: np.isfinite(times_s).sum())),
+    "of\nocclusions": (0, _reacquisition(len)),
+    "reacquired\nmedian [s]": (2, _reacquisition(pd.Series.median)),
+    "reacquired\nmax [s]": (2, _reacquisition(lambda times_s: times_s[np.isfinite(times_s)].max())),
+    "track\nlosses": (0, _total("track_losses")),
+    "3D RMSE\nmedian [m]": (3, lambda runs: runs.rmse_m[runs.track_accuracy > 0].median()),
+    "in 95 %\n[%]": (1, _percent("inside_95_share", "count", "of")),
+    "false\n[/h]": (0, _per_h("false_outputs")),
+    "overconfident\n[/h]": (0, _per_h("overconfident_false_outputs")),
+    "sent\n[%]": (1, _mean("sendable_share")),
+    "sent:\nmax [m]": (2, _largest("sendable_max_m")),
+    "sent:\nmax [deg]": (1, _largest("sendable_max_deg")),
+}
+NOTE = (
+    "Track accuracy: share of the time with a current output within 1 m. Ever accurate, no output, mostly false: "
+    "number of runs. Any return, observable: share of the time searched in searches with 1 or more, with 4 or more "
+    "returns of the drone. Detection rate: share of the time searched in searches whose best candidate is the drone; "
+    "of observable: share of the time of observable searches, any candidate. First accurate: time to the first "
+    "accurate output. Reacquired: after occlusions. Track losses: in sight. 3D RMSE: of runs with an accurate output. "
+    "False: outputs farther than 1 m from the drone; overconfident: by more than three of their own sigmas, too. "
+    "Sent: poses that the autopilot gate accepts, share of the time and largest errors. Medians and 95 % points count "
+    "a failed run as infinite ('never', or longer than the shortest failed run); maxima leave failed runs out. Each "
+    "of several drones counts as a run."
+)
+ROTATION_COLUMNS: Columns = {
+    "runs": (0, len),
+    "images": (0, lambda runs: runs.rotation_accepted_share_of.sum()),
+    "accepted\n[%]": (1, _percent("rotation_accepted_share", "count", "of")),
+    "published\nRMSE [deg]": (2, _rotations("published_angle", _degrees(rms))),
+    "mod 90\nRMSE [deg]": (2, _rotations("angle", _degrees(rms))),
+    "mod 90\nmedian": (2, _rotations("angle", _degrees(np.median))),
+    "mod 90\n95 %": (2, _rotations("angle", _degrees(p95))),
+    "roll\nRMSE": (2, _rotations("roll", _degrees(rms))),
+    "pitch\nRMSE": (2, _rotations("pitch", _degrees(rms))),
+    "yaw\nRMSE": (2, _rotations("yaw", _degrees(rms))),
+    "in 95 %\n[%]": (1, _rotations("nees", lambda nees: 100 * inside_95(nees, 3).mean())),
+    "NEES\n/ 3": (2, _rotations("nees", lambda nees: nees.mean() / 3)),
+    "RESOLVED": (0, lambda runs: runs.rotation_resolved.sum()),
+    "wrong": (0, _total("rotation_wrong_resolved")),
+    "runs\nRESOLVED": (0, lambda runs: np.isfinite(runs.rotation_resolved_s).sum()),
+    "first\n[s]": (1, _median("rotation_resolved_s")),
+    "first\n[m]": (2, _median("rotation_resolved_m")),
+    "ground\n[m]": (2, _median("rotation_resolved_ground_m")),
+    "switches": (0, lambda runs: runs.rotation_switches.sum()),
+}
+ROTATION_NOTE = (
+    f"{CAMERAS}: over all rotations of a group. Published: error of the published yaw branch. Mod 90: error of the "
+    "nearest of its four branches, turned by 90 deg about the vertical of the world, as are roll, pitch, yaw, the 95 "
+    "% bound and NEES / 3 (ideal: 1). Wrong: RESOLVED and more than 45 deg off. Runs RESOLVED: runs whose first "
+    "RESOLVED rotation is right. First, ground: time and the drone's path to it, relative to the vehicle and over "
+    "ground, medians of runs."
+)
+RELIABILITY_NOTE = (
+    "Candidates of the detector by their probability. A candidate counts once in each row, with the first observation "
+    "after which its probability is in that row; it is a drone when it is within 1 m of one then. 95 %: confidence "
+    "interval of the share."
+)
 
 
 def parse_by(text: str) -> Key:
-    """`2`, `2,3`, `config`, `2,config` -> the words. Configurations stand side by side in any case."""
-    words: list[int] = []
+    """`2`, `2,3`, `config`, `2,config` as numbers of fields. Configurations are side by side in any case."""
+    fields: list[int] = []
     for part in map(str.strip, text.split(",")):
         if part.isdecimal() and int(part) > 0:
-            words.append(int(part))
+            fields.append(int(part))
         elif part != CONFIG:
-            raise LinkError(f"--by {text}: a word's number from 1 on, several as in 2,3, or '{CONFIG}' is wanted")
-    return tuple(words)
+            raise LinkError(f"--by {text}: expected the number of a field from 1 on, several as in 2,3, or '{CONFIG}'")
+    return tuple(fields)
 
 
-def groups(evaluations: Sequence[Evaluation], key: Key) -> list[Group]:
-    """The groups of `grouped`, summed up."""
-    return [_group(*group) for group in grouped(evaluations, key)]
+def grouped(evaluations: Sequence[Evaluation], key: Key) -> list[Group]:
+    """Each combination of fields and configurations; all runs together last.
 
-
-def grouped(evaluations: Sequence[Evaluation], key: Key) -> list[tuple[tuple[str, ...], str, list[Evaluation]]]:
-    """(words, configuration, runs) for each combination of the words and of configurations; all runs together last.
-
-    Numbers stand in their order, configurations as they were given. LinkError when a name has no such word.
+    Numbers are in their order, configurations as they were given. LinkError when a name has no such field.
     """
     configs = list(by_config(list(evaluations)))
     cells: dict[tuple[str, ...], list[Evaluation]] = {}
     for e in evaluations:
-        words = e.run.recording.split("-")
-        if max(key, default=0) > len(words):
-            raise LinkError(f"--by {max(key)}: '{e.run.recording}' has {len(words)} words, joined by '-'")
-        cells.setdefault(tuple(words[word - 1] for word in key), []).append(e)
-    rows = [(words, cells[words]) for words in sorted(cells, key=lambda words: [_natural(word) for word in words])]
+        fields = e.run.recording.split("-")
+        if max(key, default=0) > len(fields):
+            raise LinkError(f"--by {max(key)}: '{e.run.recording}' has {len(fields)} fields, joined by '-'")
+        cells.setdefault(tuple(fields[number - 1] for number in key), []).append(e)
+    rows = [(fields, cells[fields]) for fields in sorted(cells, key=lambda fields: [_natural(text) for text in fields])]
     if key:
         rows.append(((ALL, *[""] * (len(key) - 1)), list(evaluations)))
     return [
-        (words, config, own)
-        for words, several in rows
+        (fields, config, own)
+        for fields, several in rows
         for config in configs
         if (own := [e for e in several if e.run.config == config])
     ]
 
 
-def _group(words: tuple[str, ...], config: str, evaluations: list[Evaluation]) -> Group:
-    right = [v for e in evaluations if (v := _number(e, "right_share")) is not None]
-    good = [v for e in evaluations if (v := _number(e, "good_share")) is not None]
-    was_right = [e for e in evaluations if (_number(e, "right_share") or 0.0) > 0.0]
-    lost = [v for e in evaluations if (v := _number(e, "lost_count")) is not None]
-    failed = [e.span_ns for e in evaluations if "first_right_s" in e.values and e.values["first_right_s"].failed]
-    lengths_s = [60 * minutes(span) for span in failed if span is not None]
-    return Group(
-        words=words,
-        config=config,
-        runs=len(evaluations),
-        right_share=sum(right) / len(right) if right else None,
-        ever_right=len(was_right),
-        silent=sum(len(e.output.poses) == 0 for e in evaluations),
-        mostly_false=sum((_number(e, "false_outputs") or 0) > 0.5 * len(e.output.poses) for e in evaluations),
-        hit=pooled((e.seconds for e in evaluations), "hit_share"),
-        seen=pooled((e.seconds for e in evaluations), "seen_share"),
-        found=pooled((e.seconds for e in evaluations), "found_share"),
-        found_when_seen=pooled((e.seconds for e in evaluations), "found_when_seen_share"),
-        first_right_s=spread(evaluations, "first_right_s"),
-        shortest_failed_s=min(lengths_s, default=None),
-        hit_gap_s=spread(evaluations, "longest_hit_gap_s"),
-        reacquired_s=Spread(tuple(sorted(t for e in evaluations for t in e.reappeared_s))),
-        lost=int(sum(lost)) if lost else None,
-        rmse_m=spread(was_right, "rmse_m"),
-        inside_95=pooled((e.counts for e in evaluations), "inside_95_share"),
-        false_per_h=_per_h(evaluations, "false_outputs"),
-        sure_false_per_h=_per_h(evaluations, "sure_false_outputs"),
-        good_share=sum(good) / len(good) if good else None,
-        good_max_m=spread(evaluations, "good_max_m").largest,
-        good_max_deg=spread(evaluations, "good_max_deg").largest,
-    )
-
-
-def _per_h(evaluations: list[Evaluation], key: str) -> float | None:
-    counted = [(v, e.span_ns) for e in evaluations if (v := _number(e, key)) is not None and e.span_ns]
-    hours = sum(minutes(span) for _, span in counted) / 60
-    return sum(count for count, _ in counted) / hours if counted else None
-
-
-def spread(evaluations: list[Evaluation], key: str) -> Spread:
-    """A metric of which less is better, over the runs that could be measured."""
-    ranks = [value.ranked("low") for e in evaluations if (value := e.values.get(key)) is not None]
-    return Spread(tuple(sorted(rank for rank in ranks if rank is not None)))
-
-
-def pooled(shares: Iterable[Mapping[str, tuple[Amount, Amount]]], key: str) -> tuple[Amount, Amount]:
-    """Of a share that each run keeps as counts or seconds: (how many, of how many) over all runs."""
-    told = [share[key] for share in shares if key in share]
-    return cast(tuple[Amount, Amount], (sum(some for some, _ in told), sum(of for _, of in told)))
-
-
-def _number(e: Evaluation, key: str) -> float | None:
-    return e.values[key].value if key in e.values else None
-
-
 def _natural(text: str) -> list[tuple[int, int | str]]:
     return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", text) if part]
+
+
+def group_numbers(groups: list[Group], columns: Columns = COLUMNS) -> pd.DataFrame:
+    """The statistics of each group, one row for each."""
+    tables = [runs_table(own) for *_, own in groups]
+    return pd.DataFrame({head: [float(statistic(t)) for t in tables] for head, (_, statistic) in columns.items()})
+
+
+def group_table(evaluations: Sequence[Evaluation], key: Key) -> Table:
+    """Groups down, statistics across; the configuration is a column when there are several or nothing else is."""
+    return _table("", grouped(evaluations, key), key, COLUMNS, NOTE)
+
+
+def rotation_table(evaluations: Sequence[Evaluation], key: Key) -> Table | None:
+    """The same for the rotation by both cameras; None when no run has one."""
+    asked = [e for e in evaluations if e.values["rotation_images"].value is not None]
+    return _table(f"{CAMERAS}, ", grouped(asked, key), key, ROTATION_COLUMNS, ROTATION_NOTE) if asked else None
+
+
+def _table(title: str, groups: list[Group], key: Key, columns: Columns, note: str) -> Table:
+    configs = [config for _, config, _ in groups]
+    frame = pd.DataFrame({f"field {number}": [fields[i] for fields, *_ in groups] for i, number in enumerate(key)})
+    if not key or len(set(configs)) > 1:
+        frame[CONFIG] = configs
+    labels, empty = frame.shape[1], []
+    failed_s = [
+        min((e.duration_s or 0.0 for e in own if e.values["first_accurate_s"].failed), default=None)
+        for *_, own in groups
+    ]
+    numbers = group_numbers(groups, columns)
+    for head, (decimals, _) in columns.items():
+        never = failed_s if head.startswith("first accurate") else [None] * len(groups)
+        if np.isnan(numbers[head].to_numpy()).all():
+            empty.append(head.replace("\n", " "))
+        else:
+            frame[head] = [number_text(n, decimals, s) for n, s in zip(numbers[head], never, strict=True)]
+    by = f"field {', '.join(map(str, key))} of the recording's name" if key else CONFIG
+    return Table(f"{title}by {by}", frame, labels, note + (f" Without values: {', '.join(empty)}." if empty else ""))
+
+
+def false_track_numbers(evaluations: list[Evaluation]) -> pd.DataFrame:
+    """Runs without a drone, one row for each configuration; runs whose length is not known are left out.
+
+    The rate of false tracks has a one-sided 95 % bound of a Poisson process: tracks are independent, outputs are not.
+    """
+    rows: list[dict[str, object]] = []
+    for config, several in by_config([e for e in evaluations if e.duration_s is not None]).items():
+        hours = sum(e.duration_s or 0.0 for e in several) / 3600
+        tracks = int(sum(e.values["false_tracks"].value or 0 for e in several))
+        detections = sum(len(search.accepted_xyz_m) for e in several for search in e.run.searches or ())
+        outputs = sum(len(e.output.poses) for e in several)
+        row = {
+            CONFIG: config,
+            "runs": len(several),
+            "hours": hours,
+            "outputs": outputs,
+            "false\ndetections": detections,
+        }
+        row |= {"false\ntracks": tracks, "[/h]": tracks / hours, "below [/h]\n(95 %)": poisson_upper(tracks) / hours}
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def false_track_table(evaluations: list[Evaluation]) -> Table:
+    """Configurations down; the note names the recordings with false tracks."""
+    frame = false_track_numbers(evaluations).map(lambda x: f"{x:.3g}" if isinstance(x, float) else str(x))
+    runs = runs_table(evaluations)
+    false = runs[runs.false_tracks > 0].groupby(["config", "recording"], sort=False).false_tracks.sum()
+    notes: list[str] = []
+    for config, counts in false.groupby("config", sort=False):
+        names = [f"{name} ({n:.0f})" if n > 1 else str(name) for (_, name), n in counts.items()]
+        notes.append(f"{config or 'runs'}: false tracks in {', '.join(names)}")
+    return Table("without a drone", frame, 1, "; ".join(notes))
+
+
+def reliability(evaluations: list[Evaluation]) -> pd.DataFrame:
+    """Reliability of the detector's probabilities: candidates and drones among them, by configuration and bin.
+
+    Columns: config, low and high edge, candidates, mean probability, drones, share of drones and its 95 % interval.
+    """
+    rows: list[dict[str, object]] = []
+    for config, several in by_config(evaluations).items():
+        runs = {e.run.name: e for e in several}.values()  # several drones of a run have the same candidates
+        outcomes = pd.concat([probability_outcomes(e) for e in runs])
+        for k, (low, high) in enumerate(pairwise(PROBABILITY_EDGES)):
+            here = outcomes[outcomes.bin == k]
+            if n := len(here):
+                drones = int(here.is_drone.sum())
+                row = {"config": config, "low": low, "high": high, "candidates": n, "mean": here.probability.mean()}
+                below, above = wilson_interval(drones, n)
+                rows.append(row | {"drones": drones, "share": drones / n, "share_low": below, "share_high": above})
+    return pd.DataFrame(rows)
+
+
+def reliability_table(evaluations: list[Evaluation]) -> Table | None:
+    """Configurations and probabilities down; None when no run has candidates with a probability."""
+    rows = reliability(evaluations)
+    if rows.empty:
+        return None
+    percent = (100 * rows[["mean", "share", "share_low", "share_high"]]).map("{:.1f}".format)
+    frame = pd.DataFrame(
+        {CONFIG: rows.config, "probability": rows.low.map("{:g} to ".format) + rows.high.map("{:g}".format)}
+    )
+    frame["candidates"] = rows.candidates.astype(str)
+    frame["mean probability\n[%]"], frame["drones\n[%]"] = percent["mean"], percent["share"]
+    frame["95 %\n[%]"] = percent["share_low"] + " to " + percent["share_high"]
+    return Table("reliability of the detector's probabilities", frame, 2, RELIABILITY_NOTE)

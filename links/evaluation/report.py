@@ -1,52 +1,57 @@
-"""The HTML report: one file that needs nothing from outside. Every name in it is escaped.
+"""The report as HTML (one file, figures first, then tables, every text escaped) and as JSON.
 
-Source: ours.
+Source: grd.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
+from typing import Any
 
-from links.evaluation.catalogue import Metric, Value, metric_of
-from links.evaluation.compare import COMMON, Pair, pooled
-from links.evaluation.judged import Evaluation
-from links.evaluation.plots import plots
-from links.evaluation.summaries import Summary
+import numpy as np
+import pandas as pd
+
+from links.evaluation.comparison import Pair, common_rmse_m, compare, comparison_table
+from links.evaluation.evaluation import Evaluation, Value
+from links.evaluation.figures import reliability_figure, run_figures
+from links.evaluation.groups import reliability
+from links.evaluation.metrics import Metric, metric_of
 from links.evaluation.tables import (
-    HEADLINES,
-    cell,
-    common_rmse,
-    comparison_rows,
+    Table,
+    headline_table,
+    keys_of,
     label,
-    median_columns,
+    medians,
+    metrics_table,
+    not_evaluated_names,
     number,
-    pooled_cell,
-    ratio_cell,
-    rows_that_matter,
-    titled,
-    word,
+    pools,
+    ranks,
 )
 
-MAX_PICTURED = 40  # runs with pictures: more would make a file that no browser likes
+MAX_RUNS = 40  # runs with figures: a browser takes no larger file
 STYLE = """
-body{font:14px/1.45 system-ui,sans-serif;color:#223;background:#f6f7f9;margin:0 auto;max-width:1020px;padding:24px}
+body{font:14px/1.45 system-ui,sans-serif;color:#223;background:#f6f7f9;margin:0 auto;max-width:1180px;padding:24px}
 h1{font-size:24px;margin:0 0 4px}h2{font-size:19px;margin:36px 0 6px;border-bottom:2px solid #223;padding-bottom:3px}
-h3{font-size:15px;margin:18px 0 4px}table{border-collapse:collapse;background:#fff;margin:8px 0}
-th,td{padding:3px 10px;border:1px solid #dde2ea;text-align:right;white-space:nowrap}
-th:first-child,td:first-child{text-align:left}tr.group td{background:#eef1f6;font-weight:600}
-.wide{overflow-x:auto}.bad{color:#b01818}.good{color:#1b7f4b}.soft{color:#667}.cards{display:flex;gap:12px;flex-wrap:wrap}
+h3{font-size:15px;margin:18px 0 4px}table{border-collapse:collapse;background:#fff;margin:8px 0;max-width:100%}
+th,td{padding:3px 7px;border:1px solid #dde2ea;text-align:right}
+th{font-size:12px;vertical-align:bottom;overflow-wrap:break-word}td.label{text-align:left;overflow-wrap:anywhere}
+tr.section td{background:#eef1f6;font-weight:600;text-align:left}.note{color:#667}
+.bad,tr.failed td,tr.worse td:last-child{color:#b01818}tr.better td:last-child{color:#1b7f4b}
+.cards{display:flex;gap:12px;flex-wrap:wrap}ul{margin:4px 0;padding-left:20px}
 .card{background:#fff;border:1px solid #dde2ea;border-radius:6px;padding:8px 14px;min-width:128px}
-.card b{display:block;font-size:20px}ul{margin:4px 0;padding-left:20px}
-svg{background:#fff;border:1px solid #dde2ea;margin:4px 4px 4px 0}svg text{font:11px system-ui,sans-serif;fill:#223}
-svg text.title{font-weight:600;font-size:13px}
+.card b{display:block;font-size:20px}
+svg{background:#fff;border:1px solid #dde2ea;margin:4px 0;width:100%;height:auto}
 """
 CARDS = (
-    ("right_share", "of the time right (within 1 m)"),
-    ("fresh_share", "of the time with an output"),
+    ("track_accuracy", "of the time accurate (within 1 m)"),
+    ("availability", "of the time with an output"),
     ("rmse_m", "3D RMSE of the outputs"),
     ("held_rmse_m", "3D RMSE, last output held"),
-    ("first_right_s", "to the first right output"),
+    ("first_accurate_s", "to the first accurate output"),
     ("false_outputs", "false outputs"),
     ("false_alarms_per_h", "false alarms per hour"),
     ("inside_95_share", "inside the 95 % ellipsoid"),
@@ -59,150 +64,132 @@ def write_report(
     others: list[Evaluation],
     pairs: list[Pair],
     warnings: list[str],
-    summaries: list[Summary],
+    summaries: Sequence[Table],
 ) -> None:
-    """Write the report."""
-    parts = ["<h1>grd evaluate</h1>", _how(own[0])]
-    parts += [f'<p class="bad">{escape(text)}</p>' for text in warnings]
-    parts += [_summary(summary) for summary in summaries]
+    """Write the report of the runs, those that they are compared with, and tables over several runs."""
+    parts = ["<h1>grd evaluate</h1>", *(f'<p class="bad">{escape(text)}</p>' for text in warnings)]
+    everything = [*own, *others]
+    shown = everything[:MAX_RUNS]
+    rows = reliability(own)
+    for index, e in enumerate(shown):
+        parts.append(f"<h2>{escape(label(e) + ('' if index < len(own) else ' (compared with)'))}</h2>")
+        parts.append(_summary_of(e))
+        parts += run_figures(e)
+    if not rows.empty:
+        parts += ["<h2>Reliability</h2>", reliability_figure(rows)]
+    parts.append("<h2>Tables</h2>")
+    parts += [summary.html() for summary in summaries]
     if pairs:
-        parts.append(_comparison(pairs))
+        parts.append(comparison_table(pairs).html())
     if len(own) > 1:
-        parts.append(_headlines(own))
-        parts.append(_metrics("All metrics, medians over the runs", own, columns=[]))
-    shown = [*own, *others][:MAX_PICTURED]
-    parts += [_run(e, "" if index < len(own) else " (the other)") for index, e in enumerate(shown)]
-    if len(own) + len(others) > MAX_PICTURED:
-        parts.append(f"<p>{len(own) + len(others) - MAX_PICTURED} more runs are in the tables above only.</p>")
+        parts.append(headline_table(own, with_medians=True).html())
+        parts.append(metrics_table("all metrics, medians over the runs", own, []).html())
+    for e in shown:
+        parts.append(metrics_table(f"all metrics, {label(e)}", [e], [e], detailed=True).html())
+        parts.append(_list("How it was evaluated", e.remarks))
+        missing = [f"{', '.join(names)}: {reason}" for reason, names in not_evaluated_names(e).items()]
+        parts.append(_list("Not evaluated", missing))
+    if len(everything) > MAX_RUNS:
+        parts.append(f"<p>{len(everything) - MAX_RUNS} more runs are in the tables over several runs only.</p>")
+    parts.append(_definitions(own[0]))
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>grd evaluate</title>'
     text = f"<!doctype html><html lang=en><head>{head}<style>{STYLE}</style></head><body>{''.join(parts)}</body></html>"
     path.write_text(text + "\n", encoding="utf-8")
 
 
-def _how(e: Evaluation) -> str:
-    limits = e.limits
-    return (
-        '<p class="soft">T_vehicle_drone against truth, in the vehicle frame, nothing aligned. Truth is interpolated '
-        f"to each output's stamp, not over gaps of more than {limits.max_gap_s:g} s. An output counts as present for "
-        f"{limits.max_age_s:g} s; <i>right</i> is present and within {limits.wrong_m:g} m; <i>held</i> errors are "
-        "taken every 20 ms from the first output on with the last one, however old. A <i>false</i> output is farther "
-        f"than {limits.wrong_m:g} m, whatever sigma it states, and <i>sure</i> if that is more than "
-        f"{limits.wrong_sigmas:g} of it along the error. A sweep found the drone when its best detection is within "
-        f"{limits.wrong_m:g} m of where the drone was at any moment of the sweep. In a median a run that gave nothing "
-        "counts as the worst. Latency is not judged: a run's files hold measurement times only.</p>"
+def _definitions(e: Evaluation) -> str:
+    near, sigmas = f"{e.limits.false_m:g} m", f"{e.limits.overconfident_sigmas:g}"
+    sentences = (
+        "T_vehicle_drone is compared with truth in the vehicle frame; nothing is aligned.",
+        f"Truth is interpolated to the stamp of each output, not over gaps of more than {e.limits.max_gap_s:g} s.",
+        f"An output is current for {e.limits.max_age_s:g} s; it is accurate when it is current and within {near} of "
+        "the drone, and false when it is farther than that.",
+        f"A false output is overconfident when it is more than {sigmas} of its own sigmas off, along the error.",
+        "Held errors are of the last output, however old, every 20 ms from the first output on.",
+        f"A search detects the drone when its best candidate is within {near} of the drone at any time of the search.",
+        "In a median a run that failed counts as the worst.",
+        "Latency is not evaluated: the files of a run hold measurement times only.",
     )
+    return _list("Definitions", list(sentences))
 
 
-def _summary(summary: Summary) -> str:
-    head = "".join(f"<th>{escape(text).replace(chr(10), '<br>')}</th>" for text in summary.heads)
-    rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in summary.rows)
-    table = f'<div class="wide"><table><tr>{head}</tr>{rows}</table></div>'
-    return f'<h2>{escape(summary.title)}</h2>{table}<p class="soft">{escape(summary.note)}</p>'
-
-
-def _comparison(pairs: list[Pair]) -> str:
-    one = len(pairs) == 1
-    names = [label(pairs[0].own), label(pairs[0].other)] if one else ["RUN", "OTHER"]
-    title = f"{names[0]} against {names[1]}" if one else f"RUN against OTHER: medians of {len(pairs)} pairs"
-    rows: list[str] = []
-    group = ""
-    for key, row in comparison_rows(pairs):
-        metric = metric_of(key)
-        group = _group(rows, metric, group, 5)
-        verdict = word(row, metric)
-        css = {"better": "good", "worse": "bad"}.get(verdict, "")
-        cells = [pooled_cell(row.own, metric), pooled_cell(row.other, metric), ratio_cell(row)]
-        told = "".join(f"<td>{escape(text)}</td>" for text in cells)
-        rows.append(f'<tr><td>{escape(titled(metric))}</td>{told}<td class="{css}">{verdict}</td></tr>')
-    common = common_rmse(pairs)
-    if common is not None:
-        a, b = common
-        ratio = f"{a / b:.2g}" if b > 0 else "-"
-        rows.append(f"<tr><td>{COMMON} [m]</td><td>{a:.3f}</td><td>{b:.3f}</td><td>{ratio}</td><td></td></tr>")
-    head = "".join(f"<th>{escape(name)}</th>" for name in ("metric", *names, "ratio", ""))
-    return f'<h2>{escape(title)}</h2><div class="wide"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
-
-
-def _headlines(own: list[Evaluation]) -> str:
-    head = "".join(f"<th>{escape(name)}</th>" for name in ("run", *HEADLINES.values()))
-    rows: list[str] = []
-    for e in own:
-        values = [(e.values[key], metric_of(key)) for key in HEADLINES]
-        cells = "".join(f"<td{_css(value)}>{escape(_short(value, metric))}</td>" for value, metric in values)
-        rows.append(f"<tr><td>{escape(label(e))}</td>{cells}</tr>")
-    for name, several in median_columns(own):
-        medians = "".join(f"<td><b>{escape(_median(several, key))}</b></td>" for key in HEADLINES)
-        rows.append(f"<tr><td><b>{escape(name)}</b></td>{medians}</tr>")
-    return f'<h2>Runs</h2><div class="wide"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
-
-
-def _median(own: list[Evaluation], key: str) -> str:
-    median = pooled(own, key).median
-    return "-" if median is None else number(median, metric_of(key))
-
-
-def _short(value: Value, metric: Metric) -> str:
-    if value.value is None:
-        return "none" if value.failed else "-"
-    return number(value.value, metric)
-
-
-def _css(value: Value) -> str:
-    return ' class="bad"' if value.failed else ""
-
-
-def _metrics(title: str, evaluations: list[Evaluation], columns: list[Evaluation]) -> str:
-    medians = median_columns(evaluations)
-    names = [*(label(e) for e in columns), *([name for name, _ in medians] or ["n"])]
-    rows: list[str] = []
-    group = ""
-    for key in rows_that_matter(evaluations):
-        metric = metric_of(key)
-        group = _group(rows, metric, group, len(names) + 1)
-        cells = "".join(
-            f'<td{_css(e.values[key])} title="{escape(e.values[key].note)}">{escape(cell(e.values[key], metric))}</td>'
-            for e in columns
-        )
-        cells += "".join(f"<td>{escape(pooled_cell(pooled(e, key), metric))}</td>" for _, e in medians)
-        if not medians:
-            samples = evaluations[0].values[key].samples
-            cells += f'<td class="soft">{"" if samples is None else samples}</td>'
-        rows.append(f"<tr><td>{escape(titled(metric))}</td>{cells}</tr>")
-    head = "".join(f"<th>{escape(name)}</th>" for name in ("metric", *names))
-    return f'<h3>{escape(title)}</h3><div class="wide"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
-
-
-def _group(rows: list[str], metric: Metric, group: str, width: int) -> str:
-    if metric.group != group:
-        rows.append(f'<tr class="group"><td colspan="{width}">{escape(metric.group)}</td></tr>')
-    return metric.group
-
-
-def _run(e: Evaluation, aside: str) -> str:
-    parts = [f"<h2>{escape(label(e) + aside)}</h2>", f'<p class="soft">{escape(e.run.name)}, output {e.output.name}, '
-             f"{len(e.output.poses)} poses, recording {escape(e.run.recording)}</p>"]  # fmt: skip
+def _summary_of(e: Evaluation) -> str:
+    about = f"{e.run.name}, output {e.output.kind}, {len(e.output.poses)} poses, recording {e.run.recording}"
     cards = [(e.values[key], metric_of(key), text) for key, text in CARDS]
-    told = "".join(
-        f'<div class="card"><b{_css(v)}>{escape(_card(v, m))}</b>{escape(text)}</div>'
+    shown = "".join(
+        f'<div class="card"><b{" class=bad" if v.failed else ""}>{escape(_card(v, m))}</b>{escape(text)}</div>'
         for v, m, text in cards
         if v.value is not None or v.failed
     )
-    parts.append(f'<div class="cards">{told}</div>')
-    parts.append(_list("What is wrong", e.findings, "bad"))
-    parts.append("".join(plots(e)))
-    parts.append(_metrics("All metrics", [e], [e]))
-    parts.append(_list("How it was judged", e.remarks, ""))
-    missing = [f"{', '.join(names)}: {reason}" for reason, names in e.not_evaluated().items()]
-    parts.append(_list("Not evaluated", missing, "soft"))
-    return "".join(parts)
+    return f'<p class="note">{escape(about)}</p><div class="cards">{shown}</div>' + _list("Findings", e.findings, "bad")
 
 
 def _card(value: Value, metric: Metric) -> str:
     return "none" if value.value is None else f"{number(value.value, metric)} {metric.unit}".strip()
 
 
-def _list(title: str, texts: list[str], css: str) -> str:
+def _list(title: str, texts: list[str], css: str = "note") -> str:
     if not texts:
         return ""
     items = "".join(f"<li>{escape(text)}</li>" for text in texts)
     return f'<h3>{escape(title)}</h3><ul class="{css}">{items}</ul>'
+
+
+def as_json(evaluations: list[Evaluation], pairs: list[Pair], warnings: list[str]) -> dict[str, Any]:
+    """Everything for programs. No NaN: a metric without a value has `null`, a status and a reason."""
+    tree: dict[str, Any] = {
+        "format": 2,
+        "limits": asdict(evaluations[0].limits),
+        "warnings": warnings,
+        "runs": [_run_json(e) for e in evaluations],
+    }
+    keys = keys_of(evaluations)
+    pooled = {name: _medians_json(medians(ranks(several, keys))) for name, several in pools(evaluations).items()}
+    if len(pooled) > 1:
+        tree["median_by_config"] = pooled
+    elif len(evaluations) > 1:
+        tree["median"] = next(iter(pooled.values()))
+    if pairs:
+        compared = compare(pairs)
+        own, other = _medians_json(compared.own), _medians_json(compared.other)
+        ratio = {key: value if np.isfinite(value) else None for key, value in compared.ratio.items()}
+        tree["against"] = {
+            "pairs": [
+                {"recording": p.own.run.recording, "run": p.own.run.name, "other": p.other.run.name} for p in pairs
+            ],
+            "others": [_run_json(pair.other) for pair in pairs],
+            "metrics": {key: {"run": own[key], "other": other[key], "ratio": ratio[key]} for key in own},
+            "rmse_m_while_both_have_output": common_rmse_m(pairs),
+        }
+    return tree
+
+
+def _run_json(e: Evaluation) -> dict[str, Any]:
+    return {
+        "name": e.run.name,
+        "recording": e.run.recording,
+        "config": e.run.config,
+        "drone": e.run.drone,
+        "output": e.output.kind.value,
+        "outputs": len(e.output.poses),
+        "span_s": None if e.span_ns is None else [t / 1e9 for t in e.span_ns],
+        "metrics": {key: _value_json(key, value) for key, value in e.values.items()},
+        "findings": e.findings,
+        "remarks": e.remarks,
+        "not_evaluated": not_evaluated_names(e),
+    }
+
+
+def _value_json(key: str, value: Value) -> dict[str, Any]:
+    tree = {"value": value.value, "unit": metric_of(key).unit, "status": value.status.value}
+    optional = {"samples": value.samples, "low": value.low, "high": value.high, "note": value.note or None}
+    return tree | {name: content for name, content in optional.items() if content is not None}
+
+
+def _medians_json(pooled: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    named = pooled.rename(columns={"failed": "runs_failed", "not_evaluated": "runs_not_evaluated"})
+    named.insert(1, "failed", np.isinf(named["median"]))
+    return {
+        str(key): row | {"median": row["median"] if np.isfinite(row["median"]) else None}
+        for key, row in zip(named.index, named.to_dict("records"), strict=True)
+    }

@@ -1,41 +1,67 @@
-"""What there is to judge: a run's folder, or a TUM file, with the truth that belongs to it.
+"""Everything an evaluation reads: the folder of a run, or a TUM file, with the truth that belongs to it.
 
-Source: DESIGN, Outputs of a run; file names in links/runs/results.py.
+Source: DESIGN, Outputs of a run; links/runs/results.py and links/runs/truth.py write the files.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from flow.link import LinkError
-from links.evaluation.output import Output, read_output
-from links.evaluation.rotations import Rotations, read_rotations
-from links.evaluation.said import Said, read_said
-from links.evaluation.true_drone import TrueDrone, read_true_drones, read_true_vehicle
-from links.evaluation.tum import Trajectory, read_number, read_stamp_ns, read_table, read_tum
-from links.runs.results import (
-    CANDIDATES_FILE,
-    COVARIANCE_FILE,
-    DETECTIONS_FILE,
-    FIX_FILE,
-    POSE_COVARIANCE_FILE,
-    POSE_FILE,
-    ROTATION_FILE,
-    SUMMARY_FILE,
-)
-from stages.geometry.frames import Array64
+from links.evaluation.association import DroneTruth, EvaluationLimits, Source, follow, read_true_drones
+from links.evaluation.text_files import Flags, Rows, Stamps, TextTable, Trajectory, read_stamp_ns, read_tum
+from links.runs import results
+from stages.geometry.frames import Array64, rotations_from_xyzw
+from stages.messages import BranchState
+
+T = TypeVar("T")
+XYZ = ("x_m", "y_m", "z_m")
+NOT_A_RUN = {".mcap", ".rrd", ".html", ".json", ".yaml"}  # files that are given by mistake
+
+
+class OutputKind(StrEnum):
+    """Which trajectory of a run an output is."""
+
+    POSE = "pose"  # fused
+    FIX = "fix"  # of the LiDAR
+    FILE = "file"  # a TUM file without a run
 
 
 @dataclass(frozen=True, slots=True)
-class Sweep:
-    """One searched sweep and the candidates that were accepted in it, best first."""
+class Output:
+    """A trajectory of a run with the covariance and the marks of each pose."""
+
+    kind: OutputKind
+    poses: Trajectory
+    covariance: Array64 | None = None  # (n, 3, 3) [m2] vehicle axes, or (n, 6, 6) rotation first, tangent at the drone
+    why_no_covariance: str = ""
+    sendable: Flags | None = None  # (n,) the autopilot gate accepts it; None: the run does not mark that
+    returns: NDArray[np.int64] | None = None  # (n,) returns used
+    track: NDArray[np.int64] | None = None  # (n,) track number; None: the run has one track only
+    switches: int | None = None  # changes of its tracks to another drone; None: there was one drone
+    has_rotation: Flags | None = None  # (n,) the rotation is known; None: the run does not mark that
+
+    def take(self, rows: Rows) -> Output:
+        """The poses of some rows, in that order."""
+        names = ("covariance", "sendable", "returns", "track", "has_rotation")
+        arrays = {name: None if (a := getattr(self, name)) is None else a[rows] for name in names}
+        return replace(self, poses=self.poses.take(rows), **arrays)
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """A search of the detector and the candidates that it accepted, best first."""
 
     start_ns: int
     end_ns: int
@@ -43,108 +69,145 @@ class Sweep:
 
 
 @dataclass(frozen=True, slots=True)
+class RotationLog:
+    """Rotations estimated from both cameras, one row for each image of the drone's camera."""
+
+    stamps_ns: Stamps  # (n,)
+    accepted: Flags  # (n,) False: no rotation
+    R_vehicle_drone: Array64  # (n, 3, 3) of the published yaw branch; identity where there is none
+    covariance_rad2: Array64  # (n, 3, 3) of phi in R exp(phi), drone axes; zero where there is none
+    resolved: Flags  # (n,) the yaw branch is declared RESOLVED
+    switches: NDArray[np.int64]  # (n,) changes of the yaw branch so far
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True, slots=True)
 class RunData:
-    """A run as read. What is None was not recorded; `missing` says why, by what it is needed for."""
+    """A run as read from its files. `drone` selects the drone that it is evaluated against."""
 
     name: str  # as the user gave it
-    recording: str  # what it is a run of: runs of the same recording are compared with each other
-    outputs: tuple[Output, ...]  # the first is the run's answer
-    truth: Trajectory | None  # of the drone that is judged
-    no_drone: bool  # known: there was no drone at all
-    start_ns: int | None  # of the recording
-    end_ns: int | None
-    sweeps: tuple[Sweep, ...] | None
-    drone_hits_ns: NDArray[np.int64] | None  # truth: when the drone returned a pulse
-    states: tuple[tuple[int, str, int], ...]  # (since, state, track)
-    compute_ms: dict[str, dict[str, float]]
-    missing: dict[str, str]
-    config: str = ""  # what it was made with; "": not known
-    hidden_ns: NDArray[np.int64] | None = None  # (m, 2) truth: since when and until when the drone was hidden
-    drones: tuple[TrueDrone, ...] = ()  # all that truth knows of, the one that is judged among them
-    drone: int = 1  # number of the one that is judged
-    rotations: Rotations | None = None  # of both cameras; None: no stage told any
-    vehicle: Trajectory | None = None  # truth: T_world_vehicle
-    said: Said | None = None  # what may be a drone, with a probability; None: no stage tells that
+    recording: str  # runs of one recording are compared with each other
+    outputs: tuple[Output, ...]  # the first is the primary output
+    no_drone: bool  # truth, or the user, states that there was no drone
+    drones: tuple[DroneTruth, ...]  # at least one
+    drone: int = 1  # number of the selected drone
+    start_ns: int | None = None  # of the recording
+    end_ns: int | None = None
+    searches: tuple[Search, ...] | None = None
+    states: tuple[tuple[int, str, int], ...] = ()  # (since, TrackingState's name, track)
+    compute_ms: dict[str, dict[str, float]] = field(default_factory=dict)
+    missing: dict[Source, str] = field(default_factory=dict)
+    config: str = ""  # name of the configuration; empty when it is not known
+    vehicle: Trajectory | None = None  # truth, T_world_vehicle
+    rotations: RotationLog | None = None
+    candidates: pd.DataFrame | None = None  # of the detector: stamp_ns, candidate, probability, x_m, y_m, z_m
 
     @property
-    def other_paths(self) -> list[Trajectory]:
-        """Truth of the drones that are not judged."""
-        return [d.path for number, d in enumerate(self.drones, start=1) if d.path is not None and number != self.drone]
+    def target(self) -> DroneTruth:
+        """The selected drone."""
+        return self.drones[self.drone - 1]
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """T_vehicle_drone of the selected drone."""
+        return self.target.path
+
+    def why_missing(self, source: Source) -> str:
+        """Why an input is missing; empty when it is not."""
+        return (self.missing | self.target.missing).get(source, "")
 
 
 def read_run(path: Path, truth_file: Path | None = None, no_drone: bool = False) -> RunData:
-    """Read a run's folder or a TUM file. Errors are LinkError."""
+    """Read the folder of a run or a TUM file. `truth_file` replaces the truth of drone 1. Errors are LinkError."""
     if path.is_dir():
         run = _read_folder(path, truth_file, no_drone)
-    elif path.suffix.lower() in {".mcap", ".rrd", ".html", ".json", ".yaml"}:
+    elif path.suffix.lower() in NOT_A_RUN:
         raise LinkError(
-            f"{path}: a run's folder or a TUM file is wanted, not a {path.suffix} file (replay a recording first)"
+            f"{path}: expected the folder of a run or a TUM file, not a {path.suffix} file (replay a recording first)"
         )
     else:
-        poses = read_tum(path)
-        truth = read_tum(truth_file) if truth_file else None
-        nothing = f"{path.name} is a lone TUM file, not a run's folder"
-        missing: dict[str, str] = dict.fromkeys(
-            ("covariance", "recording", "detections", "compute", "hits", "visible"), nothing
-        )
-        if truth is None:
-            missing["truth"] = "no truth was given (--truth FILE.tum)"
-        output = Output("file", poses, why_no_covariance=nothing)
-        run = RunData(str(path), path.stem, (output,), truth, no_drone, None, None, None, None, (), {}, missing)
+        run = _read_file(path, truth_file, no_drone)
     if run.truth is not None and not no_drone:
-        _demand_overlap(run, run.truth)
+        _check_overlap(run, run.truth)
     return run
 
 
+def per_drone(run: RunData, limits: EvaluationLimits) -> list[RunData]:
+    """The run once for each drone with truth, with the tracks of each output that follow that drone."""
+    known = [(number, d.path) for number, d in enumerate(run.drones, start=1) if d.path is not None]
+    if len(known) < 2:
+        return [run]
+    paths = [(path.stamps_ns, path.xyz_m) for _, path in known]
+    parts: list[list[Output]] = [[] for _ in known]
+    for output in run.outputs:
+        poses = output.poses
+        tracks = np.ones(len(poses), dtype=np.int64) if output.track is None else output.track
+        found = follow(poses.stamps_ns, poses.xyz_m, tracks, paths, limits.max_gap_ns)
+        for index, part in enumerate(parts):
+            own = found.drone == index
+            switches = sum(found.switches[track] for track in np.unique(tracks[own]).tolist())
+            part.append(replace(output.take(own), switches=switches))
+    return [
+        replace(run, outputs=tuple(outputs), drone=number) for (number, _), outputs in zip(known, parts, strict=True)
+    ]
+
+
+def _read_file(path: Path, truth_file: Path | None, no_drone: bool) -> RunData:
+    why = f"{path.name} is a TUM file without a run"
+    missing = dict.fromkeys(Source, why) | {Source.TRUTH: "no truth was given (--truth FILE.tum)"}
+    output = Output(OutputKind.FILE, read_tum(path), why_no_covariance=why)
+    truth = None if truth_file is None else read_tum(truth_file)
+    return RunData(str(path), path.stem, (output,), no_drone, (DroneTruth(truth),), missing=missing)
+
+
 def _read_folder(folder: Path, truth_file: Path | None, no_drone: bool) -> RunData:
-    summary = _read_summary(folder / SUMMARY_FILE)
-    missing: dict[str, str] = {}
+    summary = _read_summary(folder / results.SUMMARY_FILE)
     outputs: list[Output] = []
-    if (folder / POSE_FILE).exists():
-        outputs.append(read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6))
-    if (folder / FIX_FILE).exists():
-        outputs.append(read_output("fix", folder / FIX_FILE, folder / COVARIANCE_FILE, 3))
+    if (folder / results.POSE_FILE).exists():
+        outputs.append(read_output(OutputKind.POSE, folder))
+    if (folder / results.FIX_FILE).exists():
+        outputs.append(read_output(OutputKind.FIX, folder))
     if not outputs:
-        raise LinkError(f"{folder}: neither {POSE_FILE} nor {FIX_FILE}: is it the --out folder of a run?")
-    drones, said_empty = read_true_drones(folder, truth_file)
-    missing |= drones[0].missing
+        raise LinkError(
+            f"{folder}: neither {results.POSE_FILE} nor {results.FIX_FILE}: is it the --out folder of a run?"
+        )
+    drones, empty_sky = read_true_drones(folder, truth_file)
     start_ns, end_ns = (
-        read_stamp_ns(str(summary[key]), f"{folder / SUMMARY_FILE}: {key}") if key in summary else None
+        read_stamp_ns(str(summary[key]), f"{folder / results.SUMMARY_FILE}: {key}") if key in summary else None
         for key in ("start_s", "end_s")
     )
-    if start_ns is None or end_ns is None:
-        missing["recording"] = f"{SUMMARY_FILE} does not say when the recording began and ended (an older grd wrote it)"
-    sweeps = None
-    if (folder / DETECTIONS_FILE).exists():
-        sweeps = _read_sweeps(folder / DETECTIONS_FILE)
-    else:
-        missing["detections"] = f"the run has no {DETECTIONS_FILE} (an older grd wrote it)"
-    states = summary.get("states", [])
-    compute = summary.get("compute_ms", {})
+    vehicle = _if_exists(folder / results.TRUTH_VEHICLE_FILE, lambda path: read_tum(path, may_be_empty=True))
     recording = Path(str(summary.get("recording", folder.name))).stem
+    compute = {stage: values for stage, values in summary.get("compute_ms", {}).items() if values.get("calls")}
     return RunData(
         name=str(folder),
         recording=recording,
         outputs=tuple(outputs),
-        truth=drones[0].path,
-        no_drone=no_drone or said_empty,
+        no_drone=no_drone or empty_sky,
+        drones=drones,
         start_ns=start_ns,
         end_ns=end_ns,
-        sweeps=sweeps,
-        drone_hits_ns=drones[0].hits_ns,
+        searches=_if_exists(folder / results.DETECTIONS_FILE, _read_searches),
         states=tuple(
             (read_stamp_ns(str(s["stamp_s"]), f"{folder}: states"), str(s["state"]), int(s.get("track_id", 1)))
-            for s in states
+            for s in summary.get("states", [])
         ),
-        compute_ms={stage: values for stage, values in compute.items() if values.get("calls")},
-        missing=missing,
+        compute_ms=compute,
+        missing={
+            Source.SEARCHES: f"the run has no {results.DETECTIONS_FILE}",
+            Source.COMPUTE: f"{results.SUMMARY_FILE} holds none",
+        },
         config=_configuration(folder, recording, summary),
-        hidden_ns=drones[0].hidden_ns,
-        drones=drones,
-        rotations=read_rotations(folder / ROTATION_FILE) if (folder / ROTATION_FILE).exists() else None,
-        vehicle=read_true_vehicle(folder),
-        said=read_said(folder / CANDIDATES_FILE) if (folder / CANDIDATES_FILE).exists() else None,
+        vehicle=vehicle if vehicle is not None and len(vehicle) else None,
+        rotations=_if_exists(folder / results.ROTATION_FILE, read_rotations),
+        candidates=_if_exists(folder / results.CANDIDATES_FILE, _read_candidates),
     )
+
+
+def _if_exists(file: Path, read: Callable[[Path], T]) -> T | None:
+    return read(file) if file.exists() else None
 
 
 def _read_summary(path: Path) -> dict[str, Any]:
@@ -160,44 +223,109 @@ def _read_summary(path: Path) -> dict[str, Any]:
 
 
 def _configuration(folder: Path, recording: str, summary: dict[str, Any]) -> str:
-    """What the run was made with. `<recording>-NAME` is the user's own name for it; else the summary says.
+    """Name of the run's configuration: NAME of a folder `<recording>-NAME`, otherwise what the summary holds.
 
-    A folder named by `grd replay` itself (`<recording>-replay-2`) tells less than its summary: `replay a.b=2`.
+    A folder that `grd replay` named itself (`<recording>-replay-2`) has less detail than the summary (`replay a.b=2`).
     """
     stem = Path(str(summary.get("config", ""))).stem
-    own = folder.resolve().name.removeprefix(f"{recording}-")
-    if own != folder.resolve().name and not re.fullmatch(rf"{re.escape(stem)}(-\d+)?", own):
-        return own
+    suffix = folder.resolve().name.removeprefix(f"{recording}-")
+    if suffix != folder.resolve().name and not re.fullmatch(rf"{re.escape(stem)}(-\d+)?", suffix):
+        return suffix
     overlays = [Path(str(name)).stem for name in summary.get("overlays", [])]
     sets = [str(text) for text in summary.get("set", []) if not str(text).startswith("viewer.")]
     return " ".join(["+".join([stem, *overlays]), *sets])
 
 
-def _read_sweeps(path: Path) -> tuple[Sweep, ...]:
-    found: dict[tuple[int, int], list[list[float]]] = {}
-    for where, row in read_table(path, ("start_s", "end_s", "x_m", "y_m", "z_m")):
-        span = read_stamp_ns(row["start_s"], where), read_stamp_ns(row["end_s"], where)
-        accepted = found.setdefault(span, [])
-        if row["x_m"]:
-            accepted.append([read_number(row[key], where) for key in ("x_m", "y_m", "z_m")])
-    return tuple(Sweep(a, b, np.array(xyz, dtype=np.float64).reshape(-1, 3)) for (a, b), xyz in found.items())
+def read_output(kind: OutputKind, folder: Path) -> Output:
+    """Poses with their covariances and marks, in order of time. Fixes of several tracks may share a stamp."""
+    if kind is OutputKind.POSE:
+        poses_file, covariance_file, upper = results.POSE_FILE, results.POSE_COVARIANCE_FILE, results.POSE_UPPER
+    else:
+        poses_file, covariance_file = results.FIX_FILE, results.COVARIANCE_FILE
+        upper = tuple(f"c{name}_m2" for name in results.UPPER)
+    if not (folder / covariance_file).exists():
+        poses = read_tum(folder / poses_file, may_be_empty=True)
+        return Output(kind, poses, why_no_covariance=f"the run has no {covariance_file}")
+    table = TextTable(folder / covariance_file, ("stamp_s", *upper))
+    track = table.whole_numbers("track_id") if "track_id" in table else None
+    one_track = track is None or len(np.unique(track)) < 2
+    poses = read_tum(folder / poses_file, may_be_empty=True, in_order=one_track)
+    covariance = table.symmetric(upper)
+    row_of = {key: row for row, key in enumerate(_occurrences(table.stamps_ns("stamp_s")))}
+    rows = np.array([row_of.get(key, -1) for key in _occurrences(poses.stamps_ns)], dtype=np.int64)
+    order = np.argsort(poses.stamps_ns, kind="stable")
+    poses, rows = poses.take(order), rows[order]
+    if absent := int(np.count_nonzero(rows < 0)):
+        why = f"{absent} of {len(rows)} lines of {poses_file} have none in {covariance_file}"
+        return Output(kind, poses, why_no_covariance=why)
+    return Output(
+        kind,
+        poses,
+        covariance[rows],
+        sendable=table.equals("good", "1")[rows] if "good" in table else None,
+        returns=table.whole_numbers("hits")[rows] if "hits" in table else None,
+        track=None if track is None else track[rows],
+        has_rotation=table.equals("rotation", "1")[rows] if "rotation" in table else None,
+    )
 
 
-def _demand_overlap(run: RunData, truth: Trajectory) -> None:
-    """LinkError when no output lies within truth's span: two clocks, or the wrong file."""
-    for output in run.outputs:
-        stamps = output.poses.stamps_ns
-        if len(stamps) and (stamps[-1] < truth.stamps_ns[0] or stamps[0] > truth.stamps_ns[-1]):
+def _occurrences(stamps_ns: Iterable[int]) -> list[tuple[int, int]]:
+    """Each stamp with the number of times it came before: tracks share stamps, and two files have them in one order."""
+    seen: Counter[int] = Counter()
+    keys: list[tuple[int, int]] = []
+    for stamp in stamps_ns:
+        keys.append((int(stamp), seen[stamp]))
+        seen[stamp] += 1
+    return keys
+
+
+def _read_searches(path: Path) -> tuple[Search, ...]:
+    """The searches of a run: rows of one span are candidates of one search; one without a position has none."""
+    table = TextTable(path, ("start_s", "end_s", *XYZ))
+    accepted = table.filled("x_m")
+    xyz_m = table.numbers(XYZ, accepted)
+    spans = np.column_stack([table.stamps_ns("start_s"), table.stamps_ns("end_s")]).tolist()
+    rows_of: dict[tuple[int, int], list[int]] = {}
+    for row, (start, end) in enumerate(spans):
+        rows_of.setdefault((start, end), []).extend([row] if accepted[row] else [])
+    return tuple(Search(*span, xyz_m[np.array(rows, dtype=np.int64)]) for span, rows in rows_of.items())
+
+
+def _read_candidates(path: Path) -> pd.DataFrame:
+    table = TextTable(path, ("stamp_s", "candidate", "detector_life", "probability", *XYZ))
+    names = (
+        pd.Series(table.text("detector_life"), dtype=object) + " " + pd.Series(table.text("candidate"), dtype=object)
+    )
+    rows = pd.DataFrame(table.numbers(("probability", *XYZ)), columns=["probability", *XYZ])
+    return rows.assign(stamp_ns=table.stamps_ns("stamp_s"), candidate=pd.factorize(names)[0])
+
+
+def read_rotations(path: Path) -> RotationLog:
+    """Read the rotations by both cameras. LinkError names the first wrong line."""
+    upper = results.ROTATION_UPPER
+    table = TextTable(path, ("stamp_s", "accepted", *results.QUATERNION, *upper, "state", "switches"))
+    accepted = table.equals("accepted", "1")
+    resolved = table.equals("state", BranchState.RESOLVED.name, list(BranchState.__members__))
+    quaternion = table.numbers(results.QUATERNION, accepted)
+    quaternion[~accepted] = [0.0, 0.0, 0.0, 1.0]
+    if not np.linalg.norm(quaternion, axis=1).all():
+        raise LinkError(f"{path}: a quaternion is 0 0 0 0, which is not a rotation")
+    R, covariance = rotations_from_xyzw(quaternion), table.symmetric(upper, accepted & table.filled(upper[0]))
+    stamps_ns, switches = table.stamps_ns("stamp_s"), table.whole_numbers("switches")
+    return RotationLog(stamps_ns, accepted, R, covariance, resolved, switches)
+
+
+def _check_overlap(run: RunData, truth: Trajectory) -> None:
+    """LinkError when an output or the recording lies outside truth's span: two clocks, or the wrong file."""
+    recording = [] if run.start_ns is None or run.end_ns is None else [("the recording", [run.start_ns, run.end_ns])]
+    outputs = [(str(output.poses.path), output.poses.stamps_ns) for output in run.outputs]
+    for name, stamps_ns in [*outputs, *recording]:
+        if len(stamps_ns) and (stamps_ns[-1] < truth.stamps_ns[0] or stamps_ns[0] > truth.stamps_ns[-1]):
             raise LinkError(
-                f"{output.poses.path} spans {_span(stamps)}, truth {truth.path} spans {_span(truth.stamps_ns)}: they "
+                f"{run.name}: {name} spans {_span(stamps_ns)}, truth {truth.path} spans {_span(truth.stamps_ns)}: they "
                 "do not overlap; both must be on the recording's clock, in seconds"
             )
-    if run.start_ns is None or run.end_ns is None:
-        return
-    if run.end_ns < truth.stamps_ns[0] or run.start_ns > truth.stamps_ns[-1]:
-        span = _span(np.array([run.start_ns, run.end_ns]))
-        raise LinkError(f"{run.name}: the recording spans {span}, truth {_span(truth.stamps_ns)}: no overlap")
 
 
-def _span(stamps_ns: NDArray[np.int64]) -> str:
+def _span(stamps_ns: Any) -> str:
     return f"{stamps_ns[0] / 1e9:.3f} .. {stamps_ns[-1] / 1e9:.3f} s"

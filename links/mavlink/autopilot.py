@@ -154,9 +154,9 @@ class Autopilot(Source[AutopilotSettings]):
         return connection.port if isinstance(connection, Udp) else None
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """See Link: the line is gone, or nothing is heard on it."""
-        return None if self._session is None else self._session.trouble
+        return None if self._session is None else self._session.status
 
     @property
     def counters(self) -> dict[str, int]:

@@ -68,7 +68,7 @@ class Connection(Protocol):
     left_late: int  # frames that waited longer for the line than LATE_NS, as far as is known
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """What is wrong with it, in words; None: nothing."""
         ...
 
@@ -91,7 +91,7 @@ class Udp:
     """One UDP socket."""
 
     datagrams = True
-    trouble: str | None = None
+    status: str | None = None
 
     def __init__(self, endpoint: Endpoint, sender: IPv4Address | None) -> None:
         self.reconnects = self.foreign = self.stalls = self.left_late = 0

@@ -73,7 +73,7 @@ class StreamConnection:
     def __init__(self, line: Line) -> None:
         self.reconnects = self.foreign = self.stalls = self.left_late = 0
         self._line = line
-        self._trouble, self._trouble_s = "", -TOLD_S  # the last one, and when it came
+        self._status, self._status_s = "", -TOLD_S  # the last one, and when it came
         self._up = True
         self._closed = False
         self._reading = threading.Lock()  # held while the line is read, opened or closed
@@ -84,10 +84,10 @@ class StreamConnection:
         self._retry_at_s, self._wait_s = 0.0, RETRY_S[0]
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """In words, while it is down and some seconds on."""
-        told = self._up and time.monotonic() - self._trouble_s >= TOLD_S
-        return None if told or not self._trouble else self._trouble
+        told = self._up and time.monotonic() - self._status_s >= TOLD_S
+        return None if told or not self._status else self._status
 
     def receive(self, timeout_s: float) -> tuple[bytes, Source_] | None:
         """See Connection."""
@@ -170,7 +170,7 @@ class StreamConnection:
     def _lost(self, how: str = "is gone: is it plugged in and powered?") -> None:
         """Only the listener closes and opens: nobody reads from a number that has become another file's."""
         self._up = False
-        self._trouble, self._trouble_s = f"{self._line.name} {how} Trying again", time.monotonic()
+        self._status, self._status_s = f"{self._line.name} {how} Trying again", time.monotonic()
         self._retry_at_s = time.monotonic() + self._wait_s
 
     def _again(self, timeout_s: float) -> bool:

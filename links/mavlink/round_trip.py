@@ -54,7 +54,7 @@ class RoundTrips:
         return self._took_ns[-1] if self._took_ns else None
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """In words, while poses would come late, or it is no longer seen whether they do."""
         if self.late:
             return (

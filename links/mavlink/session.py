@@ -143,12 +143,12 @@ class Session:
         return self._closed.is_set()
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """What does not work now; None: all does."""
         if self.closed:
             return None
-        signing = None if self._signer is None else self._signer.trouble
-        return self.connection.trouble or self._silence() or self._trips.trouble or signing
+        signing = None if self._signer is None else self._signer.status
+        return self.connection.status or self._silence() or self._trips.status or signing
 
     def _silence(self) -> str | None:
         if self._now_ns() - self._target_ns < SILENT_S * SECOND_NS:

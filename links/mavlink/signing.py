@@ -62,7 +62,7 @@ class Signer:
 
     def __init__(self, key_file: Path, now_ns: int, link_id: int = 0) -> None:
         self.unwritten = 0  # times that the file could not be written
-        self.trouble: str | None = None  # in words, while it cannot
+        self.status: str | None = None  # in words, while it cannot
         self._secret = read_key(key_file)
         self._file = key_file.with_name(key_file.name + ".timestamp")
         self._heard: dict[tuple[int, tuple[int, int]], int] = {}  # (link, sender) -> newest time
@@ -139,9 +139,9 @@ class Signer:
         except OSError as error:
             self.unwritten += 1
             self._retry_at_s = time.monotonic() + RETRY_S
-            self.trouble = (
+            self.status = (
                 f"{self._file}: the signing time cannot be written: {error.strerror}. Signing goes on; after a restart "
                 "with a wrong clock the autopilot may refuse it. Is the disk full, or signing_key's folder not ours?"
             )
         else:
-            self._reserved, self.trouble = ticks, None
+            self._reserved, self.status = ticks, None

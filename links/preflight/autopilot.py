@@ -60,7 +60,7 @@ def _silent(heard: Heard, seen: AutopilotSeen, who: str) -> Verdict:
     old = heard.counters.get("signed with our key, but not new", 0)
     if old:
         return fail(name, f"{old} frames came that are signed with an old time: does it hear us? Check both directions")
-    return fail(name, heard.silence if heard.trouble else f"no word from {who}: {heard.silence}")
+    return fail(name, heard.silence if heard.status else f"no word from {who}: {heard.silence}")
 
 
 def _heartbeat(heard: Heard, link: Autopilot, seen: AutopilotSeen, status: AutopilotStatus) -> Verdict:

@@ -43,8 +43,8 @@ def _rate(heard: Heard, link: Camera) -> Verdict:
     refused = heard.counters.get("refused", 0)
     told = f"{arrivals.rate_hz:.1f} a second" if arrivals.count > 1 else "one frame"
     text = told + (f", {refused} of {arrivals.count} damaged" if refused else "")
-    if not arrivals.rate_hz >= LEAST_HZ or (heard.live and heard.trouble):
-        why = heard.trouble or "too slow for any motion"
+    if not arrivals.rate_hz >= LEAST_HZ or (heard.live and heard.status):
+        why = heard.status or "too slow for any motion"
         return fail(name, f"{text}: {why}")
     silent_s = arrivals.longest_silence_s(heard.end_ns)
     if heard.live and silent_s > max(SILENT_S, 3.0 / arrivals.rate_hz):

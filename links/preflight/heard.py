@@ -79,15 +79,15 @@ class Heard:
     link: Link
     seen: Seen
     counters: Mapping[str, int]
-    trouble: str | None  # what the link itself says is wrong
+    status: str | None  # what the link itself says is wrong
     end_ns: int  # until when was listened
     live: bool
 
     @property
     def silence(self) -> str:
         """Why nothing came, in words."""
-        if self.trouble is not None:
-            return self.trouble
+        if self.status is not None:
+            return self.status
         return "nothing came" if self.live else f"the recording holds nothing on {self.seen.topic}"
 
 

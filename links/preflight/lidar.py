@@ -31,7 +31,7 @@ def lidar_checks(heard: Heard) -> Iterator[Verdict]:
         yield fail(f"{name} packets", _sentence(heard.silence))
         return
     if not decoded:
-        why = heard.trouble or _refused(heard) or "none was usable"
+        why = heard.status or _refused(heard) or "none was usable"
         yield fail(f"{name} packets", f"{seen.arrivals.count} packets came, and {_sentence(why)}")
         return
     yield _rate(heard, seen, link.settings.timeout_s)

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from flow.draw import mermaid
+from flow.config.draw import mermaid
 from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, Run, Source
 from flow.live import Live
-from flow.live_report import LiveReport
+from flow.live.report import LiveReport
 from flow.replay import Replay
 from links import host_time
 from links.preflight.heard import KEPT, AllHeard, Ear, Heard
@@ -32,25 +32,25 @@ def listen_live(graph: Graph, meanwhile: Callable[[Ear], None]) -> AllHeard:
     try:
         meanwhile(ear)
         report, end_ns = live.report(), host_time.now_ns()
-        troubles = {name: _trouble(name, link, report) for name, link in sources.items()}
+        statuses = {name: _status(name, link, report) for name, link in sources.items()}
         counters = {name: dict(link.counters) for name, link in sources.items()}
     finally:
         live.stop()
     heard = [
-        Heard(name, link, ear.seen(name), counters[name], troubles[name], end_ns, live=True)
+        Heard(name, link, ear.seen(name), counters[name], statuses[name], end_ns, live=True)
         for name, link in sources.items()
     ]
     return AllHeard(tuple(heard), {kind: ear.messages(kind) for kind in KEPT}, live=True)
 
 
-def _trouble(name: str, link: Source, report: LiveReport) -> str | None:
+def _status(name: str, link: Source, report: LiveReport) -> str | None:
     """What the link says itself, why it could not be opened, or what decoding raised."""
     if type(link).listen is Source.listen:
         return f"{type(link).__name__} cannot run live"
     told = report.links[name]
-    if link.trouble is not None or told.state not in ("open", "closed"):
-        return link.trouble or told.state
-    raised = [incident.text for incident in report.incidents if incident.node == name]
+    if link.status is not None or told.state not in ("open", "closed"):
+        return link.status or told.state
+    raised = [event.text for event in report.events if event.node == name]
     return raised[-1] if told.undecoded and raised else None
 
 

@@ -24,8 +24,8 @@ def ask_parameters(link: Autopilot, timeout_s: float = TIMEOUT_S) -> Answers:
         raise LinkError("no connection to the autopilot: set `connection`, as in udpin:127.0.0.1:14550")
     profile = PROFILES[link.settings.profile]
     signer = None if link.settings.signing_key is None else Signer(link.settings.signing_key, host_time.now_ns())
-    if signer is not None and signer.trouble is not None:
-        raise LinkError(signer.trouble)
+    if signer is not None and signer.status is not None:
+        raise LinkError(signer.status)
     connection = open_connection(parse_connection(link.settings.connection), link.settings.sender)
     try:
         return read_parameters(

@@ -188,7 +188,7 @@ def other_check(heard: Heard) -> Verdict:
     if not arrivals.count:
         return fail(heard.name, heard.silence)
     rate = "one record" if math.isnan(arrivals.rate_hz) else f"{arrivals.rate_hz:.1f} records a second"
-    return warning(heard.name, f"{rate}; {heard.trouble}") if heard.trouble else ok(heard.name, rate)
+    return warning(heard.name, f"{rate}; {heard.status}") if heard.status else ok(heard.name, rate)
 
 
 def _parameters(name: str, link: Autopilot) -> Verdict:

@@ -29,7 +29,7 @@ def servo_checks(heard: Heard) -> Iterator[Verdict]:
     assert isinstance(seen, ServoSeen)
     if not seen.errors:
         refused = f"{seen.arrivals.count} records came that hold no state; " if seen.arrivals.count else ""
-        advice = "" if heard.trouble else ": is it powered (12 V) and wired?"
+        advice = "" if heard.status else ": is it powered (12 V) and wired?"
         yield fail(f"{heard.name} answers", f"{refused}{heard.silence}{advice}")
         return
     yield _rate(heard, link)

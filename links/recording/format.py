@@ -102,7 +102,7 @@ TOPICS: dict[str, Topic] = {
             "the vehicle's own odometry, when it has one",
         ),
         _raw("/clock", "empty", "nothing: the host's clock, live, so often"),
-        _raw("/run/order", "grd-order", "what each stage took in which order in a live run: flow/consumption.py"),
+        _raw("/run/order", "grd-order", "what each stage took in which order in a live run: flow/live/input_order.py"),
         _json("/run/end", "grd.RunEnd", {"output_hash": {"type": "string"}}, "the live run's hash, written at its end"),
         _json("/truth/vehicle", "grd.Pose", _POSE, "T_world_vehicle; simulated only, never wired to a stage"),
         _json("/truth/drone", "grd.Pose", _POSE, "T_world_drone; simulated only, never wired to a stage"),

@@ -65,7 +65,7 @@ class Recorder(Tap[RecorderSettings]):
         self._part_s: float = 0.0  # when it was opened, monotonic
         self._stopped_s: float = 0.0
         self._before: tuple[int, int] = (0, 0)  # written and dropped in earlier parts
-        self._trouble: str | None = None
+        self._status: str | None = None
 
     def wants(self, message: type[Message]) -> bool:
         """Records only."""
@@ -81,12 +81,12 @@ class Recorder(Tap[RecorderSettings]):
         return {"written": written, "dropped": dropped, "missed": self._intake.missed, "parts": self._parts}
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """Why nothing is recorded now, in words; None: it is."""
-        return self._trouble
+        return self._status
 
     def open(self, run: Run) -> None:
-        """Begin the first part. That nothing can be recorded is `trouble`, and does not stop a run."""
+        """Begin the first part. That nothing can be recorded is `status`, and does not stop a run."""
         if not run.live:
             return
         self._run, self._session = run, uuid.uuid4().hex
@@ -127,8 +127,8 @@ class Recorder(Tap[RecorderSettings]):
         if writer is None:
             if now_s >= self._stopped_s + AGAIN_S and self._free_bytes() > 2 * settings.reserve_mb * MB:
                 self._begin_part()
-        elif writer.trouble is not None:
-            self._give_up(writer.trouble)
+        elif writer.status is not None:
+            self._give_up(writer.status)
         elif self._free_bytes() < settings.reserve_mb * MB:
             self._give_up(f"less than {settings.reserve_mb:g} MB are free at {writer.path.parent}: make room")
         elif now_s - self._part_s >= settings.split_s or self._intake.part_bytes >= settings.split_mb * MB:
@@ -160,7 +160,7 @@ class Recorder(Tap[RecorderSettings]):
             return
         self._parts += 1
         before = self._swap(writer)
-        self._part_s, self._trouble = time.monotonic(), None
+        self._part_s, self._status = time.monotonic(), None
         self._end_part(before)
 
     def _path(self, folder: Path, part: int) -> Path:
@@ -180,11 +180,11 @@ class Recorder(Tap[RecorderSettings]):
         try:
             writer.close()
         except LinkError as error:
-            self._trouble = self._trouble or str(error)
+            self._status = self._status or str(error)
         self._before = self._before[0] + writer.written, self._before[1] + writer.dropped
 
     def _give_up(self, why: str) -> None:
-        self._trouble = f"{why}; nothing is recorded now, the run goes on"
+        self._status = f"{why}; nothing is recorded now, the run goes on"
         self._stopped_s = time.monotonic()
         self._end_part(self._swap(None))
 

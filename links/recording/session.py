@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from heapq import heappop, heappush, heapreplace
 from pathlib import Path
 
-from flow.consumption import END_TOPIC
 from flow.link import LinkError, Record
+from flow.live.input_order import END_TOPIC
 from links.recording.format import Progress
 from links.recording.reader import RecordingReader
 from links.recording.recorder import PART, SESSION

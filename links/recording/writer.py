@@ -83,7 +83,7 @@ class RecordingWriter:
         self._written = 0
         self._dropped = 0
         self._closing = False
-        self._trouble: str | None = None
+        self._status: str | None = None
         self._stopped = threading.Event()
         attachments = {RIG_ATTACHMENT: rig_yaml, CONFIG_ATTACHMENT: config_yaml}
         self._stream = create(self.path, overwrite=overwrite)
@@ -100,7 +100,7 @@ class RecordingWriter:
             if not overwrite and self.path.is_file():  # nothing is in it, and it would be in the way of the next try
                 with suppress(OSError):
                     self.path.unlink()
-            raise LinkError(self._disk_trouble(error)) from None
+            raise LinkError(self._disk_status(error)) from None
         self._threads = [threading.Thread(target=self._write_all, name="recording", daemon=True)]
         if not lossless:
             self._sync_fd = os.dup(self._stream.fileno())  # its own: the writer thread closes the stream
@@ -119,9 +119,9 @@ class RecordingWriter:
         return self._dropped
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """Why nothing is being recorded any more, or None. `close` raises it."""
-        return self._trouble
+        return self._status
 
     def write(self, record: Record) -> None:
         """Queue one record; `lossless` waits while the queue is full and raises LinkError when the disk fails."""
@@ -137,14 +137,14 @@ class RecordingWriter:
             if self._closing:
                 raise LinkError(f"{self.path}: the recording is closed already")
             if self._lossless:
-                while self._waiting_bytes and self._waiting_bytes + weight > self._queue_bytes and not self._trouble:
+                while self._waiting_bytes and self._waiting_bytes + weight > self._queue_bytes and not self._status:
                     self._changed.notify_all()
                     self._changed.wait()
-                if self._trouble:
-                    raise LinkError(self._trouble)
+                if self._status:
+                    raise LinkError(self._status)
             sequence = self._sequence
             self._sequence += 1
-            if self._trouble or (self._waiting_bytes and self._waiting_bytes + weight > self._queue_bytes):
+            if self._status or (self._waiting_bytes and self._waiting_bytes + weight > self._queue_bytes):
                 self._dropped += 1
                 return
             self._queue.append((record, sequence))
@@ -162,8 +162,8 @@ class RecordingWriter:
             thread.join(max(0.0, deadline - time.monotonic()))
         if any(thread.is_alive() for thread in self._threads):
             raise LinkError(f"{self.path}: the disk did not take the data within {CLOSE_TIMEOUT_S:g} s: check the disk")
-        if self._trouble:
-            raise LinkError(self._trouble)
+        if self._status:
+            raise LinkError(self._status)
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -175,7 +175,7 @@ class RecordingWriter:
 
     def _write_all(self) -> None:
         """The writer thread."""
-        trouble: str | None = f"{self.path}: the writer thread stopped; see its error above and report it"
+        status: str | None = f"{self.path}: the writer thread stopped; see its error above and report it"
         try:
             with self._stream:
                 self._drain()
@@ -184,13 +184,13 @@ class RecordingWriter:
                 self._file.finish()
                 if not self._lossless:
                     os.fsync(self._stream.fileno())
-            trouble = None
+            status = None
         except OSError as error:
-            trouble = self._disk_trouble(error)
+            status = self._disk_status(error)
         finally:
             self._stopped.set()
-            if trouble:
-                self._fail(trouble)
+            if status:
+                self._fail(status)
                 self._dropped += self._in_hand
 
     def _drain(self) -> None:
@@ -221,18 +221,18 @@ class RecordingWriter:
             while not self._stopped.wait(SYNC_S):
                 os.fsync(self._sync_fd)
         except OSError as error:
-            self._fail(self._disk_trouble(error))
+            self._fail(self._disk_status(error))
         finally:
             os.close(self._sync_fd)
 
-    def _fail(self, trouble: str) -> None:
+    def _fail(self, status: str) -> None:
         with self._lock:
-            self._trouble = self._trouble or trouble
+            self._status = self._status or status
             self._dropped += len(self._queue)
             self._queue.clear()
             self._changed.notify_all()
 
-    def _disk_trouble(self, error: OSError) -> str:
+    def _disk_status(self, error: OSError) -> str:
         return (
             f"{self.path}: {error.strerror or error} after {self._written} records: check the disk and its free space;"
             f" `grd recover {self.path}` saves what is on it"

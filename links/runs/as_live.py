@@ -1,6 +1,6 @@
 """A live run again from its recording, into a folder as every run's: the same steps, the same messages, the same hash.
 
-Source: ours; flow/rerun.py.
+Source: ours; flow/live/rerun.py.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from pathlib import Path
 
 import yaml
 
-from flow.consumption import END_TOPIC, ORDER_TOPIC, read_orders
 from flow.graph import Graph, load_graph
 from flow.link import LinkError
-from flow.rerun import Rerun
+from flow.live.input_order import END_TOPIC, ORDER_TOPIC, read_orders
+from flow.live.rerun import Rerun
 from flow.taps import Digest
 from links.recording import Progress, Session
 from links.runs.run_folder import Asked, Finished, RunFolder, truth_beside

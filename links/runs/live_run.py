@@ -20,7 +20,7 @@ from types import FrameType
 from flow.graph import Graph
 from flow.link import LinkError, Source, Tap
 from flow.live import Live
-from flow.live_report import LiveReport
+from flow.live.report import LiveReport
 from flow.taps import Digest
 from links import host_time
 from links.recording import Recorder
@@ -37,7 +37,7 @@ class Look:
 
     since_s: float
     report: Callable[[], LiveReport]  # made when asked for: it costs some milliseconds of every thread
-    news: list[str]  # incidents not told before
+    news: list[str]  # events not told before
 
 
 Show = Callable[[Look], None]
@@ -66,32 +66,31 @@ def run_live(
     with RunFolder(folder, recording, asked, graph, began_s, live=True) as run, stop_asked() as stop:
         live = Live(graph, (*run.taps, *extra), digest=digest, now_ns=host_time.now_ns)
         if recorder is None:
-            live.incidents.report("run", "no links.recording.Recorder is configured: nothing is recorded")
+            live.events.report("run", "no links.recording.Recorder is configured: nothing is recorded")
         gc.collect()
         gc.freeze()  # what is there now stays: the collector has less to look through, and pauses are short
         live.start()
         started_s, usage = time.monotonic(), Usage()
         try:
-            while live.running and not stop.wait(LOOK_S) and (for_s is None or time.monotonic() < started_s + for_s):
+            while not stop.wait(LOOK_S) and (for_s is None or time.monotonic() < started_s + for_s):
                 _show(live, started_s, show, run)
                 usage.look(live.processes)
         finally:
             report = live.stop()
         _show(live, started_s, show, run)
         gc.unfreeze()
-        warnings = [] if report.stopped_by is None else [f"'{report.stopped_by}' stopped the run"]
-        return run.finish(report, digest.hexdigest(), None, warnings, usage)
+        return run.finish(report, digest.hexdigest(), None, [], usage)
 
 
 def _show(live: Live, started_s: float, show: Show, run: RunFolder) -> None:
-    news = live.incidents.fetch()
+    news = live.events.fetch()
     for text in news:
         run.note(text)
     try:
         show(Look(time.monotonic() - started_s, live.report, news))
     except (OSError, SystemExit) as error:  # where it is shown is full or gone; rich ends on a broken pipe
         why = error if isinstance(error, OSError) else "the pipe is closed"
-        live.incidents.report("run", f"cannot be shown on the terminal ({why}); the run goes on, run.log has it")
+        live.events.report("run", f"cannot be shown on the terminal ({why}); the run goes on, run.log has it")
 
 
 @contextmanager

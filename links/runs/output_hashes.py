@@ -19,9 +19,9 @@ from typing import Any
 
 import yaml
 
+from flow.config_error import Location
 from flow.graph import load_graph
 from flow.link import TRUTH_TOPICS, LinkError, Tap
-from flow.problem import Place
 from flow.replay import replay
 from flow.taps import Digest
 from links.recording import Session
@@ -114,7 +114,7 @@ def output_hash(recording: Path, config: Path) -> str:
     session = Session(recording)
     sections = None
     if session.rig_yaml is not None:
-        sections = {"rig": (yaml.safe_load(session.rig_yaml), Place(f"{recording} (rig.yaml)", 0))}
+        sections = {"rig": (yaml.safe_load(session.rig_yaml), Location(f"{recording} (rig.yaml)", 0))}
     graph = load_graph(config, [], _without_taps(config), sections)
     digest = Digest()
     records = (record for record in session.records() if not record.topic.startswith(TRUTH_TOPICS))

@@ -17,7 +17,7 @@ class ResultFile:
         self._stream = io.TextIOWrapper(raw, encoding="utf-8", newline="", line_buffering=True, write_through=True)
         self._patient = patient
         self.lost = 0
-        self.trouble: str | None = None
+        self.status: str | None = None
 
     def write(self, text: str) -> int:
         """Line by line, as it comes."""
@@ -38,4 +38,4 @@ class ResultFile:
         if not self._patient:
             raise error
         self.lost += 1
-        self.trouble = error.strerror or str(error)
+        self.status = error.strerror or str(error)

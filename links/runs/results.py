@@ -292,9 +292,9 @@ class Results(Tap[ResultsSettings]):
         return ResultFile(self._folder / name, patient=self._live)
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """That the disk does not take the results of a live run."""
-        why = next((file.trouble for file in tuple(self._files.values()) if file.trouble), None)
+        why = next((file.status for file in tuple(self._files.values()) if file.status), None)
         return None if why is None else f"{self._folder}: results are being lost ({why}): make room; the run goes on"
 
     def note(self, text: str) -> None:

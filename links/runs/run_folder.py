@@ -19,16 +19,16 @@ from typing import Any
 
 import yaml
 
-from flow.apart import can_run_apart, replay_apart
-from flow.draw import mermaid
+from flow.config.draw import mermaid
+from flow.config.tree import Section
+from flow.config_error import Location
 from flow.graph import Graph, load_graph
 from flow.link import LinkError, Run, Source, Tap
-from flow.live_report import LiveReport
-from flow.problem import Place
+from flow.live.report import LiveReport
 from flow.replay import RunReport, replay
 from flow.stage import Stage
+from flow.subprocess_replay import can_use_subprocesses, replay_in_subprocesses
 from flow.taps import Digest
-from flow.tree import Section
 from links.mavlink.autopilot import Autopilot
 from links.mavlink.gate import Limits
 from links.recording import Progress, RecordingReader, Session
@@ -55,7 +55,7 @@ class Asked:
         """The graph, on a rig of its own or (None) the configuration's. Raises ConfigError; LinkError for the rig."""
         sections: dict[str, Section] | None = None
         if rig_yaml is not None:
-            place = Place(where, 0)
+            place = Location(where, 0)
             try:
                 sections = {"rig": (yaml.safe_load(rig_yaml), place)}
             except yaml.YAMLError as error:
@@ -213,7 +213,7 @@ def replay_into(
     truth, digest = truth_beside(recording), Digest()
     clocks = other_clocks(graph, session.config_yaml)
     with RunFolder(folder, recording, asked, graph, began_s) as run:
-        run_all = replay if together or not can_run_apart() else replay_apart
+        run_all = replay if together or not can_use_subprocesses() else replay_in_subprocesses
         report = run_all(graph, truth.aside(session.records(progress=progress)), (digest, *run.taps))
         warnings = [*session.warnings, *clocks]
         return run.finish(report, digest.hexdigest(), truth, warnings, parts=len(session.parts))
@@ -264,7 +264,7 @@ def holds_run(folder: Path, recording: Path, graph: Graph) -> bool:
 
 def _remarks(graph: Graph, report: RunReport) -> list[str]:
     """What went wrong, and in a replay what was not used, so that a silent port is not taken for a quiet sensor."""
-    remarks = [*graph.said_left_out(), *(str(incident) for incident in report.incidents)]
+    remarks = [*graph.left_out_texts(), *(str(event) for event in report.events)]
     if isinstance(report, LiveReport):
         return remarks
     remarks += [f"{count} records on {topic} are wired to nothing" for topic, count in report.unwired_topics.items()]
@@ -333,17 +333,16 @@ def _live(report: LiveReport, usage: Usage | None) -> dict[str, Any]:
         "links": {name: asdict(link) for name, link in report.links.items()},
         "restarts": report.restarts,
         "failures": report.failures,
-        "switched_off": report.off,
-        "stopped_by": report.stopped_by,
+        "switched_off": report.switched_off,
         "not_shown": report.tap_drops,
-        "incidents": [
+        "events": [
             {
                 "first_s": stamp_s(i.first_ns),
                 "last_s": stamp_s(i.last_ns),
                 "count": i.count,
                 "what": f"{i.node}: {i.text}",
             }
-            for i in report.incidents
+            for i in report.events
         ],
     }
 

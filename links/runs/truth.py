@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.link import LinkError, Record
-from links.evaluation.associate import interpolate
-from links.evaluation.tracks import follow
-from links.evaluation.tum import FULL_POSE, NO_DRONE
+from links.evaluation.association import follow, interpolate
+from links.evaluation.text_files import FULL_POSE, NO_DRONE
 from links.runs.results import (
     TRUTH_FILE,
     TRUTH_HITS_FILE,
@@ -213,7 +212,7 @@ def fix_errors(
 ) -> FixErrors:
     """Compare each fix with truth interpolated linearly to the fix's own stamp."""
     at_ns = np.array([fix.stamp_ns for fix in fixes], dtype=np.int64)
-    known, true_m, _ = interpolate(at_ns, stamps_ns, xyz_vehicle_m, None, MAX_GAP_NS)
+    known, true_m = interpolate(at_ns, stamps_ns, xyz_vehicle_m, MAX_GAP_NS)
     judged = [fix for fix, is_known in zip(fixes, known, strict=True) if is_known]
     error_m = np.array([fix.xyz_vehicle_m for fix in judged]).reshape(-1, 3) - true_m[known]
     nees = [float(e @ np.linalg.solve(fix.covariance_m2, e)) for e, fix in zip(error_m, judged, strict=True)]

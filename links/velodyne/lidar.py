@@ -125,7 +125,7 @@ class Lidar(Source[LidarSettings]):
             yield record
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """See Link: with `clock: utc`, the sensor's clock is not locked to UTC any more, or does not tell."""
         if not self._locked_once:
             return None

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from flow.incidents import IncidentTold
+from flow.events import EventMessage
 from flow.message import Message
 from links.viewer import colours, draw_cameras, draw_drone, draw_pose, draw_rotation, draw_sensors
 from links.viewer.marks import Marks, plot, say, state
@@ -65,9 +65,9 @@ def draw(message: Any, name: str, scene: Scene) -> Marks:
 
 
 @draw.register
-def incident(told: IncidentTold, name: str, scene: Scene) -> Marks:
+def event(told: EventMessage, name: str, scene: Scene) -> Marks:
     """What went wrong, or came right again, as it is told on the terminal."""
-    yield say(f"{name}/{told.node}", told.text, "INFO" if told.mended else "WARN")
+    yield say(f"{name}/{told.node}", told.text, "INFO" if told.resolved else "WARN")
 
 
 draw.register(LidarFirings)(draw_sensors.lidar_firings)

@@ -84,7 +84,7 @@ class Viewer(Tap[ViewerSettings]):
         return {"not drawn": sum(self.dropped.values()), "errors": sum(self._errors.values())}
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """What went wrong last, in words: the run goes on without it."""
         return f"not all is drawn: {next(reversed(self._errors))}" if self._errors else None
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from flow.config.hosts import Hop, Hosts, graph_of_host
+from flow.config.hosts_file import load_hosts
+from flow.config.node_spec import NodeSpec
 from flow.graph import Graph
-from flow.hosts import Hop, Hosts, part_of
-from flow.hosts_file import load_hosts
 from flow.link import LinkError
-from flow.node_spec import NodeSpec
 from links.zenoh.receiver import Receiver, receiver_class
 from links.zenoh.sender import Sender, sender_class
 from links.zenoh.session import Session, session_of
@@ -41,7 +41,7 @@ def host_graph(graph: Graph, hosts_file: Path, host: str, *, to_run: bool = Fals
     `to_run`: its own key and the certificates must be there, too, else LinkError.
     """
     hosts = load_hosts(hosts_file, graph)
-    part = part_of(hosts, host, ZenohEnds())
+    part = graph_of_host(hosts, host, ZenohEnds())
     if to_run:
         own = hosts.hosts[host]
         missing = [str(path) for path in (own.certificate, own.key, own.authority) if not path.is_file()]

@@ -72,7 +72,7 @@ class Connection:
         self._closing.set()
         self._thread.join(CLOSE_S)
 
-    def trouble_with(self, other: str) -> str | None:
+    def status_with(self, other: str) -> str | None:
         """What is wrong on the line to another host, in words."""
         settings = self.settings
         if self._opened is None and self._refused is not None:

@@ -16,9 +16,9 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from flow.codec import encode
-from flow.codec_fields import CodecError
 from flow.message import Message, array_fields
+from flow.remote.codec import encode
+from flow.remote.codec_fields import CodecError
 from links.host_time import now_ns
 from links.zenoh.connection import Connection
 from links.zenoh.wire import RUN, Envelope
@@ -49,7 +49,7 @@ class Lane:
         self.counts = Counts()
         self.heard = False
         """Whether somebody listens at the other end."""
-        self.trouble: str | None = None
+        self.status: str | None = None
         self._depth, self._deadline_ns = depth, deadline_ns
         self._small = not any(isinstance(dim, str) for _, _, shape in array_fields(message) for dim in shape.dims)
         self._waiting: deque[tuple[int, Message]] = deque()  # (since when, message)
@@ -104,7 +104,7 @@ class Lane:
             data = encode(message)
         except CodecError as error:
             self.counts.failed += 1
-            self.trouble = str(error)
+            self.status = str(error)
             return
         self._number += 1  # counted before it is sent: one that is lost with the line leaves a gap
         publisher.put(data, attachment=Envelope(RUN, self._number - 1, now_ns(), message.stamp_ns).pack())

@@ -1,4 +1,4 @@
-"""The receiving end: a source that stands for a node that runs on another host. `flow.hosts` puts it into a graph.
+"""The receiving end of a hop: a source that replaces a node of another host (`flow.config.hosts`).
 
 Source: ours.
 """
@@ -15,12 +15,12 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar, Union
 
 from flow import link
-from flow.codec import decode
-from flow.codec_fields import CodecError
-from flow.hosts import Hop
+from flow.config.hosts import Hop
 from flow.link import LinkError, Record, SourceSettings
 from flow.message import Message
-from flow.timeline import in_our_time
+from flow.remote.codec import decode
+from flow.remote.codec_fields import CodecError
+from flow.remote.timeline import in_local_time
 from links.host_time import now_ns
 from links.zenoh.connection import Connection, Opened, connected
 from links.zenoh.peer_clock import PeerClock
@@ -65,7 +65,7 @@ class Receiver(link.Source[ReceiverSettings]):
         try:
             offset_ns, uncertainty_ns = RECORD_HEAD.unpack_from(record.data)
             message = decode(record.data, self.expected, RECORD_HEAD.size)
-            return in_our_time(message, offset_ns, uncertainty_ns)
+            return in_local_time(message, offset_ns, uncertainty_ns)
         except (CodecError, OverflowError, struct.error) as error:
             raise LinkError(f"{self.settings.topic}: what {self.settings.sender} sent is refused: {error}") from None
 
@@ -112,7 +112,7 @@ class Receiver(link.Source[ReceiverSettings]):
         """Take messages until the session ends: then `recv` raises ZError."""
         import zenoh
 
-        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(min(hop.waiting.depth, RING))
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(min(hop.queue.depth, RING))
         subscriber = opened.session.declare_subscriber(key_of(hop), ring)
         threading.Thread(target=_end, args=(subscriber, closing, opened.over), daemon=True).start()
         handler = subscriber.handler  # the subscriber itself cannot be ended while it waits in `recv`
@@ -161,9 +161,9 @@ class Receiver(link.Source[ReceiverSettings]):
         return counts
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """What is wrong on the way from the other host."""
-        return None if self._connection is None else self._connection.trouble_with(self.settings.sender)
+        return None if self._connection is None else self._connection.status_with(self.settings.sender)
 
 
 def _until(closing: threading.Event, records: queue.Queue[Record]) -> Iterator[Record]:

@@ -1,4 +1,4 @@
-"""The sending end: a link that takes messages and sends them to one other host. `flow.hosts` puts it into a graph.
+"""The sending end of a hop: a link that sends messages to one other host (`flow.config.hosts`).
 
 Source: ours.
 """
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Any, ClassVar
 
 from flow import link
-from flow.hosts import Hop, port_of
+from flow.config.hosts import Hop, port_of
 from flow.link import Record, SourceSettings
 from flow.message import Message
 from links.zenoh.connection import Connection, connected
@@ -42,8 +42,8 @@ class Sender(link.Source[SenderSettings]):
         self._connection: Connection | None = None
         self._unopened: int = 0
         for hop in self.hops:
-            deadline_ns = round(hop.waiting.deadline_ms * 1e6)
-            self._lanes[port_of(hop)] = Lane(key_of(hop), hop.message, hop.waiting.depth, deadline_ns)
+            deadline_ns = round(hop.queue.deadline_ms * 1e6)
+            self._lanes[port_of(hop)] = Lane(key_of(hop), hop.message, hop.queue.depth, deadline_ns)
 
     def send(self, port: str, message: Message) -> None:
         """Let a message wait on its lane; before the link is open it is dropped."""
@@ -91,18 +91,18 @@ class Sender(link.Source[SenderSettings]):
         return totals
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """What is wrong on the way to the other host."""
         settings = self.settings
         if self._connection is None:
             return None
-        wrong = self._connection.trouble_with(settings.to)
+        wrong = self._connection.status_with(settings.to)
         if wrong is not None or self._connection.clocks[settings.to].answered_ns is None:
             return wrong
         unheard = [lane.key for lane in self._lanes.values() if not lane.heard]
         if unheard:
             return f"{settings.to} does not listen to {', '.join(unheard)}: is it running, with the same hosts file?"
-        return next((lane.trouble for lane in self._lanes.values() if lane.trouble), None)
+        return next((lane.status for lane in self._lanes.values() if lane.status), None)
 
 
 def _nothing_until(closing: threading.Event) -> Iterator[Record]:

@@ -22,7 +22,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from flow.hosts import Hop, Hosts
+from flow.config.hosts import Hop, Hosts
 
 ROOT = "grd"
 SEND_BUFFER_BYTES = 65_536
@@ -30,7 +30,7 @@ LEASE_MS, KEEP_ALIVES = 2000, 100
 WAIT_BEFORE_CLOSE_US = 3_000_000
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 OPENING = {"open_timeout": 2000, "accept_timeout": 2000}  # ms; a greeting that the line swallowed is begun anew
-MAX_MESSAGE_BYTES = 20 * 2**20  # more than flow.codec.MAX_BYTES
+MAX_MESSAGE_BYTES = 20 * 2**20  # more than flow.remote.codec.MAX_BYTES
 
 
 class Session(BaseModel):

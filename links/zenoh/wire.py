@@ -1,6 +1,6 @@
 """What goes with each message over a host's line, and what a receiver's record holds.
 
-A message is its `flow.codec` bytes; beside it (Zenoh's attachment) stands an envelope. All little-endian.
+A message is its `flow.remote.codec` bytes; beside it (Zenoh's attachment) stands an envelope. All little-endian.
 
 | envelope | |
 | --- | --- |

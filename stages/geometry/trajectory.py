@@ -1,6 +1,6 @@
 """The vehicle's trail: where it was at each moment, so that what stands still in the world stands still in memory.
 
-Frame local: the vehicle's own odometry frame (T_map_vehicle is the odometry pose after its jumps are removed). Without VehicleMotion it is the
+Frame local: the vehicle's own odometry frame (T_map_vehicle) without its jumps. Without VehicleMotion it is the
 vehicle's frame itself: right for a parked vehicle; then what stands still seems to move with a driving one.
 
 The odometry's start frame may jump, as when it is started afresh (vehicle_onward.py says how that is told from a false

@@ -1,7 +1,7 @@
-"""The engine's own cost: a graph of three stages replayed, beside the same stages called by hand on the same records.
+"""The cost of the engine: a graph of three nodes replayed, and the same nodes called directly on the same records.
 
 Run: pytest tests/benchmarks/bench_flow.py --benchmark-columns=min,median,max
-Cost per event = (median of the replay - median by hand) / EVENTS; `test_cost_per_event` measures both in turn and says it.
+Cost per step = (time of the replay - time of direct calls) / STEPS; `test_cost_per_step` prints its median.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from flow.taps import Digest
 from tests.flow.toys import GRAPH, Add, Double, Numbers
 
 RECORDS = [Record("/numbers", 1000 + i, i, b"1.5", i) for i in range(2_000)]
-EVENTS = 4 * len(RECORDS)  # decode, double, add.left, add.right
+STEPS = 4 * len(RECORDS)  # decode, double, add.left, add.right
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def graph(tmp_path):
     return load_graph(tmp_path / "x.yaml")
 
 
-def by_hand():
+def call_directly():
     numbers, double, add = Numbers(), Double(), Add(name="adder")
     add._seen = Total()
     for record in RECORDS:
@@ -39,7 +39,7 @@ def by_hand():
 
 
 class Total(list):
-    """Keeps the adder's memory short: its running sum would otherwise outgrow the engine's cost."""
+    """Bounds the adder's list of numbers: summing it would otherwise cost more than the engine."""
 
     def append(self, value):
         if len(self) >= 8:
@@ -47,7 +47,7 @@ class Total(list):
         super().append(value)
 
 
-def by_engine(graph, taps=()):
+def run_engine(graph, taps=()):
     runner = Replay(graph, taps)
     runner.nodes["add"]._seen = Total()
     for record in RECORDS:
@@ -55,32 +55,32 @@ def by_engine(graph, taps=()):
     return runner.finish()
 
 
-def test_stages_called_by_hand(benchmark):
-    benchmark.pedantic(by_hand, rounds=15, warmup_rounds=2)
+def test_stages_called_directly(benchmark):
+    benchmark.pedantic(call_directly, rounds=15, warmup_rounds=2)
 
 
 def test_stages_in_the_engine(benchmark, graph):
-    report = benchmark.pedantic(by_engine, (graph,), rounds=15, warmup_rounds=2)
-    assert report.events == EVENTS + 2  # and a finish for each stage
+    report = benchmark.pedantic(run_engine, (graph,), rounds=15, warmup_rounds=2)
+    assert report.steps == STEPS + 2  # and a finish for each stage
 
 
 def test_stages_in_the_engine_with_the_hash_of_every_message(benchmark, graph):
-    benchmark.pedantic(lambda: by_engine(graph, [Digest()]), rounds=15, warmup_rounds=2)
+    benchmark.pedantic(lambda: run_engine(graph, [Digest()]), rounds=15, warmup_rounds=2)
 
 
-def test_cost_per_event(benchmark, graph):
-    """Paired: the two ways alternate, so that a noisy neighbour hits both."""
+def test_cost_per_step(benchmark, graph):
+    """The two alternate, so that other load on the host affects both."""
 
     def once(work):
         begin = time.perf_counter()
         work()
         return time.perf_counter() - begin
 
-    pairs = [(once(by_hand), once(lambda: by_engine(graph))) for _ in range(15)]
-    costs_us = [(engine - hand) / EVENTS * 1e6 for hand, engine in pairs]
-    benchmark.extra_info["engine_us_per_event"] = round(statistics.median(costs_us), 2)
-    benchmark.extra_info["ratio"] = round(statistics.median(e / h for h, e in pairs), 2)
+    pairs = [(once(call_directly), once(lambda: run_engine(graph))) for _ in range(15)]
+    costs_us = [(engine - direct) / STEPS * 1e6 for direct, engine in pairs]
+    benchmark.extra_info["engine_us_per_step"] = round(statistics.median(costs_us), 2)
+    benchmark.extra_info["ratio"] = round(statistics.median(e / d for d, e in pairs), 2)
     sys.stdout.write(
-        f"\nengine cost per event: median {statistics.median(costs_us):.2f} us (range {min(costs_us):.2f}-{max(costs_us):.2f})"
+        f"\nengine cost per step: median {statistics.median(costs_us):.2f} us (range {min(costs_us):.2f}-{max(costs_us):.2f})"
     )
     benchmark.pedantic(replay, (graph, []), rounds=1)

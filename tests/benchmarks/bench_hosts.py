@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flow.codec import decode, encode
+from flow.remote.codec import decode, encode
 from stages.messages import DroneFix, Image, SweptPulses
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "zenoh"))

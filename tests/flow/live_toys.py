@@ -1,4 +1,4 @@
-"""Small sources, sinks, stages and taps for live runs: they do what a test tells them, when it tells them."""
+"""Small sources, sinks, stages and taps for live runs, controlled by the tests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flow.stage import Settings, Stage
 from stages.messages import Tick
 from tests.flow.toys import Number, Sum
 
-PATIENCE_S = 60.0  # for what surely comes, on however busy a machine
+PATIENCE_S = 60.0  # for what must happen, on a busy machine too
 
 
 class LineSettings(SourceSettings):
@@ -85,7 +85,7 @@ class OtherLine(Line):
 
 
 class Clinging(Line):
-    """A line that can be closed only when a test lets it go."""
+    """A line that can be closed only when a test releases it."""
 
     def __init__(self, settings: LineSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -101,7 +101,7 @@ class Clinging(Line):
 
 
 class Jam(Link):
-    """A sink that hangs at its first number until a test lets it go."""
+    """A sink that hangs at its first number until a test releases it."""
 
     def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -114,7 +114,7 @@ class Jam(Link):
 
 
 class Collector(Link):
-    """A sink that keeps what it is given, and tells what it sent."""
+    """A sink that keeps its messages and records what it sent."""
 
     def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -127,7 +127,7 @@ class Collector(Link):
         self._sent.append(Record("/sent", number.stamp_ns, number.stamp_ns, b"%d" % int(number.value)))
         self._got.put(number.value)
 
-    def orphaned(self, port: str) -> str:
+    def upstream_lost(self, port: str) -> str:
         self._got.put(port)
         return "it stands still"
 
@@ -140,7 +140,7 @@ class Collector(Link):
 
 
 class Brittle(Stage):
-    """Doubles; breaks at 666, and again at each 999; counts what this object took."""
+    """Doubles; raises at 666 and 999; counts its messages since it was made."""
 
     def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -149,7 +149,7 @@ class Brittle(Stage):
     def on_number(self, number: Number) -> Number:
         self._taken += 1
         if number.value in (666, 999):
-            raise ArithmeticError(f"cannot bear {number.value:g}")
+            raise ArithmeticError(f"cannot take {number.value:g}")
         return Number(stamp_ns=self._taken, value=2 * number.value)
 
     @property
@@ -158,7 +158,7 @@ class Brittle(Stage):
 
 
 class Gate(Stage):
-    """Passes numbers on, but stands still in each until a test opens it."""
+    """Passes numbers on, but blocks in each call until a test opens it."""
 
     def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -172,7 +172,7 @@ class Gate(Stage):
 
 
 class Order(Stage):
-    """Its output tells in which order it took its inputs."""
+    """Its output depends on the order of its inputs."""
 
     def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -207,7 +207,7 @@ class Memory(Tap):
 
 
 class Stuck(Tap):
-    """A viewer that hangs at the first message until a test lets it go."""
+    """A viewer that hangs at the first message until a test releases it."""
 
     def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -248,17 +248,17 @@ class Ticker(Stage[TickerSettings]):
     def on_tick(self, tick: Tick) -> Number:
         self._count += 1
         if self._count == self.settings.raise_at:
-            raise ArithmeticError(f"asked to at {self._count}")
+            raise ArithmeticError(f"requested at {self._count}")
         return Number(stamp_ns=tick.stamp_ns, value=self._count)
 
 
 class JudgeSettings(Settings):
-    """Settings of `Judge`."""
+    """Settings of `ArrivalTap`."""
 
     file: Path
 
 
-class Judge(Tap[JudgeSettings]):
+class ArrivalTap(Tap[JudgeSettings]):
     """Keeps the newest record's arrival in a mapped file, which outlives the process."""
 
     def __init__(self, settings: JudgeSettings | None = None, /, **values: Any) -> None:

@@ -143,6 +143,6 @@ def test_a_message_without_a_number_is_hashed_under_its_own_name():
     assert (Cloud.schema, Before.schema) == ("cloud", "901")
 
 
-def test_what_cannot_be_hashed_is_refused():
+def test_what_cannot_be_hashed_raises():
     with pytest.raises(TypeError, match=r"a message may not hold a dict"):
         digest({"a": 1})

@@ -1,4 +1,4 @@
-"""Small stages and links for the engine's tests; the engine knows nothing about drones, so neither do they."""
+"""Small stages and links for tests of the engine."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from flow.link import Link, LinkError, Record, Source, SourceSettings
+from flow.link import Link, LinkError, Record, Run, Source, SourceSettings, Tap
 from flow.message import Message, PerPointF32, message
 from flow.stage import Settings, Stage
 
@@ -57,7 +57,7 @@ class WordsSettings(SourceSettings):
 
 
 class Words(Source[WordsSettings]):
-    """Brings in words."""
+    """Brings in texts."""
 
     def decode(self, record: Record) -> Text:
         return Text(stamp_ns=record.stamp_ns, words=record.data.decode())
@@ -77,8 +77,21 @@ class DoubleSettings(Settings):
     unused_option: bool = False
 
 
+class Stamps(Tap):
+    """Writes the stamp of every message to a file in the run's folder."""
+
+    def open(self, run: Run) -> None:
+        self._file = (run.out_dir / "stamps.txt").open("w", encoding="utf-8")
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        self._file.write(f"{output} {message.stamp_ns} {arrival_ns}\n")
+
+    def close(self) -> None:
+        self._file.close()
+
+
 class Double(Stage[DoubleSettings]):
-    """Doubles, by a factor if asked."""
+    """Multiplies by `factor`."""
 
     def __init__(self, settings: DoubleSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -101,7 +114,7 @@ class AddSettings(Settings):
 
 
 class Add(Stage[AddSettings]):
-    """Adds two streams; gives a sum for each number and a word when it ends."""
+    """Adds two streams; gives a sum for each number and a text when it finishes."""
 
     optional_inputs = frozenset({"words"})
 
@@ -119,21 +132,21 @@ class Add(Stage[AddSettings]):
 
     def on_words(self, text: Text) -> None:
         if text.words == "fail":
-            raise ZeroDivisionError("asked to")
+            raise ZeroDivisionError("on request")
 
     def finish(self) -> Text:
         return Text(stamp_ns=0, words=f"{self.settings.name} ends with {sum(self._seen)}")
 
 
-class Liar(Stage):
-    """Promises a sum of float32 and gives float64."""
+class WrongArray(Stage):
+    """Declares a sum of float32 and gives float64."""
 
     def on_number(self, number: Number) -> Sum:
         return Sum(stamp_ns=number.stamp_ns, total=0.0, last=np.zeros(2))
 
 
-class Careless(Stage):
-    """Gives what it does not promise."""
+class Undeclared(Stage):
+    """Gives a message that it does not declare."""
 
     def on_number(self, number: Number) -> Sum | None:
         return Text(stamp_ns=0, words="surprise")  # type: ignore[return-value]

@@ -28,12 +28,12 @@ import yaml
 from dynamixel_sdk import Protocol2PacketHandler
 from pymavlink.dialects.v20 import ardupilotmega
 
-from flow.codec import MAX_BYTES, CodecError, decode, encode
+from flow.config.hosts_file import load_hosts
+from flow.config_error import ConfigError
 from flow.graph import load_graph
-from flow.hosts_file import load_hosts
 from flow.link import LinkError, Record
 from flow.message import Message
-from flow.problem import ConfigError
+from flow.remote.codec import MAX_BYTES, CodecError, decode, encode
 from links.camera import Camera
 from links.dynamixel.bus import BlockingPort, Bus, BusError
 from links.dynamixel.servo import Servo

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+from flow.config_error import ConfigError
 from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, LinkError
 from flow.ports import RunError
-from flow.problem import ConfigError
 from links.recording import RecordingReader
 from links.runs.run_folder import Asked, RunFolder, holds_run, replay_into
 from links.runs.truth import TruthLog

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flow.config_error import ConfigError
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from flow.metrics import Latency
-from flow.problem import ConfigError
 from links import host_time
 from links.mavlink.profiles import ARDUPILOT
 from links.mavlink.stream import ARMED

@@ -64,7 +64,7 @@ class LiveRig(Tap[LiveRigSettings]):
         return False
 
     @property
-    def trouble(self) -> str | None:
+    def status(self) -> str | None:
         """Error text when the rig has ended."""
         process = self._process
         if process is None or process.poll() is None:

@@ -13,8 +13,8 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from flow.problem import ConfigError, did_you_mean
-from flow.tree import load_tree, resolve
+from flow.config.tree import load_tree, resolve
+from flow.config_error import ConfigError, did_you_mean
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.rig.closed_loop import ClosedLoopSettings
 from links.simulated.rig.scripted_servo import Segment, VibrateSegment
@@ -182,7 +182,7 @@ def load_scenario(path: FilePath) -> Scenario:
     """Load a scenario file with its includes. ConfigError lists all problems with file and line."""
     tree = load_tree(path)
     values = resolve(tree, (), tree.values)
-    if not tree.problems:
+    if not tree.errors:
         try:
             return Scenario.model_validate(values)
         except ValidationError as errors:
@@ -190,7 +190,7 @@ def load_scenario(path: FilePath) -> Scenario:
                 where = tuple(str(part) for part in error["loc"])
                 if error["type"] == "extra_forbidden":
                     known = Scenario.model_fields if len(where) == 1 else ()
-                    tree.problem(where, f"unknown key '{where[-1]}'.{did_you_mean(where[-1], known)}")
+                    tree.error(where, f"unknown key '{where[-1]}'.{did_you_mean(where[-1], known)}")
                 else:
-                    tree.problem(where, f"{error['msg'].removeprefix('Value error, ')}.")
-    raise ConfigError(tree.problems)
+                    tree.error(where, f"{error['msg'].removeprefix('Value error, ')}.")
+    raise ConfigError(tree.errors)

@@ -1,4 +1,4 @@
-"""`grd calibrate` as a user meets it: a new rig that a replay takes, pictures, and refusals in words."""
+"""`grd calibrate` as a user meets it: a new rig that a replay takes, figures, and refusals in words."""
 
 from __future__ import annotations
 
@@ -67,12 +67,22 @@ def test_the_new_rig_can_be_laid_over_a_configuration(calibrated):
     assert checked_rig(read_rig(rig), "rig")[1] == mount
 
 
-def test_the_pictures_are_one_svg_with_four_charts(calibrated):
+def test_the_figures_are_one_svg_with_four_charts(calibrated):
     folder, _ = calibrated
     tree = ElementTree.parse(folder / "street.rig.svg")
-    charts = [e.get("aria-label") or "" for e in tree.iter() if e.get("role") == "img"]
+    charts = [e for e in tree.iter() if (e.get("id") or "").startswith("axes_")]
+    texts = [e.text or "" for e in tree.iter() if e.tag.endswith("}text")]
     assert len(charts) == 4
-    assert "thick before" in charts[0]
+    assert any("thick before" in text for text in texts)
+    assert {"one wall from above", "distance of returns from their patch"} <= set(texts)
+
+
+def test_without_matplotlib_the_rig_is_written_and_the_missing_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    text = grd("calibrate", STREET, "-o", tmp_path / "rig.yaml")
+    assert "figures none: matplotlib is not installed: pip install -e '.[evaluate]'" in text
+    assert (tmp_path / "rig.yaml").exists()
+    assert not (tmp_path / "rig.svg").exists()
 
 
 def test_an_old_rig_is_never_written_over_unasked(calibrated):

@@ -118,14 +118,14 @@ def test_a_host_that_decodes_more_slowly_than_pictures_come_says_so(monkeypatch)
     camera = Camera(topic="/camera/drone", source="rtsp://camera/live", fps=30.0)
     settings = CaptureSettings("rtsp://camera/live", None, 30.0, 1.0, 90)
     capture = Capture(settings, lambda: stream.now_ns, camera._counts)
-    assert camera.trouble is None
+    assert camera.status is None
     frames = [capture.read() for _ in range(20)]
     assert camera.counters["too slow"] > 5
-    assert "decodes its stream more slowly than it comes" in camera.trouble
+    assert "decodes its stream more slowly than it comes" in camera.status
     late_ns = [frame.came_ns - stream.came_ns(1) for frame in frames]
     assert late_ns == sorted(late_ns)
     monkeypatch.setattr("links.camera.camera.SLOW_TOLD_S", -1.0)
-    assert camera.trouble is None
+    assert camera.status is None
 
 
 def test_a_stream_whose_times_stand_still_is_stamped_on_arrival(monkeypatch):

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flow import apart
-from flow.apart import can_run_apart
+from flow import subprocess_replay
+from flow.subprocess_replay import can_use_subprocesses
 from links.cli.files import read_rig
 from tests.links import command
 
@@ -88,21 +88,23 @@ def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_p
     assert "holds a run already" in again
 
 
-@pytest.mark.skipif(not can_run_apart(), reason="one core, or no fork: there is one process anyway")
+@pytest.mark.skipif(not can_use_subprocesses(), reason="one core, or no fork: there is one process anyway")
 def test_a_replay_in_several_processes_leaves_the_files_of_one(grd, tmp_path, monkeypatch):
     started = []
-    start = apart._PartProcess.start
-    monkeypatch.setattr(apart._PartProcess, "start", lambda part: (started.append(part.topics), start(part))[1])
-    (tmp_path / "apart.yaml").write_text("stages: {sweep: {process: lidar}}\nlinks: {viewer: null}\n")
-    both = ("replay", STREET, "--config", ROOT / "configs" / "estimate.yaml", "--overlay", "apart.yaml")
+    start = subprocess_replay._Partition.start
+    monkeypatch.setattr(
+        subprocess_replay._Partition, "start", lambda partition: (started.append(partition.topics), start(partition))[1]
+    )
+    (tmp_path / "processes.yaml").write_text("stages: {sweep: {process: lidar}}\nlinks: {viewer: null}\n")
+    both = ("replay", STREET, "--config", ROOT / "configs" / "estimate.yaml", "--overlay", "processes.yaml")
     grd(*both, "--out", "together", "--together")
     assert not started
-    grd(*both, "--out", "apart")
+    grd(*both, "--out", "processes")
     assert [sorted(topics) for topics in started] == [["/lidar/packets", "/servo/state"]]
     names = {path.name for path in (tmp_path / "together").iterdir()}
-    assert names == {path.name for path in (tmp_path / "apart").iterdir()} > {"run.log", "fix_vehicle_drone.tum"}
+    assert names == {path.name for path in (tmp_path / "processes").iterdir()} > {"run.log", "fix_vehicle_drone.tum"}
     for name in names - {"summary.json"}:  # it tells how long the run took
-        assert (tmp_path / "together" / name).read_bytes() == (tmp_path / "apart" / name).read_bytes(), name
+        assert (tmp_path / "together" / name).read_bytes() == (tmp_path / "processes" / name).read_bytes(), name
 
 
 def test_a_changed_setting_changes_the_hash(grd, tmp_path):

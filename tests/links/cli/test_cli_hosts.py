@@ -28,9 +28,9 @@ HOSTS = f"""
 hosts:
   vehicle: {{listen: "tls/192.168.7.1:7447", {FILES}}}
   base: {{{FILES}}}
-place:
+placement:
 PLACES
-see: {{viewer: [track.drone_fix, detect.detections]}}
+taps: {{viewer: [track.drone_fix, detect.detections]}}
 """
 
 
@@ -63,7 +63,7 @@ def test_check_says_at_its_line_what_is_wrong_with_the_hosts_file(hosts):
     hosts.write_text(hosts.read_text().replace("  viewer: base", "  viewer: bas"))
     done = grd("check", PAPER, "--hosts", hosts)
     assert done.exit_code == 1
-    assert "place.viewer: no host 'bas'; there is 'vehicle' or 'base'. Did you mean 'base'?" in done.output
+    assert "placement.viewer: no host 'bas'; there is 'vehicle' or 'base'. Did you mean 'base'?" in done.output
 
 
 def test_graph_draws_a_box_for_each_host_or_the_part_of_one(hosts):
@@ -104,7 +104,7 @@ links:
   clock: {use: links.clock.Clock, config: {rate_hz: 50}}
   recorder: {use: links.recording.Recorder}
 """
-PLACE = "place: {clock: vehicle, ticker: vehicle, order: base, recorder: base}\n"
+PLACE = "placement: {clock: vehicle, ticker: vehicle, order: base, recorder: base}\n"
 
 
 def test_two_commands_run_one_graph_on_two_hosts(tmp_path):

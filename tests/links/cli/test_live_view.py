@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flow.edge import Edge, Waiting
-from flow.live_report import EdgeCount, LinkReport, LiveReport, edge_report
+from flow.config.edge import Edge, QueueSettings
+from flow.live.report import EdgeCount, LinkReport, LiveReport, edge_report
 from flow.taps import Digest
 from links.cli.live_view import LiveView
 from links.runs.live_run import Look
@@ -17,7 +17,7 @@ from stages.messages import DroneFix, Image, PoseState, RelativePose, SweptPulse
 
 
 def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
-    count = EdgeCount(Edge("sweep", "swept_pulses", "track", "pulses", SweptPulses, Waiting("drop_oldest", 64)))
+    count = EdgeCount(Edge("sweep", "swept_pulses", "track", "pulses", SweptPulses, QueueSettings("drop_oldest", 64)))
     for lag_ms in lags_ms:
         count.done(round(lag_ms * 1e6))
     return LiveReport(

@@ -124,16 +124,16 @@ def test_it_is_read_at_least_200_times_a_second(emulator):
     assert max(rates_hz) >= 200.0, rates_hz
 
 
-def test_a_healthy_servo_is_never_in_trouble_from_its_start_to_its_end(emulator):
+def test_a_healthy_servo_is_never_in_status_from_its_start_to_its_end(emulator):
     servo = live(emulator, watchdog_s=2.5)  # a busy machine may be late
-    told = [servo.trouble]
+    told = [servo.status]
     with servo.listen() as records:
-        told.append(servo.trouble)
+        told.append(servo.status)
         next(records)
         servo.on_goal(goal(120, 40))
-        until(records, lambda state: told.append(servo.trouble) or at(120)(state))
-        until(records, lambda _: told.append(servo.trouble) or servo.counters["reads"] > 200)
-    assert {*told, servo.trouble} == {None}
+        until(records, lambda state: told.append(servo.status) or at(120)(state))
+        until(records, lambda _: told.append(servo.status) or servo.counters["reads"] > 200)
+    assert {*told, servo.status} == {None}
 
 
 def test_the_newest_goal_is_obeyed_at_its_speed(emulator):
@@ -149,12 +149,12 @@ def test_the_newest_goal_is_obeyed_at_its_speed(emulator):
 
 def test_a_servo_that_nobody_aims_any_more_stops_in_mid_sweep_and_obeys_the_next_goal(emulator):
     servo = live(emulator)
-    assert servo.orphaned("goal") is None, "it is not live yet"
+    assert servo.upstream_lost("goal") is None, "it is not live yet"
     with servo.listen() as records:
         next(records)
         servo.on_goal(goal(170, 10))
         until(records, lambda state: math.degrees(state["position_rad"]) > 100)
-        assert servo.orphaned("goal") == "the servo stays where it is"
+        assert servo.upstream_lost("goal") == "the servo stays where it is"
         stopped = until(records, lambda state: math.degrees(state["goal_rad"]) < 165)[-1]
         until(records, lambda state: abs(state["velocity_radps"]) < 0.01)
         assert math.degrees(emulator.position_rad(np.array([time.monotonic_ns()]))[0]) < 160
@@ -258,15 +258,15 @@ def test_after_an_overload_it_is_rebooted_and_set_up_and_its_angle_is_told_meanw
         next(records)
         emulator.stall(overload_s=0.05)
         servo.on_goal(goal(120))
-        assert servo.trouble is None
+        assert servo.status is None
         until(records, lambda s: s["error"] == mx28.OVERLOAD)
         until(
-            records, lambda _: "has shut down (overload) and stands still: it is set up again" in (servo.trouble or "")
+            records, lambda _: "has shut down (overload) and stands still: it is set up again" in (servo.status or "")
         )
         emulator.free()
         states = until(records, lambda s: s["error"] == 0)
         until(records, lambda _: servo.counters["connected"] == 1)
-        assert servo.trouble is None
+        assert servo.status is None
         assert at(90)(states[-1])  # the goal from before does not come back
         servo.on_goal(goal(120))
         until(records, at(120))
@@ -281,7 +281,7 @@ def test_without_leave_to_reboot_it_stays_down_and_says_so(emulator):
         emulator.overload()
         until(records, lambda s: s["error"] == mx28.OVERLOAD)
         until(records, lambda _: servo.counters["connected"] == 0)
-        assert "to be rebooted (`reboot: false`)" in (servo.trouble or "")
+        assert "to be rebooted (`reboot: false`)" in (servo.status or "")
         servo.on_goal(goal(120))
         states = until(records, lambda _: servo.counters["goals_lost"] == 1)
     assert at(90)(states[-1])

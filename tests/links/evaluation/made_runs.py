@@ -1,4 +1,4 @@
-"""Run folders with metrics known by hand: the files `grd replay` writes, made of arrays."""
+"""Run folders with metrics known by hand: the files that `grd replay` writes, made of arrays; and their evaluation."""
 
 from __future__ import annotations
 
@@ -7,9 +7,35 @@ from pathlib import Path
 
 import numpy as np
 
+from links.evaluation.association import EvaluationLimits
+from links.evaluation.evaluation import Evaluation
+from links.evaluation.metrics import evaluate
+from links.evaluation.run_data import per_drone, read_run
+
 START_S = 1_748_773_230
 SECOND = 1_000_000_000
 START_NS = START_S * SECOND
+
+
+def evaluated(
+    folder: Path, truth: Path | None = None, no_drone: bool = False, which: int = 0, limits=None
+) -> Evaluation:
+    """The evaluation of one output of a run, the primary one by default."""
+    run = read_run(folder, truth, no_drone)
+    return evaluate(run, run.outputs[which], limits)
+
+
+def all_evaluated(*folders: Path) -> list[Evaluation]:
+    """The evaluations of all outputs of all drones of several runs."""
+    runs = [run for folder in folders for run in per_drone(read_run(folder), EvaluationLimits())]
+    return [evaluate(run, output) for run in runs for output in run.outputs]
+
+
+def value(e: Evaluation, key: str) -> float:
+    """The value of a metric that has one."""
+    found = e.values[key]
+    assert found.value is not None, (key, found.note)
+    return found.value
 
 
 def stamp(t_s: float) -> str:
@@ -98,7 +124,7 @@ def make_run(
 def add_pose(
     folder: Path, t_s, xyz, quaternions, covariance: np.ndarray | None, good: np.ndarray | None = None
 ) -> None:
-    """The fused pose beside the fixes, with its 6x6 covariance."""
+    """Add the fused pose with its 6x6 covariance to a run."""
     (folder / "pose_vehicle_drone.tum").write_text(lines(t_s, xyz, quaternions))
     if covariance is None:
         return
@@ -118,7 +144,7 @@ def yaw_quaternion(yaw_rad) -> np.ndarray:
 def add_rotations(
     folder: Path, t_s, quaternions, *, variance_rad2=(1e-4, 1e-4, 1e-4), accepted=True, resolved=False, switches=0
 ) -> Path:
-    """The rotation told at `t_s`, with a covariance along the drone's axes."""
+    """Add the rotation by both cameras at `t_s`, with a covariance along the drone's axes."""
     n = len(t_s)
     accepted, resolved, switches = (np.broadcast_to(flags, n) for flags in (accepted, resolved, switches))
     rows = ["stamp_s,accepted,qx,qy,qz,qw,cxx_rad2,cxy_rad2,cxz_rad2,cyy_rad2,cyz_rad2,czz_rad2,state,switches,reason"]

@@ -1,4 +1,4 @@
-"""What was said to be a drone with a probability, and how often it was."""
+"""Probabilities of candidates, and how often a candidate was a drone."""
 
 from __future__ import annotations
 
@@ -6,88 +6,94 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError, Run
-from links.evaluation import evaluate, read_run
-from links.evaluation.probabilities import reliabilities
-from links.evaluation.summaries import reliability_summary
+from links.evaluation.groups import reliability, reliability_table
+from links.evaluation.run_data import read_run
 from links.runs.results import CANDIDATES_FILE, Results
 from stages.messages import Candidates
 from tests.links.command import grd
-from tests.links.evaluation.made_runs import lines, make_run, stamp, truth_at
+from tests.links.evaluation.made_runs import all_evaluated, lines, make_run, stamp, truth_at
 
 HEAD = "stamp_s,candidate,detector_life,looks,probability,x_m,y_m,z_m\n"
 T_S = np.arange(0.0, 10.0, 0.1)
 
 
-def run_that_said(folder, said, **made):
-    """`said`: (time, candidate, probability, how far beside the drone, or a place)."""
-    make_run(folder, T_S, truth_at(T_S), **made)
-    rows = ""
-    for k, (t_s, candidate, probability, aside_m) in enumerate(said):
-        x, y, z = truth_at(np.array([t_s]))[0] + np.array([0.0, aside_m, 0.0])
-        rows += f"{stamp(t_s)},{candidate},7,{k + 1},{probability},{x},{y},{z}\n"
-    (folder / CANDIDATES_FILE).write_text(HEAD + rows)
+def run_with_candidates(folder, rows, **settings):
+    """`rows`: (time, candidate, probability, distance from the drone)."""
+    make_run(folder, T_S, truth_at(T_S), **settings)
+    text = ""
+    for k, (t_s, candidate, probability, distance_m) in enumerate(rows):
+        x, y, z = truth_at(np.array([t_s]))[0] + np.array([0.0, distance_m, 0.0])
+        text += f"{stamp(t_s)},{candidate},7,{k + 1},{probability},{x},{y},{z}\n"
+    (folder / CANDIDATES_FILE).write_text(HEAD + text)
     return folder
 
 
-def judge(*folders):
-    runs = [read_run(folder) for folder in folders]
-    return [evaluate(run, run.outputs[0]) for run in runs]
-
-
 def rows_of(*folders):
-    return {(r.low, r.high): (r.things, r.stated, r.drones) for r in reliabilities(judge(*folders))}
+    rows = reliability(all_evaluated(*folders))
+    return {(r.low, r.high): (r.candidates, r.mean, r.drones) for r in rows.itertuples()}
 
 
-def test_each_thing_counts_once_in_a_row_and_is_a_drone_within_a_metre(tmp_path):
-    said = [(1.0, 1, 0.01, 0.2), (2.0, 1, 0.4, 0.9), (3.0, 1, 0.45, 5.0), (4.0, 1, 0.997, 0.1), (5.0, 2, 0.35, 1.2)]
-    rows = rows_of(run_that_said(tmp_path / "a", said))
+def test_each_candidate_counts_once_in_a_bin_and_is_a_drone_within_a_metre(tmp_path):
+    observations = [
+        (1.0, 1, 0.01, 0.2),
+        (2.0, 1, 0.4, 0.9),
+        (3.0, 1, 0.45, 5.0),
+        (4.0, 1, 0.997, 0.1),
+        (5.0, 2, 0.35, 1.2),
+    ]
+    rows = rows_of(run_with_candidates(tmp_path / "a", observations))
     assert rows[(0.0, 0.02)] == (1, 0.01, 1)
-    assert rows[(0.3, 0.5)] == (2, pytest.approx(0.375), 1)  # the second look at thing 1 in this row does not count
+    assert rows[(0.3, 0.5)] == (
+        2,
+        pytest.approx(0.375),
+        1,
+    )  # the second observation of candidate 1 in this bin does not count
     assert rows[(0.95, 1.0)] == (1, 0.997, 1)
     assert len(rows) == 3
 
 
-def test_what_is_certain_is_in_the_last_row(tmp_path):
-    assert rows_of(run_that_said(tmp_path / "a", [(1.0, 1, 1.0, 0.0)])) == {(0.95, 1.0): (1, 1.0, 1)}
+def test_a_probability_of_one_is_in_the_last_bin(tmp_path):
+    assert rows_of(run_with_candidates(tmp_path / "a", [(1.0, 1, 1.0, 0.0)])) == {(0.95, 1.0): (1, 1.0, 1)}
 
 
-def test_without_a_drone_nothing_is_one_and_where_truth_is_silent_nothing_counts(tmp_path):
-    empty = run_that_said(tmp_path / "empty", [(1.0, 1, 0.6, 0.0)], truth="no drone")
+def test_without_a_drone_no_candidate_is_one_and_without_truth_none_counts(tmp_path):
+    empty = run_with_candidates(tmp_path / "empty", [(1.0, 1, 0.6, 0.0)], truth="no drone")
     assert rows_of(empty) == {(0.5, 0.7): (1, 0.6, 0)}
-    after = run_that_said(tmp_path / "after", [(1.0, 1, 0.6, 0.0), (11.0, 2, 0.6, 0.0)])
+    after = run_with_candidates(tmp_path / "after", [(1.0, 1, 0.6, 0.0), (11.0, 2, 0.6, 0.0)])
     assert rows_of(after) == {(0.5, 0.7): (1, 0.6, 1)}
-    unknown = run_that_said(tmp_path / "unknown", [(1.0, 1, 0.6, 0.0)], truth="none")
+    unknown = run_with_candidates(tmp_path / "unknown", [(1.0, 1, 0.6, 0.0)], truth="none")
     assert rows_of(unknown) == {}
 
 
-def test_a_drone_is_one_whatever_is_not_known_of_another(tmp_path):
-    said = [(1.0, 1, 0.6, 0.0), (9.0, 2, 0.6, 0.0), (9.0, 3, 0.6, 5.0)]
-    folder = run_that_said(tmp_path / "two", said)
+def test_a_candidate_at_a_drone_counts_though_truth_does_not_cover_another_drone(tmp_path):
+    observations = [(1.0, 1, 0.6, 0.0), (9.0, 2, 0.6, 0.0), (9.0, 3, 0.6, 5.0)]
+    folder = run_with_candidates(tmp_path / "two", observations)
     other = lines(T_S[:50], truth_at(T_S[:50]) + np.array([0.0, 30.0, 0.0]))
     (folder / "truth_vehicle_drone_2.tum").write_text("# T_vehicle_drone, full pose, truth\n" + other)
     assert rows_of(folder) == {(0.5, 0.7): (2, 0.6, 2)}  # the third may have been the other one
 
 
-def test_numbers_of_two_runs_and_of_two_lives_of_a_detector_are_of_other_things(tmp_path):
-    one, two = (run_that_said(tmp_path / name, [(1.0, 1, 0.6, 0.0)]) for name in "ab")
+def test_equal_numbers_in_two_runs_or_after_a_restart_of_the_detector_are_different_candidates(tmp_path):
+    one, two = (run_with_candidates(tmp_path / name, [(1.0, 1, 0.6, 0.0)]) for name in "ab")
     assert rows_of(one, two)[(0.5, 0.7)][0] == 2
     text = (two / CANDIDATES_FILE).read_text()
     (two / CANDIDATES_FILE).write_text(text + text.removeprefix(HEAD).replace(",1,7,", ",1,8,"))
     assert rows_of(two)[(0.5, 0.7)][0] == 2
 
 
-def test_a_damaged_table_is_told(tmp_path):
-    folder = run_that_said(tmp_path / "a", [(1.0, 1, 0.6, 0.0)])
+def test_a_damaged_table_is_rejected(tmp_path):
+    folder = run_with_candidates(tmp_path / "a", [(1.0, 1, 0.6, 0.0)])
     (folder / CANDIDATES_FILE).write_text(HEAD + "1.0,1,7\n")
     with pytest.raises(LinkError, match=r"candidates.csv:2: 3 cells, the header has 8"):
         read_run(folder)
 
 
-def test_the_table_has_what_was_said_and_what_it_was(tmp_path):
-    summary = reliability_summary(reliabilities(judge(run_that_said(tmp_path / "a", [(1.0, 1, 0.6, 0.0)]))))
-    assert summary.rows == [[".yaml", "0.5 to 0.7", "1", "60.0", "100.0", "20.7 to 100.0"]]
-    folders = [str(run_that_said(tmp_path / name, [(1.0, 1, 0.6, 0.0)])) for name in "bc"]
-    assert "what was said to be a drone" in grd("evaluate", *folders, "--by", "config")
+def test_the_table_has_probabilities_and_shares_of_drones(tmp_path):
+    table = reliability_table(all_evaluated(run_with_candidates(tmp_path / "a", [(1.0, 1, 0.6, 0.0)])))
+    assert table is not None
+    assert table.frame.to_numpy().tolist() == [[".yaml", "0.5 to 0.7", "1", "60.0", "100.0", "20.7 to 100.0"]]
+    folders = [str(run_with_candidates(tmp_path / name, [(1.0, 1, 0.6, 0.0)])) for name in "bc"]
+    assert "reliability of the detector's probabilities" in grd("evaluate", *folders, "--by", "config")
 
 
 def candidates(looks, probability, life=7):
@@ -105,7 +111,7 @@ def candidates(looks, probability, life=7):
     )
 
 
-def test_a_run_writes_a_line_for_each_new_look(tmp_path):
+def test_a_run_writes_a_line_for_each_new_observation(tmp_path):
     results = Results()
     results.open(Run(tmp_path, "made", "", ""))
     assert results.wants(Candidates)

@@ -105,7 +105,7 @@ class RatedLine:
 class RatedBridge:
     """A bridge behind a faster line: takes every datagram."""
 
-    datagrams, trouble = True, None
+    datagrams, status = True, None
     reconnects = foreign = stalls = left_late = 0
 
     def __init__(self, line: RatedLine) -> None:

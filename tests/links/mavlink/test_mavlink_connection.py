@@ -184,8 +184,8 @@ def test_while_tcp_is_down_nothing_is_sent_and_it_says_so():
     for _ in range(20):
         link.receive(0.02)
     assert not link.send(FRAME)
-    assert link.trouble is not None
-    assert "Trying again" in link.trouble
+    assert link.status is not None
+    assert "Trying again" in link.status
     link.close()
 
 
@@ -315,14 +315,14 @@ def test_a_line_that_stands_still_is_dropped_and_says_so_and_one_that_moves_is_n
         now_s += 0.3
         link.receive(0.0)
         line.waiting = 0
-    assert (link.stalls, link.trouble) == (0, None)
+    assert (link.stalls, link.status) == (0, None)
     line.room = room
     assert link.send(b"BBBB")
     line.waiting = 4 if room == 4 else 0
     now_s += STALL_S + 0.01
     link.receive(0.0)
     assert link.stalls == 1
-    assert "did not take what was sent within 0.5 s" in (link.trouble or "")
+    assert "did not take what was sent within 0.5 s" in (link.status or "")
     line.room = 100
     assert not link.send(b"CCCC")
 
@@ -348,7 +348,7 @@ class MeteredLine(SlowLine):
 def poses_for_20_s(
     kbit_per_s: float, backlog_bytes: int, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[int, StreamConnection, list[str | None]]:
-    """How many went out of 50 a second, and each new word of trouble, looked at once a second as `flow.live` does."""
+    """How many went out of 50 a second, and each new word of status, looked at once a second as `flow.live` does."""
     now_s = 0.0
     monkeypatch.setattr("links.mavlink.lines.time.monotonic", lambda: now_s)
     line, sent, said = MeteredLine(kbit_per_s, backlog_bytes), 0, list[str | None]()
@@ -358,8 +358,8 @@ def poses_for_20_s(
         line.rest(0.02)
         now_s += 0.02
         link.receive(0.0)
-        if tick % 50 == 0 and (said[-1] if said else None) != link.trouble:
-            said.append(link.trouble)
+        if tick % 50 == 0 and (said[-1] if said else None) != link.status:
+            said.append(link.status)
     return sent, link, said
 
 
@@ -390,7 +390,7 @@ def test_a_stall_shorter_than_between_two_looks_is_said_and_then_that_all_works(
         now_s += 0.05
         link.receive(0.0)
         if tick % 20 == 0:
-            seen.append(link.trouble is not None)
+            seen.append(link.status is not None)
     assert (link.stalls, link.reconnects) == (1, 1)
     assert seen[:3] == [False, True, True]
     assert seen[-1] is False
@@ -406,7 +406,7 @@ def test_serial_on_a_pseudo_terminal_carries_all_bytes_both_ways_and_notices_whe
     assert os.read(ours, 1000) == everything
     os.close(theirs)
     os.close(ours)
-    while link.trouble is None:
+    while link.status is None:
         link.receive(0.01)
     assert not link.send(b"pose")
     link.close()

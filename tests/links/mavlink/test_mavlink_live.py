@@ -250,7 +250,7 @@ def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
         heard.fly(lambda: heard.link.counters["pose held back: line too slow"] >= 25)
         assert heard.link.counters["sent: ODOMETRY"] == sent
         assert heard.link.counters["round trip [ms]"] >= 600
-        assert "answers to TIMESYNC take longer than 0.3 s" in (heard.link.trouble or "")
+        assert "answers to TIMESYNC take longer than 0.3 s" in (heard.link.status or "")
         told = "grd: STOPPED: line too slow"
         heard.rest(lambda: any((m.severity, m.text) == (2, told) for m in drone.messages("STATUSTEXT")))
         assert heard.link.counters["sent: ODOMETRY"] == sent
@@ -258,7 +258,7 @@ def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
         bridge.delay_s = 0.0
         heard.fly(lambda: drone.messages("ODOMETRY")[-1].time_usec > prompt_us)
         assert next(m for m in drone.messages("ODOMETRY") if m.time_usec > prompt_us).reset_counter != counter
-        heard.rest(lambda: heard.link.trouble is None)
+        heard.rest(lambda: heard.link.status is None)
 
 
 def test_an_answer_that_we_did_not_ask_for_is_not_believed_though_it_names_nobody():
@@ -414,7 +414,7 @@ def test_a_disk_that_takes_no_signing_time_ends_no_flight(tmp_path: Path, monkey
         monkeypatch.setattr("links.mavlink.signing.os.fsync", full)
         signer._reserved = 0
         heard.rest(lambda: heard.link.counters.get("signing time not written", 0) == 1)
-        assert "signing time cannot be written" in (heard.link.trouble or "")
+        assert "signing time cannot be written" in (heard.link.status or "")
         udp.sendto(beat, ("127.0.0.1", heard.link.port))
         heard.rest(lambda: len(heard.records) == 1)
         heard.link.on_pose(good_pose(host_time.now_ns()))
@@ -458,15 +458,15 @@ def test_our_own_frames_that_come_back_are_not_heard():
     assert heard.records == []
 
 
-def test_a_silent_autopilot_is_trouble_in_words(monkeypatch: pytest.MonkeyPatch):
+def test_a_silent_autopilot_is_status_in_words(monkeypatch: pytest.MonkeyPatch):
     with listening() as heard:
-        assert heard.link.trouble is None
+        assert heard.link.status is None
         real = host_time.now_ns()
         session = heard.link._session  # the clock of the session, set ahead
         assert session is not None
         monkeypatch.setattr(session, "_now_ns", lambda: real + 10**10)
-        assert "no word from the autopilot (system 1, component 1)" in (heard.link.trouble or "")
-    assert heard.link.trouble is None
+        assert "no word from the autopilot (system 1, component 1)" in (heard.link.status or "")
+    assert heard.link.status is None
 
 
 @given(datagrams=st.lists(st.binary(min_size=1, max_size=400), min_size=1, max_size=20))

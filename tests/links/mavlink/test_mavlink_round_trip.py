@@ -57,7 +57,7 @@ class Asking:
 def test_who_never_answers_is_never_late():
     asking = Asking()
     assert not any(asking.late_after([None] * 1000))
-    assert (asking.trips.newest_ns, asking.trips.trouble) == (None, None)
+    assert (asking.trips.newest_ns, asking.trips.status) == (None, None)
 
 
 def test_two_of_three_late_answers_are_late_and_one_or_a_lost_one_is_not():
@@ -69,10 +69,10 @@ def test_two_of_three_late_answers_are_late_and_one_or_a_lost_one_is_not():
 def test_it_stays_late_until_it_was_prompt_for_three_seconds():
     asking = Asking()
     assert asking.late_after([1000, 1000])[-1]
-    assert "no poses are sent" in (asking.trips.trouble or "")
+    assert "no poses are sent" in (asking.trips.status or "")
     assert all(asking.late_after([None] * 5 + [20] * 10 + [1000, 1000]))
     assert WAIT <= asking.prompt_until_good() <= WAIT + 6  # what came late lies up to 1 s after its request
-    assert asking.trips.trouble is None
+    assert asking.trips.status is None
 
 
 def test_lateness_that_comes_back_doubles_the_wait_up_to_a_minute():
@@ -118,9 +118,9 @@ def test_who_is_heard_and_answers_no_more_gets_poses_again_after_half_a_minute_a
         waited_ns = asking.now_ns - begun_ns
         assert asking.trips.late == ((UNANSWERED + 1) * ASK_NS <= waited_ns < GIVEN_UP * ASK_NS + FIRST_WAIT_NS)
     assert told == 1
-    assert "whether they come late is not seen" in (asking.trips.trouble or "")
+    assert "whether they come late is not seen" in (asking.trips.status or "")
     asking.late_after([20])
-    assert asking.trips.trouble is None
+    assert asking.trips.status is None
     assert asking.late_after([None] * (UNANSWERED + 1))[-1]  # it has answered again
 
 

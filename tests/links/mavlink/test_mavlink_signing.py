@@ -143,13 +143,13 @@ def test_a_disk_that_takes_no_more_is_said_and_counted_and_times_go_on_growing(
         full.setattr("links.mavlink.signing.os.fsync", full_disk)
         times = signed_for_minutes(signer)
         assert signer.unwritten == 1  # it is not tried each time
-        assert "cannot be written: No space left on device" in (signer.trouble or "")
+        assert "cannot be written: No space left on device" in (signer.status or "")
         signer.close()
         times += [ticks(signed(signer, HOST0)) for _ in range(3)]  # the link again, and the clock set back
         assert all(b > a for a, b in itertools.pairwise(times))
     now_s += RETRY_S
     signer.keep()
-    assert signer.trouble is None
+    assert signer.status is None
     assert ticks(signed(Signer(key_file, HOST0))) > times[-1]
 
 

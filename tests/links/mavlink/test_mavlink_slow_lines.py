@@ -62,7 +62,7 @@ def test_who_answers_no_timesync_any_more_gets_poses_again_and_is_told(monkeypat
     assert flight.session.counters["sent: ODOMETRY"] >= sent + 50 * 29
     told = [m.text for m in flight.got if m.get_type() == "STATUSTEXT"]
     assert told.count("grd: answers no TIMESYNC: late is not seen") == 1
-    assert "whether they come late is not seen" in (flight.session.trouble or "")
+    assert "whether they come late is not seen" in (flight.session.status or "")
 
 
 def test_an_autopilot_that_restarts_and_then_answers_no_timesync_gets_poses_as_soon_as_it_is_heard(
@@ -76,7 +76,7 @@ def test_an_autopilot_that_restarts_and_then_answers_no_timesync_gets_poses_as_s
     flight.speaks = True
     flight.fly(60)
     assert flight.session.counters["sent: ODOMETRY"] >= sent + 50 * 59.5
-    assert (flight.late_since_s, flight.session.trouble) == ([], None)
+    assert (flight.late_since_s, flight.session.status) == ([], None)
 
 
 @pytest.mark.parametrize("kbit_per_s", [10.0, 14.0, 16.0, 18.0, 20.0, 24.0, 40.0])

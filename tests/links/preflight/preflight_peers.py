@@ -181,7 +181,7 @@ def film(file, seconds: float = 12.0, size: int = 64, fps: int = 15) -> None:
     video.release()
 
 
-def hear(link, records, *, counters=None, trouble=None, live=True, end_ns=None) -> Heard:
+def hear(link, records, *, counters=None, status=None, live=True, end_ns=None) -> Heard:
     """What a preflight has of one link after these records, each decoded."""
     ear = Ear()
     ear.attach({"it": link})
@@ -190,4 +190,4 @@ def hear(link, records, *, counters=None, trouble=None, live=True, end_ns=None) 
         link.decode(record)
     last_ns = records[-1].arrival_ns if records else 0
     told = dict(link.counters) | (counters or {})
-    return Heard("it", link, ear.seen("it"), told, trouble, last_ns if end_ns is None else end_ns, live)
+    return Heard("it", link, ear.seen("it"), told, status, last_ns if end_ns is None else end_ns, live)

@@ -63,7 +63,7 @@ def test_a_dual_return_lidar_is_expected_to_send_twice_as_often():
 
 def test_an_absent_lidar_says_what_its_link_says():
     told = "no packet on UDP 2368 for 2 s: is the lidar powered, and is this host on its subnet?"
-    (verdict,) = lidar_checks(hear(Lidar(), [], trouble=told))
+    (verdict,) = lidar_checks(hear(Lidar(), [], status=told))
     assert (verdict.level, verdict.sentence) == (Level.FAIL, told)
     (verdict,) = lidar_checks(hear(Lidar(), [], live=False))
     assert "the recording holds nothing on /lidar/packets" in verdict.sentence
@@ -165,7 +165,7 @@ def test_a_servo_that_fell_silent_is_no_go_and_damaged_answers_are_to_look_at():
 
 
 def test_an_absent_servo_says_what_its_link_says():
-    (verdict,) = servo_checks(hear(Servo(), [], trouble="/dev/ttyUSB0: the servo does not answer"))
+    (verdict,) = servo_checks(hear(Servo(), [], status="/dev/ttyUSB0: the servo does not answer"))
     assert (verdict.level, verdict.sentence) == (Level.FAIL, "/dev/ttyUSB0: the servo does not answer")
     (verdict,) = servo_checks(hear(Servo(), [Record("/servo/state", 1, 1, b"{}")]))
     assert "1 records came that hold no state" in verdict.sentence
@@ -248,7 +248,7 @@ def test_a_camera_and_an_odometry_that_fell_silent_are_no_go():
 
 def test_a_camera_without_pictures_is_no_go():
     link = Camera(topic="/camera/drone")
-    (verdict,) = camera_checks(hear(link, [], trouble="there is no /dev/video9"), (64, 64), 0.0)
+    (verdict,) = camera_checks(hear(link, [], status="there is no /dev/video9"), (64, 64), 0.0)
     assert (verdict.level, verdict.sentence) == (Level.FAIL, "there is no /dev/video9")
     (verdict,) = camera_checks(hear(link, [Record("/camera/drone", 1, 1, b"no picture")]), (64, 64), 0.0)
     assert "1 records came that hold no picture" in verdict.sentence

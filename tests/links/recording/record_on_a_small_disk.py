@@ -33,18 +33,18 @@ def main(folder: Path) -> None:
     live.start()
     collector = live.nodes["collector"]
     numbers = 0
-    while recorder.trouble is None:  # a number is a record of 1 to 1000 digits; they do not shrink to nothing
+    while recorder.status is None:  # a number is a record of 1 to 1000 digits; they do not shrink to nothing
         for _ in range(50):
             numbers += 1
             live.nodes["line"].put(f"{numbers}.{hash(('a', numbers)) ** 40}"[:1000])
         collector.take(50)
     live.nodes["line"].put(7)
     (after,) = collector.take(1)
-    while not any("nothing is recorded now" in str(incident) for incident in live.report().incidents):
+    while not any("nothing is recorded now" in str(event) for event in live.report().events):
         threading.Event().wait(0.01)
     report = live.stop()
     recorder.close()
-    said = [str(incident) for incident in report.incidents]
+    said = [str(event) for event in report.events]
     told = {
         "after": after,
         "said": said,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flow.consumption import END_TOPIC
 from flow.link import Record
+from flow.live.input_order import END_TOPIC
 from links.recording import RecordingReader, RecordingWriter
 
 LATE_NS = 20_000_000

@@ -45,7 +45,7 @@ def test_every_record_is_in_the_recording_with_rig_and_configuration(tmp_path):
         assert (reader.rig_yaml, reader.config_yaml) == ("version: 1\n", SETTINGS)
         assert reader.metadata["made_by"] == "grd run"
     assert recorder.counters == {"written": 100, "dropped": 0, "missed": 0, "parts": 1}
-    assert recorder.trouble is None
+    assert recorder.status is None
 
 
 def test_each_part_can_be_replayed_alone_and_together_they_are_all(tmp_path):
@@ -135,8 +135,8 @@ def test_a_recording_of_no_run_is_its_only_part():
 def test_a_disk_without_room_is_said_and_records_are_counted_as_missed(tmp_path):
     recorder = opened(tmp_path, reserve_mb=1e12)
     recorder.record(record(1))
-    assert "less than 1e+12 MB are free at" in recorder.trouble
-    assert "make room; nothing is recorded now, the run goes on" in recorder.trouble
+    assert "less than 1e+12 MB are free at" in recorder.status
+    assert "make room; nothing is recorded now, the run goes on" in recorder.status
     assert recorder.counters == {"written": 0, "dropped": 0, "missed": 1, "parts": 0}
     recorder.close()
     assert not list(tmp_path.iterdir())
@@ -148,11 +148,11 @@ def test_a_disk_that_gets_full_ends_the_recording_properly_and_room_again_begins
     recorder.record(record(1))
     free = [0]
     monkeypatch.setattr(Recorder, "_free_bytes", lambda self: free[0])
-    while recorder.trouble is None:
+    while recorder.status is None:
         threading.Event().wait(0.01)
     recorder.record(record(2))
     free[0] = 10**12
-    while recorder.trouble is not None:
+    while recorder.status is not None:
         threading.Event().wait(0.01)
     recorder.record(record(3))
     recorder.close()
@@ -171,11 +171,11 @@ def test_a_disk_that_is_gone_is_said_and_the_recording_goes_on_when_it_is_back(t
 
     with monkeypatch.context() as away:
         away.setattr("shutil.disk_usage", gone)
-        wait_until(lambda: recorder.trouble is not None)
+        wait_until(lambda: recorder.status is not None)
         assert (
-            "Stale file handle: is the disk still there?; nothing is recorded now, the run goes on" in recorder.trouble
+            "Stale file handle: is the disk still there?; nothing is recorded now, the run goes on" in recorder.status
         )
-    wait_until(lambda: recorder.trouble is None)
+    wait_until(lambda: recorder.status is None)
     recorder.record(record(1))
     recorder.close()
     assert recorder.counters["parts"] == 2

@@ -305,7 +305,7 @@ def test_a_disk_that_fills_up_is_told_at_close_and_what_is_on_it_can_be_read(tmp
         writer.write(lidar(i, T0 + i))
     with pytest.raises(LinkError, match=r"No space left on device after .* free space; `grd recover"):
         writer.close()
-    assert writer.trouble
+    assert writer.status
     assert writer.written + writer.dropped == 5000
     report = recover(path)
     assert report.records < 5000

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flow.consumption import END_TOPIC
 from flow.link import LinkError
+from flow.live.input_order import END_TOPIC
 from links.calibration.gather import gather
 from links.recording import RecordingReader, Session
 from tests.links import command

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flow.link import Run
-from links.evaluation.output import read_output
+from links.evaluation.run_data import OutputKind, read_output
 from links.mavlink.gate import Limits
 from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
 from stages.fuse.measurement_covariance import Known, Verdict, lost, pose
@@ -47,12 +47,12 @@ def run(tmp_path):
 def test_a_pose_is_a_line_of_both_files_and_reads_back(run):
     R = rotation_z(0.5)
     folder = run([made(1.0, R), made(1.02, R, xyz=(1.1, 2.0, 3.0))])
-    back = read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6)
+    back = read_output(OutputKind.POSE, folder)
     assert back.poses.stamps_ns.tolist() == [S, 1_020_000_000]
     assert np.allclose(back.poses.xyz_m, [[1, 2, 3], [1.1, 2, 3]])
     assert np.allclose(back.poses.quaternion_xyzw, quaternions_xyzw(np.array([R, R])), atol=1e-5)
     assert np.allclose(back.covariance[0], np.diag([0.001, 0.002, 0.003, 0.01, 0.02, 0.03]))
-    assert back.good.tolist() == [True, True]
+    assert back.sendable.tolist() == [True, True]
 
 
 def test_each_pose_tells_which_drone_it_is_of(run):
@@ -61,14 +61,14 @@ def test_each_pose_tells_which_drone_it_is_of(run):
     ]
     parked = Motions(FuseErrors(), parked=True)
     folder = run([pose(one, verdict(POSITION_ONLY, track_id=k), parked) for k, one in enumerate(known, start=1)])
-    back = read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6)
+    back = read_output(OutputKind.POSE, folder)
     assert back.track.tolist() == [1, 2]
 
 
 def test_a_pose_without_rotation_is_marked_and_its_variance_is_no_infinity(run):
     folder = run([made(1.0, state=POSITION_ONLY), made(1.02, rotation_z(0.5))])
-    back = read_output("pose", folder / POSE_FILE, folder / POSE_COVARIANCE_FILE, 6)
-    assert back.good.tolist() == [False, True]
+    back = read_output(OutputKind.POSE, folder)
+    assert back.sendable.tolist() == [False, True]
     assert np.allclose(np.diag(back.covariance[0])[:3], UNKNOWN_RAD2)
     assert np.allclose(np.diag(back.covariance[0])[3:], [0.01, 0.02, 0.03])
     rows = list(csv.DictReader((folder / POSE_COVARIANCE_FILE).open()))

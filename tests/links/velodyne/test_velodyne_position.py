@@ -156,13 +156,13 @@ def test_with_clock_utc_a_lock_that_is_lost_is_said_until_it_is_back_and_the_pac
     said = []
     with lidar.listen() as records:
         for told in (lost, position(), lost, position(pps=1), position(pps=7), position()):  # the 7 is damaged
-            said.append(lidar.trouble)
+            said.append(lidar.status)
             send(ports[1], told)
             assert next(records).data == told
             if lidar.counters.get("PPS locks lost"):
                 send(ports[0], packet())
                 assert next(records).data == packet()
-        said.append(lidar.trouble)
+        said.append(lidar.status)
     before, not_yet, locked, lost_now, still, unheard, again = said
     assert (before, not_yet, locked, again) == (None,) * 4, "a lock that never was is an error of its own, later"
     assert words in lost_now
@@ -179,27 +179,27 @@ def test_with_clock_utc_position_packets_that_end_are_said(ports, monkeypatch):
         send(ports[1], position())
         next(records)
         end_s = time.monotonic() + 10.0
-        while lidar.trouble is None and time.monotonic() < end_s:
+        while lidar.status is None and time.monotonic() < end_s:
             send(ports[0], packet())
             next(records)
-        assert "no position packet comes any more" in lidar.trouble
+        assert "no position packet comes any more" in lidar.status
         send(ports[1], position())
         next(records)
-        assert lidar.trouble is None
+        assert lidar.status is None
         send(ports[1], position(pps=0))
         next(records)
-        assert lidar.trouble is not None
-    assert lidar.trouble is None, "nobody listens any more"
+        assert lidar.status is not None
+    assert lidar.status is None, "nobody listens any more"
 
 
-def test_with_a_free_clock_a_lost_lock_is_no_trouble(ports):
+def test_with_a_free_clock_a_lost_lock_is_no_failure(ports):
     lidar = Lidar(port=ports[0], position_port=ports[1])
     with lidar.listen() as records:
         for told in (position(), position(pps=0)):
             send(ports[1], told)
             next(records)
         assert lidar.counters["PPS locks lost"] == 1
-        assert lidar.trouble is None
+        assert lidar.status is None
 
 
 def test_clock_utc_without_position_packets_is_refused_live(ports):

@@ -202,7 +202,7 @@ def test_a_recording_with_a_burst_of_bad_packets_is_replayed_to_its_end(tmp_path
     good = exact_records(4)
     report = replay(load_graph(tmp_path / "x.yaml"), [*good[:2], *[record(bytes(1206))] * 250, *good[2:]])
     assert report.messages["lidar.lidar_firings"] == 4
-    (said,) = report.incidents
+    (said,) = report.events
     assert (said.node, said.count) == ("lidar", 2)
     assert "100 packets in a row are no use" in said.text
 

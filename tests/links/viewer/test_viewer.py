@@ -196,7 +196,7 @@ def test_a_message_that_cannot_be_drawn_is_counted_and_the_next_one_is(tmp_path)
     viewer.see(output, content, 0)
     viewer.close()
     ((text, count),) = viewer.errors.items()
-    assert viewer.trouble == f"not all is drawn: {text}"
+    assert viewer.status == f"not all is drawn: {text}"
     assert viewer.counters["errors"] == count
     assert text.startswith("track.drone_fix could not be drawn: LinAlgError")
     assert count == 1

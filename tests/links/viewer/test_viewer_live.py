@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from shown import drawn, words
 
-from flow.incidents import IncidentTold
-from flow.live_report import EdgeStatus
+from flow.events import EventMessage
+from flow.live.report import EdgeStatus
 
 
 @pytest.mark.parametrize(("name", "value"), [("lag_ms", 12.5), ("dropped", 3), ("missed", 1), ("waiting", 7)])
@@ -17,11 +17,11 @@ def test_lateness_and_losses_of_an_edge_are_curves(name, value):
     assert marks[f"plots/other/run/track/pulses/{name}"].values.tolist() == [value]
 
 
-@pytest.mark.parametrize(("mended", "level"), [(False, "WARN"), (True, "INFO")])
-def test_what_went_wrong_stands_in_the_log_under_who_it_happened_to(mended, level):
-    told = IncidentTold(stamp_ns=1, node="servo", text="has said nothing for 2 s (3 times)", mended=mended)
-    marks = drawn(told, "run/incidents")
-    assert list(marks) == ["log/run/incidents/servo"]
-    entry = marks["log/run/incidents/servo"].parts[0]
-    assert words(entry.text) == ["has said nothing for 2 s (3 times)"]
+@pytest.mark.parametrize(("resolved", "level"), [(False, "WARN"), (True, "INFO")])
+def test_what_went_wrong_stands_in_the_log_under_who_it_happened_to(resolved, level):
+    told = EventMessage(stamp_ns=1, node="servo", text="has sent nothing for 2 s (3 times)", resolved=resolved)
+    marks = drawn(told, "run/events")
+    assert list(marks) == ["log/run/events/servo"]
+    entry = marks["log/run/events/servo"].parts[0]
+    assert words(entry.text) == ["has sent nothing for 2 s (3 times)"]
     assert words(entry.level) == [level]

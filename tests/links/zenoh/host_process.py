@@ -35,9 +35,9 @@ def main() -> None:
     for line in sys.stdin:
         if line.strip() == "report":
             report = live.report()
-            troubles = {name: link.trouble for name, link in live.nodes.items() if link.trouble}
-            incidents = [str(incident) for incident in report.incidents]
-            say(kind="report", counters=report.counters, troubles=troubles, incidents=incidents)
+            statuses = {name: link.status for name, link in live.nodes.items() if link.status}
+            events = [str(event) for event in report.events]
+            say(kind="report", counters=report.counters, statuses=statuses, events=events)
     begin_s = time.monotonic()
     live.stop()
     say(kind="stopped", took_s=time.monotonic() - begin_s)

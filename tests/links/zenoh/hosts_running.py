@@ -35,7 +35,7 @@ def write_config(folder: Path, rate_hz: float = 100.0, every: int = 10, size_px:
 def write_hosts(
     folder: Path,
     listen: str,
-    place: dict[str, str],
+    placement: dict[str, str],
     connect: str | None = None,
     name: str = "hosts.yaml",
     drone: str = "drone",
@@ -47,7 +47,7 @@ def write_hosts(
     text += f"  vehicle: {{listen: 'tls/{listen}', {files.format('vehicle', 'ca')}}}\n"
     text += f"  drone: {{{files.format(drone, 'ca')}{also}}}\n".replace("CA", authority)
     text += f"  base: {{{files.format('base', 'ca')}}}\n"
-    text += "place: {" + ", ".join(f"{node}: {host}" for node, host in place.items()) + "}\n"
+    text += "placement: {" + ", ".join(f"{node}: {host}" for node, host in placement.items()) + "}\n"
     file = folder / name
     file.write_text(text)
     return file
@@ -109,17 +109,17 @@ class HostProcess:
         return [self.until(lambda line: line["kind"] == kind, within_s) for _ in range(count)]
 
     def report(self) -> dict[str, Any]:
-        """Counters, troubles and incidents now."""
+        """Counters, statuses and events now."""
         assert self._process.stdin
         self._process.stdin.write("report\n")
         self._process.stdin.flush()
         return self.wait_for("report")[0]
 
-    def until_trouble(self, node: str, wanted: str | None, within_s: float = 60.0) -> str | None:
-        """A node's trouble, once it has the words `wanted`; None: once it has none."""
+    def until_status(self, node: str, wanted: str | None, within_s: float = 60.0) -> str | None:
+        """A node's status, once it has the words `wanted`; None: once it has none."""
         end_s = time.monotonic() + within_s
         while True:
-            said = self.report()["troubles"].get(node)
+            said = self.report()["statuses"].get(node)
             if (said is None) == (wanted is None) and (wanted is None or wanted in said):
                 return said
             assert time.monotonic() < end_s, f"{self.name}.{node}: {said}"

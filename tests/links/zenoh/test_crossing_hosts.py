@@ -83,7 +83,7 @@ def test_a_certificate_of_another_authority_is_not_taken_in(folder):
     rogue = write_hosts(folder, listen, DRONE_SIDE, name="rogue.yaml", drone="rogue")
     with HostProcess(config, honest, "vehicle") as vehicle, HostProcess(config, rogue, "drone") as intruder:
         intruder.wait_for("started")
-        said = intruder.until_trouble("to_vehicle", "does not take us in")
+        said = intruder.until_status("to_vehicle", "does not take us in")
         assert "of the same authority (ca.pem)?" in said
         assert vehicle.report()["counters"]["beats"]["received"] == 0
         assert vehicle.of("beat") == []
@@ -104,8 +104,8 @@ def test_a_host_cannot_say_what_another_one_s_nodes_say(folder):
         with HostProcess(config, taken, "drone") as drone, HostProcess(config, posing, "base") as poser:
             drone.wait_for("started")
             poser.wait_for("started")
-            drone.until_trouble("to_vehicle", "vehicle")
-            poser.until_trouble("to_vehicle", "vehicle")
+            drone.until_status("to_vehicle", "vehicle")
+            poser.until_status("to_vehicle", "vehicle")
             assert vehicle.report()["counters"]["beats"]["received"] == 0
             assert vehicle.of("beat") == []
         with HostProcess(config, honest, "base"):
@@ -124,7 +124,7 @@ def test_a_line_that_was_cut_comes_back(folder):
         ):
             vehicle.wait_for("picture", 3)
             proxy.cut()
-            vehicle.until_trouble("beats", "has not answered for")
+            vehicle.until_status("beats", "has not answered for")
             before = drone.report()["counters"]["to_vehicle"]
             proxy.mend()
             newest = vehicle.lines[-1].get("number", 0)
@@ -136,7 +136,7 @@ def test_a_line_that_was_cut_comes_back(folder):
             assert abs(beat["late_ms"] - beat["true_late_ms"]) < 50.0
             numbers = [line["number"] for line in vehicle.of("beat")]
             assert numbers == sorted(set(numbers))
-            vehicle.until_trouble("beats", None)
+            vehicle.until_status("beats", None)
             assert drone.stop() < 4.0
 
 
@@ -163,5 +163,5 @@ def test_two_hubs_on_one_port_are_told_apart(folder):
             first.wait_for("beat")
             with HostProcess(config, hosts, "vehicle") as second:
                 second.wait_for("started")
-                said = second.until_trouble("beats", "cannot open tls/127.0.0.1:")
+                said = second.until_status("beats", "cannot open tls/127.0.0.1:")
     assert "Address already in use" in said

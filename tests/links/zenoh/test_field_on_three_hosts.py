@@ -64,9 +64,9 @@ def test_the_fields_stack_flies_on_three_hosts(tmp_path):
     }
     host["vehicle"]["listen"] = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     nodes = load_graph(config, overlays=[tmp_path / "overlay.yaml"]).nodes
-    place = {name: "drone" if name in ON_DRONE else "base" if name == "viewer" else "vehicle" for name in nodes}
-    see = {"viewer": ["fuse.relative_pose", "track.track_state", "track.drone_fix"]}
-    (tmp_path / "hosts.yaml").write_text(yaml.safe_dump({"hosts": host, "place": place, "see": see}))
+    placement = {name: "drone" if name in ON_DRONE else "base" if name == "viewer" else "vehicle" for name in nodes}
+    taps = {"viewer": ["fuse.relative_pose", "track.track_state", "track.drone_fix"]}
+    (tmp_path / "hosts.yaml").write_text(yaml.safe_dump({"hosts": host, "placement": placement, "taps": taps}))
     running = {}
     for name in host:
         command = [sys.executable, "-c", "from links.cli import main; main()", "run", str(config)]

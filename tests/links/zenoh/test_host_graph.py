@@ -8,11 +8,11 @@ import pytest
 from crossing_toys import Beat
 from hosts_running import write_config, write_hosts
 
-from flow.codec import encode
-from flow.edge import Waiting
+from flow.config.edge import QueueSettings
+from flow.config_error import ConfigError
 from flow.graph import load_graph
 from flow.link import LinkError, Record, Source
-from flow.problem import ConfigError
+from flow.remote.codec import encode
 from flow.stage import input_ports, output_ports
 from links.zenoh import Receiver, Sender, host_graph
 from links.zenoh.session import Session, access_control, config_of
@@ -74,8 +74,8 @@ def test_a_receiver_stands_for_each_node_that_is_listened_to(files):
 def test_how_messages_wait_is_the_edge_s_own(files):
     graph, hosts = files
     part = host_graph(graph, hosts, "drone")
-    waiting = {edge.port: edge.waiting for edge in part.edges}
-    assert waiting["beats__picture"] == Waiting("latest", 1)
+    waiting = {edge.port: edge.queue for edge in part.edges}
+    assert waiting["beats__picture"] == QueueSettings("latest", 1)
     assert waiting["beats__beat"].policy == "drop_oldest"
 
 

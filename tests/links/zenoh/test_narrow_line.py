@@ -69,8 +69,8 @@ def test_on_a_line_too_narrow_the_newest_picture_comes_and_small_messages_overta
     need_openssl()
     make_all(tmp_path, VEHICLE_ADDRESS)
     config = write_config(tmp_path, rate_hz=5.0 * PICTURES_HZ, every=5, size_px=SIZE_PX)
-    place = {"beats": "drone", "echo": "vehicle", "teller": "vehicle"}
-    hosts = write_hosts(tmp_path, f"{VEHICLE_ADDRESS}:7447", place)
+    placement = {"beats": "drone", "echo": "vehicle", "teller": "vehicle"}
+    hosts = write_hosts(tmp_path, f"{VEHICLE_ADDRESS}:7447", placement)
     with (
         HostProcess(config, hosts, "vehicle", ahead_s=-3600.0, namespace=vehicle_side) as vehicle,
         HostProcess(config, hosts, "drone", namespace=drone_side) as drone,
@@ -93,7 +93,7 @@ def test_on_a_line_too_narrow_the_newest_picture_comes_and_small_messages_overta
         assert max(abs(b["late_ms"] - b["true_late_ms"]) for b in beats) < 25.0
 
         ip("-n", drone_side, "link", "set", end, "down")
-        vehicle.until_trouble("beats", "has not answered for")
+        vehicle.until_status("beats", "has not answered for")
         ip("-n", drone_side, "link", "set", end, "up")
         vehicle.until(lambda said: said["kind"] == "picture" and said["late_ms"] < 8 * PICTURE_MS)
-        vehicle.until_trouble("beats", None)
+        vehicle.until_status("beats", None)

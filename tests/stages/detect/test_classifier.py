@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from links.evaluation.probabilities import EDGES
+from links.evaluation.stage_metrics import PROBABILITY_EDGES
 from stages.detect import EvidenceDetect
 from stages.detect.candidate_messages import odds_of
 from stages.detect.classifier import (
@@ -241,7 +241,7 @@ def test_without_the_drones_word_what_is_accepted_and_looked_at_again_has_the_ev
 def test_tracker_and_evaluation_know_from_where_on_the_detector_accepts():
     accepts = EvidenceDetect.settings_type.model_fields["accept_probability"].default
     assert pytest.approx(odds_of(accepts)) == ACCEPTED_NATS
-    assert EDGES[-2] == accepts
+    assert PROBABILITY_EDGES[-2] == accepts
 
 
 def test_what_is_likely_a_drone_is_one_less_often_than_its_odds_and_what_is_not_just_as_often():

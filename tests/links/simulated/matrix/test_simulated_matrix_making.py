@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from flow.config_error import ConfigError
 from flow.link import LinkError
-from flow.problem import ConfigError
 from links.cli.app import app
 from links.recording import RecordingReader
 from links.runs.run_folder import Asked
@@ -23,7 +23,7 @@ from links.simulated.rig.run import simulate_into
 from tests.links.simulated.fast_loop import GRAPH
 
 VIEWER = "  view: {use: links.viewer.Viewer}\n"
-TABLE = "  table: {use: flow.taps.Csv}\n"
+STAMPS = "  stamps: {use: tests.flow.toys.Stamps}\n"
 HOVER = Cell("open_lot", 10, "hover", "parked")
 SHORT_S = 0.2
 
@@ -33,7 +33,7 @@ def config(tmp_path: Path) -> Path:
     """A closed loop in two files, with a viewer and another tap."""
     (tmp_path / "stages.yaml").write_text(GRAPH, encoding="utf-8")
     file = tmp_path / "fast.yaml"
-    file.write_text(f"include: stages.yaml\nlinks:\n{VIEWER}{TABLE}", encoding="utf-8")
+    file.write_text(f"include: stages.yaml\nlinks:\n{VIEWER}{STAMPS}", encoding="utf-8")
     return file
 
 
@@ -108,7 +108,7 @@ def test_the_run_of_the_closed_loop_is_that_of_a_replay(tmp_path, monkeypatch, c
         "truth_hits.csv",
         "truth_visible.csv",
         "truth_vehicle_drone.tum",
-        "csv/sweep.depth_image.csv",
+        "stamps.txt",
     } <= left.keys()
     assert not [file for file in left if file.endswith(".rrd")]
     summary = json.loads(left["summary.json"])

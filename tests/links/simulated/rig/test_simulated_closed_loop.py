@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
+from flow.config_error import ConfigError, Location
 from flow.graph import load_graph
 from flow.link import LinkError, Record, Tap
 from flow.message import Message
-from flow.problem import ConfigError, Place
 from flow.replay import replay
 from flow.stage import Settings
 from flow.taps import Digest
@@ -80,7 +80,7 @@ class Goals(Tap):
 def replayed(records: list[Record], scenario: Scenario, config: FilePath) -> tuple[str, list[tuple[int, float]]]:
     """Output hash and goals of an open-loop replay."""
     digest, goals = Digest(), Goals()
-    graph = load_graph(config, sections={"rig": (yaml.safe_load(scenario.rig_yaml()), Place("test", 0))})
+    graph = load_graph(config, sections={"rig": (yaml.safe_load(scenario.rig_yaml()), Location("test", 0))})
     replay(graph, [r for r in records if not r.topic.startswith("/truth")], (digest, goals))
     return digest.hexdigest(), goals._seen
 
@@ -179,6 +179,6 @@ def test_no_stage_can_be_wired_to_truth(tmp_path: FilePath, topic: str, link: st
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         load_loop(file, load_scenario(STREET).rig_yaml(), "test", load_scenario(STREET).closed_loop)
-    assert [str(p).partition(": ")[2] for p in caught.value.problems] == [
+    assert [str(p).partition(": ")[2] for p in caught.value.errors] == [
         f"links.spy.config.topic: truth is for evaluation only: no source may bring in '{topic}'."
     ]

@@ -49,7 +49,7 @@ def run_of(folder: Path, live: bool = True) -> Run:
 def test_a_replay_starts_no_rig(tmp_path):
     rig = LiveRig(scenario=tmp_path / "none.yaml", servo=tmp_path / "servo")
     rig.open(run_of(tmp_path, live=False))
-    assert rig.trouble is None
+    assert rig.status is None
     rig.close()
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
+from flow.config_error import ConfigError
 from flow.link import LinkError, Record
-from flow.problem import ConfigError
 from links.recording import RecordingReader
 from links.simulated.rig import run
 from links.simulated.rig.run import Simulation, simulate, simulate_records

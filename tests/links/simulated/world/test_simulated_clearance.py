@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
+from flow.config_error import ConfigError
 from flow.link import LinkError
-from flow.problem import ConfigError
 from links.simulated.rig.run import Simulation
 from links.simulated.rig.scenario import load_scenario
 from links.simulated.world.clearance import check_path, clearance_m, fits, sample_times_s, under_open_sky, visible

@@ -1,0 +1,1 @@
+"""Configuration files: read, checked, drawn. `flow.graph` has the result."""

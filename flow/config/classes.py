@@ -1,0 +1,110 @@
+"""The classes that a configuration may name, by kind: stages and links.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import pkgutil
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any, cast
+
+from flow.config.tree import KeyPath, Tree
+from flow.config_error import did_you_mean
+from flow.link import Link, Tap
+from flow.stage import Node, PortError, Stage, input_ports, output_ports
+
+KINDS: dict[str, type[Node[Any]]] = {"stages": Stage, "links": Link}
+PACKAGES = {"stages": "stages", "links": "links"}  # packages whose classes are suggested, by kind
+
+
+def named_class(tree: Tree, kind: str, path: KeyPath, use: Any) -> type[Node[Any]] | None:
+    """The class that `use:` of the node at `path` names; None, and an error in `tree`, when it names none."""
+    here = (*path, "use")
+    node_kind = kind.removesuffix("s")
+    if not isinstance(use, str) or "." not in use:
+        tree.error(here, f"must name a class as module.Class, got {use!r}." if use is not None else "is missing.")
+        return None
+    module_name, _, class_name = use.rpartition(".")
+    if not all(part.isidentifier() for part in use.split(".")) or not _exists(module_name):
+        tree.error(here, f"unknown {node_kind} '{use}'.{did_you_mean(use, known_classes(kind))}")
+        return None
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        tree.error(here, f"'{module_name}' cannot be imported: {error}.")
+        return None
+    cls: Any = getattr(module, class_name, None)
+    if cls is None:
+        tree.error(here, f"unknown {node_kind} '{use}'.{did_you_mean(use, known_classes(kind))}")
+    elif not (isinstance(cls, type) and issubclass(cls, KINDS[kind])):
+        section = next((k for k, base in KINDS.items() if isinstance(cls, type) and issubclass(cls, base)), None)
+        hint = f"; it belongs under '{section}:'" if section else ""
+        tree.error(here, f"'{use}' is no {node_kind}{hint}.")
+    else:
+        node = cast("type[Node[Any]]", cls)
+        try:
+            input_ports(node)
+            output_ports(node)
+        except PortError as error:
+            tree.error(here, f"'{use}' is not written as a {node_kind} must be: {error}.")
+        else:
+            return node
+    return None
+
+
+def _exists(module_name: str) -> bool:
+    try:
+        return importlib.util.find_spec(module_name) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def known_classes(kind: str) -> dict[str, type[Node[Any]]]:
+    """Usable classes of a kind by import path, in alphabetical order: for suggestions and the schema.
+
+    A package within PACKAGES offers its own classes that `__all__` names, or without that those that its `__init__`
+    imports or defines; `stages/x.py` offers the classes that it defines. What cannot be imported (a driver without its
+    library) is left out.
+    """
+    found: dict[type[Node[Any]], str] = {}
+    for module in _public_modules(PACKAGES[kind]):
+        names: list[str] = getattr(module, "__all__", None) or [name for name in vars(module) if name[0] != "_"]
+        for name in names:
+            value: Any = getattr(module, name, None)
+            if isinstance(value, type) and issubclass(value, KINDS[kind]):
+                cls = cast("type[Node[Any]]", value)
+                if f"{cls.__module__}.".startswith(f"{module.__name__}.") and _is_usable(cls):
+                    found.setdefault(cls, f"{module.__name__}.{name}")
+    return {path: cls for cls, path in sorted(found.items(), key=lambda item: item[1])}
+
+
+def _public_modules(package: str) -> Iterator[ModuleType]:
+    """A package's modules from which configurations may take classes: the packages within, and stages/x.py."""
+    parent = _imported(package)
+    for info in pkgutil.iter_modules(parent.__path__, f"{package}.") if parent else ():
+        if not info.ispkg and package != "stages":
+            continue
+        module = _imported(info.name)
+        if module is not None:
+            yield module
+        if info.ispkg:
+            yield from _public_modules(info.name)
+
+
+def _imported(name: str) -> ModuleType | None:
+    try:
+        return importlib.import_module(name)
+    except Exception:  # noqa: BLE001 - whatever a driver's library raises
+        return None
+
+
+def _is_usable(cls: type[Node[Any]]) -> bool:
+    """Whether a node of this class does anything as it is: a base class of others has no ports."""
+    try:
+        return bool(issubclass(cls, Tap) or input_ports(cls) or output_ports(cls))
+    except PortError:
+        return False

@@ -1,0 +1,154 @@
+"""What a configuration declares of each stage and link: class, settings, thread and process; errors go to the tree.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+from pydantic import ValidationError
+
+from flow.config.classes import named_class
+from flow.config.tree import KeyPath, Tree, resolve
+from flow.config_error import did_you_mean, one_of
+from flow.stage import Node
+
+NODE_KEYS = {
+    "stages": ("use", "config", "inputs", "needs", "thread", "process", "low_priority"),
+    "links": ("use", "config", "inputs", "needs"),
+}
+_NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
+NEEDED = r"^\$[^\s$]+$"  # a reference without a default
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSpec:
+    """One stage or link as declared: its class and checked settings."""
+
+    name: str
+    kind: str  # "stages" or "links"
+    use: str  # import path as declared
+    cls: type[Node[Any]]
+    config: dict[str, Any]
+    thread: str = ""  # of a stage in a live run; stages of one name share it
+    process: str = ""  # of a stage, the worker process; stages of one name share it; empty: the run's own process
+    low_priority: bool = False  # of a stage in a live run: it takes fewer images while others do not keep up
+
+    def build(self) -> Node[Any]:
+        """A new instance, without state of any other."""
+        return self.cls(self.cls.settings_type.model_validate(self.config))
+
+
+def read_nodes(tree: Tree, kind: str, left_out: dict[str, str]) -> Iterator[NodeSpec]:
+    """Every node of a kind ("stages", "links") that has a class; a wrong setting is an error in `tree`.
+
+    A node is left out when the configuration does not have what its `needs:` names; `left_out` receives both.
+    """
+    for name, declared in _declared(tree, kind):
+        path = (kind, name)
+        _check_keys(tree, path, declared)
+        low_priority = _low_priority(tree, path, declared)
+        thread, process = _thread(tree, path, declared), _process(tree, path, declared)
+        cls = named_class(tree, kind, path, declared.get("use"))
+        if unmet := _unmet(tree, path, declared):
+            left_out[name] = unmet
+        elif cls is not None:
+            before = len(tree.errors)
+            config = resolve(tree, (*path, "config"), declared.get("config") or {})
+            if len(tree.errors) == before:  # a reference to nothing is an error already
+                config = _settings(tree, path, cls, config)
+            yield NodeSpec(name, kind, declared["use"], cls, config, thread, process, low_priority)
+
+
+def _declared(tree: Tree, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Name and mapping of each well-formed entry of a section; another one is an error in `tree`."""
+    section = tree.values.get(kind)
+    if section is None:
+        return
+    if not isinstance(section, dict):
+        tree.error((kind,), "must be a mapping of names.")
+        return
+    for name, declared in cast("dict[str, Any]", section).items():
+        path = (kind, name)
+        if not _NAME.match(name):
+            tree.error(path, f"'{name}' is no name: use small letters, digits and '_', starting with a letter.")
+        elif kind == "links" and name in (tree.values.get("stages") or {}):
+            tree.error(path, f"a stage has the name '{name}' already; an edge could not distinguish them.")
+        elif not isinstance(declared, dict):
+            tree.error(path, "must be a mapping with 'use:', and 'config:' and 'inputs:' where needed.")
+        else:
+            yield name, cast("dict[str, Any]", declared)
+
+
+def _unmet(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> str:
+    """What a node `needs:` and the configuration does not have; empty when it needs nothing, or has it."""
+    needs: Any = declared.get("needs")
+    if needs is None:
+        return ""
+    if not (isinstance(needs, str) and re.fullmatch(NEEDED, needs)):
+        tree.error((*path, "needs"), f"must name a value of the configuration, as $rig.cameras, got {needs!r}.")
+        return ""
+    return needs if resolve(tree, (*path, "needs"), f"{needs} or null") is None else ""
+
+
+def _check_keys(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> None:
+    known = NODE_KEYS[path[0]]
+    for key in declared:
+        if key not in known:
+            tree.error((*path, key), f"unknown key '{key}'; there is {one_of(known)}.{did_you_mean(key, known)}")
+
+
+def _thread(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> str:
+    thread: Any = declared.get("thread", path[1])
+    if not (isinstance(thread, str) and _NAME.match(thread)):
+        tree.error((*path, "thread"), f"must be a name as stages have, got {thread!r}.")
+    return str(thread)
+
+
+def _process(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> str:
+    process: Any = declared.get("process", "")
+    if not (isinstance(process, str) and (process == "" or _NAME.match(process))):
+        tree.error((*path, "process"), f"must be a name as stages have, got {process!r}.")
+    elif process and "thread" in declared:
+        tree.error((*path, "process"), "in a worker process each stage has its own thread: leave 'thread' out.")
+    return str(process)
+
+
+def _low_priority(tree: Tree, path: KeyPath, declared: dict[str, Any]) -> bool:
+    low_priority: Any = declared.get("low_priority", False)
+    if not isinstance(low_priority, bool):
+        tree.error((*path, "low_priority"), f"must be true or false, got {low_priority!r}.")
+    return low_priority is True
+
+
+def _settings(tree: Tree, path: KeyPath, cls: type[Node], config: Any) -> dict[str, Any]:
+    here = (*path, "config")
+    if not isinstance(config, dict):
+        tree.error(here, "must be a mapping of settings.")
+        return {}
+    settings = cast("dict[str, Any]", config)
+    try:
+        cls.settings_type.model_validate(settings)
+    except ValidationError as errors:
+        for error in errors.errors(include_url=False):
+            where = (*here, *(str(part) for part in error["loc"]))
+            known = cls.settings_type.model_fields if len(error["loc"]) == 1 else ()
+            tree.error(where, _setting_error(error, cls.__name__, known))
+    return settings
+
+
+def _setting_error(error: Any, class_name: str, known: Any) -> str:
+    """The text of a pydantic error, for people."""
+    name = str(error["loc"][-1]) if error["loc"] else ""
+    if error["type"] == "extra_forbidden":
+        has = f" {class_name} has {one_of(known)}." if known else ""
+        return f"unknown setting '{name}'.{did_you_mean(name, known) or has}"
+    if error["type"] == "missing":
+        return "is missing and has no default."
+    text = str(error["msg"]).removeprefix("Value error, ").removeprefix("Input should be ").removesuffix(".")
+    text = text if error["type"] == "value_error" else f"must be {text}"
+    return f"{text}, got {error['input']!r}." if not isinstance(error["input"], dict) else f"{text}."

@@ -1,0 +1,124 @@
+"""Inbox: the queues of one node of a live run. Many threads put messages; one takes them in the order of putting.
+
+Each port has its own bound, so that a flood on one edge drops nothing of another.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from flow.config.edge import QueueSettings
+from flow.message import Message
+
+
+class Item(NamedTuple):
+    """One queued message."""
+
+    order: int  # of putting, over all ports
+    port: int
+    number: int  # of the message among those of its output, from 0; a gap: messages were dropped
+    arrival_ns: int
+    message: Message
+
+
+class Wakeup:
+    """Wakes the thread that takes from one or several inboxes when a message arrives or an inbox closes."""
+
+    def __init__(self) -> None:
+        self.changed = threading.Condition()
+        self.someone_waits = False
+
+    def wait(self, inboxes: Sequence[Inbox], timeout_s: float) -> None:
+        """Wait until one of the inboxes has a message or is closed, at most `timeout_s`."""
+        with self.changed:
+            self.someone_waits = True
+            self.changed.wait_for(lambda: any(inbox.has_work for inbox in inboxes), timeout_s)
+            self.someone_waits = False
+
+
+class Inbox:
+    """Bounded queues of a node's ports, taken from as one. Inboxes of one thread share a wakeup."""
+
+    def __init__(self, ports: Sequence[QueueSettings], wakeup: Wakeup | None = None) -> None:
+        self._ports: list[deque[Item]] = [deque() for _ in ports]
+        self._depths = [port.depth for port in ports]
+        self._order = 0
+        self.wakeup = wakeup or Wakeup()
+        self._changed = self.wakeup.changed
+        self._closed = False
+        self._close_reported = False
+        self.dropped = [0] * len(self._ports)
+        """Messages of each port that were never taken."""
+
+    def put(self, port: int, number: int, arrival_ns: int, message: Message) -> None:
+        """Add a message. A full port drops its oldest."""
+        with self._changed:
+            queue = self._ports[port]
+            if self._closed:
+                self.dropped[port] += 1
+                return
+            if len(queue) >= self._depths[port]:
+                queue.popleft()
+                self.dropped[port] += 1
+            queue.append(Item(self._order, port, number, arrival_ns, message))
+            self._order += 1
+            if self.wakeup.someone_waits:
+                self._changed.notify_all()
+
+    def take(self) -> Item | None:
+        """The queued message that was put first; None: no message is queued."""
+        with self._changed:
+            queue = self._first()
+            return None if queue is None else queue.popleft()
+
+    def take_all(self) -> list[Item]:
+        """All queued messages, in the order of putting."""
+        with self._changed:
+            items = sorted(item for queue in self._ports for item in queue)
+            for queue in self._ports:
+                queue.clear()
+        return items
+
+    def _first(self) -> deque[Item] | None:
+        first: deque[Item] | None = None
+        for queue in self._ports:
+            if queue and (first is None or queue[0] < first[0]):
+                first = queue
+        return first
+
+    def close(self) -> None:
+        """Drop whatever is put from now on; queued messages can still be taken."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def clear(self) -> None:
+        """Drop all queued messages."""
+        with self._changed:
+            for port, queue in enumerate(self._ports):
+                self.dropped[port] += len(queue)
+                queue.clear()
+            self._changed.notify_all()
+
+    @property
+    def has_work(self) -> bool:
+        """Whether a message is queued, or the inbox has closed (True once)."""
+        if self._closed and not self._close_reported:
+            self._close_reported = True
+            return True
+        return any(self._ports)
+
+    @property
+    def done(self) -> bool:
+        """Whether it is closed and empty."""
+        with self._changed:
+            return self._closed and not any(self._ports)
+
+    def waiting(self, port: int) -> int:
+        """Number of queued messages of a port."""
+        return len(self._ports[port])

@@ -22,7 +22,6 @@ from matplotlib.axes import Axes
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = Path(__file__).resolve().parent / "images"
-NOTE = "FLU everywhere in grd;\nFRD and NED only in links/mavlink:\nF = diag(1, -1, -1)"
 TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 
 

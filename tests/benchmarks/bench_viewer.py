@@ -1,6 +1,6 @@
 """What the viewer costs the run: `see` beside doing the same drawing in the caller's thread, and a slice's thinning.
 
-Run: python -m pytest tests/benchmarks/bench_viewer.py --benchmark-only
+Run: python -m pytest tests/benchoverlays/bench_viewer.py --benchmark-only
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import rerun.blueprint as rrb
 from flow.link import Run
 from links.viewer import Viewer
 from links.viewer.draw import draw
+from links.viewer.message_queue import Slicer, thin
 from links.viewer.scene import Scene
-from links.viewer.slices import Slicer, thin
 from links.viewer.stream import Stream
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "viewer"))
@@ -48,8 +48,8 @@ def test_see_a_second_of_messages(benchmark, viewer, run):
 class RowByRow(Stream):
     """Each number of a curve written when it comes."""
 
-    def put(self, mark, *, static=False):
-        super().put(mark, static=static)
+    def put(self, entity, *, static=False):
+        super().put(entity, static=static)
         self._write_curves()
 
 
@@ -67,8 +67,8 @@ def test_draw_a_second_of_messages_in_the_caller(benchmark, tmp_path, run, slice
         for output, content in RUNS[run]:
             for name, stamp_ns, ready in slicer.add(output, content):
                 stream.at(stamp_ns)
-                for mark in draw(ready, name.replace(".", "/"), scene):
-                    stream.put(mark)
+                for entity in draw(ready, name.replace(".", "/"), scene):
+                    stream.put(entity)
 
     benchmark.pedantic(draw_all, rounds=2)
     benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(RUNS[run]) * 1e6, 2)

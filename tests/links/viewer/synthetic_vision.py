@@ -36,7 +36,7 @@ MERMAID = (
 )
 
 
-def picture(stamp_ns: int = 0, frame_id: str = "camera_vehicle", size_px: int = SIZE_PX) -> Image:
+def camera_image(stamp_ns: int = 0, frame_id: str = "camera_vehicle", size_px: int = SIZE_PX) -> Image:
     grey = np.tile(np.linspace(30, 220, size_px).astype(np.uint8), (size_px, 1))
     return Image(stamp_ns=stamp_ns, frame_id=frame_id, grey=grey)
 
@@ -120,8 +120,8 @@ def run(duration_s: float) -> Iterator[tuple[str, Message]]:
         yield output, content
         if content.stamp_ns < due_ns:
             continue
-        yield "camera_vehicle.image", picture(due_ns)
-        yield "camera_drone.image", picture(due_ns, "camera_drone")
+        yield "camera_vehicle.image", camera_image(due_ns)
+        yield "camera_drone.image", camera_image(due_ns, "camera_drone")
         yield "vp_vehicle.vanishing_directions", directions(due_ns)
         blind = k % 5 == 4
         yield "vp_drone.vanishing_directions", directions(due_ns, CameraMount.DRONE, 0 if blind else 3)

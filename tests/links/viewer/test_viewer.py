@@ -18,8 +18,7 @@ from rerun.chunk import RrdReader
 from flow.link import Run
 from flow.message import Message, message
 from links.viewer import Viewer
-from links.viewer.mailbox import Mailbox
-from links.viewer.slices import Slicer, join, thin
+from links.viewer.message_queue import MessageQueue, Slicer, join, thin
 from tests.links.ports import free_port
 
 
@@ -46,7 +45,7 @@ def ticks(number: int, start_ns: int = 0) -> list[Tick]:
 
 
 def test_a_full_box_drops_the_oldest_and_counts_it_by_output():
-    box: Mailbox[int] = Mailbox(3, lossless=False, patience_s=1.0)
+    box: MessageQueue[int] = MessageQueue(3, lossless=False, timeout_s=1.0)
     for k in range(5):
         box.put("early" if k < 2 else "late", k)
     assert box.take() == [("late", 2), ("late", 3), ("late", 4)]
@@ -54,7 +53,7 @@ def test_a_full_box_drops_the_oldest_and_counts_it_by_output():
 
 
 def test_a_lossless_box_waits_and_keeps_everything_in_order():
-    box: Mailbox[int] = Mailbox(4, lossless=True, patience_s=10.0)
+    box: MessageQueue[int] = MessageQueue(4, lossless=True, timeout_s=10.0)
     got: list[int] = []
 
     def take_all() -> None:
@@ -72,7 +71,7 @@ def test_a_lossless_box_waits_and_keeps_everything_in_order():
 
 
 def test_a_lossless_box_does_not_wait_for_a_stalled_taker_for_ever():
-    box: Mailbox[int] = Mailbox(2, lossless=True, patience_s=0.05)
+    box: MessageQueue[int] = MessageQueue(2, lossless=True, timeout_s=0.05)
     for k in range(100):  # waits once, not a hundred times
         box.put("x", k)
     assert box.dropped == {"x": 98}
@@ -80,7 +79,7 @@ def test_a_lossless_box_does_not_wait_for_a_stalled_taker_for_ever():
 
 
 def test_a_closed_box_takes_no_more_and_says_so():
-    box: Mailbox[int] = Mailbox(2, lossless=True, patience_s=10.0)
+    box: MessageQueue[int] = MessageQueue(2, lossless=True, timeout_s=10.0)
     box.put("x", 1)
     box.close()
     box.put("x", 2)
@@ -146,7 +145,7 @@ def test_every_edge_of_a_run_is_in_the_file_on_the_sensors_time(tmp_path):
         "/depth/sweep/depth_image",
         "/score/detect/score_image",
         "/vehicle/detect/detections/accepted",
-        "/marks/detect/detections/accepted",
+        "/overlays/detect/detections/accepted",
         "/vehicle/track/drone_fix/drone_1/ellipsoid_95",
         "/plots/hits/track/track_state/drone_1",
         "/states/track",
@@ -235,7 +234,7 @@ sys.stdout.write(repr(list(viewer.errors.items())))
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=root, capture_output=True, text=True, timeout=60, check=True
     )
-    assert "run.rrd ends early: File too large" in done.stdout
+    assert "run.rrd is truncated: File too large" in done.stdout
     assert done.stdout.endswith("1)]")
     assert (tmp_path / "run.rrd").stat().st_size == 300_000
 
@@ -249,7 +248,7 @@ def test_no_space_left_is_said_once(tmp_path):
         viewer.see(output, content, 0)
     viewer.close()
     ((text, count),) = viewer.errors.items()
-    assert "run.rrd ends early: No space left on device" in text
+    assert "run.rrd is truncated: No space left on device" in text
     assert count == 1
 
 
@@ -309,7 +308,7 @@ def test_a_taken_port_is_said_and_the_file_is_written_all_the_same(tmp_path):
         viewer.see("clock.tick", ticks(1)[0], 0)
         viewer.close()
     (text,) = viewer.errors
-    assert text.startswith(f"port {viewer.settings.port} is taken")
+    assert text.startswith(f"port {viewer.settings.port} is in use")
     assert rows(tmp_path / "run.rrd")["/plots/other/clock/tick/count"] == 1
 
 

@@ -71,21 +71,21 @@ def test_a_run_of_the_lidar_alone_without_mount_is_shown_too(tmp_path):
 def test_a_damaged_file_is_named_and_does_not_hang(tmp_path):
     damaged = tmp_path / "damaged.rrd"
     damaged.write_bytes(b"no rerun recording" * 100)
-    with pytest.raises(LinkError, match=r"damaged\.rrd: the viewer cannot show it"):
+    with pytest.raises(LinkError, match=r"damaged\.rrd: the viewer cannot load it"):
         complaints(damaged, tmp_path / "x.png")
 
 
-def test_a_run_that_was_cut_short_can_be_mended_as_the_error_says(tmp_path):
+def test_a_run_that_was_cut_short_can_be_recovered_as_the_error_says(tmp_path):
     rrd = record(tmp_path, 0.5)
     rrd.write_bytes(rrd.read_bytes()[: rrd.stat().st_size // 2])
-    with pytest.raises(LinkError, match=r"rerun rrd merge .*run\.rrd -o mended\.rrd"):
+    with pytest.raises(LinkError, match=r"rerun rrd merge .*run\.rrd -o recovered\.rrd"):
         complaints(rrd, tmp_path / "x.png")
-    mended = tmp_path / "mended.rrd"
+    recovered = tmp_path / "recovered.rrd"
     subprocess.run(
-        [sys.executable, "-m", "rerun_cli", "rrd", "merge", rrd, "-o", mended], check=True, capture_output=True
+        [sys.executable, "-m", "rerun_cli", "rrd", "merge", rrd, "-o", recovered], check=True, capture_output=True
     )
-    entities = {chunk.entity_path for chunk in RrdReader(mended).stream().to_chunks()}
-    assert "/frames/turntable" in entities
+    paths = {chunk.entity_path for chunk in RrdReader(recovered).stream().to_chunks()}
+    assert "/frames/turntable" in paths
 
 
 @pytest.mark.skipif("DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ, reason="would open a window")

@@ -1,4 +1,4 @@
-"""What the viewer costs the run: `see` beside doing the same drawing in the caller's thread, and a slice's thinning.
+"""Cost of the viewer for the run: `see`, compared with drawing in the caller's thread, and thinning of a slice.
 
 Run: python -m pytest tests/benchoverlays/bench_viewer.py --benchmark-only
 """
@@ -28,7 +28,7 @@ RUNS = {"paper": list(synthetic.run(1.0)), "evidence": list(synthetic.run_by_evi
 
 @pytest.fixture
 def viewer(tmp_path):
-    """A viewer that never drops nor waits in the time of a benchmark."""
+    """A viewer that neither drops nor blocks within a benchmark."""
     tap = Viewer(queue_size=10_000_000)
     tap.open(Run(out_dir=tmp_path, name="bench", mermaid="", settings_yaml=""))
     yield tap
@@ -46,7 +46,7 @@ def test_see_a_second_of_messages(benchmark, viewer, run):
 
 
 class RowByRow(Stream):
-    """Each number of a curve written when it comes."""
+    """Writes each number of a curve as it arrives."""
 
     def put(self, entity, *, static=False):
         super().put(entity, static=static)
@@ -58,7 +58,7 @@ class RowByRow(Stream):
 )
 @pytest.mark.parametrize("run", RUNS)
 def test_draw_a_second_of_messages_in_the_caller(benchmark, tmp_path, run, slice_s, kind):
-    """As the viewer does, beside each number of a curve written by itself, and each packet drawn by itself."""
+    """Compares the viewer's batches with writing each number of a curve and drawing each packet on its own."""
     stream = kind(tmp_path / "bench.rrd", None, "256MiB", Counter(), rrb.Blueprint())
 
     def draw_all():

@@ -1,4 +1,4 @@
-"""What a message becomes, for tests: the entities by path, and the numbers and words in them."""
+"""Helpers to draw one message and read the entities: by path, and the numbers and texts in them."""
 
 from __future__ import annotations
 
@@ -28,5 +28,5 @@ def values_of(batch) -> list:
     return batch.as_arrow_array().to_pylist()
 
 
-def page(entity: Entity) -> str:
+def document(entity: Entity) -> str:
     return values_of(entity.archetypes[0].text)[0]

@@ -1,4 +1,4 @@
-"""Pictures, lines and rotations as a run with two fisheyes would tell them, built by hand: no stage is involved."""
+"""Images, lines and rotations of a run with two fisheyes, built by hand, without any stage."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def motion(stamp_ns: int = PERIOD_NS, **changes) -> VisualMotion:
 
 
 def run(duration_s: float) -> Iterator[tuple[str, Message]]:
-    """A run by evidence, and both cameras ten times a second; the drone's sees no structure in every fifth picture."""
+    """A run with candidates and both cameras at 10 Hz; every fifth image of the drone has no structure."""
     due_ns, k = synthetic.START_NS, 0
     for output, content in synthetic.run_by_evidence(duration_s):
         yield output, content

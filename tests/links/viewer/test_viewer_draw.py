@@ -1,4 +1,4 @@
-"""What each message becomes: paths, frames and numbers, by hand."""
+"""Entities of each message: paths, frames and numbers, computed by hand."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import enum
 import numpy as np
 import pytest
 import synthetic
-from drawing import drawn, numbers, page, scene
+from drawing import document, drawn, numbers, scene
 
 from flow.message import Mat3, Message, Points64, message
 from links.viewer import colours, draw_sensors
@@ -55,7 +55,7 @@ def test_the_ellipsoid_holds_95_percent_of_a_known_covariance():
     assert inside.mean() == pytest.approx(0.95, abs=0.004)
 
 
-def test_the_ellipsoid_turns_with_its_covariance():
+def test_the_ellipsoid_rotates_with_its_covariance():
     turn = rotation_from_rpy_deg((20.0, -35.0, 70.0))
     covariance = turn @ np.diag([0.01, 0.04, 0.09]) @ turn.T
     half_sizes_m, axes = ellipsoid(covariance)
@@ -64,7 +64,7 @@ def test_the_ellipsoid_turns_with_its_covariance():
 
 
 @pytest.mark.parametrize("rpy_deg", [(0, 0, 0), (180, 0, 0), (0, 180, 0), (0, 0, 180), (12, -50, 170)])
-def test_a_quaternion_turns_as_its_matrix_does(rpy_deg):
+def test_a_quaternion_equals_its_rotation_matrix(rpy_deg):
     rotation = rotation_from_rpy_deg(rpy_deg)
     x, y, z, w = quaternions_xyzw(rotation[None])[0]
     np.testing.assert_allclose(rotation_from_quaternion_xyzw((x, y, z, w)), rotation, atol=1e-12)
@@ -90,7 +90,7 @@ def test_a_fix_is_an_ellipsoid_in_the_vehicle_frame_with_trail_and_curves():
     assert label == ["drone 1: 13.0 m, 5 returns"]
 
 
-def test_a_trail_is_broken_by_a_pause_and_forgets_what_is_old():
+def test_a_trail_is_split_at_a_gap_and_drops_old_fixes():
     where = scene(trail_s=5.0)
     for second in (0.0, 0.5, 4.0, 4.5, 5.2):
         strips = where.trail("track/drone_fix", fix(int(second * 1e9), xyz=(second, 0.0, 10.0)))
@@ -104,7 +104,7 @@ def test_the_close_up_follows_the_first_of_two_trackers():
     assert "frames/drone_position" in drawn(fix(), "track/drone_fix", where)
 
 
-def test_candidates_are_marked_where_they_lie_in_the_depth_image():
+def test_candidates_have_rings_at_their_pixels_in_the_depth_image():
     where = scene()
     drawn(image(np.zeros((40, 60), np.float32)), "sweep/depth_image", where)
     candidates = Detections(
@@ -125,18 +125,18 @@ def test_candidates_are_marked_where_they_lie_in_the_depth_image():
     np.testing.assert_allclose(
         numbers(entities["overlays/detect/detections/rejected"].archetypes[0].centers), [[32.0, 22.0]]
     )
-    refused = entities["vehicle/detect/detections/rejected"].archetypes[0]
-    assert refused.labels.as_arrow_array().to_pylist() == [
+    rejected = entities["vehicle/detect/detections/rejected"].archetypes[0]
+    assert rejected.labels.as_arrow_array().to_pylist() == [
         "candidate 2, e = 2.0: touches a wall",
         "candidate 3, e = 3.0: below",
     ]
-    assert numbers(refused.positions).shape == (2, 3)
+    assert numbers(rejected.positions).shape == (2, 3)
     assert entities["labels/detect/detections"].archetypes[0].labels.as_arrow_array().to_pylist() == ["candidate 1"]
-    assert "- 2: e = 2.0, rejected at 1.0 / 1.0 / 5.2 m: touches a wall" in page(entities["candidates"])
+    assert "- 2: e = 2.0, rejected at 1.0 / 1.0 / 5.2 m: touches a wall" in document(entities["candidates"])
     assert entities["log/detect/detections"].archetypes[0].text.as_arrow_array().to_pylist() == ["drone at 10.4 m"]
 
 
-def test_no_candidate_is_drawn_as_no_drone():
+def test_a_search_without_candidates_is_drawn_as_no_drone():
     nothing = Detections(
         stamp_ns=0,
         xyz_vehicle_m=np.zeros((0, 3)),
@@ -149,10 +149,10 @@ def test_no_candidate_is_drawn_as_no_drone():
     )
     entities = drawn(nothing, "detect/detections")
     assert entities["states/detect"].archetypes[0].state.as_arrow_array().to_pylist() == ["no drone"]
-    assert len(entities["labels/detect/detections"].archetypes[0].positions) == 0  # an earlier label goes away
+    assert len(entities["labels/detect/detections"].archetypes[0].positions) == 0  # an earlier label is removed
 
 
-def test_a_lane_changes_only_when_the_state_does():
+def test_a_state_lane_changes_only_with_the_state():
     where = scene()
     seen = [
         "states/track" in drawn(track_state(state), "track/track_state", where)
@@ -161,7 +161,7 @@ def test_a_lane_changes_only_when_the_state_does():
     assert seen == [True, False, True, True]
 
 
-def test_the_servo_turns_the_turntable_as_the_mount_says():
+def test_the_servo_rotates_the_turntable_according_to_the_mount():
     state = ServoState(stamp_ns=0, position_rad=np.pi / 2, velocity_radps=0.5, goal_rad=1.0, error=4)
     entities = drawn(state, "servo/servo_state")
     np.testing.assert_allclose(entities["plots/servo/servo/servo_state"].values, [90.0, 57.29578])
@@ -173,14 +173,14 @@ def test_the_servo_turns_the_turntable_as_the_mount_says():
     np.testing.assert_allclose(columns.T, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-7)
 
 
-def test_without_a_mount_no_frame_is_made_up():
+def test_without_a_mount_no_turntable_frame_is_drawn():
     assert {entity.path for entity in static_entities(None)} == {"vehicle/axes", "vehicle/name"}
     assert [entity.path for entity in initial_frames(None)] == ["frames/drone_position"]
     state = ServoState(stamp_ns=0, position_rad=1.0, velocity_radps=0.0, goal_rad=1.0, error=0)
     assert "frames/turntable" not in drawn(state, "servo/servo_state", scene(mount=None))
 
 
-def test_slices_of_the_cloud_take_turns_and_the_drone_is_warm():
+def test_slices_of_the_cloud_reuse_their_paths_and_the_drone_has_its_colour():
     where = scene(history_s=0.3)
     drawn(fix(xyz=(6.0, 0.0, 12.0)), "track/drone_fix", where)
     _, swept = synthetic.packet(0.0)
@@ -195,7 +195,7 @@ def test_slices_of_the_cloud_take_turns_and_the_drone_is_warm():
 
 
 def test_the_range_image_has_the_highest_beam_on_top():
-    firings, _ = synthetic.packet(0.05)  # half a turn on, the beams look down
+    firings, _ = synthetic.packet(0.05)  # half a revolution later, the beams point down
     pixels = draw_sensors.range_counts(firings)
     assert pixels.shape == (16, 900)
     pulse = int(np.flatnonzero(firings.range_m > 0)[0])
@@ -226,42 +226,42 @@ def test_the_best_score_is_the_brightest_and_no_candidate_is_black():
     assert not nothing.any()
 
 
-class Mood(enum.Enum):
+class Mode(enum.Enum):
     CALM = 0
 
 
 @message
-class Unheard(Message):
+class Unknown(Message):
     """A type the viewer has no function for."""
 
     level_v: float
     count: int
     healthy: bool
-    mood: Mood
-    words: str
+    mode: Mode
+    text: str
     points_vehicle_m: Points64
     covariance_m2: Mat3
     samples: np.ndarray
 
 
 def test_a_message_of_unknown_type_is_visible_field_by_field():
-    content = Unheard(
+    content = Unknown(
         stamp_ns=0,
         level_v=12.5,
         count=3,
         healthy=True,
-        mood=Mood.CALM,
-        words="hello",
+        mode=Mode.CALM,
+        text="hello",
         points_vehicle_m=np.arange(30.0).reshape(10, 3),
         covariance_m2=np.eye(3),
         samples=np.arange(100.0),
     )
-    entities = drawn(content, "power/unheard")
-    assert entities["plots/other/power/unheard/level_v"].values == [12.5]
-    assert entities["plots/other/power/unheard/count"].values == [3]
-    assert entities["plots/other/power/unheard/healthy"].values == [1]
-    assert entities["states/power/unheard/mood"].archetypes[0].state.as_arrow_array().to_pylist() == ["CALM"]
-    assert entities["log/power/unheard/words"].archetypes[0].text.as_arrow_array().to_pylist() == ["hello"]
-    assert entities["vehicle/power/unheard/points_vehicle_m"].frame == "vehicle"
-    assert len(entities["plots/other/power/unheard/covariance_m2"].values) == 9
-    np.testing.assert_allclose(entities["plots/other/power/unheard/samples"].values, [100, 0.0, 49.5, 99.0])
+    entities = drawn(content, "power/unknown")
+    assert entities["plots/other/power/unknown/level_v"].values == [12.5]
+    assert entities["plots/other/power/unknown/count"].values == [3]
+    assert entities["plots/other/power/unknown/healthy"].values == [1]
+    assert entities["states/power/unknown/mode"].archetypes[0].state.as_arrow_array().to_pylist() == ["CALM"]
+    assert entities["log/power/unknown/text"].archetypes[0].text.as_arrow_array().to_pylist() == ["hello"]
+    assert entities["vehicle/power/unknown/points_vehicle_m"].frame == "vehicle"
+    assert len(entities["plots/other/power/unknown/covariance_m2"].values) == 9
+    np.testing.assert_allclose(entities["plots/other/power/unknown/samples"].values, [100, 0.0, 49.5, 99.0])

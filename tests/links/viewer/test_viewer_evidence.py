@@ -1,4 +1,4 @@
-"""Candidates with reasons, answers with probabilities, several drones with states: what is seen of them, by hand."""
+"""Candidates with reasons, detections with probabilities, several drones with states: entities computed by hand."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rerun as rr
 import synthetic
-from drawing import drawn, numbers, page, scene, values_of
+from drawing import document, drawn, numbers, scene, values_of
 
 from links.viewer import colours
 from links.viewer.message_queue import Slicer
@@ -16,7 +16,7 @@ from stages.messages import Candidates, ServoGoal, SweptPulses, TrackingState, T
 
 
 def candidates(stamp_ns: int, **found: tuple[float, str]) -> Candidates:
-    """`c7=(0.2, "why")`: candidate 7, 7 m up, hit 0.5 s ago."""
+    """`c7=(0.2, "why")`: candidate 7, 7 m above the vehicle, last return 0.5 s ago."""
     numbers_ = [int(name[1:]) for name in found]
     n = len(found)
     return Candidates(
@@ -58,14 +58,14 @@ def fix(number: int = 1, stamp_ns: int = 0, x_m: float = 3.0):
     )
 
 
-def test_a_candidate_is_a_dot_by_probability_with_number_and_reason():
-    found = candidates(0, c7=(0.2, "it may stand still"), c3=(0.999, "9 looks"))
+def test_a_candidate_is_a_coloured_point_with_number_and_reason():
+    found = candidates(0, c7=(0.2, "it may be static"), c3=(0.999, "9 looks"))
     entities = drawn(found, "detect/candidates")
     dots = entities["vehicle/detect/candidates"]
     assert dots.frame == "vehicle"
     np.testing.assert_allclose(numbers(dots.archetypes[0].positions), [[1, 2, 7], [1, 2, 3]])
     assert values_of(dots.archetypes[0].labels) == [
-        "candidate 7: 20.0 %, it may stand still",
+        "candidate 7: 20.0 %, it may be static",
         "candidate 3: 99.9 %, 9 looks",
     ]
     assert values_of(entities["labels/detect/candidates"].archetypes[0].labels) == ["7: 20.0 %", "3: 99.9 %"]
@@ -73,11 +73,11 @@ def test_a_candidate_is_a_dot_by_probability_with_number_and_reason():
     assert packed == colours.by_probability(found.probability).tolist()
     percent = entities["plots/probability/detect/candidates"].values
     np.testing.assert_allclose(percent, [99.9, 20.0])
-    text = page(entities["candidates"])
-    assert "- 7: 20.0 %, last return 0.5 s ago at 1.0 / 2.0 / 7.0 m: it may stand still" in text
+    text = document(entities["candidates"])
+    assert "- 7: 20.0 %, last return 0.5 s ago at 1.0 / 2.0 / 7.0 m: it may be static" in text
 
 
-def test_colours_go_from_red_over_violet_to_green_evenly_in_the_odds():
+def test_colours_go_from_red_over_violet_to_green_linearly_in_the_log_odds():
     red, low, even, high, green = colours.by_probability(np.array([0.0, 0.1, 0.5, 0.9, 1.0])).tolist()
     assert (red, green) == (0xE07070FF, colours.ACCEPTED)
     assert [(even >> shift & 255) - (colours.CANDIDATE >> shift & 255) for shift in (24, 16, 8, 0)] == pytest.approx(
@@ -86,17 +86,17 @@ def test_colours_go_from_red_over_violet_to_green_evenly_in_the_odds():
     assert len({red, low, even, high, green}) == 5
 
 
-def test_no_candidate_takes_the_dots_away():
+def test_an_empty_list_of_candidates_removes_the_points():
     where = scene()
     drawn(candidates(0, c1=(0.1, "x")), "detect/candidates", where)
     entities = drawn(candidates(1), "detect/candidates", where)
     assert len(numbers(entities["vehicle/detect/candidates"].archetypes[0].positions)) == 0
     assert len(numbers(entities["labels/detect/candidates"].archetypes[0].positions)) == 0
     np.testing.assert_allclose(entities["plots/probability/detect/candidates"].values, [0.0, 0.0])
-    assert "no candidate" in page(entities["candidates"])
+    assert "no candidate" in document(entities["candidates"])
 
 
-def test_what_became_of_a_dropped_candidate_stays_in_the_log():
+def test_a_removed_candidate_is_logged():
     where = scene()
     first = drawn(candidates(0, c4=(0.001, "if not a drone, a bird"), c5=(0.7, "x")), "detect/candidates", where)
     assert "log/detect/candidates" not in first
@@ -106,9 +106,7 @@ def test_what_became_of_a_dropped_candidate_stays_in_the_log():
     assert values_of(entry.level) == ["INFO"]
     assert "log/detect/candidates" not in drawn(candidates(10**9, c5=(0.7, "x")), "detect/candidates", where)
     gone = drawn(candidates(2 * 10**9), "detect/candidates", where)
-    assert values_of(gone["log/detect/candidates"].archetypes[0].level) == [
-        "WARN"
-    ]  # it was more likely a drone than not
+    assert values_of(gone["log/detect/candidates"].archetypes[0].level) == ["WARN"]  # its probability was above 0.5
 
 
 def test_a_candidate_that_is_tracked_has_the_drones_label_only():
@@ -121,33 +119,35 @@ def test_a_candidate_that_is_tracked_has_the_drones_label_only():
     assert len(numbers(entities["vehicle/detect/candidates"].archetypes[0].positions)) == 2
 
 
-def test_an_answer_by_evidence_tells_why_each_candidate_was_refused():
+def test_detections_list_the_reason_for_each_rejected_candidate():
     answer = next(c for output, c in synthetic.run_by_evidence(2.0) if output == "detect.detections")
     entities = drawn(answer, "detect/detections")
     assert values_of(entities["vehicle/detect/detections/accepted"].archetypes[0].labels) == [
         "candidate 3, 99.2 %: 9 looks"
     ]
     assert values_of(entities["vehicle/detect/detections/rejected"].archetypes[0].labels) == [
-        "candidate 5, 1.0 %: beside something big; if not a drone, a lamp, wire or edge"
+        "candidate 5, 1.0 %: next to a large object; if not a drone, a lamp, wire or edge"
     ]
     np.testing.assert_allclose(entities["plots/probability/detect/detections"].values, [99.2, 1.0], atol=1e-9)
-    assert "labels/detect/detections" not in entities  # it stands where the candidate was; Candidates tell where it is
-    text = page(entities["candidates"])
-    assert "- 5: 1.0 %, rejected at -16.0 / -23.0 / 8.0 m: beside something big" in text
+    assert (
+        "labels/detect/detections" not in entities
+    )  # a detection has the position of the search; Candidates has the current one
+    text = document(entities["candidates"])
+    assert "- 5: 1.0 %, rejected at -16.0 / -23.0 / 8.0 m: next to a large object" in text
     assert "- 3: 99.2 %, accepted" in text
 
 
-def test_the_page_keeps_the_answer_beside_the_present():
+def test_the_document_keeps_the_last_search_after_the_current_candidates():
     where = scene()
     answer = next(c for output, c in synthetic.run_by_evidence(2.0) if output == "detect.detections")
     drawn(answer, "detect/detections", where)
-    text = page(drawn(candidates(0, c7=(0.2, "alone")), "detect/candidates", where)["candidates"])
+    text = document(drawn(candidates(0, c7=(0.2, "alone")), "detect/candidates", where)["candidates"])
     assert (
         text.index("detect, now") < text.index("7: 20.0 %") < text.index("detect, last search") < text.index("5: 1.0 %")
     )
 
 
-def test_each_drone_has_a_place_and_a_way_of_its_own():
+def test_each_drone_has_its_own_position_and_trail():
     where = scene()
     for k in range(3):
         one = drawn(fix(1, k * 10**8, x_m=float(k)), "track/drone_fix", where)
@@ -164,7 +164,7 @@ def test_each_drone_has_a_place_and_a_way_of_its_own():
     assert "frames/drone_position" not in two  # the close-up stays with the first
 
 
-def test_the_close_up_goes_to_the_next_drone_when_the_first_is_lost():
+def test_the_close_up_follows_the_next_drone_when_the_first_is_lost():
     where = scene()
     drawn(fix(1), "track/drone_fix", where)
     drawn(fix(2), "track/drone_fix", where)
@@ -172,7 +172,7 @@ def test_the_close_up_goes_to_the_next_drone_when_the_first_is_lost():
     assert "frames/drone_position" in drawn(fix(2), "track/drone_fix", where)
 
 
-def test_a_coasting_drone_is_where_it_is_predicted_and_its_ellipsoid_grows():
+def test_a_coasting_drone_is_at_its_prediction_and_its_ellipsoid_grows():
     where, sizes = scene(), []
     for k, sigma_m in enumerate((0.1, 0.4, 1.6)):
         entities = drawn(state(TrackingState.COASTING, sigma_m=sigma_m, stamp_ns=k), "track/track_state", where)
@@ -188,7 +188,7 @@ def test_a_coasting_drone_is_where_it_is_predicted_and_its_ellipsoid_grows():
     assert int(numbers(arrow.colors).ravel()[0]) == colours.COASTING
 
 
-def test_a_lost_drone_leaves_its_way_and_nothing_else():
+def test_a_lost_drone_keeps_its_trail_and_nothing_else():
     where = scene()
     drawn(fix(2), "track/drone_fix", where)
     drawn(state(TrackingState.TRACKING, 2), "track/track_state", where)
@@ -203,19 +203,19 @@ def test_a_lost_drone_leaves_its_way_and_nothing_else():
         "labels/track/drone_fix/drone_2",
     }
     assert values_of(entities["states/track/drone_2"].archetypes[0].state) == ["LOST"]
-    assert page(entities["status"]) == "**track:** drone 2: LOST: why"
+    assert document(entities["status"]) == "**track:** drone 2: LOST: why"
     assert not where.near_a_drone(np.array([[3.0, 4.0, 12.0]])).any()
 
 
-def test_the_lane_of_a_tracker_shows_the_most_it_does_and_each_drone_has_one_too():
-    where, lane, second = scene(), [], []
+def test_the_state_of_a_tracker_is_that_of_its_best_drone_and_each_drone_has_its_own():
+    where, states, second = scene(), [], []
     steps = (
         state(TrackingState.SEARCHING, 0, 0),
         state(TrackingState.CANDIDATE, 0, 1),
         state(TrackingState.TRACKING, 1, 2),
-        state(TrackingState.CANDIDATE, 0, 3),  # beside the tracked one: nothing new
+        state(TrackingState.CANDIDATE, 0, 3),  # a hypothesis next to the tracked drone changes nothing
         state(TrackingState.TRACKING, 2, 4),
-        state(TrackingState.COASTING, 1, 5),  # the second is tracked: no less
+        state(TrackingState.COASTING, 1, 5),  # the second is still tracked
         state(TrackingState.TRACKING, 1, 6),
         state(TrackingState.COASTING, 1, 7),
         state(TrackingState.COASTING, 2, 8),
@@ -224,31 +224,31 @@ def test_the_lane_of_a_tracker_shows_the_most_it_does_and_each_drone_has_one_too
     )
     for step in steps:
         entities = drawn(step, "track/track_state", where)
-        lane += values_of(entities["states/track"].archetypes[0].state) if "states/track" in entities else []
+        states += values_of(entities["states/track"].archetypes[0].state) if "states/track" in entities else []
         second += (
             values_of(entities["states/track/drone_2"].archetypes[0].state)
             if "states/track/drone_2" in entities
             else []
         )
-    assert lane == ["SEARCHING", "CANDIDATE", "TRACKING", "COASTING", "LOST"]
+    assert states == ["SEARCHING", "CANDIDATE", "TRACKING", "COASTING", "LOST"]
     assert second == ["TRACKING", "COASTING", "LOST"]
 
 
-def test_each_drones_change_of_state_is_said_once_with_its_reason():
-    where, said = scene(), []
+def test_each_change_of_a_drones_state_is_logged_once_with_its_reason():
+    where, logged = scene(), []
     for step in (TrackingState.TRACKING, TrackingState.TRACKING, TrackingState.COASTING, TrackingState.TRACKING):
         entities = drawn(state(step, 2), "track/track_state", where)
         if "log/track/track_state" in entities:
             entry = entities["log/track/track_state"].archetypes[0]
-            said += [(values_of(entry.text)[0], values_of(entry.level)[0])]
-    assert said == [
+            logged += [(values_of(entry.text)[0], values_of(entry.level)[0])]
+    assert logged == [
         ("drone 2: TRACKING: why", "INFO"),
         ("drone 2: COASTING: why", "WARN"),
         ("drone 2: TRACKING: why", "INFO"),
     ]
 
 
-def test_hypotheses_without_a_number_are_shown_together_and_go_away():
+def test_unnumbered_hypotheses_are_drawn_together_and_cleared():
     where, path = scene(), "vehicle/track/track_state/candidates"
     for k in range(3):
         entities = drawn(
@@ -260,20 +260,18 @@ def test_hypotheses_without_a_number_are_shown_together_and_go_away():
     assert len(numbers(entities[f"{path}/velocity"].archetypes[0].vectors)) == 3
     assert "plots/hits/track/track_state/drone_0" not in entities
     entities = drawn(state(TrackingState.CANDIDATE, 0, 165_000_000), "track/track_state", where)
-    assert (
-        len(numbers(entities[f"{path}/predicted"].archetypes[0].centers)) == 2
-    )  # one of the three was told lately enough
+    assert len(numbers(entities[f"{path}/predicted"].archetypes[0].centers)) == 2  # one of the three is recent enough
     assert path not in drawn(state(TrackingState.TRACKING, 1, 200_000_000), "track/track_state", where)
     entities = drawn(state(TrackingState.TRACKING, 1, 600_000_000), "track/track_state", where)
     assert isinstance(entities[path].archetypes[0], rr.Clear)
-    assert page(entities["status"]) == "**track, drone 1:** TRACKING: why"
+    assert document(entities["status"]) == "**track, drone 1:** TRACKING: why"
     assert path not in drawn(state(TrackingState.TRACKING, 1, 700_000_000), "track/track_state", where)
 
 
-def test_a_tracker_that_predicts_nothing_has_no_ellipsoid_and_one_lane():
+def test_a_tracker_without_prediction_has_no_ellipsoid_and_one_state():
     entities = drawn(
         dataclasses.replace(lost(), state=TrackingState.TRACKING), "track/track_state"
-    )  # as the paper's: state, reason and hits only
+    )  # as the paper's tracker: state, reason and returns only
     assert {path for path in entities if path.startswith(("vehicle", "states"))} == {"states/track"}
 
 
@@ -309,7 +307,7 @@ def test_a_slice_without_pulses_has_no_share():
     assert set(entities) == {"plots/other/sweep/swept_pulses/pulses"}
 
 
-def test_what_the_aim_asks_for_stands_beside_the_servos_angle():
+def test_the_servo_goal_is_a_stepped_curve_next_to_the_servo_angle():
     entities = drawn(ServoGoal(stamp_ns=0, position_rad=np.pi / 6, speed_radps=1.0), "aim/servo_goal")
     np.testing.assert_allclose(entities["plots/servo/aim/servo_goal"].values, [30.0])
     held = [
@@ -320,7 +318,7 @@ def test_what_the_aim_asks_for_stands_beside_the_servos_angle():
     assert len(held) == 1  # as steps: a goal holds until the next
 
 
-def test_the_vehicles_way_is_three_curves_and_a_yaw():
+def test_the_vehicles_position_is_three_curves_and_its_yaw_one():
     R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     motion = VehicleMotion(stamp_ns=0, xyz_map_m=np.array([1.0, 2.0, 0.5]), R_map_vehicle=R, covariance=None)
     entities = drawn(motion, "odometry/vehicle_motion")

@@ -1,4 +1,4 @@
-"""The fused pose in the viewer, and what the autopilot makes of it: states, jumps, what is not known."""
+"""The fused pose and the autopilot's EKF status in the viewer: states, resets, unknown values."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import rerun.blueprint as rrb
-from drawing import drawn, numbers, page, scene
+from drawing import document, drawn, numbers, scene
 
 from links.viewer.layout import Vision, layout
 from links.viewer.stream import Stream
@@ -54,7 +54,7 @@ def test_a_full_pose_has_axes_curves_and_sigmas_in_the_vehicle_s_axes():
     np.testing.assert_allclose(scalars(entities[f"plots/other/{NAME}/age"]), [0.1])
     arrows = entities[f"vehicle/{NAME}/axes"].archetypes[0]
     np.testing.assert_allclose(numbers(arrows.vectors).reshape(3, 3)[0], [0.0, 0.8, 0.0], atol=1e-6)
-    assert page(entities["status"]).startswith(
+    assert document(entities["status"]).startswith(
         "**fuse:** FULL: 1.00 / 2.00 / 10.00 m, sigma 0.30 / 0.20 / 0.40 m; roll"
     )
 
@@ -69,7 +69,7 @@ def test_without_a_rotation_no_axes_and_no_angles_are_shown():
     assert "Clear" in type(entities[f"vehicle/{NAME}/axes"].archetypes[0]).__name__
 
 
-def test_a_lost_pose_clears_all_and_a_jump_is_said():
+def test_a_lost_pose_clears_all_and_a_reset_is_logged():
     where = scene()
     drawn(pose(), NAME, where)
     assert "the pose jumped, reset 1: a new branch" in str(
@@ -79,10 +79,10 @@ def test_a_lost_pose_clears_all_and_a_jump_is_said():
     entities = drawn(lost, NAME, where)
     assert "Clear" in type(entities[f"vehicle/{NAME}"].archetypes[0]).__name__
     assert f"plots/position/{NAME}" not in entities
-    assert page(entities["status"]) == "**fuse:** LOST: no drone"
+    assert document(entities["status"]) == "**fuse:** LOST: no drone"
 
 
-def test_what_the_autopilot_does_not_fuse_is_said_in_words():
+def test_the_status_names_what_the_autopilot_does_not_fuse():
     estimator = AutopilotEstimator(
         stamp_ns=0,
         attitude_good=True,
@@ -97,14 +97,14 @@ def test_what_the_autopilot_does_not_fuse_is_said_in_words():
         flags=5,
     )
     entities = drawn(estimator, "autopilot/autopilot_estimator")
-    assert page(entities["status"]) == "**autopilot, EKF:** no good position; constant position mode"
+    assert document(entities["status"]) == "**autopilot, EKF:** no good position; constant position mode"
     np.testing.assert_allclose(scalars(entities["plots/other/autopilot/autopilot_estimator"])[:3], [0.1, 1.7, 0.2])
 
 
-def test_a_servo_offset_is_shown_beside_the_rig_s():
+def test_a_servo_offset_is_shown_with_that_of_the_rig():
     offset = ServoOffset(stamp_ns=0, offset_s=0.0012, sigma_s=0.0001, rig_s=0.002, windows=2, reason="one window")
     entities = drawn(offset, "servo_clock/servo_offset")
-    assert page(entities["status"]) == "**servo_clock:** 1.20 +- 0.10 ms, rig 2.00 ms; one window"
+    assert document(entities["status"]) == "**servo_clock:** 1.20 +- 0.10 ms, rig 2.00 ms; one window"
     nothing = drawn(dataclasses.replace(offset, offset_s=None, sigma_s=None), "servo_clock/servo_offset")
     assert list(nothing) == ["status"]
 
@@ -125,7 +125,7 @@ def test_a_graph_that_fuses_without_cameras_shows_the_rotation():
 
 
 def test_axes_that_were_cleared_before_they_were_drawn_have_their_frame():
-    """A pose is POSITION_ONLY first, mostly: its axes are cleared before there are any."""
+    """A pose is usually POSITION_ONLY first, so its axes are cleared before they exist."""
     logged = []
 
     class Recording:

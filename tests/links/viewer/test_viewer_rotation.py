@@ -1,4 +1,4 @@
-"""The rotation between vehicle and drone and the drone's motion: probabilities, state, jumps, what is not known."""
+"""The rotation between vehicle and drone and the drone's motion: probabilities, state, switches, unknown values."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import rerun as rr
-from drawing import drawn, numbers, page, scene, values_of
+from drawing import document, drawn, numbers, scene, values_of
 from synthetic_vision import motion, rotation
 
 from links.viewer.draw import draw
@@ -42,7 +42,7 @@ def test_angles_come_back_from_a_rotation(rpy):
     np.testing.assert_allclose(rpy_deg(rotation_from_rpy_deg(rpy)), rpy, atol=1e-9)
 
 
-def test_a_rotation_has_angles_sigma_and_a_sphere_turned_by_it():
+def test_a_rotation_has_angles_sigmas_and_a_rotated_sphere():
     entities = drawn(rotation(), NAME)
     np.testing.assert_allclose(scalars(entities[f"plots/rotation/{NAME}"]), [0.0, 0.0, 30.0], atol=1e-9)
     np.testing.assert_allclose(scalars(entities[f"plots/rotation_sigma/{NAME}"]), [0.1, 0.2, 0.4])
@@ -51,15 +51,15 @@ def test_a_rotation_has_angles_sigma_and_a_sphere_turned_by_it():
     assert values_of(entities["sphere/drone/name"].archetypes[0].labels) == [
         "drone, rotated by the estimate: AMBIGUOUS"
     ]
-    text = page(entities["status"])
+    text = document(entities["status"])
     assert text == (
         "**align:** AMBIGUOUS, 60.0 %: roll / pitch / yaw 0.0 / 0.0 / 30.0 deg, sigma 0.10 / 0.20 / 0.40 deg; "
         "waits for motion"
     )
-    assert f"vehicle/{NAME}/axes" not in entities  # nobody knows where the drone is
+    assert f"vehicle/{NAME}/axes" not in entities  # the position of the drone is unknown
 
 
-def test_the_drones_axes_stand_at_its_fix_and_are_dim_while_the_branch_is_open():
+def test_the_drones_axes_are_at_its_fix_and_dim_while_the_branch_is_ambiguous():
     where = at_a_fix()
     R = rotation_from_rpy_deg((0.0, 0.0, 30.0))
     dim = drawn(rotation(), NAME, where)[f"vehicle/{NAME}/axes"]
@@ -70,7 +70,7 @@ def test_the_drones_axes_stand_at_its_fix_and_are_dim_while_the_branch_is_open()
         assert {int(c) & 0xFF for c in numbers(entity.archetypes[0].colors)} == {alpha}
 
 
-def test_without_rotation_nothing_old_stays_and_the_reason_is_told():
+def test_without_rotation_old_entities_are_cleared_and_the_reason_is_shown():
     where = at_a_fix()
     drawn(rotation(), NAME, where)
     none = rotation(R_vehicle_drone=None, covariance_rad2=None, state=BranchState.NONE, reason="no structure here")
@@ -80,11 +80,11 @@ def test_without_rotation_nothing_old_stays_and_the_reason_is_told():
     np.testing.assert_allclose(numbers(entities["frames/sphere_drone"].archetypes[0].mat3x3).reshape(3, 3), np.eye(3))
     assert values_of(entities["sphere/drone/name"].archetypes[0].labels) == ["drone, own axes"]
     assert values_of(entities["states/align"].archetypes[0].state) == ["NONE"]
-    assert "**align:** NONE: no structure here" in page(entities["status"])
+    assert "**align:** NONE: no structure here" in document(entities["status"])
 
 
-def test_a_switch_of_the_branch_is_said_once_as_a_warning():
-    where, said = scene(), []
+def test_a_branch_switch_is_logged_once_as_a_warning():
+    where, logged = scene(), []
     steps = [
         (BranchState.AMBIGUOUS, 0),
         (BranchState.RESOLVED, 0),
@@ -93,12 +93,12 @@ def test_a_switch_of_the_branch_is_said_once_as_a_warning():
     ]
     for state, switches in steps:
         entities = list(draw(rotation(state=state, switches=switches), NAME, where))
-        said += [
+        logged += [
             (values_of(m.archetypes[0].text)[0], values_of(m.archetypes[0].level)[0])
             for m in entities
             if m.path == f"log/{NAME}"
         ]
-    assert said == [
+    assert logged == [
         ("AMBIGUOUS: waits for motion", "WARN"),
         ("RESOLVED: waits for motion", "INFO"),
         ("the published branch changed, switch 1: waits for motion", "WARN"),
@@ -106,7 +106,7 @@ def test_a_switch_of_the_branch_is_said_once_as_a_warning():
     assert scalars(next(m for m in entities if m.path == f"plots/other/{NAME}/switches")) == [1.0]
 
 
-def test_a_motion_shows_matches_sigma_and_where_the_drone_goes_in_its_own_axes():
+def test_a_motion_shows_matches_sigmas_and_the_direction_of_travel_in_drone_axes():
     entities = drawn(motion(), "drone_odometry/visual_motion")
     assert scalars(entities["plots/matches/drone_odometry/visual_motion"]) == [120.0]
     sigma = "plots/motion_sigma/drone_odometry/visual_motion"
@@ -114,20 +114,21 @@ def test_a_motion_shows_matches_sigma_and_where_the_drone_goes_in_its_own_axes()
     np.testing.assert_allclose(scalars(entities[f"{sigma}/direction"]), [2.0])
     travel = entities["sphere/drone_odometry/visual_motion/travel"]
     assert travel.frame == "sphere_drone"
-    # it turned left by 90 deg meanwhile: what was ahead then is on its right now
+    # the drone yawed left by 90 deg: the former forward direction is now to its right
     np.testing.assert_allclose(numbers(travel.archetypes[0].vectors), [[0.0, -1.4, 0.0]], atol=1e-6)
     assert (
-        page(entities["status"]) == "**drone_odometry:** 120 inlier features over 0.10 s, direction of travel +-2.0 deg"
+        document(entities["status"])
+        == "**drone_odometry:** 120 inlier features over 0.10 s, direction of travel +-2.0 deg"
     )
 
 
-def test_a_drone_that_only_turns_has_no_direction_and_no_old_arrow():
+def test_a_drone_that_only_rotates_has_no_direction_and_no_old_arrow():
     still = dataclasses.replace(motion(), direction_from=None, direction_sigma_rad=None, reason="no motion seen")
     entities = drawn(still, "drone_odometry/visual_motion")
     assert len(entities["sphere/drone_odometry/visual_motion/travel"].archetypes[0].vectors.as_arrow_array()) == 0
     assert "plots/motion_sigma/drone_odometry/visual_motion/direction" not in entities
     assert values_of(entities["states/drone_odometry"].archetypes[0].state) == ["no motion"]
-    assert page(entities["status"]).endswith("no motion seen")
+    assert document(entities["status"]).endswith("no motion seen")
 
 
 def names(vision: Vision) -> set[str]:
@@ -140,7 +141,7 @@ def names(vision: Vision) -> set[str]:
     return below(layout(depth_images=False, candidates=True, vision=vision).root_container)
 
 
-def test_views_of_the_cameras_are_there_only_when_the_graph_has_them():
+def test_camera_views_exist_only_when_the_graph_has_their_outputs():
     without = names(Vision())
     everything = Vision(["camera_drone"], directions=True, rotation=True, odometry=True)
     added = names(everything) - without

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from streets import LOOKS_DOWN, LOOKS_UP, fisheye, foliage, street
+from synthetic_street import LOOKS_DOWN, LOOKS_UP, fisheye, foliage, street
 
 from stages.geometry.frames import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
 from stages.geometry.lens import KannalaBrandt

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.vp.paper_views import RectifiedView, ViewDirection, great_circles, segment_length_px
-from tests.stages.vp.paper_rooms import LENS, SIZE_PX
+from tests.stages.vp.synthetic_courtyard import LENS, SIZE_PX
 
 
 def view(azimuth_deg=0.0, off_axis_deg=60.0, size_px=200, fov_deg=90.0, R=None):

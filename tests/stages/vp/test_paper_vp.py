@@ -14,7 +14,7 @@ from stages.geometry.frames import Pose, rotation_from_rpy_deg
 from stages.messages import CameraMount, Image
 from stages.vp import PaperVp
 from stages.vp.paper_vp import lines_of
-from tests.stages.vp.paper_rooms import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, courtyard, plain
+from tests.stages.vp.synthetic_courtyard import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, courtyard, plain
 
 
 def vp(mount=LOOKS_UP, camera_mount="vehicle", **settings):

@@ -39,7 +39,11 @@ class Arcs:
 
 
 def fit_arcs(
-    chains: Chains, pixel_rays: PixelRays, tolerance_px: float, min_extent_px: float, turn_rad_per_row: Array64 | None = None
+    chains: Chains,
+    pixel_rays: PixelRays,
+    tolerance_px: float,
+    min_extent_px: float,
+    turn_rad_per_row: Array64 | None = None,
 ) -> Arcs:
     """All arcs of all chains with an extent of at least `min_extent_px`.
 
@@ -49,7 +53,9 @@ def fit_arcs(
     tolerance, extent = tolerance_px * pixel_rays.pixel_rad, min_extent_px * pixel_rays.pixel_rad
     min_sigma, middle = MIN_SIGMA_PX * pixel_rays.pixel_rad, 0.5 * (pixel_rays.usable.shape[0] - 1)
     turn = np.zeros(3) if turn_rad_per_row is None else turn_rad_per_row
-    return arcs_of(split_all(chains.points_px, chains.start, pixel_rays.rays, tolerance, extent, min_sigma, turn, middle))
+    return arcs_of(
+        split_all(chains.points_px, chains.start, pixel_rays.rays, tolerance, extent, min_sigma, turn, middle)
+    )
 
 
 def arcs_of(rows: Array64) -> Arcs:

@@ -5,10 +5,10 @@ line's rotation about its middle ray m, the residual has
 
     sigma_r^2 = sigma^2 (t . d)^2 + sigma_model^2,   t = n x m
 
-where sigma_model accounts for lines that are not exactly straight and parallel. All directions are refined together: the rotation of the
-first frame (its axes x, y, and the vertical) and the yaw of every further frame against it,
+where sigma_model accounts for lines that are not exactly straight and parallel. All directions are refined together:
+the rotation of the first frame (its axes x, y, and the vertical) and the yaw of every further frame against it,
 
-    minimise sum w_i (n_i . d_k(i))^2 / sigma_r^2  +  the gravity prior,   w Cauchy, assignment k(i) updated in each iteration.
+    minimise sum w_i (n_i . d_k(i))^2 / sigma_r^2  +  the gravity prior,   w Cauchy, k(i) updated in each iteration.
 
 Source: ours; Manhattan and Atlanta worlds: Coughlan and Yuille 1999, Schindler and Dellaert 2004. DESIGN, Vision.
 """

@@ -28,8 +28,8 @@ from stages.vp.arcs import fit_arcs
 from stages.vp.clustering import cluster
 from stages.vp.directions import lines_of
 from stages.vp.edges import EdgeFinder
-from stages.vp.pixel_rays import PixelRays, Polygon, make_pixel_rays
 from stages.vp.gravity import AttitudeBuffer
+from stages.vp.pixel_rays import PixelRays, Polygon, make_pixel_rays
 from stages.vp.search import FoundDirections, SearchLimits, VerticalPrior, find_structure
 
 MIN_POINTS = 6  # of a chain
@@ -46,7 +46,9 @@ class GreatCircleVpSettings(Settings):
     T_mount_camera: Pose
     lens: Lens
     masked_px: tuple[Polygon, ...] = ()  # polygons of (column, row) over the body of the vehicle or drone
-    max_off_axis_deg: float | None = Field(None, gt=0, le=150)  # rays farther off axis are not used; None: limit of the lens
+    max_off_axis_deg: float | None = Field(
+        None, gt=0, le=150
+    )  # rays farther off axis are not used; None: limit of the lens
     min_contrast: float = Field(8.0, gt=0, le=100)  # of an edge [grey levels]
     tolerance_px: float = Field(1.0, gt=0, le=10)  # largest distance of a line's points from its great circle
     min_extent_px: float = Field(14.0, ge=5)  # shorter arcs are not used
@@ -54,7 +56,9 @@ class GreatCircleVpSettings(Settings):
     vertical_sigma_deg: float = Field(3.0, gt=0, le=60)  # of the mount's z axis against the vertical, without attitude
     attitude_sigma_deg: float = Field(1.0, gt=0, le=30)  # of the attitude's roll and pitch
     attitude_age_s: float = Field(0.2, gt=0)  # maximum age of an attitude
-    search_deg: float | None = Field(None, ge=0, le=90)  # without attitude, the vertical is searched in this cone about z;
+    search_deg: float | None = Field(
+        None, ge=0, le=90
+    )  # without attitude, the vertical is searched in this cone about z;
     # 0: it is z, within `vertical_sigma_deg`. None: 0 for a vehicle, 35 for a drone, which tilts in flight
     max_frames: int = Field(3, ge=1, le=6)  # horizontal pairs; 1: Manhattan
     min_lines: int = Field(4, ge=2)  # of a horizontal pair
@@ -75,7 +79,7 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
 
     def __init__(self, settings: GreatCircleVpSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._eye: PixelRays | None = None
+        self._pixel_rays: PixelRays | None = None
         self._edges: EdgeFinder | None = None
         self._attitudes = AttitudeBuffer()
         self._vehicle = VehicleTrajectory()
@@ -97,16 +101,20 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
         settings = self.settings
         if image.frame_id != f"camera_{settings.camera_mount.value}":
             raise ValueError(
-                f"image has frame_id {image.frame_id}, but the camera_mount of this stage is {settings.camera_mount.value}"
+                f"the image is of {image.frame_id}, but the camera_mount of this stage is {settings.camera_mount.value}"
             )
-        if self._eye is None or self._edges is None or self._eye.usable.shape != image.grey.shape:
-            self._eye = make_pixel_rays(settings.lens, image.grey.shape, settings.max_off_axis_deg, settings.masked_px)
-            self._edges = EdgeFinder(self._eye.usable, settings.min_contrast, MIN_POINTS)
-        pixel_rays = self._eye
+        if self._pixel_rays is None or self._edges is None or self._pixel_rays.usable.shape != image.grey.shape:
+            self._pixel_rays = make_pixel_rays(
+                settings.lens, image.grey.shape, settings.max_off_axis_deg, settings.masked_px
+            )
+            self._edges = EdgeFinder(self._pixel_rays.usable, settings.min_contrast, MIN_POINTS)
+        pixel_rays = self._pixel_rays
         chains = self._edges.find(image.grey)
         R = settings.T_mount_camera.matrix()[:3, :3]
         turn = image.rows_after_s() * (self._rate_radps(image.stamp_ns) @ R)
-        arcs = cluster(fit_arcs(chains, pixel_rays, settings.tolerance_px, settings.min_extent_px, turn), pixel_rays, MAX_LINES)
+        arcs = cluster(
+            fit_arcs(chains, pixel_rays, settings.tolerance_px, settings.min_extent_px, turn), pixel_rays, MAX_LINES
+        )
         lines = lines_of(arcs, R, FULL_WEIGHT_RAD)
         found = find_structure(lines, self._prior(image.stamp_ns), self._limits())
         return self._message(image.stamp_ns, found, lines.normal, arcs.ends @ R.T, arcs.sigma_rad)

@@ -1,7 +1,7 @@
 """Rectified views: square pinhole images resampled from a fisheye, and the line segments in them.
 
-The optical axis of a view is `off_axis_deg` away from the optical axis of the lens, towards `azimuth_deg` in the image (0 right,
-90 down). Pixel (column u, row v) of a view has the ray
+The optical axis of a view is `off_axis_deg` away from the optical axis of the lens, towards `azimuth_deg` in the image
+(0 right, 90 down). Pixel (column u, row v) of a view has the ray
 
     R_camera_view ((u - c) / f, (v - c) / f, 1),   c = (N - 1) / 2,   f = N / (2 tan(fov / 2))
 

@@ -1,6 +1,7 @@
 """Grid vote on the sphere for the intersections of pairs of lines, and completion of two directions to three.
 
-Every pair of lines intersects in one direction v = n_i x n_j (n: normal of a line's great circle), with v and -v equivalent. It adds
+Every pair of lines intersects in one direction v = n_i x n_j (n: normal of a great circle), with v and -v equivalent.
+It adds
 
     w = l_i l_j |sin 2 theta|       l: lengths, theta: angle between the lines in the view
 

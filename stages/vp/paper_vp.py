@@ -84,7 +84,7 @@ class PaperVpSettings(Settings):
         for k, view in enumerate(self.rectified_views()):
             if view.visible_share < MIN_VISIBLE:
                 raise ValueError(
-                    f"views.{k}: only {view.visible_share:.0%} of it is inside the lens; decrease off_axis_deg or fov_deg "
+                    f"views.{k}: only {view.visible_share:.0%} of it is in the lens; decrease off_axis_deg or fov_deg "
                     f"(the lens ends at {self.lens.max_off_axis_deg:g} deg)"
                 )
         return self
@@ -108,7 +108,7 @@ class PaperVp(Stage[PaperVpSettings]):
         lines: list[_Lines] = []
         points: list[Array64] = []
         for view in self._views:
-            lines.append(self._look(view, image, points))
+            lines.append(self._view_lines(view, image, points))
             if (point := lines[-1].point) is not None:
                 points.append(point)
         if len(points) < 2:
@@ -121,7 +121,7 @@ class PaperVp(Stage[PaperVpSettings]):
         reason = f"{len(points)} vanishing points, two at {math.degrees(angle_rad):.1f} deg"
         return self._message(image.stamp_ns, lines, complete(points[i], points[j]), reason)
 
-    def _look(self, view: RectifiedView, image: Image, taken: list[Array64]) -> _Lines:
+    def _view_lines(self, view: RectifiedView, image: Image, taken: list[Array64]) -> _Lines:
         settings = self.settings
         segments = view.segments(view.rectify(image.grey), settings.min_length_px, settings.max_lines)
         ends = view.ends(segments)
@@ -165,7 +165,7 @@ class PaperVp(Stage[PaperVpSettings]):
 
 
 def assign_lines(normal: Array64, directions: Array64, within_rad: float) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Index (m,) of the direction (n, 3) of each line with normal (m, 3): least |n . v| <= sin(within_rad); -1: none."""
+    """Index (m,) of the direction (n, 3) of each normal (m, 3): least |n . v| <= sin(within_rad); -1: none."""
     if not len(directions):
         return np.full(len(normal), -1, dtype=np.int64)
     residual = np.abs(normal @ directions.T)

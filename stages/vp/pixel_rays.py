@@ -28,7 +28,9 @@ class PixelRays:
     pixel_rad: float  # median angle of a usable pixel
 
 
-def make_pixel_rays(lens: Lens, shape: tuple[int, int], max_off_axis_deg: float | None, masked_px: tuple[Polygon, ...]) -> PixelRays:
+def make_pixel_rays(
+    lens: Lens, shape: tuple[int, int], max_off_axis_deg: float | None, masked_px: tuple[Polygon, ...]
+) -> PixelRays:
     """Tables for images of `shape` (h, w). Polygons (column, row) mask the body of the vehicle or drone.
 
     Raises ValueError when no usable pixel is left.

@@ -97,7 +97,9 @@ def _best_pair(lines: Lines, vertical: Array64, prior: VerticalPrior, limits: Se
     axes = upright(vertical)
     spectrum = yaw_spectrum(lines, axes, ~_along_vertical(lines, vertical, limits), limits.sigma_model, BINS)
     found = [
-        refine(lines, axes @ _about_z(yaw), np.zeros(1), prior.up, prior.sigma_rad, limits.sigma_model, TRIAL_ITERATIONS)
+        refine(
+            lines, axes @ _about_z(yaw), np.zeros(1), prior.up, prior.sigma_rad, limits.sigma_model, TRIAL_ITERATIONS
+        )
         for yaw in peaks(spectrum, PEAKS)
     ]
     return max(found, key=lambda s: s.agreement)
@@ -175,7 +177,9 @@ def _sigma(cov: Array64, axes: Array64, d: Array64, frame: int) -> float:
     return math.sqrt(max(float(turn.trace() - local @ turn @ local) / 2, 0.0))  # a rotation about d does not change d
 
 
-def _vertical_only(lines: Lines, v: Array64, prior: VerticalPrior, limits: SearchLimits, peak: float) -> FoundDirections:
+def _vertical_only(
+    lines: Lines, v: Array64, prior: VerticalPrior, limits: SearchLimits, peak: float
+) -> FoundDirections:
     near = _along_vertical(lines, v, limits)
     reason = f"no horizontal structure: best score {peak:.1f} sigma, required {limits.min_score:g}"
     if near.sum() < limits.min_lines or prior.cone_rad > 0:
@@ -189,7 +193,9 @@ def _vertical_only(lines: Lines, v: Array64, prior: VerticalPrior, limits: Searc
 
 
 def _no_directions(m: int, reason: str) -> FoundDirections:
-    return FoundDirections(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.int64), np.full(m, -1, dtype=np.int64), reason)
+    return FoundDirections(
+        np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.int64), np.full(m, -1, dtype=np.int64), reason
+    )
 
 
 def _about_z(angle: float) -> Array64:

@@ -42,7 +42,8 @@ def test_see_a_second_of_messages(benchmark, viewer, run):
             viewer.see(output, content, 0)
 
     benchmark.pedantic(see_all, rounds=20)
-    benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(RUNS[run]) * 1e6, 2)
+    if benchmark.stats is not None:  # None with --benchmark-disable
+        benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(RUNS[run]) * 1e6, 2)
 
 
 class RowByRow(Stream):
@@ -71,7 +72,8 @@ def test_draw_a_second_of_messages_in_the_caller(benchmark, tmp_path, run, slice
                     stream.put(entity)
 
     benchmark.pedantic(draw_all, rounds=2)
-    benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(RUNS[run]) * 1e6, 2)
+    if benchmark.stats is not None:  # None with --benchmark-disable
+        benchmark.extra_info["us_per_message"] = round(benchmark.stats.stats.median / len(RUNS[run]) * 1e6, 2)
 
 
 def test_thin_a_slice(benchmark):

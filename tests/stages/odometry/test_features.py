@@ -104,7 +104,7 @@ def test_a_number_is_never_used_twice_and_forgotten_ones_are_gone():
     grey = picture(np.eye(3), np.zeros(3))
     tracker.follow(1, grey, np.eye(3))
     first = tracker.complete(np.eye(3)).number
-    tracker.forget(first[::2])
+    tracker.drop(first[::2])
     tracker.follow(2, grey, np.eye(3))
     after = tracker.complete(np.eye(3)).number
     assert not np.isin(first[::2], after).any()

@@ -138,7 +138,7 @@ def test_an_image_of_another_size_is_rejected_with_the_setting():
     [
         (
             {"views": [{"azimuth_deg": 0, "off_axis_deg": 130}, {"azimuth_deg": 90, "off_axis_deg": 60}]},
-            "views.0: the lens sees",
+            "views.0: only ",
         ),
         ({"views": [{"azimuth_deg": 0, "off_axis_deg": 60}]}, "at least 2"),
         ({"fov_deg": 180.0}, "less than or equal to 120"),

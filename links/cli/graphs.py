@@ -1,4 +1,4 @@
-"""`grd check`, `grd graph`, `grd schema`: look at a configuration without running it.
+"""`grd check`, `grd graph`, `grd schema`: inspect a configuration without running it.
 
 Source: DESIGN, flow.
 """
@@ -28,7 +28,7 @@ HostsFile = Annotated[Path | None, typer.Option("--hosts", help="A hosts file: w
 
 
 class Format(StrEnum):
-    """How to draw."""
+    """Output format of `grd graph`."""
 
     MERMAID = "mermaid"
     SVG = "svg"
@@ -36,9 +36,9 @@ class Format(StrEnum):
 
 @report_errors
 def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: HostsFile = None) -> None:
-    """Say everything that is wrong with CONFIG, and with the hosts file where one is given.
+    """Report all errors of CONFIG and of the hosts file.
 
-    Each problem with its line and a suggestion; exit code 1 when there is one.
+    Each error has its line and a suggestion; the exit code is 1 when there is one.
 
     Example: grd check configs/paper.yaml --set track.radius_m=0.8
     """
@@ -46,19 +46,19 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
         graph = load_graph(config, overlay or (), sets or ())
         placed = load_hosts(hosts, graph) if hosts is not None else None
     except ConfigError as error:
-        for problem in error.errors:
-            err.print(str(problem), markup=False, style="red")
+        for entry in error.errors:
+            err.print(str(entry), markup=False, style="red")
         raise typer.Exit(EXIT_FAILED) from None
     stages = sum(spec.kind == "stages" for spec in graph.nodes.values())
     out.print(f"{config}: {stages} stages, {len(graph.nodes) - stages} links, {len(graph.edges)} edges, no problems")
     for text in graph.left_out_texts():
         out.print(text, markup=False)
     if placed is not None:
-        _tell_hosts(placed)
+        _print_hosts(placed)
 
 
-def _tell_hosts(hosts: Hosts) -> None:
-    """What each host runs and sends."""
+def _print_hosts(hosts: Hosts) -> None:
+    """Print what each host runs and sends."""
     for name in hosts.hosts:
         nodes = [node for node in hosts.graph.nodes if hosts.placement[node] == name]
         hub = ", the hub" if name == hosts.hub else ""
@@ -71,7 +71,7 @@ def _tell_hosts(hosts: Hosts) -> None:
 @report_errors
 def graph(
     config: Config,
-    format: Annotated[Format, typer.Option("--format", help="Mermaid text or an SVG picture.")] = Format.MERMAID,
+    format: Annotated[Format, typer.Option("--format", help="Mermaid text or an SVG image.")] = Format.MERMAID,
     out_file: OutFile = None,
     overlay: Overlay = None,
     sets: Sets = None,
@@ -87,7 +87,7 @@ def graph(
         err.print("--host NAME needs --hosts FILE")
         raise typer.Exit(EXIT_USAGE)
     if hosts is not None and host is None and format is Format.SVG:
-        err.print("an SVG shows one host: say --host NAME, or draw all of them as mermaid")
+        err.print("an SVG shows one host: add --host NAME, or draw all hosts as Mermaid")
         raise typer.Exit(EXIT_USAGE)
     if hosts is not None and host is not None:
         checked = host_graph(checked, hosts, host)

@@ -1,4 +1,4 @@
-"""What a message becomes, for tests: the marks by path, and the numbers and words in them."""
+"""Helpers to draw one message and read the entities: by path, and the numbers and texts in them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import synthetic
 
 from flow.message import Message
 from links.viewer.draw import draw
-from links.viewer.scene import Mark, Scene
+from links.viewer.entities import Entity
+from links.viewer.scene import Scene
 
 
 def scene(**changes) -> Scene:
@@ -15,17 +16,17 @@ def scene(**changes) -> Scene:
     return Scene(**(settings | changes))
 
 
-def drawn(content: Message, name: str, where: Scene | None = None) -> dict[str, Mark]:
-    return {mark.path: mark for mark in draw(content, name, where or scene())}
+def drawn(content: Message, name: str, where: Scene | None = None) -> dict[str, Entity]:
+    return {entity.path: entity for entity in draw(content, name, where or scene())}
 
 
 def numbers(batch) -> np.ndarray:
     return np.array(batch.as_arrow_array().to_pylist(), dtype=float)
 
 
-def words(batch) -> list:
+def values_of(batch) -> list:
     return batch.as_arrow_array().to_pylist()
 
 
-def page(mark: Mark) -> str:
-    return words(mark.parts[0].text)[0]
+def document(entity: Entity) -> str:
+    return values_of(entity.archetypes[0].text)[0]

@@ -1,4 +1,4 @@
-"""Pictures of a chequered courtyard through a fisheye: every edge in them runs along one of its three axes."""
+"""Images of a chequered courtyard through a fisheye: every edge is parallel to one of its three axes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOOKS_DOWN = Pose(rpy_deg=(180.0, 0.0, -90.0))
 
 
 def courtyard(R_yard_camera, stamp_ns=0, camera_mount="vehicle", seen_m=(0.7, 0.3, -0.2)) -> Image:
-    """What a camera at `seen_m` sees of it, 3 x 3 samples a pixel."""
+    """Image of a camera at `seen_m`, with 3 x 3 samples per pixel."""
     offsets = np.linspace(-1 / 3, 1 / 3, 3)
     column, row = np.meshgrid(np.arange(SIZE_PX, dtype=np.float64), np.arange(SIZE_PX, dtype=np.float64))
     total = np.zeros(SIZE_PX * SIZE_PX)
@@ -30,7 +30,7 @@ def courtyard(R_yard_camera, stamp_ns=0, camera_mount="vehicle", seen_m=(0.7, 0.
 
 
 def _tiles(rays, at):
-    """Brightness along rays (n, 3): walls are chequered, ground and sky plain; 0 where the lens sees nothing."""
+    """Brightness along rays (n, 3): walls are chequered, ground and sky plain; 0 outside the lens."""
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = (np.sign(rays) * HALF_M - at) / rays
     reach[~np.isfinite(reach)] = np.inf
@@ -42,5 +42,5 @@ def _tiles(rays, at):
 
 
 def plain(level=128, size_px=SIZE_PX) -> Image:
-    """A picture of nothing."""
+    """An image of constant brightness."""
     return Image(stamp_ns=5, frame_id="camera_vehicle", grey=np.full((size_px, size_px), level, dtype=np.uint8))

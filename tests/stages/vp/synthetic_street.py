@@ -1,4 +1,4 @@
-"""Pictures of made streets through any lens: walls with windows, a kerb, sky. Four rays a pixel."""
+"""Images of synthetic streets through any lens: walls with windows, a kerb, sky. Four rays per pixel."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def fisheye(size_px: int = 480) -> Equidistant:
 
 
 def street(R_world_camera, lens, size_px=480, wall_turns_deg=(0.0, 0.0), noise=1.0, up_m=2.0, seed=0, row_turn=None):
-    """Grey picture of a street along x; its left and right walls are turned from it, each by its own angle.
+    """Grey image of a street along x; its left and right walls are rotated, each by its own angle.
 
     The camera is `up_m` over the road; the walls stand 7 m away and are 10 m high. `row_turn` (3,) [rad]: how the
     camera turns from row to row, its own axes; it is where R_world_camera says at the middle one.

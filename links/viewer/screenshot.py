@@ -1,7 +1,7 @@
-"""Pictures of a run and a window on it: start the installed Rerun viewer, loopback only.
+"""Screenshots of a run, and a viewer window: starts the installed Rerun viewer, on the loopback interface only.
 
 Source: Rerun 0.41, `rerun --help` and `rerun.experimental.ViewerClient`. Its own `spawn` listens on all interfaces;
-here `--bind 127.0.0.1` is given. Without a screen it needs a Vulkan driver (Debian: mesa-vulkan-drivers).
+this module passes `--bind 127.0.0.1`. Without a display it needs a Vulkan driver (Debian: mesa-vulkan-drivers).
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from links.viewer.scene import TIMELINE
 from links.viewer.stream import LOOPBACK
 
 START_S = 20.0
-WINDOW_S = 1.5  # a viewer that finds no screen has ended by then
+WINDOW_S = 1.5  # a viewer without a display has exited by then
 LOAD_S = 60.0
-SETTLE_S = 0.5  # views need a few frames after something has changed
-GREETING_S = 5.0  # the viewer's notifications cover the picture this long
+SETTLE_S = 0.5  # views need a few frames after a change
+NOTIFICATION_S = 5.0  # the viewer's notifications cover the views this long
 
 
 class ViewerMissing(LinkError):
-    """There is no viewer on this machine, or it cannot draw here."""
+    """The Rerun viewer is not installed, or it cannot draw on this machine."""
 
 
 def show(url_or_file: str | Path) -> subprocess.Popen[bytes]:
-    """Open a viewer window on a serving run (`Viewer.url`) or on an .rrd file; it outlives us.
+    """Open a viewer window on a serving run (`Viewer.url`) or on an .rrd file; it outlives this process.
 
     Raises ViewerMissing when the window does not open.
     """
@@ -46,17 +46,17 @@ def show(url_or_file: str | Path) -> subprocess.Popen[bytes]:
     except subprocess.TimeoutExpired:
         return process
     raise ViewerMissing(
-        f"the Rerun viewer could not open a window: is there a screen here? Else look at {where} on another machine, "
-        "or make a picture of a run: grd view RUN.rrd --screenshot run.png"
+        f"the Rerun viewer could not open a window: is there a display? Open {where} on another machine, "
+        "or take a screenshot of a run: grd view RUN.rrd --screenshot run.png"
     )
 
 
 def screenshot(
-    rrd: Path, png: Path, *, at: float = 0.9, size: str = "1920x1080", wait_s: float = GREETING_S
+    rrd: Path, png: Path, *, at: float = 0.9, size: str = "1920x1080", wait_s: float = NOTIFICATION_S
 ) -> list[str]:
-    """Draw a recording without a screen, at fraction `at` of its time, into a PNG; the views' complaints, best empty.
+    """Draw a recording off-screen, at fraction `at` of its duration, into a PNG. Returns the errors that views report.
 
-    Raises ViewerMissing when there is no viewer or no graphics driver, LinkError when the file cannot be shown.
+    Raises ViewerMissing when there is no viewer or no graphics driver, LinkError when the viewer cannot load the file.
     """
     if not rrd.is_file():
         raise LinkError(f"{rrd}: no such file; `grd run` and `grd replay` write run.rrd into their folder")
@@ -70,14 +70,14 @@ def screenshot(
             viewer.set_time(TIMELINE, duration=np.timedelta64(moment_ns, "ns"), play_state="paused")
         time.sleep(wait_s)
         png.write_bytes(viewer.take_screenshot())
-        complaints = _complaints(viewer)
+        errors = _view_errors(viewer)
         for _ in _other_tabs(viewer):
-            complaints += _complaints(viewer)
-        return list(dict.fromkeys(complaints))
+            errors += _view_errors(viewer)
+        return list(dict.fromkeys(errors))
 
 
-def _complaints(viewer: ViewerClient) -> list[str]:
-    viewer.take_screenshot()  # a view reports on what it last drew, and hidden tabs draw nothing
+def _view_errors(viewer: ViewerClient) -> list[str]:
+    viewer.take_screenshot()  # a view reports on its last frame, and hidden tabs draw nothing
     return [
         f"{view.name}: {report.severity}: {report.summary}{f' ({report.details})' if report.details else ''}"
         for view in viewer.get_state().views
@@ -86,16 +86,16 @@ def _complaints(viewer: ViewerClient) -> list[str]:
 
 
 def _other_tabs(viewer: ViewerClient) -> Iterator[int]:
-    """Bring the second tab of every group of tabs to the front, then the third, until all have been there."""
+    """Activate the second tab of every tab group, then the third, and so on; yields after each step."""
     read = viewer.get_blueprint()
     containers = [part["ContainerBlueprint"] for part in read.blueprint.values() if "ContainerBlueprint" in part]
     groups = [container for container in containers if "active_tab" in container]
-    for turn in range(1, max((len(group["contents"]) for group in groups), default=0)):
+    for index in range(1, max((len(group["contents"]) for group in groups), default=0)):
         for group in groups:
-            group["active_tab"] = group["contents"][turn % len(group["contents"])]
+            group["active_tab"] = group["contents"][index % len(group["contents"])]
         viewer.set_blueprint(read.blueprint, "recording")
         time.sleep(SETTLE_S)
-        yield turn
+        yield index
 
 
 @contextmanager
@@ -104,9 +104,12 @@ def _headless(rrd: Path, size: str) -> Iterator[ViewerClient]:
     process = _start([str(rrd), "--headless", "--window-size", size, "--port", str(port)])
     try:
         yield _connect(process, port)
-    except (ConnectionError, RuntimeError) as error:  # it answers before it looks for a graphics driver
+    except (
+        ConnectionError,
+        RuntimeError,
+    ) as error:  # the viewer accepts connections before it looks for a graphics driver
         raise ViewerMissing(
-            f"the Rerun viewer stopped ({error}): without a screen it needs a Vulkan driver "
+            f"the Rerun viewer stopped ({error}): without a display it needs a Vulkan driver "
             "(Debian/Ubuntu: apt-get install mesa-vulkan-drivers)"
         ) from error
     finally:
@@ -152,12 +155,12 @@ def _wait_until_loaded(viewer: ViewerClient, rrd: Path) -> ViewerState:
         state = viewer.get_state()
         if state.active_recording and state.views and not state.loading:
             return state
-        complaints = [entry.message for entry in viewer.get_logs() if entry.level == "ERROR"]
-        if complaints or time.monotonic() > deadline:
-            why = complaints[-1] if complaints else f"not loaded within {LOAD_S:.0f} s"
+        errors = [entry.message for entry in viewer.get_logs() if entry.level == "ERROR"]
+        if errors or time.monotonic() > deadline:
+            why = errors[-1] if errors else f"not loaded within {LOAD_S:.0f} s"
             raise LinkError(
-                f"{rrd}: the viewer cannot show it: {why}\n"
-                f"If its run was cut short, this keeps what is readable: rerun rrd merge {rrd} -o mended.rrd"
+                f"{rrd}: the viewer cannot load it: {why}\n"
+                f"If the file is truncated, recover the readable part: rerun rrd merge {rrd} -o recovered.rrd"
             )
         time.sleep(0.1)
 
@@ -167,7 +170,7 @@ def _span(state: ViewerState, rrd: Path) -> tuple[int, int, str]:
         for timeline in recording.timelines:
             if timeline.name == TIMELINE and timeline.start is not None and timeline.end is not None:
                 return timeline.start, timeline.end, timeline.time_type
-    raise LinkError(f"{rrd}: nothing on the timeline {TIMELINE!r}: an empty run?")
+    raise LinkError(f"{rrd}: no data on the timeline {TIMELINE!r}: is the run empty?")
 
 
 def _free_port() -> int:

@@ -6,16 +6,16 @@ Within t seconds after the newest pose an unobserved maneuver moves the vehicle 
 
 Speeds are averaged over at least 0.1 s: poses that arrive together would otherwise give a parked vehicle a speed.
 
-| user                  | model and horizon                             | maneuver bound                               |
-| --------------------- | --------------------------------------------- | -------------------------------------------- |
-| VehicleTrajectory     | constant velocity for EXTRAPOLATION_S          | USUAL_MANEUVER; the next pose removes the error |
-| VehicleMotionSelector | constant turn rate for SOURCE_CHANGE_S         | GAP_MANEUVER; the error of a source change stays |
-| VisualLidarOdometry   | constant velocity to the next image            | GAP_MANEUVER, and any usual turn rate         |
+| user                  | model and horizon                      | bound                                       |
+| --------------------- | -------------------------------------- | ------------------------------------------- |
+| VehicleTrajectory     | constant velocity, EXTRAPOLATION_S     | USUAL_MANEUVER: the next pose ends the error |
+| VehicleMotionSelector | constant turn rate, SOURCE_CHANGE_S    | GAP_MANEUVER: the error stays                |
+| VisualLidarOdometry   | constant velocity, to the next image   | GAP_MANEUVER, and any usual turn rate        |
 
 A pose further from the extrapolation than HARDEST_MANEUVER allows is an outlier, or the source's start frame has jumped
 (an odometry that restarts). The pose is rejected. When AGREE rejected poses in a row lie on one smooth path, they are
-accepted as poses in a new start frame. After seconds of silence HARDEST_MANEUVER allows nearly any pose, so a small jump
-during a silence is not detected. For the same reason one plausible pose does not end a series of AGREE outliers:
+accepted as poses in a new start frame. After seconds of silence HARDEST_MANEUVER allows nearly any pose, so a small
+jump during a silence is not detected. For the same reason one plausible pose does not end a series of AGREE outliers:
 continuing nonsense would produce a plausible pose sooner or later.
 
 Source: ours.
@@ -139,7 +139,7 @@ def _is_smooth(poses: tuple[VehicleMotion, ...]) -> bool:
     share, longer_s = second_s / first_s, max(first_s, second_s)
     off_m = c.xyz_map_m - b.xyz_map_m - share * (b.xyz_map_m - a.xyz_map_m)
     turns = log_rotation(a.R_map_vehicle.T @ b.R_map_vehicle), log_rotation(b.R_map_vehicle.T @ c.R_map_vehicle)
-    near = float(np.linalg.norm(off_m)) <= OFF_M + 2.0 * HARDEST_MANEUVER.place_m(longer_s)
+    near = float(np.linalg.norm(off_m)) <= OFF_M + 2.0 * HARDEST_MANEUVER.displacement_m(longer_s)
     return near and float(np.linalg.norm(turns[1] - share * turns[0])) <= OFF_RAD + 2.0 * HARDEST_MANEUVER.turn_rad(
         longer_s
     )

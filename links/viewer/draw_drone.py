@@ -72,16 +72,16 @@ def detections(message: Detections, name: str, scene: Scene) -> Marks:
         best = [percent[chosen].max(initial=0.0) for chosen in (message.accepted, ~message.accepted)]
         yield plot(f"plots/probability/{name}", best, ["accepted", "best refused"], ANSWER_COLOURS)
     found = bool(message.accepted.any())
-    yield say(name, message.verdict, "INFO" if found else "WARN")
+    yield say(name, message.summary, "INFO" if found else "WARN")
     yield from state(lane_of(name), "drone" if found else "no drone", scene)
-    yield scene.now(2, stage_of(name), message.verdict)
+    yield scene.now(2, stage_of(name), message.summary)
     rows = [
         f"{number}: {said}, {'accepted' if accepted else 'refused'} at {_xyz(xyz)} m: {reason}"
         for number, said, accepted, xyz, reason in zip(
             numbers, sure, message.accepted, message.xyz_vehicle_m, message.reasons, strict=True
         )
     ]
-    yield scene.why(2, f"{stage_of(name)}, last answer", [message.verdict, *rows])
+    yield scene.why(2, f"{stage_of(name)}, last answer", [message.summary, *rows])
 
 
 def drone_fix(message: DroneFix, name: str, scene: Scene) -> Marks:

@@ -87,7 +87,7 @@ def servo_offset(message: ServoOffset, name: str, scene: Scene) -> Marks:
     if message.offset_s is None or message.sigma_s is None:
         yield scene.now(9, stage_of(name), message.reason)
         return
-    values = 1e3 * np.array([message.offset_s, message.sigma_s, message.rig_s])
+    values = 1e3 * np.array([message.offset_s, message.sigma_s, message.rig_offset_s])
     yield plot(f"plots/other/{name}", values, ["servo offset [ms]", "its sigma [ms]", "the rig's [ms]"])
     words = f"{values[0]:.2f} +- {values[1]:.2f} ms, the rig says {values[2]:.2f} ms; {message.reason}"
     yield scene.now(9, stage_of(name), words)

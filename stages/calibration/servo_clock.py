@@ -139,7 +139,7 @@ class ServoClock(Stage[ServoClockSettings]):
             stamp_ns=stamp_ns,
             offset_s=settings.mount.servo_time_offset_s + self._offset_s if known else None,
             sigma_s=sigma_s if known else None,
-            rig_s=settings.mount.servo_time_offset_s,
+            rig_offset_s=settings.mount.servo_time_offset_s,
             windows=self._windows,
             reason=reason,
         )

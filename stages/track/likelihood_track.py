@@ -105,9 +105,9 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Follow the promising ones; drop what is no longer taken for a drone."""
-        if self._detector_life not in (None, candidates.detector_life):
+        if self._detector_life not in (None, candidates.detector_instance):
             self._known.forget_numbers()
-        self._detector_life = candidates.detector_life
+        self._detector_life = candidates.detector_instance
         own = set(candidates.candidate_id[candidates.probability >= 0.5].tolist())
         for i in range(len(candidates.candidate_id)):
             number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])
@@ -124,7 +124,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
                 if doubtful and (0.5 if own_word else self._known.needed(known, candidates.stamp_ns)) <= P:
                     self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
                 # what is refused beside a track whose own candidate is taken for a drone is another one there
-                sure = known.candidate == number or (candidates.looks[i] >= 6 and known.candidate not in own)
+                sure = known.candidate == number or (candidates.scan_passes[i] >= 6 and known.candidate not in own)
                 if P < 0.2 and known.confirmed and sure:
                     yield from self._lose(
                         known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}"

@@ -100,7 +100,7 @@ def test_what_the_autopilot_does_not_fuse_is_said_in_words():
 
 
 def test_a_servo_offset_is_shown_beside_the_rig_s():
-    offset = ServoOffset(stamp_ns=0, offset_s=0.0012, sigma_s=0.0001, rig_s=0.002, windows=2, reason="told")
+    offset = ServoOffset(stamp_ns=0, offset_s=0.0012, sigma_s=0.0001, rig_offset_s=0.002, windows=2, reason="told")
     marks = drawn(offset, "servo_clock/servo_offset")
     assert page(marks["now"]) == "**servo_clock:** 1.20 +- 0.10 ms, the rig says 2.00 ms; told"
     nothing = drawn(dataclasses.replace(offset, offset_s=None, sigma_s=None), "servo_clock/servo_offset")

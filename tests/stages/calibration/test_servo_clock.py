@@ -62,14 +62,14 @@ def test_stamps_that_are_late_are_found_with_an_honest_sigma(recorded, late_s):
     check_arrays(offset)
     assert offset.sigma_s < 4e-4
     assert abs(offset.offset_s + late_s) < 3 * offset.sigma_s
-    assert (offset.windows, offset.rig_s) == (1, 0.0)
+    assert (offset.windows, offset.rig_offset_s) == (1, 0.0)
     assert "this window alone" in offset.reason
 
 
 def test_what_the_rig_says_already_is_counted_in(recorded):
     mount = recorded[0].model_copy(update={"servo_time_offset_s": 1e-3})
     (offset,) = told(recorded, late_s=-1e-3, mount=mount)
-    assert offset.rig_s == 1e-3
+    assert offset.rig_offset_s == 1e-3
     assert abs(offset.offset_s - 1e-3) < 3 * offset.sigma_s
 
 

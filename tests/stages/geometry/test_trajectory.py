@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
-from stages.geometry.trajectory import FURTHEST_NS, KEPT, STILL_NS, VehicleTrajectory
+from stages.geometry.trajectory import FURTHEST_NS, KEPT, RECENT_NS, VehicleTrajectory
 from stages.kernels.geometry.trajectory import STEP_NS
 from stages.messages import VehicleMotion
 from tests.stages.made import MS, START_NS
@@ -38,8 +38,8 @@ def test_a_vehicle_that_tells_nothing_stands_at_the_origin():
 
 def test_a_word_is_known_until_it_is_so_old_that_the_vehicle_may_be_anywhere():
     made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (1, 0, 0)))
-    assert made.known_at(START_NS + 100 * MS + STILL_NS - 1)
-    assert not made.known_at(START_NS + 100 * MS + STILL_NS)
+    assert made.known_at(START_NS + 100 * MS + RECENT_NS - 1)
+    assert not made.known_at(START_NS + 100 * MS + RECENT_NS)
     assert not trail().known_at(START_NS)
 
 

@@ -219,7 +219,7 @@ def followed(tells):
             e_outer=np.zeros(1),
             accepted=np.array([True]),
             reasons=("made",),
-            verdict="made",
+            summary="made",
             seen_ns=np.array([at_ns(0.0)]),
             velocity_vehicle_mps=velocity[None],
         )

@@ -46,8 +46,9 @@ class SweptPulses(Message):
 
 @message(schema=23)
 class DepthImage(Message):
-    """Depth image of one whole sweep: a pinhole camera at the turntable, looking up; stamp_ns is the sweep's end. P III.A.
+    """Depth image of one whole sweep: a pinhole camera at the turntable, looking up. P III.A.
 
+    stamp_ns is the sweep's end.
     Pixel (row v, column u) looks along (x, y, 1) with x = (u + 0.5 - w/2) / focal_px, y = (v + 0.5 - h/2) / focal_px,
     in axes parallel to the vehicle's. Depth is z over the origin.
     """

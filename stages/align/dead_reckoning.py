@@ -73,7 +73,7 @@ class Reckoning:
 
     def add_autopilot(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """What the autopilot says of itself."""
-        self.autopilot.hear(word)
+        self.autopilot.add(word)
 
     def add_drone_motion(self, motion: VisualMotion) -> None:
         """A step of the odometry by pictures."""
@@ -81,8 +81,8 @@ class Reckoning:
 
     def new_silences(self) -> int:
         """Times since the last call that the autopilot was not heard for so long that it may have jumped."""
-        new = self.autopilot.silences - self._silences
-        self._silences = self.autopilot.silences
+        new = self.autopilot.gaps - self._silences
+        self._silences = self.autopilot.gaps
         return new
 
     def rate_radps(self, stamp_ns: int) -> float:
@@ -137,7 +137,7 @@ class Reckoning:
             return {}
         R = rotation_z(offset_rad) @ self._R_map_drone
         turns = {ns: rotation_between(self.autopilot, self.pictures, self._stamp_ns, ns) for ns in stamps_ns}
-        return {ns: R @ turn.R_from_to for ns, turn in turns.items() if turn.sure}
+        return {ns: R @ turn.R_from_to for ns, turn in turns.items() if turn.measured}
 
     def at_one_moment(self, vehicle_ns: int, drone_ns: int) -> tuple[Array64, Array64, int, float]:
         """L, R so that L R_vehicle(vehicle_ns)_drone(drone_ns) R is the rotation at one moment, that, and its variance.
@@ -149,7 +149,7 @@ class Reckoning:
             turn = self.vehicle.at(drone_ns)[0].T @ self.vehicle.at(vehicle_ns)[0]
             return turn, one, drone_ns, VEHICLE_DRIFT_RAD2_PER_S * dt
         own = rotation_between(self.autopilot, self.pictures, drone_ns, vehicle_ns)
-        if own.sure and not self._parked:
+        if own.measured and not self._parked:
             return one, own.R_from_to, vehicle_ns, own.variance_rad2
         return one, one, drone_ns, self._vehicle_variance_rad2(drone_ns, dt)
 

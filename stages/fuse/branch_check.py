@@ -84,4 +84,4 @@ class Witness:
         turn = rotation_between(
             self._motions.motion_model.autopilot, self._motions.motion_model.pictures, from_ns, stamp_ns
         )
-        return R @ turn.R_from_to if turn.sure else None
+        return R @ turn.R_from_to if turn.measured else None

@@ -125,7 +125,7 @@ class MotionModel:
                 kept = (0.5 * max(1.0, self.autopilot.rate_radps(to_ns)) * beyond_s**2) ** 2  # rates change
                 return a.T @ b, walk + (CLOCK_S * change) ** 2 + kept, True
         turn = rotation_between(self.autopilot, self.pictures, from_ns, to_ns)
-        return turn.R_from_to, turn.variance_rad2, turn.sure
+        return turn.R_from_to, turn.variance_rad2, turn.measured
 
     def newest_ns(self, now_ns: int, positions: bool) -> int | None:
         """Up to when the drone's motion has been told by who was heard in the last second; None: nobody was."""

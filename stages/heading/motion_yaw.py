@@ -51,7 +51,7 @@ class Point:
     xyz_map_m: Array64
     variance_m2: float  # level, one axis
     xyz_odom_m: Array64
-    stretch: int
+    segment: int
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Weighed:
 
 
 class MotionYaw:
-    """Collects points of one track and one stretch of the autopilot's."""
+    """Collects points of one track and one segment of the autopilot's."""
 
     def __init__(self, errors: FuseErrors, sigma_rad: float) -> None:
         """`sigma_rad`: a yaw known worse is not told."""
@@ -127,7 +127,7 @@ class MotionYaw:
     def add(self, point: Point) -> bool:
         """One more; True: the answer was weighed anew."""
         points = self._points
-        if points and (point.stretch != points[-1].stretch or point.stamp_ns < points[-1].stamp_ns):
+        if points and (point.segment != points[-1].segment or point.stamp_ns < points[-1].stamp_ns):
             self.restart()
         if points and point.stamp_ns - points[-1].stamp_ns < APART_NS:
             return False

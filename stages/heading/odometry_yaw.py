@@ -38,12 +38,12 @@ class North:
 
     def hear(self, trail: AutopilotTrajectory, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """The autopilot's word goes to its trail; a silence that may hide a turn of its north costs."""
-        before_ns, silences = trail.attitude_ns, trail.silences
+        before_ns, silences = trail.attitude_ns, trail.gaps
         R_before = None if before_ns is None else trail.R_odom_drone(before_ns)
         rate = 0.0 if before_ns is None else trail.rate_radps(before_ns)
-        trail.hear(word)
+        trail.add(word)
         after_ns = trail.attitude_ns
-        if trail.silences == silences or before_ns is None or R_before is None or after_ns is None:
+        if trail.gaps == silences or before_ns is None or R_before is None or after_ns is None:
             return
         R_after, silent_s = trail.R_odom_drone(after_ns), (after_ns - before_ns) * 1e-9
         assert R_after is not None

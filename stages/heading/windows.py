@@ -97,8 +97,8 @@ class Windows:
         start, end = self._ends()
         if start is None or end is None:
             return None
-        stretches = {f.own[1] if f.own else None for f in start.fixes + end.fixes}
-        if len(stretches) != 1 or None in stretches:
+        segments = {f.own[1] if f.own else None for f in start.fixes + end.fixes}
+        if len(segments) != 1 or None in segments:
             self._begin_at(end)
             return None
         anchor = own_m(start.fixes[0])

@@ -1,6 +1,6 @@
-"""Compiled functions of `links/velodyne/decode.py`.
+"""Compiled functions that decode VLP-16 packets into one row per laser pulse.
 
-Source: see there.
+Source: see `links/velodyne/decode.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/calibration/scan_passes.py`.
+"""Compiled functions that derive the side of the gear play from the servo's motion.
 
-Source: see there.
+Source: see `stages/calibration/scan_passes.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/candidate.py`.
+"""Compiled functions that rate from one tally whether something stands next to a candidate.
 
-Source: see there.
+Source: see `stages/detect/candidate.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/candidate_table.py`.
+"""Compiled functions that associate sightings and slices of pulses with candidates.
 
-Source: see there.
+Source: see `stages/detect/candidate_table.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/isolation.py`.
+"""Compiled functions that tally the pulses around a position and map remembered returns.
 
-Source: see there.
+Source: see `stages/detect/isolation.py`.
 """
 
 from __future__ import annotations

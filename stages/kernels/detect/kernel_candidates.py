@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/kernel_candidates.py`.
+"""Compiled functions that find minima of a score image and count the pixels around them.
 
-Source: see there.
+Source: see `stages/detect/kernel_candidates.py`.
 """
 
 from __future__ import annotations

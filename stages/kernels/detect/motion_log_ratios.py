@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/motion_log_ratios.py`.
+"""Compiled functions that compare a path with the drone's odometry and with other motion models.
 
-Source: see there.
+Source: see `stages/detect/motion_log_ratios.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/pulse_buffer.py`.
+"""Compiled functions that buffer recent pulses and search them around a position.
 
-Source: see there.
+Source: see `stages/detect/pulse_buffer.py`.
 """
 
 from __future__ import annotations

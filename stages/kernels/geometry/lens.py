@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/geometry/lens.py`.
+"""Compiled functions that project rays to pixels and pixels to rays for fisheye lenses.
 
-Source: see there.
+Source: see `stages/geometry/lens.py`.
 """
 
 from __future__ import annotations

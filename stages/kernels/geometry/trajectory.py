@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/geometry/trajectory.py`.
+"""Compiled functions that convert positions and velocities between frames map and vehicle.
 
-Source: see there.
+Source: see `stages/geometry/trajectory.py`.
 """
 
 from __future__ import annotations

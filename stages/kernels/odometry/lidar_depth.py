@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/odometry/vehicle/lidar_depth.py`.
+"""Compiled functions that fit inverse depths of rays to LiDAR points.
 
-Source: see there.
+Source: see `stages/odometry/vehicle/lidar_depth.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/sweep/depth_image.py`.
+"""Compiled functions that draw points into a depth image.
 
-Source: see there.
+Source: see `stages/sweep/depth_image.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/sweep/pulses.py`.
+"""Compiled functions that average the directions of pulses.
 
-Source: see there.
+Source: see `stages/sweep/pulses.py`.
 """
 
 from __future__ import annotations

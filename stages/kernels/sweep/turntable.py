@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/sweep/turntable.py`.
+"""Compiled functions that interpolate the turntable angle and place returns and pulses by it.
 
-Source: see there.
+Source: see `stages/sweep/turntable.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/hull.py`.
+"""Compiled functions that compute the posterior of the drone's position from returns and pass-throughs.
 
-Source: see there.
+Source: see `stages/track/hull.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/kalman.py`.
+"""Compiled functions that predict a constant-velocity Kalman filter.
 
-Source: see there.
+Source: see `stages/track/kalman.py`.
 """
 
 from __future__ import annotations

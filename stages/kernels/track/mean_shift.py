@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/mean_shift.py`.
+"""Compiled functions that compute the paper's mean shift, Equation (6).
 
-Source: see there.
+Source: see `stages/track/mean_shift.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/odometry_motion_model.py`.
+"""Compiled functions that propagate a track by the drone's odometry at unknown yaw.
 
-Source: see there.
+Source: see `stages/track/odometry_motion_model.py`.
 """
 
 from __future__ import annotations

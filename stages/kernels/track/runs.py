@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/runs.py`.
+"""Compiled functions that exclude long runs of returns (walls) from a scan pass.
 
-Source: see there.
+Source: see `stages/track/runs.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/scan_pass.py`.
+"""Compiled functions that relate a predicted track to the slices of a scan pass.
 
-Source: see there.
+Source: see `stages/track/scan_pass.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/arcs.py`.
+"""Compiled functions that split edge chains into great-circle arcs and fit them.
 
-Source: see there.
+Source: see `stages/vp/arcs.py`.
 """
 
 from __future__ import annotations

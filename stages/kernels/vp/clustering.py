@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/clustering.py`.
+"""Compiled functions that merge arcs of the same great circle into lines.
 
-Source: see there.
+Source: see `stages/vp/clustering.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/directions.py`.
+"""Compiled functions that assign lines to vanishing directions and refine the directions.
 
-Source: see there.
+Source: see `stages/vp/directions.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/edges.py`.
+"""Compiled functions that find the edge threshold of an image and follow edge ridges into chains.
 
-Source: see there.
+Source: see `stages/vp/edges.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/paper_vote.py`.
+"""Compiled functions that vote for vanishing directions on a cube, as in the paper.
 
-Source: see there.
+Source: see `stages/vp/paper_vote.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/spectrum.py`.
+"""Compiled functions that build the yaw spectrum of lines and find its peaks.
 
-Source: see there.
+Source: see `stages/vp/spectrum.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/verticals.py`.
+"""Compiled functions that propose, score and refine the vertical vanishing direction.
 
-Source: see there.
+Source: see `stages/vp/verticals.py`.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class VehicleMotionSelectorSettings(Settings):
 
 
 class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
-    """T_map_vehicle without jumps from whichever source is available. Both inputs are optional and may be interrupted."""
+    """T_map_vehicle without jumps from whichever source is available. Both inputs are optional."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry", "ego"})
 

@@ -419,7 +419,7 @@ def test_a_drone_that_tells_its_velocity_cannot_have_turned_unheard():
         for i in range(30):
             t = 0.1 * i
             if told:
-                motions.motion_model.autopilot.hear(
+                motions.motion_model.autopilot.add(
                     DroneLocalPosition(
                         stamp_ns=ns(t), xyz_odom_m=np.array([2 * t, 0, 9]), velocity_odom_mps=np.array([2.0, 0, 0])
                     )

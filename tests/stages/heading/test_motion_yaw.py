@@ -172,7 +172,7 @@ def test_a_jump_of_the_autopilots_frame_begins_anew():
         bank_.add(p)
     assert bank_.yaw is not None
     p = points(circle())[-1]
-    bank_.add(Point(p.stamp_ns + S, p.xyz_map_m, p.variance_m2, p.xyz_odom_m, stretch=1))
+    bank_.add(Point(p.stamp_ns + S, p.xyz_map_m, p.variance_m2, p.xyz_odom_m, segment=1))
     assert bank_.yaw is None
     assert not bank_.backs(p.stamp_ns, 0.0, 0.01)
 

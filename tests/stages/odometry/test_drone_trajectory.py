@@ -74,7 +74,7 @@ def test_a_fast_turn_is_no_jump():
 def test_after_silence_a_jump_cannot_be_seen_and_that_is_counted():
     trail = turning(5)
     trail.add_attitude(3000 * MS, rotation_z(2.0), RATE)
-    assert (trail.jumps, trail.silences) == (0, 1)
+    assert (trail.jumps, trail.gaps) == (0, 1)
 
 
 def test_in_a_gap_it_is_known_a_little_beyond_its_beginning_alone():
@@ -88,9 +88,9 @@ def test_in_a_gap_it_is_known_a_little_beyond_its_beginning_alone():
         assert trail.R_odom_drone(ms * MS) is None
         assert trail.position(ms * MS) is None
         assert trail.velocity_odom_mps(ms * MS) is None
-        assert not rotation_between(trail, VisualTrajectory(), 200 * MS, ms * MS).sure
+        assert not rotation_between(trail, VisualTrajectory(), 200 * MS, ms * MS).measured
     np.testing.assert_allclose(trail.R_odom_drone(4400 * MS), exp_rotation(4.4 * RATE), atol=1e-9)
-    assert rotation_between(trail, VisualTrajectory(), 200 * MS, 4500 * MS).sure  # over it both ends tell
+    assert rotation_between(trail, VisualTrajectory(), 200 * MS, 4500 * MS).measured  # over it both ends tell
 
 
 def test_words_half_a_second_apart_tell_of_the_time_between():
@@ -107,7 +107,7 @@ def test_pictures_far_apart_tell_of_the_whole_turn_and_not_of_the_time_between()
     assert pictures.at(1400 * MS) is None
     assert pictures.at(400 * MS) is not None
     assert pictures.at(2400 * MS) is not None
-    assert rotation_between(AutopilotTrajectory(), pictures, 300 * MS, 2500 * MS).sure
+    assert rotation_between(AutopilotTrajectory(), pictures, 300 * MS, 2500 * MS).measured
 
 
 def flown(jump_at=None, jump_m=(5.0, 0, 0)) -> AutopilotTrajectory:
@@ -184,7 +184,7 @@ def test_a_gap_between_steps_begins_a_new_chain():
     pictures.add(step(0, 100))
     pictures.add(step(300, 400))
     turn = rotation_between(AutopilotTrajectory(), pictures, 50 * MS, 350 * MS)
-    assert not turn.sure
+    assert not turn.measured
     np.testing.assert_array_equal(turn.R_from_to, np.eye(3))
     assert math.degrees(math.sqrt(turn.variance_rad2)) == pytest.approx(12.0)  # 40 deg/s for 0.3 s
 
@@ -195,7 +195,7 @@ def test_the_autopilot_goes_before_pictures_and_both_agree():
     expected = exp_rotation(0.3 * RATE)
     for trail in (turning(), AutopilotTrajectory()):
         turn = rotation_between(trail, pictures, 100 * MS, 400 * MS)
-        assert turn.sure
+        assert turn.measured
         np.testing.assert_allclose(turn.R_from_to, expected, atol=1e-9)
         back = rotation_between(trail, pictures, 400 * MS, 100 * MS)
         np.testing.assert_allclose(back.R_from_to, expected.T, atol=1e-9)

@@ -1,9 +1,9 @@
 """Trajectory of the drone in frame odom, without the jumps of the autopilot's estimate, and rotations between times.
 
 The autopilot's raw local frame has an arbitrary yaw, and its EKF may reset it in flight (compass, GPS). A change of
-attitude that the rates do not confirm, or of position that the velocity does not confirm, is such a jump and is removed:
-frame odom is the raw local frame at the start, continued smoothly. Without an autopilot, visual odometry is chained
-instead. Without either, the drone is assumed to keep its yaw, with a large variance.
+attitude that the rates do not confirm, or of position that the velocity does not confirm, is such a jump and is
+removed: frame odom is the raw local frame at the start, continued smoothly. Without an autopilot, visual odometry is
+chained instead. Without either, the drone is assumed to keep its yaw, with a large variance.
 
 Attitude and position are interpolated between samples. Within a gap longer than BRIDGED_NS they are not known; the
 displacement and rotation over the whole gap still are.

@@ -16,7 +16,7 @@ from stages.calibration.result import Finding
 from stages.geometry.frames import LidarMount, Pose
 
 DIGITS = 7
-TAKEN_BACK = (
+ZERO_NOTE = (
     "# A zero that differs from that takes back the mean of the encoder's error, which nothing tells from a zero."
 )
 
@@ -28,15 +28,15 @@ def rig_text(rig: dict[str, Any], found: Calibration, source: str) -> str:
     head = [
         f"# Found by `grd calibrate {source}`; everything but lidar.mount is as it was.",
         "# To replay with it: grd replay RECORDING --overlay THIS_FILE; to fly: include it in place of the rig's file.",
-        *(f"# {said(finding)}" for finding in found.findings),
-        *(() if zero_told(found) else (TAKEN_BACK,)),
+        *(f"# {describe(finding)}" for finding in found.findings),
+        *(() if zero_found(found) else (ZERO_NOTE,)),
     ]
     return "\n".join([*head, yaml.safe_dump({"rig": new}, sort_keys=False, width=120)])
 
 
-def zero_told(found: Calibration) -> bool:
+def zero_found(found: Calibration) -> bool:
     """Whether the servo's zero was found, by a wall."""
-    return not next(finding.refused for finding in found.findings if finding.name == "zero")
+    return not next(finding.rejected for finding in found.findings if finding.name == "zero")
 
 
 def mount_tree(mount: LidarMount) -> dict[str, Any]:
@@ -70,10 +70,10 @@ def pose_tree(pose: Pose) -> dict[str, Any]:
     }
 
 
-def said(finding: Finding) -> str:
+def describe(finding: Finding) -> str:
     """A finding in one line."""
-    if finding.refused:
-        return f"{finding.what}: stays {finding.before:.4g} {finding.unit}: {finding.refused}"
+    if finding.rejected:
+        return f"{finding.what}: stays {finding.before:.4g} {finding.unit}: {finding.rejected}"
     digits = max(0, 1 - math.floor(math.log10(max(finding.sigma, 1e-9))))
     return (
         f"{finding.what}: {finding.after:.{digits}f} +- {finding.sigma:.{digits}f} {finding.unit} "

@@ -130,7 +130,7 @@ def _calibrated(gathered: Gathered, parked: bool) -> Calibration:
 
 def _tell(recording: str, found: Calibration, gathered: Gathered) -> None:
     """What was found, how surely, and what was not."""
-    from links.calibration import zero_told
+    from links.calibration import zero_found
 
     parts = f" of the {gathered.parts} parts of {recording}" if gathered.parts > 1 else ""
     table = Table(
@@ -139,21 +139,21 @@ def _tell(recording: str, found: Calibration, gathered: Gathered) -> None:
     for head in ("", "before", "found", "sigma", ""):
         table.add_column(Text(head), justify="left" if not head else "right")
     for f in found.findings:
-        after = "-" if f.refused else f"{f.after:.4f}"
+        after = "-" if f.rejected else f"{f.after:.4f}"
         table.add_row(Text(f.what), f"{f.before:.4f}", after, f"{f.sigma:.4f}", f.unit)
     show_table(table)
     for f in found.findings:
-        if f.refused:
-            out.print(f"{f.what} stays as it is: {f.refused}", markup=False)
+        if f.rejected:
+            out.print(f"{f.what} stays as it is: {f.rejected}", markup=False)
     taken_back_deg = found.mount.servo_zero_deg - gathered.mount.servo_zero_deg
-    if abs(taken_back_deg) > ROUNDING_DEG and not zero_told(found):
+    if abs(taken_back_deg) > ROUNDING_DEG and not zero_found(found):
         out.print(
             f"the zero is written as {found.mount.servo_zero_deg:.4f} deg: it takes back the mean of the encoder's "
             "error, so that the sweep as a whole points where it pointed before"
         )
     out.print(
         f"the rig takes the servo's angle as known to {found.mount.pointing_sigma_deg:.2f} deg, "
-        f"{'the zero found' if zero_told(found) else 'a zero set by eye'} in it"
+        f"{'the zero found' if zero_found(found) else 'a zero set by eye'} in it"
     )
     before_mm, after_mm = (1e3 * t for t in found.thickness.medians_m)
     out.print(

@@ -208,6 +208,6 @@ def _pose(before: Pose, R: Array64) -> Pose:
 
 def _pointing(found: Calibration, zero_sigma_deg: float) -> dict[str, float]:
     """How well the servo's angle is known with such a zero; nothing where the rest of it is not told."""
-    if not {f.name for f in found.findings if not f.refused}.issuperset({*CURVE, "play"}):
+    if not {f.name for f in found.findings if not f.rejected}.issuperset({*CURVE, "play"}):
         return {}
     return {"pointing_sigma_deg": math.hypot(zero_sigma_deg, math.degrees(found.curve_sigma_rad))}

@@ -1,8 +1,8 @@
 """The depth image: the returns of a sweep as a pinhole image from the turntable, looking up.
 
-A plane at height h above the turntable is divided into N x N pixels of size res, so that focal_px = h / res; for a field
-of view of 2 theta_max, focal_px = N / (2 tan theta_max). Depth is height above the turntable; a pixel
-keeps the nearest of its returns.
+A plane at height h above the turntable is divided into N x N pixels of size res, so that focal_px = h / res; for a
+field of view of 2 theta_max, focal_px = N / (2 tan theta_max). Depth is height above the turntable; a pixel keeps the
+nearest of its returns.
 
 Source: P III.A; DESIGN, "Depth image N=512, FOV 2 theta_max = 120 deg".
 """

@@ -25,7 +25,7 @@ def found_in(seed=0, parked=False, **how):
 
 
 def refused(found):
-    return {f.name: f.refused for f in found.findings if f.refused}
+    return {f.name: f.rejected for f in found.findings if f.rejected}
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_a_second_calibration_finds_nothing_more(yard):
     made = sweep(true, seed=0)
     again = calibrate(made.returns, made.trace, found.mount)
     for finding in again.findings:
-        if not finding.refused:
+        if not finding.rejected:
             assert abs(finding.after - finding.before) < 1.5 * finding.sigma, finding
 
 

@@ -45,7 +45,7 @@ def test_braking_or_turning_takes_it_half_a_t_squared_off():
     may = ManeuverBound(4.0, 0.6)
     assert may.displacement_m(0.5) == pytest.approx(0.5)
     assert may.turn_rad(2.0) == pytest.approx(1.2)
-    assert USUAL_MANEUVER.displacement_m(1) < GAP_MANEUVER.place_m(1) < HARDEST_MANEUVER.place_m(1)
+    assert USUAL_MANEUVER.displacement_m(1) < GAP_MANEUVER.displacement_m(1) < HARDEST_MANEUVER.displacement_m(1)
     assert USUAL_MANEUVER.turn_rad(1) < GAP_MANEUVER.turn_rad(1) < HARDEST_MANEUVER.turn_rad(1)
 
 

@@ -90,7 +90,7 @@ def test_hovering_has_no_direction_and_keeps_its_key():
     for motion in motions[1:]:
         assert motion.direction_from is None
         assert motion.direction_sigma_rad is None
-        assert motion.reason == "no motion seen beyond the rotation"
+        assert motion.reason == "no translation observed"
         assert turn_error_deg(truth, motion) < 0.02
 
 

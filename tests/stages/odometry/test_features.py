@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.kernels.visual.features import best_per_cell
-from stages.kernels.visual.patches import RADIUS_PX, SIDE_PX, at, find, look, take
+from stages.kernels.visual.patches import RADIUS_PX, SIDE_PX, at, find, sample, take
 from stages.odometry.visual.features import FeatureSettings, FeatureTracker, usable_pixels
 from tests.stages.seen import LENS, PIXEL_RAD, SIZE_PX, picture
 
@@ -159,10 +159,10 @@ def test_a_template_is_looked_for_in_the_pixels_between_the_pictures_own_and_nev
                 for du in patch
             ]
         )
-        if look(grey, column, row, warp, seen):
+        if sample(grey, column, row, warp, seen):
             np.testing.assert_array_equal(seen, wanted)
         else:
             beyond += 1
             assert np.isnan(wanted).any()
     assert 100 < beyond < 400
-    assert not look(grey, np.nan, 20.0, np.eye(2), seen)
+    assert not sample(grey, np.nan, 20.0, np.eye(2), seen)

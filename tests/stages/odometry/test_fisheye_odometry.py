@@ -12,7 +12,7 @@ from flow.stage import input_ports, output_ports
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import DroneImu, FollowedFeatures, Image, VisualMotion
 from stages.odometry.drone import FisheyeOdometry
-from stages.odometry.drone.fisheye_odometry import turned, visual_motion
+from stages.odometry.drone.fisheye_odometry import gyro_rotation, visual_motion
 from stages.odometry.visual.features import Tracks
 from stages.odometry.visual.image_motion import Link
 from stages.odometry.visual.two_view import TwoView
@@ -139,11 +139,11 @@ def test_the_gyro_is_summed_from_picture_to_picture_and_not_over_holes():
     rate = np.array([0.0, 0.0, 1.0])
     ms = 1_000_000
     even = [(k * 10 * ms, rate) for k in range(11)]
-    R = turned(even, 5 * ms, 95 * ms)
+    R = gyro_rotation(even, 5 * ms, 95 * ms)
     np.testing.assert_allclose(log_rotation(R), 0.09 * rate, atol=1e-12)
-    assert turned([g for g in even if not 30 * ms <= g[0] <= 90 * ms], 5 * ms, 95 * ms) is None
-    assert turned(even, 5 * ms, 500 * ms) is None
-    assert turned([(80 * ms, rate)], 5 * ms, 95 * ms) is None
+    assert gyro_rotation([g for g in even if not 30 * ms <= g[0] <= 90 * ms], 5 * ms, 95 * ms) is None
+    assert gyro_rotation(even, 5 * ms, 500 * ms) is None
+    assert gyro_rotation([(80 * ms, rate)], 5 * ms, 95 * ms) is None
 
 
 def test_a_blank_picture_ends_the_chain_and_the_next_begins_one():

@@ -1,4 +1,4 @@
-"""The new rig as a file: to lay over a configuration (`--overlay`), to include in one, or to import with (`--rig`).
+"""The calibrated rig as a file, for `--overlay`, for `include:` in a configuration, or for `--rig`.
 
 Source: ours; the format of configs/rigs/standard.yaml.
 """
@@ -22,7 +22,7 @@ ZERO_NOTE = (
 
 
 def rig_text(rig: dict[str, Any], found: Calibration, source: str) -> str:
-    """The whole rig file: what was known, with the LiDAR's mount as it was found, and a line for each number."""
+    """The whole rig file: the old rig with the calibrated LiDAR mount, and a comment line for each parameter."""
     new = copy.deepcopy(rig)
     new["lidar"]["mount"] = mount_tree(found.mount)
     head = [
@@ -35,12 +35,12 @@ def rig_text(rig: dict[str, Any], found: Calibration, source: str) -> str:
 
 
 def zero_found(found: Calibration) -> bool:
-    """Whether the servo's zero was found, by a wall."""
+    """Whether the servo's zero was estimated, from a wall."""
     return not next(finding.rejected for finding in found.findings if finding.name == "zero")
 
 
 def mount_tree(mount: LidarMount) -> dict[str, Any]:
-    """A mount as YAML values; every key is there, so that laid over another rig nothing of that one shows through."""
+    """A mount as YAML values with every key, so that as an overlay it replaces another mount completely."""
     return {
         "T_vehicle_turntable": pose_tree(mount.T_vehicle_turntable),
         "T_turntable_lidar": pose_tree(mount.T_turntable_lidar),
@@ -62,7 +62,7 @@ def mount_tree(mount: LidarMount) -> dict[str, Any]:
 
 
 def pose_tree(pose: Pose) -> dict[str, Any]:
-    """A pose as YAML values, the way of writing the rotation that is not used as null."""
+    """A pose as YAML values; the rotation format that is not used is null."""
     return {
         "xyz_m": [round(value, DIGITS) for value in pose.xyz_m],
         "rpy_deg": None if pose.rpy_deg is None else list(pose.rpy_deg),

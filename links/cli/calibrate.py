@@ -72,10 +72,11 @@ def calibrate_recording(
     Estimates tilt and offset from the servo's axis, the encoder error, the gear play and the servo's time offset, each
     with a sigma. A parameter that the sweep or the scene does not determine keeps its value, with the reason. Writes a
     new rig file and, where matplotlib is installed, figures next to it (.svg). The vehicle must stand still. A sweep in
-    both directions at two speeds near walls is best. Exit code 1 if no calibration is possible; then no file is written.
+    both directions at two speeds near walls is best. Exit code 1 if no calibration is possible, and no file is written.
 
     The servo's zero and the tilt of its axis in the vehicle are not observable from a sweep: give the vehicle's
-    orientation with --parallel and --level. Front and rear wheel equally far from a wall within 5 mm are parallel within 0.15 deg.
+    orientation with --parallel and --level. Front and rear wheel equally far from a wall within 5 mm are parallel
+    within 0.15 deg.
 
     Example: grd calibrate parked.mcap -o rig.yaml && grd replay flight.mcap --overlay rig.yaml
     """

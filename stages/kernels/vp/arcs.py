@@ -136,7 +136,7 @@ def _fit_piece(rays: Array64, i: int, j: int, min_extent: float, least_sigma: fl
 def fit_moments(
     moments: Moments, first: Vector, last: Vector, min_extent: float, least_sigma: float, row: Array64
 ) -> bool:
-    """The circle through rays of these moments, from about `first` to about `last`. Returns False if shorter than min_extent."""
+    """Fit the circle to rays of these moments, from about `first` to about `last`. False: shorter than min_extent."""
     n = cross(first, last)
     extent = math.atan2(_length(n), dot(first, last))
     if not min_extent <= extent < WIDEST_RAD:

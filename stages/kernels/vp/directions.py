@@ -127,7 +127,7 @@ def _normal_equations(
     residual: Array64,
     sigma: Array64,
 ) -> tuple[Array64, Array64, float]:
-    """Normal equations H, g of the rotation omega of frame 0 about its own axes, then of each further yaw: d -> d + omega x d."""
+    """Normal equations H, g of the rotation omega of frame 0 about its axes, then each further yaw: d + omega x d."""
     size = 3 + (len(directions) - 1) // 2 - 1
     H, g = np.zeros((size, size)), np.zeros(size)
     J, at = np.zeros(4), np.zeros(4, dtype=np.int64)

@@ -59,9 +59,9 @@ def follow(
     start: NDArray[np.int64],
     back: NDArray[np.float32],
 ) -> tuple[int, int]:
-    """Chains from seeds on a lattice that no straight 8-connected run of five pixels misses: number of points and chains.
+    """Follow chains from seeds on a lattice that no straight 8-connected run of five pixels misses.
 
-    `free` is used up; it is 0 in a border of two pixels.
+    Returns the number of points and of chains. `free` is used up; it is 0 in a border of two pixels.
     """
     height, width = grey.shape
     flat_x, flat_y, flat_free = dx.ravel(), dy.ravel(), free.ravel()

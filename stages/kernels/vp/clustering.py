@@ -13,7 +13,7 @@ from stages.geometry.lens import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.vp.arcs import COLUMNS, WIDEST_RAD, Moments, Vector, cross, dot, fit_moments
 
-TOGETHER_SIGMAS = 2.0  # gate in sigmas of the circle's normal, if larger
+TOGETHER_SIGMAS = 2.0  # additional tolerance, in sigmas of the circle's normal
 GAP_RAD = 0.2  # largest gap between the ends of an arc and of the line
 
 

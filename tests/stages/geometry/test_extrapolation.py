@@ -41,7 +41,7 @@ def word(time_s, at=bend, covariance=True):
 WORDS = [word(0.1 * k) for k in range(10)]
 
 
-def test_braking_or_turning_takes_it_half_a_t_squared_off():
+def test_a_maneuver_deviates_by_half_a_t_squared():
     may = ManeuverBound(4.0, 0.6)
     assert may.displacement_m(0.5) == pytest.approx(0.5)
     assert may.turn_rad(2.0) == pytest.approx(1.2)
@@ -51,7 +51,7 @@ def test_braking_or_turning_takes_it_half_a_t_squared_off():
 
 @pytest.mark.parametrize("untold_s", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("turned", [0.0, 2.0])
-def test_it_goes_on_along_the_bend_that_it_drove(untold_s, turned):
+def test_extrapolation_follows_the_constant_turn_rate(untold_s, turned):
     frame = rotation_z(turned)
     R, xyz_m = bend(0.9 + untold_s)
     told = constant_turn_rate(
@@ -62,7 +62,7 @@ def test_it_goes_on_along_the_bend_that_it_drove(untold_s, turned):
     np.testing.assert_allclose(told.R_map_vehicle, frame @ R, atol=1e-6)
 
 
-def test_after_a_second_it_stands_and_is_ever_less_sure():
+def test_after_the_horizon_the_pose_is_constant_and_the_covariance_grows():
     one, many = (
         constant_turn_rate(WORDS, WORDS[-1].stamp_ns + round(s * S)) for s in (SOURCE_CHANGE_S, 5 * SOURCE_CHANGE_S)
     )
@@ -73,18 +73,18 @@ def test_after_a_second_it_stands_and_is_ever_less_sure():
     np.testing.assert_allclose(sigma, [0.5 * 0.5 * 5**2] * 3 + [0.5 * 3.0 * 5**2] * 3)
 
 
-def test_one_word_alone_and_words_from_long_ago_tell_no_speed():
+def test_one_pose_or_poses_from_long_ago_give_no_speed():
     for words in (WORDS[-1:], [word(-5.0), WORDS[-1]]):
         told = constant_turn_rate(words, 2 * S)
         np.testing.assert_allclose(told.xyz_map_m, WORDS[-1].xyz_map_m)
         np.testing.assert_allclose(told.R_map_vehicle, WORDS[-1].R_map_vehicle)
 
 
-def test_who_does_not_say_how_sure_it_is_is_not_made_sure():
+def test_a_pose_without_covariance_is_extrapolated_without_one():
     assert constant_turn_rate([word(0.0, covariance=False)], S).covariance is None
 
 
-def test_the_speed_outlives_a_start_frame_that_jumps():
+def test_the_speed_is_kept_when_the_start_frame_jumps():
     words, far = AcceptedPoses(), 1000.0
     assert words.speed_mps is None
     for k in range(10):

@@ -15,14 +15,14 @@ def test_the_adjoint_is_as_printed():
     np.testing.assert_allclose(A @ adjoint(R.T, -R.T @ t), np.eye(6), atol=1e-12)
 
 
-def test_a_covariance_carried_along_is_by_the_adjoint_of_the_way_back():
+def test_a_composed_covariance_uses_the_adjoint_of_the_inverse():
     P, Q = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), 0.1 * np.eye(6)
     R, t = exp_rotation(np.array([0.3, 0.0, 0.1])), np.array([1.0, -2.0, 0.5])
     A = adjoint(R.T, -R.T @ t)
     np.testing.assert_allclose(composed_covariance(P, R, t, Q), A @ P @ A.T + Q, atol=1e-12)
 
 
-def test_a_covariance_carried_along_is_that_of_drawn_poses():
+def test_a_composed_covariance_is_that_of_sampled_poses():
     rng = np.random.default_rng(5)
     P, Q = np.diag([0.02, 0.01, 0.03, 0.1, 0.2, 0.05]) ** 2, np.diag([0.01] * 3 + [0.05] * 3) ** 2
     R_step, t_step = exp_rotation(np.array([0.1, -0.4, 0.8])), np.array([2.0, -1.0, 0.5])

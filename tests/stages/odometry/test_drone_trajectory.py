@@ -57,7 +57,7 @@ def test_a_late_or_repeated_sample_is_ignored():
     np.testing.assert_allclose(trail.R_odom_drone(100 * MS), exp_rotation(0.1 * RATE), atol=1e-9)
 
 
-def test_a_heading_reset_is_taken_out_by_the_rates():
+def test_a_yaw_reset_is_removed_by_the_rates():
     """From 400 ms on the autopilot's north is 50 deg elsewhere; the drone turns on as its rates say."""
     trail = AutopilotTrajectory()
     for i in range(40):
@@ -71,13 +71,13 @@ def test_a_fast_turn_is_no_jump():
     assert turning(rate=np.array([0, 0, math.radians(120)]), step_ms=100).jumps == 0
 
 
-def test_after_silence_a_jump_cannot_be_seen_and_that_is_counted():
+def test_a_gap_in_which_a_jump_cannot_be_detected_is_counted():
     trail = turning(5)
     trail.add_attitude(3000 * MS, rotation_z(2.0), RATE)
     assert (trail.jumps, trail.gaps) == (0, 1)
 
 
-def test_in_a_gap_it_is_known_a_little_beyond_its_beginning_alone():
+def test_in_a_gap_only_a_short_extrapolation_is_known():
     """It turned 1.5 rad/s all the time: 6 rad in 4 s of silence, which the shorter way round would make a turn back."""
     trail = AutopilotTrajectory()
     for ms in [*range(0, 400, 20), *range(4400, 4800, 20)]:
@@ -93,14 +93,14 @@ def test_in_a_gap_it_is_known_a_little_beyond_its_beginning_alone():
     assert rotation_between(trail, VisualTrajectory(), 200 * MS, 4500 * MS).measured  # over it both ends tell
 
 
-def test_words_half_a_second_apart_tell_of_the_time_between():
+def test_samples_half_a_second_apart_are_interpolated():
     trail = AutopilotTrajectory()
     for ms in range(0, 2000, 500):
         trail.add_attitude(ms * MS, exp_rotation(ms * 1e-3 * RATE), RATE)
     np.testing.assert_allclose(trail.R_odom_drone(950 * MS), exp_rotation(0.95 * RATE), atol=1e-9)
 
 
-def test_pictures_far_apart_tell_of_the_whole_turn_and_not_of_the_time_between():
+def test_images_far_apart_give_the_whole_rotation_but_no_interpolation():
     pictures = VisualTrajectory()
     for one in (step(0, 200), step(200, 400), step(400, 2400), step(2400, 2600)):
         pictures.add(one)
@@ -120,7 +120,7 @@ def flown(jump_at=None, jump_m=(5.0, 0, 0)) -> AutopilotTrajectory:
     return trail
 
 
-def test_places_between_and_a_little_beyond():
+def test_positions_between_and_a_little_beyond_the_samples():
     for ms in (0, 60, 1500):
         place = flown().position(ms * MS)
         assert place is not None
@@ -130,7 +130,7 @@ def test_places_between_and_a_little_beyond():
     assert flown().position(-1) is None
 
 
-def test_a_step_that_the_velocity_does_not_confirm_is_taken_out():
+def test_a_step_that_the_velocity_does_not_confirm_is_removed():
     trail = flown(jump_at=12)
     place = trail.position(1200 * MS)
     assert place is not None
@@ -138,7 +138,7 @@ def test_a_step_that_the_velocity_does_not_confirm_is_taken_out():
     assert trail.jumps == 1
 
 
-def test_a_counted_reset_ends_the_stretch():
+def test_a_counted_reset_ends_the_segment():
     trail = flown()
     trail.reset(3)
     trail.add_position(1500 * MS, np.array([3.0, 1.5, 0.0]), np.array([2.0, 1.0, 0.0]))
@@ -151,7 +151,7 @@ def test_a_counted_reset_ends_the_stretch():
     assert before[1] != after[1]
 
 
-def test_a_silence_ends_the_stretch():
+def test_a_gap_ends_the_segment():
     trail = flown()
     trail.add_position(9000 * MS, np.array([90.0, 0, 0]), np.zeros(3))
     place = trail.position(9000 * MS)
@@ -160,7 +160,7 @@ def test_a_silence_ends_the_stretch():
     assert trail.position(5000 * MS) is None  # in the silence: of neither stretch
 
 
-def test_pictures_chain_steps_that_join():
+def test_consecutive_visual_motions_are_chained():
     pictures = VisualTrajectory()
     for i in range(10):
         pictures.add(step(100 * i, 100 * (i + 1)))
@@ -170,7 +170,7 @@ def test_pictures_chain_steps_that_join():
     assert at[1] == pytest.approx(6.5e-6)
 
 
-def test_a_step_that_skips_a_picture_joins_at_the_one_it_names():
+def test_a_motion_that_skips_an_image_is_chained_at_its_from_stamp():
     pictures = VisualTrajectory()
     pictures.add(step(0, 100))
     pictures.add(step(0, 200))
@@ -189,7 +189,7 @@ def test_a_gap_between_steps_begins_a_new_chain():
     assert math.degrees(math.sqrt(turn.variance_rad2)) == pytest.approx(12.0)  # 40 deg/s for 0.3 s
 
 
-def test_the_autopilot_goes_before_pictures_and_both_agree():
+def test_the_autopilot_takes_precedence_over_images_and_both_agree():
     pictures = VisualTrajectory()
     pictures.add(step(0, 500))
     expected = exp_rotation(0.3 * RATE)

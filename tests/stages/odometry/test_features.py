@@ -140,7 +140,7 @@ def test_what_is_usable_is_symmetric_about_the_lens():
 @pytest.mark.parametrize(
     "wrong", [{"count": 3}, {"window_px": 0}, {"likeness": 1.0}, {"masked_px": (((0, 0), (1, 1)),)}]
 )
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValidationError):
         FeatureSettings(**wrong)
 

@@ -206,6 +206,6 @@ def test_its_ports_are_image_and_a_gyro_that_may_be_missing():
 @pytest.mark.parametrize(
     "wrong", [{"least_matches": 3}, {"link": {"key_share": 1.5}}, {"link": {"tries": 0}}, {"features": {"count": 1}}]
 )
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValidationError):
         FisheyeOdometry(lens=LENS, T_drone_camera=LOOKS_DOWN, **wrong)

@@ -18,10 +18,10 @@ from flow.graph import load_graph
 from flow.link import LinkError, Tap
 from flow.message import Message
 from flow.replay import Replay
-from links.simulated.path import Path as FlightPath
-from links.simulated.path import Waypoint
-from links.simulated.run import Simulation
-from links.simulated.scenario import load_scenario
+from links.simulated.rig.run import Simulation
+from links.simulated.rig.scenario import load_scenario
+from links.simulated.world.path import Path as FlightPath
+from links.simulated.world.path import Waypoint
 from stages.messages import Detections, DroneFix
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,7 +14,7 @@ from flow.compile_cache import keep_compiled
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-COMPILED = ("stages/kernels", "links/simulated")  # folders with compiled functions
+COMPILED = ("stages/kernels", "links/simulated/kernels")  # folders with compiled functions
 CACHE_FOLDER = keep_compiled(COMPILED)
 
 

@@ -30,9 +30,9 @@ from links.mavlink import Autopilot
 from links.mavlink.wire import parse_frame
 from links.recording import RecordingReader
 from links.runs.run_folder import Asked
-from links.simulated.matrix import Conditions, scenario_of
-from links.simulated.matrix_flights import Cell
-from links.simulated.run import simulate_records
+from links.simulated.matrix.flights import Cell
+from links.simulated.matrix.matrix import Conditions, scenario_of
+from links.simulated.rig.run import simulate_records
 from stages.messages import RelativePose
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))

@@ -29,7 +29,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.recording import RecordingReader
 from links.runs.truth import TruthLog
-from links.simulated.live_pictures import PictureServer
+from links.simulated.rig.live_images import MjpegServer
 from tests.links.fault_bounds import KEPT_S, KILLED, MUST, POSES_AGAIN_S, POSITION_AGAIN_S, REST_S
 from tests.links.ports import free_ports
 from tests.unit_file import unit_file
@@ -177,7 +177,7 @@ class Camera:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            with PictureServer(self._port) as server:
+            with MjpegServer(self._port) as server:
                 while not self.off and not self._stop.wait(0.1):
                     server.show(self._jpeg)
             while self.off and not self._stop.wait(0.05):

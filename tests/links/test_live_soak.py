@@ -37,7 +37,7 @@ links:
 WITH_CAMERAS = """\
   camera_vehicle: {{config: {{source: "http://127.0.0.1:{vehicle}/"}}}}
   camera_drone: {{config: {{source: "http://127.0.0.1:{drone}/"}}}}
-  sim: {{config: {{pictures: {pictures}, camera_ports: {{vehicle: {vehicle}, drone: {drone}}}}}}}
+  sim: {{config: {{images: {images}, camera_ports: {{vehicle: {vehicle}, drone: {drone}}}}}}}
 """
 
 
@@ -50,7 +50,7 @@ def test_an_hour_in_flight_grows_nothing_and_stops_nothing(tmp_path):
     command = [sys.executable, "-c", "from links.cli import main; main()", "run", config]
     for number, text in enumerate(overlays):
         overlay = tmp_path / f"soak_{number}.yaml"
-        told = {**ports, "servo": tmp_path / "servo", "pictures": PICTURES, "duration_s": SOAK_S + 60.0}
+        told = {**ports, "servo": tmp_path / "servo", "images": PICTURES, "duration_s": SOAK_S + 60.0}
         overlay.write_text(text.format(**told))
         command += ["--overlay", str(overlay)]
     command += ["--for", str(SOAK_S), "--out", str(tmp_path / "soak")]

@@ -29,7 +29,7 @@ def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
             "fuse": {"refused: fix: not finite": 3, "back end begun anew": 0},
             "recorder": {"missed": 0},
         },
-        off=list(off),
+        switched_off=list(off),
     )
 
 

@@ -48,7 +48,7 @@ def overlay(folder: Path) -> dict:
     }
     if PICTURES is not None:
         cameras = {name: ports[name] for name in ("vehicle", "drone")}
-        links["sim"] |= {"pictures": str(Path(PICTURES).resolve()), "camera_ports": cameras}
+        links["sim"] |= {"images": str(Path(PICTURES).resolve()), "camera_ports": cameras}
         links |= {f"camera_{name}": {"source": f"http://127.0.0.1:{port}/"} for name, port in cameras.items()}
     return {"links": {name: {"config": config} for name, config in links.items()}}
 

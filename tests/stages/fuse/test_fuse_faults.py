@@ -18,10 +18,10 @@ import pytest
 
 from links.runs.run_folder import Asked
 from links.runs.truth import TruthLog
-from links.simulated.closed_loop import ClosedLoop
-from links.simulated.matrix import Conditions, scenario_of
-from links.simulated.matrix_flights import Cell
-from links.simulated.run import Simulation
+from links.simulated.matrix.flights import Cell
+from links.simulated.matrix.matrix import Conditions, scenario_of
+from links.simulated.rig.closed_loop import ClosedLoop
+from links.simulated.rig.run import Simulation
 from stages.messages import PoseState
 from tests.stages.fuse.flown import (
     Fault,

@@ -238,7 +238,7 @@ def test_memory_is_bounded():
     np.testing.assert_allclose(made.at(START_NS + (3 * KEPT - 2) * MS)[1], (0.01 * (3 * KEPT - 2), 0, 0))
     for k in range(2 * KEPT):  # and of the moments that were asked for
         made.at(START_NS + 2 * KEPT * MS + k)
-        assert len(made._known) <= KEPT
+        assert len(made._cache) <= KEPT
     np.testing.assert_allclose(made.at(START_NS + 2 * KEPT * MS)[1], (0.01 * 2 * KEPT, 0, 0))
 
 

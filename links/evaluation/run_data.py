@@ -292,9 +292,11 @@ def _read_searches(path: Path) -> tuple[Search, ...]:
 
 
 def _read_candidates(path: Path) -> pd.DataFrame:
-    table = TextTable(path, ("stamp_s", "candidate", "detector_life", "probability", *XYZ))
+    table = TextTable(path, ("stamp_s", "candidate", "detector_instance", "probability", *XYZ))
     names = (
-        pd.Series(table.text("detector_life"), dtype=object) + " " + pd.Series(table.text("candidate"), dtype=object)
+        pd.Series(table.text("detector_instance"), dtype=object)
+        + " "
+        + pd.Series(table.text("candidate"), dtype=object)
     )
     rows = pd.DataFrame(table.numbers(("probability", *XYZ)), columns=["probability", *XYZ])
     return rows.assign(stamp_ns=table.stamps_ns("stamp_s"), candidate=pd.factorize(names)[0])

@@ -183,11 +183,11 @@ class Results(Tap[ResultsSettings]):
             self._sweep_start_ns = {message.stamp_ns: message.start_ns}
         elif isinstance(message, Detections):
             self._write_detections(message)
-            kind = _NUMBER.sub("#", message.verdict)
+            kind = _NUMBER.sub("#", message.summary)
             self._sweeps[kind] += 1
-            self._examples.setdefault(kind, message.verdict)
+            self._examples.setdefault(kind, message.summary)
             self._sweeps_with_drone += bool(message.accepted.any())
-            self._log(message.stamp_ns, output, message.verdict)
+            self._log(message.stamp_ns, output, message.summary)
         elif isinstance(message, Candidates):
             self._write_candidates(message)
         elif isinstance(message, TrackState):
@@ -227,14 +227,17 @@ class Results(Tap[ResultsSettings]):
         if self._candidates is None:
             self._files[CANDIDATES_FILE] = self._file(CANDIDATES_FILE)
             self._candidates = csv.writer(self._files[CANDIDATES_FILE])
-            head = ["stamp_s", "candidate", "detector_life", "observations", "probability", "x_m", "y_m", "z_m"]
+            head = ["stamp_s", "candidate", "detector_instance", "observations", "probability", "x_m", "y_m", "z_m"]
             self._candidates.writerow(head)
-        before = self._observations if message.detector_life == self._detector_life else {}
-        numbers, observations = message.candidate_id.tolist(), message.looks.tolist()
-        self._observations, self._detector_life = dict(zip(numbers, observations, strict=True)), message.detector_life
+        before = self._observations if message.detector_instance == self._detector_life else {}
+        numbers, observations = message.candidate_id.tolist(), message.scan_passes.tolist()
+        self._observations, self._detector_life = (
+            dict(zip(numbers, observations, strict=True)),
+            message.detector_instance,
+        )
         for i, number in enumerate(numbers):
             if observations[i] != before.get(number):
-                values = [number, message.detector_life, observations[i], f"{message.probability[i]:.6g}"]
+                values = [number, message.detector_instance, observations[i], f"{message.probability[i]:.6g}"]
                 xyz = [f"{v:.4f}" for v in message.xyz_vehicle_m[i].tolist()]
                 self._candidates.writerow([stamp_s(message.stamp_ns), *values, *xyz])
 

@@ -89,16 +89,16 @@ def detections(message: Detections, name: str, scene: Scene) -> Entities:
         best = [percent[chosen].max(initial=0.0) for chosen in (message.accepted, ~message.accepted)]
         yield plot(f"plots/probability/{name}", best, ["accepted", "best rejected"], DETECTION_COLOURS)
     found = bool(message.accepted.any())
-    yield log_entry(name, message.verdict, "INFO" if found else "WARN")
+    yield log_entry(name, message.summary, "INFO" if found else "WARN")
     yield from state_change(state_path(name), "drone" if found else "no drone", scene)
-    yield scene.status(2, stage_of(name), message.verdict)
+    yield scene.status(2, stage_of(name), message.summary)
     rows = [
         f"{number}: {value}, {'accepted' if accepted else 'rejected'} at {_xyz(xyz)} m: {reason}"
         for number, value, accepted, xyz, reason in zip(
             numbers, confidence, message.accepted, message.xyz_vehicle_m, message.reasons, strict=True
         )
     ]
-    yield scene.reasons(2, f"{stage_of(name)}, last search", [message.verdict, *rows])
+    yield scene.reasons(2, f"{stage_of(name)}, last search", [message.summary, *rows])
 
 
 def drone_fix(message: DroneFix, name: str, scene: Scene) -> Entities:

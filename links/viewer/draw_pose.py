@@ -175,7 +175,7 @@ def servo_offset(message: ServoOffset, name: str, scene: Scene) -> Entities:
     if message.offset_s is None or message.sigma_s is None:
         yield scene.status(9, stage_of(name), message.reason)
         return
-    values = 1e3 * np.array([message.offset_s, message.sigma_s, message.rig_s])
+    values = 1e3 * np.array([message.offset_s, message.sigma_s, message.rig_offset_s])
     names = ["servo offset [ms]", "sigma of the servo offset [ms]", "servo offset of the rig [ms]"]
     yield plot(f"plots/other/{name}", values, names)
     text = f"{values[0]:.2f} +- {values[1]:.2f} ms, rig {values[2]:.2f} ms; {message.reason}"

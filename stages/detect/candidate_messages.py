@@ -31,7 +31,7 @@ def candidates_message(
     bank: list[Candidate],
     trail: VehicleTrajectory,
     now_ns: int,
-    detector_life: int,
+    detector_instance: int,
     at_most: int,
     usual_mps: Array64,
     spread_mps: float,
@@ -42,8 +42,8 @@ def candidates_message(
     `said_mps`: the level speed that the drone says it has, 0 when it is silent.
     """
     listed = sorted(bank, key=lambda c: -c.odds)[:at_most]
-    wander_mps = [said_mps if c.hit_looks == 1 else 0.0 for c in listed]
-    spreads_mps = [0.0 if wander else spread_mps for wander in wander_mps]
+    undirected_speed_mps = [said_mps if c.hit_looks == 1 else 0.0 for c in listed]
+    spreads_mps = [0.0 if wander else spread_mps for wander in undirected_speed_mps]
     drones = [c.as_drone(now_ns, usual_mps, spread) for c, spread in zip(listed, spreads_mps, strict=True)]
     seen = [trail.to_vehicle(now_ns, *drone) for drone in drones]
     return Candidates(
@@ -53,10 +53,10 @@ def candidates_message(
         velocity_vehicle_mps=np.array([v for _, v in seen]).reshape(-1, 3),
         probability=np.array([probability(c.odds) for c in listed], dtype=np.float64),
         seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
-        looks=np.array([c.hit_looks for c in listed], dtype=np.int64),
+        scan_passes=np.array([c.hit_looks for c in listed], dtype=np.int64),
         reasons=tuple(c.why for c in listed),
-        wander_mps=np.array(wander_mps, dtype=np.float64),
-        detector_life=detector_life,
+        undirected_speed_mps=np.array(undirected_speed_mps, dtype=np.float64),
+        detector_instance=detector_instance,
     )
 
 
@@ -74,13 +74,13 @@ def detections_message(
     accepted = sum(c.accepted for c in listed)
     if accepted:
         x, y, z = xyz_vehicle_m[0]
-        verdict = f"drone at ({x:.2f}, {y:.2f}, {z:.2f}) m, {100 * probability(listed[0].odds):.1f} %: {listed[0].why}"
-        verdict += f"; {accepted - 1} more" if accepted > 1 else ""
+        summary = f"drone at ({x:.2f}, {y:.2f}, {z:.2f}) m, {100 * probability(listed[0].odds):.1f} %: {listed[0].why}"
+        summary += f"; {accepted - 1} more" if accepted > 1 else ""
     else:
         why = ", ".join(f"{n} x '{reason}'" for reason, n in refused.most_common(3) if n)
-        verdict = f"no drone: {sum(refused.values())} short returns refused at once ({why or 'none'})"
+        summary = f"no drone: {sum(refused.values())} short returns refused at once ({why or 'none'})"
         if listed:
-            verdict += f"; the best candidate, {100 * probability(listed[0].odds):.1f} %: {listed[0].why}"
+            summary += f"; the best candidate, {100 * probability(listed[0].odds):.1f} %: {listed[0].why}"
     return Detections(
         stamp_ns=end_ns,
         xyz_vehicle_m=xyz_vehicle_m,
@@ -89,7 +89,7 @@ def detections_message(
         e_outer=np.zeros(len(listed)),
         accepted=np.array([c.accepted for c in listed], dtype=np.bool_),
         reasons=tuple(c.why for c in listed),
-        verdict=verdict,
+        summary=summary,
         start_ns=start_ns,
         seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
         velocity_vehicle_mps=np.array([v for _, v in seen]).reshape(-1, 3),

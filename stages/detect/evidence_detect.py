@@ -84,7 +84,7 @@ class _Now:
     tidied_ns: int = 0
     elsewhere: bool = False  # all that is remembered, by the vehicle's odometry
     number: int = 0  # of the newest candidate
-    detector_life: int = 0  # its first pulse's stamp
+    detector_instance: int = 0  # its first pulse's stamp
     start_ns: int | None = None  # of the search not yet reported
     end_ns: int | None = None  # of a pass that is over, not yet reported
 
@@ -151,7 +151,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         now = self._now
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
-            now.start_ns = now.tidied_ns = now.detector_life = pulses.stamp_ns
+            now.start_ns = now.tidied_ns = now.detector_instance = pulses.stamp_ns
         part = Slice(pulses, *now.trail.at(middle_ns(pulses)), looking_along(pulses.direction_vehicle))
         changed = False
         sightings = now.finder.feed(part, self._motion_known(now_ns))
@@ -313,7 +313,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         if changed or new:
             told = [c for c in now.bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
             flight = now.word.usual_flight(now.trail, now_ns)
-            yield candidates_message(told, now.trail, now_ns, now.detector_life, settings.max_candidates, *flight)
+            yield candidates_message(told, now.trail, now_ns, now.detector_instance, settings.max_candidates, *flight)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9
         here = any(c.seen_ns >= now.start_ns for c in accepted)

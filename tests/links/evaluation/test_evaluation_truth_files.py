@@ -175,7 +175,7 @@ def test_a_search_with_a_start_time_keeps_it(tmp_path):
         empty = np.zeros(0)
         found = Detections(
             stamp_ns=end, xyz_vehicle_m=np.zeros((0, 3)), score=empty, e_inner=empty, e_outer=empty,
-            accepted=np.zeros(0, dtype=bool), reasons=(), verdict="no drone", start_ns=start,
+            accepted=np.zeros(0, dtype=bool), reasons=(), summary="no drone", start_ns=start,
         )  # fmt: skip
         results.see("detect.detections", found, 0)
     results.close()
@@ -208,7 +208,7 @@ def test_every_sweep_has_a_line_with_its_accepted_candidates(tmp_path):
             e_outer=np.zeros(3),
             accepted=np.array(accepted),
             reasons=("", "", ""),
-            verdict="",
+            summary="",
         )
         results.see("sweep.depth_image", image, 0)
         results.see("detect.detections", found, 0)

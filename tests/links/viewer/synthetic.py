@@ -144,7 +144,7 @@ def detections(stamp_ns: int) -> Detections:
         e_outer=np.array([10.4, 88.0, 80.2]),
         accepted=np.array([True, False, False]),
         reasons=("drone: e = 12.4, lowest", "e_outer 88 over 40: touches a facade", "e_inner 60 over 20: not compact"),
-        verdict="drone at x 6.8, y 3.1, z 12.3 m: e = 12.4, the next is 88.0",
+        summary="drone at x 6.8, y 3.1, z 12.3 m: e = 12.4, the next is 88.0",
     )
 
 
@@ -222,7 +222,7 @@ def candidates(stamp_ns: int, t_s: float) -> Candidates:
         velocity_vehicle_mps=np.zeros((n, 3)),
         probability=np.array([min(0.99, 0.2 + t_s), 0.01])[:n],
         seen_ns=np.full(n, stamp_ns - 20_000_000),
-        looks=np.full(n, 4),
+        scan_passes=np.full(n, 4),
         reasons=(
             "9 looks; 8 of 8 sectors around it free",
             "next to a large object; if not a drone, a lamp, wire or edge",
@@ -240,7 +240,7 @@ def classified(stamp_ns: int, t_s: float) -> Detections:
         e_outer=np.zeros(2),
         accepted=np.array([True, False]),
         reasons=("9 looks", "next to a large object; if not a drone, a lamp, wire or edge"),
-        verdict="drone at (6.8, 3.1, 12.3) m, 99.2 %: 9 looks",
+        summary="drone at (6.8, 3.1, 12.3) m, 99.2 %: 9 looks",
         start_ns=START_NS,
         seen_ns=np.full(2, stamp_ns),
         velocity_vehicle_mps=np.zeros((2, 3)),

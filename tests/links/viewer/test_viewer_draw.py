@@ -115,7 +115,7 @@ def test_candidates_have_rings_at_their_pixels_in_the_depth_image():
         e_outer=np.zeros(3),
         accepted=np.array([True, False, False]),
         reasons=("lowest", "touches a wall", "below"),
-        verdict="drone at 10.4 m",
+        summary="drone at 10.4 m",
     )
     entities = drawn(candidates, "detect/detections", where)
     # u = 10 * 2/10 + 60/2 = 32, v = 10 * -1/10 + 40/2 = 19; the one below the lidar is not in the image
@@ -145,7 +145,7 @@ def test_a_search_without_candidates_is_drawn_as_no_drone():
         e_outer=np.zeros(0),
         accepted=np.zeros(0, dtype=bool),
         reasons=(),
-        verdict="no drone: no candidate",
+        summary="no drone: no candidate",
     )
     entities = drawn(nothing, "detect/detections")
     assert entities["states/detect"].archetypes[0].state.as_arrow_array().to_pylist() == ["no drone"]

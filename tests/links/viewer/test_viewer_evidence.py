@@ -26,7 +26,7 @@ def candidates(stamp_ns: int, **found: tuple[float, str]) -> Candidates:
         velocity_vehicle_mps=np.zeros((n, 3)),
         probability=np.array([p for p, _ in found.values()]),
         seen_ns=np.full(n, stamp_ns - 500_000_000),
-        looks=np.full(n, 3),
+        scan_passes=np.full(n, 3),
         reasons=tuple(why for _, why in found.values()),
     )
 

@@ -102,7 +102,9 @@ def test_the_status_names_what_the_autopilot_does_not_fuse():
 
 
 def test_a_servo_offset_is_shown_with_that_of_the_rig():
-    offset = ServoOffset(stamp_ns=0, offset_s=0.0012, sigma_s=0.0001, rig_s=0.002, windows=2, reason="one window")
+    offset = ServoOffset(
+        stamp_ns=0, offset_s=0.0012, sigma_s=0.0001, rig_offset_s=0.002, windows=2, reason="one window"
+    )
     entities = drawn(offset, "servo_clock/servo_offset")
     assert document(entities["status"]) == "**servo_clock:** 1.20 +- 0.10 ms, rig 2.00 ms; one window"
     nothing = drawn(dataclasses.replace(offset, offset_s=None, sigma_s=None), "servo_clock/servo_offset")

@@ -160,7 +160,7 @@ def test_a_small_thing_that_moves_in_the_free_sky_is_a_drone_after_a_second_or_t
     truth = MOVING(np.array([(last.seen_ns[0] - START_NS) * 1e-9]))[0]
     np.testing.assert_allclose(last.xyz_vehicle_m[0], truth, atol=0.3)
     np.testing.assert_allclose(last.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
-    assert last.verdict.startswith("drone at (")
+    assert last.summary.startswith("drone at (")
     assert "sectors around it free" in last.reasons[0]
     assert last.candidate_id[0] == candidates[0].candidate_id[0]  # the same thing keeps its number
 
@@ -169,7 +169,7 @@ def test_four_packets_together_tell_the_same_as_one_by_one():
     drives_mps = (5.0, 0.0, 0.0)  # and the drone with it
     (candidates, one), (together_4, four) = (run([Drone(MOVING)], drives_mps=drives_mps, packets=n) for n in (1, 4))
     assert accepted_after_s(four) == pytest.approx(accepted_after_s(one), abs=0.1)
-    assert together_4[-1].looks[0] == candidates[-1].looks[0]
+    assert together_4[-1].scan_passes[0] == candidates[-1].scan_passes[0]
     assert together_4[-1].seen_ns[0] == pytest.approx(candidates[-1].seen_ns[0], abs=6e6)
     np.testing.assert_allclose(together_4[-1].xyz_vehicle_m[0], candidates[-1].xyz_vehicle_m[0], atol=0.05)
 
@@ -192,7 +192,7 @@ def test_its_probability_is_told_from_the_first_looks_on_and_grows():
     assert (candidates[0].stamp_ns - START_NS) * 1e-9 < 0.6
     probability = [float(c.probability[0]) for c in candidates]
     assert probability[0] < 0.5 < 0.98 < probability[-1]
-    assert candidates[-1].looks[0] > 15
+    assert candidates[-1].scan_passes[0] > 15
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -207,11 +207,11 @@ def test_what_hangs_quite_still_nearby_is_a_drone_once_all_that_could_hold_it_wo
 def test_candidates_tell_which_life_of_the_detector_counts_them():
     stage = EvidenceDetect(sweep_deg=PASS_DEG)
     whole, _ = run([hanging()], 1.5, stage=stage)
-    assert {m.detector_life for m in whole} == {START_NS}
+    assert {m.detector_instance for m in whole} == {START_NS}
     later = [p for p in pulses_seen([hanging()], WATCHING, 1.5) if p.stamp_ns > START_NS + 700_000_000]
     afresh = EvidenceDetect(sweep_deg=PASS_DEG)
     told = [m for p in later for m in afresh.on_pulses(p) if isinstance(m, Candidates)]
-    assert {m.detector_life for m in told} == {later[0].stamp_ns}
+    assert {m.detector_instance for m in told} == {later[0].stamp_ns}
 
 
 def test_far_away_it_stays_a_candidate_because_a_wire_would_not_be_seen():
@@ -234,9 +234,9 @@ def test_the_same_thing_is_refused_with_a_reason(where):
     candidates, detections = run([hanging(), other], 3.0)
     assert accepted_after_s(detections) == math.inf
     assert len(detections) >= 6
-    said = reasons_of(candidates) + " | ".join(d.verdict for d in detections)
+    said = reasons_of(candidates) + " | ".join(d.summary for d in detections)
     assert all(word in said for word in words), said
-    assert all(d.verdict.startswith("no drone: ") for d in detections)
+    assert all(d.summary.startswith("no drone: ") for d in detections)
     assert all(c.probability.size == 0 or c.probability.max() < 0.9 for c in candidates)
 
 
@@ -244,7 +244,7 @@ def test_what_is_half_hidden_by_something_nearer_is_counted_as_such():
     edge = Box((-3.0, 4.0, 0.0), (3.0, 4.1, 5.2))  # a nearer wall that covers its lower half
     _, detections = run([Drone(still(*PLACE_M)), edge], 2.0)
     assert accepted_after_s(detections) == math.inf
-    assert any("hidden at an end by something nearer" in d.verdict for d in detections)
+    assert any("hidden at an end by something nearer" in d.summary for d in detections)
 
 
 def test_what_stands_far_behind_it_does_not_matter():
@@ -291,7 +291,7 @@ def test_no_drone_is_a_normal_answer_at_the_end_of_each_pass():
     candidates, detections = run([], 2.0)
     assert candidates == []
     assert len(detections) >= 3
-    assert all(d.verdict.startswith("no drone: ") and len(d.score) == 0 for d in detections)
+    assert all(d.summary.startswith("no drone: ") and len(d.score) == 0 for d in detections)
 
 
 def test_searched_intervals_follow_one_another_without_gap():
@@ -309,7 +309,7 @@ def test_a_sweep_over_the_whole_sky_finds_houses_no_drone_and_says_how_many_were
     assert accepted_after_s(detections) == math.inf
     ends_s = [(d.stamp_ns - START_NS) * 1e-9 for d in detections]
     assert ends_s == pytest.approx([1.475, 2.95], abs=0.02)  # 177 deg at 120 deg/s, each
-    assert "short returns refused at once" in detections[0].verdict
+    assert "short returns refused at once" in detections[0].summary
 
 
 # what the drone tells of its flight
@@ -365,8 +365,8 @@ def test_a_drone_met_a_pass_later_where_it_says_it_would_be_goes_on_with_its_evi
 def test_what_was_met_once_flies_on_at_the_speed_that_the_drone_says_nobody_knows_whither():
     for say, speed_mps in ((saying(PASSING_BY), 3.0), (None, 0.0)):
         candidates, _ = run([Drone(PASSING_BY)], seconds=1.0, say=say)
-        once = [told.wander_mps[told.looks == 1] for told in candidates]
-        more = [told.wander_mps[told.looks > 1] for told in candidates]
+        once = [told.undirected_speed_mps[told.looks == 1] for told in candidates]
+        more = [told.undirected_speed_mps[told.looks > 1] for told in candidates]
         np.testing.assert_allclose(np.concatenate(once), speed_mps, atol=0.01)
         assert np.concatenate(once).size
         assert not np.concatenate(more).any()
@@ -442,9 +442,9 @@ def test_what_stood_is_known_again_and_not_looked_at_anew():
     numbers = {int(number) for told in candidates for number in told.candidate_id}
     assert numbers == {1}
     told = [c for c in candidates if c.candidate_id.size]
-    before = max(c.looks[0] for c in told if c.stamp_ns < START_NS + 2e9)
+    before = max(c.scan_passes[0] for c in told if c.stamp_ns < START_NS + 2e9)
     again = next(c for c in told if c.stamp_ns > START_NS + 2.9e9)
-    assert again.looks[0] > before > 5
+    assert again.scan_passes[0] > before > 5
     assert accepted_after_s(detections) == math.inf
     assert len(stage._now.standing) == 0  # it is a candidate again
 
@@ -550,7 +550,7 @@ def test_where_the_vehicles_start_frame_jumps_nothing_is_lost_and_what_stands_ha
     assert {int(number) for told in candidates for number in told.candidate_id} == {1}
     assert accepted_after_s(detections) == math.inf
     assert "it may stand still" in candidates[-1].reasons[0]
-    assert candidates[-1].looks[0] > 12
+    assert candidates[-1].scan_passes[0] > 12
     _, detections = run([Drone(MOVING)], 4.0, drives_mps=None, say=jumping(1.0, by_m))
     assert accepted_after_s(detections) < 3.0
 

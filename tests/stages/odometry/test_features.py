@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.kernels.visual.features import best_per_cell
-from stages.kernels.visual.patches import RADIUS_PX, SIDE_PX, at, find, look, take
+from stages.kernels.visual.patches import RADIUS_PX, SIDE_PX, at, find, sample, take
 from stages.odometry.visual.features import FeatureSettings, FeatureTracker, usable_pixels
 from tests.stages.seen import LENS, PIXEL_RAD, SIZE_PX, picture
 
@@ -140,7 +140,7 @@ def test_what_is_usable_is_symmetric_about_the_lens():
 @pytest.mark.parametrize(
     "wrong", [{"count": 3}, {"window_px": 0}, {"likeness": 1.0}, {"masked_px": (((0, 0), (1, 1)),)}]
 )
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValidationError):
         FeatureSettings(**wrong)
 
@@ -159,10 +159,10 @@ def test_a_template_is_matched_at_sub_pixel_positions_inside_the_image_only():
                 for du in patch
             ]
         )
-        if look(grey, column, row, warp, seen):
+        if sample(grey, column, row, warp, seen):
             np.testing.assert_array_equal(seen, wanted)
         else:
             beyond += 1
             assert np.isnan(wanted).any()
     assert 100 < beyond < 400
-    assert not look(grey, np.nan, 20.0, np.eye(2), seen)
+    assert not sample(grey, np.nan, 20.0, np.eye(2), seen)

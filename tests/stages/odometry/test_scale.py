@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
-from stages.odometry.vehicle.image_motion import Pose6, Step, after, believable, carrier_pose
+from stages.odometry.vehicle.image_motion import Pose6, Step, after, is_plausible, vehicle_pose
 from stages.odometry.vehicle.scale import length_of, parallax_ratio
 from tests.stages.seen import point_rays
 
@@ -58,9 +58,9 @@ def test_few_features_are_believed_only_near_what_was_expected():
     many = length_of(rho, sigma, inverse, inverse_sigma)
     few = length_of(rho[:9], sigma[:9], inverse[:9], inverse_sigma[:9])
     far = type(few)(length + 5.0, 0.1, 0)
-    assert believable(many, far)
-    assert not believable(few, far)
-    assert believable(few, type(few)(length, 0.1, 0))
+    assert is_plausible(many, far)
+    assert not is_plausible(few, far)
+    assert is_plausible(few, type(few)(length, 0.1, 0))
 
 
 def test_steps_add_up_with_their_covariance():
@@ -89,11 +89,11 @@ def test_the_carriers_covariance_is_that_of_its_pose():
     M[:3, :3], M[:3, 3] = exp_rotation(np.array([0.3, -0.2, 1.5])), [1.5, -0.4, 0.8]
     P = np.diag([1e-4, 4e-4, 1e-6, 1e-4, 9e-4, 1e-6])
     camera = Pose6(exp_rotation(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2.0, 3.0]), P)
-    vehicle = carrier_pose(camera, M)
+    vehicle = vehicle_pose(camera, M)
     samples = []
     for _ in range(4000):
         xi = np.sqrt(np.diag(P)) * rng.normal(size=6)
-        other = carrier_pose(Pose6(camera.R @ exp_rotation(xi[:3]), camera.p + camera.R @ xi[3:], P), M)
+        other = vehicle_pose(Pose6(camera.R @ exp_rotation(xi[:3]), camera.p + camera.R @ xi[3:], P), M)
         samples.append([*log_rotation(vehicle.R.T @ other.R), *(vehicle.R.T @ (other.p - vehicle.p))])
     np.testing.assert_allclose(np.cov(np.array(samples).T), vehicle.covariance, atol=0.06 * vehicle.covariance.max())
     np.testing.assert_allclose(vehicle.R, M[:3, :3] @ camera.R @ M[:3, :3].T)

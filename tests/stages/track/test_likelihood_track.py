@@ -38,7 +38,7 @@ def accepted(xyz_m, velocity_mps=(0.0, 0.0, 0.0), t_s=0.0, number=1) -> Detectio
         e_outer=np.zeros(1),
         accepted=np.array([True]),
         reasons=("made",),
-        verdict="made",
+        summary="made",
         start_ns=at_s(t_s) - 1,
         seen_ns=np.array([at_s(t_s)]),
         velocity_vehicle_mps=np.array([velocity_mps], dtype=np.float64),
@@ -50,13 +50,13 @@ def accepted(xyz_m, velocity_mps=(0.0, 0.0, 0.0), t_s=0.0, number=1) -> Detectio
 def candidate(xyz_m, probability, t_s=0.0, number=1, looks=3, life_since_s=0.0) -> Candidates:
     return Candidates(
         stamp_ns=at_s(t_s),
-        detector_life=at_s(life_since_s),
+        detector_instance=at_s(life_since_s),
         candidate_id=np.array([number]),
         xyz_vehicle_m=np.array([xyz_m], dtype=np.float64),
         velocity_vehicle_mps=np.zeros((1, 3)),
         probability=np.array([probability]),
         seen_ns=np.array([at_s(t_s)]),
-        looks=np.array([looks]),
+        scan_passes=np.array([looks]),
         reasons=("flew as a bird does",),
     )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -370,3 +372,13 @@ def test_what_it_is_if_it_is_no_drone_is_noted():
         _, words = classify(c, E, True, True)
         assert c.alternative == suspect
         assert words.endswith(f"if not a drone: {suspect.value}")
+
+
+@pytest.mark.parametrize(
+    ("log_ratios", "range_m", "birds"), [(NOTHING, 5.0, 24.0), (NOTHING, 40.0, 3.3), (None, 20.0, 1.65)]
+)
+def test_the_bird_prior_is_the_assumed_number_of_birds_for_each_drone(log_ratios, range_m, birds):
+    """Two dozen at close range and three far away with telemetry; without it, before any motion was observed, 1.65."""
+    c = candidate(observation(0.0, range_m=range_m))
+    c.log_ratios = log_ratios
+    assert math.exp(-over_bird(c, E)) == pytest.approx(birds, rel=0.05)

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.detect import EvidenceDetect
-from stages.detect.candidate import Observation
+from stages.detect.candidate import Alternative, Observation
 from stages.detect.candidate_messages import detections_message, log_odds_of
 from stages.detect.classifier import ClassifierWeights, over_clutter
 from stages.detect.evidence_detect import HYSTERESIS_NATS, NEAR_REJECTED_M, NEAR_REJECTED_NS, STATIC_NS
@@ -636,3 +636,15 @@ def test_a_lamp_that_was_refused_at_first_sight_is_not_told_anew_while_the_drone
     flies = flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0))
     assert told_again(flies, 4.0) == 0 < told_again(flies, 0.0)
     assert told_again(still(0.0, 0.0, 0.0), 4.0) > 0
+
+
+@pytest.mark.parametrize(("step_m", "remembered"), [(0.0, True), (0.5, False)])
+def test_only_static_candidates_are_remembered_as_rejected_objects(step_m, remembered):
+    """A rejected candidate that moved, a bird say, leaves nothing behind where it was."""
+    path = [observation(0.1 * k, (step_m * k, 20.0, 20.0)) for k in range(6)]
+    c = candidate(*path)
+    c.alternative = Alternative.STATIC
+    stage = EvidenceDetect(parked=True)
+    stage._remember_rejected(stage._now, c)
+    nearest_m = stage._now.rejected_map.nearest_m(c.xyz_m, 0.0, NEAR_REJECTED_M, START_NS)
+    assert math.isfinite(nearest_m) == remembered

@@ -208,7 +208,7 @@ def test_what_hangs_quite_still_nearby_is_a_drone_once_all_that_could_hold_it_wo
     candidates, detections = run([hanging(seed)], 4.2)
     assert 1.0 < accepted_after_s(detections) < 3.0
     assert "it may be static" in candidates[-1].reasons[0]
-    _, told_to_doubt = run([hanging(seed)], 4.2, evidence={"max_isolated_near": 0.0})
+    _, told_to_doubt = run([hanging(seed)], 4.2, weights={"max_isolated_near": 0.0})
     assert accepted_after_s(told_to_doubt) == math.inf
 
 
@@ -616,7 +616,7 @@ def test_a_slice_without_pulses_is_nothing():
         {"accept_probability": 1.0},
         {"follow_up_probability": 0.6},
         {"report_s": 0.0},
-        {"evidence": {"luck": 1}},
+        {"weights": {"luck": 1}},
     ],
 )
 def test_impossible_settings_are_refused(settings):

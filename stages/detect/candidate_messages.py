@@ -65,7 +65,7 @@ def detections_message(
     trail: VehicleTrajectory,
     start_ns: int,
     end_ns: int,
-    refused: Counter[str],
+    rejected: Counter[str],
     at_most: int,
 ) -> Detections:
     """The result of a search from start_ns to end_ns: candidates at their last observation, accepted ones first.
@@ -84,8 +84,8 @@ def detections_message(
         )
         verdict += f"; {accepted - 1} more" if accepted > 1 else ""
     else:
-        why = ", ".join(f"{n} x '{reason}'" for reason, n in refused.most_common(3) if n)
-        verdict = f"no drone: {sum(refused.values())} short returns refused at once ({why or 'none'})"
+        why = ", ".join(f"{n} x '{reason}'" for reason, n in rejected.most_common(3) if n)
+        verdict = f"no drone: {sum(rejected.values())} short returns rejected at once ({why or 'none'})"
         if listed:
             verdict += f"; the best candidate, {100 * probability(listed[0].log_odds):.1f} %: {listed[0].reason}"
     return Detections(

@@ -511,7 +511,7 @@ def test_beside_something_refused_lately_a_still_thing_is_less_likely_a_drone():
     assert "an object near it was rejected" in beside.reason
     assert "an object near it was rejected" not in apart.reason
     assert beside.log_odds < apart.log_odds
-    (less, _), (more, _) = (over_clutter(c, ClassifierWeights(), True, True) for c in (beside, apart))
+    (less, *_), (more, *_) = (over_clutter(c, ClassifierWeights(), True, True) for c in (beside, apart))
     assert more - less == pytest.approx(
         ClassifierWeights().near_rejected, abs=0.01
     )  # 1 m more to it is a hair farther away

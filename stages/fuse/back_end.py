@@ -1,4 +1,4 @@
-"""What keeps the pose: the smoother (smoother.py) or the Kalman filter (ekf.py), one interface.
+"""Interface of the estimator that keeps the pose: the fixed-lag smoother (smoother.py).
 
 Source: ours.
 """

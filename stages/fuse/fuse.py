@@ -1,7 +1,7 @@
 """One pose of the drone, fifty times a second, from everything that tells of it.
 
     fixes, rotations, odometries, each at its own time (estimator.py)
-      -> a chain of poses (smoother.py, or ekf.py)  -> predicted to now -> RelativePose
+      -> a chain of poses (smoother.py)  -> predicted to now -> RelativePose
 
 Now is the newest stamp heard on any port, on a grid of 20 ms; it never goes back. Every port but `fix` may be unwired,
 fall silent and return. Without `motion` the vehicle's frame at each moment is taken for the start frame, as if it were
@@ -28,7 +28,6 @@ from flow.message import Message
 from flow.stage import Settings, Stage
 from stages.fuse.back_end import BackEnd
 from stages.fuse.chain import yaw_sigma_rad
-from stages.fuse.ekf import Ekf
 from stages.fuse.estimator import Estimator
 from stages.fuse.intake import Intake
 from stages.fuse.measurement_covariance import Known, Verdict, lost, pose
@@ -247,10 +246,3 @@ class Fuse(Stage[FuseSettings]):
         R_known = None if unsure else R
         yaw_sigma = 0.0 if R_known is None else yaw_sigma_rad(R_known, whole)
         return Known(now_ns, R_known, xyz_m, whole, *e.positions.velocity(now_ns, R_known, yaw_sigma))
-
-
-class EkfFuse(Fuse):
-    """The same with a Kalman filter in place of the smoother, for comparison."""
-
-    def _back_end(self) -> BackEnd:
-        return Ekf()

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from stages.fuse import EkfFuse, Fuse
+from stages.fuse import Fuse
 from stages.heading.hypothesis_bank import BranchBank, BranchSettings
 from stages.messages import PoseState
+from tests.stages.fuse.ekf import EkfFuse
 from tests.stages.fuse.made_drone_flight import Made, ns
 
 FULL, AMBIGUOUS, COASTING = PoseState.FULL, PoseState.AMBIGUOUS, PoseState.COASTING

@@ -10,9 +10,10 @@ import resource
 import numpy as np
 import pytest
 
-from stages.fuse import EkfFuse, Fuse
+from stages.fuse import Fuse
 from stages.fuse.settings import FuseErrors
 from stages.messages import PoseState
+from tests.stages.fuse.ekf import EkfFuse
 from tests.stages.fuse.made_drone_flight import START_NS, Made, S, rms
 
 CHI2_95 = {3: 7.815, 6: 12.592}

@@ -8,8 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from stages.fuse import EkfFuse, Fuse
+from stages.fuse import Fuse
 from stages.messages import PoseState, ServoState, TrackingState
+from tests.stages.fuse.ekf import EkfFuse
 from tests.stages.fuse.made_drone_flight import START_NS, Made, S, fix, ns, rms, rotation, track
 
 FULL, COASTING, LOST = PoseState.FULL, PoseState.COASTING, PoseState.LOST

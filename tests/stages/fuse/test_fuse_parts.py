@@ -9,7 +9,6 @@ import pytest
 
 from stages.fuse.correlated import MOST, Worth, inflation
 from stages.fuse.drift import Drift
-from stages.fuse.ekf import Ekf
 from stages.fuse.estimator import Estimator
 from stages.fuse.motions import Motions
 from stages.fuse.positions import Positions, Told
@@ -26,6 +25,7 @@ from stages.heading.odometry_yaw import North
 from stages.heading.yaw_fit import DRIFT_RAD_PER_S, Yaw
 from stages.messages import DroneAttitude, DroneLocalPosition, TrackingState, TrackState
 from stages.odometry.drone.trajectory import AutopilotTrail
+from tests.stages.fuse.ekf import Ekf
 from tests.stages.fuse.made_drone_flight import S, fix, gauss_markov, ns, track
 
 ERRORS = FuseErrors()

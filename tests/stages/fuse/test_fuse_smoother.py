@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 
-from stages.fuse.ekf import Ekf
 from stages.fuse.propagated import Step
 from stages.fuse.smoother import Smoother
 from stages.geometry.frames import rotation_z
 from stages.geometry.se3 import carried_covariance
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
+from tests.stages.fuse.ekf import Ekf
 
 TENTH = 100_000_000
 TILT = 0.2

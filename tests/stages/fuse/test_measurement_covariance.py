@@ -9,6 +9,7 @@ from stages.fuse.measurement_covariance import Known, Verdict, pose
 from stages.messages import PoseState
 
 SHIFT_M2 = np.diag([0.01, 0.02, 0.04])  # vehicle axes, of the vehicle's position since its newest message
+NO_SHIFT_M2 = np.zeros((3, 3))
 YAW_RAD2 = 0.001
 COS, SIN = 0.8, 0.6
 R_MAP_VEHICLE = np.array([[COS, -SIN, 0.0], [SIN, COS, 0.0], [0.0, 0.0, 1.0]])
@@ -17,7 +18,7 @@ XYZ_VEHICLE_M = np.array([1.0, 2.0, 3.0])
 LEVER_VEHICLE_M = np.array([-2.0, 1.0, 0.0])  # derivative of the drone's position by the vehicle's yaw
 
 
-def motions(yaw_rad2=0.0, shift_m2=np.zeros((3, 3))):
+def motions(yaw_rad2=0.0, shift_m2=NO_SHIFT_M2):
     """A vehicle at the origin of `map`, turned by R_MAP_VEHICLE, with the given uncertainty of its extrapolation."""
     position_m2 = shift_m2 + yaw_rad2 * np.outer(LEVER_VEHICLE_M, LEVER_VEHICLE_M)
     return SimpleNamespace(

@@ -14,7 +14,7 @@ from links.viewer import colours
 from links.viewer.draw_rotation import rpy_deg
 from links.viewer.marks import Marks, clear, ellipsoids, lane_of, plot, say, stage_of, state
 from links.viewer.scene import Mark, Scene
-from stages.messages import AutopilotEstimator, PoseState, RelativePose, ServoOffset
+from stages.messages import AutopilotEstimator, PoseEstimate, PoseState, PositionEstimate, RelativePose, ServoOffset
 
 AXIS_M = 0.8
 AXES = ["x forward", "y left", "z up"]
@@ -30,12 +30,12 @@ def relative_pose(message: RelativePose, name: str, scene: Scene) -> Marks:
         yield say(name, f"{word}: {message.reason}", "WARN" if message.state in WARNED else "INFO")
     if scene.changed(f"resets/{name}", str(message.resets)) and message.resets:
         yield say(name, f"the pose jumped, {message.resets} so far: {message.reason}", "WARN")
-    R, xyz_m, covariance = message.R_vehicle_drone, message.xyz_vehicle_m, message.covariance
-    if xyz_m is None or covariance is None:
+    estimate = message.estimate
+    if estimate is None:
         yield clear(f"vehicle/{name}")
         yield scene.now(6, stage_of(name), f"{word}: {message.reason}")
         return
-    placed = covariance[3:, 3:] if R is None else R @ covariance[3:, 3:] @ R.T  # vehicle axes
+    xyz_m, placed = estimate.xyz_vehicle_m, position_covariance_vehicle_m2(estimate)
     yield ellipsoids(f"vehicle/{name}/ellipsoid_95", xyz_m[None], placed[None], colours.NEUTRAL, filled=False)
     yield plot(f"plots/position/{name}", xyz_m, [f"fused {axis}" for axis in AXES], colours.AXES, dots=False)
     sigma_m = np.sqrt(np.diag(placed))
@@ -46,20 +46,28 @@ def relative_pose(message: RelativePose, name: str, scene: Scene) -> Marks:
         age_s = (message.stamp_ns - message.measured_ns) * 1e-9
         yield plot(f"plots/other/{name}/age", [age_s], ["age of the newest fix [s]"])
     where = f"{_slashed(xyz_m, 2)} m, sigma {_slashed(sigma_m, 2)} m"
-    if R is None:
+    if not isinstance(estimate, PoseEstimate):
         yield clear(f"vehicle/{name}/axes")
     else:
+        R = estimate.R_vehicle_drone
         arrows = rr.Arrows3D(
             origins=np.tile(xyz_m, (3, 1)), vectors=AXIS_M * R.T, colors=colours.AXES, radii=rr.Radius.ui_points(2.0)
         )
         yield Mark(f"vehicle/{name}/axes", arrows, frame="vehicle")
         angles_deg = rpy_deg(R)
-        sigma_deg = np.rad2deg(np.sqrt(np.diag(covariance)[:3]))
+        sigma_deg = np.rad2deg(np.sqrt(np.diag(estimate.covariance)[:3]))
         yield plot(f"plots/rotation/{name}", angles_deg, ["fused roll", "pitch", "yaw"], colours.AXES, dots=False)
         names = [f"fused sigma about {axis}" for axis in AXES]
         yield plot(f"plots/rotation_sigma/{name}", sigma_deg, names, colours.AXES, dots=False)
         where += f"; roll / pitch / yaw {_slashed(angles_deg, 1)} deg, sigma {_slashed(sigma_deg, 1)} deg"
     yield scene.now(6, stage_of(name), f"{word}: {where}; {message.reason}")
+
+
+def position_covariance_vehicle_m2(estimate: PositionEstimate | PoseEstimate) -> np.ndarray:
+    """(3, 3) covariance of the drone's position, vehicle axes."""
+    if isinstance(estimate, PoseEstimate):
+        return estimate.R_vehicle_drone @ estimate.covariance[3:, 3:] @ estimate.R_vehicle_drone.T
+    return estimate.covariance_vehicle_m2
 
 
 def autopilot_estimator(message: AutopilotEstimator, name: str, scene: Scene) -> Marks:

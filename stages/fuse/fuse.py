@@ -30,7 +30,7 @@ from stages.fuse.back_end import BackEnd
 from stages.fuse.chain import yaw_sigma_rad
 from stages.fuse.estimator import Estimator
 from stages.fuse.intake import Intake
-from stages.fuse.measurement_covariance import Known, Verdict, lost, pose
+from stages.fuse.measurement_covariance import MapEstimate, Status, lost, pose
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
 from stages.fuse.status import Jumps, state_of, why_unbacked
@@ -214,9 +214,9 @@ class Fuse(Stage[FuseSettings]):
             if known is not None:
                 e.lose()
             self._jumps.lost()
-            return lost(now_ns, self._verdict(PoseState.LOST, reason))
+            return lost(now_ns, self._status(PoseState.LOST, reason))
         self._jumps.see(known, e.resets)
-        return pose(known, self._verdict(state, reason), e.motions)
+        return pose(known, self._status(state, reason), e.motions)
 
     def _doubt(self, now_ns: int) -> str:
         """Why a rotation that is told is not believed; empty: none is told."""
@@ -227,11 +227,11 @@ class Fuse(Stage[FuseSettings]):
             return ""
         return f"rotation known up to quarter turns: {self._rotation_reason}"
 
-    def _verdict(self, state: PoseState, reason: str) -> Verdict:
+    def _status(self, state: PoseState, reason: str) -> Status:
         e = self._estimator
-        return Verdict(state, reason, e.newest_fix_ns, e.track_id, e.resets + self._jumps.number, e.positions.nis)
+        return Status(state, reason, e.newest_fix_ns, e.track_id, e.resets + self._jumps.number, e.positions.nis)
 
-    def _known(self, now_ns: int) -> Known:
+    def _known(self, now_ns: int) -> MapEstimate:
         """The estimate carried to now, with what never averages out added."""
         e = self._estimator
         R, xyz_m, covariance = e.at(now_ns)
@@ -245,4 +245,4 @@ class Fuse(Stage[FuseSettings]):
             whole[3:, 3:] += R.T @ lasting @ R
         R_known = None if unsure else R
         yaw_sigma = 0.0 if R_known is None else yaw_sigma_rad(R_known, whole)
-        return Known(now_ns, R_known, xyz_m, whole, *e.positions.velocity(now_ns, R_known, yaw_sigma))
+        return MapEstimate(now_ns, R_known, xyz_m, whole, *e.positions.velocity(now_ns, R_known, yaw_sigma))

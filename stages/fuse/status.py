@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from stages.fuse.estimator import Estimator
-from stages.fuse.measurement_covariance import Known
+from stages.fuse.measurement_covariance import MapEstimate
 from stages.fuse.settings import FuseLimits
 from stages.heading.fused_heading import STREETS_NS
 from stages.kernels.geometry.so3 import log_rotation
@@ -26,7 +26,7 @@ JUMP_MPS2, JUMP_RAD_PER_S = 10.0, 4.0  # what a drone can do between two outputs
 
 
 def state_of(
-    known: Known | None, estimator: Estimator, limits: FuseLimits, now_ns: int, tracker: str, doubt: str
+    known: MapEstimate | None, estimator: Estimator, limits: FuseLimits, now_ns: int, tracker: str, doubt: str
 ) -> tuple[PoseState, str]:
     """The state, and why. `tracker`: what it says; `doubt`: why a rotation that is told is not believed, or empty."""
     e = estimator
@@ -77,7 +77,7 @@ class Jumps:
 
     def __init__(self, limits: FuseLimits) -> None:
         self._limits = limits
-        self._last: Known | None = None
+        self._last: MapEstimate | None = None
         self._resets_told = 0
         self.number = 0
 
@@ -86,7 +86,7 @@ class Jumps:
         self.number += self._last is not None
         self._last = None
 
-    def see(self, known: Known, resets: int) -> None:
+    def see(self, known: MapEstimate, resets: int) -> None:
         """One more pose; `resets` of the estimator are counted there already."""
         last, told = self._last, self._resets_told
         self._last, self._resets_told = known, resets

@@ -206,7 +206,7 @@ def judge(flown: Flown, poses: list[RelativePose], into: Row | None = None) -> R
     for pose in poses:
         row.states[pose.state] += 1
         true = flown.truth(pose.stamp_ns)
-        if pose.xyz_vehicle_m is None or pose.covariance is None or true is None:
+        if pose.estimate is None or true is None:
             continue
         R, xyz = true
         add_errors(row, pose, R, xyz)

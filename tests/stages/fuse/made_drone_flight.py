@@ -20,7 +20,9 @@ from stages.messages import (
     DroneFix,
     DroneLocalPosition,
     DroneOdometry,
+    PoseEstimate,
     PoseState,
+    PositionEstimate,
     RelativePose,
     RelativeRotation,
     ServoState,
@@ -253,12 +255,11 @@ class Made:
             if t < after_s:
                 continue
             out.states[pose.state] += 1
-            if pose.xyz_vehicle_m is None:
+            if pose.estimate is None:
                 continue
             R, xyz = self.truth(t)
-            P = pose.covariance
             out.at_s.append(t)
-            out.sigma_m.append(math.sqrt(float(np.trace(P[3:, 3:])) / 3))
+            out.sigma_m.append(math.sqrt(float(np.trace(position_covariance_m2(pose.estimate))) / 3))
             add_errors(out, pose, R, xyz)
         return out
 
@@ -273,13 +274,20 @@ class Errors:
     nees6: list[float] = field(default_factory=list)
 
 
+def position_covariance_m2(estimate: PositionEstimate | PoseEstimate) -> np.ndarray:
+    """(3, 3) of the drone's position: in drone axes where its rotation is known, else in vehicle axes."""
+    return estimate.covariance[3:, 3:] if isinstance(estimate, PoseEstimate) else estimate.covariance_vehicle_m2
+
+
 def add_errors(errors: Errors, pose: RelativePose, R: np.ndarray, xyz_m: np.ndarray) -> None:
     """What a pose with a position is off, and by its own covariance, whose axes are the drone's where it has any."""
-    e, P = pose.xyz_vehicle_m - xyz_m, pose.covariance
+    estimate = pose.estimate
+    e = estimate.xyz_vehicle_m - xyz_m
     errors.error_m.append(float(np.linalg.norm(e)))
-    if pose.R_vehicle_drone is None:
-        errors.nees3.append(float(e @ np.linalg.solve(P[3:, 3:], e)))
+    if isinstance(estimate, PositionEstimate):
+        errors.nees3.append(float(e @ np.linalg.solve(estimate.covariance_vehicle_m2, e)))
         return
+    P = estimate.covariance
     off = np.concatenate([log_rotation(pose.R_vehicle_drone.T @ R), -pose.R_vehicle_drone.T @ e])
     errors.nees3.append(float(off[3:] @ np.linalg.solve(P[3:, 3:], off[3:])))
     errors.nees6.append(float(off @ np.linalg.solve(P, off)))

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stages.fuse.measurement_covariance import Known, Verdict, pose
+from stages.fuse.measurement_covariance import MapEstimate, Status, pose
 from stages.messages import PoseState
 
 SHIFT_M2 = np.diag([0.01, 0.02, 0.04])  # vehicle axes, of the vehicle's position since its newest message
@@ -31,8 +31,8 @@ def motions(yaw_rad2=0.0, shift_m2=NO_SHIFT_M2):
 
 
 def fused(covariance, R_map_drone, motions):
-    known = Known(10**9, R_map_drone, R_MAP_VEHICLE @ XYZ_VEHICLE_M, covariance, np.zeros(3), np.eye(3))
-    return pose(known, Verdict(PoseState.FULL, "", 10**9, 1, 0, 1.0), motions)
+    known = MapEstimate(10**9, R_map_drone, R_MAP_VEHICLE @ XYZ_VEHICLE_M, covariance, np.zeros(3), np.eye(3))
+    return pose(known, Status(PoseState.FULL, "", 10**9, 1, 0, 1.0), motions)
 
 
 def test_without_a_rotation_the_position_covariance_turns_from_map_into_vehicle_axes():
@@ -40,34 +40,34 @@ def test_without_a_rotation_the_position_covariance_turns_from_map_into_vehicle_
     covariance[3:, 3:] = np.diag([1.0, 4.0, 9.0])
     message = fused(covariance, None, motions())
     np.testing.assert_allclose(
-        message.covariance[3:, 3:], [[2.08, 1.44, 0.0], [1.44, 2.92, 0.0], [0.0, 0.0, 9.0]], atol=1e-12
+        message.estimate.covariance_vehicle_m2, [[2.08, 1.44, 0.0], [1.44, 2.92, 0.0], [0.0, 0.0, 9.0]], atol=1e-12
     )
-    np.testing.assert_allclose(message.map_covariance[3:, 3:], np.diag([1.0, 4.0, 9.0]))
-    np.testing.assert_array_equal(np.diag(message.covariance)[:3], [np.inf] * 3)
+    np.testing.assert_allclose(message.estimate.covariance_map_m2, np.diag([1.0, 4.0, 9.0]))
+    assert message.R_vehicle_drone is None
 
 
 def test_with_a_rotation_the_covariance_in_drone_axes_is_the_same_from_both_frames():
     covariance = np.diag([1e-4, 2e-4, 3e-4, 0.1, 0.2, 0.3])
     message = fused(covariance, R_MAP_VEHICLE @ R_VEHICLE_DRONE, motions())
-    np.testing.assert_allclose(message.covariance, covariance)
-    np.testing.assert_allclose(message.map_covariance, covariance)
+    np.testing.assert_allclose(message.estimate.covariance, covariance)
+    np.testing.assert_allclose(message.estimate.map_covariance, covariance)
     np.testing.assert_allclose(message.R_vehicle_drone, R_VEHICLE_DRONE, atol=1e-12)
 
 
 def test_the_shift_of_the_vehicle_is_added_in_drone_axes():
     message = fused(np.eye(6), R_MAP_VEHICLE @ R_VEHICLE_DRONE, motions(shift_m2=SHIFT_M2))
-    np.testing.assert_allclose(message.covariance, np.diag([1.0, 1.0, 1.0, 1.02, 1.04, 1.01]), atol=1e-12)
-    np.testing.assert_allclose(message.map_covariance, np.eye(6))
+    np.testing.assert_allclose(message.estimate.covariance, np.diag([1.0, 1.0, 1.0, 1.02, 1.04, 1.01]), atol=1e-12)
+    np.testing.assert_allclose(message.estimate.map_covariance, np.eye(6))
 
 
 def test_the_yaw_of_the_vehicle_turns_the_drone_about_its_vertical_and_moves_it_along_the_lever():
     message = fused(np.eye(6), R_MAP_VEHICLE @ R_VEHICLE_DRONE, motions(YAW_RAD2))
     column = np.array([0.0, 1.0, 0.0, 1.0, 0.0, -2.0])  # vertical, then lever, both in drone axes
-    np.testing.assert_allclose(message.covariance, np.eye(6) + YAW_RAD2 * np.outer(column, column), atol=1e-12)
+    np.testing.assert_allclose(message.estimate.covariance, np.eye(6) + YAW_RAD2 * np.outer(column, column), atol=1e-12)
 
 
 @pytest.mark.parametrize("yaw_rad2", [0.0, YAW_RAD2])
 def test_without_a_rotation_the_motion_of_the_vehicle_is_added_in_vehicle_axes(yaw_rad2):
     message = fused(np.zeros((6, 6)), None, motions(yaw_rad2, SHIFT_M2))
     expected_m2 = SHIFT_M2 + yaw_rad2 * np.array([[4.0, -2.0, 0.0], [-2.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(message.covariance[3:, 3:], expected_m2, atol=1e-12)
+    np.testing.assert_allclose(message.estimate.covariance_vehicle_m2, expected_m2, atol=1e-12)

@@ -24,7 +24,7 @@ from stages.geometry.frames import Array64, heading_rad, rotation_z
 from stages.geometry.trajectory import FURTHEST_NS, VehicleTrajectory
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry, VehicleMotion, VisualMotion
-from stages.odometry.drone.trajectory import AutopilotTrail, PictureTrail, turn_between
+from stages.odometry.drone.trajectory import AutopilotTrajectory, VisualTrajectory, rotation_between
 
 VEHICLE_RAD_PER_S = math.radians(20.0)  # a vehicle that does not tell its turns may turn like this
 VEHICLE_DRIFT_RAD2_PER_S = math.radians(0.1) ** 2
@@ -52,8 +52,8 @@ class Reckoning:
         """`parked`: the vehicle stands, whether it says so or not."""
         self._parked = parked
         self.vehicle = VehicleTrajectory()
-        self.autopilot = AutopilotTrail()
-        self.pictures = PictureTrail()
+        self.autopilot = AutopilotTrajectory()
+        self.pictures = VisualTrajectory()
         self._R_map_drone = np.eye(3)
         self._stamp_ns: int | None = None
         self._silences = 0
@@ -97,7 +97,7 @@ class Reckoning:
             self._R_map_drone = R_map_vehicle @ vehicle.R_carrier_level @ drone.R_carrier_level.T
         else:
             dt = abs(drone_ns - self._stamp_ns) * 1e-9
-            turn = turn_between(self.autopilot, self.pictures, self._stamp_ns, drone_ns)
+            turn = rotation_between(self.autopilot, self.pictures, self._stamp_ns, drone_ns)
             self._R_map_drone = self._R_map_drone @ turn.R_from_to
             variance = turn.variance_rad2 + self._vehicle_variance_rad2(vehicle_ns, dt)
             variance += abs(silent_rad2 - self._silent_rad2)
@@ -128,15 +128,15 @@ class Reckoning:
         """How the autopilot's frame `own` is turned in the start frame; None: it has no attitude now."""
         if self._stamp_ns is None:
             return None
-        R_own_drone = self.autopilot.R_own_drone(self._stamp_ns)
-        return None if R_own_drone is None else rotation_z(offset_rad) @ self._R_map_drone @ R_own_drone.T
+        R_odom_drone = self.autopilot.R_odom_drone(self._stamp_ns)
+        return None if R_odom_drone is None else rotation_z(offset_rad) @ self._R_map_drone @ R_odom_drone.T
 
     def R_map_drone(self, offset_rad: float, stamps_ns: list[int]) -> dict[int, Array64]:
         """The drone's rotation at those moments of which it is known."""
         if self._stamp_ns is None:
             return {}
         R = rotation_z(offset_rad) @ self._R_map_drone
-        turns = {ns: turn_between(self.autopilot, self.pictures, self._stamp_ns, ns) for ns in stamps_ns}
+        turns = {ns: rotation_between(self.autopilot, self.pictures, self._stamp_ns, ns) for ns in stamps_ns}
         return {ns: R @ turn.R_from_to for ns, turn in turns.items() if turn.sure}
 
     def at_one_moment(self, vehicle_ns: int, drone_ns: int) -> tuple[Array64, Array64, int, float]:
@@ -148,7 +148,7 @@ class Reckoning:
         if self.vehicle.known_at(drone_ns):
             turn = self.vehicle.at(drone_ns)[0].T @ self.vehicle.at(vehicle_ns)[0]
             return turn, one, drone_ns, VEHICLE_DRIFT_RAD2_PER_S * dt
-        own = turn_between(self.autopilot, self.pictures, drone_ns, vehicle_ns)
+        own = rotation_between(self.autopilot, self.pictures, drone_ns, vehicle_ns)
         if own.sure and not self._parked:
             return one, own.R_from_to, vehicle_ns, own.variance_rad2
         return one, one, drone_ns, self._vehicle_variance_rad2(drone_ns, dt)
@@ -164,5 +164,7 @@ class Reckoning:
         newest_ns = self.vehicle.newest_ns
         beyond_ns = 0 if newest_ns is None or self._parked else stamp_ns - newest_ns - FURTHEST_NS
         return (
-            0.0 if beyond_ns <= 0 else max(self.vehicle.unsure(stamp_ns)[1], VEHICLE_RAD_PER_S * beyond_ns * 1e-9) ** 2
+            0.0
+            if beyond_ns <= 0
+            else max(self.vehicle.extrapolation_sigma(stamp_ns)[1], VEHICLE_RAD_PER_S * beyond_ns * 1e-9) ** 2
         )

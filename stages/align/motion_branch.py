@@ -66,7 +66,7 @@ class ByMotion:
         at = reckoning.vehicle.at(fix.stamp_ns)
         self._windows.add_fix(fix, *at, reckoning.autopilot)
         self._heading_windows.add_fix(fix, *at, reckoning.autopilot)
-        by_places = reckoning.autopilot.place(fix.stamp_ns) is not None
+        by_places = reckoning.autopilot.position(fix.stamp_ns) is not None
         self._weigh_headings(by_places)
         if lock.offset_rad is None:
             return False

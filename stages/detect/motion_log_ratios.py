@@ -57,7 +57,7 @@ def hear(
 
     `level_known` False: the vehicle's motion is not known, so only heights are compared. sigma_m: of a sighting.
     """
-    heard_ns = telemetry.heard_ns
+    heard_ns = telemetry.span_ns
     if heard_ns is None or len(path_ns) < 2 or path_ns[-1] > heard_ns[1] + SILENT_NS:
         return None
     first = bisect_left(path_ns, max(path_ns[-1] - KEPT_NS // 2, heard_ns[0]))

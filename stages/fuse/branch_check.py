@@ -20,7 +20,7 @@ from stages.heading.hypothesis_bank import BranchBank, BranchSettings
 from stages.heading.windows import Windows
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import DroneFix, VisualMotion
-from stages.odometry.drone.trajectory import turn_between
+from stages.odometry.drone.trajectory import rotation_between
 
 BEARING_RAD = 0.05  # of the lever between the drone's camera and its middle, and of the streets
 JUMP_RAD = math.radians(30.0)  # a rotation so far from the one before, carried on, is of another branch
@@ -81,7 +81,7 @@ class Witness:
         """The streets' rotation, by the drone's own turn since; None: nobody told that."""
         assert self._told is not None
         from_ns, R = self._told
-        turn = turn_between(
+        turn = rotation_between(
             self._motions.motion_model.autopilot, self._motions.motion_model.pictures, from_ns, stamp_ns
         )
         return R @ turn.R_from_to if turn.sure else None

@@ -18,7 +18,7 @@ from stages.fuse.positions import GATE, Positions
 from stages.fuse.rejected import Rejected
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64, heading_rad
-from stages.geometry.se3 import carried_covariance, distance2, position_covariance
+from stages.geometry.se3 import composed_covariance, mahalanobis2, position_covariance
 from stages.kernels.geometry.so3 import log_rotation
 
 PERIOD_NS = 100_000_000  # of the chain's poses
@@ -62,12 +62,12 @@ class Chain:
         self.rotation_covariance_rad2 = covariance_rad2
         self._worth = Worth(self._errors.rotation_time_s)
 
-    def extend(self, next_ns: int, R_own_drone: Array64 | None) -> None:
-        """One pose more; `R_own_drone`: the autopilot's attitude there, of which the vertical is used."""
+    def extend(self, next_ns: int, R_odom_drone: Array64 | None) -> None:
+        """One pose more; `R_odom_drone`: the autopilot's attitude there, of which the vertical is used."""
         step = self._positions.step(self.back.stamp_ns, next_ns, self.back.R_map_drone)
         R_expected = self.back.R_map_drone @ step.R
         tilt_rad2 = math.radians(self._errors.tilt_deg) ** 2 * inflation(1e-9 * PERIOD_NS, self._errors.tilt_time_s)
-        self.back.extend(next_ns, step, None if R_own_drone is None else R_own_drone[2], tilt_rad2)
+        self.back.extend(next_ns, step, None if R_odom_drone is None else R_odom_drone[2], tilt_rad2)
         self._tell_turned(R_expected, self.back.R_map_drone)
 
     def _tell_turned(self, R_before: Array64, R_after: Array64) -> None:
@@ -78,7 +78,7 @@ class Chain:
         """R_map_drone, position and covariance (6, 6), carried from the nearest pose of the chain."""
         key_ns, R, xyz_m = self.back.near(stamp_ns)
         step = self._positions.step(key_ns, stamp_ns, R)
-        covariance = carried_covariance(self.back.covariance, step.R, step.t_m, step.covariance)
+        covariance = composed_covariance(self.back.covariance, step.R, step.t_m, step.covariance)
         return R @ step.R, xyz_m + R @ step.t_m, covariance
 
     def add_position(self, stamp_ns: int, R_map_drone: Array64, z: Array64, covariance_m2: Array64) -> None:
@@ -93,7 +93,7 @@ class Chain:
         """Whether a rotation is within the gate; None: it is not; False: nor were those before, and they agree."""
         R_expected, _, covariance = self.at(stamp_ns)
         off = log_rotation(R_expected.T @ R)
-        if distance2(off, covariance[:3, :3] + covariance_rad2) <= GATE:
+        if mahalanobis2(off, covariance[:3, :3] + covariance_rad2) <= GATE:
             self._refused.clear()
             return True
         return False if self._refused.add(stamp_ns, off, covariance_rad2) else None

@@ -22,7 +22,7 @@ from stages.fuse.motions import WAIT_NS, Motions
 from stages.fuse.positions import GATE, Positions, Told
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.geometry.frames import Array64, heading_rad, rotation_z
-from stages.geometry.se3 import distance2, position_covariance
+from stages.geometry.se3 import mahalanobis2, position_covariance
 from stages.heading.motion_yaw import DOUBT, Point
 from stages.heading.odometry_yaw import North
 from stages.heading.yaw_fit import apart_rad
@@ -72,7 +72,7 @@ class Estimator:
         self._witness.restart()
         if at_ns is not None and before is not None:
             R, t, velocity_mps = before
-            R_after, t_after = vehicle.in_newest_frame(at_ns)
+            R_after, t_after = vehicle.at_in_current_frame(at_ns)
             R_new_old = R_after @ R.T
             new_mps = vehicle.velocity_mps(motion.stamp_ns) - R_new_old @ velocity_mps
             self.positions.turn(R_new_old, t_after - R_new_old @ t, new_mps)
@@ -127,10 +127,10 @@ class Estimator:
             newest = self.motions.newest_ns(next_ns, now_ns)
             if newest is not None and newest < next_ns and now_ns - next_ns < WAIT_NS:
                 break
-            R_own = self.motions.motion_model.R_own_drone(next_ns)
-            self.chain.extend(next_ns, R_own)
-            if R_own is not None and self.motions.still(next_ns):
-                self.north.remember(next_ns, back.R_map_drone @ R_own.T, self.chain.yaw_sigma_rad**2)
+            R_odom = self.motions.motion_model.R_odom_drone(next_ns)
+            self.chain.extend(next_ns, R_odom)
+            if R_odom is not None and self.motions.still(next_ns):
+                self.north.remember(next_ns, back.R_map_drone @ R_odom.T, self.chain.yaw_sigma_rad**2)
         if not self.chain.running and self.positions.free.stamp_ns is not None:
             self._resume(self.positions.free.stamp_ns)
         elif self.chain.running and self.chain.yaw_sigma_rad > self._yaw_sigma_rad:
@@ -161,12 +161,12 @@ class Estimator:
         R, expected_m, covariance = self.chain.at(fix.stamp_ns)
         told_m2 = R_map_vehicle @ fix.covariance_m2 @ R_map_vehicle.T
         off_m = R_map_vehicle @ fix.xyz_vehicle_m + t - expected_m
-        return distance2(off_m, position_covariance(covariance, R) + told_m2) <= GATE
+        return mahalanobis2(off_m, position_covariance(covariance, R) + told_m2) <= GATE
 
     def see_fix(self, fix: DroneFix) -> None:
         """A LiDAR position at its own time."""
         stamp_ns = fix.stamp_ns
-        if not self.motions.vehicle.in_this_frame(stamp_ns):
+        if not self.motions.vehicle.in_current_frame(stamp_ns):
             return
         self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
         R_map_vehicle, t = self.motions.vehicle.at(stamp_ns)
@@ -209,7 +209,7 @@ class Estimator:
 
     def _watch_motion(self, stamp_ns: int, z: Array64, told_m2: Array64) -> None:
         """A fix that fits, beside the autopilot's position: together they tell the heading."""
-        place = self.motions.motion_model.autopilot.place(stamp_ns)
+        place = self.motions.motion_model.autopilot.position(stamp_ns)
         if place is None or not self.motions.still(stamp_ns):
             return
         if not self.north.watch(Point(stamp_ns, z, 0.5 * float(told_m2[0, 0] + told_m2[1, 1]), *place)):
@@ -221,12 +221,12 @@ class Estimator:
 
     def see_rotation(self, stamp_ns: int, R_vehicle_drone: Array64, covariance_rad2: Array64, switches: int) -> None:
         """A RESOLVED rotation at its own time."""
-        if not self.motions.vehicle.in_this_frame(stamp_ns):
+        if not self.motions.vehicle.in_current_frame(stamp_ns):
             return
         R, heading = self.motions.vehicle.at(stamp_ns)[0] @ R_vehicle_drone, self.north.heading
-        R_own = self.motions.R_own_drone(stamp_ns)
+        R_odom = self.motions.R_odom_drone(stamp_ns)
         sigma = math.sqrt(float(np.linalg.eigvalsh(covariance_rad2)[-1]))
-        yaw_rad = None if R_own is None else heading_rad(R @ R_own.T)
+        yaw_rad = None if R_odom is None else heading_rad(R @ R_odom.T)
         if heading.switched(switches):
             self.unresolved()
         self._witness.hear_streets(stamp_ns, R)
@@ -283,12 +283,12 @@ class Estimator:
 
     def _resume(self, stamp_ns: int) -> None:
         """Begin a chain with the yaw that is known of the autopilot's frame, if it is."""
-        own, R_own = self.north.known(stamp_ns), self.motions.R_own_drone(stamp_ns)
+        own, R_odom = self.north.known(stamp_ns), self.motions.R_odom_drone(stamp_ns)
         if own is not None and self.on_trial:
             self.on_trial = not self.north.by_motion.fits(own)
             if self.on_trial:
                 return
-        if own is not None and R_own is not None:
-            R = rotation_z(own.yaw_rad) @ R_own
+        if own is not None and R_odom is not None:
+            R = rotation_z(own.yaw_rad) @ R_odom
             variance = np.diag([self._tilt_rad2, self._tilt_rad2, own.sigma_at(stamp_ns) ** 2])
             self.chain.start(stamp_ns, R, R.T @ variance @ R)

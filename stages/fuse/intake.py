@@ -13,7 +13,7 @@ import numpy as np
 
 from flow.message import Message
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import good_covariance
+from stages.geometry.se3 import is_covariance
 
 AHEAD_NS = 1_000_000_000
 BELIEVED = 5
@@ -44,7 +44,7 @@ class Intake:
 
     def covariant(self, covariance: Array64, what: str) -> bool:
         """Whether a covariance is one."""
-        if good_covariance(covariance):
+        if is_covariance(covariance):
             return True
         self.refused[f"{what}: its covariance is not positive definite"] += 1
         return False

@@ -40,16 +40,16 @@ class Motions:
         moves with the yaw (3,).
         """
         lever = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0])
-        shift_m, yaw_rad = self.vehicle.unsure(stamp_ns) if self.still(stamp_ns) else (0.0, 0.0)
+        shift_m, yaw_rad = self.vehicle.extrapolation_sigma(stamp_ns) if self.still(stamp_ns) else (0.0, 0.0)
         return shift_m**2 * np.eye(3) + yaw_rad**2 * np.outer(lever, lever), yaw_rad**2, lever
 
     def still(self, stamp_ns: int) -> bool:
         """Whether it is known how the vehicle moves, so that the start frame stands still."""
         return self._parked or self.vehicle.known_at(stamp_ns)
 
-    def R_own_drone(self, stamp_ns: int) -> Array64 | None:
+    def R_odom_drone(self, stamp_ns: int) -> Array64 | None:
         """The autopilot's attitude, where a yaw between its frame and the start frame means something."""
-        return self.motion_model.R_own_drone(stamp_ns) if self.still(stamp_ns) else None
+        return self.motion_model.R_odom_drone(stamp_ns) if self.still(stamp_ns) else None
 
     def newest_ns(self, stamp_ns: int, now_ns: int) -> int | None:
         """Up to when the drone's motion has been told, to one who asks for a moment; None: nobody is heard."""

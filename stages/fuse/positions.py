@@ -20,7 +20,7 @@ from stages.fuse.propagated import Step
 from stages.fuse.rejected import Rejected
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import distance2
+from stages.geometry.se3 import mahalanobis2
 from stages.messages import DroneFix
 
 HELD_MPS = 0.1  # noise of the autopilot's velocity beside its drift, and of its age
@@ -60,14 +60,14 @@ class Positions:
         """The first fix, or the first that is believed again."""
         velocity = fix.velocity_vehicle_mps
         if velocity is not None:
-            velocity = self._motions.vehicle.to_local(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
+            velocity = self._motions.vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
         self.free.start(fix.stamp_ns, z, told.whole_m2, velocity)
         self.fix_ns = fix.stamp_ns
         self._believe(told)
 
     def takes(self, stamp_ns: int, off_m: Array64, expected_m2: Array64, told: Told) -> bool | None:
         """Whether a fix is within the gate; None: it is not; False: nor were those before, and they agree."""
-        nis = distance2(off_m, expected_m2 + told.whole_m2)
+        nis = mahalanobis2(off_m, expected_m2 + told.whole_m2)
         if not nis <= GATE:
             return False if self._refused.add(stamp_ns, off_m, told.whole_m2) else None
         self._refused.clear()
@@ -93,20 +93,20 @@ class Positions:
     def follow(self, stamp_ns: int, z: Array64, worth: float, R_map_drone: Array64 | None) -> None:
         """A fix that was taken: velocity without odometry, and what odometry leaves over."""
         covariance_m2, trail = self.fix_covariance_m2, self._motions.motion_model.autopilot
-        v0 = None if self.free.stamp_ns is None else trail.velocity_own_mps(self.free.stamp_ns)
-        v1 = trail.velocity_own_mps(stamp_ns)
+        v0 = None if self.free.stamp_ns is None else trail.velocity_odom_mps(self.free.stamp_ns)
+        v1 = trail.velocity_odom_mps(stamp_ns)
         turned_mps = 0.0 if v0 is None or v1 is None else float(np.linalg.norm(v1 - v0))
         self.free.q = self._manoeuvre(stamp_ns)
         self.free.see(stamp_ns, z, covariance_m2 + self.bias_covariance_m2, None, turned_mps)
         self.fix_ns = max(stamp_ns, self.fix_ns or stamp_ns)
-        R_own, last_ns = self._motions.R_own_drone(stamp_ns), self.left.stamp_ns
-        if R_map_drone is None or R_own is None:
+        R_odom, last_ns = self._motions.R_odom_drone(stamp_ns), self.left.stamp_ns
+        if R_map_drone is None or R_odom is None:
             return
-        way = None if last_ns is None else self._motions.motion_model.way_own_m(last_ns, stamp_ns)
+        way = None if last_ns is None else self._motions.motion_model.displacement_odom_m(last_ns, stamp_ns)
         if way is None:
             self.left.start(stamp_ns, z, worth * covariance_m2, None)
         else:
-            self.left.see(stamp_ns, z, worth * covariance_m2, R_map_drone @ R_own.T @ way[0], turned_mps)
+            self.left.see(stamp_ns, z, worth * covariance_m2, R_map_drone @ R_odom.T @ way[0], turned_mps)
 
     def turn(self, R_new_old: Array64, t_m: Array64, velocity_mps: Array64) -> None:
         """The start frame is another one now: p <- R p + t, v <- R v + velocity, which is no more than a guess."""
@@ -150,18 +150,18 @@ class Positions:
     def velocity(self, stamp_ns: int, R_map_drone: Array64 | None, yaw_sigma_rad: float) -> tuple[Array64, Array64]:
         """Over ground (3,), start axes, and its covariance; by the autopilot's velocity where the rotation is known."""
         age_s = 0.0 if self.fix_ns is None else max((stamp_ns - self.fix_ns) * 1e-9, 0.0)
-        v_own, R_own = (
-            self._motions.motion_model.autopilot.velocity_own_mps(stamp_ns),
-            self._motions.R_own_drone(stamp_ns),
+        v_own, R_odom = (
+            self._motions.motion_model.autopilot.velocity_odom_mps(stamp_ns),
+            self._motions.R_odom_drone(stamp_ns),
         )
-        if R_map_drone is None or v_own is None or R_own is None or self.left.stamp_ns is None:
+        if R_map_drone is None or v_own is None or R_odom is None or self.left.stamp_ns is None:
             return self.free.velocity_mps, self.free.velocity_covariance + self.free.q * age_s * np.eye(3)
-        told = R_map_drone @ R_own.T @ v_own
+        told = R_map_drone @ R_odom.T @ v_own
         across = np.cross([0.0, 0.0, yaw_sigma_rad], told)
         spread = self.left.velocity_covariance + (self.left.q * age_s + HELD_MPS**2) * np.eye(3)
         return told + self.left.velocity_mps, spread + np.outer(across, across)
 
     def _manoeuvre(self, stamp_ns: int) -> float:
         """Density of the acceleration that nobody tells [m2/s3]."""
-        told = self._motions.motion_model.autopilot.velocity_own_mps(stamp_ns) is not None
+        told = self._motions.motion_model.autopilot.velocity_odom_mps(stamp_ns) is not None
         return self._errors.manoeuvre_told if told else self._errors.manoeuvre

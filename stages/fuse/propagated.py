@@ -1,7 +1,7 @@
 """How the drone moved between two moments, from whatever tells it, with the covariance of that.
 
-    D = O(t0)^-1 O(t1) with b dt:   R = R_own_drone(t0)^T R_own_drone(t1)
-                                     t = R_own_drone(t0)^T (p_own(t1) - p_own(t0)) + R_map_drone(t0)^T b dt
+    D = O(t0)^-1 O(t1) with b dt:   R = R_odom_drone(t0)^T R_odom_drone(t1)
+                                     t = R_odom_drone(t0)^T (p_odom(t1) - p_odom(t0)) + R_map_drone(t0)^T b dt
 
 O is the autopilot's pose in its frame `own` (stages/odometry/drone/trajectory.py), b what it creeps away by (drift.py).
 Without its positions b is the drone's whole velocity; without its attitude the turn is the drone's pictures', or
@@ -21,7 +21,7 @@ import numpy as np
 from stages.fuse.drift import Drift
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64
-from stages.odometry.drone.trajectory import AHEAD_NS, AutopilotTrail, PictureTrail, turn_between
+from stages.odometry.drone.trajectory import AHEAD_NS, AutopilotTrajectory, VisualTrajectory, rotation_between
 
 VEHICLE_TURN_RAD_PER_S = math.radians(20.0)  # of a vehicle that does not tell its turns
 CLOCK_S = 0.003  # the autopilot's stamps against ours
@@ -44,8 +44,8 @@ class MotionModel:
 
     def __init__(self, errors: FuseErrors) -> None:
         self._errors = errors
-        self.autopilot = AutopilotTrail()
-        self.pictures = PictureTrail()
+        self.autopilot = AutopilotTrajectory()
+        self.pictures = VisualTrajectory()
 
     def step(
         self, from_ns: int, to_ns: int, R_map_drone: Array64, left: Drift, free: Drift, still: bool, since_ns: int
@@ -60,17 +60,17 @@ class MotionModel:
         R, turn_rad2, told = self._turn(from_ns, to_ns)
         if not still:
             turn_rad2 += (VEHICLE_TURN_RAD_PER_S * dt) ** 2
-        own = self.way_own_m(from_ns, to_ns) if still and left.stamp_ns is not None else None
-        R_own = None if own is None else self._R_own_held(from_ns)
-        by_odometry = own is not None and R_own is not None
+        own = self.displacement_odom_m(from_ns, to_ns) if still and left.stamp_ns is not None else None
+        R_odom = None if own is None else self._R_odom_held(from_ns)
+        by_odometry = own is not None and R_odom is not None
         drift = left if by_odometry else free
         ago, then = (from_ns - since_ns) * 1e-9, (to_ns - since_ns) * 1e-9
         gathered = drift.gathered(then) - drift.gathered(ago) if then >= ago else drift.gathered(abs(dt))
         spread = gathered + e.walk_m_per_sqrt_s**2 * abs(dt) * np.eye(3)
         t = dt * (R_map_drone.T @ drift.velocity_mps)
-        if own is not None and R_own is not None:
+        if own is not None and R_odom is not None:
             way_m, beyond_s = own
-            t = t + R_own.T @ way_m
+            t = t + R_odom.T @ way_m
             spread = spread + (0.5 * BEYOND_MPS2 * beyond_s**2) ** 2 * np.eye(3)
         R_map_after = R_map_drone @ R
         Q = np.zeros((6, 6))
@@ -78,38 +78,38 @@ class MotionModel:
         Q[3:, 3:] = R_map_after.T @ spread @ R_map_after
         return Step(R, t, Q, by_odometry, told)
 
-    def R_own_drone(self, stamp_ns: int) -> Array64 | None:
+    def R_odom_drone(self, stamp_ns: int) -> Array64 | None:
         """The autopilot's attitude, turned on a little beyond its newest word; None: not known."""
-        return self.autopilot.R_own_drone(stamp_ns)
+        return self.autopilot.R_odom_drone(stamp_ns)
 
-    def way_own_m(self, from_ns: int, to_ns: int) -> tuple[Array64, float] | None:
+    def displacement_odom_m(self, from_ns: int, to_ns: int) -> tuple[Array64, float] | None:
         """Way (3,) in frame own by the autopilot's positions, and how long beyond its newest word [s]; None: unknown.
 
         A way over a jump of its estimate is unknown.
         """
-        newest = self.autopilot.place_ns
+        newest = self.autopilot.position_ns
         if newest is None or max(from_ns, to_ns) > newest + 2 * AHEAD_NS:
             return None
         last = newest + AHEAD_NS
-        a, b = self.autopilot.place(min(from_ns, last)), self.autopilot.place(min(to_ns, last))
+        a, b = self.autopilot.position(min(from_ns, last)), self.autopilot.position(min(to_ns, last))
         if a is None or b is None or a[1] != b[1]:
             return None
         beyond_ns = max(to_ns, from_ns) - newest
         way = b[0] - a[0]
         kept_s = (max(to_ns - last, 0) - max(from_ns - last, 0)) * 1e-9
-        velocity = self.autopilot.velocity_own_mps(last) if kept_s else None
+        velocity = self.autopilot.velocity_odom_mps(last) if kept_s else None
         if velocity is not None:
             way = way + kept_s * velocity
         return way, max(beyond_ns, 0) * 1e-9
 
     def bent_m(self, from_ns: int, to_ns: int) -> Array64 | None:
         """How far (3,) the autopilot's way, frame own, is from straight on at the first moment's velocity."""
-        way, velocity = self.way_own_m(from_ns, to_ns), self.autopilot.velocity_own_mps(from_ns)
+        way, velocity = self.displacement_odom_m(from_ns, to_ns), self.autopilot.velocity_odom_mps(from_ns)
         return None if way is None or velocity is None else way[0] - (to_ns - from_ns) * 1e-9 * velocity
 
-    def _R_own_held(self, stamp_ns: int) -> Array64 | None:
+    def _R_odom_held(self, stamp_ns: int) -> Array64 | None:
         newest = self.autopilot.attitude_ns
-        return None if newest is None else self.autopilot.R_own_drone(min(stamp_ns, newest + AHEAD_NS))
+        return None if newest is None else self.autopilot.R_odom_drone(min(stamp_ns, newest + AHEAD_NS))
 
     def _turn(self, from_ns: int, to_ns: int) -> tuple[Array64, float, bool]:
         """R, its variance [rad2] about each axis, and whether anybody told."""
@@ -117,19 +117,19 @@ class MotionModel:
         newest = self.autopilot.attitude_ns
         if newest is not None:
             last = newest + AHEAD_NS
-            a, b = self.autopilot.R_own_drone(min(from_ns, last)), self.autopilot.R_own_drone(min(to_ns, last))
+            a, b = self.autopilot.R_odom_drone(min(from_ns, last)), self.autopilot.R_odom_drone(min(to_ns, last))
             beyond_s = max(max(from_ns, to_ns) - newest, 0) * 1e-9
             if a is not None and b is not None and beyond_s < 2e-9 * AHEAD_NS:
                 change = self.autopilot.rate_radps(to_ns) - self.autopilot.rate_radps(from_ns)
                 walk = math.radians(self._errors.turn_walk_deg_per_sqrt_s) ** 2 * dt
                 kept = (0.5 * max(1.0, self.autopilot.rate_radps(to_ns)) * beyond_s**2) ** 2  # rates change
                 return a.T @ b, walk + (CLOCK_S * change) ** 2 + kept, True
-        turn = turn_between(self.autopilot, self.pictures, from_ns, to_ns)
+        turn = rotation_between(self.autopilot, self.pictures, from_ns, to_ns)
         return turn.R_from_to, turn.variance_rad2, turn.sure
 
     def newest_ns(self, now_ns: int, positions: bool) -> int | None:
         """Up to when the drone's motion has been told by who was heard in the last second; None: nobody was."""
-        said = [self.autopilot.attitude_ns, self.autopilot.place_ns if positions else None]
+        said = [self.autopilot.attitude_ns, self.autopilot.position_ns if positions else None]
         heard = [ns for ns in said if ns is not None and now_ns - ns < 1_000_000_000]
         if not heard and self.pictures.newest_ns is not None and now_ns - self.pictures.newest_ns < 1_000_000_000:
             heard = [self.pictures.newest_ns]

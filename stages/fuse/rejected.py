@@ -10,7 +10,7 @@ from collections import deque
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import distance2
+from stages.geometry.se3 import mahalanobis2
 
 ENOUGH = 8
 LONGEST_NS = 3_000_000_000
@@ -46,5 +46,5 @@ class Rejected:
         y = np.array([e for _, e, _ in self._off])
         A = np.column_stack([np.ones(len(t)), t])
         left = y - A @ np.linalg.solve(A.T @ A, A.T @ y)
-        chi2 = sum(distance2(left[i], C) for i, (_, _, C) in enumerate(self._off))
+        chi2 = sum(mahalanobis2(left[i], C) for i, (_, _, C) in enumerate(self._off))
         return bool(chi2 <= AGREE * 3 * (ENOUGH - 2))

@@ -25,7 +25,7 @@ from gtsam.symbol_shorthand import X
 from stages.fuse.back_end import HUBER
 from stages.fuse.propagated import Step
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import carried_covariance, good_covariance
+from stages.geometry.se3 import composed_covariance, is_covariance
 
 RAISED = (RuntimeError, IndexError, ValueError)  # what GTSAM's wrapper makes of C++ exceptions
 FLOOR = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)  # a step of no length is known no better
@@ -73,7 +73,7 @@ class Smoother:
     def extend(self, stamp_ns: int, step: Step, up_drone: Array64 | None, tilt_rad2: float) -> None:
         """One pose more."""
         R, t_m = self.R_map_drone @ step.R, self.xyz_map_m + self.R_map_drone @ step.t_m
-        P = carried_covariance(self.covariance, step.R, step.t_m, step.covariance + FLOOR)
+        P = composed_covariance(self.covariance, step.R, step.t_m, step.covariance + FLOOR)
         before, self._number = self._number, self._number + 1
         way = gtsam.Pose3(gtsam.Rot3(step.R), step.t_m)
         noise = gtsam.noiseModel.Gaussian.Covariance(step.covariance + FLOOR)
@@ -129,7 +129,7 @@ class Smoother:
     ) -> bool:
         """Checked, then handed to the smoother. False: the numbers make no sense, or their pose has left the window."""
         number = next((number for at_ns, number in self._keys if at_ns == key_ns), None)
-        if number is None or not all(np.isfinite(v).all() for v in numbers) or not good_covariance(covariance):
+        if number is None or not all(np.isfinite(v).all() for v in numbers) or not is_covariance(covariance):
             return False
         graph = gtsam.NonlinearFactorGraph()
         graph.add(factor(X(number), _robust(covariance)))
@@ -159,6 +159,6 @@ class Smoother:
         pose = self._smoother.calculateEstimatePose3(X(self._number))
         covariance = self._smoother.marginalCovariance(X(self._number))
         near = bool(np.abs(pose.translation() - self._first_m).max() < FARTHEST_M)  # NaN compares false
-        if not (near and good_covariance(covariance)):
+        if not (near and is_covariance(covariance)):
             return None
         return pose.rotation().matrix(), pose.translation(), covariance

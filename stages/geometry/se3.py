@@ -18,7 +18,7 @@ def adjoint(R: Array64, t: Array64) -> Array64:
     return A
 
 
-def carried_covariance(P: Array64, R_step: Array64, t_step_m: Array64, Q: Array64) -> Array64:
+def composed_covariance(P: Array64, R_step: Array64, t_step_m: Array64, Q: Array64) -> Array64:
     """Covariance (6, 6) of T D, D = (R, t) with covariance Q, from that of T: Ad(D^-1) P Ad(D^-1)^T + Q."""
     A = np.zeros((6, 6))
     A[:3, :3] = R_step.T
@@ -33,12 +33,12 @@ def position_covariance(P: Array64, R: Array64) -> Array64:
     return R @ P[3:, 3:] @ R.T
 
 
-def distance2(e: Array64, S: Array64) -> float:
+def mahalanobis2(e: Array64, S: Array64) -> float:
     """e^T S^-1 e: chi-square distributed where S is the covariance of e."""
     return float(e @ np.linalg.solve(S, e))
 
 
-def good_covariance(P: Array64) -> bool:
+def is_covariance(P: Array64) -> bool:
     """Whether a matrix is finite, symmetric and positive definite."""
     if not np.isfinite(P).all() or np.abs(P - P.T).max() > 1e-6 * np.abs(P).max():
         return False

@@ -18,17 +18,17 @@ from collections import deque
 
 import numpy as np
 
-from stages.geometry.extrapolation import LEAST_SPAN_NS, TRAIL_S, USUAL, JumpWatch, leads_to
+from stages.geometry.extrapolation import EXTRAPOLATION_S, LEAST_SPAN_NS, USUAL_MANEUVER, JumpGate, is_reachable
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation, nearest_rotation, nearly_rotation
-from stages.kernels.geometry.trajectory import STEP_NS, to_local, to_vehicle
+from stages.kernels.geometry.trajectory import STEP_NS, to_map, to_vehicle
 from stages.messages import VehicleMotion
 
 KEPT = 512
 TOGETHER_NS = 10_000_000  # poses that arrived so soon after one another are no speed
 STILL_NS = 700_000_000  # how the vehicle moves is known so long after its word: by pictures it comes 5 times a second
 AFRESH_NS = 2_000_000_000  # in so long a silence an odometry may have been started afresh, and nothing tells
-FURTHEST_NS = round(1e9 * TRAIL_S)  # beyond the newest pose
+FURTHEST_NS = round(1e9 * EXTRAPOLATION_S)  # beyond the newest pose
 
 
 class VehicleTrajectory:
@@ -36,7 +36,7 @@ class VehicleTrajectory:
 
     def __init__(self, joined: bool = True) -> None:
         """`joined`: a start frame that jumped is laid on the one before; else another local frame begins."""
-        self._joined, self._watch = joined, JumpWatch()
+        self._joined, self._watch = joined, JumpGate()
         self._local_start: tuple[Array64, Array64] | None = None  # R, t; None: the local frame is the start frame
         self._poses: deque[tuple[int, Array64, Array64]] = deque(maxlen=KEPT)
         self._onward: tuple[Array64, Array64] | None = None  # see `_went`, since the newest pose
@@ -71,7 +71,7 @@ class VehicleTrajectory:
         if motion.stamp_ns <= self._poses[-1][0]:
             return False
         heard = self._joined or self.known_at(motion.stamp_ns)
-        poses = self._watch.hear(motion, heard and self._leads_to(motion))
+        poses = self._watch.add(motion, heard and self._is_reachable(motion))
         another = len(poses) > 1
         silent_ns = poses[0].stamp_ns - self._poses[-1][0] if poses else 0
         guessed = silent_ns >= AFRESH_NS or (another and silent_ns >= STILL_NS)
@@ -82,13 +82,13 @@ class VehicleTrajectory:
             self._append(pose)
         return elsewhere
 
-    def _leads_to(self, motion: VehicleMotion) -> bool:
+    def _is_reachable(self, motion: VehicleMotion) -> bool:
         """Whether a pose is where the ones before lead."""
         newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self._begun_ns)
         speed_known = newest_ns - oldest_ns >= TOGETHER_NS
-        straight_on, seconds = self.straight_on(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
+        constant_velocity, seconds = self.constant_velocity(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
         speed_mps = float(np.linalg.norm(self._went()[1])) if speed_known else None
-        return leads_to(straight_on, self._local(motion), seconds, speed_mps)
+        return is_reachable(constant_velocity, self._local(motion), seconds, speed_mps)
 
     def _local(self, motion: VehicleMotion) -> tuple[Array64, Array64]:
         """A pose in the local frame."""
@@ -154,13 +154,13 @@ class VehicleTrajectory:
             self._onward = log_rotation(R_then.T @ R) / (span_ns * 1e-9), (t - t_then) / (span_ns * 1e-9)
         return self._onward
 
-    def in_this_frame(self, stamp_ns: int) -> bool:
+    def in_current_frame(self, stamp_ns: int) -> bool:
         """Whether what `at` tells of a moment is in the frame that is told now."""
         return self._joined or stamp_ns >= self._begun_ns
 
-    def in_newest_frame(self, stamp_ns: int) -> tuple[Array64, Array64]:
+    def at_in_current_frame(self, stamp_ns: int) -> tuple[Array64, Array64]:
         """R and t in the frame that is told now; before that began: straight back, as it goes in it."""
-        if self.in_this_frame(stamp_ns):
+        if self.in_current_frame(stamp_ns):
             return self.at(stamp_ns)
         first_ns, R, t = next(pose for pose in self._poses if pose[0] >= self._begun_ns)
         turn_radps, velocity_mps = self._went()
@@ -176,19 +176,19 @@ class VehicleTrajectory:
         """The vehicle's own velocity (3,) in the local frame."""
         return (self.at(stamp_ns + STEP_NS)[1] - self.at(stamp_ns)[1]) / (STEP_NS * 1e-9)
 
-    def straight_on(self, stamp_ns: int) -> tuple[Array64, Array64]:
+    def constant_velocity(self, stamp_ns: int) -> tuple[Array64, Array64]:
         """R and t where the newest pose's speed and turn lead, however long that is ago: they end only in `at`."""
         return self._beyond((stamp_ns - self._poses[-1][0]) * 1e-9)
 
-    def unsure(self, stamp_ns: int) -> tuple[float, float]:
+    def extrapolation_sigma(self, stamp_ns: int) -> tuple[float, float]:
         """One sigma of the place [m] and of the yaw [rad] that `at` tells beyond the newest pose, by what is not told.
 
-        The vehicle may have changed as USUAL says, and all its way from where the trail ends.
+        The vehicle may have changed as USUAL_MANEUVER says, and all its way from where the trail ends.
         """
         if not self._poses or stamp_ns <= self._poses[-1][0]:
             return 0.0, 0.0
         dt = (stamp_ns - self._poses[-1][0]) * 1e-9
-        place_m, yaw_rad = USUAL.place_m(dt), USUAL.turn_rad(dt)
+        place_m, yaw_rad = USUAL_MANEUVER.displacement_m(dt), USUAL_MANEUVER.turn_rad(dt)
         beyond_s = dt - 1e-9 * FURTHEST_NS
         if beyond_s > 0.0:
             turn_radps, velocity_mps = self._went()
@@ -200,6 +200,6 @@ class VehicleTrajectory:
         """Place (3,) and velocity (3,) as the vehicle sees them at a time, its own driving and turning in them."""
         return to_vehicle(*self.at(stamp_ns), *self.at(stamp_ns + STEP_NS), xyz_m, velocity_mps)
 
-    def to_local(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
+    def to_map(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
         """The inverse of `to_vehicle`."""
-        return to_local(*self.at(stamp_ns), *self.at(stamp_ns + STEP_NS), xyz_m, velocity_mps)
+        return to_map(*self.at(stamp_ns), *self.at(stamp_ns + STEP_NS), xyz_m, velocity_mps)

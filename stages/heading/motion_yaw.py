@@ -50,7 +50,7 @@ class Point:
     stamp_ns: int
     xyz_map_m: Array64
     variance_m2: float  # level, one axis
-    xyz_own_m: Array64
+    xyz_odom_m: Array64
     stretch: int
 
 
@@ -144,7 +144,7 @@ def weigh(points: tuple[Point, ...], errors: FuseErrors) -> Weighed:
     if len(points) < LEAST_TO_BACK:
         return few
     t = np.array([(p.stamp_ns - points[0].stamp_ns) * 1e-9 for p in points])
-    z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_own_m for p in points])
+    z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_odom_m for p in points])
     moved_m = float(np.linalg.norm(own[:, :2] - own[0, :2], axis=1).max())
     if moved_m < LEAST_M:
         return Weighed(f"the drone has moved {moved_m:.1f} m, too little to tell its heading")
@@ -186,7 +186,7 @@ def moves_with(points: tuple[Point, ...], yaw: Yaw, errors: FuseErrors) -> bool:
     """Whether the points lie on the way that the drone tells, turned by a yaw."""
     t = np.array([(p.stamp_ns - points[0].stamp_ns) * 1e-9 for p in points])
     variance = np.array([p.variance_m2 for p in points]) + FLOOR_M**2
-    z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_own_m for p in points])
+    z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_odom_m for p in points])
     way = own[:, :2] - own[0, :2]
     level = level_covariance(t, own[:, :2], variance, errors) + yaw.sigma_at(points[-1].stamp_ns) ** 2 * (way @ way.T)
     left = z[:, :2] - own[:, :2] @ rotation_z(yaw.yaw_rad)[:2, :2].T

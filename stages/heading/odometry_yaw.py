@@ -19,7 +19,7 @@ from stages.heading.motion_yaw import MotionYaw, Point
 from stages.heading.yaw_fit import Yaw
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry
-from stages.odometry.drone.trajectory import AutopilotTrail
+from stages.odometry.drone.trajectory import AutopilotTrajectory
 
 MOTION_DEG = 6.0  # a yaw by motion known worse is not told
 SILENCE_S, SILENCE_RAD = 3.0, math.radians(45.0)  # beyond, an autopilot may have turned its north unheard
@@ -36,16 +36,16 @@ class North:
         self.heading = Heading()
         self.yaw: Yaw | None = None
 
-    def hear(self, trail: AutopilotTrail, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
+    def hear(self, trail: AutopilotTrajectory, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """The autopilot's word goes to its trail; a silence that may hide a turn of its north costs."""
         before_ns, silences = trail.attitude_ns, trail.silences
-        R_before = None if before_ns is None else trail.R_own_drone(before_ns)
+        R_before = None if before_ns is None else trail.R_odom_drone(before_ns)
         rate = 0.0 if before_ns is None else trail.rate_radps(before_ns)
         trail.hear(word)
         after_ns = trail.attitude_ns
         if trail.silences == silences or before_ns is None or R_before is None or after_ns is None:
             return
-        R_after, silent_s = trail.R_own_drone(after_ns), (after_ns - before_ns) * 1e-9
+        R_after, silent_s = trail.R_odom_drone(after_ns), (after_ns - before_ns) * 1e-9
         assert R_after is not None
         turn = float(np.linalg.norm(log_rotation(R_before.T @ R_after)))
         unexplained = max(turn - silent_s * max(rate, trail.rate_radps(after_ns)), 0.0)

@@ -18,7 +18,7 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.heading.hypothesis_bank import ASKEW, Displacement, turns
 from stages.messages import DroneFix, VisualMotion
-from stages.odometry.drone.trajectory import AutopilotTrail
+from stages.odometry.drone.trajectory import AutopilotTrajectory
 
 HANDFUL = 3  # fixes
 HANDFUL_NS = 400_000_000
@@ -73,7 +73,9 @@ class Windows:
         """A step of the odometry by pictures: its direction."""
         self._steps.append(motion)
 
-    def add_fix(self, fix: DroneFix, R_map_vehicle: Array64, t_map_vehicle_m: Array64, own: AutopilotTrail) -> None:
+    def add_fix(
+        self, fix: DroneFix, R_map_vehicle: Array64, t_map_vehicle_m: Array64, own: AutopilotTrajectory
+    ) -> None:
         """A fix, with where the vehicle was; one of another track starts anew."""
         if fix.track_id != self._track or (self._recent and fix.stamp_ns <= self._recent[-1].stamp_ns):
             self.restart()
@@ -84,7 +86,7 @@ class Windows:
                 fix.stamp_ns,
                 R_map_vehicle @ fix.xyz_vehicle_m + t_map_vehicle_m,
                 covariance[:2, :2],
-                own.place(fix.stamp_ns),
+                own.position(fix.stamp_ns),
             )
         )
         if self._start is None and len(self._recent) == HANDFUL:

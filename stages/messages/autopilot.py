@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from flow.message import Mat3, Message, Vec3, message
-from stages.messages.shapes import Mat6
+from flow.message import Mat3, Mat6, Message, Vec3, message
 
 
 @message(schema=51)

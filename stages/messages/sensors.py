@@ -7,8 +7,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.message import Mat3, Message, PerPointF32, PerPointI64, PerPointU8, Points32, Shape, Vec3, message
-from stages.messages.shapes import Mat6
+from flow.message import Mat3, Mat6, Message, PerPointF32, PerPointI64, PerPointU8, Points32, Shape, Vec3, message
 
 
 @message(schema=11)

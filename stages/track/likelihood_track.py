@@ -111,7 +111,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         own = set(candidates.candidate_id[candidates.probability >= 0.5].tolist())
         for i in range(len(candidates.candidate_id)):
             number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])
-            xyz, v = self._trail.to_local(
+            xyz, v = self._trail.to_map(
                 candidates.stamp_ns, candidates.xyz_vehicle_m[i], candidates.velocity_vehicle_mps[i]
             )
             known = self._known.near(xyz, candidates.stamp_ns, number)
@@ -139,7 +139,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             number = -1 if detections.candidate_id is None else int(detections.candidate_id[i])
             velocity = detections.velocity_vehicle_mps
             v = np.zeros(3) if velocity is None else velocity[i]
-            xyz, v = self._trail.to_local(seen_ns, detections.xyz_vehicle_m[i], v)
+            xyz, v = self._trail.to_map(seen_ns, detections.xyz_vehicle_m[i], v)
             track = self._known.near(xyz, seen_ns, number) or self._known.astray(number, xyz, v, seen_ns, seen_ns)
             drone = track if track is not None and track.confirmed else None
             if drone is not None and seen_ns > drone.last_hit_ns and self._known.doubtful(drone, seen_ns):
@@ -244,7 +244,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
 
     def _unsure_vehicle_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> Array64:
         """What a place beside a vehicle that is not heard any more is wrong by (3, 3), its axes."""
-        place_m, yaw_rad = self._trail.unsure(stamp_ns)
+        place_m, yaw_rad = self._trail.extrapolation_sigma(stamp_ns)
         level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * yaw_rad
         return place_m**2 * np.eye(3) + np.outer(level, level)
 

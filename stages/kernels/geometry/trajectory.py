@@ -21,7 +21,7 @@ def to_vehicle(
 
 
 @compiled
-def to_local(
+def to_map(
     R: Array64, t: Array64, R_then: Array64, t_then: Array64, xyz_m: Array64, velocity_mps: Array64
 ) -> tuple[Array64, Array64]:
     now = R @ xyz_m + t

@@ -66,7 +66,7 @@ class DroneTelemetry:
         self.add(odometry.stamp_ns, odometry.xyz_odom_m, velocity_mps, odometry.reset_counter)
 
     @property
-    def heard_ns(self) -> tuple[int, int] | None:
+    def span_ns(self) -> tuple[int, int] | None:
         """Times of the oldest word that is kept and of the newest; None before the first."""
         return (self._ns[0], self._ns[-1]) if self._ns else None
 

@@ -49,29 +49,29 @@ class Turn:
 @dataclass(frozen=True)
 class _Node:
     stamp_ns: int
-    R_own_drone: Array64
+    R_odom_drone: Array64
     rate_drone_radps: Array64
 
 
 @dataclass(frozen=True)
 class _Place:
     stamp_ns: int
-    xyz_own_m: Array64
-    velocity_own_mps: Array64
+    xyz_odom_m: Array64
+    velocity_odom_mps: Array64
     stretch: int  # places of one stretch are told apart by displacement, those of two are not
 
 
 _Told = TypeVar("_Told", _Node, _Place)
 
 
-class AutopilotTrail:
+class AutopilotTrajectory:
     """The autopilot's attitude and position in frame own."""
 
     def __init__(self) -> None:
         self._nodes: deque[_Node] = deque(maxlen=KEPT)
         self._places: deque[_Place] = deque(maxlen=KEPT)
-        self._R_own_local = np.eye(3)
-        self._offset_m = np.zeros(3)  # xyz_own = R_own_local xyz_local + offset
+        self._R_odom_raw = np.eye(3)
+        self._offset_m = np.zeros(3)  # xyz_own = R_odom_raw xyz_local + offset
         self._reset_counter: int | None = None
         self._odometry_ns: int | None = None
         self.jumps = 0  # taken out
@@ -96,30 +96,30 @@ class AutopilotTrail:
         else:
             self.add_position(word.stamp_ns, word.xyz_odom_m, word.velocity_odom_mps)
 
-    def add_attitude(self, stamp_ns: int, R_odom_drone: Array64, rate_drone_radps: Array64) -> None:
+    def add_attitude(self, stamp_ns: int, R_raw_drone: Array64, rate_drone_radps: Array64) -> None:
         """One more attitude; one that is not newer than the last is ignored."""
-        R_own_drone = self._R_own_local @ R_odom_drone
+        R_odom_drone = self._R_odom_raw @ R_raw_drone
         if self._nodes:
             last = self._nodes[-1]
             dt = (stamp_ns - last.stamp_ns) * 1e-9
             if dt <= 0:
                 return
             turn = 0.5 * dt * (last.rate_drone_radps + rate_drone_radps)
-            expected = last.R_own_drone @ exp_rotation(turn)
-            off = float(np.linalg.norm(log_rotation(expected.T @ R_own_drone)))
+            expected = last.R_odom_drone @ exp_rotation(turn)
+            off = float(np.linalg.norm(log_rotation(expected.T @ R_odom_drone)))
             if dt > GAP_S:
                 self.silences += 1
             elif off > JUMP_RAD + 0.3 * float(np.linalg.norm(turn)):
                 self.jumps += 1
-                self._R_own_local = expected @ R_odom_drone.T
+                self._R_odom_raw = expected @ R_raw_drone.T
                 self._break_places()
-                R_own_drone = expected
-        self._nodes.append(_Node(stamp_ns, R_own_drone, rate_drone_radps))
+                R_odom_drone = expected
+        self._nodes.append(_Node(stamp_ns, R_odom_drone, rate_drone_radps))
 
-    def add_position(self, stamp_ns: int, xyz_odom_m: Array64, velocity_odom_mps: Array64) -> None:
+    def add_position(self, stamp_ns: int, xyz_raw_m: Array64, velocity_raw_mps: Array64) -> None:
         """One more position with its velocity, of the same estimate as the attitude."""
-        xyz = self._R_own_local @ xyz_odom_m + self._offset_m
-        velocity = self._R_own_local @ velocity_odom_mps
+        xyz = self._R_odom_raw @ xyz_raw_m + self._offset_m
+        velocity = self._R_odom_raw @ velocity_raw_mps
         stretch = 0
         if self._places:
             last = self._places[-1]
@@ -127,7 +127,7 @@ class AutopilotTrail:
             if dt <= 0:
                 return
             stretch = last.stretch
-            expected = last.xyz_own_m + 0.5 * dt * (last.velocity_own_mps + velocity)
+            expected = last.xyz_odom_m + 0.5 * dt * (last.velocity_odom_mps + velocity)
             if dt > GAP_S:
                 stretch += 1
             elif float(np.linalg.norm(xyz - expected)) > JUMP_M + 0.3 * dt * float(np.linalg.norm(velocity)):
@@ -145,14 +145,14 @@ class AutopilotTrail:
     def _break_places(self) -> None:
         if self._places:
             last = self._places[-1]
-            self._places[-1] = _Place(last.stamp_ns, last.xyz_own_m, last.velocity_own_mps, last.stretch + 1)
+            self._places[-1] = _Place(last.stamp_ns, last.xyz_odom_m, last.velocity_odom_mps, last.stretch + 1)
 
     def rate_radps(self, stamp_ns: int) -> float:
         """How fast the drone turns [rad/s]; 0 where nobody says."""
         node = self._before(stamp_ns)
         return 0.0 if node is None else float(np.linalg.norm(node.rate_drone_radps))
 
-    def R_own_drone(self, stamp_ns: int) -> Array64 | None:
+    def R_odom_drone(self, stamp_ns: int) -> Array64 | None:
         """Attitude at a time, a little beyond the newest with its rate; None: not known."""
         around = _around(self._nodes, stamp_ns)
         if around is None:
@@ -160,11 +160,11 @@ class AutopilotTrail:
         before, after = around
         since_s = (stamp_ns - before.stamp_ns) * 1e-9
         if after is None:
-            return before.R_own_drone @ exp_rotation(since_s * before.rate_drone_radps)
+            return before.R_odom_drone @ exp_rotation(since_s * before.rate_drone_radps)
         share = since_s / ((after.stamp_ns - before.stamp_ns) * 1e-9)
-        return before.R_own_drone @ exp_rotation(share * log_rotation(before.R_own_drone.T @ after.R_own_drone))
+        return before.R_odom_drone @ exp_rotation(share * log_rotation(before.R_odom_drone.T @ after.R_odom_drone))
 
-    def place(self, stamp_ns: int) -> tuple[Array64, int] | None:
+    def position(self, stamp_ns: int) -> tuple[Array64, int] | None:
         """Position (3,) [m] in frame own and its stretch; None: not known."""
         around = _around(self._places, stamp_ns)
         if around is None:
@@ -172,16 +172,16 @@ class AutopilotTrail:
         before, after = around
         since_s = (stamp_ns - before.stamp_ns) * 1e-9
         if after is None:
-            return before.xyz_own_m + since_s * before.velocity_own_mps, before.stretch
+            return before.xyz_odom_m + since_s * before.velocity_odom_mps, before.stretch
         if after.stretch != before.stretch:
             return None
         share = since_s / ((after.stamp_ns - before.stamp_ns) * 1e-9)
-        return before.xyz_own_m + share * (after.xyz_own_m - before.xyz_own_m), before.stretch
+        return before.xyz_odom_m + share * (after.xyz_odom_m - before.xyz_odom_m), before.stretch
 
-    def velocity_own_mps(self, stamp_ns: int) -> Array64 | None:
+    def velocity_odom_mps(self, stamp_ns: int) -> Array64 | None:
         """Velocity (3,) in frame own, as said last before a time; None: not known."""
         around = _around(self._places, stamp_ns)
-        return None if around is None else around[0].velocity_own_mps
+        return None if around is None else around[0].velocity_odom_mps
 
     @property
     def attitude_ns(self) -> int | None:
@@ -189,7 +189,7 @@ class AutopilotTrail:
         return self._nodes[-1].stamp_ns if self._nodes else None
 
     @property
-    def place_ns(self) -> int | None:
+    def position_ns(self) -> int | None:
         """Time of the newest position."""
         return self._places[-1].stamp_ns if self._places else None
 
@@ -212,7 +212,7 @@ def _around(told: deque[_Told], stamp_ns: int) -> tuple[_Told, _Told | None] | N
     return (before, None) if stamp_ns - before.stamp_ns <= AHEAD_NS else None
 
 
-class PictureTrail:
+class VisualTrajectory:
     """The drone's odometry by pictures, one step after the other as long as they join."""
 
     def __init__(self) -> None:
@@ -255,10 +255,10 @@ class PictureTrail:
         return R0 @ exp_rotation(share * log_rotation(R0.T @ R1)), variance, chain0
 
 
-def turn_between(autopilot: AutopilotTrail, pictures: PictureTrail, from_ns: int, to_ns: int) -> Turn:
+def rotation_between(autopilot: AutopilotTrajectory, pictures: VisualTrajectory, from_ns: int, to_ns: int) -> Turn:
     """The drone's turn between two moments, from the best source that covers both."""
     dt = abs(to_ns - from_ns) * 1e-9
-    R0, R1 = autopilot.R_own_drone(from_ns), autopilot.R_own_drone(to_ns)
+    R0, R1 = autopilot.R_odom_drone(from_ns), autopilot.R_odom_drone(to_ns)
     if R0 is not None and R1 is not None:
         late = CLOCK_S * (autopilot.rate_radps(to_ns) - autopilot.rate_radps(from_ns))
         return Turn(R0.T @ R1, DRIFT_RAD2_PER_S * dt + late**2, True)

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from stages.geometry.frames import Array64, transform
-from stages.geometry.se3 import adjoint, carried_covariance
+from stages.geometry.se3 import adjoint, composed_covariance
 from stages.odometry.vehicle.scale import Length
 
 MANY = 12  # features
@@ -47,7 +47,7 @@ def after(at: Pose6, step: Step) -> Pose6:
     """T T_step and its covariance."""
     Q = np.zeros((6, 6))
     Q[:3, :3], Q[3:, 3:] = step.turn_rad2, step.R.T @ step.spread_m2 @ step.R
-    return Pose6(at.R @ step.R, at.p + at.R @ step.t, carried_covariance(at.covariance, step.R, step.t, Q))
+    return Pose6(at.R @ step.R, at.p + at.R @ step.t, composed_covariance(at.covariance, step.R, step.t, Q))
 
 
 def believable(found: Length, expected: Length) -> bool:

@@ -26,7 +26,7 @@ import numpy as np
 from pydantic import Field
 
 from flow.stage import Settings, Stage
-from stages.geometry.extrapolation import BelievedWords, along_its_bend
+from stages.geometry.extrapolation import AcceptedPoses, constant_turn_rate
 from stages.geometry.frames import Array64, transform
 from stages.geometry.se3 import adjoint
 from stages.kernels.geometry.so3 import nearest_rotation
@@ -56,7 +56,7 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
     def __init__(self, settings: VehicleMotionSelectorSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._teller: Teller | None = None
-        self._words: dict[Teller, BelievedWords] = {t: BelievedWords() for t in Teller}
+        self._words: dict[Teller, AcceptedPoses] = {t: AcceptedPoses() for t in Teller}
         self._told: deque[VehicleMotion] = deque(maxlen=64)
         self._T_start_source: Array64 = np.eye(4)
         self._joint: tuple[VehicleMotion, Array64 | None] | None = None  # the source's word at the change
@@ -82,7 +82,7 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         if odometry_ns is not None and motion.stamp_ns - odometry_ns < self.settings.silent_s * 1e9:
             return None
         if self._teller is not Teller.EGO:
-            self._words[Teller.EGO] = BelievedWords()  # it has begun anew
+            self._words[Teller.EGO] = AcceptedPoses()  # it has begun anew
         return self._tell(Teller.EGO, motion)
 
     def _tell(self, teller: Teller, motion: VehicleMotion) -> VehicleMotion | None:
@@ -90,7 +90,7 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         words = self._words[teller]
         if words.newest_ns is not None and motion.stamp_ns <= words.newest_ns:
             return None
-        believed = words.hear(motion)
+        believed = words.add(motion)
         if not believed:
             self._refused[f"{teller.value}: not where the words before lead"] += 1
             return None
@@ -116,7 +116,7 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         """Lay the new source on the end of the old one."""
         if not self._told:
             return
-        at = along_its_bend(list(self._told), motion.stamp_ns)
+        at = constant_turn_rate(list(self._told), motion.stamp_ns)
         there = transform(motion.R_map_vehicle, motion.xyz_map_m)
         self._T_start_source = transform(at.R_map_vehicle, at.xyz_map_m) @ np.linalg.inv(there)
         self._joint = motion, at.covariance

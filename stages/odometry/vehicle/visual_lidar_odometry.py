@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import Field
 
 from flow.stage import Settings, Stage
-from stages.geometry.extrapolation import UNTOLD, BelievedWords
+from stages.geometry.extrapolation import GAP_MANEUVER, AcceptedPoses
 from stages.geometry.frames import Array64, Pose
 from stages.geometry.lens import Lens
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
@@ -101,7 +101,7 @@ class VisualLidarOdometry(Stage[VisualLidarOdometrySettings]):
     def __init__(self, settings: VisualLidarOdometrySettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._now = _Now()
-        self._odometry = BelievedWords()
+        self._odometry = AcceptedPoses()
         self._resting: bool = False
         settings = self.settings
         self._links = MotionLinks(settings.lens, settings.features, settings.link)
@@ -111,7 +111,7 @@ class VisualLidarOdometry(Stage[VisualLidarOdometrySettings]):
         """The vehicle tells its motion itself: nothing is to be done here."""
         newest_ns = self._odometry.newest_ns
         if newest_ns is None or motion.stamp_ns > newest_ns:
-            self._resting |= bool(self._odometry.hear(motion))
+            self._resting |= bool(self._odometry.add(motion))
 
     def on_points(self, points: SweptPoints) -> None:
         """LiDAR returns wait until a picture has told where the vehicle was."""
@@ -202,7 +202,7 @@ class VisualLidarOdometry(Stage[VisualLidarOdometrySettings]):
         rho = parallax_ratio(link.ray_key, link.ray_now, link.motion.R_later_earlier, t_hat, link.motion.sigma_rad)
         found = length_of(rho[0][inlier], rho[1][inlier], known.inverse_m[rows][inlier], known.sigma[rows][inlier])
         m = now.speed_mps * span_s
-        expected = Length(m, UNTOLD.place_m(span_s) + 0.1 * m, 0)
+        expected = Length(m, GAP_MANEUVER.displacement_m(span_s) + 0.1 * m, 0)
         if found is None or (now.metric and not believable(found, expected)):
             found = expected
         else:
@@ -224,7 +224,7 @@ class VisualLidarOdometry(Stage[VisualLidarOdometrySettings]):
         gap_s = (stamp_ns - now.poses[-1][0]) * 1e-9
         (t0, _, p0), (t1, R, p1) = now.poses[0], now.poses[-1]
         ahead = (p1 - p0) / max((t1 - t0) * 1e-9, 1e-3) * gap_s if len(now.poses) > 1 else np.zeros(3)
-        place = (UNTOLD.place_m(gap_s) + 0.3 * float(np.linalg.norm(ahead))) ** 2
+        place = (GAP_MANEUVER.displacement_m(gap_s) + 0.3 * float(np.linalg.norm(ahead))) ** 2
         turn = (TURN_RADPS * gap_s) ** 2
         return Pose6(R, p1 + ahead, now.key.at.covariance + np.diag([turn] * 3 + [place] * 3))
 

@@ -389,7 +389,7 @@ def test_an_odometry_that_calls_itself_failed_is_not_heard():
                 quality_percent=quality,
             )
         )
-    assert told.heard_ns == (START_NS, START_NS + 100 * MS)
+    assert told.span_ns == (START_NS, START_NS + 100 * MS)
 
 
 def test_a_word_that_is_not_newer_is_ignored():

@@ -19,7 +19,7 @@ from stages.fuse import Fuse
 from stages.fuse.back_end import HUBER
 from stages.fuse.propagated import Step
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import carried_covariance
+from stages.geometry.se3 import composed_covariance
 from stages.kernels.geometry.so3 import exp_rotation, hat, log_rotation
 
 
@@ -39,7 +39,7 @@ class Ekf:
         """Propagate; `up_drone` is the vertical by the autopilot."""
         self.xyz_map_m = self.xyz_map_m + self.R_map_drone @ step.t_m
         self.R_map_drone = self.R_map_drone @ step.R
-        self.covariance = carried_covariance(self.covariance, step.R, step.t_m, step.covariance)
+        self.covariance = composed_covariance(self.covariance, step.R, step.t_m, step.covariance)
         self.stamp_ns = stamp_ns
         if up_drone is not None:
             H = np.zeros((3, 6))

@@ -18,13 +18,13 @@ from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
 from stages.fuse.track_continuity import Following
 from stages.geometry.frames import heading_rad, rotation_z
-from stages.geometry.se3 import good_covariance
+from stages.geometry.se3 import is_covariance
 from stages.heading.fused_heading import Heading
 from stages.heading.motion_yaw import Point
 from stages.heading.odometry_yaw import North
 from stages.heading.yaw_fit import DRIFT_RAD_PER_S, Yaw
 from stages.messages import DroneAttitude, DroneLocalPosition, TrackingState, TrackState
-from stages.odometry.drone.trajectory import AutopilotTrail
+from stages.odometry.drone.trajectory import AutopilotTrajectory
 from tests.stages.fuse.ekf import Ekf
 from tests.stages.fuse.made_drone_flight import S, fix, gauss_markov, ns, track
 
@@ -172,7 +172,7 @@ def test_a_step_is_the_way_told_and_the_drift_in_the_drones_axes():
     assert step.turn_told
     assert np.allclose(step.R, rotation_z(0.4), atol=1e-6)
     assert np.allclose(R0 @ step.t_m, R_map_own @ [1.0, 0.5, 0.0], atol=1e-6)
-    assert good_covariance(step.covariance)
+    assert is_covariance(step.covariance)
     back = motion_model.step(3 * S // 2, S // 2, R0 @ step.R, left, free, True, S // 2)
     assert np.allclose(step.R @ back.R, np.eye(3), atol=1e-9)
     assert np.allclose(step.t_m + step.R @ back.t_m, 0, atol=1e-9)
@@ -349,7 +349,7 @@ def attitude(t_s, yaw=0.0):
     [(0.1, 0.0, 0.01), (2.0, 0.0, 0.02), (2.0, 0.3, 0.3), (2.0, QUARTER, None), (4.0, 0.0, None)],
 )
 def test_a_silence_of_the_autopilots_costs_and_a_long_one_costs_all(silent_s, turned_rad, sigma_rad):
-    north, trail = North(ERRORS, 0.14), AutopilotTrail()
+    north, trail = North(ERRORS, 0.14), AutopilotTrajectory()
     for t in (0.0, 0.02, 0.04):
         north.hear(trail, attitude(t))
     north.yaw = Yaw(0, 0.5, 0.01**2)

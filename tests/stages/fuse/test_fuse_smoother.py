@@ -10,7 +10,7 @@ from gtsam.symbol_shorthand import X
 from stages.fuse.propagated import Step
 from stages.fuse.smoother import Smoother
 from stages.geometry.frames import rotation_z
-from stages.geometry.se3 import carried_covariance
+from stages.geometry.se3 import composed_covariance
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from tests.stages.fuse.ekf import Ekf
 
@@ -46,7 +46,7 @@ def test_a_chain_of_steps_is_their_product_and_its_covariance_theirs(make):
     P = P0
     for k in range(1, 11):
         back.extend(k * TENTH, way(), None, TILT)
-        P = carried_covariance(P, way().R, way().t_m, way().covariance)
+        P = composed_covariance(P, way().R, way().t_m, way().covariance)
     R, x = true_pose(10)
     assert np.allclose(back.R_map_drone, R, atol=1e-6)
     assert np.allclose(back.xyz_map_m, x, atol=1e-6)

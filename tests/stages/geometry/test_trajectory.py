@@ -87,7 +87,7 @@ def test_poses_that_arrived_together_are_no_speed():
     """A parked vehicle whose odometry is noisy by 2 mm, and whose words were held up and then came within 20 us."""
     poses = [motion(20 * k * MS, (0.002 * (k % 2), 0, 0), rotation_z(0.001 * (k % 2))) for k in range(10)]
     made = trail(*poses, motion(180 * MS + 20_000, (0, 0, 0)))
-    for R, t in (made.at(START_NS + 180 * MS + FURTHEST_NS), made.straight_on(START_NS + 480 * MS)):
+    for R, t in (made.at(START_NS + 180 * MS + FURTHEST_NS), made.constant_velocity(START_NS + 480 * MS)):
         np.testing.assert_allclose(t, np.zeros(3), atol=0.01)
         np.testing.assert_allclose(R, np.eye(3), atol=0.005)
 
@@ -202,7 +202,7 @@ def test_beyond_the_newest_pose_it_drives_on_for_a_while_and_then_stands():
 
 def test_straight_on_it_drives_and_turns_without_an_end():
     made = trail(*(motion(10 * k * MS, (0.1 * k, 0, 0), rotation_z(0.005 * k)) for k in range(13)))  # 10 m/s, 0.5 rad/s
-    R, t = made.straight_on(START_NS + 120 * MS + 4 * FURTHEST_NS)
+    R, t = made.constant_velocity(START_NS + 120 * MS + 4 * FURTHEST_NS)
     far_s = 0.12 + 4 * FURTHEST_NS / 1e9
     np.testing.assert_allclose(t, (10 * far_s, 0, 0), atol=1e-9)
     np.testing.assert_allclose(R, rotation_z(0.5 * far_s), atol=1e-9)
@@ -211,10 +211,10 @@ def test_straight_on_it_drives_and_turns_without_an_end():
 def test_beyond_the_newest_pose_it_is_less_sure_by_braking_and_by_the_way_not_gone():
     made = trail(*(motion(10 * k * MS, (0.1 * k, 0, 0), rotation_z(0.005 * k)) for k in range(13)))
     newest_ns = START_NS + 120 * MS
-    assert trail().unsure(START_NS) == (0.0, 0.0)
-    assert made.unsure(newest_ns) == (0.0, 0.0)
-    assert made.unsure(newest_ns + 200 * MS) == pytest.approx((0.5 * 2.0 * 0.2**2, 0.5 * 0.2 * 0.2**2))
-    place_m, yaw_rad = made.unsure(newest_ns + FURTHEST_NS + 100 * MS)
+    assert trail().extrapolation_sigma(START_NS) == (0.0, 0.0)
+    assert made.extrapolation_sigma(newest_ns) == (0.0, 0.0)
+    assert made.extrapolation_sigma(newest_ns + 200 * MS) == pytest.approx((0.5 * 2.0 * 0.2**2, 0.5 * 0.2 * 0.2**2))
+    place_m, yaw_rad = made.extrapolation_sigma(newest_ns + FURTHEST_NS + 100 * MS)
     assert place_m == pytest.approx(0.5 * 2.0 * 0.4**2 + 10 * 0.1)
     assert yaw_rad == pytest.approx(0.5 * 0.2 * 0.4**2 + 0.5 * 0.1, rel=1e-3)
 
@@ -262,6 +262,6 @@ def test_a_place_and_velocity_are_seen_from_the_vehicle_with_its_own_driving_and
     middle_m = R.T @ (place + half_step_s * velocity - middle_s * drives)
     expected_mps = R.T @ (velocity - drives) - np.cross([0, 0, rate_radps], middle_m)
     np.testing.assert_allclose(seen_mps, expected_mps, atol=1e-3)
-    back_m, back_mps = made.to_local(START_NS + round(now_s * 1e9), seen_m, seen_mps)
+    back_m, back_mps = made.to_map(START_NS + round(now_s * 1e9), seen_m, seen_mps)
     np.testing.assert_allclose(back_m, place, atol=1e-6)
     np.testing.assert_allclose(back_mps, velocity, atol=1e-6)

@@ -12,7 +12,7 @@ from stages.geometry.frames import rotation_z
 from stages.heading.hypothesis_bank import ASKEW, turns
 from stages.heading.windows import Windows
 from stages.messages import DroneFix, VisualMotion
-from stages.odometry.drone.trajectory import AutopilotTrail
+from stages.odometry.drone.trajectory import AutopilotTrajectory
 
 MS = 1_000_000
 SAME = np.eye(3)
@@ -31,8 +31,8 @@ def fix(ms, xyz, track=1, sigma=0.03) -> DroneFix:
     )
 
 
-def autopilot(turned_rad=0.0, until_ms=6000, v=V) -> AutopilotTrail:
-    trail = AutopilotTrail()
+def autopilot(turned_rad=0.0, until_ms=6000, v=V) -> AutopilotTrajectory:
+    trail = AutopilotTrajectory()
     R = rotation_z(turned_rad)
     for ms in range(0, until_ms, 50):
         trail.add_position(ms * MS, R @ (v * ms * 1e-3) + [7.0, 8.0, 9.0], R @ v)
@@ -155,7 +155,7 @@ def by_pictures(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms
                     reason="",
                 )
             )
-        windows.add_fix(fix(ms, V * ms * 1e-3), np.eye(3), np.zeros(3), AutopilotTrail())
+        windows.add_fix(fix(ms, V * ms * 1e-3), np.eye(3), np.zeros(3), AutopilotTrajectory())
         stamps = windows.steps_since_start()
         moved = windows.close_bearing(dict.fromkeys(stamps, R_map_drone), 0.03)
         out += [moved] if moved else []

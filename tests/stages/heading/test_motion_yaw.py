@@ -108,7 +108,7 @@ def test_what_flies_otherwise_than_the_drone_gives_no_heading(seed):
     rng = np.random.default_rng([seed, 9])
     way, bird = circle(), points(circle(), psi=0.0)
     other = np.cumsum(gauss_markov(rng, 1.5, 3.0, 0.5, len(way)) * 0.5, axis=0)
-    mixed = tuple(Point(b.stamp_ns, other[i], 0.0025, b.xyz_own_m, 0) for i, b in enumerate(bird))
+    mixed = tuple(Point(b.stamp_ns, other[i], 0.0025, b.xyz_odom_m, 0) for i, b in enumerate(bird))
     assert weigh(mixed, ERRORS).yaw is None
 
 
@@ -116,7 +116,7 @@ def test_a_way_of_another_length_gives_no_heading():
     told = weigh(points(1.0 * straight(length=20.0)), ERRORS)
     assert told.yaw is not None
     short = tuple(
-        Point(p.stamp_ns, 0.7 * p.xyz_map_m, p.variance_m2, p.xyz_own_m, 0) for p in points(straight(length=20.0))
+        Point(p.stamp_ns, 0.7 * p.xyz_map_m, p.variance_m2, p.xyz_odom_m, 0) for p in points(straight(length=20.0))
     )
     refused = weigh(short, ERRORS)
     assert refused.yaw is None
@@ -125,7 +125,7 @@ def test_a_way_of_another_length_gives_no_heading():
 
 def test_heights_must_agree():
     climbs = tuple(
-        Point(p.stamp_ns, p.xyz_map_m + np.array([0, 0, 0.3 * i]), p.variance_m2, p.xyz_own_m, 0)
+        Point(p.stamp_ns, p.xyz_map_m + np.array([0, 0, 0.3 * i]), p.variance_m2, p.xyz_odom_m, 0)
         for i, p in enumerate(points(circle()))
     )
     assert weigh(climbs, ERRORS).yaw is None
@@ -172,7 +172,7 @@ def test_a_jump_of_the_autopilots_frame_begins_anew():
         bank_.add(p)
     assert bank_.yaw is not None
     p = points(circle())[-1]
-    bank_.add(Point(p.stamp_ns + S, p.xyz_map_m, p.variance_m2, p.xyz_own_m, stretch=1))
+    bank_.add(Point(p.stamp_ns + S, p.xyz_map_m, p.variance_m2, p.xyz_odom_m, stretch=1))
     assert bank_.yaw is None
     assert not bank_.backs(p.stamp_ns, 0.0, 0.01)
 

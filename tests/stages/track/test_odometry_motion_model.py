@@ -35,8 +35,8 @@ def circle(t_s):
 def told(t_s, flown=circle, yaw_rad=YAW_RAD):
     """The same as the autopilot says it."""
     place, velocity = flown(t_s)
-    R_own_local = rotation_z(-yaw_rad)
-    return R_own_local @ (place - flown(0.0)[0]), R_own_local @ velocity
+    R_odom_raw = rotation_z(-yaw_rad)
+    return R_odom_raw @ (place - flown(0.0)[0]), R_odom_raw @ velocity
 
 
 def taught(seconds=4.0, seen=circle, flown=circle, yaw_rad=YAW_RAD):

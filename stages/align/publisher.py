@@ -9,20 +9,20 @@ import math
 
 import numpy as np
 
-from stages.align.dead_reckoning import Reckoned, Reckoning
+from stages.align.dead_reckoning import DeadReckonedYaw, DeadReckoning
 from stages.align.refine import Refined
 from stages.geometry.frames import Array64
-from stages.heading.hypothesis_bank import NONE, BranchBank
+from stages.heading.hypothesis_bank import NONE, HypothesisBank
 from stages.messages import BranchState, RelativeRotation
 
 JUMP_RAD = math.radians(30.0)  # of what is given out
 
 
-class Answers:
-    """One for each pair of pictures."""
+class Publisher:
+    """One for each pair of images."""
 
-    def __init__(self, bank: BranchBank, reckoning: Reckoning, resolve_probability: float) -> None:
-        self._bank, self._reckoning = bank, reckoning
+    def __init__(self, bank: HypothesisBank, dead_reckoning: DeadReckoning, resolve_probability: float) -> None:
+        self._bank, self._dead_reckoning = bank, dead_reckoning
         self._resolve_probability = resolve_probability
         self._branch = 0  # given out, counted from the yaw followed
         self._given_rad: float | None = None  # yaw given out less the dead reckoned one
@@ -34,11 +34,11 @@ class Answers:
         self._news = news
 
     def rotation(
-        self, vehicle_ns: int, drone_ns: int, refined: Refined, reckoned: Reckoned, off_rad: Array64
+        self, vehicle_ns: int, drone_ns: int, refined: Refined, dead_reckoned: DeadReckonedYaw, off_rad: Array64
     ) -> RelativeRotation:
         """The most probable branch; `off_rad` (3,): by how much it contradicts what is known, its error then."""
         before, self._branch = self._branch, self._bank.best(self._branch)
-        given_rad = refined.yaw_rad + self._branch * math.pi / 2 - reckoned.yaw_rad
+        given_rad = refined.yaw_rad + self._branch * math.pi / 2 - dead_reckoned.yaw_rad
         if self._given_rad is not None:
             jump_rad = math.remainder(given_rad - self._given_rad, 2 * math.pi)
             if abs(jump_rad) > JUMP_RAD:
@@ -47,7 +47,7 @@ class Answers:
                 self._news = f"JUMP: {why} {math.degrees(jump_rad):+.0f} deg; {self._news}".rstrip("; ")
         self._given_rad = given_rad
         resolved = self._bank.resolved(self._branch, self._resolve_probability)
-        left, right, stamp_ns, variance_rad2 = self._reckoning.at_one_moment(vehicle_ns, drone_ns)
+        left, right, stamp_ns, variance_rad2 = self._dead_reckoning.at_common_time(vehicle_ns, drone_ns)
         covariance = right.T @ (refined.covariance_rad2(self._branch) + np.outer(off_rad, off_rad)) @ right
         told = f"{refined.directions} directions, {refined.vehicle_lines} and {refined.drone_lines} lines"
         known = f"{self._bank.windows} windows of motion, none right: {self._bank.probability[NONE]:.1g}"
@@ -63,7 +63,7 @@ class Answers:
         )
 
     def none(self, stamp_ns: int, reason: str) -> RelativeRotation:
-        """No rotation of a picture, and why."""
+        """No rotation of a image, and why."""
         return RelativeRotation(
             stamp_ns=stamp_ns,
             R_vehicle_drone=None,

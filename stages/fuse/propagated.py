@@ -3,8 +3,8 @@
     D = O(t0)^-1 O(t1) with b dt:   R = R_odom_drone(t0)^T R_odom_drone(t1)
                                      t = R_odom_drone(t0)^T (p_odom(t1) - p_odom(t0)) + R_map_drone(t0)^T b dt
 
-O is the autopilot's pose in its frame `own` (stages/odometry/drone/trajectory.py), b what it creeps away by (drift.py).
-Without its positions b is the drone's whole velocity; without its attitude the turn is the drone's pictures', or
+O is the autopilot's pose in its frame `odom` (stages/odometry/drone/trajectory.py), b what it creeps away by (drift.py).
+Without its positions b is the drone's whole velocity; without its attitude the turn is the drone's images', or
 nobody's. Beyond
 the newest word a velocity is kept, which is worth less the longer it is kept.
 
@@ -36,7 +36,7 @@ class Step:
     t_m: Array64
     covariance: Array64  # (6, 6) rotation before translation, tangent at the later body
     by_odometry: bool  # the autopilot told the way; else it is the velocity kept
-    turn_told: bool
+    turn_measured: bool
 
 
 class MotionModel:
@@ -45,14 +45,14 @@ class MotionModel:
     def __init__(self, errors: FuseErrors) -> None:
         self._errors = errors
         self.autopilot = AutopilotTrajectory()
-        self.pictures = VisualTrajectory()
+        self.images = VisualTrajectory()
 
     def step(
         self, from_ns: int, to_ns: int, R_map_drone: Array64, left: Drift, free: Drift, still: bool, since_ns: int
     ) -> Step:
         """From one moment to another; R_map_drone at the first.
 
-        left, free: what is left over by the autopilot's odometry, and the motion without it. `still`: the start frame
+        left, free: what is left over by the autopilot's odometry, and the motion without it. `still`: the map frame
         is known to stand still; else an odometry over ground tells nothing in it. `since_ns`: time of the newest fix.
         """
         dt = (to_ns - from_ns) * 1e-9
@@ -65,8 +65,12 @@ class MotionModel:
         by_odometry = own is not None and R_odom is not None
         drift = left if by_odometry else free
         ago, then = (from_ns - since_ns) * 1e-9, (to_ns - since_ns) * 1e-9
-        gathered = drift.gathered(then) - drift.gathered(ago) if then >= ago else drift.gathered(abs(dt))
-        spread = gathered + e.walk_m_per_sqrt_s**2 * abs(dt) * np.eye(3)
+        growth_covariance_m2 = (
+            drift.growth_covariance_m2(then) - drift.growth_covariance_m2(ago)
+            if then >= ago
+            else drift.growth_covariance_m2(abs(dt))
+        )
+        spread = growth_covariance_m2 + e.walk_m_per_sqrt_s**2 * abs(dt) * np.eye(3)
         t = dt * (R_map_drone.T @ drift.velocity_mps)
         if own is not None and R_odom is not None:
             way_m, beyond_s = own
@@ -83,7 +87,7 @@ class MotionModel:
         return self.autopilot.R_odom_drone(stamp_ns)
 
     def displacement_odom_m(self, from_ns: int, to_ns: int) -> tuple[Array64, float] | None:
-        """Way (3,) in frame own by the autopilot's positions, and how long beyond its newest word [s]; None: unknown.
+        """Way (3,) in frame odom by the autopilot's positions, and how long beyond its newest word [s]; None: unknown.
 
         A way over a jump of its estimate is unknown.
         """
@@ -102,8 +106,8 @@ class MotionModel:
             way = way + kept_s * velocity
         return way, max(beyond_ns, 0) * 1e-9
 
-    def bent_m(self, from_ns: int, to_ns: int) -> Array64 | None:
-        """How far (3,) the autopilot's way, frame own, is from straight on at the first moment's velocity."""
+    def manoeuvre_m(self, from_ns: int, to_ns: int) -> Array64 | None:
+        """How far (3,) the autopilot's way, frame odom, is from straight on at the first moment's velocity."""
         way, velocity = self.displacement_odom_m(from_ns, to_ns), self.autopilot.velocity_odom_mps(from_ns)
         return None if way is None or velocity is None else way[0] - (to_ns - from_ns) * 1e-9 * velocity
 
@@ -124,13 +128,13 @@ class MotionModel:
                 walk = math.radians(self._errors.turn_walk_deg_per_sqrt_s) ** 2 * dt
                 kept = (0.5 * max(1.0, self.autopilot.rate_radps(to_ns)) * beyond_s**2) ** 2  # rates change
                 return a.T @ b, walk + (CLOCK_S * change) ** 2 + kept, True
-        turn = rotation_between(self.autopilot, self.pictures, from_ns, to_ns)
+        turn = rotation_between(self.autopilot, self.images, from_ns, to_ns)
         return turn.R_from_to, turn.variance_rad2, turn.sure
 
     def newest_ns(self, now_ns: int, positions: bool) -> int | None:
         """Up to when the drone's motion has been told by who was heard in the last second; None: nobody was."""
         said = [self.autopilot.attitude_ns, self.autopilot.position_ns if positions else None]
         heard = [ns for ns in said if ns is not None and now_ns - ns < 1_000_000_000]
-        if not heard and self.pictures.newest_ns is not None and now_ns - self.pictures.newest_ns < 1_000_000_000:
-            heard = [self.pictures.newest_ns]
+        if not heard and self.images.newest_ns is not None and now_ns - self.images.newest_ns < 1_000_000_000:
+            heard = [self.images.newest_ns]
         return min(heard) if heard else None

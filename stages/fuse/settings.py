@@ -1,7 +1,7 @@
 """Sizes of the errors that the fusion reckons with, and its limits.
 
 Source: DESIGN, Fusion; sizes are ours: a consumer-grade EKF's drift; fixes as simulated flights show them, whose errors
-correlate by .40 .19 .07 at .1 .2 .3 s about a mean of their own that holds a quarter of the variance.
+correlate by 0.40 0.19 0.07 at 0.1 0.2 0.3 s about a mean of their own that holds a quarter of the variance.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ class FuseErrors(BaseModel):
     drift_scale: float = Field(default=0.02, ge=0)  # of a change of velocity: scale and heading of the odometries
     walk_m_per_sqrt_s: float = Field(default=0.04, gt=0)  # of the odometry's position, beside its drift
     turn_walk_deg_per_sqrt_s: float = Field(default=0.1, gt=0)  # of the autopilot's attitude
-    tilt_deg: float = Field(default=1.0, gt=0)  # of the autopilot's vertical in the start frame
+    tilt_deg: float = Field(default=1.0, gt=0)  # of the autopilot's vertical in the map frame
     tilt_time_s: float = Field(default=20.0, gt=0)
     manoeuvre: float = Field(default=5.0, gt=0)  # density of the drone's acceleration where no odometry tells [m2/s3]
-    manoeuvre_told: float = Field(default=0.7, gt=0)  # beside the change of velocity that its autopilot tells
+    manoeuvre_with_odometry: float = Field(default=0.7, gt=0)  # beside the change of velocity that its autopilot tells
     fix_variance: float = Field(default=0.65, gt=0)  # a fix's true variance over the one told; trackers are careful
     fix_time_s: float = Field(default=0.2, ge=0)  # for which the error of a fix lasts
     # share of its variance that never averages out (calibration), where the tracker does not tell it itself
-    fix_lasting: float = Field(default=0.25, ge=0, lt=1)
+    fix_bias_share: float = Field(default=0.25, ge=0, lt=1)
     rotation_time_s: float = Field(default=1.0, ge=0)  # for which an error of the vanishing points lasts
-    rotation_lasting: float = Field(default=0.2, ge=0, lt=1)
+    rotation_bias_share: float = Field(default=0.2, ge=0, lt=1)
 
 
 class FuseLimits(BaseModel):

@@ -1,6 +1,6 @@
 """The back end as a fixed-lag smoother: a chain of poses X_k = T_map_drone, ten a second, the last three seconds.
 
-    X_k -- X_k+1     BetweenFactorPose3: the drone's own way (carried.py)
+    X_k -- X_k+1     BetweenFactorPose3: the drone's own way (propagated.py)
     X_k              GPSFactorArm: a LiDAR position, PoseRotationPrior3D: a rotation, each carried to its own time by
                      the drone's way since X_k, so that late data move the pose where they belong
     X_k              AttitudeFactorPose3: the autopilot's vertical
@@ -93,7 +93,7 @@ class Smoother:
     def near(self, stamp_ns: int) -> tuple[int, Array64, Array64]:
         """The newest pose of the chain not after a time; the oldest for what is older.
 
-        Where it cannot be read, the chain begins anew at its newest.
+        Where it cannot be read, the chain restarts at its newest.
         """
         key_ns, number = self._keys[0]
         for at_ns, candidate in reversed(self._keys):
@@ -105,7 +105,7 @@ class Smoother:
                 pose = self._smoother.calculateEstimatePose3(X(number))
                 return key_ns, pose.rotation().matrix(), pose.translation()
             except RAISED:
-                self._begin_anew(self.R_map_drone, self.xyz_map_m, self.covariance)
+                self._reinitialise(self.R_map_drone, self.xyz_map_m, self.covariance)
         return self.stamp_ns, self.R_map_drone, self.xyz_map_m
 
     def add_position(self, key_ns: int, step: Step, xyz_m: Array64, covariance_m2: Array64) -> bool:
@@ -145,12 +145,12 @@ class Smoother:
         except RAISED:
             pass
         if newest is None:
-            self._begin_anew(R, xyz_m, covariance)
+            self._reinitialise(R, xyz_m, covariance)
             return False
         self.R_map_drone, self.xyz_map_m, self.covariance = newest
         return True
 
-    def _begin_anew(self, R: Array64, xyz_m: Array64, covariance: Array64) -> None:
+    def _reinitialise(self, R: Array64, xyz_m: Array64, covariance: Array64) -> None:
         self.recoveries += 1
         self.start(self.stamp_ns, R, xyz_m, covariance)
 

@@ -16,9 +16,9 @@ import math
 import numpy as np
 
 from stages.fuse.estimator import Estimator
-from stages.fuse.measurement_covariance import MapEstimate
+from stages.fuse.pose_message import MapEstimate
 from stages.fuse.settings import FuseLimits
-from stages.heading.fused_heading import STREETS_NS
+from stages.heading.fused_heading import VP_ROTATION_NS
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import PoseState
 
@@ -26,7 +26,7 @@ JUMP_MPS2, JUMP_RAD_PER_S = 10.0, 4.0  # what a drone can do between two outputs
 
 
 def state_of(
-    known: MapEstimate | None, estimator: Estimator, limits: FuseLimits, now_ns: int, tracker: str, doubt: str
+    known: MapEstimate | None, estimator: Estimator, limits: FuseLimits, now_ns: int, tracker: str, ambiguity: str
 ) -> tuple[PoseState, str]:
     """The state, and why. `tracker`: what it says; `doubt`: why a rotation that is told is not believed, or empty."""
     e = estimator
@@ -43,13 +43,13 @@ def state_of(
         return PoseState.LOST, f"position known to {worst_m:.1f} m only, {age_s:.1f} s after the last by LiDAR"
     unseen = f"; the LiDAR has not seen it for {age_s:.1f} s" if age_s > limits.coast_after_s else ""
     if known.R_map_drone is None:
-        if e.north.heading.contradiction:
-            return PoseState.AMBIGUOUS, e.north.heading.contradiction + unseen
-        if doubt:
-            return PoseState.AMBIGUOUS, doubt + unseen
-        if e.on_trial and e.north.known(now_ns) is not None:
+        if e.odometry_yaw.heading.contradiction:
+            return PoseState.AMBIGUOUS, e.odometry_yaw.heading.contradiction + unseen
+        if ambiguity:
+            return PoseState.AMBIGUOUS, ambiguity + unseen
+        if e.unverified and e.odometry_yaw.known(now_ns) is not None:
             return PoseState.POSITION_ONLY, f"found elsewhere: does it move as the drone says it does?{unseen}"
-        return PoseState.POSITION_ONLY, f"heading not known: {e.north.by_motion.reason}{unseen}"
+        return PoseState.POSITION_ONLY, f"heading not known: {e.odometry_yaw.by_motion.reason}{unseen}"
     if unseen:
         return PoseState.COASTING, f"carried by odometry{unseen}"
     return PoseState.FULL, _why_rotation(e)
@@ -57,18 +57,18 @@ def state_of(
 
 def _why_rotation(estimator: Estimator) -> str:
     """Who tells the rotation."""
-    if estimator.from_streets:
+    if estimator.from_vanishing_points:
         return "rotation by both cameras"
-    streets_ns, seen = estimator.streets_ns, estimator.north.by_motion.reason
-    cameras = streets_ns is not None and estimator.chain.back.stamp_ns - streets_ns < STREETS_NS
+    vp_rotation_ns, seen = estimator.vp_rotation_ns, estimator.odometry_yaw.by_motion.reason
+    cameras = vp_rotation_ns is not None and estimator.chain.back.stamp_ns - vp_rotation_ns < VP_ROTATION_NS
     return f"rotation by {'both cameras and ' if cameras else ''}the drone's motion; {seen}"
 
 
-def why_unbacked(estimator: Estimator, stamp_ns: int) -> str:
+def unconfirmed_reason(estimator: Estimator, stamp_ns: int) -> str:
     """Why the streets' rotation, RESOLVED, is not believed, and what helps."""
-    if not estimator.motions.still(stamp_ns):
+    if not estimator.motions.map_is_fixed(stamp_ns):
         return "the streets' rotation is not believed: how the vehicle moves is not told, so no motion can agree"
-    seen = estimator.north.by_motion.reason
+    seen = estimator.odometry_yaw.by_motion.reason
     return f"the streets' rotation waits for the drone's motion to agree: fly some metres, any way; {seen}"
 
 

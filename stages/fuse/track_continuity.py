@@ -17,7 +17,7 @@ SILENT_NS = 2_000_000_000  # a track of which nothing is said for so long is gon
 STEP_NS = 200_000_000  # of a pause of the tracker's so much counts: nothing is said of any track then
 
 
-class Following:
+class TrackContinuity:
     """The number of the track that is followed, 0 for none."""
 
     def __init__(self, wanted: int | None) -> None:
@@ -29,7 +29,7 @@ class Following:
         self.number = 0
         self.reason = "no drone is tracked"
 
-    def hear(self, state: TrackState) -> None:
+    def add(self, state: TrackState) -> None:
         """What the tracker says of a track."""
         if state.track_id == 0 and state.state is TrackingState.SEARCHING:
             self._forget(self._states, state.reason)
@@ -52,7 +52,7 @@ class Following:
             if number == self.number:
                 self.number, self.reason = 0, f"the tracker lost it: {why}"
 
-    def takes(self, track_id: int, stamp_ns: int) -> bool:
+    def accepts(self, track_id: int, stamp_ns: int) -> bool:
         """Whether a fix of a track is to be used; chooses a track where none is followed."""
         if self._wanted is not None and track_id != self._wanted:
             return False

@@ -19,34 +19,34 @@ from stages.heading.yaw_fit import Yaw, apart_rad
 SLACK_RAD = math.radians(5.0)
 CLEAR, ALIKE = 4.0, 3.0  # sigmas
 MOTION_NS = 5_000_000_000  # a yaw by motion serves as a witness for this long
-STREETS_NS = 1_000_000_000
+VP_ROTATION_NS = 1_000_000_000
 SETTLE_NS = 2_000_000_000
 FORGET_NS = 30_000_000_000
 
 
 class Heading:
-    """Remembers what both said of the yaw of R_map_own, and judges."""
+    """Remembers what both said of the yaw of R_map_odom, and judges."""
 
     def __init__(self) -> None:
         self._motion: Yaw | None = None
-        self._streets: Yaw | None = None
+        self._vp_yaw: Yaw | None = None
         self._resolved_ns: int | None = None
         self._switches: int | None = None
         self._switched_ns: int | None = None
         self.contradiction = ""
 
-    def hear_motion(self, yaw: Yaw) -> None:
+    def add_motion_yaw(self, yaw: Yaw) -> None:
         """Motion's word."""
         self._motion = yaw
         self._compare(yaw.stamp_ns)
 
-    def hear_streets(self, stamp_ns: int, switches: int, yaw_rad: float | None, sigma_rad: float) -> bool:
+    def add_vp_rotation(self, stamp_ns: int, switches: int, yaw_rad: float | None, sigma_rad: float) -> bool:
         """The streets' word, RESOLVED; yaw None: the autopilot's attitude is not known. Whether it is believed."""
         if self._switches is not None and switches != self._switches:
             self._switched_ns = stamp_ns
         self._switches, self._resolved_ns = switches, stamp_ns
         if yaw_rad is not None:
-            self._streets = Yaw(stamp_ns, yaw_rad, sigma_rad**2)
+            self._vp_yaw = Yaw(stamp_ns, yaw_rad, sigma_rad**2)
             self._compare(stamp_ns)
         if self.contradiction:
             return False
@@ -75,7 +75,7 @@ class Heading:
     def pass_time(self, now_ns: int) -> None:
         """A contradiction is over when one side has been silent for long."""
         if self.contradiction and (self._resolved_ns is None or now_ns - self._resolved_ns > FORGET_NS):
-            self.contradiction, self._streets = "", None
+            self.contradiction, self._vp_yaw = "", None
 
     def forget_motion(self) -> None:
         """Motion's word was about another frame or another drone."""
@@ -86,9 +86,9 @@ class Heading:
         return m if m is not None and abs(stamp_ns - m.stamp_ns) <= MOTION_NS else None
 
     def _compare(self, stamp_ns: int) -> None:
-        if self._streets is None or stamp_ns - self._streets.stamp_ns > STREETS_NS:
+        if self._vp_yaw is None or stamp_ns - self._vp_yaw.stamp_ns > VP_ROTATION_NS:
             return
-        yaw_rad, sigma_rad = self._streets.yaw_rad, self._streets.sigma_rad
+        yaw_rad, sigma_rad = self._vp_yaw.yaw_rad, self._vp_yaw.sigma_rad
         if self.denies(stamp_ns, yaw_rad, sigma_rad):
             assert self._motion is not None
             off = math.degrees(apart_rad(self._motion.yaw_rad, yaw_rad))

@@ -1,4 +1,4 @@
-"""The yaw of the autopilot's own frame in the start frame, as somebody told it once: R_map_own = Rz(yaw).
+"""The yaw of the autopilot's own frame in the map frame, as somebody told it once: R_map_odom = Rz(yaw).
 
 Source: ours; sizes of the drift: links' and autopilots' usual degrees a minute.
 """
@@ -30,7 +30,7 @@ class Yaw:
         dt = abs(stamp_ns - self.stamp_ns) * 1e-9
         return math.sqrt(self.variance_rad2 + (DRIFT_RAD_PER_S * dt) ** 2 + WALK_RAD2_PER_S * dt)
 
-    def less_sure(self, by_rad2: float) -> Yaw:
+    def inflated(self, by_rad2: float) -> Yaw:
         """The same yaw, known worse."""
         return Yaw(self.stamp_ns, self.yaw_rad, self.variance_rad2 + by_rad2)
 

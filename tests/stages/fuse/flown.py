@@ -131,7 +131,7 @@ def late(ports: tuple[str, ...], by_s: float) -> Fault:
     return fault
 
 
-def spoilt(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
+def inflation(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
     """This share of what these ports hear is false: places by metres, turns by some tens of degrees."""
 
     def fault(events: list[Event]) -> list[Event]:

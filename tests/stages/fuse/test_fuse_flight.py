@@ -132,7 +132,7 @@ def test_a_branch_that_changes_in_flight_ends_full(said):
 
 
 def test_what_the_streets_alone_told_is_doubted_when_they_are_not_resolved_any_more():
-    made, stage = Made(until_s=5, autopilot="none", pictures=True), Fuse()
+    made, stage = Made(until_s=5, autopilot="none", images=True), Fuse()
     poses = made.run(stage)
     assert poses[-1].state is FULL
     poses += list(stage.on_rotation(rotation(5.05, made.truth(5.05)[0], resolved=False)))
@@ -187,17 +187,17 @@ def test_a_drone_that_was_lost_has_its_heading_when_it_is_found_again():
 
 
 def test_without_an_autopilot_rotations_and_the_drones_pictures_make_it_full():
-    made = Made(autopilot="none", pictures=True)
+    made = Made(autopilot="none", images=True)
     seen = made.judge(made.run(Fuse()), after_s=3)
     assert set(seen.states) == {FULL}
     assert rms(seen.angle_deg) < 1.0
 
 
 def test_directions_without_a_scale_sharpen_the_velocity_of_a_drone_without_autopilot():
-    """Rotations too, so that directions can be turned into the start frame; fixes each 0.1 s, rough."""
+    """Rotations too, so that directions can be turned into the map frame; fixes each 0.1 s, rough."""
     errors = []
-    for pictures in (False, True):
-        made = Made(autopilot="none", pictures=pictures, turn_dps=0.0, fix_sigma_m=0.15, seed=4)
+    for images in (False, True):
+        made = Made(autopilot="none", images=images, turn_dps=0.0, fix_sigma_m=0.15, seed=4)
         poses = [pose for pose in made.run(Fuse()) if pose.stamp_ns > ns(4)]
         errors.append(
             rms(
@@ -287,7 +287,7 @@ def test_one_track_is_followed_the_lowest_and_another_one_when_it_is_lost():
 def test_what_moved_as_another_track_does_not_tell_how_the_new_one_is_turned():
     made, stage = Made(until_s=16.0, rotations=False, gaps_s={"fix": (3.0, 99.0)}), Fuse()
     assert made.run(stage)[-1].state is LOST
-    seen = stage._estimator.north.by_motion
+    seen = stage._estimator.odometry_yaw.by_motion
     assert "moved" in seen.reason
     list(stage.on_track(track(16.0, TrackingState.LOST, 1)))
     list(stage.on_fix(fix(15.9, made.truth(15.9)[1], track_id=2)))
@@ -392,7 +392,7 @@ def test_a_position_only_covariance_is_in_the_frames_own_axes():
     object.__setattr__(long, "covariance_m2", np.diag([0.04, 0.0004, 0.01]))
     told = list(stage.on_fix(long))
     assert told[-1].state is POSITION_ONLY
-    variances = np.diag(told[-1].covariance)[3:]
+    variances = np.diag(told[-1].estimate.covariance_vehicle_m2)
     assert variances[0] > variances[2] > variances[1]
 
 

@@ -53,7 +53,7 @@ def pose(estimate: MapEstimate, status: Status, motions: Motions) -> RelativePos
     xyz, velocity = vehicle.to_vehicle(stamp_ns, estimate.xyz_map_m, estimate.velocity_map_mps)
     R, covariance = estimate.R_map_drone, estimate.covariance
     if R is None:
-        position_m2, _, _ = motions.vehicle_ahead_m2(stamp_ns, xyz)
+        position_m2, _, _ = motions.vehicle_covariance_m2(stamp_ns, xyz)
         covariance_m2 = covariance[3:, 3:]
         position = PositionEstimate(
             xyz_vehicle_m=xyz,
@@ -100,7 +100,7 @@ def _vehicle_covariance(motions: Motions, stamp_ns: int, xyz_vehicle_m: Array64,
 
     Its shift moves the drone, its yaw turns the drone about the vertical and moves it along the lever arm.
     """
-    position_m2, yaw_rad2, lever = motions.vehicle_ahead_m2(stamp_ns, xyz_vehicle_m)
+    position_m2, yaw_rad2, lever = motions.vehicle_covariance_m2(stamp_ns, xyz_vehicle_m)
     covariance = np.zeros((6, 6))
     by_yaw = np.concatenate([R[2], R.T @ lever])
     covariance[3:, 3:] = R.T @ (position_m2 - yaw_rad2 * np.outer(lever, lever)) @ R

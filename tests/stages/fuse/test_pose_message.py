@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stages.fuse.measurement_covariance import MapEstimate, Status, pose
+from stages.fuse.pose_message import MapEstimate, Status, pose
 from stages.messages import PoseState
 
 SHIFT_M2 = np.diag([0.01, 0.02, 0.04])  # vehicle axes, of the vehicle's position since its newest message
@@ -26,7 +26,7 @@ def motions(yaw_rad2=0.0, shift_m2=NO_SHIFT_M2):
             at=lambda _: (R_MAP_VEHICLE, np.zeros(3)),
             to_vehicle=lambda _, xyz_m, velocity_mps: (R_MAP_VEHICLE.T @ xyz_m, R_MAP_VEHICLE.T @ velocity_mps),
         ),
-        vehicle_ahead_m2=lambda _, xyz_vehicle_m: (position_m2, yaw_rad2, LEVER_VEHICLE_M),
+        vehicle_covariance_m2=lambda _, xyz_vehicle_m: (position_m2, yaw_rad2, LEVER_VEHICLE_M),
     )
 
 

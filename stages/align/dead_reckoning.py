@@ -1,12 +1,12 @@
-"""Dead reckoning of the drone's rotation in the vehicle's map frame, from image to image.
+"""Dead reckoning of the drone's rotation in `map`, from image to image.
 
     R_map_drone(t) = R_map_drone(t0) R_drone(t0)_drone(t),  R_vehicle_drone = R_map_vehicle(t)^T R_map_drone(t)
 
-The drone's own turn comes from its autopilot or its images, the vehicle's from its motion. Yaw is told between the
-two cameras' level axes, the one number that images add an offset to (yaw_tracker.py).
+The turn of the drone comes from its autopilot or its images, that of the vehicle from its motion. The yaw is that
+between the level axes of the two cameras, to which images add an offset (yaw_tracker.py).
 
-While the vehicle is silent that offset takes its turn over, which its next word tells again: so twice the heading is
-not known by as much as the vehicle may have turned, and not at all where its map frame may be another one.
+While the vehicle's motion is missing, that offset absorbs its turn, which the next message contains again. So at both
+times the heading is uncertain by the largest turn of the vehicle, and unknown where its map frame may have changed.
 
 Source: ours.
 """

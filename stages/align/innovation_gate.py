@@ -1,13 +1,13 @@
-"""What a pair of images is worth beside what was known before of tilt and yaw: the turns felt since the last pairs.
+"""Fusion of a pair of images with the prediction of tilt and yaw by dead reckoning.
 
-    yaw     the image's and the one carried on, weighed by their variances. The image's is no less than the last
-            images scattered; where the two are farther apart than both allow, either may be right, and the spread
-            of that is added
-    tilt    the image's; where it contradicts the turns felt it is given out as uncertain as it is far off
+    yaw     mean of the measured and the predicted one, weighed by their variances. The variance of the measured one is
+            at least the scatter of recent images; where both differ by more than both allow, either may be wrong, and
+            the spread between them is added
+    tilt    the measured one; where it contradicts dead reckoning its covariance covers the difference
 
-Where few lines run straight, other edges lie among them and pull a image's yaw by a degree or two, each image's
-otherwise: it does not know, and the next ones tell. Leaves and cars have verticals of their own: one image's word
-against the turns felt is not taken over, two images' is.
+With few straight lines, other edges among them bias the yaw of an image by a degree or two, each image differently; the
+scatter of the next ones shows it. Leaves and cars have verticals of their own: one image that contradicts dead
+reckoning does not replace it, two do.
 
 Source: ours.
 """

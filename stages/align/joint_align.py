@@ -1,17 +1,17 @@
-"""How the drone is turned in the vehicle's axes, from the lines of both cameras together.
+"""Rotation of the drone relative to the vehicle, from the lines of both cameras.
 
     pairs of images (pairing.py) -> yaw spectra and their matches (spectra.py) -> the match that continues the last
-    ones (dead_reckoning.py, yaw_tracker.py) -> all angles refined together (refine.py), weighed with what was known before
-    (innovation_gate.py) -> which quarter turn, by the drone's motion (motion_branch.py) -> what is told of it (publisher.py)
+    ones (dead_reckoning.py, yaw_tracker.py) -> all angles refined together (refine.py), fused with the prediction
+    (innovation_gate.py) -> yaw branch by the drone's motion (motion_branch.py) -> message (publisher.py)
 
-A rotation is given for each image of the drone's, or the reason why there is none. It is RESOLVED when one branch has
-`resolve_probability`; what the four lack to 1 is that none of them is right. Nothing but motion, or motion and a prior,
-gets there; what was RESOLVED is so no longer when the thread of turns is lost, or when motion says otherwise.
+Each image of the drone gives a rotation, or the reason why there is none. It is RESOLVED when one branch has
+`resolve_probability`; the rest of the four to 1 is the probability that none is right. Only motion, or motion and a
+prior, resolves a branch; it is no longer RESOLVED when dead reckoning is lost or motion contradicts it.
 
-Where streets run at many angles the lines alone seldom say which of them both cameras see. The drone's way, told by the
-LiDAR and by its autopilot, is a heading without a street: it says which, and denies a match made askew.
+Where streets have many directions, lines alone seldom decide which of them both cameras see. The drone's displacement
+by LiDAR and by its autopilot gives a heading without them: it selects the match, and rejects a wrong one.
 
-Without `motion` the vehicle is taken to stand if `parked` says so; else nothing is concluded from the drone's motion.
+Without `motion` the vehicle is assumed to stand if `parked` is set; else the drone's motion is not used.
 
 Source: ours, for P IV Eq. 7-10 and V.E; DESIGN, Vision and Yaw branch.
 """
@@ -50,7 +50,7 @@ from stages.messages import (
 
 @dataclass
 class _Parts:
-    """Of the stage, and what each remembers."""
+    """Parts of the stage, each with its own state."""
 
     pairing: Pairing
     dead_reckoning: DeadReckoning
@@ -86,7 +86,7 @@ class JointAlignSettings(Settings):
 
 
 class JointAlign(Stage[JointAlignSettings]):
-    """Both cameras' lines laid on each other; four branches with probabilities."""
+    """Joint alignment of both cameras' lines; four branches with probabilities."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
         {"motion", "visual_motion", "attitude", "position", "odometry", "fix"}
@@ -107,48 +107,48 @@ class JointAlign(Stage[JointAlignSettings]):
         )
 
     def on_motion(self, motion: VehicleMotion) -> None:
-        """Where the vehicle is and how it is turned."""
+        """Pose of the vehicle."""
         self._parts.dead_reckoning.add_vehicle(motion)
 
     def on_attitude(self, attitude: DroneAttitude) -> None:
-        """How the drone turns; its yaw's zero is not ours."""
+        """Attitude by the autopilot, in frame odom."""
         self._parts.dead_reckoning.add_autopilot(attitude)
 
     def on_position(self, position: DroneLocalPosition) -> None:
-        """How the drone moves, in the same frame as its attitude."""
+        """Position by the autopilot, in frame odom."""
         self._parts.dead_reckoning.add_autopilot(position)
 
     def on_odometry(self, odometry: DroneOdometry) -> None:
-        """Both at once."""
+        """Pose by the autopilot, in frame odom."""
         self._parts.dead_reckoning.add_autopilot(odometry)
 
     def on_visual_motion(self, motion: VisualMotion) -> None:
-        """Turn and direction from the drone's images."""
+        """Visual odometry of the drone: turn and direction."""
         self._parts.dead_reckoning.add_drone_motion(motion)
         self._parts.motion.add_visual_motion(motion)
 
     def on_fix(self, fix: DroneFix) -> None:
-        """Where the LiDAR saw the drone: evidence for the branch once it has moved."""
+        """LiDAR position: evidence for the branch once the drone has moved."""
         if self._parts.motion.add_fix(fix):
-            self._reinitialise("the drone's motion fits no branch, all is begun anew")
+            self._reinitialise("the drone's motion fits no branch: reset")
 
     def on_vehicle(self, seen: VanishingDirections) -> Iterator[RelativeRotation]:
-        """The vehicle's lines."""
+        """Lines of the vehicle's camera."""
         for pair in self._parts.pairing.vehicle(_of(seen, CameraMount.VEHICLE, "vehicle")):
             yield self._align(pair)
 
     def on_drone(self, seen: VanishingDirections) -> Iterator[RelativeRotation]:
-        """The drone's lines: one answer each, once the vehicle's nearest image is known."""
+        """Lines of the drone's camera: one rotation each, once the nearest image of the vehicle is known."""
         for pair in self._parts.pairing.drone(_of(seen, CameraMount.DRONE, "drone")):
             yield self._align(pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
-        """Images that still waited for a nearer one."""
+        """Rotations of images that waited for a nearer one."""
         for pair in self._parts.pairing.rest():
             yield self._align(pair)
 
     def _align(self, pair: Pair) -> RelativeRotation:
-        """One answer for a pair of images."""
+        """The rotation of a pair of images."""
         settings = self.settings
         parts = self._parts
         seen_by_vehicle, seen_by_drone = pair
@@ -170,7 +170,7 @@ class JointAlign(Stage[JointAlignSettings]):
         told = parts.motion.heading(drone_ns)
         if parts.tracker.denied(told):
             parts.tracker.release()
-            self._reinitialise("the drone's motion denies the streets matched, all is begun anew")
+            self._reinitialise("the drone's motion contradicts the match: reset")
         match = parts.tracker.choose(a, b, dead_reckoned, parts.dead_reckoning.rate_radps(drone_ns), told)
         if match.yaw_rad is None:
             return parts.publisher.none(drone_ns, match.reason)
@@ -179,7 +179,7 @@ class JointAlign(Stage[JointAlignSettings]):
         if refined.directions == 0 or min(refined.vehicle_lines, refined.drone_lines) < settings.min_lines:
             return parts.publisher.none(drone_ns, "too few lines run along the same streets")
         if parts.tracker.reacquired:
-            self._reinitialise("the lines match elsewhere for long now, all is begun anew there")
+            self._reinitialise("the lines match at another yaw for some time: reset there")
         off_rad = parts.innovation_gate.tilt_off_rad(vehicle_ns, refined, dead_reckoned)
         refined = parts.innovation_gate.with_scatter(refined, dead_reckoned)
         weighed = parts.innovation_gate.weigh_yaw(refined, dead_reckoned)

@@ -1,10 +1,10 @@
-"""What the drone's motion says of its yaw: which of the streets' branches it is, and its heading without a street.
+"""Yaw by the drone's motion: the branch of the vanishing points, and the heading without them.
 
-    windows of flight, told by LiDAR and by the drone's odometry (stages/heading)
-      -> four branches, counted from the yaw that is followed (yaw_tracker.py)
-      -> the odometry's heading, whatever the streets say: it says which match is followed, and denies one made askew
+    windows of flight, by LiDAR and by the drone's odometry (stages/heading)
+      -> four branches, counted from the tracked yaw (yaw_tracker.py)
+      -> the heading of the odometry, without vanishing points: it selects the match and rejects a wrong one
 
-A word of people or of a compass is weighed once, with the first rotation.
+An initial yaw or a compass is weighed once, with the first rotation.
 
 Source: ours, for P V.E; DESIGN, Yaw branch.
 """

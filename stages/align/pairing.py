@@ -1,4 +1,4 @@
-"""Which image of the vehicle's camera goes with which of the drone's: the nearest in time.
+"""Pairs each image of the drone with the image of the vehicle that is nearest in time.
 
 Source: ours.
 """

@@ -1,4 +1,4 @@
-"""What is given out: a rotation on its most probable branch, or why there is none, and whether it jumped.
+"""Message of a pair of images: the rotation on its most probable branch, or why there is none, and whether it jumped.
 
 Source: ours.
 """
@@ -15,7 +15,7 @@ from stages.geometry.frames import Array64
 from stages.heading.hypothesis_bank import NONE, HypothesisBank
 from stages.messages import BranchState, RelativeRotation
 
-JUMP_RAD = math.radians(30.0)  # of what is given out
+JUMP_RAD = math.radians(30.0)  # change of the published yaw that counts as a jump
 
 
 class Publisher:
@@ -24,13 +24,13 @@ class Publisher:
     def __init__(self, bank: HypothesisBank, dead_reckoning: DeadReckoning, resolve_probability: float) -> None:
         self._bank, self._dead_reckoning = bank, dead_reckoning
         self._resolve_probability = resolve_probability
-        self._branch = 0  # given out, counted from the yaw followed
-        self._given_rad: float | None = None  # yaw given out less the dead reckoned one
+        self._branch = 0  # published, counted from the tracked yaw
+        self._given_rad: float | None = None  # published yaw less the dead reckoned one
         self._switches = 0
         self._news = ""
 
     def add_news(self, news: str) -> None:
-        """To be told with the next rotation."""
+        """Add a text to the reason of the next rotation."""
         self._news = news
 
     def rotation(
@@ -43,7 +43,7 @@ class Publisher:
             jump_rad = math.remainder(given_rad - self._given_rad, 2 * math.pi)
             if abs(jump_rad) > JUMP_RAD:
                 self._switches += 1
-                why = "motion says" if before != self._branch else "the streets say"
+                why = "by motion" if before != self._branch else "by vanishing points"
                 self._news = f"JUMP: {why} {math.degrees(jump_rad):+.0f} deg; {self._news}".rstrip("; ")
         self._given_rad = given_rad
         resolved = self._bank.resolved(self._branch, self._resolve_probability)
@@ -63,7 +63,7 @@ class Publisher:
         )
 
     def none(self, stamp_ns: int, reason: str) -> RelativeRotation:
-        """No rotation of a image, and why."""
+        """A message without a rotation, with the reason."""
         return RelativeRotation(
             stamp_ns=stamp_ns,
             R_vehicle_drone=None,
@@ -75,5 +75,5 @@ class Publisher:
         )
 
     def _probability(self) -> Array64:
-        """(4,) the branch given out first."""
+        """(4,) branch probabilities, the published branch first."""
         return np.roll(self._bank.probability[:4], -self._branch)

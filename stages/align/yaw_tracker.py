@@ -1,4 +1,4 @@
-"""Follow the yaw between the cameras through time: which match of the spectra is it, and how many quarter turns on.
+"""Track the yaw between the cameras through time: the match of the spectra and the multiple of 90 deg.
 
     dead reckoning    yaw told by turning the last one on with the drone's and the vehicle's own turns
     offset            what the images add to it: slow, one number with a variance (a scalar Kalman filter)
@@ -11,9 +11,9 @@ further matches. The first one is taken from the maps, which know more streets t
     nearly all lines of both cameras match and no other match comes near     (streets at right angles), or
     most lines match, along two directions or more, and no other comes near  (streets at other angles)
 
-as one direction alone could be any of the streets. Where the drone's motion has told its heading (motion_branch.py), the
-match there is taken though others compete, and one that motion denies is let go. A match elsewhere that fits the maps
-better for long is taken over, and the jump is told.
+as one direction alone fits any street. Where the drone's motion gives its heading (motion_branch.py), the match there
+is used though others compete, and a match that motion contradicts is released. Another match that fits the maps better
+for some time replaces it, and the jump is reported.
 
 Source: ours.
 """
@@ -49,7 +49,7 @@ PERIOD_S = 0.2  # images that come sooner after one another err alike: together 
 
 @dataclass(frozen=True)
 class Match:
-    """The yaw chosen, or why none."""
+    """The selected yaw, or why there is none."""
 
     yaw_rad: float | None  # of the whole circle, near the prediction
     reason: str
@@ -69,17 +69,17 @@ class YawTracker:
     _accepted_ns: int = 0
 
     def forget(self) -> None:
-        """Start anew."""
+        """Reset the tracker and its maps."""
         self.offset_rad = None
         self._vehicle, self._drone = np.zeros(BINS), np.zeros(BINS)
         self._better_since_ns = None
 
     def denied(self, told: Heading | None) -> bool:
-        """Whether the drone's motion says that another match is followed than the true one."""
+        """Whether the drone's motion contradicts the match."""
         return self.offset_rad is not None and told is not None and not _agrees(told, self.offset_rad)
 
     def release(self) -> None:
-        """Follow nothing; what was seen is remembered."""
+        """Release the match; the maps stay."""
         self.offset_rad, self._better_since_ns = None, None
 
     def choose(

@@ -40,7 +40,7 @@ class Chain:
         self._inflation = InformationInflation(self._errors.rotation_time_s)
 
     def start(self, stamp_ns: int, R: Array64, covariance_rad2: Array64) -> None:
-        """Start from a rotation at `stamp_ns`, at the newest LiDAR position or at the newest pose of a running chain."""
+        """Start from a rotation at `stamp_ns`, at the newest fix or at the newest pose of a running chain."""
         if self.running:
             at_ns, xyz_m = self.back.stamp_ns, self.back.xyz_map_m
             covariance_m2 = position_covariance(self.back.covariance, self.back.R_map_drone)

@@ -191,7 +191,7 @@ class Estimator:
         worth = self.positions.worth(stamp_ns)
         if R is not None:
             self.chain.add_position(stamp_ns, R, z, worth * self.positions.fix_covariance_m2)
-        R_after = None if R is None else self.chain.at(stamp_ns)[0]  # the corrected rotation: what it explains is not drift
+        R_after = None if R is None else self.chain.at(stamp_ns)[0]  # what it explains is not drift
         self.positions.follow(stamp_ns, z, worth, R_after)
         self._branch_check.add_fix(fix)
         self._add_motion_point(stamp_ns, z, told.whole_m2)

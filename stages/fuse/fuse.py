@@ -3,8 +3,8 @@
     fixes, rotations, odometries, each at its own time (estimator.py)
       -> a chain of poses (smoother.py)  -> predicted to now -> RelativePose
 
-Now is the newest stamp received on any port, on a grid of 20 ms; it never decreases. Every port but `fix` may be unwired,
-fall silent and return. Without `motion` the vehicle frame at each moment serves as the map frame, as if the vehicle were
+Now is the newest stamp received on any port, on a grid of 20 ms; it never decreases. Every port but `fix` may be
+unwired, fall silent and return. Without `motion` the vehicle frame serves as the map frame, as if the vehicle were
 parked; only with the setting `parked` is it assumed to stand, so that the drone's odometry is used.
 
 A rotation comes from a RESOLVED RelativeRotation, or from the drone's motion by LiDAR and autopilot (motion_yaw.py):

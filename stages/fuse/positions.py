@@ -1,7 +1,7 @@
-"""Where the drone is by the LiDAR's positions alone, how fast, and what its odometry leaves over of that.
+"""Position and velocity of the drone by LiDAR alone, and the drift of its odometry.
 
-A fix is gated by chi-square on its innovation with P + R. Eight refused in a row that agree with each other are right,
-and what is believed is wrong.
+A fix passes a chi-square gate on its innovation with P + R. Eight consecutive rejected fixes that agree with each other
+replace the estimate.
 
 Source: DESIGN, Fusion; ours.
 """
@@ -28,36 +28,36 @@ GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
 
 
 class MeasurementCovariance(NamedTuple):
-    """What a fix says of its error, map axes."""
+    """Error of a fix, map axes."""
 
     whole_m2: Array64  # (3, 3)
-    bias_covariance_m2: Array64 | None  # what of it is the same from fix to fix
+    bias_covariance_m2: Array64 | None  # the part that is the same from fix to fix
 
 
 class Positions:
-    """Of the drone that is followed."""
+    """Filters of the drone that is followed."""
 
     def __init__(self, errors: FuseErrors, motions: Motions) -> None:
         self._errors, self._motions = errors, motions
         self.lose()
 
     def lose(self) -> None:
-        """No position is known."""
+        """Drop the position."""
         self.free, self.left = Drift(self._errors, odometry=False), Drift(self._errors, odometry=True)
         self.fix_ns: int | None = None
-        self.fix_covariance_m2 = np.zeros((3, 3))  # map axes, of the newest used: what averages out,
-        self.bias_covariance_m2 = np.zeros((3, 3))  # and what never does
+        self.fix_covariance_m2 = np.zeros((3, 3))  # map axes, of the newest fix used: the part that averages out,
+        self.bias_covariance_m2 = np.zeros((3, 3))  # and the bias
         self.nis = math.nan
         self._refused = Rejected()
         self._inflation = InformationInflation(self._errors.fix_time_s)
 
     @property
     def known(self) -> bool:
-        """Whether there is a position."""
+        """Whether a position is known."""
         return self.free.stamp_ns is not None
 
     def find(self, fix: DroneFix, z: Array64, told: MeasurementCovariance) -> None:
-        """The first fix, or the first that is believed again."""
+        """Start at the first fix, or at the first after a reset."""
         velocity = fix.velocity_vehicle_mps
         if velocity is not None:
             velocity = self._motions.vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
@@ -66,7 +66,7 @@ class Positions:
         self._accept(told)
 
     def accepts(self, stamp_ns: int, off_m: Array64, expected_m2: Array64, told: MeasurementCovariance) -> bool | None:
-        """Whether a fix is within the gate; None: it is not; False: nor were those before, and they agree."""
+        """True: within the gate. None: rejected. False: rejected, and it agrees with the rejected ones before it."""
         nis = mahalanobis2(off_m, expected_m2 + told.whole_m2)
         if not nis <= GATE:
             return False if self._refused.add(stamp_ns, off_m, told.whole_m2) else None
@@ -87,11 +87,11 @@ class Positions:
             )
 
     def worth(self, stamp_ns: int) -> float:
-        """Factor for the variance of the fix just taken."""
+        """Variance factor of the fix just accepted."""
         return self._inflation.factor(stamp_ns)
 
     def follow(self, stamp_ns: int, z: Array64, worth: float, R_map_drone: Array64 | None) -> None:
-        """A fix that was taken: velocity without odometry, and what odometry leaves over."""
+        """Update both filters by an accepted fix: velocity without odometry, and drift of the odometry."""
         covariance_m2, trail = self.fix_covariance_m2, self._motions.motion_model.autopilot
         v0 = None if self.free.stamp_ns is None else trail.velocity_odom_mps(self.free.stamp_ns)
         v1 = trail.velocity_odom_mps(stamp_ns)
@@ -109,31 +109,31 @@ class Positions:
             self.left.see(stamp_ns, z, worth * covariance_m2, R_map_drone @ R_odom.T @ way[0], turned_mps)
 
     def turn(self, R_new_old: Array64, t_m: Array64, velocity_mps: Array64) -> None:
-        """The map frame is another one now: p <- R p + t, v <- R v + velocity, which is no more than a guess."""
+        """Change to another map frame: p <- R p + t; the velocity R v + velocity_mps is a guess."""
         self.free.turn(R_new_old, t_m)
         self.forget_velocity(self.free.velocity_mps + velocity_mps)
 
     def forget_velocity(self, guess_mps: Array64 | None = None) -> None:
-        """The map frame moves, or moves no more: no velocity in it is known."""
+        """The map frame starts or stops moving: reset the velocity."""
         self.left = Drift(self._errors, odometry=True)
         self.free.forget_velocity(np.zeros(3) if guess_mps is None else guess_mps)
 
     def start_drift(self, xyz_m: Array64, covariance_m2: Array64) -> None:
-        """From the newest fix on the odometry's own drift is watched."""
+        """Start the drift filter of the odometry at the newest fix."""
         assert self.free.stamp_ns is not None
         self.left = Drift(self._errors, odometry=True)
         self.left.start(self.free.stamp_ns, xyz_m, covariance_m2, None)
 
     def step(self, from_ns: int, to_ns: int, R_map_drone: Array64) -> Step:
-        """The drone's way between two moments."""
+        """Motion of the drone between two times."""
         since_ns = self.fix_ns if self.fix_ns is not None else from_ns
         still = self._motions.map_is_fixed(to_ns)
         return self._motions.motion_model.step(from_ns, to_ns, R_map_drone, self.left, self.free, still, since_ns)
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64]:
-        """Position and covariance by the fixes' velocity; how far the drone says it left that is not known better.
+        """Position and covariance by the velocity of the fixes; a reported maneuver adds to the covariance.
 
-        Of the covariance (6, 6) only the position's block counts, map axes.
+        Only the position block of the covariance (6, 6) is valid, map axes.
         """
         assert self.free.stamp_ns is not None
         self.free.q = self._manoeuvre(stamp_ns)
@@ -143,7 +143,7 @@ class Positions:
         manoeuvre_m = self._motions.motion_model.manoeuvre_m(self.free.stamp_ns, stamp_ns)
         if manoeuvre_m is not None:
             xyz_m = xyz_m + np.array([0.0, 0.0, manoeuvre_m[2]])
-            aside_m2 = 0.5 * float(manoeuvre_m[:2] @ manoeuvre_m[:2])  # whichever way
+            aside_m2 = 0.5 * float(manoeuvre_m[:2] @ manoeuvre_m[:2])  # in an unknown level direction
             covariance[3:, 3:] += np.diag([aside_m2, aside_m2, 0.0])
         return xyz_m, covariance
 
@@ -162,6 +162,6 @@ class Positions:
         return told + self.left.velocity_mps, spread + np.outer(across, across)
 
     def _manoeuvre(self, stamp_ns: int) -> float:
-        """Density of the acceleration that nobody tells [m2/s3]."""
+        """Density of the acceleration that is not measured [m2/s3]."""
         told = self._motions.motion_model.autopilot.velocity_odom_mps(stamp_ns) is not None
         return self._errors.manoeuvre_with_odometry if told else self._errors.manoeuvre

@@ -225,7 +225,7 @@ def test_a_flip_is_found_and_told():
     assert {m.state for m in before} == {BranchState.RESOLVED}
     jumps = [m for m in told if "JUMP" in m.reason and m.stamp_ns > START_NS + 6 * S]
     assert len(jumps) == 1
-    assert "motion says" in jumps[0].reason
+    assert "by motion" in jumps[0].reason
     assert jumps[0].switches == before[-1].switches + 1
     assert (jumps[0].stamp_ns - START_NS) / S < 9.5
     assert any(m.state is BranchState.AMBIGUOUS for m in told if m.stamp_ns > START_NS + 6 * S)

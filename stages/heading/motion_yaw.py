@@ -1,14 +1,14 @@
-"""The yaw between the map frame and the autopilot's, from how the drone moved: told by LiDAR and by its odometry.
+"""Yaw of frame `odom` in `map` by the drone's motion, measured by LiDAR and by its odometry.
 
     z_i = c + s Rz(psi) p_i + e_i,   a = s (cos psi, sin psi)      horizontally
 
-p: the autopilot's positions (frame odom), z: the fixes (map frame). c and a are linear; e has the fixes' noise and
-both odometries' drift, correlated over the window, alike on both axes. So generalised least squares gives a with
-covariance I / Lambda, and the likelihood round the circle is exp(Lambda |a| cos(psi - peak)): one peak, as sharp as the
-drone moved far. A bank of yaws round the circle is weighed by it. What is told:
-    nothing, while the drone has not moved: sigma is large
-    nothing, where both do not tell one motion: lengths (|a| is not 1), heights or the paths themselves disagree
-    nothing, while any yaw farther than 45 deg from the peak has odds above 1 : 1000, or P of the peak is below 0.999
+p: positions by the autopilot (odom), z: fixes (map). c and a are linear; e has the noise of the fixes and the drift of
+both odometries, correlated over the window, alike on both axes. So generalised least squares gives a with covariance
+I / Lambda, and the likelihood over the circle is exp(Lambda |a| cos(psi - peak)): one peak, whose sharpness grows with
+the displacement. It weighs hypotheses over the circle. There is no yaw
+    while the drone has not moved: sigma is large
+    where both do not measure one motion: lengths (|a| is not 1), heights or paths disagree
+    while a yaw farther than 45 deg from the peak has odds above 1 : 1000, or P of the peak is below 0.999
 
 Source: DESIGN, Yaw branch (a naive bank was 30 % wrong); Horn, JOSA A 4(4) (1987) for the complex number; ours.
 """

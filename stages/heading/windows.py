@@ -1,8 +1,8 @@
-"""The drone's displacements told twice, by the LiDAR and by its own odometry, window by window without overlap.
+"""Displacements of the drone by LiDAR and by its own odometry, in windows that do not overlap.
 
-A window runs from one handful of fixes to a later one, as soon as the drone is `baseline_m` away and that is well
-above the fixes' noise. Fixes of a handful are brought together along the way the odometry tells, which each branch
-turns its own way, and their median is taken: one false fix does no harm.
+A window runs from one group of fixes to a later one, once the drone is `baseline_m` away and that is well above the
+noise of the fixes. The fixes of a group are moved to one time along the displacement by odometry, which each hypothesis
+turns by its own yaw, and their median is taken: one false fix has no effect.
 
 Source: ours; DESIGN, Yaw branch: non-overlapping windows, baseline >= 0.4 m.
 """

@@ -224,7 +224,7 @@ def test_without_word_of_the_vehicle_its_frame_is_the_start_frame(parked):
     poses = made.run(Fuse(parked=parked))
     seen = made.judge(poses, after_s=4)
     assert set(seen.states) == {FULL if parked else AMBIGUOUS}
-    assert parked or "how the vehicle moves is not told" in poses[-1].reason
+    assert parked or "without the vehicle's motion" in poses[-1].reason
     assert np.allclose(poses[-1].xyz_map_m, poses[-1].xyz_vehicle_m)
     assert seen.rmse_m() < (0.12 if parked else 0.2)
 

@@ -266,7 +266,7 @@ def test_two_that_contradict_are_not_believed_until_they_agree():
     heading = Heading()
     assert heading.add_vp_rotation(S, 0, 0.3, 0.01)
     heading.add_motion_yaw(by_motion(1.2, 0.3 + QUARTER))
-    assert "90 deg apart" in heading.contradiction
+    assert "differ by 90 deg" in heading.contradiction
     assert not heading.add_vp_rotation(2 * S, 0, 0.3, 0.01)
     heading.add_motion_yaw(by_motion(2.5, 0.32))
     assert heading.add_vp_rotation(3 * S, 0, 0.3, 0.01)

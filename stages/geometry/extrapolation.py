@@ -139,7 +139,7 @@ def _is_smooth(poses: tuple[VehicleMotion, ...]) -> bool:
     share, longer_s = second_s / first_s, max(first_s, second_s)
     off_m = c.xyz_map_m - b.xyz_map_m - share * (b.xyz_map_m - a.xyz_map_m)
     turns = log_rotation(a.R_map_vehicle.T @ b.R_map_vehicle), log_rotation(b.R_map_vehicle.T @ c.R_map_vehicle)
-    near = float(np.linalg.norm(off_m)) <= OFF_M + 2.0 * HARDEST_MANEUVER.place_m(longer_s)
+    near = float(np.linalg.norm(off_m)) <= OFF_M + 2.0 * HARDEST_MANEUVER.displacement_m(longer_s)
     return near and float(np.linalg.norm(turns[1] - share * turns[0])) <= OFF_RAD + 2.0 * HARDEST_MANEUVER.turn_rad(
         longer_s
     )

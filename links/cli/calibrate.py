@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flow.link import LinkError
-from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table, warn
+from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, show_table, warn
 from links.cli.files import read_rig
 
 if TYPE_CHECKING:  # scipy and numba are loaded when it runs
@@ -27,7 +27,7 @@ STILL_M = 0.05  # of the vehicle's own odometry over the whole time: so little s
 DRIFT_MPS = 0.02  # and this much more may be the odometry's drift: the surfaces tell then
 
 
-@in_words
+@report_errors
 def calibrate_recording(
     recording: Annotated[
         Path, typer.Argument(help="A recording in which the vehicle stands still and the servo sweeps.")
@@ -102,7 +102,7 @@ def calibrate_recording(
         found = stand(_calibrated(gathered, parked), gathered.mount, said)
     except CannotCalibrate as why:
         err.print(f"{recording}: {why}.", markup=False, style="red")
-        raise typer.Exit(FINDING) from None
+        raise typer.Exit(EXIT_FAILED) from None
     _tell(recording.name, found, gathered)
     target.write_text(rig_text(gathered.rig, found, recording.name), encoding="utf-8")
     out.print(f"rig         {target}   (use it: grd replay RECORDING --overlay {target})", markup=False)

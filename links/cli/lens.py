@@ -12,7 +12,7 @@ import typer
 import yaml
 
 from flow.link import LinkError
-from links.cli.console import in_words, out
+from links.cli.console import out, report_errors
 from links.cli.files import Overwrite
 from stages.geometry.lens_files import CalibratedLens, LensFileError, lens_from_kalibr, lens_from_ocamcalib
 from stages.messages import CameraMount
@@ -20,7 +20,7 @@ from stages.messages import CameraMount
 MAX_BYTES = 1_000_000
 
 
-@in_words
+@report_errors
 def import_lens(
     file: Annotated[Path, typer.Argument(help="Kalibr's camchain.yaml, or OCamCalib's calib_results.txt.")],
     camera_mount: Annotated[CameraMount, typer.Argument(help="Which camera of the rig it is.")],

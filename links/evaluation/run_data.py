@@ -262,8 +262,8 @@ def read_output(kind: OutputKind, folder: Path) -> Output:
         kind,
         poses,
         covariance[rows],
-        sendable=table.equals("good", "1")[rows] if "good" in table else None,
-        returns=table.whole_numbers("hits")[rows] if "hits" in table else None,
+        sendable=table.equals("accepted", "1")[rows] if "accepted" in table else None,
+        returns=table.whole_numbers("returns")[rows] if "returns" in table else None,
         track=None if track is None else track[rows],
         has_rotation=table.equals("rotation", "1")[rows] if "rotation" in table else None,
     )

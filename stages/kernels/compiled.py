@@ -14,7 +14,7 @@ from flow.compile_cache import keep_compiled
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-COMPILED = ("stages/kernels", "links/simulated")  # where such code is
+COMPILED = ("stages/kernels", "links/simulated/kernels")  # where such code is
 CACHE_FOLDER = keep_compiled(COMPILED)
 
 

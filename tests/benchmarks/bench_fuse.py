@@ -85,7 +85,7 @@ def test_a_prediction(benchmark, name):
     stage = STAGES[name]()
     made = Made(until_s=6.0)
     made.run(stage)
-    now_ns = stage._now_ns
+    now_ns = stage._intake.now_ns
     benchmark(lambda: stage._pose(now_ns))
 
 

@@ -1,4 +1,4 @@
-"""What the console shows of a live run, on a terminal and in a log."""
+"""Console display of a live run, on a terminal and in a log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flow.config.edge import Edge, QueueSettings
 from flow.live.report import EdgeCount, LinkReport, LiveReport, edge_report
 from flow.taps import Digest
 from links.cli.live_view import LiveView
-from links.runs.live_run import Look
+from links.runs.live_run import RunStatus
 from stages.messages import (
     DroneFix,
     Image,
@@ -38,7 +38,7 @@ def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
             "fuse": {"refused: fix: not finite": 3, "back end begun anew": 0},
             "recorder": {"missed": 0},
         },
-        off=list(off),
+        switched_off=list(off),
     )
 
 
@@ -72,8 +72,8 @@ def shown(report, *messages, terminal=False, news=()):
     console = Console(file=stream, force_terminal=terminal, width=160, highlight=False, soft_wrap=True)
     with LiveView(console) as view:
         for message in messages:
-            view.newest.see("x", message, 0)
-        view.show(Look(12.34, lambda: report, list(news)))
+            view.latest.see("x", message, 0)
+        view.show(RunStatus(12.34, lambda: report, list(news)))
     return stream.getvalue()
 
 
@@ -111,8 +111,8 @@ def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():
 def test_news_are_told_at_once_even_between_two_lines(capsys):
     stream = io.StringIO()
     with LiveView(Console(file=stream, width=160, soft_wrap=True)) as view:
-        view.show(Look(0.0, report_of, ["lidar: first"]))
-        view.show(Look(0.1, report_of, ["lidar: second"]))
+        view.show(RunStatus(0.0, report_of, ["lidar: first"]))
+        view.show(RunStatus(0.1, report_of, ["lidar: second"]))
     assert stream.getvalue().count("\n") == 1
     assert capsys.readouterr().err == "lidar: first\nlidar: second\n"
 
@@ -129,5 +129,5 @@ def test_a_terminal_shows_every_edge_and_link():
 
 @pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (Image, False)])
 def test_the_view_takes_only_what_it_shows(kind, wanted):
-    assert LiveView().newest.wants(kind) is wanted
+    assert LiveView().latest.wants(kind) is wanted
     assert Digest().wants(kind)

@@ -18,8 +18,8 @@ from pydantic import ValidationError
 from flow.link import LinkError
 from links import host_time
 from links.dynamixel import Servo, mx28
-from links.simulated.dynamixel_emulator import DynamixelEmulator
-from links.simulated.servo import ServoSettings
+from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
+from links.simulated.sensors.servo import ServoSettings
 from stages.messages import ServoGoal
 
 RPM = math.tau / 60
@@ -350,10 +350,10 @@ def test_a_cable_that_is_pulled_and_put_back_is_found_again(emulator):
         (lambda e: e.bad_crc(3), "damaged"),
         (lambda e: e.hold_back(), "wrong"),
         (lambda e: e.short_data(3), "wrong"),
-        (lambda e: e.lie(3000, 1), "implausible"),
+        (lambda e: e.false_position(3000, 1), "implausible"),
         (lambda e: e.garbage(b"\xff\xff\xfd\x00\x01\x07\x00\x55" + bytes(7), 3), "damaged"),
     ],
-    ids=["crc", "late", "short", "lie", "garbage"],
+    ids=["crc", "late", "short", "false_position", "garbage"],
 )
 def test_spoilt_answers_are_counted_and_no_false_angle_comes_of_them(emulator, fault, counter):
     servo = live(emulator)
@@ -370,7 +370,7 @@ def test_a_place_that_is_told_twice_is_believed(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
-        emulator.lie(3000, 400)
+        emulator.false_position(3000, 400)
         until(records, lambda s: s["position_rad"] > 4)
         until(records, lambda _: servo.counters["implausible"] >= 1)
 

@@ -13,7 +13,7 @@ from stages.messages import Candidates
 from tests.links.command import grd
 from tests.links.evaluation.made_runs import all_evaluated, lines, make_run, stamp, truth_at
 
-HEAD = "stamp_s,candidate,detector_life,looks,probability,x_m,y_m,z_m\n"
+HEAD = "stamp_s,candidate,detector_life,observations,probability,x_m,y_m,z_m\n"
 T_S = np.arange(0.0, 10.0, 0.1)
 
 

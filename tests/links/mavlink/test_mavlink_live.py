@@ -28,10 +28,10 @@ from links.mavlink import Autopilot
 from links.mavlink.session import Session
 from links.mavlink.signing import AHEAD_TICKS
 from links.mavlink.wire import header, packed, parse_frame
-from links.simulated.ardupilot_rules import ArduPilotRules
-from links.simulated.autopilot_rules import Fate
-from links.simulated.autopilot_socket import AutopilotSocket
-from links.simulated.px4_rules import Px4Rules
+from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
+from links.simulated.autopilot.autopilot_socket import AutopilotSocket
+from links.simulated.autopilot.px4_rules import Px4Rules
+from links.simulated.autopilot.rules import PoseResult
 from stages.geometry.frames import rotation_z
 from stages.messages import AutopilotEstimator, PoseState, RelativePose
 
@@ -108,9 +108,15 @@ def test_the_pose_is_an_optional_input():
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
 def test_good_poses_are_fused_and_the_autopilot_says_so(rules: Any):
     with listening() as heard, drone_for(heard, rules()) as drone:
-        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 40)
-        assert set(drone.rules.fates) <= {Fate.FUSED, Fate.RESET, Fate.NOT_FOR_IT, Fate.NOT_STARTED, Fate.TOO_SOON}
-        assert drone.rules.fates[Fate.RESET] == 1  # the beginning
+        heard.fly(lambda: drone.rules.results[PoseResult.FUSED] >= 40)
+        assert set(drone.rules.results) <= {
+            PoseResult.FUSED,
+            PoseResult.RESET,
+            PoseResult.NOT_A_POSE,
+            PoseResult.NOT_STARTED,
+            PoseResult.TOO_SOON,
+        }
+        assert drone.rules.results[PoseResult.RESET] == 1  # the beginning
         assert drone.rules.estimate is not None
         np.testing.assert_allclose(drone.rules.estimate.xyz_m, [101, -2, -10], atol=0.5)
         told = [m for m in heard.messages if isinstance(m, AutopilotEstimator)]
@@ -149,15 +155,15 @@ def test_an_unresolved_branch_never_reaches_the_autopilot_and_it_is_told_why():
 
 def test_it_stops_loudly_keeps_its_heartbeat_and_resets_when_it_goes_on():
     with listening() as heard, drone_for(heard, ArduPilotRules()) as drone:
-        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        heard.fly(lambda: drone.rules.results[PoseResult.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         beats = len(drone.messages("HEARTBEAT"))
         heard.rest(lambda: any(m.severity == 2 for m in drone.messages("STATUSTEXT")))
         heard.rest(lambda: len(drone.messages("HEARTBEAT")) >= beats + 2)
         assert drone.messages("HEARTBEAT")[-1].system_status == mavlink.MAV_STATE_STANDBY
         assert not drone.rules.healthy(drone.device_ns())
-        resets = drone.rules.fates[Fate.RESET]
-        heard.fly(lambda: drone.rules.fates[Fate.RESET] > resets)
+        resets = drone.rules.results[PoseResult.RESET]
+        heard.fly(lambda: drone.rules.results[PoseResult.RESET] > resets)
         assert drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256
         beat = drone.messages("HEARTBEAT")[0]
         assert (beat.type, beat.autopilot) == (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
@@ -165,7 +171,7 @@ def test_it_stops_loudly_keeps_its_heartbeat_and_resets_when_it_goes_on():
 
 def test_an_autopilot_that_stands_still_gets_no_poses_that_it_would_take_for_new_later():
     with listening() as heard, drone_for(heard, ArduPilotRules()) as drone:
-        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        heard.fly(lambda: drone.rules.results[PoseResult.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         drone.silent = True
         heard.fly(lambda: heard.link.counters.get("pose held back: autopilot not heard", 0) >= 1, most=150)
@@ -236,7 +242,7 @@ def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
         Bridge(heard.link.port or 0) as bridge,
         AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", bridge.port)) as drone,
     ):
-        heard.fly(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        heard.fly(lambda: drone.rules.results[PoseResult.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         bridge.delay_s = 0.6
         heard.fly(lambda: heard.link.counters.get("pose held back: line too slow", 0) >= 1)
@@ -258,7 +264,7 @@ def test_no_poses_over_a_bridge_that_hands_them_on_late_and_it_stops_loudly():
 def test_an_answer_that_we_did_not_ask_for_is_not_believed_though_it_names_nobody():
     with listening() as heard, drone_for(heard, Px4Rules()) as drone:
         heard.rest(lambda: heard.link.counters["timesync replies"] >= 2)
-        drone.say(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
+        drone.send(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
         heard.rest(lambda: heard.link.counters.get("refused: timesync for another", 0) == 1)
         before = heard.link.counters["timesync replies"]
         heard.rest(lambda: heard.link.counters["timesync replies"] > before)

@@ -11,9 +11,9 @@ from links.mavlink.connection import Endpoint, Udp
 from links.mavlink.lines import open_connection
 from links.mavlink.parameters import read_parameters
 from links.mavlink.profiles import ARDUPILOT, PROFILES, PX4, Profile, Wanted, findings
-from links.simulated.ardupilot_rules import ArduPilotRules
-from links.simulated.autopilot_socket import AutopilotSocket
-from links.simulated.px4_rules import Px4Rules
+from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
+from links.simulated.autopilot.autopilot_socket import AutopilotSocket
+from links.simulated.autopilot.px4_rules import Px4Rules
 
 
 def right(profile: Profile) -> dict[str, float]:

@@ -20,7 +20,7 @@ from links.preflight.preflight import odometry_check, rig_readout_ms, rig_size_p
 from links.preflight.servo import servo_checks
 from links.preflight.verdict import Level
 from links.recording import CompressedImage, encode_compressed_image
-from links.simulated.vlp16_position import encode_position
+from links.simulated.sensors.vlp16_packets import encode_position
 from links.vehicle_odometry import VehicleOdometry
 from links.velodyne import Lidar, vlp16
 from tests.links.preflight.preflight_peers import hear, packet

@@ -1,4 +1,4 @@
-"""Fused poses in a run's folder: a line each, the rotation marked where it is not known, states in the log."""
+"""Fused poses in the folder of a run: a line per pose, unknown rotations marked, states in the log."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from flow.link import Run
 from links.evaluation.run_data import OutputKind, read_output
 from links.mavlink.gate import Limits
 from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
-from stages.fuse.pose_message import MapEstimate, Status, lost, pose
 from stages.fuse.motions import Motions
+from stages.fuse.pose_message import MapEstimate, Status, lost, pose
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import quaternions_xyzw, rotation_z
 from stages.messages import DroneFix, PoseState, RelativePose, SweptPulses
@@ -87,7 +87,7 @@ def test_a_pose_is_good_when_the_autopilots_gate_lets_it_out(tmp_path):
             results.see("fuse.relative_pose", message, message.stamp_ns)
         results.close()
         rows = list(csv.DictReader((tmp_path / POSE_COVARIANCE_FILE).open()))
-        assert [row["good"] == "1" for row in rows] == expected
+        assert [row["accepted"] == "1" for row in rows] == expected
         assert [row["rotation"] for row in rows] == ["1"] * 3
 
 

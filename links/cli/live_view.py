@@ -20,7 +20,7 @@ from flow.live.report import LiveReport
 from flow.message import Message
 from links.cli.console import err, out
 from links.runs.live_run import RunStatus
-from stages.messages import DroneFix, RelativePose, TrackState
+from stages.messages import DroneFix, PositionEstimate, RelativePose, TrackState
 
 SCREEN_PERIOD_S, LINE_PERIOD_S = 0.25, 5.0
 SHOWN = (RelativePose, DroneFix, TrackState)
@@ -53,20 +53,19 @@ class LatestMessages(Tap):
 
 
 def _pose(pose: RelativePose) -> str:
-    if pose.xyz_vehicle_m is None:
+    estimate = pose.estimate
+    if estimate is None:
         return ""
-    sigma_m2 = None if pose.covariance is None else pose.covariance[3:, 3:]
-    text = _position(pose.xyz_vehicle_m, sigma_m2)
-    if pose.R_vehicle_drone is not None:
-        R = pose.R_vehicle_drone
-        text += f"  yaw {np.degrees(np.arctan2(R[1, 0], R[0, 0])):.1f} deg"
-    return text
+    if isinstance(estimate, PositionEstimate):
+        return _position(estimate.xyz_vehicle_m, estimate.covariance_vehicle_m2)
+    text = _position(estimate.xyz_vehicle_m, estimate.covariance[3:, 3:])
+    R = estimate.R_vehicle_drone
+    return f"{text}  yaw {np.degrees(np.arctan2(R[1, 0], R[0, 0])):.1f} deg"
 
 
 def _position(xyz_m: Any, covariance_m2: Any) -> str:
     x, y, z = xyz_m
-    sigma = "" if covariance_m2 is None else f"  sigma {float(np.trace(covariance_m2)) ** 0.5:.2f} m"
-    return f"x {x:.2f}  y {y:.2f}  z {z:.2f} m{sigma}"
+    return f"x {x:.2f}  y {y:.2f}  z {z:.2f} m  sigma {float(np.trace(covariance_m2)) ** 0.5:.2f} m"
 
 
 class LiveView:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.messages import PoseState, RelativePose
+from stages.messages import PoseEstimate, PoseState, RelativePose
 
 AHEAD_NS = 50_000_000  # a pose predicted further ahead than this has another clock than ours
 SENDABLE = (PoseState.FULL, PoseState.COASTING)
@@ -59,16 +59,16 @@ def refusal(pose: RelativePose, now_ns: int, limits: Limits) -> Refusal | None:
     """Why the pose may not go out now; None: it may."""
     if pose.state not in SENDABLE:
         return Refusal[pose.state.name]
-    rotations = pose.R_vehicle_drone, pose.R_map_drone
-    vectors = (pose.xyz_vehicle_m, pose.xyz_map_m, *rotations, pose.covariance, pose.map_covariance)
-    given = [vector.ravel() for vector in vectors if vector is not None]
-    if len(given) < len(vectors):
+    estimate = pose.estimate
+    if not isinstance(estimate, PoseEstimate):
         return Refusal.INCOMPLETE
-    if not np.isfinite(np.concatenate(given)).all():
+    rotations = estimate.R_vehicle_drone, estimate.R_map_drone
+    vectors = (estimate.xyz_vehicle_m, estimate.xyz_map_m, *rotations, estimate.covariance, estimate.map_covariance)
+    if not np.isfinite(np.concatenate([vector.ravel() for vector in vectors])).all():
         return Refusal.NOT_FINITE
-    if not all([_is_rotation(R) for R in rotations if R is not None]):
+    if not all([_is_rotation(R) for R in rotations]):
         return Refusal.NO_ROTATION
-    worst = worst_sigmas(pose)
+    worst = worst_sigmas(estimate)
     if worst is None:
         return Refusal.COVARIANCE
     rotation_rad, position_m = worst
@@ -83,10 +83,8 @@ def refusal(pose: RelativePose, now_ns: int, limits: Limits) -> Refusal | None:
 
 
 @lru_cache(maxsize=1)  # the gate asks, and the message tells its quality
-def worst_sigmas(pose: RelativePose) -> tuple[float, float] | None:
-    """`pose_sigmas` of both covariances of a pose; None: one is missing, or none."""
-    if pose.covariance is None or pose.map_covariance is None:
-        return None
+def worst_sigmas(pose: PoseEstimate) -> tuple[float, float] | None:
+    """`pose_sigmas` of both covariances of a pose; None: one is not a covariance."""
     return pose_sigmas(pose.covariance, pose.map_covariance)
 
 
@@ -106,10 +104,10 @@ def pose_sigmas(*covariances: NDArray[np.float64]) -> tuple[float, float] | None
     return math.sqrt(max(worst[: len(C)])), math.sqrt(max(worst[len(C) :]))
 
 
-def velocity_to_send(pose: RelativePose, limits: Limits) -> NDArray[np.float64] | None:
-    """The drone's velocity over ground, start axes, where it is known well enough; None: it goes out as not known."""
+def velocity_to_send(pose: PoseEstimate, limits: Limits) -> NDArray[np.float64] | None:
+    """The drone's velocity over ground, map axes, where it is known well enough; None: it goes out as not known."""
     velocity, covariance = pose.velocity_map_mps, pose.velocity_covariance
-    if velocity is None or covariance is None or not (np.isfinite(velocity).all() and np.isfinite(covariance).all()):
+    if not (np.isfinite(velocity).all() and np.isfinite(covariance).all()):
         return None
     if min(np.diagonal(covariance).tolist()) <= 0 or not _is_symmetric(covariance):
         return None

@@ -28,7 +28,9 @@ from stages.messages import (
     DepthImage,
     Detections,
     DroneFix,
+    PoseEstimate,
     PoseState,
+    PositionEstimate,
     RelativePose,
     RelativeRotation,
     TrackState,
@@ -276,13 +278,12 @@ class Results(Tap[ResultsSettings]):
             self._poses = csv.writer(self._files[POSE_COVARIANCE_FILE])
             head = ["state", "accepted", "rotation", "resets", "nis", "measured_s", "track_id"]
             self._poses.writerow(["stamp_s", *POSE_UPPER, *head])
-        R, xyz_m, covariance = message.R_vehicle_drone, message.xyz_vehicle_m, message.covariance
-        if xyz_m is None or covariance is None:
+        estimate, R = message.estimate, message.R_vehicle_drone
+        if estimate is None:
             return
         q = (0.0, 0.0, 0.0, 1.0) if R is None else tuple(quaternions_xyzw(R[None])[0].tolist())
-        self._files[POSE_FILE].write(tum_line(message.stamp_ns, xyz_m, q))
-        upper = covariance[UPPER_6]
-        upper[np.isinf(upper)] = UNKNOWN_RAD2
+        self._files[POSE_FILE].write(tum_line(message.stamp_ns, estimate.xyz_vehicle_m, q))
+        upper = _covariance(estimate)[UPPER_6]
         measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
         accepted = refusal(message, message.stamp_ns, self.settings.limits) is None
@@ -322,6 +323,15 @@ class Results(Tap[ResultsSettings]):
         for stream in self._files.values():
             stream.close()
         self._files.clear()
+
+
+def _covariance(estimate: PositionEstimate | PoseEstimate) -> NDArray[np.float64]:
+    """(6, 6) of T_vehicle_drone; UNKNOWN_RAD2 for a rotation that is not known."""
+    if isinstance(estimate, PoseEstimate):
+        return estimate.covariance
+    covariance = np.diag([UNKNOWN_RAD2] * 3 + [0.0] * 3)
+    covariance[3:, 3:] = estimate.covariance_vehicle_m2
+    return covariance
 
 
 def _digits(values: NDArray[np.float64]) -> list[str]:

@@ -30,7 +30,9 @@ from stages.messages import (
     AutopilotEstimator,
     BranchState,
     CameraMount,
+    PoseEstimate,
     PoseState,
+    PositionEstimate,
     RelativePose,
     RelativeRotation,
     ServoOffset,
@@ -60,12 +62,12 @@ def relative_pose(message: RelativePose, name: str, scene: Scene) -> Entities:
         yield log_entry(name, f"{state}: {message.reason}", "WARN" if message.state in WARNING_STATES else "INFO")
     if scene.changed(f"resets/{name}", str(message.resets)) and message.resets:
         yield log_entry(name, f"the pose jumped, reset {message.resets}: {message.reason}", "WARN")
-    R, xyz_m, covariance = message.R_vehicle_drone, message.xyz_vehicle_m, message.covariance
-    if xyz_m is None or covariance is None:
+    estimate = message.estimate
+    if estimate is None:
         yield clear(f"vehicle/{name}")
         yield scene.status(6, stage_of(name), f"{state}: {message.reason}")
         return
-    position_m2 = covariance[3:, 3:] if R is None else R @ covariance[3:, 3:] @ R.T  # vehicle axes
+    xyz_m, position_m2 = estimate.xyz_vehicle_m, position_covariance_vehicle_m2(estimate)
     yield ellipsoids(f"vehicle/{name}/ellipsoid_95", xyz_m[None], position_m2[None], colours.NEUTRAL, filled=False)
     yield plot(f"plots/position/{name}", xyz_m, [f"fused {axis}" for axis in AXES], colours.AXES, dots=False)
     sigma_m = np.sqrt(np.diag(position_m2))
@@ -76,9 +78,10 @@ def relative_pose(message: RelativePose, name: str, scene: Scene) -> Entities:
         age_s = (message.stamp_ns - message.measured_ns) * 1e-9
         yield plot(f"plots/other/{name}/age", [age_s], ["age of the newest fix [s]"])
     text = f"{slashed(xyz_m, 2)} m, sigma {slashed(sigma_m, 2)} m"
-    if R is None:
+    if not isinstance(estimate, PoseEstimate):
         yield clear(f"vehicle/{name}/axes")
     else:
+        R = estimate.R_vehicle_drone
         arrows = rr.Arrows3D(
             origins=np.tile(xyz_m, (3, 1)),
             vectors=POSE_AXIS_M * R.T,
@@ -87,12 +90,19 @@ def relative_pose(message: RelativePose, name: str, scene: Scene) -> Entities:
         )
         yield Entity(f"vehicle/{name}/axes", arrows, frame="vehicle")
         angles_deg = rpy_deg(R)
-        sigma_deg = np.rad2deg(np.sqrt(np.diag(covariance)[:3]))
+        sigma_deg = np.rad2deg(np.sqrt(np.diag(estimate.covariance)[:3]))
         yield plot(f"plots/rotation/{name}", angles_deg, ["fused roll", "pitch", "yaw"], colours.AXES, dots=False)
         names = [f"fused sigma about {axis}" for axis in AXES]
         yield plot(f"plots/rotation_sigma/{name}", sigma_deg, names, colours.AXES, dots=False)
         text += f"; roll / pitch / yaw {slashed(angles_deg, 1)} deg, sigma {slashed(sigma_deg, 1)} deg"
     yield scene.status(6, stage_of(name), f"{state}: {text}; {message.reason}")
+
+
+def position_covariance_vehicle_m2(estimate: PositionEstimate | PoseEstimate) -> Array64:
+    """(3, 3) covariance of the drone's position, vehicle axes."""
+    if isinstance(estimate, PoseEstimate):
+        return estimate.R_vehicle_drone @ estimate.covariance[3:, 3:] @ estimate.R_vehicle_drone.T
+    return estimate.covariance_vehicle_m2
 
 
 def relative_rotation(message: RelativeRotation, name: str, scene: Scene) -> Entities:

@@ -24,7 +24,9 @@ from stages.messages.drone import Detections as Detections
 from stages.messages.drone import DroneFix as DroneFix
 from stages.messages.drone import TrackingState as TrackingState
 from stages.messages.drone import TrackState as TrackState
+from stages.messages.pose import PoseEstimate as PoseEstimate
 from stages.messages.pose import PoseState as PoseState
+from stages.messages.pose import PositionEstimate as PositionEstimate
 from stages.messages.pose import RelativePose as RelativePose
 from stages.messages.sensors import Image as Image
 from stages.messages.sensors import LidarFirings as LidarFirings

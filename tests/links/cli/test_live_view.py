@@ -13,7 +13,16 @@ from flow.live.report import EdgeCount, LinkReport, LiveReport, edge_report
 from flow.taps import Digest
 from links.cli.live_view import LiveView
 from links.runs.live_run import RunStatus
-from stages.messages import DroneFix, Image, PoseState, RelativePose, SweptPulses, TrackingState, TrackState
+from stages.messages import (
+    DroneFix,
+    Image,
+    PoseEstimate,
+    PoseState,
+    RelativePose,
+    SweptPulses,
+    TrackingState,
+    TrackState,
+)
 
 
 def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
@@ -41,17 +50,19 @@ def pose(state=PoseState.FULL, **changes):
         "reason": "seen now",
         "measured_ns": 1,
         "track_id": 1,
-        "xyz_vehicle_m": np.array([1.0, -2.0, 10.0]),
-        "R_vehicle_drone": quarter,
-        "covariance": np.diag([1.0, 1.0, 1.0, 0.01, 0.02, 0.06]),
-        "velocity_vehicle_mps": None,
-        "xyz_map_m": None,
-        "R_map_drone": None,
-        "map_covariance": None,
-        "velocity_map_mps": None,
-        "velocity_covariance": None,
         "resets": 0,
         "nis": 1.0,
+        "estimate": PoseEstimate(
+            xyz_vehicle_m=np.array([1.0, -2.0, 10.0]),
+            R_vehicle_drone=quarter,
+            covariance=np.diag([1.0, 1.0, 1.0, 0.01, 0.02, 0.06]),
+            velocity_vehicle_mps=np.zeros(3),
+            xyz_map_m=np.zeros(3),
+            R_map_drone=np.eye(3),
+            map_covariance=np.eye(6),
+            velocity_map_mps=np.zeros(3),
+            velocity_covariance=np.eye(3),
+        ),
     }
     return RelativePose(**(values | changes))
 
@@ -89,7 +100,7 @@ def test_without_a_fused_pose_the_track_and_its_last_fix_are_shown():
 
 
 def test_a_lost_pose_has_no_numbers():
-    assert "LOST: seen now; 1234 records" in shown(report_of(), pose(PoseState.LOST, xyz_vehicle_m=None))
+    assert "LOST: seen now; 1234 records" in shown(report_of(), pose(PoseState.LOST, estimate=None))
 
 
 def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mavlink_poses import HOST0, MS, good_pose
+from mavlink_poses import HOST0, MS, good_pose, position_of
 from pydantic import ValidationError
 
 from links.mavlink.gate import Limits, Refusal, pose_sigmas, refusal
@@ -43,11 +43,8 @@ def test_no_other_state_passes_even_if_the_pose_looks_whole(state: PoseState):
 
 
 SPOILED = [
-    ({"R_vehicle_drone": None}, Refusal.INCOMPLETE),
-    ({"R_map_drone": None}, Refusal.INCOMPLETE),
-    ({"xyz_map_m": None}, Refusal.INCOMPLETE),
-    ({"covariance": None}, Refusal.INCOMPLETE),
-    ({"map_covariance": None}, Refusal.INCOMPLETE),
+    ({"estimate": None}, Refusal.INCOMPLETE),
+    ({"estimate": position_of(good_pose())}, Refusal.INCOMPLETE),
     ({"xyz_map_m": nan_at(np.ones(3))}, Refusal.NOT_FINITE),
     ({"xyz_vehicle_m": nan_at(np.ones(3), math.inf)}, Refusal.NOT_FINITE),
     ({"R_map_drone": nan_at(np.eye(3))}, Refusal.NOT_FINITE),
@@ -121,7 +118,7 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
 def test_whatever_one_number_becomes_what_goes_out_is_finite_sure_and_fresh(
     state: PoseState, field: str, at: int, value: float, age_ms: int
 ):
-    spoiled = np.array(getattr(good_pose(), field))
+    spoiled = np.array(getattr(good_pose().estimate, field))
     spoiled.flat[at % spoiled.size] = value
     pose = good_pose(state=state, **{field: spoiled})
     messages = PoseSpeaker(("odometry",), LIMITS).speak(pose, HOST0 + age_ms * MS)

@@ -12,7 +12,7 @@ from drawing import document, drawn, numbers, scene
 from links.viewer.layout import Vision, layout
 from links.viewer.stream import Stream
 from stages.geometry.frames import rotation_from_rpy_deg
-from stages.messages import AutopilotEstimator, PoseState, RelativePose, ServoOffset
+from stages.messages import AutopilotEstimator, PoseEstimate, PoseState, PositionEstimate, RelativePose, ServoOffset
 
 NAME = "fuse/relative_pose"
 R = rotation_from_rpy_deg((0.0, 0.0, 90.0))
@@ -20,12 +20,7 @@ R = rotation_from_rpy_deg((0.0, 0.0, 90.0))
 
 def pose(**changes) -> RelativePose:
     covariance = np.diag([1e-4, 4e-4, 9e-4, 0.04, 0.09, 0.16])
-    full = RelativePose(
-        stamp_ns=2_000_000_000,
-        state=PoseState.FULL,
-        reason="all there",
-        measured_ns=1_900_000_000,
-        track_id=1,
+    estimate = PoseEstimate(
         xyz_vehicle_m=np.array([1.0, 2.0, 10.0]),
         R_vehicle_drone=R,
         covariance=covariance,
@@ -35,10 +30,30 @@ def pose(**changes) -> RelativePose:
         map_covariance=covariance,
         velocity_map_mps=np.zeros(3),
         velocity_covariance=np.eye(3),
+    )
+    full = RelativePose(
+        stamp_ns=2_000_000_000,
+        state=PoseState.FULL,
+        reason="all there",
+        measured_ns=1_900_000_000,
+        track_id=1,
         resets=0,
         nis=2.5,
+        estimate=estimate,
     )
     return dataclasses.replace(full, **changes)
+
+
+def position() -> PositionEstimate:
+    return PositionEstimate(
+        xyz_vehicle_m=np.array([1.0, 2.0, 10.0]),
+        covariance_vehicle_m2=np.diag([0.04, 0.09, 0.16]),
+        velocity_vehicle_mps=np.zeros(3),
+        xyz_map_m=np.array([1.0, 2.0, 10.0]),
+        covariance_map_m2=np.diag([0.04, 0.09, 0.16]),
+        velocity_map_mps=np.zeros(3),
+        velocity_covariance=np.eye(3),
+    )
 
 
 def scalars(entity) -> list[float]:
@@ -60,10 +75,9 @@ def test_a_full_pose_has_axes_curves_and_sigmas_in_the_vehicle_s_axes():
 
 
 def test_without_a_rotation_no_axes_and_no_angles_are_shown():
-    unknown = np.diag([math.inf] * 3 + [0.04, 0.09, 0.16])
     where = scene()
     drawn(pose(), NAME, where)
-    entities = drawn(pose(state=PoseState.POSITION_ONLY, R_vehicle_drone=None, covariance=unknown), NAME, where)
+    entities = drawn(pose(state=PoseState.POSITION_ONLY, estimate=position()), NAME, where)
     np.testing.assert_allclose(scalars(entities[f"plots/sigma/{NAME}"]), [0.2, 0.3, 0.4], atol=1e-12)
     assert f"plots/rotation/{NAME}" not in entities
     assert "Clear" in type(entities[f"vehicle/{NAME}/axes"].archetypes[0]).__name__
@@ -75,7 +89,7 @@ def test_a_lost_pose_clears_all_and_a_reset_is_logged():
     assert "the pose jumped, reset 1: a new branch" in str(
         drawn(pose(resets=1, reason="a new branch"), NAME, where)[f"log/{NAME}"].archetypes[0].text.as_arrow_array()
     )
-    lost = pose(state=PoseState.LOST, xyz_vehicle_m=None, R_vehicle_drone=None, covariance=None, reason="no drone")
+    lost = pose(state=PoseState.LOST, estimate=None, reason="no drone")
     entities = drawn(lost, NAME, where)
     assert "Clear" in type(entities[f"vehicle/{NAME}"].archetypes[0]).__name__
     assert f"plots/position/{NAME}" not in entities
@@ -137,7 +151,7 @@ def test_axes_that_were_cleared_before_they_were_drawn_have_their_frame():
     stream = Stream.__new__(Stream)
     stream._rerun, stream._styled, stream._curves = Recording(), set(), {}
     where = scene()
-    for one in (pose(state=PoseState.POSITION_ONLY, R_vehicle_drone=None), pose(), pose()):
+    for one in (pose(state=PoseState.POSITION_ONLY, estimate=position()), pose(), pose()):
         for entity in drawn(one, NAME, where).values():
             if entity.path == f"vehicle/{NAME}/axes":
                 stream.put(entity)

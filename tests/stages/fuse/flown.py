@@ -131,7 +131,7 @@ def late(ports: tuple[str, ...], by_s: float) -> Fault:
     return fault
 
 
-def spoilt(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
+def inflation(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
     """This share of what these ports hear is false: places by metres, turns by some tens of degrees."""
 
     def fault(events: list[Event]) -> list[Event]:
@@ -206,7 +206,7 @@ def judge(flown: Flown, poses: list[RelativePose], into: Row | None = None) -> R
     for pose in poses:
         row.states[pose.state] += 1
         true = flown.truth(pose.stamp_ns)
-        if pose.xyz_vehicle_m is None or pose.covariance is None or true is None:
+        if pose.estimate is None or true is None:
             continue
         R, xyz = true
         add_errors(row, pose, R, xyz)

@@ -2,8 +2,8 @@
 
     pytest -m slow tests/stages/fuse/test_fuse_faults.py -s
 
-The flights are made first, in closed loop; without pictures, so rotations are made from the truth, as `align` tells
-them. GRD_FLIGHTS='some/*.mcap' takes recordings with pictures instead, replayed through configs/vision.yaml.
+The flights are made first, in closed loop; without images, so rotations are made from the truth, as `align` tells
+them. GRD_FLIGHTS='some/*.mcap' takes recordings with images instead, replayed through configs/vision.yaml.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from tests.stages.fuse.flown import (
     Row,
     flown,
     heard,
+    inflation,
     judge,
     late,
-    spoilt,
     with_rotations,
     without,
 )
@@ -57,7 +57,7 @@ FAULTS: dict[str, Callable[[tuple[str, ...]], Fault]] = {
     "gone for 3 s": lambda ports: without(ports, AT_S, AT_S + FOR_S),
     "gone": without,
     "300 ms late": lambda ports: late(ports, 0.3),
-    "20 % false": lambda ports: spoilt(ports, 0.2),
+    "20 % false": lambda ports: inflation(ports, 0.2),
 }
 WITH_ROTATION = (PoseState.FULL, PoseState.COASTING)
 

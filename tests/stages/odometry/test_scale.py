@@ -45,6 +45,22 @@ def test_a_third_of_wrong_depths_is_left_out():
     assert length_of(rho, sigma, inverse, inverse_sigma).m == pytest.approx(length, rel=0.03)
 
 
+def test_a_precise_depth_outweighs_imprecise_ones():
+    """Ten depths known to 1 % give 1 m, twenty known to 30 % give 1.3 m: the mean by 1 / sigma^2 is 1.00 m."""
+    rho, rho_sigma = np.full(30, 0.1), np.full(30, 1e-4)
+    inverse = np.where(np.arange(30) < 10, 0.1, 0.1 / 1.3)
+    inverse_sigma = np.where(np.arange(30) < 10, 0.01, 0.3) * inverse
+    assert length_of(rho, rho_sigma, inverse, inverse_sigma).m == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_sigma_of_the_length_grows_with_the_sigma_of_the_depths():
+    """Sigma of the mean of 100 depths known to 20 %, with 1 % of each and 0.4 % of all added: 0.0204 of the length."""
+    rho, rho_sigma, inverse = np.full(100, 0.1), np.full(100, 1e-6), np.full(100, 0.05)
+    found = length_of(rho, rho_sigma, inverse, 0.2 * inverse)
+    assert found.m == pytest.approx(2.0)
+    assert found.sigma_m / found.m == pytest.approx(np.hypot(np.hypot(0.2, 0.01) / 10.0, 0.004), rel=1e-6)
+
+
 def test_nothing_known_or_nothing_parted_is_no_length():
     rho, sigma, inverse, inverse_sigma, _, _ = with_depths(60)
     assert length_of(rho, sigma, np.full(60, np.nan), inverse_sigma) is None

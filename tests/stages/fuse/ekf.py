@@ -1,11 +1,10 @@
-"""The back end as a plain error-state Kalman filter: one pose, late data brought to its time by the drone's own motion.
+"""The error-state Kalman filter that the smoother is compared with: one pose, late data moved to its time.
 
     extend       T <- T D,  P <- Ad(D^-1) P Ad(D^-1)^T + Q
     position     z = T d + noise,  d: where the body was at the measurement's time, in the body's axes now
     rotation     R_z = R d_R exp(noise)
 
-Kept for comparison with the smoother (tests/benchmarks/bench_fuse.py): as accurate while all is well, it cannot mend a
-bad start.
+It is as accurate as the smoother while every measurement is good, and cannot correct a wrong start.
 
 Source: Sola, Quaternion kinematics for the error-state Kalman filter (2017), 6; DESIGN, Fusion.
 """
@@ -16,6 +15,7 @@ import math
 
 import numpy as np
 
+from stages.fuse import Fuse
 from stages.fuse.back_end import HUBER
 from stages.fuse.propagated import Step
 from stages.geometry.frames import Array64
@@ -31,12 +31,12 @@ class Ekf:
         self.R_map_drone, self.xyz_map_m, self.covariance = np.eye(3), np.zeros(3), np.eye(6)
 
     def start(self, stamp_ns: int, R_map_drone: Array64, xyz_map_m: Array64, covariance: Array64) -> None:
-        """Begin here."""
+        """Start from one pose."""
         self.stamp_ns, self.covariance = stamp_ns, covariance
         self.R_map_drone, self.xyz_map_m = R_map_drone, xyz_map_m
 
     def extend(self, stamp_ns: int, step: Step, up_drone: Array64 | None, tilt_rad2: float) -> None:
-        """Move on; `up_drone`: where the autopilot has the vertical."""
+        """Propagate; `up_drone` is the vertical by the autopilot."""
         self.xyz_map_m = self.xyz_map_m + self.R_map_drone @ step.t_m
         self.R_map_drone = self.R_map_drone @ step.R
         self.covariance = composed_covariance(self.covariance, step.R, step.t_m, step.covariance)
@@ -47,11 +47,11 @@ class Ekf:
             self._correct(H, up_drone - self.R_map_drone.T[:, 2], tilt_rad2 * np.eye(3))
 
     def near(self, stamp_ns: int) -> tuple[int, Array64, Array64]:
-        """The moment whose pose is known that a measurement is told from, and that pose."""
+        """The pose that a measurement refers to, with its time: always the newest."""
         return self.stamp_ns, self.R_map_drone, self.xyz_map_m
 
     def add_position(self, key_ns: int, step: Step, xyz_m: Array64, covariance_m2: Array64) -> bool:
-        """A position at the end of a step from the known moment."""
+        """Correct by a position at the end of a step from the newest pose."""
         H = np.zeros((3, 6))
         H[:, :3] = -self.R_map_drone @ hat(step.t_m)
         H[:, 3:] = self.R_map_drone
@@ -59,7 +59,7 @@ class Ekf:
         return True
 
     def add_rotation(self, key_ns: int, step: Step, R: Array64, covariance_rad2: Array64) -> bool:
-        """A rotation at the end of a step."""
+        """Correct by a rotation at the end of a step from the newest pose."""
         H = np.zeros((3, 6))
         H[:, :3] = np.eye(3)
         e = log_rotation(self.R_map_drone.T @ R @ step.R.T)
@@ -67,7 +67,7 @@ class Ekf:
         return True
 
     def _correct(self, H: Array64, e: Array64, noise: Array64) -> None:
-        """Huber's weight on the whitened residual, as the smoother's factors have."""
+        """Kalman update with the Huber weight of the whitened residual, as in the factors of the smoother."""
         far = math.sqrt(max(float(e @ np.linalg.solve(noise, e)), 0.0))
         noise = noise * max(1.0, far / HUBER)
         K = np.linalg.solve(H @ self.covariance @ H.T + noise, H @ self.covariance).T
@@ -77,3 +77,10 @@ class Ekf:
         self.xyz_map_m = self.xyz_map_m + self.R_map_drone @ xi[3:]
         self.R_map_drone = self.R_map_drone @ exp_rotation(xi[:3])
         self.covariance = 0.5 * (after + after.T)
+
+
+class EkfFuse(Fuse):
+    """`Fuse` with this filter in place of the smoother."""
+
+    def _back_end(self) -> Ekf:
+        return Ekf()

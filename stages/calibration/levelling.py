@@ -60,14 +60,14 @@ def stand(found: Calibration, rig: LidarMount, said: Standing) -> Calibration:
         before = _tilt_deg(R_vehicle_base)
         try:
             up, ground_rad = ground(normal @ R_vehicle_base.T, centre @ R_vehicle_base.T, -T[2, 3])
-            sigma_rad, refused = math.hypot(said.level_rad, ground_rad), ""
+            sigma_rad, rejected = math.hypot(said.level_rad, ground_rad), ""
             R_vehicle_base = _upright(up) @ R_vehicle_base
             mount = mount.model_copy(update={"T_vehicle_turntable": _pose(rig.T_vehicle_turntable, R_vehicle_base)})
         except _Undetermined as why:
-            sigma_rad, refused = math.radians(1.0), str(why)
+            sigma_rad, rejected = math.radians(1.0), str(why)
         for i, axis in enumerate("xy"):
             what, after = f"axis's tilt in the vehicle about {axis}", _tilt_deg(R_vehicle_base)[i]
-            findings.append(Finding(f"level_{axis}", what, "deg", before[i], after, math.degrees(sigma_rad), refused))
+            findings.append(Finding(f"level_{axis}", what, "deg", before[i], after, math.degrees(sigma_rad), rejected))
     if said.parallel_rad is not None:
         at = next(i for i, finding in enumerate(findings) if finding.name == "zero")
         try:
@@ -80,9 +80,9 @@ def stand(found: Calibration, rig: LidarMount, said: Standing) -> Calibration:
             zero_deg = mount.servo_zero_deg + rig.servo_sign * math.degrees(heading_rad)
             mount = mount.model_copy(update={"servo_zero_deg": zero_deg, **_pointing(found, sigma_deg)})
             what = f"servo's zero, by the wall {where}"
-            findings[at] = replace(findings[at], what=what, after=zero_deg, sigma=sigma_deg, refused="")
+            findings[at] = replace(findings[at], what=what, after=zero_deg, sigma=sigma_deg, rejected="")
         except _Undetermined as why:
-            findings[at] = replace(findings[at], refused=str(why))
+            findings[at] = replace(findings[at], rejected=str(why))
     return replace(found, mount=mount, findings=tuple(findings))
 
 

@@ -24,7 +24,7 @@ def found_in(seed=0, parked=False, **how):
     return true, calibrate(made.returns, made.trace, RIG, parked=parked)
 
 
-def refused(found):
+def rejected(found):
     return {f.name: f.rejected for f in found.findings if f.rejected}
 
 
@@ -73,8 +73,8 @@ def test_a_second_calibration_finds_nothing_more(yard):
 
 def test_the_zero_is_never_estimated_and_stays(yard):
     _, found = yard
-    assert set(refused(found)) == {"zero"}
-    assert "no scene tells it" in refused(found)["zero"]
+    assert set(rejected(found)) == {"zero"}
+    assert "no scene tells it" in rejected(found)["zero"]
 
 
 def test_the_rig_contains_the_sigma_of_the_servos_angle(yard):
@@ -87,7 +87,7 @@ def test_sigmas_hold_over_many_yards():
     for seed in range(1, 7):
         true, found = found_in(seed, count=30_000)
         after, wanted = values_of(found.numbers, servo_mount(RIG)), values_of(true, servo_mount(RIG))
-        told = [i for i, name in enumerate(NAMES) if name not in refused(found)]
+        told = [i for i, name in enumerate(NAMES) if name not in rejected(found)]
         off = np.array([after[name] - wanted[name] for name in NAMES])[told]
         inner = found.covariance[np.ix_(told, told)]
         scores += (off / np.sqrt(np.diag(inner))).tolist()
@@ -111,23 +111,23 @@ def test_an_unobservable_mean_is_compensated_by_the_zero():
 
 def test_one_direction_determines_neither_time_offset_nor_play():
     _, found = found_in(parked=True, legs=((0.0, 180.0, SLOW),))
-    assert {"time", "play", "zero"} <= set(refused(found))
-    assert "one way only" in refused(found)["time"]
-    assert "tilt_x" not in refused(found)
+    assert {"time", "play", "zero"} <= set(rejected(found))
+    assert "one way only" in rejected(found)["time"]
+    assert "tilt_x" not in rejected(found)
     assert found.mount.servo_time_offset_s == 0.0
     assert found.mount.servo_play_deg == 0.0
 
 
 def test_one_speed_does_not_separate_time_offset_and_play():
     _, found = found_in(legs=((0.0, 180.0, SLOW), (180.0, 0.0, SLOW)))
-    assert "one speed only" in refused(found)["time"]
-    assert "one speed only" in refused(found)["play"]
+    assert "one speed only" in rejected(found)["time"]
+    assert "one speed only" in rejected(found)["play"]
     assert found.mount.pointing_sigma_deg == UNCALIBRATED_DEG
 
 
 def test_an_open_field_determines_tilts_but_no_rotation():
     _, found = found_in(planes=GROUND)
-    said = refused(found)
+    said = rejected(found)
     assert {*CURVE, "play", "time", "axis_x", "axis_y"} <= set(said)
     assert "level ground" in said["play"]
     assert "tilt_x" not in said

@@ -1,4 +1,4 @@
-"""The zero and the axis's tilt, by how the vehicle stands: found, as sure as what was said, or refused with a reason."""
+"""The zero and the axis's tilt, by how the vehicle stands: found, as sure as what was said, or rejected with a reason."""
 
 from __future__ import annotations
 

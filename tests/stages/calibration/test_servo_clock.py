@@ -100,11 +100,11 @@ def test_windows_are_combined_except_outliers():
     object.__setattr__(stage._firings[0], "stamp_ns", 0)
     stage._join(1e-3, 2e-4, 0.0)
     assert "alone: 1.20 ms, sigma 0.20 ms" in stage._join(1.2e-3, 2e-4, 0.0)
-    first = stage._told(0, "")
+    first = stage._estimate(0, "")
     assert first.offset_s == pytest.approx(1.1e-3, rel=1e-3)
     assert first.sigma_s == pytest.approx(math.hypot(2e-4 / math.sqrt(2), 3e-4), rel=1e-3)
     assert "disagrees: 9.00 ms" in stage._join(9e-3, 2e-4, 0.0)
-    doubtful = stage._told(0, "")
+    doubtful = stage._estimate(0, "")
     assert doubtful.offset_s == first.offset_s
     assert doubtful.sigma_s > 4 * first.sigma_s
 
@@ -116,7 +116,7 @@ def test_the_common_sigma_does_not_decrease_with_the_number_of_windows():
     for _ in range(100):
         said = stage._join(1e-3, 2e-4, 3e-4)
     assert "sigma 0.36 ms" in said
-    assert stage._told(0, "").sigma_s == pytest.approx(math.hypot(2e-5, 3e-4, 3e-4), rel=1e-3)
+    assert stage._estimate(0, "").sigma_s == pytest.approx(math.hypot(2e-5, 3e-4, 3e-4), rel=1e-3)
     assert "alone" in stage._join(2.5e-3, 2e-4, 3e-4)  # a window may be off by what it shares with itself only
 
 

@@ -38,7 +38,12 @@ def test_every_command_in_a_document_exists(file):
 
 @pytest.mark.parametrize("file", DOCUMENTS, ids=name_of)
 def test_every_configuration_in_a_document_exists(file):
-    made = {"configs/rigs/mine.yaml", "configs/rigs/vehicle_lens.yaml", "configs/rigs/drone_lens.yaml"}
+    made = {
+        "configs/mine.yaml",
+        "configs/rigs/mine.yaml",
+        "configs/rigs/vehicle_lens.yaml",
+        "configs/rigs/drone_lens.yaml",
+    }
     for path in re.findall(r"\bconfigs/[\w/]+\.yaml\b", file.read_text(encoding="utf-8")):
         assert path in made or (ROOT / path).is_file(), f"{name_of(file)} names {path}"
 

@@ -90,6 +90,7 @@ class Shape:
 # Array types that messages use; the field's name has the unit.
 Vec3 = Annotated[NDArray[np.float64], Shape(3)]
 Mat3 = Annotated[NDArray[np.float64], Shape(3, 3)]
+Mat6 = Annotated[NDArray[np.float64], Shape(6, 6)]
 Points32 = Annotated[NDArray[np.float32], Shape("n", 3)]
 Points64 = Annotated[NDArray[np.float64], Shape("n", 3)]
 PerPointF32 = Annotated[NDArray[np.float32], Shape("n")]

@@ -192,7 +192,9 @@ class _Partition:
         try:
             return self._remote.answer()
         except RemoteError as error:
-            raise RunError(f"{error}: is there enough memory? A replay with --together runs in one process") from None
+            raise RunError(
+                f"{error}: is there enough memory? A replay with --single-process runs in one process"
+            ) from None
 
     def _flush(self) -> None:
         if self._batch:

@@ -50,7 +50,7 @@ SAID = {  # where it is said, and what
     "flow/live/threads.py": ["is switched off: ", "takes fewer images: this host is too slow for all stages"],
     "flow/live/wiring.py": ["cannot run live: it gives nothing"],
     "flow/live/supervised_stage.py": ["restarts", "stays off"],
-    "links/runs/live_run.py": ["cannot be shown on the terminal"],
+    "links/runs/live_run.py": ["cannot write to the terminal"],
     "links/runs/results.py": ["results are being lost"],
     "links/recording/recorder.py": ["nothing is recorded now"],
     "links/velodyne/udp.py": ["cannot listen on UDP", "is the network interface still up?", "no packet on UDP"],
@@ -94,7 +94,7 @@ SAID = {  # where it is said, and what
     "links/viewer/viewer.py": ["not all is drawn", "not drawn"],
     "links/zenoh/connection.py": ["does not take us in", "has not answered for"],
     "links/zenoh/sender.py": ["does not listen to"],
-    "links/cli/run.py": ["left out: "],
+    "links/cli/run.py": ["rejected: "],
 }
 
 

@@ -1,4 +1,4 @@
-"""deploy/grd.service: what of it a crew relies on, and that its two ways to start are what it says."""
+"""deploy/grd.service: the properties that a crew relies on, and its two ways to start."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHECK, RUN, RUN_AT_ONCE = (
 
 @pytest.fixture
 def vehicle(tmp_path):
-    """/opt/grd and /run/grd in a folder; grd says what it was asked, one line each time."""
+    """/opt/grd and /run/grd in a folder; a stand-in for grd prints its arguments."""
     grd = tmp_path / ".venv" / "bin" / "grd"
     grd.parent.mkdir(parents=True)
     grd.write_text('#!/bin/sh\necho "$@"\n')
@@ -31,17 +31,17 @@ def vehicle(tmp_path):
 
 
 def do(vehicle, setting: str) -> str:
-    """What one of the unit's commands makes grd say, with /run/grd in the folder."""
+    """Output of one of the unit's commands, with /run/grd in the folder."""
     command = shlex.split(unit_file()["Service"][setting].replace("/run/grd", str(vehicle / "run")))
     return subprocess.run(command, cwd=vehicle, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def start(vehicle) -> list[str]:
-    return [said for setting in ("ExecStartPre", "ExecStart") if (said := do(vehicle, setting))]
+    return [output for setting in ("ExecStartPre", "ExecStart") if (output := do(vehicle, setting))]
 
 
 def since(vehicle, ago_s: float) -> None:
-    """grd was started so long ago."""
+    """Set the start of grd to this time before now."""
     then_s = time.time() - ago_s
     os.utime(vehicle / "run" / "since", (then_s, then_s))
 
@@ -54,20 +54,20 @@ def test_the_stop_signal_goes_to_grd_alone_so_that_it_ends_the_servo_in_order():
     assert float(service["TimeoutStopSec"]) >= 30, "a slow disk is waited for"
 
 
-def test_what_it_starts_after_it_wants_too():
+def test_it_wants_all_units_that_it_starts_after():
     unit = unit_file()["Unit"]
     assert set(unit["After"].split()) == {"network-online.target", "time-sync.target"}
     assert set(unit["Wants"].split()) == set(unit["After"].split())
 
 
-def test_grd_that_ends_by_itself_is_started_again_however_often():
+def test_grd_is_restarted_after_every_failure():
     parts = unit_file()
     assert parts["Service"]["Restart"] == "on-failure"
     assert 0 < float(parts["Service"]["RestartSec"]) <= 1
     assert parts["Unit"]["StartLimitIntervalSec"] == "0"
 
 
-def test_its_note_of_the_start_outlives_a_restart_and_is_its_own():
+def test_its_start_time_file_survives_a_restart():
     service = unit_file()["Service"]
     assert service["RuntimeDirectory"] == "grd"
     assert service["RuntimeDirectoryPreserve"] == "restart"
@@ -77,7 +77,7 @@ def test_a_first_start_is_checked_and_warmed_up(vehicle):
     assert start(vehicle) == [CHECK, RUN]
 
 
-def test_a_crash_in_flight_is_answered_at_once_and_so_is_the_next(vehicle):
+def test_after_a_crash_in_flight_it_restarts_without_checks(vehicle):
     start(vehicle)
     since(vehicle, 180.0)
     assert start(vehicle) == [RUN_AT_ONCE]
@@ -92,23 +92,23 @@ def test_a_crash_soon_after_the_start_is_not_one_in_flight(vehicle):
     assert (vehicle / "run" / "since").stat().st_mtime == note_s, "crashes one after the other do not renew the note"
 
 
-def test_who_stops_it_gets_a_careful_start_next(vehicle):
+def test_after_a_stop_the_next_start_is_checked(vehicle):
     start(vehicle)
     since(vehicle, 180.0)
     do(vehicle, "ExecStop")
     assert start(vehicle) == [CHECK, RUN]
 
 
-def test_a_wrong_configuration_is_refused_before_anything_starts(vehicle):
+def test_an_invalid_configuration_stops_the_start(vehicle):
     (vehicle / ".venv" / "bin" / "grd").write_text("#!/bin/sh\nexit 2\n")
-    with pytest.raises(subprocess.CalledProcessError) as told:
+    with pytest.raises(subprocess.CalledProcessError) as error:
         do(vehicle, "ExecStartPre")
-    assert told.value.returncode == 2
+    assert error.value.returncode == 2
     assert not (vehicle / "run" / "since").exists()
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze")
-def test_systemd_finds_nothing_wrong_with_it():
-    told = subprocess.run(["systemd-analyze", "verify", str(UNIT)], capture_output=True, text=True, check=False)
-    assert "grd.service" not in told.stderr, told.stderr
-    assert told.returncode == 0, told.stderr
+def test_systemd_accepts_it():
+    result = subprocess.run(["systemd-analyze", "verify", str(UNIT)], capture_output=True, text=True, check=False)
+    assert "grd.service" not in result.stderr, result.stderr
+    assert result.returncode == 0, result.stderr

@@ -10,8 +10,9 @@
     ...            body: the fields in order
 
 All numbers are little-endian. int: 8 bytes, signed; float: 8; bool: 1; str and bytes: length (4), then the bytes; enum:
-its member's name as str; X | None: a byte 0 or 1, then X; tuple[X, ...]: count (4), then each; an array: its sizes (4
-each), then its elements in C order. A reader accepts only classes that it expects and whose fingerprint equals its own.
+its member's name as str; X | None: a byte 0 or 1, then X; a dataclass: its fields in order; X | Y of dataclasses: the
+index of the class (1), then its fields; tuple[X, ...]: count (4), then each; an array: its sizes (4 each), then its
+elements in C order. A reader accepts only classes that it expects and whose fingerprint equals its own.
 So two versions of grd with different fields of a message do not misread each other.
 
 Bytes may be hostile: every length is checked against the bytes that are left before memory is allocated, every array

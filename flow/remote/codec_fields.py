@@ -5,11 +5,12 @@ Source: ours.
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import math
 import struct
 import types
-from typing import Annotated, Any, Protocol, Union, get_args, get_origin
+from typing import Annotated, Any, Protocol, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -257,6 +258,50 @@ class _Array:
                 raise CodecError(f"declared {self._shape}{bound}, got {shape}")
 
 
+class _Record:
+    """A nested dataclass: its fields in order."""
+
+    def __init__(self, cls: type[Any]) -> None:
+        hints = get_type_hints(cls, include_extras=True)
+        self.cls = cls
+        self._fields = [(field.name, field_of(hints[field.name])) for field in dataclasses.fields(cls)]
+        self.signature = f"{cls.__name__}({';'.join(f'{name}:{field.signature}' for name, field in self._fields)})"
+        self.min_bytes = sum(field.min_bytes for _, field in self._fields)
+
+    def write(self, out: Writer, value: Any, sizes: Sizes) -> None:
+        if type(value) is not self.cls:
+            raise CodecError(f"declared {self.cls.__name__}, got {type(value).__name__}")
+        for name, field in self._fields:
+            field.write(out, getattr(value, name), sizes)
+
+    def read(self, reader: Reader, sizes: Sizes) -> Any:
+        return self.cls(**{name: field.read(reader, sizes) for name, field in self._fields})
+
+
+class _Union:
+    """X | Y of dataclasses: the index of the class, then its fields."""
+
+    def __init__(self, records: list[_Record]) -> None:
+        self._records = records
+        self.signature = "|".join(record.signature for record in records)
+        self.min_bytes = 1 + min(record.min_bytes for record in records)
+
+    def write(self, out: Writer, value: Any, sizes: Sizes) -> None:
+        index = next((i for i, record in enumerate(self._records) if type(value) is record.cls), None)
+        if index is None:
+            raise CodecError(
+                f"declared {' | '.join(r.cls.__name__ for r in self._records)}, got {type(value).__name__}"
+            )
+        out.append(bytes([index]))
+        self._records[index].write(out, value, sizes)
+
+    def read(self, reader: Reader, sizes: Sizes) -> Any:
+        index = reader.take(1)[0]
+        if index >= len(self._records):
+            raise CodecError(f"class {index} of {len(self._records)}")
+        return self._records[index].read(reader, sizes)
+
+
 _FLAG = _Bool()
 _PLAIN: dict[Any, Field] = {int: _Int(), float: _Float(), bool: _FLAG, str: _Text(), bytes: _Bytes()}
 
@@ -275,10 +320,15 @@ def field_of(hint: Any) -> Field:
         inner = [arg for arg in args if arg is not type(None)]
         if len(inner) == 1 and len(args) == 2:
             return _Optional(field_of(inner[0]))
+        if all(dataclasses.is_dataclass(arg) for arg in inner):
+            union = _Union([_Record(arg) for arg in inner])
+            return union if len(inner) == len(args) else _Optional(union)
     if origin is tuple and args:
         if args[-1] is Ellipsis:
             return _Many(field_of(args[0]))
         return _Each([field_of(arg) for arg in args])
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
         return _Enum(hint)
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        return _Record(hint)
     raise TypeError(f"{hint!r} is no type that can be encoded")

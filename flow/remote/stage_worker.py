@@ -213,8 +213,7 @@ def serve(control: socket.socket, inherited: tuple[socket.socket, ...] = ()) -> 
     try:
         for copy in inherited:
             copy.close()
-        for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C reaches all processes of a terminal; the parent ends us
-            signal.signal(number, signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent ends us
         sys.setswitchinterval(SWITCH_S)
         while True:
             _, streams, _, _ = socket.recv_fds(control, 1, 1)
@@ -228,6 +227,7 @@ def serve(control: socket.socket, inherited: tuple[socket.socket, ...] = ()) -> 
 
 def serve_forked(control: socket.socket, inherited: tuple[socket.socket, ...]) -> None:
     """`serve` in a forked process."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not the parent's handler; multiprocessing ends it so at exit
     if cv2 := sys.modules.get("cv2"):
         cv2.setNumThreads(0)  # the threads of its pool are the parent's
     serve(control, inherited)
@@ -235,4 +235,5 @@ def serve_forked(control: socket.socket, inherited: tuple[socket.socket, ...]) -
 
 if __name__ == "__main__":
     os.nice(int(sys.argv[2]))
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service manager sends it to all processes; the parent ends us
     serve(socket.socket(fileno=int(sys.argv[1])))

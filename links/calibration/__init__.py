@@ -6,4 +6,4 @@ Source: grd; the maths is in `stages/calibration`.
 from links.calibration.gather import Gathered as Gathered
 from links.calibration.gather import gather as gather
 from links.calibration.rig_file import rig_text as rig_text
-from links.calibration.rig_file import zero_told as zero_told
+from links.calibration.rig_file import zero_found as zero_found

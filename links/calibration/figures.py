@@ -96,7 +96,7 @@ def _encoder(axes: Axes, found: Calibration) -> None:
     band = 2 * math.degrees(found.curve_sigma_rad)
     axes.fill_between(x, after - band, after + band, color=BAND, alpha=0.35, linewidth=0, label="2 sigma")
     axes.plot(x, before, color=SOFT, label="rig before")
-    axes.plot(x, after, color=AFTER, label="refused" if by_name[CURVE[0]].refused else "found")
+    axes.plot(x, after, color=AFTER, label="rejected" if by_name[CURVE[0]].rejected else "found")
     axes.set(title="the encoder's error, its mean left out", xlabel="servo [deg]", ylabel="[deg]", xlim=(x[0], x[-1]))
 
 

@@ -1,4 +1,4 @@
-"""The new rig as a file: to lay over a configuration (`--overlay`), to include in one, or to import with (`--rig`).
+"""The calibrated rig as a file, for `--overlay`, for `include:` in a configuration, or for `--rig`.
 
 Source: ours; the format of configs/rigs/standard.yaml.
 """
@@ -16,31 +16,31 @@ from stages.calibration.result import Finding
 from stages.geometry.frames import LidarMount, Pose
 
 DIGITS = 7
-TAKEN_BACK = (
+ZERO_NOTE = (
     "# A zero that differs from that takes back the mean of the encoder's error, which nothing tells from a zero."
 )
 
 
 def rig_text(rig: dict[str, Any], found: Calibration, source: str) -> str:
-    """The whole rig file: what was known, with the LiDAR's mount as it was found, and a line for each number."""
+    """The whole rig file: the old rig with the calibrated LiDAR mount, and a comment line for each parameter."""
     new = copy.deepcopy(rig)
     new["lidar"]["mount"] = mount_tree(found.mount)
     head = [
         f"# Found by `grd calibrate {source}`; everything but lidar.mount is as it was.",
         "# To replay with it: grd replay RECORDING --overlay THIS_FILE; to fly: include it in place of the rig's file.",
-        *(f"# {said(finding)}" for finding in found.findings),
-        *(() if zero_told(found) else (TAKEN_BACK,)),
+        *(f"# {describe(finding)}" for finding in found.findings),
+        *(() if zero_found(found) else (ZERO_NOTE,)),
     ]
     return "\n".join([*head, yaml.safe_dump({"rig": new}, sort_keys=False, width=120)])
 
 
-def zero_told(found: Calibration) -> bool:
-    """Whether the servo's zero was found, by a wall."""
-    return not next(finding.refused for finding in found.findings if finding.name == "zero")
+def zero_found(found: Calibration) -> bool:
+    """Whether the servo's zero was estimated, from a wall."""
+    return not next(finding.rejected for finding in found.findings if finding.name == "zero")
 
 
 def mount_tree(mount: LidarMount) -> dict[str, Any]:
-    """A mount as YAML values; every key is there, so that laid over another rig nothing of that one shows through."""
+    """A mount as YAML values with every key, so that as an overlay it replaces another mount completely."""
     return {
         "T_vehicle_turntable": pose_tree(mount.T_vehicle_turntable),
         "T_turntable_lidar": pose_tree(mount.T_turntable_lidar),
@@ -62,7 +62,7 @@ def mount_tree(mount: LidarMount) -> dict[str, Any]:
 
 
 def pose_tree(pose: Pose) -> dict[str, Any]:
-    """A pose as YAML values, the way of writing the rotation that is not used as null."""
+    """A pose as YAML values; the rotation format that is not used is null."""
     return {
         "xyz_m": [round(value, DIGITS) for value in pose.xyz_m],
         "rpy_deg": None if pose.rpy_deg is None else list(pose.rpy_deg),
@@ -70,10 +70,10 @@ def pose_tree(pose: Pose) -> dict[str, Any]:
     }
 
 
-def said(finding: Finding) -> str:
+def describe(finding: Finding) -> str:
     """A finding in one line."""
-    if finding.refused:
-        return f"{finding.what}: stays {finding.before:.4g} {finding.unit}: {finding.refused}"
+    if finding.rejected:
+        return f"{finding.what}: stays {finding.before:.4g} {finding.unit}: {finding.rejected}"
     digits = max(0, 1 - math.floor(math.log10(max(finding.sigma, 1e-9))))
     return (
         f"{finding.what}: {finding.after:.{digits}f} +- {finding.sigma:.{digits}f} {finding.unit} "

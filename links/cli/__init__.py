@@ -1,7 +1,4 @@
-"""The command `grd`: thin commands over flow, stages and links. Exit codes: 0 ok, 1 a finding, 2 wrong use.
-
-Source: DESIGN, Command line.
-"""
+"""The command `grd`. Exit codes: 0 success, 1 failed run or check, 2 usage or configuration error."""
 
 from links.cli.app import main
 

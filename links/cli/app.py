@@ -1,6 +1,6 @@
-"""The commands of `grd`, put together.
+"""The command line application `grd` and its commands.
 
-Source: DESIGN, Command line.
+Source: ours.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from links.cli.verify import verify
 
 app = typer.Typer(
     name="grd",
-    help="Where is the drone, relative to the vehicle? Runs, replays, checks and makes recordings.",
+    help="Pose of a drone relative to a moving ground vehicle: run live, replay, check, simulate, evaluate.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -1,4 +1,4 @@
-"""`grd calibrate`: how the LiDAR sits on its servo, found from a sweep of a parked vehicle.
+"""`grd calibrate`: the LiDAR's mount on its servo, estimated from a sweep of a parked vehicle.
 
 Source: DESIGN, Command line; the maths is in `stages/calibration`.
 """
@@ -15,19 +15,19 @@ from rich.table import Table
 from rich.text import Text
 
 from flow.link import LinkError
-from links.cli.console import FINDING, err, in_words, out, progress_bar, show_table, warn
+from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, show_table, warn
 from links.cli.files import read_rig
 
-if TYPE_CHECKING:  # scipy and numba are loaded when it runs
+if TYPE_CHECKING:  # scipy and numba are imported when the command runs
     from links.calibration import Gathered
     from stages.calibration.calibrate import Calibration
 
 ROUNDING_DEG = 1e-6
-STILL_M = 0.05  # of the vehicle's own odometry over the whole time: so little shows that it stood
-DRIFT_MPS = 0.02  # and this much more may be the odometry's drift: the surfaces tell then
+STILL_M = 0.05  # motion by the vehicle's odometry below which it stood still
+DRIFT_MPS = 0.02  # allowed drift of the odometry; the surfaces decide then
 
 
-@in_words
+@report_errors
 def calibrate_recording(
     recording: Annotated[
         Path, typer.Argument(help="A recording in which the vehicle stands still and the servo sweeps.")
@@ -48,7 +48,7 @@ def calibrate_recording(
             min=0.02,
             max=1.0,
             metavar="DEG",
-            help="The vehicle stands level on the ground about it, within DEG (one sigma): tells the axis's tilt.",
+            help="The vehicle stands level on the ground about it, within DEG (one sigma): gives the axis's tilt.",
         ),
     ] = None,
     parallel_deg: Annotated[
@@ -58,7 +58,7 @@ def calibrate_recording(
             min=0.02,
             max=1.0,
             metavar="DEG",
-            help="The vehicle stands parallel to the wall beside it, within DEG (one sigma): tells the servo's zero.",
+            help="The vehicle stands parallel to the wall beside it, within DEG (one sigma): gives the servo's zero.",
         ),
     ] = None,
     from_s: Annotated[float, typer.Option("--from", min=0, help="Second of RECORDING to begin at.")] = 0.0,
@@ -67,15 +67,16 @@ def calibrate_recording(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output files.")] = False,
 ) -> None:
-    """Find how the LiDAR sits on its servo, from surfaces that a sweep of RECORDING sees more than once.
+    """Estimate the LiDAR's mount on its servo, from surfaces that a sweep of RECORDING observes more than once.
 
-    Tilt and place on the servo's axis, the encoder's error, the play of the gear and the servo's time offset, each with
-    a sigma; what the sweep or the scene cannot tell stays as it is, with the reason. Writes a new rig file and, where
-    matplotlib is installed, figures next to it (.svg). The vehicle must stand still. Best is a sweep there and back at
-    two speeds near walls. Exit code 1 when nothing could be told, then nothing is written.
+    Estimates tilt and offset from the servo's axis, the encoder error, the gear play and the servo's time offset, each
+    with a sigma. A parameter that the sweep or the scene does not determine keeps its value, with the reason. Writes a
+    new rig file and, where matplotlib is installed, figures next to it (.svg). The vehicle must stand still. A sweep in
+    both directions at two speeds near walls is best. Exit code 1 if no calibration is possible, and no file is written.
 
-    The servo's zero, and how its axis is tilted in the vehicle, no sweep tells by itself: say how the vehicle stands
-    with --parallel and --level. Front and rear wheel equally far from a wall within 5 mm are parallel within .15 deg.
+    The servo's zero and the tilt of its axis in the vehicle are not observable from a sweep: give the vehicle's
+    orientation with --parallel and --level. Front and rear wheel equally far from a wall within 5 mm are parallel
+    within 0.15 deg.
 
     Example: grd calibrate parked.mcap -o rig.yaml && grd replay flight.mcap --overlay rig.yaml
     """
@@ -97,13 +98,13 @@ def calibrate_recording(
         gathered = gather(recording, rig_yaml, (from_s, math.inf if to_s is None else to_s), progress=step)
     for text in gathered.warnings:
         warn(text)
-    said = Standing(*(None if deg is None else math.radians(deg) for deg in (level_deg, parallel_deg)))
+    standing = Standing(*(None if deg is None else math.radians(deg) for deg in (level_deg, parallel_deg)))
     try:
-        found = stand(_calibrated(gathered, parked), gathered.mount, said)
+        found = stand(_calibrated(gathered, parked), gathered.mount, standing)
     except CannotCalibrate as why:
         err.print(f"{recording}: {why}.", markup=False, style="red")
-        raise typer.Exit(FINDING) from None
-    _tell(recording.name, found, gathered)
+        raise typer.Exit(EXIT_FAILED) from None
+    _report(recording.name, found, gathered)
     target.write_text(rig_text(gathered.rig, found, recording.name), encoding="utf-8")
     out.print(f"rig         {target}   (use it: grd replay RECORDING --overlay {target})", markup=False)
     if importlib.util.find_spec("matplotlib") is None:
@@ -116,7 +117,7 @@ def calibrate_recording(
 
 
 def _calibrated(gathered: Gathered, parked: bool) -> Calibration:
-    """What the sweep tells. CannotCalibrate, also of a vehicle that drove by its own odometry."""
+    """The calibration. Raises CannotCalibrate, also if the vehicle moved by its own odometry."""
     from stages.calibration.calibrate import CannotCalibrate, calibrate
 
     if gathered.driven_m is not None and gathered.driven_m > STILL_M + DRIFT_MPS * gathered.seconds:
@@ -128,9 +129,9 @@ def _calibrated(gathered: Gathered, parked: bool) -> Calibration:
     return calibrate(gathered.returns, gathered.trace, gathered.mount, parked=stood)
 
 
-def _tell(recording: str, found: Calibration, gathered: Gathered) -> None:
-    """What was found, how surely, and what was not."""
-    from links.calibration import zero_told
+def _report(recording: str, found: Calibration, gathered: Gathered) -> None:
+    """Print the parameters with their sigmas, and why others were rejected."""
+    from links.calibration import zero_found
 
     parts = f" of the {gathered.parts} parts of {recording}" if gathered.parts > 1 else ""
     table = Table(
@@ -139,21 +140,21 @@ def _tell(recording: str, found: Calibration, gathered: Gathered) -> None:
     for head in ("", "before", "found", "sigma", ""):
         table.add_column(Text(head), justify="left" if not head else "right")
     for f in found.findings:
-        after = "-" if f.refused else f"{f.after:.4f}"
+        after = "-" if f.rejected else f"{f.after:.4f}"
         table.add_row(Text(f.what), f"{f.before:.4f}", after, f"{f.sigma:.4f}", f.unit)
     show_table(table)
     for f in found.findings:
-        if f.refused:
-            out.print(f"{f.what} stays as it is: {f.refused}", markup=False)
-    taken_back_deg = found.mount.servo_zero_deg - gathered.mount.servo_zero_deg
-    if abs(taken_back_deg) > ROUNDING_DEG and not zero_told(found):
+        if f.rejected:
+            out.print(f"{f.what} stays as it is: {f.rejected}", markup=False)
+    zero_change_deg = found.mount.servo_zero_deg - gathered.mount.servo_zero_deg
+    if abs(zero_change_deg) > ROUNDING_DEG and not zero_found(found):
         out.print(
             f"the zero is written as {found.mount.servo_zero_deg:.4f} deg: it takes back the mean of the encoder's "
             "error, so that the sweep as a whole points where it pointed before"
         )
     out.print(
         f"the rig takes the servo's angle as known to {found.mount.pointing_sigma_deg:.2f} deg, "
-        f"{'the zero found' if zero_told(found) else 'a zero set by eye'} in it"
+        f"{'the zero found' if zero_found(found) else 'a zero set by eye'} in it"
     )
     before_mm, after_mm = (1e3 * t for t in found.thickness.medians_m)
     out.print(

@@ -1,4 +1,4 @@
-"""What all commands share: the two consoles, errors in words with an exit code, a progress bar, tables.
+"""Parts of all commands: the two consoles, errors with exit codes, a progress bar, tables.
 
 Source: ours.
 """
@@ -21,9 +21,9 @@ from flow.config_error import ConfigError
 from flow.link import LinkError
 from flow.ports import RunError
 
-FINDING, WRONG_USE = 1, 2
-BAR_AFTER_S = 1.0  # anything that takes longer than 2 s shows a bar before that
-NO_WINDOW = 100_000  # columns
+EXIT_FAILED, EXIT_USAGE = 1, 2
+BAR_DELAY_S = 1.0
+UNBOUNDED_WIDTH = 100_000  # columns
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -31,27 +31,29 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def in_words(command: F) -> F:
-    """Errors that are the user's to mend become a text and exit code 2 (1 when a stage failed), without a traceback."""
+def report_errors(command: F) -> F:
+    """Decorator of a command: prints configuration and link errors without a traceback.
+
+    Exit code 2; 1 when a stage failed."""
 
     @functools.wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
         try:
             return command(*args, **kwargs)
         except ConfigError as error:
-            for problem in error.errors:
-                err.print(str(problem), markup=False, style="red")
-            raise typer.Exit(WRONG_USE) from None
+            for config_error in error.errors:
+                err.print(str(config_error), markup=False, style="red")
+            raise typer.Exit(EXIT_USAGE) from None
         except LinkError as error:
             err.print(str(error), markup=False, style="red")
-            raise typer.Exit(WRONG_USE) from None
+            raise typer.Exit(EXIT_USAGE) from None
         except RunError as error:
             err.print(str(error), markup=False, style="red")
-            raise typer.Exit(FINDING) from error
+            raise typer.Exit(EXIT_FAILED) from error
         except OSError as error:
             where = f"{error.filename}: " if error.filename else ""
             err.print(f"{where}{error.strerror or error}.", markup=False, style="red")
-            raise typer.Exit(WRONG_USE) from None
+            raise typer.Exit(EXIT_USAGE) from None
         except KeyboardInterrupt:
             err.print("stopped.")
             raise typer.Exit(130) from None
@@ -61,7 +63,7 @@ def in_words(command: F) -> F:
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
-    """`with progress_bar("replay") as step: step(done, total)`: a bar on stderr once the work has taken a second."""
+    """`with progress_bar("replay") as step: step(done, total)`: a bar on stderr, shown after BAR_DELAY_S."""
     begin = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=err, transient=True, refresh_per_second=5)
@@ -71,7 +73,7 @@ def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
     def step(done: float, total: float) -> None:
         nonlocal shown
         if not shown:
-            if time.monotonic() - begin < BAR_AFTER_S:
+            if time.monotonic() - begin < BAR_DELAY_S:
                 return
             bar.start()
             shown = True
@@ -85,11 +87,11 @@ def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
 
 
 def warn(text: str) -> None:
-    """A warning on stderr."""
+    """Print a warning on stderr."""
     err.print(f"warning: {text}", markup=False, style="yellow")
 
 
 def show_table(table: Table) -> None:
-    """As wide as its cells are, also where the window, or a pipe's 80 columns, is narrower: no number is cut."""
-    table.width = Measurement.get(out, out.options.update(width=NO_WINDOW), table).maximum
+    """Print a table as wide as its cells, even in a narrower window or a pipe, so that no number is cut."""
+    table.width = Measurement.get(out, out.options.update(width=UNBOUNDED_WIDTH), table).maximum
     out.print(table, crop=False)

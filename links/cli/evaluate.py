@@ -12,14 +12,14 @@ from typing import Annotated
 import typer
 
 from flow.link import LinkError
-from links.cli.console import FINDING, in_words
+from links.cli.console import EXIT_FAILED, report_errors
 from links.evaluation.association import EvaluationLimits
 
 JSON_FILE, DEFAULTS = "evaluation.json", EvaluationLimits()
 NEEDED = ("pandas", "matplotlib")  # evo is optional: without it its metrics are not evaluated
 
 
-@in_words
+@report_errors
 def evaluate_runs(
     runs: Annotated[list[Path], typer.Argument(help="Folders written by `grd run` or `grd replay`, or TUM files.")],
     against: Annotated[
@@ -89,4 +89,4 @@ def evaluate_runs(
     files = Files(None if folder is None else folder / JSON_FILE, report, csv_file, tables_file)
     compare_and_show(own, others, keys, files)
     if any(e.findings for e in own):
-        raise typer.Exit(FINDING)
+        raise typer.Exit(EXIT_FAILED)

@@ -13,18 +13,18 @@ import yaml
 from pydantic import ValidationError
 
 from flow.link import LinkError
-from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
 from stages.geometry.frames import LidarMount
 
 MAX_RIG_BYTES = 100_000
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
 
-@in_words
+@report_errors
 def import_recording(
     file: Annotated[Path, typer.Argument(help="A VLP-16 capture (.pcap) or a MAVLink log (.tlog).")],
     out_file: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Recording to write [default: beside FILE].")
+        Path | None, typer.Option("--out", "-o", help="Recording to write [default: next to FILE].")
     ] = None,
     rig: Annotated[
         Path | None, typer.Option("--rig", help="rig.yaml to attach [default for .pcap: bolted upright].")
@@ -35,7 +35,7 @@ def import_recording(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Make a recording of a capture or a telemetry log.
+    """Convert a capture or a telemetry log to a recording.
 
     Example: grd import flight.pcap -o flight.mcap --rig configs/rigs/standard.yaml
     """
@@ -49,13 +49,16 @@ def import_recording(
     for text in report.warnings:
         warn(text)
     for reason, count in report.skipped.items():
-        warn(f"{count} left out: {reason}")
+        warn(f"{count} skipped: {reason}")
     topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())
     out.print(f"{report.path}: {topics}", markup=False)
 
 
 def read_rig(file: Path) -> str:
-    """A rig file's text as recordings hold it; a configuration's `rig:` section will do. LinkError: what is wrong."""
+    """Text of a rig file, or of the `rig:` section of a configuration, as recordings store it.
+
+    Raises LinkError when it is not a rig.
+    """
     with file.open("rb") as stream:
         data = stream.read(MAX_RIG_BYTES + 1)
     try:
@@ -75,7 +78,7 @@ def read_rig(file: Path) -> str:
     return yaml.safe_dump(rig, sort_keys=False)
 
 
-@in_words
+@report_errors
 def recover_recording(
     file: Annotated[Path, typer.Argument(help="An unfinished or damaged recording.")],
     out_file: Annotated[
@@ -98,34 +101,32 @@ def recover_recording(
     topics = ", ".join(f"{count} on {topic}" for topic, count in report.topics.items())
     out.print(f"{report.path}: {topics}", markup=False)
     if report.warnings:
-        raise typer.Exit(FINDING)
+        raise typer.Exit(EXIT_FAILED)
 
 
-@in_words
+@report_errors
 def view(
     rrd: Annotated[Path, typer.Argument(help="The run.rrd of a run.")],
-    picture: Annotated[
+    png: Annotated[
         Path | None,
-        typer.Option("--screenshot", help="Write a picture instead of opening a window (no screen needed)."),
+        typer.Option("--screenshot", help="Write an image instead of opening a window (no display needed)."),
     ] = None,
-    at: Annotated[
-        float, typer.Option("--at", min=0, max=1, help="Moment of the picture, as a fraction of the run.")
-    ] = 0.9,
+    at: Annotated[float, typer.Option("--at", min=0, max=1, help="Time of the image, as a fraction of the run.")] = 0.9,
 ) -> None:
-    """Open a run in the Rerun viewer, or draw it.
+    """Open a run in the Rerun viewer, or write a screenshot of it.
 
-    With --screenshot a picture is written; exit code 1 when a view has errors.
+    With --screenshot the exit code is 1 when a view has errors.
 
     Example: grd view out/street_sweep-replay/run.rrd --screenshot run.png
     """
     from links.viewer import screenshot, show
 
-    if picture is None:
+    if png is None:
         show(rrd)
         return
-    complaints = screenshot(rrd, picture, at=at)
-    for text in complaints:
+    errors = screenshot(rrd, png, at=at)
+    for text in errors:
         err.print(text, markup=False, style="red")
-    out.print(f"wrote {picture}", markup=False)
-    if complaints:
-        raise typer.Exit(FINDING)
+    out.print(f"wrote {png}", markup=False)
+    if errors:
+        raise typer.Exit(EXIT_FAILED)

@@ -1,4 +1,4 @@
-"""`grd check`, `grd graph`, `grd schema`: look at a configuration without running it.
+"""`grd check`, `grd graph`, `grd schema`: inspect a configuration without running it.
 
 Source: DESIGN, flow.
 """
@@ -18,7 +18,7 @@ from flow.config.hosts_file import load_hosts
 from flow.config.schema import schema as schema_of
 from flow.config_error import ConfigError
 from flow.graph import Graph, load_graph
-from links.cli.console import FINDING, WRONG_USE, err, in_words, out
+from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, report_errors
 from links.cli.run import Overlay, Sets
 from links.zenoh import host_graph
 
@@ -28,17 +28,17 @@ HostsFile = Annotated[Path | None, typer.Option("--hosts", help="A hosts file: w
 
 
 class Format(StrEnum):
-    """How to draw."""
+    """Output format of `grd graph`."""
 
     MERMAID = "mermaid"
     SVG = "svg"
 
 
-@in_words
+@report_errors
 def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: HostsFile = None) -> None:
-    """Say everything that is wrong with CONFIG, and with the hosts file where one is given.
+    """Report all errors of CONFIG and of the hosts file.
 
-    Each problem with its line and a suggestion; exit code 1 when there is one.
+    Each error has its line and a suggestion; the exit code is 1 when there is one.
 
     Example: grd check configs/paper.yaml --set track.radius_m=0.8
     """
@@ -46,19 +46,19 @@ def check(config: Config, overlay: Overlay = None, sets: Sets = None, hosts: Hos
         graph = load_graph(config, overlay or (), sets or ())
         placed = load_hosts(hosts, graph) if hosts is not None else None
     except ConfigError as error:
-        for problem in error.errors:
-            err.print(str(problem), markup=False, style="red")
-        raise typer.Exit(FINDING) from None
+        for entry in error.errors:
+            err.print(str(entry), markup=False, style="red")
+        raise typer.Exit(EXIT_FAILED) from None
     stages = sum(spec.kind == "stages" for spec in graph.nodes.values())
     out.print(f"{config}: {stages} stages, {len(graph.nodes) - stages} links, {len(graph.edges)} edges, no problems")
     for text in graph.left_out_texts():
         out.print(text, markup=False)
     if placed is not None:
-        _tell_hosts(placed)
+        _print_hosts(placed)
 
 
-def _tell_hosts(hosts: Hosts) -> None:
-    """What each host runs and sends."""
+def _print_hosts(hosts: Hosts) -> None:
+    """Print what each host runs and sends."""
     for name in hosts.hosts:
         nodes = [node for node in hosts.graph.nodes if hosts.placement[node] == name]
         hub = ", the hub" if name == hosts.hub else ""
@@ -68,10 +68,10 @@ def _tell_hosts(hosts: Hosts) -> None:
                 out.print(f"  to {hop.receiver}: {hop.producer}.{hop.output} ({hop.queue})", markup=False)
 
 
-@in_words
+@report_errors
 def graph(
     config: Config,
-    format: Annotated[Format, typer.Option("--format", help="Mermaid text or an SVG picture.")] = Format.MERMAID,
+    format: Annotated[Format, typer.Option("--format", help="Mermaid text or an SVG image.")] = Format.MERMAID,
     out_file: OutFile = None,
     overlay: Overlay = None,
     sets: Sets = None,
@@ -85,10 +85,10 @@ def graph(
     checked = load_graph(config, overlay or (), sets or ())
     if host is not None and hosts is None:
         err.print("--host NAME needs --hosts FILE")
-        raise typer.Exit(WRONG_USE)
+        raise typer.Exit(EXIT_USAGE)
     if hosts is not None and host is None and format is Format.SVG:
-        err.print("an SVG shows one host: say --host NAME, or draw all of them as mermaid")
-        raise typer.Exit(WRONG_USE)
+        err.print("an SVG shows one host: add --host NAME, or draw all hosts as Mermaid")
+        raise typer.Exit(EXIT_USAGE)
     if hosts is not None and host is not None:
         checked = host_graph(checked, hosts, host)
     boxes = _boxes(checked, load_hosts(hosts, checked)) if hosts is not None and host is None else ""
@@ -104,7 +104,7 @@ def _boxes(graph: Graph, hosts: Hosts) -> str:
     return "\n".join(lines) + "\n"
 
 
-@in_words
+@report_errors
 def schema(out_file: OutFile = None) -> None:
     """Write the JSON Schema of the YAML files, for editors.
 

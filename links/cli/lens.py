@@ -1,4 +1,4 @@
-"""`grd lens`: the lens of a camera, as a calibration program wrote it, as a rig file.
+"""`grd lens`: converts a camera lens from a calibration program's file to a rig file.
 
 Source: DESIGN, Command line; the programs' formats are in `stages/lens_files`.
 """
@@ -12,7 +12,7 @@ import typer
 import yaml
 
 from flow.link import LinkError
-from links.cli.console import in_words, out
+from links.cli.console import out, report_errors
 from links.cli.files import Overwrite
 from stages.geometry.lens_files import CalibratedLens, LensFileError, lens_from_kalibr, lens_from_ocamcalib
 from stages.messages import CameraMount
@@ -20,7 +20,7 @@ from stages.messages import CameraMount
 MAX_BYTES = 1_000_000
 
 
-@in_words
+@report_errors
 def import_lens(
     file: Annotated[Path, typer.Argument(help="Kalibr's camchain.yaml, or OCamCalib's calib_results.txt.")],
     camera_mount: Annotated[CameraMount, typer.Argument(help="Which camera of the rig it is.")],
@@ -41,8 +41,8 @@ def import_lens(
 ) -> None:
     """Write the lens in FILE as a rig file, to include in a configuration after its rig.
 
-    It holds the numbers: FILE is not needed any more. What else the rig says of the camera stays, so draw `masked_px`
-    and say `max_off_axis_deg` for pictures of this lens.
+    The rig file contains the lens parameters; FILE is not needed afterwards. The other camera settings of the rig stay:
+    set `masked_px` and `max_off_axis_deg` for images of this lens.
 
     Example: grd lens camchain.yaml vehicle --camera cam0 -o configs/rigs/vehicle_lens.yaml
     """
@@ -55,20 +55,19 @@ def import_lens(
     target.write_text(lens_text(found, camera_mount, file.name), encoding="utf-8")
     lens, size_px = found
     width, height = size_px or (None, None)
-    size = f"{width} x {height} px" if size_px else "the file does not say for which size of pictures"
+    size = f"{width} x {height} px" if size_px else "the file does not state the image size"
     out.print(f"lens        {lens.model}, up to {lens.max_off_axis_deg:g} deg off axis, {size}", markup=False)
     out.print(
         f"rig         {target}   (to fly: include it after the rig; or grd replay --overlay {target})", markup=False
     )
     if width != height:
         out.print(
-            f"size_px is left open: say size_px: [{width}, {height}] in the config of camera_{camera_mount.value}",
+            f"size_px is not set: set size_px: [{width}, {height}] in the config of camera_{camera_mount.value}",
             markup=False,
         )
     out.print(
         f"check       cameras.{camera_mount.value}.masked_px, .max_off_axis_deg and .readout_ms (rolling shutter) are "
-        "still "
-        "those of the rig below it",
+        "still those of the rig below it",
         soft_wrap=True,
     )
 

@@ -1,4 +1,4 @@
-"""What the console shows while a run is live: a table on a terminal, a line now and then elsewhere (a log, systemd).
+"""Console display of a live run: a table on a terminal, a line every few seconds otherwise (a log file, systemd).
 
 Source: ours.
 """
@@ -19,14 +19,14 @@ from flow.link import Tap
 from flow.live.report import LiveReport
 from flow.message import Message
 from links.cli.console import err, out
-from links.runs.live_run import Look
-from stages.messages import DroneFix, RelativePose, TrackState
+from links.runs.live_run import RunStatus
+from stages.messages import DroneFix, PositionEstimate, RelativePose, TrackState
 
-SCREEN_S, LINE_S = 0.25, 5.0
+SCREEN_PERIOD_S, LINE_PERIOD_S = 0.25, 5.0
 SHOWN = (RelativePose, DroneFix, TrackState)
 
 
-class Newest(Tap):
+class LatestMessages(Tap):
     """Keeps the newest message of each kind that the console shows."""
 
     def __init__(self) -> None:
@@ -34,15 +34,15 @@ class Newest(Tap):
         self._messages: dict[type[Message], Any] = {}
 
     def wants(self, message: type[Message]) -> bool:
-        """The kinds that are shown."""
+        """Only messages that the console shows."""
         return message in SHOWN
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
-        """Keep it."""
+        """Store the message."""
         self._messages[type(message)] = message
 
-    def now(self) -> tuple[str, str]:
-        """State and pose in words, of the best there is: the fused pose, else the track and its last fix."""
+    def state_and_pose(self) -> tuple[str, str]:
+        """Texts of the state and the pose: those of the fused pose, without one those of the track and its last fix."""
         pose: RelativePose | None = self._messages.get(RelativePose)
         if pose is not None:
             return f"{pose.state.name}: {pose.reason}", _pose(pose)
@@ -53,27 +53,26 @@ class Newest(Tap):
 
 
 def _pose(pose: RelativePose) -> str:
-    if pose.xyz_vehicle_m is None:
+    estimate = pose.estimate
+    if estimate is None:
         return ""
-    sigma_m2 = None if pose.covariance is None else pose.covariance[3:, 3:]
-    text = _position(pose.xyz_vehicle_m, sigma_m2)
-    if pose.R_vehicle_drone is not None:
-        R = pose.R_vehicle_drone
-        text += f"  yaw {np.degrees(np.arctan2(R[1, 0], R[0, 0])):.1f} deg"
-    return text
+    if isinstance(estimate, PositionEstimate):
+        return _position(estimate.xyz_vehicle_m, estimate.covariance_vehicle_m2)
+    text = _position(estimate.xyz_vehicle_m, estimate.covariance[3:, 3:])
+    R = estimate.R_vehicle_drone
+    return f"{text}  yaw {np.degrees(np.arctan2(R[1, 0], R[0, 0])):.1f} deg"
 
 
 def _position(xyz_m: Any, covariance_m2: Any) -> str:
     x, y, z = xyz_m
-    sigma = "" if covariance_m2 is None else f"  sigma {float(np.trace(covariance_m2)) ** 0.5:.2f} m"
-    return f"x {x:.2f}  y {y:.2f}  z {z:.2f} m{sigma}"
+    return f"x {x:.2f}  y {y:.2f}  z {z:.2f} m  sigma {float(np.trace(covariance_m2)) ** 0.5:.2f} m"
 
 
 class LiveView:
-    """`with LiveView() as view`: `view.newest` is a tap of the run, `view.show` is told how it goes."""
+    """`with LiveView() as view`: `view.latest` is a tap of the run, `view.show` displays its status."""
 
     def __init__(self, console: Console = out) -> None:
-        self.newest = Newest()
+        self.latest = LatestMessages()
         self._console = console
         self._screen = Screen(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
         self._next_s = 0.0
@@ -89,31 +88,31 @@ class LiveView:
         if self._screen is not None:
             self._screen.stop()
 
-    def show(self, look: Look) -> None:
-        """News at once; the rest some times a second on a terminal, else each few seconds."""
-        for text in look.news:
+    def show(self, status: RunStatus) -> None:
+        """Print new events at once; the status every SCREEN_PERIOD_S on a terminal, otherwise every LINE_PERIOD_S."""
+        for text in status.new_events:
             (self._console if self._screen is not None else err).print(text, markup=False, style="yellow")
         now_s = time.monotonic()
         if now_s < self._next_s:
             return
         if self._screen is not None:
-            self._next_s = now_s + SCREEN_S
-            self._screen.update(self._table(look), refresh=True)
+            self._next_s = now_s + SCREEN_PERIOD_S
+            self._screen.update(self._table(status), refresh=True)
         else:
-            self._next_s = now_s + LINE_S
-            self._console.print(self._line(look), markup=False)
+            self._next_s = now_s + LINE_PERIOD_S
+            self._console.print(self._line(status), markup=False)
 
-    def _line(self, look: Look) -> str:
-        report = look.report()
-        state, pose = self.newest.now()
+    def _line(self, status: RunStatus) -> str:
+        report = status.report()
+        state, pose = self.latest.state_and_pose()
         closed = [f"{name} {link.state}" for name, link in report.links.items() if link.state != "open"]
-        parts = [f"{look.since_s:.1f} s", state, pose, _numbers(report), *closed]
+        parts = [f"{status.elapsed_s:.1f} s", state, pose, _numbers(report), *closed]
         return "; ".join(part for part in parts if part)
 
-    def _table(self, look: Look) -> Group:
-        report = look.report()
-        state, pose = self.newest.now()
-        head = Text(f"{look.since_s:8.1f} s   {state}\n             {pose}\n             {_numbers(report)}")
+    def _table(self, status: RunStatus) -> Group:
+        report = status.report()
+        state, pose = self.latest.state_and_pose()
+        head = Text(f"{status.elapsed_s:8.1f} s   {state}\n             {pose}\n             {_numbers(report)}")
         edges = Table("edge", "from", box=None, pad_edge=False)
         for name in ("lag [ms]", "p99", "max", "taken", "dropped", "late"):
             edges.add_column(Text(name), justify="right")
@@ -124,8 +123,8 @@ class LiveView:
             edges.add_row(name, edge.source, *numbers, *counts, style=bad)
         links = Table("link", "records", "state", box=None, pad_edge=False)
         for name, link in report.links.items():
-            told = ", ".join(f"{key} {value}" for key, value in report.counters.get(name, {}).items() if value)
-            links.add_row(name, str(link.records), Text(f"{link.state}  {told}", overflow="ellipsis", no_wrap=True))
+            counts = ", ".join(f"{key} {value}" for key, value in report.counters.get(name, {}).items() if value)
+            links.add_row(name, str(link.records), Text(f"{link.state}  {counts}", overflow="ellipsis", no_wrap=True))
         others = Table("others", "counts", box=None, pad_edge=False)
         for name, counted in report.counters.items():
             if name not in report.links and any(counted.values()):

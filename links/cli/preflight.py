@@ -15,20 +15,20 @@ import typer
 from rich.text import Text
 
 from flow.link import LinkError
-from links.cli.console import FINDING, err, in_words, out, progress_bar, warn
+from links.cli.console import EXIT_FAILED, err, out, progress_bar, report_errors, warn
 from links.cli.run import Overlay, Sets
 from links.preflight.check_result import CheckResult, Level, is_go
 from links.preflight.hand_motion import HandMotion
 from links.preflight.preflight import OUT_DIR, preflight_live, preflight_recording
 from links.recording import Session
 from links.runs.live_run import live_graph
-from links.runs.run_folder import Asked
+from links.runs.request import RunRequest
 
 COLOURS = {Level.OK: "green", Level.WARNING: "yellow", Level.FAIL: "red"}
 WORDS = {Level.OK: "ok", Level.WARNING: "look", Level.FAIL: "NO GO"}
 
 
-@in_words
+@report_errors
 def preflight(
     config: Annotated[Path, typer.Argument(help="The configuration to fly with, as configs/field.yaml.")],
     overlay: Overlay = None,
@@ -59,7 +59,7 @@ def preflight(
 
     Example: grd preflight configs/field.yaml --set lidar.bind=192.168.1.100 --set lidar.sender=192.168.1.201
     """
-    asked = Asked(config, tuple(overlay or ()), tuple(sets or ()))
+    asked = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
     if recording is None:
         results = _told(preflight_live(live_graph(asked), for_s, _wait, _ask if motion else None, step_s, out_dir))
     else:
@@ -72,10 +72,10 @@ def preflight(
         return
     names = ", ".join(v.name for v in failed)
     out.print(Text(f"NO-GO: {len(failed)} of {len(results)} checks failed ({names}){more}", style="bold red"))
-    raise typer.Exit(FINDING)
+    raise typer.Exit(EXIT_FAILED)
 
 
-def _on_recording(asked: Asked, recording: Path, motion: bool) -> list[CheckResult]:
+def _on_recording(asked: RunRequest, recording: Path, motion: bool) -> list[CheckResult]:
     session = Session(recording)
     graph = asked.graph(session.rig_yaml, f"{recording} (rig.yaml)")
     with progress_bar(f"look through {recording.name}") as step:

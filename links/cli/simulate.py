@@ -11,51 +11,51 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flow.link import LinkError
-from links.cli.console import FINDING, WRONG_USE, err, in_words, out, progress_bar, warn
+from links.cli.console import EXIT_FAILED, EXIT_USAGE, err, out, progress_bar, report_errors, warn
 from links.cli.files import Overwrite
 
-if TYPE_CHECKING:  # what simulates is installed where it is wanted
-    from links.simulated.matrix_flights import Cell
-    from links.simulated.matrix_making import MatrixReport
+if TYPE_CHECKING:  # the simulator is an optional dependency
+    from links.simulated.matrix.flights import Cell
+    from links.simulated.matrix.making import MatrixReport
 
 ClosedLoop = Annotated[
     Path | None,
-    typer.Option("--closed-loop", metavar="CONFIG", help="Configuration whose own aim turns the servo, in its time."),
+    typer.Option("--closed-loop", metavar="CONFIG", help="Configuration whose pipeline commands the servo."),
 ]
 
 
-@in_words
+@report_errors
 def simulate_recording(
     scenario: Annotated[Path, typer.Argument(help="Scenario file, as in configs/scenarios/.")],
     out_file: Annotated[Path, typer.Option("--out", "-o", help="Recording to write.")],
     seed: Annotated[
-        int | None, typer.Option("--seed", help="Another world and other noise [default: the scenario's].")
+        int | None, typer.Option("--seed", help="Seed of scene and noise [default: the scenario's].")
     ] = None,
     closed_loop: ClosedLoop = None,
     duration_s: Annotated[
         float | None,
         typer.Option("--duration", min=0.1, max=3600, help="Seconds to simulate [default: the scenario's]."),
     ] = None,
-    pictures: Annotated[
+    images: Annotated[
         Path | None,
         typer.Option(
-            "--pictures",
+            "--images",
             metavar="FROM.mcap",
-            help="Take the cameras' pictures from a recording of the same flight instead of painting them, which takes "
-            "most of the time. LiDAR, servo, radio and CONFIG may differ; what pictures show may not.",
+            help="Use the camera images of a recording of the same flight: rendering takes most of the time. LiDAR, "
+            "servo, radio and CONFIG may differ; settings that affect the images may not.",
         ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Make a recording of a simulated flight.
 
-    It holds the bytes that the sensors would have sent, and the truth beside them. The scenario's script turns the
-    servo, or in closed loop a configuration's own aim does.
+    The recording has the bytes that the sensors send, and the ground truth. The servo is commanded by the script of the
+    scenario or, in closed loop, by the pipeline of a configuration.
 
     Example: grd simulate configs/scenarios/experiment_1.yaml -o flight.mcap --closed-loop configs/sim.yaml --seed 3
     """
     try:
-        from links.simulated.run import simulate
+        from links.simulated.rig.run import simulate
     except ModuleNotFoundError as missing:
         raise _not_installed(missing) from None
 
@@ -68,37 +68,37 @@ def simulate_recording(
             progress=lambda done: step(done, 1.0),
             closed_loop=closed_loop,
             duration_s=duration_s,
-            pictures=pictures,
+            images=images,
         )
     out.print(str(report), markup=False)
 
 
-@in_words
+@report_errors
 def simulate_matrix(
-    folder: Annotated[Path, typer.Argument(help="Where the recordings go, one for each cell and seed.")],
-    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Make so many seeds of each cell.")] = 1,
-    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first of them.")] = 1,
+    folder: Annotated[Path, typer.Argument(help="Folder for the recordings, one per cell and seed.")],
+    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of seeds per cell.")] = 1,
+    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="First seed.")] = 1,
     only: Annotated[
         list[str] | None,
-        typer.Option("--only", help="Cells whose name matches, as in 'campus-*-orbit-parked'; may be repeated."),
+        typer.Option("--only", help="Cells whose name matches, as 'campus-*-orbit-parked'; may be repeated."),
     ] = None,
     pairs: Annotated[
-        bool, typer.Option("--pairs", help="Few cells in which each two of range, motion, vehicle and scene meet.")
+        bool, typer.Option("--pairs", help="Subset of cells that has any two of range, motion, vehicle and scene.")
     ] = False,
     closed_loop: ClosedLoop = None,
     calibrated: Annotated[
-        bool, typer.Option("--calibrated", help="The rig knows the error of the servo's encoder and its play.")
+        bool, typer.Option("--calibrated", help="The rig file has the encoder's error and the backlash of the servo.")
     ] = False,
-    as_built: Annotated[
+    perturbed: Annotated[
         bool,
         typer.Option(
-            "--as-built", help="Each flight's rig is not quite as its file says, its drone one of several kinds."
+            "--perturbed", help="Each flight has a rig that differs from its file, and a random kind of drone."
         ),
     ] = False,
-    odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle has odometry.")] = False,
-    rain: Annotated[bool, typer.Option("--rain", help="It rains, 5 mm/h.")] = False,
+    odometry: Annotated[bool, typer.Option("--odometry", help="The vehicle sends odometry.")] = False,
+    rain: Annotated[bool, typer.Option("--rain", help="Rain of 5 mm/h.")] = False,
     autopilot: Annotated[
-        bool, typer.Option("--autopilot", help="The drone tells over a radio how it flies, and flies by its dynamics.")
+        bool, typer.Option("--autopilot", help="The drone sends telemetry over a radio, and obeys flight dynamics.")
     ] = False,
     cameras_hz: Annotated[
         float | None,
@@ -107,26 +107,24 @@ def simulate_matrix(
             metavar="HZ",
             min=1,
             max=15,
-            help="Two fisheyes at this rate; at 720 px 0.8 s of a core a pair.",
+            help="Rate of two fisheyes; rendering a pair of 720 px images takes 0.8 s of a core.",
         ),
     ] = None,
     cameras_px: Annotated[
         int | None,
-        typer.Option("--pixels", min=64, max=1440, help="The fisheyes' pictures are this large. [default: 720]"),
+        typer.Option("--pixels", min=64, max=1440, help="Size of the fisheye images. [default: 720]"),
     ] = None,
     readout_ms: Annotated[
         float | None,
-        typer.Option(
-            "--readout", metavar="MS", min=0, max=60, help="Their rolling shutter, first to last row. [default: 0]"
-        ),
+        typer.Option("--readout", metavar="MS", min=0, max=60, help="Rolling shutter, first to last row. [default: 0]"),
     ] = None,
-    pictures: Annotated[
+    images: Annotated[
         Path | None,
         typer.Option(
-            "--pictures",
+            "--images",
             metavar="DIR",
-            help="Take the pictures from DIR's recordings of the same names; where one is missing or of another flight "
-            "that is an error (the same command without --pictures then paints what is left).",
+            help="Use the images of the recordings of the same names in DIR. It is an error if one is missing or shows "
+            "another flight (the same command without --images then renders the rest).",
         ),
     ] = None,
     results: Annotated[
@@ -134,74 +132,74 @@ def simulate_matrix(
         typer.Option(
             "--results",
             metavar="OUT",
-            help="Keep the closed loop's runs too, as OUT/<recording>-<config>: what `grd replay --config CONFIG` of "
-            "each recording leaves, without the second pass. No viewer file. For `grd evaluate OUT/*`.",
+            help="Keep the runs of the closed loop, as OUT/<recording>-<config>: the output of `grd replay --config "
+            "CONFIG` of each recording, without the second pass, without .rrd file. For `grd evaluate OUT/*`.",
         ),
     ] = None,
     jobs: Annotated[
-        int, typer.Option("--jobs", min=1, max=256, help="Processes to share the recordings; the outcome is the same.")
+        int, typer.Option("--jobs", min=1, max=256, help="Number of processes; it does not affect the recordings.")
     ] = 1,
-    list_only: Annotated[bool, typer.Option("--list", help="Name the cells; make none.")] = False,
+    list_only: Annotated[bool, typer.Option("--list", help="Print the names of the cells and exit.")] = False,
 ) -> None:
     """Make the recordings of the scenario matrix.
 
-    Range x motion x vehicle x scene, an occlusion, and a drone that leaves and returns; beside them an empty sky, two
-    drones, a drone to search for at 40 m, and drones at 50 m. Recordings that are there, complete and made alike (the
-    same scenario and all that CONFIG and its includes say) are kept, so it can be stopped and started again; changed
-    code is not noticed, take another DIR for it. When one cannot be made the others are made all the same, and it is
-    named in the end. Exit code 1 when a scene had no place for a cell or a stage failed, 2 when another thing did.
+    Range x motion x vehicle x scene, an occlusion, and a drone that leaves and returns; also an empty sky, two drones,
+    a drone to search for at 40 m, and drones at 50 m. Existing recordings are kept if they are complete and made in the
+    same way (the same scenario, and the same CONFIG with its includes), so the command can be interrupted and repeated.
+    Changed code is not detected: use another DIR after a change. A recording that fails does not stop the others.
+    Exit code 1 when a scene does not allow a cell or a stage failed, 2 for any other failure.
 
     Example: grd matrix out/matrix --only '*-empty-*' --closed-loop configs/sim.yaml --results out/runs --jobs 2
     """
     try:
-        from links.simulated.matrix import Conditions
-        from links.simulated.matrix_making import make_matrix
+        from links.simulated.matrix.making import make_matrix
+        from links.simulated.matrix.matrix import Conditions
     except ModuleNotFoundError as missing:
         raise _not_installed(missing) from None
 
     if results is not None and closed_loop is None:
-        raise LinkError("--results keeps the closed loop's runs: say whose with --closed-loop CONFIG")
-    of_cameras = {"--pictures": pictures, "--pixels": cameras_px, "--readout": readout_ms}
+        raise LinkError("--results keeps the runs of a closed loop: add --closed-loop CONFIG")
+    of_cameras = {"--images": images, "--pixels": cameras_px, "--readout": readout_ms}
     for option, value in of_cameras.items():
         if value is not None and cameras_hz is None:
-            raise LinkError(f"{option} is for recordings with cameras: say at which rate with --cameras HZ")
-    wanted = _cells(folder, only or ["*"], pairs)
+            raise LinkError(f"{option} is for recordings with cameras: add --cameras HZ")
+    selected = _cells(folder, only or ["*"], pairs)
     if list_only:
-        for cell in wanted:
+        for cell in selected:
             out.print(cell.name, markup=False)
         return
     size_px = cameras_px or Conditions.cameras_px
-    conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, as_built)
+    conditions = Conditions(calibrated, odometry, rain, autopilot, cameras_hz, size_px, readout_ms or 0.0, perturbed)
     several = range(first_seed, first_seed + seeds)
-    with progress_bar(f"{len(wanted) * seeds} recordings") as step:
-        report = make_matrix(folder, wanted, several, closed_loop, step, conditions, results, jobs, pictures)
-    _tell(folder, report)
+    with progress_bar(f"{len(selected) * seeds} recordings") as step:
+        report = make_matrix(folder, selected, several, closed_loop, step, conditions, results, jobs, images)
+    _report(folder, report)
 
 
 def _cells(folder: Path, patterns: list[str], pairs: bool) -> list[Cell]:
-    """Those of the matrix that are called so. LinkError: none is."""
-    from links.simulated.matrix import cells
+    """The cells whose name matches. LinkError when none does."""
+    from links.simulated.matrix.matrix import cells
 
-    wanted = cells(patterns, pairs)
-    if not wanted:
+    selected = cells(patterns, pairs)
+    if not selected:
         names = " or ".join(f"'{pattern}'" for pattern in patterns)
         few = " among the pairs" if pairs else ""
-        raise LinkError(f"no cell{few} is called like {names}; `grd matrix {folder} --list` names them all")
-    return wanted
+        raise LinkError(f"no cell{few} matches {names}; `grd matrix {folder} --list` prints all names")
+    return selected
 
 
-def _tell(folder: Path, report: MatrixReport) -> None:
-    """What was made, and by the exit code whether all was."""
+def _report(folder: Path, report: MatrixReport) -> None:
+    """Print the summary and exit with its code."""
     for text in report.impossible:
         warn(text)
     for failure in report.failed:
         err.print(failure.text, markup=False, style="red")
-    text = f"{folder}: {report.made} made, {report.kept} were there already"
+    text = f"{folder}: {report.made} made, {report.kept} kept"
     out.print(f"{text}; {report.replayed} of them replayed" if report.replayed else text, markup=False)
     if any(not failure.stage_failed for failure in report.failed):
-        raise typer.Exit(WRONG_USE)
+        raise typer.Exit(EXIT_USAGE)
     if report.impossible or report.failed:
-        raise typer.Exit(FINDING)
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _not_installed(missing: ModuleNotFoundError) -> LinkError:

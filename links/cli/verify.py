@@ -1,4 +1,4 @@
-"""`grd verify`: whether the committed recordings still give the output hashes that are pinned for them.
+"""`grd verify`: compares the output hashes of the committed recordings with the pinned ones.
 
 Source: ours.
 """
@@ -11,28 +11,26 @@ from typing import Annotated
 
 import typer
 
-from links.cli.console import FINDING, in_words, out, progress_bar
+from links.cli.console import EXIT_FAILED, out, progress_bar, report_errors
 from links.runs.output_hashes import Outcome, measure, read_pins, write_pins
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-@in_words
+@report_errors
 def verify(
     recordings: Annotated[
         list[str] | None, typer.Argument(help="Names in recordings/, without .mcap [default: all].")
     ] = None,
-    values: Annotated[
-        bool, typer.Option("--values", help="Compare values alone; texts for people may differ.")
-    ] = False,
+    values: Annotated[bool, typer.Option("--values", help="Compare values only; reason texts may differ.")] = False,
     update: Annotated[
-        bool, typer.Option("--update", help="Pin the hashes as they are now, in recordings/hashes.json.")
+        bool, typer.Option("--update", help="Write the current hashes to recordings/hashes.json.")
     ] = False,
-    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="Replays at a time [default: one a core].")] = None,
+    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="Parallel replays [default: one per core].")] = None,
 ) -> None:
     """Replay the committed recordings and compare their output hashes with recordings/hashes.json.
 
-    Exit code 1 when one differs, or is not pinned.
+    Exit code 1 when a hash differs or is not pinned.
 
     Example: grd verify street_sweep
     """
@@ -45,15 +43,15 @@ def verify(
             step(len(outcomes), len(pins))
     outcomes.sort(key=lambda outcome: (outcome.pin.recording.name, outcome.pin.config.name))
     for outcome in outcomes:
-        out.print(f"{outcome.pin.recording.stem:20} {outcome.pin.config.stem:10} {_in_words(outcome)}", markup=False)
+        out.print(f"{outcome.pin.recording.stem:20} {outcome.pin.config.stem:10} {_comparison(outcome)}", markup=False)
     if update:
         write_pins(folder, outcomes)
         out.print(f"pinned in {folder / 'hashes.json'}", markup=False)
     elif not all(outcome.values_match if values else outcome.matches for outcome in outcomes):
-        raise typer.Exit(FINDING)
+        raise typer.Exit(EXIT_FAILED)
 
 
-def _in_words(outcome: Outcome) -> str:
+def _comparison(outcome: Outcome) -> str:
     if outcome.matches:
         return f"{outcome.actual}  same"
     if outcome.pin.expected is None:

@@ -71,7 +71,7 @@ def read_true_drones(folder: Path, truth_file: Path | None) -> tuple[tuple[Drone
         empty_sky = NO_DRONE in first.header
         first, why = None, "there was no drone" if empty_sky else f"{path} is empty"
     drones = [_read_drone(folder, 1, first, why)]
-    while truth_file is None and (more := folder / results.of_drone(results.TRUTH_FILE, len(drones) + 1)).exists():
+    while truth_file is None and (more := folder / results.drone_file(results.TRUTH_FILE, len(drones) + 1)).exists():
         drones.append(_read_drone(folder, len(drones) + 1, read_tum(more), ""))
     return tuple(drones), empty_sky
 
@@ -83,7 +83,7 @@ def _read_drone(folder: Path, number: int, path: Trajectory | None, why_no_path:
         Source.VISIBILITY: "the recording does not hold when the drone was occluded",
     }
     returns, visible = (
-        folder / results.of_drone(name, number) for name in (results.TRUTH_HITS_FILE, results.TRUTH_VISIBLE_FILE)
+        folder / results.drone_file(name, number) for name in (results.TRUTH_RETURNS_FILE, results.TRUTH_VISIBLE_FILE)
     )
     return DroneTruth(path, _read_returns(returns), _read_occlusions(visible), missing)
 

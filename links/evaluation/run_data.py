@@ -262,8 +262,8 @@ def read_output(kind: OutputKind, folder: Path) -> Output:
         kind,
         poses,
         covariance[rows],
-        sendable=table.equals("good", "1")[rows] if "good" in table else None,
-        returns=table.whole_numbers("hits")[rows] if "hits" in table else None,
+        sendable=table.equals("accepted", "1")[rows] if "accepted" in table else None,
+        returns=table.whole_numbers("returns")[rows] if "returns" in table else None,
         track=None if track is None else track[rows],
         has_rotation=table.equals("rotation", "1")[rows] if "rotation" in table else None,
     )
@@ -292,9 +292,11 @@ def _read_searches(path: Path) -> tuple[Search, ...]:
 
 
 def _read_candidates(path: Path) -> pd.DataFrame:
-    table = TextTable(path, ("stamp_s", "candidate", "detector_life", "probability", *XYZ))
+    table = TextTable(path, ("stamp_s", "candidate", "detector_instance", "probability", *XYZ))
     names = (
-        pd.Series(table.text("detector_life"), dtype=object) + " " + pd.Series(table.text("candidate"), dtype=object)
+        pd.Series(table.text("detector_instance"), dtype=object)
+        + " "
+        + pd.Series(table.text("candidate"), dtype=object)
     )
     rows = pd.DataFrame(table.numbers(("probability", *XYZ)), columns=["probability", *XYZ])
     return rows.assign(stamp_ns=table.stamps_ns("stamp_s"), candidate=pd.factorize(names)[0])

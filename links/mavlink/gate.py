@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.messages import PoseState, RelativePose
+from stages.messages import PoseEstimate, PoseState, RelativePose
 
 AHEAD_NS = 50_000_000  # a pose further in the future has another clock
 SENDABLE = (PoseState.FULL, PoseState.COASTING)
@@ -45,7 +45,7 @@ class RejectReason(enum.Enum):
 
 
 class PoseLimits(BaseModel):
-    """Limits for sending a pose: one sigma of the worst axis, and age."""
+    """PoseLimits for sending a pose: one sigma of the worst axis, and age."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -59,16 +59,16 @@ def reject_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> Reject
     """Why the pose must not be sent now; None: it may be sent."""
     if pose.state not in SENDABLE:
         return RejectReason[pose.state.name]
-    rotations = pose.R_vehicle_drone, pose.R_map_drone
-    vectors = (pose.xyz_vehicle_m, pose.xyz_map_m, *rotations, pose.covariance, pose.map_covariance)
-    given = [vector.ravel() for vector in vectors if vector is not None]
-    if len(given) < len(vectors):
+    estimate = pose.estimate
+    if not isinstance(estimate, PoseEstimate):
         return RejectReason.INCOMPLETE
-    if not np.isfinite(np.concatenate(given)).all():
+    rotations = estimate.R_vehicle_drone, estimate.R_map_drone
+    vectors = (estimate.xyz_vehicle_m, estimate.xyz_map_m, *rotations, estimate.covariance, estimate.map_covariance)
+    if not np.isfinite(np.concatenate([vector.ravel() for vector in vectors])).all():
         return RejectReason.NOT_FINITE
-    if not all([_is_rotation(R) for R in rotations if R is not None]):
+    if not all([_is_rotation(R) for R in rotations]):
         return RejectReason.INVALID_ROTATION
-    worst = worst_sigmas(pose)
+    worst = worst_sigmas(estimate)
     if worst is None:
         return RejectReason.INVALID_COVARIANCE
     rotation_rad, position_m = worst
@@ -83,10 +83,8 @@ def reject_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> Reject
 
 
 @lru_cache(maxsize=1)  # used by the gate and for the message's quality
-def worst_sigmas(pose: RelativePose) -> tuple[float, float] | None:
-    """`pose_sigmas` of both covariances of a pose; None: one is missing or invalid."""
-    if pose.covariance is None or pose.map_covariance is None:
-        return None
+def worst_sigmas(pose: PoseEstimate) -> tuple[float, float] | None:
+    """`pose_sigmas` of both covariances of a pose; None: one is invalid."""
     return pose_sigmas(pose.covariance, pose.map_covariance)
 
 
@@ -106,10 +104,10 @@ def pose_sigmas(*covariances: NDArray[np.float64]) -> tuple[float, float] | None
     return math.sqrt(max(worst[: len(C)])), math.sqrt(max(worst[len(C) :]))
 
 
-def velocity_to_send(pose: RelativePose, limits: PoseLimits) -> NDArray[np.float64] | None:
-    """The drone's velocity over ground in start axes; None: unknown, invalid, or its sigma exceeds the limit."""
+def velocity_to_send(pose: PoseEstimate, limits: PoseLimits) -> NDArray[np.float64] | None:
+    """The drone's velocity over ground in map axes; None: invalid, or its sigma exceeds the limit."""
     velocity, covariance = pose.velocity_map_mps, pose.velocity_covariance
-    if velocity is None or covariance is None or not (np.isfinite(velocity).all() and np.isfinite(covariance).all()):
+    if not (np.isfinite(velocity).all() and np.isfinite(covariance).all()):
         return None
     if min(np.diagonal(covariance).tolist()) <= 0 or not _is_symmetric(covariance):
         return None

@@ -32,7 +32,7 @@ from links.mavlink.ned_frd import (
     upper_from_velocity_covariance,
     wxyz_from_R_odom_drone,
 )
-from stages.messages import RelativePose
+from stages.messages import PoseEstimate, RelativePose
 
 LOCAL_FRD, BODY_FRD = 20, 12  # MAV_FRAME: the only ones that ArduPilot accepts in ODOMETRY
 VIO = 3  # MAV_ESTIMATOR_TYPE_VIO: accepted by PX4, unlike LIDAR
@@ -40,7 +40,7 @@ VISION_OTHER = 3  # LANDING_TARGET_TYPE
 UNKNOWN = [math.nan] * 3
 
 
-def quality_percent(pose: RelativePose, limits: PoseLimits) -> int:
+def quality_percent(pose: PoseEstimate, limits: PoseLimits) -> int:
     """Quality, 1 (at the limit) to 100 (sigma 0), linear in the larger of the two ratios of sigma to limit."""
     sigmas = worst_sigmas(pose)
     if sigmas is None:
@@ -51,32 +51,34 @@ def quality_percent(pose: RelativePose, limits: PoseLimits) -> int:
 
 def odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits) -> Any:
     """ODOMETRY of a pose that the gate has accepted."""
-    xyz_m, R, covariance = _start_pose(pose)
-    velocity = velocity_to_send(pose, limits)
+    estimate = _estimate(pose)
+    R = estimate.R_map_drone
+    velocity = velocity_to_send(estimate, limits)
     return dialect().MAVLink_odometry_message(
         pose.stamp_ns // 1000,
         LOCAL_FRD,
         BODY_FRD,
-        *flip_yz(xyz_m),
+        *flip_yz(estimate.xyz_map_m),
         wxyz_from_R_odom_drone(R),
         *(UNKNOWN if velocity is None else flip_yz(R.T @ velocity)),
         *UNKNOWN,  # angular velocity: the autopilot's gyros are better
-        upper_from_pose_covariance(covariance, R),
-        _velocity_upper(pose.velocity_covariance if velocity is not None else None, R),
+        upper_from_pose_covariance(estimate.map_covariance, R),
+        _velocity_upper(estimate.velocity_covariance if velocity is not None else None, R),
         reset_counter % SEQUENCE,
         VIO,
-        quality_percent(pose, limits),
+        quality_percent(estimate, limits),
     )
 
 
 def vision_position_estimate(pose: RelativePose, reset_counter: int) -> Any:
     """VISION_POSITION_ESTIMATE of a pose that the gate has accepted; for ArduPilot only, PX4 assumes north."""
-    xyz_m, R, covariance = _start_pose(pose)
+    estimate = _estimate(pose)
+    R = estimate.R_map_drone
     return dialect().MAVLink_vision_position_estimate_message(
         pose.stamp_ns // 1000,
-        *flip_yz(xyz_m),
+        *flip_yz(estimate.xyz_map_m),
         *rpy_from_R_odom_drone(R),
-        upper_from_pose_covariance(covariance, R),
+        upper_from_pose_covariance(estimate.map_covariance, R),
         reset_counter % SEQUENCE,
     )
 
@@ -87,11 +89,10 @@ def landing_target(pose: RelativePose) -> Any:
     The angles are those of the line of sight from straight down about the body's x and y axes, as ArduPilot reads them
     when the position is not valid: (-tan angle_y, tan angle_x, 1). NaN when the vehicle is not below the drone.
     """
-    if pose.xyz_vehicle_m is None or pose.R_vehicle_drone is None:
-        raise ValueError("a landing target needs the drone's rotation")
-    x, y, z = flip_yz(-pose.R_vehicle_drone.T @ pose.xyz_vehicle_m).tolist()
+    estimate = _estimate(pose)
+    x, y, z = flip_yz(-estimate.R_vehicle_drone.T @ estimate.xyz_vehicle_m).tolist()
     angles = (math.atan2(y, z), math.atan2(-x, z)) if z > 0 else (math.nan, math.nan)
-    R_drone_vehicle = pose.R_vehicle_drone.T
+    R_drone_vehicle = estimate.R_vehicle_drone.T
     return dialect().MAVLink_landing_target_message(
         pose.stamp_ns // 1000,
         0,
@@ -109,10 +110,11 @@ def landing_target(pose: RelativePose) -> Any:
     )
 
 
-def _start_pose(pose: RelativePose) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    if pose.xyz_map_m is None or pose.R_map_drone is None or pose.map_covariance is None:
-        raise ValueError("incomplete pose: the gate must reject it")
-    return pose.xyz_map_m, pose.R_map_drone, pose.map_covariance
+def _estimate(pose: RelativePose) -> PoseEstimate:
+    """The estimate with its rotation. Raises ValueError without one: the gate must reject such a pose."""
+    if not isinstance(pose.estimate, PoseEstimate):
+        raise ValueError("the pose has no rotation: the gate must reject it")
+    return pose.estimate
 
 
 def _velocity_upper(covariance_start: NDArray[np.float64] | None, R_map_drone: NDArray[np.float64]) -> list[float]:

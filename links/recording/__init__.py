@@ -1,4 +1,4 @@
-"""Recordings: what came in, byte by byte, in one MCAP file; recordings/README.md documents the format."""
+"""Recordings: all inputs as raw bytes in one MCAP file; recordings/README.md documents the format."""
 
 from links.recording.compressed_image import CompressedImage, decode_compressed_image, encode_compressed_image
 from links.recording.format import TOPICS, Progress, Topic

@@ -1,4 +1,4 @@
-"""One chunk of a recording, and its messages. Nothing in it is believed before it is checked.
+"""One chunk of a recording and its messages. All contents are checked before use.
 
 Source: MCAP specification 0 (https://mcap.dev/spec), chunk and message records; RFC 8878 (zstd).
 """
@@ -18,18 +18,18 @@ from links.recording.format import MAX_CHUNK_BYTES, MAX_TIME_NS
 HEAD = struct.Struct("<BQ")  # of any record: opcode, length of what follows
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, CRC, length of the compression's name
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log_time, publish_time
-_MAX_OFFSET = 2**63 - 1  # that a file can have
+_MAX_OFFSET = 2**63 - 1  # of any file
 _ZSTD = b"\x04\x00\x00\x00zstd"
 _ZSTD_AT = HEAD.size + 28  # from the start of a chunk record to its compression's name
 
 
 class Damage(Exception):
-    """A part of the file is not what it should be. The text says what, in one clause."""
+    """A part of the file is damaged. The text describes the damage in one clause."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkRef:
-    """One chunk: where its record starts, how long it is with its head, and the arrival times it claims."""
+    """One chunk: offset and length of its record with the header, and its range of arrival times."""
 
     offset: int
     length: int
@@ -39,7 +39,7 @@ class ChunkRef:
 
 
 def chunk_ref(stream: IO[bytes], offset: int, end: int) -> ChunkRef:
-    """The chunk whose record stands at these bytes, from its head. Raises Damage."""
+    """The chunk whose record is at these bytes, from its header. Raises Damage."""
     stream.seek(offset + HEAD.size)
     head = stream.read(_CHUNK_HEAD.size)
     if len(head) < _CHUNK_HEAD.size:
@@ -53,11 +53,11 @@ def chunk_ref(stream: IO[bytes], offset: int, end: int) -> ChunkRef:
 def read_chunk(stream: IO[bytes], chunk: ChunkRef) -> bytes:
     """The messages of a chunk, uncompressed and checked by its CRC. Raises Damage."""
     if not HEAD.size < chunk.length <= 2 * MAX_CHUNK_BYTES or chunk.offset > _MAX_OFFSET:
-        raise Damage("its place or its length is impossible")
+        raise Damage("its offset or its length is impossible")
     stream.seek(chunk.offset)
     record = stream.read(chunk.length)
     if len(record) < chunk.length or HEAD.unpack_from(record) != (Opcode.CHUNK, chunk.length - HEAD.size):
-        raise Damage("no chunk stands there")
+        raise Damage("there is no chunk at its offset")
     try:
         _, _, size, crc, name_length = _CHUNK_HEAD.unpack_from(record, HEAD.size)
         name_end = HEAD.size + _CHUNK_HEAD.size + name_length
@@ -101,7 +101,7 @@ def _unpack(compression: bytes, stored: memoryview, size: int) -> bytes:
         return bytes(stored)
     if compression != b"zstd":
         raise Damage(f"it is compressed with {compression[:16]!r}, and grd writes zstd only")
-    try:  # the stream reader stops at the size asked for, whatever the frame claims
+    try:  # the stream reader stops at the requested size, whatever size the frame claims
         decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
         with decompressor.stream_reader(stored) as unpacked:
             return unpacked.read(size + 1)

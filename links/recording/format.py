@@ -1,7 +1,7 @@
 """The recording format: an MCAP file with profile "grd"; recordings/README.md documents it.
 
     header             profile "grd"
-    metadata "grd"     format_version; then metadata "recording": what the writer was told
+    metadata "grd"     format_version; then metadata "recording": the metadata passed to the writer
     attachments        rig.yaml, config.yaml (both at the start, so that a killed recording keeps them)
     chunks             camera topics uncompressed (JPEG does not shrink), all others zstd
     metadata "losses"  only when records were dropped
@@ -29,7 +29,7 @@ METADATA_LOSSES = "losses"
 RIG_ATTACHMENT = "rig.yaml"
 CONFIG_ATTACHMENT = "config.yaml"
 
-MAX_MESSAGE_BYTES = 32 * 2**20  # one record; more is a mistake of the caller
+MAX_MESSAGE_BYTES = 32 * 2**20  # of one record
 MAX_CHUNK_BYTES = 64 * 2**20  # uncompressed; a file that claims more is damaged
 MAX_TIME_NS = 2**63 - 1
 
@@ -39,7 +39,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """What a topic holds and how MCAP declares it."""
+    """Contents of a topic and its MCAP declaration."""
 
     name: str
     holds: str
@@ -101,8 +101,8 @@ TOPICS: dict[str, Topic] = {
             {**_POSE, "covariance": _COVARIANCE},
             "the vehicle's own odometry, when it has one",
         ),
-        _raw("/clock", "empty", "nothing: the host's clock, live, so often"),
-        _raw("/run/order", "grd-order", "what each stage took in which order in a live run: flow/live/input_order.py"),
+        _raw("/clock", "empty", "empty: a tick of the host's clock in a live run"),
+        _raw("/run/order", "grd-order", "order of the inputs of each stage, live runs only: flow/live/input_order.py"),
         _json("/run/end", "grd.RunEnd", {"output_hash": {"type": "string"}}, "the live run's hash, written at its end"),
         _json("/truth/vehicle", "grd.Pose", _POSE, "T_world_vehicle; simulated only, never wired to a stage"),
         _json("/truth/drone", "grd.Pose", _POSE, "T_world_drone; simulated only, never wired to a stage"),
@@ -111,5 +111,5 @@ TOPICS: dict[str, Topic] = {
 
 
 def topic(name: str) -> Topic:
-    """Declaration of a topic; one that the table does not know is kept as raw bytes."""
+    """Declaration of a topic; a topic that is not in the table holds raw bytes."""
     return TOPICS.get(name) or _raw(name, "application/octet-stream", "raw bytes of a topic that grd does not know")

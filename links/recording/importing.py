@@ -1,6 +1,6 @@
-"""Make a recording of someone else's file: a VLP-16 `.pcap`, or a MAVLink `.tlog`. What it is, its bytes tell.
+"""Imports a VLP-16 `.pcap` or a MAVLink `.tlog` as a recording; the contents decide the file type.
 
-The file's time of a packet is its arrival. Nothing better is known of when it was measured, so it is the stamp, too.
+The time of a packet in the file is used as arrival and as stamp: no better time of the measurement is known.
 
 Source: ours; VLP-16 user manual 63-9243 Rev. E, chapter 9 (packets, ports, product ids).
 """
@@ -47,7 +47,7 @@ drone: {span_m: 0.5}
 
 @dataclass(frozen=True, slots=True)
 class ImportReport:
-    """What an import wrote, and what it left out."""
+    """What an import wrote and skipped."""
 
     path: Path
     topics: dict[str, int]  # records by topic
@@ -65,29 +65,29 @@ def import_file(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> ImportReport:
-    """Turn a .pcap or .tlog into a recording beside it (or at `out`).
+    """Convert a .pcap or .tlog to a recording next to it (or at `out`).
 
     `port` and `sender` (IPv4 address) choose the lidar in a capture; `rig_yaml` is the text of its calibration, by
-    default DEFAULT_RIG for a capture and none for a telemetry log. LinkError when nothing in the file is of use; a
-    half-made import is removed.
+    default DEFAULT_RIG for a capture and none for a telemetry log. LinkError when the file has no usable record; a
+    partial output is removed.
     """
     source = Path(path)
     target = Path(out) if out is not None else source.with_suffix(".mcap")
     with open_file(source) as stream:
         if target.exists() and target.samefile(source):
             raise LinkError(f"{target} is the file to import: give the recording another name")
-        foreign = _recognise(stream, source, port, sender)
-        records = foreign.records()
+        imported = _recognise(stream, source, port, sender)
+        records = imported.records()
         first = next(records, None)
         if first is None:
-            raise LinkError(foreign.nothing_found())
+            raise LinkError(imported.nothing_found())
         topics: Counter[str] = Counter()
         total_bytes = source.stat().st_size
         writer = RecordingWriter(
             target,
-            rig_yaml=rig_yaml or foreign.default_rig,
+            rig_yaml=rig_yaml or imported.default_rig,
             metadata={"imported_from": source.name},
-            channels=foreign.channels(),
+            channels=imported.channels(),
             lossless=True,
             overwrite=overwrite,
         )
@@ -97,17 +97,17 @@ def import_file(
                     writer.write(record)
                     topics[record.topic] += 1
                     if progress and number % _PROGRESS_EVERY == 0:
-                        progress(foreign.done_bytes(), total_bytes)
+                        progress(imported.done_bytes(), total_bytes)
         except BaseException:
             with suppress(OSError):
                 target.unlink()
             raise
     if progress:
         progress(total_bytes, total_bytes)
-    return ImportReport(target, dict(topics), foreign.skipped(), foreign.warnings())
+    return ImportReport(target, dict(topics), imported.skipped(), imported.warnings())
 
 
-def _recognise(stream: IO[bytes], source: Path, port: int, sender: str | None) -> _Foreign:
+def _recognise(stream: IO[bytes], source: Path, port: int, sender: str | None) -> _ImportedFile:
     start = stream.read(_SNIFF_BYTES)
     stream.seek(0)
     if is_pcap(start):
@@ -119,37 +119,37 @@ def _recognise(stream: IO[bytes], source: Path, port: int, sender: str | None) -
     raise LinkError(f"{source} is neither a pcap capture nor a MAVLink telemetry log (.tlog): these can be imported")
 
 
-class _Foreign(ABC):
+class _ImportedFile(ABC):
     """A file that can be imported."""
 
     default_rig: str | None = None
 
     @abstractmethod
     def records(self) -> Iterator[Record]:
-        """What is of use in it, in file order."""
+        """Its usable records, in file order."""
 
     @abstractmethod
     def done_bytes(self) -> int:
-        """How much of it was read."""
+        """Number of bytes read."""
 
     @abstractmethod
     def skipped(self) -> dict[str, int]:
-        """What was passed over, by reason."""
+        """What was skipped, by reason."""
 
     @abstractmethod
     def warnings(self) -> list[str]:
-        """What is wrong with the file, with byte offsets."""
+        """Damage in the file, with byte offsets."""
 
     @abstractmethod
     def nothing_found(self) -> str:
-        """Why it gave no record, and what to try."""
+        """The reason why there is no record, and what to try."""
 
     def channels(self) -> dict[str, dict[str, str]]:
-        """What is known of the senders, once there was a record."""
+        """Properties of the senders by topic, after the first record."""
         return {}
 
 
-class _Capture(_Foreign):
+class _Capture(_ImportedFile):
     """One VLP-16's packets in a pcap capture."""
 
     default_rig = DEFAULT_RIG
@@ -160,7 +160,7 @@ class _Capture(_Foreign):
         self._port = port
         self._sender = sender
         self._report = PcapReport()
-        self._elsewhere: Counter[int] = Counter()  # data packets on other ports
+        self._other_ports: Counter[int] = Counter()  # data packets on other ports
 
     def records(self) -> Iterator[Record]:
         skipped = self._report.skipped
@@ -195,8 +195,8 @@ class _Capture(_Foreign):
         text = f"{self._source}: no VLP-16 packet ({vlp16.PACKET_BYTES} bytes) on UDP port {self._port}"
         if self._sender:
             text += f" from {self._sender}"
-        if self._elsewhere:
-            ((port, count),) = self._elsewhere.most_common(1)
+        if self._other_ports:
+            ((port, count),) = self._other_ports.most_common(1)
             return f"{text}; {count} on port {port}: try --port {port}"
         seen = [f"{count} packets {reason}" for reason, count in self._report.skipped.most_common(3)]
         return "; ".join([text, *seen, *self._report.warnings])
@@ -206,7 +206,7 @@ class _Capture(_Foreign):
         if size == vlp16.PACKET_BYTES:
             if datagram.port == self._port:
                 return _LIDAR
-            self._elsewhere[datagram.port] += 1
+            self._other_ports[datagram.port] += 1
         elif size == vlp16.POSITION_BYTES and datagram.port == vlp16.POSITION_PORT:
             return _POSITION
         return None
@@ -221,7 +221,7 @@ class _Capture(_Foreign):
             )
 
 
-class _TelemetryLog(_Foreign):
+class _TelemetryLog(_ImportedFile):
     """The MAVLink frames of a telemetry log."""
 
     def __init__(self, stream: IO[bytes], source: Path) -> None:

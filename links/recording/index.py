@@ -120,10 +120,10 @@ def _read_summary(stream: IO[bytes], size: int, index: FileIndex) -> None:
     stream.seek(footer_at)
     tail = stream.read(9 + 20)
     if HEAD.unpack_from(tail) != (Opcode.FOOTER, 20):
-        raise Damage("no footer stands at the end")
+        raise Damage("there is no footer at the end")
     footer: Footer = _parse(Footer.read, tail[9:])
     if not len(MCAP0_MAGIC) < footer.summary_start < footer_at or footer_at - footer.summary_start > 2**30:
-        raise Damage("the footer points elsewhere")
+        raise Damage("the footer points to a wrong offset")
     stream.seek(footer.summary_start)
     body = stream.read(footer_at - footer.summary_start)
     if zlib.crc32(tail[:-4], zlib.crc32(body)) != footer.summary_crc:
@@ -174,7 +174,7 @@ def _read_aside(stream: IO[bytes], offset: int, size: int, index: FileIndex) -> 
             attachment: Attachment = _parse(Attachment.read, body)
             index.attachments[attachment.name] = attachment.data
         else:
-            raise Damage("neither an attachment nor metadata stands there")
+            raise Damage("there is neither an attachment nor metadata at its offset")
     except Damage as damage:
         index.warnings.append(f"attachment or metadata at byte {offset} cannot be read: {damage}")
 
@@ -228,5 +228,5 @@ def _counted(stream: IO[bytes], chunk: ChunkRef) -> dict[int, int]:
         for message in chunk_messages(read_chunk(stream, chunk)):
             counts[message[3]] = counts.get(message[3], 0) + 1
     except Damage:
-        pass  # said when the chunk is read
+        pass  # reported when the chunk is read
     return counts

@@ -43,7 +43,7 @@ _FOOTER_START = struct.Struct("<BQQQ")  # opcode, length, summary_start, summary
 
 
 class _OpenChunk:
-    """Messages gathered for one chunk."""
+    """Messages collected for one chunk."""
 
     def __init__(self, compression: str) -> None:
         self.compression = compression
@@ -115,7 +115,7 @@ class McapFile:
             self._close_chunk(chunk)
 
     def flush(self) -> None:
-        """Hand all that was added to the operating system: from here on a killed process loses none of it."""
+        """Pass all added records to the operating system: a process killed later loses none of them."""
         for chunk in self._chunks.values():
             if chunk.parts:
                 self._close_chunk(chunk)
@@ -200,7 +200,7 @@ class McapFile:
         return entry
 
     def _close_chunk(self, chunk: _OpenChunk) -> None:
-        """Write a chunk and its message indexes in one piece, and start it anew."""
+        """Write a chunk and its message indexes in one piece, and clear it."""
         data = b"".join(chunk.parts)
         stored = self._compressor.compress(data) if chunk.compression else data
         record = RecordBuilder()
@@ -254,7 +254,7 @@ class McapFile:
 
 
 def _message_index(channel_id: int, index: list[int]) -> bytes:
-    """The record that tells where a channel's messages stand; in one piece, mcap's class writes it number by number."""
+    """The message index record of a channel, packed at once: the class of the mcap package packs number by number."""
     head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(index), channel_id, 8 * len(index))
     return head + struct.pack(f"<{len(index)}Q", *index)
 

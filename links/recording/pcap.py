@@ -47,7 +47,7 @@ class Datagram:
 
 @dataclass(slots=True)
 class PcapReport:
-    """What was passed over in a capture."""
+    """What was skipped in a capture."""
 
     skipped: Counter[str] = field(default_factory=Counter)  # packets by reason
     warnings: list[str] = field(default_factory=list)
@@ -55,7 +55,7 @@ class PcapReport:
 
 
 def is_pcap(magic: bytes) -> bool:
-    """Whether a file that starts so is a capture, of the classic or of the new kind."""
+    """Whether a file with this start is a capture, pcap or pcapng."""
     return magic[:4] in _MAGIC or magic[:4] == _PCAPNG
 
 

@@ -1,7 +1,7 @@
 """Read a recording in the order of arrival, finished or not, with memory for a few chunks only.
 
-Damage costs the chunk it is in, no more: it is named in `warnings` with its byte offset. A file of which nothing can
-be read is a LinkError.
+Damage loses only the chunk that contains it; `warnings` has its byte offset. A file without a readable record is a
+LinkError.
 
 Source: ours; MCAP specification 0 (https://mcap.dev/spec).
 """
@@ -33,7 +33,7 @@ from links.recording.format import (
 from links.recording.index import FileIndex, read_index
 
 MAX_OVERLAP_BYTES = 512 * 2**20  # chunks that overlap in time are in memory together
-_ENTRY_BYTES = 256  # what a record costs in memory beside its data
+_ENTRY_BYTES = 256  # memory of a record in addition to its data
 _IMPORTABLE = {
     b"\xd4\xc3\xb2\xa1": "pcap capture",
     b"\xa1\xb2\xc3\xd4": "pcap capture",
@@ -67,12 +67,12 @@ class RecordingReader:
         self.channels: dict[str, dict[str, str]] = {
             channel.topic: channel.metadata for channel in index.topics.values() if channel.metadata
         }
-        """What is known of a topic's sender: model, port, sender."""
+        """Properties of the sender of each topic: model, port, sender."""
         self.metadata: dict[str, str] = index.metadata.get(METADATA_USER, {})
         self.start_ns = min((chunk.start_ns for chunk in index.chunks), default=0)
         self.end_ns = max((chunk.end_ns for chunk in index.chunks), default=0)
         self.warnings: list[str] = []
-        """What cannot be read and where; `records` adds to it while it reads."""
+        """Unreadable parts with their offsets; `records` adds to it while reading."""
         for text in index.warnings:
             self._warn(text)
         if index.cut_off:
@@ -212,7 +212,7 @@ class RecordingReader:
 
 
 def open_file(path: Path) -> IO[bytes]:
-    """Open a file for reading; LinkError says why not. An empty file is one, too."""
+    """Open a file for reading. LinkError when it cannot be opened or is empty."""
     if path.exists() and not path.is_file() and not path.is_dir():
         raise LinkError(f"{path} is no regular file: copy what comes from it to a file first")
     try:

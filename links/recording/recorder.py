@@ -82,7 +82,7 @@ class Recorder(Tap[RecorderSettings]):
 
     @property
     def status(self) -> str | None:
-        """Why nothing is recorded now, in words; None: it is."""
+        """The reason why nothing is recorded; None while recording."""
         return self._status
 
     def open(self, run: Run) -> None:

@@ -1,6 +1,6 @@
 """A live run's recording as one, whether it has one part or several.
 
-Parts are known by what they say of themselves (run and number), not by their names. What of a run is not read is said.
+Parts are identified by their metadata (run and number), not by their names. Warnings list parts that are not read.
 
 Source: ours; recordings/README.md.
 """
@@ -25,7 +25,7 @@ from links.recording.recorder import PART, SESSION
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """One file of a recording, as its index tells."""
+    """One file of a recording, from its index."""
 
     path: Path
     run: str | None  # None: of no live run
@@ -53,15 +53,15 @@ class Session:
             self._note(reader.warnings)
         found = {named.number: named}
         if named.run is not None:
-            beside = self._look_beside(named, found)
-            self._note(beside if named.number == 1 else [])
+            found_warnings = self._find_other_parts(named, found)
+            self._note(found_warnings if named.number == 1 else [])
         self.known = len(found)
         """Parts of the run that are there."""
         if named.number != 1:
-            self._is_later(named, found, whole)
+            self._report_later_part(named, found, whole)
             found = {named.number: named}
         elif missing := sorted(set(range(1, max(found))) - set(found)):
-            self._lacks(missing, len(found), whole)
+            self._report_missing(missing, len(found), whole)
         self._parts = [found[number] for number in sorted(found)]
         last = self._parts[-1]
         if named.number == 1 and last.stops_short:
@@ -82,9 +82,9 @@ class Session:
     def _note(self, warnings: Sequence[str]) -> None:
         self.warnings += [text for text in warnings if text not in self.warnings]
 
-    def _look_beside(self, named: _Part, found: dict[int, _Part]) -> list[str]:
-        """Find the other parts in the folder; warnings of theirs, and of what is called like one and is none."""
-        beside: list[str] = []
+    def _find_other_parts(self, named: _Part, found: dict[int, _Part]) -> list[str]:
+        """Find the other parts in the folder; returns their warnings and those for other files named like a part."""
+        warnings_of_others: list[str] = []
         alike = re.compile(rf"{re.escape(named.path.stem)}-\d+\.mcap")
         for path in sorted(named.path.parent.glob("*.mcap")):
             if path == named.path:
@@ -94,28 +94,28 @@ class Session:
                     part, warnings = _part(reader), reader.warnings
             except LinkError as error:
                 if alike.fullmatch(path.name):
-                    beside.append(f"left out: {error}")
+                    warnings_of_others.append(f"left out: {error}")
                 continue
             if part.run == named.run:
                 if found.setdefault(part.number, part) is part:
-                    beside += warnings
+                    warnings_of_others += warnings
             elif alike.fullmatch(path.name):
-                beside.append(f"{path} is of another run than {named.path.name}: left out")
-        return beside
+                warnings_of_others.append(f"{path} is of another run than {named.path.name}: left out")
+        return warnings_of_others
 
-    def _is_later(self, named: _Part, found: dict[int, _Part], whole: bool) -> None:
-        first = found[1].path.name if 1 in found else "which is not beside it"
-        said = f"{named.path} is part {named.number} of its run"
+    def _report_later_part(self, named: _Part, found: dict[int, _Part], whole: bool) -> None:
+        first = found[1].path.name if 1 in found else "which is not in the folder"
+        text = f"{named.path} is part {named.number} of its run"
         if whole:
-            raise LinkError(f"{said}: a run is taken again from its first part, {first}")
-        self._note([f"{said}, and read alone; all parts are read where the first is named, {first}"])
+            raise LinkError(f"{text}: a run is taken again from its first part, {first}")
+        self._note([f"{text}, and read alone; all parts are read where the first is named, {first}"])
 
-    def _lacks(self, missing: list[int], there: int, whole: bool) -> None:
+    def _report_missing(self, missing: list[int], there: int, whole: bool) -> None:
         numbers = ", ".join(map(str, missing))
-        said = f"{self.path.parent}: part {numbers} of this run is missing, there are {there} others"
+        text = f"{self.path.parent}: part {numbers} of this run is missing, there are {there} others"
         if whole:
-            raise LinkError(said)
-        self._note([f"{said}: what it held is left out"])
+            raise LinkError(text)
+        self._note([f"{text}: what it held is left out"])
 
 
 def _part(reader: RecordingReader) -> _Part:
@@ -136,7 +136,7 @@ def _merged(
 ) -> Iterator[Record]:
     """Records by (arrival, part, sequence). A part is opened when one at or after its start is due.
 
-    Where one part gives way to the next, many threads write: a record may be in the later one and have come before.
+    Several threads write while parts change: a record in the later part may have arrived first.
     """
     waiting = deque(sorted(parts, key=lambda part: (part.start_ns, part.number)))
     done, whole = dict.fromkeys((part.number for part in parts), 0), sum(part.size for part in parts)
@@ -171,7 +171,7 @@ def _merged(
 def _read(
     path: Path, topics: Collection[str] | None, progress: Progress, note: Callable[[list[str]], None]
 ) -> Generator[Record]:
-    """One part's records; what could not be read is noted."""
+    """Records of one part; `note` receives the warnings."""
     with RecordingReader(path) as reader:
         yield from reader.records(topics, progress=progress)
         note(reader.warnings)

@@ -1,7 +1,7 @@
 """MAVLink frames of a telemetry log: an 8-byte big-endian time [us since 1970] before each frame, nothing else.
 
-A frame is believed when its checksum is right, or when the next time and frame follow where it ends (a message that
-our dialect does not know, or knows otherwise). Anything else is passed over byte by byte and counted.
+A frame is accepted when its checksum is correct, or when a time and a frame follow its end (a message that is unknown
+or different in our dialect). All other bytes are skipped and counted.
 
 Source: https://mavlink.io/en/guide/serialization.html (frames, CRC); pymavlink's mavlogfile (the log's layout).
 """
@@ -19,13 +19,13 @@ _V1, _V2 = 0xFE, 0xFD
 _V1_EXTRA_BYTES, _V2_EXTRA_BYTES, _SIGNATURE_BYTES = 8, 12, 13
 _SIGNED = 0x01  # v2 incompatibility flag
 _MAX_STAMP_US = 4_102_444_800_000_000  # the year 2100
-_MAX_STEP_US = 3 * 24 * 3600 * 1_000_000  # between neighbours, where the checksum does not speak for them
+_MAX_STEP_US = 3 * 24 * 3600 * 1_000_000  # between neighbours without a correct checksum
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 @dataclass(slots=True)
 class TlogReport:
-    """What was passed over in a log."""
+    """What was skipped in a log."""
 
     unknown_checksum: int = 0  # frames kept though their checksum does not fit our dialect
     bad_bytes: int = 0
@@ -35,7 +35,7 @@ class TlogReport:
 
 
 def looks_like_tlog(data: bytes) -> bool:
-    """Whether a file that starts so is a telemetry log."""
+    """Whether a file with this start is a telemetry log."""
     return _frame_end(data, 0) is not None
 
 

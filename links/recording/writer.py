@@ -1,4 +1,4 @@
-"""Record to disk without making a sensor wait.
+"""Writes a recording to disk without blocking the sensors' threads.
 
 `write` puts a record into a queue bounded in bytes; one thread builds chunks and hands them to the operating system.
 Every chunk is closed when it is FLUSH_S old, half of the 0.5 s that a killed recording may lose: the other half is for
@@ -34,11 +34,11 @@ FLUSH_S = 0.25
 SYNC_S = 1.0
 CLOSE_TIMEOUT_S = 30.0  # for a disk that hangs
 _POLL_S = 0.05
-_RECORD_BYTES = 64  # what a record weighs beside its data
+_RECORD_BYTES = 64  # queue size of a record in addition to its data
 
 
 def create(path: Path, *, overwrite: bool) -> IO[bytes]:
-    """Open a new file for a recording. LinkError says what is in the way."""
+    """Open a new file for a recording. Raises LinkError with the reason."""
     try:
         return path.open("wb" if overwrite else "xb")
     except FileExistsError:
@@ -120,7 +120,7 @@ class RecordingWriter:
 
     @property
     def status(self) -> str | None:
-        """Why nothing is being recorded any more, or None. `close` raises it."""
+        """The reason why recording stopped, or None. `close` raises it."""
         return self._status
 
     def write(self, record: Record) -> None:

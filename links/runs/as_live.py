@@ -1,4 +1,4 @@
-"""A live run again from its recording, into a folder as every run's: the same steps, the same messages, the same hash.
+"""Re-runs a live run from its recording: the same order of inputs, the same messages, the same output hash.
 
 Source: ours; flow/live/rerun.py.
 """
@@ -19,65 +19,66 @@ from flow.live.input_order import END_TOPIC, ORDER_TOPIC, read_orders
 from flow.live.rerun import Rerun
 from flow.taps import Digest
 from links.recording import Progress, Session
-from links.runs.run_folder import Asked, Finished, RunFolder, truth_beside
+from links.runs.request import RunRequest, RunResult
+from links.runs.run_folder import RunFolder, read_truth_file
 
 
 @dataclass(frozen=True, slots=True)
-class Repeated:
-    """A repeated run, and how it compares with the live one."""
+class RerunResult:
+    """A re-run and its comparison with the live run."""
 
-    finished: Finished
-    same: bool
-    verdict: str
+    result: RunResult
+    same_hash: bool  # also when the hash of the live run is not known
+    comparison: str  # for people
 
 
-def repeat_into(folder: Path, recording: Path, progress: Progress | None = None) -> Repeated:
-    """Take a live run again, all its parts. Raises ConfigError, LinkError."""
-    began_s = time.monotonic()
+def rerun_into(folder: Path, recording: Path, progress: Progress | None = None) -> RerunResult:
+    """Re-run a live run, all parts of its recording. Raises ConfigError, LinkError."""
+    started_s = time.monotonic()
     session = Session(recording, whole=True)
     orders = read_orders(session.records([ORDER_TOPIC]))
     if not orders:
         raise LinkError(
-            f"{recording} does not say in which order its stages worked (topic {ORDER_TOPIC}): it is no live run's"
-            " recording. Replay it without --as-live"
+            f"{recording} has no order of inputs (topic {ORDER_TOPIC}): it is not the recording of a live"
+            " run. Replay it without --as-live"
         )
-    graph, asked = _graph_of(session)
+    graph, request = _graph_of(session)
     warnings: list[str] = []
     for name, order in orders.items():
         if order.cut_off:
-            warnings.append(f"{name}: a piece of its order is missing; it is repeated up to there")
-    digest, truth, live_hash = Digest(), truth_beside(recording), None
-    with RunFolder(folder, recording, asked, graph, began_s) as run:
+            warnings.append(f"{name}: part of its input order is missing; the re-run ends there")
+    digest, truth, live_hash = Digest(), read_truth_file(recording), None
+    with RunFolder(folder, recording, request, graph, started_s) as run:
         rerun = Rerun(graph, orders, (digest, *run.taps))
         for record in session.records(progress=progress):
             if record.topic == END_TOPIC:
                 live_hash = _hash_of(record.data)
             rerun.feed(record)
         report = rerun.finish()
-        warnings += [f"{name}: {n} messages of the live run are not there" for name, n in rerun.left.items()]
+        warnings += [f"{name}: {n} messages of the live run are missing" for name, n in rerun.left.items()]
         warnings = [*session.warnings, *warnings]
-        finished = run.finish(report, digest.hexdigest(), truth, warnings, parts=len(session.parts))
+        result = run.finish(report, digest.hexdigest(), truth, warnings, parts=len(session.parts))
     if live_hash is None:
-        return Repeated(finished, True, "the live run was not stopped in order, so its hash is not known")
-    same = live_hash == finished.digest
-    return Repeated(finished, same, f"the live run's hash was {'the same' if same else live_hash}")
+        return RerunResult(result, True, "the live run was interrupted, so its hash is not known")
+    same_hash = live_hash == result.output_hash
+    return RerunResult(result, same_hash, f"the live run's hash is {'the same' if same_hash else live_hash}")
 
 
-def _graph_of(session: Session) -> tuple[Graph, Asked]:
-    """The graph of the configuration that the recording carries."""
+def _graph_of(session: Session) -> tuple[Graph, RunRequest]:
+    """The graph of the configuration in the recording, and the request for it."""
     text, recording = session.config_yaml, session.path
     if text is None:
-        raise LinkError(f"{recording} carries no configuration: it is no live run's recording. Leave out --as-live")
+        raise LinkError(f"{recording} has no configuration: it is not the recording of a live run. Leave out --as-live")
     values = yaml.safe_load(text)
     if isinstance(values, dict) and "host" in values:
         raise LinkError(
-            f"{recording} is what host '{values['host']}' recorded of a run on several hosts: --as-live repeats runs "
-            "on one host only. What its own sensors gave can be replayed: name a configuration with --config instead"
+            f"{recording} was recorded on host '{values['host']}' of a run on several hosts: --as-live needs a run on "
+            "one host. To replay the sensors of this host, name a configuration with --config"
         )
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder, "config.yaml")
         config.write_text(text, encoding="utf-8")
-        return load_graph(config), Asked(config)
+        return load_graph(config), RunRequest(config)
 
 
 def _hash_of(data: bytes) -> str | None:

@@ -1,4 +1,4 @@
-"""The fixes of a run, 160 bytes each: an hour's are kept in memory for its summary.
+"""The drone fixes of a run in memory, 160 bytes each, so that an hour of them fits for the summary.
 
 Source: ours.
 """
@@ -13,26 +13,26 @@ import numpy as np
 
 from stages.messages import DroneFix
 
-WHOLE, REAL = 4, 16  # numbers of a fix: whole ones, and others
+INTEGERS, FLOATS = 4, 16  # numbers of each kind per fix
 
 
 class FixLog(Sequence[DroneFix]):
-    """Fixes in order; each is made anew when it is asked for."""
+    """Fixes in order of arrival, stored in arrays; indexing makes a new DroneFix."""
 
     def __init__(self) -> None:
-        self._whole, self._real = array("q"), array("d")
+        self._integers, self._floats = array("q"), array("d")
 
     def append(self, fix: DroneFix) -> None:
-        """One more."""
+        """Append a fix."""
         velocity = fix.velocity_vehicle_mps
-        self._whole.extend((fix.stamp_ns, fix.hits, fix.iterations, fix.track_id))
-        self._real.append(fix.shift_m)
-        self._real.extend(fix.xyz_vehicle_m.tolist())
-        self._real.extend(fix.covariance_m2.ravel().tolist())
-        self._real.extend((np.nan, np.nan, np.nan) if velocity is None else velocity.tolist())
+        self._integers.extend((fix.stamp_ns, fix.hits, fix.iterations, fix.track_id))
+        self._floats.append(fix.shift_m)
+        self._floats.extend(fix.xyz_vehicle_m.tolist())
+        self._floats.extend(fix.covariance_m2.ravel().tolist())
+        self._floats.extend((np.nan, np.nan, np.nan) if velocity is None else velocity.tolist())
 
     def __len__(self) -> int:
-        return len(self._whole) // WHOLE
+        return len(self._integers) // INTEGERS
 
     @overload
     def __getitem__(self, which: int) -> DroneFix: ...
@@ -43,13 +43,13 @@ class FixLog(Sequence[DroneFix]):
         return self._fix(rows) if isinstance(rows, int) else [self._fix(row) for row in rows]
 
     def _fix(self, row: int) -> DroneFix:
-        stamp_ns, hits, iterations, track_id = self._whole[WHOLE * row : WHOLE * (row + 1)]
-        shift_m, *real = self._real[REAL * row : REAL * (row + 1)]
-        velocity = np.array(real[12:])
+        stamp_ns, hits, iterations, track_id = self._integers[INTEGERS * row : INTEGERS * (row + 1)]
+        shift_m, *floats = self._floats[FLOATS * row : FLOATS * (row + 1)]
+        velocity = np.array(floats[12:])
         return DroneFix(
             stamp_ns=stamp_ns,
-            xyz_vehicle_m=np.array(real[:3]),
-            covariance_m2=np.array(real[3:12]).reshape(3, 3),
+            xyz_vehicle_m=np.array(floats[:3]),
+            covariance_m2=np.array(floats[3:12]).reshape(3, 3),
             hits=hits,
             iterations=iterations,
             shift_m=shift_m,

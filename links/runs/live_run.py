@@ -1,6 +1,7 @@
-"""A live run from its configuration to its folder: started, watched until it shall stop, ended, summed up.
+"""A live run: start, monitoring until the stop signal, stop, and output folder.
 
-The folder is what a replay leaves, and the recording. `flow.live` does the work, `links.recording.Recorder` records.
+The output folder has the files of a replay and the recording. `flow.live` runs the graph, `links.recording.Recorder`
+records it.
 
 Source: ours.
 """
@@ -24,88 +25,94 @@ from flow.live.report import LiveReport
 from flow.taps import Digest
 from links.clock import host_time
 from links.recording import Recorder
-from links.runs.run_folder import Asked, Finished, RunFolder
+from links.runs.request import RunRequest, RunResult
+from links.runs.run_folder import RunFolder
 from links.runs.usage import Usage
 
-LOOK_S = 0.1
-STOPPING = (signal.SIGINT, signal.SIGTERM)
+POLL_S = 0.1
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """What one who watches a run is shown, some times a second."""
+class RunStatus:
+    """Status of a live run, passed to its display some times a second."""
 
-    since_s: float
-    report: Callable[[], LiveReport]  # made when asked for: it costs some milliseconds of every thread
-    news: list[str]  # events not told before
-
-
-Show = Callable[[Look], None]
+    elapsed_s: float
+    report: Callable[[], LiveReport]  # on demand: it takes some milliseconds of every thread
+    new_events: list[str]
 
 
-def live_graph(asked: Asked) -> Graph:
+ShowStatus = Callable[[RunStatus], None]
+
+
+def live_graph(request: RunRequest) -> Graph:
     """The graph of a configuration that can run live. Raises ConfigError, LinkError."""
-    graph = asked.graph(None, "")
+    graph = request.graph(None, "")
     if not any(issubclass(spec.cls, Source) and spec.cls.listen is not Source.listen for spec in graph.nodes.values()):
-        raise LinkError(f"{asked.config}: no link of it can listen, so there is nothing to run live")
+        raise LinkError(f"{request.config}: no link of this configuration can run live")
     return graph
 
 
 def run_live(
-    folder: Path, asked: Asked, graph: Graph, show: Show, for_s: float | None = None, extra: tuple[Tap, ...] = ()
-) -> Finished:
+    folder: Path,
+    request: RunRequest,
+    graph: Graph,
+    show: ShowStatus,
+    for_s: float | None = None,
+    extra: tuple[Tap, ...] = (),
+) -> RunResult:
     """Run live until SIGINT, SIGTERM, `for_s` seconds, or a stage that stops it. Raises LinkError.
 
-    `graph` is `live_graph(asked)`. `extra` taps see every message beside those that the configuration declares. From
-    the main thread only.
+    `graph` is `live_graph(request)`. `extra` taps are added to those of the configuration. Call it from the main
+    thread only.
     """
-    began_s = time.monotonic()
+    started_s = time.monotonic()
     digest = Digest()
     recorder = next((spec for spec in graph.nodes.values() if issubclass(spec.cls, Recorder)), None)
     recording = folder / (str(recorder.config.get("file", "flight.mcap")) if recorder else "not recorded")
-    with RunFolder(folder, recording, asked, graph, began_s, live=True) as run, stop_asked() as stop:
+    with RunFolder(folder, recording, request, graph, started_s, live=True) as run, stop_signals() as stop:
         live = Live(graph, (*run.taps, *extra), digest=digest, now_ns=host_time.now_ns)
         if recorder is None:
             live.events.report("run", "no links.recording.Recorder is configured: nothing is recorded")
         gc.collect()
-        gc.freeze()  # what is there now stays: the collector has less to look through, and pauses are short
+        gc.freeze()  # objects that exist now are not scanned again: shorter pauses
         live.start()
-        started_s, usage = time.monotonic(), Usage()
+        live_since_s, usage = time.monotonic(), Usage()
         try:
-            while not stop.wait(LOOK_S) and (for_s is None or time.monotonic() < started_s + for_s):
-                _show(live, started_s, show, run)
-                usage.look(live.processes)
+            while not stop.wait(POLL_S) and (for_s is None or time.monotonic() < live_since_s + for_s):
+                _show(live, live_since_s, show, run)
+                usage.sample(live.processes)
         finally:
             report = live.stop()
-        _show(live, started_s, show, run)
+        _show(live, live_since_s, show, run)
         gc.unfreeze()
         return run.finish(report, digest.hexdigest(), None, [], usage)
 
 
-def _show(live: Live, started_s: float, show: Show, run: RunFolder) -> None:
-    news = live.events.fetch()
-    for text in news:
+def _show(live: Live, live_since_s: float, show: ShowStatus, run: RunFolder) -> None:
+    new_events = live.events.fetch()
+    for text in new_events:
         run.note(text)
     try:
-        show(Look(time.monotonic() - started_s, live.report, news))
-    except (OSError, SystemExit) as error:  # where it is shown is full or gone; rich ends on a broken pipe
-        why = error if isinstance(error, OSError) else "the pipe is closed"
-        live.events.report("run", f"cannot be shown on the terminal ({why}); the run goes on, run.log has it")
+        show(RunStatus(time.monotonic() - live_since_s, live.report, new_events))
+    except (OSError, SystemExit) as error:  # the output is full or closed; rich exits on a broken pipe
+        reason = error if isinstance(error, OSError) else "the pipe is closed"
+        live.events.report("run", f"cannot write to the terminal ({reason}); the run continues, see run.log")
 
 
 @contextmanager
-def stop_asked() -> Generator[threading.Event]:
-    """An event that SIGINT and SIGTERM set; the second time they do what they did before."""
-    asked = threading.Event()
+def stop_signals() -> Generator[threading.Event]:
+    """An event that SIGINT and SIGTERM set; a second signal has its previous effect."""
+    stopped = threading.Event()
 
     def stop(number: int, frame: FrameType | None) -> None:
         del frame
-        asked.set()
+        stopped.set()
         signal.signal(number, before[number])
 
-    before = {int(number): signal.signal(number, stop) for number in STOPPING}
+    before = {int(number): signal.signal(number, stop) for number in STOP_SIGNALS}
     try:
-        yield asked
+        yield stopped
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""Pinned output hashes: what each committed recording gives under each configuration, in `recordings/hashes.json`.
+"""Pinned output hashes of the committed recordings under each configuration, in `recordings/hashes.json`.
 
     {"street_sweep.mcap": {"replay": "0123456789abcdef-fedcba9876543210", ...}, ...}
 
@@ -43,19 +43,19 @@ class Pin:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A pin and what its replay gave."""
+    """A pin and the output hash of its replay."""
 
     pin: Pin
     actual: str
 
     @property
     def values_match(self) -> bool:
-        """Every value of every message is as pinned."""
+        """Whether every value of every message is as pinned."""
         return self.pin.expected is not None and values_half(self.pin.expected) == values_half(self.actual)
 
     @property
     def matches(self) -> bool:
-        """So are the texts."""
+        """Whether values and texts are as pinned."""
         return self.pin.expected == self.actual
 
 
@@ -65,16 +65,16 @@ def values_half(output_hash: str) -> str:
 
 
 def hash_matches(expected: str, actual: str) -> bool:
-    """Whether a run has an expected hash: a whole one, or its first half for the values alone. LinkError: neither."""
+    """Whether a run has an expected hash: a whole one, or the half that covers values. LinkError for anything else."""
     if not expected or len(expected) not in (16, 33) or set(expected) - set("0123456789abcdef-"):
         raise LinkError(f"'{expected}' is not an output hash: give {HASH_FORM}, or the first 16 for the values alone")
     return expected == (actual if "-" in expected else values_half(actual))
 
 
 def read_pins(folder: Path, configs: Path, only: tuple[str, ...] = ()) -> list[Pin]:
-    """The pins of a folder of recordings, also those that are missing in its `hashes.json`.
+    """The pins of a folder of recordings, including those missing in its `hashes.json`.
 
-    `only`: names of recordings, without `.mcap`. LinkError when there is none of that name, or the file is damaged.
+    `only`: names of recordings, without `.mcap`. LinkError for an unknown name or a damaged file.
     """
     recordings = sorted(folder.glob("*.mcap"))
     known = {file.stem for file in recordings}
@@ -90,7 +90,7 @@ def read_pins(folder: Path, configs: Path, only: tuple[str, ...] = ()) -> list[P
 
 
 def write_pins(folder: Path, outcomes: list[Outcome]) -> None:
-    """Pin what was measured; pins of other recordings stay."""
+    """Pin the measured hashes; pins of other recordings stay."""
     pinned = _read(folder / HASHES_FILE)
     for outcome in outcomes:
         pinned.setdefault(outcome.pin.recording.name, {})[outcome.pin.config.stem] = outcome.actual
@@ -99,7 +99,7 @@ def write_pins(folder: Path, outcomes: list[Outcome]) -> None:
 
 
 def measure(pins: list[Pin], jobs: int) -> Iterator[Outcome]:
-    """Replay each pin, `jobs` at a time; outcomes as they come. ConfigError, LinkError, RunError of a replay."""
+    """Replay each pin, `jobs` at a time; outcomes in order of completion. Raises the errors of a replay."""
     if jobs == 1:
         yield from (Outcome(pin, output_hash(pin.recording, pin.config)) for pin in pins)
         return
@@ -123,7 +123,7 @@ def output_hash(recording: Path, config: Path) -> str:
 
 
 def _without_taps(config: Path) -> list[str]:
-    """Settings that switch a configuration's taps off: the viewer takes half of a replay's time."""
+    """Settings that disable the taps of a configuration: the viewer takes half the time of a replay."""
     graph = load_graph(config, [], [], None)
     return [f"links.{spec.name}=null" for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
 

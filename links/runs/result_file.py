@@ -1,4 +1,4 @@
-"""A text file of a run's results, written line by line; a live run goes on though the disk takes no more.
+"""A text file with results of a run, written line by line; a live run continues when the disk is full.
 
 Source: ours.
 """
@@ -10,17 +10,17 @@ from pathlib import Path
 
 
 class ResultFile:
-    """`write` and `close`. `patient`: what the disk does not take is counted in `lost`, else it is OSError."""
+    """A text file. `tolerant`: failed writes are counted in `lost_writes`; otherwise they raise OSError."""
 
-    def __init__(self, path: Path, *, patient: bool = False) -> None:
+    def __init__(self, path: Path, *, tolerant: bool = False) -> None:
         raw = path.open("wb")
         self._stream = io.TextIOWrapper(raw, encoding="utf-8", newline="", line_buffering=True, write_through=True)
-        self._patient = patient
-        self.lost = 0
+        self._tolerant = tolerant
+        self.lost_writes = 0
         self.status: str | None = None
 
     def write(self, text: str) -> int:
-        """Line by line, as it comes."""
+        """Write and flush text; returns its length."""
         try:
             return self._stream.write(text)
         except OSError as error:
@@ -28,14 +28,14 @@ class ResultFile:
             return len(text)
 
     def close(self) -> None:
-        """The last lines, too."""
+        """Flush and close the file."""
         try:
             self._stream.close()
         except OSError as error:
             self._failed(error)
 
     def _failed(self, error: OSError) -> None:
-        if not self._patient:
+        if not self._tolerant:
             raise error
-        self.lost += 1
+        self.lost_writes += 1
         self.status = error.strerror or str(error)

@@ -28,7 +28,9 @@ from stages.messages import (
     DepthImage,
     Detections,
     DroneFix,
+    PoseEstimate,
     PoseState,
+    PositionEstimate,
     RelativePose,
     RelativeRotation,
     TrackState,
@@ -36,28 +38,26 @@ from stages.messages import (
 
 FIX_FILE, COVARIANCE_FILE, LOG_FILE = "fix_vehicle_drone.tum", "fix_covariance.csv", "run.log"
 DETECTIONS_FILE, SUMMARY_FILE = "detections.csv", "summary.json"
-TRUTH_FILE, TRUTH_HITS_FILE = "truth_vehicle_drone.tum", "truth_hits.csv"
+TRUTH_FILE, TRUTH_RETURNS_FILE = "truth_vehicle_drone.tum", "truth_returns.csv"
 TRUTH_VISIBLE_FILE, TRUTH_VEHICLE_FILE = "truth_visible.csv", "truth_world_vehicle.tum"
 POSE_FILE, POSE_COVARIANCE_FILE = "pose_vehicle_drone.tum", "pose_covariance.csv"
 ROTATION_FILE, CANDIDATES_FILE = "rotation_vehicle_drone.csv", "candidates.csv"
-UPPER = tuple(a + b for a, b in zip("xxxyyz", "xyzyzz", strict=True))  # names of an upper triangle, by rows
-QUATERNION, ROTATION_UPPER = ("qx", "qy", "qz", "qw"), tuple(f"c{name}_rad2" for name in UPPER)  # empty: not given
-BRANCHES = ("p_0", "p_90", "p_180", "p_270")  # probability of the rotation given, and of it turned by so many degrees
+UPPER = tuple(a + b for a, b in zip("xxxyyz", "xyzyzz", strict=True))  # upper triangle of a 3x3 matrix, by rows
+QUATERNION, ROTATION_UPPER = ("qx", "qy", "qz", "qw"), tuple(f"c{name}_rad2" for name in UPPER)  # empty: not known
+BRANCHES = ("p_0", "p_90", "p_180", "p_270")  # probability of each yaw branch: the rotation, and turned by [deg]
 POSITION_ONLY = (
-    "# T_vehicle_drone, position only: the LiDAR does not measure orientation, '0 0 0 1' stands for not measured\n"
+    "# T_vehicle_drone, position only: the LiDAR does not measure orientation, '0 0 0 1' means not measured\n"
 )
 POSE_UPPER = tuple(f"c{a}{b}" for a in range(6) for b in range(a, 6))  # rotation [rad] before translation [m]
-POSE_HEAD = (
-    "# T_vehicle_drone, fused; '0 0 0 1' where its rotation is not known: rotation is 0 in the table of covariances\n"
-)
-UNKNOWN_RAD2 = math.pi**2  # variance written for a rotation that is not known: a table of numbers holds no infinity
+POSE_HEAD = "# T_vehicle_drone, fused; '0 0 0 1' where the rotation is unknown: the covariance table has rotation 0\n"
+UNKNOWN_RAD2 = math.pi**2  # variance of an unknown rotation in the table, which has no infinity
 UPPER_3, UPPER_6 = np.triu_indices(3), np.triu_indices(6)
-KEPT = (DroneFix, DepthImage, Detections, Candidates, TrackState, RelativeRotation, RelativePose)
+WRITTEN = (DroneFix, DepthImage, Detections, Candidates, TrackState, RelativeRotation, RelativePose)
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
 
 
-def of_drone(name: str, number: int) -> str:
-    """`truth_hits.csv` for drone 1, `truth_hits_2.csv` for drone 2."""
+def drone_file(name: str, number: int) -> str:
+    """`truth_returns.csv` for drone 1, `truth_returns_2.csv` for drone 2."""
     stem, suffix = name.rsplit(".", 1)
     return name if number == 1 else f"{stem}_{number}.{suffix}"
 
@@ -76,7 +76,7 @@ def tum_line(stamp_ns: int, xyz_m: NDArray[np.float64], quaternion_xyzw: tuple[f
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """A track changed its state."""
+    """A change of a track's state."""
 
     stamp_ns: int
     state: str
@@ -87,13 +87,13 @@ class Transition:
 class ResultsSettings(Settings):
     """Settings of `Results`."""
 
-    limits: PoseLimits = PoseLimits()  # of the autopilot's gate: which poses are good
+    limits: PoseLimits = PoseLimits()  # of the autopilot's gate: which poses it accepts
 
 
 class Results(Tap[ResultsSettings]):
-    """Collects fixes, verdicts and state changes; writes each as it comes, so that a stopped run keeps what it had.
+    """Collects fixes, search results and state changes, and writes each when it arrives: an interrupted run keeps them.
 
-    What no stage of a run tells has no file: rotations, fused poses, candidates.
+    The files of rotations, fused poses and candidates exist only when a stage publishes those messages.
     """
 
     def __init__(self, settings: ResultsSettings | None = None, /, **values: Any) -> None:
@@ -103,7 +103,7 @@ class Results(Tap[ResultsSettings]):
         self._covariance: Any = None
         self._detections: Any = None
         self._candidates: Any = None
-        self._looks: dict[int, int] = {}  # of the candidates told last, by number
+        self._observations: dict[int, int] = {}  # of the newest candidates, by number
         self._detector_life: int = 0
         self._rotations: Any = None
         self._poses: Any = None
@@ -111,8 +111,8 @@ class Results(Tap[ResultsSettings]):
         self._last_sweep_ns: int | None = None
         self._fixes = FixLog()
         self._sweeps: Counter[str] = Counter()
-        self._examples: dict[str, str] = {}
-        self._found: int = 0
+        self._examples: dict[str, str] = {}  # of each kind of search result
+        self._sweeps_with_drone: int = 0
         self._transitions: list[Transition] = []
         self._state: dict[int, str] = {}  # of each track
         self._pose_state: PoseState | None = None
@@ -128,35 +128,35 @@ class Results(Tap[ResultsSettings]):
     @property
     def sweeps_with_drone(self) -> int:
         """Sweeps in which the detector accepted a candidate."""
-        return self._found
+        return self._sweeps_with_drone
 
     @property
     def sweeps(self) -> int:
-        """Sweeps that were searched."""
+        """Sweeps that the detector searched."""
         return sum(self._sweeps.values())
 
     @property
-    def verdicts(self) -> list[tuple[str, int]]:
-        """What the detector said and how often, most frequent first; verdicts that differ in numbers only are one."""
+    def search_results(self) -> list[tuple[str, int]]:
+        """Summaries by the detector and their counts, most frequent first; numbers in them are ignored."""
         return [(self._examples[kind], count) for kind, count in self._sweeps.most_common()]
 
     @property
     def pose_states(self) -> dict[str, int]:
-        """How many poses were told in each state, most frequent first; empty when nobody fuses."""
+        """Number of poses in each state, most frequent first; empty without a fuse stage."""
         return dict(self._pose_states.most_common())
 
     @property
     def resets(self) -> int:
-        """How often the fused pose jumped."""
+        """Number of jumps of the fused pose."""
         return self._resets
 
     @property
     def transitions(self) -> list[Transition]:
-        """Every change of a track's state, with its reason; those of all tracks as they came."""
+        """State changes of all tracks with their reasons, in order of arrival."""
         return self._transitions
 
     def open(self, run: Run) -> None:
-        """Start the run's files."""
+        """Open the files of the run."""
         self._folder, self._live = run.out_dir, run.live
         for name in (FIX_FILE, COVARIANCE_FILE, DETECTIONS_FILE, LOG_FILE):
             self._files[name] = self._file(name)
@@ -165,16 +165,16 @@ class Results(Tap[ResultsSettings]):
         self._files[FIX_FILE].write(POSITION_ONLY)
         self._covariance = csv.writer(self._files[COVARIANCE_FILE])
         upper = [f"c{name}_m2" for name in UPPER]
-        self._covariance.writerow(["stamp_s", *upper, "hits", "iterations", "track_id"])
+        self._covariance.writerow(["stamp_s", *upper, "returns", "iterations", "track_id"])
         self._detections = csv.writer(self._files[DETECTIONS_FILE])
         self._detections.writerow(["start_s", "end_s", "x_m", "y_m", "z_m", "score"])
 
     def wants(self, message: type[Message]) -> bool:
-        """What the files hold: the rest comes by the thousand."""
-        return message in KEPT
+        """Only messages that the files hold."""
+        return message in WRITTEN
 
     def see(self, output: str, message: Message, arrival_ns: int) -> None:
-        """Take what belongs here; all else passes by."""
+        """Write a message to its file."""
         if isinstance(message, DroneFix):
             self._fixes.append(message)
             self._files[FIX_FILE].write(tum_line(message.stamp_ns, message.xyz_vehicle_m))
@@ -185,11 +185,11 @@ class Results(Tap[ResultsSettings]):
             self._sweep_start_ns = {message.stamp_ns: message.start_ns}
         elif isinstance(message, Detections):
             self._write_detections(message)
-            kind = _NUMBER.sub("#", message.verdict)
+            kind = _NUMBER.sub("#", message.summary)
             self._sweeps[kind] += 1
-            self._examples.setdefault(kind, message.verdict)
-            self._found += bool(message.accepted.any())
-            self._log(message.stamp_ns, output, message.verdict)
+            self._examples.setdefault(kind, message.summary)
+            self._sweeps_with_drone += bool(message.accepted.any())
+            self._log(message.stamp_ns, output, message.summary)
         elif isinstance(message, Candidates):
             self._write_candidates(message)
         elif isinstance(message, TrackState):
@@ -200,7 +200,7 @@ class Results(Tap[ResultsSettings]):
             self._write_pose(output, message)
 
     def _note_state(self, output: str, message: TrackState) -> None:
-        """Keep and log a track's state when it is another than before."""
+        """Store and log the state of a track when it changes."""
         state, number = message.state.name, message.track_id
         if self._state.get(number) == state:
             return
@@ -210,14 +210,14 @@ class Results(Tap[ResultsSettings]):
         self._log(message.stamp_ns, output, f"{who}{state}: {message.reason}")
 
     def _write_detections(self, message: Detections) -> None:
-        """A line for each accepted candidate, best first; a search without one is a line without a position.
+        """Write a line per accepted candidate, best first; a search without one is a line without a position.
 
-        A search began when its message says, else with its depth image, else where the search before it ended.
+        The start of a search is in its message, else it is that of its depth image, else the end of the search before.
         """
         start_ns = message.start_ns
         if start_ns is None:
-            since = self._last_sweep_ns if self._last_sweep_ns is not None else message.stamp_ns
-            start_ns = self._sweep_start_ns.get(message.stamp_ns, since)
+            previous_ns = self._last_sweep_ns if self._last_sweep_ns is not None else message.stamp_ns
+            start_ns = self._sweep_start_ns.get(message.stamp_ns, previous_ns)
         self._last_sweep_ns = message.stamp_ns
         span = [stamp_s(start_ns), stamp_s(message.stamp_ns)]
         accepted = zip(message.xyz_vehicle_m[message.accepted], message.score[message.accepted], strict=True)
@@ -225,23 +225,26 @@ class Results(Tap[ResultsSettings]):
         self._detections.writerows(lines or [[*span, "", "", "", ""]])
 
     def _write_candidates(self, message: Candidates) -> None:
-        """A line for each candidate that had one more look: where it is, and with what probability it is a drone."""
+        """Write a line per candidate with a new observation: its position and the probability that it is a drone."""
         if self._candidates is None:
             self._files[CANDIDATES_FILE] = self._file(CANDIDATES_FILE)
             self._candidates = csv.writer(self._files[CANDIDATES_FILE])
-            head = ["stamp_s", "candidate", "detector_life", "looks", "probability", "x_m", "y_m", "z_m"]
+            head = ["stamp_s", "candidate", "detector_instance", "observations", "probability", "x_m", "y_m", "z_m"]
             self._candidates.writerow(head)
-        before = self._looks if message.detector_life == self._detector_life else {}
-        numbers, looks = message.candidate_id.tolist(), message.looks.tolist()
-        self._looks, self._detector_life = dict(zip(numbers, looks, strict=True)), message.detector_life
+        before = self._observations if message.detector_instance == self._detector_life else {}
+        numbers, observations = message.candidate_id.tolist(), message.scan_passes.tolist()
+        self._observations, self._detector_life = (
+            dict(zip(numbers, observations, strict=True)),
+            message.detector_instance,
+        )
         for i, number in enumerate(numbers):
-            if looks[i] != before.get(number):
-                told = [number, message.detector_life, looks[i], f"{message.probability[i]:.6g}"]
+            if observations[i] != before.get(number):
+                values = [number, message.detector_instance, observations[i], f"{message.probability[i]:.6g}"]
                 xyz = [f"{v:.4f}" for v in message.xyz_vehicle_m[i].tolist()]
-                self._candidates.writerow([stamp_s(message.stamp_ns), *told, *xyz])
+                self._candidates.writerow([stamp_s(message.stamp_ns), *values, *xyz])
 
     def _write_rotation(self, output: str, message: RelativeRotation) -> None:
-        """A line for each answer, also for none; the log tells when its state or the branch changes."""
+        """Write a line per message, also without a rotation; log changes of the state and of the yaw branch."""
         if self._rotations is None:
             self._files[ROTATION_FILE] = self._file(ROTATION_FILE)
             self._rotations = csv.writer(self._files[ROTATION_FILE])
@@ -250,18 +253,18 @@ class Results(Tap[ResultsSettings]):
         R, covariance_rad2 = message.R_vehicle_drone, message.covariance_rad2
         quaternion = [""] * 4 if R is None else _digits(quaternions_xyzw(R[None])[0])
         upper = [""] * 6 if covariance_rad2 is None else _digits(covariance_rad2[UPPER_3])
-        told = [*_digits(message.branch_probability), message.state.name, message.switches, message.reason]
-        self._rotations.writerow([stamp_s(message.stamp_ns), int(R is not None), *quaternion, *upper, *told])
+        values = [*_digits(message.branch_probability), message.state.name, message.switches, message.reason]
+        self._rotations.writerow([stamp_s(message.stamp_ns), int(R is not None), *quaternion, *upper, *values])
         branch = message.state.name, message.switches
         if branch != self._branch:
             self._branch = branch
             self._log(message.stamp_ns, output, f"{message.state.name}: {message.reason}")
 
     def _write_pose(self, output: str, message: RelativePose) -> None:
-        """A line for each pose whose position is known; the log tells when the state changes.
+        """Write a line per pose with a known position; log changes of the state.
 
-        `rotation`: whether it is known; where it is not the covariance's position is in the vehicle's axes. `good`:
-        whether the autopilot's gate lets the pose out, at its own time.
+        `rotation`: whether it is known; if not, the covariance of the position is in vehicle axes. `accepted`:
+        whether the autopilot's gate accepts the pose at its own time.
         """
         self._pose_states[message.state.name] += 1
         self._resets = message.resets
@@ -273,42 +276,62 @@ class Results(Tap[ResultsSettings]):
                 self._files[name] = self._file(name)
             self._files[POSE_FILE].write(POSE_HEAD)
             self._poses = csv.writer(self._files[POSE_COVARIANCE_FILE])
-            head = ["state", "good", "rotation", "resets", "nis", "measured_s", "track_id"]
+            head = ["state", "accepted", "rotation", "resets", "nis", "measured_s", "track_id"]
             self._poses.writerow(["stamp_s", *POSE_UPPER, *head])
-        R, xyz_m, covariance = message.R_vehicle_drone, message.xyz_vehicle_m, message.covariance
-        if xyz_m is None or covariance is None:
+        estimate, R = message.estimate, message.R_vehicle_drone
+        if estimate is None:
             return
         q = (0.0, 0.0, 0.0, 1.0) if R is None else tuple(quaternions_xyzw(R[None])[0].tolist())
-        self._files[POSE_FILE].write(tum_line(message.stamp_ns, xyz_m, q))
-        upper = covariance[UPPER_6]
-        upper[np.isinf(upper)] = UNKNOWN_RAD2
+        self._files[POSE_FILE].write(tum_line(message.stamp_ns, estimate.xyz_vehicle_m, q))
+        upper = _covariance(estimate)[UPPER_6]
         measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
-        good = reject_reason(message, message.stamp_ns, self.settings.limits) is None
-        told = [message.state.name, int(good), int(R is not None), message.resets, nis, measured, message.track_id]
-        self._poses.writerow([stamp_s(message.stamp_ns), *_digits(upper), *told])
+        accepted = reject_reason(message, message.stamp_ns, self.settings.limits) is None
+        values = [
+            message.state.name,
+            int(accepted),
+            int(R is not None),
+            message.resets,
+            nis,
+            measured,
+            message.track_id,
+        ]
+        self._poses.writerow([stamp_s(message.stamp_ns), *_digits(upper), *values])
 
     def _file(self, name: str) -> ResultFile:
-        return ResultFile(self._folder / name, patient=self._live)
+        return ResultFile(self._folder / name, tolerant=self._live)
 
     @property
     def status(self) -> str | None:
-        """That the disk does not take the results of a live run."""
-        why = next((file.status for file in tuple(self._files.values()) if file.status), None)
-        return None if why is None else f"{self._folder}: results are being lost ({why}): make room; the run goes on"
+        """Reports that results of a live run cannot be written; None: all are written."""
+        error = next((file.status for file in tuple(self._files.values()) if file.status), None)
+        return (
+            None
+            if error is None
+            else f"{self._folder}: results are being lost ({error}): free disk space; the run continues"
+        )
 
     def note(self, text: str) -> None:
-        """One line of the log without a time: a warning of the recording, the hash."""
+        """Append a line without a time to the log: a warning of the recording, the output hash."""
         self._files[LOG_FILE].write(f"{text}\n")
 
     def _log(self, stamp_ns: int, output: str, text: str) -> None:
         self.note(f"{stamp_s(stamp_ns)} {output}: {text}")
 
     def close(self) -> None:
-        """Close the run's files."""
+        """Close the files of the run."""
         for stream in self._files.values():
             stream.close()
         self._files.clear()
+
+
+def _covariance(estimate: PositionEstimate | PoseEstimate) -> NDArray[np.float64]:
+    """(6, 6) of T_vehicle_drone; UNKNOWN_RAD2 for a rotation that is not known."""
+    if isinstance(estimate, PoseEstimate):
+        return estimate.covariance
+    covariance = np.diag([UNKNOWN_RAD2] * 3 + [0.0] * 3)
+    covariance[3:, 3:] = estimate.covariance_vehicle_m2
+    return covariance
 
 
 def _digits(values: NDArray[np.float64]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Truth of a simulated recording, for judging a run after it is done. Nothing of it reaches a stage.
+"""Truth of a simulated recording, for the evaluation of a run. It reaches no stage.
 
 Source: ours; recording format in recordings/README.md (/truth/*).
 """
@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from flow.link import LinkError, Record
 from links.evaluation.association import follow, interpolate
 from links.evaluation.text_files import FULL_POSE, NO_DRONE
+from links.recording import RecordingReader
 from links.runs.results import (
     TRUTH_FILE,
-    TRUTH_HITS_FILE,
+    TRUTH_RETURNS_FILE,
     TRUTH_VEHICLE_FILE,
     TRUTH_VISIBLE_FILE,
-    of_drone,
+    drone_file,
     stamp_s,
     tum_line,
 )
@@ -31,48 +32,48 @@ from stages.geometry.frames import rotation_from_quaternion_xyzw
 from stages.messages import DroneFix
 
 TOPIC_VEHICLE = "/truth/vehicle"
-TRUTH_RECORDING = "truth.mcap"  # beside a live recording of the simulated rig: the truth, which no run takes in
-OF_A_DRONE = re.compile(r"/truth/(drone|hits|visible)(?:_([1-9]\d*))?")  # /truth/hits_2 is of drone 2
-MAX_GAP_NS = 50_000_000  # truth further apart than this is not interpolated over
+TRUTH_RECORDING = "truth.mcap"  # next to a live recording of the simulated rig; no run reads it
+DRONE_TOPIC = re.compile(r"/truth/(drone|hits|visible)(?:_([1-9]\d*))?")  # /truth/hits_2: drone 2
+MAX_GAP_NS = 50_000_000  # the truth is not interpolated across a larger gap
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
 CHI2_95_3 = 7.814728  # 95 % quantile of chi-square with 3 degrees of freedom
 
 
 @dataclass
 class TrueDrone:
-    """What a recording's truth says of one drone."""
+    """Truth of one drone."""
 
     pose: dict[int, Any] = field(default_factory=dict)  # T_world_drone by stamp [ns]
-    hits_ns: list[int] | None = None  # pulses that it returned; None: the recording does not say
-    visible: dict[int, bool] | None = None  # whether the LiDAR has a line of sight to it, since when
+    return_ns: list[int] | None = None  # stamps of the pulses that it returned; None: not recorded
+    visible: dict[int, bool] | None = None  # from this stamp on: whether the LiDAR has a line of sight to it
 
 
 @dataclass
 class TruthLog:
-    """Sets truth records aside while a recording streams by."""
+    """Collects the truth records of a recording."""
 
     vehicle: dict[int, Any] = field(default_factory=dict)
     drones: dict[int, TrueDrone] = field(default_factory=dict)  # by number, from 1
 
-    def aside(self, records: Iterable[Record]) -> Iterator[Record]:
-        """Pass on all records but those of truth, which are kept here."""
+    def without_truth(self, records: Iterable[Record]) -> Iterator[Record]:
+        """Yield all records except those of truth, which are stored."""
         for record in records:
-            of_a_drone = OF_A_DRONE.fullmatch(record.topic)
+            match = DRONE_TOPIC.fullmatch(record.topic)
             if record.topic == TOPIC_VEHICLE:
                 self.vehicle[record.stamp_ns] = _pose(record)
-            elif of_a_drone:
-                drone = self.drones.setdefault(int(of_a_drone[2] or 1), TrueDrone())
-                _keep(drone, of_a_drone[1], record)
+            elif match:
+                drone = self.drones.setdefault(int(match[2] or 1), TrueDrone())
+                _store(drone, match[1], record)
             else:
                 yield record
 
-    def take(self, records: Iterable[Record]) -> None:
-        """Keep what of these records is truth."""
-        for _ in self.aside(records):
+    def add_all(self, records: Iterable[Record]) -> None:
+        """Store the truth records among `records`."""
+        for _ in self.without_truth(records):
             pass
 
     def drone_in_vehicle(self, number: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Stamps (n,) [ns] and a drone's position in the vehicle frame (n, 3) [m], where both poses are known."""
+        """Stamps (n,) [ns] and positions (n, 3) [m] of a drone in the vehicle frame, where both poses are known."""
         poses = self.drones[number].pose if number in self.drones else {}
         stamps = sorted(self.vehicle.keys() & poses.keys())
         xyz = np.empty((len(stamps), 3))
@@ -82,8 +83,8 @@ class TruthLog:
             xyz[row] = R_world_vehicle.T @ (np.asarray(poses[stamp][0]) - np.asarray(t_vehicle))
         return np.array(stamps, dtype=np.int64), xyz
 
-    def errors_of(self, fixes: Sequence[DroneFix]) -> FixErrors | None:
-        """Each fix against the drone that its track follows; None when there was none."""
+    def fix_errors_of(self, fixes: Sequence[DroneFix]) -> FixErrors | None:
+        """Errors of the fixes against the drone that their track follows; None when the truth has no drone."""
         numbers = [number for number, drone in sorted(self.drones.items()) if drone.pose]
         paths = [self.drone_in_vehicle(number) for number in numbers]
         if len(paths) < 2:
@@ -99,12 +100,12 @@ class TruthLog:
         stamps = np.concatenate([part.stamps_ns for part in parts])
         order = np.argsort(stamps, kind="stable")
         errors, nees = (np.concatenate([getattr(part, what) for part in parts]) for what in ("error_m", "nees"))
-        return FixErrors(stamps[order], errors[order], nees[order], sum(part.not_covered for part in parts))
+        return FixErrors(stamps[order], errors[order], nees[order], sum(part.without_truth for part in parts))
 
     def write(self, folder: Path) -> None:
-        """Write what is known of the vehicle and each drone beside a run's results; nothing when that is nothing.
+        """Write the truth of the vehicle and of each drone into the folder of a run; no file when there is no truth.
 
-        A recording that knows where the vehicle is and has no drone gives a file that says so.
+        When there are vehicle poses and no drone, the file states that.
         """
         if any(drone.pose for drone in self.drones.values()):
             for number, drone in self.drones.items():
@@ -121,21 +122,21 @@ class TruthLog:
             stamp_ns = int(stamp)
             q = _relative(self.vehicle[stamp_ns][1], drone.pose[stamp_ns][1])
             lines.append(tum_line(stamp_ns, position, q))
-        (folder / of_drone(TRUTH_FILE, number)).write_text("".join(lines), encoding="utf-8")
-        if drone.hits_ns is not None:
-            hits = "".join(f"{stamp_s(stamp)}\n" for stamp in sorted(drone.hits_ns))
-            (folder / of_drone(TRUTH_HITS_FILE, number)).write_text(f"stamp_s\n{hits}", encoding="utf-8")
+        (folder / drone_file(TRUTH_FILE, number)).write_text("".join(lines), encoding="utf-8")
+        if drone.return_ns is not None:
+            returns = "".join(f"{stamp_s(stamp)}\n" for stamp in sorted(drone.return_ns))
+            (folder / drone_file(TRUTH_RETURNS_FILE, number)).write_text(f"stamp_s\n{returns}", encoding="utf-8")
         if drone.visible is not None:
-            rows = "".join(f"{stamp_s(stamp)},{int(seen)}\n" for stamp, seen in sorted(drone.visible.items()))
-            (folder / of_drone(TRUTH_VISIBLE_FILE, number)).write_text(f"stamp_s,visible\n{rows}", encoding="utf-8")
+            rows = "".join(f"{stamp_s(stamp)},{int(visible)}\n" for stamp, visible in sorted(drone.visible.items()))
+            (folder / drone_file(TRUTH_VISIBLE_FILE, number)).write_text(f"stamp_s,visible\n{rows}", encoding="utf-8")
 
 
-def _keep(drone: TrueDrone, what: str, record: Record) -> None:
+def _store(drone: TrueDrone, what: str, record: Record) -> None:
     if what == "drone":
         drone.pose[record.stamp_ns] = _pose(record)
     elif what == "hits":
-        drone.hits_ns = drone.hits_ns or []
-        drone.hits_ns += _pulses(record)
+        drone.return_ns = drone.return_ns or []
+        drone.return_ns += _pulses(record)
     else:
         drone.visible = drone.visible or {}
         drone.visible[record.stamp_ns] = _visible(record)
@@ -157,14 +158,14 @@ def _pulses(record: Record) -> list[int]:
     try:
         return [int(stamp) for stamp in json.loads(record.data)["pulse_stamp_ns"]]
     except (ValueError, TypeError, KeyError) as error:
-        raise LinkError(f"{record.topic} at {record.stamp_ns} ns holds no pulses ({error!r})") from None
+        raise LinkError(f"{record.topic} at {record.stamp_ns} ns has no pulse stamps ({error!r})") from None
 
 
 def _visible(record: Record) -> bool:
     try:
         visible = json.loads(record.data)["visible"]
     except (ValueError, TypeError, KeyError) as error:
-        raise LinkError(f"{record.topic} at {record.stamp_ns} ns does not say what is visible ({error!r})") from None
+        raise LinkError(f"{record.topic} at {record.stamp_ns} ns has no visibility ({error!r})") from None
     if not isinstance(visible, bool):
         raise LinkError(f"{record.topic} at {record.stamp_ns} ns: visible is {visible!r}, neither true nor false")
     return visible
@@ -177,19 +178,28 @@ def _pose(record: Record) -> tuple[tuple[float, float, float], Quaternion]:
         qx, qy, qz, qw = (float(v) for v in fields["quaternion_xyzw"])
     except (ValueError, TypeError, KeyError) as error:
         raise LinkError(
-            f"{record.topic} at {record.stamp_ns} ns holds no pose ({error!r}): was it recorded by grd?"
+            f"{record.topic} at {record.stamp_ns} ns has no pose ({error!r}): was it recorded by grd?"
         ) from None
     return (x, y, z), (qx, qy, qz, qw)
 
 
+def read_truth_file(recording: Path) -> TruthLog:
+    """The truth that a simulated rig wrote next to a live recording; empty when there is no such file."""
+    truth, file = TruthLog(), recording.parent / TRUTH_RECORDING
+    if file.is_file() and file != recording:
+        with RecordingReader(file) as reader:
+            truth.add_all(reader.records())
+    return truth
+
+
 @dataclass(frozen=True, slots=True)
 class FixErrors:
-    """Errors of fixes against truth, for the fixes that truth covers."""
+    """Errors of fixes against the truth, for fixes at times with truth."""
 
     stamps_ns: NDArray[np.int64]
     error_m: NDArray[np.float64]  # (n, 3) fix - truth, vehicle axes
-    nees: NDArray[np.float64]  # (n,) error^T covariance^-1 error; 3 on average when the covariance is honest
-    not_covered: int  # fixes outside truth or in a gap of it
+    nees: NDArray[np.float64]  # (n,) error^T covariance^-1 error; 3 on average when the covariance is consistent
+    without_truth: int  # number of fixes outside the truth or in a gap of it
 
     @property
     def rmse_xyz_m(self) -> NDArray[np.float64]:
@@ -203,17 +213,17 @@ class FixErrors:
 
     @property
     def inside_95(self) -> float:
-        """Share of fixes whose 95 % ellipsoid holds the truth."""
+        """Share of fixes whose 95 % ellipsoid contains the truth."""
         return float(np.mean(self.nees <= CHI2_95_3))
 
 
 def fix_errors(
     fixes: Sequence[DroneFix], stamps_ns: NDArray[np.int64], xyz_vehicle_m: NDArray[np.float64]
 ) -> FixErrors:
-    """Compare each fix with truth interpolated linearly to the fix's own stamp."""
+    """Errors of fixes against the truth, interpolated linearly to the stamp of each fix."""
     at_ns = np.array([fix.stamp_ns for fix in fixes], dtype=np.int64)
     known, true_m = interpolate(at_ns, stamps_ns, xyz_vehicle_m, MAX_GAP_NS)
-    judged = [fix for fix, is_known in zip(fixes, known, strict=True) if is_known]
-    error_m = np.array([fix.xyz_vehicle_m for fix in judged]).reshape(-1, 3) - true_m[known]
-    nees = [float(e @ np.linalg.solve(fix.covariance_m2, e)) for e, fix in zip(error_m, judged, strict=True)]
-    return FixErrors(at_ns[known], error_m, np.array(nees), len(fixes) - len(judged))
+    evaluated = [fix for fix, is_known in zip(fixes, known, strict=True) if is_known]
+    error_m = np.array([fix.xyz_vehicle_m for fix in evaluated]).reshape(-1, 3) - true_m[known]
+    nees = [float(e @ np.linalg.solve(fix.covariance_m2, e)) for e, fix in zip(error_m, evaluated, strict=True)]
+    return FixErrors(at_ns[known], error_m, np.array(nees), len(fixes) - len(evaluated))

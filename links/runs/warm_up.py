@@ -1,8 +1,7 @@
-"""A graph tried on a recording before it runs live: what is compiled at first use is compiled, and loaded, by then.
+"""Replays a recording through a graph before a live run, so that all kernels are compiled and loaded at its start.
 
-Without it the first packets wait for seconds where a stage is compiled (the first run after an update), and tenths of a
-second each time. The recording is one of grd's own, simulated, with every sensor; nothing of it stays: the nodes are
-built anew for the run.
+Without it the first packets wait while kernels compile (seconds after an update) or load (tenths of a second). The
+recording is a committed simulated one with every sensor. No state remains: the live run builds its nodes again.
 
 Source: ours; numba compiles at the first call.
 """
@@ -21,7 +20,7 @@ RECORDING = Path(__file__).resolve().parents[2] / "recordings" / "experiment_1.m
 
 
 def warm_up(graph: Graph, progress: Progress, recording: Path = RECORDING) -> str | None:
-    """Run the graph over a recording; why it was not, or not to its end, in words."""
+    """Replay a recording through the graph; returns None, or the reason why the replay failed or ended early."""
     try:
         with RecordingReader(recording) as reader:
             runner = Replay(graph)
@@ -30,5 +29,5 @@ def warm_up(graph: Graph, progress: Progress, recording: Path = RECORDING) -> st
                     runner.feed(record)
             runner.finish()
     except (LinkError, RunError) as error:
-        return f"the graph could not be tried on {recording.name} beforehand, the start may be rough: {error}"
+        return f"warm-up on {recording.name} failed, the first messages may be late: {error}"
     return None

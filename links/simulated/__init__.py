@@ -1,8 +1,8 @@
-"""A simulated world and sensors that give the same bytes as the hardware.
+"""Simulator of the rig: world, sensors, servo and autopilot. It produces the bytes that the hardware sends.
 
 Source: ours.
 """
 
-from links.simulated.live_rig import LiveRig
+from links.simulated.rig.live_rig import LiveRig
 
 __all__ = ["LiveRig"]

@@ -1,4 +1,4 @@
-"""Colours of the viewer, packed as Rerun wants them (0xRRGGBBAA): scenery is cold and dim, answers are warm and bright.
+"""Colours of the viewer, packed as 0xRRGGBBAA: cold and dim for raw data, warm and bright for results.
 
 Source: ours.
 """
@@ -9,22 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 DRONE = 0xFFC83DFF  # the tracked drone
-DRONE_VEIL = 0xFFC83D80  # what belongs to it and must not hide it
-ACCEPTED = 0x4DE38AFF  # a candidate taken for a drone
-REFUSED = 0xE0707090  # a candidate refused
-MAYBE = 0xB58CFFFF  # what may be one
-COASTING = 0xFF9F43FF  # one that is not seen now, predicted
-FAN = 0x5AA9FF60  # where the LiDAR looks now
+DRONE_TRANSLUCENT = 0xFFC83D80  # its ellipsoid and other entities that must not hide it
+ACCEPTED = 0x4DE38AFF  # an accepted candidate
+REJECTED = 0xE0707090  # a rejected candidate
+CANDIDATE = 0xB58CFFFF  # an undecided candidate
+COASTING = 0xFF9F43FF  # a drone without current returns, predicted
+FAN = 0x5AA9FF60  # the plane of the LiDAR's beams
 NEUTRAL = 0x9AA4B2FF
 GOOD = 0x3FB871FF
 BAD = 0xD9534FFF
-VERTICAL = 0x64B5FFFF  # the vertical and what runs along it
-UNASSIGNED = 0x9AA4B290  # a line along no known direction
+VERTICAL = 0x64B5FFFF  # the vertical and the lines along it
+UNASSIGNED = 0x9AA4B290  # a line without a direction
 PAIRS = ((0xFF9F43FF, 0xFFD9A6FF), (0x3FD07AFF, 0xB4F2CBFF), (0xE86AD0FF, 0xF6BFEAFF), (0xF2E03AFF, 0xFAF3AEFF))
-"""Horizontal pairs of directions, strongest first: each a hue, full for its one direction and pale for the other."""
-AXES = np.array([0xFF6B6BFF, 0x6BD66BFF, 0x6BA8FFFF], dtype=np.uint32)  # x, y, z as everywhere in Rerun
+"""Horizontal pairs of directions, strongest first: one hue each, saturated for one direction, pale for the other."""
+AXES = np.array([0xFF6B6BFF, 0x6BD66BFF, 0x6BA8FFFF], dtype=np.uint32)  # x, y, z, as in Rerun
 
-EVEN_ODDS_SPAN = 5.0  # ln of the odds at which a probability has its last colour: 0.7 %, 99.3 %
+LOG_ODDS_SPAN = 5.0  # log-odds of the ends of the colour ramp: 0.7 %, 99.3 %
 
 
 def _ramp(stops_rgb: list[list[int]]) -> NDArray[np.uint32]:
@@ -46,8 +46,8 @@ def by_height(z_m: NDArray[np.float32], low_m: float = -2.0, high_m: float = 25.
 
 
 def by_probability(probability: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """Packed colour (n,) of probabilities (n,), even in the odds: red surely not, violet even, green surely."""
-    sure = np.clip(probability, 1e-9, 1 - 1e-9)
-    odds = np.log(sure / (1 - sure))
-    index = np.clip((odds + EVEN_ODDS_SPAN) / (2 * EVEN_ODDS_SPAN) * 255, 0, 255).astype(np.uint8)
+    """Packed colour (n,) of probabilities (n,), linear in the log-odds: red at 0, violet at 0.5, green at 1."""
+    clipped = np.clip(probability, 1e-9, 1 - 1e-9)
+    log_odds = np.log(clipped / (1 - clipped))
+    index = np.clip((log_odds + LOG_ODDS_SPAN) / (2 * LOG_ODDS_SPAN) * 255, 0, 255).astype(np.uint8)
     return _PROBABILITY_RAMP[index]

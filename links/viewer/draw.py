@@ -1,17 +1,17 @@
-"""How each message looks in Rerun: one function per message type. A type without one is drawn field by field.
+"""Draws messages in Rerun: one function per message type. A type without a function is drawn field by field.
 
-Entity paths are a group, then the output (`vehicle/sweep/swept_points`), then which drone (`.../drone_1`):
+Entity paths consist of a group, the output (`vehicle/sweep/swept_points`) and the drone (`.../drone_1`):
 
-| group                          | what                                                        |
-| ------------------------------ | ----------------------------------------------------------- |
-| vehicle/, labels/, lidar/      | 3D: in the vehicle frame, its dots with words, in the lidar's |
-| frames/                        | frames vehicle -> turntable -> lidar, drone_position; sphere_vehicle, sphere_drone |
-| depth/, score/, range/, marks/ | images, and what is marked on them                          |
-| camera/                        | by camera: its picture, and what was found in it            |
-| sphere/                        | directions, on the unit sphere of vehicle and drone         |
-| plots/                         | curves, by quantity                                         |
-| states/                        | lanes: one word at a time                                   |
-| log/, now, candidates, about/  | sentences, the present in words, why or why not, graph and settings |
+| group                             | content                                                          |
+| --------------------------------- | ---------------------------------------------------------------- |
+| vehicle/, labels/, lidar/         | 3D: in the vehicle frame, labelled points there, in the lidar frame |
+| frames/                           | transforms: turntable, lidar, drone_position, sphere_vehicle, sphere_drone |
+| depth/, score/, range/, overlays/ | images, and overlays on them                                     |
+| camera/                           | per camera: its image, and the detections in it                  |
+| sphere/                           | directions, on the unit spheres of vehicle and drone             |
+| plots/                            | curves, per quantity                                             |
+| states/                           | state lanes                                                      |
+| log/, status, candidates, about/  | text log, current status, reasons per candidate, graph and settings |
 
 Source: ours.
 """
@@ -28,10 +28,10 @@ import rerun as rr
 
 from flow.events import EventMessage
 from flow.message import Message
-from links.viewer import colours, draw_cameras, draw_drone, draw_pose, draw_rotation, draw_sensors
-from links.viewer.marks import Marks, plot, say, state
-from links.viewer.scene import Mark, Scene
-from links.viewer.slices import thin
+from links.viewer import colours, draw_cameras, draw_drone, draw_pose, draw_sensors
+from links.viewer.entities import Entities, Entity, log_entry, plot, state_change
+from links.viewer.message_queue import thin
+from links.viewer.scene import Scene
 from stages.messages import (
     AutopilotEstimator,
     Candidates,
@@ -57,17 +57,17 @@ from stages.messages import (
 
 
 @singledispatch
-def draw(message: Any, name: str, scene: Scene) -> Marks:
-    """What to log for a message of output `name` ("track/drone_fix"). This body: any type without its own function."""
+def draw(message: Any, name: str, scene: Scene) -> Entities:
+    """Entities of a message of output `name` ("track/drone_fix"). This body draws the remaining types."""
     for field in dataclasses.fields(message):
         if field.name != "stamp_ns":
             yield from _draw_field(getattr(message, field.name), f"{name}/{field.name}", scene)
 
 
 @draw.register
-def event(told: EventMessage, name: str, scene: Scene) -> Marks:
-    """What went wrong, or came right again, as it is told on the terminal."""
-    yield say(f"{name}/{told.node}", told.text, "INFO" if told.resolved else "WARN")
+def event(message: EventMessage, name: str, scene: Scene) -> Entities:
+    """A status event of the run, with the text of the terminal."""
+    yield log_entry(f"{name}/{message.node}", message.text, "INFO" if message.resolved else "WARN")
 
 
 draw.register(LidarFirings)(draw_sensors.lidar_firings)
@@ -85,21 +85,21 @@ draw.register(TrackState)(draw_drone.track_state)
 draw.register(Image)(draw_cameras.image)
 draw.register(VanishingDirections)(draw_cameras.vanishing_directions)
 draw.register(FollowedFeatures)(draw_cameras.followed_features)
-draw.register(RelativeRotation)(draw_rotation.relative_rotation)
-draw.register(VisualMotion)(draw_rotation.visual_motion)
+draw.register(RelativeRotation)(draw_pose.relative_rotation)
+draw.register(VisualMotion)(draw_pose.visual_motion)
 draw.register(RelativePose)(draw_pose.relative_pose)
 draw.register(AutopilotEstimator)(draw_pose.autopilot_estimator)
 draw.register(ServoOffset)(draw_pose.servo_offset)
 
 
-def _draw_field(value: Any, name: str, scene: Scene) -> Marks:
+def _draw_field(value: Any, name: str, scene: Scene) -> Entities:
     if isinstance(value, Message) or dataclasses.is_dataclass(value):
         yield from draw.registry[object](value, name, scene)
     elif isinstance(value, enum.Enum):
-        yield from state(f"states/{name}", value.name, scene)
+        yield from state_change(f"states/{name}", value.name, scene)
     elif isinstance(value, str | tuple | None):
         if scene.changed(name, str(value)):
-            yield say(name, str(value))
+            yield log_entry(name, str(value))
     elif isinstance(value, bytes):
         yield plot(f"plots/other/{name}", [len(value)], [f"{name} bytes"])
     elif 0 < np.size(value) <= 9:
@@ -107,7 +107,7 @@ def _draw_field(value: Any, name: str, scene: Scene) -> Marks:
         yield plot(f"plots/other/{name}", np.ravel(value).astype(np.float64), names)
     elif np.ndim(value) == 2 and np.shape(value)[1] == 3 and name.endswith("_vehicle_m"):
         shown = value[thin(np.asarray(value, dtype=np.float32), scene.max_points)]
-        yield Mark(f"vehicle/{name}", rr.Points3D(shown, colors=colours.NEUTRAL), frame="vehicle")
+        yield Entity(f"vehicle/{name}", rr.Points3D(shown, colors=colours.NEUTRAL), frame="vehicle")
     else:
         finite = np.asarray(value, dtype=np.float64)
         finite = finite[np.isfinite(finite)]

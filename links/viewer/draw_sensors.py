@@ -1,19 +1,23 @@
-"""How the sensors' messages look: what was measured, where the turntable stands, what became of the pulses.
+"""Draws the sensors' messages: LiDAR firings and points, the servo, vehicle motion, depth and score images.
 
-Source: ours.
+In the images zero means no data, and isolated pixels are enlarged so that they stay visible.
+
+Source: ours; geometry of the depth image: `stages.messages.DepthImage`, P III.A.
 """
 
 from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
-from links.viewer import colours, images
-from links.viewer.marks import Marks, lane_of, plot, stage_of, state
-from links.viewer.scene import Mark, Scene, turntable_transform
-from links.viewer.slices import thin
+from links.viewer import colours
+from links.viewer.entities import Entities, Entity, plot, stage_of, state_change, state_path
+from links.viewer.message_queue import thin
+from links.viewer.scene import Scene, turntable_transform
 from stages.messages import (
     DepthImage,
     LidarFirings,
@@ -26,46 +30,55 @@ from stages.messages import (
 )
 
 SERVO_COLOURS = np.array([colours.NEUTRAL, colours.FAN | 0xFF], dtype=np.uint32)
-ASKED_COLOUR = np.array([colours.DRONE], dtype=np.uint32)
+GOAL_COLOUR = np.array([colours.DRONE], dtype=np.uint32)
+STEP_M = 0.002  # one count of the u16 images, the VLP-16's own resolution
+COLUMNS = 900  # of the range image: 0.4 deg, the spacing of firings at 20 turns a second
+
+# VLP-16 user manual 63-9243, table 9-1: elevation of the 16 lasers in the packet's order.
+ELEVATION_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
+ROW_OF_LASER = (15 - ELEVATION_DEG) // 2  # top row: the highest beam
 
 
-def lidar_firings(message: LidarFirings, name: str, scene: Scene) -> Marks:
-    """The range image, and what was lost."""
-    yield Mark(f"range/{name}", images.range_image(message))
+def lidar_firings(message: LidarFirings, name: str, scene: Scene) -> Entities:
+    """The range image and the number of lost packets.
+
+    The image is a tensor, because a tensor view stretches 16 rows to a readable height.
+    """
+    counts = range_counts(message)
+    yield Entity(f"range/{name}", rr.Tensor(counts, dim_names=("laser", "azimuth"), value_range=(0.0, 60.0 / STEP_M)))
     yield plot(f"plots/other/{name}/lost_packets", [message.lost_packets], [f"{name} lost packets"])
-    yield from state(lane_of(name), "packets lost" if message.lost_packets else "ok", scene)
+    yield from state_change(state_path(name), "packets lost" if message.lost_packets else "ok", scene)
 
 
-def servo_state(message: ServoState, name: str, scene: Scene) -> Marks:
-    """Angle and goal, health, and the turntable where it stands."""
+def servo_state(message: ServoState, name: str, scene: Scene) -> Entities:
+    """Servo angle, goal and error; the orientation of the turntable."""
     angles_deg = np.rad2deg([message.position_rad, message.goal_rad])
-    yield plot(f"plots/servo/{name}", angles_deg, ["servo", "its goal"], SERVO_COLOURS, dots=False)
+    yield plot(f"plots/servo/{name}", angles_deg, ["servo position", "servo goal"], SERVO_COLOURS, dots=False)
     yield plot(f"plots/other/{name}/velocity", [math.degrees(message.velocity_radps)], ["servo [deg/s]"])
-    yield from state(lane_of(name), f"error 0x{message.error:02X}" if message.error else "ok", scene)
+    yield from state_change(state_path(name), f"error 0x{message.error:02X}" if message.error else "ok", scene)
     if scene.mount is not None and scene.mount.turns and scene.turntable_is_due(message.stamp_ns):
-        yield Mark("frames/turntable", turntable_transform(scene.mount, message.position_rad))
+        yield Entity("frames/turntable", turntable_transform(scene.mount, message.position_rad))
 
 
-def servo_goal(message: ServoGoal, name: str, scene: Scene) -> Marks:
-    """What the aim asks for, beside what the servo does."""
+def servo_goal(message: ServoGoal, name: str, scene: Scene) -> Entities:
+    """The angle and speed that a stage requests of the servo."""
     del scene
-    yield plot(
-        f"plots/servo/{name}", [math.degrees(message.position_rad)], ["asked"], ASKED_COLOUR, dots=False, steps=True
-    )
-    yield plot(f"plots/other/{name}/speed", [math.degrees(message.speed_radps)], ["asked [deg/s]"])
+    angle_deg = [math.degrees(message.position_rad)]
+    yield plot(f"plots/servo/{name}", angle_deg, ["requested"], GOAL_COLOUR, dots=False, steps=True)
+    yield plot(f"plots/other/{name}/speed", [math.degrees(message.speed_radps)], ["requested [deg/s]"])
 
 
-def swept_points(message: SweptPoints, name: str, scene: Scene) -> Marks:
-    """One slice of the cloud. The slices of `history_s` take turns, so at any time the last of them are all there."""
+def swept_points(message: SweptPoints, name: str, scene: Scene) -> Entities:
+    """One slice of the cloud. The slices reuse `history_s / slice_s` entity paths, so the last `history_s` is shown."""
     xyz_m = message.xyz_vehicle_m[thin(message.xyz_vehicle_m, scene.max_points)]
-    turn = message.stamp_ns // scene.slice_ns % scene.slices
+    index = message.stamp_ns // scene.slice_ns % scene.slices
     points = rr.Points3D(xyz_m, colors=scene.colours(xyz_m), radii=rr.Radius.ui_points(1.2))
-    yield Mark(f"vehicle/{name}/slice_{turn:02d}", points, frame="vehicle")
+    yield Entity(f"vehicle/{name}/slice_{index:02d}", points, frame="vehicle")
     yield plot(f"plots/other/{name}", [message.pulses, len(message.xyz_vehicle_m)], ["pulses", "returns"])
 
 
-def swept_pulses(message: SweptPulses, name: str, scene: Scene) -> Marks:
-    """How many there were and how many saw nothing; where they went, the points and the range image show."""
+def swept_pulses(message: SweptPulses, name: str, scene: Scene) -> Entities:
+    """The number of pulses and the share without a return; points and range image show their geometry."""
     del scene
     count = message.range_m.size
     yield plot(f"plots/other/{name}/pulses", [count], ["pulses placed"])
@@ -74,25 +87,92 @@ def swept_pulses(message: SweptPulses, name: str, scene: Scene) -> Marks:
         yield plot(f"plots/other/{name}/empty", [empty], ["pulses without return [%]"])
 
 
-def vehicle_motion(message: VehicleMotion, name: str, scene: Scene) -> Marks:
-    """Where the vehicle has come to."""
+def vehicle_motion(message: VehicleMotion, name: str, scene: Scene) -> Entities:
+    """Position and yaw of the vehicle in the map frame, as curves."""
     del scene
     R = message.R_map_vehicle
     yield plot(f"plots/other/{name}/position", message.xyz_map_m, [f"vehicle {axis} [m]" for axis in "xyz"])
     yield plot(f"plots/other/{name}/yaw", [math.degrees(math.atan2(R[1, 0], R[0, 0]))], ["vehicle yaw [deg]"])
 
 
-def depth_image(message: DepthImage, name: str, scene: Scene) -> Marks:
-    """A whole sweep."""
+def depth_image(message: DepthImage, name: str, scene: Scene) -> Entities:
+    """The depth image of a sweep; the colours span its depths without the farthest 2 %."""
     scene.depth = message
-    yield Mark(f"depth/{name}", images.depth_image(message))
-    yield Mark("marks/axes", images.axes(message))
+    pixels = depth_counts(message)
+    far = float(np.percentile(pixels[pixels > 0], 98)) if pixels.any() else 1.0
+    colormap = rr.components.Colormap.Turbo
+    yield Entity(f"depth/{name}", rr.DepthImage(pixels, meter=1.0 / STEP_M, colormap=colormap, depth_range=(0.0, far)))
+    yield Entity("overlays/axes", _vehicle_axes(message))
     counts = [message.points, message.returns]
     yield plot(f"plots/other/{name}", counts, ["returns in image", "returns of sweep"])
-    yield scene.now(1, stage_of(name), f"{message.points} of {message.returns} returns fell into the depth image")
+    text = f"{message.points} of {message.returns} returns are inside the depth image"
+    yield scene.status(1, stage_of(name), text)
 
 
-def score_image(message: ScoreImage, name: str, scene: Scene) -> Marks:
-    """What the paper's detector makes of it."""
+def score_image(message: ScoreImage, name: str, scene: Scene) -> Entities:
+    """The score image of the paper's detector."""
     del scene
-    yield Mark(f"score/{name}", images.score_image(message))
+    colormap = rr.components.Colormap.Inferno
+    yield Entity(f"score/{name}", rr.DepthImage(score_counts(message), colormap=colormap, depth_range=(0.0, 65535.0)))
+
+
+def range_counts(firings: LidarFirings) -> NDArray[np.uint16]:
+    """Range by laser (rows, highest beam on top) and azimuth (columns, 0 along +y_lidar); the newest return wins."""
+    image = np.zeros((16, COLUMNS), dtype=np.uint16)
+    hit = (firings.range_m > 0) & (firings.return_kind == 0)
+    column = (firings.azimuth_rad[hit] / (2 * np.pi) * COLUMNS).astype(np.int64) % COLUMNS
+    image[ROW_OF_LASER[firings.laser[hit] % 16], column] = _counts(firings.range_m[hit])
+    return image
+
+
+def depth_counts(message: DepthImage) -> NDArray[np.uint16]:
+    """Depth in steps of 2 mm; an empty pixel takes the depth of its nearest non-empty neighbour, if there is one."""
+    counts = _counts(message.depth_m)
+    nearness = _thicken(np.where(counts > 0, 65535 - counts, 0).astype(np.uint16))
+    return np.where(nearness > 0, 65535 - nearness, 0).astype(np.uint16)
+
+
+def score_counts(message: ScoreImage) -> NDArray[np.uint16]:
+    """Score of each candidate pixel on a logarithmic scale: best 65535, worst a fifth of it, no candidate 0."""
+    known = np.isfinite(message.score)
+    counts = np.zeros(message.score.shape, dtype=np.uint16)
+    if known.any():
+        worse = np.log1p(message.score[known] - message.score[known].min())
+        counts[known] = np.round(65535 * (1 - 0.8 * worse / max(float(worse.max()), 1e-9)))
+    return _thicken(counts)
+
+
+def project_to_depth_image(
+    image: DepthImage, xyz_vehicle_m: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Pixels (n, 2) as (u, v), with the top left corner at 0, and a mask of those inside the image. P III.A."""
+    height_px, width_px = image.depth_m.shape
+    ray = xyz_vehicle_m - image.origin_vehicle_m
+    above = ray[:, 2] > 0
+    pixels = image.focal_px * ray[:, :2] / np.where(above, ray[:, 2], 1.0)[:, None] + [width_px / 2, height_px / 2]
+    inside = above & (pixels >= 0).all(axis=1) & (pixels < [width_px, height_px]).all(axis=1)
+    return pixels, inside
+
+
+def _counts(distance_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    return np.clip(np.nan_to_num(distance_m) / STEP_M + 0.5, 0, 65535).astype(np.uint16)
+
+
+def _thicken(image: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Empty pixels take the value of their largest neighbour, so that downscaling keeps isolated pixels."""
+    grown = cv2.dilate(image, np.ones((3, 3), np.uint8))
+    return np.where(image > 0, image, grown).astype(np.uint16)
+
+
+def _vehicle_axes(image: DepthImage) -> rr.Arrows2D:
+    """The vehicle's forward and left directions in the image."""
+    height_px, width_px = image.depth_m.shape
+    corner = [[0.03 * width_px, 0.03 * height_px]] * 2
+    return rr.Arrows2D(
+        origins=corner,
+        vectors=[[0.12 * width_px, 0.0], [0.0, 0.12 * height_px]],
+        colors=colours.AXES[:2],
+        labels=["forward", "left"],
+        show_labels=True,
+        draw_order=40,
+    )

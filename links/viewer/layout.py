@@ -1,4 +1,4 @@
-"""How a recording opens: where the drone is on the left, why and how sure on the right, both over what is said.
+"""The initial layout of a recording: 3D views left, images, curves and states right, cameras in a third column.
 
 Source: ours.
 """
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
-from links.viewer.scene import DRONE_FRAME, SPHERES_APART, TIMELINE, sphere_frame
+from links.viewer.scene import DRONE_FRAME, SPHERE_SPACING, TIMELINE, sphere_frame
 from stages.messages import CameraMount
 
 _BACKGROUND = [12, 15, 22]
@@ -21,28 +21,28 @@ _WHOLE_RUN = rrb.TimeAxis(
 
 
 class Vision(NamedTuple):
-    """What the graph has of the cameras."""
+    """Camera outputs of the graph that the layout has views for."""
 
-    pictures: Sequence[str] = ()  # frame ids
+    images: Sequence[str] = ()  # frame ids
     directions: bool = False
-    rotation: bool = False  # between the cameras' directions
-    pose: bool = False  # fused, with a rotation
+    rotation: bool = False  # relative rotation from vanishing directions
+    pose: bool = False  # fused pose with a rotation
     odometry: bool = False
 
 
-def layout(*, images: bool, evidence: bool, vision: Vision) -> rrb.Blueprint:
-    """The blueprint. Views ask for groups of entities, whatever the stages are called: see `links/viewer/draw.py`.
+def layout(*, depth_images: bool, candidates: bool, vision: Vision) -> rrb.Blueprint:
+    """The blueprint. Views select groups of entities, independent of stage names: see `links/viewer/draw.py`.
 
-    `images`: the graph has depth images to show; `evidence`: it has candidates with reasons and a probability;
-    `vision`: with anything of the cameras, or a fused pose, it has a third column, on the right.
+    `depth_images`: the graph has depth images; `candidates`: it has candidates with reasons and a probability;
+    `vision`: with camera outputs or a fused pose there is a third column, on the right.
     """
     scene = _space(
-        "Vehicle frame: last returns (blue low, white high), LiDAR fan, drone with 95 % ellipsoid",
+        "Vehicle frame: recent returns (blue low, white high), LiDAR fan, drone with 95 % ellipsoid",
         ["/vehicle/**", "/labels/**", "/lidar/**", "/frames/**"],
         frame="vehicle",
         eye=rrb.EyeControls3D(
-            position=(-38.0, -30.0, 20.0) if evidence else (-22.0, -17.0, 17.0),  # it sees farther
-            look_target=(5.0, 0.5, 15.0) if evidence else (5.0, 0.5, 7.0),
+            position=(-38.0, -30.0, 20.0) if candidates else (-22.0, -17.0, 17.0),  # this detector reaches farther
+            look_target=(5.0, 0.5, 15.0) if candidates else (5.0, 0.5, 7.0),
             eye_up=(0.0, 0.0, 1.0),
         ),
         grid_m=5.0,
@@ -54,7 +54,7 @@ def layout(*, images: bool, evidence: bool, vision: Vision) -> rrb.Blueprint:
         eye=rrb.EyeControls3D(position=(-2.6, -2.0, 1.4), look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)),
         grid_m=None,
     )
-    candidates = rrb.TextDocumentView(name="Candidates: why, and why not", origin="/candidates")
+    reasons = rrb.TextDocumentView(name="Candidates: reasons", origin="/candidates")
     lidar_range = rrb.TensorView(
         name="LiDAR range",
         origin="/range",
@@ -62,32 +62,32 @@ def layout(*, images: bool, evidence: bool, vision: Vision) -> rrb.Blueprint:
         view_fit="fill",
         scalar_mapping=rrb.TensorScalarMapping(colormap="turbo", mag_filter="nearest"),
     )
-    words = rrb.Tabs(
-        rrb.TextDocumentView(name="Now", origin="/now"),
-        rrb.TextLogView(name="Verdicts", origin="/log", contents="/log/**"),
-        *([lidar_range] if evidence and not images else [candidates]),
+    texts = rrb.Tabs(
+        rrb.TextDocumentView(name="Status", origin="/status"),
+        rrb.TextLogView(name="Log", origin="/log", contents="/log/**"),
+        *([lidar_range] if candidates and not depth_images else [reasons]),
         rrb.TextDocumentView(name="Graph", origin="/about/graph"),
         rrb.TextDocumentView(name="Settings", origin="/about/settings"),
         _curves("All other numbers", "/plots/other/**"),
     )
-    pictures = rrb.Horizontal(
-        _image("Depth image, up (blue near, red far)", ["/depth/**", "/marks/**"]),
-        rrb.Tabs(_image("Score (bright: like a drone)", ["/score/**", "/marks/**"]), lidar_range),
+    image_views = rrb.Horizontal(
+        _image("Depth image, up (blue near, red far)", ["/depth/**", "/overlays/**"]),
+        rrb.Tabs(_image("Score (bright: similar to a drone)", ["/score/**", "/overlays/**"]), lidar_range),
     )
     probability = _curves("Probability of a drone [%]", "/plots/probability/**")
-    cameras = _of_cameras(vision)
+    cameras = _camera_views(vision)
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(scene, rrb.Horizontal(close_up, words, column_shares=[2, 3]), row_shares=[2, 1]),
+            rrb.Vertical(scene, rrb.Horizontal(close_up, texts, column_shares=[2, 3]), row_shares=[2, 1]),
             rrb.Vertical(
-                pictures if images or not evidence else candidates,
-                *([probability] if evidence else []),
+                image_views if depth_images or not candidates else reasons,
+                *([probability] if candidates else []),
                 _curves("Position of the drone [m]", "/plots/position/**"),
-                _curves("Its sigma [m]", "/plots/sigma/**"),
-                _curves("Returns on the drone, per look", "/plots/hits/**"),
+                _curves("Sigma of the position [m]", "/plots/sigma/**"),
+                _curves("Returns on the drone, per scan pass", "/plots/hits/**"),
                 _curves("Servo angle and goal [deg]", "/plots/servo/**"),
                 rrb.StateTimelineView(name="States", origin="/states", contents="/states/**", time_view=_WHOLE_RUN),
-                row_shares=[26, 11, 11, 10, 7, 9, 26] if evidence else [32, 14, 12, 9, 10, 21],
+                row_shares=[26, 11, 11, 10, 7, 9, 26] if candidates else [32, 14, 12, 9, 10, 21],
             ),
             *(
                 [rrb.Vertical(*(view for _, view in cameras), row_shares=[share for share, _ in cameras])]
@@ -96,7 +96,7 @@ def layout(*, images: bool, evidence: bool, vision: Vision) -> rrb.Blueprint:
             ),
             column_shares=[11, 10] if not cameras else [11, 8, 11],
         ),
-        # Following: a live run moves on, a finished file opens at its end, with every curve complete.
+        # Following: a live run advances, and a finished file opens at its end with complete curves.
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -104,28 +104,28 @@ def layout(*, images: bool, evidence: bool, vision: Vision) -> rrb.Blueprint:
     )
 
 
-def _of_cameras(vision: Vision) -> list[tuple[int, rrb.View | rrb.Container]]:
-    """The views of the cameras, each with its share of the column's height."""
+def _camera_views(vision: Vision) -> list[tuple[int, rrb.View | rrb.Container]]:
+    """The camera views, each with its share of the column's height."""
     rows: list[tuple[int, rrb.View | rrb.Container]] = []
-    if vision.pictures:
-        views = [_image(frame_id.replace("_", " "), [f"/camera/{frame_id}/**"]) for frame_id in vision.pictures]
+    if vision.images:
+        views = [_image(frame_id.replace("_", " "), [f"/camera/{frame_id}/**"]) for frame_id in vision.images]
         rows.append((30, rrb.Horizontal(*views)))
     if vision.directions:
         eye = rrb.EyeControls3D(
-            position=(-2.6, -0.5 * SPHERES_APART, 1.1),
-            look_target=(0.0, -0.5 * SPHERES_APART, 0.1),
+            position=(-2.6, -0.5 * SPHERE_SPACING, 1.1),
+            look_target=(0.0, -0.5 * SPHERE_SPACING, 0.1),
             eye_up=(0.0, 0.0, 1.0),
         )
-        name = "Directions and lines on the unit sphere: vertical blue, each horizontal pair its hue"
+        name = "Directions and lines on the unit sphere: vertical blue, one hue per horizontal pair"
         contents = ["/sphere/**", "/frames/**"]
         rows.append((24, _space(name, contents, frame=sphere_frame(CameraMount.VEHICLE), eye=eye, grid_m=None)))
     if vision.rotation:
-        rows.append((13, _curves("Branch of the rotation [%]", "/plots/branch/**")))
+        rows.append((13, _curves("Yaw branch probabilities [%]", "/plots/branch/**")))
     if vision.rotation or vision.pose:
-        rows.append((11, _curves("The drone in the vehicle's axes [deg]", "/plots/rotation/**")))
+        rows.append((11, _curves("Rotation of the drone in the vehicle frame [deg]", "/plots/rotation/**")))
         rows.append((10, _curves("Sigma of the rotation [deg]", "/plots/rotation_sigma/**")))
     if vision.odometry:
-        matches = _curves("Drone odometry: features that agree", "/plots/matches/**")
+        matches = _curves("Drone odometry: inlier features", "/plots/matches/**")
         sigma = _curves("Sigma of the motion [deg]", "/plots/motion_sigma/**")
         rows.append((11, rrb.Horizontal(matches, sigma)))
     return rows

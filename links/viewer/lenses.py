@@ -1,6 +1,6 @@
-"""The cameras as the viewer needs them, and great-circle arcs as strips: on the unit sphere, and through a lens.
+"""The rig's cameras, and great-circle arcs as line strips on the unit sphere and in the image.
 
-Source: ours; lenses: stages/geometry/lens.py; a line of the world is a great circle of rays, P IV.
+Source: ours; lenses: stages/geometry/lens.py; a straight line in space is a great circle of rays, P IV.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from stages.geometry.frames import Array64, Pose
 from stages.geometry.lens import Lens
 from stages.messages import CameraMount
 
-STEP_RAD = np.deg2rad(4.0)  # between points of an arc; a fisheye bends it by less than a tenth of a pixel within that
+ARC_STEP_RAD = np.deg2rad(4.0)  # spacing of the points of an arc; a fisheye bends a chord by less than 0.1 px
 
 
 class _Camera(BaseModel):
-    """One camera of the rig file. Its other keys are for the stages."""
+    """One camera of the rig file, without the keys that only stages use."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     lens: Lens
-    size_px: int | None = Field(None, ge=1)  # of the square pictures that the lens was calibrated with
+    size_px: int | None = Field(None, ge=1)  # side of the square calibration images
 
     def pose(self) -> Pose:
         raise NotImplementedError
@@ -57,31 +57,31 @@ class Cameras(BaseModel):
     drone: DroneCamera | None = None
 
     def of(self, camera_mount: CameraMount) -> VehicleCamera | DroneCamera | None:
-        """The camera on this camera_mount."""
+        """The camera on a mount, None without one."""
         return self.vehicle if camera_mount is CameraMount.VEHICLE else self.drone
 
-    def named(self) -> list[str]:
-        """Frame ids of the pictures."""
+    def frame_ids(self) -> list[str]:
+        """Frame ids of the images of the configured cameras."""
         return [f"camera_{camera_mount.value}" for camera_mount in CameraMount if self.of(camera_mount) is not None]
 
 
-def pixels_of(camera: VehicleCamera | DroneCamera, rays_carrier: Array64) -> Array64:
-    """Pixels (n, 2) of rays (n, 3) in the camera_mount's axes; NaN where the lens does not see them."""
-    R_carrier_camera = camera.pose().matrix()[:3, :3]
-    return camera.lens.project(rays_carrier @ R_carrier_camera)
+def pixels_of(camera: VehicleCamera | DroneCamera, rays_mount: Array64) -> Array64:
+    """Pixels (n, 2) of rays (n, 3) in the mount's axes; NaN for rays outside the field of view."""
+    R_mount_camera = camera.pose().matrix()[:3, :3]
+    return camera.lens.project(rays_mount @ R_mount_camera)
 
 
-def arcs(ends: Array64, step_rad: float = STEP_RAD) -> tuple[Array64, NDArray[np.int64]]:
-    """Points (k, 3) on the shorter great-circle arcs between unit rays (m, 2, 3), and which arc each is of (k,).
+def arcs(ends: Array64, step_rad: float = ARC_STEP_RAD) -> tuple[Array64, NDArray[np.int64]]:
+    """Points (k, 3) on the shorter great-circle arcs between unit rays (m, 2, 3), and the arc index of each point (k,).
 
     p(s) = a cos(s) + q sin(s), q the unit vector from a towards b, s from 0 to the angle between them.
     """
     a, b = ends[:, 0], ends[:, 1]
-    along = np.sum(a * b, axis=1, keepdims=True)
-    q = b - along * a
-    across = np.linalg.norm(q, axis=1, keepdims=True)
-    q /= np.maximum(across, 1e-12)
-    angle = np.arctan2(across, along)[:, 0]
+    cosine = np.sum(a * b, axis=1, keepdims=True)
+    q = b - cosine * a
+    sine = np.linalg.norm(q, axis=1, keepdims=True)
+    q /= np.maximum(sine, 1e-12)
+    angle = np.arctan2(sine, cosine)[:, 0]
     count = 2 + np.floor(angle / step_rad).astype(np.int64)
     arc = np.repeat(np.arange(len(ends)), count)
     nth = np.arange(len(arc)) - np.repeat(np.cumsum(count) - count, count)
@@ -90,14 +90,14 @@ def arcs(ends: Array64, step_rad: float = STEP_RAD) -> tuple[Array64, NDArray[np
 
 
 def strips(points: Array64, arc: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
-    """Points (m, d) of points (k, d) strip after strip, how many each strip has (s,), and the arc that it is of (s,).
+    """Strips of points (k, d): concatenated points (m, d), length of each strip (s,), arc index of each strip (s,).
 
-    A point that is NaN breaks its arc's strip, one that is then alone is none.
+    A NaN point splits the strip of its arc; a strip of a single point is dropped.
     """
-    seen = np.asarray(np.isfinite(points).all(axis=1), dtype=np.bool_)
-    begins = np.append([True], (arc[1:] != arc[:-1]) | ~seen[:-1])[: len(points)]
+    valid = np.asarray(np.isfinite(points).all(axis=1), dtype=np.bool_)
+    begins = np.append([True], (arc[1:] != arc[:-1]) | ~valid[:-1])[: len(points)]
     _, first, strip, length = np.unique(
-        np.cumsum(begins)[seen], return_index=True, return_inverse=True, return_counts=True
+        np.cumsum(begins)[valid], return_index=True, return_inverse=True, return_counts=True
     )
     drawn = length > 1
-    return points[seen][drawn[strip]].astype(np.float32), length[drawn], arc[seen][first[drawn]]
+    return points[valid][drawn[strip]].astype(np.float32), length[drawn], arc[valid][first[drawn]]

@@ -1,4 +1,4 @@
-"""What drawing needs to remember between messages, and what it hands to the logging thread.
+"""State that drawing keeps between messages, and the coordinate frames of the 3D views.
 
 Source: ours.
 """
@@ -7,77 +7,53 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from links.viewer import colours
+from links.viewer.entities import Entities, Entity, stage_of
 from links.viewer.lenses import Cameras
 from stages.geometry.frames import Array64, LidarMount, rotation_z, transform
 from stages.messages import CameraMount, Candidates, DepthImage, DroneFix, TrackingState, TrackState
 
 TIMELINE = "sensor_time"
-DRONE_FRAME = "drone_position"  # axes as the vehicle's, origin at the latest fix: the close-up looks from there
+DRONE_FRAME = "drone_position"  # axes of the vehicle, origin at the latest fix; target frame of the close-up view
 FAN_RADIUS_M = 12.0
-SPHERES_APART = 2.8  # radii, between the unit spheres of vehicle and drone
+SPHERE_SPACING = 2.8  # distance of the unit spheres of vehicle and drone [radii]
 NEAR_DRONE_M = 1.0
-TURNTABLE_EVERY_NS = 20_000_000
-FRESH_NS = 150_000_000  # a hypothesis is told ten times a second
-STATE_HOLDS_NS = 1_000_000_000
-FIRST_OF_ALL = (TrackingState.TRACKING, TrackingState.COASTING, TrackingState.CANDIDATE)
+TURNTABLE_PERIOD_NS = 20_000_000
+HYPOTHESIS_TIMEOUT_NS = 150_000_000  # a tracker reports each hypothesis ten times a second
+STATE_TIMEOUT_NS = 1_000_000_000
+STATE_PRIORITY = (TrackingState.TRACKING, TrackingState.COASTING, TrackingState.CANDIDATE)
 FAN_HALF_OPENING_RAD = np.deg2rad(15.0)  # VLP-16 user manual 63-9243: beams from -15 to +15 deg
 
 
-class Mark:
-    """One thing to log: archetypes at an entity path, in a named frame; `style` is made and logged once, static."""
-
-    __slots__ = ("frame", "parts", "path", "style")
-
-    def __init__(
-        self, path: str, *parts: Any, frame: str | None = None, style: Callable[[], Any] | None = None
-    ) -> None:
-        self.path = path
-        self.parts = parts
-        self.frame = frame
-        self.style = style
-
-
-class Curve(Mark):
-    """Numbers (n,) to plot at an entity path."""
-
-    __slots__ = ("values",)
-
-    def __init__(self, path: str, values: Any, style: Callable[[], Any] | None = None) -> None:
-        super().__init__(path, style=style)
-        self.values = np.asarray(values, dtype=np.float64).ravel()
-
-
-class Listed(NamedTuple):
-    """A candidate as it was told last."""
+class LastCandidate(NamedTuple):
+    """A candidate as it was in the previous message."""
 
     probability: float
     seen_ns: int
     reason: str
 
 
-class Picture(NamedTuple):
-    """A camera's picture as it is shown."""
+class LoggedImage(NamedTuple):
+    """Size of a camera's image and the scale at which it was logged."""
 
     stamp_ns: int
-    width_px: int  # as it was taken
+    width_px: int  # of the original
     height_px: int
-    factor: float  # shown smaller by
+    scale: float  # logged width / original width
 
-    def shown(self, pixels: Array64) -> Array64:
-        """Where pixels (n, 2) of the picture taken, whole numbers at centres, are in the one shown, corner at 0."""
-        return (pixels + 0.5) * self.factor
+    def scaled(self, pixels: Array64) -> Array64:
+        """Pixels (n, 2) of the original, integers at pixel centres, in the logged image, 0 at its top left corner."""
+        return (pixels + 0.5) * self.scale
 
 
 class Scene:
-    """Memory of one run, bounded: trails, candidates, the last depth image's geometry, the last word of each state."""
+    """State of one run, bounded: trails, candidates, last depth image, last value of each state lane."""
 
     def __init__(
         self,
@@ -88,12 +64,12 @@ class Scene:
         max_points: int,
         trail_s: float,
         cameras: Cameras | None = None,
-        picture_every_s: float = 0.0,
+        image_period_s: float = 0.0,
     ):
         self.mount = mount
         self.cameras = cameras or Cameras()
-        self.pictures: dict[str, Picture] = {}  # by frame id, the last one shown
-        self._picture_every_ns = int(picture_every_s * 1e9)
+        self.images: dict[str, LoggedImage] = {}  # by frame id, the last one logged
+        self._image_period_ns = int(image_period_s * 1e9)
         self.max_points = max_points
         self.trail_s = trail_s
         self.slice_ns = int(slice_s * 1e9)
@@ -101,38 +77,38 @@ class Scene:
         self.depth: DepthImage | None = None
         self.fixes: dict[tuple[str, int], DroneFix] = {}  # by output and drone, until it is lost
         self._lines: dict[str, dict[tuple[int, str], str]] = {}
-        self._listed: dict[str, dict[int, Listed]] = {}
+        self._candidates: dict[str, dict[int, LastCandidate]] = {}
         self._tracks: dict[str, dict[int, TrackState]] = {}
         self._hypotheses: dict[str, list[TrackState]] = {}
-        self._turned_ns = -TURNTABLE_EVERY_NS
-        self._said: dict[str, str] = {}
+        self._turntable_ns = -TURNTABLE_PERIOD_NS
+        self._last_values: dict[str, str] = {}
         self._trails: dict[str, deque[tuple[int, NDArray[np.float32]]]] = {}
 
-    def changed(self, path: str, word: str) -> bool:
-        """Is `word` another than the last one said at `path`?"""
-        if self._said.get(path) == word:
+    def changed(self, path: str, value: str) -> bool:
+        """Whether `value` differs from the last value stored under `path`; stores it."""
+        if self._last_values.get(path) == value:
             return False
-        self._said[path] = word
+        self._last_values[path] = value
         return True
 
-    def has_said(self, path: str) -> bool:
-        """Was anything said at `path`?"""
-        return path in self._said
+    def has_value(self, path: str) -> bool:
+        """Whether a value is stored under `path`."""
+        return path in self._last_values
 
     def turntable_is_due(self, stamp_ns: int) -> bool:
-        """The turntable is moved 50 times a second at most, however often the servo answers."""
-        if 0 <= stamp_ns - self._turned_ns < TURNTABLE_EVERY_NS:
+        """Whether to log the turntable's frame: at most 50 times a second, at any rate of servo replies."""
+        if 0 <= stamp_ns - self._turntable_ns < TURNTABLE_PERIOD_NS:
             return False
-        self._turned_ns = stamp_ns
+        self._turntable_ns = stamp_ns
         return True
 
-    def picture_is_due(self, frame_id: str, stamp_ns: int) -> bool:
-        """Has the last picture of this camera been shown long enough?"""
-        last = self.pictures.get(frame_id)
-        return last is None or not 0 <= stamp_ns - last.stamp_ns < self._picture_every_ns
+    def image_is_due(self, frame_id: str, stamp_ns: int) -> bool:
+        """Whether the image period of this camera has passed since its last logged image."""
+        last = self.images.get(frame_id)
+        return last is None or not 0 <= stamp_ns - last.stamp_ns < self._image_period_ns
 
     def trail(self, name: str, fix: DroneFix) -> list[NDArray[np.float32]]:
-        """Strips (n, 3) through the fixes of the last `trail_s`; a pause of a second starts a new strip."""
+        """Strips (n, 3) through the fixes of the last `trail_s`; a gap of more than one second starts a new strip."""
         trail = self._trails.setdefault(name, deque())
         trail.append((fix.stamp_ns, fix.xyz_vehicle_m.astype(np.float32)))
         while trail[-1][0] - trail[0][0] > self.trail_s * 1e9:
@@ -146,149 +122,149 @@ class Scene:
             previous_ns = stamp_ns
         return [np.array(strip) for strip in strips]
 
-    def no_longer(self, name: str, candidates: Candidates) -> list[tuple[int, Listed]]:
-        """Candidates told last time and not any more: dropped, or pushed out by better ones; as they were."""
-        told = zip(candidates.probability.tolist(), candidates.seen_ns.tolist(), candidates.reasons, strict=True)
-        now = dict(zip(candidates.candidate_id.tolist(), (Listed(*each) for each in told), strict=True))
-        before = self._listed.get(name, {})
-        self._listed[name] = now
+    def removed_candidates(self, name: str, candidates: Candidates) -> list[tuple[int, LastCandidate]]:
+        """Candidates of the previous message that are missing in this one, with their last values."""
+        rows = zip(candidates.probability.tolist(), candidates.seen_ns.tolist(), candidates.reasons, strict=True)
+        now = dict(zip(candidates.candidate_id.tolist(), (LastCandidate(*row) for row in rows), strict=True))
+        before = self._candidates.get(name, {})
+        self._candidates[name] = now
         return [(number, last) for number, last in before.items() if number not in now]
 
-    def overall(self, name: str, track: TrackState) -> TrackingState:
-        """What a tracker with several drones and hypotheses does, in one word: the most that it does for any."""
+    def tracker_state(self, name: str, track: TrackState) -> TrackingState:
+        """One state for a tracker with several drones and hypotheses: the first of `STATE_PRIORITY` that one is in."""
         tracks = self._tracks.setdefault(name, {})
         tracks[track.track_id] = track
-        for number in [n for n, t in tracks.items() if not 0 <= track.stamp_ns - t.stamp_ns < STATE_HOLDS_NS]:
+        for number in [n for n, t in tracks.items() if not 0 <= track.stamp_ns - t.stamp_ns < STATE_TIMEOUT_NS]:
             del tracks[number]
         states = {each.state for each in tracks.values()}
-        return next((first for first in FIRST_OF_ALL if first in states), track.state)
+        return next((first for first in STATE_PRIORITY if first in states), track.state)
 
     def hypotheses(self, path: str, track: TrackState) -> list[TrackState]:
-        """This one and the others without a number that were told just before."""
-        fresh = [t for t in self._hypotheses.get(path, []) if 0 <= track.stamp_ns - t.stamp_ns < FRESH_NS]
+        """This hypothesis and the other unnumbered ones of the last `HYPOTHESIS_TIMEOUT_NS`."""
+        fresh = [t for t in self._hypotheses.get(path, []) if 0 <= track.stamp_ns - t.stamp_ns < HYPOTHESIS_TIMEOUT_NS]
         self._hypotheses[path] = [*fresh[-15:], track]
         return self._hypotheses[path]
 
-    def none_left(self, path: str, track: TrackState) -> bool:
-        """Were there hypotheses without a number, and are they over? True once."""
+    def hypotheses_ended(self, path: str, track: TrackState) -> bool:
+        """Whether the tracker stopped reporting unnumbered hypotheses; true once per end."""
         last = self._hypotheses.get(path)
         if not last or (track.track_id == 0 and track.state is TrackingState.CANDIDATE):
             return False
-        if track.track_id and track.stamp_ns - last[-1].stamp_ns < 2 * FRESH_NS:
+        if track.track_id and track.stamp_ns - last[-1].stamp_ns < 2 * HYPOTHESIS_TIMEOUT_NS:
             return False
         del self._hypotheses[path]
         return True
 
     def forget_drone(self, stage: str, track_id: int) -> list[str]:
-        """A stage lost a drone: forget its fixes and what is said of it now; the outputs that told where it was."""
-        names = [name for name, number in self.fixes if number == track_id and name.split("/", 1)[0] == stage]
+        """Remove the fixes, trails and status lines of a drone that `stage` lost. Returns their outputs."""
+        names = [name for name, number in self.fixes if number == track_id and stage_of(name) == stage]
         for name in names:
             del self.fixes[name, track_id]
             self._trails.pop(f"{name}/drone_{track_id}", None)
-        for rank, topic in list(self._lines.get("now", {})):
+        for rank, topic in list(self._lines.get("status", {})):
             if topic.startswith(f"{stage}, drone {track_id}"):
-                self.now(rank, topic, None)
+                self.status(rank, topic, None)
         return names
 
-    def now(self, rank: int, topic: str, text: str | None) -> Mark:
-        """The page that tells the present in words: one line per topic, always the newest; None: nothing to tell."""
-        return self._page("now", rank, topic, text and f"**{topic}:** {text}")
+    def status(self, rank: int, topic: str, text: str | None) -> Entity:
+        """The status document with a new line for `topic`, lines in order of rank; None removes the line."""
+        return self._document("status", rank, topic, text and f"**{topic}:** {text}")
 
-    def why(self, rank: int, topic: str, rows: list[str]) -> Mark:
-        """The page that tells why each candidate is taken for a drone or not."""
-        return self._page("candidates", rank, topic, "\n".join([f"**{topic}**\n", *(f"- {row}" for row in rows)]))
+    def reasons(self, rank: int, topic: str, rows: list[str]) -> Entity:
+        """The document with the reasons for which candidates are accepted or rejected, with new rows for `topic`."""
+        return self._document("candidates", rank, topic, "\n".join([f"**{topic}**\n", *(f"- {row}" for row in rows)]))
 
-    def _page(self, path: str, rank: int, topic: str, text: str | None) -> Mark:
+    def _document(self, path: str, rank: int, topic: str, text: str | None) -> Entity:
         lines = self._lines.setdefault(path, {})
         lines.pop((rank, topic), None)
         if text is not None:
             lines[rank, topic] = text
-        together = "\n\n".join(line for _, line in sorted(lines.items()))
-        return Mark(path, rr.TextDocument(together, media_type=rr.MediaType.MARKDOWN))
+        joined = "\n\n".join(line for _, line in sorted(lines.items()))
+        return Entity(path, rr.TextDocument(joined, media_type=rr.MediaType.MARKDOWN))
 
     def near_a_drone(self, xyz_m: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which of the points (n, 3) lie within 1 m of a latest fix."""
+        """Mask (n,) of the points (n, 3) within 1 m of the latest fix of a drone."""
         near = np.zeros(len(xyz_m), dtype=np.bool_)
         for fix in self.fixes.values():
             near |= np.linalg.norm(xyz_m - fix.xyz_vehicle_m, axis=1) < NEAR_DRONE_M
         return near
 
     def colours(self, xyz_m: NDArray[np.float32]) -> NDArray[np.uint32]:
-        """Packed colours (n,) of returns (n, 3): by height, warm within 1 m of a latest fix."""
+        """Packed colours (n,) of returns (n, 3): by height; the drone's colour within 1 m of a latest fix."""
         packed = colours.by_height(xyz_m[:, 2])
         packed[self.near_a_drone(xyz_m)] = colours.DRONE
         return packed
 
 
-def scenery(mount: LidarMount | None) -> Iterator[Mark]:
-    """What never changes: the vehicle's axes and, with a mount, the LiDAR's frame and the fan its beams lie in."""
+def static_entities(mount: LidarMount | None) -> Entities:
+    """Static entities: the vehicle's axes and, with a mount, the LiDAR's frame and the fan of its beams."""
     axes = rr.Arrows3D(vectors=np.diag([5.0, 2.5, 2.5]), colors=colours.AXES, radii=rr.Radius.ui_points(2.0))
-    yield Mark("vehicle/axes", axes, frame="vehicle")
+    yield Entity("vehicle/axes", axes, frame="vehicle")
     labels = ["vehicle", "forward"]
     name = rr.Points3D([[0, 0, 0], [5, 0, 0]], labels=labels, show_labels=True, colors=colours.NEUTRAL)
-    yield Mark("vehicle/name", name, frame="vehicle")
+    yield Entity("vehicle/name", name, frame="vehicle")
     if mount is None:
         return
     lidar = mount.T_turntable_lidar.matrix()
-    yield Mark("frames/lidar", _transform(lidar, "turntable", "lidar"))
+    yield Entity("frames/lidar", _transform(lidar, "turntable", "lidar"))
     turn = np.linspace(0, 2 * np.pi, 73)
     circle = np.stack([np.sin(turn), np.cos(turn), np.zeros_like(turn)], axis=1)
     c, s = np.cos(FAN_HALF_OPENING_RAD), np.sin(FAN_HALF_OPENING_RAD)
     edges = [FAN_RADIUS_M * (c * circle + [0, 0, s * side]) for side in (-1, 1)]
     fan = rr.LineStrips3D(edges, colors=colours.FAN, radii=rr.Radius.ui_points(1.0))
-    yield Mark("lidar/fan", fan, frame="lidar")
+    yield Entity("lidar/fan", fan, frame="lidar")
 
 
-def opening(mount: LidarMount | None) -> Iterator[Mark]:
-    """Frames that move later, at rest at the start: without them a view has no way from one frame to another."""
-    yield Mark(f"frames/{DRONE_FRAME}", drone_transform(np.zeros(3)))
+def initial_frames(mount: LidarMount | None) -> Entities:
+    """Initial poses of the moving frames. Without them a view cannot transform between frames until one moves."""
+    yield Entity(f"frames/{DRONE_FRAME}", drone_transform(np.zeros(3)))
     if mount is not None:
-        yield Mark("frames/turntable", turntable_transform(mount, math.radians(mount.servo_zero_deg)))
+        yield Entity("frames/turntable", turntable_transform(mount, math.radians(mount.servo_zero_deg)))
 
 
-def spheres() -> Iterator[Mark]:
-    """The unit spheres of both carriers' directions, side by side."""
+def spheres() -> Entities:
+    """The unit spheres of the directions of both camera mounts, side by side."""
     for camera_mount in CameraMount:
         frame = sphere_frame(camera_mount)
-        ball = rr.Ellipsoids3D(
+        sphere = rr.Ellipsoids3D(
             half_sizes=[[1.0, 1.0, 1.0]],
             colors=0xFFFFFF18,
             line_radii=rr.Radius.ui_points(0.5),
             fill_mode=rr.components.FillMode.MajorWireframe,
         )
-        yield Mark(f"sphere/{camera_mount.value}/ball", ball, frame=frame)
+        yield Entity(f"sphere/{camera_mount.value}/surface", sphere, frame=frame)
         axes = rr.Arrows3D(vectors=0.35 * np.eye(3), colors=colours.AXES, radii=rr.Radius.ui_points(1.5))
-        yield Mark(f"sphere/{camera_mount.value}/axes", axes, frame=frame)
+        yield Entity(f"sphere/{camera_mount.value}/axes", axes, frame=frame)
     yield _sphere_name(CameraMount.VEHICLE, "vehicle")
 
 
 def sphere_frame(camera_mount: CameraMount) -> str:
-    """The camera_mount's axes, at the middle of its unit sphere."""
+    """Name of the frame at the centre of a camera mount's unit sphere."""
     return f"sphere_{camera_mount.value}"
 
 
-def drone_sphere(R_vehicle_drone: Array64 | None, how: str = "own axes") -> Iterator[Mark]:
-    """The drone's sphere beside the vehicle's, turned as the drone is; None: that is not known. `how` it is turned."""
-    at = np.array([0.0, -SPHERES_APART, 0.0])
+def drone_sphere(R_vehicle_drone: Array64 | None, description: str = "own axes") -> Entities:
+    """The drone's sphere next to the vehicle's, rotated by R_vehicle_drone; None: not rotated, because R is unknown."""
+    t = np.array([0.0, -SPHERE_SPACING, 0.0])
     R = np.eye(3) if R_vehicle_drone is None else R_vehicle_drone
     vehicle, drone = sphere_frame(CameraMount.VEHICLE), sphere_frame(CameraMount.DRONE)
-    yield Mark(f"frames/{drone}", _transform(transform(R, at), vehicle, drone))
-    yield _sphere_name(CameraMount.DRONE, f"drone, {how}")
+    yield Entity(f"frames/{drone}", _transform(transform(R, t), vehicle, drone))
+    yield _sphere_name(CameraMount.DRONE, f"drone, {description}")
 
 
-def _sphere_name(camera_mount: CameraMount, text: str) -> Mark:
-    above = [[0.0, -SPHERES_APART * (camera_mount is CameraMount.DRONE), 1.4]]
-    words = rr.Points3D(above, labels=[text], show_labels=True, colors=colours.NEUTRAL, radii=0.0)
-    return Mark(f"sphere/{camera_mount.value}/name", words, frame=sphere_frame(CameraMount.VEHICLE))
+def _sphere_name(camera_mount: CameraMount, text: str) -> Entity:
+    above = [[0.0, -SPHERE_SPACING * (camera_mount is CameraMount.DRONE), 1.4]]
+    name = rr.Points3D(above, labels=[text], show_labels=True, colors=colours.NEUTRAL, radii=0.0)
+    return Entity(f"sphere/{camera_mount.value}/name", name, frame=sphere_frame(CameraMount.VEHICLE))
 
 
 def drone_transform(xyz_vehicle_m: NDArray[np.float64]) -> rr.Transform3D:
-    """The close-up's frame: the vehicle's axes, moved to the drone."""
+    """Frame of the close-up view: the vehicle's axes at the position of the drone."""
     return _transform(transform(np.eye(3), xyz_vehicle_m), "vehicle", DRONE_FRAME)
 
 
 def turntable_transform(mount: LidarMount, servo_rad: float) -> rr.Transform3D:
-    """T_vehicle_turntable Rz(angle) for a servo position."""
+    """T_vehicle_turntable Rz(angle) for a servo position [rad]."""
     turn = rotation_z(mount.turntable_rad(servo_rad))
     return _transform(mount.T_vehicle_turntable.matrix() @ transform(turn, np.zeros(3)), "vehicle", "turntable")
 

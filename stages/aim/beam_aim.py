@@ -252,12 +252,12 @@ class BeamAim(Stage[BeamAimSettings]):
         once: where it most likely is by now.
         """
         settings = self.settings
-        if not target.tried and (target.sure or (target.looks and not target.wander_mps)):
+        if not target.tried and (target.sure or (target.looks and not target.undirected_speed_mps)):
             wide_m = 0.175 * settings.span_m * min(1.0, 20.0 / range_m)
             if target.sure:
                 wide_m = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * settings.span_m + 0.35 * target.sigma_m
             return wide_m * low_discrepancy(target.looks % 16)
-        reach_m, headed = target.reach_m(pass_ns), target.wander_mps > 0.0
+        reach_m, headed = target.reach_m(pass_ns), target.undirected_speed_mps > 0.0
         spacing_m = self._now.spacing_rad * range_m
         return best_offset_m(reach_m, headed, target.tried, spacing_m, HALF_SHARE * settings.span_m)
 

@@ -37,7 +37,7 @@ class Target:
     seen_looks: int = 0  # turns in which the detector saw it
     looks: int = 0  # planned for it
     heard_ns: int = 0  # seen, if it is a candidate
-    wander_mps: float = 0.0  # level, nobody knows whither
+    undirected_speed_mps: float = 0.0  # level, nobody knows whither
     tried: list[Look] = field(default_factory=lambda: list[Look]())  # since it was seen last, the newest
 
     def at(self, stamp_ns: int) -> Array64:
@@ -45,8 +45,8 @@ class Target:
 
     def reach_m(self, stamp_ns: int) -> float:
         """How far beside its place it may be: one sigma; or how far it has flown since it was seen, if it wanders."""
-        if self.wander_mps:
-            return self.wander_mps * max(stamp_ns - self.heard_ns, 0) * 1e-9
+        if self.undirected_speed_mps:
+            return self.undirected_speed_mps * max(stamp_ns - self.heard_ns, 0) * 1e-9
         return self.sigma_m
 
 
@@ -64,8 +64,8 @@ class Targets:
 
     def hear_candidates(self, candidates: Candidates, least_probability: float) -> None:
         """What is worth another look now."""
-        if candidates.detector_life != self._detector_life:  # those before were of other things
-            self._detector_life = candidates.detector_life
+        if candidates.detector_instance != self._detector_life:  # those before were of other things
+            self._detector_life = candidates.detector_instance
             self._rests.clear()
             self.known = {key: target for key, target in self.known.items() if target.sure}
         for key in [key for key in self.known if key[0] == "candidate"]:
@@ -89,11 +89,13 @@ class Targets:
                 sigma_m=0.15 + 1.0 * age_s,  # seen some times, its velocity is known to a metre a second
                 sure=False,
                 probability=float(candidates.probability[i]),
-                seen_looks=int(candidates.looks[i]),
+                seen_looks=int(candidates.scan_passes[i]),
                 glance=old.glance if old else False,
                 looks=old.looks if old else 0,
                 heard_ns=int(candidates.seen_ns[i]),
-                wander_mps=0.0 if candidates.wander_mps is None else float(candidates.wander_mps[i]),
+                undirected_speed_mps=0.0
+                if candidates.undirected_speed_mps is None
+                else float(candidates.undirected_speed_mps[i]),
                 tried=[] if old is None or again else old.tried,
             )
 

@@ -1,12 +1,12 @@
-"""Dead reckoning of the drone's rotation in the vehicle's start frame, from picture to picture.
+"""Dead reckoning of the drone's rotation in `map`, from image to image.
 
     R_map_drone(t) = R_map_drone(t0) R_drone(t0)_drone(t),  R_vehicle_drone = R_map_vehicle(t)^T R_map_drone(t)
 
-The drone's own turn comes from its autopilot or its pictures, the vehicle's from its motion. Yaw is told between the
-two cameras' level axes, the one number that pictures add an offset to (lock.py).
+The turn of the drone comes from its autopilot or its images, that of the vehicle from its motion. The yaw is that
+between the level axes of the two cameras, to which images add an offset (yaw_tracker.py).
 
-While the vehicle is silent that offset takes its turn over, which its next word tells again: so twice the heading is
-not known by as much as the vehicle may have turned, and not at all where its start frame may be another one.
+While the vehicle's motion is missing, that offset absorbs its turn, which the next message contains again. So at both
+times the heading is uncertain by the largest turn of the vehicle, and unknown where its map frame may have changed.
 
 Source: ours.
 """
@@ -24,15 +24,15 @@ from stages.geometry.frames import Array64, heading_rad, rotation_z
 from stages.geometry.trajectory import FURTHEST_NS, VehicleTrajectory
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry, VehicleMotion, VisualMotion
-from stages.odometry.drone.trajectory import AutopilotTrail, PictureTrail, turn_between
+from stages.odometry.drone.trajectory import AutopilotTrajectory, VisualTrajectory, rotation_between
 
 VEHICLE_RAD_PER_S = math.radians(20.0)  # a vehicle that does not tell its turns may turn like this
 VEHICLE_DRIFT_RAD2_PER_S = math.radians(0.1) ** 2
 
 
 @dataclass(frozen=True)
-class Reckoned:
-    """Where dead reckoning has a pair's level axes, in the start frame."""
+class DeadReckonedYaw:
+    """Where dead reckoning has a pair's level axes, in the map frame."""
 
     stamp_ns: int
     vehicle_rad: float  # heading of the vehicle's level axes
@@ -45,20 +45,20 @@ class Reckoned:
         return self.drone_rad - self.vehicle_rad
 
 
-class Reckoning:
-    """All that tells of turns, and the rotation carried on by them; it lacks the offset that pictures add."""
+class DeadReckoning:
+    """All that tells of turns, and the rotation carried on by them; it lacks the offset that images add."""
 
     def __init__(self, parked: bool) -> None:
         """`parked`: the vehicle stands, whether it says so or not."""
         self._parked = parked
         self.vehicle = VehicleTrajectory()
-        self.autopilot = AutopilotTrail()
-        self.pictures = PictureTrail()
+        self.autopilot = AutopilotTrajectory()
+        self.images = VisualTrajectory()
         self._R_map_drone = np.eye(3)
         self._stamp_ns: int | None = None
         self._silences = 0
         self._silent_rad2 = 0.0  # `_vehicle_silent_rad2` at the pair before; a half turn's where the frame is another
-        self.frames = 0  # how often the vehicle's start frame may have become another one
+        self.frames = 0  # how often the vehicle's map frame may have become another one
 
     def vehicle_known(self, stamp_ns: int) -> bool:
         """Whether it is told where the vehicle is: not long after its last word."""
@@ -73,23 +73,23 @@ class Reckoning:
 
     def add_autopilot(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """What the autopilot says of itself."""
-        self.autopilot.hear(word)
+        self.autopilot.add(word)
 
     def add_drone_motion(self, motion: VisualMotion) -> None:
-        """A step of the odometry by pictures."""
-        self.pictures.add(motion)
+        """A step of the odometry by images."""
+        self.images.add(motion)
 
     def new_silences(self) -> int:
         """Times since the last call that the autopilot was not heard for so long that it may have jumped."""
-        new = self.autopilot.silences - self._silences
-        self._silences = self.autopilot.silences
+        new = self.autopilot.gaps - self._silences
+        self._silences = self.autopilot.gaps
         return new
 
     def rate_radps(self, stamp_ns: int) -> float:
         """How fast the drone turns."""
         return self.autopilot.rate_radps(stamp_ns)
 
-    def advance(self, vehicle_ns: int, drone_ns: int, vehicle: LevelLines, drone: LevelLines) -> Reckoned:
+    def advance(self, vehicle_ns: int, drone_ns: int, vehicle: LevelLines, drone: LevelLines) -> DeadReckonedYaw:
         """Turn on to a pair's moments."""
         R_map_vehicle = self.vehicle.at(vehicle_ns)[0]
         variance, silent_rad2 = 0.0, self._vehicle_silent_rad2(vehicle_ns)
@@ -97,59 +97,59 @@ class Reckoning:
             self._R_map_drone = R_map_vehicle @ vehicle.R_carrier_level @ drone.R_carrier_level.T
         else:
             dt = abs(drone_ns - self._stamp_ns) * 1e-9
-            turn = turn_between(self.autopilot, self.pictures, self._stamp_ns, drone_ns)
+            turn = rotation_between(self.autopilot, self.images, self._stamp_ns, drone_ns)
             self._R_map_drone = self._R_map_drone @ turn.R_from_to
             variance = turn.variance_rad2 + self._vehicle_variance_rad2(vehicle_ns, dt)
             variance += abs(silent_rad2 - self._silent_rad2)
         self._silent_rad2 = silent_rad2
         self._stamp_ns = drone_ns
-        return Reckoned(
+        return DeadReckonedYaw(
             drone_ns,
             heading_rad(R_map_vehicle @ vehicle.R_carrier_level),
             heading_rad(self._R_map_drone @ drone.R_carrier_level),
             variance,
         )
 
-    def correct(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> None:
-        """Take the tilts that the pictures tell; the yaw stays the dead reckoned one."""
-        self._R_map_drone = self._told(vehicle_ns, refined, reckoned_rad)
+    def correct(self, vehicle_ns: int, refined: Refined, dead_reckoned_rad: float) -> None:
+        """Take the tilts that the images tell; the yaw stays the dead reckoned one."""
+        self._R_map_drone = self._told(vehicle_ns, refined, dead_reckoned_rad)
 
-    def tilt_off(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> Array64:
-        """How far (3,) [rad] the tilts that the pictures tell are from the dead reckoned ones, the drone's axes."""
-        R = self._told(vehicle_ns, refined, reckoned_rad)
+    def tilt_off(self, vehicle_ns: int, refined: Refined, dead_reckoned_rad: float) -> Array64:
+        """How far (3,) [rad] the tilts that the images tell are from the dead reckoned ones, the drone's axes."""
+        R = self._told(vehicle_ns, refined, dead_reckoned_rad)
         off, up = log_rotation(np.ascontiguousarray(self._R_map_drone.T @ R)), R[2]
         return off - (off @ up) * up
 
-    def _told(self, vehicle_ns: int, refined: Refined, reckoned_rad: float) -> Array64:
-        level = refined.R_vehicle_level @ rotation_z(reckoned_rad) @ refined.R_drone_level.T
+    def _told(self, vehicle_ns: int, refined: Refined, dead_reckoned_rad: float) -> Array64:
+        level = refined.R_vehicle_level @ rotation_z(dead_reckoned_rad) @ refined.R_drone_level.T
         return self.vehicle.at(vehicle_ns)[0] @ level
 
-    def R_map_own(self, offset_rad: float) -> Array64 | None:
-        """How the autopilot's frame `own` is turned in the start frame; None: it has no attitude now."""
+    def R_map_odom(self, offset_rad: float) -> Array64 | None:
+        """How the autopilot's frame `odom` is turned in the map frame; None: it has no attitude now."""
         if self._stamp_ns is None:
             return None
-        R_own_drone = self.autopilot.R_own_drone(self._stamp_ns)
-        return None if R_own_drone is None else rotation_z(offset_rad) @ self._R_map_drone @ R_own_drone.T
+        R_odom_drone = self.autopilot.R_odom_drone(self._stamp_ns)
+        return None if R_odom_drone is None else rotation_z(offset_rad) @ self._R_map_drone @ R_odom_drone.T
 
     def R_map_drone(self, offset_rad: float, stamps_ns: list[int]) -> dict[int, Array64]:
         """The drone's rotation at those moments of which it is known."""
         if self._stamp_ns is None:
             return {}
         R = rotation_z(offset_rad) @ self._R_map_drone
-        turns = {ns: turn_between(self.autopilot, self.pictures, self._stamp_ns, ns) for ns in stamps_ns}
-        return {ns: R @ turn.R_from_to for ns, turn in turns.items() if turn.sure}
+        turns = {ns: rotation_between(self.autopilot, self.images, self._stamp_ns, ns) for ns in stamps_ns}
+        return {ns: R @ turn.R_from_to for ns, turn in turns.items() if turn.measured}
 
-    def at_one_moment(self, vehicle_ns: int, drone_ns: int) -> tuple[Array64, Array64, int, float]:
+    def at_common_time(self, vehicle_ns: int, drone_ns: int) -> tuple[Array64, Array64, int, float]:
         """L, R so that L R_vehicle(vehicle_ns)_drone(drone_ns) R is the rotation at one moment, that, and its variance.
 
-        At the drone's picture if the vehicle's turn is known, else at the vehicle's if the drone's is.
+        At the drone's image if the vehicle's turn is known, else at the vehicle's if the drone's is.
         """
         dt, one = abs(drone_ns - vehicle_ns) * 1e-9, np.eye(3)
         if self.vehicle.known_at(drone_ns):
             turn = self.vehicle.at(drone_ns)[0].T @ self.vehicle.at(vehicle_ns)[0]
             return turn, one, drone_ns, VEHICLE_DRIFT_RAD2_PER_S * dt
-        own = turn_between(self.autopilot, self.pictures, drone_ns, vehicle_ns)
-        if own.sure and not self._parked:
+        own = rotation_between(self.autopilot, self.images, drone_ns, vehicle_ns)
+        if own.measured and not self._parked:
             return one, own.R_from_to, vehicle_ns, own.variance_rad2
         return one, one, drone_ns, self._vehicle_variance_rad2(drone_ns, dt)
 
@@ -164,5 +164,7 @@ class Reckoning:
         newest_ns = self.vehicle.newest_ns
         beyond_ns = 0 if newest_ns is None or self._parked else stamp_ns - newest_ns - FURTHEST_NS
         return (
-            0.0 if beyond_ns <= 0 else max(self.vehicle.unsure(stamp_ns)[1], VEHICLE_RAD_PER_S * beyond_ns * 1e-9) ** 2
+            0.0
+            if beyond_ns <= 0
+            else max(self.vehicle.extrapolation_sigma(stamp_ns)[1], VEHICLE_RAD_PER_S * beyond_ns * 1e-9) ** 2
         )

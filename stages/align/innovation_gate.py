@@ -1,13 +1,13 @@
-"""What a pair of pictures is worth beside what was known before of tilt and yaw: the turns felt since the last pairs.
+"""Fusion of a pair of images with the prediction of tilt and yaw by dead reckoning.
 
-    yaw     the picture's and the one carried on, weighed by their variances. The picture's is no less than the last
-            pictures scattered; where the two are farther apart than both allow, either may be right, and the spread
-            of that is added
-    tilt    the picture's; where it contradicts the turns felt it is given out as uncertain as it is far off
+    yaw     mean of the measured and the predicted one, weighed by their variances. The variance of the measured one is
+            at least the scatter of recent images; where both differ by more than both allow, either may be wrong, and
+            the spread between them is added
+    tilt    the measured one; where it contradicts dead reckoning its covariance covers the difference
 
-Where few lines run straight, other edges lie among them and pull a picture's yaw by a degree or two, each picture's
-otherwise: it does not know, and the next ones tell. Leaves and cars have verticals of their own: one picture's word
-against the turns felt is not taken over, two pictures' is.
+With few straight lines, other edges among them bias the yaw of an image by a degree or two, each image differently; the
+scatter of the next ones shows it. Leaves and cars have verticals of their own: one image that contradicts dead
+reckoning does not replace it, two do.
 
 Source: ours.
 """
@@ -19,37 +19,37 @@ from dataclasses import replace
 
 import numpy as np
 
-from stages.align.dead_reckoning import Reckoned, Reckoning
+from stages.align.dead_reckoning import DeadReckonedYaw, DeadReckoning
 from stages.align.refine import Refined
 from stages.align.spectra import quarter_difference
-from stages.align.yaw_tracker import YawLock
+from stages.align.yaw_tracker import YawTracker
 from stages.geometry.frames import Array64
 
-SURPRISE_RAD = math.radians(0.3)  # beyond the tilts' own errors
-SURPRISE = 3.0  # sigmas
-SURE_RAD2 = math.radians(1.0) ** 2  # of the turns felt between two pictures: worse ones contradict nobody
-SCATTER_S = 2.0  # over which the pictures' scatter is taken
+GATE_FLOOR_RAD = math.radians(0.3)  # beyond the tilts' own errors
+GATE_SIGMAS = 3.0  # sigmas
+MAX_TURN_RAD2 = math.radians(1.0) ** 2  # of the turns felt between two images: worse ones contradict nobody
+SCATTER_S = 2.0  # over which the images' scatter is taken
 APART_NS = 180_000_000  # between two that are compared: sooner after one another they err alike
-MOST_RAD2 = math.radians(5.0) ** 2  # of one picture's scatter
+MOST_RAD2 = math.radians(5.0) ** 2  # of one image's scatter
 
 
-class Surprise:
-    """Lays each pair of pictures beside dead reckoning, which takes their tilts over."""
+class InnovationGate:
+    """Lays each pair of images beside dead reckoning, which takes their tilts over."""
 
-    def __init__(self, reckoning: Reckoning, lock: YawLock) -> None:
-        self._reckoning, self._lock = reckoning, lock
-        self._tilted_before = False  # the pictures before contradicted the turns felt
-        self._scatter_rad2 = 0.0  # of the pictures' yaws, each beside an earlier one
+    def __init__(self, dead_reckoning: DeadReckoning, tracker: YawTracker) -> None:
+        self._dead_reckoning, self._tracker = dead_reckoning, tracker
+        self._tilted_before = False  # the images before contradicted the turns felt
+        self._scatter_rad2 = 0.0  # of the images' yaws, each beside an earlier one
         self._scatter_s = 0.0  # over how long, SCATTER_S at most
-        self._before: tuple[int, float] | None = None  # the picture to compare with: stamp, `_off_rad`
+        self._before: tuple[int, float] | None = None  # the image to compare with: stamp, `_off_rad`
 
-    def as_scattered(self, refined: Refined, reckoned: Reckoned) -> Refined:
-        """A yaw no surer than the last pictures scattered about the turns felt."""
-        lock = self._lock
-        if lock.offset_rad is None or lock.relocked:
+    def with_scatter(self, refined: Refined, dead_reckoned: DeadReckonedYaw) -> Refined:
+        """A yaw no surer than the last images scattered about the turns felt."""
+        tracker = self._tracker
+        if tracker.offset_rad is None or tracker.reacquired:
             self._before = None  # it was laid beside another offset
-        elif lock.variance_rad2 < SURE_RAD2:
-            self._compare(reckoned.stamp_ns, self._off_rad(refined, reckoned))
+        elif tracker.variance_rad2 < MAX_TURN_RAD2:
+            self._compare(dead_reckoned.stamp_ns, self._off_rad(refined, dead_reckoned))
         covariance = refined.covariance.copy()
         covariance[4, 4] = max(covariance[4, 4], self._scatter_rad2)
         return replace(refined, covariance=covariance)
@@ -64,13 +64,13 @@ class Surprise:
             self._scatter_rad2 += (apart_rad2 - self._scatter_rad2) * since_s / self._scatter_s
         self._before = stamp_ns, off_rad
 
-    def weigh_yaw(self, refined: Refined, reckoned: Reckoned) -> Refined:
-        """With the yaw that the turns felt carry on. To be asked before the lock takes the picture's."""
-        lock = self._lock
-        if lock.offset_rad is None or lock.relocked or not lock.variance_rad2 < SURE_RAD2:
+    def weigh_yaw(self, refined: Refined, dead_reckoned: DeadReckonedYaw) -> Refined:
+        """With the yaw that the turns felt carry on. To be asked before the lock takes the image's."""
+        tracker = self._tracker
+        if tracker.offset_rad is None or tracker.reacquired or not tracker.variance_rad2 < MAX_TURN_RAD2:
             return refined
-        off_rad = self._off_rad(refined, reckoned)
-        own, known = refined.yaw_sigma_rad**2, lock.variance_rad2
+        off_rad = self._off_rad(refined, dead_reckoned)
+        own, known = refined.yaw_sigma_rad**2, tracker.variance_rad2
         gain = own / (own + known)
         keep = np.diag([1.0, 1.0, 1.0, 1.0, 1.0 - gain])
         covariance = keep @ refined.covariance @ keep
@@ -78,16 +78,16 @@ class Surprise:
         covariance[4, 4] += gain**2 * known + at_odds
         return replace(refined, yaw_rad=refined.yaw_rad + gain * off_rad, covariance=covariance)
 
-    def _off_rad(self, refined: Refined, reckoned: Reckoned) -> float:
-        """What was known less the picture's yaw."""
-        return quarter_difference(reckoned.yaw_rad + (self._lock.offset_rad or 0.0) - refined.yaw_rad)
+    def _off_rad(self, refined: Refined, dead_reckoned: DeadReckonedYaw) -> float:
+        """What was known less the image's yaw."""
+        return quarter_difference(dead_reckoned.yaw_rad + (self._tracker.offset_rad or 0.0) - refined.yaw_rad)
 
-    def tilt_off_rad(self, vehicle_ns: int, refined: Refined, reckoned: Reckoned) -> Array64:
-        """(3,) by which the pictures contradict the turns felt since the last ones, the drone's axes; zero mostly."""
-        off = self._reckoning.tilt_off(vehicle_ns, refined, reckoned.yaw_rad)
-        tilts = float(np.trace(refined.covariance[:4, :4])) / 2 + reckoned.variance_rad2
-        surprised = float(np.linalg.norm(off)) > SURPRISE * math.sqrt(tilts) + SURPRISE_RAD
-        if not surprised or self._tilted_before or not reckoned.variance_rad2 < SURE_RAD2:
-            self._reckoning.correct(vehicle_ns, refined, reckoned.yaw_rad)
-        self._tilted_before = surprised
-        return off if surprised and reckoned.variance_rad2 < SURE_RAD2 else np.zeros(3)
+    def tilt_off_rad(self, vehicle_ns: int, refined: Refined, dead_reckoned: DeadReckonedYaw) -> Array64:
+        """(3,) by which the images contradict the turns felt since the last ones, the drone's axes; zero mostly."""
+        off = self._dead_reckoning.tilt_off(vehicle_ns, refined, dead_reckoned.yaw_rad)
+        tilts = float(np.trace(refined.covariance[:4, :4])) / 2 + dead_reckoned.variance_rad2
+        rejected = float(np.linalg.norm(off)) > GATE_SIGMAS * math.sqrt(tilts) + GATE_FLOOR_RAD
+        if not rejected or self._tilted_before or not dead_reckoned.variance_rad2 < MAX_TURN_RAD2:
+            self._dead_reckoning.correct(vehicle_ns, refined, dead_reckoned.yaw_rad)
+        self._tilted_before = rejected
+        return off if rejected and dead_reckoned.variance_rad2 < MAX_TURN_RAD2 else np.zeros(3)

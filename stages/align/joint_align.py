@@ -1,17 +1,17 @@
-"""How the drone is turned in the vehicle's axes, from the lines of both cameras together.
+"""Rotation of the drone relative to the vehicle, from the lines of both cameras.
 
-    pairs of pictures (pairing.py) -> yaw spectra and their matches (spectra.py) -> the match that continues the last
-    ones (reckoning.py, lock.py) -> all angles refined together (refine.py), weighed with what was known before
-    (surprise.py) -> which quarter turn, by the drone's motion (by_motion.py) -> what is told of it (answers.py)
+    pairs of images (pairing.py) -> yaw spectra and their matches (spectra.py) -> the match that continues the last
+    ones (dead_reckoning.py, yaw_tracker.py) -> all angles refined together (refine.py), fused with the prediction
+    (innovation_gate.py) -> yaw branch by the drone's motion (motion_branch.py) -> message (publisher.py)
 
-A rotation is given for each picture of the drone's, or the reason why there is none. It is RESOLVED when one branch has
-`resolve_probability`; what the four lack to 1 is that none of them is right. Nothing but motion, or motion and a prior,
-gets there; what was RESOLVED is so no longer when the thread of turns is lost, or when motion says otherwise.
+Each image of the drone gives a rotation, or the reason why there is none. It is RESOLVED when one branch has
+`resolve_probability`; the rest of the four to 1 is the probability that none is right. Only motion, or motion and a
+prior, resolves a branch; it is no longer RESOLVED when dead reckoning is lost or motion contradicts it.
 
-Where streets run at many angles the lines alone seldom say which of them both cameras see. The drone's way, told by the
-LiDAR and by its autopilot, is a heading without a street: it says which, and denies a match made askew.
+Where streets have many directions, lines alone seldom decide which of them both cameras see. The drone's displacement
+by LiDAR and by its autopilot gives a heading without them: it selects the match, and rejects a wrong one.
 
-Without `motion` the vehicle is taken to stand if `parked` says so; else nothing is concluded from the drone's motion.
+Without `motion` the vehicle is assumed to stand if `parked` is set; else the drone's motion is not used.
 
 Source: ours, for P IV Eq. 7-10 and V.E; DESIGN, Vision and Yaw branch.
 """
@@ -26,14 +26,14 @@ from typing import Any, ClassVar
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.align.dead_reckoning import Reckoning
-from stages.align.innovation_gate import Surprise
-from stages.align.motion_branch import ByMotion, Prior
+from stages.align.dead_reckoning import DeadReckoning
+from stages.align.innovation_gate import InnovationGate
+from stages.align.motion_branch import MotionBranch, Prior
 from stages.align.pairing import Pair, Pairing
-from stages.align.publisher import Answers
+from stages.align.publisher import Publisher
 from stages.align.refine import Tolerances, refine, street_directions
 from stages.align.spectra import level_lines, spectrum
-from stages.align.yaw_tracker import YawLock
+from stages.align.yaw_tracker import YawTracker
 from stages.heading.hypothesis_bank import BranchSettings
 from stages.messages import (
     CameraMount,
@@ -50,24 +50,24 @@ from stages.messages import (
 
 @dataclass
 class _Parts:
-    """Of the stage, and what each remembers."""
+    """Parts of the stage, each with its own state."""
 
     pairing: Pairing
-    reckoning: Reckoning
-    lock: YawLock
-    motion: ByMotion
-    surprise: Surprise
-    answers: Answers
+    dead_reckoning: DeadReckoning
+    tracker: YawTracker
+    motion: MotionBranch
+    innovation_gate: InnovationGate
+    publisher: Publisher
 
 
 class JointAlignSettings(Settings):
     """Settings of `JointAlign`."""
 
-    max_apart_s: float = Field(0.1, gt=0, le=1)  # between the pictures of a pair; half the slower camera's period
+    max_apart_s: float = Field(0.1, gt=0, le=1)  # between the images of a pair; half the slower camera's period
     straight_deg: float = Field(0.25, gt=0, le=5)  # how straight and parallel streets are, one sigma of a line
     direction_sigma_deg: float = Field(0.1, gt=0, le=5)  # error of a street's direction that one camera's lines share
     square_sigma_deg: float = Field(0.5, gt=0, le=5)  # how square crossings are
-    tilt_sigma_deg: float = Field(0.07, ge=0, le=5)  # error of a vertical beyond what its picture says, in all pictures
+    tilt_sigma_deg: float = Field(0.07, ge=0, le=5)  # error of a vertical beyond what its image says, in all images
     # alike: a mount's 0.05 deg, and as much by a lens whose centre is 0.15 px off at 720 px
     min_lines: int = Field(5, ge=1)  # of each camera
     parked: bool = False  # the vehicle stands: where the drone moves is known without VehicleMotion
@@ -86,7 +86,7 @@ class JointAlignSettings(Settings):
 
 
 class JointAlign(Stage[JointAlignSettings]):
-    """Both cameras' lines laid on each other; four branches with probabilities."""
+    """Joint alignment of both cameras' lines; four branches with probabilities."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
         {"motion", "visual_motion", "attitude", "position", "odometry", "fix"}
@@ -95,101 +95,101 @@ class JointAlign(Stage[JointAlignSettings]):
     def __init__(self, settings: JointAlignSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         settings = self.settings
-        reckoning, lock = Reckoning(settings.parked), YawLock()
-        motion = ByMotion(settings.branches, self._prior(), reckoning, lock)
+        dead_reckoning, tracker = DeadReckoning(settings.parked), YawTracker()
+        motion = MotionBranch(settings.branches, self._prior(), dead_reckoning, tracker)
         self._parts = _Parts(
             Pairing(round(1e9 * settings.max_apart_s)),
-            reckoning,
-            lock,
+            dead_reckoning,
+            tracker,
             motion,
-            Surprise(reckoning, lock),
-            Answers(motion.bank, reckoning, settings.resolve_probability),
+            InnovationGate(dead_reckoning, tracker),
+            Publisher(motion.bank, dead_reckoning, settings.resolve_probability),
         )
 
     def on_motion(self, motion: VehicleMotion) -> None:
-        """Where the vehicle is and how it is turned."""
-        self._parts.reckoning.add_vehicle(motion)
+        """Pose of the vehicle."""
+        self._parts.dead_reckoning.add_vehicle(motion)
 
     def on_attitude(self, attitude: DroneAttitude) -> None:
-        """How the drone turns; its yaw's zero is not ours."""
-        self._parts.reckoning.add_autopilot(attitude)
+        """Attitude by the autopilot, in frame odom."""
+        self._parts.dead_reckoning.add_autopilot(attitude)
 
     def on_position(self, position: DroneLocalPosition) -> None:
-        """How the drone moves, in the same frame as its attitude."""
-        self._parts.reckoning.add_autopilot(position)
+        """Position by the autopilot, in frame odom."""
+        self._parts.dead_reckoning.add_autopilot(position)
 
     def on_odometry(self, odometry: DroneOdometry) -> None:
-        """Both at once."""
-        self._parts.reckoning.add_autopilot(odometry)
+        """Pose by the autopilot, in frame odom."""
+        self._parts.dead_reckoning.add_autopilot(odometry)
 
     def on_visual_motion(self, motion: VisualMotion) -> None:
-        """Turn and direction from the drone's pictures."""
-        self._parts.reckoning.add_drone_motion(motion)
-        self._parts.motion.hear_pictures(motion)
+        """Visual odometry of the drone: turn and direction."""
+        self._parts.dead_reckoning.add_drone_motion(motion)
+        self._parts.motion.add_visual_motion(motion)
 
     def on_fix(self, fix: DroneFix) -> None:
-        """Where the LiDAR saw the drone: evidence for the branch once it has moved."""
-        if self._parts.motion.see_fix(fix):
-            self._begin_anew("the drone's motion fits no branch, all is begun anew")
+        """LiDAR position: evidence for the branch once the drone has moved."""
+        if self._parts.motion.add_fix(fix):
+            self._reinitialise("the drone's motion fits no branch: reset")
 
     def on_vehicle(self, seen: VanishingDirections) -> Iterator[RelativeRotation]:
-        """The vehicle's lines."""
+        """Lines of the vehicle's camera."""
         for pair in self._parts.pairing.vehicle(_of(seen, CameraMount.VEHICLE, "vehicle")):
             yield self._align(pair)
 
     def on_drone(self, seen: VanishingDirections) -> Iterator[RelativeRotation]:
-        """The drone's lines: one answer each, once the vehicle's nearest picture is known."""
+        """Lines of the drone's camera: one rotation each, once the nearest image of the vehicle is known."""
         for pair in self._parts.pairing.drone(_of(seen, CameraMount.DRONE, "drone")):
             yield self._align(pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
-        """Pictures that still waited for a nearer one."""
+        """Rotations of images that waited for a nearer one."""
         for pair in self._parts.pairing.rest():
             yield self._align(pair)
 
     def _align(self, pair: Pair) -> RelativeRotation:
-        """One answer for a pair of pictures."""
+        """The rotation of a pair of images."""
         settings = self.settings
         parts = self._parts
         seen_by_vehicle, seen_by_drone = pair
         drone_ns = seen_by_drone.stamp_ns
         if seen_by_vehicle is None:
-            return parts.answers.none(drone_ns, f"no picture of the vehicle's within {settings.max_apart_s:g} s")
+            return parts.publisher.none(drone_ns, f"no picture of the vehicle's within {settings.max_apart_s:g} s")
         vehicle_ns = seen_by_vehicle.stamp_ns
         straight_rad = math.radians(settings.straight_deg)
         vehicle, drone = level_lines(seen_by_vehicle, straight_rad), level_lines(seen_by_drone, straight_rad)
         if vehicle is None or drone is None or min(len(vehicle.weight), len(drone.weight)) < settings.min_lines:
             both = ((seen_by_vehicle, vehicle), (seen_by_drone, drone))
             few = (seen for seen, lines in both if lines is None or len(lines.weight) < settings.min_lines)
-            return parts.answers.none(
+            return parts.publisher.none(
                 drone_ns,
                 "; ".join(f"{seen.camera_mount.value}: {seen.reason or 'too few level lines'}" for seen in few),
             )
         a, b = spectrum(vehicle), spectrum(drone)
-        reckoned = parts.reckoning.advance(vehicle_ns, drone_ns, vehicle, drone)
+        dead_reckoned = parts.dead_reckoning.advance(vehicle_ns, drone_ns, vehicle, drone)
         told = parts.motion.heading(drone_ns)
-        if parts.lock.denied(told):
-            parts.lock.let_go()
-            self._begin_anew("the drone's motion denies the streets matched, all is begun anew")
-        match = parts.lock.choose(a, b, reckoned, parts.reckoning.rate_radps(drone_ns), told)
+        if parts.tracker.denied(told):
+            parts.tracker.release()
+            self._reinitialise("the drone's motion contradicts the match: reset")
+        match = parts.tracker.choose(a, b, dead_reckoned, parts.dead_reckoning.rate_radps(drone_ns), told)
         if match.yaw_rad is None:
-            return parts.answers.none(drone_ns, match.reason)
+            return parts.publisher.none(drone_ns, match.reason)
         streets = street_directions(a, b, match.yaw_rad)
         refined = refine(vehicle, drone, streets, match.yaw_rad, self._tolerances())
         if refined.directions == 0 or min(refined.vehicle_lines, refined.drone_lines) < settings.min_lines:
-            return parts.answers.none(drone_ns, "too few lines run along the same streets")
-        if parts.lock.relocked:
-            self._begin_anew("the lines match elsewhere for long now, all is begun anew there")
-        off_rad = parts.surprise.tilt_off_rad(vehicle_ns, refined, reckoned)
-        refined = parts.surprise.as_scattered(refined, reckoned)
-        weighed = parts.surprise.weigh_yaw(refined, reckoned)
-        parts.motion.slip(parts.lock.accept(refined.yaw_rad, refined.yaw_sigma_rad, reckoned))
+            return parts.publisher.none(drone_ns, "too few lines run along the same streets")
+        if parts.tracker.reacquired:
+            self._reinitialise("the lines match at another yaw for some time: reset there")
+        off_rad = parts.innovation_gate.tilt_off_rad(vehicle_ns, refined, dead_reckoned)
+        refined = parts.innovation_gate.with_scatter(refined, dead_reckoned)
+        weighed = parts.innovation_gate.weigh_yaw(refined, dead_reckoned)
+        parts.motion.slip(parts.tracker.accept(refined.yaw_rad, refined.yaw_sigma_rad, dead_reckoned))
         parts.motion.weigh_prior(refined)
-        return parts.answers.rotation(vehicle_ns, drone_ns, weighed, reckoned, off_rad)
+        return parts.publisher.rotation(vehicle_ns, drone_ns, weighed, dead_reckoned, off_rad)
 
-    def _begin_anew(self, news: str) -> None:
-        self._parts.answers.add_news(news)
-        self._parts.motion.begin_anew()
+    def _reinitialise(self, news: str) -> None:
+        self._parts.publisher.add_news(news)
+        self._parts.motion.reset()
 
     def _prior(self) -> Prior:
         settings = self.settings

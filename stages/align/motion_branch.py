@@ -1,10 +1,10 @@
-"""What the drone's motion says of its yaw: which of the streets' branches it is, and its heading without a street.
+"""Yaw by the drone's motion: the branch of the vanishing points, and the heading without them.
 
-    windows of flight, told by LiDAR and by the drone's odometry (stages/heading)
-      -> four branches, counted from the yaw that is followed (lock.py)
-      -> the odometry's heading, whatever the streets say: it says which match is followed, and denies one made askew
+    windows of flight, by LiDAR and by the drone's odometry (stages/heading)
+      -> four branches, counted from the tracked yaw (yaw_tracker.py)
+      -> the heading of the odometry, without vanishing points: it selects the match and rejects a wrong one
 
-A word of people or of a compass is weighed once, with the first rotation.
+An initial yaw or a compass is weighed once, with the first rotation.
 
 Source: ours, for P V.E; DESIGN, Yaw branch.
 """
@@ -14,18 +14,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from stages.align.dead_reckoning import Reckoning
+from stages.align.dead_reckoning import DeadReckoning
 from stages.align.refine import Refined
-from stages.align.yaw_tracker import YawLock
+from stages.align.yaw_tracker import YawTracker
 from stages.geometry.frames import Array64
 from stages.heading.heading_bank import Heading, HeadingBank
-from stages.heading.hypothesis_bank import NONE, BranchBank, BranchSettings
+from stages.heading.hypothesis_bank import NONE, BranchSettings, HypothesisBank
 from stages.heading.windows import Windows
 from stages.messages import DroneFix, VisualMotion
 
 SILENCE_SHARE = 1e-4  # chance that the autopilot's heading jumped while it was not heard
-NONSENSE = 0.99  # that none of the branches is right, from which all is begun anew
-SUSPICION = 0.95  # of that, then
+MAX_NONE = 0.99  # that none of the branches is right, from which all is reset
+NONE_AFTER_RESET = 0.95  # of that, then
 BEARING_RAD = math.radians(2.0)  # error of an odometry's heading within a window
 
 
@@ -39,68 +39,70 @@ class Prior:
     trust: float
 
 
-class ByMotion:
+class MotionBranch:
     """Weighs the windows."""
 
-    def __init__(self, settings: BranchSettings, prior: Prior, reckoning: Reckoning, lock: YawLock) -> None:
+    def __init__(
+        self, settings: BranchSettings, prior: Prior, dead_reckoning: DeadReckoning, tracker: YawTracker
+    ) -> None:
         self._prior, self._prior_weighed = prior, False
-        self._reckoning, self._lock = reckoning, lock
-        self.bank = BranchBank(settings)
+        self._dead_reckoning, self._tracker = dead_reckoning, tracker
+        self.bank = HypothesisBank(settings)
         self._windows = Windows(settings.baseline_m)
         self._headings = HeadingBank(settings)
         self._heading_windows = Windows(settings.baseline_m, HeadingBank.HYPOTHESES)
         self._frames = 0  # of the vehicle, as `reckoning` counts
 
-    def hear_pictures(self, motion: VisualMotion) -> None:
+    def add_visual_motion(self, motion: VisualMotion) -> None:
         """A step of the drone's odometry by its camera."""
         self._windows.add_step(motion)
 
-    def see_fix(self, fix: DroneFix) -> bool:
+    def add_fix(self, fix: DroneFix) -> bool:
         """Where the LiDAR saw the drone; True: its motion fits no branch, and the match followed is forgotten."""
-        reckoning, lock = self._reckoning, self._lock
-        self._stay_in_frame()
-        if not reckoning.vehicle_known(fix.stamp_ns):  # its way would be taken for the drone's
+        dead_reckoning, tracker = self._dead_reckoning, self._tracker
+        self._follow_frame()
+        if not dead_reckoning.vehicle_known(fix.stamp_ns):  # its way would be taken for the drone's
             self._windows.restart()
             self._heading_windows.restart()
             return False
-        at = reckoning.vehicle.at(fix.stamp_ns)
-        self._windows.add_fix(fix, *at, reckoning.autopilot)
-        self._heading_windows.add_fix(fix, *at, reckoning.autopilot)
-        by_places = reckoning.autopilot.place(fix.stamp_ns) is not None
+        at = dead_reckoning.vehicle.at(fix.stamp_ns)
+        self._windows.add_fix(fix, *at, dead_reckoning.autopilot)
+        self._heading_windows.add_fix(fix, *at, dead_reckoning.autopilot)
+        by_places = dead_reckoning.autopilot.position(fix.stamp_ns) is not None
         self._weigh_headings(by_places)
-        if lock.offset_rad is None:
+        if tracker.offset_rad is None:
             return False
-        bearing_rad = math.hypot(math.sqrt(lock.variance_rad2), BEARING_RAD)
-        R_map_own = reckoning.R_map_own(lock.offset_rad)
-        if R_map_own is not None and by_places:
-            moved = self._windows.close_metric(R_map_own, bearing_rad)
+        bearing_rad = math.hypot(math.sqrt(tracker.variance_rad2), BEARING_RAD)
+        R_map_odom = dead_reckoning.R_map_odom(tracker.offset_rad)
+        if R_map_odom is not None and by_places:
+            moved = self._windows.close_metric(R_map_odom, bearing_rad)
         else:
             stamps_ns = self._windows.steps_since_start()
-            moved = self._windows.close_bearing(reckoning.R_map_drone(lock.offset_rad, stamps_ns), bearing_rad)
+            moved = self._windows.close_bearing(dead_reckoning.R_map_drone(tracker.offset_rad, stamps_ns), bearing_rad)
         if moved is None:
             return False
         self.bank.see(moved)
-        nonsense = bool(self.bank.probability[NONE] > NONSENSE)
+        nonsense = bool(self.bank.probability[NONE] > MAX_NONE)
         if nonsense:
-            lock.forget()
+            tracker.forget()
         return nonsense
 
     def _weigh_headings(self, by_places: bool) -> None:
         """The way that the autopilot tells, laid on the LiDAR's: its heading, without a street."""
-        R_map_own = self._reckoning.R_map_own(0.0)
-        if R_map_own is None or not by_places:
+        R_map_odom = self._dead_reckoning.R_map_odom(0.0)
+        if R_map_odom is None or not by_places:
             return
-        moved = self._heading_windows.close_metric(R_map_own, 0.0)
+        moved = self._heading_windows.close_metric(R_map_odom, 0.0)
         if moved is not None:
             self._headings.see(moved)
 
     def heading(self, stamp_ns: int) -> Heading | None:
-        """Let time go on to a picture; the offset (lock.py) as the drone's motion tells it by then.
+        """Let time go on to a image; the offset (yaw_tracker.py) as the drone's motion tells it by then.
 
         It is forgotten, and the branches a little, when the autopilot may have turned its north unheard.
         """
-        self._stay_in_frame()
-        silences = self._reckoning.new_silences()
+        self._follow_frame()
+        silences = self._dead_reckoning.new_silences()
         self.bank.pass_time(stamp_ns)
         self.bank.mix(1.0 - (1.0 - SILENCE_SHARE) ** silences)
         self._headings.pass_time(stamp_ns)
@@ -109,10 +111,10 @@ class ByMotion:
             self._heading_windows.restart()
         return self._headings.heading
 
-    def _stay_in_frame(self) -> None:
-        """What was seen in another start frame of the vehicle's does not count."""
-        if self._frames != self._reckoning.frames:
-            self._frames = self._reckoning.frames
+    def _follow_frame(self) -> None:
+        """What was seen in another map frame of the vehicle's does not count."""
+        if self._frames != self._dead_reckoning.frames:
+            self._frames = self._dead_reckoning.frames
             self._windows.restart()
             self._heading_windows.restart()
             self._headings.reset()
@@ -125,20 +127,20 @@ class ByMotion:
         """The word of people or of a compass, once."""
         if self._prior_weighed:
             return
-        R_map_own = self._reckoning.R_map_own(self._lock.offset_rad or 0.0)
+        R_map_odom = self._dead_reckoning.R_map_odom(self._tracker.offset_rad or 0.0)
         off_rad = None
         if self._prior.initial_yaw_rad is not None:
             R = refined.R_vehicle_drone(0)
             off_rad = math.atan2(R[1, 0], R[0, 0]) - self._prior.initial_yaw_rad
-        elif self._prior.compass_rad is not None and R_map_own is not None:
-            off_rad = math.atan2(R_map_own[1, 0], R_map_own[0, 0]) - self._prior.compass_rad
+        elif self._prior.compass_rad is not None and R_map_odom is not None:
+            off_rad = math.atan2(R_map_odom[1, 0], R_map_odom[0, 0]) - self._prior.compass_rad
         if off_rad is not None:
             self.bank.expect_yaw(off_rad, self._prior.sigma_rad, self._prior.trust)
             self._prior_weighed = True
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """No branch is known, and likely none is right."""
-        self.bank.reset(SUSPICION)
+        self.bank.reset(NONE_AFTER_RESET)
         self._windows.restart()
         if self._prior.compass_rad is not None:
             self._prior_weighed = False  # a compass has not changed its mind

@@ -1,4 +1,4 @@
-"""Which picture of the vehicle's camera goes with which of the drone's: the nearest in time.
+"""Pairs each image of the drone with the image of the vehicle that is nearest in time.
 
 Source: ours.
 """
@@ -17,7 +17,7 @@ Pair = tuple[VanishingDirections | None, VanishingDirections]
 
 
 class Pairing:
-    """Each drone picture with the vehicle picture nearest to it, told as soon as no nearer one can come."""
+    """Each drone image with the vehicle image nearest to it, told as soon as no nearer one can come."""
 
     def __init__(self, furthest_ns: int) -> None:
         self._furthest_ns = furthest_ns
@@ -25,18 +25,18 @@ class Pairing:
         self._waiting: deque[VanishingDirections] = deque()
 
     def vehicle(self, seen: VanishingDirections) -> Iterator[Pair]:
-        """One more picture of the vehicle's; one that is not newer than the last is ignored."""
+        """One more image of the vehicle's; one that is not newer than the last is ignored."""
         if not self._vehicle or seen.stamp_ns > self._vehicle[-1].stamp_ns:
             self._vehicle.append(seen)
         yield from self._ready()
 
     def drone(self, seen: VanishingDirections) -> Iterator[Pair]:
-        """One more picture of the drone's."""
+        """One more image of the drone's."""
         self._waiting.append(seen)
         yield from self._ready()
 
     def rest(self) -> Iterator[Pair]:
-        """The drone's pictures that still wait, with what there is."""
+        """The drone's images that still wait, with what there is."""
         while self._waiting:
             drone = self._waiting.popleft()
             yield self._nearest(drone), drone
@@ -47,7 +47,7 @@ class Pairing:
             yield self._nearest(drone), drone
 
     def _may_come(self, stamp_ns: int) -> bool:
-        """Whether a picture of the vehicle's may still come that is nearer than all so far."""
+        """Whether a image of the vehicle's may still come that is nearer than all so far."""
         if self._waiting[-1].stamp_ns - stamp_ns > 2 * self._furthest_ns:
             return False  # it is late, or the camera is dead
         if not self._vehicle:

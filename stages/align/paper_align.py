@@ -6,14 +6,14 @@
 
 The first matching goes by `initial_yaw_deg`: a wrong one picks a wrong branch, and every later match keeps to it, until
 the drone has moved for long enough to be corrected. The corrected rotation R_G^-1 R_f R_G R_GD0 is what the next
-pictures are matched under. If that gives the same pairs, the filter goes on; if it gives others, the branch was wrong
-and the filter begins anew with them (`switches` counts it). So a correction's own error, some degrees of a 5-point
+images are matched under. If that gives the same pairs, the filter goes on; if it gives others, the branch was wrong
+and the filter restarts with them (`switches` counts it). So a correction's own error, some degrees of a 5-point
 direction, never reaches the rotation.
 
 What is known of the branch: before any correction nothing but the initial yaw, which the paper takes on trust. All four
 get 1/4 and the state is AMBIGUOUS. After one it is RESOLVED as the paper has it, with the probability that the
 paper's rule earned where we measured it: wrong in up to 3.3 % (`wrong_share`), shared by the other three. One-hot would
-be a lie: seven pairs that are 14 pictures apart share most of their pictures and are no seven votes. Who wants
+be a lie: seven pairs that are 14 images apart share most of their images and are no seven votes. Who wants
 P > 0.999 must not use this stage.
 
 A match is taken whatever its angle, as in the paper. A gate on it made things worse on our tuning streets: while it
@@ -57,11 +57,11 @@ class PaperAlignSettings(Settings):
 
     initial_yaw_deg: float = Field(0.0, ge=-360, le=360)  # the drone's heading in the vehicle's axes at the start
     initial_sigma_deg: float = Field(30.0, gt=0)
-    max_apart_s: float = Field(0.1, gt=0, le=1)  # between the pictures of a pair; half the slower camera's period
+    max_apart_s: float = Field(0.1, gt=0, le=1)  # between the images of a pair; half the slower camera's period
     observation_deg: float = Field(1.0, gt=0)  # V_G V_D^-1, one axis
     rate_sigma_dps: float = Field(10.0, gt=0)  # the drone's rate against the vehicle, at the start
     rate_noise_dps: float = Field(5.0, gt=0)  # how much that changes within a second
-    pictures_apart: int = Field(14, ge=1)  # j - i
+    images_apart: int = Field(14, ge=1)  # j - i
     shortest_m: float = Field(1.0, gt=0)  # |f|
     last: int = Field(7, ge=1)
     cone_deg: float = Field(30.0, gt=0, lt=90)
@@ -81,7 +81,7 @@ class PaperAlign(Stage[PaperAlignSettings]):
         settings = self.settings
         self._pairing = Pairing(round(settings.max_apart_s * 1e9))
         rule = CorrectionRule(
-            settings.pictures_apart, settings.shortest_m, settings.last, math.radians(settings.cone_deg)
+            settings.images_apart, settings.shortest_m, settings.last, math.radians(settings.cone_deg)
         )
         self._correction = MotionCorrection(rule)
         self._filter = RotationFilter(
@@ -109,26 +109,26 @@ class PaperAlign(Stage[PaperAlignSettings]):
             yield self._answer(*pair)
 
     def on_drone(self, directions: VanishingDirections) -> Iterator[RelativeRotation]:
-        """V_D. One answer comes for each of the drone's pictures, once the vehicle's nearest one is known."""
+        """V_D. One answer comes for each of the drone's images, once the vehicle's nearest one is known."""
         for pair in self._pairing.drone(_of(directions, CameraMount.DRONE, "drone")):
             yield self._answer(*pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
-        """What still waited for a later picture of the vehicle goes with what there is."""
+        """What still waited for a later image of the vehicle goes with what there is."""
         for pair in self._pairing.rest():
             yield self._answer(*pair)
 
     def _answer(self, vehicle: VanishingDirections | None, drone: VanishingDirections) -> RelativeRotation:
-        """What one picture of the drone and the vehicle's nearest one say."""
+        """What one image of the drone and the vehicle's nearest one say."""
         now_ns, estimate = drone.stamp_ns, self._filter
         estimate.predict(now_ns)
         why = self._absence(vehicle, drone)
         if vehicle is None or why:
-            self._correction.add_picture(now_ns, estimate.rotation if self._observed else None)
+            self._correction.add_image(now_ns, estimate.rotation if self._observed else None)
             return self._message(now_ns, None, why)
         reason = self._observe(vehicle.direction, drone.direction, now_ns)
         self._observed = True
-        self._correction.add_picture(now_ns, estimate.rotation)
+        self._correction.add_image(now_ns, estimate.rotation)
         return self._message(now_ns, estimate.rotation, reason)
 
     def _absence(self, vehicle: VanishingDirections | None, drone: VanishingDirections) -> str:

@@ -2,11 +2,11 @@
 
     f_hat = R_G R_GD0 dt_DD(i, j)          the camera's direction of motion (5-point), under the rotation so far
     f     = t_D(j) - t_D(i),   t_D = R_G t_GD + t_G                                     what the LiDAR saw
-    j - i = 14 pictures, |f| >= 1 m; the last 7 of each, all within 30 deg of their sum, are summed
+    j - i = 14 images, |f| >= 1 m; the last 7 of each, all within 30 deg of their sum, are summed
     R_f   = rotation about Z that takes XY(sum f_hat) to XY(sum f)
     R_GD  = R_G^-1 R_f R_G R_GD0
 
-The camera does not know lengths: f_hat is given f's. Where the odometry tells shorter steps than 14 pictures they are
+The camera does not know lengths: f_hat is given f's. Where the odometry tells shorter steps than 14 images they are
 chained, each with the length that the LiDAR saw. R_G and t_G are the vehicle's own odometry; without it the vehicle is
 taken to stand. Z: where a sum stands steeper than 60 deg its heading says nothing, and there is no correction (ours).
 
@@ -28,9 +28,9 @@ from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.geometry.so3 import nearest_rotation
 from stages.messages import DroneFix, VehicleMotion, VisualMotion
 
-KEPT = 256  # pictures, fixes, motions
+KEPT = 256  # images, fixes, motions
 FIX_GAP_NS = 500_000_000  # between fixes further apart nothing is interpolated
-WAITS_NS = 1_000_000_000  # for the fix after a picture
+WAITS_NS = 1_000_000_000  # for the fix after a image
 LEVEL_AT_LEAST = 0.5  # horizontal part of a sum, at least
 
 
@@ -38,7 +38,7 @@ LEVEL_AT_LEAST = 0.5  # horizontal part of a sum, at least
 class CorrectionRule:
     """The paper's numbers."""
 
-    pictures_apart: int = 14  # j - i
+    images_apart: int = 14  # j - i
     shortest_m: float = 1.0  # |f|
     last: int = 7
     cone_rad: float = math.radians(30.0)
@@ -52,15 +52,15 @@ class MotionCorrection:
         self.trail = VehicleTrajectory()
         self._fixes: deque[tuple[int, Array64]] = deque(maxlen=KEPT)
         self._track_id: int | None = None
-        self._pictures: deque[int] = deque(maxlen=KEPT)  # stamps of the drone's
-        self._rotations: dict[int, Array64] = {}  # R_GD0 at the drone's pictures
-        self._motions: dict[int, VisualMotion] = {}  # by the later picture
+        self._images: deque[int] = deque(maxlen=KEPT)  # stamps of the drone's
+        self._rotations: dict[int, Array64] = {}  # R_GD0 at the drone's images
+        self._motions: dict[int, VisualMotion] = {}  # by the later image
         self._waiting: deque[VisualMotion] = deque(maxlen=KEPT)
         self._pairs: deque[tuple[Array64, Array64]] = deque(maxlen=rule.last)  # f_hat, f
         self._news = False  # a pair since the last answer
 
     def add_fix(self, fix: DroneFix) -> None:
-        """Where the LiDAR saw the drone; another track begins anew, a fix that is not newer is ignored."""
+        """Where the LiDAR saw the drone; another track restarts, a fix that is not newer is ignored."""
         if fix.track_id != self._track_id:
             self._fixes.clear()
             self._track_id = fix.track_id
@@ -72,15 +72,15 @@ class MotionCorrection:
         self.trail.add(motion)
 
     def add_motion(self, motion: VisualMotion) -> None:
-        """How the drone moved between two pictures."""
+        """How the drone moved between two images."""
         self._motions[motion.stamp_ns] = motion
         _drop_oldest(self._motions)
         self._waiting.append(motion)
 
-    def add_picture(self, stamp_ns: int, R_vehicle_drone: Array64 | None) -> None:
-        """One picture of the drone and R_GD0 then; None: not known yet."""
-        if not self._pictures or stamp_ns > self._pictures[-1]:
-            self._pictures.append(stamp_ns)
+    def add_image(self, stamp_ns: int, R_vehicle_drone: Array64 | None) -> None:
+        """One image of the drone and R_GD0 then; None: not known yet."""
+        if not self._images or stamp_ns > self._images[-1]:
+            self._images.append(stamp_ns)
         if R_vehicle_drone is not None:
             self._rotations[stamp_ns] = R_vehicle_drone
             _drop_oldest(self._rotations)
@@ -107,9 +107,9 @@ class MotionCorrection:
         return bool((vectors @ total >= math.cos(self._rule.cone_rad) * size).all())
 
     def _work(self) -> None:
-        """Pairs of all motions whose later picture is paired and lies before a fix; the others wait a while."""
+        """Pairs of all motions whose later image is paired and lies before a fix; the others wait a while."""
         fixed_ns = self._fixes[-1][0] if self._fixes else 0
-        paired_ns = self._pictures[-1] if self._pictures else 0
+        paired_ns = self._images[-1] if self._images else 0
         while self._waiting:
             motion = self._waiting[0]
             late = max(fixed_ns, paired_ns) - motion.stamp_ns > WAITS_NS
@@ -126,11 +126,11 @@ class MotionCorrection:
         chain = self._chain(motion)
         if chain is None:
             return None
-        first_ns, places = chain[0].from_ns, [self._place(chain[0].from_ns)]
-        places += [self._place(link.stamp_ns) for link in chain]
-        known = [place for place in places if place is not None]
+        first_ns, positions = chain[0].from_ns, [self._place(chain[0].from_ns)]
+        positions += [self._place(link.stamp_ns) for link in chain]
+        known = [place for place in positions if place is not None]
         R_GD0 = self._rotations.get(first_ns)
-        if len(known) < len(places) or R_GD0 is None:
+        if len(known) < len(positions) or R_GD0 is None:
             return None
         f = known[-1] - known[0]
         if float(np.linalg.norm(f)) < self._rule.shortest_m:
@@ -147,18 +147,18 @@ class MotionCorrection:
         return f_hat * float(np.linalg.norm(f)) / length, f
 
     def _chain(self, motion: VisualMotion) -> list[VisualMotion] | None:
-        """Motions, one after the other, over `pictures_apart` of the drone's pictures; None: a link is missing."""
+        """Motions, one after the other, over `pictures_apart` of the drone's images; None: a link is missing."""
         chain = [motion]
-        while self._pictures_between(chain[0].from_ns, motion.stamp_ns) < self._rule.pictures_apart:
+        while self._images_between(chain[0].from_ns, motion.stamp_ns) < self._rule.images_apart:
             before = self._motions.get(chain[0].from_ns)
             if before is None or before.from_ns >= before.stamp_ns:
                 return None
             chain.insert(0, before)
         return chain
 
-    def _pictures_between(self, from_ns: int, to_ns: int) -> int:
-        """j - i of the pictures at two times."""
-        return bisect_right(self._pictures, to_ns) - bisect_right(self._pictures, from_ns)
+    def _images_between(self, from_ns: int, to_ns: int) -> int:
+        """j - i of the images at two times."""
+        return bisect_right(self._images, to_ns) - bisect_right(self._images, from_ns)
 
     def _place(self, stamp_ns: int) -> Array64 | None:
         """t_D (3,) = R_G t_GD + t_G at a time, between two fixes; None where there are none near enough."""

@@ -1,4 +1,4 @@
-"""What is given out: a rotation on its most probable branch, or why there is none, and whether it jumped.
+"""Message of a pair of images: the rotation on its most probable branch, or why there is none, and whether it jumped.
 
 Source: ours.
 """
@@ -9,45 +9,45 @@ import math
 
 import numpy as np
 
-from stages.align.dead_reckoning import Reckoned, Reckoning
+from stages.align.dead_reckoning import DeadReckonedYaw, DeadReckoning
 from stages.align.refine import Refined
 from stages.geometry.frames import Array64
-from stages.heading.hypothesis_bank import NONE, BranchBank
+from stages.heading.hypothesis_bank import NONE, HypothesisBank
 from stages.messages import BranchState, RelativeRotation
 
-JUMP_RAD = math.radians(30.0)  # of what is given out
+JUMP_RAD = math.radians(30.0)  # change of the published yaw that counts as a jump
 
 
-class Answers:
-    """One for each pair of pictures."""
+class Publisher:
+    """One for each pair of images."""
 
-    def __init__(self, bank: BranchBank, reckoning: Reckoning, resolve_probability: float) -> None:
-        self._bank, self._reckoning = bank, reckoning
+    def __init__(self, bank: HypothesisBank, dead_reckoning: DeadReckoning, resolve_probability: float) -> None:
+        self._bank, self._dead_reckoning = bank, dead_reckoning
         self._resolve_probability = resolve_probability
-        self._branch = 0  # given out, counted from the yaw followed
-        self._given_rad: float | None = None  # yaw given out less the dead reckoned one
+        self._branch = 0  # published, counted from the tracked yaw
+        self._given_rad: float | None = None  # published yaw less the dead reckoned one
         self._switches = 0
         self._news = ""
 
     def add_news(self, news: str) -> None:
-        """To be told with the next rotation."""
+        """Add a text to the reason of the next rotation."""
         self._news = news
 
     def rotation(
-        self, vehicle_ns: int, drone_ns: int, refined: Refined, reckoned: Reckoned, off_rad: Array64
+        self, vehicle_ns: int, drone_ns: int, refined: Refined, dead_reckoned: DeadReckonedYaw, off_rad: Array64
     ) -> RelativeRotation:
         """The most probable branch; `off_rad` (3,): by how much it contradicts what is known, its error then."""
         before, self._branch = self._branch, self._bank.best(self._branch)
-        given_rad = refined.yaw_rad + self._branch * math.pi / 2 - reckoned.yaw_rad
+        given_rad = refined.yaw_rad + self._branch * math.pi / 2 - dead_reckoned.yaw_rad
         if self._given_rad is not None:
             jump_rad = math.remainder(given_rad - self._given_rad, 2 * math.pi)
             if abs(jump_rad) > JUMP_RAD:
                 self._switches += 1
-                why = "motion says" if before != self._branch else "the streets say"
+                why = "by motion" if before != self._branch else "by vanishing points"
                 self._news = f"JUMP: {why} {math.degrees(jump_rad):+.0f} deg; {self._news}".rstrip("; ")
         self._given_rad = given_rad
         resolved = self._bank.resolved(self._branch, self._resolve_probability)
-        left, right, stamp_ns, variance_rad2 = self._reckoning.at_one_moment(vehicle_ns, drone_ns)
+        left, right, stamp_ns, variance_rad2 = self._dead_reckoning.at_common_time(vehicle_ns, drone_ns)
         covariance = right.T @ (refined.covariance_rad2(self._branch) + np.outer(off_rad, off_rad)) @ right
         told = f"{refined.directions} directions, {refined.vehicle_lines} and {refined.drone_lines} lines"
         known = f"{self._bank.windows} windows of motion, none right: {self._bank.probability[NONE]:.1g}"
@@ -63,7 +63,7 @@ class Answers:
         )
 
     def none(self, stamp_ns: int, reason: str) -> RelativeRotation:
-        """No rotation of a picture, and why."""
+        """A message without a rotation, with the reason."""
         return RelativeRotation(
             stamp_ns=stamp_ns,
             R_vehicle_drone=None,
@@ -75,5 +75,5 @@ class Answers:
         )
 
     def _probability(self) -> Array64:
-        """(4,) the branch given out first."""
+        """(4,) branch probabilities, the published branch first."""
         return np.roll(self._bank.probability[:4], -self._branch)

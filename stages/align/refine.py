@@ -4,9 +4,9 @@
     line i     n_i . h(a_vk) = 0 in the vehicle's level axes,  n_i . h(a_dk) = 0 in the drone's       robust weights
     camera     a_vk = a_k,  a_dk = a_k - yaw        up to `direction_rad`: errors that many lines have in common
     streets    a_j = a_k + 90 deg for two directions nearly at right angles      up to `square_rad`
-    tilt       as the pictures' verticals say, up to their sigma
+    tilt       as the images' verticals say, up to their sigma
 
-Hundreds of lines along one street do not average its error away: they share the lens, the picture and the street. So
+Hundreds of lines along one street do not average its error away: they share the lens, the image and the street. So
 each camera has its own idea of each direction, and only these are tied together; the covariance is what is left.
 
 Source: ours, for P IV Eq. 7-10; DESIGN, Vision: raw covariance is overconfident (NEES/3 about 21).
@@ -39,12 +39,12 @@ FEW = 20.0  # lines: a direction of so few is worse
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How far from perfect the world and the pictures are, one sigma [rad]."""
+    """How far from perfect the world and the images are, one sigma [rad]."""
 
     straight_rad: float  # a line of a street
     direction_rad: float  # what all lines that one camera has of a street share
     square_rad: float  # a crossing
-    tilt_rad: float  # a vertical, beyond what its picture says, and what all lines of a picture share
+    tilt_rad: float  # a vertical, beyond what its image says, and what all lines of a image share
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def half_turn_difference(angle_rad: float) -> float:
 
 
 @dataclass
-class _Eye:
+class _Camera:
     """One camera's share: its lines by direction, and its level axes as refined so far."""
 
     R: Array64  # R_carrier_level
@@ -108,8 +108,8 @@ class _Eye:
     azimuth: Array64  # (K,) as this camera has it, in its own level axes
     tilt: Array64  # (2,) turned so far from what the vertical says
     tilt_sigma_rad: float
-    spoilt: Array64  # (K,) how many times worse than usual this camera has a direction: few lines, or at odds
-    sees: float = 0.0
+    inflation: Array64  # (K,) how many times worse than usual this camera has a direction: few lines, or at odds
+    effective_lines: float = 0.0
 
     def rows(self, at: int, tilt_at: int, unknowns: int) -> tuple[Array64, Array64]:
         """J (m, unknowns) and r (m,) of the lines, in sigmas and weighed."""
@@ -123,15 +123,15 @@ class _Eye:
         J[np.arange(len(r)), at + self.k] = n[:, 1] * c - n[:, 0] * s
         scaled = r / self.sigma
         weight = 1.0 / (1.0 + (scaled / CAUCHY) ** 2)
-        self.sees = float(weight.sum())
+        self.effective_lines = float(weight.sum())
         lines = np.maximum(np.bincount(self.k, minlength=len(self.azimuth)), 1)
         at_odds = np.bincount(self.k, np.minimum(scaled**2, ODD), minlength=len(self.azimuth)) / lines
-        self.spoilt = np.maximum(at_odds, 1.0) * np.sqrt(1.0 + FEW / lines)
+        self.inflation = np.maximum(at_odds, 1.0) * np.sqrt(1.0 + FEW / lines)
         root = np.sqrt(weight) / self.sigma
         return J * root[:, None], r * root
 
 
-def _eye(lines: LevelLines, directions: Array64, yaw_rad: float, allowed: Tolerances) -> _Eye:
+def _camera(lines: LevelLines, directions: Array64, yaw_rad: float, allowed: Tolerances) -> _Camera:
     """The lines near one of the directions (K,), which the vehicle has; `yaw_rad` turns them into the camera's."""
     azimuth = directions - yaw_rad
     off = lines.azimuth_rad[:, None] - azimuth
@@ -141,7 +141,7 @@ def _eye(lines: LevelLines, directions: Array64, yaw_rad: float, allowed: Tolera
     own = nearest < np.maximum(NEAR_RAD, 2.0 * lines.azimuth_sigma_rad)
     normal = lines.normal[own]
     flat = np.hypot(normal[:, 0], normal[:, 1])
-    return _Eye(
+    return _Camera(
         R=lines.R_carrier_level,
         normal=normal @ lines.R_carrier_level.T,
         sigma=np.hypot(lines.sigma_rad[own], allowed.straight_rad * flat),
@@ -149,7 +149,7 @@ def _eye(lines: LevelLines, directions: Array64, yaw_rad: float, allowed: Tolera
         azimuth=azimuth,
         tilt=np.zeros(2),
         tilt_sigma_rad=math.hypot(lines.tilt_sigma_rad, allowed.tilt_rad),
-        spoilt=np.ones(len(directions)),
+        inflation=np.ones(len(directions)),
     )
 
 
@@ -164,9 +164,9 @@ def refine(
     K = len(directions)
     unknowns = TILTS_AND_YAW + 3 * K
     street, own = TILTS_AND_YAW, (TILTS_AND_YAW + K, TILTS_AND_YAW + 2 * K)
-    eyes = (
-        _eye(vehicle, directions, 0.0, allowed),
-        _eye(drone, directions, yaw_rad, allowed),
+    cameras = (
+        _camera(vehicle, directions, 0.0, allowed),
+        _camera(drone, directions, yaw_rad, allowed),
     )
     a, yaw = directions.copy(), yaw_rad
     squares = [
@@ -177,11 +177,11 @@ def refine(
     ]
     ties = np.zeros((2 * K + len(squares) + 4, unknowns))
     seen = np.arange(K)
-    for c, eye in enumerate(eyes):
+    for c, camera in enumerate(cameras):
         ties[c * K + seen, own[c] + seen] = 1 / allowed.direction_rad
         ties[c * K + seen, street + seen] = -1 / allowed.direction_rad
         for axis in range(2):
-            ties[2 * K + len(squares) + 2 * c + axis, 2 * c + axis] = 1 / eye.tilt_sigma_rad
+            ties[2 * K + len(squares) + 2 * c + axis, 2 * c + axis] = 1 / camera.tilt_sigma_rad
     ties[K + seen, 4] = 1 / allowed.direction_rad
     for row, (i, j) in enumerate(squares, 2 * K):
         ties[row, [street + i, street + j]] = 1 / allowed.square_rad, -1 / allowed.square_rad
@@ -191,39 +191,39 @@ def refine(
         off_square = [from_square(a[i] - a[j]) / allowed.square_rad for i, j in squares]
         r_ties = np.concatenate(
             [
-                (eyes[0].azimuth - a) / allowed.direction_rad,
-                (eyes[1].azimuth - a + yaw) / allowed.direction_rad,
+                (cameras[0].azimuth - a) / allowed.direction_rad,
+                (cameras[1].azimuth - a + yaw) / allowed.direction_rad,
                 off_square,
-                *(eye.tilt / eye.tilt_sigma_rad for eye in eyes),
+                *(camera.tilt / camera.tilt_sigma_rad for camera in cameras),
             ]
         )
-        spoilt = np.concatenate([eye.spoilt for eye in eyes])
-        weight[: 2 * K] = 1.0 / (spoilt**2 + (r_ties[: 2 * K] / CAUCHY) ** 2)
+        inflation = np.concatenate([camera.inflation for camera in cameras])
+        weight[: 2 * K] = 1.0 / (inflation**2 + (r_ties[: 2 * K] / CAUCHY) ** 2)
         information[:] = (ties.T * weight) @ ties
         slope = (ties.T * weight) @ r_ties
-        for c, eye in enumerate(eyes):
-            J, r = eye.rows(own[c], 2 * c, unknowns)
+        for c, camera in enumerate(cameras):
+            J, r = camera.rows(own[c], 2 * c, unknowns)
             information += J.T @ J
             slope += J.T @ r
         step = np.asarray(-np.linalg.solve(information, slope), dtype=np.float64)
-        for c, eye in enumerate(eyes):
+        for c, camera in enumerate(cameras):
             turn = step[2 * c : 2 * c + 2]
-            eye.R = eye.R @ exp_rotation(np.append(turn, 0.0))
-            eye.tilt = eye.tilt + turn
-            eye.azimuth = eye.azimuth + step[own[c] : own[c] + K]
+            camera.R = camera.R @ exp_rotation(np.append(turn, 0.0))
+            camera.tilt = camera.tilt + turn
+            camera.azimuth = camera.azimuth + step[own[c] : own[c] + K]
         yaw += float(step[4])
         a = a + step[street : street + K]
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)[:TILTS_AND_YAW, :TILTS_AND_YAW]
     covariance[range(4), range(4)] += allowed.tilt_rad**2  # hundreds of lines share this, too
-    both = sum(1 for k in range(K) if all(np.any(eye.k == k) for eye in eyes))
+    both = sum(1 for k in range(K) if all(np.any(camera.k == k) for camera in cameras))
     return Refined(
-        R_vehicle_level=eyes[0].R,
-        R_drone_level=eyes[1].R,
+        R_vehicle_level=cameras[0].R,
+        R_drone_level=cameras[1].R,
         yaw_rad=yaw,
         covariance=covariance,
         directions=both,
-        vehicle_lines=round(eyes[0].sees),
-        drone_lines=round(eyes[1].sees),
+        vehicle_lines=round(cameras[0].effective_lines),
+        drone_lines=round(cameras[1].effective_lines),
     )
 
 

@@ -1,6 +1,6 @@
 """Yaw spectra: how much line there is along each horizontal direction, and how two cameras' spectra lie on each other.
 
-A line of the picture lies on a great circle with normal n (level axes, z up). If the line is horizontal in the world,
+A line of the image lies on a great circle with normal n (level axes, z up). If the line is horizontal in the world,
 its direction is where the circle meets the horizon:
 
     h = z x n / |z x n|,   azimuth = atan2(h_y, h_x) mod 180 deg,   sigma_azimuth = sigma |t . h| / |z x n|
@@ -57,7 +57,7 @@ def level_axes(up: Array64) -> Array64:
 
 
 def level_lines(seen: VanishingDirections, sharpest_rad: float) -> LevelLines | None:
-    """The horizontal lines of a picture; `sharpest_rad` is how straight streets are. None: it has no vertical."""
+    """The horizontal lines of a image; `sharpest_rad` is how straight streets are. None: it has no vertical."""
     upright = np.flatnonzero(seen.is_vertical)
     if upright.size == 0:
         return None

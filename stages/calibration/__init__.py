@@ -1,3 +1,3 @@
-"""Self-calibration: how the LiDAR sits on its servo, from surfaces seen more than once during a sweep."""
+"""Self-calibration of the LiDAR's mount on its servo, from surfaces observed more than once during a sweep."""
 
 from stages.calibration.servo_clock import ServoClock as ServoClock

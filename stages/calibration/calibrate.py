@@ -1,4 +1,4 @@
-"""Self-calibration: from returns and servo states to a better mount, or a sentence why not.
+"""Self-calibration: estimates the LiDAR's mount from returns and servo states, or states why it cannot.
 
 Source: ours; issue 7, point 5: planes seen twice must coincide.
 """
@@ -13,26 +13,26 @@ import numpy as np
 from stages.calibration.columns import LASERS, Placed, place
 from stages.calibration.motion import drift, shift
 from stages.calibration.patches import Patches, thickness_m
-from stages.calibration.result import CURVE, Finding, Travel, accepted, curve_sigmas, judge
+from stages.calibration.result import CURVE, Finding, Travel, accepted, assess, curve_sigmas
 from stages.calibration.scan_passes import Returns, ServoTrace, servo_at
 from stages.calibration.servo_mount import ServoMount, lidar_mount, servo_mount
 from stages.calibration.solve import COARSE_RAD, Solution, linearise, solve
 from stages.geometry.frames import Array64, LidarMount
 
-LEAST_TRAVEL_RAD = math.radians(40.0)  # the fan is 30 deg wide: less, and nothing is seen at two angles
-STILL_RAD = math.radians(0.5)  # what the encoder's steps may look like
+LEAST_TRAVEL_RAD = math.radians(40.0)  # the fan is 30 deg wide: with less, no surface is observed at two angles
+STILL_RAD = math.radians(0.5)  # apparent motion from encoder steps
 FEWEST_RETURNS = 2_000
 FEWEST_PATCHES = 30
-MOVED_M, TURNED_RAD = 0.03, math.radians(0.1)  # over the whole time; less does not matter
+MOVED_M, TURNED_RAD = 0.03, math.radians(0.1)  # over the whole time; a smaller motion is negligible
 
 
 class CannotCalibrate(Exception):
-    """This recording cannot calibrate anything; the text says why and what to do."""
+    """The recording cannot be used for calibration; the text states the reason and the remedy."""
 
 
 @dataclass(frozen=True)
 class Thickness:
-    """Root mean square distance of returns from their patch (m,) [m], before and after, and how far off it is (m,)."""
+    """RMS distance of the returns from their patch (m,) [m], before and after, and the patch's range (m,) [m]."""
 
     before_m: Array64
     after_m: Array64
@@ -40,26 +40,26 @@ class Thickness:
 
     @property
     def medians_m(self) -> tuple[float, float]:
-        """Of the patches, before and after."""
+        """Medians over the patches, before and after."""
         return float(np.median(self.before_m)), float(np.median(self.after_m))
 
 
-ZERO_SIGMA_DEG = 0.1  # the zero against the vehicle's axes, which no sweep tells: 2 mm in a metre
+ZERO_SIGMA_DEG = 0.1  # zero against the vehicle's axes, not observable by a sweep: 2 mm in a metre
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found, and what is known of it."""
+    """Result of a calibration: the mount, its findings and its uncertainty."""
 
-    mount: LidarMount  # the rig with the numbers that are told
+    mount: LidarMount  # the rig with the accepted parameters
     findings: tuple[Finding, ...]
-    covariance: Array64  # of all numbers, in the order of PARAMETERS, inside units
+    covariance: Array64  # of all PARAMETERS, SI units
     curve_sigma_rad: float  # of the encoder's error over the sweep, without its mean
-    curve_mean_sigma_rad: float  # of that mean: alike a zero
+    curve_mean_sigma_rad: float  # of that mean, which is not separable from a zero
     travel: Travel
     thickness: Thickness
     before: Placed  # the returns of all patches under the rig
-    after: Placed  # and under the mount found
+    after: Placed  # the same under the mount found
     patches: Patches
     numbers: ServoMount  # the mount found, as it is written
 
@@ -67,9 +67,9 @@ class Calibration:
 def calibrate(
     returns: Returns, trace: ServoTrace, rig: LidarMount, *, parked: bool = False, max_gap_s: float = 0.1
 ) -> Calibration:
-    """Find how the LiDAR sits on its servo. Raises CannotCalibrate when nothing can be told.
+    """Estimate the LiDAR's mount on its servo. Raises CannotCalibrate when no estimate is possible.
 
-    `parked`: it is known that the vehicle stood still. A servo that comes back shows that by itself.
+    `parked`: the vehicle is known to have stood still. A servo that sweeps in both directions does not need it.
     """
     if not rig.turns:
         raise CannotCalibrate("the rig says that its LiDAR is bolted down (turns: false): there is no servo mount")
@@ -79,7 +79,7 @@ def calibrate(
         raise CannotCalibrate(
             f"the LiDAR returned {len(returns.stamp_ns)} pulses, at least {FEWEST_RETURNS} are needed: was it running?"
         )
-    _check_travel(float(np.ptp(trace.position_rad)))  # first: of a servo that stands, no side of its play is known
+    _check_travel(float(np.ptp(trace.position_rad)))  # first: the side of the play is not known for a servo at rest
     numbers = servo_mount(rig)
     at = servo_at(trace, returns.stamp_ns, numbers, max_gap_s)
     if not np.isfinite(at.position_rad).any():
@@ -97,19 +97,19 @@ def calibrate(
         raise CannotCalibrate(
             "too few flat surfaces were seen more than once: drive to where there are walls, and stand still there"
         )
-    findings = judge(numbers, solution.mount, solution.covariance, travel)
+    findings = assess(numbers, solution.mount, solution.covariance, travel)
     written = accepted(numbers, solution.mount, findings, solution.covariance, travel)
     curve_rad, mean_rad = curve_sigmas(solution.covariance, travel)
     chosen = solution.system.chosen
-    looked_at = Returns(returns.stamp_ns[chosen], returns.laser[chosen], returns.xyz_lidar_m[chosen])
+    on_patches = Returns(returns.stamp_ns[chosen], returns.laser[chosen], returns.xyz_lidar_m[chosen])
     before, after = (
-        place(looked_at, servo_at(trace, looked_at.stamp_ns, mount, max_gap_s), mount, solution.bias_m)
+        place(on_patches, servo_at(trace, on_patches.stamp_ns, mount, max_gap_s), mount, solution.bias_m)
         for mount in (numbers, written)
     )
     patches = solution.system.patches
     centre = patches.centre_m
     mount = lidar_mount(written, rig)
-    if {f.name for f in findings if not f.refused}.issuperset({*CURVE, "play"}):
+    if {f.name for f in findings if not f.rejected}.issuperset({*CURVE, "play"}):
         pointing_deg = math.hypot(ZERO_SIGMA_DEG, math.degrees(curve_rad), math.degrees(mean_rad))
         mount = mount.model_copy(update={"pointing_sigma_deg": pointing_deg})
     return Calibration(
@@ -130,7 +130,7 @@ def calibrate(
 
 
 def _check_travel(angle_rad: float) -> None:
-    """Raise CannotCalibrate when the servo turned too little."""
+    """Raise CannotCalibrate if the servo turned too little."""
     if angle_rad < LEAST_TRAVEL_RAD:
         turned = f"turned by {math.degrees(angle_rad):.0f} deg only" if angle_rad > STILL_RAD else "stood still"
         raise CannotCalibrate(
@@ -142,7 +142,7 @@ def _check_travel(angle_rad: float) -> None:
 def _check_still(
     returns: Returns, trace: ServoTrace, rig: ServoMount, solution: Solution | None, both_ways: bool, max_gap_s: float
 ) -> None:
-    """Raise CannotCalibrate when the vehicle moved, under the mount found, or the rig's where none was."""
+    """Raise CannotCalibrate if the vehicle moved, under the mount found or, without one, the rig's."""
     mount, bias_m = (solution.mount, solution.bias_m) if solution else (rig, np.zeros(LASERS))
     placed = place(returns, servo_at(trace, returns.stamp_ns, mount, max_gap_s), mount, bias_m)
     between = None if not both_ways else shift(placed.xyz_m, returns.stamp_ns)

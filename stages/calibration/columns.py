@@ -1,4 +1,4 @@
-"""Where a mount puts the returns, and how each number of it moves them across their patch.
+"""Returns placed by a mount, and the derivatives of their distance from a plane by each parameter.
 
 Source: ours: derivatives of `stages/calibration/servo_mount.py`'s two formulas.
 """
@@ -18,16 +18,16 @@ LASERS = 16
 
 
 class Placed(NamedTuple):
-    """Returns in the base frame (n, 3); turned: cosine and sine (n, 2) of the turntable's angle."""
+    """Returns in the base frame (n, 3); `turned`: cosine and sine (n, 2) of the turntable's angle."""
 
     xyz_m: Array64
-    origin_m: Array64  # where each beam started
+    origin_m: Array64  # origin of each beam
     direction: Array64  # of the beam, unit
     turned: Array64
     servo: ServoAt
 
     def taken(self, index: NDArray[np.int64]) -> Placed:
-        """Some of the returns."""
+        """The returns at `index`."""
         return Placed(
             self.xyz_m[index],
             self.origin_m[index],
@@ -38,8 +38,8 @@ class Placed(NamedTuple):
 
 
 def place(returns: Returns, servo: ServoAt, mount: ServoMount, bias_m: Array64) -> Placed:
-    """Put returns where a mount says; bias_m (16,) is taken off each laser's ranges. NaN where the angle is."""
-    angle = mount.sign * (servo.position_rad - servo.hang * mount.play_rad / 2 - mount.zero_rad)
+    """Place returns by a mount; bias_m (16,) is subtracted from each laser's ranges. NaN where the angle is NaN."""
+    angle = mount.sign * (servo.position_rad - servo.play_side * mount.play_rad / 2 - mount.zero_rad)
     angle = angle - mount.encoder_error_rad(servo.position_rad)
     turned = np.column_stack([np.cos(angle), np.sin(angle)])
     along = returns.xyz_lidar_m / np.linalg.norm(returns.xyz_lidar_m, axis=1, keepdims=True)
@@ -55,7 +55,7 @@ def place(returns: Returns, servo: ServoAt, mount: ServoMount, bias_m: Array64) 
 
 
 def about_z(xyz: Array64, turned: Array64) -> Array64:
-    """Vectors (n, 3) turned about z by angles given as cosine and sine (n, 2)."""
+    """Vectors (n, 3) rotated about z by angles given as cosine and sine (n, 2)."""
     c, s = turned[:, 0], turned[:, 1]
     return np.column_stack([c * xyz[:, 0] - s * xyz[:, 1], s * xyz[:, 0] + c * xyz[:, 1], xyz[:, 2]])
 
@@ -79,7 +79,7 @@ def mount_columns(placed: Placed, normal: Array64, mount: ServoMount) -> dict[st
     for order in ORDERS:
         columns[f"sin_{order}"] = -by_angle * np.sin(order * servo.position_rad)
         columns[f"cos_{order}"] = -by_angle * np.cos(order * servo.position_rad)
-    columns["play"] = -0.5 * mount.sign * by_angle * servo.hang
+    columns["play"] = -0.5 * mount.sign * by_angle * servo.play_side
     columns["time"] = -by_angle * slope * servo.rate_radps
     columns["zero"] = -mount.sign * by_angle
     return columns
@@ -93,6 +93,6 @@ def laser_columns(placed: Placed, normal: Array64, laser: NDArray[np.uint8]) -> 
 
 
 def drift_columns(placed: Placed, normal: Array64, since_s: Array64) -> Array64:
-    """d(normal . p) / d(velocity, turn rate) of a vehicle that moves steadily, (n, 6), x, y, z each."""
+    """d(normal . p) / d(velocity, turn rate) of a vehicle in steady motion, (n, 6), x, y, z each."""
     turning = np.cross(placed.xyz_m, normal)  # normal . (e x p) = e . (p x normal)
     return np.column_stack([normal, turning]) * since_s[:, None]

@@ -1,10 +1,10 @@
-"""Whether the vehicle stood still: when it drives, surfaces smear as they do under a wrong mount.
+"""Check that the vehicle stood still: motion blurs surfaces as a wrong mount does.
 
-Two looks at it. A drive by centimetres bends patches: beside the mount's numbers a steady velocity and turn rate are
-put into the least squares, to see whether they explain something. A drive by more takes surfaces out of their patches:
-then what stood upright is compared as seen from above, an earlier look against a later one, at all shifts; of a vehicle
-that stands, no shift fits better than none. That takes a servo that comes back: one way only, little is seen twice with
-time between.
+Two tests. Motion by centimetres bends patches: a constant velocity and turn rate are added to the parameters of the
+least squares, and are significant if the vehicle moved. Larger motion takes surfaces out of their patches: the upright
+objects of the first half of the time are then correlated with those of the second half, in a view from above, at all
+shifts; for a vehicle at rest no shift fits better than zero. This needs a servo that sweeps in both directions,
+otherwise few surfaces are observed twice with time between.
 
 Source: ours; shifts by correlation: Kuglin, Hines (1975).
 """
@@ -21,27 +21,27 @@ from stages.calibration.scan_passes import Returns
 from stages.calibration.solve import PRIOR, System, one_step, sandwich, without_planes
 from stages.geometry.frames import Array64
 
-SURE = 5.0  # sigmas
-EXPECTED = np.array([5.0, 5.0, 0.5, 0.2, 0.2, 0.5])  # [m/s], [rad/s]: one sigma before anything is seen
+SIGNIFICANT = 5.0  # sigmas
+EXPECTED = np.array([5.0, 5.0, 0.5, 0.2, 0.2, 0.5])  # [m/s], [rad/s]: prior sigma
 CELL_M = 0.2
 CELLS = 512
 FARTHEST_M = 50.0
-UPRIGHT_M = 0.5  # a column of air in which returns are this far apart in height holds something upright
+UPRIGHT_M = 0.5  # a column with returns this far apart in height contains an upright object
 FEWEST_CELLS = 150
 SECTORS = 72
-BETTER = 1.1  # a shift must match so much more
+BETTER = 1.1  # least gain of a shift over no shift
 
 
 @dataclass(frozen=True)
 class Drift:
-    """How far the vehicle seems to have moved and turned over the time looked at; 0 where that is not sure."""
+    """Apparent motion and rotation of the vehicle over the recording; 0 where not significant."""
 
     moved_m: float
     turned_rad: float
 
 
 def drift(system: System, returns: Returns) -> Drift:
-    """The steady motion that patches tell, at the mount of a system."""
+    """The constant motion that best explains the patches, at the mount of a system."""
     stamp_ns = returns.stamp_ns[system.chosen]
     since_s = (stamp_ns - stamp_ns.mean()) * 1e-9
     normal = system.patches.normal[system.patches.patch]
@@ -53,25 +53,25 @@ def drift(system: System, returns: Returns) -> Drift:
     step = one_step(wider, np.zeros(len(prior)), prior)
     explained = replace(wider, residual=wider.residual + wider.columns @ step)
     sigma = np.sqrt(np.diag(sandwich(explained, stamp_ns, prior))[k:])
-    rate = np.where(np.abs(step[k:]) > SURE * sigma, step[k:], 0.0) * float(np.ptp(since_s))
+    rate = np.where(np.abs(step[k:]) > SIGNIFICANT * sigma, step[k:], 0.0) * float(np.ptp(since_s))
     return Drift(float(np.linalg.norm(rate[:3])), float(np.linalg.norm(rate[3:])))
 
 
 @dataclass(frozen=True)
 class Shift:
-    """What two looks have in common, seen from above."""
+    """Correlation of two views from above, over shifts."""
 
-    best_m: tuple[float, float]  # at which shift they fit best
-    gain: float  # how much better than without: 1 is not at all
+    best_m: tuple[float, float]  # shift with the best fit
+    gain: float  # correlation relative to no shift; 1: no improvement
 
     @property
     def moved(self) -> bool:
-        """Whether the vehicle moved, or the scene about it."""
+        """Whether the vehicle moved, or the scene around it."""
         return self.gain > BETTER
 
 
 def shift(xyz_m: Array64, stamp_ns: NDArray[np.int64]) -> Shift | None:
-    """Compare the halves of the time in a cloud (n, 3), NaN for unknown places; None: too little was seen in both."""
+    """Correlate the two halves of a recording's points (n, 3), NaN where unknown; None: too few common cells."""
     known = np.isfinite(xyz_m[:, 0]) & (np.hypot(xyz_m[:, 0], xyz_m[:, 1]) < FARTHEST_M)
     late = (stamp_ns > (stamp_ns[0] + stamp_ns[-1]) // 2)[known]
     xyz_m = xyz_m[known]
@@ -91,7 +91,7 @@ def shift(xyz_m: Array64, stamp_ns: NDArray[np.int64]) -> Shift | None:
 
 
 def _upright(xyz_m: Array64) -> Array64:
-    """Where something upright stands, (CELLS, CELLS) of 0 and 1 from above."""
+    """Map (CELLS, CELLS) from above: 1 where an upright object stands, else 0."""
     cell = np.floor(xyz_m[:, :2] / CELL_M).astype(np.int64) + CELLS // 2
     place = cell[:, 0] * CELLS + cell[:, 1]
     low, high = np.full(CELLS**2, np.inf), np.full(CELLS**2, -np.inf)

@@ -1,7 +1,7 @@
-"""What a calibration may find, in what units people read it, and how sure it must be to be told.
+"""Parameters of a calibration: display units, prior sigmas, and the limits of sigma for acceptance.
 
-Source: ours. Floors are from simulated scenes. The limits are what matters at the drone: 0.05 deg is 26 mm at 30 m,
-0.2 ms at 57 rpm the same at 20 m.
+Source: ours. Floors are from simulated scenes. The limits follow from the error at the drone: 0.05 deg is 26 mm at
+30 m, and so is 0.2 ms at 57 rpm at 20 m.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ DEG = math.pi / 180
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number. Inside it is in rad, m or s; `unit` and `per_unit` are for people."""
+    """One parameter, in rad, m or s internally; `unit` and `per_unit` are for display."""
 
     name: str
     what: str
     unit: str
-    per_unit: float  # inside value of one `unit`
-    expected: float  # [unit] how far off a rig may be, one sigma, before anything is seen
-    limit: float  # [unit] a larger sigma is refused
-    floor: float = 0.0  # [unit] one sigma of what walls that are no planes leave, however long one looks
+    per_unit: float  # SI value of one `unit`
+    expected: float  # [unit] prior sigma of the rig's value
+    limit: float  # [unit] a larger sigma is rejected
+    floor: float = 0.0  # [unit] systematic sigma from walls that are not planes
 
 
 PARAMETERS: tuple[Parameter, ...] = (

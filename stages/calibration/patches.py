@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 
 CELLS_M = ((6.0, 0.5), (18.0, 1.0), (1e9, 2.0))  # up to which range, edge of the cube
-RANGE_NOISE_M = 0.012  # along the beam: what remains of a laser's noise
-ANGLE_NOISE_RAD = 5e-4  # across it: encoder steps, time stamps, the beam's width on a slope
-FEWEST = 24  # returns of a patch
-MOST = 160  # of one patch: more tell little, since no wall is quite flat
-WIDE = 0.15  # a patch is at least so wide (one sigma of its narrower side), as a share of the cell
-MARGIN_M = 0.05  # from the cell's sides: there noise in range decides whether a return is inside
+RANGE_NOISE_M = 0.012  # along the beam: noise of a laser without its bias
+ANGLE_NOISE_RAD = 5e-4  # across the beam: encoder steps, time stamps, beam width on a slope
+FEWEST = 24  # returns of a patch, at least
+MOST = 160  # returns of a patch, at most: no wall is flat enough for more
+WIDE = 0.15  # least width (one sigma of the narrower side) as a share of the cell
+MARGIN_M = 0.05  # excluded margin of a cell, where range noise decides whether a return is inside
 CLOSE_RAD = 0.003
 ROUGHEST = 2.0  # mean square distance from the plane, in that of the median patch
-EXPECTED_ROUGH = 1.0  # in that of `expected_sigma_m`: so rough any patch may be
-STEEPEST = 0.10  # least |cosine| between beams and normal: what grazes a surface is blurred along it
+EXPECTED_ROUGH = 1.0  # mean square distance in units of `expected_sigma_m` that is always accepted
+STEEPEST = 0.10  # least |cosine| between beams and normal: grazing returns are blurred
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,14 @@ class Patches:
     """Returns on patches, patch by patch. n returns, m patches."""
 
     index: NDArray[np.int64]  # (n,) into the returns given
-    patch: NDArray[np.int64]  # (n,) which patch, growing
-    first: NDArray[np.int64]  # (m,) where each patch starts
+    patch: NDArray[np.int64]  # (n,) patch number, ascending
+    first: NDArray[np.int64]  # (m,) first return of each patch
     normal: Array64  # (m, 3)
     centre_m: Array64  # (m, 3)
-    on_plane_m: Array64  # (n, 3) where the beams meet their planes: the returns without their noise in range
-    plane_basis: Array64  # (n, 3) 1 and the place in the plane [m]: how moving the plane moves the residual
+    on_plane_m: Array64  # (n, 3) intersections of beams and planes: the returns without range noise
+    plane_basis: Array64  # (n, 3) 1 and the position in the plane [m]: derivative of the residual by the plane
     residual_m: Array64  # (n,) signed distance from the plane
-    sigma_m: Array64  # (n,) expected of it
+    sigma_m: Array64  # (n,) its expected sigma
 
 
 def expected_sigma_m(range_m: Array64, cosine: Array64) -> Array64:
@@ -51,9 +51,9 @@ def expected_sigma_m(range_m: Array64, cosine: Array64) -> Array64:
 
 
 def find_patches(xyz_m: Array64, origin_m: Array64, tolerance_rad: float) -> Patches:
-    """Patches in a cloud (n, 3) seen from places (n, 3), where angles may still be wrong by the tolerance.
+    """Flat patches among points (n, 3) with beam origins (n, 3), tolerating angle errors of `tolerance_rad`.
 
-    Two grids of cells, half a cell apart: what lies on the sides of the first is in the middle of the second.
+    Two grids, offset by half a cell: points at the borders of the first are in the middle of the second.
     """
     found = _on_grid(xyz_m, origin_m, tolerance_rad, np.arange(len(xyz_m)), 0.0)
     rest = np.ones(len(xyz_m), dtype=np.bool_)
@@ -144,7 +144,7 @@ def _even(
     centre_m: Array64,
     roughest: float,
 ) -> NDArray[np.bool_]:
-    """Patches (m,) no rougher than most: not those with sills, leaves or window panes in them."""
+    """Whether each patch (m,) is about as smooth as most: excludes window sills, leaves and panes."""
     if len(first) == 0:
         return np.zeros(0, dtype=np.bool_)
     patch = _numbers(first, len(index))
@@ -160,19 +160,19 @@ def _even(
 def _on_plane(
     beam_m: Array64, origin_m: Array64, normal: Array64, centre_m: Array64, patch: NDArray[np.int64]
 ) -> Array64:
-    """Where beams (n, 3) from origins (n, 3) meet the planes of their patches."""
+    """Intersections (n, 3) of beams (n, 3) from origins (n, 3) with the planes of their patches."""
     to_plane = np.einsum("ij,ij->i", centre_m[patch] - origin_m, normal[patch])
     along = np.einsum("ij,ij->i", beam_m, normal[patch])
     return origin_m + (to_plane / along)[:, None] * beam_m
 
 
 def _numbers(first: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Which patch (count,) each return belongs to."""
+    """Patch number (count,) of each return."""
     return np.repeat(np.arange(len(first)), np.diff(np.append(first, count)))
 
 
 def _thinned(first: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Places of at most MOST returns of each cell, spread over its looks, and where each cell starts then."""
+    """Indices of at most MOST returns per cell, spread over its scan passes, and the new start of each cell."""
     sizes = np.diff(np.append(first, count))
     step = np.maximum(-(-sizes // MOST), 1)
     within = np.arange(count) - np.repeat(first, sizes)
@@ -210,6 +210,6 @@ def planes(xyz_m: Array64, first: NDArray[np.int64], patch: NDArray[np.int64]) -
 
 
 def thickness_m(xyz_m: Array64, patches: Patches) -> Array64:
-    """How thick (m,) the returns (n, 3) of each patch lie about the plane through them, root mean square."""
+    """RMS distance (m,) of the returns (n, 3) of each patch from the plane through them."""
     known = np.where(np.isfinite(xyz_m), xyz_m, patches.on_plane_m)
     return planes(known, patches.first, patches.patch)[2][:, 0]

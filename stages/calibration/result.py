@@ -1,8 +1,8 @@
-"""What may be told of a solution, and what not and why.
+"""Acceptance of a calibration's parameters: which of them are written to the rig, and why the others are not.
 
-A number is told when its sigma is below its limit. One that is not keeps the rig's value; since all numbers were free
-together, those that are told do not depend on it. The encoder's error is told as one curve over the angles swept: its
-terms look alike over half a turn, and its mean there cannot be told from a zero.
+A parameter is accepted when its sigma is below its limit. A rejected one keeps the rig's value; since all parameters
+were estimated together, the accepted ones do not depend on it. The encoder error is accepted as one curve over the
+swept angles: its terms are not separable over half a turn, and its mean there is not separable from the zero.
 
 Source: ours.
 """
@@ -20,17 +20,17 @@ from stages.calibration.solve import NAMES
 from stages.geometry.frames import Array64
 
 CURVE = tuple(f"{part}_{order}" for order in ORDERS for part in ("sin", "cos"))
-CURVE_LIMIT_RAD = math.radians(0.03)  # sigma of the curve, its mean taken out, root mean square over the sweep
-BLIND = 0.5  # of what was expected beforehand: so large a sigma means that nothing was seen of a number
-ALIKE = 0.9  # correlation of two numbers that a sweep cannot tell apart
+CURVE_LIMIT_RAD = math.radians(0.03)  # limit for the RMS sigma of the curve over the sweep, without its mean
+BLIND = 0.5  # of the prior sigma: a parameter with a larger sigma was not observed
+ALIKE = 0.9  # correlation of two parameters that the sweep cannot separate
 CURVE_POINTS = 181
-SAME_SPEED = 1.5  # speeds that differ by less than this factor are one
-MANY = 0.02  # share of the moving time that makes a speed, or a way round, one that was used
+SAME_SPEED = 1.5  # speeds within this factor count as one
+MANY = 0.02  # least share of the moving time for a speed or direction to count as used
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One number before and after, in its unit; `refused` says why it stays as it was."""
+    """One parameter before and after, in its unit; `rejected` states why it keeps its value, empty if accepted."""
 
     name: str
     what: str
@@ -38,12 +38,12 @@ class Finding:
     before: float
     after: float
     sigma: float
-    refused: str = ""
+    rejected: str = ""
 
 
 @dataclass(frozen=True)
 class Travel:
-    """How the servo went."""
+    """Range, directions and speeds of the servo's motion."""
 
     low_rad: float
     high_rad: float
@@ -52,7 +52,7 @@ class Travel:
 
     @staticmethod
     def of(position_rad: Array64, rate_radps: Array64) -> Travel:
-        """Of the positions and rates at the returns (n,)."""
+        """From the positions and rates at the returns (n,)."""
         known = np.isfinite(position_rad)
         position, rate = position_rad[known], rate_radps[known]
         speed = np.abs(rate)
@@ -68,12 +68,12 @@ class Travel:
 
     @property
     def angle_rad(self) -> float:
-        """From end to end."""
+        """Angle between the ends."""
         return self.high_rad - self.low_rad
 
 
 def curve_rows(travel: Travel) -> Array64:
-    """(CURVE_POINTS, 4): the curve over the sweep, per term of CURVE."""
+    """Basis (CURVE_POINTS, 4) of the encoder error curve over the sweep, one column per term of CURVE."""
     at = np.linspace(travel.low_rad, travel.high_rad, CURVE_POINTS)
     return np.column_stack([f(order * at) for order in ORDERS for f in (np.sin, np.cos)])
 
@@ -88,8 +88,8 @@ def curve_sigmas(covariance: Array64, travel: Travel) -> tuple[float, float]:
     return math.sqrt(float(np.einsum("ij,jk,ik->i", bent, inner, bent).mean())), math.sqrt(float(mean @ inner @ mean))
 
 
-def judge(rig: ServoMount, found: ServoMount, covariance: Array64, travel: Travel) -> tuple[Finding, ...]:
-    """A finding for each number of PARAMETERS, with those of CURVE judged together."""
+def assess(rig: ServoMount, found: ServoMount, covariance: Array64, travel: Travel) -> tuple[Finding, ...]:
+    """A finding for each of PARAMETERS; those of CURVE are accepted or rejected together."""
     before, after = values_of(rig, rig), values_of(found, rig)
     sigma = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sigma, sigma)
@@ -98,16 +98,16 @@ def judge(rig: ServoMount, found: ServoMount, covariance: Array64, travel: Trave
     findings: list[Finding] = []
     for i, parameter in enumerate(PARAMETERS):
         if parameter.name in CURVE:
-            sure = curve_rad < CURVE_LIMIT_RAD
+            accepted = curve_rad < CURVE_LIMIT_RAD
             limit = f"the curve's sigma is {math.degrees(curve_rad):.3f} deg, more than 0.03 deg"
         elif parameter.name in blind:
-            sure, sigma[i] = False, parameter.expected * parameter.per_unit
+            accepted, sigma[i] = False, parameter.expected * parameter.per_unit
             limit = f"taken as {parameter.expected:g} {parameter.unit} uncertain"
         else:
-            sure = sigma[i] < parameter.limit * parameter.per_unit
-            told = sigma[i] / parameter.per_unit
-            limit = f"sigma is {told:.3g} {parameter.unit}, more than {parameter.limit:g} {parameter.unit}"
-        refused = "" if sure else f"{blind.get(parameter.name) or _why(i, sigma, correlation)} ({limit})"
+            accepted = sigma[i] < parameter.limit * parameter.per_unit
+            sigma_unit = sigma[i] / parameter.per_unit
+            limit = f"sigma is {sigma_unit:.3g} {parameter.unit}, more than {parameter.limit:g} {parameter.unit}"
+        rejected = "" if accepted else f"{blind.get(parameter.name) or _why(i, sigma, correlation)} ({limit})"
         scale = 1 / parameter.per_unit
         findings.append(
             Finding(
@@ -115,16 +115,16 @@ def judge(rig: ServoMount, found: ServoMount, covariance: Array64, travel: Trave
                 parameter.what,
                 parameter.unit,
                 before[parameter.name] * scale,
-                (after if sure else before)[parameter.name] * scale,
+                (after if accepted else before)[parameter.name] * scale,
                 float(sigma[i]) * scale,
-                refused,
+                rejected,
             )
         )
     return tuple(findings)
 
 
 def values_of(mount: ServoMount, rig: ServoMount) -> dict[str, float]:
-    """Values of PARAMETERS, inside units; tilts are counted from the rig's LiDAR, places from its axis."""
+    """Values of PARAMETERS in SI units; tilts are relative to the rig's LiDAR, offsets to the servo axis."""
     tilt = mount.R_turntable_lidar @ rig.R_turntable_lidar.T
     terms = {
         f"{part}_{order}": mount.sin_cos_rad.get(order, (0.0, 0.0))[side]
@@ -146,28 +146,28 @@ def values_of(mount: ServoMount, rig: ServoMount) -> dict[str, float]:
 def accepted(
     rig: ServoMount, found: ServoMount, findings: tuple[Finding, ...], covariance: Array64, travel: Travel
 ) -> ServoMount:
-    """The rig with the numbers that are told.
+    """The rig with the accepted parameters.
 
-    The curve's mean over the sweep turns everything as a zero does; where it is not sure, the zero takes it back, so
-    that the sweep as a whole points where it pointed before.
+    The mean of the encoder error over the sweep acts as a zero offset. Where that mean is not well known, the zero
+    compensates it, so that the mean direction of the sweep does not change.
     """
     before, after = values_of(rig, rig), values_of(found, rig)
-    told = {f.name for f in findings if not f.refused}
-    step = {name: after[name] - before[name] for name in NAMES if name in told}
-    step["play"] = max(step.get("play", 0.0), -before["play"])  # less than none is none
+    names = {f.name for f in findings if not f.rejected}
+    step = {name: after[name] - before[name] for name in NAMES if name in names}
+    step["play"] = max(step.get("play", 0.0), -before["play"])  # no negative play
     _, mean_sigma = curve_sigmas(covariance, travel)
     limit = next(p.limit * p.per_unit for p in PARAMETERS if p.name == "zero")
-    if told.issuperset(CURVE) and "zero" not in told and mean_sigma > limit:
+    if names.issuperset(CURVE) and "zero" not in names and mean_sigma > limit:
         turn = float(curve_rows(travel).mean(axis=0) @ np.array([step[name] for name in CURVE]))
         step["zero"] = -rig.sign * turn
     return rig.moved(step)
 
 
 def unseen(travel: Travel) -> dict[str, str]:
-    """What no scene can tell after such a travel, with the reason, for a person who can do something about it.
+    """Parameters that are unobservable with such a servo motion, each with the reason and the remedy.
 
-    The few milliseconds in which a servo starts and stops are no second speed: the clock would be taken from how it
-    brakes.
+    The few milliseconds in which a servo starts and stops do not count as a second speed: the time offset would be
+    estimated from its braking.
     """
     found = {
         "zero": "a turn of everything about the servo's axis leaves every surface thin, so no scene tells it: "
@@ -185,7 +185,7 @@ def unseen(travel: Travel) -> dict[str, str]:
 
 
 def _why(i: int, sigma: Array64, correlation: Array64) -> str:
-    """The reason why the scene does not show a number."""
+    """The reason why the scene does not determine a parameter."""
     if sigma[i] > BLIND * PARAMETERS[i].expected * PARAMETERS[i].per_unit:
         if NAMES[i] in ("play", "time", *CURVE):
             return "too little that stands upright was seen more than once, and level ground does not show a turn"

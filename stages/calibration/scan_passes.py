@@ -1,7 +1,6 @@
-"""What a recording holds for a calibration: returns in the LiDAR's frame, and where the servo stood at each.
+"""Inputs of a calibration: returns in the lidar frame, and the servo's position and rate at each of them.
 
-Source: ours; angles between servo states as `stages/sweep/turntable.py` takes them, so that what is found
-fits what is used.
+Source: ours; angles are interpolated as in `stages/sweep/turntable.py`, so that the calibration matches its use.
 """
 
 from __future__ import annotations
@@ -13,22 +12,22 @@ from numpy.typing import NDArray
 
 from stages.calibration.servo_mount import ServoMount
 from stages.geometry.frames import Array64
-from stages.kernels.calibration.scan_passes import hangs
+from stages.kernels.calibration.scan_passes import play_sides
 
-SMOOTHED_STATES = (2, 4, 8, 12, 24)  # on either side; wider means less of the steps, which a far wall shows as a turn
-RATE_STATES = 4  # the rate is taken over so many states on either side: a step of the encoder is 0.088 deg
+SMOOTHED_STATES = (2, 4, 8, 12, 24)  # states on either side; wider windows suppress encoder steps better
+RATE_STATES = 4  # states on either side for the rate; an encoder step is 0.088 deg
 
 
 @dataclass(frozen=True)
 class ServoTrace:
-    """All servo states of a recording, in order; the position runs on over the encoder's end."""
+    """All servo states of a recording, in order; the position is unwrapped."""
 
     stamp_ns: NDArray[np.int64]  # (m,) as recorded
-    position_rad: Array64  # (m,) without the encoder's steps
+    position_rad: Array64  # (m,) smoothed over encoder steps
 
     @staticmethod
     def of(stamp_ns: NDArray[np.int64], position_rad: Array64, step_rad: float) -> ServoTrace:
-        """States as they were recorded, by an encoder of that step; repeated and late ones are left out."""
+        """From recorded states and the encoder's step; repeated and late states are omitted."""
         newest = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(stamp_ns)[:-1]])
         newer = stamp_ns > newest
         stamp_ns = stamp_ns[newer]
@@ -48,20 +47,20 @@ class Returns:
 class ServoAt:
     """The servo at the time of each return (n,)."""
 
-    position_rad: Array64  # of the encoder; NaN where it is not known, or not on which side the play is
+    position_rad: Array64  # of the encoder; NaN where it or the side of the play is not known
     rate_radps: Array64
-    hang: Array64  # on which side of its play the turntable is: +1 after a move up, -1 after a move down
+    play_side: Array64  # side of the play: +1 after upward, -1 after downward motion
 
     def taken(self, index: NDArray[np.int64]) -> ServoAt:
-        """Some of the returns."""
-        return ServoAt(self.position_rad[index], self.rate_radps[index], self.hang[index])
+        """The values at `index`."""
+        return ServoAt(self.position_rad[index], self.rate_radps[index], self.play_side[index])
 
 
 def smoothed(stamp_ns: NDArray[np.int64], position_rad: Array64, step_rad: float) -> Array64:
-    """Positions (m,) without the encoder's steps: the middle of a parabola through the neighbours in time.
+    """Positions (m,) smoothed over encoder steps by a parabola through the neighbouring states.
 
-    Of several widths the widest through which the parabola still fits as well as steps allow (step / sqrt(12), and as
-    much for the stamps): wide while the servo turns steadily, the position itself where it starts and stops.
+    The window is the widest of SMOOTHED_STATES whose residuals match the step noise (step / sqrt(12), and the same for
+    the stamps): wide during steady rotation, the position itself where the servo starts and stops.
     """
     found = position_rad.copy()
     if len(stamp_ns) < 2 * min(SMOOTHED_STATES) + 1:
@@ -92,13 +91,13 @@ def servo_at(trace: ServoTrace, stamp_ns: NDArray[np.int64], mount: ServoMount, 
     gap_ns = state_ns[after] - state_ns[after - 1]
     share = (stamp_ns - state_ns[after - 1]) / gap_ns
     before, step = trace.position_rad[after - 1], np.diff(trace.position_rad)[after - 1]
-    hang = np.empty(len(state_ns))
-    hangs(trace.position_rad, mount.play_rad, hang)
+    play_side = np.empty(len(state_ns))
+    play_sides(trace.position_rad, mount.play_rad, play_side)
     first, last = np.maximum(after - RATE_STATES, 0), np.minimum(after + RATE_STATES - 1, len(state_ns) - 1)
     rate = (trace.position_rad[last] - trace.position_rad[first]) / ((state_ns[last] - state_ns[first]) * 1e-9)
-    known = inside & (gap_ns <= max_gap_s * 1e9) & (hang[after - 1] == hang[after])
+    known = inside & (gap_ns <= max_gap_s * 1e9) & (play_side[after - 1] == play_side[after])
     return ServoAt(
         position_rad=np.where(known, before + share * step, np.nan),
         rate_radps=rate,
-        hang=hang[after],
+        play_side=play_side[after],
     )

@@ -1,17 +1,17 @@
-"""How much the servo's clock is off the LiDAR's, while it runs, from surfaces that are seen in both directions.
+"""Online estimate of the time offset between servo and LiDAR, from surfaces observed in both sweep directions.
 
-Where the servo's stamps are early by dt, a surface passed at the rate w is placed w dt away from where it is; passed
-back it is placed as far on the other side. Of some seconds in which the servo has passed the same angles both ways,
-the dt is taken under which what was seen twice is one thin surface: the least squares of `grd calibrate`
-(stages/calibration), with the mount's other numbers held near the rig's. Windows are then joined by a Kalman filter
-with a slow random walk. A window costs a fifth of a second of a core; so once the offset is known to 1 ms, only
-each `every_window`-th is taken.
+If the servo's stamps are early by dt, a surface passed at the rate w is placed w dt away from its position, and on the
+other side when it is passed in the opposite direction. From a window of some seconds in which the servo passes the same
+angles in both directions, the estimated dt is the one under which surfaces observed twice coincide: the least squares
+of `grd calibrate` (stages/calibration), with the mount's other parameters held near the rig's. A Kalman filter with a
+slow random walk combines the windows. A window takes a fifth of a second of one core; once the offset is known to 1 ms,
+only every `every_window`-th is evaluated.
 
-Told and not applied: people put it into the rig (`servo_time_offset_s`). Nothing is told of a window in which the
-vehicle moved, or the servo did not turn both ways. Play of the gear looks like a delay at one speed: the rig's
-`servo_play_deg` is believed to within `play_sigma_deg`. What the rig's numbers may be wrong by, all windows share: that
-part of sigma is kept apart, and no further window makes it smaller. Nor do windows with short, quick moves differ by
-chance alone: while our own aim moved the servo, simulated flights were off by .1 to .5 ms each, hence `floor_s`.
+The offset is published, not applied: the crew enters it in the rig (`servo_time_offset_s`). A window gives no estimate
+if the vehicle moved or the servo did not turn in both directions. Gear play looks like a delay at one speed: the rig's
+`servo_play_deg` is taken as known to `play_sigma_deg`. Errors of the rig's parameters are common to all windows: that
+part of sigma is kept separately and does not decrease. Windows with short, fast moves have a further systematic error
+of 0.1 to 0.5 ms in simulated flights, hence `floor_s`.
 
 Source: ours; the model is `stages/calibration/servo_mount.py`.
 """
@@ -45,16 +45,16 @@ from stages.messages import LidarFirings, ServoOffset, ServoState, VehicleMotion
 
 TIME = NAMES.index("time")
 STEP_RAD = math.tau / 4096  # of the MX-28's encoder
-MOVING_RADPS = 0.1  # slower, a state says nothing of the direction
+MOVING_RADPS = 0.1  # slower, the direction of a state is not known
 BIN_RAD = math.radians(0.5)
 START_SIGMA_S = 0.02
-CLOSE_S = 1e-3  # with a sigma below, fewer rounds do, and fewer windows
+KNOWN_S = 1e-3  # below this sigma fewer iterations and fewer windows are used
 MOST_PLACES = 4096
 TRACE_NS = 500_000_000  # of servo states before a window
 AXIS_SIGMA_M = 3e-3
 FEWEST_PATCHES = 20
-OUTLIER = 5.0  # sigmas of a window from what the others say
-WALK_S = 5e-6  # of the offset in a second, one sigma
+OUTLIER = 5.0  # sigmas of a window from the estimate so far
+WALK_S = 5e-6  # random walk of the offset, one sigma after 1 s
 
 
 class ServoClockSettings(Settings):
@@ -62,15 +62,15 @@ class ServoClockSettings(Settings):
 
     mount: LidarMount
     window_s: float = Field(3.0, ge=1, le=20)
-    every_packet: int = Field(12, ge=1, le=100)  # of the LiDAR's messages one in so many is taken
+    every_packet: int = Field(12, ge=1, le=100)  # one in so many LiDAR messages is used
     every_window: int = Field(
         10, ge=1, le=1000
-    )  # of the windows this one is taken, once the offset is known to CLOSE_S
-    both_ways_deg: float = Field(5.0, gt=0)  # so much has to be passed in both directions
-    play_sigma_deg: float = Field(0.05, gt=0)  # how well the rig knows the gear's play
-    angle_sigma_deg: float = Field(0.05, gt=0)  # and the LiDAR's tilt and the encoder's error
-    floor_s: float = Field(3e-4, gt=0)  # no sigma is told below
-    moved_m: float = Field(0.03, gt=0)  # a vehicle that moved farther in a window was not parked
+    )  # of the windows this one is taken, once the offset is known to KNOWN_S
+    both_ways_deg: float = Field(5.0, gt=0)  # least angle passed in both directions
+    play_sigma_deg: float = Field(0.05, gt=0)  # sigma of the rig's gear play
+    angle_sigma_deg: float = Field(0.05, gt=0)  # sigma of the LiDAR's tilt and of the encoder error
+    floor_s: float = Field(3e-4, gt=0)  # lower bound of the published sigma
+    moved_m: float = Field(0.03, gt=0)  # a vehicle that moves further within a window is not parked
     max_servo_gap_s: float = Field(0.1, gt=0)
 
 
@@ -100,23 +100,23 @@ class ServoClock(Stage[ServoClockSettings]):
             self._prior[i, i] = sigmas.get(parameter.name, angle_rad) ** -2.0
 
     def on_motion(self, motion: VehicleMotion) -> None:
-        """Where the vehicle is."""
+        """Buffer the vehicle's position."""
         if motion.stamp_ns < self._resting_until_ns:
             self._places.clear()
         self._places.append(motion.xyz_map_m)
         del self._places[:-MOST_PLACES]
 
     def on_servo(self, servo: ServoState) -> None:
-        """Where the servo is."""
+        """Buffer the servo state."""
         if servo.stamp_ns < self._resting_until_ns - TRACE_NS:
             return
         if not self._states or servo.stamp_ns > self._states[-1].stamp_ns:
             self._states.append(servo)
         if self._states[-1].stamp_ns - self._states[0].stamp_ns > 3.0 * self.settings.window_s * 1e9 + 2 * TRACE_NS:
-            self._states, self._firings, self._places = [], [], self._places[-1:]  # the LiDAR is silent: begin anew
+            self._states, self._firings, self._places = [], [], self._places[-1:]  # the LiDAR is silent: reset
 
     def on_firings(self, firings: LidarFirings) -> Iterator[ServoOffset]:
-        """Collect; with a whole window, what it says."""
+        """Buffer the packet; at the end of a window, publish the estimate."""
         settings = self.settings
         if not settings.mount.turns or firings.pulse_stamp_ns.size == 0 or firings.stamp_ns < self._resting_until_ns:
             return
@@ -125,13 +125,13 @@ class ServoClock(Stage[ServoClockSettings]):
             self._firings.append(firings)
         if self._firings and firings.stamp_ns - self._firings[0].stamp_ns > settings.window_s * 1e9:
             reason = self._take_window()
-            if self._known_ns == self._firings[-1].stamp_ns and self._variance_s2 < CLOSE_S**2:
+            if self._known_ns == self._firings[-1].stamp_ns and self._variance_s2 < KNOWN_S**2:
                 self._resting_until_ns = firings.stamp_ns + round((settings.every_window - 1) * settings.window_s * 1e9)
             self._firings, self._places = [], self._places[-1:]
             self._states = [s for s in self._states if s.stamp_ns > firings.stamp_ns - TRACE_NS]
-            yield self._told(firings.stamp_ns, reason)
+            yield self._estimate(firings.stamp_ns, reason)
 
-    def _told(self, stamp_ns: int, reason: str) -> ServoOffset:
+    def _estimate(self, stamp_ns: int, reason: str) -> ServoOffset:
         settings = self.settings
         known = self._windows > 0
         sigma_s = math.sqrt(self._variance_s2 + self._shared_s**2 + settings.floor_s**2)
@@ -139,13 +139,13 @@ class ServoClock(Stage[ServoClockSettings]):
             stamp_ns=stamp_ns,
             offset_s=settings.mount.servo_time_offset_s + self._offset_s if known else None,
             sigma_s=sigma_s if known else None,
-            rig_s=settings.mount.servo_time_offset_s,
+            rig_offset_s=settings.mount.servo_time_offset_s,
             windows=self._windows,
             reason=reason,
         )
 
     def _take_window(self) -> str:
-        """Use what was collected; why not, or what it said, in words."""
+        """Evaluate the window; return its result, or why it has none."""
         if len(self._places) > 1 and np.ptp(np.stack(self._places), axis=0).max() > self.settings.moved_m:
             return "the vehicle moved"
         states = self._states
@@ -162,18 +162,16 @@ class ServoClock(Stage[ServoClockSettings]):
         return self._join(*found)
 
     def _solve(self, trace: ServoTrace) -> tuple[float, float, float] | None:
-        """(offset beyond the rig's, its own sigma, and the one it shares with others) [s] of this window; None where
-        too little was seen.
-        """
+        """Offset beyond the rig's, its own sigma, and the sigma common to all windows [s]; None: too few patches."""
         hit = [(f, f.range_m > 0) for f in self._firings]
         returns = Returns(
             np.concatenate([f.pulse_stamp_ns[h] for f, h in hit]),
             np.concatenate([f.laser[h] for f, h in hit]),
             np.concatenate([f.xyz_lidar_m[h] for f, h in hit]).astype(np.float64),
         )
-        close = self._variance_s2 < CLOSE_S**2
+        close = self._variance_s2 < KNOWN_S**2
         x, mount = np.zeros(len(self._prior)), self._rig
-        if close:  # from where the others say it is
+        if close:  # start from the estimate so far
             x[TIME], mount = self._offset_s, mount.moved({"time": self._offset_s})
         variance_s2, common_s2 = math.inf, 0.0
         for tolerance_rad in (*(COARSE_RAD[2:] if close else COARSE_RAD), FINE_RAD, FINE_RAD):
@@ -195,23 +193,25 @@ class ServoClock(Stage[ServoClockSettings]):
             self._variance_s2 += WALK_S**2 * (now_ns - self._known_ns) * 1e-9
         self._known_ns = now_ns
         alone_s, sigma_s = self.settings.mount.servo_time_offset_s + found_s, math.hypot(own_s, shared_s)
-        said = f"{1e3 * alone_s:.2f} ms, sigma {1e3 * sigma_s:.2f} ms"
+        result = f"{1e3 * alone_s:.2f} ms, sigma {1e3 * sigma_s:.2f} ms"
         total_s2 = self._variance_s2 + own_s**2
         if self._windows and (found_s - self._offset_s) ** 2 > OUTLIER**2 * (
             total_s2 + shared_s**2 + self.settings.floor_s**2
         ):
-            self._variance_s2 += (found_s - self._offset_s) ** 2 / OUTLIER**2  # if it stays there it will be believed
-            return f"this window disagrees: {said}"
+            self._variance_s2 += (
+                found_s - self._offset_s
+            ) ** 2 / OUTLIER**2  # accepted if the next windows agree with it
+            return f"this window disagrees: {result}"
         gain = self._variance_s2 / total_s2
         self._offset_s += gain * (found_s - self._offset_s)
         self._shared_s += gain * (shared_s - self._shared_s)
         self._variance_s2 *= 1.0 - gain
         self._windows += 1
-        return f"this window alone: {said}"
+        return f"this window alone: {result}"
 
 
 def shared_s2(system: System, prior: Array64) -> float:
-    """What of the offset's variance the rig's other numbers bring, which are as wrong in the next window.
+    """The part of the offset's variance from errors of the rig's other parameters, common to all windows.
 
     Off by e ~ P^-1 they move the offset by (B P e)_t: variance (B P B)_tt with B = (J^T J / v + P)^-1; the time's own
     P is none of them.
@@ -224,7 +224,7 @@ def shared_s2(system: System, prior: Array64) -> float:
 
 
 def both_ways_rad(stamp_ns: np.ndarray, position_rad: Array64) -> float:
-    """How many angles a servo passed upwards as well as downwards, from its states (n,)."""
+    """Angle [rad] that the servo passed in both directions, from its states (n,)."""
     position_rad = np.unwrap(position_rad)
     rate = np.gradient(position_rad, stamp_ns * 1e-9)
     number = np.floor(position_rad / BIN_RAD).astype(np.int64)

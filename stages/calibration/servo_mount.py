@@ -1,10 +1,10 @@
-"""The numbers of a servo mount that a calibration moves, and the way from a rig's `LidarMount` and back.
+"""The mount parameters that a calibration estimates, and their conversion from and to a rig's `LidarMount`.
 
     p_base = R_base_turntable Rz(angle) (R_turntable_lidar p_lidar + t_turntable_lidar)
     angle(t) = sign * (s - lag - zero) - sum_k (sin_k sin(k s) + cos_k cos(k s)),  s = encoder at t - time_offset
 
-`base` is the frame of the rig's T_vehicle_turntable: it stands still while the vehicle does. `lag` is the play of the
-gear: the turntable hangs back by half of it, on the side it comes from.
+`base` is the frame of the rig's T_vehicle_turntable: it is at rest while the vehicle is. `lag` is the play of the
+gear: the turntable lags by half of it, on the side it comes from.
 
 Source: ours; the model of `stages/geometry/frames.py` (LidarMount) and `stages/sweep/turntable.py`.
 """
@@ -20,13 +20,13 @@ from stages.geometry.frames import Array64, Harmonic, LidarMount, Pose, quaterni
 from stages.kernels.geometry.so3 import exp_rotation
 
 ORDERS = (1, 2)
-"""Orders of the encoder's error that are sought: a magnet off centre shows once a turn, a tilted one twice."""
-SMALLEST_DEG = 1e-6  # a harmonic below this is none
+"""Estimated orders of the encoder error: a magnet off centre gives order 1, a tilted one order 2."""
+SMALLEST_DEG = 1e-6  # smaller harmonics are omitted
 
 
 @dataclass(frozen=True)
 class ServoMount:
-    """A mount as numbers; `sin_cos_rad[order]` are the encoder's error terms in sine and cosine."""
+    """Mount parameters; `sin_cos_rad[order]` are the sine and cosine terms of the encoder error."""
 
     R_turntable_lidar: Array64
     t_turntable_lidar_m: Array64
@@ -37,7 +37,7 @@ class ServoMount:
     time_offset_s: float
 
     def encoder_error_rad(self, servo_rad: Array64) -> Array64:
-        """What is taken off the angle (n,) for the encoder's own error."""
+        """Encoder error (n,) to subtract from the angle."""
         error = np.zeros_like(servo_rad)
         for order, (sine, cosine) in self.sin_cos_rad.items():
             error += sine * np.sin(order * servo_rad) + cosine * np.cos(order * servo_rad)
@@ -46,7 +46,7 @@ class ServoMount:
     def moved(self, step: dict[str, float]) -> ServoMount:
         """The mount after a step in the parameters of `stages/calibration/parameters.py` (missing ones: 0).
 
-        tilt_x, tilt_y [rad] turn the LiDAR about the turntable's axes, axis_x, axis_y [m] shift it in them.
+        tilt_x, tilt_y [rad] rotate the LiDAR about the turntable's axes, axis_x, axis_y [m] shift it along them.
         """
         tilt = exp_rotation(np.array([step.get("tilt_x", 0.0), step.get("tilt_y", 0.0), 0.0]))
         shift = np.array([step.get("axis_x", 0.0), step.get("axis_y", 0.0), 0.0])
@@ -66,7 +66,7 @@ class ServoMount:
 
 
 def servo_mount(mount: LidarMount) -> ServoMount:
-    """The numbers of a rig's mount."""
+    """The parameters of a rig's mount."""
     T_turntable_lidar = mount.T_turntable_lidar.matrix()
     terms: dict[int, tuple[float, float]] = {}
     for term in mount.servo_harmonics:  # a sin(k s + b) = a cos(b) sin(k s) + a sin(b) cos(k s)
@@ -85,7 +85,7 @@ def servo_mount(mount: LidarMount) -> ServoMount:
 
 
 def lidar_mount(found: ServoMount, rig: LidarMount) -> LidarMount:
-    """A rig's mount with the numbers found; where the turntable sits on the vehicle stays the rig's."""
+    """A rig's mount with the estimated parameters; T_vehicle_turntable stays the rig's."""
     x, y, z = found.t_turntable_lidar_m.tolist()
     qx, qy, qz, qw = quaternions_xyzw(found.R_turntable_lidar[None])[0].tolist()
     return LidarMount(

@@ -1,13 +1,13 @@
-"""Least squares over patches: the mount under which what was seen more than once is one thin surface.
+"""Least squares over patches: the mount under which surfaces observed more than once are thin.
 
     minimise  sum_i rho(r_i / sigma_i) + (x - x0)^T P^-1 (x - x0),   r_i = n_j . p_i(x) - d_j
 
 The planes (n_j, d_j) are unknown as well; each is projected out of its patch's residuals and columns, so that the
-normal matrix is that of the numbers alone and their covariance holds what the planes do not know. Ranges are not
-perfect either: each laser's bias goes along as an unknown.
+normal matrix contains the parameters alone and their covariance includes the uncertainty of the planes. The range bias
+of each laser is a further unknown.
 
-The covariance is the sandwich N^-1 S N^-1: within 0.2 s the servo's readings err alike, and so does a surface over all
-its patches, so returns are no independent witnesses. S sums the scores over both kinds of clusters.
+The covariance is the sandwich N^-1 S N^-1: the errors of the servo readings are correlated
+within 0.2 s, and those of a surface over all its patches. S sums the scores over both kinds of clusters.
 
 Source: ours; projection of the planes: variable projection, Golub, Pereyra (1973); two-way clusters: Cameron, Gelbach,
 Miller, Robust inference with multiway clustering (2011).
@@ -28,57 +28,57 @@ from stages.calibration.servo_mount import ServoMount
 from stages.geometry.frames import Array64
 
 BIAS_SIGMA_M = 0.02  # of a laser's range (datasheet: +-3 cm)
-MEAN_BIAS_SIGMA_M = 1e-3  # one that all share bends planes by fractions of a mm: it is left out
+MEAN_BIAS_SIGMA_M = 1e-3  # common bias of all lasers: it bends planes by fractions of a mm only
 HUBER = 1.345  # in sigmas
 CLUSTER_NS = 200_000_000
-SURFACE = 5.0, 1.0  # patches within 1 / 5 of a normal and 1 m of distance are one surface, as a front with its windows
-INFLATION = 1.3  # of sigmas: no wall is a plane; what errors of simulated scenes exceeded the clusters' sigmas by
-COARSE_RAD = tuple(np.radians([1.0, 0.6, 0.4, 0.3]).tolist())  # how wrong angles may still be, round by round
+SURFACE = 5.0, 1.0  # patches within 1 / 5 of a normal and 1 m of distance count as one surface
+INFLATION = 1.3  # of sigmas, because no wall is a plane; from errors in simulated scenes
+COARSE_RAD = tuple(np.radians([1.0, 0.6, 0.4, 0.3]).tolist())  # tolerated angle error per iteration
 FINE_RAD = float(np.radians(0.15))
 FINE_ROUNDS = 6
-SETTLED = 1.5  # sigmas that the last rounds may be apart: more is no answer
+SETTLED = 1.5  # largest spread of the last iterations, in sigmas; a larger one is no solution
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 EXPECTED = np.array([parameter.expected * parameter.per_unit for parameter in PARAMETERS])
-PRIOR = np.diag(np.concatenate([EXPECTED, np.full(LASERS, BIAS_SIGMA_M)]) ** -2.0)  # of all unknowns but the planes
+PRIOR = np.diag(np.concatenate([EXPECTED, np.full(LASERS, BIAS_SIGMA_M)]) ** -2.0)  # all unknowns except the planes
 PRIOR[len(NAMES) :, len(NAMES) :] += MEAN_BIAS_SIGMA_M**-2.0 / LASERS**2
 
 
 @dataclass(frozen=True)
 class System:
-    """The linear system of one round: columns and residuals without the planes, weighted to one sigma."""
+    """The linear system of one iteration: columns and residuals without the planes, weighted to one sigma."""
 
     columns: Array64  # (n, k) of NAMES, then the lasers' biases
     residual: Array64  # (n,)
     patches: Patches
     placed: Placed  # of the n returns on patches
-    chosen: NDArray[np.int64]  # (n,) which returns those are
-    weight: Array64  # (n,) [1/m], robust
+    chosen: NDArray[np.int64]  # (n,) indices of these returns
+    weight: Array64  # (n,) [1/m], robust weights
 
     @property
     def variance_factor(self) -> float:
-        """Mean square of the residuals: 1 if they are as large as expected."""
+        """Mean square of the residuals; 1 if they match their sigmas."""
         unknowns = 3 * len(self.patches.first) + self.columns.shape[1]
         return float(self.residual @ self.residual) / max(len(self.residual) - unknowns, 1)
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A mount that fits, and how well the numbers are known."""
+    """The estimated mount and its covariance."""
 
     mount: ServoMount
     bias_m: Array64  # (16,) of each laser
-    covariance: Array64  # (p, p) of PARAMETERS, inside units
+    covariance: Array64  # (p, p) of PARAMETERS, SI units
     system: System
 
 
 def without_planes(columns: Array64, weight: Array64, patches: Patches) -> Array64:
-    """Weighted columns (n, k) less what moving each patch's plane explains: (I - Q Q^T) W^1/2 J."""
+    """Weighted columns (n, k) with the motion of each patch's plane projected out: (I - Q Q^T) W^1/2 J."""
     basis = patches.plane_basis * weight[:, None]
     first, patch = patches.first, patches.patch
     gram = np.add.reduceat(basis[:, :, None] * basis[:, None, :], first, axis=0)
     inverse = np.linalg.inv(gram)
     left = columns * weight[:, None]
-    for begin in range(0, left.shape[1], 8):  # in strips: the product below is three times as large
+    for begin in range(0, left.shape[1], 8):  # in blocks of columns, to limit memory
         strip = left[:, begin : begin + 8]
         moment = np.add.reduceat(basis[:, :, None] * strip[:, None, :], first, axis=0)
         strip -= np.einsum("ij,ijk->ik", basis, (inverse @ moment)[patch])
@@ -110,10 +110,10 @@ def linearise(
 
 
 def solve(returns: Returns, trace: ServoTrace, rig: ServoMount, max_gap_s: float) -> Solution | None:
-    """The mount that fits best, from the rig's; None where the scene holds no flat patch or no mount fits for good.
+    """The best mount, starting from the rig's; None without flat patches or without convergence.
 
-    Patches are sought anew in each round, first with room for what the rig may be wrong by. Which ones are found
-    flickers from round to round, and the numbers with them by part of a sigma: the mean of the last rounds is given.
+    Each iteration searches for patches again, at first with a tolerance for the rig's error. The set of patches varies
+    between iterations and changes the parameters by part of a sigma: the result is the mean of the last iterations.
     """
     mount, x, p = rig, np.zeros(len(PRIOR)), len(NAMES)
     tried: list[Array64] = []
@@ -136,31 +136,31 @@ def solve(returns: Returns, trace: ServoTrace, rig: ServoMount, max_gap_s: float
 
 
 def one_step(system: System, x: Array64, prior: Array64 = PRIOR) -> Array64:
-    """Gauss-Newton from x (k,), counted from what was expected."""
+    """Gauss-Newton step from x (k,), which is relative to the prior."""
     J, r, v = system.columns, system.residual, system.variance_factor
     return np.asarray(np.linalg.solve(J.T @ J / v + prior, -J.T @ r / v - prior @ x), dtype=np.float64)
 
 
 def sandwich(system: System, stamp_ns: NDArray[np.int64], prior: Array64 = PRIOR) -> Array64:
-    """Covariance (k, k) with returns of one moment, and of one surface, taken as dependent."""
+    """Covariance (k, k), with correlated returns within CLUSTER_NS and within a surface."""
     J, v = system.columns, system.variance_factor
     bread = np.linalg.inv(J.T @ J / v + prior)
     score = J * system.residual[:, None] / v
     by_surface = surfaces(system.patches)[system.patches.patch]
     meat = clustered(score, stamp_ns // CLUSTER_NS) + clustered(score, by_surface) - score.T @ score
     values, axes = np.linalg.eigh(bread @ (meat - J.T @ J / v) @ bread)
-    excess = (axes * np.maximum(values, 0.0)) @ axes.T  # no less than independent returns would give
+    excess = (axes * np.maximum(values, 0.0)) @ axes.T  # at least that of independent returns
     return np.asarray(INFLATION**2 * (bread + excess), dtype=np.float64)
 
 
 def with_floor(covariance: Array64) -> Array64:
-    """The covariance of PARAMETERS with what no longer look takes away: see `Parameter.floor`."""
+    """The covariance of PARAMETERS plus their systematic sigmas, `Parameter.floor`."""
     floor = np.array([parameter.floor * parameter.per_unit for parameter in PARAMETERS])
     return covariance + np.diag(floor**2)
 
 
 def surfaces(patches: Patches) -> NDArray[np.int64]:
-    """Which surface (m,) each patch belongs to: those with nearly one normal and distance."""
+    """Surface number (m,) of each patch: patches with similar normal and distance form a surface."""
     outward = patches.normal * np.sign(np.einsum("ij,ij->i", patches.normal, patches.centre_m))[:, None]
     distance_m = np.einsum("ij,ij->i", outward, patches.centre_m)
     key = np.round(np.column_stack([SURFACE[0] * outward, distance_m / SURFACE[1]]))

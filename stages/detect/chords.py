@@ -1,9 +1,8 @@
-"""Chords: how one beam crosses a thing. Each laser's returns, pulse after pulse, become runs with two ends.
+"""Chords: runs of one laser's consecutive returns at similar ranges, each the crossing of one object by a beam.
 
-A laser looks every 0.2 deg along its cone. Returns in a row at much the same range are one chord; it ends where the
-pulses go on and return nothing or something farther (it is free there), or something nearer (who knows). A drone gives
-chords that are short and free at both ends; walls, ground and trunks give long ones. Everything is done as pulses
-arrive: a chord is told as soon as it has ended, or as soon as it is longer than any drone.
+A laser fires every 0.2 deg along its cone. A chord ends where the next pulses return nothing or something farther (the
+end is free), or something nearer (the end is hidden). A drone gives chords that are short and free at both ends; walls,
+ground and trunks give long ones. A chord is reported as soon as it has ended or is longer than any drone.
 
 Source: ours; DESIGN, "free-space evidence ... evaluated as data arrives".
 """
@@ -32,10 +31,10 @@ class Chords(NamedTuple):
 
 
 class ChordFinder:
-    """Feed it slices in order of time."""
+    """Finds chords in slices, which must be added in order of time."""
 
     def __init__(self, longest_m: float, jump_m: float, hole_m: float, lasers: int = 16) -> None:
-        """`longest_m`: what is longer is no drone. A step in range of `jump_m`, a hole of `hole_m` end a chord."""
+        """`longest_m`: longer chords are no drone. A range step of `jump_m` or a gap of `hole_m` ends a chord."""
         self._longest_m, self._jump_m, self._hole_m = longest_m, jump_m, hole_m
         self._open = np.zeros((lasers, MEMORY))
         self._open[:, BEFORE] = math.nan

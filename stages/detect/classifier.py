@@ -1,29 +1,22 @@
-"""What a candidate is: a drone, or what else returns pulses in the sky, and why, in words.
+"""Log-odds that a candidate is a drone, against four alternatives, with the reasons as text.
 
-A drone is weighed against each other thing that returns pulses in the sky, with the evidence that tells the two apart:
+    false return   rain, dust, a wrong return    it is not observed again at the next scan pass
+    static         lamp, wire, tree, roof edge   something is next to it, it returns few pulses, it does not move
+    bird                                         it is fast, or turns hard
+    balloon                                      it is smooth and round
 
-    stray       rain, dust, a wrong return     it is not there at the next look
-    clutter     lamp, wire, tree, roof edge    something stands beside it, it returns little, it does not move
-    bird                                       it is fast, or turns hard
-    balloon                                    it is smooth and round
-
-Where the drone tells how it flies, that decides over still things, birds and balloons
+Where the drone sends telemetry, its motion decides over static objects, birds and balloons
 (stages/detect/motion_log_ratios.py).
 
-    ln of the odds of a drone = -ln sum_k exp(-o_k),     o_k = ln of the odds, drone over thing k
-    (where the drone tells nothing: a share of that and an offset; from `sure` on a share of what is more)
+    log-odds of a drone = -ln sum_k exp(-o_k),     o_k = log-odds of a drone over alternative k
 
-Every o_k is a prior and a sum of log likelihood ratios, capped where looks repeat the same evidence. What is smaller
-than a drone (drops, insects, birds) returns pulses nearby only, so strays' and birds' priors depend on the range.
+Without telemetry the result is scaled by a weight and shifted by an offset. Above `calibration_knee` only a share of
+the excess counts. Every o_k is a prior and a sum of log likelihood ratios, capped where scan passes repeat the same
+evidence. Drops, insects and birds are smaller than a drone and return pulses at close range only, so the priors of
+false returns and birds depend on the range.
 
-The numbers are ours: reasoned, then changed on some dozens of matrix flights (seeds 901 to 921). `unseen_m` and
-`again` were changed after flights of the matrix (seeds 1 to 3) went wrong; `alone_near` and `rugged` after how often
-drones and other things showed each (as built, seeds 21 to 24), `look` and `look_far` after what came of them (seeds 16
-to 35). The priors of strays, birds and balloons are fitted, last of all, to what was a drone in 195 flights (as built,
-seeds 31 to 35), so that P is how often it is one; those of birds and balloons nearby less than the fit would have it,
-as what was accepted there was right. `weight_sure` is fitted to what became of the likely ones in 385 others (seeds 41
-to 45 and 56 to 60). What a drone that tells nothing is judged by is of before (`untold`; its weight and offset fitted
-to 116 flights, seeds 6 to 8). What P is worth in flights not seen then stands in `docs/RESULTS.md`.
+The weights are set by hand and adjusted on simulated flights. The priors and the calibration are fitted, so that the
+probability equals the frequency with which a candidate is a drone; `docs/RESULTS.md` reports how well it does.
 
 Source: ours; weight and offset after Platt, Advances in Large Margin Classifiers (1999); DESIGN, "a small cluster with
 *measured* emptiness around it, evaluated as data arrives".
@@ -32,245 +25,294 @@ Source: ours; weight and offset after Platt, Advances in Large Margin Classifier
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from stages.detect.candidate import OPEN_BESIDE, Candidate
+from stages.detect.candidate import OPEN_NEIGHBOUR_SCORE, Alternative, Candidate
 from stages.kernels.detect.isolation import SECTORS
 from stages.kernels.detect.motion_log_ratios import SWAY_M
 
-STANDING = "a lamp, wire or edge"
-MOVED = 3.0  # nats by its telemetry, from which on it has clearly moved as the drone says; less far, it says no more
-UNSURE = 2.3  # ln of odds, below which it is said what else it may be
+MOVED_NATS = 3.0  # telemetry log ratio above which the candidate has moved; without displacement it is the cap
+ALTERNATIVE_LOG_ODDS = 2.3  # below this the reason names the most probable alternative
 
-# ln of how much likelier a drone flies so than a bird, by the speed it reaches; of birds there are several
+# log ratio drone over bird of the speed it reaches
 FLIGHT_MPS = (0.0, 2.0, 4.0, 6.0, 9.0, 12.0)
 FLIGHT_NATS = (1.0, 1.0, 0.0, -2.0, -4.0, -7.0)
 
 
-class Evidence(BaseModel):
-    """How much each observation counts [nats], drone over the other thing, and where the caps are."""
+class ClassifierWeights(BaseModel):
+    """Log likelihood ratios [nats] of a drone over an alternative, for each kind of evidence, and their caps."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    small_m: float = 14.0  # up to this range strays and birds return pulses as drones do; from unseen_m on hardly any
-    stray: float = -7.4  # prior, nearby: of what is hit once, one in 1600 is there again;
-    stray_far: float = 0.7  # far off two of three
-    stray_untold: float = -5.0  # at any range, where the drone does not tell how it flies
-    hit: float = 1.0  # each return of the first look, up to 4
-    look: float = 4.0  # each further look with a return, up to wire_m,
-    look_far: float = 2.5  # and from unseen_m on: there looks are further apart, and more is met again by chance
-    miss: float = 0.25  # each pulse that went through the middle
-    far_m: float = 35.0  # beyond, ever less of what returns anything is a drone
-    far: float = 0.15  # each metre
+    # over false returns
+    small_m: float = 14.0  # to this range false returns and birds return as many pulses as drones; few beyond unseen_m
+    false_return: float = -7.4  # prior at close range: one in 1600 single observations is repeated,
+    false_return_far: float = 0.7  # and far away two of three
+    false_return_no_telemetry: float = -5.0  # prior at any range, without telemetry
+    first_return: float = 1.0  # each return of the first scan pass, at most 4
+    further_pass: float = 4.0  # each further scan pass with a return, to wire_m,
+    further_pass_far: float = 2.5  # and beyond unseen_m, where chance repetitions are more frequent
+    pass_through: float = 0.25  # each pulse that passed through the middle
+    far_m: float = 35.0  # beyond this range a drone becomes less probable,
+    far: float = 0.15  # by this much a metre
 
-    clutter: float = -6.0  # prior, assumed: of short things in the sky one in 400 hangs free
-    free_sector: float = 0.6  # each of eight sectors that pulses flew through
-    beside: float = -3.0  # each look with something in a sector, recently
-    most_beside: float = 12.0
-    most_beside_flown: float = 4.0  # where it had flown in the open before, as the drone says: it came to a wall
-    alone: float = 0.3  # each look with nothing, up to most_alone
-    alone_near: float = 0.7  # and so much more up to near_m, where a wire or pole returns pulses in each look,
+    # over static objects
+    clutter: float = -6.0  # prior, assumed: one of 400 short objects above the horizon hovers freely
+    free_sector: float = 0.6  # each of the eight sectors that pulses flew through
+    neighbour: float = -3.0  # each recent scan pass with an object in a sector
+    max_neighbour: float = 12.0
+    max_neighbour_flown: float = 4.0  # cap for a candidate that flew in open air before, by telemetry
+    isolated: float = 0.3  # each scan pass without a neighbour, at most max_isolated
+    isolated_near: float = 0.7  # in addition to near_m, where a wire or pole returns pulses in each scan pass,
     near_m: float = 10.0
-    not_near_m: float = 16.0  # none from here on
-    most_alone: float = 2.0
-    near_alone: float = 3.0  # nearby up to so much more: there a wire that held it would return pulses, too
-    wire_m: float = 20.0  # up to this range,
-    unseen_m: float = 30.0  # and none from here on
-    most_few: float = 6.0  # looks with a single return: a wire gives little else
-    most_many: float = 2.0  # and those with more
-    near_big: float = 8.0  # a wall, crown or trunk this close, and it has not moved away
-    spread: float = 3.0  # its sightings lie wider about a straight flight than a drone is large
-    long: float = 1.5  # each look longer than the drone, up to 4
-    moves: float = 5.0  # it moved: what stands does not
-    hung: float = 1.8  # it does not, and hangs where what would hold it may be unseen;
-    hung_m: float = 28.0  # from here on a drone that hangs and a lamp are not told apart,
-    most_hung: float = 3.3  # so that it is never more likely one than that
-    still: float = 0.12  # each look at something that does not, up to most_still: a lamp's pole is found sooner
-    most_still: float = 1.5
-    among: float = 2.0  # something was refused beside it, lately: wires are long
-    again: float = 4.0  # and more in the very place, while the drone says that it flies
+    not_near_m: float = 16.0  # falling to 0 at this range
+    max_isolated: float = 2.0
+    max_isolated_near: float = 3.0  # additional cap at close range, where a wire would return pulses
+    wire_m: float = 20.0  # a wire returns pulses to this range,
+    unseen_m: float = 30.0  # and none beyond this one
+    max_single: float = 6.0  # cap of single returns: a wire gives little else
+    max_multiple: float = 2.0  # cap of several returns
+    near_large: float = 8.0  # penalty: a wall, crown or trunk is near, and the candidate has not moved away
+    spread: float = 3.0  # penalty: its observations scatter about a straight path by more than a drone's size
+    too_long: float = 1.5  # penalty of each scan pass with returns longer than a drone, at most 4
+    moves: float = 5.0  # it moved
+    hover: float = 1.8  # penalty: it did not move, at a range at which its support may be invisible;
+    hover_m: float = 28.0  # beyond this range a hovering drone and a lamp are indistinguishable,
+    max_hover: float = 3.3  # so the log-odds are limited to this
+    static: float = 0.12  # each scan pass on a candidate that did not move, to max_static: a lamp's pole shows earlier
+    max_static: float = 1.5
+    near_rejected: float = 2.0  # penalty: something was rejected near it recently (wires are long)
+    revisited: float = 4.0  # further penalty: at the same position, while the drone reports that it flies
 
-    weight_untold: float = 0.76  # of all this, where the drone does not tell how it flies, and
-    offset_untold: float = -0.37
-    sure: float = 1.0  # what is more likely a drone than this (73 %) is one less often than its odds would have it:
-    weight_sure: float = 0.72  # looks err together, and what was not thought of is met; so much of the rest is meant
-    joined: float = 3.0  # two things that by chance lie as the drone flew; shared by the looks since
+    # calibration
+    no_telemetry_weight: float = 0.76  # without telemetry: factor and
+    no_telemetry_offset: float = -0.37  # offset of the log-odds
+    calibration_knee: float = (
+        1.0  # above these log-odds (73 %) a drone is less frequent than independent evidence implies,
+    )
+    calibration_slope: float = 0.72  # because scan passes err together: this share of the excess counts
+    reacquired: float = 3.0  # penalty of a reacquisition by chance, divided by the scan passes since
 
-    bird: float = -0.5
-    calm: float = 8.0  # each second in which it would have shown a bird's speed or turn
+    # over birds
+    bird: float = -0.5  # prior without telemetry
+    calm: float = 8.0  # each second in which a bird would have shown its speed or turn
     steady: float = 3.0  # each second of straight flight after the first
-    most_calm: float = 8.0
-    flew_so: float = 10.0  # it flew as only birds do, once
-    bird_speed_mps: float = 9.0  # no drone of ours flies faster
+    max_calm: float = 8.0
+    flew_as_bird: float = 10.0  # penalty: it flew as only birds do, once
+    bird_speed_mps: float = 9.0  # faster than any supported drone
     bird_acceleration_mps2: float = 6.0
 
-    birds: float = -3.2  # prior nearby, where the drone tells how it flies: one drone among two dozen birds,
-    birds_far: float = -1.2  # far off among three
-    told: float = 0.9  # share of what its path says against the drone's telemetry: sightings err together
-    most_told: float = 8.0
-    least_told: float = -12.0
+    bird_telemetry: float = -3.2  # prior with telemetry: one drone among two dozen birds at close range,
+    bird_telemetry_far: float = -1.2  # and among three far away
+    telemetry_weight: float = 0.9  # factor of the telemetry's log ratios: observations err together
+    max_telemetry: float = 8.0
+    min_telemetry: float = -12.0
 
-    balloon: float = 2.2  # prior, and
-    balloon_untold: float = 5.0  # where the drone does not tell how it flies
-    ball: float = 2.0  # each chord that bulges smoothly: of balloons' nine in ten, of a small drone's half
-    rugged: float = 2.4  # each chord with five or more returns that does not
-    most_round: float = 8.0  # chords that can tell a balloon: the next ones show the same side of the same thing
+    # over balloons
+    balloon: float = 2.2  # prior with telemetry
+    balloon_no_telemetry: float = 5.0  # and without
+    round_chord: float = 2.0  # penalty of each chord that bulges smoothly: nine in ten of a balloon, half of a drone
+    rough_chord: float = 2.4  # each chord with five or more returns that does not
+    max_chords: float = 8.0  # chords that count: further ones show the same side of the same object
 
 
-def judge(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tuple[float, str]:
-    """ln of the odds that it is a drone, and why, in words; what else it would be is noted in `c.suspect`.
+class ClutterOdds(NamedTuple):
+    """Log-odds of a drone over a static object, with their reasons."""
 
-    `free_space` False leaves out what was measured around it; `motion_known`: the vehicle tells how it moves.
+    log_odds: float
+    remarks: list[str]
+    kinds: list[str]  # of the reasons against a drone, without numbers
+
+
+def classify(c: Candidate, weights: ClassifierWeights, free_space: bool, motion_known: bool) -> tuple[float, str]:
+    """Log-odds that the candidate is a drone, and the reasons as text.
+
+    Sets `c.alternative` to the most probable alternative and `c.rejection` to the reasons against a drone.
+
+    `free_space` False ignores the measured surroundings. `motion_known`: the vehicle's motion is known.
     """
-    clutter, said = over_clutter(c, e, free_space, motion_known)
+    e = weights
+    clutter = over_clutter(c, e, free_space, motion_known)
     over = {
-        "a stray return": over_stray(c, e),
-        STANDING: clutter,
-        "a bird": over_bird(c, e),
-        "a balloon": over_balloon(c, e),
+        Alternative.FALSE_RETURN: over_false_return(c, e),
+        Alternative.STATIC: clutter.log_odds,
+        Alternative.BIRD: over_bird(c, e),
+        Alternative.BALLOON: over_balloon(c, e),
     }
-    least = min(over, key=lambda name: over[name])
-    shift = over[least]
-    c.suspect = least
-    evidence = shift - math.log(sum([math.exp(shift - value) for value in over.values()]))
-    words = [f"{c.hit_looks} looks, {c.hits} returns", *said]
-    if c.joined_at:
-        evidence -= e.joined / (c.hit_looks - c.joined_at)
-        words.append("met again where the drone says it would be")
+    c.alternative = min(over, key=lambda alternative: over[alternative])
+    c.rejection = ", ".join([c.alternative.value, *clutter.kinds])
+    shift = over[c.alternative]
+    log_odds = shift - math.log(sum([math.exp(shift - value) for value in over.values()]))
+    if c.reacquired_at:
+        log_odds -= e.reacquired / (c.scan_passes - c.reacquired_at)
+    if c.log_ratios is None:
+        log_odds = e.no_telemetry_weight * log_odds + e.no_telemetry_offset
+    log_odds = calibrated(log_odds, e)
+    remarks = [f"{c.scan_passes} scan passes, {c.returns} returns", *clutter.remarks, *motion_remarks(c, e)]
+    if log_odds < ALTERNATIVE_LOG_ODDS:
+        remarks.append(f"if not a drone: {c.alternative.value}")
+    return log_odds, "; ".join(remarks)
+
+
+def motion_remarks(c: Candidate, e: ClassifierWeights) -> list[str]:
+    """What the candidate's motion contributes to the reasons."""
+    remarks: list[str] = []
+    if c.reacquired_at:
+        remarks.append("reacquired where the drone's odometry predicts it")
     if c.motion is not None:
-        words.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
-    if c.heard is not None and c.heard.denied:
-        words.append("it does not fly as the drone says")
-    elif c.heard is not None and max(c.heard[:3]) > MOVED:
-        far = c.heard.way_m > c.swings_m
-        words.append("it flies as the drone says" if far else f"the drone says it went {c.heard.way_m:.1f} m only")
-    elif c.heard is None and flew_as_bird(c, e):
-        words.append("flew as a bird does")
-    if c.heard is None:
-        evidence = e.weight_untold * evidence + e.offset_untold
-    evidence = as_often(evidence, e)
-    if evidence < UNSURE:
-        words.append(f"if not a drone, {least}")
-    return evidence, "; ".join(words)
+        remarks.append(f"{c.motion.speed_mps:.1f} +- {c.motion.speed_sigma_mps:.1f} m/s")
+    if c.log_ratios is not None and c.log_ratios.denied:
+        remarks.append("its path contradicts the drone's odometry")
+    elif c.log_ratios is not None and max(c.log_ratios[:3]) > MOVED_NATS:
+        agrees = c.log_ratios.displacement_m > c.apparent_motion_m
+        short = f"the drone's odometry moved {c.log_ratios.displacement_m:.1f} m only"
+        remarks.append("its path agrees with the drone's odometry" if agrees else short)
+    elif c.log_ratios is None and flew_as_bird(c, e):
+        remarks.append("it flew as a bird")
+    return remarks
 
 
-def as_often(odds: float, e: Evidence) -> float:
-    """ln of the odds of how often it is a drone, of what seems one so much [nats]: less often where that is likely."""
-    return odds if odds < e.sure else e.sure + e.weight_sure * (odds - e.sure)
+def calibrated(log_odds: float, e: ClassifierWeights) -> float:
+    """Calibrated log-odds: the excess over `calibration_knee` counts by its share `calibration_slope` only."""
+    return (
+        log_odds
+        if log_odds < e.calibration_knee
+        else e.calibration_knee + e.calibration_slope * (log_odds - e.calibration_knee)
+    )
 
 
-def over_stray(c: Candidate, e: Evidence) -> float:
-    """Drone over rain, dust or a wrong return [nats]: that is gone at the next look."""
-    look = e.look_far + (e.look - e.look_far) * nearness(c, e)
-    prior = e.stray_untold if c.heard is None else e.stray_far + (e.stray - e.stray_far) * smallness(c, e)
-    odds = prior + e.hit * min(c.first_hits, 4) + look * (c.hit_looks - 1) - e.miss * c.missed
-    return min(odds, 10.0) - e.far * max(c.range_m - e.far_m, 0.0)
+def over_false_return(c: Candidate, e: ClassifierWeights) -> float:
+    """Log-odds of a drone over rain, dust or a wrong return, which is not observed again."""
+    further_pass = e.further_pass_far + (e.further_pass - e.further_pass_far) * nearness(c, e)
+    prior = (
+        e.false_return_no_telemetry
+        if c.log_ratios is None
+        else e.false_return_far + (e.false_return - e.false_return_far) * smallness(c, e)
+    )
+    log_odds = (
+        prior
+        + e.first_return * min(c.first_returns, 4)
+        + further_pass * (c.scan_passes - 1)
+        - e.pass_through * c.missed_returns
+    )
+    return min(log_odds, 10.0) - e.far * max(c.range_m - e.far_m, 0.0)
 
 
-def over_clutter(c: Candidate, e: Evidence, free_space: bool, motion_known: bool) -> tuple[float, list[str]]:
-    """Drone over a lamp, wire, leaf or edge [nats], and what was noticed."""
-    said: list[str] = []
-    odds = e.clutter
-    flew = c.heard is not None and e.told * c.flown > MOVED
+def over_clutter(c: Candidate, e: ClassifierWeights, free_space: bool, motion_known: bool) -> ClutterOdds:
+    """Log-odds of a drone over a lamp, wire, leaf or edge."""
+    remarks: list[str] = []
+    kinds: list[str] = []
+    log_odds = e.clutter
+    flew = c.log_ratios is not None and e.telemetry_weight * c.flight_log_ratio > MOVED_NATS
     if free_space:
-        free = sum([looks >= 1.0 for looks in c.free.tolist()])
-        beside = max(e.beside * c.beside, -(e.most_beside_flown if flew else e.most_beside))
-        odds += e.free_sector * free + beside + min(each_alone(c, e) * c.alone, most_alone(c, e))
-        said.append(f"{free} of {SECTORS} sectors around it free")
-        if c.beside > OPEN_BESIDE:
-            said.append("something beside it" + (", to which it flew through the open" if flew else ""))
-    few = min(max(c.few, -e.most_few), e.most_many)
-    odds += few - e.long * min(c.long_looks, 4)
-    if c.single:
-        said.append("single returns")
-    if c.long_looks:
-        said.append("longer than a drone")
-    if c.heard is not None:
-        wire = c.range_m < (e.unseen_m if c.single else e.wire_m)  # farther off a wire returns little, then nothing
-        told = c.heard.over_wire if wire else c.heard.over_still
-        shown = c.heard.way_m > c.swings_m  # what stands, met here and there, seems to go as far
-        nats = max(believed(told, e, shown), believed(c.flown, e))
-        moved = nats > MOVED
-        odds += nats
+        free = sum([passes >= 1.0 for passes in c.free.tolist()])
+        neighbour = max(e.neighbour * c.neighbour_score, -(e.max_neighbour_flown if flew else e.max_neighbour))
+        isolated = min(isolated_weight(c, e) * c.isolated_score, max_isolated_nats(c, e))
+        log_odds += e.free_sector * free + neighbour + isolated
+        remarks.append(f"{free} of {SECTORS} sectors around it free")
+        if c.neighbour_score > OPEN_NEIGHBOUR_SCORE:
+            kinds.append("an object next to it" + (", reached by flight through open air" if flew else ""))
+            remarks.append(kinds[-1])
+    few = min(max(c.return_count_nats, -e.max_single), e.max_multiple)
+    log_odds += few - e.too_long * min(c.too_long_passes, 4)
+    if c.returns_singly:
+        remarks.append("single returns")
+    if c.too_long_passes:
+        kinds.append("longer than a drone")
+        remarks.append(kinds[-1])
+    if c.log_ratios is not None:
+        wire = c.range_m < (e.unseen_m if c.returns_singly else e.wire_m)  # beyond, a wire returns few pulses or none
+        nats = c.log_ratios.over_wire if wire else c.log_ratios.over_static
+        displaced = c.log_ratios.displacement_m > c.apparent_motion_m
+        nats = max(telemetry_nats(nats, e, displaced), telemetry_nats(c.flight_log_ratio, e))
+        moved = nats > MOVED_NATS
+        log_odds += nats
     else:
         moved = c.moves(motion_known)
-        odds += e.moves if moved else 0.0
+        log_odds += e.moves if moved else 0.0
     if not moved:
-        odds += min(e.still * c.hit_looks, e.most_still)
-        if c.heard is not None:
-            odds -= e.hung * (1.0 - nearness(c, e))
-        said.append("it may stand still")
-        if c.among:
-            odds -= e.among + (e.again if c.again else 0.0)
-            said.append("something near it was refused")
-    if c.big_looks > 0.3 * c.hit_looks and not moved:
-        odds -= e.near_big
-        said.append("beside something big" + (f" {c.big_m:.1f} m away" if math.isfinite(c.big_m) else ""))
+        log_odds += min(e.static * c.scan_passes, e.max_static)
+        if c.log_ratios is not None:
+            log_odds -= e.hover * (1.0 - nearness(c, e))
+        remarks.append("it may be static")
+        if c.near_rejected:
+            log_odds -= e.near_rejected + (e.revisited if c.revisited else 0.0)
+            kinds.append("an object near it was rejected")
+            remarks.append(kinds[-1])
+    if c.large_object_passes > 0.3 * c.scan_passes and not moved:
+        log_odds -= e.near_large
+        kinds.append("next to a large object")
+        distance = f" {c.large_object_m:.1f} m away" if math.isfinite(c.large_object_m) else ""
+        remarks.append(kinds[-1] + distance)
     if c.motion is not None and c.motion.spread_m > 0.35 and len(c.path_ns) > 3:
-        odds -= e.spread
-        said.append(f"scattered over {c.motion.spread_m:.1f} m")
-    if c.heard is not None and not moved and c.range_m > e.hung_m:
-        odds = min(odds, e.most_hung)
-    return odds, said
+        log_odds -= e.spread
+        remarks.append(f"scattered over {c.motion.spread_m:.1f} m")
+    if c.log_ratios is not None and not moved and c.range_m > e.hover_m:
+        log_odds = min(log_odds, e.max_hover)
+    return ClutterOdds(log_odds, remarks, kinds)
 
 
-def each_alone(c: Candidate, e: Evidence) -> float:
-    """What one look with nothing beside it counts [nats]."""
-    return e.alone + e.alone_near * share_at(c.range_m, e.near_m, e.not_near_m)
+def isolated_weight(c: Candidate, e: ClassifierWeights) -> float:
+    """Weight [nats] of one scan pass without a neighbour."""
+    return e.isolated + e.isolated_near * share_at(c.range_m, e.near_m, e.not_near_m)
 
 
-def most_alone(c: Candidate, e: Evidence) -> float:
-    """What looks with nothing beside it can count [nats]: a wire is seen nearby, once pulses crossed every sector."""
+def max_isolated_nats(c: Candidate, e: ClassifierWeights) -> float:
+    """Cap [nats] of scan passes without a neighbour: higher where a wire would show and all sectors were crossed."""
     crossed = min(max((min(c.free.tolist()) - 2.0) / 6.0, 0.0), 1.0)
-    return e.most_alone + e.near_alone * crossed * nearness(c, e)
+    return e.max_isolated + e.max_isolated_near * crossed * nearness(c, e)
 
 
-def nearness(c: Candidate, e: Evidence) -> float:
-    """1 where a wire would be seen, 0 where none is."""
+def nearness(c: Candidate, e: ClassifierWeights) -> float:
+    """1 at ranges at which a wire is visible, falling to 0 where it is not."""
     return share_at(c.range_m, e.wire_m, e.unseen_m)
 
 
-def smallness(c: Candidate, e: Evidence) -> float:
-    """1 where things smaller than a drone return pulses, too, 0 where hardly any does."""
+def smallness(c: Candidate, e: ClassifierWeights) -> float:
+    """1 at ranges at which objects smaller than a drone return pulses, falling to 0 where hardly any does."""
     return share_at(c.range_m, e.small_m, e.unseen_m)
 
 
 def share_at(range_m: float, full_m: float, none_m: float) -> float:
-    """1 up to full_m, 0 from none_m on."""
+    """1 up to full_m, falling linearly to 0 at none_m."""
     return min(max((none_m - range_m) / max(none_m - full_m, 1e-9), 0.0), 1.0)
 
 
-def over_bird(c: Candidate, e: Evidence) -> float:
-    """Drone over bird [nats]."""
-    if c.heard is not None:
-        prior = e.birds_far + (e.birds - e.birds_far) * smallness(c, e)
-        return prior + believed(c.heard.over_bird, e)
-    odds = e.bird + min(e.calm * c.calm_s + e.steady * max(c.steady_s - 1.0, 0.0), e.most_calm)
-    motion = c.gentler
+def over_bird(c: Candidate, e: ClassifierWeights) -> float:
+    """Log-odds of a drone over a bird."""
+    if c.log_ratios is not None:
+        prior = e.bird_telemetry_far + (e.bird_telemetry - e.bird_telemetry_far) * smallness(c, e)
+        return prior + telemetry_nats(c.log_ratios.over_bird, e)
+    log_odds = e.bird + min(e.calm * c.calm_s + e.steady * max(c.steady_s - 1.0, 0.0), e.max_calm)
+    motion = c.slower_motion
     if motion is not None:
         flight = float(np.interp(motion.top_mps, FLIGHT_MPS, FLIGHT_NATS))
-        odds += flight / (1.0 + (motion.top_sigma_mps / 4.0) ** 2)
-    return odds - (e.flew_so if flew_as_bird(c, e) else 0.0)
+        log_odds += flight / (1.0 + (motion.top_sigma_mps / 4.0) ** 2)
+    return log_odds - (e.flew_as_bird if flew_as_bird(c, e) else 0.0)
 
 
-def over_balloon(c: Candidate, e: Evidence) -> float:
-    """Drone over balloon [nats]."""
-    round_ = e.ball * c.balls - e.rugged * c.rugged
+def over_balloon(c: Candidate, e: ClassifierWeights) -> float:
+    """Log-odds of a drone over a balloon."""
+    round_ = e.round_chord * c.round_chords - e.rough_chord * c.rough_chords
     if round_ > 0.0:
-        round_ *= min(e.most_round / (c.balls + c.rugged), 1.0)
-    if c.heard is None:
-        return e.balloon_untold - round_
-    shown = c.heard.way_m > SWAY_M  # one on its string swings as far
-    return e.balloon - round_ + believed(c.heard.over_balloon, e, shown)
+        round_ *= min(e.max_chords / (c.round_chords + c.rough_chords), 1.0)
+    if c.log_ratios is None:
+        return e.balloon_no_telemetry - round_
+    displaced = c.log_ratios.displacement_m > SWAY_M  # a balloon on its string swings as far
+    return e.balloon - round_ + telemetry_nats(c.log_ratios.over_balloon, e, displaced)
 
 
-def believed(told: float, e: Evidence, shown: bool = True) -> float:
-    """What a comparison with the drone's telemetry counts [nats]; not `shown` that the drone flies: MOVED at most."""
-    return min(max(e.told * told, e.least_told), e.most_told if shown else min(e.most_told, MOVED))
+def telemetry_nats(nats: float, e: ClassifierWeights, displaced: bool = True) -> float:
+    """Weighted and limited log ratio of telemetry; limited to MOVED_NATS unless the drone was displaced enough."""
+    return min(
+        max(e.telemetry_weight * nats, e.min_telemetry),
+        e.max_telemetry if displaced else min(e.max_telemetry, MOVED_NATS),
+    )
 
 
-def flew_as_bird(c: Candidate, e: Evidence) -> bool:
-    """Whether it once was clearly faster, or turned harder, than a drone of ours."""
+def flew_as_bird(c: Candidate, e: ClassifierWeights) -> bool:
+    """Whether it was once significantly faster, or turned harder, than a supported drone."""
     return c.fastest_mps > e.bird_speed_mps or c.hardest_mps2 > e.bird_acceleration_mps2

@@ -1,13 +1,14 @@
-"""Detect by evidence: candidates are judged as pulses arrive, each with a probability and the reasons in words.
+"""Detector by evidence: classifies candidates as pulses arrive, each with a probability and its reasons.
 
-    pulses -> chords (chords.py): short, free at both ends, above the horizon
-           -> sightings (sightings.py): one look on one thing, and what was measured around it (surroundings.py)
-           -> candidates (candidate.py): sightings that fit one moving thing (flight.py)
-           -> odds that it is a drone, and not a lamp, a bird, a balloon, rain (verdict.py)
+    pulses -> chords (chords.py): short, free at reacquired ends, above the horizon
+           -> observations (observations.py): one scan pass on one object, and its surroundings (isolation.py)
+           -> candidates (candidate.py): observations that fit one moving object (flight.py)
+           -> log-odds of a drone over a false return, a static object, a bird and a balloon (classifier.py)
 
-A look is one passing of the rotor, 0.1 s apart. A candidate is accepted at `accept_probability`; one above
-`look_again_probability` is told at once (Candidates), so that the aim can look again. Detections go out when a
-candidate is accepted, at the end of each pass of the turntable, and at least every `report_s` while there is a drone.
+A scan pass is one passing of the rotor; they are 0.1 s apart. A candidate is accepted at `accept_probability`. A
+candidate above `follow_up_probability` is promising and published at once (Candidates), so that the aim can observe it
+again. Detections are published when a candidate is accepted, at the end of each pass of the turntable, and at least
+every `report_s` while there is a drone.
 
 Source: ours, for P III.B; DESIGN, The graph: detect.
 """
@@ -24,14 +25,14 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.detect.candidate import SAME_LOOK_NS, STANDING_M, START_SPEED_MPS, Candidate, Sighting
-from stages.detect.candidate_messages import candidates_message, detections_message, odds_of
-from stages.detect.candidate_table import Bank, places_of
-from stages.detect.classifier import STANDING, Evidence, judge
-from stages.detect.isolation import BigThings
-from stages.detect.observations import Limits, SightingFinder, Slice
-from stages.detect.reacquire import joined, without_twins
-from stages.detect.telemetry import DroneWord
+from stages.detect.candidate import SAME_PASS_NS, START_SPEED_MPS, STATIC_M, Alternative, Candidate, Observation
+from stages.detect.candidate_messages import candidates_message, detections_message, log_odds_of
+from stages.detect.candidate_table import CandidateTable, positions_of
+from stages.detect.classifier import ClassifierWeights, classify
+from stages.detect.isolation import LargeObjectMap
+from stages.detect.observations import ObservationFinder, ObservationLimits, Slice
+from stages.detect.reacquire import reacquired_candidate, without_duplicates
+from stages.detect.telemetry import DetectorTelemetry
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.candidate import SIGMA_M
@@ -48,43 +49,43 @@ from stages.messages import (
 from stages.sweep.pulses import middle_ns
 from stages.sweep.sweep import Travel
 
-TIDIED_NS = 84_300_000  # about ten times a second
-AMONG_M = 1.5
-AMONG_NS = 20_000_000_000
-SAME_PLACE_M = 0.5
-MOST_STANDING = 64
-KEPT_NATS = 1.65  # so much less than it takes to accept it, and it is accepted no more
-STILL_MPS = np.zeros(3)
-STANDING_NS = 60_000_000_000  # for so long it is known that something stands there
+PRUNE_PERIOD_NS = 84_300_000  # about twelve times a second
+NEAR_REJECTED_M = 1.5  # a rejected object this close,
+NEAR_REJECTED_NS = 20_000_000_000  # and this recent, makes a new candidate less probable
+REVISITED_M = 0.5  # the same position
+MAX_STATIC = 64  # static objects remembered
+HYSTERESIS_NATS = 1.65  # an accepted candidate is rejected this far below the threshold
+AT_REST_MPS = np.zeros(3)
+STATIC_NS = 60_000_000_000  # how long a static object is remembered
 
 
 @dataclass(slots=True)
 class _Watch:
-    """Pulses through the middle of a candidate in one look."""
+    """Pulses through the middle of a candidate in one scan pass."""
 
-    hits: int = 0
-    passes: int = 0
+    returns: int = 0
+    pass_throughs: int = 0
     stamp_ns: int = 0
 
 
 @dataclass(slots=True)
-class _Now:
-    """What the detector remembers."""
+class _State:
+    """State of the detector between messages."""
 
-    finder: SightingFinder
+    finder: ObservationFinder
     travel: Travel
     trail: VehicleTrajectory = field(default_factory=VehicleTrajectory)
-    word: DroneWord = field(default_factory=DroneWord)
-    bank: Bank = field(default_factory=Bank)
-    standing: deque[Candidate] = field(default_factory=lambda: deque[Candidate](maxlen=MOST_STANDING))
-    standing_m: Array64 = field(default_factory=lambda: np.empty((0, 3)))  # where they are
-    refused_places: BigThings = field(default_factory=BigThings)
+    telemetry: DetectorTelemetry = field(default_factory=DetectorTelemetry)
+    table: CandidateTable = field(default_factory=CandidateTable)
+    static: deque[Candidate] = field(default_factory=lambda: deque[Candidate](maxlen=MAX_STATIC))
+    static_m: Array64 = field(default_factory=lambda: np.empty((0, 3)))  # their positions
+    rejected_map: LargeObjectMap = field(default_factory=LargeObjectMap)
     watches: dict[int, _Watch] = field(default_factory=lambda: dict[int, _Watch]())
-    refused: Counter[str] = field(default_factory=Counter[str])
-    tidied_ns: int = 0
-    elsewhere: bool = False  # all that is remembered, by the vehicle's odometry
+    rejected: Counter[str] = field(default_factory=Counter[str])
+    pruned_ns: int = 0
+    odometry_jumped: bool = False  # the map frame changed: all positions are invalid
     number: int = 0  # of the newest candidate
-    detector_life: int = 0  # its first pulse's stamp
+    detector_instance: int = 0  # stamp of its first pulse
     start_ns: int | None = None  # of the search not yet reported
     end_ns: int | None = None  # of a pass that is over, not yet reported
 
@@ -96,17 +97,17 @@ class EvidenceDetectSettings(Settings):
     lowest_deg: float = Field(4.0, ge=-30, le=80)  # candidates are this far above the LiDAR's horizon
     nearest_m: float = Field(1.5, ge=0.3)
     furthest_m: float = Field(65.0, gt=1)
-    clear_m: float = Field(2.0, gt=0.2)  # a lamp hangs this far from its pole; so near nothing may stand
+    clear_m: float = Field(2.0, gt=0.2)  # radius that must be free; a lamp is this far from its pole
     accept_probability: float = Field(0.95, gt=0.5, lt=1)
-    look_again_probability: float = Field(0.014, gt=0, lt=0.5)
+    follow_up_probability: float = Field(0.014, gt=0, lt=0.5)
     report_s: float = Field(1.0, gt=0.05)
-    settle_s: float = Field(0.15, ge=0)  # what was seen just before the end of a pass is judged with it
+    settle_s: float = Field(0.15, ge=0)  # delay of a pass's report, so that its last observations are complete
     sweep_deg: float = Field(180.0, gt=3, le=360)
     forget_s: float = Field(4.0, gt=0)
-    max_candidates: int = Field(12, ge=1)  # given out
-    parked: bool = False  # the vehicle stands: what moves is known without VehicleMotion
-    free_space: bool = True  # False: what was measured around a candidate counts for nothing, to see what it is worth
-    evidence: Evidence = Evidence()
+    max_candidates: int = Field(12, ge=1)  # published
+    parked: bool = False  # the vehicle does not move: motion is known without VehicleMotion
+    free_space: bool = True  # ablation: False ignores the measured surroundings
+    weights: ClassifierWeights = ClassifierWeights()
 
     @model_validator(mode="after")
     def _settings_agree(self) -> EvidenceDetectSettings:
@@ -116,204 +117,208 @@ class EvidenceDetectSettings(Settings):
 
 
 class EvidenceDetect(Stage[EvidenceDetectSettings]):
-    """Small, alone, seen to be free all around, again and again: a drone. What is refused is refused with a reason."""
+    """Accepts small objects that are repeatedly observed with free space around them; rejects others with a reason."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"motion", "drone_position", "drone_odometry"})
 
     def __init__(self, settings: EvidenceDetectSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         settings = self.settings
-        limits = Limits(
+        limits = ObservationLimits(
             settings.span_m,
             math.radians(settings.lowest_deg),
             settings.nearest_m,
             settings.furthest_m,
             settings.clear_m,
         )
-        self._now = _Now(SightingFinder(limits), Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5)))
+        self._now = _State(ObservationFinder(limits), Travel(math.radians(settings.sweep_deg - 3.0), math.radians(0.5)))
 
     def on_motion(self, motion: VehicleMotion) -> None:
-        """Where the vehicle is. Without it nothing is taken to move but what rises or sinks, unless `parked` is set."""
-        self._now.elsewhere |= self._now.trail.add(motion)
+        """Update the vehicle's trajectory. Without it only vertical motion counts, unless `parked` is set."""
+        self._now.odometry_jumped |= self._now.trail.add(motion)
 
     def on_drone_position(self, position: DroneLocalPosition) -> None:
-        """What the drone says of its flight; without it birds and lamps are told by how they fly alone."""
-        self._now.word.add_position(position)
+        """Add the drone's local position. Without telemetry only the path separates birds and lamps from drones."""
+        self._now.telemetry.add_position(position)
 
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
-        """The same from an autopilot that sends this."""
-        self._now.word.add_odometry(odometry)
+        """Add the drone's odometry, from an autopilot that sends it."""
+        self._now.telemetry.add_odometry(odometry)
 
     def on_pulses(self, pulses: SweptPulses) -> Iterator[Candidates | Detections]:
-        """One slice: judge the sightings that are complete with it, tell what changed."""
+        """Process one slice: classify the observations that it completes and publish changes."""
         if pulses.range_m.size == 0:
             return
         now = self._now
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
-            now.start_ns = now.tidied_ns = now.detector_life = pulses.stamp_ns
+            now.start_ns = now.pruned_ns = now.detector_instance = pulses.stamp_ns
         part = Slice(pulses, *now.trail.at(middle_ns(pulses)), looking_along(pulses.direction_vehicle))
         changed = False
-        sightings = now.finder.feed(part, self._motion_known(now_ns))
-        self._look_for_misses(now, part, now_ns)
-        if now_ns - now.tidied_ns > TIDIED_NS:
-            now.tidied_ns = now_ns
-            changed = self._tidy(now, now_ns)
-        for sighting in sightings:
-            changed |= self._take(now, sighting)
+        observations = now.finder.feed(part, self._motion_known(now_ns))
+        self._count_pass_throughs(now, part, now_ns)
+        if now_ns - now.pruned_ns > PRUNE_PERIOD_NS:
+            now.pruned_ns = now_ns
+            changed = self._prune(now, now_ns)
+        for observation in observations:
+            changed |= self._associate(now, observation)
         yield from self._report(now, now_ns, pulses.turntable_rad, changed)
 
     def _motion_known(self, stamp_ns: int) -> bool:
-        """Whether it is told how the vehicle moves: what stands still in the world is known then."""
+        """Whether the vehicle's motion is known, so that static objects are static in the map frame."""
         return self.settings.parked or self._now.trail.known_at(stamp_ns)
 
-    def _take(self, now: _Now, s: Sighting) -> bool:
-        """Give a sighting to the candidate it fits, or make one of it. True when that is news."""
-        both = now.bank.fitting(s, joined=True)
-        if both is not None:
-            self._see(now, both, s)
-        best = now.bank.fitting(s) or self._wake(now, s)
+    def _associate(self, now: _State, s: Observation) -> bool:
+        """Assign an observation to the candidate that it fits, or start a new one. True: publish a change."""
+        reacquired = now.table.best_fit(s, reacquired=True)
+        if reacquired is not None:
+            self._update(now, reacquired, s)
+        best = now.table.best_fit(s) or self._reactivate(now, s)
         if best is not None:
-            return self._see(now, best, s) or both is not None
-        since_ns = s.stamp_ns - (AMONG_NS if self._motion_known(s.stamp_ns) else AMONG_NS // 20)
-        refused_m = now.refused_places.nearest_m(s.xyz_map_m, 0.0, AMONG_M, since_ns)
-        among = math.isfinite(refused_m)
-        if both is None and not among and not math.isfinite(s.big_m):  # in a tree something lies everywhere
-            self._join(now, s)
+            return self._update(now, best, s) or reacquired is not None
+        since_ns = s.stamp_ns - (NEAR_REJECTED_NS if self._motion_known(s.stamp_ns) else NEAR_REJECTED_NS // 20)
+        refused_m = now.rejected_map.nearest_m(s.xyz_map_m, 0.0, NEAR_REJECTED_M, since_ns)
+        near_rejected = math.isfinite(refused_m)
+        if (
+            reacquired is None and not near_rejected and not math.isfinite(s.large_object_m)
+        ):  # under trees something is everywhere
+            self._reacquire(now, s)
         now.number += 1
         new = Candidate(
             number=now.number,
             stamp_ns=s.stamp_ns,
             seen_ns=s.stamp_ns,
             xyz_m=s.xyz_map_m,
-            velocity_mps=STILL_MPS,
+            velocity_mps=AT_REST_MPS,
             range_m=s.range_m,
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
-            first_hits=s.hits,
+            first_returns=s.returns,
         )
-        new.among, new.again = among, refused_m < SAME_PLACE_M and now.word.moves(s.stamp_ns)
-        new.note(s)
-        news = self._weigh(now, new)
-        if new.told:
-            new.velocity_mps = now.trail.velocity_mps(s.stamp_ns)  # a drone comes along with the vehicle
-            now.bank.put(new)
+        new.near_rejected, new.revisited = near_rejected, refused_m < REVISITED_M and now.telemetry.moves(s.stamp_ns)
+        new.add_observation(s)
+        news = self._classify(now, new)
+        if new.is_promising:
+            new.velocity_mps = now.trail.velocity_mps(s.stamp_ns)  # a drone follows the vehicle
+            now.table.put(new)
         else:
-            now.refused[why_refused(new.why)] += 1
-            self._remember(now, new)
+            now.rejected[new.rejection] += 1
+            self._remember_rejected(now, new)
         return news
 
-    def _see(self, now: _Now, c: Candidate, s: Sighting) -> bool:
-        """One more sighting of a candidate. True when that is news."""
-        c.see(s)
-        news = self._weigh(now, c)
-        now.bank.put(c)
+    def _update(self, now: _State, c: Candidate, s: Observation) -> bool:
+        """Update a candidate with an observation. True: publish a change."""
+        c.update(s)
+        news = self._classify(now, c)
+        now.table.put(c)
         return news
 
-    def _join(self, now: _Now, s: Sighting) -> None:
-        """What was met elsewhere and may have flown here, as the drone says, goes on here, too."""
-        if not self._motion_known(s.stamp_ns) or not now.word.moves(s.stamp_ns):
+    def _reacquire(self, now: _State, s: Observation) -> None:
+        """Continue a candidate at an observation at which the drone's odometry predicts it after a pause."""
+        if not self._motion_known(s.stamp_ns) or not now.telemetry.moves(s.stamp_ns):
             return
-        if met := now.word.met_again(now.bank, s):
+        if match := now.telemetry.reacquire(now.table, s):
             now.number += 1
-            both = joined(met[0], now.number, s, met[1])
-            self._weigh(now, both)
-            if both.told:
-                now.bank.put(both)
+            reacquired = reacquired_candidate(match[0], now.number, s, match[1])
+            self._classify(now, reacquired)
+            if reacquired.is_promising:
+                now.table.put(reacquired)
 
-    def _wake(self, now: _Now, s: Sighting) -> Candidate | None:
-        """Something that was looked at before and stood there: it goes on where it was, and is not looked at anew."""
-        place = first_within(now.standing_m, s.xyz_map_m, STANDING_M)
-        if place < 0:
+    def _reactivate(self, now: _State, s: Observation) -> Candidate | None:
+        """The remembered static object at this position, as a candidate again; None: there is none."""
+        index = first_within(now.static_m, s.xyz_map_m, STATIC_M)
+        if index < 0:
             return None
-        c = now.standing[place]
-        del now.standing[place]
-        now.standing_m = places_of(now.standing)
-        c.wake(s.stamp_ns)
+        c = now.static[index]
+        del now.static[index]
+        now.static_m = positions_of(now.static)
+        c.reactivate(s.stamp_ns)
         return c
 
-    def _weigh(self, now: _Now, c: Candidate) -> bool:
-        """Judge it anew. True when that is news."""
+    def _classify(self, now: _State, c: Candidate) -> bool:
+        """Classify a candidate again. True: publish a change."""
         settings = self.settings
         motion_known = self._motion_known(c.seen_ns)
-        c.hear(now.word.of(c, motion_known))
-        c.odds, c.why = judge(c, settings.evidence, settings.free_space, motion_known)
-        accept = odds_of(settings.accept_probability)
-        c.accepted = c.odds >= accept or (c.accepted and c.odds >= accept - KEPT_NATS)
-        was, c.told = c.told, c.odds >= odds_of(settings.look_again_probability)
-        c.worth |= c.told
-        return c.worth or was != c.told
+        c.add_log_ratios(now.telemetry.of(c, motion_known))
+        c.log_odds, c.reason = classify(c, settings.weights, settings.free_space, motion_known)
+        accept = log_odds_of(settings.accept_probability)
+        c.accepted = c.log_odds >= accept or (c.accepted and c.log_odds >= accept - HYSTERESIS_NATS)
+        before, c.is_promising = c.is_promising, c.log_odds >= log_odds_of(settings.follow_up_probability)
+        c.was_promising |= c.is_promising
+        return c.was_promising or before != c.is_promising
 
-    def _look_for_misses(self, now: _Now, part: Slice, now_ns: int) -> None:
-        """Count the pulses that went through where a candidate should be, look by look."""
+    def _count_pass_throughs(self, now: _State, part: Slice, now_ns: int) -> None:
+        """Count the pulses that pass through a candidate's predicted position, scan pass by scan pass."""
         origin_m, disc_m = np.array(part.pulses.origin_vehicle_m), 0.22 * self.settings.span_m
-        for c, hits, passes, elsewhere in now.bank.looked_at(
+        for c, returns, pass_throughs, outside in now.table.pass_throughs_of(
             part, origin_m, now_ns, disc_m, (0.5 * self.settings.span_m) ** 2
         ):
-            if not elsewhere:
+            if not outside:
                 watch = now.watches.setdefault(c.number, _Watch())
-                watch.hits += hits
-                watch.passes += passes
+                watch.returns += returns
+                watch.pass_throughs += pass_throughs
                 watch.stamp_ns = now_ns
                 continue
             watch = now.watches.get(c.number)
-            if watch is not None and now_ns - watch.stamp_ns > SAME_LOOK_NS:
-                if watch.hits == 0 and now_ns - c.seen_ns > 2 * SAME_LOOK_NS:
-                    c.missed += watch.passes * min(1.0, (35.0 / c.range_m) ** 2)
-                    self._weigh(now, c)
-                    now.bank.put(c)
+            if watch is not None and now_ns - watch.stamp_ns > SAME_PASS_NS:
+                if watch.returns == 0 and now_ns - c.seen_ns > 2 * SAME_PASS_NS:
+                    c.missed_returns += watch.pass_throughs * min(1.0, (35.0 / c.range_m) ** 2)
+                    self._classify(now, c)
+                    now.table.put(c)
                 del now.watches[c.number]
 
-    def _tidy(self, now: _Now, now_ns: int) -> bool:
-        """Put away what was not seen for long, sooner what was refused. True when one that was told goes."""
-        if now.elsewhere:
-            return self._forget(now)
-        kept = without_twins(c for c in now.bank if now_ns - c.seen_ns < self._kept_ns(c))
-        for c in now.bank:
-            if now_ns - c.seen_ns >= self._kept_ns(c) and not c.told:
-                self._remember(now, c)
+    def _prune(self, now: _State, now_ns: int) -> bool:
+        """Remove candidates without recent observations, rejected ones sooner. True: a published one is removed."""
+        if now.odometry_jumped:
+            return self._reset(now)
+        kept = without_duplicates(c for c in now.table if now_ns - c.seen_ns < self._retention_ns(c))
+        for c in now.table:
+            if now_ns - c.seen_ns >= self._retention_ns(c) and not c.is_promising:
+                self._remember_rejected(now, c)
         if self._motion_known(now_ns):
-            now.standing.extend(c for c in now.bank if now_ns - c.seen_ns >= self._kept_ns(c) and c.stands)
-        while now.standing and now_ns - now.standing[0].seen_ns > STANDING_NS:
-            now.standing.popleft()
-        now.standing_m = places_of(now.standing)
-        gone = len({c.number for c in now.bank if c.told} - {c.number for c in kept}) > 0
-        now.bank.keep(kept)
+            now.static.extend(c for c in now.table if now_ns - c.seen_ns >= self._retention_ns(c) and c.is_static)
+        while now.static and now_ns - now.static[0].seen_ns > STATIC_NS:
+            now.static.popleft()
+        now.static_m = positions_of(now.static)
+        gone = len({c.number for c in now.table if c.is_promising} - {c.number for c in kept}) > 0
+        now.table.keep(kept)
         now.watches = {c.number: now.watches[c.number] for c in kept if c.number in now.watches}
         return gone
 
-    def _forget(self, now: _Now) -> bool:
-        """Put away all: nobody knows where it lies in the frame that the vehicle's odometry has come back with."""
-        gone = any(c.told for c in now.bank)
-        now.elsewhere, now.standing_m, now.refused_places = False, places_of(()), BigThings()
-        now.bank.keep(())
-        now.standing.clear()
+    def _reset(self, now: _State) -> bool:
+        """Remove everything: after a jump of the vehicle's odometry no position in the map frame is valid."""
+        gone = any(c.is_promising for c in now.table)
+        now.odometry_jumped, now.static_m, now.rejected_map = False, positions_of(()), LargeObjectMap()
+        now.table.keep(())
+        now.static.clear()
         now.watches.clear()
         return gone
 
-    def _remember(self, now: _Now, c: Candidate) -> None:
-        """Where something that stands was refused."""
-        if c.suspect == STANDING and (c.hit_looks < 3 or c.stands):
-            now.refused_places.add(c.xyz_m[None], c.seen_ns)
+    def _remember_rejected(self, now: _State, c: Candidate) -> None:
+        """Remember the position of a rejected static object."""
+        if c.alternative is Alternative.STATIC and (c.scan_passes < 3 or c.is_static):
+            now.rejected_map.add(c.xyz_m[None], c.seen_ns)
 
-    def _kept_ns(self, c: Candidate) -> float:
-        """How long a candidate is followed without a sighting."""
-        if c.told:
+    def _retention_ns(self, c: Candidate) -> float:
+        """How long a candidate is kept without an observation."""
+        if c.is_promising:
             return self.settings.forget_s * 1e9
-        return 1.5e9 if c.hit_looks >= 3 else 0.35e9
+        return 1.5e9 if c.scan_passes >= 3 else 0.35e9
 
-    def _report(self, now: _Now, now_ns: int, turntable_rad: float, changed: bool) -> Iterator[Candidates | Detections]:
+    def _report(
+        self, now: _State, now_ns: int, turntable_rad: float, changed: bool
+    ) -> Iterator[Candidates | Detections]:
         settings = self.settings
         if not math.isnan(turntable_rad):
             now.travel.advance(turntable_rad, 0.0)
             if now.travel.whole:
                 now.travel.restart(turntable_rad)
                 now.end_ns = now.end_ns or now_ns
-        accepted = [c for c in now.bank if c.accepted]
+        accepted = [c for c in now.table if c.accepted]
         new = [c for c in accepted if not c.announced]
         if changed or new:
-            told = [c for c in now.bank if c.told or (c.worth and now_ns - c.seen_ns < 300_000_000)]
-            flight = now.word.usual_flight(now.trail, now_ns)
-            yield candidates_message(told, now.trail, now_ns, now.detector_life, settings.max_candidates, *flight)
+            listed = [c for c in now.table if c.is_promising or (c.was_promising and now_ns - c.seen_ns < 300_000_000)]
+            motion = now.telemetry.expected_motion(now.trail, now_ns)
+            yield candidates_message(listed, now.trail, now_ns, now.detector_instance, settings.max_candidates, *motion)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9
         here = any(c.seen_ns >= now.start_ns for c in accepted)
@@ -325,21 +330,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             end_ns = now_ns
         else:
             return
-        refused = now.refused + now.finder.hidden
-        yield detections_message(now.bank, now.trail, now.start_ns, end_ns, refused, settings.max_candidates)
+        rejected = now.rejected + now.finder.hidden
+        yield detections_message(now.table, now.trail, now.start_ns, end_ns, rejected, settings.max_candidates)
         for c in new:
             c.announced = True
         now.start_ns, now.end_ns = end_ns + 1, None
-        now.refused.clear()
+        now.rejected.clear()
         now.finder.hidden.clear()
-
-
-def why_refused(why: str) -> str:
-    """What it most likely is, and what speaks for that: the reasons of a judgement without their numbers."""
-    parts = why.split("; ")
-    told = [
-        part.partition(" m away")[0].rstrip("0123456789. ")
-        for part in parts
-        if part.startswith(("something", "beside", "longer"))
-    ]
-    return ", ".join([parts[-1].removeprefix("if not a drone, "), *told])

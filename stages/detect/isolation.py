@@ -1,14 +1,14 @@
-"""What was measured around a place: sectors pulses flew through, sectors in which something stands, big things.
+"""Isolation: which sectors around a position are free or occupied, and where large objects are.
 
-Around a place at range R, in the plane across the line of sight:
+Around a position at range R, in the plane across the line of sight:
 
-    inner disc     the thing itself: hits, and pulses that passed
+    inner disc     the object itself: returns, and pulses that passed
     ring           8 sectors between `inner` and `close`: free when a pulse went on farther than R there, occupied when
                    one returned near R, within `depth` and a slope
-    farther        up to `outer`: what stands there counts where nothing says that it is free in between
+    farther        up to `outer`: objects there count where no free space is measured in between
 
-A drone hangs free: pulses pass it on every side. What stands on a pole, hangs on a wire, sticks out of a tree or ends a
-wall has something beside it. A sector nothing flew through says nothing.
+A drone hovers freely: pulses pass it on every side. An object on a pole or wire, at a tree or at the end of a wall has
+a neighbour. A sector that no pulse crossed gives no information.
 
 Source: ours; DESIGN, "a small cluster with *measured* emptiness around it".
 """
@@ -21,8 +21,8 @@ from stages.geometry.frames import Array64
 from stages.kernels.detect.isolation import MAP_SIZE, nearest_remembered, remember
 
 
-class BigThings:
-    """Where walls, ground, trunks and crowns stand: cells in which a beam's chord was longer than any drone."""
+class LargeObjectMap:
+    """Map of walls, ground, trunks and crowns: cells with a chord longer than any drone."""
 
     def __init__(self, cell_m: float = 0.5) -> None:
         self._cell_m = cell_m
@@ -30,9 +30,9 @@ class BigThings:
         self._when = np.zeros(MAP_SIZE, dtype=np.int64)
 
     def add(self, points_m: Array64, stamp_ns: int) -> None:
-        """Points (n, 3) of big things, in a frame in which they stand still."""
+        """Add points (n, 3) of large objects, in a static frame."""
         remember(points_m, self._cell_m, stamp_ns, self._key, self._when)
 
     def nearest_m(self, centre_m: Array64, least_m: float, most_m: float, since_ns: int) -> float:
-        """How near the nearest one seen since then is; inf beyond most_m. Nearer than least_m is the thing itself."""
+        """Distance to the nearest one observed since then, beyond least_m (the object itself); inf beyond most_m."""
         return float(nearest_remembered(centre_m, self._cell_m, least_m, most_m, since_ns, self._key, self._when))

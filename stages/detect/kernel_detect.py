@@ -90,11 +90,11 @@ class KernelDetect(Stage[KernelDetectSettings]):
         if accepted.any():
             best = int(accepted.argmax())
             x, y, z = xyz_vehicle_m[best]
-            verdict = f"drone at ({x:.2f}, {y:.2f}, {z:.2f}) m, score {terms[best].sum():.3g}"
+            summary = f"drone at ({x:.2f}, {y:.2f}, {z:.2f}) m, score {terms[best].sum():.3g}"
             if accepted.sum() > 1:
-                verdict += f"; {int(accepted.sum()) - 1} more with a higher score"
+                summary += f"; {int(accepted.sum()) - 1} more with a higher score"
         else:
-            verdict = f"no drone: {self._why_none(image, judged)}"
+            summary = f"no drone: {self._why_none(image, judged)}"
         return Detections(
             stamp_ns=image.stamp_ns,
             xyz_vehicle_m=xyz_vehicle_m,
@@ -103,7 +103,7 @@ class KernelDetect(Stage[KernelDetectSettings]):
             e_outer=terms[:, 1].copy(),
             accepted=accepted,
             reasons=tuple(c.reason for c in listed),
-            verdict=verdict,
+            summary=summary,
         )
 
     def _terms(self, image: DepthImage, pixel: Pixel) -> tuple[float, float]:

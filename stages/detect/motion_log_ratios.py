@@ -1,16 +1,16 @@
-"""What the drone itself says of its flight, and how well a candidate's path fits it.
+"""Log ratios of a candidate's path: motion by the drone's odometry against motion of other objects.
 
-The autopilot tells its position in a frame of its own: z up, north anywhere, drifting slowly. A candidate that is the
-drone moves as it says, turned by a yaw psi that nobody knows:
+The autopilot's odometry is in its own frame: z up, unknown yaw, slow drift. A candidate that is the drone moves by that
+odometry, turned by an unknown yaw psi:
 
     drone      x_i = c + Rz(psi) d_i + u t_i + noise           u: drift of both odometries, decimetres a second
-    still      x_i = c + u t_i + noise                         a lamp; or scattered, or met farther and farther along
-                                                               something long (a wire: as fast as one looks along it)
+    static     x_i = c + u t_i + noise                         a lamp; or scattered, or observed farther and farther
+                                                               along something long (a wire, at the scan's speed)
     flier      x_i = c + v t_i + a t_i^2 / 2 + noise           v, a of a bird, or of a balloon, on a string or loose
 
-Each is a Gaussian over the path's n points, c and psi are integrated out; ln of the ratio of two marginal likelihoods
-is the evidence. Speeds and heights alone tell the drone from a bird in a few looks, whatever psi is. A drone that hangs
-still says nothing against a lamp.
+Each model is a Gaussian over the path's n points, with c and psi integrated out. The evidence is the log ratio of two
+marginal likelihoods. Speeds and heights alone separate the drone from a bird in a few scan passes, whatever psi is. The
+odometry of a hovering drone gives no evidence against a lamp.
 
 Source: ours; DESIGN, The graph: `odometry` ("autopilot odometry when present").
 """
@@ -26,57 +26,58 @@ from stages.geometry.frames import Array64
 from stages.kernels.detect.motion_log_ratios import weigh
 from stages.odometry.drone.telemetry import KEPT_NS, DroneTelemetry
 
-MOST_POINTS = 14
-SILENT_NS = 2_000_000_000  # by then a path may have gone over from one thing to another
-DENIED = -3.0  # nats
-MOST_MISFIT = 4.0  # beyond it is none of these, and nothing speaks for the drone; drones come to 1.3
+MAX_POINTS = 14
+SILENT_NS = 2_000_000_000  # without telemetry for longer, a path may have switched to another object
+DENIED = -3.0  # [nats] below it the path contradicts the odometry
+MAX_MISFIT = 4.0  # beyond it no model fits, and nothing favours the drone; drones reach 1.3
 
 
-class Heard(NamedTuple):
-    """ln of how much likelier a path is as the drone's than as something else's, psi not known."""
+class MotionLogRatios(NamedTuple):
+    """Log ratios of a path's likelihood as the drone's over another object's, with psi unknown."""
 
-    over_still: float
+    over_static: float
     over_bird: float
     over_balloon: float
-    over_wire: float  # over what is met farther and farther along it, at any speed: the aim looks where it expects
-    misfit: float  # by how many squared sigmas a coordinate it is off the drone's way at the best yaw
-    way_m: float  # how far the drone says it has been from where it was at first; up, where only heights are compared
+    over_wire: float  # over a wire, observed at positions that move along it at any speed
+    misfit: float  # mean squared normalised residual from the odometry at the best yaw
+    displacement_m: float  # largest odometry displacement since the first point; vertical if only heights are compared
 
     @property
     def denied(self) -> bool:
-        """Whether it clearly does not fly as the drone says."""
-        return min(self.over_still, self.over_bird, self.over_balloon) < DENIED
+        """Whether the path significantly contradicts the drone's odometry."""
+        return min(self.over_static, self.over_bird, self.over_balloon) < DENIED
 
 
-def hear(
+def compare_motion(
     telemetry: DroneTelemetry, path_ns: list[int], path_m: list[Array64], sigma_m: float, level_known: bool
-) -> Heard | None:
-    """Compare a path (n, 3) in a frame that stands still and is level with what the drone says; None: nothing to say.
+) -> MotionLogRatios | None:
+    """Compare a path (n, 3) in a static level frame with the drone's odometry; None: no telemetry to compare.
 
-    Sightings at which the drone was silent are left out; when it is silent by now it says nothing at all.
+    Observations without telemetry are left out. Without recent telemetry there is no comparison.
 
-    `level_known` False: the vehicle's motion is not known, so only heights are compared. sigma_m: of a sighting.
+    `level_known` False: the vehicle's motion is unknown, so only heights are compared. sigma_m: of an observation.
     """
-    heard_ns = telemetry.heard_ns
-    if heard_ns is None or len(path_ns) < 2 or path_ns[-1] > heard_ns[1] + SILENT_NS:
+    span_ns = telemetry.span_ns
+    if span_ns is None or len(path_ns) < 2 or path_ns[-1] > span_ns[1] + SILENT_NS:
         return None
-    first = bisect_left(path_ns, max(path_ns[-1] - KEPT_NS // 2, heard_ns[0]))
+    first = bisect_left(path_ns, max(path_ns[-1] - KEPT_NS // 2, span_ns[0]))
     if len(path_ns) - first < 2:
         return None
     rows = list(range(first, len(path_ns)))
-    if len(rows) > MOST_POINTS:
+    if len(rows) > MAX_POINTS:
         last = len(rows) - 1
-        rows = [rows[round(i * last / (MOST_POINTS - 1))] for i in range(MOST_POINTS)]
+        rows = [rows[round(i * last / (MAX_POINTS - 1))] for i in range(MAX_POINTS)]
     states = {k: telemetry.state(path_ns[k]) for k in rows}
-    places = {k: state[0] for k, state in states.items() if state is not None}
-    if len(places) < 2:
+    positions = {k: state[0] for k, state in states.items() if state is not None}
+    if len(positions) < 2:
         return None
-    rows, told = list(places), np.array(list(places.values()))
+    rows, odometry_m = list(positions), np.array(list(positions.values()))
     t = (np.array([path_ns[k] for k in rows]) - path_ns[rows[-1]]) * 1e-9
-    compared_m = told if level_known else told[:, 2:]
-    way_m = float(np.sqrt(((compared_m - compared_m[0]) ** 2).sum(axis=1).max()))
-    heard = Heard(*weigh(t, np.array([path_m[k] for k in rows]), told, sigma_m, level_known), way_m)
-    if heard.misfit <= MOST_MISFIT:
-        return heard
-    still, bird, balloon, wire = (min(ratio, 0.0) for ratio in heard[:4])
-    return Heard(still, bird, balloon, wire, heard.misfit, way_m)
+    compared_m = odometry_m if level_known else odometry_m[:, 2:]
+    displacement_m = float(np.sqrt(((compared_m - compared_m[0]) ** 2).sum(axis=1).max()))
+    x_m = np.array([path_m[k] for k in rows])
+    log_ratios = MotionLogRatios(*weigh(t, x_m, odometry_m, sigma_m, level_known), displacement_m)
+    if log_ratios.misfit <= MAX_MISFIT:
+        return log_ratios
+    static, bird, balloon, wire = (min(ratio, 0.0) for ratio in log_ratios[:4])
+    return MotionLogRatios(static, bird, balloon, wire, log_ratios.misfit, displacement_m)

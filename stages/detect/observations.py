@@ -1,6 +1,6 @@
-"""From pulses to sightings: the short, free-ended chords of one look on one thing, and what was measured around it.
+"""Observations from pulses: the short, free-ended chords of one scan pass on one object, and its surroundings.
 
-A sighting is complete when the rotor has gone on: what stands around a place is known `DELAY_NS` later.
+An observation is complete `DELAY_NS` after its chord, when the rotor has scanned its surroundings.
 
 Source: ours; DESIGN, The graph: detect.
 """
@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.detect.candidate import Sighting
+from stages.detect.candidate import Observation
 from stages.detect.chords import ChordFinder
-from stages.detect.isolation import BigThings
-from stages.detect.pulse_buffer import MOST_SLICES, Lately
+from stages.detect.isolation import LargeObjectMap
+from stages.detect.pulse_buffer import MAX_SLICES, RecentPulses
 from stages.geometry.frames import Array64
 from stages.kernels.detect.observations import BIG, SMALL, kinds_of, one_thing, places_of_kind, round_and_rugged
 from stages.kernels.detect.pulse_buffer import WINDOW_NS
@@ -25,9 +25,9 @@ from stages.messages import SweptPulses
 from stages.sweep.pulses import middle_ns
 
 BEAM_SPACING_RAD = math.radians(2.0)  # between two lasers of a VLP-16
-DELAY_NS = 3_300_000  # after which what stands around a sighting has been seen
-MEMORY_NS = 3_000_000_000  # of big things, when the vehicle tells how it moves
-SHORT_MEMORY_NS = 1_000_000_000  # when it does not
+DELAY_NS = 3_300_000  # after which the surroundings of an observation were scanned
+MEMORY_NS = 3_000_000_000  # of large objects, when the vehicle's motion is known
+SHORT_MEMORY_NS = 1_000_000_000  # and when it is not
 
 
 class Slice(NamedTuple):
@@ -39,8 +39,8 @@ class Slice(NamedTuple):
     axis: Array64  # mean direction, unit
 
 
-class Limits(NamedTuple):
-    """Where a sighting may be."""
+class ObservationLimits(NamedTuple):
+    """Where an observation may be."""
 
     span_m: float
     lowest_rad: float  # over the LiDAR's horizon
@@ -59,45 +59,45 @@ class _Kept(NamedTuple):
 class _Chord(NamedTuple):
     found_ns: int  # the end of the slice it was found in
     row: Array64
-    place_m: tuple[float, ...]  # its middle
+    middle_m: tuple[float, ...]  # its middle
     stamp_ns: int
 
 
-class SightingFinder:
-    """Feed it slices in order of time; it keeps the last few, and where big things stand."""
+class ObservationFinder:
+    """Finds observations in slices, which must be added in order of time."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: ObservationLimits) -> None:
         self._limits = limits
         span_m = limits.span_m
         self._chords = ChordFinder(LONGEST * span_m, STEP * span_m, HOLE * span_m)
-        self._big = BigThings()
-        self._slices: deque[_Kept] = deque(maxlen=MOST_SLICES)
-        self._lately = Lately()
+        self._large = LargeObjectMap()
+        self._slices: deque[_Kept] = deque(maxlen=MAX_SLICES)
+        self._recent = RecentPulses()
         self._waiting: list[_Chord] = []
         self.hidden: Counter[str] = Counter()  # short chords that were not free at both ends
 
-    def feed(self, part: Slice, motion_known: bool) -> list[Sighting]:
-        """The sightings that are complete with this slice."""
-        now_ns = int(part.pulses.point_stamp_ns[-1])
+    def feed(self, slice_: Slice, motion_known: bool) -> list[Observation]:
+        """The observations that this slice completes."""
+        now_ns = int(slice_.pulses.point_stamp_ns[-1])
         while self._slices and now_ns - self._slices[0].end_ns > WINDOW_NS:
             self._slices.popleft()
-        self._slices.append(_Kept(middle_ns(part.pulses), now_ns, part.R, part.t))
-        self._lately.add(part.pulses, part.axis, now_ns)
-        self._find(part, now_ns)
+        self._slices.append(_Kept(middle_ns(slice_.pulses), now_ns, slice_.R, slice_.t))
+        self._recent.add(slice_.pulses, slice_.axis, now_ns)
+        self._find(slice_, now_ns)
         if not self._waiting or now_ns - self._waiting[0].found_ns < DELAY_NS:
             return []
         ready = [c for c in self._waiting if now_ns - c.found_ns >= DELAY_NS]
         self._waiting = self._waiting[len(ready) :]
-        found: list[Sighting] = []
+        found: list[Observation] = []
         while ready:
-            first = ready[0].place_m
-            near = [math.dist(c.place_m, first) <= 1.2 * self._limits.span_m for c in ready]
-            found.append(self._sighting([c for c, same in zip(ready, near, strict=True) if same], motion_known))
+            first = ready[0].middle_m
+            near = [math.dist(c.middle_m, first) <= 1.2 * self._limits.span_m for c in ready]
+            found.append(self._observation([c for c, same in zip(ready, near, strict=True) if same], motion_known))
             ready = [c for c, same in zip(ready, near, strict=True) if not same]
         return found
 
-    def _find(self, part: Slice, now_ns: int) -> None:
-        limits, pulses = self._limits, part.pulses
+    def _find(self, slice_: Slice, now_ns: int) -> None:
+        limits, pulses = self._limits, slice_.pulses
         found = self._chords.feed(pulses)
         rows = found.rows
         if not len(rows):
@@ -105,7 +105,7 @@ class SightingFinder:
         kinds = np.empty(len(rows), dtype=np.int64)
         big, small, hidden = kinds_of(rows, pulses.origin_vehicle_m[2], *limits, kinds)
         if big:
-            self._big.add(places_of_kind(rows, kinds, BIG, big, part.R, part.t), pulses.stamp_ns)
+            self._large.add(places_of_kind(rows, kinds, BIG, big, slice_.R, slice_.t), pulses.stamp_ns)
         if hidden:
             self.hidden["hidden at an end by something nearer"] += hidden
         if small:
@@ -113,30 +113,30 @@ class SightingFinder:
                 half_way_ns = int(found.first_ns[i] + found.last_ns[i]) // 2
                 self._waiting.append(_Chord(now_ns, rows[i], tuple(rows[i, :3].tolist()), half_way_ns))
 
-    def _sighting(self, same: list[_Chord], motion_known: bool) -> Sighting:
+    def _observation(self, same: list[_Chord], motion_known: bool) -> Observation:
         span_m = self._limits.span_m
         rows, stamp_ns = np.array([c.row for c in same]), same[0].stamp_ns
         away_ns = [abs(kept.middle_ns - stamp_ns) for kept in self._slices]
         then = self._slices[away_ns.index(min(away_ns))]
-        middle, local, hits, range_m, extent_m = one_thing(rows, then.R, then.t)
-        balls, rugged = round_and_rugged(rows)
+        middle, local, returns, range_m, extent_m = one_thing(rows, then.R, then.t)
+        round_chords, rough = round_and_rugged(rows)
         since_ns = stamp_ns - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
-        return Sighting(
+        return Observation(
             stamp_ns=stamp_ns,
             xyz_map_m=local,
             vehicle_map_m=then.t,
             range_m=range_m,
-            hits=hits,
+            returns=returns,
             too_long=extent_m > 1.3 * span_m,
-            balls=balls,
-            rugged=rugged,
-            around=self._around(middle, range_m),
-            big_m=self._big.nearest_m(local, 1.1 * span_m, self._limits.clear_m, since_ns),
+            round_chords=round_chords,
+            rough_chords=rough,
+            isolation=self._isolation(middle, range_m),
+            large_object_m=self._large.nearest_m(local, 1.1 * span_m, self._limits.clear_m, since_ns),
         )
 
-    def _around(self, middle_m: Array64, range_m: float) -> Array64:
+    def _isolation(self, middle_m: Array64, range_m: float) -> Array64:
         """What the last slices measured about a place of the vehicle frame: (TALLY,)."""
         span_m = self._limits.span_m
         close_m = max(2.4 * span_m, 1.15 * BEAM_SPACING_RAD * range_m)  # two beams wide at least
         outer_m = max(self._limits.clear_m, 1.5 * BEAM_SPACING_RAD * range_m)
-        return self._lately.around(middle_m, 0.3 * span_m, 1.1 * span_m, close_m, outer_m, 0.5)
+        return self._recent.isolation(middle_m, 0.3 * span_m, 1.1 * span_m, close_m, outer_m, 0.5)

@@ -1,5 +1,5 @@
-"""Fusion: one pose from everything that tells of the drone."""
+"""Fusion of LiDAR positions, rotations and odometry into one pose of the drone."""
 
-from stages.fuse.fuse import EkfFuse, Fuse
+from stages.fuse.fuse import Fuse
 
-__all__ = ["EkfFuse", "Fuse"]
+__all__ = ["Fuse"]

@@ -1,4 +1,4 @@
-"""What keeps the pose: the smoother (smoother.py) or the Kalman filter (ekf.py), one interface.
+"""Interface of the estimator that keeps the pose: the fixed-lag smoother (smoother.py).
 
 Source: ours.
 """
@@ -10,7 +10,7 @@ from typing import Protocol
 from stages.fuse.propagated import Step
 from stages.geometry.frames import Array64
 
-HUBER = 1.345  # beyond so many sigmas a residual's weight falls: 95 % efficient where all is Gaussian
+HUBER = 1.345  # [sigma] residual from which its weight falls: 95 % efficient on Gaussian noise
 
 
 class BackEnd(Protocol):
@@ -20,24 +20,24 @@ class BackEnd(Protocol):
     R_map_drone: Array64
     xyz_map_m: Array64
     covariance: Array64
-    recoveries: int  # how often it had to be begun anew after an error of its library
+    recoveries: int  # how often it had to be reset after an error of its library
 
     def start(self, stamp_ns: int, R_map_drone: Array64, xyz_map_m: Array64, covariance: Array64) -> None:
-        """Begin here, nothing before counts."""
+        """Start from one pose; earlier measurements are dropped."""
         ...
 
     def extend(self, stamp_ns: int, step: Step, up_drone: Array64 | None, tilt_rad2: float) -> None:
-        """Move on to a later moment; `up_drone`: the vertical (3,) in the drone's axes there, with its variance."""
+        """Add a later pose; `up_drone` is the vertical (3,) in drone axes there, `tilt_rad2` its variance."""
         ...
 
     def near(self, stamp_ns: int) -> tuple[int, Array64, Array64]:
-        """The known moment that a measurement is told from, and the pose there."""
+        """Time and pose that a measurement at `stamp_ns` is referred to."""
         ...
 
     def add_position(self, key_ns: int, step: Step, xyz_m: Array64, covariance_m2: Array64) -> bool:
-        """z = T(key) step: where the drone was at the end of a step from `key_ns`; False: it could not be used."""
+        """Position at the end of a step from `key_ns`, z = T(key) step. False: not usable."""
         ...
 
     def add_rotation(self, key_ns: int, step: Step, R: Array64, covariance_rad2: Array64) -> bool:
-        """R_map_drone at the end of a step; covariance in the drone's axes there."""
+        """R_map_drone at the end of a step from `key_ns`; covariance in drone axes there. False: not usable."""
         ...

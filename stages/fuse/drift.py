@@ -1,20 +1,20 @@
-"""Where the LiDAR has the drone, and how fast that creeps away from what its odometry tells.
+"""Position of the drone by LiDAR and the drift velocity of its odometry: a Kalman filter in `map`.
 
-    p' = p + u + b dt      u: the odometry's way, turned into the start frame;   z = p + noise
+    p' = p + u + b dt      u: displacement by odometry, turned into map axes;   z = p + noise
 
-With odometry b is its drift, a Gauss-Markov velocity that lasts for seconds: known from the fixes of the last seconds
-it makes a gap without fixes less bad. Without odometry u = 0 and b is the drone's whole velocity, with white
-acceleration, and with as much more as the drone says its velocity has changed, in whatever direction.
+With odometry b is its drift, a Gauss-Markov velocity that lasts for seconds; known from the recent fixes, it reduces
+the error of a gap without fixes. Without odometry u = 0 and b is the whole velocity of the drone, with white
+acceleration, plus the change of velocity that the autopilot reports, in an unknown direction.
 
-The ways u seen so far were turned by the yaw as it was believed then. Where that proves wrong, what was learnt of b is
-made good (`turn_ways`), else the same error would count as yaw and as drift: x is linear in u, so that what the ways
-turned by a quarter, s, and their level part, c, have to do with it is carried along,
+The displacements u so far were turned by the yaw estimate of their time. When that estimate is corrected, `correct_yaw`
+corrects b, else one error would count as yaw and as drift. x is linear in u, so the filter propagates its derivative s
+by the displacements turned by 90 deg, and their level part c:
 
     s' = F s + (z x u, 0) - K (F s + z x u)_p,     x(a) = x + sin(a) s + (cos(a) - 1) c
 
     V(T) = T^2 P_b + q T^3 / 3
 
-is what a time T without a fix adds to the position's covariance, q = 2 sigma^2 / tau with odometry.
+is what a time T without a fix adds to the position covariance, with q = 2 sigma^2 / tau with odometry.
 
 Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 6.2; ours.
 """
@@ -28,43 +28,43 @@ import numpy as np
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64
 
-START_MPS = 1.0  # a tracker's velocity, one sigma
-UNKNOWN_MPS = 6.0  # nobody's
+START_MPS = 1.0  # sigma of the tracker's velocity
+UNKNOWN_MPS = 6.0  # sigma of an unknown velocity
 
 
 class Drift:
-    """A Kalman filter over the fixes, in the start frame."""
+    """Kalman filter of position and drift velocity, in `map`."""
 
     def __init__(self, errors: FuseErrors, odometry: bool) -> None:
-        """`odometry`: whether u is told."""
+        """`odometry`: whether u is measured."""
         self._errors, self.odometry = errors, odometry
         self._x = np.zeros(6)
         self._covariance = np.eye(6)
-        self._of_ways = np.zeros((6, 2))  # s, c
+        self._by_yaw = np.zeros((6, 2))  # s, c
         self.stamp_ns: int | None = None  # of the newest fix
         self.q = 2 * errors.drift_mps**2 / errors.drift_time_s if odometry else errors.manoeuvre
 
     @property
     def xyz_map_m(self) -> Array64:
-        """At the newest fix."""
+        """Position at the newest fix."""
         return self._x[:3]
 
     @property
     def velocity_mps(self) -> Array64:
-        """b (3,), start axes."""
+        """Drift velocity b (3,), map axes."""
         return self._x[3:]
 
     @property
     def velocity_covariance(self) -> Array64:
-        """Of b (3, 3)."""
+        """Covariance (3, 3) of b."""
         return self._covariance[3:, 3:]
 
     def start(self, stamp_ns: int, xyz_m: Array64, covariance_m2: Array64, velocity_mps: Array64 | None) -> None:
-        """Begin at a fix; with odometry b begins at none, else at the tracker's velocity."""
+        """Start at a fix; b starts at zero with odometry, else at the tracker's velocity."""
         self.stamp_ns = stamp_ns
         known = np.zeros(3) if self.odometry or velocity_mps is None else velocity_mps
         sigma = START_MPS if velocity_mps is not None else UNKNOWN_MPS
-        self._x, self._of_ways = np.concatenate([xyz_m, known]), np.zeros((6, 2))
+        self._x, self._by_yaw = np.concatenate([xyz_m, known]), np.zeros((6, 2))
         self._covariance = np.zeros((6, 6))
         self._covariance[:3, :3] = covariance_m2
         self._covariance[3:, 3:] = (self._errors.drift_mps if self.odometry else sigma) ** 2 * np.eye(3)
@@ -72,9 +72,9 @@ class Drift:
     def see(
         self, stamp_ns: int, xyz_m: Array64, covariance_m2: Array64, moved_m: Array64 | None, turned_mps: float
     ) -> None:
-        """One more fix; an older one than the newest is left to others.
+        """Add a fix; one older than the newest is ignored.
 
-        moved_m: u since the fix before; turned_mps: how much the drone says its velocity has changed since then.
+        moved_m: u since the fix before; turned_mps: change of velocity that the autopilot reports since then.
         """
         if self.stamp_ns is None or stamp_ns <= self.stamp_ns:
             return
@@ -84,50 +84,50 @@ class Drift:
         keep = float(np.exp(-dt / e.drift_time_s)) if self.odometry else 1.0
         walk = e.walk_m_per_sqrt_s**2 * dt if self.odometry else 0.0
         fresh = ((e.drift_scale if self.odometry else 0.7) * turned_mps) ** 2
-        x = np.column_stack([self._x, self._of_ways])
+        x = np.column_stack([self._x, self._by_yaw])
         u = np.array([[moved[0], -moved[1], moved[0]], [moved[1], moved[0], moved[1]], [moved[2], 0.0, 0.0]])
         x, P = _step(x, self._covariance, u, dt, keep, self.q, walk, fresh)
         residual = np.column_stack([xyz_m, np.zeros((3, 2))]) - x[:3]
         x, self._covariance = _correct(x, P, residual, covariance_m2)
-        self._x, self._of_ways = x[:, 0].copy(), x[:, 1:].copy()
+        self._x, self._by_yaw = x[:, 0].copy(), x[:, 1:].copy()
         self.stamp_ns = stamp_ns
 
-    def turn_ways(self, yaw_rad: float) -> None:
-        """The ways seen so far had been turned too little by so much."""
+    def correct_yaw(self, yaw_rad: float) -> None:
+        """Turn the displacements so far by a correction of the yaw."""
         sin, cos = math.sin(yaw_rad), math.cos(yaw_rad)
-        self._x = self._x + self._of_ways @ np.array([sin, cos - 1.0])
-        self._of_ways = self._of_ways @ np.array([[cos, sin], [-sin, cos]])
+        self._x = self._x + self._by_yaw @ np.array([sin, cos - 1.0])
+        self._by_yaw = self._by_yaw @ np.array([[cos, sin], [-sin, cos]])
 
     def turn(self, R: Array64, t_m: Array64) -> None:
-        """The start frame is another one now: p <- R p + t."""
+        """Change to another map frame: p <- R p + t."""
         whole = np.zeros((6, 6))
         whole[:3, :3] = whole[3:, 3:] = R
         self._x = whole @ self._x
         self._x[:3] += t_m
-        self._of_ways = whole @ self._of_ways
+        self._by_yaw = whole @ self._by_yaw
         self._covariance = whole @ self._covariance @ whole.T
 
     def forget_velocity(self, guess_mps: Array64) -> None:
-        """What was known of b counts no more; it is guessed."""
-        self._x[3:], self._of_ways[3:] = guess_mps, 0.0
+        """Reset b to a guess with sigma UNKNOWN_MPS."""
+        self._x[3:], self._by_yaw[3:] = guess_mps, 0.0
         self._covariance[3:, :] = self._covariance[:, 3:] = 0.0
         self._covariance[3:, 3:] = UNKNOWN_MPS**2 * np.eye(3)
 
     def ahead(self, stamp_ns: int) -> tuple[Array64, Array64]:
-        """Position (3,) and its covariance (3, 3) at a time, moved by b alone."""
+        """Position (3,) and covariance (3, 3) at a time, propagated by b alone."""
         assert self.stamp_ns is not None
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         x, P = _step(self._x, self._covariance, np.zeros(3), dt, 1.0, self.q if dt > 0 else 0.0, 0.0, 0.0)
         return x[:3], P[:3, :3]
 
-    def look_along(self, direction_start: Array64, sigma_rad: float) -> None:
-        """The drone flies this way, says its camera, at whatever speed: v across it is none. Without odometry."""
+    def add_direction(self, direction_map: Array64, sigma_rad: float) -> None:
+        """Add a direction of flight by the camera, at any speed: no velocity across it. Without odometry."""
         speed = float(np.linalg.norm(self._x[3:]))
-        across = np.eye(3) - np.outer(direction_start, direction_start)
+        across = np.eye(3) - np.outer(direction_map, direction_map)
         self._x, self._covariance = _across(self._x, self._covariance, across, (speed * sigma_rad) ** 2 + 0.05**2)
 
-    def gathered(self, since_s: float) -> Array64:
-        """V(T) (3, 3), start axes."""
+    def growth_covariance_m2(self, since_s: float) -> Array64:
+        """V(T) (3, 3), map axes."""
         T = max(since_s, 0.0)
         return T**2 * self._covariance[3:, 3:] + self.q * T**3 / 3 * np.eye(3)
 

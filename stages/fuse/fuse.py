@@ -1,15 +1,14 @@
-"""One pose of the drone, fifty times a second, from everything that tells of it.
+"""Fuse: one pose of the drone, 50 times a second, from all measurements.
 
     fixes, rotations, odometries, each at its own time (estimator.py)
-      -> a chain of poses (smoother.py, or ekf.py)  -> predicted to now -> RelativePose
+      -> a chain of poses (smoother.py)  -> predicted to now -> RelativePose
 
-Now is the newest stamp heard on any port, on a grid of 20 ms; it never goes back. Every port but `fix` may be unwired,
-fall silent and return. Without `motion` the vehicle's frame at each moment is taken for the start frame, as if it were
-parked; only with `parked` is it believed to stand, so that the drone's own odometry is used.
+Now is the newest stamp received on any port, on a grid of 20 ms; it never decreases. Every port but `fix` may be
+unwired, fall silent and return. Without `motion` the vehicle frame serves as the map frame, as if the vehicle were
+parked; only with the setting `parked` is it assumed to stand, so that the drone's odometry is used.
 
-A rotation comes from RelativeRotation when RESOLVED, or from the drone's motion as the LiDAR and its autopilot tell it
-(motion_yaw.py): then FULL needs no pictures. Doubt about it (heading.py) ends FULL at once. What may be
-said of a pose: verdict.py.
+A rotation comes from a RESOLVED RelativeRotation, or from the drone's motion by LiDAR and autopilot (motion_yaw.py):
+then FULL needs no images. A contradiction of the two (fused_heading.py) ends FULL at once. States: status.py.
 
 Source: ours; DESIGN, Fusion and The graph: fuse.
 """
@@ -28,14 +27,13 @@ from flow.message import Message
 from flow.stage import Settings, Stage
 from stages.fuse.back_end import BackEnd
 from stages.fuse.chain import yaw_sigma_rad
-from stages.fuse.ekf import Ekf
 from stages.fuse.estimator import Estimator
 from stages.fuse.intake import Intake
-from stages.fuse.measurement_covariance import Known, Verdict, lost, pose
+from stages.fuse.pose_message import MapEstimate, Status, lost, pose
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
-from stages.fuse.status import Jumps, state_of, why_unbacked
-from stages.fuse.track_continuity import Following
+from stages.fuse.status import Jumps, state_of, unconfirmed_reason
+from stages.fuse.track_continuity import TrackContinuity
 from stages.geometry.se3 import position_covariance
 from stages.messages import (
     BranchState,
@@ -54,14 +52,14 @@ from stages.messages import (
 )
 
 GRID_NS = 20_000_000
-AMBIGUOUS_NS = 1_000_000_000  # a rotation up to quarter turns counts for so long
-Told = Iterator[RelativePose]
+AMBIGUOUS_NS = 1_000_000_000  # an ambiguous rotation is reported for this long
+Poses = Iterator[RelativePose]
 
 
 class FuseSettings(Settings):
     """Settings of `Fuse`."""
 
-    parked: bool = False  # the vehicle stands, whether it says so or not
+    parked: bool = False  # the vehicle stands, without VehicleMotion
     track_id: int | None = Field(None, ge=1)  # follow this drone; None: the lowest number that is TRACKING
     lag_s: float = Field(3.0, ge=0.5, le=20)
     errors: FuseErrors = FuseErrors()
@@ -69,7 +67,7 @@ class FuseSettings(Settings):
 
 
 class Fuse(Stage[FuseSettings]):
-    """The smoother."""
+    """Pose of the drone by a fixed-lag smoother, with its state."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
         {"rotation", "motion", "position", "odometry", "attitude", "visual_motion", "track", "servo", "tick"}
@@ -77,13 +75,13 @@ class Fuse(Stage[FuseSettings]):
 
     def __init__(self, settings: FuseSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._told_ns: int = 0
+        self._published_ns: int = 0
         self._waiting: list[DroneFix | RelativeRotation] = []
         self._ambiguous_ns: int | None = None
-        self._rotation_reason: str = "no rotation heard"
+        self._rotation_reason: str = "no rotation received"
         settings = self.settings
         self._estimator = Estimator(self._back_end(), settings.errors, settings.limits, settings.parked)
-        self._following = Following(settings.track_id)
+        self._track_continuity = TrackContinuity(settings.track_id)
         self._intake, self._jumps = Intake(round(settings.lag_s * 1e9)), Jumps(settings.limits)
 
     def _back_end(self) -> BackEnd:
@@ -91,71 +89,71 @@ class Fuse(Stage[FuseSettings]):
 
     @property
     def refused(self) -> Counter[str]:
-        """Messages left out because they make no sense, by reason."""
+        """Invalid messages, by reason."""
         return self._intake.refused
 
     @property
     def counters(self) -> dict[str, int]:
-        """What is refused, and how often the back end began anew."""
-        begun = {"back end begun anew": self.recoveries} if self.recoveries else {}
+        """Invalid messages by reason, and resets of the back end."""
+        begun = {"back end reset": self.recoveries} if self.recoveries else {}
         return {f"refused: {why}": count for why, count in self.refused.items()} | begun
 
     @property
     def recoveries(self) -> int:
-        """How often the back end had to be begun anew after an error of its library."""
+        """How often the back end had to be reset after an error of its library."""
         return self._estimator.chain.back.recoveries
 
-    def on_motion(self, motion: VehicleMotion) -> Told:
-        """Where the vehicle is in the start frame."""
-        if self._intake.sound(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle):
-            self._estimator.hear_vehicle(motion)
-        yield from self._tell(motion)
+    def on_motion(self, motion: VehicleMotion) -> Poses:
+        """Pose of the vehicle in `map`."""
+        if self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle):
+            self._estimator.add_vehicle_motion(motion)
+        yield from self._publish(motion)
 
-    def on_odometry(self, odometry: DroneOdometry) -> Told:
-        """The autopilot's whole estimate."""
+    def on_odometry(self, odometry: DroneOdometry) -> Poses:
+        """Pose and velocity by the autopilot."""
         numbers = (odometry.xyz_odom_m, odometry.R_odom_drone, odometry.velocity_drone_mps)
-        if self._intake.sound(odometry, "odometry", *numbers, odometry.angular_velocity_drone_radps):
-            self._estimator.hear_autopilot(odometry)
-        yield from self._tell(odometry)
+        if self._intake.is_valid(odometry, "odometry", *numbers, odometry.angular_velocity_drone_radps):
+            self._estimator.add_autopilot(odometry)
+        yield from self._publish(odometry)
 
-    def on_attitude(self, attitude: DroneAttitude) -> Told:
-        """The autopilot's attitude, used while its odometry is not heard."""
-        if self._intake.sound(attitude, "attitude", attitude.R_odom_drone, attitude.angular_velocity_drone_radps):
-            self._estimator.hear_autopilot(attitude)
-        yield from self._tell(attitude)
+    def on_attitude(self, attitude: DroneAttitude) -> Poses:
+        """Attitude by the autopilot, used without its odometry."""
+        if self._intake.is_valid(attitude, "attitude", attitude.R_odom_drone, attitude.angular_velocity_drone_radps):
+            self._estimator.add_autopilot(attitude)
+        yield from self._publish(attitude)
 
-    def on_position(self, position: DroneLocalPosition) -> Told:
-        """The autopilot's position, in the same frame."""
-        if self._intake.sound(position, "position", position.xyz_odom_m, position.velocity_odom_mps):
-            self._estimator.hear_autopilot(position)
-        yield from self._tell(position)
+    def on_position(self, position: DroneLocalPosition) -> Poses:
+        """Position by the autopilot, in frame odom."""
+        if self._intake.is_valid(position, "position", position.xyz_odom_m, position.velocity_odom_mps):
+            self._estimator.add_autopilot(position)
+        yield from self._publish(position)
 
-    def on_visual_motion(self, motion: VisualMotion) -> Told:
-        """The drone's odometry by its camera: turns, and directions without a scale."""
+    def on_visual_motion(self, motion: VisualMotion) -> Poses:
+        """Visual odometry of the drone: turns, and directions without scale."""
         direction, sigma_rad = motion.direction_from, np.array(motion.direction_sigma_rad or 0.0)
         numbers = (motion.R_from_to, motion.covariance_rad2, sigma_rad, *(() if direction is None else (direction,)))
-        if self._intake.sound(motion, "drone motion", *numbers):
-            self._estimator.hear_pictures(motion)
-        yield from self._tell(motion)
+        if self._intake.is_valid(motion, "drone motion", *numbers):
+            self._estimator.add_visual_motion(motion)
+        yield from self._publish(motion)
 
-    def on_track(self, state: TrackState) -> Told:
-        """Whether the tracker still holds the drone."""
-        self._following.hear(state)
-        yield from self._tell(state)
+    def on_track(self, state: TrackState) -> Poses:
+        """State of a track."""
+        self._track_continuity.add(state)
+        yield from self._publish(state)
 
-    def on_fix(self, fix: DroneFix) -> Told:
-        """A LiDAR position."""
+    def on_fix(self, fix: DroneFix) -> Poses:
+        """LiDAR position."""
         velocity = () if fix.velocity_vehicle_mps is None else (fix.velocity_vehicle_mps,)
         bias_covariance_m2 = np.zeros((3, 3)) if fix.bias_covariance_m2 is None else fix.bias_covariance_m2
         numbers = (fix.xyz_vehicle_m, fix.covariance_m2, bias_covariance_m2, *velocity)
-        if self._intake.sound(fix, "fix", *numbers) and self._intake.covariant(
+        if self._intake.is_valid(fix, "fix", *numbers) and self._intake.is_covariance(
             fix.covariance_m2 - bias_covariance_m2, "fix"
         ):
             self._waiting.append(fix)
-        yield from self._tell(fix)
+        yield from self._publish(fix)
 
-    def on_rotation(self, rotation: RelativeRotation) -> Told:
-        """A rotation by both cameras; only a RESOLVED one moves the pose."""
+    def on_rotation(self, rotation: RelativeRotation) -> Poses:
+        """Rotation by both cameras; only a RESOLVED one corrects the pose."""
         R, covariance = rotation.R_vehicle_drone, rotation.covariance_rad2
         self._rotation_reason = rotation.reason
         if R is None or covariance is None:
@@ -163,34 +161,36 @@ class Fuse(Stage[FuseSettings]):
         elif rotation.state is not BranchState.RESOLVED:
             self._ambiguous_ns = rotation.stamp_ns
             self._estimator.unresolved()
-        elif self._intake.sound(rotation, "rotation", R, covariance) and self._intake.covariant(covariance, "rotation"):
+        elif self._intake.is_valid(rotation, "rotation", R, covariance) and self._intake.is_covariance(
+            covariance, "rotation"
+        ):
             self._waiting.append(rotation)
-        yield from self._tell(rotation)
+        yield from self._publish(rotation)
 
-    def on_servo(self, servo: ServoState) -> Told:
-        """A clock, while a recording is replayed and nothing else is heard."""
-        yield from self._tell(servo)
+    def on_servo(self, servo: ServoState) -> Poses:
+        """Clock of a replay without other messages."""
+        yield from self._publish(servo)
 
-    def on_tick(self, tick: Tick) -> Told:
+    def on_tick(self, tick: Tick) -> Poses:
         """The host's clock."""
-        yield from self._tell(tick)
+        yield from self._publish(tick)
 
     # output
 
-    def _tell(self, message: Message) -> Told:
-        """Let time go on to a message's stamp; a pose when that passes a point of the grid."""
+    def _publish(self, message: Message) -> Poses:
+        """Advance to the stamp of a message; yield a pose when that passes a point of the grid."""
         now_ns = self._intake.pass_time(message.stamp_ns)
         if now_ns is None:
             return
         self._use_waiting(now_ns)
         self._estimator.advance(now_ns)
         at_ns = now_ns // GRID_NS * GRID_NS
-        if at_ns > self._told_ns:
-            self._told_ns = at_ns
+        if at_ns > self._published_ns:
+            self._published_ns = at_ns
             yield self._pose(at_ns)
 
     def _use_waiting(self, now_ns: int) -> None:
-        """Fixes and rotations whose moment the drone's odometry has reached, in the order of their time."""
+        """Use fixes and rotations up to the newest odometry of the drone, in time order."""
         if not self._waiting:
             return
         later: list[DroneFix | RelativeRotation] = []
@@ -198,11 +198,11 @@ class Fuse(Stage[FuseSettings]):
             if self._estimator.motions.must_wait(message.stamp_ns, now_ns):
                 later.append(message)
             elif isinstance(message, DroneFix):
-                if self._following.takes(message.track_id, message.stamp_ns):
+                if self._track_continuity.accepts(message.track_id, message.stamp_ns):
                     self._estimator.follow(message)
-                    self._estimator.see_fix(message)
+                    self._estimator.add_fix(message)
             elif message.R_vehicle_drone is not None and message.covariance_rad2 is not None:
-                self._estimator.see_rotation(
+                self._estimator.add_rotation(
                     message.stamp_ns, message.R_vehicle_drone, message.covariance_rad2, message.switches
                 )
         self._waiting = later
@@ -210,47 +210,44 @@ class Fuse(Stage[FuseSettings]):
     def _pose(self, now_ns: int) -> RelativePose:
         e = self._estimator
         known = self._known(now_ns) if e.positions.known else None
-        state, reason = state_of(known, e, self.settings.limits, now_ns, self._following.reason, self._doubt(now_ns))
+        state, reason = state_of(
+            known, e, self.settings.limits, now_ns, self._track_continuity.reason, self._ambiguity(now_ns)
+        )
         if state is PoseState.LOST or known is None:
             if known is not None:
                 e.lose()
             self._jumps.lost()
-            return lost(now_ns, self._verdict(PoseState.LOST, reason))
+            return lost(now_ns, self._status(PoseState.LOST, reason))
         self._jumps.see(known, e.resets)
-        return pose(known, self._verdict(state, reason), e.motions)
+        return pose(known, self._status(state, reason), e.motions)
 
-    def _doubt(self, now_ns: int) -> str:
-        """Why a rotation that is told is not believed; empty: none is told."""
-        unbacked_ns = self._estimator.unbacked_ns
-        if unbacked_ns is not None and now_ns - unbacked_ns < AMBIGUOUS_NS:
-            return why_unbacked(self._estimator, unbacked_ns)
+    def _ambiguity(self, now_ns: int) -> str:
+        """Why a received rotation is not used; empty: none was received."""
+        unconfirmed_ns = self._estimator.unconfirmed_ns
+        if unconfirmed_ns is not None and now_ns - unconfirmed_ns < AMBIGUOUS_NS:
+            return unconfirmed_reason(self._estimator, unconfirmed_ns)
         if self._ambiguous_ns is None or now_ns - self._ambiguous_ns >= AMBIGUOUS_NS:
             return ""
-        return f"rotation known up to quarter turns: {self._rotation_reason}"
+        return f"rotation known up to a multiple of 90 deg: {self._rotation_reason}"
 
-    def _verdict(self, state: PoseState, reason: str) -> Verdict:
+    def _status(self, state: PoseState, reason: str) -> Status:
         e = self._estimator
-        return Verdict(state, reason, e.newest_fix_ns, e.track_id, e.resets + self._jumps.number, e.positions.nis)
+        return Status(state, reason, e.newest_fix_ns, e.track_id, e.resets + self._jumps.number, e.positions.nis)
 
-    def _known(self, now_ns: int) -> Known:
-        """The estimate carried to now, with what never averages out added."""
+    def _known(self, now_ns: int) -> MapEstimate:
+        """The estimate propagated to now, with the bias covariances added."""
         e = self._estimator
         R, xyz_m, covariance = e.at(now_ns)
-        lasting = e.positions.bias_covariance_m2
+        bias_covariance_m2 = e.positions.bias_covariance_m2
         unsure = R is not None and yaw_sigma_rad(R, covariance) > math.radians(self.settings.limits.yaw_sigma_deg)
         whole = covariance.copy()
         if R is None or unsure:
-            whole[3:, 3:] = lasting + (covariance[3:, 3:] if R is None else position_covariance(covariance, R))
+            whole[3:, 3:] = bias_covariance_m2 + (
+                covariance[3:, 3:] if R is None else position_covariance(covariance, R)
+            )
         else:
-            whole[:3, :3] += self.settings.errors.rotation_lasting * e.chain.rotation_covariance_rad2
-            whole[3:, 3:] += R.T @ lasting @ R
+            whole[:3, :3] += self.settings.errors.rotation_bias_share * e.chain.rotation_covariance_rad2
+            whole[3:, 3:] += R.T @ bias_covariance_m2 @ R
         R_known = None if unsure else R
         yaw_sigma = 0.0 if R_known is None else yaw_sigma_rad(R_known, whole)
-        return Known(now_ns, R_known, xyz_m, whole, *e.positions.velocity(now_ns, R_known, yaw_sigma))
-
-
-class EkfFuse(Fuse):
-    """The same with a Kalman filter in place of the smoother, for comparison."""
-
-    def _back_end(self) -> BackEnd:
-        return Ekf()
+        return MapEstimate(now_ns, R_known, xyz_m, whole, *e.positions.velocity(now_ns, R_known, yaw_sigma))

@@ -1,7 +1,7 @@
-"""Where the drone is by the LiDAR's positions alone, how fast, and what its odometry leaves over of that.
+"""Position and velocity of the drone by LiDAR alone, and the drift of its odometry.
 
-A fix is gated by chi-square on its innovation with P + R. Eight refused in a row that agree with each other are right,
-and what is believed is wrong.
+A fix passes a chi-square gate on its innovation with P + R. Eight consecutive rejected fixes that agree with each other
+replace the estimate.
 
 Source: DESIGN, Fusion; ours.
 """
@@ -13,70 +13,70 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.fuse.correlated import Worth
+from stages.fuse.correlated import InformationInflation
 from stages.fuse.drift import Drift
 from stages.fuse.motions import Motions
 from stages.fuse.propagated import Step
 from stages.fuse.rejected import Rejected
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import distance2
+from stages.geometry.se3 import mahalanobis2
 from stages.messages import DroneFix
 
 HELD_MPS = 0.1  # noise of the autopilot's velocity beside its drift, and of its age
 GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
 
 
-class Told(NamedTuple):
-    """What a fix says of its error, start axes."""
+class MeasurementCovariance(NamedTuple):
+    """Error of a fix, map axes."""
 
     whole_m2: Array64  # (3, 3)
-    bias_covariance_m2: Array64 | None  # what of it is the same from fix to fix
+    bias_covariance_m2: Array64 | None  # the part that is the same from fix to fix
 
 
 class Positions:
-    """Of the drone that is followed."""
+    """Filters of the drone that is followed."""
 
     def __init__(self, errors: FuseErrors, motions: Motions) -> None:
         self._errors, self._motions = errors, motions
         self.lose()
 
     def lose(self) -> None:
-        """No position is known."""
+        """Drop the position."""
         self.free, self.left = Drift(self._errors, odometry=False), Drift(self._errors, odometry=True)
         self.fix_ns: int | None = None
-        self.fix_covariance_m2 = np.zeros((3, 3))  # start axes, of the newest used: what averages out,
-        self.bias_covariance_m2 = np.zeros((3, 3))  # and what never does
+        self.fix_covariance_m2 = np.zeros((3, 3))  # map axes, of the newest fix used: the part that averages out,
+        self.bias_covariance_m2 = np.zeros((3, 3))  # and the bias
         self.nis = math.nan
         self._refused = Rejected()
-        self._worth = Worth(self._errors.fix_time_s)
+        self._inflation = InformationInflation(self._errors.fix_time_s)
 
     @property
     def known(self) -> bool:
-        """Whether there is a position."""
+        """Whether a position is known."""
         return self.free.stamp_ns is not None
 
-    def find(self, fix: DroneFix, z: Array64, told: Told) -> None:
-        """The first fix, or the first that is believed again."""
+    def find(self, fix: DroneFix, z: Array64, told: MeasurementCovariance) -> None:
+        """Start at the first fix, or at the first after a reset."""
         velocity = fix.velocity_vehicle_mps
         if velocity is not None:
-            velocity = self._motions.vehicle.to_local(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
+            velocity = self._motions.vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
         self.free.start(fix.stamp_ns, z, told.whole_m2, velocity)
         self.fix_ns = fix.stamp_ns
-        self._believe(told)
+        self._accept(told)
 
-    def takes(self, stamp_ns: int, off_m: Array64, expected_m2: Array64, told: Told) -> bool | None:
-        """Whether a fix is within the gate; None: it is not; False: nor were those before, and they agree."""
-        nis = distance2(off_m, expected_m2 + told.whole_m2)
+    def accepts(self, stamp_ns: int, off_m: Array64, expected_m2: Array64, told: MeasurementCovariance) -> bool | None:
+        """True: within the gate. None: rejected. False: rejected, and it agrees with the rejected ones before it."""
+        nis = mahalanobis2(off_m, expected_m2 + told.whole_m2)
         if not nis <= GATE:
             return False if self._refused.add(stamp_ns, off_m, told.whole_m2) else None
         self._refused.clear()
         self.nis = nis
-        self._believe(told)
+        self._accept(told)
         return True
 
-    def _believe(self, told: Told) -> None:
-        variance, share = self._errors.fix_variance, self._errors.fix_lasting
+    def _accept(self, told: MeasurementCovariance) -> None:
+        variance, share = self._errors.fix_variance, self._errors.fix_bias_share
         if told.bias_covariance_m2 is None:
             self.fix_covariance_m2 = (1.0 - share) * variance * told.whole_m2
             self.bias_covariance_m2 = share * variance * told.whole_m2
@@ -87,81 +87,81 @@ class Positions:
             )
 
     def worth(self, stamp_ns: int) -> float:
-        """Factor for the variance of the fix just taken."""
-        return self._worth.factor(stamp_ns)
+        """Variance factor of the fix just accepted."""
+        return self._inflation.factor(stamp_ns)
 
     def follow(self, stamp_ns: int, z: Array64, worth: float, R_map_drone: Array64 | None) -> None:
-        """A fix that was taken: velocity without odometry, and what odometry leaves over."""
+        """Update both filters by an accepted fix: velocity without odometry, and drift of the odometry."""
         covariance_m2, trail = self.fix_covariance_m2, self._motions.motion_model.autopilot
-        v0 = None if self.free.stamp_ns is None else trail.velocity_own_mps(self.free.stamp_ns)
-        v1 = trail.velocity_own_mps(stamp_ns)
+        v0 = None if self.free.stamp_ns is None else trail.velocity_odom_mps(self.free.stamp_ns)
+        v1 = trail.velocity_odom_mps(stamp_ns)
         turned_mps = 0.0 if v0 is None or v1 is None else float(np.linalg.norm(v1 - v0))
         self.free.q = self._manoeuvre(stamp_ns)
         self.free.see(stamp_ns, z, covariance_m2 + self.bias_covariance_m2, None, turned_mps)
         self.fix_ns = max(stamp_ns, self.fix_ns or stamp_ns)
-        R_own, last_ns = self._motions.R_own_drone(stamp_ns), self.left.stamp_ns
-        if R_map_drone is None or R_own is None:
+        R_odom, last_ns = self._motions.R_odom_drone(stamp_ns), self.left.stamp_ns
+        if R_map_drone is None or R_odom is None:
             return
-        way = None if last_ns is None else self._motions.motion_model.way_own_m(last_ns, stamp_ns)
+        way = None if last_ns is None else self._motions.motion_model.displacement_odom_m(last_ns, stamp_ns)
         if way is None:
             self.left.start(stamp_ns, z, worth * covariance_m2, None)
         else:
-            self.left.see(stamp_ns, z, worth * covariance_m2, R_map_drone @ R_own.T @ way[0], turned_mps)
+            self.left.see(stamp_ns, z, worth * covariance_m2, R_map_drone @ R_odom.T @ way[0], turned_mps)
 
     def turn(self, R_new_old: Array64, t_m: Array64, velocity_mps: Array64) -> None:
-        """The start frame is another one now: p <- R p + t, v <- R v + velocity, which is no more than a guess."""
+        """Change to another map frame: p <- R p + t; the velocity R v + velocity_mps is a guess."""
         self.free.turn(R_new_old, t_m)
         self.forget_velocity(self.free.velocity_mps + velocity_mps)
 
     def forget_velocity(self, guess_mps: Array64 | None = None) -> None:
-        """The start frame moves, or moves no more: no velocity in it is known."""
+        """The map frame starts or stops moving: reset the velocity."""
         self.left = Drift(self._errors, odometry=True)
         self.free.forget_velocity(np.zeros(3) if guess_mps is None else guess_mps)
 
-    def begin_left_over(self, xyz_m: Array64, covariance_m2: Array64) -> None:
-        """From the newest fix on the odometry's own drift is watched."""
+    def start_drift(self, xyz_m: Array64, covariance_m2: Array64) -> None:
+        """Start the drift filter of the odometry at the newest fix."""
         assert self.free.stamp_ns is not None
         self.left = Drift(self._errors, odometry=True)
         self.left.start(self.free.stamp_ns, xyz_m, covariance_m2, None)
 
     def step(self, from_ns: int, to_ns: int, R_map_drone: Array64) -> Step:
-        """The drone's way between two moments."""
+        """Motion of the drone between two times."""
         since_ns = self.fix_ns if self.fix_ns is not None else from_ns
-        still = self._motions.still(to_ns)
+        still = self._motions.map_is_fixed(to_ns)
         return self._motions.motion_model.step(from_ns, to_ns, R_map_drone, self.left, self.free, still, since_ns)
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64]:
-        """Position and covariance by the fixes' velocity; how far the drone says it left that is not known better.
+        """Position and covariance by the velocity of the fixes; a reported maneuver adds to the covariance.
 
-        Of the covariance (6, 6) only the position's block counts, start axes.
+        Only the position block of the covariance (6, 6) is valid, map axes.
         """
         assert self.free.stamp_ns is not None
         self.free.q = self._manoeuvre(stamp_ns)
         xyz_m, covariance_m2 = self.free.ahead(stamp_ns)
         covariance = np.zeros((6, 6))
         covariance[3:, 3:] += covariance_m2
-        bent_m = self._motions.motion_model.bent_m(self.free.stamp_ns, stamp_ns)
-        if bent_m is not None:
-            xyz_m = xyz_m + np.array([0.0, 0.0, bent_m[2]])
-            aside_m2 = 0.5 * float(bent_m[:2] @ bent_m[:2])  # whichever way
+        manoeuvre_m = self._motions.motion_model.manoeuvre_m(self.free.stamp_ns, stamp_ns)
+        if manoeuvre_m is not None:
+            xyz_m = xyz_m + np.array([0.0, 0.0, manoeuvre_m[2]])
+            aside_m2 = 0.5 * float(manoeuvre_m[:2] @ manoeuvre_m[:2])  # in an unknown level direction
             covariance[3:, 3:] += np.diag([aside_m2, aside_m2, 0.0])
         return xyz_m, covariance
 
     def velocity(self, stamp_ns: int, R_map_drone: Array64 | None, yaw_sigma_rad: float) -> tuple[Array64, Array64]:
-        """Over ground (3,), start axes, and its covariance; by the autopilot's velocity where the rotation is known."""
+        """Over ground (3,), map axes, and its covariance; by the autopilot's velocity where the rotation is known."""
         age_s = 0.0 if self.fix_ns is None else max((stamp_ns - self.fix_ns) * 1e-9, 0.0)
-        v_own, R_own = (
-            self._motions.motion_model.autopilot.velocity_own_mps(stamp_ns),
-            self._motions.R_own_drone(stamp_ns),
+        v_odom, R_odom = (
+            self._motions.motion_model.autopilot.velocity_odom_mps(stamp_ns),
+            self._motions.R_odom_drone(stamp_ns),
         )
-        if R_map_drone is None or v_own is None or R_own is None or self.left.stamp_ns is None:
+        if R_map_drone is None or v_odom is None or R_odom is None or self.left.stamp_ns is None:
             return self.free.velocity_mps, self.free.velocity_covariance + self.free.q * age_s * np.eye(3)
-        told = R_map_drone @ R_own.T @ v_own
+        told = R_map_drone @ R_odom.T @ v_odom
         across = np.cross([0.0, 0.0, yaw_sigma_rad], told)
         spread = self.left.velocity_covariance + (self.left.q * age_s + HELD_MPS**2) * np.eye(3)
         return told + self.left.velocity_mps, spread + np.outer(across, across)
 
     def _manoeuvre(self, stamp_ns: int) -> float:
-        """Density of the acceleration that nobody tells [m2/s3]."""
-        told = self._motions.motion_model.autopilot.velocity_own_mps(stamp_ns) is not None
-        return self._errors.manoeuvre_told if told else self._errors.manoeuvre
+        """Density of the acceleration that is not measured [m2/s3]."""
+        told = self._motions.motion_model.autopilot.velocity_odom_mps(stamp_ns) is not None
+        return self._errors.manoeuvre_with_odometry if told else self._errors.manoeuvre

@@ -1,12 +1,11 @@
-"""How the drone moved between two moments, from whatever tells it, with the covariance of that.
+"""Motion of the drone between two times, by the best odometry available, with its covariance.
 
-    D = O(t0)^-1 O(t1) with b dt:   R = R_own_drone(t0)^T R_own_drone(t1)
-                                     t = R_own_drone(t0)^T (p_own(t1) - p_own(t0)) + R_map_drone(t0)^T b dt
+    D = O(t0)^-1 O(t1) with b dt:   R = R_odom_drone(t0)^T R_odom_drone(t1)
+                                     t = R_odom_drone(t0)^T (p_odom(t1) - p_odom(t0)) + R_map_drone(t0)^T b dt
 
-O is the autopilot's pose in its frame `own` (stages/odometry/drone/trajectory.py), b what it creeps away by (drift.py).
-Without its positions b is the drone's whole velocity; without its attitude the turn is the drone's pictures', or
-nobody's. Beyond
-the newest word a velocity is kept, which is worth less the longer it is kept.
+O is the autopilot's pose in frame `odom` (stages/odometry/drone/trajectory.py), b its drift velocity (drift.py).
+Without the autopilot's positions b is the whole velocity of the drone; without its attitude the turn comes from visual
+odometry, or is unknown. Beyond the newest message the velocity is kept, with a variance that grows.
 
 Source: DESIGN, Fusion: covariance dt (Q_d + Ad Q_v Ad^T); ours: drift that lasts, V(T) by its increments.
 """
@@ -21,38 +20,38 @@ import numpy as np
 from stages.fuse.drift import Drift
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64
-from stages.odometry.drone.trajectory import AHEAD_NS, AutopilotTrail, PictureTrail, turn_between
+from stages.odometry.drone.trajectory import AHEAD_NS, AutopilotTrajectory, VisualTrajectory, rotation_between
 
-VEHICLE_TURN_RAD_PER_S = math.radians(20.0)  # of a vehicle that does not tell its turns
-CLOCK_S = 0.003  # the autopilot's stamps against ours
-BEYOND_MPS2 = 3.0  # a velocity kept too long: the drone's acceleration
+VEHICLE_TURN_RAD_PER_S = math.radians(20.0)  # turn rate of a vehicle without VehicleMotion
+CLOCK_S = 0.003  # error of the autopilot's stamps against the host clock
+BEYOND_MPS2 = 3.0  # acceleration of the drone while its velocity is kept
 
 
 @dataclass(frozen=True)
 class Step:
-    """The drone's way from one moment to another, in its own axes at the first."""
+    """Motion of the drone from one time to another, in drone axes at the first."""
 
     R: Array64
     t_m: Array64
     covariance: Array64  # (6, 6) rotation before translation, tangent at the later body
-    by_odometry: bool  # the autopilot told the way; else it is the velocity kept
-    turn_told: bool
+    by_odometry: bool  # displacement by the autopilot; else by the kept velocity
+    turn_measured: bool
 
 
 class MotionModel:
-    """All that carries a pose through time."""
+    """Propagates a pose through time."""
 
     def __init__(self, errors: FuseErrors) -> None:
         self._errors = errors
-        self.autopilot = AutopilotTrail()
-        self.pictures = PictureTrail()
+        self.autopilot = AutopilotTrajectory()
+        self.images = VisualTrajectory()
 
     def step(
         self, from_ns: int, to_ns: int, R_map_drone: Array64, left: Drift, free: Drift, still: bool, since_ns: int
     ) -> Step:
-        """From one moment to another; R_map_drone at the first.
+        """Motion from one time to another; R_map_drone at the first.
 
-        left, free: what is left over by the autopilot's odometry, and the motion without it. `still`: the start frame
+        left, free: what is left over by the autopilot's odometry, and the motion without it. `still`: the map frame
         is known to stand still; else an odometry over ground tells nothing in it. `since_ns`: time of the newest fix.
         """
         dt = (to_ns - from_ns) * 1e-9
@@ -60,17 +59,21 @@ class MotionModel:
         R, turn_rad2, told = self._turn(from_ns, to_ns)
         if not still:
             turn_rad2 += (VEHICLE_TURN_RAD_PER_S * dt) ** 2
-        own = self.way_own_m(from_ns, to_ns) if still and left.stamp_ns is not None else None
-        R_own = None if own is None else self._R_own_held(from_ns)
-        by_odometry = own is not None and R_own is not None
+        own = self.displacement_odom_m(from_ns, to_ns) if still and left.stamp_ns is not None else None
+        R_odom = None if own is None else self._R_odom_held(from_ns)
+        by_odometry = own is not None and R_odom is not None
         drift = left if by_odometry else free
         ago, then = (from_ns - since_ns) * 1e-9, (to_ns - since_ns) * 1e-9
-        gathered = drift.gathered(then) - drift.gathered(ago) if then >= ago else drift.gathered(abs(dt))
-        spread = gathered + e.walk_m_per_sqrt_s**2 * abs(dt) * np.eye(3)
+        growth_covariance_m2 = (
+            drift.growth_covariance_m2(then) - drift.growth_covariance_m2(ago)
+            if then >= ago
+            else drift.growth_covariance_m2(abs(dt))
+        )
+        spread = growth_covariance_m2 + e.walk_m_per_sqrt_s**2 * abs(dt) * np.eye(3)
         t = dt * (R_map_drone.T @ drift.velocity_mps)
-        if own is not None and R_own is not None:
+        if own is not None and R_odom is not None:
             way_m, beyond_s = own
-            t = t + R_own.T @ way_m
+            t = t + R_odom.T @ way_m
             spread = spread + (0.5 * BEYOND_MPS2 * beyond_s**2) ** 2 * np.eye(3)
         R_map_after = R_map_drone @ R
         Q = np.zeros((6, 6))
@@ -78,59 +81,59 @@ class MotionModel:
         Q[3:, 3:] = R_map_after.T @ spread @ R_map_after
         return Step(R, t, Q, by_odometry, told)
 
-    def R_own_drone(self, stamp_ns: int) -> Array64 | None:
-        """The autopilot's attitude, turned on a little beyond its newest word; None: not known."""
-        return self.autopilot.R_own_drone(stamp_ns)
+    def R_odom_drone(self, stamp_ns: int) -> Array64 | None:
+        """The autopilot's attitude, extrapolated shortly beyond its newest message; None: not known."""
+        return self.autopilot.R_odom_drone(stamp_ns)
 
-    def way_own_m(self, from_ns: int, to_ns: int) -> tuple[Array64, float] | None:
-        """Way (3,) in frame own by the autopilot's positions, and how long beyond its newest word [s]; None: unknown.
+    def displacement_odom_m(self, from_ns: int, to_ns: int) -> tuple[Array64, float] | None:
+        """Displacement (3,) in odom by the autopilot, and the time beyond its newest message [s]; None: unknown.
 
-        A way over a jump of its estimate is unknown.
+        A displacement over a jump of its estimate is unknown.
         """
-        newest = self.autopilot.place_ns
+        newest = self.autopilot.position_ns
         if newest is None or max(from_ns, to_ns) > newest + 2 * AHEAD_NS:
             return None
         last = newest + AHEAD_NS
-        a, b = self.autopilot.place(min(from_ns, last)), self.autopilot.place(min(to_ns, last))
+        a, b = self.autopilot.position(min(from_ns, last)), self.autopilot.position(min(to_ns, last))
         if a is None or b is None or a[1] != b[1]:
             return None
         beyond_ns = max(to_ns, from_ns) - newest
         way = b[0] - a[0]
         kept_s = (max(to_ns - last, 0) - max(from_ns - last, 0)) * 1e-9
-        velocity = self.autopilot.velocity_own_mps(last) if kept_s else None
+        velocity = self.autopilot.velocity_odom_mps(last) if kept_s else None
         if velocity is not None:
             way = way + kept_s * velocity
         return way, max(beyond_ns, 0) * 1e-9
 
-    def bent_m(self, from_ns: int, to_ns: int) -> Array64 | None:
-        """How far (3,) the autopilot's way, frame own, is from straight on at the first moment's velocity."""
-        way, velocity = self.way_own_m(from_ns, to_ns), self.autopilot.velocity_own_mps(from_ns)
+    def manoeuvre_m(self, from_ns: int, to_ns: int) -> Array64 | None:
+        """How far (3,) the autopilot's way, frame odom, is from straight on at the first moment's velocity."""
+        way, velocity = self.displacement_odom_m(from_ns, to_ns), self.autopilot.velocity_odom_mps(from_ns)
         return None if way is None or velocity is None else way[0] - (to_ns - from_ns) * 1e-9 * velocity
 
-    def _R_own_held(self, stamp_ns: int) -> Array64 | None:
+    def _R_odom_held(self, stamp_ns: int) -> Array64 | None:
         newest = self.autopilot.attitude_ns
-        return None if newest is None else self.autopilot.R_own_drone(min(stamp_ns, newest + AHEAD_NS))
+        return None if newest is None else self.autopilot.R_odom_drone(min(stamp_ns, newest + AHEAD_NS))
 
     def _turn(self, from_ns: int, to_ns: int) -> tuple[Array64, float, bool]:
-        """R, its variance [rad2] about each axis, and whether anybody told."""
+        """R, its variance [rad2] about each axis, and whether it was measured."""
         dt = abs(to_ns - from_ns) * 1e-9
         newest = self.autopilot.attitude_ns
         if newest is not None:
             last = newest + AHEAD_NS
-            a, b = self.autopilot.R_own_drone(min(from_ns, last)), self.autopilot.R_own_drone(min(to_ns, last))
+            a, b = self.autopilot.R_odom_drone(min(from_ns, last)), self.autopilot.R_odom_drone(min(to_ns, last))
             beyond_s = max(max(from_ns, to_ns) - newest, 0) * 1e-9
             if a is not None and b is not None and beyond_s < 2e-9 * AHEAD_NS:
                 change = self.autopilot.rate_radps(to_ns) - self.autopilot.rate_radps(from_ns)
                 walk = math.radians(self._errors.turn_walk_deg_per_sqrt_s) ** 2 * dt
-                kept = (0.5 * max(1.0, self.autopilot.rate_radps(to_ns)) * beyond_s**2) ** 2  # rates change
+                kept = (0.5 * max(1.0, self.autopilot.rate_radps(to_ns)) * beyond_s**2) ** 2  # the turn rate may change
                 return a.T @ b, walk + (CLOCK_S * change) ** 2 + kept, True
-        turn = turn_between(self.autopilot, self.pictures, from_ns, to_ns)
-        return turn.R_from_to, turn.variance_rad2, turn.sure
+        turn = rotation_between(self.autopilot, self.images, from_ns, to_ns)
+        return turn.R_from_to, turn.variance_rad2, turn.measured
 
     def newest_ns(self, now_ns: int, positions: bool) -> int | None:
-        """Up to when the drone's motion has been told by who was heard in the last second; None: nobody was."""
-        said = [self.autopilot.attitude_ns, self.autopilot.place_ns if positions else None]
+        """Time up to which sources of the last second measured the drone's motion; None: there were none."""
+        said = [self.autopilot.attitude_ns, self.autopilot.position_ns if positions else None]
         heard = [ns for ns in said if ns is not None and now_ns - ns < 1_000_000_000]
-        if not heard and self.pictures.newest_ns is not None and now_ns - self.pictures.newest_ns < 1_000_000_000:
-            heard = [self.pictures.newest_ns]
+        if not heard and self.images.newest_ns is not None and now_ns - self.images.newest_ns < 1_000_000_000:
+            heard = [self.images.newest_ns]
         return min(heard) if heard else None

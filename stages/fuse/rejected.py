@@ -1,4 +1,4 @@
-"""Measurements refused in a row: when they agree with each other it is the estimate that is wrong.
+"""Consecutive rejected measurements: when they agree with each other, the estimate is wrong.
 
 Source: DESIGN, Fusion: restart after 8 mutually consistent rejections; ours: agreement by a line through them.
 """
@@ -10,7 +10,7 @@ from collections import deque
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import distance2
+from stages.geometry.se3 import mahalanobis2
 
 ENOUGH = 8
 LONGEST_NS = 3_000_000_000
@@ -18,7 +18,7 @@ AGREE = 3.0  # chi-square for each degree of freedom
 
 
 class Rejected:
-    """The last ones, with what they were off the estimate."""
+    """The last rejected measurements, with their residuals."""
 
     def __init__(self) -> None:
         self._off: deque[tuple[int, Array64, Array64]] = deque(maxlen=ENOUGH)
@@ -27,13 +27,13 @@ class Rejected:
         return len(self._off)
 
     def clear(self) -> None:
-        """One was accepted."""
+        """A measurement was accepted: start over."""
         self._off.clear()
 
     def add(self, stamp_ns: int, off: Array64, covariance: Array64) -> bool:
-        """One more refused, off (3,) the estimate; True: enough of them lie on a line in time.
+        """Add a rejected measurement with its residual `off` (3,); True: enough of them lie on a line in time.
 
-        What comes twice counts once.
+        A repeated stamp counts once.
         """
         if any(stamp_ns == ns for ns, _, _ in self._off):
             return False
@@ -46,5 +46,5 @@ class Rejected:
         y = np.array([e for _, e, _ in self._off])
         A = np.column_stack([np.ones(len(t)), t])
         left = y - A @ np.linalg.solve(A.T @ A, A.T @ y)
-        chi2 = sum(distance2(left[i], C) for i, (_, _, C) in enumerate(self._off))
+        chi2 = sum(mahalanobis2(left[i], C) for i, (_, _, C) in enumerate(self._off))
         return bool(chi2 <= AGREE * 3 * (ENOUGH - 2))

@@ -1,13 +1,12 @@
-"""The back end as a fixed-lag smoother: a chain of poses X_k = T_map_drone, ten a second, the last three seconds.
+"""Fixed-lag smoother: a chain of poses X_k = T_map_drone, ten a second, over the last three seconds.
 
-    X_k -- X_k+1     BetweenFactorPose3: the drone's own way (carried.py)
-    X_k              GPSFactorArm: a LiDAR position, PoseRotationPrior3D: a rotation, each carried to its own time by
-                     the drone's way since X_k, so that late data move the pose where they belong
+    X_k -- X_k+1     BetweenFactorPose3: the drone's own motion (propagated.py)
+    X_k              GPSFactorArm: a LiDAR position, PoseRotationPrior3D: a rotation, each referred to its own time by
+                     the drone's motion since X_k, so that late data correct the pose of their time
     X_k              AttitudeFactorPose3: the autopilot's vertical
 
-Whatever goes in is checked first: a factor on a key that has left the window, or one NaN, would spoil the smoother for
-good. What it raises all the same (GTSAM's errors arrive as RuntimeError, IndexError, ValueError) ends in a new smoother
-that begins where the last good one was.
+Each input is checked first: a factor on a key that has left the window, or one NaN, would invalidate the smoother for
+good. Errors of GTSAM (RuntimeError, IndexError, ValueError) start a new smoother at the last valid pose.
 
 Source: Kaess et al., iSAM2 (IJRR 2012); GTSAM 4.3 nonlinear/IncrementalFixedLagSmoother; DESIGN, Fusion.
 """
@@ -25,11 +24,11 @@ from gtsam.symbol_shorthand import X
 from stages.fuse.back_end import HUBER
 from stages.fuse.propagated import Step
 from stages.geometry.frames import Array64
-from stages.geometry.se3 import carried_covariance, good_covariance
+from stages.geometry.se3 import composed_covariance, is_covariance
 
-RAISED = (RuntimeError, IndexError, ValueError)  # what GTSAM's wrapper makes of C++ exceptions
-FLOOR = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)  # a step of no length is known no better
-FARTHEST_M = 1e5  # from where it began
+RAISED = (RuntimeError, IndexError, ValueError)  # C++ exceptions through GTSAM's wrapper
+FLOOR = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)  # smallest covariance of a step
+FARTHEST_M = 1e5  # distance from the start
 SLACK_S = 1e-3  # GTSAM keeps a pose for so much longer than it is asked for here: its times are floats
 UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 
@@ -52,7 +51,7 @@ class Smoother:
         self.R_map_drone, self.xyz_map_m, self.covariance = np.eye(3), np.zeros(3), np.eye(6)
 
     def start(self, stamp_ns: int, R_map_drone: Array64, xyz_map_m: Array64, covariance: Array64) -> None:
-        """A new smoother with one pose."""
+        """Start a new smoother with one pose."""
         params: Any = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(0.01)
         params.relinearizeSkip = 1
@@ -71,9 +70,9 @@ class Smoother:
         self._smoother.update(graph, values, {X(self._number): 0.0})
 
     def extend(self, stamp_ns: int, step: Step, up_drone: Array64 | None, tilt_rad2: float) -> None:
-        """One pose more."""
+        """Add a pose."""
         R, t_m = self.R_map_drone @ step.R, self.xyz_map_m + self.R_map_drone @ step.t_m
-        P = carried_covariance(self.covariance, step.R, step.t_m, step.covariance + FLOOR)
+        P = composed_covariance(self.covariance, step.R, step.t_m, step.covariance + FLOOR)
         before, self._number = self._number, self._number + 1
         way = gtsam.Pose3(gtsam.Rot3(step.R), step.t_m)
         noise = gtsam.noiseModel.Gaussian.Covariance(step.covariance + FLOOR)
@@ -91,9 +90,9 @@ class Smoother:
         self._guarded(lambda: self._smoother.update(graph, values, {X(self._number): at_s}), R, t_m, P)
 
     def near(self, stamp_ns: int) -> tuple[int, Array64, Array64]:
-        """The newest pose of the chain not after a time; the oldest for what is older.
+        """Newest pose of the chain not after a time; the oldest one for older times.
 
-        Where it cannot be read, the chain begins anew at its newest.
+        Where it cannot be read, the chain restarts at its newest pose.
         """
         key_ns, number = self._keys[0]
         for at_ns, candidate in reversed(self._keys):
@@ -105,7 +104,7 @@ class Smoother:
                 pose = self._smoother.calculateEstimatePose3(X(number))
                 return key_ns, pose.rotation().matrix(), pose.translation()
             except RAISED:
-                self._begin_anew(self.R_map_drone, self.xyz_map_m, self.covariance)
+                self._reinitialise(self.R_map_drone, self.xyz_map_m, self.covariance)
         return self.stamp_ns, self.R_map_drone, self.xyz_map_m
 
     def add_position(self, key_ns: int, step: Step, xyz_m: Array64, covariance_m2: Array64) -> bool:
@@ -127,9 +126,9 @@ class Smoother:
     def _add(
         self, key_ns: int, numbers: tuple[Array64, ...], covariance: Array64, factor: Callable[[int, Any], Any]
     ) -> bool:
-        """Checked, then handed to the smoother. False: the numbers make no sense, or their pose has left the window."""
+        """Check a factor and add it. False: invalid numbers, or its pose has left the window."""
         number = next((number for at_ns, number in self._keys if at_ns == key_ns), None)
-        if number is None or not all(np.isfinite(v).all() for v in numbers) or not good_covariance(covariance):
+        if number is None or not all(np.isfinite(v).all() for v in numbers) or not is_covariance(covariance):
             return False
         graph = gtsam.NonlinearFactorGraph()
         graph.add(factor(X(number), _robust(covariance)))
@@ -137,7 +136,7 @@ class Smoother:
         return self._guarded(lambda: self._smoother.update(graph, gtsam.Values(), {}), *now)
 
     def _guarded(self, update: Callable[[], Any], R: Array64, xyz_m: Array64, covariance: Array64) -> bool:
-        """Update and read the newest pose; where that fails, begin anew at the one given."""
+        """Update and read the newest pose; on failure restart at the given pose."""
         newest = None
         try:
             update()
@@ -145,20 +144,20 @@ class Smoother:
         except RAISED:
             pass
         if newest is None:
-            self._begin_anew(R, xyz_m, covariance)
+            self._reinitialise(R, xyz_m, covariance)
             return False
         self.R_map_drone, self.xyz_map_m, self.covariance = newest
         return True
 
-    def _begin_anew(self, R: Array64, xyz_m: Array64, covariance: Array64) -> None:
+    def _reinitialise(self, R: Array64, xyz_m: Array64, covariance: Array64) -> None:
         self.recoveries += 1
         self.start(self.stamp_ns, R, xyz_m, covariance)
 
     def _newest(self) -> tuple[Array64, Array64, Array64] | None:
-        """The newest pose with its covariance; None: they are nonsense."""
+        """The newest pose with its covariance; None: not valid."""
         pose = self._smoother.calculateEstimatePose3(X(self._number))
         covariance = self._smoother.marginalCovariance(X(self._number))
         near = bool(np.abs(pose.translation() - self._first_m).max() < FARTHEST_M)  # NaN compares false
-        if not (near and good_covariance(covariance)):
+        if not (near and is_covariance(covariance)):
             return None
         return pose.rotation().matrix(), pose.translation(), covariance

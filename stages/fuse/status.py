@@ -1,10 +1,10 @@
-"""What may be said of a pose: the state with its reason, and whether it jumped.
+"""State of the pose with its reason, and detection of jumps.
 
     LOST            no position, or its sigma or age is beyond the limit
-    POSITION_ONLY   the LiDAR sees the drone, its yaw is not known
-    AMBIGUOUS       as before; a rotation is told, up to quarter turns, or two tell different ones
+    POSITION_ONLY   the LiDAR measures the drone, its yaw is not known
+    AMBIGUOUS       as before; a rotation is known up to a multiple of 90 deg, or two sources contradict each other
     FULL            position and rotation
-    COASTING        the same, but the LiDAR has not seen the drone for a while: its odometry carries the pose
+    COASTING        the same without a recent LiDAR position: odometry propagates the pose
 
 Source: ours.
 """
@@ -16,9 +16,9 @@ import math
 import numpy as np
 
 from stages.fuse.estimator import Estimator
-from stages.fuse.measurement_covariance import Known
+from stages.fuse.pose_message import MapEstimate
 from stages.fuse.settings import FuseLimits
-from stages.heading.fused_heading import STREETS_NS
+from stages.heading.fused_heading import VP_ROTATION_NS
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import PoseState
 
@@ -26,7 +26,7 @@ JUMP_MPS2, JUMP_RAD_PER_S = 10.0, 4.0  # what a drone can do between two outputs
 
 
 def state_of(
-    known: Known | None, estimator: Estimator, limits: FuseLimits, now_ns: int, tracker: str, doubt: str
+    known: MapEstimate | None, estimator: Estimator, limits: FuseLimits, now_ns: int, tracker: str, ambiguity: str
 ) -> tuple[PoseState, str]:
     """The state, and why. `tracker`: what it says; `doubt`: why a rotation that is told is not believed, or empty."""
     e = estimator
@@ -41,53 +41,53 @@ def state_of(
         return PoseState.LOST, f"no LiDAR position for {age_s:.1f} s"
     if not worst_m <= limits.lost_sigma_m:
         return PoseState.LOST, f"position known to {worst_m:.1f} m only, {age_s:.1f} s after the last by LiDAR"
-    unseen = f"; the LiDAR has not seen it for {age_s:.1f} s" if age_s > limits.coast_after_s else ""
+    unseen = f"; no LiDAR position for {age_s:.1f} s" if age_s > limits.coast_after_s else ""
     if known.R_map_drone is None:
-        if e.north.heading.contradiction:
-            return PoseState.AMBIGUOUS, e.north.heading.contradiction + unseen
-        if doubt:
-            return PoseState.AMBIGUOUS, doubt + unseen
-        if e.on_trial and e.north.known(now_ns) is not None:
-            return PoseState.POSITION_ONLY, f"found elsewhere: does it move as the drone says it does?{unseen}"
-        return PoseState.POSITION_ONLY, f"heading not known: {e.north.by_motion.reason}{unseen}"
+        if e.odometry_yaw.heading.contradiction:
+            return PoseState.AMBIGUOUS, e.odometry_yaw.heading.contradiction + unseen
+        if ambiguity:
+            return PoseState.AMBIGUOUS, ambiguity + unseen
+        if e.unverified and e.odometry_yaw.known(now_ns) is not None:
+            return PoseState.POSITION_ONLY, f"found at another position: its motion is compared with odometry{unseen}"
+        return PoseState.POSITION_ONLY, f"heading not known: {e.odometry_yaw.by_motion.reason}{unseen}"
     if unseen:
-        return PoseState.COASTING, f"carried by odometry{unseen}"
+        return PoseState.COASTING, f"propagated by odometry{unseen}"
     return PoseState.FULL, _why_rotation(e)
 
 
 def _why_rotation(estimator: Estimator) -> str:
-    """Who tells the rotation."""
-    if estimator.from_streets:
+    """Which sources give the rotation."""
+    if estimator.from_vanishing_points:
         return "rotation by both cameras"
-    streets_ns, seen = estimator.streets_ns, estimator.north.by_motion.reason
-    cameras = streets_ns is not None and estimator.chain.back.stamp_ns - streets_ns < STREETS_NS
+    vp_rotation_ns, seen = estimator.vp_rotation_ns, estimator.odometry_yaw.by_motion.reason
+    cameras = vp_rotation_ns is not None and estimator.chain.back.stamp_ns - vp_rotation_ns < VP_ROTATION_NS
     return f"rotation by {'both cameras and ' if cameras else ''}the drone's motion; {seen}"
 
 
-def why_unbacked(estimator: Estimator, stamp_ns: int) -> str:
-    """Why the streets' rotation, RESOLVED, is not believed, and what helps."""
-    if not estimator.motions.still(stamp_ns):
-        return "the streets' rotation is not believed: how the vehicle moves is not told, so no motion can agree"
-    seen = estimator.north.by_motion.reason
-    return f"the streets' rotation waits for the drone's motion to agree: fly some metres, any way; {seen}"
+def unconfirmed_reason(estimator: Estimator, stamp_ns: int) -> str:
+    """Why a RESOLVED rotation by vanishing points is not used, and what helps."""
+    if not estimator.motions.map_is_fixed(stamp_ns):
+        return "the rotation by vanishing points is not used: without the vehicle's motion no motion can confirm it"
+    seen = estimator.odometry_yaw.by_motion.reason
+    return f"the rotation by vanishing points needs the drone's motion to confirm it: fly some metres; {seen}"
 
 
 class Jumps:
-    """Counts poses that are not where the one before, carried on, would be: the autopilot has to be told."""
+    """Counts jumps: poses away from the propagated pose before. The autopilot receives the count as resets."""
 
     def __init__(self, limits: FuseLimits) -> None:
         self._limits = limits
-        self._last: Known | None = None
+        self._last: MapEstimate | None = None
         self._resets_told = 0
         self.number = 0
 
     def lost(self) -> None:
-        """No pose any more: where it is found again is not where it was."""
+        """The pose is lost; the next one counts as a jump."""
         self.number += self._last is not None
         self._last = None
 
-    def see(self, known: Known, resets: int) -> None:
-        """One more pose; `resets` of the estimator are counted there already."""
+    def see(self, known: MapEstimate, resets: int) -> None:
+        """Add a pose; `resets` of the estimator are counted there already."""
         last, told = self._last, self._resets_told
         self._last, self._resets_told = known, resets
         if last is None or resets > told:

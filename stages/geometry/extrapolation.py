@@ -1,23 +1,22 @@
-"""A vehicle past its last word: on as it went, for a while, and less sure the longer nobody tells.
+"""Extrapolation of the vehicle's pose beyond its newest measurement, and detection of jumps in a pose source.
 
-    off by   a t^2 / 2 in place,   alpha t^2 / 2 in its turn        t since the last word
+Within t seconds after the newest pose an unobserved maneuver moves the vehicle away from its extrapolated pose by
 
-Its speed is that of a tenth of a second or more: words that arrive together would make a parked vehicle race.
-Three go on past a word, each as far as an error of its own costs:
+    a t^2 / 2   in position [m],        alpha t^2 / 2   in rotation [rad]
 
-    VehicleTrajectory (trail.py)     TRAIL_S, straight on; USUAL. Asked at every slice, and the next word, which
-    comes soon,
-                                takes the error back
-    VehicleMotionSelector (ego)   JOINT_S, along its bend; UNTOLD. Another source is laid on there: the error
-    stays
-    VisualLidarOdometry (ego)            to the next picture, straight on; UNTOLD, and a turn at any usual rate: how
-    it turned is
-                                what its pictures would have told
+Speeds are averaged over at least 0.1 s: poses that arrive together would otherwise give a parked vehicle a speed.
 
-A word that is farther off than HARD lets it be is false, or its start frame has jumped, as when an odometry is started
-afresh: it is left out, and when three such in a row lie on one smooth way, that is the way, in another start frame.
-After seconds of silence HARD lets it be nearly anywhere: a small jump in them is not seen. So after three odd words one
-that may be true is not enough: nonsense that goes on would have one such in time.
+| user                  | model and horizon                      | bound                                       |
+| --------------------- | -------------------------------------- | ------------------------------------------- |
+| VehicleTrajectory     | constant velocity, EXTRAPOLATION_S     | USUAL_MANEUVER: the next pose ends the error |
+| VehicleMotionSelector | constant turn rate, SOURCE_CHANGE_S    | GAP_MANEUVER: the error stays                |
+| VisualLidarOdometry   | constant velocity, to the next image   | GAP_MANEUVER, and any usual turn rate        |
+
+A pose further from the extrapolation than HARDEST_MANEUVER allows is an outlier, or the source's start frame has jumped
+(an odometry that restarts). The pose is rejected. When AGREE rejected poses in a row lie on one smooth path, they are
+accepted as poses in a new start frame. After seconds of silence HARDEST_MANEUVER allows nearly any pose, so a small
+jump during a silence is not detected. For the same reason one plausible pose does not end a series of AGREE outliers:
+continuing nonsense would produce a plausible pose sooner or later.
 
 Source: ours.
 """
@@ -34,147 +33,149 @@ from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import VehicleMotion
 
-TRAIL_S = 0.3
-JOINT_S = 1.0
-LEAST_SPAN_NS = 100_000_000  # of the last motion, over which its speed is taken
-MOST_SPAN_NS = 1_000_000_000
-OFF_M, OFF_RAD = 0.25, 0.1  # a word so far off is false, or the start frame has jumped
-LATE_S = 0.03  # a busy host stamps a word so much too late: at speed that is a way
-FASTEST_MPS, FASTEST_RADPS = 60.0, 2.0  # where no speed is known yet
-AGREE = 3
-Placed = tuple[Array64, Array64]  # R (3, 3), xyz (3,) [m] in one frame
+EXTRAPOLATION_S = 0.3
+SOURCE_CHANGE_S = 1.0
+LEAST_SPAN_NS = 100_000_000  # shortest interval over which a speed is averaged
+MOST_SPAN_NS = 1_000_000_000  # longest interval over which a speed is averaged
+OFF_M, OFF_RAD = 0.25, 0.1  # jump gate without any maneuver
+LATE_S = 0.03  # timestamp error of a busy host; multiplied by the speed it is a position error
+FASTEST_MPS, FASTEST_RADPS = 60.0, 2.0  # bounds while no speed is known
+AGREE = 3  # consistent poses that establish a new start frame
+Pose3 = tuple[Array64, Array64]  # R (3, 3) and xyz (3,) [m] in one frame
 
 
 @dataclass(frozen=True)
-class MayChange:
-    """How hard a vehicle may speed up, brake or swerve while nobody tells."""
+class ManeuverBound:
+    """Acceleration and angular acceleration that a vehicle may have without a measurement of them."""
 
     acceleration_mps2: float
     turn_radps2: float
 
-    def place_m(self, seconds: float) -> float:
-        """How far that takes it from where it would be."""
+    def displacement_m(self, seconds: float) -> float:
+        """Deviation [m] from the extrapolated position after a time."""
         return 0.5 * self.acceleration_mps2 * seconds**2
 
     def turn_rad(self, seconds: float) -> float:
-        """And how far it turns it."""
+        """Deviation [rad] from the extrapolated rotation after a time."""
         return 0.5 * self.turn_radps2 * seconds**2
 
 
-USUAL = MayChange(2.0, 0.2)  # one sigma, in traffic, from one word to the next
-UNTOLD = MayChange(3.0, 0.5)  # one sigma, over a gap in which anything may begin
-HARD = MayChange(6.0, 1.5)  # no vehicle on the road does much more: full braking, a swerve
+USUAL_MANEUVER = ManeuverBound(2.0, 0.2)  # one sigma in traffic, between two poses
+GAP_MANEUVER = ManeuverBound(3.0, 0.5)  # one sigma over a gap in the measurements
+HARDEST_MANEUVER = ManeuverBound(6.0, 1.5)  # limit of a road vehicle: full braking, evasive steering
 
 
-class JumpWatch:
-    """Which words are believed, by whether each is where those before lead."""
+class JumpGate:
+    """Accepts or rejects the poses of one source, by whether each is reachable from the poses before it."""
 
     def __init__(self) -> None:
-        self._odd: deque[VehicleMotion] = deque(maxlen=AGREE)  # left out since the newest believed
+        self._rejected: deque[VehicleMotion] = deque(maxlen=AGREE)  # since the newest accepted pose
 
-    def hear(self, motion: VehicleMotion, leads: bool) -> tuple[VehicleMotion, ...]:
-        """What is believed now: the word; nothing yet; or three at once, and the start frame may be another one."""
-        if not leads or len(self._odd) == AGREE:
-            self._odd.append(motion)
-            if not _go_on(tuple(self._odd)):
+    def add(self, motion: VehicleMotion, reachable: bool) -> tuple[VehicleMotion, ...]:
+        """The poses accepted now: this one, none, or the last AGREE together, which may have a new start frame."""
+        if not reachable or len(self._rejected) == AGREE:
+            self._rejected.append(motion)
+            if not _is_smooth(tuple(self._rejected)):
                 return ()
-        believed = (motion,) if leads else tuple(self._odd)
-        self._odd.clear()
-        return believed
+        accepted = (motion,) if reachable else tuple(self._rejected)
+        self._rejected.clear()
+        return accepted
 
 
-class BelievedWords:
-    """The words of one source that are believed, in its own start frame."""
+class AcceptedPoses:
+    """The accepted poses of one source, in that source's start frame."""
 
     def __init__(self) -> None:
-        self._watch = JumpWatch()
-        self._words: deque[VehicleMotion] = deque(maxlen=64)  # of one start frame
-        self.speed_mps: float | None = None  # as they told it last; None: they never did
+        self._gate = JumpGate()
+        self._poses: deque[VehicleMotion] = deque(maxlen=64)  # of one start frame
+        self.speed_mps: float | None = None  # newest known speed; None: never known
 
     @property
     def newest_ns(self) -> int | None:
-        """Time of the newest."""
-        return self._words[-1].stamp_ns if self._words else None
+        """Stamp of the newest accepted pose; None before the first."""
+        return self._poses[-1].stamp_ns if self._poses else None
 
-    def hear(self, motion: VehicleMotion) -> tuple[VehicleMotion, ...]:
-        """What is believed now, as JumpWatch says; a word that is not newer than the last is to be left out before."""
-        believed = (motion,) if not self._words else self._watch.hear(motion, self._leads_to(motion))
-        if len(believed) > 1:
-            self._words.clear()  # of another start frame
-        self._words.extend(believed)
-        if believed:
-            told_mps = speed_mps(list(self._words))
-            self.speed_mps = self.speed_mps if told_mps is None else told_mps
-        return believed
+    def add(self, motion: VehicleMotion) -> tuple[VehicleMotion, ...]:
+        """The poses accepted now, as in `JumpGate.add`. The caller drops a pose that is not newer than the last."""
+        accepted = (motion,) if not self._poses else self._gate.add(motion, self._is_reachable(motion))
+        if len(accepted) > 1:
+            self._poses.clear()  # of another start frame
+        self._poses.extend(accepted)
+        if accepted:
+            newest_mps = speed_mps(list(self._poses))
+            self.speed_mps = self.speed_mps if newest_mps is None else newest_mps
+        return accepted
 
-    def _leads_to(self, motion: VehicleMotion) -> bool:
-        words, last_ns = list(self._words), self._words[-1].stamp_ns
-        at = along_its_bend(words, motion.stamp_ns, until_s=math.inf)
-        expected, told = ((m.R_map_vehicle, m.xyz_map_m) for m in (at, motion))
-        return leads_to(expected, told, (motion.stamp_ns - last_ns) * 1e-9, speed_mps(words))
+    def _is_reachable(self, motion: VehicleMotion) -> bool:
+        poses, last_ns = list(self._poses), self._poses[-1].stamp_ns
+        predicted = constant_turn_rate(poses, motion.stamp_ns, until_s=math.inf)
+        expected, measured = ((m.R_map_vehicle, m.xyz_map_m) for m in (predicted, motion))
+        return is_reachable(expected, measured, (motion.stamp_ns - last_ns) * 1e-9, speed_mps(poses))
 
 
-def leads_to(expected: Placed, told: Placed, seconds: float, speed_mps: float | None) -> bool:
-    """Whether the vehicle may be there, so long after the last word, which led it to another place.
+def is_reachable(expected: Pose3, measured: Pose3, seconds: float, speed_mps: float | None) -> bool:
+    """Whether a measured pose lies within HARDEST_MANEUVER of the extrapolated one.
 
-    `speed_mps` is the speed it was led on at, None where none is known yet.
+    `seconds`: since the newest accepted pose. `speed_mps`: the speed of the extrapolation; None: not known.
     """
-    place_m, turn_rad = OFF_M + HARD.place_m(seconds), OFF_RAD + HARD.turn_rad(seconds)
+    limit_m, limit_rad = OFF_M + HARDEST_MANEUVER.displacement_m(seconds), OFF_RAD + HARDEST_MANEUVER.turn_rad(seconds)
     if speed_mps is None:
-        place_m, turn_rad = place_m + FASTEST_MPS * seconds, turn_rad + FASTEST_RADPS * seconds
+        limit_m, limit_rad = limit_m + FASTEST_MPS * seconds, limit_rad + FASTEST_RADPS * seconds
     else:
-        place_m += LATE_S * speed_mps
-    (R, xyz_m), (R_told, told_m) = expected, told
-    near = float(np.linalg.norm(told_m - xyz_m)) <= place_m
-    return near and float(np.linalg.norm(log_rotation(R.T @ R_told))) <= turn_rad
+        limit_m += LATE_S * speed_mps
+    (R, xyz_m), (R_measured, measured_m) = expected, measured
+    near = float(np.linalg.norm(measured_m - xyz_m)) <= limit_m
+    return near and float(np.linalg.norm(log_rotation(R.T @ R_measured))) <= limit_rad
 
 
-def _go_on(words: tuple[VehicleMotion, ...]) -> bool:
-    """Whether three in a row are of one smooth way: the second step goes on as the first."""
-    if len(words) < AGREE:
+def _is_smooth(poses: tuple[VehicleMotion, ...]) -> bool:
+    """Whether AGREE poses lie on one smooth path: the second step continues the first."""
+    if len(poses) < AGREE:
         return False
-    a, b, c = words
+    a, b, c = poses
     first_s, second_s = (b.stamp_ns - a.stamp_ns) * 1e-9, (c.stamp_ns - b.stamp_ns) * 1e-9
     if min(first_s, second_s) <= 0.0:
         return False
     share, longer_s = second_s / first_s, max(first_s, second_s)
     off_m = c.xyz_map_m - b.xyz_map_m - share * (b.xyz_map_m - a.xyz_map_m)
     turns = log_rotation(a.R_map_vehicle.T @ b.R_map_vehicle), log_rotation(b.R_map_vehicle.T @ c.R_map_vehicle)
-    near = float(np.linalg.norm(off_m)) <= OFF_M + 2.0 * HARD.place_m(longer_s)
-    return near and float(np.linalg.norm(turns[1] - share * turns[0])) <= OFF_RAD + 2.0 * HARD.turn_rad(longer_s)
-
-
-def along_its_bend(told: list[VehicleMotion], stamp_ns: int, until_s: float = JOINT_S) -> VehicleMotion:
-    """Where the vehicle is some time after the last word (`told`, oldest first), less sure as UNTOLD says.
-
-    Its speed and turn, in its own axes, are those over the last tenth of a second or more; after `until_s` it is taken
-    to stand where it is then, and what it is unsure by grows on.
-    """
-    last = told[-1]
-    untold_s = (stamp_ns - last.stamp_ns) * 1e-9
-    span_ns, before = _speed_span(told)
-    share = min(untold_s, until_s) / (span_ns * 1e-9) if span_ns else 0.0
-    R = last.R_map_vehicle
-    turn = log_rotation(np.ascontiguousarray(before.R_map_vehicle.T @ R))
-    way_m = exp_rotation(-0.5 * turn) @ before.R_map_vehicle.T @ (last.xyz_map_m - before.xyz_map_m)  # own axes
-    unsure = np.diag([UNTOLD.turn_rad(untold_s) ** 2] * 3 + [UNTOLD.place_m(untold_s) ** 2] * 3)
-    return VehicleMotion(
-        stamp_ns=stamp_ns,
-        xyz_map_m=last.xyz_map_m + R @ exp_rotation(0.5 * share * turn) @ (share * way_m),
-        R_map_vehicle=R @ exp_rotation(share * turn),
-        covariance=None if last.covariance is None else last.covariance + unsure,
+    near = float(np.linalg.norm(off_m)) <= OFF_M + 2.0 * HARDEST_MANEUVER.displacement_m(longer_s)
+    return near and float(np.linalg.norm(turns[1] - share * turns[0])) <= OFF_RAD + 2.0 * HARDEST_MANEUVER.turn_rad(
+        longer_s
     )
 
 
-def speed_mps(told: list[VehicleMotion]) -> float | None:
-    """The speed that the words tell; None: they tell none."""
-    span_ns, before = _speed_span(told)
-    return float(np.linalg.norm(told[-1].xyz_map_m - before.xyz_map_m)) / (span_ns * 1e-9) if span_ns else None
+def constant_turn_rate(poses: list[VehicleMotion], stamp_ns: int, until_s: float = SOURCE_CHANGE_S) -> VehicleMotion:
+    """The vehicle's pose at a time after the newest of `poses` (oldest first), with constant body rates.
+
+    Velocity and turn rate, in vehicle axes, are averaged over the last LEAST_SPAN_NS or more. After `until_s` the pose
+    stays constant. The covariance grows by GAP_MANEUVER all the time; it is None where the newest pose has none.
+    """
+    last = poses[-1]
+    gap_s = (stamp_ns - last.stamp_ns) * 1e-9
+    span_ns, before = _speed_span(poses)
+    share = min(gap_s, until_s) / (span_ns * 1e-9) if span_ns else 0.0
+    R = last.R_map_vehicle
+    turn = log_rotation(np.ascontiguousarray(before.R_map_vehicle.T @ R))
+    displacement_m = exp_rotation(-0.5 * turn) @ before.R_map_vehicle.T @ (last.xyz_map_m - before.xyz_map_m)  # vehicle
+    growth = np.diag([GAP_MANEUVER.turn_rad(gap_s) ** 2] * 3 + [GAP_MANEUVER.displacement_m(gap_s) ** 2] * 3)
+    return VehicleMotion(
+        stamp_ns=stamp_ns,
+        xyz_map_m=last.xyz_map_m + R @ exp_rotation(0.5 * share * turn) @ (share * displacement_m),
+        R_map_vehicle=R @ exp_rotation(share * turn),
+        covariance=None if last.covariance is None else last.covariance + growth,
+    )
 
 
-def _speed_span(told: list[VehicleMotion]) -> tuple[int, VehicleMotion]:
-    """Since which word the speed is taken, and how long before the last that was; 0: no speed is known."""
-    last = told[-1]
-    spans_ns = ((last.stamp_ns - m.stamp_ns, m) for m in reversed(told))
+def speed_mps(poses: list[VehicleMotion]) -> float | None:
+    """Mean speed over the last LEAST_SPAN_NS or more; None where the poses do not determine one."""
+    span_ns, before = _speed_span(poses)
+    return float(np.linalg.norm(poses[-1].xyz_map_m - before.xyz_map_m)) / (span_ns * 1e-9) if span_ns else None
+
+
+def _speed_span(poses: list[VehicleMotion]) -> tuple[int, VehicleMotion]:
+    """The interval [ns] over which the speed is averaged and the pose at its start; 0: no speed is known."""
+    last = poses[-1]
+    spans_ns = ((last.stamp_ns - m.stamp_ns, m) for m in reversed(poses))
     span_ns, before = next(((span, m) for span, m in spans_ns if span >= LEAST_SPAN_NS), (0, last))
     return (span_ns, before) if span_ns <= MOST_SPAN_NS else (0, last)

@@ -1,17 +1,23 @@
-"""Frames and rigid transforms. The one frame table of the project.
+"""The frames of the project, and rigid transforms between them.
 
-| frame     | origin, axes                                                                        |
-| --------- | ----------------------------------------------------------------------------------- |
-| vehicle   | at the vehicle camera; x forward, y left, z up                                       |
-| drone     | at the drone body's centre; x forward, y left, z up                                  |
-| world     | the vehicle frame at the start, z up                                                 |
-| turntable | on the servo's axis, z up along it, turned by the servo angle                         |
-| lidar     | Velodyne's: z_lidar is the spin axis, azimuth 0 along +y_lidar, growing towards +x    |
-| camera    | at the lens; z along the optical axis, x right in the image, y down                   |
+| frame     | origin and axes                                                                          |
+| --------- | ---------------------------------------------------------------------------------------- |
+| map       | the vehicle frame at the start of the vehicle's odometry; gravity aligned, z up (REP-105) |
+| odom      | the local frame of the drone's autopilot; z up, any yaw; continuous within one segment    |
+| vehicle   | at the vehicle camera; x forward, y left, z up                                            |
+| turntable | on the servo's axis; z up along the axis; rotates with the servo angle                    |
+| lidar     | VLP-16: z_lidar is the spin axis, azimuth 0 along +y_lidar, growing towards +x_lidar      |
+| drone     | at the centre of the drone's body; x forward, y left, z up                                |
+| camera    | at the lens; z along the optical axis, x right in the image, y down                       |
+| world     | the ground truth frame of the simulator; no stage uses it                                 |
 
-`T_a_b` takes points from b to a: p_a = T_a_b @ p_b (4x4, float64). NED and FRD live in links/mavlink only.
+The vehicle camera is mounted on `vehicle`, the drone camera on `drone` (CameraMount). Directions and rotations derived
+from images are given in the axes of the mount, not of the lens. A reset of the autopilot's estimate begins a new
+segment of `odom`: displacements within a segment are meaningful, those across segments are not.
 
-Source: DESIGN, Frames; VLP-16 user manual 63-9243, section 9 (lidar axes).
+`T_a_b` takes points from b to a: p_a = T_a_b @ p_b (4x4, float64). NED and FRD occur in links/mavlink only.
+
+Source: DESIGN, Frames; REP-105; VLP-16 user manual 63-9243, section 9 (lidar axes).
 """
 
 from __future__ import annotations
@@ -33,7 +39,7 @@ class _Settings(BaseModel):
 
 
 def rotation_from_rpy_deg(rpy_deg: Vector3) -> Array64:
-    """R = Rz(yaw) Ry(pitch) Rx(roll), fixed axes (URDF's convention), degrees. (3, 3)."""
+    """Rotation (3, 3) R = Rz(yaw) Ry(pitch) Rx(roll), fixed axes as in URDF, in degrees."""
     roll, pitch, yaw = (math.radians(a) for a in rpy_deg)
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
     return np.array(
@@ -46,7 +52,7 @@ def rotation_from_rpy_deg(rpy_deg: Vector3) -> Array64:
 
 
 def rotation_from_quaternion_xyzw(quaternion_xyzw: tuple[float, float, float, float]) -> Array64:
-    """Rotation of a quaternion (x, y, z, w), normalised first. (3, 3)."""
+    """Rotation (3, 3) of a quaternion (x, y, z, w), which is normalised first."""
     x, y, z, w = np.asarray(quaternion_xyzw, dtype=np.float64) / math.hypot(*quaternion_xyzw)
     return np.array(
         [
@@ -58,9 +64,9 @@ def rotation_from_quaternion_xyzw(quaternion_xyzw: tuple[float, float, float, fl
 
 
 def quaternions_xyzw(rotations: Array64) -> Array64:
-    """(n, 4), w >= 0, of rotations (n, 3, 3): the eigenvector of Bar-Itzhack's symmetric matrix (2000)."""
+    """Quaternions (n, 4) with w >= 0 of rotations (n, 3, 3), by the eigenvectors of Bar-Itzhack's matrix (2000)."""
     R = rotations
-    K = np.zeros((len(R), 4, 4))  # its lower half, which is what eigh reads
+    K = np.zeros((len(R), 4, 4))  # eigh reads the lower half only
     K[:, 0, 0] = R[:, 0, 0] - R[:, 1, 1] - R[:, 2, 2]
     K[:, 1, 1] = R[:, 1, 1] - R[:, 0, 0] - R[:, 2, 2]
     K[:, 2, 2] = R[:, 2, 2] - R[:, 0, 0] - R[:, 1, 1]
@@ -83,13 +89,13 @@ def rotations_from_xyzw(quaternions: Array64) -> Array64:
 
 
 def rotation_z(angle_rad: float) -> Array64:
-    """Turn about z by `angle_rad`, counter-clockwise seen from above. (3, 3)."""
+    """Rotation (3, 3) about z by `angle_rad`, counter-clockwise seen from above."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def heading_rad(R: Array64) -> float:
-    """Angle of a rotation (3, 3) that is nearly one about z; what is left of a tilt is shared by both axes."""
+    """Yaw [rad] of a rotation (3, 3) that is nearly about z; a remaining tilt affects both axes equally."""
     return math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
 
 
@@ -102,7 +108,7 @@ def transform(rotation: Array64, translation_m: Array64) -> Array64:
 
 
 class Pose(_Settings):
-    """A transform as people write it: `{xyz_m: [0, 0, 1.2], rpy_deg: [0, 0, 90]}` or with `quaternion_xyzw`."""
+    """A transform in a configuration file: `{xyz_m: [0, 0, 1.2], rpy_deg: [0, 0, 90]}` or with `quaternion_xyzw`."""
 
     xyz_m: Vector3 = (0.0, 0.0, 0.0)
     rpy_deg: Vector3 | None = None
@@ -133,7 +139,7 @@ class Harmonic(_Settings):
     phase_deg: float = 0.0
 
 
-UNCALIBRATED_DEG = 0.3  # of an MX-28 as it is bought: the encoder's error, half the gear's play, a zero set by eye
+UNCALIBRATED_DEG = 0.3  # MX-28 without calibration: encoder error, half the gear play, zero set by eye
 
 
 def _is_zero(value: float) -> bool:
@@ -145,14 +151,13 @@ def _is_uncalibrated(value: float) -> bool:
 
 
 class LidarMount(_Settings):
-    """How the LiDAR sits on the vehicle: T_vehicle_lidar = T_vehicle_turntable Rz(angle) T_turntable_lidar.
+    """Mount of the LiDAR on the vehicle: T_vehicle_lidar = T_vehicle_turntable Rz(angle) T_turntable_lidar.
 
-    angle = sign * (servo position - zero) - encoder error. `turns: false` is a LiDAR bolted down, without servo.
+    angle = sign * (servo position - zero) - encoder error. `turns: false` is a fixed LiDAR without servo.
     A servo stamp is corrected by `servo_time_offset_s` before interpolation (positive: the servo's stamps are early).
-    `servo_play_deg` is the gear's play, end to end: the table hangs back by half of it (`stages/sweep/turntable.py`).
-    A file holds it only where there is some. `pointing_sigma_deg` is how well the angle is known, one sigma, of an
-    error that
-    lasts; `grd calibrate` writes it.
+    `servo_play_deg` is the gear's backlash, end to end: the table lags by half of it (`stages/sweep/turntable.py`).
+    Files contain it only where it is not zero. `pointing_sigma_deg` is one sigma of the angle's systematic error;
+    `grd calibrate` writes it.
     """
 
     T_vehicle_turntable: Pose = Pose()
@@ -176,9 +181,9 @@ class LidarMount(_Settings):
         return angle
 
     def servo_rad(self, turntable_rad: float) -> float:
-        """Servo position that turns the table to an angle [rad]: the inverse of `turntable_rad`, the error by rounds.
+        """Servo position for a turntable angle [rad]: the inverse of `turntable_rad`, by fixed-point iteration.
 
-        The error is below 5 deg and smooth: each round wins a digit or more.
+        The encoder error is below 5 deg and smooth: each iteration gains at least one digit.
         """
         servo = math.radians(self.servo_zero_deg) + self.servo_sign * turntable_rad
         for _ in range(4 if self.servo_harmonics else 0):

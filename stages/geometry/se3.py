@@ -1,4 +1,4 @@
-"""Rigid motions as (R, t) and their covariances: rotation before translation, tangent at the body: T exp(xi).
+"""Covariances of rigid transforms (R, t): rotation before translation, tangent at the body, T exp(xi).
 
 Source: Sola, Deray, Atchuthan, A micro Lie theory (2018), III.C; ours.
 """
@@ -12,14 +12,14 @@ from stages.kernels.geometry.so3 import hat
 
 
 def adjoint(R: Array64, t: Array64) -> Array64:
-    """Ad (6, 6) of (R, t), rotation first: [[R, 0], [[t]x R, R]]."""
+    """Adjoint (6, 6) of the transform (R, t), rotation first: [[R, 0], [[t]x R, R]]."""
     A = np.zeros((6, 6))
     A[:3, :3], A[3:, 3:], A[3:, :3] = R, R, hat(np.ascontiguousarray(t)) @ R
     return A
 
 
-def carried_covariance(P: Array64, R_step: Array64, t_step_m: Array64, Q: Array64) -> Array64:
-    """Covariance (6, 6) of T D, D = (R, t) with covariance Q, from that of T: Ad(D^-1) P Ad(D^-1)^T + Q."""
+def composed_covariance(P: Array64, R_step: Array64, t_step_m: Array64, Q: Array64) -> Array64:
+    """Covariance (6, 6) of T D: Ad(D^-1) P Ad(D^-1)^T + Q, where T has covariance P and D = (R, t) has Q."""
     A = np.zeros((6, 6))
     A[:3, :3] = R_step.T
     A[3:, 3:] = R_step.T
@@ -29,16 +29,16 @@ def carried_covariance(P: Array64, R_step: Array64, t_step_m: Array64, Q: Array6
 
 
 def position_covariance(P: Array64, R: Array64) -> Array64:
-    """(3, 3) of the position, in the axes that R leads to."""
+    """Position covariance (3, 3) [m^2] in the parent frame of R, from a pose covariance P (6, 6)."""
     return R @ P[3:, 3:] @ R.T
 
 
-def distance2(e: Array64, S: Array64) -> float:
-    """e^T S^-1 e: chi-square distributed where S is the covariance of e."""
+def mahalanobis2(e: Array64, S: Array64) -> float:
+    """Squared Mahalanobis distance e^T S^-1 e: chi-square distributed where S is the covariance of e."""
     return float(e @ np.linalg.solve(S, e))
 
 
-def good_covariance(P: Array64) -> bool:
+def is_covariance(P: Array64) -> bool:
     """Whether a matrix is finite, symmetric and positive definite."""
     if not np.isfinite(P).all() or np.abs(P - P.T).max() > 1e-6 * np.abs(P).max():
         return False

@@ -1,10 +1,11 @@
-"""The vehicle's trail: where it was at each moment, so that what stands still in the world stands still in memory.
+"""The vehicle's trajectory in frame map, interpolated and briefly extrapolated.
 
-Frame local: the vehicle's own odometry frame (T_map_vehicle) without its jumps. Without VehicleMotion it is the
-vehicle's frame itself: right for a parked vehicle; then what stands still seems to move with a driving one.
+Frame map is the start frame of the vehicle's odometry (T_map_vehicle), without the jumps of that odometry. Without
+VehicleMotion it equals the vehicle frame: correct for a parked vehicle; for a moving one static objects then seem to
+move.
 
-The odometry's start frame may jump, as when it is started afresh (vehicle_onward.py says how that is told from a false
-pose). The new one is then laid on where the trail had the vehicle: the local frame goes on, and no jump is a speed.
+The start frame of the odometry may jump, as when the odometry restarts (extrapolation.py detects it). The new start
+frame is then aligned with the trajectory, so that frame map continues and the jump does not become a velocity:
 
     T_map_vehicle = T_map_source T_source_vehicle,   T_map_source = T_map_vehicle(t) T_source_vehicle(t)^-1
 
@@ -18,188 +19,191 @@ from collections import deque
 
 import numpy as np
 
-from stages.geometry.extrapolation import LEAST_SPAN_NS, TRAIL_S, USUAL, JumpWatch, leads_to
+from stages.geometry.extrapolation import EXTRAPOLATION_S, LEAST_SPAN_NS, USUAL_MANEUVER, JumpGate, is_reachable
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation, nearest_rotation, nearly_rotation
-from stages.kernels.geometry.trajectory import STEP_NS, to_local, to_vehicle
+from stages.kernels.geometry.trajectory import STEP_NS, to_map, to_vehicle
 from stages.messages import VehicleMotion
 
-KEPT = 512
-TOGETHER_NS = 10_000_000  # poses that arrived so soon after one another are no speed
-STILL_NS = 700_000_000  # how the vehicle moves is known so long after its word: by pictures it comes 5 times a second
-AFRESH_NS = 2_000_000_000  # in so long a silence an odometry may have been started afresh, and nothing tells
-FURTHEST_NS = round(1e9 * TRAIL_S)  # beyond the newest pose
+KEPT = 512  # poses
+TOGETHER_NS = 10_000_000  # shortest interval that gives a speed
+RECENT_NS = 700_000_000  # the motion counts as known this long after a pose; visual odometry delivers 5 poses a second
+RESTART_NS = 2_000_000_000  # during a silence this long an odometry may restart without notice
+FURTHEST_NS = round(1e9 * EXTRAPOLATION_S)  # extrapolation beyond the newest pose
 
 
 class VehicleTrajectory:
-    """T_map_vehicle over time: linear between two poses; a little beyond the newest as it went in the last 0.1 s."""
+    """T_map_vehicle over time: linear between poses, constant velocity for EXTRAPOLATION_S beyond the newest."""
 
     def __init__(self, joined: bool = True) -> None:
-        """`joined`: a start frame that jumped is laid on the one before; else another local frame begins."""
-        self._joined, self._watch = joined, JumpWatch()
-        self._local_start: tuple[Array64, Array64] | None = None  # R, t; None: the local frame is the start frame
-        self._poses: deque[tuple[int, Array64, Array64]] = deque(maxlen=KEPT)
-        self._onward: tuple[Array64, Array64] | None = None  # see `_went`, since the newest pose
-        self._begun_ns = 0  # poses before lie in another frame
-        self._known: dict[int, tuple[Array64, Array64]] = {}  # asked since the newest pose: the same moments are, often
+        """`joined`: a new start frame is aligned with the trajectory; otherwise it begins a new frame map."""
+        self._joined, self._gate = joined, JumpGate()
+        self._T_map_source: tuple[Array64, Array64] | None = None  # R, t; None: identity
+        self._poses: deque[tuple[int, Array64, Array64]] = deque(maxlen=KEPT)  # stamp, R_map_vehicle, t_map_vehicle
+        self._rates: tuple[Array64, Array64] | None = None  # cache of `_newest_rates`
+        self._frame_start_ns = 0  # earlier poses lie in another frame
+        self._cache: dict[int, tuple[Array64, Array64]] = {}  # results of `at` since the newest pose
 
     @property
     def known(self) -> bool:
-        """Whether the vehicle told its motion at all."""
+        """Whether there is any pose."""
         return bool(self._poses)
 
     def known_at(self, stamp_ns: int) -> bool:
-        """Whether its newest word is not so old that it may be anywhere by now."""
-        return bool(self._poses) and stamp_ns - self._poses[-1][0] < STILL_NS
+        """Whether the newest pose is recent enough (RECENT_NS) for the motion to be known."""
+        return bool(self._poses) and stamp_ns - self._poses[-1][0] < RECENT_NS
 
     @property
     def newest_ns(self) -> int | None:
-        """Time of its newest word."""
+        """Stamp of the newest pose; None before the first."""
         return self._poses[-1][0] if self._poses else None
 
     def add(self, motion: VehicleMotion) -> bool:
-        """One more pose. True: what was remembered in the local frame may lie elsewhere from now on.
+        """Add a pose. True: positions remembered in frame map may be wrong from now on.
 
-        One that is not newer than the last is ignored, one that is not where those before lead is left out, until three
-        agree: then the start frame is another one. That is laid on the old one, which is no more than a guess after a
-        silence: an odometry started afresh in it may begin anywhere near, and nothing tells. Where frames are not
-        joined, another begins, and so it does after each silence.
+        A pose that is not newer than the last is ignored. One that is not reachable from the poses before is rejected
+        until AGREE of them are consistent: then the start frame has jumped. The new start frame is aligned with the
+        trajectory. After a silence that alignment is a guess, because an odometry that restarts unnoticed may begin
+        near the extrapolated pose. Where frames are not joined, a new frame begins, also after each silence.
         """
         if not self._poses:
             self._append(motion)
             return not self._joined
         if motion.stamp_ns <= self._poses[-1][0]:
             return False
-        heard = self._joined or self.known_at(motion.stamp_ns)
-        poses = self._watch.hear(motion, heard and self._leads_to(motion))
-        another = len(poses) > 1
+        continuous = self._joined or self.known_at(motion.stamp_ns)
+        poses = self._gate.add(motion, continuous and self._is_reachable(motion))
+        new_frame = len(poses) > 1
         silent_ns = poses[0].stamp_ns - self._poses[-1][0] if poses else 0
-        guessed = silent_ns >= AFRESH_NS or (another and silent_ns >= STILL_NS)
-        elsewhere = guessed if self._joined else another
-        if another:
-            self._begin_anew(poses[0])
+        guessed = silent_ns >= RESTART_NS or (new_frame and silent_ns >= RECENT_NS)
+        displaced = guessed if self._joined else new_frame
+        if new_frame:
+            self._start_frame(poses[0])
         for pose in poses:
             self._append(pose)
-        return elsewhere
+        return displaced
 
-    def _leads_to(self, motion: VehicleMotion) -> bool:
-        """Whether a pose is where the ones before lead."""
-        newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self._begun_ns)
+    def _is_reachable(self, motion: VehicleMotion) -> bool:
+        """Whether a pose is reachable from the poses before it."""
+        newest_ns, oldest_ns = self._poses[-1][0], max(self._poses[0][0], self._frame_start_ns)
         speed_known = newest_ns - oldest_ns >= TOGETHER_NS
-        straight_on, seconds = self.straight_on(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
-        speed_mps = float(np.linalg.norm(self._went()[1])) if speed_known else None
-        return leads_to(straight_on, self._local(motion), seconds, speed_mps)
+        expected, seconds = self.constant_velocity(motion.stamp_ns), (motion.stamp_ns - newest_ns) * 1e-9
+        speed_mps = float(np.linalg.norm(self._newest_rates()[1])) if speed_known else None
+        return is_reachable(expected, self._in_map(motion), seconds, speed_mps)
 
-    def _local(self, motion: VehicleMotion) -> tuple[Array64, Array64]:
-        """A pose in the local frame."""
-        if self._local_start is None:
+    def _in_map(self, motion: VehicleMotion) -> tuple[Array64, Array64]:
+        """A pose of the source, in frame map."""
+        if self._T_map_source is None:
             return motion.R_map_vehicle, motion.xyz_map_m
-        R, t = self._local_start
+        R, t = self._T_map_source
         return R @ motion.R_map_vehicle, R @ motion.xyz_map_m + t
 
     def _append(self, motion: VehicleMotion) -> None:
-        self._known.clear()
-        self._onward = None
-        self._poses.append((motion.stamp_ns, *self._local(motion)))
+        self._cache.clear()
+        self._rates = None
+        self._poses.append((motion.stamp_ns, *self._in_map(motion)))
 
-    def _begin_anew(self, first: VehicleMotion) -> None:
-        """From this pose on the start frame is another one: how it went before says nothing."""
+    def _start_frame(self, first: VehicleMotion) -> None:
+        """Begin a new start frame with this pose; earlier poses no longer contribute to the velocity."""
         if self._joined:
             R, t = self.at(first.stamp_ns)
             R_map_source = nearest_rotation(R @ first.R_map_vehicle.T)
-            self._local_start = R_map_source, t - R_map_source @ first.xyz_map_m
-        self._begun_ns = first.stamp_ns
+            self._T_map_source = R_map_source, t - R_map_source @ first.xyz_map_m
+        self._frame_start_ns = first.stamp_ns
 
     def at(self, stamp_ns: int) -> tuple[Array64, Array64]:
-        """R_map_vehicle (3, 3) and t_map_vehicle (3,) [m]."""
+        """R_map_vehicle (3, 3) and t_map_vehicle (3,) [m]; identity without any pose, constant before the first."""
         poses = self._poses
-        if stamp_ns in self._known:
-            return self._known[stamp_ns]
+        if stamp_ns in self._cache:
+            return self._cache[stamp_ns]
         if not poses:
             return np.eye(3), np.zeros(3)
         if len(poses) == 1 or stamp_ns <= poses[0][0]:
             return poses[0][1], poses[0][2]
-        if len(self._known) >= KEPT:
-            self._known.clear()
+        if len(self._cache) >= KEPT:
+            self._cache.clear()
         if stamp_ns > poses[-1][0]:
-            self._known[stamp_ns] = self._beyond(min(stamp_ns - poses[-1][0], FURTHEST_NS) * 1e-9)
-            return self._known[stamp_ns]
+            self._cache[stamp_ns] = self._beyond(min(stamp_ns - poses[-1][0], FURTHEST_NS) * 1e-9)
+            return self._cache[stamp_ns]
         after = len(poses) - 1
-        if stamp_ns < poses[-2][0]:  # of the newest step, mostly
+        if stamp_ns < poses[-2][0]:  # most queries fall between the two newest poses
             after = bisect_right(poses, stamp_ns, key=lambda pose: pose[0])
         (t0, R0, x0), (t1, R1, x1) = poses[after - 1], poses[after]
         share = (stamp_ns - t0) / (t1 - t0)
-        # poses are milliseconds apart: the mean of the two, made a rotation again
-        self._known[stamp_ns] = nearly_rotation(R0 + share * (R1 - R0)), x0 + share * (x1 - x0)
-        return self._known[stamp_ns]
+        # The poses are milliseconds apart: interpolate linearly and project back to a rotation.
+        self._cache[stamp_ns] = nearly_rotation(R0 + share * (R1 - R0)), x0 + share * (x1 - x0)
+        return self._cache[stamp_ns]
 
     def _beyond(self, seconds: float) -> tuple[Array64, Array64]:
-        """R and t so long after the newest pose."""
+        """R and t some seconds after the newest pose, with constant rates."""
         _, R, t = self._poses[-1]
-        turn_radps, velocity_mps = self._went()
+        turn_radps, velocity_mps = self._newest_rates()
         return R @ exp_rotation(seconds * turn_radps), t + seconds * velocity_mps
 
-    def _went(self) -> tuple[Array64, Array64]:
-        """Turn (3,) [rad/s], own axes, and velocity (3,) [m/s] up to the newest pose; it stood, if nothing tells."""
-        if self._onward is None:
+    def _newest_rates(self) -> tuple[Array64, Array64]:
+        """Angular velocity (3,) [rad/s], vehicle axes, and velocity (3,) [m/s], map axes; zero if not observed."""
+        if self._rates is None:
             newest_ns, R, t = self._poses[-1]
             span_ns, R_then, t_then = TOGETHER_NS, R, t
             for then_ns, R_before, t_before in reversed(self._poses):
-                if then_ns < self._begun_ns:
+                if then_ns < self._frame_start_ns:
                     break
                 if newest_ns - then_ns >= TOGETHER_NS:
                     span_ns, R_then, t_then = newest_ns - then_ns, R_before, t_before
                 if span_ns >= LEAST_SPAN_NS:
                     break
-            self._onward = log_rotation(R_then.T @ R) / (span_ns * 1e-9), (t - t_then) / (span_ns * 1e-9)
-        return self._onward
+            self._rates = log_rotation(R_then.T @ R) / (span_ns * 1e-9), (t - t_then) / (span_ns * 1e-9)
+        return self._rates
 
-    def in_this_frame(self, stamp_ns: int) -> bool:
-        """Whether what `at` tells of a moment is in the frame that is told now."""
-        return self._joined or stamp_ns >= self._begun_ns
+    def in_current_frame(self, stamp_ns: int) -> bool:
+        """Whether the result of `at` for a time lies in the current frame map."""
+        return self._joined or stamp_ns >= self._frame_start_ns
 
-    def in_newest_frame(self, stamp_ns: int) -> tuple[Array64, Array64]:
-        """R and t in the frame that is told now; before that began: straight back, as it goes in it."""
-        if self.in_this_frame(stamp_ns):
+    def at_in_current_frame(self, stamp_ns: int) -> tuple[Array64, Array64]:
+        """R and t in the current frame map; before its first pose extrapolated backwards with constant velocity."""
+        if self.in_current_frame(stamp_ns):
             return self.at(stamp_ns)
-        first_ns, R, t = next(pose for pose in self._poses if pose[0] >= self._begun_ns)
-        turn_radps, velocity_mps = self._went()
+        first_ns, R, t = next(pose for pose in self._poses if pose[0] >= self._frame_start_ns)
+        turn_radps, velocity_mps = self._newest_rates()
         back_s = (stamp_ns - first_ns) * 1e-9
         return R @ exp_rotation(back_s * turn_radps), t + back_s * velocity_mps
 
     def rate_radps(self, stamp_ns: int) -> Array64:
-        """How the vehicle turns (3,), its own axes; zero where nothing tells."""
+        """Angular velocity (3,) in vehicle axes; zero where no pose gives it."""
         before, after = self.at(stamp_ns - STEP_NS // 2)[0], self.at(stamp_ns + STEP_NS // 2)[0]
         return log_rotation(before.T @ after) / (STEP_NS * 1e-9)
 
     def velocity_mps(self, stamp_ns: int) -> Array64:
-        """The vehicle's own velocity (3,) in the local frame."""
+        """The vehicle's velocity (3,) in frame map."""
         return (self.at(stamp_ns + STEP_NS)[1] - self.at(stamp_ns)[1]) / (STEP_NS * 1e-9)
 
-    def straight_on(self, stamp_ns: int) -> tuple[Array64, Array64]:
-        """R and t where the newest pose's speed and turn lead, however long that is ago: they end only in `at`."""
+    def constant_velocity(self, stamp_ns: int) -> tuple[Array64, Array64]:
+        """R and t extrapolated with the newest rates, without the horizon that `at` has."""
         return self._beyond((stamp_ns - self._poses[-1][0]) * 1e-9)
 
-    def unsure(self, stamp_ns: int) -> tuple[float, float]:
-        """One sigma of the place [m] and of the yaw [rad] that `at` tells beyond the newest pose, by what is not told.
+    def extrapolation_sigma(self, stamp_ns: int) -> tuple[float, float]:
+        """One sigma of the position [m] and yaw [rad] that `at` returns, from extrapolation alone; 0 up to the newest.
 
-        The vehicle may have changed as USUAL says, and all its way from where the trail ends.
+        USUAL_MANEUVER gives the growth; beyond EXTRAPOLATION_S the whole assumed motion is added.
         """
         if not self._poses or stamp_ns <= self._poses[-1][0]:
             return 0.0, 0.0
         dt = (stamp_ns - self._poses[-1][0]) * 1e-9
-        place_m, yaw_rad = USUAL.place_m(dt), USUAL.turn_rad(dt)
+        position_m, yaw_rad = USUAL_MANEUVER.displacement_m(dt), USUAL_MANEUVER.turn_rad(dt)
         beyond_s = dt - 1e-9 * FURTHEST_NS
         if beyond_s > 0.0:
-            turn_radps, velocity_mps = self._went()
-            place_m += beyond_s * float(np.linalg.norm(velocity_mps))
+            turn_radps, velocity_mps = self._newest_rates()
+            position_m += beyond_s * float(np.linalg.norm(velocity_mps))
             yaw_rad += beyond_s * float(np.linalg.norm(turn_radps))
-        return place_m, yaw_rad
+        return position_m, yaw_rad
 
     def to_vehicle(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
-        """Place (3,) and velocity (3,) as the vehicle sees them at a time, its own driving and turning in them."""
+        """Position (3,) and velocity (3,) relative to the vehicle, in its axes, of map position and velocity.
+
+        The velocity contains the vehicle's own translation and rotation.
+        """
         return to_vehicle(*self.at(stamp_ns), *self.at(stamp_ns + STEP_NS), xyz_m, velocity_mps)
 
-    def to_local(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
+    def to_map(self, stamp_ns: int, xyz_m: Array64, velocity_mps: Array64) -> tuple[Array64, Array64]:
         """The inverse of `to_vehicle`."""
-        return to_local(*self.at(stamp_ns), *self.at(stamp_ns + STEP_NS), xyz_m, velocity_mps)
+        return to_map(*self.at(stamp_ns), *self.at(stamp_ns + STEP_NS), xyz_m, velocity_mps)

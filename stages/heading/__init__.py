@@ -1,4 +1,4 @@
-"""Which way round: quarter turns, or any heading, weighed by the drone's way told twice, by LiDAR and by odometry.
+"""Yaw of the drone by its motion: yaw branches, or any heading, weighed by displacements by LiDAR and by odometry.
 
-Both `align`, which gives a rotation out, and `fuse`, which looks at it a second time, ask here.
+`align`, which publishes a rotation, and `fuse`, which checks it, both use it.
 """

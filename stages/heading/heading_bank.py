@@ -1,7 +1,7 @@
-"""How far the drone's odometry is turned, while no street is known: headings all round the circle.
+"""Yaw of the drone's odometry without vanishing points: hypotheses over the whole circle.
 
-The windows that tell branches apart (bank.py) weigh them too. Where streets run at many angles, the heading by motion
-tells which of them both cameras see.
+The windows that separate the branches (hypothesis_bank.py) weigh them too. Where streets have many directions, the
+heading by motion decides which of them both cameras see.
 
 Source: ours.
 """
@@ -14,23 +14,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.heading.hypothesis_bank import BranchBank, BranchSettings
+from stages.heading.hypothesis_bank import BranchSettings, HypothesisBank
 
 HEADING_STEP_DEG = 2.5
-NONSENSE_LIKELY = 0.01
+MAX_NONSENSE = 0.01
 WORST_HEADING_RAD = math.radians(4.0)  # one sigma: streets are 14 deg and more apart
 
 
 @dataclass(frozen=True)
 class Heading:
-    """How far the odometry has to be turned, on the whole circle."""
+    """Yaw that turns the odometry into `map`, on the whole circle."""
 
     turn_rad: float
     sigma_rad: float
 
 
-class HeadingBank(BranchBank):
-    """The same evidence while no street is known: any heading is alike at first, in steps of HEADING_STEP_DEG."""
+class HeadingBank(HypothesisBank):
+    """Hypotheses in steps of HEADING_STEP_DEG, at first all equally probable."""
 
     HYPOTHESES = round(360 / HEADING_STEP_DEG)
 
@@ -43,9 +43,9 @@ class HeadingBank(BranchBank):
 
     @property
     def heading(self) -> Heading | None:
-        """Their mean; None while they are spread too far, too few windows have spoken, or nonsense is likely."""
+        """Mean heading; None while the spread is too large, the windows are too few, or `none` is probable."""
         weight = self._weight[:-1]
-        if self.windows < self.settings.least_windows or self._weight[-1] > NONSENSE_LIKELY:
+        if self.windows < self.settings.least_windows or self._weight[-1] > MAX_NONSENSE:
             return None
         mean = complex((weight * np.exp(1j * self._turns_rad)).sum() / weight.sum())
         sigma_rad = math.sqrt(-2.0 * math.log(min(abs(mean), 1.0))) if abs(mean) > 0.5 else math.inf

@@ -1,6 +1,6 @@
 """Which of the street's four directions is which: four hypotheses, and that none of them is right.
 
-Evidence is a displacement of the drone told twice: by the LiDAR in the vehicle's start frame, and by the drone's own
+Evidence is a displacement of the drone told twice: by the LiDAR in the vehicle's map frame, and by the drone's own
 odometry, which each branch k turns its own way. The evidence of window w for branch k is
 
     metric     e = d_lidar - Rz(k 90 deg) d_odometry = T b_k + noise,   (1 - o) N(e; T b_k, S) + o / area
@@ -28,8 +28,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from stages.geometry.frames import Array64
 
 NONE = 4  # index of "none of them" in a bank's probabilities
-ASKEW = 16  # hypotheses round the circle: the branches are each fourth, those between are streets matched askew
-ASKEW_SHARE = 0.02  # of the chance that none is right, at first; the rest is nonsense
+DIRECTIONS = 16  # hypotheses round the circle: the branches are each fourth, those between are streets matched askew
+MISALIGNED_SHARE = 0.02  # of the chance that none is right, at first; the rest is nonsense
 
 
 class BranchSettings(BaseModel):
@@ -62,7 +62,7 @@ def turns(count: int) -> Array64:
 
 @dataclass(frozen=True)
 class Displacement:
-    """One window: the drone's way, told twice; horizontal, start frame. Branch 0 has turned the odometry's into it."""
+    """One window: the drone's way, told twice; horizontal, map frame. Branch 0 has turned the odometry's into it."""
 
     start_ns: int
     end_ns: int
@@ -78,10 +78,10 @@ class Displacement:
         return (self.end_ns - self.start_ns) * 1e-9
 
 
-class BranchBank:
+class HypothesisBank:
     """Probabilities of four branches, counted from a yaw that is followed through time, and of none of them."""
 
-    def __init__(self, settings: BranchSettings, hypotheses: int = ASKEW) -> None:
+    def __init__(self, settings: BranchSettings, hypotheses: int = DIRECTIONS) -> None:
         """`hypotheses` round the circle, a multiple of 4."""
         self.settings = settings
         self._turns_rad, self._R = turns_rad(hypotheses), turns(hypotheses)
@@ -100,9 +100,9 @@ class BranchBank:
 
     def _first(self, none: float) -> Array64:
         """Weights (h + 1,): the hypotheses round the circle, then nonsense."""
-        weight = np.full(len(self._R) + 1, ASKEW_SHARE * none / (len(self._R) - 4))
+        weight = np.full(len(self._R) + 1, MISALIGNED_SHARE * none / (len(self._R) - 4))
         weight[self._branches] = (1 - none) / 4
-        weight[-1] = (1 - ASKEW_SHARE) * none
+        weight[-1] = (1 - MISALIGNED_SHARE) * none
         return weight
 
     @property
@@ -170,8 +170,8 @@ class BranchBank:
         inverse = np.linalg.inv(S)
         chi2 = np.einsum("hi,hij,hj->h", e, inverse, e)
         inlier = (1 - s.metric_outliers) * np.exp(-0.5 * chi2) / (2 * math.pi * np.sqrt(np.linalg.det(S)))
-        believes = inlier > s.metric_outliers * nonsense
-        gain = T * self._drift_m2ps2 @ inverse * believes[:, None, None]
+        accepted = inlier > s.metric_outliers * nonsense
+        gain = T * self._drift_m2ps2 @ inverse * accepted[:, None, None]
         self._drift_mps = self._drift_mps + np.einsum("hij,hj->hi", gain, e)
         self._drift_m2ps2 = self._drift_m2ps2 - T * gain @ self._drift_m2ps2
         self._drift_to(moved.end_ns)

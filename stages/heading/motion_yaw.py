@@ -1,14 +1,14 @@
-"""The yaw between the start frame and the autopilot's, from how the drone moved: told by LiDAR and by its odometry.
+"""Yaw of frame `odom` in `map` by the drone's motion, measured by LiDAR and by its odometry.
 
     z_i = c + s Rz(psi) p_i + e_i,   a = s (cos psi, sin psi)      horizontally
 
-p: the autopilot's positions (frame own), z: the fixes (start frame). c and a are linear; e has the fixes' noise and
-both odometries' drift, correlated over the window, alike on both axes. So generalised least squares gives a with
-covariance I / Lambda, and the likelihood round the circle is exp(Lambda |a| cos(psi - peak)): one peak, as sharp as the
-drone moved far. A bank of yaws round the circle is weighed by it. What is told:
-    nothing, while the drone has not moved: sigma is large
-    nothing, where both do not tell one motion: lengths (|a| is not 1), heights or the paths themselves disagree
-    nothing, while any yaw farther than 45 deg from the peak has odds above 1 : 1000, or P of the peak is below .999
+p: positions by the autopilot (odom), z: fixes (map). c and a are linear; e has the noise of the fixes and the drift of
+both odometries, correlated over the window, alike on both axes. So generalised least squares gives a with covariance
+I / Lambda, and the likelihood over the circle is exp(Lambda |a| cos(psi - peak)): one peak, whose sharpness grows with
+the displacement. It weighs hypotheses over the circle. There is no yaw
+    while the drone has not moved: sigma is large
+    where both do not measure one motion: lengths (|a| is not 1), heights or paths disagree
+    while a yaw farther than 45 deg from the peak has odds above 1 : 1000, or P of the peak is below 0.999
 
 Source: DESIGN, Yaw branch (a naive bank was 30 % wrong); Horn, JOSA A 4(4) (1987) for the complex number; ours.
 """
@@ -28,18 +28,18 @@ from stages.heading.yaw_fit import Yaw
 APART_NS = 400_000_000  # of the fixes used: their errors last that long
 WINDOW_NS = 30_000_000_000
 LEAST, MOST = 6, 48  # points
-LEAST_TO_BACK = 4  # that somebody else's yaw is none of its other quarter turns
+MIN_TO_CONFIRM = 4  # that somebody else's yaw is none of its other quarter turns
 LEAST_M = 1.0  # of displacement
 FLOOR_M = 0.05  # no fix is better
 SCALE = 0.03  # of lengths; the drone's scale and the vehicle's
 BEND = 0.01  # of a displacement, gathered heading error of both odometries
 HEIGHT_WALK_M = 0.08  # per sqrt(s)
-WITNESS_RAD = math.radians(11.5)  # worse than this it is no yaw at all
+COARSE_RAD = math.radians(11.5)  # worse than this it is no yaw at all
 FALSE_SHARE = 0.2  # of the points may be false
 BANK_RAD = 2 * math.pi / 72 * np.arange(72)
 NEAR_RAD = math.radians(45.0)
-DOUBT = 1e-3
-BACKED_NS = 5_000_000_000  # so long ago that is still said of now
+MAX_ALTERNATIVE_ODDS = 1e-3
+CONFIRMED_NS = 5_000_000_000  # so long ago that is still said of now
 ALIKE, SLACK_RAD = 3.0, math.radians(5.0)
 
 
@@ -50,41 +50,41 @@ class Point:
     stamp_ns: int
     xyz_map_m: Array64
     variance_m2: float  # level, one axis
-    xyz_own_m: Array64
-    stretch: int
+    xyz_odom_m: Array64
+    segment: int
 
 
 @dataclass(frozen=True)
-class Leaning:
+class YawLikelihood:
     """The likelihood round the circle, exp(sharpness (cos(yaw - peak) - 1)), though it may be flat."""
 
     stamp_ns: int
     peak_rad: float
     sharpness: float
 
-    def others(self, yaw_rad: float) -> float:
+    def alternatives_odds(self, yaw_rad: float) -> float:
         """Odds of the three other quarter turns together against a yaw."""
         quarters = yaw_rad - self.peak_rad + 0.5 * math.pi * np.arange(1, 4)
         return float(np.exp(self.sharpness * (np.cos(quarters) - math.cos(yaw_rad - self.peak_rad))).sum())
 
 
 @dataclass(frozen=True)
-class Weighed:
+class YawFit:
     """What the points say."""
 
     reason: str
-    leaning: Leaning | None = None  # None: nothing, or that both do not tell one motion
+    likelihood: YawLikelihood | None = None  # None: nothing, or that both do not tell one motion
     yaw: Yaw | None = None  # None: they tell none
 
 
 class MotionYaw:
-    """Collects points of one track and one stretch of the autopilot's."""
+    """Collects points of one track and one segment of the autopilot's."""
 
     def __init__(self, errors: FuseErrors, sigma_rad: float) -> None:
         """`sigma_rad`: a yaw known worse is not told."""
         self._errors, self._sigma_rad = errors, sigma_rad
         self._points: deque[Point] = deque(maxlen=MOST)
-        self._told = Weighed("no motion of the drone's seen yet")
+        self._told = YawFit("no motion of the drone's seen yet")
 
     @property
     def yaw(self) -> Yaw | None:
@@ -93,7 +93,7 @@ class MotionYaw:
         return yaw if yaw is not None and yaw.sigma_rad <= self._sigma_rad else None
 
     @property
-    def witness(self) -> Yaw | None:
+    def coarse_yaw(self) -> Yaw | None:
         """Known well enough to speak against another quarter turn."""
         return self._told.yaw
 
@@ -102,14 +102,14 @@ class MotionYaw:
         """Why there is none, or how well it is known."""
         return self._told.reason
 
-    def backs(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
+    def confirms(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
         """Whether the motion seen lately agrees with a yaw, and with none of its other quarter turns."""
-        lean = self._told.leaning
-        if lean is None or lean.sharpness <= 0.0 or abs(stamp_ns - lean.stamp_ns) > BACKED_NS:
+        likelihood = self._told.likelihood
+        if likelihood is None or likelihood.sharpness <= 0.0 or abs(stamp_ns - likelihood.stamp_ns) > CONFIRMED_NS:
             return False
-        off = abs(math.remainder(yaw_rad - lean.peak_rad, 2 * math.pi))
-        near = off <= ALIKE * math.hypot(1.0 / math.sqrt(lean.sharpness), sigma_rad) + SLACK_RAD
-        return near and lean.others(yaw_rad) <= DOUBT
+        off = abs(math.remainder(yaw_rad - likelihood.peak_rad, 2 * math.pi))
+        near = off <= ALIKE * math.hypot(1.0 / math.sqrt(likelihood.sharpness), sigma_rad) + SLACK_RAD
+        return near and likelihood.alternatives_odds(yaw_rad) <= MAX_ALTERNATIVE_ODDS
 
     def fits(self, yaw: Yaw) -> bool | None:
         """Whether what is followed moves as the drone says it does, with this yaw, or hangs as it hangs.
@@ -117,17 +117,17 @@ class MotionYaw:
         None: too few points to say.
         """
         points = tuple(self._points)
-        return None if len(points) < LEAST_TO_BACK else moves_with(points, yaw, self._errors)
+        return None if len(points) < MIN_TO_CONFIRM else moves_with(points, yaw, self._errors)
 
     def restart(self) -> None:
         """Nothing before now counts."""
         self._points.clear()
-        self._told = Weighed("its motion is being watched")
+        self._told = YawFit("its motion is being watched")
 
     def add(self, point: Point) -> bool:
         """One more; True: the answer was weighed anew."""
         points = self._points
-        if points and (point.stretch != points[-1].stretch or point.stamp_ns < points[-1].stamp_ns):
+        if points and (point.segment != points[-1].segment or point.stamp_ns < points[-1].stamp_ns):
             self.restart()
         if points and point.stamp_ns - points[-1].stamp_ns < APART_NS:
             return False
@@ -138,16 +138,16 @@ class MotionYaw:
         return True
 
 
-def weigh(points: tuple[Point, ...], errors: FuseErrors) -> Weighed:
+def weigh(points: tuple[Point, ...], errors: FuseErrors) -> YawFit:
     """The yaw that points tell, or none, and why."""
-    few = Weighed(f"{len(points)} LiDAR positions beside the autopilot's, {LEAST} are needed")
-    if len(points) < LEAST_TO_BACK:
+    few = YawFit(f"{len(points)} LiDAR positions beside the autopilot's, {LEAST} are needed")
+    if len(points) < MIN_TO_CONFIRM:
         return few
     t = np.array([(p.stamp_ns - points[0].stamp_ns) * 1e-9 for p in points])
-    z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_own_m for p in points])
+    z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_odom_m for p in points])
     moved_m = float(np.linalg.norm(own[:, :2] - own[0, :2], axis=1).max())
     if moved_m < LEAST_M:
-        return Weighed(f"the drone has moved {moved_m:.1f} m, too little to tell its heading")
+        return YawFit(f"the drone has moved {moved_m:.1f} m, too little to tell its heading")
     variance = np.array([p.variance_m2 for p in points]) + FLOOR_M**2
     false: list[int] = []
     while True:
@@ -161,32 +161,32 @@ def weigh(points: tuple[Point, ...], errors: FuseErrors) -> Weighed:
         if misfit <= chi2_999(2 * n - 4) and high <= chi2_999(n - 1):
             break
         if len(false) >= FALSE_SHARE * len(points) or n <= LEAST:
-            return Weighed("what the LiDAR follows does not move as the drone says it does")
+            return YawFit("what the LiDAR follows does not move as the drone says it does")
         off = int(np.argmax(np.abs(rise - np.median(rise)) / np.sqrt(variance[rows]))) if misfit < high else worst
         false.append(int(rows[off]))
     if precision <= 0.0:  # all points that are left have one place
-        return Weighed("the drone's own positions tell no motion")
+        return YawFit("the drone's own positions tell no motion")
     length = float(np.linalg.norm(a))
     sigma = 1.0 / (math.sqrt(precision) * max(length, 1e-6))
     if abs(length - 1.0) > 3.3 * math.hypot(SCALE, 1.0 / math.sqrt(precision)):
-        return Weighed(f"the LiDAR sees {length:.2f} of the way that the drone says it flew")
+        return YawFit(f"the LiDAR sees {length:.2f} of the way that the drone says it flew")
     peak, nearest, odds = bank(a, precision)
-    lean = Leaning(points[-1].stamp_ns, peak, precision * length)
+    likelihood = YawLikelihood(points[-1].stamp_ns, peak, precision * length)
     if len(points) < LEAST:
-        return Weighed(few.reason, lean)
-    if sigma > WITNESS_RAD:
-        return Weighed(f"heading by motion hardly known: {moved_m:.1f} m moved", lean)
-    if nearest < 1 - DOUBT or odds > DOUBT:
-        return Weighed(f"several headings fit its motion: P {nearest:.3f}", lean)
+        return YawFit(few.reason, likelihood)
+    if sigma > COARSE_RAD:
+        return YawFit(f"heading by motion hardly known: {moved_m:.1f} m moved", likelihood)
+    if nearest < 1 - MAX_ALTERNATIVE_ODDS or odds > MAX_ALTERNATIVE_ODDS:
+        return YawFit(f"several headings fit its motion: P {nearest:.3f}", likelihood)
     told = f"heading by motion {math.degrees(peak):.0f} deg, sigma {math.degrees(sigma):.1f}, {moved_m:.1f} m moved"
-    return Weighed(told, lean, Yaw(points[-1].stamp_ns, peak, sigma**2))
+    return YawFit(told, likelihood, Yaw(points[-1].stamp_ns, peak, sigma**2))
 
 
 def moves_with(points: tuple[Point, ...], yaw: Yaw, errors: FuseErrors) -> bool:
     """Whether the points lie on the way that the drone tells, turned by a yaw."""
     t = np.array([(p.stamp_ns - points[0].stamp_ns) * 1e-9 for p in points])
     variance = np.array([p.variance_m2 for p in points]) + FLOOR_M**2
-    z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_own_m for p in points])
+    z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_odom_m for p in points])
     way = own[:, :2] - own[0, :2]
     level = level_covariance(t, own[:, :2], variance, errors) + yaw.sigma_at(points[-1].stamp_ns) ** 2 * (way @ way.T)
     left = z[:, :2] - own[:, :2] @ rotation_z(yaw.yaw_rad)[:2, :2].T
@@ -203,7 +203,7 @@ def bank(a: Array64, precision: float) -> tuple[float, float, float]:
     return math.atan2(a[1], a[0]), float(weight[near].sum() / weight.sum()), float(weight[~near].max())
 
 
-def level_covariance(t_s: Array64, own_m: Array64, variance_m2: Array64, errors: FuseErrors) -> Array64:
+def level_covariance(t_s: Array64, odometry_m_of: Array64, variance_m2: Array64, errors: FuseErrors) -> Array64:
     """(n, n) of e on one axis: fixes, the integral of a Gauss-Markov drift, walk, and gathered turns.
 
     Of the integral x of v with E[v v'] = s^2 exp(-|d| / T): E[x_a x_b] = s^2 T^2 (2 m / T - 1 + exp(-a / T) +
@@ -213,26 +213,26 @@ def level_covariance(t_s: Array64, own_m: Array64, variance_m2: Array64, errors:
     first = np.minimum.outer(t_s, t_s)
     fade = np.exp(-t_s / T)
     drift = 2 * first / T - 1 + fade[:, None] + fade[None, :] - np.exp(-np.abs(np.subtract.outer(t_s, t_s)) / T)
-    way = own_m - own_m[0]
+    way = odometry_m_of - odometry_m_of[0]
     bent = BEND**2 * 0.5 * (way @ way.T)
     walk = errors.walk_m_per_sqrt_s**2 * first
     return np.diag(variance_m2) + (errors.drift_mps * T) ** 2 * drift + walk + bent
 
 
-def fit(z_m: Array64, own_m: Array64, covariance_m2: Array64) -> tuple[Array64, float, float, int]:
+def fit(z_m: Array64, odometry_m_of: Array64, covariance_m2: Array64) -> tuple[Array64, float, float, int]:
     """a (2,), Lambda, the misfit (chi-square, 2 n - 4 degrees of freedom) and the point that fits worst."""
     inverse = np.linalg.inv(covariance_m2)
     ones = inverse.sum(axis=1)
     W = inverse - np.outer(ones, ones) / ones.sum()  # c integrated out
-    Wp, Wz = W @ own_m, W @ z_m
-    precision = float((own_m * Wp).sum())
+    Wp, Wz = W @ odometry_m_of, W @ z_m
+    precision = float((odometry_m_of * Wp).sum())
     a = np.zeros(2)
     if precision > 0.0:
-        a[0] = (own_m * Wz).sum() / precision
-        a[1] = (own_m[:, 0] * Wz[:, 1] - own_m[:, 1] * Wz[:, 0]).sum() / precision
+        a[0] = (odometry_m_of * Wz).sum() / precision
+        a[1] = (odometry_m_of[:, 0] * Wz[:, 1] - odometry_m_of[:, 1] * Wz[:, 0]).sum() / precision
     left = np.empty_like(z_m)
-    left[:, 0] = z_m[:, 0] - a[0] * own_m[:, 0] + a[1] * own_m[:, 1]
-    left[:, 1] = z_m[:, 1] - a[1] * own_m[:, 0] - a[0] * own_m[:, 1]
+    left[:, 0] = z_m[:, 0] - a[0] * odometry_m_of[:, 0] + a[1] * odometry_m_of[:, 1]
+    left[:, 1] = z_m[:, 1] - a[1] * odometry_m_of[:, 0] - a[0] * odometry_m_of[:, 1]
     Wl = W @ left
     misfit = float((left * Wl).sum())
     off = (Wl**2).sum(axis=1) / np.maximum(np.diag(W), 1e-12)  # each point against all others

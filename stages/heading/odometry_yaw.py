@@ -1,7 +1,7 @@
-"""How the autopilot's own frame is turned in the start frame (yaw.py), and how long that may be believed.
+"""Yaw of the autopilot's frame `odom` in `map` (yaw_fit.py), and how long it stays valid.
 
-It is remembered while nothing measures it, over gaps of the LiDAR's too, until both odometries'
-headings have drifted too far, the autopilot may have turned its north unheard, or somebody says otherwise (heading.py).
+It is kept while nothing measures it, also over gaps of the LiDAR, until the headings of both odometries have drifted
+too far, the autopilot may have turned its yaw during a silence, or sources contradict each other (fused_heading.py).
 
 Source: ours.
 """
@@ -19,46 +19,46 @@ from stages.heading.motion_yaw import MotionYaw, Point
 from stages.heading.yaw_fit import Yaw
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry
-from stages.odometry.drone.trajectory import AutopilotTrail
+from stages.odometry.drone.trajectory import AutopilotTrajectory
 
-MOTION_DEG = 6.0  # a yaw by motion known worse is not told
-SILENCE_S, SILENCE_RAD = 3.0, math.radians(45.0)  # beyond, an autopilot may have turned its north unheard
-SILENT_RAD = math.radians(1.0)  # what a shorter silence costs
+MOTION_DEG = 6.0  # largest sigma of a yaw by motion
+SILENCE_S, SILENCE_RAD = 3.0, math.radians(45.0)  # a longer silence may hide a turn of frame odom
+SILENT_RAD = math.radians(1.0)  # sigma added by a shorter silence
 
 
-class North:
-    """What is known of R_map_own, from whom, and whether they agree."""
+class OdometryYaw:
+    """R_map_odom by all its sources, and whether they agree."""
 
     def __init__(self, errors: FuseErrors, sigma_rad: float) -> None:
-        """`sigma_rad`: a yaw known worse is of no use."""
+        """`sigma_rad`: largest sigma of a usable yaw."""
         self._sigma_rad = sigma_rad
         self.by_motion = MotionYaw(errors, min(math.radians(MOTION_DEG), sigma_rad))
         self.heading = Heading()
         self.yaw: Yaw | None = None
 
-    def hear(self, trail: AutopilotTrail, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
-        """The autopilot's word goes to its trail; a silence that may hide a turn of its north costs."""
-        before_ns, silences = trail.attitude_ns, trail.silences
-        R_before = None if before_ns is None else trail.R_own_drone(before_ns)
+    def add(self, trail: AutopilotTrajectory, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
+        """Add telemetry to the trajectory; a silence that may hide a turn of frame odom adds variance."""
+        before_ns, silences = trail.attitude_ns, trail.gaps
+        R_before = None if before_ns is None else trail.R_odom_drone(before_ns)
         rate = 0.0 if before_ns is None else trail.rate_radps(before_ns)
-        trail.hear(word)
+        trail.add(word)
         after_ns = trail.attitude_ns
-        if trail.silences == silences or before_ns is None or R_before is None or after_ns is None:
+        if trail.gaps == silences or before_ns is None or R_before is None or after_ns is None:
             return
-        R_after, silent_s = trail.R_own_drone(after_ns), (after_ns - before_ns) * 1e-9
+        R_after, silent_s = trail.R_odom_drone(after_ns), (after_ns - before_ns) * 1e-9
         assert R_after is not None
         turn = float(np.linalg.norm(log_rotation(R_before.T @ R_after)))
         unexplained = max(turn - silent_s * max(rate, trail.rate_radps(after_ns)), 0.0)
         if silent_s > SILENCE_S or unexplained > SILENCE_RAD:
             self.forget()
         elif self.yaw is not None:
-            self.yaw = self.yaw.less_sure(unexplained**2 + SILENT_RAD**2)
+            self.yaw = self.yaw.inflated(unexplained**2 + SILENT_RAD**2)
 
-    def watch(self, point: Point) -> bool:
-        """A fix beside the autopilot's position; False: the drone's motion denies the yaw believed so far."""
-        if not self.by_motion.add(point) or self.by_motion.witness is None:
+    def add_point(self, point: Point) -> bool:
+        """Add a fix with the autopilot's position; False: the drone's motion contradicts the yaw."""
+        if not self.by_motion.add(point) or self.by_motion.coarse_yaw is None:
             return True
-        self.heading.hear_motion(self.by_motion.witness)
+        self.heading.add_motion_yaw(self.by_motion.coarse_yaw)
         told, own = self.by_motion.yaw, self.useful(point.stamp_ns)
         if own is not None:
             if not self.heading.denies(point.stamp_ns, own.yaw_rad, own.sigma_at(point.stamp_ns)):
@@ -69,30 +69,30 @@ class North:
             self.yaw = told
         return True
 
-    def backs(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
-        """Whether the drone's motion agrees with a yaw and with none of its other quarter turns."""
+    def confirms(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
+        """Whether the drone's motion agrees with a yaw and with none of its other branches."""
         denied = self.heading.denies(stamp_ns, yaw_rad, sigma_rad)
-        return not denied and self.by_motion.backs(stamp_ns, yaw_rad, sigma_rad)
+        return not denied and self.by_motion.confirms(stamp_ns, yaw_rad, sigma_rad)
 
-    def by_motion_too(self, stamp_ns: int) -> bool:
-        """Whether the drone's motion has told the yaw believed."""
+    def motion_agrees(self, stamp_ns: int) -> bool:
+        """Whether the drone's motion has confirmed the yaw."""
         return self.yaw is not None and self.heading.agrees(stamp_ns, self.yaw.yaw_rad, self.yaw.sigma_at(stamp_ns))
 
     def useful(self, stamp_ns: int) -> Yaw | None:
-        """The yaw, unless so much may have drifted since it was told that it says nothing any more."""
+        """The yaw; None: none, or its drift since is too large."""
         return self.yaw if self.yaw is not None and self.yaw.sigma_at(stamp_ns) <= self._sigma_rad else None
 
     def known(self, stamp_ns: int) -> Yaw | None:
-        """The yaw, if it is of use and nobody objects."""
+        """The usable yaw; None also while its sources contradict each other."""
         return None if self.heading.contradiction else self.useful(stamp_ns)
 
-    def remember(self, stamp_ns: int, R_map_own: Array64, variance_rad2: float) -> None:
-        """What the pose tells of it, unless it is known better."""
+    def remember(self, stamp_ns: int, R_map_odom: Array64, variance_rad2: float) -> None:
+        """Take the yaw of the pose, unless it is less certain."""
         if self.yaw is None or math.sqrt(variance_rad2) <= self.yaw.sigma_at(stamp_ns):
-            self.yaw = Yaw(stamp_ns, heading_rad(R_map_own), variance_rad2)
+            self.yaw = Yaw(stamp_ns, heading_rad(R_map_odom), variance_rad2)
 
     def forget(self) -> None:
-        """Nothing said so far counts any more."""
+        """Drop all yaws."""
         self.yaw = None
         self.by_motion.restart()
         self.heading.forget_motion()

@@ -1,8 +1,8 @@
-"""The drone's displacements told twice, by the LiDAR and by its own odometry, window by window without overlap.
+"""Displacements of the drone by LiDAR and by its own odometry, in windows that do not overlap.
 
-A window runs from one handful of fixes to a later one, as soon as the drone is `baseline_m` away and that is well
-above the fixes' noise. Fixes of a handful are brought together along the way the odometry tells, which each branch
-turns its own way, and their median is taken: one false fix does no harm.
+A window runs from one group of fixes to a later one, once the drone is `baseline_m` away and that is well above the
+noise of the fixes. The fixes of a group are moved to one time along the displacement by odometry, which each hypothesis
+turns by its own yaw, and their median is taken: one false fix has no effect.
 
 Source: ours; DESIGN, Yaw branch: non-overlapping windows, baseline >= 0.4 m.
 """
@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.heading.hypothesis_bank import ASKEW, Displacement, turns
+from stages.heading.hypothesis_bank import DIRECTIONS, Displacement, turns
 from stages.messages import DroneFix, VisualMotion
-from stages.odometry.drone.trajectory import AutopilotTrail
+from stages.odometry.drone.trajectory import AutopilotTrajectory
 
 HANDFUL = 3  # fixes
 HANDFUL_NS = 400_000_000
@@ -26,8 +26,8 @@ LONGEST_S = 20.0  # a drone that hardly moves starts a new window
 CLEAR = 3.0  # sigmas of the fixes' noise that a displacement must have
 FIX_FLOOR_M = 0.04  # no handful is placed better
 STRAIGHT = 0.7  # way told by directions alone: as the crow flies over flown
-COVERED = 0.8  # of a window, by pictures
-PICTURES_LATE_NS = 500_000_000  # a window that is long enough waits so long for the pictures of its end
+COVERED = 0.8  # of a window, by images
+IMAGES_LATE_NS = 500_000_000  # a window that is long enough waits so long for the images of its end
 SLACK_M = 0.6  # the LiDAR may see so much more way than the odometry before that alone is a window
 
 
@@ -35,7 +35,7 @@ SLACK_M = 0.6  # the LiDAR may see so much more way than the odometry before tha
 class _Fix:
     stamp_ns: int
     xyz_map_m: Array64
-    covariance_m2: Array64  # (2, 2) start frame, horizontal
+    covariance_m2: Array64  # (2, 2) map frame, horizontal
     own: tuple[Array64, int] | None  # where the odometry had the drone
 
 
@@ -54,13 +54,13 @@ class _Handful:
 class Windows:
     """Collects fixes and steps; `close` tells the displacement since the last window, once it is long enough."""
 
-    def __init__(self, baseline_m: float, hypotheses: int = ASKEW) -> None:
+    def __init__(self, baseline_m: float, hypotheses: int = DIRECTIONS) -> None:
         """`hypotheses` round the circle, as the bank has that is told."""
         self._baseline_m = baseline_m
         self._R = turns(hypotheses)
         self._recent: deque[_Fix] = deque(maxlen=HANDFUL)
         self._start: _Handful | None = None
-        self._waiting: _Handful | None = None  # the end of a window whose pictures are still to come
+        self._waiting: _Handful | None = None  # the end of a window whose images are still to come
         self._track: int | None = None
         self._steps: deque[VisualMotion] = deque(maxlen=512)
 
@@ -70,10 +70,12 @@ class Windows:
         self._start = self._waiting = None
 
     def add_step(self, motion: VisualMotion) -> None:
-        """A step of the odometry by pictures: its direction."""
+        """A step of the odometry by images: its direction."""
         self._steps.append(motion)
 
-    def add_fix(self, fix: DroneFix, R_map_vehicle: Array64, t_map_vehicle_m: Array64, own: AutopilotTrail) -> None:
+    def add_fix(
+        self, fix: DroneFix, R_map_vehicle: Array64, t_map_vehicle_m: Array64, own: AutopilotTrajectory
+    ) -> None:
         """A fix, with where the vehicle was; one of another track starts anew."""
         if fix.track_id != self._track or (self._recent and fix.stamp_ns <= self._recent[-1].stamp_ns):
             self.restart()
@@ -84,23 +86,23 @@ class Windows:
                 fix.stamp_ns,
                 R_map_vehicle @ fix.xyz_vehicle_m + t_map_vehicle_m,
                 covariance[:2, :2],
-                own.place(fix.stamp_ns),
+                own.position(fix.stamp_ns),
             )
         )
         if self._start is None and len(self._recent) == HANDFUL:
             self._start = self._handful()
 
-    def close_metric(self, R_map_own: Array64, bearing_rad: float) -> Displacement | None:
-        """The window since the last, told by the autopilot's positions; R_map_own is branch 0's."""
+    def close_metric(self, R_map_odom: Array64, bearing_rad: float) -> Displacement | None:
+        """The window since the last, told by the autopilot's positions; R_map_odom is branch 0's."""
         start, end = self._ends()
         if start is None or end is None:
             return None
-        stretches = {f.own[1] if f.own else None for f in start.fixes + end.fixes}
-        if len(stretches) != 1 or None in stretches:
+        segments = {f.own[1] if f.own else None for f in start.fixes + end.fixes}
+        if len(segments) != 1 or None in segments:
             self._begin_at(end)
             return None
-        anchor = own_m(start.fixes[0])
-        told = [[(R_map_own @ (own_m(f) - anchor))[:2] for f in h.fixes] for h in (start, end)]
+        anchor = odometry_m_of(start.fixes[0])
+        told = [[(R_map_odom @ (odometry_m_of(f) - anchor))[:2] for f in h.fixes] for h in (start, end)]
         middle = [np.mean(t, axis=0) for t in told]
         odometry = middle[1] - middle[0]
         left = [  # of the fixes, when the way told is taken off as each hypothesis turns it
@@ -118,7 +120,7 @@ class Windows:
         return Displacement(start.stamp_ns, end.stamp_ns, lidar, noise, odometry, bearing_rad, True)
 
     def close_bearing(self, R_map_drone: dict[int, Array64], bearing_rad: float) -> Displacement | None:
-        """The window since the last, told by directions between pictures; R_map_drone by from_ns is branch 0's."""
+        """The window since the last, told by directions between images; R_map_drone by from_ns is branch 0's."""
         start, end = self._ends()
         if start is None or end is None:
             return None
@@ -127,8 +129,8 @@ class Windows:
         noise = start.covariance_m2 + end.covariance_m2
         if float(np.linalg.norm(way)) < max(self._baseline_m, CLEAR * math.sqrt(0.5 * float(np.trace(noise)))):
             return None
-        pictures_ns = self._steps[-1].stamp_ns if self._steps else 0
-        if pictures_ns < end.stamp_ns and newest_ns - end.stamp_ns < PICTURES_LATE_NS:
+        images_ns = self._steps[-1].stamp_ns if self._steps else 0
+        if images_ns < end.stamp_ns and newest_ns - end.stamp_ns < IMAGES_LATE_NS:
             self._waiting = end
             return None
         self._begin_at(end)
@@ -150,7 +152,7 @@ class Windows:
         )
 
     def _keys_steps(self, start_ns: int, end_ns: int) -> list[tuple[VisualMotion, int]]:
-        """One step of each key picture, with how much of the window [ns] it covers: most, and as little else."""
+        """One step of each key image, with how much of the window [ns] it covers: most, and as little else."""
         best: dict[int, tuple[VisualMotion, int]] = {}
         for step in self._steps:  # those of one key from short to long: each covers what those before it do
             overlap = min(step.stamp_ns, end_ns) - max(step.from_ns, start_ns)
@@ -187,7 +189,7 @@ class Windows:
         return self._start, self._handful()
 
 
-def own_m(fix: _Fix) -> Array64:
+def odometry_m_of(fix: _Fix) -> Array64:
     """Where the odometry had the drone at a fix that it covers."""
     assert fix.own is not None
     return fix.own[0]

@@ -1,6 +1,6 @@
-"""The yaw of the autopilot's own frame in the start frame, as somebody told it once: R_map_own = Rz(yaw).
+"""Yaw of frame `odom` in `map`, R_map_odom = Rz(yaw), with the growth of its variance.
 
-Source: ours; sizes of the drift: links' and autopilots' usual degrees a minute.
+Source: ours; the usual drift of autopilots and links, in degrees per minute.
 """
 
 from __future__ import annotations
@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-DRIFT_RAD_PER_S = math.radians(2.0) / 60  # both odometries' headings, while nothing measures them
+DRIFT_RAD_PER_S = math.radians(2.0) / 60  # heading drift of both odometries
 WALK_RAD2_PER_S = math.radians(0.1) ** 2
 
 
 @dataclass(frozen=True)
 class Yaw:
-    """By motion, by the streets or by the pose; at a time."""
+    """Yaw at a time, by motion, by vanishing points or by the pose."""
 
     stamp_ns: int
     yaw_rad: float
@@ -22,16 +22,16 @@ class Yaw:
 
     @property
     def sigma_rad(self) -> float:
-        """When it was told."""
+        """Sigma at its own time."""
         return math.sqrt(self.variance_rad2)
 
     def sigma_at(self, stamp_ns: int) -> float:
-        """[rad], with what has drifted since."""
+        """Sigma at another time [rad], with the drift since."""
         dt = abs(stamp_ns - self.stamp_ns) * 1e-9
         return math.sqrt(self.variance_rad2 + (DRIFT_RAD_PER_S * dt) ** 2 + WALK_RAD2_PER_S * dt)
 
-    def less_sure(self, by_rad2: float) -> Yaw:
-        """The same yaw, known worse."""
+    def inflated(self, by_rad2: float) -> Yaw:
+        """The same yaw with `by_rad2` added to its variance."""
         return Yaw(self.stamp_ns, self.yaw_rad, self.variance_rad2 + by_rad2)
 
 

@@ -1,1 +1,1 @@
-"""Every numba-compiled function of the method, and nothing else: the compile cache depends on this folder alone."""
+"""All numba-compiled functions of the stages, and nothing else: the compile cache depends on this folder alone."""

@@ -1,6 +1,6 @@
-"""A typed `njit`: hot loops compile once, are cached on disk (flow/compile_cache.py) and release the GIL.
+"""Typed decorators for numba: functions are compiled once, cached on disk (flow/compile_cache.py), without the GIL.
 
-Source: ours; numba's decorator has no types, this one keeps the function's own.
+Source: ours; numba's decorator has no types, these keep the type of the function.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from flow.compile_cache import keep_compiled
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-COMPILED = ("stages/kernels", "links/simulated")  # where such code is
+COMPILED = ("stages/kernels", "links/simulated/kernels")  # folders with compiled functions
 CACHE_FOLDER = keep_compiled(COMPILED)
 
 
@@ -24,9 +24,9 @@ def compiled(function: F) -> F:
 
 
 def compiled_at_once(types: str) -> Callable[[F], F]:
-    """`compiled`, for arguments of these types when its module is loaded; for others at the first call.
+    """`compiled`, but compiled for these argument types at import; for other types at the first call.
 
-    For what is first called in flight, and not before by `links/runs/warm_up.py`: "(float64[::1], float64)".
+    For functions that are first called in flight and not by `links/runs/warm_up.py`: "(float64[::1], float64)".
     """
 
     def compile_now(function: F) -> F:

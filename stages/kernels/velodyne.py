@@ -1,6 +1,6 @@
-"""Compiled functions of `links/velodyne/decode.py`.
+"""Compiled functions that decode VLP-16 packets into one row per laser pulse.
 
-Source: see there.
+Source: see `links/velodyne/decode.py`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _MAX_STEP = int(1.5 * MAX_SPIN_HZ * AZIMUTH_TURN * _BLOCK_NS * 1e-9)
 
 @compiled
 def _rotation(data: bytes, dual: bool, block_azimuth: NDArray[np.int64]) -> float:
-    """Fill the blocks' azimuths [0.01 deg]; return the mean turn per block time, NaN when they cannot be right."""
+    """Fill the blocks' azimuths [0.01 deg]; return the mean rotation per block time; NaN if they are invalid."""
     half = AZIMUTH_TURN // 2
     turned = 0
     for block in range(BLOCKS):
@@ -82,7 +82,7 @@ def decode(
     return_kind: Bytes,
     xyz_lidar_m: Floats,
 ) -> int:
-    """Fill a row for each of the 384 channel entries; returns their number, 0 when the azimuths cannot be right."""
+    """Fill a row for each of the 384 channel entries; returns their number, 0 if the azimuths are invalid."""
     dual = data[RETURN_MODE_AT] == DUAL
     block_azimuth = np.empty(BLOCKS, np.int64)
     rate = _rotation(data, dual, block_azimuth)
@@ -137,7 +137,7 @@ def decode_dual(
     return_kind: Bytes,
     xyz_lidar_m: Floats,
 ) -> int:
-    """Dual return: as `decode`, then each pulse's two returns side by side; returns how many rows are filled.
+    """Dual return: as `decode`, then the two returns of each pulse as neighbours; returns the number of rows.
 
     Even blocks hold the last return, odd ones the strongest. A pulse gets a row for its strongest or only return, and a
     second one where its last return is another.
@@ -151,7 +151,7 @@ def decode_dual(
     xyz_ = np.empty_like(xyz_lidar_m)
     if decode(data, stamp_ns, stamp_, laser_, azimuth_, range_, reflectivity_, kind_, xyz_) == 0:
         return 0
-    entry = np.empty(PULSES + 1, np.int64)  # one to spare: written before it is known to stay
+    entry = np.empty(PULSES + 1, np.int64)  # one spare: written before its validity is known
     rows = 0
     for pair in range(BLOCKS // 2):
         for j in range(BLOCK_PULSES):

@@ -1,8 +1,10 @@
-"""Every message of the method. Frames: see `stages/geometry/frames.py`. In the order data flows:
+"""All messages between stages, by module in the order of data flow. Frames: see `stages/geometry/frames.py`.
 
     sensors -> sweep -> drone;  sensors -> cameras;  autopilot;  all of them -> pose
 
-Source: DESIGN, the graph. Sensor messages carry what was measured; nothing here comes from truth.
+`stamp_ns` is the time at which a message's content was true, not its arrival. None of them contains ground truth.
+
+Source: DESIGN, the graph.
 """
 
 from stages.messages.autopilot import AutopilotEstimator as AutopilotEstimator
@@ -22,7 +24,9 @@ from stages.messages.drone import Detections as Detections
 from stages.messages.drone import DroneFix as DroneFix
 from stages.messages.drone import TrackingState as TrackingState
 from stages.messages.drone import TrackState as TrackState
+from stages.messages.pose import PoseEstimate as PoseEstimate
 from stages.messages.pose import PoseState as PoseState
+from stages.messages.pose import PositionEstimate as PositionEstimate
 from stages.messages.pose import RelativePose as RelativePose
 from stages.messages.sensors import Image as Image
 from stages.messages.sensors import LidarFirings as LidarFirings

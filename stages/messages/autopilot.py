@@ -1,14 +1,13 @@
-"""What the drone's autopilot tells of itself."""
+"""Messages from the drone's autopilot: attitude, position, odometry, IMU, status and estimator health."""
 
 from __future__ import annotations
 
-from flow.message import Mat3, Message, Vec3, message
-from stages.messages.shapes import Mat6
+from flow.message import Mat3, Mat6, Message, Vec3, message
 
 
 @message(schema=51)
 class DroneAttitude(Message):
-    """The autopilot's attitude. Frame local is the autopilot's own: x its north, z up; its yaw is unrelated to ours."""
+    """Attitude of the drone in frame odom: x along the autopilot's north, z up. Its yaw is unrelated to frame map."""
 
     R_odom_drone: Mat3
     angular_velocity_drone_radps: Vec3
@@ -16,7 +15,7 @@ class DroneAttitude(Message):
 
 @message(schema=52)
 class DroneLocalPosition(Message):
-    """The autopilot's position and velocity in its local frame (see DroneAttitude), origin where it began."""
+    """Position and velocity of the drone in frame odom (see DroneAttitude)."""
 
     xyz_odom_m: Vec3
     velocity_odom_mps: Vec3
@@ -24,21 +23,21 @@ class DroneLocalPosition(Message):
 
 @message(schema=53)
 class DroneOdometry(Message):
-    """The autopilot's whole estimate: T_local_drone and how it changes. Covariances are rotation first, drone axes."""
+    """The autopilot's full estimate: T_odom_drone and its velocities. Covariances are rotation first, drone axes."""
 
     xyz_odom_m: Vec3
     R_odom_drone: Mat3
     velocity_drone_mps: Vec3
     angular_velocity_drone_radps: Vec3
-    pose_covariance: Mat6 | None  # [rad, m], tangent at the body; None: the autopilot does not say
+    pose_covariance: Mat6 | None  # [rad, m], tangent at the body; None: not reported
     velocity_covariance: Mat6 | None  # [rad/s, m/s]
-    reset_counter: int  # a change: the estimate jumped
-    quality_percent: int | None  # None: unknown; a failed estimate is 0
+    reset_counter: int  # changes when the estimate jumps
+    quality_percent: int | None  # None: not reported; 0: the estimate has failed
 
 
 @message(schema=54)
 class DroneImu(Message):
-    """One inertial sample, drone axes."""
+    """One IMU sample in drone axes."""
 
     acceleration_drone_mps2: Vec3  # specific force: +g along z at rest
     angular_velocity_drone_radps: Vec3
@@ -46,29 +45,29 @@ class DroneImu(Message):
 
 @message(schema=55)
 class AutopilotStatus(Message):
-    """The autopilot's heartbeat, with what its link and clock do."""
+    """The autopilot's heartbeat, with the state of its link and clock."""
 
     armed: bool
     custom_mode: int  # the autopilot's own mode number
-    failsafe: bool  # it says critical, emergency or termination
-    lost_frames: int  # missing in its sequence since the start
-    clock_offset_ns: int | None  # host - autopilot's time since boot; None: not known yet
-    clock_uncertainty_ns: int | None  # the offset is wrong by at most this; None: no TIMESYNC, delays are unknown
-    clock_drift_ppm: float | None = None  # the host's clock gains so much on it; None: not known (yet)
+    failsafe: bool  # MAV_STATE is critical, emergency or termination
+    lost_frames: int  # gaps in the autopilot's MAVLink sequence since the start
+    clock_offset_ns: int | None  # host time - autopilot's time since boot; None: not known yet
+    clock_uncertainty_ns: int | None  # bound of the offset error; None: no TIMESYNC, delays are not known
+    clock_drift_ppm: float | None = None  # rate of the host's clock relative to it; None: not known (yet)
     clock_drift_sigma_ppm: float | None = None
 
 
 @message(schema=56)
 class AutopilotEstimator(Message):
-    """What the drone's EKF says it fuses right now: EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (both)."""
+    """Status of the drone's EKF: EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (ArduPilot and PX4)."""
 
     attitude_good: bool
     velocity_good: bool
     position_good: bool  # horizontal position relative to its origin, from external pose, flow or GPS
     height_good: bool
-    constant_position: bool  # it has no position source and pretends to stand still
-    velocity_ratio: float  # innovation test ratios (1: at the gate); NaN: not said
+    constant_position: bool  # no position source: the EKF assumes a constant position
+    velocity_ratio: float  # innovation test ratios (1: at the gate); NaN: not reported
     horizontal_ratio: float
     height_ratio: float
     compass_ratio: float
-    flags: int  # as sent
+    flags: int  # flags as received

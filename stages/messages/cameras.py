@@ -1,4 +1,4 @@
-"""What both fisheyes tell of rotations and motions. P IV, V."""
+"""Messages derived from the fisheye images: vanishing directions, rotations, visual motion. P IV, V."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flow.message import Mat3, Message, PerPointBool, PerPointF64, PerPointI64, 
 
 
 class CameraMount(enum.Enum):
-    """What a camera is mounted on, and in whose axes its directions are told."""
+    """The body a camera is mounted on; its directions are given in that body's axes."""
 
     VEHICLE = "vehicle"
     DRONE = "drone"
@@ -20,73 +20,72 @@ class CameraMount(enum.Enum):
 
 @message(schema=41)
 class VanishingDirections(Message):
-    """Directions in which a picture's straight lines run, and the lines; stamp_ns is the picture's. P IV, V.C.
+    """Vanishing directions of one image and the lines that support them; stamp_ns is the image's. P IV, V.C.
 
-    Axes are the camera_mount's (x forward, y left, z up), not the lens's. A direction's sign means nothing.
-    No directions is a normal answer: `reason` says why.
+    Axes are those of `camera_mount` (x forward, y left, z up), not of the lens. The sign of a direction is arbitrary.
+    A message without directions is normal: `reason` states why.
     """
 
     camera_mount: CameraMount
-    direction: Points64  # (n, 3) unit; the vertical first where there is one
-    sigma_rad: PerPointF64  # (n,) of each direction, one axis, 1 sigma
+    direction: Points64  # (n, 3) unit; the vertical first, if present
+    sigma_rad: PerPointF64  # (n,) 1 sigma of each direction, per axis
     is_vertical: PerPointBool  # (n,)
-    frame: PerPointI64  # (n,) which horizontal pair it belongs to, 0 the strongest; -1: the vertical
-    line_normal: Annotated[NDArray[np.float64], Shape("m", 3)]  # unit normals of the lines' great circles
-    line_end: Annotated[NDArray[np.float64], Shape("m", 2, 3)]  # unit rays of each line's two ends
-    line_sigma_rad: Annotated[
-        NDArray[np.float64], Shape("m")
-    ]  # (m,) how far the normal may be turned about the ray to the line's middle
-    line_direction: Annotated[NDArray[np.int64], Shape("m")]  # index of its direction; -1: none
+    frame: PerPointI64  # (n,) index of its horizontal pair, 0 the strongest; -1: the vertical
+    line_normal: Annotated[NDArray[np.float64], Shape("m", 3)]  # (m, 3) unit normals of the lines' great circles
+    line_end: Annotated[NDArray[np.float64], Shape("m", 2, 3)]  # (m, 2, 3) unit rays of each line's end points
+    # (m,) 1 sigma of the normal's rotation about the ray to the line's middle
+    line_sigma_rad: Annotated[NDArray[np.float64], Shape("m")]
+    line_direction: Annotated[NDArray[np.int64], Shape("m")]  # (m,) index of its direction; -1: none
     reason: str
 
 
 class BranchState(enum.Enum):
-    """How well it is known which of the street's four directions is which."""
+    """Whether the 90 deg yaw ambiguity of the street is resolved."""
 
-    NONE = 0  # no rotation now
-    AMBIGUOUS = 1  # up to a quarter turn, or half of one
+    NONE = 0  # no rotation available
+    AMBIGUOUS = 1  # known up to multiples of 90 deg, or of 180 deg
     RESOLVED = 2
 
 
 @message(schema=42)
 class RelativeRotation(Message):
-    """How the drone is turned in the vehicle's axes, up to the street's symmetry; stamp_ns is the pictures'. P IV.
+    """R_vehicle_drone from both cameras, up to the 90 deg yaw ambiguity; stamp_ns is the images'. P IV.
 
-    Branch k is turned further by k * 90 deg about the world's vertical: Rz(k 90 deg) R_vehicle_drone where the vehicle
-    stands level. Branch 0 is the most probable and given here. What the probabilities leave to 1: none is right.
+    Branch k adds a rotation of k * 90 deg about the vertical: Rz(k 90 deg) R_vehicle_drone where the vehicle is level.
+    `R_vehicle_drone` is branch 0, the most probable. 1 - sum(branch_probability): the probability that none is correct.
     """
 
-    R_vehicle_drone: Mat3 | None  # None: no rotation now, `reason` says why
-    covariance_rad2: Mat3 | None  # of phi in R exp(phi), the drone's axes
+    R_vehicle_drone: Mat3 | None  # None: no rotation, `reason` states why
+    covariance_rad2: Mat3 | None  # of phi in R exp(phi), drone axes
     branch_probability: Annotated[NDArray[np.float64], Shape(4)]  # of branch k
     state: BranchState
-    switches: int  # how often the branch given out has changed since the start: a change is a jump
+    switches: int  # changes of the published branch since the start; each one is a jump
     reason: str
 
 
 @message(schema=43)
 class VisualMotion(Message):
-    """How the drone's camera moved from one picture to a later one, told in the drone's axes. P V.E.
+    """Motion of the drone's camera between two images, in drone axes; stamp_ns is the later image's. P V.E.
 
-    p_from = R_from_to p_to + |t| direction: the length is not known from one camera. stamp_ns is the later picture's.
+    p_from = R_from_to p_to + |t| direction_from. One camera does not determine the length |t|.
     """
 
-    from_ns: int
+    from_ns: int  # the earlier image's stamp
     R_from_to: Mat3
-    covariance_rad2: Mat3  # of phi in R exp(phi), axes of the later picture's drone
-    direction_from: Vec3 | None  # unit; None: no motion seen beyond the rotation
+    covariance_rad2: Mat3  # of phi in R exp(phi), drone axes at the later image
+    direction_from: Vec3 | None  # unit; None: no translation observed
     direction_sigma_rad: float | None
-    matches: int  # features that agree
+    matches: int  # inlier features
     reason: str
 
 
 @message(schema=44)
 class FollowedFeatures(Message):
-    """Features of a camera followed from an earlier picture to this one; stamp_ns is this picture's. P V.B, V.E."""
+    """Features tracked from an earlier image to this one; stamp_ns is this image's. P V.B, V.E."""
 
-    frame_id: str  # which camera
-    from_ns: int  # the earlier picture's stamp
-    pixel_from: Annotated[NDArray[np.float64], Shape("n", 2)]  # column, row in the earlier picture
+    frame_id: str  # the camera
+    from_ns: int  # the earlier image's stamp
+    pixel_from: Annotated[NDArray[np.float64], Shape("n", 2)]  # column, row in the earlier image
     pixel_to: Annotated[NDArray[np.float64], Shape("n", 2)]
-    residual_rad: PerPointF64  # by how much each misses the camera's motion that was found
-    agrees: PerPointBool  # with that motion
+    residual_rad: PerPointF64  # epipolar error of each under the estimated camera motion
+    agrees: PerPointBool  # inlier of that motion

@@ -1,4 +1,4 @@
-"""Where the drone may be, and where it is, by the LiDAR. P III.B, III.C."""
+"""Messages of drone detection and tracking by the LiDAR. P III.B, III.C."""
 
 from __future__ import annotations
 
@@ -9,78 +9,77 @@ from flow.message import Mat3, Message, PerPointBool, PerPointF64, PerPointI64, 
 
 @message(schema=31)
 class Detections(Message):
-    """Drone candidates of one search, best first. A list that is empty or wholly refused is a normal answer.
+    """Drone candidates of one search, best first. An empty list, or one without an accepted candidate, is normal.
 
-    stamp_ns: up to when was searched. The paper's detector judges whole sweeps by e = e_inner + e_outer, lower is
-    better; the detector by evidence judges as data arrive and states a probability.
+    stamp_ns: end of the searched interval. The paper's detector scores whole sweeps by e = e_inner + e_outer, lower is
+    better. EvidenceDetect scores incrementally and gives a probability.
     """
 
-    xyz_vehicle_m: Points64  # at seen_ns
-    score: PerPointF64  # e, or ln of the odds that it is a drone
+    xyz_vehicle_m: Points64  # (n, 3) [m] at seen_ns
+    score: PerPointF64  # e, or the log-odds that it is a drone
     e_inner: PerPointF64  # paper only, else 0
     e_outer: PerPointF64
     accepted: PerPointBool
-    reasons: tuple[str, ...]  # one per candidate: why it was accepted or refused
-    verdict: str  # one sentence for people: "drone at ..." or "no drone: ..."
-    start_ns: int | None = None  # since when was searched; None: since the depth image's start
-    seen_ns: PerPointI64 | None = None  # when each was seen last; None: at some time in the sweep
+    reasons: tuple[str, ...]  # one per candidate: why it was accepted or rejected
+    summary: str  # one sentence: "drone at ..." or "no drone: ..."
+    start_ns: int | None = None  # start of the searched interval; None: the depth image's start
+    seen_ns: PerPointI64 | None = None  # newest return of each; None: at some time in the sweep
     velocity_vehicle_mps: Points64 | None = None
-    probability: PerPointF64 | None = (
-        None  # that it is a drone, as the detector judges; None: the score says nothing of it
-    )
-    candidate_id: PerPointI64 | None = None  # the same thing keeps its number
+    probability: PerPointF64 | None = None  # that it is a drone; None: the detector gives none
+    candidate_id: PerPointI64 | None = None  # constant for the same object
 
 
 @message(schema=32)
 class Candidates(Message):
-    """What may be a drone right now and is worth another look, most probable first; told when it changes."""
+    """Open drone candidates that need more observations, most probable first; published on change."""
 
-    candidate_id: PerPointI64  # the same as in Detections
+    candidate_id: PerPointI64  # as in Detections
     xyz_vehicle_m: Points64  # predicted at stamp_ns
     velocity_vehicle_mps: Points64
     probability: PerPointF64
     seen_ns: PerPointI64
-    looks: PerPointI64  # turns of the rotor in which it was hit
-    reasons: tuple[str, ...]  # what speaks for and against, one each
-    wander_mps: PerPointF64 | None = None  # level speed it says it has and heading unknown, beyond velocity_vehicle_mps
-    detector_life: int = 0  # another one: it was started afresh, its numbers are of other things
+    scan_passes: PerPointI64  # rotor revolutions with a return from it
+    reasons: tuple[str, ...]  # one per candidate: the evidence for and against
+    undirected_speed_mps: PerPointF64 | None = (
+        None  # horizontal speed by telemetry whose direction is unknown; not in velocity_vehicle_mps
+    )
+    detector_instance: int = 0  # changes when the detector restarts: candidate_id then counts from the start
 
 
 class TrackingState(enum.Enum):
-    """What the tracker is doing."""
+    """State of a track."""
 
-    SEARCHING = 0  # no drone known
-    CANDIDATE = 1  # something that may be one is being looked at
+    SEARCHING = 0  # no drone
+    CANDIDATE = 1  # a possible drone is being confirmed
     TRACKING = 2
-    COASTING = 3  # not seen now, predicted; the covariance grows
-    LOST = 4  # had one, has none
+    COASTING = 3  # no returns now; predicted, with growing covariance
+    LOST = 4  # the track ended
 
 
 @message(schema=33)
 class DroneFix(Message):
-    """Where the LiDAR saw the drone; stamp_ns is the weighted mean time of the returns used. P III.C."""
+    """Drone position measured by the LiDAR; stamp_ns is the weighted mean time of the returns used. P III.C."""
 
     xyz_vehicle_m: Vec3
     covariance_m2: Mat3
     hits: int  # returns used
     iterations: int
     shift_m: float  # last mean shift step
-    track_id: int = 1  # which drone
+    track_id: int = 1  # number of the track
     velocity_vehicle_mps: Vec3 | None = None  # relative to the vehicle; None: not estimated
-    bias_covariance_m2: Mat3 | None = (
-        None  # what of covariance_m2 is the same from fix to fix: calibration; None: not told
-    )
+    # the part of covariance_m2 that does not average out over fixes (calibration); None: not estimated
+    bias_covariance_m2: Mat3 | None = None
 
 
 @message(schema=34)
 class TrackState(Message):
-    """A track's state after each frame, with the reason for it in words, and where it is predicted at stamp_ns."""
+    """State of a track after each frame, the reason for it, and the position predicted for stamp_ns."""
 
     state: TrackingState
     reason: str
     hits: int  # returns within the radius in the frame just ended
-    frame_s: float  # how long that frame was
-    track_id: int = 1  # which drone; one that was lost and found elsewhere has a new number
+    frame_s: float  # duration of that frame
+    track_id: int = 1  # a drone that was lost and reacquired at another position has a new number
     xyz_vehicle_m: Vec3 | None = None  # None: not predicted
     velocity_vehicle_mps: Vec3 | None = None
     covariance_m2: Mat3 | None = None  # of the position

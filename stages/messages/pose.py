@@ -1,45 +1,85 @@
-"""The relative pose: what all is for."""
+"""The relative pose of the drone, the output of the estimator."""
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 
-from flow.message import Mat3, Message, Vec3, message
-from stages.messages.shapes import Mat6
+from flow.message import Mat3, Mat6, Message, Vec3, message
 
 
 class PoseState(enum.Enum):
-    """How much of the relative pose is known, and by what."""
+    """How much of the relative pose is known, and from which measurements."""
 
     LOST = 0  # no position; nothing may be used
-    POSITION_ONLY = 1  # the LiDAR sees the drone, its yaw relative to the vehicle is not known
-    AMBIGUOUS = 2  # the rotation is known up to the street's quarter turns
+    POSITION_ONLY = 1  # the LiDAR measures the drone, its yaw relative to the vehicle is not known
+    AMBIGUOUS = 2  # the rotation is known up to a multiple of 90 deg
     FULL = 3  # position and rotation
-    COASTING = 4  # as FULL, but the LiDAR has not seen the drone for a while, its odometry carries the pose
+    COASTING = 4  # as FULL, but without a recent LiDAR position: the odometry of the drone propagates the pose
 
 
-@message(schema=61)
-class RelativePose(Message):
-    """T_vehicle_drone and how well it is known, predicted to stamp_ns; and the same in the vehicle's start frame.
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PositionEstimate:
+    """The drone without a rotation: its position and velocity in the frames `vehicle` and `map`."""
 
-    Frame start (W for the autopilot) stands still in the world: T_map_drone = T_map_vehicle T_vehicle_drone.
+    xyz_vehicle_m: Vec3
+    covariance_vehicle_m2: Mat3  # vehicle axes
+    velocity_vehicle_mps: Vec3  # of the drone relative to the vehicle, vehicle axes
+    xyz_map_m: Vec3
+    covariance_map_m2: Mat3  # map axes, without the drift of the vehicle's odometry
+    velocity_map_mps: Vec3  # of the drone over ground, map axes
+    velocity_covariance: Mat3  # of velocity_map_mps [m2/s2]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PoseEstimate:
+    """T_vehicle_drone and T_map_drone = T_map_vehicle T_vehicle_drone, with the drone's velocity.
+
     Covariances are rotation [rad] before translation [m], tangent at the drone body: T exp(xi).
     """
 
+    xyz_vehicle_m: Vec3
+    R_vehicle_drone: Mat3
+    covariance: Mat6  # of T_vehicle_drone
+    velocity_vehicle_mps: Vec3  # of the drone relative to the vehicle, vehicle axes
+    xyz_map_m: Vec3
+    R_map_drone: Mat3
+    map_covariance: Mat6  # of T_map_drone, without the drift of the vehicle's odometry
+    velocity_map_mps: Vec3  # of the drone over ground, map axes
+    velocity_covariance: Mat3  # of velocity_map_mps [m2/s2]
+
+
+@message(schema=74)
+class RelativePose(Message):
+    """State and estimate of the drone relative to the vehicle and in `map`, predicted to stamp_ns.
+
+    `map`, the frame that the autopilot receives, does not move: it is the frame of the vehicle at its start.
+    """
+
     state: PoseState
-    reason: str  # in words, why this state
-    measured_ns: int | None  # time of the newest LiDAR position in it; None: never
+    reason: str  # why this state, for people
+    measured_ns: int | None  # time of the newest LiDAR position in the estimate; None: never
     track_id: int  # which drone; 0: none yet
-    xyz_vehicle_m: Vec3 | None  # None: LOST
-    R_vehicle_drone: Mat3 | None  # None unless FULL or COASTING: an unresolved branch is not given out as a rotation
-    covariance: (
-        Mat6 | None
-    )  # of T_vehicle_drone; rotation rows are infinite variance (diagonal inf, else 0) where not known
-    velocity_vehicle_mps: Vec3 | None  # of the drone relative to the vehicle, in the vehicle's axes; None: not known
-    xyz_map_m: Vec3 | None
-    R_map_drone: Mat3 | None
-    map_covariance: Mat6 | None  # of T_map_drone, without the drift of the vehicle's odometry
-    velocity_map_mps: Vec3 | None  # of the drone over ground, start's axes
-    velocity_covariance: Mat3 | None  # of velocity_map_mps [m2/s2]
     resets: int  # how often the pose jumped since the start: a new branch, a new drone, a restart
     nis: float  # normalised innovation squared of the newest accepted LiDAR position, 3 degrees of freedom; NaN: none
+    estimate: PositionEstimate | PoseEstimate | None  # a pose when FULL or COASTING; None when LOST
+
+    @property
+    def xyz_vehicle_m(self) -> Vec3 | None:
+        """Position of the drone in the vehicle frame; None: not known."""
+        return None if self.estimate is None else self.estimate.xyz_vehicle_m
+
+    @property
+    def R_vehicle_drone(self) -> Mat3 | None:
+        """Rotation of the drone in the vehicle frame; None: not known."""
+        return self.estimate.R_vehicle_drone if isinstance(self.estimate, PoseEstimate) else None
+
+    @property
+    def xyz_map_m(self) -> Vec3 | None:
+        """Position of the drone in `map`; None: not known."""
+        return None if self.estimate is None else self.estimate.xyz_map_m
+
+    @property
+    def R_map_drone(self) -> Mat3 | None:
+        """Rotation of the drone in `map`; None: not known."""
+        return self.estimate.R_map_drone if isinstance(self.estimate, PoseEstimate) else None

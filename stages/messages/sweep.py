@@ -1,4 +1,4 @@
-"""What the LiDAR saw, placed in the vehicle frame. P III.A, III.B."""
+"""LiDAR returns and pulses in the vehicle frame, and depth images of a sweep. P III.A, III.B."""
 
 from __future__ import annotations
 
@@ -21,33 +21,34 @@ class SweptPoints(Message):
     laser: PerPointU8
     reflectivity: PerPointU8
     servo_rad: PerPointF32  # turntable angle at the pulse, after sign, zero and time offset
-    pulses: int  # laser pulses fired in this slice, with those that returned nothing
-    origin_vehicle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # where the beams start, mid-slice
-    unplaced: int = 0  # returns left out because the turntable's angle at their time is not known
-    reason: str = ""  # why returns were left out; empty when none were
+    pulses: int  # laser pulses fired in this slice, including those without a return
+    origin_vehicle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # origin of the beams, mid-slice
+    unplaced: int = 0  # returns omitted because the turntable angle at their time is not known
+    reason: str = ""  # why returns were omitted; empty if none were
 
 
 @message(schema=22)
 class SweptPulses(Message):
-    """Every laser pulse of a slice in the vehicle frame, also those that saw nothing: what flew free is evidence too.
+    """All laser pulses of a slice in the vehicle frame, including those without a return, which show free space.
 
-    One row per pulse, in firing order; of two returns of a pulse the nearer. stamp_ns is the first pulse's. A slice
-    whose turntable angle is not known is empty.
+    One row per pulse, in firing order, with the nearer of two returns; stamp_ns is the first pulse's. The slice is
+    empty where the turntable angle is not known.
     """
 
-    point_stamp_ns: PerPointI64  # when each laser fired
+    point_stamp_ns: PerPointI64  # firing time of each pulse
     direction_vehicle: Points32  # unit vectors
     range_m: PerPointF32  # along the direction, from origin_vehicle_m; 0: no return
     laser: PerPointU8
     reflectivity: PerPointU8
     turntable_rad: float  # turntable angle, mid-slice; NaN: not known
-    origin_vehicle_m: tuple[float, float, float]  # where the beams start, mid-slice
+    origin_vehicle_m: tuple[float, float, float]  # origin of the beams, mid-slice
 
 
 @message(schema=23)
 class DepthImage(Message):
-    """One whole sweep seen from the turntable as a pinhole image looking up; stamp_ns is the sweep's end. P III.A.
+    """Depth image of one whole sweep: a pinhole camera at the turntable, looking up. P III.A.
 
+    stamp_ns is the sweep's end.
     Pixel (row v, column u) looks along (x, y, 1) with x = (u + 0.5 - w/2) / focal_px, y = (v + 0.5 - h/2) / focal_px,
     in axes parallel to the vehicle's. Depth is z over the origin.
     """
@@ -55,15 +56,15 @@ class DepthImage(Message):
     start_ns: int
     depth_m: DepthPixels  # z of the nearest return, 0: none
     focal_px: float  # plane height / pixel size on that plane
-    origin_vehicle_m: Vec3  # where the image looks from
-    points: int  # returns that fell into the image
-    returns: int  # returns of the whole sweep, in the image or not
-    turned_rad: float  # servo travel the sweep covered; 0 for a bolted-down LiDAR
+    origin_vehicle_m: Vec3  # centre of projection
+    points: int  # returns inside the image
+    returns: int  # returns of the whole sweep
+    turned_rad: float  # servo travel of the sweep; 0 for a fixed LiDAR
     lost_packets: int = 0  # LiDAR packets missing within the sweep
 
 
 @message(schema=24)
 class ScoreImage(Message):
-    """The detector's score per pixel of a DepthImage: lower is more like a drone, NaN is no candidate. P III.B."""
+    """Score per pixel of a DepthImage by the paper's detector: lower is better, NaN is no candidate. P III.B."""
 
     score: DepthPixels

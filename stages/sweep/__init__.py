@@ -1,3 +1,3 @@
-"""P III.A: packets and servo angles to points in the vehicle frame."""
+"""Conversion of LiDAR packets and servo angles to points in the vehicle frame. P III.A."""
 
 from stages.sweep.sweep import Sweep as Sweep

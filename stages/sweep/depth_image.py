@@ -1,8 +1,8 @@
-"""The depth image: a sweep seen from the turntable as a pinhole image looking up.
+"""The depth image: the returns of a sweep as a pinhole image from the turntable, looking up.
 
-A plane at height h above the turntable is cut into N x N pixels of size res, so that focal_px = h / res; for a field
-of view of 2 theta_max, focal_px = N / (2 tan theta_max). Depth is height above the turntable; of several returns in
-one pixel the nearest stays.
+A plane at height h above the turntable is divided into N x N pixels of size res, so that focal_px = h / res; for a
+field of view of 2 theta_max, focal_px = N / (2 tan theta_max). Depth is height above the turntable; a pixel keeps the
+nearest of its returns.
 
 Source: P III.A; DESIGN, "Depth image N=512, FOV 2 theta_max = 120 deg".
 """
@@ -19,12 +19,12 @@ from stages.messages import DepthImage
 
 
 def focal_length_px(size_px: int, fov_deg: float) -> float:
-    """N / (2 tan(fov / 2)): pixels per unit of x / z."""
+    """Focal length N / (2 tan(fov / 2)) [px]: pixels per unit of x / z."""
     return size_px / (2.0 * math.tan(math.radians(fov_deg) / 2.0))
 
 
 def unproject(image: DepthImage, row: int, column: int) -> NDArray[np.float64]:
-    """The point (3,) [m, vehicle frame] in the middle of a pixel, at the pixel's depth."""
+    """The point (3,) [m], vehicle frame, at the centre of a pixel and its depth."""
     height, width = image.depth_m.shape
     depth = float(image.depth_m[row, column])
     x = (column + 0.5 - width / 2) / image.focal_px * depth
@@ -33,7 +33,7 @@ def unproject(image: DepthImage, row: int, column: int) -> NDArray[np.float64]:
 
 
 class DepthCanvas:
-    """A depth image being drawn, packet by packet, so that the end of a sweep costs nothing."""
+    """A depth image drawn packet by packet, so that the end of a sweep needs no extra computation."""
 
     def __init__(self, size_px: int, fov_deg: float, origin_vehicle_m: NDArray[np.float64]) -> None:
         self._size_px = size_px
@@ -42,7 +42,7 @@ class DepthCanvas:
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything drawn."""
+        """Start an empty image."""
         self._depth_m = np.zeros((self._size_px, self._size_px), dtype=np.float32)
         self._start_ns: int | None = None
         self._points = self._returns = self._lost_packets = 0
@@ -51,13 +51,13 @@ class DepthCanvas:
         """Add the returns (n, 3) of one packet."""
         if self._start_ns is None:
             self._start_ns = first_pulse_ns
-            lost_packets = 0  # missing before the sweep, not in it
+            lost_packets = 0  # lost before the sweep, not within it
         self._points += keep_nearest(xyz_vehicle_m, self._origin_vehicle_m, self._focal_px, self._depth_m)
         self._returns += len(xyz_vehicle_m)
         self._lost_packets += lost_packets
 
     def take(self, end_ns: int, turned_rad: float) -> DepthImage:
-        """The image drawn so far, handed over whole; drawing starts again on an empty one."""
+        """Return the image drawn so far and start an empty one."""
         image = DepthImage(
             stamp_ns=end_ns,
             start_ns=end_ns if self._start_ns is None else self._start_ns,

@@ -1,4 +1,4 @@
-"""What several stages ask of a slice's pulses.
+"""Functions of a slice of pulses that several stages use.
 
 Source: ours.
 """
@@ -9,5 +9,5 @@ from stages.messages import SweptPulses
 
 
 def middle_ns(pulses: SweptPulses) -> int:
-    """When the middle one of a slice's pulses left: the vehicle's pose then is the slice's."""
+    """Firing time of the middle pulse: the vehicle's pose at that time is used for the whole slice."""
     return int(pulses.point_stamp_ns[pulses.point_stamp_ns.size // 2])

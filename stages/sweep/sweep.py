@@ -1,13 +1,10 @@
-"""Sweep: LiDAR packets and servo angles become points in the vehicle frame, and a depth image at the end of each sweep.
+"""Sweep: LiDAR packets and servo angles to points in the vehicle frame, and a depth image at the end of each sweep.
 
-A packet waits, in order, until a servo state newer than its last pulse has come; each return is then turned with the
-angle at its own time (`stages/sweep/turntable.py`) and drawn into the growing depth image
-(`stages/sweep/depth_image.py`)
-(`stages/sweep/depth_image.py`).
-The image is given out when the turntable has gone `sweep_deg` one way; a reversal or a hole in the servo's answers
-starts
-it anew, so vibration about a target never makes one. A bolted-down LiDAR gives one image per revolution. As in the
-paper, what vehicle and drone move during a sweep is not compensated.
+Packets wait in a queue until a servo state newer than their last pulse has arrived. Each return is then rotated by the
+turntable angle at its own time (`stages/sweep/turntable.py`) and drawn into the depth image
+(`stages/sweep/depth_image.py`). The image is published when the turntable has travelled `sweep_deg` in one direction. A
+reversal or a gap in the servo states clears it, so vibration about a target never completes an image. A fixed LiDAR
+gives one image per revolution. As in the paper, the motion of vehicle and drone during a sweep is not compensated.
 
 Source: P III.A (sweep at 11.4 rpm over 180 deg, N = 512, 2 theta_max = 120 deg).
 """
@@ -33,9 +30,9 @@ from stages.sweep.turntable import Turntable
 class SweepSettings(Settings):
     """Settings of `Sweep`.
 
-    `tolerance_deg`: a sweep counts as whole this much short of `sweep_deg`, because a position servo stops short of its
-    goal (an MX-28 under load by about 1 deg, encoder step 0.088 deg). The fan is 30 deg wide, so nothing stays unseen.
-    `reversal_deg`: going back by less than this is encoder jitter; vibration (+-5 deg) goes back by far more.
+    `tolerance_deg`: a sweep is complete this much before `sweep_deg`, because a position servo stops short of its goal
+    (an MX-28 under load by about 1 deg, encoder step 0.088 deg). The fan is 30 deg wide, so nothing remains unseen.
+    `reversal_deg`: a smaller reversal is encoder jitter; vibration (+-5 deg) reverses by far more.
     """
 
     mount: LidarMount
@@ -44,9 +41,9 @@ class SweepSettings(Settings):
     sweep_deg: float = Field(180.0, gt=0, le=360)
     tolerance_deg: float = Field(3.0, ge=0, lt=30)
     reversal_deg: float = Field(0.5, gt=0, lt=30)
-    min_range_m: float = Field(0.6, ge=0)  # nearer returns are the sensor's own mount
-    max_servo_gap_s: float = Field(0.1, ge=0.005)  # between two states; longer is not interpolated
-    max_wait_s: float = Field(0.34, gt=0)  # for a servo state; then the oldest packet goes without an angle
+    min_range_m: float = Field(0.6, ge=0)  # nearer returns come from the sensor's mount
+    max_servo_gap_s: float = Field(0.1, ge=0.005)  # longest gap between two servo states that is interpolated
+    max_wait_s: float = Field(0.34, gt=0)  # for a servo state; then the oldest packet is released without an angle
 
     @model_validator(mode="after")
     def _settings_agree(self) -> SweepSettings:
@@ -56,7 +53,7 @@ class SweepSettings(Settings):
 
 
 class Sweep(Stage[SweepSettings]):
-    """P III.A: swept points per packet, a depth image per sweep."""
+    """Swept points and pulses per packet, a depth image per sweep. P III.A."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"servo"})
 
@@ -75,7 +72,7 @@ class Sweep(Stage[SweepSettings]):
             self._travel = Revolution()
 
     def on_firings(self, firings: LidarFirings) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
-        """Queue the packet; give out what can be placed."""
+        """Queue the packet; yield what can be placed."""
         if firings.pulse_stamp_ns.size == 0:
             return
         waiting = self._waiting
@@ -85,12 +82,12 @@ class Sweep(Stage[SweepSettings]):
             yield from self._place(waiting.popleft())
 
     def on_servo(self, servo: ServoState) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
-        """One more angle; give out what waited for it."""
+        """Add a servo state; yield the packets that waited for it."""
         self._turntable.add(servo)
         yield from self._release()
 
     def finish(self) -> Iterator[SweptPoints | SweptPulses | DepthImage]:
-        """Give out what still waits, as far as its angle is known. A sweep cut short makes no image."""
+        """Yield the packets still queued, as far as their angle is known. An incomplete sweep gives no image."""
         while self._waiting:
             yield from self._place(self._waiting.popleft())
 
@@ -142,20 +139,20 @@ class Sweep(Stage[SweepSettings]):
 
 @dataclass
 class Travel:
-    """How far the turntable has gone one way since it last turned back."""
+    """Travel of the turntable in one direction since its last reversal."""
 
-    whole_rad: float  # a sweep is whole after this
-    reversal_rad: float  # going back by less is jitter
+    whole_rad: float  # a sweep is complete after this
+    reversal_rad: float  # a smaller reversal is jitter
     _start_rad: float = field(default=math.nan, init=False)
     _furthest_rad: float = field(default=math.nan, init=False)
 
     def restart(self, angle_rad: float = math.nan, azimuth_rad: float = math.nan) -> None:
-        """Count from this angle, or from the next one told."""
+        """Count from this angle, or from the next one added."""
         del azimuth_rad
         self._start_rad = self._furthest_rad = angle_rad
 
     def advance(self, angle_rad: float, azimuth_rad: float) -> bool:
-        """Tell the angle now. True when the turntable has turned back: count and image start anew."""
+        """Add an angle. True after a reversal: travel and image start again."""
         del azimuth_rad
         if math.isnan(self._start_rad):
             self.restart(angle_rad)
@@ -174,7 +171,7 @@ class Travel:
 
     @property
     def moving(self) -> bool:
-        """False while it stands where it began: what is seen meanwhile belongs to no sweep, and would grow stale."""
+        """False while the turntable rests at its start: returns of that time belong to no sweep."""
         return self.turned_rad > self.reversal_rad
 
     @property
@@ -185,20 +182,20 @@ class Travel:
 
 @dataclass
 class Revolution:
-    """How far the LiDAR itself has spun: the sweep of a LiDAR without servo."""
+    """Rotation of the LiDAR itself: the sweep of a LiDAR without servo."""
 
-    turned_rad: float = field(default=0.0, init=False)  # of the servo: there is none
+    turned_rad: float = field(default=0.0, init=False)  # travel of the servo, which does not exist
     moving: bool = field(default=True, init=False)
     _spun_rad: float = field(default=0.0, init=False)
     _azimuth_rad: float = field(default=math.nan, init=False)
 
     def restart(self, angle_rad: float = math.nan, azimuth_rad: float = math.nan) -> None:
-        """Count from this azimuth, or from the next one told."""
+        """Count from this azimuth, or from the next one added."""
         del angle_rad
         self._spun_rad, self._azimuth_rad = 0.0, azimuth_rad
 
     def advance(self, angle_rad: float, azimuth_rad: float) -> bool:
-        """Tell the azimuth now; it only grows. Never True: a LiDAR does not spin back."""
+        """Add an azimuth, which only increases. Never True: a LiDAR does not reverse."""
         del angle_rad
         if not math.isnan(self._azimuth_rad):
             self._spun_rad += (azimuth_rad - self._azimuth_rad) % math.tau

@@ -1,8 +1,8 @@
-"""Where the turntable stood when each laser fired, and the returns turned into the vehicle frame with it.
+"""The turntable's angle at each laser pulse, and the returns and pulses transformed to the vehicle frame by it.
 
-p_vehicle = T_vehicle_turntable Rz(angle) T_turntable_lidar p_lidar, the angle linear in time between the two servo
-states around each pulse. Nothing is extrapolated: a pulse before the first state, after the last one, or in a gap
-longer than allowed has no angle, and its return is left out and counted.
+p_vehicle = T_vehicle_turntable Rz(angle) T_turntable_lidar p_lidar, with the angle interpolated linearly between the
+two servo states around each pulse. Nothing is extrapolated: a pulse before the first state, after the last one, or in a
+gap longer than allowed has no angle, and its return is omitted and counted.
 
 Source: P III.A; DESIGN, Frames. Per-pulse interpolation is ours: 1 ms at 57 rpm is 12 cm at 20 m.
 """
@@ -20,39 +20,40 @@ from stages.geometry.frames import Array64, LidarMount
 from stages.kernels.sweep.turntable import place_pulses, place_returns, turns_at
 from stages.messages import LidarFirings, ServoState, SweptPulses
 
-STATES_KEPT = 512  # 5 s at 100 Hz: far longer than any packet waits
+STATES_KEPT = 512  # 5 s at 100 Hz: longer than any packet waits
 
 
 class Placed(NamedTuple):
     """Returns of one packet in the vehicle frame."""
 
-    pulse: NDArray[np.int64]  # (n,) which pulse of the packet
+    pulse: NDArray[np.int64]  # (n,) index of the pulse in the packet
     xyz_vehicle_m: NDArray[np.float32]  # (n, 3)
     turntable_rad: NDArray[np.float32]  # (n,)
     unplaced: int
 
 
 class GearPlay:
-    """The turntable follows the servo with play: it stays where it is until the servo takes it along.
+    """Backlash of the gear: the turntable rests until the servo has crossed the play.
 
-    Where it stands in its play before the first move is not known: the middle is taken. Angles in the servo's sense.
+    The position within the play before the first motion is not known: the middle is assumed. Angles in the servo's
+    sense of rotation.
     """
 
     def __init__(self, mount: LidarMount) -> None:
         self.half_rad = math.radians(mount.servo_play_deg) / 2
-        self.lag_rad = 0.0  # by how much the turntable hangs back
+        self.lag_rad = 0.0  # lag of the turntable behind the servo
 
     def move(self, step_rad: float) -> None:
-        """The servo went on by a step."""
+        """Add a step of the servo."""
         self.lag_rad = min(max(self.lag_rad + step_rad, -self.half_rad), self.half_rad)
 
     def goal_rad(self, servo_rad: float, wanted_rad: float) -> float:
-        """Where the servo, now at servo_rad, must go to: the table then stands as at wanted_rad without play."""
+        """Servo goal, from servo_rad, that brings the table to where wanted_rad would bring it without play."""
         return wanted_rad + math.copysign(self.half_rad, wanted_rad - (servo_rad - self.lag_rad))
 
 
 class Turntable:
-    """The servo's recent states as turntable angles over time, and the mount they turn."""
+    """Recent servo states as turntable angles over time, and the LiDAR's mount."""
 
     def __init__(self, mount: LidarMount, max_gap_s: float, min_range_m: float) -> None:
         self._mount = mount
@@ -60,7 +61,7 @@ class Turntable:
         self._min_range_m = min_range_m
         self._offset_ns = round(mount.servo_time_offset_s * 1e9)
         self.T_vehicle_turntable = mount.T_vehicle_turntable.matrix()
-        self._rows_vehicle_turntable: list[list[float]] = self.T_vehicle_turntable[:3].tolist()  # each packet asks
+        self._rows_vehicle_turntable: list[list[float]] = self.T_vehicle_turntable[:3].tolist()  # used per packet
         self._T_turntable_lidar = mount.T_turntable_lidar.matrix()
         self._lidar_turntable_m: tuple[float, float, float] = tuple(self._T_turntable_lidar[:3, 3].tolist())
         self._last_servo_rad: float | None = None
@@ -71,13 +72,13 @@ class Turntable:
 
     @property
     def known_until_ns(self) -> int | None:
-        """Time of the newest servo state, None before the first."""
+        """Stamp of the newest servo state; None before the first."""
         return self._states[-1][0] if self._states else None
 
     def add(self, servo: ServoState) -> None:
-        """One more state. One that is not newer than the last is ignored: it can only be a repeated answer.
+        """Add a servo state. One that is not newer than the last is ignored: it is a repeated reply.
 
-        A single-turn encoder jumps by a whole turn at its end; the shorter way round is taken, so angles run on.
+        A single-turn encoder jumps by a full turn at its end; steps are unwrapped to the shorter direction.
         """
         stamp_ns = servo.stamp_ns + self._offset_ns
         if self._states and stamp_ns <= self._states[-1][0]:
@@ -106,7 +107,7 @@ class Turntable:
         self._state_rad = np.array([angle for _, angle in self._states])
 
     def lidar_origin_vehicle_m(self, angle_rad: float) -> tuple[float, float, float]:
-        """Where the beams start, for a turntable angle; NaN counts as 0."""
+        """Origin of the beams for a turntable angle; NaN counts as 0."""
         angle_rad = 0.0 if math.isnan(angle_rad) else angle_rad
         x, y, z = self._lidar_turntable_m
         c, s = math.cos(angle_rad), math.sin(angle_rad)
@@ -128,7 +129,7 @@ class Turntable:
         return turn
 
     def place(self, firings: LidarFirings, turns: Array64) -> Placed:
-        """The packet's returns in the vehicle frame; `turns` are those of its pulses."""
+        """The packet's returns in the vehicle frame; `turns`: as returned for its pulses."""
         n = firings.pulse_stamp_ns.size
         pulse = np.empty(n, dtype=np.int64)
         xyz_vehicle_m = np.empty((n, 3), dtype=np.float32)
@@ -147,7 +148,7 @@ class Turntable:
         return Placed(pulse[:placed], xyz_vehicle_m[:placed], turntable_rad[:placed], unplaced)
 
     def pulses(self, firings: LidarFirings, turns: Array64) -> SweptPulses:
-        """Every pulse of the packet in the vehicle frame; none when the angle is not known for all of it."""
+        """All pulses of the packet in the vehicle frame; empty unless the angle is known for all of them."""
         pulse_ns = firings.pulse_stamp_ns
         n = pulse_ns.size
         middle_rad = float(turns[n // 2, 0])
@@ -171,7 +172,7 @@ class Turntable:
             distance_m,
         )
         laser, reflectivity = firings.laser, firings.reflectivity
-        if count < n:  # else each pulse has one row, in order: the packet's own arrays will do
+        if count < n:  # otherwise each pulse has one row, in order, and the packet's arrays are used
             row = row[:count]
             pulse_ns, laser, reflectivity = pulse_ns[row], laser[row], reflectivity[row]
         return SweptPulses(
@@ -186,7 +187,7 @@ class Turntable:
         )
 
     def why_unknown(self, t_ns: int) -> str:
-        """Why the angle at a time is not known, in words."""
+        """The reason why the angle at a time is not known."""
         if not self._states:
             return "no servo state yet: is the servo link wired to this stage, and does the servo answer?"
         first_ns, last_ns = self._states[0][0], self._states[-1][0]

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.kernels.track.kalman import forward_kernel
+from stages.kernels.track.scan_pass import forward_kernel
 
 
 def predicted(x: Array64, P: Array64, dt_s: float, q: float) -> tuple[Array64, Array64]:

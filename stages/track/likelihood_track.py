@@ -40,9 +40,9 @@ from stages.messages import (
 )
 from stages.sweep.pulses import middle_ns
 from stages.track.hypotheses import Hypotheses, Hypothesis
-from stages.track.scan_pass import Look, collect_into, evaluate
+from stages.track.scan_pass import ScanPass, collect_into, evaluate
 
-LOOK_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
+PASS_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
 CANDIDATE_S = 1.5  # one that was not accepted is forgotten so long after its last hit
 
 
@@ -56,7 +56,7 @@ class LikelihoodTrackSettings(Settings):
     max_hypotheses: int = Field(4, ge=0, le=16)  # candidates followed beside them
     own_sigma_m: float = Field(0.8, gt=0)  # less known, only the detector finds it again
     manoeuvre: float = Field(1.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
-    told_manoeuvre: float = Field(0.01, gt=0)  # and what is left of it where the drone tells how it flies
+    odometry_manoeuvre: float = Field(0.01, gt=0)  # and what is left of it where the drone tells how it flies
     coast_after_s: float = Field(0.35, gt=0)
     lost_after_s: float = Field(6.0, gt=0)  # later where the drone tells its flight, as long as
     lost_sigma_m: float = Field(5.0, gt=0)  # it is known as well as this
@@ -66,7 +66,7 @@ class LikelihoodTrackSettings(Settings):
         0.017, ge=0
     )  # of the LiDAR, constant: VLP-16 data sheet 63-9229, +-3 cm, taken as even
     shape_share: float = Field(0.03, ge=0, le=1)  # of its span: returns lie so far off its middle, one sigma, an axis
-    misses: bool = True  # ablation: without, only hits count
+    use_pass_throughs: bool = True  # ablation: without, only hits count
     de_skew: bool = True  # ablation: without, a look is taken to be one moment
 
 
@@ -85,7 +85,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         settings = self.settings
         self._known = Hypotheses(
             settings.manoeuvre,
-            settings.told_manoeuvre,
+            settings.odometry_manoeuvre,
             settings.start_sigma_mps,
             settings.own_sigma_m,
             settings.max_drones,
@@ -97,34 +97,37 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
 
     def on_drone_position(self, position: DroneLocalPosition) -> None:
         """What the drone says of its flight: a track moves as it says."""
-        self._known.hear_position(position)
+        self._known.add_position(position)
 
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
         """The same from an autopilot that sends this; taken where it sends both."""
-        self._known.hear_odometry(odometry)
+        self._known.add_odometry(odometry)
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Follow the promising ones; drop what is no longer taken for a drone."""
-        if self._detector_life not in (None, candidates.detector_life):
-            self._known.forget_numbers()
-        self._detector_life = candidates.detector_life
+        if self._detector_life not in (None, candidates.detector_instance):
+            self._known.clear_candidate_numbers()
+        self._detector_life = candidates.detector_instance
         own = set(candidates.candidate_id[candidates.probability >= 0.5].tolist())
         for i in range(len(candidates.candidate_id)):
             number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])
-            xyz, v = self._trail.to_local(
+            xyz, v = self._trail.to_map(
                 candidates.stamp_ns, candidates.xyz_vehicle_m[i], candidates.velocity_vehicle_mps[i]
             )
             known = self._known.near(xyz, candidates.stamp_ns, number)
             if known is None and P >= 0.5:
-                known = self._known.astray(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+                known = self._known.diverged(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
             if known is not None:
-                seen_later = int(candidates.seen_ns[i]) > known.last_hit_ns
-                doubtful = known.confirmed and seen_later and self._known.doubtful(known, candidates.stamp_ns)
-                own_word = known.candidate == number  # the detector itself has followed it on
-                if doubtful and (0.5 if own_word else self._known.needed(known, candidates.stamp_ns)) <= P:
+                seen_later = int(candidates.seen_ns[i]) > known.last_return_ns
+                uncertain = known.confirmed and seen_later and self._known.uncertain(known, candidates.stamp_ns)
+                own_candidate = known.candidate == number  # the detector itself has followed it on
+                if (
+                    uncertain
+                    and (0.5 if own_candidate else self._known.required_probability(known, candidates.stamp_ns)) <= P
+                ):
                     self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
                 # what is refused beside a track whose own candidate is taken for a drone is another one there
-                sure = known.candidate == number or (candidates.looks[i] >= 6 and known.candidate not in own)
+                sure = known.candidate == number or (candidates.scan_passes[i] >= 6 and known.candidate not in own)
                 if P < 0.2 and known.confirmed and sure:
                     yield from self._lose(
                         known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}"
@@ -139,12 +142,12 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             number = -1 if detections.candidate_id is None else int(detections.candidate_id[i])
             velocity = detections.velocity_vehicle_mps
             v = np.zeros(3) if velocity is None else velocity[i]
-            xyz, v = self._trail.to_local(seen_ns, detections.xyz_vehicle_m[i], v)
-            track = self._known.near(xyz, seen_ns, number) or self._known.astray(number, xyz, v, seen_ns, seen_ns)
+            xyz, v = self._trail.to_map(seen_ns, detections.xyz_vehicle_m[i], v)
+            track = self._known.near(xyz, seen_ns, number) or self._known.diverged(number, xyz, v, seen_ns, seen_ns)
             drone = track if track is not None and track.confirmed else None
-            if drone is not None and seen_ns > drone.last_hit_ns and self._known.doubtful(drone, seen_ns):
+            if drone is not None and seen_ns > drone.last_return_ns and self._known.uncertain(drone, seen_ns):
                 self._known.move(drone, number, xyz, v, seen_ns, seen_ns)
-            if drone is None and (old := self._known.gives_way(seen_ns)):
+            if drone is None and (old := self._known.oldest_unseen(seen_ns)):
                 yield from self._lose(old, seen_ns, "not hit, while the detector accepted a drone elsewhere")
             if track is None:
                 if len(self._known.confirmed) >= self.settings.max_drones:
@@ -155,7 +158,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
                 track.number, self._next_number = self._next_number, self._next_number + 1
                 track.candidate = number
                 track.reason = "accepted by the detector"
-                track.odds = max(track.odds, 4.0)
+                track.log_odds = max(track.log_odds, 4.0)
                 yield self._state(track, max(detections.stamp_ns, track.stamp_ns))
 
     def on_pulses(self, pulses: SweptPulses) -> Iterator[DroneFix | TrackState]:
@@ -169,15 +172,15 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         for track in hypotheses:
             if track not in hypotheses:  # dropped a moment ago as the same as another
                 continue
-            look = track.look
-            if look is not None and pulses.stamp_ns - look.last_ns > LOOK_OVER_NS:
-                track.look = None
-                yield from self._close(track, look)
-            before = track.look
+            scan_pass = track.scan_pass
+            if scan_pass is not None and pulses.stamp_ns - scan_pass.last_ns > PASS_OVER_NS:
+                track.scan_pass = None
+                yield from self._close(track, scan_pass)
+            before = track.scan_pass
             state = hypotheses.at(track, pulses.stamp_ns) if before is None else (before.x, before.P)
-            track.look = collect_into(before, pulses, R, t, axis, *state, span_m, de_skew)
+            track.scan_pass = collect_into(before, pulses, R, t, axis, *state, span_m, de_skew)
             if before is None:
-                track.look_word = hypotheses.word(pulses.stamp_ns)
+                track.pass_sample = hypotheses.sample(pulses.stamp_ns)
             if track in hypotheses:
                 yield from self._watch(track, now_ns)
         if not len(hypotheses) and now_ns - self._idle_ns > 500_000_000:
@@ -197,12 +200,12 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
     def _watch(self, track: Hypothesis, now_ns: int) -> Iterator[TrackState]:
         """Coasting and losing are told without a look."""
         settings = self.settings
-        silent_s = (now_ns - track.last_hit_ns) * 1e-9
+        silent_s = (now_ns - track.last_return_ns) * 1e-9
         gone = silent_s > (settings.lost_after_s if track.confirmed else CANDIDATE_S)
         if track.confirmed and gone:
-            known = self._known.word(now_ns) is not None
+            known = self._known.sample(now_ns) is not None
             gone = not (known and largest_sigma_m(self._known.at(track, now_ns)[1]) < settings.lost_sigma_m)
-        if gone or track.odds < -4.0:
+        if gone or track.log_odds < -4.0:
             why = f"not hit for {silent_s:.1f} s" if silent_s > 1.0 else "looked at again and again, not hit"
             yield from self._lose(track, now_ns, why)
         elif track.confirmed:
@@ -211,25 +214,25 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
                     younger = other if not other.confirmed or other.number > track.number else track
                     if younger is not track:
                         yield from self._lose(other, now_ns, f"is the same as drone {track.number}")
-            if now_ns - track.told_ns > 100_000_000:
+            if now_ns - track.published_ns > 100_000_000:
                 if silent_s > settings.coast_after_s:
                     track.reason = f"not hit for {silent_s:.1f} s"
                 yield self._state(track, now_ns)
-        elif now_ns - track.told_ns > 100_000_000:
+        elif now_ns - track.published_ns > 100_000_000:
             yield self._state(track, now_ns)
 
     def _state(self, track: Hypothesis, now_ns: int) -> TrackState:
-        silent_s = (now_ns - track.last_hit_ns) * 1e-9
+        silent_s = (now_ns - track.last_return_ns) * 1e-9
         state = TrackingState.CANDIDATE
         if track.confirmed:
             state = TrackingState.COASTING if silent_s > self.settings.coast_after_s else TrackingState.TRACKING
         x, P = self._known.at(track, now_ns)
         R, _ = self._trail.at(now_ns)
         xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
-        covariance = R.T @ P[:3, :3] @ R + self._lasting_covariance(xyz)
+        covariance = R.T @ P[:3, :3] @ R + self._bias_covariance(xyz)
         if silent_s > self.settings.coast_after_s:  # what is seen is seen from the vehicle, wherever that is
-            covariance += self._unsure_vehicle_m2(now_ns, xyz)
-        track.told_ns = now_ns
+            covariance += self._vehicle_covariance_m2(now_ns, xyz)
+        track.published_ns = now_ns
         return TrackState(
             stamp_ns=now_ns,
             state=state,
@@ -242,32 +245,32 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             covariance_m2=covariance,
         )
 
-    def _unsure_vehicle_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> Array64:
+    def _vehicle_covariance_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> Array64:
         """What a place beside a vehicle that is not heard any more is wrong by (3, 3), its axes."""
-        place_m, yaw_rad = self._trail.unsure(stamp_ns)
+        place_m, yaw_rad = self._trail.extrapolation_sigma(stamp_ns)
         level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * yaw_rad
         return place_m**2 * np.eye(3) + np.outer(level, level)
 
     # one look
 
-    def _close(self, track: Hypothesis, look: Look) -> Iterator[DroneFix | TrackState]:
+    def _close(self, track: Hypothesis, scan_pass: ScanPass) -> Iterator[DroneFix | TrackState]:
         settings = self.settings
         seen = evaluate(
-            look,
+            scan_pass,
             settings.span_m,
             settings.hull_share * settings.span_m,
             track.p_0,
-            settings.misses,
+            settings.use_pass_throughs,
             settings.own_sigma_m,
         )
         track.hits = 0 if seen is None else seen.hits
         if seen is None:
             return
-        self._known.update(track, look.start_ns, seen.x, seen.P, track.look_word)
-        track.odds = min(max(track.odds + seen.evidence, -8.0), 8.0)
+        self._known.update(track, scan_pass.start_ns, seen.x, seen.P, track.pass_sample)
+        track.log_odds = min(max(track.log_odds + seen.evidence, -8.0), 8.0)
         if seen.hits == 0:
             return
-        track.last_hit_ns = seen.hit_ns
+        track.last_return_ns = seen.return_ns
         if seen.expected > 0.5:
             ratio = min(max(track.p_0 * seen.hits / seen.expected, 0.15), 0.95)
             track.p_0 += 0.1 * (ratio - track.p_0)
@@ -275,15 +278,15 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         if track.confirmed:
             self._known.learn(track)
             yield self._fix(track)
-        yield self._state(track, max(look.last_ns, track.last_hit_ns, track.told_ns))
+        yield self._state(track, max(scan_pass.last_ns, track.last_return_ns, track.published_ns))
 
     def _fix(self, track: Hypothesis) -> DroneFix:
-        x, P = self._known.at(track, track.last_hit_ns)
-        R, _ = self._trail.at(track.last_hit_ns)
-        xyz, velocity = self._trail.to_vehicle(track.last_hit_ns, x[:3], x[3:])
-        bias_covariance_m2 = self._lasting_covariance(xyz)
+        x, P = self._known.at(track, track.last_return_ns)
+        R, _ = self._trail.at(track.last_return_ns)
+        xyz, velocity = self._trail.to_vehicle(track.last_return_ns, x[:3], x[3:])
+        bias_covariance_m2 = self._bias_covariance(xyz)
         return DroneFix(
-            stamp_ns=track.last_hit_ns,
+            stamp_ns=track.last_return_ns,
             xyz_vehicle_m=xyz,
             covariance_m2=R.T @ P[:3, :3] @ R + bias_covariance_m2,
             hits=track.hits,
@@ -294,7 +297,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             bias_covariance_m2=bias_covariance_m2,
         )
 
-    def _lasting_covariance(self, xyz_vehicle_m: Array64) -> Array64:
+    def _bias_covariance(self, xyz_vehicle_m: Array64) -> Array64:
         """What does not average out (3, 3): the turntable's zero and tilt, the range, the drone's outline.
 
         Axes of the vehicle; the line of sight is taken from its origin, decimetres beside the LiDAR's.

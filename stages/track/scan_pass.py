@@ -21,17 +21,17 @@ from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS, WIDTH, across
 from stages.track.kalman import condition, measured
 
-FURTHEST_M = 6.0  # beside the prediction pulses are collected
+MAX_OFFSET_M = 6.0  # beside the prediction pulses are collected
 RANGE_NOISE = 0.1  # of one return about the body's middle, one sigma, over the span: it is as deep
 RANGE_FLOOR_M = 0.02
-MOST_ROWS = 256
+MAX_ROWS = 256
 OFF_SPAN = np.array([0.3, 0.3, 0.2])  # a, b, depth: of returns about the prediction beside its own sigma, over the span
-LEAST_SCORE = -6.0  # of a group: of 3498 looks at drones followed in 25 flights as built none was worse than -4.8,
-LEAST_GLIMPSED = -1.5  # and one in a hundred worse than this
+MIN_SCORE = -6.0  # of a group: of 3498 looks at drones followed in 25 flights as built none was worse than -4.8,
+MIN_GLIMPSE_SCORE = -1.5  # and one in a hundred worse than this
 
 
 @dataclass(slots=True, eq=False)
-class Look:
+class ScanPass:
     """Pulses of one passing of the rotor, and the state they are measured against."""
 
     start_ns: int
@@ -48,7 +48,7 @@ class Look:
         return largest_sigma_m(self.P)
 
 
-class Seen(NamedTuple):
+class PassUpdate(NamedTuple):
     """What a look says."""
 
     x: Array64  # state at the look's start
@@ -57,11 +57,11 @@ class Seen(NamedTuple):
     hits: int
     expected: float  # hits expected there
     beside: int  # pulses that passed it
-    hit_ns: int  # mean time of the hits; the look's start when there were none
+    return_ns: int  # mean time of the hits; the look's start when there were none
 
 
 def collect_into(
-    look: Look | None,
+    scan_pass: ScanPass | None,
     pulses: SweptPulses,
     R: Array64,
     t: Array64,
@@ -70,7 +70,7 @@ def collect_into(
     P: Array64,
     span_m: float,
     de_skew: bool,
-) -> Look | None:
+) -> ScanPass | None:
     """The look with this slice's pulses near the drone, a new one if there was none; None while there are none.
 
     R, t are T_map_vehicle of the slice, `axis` (3,) its mean direction; x, P the state predicted at the look's start.
@@ -78,11 +78,11 @@ def collect_into(
     origin = np.array(pulses.origin_vehicle_m)
     away, range_m, here = seen_from(R, t, origin, x, axis)
     if not here:
-        return look
-    start_ns = pulses.stamp_ns if look is None else look.start_ns
+        return scan_pass
+    start_ns = pulses.stamp_ns if scan_pass is None else scan_pass.start_ns
     sigma_m = largest_sigma_m(P)
-    reach_m = min(0.6 * span_m + 3.0 * sigma_m, FURTHEST_M)
-    line = R @ away / range_m if look is None else look.line
+    reach_m = min(0.6 * span_m + 3.0 * sigma_m, MAX_OFFSET_M)
+    line = R @ away / range_m if scan_pass is None else scan_pass.line
     found = np.empty((pulses.range_m.size, COLUMNS))
     count = collect(
         pulses.point_stamp_ns,
@@ -100,52 +100,52 @@ def collect_into(
         found,
     )
     if count == 0:
-        return look
-    if look is None:
-        look = Look(start_ns, start_ns, x, P, line, reach_m)
-    look.parts.append(found[:count])
-    look.last_ns = int(pulses.point_stamp_ns[-1])
-    return look
+        return scan_pass
+    if scan_pass is None:
+        scan_pass = ScanPass(start_ns, start_ns, x, P, line, reach_m)
+    scan_pass.parts.append(found[:count])
+    scan_pass.last_ns = int(pulses.point_stamp_ns[-1])
+    return scan_pass
 
 
 def evaluate(
-    look: Look, span_m: float, hull_offset_m: float, p_0: float, use_misses: bool, own_sigma_m: float
-) -> Seen | None:
+    scan_pass: ScanPass, span_m: float, hull_offset_m: float, p_0: float, use_pass_throughs: bool, own_sigma_m: float
+) -> PassUpdate | None:
     """Where the drone is after a look; None when the look says nothing.
 
     What is hit where the prediction is worse than own_sigma_m may be anything: that is for the detector to judge.
     """
-    pulses, sigma_m = np.concatenate(look.parts), look.sigma_m
+    pulses, sigma_m = np.concatenate(scan_pass.parts), scan_pass.sigma_m
     leave_out_walls(pulses, span_m)
-    pulses = pulses[np.hypot(pulses[:, A], pulses[:, B]) <= look.reach_m]
+    pulses = pulses[np.hypot(pulses[:, A], pulses[:, B]) <= scan_pass.reach_m]
     missed = pulses[(pulses[:, KIND] == MISS) | (pulses[:, KIND] == NEARER)]
-    H = across(look.line)
-    prior = H @ look.P[:3, :3] @ H.T
+    H = across(scan_pass.line)
+    prior = H @ scan_pass.P[:3, :3] @ H.T
     mean, after = np.zeros(2), np.zeros((2, 2))
-    rows = drone_hits(pulses, span_m, sigma_m) if sigma_m < own_sigma_m else None
+    rows = drone_returns(pulses, span_m, sigma_m) if sigma_m < own_sigma_m else None
     if rows is None:
         alone = len(missed) == len(pulses) > 1
-        if not (use_misses and alone and sigma_m < 0.7 * span_m):
+        if not (use_pass_throughs and alone and sigma_m < 0.7 * span_m):
             return None
         evidence, expected = posterior(missed, prior, 0.0, 0.0, 3.0 * sigma_m, p_0, WIDTH * span_m, True, mean, after)
-        x, P = condition(look.x, look.P, H, mean, after)
-        return Seen(x, P, max(evidence, -1.0), 0, expected, len(missed), look.start_ns)
+        x, P = condition(scan_pass.x, scan_pass.P, H, mean, after)
+        return PassUpdate(x, P, max(evidence, -1.0), 0, expected, len(missed), scan_pass.start_ns)
     hits = pulses[rows]
     hits[:, KIND] = HIT
     a, b = float(hits[:, A].mean()), float(hits[:, B].mean())
     half_m = max(0.6 * span_m, 0.6 * math.hypot(a, b) + 0.3 * span_m)
     used = np.concatenate([hits, missed])
-    evidence, expected = posterior(used, prior, a, b, half_m, p_0, WIDTH * span_m, use_misses, mean, after)
-    x, sideways = condition(look.x, look.P, H, mean, after)
+    evidence, expected = posterior(used, prior, a, b, half_m, p_0, WIDTH * span_m, use_pass_throughs, mean, after)
+    x, sideways = condition(scan_pass.x, scan_pass.P, H, mean, after)
     depth_m = float(np.median(hits[:, DEPTH])) + hull_offset_m
     noise_m = math.sqrt((RANGE_NOISE * span_m) ** 2 / len(hits) + RANGE_FLOOR_M**2)
-    along_m = depth_m - float(look.line @ (x[:3] - look.x[:3]))
-    x, both = measured(x, sideways, look.line, along_m, noise_m)
-    hit_ns = look.start_ns + round(float(hits[:, WHEN_S].mean()) * 1e9)
-    return Seen(x, both, min(evidence, 3.0), len(hits), expected, len(missed), hit_ns)
+    along_m = depth_m - float(scan_pass.line @ (x[:3] - scan_pass.x[:3]))
+    x, both = measured(x, sideways, scan_pass.line, along_m, noise_m)
+    return_ns = scan_pass.start_ns + round(float(hits[:, WHEN_S].mean()) * 1e9)
+    return PassUpdate(x, both, min(evidence, 3.0), len(hits), expected, len(missed), return_ns)
 
 
-def drone_hits(pulses: Array64, span_m: float, sigma_m: float) -> NDArray[np.intp] | None:
+def drone_returns(pulses: Array64, span_m: float, sigma_m: float) -> NDArray[np.intp] | None:
     """Which of a look's pulses (n, COLUMNS) are the drone's returns: rows, or None when none are.
 
     The densest group of the drone's size, near the prediction rather than far; none when more stands right beside it:
@@ -156,15 +156,15 @@ def drone_hits(pulses: Array64, span_m: float, sigma_m: float) -> NDArray[np.int
         return None
     place = pulses[rows][:, [A, B, DEPTH]]
     variance_m2 = sigma_m**2 + (span_m * OFF_SPAN) ** 2
-    if len(rows) > MOST_ROWS:  # a wall: what is nearest to the prediction will do
-        rows = rows[np.argsort(np.sum(place**2, axis=1), kind="stable")[:MOST_ROWS]]
+    if len(rows) > MAX_ROWS:  # a wall: what is nearest to the prediction will do
+        rows = rows[np.argsort(np.sum(place**2, axis=1), kind="stable")[:MAX_ROWS]]
         place = pulses[rows][:, [A, B, DEPTH]]
     apart = np.linalg.norm(place[:, None] - place[None], axis=2)
     near = apart <= 0.5 * span_m
     score = np.log(near.sum(axis=1)) - 0.5 * np.sum(place**2 / variance_m2, axis=1)
     best = int(score.argmax())
     glimpsed = (pulses[rows[near[best]], KIND] == GLIMPSE).all()
-    if score[best] < (LEAST_GLIMPSED if glimpsed else LEAST_SCORE):
+    if score[best] < (MIN_GLIMPSE_SCORE if glimpsed else MIN_SCORE):
         return None
     centre = place[near[best]].mean(axis=0)
     away = np.linalg.norm(place - centre, axis=1)

@@ -1,5 +1,5 @@
-"""P IV, V.C: in which directions a picture's straight lines run. The paper's rectified views, and ours by
-great circles on the native fisheye."""
+"""Vanishing directions of the straight lines in an image (P IV, V.C): the paper's method on rectified views, and grd's
+by great circles on the native fisheye."""
 
 from stages.vp.great_circle_vp import GreatCircleVp as GreatCircleVp
 from stages.vp.paper_vp import PaperVp as PaperVp

@@ -1,7 +1,7 @@
-"""Lines: arcs that lie on one great circle, near each other, are one line, cut by trees, windows or the tracing.
+"""Lines: neighbouring arcs on one great circle are one line, which trees, windows or the edge tracing have split.
 
-What a facade repeats (sills, cornices, kerbs) is one observation, not ten: counting it ten times is how a covariance
-becomes a lie.
+Repeated structure on one line (sills, cornices, kerbs) is one observation. Counting each arc would make the covariance
+too small.
 
 Source: ours. DESIGN, Vision: cluster lines.
 """
@@ -11,14 +11,14 @@ from __future__ import annotations
 import numpy as np
 
 from stages.kernels.vp.clustering import gather
-from stages.vp.arcs import LEAST_SIGMA_PX, Arcs, arcs_of
-from stages.vp.eye import Eye
+from stages.vp.arcs import MIN_SIGMA_PX, Arcs, arcs_of
+from stages.vp.pixel_rays import PixelRays
 
-TOGETHER_PX = 0.8  # how far an arc's ends may lie from a line's circle
+MERGE_PX = 0.8  # largest distance of an arc's ends from the great circle of its line
 
 
-def cluster(arcs: Arcs, eye: Eye, most: int) -> Arcs:
-    """The `most` widest lines, the widest first."""
+def cluster(arcs: Arcs, pixel_rays: PixelRays, max_lines: int) -> Arcs:
+    """The `max_lines` longest lines, longest first."""
     if len(arcs) == 0:
         return arcs
     order = np.argsort(-arcs.extent_rad, kind="stable")
@@ -28,11 +28,11 @@ def cluster(arcs: Arcs, eye: Eye, most: int) -> Arcs:
         arcs.sigma_rad[order],
         arcs.extent_rad[order],
         arcs.moments[order],
-        TOGETHER_PX * eye.pixel_rad,
-        LEAST_SIGMA_PX * eye.pixel_rad,
+        MERGE_PX * pixel_rays.pixel_rad,
+        MIN_SIGMA_PX * pixel_rays.pixel_rad,
     )
     lines = arcs_of(rows)
-    keep = np.argsort(-lines.extent_rad, kind="stable")[:most]
+    keep = np.argsort(-lines.extent_rad, kind="stable")[:max_lines]
     return Arcs(
         lines.normal[keep], lines.ends[keep], lines.sigma_rad[keep], lines.extent_rad[keep], lines.moments[keep]
     )

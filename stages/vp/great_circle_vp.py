@@ -1,13 +1,12 @@
-"""Vanishing directions from great circles on the native fisheye: no rectified views, nothing lost beyond 90 deg.
+"""Vanishing directions from great circles on the native fisheye: no rectified views, valid beyond 90 deg off axis.
 
-    picture -> chains of edge points (edges.py) -> great-circle arcs (arcs.py) -> lines (clustering.py)
-            -> the vertical, by gravity or found; horizontal pairs, one or more (search.py) -> directions with sigma
+    image -> chains of edge points (edges.py) -> great-circle arcs (arcs.py) -> lines (clustering.py)
+            -> vertical, from gravity or search; one or more horizontal pairs (search.py) -> directions with sigma
 
-Gravity is the autopilot's attitude on the drone, and the camera_mount's own z within `vertical_sigma_deg` without
-it: right
-for a vehicle. Where the camera's rows are exposed one after another (`readout_ms` of its link), each point is told in
-the axes of the middle row, by the camera_mount's turning: `attitude` on the drone, `motion` on the vehicle. A picture
-without enough straight lines gives no directions and the reason.
+On the drone, gravity is the autopilot's attitude. Without it, gravity is the mount's z axis within
+`vertical_sigma_deg`, which is correct for a vehicle. With a rolling shutter (`readout_ms` of the camera link), each
+point is corrected to the exposure of the middle row with the angular rate of the mount: `attitude` on the drone,
+`motion` on the vehicle. An image without enough straight lines gives no directions, and a reason.
 
 Source: ours, for P IV and V.C; DESIGN, The graph: vp.
 """
@@ -29,14 +28,14 @@ from stages.vp.arcs import fit_arcs
 from stages.vp.clustering import cluster
 from stages.vp.directions import lines_of
 from stages.vp.edges import EdgeFinder
-from stages.vp.eye import Eye, Polygon, make_eye
-from stages.vp.gravity import GravityTrail
-from stages.vp.search import Found, Limits, Prior, find_structure
+from stages.vp.gravity import AttitudeBuffer
+from stages.vp.pixel_rays import PixelRays, Polygon, make_pixel_rays
+from stages.vp.search import FoundDirections, SearchLimits, VerticalPrior, find_structure
 
 MIN_POINTS = 6  # of a chain
-MOST_LINES = 400
-WIDE_RAD = 0.35  # a line seen over so much counts fully
-LEAST_SCATTER = 0.3  # of lines against `line_sigma_deg`: no world is straighter than so much of it
+MAX_LINES = 400
+FULL_WEIGHT_RAD = 0.35  # extent from which a line has full weight
+MIN_SCATTER = 0.3  # smallest accepted scatter of lines, in units of `line_sigma_deg`
 SEARCH_DEG = {CameraMount.VEHICLE: 0.0, CameraMount.DRONE: 35.0}
 
 
@@ -46,21 +45,25 @@ class GreatCircleVpSettings(Settings):
     camera_mount: CameraMount
     T_mount_camera: Pose
     lens: Lens
-    masked_px: tuple[Polygon, ...] = ()  # where the camera_mount itself is seen: polygons of (column, row)
-    max_off_axis_deg: float | None = Field(None, gt=0, le=150)  # look no farther out; None: as far as the lens does
-    min_contrast: float = Field(8.0, gt=0, le=100)  # grey levels, of an edge
-    tolerance_px: float = Field(1.0, gt=0, le=10)  # how far a straight line may be from its great circle
+    masked_px: tuple[Polygon, ...] = ()  # polygons of (column, row) over the body of the vehicle or drone
+    max_off_axis_deg: float | None = Field(
+        None, gt=0, le=150
+    )  # rays farther off axis are not used; None: limit of the lens
+    min_contrast: float = Field(8.0, gt=0, le=100)  # of an edge [grey levels]
+    tolerance_px: float = Field(1.0, gt=0, le=10)  # largest distance of a line's points from its great circle
     min_extent_px: float = Field(14.0, ge=5)  # shorter arcs are not used
-    line_sigma_deg: float = Field(0.25, gt=0, le=5)  # how straight and parallel the world is, one sigma of a line
-    vertical_sigma_deg: float = Field(3.0, gt=0, le=60)  # how upright the camera_mount stands, without attitude
+    line_sigma_deg: float = Field(0.25, gt=0, le=5)  # one sigma of straightness and parallelism of lines
+    vertical_sigma_deg: float = Field(3.0, gt=0, le=60)  # of the mount's z axis against the vertical, without attitude
     attitude_sigma_deg: float = Field(1.0, gt=0, le=30)  # of the attitude's roll and pitch
-    attitude_age_s: float = Field(0.2, gt=0)  # an older one is not used
-    search_deg: float | None = Field(None, ge=0, le=90)  # without attitude the vertical is within this cone about z;
-    # 0: it is z, within `vertical_sigma_deg`. None: 0 for a vehicle, 35 for a drone, which tilts as it flies
+    attitude_age_s: float = Field(0.2, gt=0)  # maximum age of an attitude
+    search_deg: float | None = Field(
+        None, ge=0, le=90
+    )  # without attitude, the vertical is searched in this cone about z;
+    # 0: it is z, within `vertical_sigma_deg`. None: 0 for a vehicle, 35 for a drone, which tilts in flight
     max_frames: int = Field(3, ge=1, le=6)  # horizontal pairs; 1: Manhattan
     min_lines: int = Field(4, ge=2)  # of a horizontal pair
-    min_score: float = Field(7.0, gt=0)  # standard deviations over lines in random directions
-    least_sigma_deg: float = Field(0.1, gt=0, le=5)  # no direction is known better
+    min_score: float = Field(7.0, gt=0)  # in standard deviations above lines of random directions
+    least_sigma_deg: float = Field(0.1, gt=0, le=5)  # lower limit of a direction's sigma
 
     @model_validator(mode="after")
     def _settings_agree(self) -> GreatCircleVpSettings:
@@ -70,77 +73,81 @@ class GreatCircleVpSettings(Settings):
 
 
 class GreatCircleVp(Stage[GreatCircleVpSettings]):
-    """The directions in which a street runs, as one fisheye sees them, and how well they are known."""
+    """Vertical and horizontal directions of a street from one fisheye image, each with its sigma."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude", "motion"})
 
     def __init__(self, settings: GreatCircleVpSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._eye: Eye | None = None
+        self._pixel_rays: PixelRays | None = None
         self._edges: EdgeFinder | None = None
-        self._gravity = GravityTrail()
+        self._attitudes = AttitudeBuffer()
         self._vehicle = VehicleTrajectory()
 
     def on_attitude(self, attitude: DroneAttitude) -> None:
-        """Roll, pitch and turning of the drone; its yaw is not used."""
+        """Roll, pitch and angular rate of the drone; its yaw is not used."""
         if self.settings.camera_mount is not CameraMount.DRONE:
-            raise ValueError("attitude is the drone's: wire it to the stage whose camera_mount is the drone")
-        self._gravity.add(attitude)
+            raise ValueError("attitude belongs to the drone: connect it to the stage whose camera_mount is drone")
+        self._attitudes.add(attitude)
 
     def on_motion(self, motion: VehicleMotion) -> None:
-        """How the vehicle turns; nothing else of it is used."""
+        """Angular rate of the vehicle; nothing else of the message is used."""
         if self.settings.camera_mount is not CameraMount.VEHICLE:
-            raise ValueError("motion is the vehicle's: wire it to the stage whose camera_mount is the vehicle")
+            raise ValueError("motion belongs to the vehicle: connect it to the stage whose camera_mount is vehicle")
         self._vehicle.add(motion)
 
     def on_image(self, image: Image) -> VanishingDirections:
-        """One picture's directions and lines."""
+        """Directions and lines of one image."""
         settings = self.settings
         if image.frame_id != f"camera_{settings.camera_mount.value}":
             raise ValueError(
-                f"image comes from {image.frame_id}, this stage's camera_mount is the {settings.camera_mount.value}"
+                f"the image is of {image.frame_id}, but the camera_mount of this stage is {settings.camera_mount.value}"
             )
-        if self._eye is None or self._edges is None or self._eye.usable.shape != image.grey.shape:
-            self._eye = make_eye(settings.lens, image.grey.shape, settings.max_off_axis_deg, settings.masked_px)
-            self._edges = EdgeFinder(self._eye.usable, settings.min_contrast, MIN_POINTS)
-        eye = self._eye
+        if self._pixel_rays is None or self._edges is None or self._pixel_rays.usable.shape != image.grey.shape:
+            self._pixel_rays = make_pixel_rays(
+                settings.lens, image.grey.shape, settings.max_off_axis_deg, settings.masked_px
+            )
+            self._edges = EdgeFinder(self._pixel_rays.usable, settings.min_contrast, MIN_POINTS)
+        pixel_rays = self._pixel_rays
         chains = self._edges.find(image.grey)
         R = settings.T_mount_camera.matrix()[:3, :3]
         turn = image.rows_after_s() * (self._rate_radps(image.stamp_ns) @ R)
-        arcs = cluster(fit_arcs(chains, eye, settings.tolerance_px, settings.min_extent_px, turn), eye, MOST_LINES)
-        lines = lines_of(arcs, R, WIDE_RAD)
+        arcs = cluster(
+            fit_arcs(chains, pixel_rays, settings.tolerance_px, settings.min_extent_px, turn), pixel_rays, MAX_LINES
+        )
+        lines = lines_of(arcs, R, FULL_WEIGHT_RAD)
         found = find_structure(lines, self._prior(image.stamp_ns), self._limits())
         return self._message(image.stamp_ns, found, lines.normal, arcs.ends @ R.T, arcs.sigma_rad)
 
     def _rate_radps(self, stamp_ns: int) -> Array64:
-        """How the camera_mount turns (3,), its own axes; zero where nothing tells."""
+        """Angular rate (3,) of the mount, mount axes; zero when it is unknown."""
         if self.settings.camera_mount is CameraMount.DRONE:
-            rate = self._gravity.rate_radps(stamp_ns, self.settings.attitude_age_s)
+            rate = self._attitudes.rate_radps(stamp_ns, self.settings.attitude_age_s)
             return np.zeros(3) if rate is None else rate
         return self._vehicle.rate_radps(stamp_ns) if self._vehicle.known_at(stamp_ns) else np.zeros(3)
 
-    def _prior(self, stamp_ns: int) -> Prior:
+    def _prior(self, stamp_ns: int) -> VerticalPrior:
         settings = self.settings
-        up = self._gravity.at(stamp_ns, settings.attitude_age_s)
+        up = self._attitudes.up_at(stamp_ns, settings.attitude_age_s)
         if up is not None:
-            return Prior(up, math.radians(settings.attitude_sigma_deg), 0.0)
+            return VerticalPrior(up, math.radians(settings.attitude_sigma_deg), 0.0)
         search_deg = SEARCH_DEG[settings.camera_mount] if settings.search_deg is None else settings.search_deg
         sigma_deg = max(settings.vertical_sigma_deg, search_deg)
-        return Prior(np.array([0.0, 0.0, 1.0]), math.radians(sigma_deg), math.radians(search_deg))
+        return VerticalPrior(np.array([0.0, 0.0, 1.0]), math.radians(sigma_deg), math.radians(search_deg))
 
-    def _limits(self) -> Limits:
+    def _limits(self) -> SearchLimits:
         settings = self.settings
-        return Limits(
+        return SearchLimits(
             math.radians(settings.line_sigma_deg),
             math.radians(settings.least_sigma_deg),
-            LEAST_SCATTER,
+            MIN_SCATTER,
             settings.max_frames,
             settings.min_lines,
             settings.min_score,
         )
 
     def _message(
-        self, stamp_ns: int, found: Found, normal: Array64, ends: Array64, sigma_rad: Array64
+        self, stamp_ns: int, found: FoundDirections, normal: Array64, ends: Array64, sigma_rad: Array64
     ) -> VanishingDirections:
         return VanishingDirections(
             stamp_ns=stamp_ns,

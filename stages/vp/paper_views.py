@@ -1,12 +1,12 @@
-"""Rectified views: square pinhole pictures cut from a fisheye, and the straight lines in them.
+"""Rectified views: square pinhole images resampled from a fisheye, and the line segments in them.
 
-A view looks along a direction `off_axis_deg` away from the lens's axis, towards `azimuth_deg` in the image (0 right,
-90 down, as the camera frame turns). Pixel (column u, row v) of a view sees the ray
+The optical axis of a view is `off_axis_deg` away from the optical axis of the lens, towards `azimuth_deg` in the image
+(0 right, 90 down). Pixel (column u, row v) of a view has the ray
 
     R_camera_view ((u - c) / f, (v - c) / f, 1),   c = (N - 1) / 2,   f = N / (2 tan(fov / 2))
 
-Source: P IV (three rectified views of 428 x 428 px, lines by LSD). How the three views lie is ours: the paper's text as
-we have it does not say. LSD: Grompone von Gioi et al., PAMI 2010, as in OpenCV.
+Source: P IV (three rectified views of 428 x 428 px, lines by LSD). The orientations of the three views are ours: the
+paper does not give them. LSD: Grompone von Gioi et al., PAMI 2010, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from stages.geometry.frames import Array64
 from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
 
-END_NOISE_PX = 0.5  # of a line's end, across the line
-RIM_PX = 6  # so near the edge of what the lens sees, a line is that edge
+END_NOISE_PX = 0.5  # standard deviation of a segment's end across the segment
+RIM_PX = 6  # segments this close to the edge of the field of view are dropped
 
 
 class ViewDirection(BaseModel):
-    """Where one rectified view looks."""
+    """Direction of the optical axis of one rectified view."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -35,7 +35,7 @@ class ViewDirection(BaseModel):
     off_axis_deg: float = Field(ge=0, le=150)
 
     def rotation(self) -> Array64:
-        """R_camera_view (3, 3): z where the view looks, y away from the lens's axis: the axis is up in the view."""
+        """R_camera_view (3, 3): z along the view, y away from the axis of the lens, which is up in the view."""
         azimuth, off = math.radians(self.azimuth_deg), math.radians(self.off_axis_deg)
         c, s = math.cos(azimuth), math.sin(azimuth)
         x = np.array([-s, c, 0.0])
@@ -44,42 +44,42 @@ class ViewDirection(BaseModel):
 
 
 class RectifiedView:
-    """One pinhole view of a fisheye picture, with its remap table."""
+    """One pinhole view of a fisheye image, with its remap table."""
 
     def __init__(
         self,
         direction: ViewDirection,
         lens: Equidistant | KannalaBrandt | OCam,
-        R_carrier_camera: Array64,
+        R_mount_camera: Array64,
         size_px: int,
         fov_deg: float,
     ) -> None:
         self._focal_px = size_px / (2 * math.tan(math.radians(fov_deg) / 2))
         self._centre_px = (size_px - 1) / 2
         R_camera_view = direction.rotation()
-        self.R_carrier_view: Array64 = R_carrier_camera @ R_camera_view
+        self.R_mount_view: Array64 = R_mount_camera @ R_camera_view
         v, u = np.mgrid[0:size_px, 0:size_px]
         pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
         found = lens.project(self._rays(pixels) @ R_camera_view.T).astype(np.float32)
-        seen = np.isfinite(found).all(axis=1).reshape(size_px, size_px)
+        visible = np.isfinite(found).all(axis=1).reshape(size_px, size_px)
         self._map = np.where(np.isfinite(found), found, -1e4).astype(np.float32).reshape(size_px, size_px, 2)
         rim = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), dtype=np.uint8)
-        self._inside = cv2.erode(seen.astype(np.uint8), rim, borderType=cv2.BORDER_REPLICATE).astype(np.bool_)
+        self._inside = cv2.erode(visible.astype(np.uint8), rim, borderType=cv2.BORDER_REPLICATE).astype(np.bool_)
         self._detector = cv2.createLineSegmentDetector()
 
     @property
-    def seen(self) -> float:
-        """Share of the view that the lens sees."""
+    def visible_share(self) -> float:
+        """Share of the view inside the field of view of the lens."""
         return float(self._inside.mean())
 
-    def picture(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The view (N, N) of a fisheye picture."""
-        cut = cv2.remap(grey, self._map, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)  # pyright: ignore
-        return np.asarray(cut, dtype=np.uint8)
+    def rectify(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The view (N, N) of a fisheye image."""
+        view = cv2.remap(grey, self._map, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)  # pyright: ignore
+        return np.asarray(view, dtype=np.uint8)
 
-    def segments(self, picture: NDArray[np.uint8], min_length_px: float, most: int) -> Array64:
-        """Line segments (n, 4): u1, v1, u2, v2 of the longest `most`, longest first, each at least so long."""
-        raw = cast("NDArray[np.float32] | None", self._detector.detect(picture)[0])
+    def segments(self, view: NDArray[np.uint8], min_length_px: float, max_lines: int) -> Array64:
+        """The longest `max_lines` segments (n, 4) u1, v1, u2, v2 of at least `min_length_px`, longest first."""
+        raw = cast("NDArray[np.float32] | None", self._detector.detect(view)[0])
         if raw is None:
             return np.empty((0, 4))
         found = np.asarray(raw, dtype=np.float64).reshape(-1, 4)
@@ -87,12 +87,12 @@ class RectifiedView:
         pixel = np.clip(np.rint(found), 0, len(self._inside) - 1).astype(np.int64)
         inside = self._inside[pixel[:, 1], pixel[:, 0]] & self._inside[pixel[:, 3], pixel[:, 2]]
         kept = np.flatnonzero(inside & (length >= min_length_px))
-        order = np.argsort(-length[kept], kind="stable")[:most]
+        order = np.argsort(-length[kept], kind="stable")[:max_lines]
         return found[kept[order]]
 
     def ends(self, segments: Array64) -> Array64:
-        """Unit rays (n, 2, 3) of the ends of segments (n, 4), in the camera_mount's axes."""
-        rays = self._rays(segments.reshape(-1, 2)) @ self.R_carrier_view.T
+        """Unit rays (n, 2, 3) of the ends of segments (n, 4), in the axes of the camera mount."""
+        rays = self._rays(segments.reshape(-1, 2)) @ self.R_mount_view.T
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         return rays.reshape(-1, 2, 3)
 
@@ -100,7 +100,7 @@ class RectifiedView:
         return np.column_stack([(pixels - self._centre_px) / self._focal_px, np.ones(len(pixels))])
 
     def normal_sigma_rad(self, segments: Array64) -> Array64:
-        """(n,) how far the great circle of a segment may be turned about its middle: sqrt(2) end noise / length."""
+        """(n,) sigma of the rotation of a segment's great circle about its middle: sqrt(2) end noise / length."""
         return math.sqrt(2.0) * END_NOISE_PX / segment_length_px(segments)
 
 

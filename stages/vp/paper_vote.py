@@ -1,14 +1,15 @@
-"""Grid vote on the sphere: where most pairs of lines meet; and three directions of two.
+"""Grid vote on the sphere for the intersections of pairs of lines, and completion of two directions to three.
 
-Every pair of lines meets in one direction v = n_i x n_j (n: normal of a line's great circle), v and -v alike. It gives
+Every pair of lines intersects in one direction v = n_i x n_j (n: normal of a great circle), with v and -v equivalent.
+It adds
 
     w = l_i l_j |sin 2 theta|       l: lengths, theta: angle between the lines in the view
 
-to its cell. The grid is a cube's: a cell is 1 deg or so wide everywhere, the two sides of the sphere share cells. The
-fullest cell, its eight neighbours counted in, is the vanishing point; it lies at the mean of their votes.
+to its cell. The grid is that of a cube: a cell is about 1 deg wide everywhere, and opposite sides of the sphere share
+cells. The vanishing point is the mean of the votes in the fullest cell and its eight neighbours.
 
-Source: P IV (grid vote, two directions and their cross product). The weight is Lu et al.'s, WACV 2017, whose grid has
-poles; a cube's has none. The mean in the cell is ours.
+Source: P IV (grid vote, two directions and their cross product). The weight is that of Lu et al., WACV 2017, whose
+grid has poles; the cube grid has none. The mean in the cell is ours.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from stages.geometry.frames import Array64
 
 
 def most_orthogonal(directions: Array64) -> tuple[int, int, float]:
-    """Which two of directions (n, 3), n >= 2, stand nearest to a right angle, and the angle between them [rad]."""
+    """Indices of the two of directions (n, 3), n >= 2, nearest to a right angle, and the angle between them [rad]."""
     cosine = np.abs(directions @ directions.T)
     cosine[np.tril_indices(len(directions))] = 2.0
     i, j = np.unravel_index(int(np.argmin(cosine)), cosine.shape)
     return int(i), int(j), math.acos(min(float(cosine[i, j]), 1.0))
 
 
-def completed(first: Array64, second: Array64) -> Array64:
-    """Directions (3, 3), one a row: the two given and their cross product, of length 1."""
+def complete(first: Array64, second: Array64) -> Array64:
+    """Directions (3, 3), one per row: the two given and their normalised cross product."""
     third = np.cross(first, second)
     return np.stack([first, second, third / np.linalg.norm(third)])

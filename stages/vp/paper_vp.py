@@ -1,21 +1,19 @@
-"""Vanishing points as the paper finds them: three rectified views, lines, a grid vote, the best two.
+"""Vanishing points by the method of the paper: three rectified views, lines, a grid vote, the best two.
 
     fisheye -> three views of 428 x 428 px (paper_views.py) -> lines by LSD -> a vanishing point each (paper_vote.py)
-            -> the two that stand nearest to a right angle -> the third by cross product
+            -> the two nearest to a right angle -> the third by cross product
 
-The two are given as found, not made orthogonal: that is left to the alignment. Two that stand at less than
-`min_angle_deg` are no answer. There is one Manhattan frame, as in the paper: in a town with streets at other angles it
-may be any of them, or two streets' mixed.
+The two directions are not made orthogonal: the alignment does that. Two at less than `min_angle_deg` give no result.
+There is one Manhattan frame, as in the paper. In a town with streets at other angles it may follow any of them, or mix
+two.
 
-A view takes another vanishing point than the views before it, `apart_deg` away from theirs: by themselves all three
-often choose the vertical (`apart_deg: 0`: no answer in 21 of 80 pictures of Manhattan streets, else in 4).
+Each view takes a vanishing point at least `apart_deg` from those of the previous views, because independent views
+often all choose the vertical.
 
-`is_vertical` says which direction is within `vertical_deg` of the camera_mount's own up axis; the paper does not
-ask. Nor
-does it give a sigma: on simulated streets it was 0.7 deg where the answer was right, and one answer in seven was wrong
-by more than 5 deg, which no sigma tells.
+`is_vertical` marks the direction within `vertical_deg` of the up axis of the camera mount; the paper does not need
+it. The paper gives no sigma either, so `sigma_deg` is a setting.
 
-Source: P IV, V.C. The views' directions and field of view are ours: the paper's text as we have it does not say.
+Source: P IV, V.C. The directions and the field of view of the views are ours: the paper does not give them.
 """
 
 from __future__ import annotations
@@ -33,17 +31,17 @@ from stages.geometry.lens import Lens
 from stages.kernels.vp.paper_vote import fullest, vote
 from stages.messages import CameraMount, Image, VanishingDirections
 from stages.vp.paper_views import RectifiedView, ViewDirection, great_circles, segment_length_px
-from stages.vp.paper_vote import completed, most_orthogonal
+from stages.vp.paper_vote import complete, most_orthogonal
 
-SEEN_AT_LEAST = 0.5  # of each view by the lens
-ON_DIRECTION_DEG = 2.0  # a line within this of a direction is counted as its
+MIN_VISIBLE = 0.5  # share of each view inside the field of view of the lens
+ON_DIRECTION_DEG = 2.0  # a line within this angle of a direction belongs to it
 
 
 @dataclass(frozen=True, slots=True)
 class _Lines:
     """The lines of one view."""
 
-    ends: Array64  # (n, 2, 3) unit rays, camera_mount axes
+    ends: Array64  # (n, 2, 3) unit rays, axes of the camera mount
     normal: Array64  # (n, 3)
     sigma_rad: Array64  # (n,)
     point: Array64 | None  # (3,) the view's vanishing point
@@ -55,7 +53,7 @@ class PaperVpSettings(Settings):
     camera_mount: CameraMount
     T_mount_camera: Pose
     lens: Lens
-    size_px: int = Field(ge=64, le=4096)  # of the square picture that the lens belongs to
+    size_px: int = Field(ge=64, le=4096)  # side of the square image of the lens
     views: tuple[ViewDirection, ...] = Field(
         (
             ViewDirection(azimuth_deg=-90, off_axis_deg=70),
@@ -70,23 +68,23 @@ class PaperVpSettings(Settings):
     min_length_px: float = Field(20.0, ge=5)
     max_lines: int = Field(200, ge=2, le=1000)  # the longest of each view
     cells: int = Field(90, ge=10, le=360)  # of the grid, per 90 deg
-    min_lines: int = Field(10, ge=2)  # through a view's vanishing point, within 2 deg; with fewer it has none
-    apart_deg: float = Field(20.0, ge=0, lt=45)  # the views' vanishing points; 0: each view by itself
-    min_angle_deg: float = Field(80.0, gt=5, lt=90)  # between the two that are taken
+    min_lines: int = Field(10, ge=2)  # within 2 deg of a view's vanishing point; with fewer the view has none
+    apart_deg: float = Field(20.0, ge=0, lt=45)  # between the vanishing points of the views; 0: independent views
+    min_angle_deg: float = Field(80.0, gt=5, lt=90)  # between the two selected vanishing points
     vertical_deg: float = Field(30.0, gt=0, le=45)
     sigma_deg: float = Field(1.0, gt=0)
 
     def rectified_views(self) -> list[RectifiedView]:
-        """The views, each with its map from the fisheye."""
+        """The views, each with its remap table."""
         R = self.T_mount_camera.matrix()[:3, :3]
         return [RectifiedView(view, self.lens, R, self.view_px, self.fov_deg) for view in self.views]
 
     @model_validator(mode="after")
     def _lens_sees_views(self) -> PaperVpSettings:
         for k, view in enumerate(self.rectified_views()):
-            if view.seen < SEEN_AT_LEAST:
+            if view.visible_share < MIN_VISIBLE:
                 raise ValueError(
-                    f"views.{k}: the lens sees {view.seen:.0%} of it; make off_axis_deg or fov_deg smaller "
+                    f"views.{k}: only {view.visible_share:.0%} of it is in the lens; decrease off_axis_deg or fov_deg "
                     f"(the lens ends at {self.lens.max_off_axis_deg:g} deg)"
                 )
         return self
@@ -100,17 +98,17 @@ class PaperVp(Stage[PaperVpSettings]):
         self._views = self.settings.rectified_views()
 
     def on_image(self, image: Image) -> VanishingDirections:
-        """The picture's directions; none, with the reason, where the views hold too little."""
+        """Directions of an image; none, with a reason, when the views have too few lines."""
         settings = self.settings
         if image.grey.shape != (settings.size_px, settings.size_px):
             height, width = image.grey.shape
             raise ValueError(
-                f"a picture of {width} x {height} px, but size_px is {settings.size_px}: give the lens of this camera"
+                f"the image is {width} x {height} px, but size_px is {settings.size_px}: set the lens of this camera"
             )
         lines: list[_Lines] = []
         points: list[Array64] = []
         for view in self._views:
-            lines.append(self._look(view, image, points))
+            lines.append(self._view_lines(view, image, points))
             if (point := lines[-1].point) is not None:
                 points.append(point)
         if len(points) < 2:
@@ -121,11 +119,11 @@ class PaperVp(Stage[PaperVpSettings]):
             reason = f"no two vanishing points are at a right angle: {math.degrees(angle_rad):.0f} deg at most"
             return self._message(image.stamp_ns, lines, None, reason)
         reason = f"{len(points)} vanishing points, two at {math.degrees(angle_rad):.1f} deg"
-        return self._message(image.stamp_ns, lines, completed(points[i], points[j]), reason)
+        return self._message(image.stamp_ns, lines, complete(points[i], points[j]), reason)
 
-    def _look(self, view: RectifiedView, image: Image, taken: list[Array64]) -> _Lines:
+    def _view_lines(self, view: RectifiedView, image: Image, taken: list[Array64]) -> _Lines:
         settings = self.settings
-        segments = view.segments(view.picture(image.grey), settings.min_length_px, settings.max_lines)
+        segments = view.segments(view.rectify(image.grey), settings.min_length_px, settings.max_lines)
         ends = view.ends(segments)
         normal = great_circles(ends)
         point = None
@@ -142,7 +140,7 @@ class PaperVp(Stage[PaperVpSettings]):
         self, stamp_ns: int, lines: list[_Lines], directions: Array64 | None, reason: str
     ) -> VanishingDirections:
         found, vertical = self._vertical_first(np.empty((0, 3)) if directions is None else directions)
-        normal = np.concatenate([part.normal for part in lines])
+        normal = np.concatenate([view_lines.normal for view_lines in lines])
         return VanishingDirections(
             stamp_ns=stamp_ns,
             camera_mount=self.settings.camera_mount,
@@ -151,14 +149,14 @@ class PaperVp(Stage[PaperVpSettings]):
             is_vertical=vertical,
             frame=np.where(vertical, -1, 0).astype(np.int64),
             line_normal=normal,
-            line_end=np.concatenate([part.ends for part in lines]),
-            line_sigma_rad=np.concatenate([part.sigma_rad for part in lines]),
-            line_direction=lines_of(normal, found, math.radians(ON_DIRECTION_DEG)),
+            line_end=np.concatenate([view_lines.ends for view_lines in lines]),
+            line_sigma_rad=np.concatenate([view_lines.sigma_rad for view_lines in lines]),
+            line_direction=assign_lines(normal, found, math.radians(ON_DIRECTION_DEG)),
             reason=reason,
         )
 
     def _vertical_first(self, directions: Array64) -> tuple[Array64, np.ndarray[Any, np.dtype[np.bool_]]]:
-        """Directions with the one nearest to up first, and which is vertical."""
+        """Directions with the one nearest to up first, and the mask of the vertical one."""
         order = np.argsort(-np.abs(directions[:, 2]), kind="stable")
         found = directions[order]
         vertical = np.abs(found[:, 2]) > math.cos(math.radians(self.settings.vertical_deg))
@@ -166,10 +164,10 @@ class PaperVp(Stage[PaperVpSettings]):
         return found, vertical
 
 
-def lines_of(normal: Array64, directions: Array64, within_rad: float) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """(m,) which of directions (n, 3) lines with normals (m, 3) run in: least |n . v| <= sin(within); -1: none."""
+def assign_lines(normal: Array64, directions: Array64, within_rad: float) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """Index (m,) of the direction (n, 3) of each normal (m, 3): least |n . v| <= sin(within_rad); -1: none."""
     if not len(directions):
         return np.full(len(normal), -1, dtype=np.int64)
-    off = np.abs(normal @ directions.T)
-    nearest = np.argmin(off, axis=1)
-    return np.where(off.min(axis=1) <= math.sin(within_rad), nearest, -1).astype(np.int64)
+    residual = np.abs(normal @ directions.T)
+    nearest = np.argmin(residual, axis=1)
+    return np.where(residual.min(axis=1) <= math.sin(within_rad), nearest, -1).astype(np.int64)

@@ -1,6 +1,8 @@
-"""The search for structure: which vertical, how many horizontal pairs, and whether there is anything at all.
+"""The search for structure in lines: the vertical, the horizontal pairs, or a reason why there is none.
 
-Source: ours, for P IV; "no structure here" is an answer: a park's branches fit any direction a little.
+Irregular lines, such as branches in a park, fit every direction a little, so each result must stand out significantly.
+
+Source: ours, for P IV.
 """
 
 from __future__ import annotations
@@ -15,33 +17,33 @@ from stages.geometry.lens import Array64
 from stages.kernels.vp.directions import all_directions, upright
 from stages.kernels.vp.spectrum import APART_RAD
 from stages.vp.directions import Lines, Structure, assign, refine, residual_sigma
-from stages.vp.spectrum import peaks, quarter, yaw_spectrum
+from stages.vp.spectrum import peaks, wrap_90deg, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
-BINS = 180  # of the yaw spectrum: half a degree
-PAIR_LINES = 45  # proposals for the vertical come from so many of the widest lines
+BINS = 180  # of the yaw spectrum: 0.5 deg each
+PAIR_LINES = 45  # number of longest lines whose pairs propose verticals
 PROPOSALS = 8
-FURTHER_SCORE = 1.5  # a second pair has to stand out by so much more
-PEAKS = 3  # of the yaw spectrum are tried for the first pair
-NEARLY_RAD = math.radians(1.0)  # two starts nearer than this come to the same
-TRIAL_ROUNDS = 4
-SAME_RAD = math.radians(3.0)  # two verticals nearer than this are one
-RIVAL_SHARE = 0.85  # of the best vertical's agreement: another one as good means that none is sure
-MIN_EXTRA = 2  # lines that a direction needs to be told
+FURTHER_SCORE = 1.5  # added to `min_score` for further pairs
+PEAKS = 3  # highest peaks of the yaw spectrum to refine for the first pair
+DUPLICATE_RAD = math.radians(1.0)  # refined verticals nearer than this are one
+TRIAL_ITERATIONS = 4
+RIVAL_RAD = math.radians(3.0)  # a vertical farther than this from the best one is a rival
+RIVAL_SHARE = 0.85  # a rival with more than this share of the best agreement makes the result ambiguous
+MIN_DIRECTION_LINES = 2  # of a horizontal direction
 
 
 @dataclass(frozen=True)
-class Prior:
-    """What is known of the vertical before the picture is looked at."""
+class VerticalPrior:
+    """Prior knowledge of the vertical."""
 
     up: Array64
     sigma_rad: float
-    cone_rad: float  # 0: it is near enough to start from
+    cone_rad: float  # search cone about `up`; 0: refine from `up`
 
 
 @dataclass(frozen=True)
-class Limits:
-    """When something counts."""
+class SearchLimits:
+    """Thresholds of the search; sigmas in radians."""
 
     sigma_model: float
     least_sigma: float
@@ -52,8 +54,8 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Found:
-    """Directions as the message wants them."""
+class FoundDirections:
+    """Directions in the layout of the message `VanishingDirections`."""
 
     direction: Array64
     sigma_rad: Array64
@@ -62,11 +64,11 @@ class Found:
     reason: str
 
 
-def find_structure(lines: Lines, prior: Prior, limits: Limits) -> Found:
-    """The best upright structure of the lines, or none and why."""
+def find_structure(lines: Lines, prior: VerticalPrior, limits: SearchLimits) -> FoundDirections:
+    """The best upright structure of the lines, or no direction and the reason."""
     m = len(lines.normal)
     if m < limits.min_lines:
-        return _nothing(m, f"{m} straight lines: too few")
+        return _no_directions(m, f"too few straight lines: {m}")
     starts = np.array([prior.up])
     if prior.cone_rad > 0:
         found = propose_verticals(lines, prior.up, prior.cone_rad, limits.sigma_model, PAIR_LINES, PROPOSALS)
@@ -75,52 +77,54 @@ def find_structure(lines: Lines, prior: Prior, limits: Limits) -> Found:
     verticals: list[Array64] = []
     for start in starts:
         v = refine_vertical(lines, start, prior.up, prior.sigma_rad, limits.sigma_model, gate)
-        if all(abs(float(v @ other)) < math.cos(NEARLY_RAD) for other in verticals):
+        if all(abs(float(v @ other)) < math.cos(DUPLICATE_RAD) for other in verticals):
             verticals.append(v)
     pairs = sorted((_best_pair(lines, v, prior, limits) for v in verticals), key=lambda p: -p.agreement)
     for other in pairs[1:]:
-        apart = abs(float(other.axes[:, 2] @ pairs[0].axes[:, 2])) < math.cos(SAME_RAD)
-        if apart and other.agreement > RIVAL_SHARE * pairs[0].agreement:
-            return _nothing(m, "two verticals fit the lines about as well: an attitude would decide")
+        is_rival = abs(float(other.axes[:, 2] @ pairs[0].axes[:, 2])) < math.cos(RIVAL_RAD)
+        if is_rival and other.agreement > RIVAL_SHARE * pairs[0].agreement:
+            return _no_directions(m, "ambiguous: two verticals fit the lines about equally well; connect an attitude")
     yaws, peak = _frames(lines, pairs[0].axes, limits)
     if not yaws:
         vertical = verticals[0] if len(verticals) == 1 else pairs[0].axes[:, 2]
         return _vertical_only(lines, vertical, prior, limits, peak)
     structure = refine(lines, pairs[0].axes, np.array(yaws), prior.up, prior.sigma_rad, limits.sigma_model)
-    return _told(lines, structure, limits)
+    return _directions_of(lines, structure, limits)
 
 
-def _best_pair(lines: Lines, vertical: Array64, prior: Prior, limits: Limits) -> Structure:
-    """The vertical and one horizontal pair, refined from each of the spectrum's highest peaks: the best of them."""
+def _best_pair(lines: Lines, vertical: Array64, prior: VerticalPrior, limits: SearchLimits) -> Structure:
+    """The vertical and one horizontal pair, refined from each of the highest peaks of the spectrum; the best one."""
     axes = upright(vertical)
     spectrum = yaw_spectrum(lines, axes, ~_along_vertical(lines, vertical, limits), limits.sigma_model, BINS)
     found = [
-        refine(lines, axes @ _about_z(yaw), np.zeros(1), prior.up, prior.sigma_rad, limits.sigma_model, TRIAL_ROUNDS)
+        refine(
+            lines, axes @ _about_z(yaw), np.zeros(1), prior.up, prior.sigma_rad, limits.sigma_model, TRIAL_ITERATIONS
+        )
         for yaw in peaks(spectrum, PEAKS)
     ]
     return max(found, key=lambda s: s.agreement)
 
 
-def _along_vertical(lines: Lines, vertical: Array64, limits: Limits) -> NDArray[np.bool_]:
+def _along_vertical(lines: Lines, vertical: Array64, limits: SearchLimits) -> NDArray[np.bool_]:
     return np.abs(lines.normal @ vertical) < 3.0 * residual_sigma(lines, vertical, limits.sigma_model)
 
 
-def _frames(lines: Lines, axes: Array64, limits: Limits) -> tuple[list[float], float]:
-    """Yaws of all horizontal pairs against the best one, whose axes are given; none when nothing stands out.
+def _frames(lines: Lines, axes: Array64, limits: SearchLimits) -> tuple[list[float], float]:
+    """Yaws of the significant horizontal pairs relative to `axes`, the axes of the best pair.
 
-    Also how high the highest peak of the spectrum was.
+    Also returns the highest score of the spectrum.
     """
     free = ~_along_vertical(lines, axes[:, 2], limits)
     yaws: list[float] = []
     highest = 0.0
     for _ in range(limits.max_frames):
         spectrum = yaw_spectrum(lines, axes, free, limits.sigma_model, BINS)
-        apart = np.ones(BINS, dtype=np.bool_)
+        allowed = np.ones(BINS, dtype=np.bool_)
         for yaw in yaws:
-            apart &= np.abs(quarter(spectrum.yaw_rad - yaw)) > APART_RAD
-        if not yaws:  # it is the frame's own axes, or nothing
-            apart = np.abs(quarter(spectrum.yaw_rad)) < APART_RAD / 2
-        peak = int(np.argmax(np.where(apart, spectrum.score, -np.inf)))
+            allowed &= np.abs(wrap_90deg(spectrum.yaw_rad - yaw)) > APART_RAD
+        if not yaws:  # the first pair lies along the given axes
+            allowed = np.abs(wrap_90deg(spectrum.yaw_rad)) < APART_RAD / 2
+        peak = int(np.argmax(np.where(allowed, spectrum.score, -np.inf)))
         highest = max(highest, float(spectrum.score[peak]))
         near = _near(lines, axes, float(spectrum.yaw_rad[peak]) if yaws else 0.0, limits) & free
         more = FURTHER_SCORE if yaws else 0.0
@@ -131,13 +135,13 @@ def _frames(lines: Lines, axes: Array64, limits: Limits) -> tuple[list[float], f
     return yaws, highest
 
 
-def _near(lines: Lines, axes: Array64, yaw: float, limits: Limits) -> NDArray[np.bool_]:
+def _near(lines: Lines, axes: Array64, yaw: float, limits: SearchLimits) -> NDArray[np.bool_]:
     directions = all_directions(axes, np.array([yaw]))[1:]
     return assign(lines, directions, 2.0 * limits.sigma_model)[0] >= 0
 
 
-def _told(lines: Lines, s: Structure, limits: Limits) -> Found:
-    """Directions with lines of their own; sigma by the information, no smaller than the floor."""
+def _directions_of(lines: Lines, s: Structure, limits: SearchLimits) -> FoundDirections:
+    """The directions that have lines; sigmas from the information matrix, combined with `least_sigma`."""
     directions = all_directions(s.axes, s.yaw_rad)
     counts = np.bincount(s.assigned[s.assigned >= 0], minlength=len(directions))
     cov: Array64 = np.linalg.inv(s.information).astype(np.float64) * max(s.scatter, limits.least_scatter) ** 2
@@ -148,18 +152,18 @@ def _told(lines: Lines, s: Structure, limits: Limits) -> Found:
     for k, d in enumerate(directions):
         f = (k - 1) // 2 if k else -1
         in_frame = counts[1 + 2 * f] + counts[2 + 2 * f] if k else counts[0]
-        if k and (counts[k] < MIN_EXTRA or in_frame < limits.min_lines):
-            continue  # the vertical is known by the horizontal ones, too
+        if k and (counts[k] < MIN_DIRECTION_LINES or in_frame < limits.min_lines):
+            continue  # the vertical is kept: horizontal lines determine it as well
         number[k] = len(rows)
         rows.append(d)
         frames.append(f)
         sigmas.append(math.hypot(_sigma(cov, s.axes, d, f), limits.least_sigma))
     line_direction = np.where(s.assigned >= 0, number[s.assigned], -1)
     if not rows:
-        return _nothing(len(lines.normal), "no direction has enough lines after refinement")
+        return _no_directions(len(lines.normal), "no direction has enough lines after refinement")
     pairs = len({f for f in frames if f >= 0})
     reason = f"{pairs} horizontal frame{'s' if pairs != 1 else ''}, {int((line_direction >= 0).sum())} lines"
-    return Found(np.array(rows), np.array(sigmas), np.array(frames, dtype=np.int64), line_direction, reason)
+    return FoundDirections(np.array(rows), np.array(sigmas), np.array(frames, dtype=np.int64), line_direction, reason)
 
 
 def _sigma(cov: Array64, axes: Array64, d: Array64, frame: int) -> float:
@@ -170,24 +174,28 @@ def _sigma(cov: Array64, axes: Array64, d: Array64, frame: int) -> float:
         A[2, 2 + frame] = 1.0
     turn = A @ cov @ A.T
     local = axes.T @ d
-    return math.sqrt(max(float(turn.trace() - local @ turn @ local) / 2, 0.0))  # a turn about d moves it nowhere
+    return math.sqrt(max(float(turn.trace() - local @ turn @ local) / 2, 0.0))  # a rotation about d does not change d
 
 
-def _vertical_only(lines: Lines, v: Array64, prior: Prior, limits: Limits, peak: float) -> Found:
+def _vertical_only(
+    lines: Lines, v: Array64, prior: VerticalPrior, limits: SearchLimits, peak: float
+) -> FoundDirections:
     near = _along_vertical(lines, v, limits)
-    why = f"no horizontal structure: the best direction stands out by {peak:.1f} of {limits.min_score:g} sigma"
+    reason = f"no horizontal structure: best score {peak:.1f} sigma, required {limits.min_score:g}"
     if near.sum() < limits.min_lines or prior.cone_rad > 0:
-        return _nothing(len(near), why)
+        return _no_directions(len(near), reason)
     e = upright(v)[:, :2]
     J = lines.normal[near] @ e / residual_sigma(lines, v, limits.sigma_model)[near, None]
     H = (J.T * lines.weight[near]) @ J + np.eye(2) / prior.sigma_rad**2
-    spread = math.hypot(math.sqrt(float(np.trace(np.linalg.inv(H))) / 2), limits.least_sigma)
+    sigma = math.hypot(math.sqrt(float(np.trace(np.linalg.inv(H))) / 2), limits.least_sigma)
     none = np.array([-1], dtype=np.int64)
-    return Found(v[None], np.array([spread]), none, np.where(near, 0, -1).astype(np.int64), why)
+    return FoundDirections(v[None], np.array([sigma]), none, np.where(near, 0, -1).astype(np.int64), reason)
 
 
-def _nothing(m: int, reason: str) -> Found:
-    return Found(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.int64), np.full(m, -1, dtype=np.int64), reason)
+def _no_directions(m: int, reason: str) -> FoundDirections:
+    return FoundDirections(
+        np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.int64), np.full(m, -1, dtype=np.int64), reason
+    )
 
 
 def _about_z(angle: float) -> Array64:

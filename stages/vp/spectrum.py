@@ -1,4 +1,4 @@
-"""The yaw spectrum: how much line there is in each horizontal direction, modulo a quarter turn.
+"""The yaw spectrum: weight of the lines along each horizontal direction, modulo 90 deg.
 
 Source: ours. DESIGN, Vision: yaw spectra.
 """
@@ -18,17 +18,18 @@ from stages.vp.directions import Lines
 
 @dataclass(frozen=True)
 class Spectrum:
-    """How much line there is in each horizontal direction, modulo 90 deg."""
+    """Weight of the lines along each horizontal direction, modulo 90 deg."""
 
-    yaw_rad: Array64  # (b,) bin middles in the upright axes
-    score: Array64  # (b,) in standard deviations over directions drawn at random
+    yaw_rad: Array64  # (b,) bin centres in the upright axes
+    score: Array64  # (b,) in standard deviations above random directions
     lines: Array64  # (b,) sum of weights
 
 
 def yaw_spectrum(lines: Lines, axes: Array64, free: NDArray[np.bool_], sigma_model: float, bins: int) -> Spectrum:
-    """Each line, were it horizontal, runs along n x v; its yaw modulo a quarter turn, spread by its sigma.
+    """Spectrum of the lines in the mask `free`, `axes` with the vertical v as third column.
 
-    score = (S - E[S]) / sd[S] when all yaws were drawn at random.
+    A horizontal line with normal n is parallel to n x v. It adds a Gaussian with its sigma at its yaw modulo 90 deg.
+    score = (S - E[S]) / sd[S] under uniformly random yaws.
     """
     middles: Array64 = (np.arange(bins, dtype=np.float64) + 0.5) * (math.pi / 2 / bins)
     total, mean, variance = spread(
@@ -44,11 +45,11 @@ def yaw_spectrum(lines: Lines, axes: Array64, free: NDArray[np.bool_], sigma_mod
     return Spectrum(middles, (total - mean) / math.sqrt(max(variance, 1e-12)), total)
 
 
-def peaks(spectrum: Spectrum, most: int) -> list[float]:
-    """Yaws of the highest places, each APART_RAD from the higher ones."""
-    return peaks_kernel(spectrum.yaw_rad, spectrum.score, most).tolist()
+def peaks(spectrum: Spectrum, max_peaks: int) -> list[float]:
+    """Yaws of the highest bins, each at least APART_RAD from the higher ones."""
+    return peaks_kernel(spectrum.yaw_rad, spectrum.score, max_peaks).tolist()
 
 
-def quarter(angle: Array64 | float) -> Array64 | float:
-    """Wrapped into -45 to 45 deg."""
+def wrap_90deg(angle: Array64 | float) -> Array64 | float:
+    """An angle [rad] modulo 90 deg, in -45 to 45 deg."""
     return np.mod(angle + math.pi / 4, math.pi / 2) - math.pi / 4

@@ -1,6 +1,6 @@
-"""The vertical from lines alone: proposals where lines meet, and one of them refined.
+"""The vertical from lines alone: proposals from intersections of pairs of lines, and their refinement.
 
-Source: ours; the vote is that of every method that looks for vanishing points among the meetings of pairs of lines.
+Source: ours; the vote over pairwise intersections is common to vanishing point detectors.
 """
 
 from __future__ import annotations
@@ -13,38 +13,38 @@ from stages.geometry.lens import Array64
 from stages.kernels.vp.verticals import meetings, picked, refine_vertical_kernel, votes_kernel
 from stages.vp.directions import Lines
 
-LEAST_SINE = 0.05  # two lines that meet at less do not say where
-LEVEL_APART_RAD = math.radians(12.0)  # between level directions tried for the vertical at right angles to both
+MIN_SINE = 0.05  # of the angle between two lines; below, their intersection is uncertain
+LEVEL_APART_RAD = math.radians(12.0)  # between level directions whose cross products propose verticals
 
 
 def propose_verticals(
-    lines: Lines, about: Array64, cone_rad: float, sigma_model: float, pairs: int, most: int
+    lines: Lines, about: Array64, cone_rad: float, sigma_model: float, pairs: int, max_proposals: int
 ) -> Array64:
-    """Verticals (k, 3) within a cone, the best of each kind first: where lines meet that many others run to as well,
-    and what is at right angles to two such directions outside the cone (a car park has no upright lines).
+    """Proposed verticals (k, 3) within a cone about `about`, in two groups, each with the best first.
 
-    Pairs are drawn from the widest lines.
+    The first are intersections of lines with many votes. The second are cross products of two such directions outside
+    the cone, for scenes without upright lines. Pairs are taken from the `pairs` longest lines.
     """
     count = min(pairs, len(lines.normal))
-    meet = meetings(lines.normal[:count], LEAST_SINE)
+    meet = meetings(lines.normal[:count], MIN_SINE)
     meet *= np.where(meet @ about < 0, -1.0, 1.0)[:, None]
     inside = meet @ about > math.cos(cone_rad)
     votes = votes_kernel(meet, lines.normal, lines.tangent, lines.sigma_rad, lines.weight, 2.0 * sigma_model)
-    upright_ones = _best_apart(meet[inside], votes[inside], most, 6.0 * sigma_model)
-    level = _best_apart(meet[~inside], votes[~inside], most, LEVEL_APART_RAD)
+    upright_ones = _best_separated(meet[inside], votes[inside], max_proposals, 6.0 * sigma_model)
+    level = _best_separated(meet[~inside], votes[~inside], max_proposals, LEVEL_APART_RAD)
     crossed = meetings(level, math.sin(math.radians(80.0)))
     crossed *= np.where(crossed @ about < 0, -1.0, 1.0)[:, None]
     return np.vstack([upright_ones, crossed[crossed @ about > math.cos(cone_rad)]])
 
 
-def _best_apart(directions: Array64, votes: Array64, most: int, apart_rad: float) -> Array64:
-    return picked(directions, np.argsort(-votes, kind="stable"), most, math.cos(apart_rad))
+def _best_separated(directions: Array64, votes: Array64, max_count: int, min_angle_rad: float) -> Array64:
+    return picked(directions, np.argsort(-votes, kind="stable"), max_count, math.cos(min_angle_rad))
 
 
 def refine_vertical(
     lines: Lines, vertical: Array64, prior: Array64, prior_sigma: float, sigma_model: float, gate_rad: float
 ) -> Array64:
-    """The direction nearest to all lines within a gate that closes round by round, pulled by the prior."""
+    """The vertical that best fits the lines within a gate and the prior; the gate narrows in each iteration."""
     return refine_vertical_kernel(
         lines.normal,
         lines.tangent,

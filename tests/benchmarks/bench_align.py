@@ -13,7 +13,7 @@ import pytest
 from stages.align import JointAlign, PaperAlign
 from stages.align.refine import Tolerances, refine, street_directions
 from stages.align.spectra import level_lines, overlap, peaks, spectrum
-from stages.heading.hypothesis_bank import ASKEW, BranchBank, BranchSettings, Displacement
+from stages.heading.hypothesis_bank import DIRECTIONS, BranchSettings, Displacement, HypothesisBank
 from stages.messages import CameraMount
 from tests.stages.align.made_joint_flight import START_NS, S
 from tests.stages.align.made_lines import ATLANTA, MANHATTAN, MS, seen, turned
@@ -71,7 +71,7 @@ def test_refinement(benchmark, name):
 
 
 def test_a_window_of_motion(benchmark):
-    bank = BranchBank(BranchSettings())
+    bank = HypothesisBank(BranchSettings())
     way = np.array([0.5, 0.1])
-    window = Displacement(S, 2 * S, np.tile(way, (ASKEW, 1)), 0.01 * np.eye(2), way, 0.03, True)
+    window = Displacement(S, 2 * S, np.tile(way, (DIRECTIONS, 1)), 0.01 * np.eye(2), way, 0.03, True)
     benchmark(bank.see, window)

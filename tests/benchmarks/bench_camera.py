@@ -17,10 +17,10 @@ import pytest
 from flow.link import Record
 from links.camera import Camera as CameraLink
 from links.recording import CompressedImage, encode_compressed_image
-from links.simulated.camera import Camera
-from links.simulated.camera_sensor import encode_jpeg
-from links.simulated.run import Simulation
-from links.simulated.scenario import Scenario, load_scenario
+from links.simulated.rig.run import Simulation
+from links.simulated.rig.scenario import Scenario, load_scenario
+from links.simulated.sensors.camera import Camera
+from links.simulated.sensors.camera_sensor import encode_jpeg
 from stages.geometry.lens import Equidistant, KannalaBrandt, OCam
 
 SCENARIO = Path(__file__).resolve().parents[2] / "configs" / "scenarios" / "street_sweep.yaml"
@@ -43,10 +43,10 @@ def cameras(kind: str, size_px: int) -> tuple[Camera, Camera]:
 
 
 @pytest.mark.parametrize("kind", ["street", "manhattan", "park_edge"])
-@pytest.mark.parametrize("camera_mount", ["vehicle", "drone"])
+@pytest.mark.parametrize("platform", ["vehicle", "drone"])
 @pytest.mark.parametrize("size_px", [720, 1440])
-def test_one_frame(benchmark, kind, camera_mount, size_px):
-    camera = dict(zip(("vehicle", "drone"), cameras(kind, size_px), strict=True))[camera_mount]
+def test_one_frame(benchmark, kind, platform, size_px):
+    camera = dict(zip(("vehicle", "drone"), cameras(kind, size_px), strict=True))[platform]
     stamp_ns = load_scenario(SCENARIO).start_ns + 10**9
     benchmark.pedantic(camera.image, args=(stamp_ns,), rounds=4, warmup_rounds=1)
 

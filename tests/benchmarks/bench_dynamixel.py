@@ -28,7 +28,7 @@ BAUD = 1_000_000
 @pytest.fixture(scope="module")
 def port(tmp_path_factory):
     path = tmp_path_factory.mktemp("pty") / "servo"
-    command = [sys.executable, "-m", "links.simulated.dynamixel_emulator", str(path)]
+    command = [sys.executable, "-m", "links.simulated.sensors.dynamixel_emulator", str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE) as emulator:
         while not path.exists():
             time.sleep(0.05)

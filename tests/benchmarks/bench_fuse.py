@@ -10,13 +10,13 @@ import time
 import numpy as np
 import pytest
 
-from stages.fuse import EkfFuse, Fuse
-from stages.fuse.ekf import Ekf
+from stages.fuse import Fuse
 from stages.fuse.propagated import Step
 from stages.fuse.settings import FuseErrors
 from stages.fuse.smoother import Smoother
 from stages.geometry.frames import rotation_z
 from stages.heading.motion_yaw import weigh
+from tests.stages.fuse.ekf import Ekf, EkfFuse
 from tests.stages.fuse.made_drone_flight import Made
 from tests.stages.heading.test_motion_yaw import circle, points
 
@@ -85,7 +85,7 @@ def test_a_prediction(benchmark, name):
     stage = STAGES[name]()
     made = Made(until_s=6.0)
     made.run(stage)
-    now_ns = stage._now_ns
+    now_ns = stage._intake.now_ns
     benchmark(lambda: stage._pose(now_ns))
 
 

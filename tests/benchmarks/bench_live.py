@@ -24,7 +24,7 @@ from flow.replay import Replay
 from flow.taps import Digest
 from links.clock import host_time
 from links.recording import RecordingReader
-from links.runs.run_folder import Asked
+from links.runs.request import RunRequest
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDING = ROOT / "recordings" / "experiment_2.mcap"
@@ -40,7 +40,7 @@ def flight():
 
 def graph_of(rig_yaml, *sets):
     config = ROOT / "configs" / "sim_live.yaml"
-    return Asked(config, (), ("lidar.clock=free", *sets)).graph(rig_yaml, str(RECORDING))
+    return RunRequest(config, (), ("lidar.clock=free", *sets)).graph(rig_yaml, str(RECORDING))
 
 
 def pace(source: Source, records: list[Record], begin_ns: int) -> None:

@@ -1,9 +1,9 @@
-"""Time per picture of odometry and ego-motion: `python -m pytest tests/benchmarks/bench_odometry.py`.
+"""Run time per image of drone odometry and visual-lidar odometry: `python -m pytest tests/benchmarks/bench_odometry.py`.
 
-Limit of the design: 15 ms a picture of 1080 px, one core. Beside it the usual way: corners on the whole picture,
-Lucas-Kanade forward and back, OpenCV's essential matrix on what lies within 80 deg of the axis, and poselib's RANSAC on
-the same points. Errors against the truth are in `extra_info`: ours from the key picture, the usual way from the picture
-before, so that its baseline is shorter.
+Limit of the design: 15 ms per image of 1080 px on one core. The baseline: corners on the whole image,
+Lucas-Kanade forward and backward, OpenCV's essential matrix on what lies within 80 deg of the axis, and poselib's RANSAC on
+the same points. Errors against the truth are in `extra_info`: grd from the key image, the baseline from the previous
+image, over a shorter translation.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, degrees_betwe
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-PICTURES = 16
+IMAGES = 16
 STEP_NS = 66_000_000
 WIDEST = math.cos(math.radians(80.0))
 TURN_RADPS, VELOCITY_MPS = np.array([0.1, -0.1, 0.6]), np.array([3.0, 1.0, 0.0])
@@ -36,26 +36,26 @@ def pose(k):
 
 
 def flight(size_px, mount):
-    """Pictures of a turning, flying camera."""
+    """Images of a rotating, flying camera."""
     C = mount.matrix()[:3, :3]
-    return [picture(pose(k)[0] @ C, pose(k)[1], k, size_px) for k in range(PICTURES)]
+    return [picture(pose(k)[0] @ C, pose(k)[1], k, size_px) for k in range(IMAGES)]
 
 
 @pytest.mark.parametrize("size_px", [720, 1080, 1440])
-@pytest.mark.benchmark(group="odometry, a picture")
+@pytest.mark.benchmark(group="odometry, per image")
 def test_ours(benchmark, size_px):
-    pictures = flight(size_px, LOOKS_DOWN)
+    images = flight(size_px, LOOKS_DOWN)
     turn, direction, clock = [], [], iter(range(1, 100_000))
     odometry = FisheyeOdometry(lens=LENS.scaled(size_px / SIZE_PX), T_drone_camera=LOOKS_DOWN)
 
     def one():
         k = next(clock)
-        there = (k - 1) % (2 * PICTURES - 2)  # to and fro: every step is one of the flight
-        at = min(there, 2 * PICTURES - 2 - there)
+        there = (k - 1) % (2 * IMAGES - 2)  # to and fro: every step is one of the flight
+        at = min(there, 2 * IMAGES - 2 - there)
         return (
             k,
             at,
-            of(odometry.on_image(Image(stamp_ns=k * STEP_NS, frame_id="camera", grey=pictures[at])), VisualMotion),
+            of(odometry.on_image(Image(stamp_ns=k * STEP_NS, frame_id="camera", grey=images[at])), VisualMotion),
         )
 
     places = {}
@@ -78,16 +78,16 @@ def test_ours(benchmark, size_px):
 
 @pytest.mark.parametrize("size_px", [720, 1080])
 @pytest.mark.parametrize("solver", ["opencv", "poselib"])
-@pytest.mark.benchmark(group="odometry, a picture")
-def test_the_usual_way(benchmark, size_px, solver):
-    """From picture to picture, points in front of the lens only: their x / z, y / z."""
-    pictures, lens = flight(size_px, LOOKS_DOWN), LENS.scaled(size_px / SIZE_PX)
+@pytest.mark.benchmark(group="odometry, per image")
+def test_baseline(benchmark, size_px, solver):
+    """From image to image, points in front of the lens only: their x / z, y / z."""
+    images, lens = flight(size_px, LOOKS_DOWN), LENS.scaled(size_px / SIZE_PX)
     C = LOOKS_DOWN.matrix()[:3, :3]
     turn, direction, k = [], [], iter(range(10_000))
 
     def one():
-        at = next(k) % (PICTURES - 1)
-        before, now = pictures[at], pictures[at + 1]
+        at = next(k) % (IMAGES - 1)
+        before, now = images[at], images[at + 1]
         corners = cv2.goodFeaturesToTrack(before, 300, 0.01, size_px / 40)
         found, forward, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None)
         back, backward, _ = cv2.calcOpticalFlowPyrLK(now, before, found, None)
@@ -127,20 +127,20 @@ def test_our_ransac(benchmark, outliers):
 
 
 @pytest.mark.parametrize("size_px", [720, 1080])
-@pytest.mark.benchmark(group="ego, a picture with its LiDAR")
+@pytest.mark.benchmark(group="visual-lidar odometry, per image with LiDAR")
 def test_ego(benchmark, size_px):
-    pictures, k = flight(size_px, LOOKS_UP), iter(range(1, 100_000))
+    images, k = flight(size_px, LOOKS_UP), iter(range(1, 100_000))
     ego = VisualLidarOdometry(lens=LENS.scaled(size_px / SIZE_PX), T_vehicle_camera=LOOKS_UP)
 
     def place(number):
-        there = (number - 1) % (2 * PICTURES - 2)
-        return min(there, 2 * PICTURES - 2 - there)
+        there = (number - 1) % (2 * IMAGES - 2)
+        return min(there, 2 * IMAGES - 2 - there)
 
     def ready():
         number = next(k)
         at = place(number)
         slices = [lidar_slice(number * STEP_NS, *pose(at), number, 5000)]
-        return (slices, Image(stamp_ns=number * STEP_NS, frame_id="camera", grey=pictures[at])), {}
+        return (slices, Image(stamp_ns=number * STEP_NS, frame_id="camera", grey=images[at])), {}
 
     def one(slices, seen):
         for points in slices:

@@ -29,10 +29,10 @@ from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.framing import parse_frame
 from links.recording import RecordingReader
-from links.runs.run_folder import Asked
-from links.simulated.matrix import Conditions, scenario_of
-from links.simulated.matrix_flights import Cell
-from links.simulated.run import simulate_records
+from links.runs.request import RunRequest
+from links.simulated.matrix.flights import Cell
+from links.simulated.matrix.matrix import Conditions, scenario_of
+from links.simulated.rig.run import simulate_records
 from stages.messages import RelativePose
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))
@@ -73,7 +73,7 @@ def told(name: str, took_ms: list[float]) -> None:
 
 def test_a_packet_to_its_poses_datagram_by_computing() -> None:
     scenario = scenario_of(Cell("manhattan", 10, "orbit", "driving"), 1, Conditions(odometry=True, autopilot=True))
-    graph = Asked(CONFIG, sets=("viewer.file=null",)).graph(scenario.rig_yaml(), scenario.name)
+    graph = RunRequest(CONFIG, sets=("viewer.file=null",)).graph(scenario.rig_yaml(), scenario.name)
     tap = ToAutopilot()
     runner, packet_ms, pose_ms = Replay(graph, (tap,)), [], []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:

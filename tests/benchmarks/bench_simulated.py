@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from links.simulated import run
-from links.simulated.run import Simulation
-from links.simulated.scenario import Scenario, load_scenario
-from links.simulated.world.build import KINDS
+from links.simulated.rig import run
+from links.simulated.rig.run import Simulation
+from links.simulated.rig.scenario import Scenario, load_scenario
+from links.simulated.world.procedural.build import KINDS
 
 STREET = Path(__file__).parents[2] / "configs/scenarios/street_sweep.yaml"
 ROUNDS = 7

@@ -1,15 +1,15 @@
-"""Vanishing directions: time of ours on fisheyes of three sizes, and ours beside lu-vp-detect on York Urban.
+"""Vanishing directions: run time on fisheyes of three sizes, and grd compared with lu-vp-detect on York Urban.
 
     python -m pytest tests/benchmarks/bench_vp.py --benchmark-columns=min,median,iqr,rounds -s
 
-lu-vp-detect needs OpenCV 4: make it an environment of its own and say where its Python is,
+lu-vp-detect needs OpenCV 4: create a separate environment and name its Python:
 
     python -m venv luvp && luvp/bin/pip install lu-vp-detect==1.0.4 --no-deps
     luvp/bin/pip install numpy scipy "opencv-python-headless==4.10.0.84"
     GRD_LU_VP_PYTHON=luvp/bin/python python -m pytest tests/benchmarks/bench_vp.py -s
 
-Both see the same 51 pictures with the same camera on one thread, neither knows gravity, and both are asked for three
-directions at right angles. Errors are against the hand-labelled orthogonal directions, themselves good to about 1 deg.
+Both process the same 51 images with the same camera on one thread, without gravity, and estimate three orthogonal
+directions. Errors are against the hand-labelled orthogonal directions, themselves good to about 1 deg.
 Recall counts true directions with a found one within so many degrees.
 """
 
@@ -35,7 +35,7 @@ YORK = Path(__file__).resolve().parents[3] / "shared" / "data" / "vp_york_urban"
 LU_PYTHON = os.environ.get("GRD_LU_VP_PYTHON", "")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-R_CARRIER_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks forward
+R_MOUNT_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks forward
 LU = """
 import json, sys, time
 import cv2
@@ -46,11 +46,11 @@ focal, cx, cy, *paths = json.load(sys.stdin)
 detector = VPDetection(30, (cx, cy), focal, seed=1)
 out = []
 for path in paths:
-    picture = cv2.imread(path)
+    image = cv2.imread(path)
     seconds = []
     for again in range(3):
         start = time.thread_time()
-        found = detector.find_vps(picture).tolist()
+        found = detector.find_vps(image).tolist()
         seconds.append(time.thread_time() - start)
     out.append((min(seconds), found))
 print(json.dumps(out))
@@ -58,7 +58,7 @@ print(json.dumps(out))
 
 
 def courtyard(size_px):
-    """A fisheye picture of chequered walls with noise: more edges than a street has."""
+    """A fisheye image of chequered walls with noise: more edges than a street has."""
     middle = (size_px - 1) / 2
     lens = Equidistant(focal_px=(size_px / 2 - 2) / math.radians(117.5), centre_px=(middle, middle))
     column, row = np.meshgrid(np.arange(size_px, dtype=np.float64), np.arange(size_px, dtype=np.float64))
@@ -72,23 +72,23 @@ def courtyard(size_px):
 
 
 @pytest.mark.parametrize("size_px", [720, 1080, 1440])
-def test_ours_whole_picture(benchmark, size_px):
+def test_ours_whole_image(benchmark, size_px):
     lens, grey = courtyard(size_px)
     vp = GreatCircleVp(camera_mount=CameraMount.VEHICLE, T_mount_camera=Pose(rpy_deg=(0.0, 0.0, 90.0)), lens=lens)
-    picture = Image(stamp_ns=0, frame_id="camera_vehicle", grey=grey)
-    assert len(vp.on_image(picture).direction) == 3
-    benchmark(vp.on_image, picture)
+    message = Image(stamp_ns=0, frame_id="camera_vehicle", grey=grey)
+    assert len(vp.on_image(message).direction) == 3
+    benchmark(vp.on_image, message)
 
 
 @pytest.mark.parametrize("size_px", [720, 1080, 1440])
-def test_paper_whole_picture(benchmark, size_px):
-    """The same pictures through three views of 428 px; most of it is LSD's."""
+def test_paper_whole_image(benchmark, size_px):
+    """The same images through three views of 428 px; LSD takes most of the time."""
     lens, grey = courtyard(size_px)
     looks_up = Pose(rpy_deg=(0.0, 0.0, 90.0))
     vp = PaperVp(camera_mount=CameraMount.VEHICLE, T_mount_camera=looks_up, lens=lens, size_px=size_px)
-    picture = Image(stamp_ns=0, frame_id="camera_vehicle", grey=grey)
-    assert len(vp.on_image(picture).line_normal) > 100
-    benchmark(vp.on_image, picture)
+    message = Image(stamp_ns=0, frame_id="camera_vehicle", grey=grey)
+    assert len(vp.on_image(message).line_normal) > 100
+    benchmark(vp.on_image, message)
 
 
 def york_camera():
@@ -109,7 +109,7 @@ def york_truth(folder):
 
 
 def ours_on_york(folders):
-    """CPU time [s], the best of three, and directions (n, 3) in the camera frame of each picture."""
+    """CPU time [s], the best of three, and directions (n, 3) in the camera frame of each image."""
     focal, column, row = york_camera()
     lens = OCam(polynomial=(-focal, 0.0, 0.0, 0.0, 0.0), centre_px=(column, row), max_off_axis_deg=60.0)  # a pinhole
     vp = GreatCircleVp(
@@ -120,15 +120,15 @@ def ours_on_york(folders):
         vertical_sigma_deg=20.0,
         max_frames=1,
     )
-    pictures = [cv2.imread(str(folder / f"{folder.name}.jpg"), cv2.IMREAD_GRAYSCALE) for folder in folders]
+    images = [cv2.imread(str(folder / f"{folder.name}.jpg"), cv2.IMREAD_GRAYSCALE) for folder in folders]
     answers = []
-    for grey in pictures:
+    for grey in images:
         seconds = []
         for _ in range(3):
             start = time.thread_time()
             found = vp.on_image(Image(stamp_ns=0, frame_id="camera_drone", grey=grey))
             seconds.append(time.thread_time() - start)
-        answers.append((min(seconds), found.direction @ R_CARRIER_CAMERA))
+        answers.append((min(seconds), found.direction @ R_MOUNT_CAMERA))
     return answers
 
 
@@ -151,7 +151,7 @@ def line_of(name, errors, seconds):
     whole = " ".join(f"{np.mean(errors.max(axis=1) < limit):.2f}" for limit in (2, 5))
     return (
         f"{name:24s} median {np.median(errors):.2f} deg, RMS below 5 deg {np.sqrt(np.mean(errors[errors < 5] ** 2)):.2f}, "
-        f"recall 1/2/5 deg {recall}, whole pictures 2/5 deg {whole}, {1e3 * np.median(seconds):.1f} ms CPU a picture"
+        f"recall 1/2/5 deg {recall}, whole images 2/5 deg {whole}, {1e3 * np.median(seconds):.1f} ms CPU a image"
     )
 
 

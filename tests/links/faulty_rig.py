@@ -11,8 +11,8 @@ import sys
 import threading
 from pathlib import Path
 
-from links.simulated.live_process import SWITCH_S, LiveAutopilot, RigInTime
-from links.simulated.live_rig import LiveRigSettings
+from links.simulated.rig.live_process import SWITCH_S, LiveAutopilot, RealTimeRig
+from links.simulated.rig.live_rig import LiveRigSettings
 
 
 class RestartedAutopilot(LiveAutopilot):
@@ -35,7 +35,7 @@ class RestartedAutopilot(LiveAutopilot):
         super()._send(message)
 
 
-class FaultyRig(RigInTime):
+class FaultyRig(RealTimeRig):
     """`do("lidar off")` and so on, from any thread."""
 
     def __init__(self, rig: LiveRigSettings, folder: Path) -> None:

@@ -40,7 +40,7 @@ from links.dynamixel.servo import Servo
 from links.mavlink import Autopilot
 from links.mavlink.framing import FrameSplitter, dialect, frame_bytes
 from links.recording import CompressedImage, RecordingReader, RecordingWriter, encode_compressed_image
-from links.simulated.protocol2 import status
+from links.simulated.sensors.protocol2 import status
 from links.vehicle_odometry import VehicleOdometry
 from links.velodyne import Lidar
 from links.velodyne.position import PpsMonitor

@@ -29,7 +29,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.recording import RecordingReader
 from links.runs.truth import TruthLog
-from links.simulated.live_pictures import PictureServer
+from links.simulated.rig.live_images import MjpegServer
 from tests.links.fault_bounds import KEPT_S, KILLED, MUST, POSES_AGAIN_S, POSITION_AGAIN_S, REST_S
 from tests.links.ports import free_ports
 from tests.unit_file import unit_file
@@ -128,7 +128,7 @@ def positions(folder: Path) -> list[Told]:
     poses, table = folder / "pose_vehicle_drone.tum", folder / "pose_covariance.csv"
     if not poses.exists() or not table.exists():
         return []
-    good = {row["stamp_s"]: row["good"] == "1" for row in csv.DictReader(table.read_text().splitlines())}
+    good = {row["stamp_s"]: row["accepted"] == "1" for row in csv.DictReader(table.read_text().splitlines())}
     lines = [line.split() for line in poses.read_text().splitlines() if line[:1].isdigit()]
     whole = [line for line in lines if len(line) == 8 and line[0] in good]
     return [Told(float(line[0]), good[line[0]], tuple(map(float, line[1:]))) for line in whole]
@@ -177,7 +177,7 @@ class Camera:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            with PictureServer(self._port) as server:
+            with MjpegServer(self._port) as server:
                 while not self.off and not self._stop.wait(0.1):
                     server.show(self._jpeg)
             while self.off and not self._stop.wait(0.05):
@@ -330,7 +330,7 @@ def errors_of(poses: list[Told], folder: Path) -> np.ndarray:
     if truth is None:
         truth = _truth[folder] = TruthLog()
         with RecordingReader(folder / "truth.mcap") as reader:
-            truth.take(reader.records())
+            truth.add_all(reader.records())
     stamps_ns, xyz_m = truth.drone_in_vehicle()  # the vehicle stands still with its axes along the world's
     quaternions = np.array([truth.drones[1].pose[stamp][1] for stamp in stamps_ns.tolist()])
     yaw_rad = np.unwrap(2 * np.arctan2(quaternions[:, 2], quaternions[:, 3]), period=2 * np.pi)

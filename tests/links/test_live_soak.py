@@ -37,7 +37,7 @@ links:
 WITH_CAMERAS = """\
   camera_vehicle: {{config: {{source: "http://127.0.0.1:{vehicle}/"}}}}
   camera_drone: {{config: {{source: "http://127.0.0.1:{drone}/"}}}}
-  sim: {{config: {{pictures: {pictures}, camera_ports: {{vehicle: {vehicle}, drone: {drone}}}}}}}
+  sim: {{config: {{images: {images}, camera_ports: {{vehicle: {vehicle}, drone: {drone}}}}}}}
 """
 
 
@@ -50,7 +50,7 @@ def test_an_hour_in_flight_grows_nothing_and_stops_nothing(tmp_path):
     command = [sys.executable, "-c", "from links.cli import main; main()", "run", config]
     for number, text in enumerate(overlays):
         overlay = tmp_path / f"soak_{number}.yaml"
-        told = {**ports, "servo": tmp_path / "servo", "pictures": PICTURES, "duration_s": SOAK_S + 60.0}
+        told = {**ports, "servo": tmp_path / "servo", "images": PICTURES, "duration_s": SOAK_S + 60.0}
         overlay.write_text(text.format(**told))
         command += ["--overlay", str(overlay)]
     command += ["--for", str(SOAK_S), "--out", str(tmp_path / "soak")]
@@ -58,7 +58,7 @@ def test_an_hour_in_flight_grows_nothing_and_stops_nothing(tmp_path):
         code = subprocess.run(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, check=False).returncode
     assert code == 0, (tmp_path / "log.txt").read_text()[-2_000:]
     summary = json.loads((tmp_path / "soak" / "summary.json").read_text())
-    usage = np.array([summary["live"]["usage"][name] for name in ("since_s", "rss_mb", "threads", "files")]).T
+    usage = np.array([summary["live"]["usage"][name] for name in ("elapsed_s", "rss_mb", "threads", "files")]).T
     begun, ended = usage[usage[:, 0] > 0.25 * SOAK_S][0], usage[-1]
     poses = np.loadtxt(tmp_path / "soak" / "pose_vehicle_drone.tum", usecols=0)
     gaps_s = np.diff(poses)
@@ -66,7 +66,7 @@ def test_an_hour_in_flight_grows_nothing_and_stops_nothing(tmp_path):
         f"\n{SOAK_S:.0f} s: {begun[1]:.0f} MB after a quarter, {ended[1]:.0f} MB at the end; threads {begun[2]:.0f}, "
         f"{ended[2]:.0f}; files {begun[3]:.0f}, {ended[3]:.0f}; {len(poses)} poses, gaps p99 "
         f"{1e3 * np.percentile(gaps_s, 99):.0f}, max {1e3 * gaps_s.max():.0f} ms; {summary['poses']['states']}; "
-        f"dropped {summary['live']['dropped']}; {summary['against_truth']}; rig {json.loads((tmp_path / 'soak' / 'rig.json').read_text())}\n"
+        f"dropped {summary['live']['dropped']}; {summary['truth_errors']}; rig {json.loads((tmp_path / 'soak' / 'rig.json').read_text())}\n"
     )
     assert ended[1] < 1.05 * begun[1] + 10.0
     assert ended[2] <= begun[2]

@@ -86,7 +86,7 @@ def detections(*xyz_accepted, stamp_ns=START_NS, refused=()) -> Detections:
         e_outer=np.zeros(n),
         accepted=accepted,
         reasons=("made",) * n,
-        verdict="made",
+        summary="made",
     )
 
 

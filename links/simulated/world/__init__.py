@@ -1,6 +1,1 @@
-"""Procedural scenes by seed and kind."""
-
-from links.simulated.world.build import World, build_world, world_mesh
-from links.simulated.world.settings import SceneSettings
-
-__all__ = ["SceneSettings", "World", "build_world", "world_mesh"]
+"""What a simulated scene contains: meshes, ray casting, moving bodies, paths, flight dynamics, weather and sky."""

@@ -1,1 +1,1 @@
-"""align."""
+"""Compiled functions for camera alignment."""

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/align/spectra.py`.
+"""Compiled functions that add line votes to a spectrum over yaw.
 
-Source: see there.
+Source: see `stages/align/spectra.py`.
 """
 
 from __future__ import annotations

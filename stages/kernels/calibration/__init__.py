@@ -1,1 +1,1 @@
-"""calibration."""
+"""Compiled functions for calibration."""

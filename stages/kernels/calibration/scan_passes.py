@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/calibration/scan_passes.py`.
+"""Compiled functions that derive the side of the gear play from the servo's motion.
 
-Source: see there.
+Source: see `stages/calibration/scan_passes.py`.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ import math
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled_at_once
 
-SETTLED_RAD = math.radians(0.5)  # a turn-back is over after that: how play gives way is not modelled so finely
+SETTLED_RAD = math.radians(0.5)  # travel beyond the play after which a reversal is complete
 
 
 @compiled_at_once("(float64[::1], float64, float64[::1])")
-def hangs(position_rad: Array64, play_rad: float, hang: Array64) -> None:
-    """Fill hang (m,): +1 where the turntable hangs behind a servo that went up, -1 behind one that went down.
+def play_sides(position_rad: Array64, play_rad: float, play_side: Array64) -> None:
+    """Fill play_side (m,): +1 where the turntable lags a servo that moved up, -1 one that moved down.
 
-    NaN in between: after a turn-back, until the servo has gone the play and SETTLED_RAD further.
+    NaN after a reversal, until the servo has crossed the play and SETTLED_RAD more.
     """
     half = max(play_rad, 0.0) / 2
     lag = beyond = 0.0
-    hang[0] = math.nan
+    play_side[0] = math.nan
     for k in range(1, position_rad.size):
         step = position_rad[k] - position_rad[k - 1]
         pushed = lag + step
@@ -29,4 +29,4 @@ def hangs(position_rad: Array64, play_rad: float, hang: Array64) -> None:
         if step * beyond < 0.0:
             beyond = 0.0
         beyond += pushed - lag
-        hang[k] = math.nan if abs(beyond) < SETTLED_RAD else math.copysign(1.0, beyond)
+        play_side[k] = math.nan if abs(beyond) < SETTLED_RAD else math.copysign(1.0, beyond)

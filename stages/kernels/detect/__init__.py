@@ -1,1 +1,1 @@
-"""detect."""
+"""Compiled functions for drone detection."""

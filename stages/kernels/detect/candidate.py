@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/candidate.py`.
+"""Compiled functions that rate from one tally whether something stands next to a candidate.
 
-Source: see there.
+Source: see `stages/detect/candidate.py`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.detect.isolation import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
 
-OPEN_LOOKS = 3  # a sector free in so many looks holds nothing up: what stands behind it is something else
+OPEN_LOOKS = 3  # a sector free in so many scan passes has no support: a return behind it is another object
 SIGMA_M = 0.15  # of a sighting
 ACCELERATION_MPS2 = 4.0
 

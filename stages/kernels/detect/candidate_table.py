@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/candidate_table.py`.
+"""Compiled functions that associate sightings and slices of pulses with candidates.
 
-Source: see there.
+Source: see `stages/detect/candidate_table.py`.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from stages.kernels.compiled import compiled
 from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M
 from stages.kernels.detect.isolation import INNER_HITS, INNER_PASSES, TALLY, look_around
 
-FURTHEST_STEP_M = 2.5  # from where it was expected
+FURTHEST_STEP_M = 2.5  # largest distance of a sighting from the prediction
 MOST_COST = 9.0  # of a sighting: squared sigmas
-SEEN_LATELY_NS = 1_500_000_000  # later nobody knows where a miss would be
-FAN_COS = 0.93  # a slice covers less to each side of its middle
-X, Y, Z, VX, VY, VZ, P_X, P_XV, P_V = range(9)  # [m], [m/s] in the local frame, and their variances
+SEEN_LATELY_NS = 1_500_000_000  # beyond this age a miss is not counted
+FAN_COS = 0.93  # cosine of half the angle that a slice covers
+X, Y, Z, VX, VY, VZ, P_X, P_XV, P_V = range(9)  # [m], [m/s] in frame map, and their variances
 STAMP, SEEN = 0, 1  # [ns]
 NOTHING, NEAR, ELSEWHERE = 0, 1, 2  # of a candidate: nothing to say; pulses near its middle; the fan is elsewhere
 
 
 @compiled
 def first_within(places_m: Array64, xyz_m: Array64, reach_m: float) -> int:
-    """The first of places (n, 3) within reach of one (3,); -1 when none is."""
+    """Index of the first of positions (n, 3) within reach_m of xyz_m (3,); -1: none."""
     for k in range(places_m.shape[0]):
         x, y, z = places_m[k, 0] - xyz_m[0], places_m[k, 1] - xyz_m[1], places_m[k, 2] - xyz_m[2]
         if math.sqrt(x * x + y * y + z * z) < reach_m:
@@ -36,7 +36,7 @@ def first_within(places_m: Array64, xyz_m: Array64, reach_m: float) -> int:
 
 @compiled
 def predicted(state: Array64, dt_s: float) -> tuple[float, float, float, float]:
-    """Place x, y, z [m] and its variance [m^2] of a row of the table after dt_s."""
+    """Predicted position x, y, z [m] and its variance [m^2] of a row of the table after dt_s."""
     variance = state[P_X] + 2 * dt_s * state[P_XV] + dt_s * dt_s * state[P_V]
     variance += (ACCELERATION_MPS2 * dt_s * dt_s) ** 2 / 4
     return state[X] + dt_s * state[VX], state[Y] + dt_s * state[VY], state[Z] + dt_s * state[VZ], variance

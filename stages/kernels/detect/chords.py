@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/chords.py`.
+"""Compiled functions that group the consecutive returns of each laser into chords.
 
-Source: see there.
+Source: see `stages/detect/chords.py`.
 """
 
 from __future__ import annotations

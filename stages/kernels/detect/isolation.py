@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/isolation.py`.
+"""Compiled functions that tally the pulses around a position and map remembered returns.
 
-Source: see there.
+Source: see `stages/detect/isolation.py`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from stages.kernels.compiled import compiled
 SECTORS = 8
 INNER_HITS, INNER_PASSES, NEARER, FREE_0 = 0, 1, 2, 3  # FREE_0.. 8 free, then 8 occupied
 OCCUPIED_0 = FREE_0 + SECTORS
-FARTHER_0 = OCCUPIED_0 + SECTORS  # 8 in which something stands, but not close by
+FARTHER_0 = OCCUPIED_0 + SECTORS  # 8 with a return, but not close
 TALLY = FARTHER_0 + SECTORS
-BITS = 16  # of the map's table
+BITS = 16  # log2 of the map's table size
 MAP_SIZE = 1 << BITS
 
 
@@ -35,7 +35,7 @@ def look_around(
     depth_m: float,
     tally: NDArray[np.int64],
 ) -> None:
-    """Add to tally (TALLY,) what pulses (n, 3), (n,) found around centre_m (3,)."""
+    """Add the pulses (n, 3), (n,) around centre_m (3,) to the tally (TALLY,)."""
     x, y, z = centre_m[0] - origin_m[0], centre_m[1] - origin_m[1], centre_m[2] - origin_m[2]
     R = math.sqrt(x * x + y * y + z * z)
     ux, uy, uz = x / R, y / R, z / R
@@ -43,7 +43,7 @@ def look_around(
     if level < 1e-6:
         ax, ay = 1.0, 0.0
     else:
-        ax, ay = -uy / level, ux / level  # a: level, across the line of sight; b = u x a
+        ax, ay = -uy / level, ux / level  # a: horizontal, orthogonal to the line of sight; b = u x a
     bx, by, bz = -uz * ay, uz * ax, ux * ay - uy * ax
     least = math.cos(min(outer_m / R * 1.05, 1.5))
     for i in range(range_m.size):
@@ -57,7 +57,7 @@ def look_around(
         if away > outer_m:
             continue
         r = range_m[i]
-        deep = depth_m + 1.2 * away  # a wire may run towards us
+        deep = depth_m + 1.2 * away  # a wire may run towards the sensor
         if r > 0.0 and r < R - deep:
             tally[NEARER] += 1
             continue
@@ -84,7 +84,7 @@ def _cell(x: int, y: int, z: int) -> int:
 
 @compiled
 def remember(points_m: Array64, cell_m: float, stamp_ns: int, key: NDArray[np.int64], when: NDArray[np.int64]) -> None:
-    """Note the cells of points (n, 3); a cell that shares its place in the table takes it over."""
+    """Mark the cells of points (n, 3); a hash collision overwrites the older cell."""
     for i in range(points_m.shape[0]):
         x, y, z = (
             math.floor(points_m[i, 0] / cell_m),
@@ -106,7 +106,7 @@ def nearest_remembered(
     key: NDArray[np.int64],
     when: NDArray[np.int64],
 ) -> float:
-    """Distance [m] to the nearest noted cell's middle between least_m and most_m of centre_m (3,); inf without one."""
+    """Distance [m] to the nearest marked cell's centre between least_m and most_m of centre_m (3,); inf without one."""
     reach = math.ceil(most_m / cell_m)
     x0, y0, z0 = (
         math.floor(centre_m[0] / cell_m),

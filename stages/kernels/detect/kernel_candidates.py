@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/kernel_candidates.py`.
+"""Compiled functions that find minima of a score image and count the pixels around them.
 
-Source: see there.
+Source: see `stages/detect/kernel_candidates.py`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ INFINITY_BITS = 0x7F80_0000  # of a float32; those of finite numbers from 0 up a
 
 @compiled
 def lowest_places(bits: NDArray[np.uint32], few: int) -> NDArray[np.int64]:
-    """Where the `few` lowest scores are, and some more: all up to the same upper 16 bits. NaN is no score.
+    """Indices of the `few` lowest scores, and all others with the same upper 16 bits. NaN is no score.
 
     A histogram instead of a partition: its time does not depend on the scores.
     """
@@ -80,7 +80,7 @@ def distance_m(depth_m: NDArray[np.float32], focal_px: float, centre_m: Array64,
 
 @compiled
 def box_px(shape: tuple[int, int], focal_px: float, centre_m: Array64, far_m: float) -> tuple[int, int, int]:
-    """(row, column, reach): points within far_m of centre_m are seen at most `reach` pixels from there.
+    """(row, column, reach): points within far_m of centre_m project within `reach` pixels of it.
 
     |x / d - x_c / d_c| <= far (1 + |x_c| / d_c) / d. Points nearer than half the centre's depth are not looked for.
     """
@@ -130,7 +130,7 @@ def company_pixels(
     height, width = depth_m.shape
     row, column, reach = box_px(depth_m.shape, focal_px, centre_m, far_m)
     count = 0
-    for ring in range(reach + 1):  # outwards: a wall has enough of it in the first rings
+    for ring in range(reach + 1):  # outwards: a wall reaches `enough` in the first rings
         for v in range(max(0, row - ring), min(height, row + ring + 1)):
             step = 1 if abs(v - row) == ring else 2 * ring
             for u in range(column - ring, column + ring + 1, step):

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/kernel_score.py`.
+"""Compiled functions that compute the paper's detector score, Equations (2) to (5), per pixel.
 
-Source: see there.
+Source: see `stages/detect/kernel_score.py`.
 """
 
 from __future__ import annotations

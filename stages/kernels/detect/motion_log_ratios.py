@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/motion_log_ratios.py`.
+"""Compiled functions that compare a path with the drone's odometry and with other motion models.
 
-Source: see there.
+Source: see `stages/detect/motion_log_ratios.py`.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from stages.kernels.compiled import compiled
 from stages.kernels.geometry.smooth_motion import log_p, misfit, model_of
 
 YAWS = 72  # steps of 5 deg: coarser, a fast straight flight fits none
-DRIFT_MPS = 0.3  # of the autopilot's velocity and the vehicle's, together, level
+DRIFT_MPS = 0.3  # horizontal velocity drift of autopilot and vehicle together
 DRIFT_UP_MPS = 0.1
-SCATTERED_M = 0.45  # sightings of something long
-SLIDING_MPS = 0.5  # or how fast looks at it wander along
-FOLLOWED_MPS = 5.0  # and along a wire, where each next look is aimed at as if it flew
+SCATTERED_M = 0.45  # scatter of the sightings of a long object
+SLIDING_MPS = 0.5  # or speed at which sightings move along it
+FOLLOWED_MPS = 5.0  # the same along a wire, where each pass is aimed as at a flying object
 CRUISING, CRUISE_MPS, CRUISE_SIGMA_MPS = 0.8, 10.0, 2.5  # share of birds' time, speed; else anything up to it
 BIRD = (6.0, 3.0, 1.5, 1.0)  # sigma of speed [m/s] and acceleration [m/s^2], level; the same, up
-BALLOON = (0.7, 0.7, 0.3, 0.4)  # the same, on a string
-SWAY_M = 1.0  # sigma of how far that comes in all, however long one looks
+BALLOON = (0.7, 0.7, 0.3, 0.4)  # the same, on a string (balloon)
+SWAY_M = 1.0  # sigma of its total displacement, at any duration
 LOOSE, LOOSE_MPS, LOOSE_MPS2 = 0.1, 2.0, 0.3  # assumed share of balloons that drift with the wind, their sigmas
 
 

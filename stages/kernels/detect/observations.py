@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/observations.py`.
+"""Compiled functions that classify chords and summarise those of one object.
 
-Source: see there.
+Source: see `stages/detect/observations.py`.
 """
 
 from __future__ import annotations

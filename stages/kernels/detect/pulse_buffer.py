@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/detect/pulse_buffer.py`.
+"""Compiled functions that buffer recent pulses and search them around a position.
 
-Source: see there.
+Source: see `stages/detect/pulse_buffer.py`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.detect.isolation import TALLY, look_around
 
-WINDOW_NS = 8_600_000  # what is kept: 31 deg of a rotor at 600 rpm and the slice that is begun
-ROUNDED_RAD = 1e-3  # more than directions are rounded by
+WINDOW_NS = 8_600_000  # length of the buffer: 31 deg of a rotor at 600 rpm and the newest slice
+ROUNDED_RAD = 1e-3  # bound of the rounding of directions
 
 
 @compiled
@@ -33,7 +33,7 @@ def keep_slice(
     sizes: NDArray[np.int64],
     ends_ns: NDArray[np.int64],
 ) -> None:
-    """Write a slice into row k of what is kept, its `fan` with it; those before the window get the size 0."""
+    """Write a slice and its `fan` into row k of the buffer; slices before the window get size 0."""
     widest = 1.0
     for i in range(range_m.size):
         along = 0.0
@@ -51,7 +51,7 @@ def keep_slice(
 
 @compiled
 def passes_by(fan: Array64, origin_m: Array64, centre_m: Array64, outer_m: float) -> bool:
-    """Whether no pulse of a slice comes within `outer_m` of a place (3,), as `look_around` takes it."""
+    """Whether no pulse of a slice comes within `outer_m` of a position (3,), as in `look_around`."""
     x, y, z = centre_m[0] - origin_m[0], centre_m[1] - origin_m[1], centre_m[2] - origin_m[2]
     away_m = max(math.sqrt(x * x + y * y + z * z), 1e-9)
     beside = math.acos(min(max((x * fan[0] + y * fan[1] + z * fan[2]) / away_m, -1.0), 1.0))

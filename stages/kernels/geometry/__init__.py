@@ -1,1 +1,1 @@
-"""geometry."""
+"""Compiled functions for rotations, trajectories and lenses."""

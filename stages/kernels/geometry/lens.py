@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/geometry/lens.py`.
+"""Compiled functions that project rays to pixels and pixels to rays for fisheye lenses.
 
-Source: see there.
+Source: see `stages/geometry/lens.py`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-ANGLE_SERIES, OCAM = 0, 1  # what the coefficients of the radial function mean
+ANGLE_SERIES, OCAM = 0, 1  # kinds of radial function
 _TURNS = 60  # of the bracketed Newton iteration; 6 are usual
 
 
@@ -93,7 +93,7 @@ def _theta_of_rho(rho: float, kind: int, a: Array64, max_theta: float, max_rho: 
 
 @compiled
 def _newton(x: float, value: float, slope: float, low: float, high: float) -> tuple[float, bool]:
-    """One Newton step kept inside the bracket, and whether it no longer moves."""
+    """One Newton step limited to the bracket, and whether it has converged."""
     following = x - value / slope if slope != 0.0 else low - 1.0
     if not low <= following <= high:
         following = 0.5 * (low + high)

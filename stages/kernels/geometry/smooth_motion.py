@@ -1,4 +1,4 @@
-"""How likely a path is under a smooth motion nobody knows: place, velocity, acceleration integrated out.
+"""Marginal likelihood of a path under smooth motion: position, velocity and acceleration are integrated out.
 
     e(t) = c + v t + a t^2 / 2 + noise,   c, v, a normal about zero
 
@@ -19,7 +19,7 @@ ANYWHERE_M = 100.0  # sigma of c
 
 @compiled
 def model_of(t: Array64, sigma: float, speed: float, acceleration: float) -> Array64:
-    """What `log_p` needs of e (n,) = c + v t + a t^2 / 2 + noise: (4, 3), a Cholesky factor L and what is constant.
+    """The model (4, 3) that `log_p` needs for e (n,) = c + v t + a t^2 / 2 + noise: Cholesky factor L and constants.
 
     c, v, a are normal about zero with sigmas ANYWHERE_M, speed, acceleration; 0: there is none.
         ln p = -(e.e / sigma^2 - b.A^-1 b) / 2 - ln|A Q| / 2 - n ln sigma
@@ -48,7 +48,7 @@ def model_of(t: Array64, sigma: float, speed: float, acceleration: float) -> Arr
 
 @compiled
 def misfit(model: Array64, t: Array64, e: Array64) -> float:
-    """How badly e (n,) fits: squared sigmas, n of them where the model is right."""
+    """Squared residual of e (n,) in sigmas: n on average if the model is correct."""
     b0 = b1 = b2 = square = 0.0
     for i in range(len(t)):
         square += e[i] * e[i]

@@ -1,7 +1,7 @@
-"""Rotations by their vectors: exponential, logarithm and the nearest rotation to a matrix.
+"""Compiled functions for rotations: exponential, logarithm and the nearest rotation to a matrix.
 
-Source: Rodrigues' formula; Sola, Deray, Atchuthan, A micro Lie theory (2018), appendix B. R exp(phi): phi in the axes
-on R's right.
+Source: Rodrigues' formula; Sola, Deray, Atchuthan, A micro Lie theory (2018), appendix B. In R exp(phi), phi is
+in the child axes of R.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled, compiled_at_once
 
 SMALL_RAD = 1e-7
-NEARLY = 0.2  # of M^T M from 1: Newton's iteration converges from there
+NEARLY = 0.2  # largest deviation of M^T M from 1 from which Newton's iteration converges
 NEWTON_STEPS = 6
 
 
@@ -26,7 +26,7 @@ def hat(v: Array64) -> Array64:
 
 @compiled
 def exp_rotation(phi_rad: Array64) -> Array64:
-    """Rotation (3, 3) about phi (3,) by its length: I + sin(a)/a [phi]x + (1 - cos(a))/a^2 [phi]x^2."""
+    """Rotation (3, 3) of a rotation vector phi (3,) [rad]: I + sin(a)/a [phi]x + (1 - cos(a))/a^2 [phi]x^2."""
     angle = math.sqrt(phi_rad[0] ** 2 + phi_rad[1] ** 2 + phi_rad[2] ** 2)
     K = hat(phi_rad)
     if angle < SMALL_RAD:
@@ -36,7 +36,7 @@ def exp_rotation(phi_rad: Array64) -> Array64:
 
 @compiled
 def log_rotation(R: Array64) -> Array64:
-    """phi (3,) of R = exp(phi), its length in [0, pi]. By the quaternion: well behaved at both ends."""
+    """Rotation vector phi (3,) of R = exp(phi), length in [0, pi]; by the quaternion, stable at both ends."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     q = np.empty(4)
     if trace > 0.0:
@@ -70,7 +70,7 @@ def nearest_rotation(M: Array64) -> Array64:
 
 @compiled_at_once("(float64[:, ::1],)")
 def nearly_rotation(M: Array64) -> Array64:
-    """The same, by Newton's iteration where M is nearly a rotation: a hundredth of the time.
+    """`nearest_rotation` by Newton's iteration, 100 times faster, where M is nearly a rotation.
 
     Source: Higham, Functions of Matrices (2008), 8.3.
     """

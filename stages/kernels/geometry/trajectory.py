@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/geometry/trajectory.py`.
+"""Compiled functions that convert positions and velocities between frames map and vehicle.
 
-Source: see there.
+Source: see `stages/geometry/trajectory.py`.
 """
 
 from __future__ import annotations
@@ -8,22 +8,27 @@ from __future__ import annotations
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-STEP_NS = 50_000_000  # over which a velocity is taken
+STEP_NS = 50_000_000  # interval over which a velocity is computed
 
 
 @compiled
 def to_vehicle(
     R: Array64, t: Array64, R_then: Array64, t_then: Array64, xyz_m: Array64, velocity_mps: Array64
 ) -> tuple[Array64, Array64]:
+    """Position and velocity (3,) in frame vehicle of those in frame map.
+
+    R (3, 3), t (3,): T_map_vehicle; R_then, t_then: the same STEP_NS later.
+    """
     now = R.T @ (xyz_m - t)
     then = R_then.T @ (xyz_m + STEP_NS * 1e-9 * velocity_mps - t_then)
     return now, (then - now) / (STEP_NS * 1e-9)
 
 
 @compiled
-def to_local(
+def to_map(
     R: Array64, t: Array64, R_then: Array64, t_then: Array64, xyz_m: Array64, velocity_mps: Array64
 ) -> tuple[Array64, Array64]:
+    """Position and velocity (3,) in frame map of those in frame vehicle: the inverse of `to_vehicle`."""
     now = R @ xyz_m + t
     then = R_then @ (xyz_m + STEP_NS * 1e-9 * velocity_mps) + t_then
     return now, (then - now) / (STEP_NS * 1e-9)

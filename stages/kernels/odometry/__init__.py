@@ -1,1 +1,1 @@
-"""odometry."""
+"""Compiled functions for vehicle odometry."""

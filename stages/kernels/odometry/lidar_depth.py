@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/odometry/vehicle/lidar_depth.py`.
+"""Compiled functions that fit inverse depths of rays to LiDAR points.
 
-Source: see there.
+Source: see `stages/odometry/vehicle/lidar_depth.py`.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
 LEAST_POINTS = 5
-LEAST_SPREAD = 0.15  # of the reach, one sigma of u and of v: points on one ring say nothing across it
-ROUGHNESS = 0.06  # of the inverse depth, one sigma: rougher is no plane (a corner, leaves)
+LEAST_SPREAD = 0.15  # of the reach: least sigma of u and v; points on one ring do not constrain the plane across it
+ROUGHNESS = 0.06  # of the inverse depth, one sigma: a larger one is no plane (corners, leaves)
 RANGE_M = 0.03  # one sigma of the LiDAR
 NEAREST_M = 0.8
 
 
 @compiled
 def add(ray: Array64, frames: Array64, sums: Array64, points: Array64, reach: float) -> None:
+    """Add points (m, 3) to the sums (n, SUMS) of the rays (n, 3) within `reach` [rad]; frames (n, 3, 2): their axes."""
     least = math.cos(math.atan(reach * math.sqrt(2.0)))
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -51,6 +52,7 @@ def add(ray: Array64, frames: Array64, sums: Array64, points: Array64, reach: fl
 
 @compiled
 def solve(sums: Array64, reach: float) -> tuple[Array64, Array64]:
+    """Inverse depths (n,) [1/m] and their sigma from the sums (n, SUMS); NaN where no plane fits."""
     n = len(sums)
     inverse, sigma = np.full(n, np.nan), np.full(n, np.nan)
     for k in range(n):

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/odometry/vehicle/window.py`.
+"""Compiled functions that triangulate features and solve the windowed bundle adjustment.
 
-Source: see there.
+Source: see `stages/odometry/vehicle/window.py`.
 """
 
 from __future__ import annotations

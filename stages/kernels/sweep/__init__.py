@@ -1,1 +1,1 @@
-"""sweep."""
+"""Compiled functions for sweeps."""

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/sweep/depth_image.py`.
+"""Compiled functions that draw points into a depth image.
 
-Source: see there.
+Source: see `stages/sweep/depth_image.py`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stages.kernels.compiled import compiled
 def keep_nearest(
     xyz_vehicle_m: NDArray[np.float32], origin_m: NDArray[np.float64], focal_px: float, depth_m: NDArray[np.float32]
 ) -> int:
-    """Draw points (n, 3) into depth_m (N, N) in place; the nearest depth stays. Returns how many fell into the image.
+    """Draw points (n, 3) into depth_m (N, N) in place; keeping the nearest depth. Returns the number inside the image.
 
     column u = floor(focal x / z + N / 2), row v = floor(focal y / z + N / 2), with (x, y, z) = point - origin, z > 0.
     """

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/sweep/pulses.py`.
+"""Compiled functions that average the directions of pulses.
 
-Source: see there.
+Source: see `stages/sweep/pulses.py`.
 """
 
 from __future__ import annotations
@@ -32,6 +32,6 @@ def mean_direction(direction: NDArray[np.float32]) -> Array64:
 
 @compiled
 def looking_along(direction: NDArray[np.float32]) -> Array64:
-    """`mean_direction` as a unit vector (3,); zero where there is none."""
+    """`mean_direction` as a unit vector (3,); zero for a zero mean."""
     mean = mean_direction(direction)
     return mean / max(math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2), 1e-9)

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/sweep/turntable.py`.
+"""Compiled functions that interpolate the turntable angle and place returns and pulses by it.
 
-Source: see there.
+Source: see `stages/sweep/turntable.py`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from stages.kernels.compiled import compiled
 
 @compiled
 def angle_at(t_ns: int, state_ns: NDArray[np.int64], state_rad: Array64, max_gap_ns: int) -> float:
-    """Angle at a time, linear between the neighbouring states; NaN where that would be a guess."""
+    """Angle at a time, interpolated between the neighbouring states; NaN outside them or in a gap."""
     n = state_ns.size
     if n == 0 or t_ns < state_ns[0] or t_ns > state_ns[n - 1]:
         return math.nan
@@ -54,7 +54,7 @@ def place_returns(
 ) -> tuple[int, int]:
     """Fill the last three arrays with the returns of a packet, in order: pulse index, point, angle.
 
-    Returns (how many were filled, how many had no angle). Pulses nearer than min_range_m or without return are skipped.
+    Returns (number filled, number without an angle). Pulses nearer than min_range_m or without return are skipped.
     """
     A, B = T_vehicle_turntable, T_turntable_lidar
     placed = unplaced = 0
@@ -103,9 +103,9 @@ def place_pulses(
     n = 0
     cos_w, sin_w = np.cos(elevation_rad), np.sin(elevation_rad)
     for i in range(range_m.size):
-        if return_kind[i] != 0:  # the last return of the pulse before
+        if return_kind[i] != 0:  # the last return of the previous pulse
             if n > 0 and range_m[i] > 0.0 and (distance_m[n - 1] == 0.0 or range_m[i] < distance_m[n - 1]):
-                n -= 1  # nearer: takes its place
+                n -= 1  # nearer: replaces it
             else:
                 continue
         angle, c, s = turn[i, 0], turn[i, 1], turn[i, 2]

@@ -1,1 +1,1 @@
-"""track."""
+"""Compiled functions for drone tracking."""

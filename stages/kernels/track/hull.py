@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/hull.py`.
+"""Compiled functions that compute the posterior of the drone's position from returns and pass-throughs.
 
-Source: see there.
+Source: see `stages/track/hull.py`.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-STRAY = 0.005  # eps: a return that is none of the drone's
+STRAY = 0.005  # eps: probability of a false return
 # of a collected pulse: offsets [m], hit or miss, range over the prediction [m] (inf: no return), time, laser
 A, B, KIND, DEPTH, WHEN_S, LASER = range(6)
-MISS, HIT, NEARER = 0.0, 1.0, 2.0  # NEARER says nothing: what is behind is hidden, or nobody knows what it is
-GLIMPSE = 3.0  # a hit through a gap: nobody knows how far it goes on behind
+MISS, HIT, NEARER = 0.0, 1.0, 2.0  # NEARER: no information, the space behind is hidden
+GLIMPSE = 3.0  # a return seen through a gap: its extent behind is not known
 CELLS = 25
 
 
 @compiled
 def basis(ux: float, uy: float, uz: float) -> tuple[float, float, float, float, float]:
-    """(a_x, a_y, b_x, b_y, b_z): a level (a_z = 0), b = u x a, both across the line of sight u."""
+    """(a_x, a_y, b_x, b_y, b_z): a horizontal (a_z = 0), b = u x a, both orthogonal to the line of sight u."""
     level = math.hypot(ux, uy)
     if level < 1e-6:
         ax, ay = 1.0, 0.0
@@ -48,7 +48,7 @@ def collect(
     axes: Array64,
     found: Array64,
 ) -> int:
-    """Fill found (n, COLUMNS) with the pulses that pass the moving centre within reach_m; returns how many.
+    """Fill found (n, COLUMNS) with the pulses that pass within reach_m of the moving centre; returns their number.
 
     Each is measured against where the centre is at its own time (de-skew), along the `axes` (2, 3) across `line`, the
     unit line of sight of the look. A return nearer than depth_m before it hides what is behind and says nothing.
@@ -98,7 +98,7 @@ def posterior(
     mean: Array64,
     covariance: Array64,
 ) -> tuple[float, float]:
-    """Fill mean (2,) and covariance (2, 2) of the centre's offset [m], [m^2] after the look's pulses (n, COLUMNS).
+    """Fill mean (2,) and covariance (2, 2) of the centre's offset [m], [m^2] from a scan pass's pulses (n, COLUMNS).
 
     prior (2, 2) is about (0, 0). The grid is square, half_m each way about the middle. Returns (ln of the likelihood
     ratio drone over nothing, expected number of hits under the posterior).
@@ -146,7 +146,7 @@ def posterior(
             cab += value[i, j] * a * b
             cbb += value[i, j] * b * b
     mean[0], mean[1] = ma, mb
-    floor = step * step / 6.0  # the grid's own fineness
+    floor = step * step / 6.0  # variance of the grid spacing
     covariance[0, 0], covariance[0, 1] = caa / total + floor, cab / total
     covariance[1, 0], covariance[1, 1] = cab / total, cbb / total + floor
     normal = 2.0 * math.pi * math.sqrt(determinant)

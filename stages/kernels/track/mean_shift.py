@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/mean_shift.py`.
+"""Compiled functions that compute the paper's mean shift, Equation (6).
 
-Source: see there.
+Source: see `stages/track/mean_shift.py`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from stages.kernels.compiled import compiled
 
 @compiled
 def within(points_m: NDArray[np.float32], t_0: NDArray[np.float64], radius_m: float) -> NDArray[np.int64]:
-    """F: which of points (n, 3) lie within radius_m of t_0 (3,)."""
+    """F: indices of the points (n, 3) within radius_m of t_0 (3,)."""
     index = np.empty(points_m.shape[0], dtype=np.int64)
     n = 0
     for i in range(points_m.shape[0]):

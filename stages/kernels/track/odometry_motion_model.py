@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/odometry_motion_model.py`.
+"""Compiled functions that propagate a track by the drone's odometry at unknown yaw.
 
-Source: see there.
+Source: see `stages/track/odometry_motion_model.py`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from stages.kernels.compiled import compiled, compiled_at_once
 from stages.kernels.geometry.smooth_motion import log_p, model_of
 
 YAWS = 120
-DRIFT_MPS = 0.15  # of both odometries
-FREE_MPS, FREE_MPS2 = 6.0, 3.0  # of something else, one sigma
+DRIFT_MPS = 0.15  # velocity drift of both odometries
+FREE_MPS, FREE_MPS2 = 6.0, 3.0  # speed and acceleration of another object, one sigma
 
 
 @compiled
@@ -31,7 +31,7 @@ def move_as_told(
     m_1: complex,
     m_2: complex,
 ) -> None:
-    """Add to state (6,) and covariance (6, 6) what the words (3,) for then and now say beyond a constant velocity."""
+    """Add to state (6,) and covariance (6, 6) the odometry's motion (3,) beyond constant velocity, at unknown yaw."""
     told = np.empty(2, dtype=np.complex128)  # level: of place and velocity
     for k in range(2):
         step = (now_m - then_m - dt_s * then_mps) if k == 0 else (now_mps - then_mps)
@@ -53,7 +53,7 @@ def move_as_told(
 
 @compiled_at_once("(float64[::1], float64[:, ::1], float64[:, ::1], float64)")
 def weigh_yaws(t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float) -> tuple[Array64, float]:
-    """ln p (YAWS,) of a path x (n, 3) as told (n, 3) turned by each yaw, and of it as anything's."""
+    """ln p (YAWS,) of a path x (n, 3) given the odometry (n, 3) at each yaw, and given any other object."""
     x, d = x_m.copy(), told_m.copy()
     for axis in range(3):
         x[:, axis] -= x[:, axis].mean()

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/track/runs.py`.
+"""Compiled functions that exclude long runs of returns (walls) from a scan pass.
 
-Source: see there.
+Source: see `stages/track/runs.py`.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ LASERS = 256
 
 @compiled
 def leave_out_walls(pulses: Array64, span_m: float) -> None:
-    """Of the hits of a look's pulses (n, COLUMNS), in order of time, those of a long run become NEARER: no word.
+    """Mark returns of long runs among a scan pass's pulses (n, COLUMNS), in order of time, as NEARER: no information.
 
-    Those of a short one hidden at both ends become GLIMPSE.
+    Returns of a short run that is hidden at both ends become GLIMPSE.
     """
     first, last, newest = np.full(LASERS, -1), np.full(LASERS, -1), np.full(LASERS, -1)
-    run = np.full(pulses.shape[0], -1)  # row at which each row's run began
-    long = np.zeros(pulses.shape[0], dtype=np.bool_)  # by that row, as are these: what is beside it is nearer
+    run = np.full(pulses.shape[0], -1)  # first row of each row's run
+    long = np.zeros(pulses.shape[0], dtype=np.bool_)  # per first row, as are these: whether the neighbour is nearer
     hidden_before, hidden_after = np.zeros_like(long), np.zeros_like(long)
     for i in range(pulses.shape[0]):
         k = int(pulses[i, LASER])

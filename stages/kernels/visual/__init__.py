@@ -1,1 +1,1 @@
-"""visual."""
+"""Compiled functions for image features and two-view geometry."""

@@ -1,9 +1,9 @@
-"""Rays of the same points from two places: errors, costs and the least squares of rotation and direction.
+"""Compiled functions of two-view geometry on rays: errors, costs and least squares of rotation and direction.
 
     x = ray earlier, x' = ray later, y = R x, t = t_hat_later:   p_later = R p_earlier + |t| t_hat
-    e = x' . (t x y) / sqrt(|t x y|^2 + |t x x'|^2): by how much both rays miss one plane with t [rad]
+    e = x' . (t x y) / sqrt(|t x y|^2 + |t x x'|^2): deviation of both rays from one plane with t [rad]
 
-All of it for any ray of the sphere: nothing is divided by z.
+Valid for all rays of the sphere: nothing is divided by z.
 
 Source: P V.E; the error is Sampson's on the sphere, as in Pagani and Stricker, Structure from motion using full
 spherical panoramic cameras (2011).
@@ -26,8 +26,8 @@ SAMPLE = 5  # rays of a hypothesis
 ROUNDS = 12  # of Gauss-Newton at most
 CONVERGED_RAD = 1e-6
 CAUCHY = 2.385  # sigmas: 95 % efficient on Gaussian noise
-BEYOND_SIGMAS = 20.0  # a hypothesis pays no more for a point than for this error
-NEAR_SIGMAS = 8.0  # of the least noise: what a hypothesis may count as its own
+BEYOND_SIGMAS = 20.0  # the cost of a point is bounded by that of this error
+NEAR_SIGMAS = 8.0  # inlier bound, in sigmas of the least noise
 
 
 @compiled
@@ -58,7 +58,7 @@ def _turned(R: Array64, v: Vector) -> Vector:
 def epipolar(
     earlier: Array64, later: Array64, R: Array64, t: Array64, sigma_rad: float
 ) -> tuple[Array64, NDArray[np.bool_]]:
-    """e (n,) [rad], and whether the point is ahead along both rays (or too far away to tell)."""
+    """e (n,) [rad], and whether the point is ahead along both rays (or too distant to decide)."""
     n = len(earlier)
     error = np.empty(n)
     ahead = np.empty(n, dtype=np.bool_)
@@ -75,9 +75,9 @@ def epipolar(
 
 @compiled
 def cost_of(earlier: Array64, later: Array64, R: Array64, t: Array64, sigma_rad: float) -> tuple[float, int]:
-    """Sum of log(1 + e^2 / sigma^2), no point above that of BEYOND_SIGMAS, and how many are within NEAR_SIGMAS.
+    """Sum of log(1 + e^2 / sigma^2), bounded per point by BEYOND_SIGMAS, and the number within NEAR_SIGMAS.
 
-    The logarithm asks for many good points rather than few bad ones, whatever the noise. Behind a camera is beyond.
+    The logarithm favours many inliers over few outliers, whatever the noise. Points behind a camera count as outliers.
     """
     error, ahead = epipolar(earlier, later, R, t, sigma_rad)
     most = math.log(1.0 + BEYOND_SIGMAS**2)
@@ -94,7 +94,7 @@ def cost_of(earlier: Array64, later: Array64, R: Array64, t: Array64, sigma_rad:
 
 @compiled
 def across(t: Array64) -> Array64:
-    """Two unit vectors (3, 2) square to t and to each other."""
+    """Two unit vectors (3, 2) orthogonal to t and to each other."""
     axis = np.zeros(3)
     axis[np.argmin(np.abs(t))] = 1.0
     first = np.cross(t, axis)
@@ -158,7 +158,7 @@ def refine(
 
 @compiled
 def shown_noise(earlier: Array64, later: Array64, R: Array64, t: Array64, least_rad: float) -> float:
-    """Noise of one ray, one axis, that the errors show, by their median; at least `least_rad`."""
+    """Noise [rad] of one ray, per axis, from the median error; at least `least_rad`."""
     error, ahead = epipolar(earlier, later, R, t, least_rad)
     size = np.sort(np.abs(error[ahead]))
     if len(size) <= SAMPLE:

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/odometry/visual/features.py`.
+"""Compiled functions that pick the strongest corner of each cell of an image.
 
-Source: see there.
+Source: see `stages/odometry/visual/features.py`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Where a patch of an earlier picture lies now, to some hundredths of a pixel and without drift.
+"""Compiled functions that track image patches to some hundredths of a pixel, without drift.
 
-A template is kept as it was when it was taken, and warped by A (2, 2), what rotation and lens have made of its pixels
-since: Lucas-Kanade alone takes a turned patch for a moved one, and following from picture to picture adds that up.
+A template keeps its first appearance and is warped by A (2, 2), the effect of rotation and lens on its pixels since:
+Lucas-Kanade without a warp takes rotation for translation, and accumulates that error from image to image.
 
     r(d) = gain (I(p + A d) - mean I) - (T(d) - mean T),   step = (sum g g^T)^-1 sum g r,   p <- p - A step
 
@@ -27,14 +27,14 @@ RADIUS_PX = 6
 SIDE_PX = 2 * RADIUS_PX + 1
 STEPS = 10
 STEP_PX = 0.01
-FARTHEST_PX = 3.0  # from where it was looked for
-ROUNDNESS = 0.14  # least det / trace^2 of its Hessian: along an edge it would slide
-FLAT = 1.0  # grey levels, one sigma: a patch with less has nothing to hold on to
+FARTHEST_PX = 3.0  # from the predicted position
+ROUNDNESS = 0.14  # least det / trace^2 of the Hessian: a patch on an edge would slide along it
+FLAT = 1.0  # grey levels, one sigma: least contrast of a patch
 
 
 @compiled
 def take(grey: Grey, pixel: Array64) -> Array32:
-    """Templates (n, SIDE, SIDE) about pixels (n, 2), column and row. NaN where the picture ends."""
+    """Templates (n, SIDE, SIDE) about pixels (n, 2), column and row. NaN beyond the image."""
     n = len(pixel)
     out = np.empty((n, SIDE_PX, SIDE_PX), dtype=np.float32)
     for i in range(n):
@@ -46,7 +46,7 @@ def take(grey: Grey, pixel: Array64) -> Array32:
 
 @compiled
 def at(grey: Grey, column: float, row: float) -> float:
-    """Between the four pixels around; NaN outside."""
+    """Bilinear interpolation of the grey level; NaN outside the image."""
     height, width = grey.shape
     if not (0.0 <= column < width - 1 and 0.0 <= row < height - 1):
         return math.nan
@@ -58,10 +58,10 @@ def at(grey: Grey, column: float, row: float) -> float:
 
 
 @compiled
-def look(grey: Grey, column: float, row: float, A: Array64, seen: Array64) -> bool:
-    """What a template warped by A (2, 2) sees about a pixel, into `seen` (SIDE * SIDE). False: beyond the picture.
+def sample(grey: Grey, column: float, row: float, A: Array64, seen: Array64) -> bool:
+    """Sample the image on a template's grid warped by A (2, 2), into `seen` (SIDE * SIDE). False: beyond the image.
 
-    Rounding keeps order, so that all its pixels lie between its corners' and none needs to be asked for itself.
+    Rounding is monotonic, so that all samples lie between the corners and only these are checked.
     """
     height, width = grey.shape
     for dv in (-RADIUS_PX, RADIUS_PX):
@@ -84,13 +84,13 @@ def look(grey: Grey, column: float, row: float, A: Array64, seen: Array64) -> bo
 
 @compiled
 def find(grey: Grey, templates: Array32, warp: Array64, guess: Array64) -> tuple[Array64, Array64]:
-    """Pixels (n, 2) and likeness (n,), the correlation in [-1, 1]; likeness -1 where it is not found.
+    """Pixels (n, 2) and correlation (n,), in [-1, 1]; -1 where it is not found.
 
-    `warp` (n, 2, 2): what the template's pixel steps have become; `guess` (n, 2): where to begin.
+    `warp` (n, 2, 2): the templates' warps A; `guess` (n, 2): initial positions.
     """
     n = len(guess)
     place = guess.copy()
-    likeness = np.full(n, -1.0)
+    correlation = np.full(n, -1.0)
     size = SIDE_PX * SIDE_PX
     known, gx, gy, seen = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     for i in range(n):
@@ -120,8 +120,8 @@ def find(grey: Grey, templates: Array32, warp: Array64, guess: Array64) -> tuple
         if not (energy > size * FLAT * FLAT and det > ROUNDNESS * (a + c) ** 2):  # NaN too
             continue
         for _ in range(STEPS):
-            if not look(grey, place[i, 0], place[i, 1], A, seen):
-                likeness[i] = -1.0
+            if not sample(grey, place[i, 0], place[i, 1], A, seen):
+                correlation[i] = -1.0
                 break
             mean = 0.0
             for k in range(size):
@@ -135,10 +135,10 @@ def find(grey: Grey, templates: Array32, warp: Array64, guess: Array64) -> tuple
                 x_seen += gx[k] * value
                 y_seen += gy[k] * value
             if not power > size * FLAT * FLAT:
-                likeness[i] = -1.0
+                correlation[i] = -1.0
                 break
             gain = alike / power
-            likeness[i] = gain * math.sqrt(power / energy)
+            correlation[i] = gain * math.sqrt(power / energy)
             r0, r1 = gain * x_seen - x_known, gain * y_seen - y_known
             s0, s1 = (c * r0 - b * r1) / det, (a * r1 - b * r0) / det
             length = math.hypot(s0, s1)
@@ -149,5 +149,5 @@ def find(grey: Grey, templates: Array32, warp: Array64, guess: Array64) -> tuple
             if length < STEP_PX:
                 break
         if math.hypot(place[i, 0] - guess[i, 0], place[i, 1] - guess[i, 1]) > FARTHEST_PX:
-            likeness[i] = -1.0
-    return place, likeness
+            correlation[i] = -1.0
+    return place, correlation

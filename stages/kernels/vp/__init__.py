@@ -1,1 +1,1 @@
-"""vp."""
+"""Compiled functions for vanishing point detection."""

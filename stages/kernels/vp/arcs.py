@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/arcs.py`.
+"""Compiled functions that split edge chains into great-circle arcs and fit them.
 
-Source: see there.
+Source: see `stages/vp/arcs.py`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from stages.kernels.compiled import compiled
 
 STEP_PX = 4  # of the table of rays
 
-TRIMMED = 1  # points at each end of a piece that a corner has bent
-CORRELATED = 2.0  # neighbouring points that share their error
-DEEPEST = 64  # splits waiting at once
+TRIMMED = 1  # points omitted at each end of a piece, bent by a corner
+CORRELATED = 2.0  # number of neighbouring points with correlated errors
+DEEPEST = 64  # depth of the stack of splits
 WIDEST_RAD = 2.9  # an arc of half a turn has no plane
 NORMAL, FIRST, LAST, SIGMA, EXTENT, MOMENTS = 0, 3, 6, 9, 10, 11  # columns of the table
 COLUMNS = MOMENTS + 7  # six moments of the rays and their number
-Vector = tuple[float, float, float]  # in compiled code: an array of three is fetched from afar
+Vector = tuple[float, float, float]  # a tuple stays in registers in compiled code
 Moments = tuple[float, float, float, float, float, float, float]
 
 
@@ -69,9 +69,9 @@ def split_all(
 
 @compiled
 def _ray(table: NDArray[np.float32], x: float, y: float, out: Array64, at: int) -> None:
-    """The ray at a place between pixels, a mean of the four of the table around it: off by 3e-5 rad at most."""
+    """The ray between pixels, bilinearly interpolated in the table: error at most 3e-5 rad."""
     x, y = x / STEP_PX, y / STEP_PX
-    column, row = np.uint64(x), np.uint64(y)  # as these are never negative, no index is wound around
+    column, row = np.uint64(x), np.uint64(y)  # unsigned: avoids the check for negative indices
     right, below = column + np.uint64(1), row + np.uint64(1)
     u, v = x - column, y - row
     square = 0.0
@@ -88,7 +88,7 @@ def _ray(table: NDArray[np.float32], x: float, y: float, out: Array64, at: int) 
 
 @compiled
 def _turn(ray: Array64, rows: float, turn_rad: Array64) -> None:
-    """Turn a ray by `rows` times the angle (3,), some degrees at most, to its third power (Cayley's formula)."""
+    """Rotate a ray by `rows` times the angle (3,), some degrees at most, to third order (Cayley's formula)."""
     a, b, c = 0.5 * rows * turn_rad[0], 0.5 * rows * turn_rad[1], 0.5 * rows * turn_rad[2]
     x, y, z = ray[0], ray[1], ray[2]
     u, v, w = x + b * z - c * y, y + c * x - a * z, z + a * y - b * x  # the ray and h x ray
@@ -136,7 +136,7 @@ def _fit_piece(rays: Array64, i: int, j: int, min_extent: float, least_sigma: fl
 def fit_moments(
     moments: Moments, first: Vector, last: Vector, min_extent: float, least_sigma: float, row: Array64
 ) -> bool:
-    """The circle through rays of these moments, from about `first` to about `last`. False: shorter than min_extent."""
+    """Fit the circle to rays of these moments, from about `first` to about `last`. False: shorter than min_extent."""
     n = cross(first, last)
     extent = math.atan2(_length(n), dot(first, last))
     if not min_extent <= extent < WIDEST_RAD:
@@ -188,7 +188,7 @@ def _unit(a: Vector) -> Vector:
 
 @compiled
 def _onto(ray: Vector, n: Vector) -> Vector:
-    """The ray moved onto the circle of n."""
+    """The ray projected onto the great circle with normal n."""
     off = dot(n, ray)
     return _unit((ray[0] - n[0] * off, ray[1] - n[1] * off, ray[2] - n[2] * off))
 

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/clustering.py`.
+"""Compiled functions that merge arcs of the same great circle into lines.
 
-Source: see there.
+Source: see `stages/vp/clustering.py`.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from stages.geometry.lens import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.vp.arcs import COLUMNS, WIDEST_RAD, Moments, Vector, cross, dot, fit_moments
 
-TOGETHER_SIGMAS = 2.0  # of the circle's own turn, if that is more
-GAP_RAD = 0.2  # between an arc's end and the line's
+TOGETHER_SIGMAS = 2.0  # additional tolerance, in sigmas of the circle's normal
+GAP_RAD = 0.2  # largest gap between the ends of an arc and of the line
 
 
 @compiled
 def gather(
     normal: Array64, ends: Array64, sigma: Array64, extent: Array64, moments: Array64, near: float, least_sigma: float
 ) -> Array64:
-    """Take arcs in their order; each draws in the ones after it that lie on its circle."""
+    """Merge arcs into lines: each arc, in order, takes the later ones that lie on its great circle."""
     count = len(normal)
     left = np.arange(count)  # indices not yet taken, in order
     waiting = count

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/directions.py`.
+"""Compiled functions that assign lines to vanishing directions and refine the directions.
 
-Source: see there.
+Source: see `stages/vp/directions.py`.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from stages.kernels.compiled import compiled
 from stages.kernels.geometry.so3 import exp_rotation
 
 NONE, VERTICAL = -1, 0  # of a line's direction; frame f has directions 1 + 2 f and 2 + 2 f
-ENOUGH_RAD = 1e-5  # a smaller step is the last
+ENOUGH_RAD = 1e-5  # convergence threshold of a step
 CAUCHY = 1.5  # sigmas
 NORMAL_MEDIAN = 0.6745  # of the absolute value, in sigmas
-FEW_LINES = 10  # what was expected counts as much as so many lines
-GATE = 4.0  # sigmas; a line farther from all directions has none
-WELL = 1.0 + 1e-9  # beyond a bound by so much: beyond it, however it was rounded
+FEW_LINES = 10  # weight of the prior scatter, in lines
+GATE = 4.0  # sigmas; lines further from all directions are unassigned
+WELL = 1.0 + 1e-9  # margin that decides a bound independently of rounding
 
 
 @compiled
 def tangents(normal: Array64, ends: Array64) -> Array64:
-    """n x m (n, 3) of the middle rays m."""
+    """Tangents n x m (n, 3) of the lines with normals n (n, 3) at their middle rays m."""
     out = np.empty((len(normal), 3))
     for i in range(len(normal)):
         n, first, last = normal[i], ends[i, 0], ends[i, 1]
@@ -38,7 +38,7 @@ def tangents(normal: Array64, ends: Array64) -> Array64:
 
 @compiled
 def all_directions(axes: Array64, yaw_rad: Array64) -> Array64:
-    """(1 + 2 k, 3): the vertical, then both of each frame, the second a quarter turn to the left of the first."""
+    """Directions (1 + 2 k, 3): the vertical, then two per frame, the second 90 deg to the left of the first."""
     out = np.empty((1 + 2 * len(yaw_rad), 3))
     out[VERTICAL] = axes[:, 2]
     for f in range(len(yaw_rad)):
@@ -50,7 +50,7 @@ def all_directions(axes: Array64, yaw_rad: Array64) -> Array64:
 
 @compiled
 def upright(vertical: Array64) -> Array64:
-    """Some axes (3, 3) whose third is the vertical."""
+    """Orthonormal axes (3, 3) whose third is the vertical."""
     a, b, c = vertical[0], vertical[1], vertical[2]
     x, y, z = (c, 0.0, -a) if abs(b) < 0.9 else (0.0, -c, b)
     scale = 1.0 / math.sqrt(x * x + y * y + z * z)
@@ -95,7 +95,7 @@ def refine_kernel(
     sigma_model: float,
     rounds: int,
 ) -> tuple[Array64, Array64, NDArray[np.int64], Array64, float, float]:
-    """The fields of Structure."""
+    """Refine vertical and yaws by robust least squares; returns the fields of `Structure`."""
     yaw = yaw_rad.copy()
     round_ = 0
     while True:
@@ -127,7 +127,7 @@ def _normal_equations(
     residual: Array64,
     sigma: Array64,
 ) -> tuple[Array64, Array64, float]:
-    """H, g of the turn omega of frame 0 about its own axes, then of each further yaw: d -> d + omega x d."""
+    """Normal equations H, g of the rotation omega of frame 0 about its axes, then each further yaw: d + omega x d."""
     size = 3 + (len(directions) - 1) // 2 - 1
     H, g = np.zeros((size, size)), np.zeros(size)
     J, at = np.zeros(4), np.zeros(4, dtype=np.int64)
@@ -158,7 +158,7 @@ def _normal_equations(
 
 @compiled
 def _scatter(assigned: NDArray[np.int64], residual: Array64, sigma: Array64) -> float:
-    """Sigma of residual / sigma of the lines that have a direction, by their median; near 1 when they are few."""
+    """Sigma of residual / sigma of the lines that have a direction, by their median; shrunk to 1 with few lines."""
     off = np.abs(residual / sigma)[assigned != NONE]
     if len(off) == 0:
         return 1.0

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/edges.py`.
+"""Compiled functions that find the edge threshold of an image and follow edge ridges into chains.
 
-Source: see there.
+Source: see `stages/vp/edges.py`.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from stages.kernels.compiled import compiled
 
 Grey = NDArray[np.uint8]
 Slopes = NDArray[np.int16]
-LEVELS = 16  # grey levels are binned by so many
-QUIET_QUANTILE = 0.3  # of |slope|: mostly noise even in a picture full of edges
-QUIET_SIGMAS = 0.385  # that quantile of a normal's absolute value
+LEVELS = 16  # number of bins of the grey levels
+QUIET_QUANTILE = 0.3  # of |slope|: mostly noise, even in an image with many edges
+QUIET_SIGMAS = 0.385  # the same quantile of the absolute value of a standard normal
 NOISE_SIGMAS = 5.0
-SOBEL_GAIN = 4.6  # what a step of one grey level gives after the blur: slope in both Sobel columns
-STRIDE = 2  # every second pixel of a chain is told: the one between its neighbours knows nothing new
-LOW_SHARE = 0.5  # a chain goes on down to this share of the threshold it starts at
+SOBEL_GAIN = 4.6  # slope of a step of one grey level after the blur, in both Sobel columns
+STRIDE = 2  # every second pixel of a chain is returned: the one between adds no information
+LOW_SHARE = 0.5  # a chain continues down to this share of its start threshold
 
 
 @compiled
 def thresholds(
     grey: Grey, dx: Slopes, dy: Slopes, usable: NDArray[np.uint8], min_contrast: float
 ) -> NDArray[np.float32]:
-    """Squared slope (LEVELS,) from which an edge counts, by grey level: NOISE_SIGMAS of what is quiet there."""
+    """Squared slope (LEVELS,) threshold of an edge per grey level: NOISE_SIGMAS of the noise there."""
     counts = np.zeros((LEVELS, 64), dtype=np.int64)
     for y in range(2, grey.shape[0] - 2, 4):
         for x in range(2, grey.shape[1] - 2, 4):
@@ -59,9 +59,9 @@ def follow(
     start: NDArray[np.int64],
     back: NDArray[np.float32],
 ) -> tuple[int, int]:
-    """Chains from seeds on a lattice that no straight 8-connected run of five pixels misses: points and chains written.
+    """Follow chains from seeds on a lattice that no straight 8-connected run of five pixels misses.
 
-    `free` is used up; it is 0 in a border of two pixels.
+    Returns the number of points and of chains. `free` is used up; it is 0 in a border of two pixels.
     """
     height, width = grey.shape
     flat_x, flat_y, flat_free = dx.ravel(), dy.ravel(), free.ravel()
@@ -98,7 +98,7 @@ def follow(
 def _walk(
     dx: Slopes, dy: Slopes, free: NDArray[np.uint8], width: int, at: int, way: int, low: int, out: NDArray[np.float32]
 ) -> int:
-    """Follow the ridge with the brighter side on the left (way 1) or right (-1); how many points were written.
+    """Follow the ridge with the brighter side on the left (way 1) or right (-1); returns the number of points.
 
     Pictures are flat here: pixel `at` is column at % width of row at // width.
     """

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/paper_vote.py`.
+"""Compiled functions that vote for vanishing directions on a cube, as in the paper.
 
-Source: see there.
+Source: see `stages/vp/paper_vote.py`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def vote(
 
 @compiled
 def fullest(votes: Array64, sums: Array64) -> tuple[Array64, float]:
-    """The unit direction (3,) at which most votes lie, and their share of all; share 0 without votes."""
+    """The unit direction (3,) with the most votes, and their share of all; share 0 without votes."""
     best, total = 0.0, votes.sum()
     direction = np.zeros(3)
     cells = votes.shape[1]

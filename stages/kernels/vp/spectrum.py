@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/spectrum.py`.
+"""Compiled functions that build the yaw spectrum of lines and find its peaks.
 
-Source: see there.
+Source: see `stages/vp/spectrum.py`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from stages.geometry.lens import Array64
 from stages.kernels.compiled import compiled
 
-APART_RAD = math.radians(6.0)  # two horizontal pairs differ by more
-WIDEST_RAD = math.radians(6.0)  # a line whose yaw is known worse tells nothing
+APART_RAD = math.radians(6.0)  # least difference of two horizontal pairs
+WIDEST_RAD = math.radians(6.0)  # lines with a larger yaw sigma are ignored
 
 
 @compiled
@@ -67,6 +67,7 @@ def spread(
 
 @compiled
 def peaks_kernel(yaw_rad: Array64, score: Array64, most: int) -> Array64:
+    """The `most` highest peaks of a score over yaw, with period 90 deg, at least APART_RAD apart."""
     quarter = 0.5 * math.pi
     out = np.empty(most)
     left = np.ones(len(score), dtype=np.bool_)

@@ -1,6 +1,6 @@
-"""Compiled functions of `stages/vp/verticals.py`.
+"""Compiled functions that propose, score and refine the vertical vanishing direction.
 
-Source: see there.
+Source: see `stages/vp/verticals.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ROUNDS = 5
 
 @compiled_at_once("(float64[:, ::1], float64)")
 def meetings(normal: Array64, least_sine: float) -> Array64:
-    """Cross products (k, 3), unit, of all pairs of (n, 3) that are not too parallel."""
+    """Unit cross products (k, 3) of all pairs of normals (n, 3) whose angle has a sine of at least least_sine."""
     out = np.empty((len(normal) * (len(normal) - 1) // 2, 3))
     count = 0
     for i in range(len(normal)):
@@ -35,6 +35,7 @@ def meetings(normal: Array64, least_sine: float) -> Array64:
 
 @compiled_at_once("(float64[:, ::1], int64[::1], int64, float64)")
 def picked(directions: Array64, order: NDArray[np.int64], most: int, cos_apart: float) -> Array64:
+    """The first `most` of directions (n, 3), in the given order, that are separated by more than cos_apart."""
     out = np.empty((most, 3))
     count = 0
     for k in order:
@@ -108,7 +109,7 @@ def refine_vertical_kernel(
 def _vertical_step(
     normal: Array64, tangent: Array64, sigma: Array64, weight: Array64, e: Array64, sigma_model: float, least: float
 ) -> tuple[Array64, Array64]:
-    """Normal equations of the vertical e[:, 2] turned towards e[:, 0] and e[:, 1]; the gate is at least `least`."""
+    """Normal equations of the vertical e[:, 2] rotated towards e[:, 0] and e[:, 1]; the gate is at least `least`."""
     H, g = np.zeros((2, 2)), np.zeros(2)
     for i in range(len(normal)):
         nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]

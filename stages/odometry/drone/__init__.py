@@ -1,3 +1,3 @@
-"""P V.E: how the drone moved, from its camera."""
+"""Motion of the drone, from its camera and its autopilot. P V.E."""
 
 from stages.odometry.drone.fisheye_odometry import FisheyeOdometry as FisheyeOdometry

@@ -1,14 +1,15 @@
-"""The drone's motion from its fisheye: rotation, and the direction of travel without its length.
+"""Visual odometry of the drone's fisheye: rotation, and direction of translation without its length.
 
-Each picture gives one VisualMotion, from the key picture to it. Chaining: a key picture stays for several pictures, so
-motions with the same `from_ns` share it; the last of them ends in the next key, and the next motion's `from_ns` is its
-`stamp_ns`. Rotations multiply along the keys, R_a_c = R_a_b R_b_c; directions add once each is given its length:
-t_a_c = t_a_b + R_a_b t_b_c. Between two pictures of one key R_i_j = R_k_i^T R_k_j. Errors of motions of the same key
-go together, those of different keys hardly. A `from_ns` that is no earlier motion's `stamp_ns` begins a new chain.
+Each image gives one VisualMotion relative to the keyframe. Chaining: a keyframe serves several images, so motions with
+the same `from_ns` share it; the last of them ends at the next keyframe, and the next motion's `from_ns` is its
+`stamp_ns`. Rotations multiply along the keyframes, R_a_c = R_a_b R_b_c; translations add once each has its length:
+t_a_c = t_a_b + R_a_b t_b_c. Between two images of one keyframe R_i_j = R_k_i^T R_k_j. Errors of motions of the same
+keyframe are correlated, those of different keyframes hardly. A `from_ns` that is no earlier motion's `stamp_ns` begins
+a new chain.
 
-Camera and drone turn alike, but the camera sits off the drone's centre: the direction is the camera's.
+The camera is mounted off the drone's centre: the direction of translation is the camera's.
 
-Source: P V.E (5-point); ours: bearing vectors, key pictures, "no motion" as an answer, covariance.
+Source: P V.E (5-point); ours: bearing vectors, keyframes, detection of no translation, covariance.
 """
 
 from __future__ import annotations
@@ -40,11 +41,11 @@ class FisheyeOdometrySettings(Settings):
     T_drone_camera: Pose
     features: FeatureSettings = FeatureSettings()
     link: LinkSettings = LinkSettings()
-    least_matches: int = Field(30, ge=12, le=1000)  # with fewer that agree the motion is not told
+    least_matches: int = Field(30, ge=12, le=1000)  # with fewer inliers no motion is published
 
 
 class FisheyeOdometry(Stage[FisheyeOdometrySettings]):
-    """Rotation and direction of the drone's camera since its key picture, at every picture."""
+    """Rotation and direction of translation of the drone's camera since its keyframe, at every image."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"imu"})
 
@@ -56,16 +57,16 @@ class FisheyeOdometry(Stage[FisheyeOdometrySettings]):
         self._R_drone_camera: Array64 = settings.T_drone_camera.matrix()[:3, :3]
 
     def on_imu(self, imu: DroneImu) -> None:
-        """The drone's gyro: where to look for the features of the next picture. Nothing else is taken from it."""
+        """The drone's gyro, used only to predict the features' positions in the next image."""
         if not self._gyro or imu.stamp_ns > self._gyro[-1][0]:
             self._gyro.append((imu.stamp_ns, imu.angular_velocity_drone_radps))
 
     def on_image(self, image: Image) -> Iterator[VisualMotion | FollowedFeatures]:
-        """The motion since the key picture, and from what. Nothing: the first picture, or nothing to follow."""
+        """The motion since the keyframe and its features; nothing at the first image or without features to track."""
         gyro, before_ns = self._gyro, self._links.newest_ns
         while len(gyro) > 1 and gyro[1][0] <= before_ns:
             gyro.popleft()
-        R = turned(list(gyro), before_ns, image.stamp_ns) if gyro else None
+        R = gyro_rotation(list(gyro), before_ns, image.stamp_ns) if gyro else None
         C = self._R_drone_camera
         link = self._links.feed(image.stamp_ns, image.grey, None if R is None else C.T @ R.T @ C)
         if link is None:
@@ -87,12 +88,12 @@ def visual_motion(link: Link, R_drone_camera: Array64) -> VisualMotion:
         direction_from=None if t is None else C @ t,
         direction_sigma_rad=back.direction_sigma_rad,
         matches=int(np.count_nonzero(link.motion.inlier)),
-        reason="no motion seen beyond the rotation" if t is None else "",
+        reason="no translation observed" if t is None else "",
     )
 
 
-def turned(gyro: list[tuple[int, Array64]], before_ns: int, now_ns: int) -> Array64 | None:
-    """R_before_now (3, 3) of the drone by its gyro, one rate from each sample to the next; None where it has holes."""
+def gyro_rotation(gyro: list[tuple[int, Array64]], before_ns: int, now_ns: int) -> Array64 | None:
+    """R_before_now (3, 3) of the drone by its gyro, constant rates between samples; None across a gap."""
     rotation = np.eye(3)
     at_ns = before_ns
     for (stamp_ns, rate), following in zip(gyro, [*gyro[1:], None], strict=True):

@@ -1,4 +1,4 @@
-"""What the drone's autopilot tells of its place, kept for a while, in its own level frame: north anywhere, drifting.
+"""Recent positions and velocities by the drone's autopilot, in frame odom (level, any yaw, drifting).
 
 Source: ours; DESIGN, The graph: `odometry` ("autopilot odometry when present").
 """
@@ -15,26 +15,26 @@ from stages.geometry.frames import Array64
 from stages.messages import DroneLocalPosition, DroneOdometry
 
 KEPT_NS = 20_000_000_000
-AHEAD_NS = 500_000_000  # beyond the newest word it is not known any more
-JUMP_M = 1.0  # a step that its velocity does not explain: the autopilot's estimate was reset
-JUMP_MPS, JUMP_MPS2 = 1.5, 30.0  # nor does a drone change its velocity so: its frame was turned
+AHEAD_NS = 500_000_000  # longest extrapolation beyond a sample
+JUMP_M = 1.0  # a step that the velocity does not explain: the autopilot's estimate was reset
+JUMP_MPS, JUMP_MPS2 = 1.5, 30.0  # a change of velocity that no drone performs: the frame was rotated
 
 
 class DroneTelemetry:
-    """Where the drone says it has been, lately."""
+    """Buffer of the last 20 s of the autopilot's position and velocity."""
 
     def __init__(self) -> None:
         self._ns: deque[int] = deque()
         self._xyz_m: deque[Array64] = deque()
         self._v_mps: deque[Array64] = deque()
-        self._counted: int | None = None
+        self._reset_counter: int | None = None
         self.resets = 0
-        """How often its estimate jumped: places before and after have nothing to do with each other."""
+        """Number of jumps of the estimate: positions before and after are unrelated."""
 
-    def add(self, stamp_ns: int, xyz_m: Array64, v_mps: Array64, counted: int | None = None) -> None:
-        """One word of it, in the autopilot's level frame; older than the newest is left out.
+    def add(self, stamp_ns: int, xyz_m: Array64, v_mps: Array64, reset_counter: int | None = None) -> None:
+        """Add a sample in frame odom; one that is not newer than the last is ignored.
 
-        `counted`: the autopilot's own count of its jumps, where it tells; each change is one.
+        `reset_counter`: the autopilot's reset counter, if it has one; each change is a jump.
         """
         if self._ns:
             dt = (stamp_ns - self._ns[-1]) * 1e-9
@@ -42,11 +42,11 @@ class DroneTelemetry:
                 return
             left = xyz_m - self._xyz_m[-1] - 0.5 * dt * (v_mps + self._v_mps[-1])
             turned = float(np.linalg.norm(v_mps - self._v_mps[-1])) > JUMP_MPS + JUMP_MPS2 * dt
-            if turned or counted != self._counted or float(np.linalg.norm(left)) > JUMP_M + dt:
+            if turned or reset_counter != self._reset_counter or float(np.linalg.norm(left)) > JUMP_M + dt:
                 self.resets += 1
                 for kept in (self._ns, self._xyz_m, self._v_mps):
                     kept.clear()
-        self._counted = counted
+        self._reset_counter = reset_counter
         self._ns.append(stamp_ns)
         self._xyz_m.append(xyz_m)
         self._v_mps.append(v_mps)
@@ -55,30 +55,30 @@ class DroneTelemetry:
                 kept.popleft()
 
     def add_position(self, position: DroneLocalPosition) -> None:
-        """LOCAL_POSITION_NED and its like."""
+        """Add a LOCAL_POSITION_NED or equivalent."""
         self.add(position.stamp_ns, position.xyz_odom_m, position.velocity_odom_mps)
 
     def add_odometry(self, odometry: DroneOdometry) -> None:
-        """ODOMETRY: its velocity is in the drone's axes, and it counts its own jumps; one called failed is not used."""
+        """Add an ODOMETRY, with velocity in drone axes and a reset counter; a failed estimate is ignored."""
         if odometry.quality_percent == 0:
             return
         velocity_mps = odometry.R_odom_drone @ odometry.velocity_drone_mps
         self.add(odometry.stamp_ns, odometry.xyz_odom_m, velocity_mps, odometry.reset_counter)
 
     @property
-    def heard_ns(self) -> tuple[int, int] | None:
-        """Times of the oldest word that is kept and of the newest; None before the first."""
+    def span_ns(self) -> tuple[int, int] | None:
+        """Stamps of the oldest and the newest sample; None before the first."""
         return (self._ns[0], self._ns[-1]) if self._ns else None
 
     def speed_mps(self, stamp_ns: int) -> tuple[float, float] | None:
-        """(level, up) at a time; None when it is silent."""
+        """(horizontal, upward) speed at a time; None without a recent sample."""
         if not self._ns or abs(stamp_ns - self._ns[-1]) > AHEAD_NS:
             return None
         x, y, z = self._v_mps[-1]
         return math.hypot(x, y), float(z)
 
     def state(self, stamp_ns: int) -> tuple[Array64, Array64] | None:
-        """Position (3,) [m] and velocity (3,) [m/s] in the autopilot's frame; None when it was silent then."""
+        """Position (3,) [m] and velocity (3,) [m/s] in frame odom; None without a sample near that time."""
         known = self._ns
         if len(known) < 2 or stamp_ns < known[0]:
             return None

@@ -1,12 +1,12 @@
-"""How the drone turned and moved between two moments, from whatever tells it, freed of the autopilot's jumps.
+"""Trajectory of the drone in frame odom, without the jumps of the autopilot's estimate, and rotations between times.
 
-The autopilot's local frame has its own yaw, and an EKF may reset it in flight (compass, GPS). A turn that the rates
-do not confirm, or a step that the velocity does not, is such a jump: it is taken out, so that frame `own` is the
-local frame as it was first, continued smoothly. With no autopilot the odometry by pictures is chained instead; with
-neither the drone is taken to keep its heading, not better than so many degrees a second.
+The autopilot's raw local frame has an arbitrary yaw, and its EKF may reset it in flight (compass, GPS). A change of
+attitude that the rates do not confirm, or of position that the velocity does not confirm, is such a jump and is
+removed: frame odom is the raw local frame at the start, continued smoothly. Without an autopilot, visual odometry is
+chained instead. Without either, the drone is assumed to keep its yaw, with a large variance.
 
-Between two words it turned and flew evenly, unless they are so far apart that the middle would be invented: there it is
-not known, and what it did over the whole gap is.
+Attitude and position are interpolated between samples. Within a gap longer than BRIDGED_NS they are not known; the
+displacement and rotation over the whole gap still are.
 
 Source: ours; DESIGN: R_GD follows 120 deg/s.
 """
@@ -25,201 +25,201 @@ from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry, VisualMotion
 
-KEPT = 1024
-AHEAD_NS = 250_000_000  # beyond its newest word a source is believed this long
-BRIDGED_NS = 1_000_000_000  # a silence no longer than this is told through, linearly: radios pause as long
-GAP_S = 0.5  # after a longer silence rates and velocity say nothing about a jump
+KEPT = 1024  # samples
+AHEAD_NS = 250_000_000  # extrapolation beyond the newest sample of a source
+BRIDGED_NS = 1_000_000_000  # longest gap that is interpolated; radio links pause this long
+GAP_S = 0.5  # after a longer gap rates and velocity cannot detect a jump
 JUMP_RAD = math.radians(3.0)
 JUMP_M = 0.3
-DRIFT_RAD2_PER_S = math.radians(0.3) ** 2  # of an attitude: walk
-CLOCK_S = 0.02  # an attitude's stamp may be off by this: at 120 deg/s that is 2.4 deg
-UNKNOWN_RAD_PER_S = math.radians(40.0)  # a heading nobody tells changes like this
-ODOMETRY_NS = 1_000_000_000  # while it is heard, attitude and position of other messages are not needed
+DRIFT_RAD2_PER_S = math.radians(0.3) ** 2  # random walk of the autopilot's yaw
+CLOCK_S = 0.02  # timestamp error of an attitude: 2.4 deg at 120 deg/s
+UNKNOWN_RAD_PER_S = math.radians(40.0)  # yaw rate, one sigma, without any measurement
+ODOMETRY_NS = 1_000_000_000  # DroneOdometry this recent replaces DroneAttitude and DroneLocalPosition
 
 
 @dataclass(frozen=True)
-class Turn:
-    """How the drone turned from one moment to another."""
+class DroneRotation:
+    """Rotation of the drone between two times."""
 
     R_from_to: Array64
-    variance_rad2: float  # of its yaw
-    sure: bool  # whether anybody told; else the drone is taken not to have turned
+    variance_rad2: float  # of the yaw
+    measured: bool  # False: no source covers the interval, R_from_to is the identity
 
 
 @dataclass(frozen=True)
-class _Node:
+class _Attitude:
     stamp_ns: int
-    R_own_drone: Array64
+    R_odom_drone: Array64
     rate_drone_radps: Array64
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Position:
     stamp_ns: int
-    xyz_own_m: Array64
-    velocity_own_mps: Array64
-    stretch: int  # places of one stretch are told apart by displacement, those of two are not
+    xyz_odom_m: Array64
+    velocity_odom_mps: Array64
+    segment: int  # displacements are known within a segment, not between segments
 
 
-_Told = TypeVar("_Told", _Node, _Place)
+_Sample = TypeVar("_Sample", _Attitude, _Position)
 
 
-class AutopilotTrail:
-    """The autopilot's attitude and position in frame own."""
+class AutopilotTrajectory:
+    """The autopilot's attitude and position in frame odom."""
 
     def __init__(self) -> None:
-        self._nodes: deque[_Node] = deque(maxlen=KEPT)
-        self._places: deque[_Place] = deque(maxlen=KEPT)
-        self._R_own_local = np.eye(3)
-        self._offset_m = np.zeros(3)  # xyz_own = R_own_local xyz_local + offset
+        self._attitudes: deque[_Attitude] = deque(maxlen=KEPT)
+        self._positions: deque[_Position] = deque(maxlen=KEPT)
+        self._R_odom_raw = np.eye(3)
+        self._offset_m = np.zeros(3)  # xyz_odom = R_odom_raw xyz_raw + offset
         self._reset_counter: int | None = None
         self._odometry_ns: int | None = None
-        self.jumps = 0  # taken out
-        self.silences = 0  # after which a jump could not have been seen
+        self.jumps = 0  # jumps removed
+        self.gaps = 0  # gaps across which a jump cannot be detected
 
-    def hear(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
-        """A message of the autopilot's: its whole odometry rather than attitude and position by themselves.
+    def add(self, message: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
+        """Add a message of the autopilot; DroneOdometry takes precedence over attitude and position messages.
 
-        An estimate that calls itself failed is not used.
+        An estimate that the autopilot reports as failed is ignored.
         """
-        if isinstance(word, DroneOdometry):
-            if word.quality_percent == 0:
+        if isinstance(message, DroneOdometry):
+            if message.quality_percent == 0:
                 return
-            self._odometry_ns = word.stamp_ns
-            self.reset(word.reset_counter)
-            self.add_attitude(word.stamp_ns, word.R_odom_drone, word.angular_velocity_drone_radps)
-            self.add_position(word.stamp_ns, word.xyz_odom_m, word.R_odom_drone @ word.velocity_drone_mps)
-        elif self._odometry_ns is not None and word.stamp_ns - self._odometry_ns < ODOMETRY_NS:
+            self._odometry_ns = message.stamp_ns
+            self.reset(message.reset_counter)
+            self.add_attitude(message.stamp_ns, message.R_odom_drone, message.angular_velocity_drone_radps)
+            self.add_position(message.stamp_ns, message.xyz_odom_m, message.R_odom_drone @ message.velocity_drone_mps)
+        elif self._odometry_ns is not None and message.stamp_ns - self._odometry_ns < ODOMETRY_NS:
             return
-        elif isinstance(word, DroneAttitude):
-            self.add_attitude(word.stamp_ns, word.R_odom_drone, word.angular_velocity_drone_radps)
+        elif isinstance(message, DroneAttitude):
+            self.add_attitude(message.stamp_ns, message.R_odom_drone, message.angular_velocity_drone_radps)
         else:
-            self.add_position(word.stamp_ns, word.xyz_odom_m, word.velocity_odom_mps)
+            self.add_position(message.stamp_ns, message.xyz_odom_m, message.velocity_odom_mps)
 
-    def add_attitude(self, stamp_ns: int, R_odom_drone: Array64, rate_drone_radps: Array64) -> None:
-        """One more attitude; one that is not newer than the last is ignored."""
-        R_own_drone = self._R_own_local @ R_odom_drone
-        if self._nodes:
-            last = self._nodes[-1]
+    def add_attitude(self, stamp_ns: int, R_raw_drone: Array64, rate_drone_radps: Array64) -> None:
+        """Add an attitude in the raw frame; one that is not newer than the last is ignored."""
+        R_odom_drone = self._R_odom_raw @ R_raw_drone
+        if self._attitudes:
+            last = self._attitudes[-1]
             dt = (stamp_ns - last.stamp_ns) * 1e-9
             if dt <= 0:
                 return
             turn = 0.5 * dt * (last.rate_drone_radps + rate_drone_radps)
-            expected = last.R_own_drone @ exp_rotation(turn)
-            off = float(np.linalg.norm(log_rotation(expected.T @ R_own_drone)))
+            expected = last.R_odom_drone @ exp_rotation(turn)
+            off = float(np.linalg.norm(log_rotation(expected.T @ R_odom_drone)))
             if dt > GAP_S:
-                self.silences += 1
+                self.gaps += 1
             elif off > JUMP_RAD + 0.3 * float(np.linalg.norm(turn)):
                 self.jumps += 1
-                self._R_own_local = expected @ R_odom_drone.T
-                self._break_places()
-                R_own_drone = expected
-        self._nodes.append(_Node(stamp_ns, R_own_drone, rate_drone_radps))
+                self._R_odom_raw = expected @ R_raw_drone.T
+                self._end_segment()
+                R_odom_drone = expected
+        self._attitudes.append(_Attitude(stamp_ns, R_odom_drone, rate_drone_radps))
 
-    def add_position(self, stamp_ns: int, xyz_odom_m: Array64, velocity_odom_mps: Array64) -> None:
-        """One more position with its velocity, of the same estimate as the attitude."""
-        xyz = self._R_own_local @ xyz_odom_m + self._offset_m
-        velocity = self._R_own_local @ velocity_odom_mps
-        stretch = 0
-        if self._places:
-            last = self._places[-1]
+    def add_position(self, stamp_ns: int, xyz_raw_m: Array64, velocity_raw_mps: Array64) -> None:
+        """Add a position and velocity in the raw frame, of the same estimate as the attitude."""
+        xyz = self._R_odom_raw @ xyz_raw_m + self._offset_m
+        velocity = self._R_odom_raw @ velocity_raw_mps
+        segment = 0
+        if self._positions:
+            last = self._positions[-1]
             dt = (stamp_ns - last.stamp_ns) * 1e-9
             if dt <= 0:
                 return
-            stretch = last.stretch
-            expected = last.xyz_own_m + 0.5 * dt * (last.velocity_own_mps + velocity)
+            segment = last.segment
+            expected = last.xyz_odom_m + 0.5 * dt * (last.velocity_odom_mps + velocity)
             if dt > GAP_S:
-                stretch += 1
+                segment += 1
             elif float(np.linalg.norm(xyz - expected)) > JUMP_M + 0.3 * dt * float(np.linalg.norm(velocity)):
                 self.jumps += 1
                 self._offset_m = self._offset_m + expected - xyz
                 xyz = expected
-        self._places.append(_Place(stamp_ns, xyz, velocity, stretch))
+        self._positions.append(_Position(stamp_ns, xyz, velocity, segment))
 
     def reset(self, counter: int) -> None:
-        """What the autopilot counts its own jumps with: a change ends a stretch of positions."""
+        """The autopilot's reset counter: a change begins a new segment."""
         if self._reset_counter is not None and counter != self._reset_counter:
-            self._break_places()
+            self._end_segment()
         self._reset_counter = counter
 
-    def _break_places(self) -> None:
-        if self._places:
-            last = self._places[-1]
-            self._places[-1] = _Place(last.stamp_ns, last.xyz_own_m, last.velocity_own_mps, last.stretch + 1)
+    def _end_segment(self) -> None:
+        if self._positions:
+            last = self._positions[-1]
+            self._positions[-1] = _Position(last.stamp_ns, last.xyz_odom_m, last.velocity_odom_mps, last.segment + 1)
 
     def rate_radps(self, stamp_ns: int) -> float:
-        """How fast the drone turns [rad/s]; 0 where nobody says."""
+        """Angular speed of the drone [rad/s]; 0 where not known."""
         node = self._before(stamp_ns)
         return 0.0 if node is None else float(np.linalg.norm(node.rate_drone_radps))
 
-    def R_own_drone(self, stamp_ns: int) -> Array64 | None:
-        """Attitude at a time, a little beyond the newest with its rate; None: not known."""
-        around = _around(self._nodes, stamp_ns)
-        if around is None:
+    def R_odom_drone(self, stamp_ns: int) -> Array64 | None:
+        """Attitude (3, 3) at a time, extrapolated with its rate for AHEAD_NS; None: not known."""
+        neighbours = _neighbours(self._attitudes, stamp_ns)
+        if neighbours is None:
             return None
-        before, after = around
+        before, after = neighbours
         since_s = (stamp_ns - before.stamp_ns) * 1e-9
         if after is None:
-            return before.R_own_drone @ exp_rotation(since_s * before.rate_drone_radps)
+            return before.R_odom_drone @ exp_rotation(since_s * before.rate_drone_radps)
         share = since_s / ((after.stamp_ns - before.stamp_ns) * 1e-9)
-        return before.R_own_drone @ exp_rotation(share * log_rotation(before.R_own_drone.T @ after.R_own_drone))
+        return before.R_odom_drone @ exp_rotation(share * log_rotation(before.R_odom_drone.T @ after.R_odom_drone))
 
-    def place(self, stamp_ns: int) -> tuple[Array64, int] | None:
-        """Position (3,) [m] in frame own and its stretch; None: not known."""
-        around = _around(self._places, stamp_ns)
-        if around is None:
+    def position(self, stamp_ns: int) -> tuple[Array64, int] | None:
+        """Position (3,) [m] in frame odom and its segment; None: not known."""
+        neighbours = _neighbours(self._positions, stamp_ns)
+        if neighbours is None:
             return None
-        before, after = around
+        before, after = neighbours
         since_s = (stamp_ns - before.stamp_ns) * 1e-9
         if after is None:
-            return before.xyz_own_m + since_s * before.velocity_own_mps, before.stretch
-        if after.stretch != before.stretch:
+            return before.xyz_odom_m + since_s * before.velocity_odom_mps, before.segment
+        if after.segment != before.segment:
             return None
         share = since_s / ((after.stamp_ns - before.stamp_ns) * 1e-9)
-        return before.xyz_own_m + share * (after.xyz_own_m - before.xyz_own_m), before.stretch
+        return before.xyz_odom_m + share * (after.xyz_odom_m - before.xyz_odom_m), before.segment
 
-    def velocity_own_mps(self, stamp_ns: int) -> Array64 | None:
-        """Velocity (3,) in frame own, as said last before a time; None: not known."""
-        around = _around(self._places, stamp_ns)
-        return None if around is None else around[0].velocity_own_mps
+    def velocity_odom_mps(self, stamp_ns: int) -> Array64 | None:
+        """Velocity (3,) in frame odom of the newest sample up to a time; None: not known."""
+        neighbours = _neighbours(self._positions, stamp_ns)
+        return None if neighbours is None else neighbours[0].velocity_odom_mps
 
     @property
     def attitude_ns(self) -> int | None:
-        """Time of the newest attitude."""
-        return self._nodes[-1].stamp_ns if self._nodes else None
+        """Stamp of the newest attitude; None before the first."""
+        return self._attitudes[-1].stamp_ns if self._attitudes else None
 
     @property
-    def place_ns(self) -> int | None:
-        """Time of the newest position."""
-        return self._places[-1].stamp_ns if self._places else None
+    def position_ns(self) -> int | None:
+        """Stamp of the newest position; None before the first."""
+        return self._positions[-1].stamp_ns if self._positions else None
 
-    def _before(self, stamp_ns: int) -> _Node | None:
-        at = bisect_right(self._nodes, stamp_ns, key=lambda node: node.stamp_ns)
-        return self._nodes[at - 1] if at else None
+    def _before(self, stamp_ns: int) -> _Attitude | None:
+        at = bisect_right(self._attitudes, stamp_ns, key=lambda node: node.stamp_ns)
+        return self._attitudes[at - 1] if at else None
 
 
-def _around(told: deque[_Told], stamp_ns: int) -> tuple[_Told, _Told | None] | None:
-    """The words before and after a time; beyond the newest and into a gap, for AHEAD_NS, the one before and None.
+def _neighbours(samples: deque[_Sample], stamp_ns: int) -> tuple[_Sample, _Sample | None] | None:
+    """The samples before and after a time; for AHEAD_NS beyond the newest or into a gap: the one before, and None.
 
     None: not known.
     """
-    at = bisect_right(told, stamp_ns, key=lambda word: word.stamp_ns)
+    at = bisect_right(samples, stamp_ns, key=lambda sample: sample.stamp_ns)
     if at == 0:
         return None
-    before, after = told[at - 1], told[at] if at < len(told) else None
+    before, after = samples[at - 1], samples[at] if at < len(samples) else None
     if after is not None and after.stamp_ns - before.stamp_ns <= BRIDGED_NS:
         return before, after
     return (before, None) if stamp_ns - before.stamp_ns <= AHEAD_NS else None
 
 
-class PictureTrail:
-    """The drone's odometry by pictures, one step after the other as long as they join."""
+class VisualTrajectory:
+    """The drone's rotation by visual odometry: motions chained as long as each begins where an earlier one ended."""
 
     def __init__(self) -> None:
         self._nodes: deque[tuple[int, Array64, float, int]] = deque(maxlen=KEPT)  # stamp, R, variance so far, chain
 
     def add(self, motion: VisualMotion) -> None:
-        """One more step; one that does not begin where a known one ended begins a new chain."""
+        """Add a motion; one that does not begin at the end of a known one begins a new chain."""
         if self._nodes and motion.stamp_ns <= self._nodes[-1][0]:
             return
         start = next((node for node in reversed(self._nodes) if node[0] == motion.from_ns), None)
@@ -233,18 +233,18 @@ class PictureTrail:
 
     @property
     def newest_ns(self) -> int | None:
-        """Time of the newest picture."""
+        """Stamp of the newest image; None before the first."""
         return self._nodes[-1][0] if self._nodes else None
 
     def at(self, stamp_ns: int) -> tuple[Array64, float, int] | None:
-        """R_chain_drone, the variance so far [rad^2] and the chain; None: not known."""
+        """R_chain_drone (3, 3), its accumulated variance [rad^2] and the chain's number; None: not known."""
         nodes = self._nodes
         if not nodes or not nodes[0][0] <= stamp_ns <= nodes[-1][0] + AHEAD_NS:
             return None
         at = bisect_right(nodes, stamp_ns, key=lambda node: node[0])
         chain = nodes[at - 1][3]
         if at == len(nodes) and stamp_ns > nodes[-1][0]:
-            at -= 1  # the last step goes on
+            at -= 1  # extrapolate the last motion
         if at == len(nodes) or at == 0:
             return (*nodes[at - 1][1:3], chain) if at else None
         (t0, R0, v0, chain0), (t1, R1, v1, chain1) = nodes[at - 1], nodes[at]
@@ -255,14 +255,16 @@ class PictureTrail:
         return R0 @ exp_rotation(share * log_rotation(R0.T @ R1)), variance, chain0
 
 
-def turn_between(autopilot: AutopilotTrail, pictures: PictureTrail, from_ns: int, to_ns: int) -> Turn:
-    """The drone's turn between two moments, from the best source that covers both."""
+def rotation_between(
+    autopilot: AutopilotTrajectory, visual: VisualTrajectory, from_ns: int, to_ns: int
+) -> DroneRotation:
+    """The drone's rotation between two times, from the best source that covers both."""
     dt = abs(to_ns - from_ns) * 1e-9
-    R0, R1 = autopilot.R_own_drone(from_ns), autopilot.R_own_drone(to_ns)
+    R0, R1 = autopilot.R_odom_drone(from_ns), autopilot.R_odom_drone(to_ns)
     if R0 is not None and R1 is not None:
         late = CLOCK_S * (autopilot.rate_radps(to_ns) - autopilot.rate_radps(from_ns))
-        return Turn(R0.T @ R1, DRIFT_RAD2_PER_S * dt + late**2, True)
-    a, b = pictures.at(from_ns), pictures.at(to_ns)
+        return DroneRotation(R0.T @ R1, DRIFT_RAD2_PER_S * dt + late**2, True)
+    a, b = visual.at(from_ns), visual.at(to_ns)
     if a is not None and b is not None and a[2] == b[2]:
-        return Turn(a[0].T @ b[0], abs(b[1] - a[1]), True)
-    return Turn(np.eye(3), (UNKNOWN_RAD_PER_S * dt) ** 2, False)
+        return DroneRotation(a[0].T @ b[0], abs(b[1] - a[1]), True)
+    return DroneRotation(np.eye(3), (UNKNOWN_RAD_PER_S * dt) ** 2, False)

@@ -1,8 +1,8 @@
-"""How far away the features of a picture are, from LiDAR points around their rays.
+"""Depths of image features from LiDAR points near their rays.
 
 Points within `reach` of a ray r, with u, v = p . e1, p . e2 over p . r, lie on one plane when 1 / (p . r) is linear in
-(u, v); its value on the ray is the feature's inverse depth q. Sums are kept, not points, so that a slice costs what it
-holds and a ray gets better with each one.
+(u, v); its value on the ray is the feature's inverse depth q. Only sums are stored, so that
+each slice of points is processed once and improves the rays it covers.
 
 Source: P V.B (scale from projected LiDAR points); ours: the plane in inverse depth.
 """
@@ -22,14 +22,14 @@ SUMS = 10  # 1, u, v, uu, uv, vv, q, qu, qv, qq
 
 @dataclass(frozen=True, slots=True)
 class Depths:
-    """Inverse depths (n,) [1/m] and their sigma; NaN where the LiDAR says nothing."""
+    """Inverse depths (n,) [1/m] and their sigma; NaN where no LiDAR point constrains them."""
 
     inverse_m: Array64
     sigma: Array64
 
 
 class RayDepths:
-    """Sums for the rays (n, 3) of one picture."""
+    """Accumulated sums for the rays (n, 3) of one image."""
 
     def __init__(self, ray: Array64, reach_rad: float) -> None:
         self._ray, self._reach = np.ascontiguousarray(ray), reach_rad
@@ -37,10 +37,10 @@ class RayDepths:
         self._sums = np.zeros((len(ray), SUMS))
 
     def add(self, xyz_camera_m: Array64) -> None:
-        """Points (m, 3) in the camera frame of the rays' picture."""
+        """Add points (m, 3) in the camera frame of the rays' image."""
         if len(xyz_camera_m):
             add(self._ray, self._frames, self._sums, xyz_camera_m, self._reach)
 
     def depths(self) -> Depths:
-        """What is known so far."""
+        """Inverse depths from the points added so far."""
         return Depths(*solve(self._sums, self._reach))

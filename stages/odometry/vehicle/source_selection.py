@@ -1,17 +1,17 @@
-"""Which word on the vehicle's motion is believed: its own odometry while that is heard, else the camera's (ego).
+"""Selection of the source of vehicle motion: the vehicle's odometry if available, otherwise the camera's ego-motion.
 
-    odometry heard      it is passed on as it comes
-    odometry silent     the camera's motion goes on from where the vehicle was, and at the return the odometry again
-    nor believed        the same: what it tells is nonsense for as long
+    odometry available             its poses are passed on unchanged
+    odometry silent                the ego-motion continues from the vehicle's pose; later the odometry again
+    odometry rejected              the same, as long as its poses are outliers
 
-Each source has a start frame of its own, and one that went away may come back with another. So at every change the new
-source is laid on the old one's end:
+Each source has its own start frame, and a source that returns may have a new one. At every change the new source is
+therefore aligned with the end of the old one:
 
     T_map_vehicle = T_map_source T_source_vehicle,   T_map_source = T_map_vehicle(t) T_source_vehicle(t)^-1
 
-with t the new source's first stamp, to where the vehicle went on (vehicle_onward.py). So it is, too, where a source's
-own frame jumps: its words are left out until three tell of one smooth way elsewhere. The start frame stays that of the
-first source heard. Consumers take T_map_vehicle for smooth: they never see a jump, but drift.
+with t the first stamp of the new source and T_map_vehicle(t) extrapolated (stages/geometry/extrapolation.py). The same
+happens when the start frame of a source jumps: its poses are rejected until three of them lie on one smooth path. Frame
+map is the start frame of the first source. The output has no jumps; it drifts.
 
 Source: ours; P V.B for the camera's motion.
 """
@@ -26,17 +26,17 @@ import numpy as np
 from pydantic import Field
 
 from flow.stage import Settings, Stage
-from stages.geometry.extrapolation import BelievedWords, along_its_bend
+from stages.geometry.extrapolation import AcceptedPoses, constant_turn_rate
 from stages.geometry.frames import Array64, transform
 from stages.geometry.se3 import adjoint
 from stages.kernels.geometry.so3 import nearest_rotation
 from stages.messages import VehicleMotion
 
-SILENT_S = 0.25  # so long no odometry, or none that is believed: it is gone
+SILENT_S = 0.25  # the odometry is unavailable after this time without an accepted pose
 
 
-class Teller(Enum):
-    """Who tells the vehicle's motion."""
+class MotionSource(Enum):
+    """Source of the vehicle's motion."""
 
     ODOMETRY = "odometry"
     EGO = "ego"
@@ -45,66 +45,66 @@ class Teller(Enum):
 class VehicleMotionSelectorSettings(Settings):
     """Settings of `VehicleMotionSelector`."""
 
-    silent_s: float = Field(SILENT_S, gt=0, le=10)  # two periods of the odometry at least
+    silent_s: float = Field(SILENT_S, gt=0, le=10)  # at least two periods of the odometry
 
 
 class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
-    """T_map_vehicle without a jump, whoever tells it. Both inputs are optional, each may go and come back."""
+    """T_map_vehicle without jumps from whichever source is available. Both inputs are optional."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry", "ego"})
 
     def __init__(self, settings: VehicleMotionSelectorSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._teller: Teller | None = None
-        self._words: dict[Teller, BelievedWords] = {t: BelievedWords() for t in Teller}
-        self._told: deque[VehicleMotion] = deque(maxlen=64)
-        self._T_start_source: Array64 = np.eye(4)
-        self._joint: tuple[VehicleMotion, Array64 | None] | None = None  # the source's word at the change
-        self._refused: Counter[str] = Counter()
+        self._source: MotionSource | None = None
+        self._accepted: dict[MotionSource, AcceptedPoses] = {source: AcceptedPoses() for source in MotionSource}
+        self._published: deque[VehicleMotion] = deque(maxlen=64)  # since the newest change of source
+        self._T_map_source: Array64 = np.eye(4)
+        self._at_change: tuple[VehicleMotion, Array64 | None] | None = None  # the source's pose, and P in frame map
+        self._rejected: Counter[str] = Counter()
 
     @property
-    def refused(self) -> Counter[str]:
-        """Words left out, by reason."""
-        return self._refused
+    def rejected(self) -> Counter[str]:
+        """Number of rejected poses by reason."""
+        return self._rejected
 
     @property
     def counters(self) -> dict[str, int]:
-        """What is refused."""
-        return {f"refused: {why}": count for why, count in self._refused.items()}
+        """Rejected poses by reason, for the run's summary."""
+        return {f"rejected: {why}": count for why, count in self._rejected.items()}
 
     def on_odometry(self, motion: VehicleMotion) -> VehicleMotion | None:
-        """The vehicle's own odometry, passed on at once."""
-        return self._tell(Teller.ODOMETRY, motion)
+        """The vehicle's odometry, passed on immediately; None for a rejected pose."""
+        return self._select(MotionSource.ODOMETRY, motion)
 
     def on_ego(self, motion: VehicleMotion) -> VehicleMotion | None:
-        """The camera's motion; None while the odometry is heard and believed."""
-        odometry_ns = self._words[Teller.ODOMETRY].newest_ns
+        """The camera's ego-motion; None while the odometry is available."""
+        odometry_ns = self._accepted[MotionSource.ODOMETRY].newest_ns
         if odometry_ns is not None and motion.stamp_ns - odometry_ns < self.settings.silent_s * 1e9:
             return None
-        if self._teller is not Teller.EGO:
-            self._words[Teller.EGO] = BelievedWords()  # it has begun anew
-        return self._tell(Teller.EGO, motion)
+        if self._source is not MotionSource.EGO:
+            self._accepted[MotionSource.EGO] = AcceptedPoses()  # the ego-motion has a new start frame
+        return self._select(MotionSource.EGO, motion)
 
-    def _tell(self, teller: Teller, motion: VehicleMotion) -> VehicleMotion | None:
-        """None for what is not newer than what was told, and for what lies elsewhere."""
-        words = self._words[teller]
-        if words.newest_ns is not None and motion.stamp_ns <= words.newest_ns:
+    def _select(self, source: MotionSource, motion: VehicleMotion) -> VehicleMotion | None:
+        """The pose in frame map; None if it is rejected or not newer than the newest published one."""
+        accepted_poses = self._accepted[source]
+        if accepted_poses.newest_ns is not None and motion.stamp_ns <= accepted_poses.newest_ns:
             return None
-        believed = words.hear(motion)
-        if not believed:
-            self._refused[f"{teller.value}: not where the words before lead"] += 1
+        accepted = accepted_poses.add(motion)
+        if not accepted:
+            self._rejected[f"{source.value}: not reachable from the poses before"] += 1
             return None
-        if self._told and motion.stamp_ns <= self._told[-1].stamp_ns:
+        if self._published and motion.stamp_ns <= self._published[-1].stamp_ns:
             return None
-        if teller is not self._teller or len(believed) > 1:
-            self._teller = teller
-            self._change_to(believed[0])
-        self._told.extend(map(self._in_start, believed))
-        return self._told[-1]
+        if source is not self._source or len(accepted) > 1:
+            self._source = source
+            self._change_to(accepted[0])
+        self._published.extend(map(self._in_map, accepted))
+        return self._published[-1]
 
-    def _in_start(self, motion: VehicleMotion) -> VehicleMotion:
-        """A source's word, in the start frame."""
-        T = self._T_start_source @ transform(motion.R_map_vehicle, motion.xyz_map_m)
+    def _in_map(self, motion: VehicleMotion) -> VehicleMotion:
+        """A pose of the source, in frame map."""
+        T = self._T_map_source @ transform(motion.R_map_vehicle, motion.xyz_map_m)
         return VehicleMotion(
             stamp_ns=motion.stamp_ns,
             xyz_map_m=T[:3, 3].copy(),
@@ -113,25 +113,25 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         )
 
     def _change_to(self, motion: VehicleMotion) -> None:
-        """Lay the new source on the end of the old one."""
-        if not self._told:
+        """Align the new source with the extrapolated end of the old one."""
+        if not self._published:
             return
-        at = along_its_bend(list(self._told), motion.stamp_ns)
-        there = transform(motion.R_map_vehicle, motion.xyz_map_m)
-        self._T_start_source = transform(at.R_map_vehicle, at.xyz_map_m) @ np.linalg.inv(there)
-        self._joint = motion, at.covariance
-        self._told.clear()  # its speed is told by the new source alone
+        at = constant_turn_rate(list(self._published), motion.stamp_ns)
+        T_source_vehicle = transform(motion.R_map_vehicle, motion.xyz_map_m)
+        self._T_map_source = transform(at.R_map_vehicle, at.xyz_map_m) @ np.linalg.inv(T_source_vehicle)
+        self._at_change = motion, at.covariance
+        self._published.clear()  # the speed is taken from the new source alone
 
     def _covariance(self, motion: VehicleMotion) -> Array64 | None:
-        """What was uncertain at the change, and what the source says it has become worse by since."""
-        if self._joint is None or motion.covariance is None:
-            return motion.covariance if self._joint is None else None
-        first, P = self._joint
+        """Covariance at the change plus the growth that the source reports since; None where either is not known."""
+        if self._at_change is None or motion.covariance is None:
+            return motion.covariance if self._at_change is None else None
+        first, P = self._at_change
         if P is None or first.covariance is None:
             return None
         T_now_first = np.linalg.inv(transform(motion.R_map_vehicle, motion.xyz_map_m)) @ transform(
             first.R_map_vehicle, first.xyz_map_m
         )
         A = adjoint(np.ascontiguousarray(T_now_first[:3, :3]), T_now_first[:3, 3])
-        worse, axes = np.linalg.eigh(motion.covariance - A @ first.covariance @ A.T)
-        return A @ P @ A.T + (axes * np.maximum(worse, 0.0)) @ axes.T
+        growth, axes = np.linalg.eigh(motion.covariance - A @ first.covariance @ A.T)
+        return A @ P @ A.T + (axes * np.maximum(growth, 0.0)) @ axes.T

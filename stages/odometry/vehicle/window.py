@@ -1,10 +1,10 @@
-"""Bundle adjustment over the last key pictures: their poses and the inverse depth of the features they share. P V.B.
+"""Bundle adjustment over the last keyframes: their poses and the inverse depths of shared features. P V.B.
 
-    feature    inverse depth q along its ray x in the picture a that saw it first; in picture j its ray is
+    feature    inverse depth q along its ray x in its first image a; in image j its ray is
                z = R_j^T (R_a x + q (p_a - p_j)),   residual B(x')^T z / |z| over the noise of a ray
     LiDAR      (q - q_lidar) / sigma_q
-    solved     Gauss-Newton, Cauchy weights, depths eliminated (Schur), the two oldest pictures held: they keep place
-               and, where no LiDAR reaches, length
+    solved     Gauss-Newton, Cauchy weights, depths eliminated (Schur), the two oldest keyframes fixed: they keep
+               position and, without LiDAR depths, scale
 
 Poses are T_map_camera; increments R exp(phi), p + R rho.
 
@@ -26,23 +26,23 @@ LEAST_FEATURES = 15
 
 
 @dataclass(frozen=True, slots=True)
-class KeyPicture:
-    """What a key picture saw, by growing track number."""
+class Keyframe:
+    """Pose and observations of a keyframe, by ascending track number."""
 
     R: Array64  # R_map_camera
     p: Array64  # (3,) [m]
     number: NDArray[np.int64]
     ray: Array64  # (n, 3)
-    inverse_m: Array64  # (n,) by the LiDAR, NaN: not known
+    inverse_m: Array64  # (n,) [1/m] by the LiDAR; NaN: not known
     inverse_sigma: Array64
 
-    def moved(self, R: Array64, p: Array64) -> KeyPicture:
-        """The same picture taken from elsewhere."""
-        return KeyPicture(R, p, self.number, self.ray, self.inverse_m, self.inverse_sigma)
+    def moved(self, R: Array64, p: Array64) -> Keyframe:
+        """The same keyframe with another pose."""
+        return Keyframe(R, p, self.number, self.ray, self.inverse_m, self.inverse_sigma)
 
 
-def adjusted(keys: list[KeyPicture], sigma_rad: float) -> list[KeyPicture]:
-    """The same pictures with poses adjusted; as they were when too few features link them."""
+def adjusted(keys: list[Keyframe], sigma_rad: float) -> list[Keyframe]:
+    """The keyframes with adjusted poses; unchanged if too few features connect them."""
     if len(keys) <= HELD:
         return keys
     obs_key, obs_feature, obs_ray, first, lidar = _observations(keys)
@@ -60,10 +60,10 @@ def adjusted(keys: list[KeyPicture], sigma_rad: float) -> list[KeyPicture]:
 
 
 def _observations(
-    keys: list[KeyPicture],
+    keys: list[Keyframe],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array64, NDArray[np.intp], Array64]:
-    """Of features seen by three pictures or more: picture, feature, ray of each sight; first sights; LiDAR's depth."""
-    picture = np.concatenate([np.full(len(k.number), i, dtype=np.int64) for i, k in enumerate(keys)])
+    """Observations of features in at least three keyframes: keyframe, feature, ray; first ones; LiDAR depths."""
+    keyframe = np.concatenate([np.full(len(k.number), i, dtype=np.int64) for i, k in enumerate(keys)])
     number = np.concatenate([k.number for k in keys])
     ray = np.concatenate([k.ray for k in keys])
     lidar = np.column_stack(
@@ -75,4 +75,4 @@ def _observations(
     use = often[feature]
     obs_feature = index[feature[use]]
     _, first = np.unique(obs_feature, return_index=True)
-    return picture[use], obs_feature, np.ascontiguousarray(ray[use]), first, np.ascontiguousarray(lidar[use][first])
+    return keyframe[use], obs_feature, np.ascontiguousarray(ray[use]), first, np.ascontiguousarray(lidar[use][first])

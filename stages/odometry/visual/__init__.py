@@ -1,1 +1,1 @@
-"""What odometry and ego-motion share: features on a fisheye picture, and how a camera moved between two of them."""
+"""Visual odometry of one fisheye camera: feature tracking, and the motion between two images."""

@@ -1,12 +1,12 @@
-"""Corners followed from picture to picture on a fisheye: spread over a grid, told as rays.
+"""Corner tracking in the images of one fisheye camera: corners spread over a grid, returned as rays.
 
-    corners   Harris on the half-size picture, the best of every cell that has none; round ones only, because what
-              slides along an edge looks like a motion
-    follow    pyramidal Lucas-Kanade from the last picture, started where the expected rotation puts each corner, then
-              the template of when the corner was new, warped by rotation and lens (patches.py): no drift
-    rays      by the lens (lens.py), so that the edge of a fisheye counts like its middle
+    corners   Harris on the half-size image, the best one of every empty cell; a high det/trace^2 excludes edges, along
+              which a feature slides
+    tracking  pyramidal Lucas-Kanade from the previous image, started at the prediction of the expected rotation, then
+              alignment with the first template, warped by rotation and lens (patches.py), which avoids drift
+    rays      by the lens model (lens.py), so that the rim of a fisheye is used like its centre
 
-A track keeps its number as long as it is followed; a number is never used twice.
+A track keeps its number while it is tracked; a number is never reused.
 
 Source: P V.B (Harris corners, KLT); ours: the grid, the warped template.
 """
@@ -30,33 +30,35 @@ from stages.kernels.visual.patches import Array32, Grey
 
 Polygon = Annotated[tuple[tuple[float, float], ...], Field(min_length=3)]
 MIN_SIDE_PX = 32
-HALF = 2  # corners are looked for in the picture at half its size
+HALF = 2  # corners are detected in the image at half size
 BORDER_PX = 12
-REFILL = 0.15  # of the cells empty: corners are looked for
-BLOCK_PX = 7  # at half size: as wide as a template
-ROUNDNESS = 0.14  # Harris's k: det > k trace^2, so nothing that slides along an edge
-STEPS = 12  # of one Lucas-Kanade level at most
-STEP_PX = 0.02  # and until it moves less
+REFILL = 0.15  # share of empty cells from which new corners are detected
+BLOCK_PX = 7  # at half size, as wide as a template
+ROUNDNESS = 0.14  # Harris's k: det > k trace^2 excludes edges
+STEPS = 12  # maximum iterations of a Lucas-Kanade level
+STEP_PX = 0.02  # convergence threshold
 
 
 class FeatureSettings(BaseModel):
-    """How many corners, and how they are followed."""
+    """Settings of `FeatureTracker`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     count: int = Field(default=300, ge=20, le=4000)  # cells of the grid inside the lens's circle, one corner each
-    max_off_axis_deg: float = Field(default=100.0, gt=1, le=150)  # beyond, the lens's edge and the own body
-    masked_px: tuple[Polygon, ...] = ()  # (column, row) corners of what is the own body: no feature there
-    min_contrast: float = Field(default=1e-8, gt=0)  # corner strength, grey in [0, 1]; below it is noise
+    max_off_axis_deg: float = Field(
+        default=100.0, gt=1, le=150
+    )  # beyond are the lens's rim and the body of the vehicle or drone
+    masked_px: tuple[Polygon, ...] = ()  # polygons of (column, row) over the own body, without features
+    min_contrast: float = Field(default=1e-8, gt=0)  # minimum corner strength for grey in [0, 1]
     window_px: int = Field(default=13, ge=5, le=51)
     levels: int = Field(default=2, ge=0, le=6)
-    likeness: float = Field(default=0.75, gt=0, lt=1)  # correlation with its template; less is something else
-    worn_likeness: float = Field(default=0.9, gt=0, le=1)  # below, a new template is taken
+    likeness: float = Field(default=0.75, gt=0, lt=1)  # minimum correlation with the template
+    worn_likeness: float = Field(default=0.9, gt=0, le=1)  # below this correlation the template is replaced
 
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """What is followed in one picture, by growing number."""
+    """Tracked features in one image, sorted by number."""
 
     stamp_ns: int
     number: NDArray[np.int64]  # (n,)
@@ -64,17 +66,17 @@ class Tracks:
     pixel: Array64  # (n, 2) column, row
 
     def common(self, later: Tracks) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows in self and in `later` of the tracks both have."""
+        """Row indices in self and in `later` of their common tracks."""
         _, mine, theirs = np.intersect1d(self.number, later.number, assume_unique=True, return_indices=True)
         return mine, theirs
 
 
 @dataclass(frozen=True, slots=True)
 class _Templates:
-    """What each track looked like when its template was taken."""
+    """Image patch and rays of each track at the time of its template."""
 
     patch: Array32  # (n, side, side)
-    ray: Array64  # (n, 3, 3) of its middle, and one STEP_PX to the right and below it, in the start's axes
+    ray: Array64  # (n, 3, 3) of its centre and of the pixels to the right and below, start axes
 
     def rows(self, pick: NDArray[np.intp]) -> _Templates:
         return _Templates(self.patch[pick], self.ray[pick])
@@ -84,12 +86,12 @@ class _Templates:
 
 
 class FeatureTracker:
-    """Follows corners through the pictures of one camera. Frame start: the camera's axes in the first picture."""
+    """Tracks corners through the images of one camera. Frame `start`: the camera axes in the first image."""
 
     def __init__(self, lens: Equidistant | KannalaBrandt | OCam, settings: FeatureSettings) -> None:
         self._lens, self._settings = lens, settings
         self._before: Grey | None = None
-        self._usable: Grey = np.zeros((0, 0), np.uint8)  # half size, 0: no corner wanted here
+        self._usable: Grey = np.zeros((0, 0), np.uint8)  # half size, 0: no corner here
         self._next = 0
         self._R_map_now: Array64 = np.eye(3)
         self._restart()
@@ -97,20 +99,20 @@ class FeatureTracker:
     def _restart(self) -> None:
         self._before = None
         self._tracks = Tracks(0, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
-        self._worn = np.zeros(0, np.bool_)  # whose template needs to be taken anew
+        self._stale = np.zeros(0, np.bool_)  # tracks whose template must be replaced
         side = patches.SIDE_PX
         self._templates = _Templates(np.zeros((0, side, side), np.float32), np.zeros((0, 3, 3)))
 
     def follow(self, stamp_ns: int, grey: Grey, R_now_before: Array64) -> Tracks:
-        """Find the tracks again in the next picture. `R_now_before` is the rotation expected."""
+        """Tracks that are found in the next image. `R_now_before` is the expected rotation."""
         if self._before is None or grey.shape != self._before.shape:
             if min(grey.shape) < MIN_SIDE_PX:
                 size = f"{grey.shape[1]} x {grey.shape[0]}"
-                raise ValueError(f"a picture of {size} pixels is too small to follow anything in")
+                raise ValueError(f"an image of {size} pixels is too small for feature tracking")
             self._restart()
             self._usable = usable_pixels(self._lens, self._settings, grey.shape)
         self._R_map_now = self._R_map_now @ R_now_before.T
-        kept, pixel = self._found_again(grey, R_now_before)
+        kept, pixel = self._track(grey, R_now_before)
         ray = self._lens.unproject(pixel)
         seen = np.isfinite(ray[:, 0])
         self._templates = self._templates.rows(kept[seen])
@@ -119,18 +121,18 @@ class FeatureTracker:
         return self._tracks
 
     def complete(self, R_correction: Array64) -> Tracks:
-        """Corners where cells are empty, and all tracks of the newest picture.
+        """Add corners in empty cells; returns all tracks of the newest image.
 
-        `R_correction` (3, 3), on the left of the expected rotation, makes it the one found.
+        `R_correction` (3, 3) times the expected rotation is the estimated rotation.
         """
-        assert self._before is not None, "follow a picture first"
+        assert self._before is not None, "call follow first"
         self._R_map_now = self._R_map_now @ R_correction.T
         t, s = self._tracks, self._settings
-        worn = np.nonzero(self._worn)[0]
+        worn = np.nonzero(self._stale)[0]
         if s.count - len(t.number) > REFILL * s.count or len(t.number) == 0:
             pixel = self._corners(self._before, t.pixel)
             ray = self._lens.unproject(pixel)
-            fresh = self._taken(pixel)
+            fresh = self._templates_at(pixel)
             number = np.arange(self._next, self._next + len(pixel))
             self._next += len(pixel)
             self._templates = self._templates.and_(fresh)
@@ -142,26 +144,26 @@ class FeatureTracker:
             )
             self._tracks = t
         if len(worn):
-            again = self._taken(t.pixel[worn])
+            again = self._templates_at(t.pixel[worn])
             self._templates.patch[worn], self._templates.ray[worn] = again.patch, again.ray
-        self._worn = np.zeros(len(t.number), np.bool_)
+        self._stale = np.zeros(len(t.number), np.bool_)
         return t
 
-    def forget(self, number: NDArray[np.int64]) -> None:
-        """Let go of tracks of the newest picture: they follow nothing that stands still."""
+    def drop(self, number: NDArray[np.int64]) -> None:
+        """Drop tracks of the newest image, because they are on moving objects."""
         t = self._tracks
         keep = np.nonzero(~np.isin(t.number, number))[0]
         self._tracks = Tracks(t.stamp_ns, t.number[keep], t.ray[keep], t.pixel[keep])
-        self._templates, self._worn = self._templates.rows(keep), self._worn[keep]
+        self._templates, self._stale = self._templates.rows(keep), self._stale[keep]
 
-    def _taken(self, pixel: Array64) -> _Templates:
+    def _templates_at(self, pixel: Array64) -> _Templates:
         assert self._before is not None
         ray = np.stack([self._lens.unproject(pixel + step) for step in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))], axis=1)
         return _Templates(patches.take(self._before, pixel), ray @ self._R_map_now.T)
 
-    def _found_again(self, grey: Grey, R_now_before: Array64) -> tuple[NDArray[np.intp], Array64]:
+    def _track(self, grey: Grey, R_now_before: Array64) -> tuple[NDArray[np.intp], Array64]:
         t, s = self._tracks, self._settings
-        self._worn = np.zeros(0, np.bool_)
+        self._stale = np.zeros(0, np.bool_)
         guess = self._lens.project(t.ray @ R_now_before.T)
         warped = self._lens.project((self._templates.ray @ self._R_map_now).reshape(-1, 3)).reshape(-1, 3, 2)
         rows = np.nonzero(np.isfinite(guess[:, 0]) & np.isfinite(warped).all(axis=(1, 2)))[0]
@@ -185,7 +187,7 @@ class FeatureTracker:
         good = (np.asarray(status).ravel() > 0) & (likeness > s.likeness)
         good &= (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
         good[good] = self._usable[np.rint(row[good]).astype(int), np.rint(column[good]).astype(int)] > 0
-        self._worn = likeness[good] < s.worn_likeness
+        self._stale = likeness[good] < s.worn_likeness
         return rows[good], pixel[good]
 
     def _corners(self, grey: Grey, taken: Array64) -> Array64:
@@ -193,16 +195,16 @@ class FeatureTracker:
         half = cv2.resize(grey, (grey.shape[1] // HALF, grey.shape[0] // HALF), interpolation=cv2.INTER_AREA)
         strength = np.asarray(cv2.cornerHarris(half, BLOCK_PX, 3, ROUNDNESS), dtype=np.float32)
         cell = max(math.sqrt(np.count_nonzero(self._usable) / s.count), 4.0)
-        place = best_per_cell(strength, self._usable, (taken + 0.5) / HALF - 0.5, cell, s.min_contrast)
-        return HALF * place  # a whole pixel: a template needs no pixels between
+        pixel = best_per_cell(strength, self._usable, (taken + 0.5) / HALF - 0.5, cell, s.min_contrast)
+        return HALF * pixel  # whole pixels: templates need no interpolation
 
 
 def usable_pixels(lens: Equidistant | KannalaBrandt | OCam, settings: FeatureSettings, shape: tuple[int, int]) -> Grey:
-    """255 where a corner may be, at half the picture's size (height, width): inside the lens, not on the own body."""
+    """Mask (height, width) at half image size, 255 where corners are allowed: inside the lens, not on the own body."""
     height, width = shape[0] // HALF, shape[1] // HALF
     column, row = np.meshgrid(np.arange(width), np.arange(height))
-    places = (np.column_stack([column.ravel(), row.ravel()]) + 0.5) * HALF - 0.5
-    ray = lens.unproject(places.astype(np.float64))
+    pixels = (np.column_stack([column.ravel(), row.ravel()]) + 0.5) * HALF - 0.5
+    ray = lens.unproject(pixels.astype(np.float64))
     away = np.arctan2(np.hypot(ray[:, 0], ray[:, 1]), ray[:, 2])
     limit = math.radians(min(settings.max_off_axis_deg, lens.max_off_axis_deg - 1.0))
     usable = (np.where(np.isnan(away), False, away <= limit).reshape(height, width) * 255).astype(np.uint8)

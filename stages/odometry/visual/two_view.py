@@ -1,18 +1,18 @@
-"""How a camera moved between two pictures, from rays of the same points: rotation and direction, or rotation alone.
+"""Relative motion between two images from matched rays: rotation and direction of translation, or rotation alone.
 
     p_later = R_later_earlier p_earlier + |t| t_hat_later;   in formulas x = ray earlier, x' = ray later, y = R x
 
-    error      e = x' . (t x y) / sqrt(|t x y|^2 + |t x x'|^2): by how much both rays miss one plane with t [rad]
-    hypotheses five rays at a time (poselib.relpose_5pt), the lowest sum of log(1 + e^2 / sigma^2) wins; a point behind
-               either camera counts as a miss, and "behind" is asked of the rays: there is no image plane to be behind
-    refined    Gauss-Newton on rotation and direction, Cauchy weights, with the noise that the errors show
-    standing   rotation alone is kept unless a direction explains a dozen points that it does not, and is known
-               better than MAX_DIRECTION_SIGMA_RAD: most of a picture may be sky, which never tells of a motion
+    error      e = x' . (t x y) / sqrt(|t x y|^2 + |t x x'|^2): angular distance of the rays from a plane with t [rad]
+    hypotheses from five rays each (poselib.relpose_5pt), ranked by the sum of log(1 + e^2 / sigma^2); a point behind
+               either camera is an outlier, where "behind" is a negative depth along its ray
+    refinement Gauss-Newton on rotation and direction, Cauchy weights, with the noise estimated from the errors
+    rotation   the pure rotation is kept unless a direction explains a dozen more points and its sigma is below
+               MAX_DIRECTION_SIGMA_RAD: distant points, such as clouds, show no translation
 
-poselib's and OpenCV's own RANSAC divide by z and lose what lies beyond 90 deg off axis.
+The RANSAC of poselib and OpenCV divides by z and fails beyond 90 deg off axis.
 
 Source: P V.E (5-point); Nister (2004); the error is Sampson's on the sphere, as in Pagani and Stricker (2011).
-Ours: the logarithm, standing, and the error that all tracks share.
+Ours: the logarithm, the test for pure rotation, and the error common to all tracks.
 """
 
 from __future__ import annotations
@@ -40,47 +40,49 @@ from stages.kernels.visual.epipolar import (
     shown_noise,
 )
 
-LEAST = 12  # points for an answer
+LEAST = 12  # inliers of a motion
 CONFIDENCE = 0.99
 NARROWINGS = 2
-WORST_SIGMAS = 40.0  # of the least noise: rays that agree no better do not agree
-LIMIT_SIGMAS = 3.5  # an error beyond is an outlier's
-MAX_DIRECTION_SIGMA_RAD = math.radians(12.0)  # less certain is no direction
-CLEAR_SIGMAS = 5.0  # parted by more than noise
-PROOF = 12 * math.log(1.0 + 5.0**2)  # of motion: what a dozen points clearly parted cost a rotation
+WORST_SIGMAS = 40.0  # largest accepted noise, in units of the minimum noise
+LIMIT_SIGMAS = 3.5  # errors beyond are outliers
+MAX_DIRECTION_SIGMA_RAD = math.radians(12.0)  # a direction with a larger sigma is discarded
+CLEAR_SIGMAS = 5.0  # parallax of a point that is clearly not noise
+PROOF = 12 * math.log(
+    1.0 + 5.0**2
+)  # minimum gain of a translation: the cost of twelve points with clear parallax under pure rotation
 
 _five_point = cast(Any, poselib).relpose_5pt
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """What a ray is worth [rad], one axis, one sigma."""
+    """Noise of a ray [rad], one axis, one sigma."""
 
-    least_rad: float  # of one track alone
-    shared_rad: float  # what all tracks may err by together: it does not average out
+    least_rad: float  # minimum, independent per track
+    shared_rad: float  # common to all tracks: it does not average out
 
 
 @dataclass(frozen=True, slots=True)
 class TwoView:
-    """The motion between two pictures. `t_hat_later` None: no motion seen beyond the rotation."""
+    """The motion between two images. `t_hat_later` is None for a pure rotation."""
 
     R_later_earlier: Array64
     t_hat_later: Array64 | None
     covariance: Array64  # (6, 6): w in exp(w) R, then t_hat, whose block is of rank 2; zero where there is none
     inlier: NDArray[np.bool_]  # (n,)
-    sigma_rad: float  # noise of one ray, one axis, as the errors show it
-    clear: int  # inliers that moved clearly beyond the rotation
-    parallax_rad: float  # and by how much, their median
+    sigma_rad: float  # noise of one ray, one axis, estimated from the errors
+    clear: int  # inliers with clear parallax
+    parallax_rad: float  # median over these inliers
 
     @property
     def direction_sigma_rad(self) -> float:
-        """Of t_hat_later, one axis, the mean of both."""
+        """Sigma of t_hat_later, one axis, mean of both."""
         return math.sqrt(0.5 * float(np.trace(self.covariance[3:, 3:])))
 
 
 @dataclass(frozen=True, slots=True)
 class Backwards:
-    """The same motion told from the earlier picture: p_earlier = R_earlier_later p_later + |t| t_hat_earlier."""
+    """The same motion in the axes of the earlier image: p_earlier = R_earlier_later p_later + |t| t_hat_earlier."""
 
     R_earlier_later: Array64
     covariance_rad2: Array64  # (3, 3) of phi in R exp(phi), later axes
@@ -89,7 +91,7 @@ class Backwards:
 
 
 def backwards(motion: TwoView) -> Backwards:
-    """R_earlier_later = R^T, t_hat_earlier = -R^T t_hat_later, with what the covariance makes of it."""
+    """R_earlier_later = R^T, t_hat_earlier = -R^T t_hat_later, with the covariance propagated."""
     R, t, cov = motion.R_later_earlier, motion.t_hat_later, motion.covariance
     if t is None:
         return Backwards(R.T.copy(), cov[:3, :3].copy(), None, None)
@@ -101,15 +103,15 @@ def backwards(motion: TwoView) -> Backwards:
 def relative_motion(
     earlier: Array64, later: Array64, R_guess: Array64, t_guess: Array64 | None, noise: Noise, tries: int
 ) -> TwoView | None:
-    """The motion from rays (n, 3) and (n, 3); None when fewer than LEAST agree on any.
+    """The motion from rays (n, 3) and (n, 3); None with fewer than LEAST inliers.
 
-    A guess (R_later_earlier, t_hat_later) is one hypothesis more; `tries`: those of five rays, at most. The same rays
-    give the same answer.
+    The guess (R_later_earlier, t_hat_later) is an additional hypothesis; `tries` limits the five-point hypotheses.
+    Deterministic: the same rays give the same result.
     """
     if len(earlier) < LEAST:
         return None
     least = noise.least_rad
-    turn = _standing(earlier, later, R_guess, noise)
+    turn = _pure_rotation(earlier, later, R_guess, noise)
     R_turn = turn.R_later_earlier if turn else R_guess
     guesses = [(R_guess, t_guess), (R_turn, t_guess)] if t_guess is not None else []
     guesses.append((R_turn, direction_given(earlier, later, R_turn, 5.0 * least)))
@@ -124,9 +126,9 @@ def relative_motion(
     agreed = sigma < WORST_SIGMAS * least and np.count_nonzero(inlier) >= LEAST
     if not agreed or not np.linalg.cond(information) < 1e12:
         return turn
-    parted = np.linalg.norm(later - earlier @ rotation.T, axis=1)
-    clearly = inlier & (parted > CLEAR_SIGMAS * sigma)
-    parallax = float(np.median(parted[clearly])) if clearly.any() else 1e-9
+    separation = np.linalg.norm(later - earlier @ rotation.T, axis=1)
+    clearly = inlier & (separation > CLEAR_SIGMAS * sigma)
+    parallax = float(np.median(separation[clearly])) if clearly.any() else 1e-9
     B = np.zeros((6, 5))
     B[:3, :3], B[3:, 3:] = np.eye(3), across(t)
     covariance = B @ np.linalg.inv(information) @ B.T * sigma**2
@@ -135,33 +137,33 @@ def relative_motion(
     moved = TwoView(rotation, t, covariance, inlier, sigma, int(np.count_nonzero(clearly)), parallax)
     if turn is None:
         return moved
-    unproved = gain_over(turn, moved, earlier, later) < PROOF or moved.clear < LEAST
-    return turn if unproved or moved.direction_sigma_rad > MAX_DIRECTION_SIGMA_RAD else moved
+    insufficient = gain_over(turn, moved, earlier, later) < PROOF or moved.clear < LEAST
+    return turn if insufficient or moved.direction_sigma_rad > MAX_DIRECTION_SIGMA_RAD else moved
 
 
 def gain_over(turn: TwoView, moved: TwoView, earlier: Array64, later: Array64) -> float:
-    """What a direction explains beyond the rotation: the difference of their sums of log(1 + e^2 / sigma^2).
+    """Gain of a translation over pure rotation: the difference of their sums of log(1 + e^2 / sigma^2).
 
-    For the rotation e is the mean of both axes, so that points that stand still cost both the same, but for 0.1 each.
+    For the rotation e is the mean of both axes, so that points without parallax cost both the same, up to 0.1 each.
     """
     assert moved.t_hat_later is not None
     sigma = moved.sigma_rad
-    parted = np.linalg.norm(later - earlier @ turn.R_later_earlier.T, axis=1) / math.sqrt(2.0) / sigma
-    standing = float(np.log1p(np.minimum(parted, BEYOND_SIGMAS) ** 2).sum())
+    separation = np.linalg.norm(later - earlier @ turn.R_later_earlier.T, axis=1) / math.sqrt(2.0) / sigma
+    standing = float(np.log1p(np.minimum(separation, BEYOND_SIGMAS) ** 2).sum())
     moving, _ = cost_of(earlier, later, moved.R_later_earlier, moved.t_hat_later, sigma)
     return standing - moving - 0.1 * len(earlier)
 
 
-def _standing(earlier: Array64, later: Array64, R_guess: Array64, noise: Noise) -> TwoView | None:
-    """Rotation alone; None when too few agree with one."""
+def _pure_rotation(earlier: Array64, later: Array64, R_guess: Array64, noise: Noise) -> TwoView | None:
+    """Pure rotation; None with too few inliers."""
     rotation = R_guess
     sigma = 20.0 * noise.least_rad
-    parted = np.zeros(0)
-    for _ in range(3):  # each time with the noise that the one before has shown
+    separation = np.zeros(0)
+    for _ in range(3):  # each time with the noise estimated before
         rotation = rotation_between(earlier, later, rotation, CAUCHY * sigma)
-        parted = np.linalg.norm(later - earlier @ rotation.T, axis=1) / math.sqrt(2.0)
-        sigma = max(noise.least_rad, float(np.median(parted)) / 1.1774)  # the median of a Rayleigh's length
-    inlier = parted < LIMIT_SIGMAS * sigma
+        separation = np.linalg.norm(later - earlier @ rotation.T, axis=1) / math.sqrt(2.0)
+        sigma = max(noise.least_rad, float(np.median(separation)) / 1.1774)  # the median of a Rayleigh's length
+    inlier = separation < LIMIT_SIGMAS * sigma
     if sigma > WORST_SIGMAS * noise.least_rad or np.count_nonzero(inlier) < LEAST:
         return None
     y = earlier[inlier] @ rotation.T
@@ -175,7 +177,7 @@ def _best_hypothesis(
     earlier: Array64, later: Array64, guesses: list[tuple[Array64, Array64]], sigma_rad: float, tries: int
 ) -> tuple[Array64, Array64]:
     """R and t_hat of the lowest `cost_of`."""
-    rng = np.random.default_rng(0)  # the same rays, the same answer
+    rng = np.random.default_rng(0)  # deterministic
     n = len(earlier)
     (least, agree), rotation, t = min(
         ((cost_of(earlier, later, rotation, t, sigma_rad), rotation, t) for rotation, t in guesses),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import struct
 import types
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -31,6 +31,9 @@ def value_of(hint: Any, sizes: dict[str, int]) -> st.SearchStrategy[Any]:
         if args[-1] is Ellipsis:
             return st.lists(value_of(args[0], sizes), max_size=3).map(tuple)
         return st.tuples(*(value_of(arg, sizes) for arg in args))
+    if is_dataclass(hint):
+        hints = get_type_hints(hint, include_extras=True)
+        return st.builds(hint, **{field.name: value_of(hints[field.name], sizes) for field in fields(hint)})
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
         return st.sampled_from(hint)
     return {int: I64, float: F64, bool: st.booleans(), str: st.text(max_size=20), bytes: st.binary(max_size=20)}[hint]

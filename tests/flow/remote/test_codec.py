@@ -189,7 +189,7 @@ def test_hostile_bytes_allocate_no_more_memory_than_they_have():
     sent = encode(
         Detections(
             stamp_ns=1, xyz_vehicle_m=np.zeros((2, 3)), score=np.zeros(2), e_inner=np.zeros(2), e_outer=np.zeros(2),
-            accepted=np.zeros(2, bool), reasons=("a", "b"), verdict="v", seen_ns=np.zeros(2, np.int64),
+            accepted=np.zeros(2, bool), reasons=("a", "b"), summary="v", seen_ns=np.zeros(2, np.int64),
         )
     )  # fmt: skip
     body = sent[22 + len("Detections") :]

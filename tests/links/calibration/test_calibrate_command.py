@@ -34,14 +34,14 @@ def calibrated(tmp_path_factory):
     return folder, text
 
 
-def test_a_street_is_told_number_by_number_with_what_is_refused(calibrated):
+def test_a_street_is_reported_by_parameter_with_reasons_for_rejection(calibrated):
     _, text = calibrated
     assert "servo's zero stays as it is" in text
     assert "mm thick before" in text
     assert "--overlay" in text
 
 
-def test_how_the_vehicle_stands_is_asked_for_and_then_tells_the_zero(calibrated, tmp_path):
+def test_a_stated_orientation_determines_the_zero(calibrated, tmp_path):
     _, without = calibrated
     assert "--parallel" in without
     text = grd("calibrate", STREET, "-o", tmp_path / "rig.yaml", "--parallel", "0.15", "--level", "0.2")
@@ -93,7 +93,7 @@ def test_an_old_rig_is_never_written_over_unasked(calibrated):
 
 
 @pytest.mark.parametrize("name", ["einride_vlp16", "mrpt_vlp16_gps"])
-def test_a_real_capture_without_servo_is_refused_in_a_sentence(name, tmp_path):
+def test_a_real_capture_without_servo_is_rejected_in_a_sentence(name, tmp_path):
     text = grd("calibrate", ROOT / "recordings" / f"{name}.mcap", "-o", tmp_path / "rig.yaml", code=2)
     assert "no servo states" in text
     assert not (tmp_path / "rig.yaml").exists()
@@ -105,7 +105,7 @@ def test_a_part_with_too_little_travel_is_a_finding_and_writes_nothing(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_vehicle_that_says_it_drove_is_refused(tmp_path):
+def test_a_vehicle_that_moved_by_its_odometry_is_rejected(tmp_path):
     drove = tmp_path / "drove.mcap"
     with RecordingReader(STREET) as reader, RecordingWriter(drove, rig_yaml=reader.rig_yaml or "") as writer:
         topics = ["/lidar/packets", "/servo/state"]

@@ -57,9 +57,9 @@ def wave_deg(error_rad: np.ndarray) -> float:
 def found(tmp_path_factory):
     """(axis [deg], time [s], encoder before, after, its sigma [deg], play [deg]) of each scene."""
     from links.calibration import gather
-    from links.simulated.run import simulate_into
-    from links.simulated.scenario import load_scenario
-    from links.simulated.servo import Turned
+    from links.simulated.rig.run import simulate_into
+    from links.simulated.rig.scenario import load_scenario
+    from links.simulated.sensors.servo import GearTrain
     from stages.calibration.calibrate import calibrate
 
     rows = []
@@ -76,7 +76,7 @@ def found(tmp_path_factory):
         simulate_into(recording, scenario)
         gathered = gather(recording, None, (0.0, math.inf))
         told = calibrate(gathered.returns, gathered.trace, gathered.mount)
-        turned = Turned(scenario.servo, seed)
+        turned = GearTrain(scenario.servo, seed)
         wrong = np.array([turned.encoder_error_rad(p) for p in SERVO_RAD])
         left = told.mount.turntable_rad(SERVO_RAD) - (SERVO_RAD - wrong)
         off_s = told.mount.servo_time_offset_s - true.servo_time_offset_s

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: what it prints, writes and returns."""
+"""The command line from the outside: output, files and exit codes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_every_command_explains_itself_with_an_example(grd, command):
 def test_quickstart_says_where_the_drone_is_and_where_to_look(grd, tmp_path):
     text = grd("run", ROOT / "configs" / "quickstart.yaml")
     folder = tmp_path / "out" / "street_sweep-quickstart"
-    for words in ("x forward [m]", "output hash", "run.rrd", "fix_vehicle_drone.tum", "against the simulation's truth"):
+    for words in ("x forward [m]", "output hash", "run.rrd", "fix_vehicle_drone.tum", "errors against the truth"):
         assert words in text
     names = {path.name for path in folder.iterdir()}
     assert names == {
@@ -66,7 +66,7 @@ def test_quickstart_says_where_the_drone_is_and_where_to_look(grd, tmp_path):
         "run.log",
         "run.rrd",
         "summary.json",
-        "truth_hits.csv",
+        "truth_returns.csv",
         "truth_vehicle_drone.tum",
         "truth_world_vehicle.tum",
     }
@@ -85,7 +85,7 @@ def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_p
     hashes = {json.loads((tmp_path / "out" / name / "summary.json").read_text())["output_hash"] for name in names}
     assert len(hashes) == 1
     again = grd("replay", STREET, "--out", tmp_path / "out" / names[0], code=2)
-    assert "holds a run already" in again
+    assert "has a run already" in again
 
 
 @pytest.mark.skipif(not can_use_subprocesses(), reason="one core, or no fork: there is one process anyway")
@@ -97,7 +97,7 @@ def test_a_replay_in_several_processes_leaves_the_files_of_one(grd, tmp_path, mo
     )
     (tmp_path / "processes.yaml").write_text("stages: {sweep: {process: lidar}}\nlinks: {viewer: null}\n")
     both = ("replay", STREET, "--config", ROOT / "configs" / "estimate.yaml", "--overlay", "processes.yaml")
-    grd(*both, "--out", "together", "--together")
+    grd(*both, "--out", "together", "--single-process")
     assert not started
     grd(*both, "--out", "processes")
     assert [sorted(topics) for topics in started] == [["/lidar/packets", "/servo/state"]]

@@ -87,7 +87,7 @@ def test_run_says_which_option_is_missing_and_that_a_replay_has_one_host(hosts):
         assert "--hosts FILE and --host NAME go together" in done.output
     done = grd("run", PAPER.with_name("quickstart.yaml"), "--hosts", hosts, "--host", "base")
     assert done.exit_code == 2
-    assert "--hosts is of live runs" in done.output
+    assert "--hosts is for live runs" in done.output
 
 
 def test_run_refuses_a_host_whose_certificates_are_not_there(hosts, tmp_path):

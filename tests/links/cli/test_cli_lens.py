@@ -1,4 +1,4 @@
-"""`grd lens` as a user meets it: a calibration program's file becomes part of a rig, or is refused with its line."""
+"""`grd lens`: a file of a calibration program becomes part of a rig, or is rejected with its line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from flow.graph import load_graph
 from tests.links import command
 from tests.stages.geometry.test_lens import KANNALA_BRANDT, OCAM
 from tests.stages.geometry.test_lens_files import KALIBR, OCAMCALIB
-from tests.test_house import ROOT
+from tests.test_architecture import ROOT
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""`grd run` live as a user meets it: started, stopped, killed, and taken again from its recording."""
+"""`grd run` live: start, stop, kill, and re-run from the recording."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ import pytest
 from flow.link import Record
 from links.recording import Recorder, RecordingReader, recover
 from links.runs.live_run import live_graph, run_live
-from links.runs.run_folder import Asked, RunFolder
+from links.runs.request import RunRequest
+from links.runs.run_folder import RunFolder
 from tests.links import command
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -63,7 +64,7 @@ def test_a_live_run_leaves_its_folder_and_is_repeated_to_the_same_hash(grd, tmp_
 
     again = grd("replay", folder / "flight.mcap", "--as-live")
     assert f"output hash {summary['output_hash']}" in again
-    assert "the live run's hash was the same" in again
+    assert "the live run's hash is the same" in again
     repeated = json.loads((tmp_path / "out" / "flight-as-live" / "summary.json").read_text())
     assert repeated["messages"] == summary["messages"]
 
@@ -80,7 +81,7 @@ def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_pat
     assert parts > 1
     again = grd("replay", folder / "flight.mcap", "--as-live")
     assert f"in {parts} parts" in again
-    assert "the live run's hash was the same" in again
+    assert "the live run's hash is the same" in again
     plain = grd("replay", folder / "flight.mcap", "--config", "ticks.yaml", "--out", "plain")
     assert f"in {parts} parts" in plain
     assert "warning" not in plain
@@ -91,7 +92,7 @@ def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_pat
 def test_a_live_recording_says_with_the_channel_who_sent(tmp_path):
     lidar = "  lidar: {use: links.velodyne.Lidar, config: {port: 42368, sender: 127.0.0.9}}\n"
     (tmp_path / "lidar.yaml").write_text(CONFIG.replace("  recorder: {use: links.recording.Recorder}\n", lidar))
-    asked = Asked(tmp_path / "lidar.yaml")
+    asked = RunRequest(tmp_path / "lidar.yaml")
     heard = RunFolder(tmp_path / "run", tmp_path / "flight.mcap", asked, live_graph(asked), live=True)
     recorder = Recorder()
     heard.taps.append(recorder)
@@ -106,7 +107,7 @@ def test_a_repetition_that_differs_is_a_finding(grd, tmp_path, monkeypatch):
     grd("run", "ticks.yaml", "--for", 0.3, "--no-warm-up")
     monkeypatch.setattr("tests.flow.live_toys.Order.finish", lambda self: None)  # another version of a stage
     text = grd("replay", tmp_path / "out" / "live-ticks" / "flight.mcap", "--as-live", code=1)
-    assert "the live run's hash was " in text
+    assert "the live run's hash is " in text
     assert "the same" not in text
 
 
@@ -125,7 +126,7 @@ def test_a_stage_that_is_switched_off_is_a_finding_and_the_run_went_on(grd, tmp_
     live = json.loads((tmp_path / "out" / "live-bad" / "summary.json").read_text())["live"]
     assert live["switched_off"] == ["ticker"]
     assert live["restarts"] == {"ticker": 5}
-    assert "'ticker' did not work to the end: it kept raising" in output
+    assert "'ticker' was switched off after repeated errors" in output
 
 
 def test_a_run_without_a_recorder_says_that_nothing_is_recorded(grd, tmp_path):
@@ -136,7 +137,7 @@ def test_a_run_without_a_recorder_says_that_nothing_is_recorded(grd, tmp_path):
 
 def test_for_is_of_live_runs_only(grd):
     text = grd("run", ROOT / "configs" / "quickstart.yaml", "--for", 1, code=2)
-    assert "--for is of live runs" in text
+    assert "--for is for live runs" in text
 
 
 def start(folder: Path, config: str) -> tuple[subprocess.Popen[str], Path]:
@@ -228,11 +229,11 @@ def test_a_terminal_that_takes_no_more_ends_no_run(grd, tmp_path, status):
     def show(look):
         raise status
 
-    asked = Asked(Path("ticks.yaml"), (), ())
+    asked = RunRequest(Path("ticks.yaml"), (), ())
     finished = run_live(tmp_path / "run", asked, live_graph(asked), show, 2.0)
-    assert any("cannot be shown on the terminal (" in str(event) for event in finished.report.events)
+    assert any("cannot write to the terminal (" in str(event) for event in finished.report.events)
     assert finished.report.records > 40
-    assert "cannot be shown" in (tmp_path / "run" / "run.log").read_text()
+    assert "cannot write to the terminal" in (tmp_path / "run" / "run.log").read_text()
 
 
 @pytest.mark.parametrize("after_s", [0.7, 1.3])
@@ -245,7 +246,7 @@ def test_a_run_killed_with_sigkill_loses_at_most_half_a_second_and_what_is_left_
         child.communicate()
     assert child.returncode == -signal.SIGKILL
     again = grd("run", "ticks.yaml", "--for", "0.2", "--out", tmp_path / "run", code=2)
-    assert "holds a recording already (flight.mcap), of a run that was cut off: name another --out, or move it" in again
+    assert "has the recording of an interrupted run already (flight.mcap): name another --out, or move it" in again
     report = recover(tmp_path / "run" / "flight.mcap")
     with RecordingReader(report.path) as reader:
         ticks = list(reader.records(["/clock"]))
@@ -255,6 +256,6 @@ def test_a_run_killed_with_sigkill_loses_at_most_half_a_second_and_what_is_left_
     assert orders
     assert not (tmp_path / "run" / "summary.json").exists()
     text = grd("replay", report.path, "--as-live", "--out", tmp_path / "again")
-    assert "the live run was not stopped in order, so its hash is not known" in text
+    assert "the live run was interrupted, so its hash is not known" in text
     repeated = json.loads((tmp_path / "again" / "summary.json").read_text())
     assert 0 < repeated["messages"]["order.number"] <= 2 * len(ticks)

@@ -1,4 +1,4 @@
-"""What the console shows of a live run, on a terminal and in a log."""
+"""Console display of a live run, on a terminal and in a log."""
 
 from __future__ import annotations
 
@@ -12,8 +12,17 @@ from flow.config.edge import Edge, QueueSettings
 from flow.live.report import EdgeCount, LinkReport, LiveReport, edge_report
 from flow.taps import Digest
 from links.cli.live_view import LiveView
-from links.runs.live_run import Look
-from stages.messages import DroneFix, Image, PoseState, RelativePose, SweptPulses, TrackingState, TrackState
+from links.runs.live_run import RunStatus
+from stages.messages import (
+    DroneFix,
+    Image,
+    PoseEstimate,
+    PoseState,
+    RelativePose,
+    SweptPulses,
+    TrackingState,
+    TrackState,
+)
 
 
 def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
@@ -29,7 +38,7 @@ def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
             "fuse": {"refused: fix: not finite": 3, "back end begun anew": 0},
             "recorder": {"missed": 0},
         },
-        off=list(off),
+        switched_off=list(off),
     )
 
 
@@ -41,17 +50,19 @@ def pose(state=PoseState.FULL, **changes):
         "reason": "seen now",
         "measured_ns": 1,
         "track_id": 1,
-        "xyz_vehicle_m": np.array([1.0, -2.0, 10.0]),
-        "R_vehicle_drone": quarter,
-        "covariance": np.diag([1.0, 1.0, 1.0, 0.01, 0.02, 0.06]),
-        "velocity_vehicle_mps": None,
-        "xyz_map_m": None,
-        "R_map_drone": None,
-        "map_covariance": None,
-        "velocity_map_mps": None,
-        "velocity_covariance": None,
         "resets": 0,
         "nis": 1.0,
+        "estimate": PoseEstimate(
+            xyz_vehicle_m=np.array([1.0, -2.0, 10.0]),
+            R_vehicle_drone=quarter,
+            covariance=np.diag([1.0, 1.0, 1.0, 0.01, 0.02, 0.06]),
+            velocity_vehicle_mps=np.zeros(3),
+            xyz_map_m=np.zeros(3),
+            R_map_drone=np.eye(3),
+            map_covariance=np.eye(6),
+            velocity_map_mps=np.zeros(3),
+            velocity_covariance=np.eye(3),
+        ),
     }
     return RelativePose(**(values | changes))
 
@@ -61,8 +72,8 @@ def shown(report, *messages, terminal=False, news=()):
     console = Console(file=stream, force_terminal=terminal, width=160, highlight=False, soft_wrap=True)
     with LiveView(console) as view:
         for message in messages:
-            view.newest.see("x", message, 0)
-        view.show(Look(12.34, lambda: report, list(news)))
+            view.latest.see("x", message, 0)
+        view.show(RunStatus(12.34, lambda: report, list(news)))
     return stream.getvalue()
 
 
@@ -89,7 +100,7 @@ def test_without_a_fused_pose_the_track_and_its_last_fix_are_shown():
 
 
 def test_a_lost_pose_has_no_numbers():
-    assert "LOST: seen now; 1234 records" in shown(report_of(), pose(PoseState.LOST, xyz_vehicle_m=None))
+    assert "LOST: seen now; 1234 records" in shown(report_of(), pose(PoseState.LOST, estimate=None))
 
 
 def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():
@@ -100,8 +111,8 @@ def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():
 def test_news_are_told_at_once_even_between_two_lines(capsys):
     stream = io.StringIO()
     with LiveView(Console(file=stream, width=160, soft_wrap=True)) as view:
-        view.show(Look(0.0, report_of, ["lidar: first"]))
-        view.show(Look(0.1, report_of, ["lidar: second"]))
+        view.show(RunStatus(0.0, report_of, ["lidar: first"]))
+        view.show(RunStatus(0.1, report_of, ["lidar: second"]))
     assert stream.getvalue().count("\n") == 1
     assert capsys.readouterr().err == "lidar: first\nlidar: second\n"
 
@@ -118,5 +129,5 @@ def test_a_terminal_shows_every_edge_and_link():
 
 @pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (Image, False)])
 def test_the_view_takes_only_what_it_shows(kind, wanted):
-    assert LiveView().newest.wants(kind) is wanted
+    assert LiveView().latest.wants(kind) is wanted
     assert Digest().wants(kind)

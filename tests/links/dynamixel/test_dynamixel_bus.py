@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from links.dynamixel import mx28
 from links.dynamixel.bus import BadReply, BlockingPort, Bus, BusError, Gone, NoReply, Refused, WrongReply
 from links.dynamixel.drive import POSITION_BLOCK, Drive, DriveSettings
-from links.simulated.dynamixel_emulator import DynamixelEmulator
-from links.simulated.protocol2 import status
-from links.simulated.servo import ServoSettings
+from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
+from links.simulated.sensors.protocol2 import status
+from links.simulated.sensors.servo import ServoSettings
 
 BAUD = 1_000_000
 

@@ -18,8 +18,8 @@ from pydantic import ValidationError
 from flow.link import LinkError
 from links.clock import host_time
 from links.dynamixel import Servo, mx28
-from links.simulated.dynamixel_emulator import DynamixelEmulator
-from links.simulated.servo import ServoSettings
+from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
+from links.simulated.sensors.servo import ServoSettings
 from stages.messages import ServoGoal
 
 RPM = math.tau / 60
@@ -350,10 +350,10 @@ def test_an_unplugged_and_replugged_cable_is_found_again(emulator):
         (lambda e: e.bad_crc(3), "damaged"),
         (lambda e: e.hold_back(), "wrong"),
         (lambda e: e.short_data(3), "wrong"),
-        (lambda e: e.lie(3000, 1), "implausible"),
+        (lambda e: e.false_position(3000, 1), "implausible"),
         (lambda e: e.garbage(b"\xff\xff\xfd\x00\x01\x07\x00\x55" + bytes(7), 3), "damaged"),
     ],
-    ids=["crc", "late", "short", "lie", "garbage"],
+    ids=["crc", "late", "short", "false_position", "garbage"],
 )
 def test_corrupted_replies_are_counted_and_give_no_wrong_angle(emulator, fault, counter):
     servo = live(emulator)
@@ -370,7 +370,7 @@ def test_a_confirmed_jump_is_accepted(emulator):
     servo = live(emulator)
     with servo.listen() as records:
         next(records)
-        emulator.lie(3000, 400)
+        emulator.false_position(3000, 400)
         until(records, lambda s: s["position_rad"] > 4)
         until(records, lambda _: servo.counters["implausible"] >= 1)
 

@@ -83,7 +83,7 @@ def make_run(
         variances = np.broadcast_to(np.asarray(sigma_m, dtype=float), len(t_s)) ** 2
         ends = [""] * len(t_s) if tracks is None else [f",{track}" for track in tracks]
         rows = [f"{stamp(t)},{v},0,0,{v},0,{v},5,3{end}\n" for t, v, end in zip(t_s, variances, ends, strict=True)]
-        head = f"stamp_s,cxx_m2,cxy_m2,cxz_m2,cyy_m2,cyz_m2,czz_m2,hits,iterations{'' if tracks is None else ',track_id'}\n"
+        head = f"stamp_s,cxx_m2,cxy_m2,cxz_m2,cyy_m2,cyz_m2,czz_m2,returns,iterations{'' if tracks is None else ',track_id'}\n"
         (folder / "fix_covariance.csv").write_text(head + "".join(rows))
     if isinstance(truth, str):
         if truth == "no drone":
@@ -103,7 +103,7 @@ def make_run(
         rows = "".join(f"{stamp(t)},{seen}\n" for t, seen in visible)
         (folder / "truth_visible.csv").write_text(f"stamp_s,visible\n{rows}")
     if hits_s is not None:
-        (folder / "truth_hits.csv").write_text("stamp_s\n" + "".join(f"{stamp(t)}\n" for t in hits_s))
+        (folder / "truth_returns.csv").write_text("stamp_s\n" + "".join(f"{stamp(t)}\n" for t in hits_s))
     summary = {
         "recording": f"{recording}.mcap",
         "start_s": stamp(0.0),
@@ -129,7 +129,7 @@ def add_pose(
     if covariance is None:
         return
     names = [f"c{a}{b}" for a in range(6) for b in range(a, 6)]
-    text = ",".join(["stamp_s", *names, *(["good"] if good is not None else [])]) + "\n"
+    text = ",".join(["stamp_s", *names, *(["accepted"] if good is not None else [])]) + "\n"
     for i, t in enumerate(t_s):
         cells = [f"{v:.12g}" for v in covariance[np.triu_indices(6)]]
         text += ",".join([stamp(t), *cells, *([str(int(good[i]))] if good is not None else [])]) + "\n"

@@ -107,7 +107,7 @@ def test_truth_has_the_pose_of_the_vehicle(tmp_path):
     log = TruthLog()
     for what, xyz, yaw_deg in (("vehicle", [10.0, 1, 2], 90), ("drone", [10.0, 5, 7], 180)):
         pose = {"xyz_m": xyz, "quaternion_xyzw": yaw_quaternion([math.radians(yaw_deg)])[0].tolist()}
-        log.take([Record(f"/truth/{what}", 7, 7, json.dumps(pose).encode())])
+        log.add_all([Record(f"/truth/{what}", 7, 7, json.dumps(pose).encode())])
     log.write(tmp_path)
     vehicle = read_tum(tmp_path / "truth_world_vehicle.tum")
     assert (vehicle.stamps_ns.tolist(), vehicle.xyz_m.tolist()) == ([7], [[10, 1, 2]])

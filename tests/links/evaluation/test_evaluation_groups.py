@@ -206,9 +206,13 @@ def test_one_row_for_each_configuration_is_the_table_of_ablations(two_configs):
         ("flight-1", [], "estimate"),
         ("flight-1-estimate", [], "estimate"),
         ("flight-1-estimate-2", [], "estimate"),
-        ("flight-1-estimate-2", ["track.misses=false", "viewer.file=null"], "estimate track.misses=false"),
-        ("flight-1-without_misses", ["track.misses=false"], "without_misses"),
-        ("anything", ["track.misses=false"], "estimate track.misses=false"),
+        (
+            "flight-1-estimate-2",
+            ["track.use_pass_throughs=false", "viewer.file=null"],
+            "estimate track.use_pass_throughs=false",
+        ),
+        ("flight-1-without_misses", ["track.use_pass_throughs=false"], "without_misses"),
+        ("anything", ["track.use_pass_throughs=false"], "estimate track.use_pass_throughs=false"),
     ],
 )
 def test_a_run_has_the_name_of_its_configuration(tmp_path, folder, sets, config):

@@ -13,7 +13,7 @@ from stages.messages import Candidates
 from tests.links.command import grd
 from tests.links.evaluation.made_runs import all_evaluated, lines, make_run, stamp, truth_at
 
-HEAD = "stamp_s,candidate,detector_life,looks,probability,x_m,y_m,z_m\n"
+HEAD = "stamp_s,candidate,detector_instance,observations,probability,x_m,y_m,z_m\n"
 T_S = np.arange(0.0, 10.0, 0.1)
 
 
@@ -105,9 +105,9 @@ def candidates(looks, probability, life=7):
         velocity_vehicle_mps=np.zeros((n, 3)),
         probability=np.array(probability),
         seen_ns=np.zeros(n, dtype=np.int64),
-        looks=np.array(looks),
+        scan_passes=np.array(looks),
         reasons=("",) * n,
-        detector_life=life,
+        detector_instance=life,
     )
 
 

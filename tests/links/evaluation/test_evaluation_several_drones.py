@@ -24,7 +24,7 @@ def two_drones(folder, t_s, xyz, tracks, **settings):
     make_run(folder, t_s, xyz, tracks=tracks, **settings)
     times = np.arange(0, 10.005, 0.01)
     (folder / "truth_vehicle_drone_2.tum").write_text("# full pose\n" + lines(times, truth_at(times) + OFFSET_M))
-    (folder / "truth_hits_2.csv").write_text("stamp_s\n" + "".join(f"{stamp(t)}\n" for t in (1.0, 2.0, 9.5)))
+    (folder / "truth_returns_2.csv").write_text("stamp_s\n" + "".join(f"{stamp(t)}\n" for t in (1.0, 2.0, 9.5)))
     return folder
 
 

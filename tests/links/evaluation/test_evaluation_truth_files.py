@@ -33,7 +33,7 @@ def test_truth_is_written_as_the_drone_in_the_vehicle_with_its_rotation(tmp_path
         Record("/truth/hits", 0, 0, b'{"pulse_stamp_ns": [3000000001, 2]}'),
         Record("/lidar/packets", 0, 0, b""),
     ]
-    assert [r.topic for r in log.aside(records)] == ["/lidar/packets"]
+    assert [r.topic for r in log.without_truth(records)] == ["/lidar/packets"]
     log.write(tmp_path)
     truth = read_tum(tmp_path / "truth_vehicle_drone.tum")
     assert truth.stamps_ns.tolist() == [1_000_000_000]
@@ -41,15 +41,15 @@ def test_truth_is_written_as_the_drone_in_the_vehicle_with_its_rotation(tmp_path
     assert truth.quaternion_xyzw is not None
     yaw_pitch_roll = Rotation.from_quat(truth.quaternion_xyzw).as_euler("ZYX", degrees=True)
     assert yaw_pitch_roll[0] == pytest.approx([90, 0, 0], abs=1e-3)
-    assert (tmp_path / "truth_hits.csv").read_text() == "stamp_s\n0.000000002\n3.000000001\n"
+    assert (tmp_path / "truth_returns.csv").read_text() == "stamp_s\n0.000000002\n3.000000001\n"
 
 
 def test_a_recording_without_a_drone_is_marked_and_one_without_truth_has_no_file(tmp_path):
     log = TruthLog()
-    list(log.aside([pose("/truth/vehicle", 5, [0, 0, 0], 0)]))
+    list(log.without_truth([pose("/truth/vehicle", 5, [0, 0, 0], 0)]))
     log.write(tmp_path)
     assert (tmp_path / "truth_vehicle_drone.tum").read_text() == "# no drone in this recording\n"
-    assert not (tmp_path / "truth_hits.csv").exists()
+    assert not (tmp_path / "truth_returns.csv").exists()
     (tmp_path / "b").mkdir()
     TruthLog().write(tmp_path / "b")
     assert list((tmp_path / "b").iterdir()) == []
@@ -65,7 +65,7 @@ def test_each_drone_has_its_own_files_of_truth(tmp_path):
         Record("/truth/visible_2", 0, 0, b'{"visible": true}'),
     ]
     records += [Record("/truth/visible_2", 1_000_000_000, 1_000_000_000, b'{"visible": false}')]
-    assert list(log.aside(records)) == []
+    assert list(log.without_truth(records)) == []
     log.write(tmp_path)
     drones, empty_sky = read_true_drones(tmp_path, None)
     assert not empty_sky
@@ -86,20 +86,20 @@ def test_fixes_are_compared_with_the_drone_their_track_follows():
     for stamp in (0, 10_000_000):
         log.vehicle[stamp] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         for number in (1, 2):
-            list(log.aside([pose(f"/truth/drone_{number}", stamp, [0, 0, 10 * number], 0)]))
+            list(log.without_truth([pose(f"/truth/drone_{number}", stamp, [0, 0, 10 * number], 0)]))
     fixes = [fix(5_000_000, 19.5, track_id=4), fix(6_000_000, 10.25, track_id=9), fix(20_000_000, 10, track_id=9)]
-    errors = log.errors_of(fixes)
+    errors = log.fix_errors_of(fixes)
     assert errors is not None
     assert errors.error_m[:, 2] == pytest.approx([-0.5, 0.25])
     assert errors.stamps_ns.tolist() == [5_000_000, 6_000_000]
-    assert errors.not_covered == 1
-    assert TruthLog().errors_of(fixes) is None
+    assert errors.without_truth == 1
+    assert TruthLog().fix_errors_of(fixes) is None
 
 
 @pytest.mark.parametrize("data", [b"{}", b'{"visible": 1}', b"no"])
 def test_what_is_visible_is_true_or_false(data):
     with pytest.raises(LinkError, match=r"/truth/visible at 3 ns"):
-        list(TruthLog().aside([Record("/truth/visible", 3, 3, data)]))
+        list(TruthLog().without_truth([Record("/truth/visible", 3, 3, data)]))
 
 
 def fix(stamp_ns: int, z_m: float, track_id: int) -> DroneFix:
@@ -116,8 +116,8 @@ def fix(stamp_ns: int, z_m: float, track_id: int) -> DroneFix:
 
 
 def test_invalid_hits_are_rejected():
-    with pytest.raises(LinkError, match="holds no pulses"):
-        list(TruthLog().aside([Record("/truth/hits", 0, 0, b"{}")]))
+    with pytest.raises(LinkError, match="has no pulse stamps"):
+        list(TruthLog().without_truth([Record("/truth/hits", 0, 0, b"{}")]))
 
 
 def test_fixes_of_all_tracks_are_written_with_their_number(tmp_path):
@@ -127,7 +127,7 @@ def test_fixes_of_all_tracks_are_written_with_their_number(tmp_path):
         results.see("track.drone_fix", fix(stamp, float(track), track), 0)
     results.close()
     rows = (tmp_path / "fix_covariance.csv").read_text().splitlines()
-    assert rows[0].endswith(",hits,iterations,track_id")
+    assert rows[0].endswith(",returns,iterations,track_id")
     assert [row.split(",")[-1] for row in rows[1:]] == ["1", "2", "2"]
     (tmp_path / "summary.json").write_text("{}")
     output = read_run(tmp_path).outputs[0]
@@ -175,7 +175,7 @@ def test_a_search_with_a_start_time_keeps_it(tmp_path):
         empty = np.zeros(0)
         found = Detections(
             stamp_ns=end, xyz_vehicle_m=np.zeros((0, 3)), score=empty, e_inner=empty, e_outer=empty,
-            accepted=np.zeros(0, dtype=bool), reasons=(), verdict="no drone", start_ns=start,
+            accepted=np.zeros(0, dtype=bool), reasons=(), summary="no drone", start_ns=start,
         )  # fmt: skip
         results.see("detect.detections", found, 0)
     results.close()
@@ -208,7 +208,7 @@ def test_every_sweep_has_a_line_with_its_accepted_candidates(tmp_path):
             e_outer=np.zeros(3),
             accepted=np.array(accepted),
             reasons=("", "", ""),
-            verdict="",
+            summary="",
         )
         results.see("sweep.depth_image", image, 0)
         results.see("detect.detections", found, 0)

@@ -15,7 +15,7 @@ from links.mavlink.gate import PoseLimits, RejectReason, pose_sigmas, reject_rea
 from links.mavlink.pose_sender import PoseSender
 from stages.geometry.frames import rotation_z
 from stages.messages import PoseState
-from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
+from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose, position_of
 
 LIMITS = PoseLimits()
 
@@ -43,11 +43,8 @@ def test_no_other_state_passes_even_if_the_pose_is_complete(state: PoseState):
 
 
 INVALID = [
-    ({"R_vehicle_drone": None}, RejectReason.INCOMPLETE),
-    ({"R_map_drone": None}, RejectReason.INCOMPLETE),
-    ({"xyz_map_m": None}, RejectReason.INCOMPLETE),
-    ({"covariance": None}, RejectReason.INCOMPLETE),
-    ({"map_covariance": None}, RejectReason.INCOMPLETE),
+    ({"estimate": None}, RejectReason.INCOMPLETE),
+    ({"estimate": position_of(good_pose())}, RejectReason.INCOMPLETE),
     ({"xyz_map_m": nan_at(np.ones(3))}, RejectReason.NOT_FINITE),
     ({"xyz_vehicle_m": nan_at(np.ones(3), math.inf)}, RejectReason.NOT_FINITE),
     ({"R_map_drone": nan_at(np.eye(3))}, RejectReason.NOT_FINITE),
@@ -126,7 +123,7 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
 def test_whatever_one_number_becomes_sent_poses_are_finite_certain_and_recent(
     state: PoseState, field: str, at: int, value: float, age_ms: int
 ):
-    changed = np.array(getattr(good_pose(), field))
+    changed = np.array(getattr(good_pose().estimate, field))
     changed.flat[at % changed.size] = value
     pose = good_pose(state=state, **{field: changed})
     messages = PoseSender(("odometry",), LIMITS).messages(pose, HOST0 + age_ms * MS)

@@ -26,10 +26,10 @@ from links.mavlink import Autopilot
 from links.mavlink.autopilot_session import AutopilotSession
 from links.mavlink.framing import header, packed, parse_frame
 from links.mavlink.signing import AHEAD_TICKS
-from links.simulated.ardupilot_rules import ArduPilotRules
-from links.simulated.autopilot_rules import Fate
-from links.simulated.autopilot_socket import AutopilotSocket
-from links.simulated.px4_rules import Px4Rules
+from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
+from links.simulated.autopilot.autopilot_socket import AutopilotSocket
+from links.simulated.autopilot.px4_rules import Px4Rules
+from links.simulated.autopilot.rules import PoseResult
 from stages.geometry.frames import rotation_z
 from stages.messages import AutopilotEstimator, PoseState, RelativePose
 from tests.links.mavlink.mavlink_poses import good_pose
@@ -110,9 +110,15 @@ def test_the_pose_is_an_optional_input():
 @pytest.mark.parametrize("rules", [ArduPilotRules, Px4Rules])
 def test_good_poses_are_fused_and_the_autopilot_reports_it(rules: Any):
     with listening() as listener, drone_for(listener, rules()) as drone:
-        listener.send_poses(lambda: drone.rules.fates[Fate.FUSED] >= 40)
-        assert set(drone.rules.fates) <= {Fate.FUSED, Fate.RESET, Fate.NOT_FOR_IT, Fate.NOT_STARTED, Fate.TOO_SOON}
-        assert drone.rules.fates[Fate.RESET] == 1  # the initial one
+        listener.send_poses(lambda: drone.rules.results[PoseResult.FUSED] >= 40)
+        assert set(drone.rules.results) <= {
+            PoseResult.FUSED,
+            PoseResult.RESET,
+            PoseResult.NOT_A_POSE,
+            PoseResult.NOT_STARTED,
+            PoseResult.TOO_SOON,
+        }
+        assert drone.rules.results[PoseResult.RESET] == 1  # the initial one
         assert drone.rules.estimate is not None
         np.testing.assert_allclose(drone.rules.estimate.xyz_m, [101, -2, -10], atol=0.5)
         statuses = [m for m in listener.messages if isinstance(m, AutopilotEstimator)]
@@ -153,15 +159,15 @@ def test_an_unresolved_branch_is_never_sent_and_the_reason_is_reported():
 
 def test_stopping_is_reported_heartbeats_continue_and_resuming_resets():
     with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
-        listener.send_poses(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        listener.send_poses(lambda: drone.rules.results[PoseResult.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         heartbeats = len(drone.messages("HEARTBEAT"))
         listener.wait(lambda: any(m.severity == 2 for m in drone.messages("STATUSTEXT")))
         listener.wait(lambda: len(drone.messages("HEARTBEAT")) >= heartbeats + 2)
         assert drone.messages("HEARTBEAT")[-1].system_status == mavlink.MAV_STATE_STANDBY
         assert not drone.rules.healthy(drone.device_ns())
-        resets = drone.rules.fates[Fate.RESET]
-        listener.send_poses(lambda: drone.rules.fates[Fate.RESET] > resets)
+        resets = drone.rules.results[PoseResult.RESET]
+        listener.send_poses(lambda: drone.rules.results[PoseResult.RESET] > resets)
         assert drone.messages("ODOMETRY")[-1].reset_counter == (counter + 1) % 256
         heartbeat = drone.messages("HEARTBEAT")[0]
         assert (heartbeat.type, heartbeat.autopilot) == (
@@ -172,7 +178,7 @@ def test_stopping_is_reported_heartbeats_continue_and_resuming_resets():
 
 def test_a_blocked_autopilot_gets_no_poses():
     with listening() as listener, drone_for(listener, ArduPilotRules()) as drone:
-        listener.send_poses(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        listener.send_poses(lambda: drone.rules.results[PoseResult.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         drone.silent = True
         listener.send_poses(
@@ -245,7 +251,7 @@ def test_no_poses_over_a_bridge_that_forwards_them_late_and_stopping_is_reported
         Bridge(listener.link.port or 0) as bridge,
         AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", bridge.port)) as drone,
     ):
-        listener.send_poses(lambda: drone.rules.fates[Fate.FUSED] >= 5)
+        listener.send_poses(lambda: drone.rules.results[PoseResult.FUSED] >= 5)
         counter = drone.messages("ODOMETRY")[-1].reset_counter
         bridge.delay_s = 0.6
         listener.send_poses(lambda: listener.link.counters.get("pose rejected: link too slow", 0) >= 1)
@@ -267,7 +273,7 @@ def test_no_poses_over_a_bridge_that_forwards_them_late_and_stopping_is_reported
 def test_an_unrequested_timesync_reply_is_ignored_although_it_has_no_target():
     with listening() as listener, drone_for(listener, Px4Rules()) as drone:
         listener.wait(lambda: listener.link.counters["timesync replies"] >= 2)
-        drone.say(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
+        drone.send(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
         listener.wait(lambda: listener.link.counters.get("refused: TIMESYNC for another component", 0) == 1)
         before = listener.link.counters["timesync replies"]
         listener.wait(lambda: listener.link.counters["timesync replies"] > before)

@@ -16,7 +16,7 @@ from links.mavlink.gate import PoseLimits
 from links.mavlink.pose_messages import landing_target, odometry, quality_percent, vision_position_estimate
 from links.mavlink.readers import read_odometry
 from stages.geometry.frames import rotation_from_rpy_deg
-from tests.links.mavlink.mavlink_poses import good_pose
+from tests.links.mavlink.mavlink_poses import good_pose, position_of
 
 mavlink: Any = ardupilotmega
 LIMITS = PoseLimits()
@@ -90,8 +90,6 @@ def test_the_local_frame_is_static_while_the_vehicle_drives_below_a_hovering_dro
 @pytest.mark.parametrize(
     "unknown",
     [
-        {"velocity_map_mps": None},
-        {"velocity_covariance": None},
         {"velocity_map_mps": np.array([1.0, math.nan, 0.0])},
         {"velocity_covariance": np.diag([1.0, 0.01, 0.01])},  # 1 m/s: above the limit
         {"velocity_covariance": np.zeros((3, 3))},
@@ -123,7 +121,7 @@ def test_quality_decreases_from_100_to_1_at_the_limit_by_the_worse_sigma():
     limit = np.diag([1e-12] * 3 + [LIMITS.position_sigma_m**2] * 3)
 
     def quality(start: Any, relative: Any) -> int:
-        return quality_percent(good_pose(map_covariance=start, covariance=relative), LIMITS)
+        return quality_percent(good_pose(map_covariance=start, covariance=relative).estimate, LIMITS)
 
     assert quality(exact, exact) == 100
     assert quality(half, exact) == quality(exact, half) == 50
@@ -159,9 +157,10 @@ def test_the_reset_counter_is_one_byte():
     assert over_the_wire(odometry(good_pose(), 256 + 5, LIMITS)).reset_counter == 5
 
 
-@pytest.mark.parametrize("missing", ["xyz_map_m", "R_map_drone", "map_covariance"])
-def test_a_pose_without_its_start_frame_raises(missing: str):
+@pytest.mark.parametrize("estimate", [None, position_of(good_pose())])
+def test_a_pose_without_a_rotation_is_an_error_of_the_caller(estimate: Any):
+    pose = good_pose(estimate=estimate)
     with pytest.raises(ValueError, match="gate"):
-        odometry(good_pose(**{missing: None}), 0, LIMITS)
+        odometry(pose, 0, LIMITS)
     with pytest.raises(ValueError, match="rotation"):
-        landing_target(good_pose(R_vehicle_drone=None))
+        landing_target(pose)

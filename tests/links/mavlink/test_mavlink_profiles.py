@@ -11,9 +11,9 @@ from links.mavlink.parameters import read_parameters
 from links.mavlink.profiles import ARDUPILOT, PROFILES, PX4, Profile, RequiredParameter, findings
 from links.mavlink.transport.connection import Endpoint, Udp
 from links.mavlink.transport.stream_connection import open_connection
-from links.simulated.ardupilot_rules import ArduPilotRules
-from links.simulated.autopilot_socket import AutopilotSocket
-from links.simulated.px4_rules import Px4Rules
+from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
+from links.simulated.autopilot.autopilot_socket import AutopilotSocket
+from links.simulated.autopilot.px4_rules import Px4Rules
 
 
 def valid(profile: Profile) -> dict[str, float]:

@@ -15,10 +15,10 @@ from flow.link import Record
 from flow.stage import Settings, Stage
 from links.mavlink.framing import packed, parse_frame
 from links.mavlink.profiles import PROFILES
-from links.simulated.autopilot import Autopilot, AutopilotSettings
-from links.simulated.flight import Flight
-from links.simulated.path import Path, Waypoint
-from links.simulated.vlp16_packets import encode_packet
+from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
+from links.simulated.sensors.vlp16_packets import encode_packet
+from links.simulated.world.flight import Flight
+from links.simulated.world.path import Path, Waypoint
 from links.velodyne import vlp16
 from stages.messages import DroneFix, DroneLocalPosition
 

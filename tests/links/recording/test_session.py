@@ -79,7 +79,7 @@ def test_a_replay_reads_all_parts_says_so_and_has_the_hash_of_one_file(first, tm
     assert apart["parts"] == 3
     assert "parts" not in whole
     assert apart["output_hash"] == whole["output_hash"]
-    assert apart["against_truth"] == whole["against_truth"]
+    assert apart["truth_errors"] == whole["truth_errors"]
     assert apart["warnings"] == whole["warnings"]
 
 

@@ -1,4 +1,4 @@
-"""FixLog gives back what it was given."""
+"""FixLog returns the fixes that were appended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fused poses in a run's folder: a line each, the rotation marked where it is not known, states in the log."""
+"""Fused poses in the folder of a run: a line per pose, unknown rotations marked, states in the log."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from flow.link import Run
 from links.evaluation.run_data import OutputKind, read_output
 from links.mavlink.gate import PoseLimits
 from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
-from stages.fuse.measurement_covariance import Known, Verdict, lost, pose
 from stages.fuse.motions import Motions
+from stages.fuse.pose_message import MapEstimate, Status, lost, pose
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import quaternions_xyzw, rotation_z
 from stages.messages import DroneFix, PoseState, RelativePose, SweptPulses
@@ -22,13 +22,13 @@ S = 1_000_000_000
 FULL, POSITION_ONLY = PoseState.FULL, PoseState.POSITION_ONLY
 
 
-def verdict(state, resets=0, track_id=1):
-    return Verdict(state, f"why {state.name}", 2 * S, track_id, resets, 1.5)
+def status(state, resets=0, track_id=1):
+    return Status(state, f"why {state.name}", 2 * S, track_id, resets, 1.5)
 
 
 def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.001, 0.002, 0.003, 0.01, 0.02, 0.03)):
-    known = Known(round(t_s * S), R, np.array(xyz), np.diag(variances), np.zeros(3), np.eye(3))
-    return pose(known, verdict(state), Motions(FuseErrors(), parked=True))
+    known = MapEstimate(round(t_s * S), R, np.array(xyz), np.diag(variances), np.zeros(3), np.eye(3))
+    return pose(known, status(state), Motions(FuseErrors(), parked=True))
 
 
 @pytest.fixture
@@ -57,10 +57,11 @@ def test_a_pose_is_a_line_of_both_files_and_reads_back(run):
 
 def test_each_pose_tells_which_drone_it_is_of(run):
     known = [
-        Known(t * S, None, np.array([x, 2.0, 3.0]), np.eye(6), np.zeros(3), np.eye(3)) for t, x in ((1, 1), (2, 30))
+        MapEstimate(t * S, None, np.array([x, 2.0, 3.0]), np.eye(6), np.zeros(3), np.eye(3))
+        for t, x in ((1, 1), (2, 30))
     ]
     parked = Motions(FuseErrors(), parked=True)
-    folder = run([pose(one, verdict(POSITION_ONLY, track_id=k), parked) for k, one in enumerate(known, start=1)])
+    folder = run([pose(one, status(POSITION_ONLY, track_id=k), parked) for k, one in enumerate(known, start=1)])
     back = read_output(OutputKind.POSE, folder)
     assert back.track.tolist() == [1, 2]
 
@@ -89,13 +90,13 @@ def test_a_pose_is_good_when_the_autopilots_gate_lets_it_out(tmp_path):
             results.see("fuse.relative_pose", message, message.stamp_ns)
         results.close()
         rows = list(csv.DictReader((tmp_path / POSE_COVARIANCE_FILE).open()))
-        assert [row["good"] == "1" for row in rows] == expected
+        assert [row["accepted"] == "1" for row in rows] == expected
         assert [row["rotation"] for row in rows] == ["1"] * 3
 
 
 def test_a_lost_drone_has_no_line_and_the_log_tells_each_change(run):
     R = np.eye(3)
-    messages = [lost(S, verdict(PoseState.LOST)), made(1.02, R), made(1.04, R), lost(2 * S, verdict(PoseState.LOST))]
+    messages = [lost(S, status(PoseState.LOST)), made(1.02, R), made(1.04, R), lost(2 * S, status(PoseState.LOST))]
     folder = run(messages)
     assert len((folder / POSE_FILE).read_text().splitlines()) == 2 + 1
     told = [line for line in (folder / "run.log").read_text().splitlines() if "fuse.relative_pose" in line]
@@ -124,12 +125,12 @@ def test_poses_are_counted_by_state_and_their_jumps_told(tmp_path):
     results.open(Run(tmp_path, "made", "", ""))
     assert results.pose_states == {}
     unknown = pose(
-        Known(S, None, np.ones(3), np.eye(6), np.zeros(3), np.eye(3)),
-        verdict(POSITION_ONLY),
+        MapEstimate(S, None, np.ones(3), np.eye(6), np.zeros(3), np.eye(3)),
+        status(POSITION_ONLY),
         Motions(FuseErrors(), parked=True),
     )
-    turned = Known(2 * S, rotation_z(0.5), np.ones(3), np.eye(6), np.zeros(3), np.eye(3))
-    for message in (unknown, *[pose(turned, verdict(FULL, resets=1), Motions(FuseErrors(), parked=True))] * 2):
+    turned = MapEstimate(2 * S, rotation_z(0.5), np.ones(3), np.eye(6), np.zeros(3), np.eye(3))
+    for message in (unknown, *[pose(turned, status(FULL, resets=1), Motions(FuseErrors(), parked=True))] * 2):
         results.see("fuse.relative_pose", message, message.stamp_ns)
     results.close()
     assert results.pose_states == {"FULL": 2, "POSITION_ONLY": 1}

@@ -1,4 +1,4 @@
-"""What a long run uses."""
+"""Samples of the resources of a run."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ def clock(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(usage.time, "monotonic", lambda: now[0])
 
-    def to(since_s: float) -> None:
-        now[0] = 100.0 + since_s
+    def to(elapsed_s: float) -> None:
+        now[0] = 100.0 + elapsed_s
 
     return to
 
 
 def test_a_look_is_taken_when_it_is_due_and_no_more_often(clock):
     used = Usage()
-    for since_s in (0.0, 0.4, 1.0, 1.5, 2.1):
-        clock(since_s)
-        used.look()
-    assert used.columns["since_s"] == [0.0, 1.0, 2.1]
+    for elapsed_s in (0.0, 0.4, 1.0, 1.5, 2.1):
+        clock(elapsed_s)
+        used.sample()
+    assert used.columns["elapsed_s"] == [0.0, 1.0, 2.1]
     assert all(len(column) == 3 for column in used.columns.values())
     assert used.columns["rss_mb"][0] > 10
     assert used.columns["threads"][0] >= 1
@@ -40,11 +40,11 @@ def test_a_look_is_taken_when_it_is_due_and_no_more_often(clock):
 
 def test_an_hour_has_no_more_looks_than_some_minutes_and_keeps_its_start(clock):
     used = Usage()
-    for since_s in range(3600):
-        clock(float(since_s))
-        used.look()
-    times = used.columns["since_s"]
-    assert usage.MOST / 2 <= len(times) < usage.MOST
+    for elapsed_s in range(3600):
+        clock(float(elapsed_s))
+        used.sample()
+    times = used.columns["elapsed_s"]
+    assert usage.MAX_SAMPLES / 2 <= len(times) < usage.MAX_SAMPLES
     assert times[0] == 0.0
     assert times[-1] > 3550
     assert len(str(used).split(";")) == 3
@@ -57,16 +57,16 @@ def test_other_processes_count_while_they_run(clock):
     try:
         while usage._used(child.pid)[1] < 0.3:
             time.sleep(0.02)
-        used.look([child.pid])
+        used.sample([child.pid])
     finally:
         child.kill()
         child.wait()
-    assert used.others_cpu_s >= 0.3
+    assert used.subprocesses_cpu_s >= 0.3
     clock(1.0)
-    used.look([child.pid])
+    used.sample([child.pid])
     with_it, alone = used.columns["rss_mb"]
     assert alone < with_it - 45
-    assert used.others_cpu_s == 0.0
+    assert used.subprocesses_cpu_s == 0.0
 
 
 def test_without_a_look_there_is_nothing_to_tell(clock):

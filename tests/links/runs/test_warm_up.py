@@ -1,4 +1,4 @@
-"""A graph is tried on a recording before it runs live."""
+"""Warm-up of a graph on a recording before it runs live."""
 
 from __future__ import annotations
 
@@ -39,9 +39,7 @@ def test_the_graph_runs_over_the_whole_recording_and_tells_how_far_it_is(graph, 
 
 def test_a_stage_that_raises_and_a_recording_that_is_not_there_are_told_and_no_more(graph, tmp_path):
     said = warm_up(graph, lambda done, total: None, recording(tmp_path, b"1", b"666"))
-    assert said.startswith(
-        "the graph could not be tried on warm.mcap beforehand, the start may be rough: brittle.number"
-    )
+    assert said.startswith("warm-up on warm.mcap failed, the first messages may be late: brittle.number")
     said = warm_up(graph, lambda done, total: None, tmp_path / "none.mcap")
     assert "none.mcap: no such file" in said
 

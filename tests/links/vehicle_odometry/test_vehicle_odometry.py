@@ -13,10 +13,10 @@ from flow.graph import load_graph
 from flow.link import Record
 from flow.replay import replay
 from flow.stage import output_ports
-from links.simulated.path import Path as SimulatedPath
-from links.simulated.path import Waypoint
-from links.simulated.vehicle_odometry import VehicleOdometry as Simulated
-from links.simulated.vehicle_odometry import VehicleOdometrySettings
+from links.simulated.sensors.vehicle_odometry import VehicleOdometry as Simulated
+from links.simulated.sensors.vehicle_odometry import VehicleOdometrySettings
+from links.simulated.world.path import Path as SimulatedPath
+from links.simulated.world.path import Waypoint
 from links.vehicle_odometry import VehicleOdometry
 from stages.geometry.frames import rotation_z
 from stages.messages import VehicleMotion

@@ -8,7 +8,7 @@ import pytest
 
 from flow.link import Record
 from links.preflight.check_result import Level
-from links.simulated.vlp16_position import encode_position
+from links.simulated.sensors.vlp16_packets import encode_position
 from links.velodyne import Lidar, vlp16
 from links.velodyne.checks import clock_drift_ppm, lidar_checks
 from tests.links.preflight.observed import BEGIN_NS, by_name, levels, observe

@@ -1,4 +1,4 @@
-"""Rerun raises instead of warning in these tests: nothing is drawn half."""
+"""Rerun raises errors instead of warnings in these tests."""
 
 import pytest
 import rerun as rr

@@ -134,7 +134,7 @@ def images(xyz_vehicle_m: np.ndarray, stamp_ns: int) -> tuple[DepthImage, ScoreI
 
 
 def detections(stamp_ns: int) -> Detections:
-    """The drone taken, a facade edge and a lamp refused."""
+    """The drone accepted, a facade edge and a lamp rejected."""
     xyz = np.array([drone_xyz(1.0), [20.0, 9.0, 21.5], [30.0, -8.0, 13.5]])
     return Detections(
         stamp_ns=stamp_ns,
@@ -144,7 +144,7 @@ def detections(stamp_ns: int) -> Detections:
         e_outer=np.array([10.4, 88.0, 80.2]),
         accepted=np.array([True, False, False]),
         reasons=("drone: e = 12.4, lowest", "e_outer 88 over 40: touches a facade", "e_inner 60 over 20: not compact"),
-        verdict="drone at x 6.8, y 3.1, z 12.3 m: e = 12.4, the next is 88.0",
+        summary="drone at x 6.8, y 3.1, z 12.3 m: e = 12.4, the next is 88.0",
     )
 
 
@@ -222,16 +222,16 @@ def candidates(stamp_ns: int, t_s: float) -> Candidates:
         velocity_vehicle_mps=np.zeros((n, 3)),
         probability=np.array([min(0.99, 0.2 + t_s), 0.01])[:n],
         seen_ns=np.full(n, stamp_ns - 20_000_000),
-        looks=np.full(n, 4),
+        scan_passes=np.full(n, 4),
         reasons=(
             "9 looks; 8 of 8 sectors around it free",
-            "beside something big; if not a drone, a lamp, wire or edge",
+            "next to a large object; if not a drone, a lamp, wire or edge",
         )[:n],
     )
 
 
-def judged(stamp_ns: int, t_s: float) -> Detections:
-    """The drone accepted, the lamp refused, by evidence."""
+def classified(stamp_ns: int, t_s: float) -> Detections:
+    """The drone accepted, the lamp rejected, with probabilities."""
     return Detections(
         stamp_ns=stamp_ns,
         xyz_vehicle_m=np.array([drone_xyz(t_s), [-16.0, -23.0, 8.0]]),
@@ -239,8 +239,8 @@ def judged(stamp_ns: int, t_s: float) -> Detections:
         e_inner=np.zeros(2),
         e_outer=np.zeros(2),
         accepted=np.array([True, False]),
-        reasons=("9 looks", "beside something big; if not a drone, a lamp, wire or edge"),
-        verdict="drone at (6.8, 3.1, 12.3) m, 99.2 %: 9 looks",
+        reasons=("9 looks", "next to a large object; if not a drone, a lamp, wire or edge"),
+        summary="drone at (6.8, 3.1, 12.3) m, 99.2 %: 9 looks",
         start_ns=START_NS,
         seen_ns=np.full(2, stamp_ns),
         velocity_vehicle_mps=np.zeros((2, 3)),
@@ -250,7 +250,7 @@ def judged(stamp_ns: int, t_s: float) -> Detections:
 
 
 def tracks(stamp_ns: int, t_s: float, second_lost_s: float) -> Iterator[tuple[str, Message]]:
-    """Drone 1 is tracked and coasts from 1.5 s on; drone 2, 6 m beside it, is lost at `second_lost_s`."""
+    """Drone 1 is tracked and coasts from 1.5 s on; drone 2, 6 m next to it, is lost at `second_lost_s`."""
     velocity = np.array([0.8, 1.2, 0.3])
     coasting_s = max(t_s - 1.5, 0.0)
     for number, xyz in ((1, drone_xyz(t_s)), (2, np.add(drone_xyz(t_s), [0.0, 6.0, 0.0]))):
@@ -310,7 +310,7 @@ def run_by_evidence(duration_s: float) -> Iterator[tuple[str, Message]]:
             yield "detect.candidates", candidates(stamp_ns, t_s)
             if t_s > 0.75 and not answered:
                 answered = True
-                yield "detect.detections", judged(stamp_ns, t_s)
+                yield "detect.detections", classified(stamp_ns, t_s)
             if answered:
                 yield from tracks(stamp_ns, t_s, second_lost_s=1.8)
             else:

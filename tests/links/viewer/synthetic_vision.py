@@ -1,4 +1,4 @@
-"""Pictures, lines and rotations as a run with two fisheyes would tell them, built by hand: no stage is involved."""
+"""Images, lines and rotations of a run with two fisheyes, built by hand, without any stage."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MERMAID = (
 )
 
 
-def picture(stamp_ns: int = 0, frame_id: str = "camera_vehicle", size_px: int = SIZE_PX) -> Image:
+def camera_image(stamp_ns: int = 0, frame_id: str = "camera_vehicle", size_px: int = SIZE_PX) -> Image:
     grey = np.tile(np.linspace(30, 220, size_px).astype(np.uint8), (size_px, 1))
     return Image(stamp_ns=stamp_ns, frame_id=frame_id, grey=grey)
 
@@ -114,14 +114,14 @@ def motion(stamp_ns: int = PERIOD_NS, **changes) -> VisualMotion:
 
 
 def run(duration_s: float) -> Iterator[tuple[str, Message]]:
-    """A run by evidence, and both cameras ten times a second; the drone's sees no structure in every fifth picture."""
+    """A run with candidates and both cameras at 10 Hz; every fifth image of the drone has no structure."""
     due_ns, k = synthetic.START_NS, 0
     for output, content in synthetic.run_by_evidence(duration_s):
         yield output, content
         if content.stamp_ns < due_ns:
             continue
-        yield "camera_vehicle.image", picture(due_ns)
-        yield "camera_drone.image", picture(due_ns, "camera_drone")
+        yield "camera_vehicle.image", camera_image(due_ns)
+        yield "camera_drone.image", camera_image(due_ns, "camera_drone")
         yield "vp_vehicle.vanishing_directions", directions(due_ns)
         blind = k % 5 == 4
         yield "vp_drone.vanishing_directions", directions(due_ns, CameraMount.DRONE, 0 if blind else 3)

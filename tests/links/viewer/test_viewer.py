@@ -1,4 +1,4 @@
-"""The tap as a run meets it: bounded, counted, alive when disk, port or thread are not."""
+"""The viewer tap: bounded queue, counted drops, and failures of disk, port or thread that do not stop the run."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from rerun.chunk import RrdReader
 from flow.link import Run
 from flow.message import Message, message
 from links.viewer import Viewer
-from links.viewer.mailbox import Mailbox
-from links.viewer.slices import Slicer, join, thin
+from links.viewer.message_queue import MessageQueue, Slicer, join, thin
 from tests.links.ports import free_port
 
 
@@ -45,48 +44,48 @@ def ticks(number: int, start_ns: int = 0) -> list[Tick]:
     return [Tick(stamp_ns=start_ns + k * 1_000_000, count=k) for k in range(number)]
 
 
-def test_a_full_box_drops_the_oldest_and_counts_it_by_output():
-    box: Mailbox[int] = Mailbox(3, lossless=False, patience_s=1.0)
+def test_a_full_queue_drops_the_oldest_and_counts_it_by_output():
+    queue: MessageQueue[int] = MessageQueue(3, lossless=False, timeout_s=1.0)
     for k in range(5):
-        box.put("early" if k < 2 else "late", k)
-    assert box.take() == [("late", 2), ("late", 3), ("late", 4)]
-    assert box.dropped == {"early": 2}
+        queue.put("early" if k < 2 else "late", k)
+    assert queue.take() == [("late", 2), ("late", 3), ("late", 4)]
+    assert queue.dropped == {"early": 2}
 
 
-def test_a_lossless_box_waits_and_keeps_everything_in_order():
-    box: Mailbox[int] = Mailbox(4, lossless=True, patience_s=10.0)
+def test_a_lossless_queue_blocks_and_keeps_everything_in_order():
+    queue: MessageQueue[int] = MessageQueue(4, lossless=True, timeout_s=10.0)
     got: list[int] = []
 
     def take_all() -> None:
-        while (items := box.take()) is not None:
+        while (items := queue.take()) is not None:
             got.extend(item for _, item in items)
 
-    taker = threading.Thread(target=take_all)
-    taker.start()
+    consumer = threading.Thread(target=take_all)
+    consumer.start()
     for k in range(500):
-        box.put("x", k)
-    box.close()
-    taker.join(10.0)
+        queue.put("x", k)
+    queue.close()
+    consumer.join(10.0)
     assert got == list(range(500))
-    assert not box.dropped
+    assert not queue.dropped
 
 
-def test_a_lossless_box_does_not_wait_for_a_stalled_taker_for_ever():
-    box: Mailbox[int] = Mailbox(2, lossless=True, patience_s=0.05)
+def test_a_lossless_queue_stops_blocking_for_a_stalled_consumer():
+    queue: MessageQueue[int] = MessageQueue(2, lossless=True, timeout_s=0.05)
     for k in range(100):  # waits once, not a hundred times
-        box.put("x", k)
-    assert box.dropped == {"x": 98}
-    assert box.take() == [("x", 98), ("x", 99)]
+        queue.put("x", k)
+    assert queue.dropped == {"x": 98}
+    assert queue.take() == [("x", 98), ("x", 99)]
 
 
-def test_a_closed_box_takes_no_more_and_says_so():
-    box: Mailbox[int] = Mailbox(2, lossless=True, patience_s=10.0)
-    box.put("x", 1)
-    box.close()
-    box.put("x", 2)
-    assert box.take() == [("x", 1)]
-    assert box.take() is None
-    assert box.dropped == {"x": 1}
+def test_a_closed_queue_accepts_no_more_and_counts_drops():
+    queue: MessageQueue[int] = MessageQueue(2, lossless=True, timeout_s=10.0)
+    queue.put("x", 1)
+    queue.close()
+    queue.put("x", 2)
+    assert queue.take() == [("x", 1)]
+    assert queue.take() is None
+    assert queue.dropped == {"x": 1}
 
 
 def test_packets_are_joined_to_slices_without_losing_a_pulse():
@@ -98,7 +97,7 @@ def test_packets_are_joined_to_slices_without_losing_a_pulse():
     assert sum(content.pulses for _, _, content in ready) == 160 * 384
     together = np.concatenate([content.xyz_vehicle_m for _, _, content in ready])
     np.testing.assert_array_equal(together, np.concatenate([swept.xyz_vehicle_m for _, swept in packets]))
-    assert [stamp_ns for _, stamp_ns, _ in ready][-1] == packets[-1][1].stamp_ns  # where its last packet stands
+    assert [stamp_ns for _, stamp_ns, _ in ready][-1] == packets[-1][1].stamp_ns  # stamp of the last packet
 
 
 def test_time_that_jumps_back_starts_a_new_slice():
@@ -128,7 +127,7 @@ def test_thinning_keeps_every_lone_return():
     assert thin(np.zeros((0, 3), np.float32), 10).size == 0
 
 
-def test_every_edge_of_a_run_is_in_the_file_on_the_sensors_time(tmp_path):
+def test_every_edge_of_a_run_is_in_the_file_on_sensor_time(tmp_path):
     viewer = Viewer(lossless=True, queue_size=64, mount=synthetic.MOUNT)
     viewer.open(a_run(tmp_path))
     for output, content in synthetic.run(2.75):
@@ -146,7 +145,7 @@ def test_every_edge_of_a_run_is_in_the_file_on_the_sensors_time(tmp_path):
         "/depth/sweep/depth_image",
         "/score/detect/score_image",
         "/vehicle/detect/detections/accepted",
-        "/marks/detect/detections/accepted",
+        "/overlays/detect/detections/accepted",
         "/vehicle/track/drone_fix/drone_1/ellipsoid_95",
         "/plots/hits/track/track_state/drone_1",
         "/states/track",
@@ -159,7 +158,7 @@ def test_every_edge_of_a_run_is_in_the_file_on_the_sensors_time(tmp_path):
 
 
 @pytest.mark.parametrize(("start_ns", "kind"), [(0, "duration"), (1_760_000_000_000_000_000, "timestamp")])
-def test_the_timeline_counts_from_1970_or_from_the_start(tmp_path, start_ns, kind):
+def test_the_timeline_counts_from_1970_or_from_the_start_of_the_run(tmp_path, start_ns, kind):
     viewer = Viewer(lossless=True)
     viewer.open(a_run(tmp_path))
     for tick in ticks(3, start_ns):
@@ -176,7 +175,7 @@ def test_the_timeline_counts_from_1970_or_from_the_start(tmp_path, start_ns, kin
     assert times.cast("int64").to_pylist() == [start_ns, start_ns + 1_000_000, start_ns + 2_000_000]
 
 
-def test_what_did_not_fit_is_counted_and_the_newest_is_drawn(tmp_path):
+def test_dropped_messages_are_counted_and_the_newest_is_drawn(tmp_path):
     viewer = Viewer(queue_size=10)
     viewer.open(a_run(tmp_path))
     for tick in ticks(5000):  # faster than Rerun's first log()
@@ -185,7 +184,7 @@ def test_what_did_not_fit_is_counted_and_the_newest_is_drawn(tmp_path):
     dropped = viewer.dropped["clock.tick"]
     found = rows(tmp_path / "run.rrd")
     assert found["/plots/other/clock/tick/count"] + dropped == 5000
-    assert found["/log/viewer"] >= 1  # the recording itself says that it has gaps
+    assert found["/log/viewer"] >= 1  # the recording reports its own gaps
 
 
 def test_a_message_that_cannot_be_drawn_is_counted_and_the_next_one_is(tmp_path):
@@ -204,7 +203,7 @@ def test_a_message_that_cannot_be_drawn_is_counted_and_the_next_one_is(tmp_path)
 
 
 def test_a_folder_that_cannot_be_written_is_an_error_of_the_viewer_not_of_the_run(tmp_path):
-    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "file").write_text("not a folder")
     viewer = Viewer(lossless=True)
     viewer.open(a_run(tmp_path / "file" / "run"))
     for tick in ticks(100):
@@ -215,7 +214,7 @@ def test_a_folder_that_cannot_be_written_is_an_error_of_the_viewer_not_of_the_ru
 
 
 def test_a_full_disk_does_not_stop_the_run(tmp_path):
-    """Files of this process may have 300 kB, which is as a full disk: said once, no hang at the end or at exit."""
+    """Files of this process may have 300 kB, which is as a full disk: logged once, no hang at the end or at exit."""
     script = f"""
 import resource, sys
 sys.path[:0] = [{str(Path(__file__).parent)!r}]
@@ -235,13 +234,13 @@ sys.stdout.write(repr(list(viewer.errors.items())))
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=root, capture_output=True, text=True, timeout=60, check=True
     )
-    assert "run.rrd ends early: File too large" in done.stdout
+    assert "run.rrd is truncated: File too large" in done.stdout
     assert done.stdout.endswith("1)]")
     assert (tmp_path / "run.rrd").stat().st_size == 300_000
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
-def test_no_space_left_is_said_once(tmp_path):
+def test_no_space_left_is_reported_once(tmp_path):
     (tmp_path / "run.rrd").symlink_to("/dev/full")
     viewer = Viewer(lossless=True)
     viewer.open(a_run(tmp_path))
@@ -249,16 +248,16 @@ def test_no_space_left_is_said_once(tmp_path):
         viewer.see(output, content, 0)
     viewer.close()
     ((text, count),) = viewer.errors.items()
-    assert "run.rrd ends early: No space left on device" in text
+    assert "run.rrd is truncated: No space left on device" in text
     assert count == 1
 
 
-def test_a_logging_thread_that_dies_does_not_hold_up_the_run(tmp_path, monkeypatch):
-    class Surprise(Exception):
-        """Not among the errors that drawing may have."""
+def test_a_logging_thread_that_dies_does_not_block_the_run(tmp_path, monkeypatch):
+    class UnexpectedError(Exception):
+        """Not one of `DRAWING_ERRORS`."""
 
     def broken(*_: object):
-        raise Surprise
+        raise UnexpectedError
 
     monkeypatch.setattr("links.viewer.viewer.draw", broken)
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
@@ -297,10 +296,10 @@ def test_a_serving_run_listens_on_loopback_only(tmp_path):
     viewer.see("clock.tick", ticks(1)[0], 0)
     viewer.close()
     assert viewer.errors == {}
-    assert rows(tmp_path / "run.rrd")["/plots/other/clock/tick/count"] == 1  # the file is written beside
+    assert rows(tmp_path / "run.rrd")["/plots/other/clock/tick/count"] == 1  # the file is written as well
 
 
-def test_a_taken_port_is_said_and_the_file_is_written_all_the_same(tmp_path):
+def test_a_port_in_use_is_reported_and_the_file_is_written(tmp_path):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -309,17 +308,17 @@ def test_a_taken_port_is_said_and_the_file_is_written_all_the_same(tmp_path):
         viewer.see("clock.tick", ticks(1)[0], 0)
         viewer.close()
     (text,) = viewer.errors
-    assert text.startswith(f"port {viewer.settings.port} is taken")
+    assert text.startswith(f"port {viewer.settings.port} is in use")
     assert rows(tmp_path / "run.rrd")["/plots/other/clock/tick/count"] == 1
 
 
-def test_without_file_and_server_nothing_is_drawn_and_nothing_fails(tmp_path, monkeypatch):
+def test_without_file_and_server_nothing_is_drawn(tmp_path, monkeypatch):
     def never(*_: object):
         raise ValueError
 
     monkeypatch.setattr("links.viewer.viewer.draw", never)
     viewer = Viewer(file=None)
-    assert not viewer.wants(type(ticks(1)[0])), "a live run hands it nothing"
+    assert not viewer.wants(type(ticks(1)[0])), "a live run sends it nothing"
     assert Viewer(file=None, serve=True).wants(type(ticks(1)[0]))
     viewer.open(a_run(tmp_path))
     viewer.see("clock.tick", ticks(1)[0], 0)
@@ -332,6 +331,6 @@ def test_without_file_and_server_nothing_is_drawn_and_nothing_fails(tmp_path, mo
     "wrong",
     [{"port": 80}, {"queue_size": 0}, {"slice_s": 0}, {"memory_limit": "much"}, {"history_s": -1}, {"host": "0.0.0.0"}],
 )
-def test_an_impossible_setting_is_refused(wrong):
+def test_an_impossible_setting_is_rejected(wrong):
     with pytest.raises(ValidationError):
         Viewer(**wrong)

@@ -1,4 +1,4 @@
-"""Pictures with the lines found in them: where they lie, which colour they have, what is said without them."""
+"""Images with their lines: positions, colours, and the text without directions."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ import cv2
 import numpy as np
 import pytest
 import synthetic_vision
+from drawing import document, drawn, numbers, scene, values_of
 from pydantic import ValidationError
 from rerun.chunk import RrdReader
-from shown import drawn, numbers, page, scene, words
-from synthetic_vision import directions, one_line, picture
+from synthetic_vision import camera_image, directions, one_line
 
 from flow.link import Run
 from links.viewer import Viewer, colours
 from links.viewer.draw import draw
 from links.viewer.draw_cameras import direction_colours
+from links.viewer.entities import strip_batch
 from links.viewer.lenses import Cameras, arcs, strips
-from links.viewer.marks import strip_batch
 from stages.messages import CameraMount, FollowedFeatures
 
 VP, LINES = "vp_vehicle/vanishing_directions", "camera/camera_vehicle/vp_vehicle/vanishing_directions/lines"
 
 
-def seeing(**changes):
+def camera_scene(**changes):
     return scene(cameras=synthetic_vision.CAMERAS, **changes)
 
 
@@ -37,7 +37,7 @@ def test_an_arc_lies_on_its_great_circle_from_end_to_end_in_equal_steps():
     np.testing.assert_allclose(np.sum(points[1:] * points[:-1], axis=1), np.cos(np.deg2rad(18.0)), atol=1e-12)
 
 
-def test_arcs_of_any_length_keep_their_order_and_a_point_is_an_arc_too():
+def test_arcs_of_any_length_keep_their_order_and_a_point_is_an_arc():
     z = np.array([0.0, 0.0, 1.0])
     points, arc = arcs(np.array([[z, z], [z, [1.0, 0.0, 0.0]]]), step_rad=np.deg2rad(50.0))
     np.testing.assert_array_equal(arc, [0, 0, 1, 1, 1])
@@ -48,7 +48,7 @@ def test_arcs_of_any_length_keep_their_order_and_a_point_is_an_arc_too():
     assert len(none) == 0
 
 
-def test_a_strip_ends_where_the_lens_sees_no_more_and_goes_on_behind():
+def test_a_strip_is_split_at_points_outside_the_field_of_view():
     nan = np.nan
     points = np.array([[0.0, 0], [1, 0], [nan, nan], [3, 0], [4, 0], [5, 5], [nan, nan], [7, 7], [8, 8]])
     drawn, lengths, owner = strips(points, np.array([0, 0, 0, 0, 0, 1, 1, 2, 2]))
@@ -61,11 +61,11 @@ def test_a_strip_ends_where_the_lens_sees_no_more_and_goes_on_behind():
         assert (len(lengths), len(owner), strip_batch(drawn, lengths).to_pylist()) == (0, 0, [])
 
 
-def test_a_picture_is_a_small_jpeg_of_its_own_view():
-    marks = drawn(picture(), "camera_vehicle/image", seeing())
-    assert set(marks) == {"camera/camera_vehicle/picture"}
-    shown = marks["camera/camera_vehicle/picture"].parts[0]
-    assert words(shown.media_type) == ["image/jpeg"]
+def test_an_image_is_a_small_jpeg_of_its_camera():
+    entities = drawn(camera_image(), "camera_vehicle/image", camera_scene())
+    assert set(entities) == {"camera/camera_vehicle/image"}
+    shown = entities["camera/camera_vehicle/image"].archetypes[0]
+    assert values_of(shown.media_type) == ["image/jpeg"]
     data = np.frombuffer(bytes(shown.blob.as_arrow_array().to_pylist()[0]), np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     assert image.shape == (480, 480)
@@ -73,72 +73,74 @@ def test_a_picture_is_a_small_jpeg_of_its_own_view():
     np.testing.assert_allclose(image[240].astype(float), np.linspace(30, 220, 480), atol=4.0)
 
 
-def test_a_picture_is_never_enlarged_and_keeps_its_shape():
-    where = seeing()
-    drawn(dataclasses.replace(picture(), grey=np.zeros((300, 960), np.uint8)), "x/image", where)
+def test_an_image_is_never_enlarged_and_keeps_its_shape():
+    where = camera_scene()
+    drawn(dataclasses.replace(camera_image(), grey=np.zeros((300, 960), np.uint8)), "x/image", where)
     np.testing.assert_allclose(
-        where.pictures["camera_vehicle"].shown(np.array([[-0.5, -0.5], [959.5, 299.5]])), [[0, 0], [480, 150]]
+        where.images["camera_vehicle"].scaled(np.array([[-0.5, -0.5], [959.5, 299.5]])), [[0, 0], [480, 150]]
     )
-    small = picture(1, size_px=64)
+    small = camera_image(1, size_px=64)
     drawn(small, "x/image", where)
-    assert where.pictures["camera_vehicle"].factor == 1.0
+    assert where.images["camera_vehicle"].scale == 1.0
 
 
-def test_a_live_run_shows_some_of_the_pictures_and_a_lossless_one_all():
+def test_a_live_run_logs_some_of_the_images_and_a_lossless_one_all():
     for every_s, count in ((0.0, 10), (0.2, 5)):
-        where = seeing(picture_every_s=every_s)
-        shown = [drawn(picture(k * 100_000_000), "camera_vehicle/image", where) for k in range(10)]
+        where = camera_scene(image_period_s=every_s)
+        shown = [drawn(camera_image(k * 100_000_000), "camera_vehicle/image", where) for k in range(10)]
         assert sum(map(bool, shown)) == count
-        assert drawn(picture(0, "camera_drone"), "camera_drone/image", where)  # each camera by itself
-        assert drawn(picture(0), "camera_vehicle/image", where)  # time jumped back: a new beginning
+        assert drawn(camera_image(0, "camera_drone"), "camera_drone/image", where)  # each camera by itself
+        assert drawn(camera_image(0), "camera_vehicle/image", where)  # the time jumped back
 
 
-def test_a_line_lies_where_the_lens_puts_its_rays():
-    where = seeing()
-    drawn(picture(), "camera_vehicle/image", where)
+def test_a_line_is_drawn_at_the_projection_of_its_rays():
+    where = camera_scene()
+    drawn(camera_image(), "camera_vehicle/image", where)
     low, high = np.deg2rad(95.0), np.deg2rad(30.0)  # off the axis, which is up
     ends = np.array([[np.sin(low), 0, np.cos(low)], [np.sin(high), 0, np.cos(high)]])  # towards the vehicle's front
-    marks = drawn(one_line(ends), VP, where)
-    (strip,) = numbers(marks[LINES].parts[0].strips)
+    entities = drawn(one_line(ends), VP, where)
+    (strip,) = numbers(entities[LINES].archetypes[0].strips)
     # Rz(90 deg): x_camera = y_vehicle, y_camera = -x_vehicle. r = f theta; 480 of 720 px, pixel centres at + 0.5
     away = (2 / 3) * synthetic_vision.FOCAL_PX * np.array([low, high])
     np.testing.assert_allclose(strip[[0, -1]], np.stack([[240.0, 240.0], 240.0 - away], axis=1), atol=1e-3)
     np.testing.assert_allclose(strip[:, 0], 240.0, atol=1e-3)  # a line through the axis stays straight
-    points = numbers(marks[LINES.replace("lines", "points")].parts[0].positions)
-    np.testing.assert_allclose(points, [[240.0, 240.0]], atol=1e-3)  # the zenith; the nadir is not seen
+    points = numbers(entities[LINES.replace("lines", "points")].archetypes[0].positions)
+    np.testing.assert_allclose(
+        points, [[240.0, 240.0]], atol=1e-3
+    )  # the zenith; the nadir is outside the field of view
 
 
 def test_the_drones_camera_looks_down():
-    where = seeing()
-    drawn(picture(0, "camera_drone"), "camera_drone/image", where)
+    where = camera_scene()
+    drawn(camera_image(0, "camera_drone"), "camera_drone/image", where)
     ends = np.array([[0.0, 0.0, -1.0], [np.sin(0.5), 0.0, -np.cos(0.5)]])
-    marks = drawn(one_line(ends, camera_mount=CameraMount.DRONE), "vp_drone/vanishing_directions", where)
-    (strip,) = numbers(marks["camera/camera_drone/vp_drone/vanishing_directions/lines"].parts[0].strips)
+    entities = drawn(one_line(ends, camera_mount=CameraMount.DRONE), "vp_drone/vanishing_directions", where)
+    (strip,) = numbers(entities["camera/camera_drone/vp_drone/vanishing_directions/lines"].archetypes[0].strips)
     R = synthetic_vision.CAMERAS.of(CameraMount.DRONE).pose().matrix()[:3, :3]
     ahead = R.T @ [1.0, 0.0, 0.0]
     expected = 240.0 + (2 / 3) * synthetic_vision.FOCAL_PX * 0.5 * ahead[:2]
     np.testing.assert_allclose(strip[0], [240.0, 240.0], atol=1e-3)
     np.testing.assert_allclose(strip[-1], expected, atol=1e-3)
-    marks = {"sphere": marks["sphere/vp_drone/vanishing_directions/directions"]}
-    assert marks["sphere"].frame == "sphere_drone"
+    entities = {"sphere": entities["sphere/vp_drone/vanishing_directions/directions"]}
+    assert entities["sphere"].frame == "sphere_drone"
 
 
 def test_each_line_has_the_colour_of_its_direction():
     full, pale = colours.PAIRS[0]
     second = colours.PAIRS[1]
-    expected = [colours.VERTICAL, full, pale, second[1], second[0]]  # of each pair the one nearer to x is the full one
+    expected = [colours.VERTICAL, full, pale, second[1], second[0]]  # in each pair the one nearer to x is saturated
     np.testing.assert_array_equal(direction_colours(directions()), expected)
-    where = seeing()
-    drawn(picture(), "camera_vehicle/image", where)
+    where = camera_scene()
+    drawn(camera_image(), "camera_vehicle/image", where)
     message = directions()
-    marks = drawn(message, VP, where)
-    on_sphere = numbers(marks[f"sphere/{VP}/lines"].parts[0].colors)
+    entities = drawn(message, VP, where)
+    on_sphere = numbers(entities[f"sphere/{VP}/lines"].archetypes[0].colors)
     np.testing.assert_array_equal(on_sphere, np.repeat([*expected, colours.UNASSIGNED], 5))
-    through = marks[f"sphere/{VP}/directions"]
+    through = entities[f"sphere/{VP}/directions"]
     assert through.frame == "sphere_vehicle"
-    np.testing.assert_array_equal(numbers(through.parts[0].colors), expected)
-    np.testing.assert_allclose(numbers(through.parts[0].strips)[1], [[-1.15, 0, 0], [1.15, 0, 0]], atol=1e-6)
-    assert len({int(c) for c in numbers(marks[LINES].parts[0].colors)}) == 6
+    np.testing.assert_array_equal(numbers(through.archetypes[0].colors), expected)
+    np.testing.assert_allclose(numbers(through.archetypes[0].strips)[1], [[-1.15, 0, 0], [1.15, 0, 0]], atol=1e-6)
+    assert len({int(c) for c in numbers(entities[LINES].archetypes[0].colors)}) == 6
 
 
 def test_a_pair_keeps_its_colours_when_its_directions_change_order():
@@ -149,67 +151,67 @@ def test_a_pair_keeps_its_colours_when_its_directions_change_order():
     assert direction_colours(many)[1] == colours.PAIRS[7 % len(colours.PAIRS)][0]
 
 
-def test_a_picture_without_directions_says_why_on_it_and_once_in_the_log():
-    where = seeing()
-    said = []
+def test_an_image_without_directions_shows_the_reason_and_logs_it_once():
+    where = camera_scene()
+    logged = []
     for k, count in enumerate((3, 0, 0, 3)):
-        drawn(picture(k), "camera_vehicle/image", where)
-        marks = drawn(directions(k, count=count), VP, where)
-        on_it = words(marks[LINES.replace("lines", "reason")].parts[0].labels) or []
+        drawn(camera_image(k), "camera_vehicle/image", where)
+        entities = drawn(directions(k, count=count), VP, where)
+        on_it = values_of(entities[LINES.replace("lines", "reason")].archetypes[0].labels) or []
         assert on_it == ([] if count else ["no structure: 5 lines, a pair needs 4"])
-        said += [words(marks[f"log/{VP}"].parts[0].text)[0]] if f"log/{VP}" in marks else []
-        lane = words(marks["states/vp_vehicle"].parts[0].state) if "states/vp_vehicle" in marks else []
-        assert lane == [["directions"], ["no directions"], [], ["directions"]][k]
-    assert said[0] == "no structure: 5 lines, a pair needs 4"
-    assert said[1:] == ["again vertical +-0.10 deg, pair 1 +-0.20 deg, pair 1 +-0.30 deg; 15 of 20 lines"]
-    np.testing.assert_allclose(marks[f"plots/other/{VP}/lines"].values, [20, 15])
-    np.testing.assert_allclose(marks[f"plots/other/{VP}/sigma"].values, [0.1, 0.3])
-    assert "**vp_vehicle:** vertical" in page(marks["now"])
+        logged += [values_of(entities[f"log/{VP}"].archetypes[0].text)[0]] if f"log/{VP}" in entities else []
+        states = values_of(entities["states/vp_vehicle"].archetypes[0].state) if "states/vp_vehicle" in entities else []
+        assert states == [["directions"], ["no directions"], [], ["directions"]][k]
+    assert logged[0] == "no structure: 5 lines, a pair needs 4"
+    assert logged[1:] == ["found again: vertical +-0.10 deg, pair 1 +-0.20 deg, pair 1 +-0.30 deg; 15 of 20 lines"]
+    np.testing.assert_allclose(entities[f"plots/other/{VP}/lines"].values, [20, 15])
+    np.testing.assert_allclose(entities[f"plots/other/{VP}/sigma"].values, [0.1, 0.3])
+    assert "**vp_vehicle:** vertical" in document(entities["status"])
 
 
-def test_no_line_at_all_is_no_error():
-    where = seeing()
-    drawn(picture(), "camera_vehicle/image", where)
+def test_an_image_without_lines_is_drawn():
+    where = camera_scene()
+    drawn(camera_image(), "camera_vehicle/image", where)
     empty = directions(count=0)
     none = {name: getattr(empty, name)[:0] for name in ("line_end", "line_normal", "line_sigma_rad", "line_direction")}
-    marks = drawn(dataclasses.replace(empty, **none), VP, where)
-    assert len(marks[LINES].parts[0].strips.as_arrow_array()) == 0
+    entities = drawn(dataclasses.replace(empty, **none), VP, where)
+    assert len(entities[LINES].archetypes[0].strips.as_arrow_array()) == 0
 
 
-def test_lines_stand_on_their_own_picture_only():
-    where = seeing(picture_every_s=0.2)
-    drawn(picture(0), "camera_vehicle/image", where)
+def test_lines_are_drawn_on_the_image_of_their_stamp_only():
+    where = camera_scene(image_period_s=0.2)
+    drawn(camera_image(0), "camera_vehicle/image", where)
     assert LINES in drawn(directions(0), VP, where)
-    drawn(picture(100_000_000), "camera_vehicle/image", where)  # left out
-    marks = drawn(directions(100_000_000), VP, where)
-    assert LINES not in marks
-    assert f"sphere/{VP}/lines" in marks
+    drawn(camera_image(100_000_000), "camera_vehicle/image", where)  # not logged
+    entities = drawn(directions(100_000_000), VP, where)
+    assert LINES not in entities
+    assert f"sphere/{VP}/lines" in entities
 
 
-def test_a_picture_without_its_lens_says_what_to_set_and_the_rest_is_drawn():
+def test_an_image_without_a_lens_names_the_setting_and_the_rest_is_drawn():
     where = scene()
-    drawn(picture(), "camera_vehicle/image", where)
+    drawn(camera_image(), "camera_vehicle/image", where)
     paths = []
 
     def draw_all() -> None:
-        for mark in draw(directions(), VP, where):
-            paths.append(mark.path)
+        for entity in draw(directions(), VP, where):
+            paths.append(entity.path)
 
-    with pytest.raises(LookupError, match=r"no lens for the picture of camera_vehicle.*cameras: \$rig\.cameras"):
+    with pytest.raises(LookupError, match=r"no lens for the image of camera_vehicle.*cameras: \$rig\.cameras"):
         draw_all()
     assert f"sphere/{VP}/lines" in paths
 
 
-def test_a_lens_of_another_size_is_refused():
-    where = seeing()
-    drawn(picture(size_px=480), "camera_vehicle/image", where)
+def test_a_lens_of_another_image_size_is_rejected():
+    where = camera_scene()
+    drawn(camera_image(size_px=480), "camera_vehicle/image", where)
     with pytest.raises(ValueError, match="480 px wide, its lens in `cameras` is for 720"):
         drawn(directions(), VP, where)
 
 
-def test_the_rigs_cameras_are_taken_as_they_are_and_a_wrong_one_is_named():
-    assert synthetic_vision.CAMERAS.named() == ["camera_vehicle", "camera_drone"]
-    assert Cameras().named() == []
+def test_the_cameras_of_the_rig_are_valid_and_a_wrong_one_is_named():
+    assert synthetic_vision.CAMERAS.frame_ids() == ["camera_vehicle", "camera_drone"]
+    assert Cameras().frame_ids() == []
     swapped = {"vehicle": synthetic_vision.RIG_CAMERAS["drone"]}
     with pytest.raises(ValidationError, match="T_vehicle_camera"):
         Cameras.model_validate(swapped)
@@ -226,28 +228,28 @@ def record(folder, viewer, mermaid=synthetic_vision.MERMAID, seconds=0.35):
     return {chunk.entity_path for chunk in chunks}
 
 
-def test_a_run_without_lenses_counts_each_picture_that_has_no_lines(tmp_path):
+def test_a_run_without_lenses_counts_each_image_without_lines(tmp_path):
     viewer = Viewer(lossless=True)
-    entities = record(tmp_path, viewer)
+    paths = record(tmp_path, viewer)
     assert {text.split(":")[0] for text in viewer.errors} == {
         "vp_vehicle.vanishing_directions could not be drawn",
         "vp_drone.vanishing_directions could not be drawn",
     }
     assert set(viewer.errors.values()) == {4}
-    assert "/camera/camera_drone/picture" in entities
-    assert f"/{LINES}" not in entities
+    assert "/camera/camera_drone/image" in paths
+    assert f"/{LINES}" not in paths
 
 
-def test_a_run_with_lenses_has_everything_of_the_cameras(tmp_path):
+def test_a_run_with_lenses_has_all_camera_entities(tmp_path):
     viewer = Viewer(lossless=True, cameras=synthetic_vision.CAMERAS)
-    entities = record(tmp_path, viewer)
+    paths = record(tmp_path, viewer)
     assert viewer.errors == {}
     assert {
         f"/{LINES}",
-        "/sphere/drone/ball",
+        "/sphere/drone/surface",
         "/frames/sphere_drone",
         "/plots/branch/align/relative_rotation",
-    } <= entities
+    } <= paths
 
 
 def test_a_graph_without_cameras_has_no_sphere(tmp_path):
@@ -255,12 +257,12 @@ def test_a_graph_without_cameras_has_no_sphere(tmp_path):
     viewer.open(Run(out_dir=tmp_path, name="test", mermaid="flowchart LR\n", settings_yaml=""))
     viewer.see("track.track_state", next(c for o, c in synthetic_vision.run(0.1) if o == "track.track_state"), 0)
     viewer.close()
-    entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "run.rrd").stream().to_chunks()}
-    assert not {path for path in entities if "sphere" in path}
+    paths = {chunk.entity_path for chunk in RrdReader(tmp_path / "run.rrd").stream().to_chunks()}
+    assert not {path for path in paths if "sphere" in path}
 
 
 def followed(stamp_ns: int = 0) -> FollowedFeatures:
-    """Two that agree with the motion and one that does not."""
+    """Two inliers of the motion and one outlier."""
     return FollowedFeatures(
         stamp_ns=stamp_ns,
         frame_id="camera_vehicle",
@@ -272,22 +274,22 @@ def followed(stamp_ns: int = 0) -> FollowedFeatures:
     )
 
 
-def test_features_are_strokes_on_their_picture_green_where_they_agree():
-    where, name = seeing(), "ego/followed_features"
-    drawn(picture(), "camera_vehicle/image", where)
-    marks = drawn(followed(), name, where)
-    strokes = marks[f"camera/camera_vehicle/{name}/strokes"].parts[0]
+def test_features_are_displacements_on_their_image_green_for_inliers():
+    where, name = camera_scene(), "ego/followed_features"
+    drawn(camera_image(), "camera_vehicle/image", where)
+    entities = drawn(followed(), name, where)
+    displacements = entities[f"camera/camera_vehicle/{name}/displacements"].archetypes[0]
     shown = 480 / 720 * (np.array([[[100.0, 200.0], [110.0, 200.0]]]) + 0.5)
-    np.testing.assert_allclose(numbers(strokes.strips).reshape(3, 2, 2)[:1], shown, atol=1e-4)
-    np.testing.assert_array_equal(numbers(strokes.colors), [colours.GOOD, colours.GOOD, colours.BAD])
-    ends = marks[f"camera/camera_vehicle/{name}/ends"].parts[0]
+    np.testing.assert_allclose(numbers(displacements.strips).reshape(3, 2, 2)[:1], shown, atol=1e-4)
+    np.testing.assert_array_equal(numbers(displacements.colors), [colours.GOOD, colours.GOOD, colours.BAD])
+    ends = entities[f"camera/camera_vehicle/{name}/ends"].archetypes[0]
     np.testing.assert_allclose(numbers(ends.positions)[2], 480 / 720 * np.array([500.5, 190.5]), atol=1e-4)
-    np.testing.assert_allclose(marks[f"plots/other/{name}/features"].values, [3, 2])
-    np.testing.assert_allclose(marks[f"plots/other/{name}/residual"].values, [0.2])
+    np.testing.assert_allclose(entities[f"plots/other/{name}/features"].values, [3, 2])
+    np.testing.assert_allclose(entities[f"plots/other/{name}/residual"].values, [0.2])
 
 
-def test_features_of_a_picture_left_out_are_numbers_only():
-    marks = drawn(followed(stamp_ns=5), "ego/followed_features", seeing())
-    assert set(marks) == {"plots/other/ego/followed_features/features", "plots/other/ego/followed_features/residual"}
+def test_features_of_an_image_not_logged_are_curves_only():
+    entities = drawn(followed(stamp_ns=5), "ego/followed_features", camera_scene())
+    assert set(entities) == {"plots/other/ego/followed_features/features", "plots/other/ego/followed_features/residual"}
     none = dataclasses.replace(followed(), agrees=np.zeros(3, bool))
-    assert set(drawn(none, "ego/followed_features", seeing())) == {"plots/other/ego/followed_features/features"}
+    assert set(drawn(none, "ego/followed_features", camera_scene())) == {"plots/other/ego/followed_features/features"}

@@ -1,4 +1,4 @@
-"""Candidates with reasons, answers with probabilities, several drones with states: what is seen of them, by hand."""
+"""Candidates with reasons, detections with probabilities, several drones with states: entities computed by hand."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import rerun as rr
 import synthetic
-from shown import drawn, numbers, page, scene, words
+from drawing import document, drawn, numbers, scene, values_of
 
 from links.viewer import colours
-from links.viewer.slices import Slicer
+from links.viewer.message_queue import Slicer
 from stages.messages import Candidates, ServoGoal, SweptPulses, TrackingState, TrackState, VehicleMotion
 
 
 def candidates(stamp_ns: int, **found: tuple[float, str]) -> Candidates:
-    """`c7=(0.2, "why")`: candidate 7, 7 m up, hit 0.5 s ago."""
+    """`c7=(0.2, "why")`: candidate 7, 7 m above the vehicle, last return 0.5 s ago."""
     numbers_ = [int(name[1:]) for name in found]
     n = len(found)
     return Candidates(
@@ -26,7 +26,7 @@ def candidates(stamp_ns: int, **found: tuple[float, str]) -> Candidates:
         velocity_vehicle_mps=np.zeros((n, 3)),
         probability=np.array([p for p, _ in found.values()]),
         seen_ns=np.full(n, stamp_ns - 500_000_000),
-        looks=np.full(n, 3),
+        scan_passes=np.full(n, 3),
         reasons=tuple(why for _, why in found.values()),
     )
 
@@ -58,52 +58,55 @@ def fix(number: int = 1, stamp_ns: int = 0, x_m: float = 3.0):
     )
 
 
-def test_a_candidate_is_a_dot_by_probability_with_number_and_reason():
-    found = candidates(0, c7=(0.2, "it may stand still"), c3=(0.999, "9 looks"))
-    marks = drawn(found, "detect/candidates")
-    dots = marks["vehicle/detect/candidates"]
+def test_a_candidate_is_a_coloured_point_with_number_and_reason():
+    found = candidates(0, c7=(0.2, "it may be static"), c3=(0.999, "9 looks"))
+    entities = drawn(found, "detect/candidates")
+    dots = entities["vehicle/detect/candidates"]
     assert dots.frame == "vehicle"
-    np.testing.assert_allclose(numbers(dots.parts[0].positions), [[1, 2, 7], [1, 2, 3]])
-    assert words(dots.parts[0].labels) == ["candidate 7: 20.0 %, it may stand still", "candidate 3: 99.9 %, 9 looks"]
-    assert words(marks["labels/detect/candidates"].parts[0].labels) == ["7: 20.0 %", "3: 99.9 %"]
-    packed = numbers(dots.parts[0].colors).astype(int).ravel().tolist()
+    np.testing.assert_allclose(numbers(dots.archetypes[0].positions), [[1, 2, 7], [1, 2, 3]])
+    assert values_of(dots.archetypes[0].labels) == [
+        "candidate 7: 20.0 %, it may be static",
+        "candidate 3: 99.9 %, 9 looks",
+    ]
+    assert values_of(entities["labels/detect/candidates"].archetypes[0].labels) == ["7: 20.0 %", "3: 99.9 %"]
+    packed = numbers(dots.archetypes[0].colors).astype(int).ravel().tolist()
     assert packed == colours.by_probability(found.probability).tolist()
-    percent = marks["plots/probability/detect/candidates"].values
+    percent = entities["plots/probability/detect/candidates"].values
     np.testing.assert_allclose(percent, [99.9, 20.0])
-    text = page(marks["candidates"])
-    assert "- 7: 20.0 %, seen 0.5 s ago at 1.0 / 2.0 / 7.0 m: it may stand still" in text
+    text = document(entities["candidates"])
+    assert "- 7: 20.0 %, last return 0.5 s ago at 1.0 / 2.0 / 7.0 m: it may be static" in text
 
 
-def test_colours_go_from_red_over_violet_to_green_evenly_in_the_odds():
+def test_colours_go_from_red_over_violet_to_green_linearly_in_the_log_odds():
     red, low, even, high, green = colours.by_probability(np.array([0.0, 0.1, 0.5, 0.9, 1.0])).tolist()
     assert (red, green) == (0xE07070FF, colours.ACCEPTED)
-    assert [(even >> shift & 255) - (colours.MAYBE >> shift & 255) for shift in (24, 16, 8, 0)] == pytest.approx(
+    assert [(even >> shift & 255) - (colours.CANDIDATE >> shift & 255) for shift in (24, 16, 8, 0)] == pytest.approx(
         [0] * 4, abs=2
     )
     assert len({red, low, even, high, green}) == 5
 
 
-def test_no_candidate_takes_the_dots_away():
+def test_an_empty_list_of_candidates_removes_the_points():
     where = scene()
     drawn(candidates(0, c1=(0.1, "x")), "detect/candidates", where)
-    marks = drawn(candidates(1), "detect/candidates", where)
-    assert len(numbers(marks["vehicle/detect/candidates"].parts[0].positions)) == 0
-    assert len(numbers(marks["labels/detect/candidates"].parts[0].positions)) == 0
-    np.testing.assert_allclose(marks["plots/probability/detect/candidates"].values, [0.0, 0.0])
-    assert "no candidate" in page(marks["candidates"])
+    entities = drawn(candidates(1), "detect/candidates", where)
+    assert len(numbers(entities["vehicle/detect/candidates"].archetypes[0].positions)) == 0
+    assert len(numbers(entities["labels/detect/candidates"].archetypes[0].positions)) == 0
+    np.testing.assert_allclose(entities["plots/probability/detect/candidates"].values, [0.0, 0.0])
+    assert "no candidate" in document(entities["candidates"])
 
 
-def test_what_became_of_a_dropped_candidate_stays_in_the_log():
+def test_a_removed_candidate_is_logged():
     where = scene()
     first = drawn(candidates(0, c4=(0.001, "if not a drone, a bird"), c5=(0.7, "x")), "detect/candidates", where)
     assert "log/detect/candidates" not in first
-    marks = drawn(candidates(10**9, c5=(0.7, "x")), "detect/candidates", where)
-    entry = marks["log/detect/candidates"].parts[0]
-    assert words(entry.text) == ["candidate 4 is out at 0.1 %, unseen for 1.5 s: if not a drone, a bird"]
-    assert words(entry.level) == ["INFO"]
+    entities = drawn(candidates(10**9, c5=(0.7, "x")), "detect/candidates", where)
+    entry = entities["log/detect/candidates"].archetypes[0]
+    assert values_of(entry.text) == ["candidate 4 removed at 0.1 %, no return for 1.5 s: if not a drone, a bird"]
+    assert values_of(entry.level) == ["INFO"]
     assert "log/detect/candidates" not in drawn(candidates(10**9, c5=(0.7, "x")), "detect/candidates", where)
     gone = drawn(candidates(2 * 10**9), "detect/candidates", where)
-    assert words(gone["log/detect/candidates"].parts[0].level) == ["WARN"]  # it was more likely a drone than not
+    assert values_of(gone["log/detect/candidates"].archetypes[0].level) == ["WARN"]  # its probability was above 0.5
 
 
 def test_a_candidate_that_is_tracked_has_the_drones_label_only():
@@ -111,53 +114,57 @@ def test_a_candidate_that_is_tracked_has_the_drones_label_only():
     drawn(fix(), "track/drone_fix", where)
     found = candidates(0, c11=(0.99, "x"), c7=(0.1, "y"))
     found = dataclasses.replace(found, xyz_vehicle_m=np.array([[3.0, 4.5, 11.0], [1.0, 2.0, 7.0]]))
-    marks = drawn(found, "detect/candidates", where)
-    assert words(marks["labels/detect/candidates"].parts[0].labels) == ["7: 10.0 %"]
-    assert len(numbers(marks["vehicle/detect/candidates"].parts[0].positions)) == 2
+    entities = drawn(found, "detect/candidates", where)
+    assert values_of(entities["labels/detect/candidates"].archetypes[0].labels) == ["7: 10.0 %"]
+    assert len(numbers(entities["vehicle/detect/candidates"].archetypes[0].positions)) == 2
 
 
-def test_an_answer_by_evidence_tells_why_each_candidate_was_refused():
+def test_detections_list_the_reason_for_each_rejected_candidate():
     answer = next(c for output, c in synthetic.run_by_evidence(2.0) if output == "detect.detections")
-    marks = drawn(answer, "detect/detections")
-    assert words(marks["vehicle/detect/detections/accepted"].parts[0].labels) == ["candidate 3, 99.2 %: 9 looks"]
-    assert words(marks["vehicle/detect/detections/refused"].parts[0].labels) == [
-        "candidate 5, 1.0 %: beside something big; if not a drone, a lamp, wire or edge"
+    entities = drawn(answer, "detect/detections")
+    assert values_of(entities["vehicle/detect/detections/accepted"].archetypes[0].labels) == [
+        "candidate 3, 99.2 %: 9 looks"
     ]
-    np.testing.assert_allclose(marks["plots/probability/detect/detections"].values, [99.2, 1.0], atol=1e-9)
-    assert "labels/detect/detections" not in marks  # it stands where the candidate was; Candidates tell where it is
-    text = page(marks["candidates"])
-    assert "- 5: 1.0 %, refused at -16.0 / -23.0 / 8.0 m: beside something big" in text
+    assert values_of(entities["vehicle/detect/detections/rejected"].archetypes[0].labels) == [
+        "candidate 5, 1.0 %: next to a large object; if not a drone, a lamp, wire or edge"
+    ]
+    np.testing.assert_allclose(entities["plots/probability/detect/detections"].values, [99.2, 1.0], atol=1e-9)
+    assert (
+        "labels/detect/detections" not in entities
+    )  # a detection has the position of the search; Candidates has the current one
+    text = document(entities["candidates"])
+    assert "- 5: 1.0 %, rejected at -16.0 / -23.0 / 8.0 m: next to a large object" in text
     assert "- 3: 99.2 %, accepted" in text
 
 
-def test_the_page_keeps_the_answer_beside_the_present():
+def test_the_document_keeps_the_last_search_after_the_current_candidates():
     where = scene()
     answer = next(c for output, c in synthetic.run_by_evidence(2.0) if output == "detect.detections")
     drawn(answer, "detect/detections", where)
-    text = page(drawn(candidates(0, c7=(0.2, "alone")), "detect/candidates", where)["candidates"])
+    text = document(drawn(candidates(0, c7=(0.2, "alone")), "detect/candidates", where)["candidates"])
     assert (
-        text.index("detect, now") < text.index("7: 20.0 %") < text.index("detect, last answer") < text.index("5: 1.0 %")
+        text.index("detect, now") < text.index("7: 20.0 %") < text.index("detect, last search") < text.index("5: 1.0 %")
     )
 
 
-def test_each_drone_has_a_place_and_a_way_of_its_own():
+def test_each_drone_has_its_own_position_and_trail():
     where = scene()
     for k in range(3):
         one = drawn(fix(1, k * 10**8, x_m=float(k)), "track/drone_fix", where)
         two = drawn(fix(2, k * 10**8, x_m=-float(k)), "track/drone_fix", where)
-    for number, marks, x_m in ((1, one, [0.0, 1.0, 2.0]), (2, two, [0.0, -1.0, -2.0])):
-        (strip,) = numbers(marks[f"vehicle/track/drone_fix/drone_{number}/trail"].parts[0].strips)
+    for number, entities, x_m in ((1, one, [0.0, 1.0, 2.0]), (2, two, [0.0, -1.0, -2.0])):
+        (strip,) = numbers(entities[f"vehicle/track/drone_fix/drone_{number}/trail"].archetypes[0].strips)
         assert [point[0] for point in strip] == x_m
         np.testing.assert_allclose(
-            marks[f"plots/position/track/drone_fix/drone_{number}"].values, [x_m[-1], 4, 10 + number]
+            entities[f"plots/position/track/drone_fix/drone_{number}"].values, [x_m[-1], 4, 10 + number]
         )
-        (text,) = words(marks[f"labels/track/drone_fix/drone_{number}"].parts[0].labels)
+        (text,) = values_of(entities[f"labels/track/drone_fix/drone_{number}"].archetypes[0].labels)
         assert text.startswith(f"drone {number}: ")
     assert "frames/drone_position" in one
     assert "frames/drone_position" not in two  # the close-up stays with the first
 
 
-def test_the_close_up_goes_to_the_next_drone_when_the_first_is_lost():
+def test_the_close_up_follows_the_next_drone_when_the_first_is_lost():
     where = scene()
     drawn(fix(1), "track/drone_fix", where)
     drawn(fix(2), "track/drone_fix", where)
@@ -165,48 +172,50 @@ def test_the_close_up_goes_to_the_next_drone_when_the_first_is_lost():
     assert "frames/drone_position" in drawn(fix(2), "track/drone_fix", where)
 
 
-def test_a_coasting_drone_is_where_it_is_predicted_and_its_ellipsoid_grows():
+def test_a_coasting_drone_is_at_its_prediction_and_its_ellipsoid_grows():
     where, sizes = scene(), []
     for k, sigma_m in enumerate((0.1, 0.4, 1.6)):
-        marks = drawn(state(TrackingState.COASTING, sigma_m=sigma_m, stamp_ns=k), "track/track_state", where)
-        shape = marks["vehicle/track/track_state/drone_1/predicted"]
+        entities = drawn(state(TrackingState.COASTING, sigma_m=sigma_m, stamp_ns=k), "track/track_state", where)
+        shape = entities["vehicle/track/track_state/drone_1/predicted"]
         assert shape.frame == "vehicle"
-        np.testing.assert_allclose(numbers(shape.parts[0].centers), [[3.0, 4.0, 11.0]])
-        sizes.append(float(numbers(shape.parts[0].half_sizes)[0, 0]))
-        np.testing.assert_allclose(marks["plots/sigma/track/track_state/drone_1"].values, [sigma_m])
+        np.testing.assert_allclose(numbers(shape.archetypes[0].centers), [[3.0, 4.0, 11.0]])
+        sizes.append(float(numbers(shape.archetypes[0].half_sizes)[0, 0]))
+        np.testing.assert_allclose(entities["plots/sigma/track/track_state/drone_1"].values, [sigma_m])
     np.testing.assert_allclose(sizes, 2.7955 * np.array([0.1, 0.4, 1.6]), atol=1e-3)
-    arrow = marks["vehicle/track/track_state/drone_1/velocity"].parts[0]
+    arrow = entities["vehicle/track/track_state/drone_1/velocity"].archetypes[0]
     np.testing.assert_allclose(numbers(arrow.origins), [[3.0, 4.0, 11.0]])
     np.testing.assert_allclose(numbers(arrow.vectors), [[1.0, -2.0, 0.5]])
     assert int(numbers(arrow.colors).ravel()[0]) == colours.COASTING
 
 
-def test_a_lost_drone_leaves_its_way_and_nothing_else():
+def test_a_lost_drone_keeps_its_trail_and_nothing_else():
     where = scene()
     drawn(fix(2), "track/drone_fix", where)
     drawn(state(TrackingState.TRACKING, 2), "track/track_state", where)
-    marks = drawn(lost(2), "track/track_state", where)
-    cleared = {path for path, mark in marks.items() if mark.parts and isinstance(mark.parts[0], rr.Clear)}
+    entities = drawn(lost(2), "track/track_state", where)
+    cleared = {
+        path for path, entity in entities.items() if entity.archetypes and isinstance(entity.archetypes[0], rr.Clear)
+    }
     assert cleared == {
         "vehicle/track/track_state/drone_2",
         "vehicle/track/drone_fix/drone_2/ellipsoid_95",
         "vehicle/track/drone_fix/drone_2/height",
         "labels/track/drone_fix/drone_2",
     }
-    assert words(marks["states/track/drone_2"].parts[0].state) == ["LOST"]
-    assert page(marks["now"]) == "**track:** drone 2: LOST: why"
+    assert values_of(entities["states/track/drone_2"].archetypes[0].state) == ["LOST"]
+    assert document(entities["status"]) == "**track:** drone 2: LOST: why"
     assert not where.near_a_drone(np.array([[3.0, 4.0, 12.0]])).any()
 
 
-def test_the_lane_of_a_tracker_shows_the_most_it_does_and_each_drone_has_one_too():
-    where, lane, second = scene(), [], []
+def test_the_state_of_a_tracker_is_that_of_its_best_drone_and_each_drone_has_its_own():
+    where, states, second = scene(), [], []
     steps = (
         state(TrackingState.SEARCHING, 0, 0),
         state(TrackingState.CANDIDATE, 0, 1),
         state(TrackingState.TRACKING, 1, 2),
-        state(TrackingState.CANDIDATE, 0, 3),  # beside the tracked one: nothing new
+        state(TrackingState.CANDIDATE, 0, 3),  # a hypothesis next to the tracked drone changes nothing
         state(TrackingState.TRACKING, 2, 4),
-        state(TrackingState.COASTING, 1, 5),  # the second is tracked: no less
+        state(TrackingState.COASTING, 1, 5),  # the second is still tracked
         state(TrackingState.TRACKING, 1, 6),
         state(TrackingState.COASTING, 1, 7),
         state(TrackingState.COASTING, 2, 8),
@@ -214,52 +223,56 @@ def test_the_lane_of_a_tracker_shows_the_most_it_does_and_each_drone_has_one_too
         lost(2, 2_000_000_000),
     )
     for step in steps:
-        marks = drawn(step, "track/track_state", where)
-        lane += words(marks["states/track"].parts[0].state) if "states/track" in marks else []
-        second += words(marks["states/track/drone_2"].parts[0].state) if "states/track/drone_2" in marks else []
-    assert lane == ["SEARCHING", "CANDIDATE", "TRACKING", "COASTING", "LOST"]
+        entities = drawn(step, "track/track_state", where)
+        states += values_of(entities["states/track"].archetypes[0].state) if "states/track" in entities else []
+        second += (
+            values_of(entities["states/track/drone_2"].archetypes[0].state)
+            if "states/track/drone_2" in entities
+            else []
+        )
+    assert states == ["SEARCHING", "CANDIDATE", "TRACKING", "COASTING", "LOST"]
     assert second == ["TRACKING", "COASTING", "LOST"]
 
 
-def test_each_drones_change_of_state_is_said_once_with_its_reason():
-    where, said = scene(), []
+def test_each_change_of_a_drones_state_is_logged_once_with_its_reason():
+    where, logged = scene(), []
     for step in (TrackingState.TRACKING, TrackingState.TRACKING, TrackingState.COASTING, TrackingState.TRACKING):
-        marks = drawn(state(step, 2), "track/track_state", where)
-        if "log/track/track_state" in marks:
-            entry = marks["log/track/track_state"].parts[0]
-            said += [(words(entry.text)[0], words(entry.level)[0])]
-    assert said == [
+        entities = drawn(state(step, 2), "track/track_state", where)
+        if "log/track/track_state" in entities:
+            entry = entities["log/track/track_state"].archetypes[0]
+            logged += [(values_of(entry.text)[0], values_of(entry.level)[0])]
+    assert logged == [
         ("drone 2: TRACKING: why", "INFO"),
         ("drone 2: COASTING: why", "WARN"),
         ("drone 2: TRACKING: why", "INFO"),
     ]
 
 
-def test_hypotheses_without_a_number_are_shown_together_and_go_away():
+def test_unnumbered_hypotheses_are_drawn_together_and_cleared():
     where, path = scene(), "vehicle/track/track_state/candidates"
     for k in range(3):
-        marks = drawn(
+        entities = drawn(
             state(TrackingState.CANDIDATE, 0, k * 10_000_000, xyz_vehicle_m=np.array([float(k), 0.0, 9.0])),
             "track/track_state",
             where,
         )
-    np.testing.assert_allclose(numbers(marks[f"{path}/predicted"].parts[0].centers)[:, 0], [0.0, 1.0, 2.0])
-    assert len(numbers(marks[f"{path}/velocity"].parts[0].vectors)) == 3
-    assert "plots/hits/track/track_state/drone_0" not in marks
-    marks = drawn(state(TrackingState.CANDIDATE, 0, 165_000_000), "track/track_state", where)
-    assert len(numbers(marks[f"{path}/predicted"].parts[0].centers)) == 2  # one of the three was told lately enough
+    np.testing.assert_allclose(numbers(entities[f"{path}/predicted"].archetypes[0].centers)[:, 0], [0.0, 1.0, 2.0])
+    assert len(numbers(entities[f"{path}/velocity"].archetypes[0].vectors)) == 3
+    assert "plots/hits/track/track_state/drone_0" not in entities
+    entities = drawn(state(TrackingState.CANDIDATE, 0, 165_000_000), "track/track_state", where)
+    assert len(numbers(entities[f"{path}/predicted"].archetypes[0].centers)) == 2  # one of the three is recent enough
     assert path not in drawn(state(TrackingState.TRACKING, 1, 200_000_000), "track/track_state", where)
-    marks = drawn(state(TrackingState.TRACKING, 1, 600_000_000), "track/track_state", where)
-    assert isinstance(marks[path].parts[0], rr.Clear)
-    assert page(marks["now"]) == "**track, drone 1:** TRACKING: why"
+    entities = drawn(state(TrackingState.TRACKING, 1, 600_000_000), "track/track_state", where)
+    assert isinstance(entities[path].archetypes[0], rr.Clear)
+    assert document(entities["status"]) == "**track, drone 1:** TRACKING: why"
     assert path not in drawn(state(TrackingState.TRACKING, 1, 700_000_000), "track/track_state", where)
 
 
-def test_a_tracker_that_predicts_nothing_has_no_ellipsoid_and_one_lane():
-    marks = drawn(
+def test_a_tracker_without_prediction_has_no_ellipsoid_and_one_state():
+    entities = drawn(
         dataclasses.replace(lost(), state=TrackingState.TRACKING), "track/track_state"
-    )  # as the paper's: state, reason and hits only
-    assert {path for path in marks if path.startswith(("vehicle", "states"))} == {"states/track"}
+    )  # as the paper's tracker: state, reason and returns only
+    assert {path for path in entities if path.startswith(("vehicle", "states"))} == {"states/track"}
 
 
 def pulses(stamp_ns: int, range_m: list[float]) -> SweptPulses:
@@ -283,33 +296,33 @@ def test_pulses_are_counted_per_slice_and_not_drawn():
     ]
     ((_, stamp_ns, joined),) = ready
     assert stamp_ns == 75 * 1_327_104  # 0.1 s; the packet after it is in the next slice
-    marks = drawn(joined, "sweep/swept_pulses")
-    assert set(marks) == {"plots/other/sweep/swept_pulses/pulses", "plots/other/sweep/swept_pulses/empty"}
-    np.testing.assert_allclose(marks["plots/other/sweep/swept_pulses/pulses"].values, [76 * 4])
-    np.testing.assert_allclose(marks["plots/other/sweep/swept_pulses/empty"].values, [50.0])
+    entities = drawn(joined, "sweep/swept_pulses")
+    assert set(entities) == {"plots/other/sweep/swept_pulses/pulses", "plots/other/sweep/swept_pulses/empty"}
+    np.testing.assert_allclose(entities["plots/other/sweep/swept_pulses/pulses"].values, [76 * 4])
+    np.testing.assert_allclose(entities["plots/other/sweep/swept_pulses/empty"].values, [50.0])
 
 
 def test_a_slice_without_pulses_has_no_share():
-    marks = drawn(pulses(0, []), "sweep/swept_pulses")
-    assert set(marks) == {"plots/other/sweep/swept_pulses/pulses"}
+    entities = drawn(pulses(0, []), "sweep/swept_pulses")
+    assert set(entities) == {"plots/other/sweep/swept_pulses/pulses"}
 
 
-def test_what_the_aim_asks_for_stands_beside_the_servos_angle():
-    marks = drawn(ServoGoal(stamp_ns=0, position_rad=np.pi / 6, speed_radps=1.0), "aim/servo_goal")
-    np.testing.assert_allclose(marks["plots/servo/aim/servo_goal"].values, [30.0])
+def test_the_servo_goal_is_a_stepped_curve_next_to_the_servo_angle():
+    entities = drawn(ServoGoal(stamp_ns=0, position_rad=np.pi / 6, speed_radps=1.0), "aim/servo_goal")
+    np.testing.assert_allclose(entities["plots/servo/aim/servo_goal"].values, [30.0])
     held = [
         batch
-        for batch in marks["plots/servo/aim/servo_goal"].style()
+        for batch in entities["plots/servo/aim/servo_goal"].style()
         if "interpolation" in str(batch.component_descriptor())
     ]
     assert len(held) == 1  # as steps: a goal holds until the next
 
 
-def test_the_vehicles_way_is_three_curves_and_a_yaw():
+def test_the_vehicles_position_is_three_curves_and_its_yaw_one():
     R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     motion = VehicleMotion(stamp_ns=0, xyz_map_m=np.array([1.0, 2.0, 0.5]), R_map_vehicle=R, covariance=None)
-    marks = drawn(motion, "odometry/vehicle_motion")
-    values = {path: mark.values.tolist() for path, mark in marks.items()}
+    entities = drawn(motion, "odometry/vehicle_motion")
+    values = {path: entity.values.tolist() for path, entity in entities.items()}
     assert values == {
         "plots/other/odometry/vehicle_motion/position": [1.0, 2.0, 0.5],
         "plots/other/odometry/vehicle_motion/yaw": [pytest.approx(90.0)],

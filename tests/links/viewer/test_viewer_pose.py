@@ -1,4 +1,4 @@
-"""The fused pose in the viewer, and what the autopilot makes of it: states, jumps, what is not known."""
+"""The fused pose and the autopilot's EKF status in the viewer: states, resets, unknown values."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import math
 
 import numpy as np
 import rerun.blueprint as rrb
-from shown import drawn, numbers, page, scene
+from drawing import document, drawn, numbers, scene
 
 from links.viewer.layout import Vision, layout
 from links.viewer.stream import Stream
 from stages.geometry.frames import rotation_from_rpy_deg
-from stages.messages import AutopilotEstimator, PoseState, RelativePose, ServoOffset
+from stages.messages import AutopilotEstimator, PoseEstimate, PoseState, PositionEstimate, RelativePose, ServoOffset
 
 NAME = "fuse/relative_pose"
 R = rotation_from_rpy_deg((0.0, 0.0, 90.0))
@@ -20,12 +20,7 @@ R = rotation_from_rpy_deg((0.0, 0.0, 90.0))
 
 def pose(**changes) -> RelativePose:
     covariance = np.diag([1e-4, 4e-4, 9e-4, 0.04, 0.09, 0.16])
-    full = RelativePose(
-        stamp_ns=2_000_000_000,
-        state=PoseState.FULL,
-        reason="all there",
-        measured_ns=1_900_000_000,
-        track_id=1,
+    estimate = PoseEstimate(
         xyz_vehicle_m=np.array([1.0, 2.0, 10.0]),
         R_vehicle_drone=R,
         covariance=covariance,
@@ -35,52 +30,73 @@ def pose(**changes) -> RelativePose:
         map_covariance=covariance,
         velocity_map_mps=np.zeros(3),
         velocity_covariance=np.eye(3),
+    )
+    full = RelativePose(
+        stamp_ns=2_000_000_000,
+        state=PoseState.FULL,
+        reason="all there",
+        measured_ns=1_900_000_000,
+        track_id=1,
         resets=0,
         nis=2.5,
+        estimate=estimate,
     )
     return dataclasses.replace(full, **changes)
 
 
-def scalars(mark) -> list[float]:
-    return mark.values.tolist()
+def position() -> PositionEstimate:
+    return PositionEstimate(
+        xyz_vehicle_m=np.array([1.0, 2.0, 10.0]),
+        covariance_vehicle_m2=np.diag([0.04, 0.09, 0.16]),
+        velocity_vehicle_mps=np.zeros(3),
+        xyz_map_m=np.array([1.0, 2.0, 10.0]),
+        covariance_map_m2=np.diag([0.04, 0.09, 0.16]),
+        velocity_map_mps=np.zeros(3),
+        velocity_covariance=np.eye(3),
+    )
+
+
+def scalars(entity) -> list[float]:
+    return entity.values.tolist()
 
 
 def test_a_full_pose_has_axes_curves_and_sigmas_in_the_vehicle_s_axes():
-    marks = drawn(pose(), NAME)
-    np.testing.assert_allclose(scalars(marks[f"plots/position/{NAME}"]), [1.0, 2.0, 10.0])
+    entities = drawn(pose(), NAME)
+    np.testing.assert_allclose(scalars(entities[f"plots/position/{NAME}"]), [1.0, 2.0, 10.0])
     # tangent at the body: its x lies along the vehicle's y
-    np.testing.assert_allclose(scalars(marks[f"plots/sigma/{NAME}"]), [0.3, 0.2, 0.4], atol=1e-12)
-    np.testing.assert_allclose(scalars(marks[f"plots/rotation/{NAME}"]), [0.0, 0.0, 90.0], atol=1e-9)
-    np.testing.assert_allclose(scalars(marks[f"plots/other/{NAME}/age"]), [0.1])
-    arrows = marks[f"vehicle/{NAME}/axes"].parts[0]
+    np.testing.assert_allclose(scalars(entities[f"plots/sigma/{NAME}"]), [0.3, 0.2, 0.4], atol=1e-12)
+    np.testing.assert_allclose(scalars(entities[f"plots/rotation/{NAME}"]), [0.0, 0.0, 90.0], atol=1e-9)
+    np.testing.assert_allclose(scalars(entities[f"plots/other/{NAME}/age"]), [0.1])
+    arrows = entities[f"vehicle/{NAME}/axes"].archetypes[0]
     np.testing.assert_allclose(numbers(arrows.vectors).reshape(3, 3)[0], [0.0, 0.8, 0.0], atol=1e-6)
-    assert page(marks["now"]).startswith("**fuse:** FULL: 1.00 / 2.00 / 10.00 m, sigma 0.30 / 0.20 / 0.40 m; roll")
+    assert document(entities["status"]).startswith(
+        "**fuse:** FULL: 1.00 / 2.00 / 10.00 m, sigma 0.30 / 0.20 / 0.40 m; roll"
+    )
 
 
 def test_without_a_rotation_no_axes_and_no_angles_are_shown():
-    unknown = np.diag([math.inf] * 3 + [0.04, 0.09, 0.16])
     where = scene()
     drawn(pose(), NAME, where)
-    marks = drawn(pose(state=PoseState.POSITION_ONLY, R_vehicle_drone=None, covariance=unknown), NAME, where)
-    np.testing.assert_allclose(scalars(marks[f"plots/sigma/{NAME}"]), [0.2, 0.3, 0.4], atol=1e-12)
-    assert f"plots/rotation/{NAME}" not in marks
-    assert "Clear" in type(marks[f"vehicle/{NAME}/axes"].parts[0]).__name__
+    entities = drawn(pose(state=PoseState.POSITION_ONLY, estimate=position()), NAME, where)
+    np.testing.assert_allclose(scalars(entities[f"plots/sigma/{NAME}"]), [0.2, 0.3, 0.4], atol=1e-12)
+    assert f"plots/rotation/{NAME}" not in entities
+    assert "Clear" in type(entities[f"vehicle/{NAME}/axes"].archetypes[0]).__name__
 
 
-def test_a_lost_pose_clears_all_and_a_jump_is_said():
+def test_a_lost_pose_clears_all_and_a_reset_is_logged():
     where = scene()
     drawn(pose(), NAME, where)
-    assert "the pose jumped, 1 so far: a new branch" in str(
-        drawn(pose(resets=1, reason="a new branch"), NAME, where)[f"log/{NAME}"].parts[0].text.as_arrow_array()
+    assert "the pose jumped, reset 1: a new branch" in str(
+        drawn(pose(resets=1, reason="a new branch"), NAME, where)[f"log/{NAME}"].archetypes[0].text.as_arrow_array()
     )
-    lost = pose(state=PoseState.LOST, xyz_vehicle_m=None, R_vehicle_drone=None, covariance=None, reason="no drone")
-    marks = drawn(lost, NAME, where)
-    assert "Clear" in type(marks[f"vehicle/{NAME}"].parts[0]).__name__
-    assert f"plots/position/{NAME}" not in marks
-    assert page(marks["now"]) == "**fuse:** LOST: no drone"
+    lost = pose(state=PoseState.LOST, estimate=None, reason="no drone")
+    entities = drawn(lost, NAME, where)
+    assert "Clear" in type(entities[f"vehicle/{NAME}"].archetypes[0]).__name__
+    assert f"plots/position/{NAME}" not in entities
+    assert document(entities["status"]) == "**fuse:** LOST: no drone"
 
 
-def test_what_the_autopilot_does_not_fuse_is_said_in_words():
+def test_the_status_names_what_the_autopilot_does_not_fuse():
     estimator = AutopilotEstimator(
         stamp_ns=0,
         attitude_good=True,
@@ -94,17 +110,19 @@ def test_what_the_autopilot_does_not_fuse_is_said_in_words():
         compass_ratio=math.nan,
         flags=5,
     )
-    marks = drawn(estimator, "autopilot/autopilot_estimator")
-    assert page(marks["now"]) == "**autopilot, its EKF:** no good position; it pretends to stand still"
-    np.testing.assert_allclose(scalars(marks["plots/other/autopilot/autopilot_estimator"])[:3], [0.1, 1.7, 0.2])
+    entities = drawn(estimator, "autopilot/autopilot_estimator")
+    assert document(entities["status"]) == "**autopilot, EKF:** no good position; constant position mode"
+    np.testing.assert_allclose(scalars(entities["plots/other/autopilot/autopilot_estimator"])[:3], [0.1, 1.7, 0.2])
 
 
-def test_a_servo_offset_is_shown_beside_the_rig_s():
-    offset = ServoOffset(stamp_ns=0, offset_s=0.0012, sigma_s=0.0001, rig_s=0.002, windows=2, reason="told")
-    marks = drawn(offset, "servo_clock/servo_offset")
-    assert page(marks["now"]) == "**servo_clock:** 1.20 +- 0.10 ms, the rig says 2.00 ms; told"
+def test_a_servo_offset_is_shown_with_that_of_the_rig():
+    offset = ServoOffset(
+        stamp_ns=0, offset_s=0.0012, sigma_s=0.0001, rig_offset_s=0.002, windows=2, reason="one window"
+    )
+    entities = drawn(offset, "servo_clock/servo_offset")
+    assert document(entities["status"]) == "**servo_clock:** 1.20 +- 0.10 ms, rig 2.00 ms; one window"
     nothing = drawn(dataclasses.replace(offset, offset_s=None, sigma_s=None), "servo_clock/servo_offset")
-    assert list(nothing) == ["now"]
+    assert list(nothing) == ["status"]
 
 
 def names(view) -> list[str]:
@@ -116,14 +134,14 @@ def names(view) -> list[str]:
 
 def test_a_graph_that_fuses_without_cameras_shows_the_rotation():
     def shown(vision):
-        return set(names(layout(images=False, evidence=True, vision=vision).root_container))
+        return set(names(layout(depth_images=False, candidates=True, vision=vision).root_container))
 
     added = shown(Vision(pose=True)) - shown(Vision())
-    assert added == {"The drone in the vehicle's axes [deg]", "Sigma of the rotation [deg]"}
+    assert added == {"Rotation of the drone in the vehicle frame [deg]", "Sigma of the rotation [deg]"}
 
 
 def test_axes_that_were_cleared_before_they_were_drawn_have_their_frame():
-    """A pose is POSITION_ONLY first, mostly: its axes are cleared before there are any."""
+    """A pose is usually POSITION_ONLY first, so its axes are cleared before they exist."""
     logged = []
 
     class Recording:
@@ -133,10 +151,10 @@ def test_axes_that_were_cleared_before_they_were_drawn_have_their_frame():
     stream = Stream.__new__(Stream)
     stream._rerun, stream._styled, stream._curves = Recording(), set(), {}
     where = scene()
-    for one in (pose(state=PoseState.POSITION_ONLY, R_vehicle_drone=None), pose(), pose()):
-        for mark in drawn(one, NAME, where).values():
-            if mark.path == f"vehicle/{NAME}/axes":
-                stream.put(mark)
+    for one in (pose(state=PoseState.POSITION_ONLY, estimate=position()), pose(), pose()):
+        for entity in drawn(one, NAME, where).values():
+            if entity.path == f"vehicle/{NAME}/axes":
+                stream.put(entity)
     path = f"vehicle/{NAME}/axes"
     assert logged[:2] == [(path, False, ["Clear"]), (path, True, ["CoordinateFrame"])]
     assert [static for _, static, _ in logged].count(True) == 1

@@ -1,4 +1,4 @@
-"""The rotation between vehicle and drone and the drone's motion: probabilities, state, jumps, what is not known."""
+"""The rotation between vehicle and drone and the drone's motion: probabilities, state, switches, unknown values."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 import rerun as rr
-from shown import drawn, numbers, page, scene, words
+from drawing import document, drawn, numbers, scene, values_of
 from synthetic_vision import motion, rotation
 
 from links.viewer.draw import draw
-from links.viewer.draw_rotation import rpy_deg
+from links.viewer.draw_pose import rpy_deg
 from links.viewer.layout import Vision, layout
 from stages.geometry.frames import rotation_from_rpy_deg
 from stages.messages import BranchState, DroneFix
@@ -19,8 +19,8 @@ from stages.messages import BranchState, DroneFix
 NAME = "align/relative_rotation"
 
 
-def scalars(mark) -> list[float]:
-    return mark.values.tolist()
+def scalars(entity) -> list[float]:
+    return entity.values.tolist()
 
 
 def at_a_fix():
@@ -42,47 +42,49 @@ def test_angles_come_back_from_a_rotation(rpy):
     np.testing.assert_allclose(rpy_deg(rotation_from_rpy_deg(rpy)), rpy, atol=1e-9)
 
 
-def test_a_rotation_has_angles_sigma_and_a_sphere_turned_by_it():
-    marks = drawn(rotation(), NAME)
-    np.testing.assert_allclose(scalars(marks[f"plots/rotation/{NAME}"]), [0.0, 0.0, 30.0], atol=1e-9)
-    np.testing.assert_allclose(scalars(marks[f"plots/rotation_sigma/{NAME}"]), [0.1, 0.2, 0.4])
-    turn = marks["frames/sphere_drone"].parts[0]
+def test_a_rotation_has_angles_sigmas_and_a_rotated_sphere():
+    entities = drawn(rotation(), NAME)
+    np.testing.assert_allclose(scalars(entities[f"plots/rotation/{NAME}"]), [0.0, 0.0, 30.0], atol=1e-9)
+    np.testing.assert_allclose(scalars(entities[f"plots/rotation_sigma/{NAME}"]), [0.1, 0.2, 0.4])
+    turn = entities["frames/sphere_drone"].archetypes[0]
     np.testing.assert_allclose(numbers(turn.mat3x3).reshape(3, 3).T, rotation_from_rpy_deg((0.0, 0.0, 30.0)), atol=1e-6)
-    assert words(marks["sphere/drone/name"].parts[0].labels) == ["drone, turned as given: AMBIGUOUS"]
-    text = page(marks["now"])
+    assert values_of(entities["sphere/drone/name"].archetypes[0].labels) == [
+        "drone, rotated by the estimate: AMBIGUOUS"
+    ]
+    text = document(entities["status"])
     assert text == (
         "**align:** AMBIGUOUS, 60.0 %: roll / pitch / yaw 0.0 / 0.0 / 30.0 deg, sigma 0.10 / 0.20 / 0.40 deg; "
         "waits for motion"
     )
-    assert f"vehicle/{NAME}/axes" not in marks  # nobody knows where the drone is
+    assert f"vehicle/{NAME}/axes" not in entities  # the position of the drone is unknown
 
 
-def test_the_drones_axes_stand_at_its_fix_and_are_dim_while_the_branch_is_open():
+def test_the_drones_axes_are_at_its_fix_and_dim_while_the_branch_is_ambiguous():
     where = at_a_fix()
     R = rotation_from_rpy_deg((0.0, 0.0, 30.0))
     dim = drawn(rotation(), NAME, where)[f"vehicle/{NAME}/axes"]
     clear = drawn(rotation(state=BranchState.RESOLVED), NAME, where)[f"vehicle/{NAME}/axes"]
     assert dim.frame == "drone_position"
-    np.testing.assert_allclose(numbers(dim.parts[0].vectors), 0.6 * R.T, atol=1e-6)
-    for mark, alpha in ((dim, 0x60), (clear, 0xFF)):
-        assert {int(c) & 0xFF for c in numbers(mark.parts[0].colors)} == {alpha}
+    np.testing.assert_allclose(numbers(dim.archetypes[0].vectors), 0.6 * R.T, atol=1e-6)
+    for entity, alpha in ((dim, 0x60), (clear, 0xFF)):
+        assert {int(c) & 0xFF for c in numbers(entity.archetypes[0].colors)} == {alpha}
 
 
-def test_without_rotation_nothing_old_stays_and_the_reason_is_told():
+def test_without_rotation_old_entities_are_cleared_and_the_reason_is_shown():
     where = at_a_fix()
     drawn(rotation(), NAME, where)
     none = rotation(R_vehicle_drone=None, covariance_rad2=None, state=BranchState.NONE, reason="no structure here")
-    marks = drawn(none, NAME, where)
-    assert isinstance(marks[f"vehicle/{NAME}"].parts[0], rr.Clear)
-    assert f"plots/rotation/{NAME}" not in marks
-    np.testing.assert_allclose(numbers(marks["frames/sphere_drone"].parts[0].mat3x3).reshape(3, 3), np.eye(3))
-    assert words(marks["sphere/drone/name"].parts[0].labels) == ["drone, own axes"]
-    assert words(marks["states/align"].parts[0].state) == ["NONE"]
-    assert "**align:** NONE: no structure here" in page(marks["now"])
+    entities = drawn(none, NAME, where)
+    assert isinstance(entities[f"vehicle/{NAME}"].archetypes[0], rr.Clear)
+    assert f"plots/rotation/{NAME}" not in entities
+    np.testing.assert_allclose(numbers(entities["frames/sphere_drone"].archetypes[0].mat3x3).reshape(3, 3), np.eye(3))
+    assert values_of(entities["sphere/drone/name"].archetypes[0].labels) == ["drone, own axes"]
+    assert values_of(entities["states/align"].archetypes[0].state) == ["NONE"]
+    assert "**align:** NONE: no structure here" in document(entities["status"])
 
 
-def test_a_switch_of_the_branch_is_said_once_as_a_warning():
-    where, said = scene(), []
+def test_a_branch_switch_is_logged_once_as_a_warning():
+    where, logged = scene(), []
     steps = [
         (BranchState.AMBIGUOUS, 0),
         (BranchState.RESOLVED, 0),
@@ -90,36 +92,43 @@ def test_a_switch_of_the_branch_is_said_once_as_a_warning():
         (BranchState.RESOLVED, 1),
     ]
     for state, switches in steps:
-        marks = list(draw(rotation(state=state, switches=switches), NAME, where))
-        said += [(words(m.parts[0].text)[0], words(m.parts[0].level)[0]) for m in marks if m.path == f"log/{NAME}"]
-    assert said == [
+        entities = list(draw(rotation(state=state, switches=switches), NAME, where))
+        logged += [
+            (values_of(m.archetypes[0].text)[0], values_of(m.archetypes[0].level)[0])
+            for m in entities
+            if m.path == f"log/{NAME}"
+        ]
+    assert logged == [
         ("AMBIGUOUS: waits for motion", "WARN"),
         ("RESOLVED: waits for motion", "INFO"),
-        ("the branch given out has changed, 1 so far: waits for motion", "WARN"),
+        ("the published branch changed, switch 1: waits for motion", "WARN"),
     ]
-    assert scalars(next(m for m in marks if m.path == f"plots/other/{NAME}/switches")) == [1.0]
+    assert scalars(next(m for m in entities if m.path == f"plots/other/{NAME}/switches")) == [1.0]
 
 
-def test_a_motion_shows_matches_sigma_and_where_the_drone_goes_in_its_own_axes():
-    marks = drawn(motion(), "drone_odometry/visual_motion")
-    assert scalars(marks["plots/matches/drone_odometry/visual_motion"]) == [120.0]
+def test_a_motion_shows_matches_sigmas_and_the_direction_of_travel_in_drone_axes():
+    entities = drawn(motion(), "drone_odometry/visual_motion")
+    assert scalars(entities["plots/matches/drone_odometry/visual_motion"]) == [120.0]
     sigma = "plots/motion_sigma/drone_odometry/visual_motion"
-    np.testing.assert_allclose(scalars(marks[f"{sigma}/rotation"]), [0.3])
-    np.testing.assert_allclose(scalars(marks[f"{sigma}/direction"]), [2.0])
-    travel = marks["sphere/drone_odometry/visual_motion/travel"]
+    np.testing.assert_allclose(scalars(entities[f"{sigma}/rotation"]), [0.3])
+    np.testing.assert_allclose(scalars(entities[f"{sigma}/direction"]), [2.0])
+    travel = entities["sphere/drone_odometry/visual_motion/travel"]
     assert travel.frame == "sphere_drone"
-    # it turned left by 90 deg meanwhile: what was ahead then is on its right now
-    np.testing.assert_allclose(numbers(travel.parts[0].vectors), [[0.0, -1.4, 0.0]], atol=1e-6)
-    assert page(marks["now"]) == "**drone_odometry:** 120 features agree over 0.10 s, direction of travel +-2.0 deg"
+    # the drone yawed left by 90 deg: the former forward direction is now to its right
+    np.testing.assert_allclose(numbers(travel.archetypes[0].vectors), [[0.0, -1.4, 0.0]], atol=1e-6)
+    assert (
+        document(entities["status"])
+        == "**drone_odometry:** 120 inlier features over 0.10 s, direction of travel +-2.0 deg"
+    )
 
 
-def test_a_drone_that_only_turns_has_no_direction_and_no_old_arrow():
+def test_a_drone_that_only_rotates_has_no_direction_and_no_old_arrow():
     still = dataclasses.replace(motion(), direction_from=None, direction_sigma_rad=None, reason="no motion seen")
-    marks = drawn(still, "drone_odometry/visual_motion")
-    assert len(marks["sphere/drone_odometry/visual_motion/travel"].parts[0].vectors.as_arrow_array()) == 0
-    assert "plots/motion_sigma/drone_odometry/visual_motion/direction" not in marks
-    assert words(marks["states/drone_odometry"].parts[0].state) == ["no motion"]
-    assert page(marks["now"]).endswith("no motion seen")
+    entities = drawn(still, "drone_odometry/visual_motion")
+    assert len(entities["sphere/drone_odometry/visual_motion/travel"].archetypes[0].vectors.as_arrow_array()) == 0
+    assert "plots/motion_sigma/drone_odometry/visual_motion/direction" not in entities
+    assert values_of(entities["states/drone_odometry"].archetypes[0].state) == ["no motion"]
+    assert document(entities["status"]).endswith("no motion seen")
 
 
 def names(vision: Vision) -> set[str]:
@@ -129,17 +138,17 @@ def names(vision: Vision) -> set[str]:
         own = {part.name} if getattr(part, "name", None) else set()
         return own.union(*(below(each) for each in parts if not isinstance(each, str)))
 
-    return below(layout(images=False, evidence=True, vision=vision).root_container)
+    return below(layout(depth_images=False, candidates=True, vision=vision).root_container)
 
 
-def test_views_of_the_cameras_are_there_only_when_the_graph_has_them():
+def test_camera_views_exist_only_when_the_graph_has_their_outputs():
     without = names(Vision())
     everything = Vision(["camera_drone"], directions=True, rotation=True, odometry=True)
     added = names(everything) - without
     assert "camera drone" in added
     assert len(added) == 7
     assert names(Vision(rotation=True)) - without == {
-        "Branch of the rotation [%]",
-        "The drone in the vehicle's axes [deg]",
+        "Yaw branch probabilities [%]",
+        "Rotation of the drone in the vehicle frame [deg]",
         "Sigma of the rotation [deg]",
     }

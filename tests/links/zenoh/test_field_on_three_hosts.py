@@ -48,7 +48,7 @@ def overlay(folder: Path) -> dict:
     }
     if PICTURES is not None:
         cameras = {name: ports[name] for name in ("vehicle", "drone")}
-        links["sim"] |= {"pictures": str(Path(PICTURES).resolve()), "camera_ports": cameras}
+        links["sim"] |= {"images": str(Path(PICTURES).resolve()), "camera_ports": cameras}
         links |= {f"camera_{name}": {"source": f"http://127.0.0.1:{port}/"} for name, port in cameras.items()}
     return {"links": {name: {"config": config} for name, config in links.items()}}
 
@@ -86,9 +86,9 @@ def test_the_fields_stack_flies_on_three_hosts(tmp_path):
     told = {name: json.loads((tmp_path / f"on_{name}" / "summary.json").read_text()) for name in running}
     poses, sent = told["vehicle"]["poses"]["states"], told["drone"]["counters"]["autopilot"]
     crossed = {name: told[name]["counters"] for name in running}
-    sys.stdout.write(f"\n{poses}\n{told['vehicle']['against_truth']}\n{json.dumps(crossed, indent=1)}\n")
+    sys.stdout.write(f"\n{poses}\n{told['vehicle']['truth_errors']}\n{json.dumps(crossed, indent=1)}\n")
     assert poses.get("FULL", 0) > 300
-    assert told["vehicle"]["against_truth"]["rmse_3d_m"] < 0.15
+    assert told["vehicle"]["truth_errors"]["rmse_3d_m"] < 0.15
     assert sent["sent: ODOMETRY"] > 200, "good poses came back to the autopilot"
     assert told["base"]["counters"]["fuse"]["received"] > 1000
     assert (tmp_path / "on_base" / "run.rrd").stat().st_size > 10_000

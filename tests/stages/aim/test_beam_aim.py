@@ -118,19 +118,21 @@ def tracking(*ways: Way, until_s=math.inf) -> Tell:
     return tell
 
 
-def candidates(place_m, t_s, probability, looks=3, seen_s=None, wander_mps=0.0, detector_life=START_NS) -> Candidates:
+def candidates(
+    place_m, t_s, probability, looks=3, seen_s=None, undirected_speed_mps=0.0, detector_instance=START_NS
+) -> Candidates:
     """One candidate; seen_s: when it was seen last, None: now."""
     return Candidates(
-        detector_life=detector_life,
+        detector_instance=detector_instance,
         stamp_ns=START_NS + round(t_s * 1e9),
         candidate_id=np.array([1]),
         xyz_vehicle_m=np.array([place_m], dtype=np.float64),
         velocity_vehicle_mps=np.zeros((1, 3)),
         probability=np.array([probability]),
         seen_ns=np.array([START_NS + round((t_s if seen_s is None else seen_s) * 1e9)]),
-        looks=np.array([looks]),
+        scan_passes=np.array([looks]),
         reasons=("made",),
-        wander_mps=np.array([wander_mps]),
+        undirected_speed_mps=np.array([undirected_speed_mps]),
     )
 
 
@@ -320,7 +322,7 @@ def test_a_new_candidate_is_not_left_alone_for_one_of_its_number_of_a_detector_t
     targets.leave(targets.known["candidate", 1], START_NS, rest_s=10.0)
     targets.hear_candidates(candidates(place, 1.0, 0.5, looks=7), 0.1)
     assert not targets.known
-    targets.hear_candidates(candidates(place, 2.0, 0.5, looks=9, detector_life=START_NS + 1), 0.1)
+    targets.hear_candidates(candidates(place, 2.0, 0.5, looks=9, detector_instance=START_NS + 1), 0.1)
     assert list(targets.known) == [("candidate", 1)]
 
 
@@ -427,10 +429,10 @@ def test_what_was_met_once_is_looked_for_beside_where_it_was_as_far_as_it_may_ha
     way = towards(60.0, 30.0)
     place = way(np.zeros(1))[0]
 
-    def missed_m(wander_mps):
+    def missed_m(undirected_speed_mps):
         def tell(aim, t_s):
             if round(t_s * 1000) % 50 == 0:
-                aim.on_candidates(candidates(place, t_s, 0.9, seen_s=0.0, wander_mps=wander_mps))
+                aim.on_candidates(candidates(place, t_s, 0.9, seen_s=0.0, undirected_speed_mps=undirected_speed_mps))
 
         return fly(BeamAim(mount=ON_ITS_SIDE), 0.3, tell, start_rad=math.radians(60.0)).missed_m(way)[1]
 

@@ -55,7 +55,7 @@ def detections(*xyz: tuple[float, float, float], accepted: tuple[bool, ...]) -> 
         e_outer=np.zeros(n),
         accepted=np.array(accepted, dtype=np.bool_),
         reasons=("",) * n,
-        verdict="",
+        summary="",
     )
 
 

@@ -1,4 +1,4 @@
-"""A flight over a parked or turning vehicle, as the stage hears of it: lines, fixes, autopilot or pictures."""
+"""A flight over a parked or turning vehicle, as the stage hears of it: lines, fixes, autopilot or images."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ class Flight:
     streets: tuple[float, ...] = MANHATTAN
     fixes: bool = True
     autopilot: str = "odometry"  # or "split": attitude and position; "attitude" alone; "none"
-    pictures: bool = False  # VisualMotion
+    images: bool = False  # VisualMotion
     tells_vehicle: bool = True
     vehicle_silent: tuple[float, float] = (math.inf, math.inf)  # no word of the vehicle
-    vehicle_afresh_deg: float = 0.0  # its start frame is turned after that
+    vehicle_afresh_deg: float = 0.0  # its map frame is turned after that
     fix_sigma_m: float = 0.05
     false_yaw_deg: float = 0.0  # the fixes are turned: what a wrong branch would look like
     false_from_s: float = 0.0
     reset_at_s: float = math.inf  # the autopilot's north jumps
     blind: tuple[float, float] = (math.inf, math.inf)  # no lines between these times
-    silent: tuple[float, float] = (math.inf, math.inf)  # no autopilot, no pictures
-    apart_s: float = 0.0  # the vehicle's picture is this much before the drone's
+    silent: tuple[float, float] = (math.inf, math.inf)  # no autopilot, no images
+    apart_s: float = 0.0  # the vehicle's image is this much before the drone's
     per_direction: int = 12
     seed: int = 0
 
@@ -91,7 +91,7 @@ class Flight:
             stage.on_motion(VehicleMotion(stamp_ns=ns, xyz_map_m=np.zeros(3), R_map_vehicle=R, covariance=None))
         if self.silent[0] <= t < self.silent[1]:
             return
-        if self.pictures and t > 0.04:
+        if self.images and t > 0.04:
             a, b = self.R_world_drone(t - 0.05), self.R_world_drone(t)
             way = a.T @ (self.place_m(t) - self.place_m(t - 0.05))
             length = float(np.linalg.norm(way))

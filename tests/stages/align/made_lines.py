@@ -1,4 +1,4 @@
-"""Lines of a street as two fisheyes see them, made without pictures: what `vp` would say, with errors of known size."""
+"""Lines of a street as two fisheyes see them, made without images: what `vp` would say, with errors of known size."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def seen(
     up_sigma_rad: float = 0.004,
     seed: int = 0,
 ) -> VanishingDirections:
-    """A picture's lines: some per street direction, some upright, some stray; the camera looks up or down.
+    """A image's lines: some per street direction, some upright, some stray; the camera looks up or down.
 
     `direction_error_rad` is common to all lines of a direction, `up_error_rad` to the vertical.
     """
@@ -92,7 +92,7 @@ def line(direction, looks: float, rng):
 
 
 def nothing(camera_mount: CameraMount, stamp_ns: int = 0, reason: str = "too few lines") -> VanishingDirections:
-    """A picture without structure."""
+    """A image without structure."""
     return VanishingDirections(
         stamp_ns=stamp_ns,
         camera_mount=camera_mount,

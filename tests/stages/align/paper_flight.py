@@ -1,4 +1,4 @@
-"""A vehicle and a drone that fly a made path: what their sensors would say, picture by picture, without noise."""
+"""A vehicle and a drone that fly a made path: what their sensors would say, image by image, without noise."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def picture_ns(k: int) -> int:
 
 
 class Flight:
-    """The drone flies straight and may turn, the vehicle drives along x and may turn; both at picture k."""
+    """The drone flies straight and may turn, the vehicle drives along x and may turn; both at image k."""
 
     def __init__(self, drone_yaw_deg=0.0, speed_mps=(2.0, 1.0, 0.1), vehicle_mps=0.5, vehicle_dps=5.0, drone_dps=0.0):
         self.drone_yaw_deg, self.speed_mps = drone_yaw_deg, np.array(speed_mps)

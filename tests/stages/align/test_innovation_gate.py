@@ -1,4 +1,4 @@
-"""A picture's yaw beside the turns felt: weighed with them, and worth no more than the last pictures scattered."""
+"""A image's yaw beside the turns felt: weighed with them, and worth no more than the last images scattered."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from stages.align.dead_reckoning import Reckoned, Reckoning
-from stages.align.innovation_gate import Surprise
+from stages.align.dead_reckoning import DeadReckonedYaw, DeadReckoning
+from stages.align.innovation_gate import InnovationGate
 from stages.align.refine import Refined
-from stages.align.yaw_tracker import YawLock
+from stages.align.yaw_tracker import YawTracker
 
 S = 1_000_000_000
 DRIFT = math.radians(0.1) ** 2  # in 0.2 s
@@ -27,19 +27,19 @@ class Pair:
 
     def __init__(self, rate_hz: float = 5.0) -> None:
         self.rate_hz = rate_hz
-        self.lock = YawLock()
-        self.surprise = Surprise(Reckoning(parked=True), self.lock)
+        self.tracker = YawTracker()
+        self.innovation_gate = InnovationGate(DeadReckoning(parked=True), self.tracker)
         self.k = 0
 
     def see(self, yaw_deg: float, sigma_deg: float = 0.3, variance: float | None = None) -> Refined:
-        """One more picture; dead reckoning has the yaw at zero."""
+        """One more image; dead reckoning has the yaw at zero."""
         self.k += 1
         variance = DRIFT * 5.0 / self.rate_hz if variance is None else variance
-        at = Reckoned(round(self.k * S / self.rate_hz), 0.0, 0.0, variance)
-        self.lock.variance_rad2 += variance
-        picture = self.surprise.as_scattered(refined(yaw_deg, sigma_deg), at)
-        told = self.surprise.weigh_yaw(picture, at)
-        self.lock.accept(picture.yaw_rad, picture.yaw_sigma_rad, at)
+        at = DeadReckonedYaw(round(self.k * S / self.rate_hz), 0.0, 0.0, variance)
+        self.tracker.variance_rad2 += variance
+        picture = self.innovation_gate.with_scatter(refined(yaw_deg, sigma_deg), at)
+        told = self.innovation_gate.weigh_yaw(picture, at)
+        self.tracker.accept(picture.yaw_rad, picture.yaw_sigma_rad, at)
         return told
 
 
@@ -67,12 +67,12 @@ def test_pictures_that_scatter_more_than_they_know_are_told_as_they_scatter(seed
     told = np.array([deg(pair.see(20.0 + e)) for e in errors])[20:]
     off = told[:, 0] - 20.0
     assert np.sqrt(np.mean(off**2)) < 0.35 * np.sqrt(np.mean(errors[20:] ** 2))
-    assert np.mean((off / told[:, 1]) ** 2) < 1.5  # as each picture says of itself that would be 9
+    assert np.mean((off / told[:, 1]) ** 2) < 1.5  # as each image says of itself that would be 9
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 30.0])
 def test_errors_that_last_are_not_averaged_away_by_more_pictures(rate_hz):
-    """A Gauss-Markov error of .6 deg that lasts .5 s, of pictures that say .3."""
+    """A Gauss-Markov error of 0.6 deg that lasts 0.5 s, of images that say 0.3."""
     off, sigma = [], []
     for seed in range(20):
         pair, rng = Pair(rate_hz), np.random.default_rng(seed)
@@ -83,7 +83,7 @@ def test_errors_that_last_are_not_averaged_away_by_more_pictures(rate_hz):
             if k > 5 * rate_hz:
                 off.append(yaw - 20.0)
                 sigma.append(told)
-    assert np.mean((np.array(off) / np.array(sigma)) ** 2) < 2.5  # 5 were each picture of 30 Hz taken for new
+    assert np.mean((np.array(off) / np.array(sigma)) ** 2) < 2.5  # 5 were each image of 30 Hz taken for new
 
 
 def test_one_odd_picture_is_told_as_doubtful_and_soon_forgotten():

@@ -64,7 +64,7 @@ def test_one_pair_gives_the_rotation_up_to_a_quarter_turn(streets):
 
 
 def test_the_stated_tilts_allow_for_cameras_that_do_not_sit_and_look_quite_as_their_file_says():
-    """NEES of both tilts over 150 rigs: mounts .05 deg off, and lens centres .15 px at 720 px, 175 px a radian."""
+    """NEES of both tilts over 150 rigs: mounts 0.05 deg off, and lens centres 0.15 px at 720 px, 175 px a radian."""
     rng = np.random.default_rng(11)
     off_rad = np.array([math.hypot(math.radians(0.05), 0.15 / 175.0)] * 2 + [math.radians(0.05)])
     R_vehicle, R_drone = turned(0, 0, 0), turned(0, 0, 25)
@@ -139,7 +139,7 @@ def test_motion_decides_the_branch_and_the_rotation_is_then_right(yaw_deg, autop
 
 @pytest.mark.parametrize("yaw_deg", [10.0, 190.0])
 def test_directions_from_pictures_decide_it_without_an_autopilot(yaw_deg):
-    flight = Flight(yaw0_deg=yaw_deg, turn_dps=5.0, autopilot="none", pictures=True)
+    flight = Flight(yaw0_deg=yaw_deg, turn_dps=5.0, autopilot="none", images=True)
     told = flight.run(JointAlign(), 8.0)
     assert told[-1].state is BranchState.RESOLVED
     assert flight.error_deg(told[-1]) < 1.0
@@ -165,7 +165,7 @@ def test_a_turning_vehicle_is_taken_into_account():
 
 @pytest.mark.parametrize("afresh_deg", [0.0, 60.0, 90.0, 180.0])
 def test_a_vehicle_odometry_started_afresh_in_a_silence_is_never_a_quarter_turn_of_the_drone(afresh_deg):
-    """Its heading begins anew; where that is a quarter turn off, the streets look alike."""
+    """Its heading restarts; where that is a quarter turn off, the streets look alike."""
     flight = Flight(vehicle_silent=(4.0, 6.5), vehicle_afresh_deg=afresh_deg)
     told = flight.run(JointAlign(), 12.0)
     assert next(m for m in reversed(told) if m.stamp_ns < START_NS + 4 * S).state is BranchState.RESOLVED
@@ -198,8 +198,8 @@ def test_without_motion_evidence_it_stays_ambiguous(left_out):
 
 @pytest.mark.parametrize("autopilot", ["odometry", "attitude", "none"])
 def test_fast_turns_are_followed(autopilot):
-    """120 deg/s, a picture each 0.2 s: 24 deg a step. Resolved and turning, the branch stays."""
-    flight = Flight(turn_dps=120.0, autopilot=autopilot, pictures=autopilot == "none")
+    """120 deg/s, a image each 0.2 s: 24 deg a step. Resolved and turning, the branch stays."""
+    flight = Flight(turn_dps=120.0, autopilot=autopilot, images=autopilot == "none")
     told = flight.run(JointAlign(), 8.0)
     assert all(m.R_vehicle_drone is not None for m in told)
     assert max(flight.quarters_off(m) for m in told) < 1.0
@@ -225,7 +225,7 @@ def test_a_flip_is_found_and_told():
     assert {m.state for m in before} == {BranchState.RESOLVED}
     jumps = [m for m in told if "JUMP" in m.reason and m.stamp_ns > START_NS + 6 * S]
     assert len(jumps) == 1
-    assert "motion says" in jumps[0].reason
+    assert "by motion" in jumps[0].reason
     assert jumps[0].switches == before[-1].switches + 1
     assert (jumps[0].stamp_ns - START_NS) / S < 9.5
     assert any(m.state is BranchState.AMBIGUOUS for m in told if m.stamp_ns > START_NS + 6 * S)
@@ -247,7 +247,7 @@ def test_through_a_short_blindness_the_branch_is_kept():
 
 
 def test_when_lines_and_turns_are_both_lost_the_branch_is_lost():
-    flight = Flight(turn_dps=40.0, blind=(8.0, 12.0), silent=(8.0, 12.0), autopilot="none", pictures=True)
+    flight = Flight(turn_dps=40.0, blind=(8.0, 12.0), silent=(8.0, 12.0), autopilot="none", images=True)
     told = flight.run(JointAlign(), 12.8)
     assert next(m for m in reversed(told) if m.stamp_ns < START_NS + 8 * S).state is BranchState.RESOLVED
     back = next(m for m in told if m.stamp_ns > START_NS + 12 * S)
@@ -330,7 +330,7 @@ def test_no_wrong_branch_is_resolved_over_many_flights():
 
 
 def test_a_picture_that_contradicts_the_turns_felt_is_wrong_by_as_much_and_leads_nobody_astray():
-    """Leaves have verticals of their own: one picture of twelve tells a roll and a yaw that nobody felt."""
+    """Leaves have verticals of their own: one image of twelve tells a roll and a yaw that nobody felt."""
     stage, R_d, told = JointAlign(), turned(3, -2, 40), []
     for i in range(12):
         now_ns = S + i * 200 * MS
@@ -345,5 +345,5 @@ def test_a_picture_that_contradicts_the_turns_felt_is_wrong_by_as_much_and_leads
     assert wrong @ np.linalg.solve(told[8].covariance_rad2, wrong) < 7.8
     sigma_deg = [math.degrees(math.sqrt(np.trace(m.covariance_rad2))) for m in told]
     assert sigma_deg[8] > 2.0
-    assert sigma_deg[9] < 2.0 * sigma_deg[7] < 0.7  # pictures have been seen to scatter
+    assert sigma_deg[9] < 2.0 * sigma_deg[7] < 0.7  # images have been seen to scatter
     assert angle_deg(told[9].R_vehicle_drone, told[7].R_vehicle_drone) < 0.3

@@ -1,4 +1,4 @@
-"""Pictures are paired with the nearest, as soon as that is certain."""
+"""Images are paired with the nearest, as soon as that is certain."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ from tests.stages.align.paper_flight import START_NS, Flight, picture_ns, vanish
 VEHICLE, DRONE = CameraMount.VEHICLE, CameraMount.DRONE
 
 
-def run(stage, flight, pictures, motions=True, seen=lambda flight, camera_mount, k: flight.seen(camera_mount, k)):
+def run(stage, flight, images, motions=True, seen=lambda flight, camera_mount, k: flight.seen(camera_mount, k)):
     out = []
-    for k in range(pictures):
+    for k in range(images):
         if motions:
             stage.on_motion(flight.vehicle(k))
             stage.on_fix(flight.fix(k))
@@ -119,7 +119,7 @@ def test_the_initial_yaw_is_where_matching_starts():
 
 
 def test_the_nearest_picture_of_the_vehicle_is_taken():
-    """The vehicle has turned by 0, 10 and 40 deg at its pictures; the drone's lies nearest to the second."""
+    """The vehicle has turned by 0, 10 and 40 deg at its images; the drone's lies nearest to the second."""
     stage = PaperAlign(initial_sigma_deg=90)
     out = []
     for after_ms, turned in ((0, 0.0), (60, 10.0), (130, 40.0)):
@@ -190,7 +190,7 @@ def test_the_same_inputs_give_the_same_bits():
 @pytest.mark.parametrize(
     "settings",
     [
-        {"pictures_apart": 0},
+        {"images_apart": 0},
         {"shortest_m": 0},
         {"cone_deg": 90},
         {"wrong_share": 0.75},

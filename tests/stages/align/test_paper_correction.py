@@ -13,17 +13,17 @@ from stages.geometry.frames import rotation_z
 from tests.stages.align.paper_flight import Flight
 
 
-def fly(flight, pictures, wrong_deg=0.0, step=14, fixes=None, vehicle=True, motion=None):
-    """Feed `pictures` pictures; R_GD0 is the true one with `wrong_deg` on its left, in the world."""
+def fly(flight, images, wrong_deg=0.0, step=14, fixes=None, vehicle=True, motion=None):
+    """Feed `images` images; R_GD0 is the true one with `wrong_deg` on its left, in the world."""
     correction = MotionCorrection(CorrectionRule())
-    for k in range(pictures):
+    for k in range(images):
         if vehicle:
             correction.add_vehicle(flight.vehicle(k))
         if fixes is None or k in fixes:
             correction.add_fix(flight.fix(k))
         R_G = flight.R_vehicle(k)
         wrong = R_G.T @ rotation_z(math.radians(wrong_deg)) @ R_G @ flight.R_vehicle_drone(k)
-        correction.add_picture(flight.fix(k).stamp_ns, wrong)
+        correction.add_image(flight.fix(k).stamp_ns, wrong)
         if k >= step:
             correction.add_motion(flight.motion(k - step, k) if motion is None else motion(k - step, k))
     return correction
@@ -78,7 +78,7 @@ def test_single_steps_are_chained_to_fourteen_pictures():
 
 
 def test_motions_from_key_pictures_are_chained_over_the_keys():
-    """A key every 4 pictures: the motion to picture k begins at the key before it."""
+    """A key every 4 images: the motion to image k begins at the key before it."""
     flight = Flight(drone_yaw_deg=-30, drone_dps=20.0)
     correction = fly(flight, 30, 90, step=99)
     for k in range(1, 30):
@@ -149,12 +149,12 @@ def test_places_lie_between_fixes_and_not_across_gaps():
 
 
 def test_a_pair_never_spans_two_tracks():
-    """The track changes at picture 18: the first whole pair is (18, 32), the seventh (24, 38)."""
+    """The track changes at image 18: the first whole pair is (18, 32), the seventh (24, 38)."""
     flight = Flight()
 
-    def until(pictures):
-        correction = fly(flight, pictures, 90, fixes=())
-        for k in range(pictures):
+    def until(images):
+        correction = fly(flight, images, 90, fixes=())
+        for k in range(images):
             correction.add_fix(flight.fix(k, track_id=1 if k < 18 else 2))
         return turn_deg(correction)
 
@@ -172,12 +172,12 @@ def test_pairs_seen_under_a_wrong_rotation_are_forgotten():
     for k in range(25, 25 + 20):
         correction.add_vehicle(flight.vehicle(k))
         correction.add_fix(flight.fix(k))
-        correction.add_picture(flight.fix(k).stamp_ns, flight.R_vehicle_drone(k))
+        correction.add_image(flight.fix(k).stamp_ns, flight.R_vehicle_drone(k))
         correction.add_motion(flight.motion(k - 14, k))
     assert turn_deg(correction) is None, "six pairs begin after it"
     correction.add_vehicle(flight.vehicle(45))
     correction.add_fix(flight.fix(45))
-    correction.add_picture(flight.fix(45).stamp_ns, flight.R_vehicle_drone(45))
+    correction.add_image(flight.fix(45).stamp_ns, flight.R_vehicle_drone(45))
     correction.add_motion(flight.motion(31, 45))
     assert turn_deg(correction) == pytest.approx(0.0, abs=1e-6)
 
@@ -190,7 +190,7 @@ def test_a_motion_waits_for_the_fix_after_it_but_not_for_ever():
         correction.add_fix(flight.fix(k))
     assert turn_deg(correction) == pytest.approx(0.0, abs=1e-6)
     late = fly(flight, 21, fixes=range(18))
-    late.add_picture(flight.fix(40).stamp_ns, None)
+    late.add_image(flight.fix(40).stamp_ns, None)
     assert turn_deg(late) is None
     for k in range(18, 21):
         late.add_fix(flight.fix(k))

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from stages.align.dead_reckoning import Reckoned
+from stages.align.dead_reckoning import DeadReckonedYaw
 from stages.align.spectra import spectrum
-from stages.align.yaw_tracker import YawLock
+from stages.align.yaw_tracker import YawTracker
 from stages.heading.heading_bank import Heading
 from tests.stages.align.test_spectra import lines_at
 
@@ -18,66 +18,66 @@ S = 1_000_000_000
 VARIANCE = math.radians(0.1) ** 2
 
 
-def at(t_s, vehicle_deg=0.0, drone_deg=0.0, variance=VARIANCE) -> Reckoned:
-    return Reckoned(round(t_s * S) + S, math.radians(vehicle_deg), math.radians(drone_deg), variance)
+def at(t_s, vehicle_deg=0.0, drone_deg=0.0, variance=VARIANCE) -> DeadReckonedYaw:
+    return DeadReckonedYaw(round(t_s * S) + S, math.radians(vehicle_deg), math.radians(drone_deg), variance)
 
 
 def seen(*azimuths_deg):
     return spectrum(lines_at(np.array(azimuths_deg, dtype=float)))
 
 
-def follow(lock: YawLock, vehicle, drone, when: Reckoned, rate=0.0):
+def follow(tracker: YawTracker, vehicle, drone, when: DeadReckonedYaw, rate=0.0):
     """Choose and accept: the yaw in degrees and the weights of quarter turns, or the reason."""
-    match = lock.choose(vehicle, drone, when, rate)
+    match = tracker.choose(vehicle, drone, when, rate)
     if match.yaw_rad is None:
         return match.reason, None
-    return math.degrees(match.yaw_rad), lock.accept(match.yaw_rad, math.radians(0.2), when)
+    return math.degrees(match.yaw_rad), tracker.accept(match.yaw_rad, math.radians(0.2), when)
 
 
 def test_streets_at_right_angles_are_taken_at_once():
-    yaw, weights = follow(YawLock(), seen(0, 90), seen(-20, 70), at(0))
+    yaw, weights = follow(YawTracker(), seen(0, 90), seen(-20, 70), at(0))
     assert yaw == pytest.approx(20.0, abs=0.2)
     np.testing.assert_array_equal(weights, [1, 0, 0, 0])
 
 
 def test_two_streets_of_each_camera_in_common_are_taken():
-    yaw, _ = follow(YawLock(), seen(0, 0, 34, 34), seen(-20, 14, 14, 70), at(0))
+    yaw, _ = follow(YawTracker(), seen(0, 0, 34, 34), seen(-20, 14, 14, 70), at(0))
     assert yaw == pytest.approx(20.0, abs=0.3)
 
 
 def test_one_street_in_common_of_several_is_not():
-    reason, _ = follow(YawLock(), seen(0, 90, 0), seen(-20, 70, 14, 14, 41, 41), at(0))
+    reason, _ = follow(YawTracker(), seen(0, 90, 0), seen(-20, 70, 14, 14, 41, 41), at(0))
     assert "could be any street's" in str(reason) or "fit" in str(reason)
 
 
 def test_nothing_in_common():
-    lock = YawLock()
-    reason, _ = follow(lock, np.zeros(720), seen(3), at(0))
+    tracker = YawTracker()
+    reason, _ = follow(tracker, np.zeros(720), seen(3), at(0))
     assert reason == "the two cameras' lines have no direction in common"
-    assert lock.offset_rad is None
+    assert tracker.offset_rad is None
 
 
 def test_a_quarter_turn_further_is_followed_round_the_circle():
-    """The drone turns 30 deg a step: yaw is told over 360 deg though pictures tell it modulo 90."""
-    lock = YawLock()
+    """The drone turns 30 deg a step: yaw is told over 360 deg though images tell it modulo 90."""
+    tracker = YawTracker()
     for i in range(13):
-        yaw, weights = follow(lock, seen(0, 90), seen(-30 * i, 90 - 30 * i), at(0.2 * i, drone_deg=30.0 * i))
+        yaw, weights = follow(tracker, seen(0, 90), seen(-30 * i, 90 - 30 * i), at(0.2 * i, drone_deg=30.0 * i))
         assert (yaw - 30 * i + 180) % 360 - 180 == pytest.approx(0.0, abs=0.3)
         assert weights[0] > 0.999999
 
 
 def test_the_turn_of_the_vehicle_counts_the_other_way():
-    lock = YawLock()
+    tracker = YawTracker()
     for i in range(8):
-        yaw, _ = follow(lock, seen(-30 * i, 90 - 30 * i), seen(0, 90), at(0.2 * i, vehicle_deg=30.0 * i))
+        yaw, _ = follow(tracker, seen(-30 * i, 90 - 30 * i), seen(0, 90), at(0.2 * i, vehicle_deg=30.0 * i))
         assert (yaw + 30 * i + 180) % 360 - 180 == pytest.approx(0.0, abs=0.3)
 
 
 def test_a_bad_prediction_makes_other_quarters_possible():
-    lock = YawLock()
-    follow(lock, seen(0, 90), seen(0, 90), at(0))
+    tracker = YawTracker()
+    follow(tracker, seen(0, 90), seen(0, 90), at(0))
     sigma = math.radians(30.0)
-    _, weights = follow(lock, seen(0, 90), seen(-20, 70), at(3, variance=sigma**2))
+    _, weights = follow(tracker, seen(0, 90), seen(-20, 70), at(3, variance=sigma**2))
     S_ = sigma**2 + lock_noise()
     expected = [math.exp(-0.5 * math.radians(a) ** 2 / S_) for a in (20, 110, 200, -70)]
     expected[2] += math.exp(-0.5 * math.radians(-160) ** 2 / S_)
@@ -89,34 +89,34 @@ def lock_noise() -> float:
 
 
 def test_a_prediction_worth_nothing_makes_all_quarters_alike():
-    lock = YawLock()
-    follow(lock, seen(0, 90), seen(0, 90), at(0))
-    _, weights = follow(lock, seen(0, 90), seen(-20, 70), at(60, variance=10.0))
+    tracker = YawTracker()
+    follow(tracker, seen(0, 90), seen(0, 90), at(0))
+    _, weights = follow(tracker, seen(0, 90), seen(-20, 70), at(60, variance=10.0))
     np.testing.assert_array_equal(weights, [0.25] * 4)
 
 
 def test_a_match_elsewhere_is_refused_at_first():
-    lock = YawLock()
+    tracker = YawTracker()
     for i in range(5):
-        follow(lock, seen(0, 90), seen(0, 90), at(0.2 * i))
-    reason, _ = follow(lock, seen(0, 90), seen(-31, 59), at(1.0))
+        follow(tracker, seen(0, 90), seen(0, 90), at(0.2 * i))
+    reason, _ = follow(tracker, seen(0, 90), seen(-31, 59), at(1.0))
     assert "+31 deg from where the cameras' own turns say" in str(reason)
-    assert not lock.relocked
+    assert not tracker.reacquired
 
 
 def test_a_match_elsewhere_that_stays_is_taken_over_and_told():
-    lock = YawLock()
+    tracker = YawTracker()
     for i in range(5):
-        follow(lock, seen(0, 90), seen(0, 90), at(0.2 * i))
+        follow(tracker, seen(0, 90), seen(0, 90), at(0.2 * i))
     taken = None
     for i in range(5, 500):
-        yaw, weights = follow(lock, seen(0, 90), seen(-31, 59), at(0.2 * i))
+        yaw, weights = follow(tracker, seen(0, 90), seen(-31, 59), at(0.2 * i))
         if weights is not None:
             taken = 0.2 * i
             break
     assert taken is not None
     assert 2.0 < taken < 60.0
-    assert lock.relocked
+    assert tracker.reacquired
     assert yaw == pytest.approx(31.0, abs=0.3)
     np.testing.assert_array_equal(weights, [0.25] * 4)
 
@@ -124,10 +124,10 @@ def test_a_match_elsewhere_that_stays_is_taken_over_and_told():
 def test_the_maps_know_what_one_picture_does_not():
     """A vehicle that sees one street after the other, each of which alone could be any of the drone's."""
     drone = seen(0, 0, 34, 34, 61, 61)
-    lock, yaw = YawLock(), None
+    tracker, yaw = YawTracker(), None
     for i, street in enumerate([0, 34, 61, 34]):
-        yaw, _ = follow(lock, seen(street, street), drone, at(0.2 * i))
-        alone, _ = follow(YawLock(), seen(street, street), drone, at(0))
+        yaw, _ = follow(tracker, seen(street, street), drone, at(0.2 * i))
+        alone, _ = follow(YawTracker(), seen(street, street), drone, at(0))
         assert isinstance(alone, str)
     assert yaw == pytest.approx(0.0, abs=0.3)
 
@@ -135,58 +135,58 @@ def test_the_maps_know_what_one_picture_does_not():
 def test_a_fast_turn_widens_what_is_taken():
     """In a turn of 120 deg/s stamps that are 20 ms off are 2.4 deg."""
     for rate, taken in ((0.0, False), (math.radians(120), True)):
-        lock = YawLock()
+        tracker = YawTracker()
         for i in range(30):
-            follow(lock, seen(0, 90), seen(0, 90), at(0.1 * i))
-        yaw, _ = follow(lock, seen(0, 90), seen(-4, 86), at(3.0), rate)
+            follow(tracker, seen(0, 90), seen(0, 90), at(0.1 * i))
+        yaw, _ = follow(tracker, seen(0, 90), seen(-4, 86), at(3.0), rate)
         assert isinstance(yaw, float) is taken
 
 
 def test_forgetting_starts_anew():
-    lock = YawLock()
-    follow(lock, seen(0, 90), seen(0, 90), at(0))
-    lock.forget()
-    assert lock.offset_rad is None
-    yaw, _ = follow(lock, seen(0, 90), seen(-40, 50), at(0.2))
+    tracker = YawTracker()
+    follow(tracker, seen(0, 90), seen(0, 90), at(0))
+    tracker.forget()
+    assert tracker.offset_rad is None
+    yaw, _ = follow(tracker, seen(0, 90), seen(-40, 50), at(0.2))
     assert yaw == pytest.approx(40.0, abs=0.3)
 
 
 # where streets run at many angles, by the heading that motion tells
 
-VEHICLE, DRONE = seen(0, 90, 0), seen(-20, 70, 14, 14, 41, 41)  # one street in common: no picture says which
-AT = Reckoned(S, 0.0, 0.0, math.radians(0.1) ** 2)
+VEHICLE, DRONE = seen(0, 90, 0), seen(-20, 70, 14, 14, 41, 41)  # one street in common: no image says which
+AT = DeadReckonedYaw(S, 0.0, 0.0, math.radians(0.1) ** 2)
 
 
 @pytest.mark.parametrize("quarters", range(4))
 @pytest.mark.parametrize("street_deg", [20.0, -14.0, -41.0])
 def test_motion_says_which_of_many_streets_both_cameras_see_and_which_way_round(street_deg, quarters):
-    lock = YawLock()
-    assert lock.choose(VEHICLE, DRONE, AT, 0.0).yaw_rad is None
+    tracker = YawTracker()
+    assert tracker.choose(VEHICLE, DRONE, AT, 0.0).yaw_rad is None
     true_rad = math.radians(street_deg + 90 * quarters)
-    match = lock.choose(VEHICLE, DRONE, AT, 0.0, Heading(true_rad + math.radians(3.0), math.radians(2.0)))
+    match = tracker.choose(VEHICLE, DRONE, AT, 0.0, Heading(true_rad + math.radians(3.0), math.radians(2.0)))
     assert match.yaw_rad is not None
     assert math.remainder(match.yaw_rad - true_rad, 2 * math.pi) == pytest.approx(0.0, abs=math.radians(0.3))
 
 
 def test_where_motion_says_there_is_no_match_none_is_taken():
     nowhere = Heading(math.radians(3.0), math.radians(1.5))
-    match = YawLock().choose(VEHICLE, DRONE, AT, 0.0, nowhere)
+    match = YawTracker().choose(VEHICLE, DRONE, AT, 0.0, nowhere)
     assert match.yaw_rad is None
     assert "no match where the drone's motion says" in match.reason
-    square = YawLock().choose(seen(0, 90), seen(-20, 70), AT, 0.0, nowhere)
+    square = YawTracker().choose(seen(0, 90), seen(-20, 70), AT, 0.0, nowhere)
     assert square.reason == "the lines match best elsewhere than the drone's motion says"
 
 
 def test_a_match_that_motion_denies_is_let_go_up_to_quarter_turns():
-    lock = YawLock()
-    match = lock.choose(seen(0, 90), seen(-20, 70), AT, 0.0)
-    lock.accept(match.yaw_rad, math.radians(0.2), AT)
+    tracker = YawTracker()
+    match = tracker.choose(seen(0, 90), seen(-20, 70), AT, 0.0)
+    tracker.accept(match.yaw_rad, math.radians(0.2), AT)
     sigma = math.radians(2.0)
-    assert not lock.denied(None)
-    assert not lock.denied(Heading(math.radians(20 + 180 + 8), sigma))
-    assert lock.denied(Heading(math.radians(20 - 90 + 14), sigma))
-    lock.let_go()
-    assert lock.offset_rad is None
-    assert not lock.denied(Heading(0.0, sigma))
-    again = lock.choose(seen(0, 90), seen(-20, 70), dataclasses.replace(AT, stamp_ns=2 * S), 0.0)
+    assert not tracker.denied(None)
+    assert not tracker.denied(Heading(math.radians(20 + 180 + 8), sigma))
+    assert tracker.denied(Heading(math.radians(20 - 90 + 14), sigma))
+    tracker.release()
+    assert tracker.offset_rad is None
+    assert not tracker.denied(Heading(0.0, sigma))
+    again = tracker.choose(seen(0, 90), seen(-20, 70), dataclasses.replace(AT, stamp_ns=2 * S), 0.0)
     assert math.degrees(again.yaw_rad) == pytest.approx(20.0, abs=0.2)

@@ -24,8 +24,8 @@ def found_in(seed=0, parked=False, **how):
     return true, calibrate(made.returns, made.trace, RIG, parked=parked)
 
 
-def refused(found):
-    return {f.name: f.refused for f in found.findings if f.refused}
+def rejected(found):
+    return {f.name: f.rejected for f in found.findings if f.rejected}
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_walls_are_as_thin_afterwards_as_their_noise(yard):
     assert np.median(found.thickness.before_m) > 2 * np.median(found.thickness.after_m)
 
 
-def test_the_new_mount_is_a_rig_that_says_the_same(yard):
+def test_the_new_mount_is_equivalent_as_a_rig(yard):
     _, found = yard
     again = servo_mount(found.mount)
     for name, value in values_of(found.numbers, servo_mount(RIG)).items():
@@ -67,17 +67,17 @@ def test_a_second_calibration_finds_nothing_more(yard):
     made = sweep(true, seed=0)
     again = calibrate(made.returns, made.trace, found.mount)
     for finding in again.findings:
-        if not finding.refused:
+        if not finding.rejected:
             assert abs(finding.after - finding.before) < 1.5 * finding.sigma, finding
 
 
-def test_the_zero_is_never_told_and_stays(yard):
+def test_the_zero_is_never_estimated_and_stays(yard):
     _, found = yard
-    assert set(refused(found)) == {"zero"}
-    assert "no scene tells it" in refused(found)["zero"]
+    assert set(rejected(found)) == {"zero"}
+    assert "no scene tells it" in rejected(found)["zero"]
 
 
-def test_the_rig_says_how_well_the_servos_angle_is_known_now(yard):
+def test_the_rig_contains_the_sigma_of_the_servos_angle(yard):
     *_, found = yard
     assert 0.1 <= found.mount.pointing_sigma_deg < 0.15, "no less than a zero that nobody has told"
 
@@ -87,7 +87,7 @@ def test_sigmas_hold_over_many_yards():
     for seed in range(1, 7):
         true, found = found_in(seed, count=30_000)
         after, wanted = values_of(found.numbers, servo_mount(RIG)), values_of(true, servo_mount(RIG))
-        told = [i for i, name in enumerate(NAMES) if name not in refused(found)]
+        told = [i for i, name in enumerate(NAMES) if name not in rejected(found)]
         off = np.array([after[name] - wanted[name] for name in NAMES])[told]
         inner = found.covariance[np.ix_(told, told)]
         scores += (off / np.sqrt(np.diag(inner))).tolist()
@@ -97,7 +97,7 @@ def test_sigmas_hold_over_many_yards():
     assert np.mean(nees) < 1.6
 
 
-def test_a_mean_that_nothing_tells_is_taken_back_by_the_zero():
+def test_an_unobservable_mean_is_compensated_by_the_zero():
     rig, found = servo_mount(RIG), wrong_mount()
     findings = tuple(Finding(n, n, "", 0.0, 0.0, 0.0, "no scene" if n == "zero" else "") for n in NAMES)
     travel = Travel(0.0, np.pi, both_ways=True, two_speeds=True)
@@ -109,53 +109,53 @@ def test_a_mean_that_nothing_tells_is_taken_back_by_the_zero():
     assert accepted(rig, found, findings, unsure * 1e-8, travel).zero_rad == rig.zero_rad
 
 
-def test_one_way_round_tells_neither_clock_nor_play():
+def test_one_direction_determines_neither_time_offset_nor_play():
     _, found = found_in(parked=True, legs=((0.0, 180.0, SLOW),))
-    assert {"time", "play", "zero"} <= set(refused(found))
-    assert "one way only" in refused(found)["time"]
-    assert "tilt_x" not in refused(found)
+    assert {"time", "play", "zero"} <= set(rejected(found))
+    assert "one way only" in rejected(found)["time"]
+    assert "tilt_x" not in rejected(found)
     assert found.mount.servo_time_offset_s == 0.0
     assert found.mount.servo_play_deg == 0.0
 
 
-def test_one_speed_does_not_tell_the_clock_from_the_play():
+def test_one_speed_does_not_separate_time_offset_and_play():
     _, found = found_in(legs=((0.0, 180.0, SLOW), (180.0, 0.0, SLOW)))
-    assert "one speed only" in refused(found)["time"]
-    assert "one speed only" in refused(found)["play"]
+    assert "one speed only" in rejected(found)["time"]
+    assert "one speed only" in rejected(found)["play"]
     assert found.mount.pointing_sigma_deg == UNCALIBRATED_DEG
 
 
-def test_an_open_field_tells_tilts_but_no_turn():
+def test_an_open_field_determines_tilts_but_no_rotation():
     _, found = found_in(planes=GROUND)
-    said = refused(found)
+    said = rejected(found)
     assert {*CURVE, "play", "time", "axis_x", "axis_y"} <= set(said)
     assert "level ground" in said["play"]
     assert "tilt_x" not in said
     assert found.mount.servo_harmonics == ()
 
 
-def test_nothing_in_reach_is_refused():
+def test_a_scene_without_surfaces_is_rejected():
     with pytest.raises(CannotCalibrate, match="returned"):
         found_in(planes=())
 
 
-def test_a_vehicle_that_creeps_is_refused():
+def test_a_slowly_moving_vehicle_is_rejected():
     with pytest.raises(CannotCalibrate, match="did not stand still"):
         found_in(velocity_mps=(0.02, 0.01, 0.0))
 
 
-def test_a_vehicle_that_drives_is_refused():
+def test_a_moving_vehicle_is_rejected():
     corners = (*YARD, (0.2, -1.0, 0.0, 9.0))
     with pytest.raises(CannotCalibrate, match="did not stand still"):
         found_in(velocity_mps=(0.8, 0.3, 0.0), planes=corners)
 
 
-def test_one_way_round_does_not_show_whether_the_vehicle_stood():
+def test_one_direction_does_not_show_whether_the_vehicle_stood_still():
     with pytest.raises(CannotCalibrate, match="--parked"):
         found_in(legs=((0.0, 180.0, SLOW),))
 
 
-def test_too_little_travel_is_refused_in_degrees():
+def test_too_little_travel_is_rejected_in_degrees():
     with pytest.raises(CannotCalibrate, match=r"turned by 20 deg only"):
         found_in(legs=((80.0, 100.0, SLOW), (100.0, 80.0, FAST)))
 
@@ -169,7 +169,7 @@ def test_a_servo_that_stands_still_is_to_be_driven(steps):
         calibrate(made.returns, ServoTrace.of(stamp_ns, stands_rad, STEP_RAD), RIG)
 
 
-def test_a_bolted_down_lidar_and_a_silent_servo_are_refused():
+def test_a_fixed_lidar_and_a_silent_servo_are_rejected():
     made = sweep(wrong_mount(), count=8_000)
     with pytest.raises(CannotCalibrate, match="bolted down"):
         calibrate(made.returns, made.trace, RIG.model_copy(update={"turns": False}))

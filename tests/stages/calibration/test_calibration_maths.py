@@ -16,7 +16,7 @@ from stages.calibration.scan_passes import Returns, ServoAt, ServoTrace, servo_a
 from stages.calibration.servo_mount import harmonics, lidar_mount, servo_mount
 from stages.calibration.solve import NAMES, clustered, linearise, sandwich, surfaces, without_planes
 from stages.geometry.frames import Harmonic, LidarMount, Pose
-from stages.kernels.calibration.scan_passes import hangs
+from stages.kernels.calibration.scan_passes import play_sides
 from tests.stages.calibration.made_sweep import STEP_RAD, YARD, sweep, wrong_mount
 
 ASKEW = LidarMount(
@@ -52,7 +52,7 @@ def test_sine_and_cosine_become_amplitude_and_phase():
     assert term.phase_deg == pytest.approx(math.degrees(math.atan2(4, 3)))
 
 
-def test_a_place_is_what_the_turntable_of_a_run_gives():
+def test_placed_returns_equal_those_of_the_turntable():
     mount = servo_mount(ASKEW)
     p, s = np.array([[1.0, 2.0, 3.0]]), np.array([0.7])
     placed = place(
@@ -61,28 +61,28 @@ def test_a_place_is_what_the_turntable_of_a_run_gives():
         mount,
         np.zeros(16),
     )
-    angle = float(ASKEW.turntable_rad(s)[0]) + math.radians(0.4) / 2  # sign -1: hangs behind the other way
+    angle = float(ASKEW.turntable_rad(s)[0]) + math.radians(0.4) / 2  # sign -1: lags in the other direction
     c, v = math.cos(angle), math.sin(angle)
     T = ASKEW.T_turntable_lidar.matrix()
     q = T[:3, :3] @ p[0] + T[:3, 3]
     assert placed.xyz_m[0] == pytest.approx([c * q[0] - v * q[1], v * q[0] + c * q[1], q[2]])
 
 
-def test_every_column_is_the_slope_of_its_number():
+def test_every_column_is_the_derivative_by_its_parameter():
     rng = np.random.default_rng(1)
     mount, n = servo_mount(ASKEW), 20
     returns = Returns(np.zeros(n, dtype=np.int64), rng.integers(0, 16, n).astype(np.uint8), rng.normal(0, 9, (n, 3)))
     rate = rng.normal(0, 2, n)
-    hang = np.where(rate > 0, 1.0, -1.0)
+    play_side = np.where(rate > 0, 1.0, -1.0)
     position = rng.uniform(0, 3, n)
     normal = rng.normal(size=(n, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
 
     def away(step, bias=np.zeros(16)):  # noqa: B008
-        later = ServoAt(position - rate * step.get("time", 0.0), rate, hang)
+        later = ServoAt(position - rate * step.get("time", 0.0), rate, play_side)
         return np.einsum("ij,ij->i", place(returns, later, mount.moved(step), bias).xyz_m, normal)
 
-    placed = place(returns, ServoAt(position, rate, hang), mount, np.zeros(16))
+    placed = place(returns, ServoAt(position, rate, play_side), mount, np.zeros(16))
     columns = mount_columns(placed, normal, mount)
     assert set(columns) == set(NAMES)
     for name in NAMES:
@@ -115,13 +115,13 @@ def test_the_encoders_steps_are_smoothed_away_but_not_its_turns():
     assert np.abs(fine - true).max() < 1.2 * STEP_RAD
 
 
-def test_the_turntable_hangs_behind_and_is_not_trusted_after_a_turn_back():
+def test_the_turntable_lags_and_its_side_is_unknown_after_a_reversal():
     position = np.radians([0.0, 1.0, 2.0, 3.0, 2.9, 2.6, 2.0, 1.0])
-    hang = np.empty(len(position))
-    hangs(position, math.radians(0.3), hang)
-    assert hang[2:4] == pytest.approx([1.0, 1.0])
-    assert np.isnan(hang[4:6]).all()  # within the play, and just beyond
-    assert hang[6:] == pytest.approx([-1.0, -1.0])
+    play_side = np.empty(len(position))
+    play_sides(position, math.radians(0.3), play_side)
+    assert play_side[2:4] == pytest.approx([1.0, 1.0])
+    assert np.isnan(play_side[4:6]).all()  # within the play, and just beyond
+    assert play_side[6:] == pytest.approx([-1.0, -1.0])
 
 
 def test_the_servo_is_looked_up_at_the_corrected_time():
@@ -133,7 +133,7 @@ def test_the_servo_is_looked_up_at_the_corrected_time():
     assert at.rate_radps[:2] == pytest.approx([10.0, 10.0])
 
 
-def test_repeated_and_late_states_are_left_out():
+def test_repeated_and_late_states_are_omitted():
     trace = ServoTrace.of(np.array([0, 5, 5, 3, 9], dtype=np.int64) * MS, np.array([0, 1, 7, 8, 2]) * 0.1, STEP_RAD)
     assert trace.stamp_ns.tolist() == [0, 5 * MS, 9 * MS]
 
@@ -154,7 +154,7 @@ def test_a_wall_becomes_patches_with_its_normal_and_its_noise():
     assert len(np.unique(patches.index)) == len(patches.index)  # no return is used twice
 
 
-def test_strays_do_not_tilt_a_patch_and_a_cloud_makes_none():
+def test_outliers_do_not_tilt_a_patch_and_a_random_cloud_has_none():
     xyz = np.vstack([wall(), np.add(wall(seed=1)[:300], [0.3, 0.0, 0.0])])
     patches = find_patches(xyz, np.zeros_like(xyz), 0.003)
     assert (patches.index < 4000).mean() > 0.995
@@ -162,7 +162,7 @@ def test_strays_do_not_tilt_a_patch_and_a_cloud_makes_none():
     assert len(find_patches(cloud, np.zeros_like(cloud), 0.003).first) == 0
 
 
-def test_what_a_moved_plane_explains_is_taken_out():
+def test_the_motion_of_a_plane_is_projected_out():
     xyz = wall()
     patches = find_patches(xyz, np.zeros_like(xyz), 0.003)
     weight = np.random.default_rng(2).uniform(0.5, 2.0, len(patches.index))
@@ -196,7 +196,7 @@ def test_upright_things_that_stand_are_best_matched_where_they_are():
     assert moved.best_m == pytest.approx((1.0, -0.6), abs=0.21)
 
 
-def test_what_a_travel_cannot_show_is_named_whatever_the_scene():
+def test_unobservable_parameters_are_named_whatever_the_scene():
     everything = Travel(0.0, 3.0, both_ways=True, two_speeds=True)
     assert set(unseen(everything)) == {"zero"}
     assert set(unseen(Travel(0.0, 3.0, both_ways=False, two_speeds=True))) == {"zero", "time", "play"}

@@ -1,4 +1,4 @@
-"""The zero and the axis's tilt, by how the vehicle stands: found, as sure as what was said, or refused with a reason."""
+"""The zero and the axis's tilt, by how the vehicle stands: found, as sure as what was said, or rejected with a reason."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ def off_deg(true, found):
 
 
 @pytest.mark.parametrize("zero_deg", [0.5, -0.5])
-def test_a_wall_beside_the_vehicle_tells_the_zero(zero_deg):
+def test_a_wall_next_to_the_vehicle_determines_the_zero(zero_deg):
     true, found = found_in((*GROUND, *WALLS, *ENDS), zero_deg, parallel_rad=SAID)
     told = finding(found, "zero")
-    assert told.refused == ""
+    assert told.rejected == ""
     assert abs(off_deg(true, found)) < 0.05
     assert 0.15 <= told.sigma < 0.2
     assert told.after == found.mount.servo_zero_deg
@@ -67,10 +67,10 @@ def test_a_wall_beside_the_vehicle_tells_the_zero(zero_deg):
     assert found.mount.pointing_sigma_deg == pytest.approx(math.hypot(told.sigma, math.degrees(found.curve_sigma_rad)))
 
 
-def test_without_a_word_all_stays_as_it_was():
+def test_without_a_stated_orientation_nothing_changes():
     true, found = found_in((*GROUND, *WALLS, *ENDS))
     assert abs(off_deg(true, found)) > 0.3
-    assert "--parallel" in finding(found, "zero").refused
+    assert "--parallel" in finding(found, "zero").rejected
     assert found.mount.T_vehicle_turntable == RIG.T_vehicle_turntable
     assert found.mount.pointing_sigma_deg < 0.15  # a zero set by eye
 
@@ -91,19 +91,19 @@ def test_a_vehicle_that_stands_askew_beside_the_wall_gets_that_for_its_zero_and_
         (((0.0, 1.0, 0.0, 12.0), (0.0, -1.0, 0.0, 15.0)), "within 10 m"),
     ],
 )
-def test_walls_that_do_not_tell_are_refused(planes, why):
+def test_unsuitable_walls_are_rejected(planes, why):
     _, found = found_in((*GROUND, *planes, *ENDS), parallel_rad=SAID)
     before = found_in((*GROUND, *planes, *ENDS))[1]
-    assert why in finding(found, "zero").refused
+    assert why in finding(found, "zero").rejected
     assert found.mount == before.mount
 
 
-def test_a_word_less_sure_than_a_rig_as_bought_is_refused():
+def test_an_orientation_less_accurate_than_an_uncalibrated_rig_is_rejected():
     _, found = found_in((*GROUND, *WALLS, *ENDS), parallel_rad=math.radians(0.5))
-    assert "as bought" in finding(found, "zero").refused
+    assert "as bought" in finding(found, "zero").rejected
 
 
-def test_the_ground_tells_how_the_axis_is_tilted_and_not_the_zero():
+def test_the_ground_determines_the_tilt_of_the_axis_but_not_the_zero():
     true, found = found_in((*GROUND, *WALLS, *ENDS), tilt_deg=TILT_DEG, level_rad=SAID)
     R = found.mount.T_vehicle_turntable.matrix()[:3, :3]
     off = R @ rotation_from_rpy_deg((*TILT_DEG, 0.0)).T
@@ -111,37 +111,37 @@ def test_the_ground_tells_how_the_axis_is_tilted_and_not_the_zero():
     assert [finding(found, f"level_{axis}").after for axis in "xy"] == pytest.approx(TILT_DEG, abs=0.05)
     assert 0.15 <= finding(found, "level_x").sigma < 0.3
     assert found.mount.T_vehicle_turntable.xyz_m == RIG.T_vehicle_turntable.xyz_m
-    assert finding(found, "zero").refused
+    assert finding(found, "zero").rejected
     assert abs(off_deg(true, found)) > 0.3
 
 
-def test_both_words_together_tell_the_zero_of_a_tilted_axis():
+def test_ground_and_wall_together_determine_the_zero_of_a_tilted_axis():
     true, found = found_in((*GROUND, *WALLS, *ENDS), tilt_deg=TILT_DEG, level_rad=SAID, parallel_rad=SAID)
-    assert finding(found, "zero").refused == ""
+    assert finding(found, "zero").rejected == ""
     assert abs(off_deg(true, found)) < 0.06
 
 
 def test_a_vehicle_that_stands_on_a_slope_stands_level_on_it():
     """The word is of the ground about it: an even slope is the vehicle's own, as its wheels stand on it."""
     _, found = found_in((sloped(3.0), *WALLS, *ENDS), tilt_deg=(3.0, 0.0), level_rad=SAID)
-    assert finding(found, "level_x").refused == ""
+    assert finding(found, "level_x").rejected == ""
     assert finding(found, "level_x").after == pytest.approx(0.0, abs=0.05)
 
 
 @pytest.mark.parametrize("rises_deg", [4.0, 8.0])
-def test_ground_that_bends_about_the_vehicle_is_refused(rises_deg):
+def test_curved_ground_is_rejected(rises_deg):
     _, found = found_in((sloped(rises_deg), sloped(-rises_deg), *WALLS, *ENDS), level_rad=SAID)
-    assert finding(found, "level_x").refused
+    assert finding(found, "level_x").rejected
     assert found.mount.T_vehicle_turntable == RIG.T_vehicle_turntable
 
 
-def test_a_slope_that_begins_beside_the_vehicle_is_refused_or_in_the_sigma():
+def test_a_slope_next_to_the_vehicle_is_rejected_or_in_the_sigma():
     for rises_deg in (0.4, 1.0, 2.0, 4.0):
         _, found = found_in((*GROUND, sloped(rises_deg), *WALLS, *ENDS), level_rad=SAID)
         told = finding(found, "level_x")
-        assert told.refused or abs(told.after) < 2 * told.sigma
+        assert told.rejected or abs(told.after) < 2 * told.sigma
 
 
-def test_ground_that_was_not_seen_about_the_vehicle_is_refused():
+def test_ground_that_was_not_observed_around_the_vehicle_is_rejected():
     _, found = found_in((*WALLS, *ENDS), level_rad=SAID)
-    assert "too little of the ground" in finding(found, "level_x").refused
+    assert "too little of the ground" in finding(found, "level_x").rejected

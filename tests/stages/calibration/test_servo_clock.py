@@ -62,18 +62,18 @@ def test_stamps_that_are_late_are_found_with_an_honest_sigma(recorded, late_s):
     check_arrays(offset)
     assert offset.sigma_s < 4e-4
     assert abs(offset.offset_s + late_s) < 3 * offset.sigma_s
-    assert (offset.windows, offset.rig_s) == (1, 0.0)
+    assert (offset.windows, offset.rig_offset_s) == (1, 0.0)
     assert "this window alone" in offset.reason
 
 
-def test_what_the_rig_says_already_is_counted_in(recorded):
+def test_the_rigs_offset_is_included(recorded):
     mount = recorded[0].model_copy(update={"servo_time_offset_s": 1e-3})
     (offset,) = told(recorded, late_s=-1e-3, mount=mount)
-    assert offset.rig_s == 1e-3
+    assert offset.rig_offset_s == 1e-3
     assert abs(offset.offset_s - 1e-3) < 3 * offset.sigma_s
 
 
-def test_a_sweep_one_way_tells_nothing(recorded):
+def test_a_sweep_in_one_direction_gives_no_estimate(recorded):
     (offset,) = told(recorded, late_s=1e-3, from_s=0.1, to_s=2.6)
     assert (offset.offset_s, offset.sigma_s, offset.windows) == (None, None, 0)
     assert "in both directions" in offset.reason
@@ -83,44 +83,44 @@ def driven(x_m):
     return VehicleMotion(stamp_ns=0, xyz_map_m=np.array([x_m, 0.0, 0.0]), R_map_vehicle=np.eye(3), covariance=None)
 
 
-def test_a_vehicle_that_moves_tells_nothing(recorded):
+def test_a_moving_vehicle_gives_no_estimate(recorded):
     (offset,) = told(recorded, motion=[driven(0.0), driven(0.1)])
     assert (offset.offset_s, offset.reason) == (None, "the vehicle moved")
     (offset,) = told(recorded, motion=[driven(0.0), driven(0.01)])
     assert offset.offset_s is not None
 
 
-def test_a_lidar_bolted_down_says_nothing(recorded):
+def test_a_fixed_lidar_gives_no_estimate(recorded):
     assert told(recorded, mount=recorded[0].model_copy(update={"turns": False})) == []
 
 
-def test_windows_are_joined_and_one_that_disagrees_is_not():
+def test_windows_are_combined_except_outliers():
     stage = ServoClock(mount=LidarMount())
     stage._firings = [LidarFirings.__new__(LidarFirings)]
     object.__setattr__(stage._firings[0], "stamp_ns", 0)
     stage._join(1e-3, 2e-4, 0.0)
     assert "alone: 1.20 ms, sigma 0.20 ms" in stage._join(1.2e-3, 2e-4, 0.0)
-    first = stage._told(0, "")
+    first = stage._estimate(0, "")
     assert first.offset_s == pytest.approx(1.1e-3, rel=1e-3)
     assert first.sigma_s == pytest.approx(math.hypot(2e-4 / math.sqrt(2), 3e-4), rel=1e-3)
     assert "disagrees: 9.00 ms" in stage._join(9e-3, 2e-4, 0.0)
-    doubtful = stage._told(0, "")
+    doubtful = stage._estimate(0, "")
     assert doubtful.offset_s == first.offset_s
     assert doubtful.sigma_s > 4 * first.sigma_s
 
 
-def test_what_windows_share_does_not_shrink_with_their_number():
+def test_the_common_sigma_does_not_decrease_with_the_number_of_windows():
     stage = ServoClock(mount=LidarMount())
     stage._firings = [LidarFirings.__new__(LidarFirings)]
     object.__setattr__(stage._firings[0], "stamp_ns", 0)
     for _ in range(100):
         said = stage._join(1e-3, 2e-4, 3e-4)
     assert "sigma 0.36 ms" in said
-    assert stage._told(0, "").sigma_s == pytest.approx(math.hypot(2e-5, 3e-4, 3e-4), rel=1e-3)
+    assert stage._estimate(0, "").sigma_s == pytest.approx(math.hypot(2e-5, 3e-4, 3e-4), rel=1e-3)
     assert "alone" in stage._join(2.5e-3, 2e-4, 3e-4)  # a window may be off by what it shares with itself only
 
 
-def test_a_play_that_the_rig_does_not_know_is_in_the_sigma_that_windows_share():
+def test_unknown_play_is_in_the_common_sigma():
     """Half of .1 deg of play at 68 deg/s is .7 ms, in each sweep there and back."""
     true = replace(servo_mount(RIG), play_rad=math.radians(0.1))
     made = sweep(true, legs=((30.0, 150.0, SLOW), (150.0, 30.0, SLOW)), count=20_000)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from stages.detect.isolation import BigThings
+from stages.detect.isolation import LargeObjectMap
 from stages.geometry.frames import rotation_from_rpy_deg
 from stages.kernels.detect.isolation import (
     FARTHER_0,
@@ -27,7 +27,7 @@ CLOSE_M, OUTER_M = 1.2, 2.0
 AHEAD_M = np.add(ORIGIN_M, [20.0, 0.0, 0.0])  # a = +y, b = +z across the line of sight
 
 
-def around(offsets_m, ranges_m, centre_m=AHEAD_M, R=None):
+def isolation(offsets_m, ranges_m, centre_m=AHEAD_M, R=None):
     """The tally of pulses that pass the place at offsets (a, b) [m]; 0 is a pulse without return."""
     R = np.eye(3) if R is None else R
     line = np.array([20.0, 0.0, 0.0])
@@ -48,37 +48,37 @@ def sector_of(tally):
 def test_a_pulse_in_the_ring_frees_or_fills_the_sector_it_passes_through(sector):
     angle = -math.pi + (sector + 0.5) * math.tau / SECTORS  # counted from -a, over -b
     offset = 1.0 * np.array([math.cos(angle), math.sin(angle)])
-    assert sector_of(around(offset, 0.0)) == [sector]
-    assert sector_of(around(offset, 35.0)) == [sector]  # went on and met a wall far behind
-    assert sector_of(around(offset, 20.0)) == [OCCUPIED_0 - FREE_0 + sector]
+    assert sector_of(isolation(offset, 0.0)) == [sector]
+    assert sector_of(isolation(offset, 35.0)) == [sector]  # went on and met a wall far behind
+    assert sector_of(isolation(offset, 20.0)) == [OCCUPIED_0 - FREE_0 + sector]
 
 
 @pytest.mark.parametrize("sector", range(SECTORS))
 def test_beyond_the_ring_what_stands_is_noted_apart_and_what_is_free_is_not(sector):
     angle = -math.pi + (sector + 0.5) * math.tau / SECTORS
     offset = 1.6 * np.array([math.cos(angle), math.sin(angle)])
-    assert sector_of(around(offset, 20.0)) == [FARTHER_0 - FREE_0 + sector]
-    assert sector_of(around(offset, 0.0)) == []
+    assert sector_of(isolation(offset, 20.0)) == [FARTHER_0 - FREE_0 + sector]
+    assert sector_of(isolation(offset, 0.0)) == []
 
 
 def test_pulses_through_the_middle_are_hits_and_passes():
-    tally = around([[0, 0], [0.1, 0], [0, -0.1], [0.1, 0.1]], [20.1, 0.0, 33.0, 19.8])
+    tally = isolation([[0, 0], [0.1, 0], [0, -0.1], [0.1, 0.1]], [20.1, 0.0, 33.0, 19.8])
     assert (tally[INNER_HITS], tally[INNER_PASSES]) == (2, 2)
     assert tally[FREE_0:].sum() == 0
 
 
 def test_between_disc_and_ring_and_beyond_the_ring_nothing_counts():
-    assert around([[0.3, 0], [0, 0.5], [2.1, 0], [0, -9]], [20.0, 0.0, 20.0, 0.0]).sum() == 0
+    assert isolation([[0.3, 0], [0, 0.5], [2.1, 0], [0, -9]], [20.0, 0.0, 20.0, 0.0]).sum() == 0
 
 
 def test_what_is_nearer_hides_the_place_and_says_nothing_of_it():
-    tally = around([[1, 0], [0, 0]], [12.0, 12.0])
+    tally = isolation([[1, 0], [0, 0]], [12.0, 12.0])
     assert tally[NEARER] == 2
     assert tally[INNER_HITS] + tally[INNER_PASSES] + tally[FREE_0:].sum() == 0
 
 
 def test_beside_it_something_may_slope_towards_the_beam_by_more_than_it_is_beside():
-    """Near R within 0.5 m + 1.2 times the way beside: a wire that runs towards us is beside it, a house far behind not."""
+    """Near R within 0.5 m + 1.2 times the way beside: a wire towards us is next to it, a far house not."""
     for away, r, expected in [
         (0.6, 18.9, "hit"),
         (0.6, 18.6, "nearer"),
@@ -86,7 +86,7 @@ def test_beside_it_something_may_slope_towards_the_beam_by_more_than_it_is_besid
         (1.8, 22.5, "hit"),
         (1.8, 22.8, "past"),
     ]:
-        tally = around([away, 0.0], r)
+        tally = isolation([away, 0.0], r)
         got = "nearer" if tally[NEARER] else ("hit" if tally[OCCUPIED_0:].sum() else "past")
         assert got == expected, (away, r)
 
@@ -102,8 +102,8 @@ def test_pulses_the_other_way_do_not_count():
 def test_turning_the_world_about_the_vertical_keeps_every_sector(yaw_deg):
     rng = np.random.default_rng(1)
     offsets, ranges = rng.uniform(-1.8, 1.8, (900, 2)), rng.choice([0.0, 20.0, 35.0, 10.0], 900)
-    plain = around(offsets, ranges)
-    turned = around(offsets, ranges, R=rotation_from_rpy_deg((0.0, 0.0, yaw_deg)))
+    plain = isolation(offsets, ranges)
+    turned = isolation(offsets, ranges, R=rotation_from_rpy_deg((0.0, 0.0, yaw_deg)))
     np.testing.assert_array_equal(plain, turned)
     assert plain[INNER_PASSES:].all()
 
@@ -111,12 +111,12 @@ def test_turning_the_world_about_the_vertical_keeps_every_sector(yaw_deg):
 def test_right_overhead_it_still_tells_hits_passes_and_all_sectors():
     R = rotation_from_rpy_deg((0.0, -90.0, 0.0))
     rng = np.random.default_rng(2)
-    tally = around(rng.uniform(-1.5, 1.5, (500, 2)), np.zeros(500), R=R)
+    tally = isolation(rng.uniform(-1.5, 1.5, (500, 2)), np.zeros(500), R=R)
     assert np.all(tally[FREE_0:OCCUPIED_0] > 5)
 
 
 def test_the_map_gives_the_distance_to_the_nearest_big_thing():
-    big = BigThings(cell_m=0.5)
+    big = LargeObjectMap(cell_m=0.5)
     big.add(np.array([[10.1, 0.1, 5.1], [12.1, 0.1, 5.1]]), 1_000)
     middle = np.array([10.25, 0.25, 5.25])
     assert big.nearest_m(np.add(middle, [1.0, 0, 0]), 0.3, 2.0, 0) == pytest.approx(1.0)  # the other is as near
@@ -125,7 +125,7 @@ def test_the_map_gives_the_distance_to_the_nearest_big_thing():
 
 
 def test_the_thing_itself_and_what_was_seen_too_long_ago_are_not_beside_it():
-    big = BigThings(cell_m=0.5)
+    big = LargeObjectMap(cell_m=0.5)
     place = np.array([[3.25, 3.25, 3.25]])
     big.add(place, 1_000)
     assert big.nearest_m(np.add(place[0], [0.2, 0, 0]), 0.3, 2.0, 0) == math.inf
@@ -136,7 +136,7 @@ def test_the_thing_itself_and_what_was_seen_too_long_ago_are_not_beside_it():
 
 
 def test_places_on_either_side_of_zero_and_far_away_do_not_mix():
-    big = BigThings(cell_m=0.5)
+    big = LargeObjectMap(cell_m=0.5)
     rng = np.random.default_rng(3)
     points = rng.uniform(-200, 200, (500, 3))
     big.add(points, 5)
@@ -148,6 +148,6 @@ def test_places_on_either_side_of_zero_and_far_away_do_not_mix():
 
 
 def test_memory_is_bounded():
-    big = BigThings()
+    big = LargeObjectMap()
     big.add(np.random.default_rng(0).uniform(-500, 500, (2 * MAP_SIZE, 3)), 1)
     assert big._key.size == big._when.size == MAP_SIZE

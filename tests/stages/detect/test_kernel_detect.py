@@ -38,7 +38,7 @@ def test_the_drone_over_a_street_is_found_where_it_is():
     assert np.abs(detections.xyz_vehicle_m[best] - centre).max() <= 20.0 / image.focal_px + 1e-6  # within a pixel
     assert detections.stamp_ns == score.stamp_ns == image.stamp_ns
     x, y, z = detections.xyz_vehicle_m[best]
-    assert detections.verdict.startswith(f"drone at ({x:.2f}, {y:.2f}, {z:.2f}) m, score ")
+    assert detections.summary.startswith(f"drone at ({x:.2f}, {y:.2f}, {z:.2f}) m, score ")
 
 
 def test_without_gates_the_lowest_score_is_the_drone():
@@ -89,22 +89,22 @@ def test_moving_the_origin_moves_the_detection():
 def test_a_street_without_a_drone_has_none_and_says_why():
     _, detections = detect(depth_image(street_depth(None)))
     assert not detections.accepted.any()
-    assert detections.verdict.startswith("no drone: ")
-    assert "candidates refused" in detections.verdict
-    assert detections.reasons[0] in detections.verdict
+    assert detections.summary.startswith("no drone: ")
+    assert "candidates refused" in detections.summary
+    assert detections.reasons[0] in detections.summary
 
 
 def test_an_empty_sky_says_how_many_returns_were_elsewhere():
     _, detections = detect(depth_image(np.zeros((512, 512))))
     assert detections.xyz_vehicle_m.shape == (0, 3)
-    assert detections.verdict == "no drone: 0 of 1000 returns lie within 60 deg of straight up"
+    assert detections.summary == "no drone: 0 of 1000 returns lie within 60 deg of straight up"
 
 
 def test_what_is_nearer_than_the_roof_is_no_candidate():
     depth = np.zeros((512, 512))
     depth[256, 256] = 0.7
     _, detections = detect(depth_image(depth))
-    assert detections.verdict.endswith("straight up, none of them 1 m or more above the turntable")
+    assert detections.summary.endswith("straight up, none of them 1 m or more above the turntable")
 
 
 def test_two_drones_are_both_accepted_the_better_first():
@@ -112,7 +112,7 @@ def test_two_drones_are_both_accepted_the_better_first():
     depth[299:302, 249:252] = 19.0
     _, detections = detect(depth_image(depth))
     assert detections.accepted.sum() == 2
-    assert detections.verdict.endswith("1 more with a higher score")
+    assert detections.summary.endswith("1 more with a higher score")
 
 
 def test_an_accepted_candidate_is_given_out_even_when_many_refused_ones_score_lower():

@@ -1,4 +1,4 @@
-"""A path against what the drone tells of its own: likelihoods by hand, frames that do not matter, birds, lamps, silence."""
+"""Log ratios of a path against the odometry: likelihoods by hand, invariance to frames, birds, lamps, silence."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.detect import motion_log_ratios
-from stages.detect.motion_log_ratios import MOST_MISFIT, MOST_POINTS, Heard, hear
+from stages.detect.motion_log_ratios import MAX_MISFIT, MAX_POINTS, MotionLogRatios, compare_motion
 from stages.geometry.frames import rotation_z
 from stages.kernels.detect.motion_log_ratios import (
     BALLOON,
@@ -49,7 +49,9 @@ def noise(seed=0, sigma_m=0.1, n=14):
 
 
 def against(path_m, told_m, level_known=True, t_s=T_S, sigma_m=SIGMA_M):
-    return Heard(*weigh(t_s, np.asarray(path_m), np.asarray(told_m), sigma_m, level_known), way_m=math.inf)
+    return MotionLogRatios(
+        *weigh(t_s, np.asarray(path_m), np.asarray(told_m), sigma_m, level_known), displacement_m=math.inf
+    )
 
 
 # formula by hand
@@ -98,8 +100,8 @@ def heard_by_hand(t, x, d, sigma, level_known):
         parts = parts + np.array(by_hand(t, x, d, sigma, (0, 1)))
     drone, still, long, sliding, bird, balloon, loose, followed = parts
     balloon = np.logaddexp(math.log(1 - LOOSE) + balloon, math.log(LOOSE) + loose)
-    over_still = drone - log_mean([still, long, sliding])
-    return over_still, drone - bird, drone - balloon, min(over_still, drone - followed)
+    over_static = drone - log_mean([still, long, sliding])
+    return over_static, drone - bird, drone - balloon, min(over_static, drone - followed)
 
 
 @pytest.mark.parametrize("level_known", [True, False])
@@ -201,10 +203,10 @@ def test_the_order_of_the_sightings_does_not_matter():
 @pytest.mark.parametrize("seed", range(3))
 def test_a_path_that_the_drone_tells_is_the_drones(flight, seed):
     path = FLIGHTS[flight] @ rotation_z(0.4 + seed).T + noise(seed)
-    heard = against(path, FLIGHTS[flight])
-    assert heard.over_still > 15.0
-    assert heard.over_bird > 4.0
-    assert heard.over_balloon > 4.0
+    log_ratios = against(path, FLIGHTS[flight])
+    assert log_ratios.over_static > 15.0
+    assert log_ratios.over_bird > 4.0
+    assert log_ratios.over_balloon > 4.0
 
 
 def test_a_slow_drift_of_the_autopilots_velocity_is_forgiven_and_a_fast_one_is_not():
@@ -225,25 +227,25 @@ def test_a_bird_is_no_drone_that_hangs_or_flies_otherwise(velocity, seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_lamp_is_no_drone_that_flies(seed):
     path = noise(seed)
-    assert against(path, STRAIGHT_M).over_still < -30.0
-    assert against(path, np.outer(T_S, (0.0, 0.0, 1.0))).over_still < -3.0
+    assert against(path, STRAIGHT_M).over_static < -30.0
+    assert against(path, np.outer(T_S, (0.0, 0.0, 1.0))).over_static < -3.0
     scattered = noise(seed, sigma_m=0.4)  # a wire is met here and there
-    assert against(scattered, STRAIGHT_M).over_still < -10.0
+    assert against(scattered, STRAIGHT_M).over_static < -10.0
 
 
 def test_a_wire_that_is_met_farther_and_farther_along_is_no_drone_that_flies_or_hangs():
     slides = np.outer(T_S, (0.6, -0.5, 0.0)) + noise()
-    assert against(slides, STRAIGHT_M).over_still < -10.0
-    assert against(slides, HANGING_M).over_still < 1.0
+    assert against(slides, STRAIGHT_M).over_static < -10.0
+    assert against(slides, HANGING_M).over_static < 1.0
     rises = np.outer(T_S, (0.0, 0.0, 0.8)) + noise()  # none slides up
-    assert against(rises, np.outer(T_S, (0.0, 0.0, 0.8))).over_still > 10.0
+    assert against(rises, np.outer(T_S, (0.0, 0.0, 0.8))).over_static > 10.0
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_wire_looked_at_farther_along_as_fast_as_the_drone_flies_is_told_from_it_by_a_turn_alone(seed):
     slides = np.outer(T_S, (2.0, -1.5, 0.0)) + noise(seed)
     straight = against(slides, np.outer(T_S, (2.5, 0.0, 0.0)))
-    assert straight.over_still > 8.0  # what nobody looks along does not go so far
+    assert straight.over_static > 8.0  # what nobody looks along does not go so far
     assert straight.over_wire < 4.0
     turned = turning()
     assert against(turned + noise(seed), turned).over_wire > 10.0
@@ -251,9 +253,9 @@ def test_a_wire_looked_at_farther_along_as_fast_as_the_drone_flies_is_told_from_
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_drone_that_hangs_still_says_nothing_against_a_lamp(seed):
-    heard = against(noise(seed), HANGING_M)
-    assert -1.5 < heard.over_still < 1.5
-    assert heard.over_bird > 5.0  # and much against birds
+    log_ratios = against(noise(seed), HANGING_M)
+    assert -1.5 < log_ratios.over_static < 1.5
+    assert log_ratios.over_bird > 5.0  # and much against birds
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -291,9 +293,9 @@ def test_when_the_vehicles_motion_is_unknown_only_heights_are_compared():
 def test_more_looks_say_more():
     told = turning()
     path = told + noise(3)
-    heard = [against(path[-n:], told[-n:], t_s=T_S[-n:]).over_still for n in (2, 4, 8, 14)]
-    assert heard == sorted(heard)
-    assert heard[-1] > heard[0] + 20.0
+    log_ratios = [against(path[-n:], told[-n:], t_s=T_S[-n:]).over_static for n in (2, 4, 8, 14)]
+    assert log_ratios == sorted(log_ratios)
+    assert log_ratios[-1] > log_ratios[0] + 20.0
 
 
 # what the drone tells
@@ -389,7 +391,7 @@ def test_an_odometry_that_calls_itself_failed_is_not_heard():
                 quality_percent=quality,
             )
         )
-    assert told.heard_ns == (START_NS, START_NS + 100 * MS)
+    assert told.span_ns == (START_NS, START_NS + 100 * MS)
 
 
 def test_a_word_that_is_not_newer_is_ignored():
@@ -431,10 +433,10 @@ def test_a_path_is_compared_with_what_was_told_at_its_times():
     times = np.linspace(1.0, 3.0, 9)
     yaw = rotation_z(math.tau * 3 / YAWS)
     stamps, path = path_of(lambda t: yaw @ circle(t) + [0.0, 40.0, -3.0], times)
-    heard = hear(telling(circle), stamps, path, SIGMA_M, True)
+    log_ratios = compare_motion(telling(circle), stamps, path, SIGMA_M, True)
     expected = weigh(times - times[-1], np.array(path), np.array([circle(t) for t in times]), SIGMA_M, True)
-    np.testing.assert_allclose(heard[:5], expected, atol=0.2)
-    assert heard.over_still > 30.0 < heard.over_balloon
+    np.testing.assert_allclose(log_ratios[:5], expected, atol=0.2)
+    assert log_ratios.over_static > 30.0 < log_ratios.over_balloon
 
 
 def test_nothing_speaks_for_a_drone_where_a_path_is_far_from_the_drones_though_all_else_is_farther():
@@ -447,19 +449,19 @@ def test_nothing_speaks_for_a_drone_where_a_path_is_far_from_the_drones_though_a
     stamps, path = path_of(lambda t: swinging(t, 2.0), times)
     told = np.array([swinging(t) for t in times])
     assert min(weigh(times - times[-1], np.array(path), told, SIGMA_M, True)[:4]) > 5.0
-    heard = hear(telling(swinging), stamps, path, SIGMA_M, True)
-    assert heard.misfit > MOST_MISFIT
-    assert max(heard[:4]) == 0.0
+    log_ratios = compare_motion(telling(swinging), stamps, path, SIGMA_M, True)
+    assert log_ratios.misfit > MAX_MISFIT
+    assert max(log_ratios[:4]) == 0.0
     stamps, path = path_of(swinging, times)
-    heard = hear(telling(swinging), stamps, path, SIGMA_M, True)
-    assert heard.misfit < 1.0
-    assert min(heard[:4]) > 5.0
+    log_ratios = compare_motion(telling(swinging), stamps, path, SIGMA_M, True)
+    assert log_ratios.misfit < 1.0
+    assert min(log_ratios[:4]) > 5.0
 
 
 def test_only_heights_are_heard_of_when_the_vehicle_does_not_say_how_it_drives():
     stamps, path = path_of(lambda t: [20.0 * t, 0.0, circle(t)[2]], np.linspace(1.0, 3.0, 9))
-    assert hear(telling(circle), stamps, path, SIGMA_M, True).over_bird < -50.0
-    assert hear(telling(circle), stamps, path, SIGMA_M, False).over_bird > -1.0
+    assert compare_motion(telling(circle), stamps, path, SIGMA_M, True).over_bird < -50.0
+    assert compare_motion(telling(circle), stamps, path, SIGMA_M, False).over_bird > -1.0
 
 
 def test_how_far_the_drone_went_is_its_farthest_from_where_it_was_at_first_and_only_up_where_heights_are_compared():
@@ -467,17 +469,21 @@ def test_how_far_the_drone_went_is_its_farthest_from_where_it_was_at_first_and_o
         return np.array([4.0 * math.sin(math.pi * (t - 1.0) / 2.0), 0.0, 10.0 + 0.7 * math.sin(math.pi * (t - 1.0))])
 
     stamps, path = path_of(out_and_back, np.linspace(1.0, 3.0, 9))
-    assert hear(telling(out_and_back), stamps, path, SIGMA_M, True).way_m == pytest.approx(4.0, abs=0.1)
-    assert hear(telling(out_and_back), stamps, path, SIGMA_M, False).way_m == pytest.approx(0.7, abs=0.1)
-    hanging = hear(telling(lambda t: [3.0, 4.0, 10.0]), stamps, path, SIGMA_M, True)
-    assert hanging.way_m == pytest.approx(0.0, abs=1e-6)
+    assert compare_motion(telling(out_and_back), stamps, path, SIGMA_M, True).displacement_m == pytest.approx(
+        4.0, abs=0.1
+    )
+    assert compare_motion(telling(out_and_back), stamps, path, SIGMA_M, False).displacement_m == pytest.approx(
+        0.7, abs=0.1
+    )
+    hanging = compare_motion(telling(lambda t: [3.0, 4.0, 10.0]), stamps, path, SIGMA_M, True)
+    assert hanging.displacement_m == pytest.approx(0.0, abs=1e-6)
 
 
 def test_silence_and_a_single_sighting_say_nothing():
     stamps, path = path_of(circle, np.linspace(1.0, 3.0, 9))
-    assert hear(DroneTelemetry(), stamps, path, SIGMA_M, True) is None
-    assert hear(telling(circle, seconds=0.9), stamps, path, SIGMA_M, True) is None  # it fell silent long ago
-    assert hear(telling(circle), stamps[:1], path[:1], SIGMA_M, True) is None
+    assert compare_motion(DroneTelemetry(), stamps, path, SIGMA_M, True) is None
+    assert compare_motion(telling(circle, seconds=0.9), stamps, path, SIGMA_M, True) is None  # it fell silent long ago
+    assert compare_motion(telling(circle), stamps[:1], path[:1], SIGMA_M, True) is None
 
 
 def test_sightings_at_which_it_was_silent_are_left_out():
@@ -485,20 +491,22 @@ def test_sightings_at_which_it_was_silent_are_left_out():
     late, early = telling(circle, start_ns=START_NS), telling(circle, seconds=1.5)
     between = DroneTelemetry()
     telling(lambda t: circle(1.4 + t), seconds=1.2, start_ns=START_NS + 1_400 * MS, into=between)
-    for told, heard in ((late, times >= 0.0), (early, times <= 2.0), (between, (times > 1.4) & (times < 3.1))):
-        expected = hear(told, *path_of(circle, times[heard]), SIGMA_M, True)
-        if heard[-1]:
-            np.testing.assert_allclose(hear(told, *path_of(circle, times), SIGMA_M, True), expected)
+    for told, log_ratios in ((late, times >= 0.0), (early, times <= 2.0), (between, (times > 1.4) & (times < 3.1))):
+        expected = compare_motion(told, *path_of(circle, times[log_ratios]), SIGMA_M, True)
+        if log_ratios[-1]:
+            np.testing.assert_allclose(compare_motion(told, *path_of(circle, times), SIGMA_M, True), expected)
         else:  # the same path, seen from a later moment
-            np.testing.assert_allclose(hear(told, *path_of(circle, times), SIGMA_M, True), expected, rtol=1e-6)
+            np.testing.assert_allclose(
+                compare_motion(told, *path_of(circle, times), SIGMA_M, True), expected, rtol=1e-6
+            )
 
 
 def test_after_a_reset_a_path_from_before_it_is_not_compared():
     told = telling(circle, seconds=2.0)
     telling(shifted(2.1, 5.0), 2.0, start_ns=START_NS + 2_100 * MS, into=told)
-    assert hear(told, *path_of(circle, np.linspace(0.5, 2.0, 9)), SIGMA_M, True) is None
-    after = hear(told, *path_of(circle, np.linspace(2.25, 4.0, 8)), SIGMA_M, True)
-    np.testing.assert_allclose(hear(told, *path_of(circle, np.linspace(1.0, 4.0, 13)), SIGMA_M, True), after)
+    assert compare_motion(told, *path_of(circle, np.linspace(0.5, 2.0, 9)), SIGMA_M, True) is None
+    after = compare_motion(told, *path_of(circle, np.linspace(2.25, 4.0, 8)), SIGMA_M, True)
+    np.testing.assert_allclose(compare_motion(told, *path_of(circle, np.linspace(1.0, 4.0, 13)), SIGMA_M, True), after)
 
 
 def test_only_the_latest_ten_seconds_and_so_many_points_of_them_are_compared(monkeypatch):
@@ -508,9 +516,9 @@ def test_only_the_latest_ten_seconds_and_so_many_points_of_them_are_compared(mon
     )
     told = telling(circle, seconds=20.0)
     stamps, path = path_of(circle, np.linspace(1.0, 19.0, 181))
-    hear(told, stamps, path, SIGMA_M, True)
+    compare_motion(told, stamps, path, SIGMA_M, True)
     ((t, x),) = asked
-    assert len(t) == len(x) == MOST_POINTS
+    assert len(t) == len(x) == MAX_POINTS
     assert (t[0], t[-1]) == pytest.approx((-KEPT_NS / 2e9, 0.0))
     np.testing.assert_allclose(x[[0, -1]], [circle(9.0), circle(19.0)])
     assert np.diff(t) == pytest.approx(np.diff(t).mean(), abs=0.11)

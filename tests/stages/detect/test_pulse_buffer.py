@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.detect.pulse_buffer import MOST_SLICES, Lately
+from stages.detect.pulse_buffer import MAX_SLICES, RecentPulses
 from stages.kernels.detect.isolation import TALLY, look_around
 from stages.kernels.detect.pulse_buffer import WINDOW_NS
 from stages.messages import SweptPulses
@@ -50,7 +50,7 @@ def test_a_place_gets_of_all_slices_together_what_each_found_around_it(spread_ra
     rng = np.random.default_rng(int(1000 * spread_rad))
     found = 0.0
     for _ in range(60):
-        lately, slices = Lately(), []
+        lately, slices = RecentPulses(), []
         for k in range(int(rng.integers(1, 8))):
             pulses, mean = fan(rng, spread_rad)
             lately.add(pulses, mean, k * STEP_NS)
@@ -58,7 +58,7 @@ def test_a_place_gets_of_all_slices_together_what_each_found_around_it(spread_ra
         for slice_ in slices:  # a place some metres off one of its pulses: at the edge of what is looked at, too
             along = slice_.direction_vehicle[int(rng.integers(len(slice_.range_m)))].astype(float)
             centre_m = rng.uniform(1.5, 30.0) * along + rng.standard_normal(3) * rng.uniform(0.0, 3.0)
-            told = lately.around(centre_m, *AROUND)
+            told = lately.isolation(centre_m, *AROUND)
             np.testing.assert_array_equal(told, one_by_one(slices, centre_m))
             found += told.sum()
     assert found > 500
@@ -66,15 +66,15 @@ def test_a_place_gets_of_all_slices_together_what_each_found_around_it(spread_ra
 
 def test_what_is_older_than_the_window_or_beyond_the_last_slices_is_forgotten() -> None:
     rng = np.random.default_rng(7)
-    made = [fan(rng, 1.2) for _ in range(MOST_SLICES + 5)]
+    made = [fan(rng, 1.2) for _ in range(MAX_SLICES + 5)]
     centre_m = 8.0 * made[0][1]
-    late, many = Lately(), Lately()
+    late, many = RecentPulses(), RecentPulses()
     for k, (pulses, mean) in enumerate(made):
         late.add(pulses, mean, 0 if k < 2 else WINDOW_NS + 1)
         many.add(pulses, mean, 0)
         if k == 4:
             np.testing.assert_array_equal(
-                late.around(centre_m, *AROUND), one_by_one([s for s, _ in made[2:5]], centre_m)
+                late.isolation(centre_m, *AROUND), one_by_one([s for s, _ in made[2:5]], centre_m)
             )
-    last = [s for s, _ in made[-MOST_SLICES:]]
-    np.testing.assert_array_equal(many.around(centre_m, *AROUND), one_by_one(last, centre_m))
+    last = [s for s, _ in made[-MAX_SLICES:]]
+    np.testing.assert_array_equal(many.isolation(centre_m, *AROUND), one_by_one(last, centre_m))

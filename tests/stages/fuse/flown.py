@@ -19,7 +19,7 @@ from flow.link import Tap
 from flow.replay import Replay
 from flow.stage import input_ports
 from links.recording import RecordingReader
-from links.runs.run_folder import Asked
+from links.runs.request import RunRequest
 from links.runs.truth import TruthLog
 from stages.fuse import Fuse
 from stages.geometry.frames import rotation_from_quaternion_xyzw
@@ -67,10 +67,10 @@ def heard(recording: Path, config: Path, fuse: str = "fuse") -> Flown:
     """Replay a recording and keep what its fusion hears."""
     truth = TruthLog()
     with RecordingReader(recording) as reader:
-        graph = Asked(config, sets=("viewer.file=null",)).graph(reader.rig_yaml, str(recording))
+        graph = RunRequest(config, sets=("viewer.file=null",)).graph(reader.rig_yaml, str(recording))
         tap = Hearing(graph, fuse)
         runner = Replay(graph, (tap,))
-        for record in truth.aside(reader.records()):
+        for record in truth.without_truth(reader.records()):
             runner.feed(record)
         runner.finish()
     return flown(recording.stem, tap, truth)
@@ -131,7 +131,7 @@ def late(ports: tuple[str, ...], by_s: float) -> Fault:
     return fault
 
 
-def spoilt(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
+def inflation(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
     """This share of what these ports hear is false: places by metres, turns by some tens of degrees."""
 
     def fault(events: list[Event]) -> list[Event]:
@@ -206,7 +206,7 @@ def judge(flown: Flown, poses: list[RelativePose], into: Row | None = None) -> R
     for pose in poses:
         row.states[pose.state] += 1
         true = flown.truth(pose.stamp_ns)
-        if pose.xyz_vehicle_m is None or pose.covariance is None or true is None:
+        if pose.estimate is None or true is None:
             continue
         R, xyz = true
         add_errors(row, pose, R, xyz)

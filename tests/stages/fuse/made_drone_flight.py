@@ -20,7 +20,9 @@ from stages.messages import (
     DroneFix,
     DroneLocalPosition,
     DroneOdometry,
+    PoseEstimate,
     PoseState,
+    PositionEstimate,
     RelativePose,
     RelativeRotation,
     ServoState,
@@ -64,14 +66,14 @@ class Made:
     vehicle: bool = True
     autopilot: str = "odometry"  # "split": attitude and position; "attitude"; "none"
     rotations: bool = True
-    pictures: bool = False
+    images: bool = False
     tracks: bool = False
     clock_hz: float = 0.0  # servo states
     resolved_after_s: float = 1.0
     # errors
     fix_sigma_m: float = 0.06
     fix_time_s: float = 0.15
-    fix_lasting: float = 0.2
+    fix_bias_share: float = 0.2
     bias_m: float = 0.0  # of all fixes of a flight, one sigma an axis, beside that
     bias_told: bool = True  # whether a fix says so
     told_variance: float = 1.6  # of a fix, over the true one: trackers are careful
@@ -115,7 +117,7 @@ class Made:
     def events(self):
         """(arrival [ns], port, message) in order of arrival."""
         rng = np.random.default_rng([self.seed, 77])
-        made = [*self._vehicle(), *self._autopilot(rng), *self._fixes(rng), *self._rotations(rng), *self._pictures(rng)]
+        made = [*self._vehicle(), *self._autopilot(rng), *self._fixes(rng), *self._rotations(rng), *self._images(rng)]
         made += [
             (t, "servo", ServoState(stamp_ns=ns(t), position_rad=0.0, velocity_radps=0.0, goal_rad=0.0, error=0))
             for t in (np.arange(0, self.until_s, 1 / self.clock_hz) if self.clock_hz else ())
@@ -149,13 +151,13 @@ class Made:
         velocity = velocity * [1 + self.drift_scale, 1 + self.drift_scale, 1.0] + drift
         turned = np.cumsum(math.radians(0.05) * math.sqrt(FINE_S) * rng.standard_normal(len(grid)))
         turned += math.radians(1.0) / 60 * grid
-        lean = gauss_markov(rng, math.radians(0.4), 20.0, FINE_S, len(grid), 2)
+        likelihood = gauss_markov(rng, math.radians(0.4), 20.0, FINE_S, len(grid), 2)
         R_yaw = [rotation_z(math.radians(self.local_yaw_deg) + a) for a in turned]
         way = np.cumsum([R @ (v + w) * FINE_S for R, v, w in zip(R_yaw, velocity, walk, strict=True)], axis=0)
         for i in range(0, len(grid) - 10, 3):
             t = float(grid[i])
             R_false = rotation_z(math.radians(self.false_north[1])) if t >= self.false_north[0] else np.eye(3)
-            R = R_false @ R_yaw[i] @ exp_rotation(np.array([*lean[i], 0.0])) @ self.R_world_drone(t)
+            R = R_false @ R_yaw[i] @ exp_rotation(np.array([*likelihood[i], 0.0])) @ self.R_world_drone(t)
             rate = log_rotation(self.R_world_drone(t - 5e-4).T @ self.R_world_drone(t + 5e-4)) / 1e-3
             v, x = R_false @ R_yaw[i] @ velocity[i], R_false @ way[i]
             at = t + 0.015
@@ -182,12 +184,12 @@ class Made:
 
     def _fixes(self, rng):
         times = np.arange(0.25, self.until_s, 0.1) + rng.uniform(-0.02, 0.02, len(np.arange(0.25, self.until_s, 0.1)))
-        lasting = math.sqrt(self.fix_lasting) * self.fix_sigma_m * rng.standard_normal(3)
+        bias_covariance_m2 = math.sqrt(self.fix_bias_share) * self.fix_sigma_m * rng.standard_normal(3)
         bias = np.zeros(3) if self.bias_m == 0 else np.random.default_rng([self.seed, 78]).normal(0, self.bias_m, 3)
-        e = gauss_markov(rng, math.sqrt(1 - self.fix_lasting) * self.fix_sigma_m, self.fix_time_s, 0.1, len(times))
+        e = gauss_markov(rng, math.sqrt(1 - self.fix_bias_share) * self.fix_sigma_m, self.fix_time_s, 0.1, len(times))
         for i, t in enumerate(times):
             R_world_vehicle, _ = self.T_world_vehicle(t)
-            xyz = self.truth(t)[1] + e[i] + lasting + bias
+            xyz = self.truth(t)[1] + e[i] + bias_covariance_m2 + bias
             if rng.random() < self.outliers.get("fix", 0.0):
                 xyz = xyz + rng.normal(0, 4.0, 3)
             yield (
@@ -208,7 +210,7 @@ class Made:
     def _lasting_m2(self):
         if self.bias_m == 0 or not self.bias_told:
             return None
-        own = self.fix_lasting * self.fix_sigma_m**2
+        own = self.fix_bias_share * self.fix_sigma_m**2
         return (own + self.bias_m**2) * np.eye(3)
 
     def _rotations(self, rng):
@@ -225,8 +227,8 @@ class Made:
                 R = R @ exp_rotation(rng.normal(0, 0.4, 3))
             yield t + 0.08, "rotation", rotation(t, R, sigma, t >= self.resolved_after_s, switches)
 
-    def _pictures(self, rng):
-        for t in np.arange(0.1, self.until_s, 1 / 15) if self.pictures else ():
+    def _images(self, rng):
+        for t in np.arange(0.1, self.until_s, 1 / 15) if self.images else ():
             a, b = self.R_world_drone(t - 1 / 15), self.R_world_drone(t)
             way = a.T @ (self.xyz_world_m(t) - self.xyz_world_m(t - 1 / 15))
             far = float(np.linalg.norm(way)) > 0.05
@@ -253,12 +255,11 @@ class Made:
             if t < after_s:
                 continue
             out.states[pose.state] += 1
-            if pose.xyz_vehicle_m is None:
+            if pose.estimate is None:
                 continue
             R, xyz = self.truth(t)
-            P = pose.covariance
             out.at_s.append(t)
-            out.sigma_m.append(math.sqrt(float(np.trace(P[3:, 3:])) / 3))
+            out.sigma_m.append(math.sqrt(float(np.trace(position_covariance_m2(pose.estimate))) / 3))
             add_errors(out, pose, R, xyz)
         return out
 
@@ -273,13 +274,20 @@ class Errors:
     nees6: list[float] = field(default_factory=list)
 
 
+def position_covariance_m2(estimate: PositionEstimate | PoseEstimate) -> np.ndarray:
+    """(3, 3) of the drone's position: in drone axes where its rotation is known, else in vehicle axes."""
+    return estimate.covariance[3:, 3:] if isinstance(estimate, PoseEstimate) else estimate.covariance_vehicle_m2
+
+
 def add_errors(errors: Errors, pose: RelativePose, R: np.ndarray, xyz_m: np.ndarray) -> None:
     """What a pose with a position is off, and by its own covariance, whose axes are the drone's where it has any."""
-    e, P = pose.xyz_vehicle_m - xyz_m, pose.covariance
+    estimate = pose.estimate
+    e = estimate.xyz_vehicle_m - xyz_m
     errors.error_m.append(float(np.linalg.norm(e)))
-    if pose.R_vehicle_drone is None:
-        errors.nees3.append(float(e @ np.linalg.solve(P[3:, 3:], e)))
+    if isinstance(estimate, PositionEstimate):
+        errors.nees3.append(float(e @ np.linalg.solve(estimate.covariance_vehicle_m2, e)))
         return
+    P = estimate.covariance
     off = np.concatenate([log_rotation(pose.R_vehicle_drone.T @ R), -pose.R_vehicle_drone.T @ e])
     errors.nees3.append(float(off[3:] @ np.linalg.solve(P[3:, 3:], off[3:])))
     errors.nees6.append(float(off @ np.linalg.solve(P, off)))

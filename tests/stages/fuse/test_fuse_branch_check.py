@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from stages.fuse import EkfFuse, Fuse
-from stages.heading.hypothesis_bank import BranchBank, BranchSettings
+from stages.fuse import Fuse
+from stages.heading.hypothesis_bank import BranchSettings, HypothesisBank
 from stages.messages import PoseState
+from tests.stages.fuse.ekf import EkfFuse
 from tests.stages.fuse.made_drone_flight import Made, ns
 
 FULL, AMBIGUOUS, COASTING = PoseState.FULL, PoseState.AMBIGUOUS, PoseState.COASTING
@@ -48,9 +49,9 @@ def test_a_drone_that_hovers_is_never_full_by_the_streets_alone(quarter, stage):
     assert made.judge(poses, after_s=2).rmse_m() < 0.15  # its position is given all the same
 
 
-@pytest.mark.parametrize(("autopilot", "pictures"), [("odometry", False), ("attitude", True), ("none", True)])
-def test_two_seconds_and_a_half_of_flight_make_it_full(autopilot, pictures):
-    made = HoverThenFly(until_s=10, autopilot=autopilot, pictures=pictures)
+@pytest.mark.parametrize(("autopilot", "images"), [("odometry", False), ("attitude", True), ("none", True)])
+def test_two_seconds_and_a_half_of_flight_make_it_full(autopilot, images):
+    made = HoverThenFly(until_s=10, autopilot=autopilot, images=images)
     poses = made.run(Fuse())
     assert ns(5.0) < first(poses, FULL).stamp_ns < ns(7.5)
     assert poses[-1].state is FULL
@@ -60,7 +61,7 @@ def test_two_seconds_and_a_half_of_flight_make_it_full(autopilot, pictures):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("quarter", [1, 2, 3])
 def test_without_the_autopilots_way_the_pictures_speak_against_a_wrong_branch(quarter, seed):
-    made = Made(until_s=9, autopilot="none", pictures=True, quarters=((0.0, quarter),), seed=seed)
+    made = Made(until_s=9, autopilot="none", images=True, quarters=((0.0, quarter),), seed=seed)
     poses = made.run(Fuse())
     assert wrong(made, poses) == 0
     assert poses[-1].state is AMBIGUOUS
@@ -68,7 +69,7 @@ def test_without_the_autopilots_way_the_pictures_speak_against_a_wrong_branch(qu
 
 @pytest.mark.parametrize("said", [True, False])
 def test_a_branch_that_changes_without_an_autopilot_ends_full(said):
-    made = Made(until_s=9, autopilot="none", pictures=True, quarters=((5.0, 1),), switches=said)
+    made = Made(until_s=9, autopilot="none", images=True, quarters=((5.0, 1),), switches=said)
     poses = made.run(Fuse())
     assert first(poses, FULL) is not None
     assert wrong(made, poses) == 0
@@ -95,7 +96,7 @@ def test_once_full_it_stays_so_through_a_hover():
 @pytest.mark.parametrize("trust", [0.95, 0.99999])
 def test_align_alone_resolves_nothing_by_a_word_without_motion(trust):
     """A compass or the crew may make a branch as good as certain; RESOLVED it is not before windows of motion."""
-    bank = BranchBank(BranchSettings())
+    bank = HypothesisBank(BranchSettings())
     bank.expect_yaw(0.0, math.radians(5), trust)
     bank.expect_yaw(0.0, math.radians(5), trust)
     assert bank.probability[0] > 0.9

@@ -10,9 +10,10 @@ import resource
 import numpy as np
 import pytest
 
-from stages.fuse import EkfFuse, Fuse
+from stages.fuse import Fuse
 from stages.fuse.settings import FuseErrors
 from stages.messages import PoseState
+from tests.stages.fuse.ekf import EkfFuse
 from tests.stages.fuse.made_drone_flight import START_NS, Made, S, rms
 
 CHI2_95 = {3: 7.815, 6: 12.592}
@@ -64,7 +65,7 @@ def test_the_covariance_holds_what_it_promises(stage):
 def test_taking_lasting_errors_for_fleeting_ones_promises_too_much():
     """Why they are inflated: without, vanishing points 1 deg wrong for 1 s break the promise."""
     made = flights(4, until_s=8, rotation_sigma_deg=1.0, rotation_time_s=1.0)
-    naive = FuseErrors(rotation_time_s=0.0, rotation_lasting=0.0, fix_time_s=0.0, fix_lasting=0.0)
+    naive = FuseErrors(rotation_time_s=0.0, rotation_bias_share=0.0, fix_time_s=0.0, fix_bias_share=0.0)
     _, honest, _, _ = pooled(Fuse, made)
     _, proud, _, _ = pooled(lambda: Fuse(errors=naive), made)
     assert honest.mean() < 9

@@ -2,8 +2,8 @@
 
     pytest -m slow tests/stages/fuse/test_fuse_faults.py -s
 
-The flights are made first, in closed loop; without pictures, so rotations are made from the truth, as `align` tells
-them. GRD_FLIGHTS='some/*.mcap' takes recordings with pictures instead, replayed through configs/vision.yaml.
+The flights are made first, in closed loop; without images, so rotations are made from the truth, as `align` tells
+them. GRD_FLIGHTS='some/*.mcap' takes recordings with images instead, replayed through configs/vision.yaml.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from links.runs.run_folder import Asked
+from links.runs.request import RunRequest
 from links.runs.truth import TruthLog
-from links.simulated.closed_loop import ClosedLoop
-from links.simulated.matrix import Conditions, scenario_of
-from links.simulated.matrix_flights import Cell
-from links.simulated.run import Simulation
+from links.simulated.matrix.flights import Cell
+from links.simulated.matrix.matrix import Conditions, scenario_of
+from links.simulated.rig.closed_loop import ClosedLoop
+from links.simulated.rig.run import Simulation
 from stages.messages import PoseState
 from tests.stages.fuse.flown import (
     Fault,
@@ -30,9 +30,9 @@ from tests.stages.fuse.flown import (
     Row,
     flown,
     heard,
+    inflation,
     judge,
     late,
-    spoilt,
     with_rotations,
     without,
 )
@@ -57,7 +57,7 @@ FAULTS: dict[str, Callable[[tuple[str, ...]], Fault]] = {
     "gone for 3 s": lambda ports: without(ports, AT_S, AT_S + FOR_S),
     "gone": without,
     "300 ms late": lambda ports: late(ports, 0.3),
-    "20 % false": lambda ports: spoilt(ports, 0.2),
+    "20 % false": lambda ports: inflation(ports, 0.2),
 }
 WITH_ROTATION = (PoseState.FULL, PoseState.COASTING)
 
@@ -65,9 +65,9 @@ WITH_ROTATION = (PoseState.FULL, PoseState.COASTING)
 def made(cell: Cell, seed: int = 1) -> Flown:
     """A flight of the matrix, flown for this test."""
     scenario = scenario_of(cell, seed, Conditions(calibrated=True, odometry=True, autopilot=True))
-    graph = Asked(CONFIGS / "estimate.yaml", sets=("viewer.file=null",)).graph(scenario.rig_yaml(), cell.name)
+    graph = RunRequest(CONFIGS / "estimate.yaml", sets=("viewer.file=null",)).graph(scenario.rig_yaml(), cell.name)
     tap, truth = Hearing(graph, "fuse"), TruthLog()
-    truth.take(Simulation(scenario, loop=ClosedLoop(graph, scenario.closed_loop, {}, (tap,))).records())
+    truth.add_all(Simulation(scenario, loop=ClosedLoop(graph, scenario.closed_loop, {}, (tap,))).records())
     return with_rotations(flown(cell.name, tap, truth))
 
 

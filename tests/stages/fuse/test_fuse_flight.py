@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from stages.fuse import EkfFuse, Fuse
-from stages.messages import PoseState, ServoState, TrackingState
+from stages.fuse import Fuse
+from stages.messages import PoseState, PositionEstimate, ServoState, TrackingState
+from tests.stages.fuse.ekf import EkfFuse
 from tests.stages.fuse.made_drone_flight import START_NS, Made, S, fix, ns, rms, rotation, track
 
 FULL, COASTING, LOST = PoseState.FULL, PoseState.COASTING, PoseState.LOST
@@ -42,7 +44,10 @@ def test_two_runs_give_the_same_to_the_last_bit():
     for p, q in zip(a, b, strict=True):
         assert p.state is q.state
         assert np.array_equal(p.xyz_vehicle_m, q.xyz_vehicle_m) or p.xyz_vehicle_m is None
-        assert p.covariance is None or np.array_equal(p.covariance, q.covariance)
+        assert type(p.estimate) is type(q.estimate)
+        if p.estimate is not None:
+            for field in dataclasses.fields(p.estimate):
+                assert np.array_equal(getattr(p.estimate, field.name), getattr(q.estimate, field.name))
 
 
 def test_relative_pose_and_pose_in_the_start_frame_are_one():
@@ -52,16 +57,19 @@ def test_relative_pose_and_pose_in_the_start_frame_are_one():
         R, x = made.T_world_vehicle((pose.stamp_ns - START_NS) / S)
         assert np.allclose(R @ pose.xyz_vehicle_m + x, pose.xyz_map_m, atol=0.03)
         assert np.allclose(R @ pose.R_vehicle_drone, pose.R_map_drone, atol=1e-2)
-        assert pose.covariance is not None
-        assert np.allclose(pose.covariance, pose.map_covariance)
+        assert np.allclose(pose.estimate.covariance, pose.estimate.map_covariance)
 
 
 def test_velocities_are_the_drones_over_ground_and_beside_the_vehicle():
     made = Made(until_s=8, vehicle_mps=3.0)
     poses = [pose for pose in made.run(Fuse()) if pose.stamp_ns > ns(4)]
-    over_ground = [np.linalg.norm(p.velocity_map_mps - made.velocity_mps((p.stamp_ns - START_NS) / S)) for p in poses]
+    over_ground = [
+        np.linalg.norm(p.estimate.velocity_map_mps - made.velocity_mps((p.stamp_ns - START_NS) / S)) for p in poses
+    ]
     beside = [
-        np.linalg.norm(p.velocity_vehicle_mps + np.array([3, 0, 0]) - made.velocity_mps((p.stamp_ns - START_NS) / S))
+        np.linalg.norm(
+            p.estimate.velocity_vehicle_mps + np.array([3, 0, 0]) - made.velocity_mps((p.stamp_ns - START_NS) / S)
+        )
         for p in poses
     ]
     assert rms(over_ground) < 0.3
@@ -84,7 +92,7 @@ def test_a_drone_that_hangs_still_tells_no_heading():
     poses = Made(rotations=False, radius_m=0.0).run(Fuse())
     assert {pose.state for pose in poses} == {LOST, POSITION_ONLY}
     assert poses[-1].R_vehicle_drone is None
-    assert np.isinf(np.diag(poses[-1].covariance)[:3]).all()
+    assert isinstance(poses[-1].estimate, PositionEstimate)
     assert "too little" in poses[-1].reason
 
 
@@ -124,7 +132,7 @@ def test_a_branch_that_changes_in_flight_ends_full(said):
 
 
 def test_what_the_streets_alone_told_is_doubted_when_they_are_not_resolved_any_more():
-    made, stage = Made(until_s=5, autopilot="none", pictures=True), Fuse()
+    made, stage = Made(until_s=5, autopilot="none", images=True), Fuse()
     poses = made.run(stage)
     assert poses[-1].state is FULL
     poses += list(stage.on_rotation(rotation(5.05, made.truth(5.05)[0], resolved=False)))
@@ -151,7 +159,7 @@ def test_through_three_seconds_without_lidar_the_odometry_carries_the_pose():
     poses = made.run(Fuse())
     in_gap = [pose for pose in poses if ns(9.4) < pose.stamp_ns < ns(12.0)]
     assert {pose.state for pose in in_gap} == {COASTING}
-    assert "has not seen it" in in_gap[0].reason
+    assert "no LiDAR position for" in in_gap[0].reason
     assert max(b.stamp_ns - a.stamp_ns for a, b in pairwise(poses)) == 20_000_000
     seen = made.judge(in_gap)
     assert max(seen.error_m) < 0.7
@@ -179,20 +187,25 @@ def test_a_drone_that_was_lost_has_its_heading_when_it_is_found_again():
 
 
 def test_without_an_autopilot_rotations_and_the_drones_pictures_make_it_full():
-    made = Made(autopilot="none", pictures=True)
+    made = Made(autopilot="none", images=True)
     seen = made.judge(made.run(Fuse()), after_s=3)
     assert set(seen.states) == {FULL}
     assert rms(seen.angle_deg) < 1.0
 
 
 def test_directions_without_a_scale_sharpen_the_velocity_of_a_drone_without_autopilot():
-    """Rotations too, so that directions can be turned into the start frame; fixes each 0.1 s, rough."""
+    """Rotations too, so that directions can be turned into the map frame; fixes each 0.1 s, rough."""
     errors = []
-    for pictures in (False, True):
-        made = Made(autopilot="none", pictures=pictures, turn_dps=0.0, fix_sigma_m=0.15, seed=4)
+    for images in (False, True):
+        made = Made(autopilot="none", images=images, turn_dps=0.0, fix_sigma_m=0.15, seed=4)
         poses = [pose for pose in made.run(Fuse()) if pose.stamp_ns > ns(4)]
         errors.append(
-            rms([np.linalg.norm(p.velocity_map_mps - made.velocity_mps((p.stamp_ns - START_NS) / S)) for p in poses])
+            rms(
+                [
+                    np.linalg.norm(p.estimate.velocity_map_mps - made.velocity_mps((p.stamp_ns - START_NS) / S))
+                    for p in poses
+                ]
+            )
         )
     assert errors[1] < 0.9 * errors[0]
 
@@ -211,7 +224,7 @@ def test_without_word_of_the_vehicle_its_frame_is_the_start_frame(parked):
     poses = made.run(Fuse(parked=parked))
     seen = made.judge(poses, after_s=4)
     assert set(seen.states) == {FULL if parked else AMBIGUOUS}
-    assert parked or "how the vehicle moves is not told" in poses[-1].reason
+    assert parked or "without the vehicle's motion" in poses[-1].reason
     assert np.allclose(poses[-1].xyz_map_m, poses[-1].xyz_vehicle_m)
     assert seen.rmse_m() < (0.12 if parked else 0.2)
 
@@ -274,7 +287,7 @@ def test_one_track_is_followed_the_lowest_and_another_one_when_it_is_lost():
 def test_what_moved_as_another_track_does_not_tell_how_the_new_one_is_turned():
     made, stage = Made(until_s=16.0, rotations=False, gaps_s={"fix": (3.0, 99.0)}), Fuse()
     assert made.run(stage)[-1].state is LOST
-    seen = stage._estimator.north.by_motion
+    seen = stage._estimator.odometry_yaw.by_motion
     assert "moved" in seen.reason
     list(stage.on_track(track(16.0, TrackingState.LOST, 1)))
     list(stage.on_fix(fix(15.9, made.truth(15.9)[1], track_id=2)))
@@ -379,7 +392,7 @@ def test_a_position_only_covariance_is_in_the_frames_own_axes():
     object.__setattr__(long, "covariance_m2", np.diag([0.04, 0.0004, 0.01]))
     told = list(stage.on_fix(long))
     assert told[-1].state is POSITION_ONLY
-    variances = np.diag(told[-1].covariance)[3:]
+    variances = np.diag(told[-1].estimate.covariance_vehicle_m2)
     assert variances[0] > variances[2] > variances[1]
 
 

@@ -7,25 +7,25 @@ import math
 import numpy as np
 import pytest
 
-from stages.fuse.correlated import MOST, Worth, inflation
+from stages.fuse.correlated import MOST, InformationInflation, inflation
 from stages.fuse.drift import Drift
-from stages.fuse.ekf import Ekf
 from stages.fuse.estimator import Estimator
 from stages.fuse.motions import Motions
-from stages.fuse.positions import Positions, Told
+from stages.fuse.positions import MeasurementCovariance, Positions
 from stages.fuse.propagated import MotionModel
 from stages.fuse.rejected import ENOUGH, Rejected
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
-from stages.fuse.track_continuity import Following
+from stages.fuse.track_continuity import TrackContinuity
 from stages.geometry.frames import heading_rad, rotation_z
-from stages.geometry.se3 import good_covariance
+from stages.geometry.se3 import is_covariance
 from stages.heading.fused_heading import Heading
 from stages.heading.motion_yaw import Point
-from stages.heading.odometry_yaw import North
+from stages.heading.odometry_yaw import OdometryYaw
 from stages.heading.yaw_fit import DRIFT_RAD_PER_S, Yaw
 from stages.messages import DroneAttitude, DroneLocalPosition, TrackingState, TrackState
-from stages.odometry.drone.trajectory import AutopilotTrail
+from stages.odometry.drone.trajectory import AutopilotTrajectory
+from tests.stages.fuse.ekf import Ekf
 from tests.stages.fuse.made_drone_flight import S, fix, gauss_markov, ns, track
 
 ERRORS = FuseErrors()
@@ -51,7 +51,7 @@ def test_the_mean_of_inflated_measurements_is_as_good_as_it_says():
 
 
 def test_each_measurement_is_counted_from_the_one_before():
-    worth = Worth(1.0)
+    worth = InformationInflation(1.0)
     assert worth.factor(0) == 1.0
     assert worth.factor(S // 10) == pytest.approx(20.0, rel=0.01)
     assert worth.factor(20 * S) == pytest.approx(1.0)
@@ -91,7 +91,7 @@ def test_without_odometry_it_is_the_whole_velocity():
 
 def test_a_gap_costs_by_its_square_and_cube():
     drift = drifting(True, [0, 0, 0])
-    V = [drift.gathered(t)[0, 0] for t in (0.0, 1.0, 2.0)]
+    V = [drift.growth_covariance_m2(t)[0, 0] for t in (0.0, 1.0, 2.0)]
     P_b = drift.velocity_covariance[0, 0]
     assert V[0] == 0
     assert V[1] == pytest.approx(P_b + drift.q / 3)
@@ -109,7 +109,7 @@ def test_a_direction_of_flight_turns_the_velocity_and_leaves_its_length_alone():
     drift = drifting(False, [0.0, 0.0, 0.0], until=5)
     before = drift.velocity_mps.copy()
     along = rotation_z(0.3) @ before / np.linalg.norm(before)
-    drift.look_along(along, 0.02)
+    drift.add_direction(along, 0.02)
     off = math.acos(drift.velocity_mps @ along / np.linalg.norm(drift.velocity_mps))
     assert off < 0.1
     assert drift.velocity_mps @ along == pytest.approx(before @ along, rel=0.1)
@@ -132,12 +132,12 @@ def test_what_a_wrong_yaw_was_taken_for_is_no_drift_once_it_is_known(parts_rad):
     right, askew = flown_askew(0.0), flown_askew(sum(parts_rad))
     assert np.linalg.norm(askew.velocity_mps - right.velocity_mps) > 0.3
     for part_rad in parts_rad:
-        askew.turn_ways(-part_rad)
+        askew.correct_yaw(-part_rad)
     assert np.allclose(askew.velocity_mps, right.velocity_mps, atol=1e-9)
     assert np.allclose(askew.xyz_map_m, right.xyz_map_m, atol=1e-9)
     free = drifting(False, [0.0, 0.0, 0.0])
     before = free.velocity_mps.copy()
-    free.turn_ways(0.1)  # whose ways nobody tells
+    free.correct_yaw(0.1)  # whose ways nobody tells
     assert np.array_equal(free.velocity_mps, before)
 
 
@@ -165,14 +165,14 @@ def told(until_s=2.0, v=(1.0, 0.5, 0.0), rate=0.4, silent_after=math.inf):
 def test_a_step_is_the_way_told_and_the_drift_in_the_drones_axes():
     motion_model, left, free = told(), Drift(ERRORS, True), Drift(ERRORS, False)
     left.start(0, np.zeros(3), np.eye(3), None)
-    R_map_own = rotation_z(-1.1)
-    R0 = R_map_own @ rotation_z(0.3 + 0.4 * 0.5)
+    R_map_odom = rotation_z(-1.1)
+    R0 = R_map_odom @ rotation_z(0.3 + 0.4 * 0.5)
     step = motion_model.step(S // 2, 3 * S // 2, R0, left, free, True, S // 2)
     assert step.by_odometry
-    assert step.turn_told
+    assert step.turn_measured
     assert np.allclose(step.R, rotation_z(0.4), atol=1e-6)
-    assert np.allclose(R0 @ step.t_m, R_map_own @ [1.0, 0.5, 0.0], atol=1e-6)
-    assert good_covariance(step.covariance)
+    assert np.allclose(R0 @ step.t_m, R_map_odom @ [1.0, 0.5, 0.0], atol=1e-6)
+    assert is_covariance(step.covariance)
     back = motion_model.step(3 * S // 2, S // 2, R0 @ step.R, left, free, True, S // 2)
     assert np.allclose(step.R @ back.R, np.eye(3), atol=1e-9)
     assert np.allclose(step.t_m + step.R @ back.t_m, 0, atol=1e-9)
@@ -198,7 +198,7 @@ def test_beyond_its_newest_word_an_odometry_is_believed_less_and_less():
         for t in (1.0, 1.2, 1.4, 1.8)
     ]
     assert spread[0] < spread[1] < spread[2] < spread[3]
-    assert not motion_model.step(9 * S // 10, 2 * S, np.eye(3), left, free, True, S).turn_told
+    assert not motion_model.step(9 * S // 10, 2 * S, np.eye(3), left, free, True, S).turn_measured
 
 
 @pytest.mark.parametrize("back", [Smoother, lambda lag_s: Ekf()])
@@ -214,7 +214,7 @@ def test_a_yaw_made_good_by_fixes_is_not_taken_for_drift_too(back):
         if i < 3 or i > 17:
             seen = fix(0.1 * i, xyz_m + rng.normal(0, 0.05, 3), sigma=0.05)
             estimator.follow(seen)
-            estimator.see_fix(seen)
+            estimator.add_fix(seen)
         if i == 0:
             estimator.chain.start(at_ns, rotation_z(yaw_rad), np.diag([0.01, 0.01, 0.05]) ** 2)
     R, _, _ = estimator.at(ns(2.0))
@@ -264,22 +264,22 @@ def by_motion(at_s, yaw, sigma_deg=2.0):
 
 def test_two_that_contradict_are_not_believed_until_they_agree():
     heading = Heading()
-    assert heading.hear_streets(S, 0, 0.3, 0.01)
-    heading.hear_motion(by_motion(1.2, 0.3 + QUARTER))
-    assert "90 deg apart" in heading.contradiction
-    assert not heading.hear_streets(2 * S, 0, 0.3, 0.01)
-    heading.hear_motion(by_motion(2.5, 0.32))
-    assert heading.hear_streets(3 * S, 0, 0.3, 0.01)
+    assert heading.add_vp_rotation(S, 0, 0.3, 0.01)
+    heading.add_motion_yaw(by_motion(1.2, 0.3 + QUARTER))
+    assert "differ by 90 deg" in heading.contradiction
+    assert not heading.add_vp_rotation(2 * S, 0, 0.3, 0.01)
+    heading.add_motion_yaw(by_motion(2.5, 0.32))
+    assert heading.add_vp_rotation(3 * S, 0, 0.3, 0.01)
     assert heading.contradiction == ""
 
 
 def test_a_contradiction_outlives_the_motions_silence_but_not_the_streets():
     heading = Heading()
-    heading.hear_motion(by_motion(1.0, 0.3 + QUARTER))
-    assert not heading.hear_streets(S, 0, 0.3, 0.01)
+    heading.add_motion_yaw(by_motion(1.0, 0.3 + QUARTER))
+    assert not heading.add_vp_rotation(S, 0, 0.3, 0.01)
     for t in range(2, 60):
         heading.pass_time(t * S)
-        assert not heading.hear_streets(t * S, 0, 0.3, 0.01)
+        assert not heading.add_vp_rotation(t * S, 0, 0.3, 0.01)
     heading.pass_time(80 * S)
     assert heading.contradiction
     heading.pass_time(95 * S)
@@ -288,22 +288,22 @@ def test_a_contradiction_outlives_the_motions_silence_but_not_the_streets():
 
 def test_small_differences_are_no_contradiction():
     heading = Heading()
-    heading.hear_motion(by_motion(1.0, 0.3 + math.radians(8)))
-    assert heading.hear_streets(S, 0, 0.3, 0.01)
+    heading.add_motion_yaw(by_motion(1.0, 0.3 + math.radians(8)))
+    assert heading.add_vp_rotation(S, 0, 0.3, 0.01)
 
 
 def test_another_branch_is_believed_after_two_seconds_or_with_a_witness():
     heading = Heading()
-    assert heading.hear_streets(S, 0, 0.3, 0.01)
-    assert not heading.hear_streets(2 * S, 1, 0.3 + QUARTER, 0.01)
-    assert not heading.hear_streets(3 * S, 1, 0.3 + QUARTER, 0.01)
-    assert heading.hear_streets(4 * S, 1, 0.3 + QUARTER, 0.01)
-    heading.hear_motion(by_motion(4.5, 0.3))
+    assert heading.add_vp_rotation(S, 0, 0.3, 0.01)
+    assert not heading.add_vp_rotation(2 * S, 1, 0.3 + QUARTER, 0.01)
+    assert not heading.add_vp_rotation(3 * S, 1, 0.3 + QUARTER, 0.01)
+    assert heading.add_vp_rotation(4 * S, 1, 0.3 + QUARTER, 0.01)
+    heading.add_motion_yaw(by_motion(4.5, 0.3))
     assert heading.contradiction
     witnessed = Heading()
-    witnessed.hear_streets(S, 0, 0.3, 0.01)
-    witnessed.hear_motion(by_motion(3.5, 0.3 + QUARTER))  # the streets spoke long before
-    assert witnessed.hear_streets(4 * S, 1, 0.3 + QUARTER, 0.01)
+    witnessed.add_vp_rotation(S, 0, 0.3, 0.01)
+    witnessed.add_motion_yaw(by_motion(3.5, 0.3 + QUARTER))  # the streets spoke long before
+    assert witnessed.add_vp_rotation(4 * S, 1, 0.3 + QUARTER, 0.01)
 
 
 def test_a_remembered_yaw_is_worth_less_with_time():
@@ -312,30 +312,30 @@ def test_a_remembered_yaw_is_worth_less_with_time():
     assert own.sigma_at(60 * S) > 60 * DRIFT_RAD_PER_S
 
 
-def flown(north, at_s, yaw):
+def flown(odometry_yaw, at_s, yaw):
     """Twelve fixes beside a drone's own positions, six metres along: whether motion denies what was believed."""
     way = np.outer(np.arange(12) * 0.5, [1.0, 0.3, 0.0])
     points = [
         Point(round((at_s + 0.5 * k) * S), rotation_z(yaw) @ own, 0.05**2, own, 0) for k, own in enumerate(way * 2.0)
     ]
-    return [north.watch(point) for point in points]
+    return [odometry_yaw.add_point(point) for point in points]
 
 
 @pytest.mark.parametrize("age_s", [20.0, 600.0])
 def test_a_yaw_too_old_to_be_of_use_gives_way_to_what_motion_tells(age_s):
     """After minutes without the drone nobody would deny it, and nobody could use it."""
-    north = North(ERRORS, math.radians(8.0))
-    north.yaw = Yaw(0, 0.5, math.radians(3.0) ** 2)
-    assert all(flown(north, age_s, 0.55))
-    own = north.known(round((age_s + 6.0) * S))
+    odometry_yaw = OdometryYaw(ERRORS, math.radians(8.0))
+    odometry_yaw.yaw = Yaw(0, 0.5, math.radians(3.0) ** 2)
+    assert all(flown(odometry_yaw, age_s, 0.55))
+    own = odometry_yaw.known(round((age_s + 6.0) * S))
     assert own is not None
     assert own.yaw_rad == pytest.approx(0.55 if age_s > 60 else 0.5, abs=0.01)
 
 
 def test_a_yaw_that_is_of_use_is_denied_by_motion():
-    north = North(ERRORS, math.radians(8.0))
-    north.yaw = Yaw(0, 0.5, math.radians(2.0) ** 2)
-    assert False in flown(north, 5.0, 0.5 + QUARTER)
+    odometry_yaw = OdometryYaw(ERRORS, math.radians(8.0))
+    odometry_yaw.yaw = Yaw(0, 0.5, math.radians(2.0) ** 2)
+    assert False in flown(odometry_yaw, 5.0, 0.5 + QUARTER)
 
 
 def attitude(t_s, yaw=0.0):
@@ -349,33 +349,33 @@ def attitude(t_s, yaw=0.0):
     [(0.1, 0.0, 0.01), (2.0, 0.0, 0.02), (2.0, 0.3, 0.3), (2.0, QUARTER, None), (4.0, 0.0, None)],
 )
 def test_a_silence_of_the_autopilots_costs_and_a_long_one_costs_all(silent_s, turned_rad, sigma_rad):
-    north, trail = North(ERRORS, 0.14), AutopilotTrail()
+    odometry_yaw, trail = OdometryYaw(ERRORS, 0.14), AutopilotTrajectory()
     for t in (0.0, 0.02, 0.04):
-        north.hear(trail, attitude(t))
-    north.yaw = Yaw(0, 0.5, 0.01**2)
-    north.hear(trail, attitude(0.04 + silent_s, turned_rad))
+        odometry_yaw.add(trail, attitude(t))
+    odometry_yaw.yaw = Yaw(0, 0.5, 0.01**2)
+    odometry_yaw.add(trail, attitude(0.04 + silent_s, turned_rad))
     if sigma_rad is None:
-        assert north.yaw is None
+        assert odometry_yaw.yaw is None
     else:
-        assert north.yaw.sigma_at(0) == pytest.approx(sigma_rad, rel=0.05)
+        assert odometry_yaw.yaw.sigma_at(0) == pytest.approx(sigma_rad, rel=0.05)
 
 
 # which drone
 
 
 def test_without_track_states_the_first_drone_is_kept_until_it_is_silent():
-    following = Following(None)
-    assert following.takes(5, 0)
-    assert not following.takes(2, S)
-    assert following.takes(5, S)
-    assert following.takes(2, 4 * S)
+    following = TrackContinuity(None)
+    assert following.accepts(5, 0)
+    assert not following.accepts(2, S)
+    assert following.accepts(5, S)
+    assert following.accepts(2, 4 * S)
 
 
 def test_a_candidate_is_no_track():
-    following = Following(None)
-    following.hear(track(0.0, TrackingState.CANDIDATE, 1))
-    following.hear(track(0.0, TrackingState.TRACKING, 2))
-    assert following.takes(2, 0)
+    following = TrackContinuity(None)
+    following.add(track(0.0, TrackingState.CANDIDATE, 1))
+    following.add(track(0.0, TrackingState.TRACKING, 2))
+    assert following.accepts(2, 0)
     assert following.number == 2
 
 
@@ -386,40 +386,40 @@ def searching(at_s):
 
 
 def test_a_tracker_that_starts_afresh_and_says_that_it_searches_follows_nothing_any_more():
-    following = Following(None)
-    following.hear(track(0.0, TrackingState.TRACKING, 3))
-    assert following.takes(3, ns(0.0))
-    following.hear(searching(0.1))
+    following = TrackContinuity(None)
+    following.add(track(0.0, TrackingState.TRACKING, 3))
+    assert following.accepts(3, ns(0.0))
+    following.add(searching(0.1))
     assert (following.number, following.reason) == (0, "the tracker lost it: afresh")
-    following.hear(track(0.3, TrackingState.TRACKING, 1))
-    assert following.takes(1, ns(0.3))
+    following.add(track(0.3, TrackingState.TRACKING, 1))
+    assert following.accepts(1, ns(0.3))
 
 
 @pytest.mark.parametrize("pause_s", [0.0, 5.0])
 def test_a_track_of_which_nothing_is_said_while_the_tracker_speaks_is_gone(pause_s):
     """A pause of the tracker's, as when the LiDAR is cut, says nothing of any track."""
-    following = Following(None)
+    following = TrackContinuity(None)
     for number in (3, 4):
-        following.hear(track(0.0, TrackingState.TRACKING, number))
-    assert following.takes(3, ns(0.0))
-    following.hear(track(pause_s + 0.1, TrackingState.TRACKING, 4))
+        following.add(track(0.0, TrackingState.TRACKING, number))
+    assert following.accepts(3, ns(0.0))
+    following.add(track(pause_s + 0.1, TrackingState.TRACKING, 4))
     assert following.number == 3
     for k in range(1, 25):
-        following.hear(track(pause_s + 0.1 * k, TrackingState.TRACKING, 4))
+        following.add(track(pause_s + 0.1 * k, TrackingState.TRACKING, 4))
     assert following.number == 0
-    assert following.takes(4, ns(pause_s + 2.5))
+    assert following.accepts(4, ns(pause_s + 2.5))
 
 
 def test_a_drone_that_tells_its_velocity_cannot_have_turned_unheard():
     """Half a second after the last fix: q dt^3 / 3 of what nobody tells, beside the same velocity."""
-    sigmas, told_m2 = [], Told(0.05**2 * np.eye(3), None)
+    sigmas, told_m2 = [], MeasurementCovariance(0.05**2 * np.eye(3), None)
     for told in (False, True):
         motions = Motions(FuseErrors(), parked=True)
         positions = Positions(FuseErrors(), motions)
         for i in range(30):
             t = 0.1 * i
             if told:
-                motions.motion_model.autopilot.hear(
+                motions.motion_model.autopilot.add(
                     DroneLocalPosition(
                         stamp_ns=ns(t), xyz_odom_m=np.array([2 * t, 0, 9]), velocity_odom_mps=np.array([2.0, 0, 0])
                     )
@@ -428,7 +428,7 @@ def test_a_drone_that_tells_its_velocity_cannot_have_turned_unheard():
             if i == 0:
                 positions.find(fix(t, z, 0.05), z, told_m2)
             else:
-                positions.takes(ns(t), np.zeros(3), np.eye(3), told_m2)
+                positions.accepts(ns(t), np.zeros(3), np.eye(3), told_m2)
                 positions.follow(ns(t), z, 1.0, None)
         sigmas.append(math.sqrt(positions.at(ns(2.99))[1][4, 4]))
     assert sigmas[1] < 0.8 * sigmas[0]

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 
-from stages.fuse.ekf import Ekf
 from stages.fuse.propagated import Step
 from stages.fuse.smoother import Smoother
 from stages.geometry.frames import rotation_z
-from stages.geometry.se3 import carried_covariance
+from stages.geometry.se3 import composed_covariance
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
+from tests.stages.fuse.ekf import Ekf
 
 TENTH = 100_000_000
 TILT = 0.2
@@ -46,7 +46,7 @@ def test_a_chain_of_steps_is_their_product_and_its_covariance_theirs(make):
     P = P0
     for k in range(1, 11):
         back.extend(k * TENTH, way(), None, TILT)
-        P = carried_covariance(P, way().R, way().t_m, way().covariance)
+        P = composed_covariance(P, way().R, way().t_m, way().covariance)
     R, x = true_pose(10)
     assert np.allclose(back.R_map_drone, R, atol=1e-6)
     assert np.allclose(back.xyz_map_m, x, atol=1e-6)
@@ -55,17 +55,17 @@ def test_a_chain_of_steps_is_their_product_and_its_covariance_theirs(make):
 
 def test_smoother_and_filter_agree_while_all_is_well():
     rng = np.random.default_rng(3)
-    backs = [Smoother(3.0), Ekf()]
-    for back in backs:
+    confirms = [Smoother(3.0), Ekf()]
+    for back in confirms:
         back.start(0, np.eye(3), np.zeros(3), P0)
     for k in range(1, 60):
         R, x = true_pose(k)
         z, turned = x + rng.normal(0, 0.05, 3), R @ exp_rotation(rng.normal(0, 0.01, 3))
-        for back in backs:
+        for back in confirms:
             back.extend(k * TENTH, way(), UP, TILT)
             assert back.add_position(k * TENTH, STAYS, z, 0.05**2 * np.eye(3))
             assert back.add_rotation(k * TENTH, STAYS, turned, 0.01**2 * np.eye(3))
-    a, b = backs
+    a, b = confirms
     assert np.linalg.norm(a.xyz_map_m - b.xyz_map_m) < 0.01
     assert np.linalg.norm(log_rotation(a.R_map_drone.T @ b.R_map_drone)) < 0.002
     assert np.allclose(np.diag(a.covariance), np.diag(b.covariance), rtol=0.15)

@@ -7,7 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from stages.geometry.extrapolation import HARD, JOINT_S, UNTOLD, USUAL, BelievedWords, MayChange, along_its_bend
+from stages.geometry.extrapolation import (
+    GAP_MANEUVER,
+    HARDEST_MANEUVER,
+    SOURCE_CHANGE_S,
+    USUAL_MANEUVER,
+    AcceptedPoses,
+    ManeuverBound,
+    constant_turn_rate,
+)
 from stages.geometry.frames import rotation_z
 from stages.messages import VehicleMotion
 
@@ -33,20 +41,20 @@ def word(time_s, at=bend, covariance=True):
 WORDS = [word(0.1 * k) for k in range(10)]
 
 
-def test_braking_or_turning_takes_it_half_a_t_squared_off():
-    may = MayChange(4.0, 0.6)
-    assert may.place_m(0.5) == pytest.approx(0.5)
+def test_a_maneuver_deviates_by_half_a_t_squared():
+    may = ManeuverBound(4.0, 0.6)
+    assert may.displacement_m(0.5) == pytest.approx(0.5)
     assert may.turn_rad(2.0) == pytest.approx(1.2)
-    assert USUAL.place_m(1) < UNTOLD.place_m(1) < HARD.place_m(1)
-    assert USUAL.turn_rad(1) < UNTOLD.turn_rad(1) < HARD.turn_rad(1)
+    assert USUAL_MANEUVER.displacement_m(1) < GAP_MANEUVER.displacement_m(1) < HARDEST_MANEUVER.displacement_m(1)
+    assert USUAL_MANEUVER.turn_rad(1) < GAP_MANEUVER.turn_rad(1) < HARDEST_MANEUVER.turn_rad(1)
 
 
 @pytest.mark.parametrize("untold_s", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("turned", [0.0, 2.0])
-def test_it_goes_on_along_the_bend_that_it_drove(untold_s, turned):
+def test_extrapolation_follows_the_constant_turn_rate(untold_s, turned):
     frame = rotation_z(turned)
     R, xyz_m = bend(0.9 + untold_s)
-    told = along_its_bend(
+    told = constant_turn_rate(
         [word(m.stamp_ns / S, lambda s: (frame @ bend(s)[0], frame @ bend(s)[1])) for m in WORDS],
         round((0.9 + untold_s) * S),
     )
@@ -54,8 +62,10 @@ def test_it_goes_on_along_the_bend_that_it_drove(untold_s, turned):
     np.testing.assert_allclose(told.R_map_vehicle, frame @ R, atol=1e-6)
 
 
-def test_after_a_second_it_stands_and_is_ever_less_sure():
-    one, many = (along_its_bend(WORDS, WORDS[-1].stamp_ns + round(s * S)) for s in (JOINT_S, 5 * JOINT_S))
+def test_after_the_horizon_the_pose_is_constant_and_the_covariance_grows():
+    one, many = (
+        constant_turn_rate(WORDS, WORDS[-1].stamp_ns + round(s * S)) for s in (SOURCE_CHANGE_S, 5 * SOURCE_CHANGE_S)
+    )
     np.testing.assert_allclose(one.xyz_map_m, many.xyz_map_m)
     np.testing.assert_allclose(one.R_map_vehicle, many.R_map_vehicle)
     assert np.trace(many.covariance) > 100 * np.trace(one.covariance)
@@ -63,24 +73,24 @@ def test_after_a_second_it_stands_and_is_ever_less_sure():
     np.testing.assert_allclose(sigma, [0.5 * 0.5 * 5**2] * 3 + [0.5 * 3.0 * 5**2] * 3)
 
 
-def test_one_word_alone_and_words_from_long_ago_tell_no_speed():
+def test_one_pose_or_poses_from_long_ago_give_no_speed():
     for words in (WORDS[-1:], [word(-5.0), WORDS[-1]]):
-        told = along_its_bend(words, 2 * S)
+        told = constant_turn_rate(words, 2 * S)
         np.testing.assert_allclose(told.xyz_map_m, WORDS[-1].xyz_map_m)
         np.testing.assert_allclose(told.R_map_vehicle, WORDS[-1].R_map_vehicle)
 
 
-def test_who_does_not_say_how_sure_it_is_is_not_made_sure():
-    assert along_its_bend([word(0.0, covariance=False)], S).covariance is None
+def test_a_pose_without_covariance_is_extrapolated_without_one():
+    assert constant_turn_rate([word(0.0, covariance=False)], S).covariance is None
 
 
-def test_the_speed_outlives_a_start_frame_that_jumps():
-    words, far = BelievedWords(), 1000.0
+def test_the_speed_is_kept_when_the_start_frame_jumps():
+    words, far = AcceptedPoses(), 1000.0
     assert words.speed_mps is None
     for k in range(10):
-        words.hear(word(0.1 * k))
+        words.add(word(0.1 * k))
     assert words.speed_mps == pytest.approx(3.0, abs=0.01)
     for k in range(4):  # of a frame that begins anew, 20 ms apart: too short to tell a speed
-        words.hear(word(0.92 + 0.02 * k, lambda s: (bend(s)[0], bend(s)[1] + far)))
+        words.add(word(0.92 + 0.02 * k, lambda s: (bend(s)[0], bend(s)[1] + far)))
     assert words.newest_ns == round(0.98 * S)
     assert words.speed_mps == pytest.approx(3.0, abs=0.01)

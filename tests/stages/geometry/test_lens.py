@@ -138,7 +138,7 @@ def test_no_direction_is_no_pixel(lens):
     assert lens.project(np.empty((0, 3))).shape == (0, 2)
 
 
-def test_arrays_of_another_shape_are_refused():
+def test_arrays_of_another_shape_are_rejected():
     with pytest.raises(ValueError, match=r"shape \(n, 3\), got \(3,\)"):
         EQUIDISTANT.project(np.array([0.0, 0.0, 1.0]))
     with pytest.raises(ValueError, match=r"shape \(n, 2\)"):
@@ -167,6 +167,6 @@ def test_a_lens_comes_back_from_a_rig_file():
         ({"model": "ocam", "polynomial": [-3.0, 0.0], "centre_px": [1, 2], "affine_cde": [0, 0, 0]}, "singular"),
     ],
 )
-def test_an_impossible_lens_is_refused(tree, text):
+def test_an_impossible_lens_is_rejected(tree, text):
     with pytest.raises(ValidationError, match=text):
         RIG_LENS.validate_python(tree)

@@ -8,7 +8,7 @@ import pytest
 from stages.kernels.geometry.so3 import exp_rotation, hat, log_rotation, nearest_rotation, nearly_rotation
 
 
-def test_a_quarter_turn_about_z_takes_x_to_y():
+def test_90_deg_about_z_takes_x_to_y():
     R = exp_rotation(np.array([0.0, 0.0, math.pi / 2]))
     np.testing.assert_allclose(R, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
 

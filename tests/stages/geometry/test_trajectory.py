@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
-from stages.geometry.trajectory import FURTHEST_NS, KEPT, STILL_NS, VehicleTrajectory
+from stages.geometry.trajectory import FURTHEST_NS, KEPT, RECENT_NS, VehicleTrajectory
 from stages.kernels.geometry.trajectory import STEP_NS
 from stages.messages import VehicleMotion
 from tests.stages.made import MS, START_NS
@@ -28,7 +28,7 @@ def trail(*motions):
     return made
 
 
-def test_a_vehicle_that_tells_nothing_stands_at_the_origin():
+def test_without_poses_the_vehicle_is_at_the_origin():
     R, t = trail().at(START_NS)
     np.testing.assert_array_equal(R, np.eye(3))
     np.testing.assert_array_equal(t, np.zeros(3))
@@ -36,21 +36,21 @@ def test_a_vehicle_that_tells_nothing_stands_at_the_origin():
     assert trail(motion(0, (1, 2, 3))).known
 
 
-def test_a_word_is_known_until_it_is_so_old_that_the_vehicle_may_be_anywhere():
+def test_the_motion_is_known_while_the_newest_pose_is_recent():
     made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (1, 0, 0)))
-    assert made.known_at(START_NS + 100 * MS + STILL_NS - 1)
-    assert not made.known_at(START_NS + 100 * MS + STILL_NS)
+    assert made.known_at(START_NS + 100 * MS + RECENT_NS - 1)
+    assert not made.known_at(START_NS + 100 * MS + RECENT_NS)
     assert not trail().known_at(START_NS)
 
 
-def test_places_between_two_poses_are_linear_in_time():
+def test_positions_between_two_poses_are_linear_in_time():
     made = trail(motion(0, (0, 0, 0)), motion(10 * MS, (0.1, 0.2, 0.3)), motion(20 * MS, (0.3, 0.3, 0.5)))
     np.testing.assert_allclose(made.at(START_NS + 5 * MS)[1], (0.05, 0.1, 0.15))
     np.testing.assert_allclose(made.at(START_NS + 10 * MS)[1], (0.1, 0.2, 0.3))
     np.testing.assert_allclose(made.at(START_NS + 15 * MS)[1], (0.2, 0.25, 0.4))
 
 
-def test_turns_between_two_poses_are_rotations_half_way():
+def test_rotations_between_two_poses_are_half_way():
     about = rotation_from_rpy_deg((10.0, -20.0, 30.0))
     made = trail(motion(0, (0, 0, 0), about), motion(10 * MS, (0, 0, 0), about @ rotation_z(0.1)))
     R, _ = made.at(START_NS + 5 * MS)
@@ -68,7 +68,7 @@ def nearest_rotation(R):
 
 @pytest.mark.parametrize("turned_deg", [(5.0, 0.0, 0.0), (10.0, -20.0, 30.0), (0.0, 0.0, -60.0)])
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.8])
-def test_between_two_poses_it_is_the_rotation_nearest_to_their_mean(turned_deg, share):
+def test_between_two_poses_the_rotation_is_nearest_to_their_mean(turned_deg, share):
     first = rotation_from_rpy_deg((40.0, 20.0, -170.0))
     then = first @ rotation_from_rpy_deg(turned_deg)
     R, _ = trail(motion(0, (0, 0, 0), first), motion(600 * MS, (0, 0, 0), then)).at(START_NS + int(share * 600 * MS))
@@ -77,22 +77,22 @@ def test_between_two_poses_it_is_the_rotation_nearest_to_their_mean(turned_deg, 
 
 
 @pytest.mark.parametrize("rate_radps", [-1.5, -0.3, 0.6, 1.5])
-def test_beyond_the_newest_pose_a_turning_vehicle_is_turned_on_by_a_rotation(rate_radps):
+def test_beyond_the_newest_pose_the_turn_rate_is_constant(rate_radps):
     made = trail(*(motion(10 * k * MS, (0, 0, 0), rotation_z(rate_radps * 0.01 * k)) for k in range(13)))
     R, _ = made.at(START_NS + 120 * MS + FURTHEST_NS)
     np.testing.assert_allclose(R, rotation_z(rate_radps * (0.12 + FURTHEST_NS * 1e-9)), atol=1e-9)
 
 
-def test_poses_that_arrived_together_are_no_speed():
+def test_poses_that_arrive_together_give_no_speed():
     """A parked vehicle whose odometry is noisy by 2 mm, and whose words were held up and then came within 20 us."""
     poses = [motion(20 * k * MS, (0.002 * (k % 2), 0, 0), rotation_z(0.001 * (k % 2))) for k in range(10)]
     made = trail(*poses, motion(180 * MS + 20_000, (0, 0, 0)))
-    for R, t in (made.at(START_NS + 180 * MS + FURTHEST_NS), made.straight_on(START_NS + 480 * MS)):
+    for R, t in (made.at(START_NS + 180 * MS + FURTHEST_NS), made.constant_velocity(START_NS + 480 * MS)):
         np.testing.assert_allclose(t, np.zeros(3), atol=0.01)
         np.testing.assert_allclose(R, np.eye(3), atol=0.005)
 
 
-def test_two_words_are_a_speed_when_they_did_not_arrive_together():
+def test_two_poses_give_a_speed_unless_they_arrive_together():
     for apart_ms, beyond_m in ((8, 0.0), (20, 0.4)):
         made = trail(motion(0, (0, 0, 0)), motion(apart_ms * MS, (0.2, 0, 0)))
         np.testing.assert_allclose(made.at(START_NS + (apart_ms + 40) * MS)[1], (0.2 + beyond_m, 0, 0))
@@ -114,7 +114,7 @@ def driving(k, jumped=False):
     return motion(20 * k * MS, JUMP[0] @ t + JUMP[1], JUMP[0] @ R) if jumped else motion(20 * k * MS, t, R)
 
 
-def test_a_start_frame_that_jumps_is_laid_on_the_old_one_and_is_no_speed():
+def test_a_start_frame_that_jumps_is_aligned_with_the_old_one_and_gives_no_speed():
     made = VehicleTrajectory()
     assert not any(made.add(driving(k, jumped=k >= 30)) for k in range(60))
     for k in range(60):
@@ -125,21 +125,21 @@ def test_a_start_frame_that_jumps_is_laid_on_the_old_one_and_is_no_speed():
         assert k == 0 or speed_mps < np.hypot(10, 0.1 * k) + 0.3
 
 
-def test_while_it_is_not_clear_that_the_start_frame_jumped_the_vehicle_goes_on():
+def test_until_a_jump_of_the_start_frame_is_confirmed_the_pose_is_extrapolated():
     made = trail(*(driving(k) for k in range(30)))
     for k in (30, 31):
         made.add(driving(k, jumped=True))
         np.testing.assert_allclose(made.at(driving(k).stamp_ns)[1], driving(k).xyz_map_m, atol=0.05)
 
 
-def test_a_false_pose_is_left_out():
+def test_an_outlier_is_rejected():
     made = trail(*(driving(k, jumped=k in (7, 20, 21, 40)) for k in range(50)))
     for k in range(50):
         np.testing.assert_allclose(made.at(driving(k).stamp_ns)[1], driving(k).xyz_map_m, atol=0.01)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_nonsense_that_goes_on_is_never_believed_and_the_true_words_after_it_are(seed):
+def test_continuing_outliers_are_never_accepted_and_true_poses_after_them_are(seed):
     made, rng = trail(*(driving(k) for k in range(30))), np.random.default_rng(seed)
     for k in range(30, 430):
         assert not made.add(motion(20 * k * MS, rng.uniform(-40, 40, 3)))
@@ -168,21 +168,21 @@ def test_a_fast_vehicles_second_pose_is_no_jump_and_the_first_real_one_after_zer
         (60, 500, False),
     ],
 )
-def test_after_a_silence_what_was_remembered_may_lie_elsewhere(first, jump_m, elsewhere):
+def test_after_a_silence_remembered_positions_may_be_displaced(first, jump_m, elsewhere):
     """2.2 s: an odometry started afresh in it may begin anywhere near. 1.2 s: where it jumps. .6 s: that is joined."""
     made = trail(*(driving(k) for k in range(30)))
     far = [motion(20 * k * MS, (0.2 * k + jump_m, 0, 0)) for k in range(first, first + 10)]
     assert any([made.add(one) for one in far]) == elsewhere
 
 
-def test_a_word_that_is_stamped_late_at_speed_is_no_jump():
+def test_a_late_stamp_at_speed_is_no_jump():
     fast = [motion(50 * k * MS + (30 * MS if k == 20 else 0), (0.05 * 20 * k, 0, 0)) for k in range(40)]
     made = trail(*fast[:20])
     made.add(fast[20])
     assert made.newest_ns == fast[20].stamp_ns
 
 
-def test_a_moment_that_was_asked_for_before_is_the_same_until_a_newer_pose_is_known():
+def test_a_cached_result_is_the_same_until_a_newer_pose_arrives():
     made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (1, 0, 0)))
     soon = START_NS + 150 * MS
     np.testing.assert_allclose(made.at(soon)[1], (1.5, 0, 0))
@@ -193,33 +193,33 @@ def test_a_moment_that_was_asked_for_before_is_the_same_until_a_newer_pose_is_kn
     np.testing.assert_allclose(made.at(soon)[1], (1.5, 0.1, 0))
 
 
-def test_beyond_the_newest_pose_it_drives_on_for_a_while_and_then_stands():
+def test_extrapolation_ends_at_its_horizon():
     made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (1, 0, 0)))  # 10 m/s
     np.testing.assert_allclose(made.at(START_NS + 150 * MS)[1], (1.5, 0, 0))
     furthest = 1 + 10 * FURTHEST_NS / 1e9
     np.testing.assert_allclose(made.at(START_NS + 100 * MS + 10 * FURTHEST_NS)[1], (furthest, 0, 0))
 
 
-def test_straight_on_it_drives_and_turns_without_an_end():
+def test_constant_velocity_has_no_horizon():
     made = trail(*(motion(10 * k * MS, (0.1 * k, 0, 0), rotation_z(0.005 * k)) for k in range(13)))  # 10 m/s, 0.5 rad/s
-    R, t = made.straight_on(START_NS + 120 * MS + 4 * FURTHEST_NS)
+    R, t = made.constant_velocity(START_NS + 120 * MS + 4 * FURTHEST_NS)
     far_s = 0.12 + 4 * FURTHEST_NS / 1e9
     np.testing.assert_allclose(t, (10 * far_s, 0, 0), atol=1e-9)
     np.testing.assert_allclose(R, rotation_z(0.5 * far_s), atol=1e-9)
 
 
-def test_beyond_the_newest_pose_it_is_less_sure_by_braking_and_by_the_way_not_gone():
+def test_extrapolation_sigma_grows_by_maneuvers_and_by_the_motion_beyond_the_horizon():
     made = trail(*(motion(10 * k * MS, (0.1 * k, 0, 0), rotation_z(0.005 * k)) for k in range(13)))
     newest_ns = START_NS + 120 * MS
-    assert trail().unsure(START_NS) == (0.0, 0.0)
-    assert made.unsure(newest_ns) == (0.0, 0.0)
-    assert made.unsure(newest_ns + 200 * MS) == pytest.approx((0.5 * 2.0 * 0.2**2, 0.5 * 0.2 * 0.2**2))
-    place_m, yaw_rad = made.unsure(newest_ns + FURTHEST_NS + 100 * MS)
+    assert trail().extrapolation_sigma(START_NS) == (0.0, 0.0)
+    assert made.extrapolation_sigma(newest_ns) == (0.0, 0.0)
+    assert made.extrapolation_sigma(newest_ns + 200 * MS) == pytest.approx((0.5 * 2.0 * 0.2**2, 0.5 * 0.2 * 0.2**2))
+    place_m, yaw_rad = made.extrapolation_sigma(newest_ns + FURTHEST_NS + 100 * MS)
     assert place_m == pytest.approx(0.5 * 2.0 * 0.4**2 + 10 * 0.1)
     assert yaw_rad == pytest.approx(0.5 * 0.2 * 0.4**2 + 0.5 * 0.1, rel=1e-3)
 
 
-def test_before_the_oldest_pose_it_stood_there():
+def test_before_the_oldest_pose_the_pose_is_constant():
     made = trail(motion(0, (1, 1, 1)), motion(100 * MS, (2, 1, 1)))
     np.testing.assert_allclose(made.at(START_NS - 50 * MS)[1], (1, 1, 1))
     np.testing.assert_allclose(trail(motion(0, (4, 5, 6))).at(START_NS + 999 * MS)[1], (4, 5, 6))
@@ -238,18 +238,18 @@ def test_memory_is_bounded():
     np.testing.assert_allclose(made.at(START_NS + (3 * KEPT - 2) * MS)[1], (0.01 * (3 * KEPT - 2), 0, 0))
     for k in range(2 * KEPT):  # and of the moments that were asked for
         made.at(START_NS + 2 * KEPT * MS + k)
-        assert len(made._known) <= KEPT
+        assert len(made._cache) <= KEPT
     np.testing.assert_allclose(made.at(START_NS + 2 * KEPT * MS)[1], (0.01 * 2 * KEPT, 0, 0))
 
 
-def test_the_vehicles_velocity_is_how_its_places_follow_one_another():
+def test_the_vehicles_velocity_is_the_derivative_of_its_position():
     made = trail(motion(0, (0, 0, 0)), motion(100 * MS, (0.5, 0, 0)), motion(200 * MS, (1.0, 0.2, 0)))
     np.testing.assert_allclose(made.velocity_mps(START_NS + 40 * MS), (5, 0, 0), atol=1e-6)
     np.testing.assert_allclose(made.velocity_mps(START_NS + 140 * MS), (5, 2, 0), atol=1e-6)
     np.testing.assert_array_equal(trail().velocity_mps(START_NS), np.zeros(3))
 
 
-def test_a_place_and_velocity_are_seen_from_the_vehicle_with_its_own_driving_and_turning():
+def test_relative_velocity_contains_the_vehicles_translation_and_rotation():
     """Relative velocity: R^T (v - v_vehicle) - w x p, here w about z and p ahead."""
     rate_radps, drives = 0.5, np.array([4.0, 0.0, 0.0])
     made = trail(*(motion(k * 10 * MS, k * 0.01 * drives, rotation_z(rate_radps * k * 0.01)) for k in range(100)))
@@ -262,6 +262,6 @@ def test_a_place_and_velocity_are_seen_from_the_vehicle_with_its_own_driving_and
     middle_m = R.T @ (place + half_step_s * velocity - middle_s * drives)
     expected_mps = R.T @ (velocity - drives) - np.cross([0, 0, rate_radps], middle_m)
     np.testing.assert_allclose(seen_mps, expected_mps, atol=1e-3)
-    back_m, back_mps = made.to_local(START_NS + round(now_s * 1e9), seen_m, seen_mps)
+    back_m, back_mps = made.to_map(START_NS + round(now_s * 1e9), seen_m, seen_mps)
     np.testing.assert_allclose(back_m, place, atol=1e-6)
     np.testing.assert_allclose(back_mps, velocity, atol=1e-6)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import rotation_z
-from stages.heading.hypothesis_bank import ASKEW, turns
+from stages.heading.hypothesis_bank import DIRECTIONS, turns
 from stages.heading.windows import Windows
 from stages.messages import DroneFix, VisualMotion
-from stages.odometry.drone.trajectory import AutopilotTrail
+from stages.odometry.drone.trajectory import AutopilotTrajectory
 
 MS = 1_000_000
 SAME = np.eye(3)
@@ -31,20 +31,20 @@ def fix(ms, xyz, track=1, sigma=0.03) -> DroneFix:
     )
 
 
-def autopilot(turned_rad=0.0, until_ms=6000, v=V) -> AutopilotTrail:
-    trail = AutopilotTrail()
+def autopilot(turned_rad=0.0, until_ms=6000, v=V) -> AutopilotTrajectory:
+    trail = AutopilotTrajectory()
     R = rotation_z(turned_rad)
     for ms in range(0, until_ms, 50):
         trail.add_position(ms * MS, R @ (v * ms * 1e-3) + [7.0, 8.0, 9.0], R @ v)
     return trail
 
 
-def metric(windows, own, until_ms, at=lambda ms: V * ms * 1e-3, R_map_own=SAME, from_ms=100, **kwargs):
+def metric(windows, own, until_ms, at=lambda ms: V * ms * 1e-3, R_map_odom=SAME, from_ms=100, **kwargs):
     """Displacements closed by fixes each 100 ms."""
     out = []
     for ms in range(from_ms, until_ms, 100):
         windows.add_fix(fix(ms, at(ms), **kwargs), np.eye(3), np.zeros(3), own)
-        moved = windows.close_metric(R_map_own, 0.03)
+        moved = windows.close_metric(R_map_odom, 0.03)
         out += [moved] if moved else []
     return out
 
@@ -61,7 +61,7 @@ def test_windows_follow_each_other_and_are_as_long_as_they_must():
 
 
 def test_the_odometry_is_told_in_the_start_frame_by_branch_0():
-    moved = metric(Windows(0.4), autopilot(turned_rad=1.1), 2000, R_map_own=rotation_z(-1.1))
+    moved = metric(Windows(0.4), autopilot(turned_rad=1.1), 2000, R_map_odom=rotation_z(-1.1))
     np.testing.assert_allclose(moved[0].odometry_m, V[:2] * moved[0].seconds, atol=1e-9)
 
 
@@ -69,10 +69,10 @@ def test_each_hypothesis_brings_the_fixes_together_its_own_way():
     """Where hypothesis i is true, its residual is nothing though the drone moves within a handful."""
     for i in (0, 3, 4, 9):
         R = np.eye(3)
-        R[:2, :2] = turns(ASKEW)[i]
+        R[:2, :2] = turns(DIRECTIONS)[i]
         moved = metric(Windows(0.4), autopilot(), 2000, at=lambda ms, R=R: R @ V * ms * 1e-3)[0]
-        np.testing.assert_allclose(moved.lidar_m[i], turns(ASKEW)[i] @ moved.odometry_m, atol=1e-9)
-        assert moved.lidar_m.shape == (ASKEW, 2)
+        np.testing.assert_allclose(moved.lidar_m[i], turns(DIRECTIONS)[i] @ moved.odometry_m, atol=1e-9)
+        assert moved.lidar_m.shape == (DIRECTIONS, 2)
 
 
 def test_one_false_fix_of_a_handful_does_no_harm():
@@ -131,9 +131,9 @@ def test_the_vehicles_own_way_is_added():
 
 
 def by_pictures(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms=10**9):
-    """Bearing windows of fixes along V with a step of pictures each 100 ms; direction None: no motion seen.
+    """Bearing windows of fixes along V with a step of images each 100 ms; direction None: no motion seen.
 
-    So many steps share a key; pictures come so late, and none of after `lost_ms`.
+    So many steps share a key; images come so late, and none of after `lost_ms`.
     """
     windows = Windows(0.4)
     R_map_drone = rotation_z(0.9)
@@ -155,7 +155,7 @@ def by_pictures(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms
                     reason="",
                 )
             )
-        windows.add_fix(fix(ms, V * ms * 1e-3), np.eye(3), np.zeros(3), AutopilotTrail())
+        windows.add_fix(fix(ms, V * ms * 1e-3), np.eye(3), np.zeros(3), AutopilotTrajectory())
         stamps = windows.steps_since_start()
         moved = windows.close_bearing(dict.fromkeys(stamps, R_map_drone), 0.03)
         out += [moved] if moved else []
@@ -193,7 +193,7 @@ def test_a_window_that_pictures_hardly_cover_tells_nothing():
 def test_pictures_of_one_key_cover_their_time_once():
     ahead = V / np.linalg.norm(V)
     assert by_pictures(lambda i: ahead, of_key=8)
-    assert by_pictures(lambda i: ahead, of_key=8, hole=(600, 1200), reach_s=1.2) == []  # .3 of .4 s, by three pictures
+    assert by_pictures(lambda i: ahead, of_key=8, hole=(600, 1200), reach_s=1.2) == []  # 0.3 of 0.4 s, by three images
 
 
 def test_a_window_waits_for_the_pictures_of_its_end():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import rotation_z
-from stages.heading.hypothesis_bank import ASKEW, NONE, BranchBank, BranchSettings, Displacement, turns
+from stages.heading.hypothesis_bank import DIRECTIONS, NONE, BranchSettings, Displacement, HypothesisBank, turns
 
 S = 1_000_000_000
 NOISE = 0.1**2 * np.eye(2)
@@ -16,11 +16,11 @@ NOISE = 0.1**2 * np.eye(2)
 
 def quarter_turned(v, k):
     """Rz(k 90 deg) v."""
-    return turns(ASKEW)[k % 4 * ASKEW // 4] @ v
+    return turns(DIRECTIONS)[k % 4 * DIRECTIONS // 4] @ v
 
 
 def moved(odometry_m, lidar_m, start_s=0.0, seconds=0.5, metric=True, bearing_rad=0.03) -> Displacement:
-    lidar = np.tile(np.asarray(lidar_m, dtype=float), (ASKEW, 1))
+    lidar = np.tile(np.asarray(lidar_m, dtype=float), (DIRECTIONS, 1))
     return Displacement(
         round(start_s * S) + S,
         round((start_s + seconds) * S) + S,
@@ -32,11 +32,11 @@ def moved(odometry_m, lidar_m, start_s=0.0, seconds=0.5, metric=True, bearing_ra
     )
 
 
-def bank(**settings) -> BranchBank:
-    return BranchBank(BranchSettings(**settings))
+def bank(**settings) -> HypothesisBank:
+    return HypothesisBank(BranchSettings(**settings))
 
 
-def decided(k, **settings) -> BranchBank:
+def decided(k, **settings) -> HypothesisBank:
     b = bank(**settings)
     for i in range(4):
         way = np.array([0.8, 0.1 * i])
@@ -82,7 +82,7 @@ def test_one_window_by_hand():
     check_bayes(b, likelihood)
 
 
-def check_bayes(b: BranchBank, likelihood) -> None:
+def check_bayes(b: HypothesisBank, likelihood) -> None:
     """Priors: 0.95 / 4 each branch, 0.049 for nonsense, 0.001 for the twelve angles between."""
     prior = np.array(([0.2375] + [0.001 / 12] * 3) * 4 + [0.049])
     weighed = prior * likelihood

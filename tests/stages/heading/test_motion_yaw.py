@@ -11,11 +11,11 @@ from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import rotation_z
 from stages.heading.motion_yaw import (
     LEAST,
-    LEAST_TO_BACK,
-    Leaning,
+    MIN_TO_CONFIRM,
     MotionYaw,
     Point,
-    Weighed,
+    YawFit,
+    YawLikelihood,
     bank,
     chi2_999,
     fit,
@@ -108,7 +108,7 @@ def test_what_flies_otherwise_than_the_drone_gives_no_heading(seed):
     rng = np.random.default_rng([seed, 9])
     way, bird = circle(), points(circle(), psi=0.0)
     other = np.cumsum(gauss_markov(rng, 1.5, 3.0, 0.5, len(way)) * 0.5, axis=0)
-    mixed = tuple(Point(b.stamp_ns, other[i], 0.0025, b.xyz_own_m, 0) for i, b in enumerate(bird))
+    mixed = tuple(Point(b.stamp_ns, other[i], 0.0025, b.xyz_odom_m, 0) for i, b in enumerate(bird))
     assert weigh(mixed, ERRORS).yaw is None
 
 
@@ -116,7 +116,7 @@ def test_a_way_of_another_length_gives_no_heading():
     told = weigh(points(1.0 * straight(length=20.0)), ERRORS)
     assert told.yaw is not None
     short = tuple(
-        Point(p.stamp_ns, 0.7 * p.xyz_map_m, p.variance_m2, p.xyz_own_m, 0) for p in points(straight(length=20.0))
+        Point(p.stamp_ns, 0.7 * p.xyz_map_m, p.variance_m2, p.xyz_odom_m, 0) for p in points(straight(length=20.0))
     )
     refused = weigh(short, ERRORS)
     assert refused.yaw is None
@@ -125,7 +125,7 @@ def test_a_way_of_another_length_gives_no_heading():
 
 def test_heights_must_agree():
     climbs = tuple(
-        Point(p.stamp_ns, p.xyz_map_m + np.array([0, 0, 0.3 * i]), p.variance_m2, p.xyz_own_m, 0)
+        Point(p.stamp_ns, p.xyz_map_m + np.array([0, 0, 0.3 * i]), p.variance_m2, p.xyz_odom_m, 0)
         for i, p in enumerate(points(circle()))
     )
     assert weigh(climbs, ERRORS).yaw is None
@@ -134,15 +134,15 @@ def test_heights_must_agree():
 def test_a_drone_that_hardly_moves_tells_nothing():
     told = weigh(points(0.05 * circle()), ERRORS)
     assert told.yaw is None
-    assert told.leaning is None
+    assert told.likelihood is None
     assert "too little" in told.reason
 
 
 def test_too_few_points_are_no_answer():
     few = weigh(points(circle())[: LEAST - 1], ERRORS)
     assert few.yaw is None
-    assert few.leaning is not None  # enough to speak for another's
-    assert weigh(points(circle())[: LEAST_TO_BACK - 1], ERRORS).leaning is None
+    assert few.likelihood is not None  # enough to speak for another's
+    assert weigh(points(circle())[: MIN_TO_CONFIRM - 1], ERRORS).likelihood is None
 
 
 def test_the_bank_has_one_peak_and_doubts_when_it_is_flat():
@@ -172,27 +172,27 @@ def test_a_jump_of_the_autopilots_frame_begins_anew():
         bank_.add(p)
     assert bank_.yaw is not None
     p = points(circle())[-1]
-    bank_.add(Point(p.stamp_ns + S, p.xyz_map_m, p.variance_m2, p.xyz_own_m, stretch=1))
+    bank_.add(Point(p.stamp_ns + S, p.xyz_map_m, p.variance_m2, p.xyz_odom_m, segment=1))
     assert bank_.yaw is None
-    assert not bank_.backs(p.stamp_ns, 0.0, 0.01)
+    assert not bank_.confirms(p.stamp_ns, 0.0, 0.01)
 
 
 def test_the_odds_of_other_quarters_are_the_likelihoods():
     """exp(k (cos a - 1)): two quarter turns and one half against a yaw at the peak."""
-    lean = Leaning(0, 0.7, 3.0)
-    assert lean.others(0.7) == pytest.approx(2 * math.exp(-3.0) + math.exp(-6.0))
-    assert lean.others(0.7 + math.pi / 4) > 1.0  # halfway to another one
-    assert lean.others(0.7 + math.pi / 2) > 10.0
+    likelihood = YawLikelihood(0, 0.7, 3.0)
+    assert likelihood.alternatives_odds(0.7) == pytest.approx(2 * math.exp(-3.0) + math.exp(-6.0))
+    assert likelihood.alternatives_odds(0.7 + math.pi / 4) > 1.0  # halfway to another one
+    assert likelihood.alternatives_odds(0.7 + math.pi / 2) > 10.0
 
 
 def test_a_short_way_backs_a_yaw_before_it_tells_one():
     """Its sigma is 15 deg, too much for a heading and little beside a quarter turn."""
     bank_ = MotionYaw(ERRORS, math.radians(6))
     p = points(circle())[0]
-    bank_._told = Weighed("", Leaning(p.stamp_ns, 0.3, 1 / math.radians(15) ** 2))
-    assert bank_.witness is None
-    assert bank_.backs(p.stamp_ns, 0.4, 0.01)
-    assert not bank_.backs(p.stamp_ns, 0.4 + math.pi / 2, 0.01)
-    assert not bank_.backs(p.stamp_ns + 6 * S, 0.4, 0.01)
-    bank_._told = Weighed("", Leaning(p.stamp_ns, 0.3, 1 / math.radians(30) ** 2))
-    assert not bank_.backs(p.stamp_ns, 0.3, 0.01)  # odds 1 : 19
+    bank_._told = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(15) ** 2))
+    assert bank_.coarse_yaw is None
+    assert bank_.confirms(p.stamp_ns, 0.4, 0.01)
+    assert not bank_.confirms(p.stamp_ns, 0.4 + math.pi / 2, 0.01)
+    assert not bank_.confirms(p.stamp_ns + 6 * S, 0.4, 0.01)
+    bank_._told = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(30) ** 2))
+    assert not bank_.confirms(p.stamp_ns, 0.3, 0.01)  # odds 1 : 19

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
-from stages.odometry.vehicle.window import KeyPicture, adjusted
+from stages.odometry.vehicle.window import Keyframe, adjusted
 
 
 def keys_of(shake, noise_rad=1e-4, lidar=True, scale=1.0, count=80, seed=0):
@@ -24,7 +24,7 @@ def keys_of(shake, noise_rad=1e-4, lidar=True, scale=1.0, count=80, seed=0):
         else:
             R_told = R
         inverse = 1.0 / away if lidar else np.full(count, np.nan)
-        keys.append(KeyPicture(R_told, told, np.arange(count), ray, inverse, np.full(count, 2e-4)))
+        keys.append(Keyframe(R_told, told, np.arange(count), ray, inverse, np.full(count, 2e-4)))
         truth.append((R, p))
     return keys, truth
 
@@ -48,7 +48,7 @@ def test_features_first_seen_late_help_too():
     keys, truth = keys_of(0.2, count=120)
     late = np.arange(120) >= 12  # nearly all come into sight with the third picture, whose pose is not held
     keys[:2] = [
-        KeyPicture(k.R, k.p, *(v[~late] for v in (k.number, k.ray, k.inverse_m, k.inverse_sigma))) for k in keys[:2]
+        Keyframe(k.R, k.p, *(v[~late] for v in (k.number, k.ray, k.inverse_m, k.inverse_sigma))) for k in keys[:2]
     ]
     moved, turned = worst(adjusted(keys, 1e-4), truth)
     assert moved < 0.02

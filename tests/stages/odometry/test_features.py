@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from stages.kernels.geometry.so3 import exp_rotation
 from stages.kernels.visual.features import best_per_cell
-from stages.kernels.visual.patches import RADIUS_PX, SIDE_PX, at, find, look, take
+from stages.kernels.visual.patches import RADIUS_PX, SIDE_PX, at, find, sample, take
 from stages.odometry.visual.features import FeatureSettings, FeatureTracker, usable_pixels
 from tests.stages.seen import LENS, PIXEL_RAD, SIZE_PX, picture
 
@@ -47,7 +47,7 @@ def test_a_template_turned_with_its_warp_is_found_and_without_it_is_not_so_well(
     one = picture(np.eye(3), np.zeros(3))
     c, s = math.cos(angle), math.sin(angle)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])  # about the optical axis
-    other = picture(R.T, np.zeros(3))  # the scene turns by R in the picture
+    other = picture(R.T, np.zeros(3))  # the scene rotates by R in the image
     corners = tracked([(np.eye(3), np.zeros(3))])[0].pixel
     centre = np.array(LENS.centre_px)
     there = (corners - centre) @ R[:2, :2].T + centre
@@ -78,7 +78,7 @@ def test_tracks_keep_their_number_and_follow_the_rotation():
     assert len(mine) > 0.4 * len(seen[0].number)
     expected = seen[0].ray[mine] @ poses[5][0]
     error_px = np.linalg.norm(expected - seen[5].ray[theirs], axis=1) / PIXEL_RAD
-    assert np.median(error_px) < 0.1  # no drift over five pictures and 30 deg
+    assert np.median(error_px) < 0.1  # no drift over five images and 30 deg
     assert (np.diff(seen[5].number) > 0).all()
 
 
@@ -90,7 +90,7 @@ def test_a_mask_and_the_off_axis_limit_keep_corners_out():
     assert np.degrees(np.arctan2(np.hypot(*seen.ray[:, :2].T), seen.ray[:, 2])).max() < 61.0
 
 
-def test_a_blank_picture_has_no_corners_and_loses_all_tracks():
+def test_a_blank_image_has_no_corners_and_loses_all_tracks():
     tracker = FeatureTracker(LENS, FeatureSettings())
     assert len(tracker.follow(1, picture(np.eye(3), np.zeros(3)), np.eye(3)).number) == 0
     assert len(tracker.complete(np.eye(3)).number) > 100
@@ -104,7 +104,7 @@ def test_a_number_is_never_used_twice_and_forgotten_ones_are_gone():
     grey = picture(np.eye(3), np.zeros(3))
     tracker.follow(1, grey, np.eye(3))
     first = tracker.complete(np.eye(3)).number
-    tracker.forget(first[::2])
+    tracker.drop(first[::2])
     tracker.follow(2, grey, np.eye(3))
     after = tracker.complete(np.eye(3)).number
     assert not np.isin(first[::2], after).any()
@@ -112,7 +112,7 @@ def test_a_number_is_never_used_twice_and_forgotten_ones_are_gone():
     assert after.max() > first.max()
 
 
-def test_another_picture_size_starts_anew_and_a_tiny_one_is_refused():
+def test_another_image_size_restarts_and_a_tiny_one_is_rejected():
     tracker = FeatureTracker(LENS, FeatureSettings())
     tracker.follow(1, picture(np.eye(3), np.zeros(3)), np.eye(3))
     tracker.complete(np.eye(3))
@@ -121,7 +121,7 @@ def test_another_picture_size_starts_anew_and_a_tiny_one_is_refused():
         tracker.follow(3, np.zeros((20, 16), np.uint8), np.eye(3))
 
 
-def test_the_best_of_each_empty_cell_is_taken():
+def test_the_best_corner_of_each_empty_cell_is_taken():
     strength = np.zeros((40, 40), dtype=np.float32)
     strength[5, 6], strength[7, 3], strength[30, 31], strength[31, 12] = 3.0, 2.0, 5.0, 4.0
     usable = np.full((40, 40), 255, np.uint8)
@@ -140,12 +140,12 @@ def test_what_is_usable_is_symmetric_about_the_lens():
 @pytest.mark.parametrize(
     "wrong", [{"count": 3}, {"window_px": 0}, {"likeness": 1.0}, {"masked_px": (((0, 0), (1, 1)),)}]
 )
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValidationError):
         FeatureSettings(**wrong)
 
 
-def test_a_template_is_looked_for_in_the_pixels_between_the_pictures_own_and_never_beyond_it():
+def test_a_template_is_matched_at_sub_pixel_positions_inside_the_image_only():
     rng = np.random.default_rng(7)
     grey = rng.integers(0, 256, (40, 50)).astype(np.uint8)
     seen, patch, beyond = np.empty(SIDE_PX**2), np.arange(SIDE_PX) - RADIUS_PX, 0
@@ -159,10 +159,10 @@ def test_a_template_is_looked_for_in_the_pixels_between_the_pictures_own_and_nev
                 for du in patch
             ]
         )
-        if look(grey, column, row, warp, seen):
+        if sample(grey, column, row, warp, seen):
             np.testing.assert_array_equal(seen, wanted)
         else:
             beyond += 1
             assert np.isnan(wanted).any()
     assert 100 < beyond < 400
-    assert not look(grey, np.nan, 20.0, np.eye(2), seen)
+    assert not sample(grey, np.nan, 20.0, np.eye(2), seen)

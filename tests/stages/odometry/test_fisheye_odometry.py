@@ -12,7 +12,7 @@ from flow.stage import input_ports, output_ports
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
 from stages.messages import DroneImu, FollowedFeatures, Image, VisualMotion
 from stages.odometry.drone import FisheyeOdometry
-from stages.odometry.drone.fisheye_odometry import turned, visual_motion
+from stages.odometry.drone.fisheye_odometry import gyro_rotation, visual_motion
 from stages.odometry.visual.features import Tracks
 from stages.odometry.visual.image_motion import Link
 from stages.odometry.visual.two_view import TwoView
@@ -90,7 +90,7 @@ def test_hovering_has_no_direction_and_keeps_its_key():
     for motion in motions[1:]:
         assert motion.direction_from is None
         assert motion.direction_sigma_rad is None
-        assert motion.reason == "no motion seen beyond the rotation"
+        assert motion.reason == "no translation observed"
         assert turn_error_deg(truth, motion) < 0.02
 
 
@@ -139,11 +139,11 @@ def test_the_gyro_is_summed_from_picture_to_picture_and_not_over_holes():
     rate = np.array([0.0, 0.0, 1.0])
     ms = 1_000_000
     even = [(k * 10 * ms, rate) for k in range(11)]
-    R = turned(even, 5 * ms, 95 * ms)
+    R = gyro_rotation(even, 5 * ms, 95 * ms)
     np.testing.assert_allclose(log_rotation(R), 0.09 * rate, atol=1e-12)
-    assert turned([g for g in even if not 30 * ms <= g[0] <= 90 * ms], 5 * ms, 95 * ms) is None
-    assert turned(even, 5 * ms, 500 * ms) is None
-    assert turned([(80 * ms, rate)], 5 * ms, 95 * ms) is None
+    assert gyro_rotation([g for g in even if not 30 * ms <= g[0] <= 90 * ms], 5 * ms, 95 * ms) is None
+    assert gyro_rotation(even, 5 * ms, 500 * ms) is None
+    assert gyro_rotation([(80 * ms, rate)], 5 * ms, 95 * ms) is None
 
 
 def test_a_blank_picture_ends_the_chain_and_the_next_begins_one():
@@ -206,6 +206,6 @@ def test_its_ports_are_image_and_a_gyro_that_may_be_missing():
 @pytest.mark.parametrize(
     "wrong", [{"least_matches": 3}, {"link": {"key_share": 1.5}}, {"link": {"tries": 0}}, {"features": {"count": 1}}]
 )
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValidationError):
         FisheyeOdometry(lens=LENS, T_drone_camera=LOOKS_DOWN, **wrong)

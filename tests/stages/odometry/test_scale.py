@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
-from stages.odometry.vehicle.image_motion import Pose6, Step, after, believable, carrier_pose
+from stages.odometry.vehicle.image_motion import Pose6, Step, after, is_plausible, vehicle_pose
 from stages.odometry.vehicle.scale import length_of, parallax_ratio
 from tests.stages.seen import point_rays
 
@@ -45,6 +45,22 @@ def test_a_third_of_wrong_depths_is_left_out():
     assert length_of(rho, sigma, inverse, inverse_sigma).m == pytest.approx(length, rel=0.03)
 
 
+def test_a_precise_depth_outweighs_imprecise_ones():
+    """Ten depths known to 1 % give 1 m, twenty known to 30 % give 1.3 m: the mean by 1 / sigma^2 is 1.00 m."""
+    rho, rho_sigma = np.full(30, 0.1), np.full(30, 1e-4)
+    inverse = np.where(np.arange(30) < 10, 0.1, 0.1 / 1.3)
+    inverse_sigma = np.where(np.arange(30) < 10, 0.01, 0.3) * inverse
+    assert length_of(rho, rho_sigma, inverse, inverse_sigma).m == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_sigma_of_the_length_grows_with_the_sigma_of_the_depths():
+    """Sigma of the mean of 100 depths known to 20 %, with 1 % of each and 0.4 % of all added: 0.0204 of the length."""
+    rho, rho_sigma, inverse = np.full(100, 0.1), np.full(100, 1e-6), np.full(100, 0.05)
+    found = length_of(rho, rho_sigma, inverse, 0.2 * inverse)
+    assert found.m == pytest.approx(2.0)
+    assert found.sigma_m / found.m == pytest.approx(np.hypot(np.hypot(0.2, 0.01) / 10.0, 0.004), rel=1e-6)
+
+
 def test_nothing_known_or_nothing_parted_is_no_length():
     rho, sigma, inverse, inverse_sigma, _, _ = with_depths(60)
     assert length_of(rho, sigma, np.full(60, np.nan), inverse_sigma) is None
@@ -58,9 +74,9 @@ def test_few_features_are_believed_only_near_what_was_expected():
     many = length_of(rho, sigma, inverse, inverse_sigma)
     few = length_of(rho[:9], sigma[:9], inverse[:9], inverse_sigma[:9])
     far = type(few)(length + 5.0, 0.1, 0)
-    assert believable(many, far)
-    assert not believable(few, far)
-    assert believable(few, type(few)(length, 0.1, 0))
+    assert is_plausible(many, far)
+    assert not is_plausible(few, far)
+    assert is_plausible(few, type(few)(length, 0.1, 0))
 
 
 def test_steps_add_up_with_their_covariance():
@@ -89,11 +105,11 @@ def test_the_carriers_covariance_is_that_of_its_pose():
     M[:3, :3], M[:3, 3] = exp_rotation(np.array([0.3, -0.2, 1.5])), [1.5, -0.4, 0.8]
     P = np.diag([1e-4, 4e-4, 1e-6, 1e-4, 9e-4, 1e-6])
     camera = Pose6(exp_rotation(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2.0, 3.0]), P)
-    vehicle = carrier_pose(camera, M)
+    vehicle = vehicle_pose(camera, M)
     samples = []
     for _ in range(4000):
         xi = np.sqrt(np.diag(P)) * rng.normal(size=6)
-        other = carrier_pose(Pose6(camera.R @ exp_rotation(xi[:3]), camera.p + camera.R @ xi[3:], P), M)
+        other = vehicle_pose(Pose6(camera.R @ exp_rotation(xi[:3]), camera.p + camera.R @ xi[3:], P), M)
         samples.append([*log_rotation(vehicle.R.T @ other.R), *(vehicle.R.T @ (other.p - vehicle.p))])
     np.testing.assert_allclose(np.cov(np.array(samples).T), vehicle.covariance, atol=0.06 * vehicle.covariance.max())
     np.testing.assert_allclose(vehicle.R, M[:3, :3] @ camera.R @ M[:3, :3].T)

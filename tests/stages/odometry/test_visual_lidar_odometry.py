@@ -108,7 +108,7 @@ def test_the_covariance_grows_and_covers_the_errors():
     np.testing.assert_allclose(told[-1].covariance, told[-1].covariance.T, atol=1e-12)
 
 
-def test_without_lidar_nothing_is_told_of_a_drive():
+def test_without_lidar_no_motion_is_published_while_driving():
     assert driven(even((0, 0, 0), (4, 0, 0)), 8, lidar=False) == [None] * 8
 
 
@@ -184,6 +184,6 @@ def test_its_ports_are_image_points_and_odometry_and_it_tells_the_vehicles_motio
 
 
 @pytest.mark.parametrize("wrong", [{"window_keys": 2}, {"every_nth_point": 0}, {"reach_deg": 0.0}, {"scale": 1.0}])
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValidationError):
         VisualLidarOdometry(lens=LENS, T_vehicle_camera=LOOKS_UP, **wrong)

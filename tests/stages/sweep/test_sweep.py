@@ -89,7 +89,7 @@ def test_a_dual_return_packet_counts_each_pulse_once():
     assert (points.pulses, len(points.xyz_vehicle_m), pulses.range_m.size) == (1, 2, 1)
 
 
-def test_each_half_turn_back_and_forth_makes_one_image():
+def test_each_180_deg_sweep_back_and_forth_makes_one_image():
     slices, images = run(Sweep(mount=ON_ITS_SIDE), driven(back_and_forth(180.0, 90.0), 6.2))
     assert len(images) == 3
     assert [math.degrees(i.turned_rad) for i in images] == pytest.approx([177, 177, 177], abs=0.2)
@@ -99,7 +99,7 @@ def test_each_half_turn_back_and_forth_makes_one_image():
     assert sum(len(s.xyz_vehicle_m) for s in slices) == pytest.approx(6.2e9 / PACKET_NS, abs=2)
 
 
-def test_a_servo_turning_on_makes_an_image_each_half_turn():
+def test_a_continuously_rotating_servo_makes_an_image_every_180_deg():
     _, images = run(Sweep(mount=ON_ITS_SIDE, tolerance_deg=0.0), driven(lambda t: 180.0 * t, 4.1))
     assert [(i.stamp_ns - START_NS) / 1e9 for i in images] == pytest.approx([1, 2, 3, 4], abs=0.01)
 
@@ -129,13 +129,13 @@ def test_a_sweep_with_ramps_that_stops_short_within_the_tolerance_is_whole():
     assert [len(images) for images in short] == [1, 0]
 
 
-def test_what_is_seen_while_the_servo_stands_still_is_in_no_image():
+def test_returns_while_the_servo_is_at_rest_are_in_no_image():
     _, images = run(Sweep(mount=ON_ITS_SIDE), driven(lambda t: max(0.0, 90 * (t - 2.0)), 4.1))
     assert len(images) == 1
     assert (images[0].start_ns - START_NS) / 1e9 == pytest.approx(2.0, abs=0.02)
 
 
-def test_a_silent_servo_loses_its_gap_with_a_reason_and_the_sweep_begins_anew():
+def test_returns_in_a_servo_gap_are_omitted_with_a_reason_and_the_sweep_restarts():
     slices, images = run(Sweep(mount=ON_ITS_SIDE), driven(lambda t: 90 * t, 2.1, silent=(1.0, 1.2)))
     lost = [s for s in slices if s.unplaced]
     assert sum(s.unplaced for s in lost) == pytest.approx(0.2e9 / PACKET_NS, abs=10)
@@ -156,7 +156,7 @@ def test_the_image_has_the_points_the_slices_had():
     assert abs(rows.mean() + 0.5 - 256 + 3 / 11.75 * image.focal_px) < 2
 
 
-def test_turning_the_turntable_a_quarter_turns_the_points():
+def test_rotating_the_turntable_by_90_deg_rotates_the_points():
     def swept_points(zero_deg):
         mount = ON_ITS_SIDE.model_copy(update={"servo_zero_deg": zero_deg})
         points = [[5.0, 20.0, 1.0], [-3.0, 9.0, 2.0]]
@@ -232,6 +232,6 @@ def test_the_same_input_gives_the_same_bits():
         {"mount": ON_ITS_SIDE, "mistyped": 1},
     ],
 )
-def test_impossible_settings_are_refused(settings):
+def test_impossible_settings_are_rejected(settings):
     with pytest.raises((ValidationError, ValueError)):
         Sweep(**settings)

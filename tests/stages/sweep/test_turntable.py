@@ -59,7 +59,7 @@ def test_nothing_is_extrapolated_and_long_gaps_are_not_bridged():
     assert "wired" in turntable().why_unknown(START_NS)
 
 
-def test_a_single_turn_encoder_runs_on_over_its_end():
+def test_a_single_turn_encoder_is_unwrapped():
     table = turntable(states=[(0, math.tau - 0.1), (10 * MS, 0.1), (20 * MS, 0.3)])
     assert angle_rad(table, START_NS + 5 * MS) == pytest.approx(math.tau)
     assert angle_rad(table, START_NS + 15 * MS) == pytest.approx(math.tau + 0.2)
@@ -126,7 +126,7 @@ def test_only_returns_beyond_the_least_range_are_placed():
     assert placed.unplaced == 0
 
 
-def test_returns_without_an_angle_are_counted_and_left_out():
+def test_returns_without_an_angle_are_counted_and_omitted():
     table = turntable(states=[(0, 0.0), (10 * MS, 0.0)])
     packet = firings([[5, 0, 0], [5, 0, 0], [0, 0, 0], [5, 0, 0]], START_NS + np.array([-1, 5, 20, 30]) * MS)
     placed = returns_of(table, packet)
@@ -154,7 +154,7 @@ def test_states_that_no_pulse_needs_are_forgotten():
 
 
 @pytest.mark.parametrize("mount", [ON_ITS_SIDE, ASKEW])
-def test_a_pulse_without_return_looks_where_its_return_would_have_been(mount):
+def test_a_pulse_without_return_has_the_direction_of_its_beam(mount):
     table = turntable(mount, states=[(0, 0.7), (10 * MS, 0.7)])
     ranges_m = np.full(384, 20.0)
     met = pulses_of(table, packet(START_NS + PULSE_NS, ranges_m))
@@ -165,7 +165,7 @@ def test_a_pulse_without_return_looks_where_its_return_would_have_been(mount):
     assert not free.range_m.any()
 
 
-def test_pulses_look_where_the_turning_beams_do_each_at_its_own_time():
+def test_each_pulse_has_the_direction_of_the_rotating_beam_at_its_own_time():
     table = turntable(ASKEW, states=[(0, 0.2), (10 * MS, 0.8)])  # 573 deg/s: 0.4 deg from first to last pulse
     stamp_ns = START_NS + PULSE_NS
     pulses = pulses_of(table, packet(stamp_ns, np.zeros(384)))

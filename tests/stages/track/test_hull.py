@@ -29,7 +29,7 @@ S_M = 0.1
 P_0 = 0.8
 
 
-def look(hits=(), misses=(), nearer=()):
+def scan_pass(hits=(), misses=(), nearer=()):
     """Pulses at offsets (a, b) [m]."""
     rows = []
     for kind, offsets in ((HIT, hits), (MISS, misses), (NEARER, nearer)):
@@ -74,10 +74,12 @@ def brute_force(pulses, prior, half_m=1.2, cells=481, misses=True):
 
 
 LOOKS = {
-    "one hit": look(hits=[(0.1, 0.05)]),
-    "a stroke with its ends": look(hits=[(-0.05, 0.1), (0.02, 0.1), (0.09, 0.1)], misses=[(-0.12, 0.1), (0.16, 0.1)]),
-    "misses only": look(misses=[(0.0, 0.0), (0.05, 0.0), (-0.05, 0.02)]),
-    "two beams": look(
+    "one hit": scan_pass(hits=[(0.1, 0.05)]),
+    "a stroke with its ends": scan_pass(
+        hits=[(-0.05, 0.1), (0.02, 0.1), (0.09, 0.1)], misses=[(-0.12, 0.1), (0.16, 0.1)]
+    ),
+    "misses only": scan_pass(misses=[(0.0, 0.0), (0.05, 0.0), (-0.05, 0.02)]),
+    "two beams": scan_pass(
         hits=[(0.0, -0.1), (0.07, -0.1), (0.03, 0.12)], misses=[(0.1, 0.12), (-0.08, 0.12), (0.14, -0.1)]
     ),
 }
@@ -99,7 +101,7 @@ def test_mean_covariance_and_evidence_are_those_of_a_finer_grid(name, prior):
 
 def test_when_nothing_was_measured_the_prior_stays():
     prior = np.array([[0.02, 0.005], [0.005, 0.01]])
-    for pulses in (look(), look(nearer=[(0.0, 0.0), (0.1, 0.1)])):
+    for pulses in (scan_pass(), scan_pass(nearer=[(0.0, 0.0), (0.1, 0.1)])):
         mean, covariance, evidence, expected = solve(pulses, prior=prior)
         np.testing.assert_allclose(mean, 0.0, atol=1e-9)
         np.testing.assert_allclose(covariance, prior, atol=2e-3)
@@ -109,7 +111,7 @@ def test_when_nothing_was_measured_the_prior_stays():
 
 def test_misses_on_one_side_shift_the_estimate_away_from_them():
     hits = [(0.0, 0.0), (0.03, 0.0)]
-    without, with_ = solve(look(hits=hits))[0], solve(look(hits=hits, misses=[(0.07, 0.0), (0.1, 0.0)]))[0]
+    without, with_ = solve(scan_pass(hits=hits))[0], solve(scan_pass(hits=hits, misses=[(0.07, 0.0), (0.1, 0.0)]))[0]
     assert with_[0] < without[0] - 0.01
     assert abs(with_[1]) < 1e-6
 
@@ -130,7 +132,7 @@ def test_passing_through_the_middle_speaks_against_a_drone_and_hits_for_it():
 
 
 def test_the_expected_hits_are_those_of_the_mean():
-    pulses = look(hits=[(0.0, 0.0)], misses=[(0.1, 0.0), (5.0, 0.0)], nearer=[(0.0, 0.0)])
+    pulses = scan_pass(hits=[(0.0, 0.0)], misses=[(0.1, 0.0), (5.0, 0.0)], nearer=[(0.0, 0.0)])
     mean, _, _, expected = solve(pulses, prior_sigma_m=0.01, half_m=0.05)
     np.testing.assert_allclose(mean, 0.0, atol=5e-3)
     assert expected == pytest.approx(P_0 * (1 + math.exp(-0.5)), abs=0.03)
@@ -159,9 +161,9 @@ LINE = np.array([0.0, 1.0, 0.0])
 NO_MOTION = np.zeros(3)
 
 
-def collected(places, ranges, stamps_ns=None, velocity=NO_MOTION, reach_m=1.0, depth_m=0.6, room=64):
+def collected(positions, ranges, stamps_ns=None, velocity=NO_MOTION, reach_m=1.0, depth_m=0.6, room=64):
     """Pulses towards places (n, 3), of which a range may be given, or None: as far as the place."""
-    away = np.asarray(places, dtype=np.float64) - ORIGIN
+    away = np.asarray(positions, dtype=np.float64) - ORIGIN
     length = np.linalg.norm(away, axis=1)
     ranges = [length[i] if r is None else r for i, r in enumerate(ranges)]
     stamps = np.zeros(len(away), dtype=np.int64) if stamps_ns is None else np.asarray(stamps_ns, dtype=np.int64)
@@ -188,8 +190,8 @@ def collected(places, ranges, stamps_ns=None, velocity=NO_MOTION, reach_m=1.0, d
 def test_each_pulse_is_measured_across_and_along_the_line_of_sight():
     ax, ay, *_ = basis(*LINE)
     level = np.array([ax, ay, 0.0])
-    places = [CENTRE + 0.3 * level, np.add(CENTRE, [0, 0, 0.2]), np.add(CENTRE, [0, 0.1, 0]), CENTRE + 0.4 * level]
-    found = collected(places, [None, None, None, 0.0])
+    positions = [CENTRE + 0.3 * level, np.add(CENTRE, [0, 0, 0.2]), np.add(CENTRE, [0, 0.1, 0]), CENTRE + 0.4 * level]
+    found = collected(positions, [None, None, None, 0.0])
     np.testing.assert_allclose(found[:, A], [0.3, 0, 0, 0.4], atol=1e-5)
     np.testing.assert_allclose(found[:, B], [0, 0.2, 0, 0], atol=1e-5)
     np.testing.assert_allclose(found[:3, DEPTH], [0, 0, 0.1], atol=1e-5)
@@ -215,9 +217,9 @@ def test_pulses_beyond_reach_or_the_other_way_are_left_out_and_room_is_kept():
 def test_hits_on_a_flying_drone_fall_onto_its_centre_when_de_skewed():
     velocity = np.array([6.0, -3.0, 2.0])
     stamps_ns = np.linspace(-20e6, 20e6, 9).astype(np.int64)  # 0.24 m of flight
-    places = CENTRE + np.outer(stamps_ns * 1e-9, velocity)
-    found = collected(places, [None] * 9, stamps_ns, velocity)
+    positions = CENTRE + np.outer(stamps_ns * 1e-9, velocity)
+    found = collected(positions, [None] * 9, stamps_ns, velocity)
     np.testing.assert_allclose(found[:, [A, B, DEPTH]], 0.0, atol=2e-3)
     np.testing.assert_allclose(found[:, WHEN_S], stamps_ns * 1e-9)
-    smeared = collected(places, [None] * 9, stamps_ns)
+    smeared = collected(positions, [None] * 9, stamps_ns)
     assert np.ptp(smeared[:, A]) == pytest.approx(0.24, abs=0.01)

@@ -15,8 +15,8 @@ from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, A, B
 from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
 from stages.track import LikelihoodTrack
 from stages.track.hull import COLUMNS
-from stages.track.likelihood_track import LOOK_OVER_NS
-from stages.track.scan_pass import drone_hits
+from stages.track.likelihood_track import PASS_OVER_NS
+from stages.track.scan_pass import drone_returns
 from tests.stages.caster import Box, Drone, During, Way, dithering, flying, pulses_seen, still
 from tests.stages.made import START_NS
 
@@ -38,7 +38,7 @@ def accepted(xyz_m, velocity_mps=(0.0, 0.0, 0.0), t_s=0.0, number=1) -> Detectio
         e_outer=np.zeros(1),
         accepted=np.array([True]),
         reasons=("made",),
-        verdict="made",
+        summary="made",
         start_ns=at_s(t_s) - 1,
         seen_ns=np.array([at_s(t_s)]),
         velocity_vehicle_mps=np.array([velocity_mps], dtype=np.float64),
@@ -50,13 +50,13 @@ def accepted(xyz_m, velocity_mps=(0.0, 0.0, 0.0), t_s=0.0, number=1) -> Detectio
 def candidate(xyz_m, probability, t_s=0.0, number=1, looks=3, life_since_s=0.0) -> Candidates:
     return Candidates(
         stamp_ns=at_s(t_s),
-        detector_life=at_s(life_since_s),
+        detector_instance=at_s(life_since_s),
         candidate_id=np.array([number]),
         xyz_vehicle_m=np.array([xyz_m], dtype=np.float64),
         velocity_vehicle_mps=np.zeros((1, 3)),
         probability=np.array([probability]),
         seen_ns=np.array([at_s(t_s)]),
-        looks=np.array([looks]),
+        scan_passes=np.array([looks]),
         reasons=("flew as a bird does",),
     )
 
@@ -249,7 +249,7 @@ CERTAIN = {"shape_share": 0.0, "range_sigma_m": 0.0, "mount": LidarMount(pointin
 
 
 def lasting(place, **sigmas):
-    return LikelihoodTrack(**{**CERTAIN, **sigmas})._lasting_covariance(np.array(place))
+    return LikelihoodTrack(**{**CERTAIN, **sigmas})._bias_covariance(np.array(place))
 
 
 def test_pointing_makes_it_less_sure_the_farther_away_and_only_about_the_axis():
@@ -273,7 +273,7 @@ def test_a_fix_tells_what_of_its_covariance_is_the_same_in_the_next_one():
     fixes = fixes_of(run([Drone(way)], [accepted(here(way))], 1.5))
     assert fixes
     for fix in fixes:
-        np.testing.assert_array_equal(fix.bias_covariance_m2, LikelihoodTrack()._lasting_covariance(fix.xyz_vehicle_m))
+        np.testing.assert_array_equal(fix.bias_covariance_m2, LikelihoodTrack()._bias_covariance(fix.xyz_vehicle_m))
         assert np.linalg.eigvalsh(fix.covariance_m2 - fix.bias_covariance_m2).min() > 0
 
 
@@ -399,7 +399,7 @@ def test_of_two_that_became_one_the_younger_says_no_more():
     for message in (accepted(here(elder), number=5), accepted(here(younger), number=9)):
         out += stage.on_detections(message)
     for pulses in pulses_seen([Drone(elder, seed=1), Drone(younger, seed=2)], WATCHING, 2.0):
-        both = [one for one in stage._known if one.look and pulses.stamp_ns - one.look.last_ns > LOOK_OVER_NS]
+        both = [one for one in stage._known if one.scan_pass and pulses.stamp_ns - one.scan_pass.last_ns > PASS_OVER_NS]
         if len(both) == 2 and pulses.stamp_ns > at_s(1.0):  # both looks end now: the younger drifts onto the elder
             both[1].x[:3] = both[0].x[:3]
         out += stage.on_pulses(pulses)
@@ -448,7 +448,7 @@ def test_the_same_pulses_give_the_same_fixes():
         np.testing.assert_array_equal(a.covariance_m2, b.covariance_m2)
 
 
-def look(points):
+def scan_pass(points):
     """Hits of a look at (a, b, depth) [m]."""
     pulses = np.zeros((len(points), COLUMNS))
     pulses[:, [A, B, DEPTH]] = points
@@ -458,30 +458,32 @@ def look(points):
 
 def test_the_group_near_the_prediction_is_the_drones_and_strays_are_not():
     points = [(0.0, 0.0, 0.0), (0.1, 0.0, 0.1), (0.05, 0.1, 0.0), (1.6, 0.0, 0.3)]
-    assert drone_hits(look(points), 0.5, 0.3).tolist() == [0, 1, 2]
-    assert drone_hits(look([(0.0, 0.0, 5.0)]), 0.5, 0.3) is None  # too far behind
-    nothing = look([(0.0, 0.0, 0.0)])
+    assert drone_returns(scan_pass(points), 0.5, 0.3).tolist() == [0, 1, 2]
+    assert drone_returns(scan_pass([(0.0, 0.0, 5.0)]), 0.5, 0.3) is None  # too far behind
+    nothing = scan_pass([(0.0, 0.0, 0.0)])
     nothing[:, KIND] = 0.0
-    assert drone_hits(nothing, 0.5, 0.3) is None
+    assert drone_returns(nothing, 0.5, 0.3) is None
 
 
 def test_what_is_met_farther_off_than_a_drone_ever_is_is_something_else():
     """As behind a tree: a wall through its leaves, .7 m behind where the drone is expected within .13 m."""
-    assert drone_hits(look([(-0.57, -0.23, 0.68), (-0.57, -0.16, 0.68), (-0.57, -0.09, 0.67)]), 0.5, 0.13) is None
-    assert drone_hits(look([(0.25, -0.1, 0.15), (0.25, -0.03, 0.15)]), 0.5, 0.13).tolist() == [0, 1]
+    assert (
+        drone_returns(scan_pass([(-0.57, -0.23, 0.68), (-0.57, -0.16, 0.68), (-0.57, -0.09, 0.67)]), 0.5, 0.13) is None
+    )
+    assert drone_returns(scan_pass([(0.25, -0.1, 0.15), (0.25, -0.03, 0.15)]), 0.5, 0.13).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(("depth_m", "taken"), [(0.05, True), (0.3, False)])
 def test_a_glimpse_through_a_gap_has_to_be_where_a_drone_nearly_always_is(depth_m, taken):
-    pulses = look([(0.05, 0.0, depth_m), (0.05, 0.07, depth_m)])
-    assert drone_hits(pulses, 0.5, 0.1) is not None
+    pulses = scan_pass([(0.05, 0.0, depth_m), (0.05, 0.07, depth_m)])
+    assert drone_returns(pulses, 0.5, 0.1) is not None
     pulses[:, KIND] = GLIMPSE
-    assert (drone_hits(pulses, 0.5, 0.1) is not None) == taken
+    assert (drone_returns(pulses, 0.5, 0.1) is not None) == taken
 
 
 def test_returns_with_many_more_beside_them_belong_to_something_bigger():
     wall = [(0.1 * k, 0.0, 0.0) for k in range(-15, 16)]
-    assert drone_hits(look(wall), 0.5, 0.3) is None
+    assert drone_returns(scan_pass(wall), 0.5, 0.3) is None
 
 
 @pytest.mark.parametrize(

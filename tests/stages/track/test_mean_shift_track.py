@@ -249,7 +249,7 @@ def test_packets_to_positions_the_whole_chain_finds_and_follows_a_ball():
         for out in sweep.on_servo(message) if hasattr(message, "goal_rad") else sweep.on_firings(message):
             if isinstance(out, DepthImage):
                 _, found = detect.on_image(out)
-                verdicts.append(found.verdict)
+                verdicts.append(found.summary)
                 track.on_detections(found)
             elif isinstance(out, SweptPoints):
                 fixes += [m for m in track.on_points(out) if isinstance(m, DroneFix)]

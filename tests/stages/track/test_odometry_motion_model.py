@@ -11,7 +11,7 @@ from stages.geometry.frames import rotation_z
 from stages.messages import Detections, DroneFix, DroneLocalPosition, TrackingState, TrackState
 from stages.track import LikelihoodTrack
 from stages.track.kalman import predicted
-from stages.track.odometry_motion_model import NONE, ToldMotion, Word
+from stages.track.odometry_motion_model import NO_ODOMETRY_PRIOR, OdometryMotionModel, OdometrySample
 from tests.stages.caster import Box, Drone, During, dithering, pulses_seen
 from tests.stages.made import START_NS
 
@@ -35,13 +35,13 @@ def circle(t_s):
 def told(t_s, flown=circle, yaw_rad=YAW_RAD):
     """The same as the autopilot says it."""
     place, velocity = flown(t_s)
-    R_own_local = rotation_z(-yaw_rad)
-    return R_own_local @ (place - flown(0.0)[0]), R_own_local @ velocity
+    R_odom_raw = rotation_z(-yaw_rad)
+    return R_odom_raw @ (place - flown(0.0)[0]), R_odom_raw @ velocity
 
 
 def taught(seconds=4.0, seen=circle, flown=circle, yaw_rad=YAW_RAD):
     """A drone that told its flight and was seen for so long."""
-    motion = ToldMotion(0)
+    motion = OdometryMotionModel(0)
     for k in range(round(seconds / 0.02) + 1):
         t_s = 0.02 * k
         motion.told.add(at_ns(t_s), *told(t_s, flown, yaw_rad))
@@ -50,8 +50,8 @@ def taught(seconds=4.0, seen=circle, flown=circle, yaw_rad=YAW_RAD):
     return motion
 
 
-def word(t_s, source=0, resets=0):
-    return Word(source, resets, *told(t_s))
+def sample(t_s, source=0, resets=0):
+    return OdometrySample(source, resets, *told(t_s))
 
 
 def state(t_s):
@@ -60,7 +60,7 @@ def state(t_s):
 
 def test_with_the_yaw_learnt_a_track_goes_where_the_drone_went():
     x, P = state(4.0)
-    ahead, covariance = taught().predicted(x, P, 2.0, word(4.0), word(6.0), 1.0, 0.02)
+    ahead, covariance = taught().predicted(x, P, 2.0, sample(4.0), sample(6.0), 1.0, 0.02)
     place, velocity = circle(6.0)
     # the yaw is known to a degree or two, and the way there is 9 m off a straight line
     np.testing.assert_allclose(ahead[:3], place, atol=0.3)
@@ -74,25 +74,39 @@ def test_the_prediction_does_not_depend_on_the_autopilot_s_north():
     x, P = state(4.0)
     one = taught(yaw_rad=0.5)
     other = taught(yaw_rad=0.5 + math.pi / 2)  # whole steps of the grid: the same to the last digits
-    a = one.predicted(x, P, 1.0, Word(0, 0, *told(4.0, yaw_rad=0.5)), Word(0, 0, *told(5.0, yaw_rad=0.5)), 1.0, 0.02)
+    a = one.predicted(
+        x,
+        P,
+        1.0,
+        OdometrySample(0, 0, *told(4.0, yaw_rad=0.5)),
+        OdometrySample(0, 0, *told(5.0, yaw_rad=0.5)),
+        1.0,
+        0.02,
+    )
     turned = 0.5 + math.pi / 2
     b = other.predicted(
-        x, P, 1.0, Word(0, 0, *told(4.0, yaw_rad=turned)), Word(0, 0, *told(5.0, yaw_rad=turned)), 1.0, 0.02
+        x,
+        P,
+        1.0,
+        OdometrySample(0, 0, *told(4.0, yaw_rad=turned)),
+        OdometrySample(0, 0, *told(5.0, yaw_rad=turned)),
+        1.0,
+        0.02,
     )
     np.testing.assert_allclose(a[0], b[0], atol=1e-6)
     np.testing.assert_allclose(a[1], b[1], atol=1e-6)
 
 
 def test_an_unknown_yaw_gives_the_spread_of_all_directions():
-    motion, (x, P) = ToldMotion(0), state(0.0)
-    before, after = word(0.0), word(1.0)
+    motion, (x, P) = OdometryMotionModel(0), state(0.0)
+    before, after = sample(0.0), sample(1.0)
     ahead, covariance = motion.predicted(x, P, 1.0, before, after, 0.0, 0.0)
     plain, before_covariance = predicted(x, P, 1.0, 0.0)
     step = after.xyz_m - before.xyz_m - before.velocity_mps
     # with psi uniform and probability 1 - NONE that it flies so: mean 0, variance |a|^2 / 2 on each level axis
     np.testing.assert_allclose(ahead, plain, atol=1e-9)
     extra = covariance - before_covariance
-    expected = 0.5 * (1.0 - NONE) * float(step[:2] @ step[:2])
+    expected = 0.5 * (1.0 - NO_ODOMETRY_PRIOR) * float(step[:2] @ step[:2])
     np.testing.assert_allclose(np.diag(extra)[:2], expected, rtol=1e-9)
     np.testing.assert_allclose(extra[0, 1], 0.0, atol=1e-9)
     np.testing.assert_allclose(np.diag(extra)[2], 0.0, atol=1e-12)
@@ -101,7 +115,7 @@ def test_an_unknown_yaw_gives_the_spread_of_all_directions():
 def test_the_covariance_is_that_of_the_yaws_weighed():
     motion = taught(0.8)  # a short way: several yaws fit
     x, P = state(0.8)
-    before, after = word(0.8), word(2.3)
+    before, after = sample(0.8), sample(2.3)
     ahead, covariance = motion.predicted(x, P, 1.5, before, after, 0.0, 0.0)
     plain, base = predicted(x, P, 1.5, 0.0)
     step = after.xyz_m - before.xyz_m - 1.5 * before.velocity_mps
@@ -124,11 +138,15 @@ def test_the_covariance_is_that_of_the_yaws_weighed():
 
 def test_a_word_that_came_late_is_made_good_by_the_next_one():
     motion, (x, P) = taught(), state(4.0)
-    held = Word(0, 0, word(4.0).xyz_m + 0.5 * word(4.0).velocity_mps, word(4.0).velocity_mps)  # nothing newer was heard
-    half, half_P = motion.predicted(x, P, 0.5, word(4.0), held, 1.0, 0.02)
-    whole, _ = motion.predicted(half, half_P, 0.5, held, word(5.0), 1.0, 0.02)
+    held = OdometrySample(
+        0, 0, sample(4.0).xyz_m + 0.5 * sample(4.0).velocity_mps, sample(4.0).velocity_mps
+    )  # nothing newer was heard
+    half, half_P = motion.predicted(x, P, 0.5, sample(4.0), held, 1.0, 0.02)
+    whole, _ = motion.predicted(half, half_P, 0.5, held, sample(5.0), 1.0, 0.02)
     np.testing.assert_allclose(whole[3:], circle(5.0)[1], atol=0.2)
-    lost, _ = motion.predicted(half, half_P, 0.5, word(4.5), word(5.0), 1.0, 0.02)  # what changed meanwhile is left out
+    lost, _ = motion.predicted(
+        half, half_P, 0.5, sample(4.5), sample(5.0), 1.0, 0.02
+    )  # what changed meanwhile is left out
     assert np.linalg.norm(lost[3:] - circle(5.0)[1]) > 1.0
 
 
@@ -137,19 +155,21 @@ def test_what_does_not_fly_as_told_is_not_moved_by_it():
         return np.array([7.0 * t_s, 9.0, 10.0]), np.array([7.0, 0.0, 0.0])
 
     motion = taught(4.0, seen=bird)
-    assert motion.sure < 0.05
+    assert motion.confidence < 0.05
     x, P = np.concatenate(bird(4.0)), np.diag([0.01] * 3 + [0.04] * 3)
-    ahead, covariance = motion.predicted(x, P, 1.0, word(4.0), word(5.0), 1.0, 0.02)
+    ahead, covariance = motion.predicted(x, P, 1.0, sample(4.0), sample(5.0), 1.0, 0.02)
     np.testing.assert_allclose(ahead[:3], bird(5.0)[0], atol=0.2)
     assert covariance[3, 3] > 0.9
 
 
 @pytest.mark.parametrize(
-    "after", [None, word(5.0, source=1), word(5.0, resets=1)], ids=["silent", "another message", "the estimate jumped"]
+    "after",
+    [None, sample(5.0, source=1), sample(5.0, resets=1)],
+    ids=["silent", "another message", "the estimate jumped"],
 )
 def test_without_two_words_of_one_frame_the_track_flies_on(after):
     motion, (x, P) = taught(), state(4.0)
-    ahead, covariance = motion.predicted(x, P, 1.0, word(4.0), after, 1.0, 0.02)
+    ahead, covariance = motion.predicted(x, P, 1.0, sample(4.0), after, 1.0, 0.02)
     plain, expected = predicted(x, P, 1.0, 1.0)
     np.testing.assert_array_equal(ahead, plain)
     np.testing.assert_array_equal(covariance, expected)
@@ -158,13 +178,13 @@ def test_without_two_words_of_one_frame_the_track_flies_on(after):
 @pytest.mark.parametrize("counts", [False, True], ids=["by its velocity", "by the autopilot's counter"])
 def test_a_frame_that_was_turned_is_noticed_and_its_yaw_learnt_anew(counts):
     motion, (x, P) = taught(), state(4.02)
-    before = motion.word(at_ns(4.0))
+    before = motion.sample(at_ns(4.0))
     for k in range(1, 6):
         t_s, yaw_rad = 4.0 + 0.02 * k, YAW_RAD + math.pi / 2
         place = told(4.0)[0]  # no step that its place would show
         velocity = told(4.0)[1] if counts else told(t_s, yaw_rad=yaw_rad)[1]
         motion.told.add(at_ns(t_s), place, velocity, 1 if counts else None)
-    after = motion.word(at_ns(4.06))
+    after = motion.sample(at_ns(4.06))
     assert before is not None
     assert after is not None
     assert before[:2] != after[:2]
@@ -172,7 +192,7 @@ def test_a_frame_that_was_turned_is_noticed_and_its_yaw_learnt_anew(counts):
     ahead, covariance = motion.predicted(x, P, 0.06, before, after, 1.0, 0.02)
     np.testing.assert_array_equal(ahead, plain)
     np.testing.assert_array_equal(covariance, expected)
-    motion.predicted(x, P, 0.04, after, motion.word(at_ns(4.1)), 1.0, 0.02)
+    motion.predicted(x, P, 0.04, after, motion.sample(at_ns(4.1)), 1.0, 0.02)
     assert abs(motion._moments[0]) == 0.0
 
 
@@ -219,7 +239,7 @@ def followed(tells):
             e_outer=np.zeros(1),
             accepted=np.array([True]),
             reasons=("made",),
-            verdict="made",
+            summary="made",
             seen_ns=np.array([at_ns(0.0)]),
             velocity_vehicle_mps=velocity[None],
         )

@@ -128,7 +128,7 @@ def found_at(frame: Frame) -> Detections:
         e_outer=np.zeros(1),
         accepted=np.ones(1, dtype=bool),
         reasons=("the only thing near and above",),
-        verdict="drone",
+        summary="drone",
     )
 
 

@@ -14,7 +14,7 @@ from stages.track.hull import COLUMNS
 SPAN_M = 0.5
 
 
-def look(depths, laser=0, spacing_m=0.07):
+def scan_pass(depths, laser=0, spacing_m=0.07):
     """One laser's pulses side by side, with their depths [m], inf for none; what lies within .6 m is a hit."""
     pulses = np.zeros((len(depths), COLUMNS))
     pulses[:, A] = spacing_m * (np.arange(len(depths)) - 0.5 * len(depths))
@@ -31,29 +31,29 @@ def hits(pulses):
 
 def test_a_drone_before_the_sky_or_before_a_wall_keeps_its_returns():
     for behind_m in (math.inf, 3.0, 0.5):
-        assert hits(look([behind_m] * 14 + [0.0, 0.05, -0.05, 0.1, 0.0] + [behind_m] * 14)) == [14, 15, 16, 17, 18]
+        assert hits(scan_pass([behind_m] * 14 + [0.0, 0.05, -0.05, 0.1, 0.0] + [behind_m] * 14)) == [14, 15, 16, 17, 18]
 
 
 def test_a_wall_at_the_drones_range_has_no_hit_and_no_miss():
-    pulses = look([0.0] * 20)
+    pulses = scan_pass([0.0] * 20)
     assert hits(pulses) == []
     assert (pulses[:, KIND] == NEARER).all()
-    assert hits(look(np.linspace(-3.0, 3.0, 25))) == []  # also one that runs away from us
+    assert hits(scan_pass(np.linspace(-3.0, 3.0, 25))) == []  # also one that runs away from us
 
 
 def test_what_touches_the_wall_cannot_be_told_from_it():
-    assert hits(look([0.2] * 9 + [0.0] * 5 + [0.2] * 9)) == []
+    assert hits(scan_pass([0.2] * 9 + [0.0] * 5 + [0.2] * 9)) == []
 
 
 @pytest.mark.parametrize("hole", [2, 9])
 def test_a_hole_in_a_wall_is_none_unless_it_is_wide(hole):
     """Returns that are missing for a moment do not end it."""
     depths = [0.0] * 8 + [math.inf] * hole + [0.0] * 8
-    assert (hits(look(depths)) == []) == (hole == 2)
+    assert (hits(scan_pass(depths)) == []) == (hole == 2)
 
 
 def test_each_laser_has_runs_of_its_own_and_the_order_of_pulses_is_that_of_time():
-    wall, drone = look([0.0] * 20, laser=3), look([math.inf] * 8 + [0.0] * 4 + [math.inf] * 8, laser=5)
+    wall, drone = scan_pass([0.0] * 20, laser=3), scan_pass([math.inf] * 8 + [0.0] * 4 + [math.inf] * 8, laser=5)
     both = np.stack([wall, drone], axis=1).reshape(-1, COLUMNS)  # fired in turn
     leave_out_walls(both, SPAN_M)
     assert set(both[both[:, KIND] == HIT][:, LASER]) == {5.0}
@@ -66,7 +66,7 @@ def test_each_laser_has_runs_of_its_own_and_the_order_of_pulses_is_that_of_time(
 )
 def test_what_shows_through_a_gap_is_a_glimpse_and_beside_an_edge_a_hit(left_m, right_m, kind):
     depths = [-5.0] * 6 + [left_m] + [0.3] * 3 + [right_m] + [-4.0] * 6
-    pulses = look(depths)
+    pulses = scan_pass(depths)
     pulses[np.array(depths) < -0.6, KIND] = NEARER
     leave_out_walls(pulses, SPAN_M)
     assert set(pulses[7:10, KIND]) == {kind}
@@ -77,7 +77,7 @@ def test_a_glimpse_with_a_hole_in_it_is_one_and_a_long_one_is_a_wall():
         ([-5.0, 0.1, 0.1, math.inf, 0.1, -5.0], GLIMPSE),
         ([-5.0] + [0.1] * 20 + [-5.0], NEARER),
     ):
-        pulses = look(depths)
+        pulses = scan_pass(depths)
         pulses[[0, -1], KIND] = NEARER
         leave_out_walls(pulses, SPAN_M)
         assert set(pulses[1:-1, KIND]) - {MISS} == {kind}

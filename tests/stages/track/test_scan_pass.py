@@ -11,7 +11,7 @@ from stages.kernels.geometry.so3 import exp_rotation
 from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, A
 from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS
-from stages.track.scan_pass import collect_into, drone_hits, evaluate
+from stages.track.scan_pass import collect_into, drone_returns, evaluate
 from tests.stages.made import START_NS
 
 SPAN_M = 0.5
@@ -21,16 +21,16 @@ EXPECTED_M = np.array([0.3, 0.4, 12.0])  # nearly overhead
 def fan(R_map_vehicle, drone_m):
     """Pulses each 3 cm over a square metre about the prediction, from the vehicle's origin; the drone returns some."""
     side = np.linspace(-0.5, 0.5, 34)
-    places = EXPECTED_M + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2) @ np.eye(2, 3)
-    length = np.linalg.norm(places, axis=1)
-    hit = np.linalg.norm(places - drone_m, axis=1) < 0.1
+    positions = EXPECTED_M + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2) @ np.eye(2, 3)
+    length = np.linalg.norm(positions, axis=1)
+    hit = np.linalg.norm(positions - drone_m, axis=1) < 0.1
     return SweptPulses(
         stamp_ns=START_NS,
-        point_stamp_ns=START_NS + np.arange(len(places)),
-        direction_vehicle=(places / length[:, None] @ R_map_vehicle).astype(np.float32),
+        point_stamp_ns=START_NS + np.arange(len(positions)),
+        direction_vehicle=(positions / length[:, None] @ R_map_vehicle).astype(np.float32),
         range_m=np.where(hit, length, 0.0).astype(np.float32),
-        laser=(np.arange(len(places)) % 16).astype(np.uint8),
-        reflectivity=np.full(len(places), 30, dtype=np.uint8),
+        laser=(np.arange(len(positions)) % 16).astype(np.uint8),
+        reflectivity=np.full(len(positions), 30, dtype=np.uint8),
         turntable_rad=0.0,
         origin_vehicle_m=(0.0, 0.0, 0.0),
     )
@@ -44,9 +44,9 @@ def test_a_drone_beside_the_prediction_is_found_on_its_own_side_however_the_vehi
     pulses = fan(R, drone_m)
     axis = pulses.direction_vehicle.mean(axis=0).astype(np.float64)
     x, P = np.concatenate([EXPECTED_M, np.zeros(3)]), np.diag([0.2**2] * 3 + [1.0] * 3)
-    look = collect_into(None, pulses, R, np.zeros(3), axis, x, P, SPAN_M, True)
-    assert look is not None
-    seen = evaluate(look, SPAN_M, 0.0, 0.8, True, 1.0)
+    scan_pass = collect_into(None, pulses, R, np.zeros(3), axis, x, P, SPAN_M, True)
+    assert scan_pass is not None
+    seen = evaluate(scan_pass, SPAN_M, 0.0, 0.8, True, 1.0)
     assert seen is not None
     assert seen.hits > 10
     assert math.dist(seen.x[:2], drone_m[:2]) < 0.03
@@ -59,6 +59,6 @@ def test_what_is_seen_through_a_gap_has_to_be_nearer_to_the_prediction(behind_m,
     for kind in (HIT, GLIMPSE):
         pulses = np.zeros((3, COLUMNS))
         pulses[:, A], pulses[:, DEPTH], pulses[:, KIND] = (-0.05, 0.0, 0.05), behind_m, kind
-        if drone_hits(pulses, SPAN_M, 0.1) is not None:
+        if drone_returns(pulses, SPAN_M, 0.1) is not None:
             found.add(kind)
     assert found == kinds

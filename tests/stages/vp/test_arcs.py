@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from streets import fisheye
+from synthetic_street import fisheye
 
 from stages.vp.arcs import fit_arcs
 from stages.vp.clustering import cluster
 from stages.vp.edges import Chains
-from stages.vp.eye import make_eye
+from stages.vp.pixel_rays import make_pixel_rays
 
 LENS = fisheye(480)
-EYE = make_eye(LENS, (480, 480), None, ())
+EYE = make_pixel_rays(LENS, (480, 480), None, ())
 
 
 def circle(normal, start_deg, stop_deg, count=None):

@@ -1,4 +1,4 @@
-"""Directions of made lines: the formulas, their symmetries, several frames, honest sigma."""
+"""Directions of synthetic lines: formulas, symmetries, several frames, consistent sigmas."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import pytest
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.kernels.vp.directions import GATE, NONE, all_directions, upright
 from stages.vp.directions import Lines, assign, refine, residual_sigma
-from stages.vp.search import Limits, Prior, find_structure
+from stages.vp.search import SearchLimits, VerticalPrior, find_structure
 from stages.vp.spectrum import peaks, yaw_spectrum
 from stages.vp.verticals import propose_verticals, refine_vertical
 
 SIGMA = np.radians(0.25)
-LIMITS = Limits(SIGMA, np.radians(0.05), 0.3, 3, 4, 7.0)
+LIMITS = SearchLimits(SIGMA, np.radians(0.05), 0.3, 3, 4, 7.0)
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -44,7 +44,7 @@ def off_deg(a, b):
     return np.degrees(np.arccos(np.clip(np.abs(a @ b), 0, 1)))
 
 
-def test_the_residual_s_sigma_is_turn_and_world_together():
+def test_the_residual_sigma_combines_line_and_model():
     lines = Lines(np.array([[0.0, 0, 1]]), np.array([[1.0, 0, 0]]), np.array([3e-3]), np.ones(1))
     assert residual_sigma(lines, np.array([1.0, 0, 0]), 4e-3)[0] == pytest.approx(5e-3)
     assert residual_sigma(lines, np.array([0.0, 1, 0]), 4e-3)[0] == pytest.approx(4e-3)
@@ -77,7 +77,7 @@ def test_the_score_is_in_standard_deviations_of_yaws_drawn_at_random():
     sigma = 0.05
     lines = Lines(np.array([[0.0, 1, 0]]), np.array([[0.0, 0, 1]]), np.array([0.0]), np.array([0.5]))
     spectrum = yaw_spectrum(lines, np.eye(3), np.ones(1, dtype=bool), sigma / 2, 900)  # it runs along x
-    share = math.sqrt(2 * math.pi) * sigma / (math.pi / 2)  # the kernel's mean over a quarter turn
+    share = math.sqrt(2 * math.pi) * sigma / (math.pi / 2)  # the kernel's mean over a 90 deg
     assert spectrum.lines.max() == pytest.approx(0.5, abs=1e-3)
     assert spectrum.lines.mean() == pytest.approx(0.5 * share, rel=0.01)
     deviation = 0.5 * math.sqrt(share / math.sqrt(2) - share**2)
@@ -99,7 +99,7 @@ def test_proposals_hold_the_vertical_with_and_without_upright_lines():
         assert off_deg(found, truth[:, 2]).min() < 1.0
 
 
-def test_refining_recovers_the_rotation_and_turns_with_the_world():
+def test_refining_recovers_the_rotation_and_is_equivariant():
     truth = rotation_from_rpy_deg((4.0, -3.0, 25.0))
     lines = lines_along(truth.T)
     start = truth @ rotation_from_rpy_deg((1.0, -1.0, 1.5))
@@ -142,12 +142,12 @@ def test_each_line_has_the_direction_that_it_is_fewest_sigmas_off():
     np.testing.assert_allclose(np.abs(r / sigma)[own], off.min(axis=1)[own])
 
 
-def test_stated_sigmas_hold_what_they_promise():
+def test_sigmas_are_consistent_with_the_errors():
     squares, places = [], []
     for seed in range(150):
         truth = rotation_from_rpy_deg((2.0, 1.0, 30.0 + seed))
         lines = lines_along(truth.T, each=6, seed=seed, loose=4)
-        found = find_structure(lines, Prior(truth[:, 2], np.radians(3), 0.0), LIMITS)
+        found = find_structure(lines, VerticalPrior(truth[:, 2], np.radians(3), 0.0), LIMITS)
         for d, sigma in zip(found.direction, found.sigma_rad, strict=True):
             off = np.radians(off_deg(truth.T, d).min())
             squares.append(off**2 / 2 / sigma**2)
@@ -157,35 +157,35 @@ def test_stated_sigmas_hold_what_they_promise():
     assert np.mean(places) > 0.9
 
 
-def test_two_horizontal_frames_are_told_apart_and_numbered_by_strength():
+def test_two_horizontal_frames_are_separated_and_numbered_by_strength():
     other = rotation_z(np.radians(30.0))
     rows = np.vstack([np.eye(3), np.eye(3)[:2], other[:, :2].T])
-    found = find_structure(lines_along(rows, each=12), Prior(UP, np.radians(3), 0.0), LIMITS)
+    found = find_structure(lines_along(rows, each=12), VerticalPrior(UP, np.radians(3), 0.0), LIMITS)
     assert list(found.frame) == [-1, 0, 0, 1, 1]
     for k, d in enumerate(found.direction[1:]):
         assert off_deg(other.T if k >= 2 else np.eye(3), d).min() < 0.5
     assert found.sigma_rad[3] > found.sigma_rad[1]
     one = find_structure(
-        lines_along(rows, each=12), Prior(UP, np.radians(3), 0.0), dataclasses.replace(LIMITS, max_frames=1)
+        lines_along(rows, each=12), VerticalPrior(UP, np.radians(3), 0.0), dataclasses.replace(LIMITS, max_frames=1)
     )
     assert list(one.frame) == [-1, 0, 0]
 
 
 @pytest.mark.parametrize(("apart_deg", "frames"), [(3.0, {-1, 0}), (7.0, {-1, 0, 1})])
-def test_pairs_are_told_apart_from_some_degrees_on(apart_deg, frames):
+def test_pairs_are_separated_from_some_degrees_on(apart_deg, frames):
     nearby = rotation_z(np.radians(apart_deg))
     rows = np.vstack([np.eye(3), np.eye(3)[:2], nearby[:, :2].T])
-    found = find_structure(lines_along(rows, each=12), Prior(UP, np.radians(3), 0.0), LIMITS)
+    found = find_structure(lines_along(rows, each=12), VerticalPrior(UP, np.radians(3), 0.0), LIMITS)
     assert set(found.frame) == frames
     for f, truth in ((0, np.eye(3)), (1, nearby)):
         assert (off_deg(truth.T, found.direction[found.frame == f].T).min(axis=0) < 0.5).all()
 
 
-def test_loose_lines_are_no_structure_and_the_reason_says_so():
-    found = find_structure(lines_along(np.empty((0, 3)), loose=80), Prior(UP, np.radians(3), 0.0), LIMITS)
+def test_random_lines_are_no_structure_and_have_a_reason():
+    found = find_structure(lines_along(np.empty((0, 3)), loose=80), VerticalPrior(UP, np.radians(3), 0.0), LIMITS)
     assert not (found.frame >= 0).any()
-    assert "stands out by" in found.reason
-    few = find_structure(lines_along(np.eye(3)[:1], each=2), Prior(UP, np.radians(3), 0.0), LIMITS)
+    assert "best score" in found.reason
+    few = find_structure(lines_along(np.eye(3)[:1], each=2), VerticalPrior(UP, np.radians(3), 0.0), LIMITS)
     assert len(few.direction) == 0
     assert "too few" in few.reason
     assert list(few.line_direction) == [-1, -1]

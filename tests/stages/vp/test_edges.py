@@ -1,4 +1,4 @@
-"""Edge chains: where they are to a fraction of a pixel, on which side is light, and what is no edge."""
+"""Edge chains: sub-pixel position, brighter side, and rejected edges."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_an_edge_is_found_to_a_tenth_of_a_pixel_at_any_angle():
         assert len(away) > 50
 
 
-def test_the_light_is_on_the_left_of_a_chain_as_seen_in_the_picture():
+def test_the_brighter_side_is_on_the_left_of_a_chain():
     for angle_deg in (0, 50, 100, 200, 290):
         points = chains_of(half_plane(angle_deg, 0.0)).points_px
         along = points[-1] - points[0]
@@ -51,7 +51,7 @@ def test_noise_has_no_chains_and_sets_its_own_threshold():
     assert len(chains_of(half_plane(20, 0.0, noise=4.0)).start) >= 2  # and a strong edge in it is still one
 
 
-def test_the_threshold_is_the_contrast_asked_for_where_the_picture_is_quiet():
+def test_the_threshold_is_the_contrast_setting_without_noise():
     grey = np.full((64, 64), 100, dtype=np.uint8)
     flat = np.zeros((64, 64), dtype=np.int16)
     limit = thresholds(grey, flat, flat, np.ones((64, 64), dtype=np.uint8), 8.0)
@@ -59,7 +59,7 @@ def test_the_threshold_is_the_contrast_asked_for_where_the_picture_is_quiet():
     np.testing.assert_allclose(np.sqrt(limit), 8.0 * SOBEL_GAIN, rtol=1e-6)
 
 
-def test_weak_edges_and_hidden_pixels_give_no_chain():
+def test_weak_edges_and_masked_pixels_give_no_chain():
     assert len(chains_of(half_plane(30, 0.0, dark=100, light=104)).start) == 1
     usable = np.ones((120, 120), dtype=np.uint8)
     usable[:, 40:80] = 0
@@ -68,7 +68,7 @@ def test_weak_edges_and_hidden_pixels_give_no_chain():
     assert not ((points[:, 0] > 39.5) & (points[:, 0] < 79.5)).any()
 
 
-def test_a_second_picture_does_not_remember_the_first():
+def test_a_second_image_is_independent_of_the_first():
     finder = EdgeFinder(np.ones((120, 120), dtype=np.uint8), 8.0, 6)
     first = finder.find(half_plane(30, 0.0)).points_px.copy()
     finder.find(half_plane(75, 5.0))

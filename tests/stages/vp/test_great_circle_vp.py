@@ -1,11 +1,11 @@
-"""The stage on made pictures: known streets through known lenses, turned cameras, parks, hidden bodies, gravity."""
+"""GreatCircleVp on synthetic images: known streets and lenses, rotated cameras, parks, masks, gravity."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from streets import LOOKS_DOWN, LOOKS_UP, fisheye, foliage, street
+from synthetic_street import LOOKS_DOWN, LOOKS_UP, fisheye, foliage, street
 
 from stages.geometry.frames import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
 from stages.geometry.lens import KannalaBrandt
@@ -35,7 +35,7 @@ def drone_vp(**settings):
 
 
 def off_deg(directions, truth):
-    """How far each direction is from the nearest of the true ones (rows)."""
+    """Angle of each direction to the nearest true one (rows)."""
     return np.degrees(np.arccos(np.clip(np.abs(directions @ np.asarray(truth).T), 0, 1))).min(axis=1)
 
 
@@ -70,7 +70,7 @@ def test_its_lines_lie_on_their_circles_and_run_in_their_directions(level):
 
 
 @pytest.mark.parametrize("rpy_deg", [(0.0, 0.0, 33.0), (2.0, -1.5, -70.0), (-1.0, 2.0, 170.0)])
-def test_turning_the_vehicle_turns_the_directions_back(rpy_deg):
+def test_rotating_the_vehicle_rotates_the_directions_back(rpy_deg):
     R_world_vehicle = rotation_from_rpy_deg(rpy_deg)
     found = vehicle_vp().on_image(image(street(R_world_vehicle @ LOOKS_UP, LENS)))
     assert list(found.frame) == [-1, 0, 0]
@@ -78,7 +78,7 @@ def test_turning_the_vehicle_turns_the_directions_back(rpy_deg):
     assert off_deg(found.direction[:1] @ R_world_vehicle.T, [[0, 0, 1]]) < 0.2
 
 
-def test_another_lens_and_mount_see_the_same_street():
+def test_another_lens_and_mount_give_the_same_directions():
     lens = KannalaBrandt(
         focal_px=(113.0, 115.0), centre_px=(242.0, 236.0), k=(0.02, -0.004, 0.0, 0.0), max_off_axis_deg=115
     )
@@ -122,7 +122,7 @@ def test_a_drone_without_attitude_finds_the_vertical_by_itself():
     assert off_deg(found.direction @ R_world_drone.T, np.eye(3)).max() < 0.3
 
 
-def test_an_attitude_is_turned_to_the_picture_s_time_and_forgotten_when_old():
+def test_an_attitude_is_extrapolated_to_the_image_and_ignored_when_old():
     R_world_drone = rotation_from_rpy_deg((14.0, 0.0, 20.0))
     grey = street(R_world_drone @ LOOKS_DOWN, LENS, up_m=6.0)
     before = R_world_drone @ rotation_from_rpy_deg((-6.0, 0.0, 0.0))  # 0.1 s ago, rolling at 60 deg/s
@@ -130,7 +130,9 @@ def test_an_attitude_is_turned_to_the_picture_s_time_and_forgotten_when_old():
     vp.on_attitude(attitude(before, 900_000_000, np.array([np.radians(60.0), 0, 0])))
     found = vp.on_image(image(grey, 1_000_000_000, "drone"))
     assert off_deg(found.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) < 0.3
-    late = vp.on_image(image(grey, 1_200_000_000, "drone"))  # no attitude: its z is taken for upright, 14 deg off
+    late = vp.on_image(
+        image(grey, 1_200_000_000, "drone")
+    )  # without attitude the mount's z is the vertical, 14 deg off
     assert not len(late.direction) or off_deg(late.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) > 1
 
 
@@ -143,7 +145,7 @@ def test_foliage_and_noise_are_no_structure(seed):
     assert len(vehicle_vp().on_image(image(noise)).direction) == 0
 
 
-def test_a_black_picture_has_no_lines_and_says_so():
+def test_a_black_image_has_no_lines_and_a_reason():
     found = vehicle_vp().on_image(image(np.zeros((480, 480), dtype=np.uint8)))
     assert found.direction.shape == (0, 3)
     assert found.line_end.shape == (0, 2, 3)
@@ -159,7 +161,7 @@ def test_masked_pixels_and_the_rim_give_no_lines(level):
     assert (found.line_end[:, :, 2] > np.cos(np.radians(81.0))).all()
 
 
-def test_the_same_picture_gives_the_same_bytes_whatever_came_before(level):
+def test_the_same_image_gives_the_same_bytes_after_any_other(level):
     vp = vehicle_vp()
     first = vp.on_image(image(level))
     vp.on_image(image(foliage()))
@@ -180,26 +182,26 @@ def test_the_same_picture_gives_the_same_bytes_whatever_came_before(level):
         {"spam": 1},
     ],
 )
-def test_impossible_settings_are_refused(settings):
+def test_impossible_settings_are_rejected(settings):
     with pytest.raises(ValidationError):
         vehicle_vp(**settings)
 
 
-def test_a_mask_that_hides_everything_is_refused_with_what_to_do(level):
+def test_a_mask_of_all_pixels_is_rejected_with_a_suggestion(level):
     everything = ((0.0, 0.0), (479.0, 0.0), (479.0, 479.0), (0.0, 479.0))
     with pytest.raises(ValueError, match="draw smaller polygons"):
         vehicle_vp(masked_px=(everything,)).on_image(image(level))
 
 
-def test_another_carrier_s_picture_or_attitude_is_refused(level):
-    with pytest.raises(ValueError, match="image comes from camera_drone"):
+def test_an_image_or_attitude_of_another_mount_is_rejected(level):
+    with pytest.raises(ValueError, match="the image is of camera_drone"):
         vehicle_vp().on_image(image(level, camera_mount="drone"))
-    with pytest.raises(ValueError, match="attitude is the drone's"):
+    with pytest.raises(ValueError, match="attitude belongs to the drone"):
         vehicle_vp().on_attitude(attitude(np.eye(3)))
 
 
 @pytest.mark.parametrize("rate_dps", [(0.0, 0.0, 60.0), (40.0, -30.0, 20.0)])
-def test_a_rolling_shutter_is_taken_out_by_the_drones_turning(rate_dps):
+def test_a_rolling_shutter_is_corrected_with_the_drones_rate(rate_dps):
     rate = np.radians(rate_dps)
     rolled = street(LOOKS_DOWN, LENS, up_m=8.0, row_turn=0.03 / 479 * (rate @ LOOKS_DOWN))
     of = []
@@ -212,7 +214,7 @@ def test_a_rolling_shutter_is_taken_out_by_the_drones_turning(rate_dps):
     assert of[1] > 2 * of[0]
 
 
-def test_a_rolling_shutter_is_taken_out_by_the_vehicles_turning():
+def test_a_rolling_shutter_is_corrected_with_the_vehicles_rate():
     rate = np.radians([0.0, 0.0, 40.0])
     rolled = street(LOOKS_UP, LENS, row_turn=0.03 / 479 * (rate @ LOOKS_UP))
     vp = vehicle_vp()
@@ -227,10 +229,10 @@ def test_a_rolling_shutter_is_taken_out_by_the_vehicles_turning():
                     stamp_ns=ms * 1_000_000, R_map_vehicle=R, xyz_map_m=np.zeros(3), covariance=np.eye(6) * 1e-6
                 )
             )
-    assert of[1] < 0.2  # as of a picture without any turning
+    assert of[1] < 0.2  # as of an image without rotation
     assert of[0] > 0.3
 
 
-def test_motion_of_the_vehicle_is_refused_where_the_drone_carries_the_camera():
-    with pytest.raises(ValueError, match="motion is the vehicle's"):
+def test_vehicle_motion_is_rejected_for_a_camera_of_the_drone():
+    with pytest.raises(ValueError, match="motion belongs to the vehicle"):
         drone_vp().on_motion(VehicleMotion(stamp_ns=1, R_map_vehicle=np.eye(3), xyz_map_m=STILL, covariance=np.eye(6)))

@@ -1,4 +1,4 @@
-"""Rectified views: where they look, pinhole geometry through the lens, lines and the rim."""
+"""Rectified views: orientation, pinhole geometry through the lens, lines and the rim."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.vp.paper_views import RectifiedView, ViewDirection, great_circles, segment_length_px
-from tests.stages.vp.paper_rooms import LENS, SIZE_PX
+from tests.stages.vp.synthetic_courtyard import LENS, SIZE_PX
 
 
 def view(azimuth_deg=0.0, off_axis_deg=60.0, size_px=200, fov_deg=90.0, R=None):
@@ -23,7 +23,7 @@ def black():
 
 @pytest.mark.parametrize("azimuth_deg", [0, 35, 90, -120])
 @pytest.mark.parametrize("off_axis_deg", [0, 60])
-def test_a_view_is_a_right_handed_frame_that_looks_where_it_is_told(azimuth_deg, off_axis_deg):
+def test_a_view_is_a_right_handed_frame_along_its_direction(azimuth_deg, off_axis_deg):
     R = ViewDirection(azimuth_deg=azimuth_deg, off_axis_deg=off_axis_deg).rotation()
     a, o = math.radians(azimuth_deg), math.radians(off_axis_deg)
     np.testing.assert_allclose(R[:, 2], [math.sin(o) * math.cos(a), math.sin(o) * math.sin(a), math.cos(o)], atol=1e-12)
@@ -41,7 +41,7 @@ def test_a_pixels_ray_is_the_pinholes():
     np.testing.assert_allclose(ends[0, 1], (R[:, 0] + R[:, 2]) / math.sqrt(2), atol=1e-12)
 
 
-def test_rays_are_told_in_the_carriers_axes():
+def test_rays_are_in_mount_axes():
     R = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     segment = np.array([[20.0, 50, 120, 70]])
     np.testing.assert_allclose(view(R=R).ends(segment), view().ends(segment) @ R.T, atol=1e-12)
@@ -53,30 +53,30 @@ def test_a_spot_in_the_fisheye_appears_where_its_ray_meets_the_view():
     pixel = LENS.project(v.ends(target)[0, :1])[0]
     fisheye = black()
     cv2.circle(fisheye, (round(pixel[0]), round(pixel[1])), 3, 255, -1)
-    seen = v.picture(fisheye).astype(np.float64)
+    seen = v.rectify(fisheye).astype(np.float64)
     rows, columns = np.mgrid[0:200, 0:200]
     at = np.array([(columns * seen).sum(), (rows * seen).sum()]) / seen.sum()
     np.testing.assert_allclose(at, target[0, :2], atol=1.5)
 
 
-def test_a_straight_edge_in_the_world_is_one_segment():
+def test_a_straight_edge_in_space_is_one_segment():
     """The edge of the half space x > 0.3 z is a great circle, bent in the fisheye, straight in the view."""
     column, row = np.meshgrid(np.arange(SIZE_PX, dtype=np.float64), np.arange(SIZE_PX, dtype=np.float64))
     rays = LENS.unproject(np.stack([column.ravel(), row.ravel()], axis=1))
     fisheye = np.where(rays @ [1.0, 0.0, -1.2] > 0, 200, 50).reshape(SIZE_PX, SIZE_PX).astype(np.uint8)
     v = view(azimuth_deg=0, off_axis_deg=45)
-    found = v.segments(v.picture(fisheye), 100.0, 10)
+    found = v.segments(v.rectify(fisheye), 100.0, 10)
     assert len(found) == 1
     normal = great_circles(v.ends(found))[0]
     assert abs(normal @ np.array([1.0, 0.0, -1.2]) / math.hypot(1, 1.2)) > math.cos(math.radians(0.3))
 
 
-def test_the_lenss_own_edge_is_no_line():
+def test_the_edge_of_the_image_circle_is_no_line():
     fisheye = black()
     cv2.circle(fisheye, (240, 240), round(LENS.circle_px), 220, -1)
     v = view(off_axis_deg=90)
-    assert 0.5 < v.seen < 0.9
-    assert len(v.segments(v.picture(fisheye), 5.0, 100)) == 0
+    assert 0.5 < v.visible_share < 0.9
+    assert len(v.segments(v.rectify(fisheye), 5.0, 100)) == 0
 
 
 def test_segments_are_the_longest_and_longest_first():
@@ -91,7 +91,7 @@ def test_segments_are_the_longest_and_longest_first():
     assert v.segments(np.full((200, 200), 9, dtype=np.uint8), 5.0, 9).shape == (0, 4)
 
 
-def test_a_great_circles_normal_stands_on_both_rays_and_a_longer_line_knows_it_better():
+def test_a_great_circles_normal_is_orthogonal_to_both_rays_and_better_for_longer_lines():
     ends = np.array([[[1.0, 0, 0], [0, 1.0, 0]], [[0, 0, 1.0], [0.6, 0, 0.8]]])
     np.testing.assert_allclose(great_circles(ends), [[0, 0, 1], [0, 1, 0]], atol=1e-12)
     sigma = view().normal_sigma_rad(np.array([[0.0, 0, 100, 0], [0.0, 0, 0, 50]]))

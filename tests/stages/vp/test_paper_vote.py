@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.kernels.vp.paper_vote import cell_of, fullest, vote
-from stages.vp.paper_vote import completed, most_orthogonal
+from stages.vp.paper_vote import complete, most_orthogonal
 
 RNG = np.random.default_rng(4)
 NONE, APART = np.empty((0, 3)), math.radians(20.0)
@@ -112,5 +112,5 @@ def test_the_sign_of_a_direction_does_not_matter_for_its_angle():
 
 
 def test_the_third_is_the_cross_product_of_length_one():
-    three = completed(unit(1, 0, 0), unit(1, 1, 0))
+    three = complete(unit(1, 0, 0), unit(1, 1, 0))
     np.testing.assert_allclose(three, [[1, 0, 0], [math.sqrt(0.5), math.sqrt(0.5), 0], [0, 0, 1]], atol=1e-12)

@@ -1,4 +1,4 @@
-"""PaperVp: a chequered room's axes from three views, whatever way camera and room are turned; absence; bad settings."""
+"""PaperVp: axes of a chequered courtyard from three views at any rotation; no result; bad settings."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from flow.stage import input_ports, output_ports
 from stages.geometry.frames import Pose, rotation_from_rpy_deg
 from stages.messages import CameraMount, Image
 from stages.vp import PaperVp
-from stages.vp.paper_vp import lines_of
-from tests.stages.vp.paper_rooms import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, courtyard, plain
+from stages.vp.paper_vp import assign_lines
+from tests.stages.vp.synthetic_courtyard import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, courtyard, plain
 
 
 def vp(mount=LOOKS_UP, camera_mount="vehicle", **settings):
@@ -32,7 +32,7 @@ def directions(R_room_carrier, mount=LOOKS_UP, camera_mount="vehicle", **setting
 
 
 def off_axes_deg(message, R_room_carrier):
-    """How far each direction is from the nearest axis of the room."""
+    """Angle of each direction to the nearest axis of the courtyard."""
     in_room = message.direction @ R_room_carrier.T
     return np.degrees(np.arccos(np.clip(np.abs(in_room).max(axis=1), 0, 1)))
 
@@ -51,7 +51,7 @@ def test_ports_are_what_the_graph_wires():
         ((10, 0, 75), LOOKS_DOWN, "drone"),
     ],
 )
-def test_the_rooms_axes_are_found_in_the_carriers_axes(rpy_deg, mount, camera_mount):
+def test_the_axes_of_the_courtyard_are_found_in_mount_axes(rpy_deg, mount, camera_mount):
     R = rotation_from_rpy_deg(rpy_deg)
     message = directions(R, mount, camera_mount)
     assert message.stamp_ns == 77
@@ -62,14 +62,14 @@ def test_the_rooms_axes_are_found_in_the_carriers_axes(rpy_deg, mount, camera_mo
     assert len(set(np.argmax(np.abs(message.direction @ R.T), axis=1))) == 3, "three different axes"
 
 
-def test_the_vertical_comes_first_and_is_said_to_be():
+def test_the_vertical_comes_first_and_is_marked():
     message = directions(rotation_from_rpy_deg((3, 2, 40)))
     assert message.is_vertical.tolist() == [True, False, False]
     assert message.frame.tolist() == [-1, 0, 0]
     assert abs(message.direction[0, 2]) > np.cos(np.radians(6))
 
 
-def test_turning_the_camera_on_its_carrier_changes_nothing():
+def test_rotating_the_camera_on_its_mount_changes_nothing():
     R = rotation_from_rpy_deg((0, 0, 25))
     turned = Pose(rpy_deg=(8.0, -5.0, 200.0))
     assert off_axes_deg(directions(R, turned), R).max() < 1.0
@@ -89,14 +89,14 @@ def test_lines_lie_on_great_circles_through_their_ends_and_belong_to_a_direction
     assert np.abs(of_first @ message.direction[1]).max() <= np.sin(np.radians(2.0))
 
 
-def test_the_third_direction_stands_on_the_two_that_were_found():
+def test_the_third_direction_is_orthogonal_to_the_other_two():
     d = directions(rotation_from_rpy_deg((5, -4, 33))).direction
     cosines = np.sort(np.abs([d[0] @ d[1], d[0] @ d[2], d[1] @ d[2]]))
     np.testing.assert_allclose(cosines[:2], 0.0, atol=1e-12)
     assert cosines[2] < np.sin(np.radians(2.0)), "found, not made orthogonal"
 
 
-def test_the_same_picture_gives_the_same_bits():
+def test_the_same_image_gives_the_same_bits():
     digests = []
     for _ in range(2):
         digest = hashlib.sha256()
@@ -105,7 +105,7 @@ def test_the_same_picture_gives_the_same_bits():
     assert digests[0] == digests[1]
 
 
-def test_an_empty_picture_has_no_directions_and_says_why():
+def test_an_empty_image_has_no_directions_and_a_reason():
     message = vp().on_image(plain())
     check_arrays(message)
     assert message.direction.shape == (0, 3)
@@ -114,31 +114,31 @@ def test_an_empty_picture_has_no_directions_and_says_why():
     assert message.reason == "0 of 3 views have a vanishing point"
 
 
-def test_one_direction_seen_by_all_views_is_no_answer():
-    picture = plain().grey.copy()
-    rays = LENS.unproject(np.argwhere(picture > 0)[:, ::-1].astype(np.float64))
+def test_one_direction_in_all_views_gives_no_result():
+    grey = plain().grey.copy()
+    rays = LENS.unproject(np.argwhere(grey > 0)[:, ::-1].astype(np.float64))
     spokes = (np.degrees(np.arctan2(rays[:, 1], rays[:, 0])) // 6) % 2 > 0  # all run to the zenith
-    picture[:] = np.where(spokes, 60, 190).reshape(picture.shape)
-    message = vp().on_image(Image(stamp_ns=1, frame_id="camera_vehicle", grey=picture))
+    grey[:] = np.where(spokes, 60, 190).reshape(grey.shape)
+    message = vp().on_image(Image(stamp_ns=1, frame_id="camera_vehicle", grey=grey))
     assert len(message.direction) == 0
     assert message.reason == "1 of 3 views have a vanishing point"
-    by_themselves = vp(apart_deg=0).on_image(Image(stamp_ns=1, frame_id="camera_vehicle", grey=picture))
-    assert by_themselves.reason == "no two vanishing points are at a right angle: 0 deg at most"
+    independent = vp(apart_deg=0).on_image(Image(stamp_ns=1, frame_id="camera_vehicle", grey=grey))
+    assert independent.reason == "no two vanishing points are at a right angle: 0 deg at most"
     assert len(message.line_normal) > 20
     assert (message.line_direction == -1).all()
 
 
-def test_a_picture_of_another_size_is_refused_with_what_to_do():
-    with pytest.raises(ValueError, match="a picture of 200 x 200 px, but size_px is 480: give the lens"):
+def test_an_image_of_another_size_is_rejected_with_the_setting():
+    with pytest.raises(ValueError, match="the image is 200 x 200 px, but size_px is 480: set the lens"):
         vp().on_image(plain(size_px=200))
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("settings", "text"),
     [
         (
             {"views": [{"azimuth_deg": 0, "off_axis_deg": 130}, {"azimuth_deg": 90, "off_axis_deg": 60}]},
-            "views.0: the lens sees",
+            "views.0: only ",
         ),
         ({"views": [{"azimuth_deg": 0, "off_axis_deg": 60}]}, "at least 2"),
         ({"fov_deg": 180.0}, "less than or equal to 120"),
@@ -147,13 +147,13 @@ def test_a_picture_of_another_size_is_refused_with_what_to_do():
         ({"polish": True}, "Extra inputs"),
     ],
 )
-def test_settings_that_cannot_work_are_refused(settings, words):
-    with pytest.raises(ValidationError, match=words):
+def test_impossible_settings_are_rejected(settings, text):
+    with pytest.raises(ValidationError, match=text):
         vp(**settings)
 
 
 def test_a_line_belongs_to_the_direction_its_circle_passes_nearest():
     normal = np.array([[0, 0, 1.0], [0, np.sin(0.01), np.cos(0.01)], [0.6, 0.8, 0]])
     towards = np.array([[1.0, 0, 0], [0, 1.0, 0]])
-    assert lines_of(normal, towards, 0.02).tolist() == [0, 0, -1]
-    assert lines_of(normal, np.empty((0, 3)), 0.02).tolist() == [-1, -1, -1]
+    assert assign_lines(normal, towards, 0.02).tolist() == [0, 0, -1]
+    assert assign_lines(normal, np.empty((0, 3)), 0.02).tolist() == [-1, -1, -1]

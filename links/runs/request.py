@@ -1,0 +1,60 @@
+"""What a run is made of (`RunRequest`) and what it leaves (`RunResult`).
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from flow.config.tree import Section
+from flow.config_error import Location
+from flow.graph import Graph, load_graph
+from flow.link import LinkError
+from flow.replay import RunReport
+from links.runs.results import Results
+from links.runs.truth import FixErrors
+from links.runs.usage import Usage
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """A configuration: a file, overlay files, and changed settings (`NAME.SETTING=VALUE`)."""
+
+    config: Path
+    overlays: tuple[Path, ...] = ()
+    sets: tuple[str, ...] = ()
+
+    def graph(self, rig_yaml: str | None, where: str) -> Graph:
+        """The graph on the rig `rig_yaml`, read from `where`, or (None) on the rig of the configuration.
+
+        Raises ConfigError for the configuration, LinkError for the rig.
+        """
+        sections: dict[str, Section] | None = None
+        if rig_yaml is not None:
+            location = Location(where, 0)
+            try:
+                sections = {"rig": (yaml.safe_load(rig_yaml), location)}
+            except yaml.YAMLError as error:
+                raise LinkError(f"{location} is not YAML: {str(error).splitlines()[0]}") from None
+        return load_graph(self.config, self.overlays, self.sets, sections)
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """A run that has ended."""
+
+    recording: Path
+    out_dir: Path
+    report: RunReport
+    results: Results
+    errors: FixErrors | None  # None: the truth is not known
+    output_hash: str
+    wall_s: float
+    warnings: list[str]
+    usage: Usage | None = None  # of a live run
+    parts: int | None = None  # of the recording that a replay read
+    stage_outputs: str = ""  # stages and message counts, when no stage of the configuration searches for a drone

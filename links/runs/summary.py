@@ -1,0 +1,108 @@
+"""`summary.json` of a run: its configuration, counts, states, computing times and errors against the truth.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import resource
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+from flow.live.report import LiveReport
+from links.runs.request import RunRequest, RunResult
+from links.runs.results import stamp_s
+from links.runs.truth import FixErrors
+from links.runs.usage import Usage
+
+
+def summary(run: RunResult, request: RunRequest) -> dict[str, Any]:
+    """The values of `summary.json`, in the order of the file."""
+    report, results = run.report, run.results
+    values: dict[str, Any] = {
+        "grd": version("grd"),
+        "recording": run.recording.name,
+        **({"parts": run.parts} if run.parts is not None and run.parts > 1 else {}),
+        "config": request.config.name,
+        "overlays": [path.name for path in request.overlays],
+        "set": list(request.sets),
+        "output_hash": run.output_hash,
+        "records": report.records,
+        "start_s": stamp_s(report.first_ns),
+        "end_s": stamp_s(report.last_ns),
+        "recorded_s": (report.last_ns - report.first_ns) / 1e9,
+        "messages": report.messages,
+        "sweeps": results.sweeps,
+        "sweeps_with_drone": results.sweeps_with_drone,
+        "search_results": [{"sweeps": count, "example": example} for example, count in results.search_results],
+        "fixes": len(results.fixes),
+        "poses": {"states": results.pose_states, "resets": results.resets},
+        "states": [
+            {"stamp_s": stamp_s(t.stamp_ns), "track_id": t.track_id, "state": t.state, "reason": t.reason}
+            for t in results.transitions
+        ],
+        "warnings": run.warnings,
+        "counters": report.counters,
+        "wall_s": round(run.wall_s, 3),
+        "compute_ms": {
+            name: {
+                "calls": node.calls,
+                "p50": round(node.compute.percentile_ns(50) / 1e6, 4),
+                "p99": round(node.compute.percentile_ns(99) / 1e6, 4),
+                "max": round(node.compute.max_ns / 1e6, 4),
+                "total": round(node.compute.total_ns / 1e6, 1),
+            }
+            for name, node in report.nodes.items()
+        },
+    }
+    if isinstance(report, LiveReport):
+        values["live"] = _live_values(report, run.usage) | ({} if run.usage is None else {"usage": run.usage.columns})
+    if run.errors is not None:
+        values["truth_errors"] = _truth_errors(run.errors)
+    return values
+
+
+def _live_values(report: LiveReport, usage: Usage | None) -> dict[str, Any]:
+    """Values of a live run only: resources, lag and drops of each edge, states of the links, failures."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    subprocesses_s = 0.0 if usage is None else usage.subprocesses_cpu_s
+    edges = {name: {key: _rounded(value) for key, value in asdict(edge).items()} for name, edge in report.edges.items()}
+    return {
+        "cpu_s": round(used.ru_utime + used.ru_stime + subprocesses_s, 2),
+        "max_rss_mb": round(used.ru_maxrss / 1024, 1),  # of this process only; kB on Linux
+        "dropped": report.dropped,
+        "missed_deadlines": report.missed,
+        "edges": edges,
+        "links": {name: asdict(link) for name, link in report.links.items()},
+        "restarts": report.restarts,
+        "failures": report.failures,
+        "switched_off": report.switched_off,
+        "tap_drops": report.tap_drops,
+        "events": [
+            {
+                "first_s": stamp_s(event.first_ns),
+                "last_s": stamp_s(event.last_ns),
+                "count": event.count,
+                "text": f"{event.node}: {event.text}",
+            }
+            for event in report.events
+        ],
+    }
+
+
+def _rounded(value: Any) -> Any:
+    return round(value, 3) if isinstance(value, float) else value
+
+
+def _truth_errors(errors: FixErrors) -> dict[str, Any]:
+    if not len(errors.stamps_ns):
+        return {"fixes": 0, "fixes_without_truth": errors.without_truth}
+    return {
+        "fixes": len(errors.stamps_ns),
+        "fixes_without_truth": errors.without_truth,
+        "rmse_xyz_m": [round(float(v), 4) for v in errors.rmse_xyz_m],
+        "rmse_3d_m": round(errors.rmse_m, 4),
+        "mean_nees_of_3": round(float(errors.nees.mean()), 3),
+        "inside_95_percent_ellipsoid": round(errors.inside_95, 4),
+    }

@@ -1,0 +1,1 @@
+"""The simulated autopilot: its MAVLink messages, its radio link, and its use of external poses."""

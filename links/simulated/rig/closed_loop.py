@@ -1,0 +1,138 @@
+"""Closed loop: goals of the pipeline drive the simulated servo, in virtual time.
+
+Each record of the simulation is fed to the graph at its arrival. A goal that follows from it leaves the host
+`compute_s` later, whatever the simulating computer needs, and the servo executes it after its command latency. The
+simulation never runs further ahead of the graph than `compute_s`, so no goal is late. Therefore the same scenario, seed
+and configuration give the same bytes, however pulses are batched.
+
+A replay of the recording with the same configuration takes the same steps and has the same output hash.
+
+Source: ours; conservative look-ahead as in parallel discrete event simulation (Chandy and Misra, 1979).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field
+
+from flow.graph import Graph
+from flow.link import LinkError, Record, Tap
+from flow.message import Message
+from flow.replay import Replay, RunReport
+from flow.taps import Digest
+from links.dynamixel import Servo
+from links.dynamixel.servo import NOT_LIVE, GoalCommand
+from links.runs.request import RunRequest
+from links.simulated.sensors.servo import STEP_NS
+from stages.messages import ServoGoal
+
+LONGEST_BATCH_NS = 40_000_000  # longer batches are not faster
+
+
+class ClosedLoopSettings(BaseModel):
+    """Compute time of the host on the vehicle."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    compute_s: float = Field(default=0.02, ge=0.003, le=1)  # from arrival of a record to the goal leaving the host
+
+
+class GoalTap(Tap):
+    """Passes each goal that is wired to the servo on to it, as a live run does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._output: str | None = None
+        self._servo: Servo | None = None
+
+    def watch(self, output: str, servo: Servo) -> None:
+        """Set the output that commands the servo, and the servo."""
+        self._output, self._servo = output, servo
+
+    def see(self, output: str, message: Message, arrival_ns: int) -> None:
+        """Pass on a goal."""
+        if self._servo is not None and output == self._output and isinstance(message, ServoGoal):
+            self._servo.on_goal(message)
+
+
+class ClosedLoop:
+    """A graph that is fed with the records of the simulation and commands its servo."""
+
+    def __init__(
+        self, graph: Graph, settings: ClosedLoopSettings, loop_metadata: dict[str, str], taps: Sequence[Tap] = ()
+    ) -> None:
+        """`loop_metadata` is for the recording, names the configuration; `taps` are open and see all messages."""
+        self.loop_metadata = loop_metadata
+        self._digest, goals = Digest(), GoalTap()
+        self._replay = Replay(graph, (self._digest, goals, *taps))
+        name, output = servo_edge(graph)
+        servo = self._replay.nodes[name]
+        assert isinstance(servo, Servo)
+        self._servo, self._servo_name = servo, name
+        goals.watch(output, servo)
+        self._compute_ns = round(settings.compute_s * 1e9)
+
+    def take(self, record: Record) -> tuple[int, GoalCommand] | None:
+        """Process a record that has arrived; returns the time at which a command leaves the host, and the command."""
+        self._replay.feed(record)
+        command = self._servo.take_command()
+        return None if command is None else (record.arrival_ns + self._compute_ns, command)
+
+    def longest_batch_ns(self) -> int:
+        """How far the simulation may run ahead of the newest record fed to the graph."""
+        return min(LONGEST_BATCH_NS, self._compute_ns - STEP_NS)
+
+    def finish(self) -> RunReport:
+        """Let the stages emit what they hold."""
+        report = self._replay.finish()
+        report.counters[self._servo_name].pop(NOT_LIVE, None)  # these commands went to the simulated servo
+        return report
+
+    @property
+    def report(self) -> RunReport:
+        """Report of the graph up to now."""
+        return self._replay.report
+
+    @property
+    def output_hash(self) -> str:
+        """Hash over all messages up to now, as `grd replay` writes it."""
+        return self._digest.hexdigest()
+
+
+def servo_edge(graph: Graph) -> tuple[str, str]:
+    """Name of the servo link that the graph commands, and the output wired to it. LinkError unless there is one."""
+    found = [
+        (edge.consumer, f"{edge.producer}.{edge.output}")
+        for edge in graph.edges
+        if issubclass(graph.nodes[edge.consumer].cls, Servo) and edge.port == "goal"
+    ]
+    if len(found) != 1:
+        raise LinkError(
+            f"closed loop needs exactly one servo that the graph commands, this graph has {len(found)}: wire it as "
+            "'servo: {use: links.dynamixel.Servo, inputs: {goal: aim.servo_goal}}', as in configs/sim.yaml"
+        )
+    return found[0]
+
+
+def loop_metadata(config: Path, graph: Graph) -> dict[str, str]:
+    """Metadata of a recording made in closed loop: name of the configuration and hash of its content.
+
+    The hash includes included files and the rig, but not the taps, which change no message.
+    """
+    taps = {name for name, spec in graph.nodes.items() if issubclass(spec.cls, Tap)}
+    links = {name: link for name, link in graph.values.get("links", {}).items() if name not in taps}
+    content = yaml.safe_dump(graph.values | {"links": links}, sort_keys=False)
+    return {
+        "closed_loop": config.name,
+        "closed_loop_hash": hashlib.blake2b(content.encode(), digest_size=16).hexdigest(),
+    }
+
+
+def load_loop(config: Path, rig_yaml: str, scenario: str, settings: ClosedLoopSettings) -> ClosedLoop:
+    """A configuration as a closed loop on the rig of a scenario. ConfigError has all problems of the configuration."""
+    graph = RunRequest(config).graph(rig_yaml, scenario)
+    return ClosedLoop(graph, settings, loop_metadata(config, graph))

@@ -1,0 +1,1 @@
+"""Simulated sensors and servo: they produce the bytes of the real devices."""

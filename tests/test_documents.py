@@ -1,0 +1,60 @@
+"""The documents: links lead somewhere, commands exist, the README stays short."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from links.cli.app import app
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = sorted(
+    file
+    for pattern in ("*.md", "docs/**/*.md", "deploy/*.md", "recordings/*.md", "links/**/*.md")
+    for file in ROOT.glob(pattern)
+)
+GENERATED = {"settings.md", "commands.md", "operate.md", "hosts.md", "contribute.md", "recordings.md", "changelog.md"}
+COMMANDS = {command.name for command in app.registered_commands}
+
+
+def name_of(file):
+    return file.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("file", DOCUMENTS, ids=name_of)
+def test_every_relative_link_leads_to_a_file(file):
+    for target in re.findall(r"\]\(([^)\s#]+)[^)]*\)", file.read_text(encoding="utf-8")):
+        if "://" not in target and Path(target).name not in GENERATED:
+            assert (file.parent / target).exists(), f"{name_of(file)} links to {target}"
+
+
+@pytest.mark.parametrize("file", DOCUMENTS, ids=name_of)
+def test_every_command_in_a_document_exists(file):
+    for command in re.findall(r"(?:^    |`|bin/)grd ([a-z]+)\b", file.read_text(encoding="utf-8"), re.M):
+        assert command in COMMANDS, f"{name_of(file)} names `grd {command}`"
+
+
+@pytest.mark.parametrize("file", DOCUMENTS, ids=name_of)
+def test_every_configuration_in_a_document_exists(file):
+    made = {
+        "configs/mine.yaml",
+        "configs/rigs/mine.yaml",
+        "configs/rigs/vehicle_lens.yaml",
+        "configs/rigs/drone_lens.yaml",
+    }
+    for path in re.findall(r"\bconfigs/[\w/]+\.yaml\b", file.read_text(encoding="utf-8")):
+        assert path in made or (ROOT / path).is_file(), f"{name_of(file)} names {path}"
+
+
+def test_the_readme_fits_a_page_and_its_lines_a_screen():
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 170
+    assert [line for line in lines if len(line) > 120] == []
+
+
+def test_the_changelog_has_the_released_version():
+    version = re.search(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.M)
+    assert version is not None
+    assert f"## [{version.group(1)}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

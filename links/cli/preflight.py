@@ -1,7 +1,4 @@
-"""`grd preflight`: everything that a configuration declares, checked before the flight; go or no go in words.
-
-Source: DESIGN, Command line; the checks are in `links/preflight`.
-"""
+"""`grd preflight`: check everything that a configuration declares before the flight; prints GO or NO-GO."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ from links.runs.live_run import live_graph
 from links.runs.request import RunRequest
 
 COLOURS = {Level.OK: "green", Level.WARNING: "yellow", Level.FAIL: "red"}
-WORDS = {Level.OK: "ok", Level.WARNING: "look", Level.FAIL: "NO GO"}
+LABELS = {Level.OK: "ok", Level.WARNING: "warn", Level.FAIL: "NO GO"}
 
 
 @report_errors
@@ -37,10 +34,10 @@ def preflight(
         Path | None, typer.Option("--recording", help="Check a recording instead of what is connected.")
     ] = None,
     for_s: Annotated[
-        float, typer.Option("--for", min=0.5, max=600, metavar="SECONDS", help="Live: listen so long.")
+        float, typer.Option("--for", min=0.5, max=600, metavar="SECONDS", help="Live: observation time.")
     ] = 5.0,
     out_dir: Annotated[
-        Path, typer.Option("--out", help="Live: the folder that `grd run` will be given; its disk is looked at.")
+        Path, typer.Option("--out", help="Live: the output folder of `grd run`; its disk is checked.")
     ] = OUT_DIR,
     motion: Annotated[
         bool,
@@ -52,51 +49,53 @@ def preflight(
         float, typer.Option("--step", min=0.5, max=120, metavar="SECONDS", help="Time for each motion by hand.")
     ] = 6.0,
 ) -> None:
-    """Check LiDAR, servo, cameras, autopilot, clocks, parameters, axes and disk; say GO or NO-GO.
+    """Check LiDAR, servo, cameras, autopilot, clocks, parameters, axes and disk; print GO or NO-GO.
 
-    Live, the turntable holds still at first; for the motions by hand it turns. Poses are not sent to the autopilot.
-    Warnings ("look") are for you to judge. Exit code 0: go, 1: no go, 2: wrong use.
+    Live, the turntable is still at first; for the motions by hand it turns. Poses are not sent to the autopilot.
+    Warnings ("warn") are for you to assess. Exit code 0: go, 1: no go, 2: wrong use.
 
     Example: grd preflight configs/field.yaml --set lidar.bind=192.168.1.100 --set lidar.sender=192.168.1.201
     """
-    asked = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
+    request = RunRequest(config, tuple(overlay or ()), tuple(sets or ()))
     if recording is None:
-        results = _told(preflight_live(live_graph(asked), for_s, _wait, _ask if motion else None, step_s, out_dir))
+        results = _print_results(
+            preflight_live(live_graph(request), for_s, _wait, _ask if motion else None, step_s, out_dir)
+        )
     else:
-        results = _on_recording(asked, recording, motion)
+        results = _on_recording(request, recording, motion)
     failed = [v for v in results if v.level is Level.FAIL]
-    looks = sum(v.level is Level.WARNING for v in results)
-    more = f"; {looks} to look at" if looks else ""
+    warnings = sum(v.level is Level.WARNING for v in results)
+    more = f"; {warnings} warnings" if warnings else ""
     if is_go(results):
-        out.print(Text(f"GO: {len(results)} checks, none forbids the flight{more}", style="bold green"))
+        out.print(Text(f"GO: {len(results)} checks, no failure{more}", style="bold green"))
         return
     names = ", ".join(v.name for v in failed)
     out.print(Text(f"NO-GO: {len(failed)} of {len(results)} checks failed ({names}){more}", style="bold red"))
     raise typer.Exit(EXIT_FAILED)
 
 
-def _on_recording(asked: RunRequest, recording: Path, motion: bool) -> list[CheckResult]:
+def _on_recording(request: RunRequest, recording: Path, motion: bool) -> list[CheckResult]:
     session = Session(recording)
-    graph = asked.graph(session.rig_yaml, f"{recording} (rig.yaml)")
-    with progress_bar(f"look through {recording.name}") as step:
+    graph = request.graph(session.rig_yaml, f"{recording} (rig.yaml)")
+    with progress_bar(f"replay {recording.name}") as step:
         results = list(preflight_recording(graph, session, motion, step))
     for text in session.warnings:
         warn(text)
     if len(session.parts) > 1:
-        out.print(f"{len(session.parts)} parts of the recording, looked through together")
-    return _told(iter(results))
+        out.print(f"{len(session.parts)} parts of the recording, checked together")
+    return _print_results(iter(results))
 
 
-def _told(results: Iterator[CheckResult]) -> list[CheckResult]:
-    """Each result in a line, as it is known."""
-    told: list[CheckResult] = []
+def _print_results(results: Iterator[CheckResult]) -> list[CheckResult]:
+    """Print each result when it is known; returns all."""
+    printed: list[CheckResult] = []
     for result in results:
-        line = Text(f"{WORDS[result.level]:<6}", style=COLOURS[result.level]).append(f"{result.name}: ", style="bold")
+        line = Text(f"{LABELS[result.level]:<6}", style=COLOURS[result.level]).append(f"{result.name}: ", style="bold")
         out.print(line.append(result.sentence, style="default"))
-        told.append(result)
-    if not told:
+        printed.append(result)
+    if not printed:
         raise LinkError("this configuration has nothing to check")
-    return told
+    return printed
 
 
 def _wait(seconds: float) -> None:
@@ -104,7 +103,7 @@ def _wait(seconds: float) -> None:
 
 
 def _ask(motion: HandMotion) -> None:
-    """Say what to do; a person at a terminal says when they begin."""
-    err.print(motion.ask, markup=False, style="bold")
+    """Print the instruction; at a terminal, wait until the operator starts."""
+    err.print(motion.instruction, markup=False, style="bold")
     if sys.stdin.isatty():
-        typer.prompt("Enter when you begin", default="", show_default=False, err=True)
+        typer.prompt("Press Enter to start", default="", show_default=False, err=True)

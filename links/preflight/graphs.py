@@ -1,7 +1,4 @@
-"""The parts of a configuration's graph that a preflight runs. Poses never go out to the autopilot in either.
-
-Source: ours.
-"""
+"""Subgraphs of a configuration that a preflight runs. Neither sends poses to the autopilot."""
 
 from __future__ import annotations
 
@@ -14,12 +11,12 @@ from stages.messages import DroneFix, RelativePose
 
 
 def sources_only(graph: Graph) -> Graph:
-    """The sources alone: nothing moves, nothing is computed."""
+    """The sources only: nothing moves and no stage runs."""
     return replace(graph, nodes={n: s for n, s in graph.nodes.items() if issubclass(s.cls, Source)}, edges=())
 
 
 def tracking(graph: Graph) -> Graph:
-    """The sources, and all that it takes to see the drone by LiDAR: the servo turns."""
+    """The sources and all nodes that the LiDAR track needs: the servo turns."""
     edges = [e for e in graph.edges if not (e.message is RelativePose and graph.nodes[e.consumer].kind == "links")]
     wanted = {name for name, spec in graph.nodes.items() if DroneFix in output_ports(spec.cls).values()}
     while more := {edge.producer for edge in edges if edge.consumer in wanted} - wanted:
@@ -30,5 +27,5 @@ def tracking(graph: Graph) -> Graph:
 
 
 def sees_drones(graph: Graph) -> bool:
-    """Whether any stage of it tells where the drone is."""
+    """Whether any stage outputs DroneFix."""
     return any(DroneFix in output_ports(spec.cls).values() for spec in graph.nodes.values())

@@ -1,9 +1,9 @@
-"""The drone moved by hand as a person is told: does the autopilot say the same motion, with the right sign?
+"""Motions of the drone by hand: whether the autopilot measures the requested motion with the right sign.
 
-Only this finds an autopilot whose whole body frame is turned, as by AHRS_ORIENTATION: its messages agree with each
-other all the same.
+Only this detects an autopilot with a rotated body frame, as by a wrong AHRS_ORIENTATION, because its messages are
+consistent with each other.
 
-Source: ours; drone axes are x forward, y left, z up.
+Drone axes are x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from links.preflight.check_result import CheckResult, fail, ok
 from stages.geometry.frames import Array64
 from stages.messages import DroneAttitude, DroneOdometry
 
-ENOUGH_RAD = np.radians(15.0)
+MIN_RAD = np.radians(15.0)
 Rotated = DroneAttitude | DroneOdometry
 
 
 def nose_down_rad(rotations: Array64) -> Array64:
-    """How far the nose points below the horizon, for rotations R_odom_drone (n, 3, 3)."""
+    """Angle of the nose below the horizon, for rotations R_odom_drone (n, 3, 3)."""
     return np.arcsin(np.clip(-rotations[:, 2, 0], -1.0, 1.0))
 
 
 def right_down_rad(rotations: Array64) -> Array64:
-    """How far the right side points below the horizon: the left axis rises."""
+    """Angle of the right side below the horizon: the left axis rises."""
     return np.arcsin(np.clip(rotations[:, 2, 1], -1.0, 1.0))
 
 
 def turned_left_rad(rotations: Array64) -> Array64:
-    """How far it has turned left since the first, counter-clockwise seen from above."""
+    """Yaw since the first rotation, counter-clockwise seen from above."""
     return np.unwrap(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
 
 
 @dataclass(frozen=True, slots=True)
 class HandMotion:
-    """One motion that is asked for."""
+    """One requested motion."""
 
-    ask: str
-    what: str
-    measure: Callable[[Array64], Array64] | None  # grows with the motion; None: judged by the paths
+    instruction: str
+    name: str
+    measure: Callable[[Array64], Array64] | None  # increases with the motion; None: checked by the paths
 
 
 MOTIONS = (
@@ -52,36 +52,40 @@ MOTIONS = (
         "Turn it to the LEFT by about 90 degrees (counter-clockwise seen from above).", "turn left", turned_left_rad
     ),
     HandMotion(
-        "Carry it in a circle 3 m across where the LiDAR sees it, and lift it by 1 m on the way.", "carry", None
+        "Move it in a circle of 3 m diameter in view of the LiDAR, and lift it by 1 m meanwhile.", "circle", None
     ),
 )
 
 
-def check_motion(motion: HandMotion, rotated: Sequence[Rotated]) -> CheckResult:
-    """Whether the attitudes during a motion tell the motion that was asked for, against where they began."""
-    name = f"by hand: {motion.what}"
+def check_motion(motion: HandMotion, attitudes: Sequence[Rotated]) -> CheckResult:
+    """Whether the attitudes during a motion show the requested motion, relative to the first attitude."""
+    name = f"by hand: {motion.name}"
     assert motion.measure is not None
-    if len(rotated) < 2:
-        return fail(name, "no attitude came meanwhile: check the autopilot's link")
-    rotations = np.array([m.R_odom_drone for m in rotated])
+    if len(attitudes) < 2:
+        return fail(name, "no attitude was received meanwhile: check the autopilot's link")
+    rotations = np.array([m.R_odom_drone for m in attitudes])
     right, wrong = _peaks(motion.measure(rotations))
-    if max(right, wrong) >= ENOUGH_RAD:
-        told = np.degrees(right if right >= wrong else -wrong)
+    if max(right, wrong) >= MIN_RAD:
+        measured_deg = np.degrees(right if right >= wrong else -wrong)
         if right >= wrong:
-            return ok(name, f"it told {told:.0f} deg")
-        return fail(name, f"it told {told:.0f} deg, the opposite: check AHRS_ORIENTATION (PX4: SENS_BOARD_ROT)")
+            return ok(name, f"measured {measured_deg:.0f} deg")
+        return fail(
+            name, f"measured {measured_deg:.0f} deg, the opposite: check AHRS_ORIENTATION (PX4: SENS_BOARD_ROT)"
+        )
     for other in MOTIONS:
         if other.measure is not None and other is not motion:
             peak = max(_peaks(other.measure(rotations)))
-            if peak >= ENOUGH_RAD:
+            if peak >= MIN_RAD:
                 return fail(
                     name,
-                    f"it told '{other.what}' or its opposite, {np.degrees(peak):.0f} deg, instead: check "
-                    "AHRS_ORIENTATION (PX4: SENS_BOARD_ROT), and that you did as told",
+                    f"measured '{other.name}' or its opposite, {np.degrees(peak):.0f} deg, instead: check "
+                    "AHRS_ORIENTATION (PX4: SENS_BOARD_ROT), and that the motion was as requested",
                 )
-    return fail(name, "it told no such motion: was it moved, and is this drone's autopilot connected? Or --no-motion")
+    return fail(
+        name, "no such motion measured: was it moved, and is this drone's autopilot connected? Or use --no-motion"
+    )
 
 
 def _peaks(angles_rad: Array64) -> tuple[float, float]:
-    """How far the angle went up and down from where it began."""
+    """Maximum increase and decrease of the angle from its first value."""
     return float(angles_rad.max() - angles_rad[0]), float(angles_rad[0] - angles_rad.min())

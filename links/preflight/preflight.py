@@ -41,7 +41,9 @@ def preflight_live(
             return
         if ask is None:
             yield from motion_checks(observations)
-            yield warning("by hand", "left out (--no-motion): signs of the axes are known only as far as said above")
+            yield warning(
+                "by hand", "skipped (--no-motion): the signs of the axes are checked only as far as reported above"
+            )
             return
         moved: list[CheckResult] = []
         observations = collect_live(tracking(graph), lambda tap: moved.extend(_hand_motions(tap, wait, ask, step_s)))
@@ -58,7 +60,7 @@ def preflight_recording(
     if motion and _has_attitude(observations):
         yield from motion_checks(observations)
     elif not motion:
-        yield warning("axes", "left out (--no-motion): not checked")
+        yield warning("axes", "skipped (--no-motion): not checked")
 
 
 def link_checks(graph: Graph, observations: Observations, out_dir: Path) -> Iterator[CheckResult]:
@@ -75,7 +77,7 @@ def configuration_checks(graph: Graph) -> Iterator[CheckResult]:
     for checks in DEVICES:
         yield from checks.check_configuration(graph)
     if not sees_drones(graph):
-        yield fail("stages", "no stage of this configuration tells where the drone is")
+        yield fail("stages", "no stage of this configuration locates the drone")
 
 
 def _has_attitude(observations: Observations) -> bool:

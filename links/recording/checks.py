@@ -1,7 +1,4 @@
-"""Is there room on the disk for the recording of a flight.
-
-Source: ours; the LiDAR's rate is measured on live recordings of an hour.
-"""
+"""Preflight checks of the recorder: free disk space for the recording of a flight."""
 
 from __future__ import annotations
 
@@ -15,8 +12,8 @@ from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observations
 from links.recording.recorder import Recorder
 
-FLIGHT_H = 1.0  # a flight that shall fit
-LEAST_GB_H = 0.1  # orders, results and what else a run writes
+FLIGHT_H = 1.0  # a flight of this duration must fit
+MIN_GB_H = 0.1  # logs, results and other files of a run
 GB, MB = 1e9, 1e6
 
 
@@ -39,39 +36,40 @@ class RecorderChecks(LinkChecks):
 
 
 def disk_check(recorder: Recorder, observations: Observations, out_dir: Path) -> CheckResult:
-    """The free room where a run's folder would be, against what the recorder keeps free and what an hour takes."""
+    """Free space for the run's folder, against the recorder's reserve and the size of one hour."""
     name, folder = "disk", existing(out_dir)
     try:
         free_bytes = shutil.disk_usage(folder).free
     except OSError as error:
-        return fail(name, f"{folder}: {error.strerror or error}: is the disk there? Nothing could be recorded")
+        return fail(name, f"{folder}: {error.strerror or error}: is the disk mounted? Nothing can be recorded")
     free = _amount(free_bytes)
     reserve_bytes = MB * recorder.settings.reserve_mb
     if free_bytes < reserve_bytes:
         return fail(
             name,
-            f"{free} free at {folder}, and the recorder leaves {_amount(reserve_bytes)} free (reserve_mb): "
-            "nothing would be recorded; make room, or give another disk with --out",
+            f"{free} free at {folder}, and the recorder keeps {_amount(reserve_bytes)} free (reserve_mb): "
+            "nothing will be recorded; free some space, or choose another disk with --out",
         )
     rates = {source.name: source.observation.recorded_gb_per_hour for source in observations.sources}
     rates_gb_h = {name: rate for name, rate in rates.items() if rate is not None}
-    told = ", ".join(f"{source} {rate:.1f}" for source, rate in rates_gb_h.items())
+    summary = ", ".join(f"{source} {rate:.1f}" for source, rate in rates_gb_h.items())
     if not rates_gb_h:
-        return ok(name, f"{free} free at {folder}; no LiDAR and no camera fills it")
-    rate = max(sum(rates_gb_h.values()), LEAST_GB_H)
+        return ok(name, f"{free} free at {folder}; no LiDAR and no camera to record")
+    rate = max(sum(rates_gb_h.values()), MIN_GB_H)
     hours = (free_bytes - reserve_bytes) / GB / rate
-    text = f"{free} free at {folder}; a flight takes {rate:.1f} GB an hour ({told})"
+    text = f"{free} free at {folder}; a flight needs {rate:.1f} GB/h ({summary})"
     if hours < FLIGHT_H:
         return warning(
-            name, f"{text}, so it is full after {60 * hours:.0f} min: make room, or give another disk with --out"
+            name,
+            f"{text}, so it is full after {60 * hours:.0f} min: free some space, or choose another disk with --out",
         )
-    return ok(name, f"{text}, so it lasts {hours:.1f} h")
+    return ok(name, f"{text}, enough for {hours:.1f} h")
 
 
 def existing(folder: Path) -> Path:
-    """The folder itself, or the nearest above it that is there."""
-    whole = folder.absolute()
-    return next((place for place in (whole, *whole.parents) if place.is_dir()), whole)
+    """The folder itself, or its nearest existing parent."""
+    absolute = folder.absolute()
+    return next((path for path in (absolute, *absolute.parents) if path.is_dir()), absolute)
 
 
 def _amount(count: float) -> str:

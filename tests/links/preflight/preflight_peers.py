@@ -1,4 +1,4 @@
-"""The rig that a preflight listens to: a LiDAR that sends for ever, a drone that a hand moves as it is told, a toy eye."""
+"""Peers of a preflight: a sending LiDAR, a drone moved by hand as requested, and a fake tracker."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from links.simulated.world.path import Path, Waypoint
 from links.velodyne import vlp16
 from stages.messages import DroneFix, DroneLocalPosition
 
-SPEED = 8.0  # rad/s of the phase of a motion by hand: there and back in 0.4 s
+SPEED = 8.0  # rad/s, phase of a hand motion: forth and back in 0.4 s
 START_NS, SECONDS = 1_748_773_230_000_000_000, 60.0
 
 
@@ -61,7 +61,7 @@ class SendingLidar:
 
 
 def good_parameters(profile="ardupilot") -> dict[str, float]:
-    """What a profile wants, the best value of each."""
+    """The best allowed value of each parameter of a profile."""
     return {
         w.name: w.values[0] if w.values else float(w.bits) or (w.at_least + w.at_most) / 2
         for w in PROFILES[profile].required
@@ -78,7 +78,7 @@ def flight() -> Autopilot:
 
 
 class OnTheGround:
-    """A flight that says it is disarmed; `upside_down`: its accelerometer has its z axis the wrong way."""
+    """A flight that reports disarmed. `upside_down`: the z axis of its accelerometer is inverted."""
 
     def __init__(self, upside_down: bool = False) -> None:
         self._flight, self._upside_down = flight(), upside_down
@@ -101,67 +101,67 @@ class OnTheGround:
 
 
 class HandHeld:
-    """A drone whose hand does what the preflight asks, at 50 Hz; `turned`: its board is mounted backwards."""
+    """A drone moved as the preflight requests, at 50 Hz. `rotated`: its board is mounted backwards."""
 
-    def __init__(self, turned: bool = False) -> None:
+    def __init__(self, rotated: bool = False) -> None:
         self._mav = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
-        self._sign = -1.0 if turned else 1.0
-        self._asked, self._since_ns, self._next_ns, self._beat_ns = "", 0, 0, 0
+        self._sign = -1.0 if rotated else 1.0
+        self._motion, self._since_ns, self._next_ns, self._beat_ns = "", 0, 0, 0
 
-    def ask(self, step) -> None:
-        """A step begins."""
-        self._asked, self._since_ns = step.what, self._next_ns
+    def ask(self, motion) -> None:
+        """A motion starts."""
+        self._motion, self._since_ns = motion.name, self._next_ns
 
     def device_ns(self, scenario_ns: int) -> int:
         """Its time since boot."""
         return scenario_ns - START_NS + 100_000_000_000
 
     def records(self, until_ns: int) -> list[Record]:
-        """What it says until then."""
+        """Its frames until then."""
         records: list[Record] = []
         if not self._next_ns:
             self._next_ns = self._beat_ns = self._since_ns = until_ns
         while self._next_ns < until_ns:
             at_ns, self._next_ns = self._next_ns, self._next_ns + 20_000_000
-            said = [self._attitude(at_ns), self._position(at_ns)]
+            messages = [self._attitude(at_ns), self._position(at_ns)]
             if at_ns >= self._beat_ns:
                 self._beat_ns += 1_000_000_000
-                said.append(ardupilotmega.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3))
-            records += [Record("/autopilot/rx", at_ns, at_ns, packed(message, self._mav)) for message in said]
+                messages.append(ardupilotmega.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3))
+            records += [Record("/autopilot/rx", at_ns, at_ns, packed(message, self._mav)) for message in messages]
         return records
 
     def _attitude(self, at_ns: int):
-        gone_s = (at_ns - self._since_ns) * 1e-9
-        angle = math.radians(40) * math.sin(min(gone_s * SPEED, math.pi))
-        rate = math.radians(40) * SPEED * math.cos(gone_s * SPEED) * (gone_s * SPEED < math.pi)
-        roll, pitch = angle * (self._asked == "right side down"), -angle * (self._asked == "nose down")
-        yaw = -angle * (self._asked == "turn left")  # FRD: nose up, right side down and clockwise are positive
-        rates = [rate * (self._asked == what) for what in ("right side down", "nose down", "turn left")]
+        elapsed_s = (at_ns - self._since_ns) * 1e-9
+        angle = math.radians(40) * math.sin(min(elapsed_s * SPEED, math.pi))
+        rate = math.radians(40) * SPEED * math.cos(elapsed_s * SPEED) * (elapsed_s * SPEED < math.pi)
+        roll, pitch = angle * (self._motion == "right side down"), -angle * (self._motion == "nose down")
+        yaw = -angle * (self._motion == "turn left")  # FRD: nose up, right side down and clockwise are positive
+        rates = [rate * (self._motion == what) for what in ("right side down", "nose down", "turn left")]
         s = self._sign
         return ardupilotmega.MAVLink_attitude_message(
             self.device_ns(at_ns) // 1_000_000, s * roll, s * pitch, yaw, s * rates[0], -s * rates[1], -rates[2]
         )
 
     def _position(self, at_ns: int):
-        turn = 6.0 * (at_ns - self._since_ns) * 1e-9 * (self._asked == "carry")
+        turn = 6.0 * (at_ns - self._since_ns) * 1e-9 * (self._motion == "circle")
         x, y, z = 1.5 * math.cos(turn), 1.5 * math.sin(turn), -0.7 * math.sin(0.5 * turn) ** 2 * 2
         return ardupilotmega.MAVLink_local_position_ned_message(self.device_ns(at_ns) // 1_000_000, x, y, z, 0, 0, 0)
 
 
-class EyeSettings(Settings):
-    """Settings of `Eye`."""
+class FakeTrackerSettings(Settings):
+    """Settings of `FakeTracker`."""
 
-    mirror: float = 1.0  # -1: it and the autopilot do not agree on left and right
+    reflect: float = 1.0  # -1: it and the autopilot do not agree on left and right
 
 
-class Eye(Stage[EyeSettings]):
-    """Sees the drone where the hand carries it, in a vehicle frame that is turned by 30 deg."""
+class FakeTracker(Stage[FakeTrackerSettings]):
+    """Outputs fixes of the moved drone in a vehicle frame that is rotated by 30 deg."""
 
     def on_position(self, position: DroneLocalPosition) -> DroneFix:
         """A fix where it is."""
         c, s = math.cos(0.5), math.sin(0.5)
         x, y, z = position.xyz_odom_m
-        y = y * self.settings.mirror
+        y = y * self.settings.reflect
         return DroneFix(
             stamp_ns=position.stamp_ns,
             xyz_vehicle_m=np.array([c * x - s * y + 3, s * x + c * y, z + 5]),

@@ -1,4 +1,4 @@
-"""What a configuration lacks, and which parts of it a preflight runs."""
+"""Missing links of a configuration, and the subgraphs that a preflight runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from links.preflight.preflight import configuration_checks
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 
 
-def test_what_a_configuration_lacks_is_said():
+def test_missing_links_are_reported():
     field = load_graph(CONFIGS / "field.yaml")
     assert list(configuration_checks(field)) == []
     names = ("lidar", "servo", "odometry", "autopilot", "recorder", "camera_vehicle", "camera_drone")
@@ -30,16 +30,16 @@ def test_what_a_configuration_lacks_is_said():
         "recorder": "warning",
     }
     fixed = dataclasses.replace(bare, values={"rig": {"lidar": {"mount": {"turns": False}}}})
-    bolted = {v.name: v.level.value for v in configuration_checks(fixed)}
-    assert bolted["servo"] == "ok"
+    fixed_levels = {v.name: v.level.value for v in configuration_checks(fixed)}
+    assert fixed_levels["servo"] == "ok"
 
 
-def test_no_pose_goes_out_and_while_listening_nothing_moves():
+def test_no_pose_is_sent_and_nothing_moves_with_the_sources_only():
     field = load_graph(CONFIGS / "field.yaml")
     assert sources_only(field).edges == ()
     assert all(spec.kind == "links" for spec in sources_only(field).nodes.values())
-    seeing = tracking(field)
-    assert "fuse" not in seeing.nodes
-    assert not any(edge.consumer == "autopilot" for edge in seeing.edges)
-    assert any((edge.producer, edge.consumer) == ("aim", "servo") for edge in seeing.edges)
-    assert {"lidar", "servo", "camera_drone", "detect", "track"} <= set(seeing.nodes)
+    subgraph = tracking(field)
+    assert "fuse" not in subgraph.nodes
+    assert not any(edge.consumer == "autopilot" for edge in subgraph.edges)
+    assert any((edge.producer, edge.consumer) == ("aim", "servo") for edge in subgraph.edges)
+    assert {"lidar", "servo", "camera_drone", "detect", "track"} <= set(subgraph.nodes)

@@ -1,4 +1,4 @@
-"""A whole preflight over real sockets and a pty, against the simulated peers: go, and why not."""
+"""A complete preflight over real sockets and a pty, against simulated peers: GO and NO-GO."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from flow.graph import Graph, load_graph
 from links.cli.app import app
-from links.preflight import Level, is_go, preflight_live
+from links.preflight.check_result import Level, is_go
+from links.preflight.preflight import preflight_live
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
@@ -43,7 +44,7 @@ links:
 """
 HAND = """\
 stages:
-  eye: {{use: tests.links.preflight.preflight_peers.Eye, config: {{mirror: {mirror}}},
+  tracker: {{use: tests.links.preflight.preflight_peers.FakeTracker, config: {{reflect: {reflect}}},
          inputs: {{position: autopilot.drone_local_position}}}}
 links:
   autopilot: {{use: links.mavlink.Autopilot, config: {{connection: "udpin:127.0.0.1:{autopilot}"}}}}
@@ -92,68 +93,68 @@ def wait(seconds: float) -> None:
     threading.Event().wait(seconds)
 
 
-def judged(graph: Graph, ask=None, listen_s=LISTEN_S):
+def results_of(graph: Graph, ask=None, listen_s=LISTEN_S):
     return {v.name: v for v in preflight_live(graph, listen_s, wait, ask, step_s=0.6)}
 
 
-def test_a_rig_that_is_fit_to_fly_is_go_with_exit_code_0(bench, emulator):
+def test_a_ready_rig_is_go_with_exit_code_0(bench, emulator):
     bench.write(emulator.path)
     with SendingLidar(bench.ports["lidar"]), bench.drone():
         result = CliRunner().invoke(app, ["preflight", str(bench.config), "--for", str(LISTEN_S), "--no-motion"])
     assert result.exit_code == 0, result.output
     assert "GO: " in result.output
-    names = ("lidar rate", "lidar losses", "servo answers", "camera_vehicle size", "autopilot parameters", "disk")
+    names = ("lidar rate", "lidar losses", "servo replies", "camera_vehicle size", "autopilot parameters", "disk")
     for name in names:
         assert f" {name}: " in result.output, result.output
 
 
-def test_a_rig_of_which_nothing_answers_is_no_go_for_each_part(bench, emulator):
+def test_a_silent_rig_fails_for_each_device(bench, emulator):
     graph = bench.write(emulator.path)
     (bench.folder / "film.avi").unlink()
     emulator.silence()
-    found = judged(graph)
+    found = results_of(graph)
     assert not is_go(found.values())
     assert "no packet on UDP" in found["lidar packets"].sentence
-    assert "the servo with id 1 does not answer" in found["servo answers"].sentence
-    assert "no word from system 1, component 1" in found["autopilot heartbeat"].sentence
+    assert "the servo with id 1 does not reply" in found["servo replies"].sentence
+    assert "no frame from system 1, component 1" in found["autopilot heartbeat"].sentence
     assert "there is no file" in found["camera_vehicle frames"].sentence
     assert {n for n, v in found.items() if v.level is Level.OK} == {"disk"}
     assert not {"autopilot parameters", "axes: accelerometer"} & set(found)
 
 
-def test_a_disk_without_room_is_no_go_though_all_else_is_right(bench, emulator, monkeypatch):
+def test_a_full_disk_fails_although_all_else_passes(bench, emulator, monkeypatch):
     graph = bench.write(emulator.path)
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1e6))
     with SendingLidar(bench.ports["lidar"]), bench.drone():
-        found = judged(graph)
+        found = results_of(graph)
     assert {n for n, v in found.items() if v.level is Level.FAIL} == {"disk"}
 
 
-def test_a_wrong_parameter_and_an_axis_upside_down_are_no_go(bench, emulator):
+def test_a_wrong_parameter_and_an_inverted_axis_fail(bench, emulator):
     graph = bench.write(emulator.path)
     parameters = good_parameters() | {"EK3_SRC1_YAW": 1.0}
     with SendingLidar(bench.ports["lidar"]), bench.drone(flight=OnTheGround(upside_down=True), parameters=parameters):
-        found = judged(graph)
+        found = results_of(graph)
     assert {n for n, v in found.items() if v.level is Level.FAIL} == {"autopilot parameters", "axes: accelerometer"}
-    assert "EK3_SRC1_YAW is 1, and must be 6" in found["autopilot parameters"].sentence
-    assert "z is told as -z" in found["axes: accelerometer"].sentence
+    assert "EK3_SRC1_YAW is 1, but must be 6" in found["autopilot parameters"].sentence
+    assert "z is measured as -z" in found["axes: accelerometer"].sentence
 
 
 @pytest.mark.parametrize(
-    ("turned", "mirror", "wrong"),
+    ("rotated", "reflect", "wrong"),
     [
         (False, 1, set()),
         (True, -1, {"by hand: nose down", "by hand: right side down", "axes: LiDAR and autopilot"}),
     ],
 )
-def test_a_drone_moved_by_hand_tells_its_signs(tmp_path, turned, mirror, wrong):
+def test_hand_motions_show_the_signs_of_the_axes(tmp_path, rotated, reflect, wrong):
     with ExitStack() as stack:
         bench = Bench(tmp_path)
-        graph = bench.read(HAND.format(mirror=mirror, **bench.ports))
-        held = HandHeld(turned)
+        graph = bench.read(HAND.format(reflect=reflect, **bench.ports))
+        held = HandHeld(rotated)
         stack.enter_context(bench.drone(flight=held))
-        found = judged(graph, held.ask, listen_s=1.2)
-    moved = {n: v for n, v in found.items() if n.startswith(("by hand", "axes"))}
-    assert {n for n, v in moved.items() if v.level is Level.FAIL} == wrong, moved
-    assert moved["axes: attitude's turn rates"].level is Level.OK, moved
+        found = results_of(graph, held.ask, listen_s=1.2)
+    motions = {n: v for n, v in found.items() if n.startswith(("by hand", "axes"))}
+    assert {n for n, v in motions.items() if v.level is Level.FAIL} == wrong, motions
+    assert motions["axes: attitude's angular velocity"].level is Level.OK, motions
     assert found["lidar"].level is Level.FAIL

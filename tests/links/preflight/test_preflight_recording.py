@@ -1,4 +1,4 @@
-"""A preflight of recordings that come with grd."""
+"""A preflight of the committed recordings."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def test_a_flight_with_every_sensor_is_go():
         code=0,
     )
     assert "ok    lidar losses: 0 of 5275 packets lost" in text
-    assert "ok    camera_drone size: 720 x 720, as the rig says" in text
+    assert "ok    camera_drone size: 720 x 720, as in the rig" in text
     assert "ok    autopilot rates: ATTITUDE 50 Hz, ODOMETRY 30 Hz" in text
-    assert "look  autopilot parameters: a recording does not tell them: not checked" in text
+    assert "warn  autopilot parameters: not in a recording: not checked" in text
     assert "GO: " in text
 
 
@@ -42,11 +42,11 @@ def test_a_recording_without_autopilot_is_no_go_where_the_configuration_declares
 
 
 @pytest.mark.parametrize("words", [["nowhere.yaml"], [ROOT / "configs" / "replay.yaml", "--recording", "nowhere.mcap"]])
-def test_what_is_not_there_is_wrong_use(words):
+def test_missing_files_are_wrong_use(words):
     assert "nowhere" in grd(*words, code=2)
 
 
-def test_a_configuration_that_cannot_listen_is_wrong_use(tmp_path):
+def test_a_configuration_without_sources_is_wrong_use(tmp_path):
     config = tmp_path / "none.yaml"
     config.write_text("stages: {ticker: {use: tests.flow.live_toys.Ticker, inputs: {tick: clock.tick}}}\nlinks: {}\n")
     grd(config, code=2)

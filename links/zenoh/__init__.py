@@ -1,7 +1,4 @@
-"""Edges between hosts over Eclipse Zenoh: `host_graph` gives the graph that one host of a hosts file runs.
-
-Source: DESIGN, Hosts and Links: Zenoh.
-"""
+"""Edges between hosts over Eclipse Zenoh: `host_graph` returns the graph that one host of a hosts file runs."""
 
 from __future__ import annotations
 
@@ -22,23 +19,23 @@ TOPIC = "/hosts/"
 
 
 class ZenohEnds:
-    """Makes the nodes at the ends of hops."""
+    """Creates the nodes at the ends of hops."""
 
     def receiver(self, hosts: Hosts, name: str, hops: list[Hop]) -> NodeSpec:
-        """A source with the name of the node that it stands for; its topic is /hosts/<name>."""
+        """A source with the name of the node that it replaces; its topic is /hosts/<name>."""
         config = {"topic": TOPIC + name, "session": session_of(hosts, hops[0].receiver), "sender": hops[0].sender}
         return NodeSpec(name, "links", "links.zenoh.Receiver", receiver_class(hops), config)
 
     def sender(self, hosts: Hosts, name: str, hops: list[Hop]) -> NodeSpec:
-        """A sink with a port for each hop; its topic has no records."""
+        """A sink with an input port per hop; its topic has no records."""
         config = {"topic": TOPIC + name, "session": session_of(hosts, hops[0].sender), "to": hops[0].receiver}
         return NodeSpec(name, "links", "links.zenoh.Sender", sender_class(hops), config)
 
 
 def host_graph(graph: Graph, hosts_file: Path, host: str, *, to_run: bool = False) -> Graph:
-    """The graph that `host` runs. ConfigError with all that is wrong in the hosts file.
+    """The graph that `host` runs. Raises ConfigError with all errors of the hosts file.
 
-    `to_run`: its own key and the certificates must be there, too, else LinkError.
+    `to_run`: also raise LinkError unless the host's key and certificates exist.
     """
     hosts = load_hosts(hosts_file, graph)
     part = graph_of_host(hosts, host, ZenohEnds())

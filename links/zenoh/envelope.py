@@ -1,18 +1,16 @@
-"""What goes with each message over a host's line, and what a receiver's record holds.
+"""Envelope of messages between hosts, and the layout of a receiver's records. All little-endian.
 
-A message is its `flow.remote.codec` bytes; beside it (Zenoh's attachment) stands an envelope. All little-endian.
+A message is its `flow.remote.codec` bytes; its Zenoh attachment is an envelope:
 
 | envelope | |
 | --- | --- |
-| u64 | the sender's run: a number drawn when its process started; its clock and its counting begin anew with it |
-| u64 | number of the message on this output_queue, from 0: a gap is what was lost |
-| i64 | when it was sent [ns], sender's timeline |
+| u64 | the sender's run: a random number of its process; clock and numbering restart with it |
+| u64 | number of the message in its output queue, from 0; a gap means lost messages |
+| i64 | time of sending [ns], sender's timeline |
 | i64 | stamp_ns of the message, sender's timeline |
 
-A record is i64 (our time - theirs) [ns], i64 (wrong by at most this) [ns], then the message's bytes: a replay decodes
-it as the flight did. An answer about the time is the asked host's run (u64) and its time (i64).
-
-Source: ours.
+A record is i64 clock offset (local - peer) [ns], i64 bound of its error [ns], then the message's bytes, so that a
+replay decodes it as the live run did. A time reply is the peer's run (u64) and its time (i64).
 """
 
 from __future__ import annotations
@@ -22,15 +20,15 @@ import struct
 from typing import NamedTuple
 
 RUN = int.from_bytes(os.urandom(8), "little")
-"""This process's own."""
+"""The run of this process."""
 
 ENVELOPE = struct.Struct("<QQqq")
 RECORD_HEAD = struct.Struct("<qq")
-TIME_ANSWER = struct.Struct("<Qq")
+TIME_REPLY = struct.Struct("<Qq")
 
 
 class Envelope(NamedTuple):
-    """See above."""
+    """Metadata of one message, see the module's docstring."""
 
     run: int
     number: int
@@ -43,5 +41,5 @@ class Envelope(NamedTuple):
 
 
 def read_envelope(data: bytes | None) -> Envelope | None:
-    """The envelope in an attachment; None when it is none."""
+    """The envelope in an attachment; None: the attachment is not an envelope."""
     return Envelope(*ENVELOPE.unpack(data)) if data is not None and len(data) == ENVELOPE.size else None

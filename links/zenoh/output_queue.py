@@ -1,11 +1,9 @@
-"""One output's way to another host: what waits to be sent, and the thread that sends it.
+"""Send queue of one output to another host, and the thread that sends from it.
 
-Zenoh is told to wait (BLOCK) when the line is full, so what waits, waits here, where the newest can be had: `latest`
-keeps one message, `drop_oldest` up to `depth` and none for longer than the edge's deadline, but always the newest.
-While nobody listens at the other end they wait as well. Small messages (of a fixed size: fixes, poses, states) overtake
-the others between two of Zenoh's fragments; a picture on the line does not hold them up.
-
-Source: ours.
+Zenoh is configured to block (BLOCK) when the connection is full, so messages wait in this queue, where old ones can be
+dropped: `latest` keeps one message, `drop_oldest` up to `depth` and none beyond the edge's deadline, but always the
+newest. Messages also wait while the other end has no subscriber. Small messages (of fixed size: fixes, poses, states)
+are sent between two of Zenoh's fragments of a large message; an image does not delay them.
 """
 
 from __future__ import annotations
@@ -26,38 +24,38 @@ from links.zenoh.envelope import RUN, Envelope
 if TYPE_CHECKING:
     import zenoh
 
-WAKE_S = 0.2  # a output_queue without messages looks this often whether it was closed
-LISTENER_S = 0.02  # and one with messages, whether somebody listens
+WAKE_S = 0.2  # how often an empty queue checks whether it was closed
+LISTENER_S = 0.02  # how often a queue with messages checks for a subscriber
 
 
 @dataclass(slots=True)
 class Counts:
-    """What became of the messages of a output_queue."""
+    """Counters of a queue."""
 
     sent: int = 0
     sent_bytes: int = 0
-    dropped: int = 0  # a newer one took its place
+    dropped: int = 0  # replaced by a newer one
     late: int = 0  # waited longer than the edge's deadline
-    failed: int = 0  # not what its class declares
+    failed: int = 0  # not as its class declares
 
 
 class OutputQueue:
-    """One output to one host."""
+    """Queue of one output to one host."""
 
     def __init__(self, key: str, message: type[Message], depth: int, deadline_ns: int) -> None:
         self.key = key
         self.counts = Counts()
-        self.heard = False
-        """Whether somebody listens at the other end."""
+        self.has_subscriber = False
+        """Whether the other end has a subscriber."""
         self.status: str | None = None
         self._depth, self._deadline_ns = depth, deadline_ns
         self._small = not any(isinstance(dim, str) for _, _, shape in array_fields(message) for dim in shape.dims)
-        self._waiting: deque[tuple[int, Message]] = deque()  # (since when, message)
+        self._waiting: deque[tuple[int, Message]] = deque()  # (time of `put`, message)
         self._changed = threading.Condition()
-        self._number = 0  # of the next message
+        self._number = 0  # number of the next message
 
     def put(self, message: Message) -> None:
-        """Let a message wait; a full output_queue drops its oldest."""
+        """Append a message; a full queue drops its oldest."""
         with self._changed:
             if len(self._waiting) >= self._depth:
                 self._waiting.popleft()
@@ -65,19 +63,19 @@ class OutputQueue:
             self._waiting.append((now_ns(), message))
             self._changed.notify()
 
-    def send_on(self, connection: Connection, closing: threading.Event) -> None:
-        """Send until closed; the output_queue's thread runs this."""
+    def run(self, connection: Connection, closing: threading.Event) -> None:
+        """Send until closed; runs in the queue's thread."""
         import zenoh
 
         while not closing.is_set():
             opened = connection.opened(WAKE_S)
             if opened is None:
                 continue
-            with contextlib.suppress(zenoh.ZError):  # the session has closed; the connection says so
+            with contextlib.suppress(zenoh.ZError):  # the session has closed; the connection reports it
                 publisher = self._publisher(opened.session)
-                while not (closing.is_set() or opened.over.is_set()):
+                while not (closing.is_set() or opened.ended.is_set()):
                     self._send_one(publisher, closing)
-            self.heard = False
+            self.has_subscriber = False
 
     def _publisher(self, session: zenoh.Session) -> zenoh.Publisher:
         import zenoh
@@ -90,13 +88,13 @@ class OutputQueue:
         )
 
     def _send_one(self, publisher: zenoh.Publisher, closing: threading.Event) -> None:
-        """Send what waits first, when there is something and somebody listens; else wait a little."""
+        """Send the oldest message if there are one and a subscriber; otherwise wait."""
         with self._changed:
-            anything = self._changed.wait_for(lambda: bool(self._waiting), WAKE_S)
-        self.heard = _matching(publisher)
-        if not self.heard:
+            has_message = self._changed.wait_for(lambda: bool(self._waiting), WAKE_S)
+        self.has_subscriber = _has_subscriber(publisher)
+        if not self.has_subscriber:
             closing.wait(LISTENER_S)
-        elif anything:
+        elif has_message:
             self._send(publisher, self._take())
 
     def _send(self, publisher: zenoh.Publisher, message: Message) -> None:
@@ -106,7 +104,7 @@ class OutputQueue:
             self.counts.failed += 1
             self.status = str(error)
             return
-        self._number += 1  # counted before it is sent: one that is lost with the line leaves a gap
+        self._number += 1  # incremented before sending: a message lost with the connection leaves a gap
         publisher.put(data, attachment=Envelope(RUN, self._number - 1, now_ns(), message.stamp_ns).pack())
         self.counts.sent += 1
         self.counts.sent_bytes += len(data)
@@ -120,6 +118,6 @@ class OutputQueue:
             return self._waiting.popleft()[1]
 
 
-def _matching(publisher: Any) -> bool:
-    """Whether somebody listens. Zenoh 1.10 types this as bool; it is an object that is always true."""
+def _has_subscriber(publisher: Any) -> bool:
+    """Whether there is a subscriber. Zenoh 1.10 declares a bool; it is an object that is always true."""
     return publisher.matching_status.matching

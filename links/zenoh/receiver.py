@@ -1,7 +1,4 @@
-"""The receiving end of a hop: a source that replaces a node of another host (`flow.config.hosts`).
-
-Source: ours.
-"""
+"""The receiving end of a hop: a source that replaces a node of another host (`flow.config.hosts`)."""
 
 from __future__ import annotations
 
@@ -32,8 +29,8 @@ if TYPE_CHECKING:
 
 WAKE_S = 0.05
 JOIN_S = 0.3
-COUNTED = ("received", "lost", "before the clock was known", "without an envelope", "at no possible time")
-RING = 256  # messages that wait for Python: more than the usual deadline of a LiDAR's packets, a bound on memory
+COUNTED = ("received", "lost", "clock unknown", "without envelope", "invalid time")
+RING = 256  # messages buffered for Python, a bound of memory: more than within the deadline of LiDAR packets
 
 
 class ReceiverSettings(SourceSettings):
@@ -44,9 +41,9 @@ class ReceiverSettings(SourceSettings):
 
 
 class Receiver(link.Source[ReceiverSettings]):
-    """Brings in what a node of another host gives, told in this host's time.
+    """Receives the outputs of a node of another host, with stamps converted to this host's time.
 
-    Not for YAML (`receiver_class` makes its outputs), and so not in the schema, which knows `class Name(Source)`.
+    Not for YAML: `receiver_class` creates its outputs.
     """
 
     hops: ClassVar[tuple[Hop, ...]] = ()
@@ -58,26 +55,26 @@ class Receiver(link.Source[ReceiverSettings]):
         self._clock: PeerClock | None = None
         self._counts: Counter[str] = Counter()
         self._counting: Any = threading.Lock()
-        self._newest: dict[str, tuple[int, int]] = {}  # key -> run and number of the newest
+        self._newest: dict[str, tuple[int, int]] = {}  # key -> run and number of the newest message
 
     def decode(self, record: Record) -> Message:
-        """The message of one record. LinkError: it is none that this receiver expects."""
+        """The message of one record. Raises LinkError for a message that this receiver does not expect."""
         try:
             offset_ns, uncertainty_ns = RECORD_HEAD.unpack_from(record.data)
             message = decode(record.data, self.expected, RECORD_HEAD.size)
             return in_local_time(message, offset_ns, uncertainty_ns)
         except (CodecError, OverflowError, struct.error) as error:
-            raise LinkError(f"{self.settings.topic}: what {self.settings.sender} sent is refused: {error}") from None
+            raise LinkError(f"{self.settings.topic}: invalid message from {self.settings.sender}: {error}") from None
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
-        """Hear the other host. LinkError: a certificate or the library is missing."""
+        """Receive from the other host. Raises LinkError when a certificate or the library is missing."""
         closing = threading.Event()
         records: queue.Queue[Record] = queue.Queue(len(self.hops))
         with connected(self.settings.session) as connection:
             self._connection, self._clock = connection, connection.clocks[self.settings.sender]
             threads = [
-                threading.Thread(target=self._hear, args=(connection, hop, records, closing), daemon=True)
+                threading.Thread(target=self._receive, args=(connection, hop, records, closing), daemon=True)
                 for hop in self.hops
             ]
             for thread in threads:
@@ -90,18 +87,20 @@ class Receiver(link.Source[ReceiverSettings]):
                 for thread in threads:
                     thread.join(JOIN_S / len(threads))
 
-    def _hear(self, connection: Connection, hop: Hop, records: queue.Queue[Record], closing: threading.Event) -> None:
-        """Take one output's messages as they come, session after session; the thread of a hop runs this."""
+    def _receive(
+        self, connection: Connection, hop: Hop, records: queue.Queue[Record], closing: threading.Event
+    ) -> None:
+        """Receive one output's messages, session after session; runs in the thread of a hop."""
         import zenoh
 
         while not closing.is_set():
             opened = connection.opened(WAKE_S)
             if opened is None:
                 continue
-            with contextlib.suppress(zenoh.ZError):  # the subscriber has ended, with us or with its session
-                self._hear_on(connection, opened, hop, records, closing)
+            with contextlib.suppress(zenoh.ZError):  # the subscriber has ended, by us or with its session
+                self._receive_on(connection, opened, hop, records, closing)
 
-    def _hear_on(
+    def _receive_on(
         self,
         connection: Connection,
         opened: OpenSession,
@@ -109,40 +108,40 @@ class Receiver(link.Source[ReceiverSettings]):
         records: queue.Queue[Record],
         closing: threading.Event,
     ) -> None:
-        """Take messages until the session ends: then `recv` raises ZError."""
+        """Receive until the session ends: then `recv` raises ZError."""
         import zenoh
 
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(min(hop.queue.depth, RING))
         subscriber = opened.session.declare_subscriber(key_of(hop), ring)
-        threading.Thread(target=_end, args=(subscriber, closing, opened.over), daemon=True).start()
-        handler = subscriber.handler  # the subscriber itself cannot be ended while it waits in `recv`
+        threading.Thread(target=_end, args=(subscriber, closing, opened.ended), daemon=True).start()
+        handler = subscriber.handler  # the subscriber cannot be undeclared while it waits in `recv`
         while not closing.is_set():
-            record = self._taken(connection, key_of(hop), handler.recv())
+            record = self._record(connection, key_of(hop), handler.recv())
             if record is not None:
                 _hand_over(record, records, closing)
 
-    def _taken(self, connection: Connection, key: str, sample: zenoh.Sample) -> Record | None:
+    def _record(self, connection: Connection, key: str, sample: zenoh.Sample) -> Record | None:
         arrival_ns = now_ns()
         attachment = sample.attachment
         envelope = read_envelope(None if attachment is None else attachment.to_bytes())
         if envelope is None:
-            self._count("without an envelope")
+            self._count("without envelope")
             return None
-        run, number = self._newest.get(key, (envelope.run, envelope.number - 1))  # before, nobody was here to hear it
+        run, number = self._newest.get(key, (envelope.run, envelope.number - 1))  # earlier messages were not expected
         if run == envelope.run:
             self._count("lost", max(envelope.number - number - 1, 0))
         self._newest[key] = envelope.run, envelope.number
-        difference = connection.clocks[self.settings.sender].heard(envelope.run, envelope.sent_ns, arrival_ns)
-        if difference is None:
-            self._count("before the clock was known")
+        clock_offset = connection.clocks[self.settings.sender].on_message(envelope.run, envelope.sent_ns, arrival_ns)
+        if clock_offset is None:
+            self._count("clock unknown")
             return None
-        stamp_ns = envelope.stamp_ns + difference.offset_ns
-        if not (0 <= stamp_ns < 2**63 and abs(difference.offset_ns) < 2**63):
-            self._count("at no possible time")
+        stamp_ns = envelope.stamp_ns + clock_offset.offset_ns
+        if not (0 <= stamp_ns < 2**63 and abs(clock_offset.offset_ns) < 2**63):
+            self._count("invalid time")
             return None
         self._count("received")
         return Record(
-            self.settings.topic, arrival_ns, stamp_ns, RECORD_HEAD.pack(*difference) + sample.payload.to_bytes()
+            self.settings.topic, arrival_ns, stamp_ns, RECORD_HEAD.pack(*clock_offset) + sample.payload.to_bytes()
         )
 
     def _count(self, what: str, by: int = 1) -> None:
@@ -151,18 +150,18 @@ class Receiver(link.Source[ReceiverSettings]):
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals since the start, and the other host's clock: ours - theirs, and what that is wrong by at most."""
+        """Totals since the start, and the clock offset (local - peer) with the bound of its error."""
         counts = {name: self._counts[name] for name in COUNTED}
-        difference = None if self._clock is None else self._clock.difference
-        if self._clock is not None and difference is not None:
-            counts["clock offset [us]"] = difference.offset_ns // 1000
-            counts["clock uncertainty [us]"] = difference.uncertainty_ns // 1000
-            counts["restarts of the other host"] = self._clock.restarts
+        offset = None if self._clock is None else self._clock.offset
+        if self._clock is not None and offset is not None:
+            counts["clock offset [us]"] = offset.offset_ns // 1000
+            counts["clock uncertainty [us]"] = offset.uncertainty_ns // 1000
+            counts["peer restarts"] = self._clock.restarts
         return counts
 
     @property
     def status(self) -> str | None:
-        """What is wrong on the way from the other host."""
+        """See Link: error text of the connection to the other host."""
         return None if self._connection is None else self._connection.status_of(self.settings.sender)
 
 
@@ -175,7 +174,7 @@ def _until(closing: threading.Event, records: queue.Queue[Record]) -> Iterator[R
 
 
 def _hand_over(record: Record, records: queue.Queue[Record], closing: threading.Event) -> None:
-    """Wait until the record is taken: meanwhile the ring keeps the newest of the others."""
+    """Wait until the record is taken; meanwhile the ring keeps the newest messages."""
     while not closing.is_set():
         try:
             records.put(record, timeout=WAKE_S)
@@ -184,18 +183,18 @@ def _hand_over(record: Record, records: queue.Queue[Record], closing: threading.
             continue
 
 
-def _end(subscriber: zenoh.Subscriber[Any], closing: threading.Event, over: threading.Event) -> None:
-    """End a subscriber with its receiver or its session. Else its `recv` waits for ever."""
+def _end(subscriber: zenoh.Subscriber[Any], closing: threading.Event, ended: threading.Event) -> None:
+    """Undeclare a subscriber when its receiver or session ends; otherwise its `recv` blocks forever."""
     import zenoh
 
-    while not (closing.wait(WAKE_S) or over.is_set()):
+    while not (closing.wait(WAKE_S) or ended.is_set()):
         pass
     with contextlib.suppress(zenoh.ZError):  # the session has closed
         subscriber.undeclare()
 
 
 def receiver_class(hops: list[Hop]) -> type[Receiver]:
-    """A Receiver whose outputs are these hops' messages."""
+    """A subclass of Receiver whose outputs are the messages of these hops."""
 
     def decode(self: Receiver, record: Record) -> Message:
         return Receiver.decode(self, record)

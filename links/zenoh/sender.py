@@ -1,7 +1,4 @@
-"""The sending end of a hop: a link that sends messages to one other host (`flow.config.hosts`).
-
-Source: ours.
-"""
+"""The sending end of a hop: a link that sends messages to one other host (`flow.config.hosts`)."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from links.zenoh.connection import Connection, connected
 from links.zenoh.output_queue import OutputQueue
 from links.zenoh.session_settings import SessionSettings, key_of
 
-JOIN_S = 0.2  # a thread whose line is stuck ends when Zenoh lets it go; the run does not wait for it
+JOIN_S = 0.2  # limit of waiting for the threads; a blocked one ends later
 
 
 class SenderSettings(SourceSettings):
@@ -29,9 +26,9 @@ class SenderSettings(SourceSettings):
 
 
 class Sender(link.Source[SenderSettings]):
-    """Sends to one host. It brings no records in: `listen` is the time for which it is connected.
+    """Sends messages to one host. It has no records: `listen` is the time for which it is connected.
 
-    Not for YAML (`sender_class` makes its ports), and so not in the schema, which knows `class Name(Source)`.
+    Not for YAML: `sender_class` creates its inputs.
     """
 
     hops: ClassVar[tuple[Hop, ...]] = ()
@@ -46,25 +43,23 @@ class Sender(link.Source[SenderSettings]):
             self._queues[port_of(hop)] = OutputQueue(key_of(hop), hop.message, hop.queue.depth, deadline_ns)
 
     def send(self, port: str, message: Message) -> None:
-        """Let a message wait on its output_queue; before the link is open it is dropped."""
+        """Queue a message; before the link is open it is dropped."""
         if self._connection is None:
             self._unopened += 1
         else:
             self._queues[port].put(message)
 
     def decode(self, record: Record) -> None:
-        """Nothing comes in here."""
+        """A sender has no records."""
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
-        """Connected to the other host. LinkError: a certificate or the library is missing."""
+        """Connect to the other host. Raises LinkError when a certificate or the library is missing."""
         closing = threading.Event()
         with connected(self.settings.session) as connection:
             self._connection = connection
             threads = [
-                threading.Thread(
-                    target=queue.send_on, args=(connection, closing), name=f"send {queue.key}", daemon=True
-                )
+                threading.Thread(target=queue.run, args=(connection, closing), name=f"send {queue.key}", daemon=True)
                 for queue in self._queues.values()
             ]
             for thread in threads:
@@ -85,7 +80,7 @@ class Sender(link.Source[SenderSettings]):
             "sent": sum(c.sent for c in counts.values()),
             "sent bytes": sum(c.sent_bytes for c in counts.values()),
         }
-        totals["before it was open"] = self._unopened
+        totals["not open"] = self._unopened
         for what in ("dropped", "late", "failed"):
             numbers = {name: getattr(c, what) for name, c in counts.items()}
             totals[what] = sum(numbers.values())
@@ -94,16 +89,17 @@ class Sender(link.Source[SenderSettings]):
 
     @property
     def status(self) -> str | None:
-        """What is wrong on the way to the other host."""
+        """See Link: error text of the connection, missing subscribers, or an invalid message."""
         settings = self.settings
         if self._connection is None:
             return None
-        wrong = self._connection.status_of(settings.to)
-        if wrong is not None or self._connection.clocks[settings.to].answered_ns is None:
-            return wrong
-        unheard = [queue.key for queue in self._queues.values() if not queue.heard]
-        if unheard:
-            return f"{settings.to} does not listen to {', '.join(unheard)}: is it running, with the same hosts file?"
+        error = self._connection.status_of(settings.to)
+        if error is not None or self._connection.clocks[settings.to].reply_ns is None:
+            return error
+        without_subscriber = [queue.key for queue in self._queues.values() if not queue.has_subscriber]
+        if without_subscriber:
+            keys = ", ".join(without_subscriber)
+            return f"{settings.to} does not subscribe to {keys}: is it running, with the same hosts file?"
         return next((queue.status for queue in self._queues.values() if queue.status), None)
 
 
@@ -113,7 +109,7 @@ def _nothing_until(closing: threading.Event) -> Iterator[Record]:
 
 
 def sender_class(hops: list[Hop]) -> type[Sender]:
-    """A Sender whose input ports are these hops."""
+    """A subclass of Sender whose inputs are these hops."""
     members: dict[str, Any] = {f"on_{port_of(hop)}": _handler(port_of(hop), hop.message) for hop in hops}
     members |= {"hops": tuple(hops), "__module__": __name__, "__doc__": Sender.__doc__}
     members["__annotations__"] = {"hops": "ClassVar[tuple[Hop, ...]]"}

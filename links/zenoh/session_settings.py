@@ -1,17 +1,19 @@
-"""What a Zenoh session is opened with: TLS both ways, who may say what, and how a full line behaves.
+"""Settings of a Zenoh session: mutual TLS, access control, and behaviour on a full connection.
 
-- Mode router at the hub, client elsewhere, no scouting: one line from each host to the hub, nobody looks for others.
-- TLS alone, both ends show a certificate, the hub's names its address: only hosts of our authority get in.
-- Access control at both ends, by the certificate's common name, nothing allowed that is not named: a host says its own
-  nodes' keys and no others, and the hosts believe nobody but the hub.
-- so_sndbuf 64 kB: what the kernel has taken cannot be taken back, and at 30 Mbit/s 2 MB are half a second.
-- lease 2 s with 100 keep-alives, one each 20 ms: Zenoh does not flush its TLS stream. When the socket was full, the
-  last 64 kB of a message wait for the next write; a keep-alive is one. With the usual 2.5 s, messages came 2.5 s late.
-- wait_before_close 3 s: a message (whole, not each fragment) that is not through by then closes the line, which is
-  opened again. So 2 MB need 5.3 Mbit/s; and a cut line holds a sender for that long.
-- Connect without time-out: else a client whose line broke gives up.
+- Mode `router` at the hub, `client` at the other hosts, no scouting: one connection from each host to the hub.
+- TLS only, with certificates at both ends; the hub's contains its address. Only hosts of the authority are accepted.
+- Access control at both ends by the certificate's common name, default deny: a host may publish only the keys of its
+  own
+  nodes, and the clients accept only the hub.
+- so_sndbuf 64 kB: bytes in the kernel's buffer cannot be dropped, and at 30 Mbit/s 2 MB are half a second.
+- lease 2 s with 100 keep-alives, one per 20 ms: Zenoh does not flush its TLS stream. When the socket was full, the last
+  64 kB of a message wait for the next write, such as a keep-alive. With the default, messages arrived 2.5 s late.
+- wait_before_close 3 s: a message (complete, not each fragment) that is not sent by then closes the connection, which
+  is
+  then reopened. Therefore 2 MB need 5.3 Mbit/s, and a broken connection blocks a sender for that time.
+- Connect without timeout: otherwise a client with a broken connection stops reconnecting.
 
-Source: https://zenoh.io/docs/manual/access-control and /tls, and Zenoh 1.10.2's own defaults; the rest was measured
+Source: https://zenoh.io/docs/manual/access-control and /tls, Zenoh 1.10.2's defaults, and measurements
 (tests/benchmarks/bench_hosts.py, tests/links/zenoh).
 """
 
@@ -29,12 +31,12 @@ SEND_BUFFER_BYTES = 65_536
 LEASE_MS, KEEP_ALIVES = 2000, 100
 WAIT_BEFORE_CLOSE_US = 3_000_000
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
-OPENING = {"open_timeout": 2000, "accept_timeout": 2000}  # ms; a greeting that the line swallowed is begun anew
+OPENING = {"open_timeout": 2000, "accept_timeout": 2000}  # ms; a lost handshake is repeated
 MAX_MESSAGE_BYTES = 20 * 2**20  # more than flow.remote.codec.MAX_BYTES
 
 
 class SessionSettings(BaseModel):
-    """One host's session: how to open it, and which keys go which way."""
+    """Settings of one host's session: endpoint, files, and the keys in each direction."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -44,23 +46,21 @@ class SessionSettings(BaseModel):
     certificate: Path
     key: Path
     authority: Path
-    keys: tuple[tuple[str, str, str], ...] = Field(
-        default=()
-    )  # (sender, receiver, key), of all that this host is part of
+    keys: tuple[tuple[str, str, str], ...] = Field(default=())  # (sender, receiver, key) of all hops of this host
 
     @property
     def is_hub(self) -> bool:
-        """The others connect to this one."""
+        """Whether the other hosts connect to this one."""
         return self.host == self.hub
 
     @property
     def others(self) -> tuple[str, ...]:
-        """The hosts at the other end of this one's lines."""
+        """The hosts that this one exchanges messages with."""
         return tuple(dict.fromkeys(host for pair in self.keys for host in pair[:2] if host != self.host))
 
 
 def session_of(hosts: Hosts, name: str) -> SessionSettings:
-    """The session of one of the hosts."""
+    """Session settings of one host."""
     host = hosts.hosts[name]
     hops = [hop for hop in hosts.hops if name in (hop.sender, hop.receiver)]
     return SessionSettings(
@@ -75,17 +75,17 @@ def session_of(hosts: Hosts, name: str) -> SessionSettings:
 
 
 def key_of(hop: Hop) -> str:
-    """The key that a hop's messages are published under."""
+    """Zenoh key of a hop's messages."""
     return f"{ROOT}/{hop.sender}/{hop.receiver}/{hop.producer}/{hop.output}"
 
 
-def clock_key(asked: str, asker: str) -> str:
-    """The key under which one host asks another for its time."""
-    return f"{ROOT}/clock/{asked}/{asker}"
+def clock_key(replier: str, requester: str) -> str:
+    """Zenoh key of the time requests from one host to another."""
+    return f"{ROOT}/clock/{replier}/{requester}"
 
 
 def config_of(session: SessionSettings) -> dict[str, Any]:
-    """Zenoh's configuration."""
+    """Configuration of Zenoh."""
     certificate, key = str(session.certificate), str(session.key)
     tls = {
         "root_ca_certificate": str(session.authority),
@@ -120,25 +120,25 @@ def config_of(session: SessionSettings) -> dict[str, Any]:
 
 
 def access_control(session: SessionSettings) -> dict[str, Any]:
-    """Who may say what on this host's lines: nothing that is not named here."""
+    """Access rules for the other hosts; everything else is denied."""
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
     for other in session.others:
         me = session.host
-        theirs = [key for sender, _, key in session.keys if sender == other]
-        ours = [key for _, receiver, key in session.keys if receiver == other]
-        asks_us, we_ask = [clock_key(me, other)], [clock_key(other, me)]
+        incoming = [key for sender, _, key in session.keys if sender == other]
+        outgoing = [key for _, receiver, key in session.keys if receiver == other]
+        requests_in, requests_out = [clock_key(me, other)], [clock_key(other, me)]
         allowed = {
-            ("ingress", "put"): theirs,
-            ("ingress", "declare_subscriber"): ours,
-            ("ingress", "query"): asks_us,
-            ("ingress", "declare_queryable"): we_ask,
-            ("ingress", "reply"): we_ask,
-            ("egress", "put"): ours,
-            ("egress", "declare_subscriber"): theirs,
-            ("egress", "query"): we_ask,
-            ("egress", "declare_queryable"): asks_us,
-            ("egress", "reply"): asks_us,
+            ("ingress", "put"): incoming,
+            ("ingress", "declare_subscriber"): outgoing,
+            ("ingress", "query"): requests_in,
+            ("ingress", "declare_queryable"): requests_out,
+            ("ingress", "reply"): requests_out,
+            ("egress", "put"): outgoing,
+            ("egress", "declare_subscriber"): incoming,
+            ("egress", "query"): requests_out,
+            ("egress", "declare_queryable"): requests_in,
+            ("egress", "reply"): requests_in,
         }
         own = [
             {

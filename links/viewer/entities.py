@@ -6,7 +6,7 @@ Source: ours, for the API of Rerun 0.41; DESIGN, Links.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -16,8 +16,14 @@ from numpy.typing import NDArray
 from links.viewer import colours
 from stages.geometry.frames import quaternions_xyzw
 
-if TYPE_CHECKING:
-    from links.viewer.scene import Scene
+
+class StateMemory(Protocol):
+    """The part of the scene that remembers the last value of each state."""
+
+    def changed(self, path: str, value: str) -> bool:
+        """Whether `value` differs from the last one of `path`; stores it."""
+        ...
+
 
 CHI2_3D_95 = 7.814727903  # 95 % quantile of the chi-square distribution with 3 degrees of freedom
 
@@ -131,7 +137,7 @@ def log_entry(name: str, text: str, level: str = "INFO") -> Entity:
     return Entity(f"log/{name}", rr.TextLog(text, level=level))
 
 
-def state_change(path: str, value: str, scene: Scene) -> Entities:
+def state_change(path: str, value: str, scene: StateMemory) -> Entities:
     """The new value of a state lane; nothing when it equals the last one."""
     if scene.changed(path, value):
         yield Entity(path, rr.StateChange(state=value), style=_state_style)

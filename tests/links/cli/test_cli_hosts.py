@@ -135,7 +135,7 @@ def test_two_commands_run_one_graph_on_two_hosts(tmp_path):
     assert told["base"]["counters"]["ticker"]["received"] > 10
     again = grd("replay", tmp_path / "base" / "flight.mcap", "--as-live", "--out", tmp_path / "again")
     assert again.exit_code == 2
-    assert "is what host 'base' recorded of a run on several hosts" in again.output.replace("\n", " ")
+    assert "was recorded on host 'base' of a run on several hosts" in again.output.replace("\n", " ")
 
 
 def wait_for_numbers(recording, running):

@@ -113,7 +113,7 @@ def test_a_repetition_that_differs_is_a_finding(grd, tmp_path, monkeypatch):
 
 def test_what_cannot_be_repeated_says_why(grd):
     street = ROOT / "recordings" / "street_sweep.mcap"
-    assert "no live run's recording" in grd("replay", street, "--as-live", code=2).replace("\n", " ")
+    assert "is not the recording of a live run" in grd("replay", street, "--as-live", code=2).replace("\n", " ")
     text = grd("replay", street, "--as-live", "--set", "track.radius_m=2", code=2)
     assert "--as-live takes the recording's own configuration" in text
 

@@ -373,8 +373,8 @@ def test_a_drone_met_a_pass_later_where_it_says_it_would_be_goes_on_with_its_evi
 def test_what_was_met_once_flies_on_at_the_speed_that_the_drone_says_nobody_knows_whither():
     for say, speed_mps in ((saying(PASSING_BY), 3.0), (None, 0.0)):
         candidates, _ = run([Drone(PASSING_BY)], seconds=1.0, say=say)
-        once = [told.undirected_speed_mps[told.looks == 1] for told in candidates]
-        more = [told.undirected_speed_mps[told.looks > 1] for told in candidates]
+        once = [told.undirected_speed_mps[told.scan_passes == 1] for told in candidates]
+        more = [told.undirected_speed_mps[told.scan_passes > 1] for told in candidates]
         np.testing.assert_allclose(np.concatenate(once), speed_mps, atol=0.01)
         assert np.concatenate(once).size
         assert not np.concatenate(more).any()

@@ -79,7 +79,7 @@ def test_a_drone_that_hardly_moves_is_met_where_it_was():
 
 def test_nothing_is_met_by_what_was_not_worth_a_look_or_while_the_drone_was_silent():
     now = observation(PAUSE_S, BEFORE_M + PAUSE_S * SAID_MPS)
-    assert reacquire([seen_before(told=False)], now, telemetry()) is None
+    assert reacquire([seen_before(is_promising=False)], now, telemetry()) is None
     assert reacquire([seen_before()], now, DroneTelemetry()) is None
     assert reacquire([], now, telemetry()) is None
 

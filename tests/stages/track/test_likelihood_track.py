@@ -236,7 +236,7 @@ def test_misses_make_the_estimate_better_and_its_covariance_truer():
     square, nees = {True: [], False: []}, {True: [], False: []}
     for misses in (True, False):
         for seed in range(3):
-            fixes = fixes_of(run([Drone(PASSING, seed=seed)], [accepted(here(PASSING))], misses=misses))
+            fixes = fixes_of(run([Drone(PASSING, seed=seed)], [accepted(here(PASSING))], use_pass_throughs=misses))
             errors = errors_m(fixes, PASSING)
             square[misses] += np.sum(errors**2, axis=1).tolist()
             nees[misses] += [e @ np.linalg.solve(f.covariance_m2, e) for e, f in zip(errors, fixes, strict=True)]
@@ -309,7 +309,14 @@ def test_what_is_refused_beside_a_track_costs_it_nothing_while_its_own_candidate
         reasons=one.reasons + other.reasons,
         **{
             name: np.concatenate([getattr(one, name), getattr(other, name)])
-            for name in ("candidate_id", "xyz_vehicle_m", "velocity_vehicle_mps", "probability", "seen_ns", "looks")
+            for name in (
+                "candidate_id",
+                "xyz_vehicle_m",
+                "velocity_vehicle_mps",
+                "probability",
+                "seen_ns",
+                "scan_passes",
+            )
         },
     )
     out = run([Drone(way)], [accepted(here(way)), both], 2.0)

@@ -44,7 +44,7 @@ def taught(seconds=4.0, seen=circle, flown=circle, yaw_rad=YAW_RAD):
     motion = OdometryMotionModel(0)
     for k in range(round(seconds / 0.02) + 1):
         t_s = 0.02 * k
-        motion.told.add(at_ns(t_s), *told(t_s, flown, yaw_rad))
+        motion.telemetry.add(at_ns(t_s), *told(t_s, flown, yaw_rad))
         if k % 5 == 0 and k:
             motion.learn(1, at_ns(t_s), seen(t_s)[0], 0.1)
     return motion
@@ -183,7 +183,7 @@ def test_a_frame_that_was_turned_is_noticed_and_its_yaw_learnt_anew(counts):
         t_s, yaw_rad = 4.0 + 0.02 * k, YAW_RAD + math.pi / 2
         place = told(4.0)[0]  # no step that its place would show
         velocity = told(4.0)[1] if counts else told(t_s, yaw_rad=yaw_rad)[1]
-        motion.told.add(at_ns(t_s), place, velocity, 1 if counts else None)
+        motion.telemetry.add(at_ns(t_s), place, velocity, 1 if counts else None)
     after = motion.sample(at_ns(4.06))
     assert before is not None
     assert after is not None
@@ -200,7 +200,7 @@ def test_the_next_track_begins_with_the_yaw_of_the_last():
     motion = taught()
     first = motion._moments[0]
     motion.learn(2, at_ns(4.0), circle(4.0)[0], 0.1)  # one place alone says nothing
-    motion.told.add(at_ns(4.02), *told(4.02))
+    motion.telemetry.add(at_ns(4.02), *told(4.02))
     motion.learn(2, at_ns(4.15), circle(4.15)[0], 0.1)
     assert abs(motion._moments[0]) > 0.7
     assert abs(np.angle(motion._moments[0]) - np.angle(first)) < 0.1

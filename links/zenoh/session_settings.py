@@ -3,14 +3,12 @@
 - Mode `router` at the hub, `client` at the other hosts, no scouting: one connection from each host to the hub.
 - TLS only, with certificates at both ends; the hub's contains its address. Only hosts of the authority are accepted.
 - Access control at both ends by the certificate's common name, default deny: a host may publish only the keys of its
-  own
-  nodes, and the clients accept only the hub.
+  own nodes, and the clients accept only the hub.
 - so_sndbuf 64 kB: bytes in the kernel's buffer cannot be dropped, and at 30 Mbit/s 2 MB are half a second.
 - lease 2 s with 100 keep-alives, one per 20 ms: Zenoh does not flush its TLS stream. When the socket was full, the last
   64 kB of a message wait for the next write, such as a keep-alive. With the default, messages arrived 2.5 s late.
 - wait_before_close 3 s: a message (complete, not each fragment) that is not sent by then closes the connection, which
-  is
-  then reopened. Therefore 2 MB need 5.3 Mbit/s, and a broken connection blocks a sender for that time.
+  is then reopened. Therefore 2 MB need 5.3 Mbit/s, and a broken connection blocks a sender for that time.
 - Connect without timeout: otherwise a client with a broken connection stops reconnecting.
 
 Source: https://zenoh.io/docs/manual/access-control and /tls, Zenoh 1.10.2's defaults, and measurements

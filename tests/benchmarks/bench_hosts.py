@@ -1,4 +1,4 @@
-"""Hosts: what the codec costs beside pickle, what a hop over loopback TLS adds beside one process, and what goes through.
+"""Hosts: codec time compared with pickle, added latency of a hop over loopback TLS, and throughput.
 
 pytest tests/benchmarks/bench_hosts.py -s
 """
@@ -20,13 +20,13 @@ sys.path.append(str(Path(__file__).parents[1] / "links" / "zenoh"))
 from socket import SOCK_STREAM
 
 from certificates import make_all, need_openssl
-from hosts_running import HostProcess, write_config, write_hosts
+from host_processes import HostProcess, write_config, write_hosts
 
 from tests.links.ports import free_port
 
 PULSES = 384
 MESSAGES = {
-    "picture 1440 px": Image(stamp_ns=1, frame_id="camera_drone", grey=np.zeros((1440, 1440), np.uint8)),
+    "image 1440 px": Image(stamp_ns=1, frame_id="camera_drone", grey=np.zeros((1440, 1440), np.uint8)),
     "a packet's pulses": SweptPulses(
         stamp_ns=1,
         point_stamp_ns=np.zeros(PULSES, np.int64),
@@ -68,50 +68,50 @@ def test_pickle_loads(benchmark, name):
     benchmark(pickle.loads, pickle.dumps(MESSAGES[name], pickle.HIGHEST_PROTOCOL))
 
 
-def lateness(lines: list[dict], field: str) -> str:
+def latency(lines: list[dict], field: str) -> str:
     late_ms = sorted(line[field] for line in lines)
     return f"p50 {late_ms[len(late_ms) // 2]:.2f}, p99 {late_ms[int(len(late_ms) * 0.99)]:.2f} ms of {len(late_ms)}"
 
 
-def place(host: str) -> dict[str, str]:
-    return {"beats": "drone", "echo": host, "teller": host}
+def placement(host: str) -> dict[str, str]:
+    return {"beats": "drone", "echo": host, "sink": host}
 
 
 @pytest.mark.parametrize("size_px", [64, 720, 1440])
-def test_what_a_hop_adds(tmp_path, capsys, size_px):
-    """Small messages at 100 Hz and pictures at 10 Hz, from the source to the sink: in one process, and over a hop."""
+def test_latency_of_a_hop(tmp_path, capsys, size_px):
+    """Small messages at 100 Hz and images at 10 Hz from source to sink, in one process and over a hop."""
     need_openssl()
     make_all(tmp_path)
     config = write_config(tmp_path, size_px=size_px)
-    hosts = write_hosts(tmp_path, f"127.0.0.1:{free_port(SOCK_STREAM)}", place("vehicle"))
+    hosts = write_hosts(tmp_path, f"127.0.0.1:{free_port(SOCK_STREAM)}", placement("vehicle"))
     with HostProcess(config, Path("-"), "all") as one:
-        one.wait_for("picture", 5)
+        one.wait_for("image", 5)
         one.lines.clear()
-        one.wait_for("picture", 100, 60.0)
+        one.wait_for("image", 100, 60.0)
     with HostProcess(config, hosts, "vehicle") as vehicle, HostProcess(config, hosts, "drone"):
-        vehicle.wait_for("picture", 5)
+        vehicle.wait_for("image", 5)
         vehicle.lines.clear()
-        vehicle.wait_for("picture", 100, 60.0)
-        uncertain_us = vehicle.report()["counters"]["beats"]["clock uncertainty [us]"]
+        vehicle.wait_for("image", 100, 60.0)
+        uncertainty_us = vehicle.report()["counters"]["beats"]["clock uncertainty [us]"]
     with capsys.disabled():
-        sys.stdout.write(f"\n{size_px} px, clock uncertainty {uncertain_us} us\n")
-        for kind, field in (("beat", "true_late_ms"), ("picture", "late_ms")):
-            sys.stdout.write(f"  {kind}: one process {lateness(one.of(kind), field)};")
-            sys.stdout.write(f" over a hop {lateness(vehicle.of(kind), field)}\n")
+        sys.stdout.write(f"\n{size_px} px, clock uncertainty {uncertainty_us} us\n")
+        for kind, field in (("beat", "true_late_ms"), ("image", "late_ms")):
+            sys.stdout.write(f"  {kind}: one process {latency(one.of(kind), field)};")
+            sys.stdout.write(f" over a hop {latency(vehicle.of(kind), field)}\n")
 
 
-def test_what_goes_through(tmp_path, capsys):
-    """Pictures of 1440 px as fast as two cores make, check, encrypt and show them."""
+def test_throughput(tmp_path, capsys):
+    """Images of 1440 px at the maximum rate of two cores."""
     need_openssl()
     make_all(tmp_path)
     config = write_config(tmp_path, rate_hz=200.0, every=1, size_px=1440)
-    hosts = write_hosts(tmp_path, f"127.0.0.1:{free_port(SOCK_STREAM)}", place("vehicle"))
+    hosts = write_hosts(tmp_path, f"127.0.0.1:{free_port(SOCK_STREAM)}", placement("vehicle"))
     with HostProcess(config, hosts, "vehicle") as vehicle, HostProcess(config, hosts, "drone") as drone:
-        vehicle.wait_for("picture", 5)
+        vehicle.wait_for("image", 5)
         vehicle.lines.clear()
         before, begin_s = drone.report()["counters"]["to_vehicle"]["sent bytes"], time.monotonic()
-        vehicle.wait_for("picture", 200, 60.0)
+        vehicle.wait_for("image", 200, 60.0)
         sent, took_s = drone.report()["counters"]["to_vehicle"]["sent bytes"] - before, time.monotonic() - begin_s
     with capsys.disabled():
-        late = lateness(vehicle.of("picture"), "late_ms")
-        sys.stdout.write(f"\n{sent / took_s / 1e6:.0f} MB/s, {200 / took_s:.0f} pictures/s, {late}\n")
+        late = latency(vehicle.of("image"), "late_ms")
+        sys.stdout.write(f"\n{sent / took_s / 1e6:.0f} MB/s, {200 / took_s:.0f} images/s, {late}\n")

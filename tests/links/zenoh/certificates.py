@@ -1,4 +1,4 @@
-"""An authority and hosts' certificates, made as links/zenoh/README.md says, with the openssl command."""
+"""Creates an authority and certificates of hosts with openssl, as links/zenoh/README.md describes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 def need_openssl() -> None:
     if shutil.which("openssl") is None:
-        pytest.skip("the openssl command makes the certificates of this test")
+        pytest.skip("this test needs the openssl command")
 
 
 def run(*command: str | Path) -> None:
@@ -41,23 +41,23 @@ def make_authority(folder: Path, name: str = "ca") -> None:
 def make_host(
     folder: Path, name: str, address: str | None = None, authority: str = "ca", file: str | None = None
 ) -> None:
-    """`address`: of the hub, which alone may be a server."""
+    """`address`: of the hub, the only server."""
     stem = folder / (file or name)
-    key, request, said = stem.with_suffix(".key"), stem.with_suffix(".csr"), stem.with_suffix(".ext")
+    key, request, extensions = stem.with_suffix(".key"), stem.with_suffix(".csr"), stem.with_suffix(".ext")
     run("openssl", "genpkey", "-algorithm", "EC", "-pkeyopt", "ec_paramgen_curve:P-256", "-out", key)
     run("openssl", "req", "-new", "-key", key, "-subj", f"/CN={name}", "-out", request)
     use = "extendedKeyUsage=clientAuth\n" if address is None else "extendedKeyUsage=clientAuth,serverAuth\n"
     alternative = f"subjectAltName=DNS:{name}" if address is None else f"subjectAltName=DNS:{name},IP:{address}"
-    said.write_text(f"basicConstraints=CA:FALSE\n{use}{alternative}\n")
+    extensions.write_text(f"basicConstraints=CA:FALSE\n{use}{alternative}\n")
     ca = folder / authority
     run(
         "openssl", "x509", "-req", "-in", request, "-CA", ca.with_suffix(".pem"), "-CAkey", ca.with_suffix(".key"),
-        "-CAcreateserial", "-days", "30", "-extfile", said, "-out", stem.with_suffix(".pem"),
+        "-CAcreateserial", "-days", "30", "-extfile", extensions, "-out", stem.with_suffix(".pem"),
     )  # fmt: skip
 
 
 def make_all(folder: Path, address: str = "127.0.0.1") -> None:
-    """An authority, vehicle (the hub), drone and base; and an authority of somebody else with a drone of its own."""
+    """An authority with vehicle (the hub), drone and base, and a second authority with a drone (rogue)."""
     make_authority(folder)
     make_host(folder, "vehicle", address)
     make_host(folder, "drone")

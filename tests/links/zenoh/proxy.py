@@ -1,4 +1,4 @@
-"""A TCP proxy in front of a port: it can cut the line (as a pulled cable: nothing moves) and mend it again."""
+"""A TCP proxy that can interrupt the connection without closing it, as an unplugged cable does, and restore it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ BUFFER_BYTES = 16_384
 
 
 class Proxy:
-    """`with Proxy(port) as proxy`: what comes to proxy.port goes to port."""
+    """`with Proxy(port) as proxy`: forwards proxy.port to port."""
 
     def __init__(self, port: int) -> None:
         self._to = port
@@ -19,8 +19,8 @@ class Proxy:
         self._listening.bind(("127.0.0.1", 0))
         self._listening.listen()
         self.port = self._listening.getsockname()[1]
-        self._whole = threading.Event()
-        self._whole.set()
+        self._forwarding = threading.Event()
+        self._forwarding.set()
         self._sockets: list[socket.socket] = []
         self._closed = False
 
@@ -30,17 +30,17 @@ class Proxy:
 
     def __exit__(self, *_: object) -> None:
         self._closed = True
-        self._whole.set()
+        self._forwarding.set()
         self._close([self._listening, *self._sockets])
 
-    def cut(self) -> None:
-        """Nothing goes through any more, and nobody is told."""
-        self._whole.clear()
+    def interrupt(self) -> None:
+        """Stop forwarding; both connections stay open."""
+        self._forwarding.clear()
 
-    def mend(self) -> None:
-        """The old connections are gone, new ones go through."""
+    def restore(self) -> None:
+        """Close the old connections and accept new ones."""
         old, self._sockets = self._sockets, []
-        self._whole.set()
+        self._forwarding.set()
         self._close(old)
 
     def _accept(self) -> None:
@@ -56,8 +56,8 @@ class Proxy:
 
     def _pump(self, source: socket.socket, sink: socket.socket) -> None:
         with contextlib.suppress(OSError):
-            while self._whole.wait() and (data := source.recv(BUFFER_BYTES)):
-                self._whole.wait()
+            while self._forwarding.wait() and (data := source.recv(BUFFER_BYTES)):
+                self._forwarding.wait()
                 sink.sendall(data)
         self._close([source, sink])
 

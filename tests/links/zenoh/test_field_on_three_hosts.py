@@ -1,10 +1,10 @@
-"""The field's stack against the simulated rig on three hosts: the vehicle's, the drone's with the autopilot, a base that sees.
+"""The field configuration against the simulated rig on three hosts: vehicle, drone with autopilot, and a base station.
 
     python -m pytest -m slow -s tests/links/zenoh/test_field_on_three_hosts.py
 
-Three processes of this machine with certificates of their own, each by the user's command. What the autopilot says
-crosses to the vehicle and the fused poses back to it; the base gets what it is to see. With both cameras, the drone's
-vanishing points and odometry on the drone's host: GRD_SOAK_PICTURES, as in tests/links/test_live_soak.py.
+Three processes of this machine with separate certificates, each started by `grd run`. The autopilot's messages are sent
+to the vehicle, the fused poses back to the drone, and the tapped messages to the base. With both cameras, the drone's
+vanishing points and odometry on the drone's host: GRD_SOAK_IMAGES, as in tests/links/test_live_soak.py.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e 
 pytest.importorskip("zenoh", reason="several hosts need eclipse-zenoh: pip install -e '.[hosts]'")
 
 ROOT = Path(__file__).resolve().parents[3]
-PICTURES = os.environ.get("GRD_SOAK_PICTURES")
-FLY_S, PATIENCE_S = 45.0, 240.0
+IMAGES = os.environ.get("GRD_SOAK_IMAGES")
+FLIGHT_S, TIMEOUT_S = 45.0, 240.0
 ON_DRONE = {"autopilot", "camera_drone", "vp_drone", "drone_odometry"}
 
 
@@ -39,24 +39,24 @@ def overlay(folder: Path) -> dict:
     names = ("lidar", "position", "odometry", "autopilot", "viewer", "vehicle", "drone")
     ports = dict(zip(names, free_ports(len(names)), strict=True))
     links = {
-        "sim": {"autopilot_port": ports["autopilot"], "duration_s": PATIENCE_S},
+        "sim": {"autopilot_port": ports["autopilot"], "duration_s": TIMEOUT_S},
         "lidar": {"port": ports["lidar"], "position_port": ports["position"]},
         "servo": {"port": str(folder / "servo")},
         "odometry": {"port": ports["odometry"]},
         "autopilot": {"connection": f"udpin:127.0.0.1:{ports['autopilot']}"},
         "viewer": {"port": ports["viewer"], "file": "run.rrd"},
     }
-    if PICTURES is not None:
+    if IMAGES is not None:
         cameras = {name: ports[name] for name in ("vehicle", "drone")}
-        links["sim"] |= {"images": str(Path(PICTURES).resolve()), "camera_ports": cameras}
+        links["sim"] |= {"images": str(Path(IMAGES).resolve()), "camera_ports": cameras}
         links |= {f"camera_{name}": {"source": f"http://127.0.0.1:{port}/"} for name, port in cameras.items()}
     return {"links": {name: {"config": config} for name, config in links.items()}}
 
 
-def test_the_fields_stack_flies_on_three_hosts(tmp_path):
+def test_field_configuration_on_three_hosts(tmp_path):
     need_openssl()
     make_all(tmp_path)
-    config = ROOT / "configs" / ("sim_live.yaml" if PICTURES is None else "sim_live_cameras.yaml")
+    config = ROOT / "configs" / ("sim_live.yaml" if IMAGES is None else "sim_live_cameras.yaml")
     (tmp_path / "overlay.yaml").write_text(yaml.safe_dump(overlay(tmp_path)))
     host = {
         name: {"certificate": f"{name}.pem", "key": f"{name}.key", "authority": "ca.pem"}
@@ -74,25 +74,25 @@ def test_the_fields_stack_flies_on_three_hosts(tmp_path):
         command += ["--hosts", str(tmp_path / "hosts.yaml"), "--host", name]
         with (tmp_path / f"{name}.txt").open("w") as log:
             running[name] = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT)
-    flight, deadline_s = tmp_path / "on_vehicle" / "pose_vehicle_drone.tum", time.monotonic() + PATIENCE_S
-    while not (flight.exists() and flight.stat().st_size > 2000):  # a first position
-        assert all(process.poll() is None for process in running.values()), said(tmp_path)
-        assert time.monotonic() < deadline_s, said(tmp_path)
+    flight, deadline_s = tmp_path / "on_vehicle" / "pose_vehicle_drone.tum", time.monotonic() + TIMEOUT_S
+    while not (flight.exists() and flight.stat().st_size > 2000):  # the first position
+        assert all(process.poll() is None for process in running.values()), logs(tmp_path)
+        assert time.monotonic() < deadline_s, logs(tmp_path)
         time.sleep(0.2)
-    time.sleep(FLY_S)
+    time.sleep(FLIGHT_S)
     for process in running.values():
         process.send_signal(signal.SIGINT)
-    assert [process.wait(60) for process in running.values()] == [0, 0, 0], said(tmp_path)
-    told = {name: json.loads((tmp_path / f"on_{name}" / "summary.json").read_text()) for name in running}
-    poses, sent = told["vehicle"]["poses"]["states"], told["drone"]["counters"]["autopilot"]
-    crossed = {name: told[name]["counters"] for name in running}
-    sys.stdout.write(f"\n{poses}\n{told['vehicle']['truth_errors']}\n{json.dumps(crossed, indent=1)}\n")
+    assert [process.wait(60) for process in running.values()] == [0, 0, 0], logs(tmp_path)
+    summaries = {name: json.loads((tmp_path / f"on_{name}" / "summary.json").read_text()) for name in running}
+    poses, sent = summaries["vehicle"]["poses"]["states"], summaries["drone"]["counters"]["autopilot"]
+    counters = {name: summaries[name]["counters"] for name in running}
+    sys.stdout.write(f"\n{poses}\n{summaries['vehicle']['truth_errors']}\n{json.dumps(counters, indent=1)}\n")
     assert poses.get("FULL", 0) > 300
-    assert told["vehicle"]["truth_errors"]["rmse_3d_m"] < 0.15
-    assert sent["sent: ODOMETRY"] > 200, "good poses came back to the autopilot"
-    assert told["base"]["counters"]["fuse"]["received"] > 1000
+    assert summaries["vehicle"]["truth_errors"]["rmse_3d_m"] < 0.15
+    assert sent["sent: ODOMETRY"] > 200, "accurate poses are sent to the autopilot"
+    assert summaries["base"]["counters"]["fuse"]["received"] > 1000
     assert (tmp_path / "on_base" / "run.rrd").stat().st_size > 10_000
 
 
-def said(folder: Path) -> str:
+def logs(folder: Path) -> str:
     return "\n".join(f"{file.name}: {file.read_text()[-1500:]}" for file in sorted(folder.glob("*.txt")))

@@ -1,6 +1,7 @@
-"""One host of a test as a process of its own: `host_process.py CONFIG HOSTS NAME [clock ahead in s]`.
+"""One host of a test as a process: `run_host.py CONFIG HOSTS NAME [clock ahead in s]`.
 
-Runs its part of the graph live; without a hosts file (`-`) all of it. Lines come in on stdin: `report` answers with a line of counters, end of file stops.
+Runs its part of the graph live; without a hosts file (`-`) the whole graph. Reads stdin: `report` prints a line of
+counters, end of file stops the host.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 
 ahead_ns = round(float(sys.argv[4]) * 1e9) if len(sys.argv) > 4 else 0
 wall_ns = time.time_ns
-time.time_ns = lambda: wall_ns() + ahead_ns  # before anything reads it: this host's clock was set wrongly
+time.time_ns = lambda: wall_ns() + ahead_ns  # before the first use: the clock of this host is wrong
 
 from flow.graph import load_graph  # noqa: E402
 from flow.live import Live  # noqa: E402
@@ -20,7 +21,7 @@ from links.clock.host_time import now_ns  # noqa: E402
 from links.zenoh import host_graph  # noqa: E402
 
 
-def say(**what: object) -> None:
+def print_line(**what: object) -> None:
     sys.stdout.write(json.dumps(what) + "\n")
     sys.stdout.flush()
 
@@ -31,16 +32,16 @@ def main() -> None:
         graph = host_graph(graph, Path(sys.argv[2]), sys.argv[3])
     live = Live(graph, now_ns=now_ns)
     live.start()
-    say(kind="started")
+    print_line(kind="started")
     for line in sys.stdin:
         if line.strip() == "report":
             report = live.report()
             statuses = {name: link.status for name, link in live.nodes.items() if link.status}
             events = [str(event) for event in report.events]
-            say(kind="report", counters=report.counters, statuses=statuses, events=events)
+            print_line(kind="report", counters=report.counters, statuses=statuses, events=events)
     begin_s = time.monotonic()
     live.stop()
-    say(kind="stopped", took_s=time.monotonic() - begin_s)
+    print_line(kind="stopped", took_s=time.monotonic() - begin_s)
 
 
 main()

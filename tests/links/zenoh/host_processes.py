@@ -1,4 +1,4 @@
-"""Starts hosts as processes, in this machine's own network or in network namespaces, and reads what they tell."""
+"""Starts hosts as processes, in the network of this machine or in network namespaces, and reads their output."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ ROOT = HERE.parents[2]
 
 CONFIG = """
 stages:
-  echo: {use: crossing_toys.Echo, inputs: {beat: beats.beat}}
+  echo: {use: example_nodes.Echo, inputs: {beat: beats.beat}}
 links:
-  beats: {use: crossing_toys.Beats, config: {rate_hz: RATE, every: EVERY, size_px: SIZE}}
-  teller: {use: crossing_toys.Teller, inputs: {beat: echo.beat, picture: beats.picture}}
+  beats: {use: example_nodes.Beats, config: {rate_hz: RATE, every: EVERY, size_px: SIZE}}
+  sink: {use: example_nodes.PrintSink, inputs: {beat: echo.beat, image: beats.image}}
 """
 
 
@@ -41,11 +41,11 @@ def write_hosts(
     drone: str = "drone",
 ) -> Path:
     files = "certificate: {0}.pem, key: {0}.key, authority: {1}.pem"
-    also = f", connect: 'tls/{connect}'" if connect else ""
+    connecting = f", connect: 'tls/{connect}'" if connect else ""
     authority = "ca" if drone == "drone" else f"{drone}_ca"
     text = "hosts:\n"
     text += f"  vehicle: {{listen: 'tls/{listen}', {files.format('vehicle', 'ca')}}}\n"
-    text += f"  drone: {{{files.format(drone, 'ca')}{also}}}\n".replace("CA", authority)
+    text += f"  drone: {{{files.format(drone, 'ca')}{connecting}}}\n".replace("CA", authority)
     text += f"  base: {{{files.format('base', 'ca')}}}\n"
     text += "placement: {" + ", ".join(f"{node}: {host}" for node, host in placement.items()) + "}\n"
     file = folder / name
@@ -54,17 +54,17 @@ def write_hosts(
 
 
 class HostProcess:
-    """One host; `lines` are what it told so far."""
+    """One host; `lines` is its output so far."""
 
     def __init__(
         self, config: Path, hosts: Path, name: str, ahead_s: float = 0.0, namespace: str | None = None
     ) -> None:
         inside = ["ip", "netns", "exec", namespace] if namespace else []
-        command = [*inside, sys.executable, str(HERE / "host_process.py"), str(config), str(hosts), name, str(ahead_s)]
+        command = [*inside, sys.executable, str(HERE / "run_host.py"), str(config), str(hosts), name, str(ahead_s)]
         environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{HERE}", "OMP_NUM_THREADS": "1"}
         self.name = name
         self.lines: list[dict[str, Any]] = []
-        self._news: queue.Queue[dict[str, Any] | None] = queue.Queue()
+        self._unread: queue.Queue[dict[str, Any] | None] = queue.Queue()
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
         )
@@ -82,22 +82,22 @@ class HostProcess:
     def _read(self) -> None:
         assert self._process.stdout
         for line in self._process.stdout:
-            self._news.put(json.loads(line))
-        self._news.put(None)
+            self._unread.put(json.loads(line))
+        self._unread.put(None)
 
-    def until(self, wanted: Callable[[dict[str, Any]], bool], within_s: float = 60.0) -> dict[str, Any]:
-        """The first new line that is wanted."""
+    def until(self, condition: Callable[[dict[str, Any]], bool], within_s: float = 60.0) -> dict[str, Any]:
+        """The first new line that satisfies the condition."""
         end_s = time.monotonic() + within_s
         while True:
             try:
-                line = self._news.get(timeout=max(end_s - time.monotonic(), 0.001))
+                line = self._unread.get(timeout=max(end_s - time.monotonic(), 0.001))
             except queue.Empty:
-                raise AssertionError(f"{self.name} did not tell it within {within_s} s: {self.lines[-3:]}") from None
+                raise AssertionError(f"{self.name} did not print it within {within_s} s: {self.lines[-3:]}") from None
             if line is None:
                 assert self._process.stderr
                 raise AssertionError(f"{self.name} ended: {self._process.stderr.read()[-3000:]}")
             self.lines.append(line)
-            if wanted(line):
+            if condition(line):
                 return line
 
     def of(self, kind: str) -> list[dict[str, Any]]:
@@ -109,24 +109,24 @@ class HostProcess:
         return [self.until(lambda line: line["kind"] == kind, within_s) for _ in range(count)]
 
     def report(self) -> dict[str, Any]:
-        """Counters, statuses and events now."""
+        """Current counters, statuses and events."""
         assert self._process.stdin
         self._process.stdin.write("report\n")
         self._process.stdin.flush()
         return self.wait_for("report")[0]
 
     def until_status(self, node: str, wanted: str | None, within_s: float = 60.0) -> str | None:
-        """A node's status, once it has the words `wanted`; None: once it has none."""
+        """The status of a node, once it contains `wanted`; None: once there is none."""
         end_s = time.monotonic() + within_s
         while True:
-            said = self.report()["statuses"].get(node)
-            if (said is None) == (wanted is None) and (wanted is None or wanted in said):
-                return said
-            assert time.monotonic() < end_s, f"{self.name}.{node}: {said}"
+            status = self.report()["statuses"].get(node)
+            if (status is None) == (wanted is None) and (wanted is None or wanted in status):
+                return status
+            assert time.monotonic() < end_s, f"{self.name}.{node}: {status}"
             time.sleep(0.1)
 
     def stop(self) -> float:
-        """End it as a user does. How long its stop took."""
+        """Stop the host as a user does; returns the time it took [s]."""
         assert self._process.stdin
         self._process.stdin.close()
         took_s = self.wait_for("stopped")[0]["took_s"]

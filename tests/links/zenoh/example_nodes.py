@@ -1,4 +1,4 @@
-"""A source that beats and takes pictures, and a sink that tells what came: the two ends of edges that cross hosts."""
+"""A source of small and large messages and a sink that prints them: the ends of edges between hosts."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class Beat(Message):
     """A small message."""
 
     number: int
-    monotonic: int  # the clock that all processes of a machine share, read with the stamp
+    monotonic: int  # clock shared by all processes of the machine, read with the stamp
     earlier_ns: int
 
 
 @message
-class Picture(Message):
-    """A big one, with noise that no line compresses."""
+class Image(Message):
+    """A large message of noise, which cannot be compressed."""
 
     number: int
     grey: Annotated[NDArray[np.uint8], Shape("h", "w")]
@@ -46,13 +46,13 @@ class BeatsSettings(SourceSettings):
 
 
 class Beats(Source[BeatsSettings]):
-    """Gives a beat, and each `every` beats a picture."""
+    """Publishes beats, and an image every `every` beats."""
 
     def __init__(self, settings: BeatsSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._number: int = 0
 
-    def decode(self, record: Record) -> Iterator[Beat | Picture]:
+    def decode(self, record: Record) -> Iterator[Beat | Image]:
         settings = self.settings
         self._number += 1
         yield Beat(
@@ -63,7 +63,7 @@ class Beats(Source[BeatsSettings]):
         )
         if self._number % settings.every == 0:
             noise = np.random.default_rng(self._number).integers(0, 255, (settings.size_px, settings.size_px), np.uint8)
-            yield Picture(stamp_ns=record.stamp_ns, number=self._number, grey=noise)
+            yield Image(stamp_ns=record.stamp_ns, number=self._number, grey=noise)
 
     @contextmanager
     def listen(self) -> Iterator[Iterator[Record]]:
@@ -83,28 +83,28 @@ class Beats(Source[BeatsSettings]):
 
 
 class Echo(Stage):
-    """Gives each beat back: its way there and back is a cycle through hosts."""
+    """Returns each beat: a cycle through two hosts."""
 
     def on_beat(self, beat: Beat) -> Beat:
         return beat
 
 
-class Teller(Link):
-    """Writes a line of JSON for each message: what came, how late, and how wrong its stamp is by the shared clock."""
+class PrintSink(Link):
+    """Prints a line of JSON per message: kind, number, age by its stamp, and age by the shared clock."""
 
-    optional_inputs = frozenset({"beat", "picture"})
+    optional_inputs = frozenset({"beat", "image"})
 
     def on_beat(self, beat: Beat) -> None:
-        self._tell("beat", beat, beat.monotonic)
+        self._print("beat", beat, beat.monotonic)
 
-    def on_picture(self, picture: Picture) -> None:
-        self._tell("picture", picture, None)
+    def on_image(self, image: Image) -> None:
+        self._print("image", image, None)
 
-    def _tell(self, kind: str, told: Beat | Picture, monotonic: int | None) -> None:
+    def _print(self, kind: str, received: Beat | Image, monotonic: int | None) -> None:
         here_ns, here_monotonic = now_ns(), time.monotonic_ns()
-        said = {"kind": kind, "number": told.number, "late_ms": (here_ns - told.stamp_ns) / 1e6}
-        if isinstance(told, Beat) and monotonic is not None:
-            said["true_late_ms"] = (here_monotonic - monotonic) / 1e6
-            said["earlier_ms"] = (told.stamp_ns - told.earlier_ns) / 1e6
-        sys.stdout.write(json.dumps(said) + "\n")
+        line = {"kind": kind, "number": received.number, "late_ms": (here_ns - received.stamp_ns) / 1e6}
+        if isinstance(received, Beat) and monotonic is not None:
+            line["true_late_ms"] = (here_monotonic - monotonic) / 1e6
+            line["earlier_ms"] = (received.stamp_ns - received.earlier_ns) / 1e6
+        sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()

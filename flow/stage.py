@@ -68,7 +68,7 @@ class Node(Generic[S]):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Totals since the start, for people: lost, refused, foreign. A run shows them and writes them at its end."""
+        """Totals since the start, for people: lost, rejected, foreign. A run shows them and writes them at its end."""
         return {}
 
 

@@ -1,7 +1,7 @@
-"""The operator's page names what grd may say, so that nobody meets a word in the field that it does not explain.
+"""deploy/OPERATOR.md explains every state, reason, counter and text of grd.
 
-Each word is asked for where it is explained: in the first column of its own table. What is said in sentences must stand
-in the source that says it, too, so that neither changes alone.
+Enum values and counters are in the first column of their table. Texts are on the page and in the source that reports
+them, so that neither changes alone.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from links.recording.writer import CLOSE_TIMEOUT_S
 from links.velodyne.position import Pps
 from links.velodyne.reject_reason import RejectReason
 from stages.messages import BranchState, PoseState, TrackingState
-from tests.links.fault_bounds import KEPT_S, KILLED, MUST, POSES_AGAIN_S, POSITION_AGAIN_S, REST_S
+from tests.links.fault_bounds import BOUNDS, FIRST_POSE_S, FIRST_POSITION_S, KILLED, MAX_RECORDING_LOSS_S, REST_S
 from tests.unit_file import unit_file
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,16 +29,16 @@ TABLES = {
     found["head"]: [re.split(r"(?<!\\) \| ", row.strip("| ")) for row in found["rows"].splitlines()]
     for found in TABLE.finditer(PAGE)
 }
-EXPLAINED = {
+VALUES = {  # table and the values in it
     "state of the pose": [state.name for state in PoseState],
     "state of the track (shown while there is no pose yet)": [state.name for state in TrackingState],
     "state of the rotation by cameras": [state.name for state in BranchState],
-    "why no pose goes out": [why.value for why in GateRejectReason],
+    "reason why no pose is sent": [reason.value for reason in GateRejectReason],
     "LiDAR": ["decoded", "lost", "from other senders", *(f"PPS {pps.name.lower()}" for pps in Pps), "PPS locks lost"],
-    "LiDAR, `refused: ` and why": [why.value for why in RejectReason],
+    "LiDAR, `rejected: ` and the reason": [reason.value for reason in RejectReason],
     "servo": list(Health._fields),
 }
-SAID = {  # where it is said, and what
+TEXTS = {  # source file and its texts
     "flow/events.py": ["more events of other kinds"],
     "flow/live/live.py": ["works again", "did not end in time"],
     "flow/live/source.py": [
@@ -55,96 +55,102 @@ SAID = {  # where it is said, and what
     "links/recording/recorder.py": ["nothing is recorded now"],
     "links/velodyne/udp.py": ["cannot listen on UDP", "is the network interface still up?", "no packet on UDP"],
     "links/velodyne/lidar.py": [
-        "packets in a row are no use",
+        "consecutive packets are invalid",
         "these packets come from a Velodyne",
         "the sensor's clock is not locked to UTC",
-        "is locked to UTC no more",
-        "no position packet comes any more",
+        "the sensor's clock lost its lock to UTC",
+        "no position packet arrives on UDP",
     ],
-    "links/camera/camera.py": ["but the lens is calibrated for"],
-    "links/camera/capture.py": ["cannot be opened as a camera", "gives no more frames", "stale", "damaged"],
+    "links/camera/camera.py": [
+        "but the lens is calibrated for",
+        "this host decodes the stream more slowly than it arrives",
+    ],
+    "links/camera/capture.py": ["cannot be opened as a camera", "delivers no more frames", "stale", "damaged"],
     "links/camera/live_camera.py": ["overtaken", "lost", "opened again"],
-    "links/dynamixel/drive.py": ["the servo is not set up for grd: "],
-    "links/dynamixel/worker.py": ["does not answer at"],
+    "links/dynamixel/drive.py": ["the servo is not configured for grd: "],
+    "links/dynamixel/worker.py": ["does not reply at"],
     "links/dynamixel/servo.py": [
-        "stands still: ",
-        "it is set up again by itself",
-        "the servo's process ended",
-        "the servo stays where it is",
+        "does not move: ",
+        "it is set up again automatically",
+        "the servo process ended",
+        "the servo is stopped",
         "process restarts",
-        "stopped: nobody aims",
+        "stops: no aim stage",
+        "goals clamped to limits_deg",
+        "goals clamped to speed_limit_rpm",
     ],
     "links/mavlink/autopilot_session.py": [
-        "no word from the autopilot",
-        "answers no TIMESYNC: late is not seen",
+        "no frame from the autopilot",
+        "no TIMESYNC replies: latency unknown",
         "stray bytes",
+        "closed: blocked",
+        "sent late",
     ],
-    "links/mavlink/pose_sender.py": ["sending poses", "STOPPED: ", "no pose goes out"],
+    "links/mavlink/pose_sender.py": ["sending poses", "STOPPED: ", "no poses sent"],
     "links/mavlink/transport/stream_connection.py": [
-        "is gone: is it plugged in and powered?",
-        "Trying again",
-        "and was dropped with it",
+        "is lost: is it plugged in and powered?",
+        "Reopening",
+        "and was closed with its buffer",
     ],
     "links/mavlink/timesync_monitor.py": [
-        "answers to TIMESYNC take longer than",
-        "the autopilot has answered TIMESYNC and does no more",
+        "TIMESYNC replies take longer than",
+        "the autopilot no longer replies to TIMESYNC",
     ],
     "links/mavlink/signing.py": ["the signing time cannot be written"],
-    "links/vehicle_odometry/udp.py": ["too old, or of no age"],
+    "links/vehicle_odometry/udp.py": ["age_s invalid or too large"],
     "links/viewer/viewer.py": ["not all is drawn", "not drawn"],
-    "links/zenoh/connection.py": ["does not take us in", "has not answered for"],
-    "links/zenoh/sender.py": ["does not listen to"],
+    "links/zenoh/connection.py": ["does not accept the connection", "has not replied for"],
+    "links/zenoh/sender.py": ["does not subscribe to"],
     "links/cli/run.py": ["rejected: "],
 }
 
 
-@pytest.mark.parametrize("table", EXPLAINED)
-def test_each_word_has_its_row(table: str) -> None:
+@pytest.mark.parametrize("table", VALUES)
+def test_each_value_has_a_row(table: str) -> None:
     first_cells = " ".join(row[0] for row in TABLES[table])
-    assert [word for word in EXPLAINED[table] if f"`{word}`" not in first_cells] == []
+    assert [value for value in VALUES[table] if f"`{value}`" not in first_cells] == []
 
 
-@pytest.mark.parametrize("table", EXPLAINED)
-def test_each_row_says_what_it_means_and_what_to_do(table: str) -> None:
+@pytest.mark.parametrize("table", VALUES)
+def test_each_row_has_meaning_and_action(table: str) -> None:
     assert [row for row in TABLES[table] if len(row) != 3 or not all(row)] == []
 
 
-@pytest.mark.parametrize("source", SAID)
-def test_what_is_said_in_sentences_stands_on_the_page_and_in_its_source(source: str) -> None:
+@pytest.mark.parametrize("source", TEXTS)
+def test_each_text_is_on_the_page_and_in_its_source(source: str) -> None:
     code = "".join((ROOT / source).read_text(encoding="utf-8").split('" "'))
     page = " ".join(PAGE.split())
-    assert [text for text in SAID[source] if text.strip() not in page] == []
-    assert [text for text in SAID[source] if text not in code] == []
+    assert [text for text in TEXTS[source] if text.strip() not in page] == []
+    assert [text for text in TEXTS[source] if text not in code] == []
 
 
-def test_what_is_not_recorded_for_want_of_room_is_told_in_figures() -> None:
-    assert f"Below {Recorder().settings.reserve_mb:g} MB" in PAGE
+def test_disk_reserve_is_on_the_page() -> None:
+    assert f"Below {Recorder().settings.reserve_mb:g} MB of free space" in PAGE
 
 
-def test_each_fault_stands_with_its_bounds() -> None:
-    told = {row[0]: row[1:4] for row in TABLES["fault"]}
-    for name, must in MUST.items():
-        back = "-" if must.back_s is None else f"{must.back_s:g}"
-        assert told[name] == [back, f"{must.silent_s:g}", str(must.poses)], name
-    assert told[KILLED] == [f"{POSITION_AGAIN_S:g} (position)", f"{POSES_AGAIN_S:g}", "1"]
-    assert set(told) == {*MUST, KILLED}
-    assert f"until {REST_S:g} s after its end" in PAGE
-    assert f"takes more than {KEPT_S:g} s of the recording".replace(" 0.", " .") in PAGE
+def test_each_fault_has_its_bounds() -> None:
+    rows = {row[0]: row[1:4] for row in TABLES["fault"]}
+    for name, bounds in BOUNDS.items():
+        back = "-" if bounds.back_s is None else f"{bounds.back_s:g}"
+        assert rows[name] == [back, f"{bounds.silent_s:g}", str(bounds.poses)], name
+    assert rows[KILLED] == [f"{FIRST_POSITION_S:g} (position)", f"{FIRST_POSE_S:g}", "1"]
+    assert set(rows) == {*BOUNDS, KILLED}
+    page = " ".join(PAGE.split())
+    assert f"until {REST_S:g} s after its end" in page
+    assert f"takes more than {MAX_RECORDING_LOSS_S:g} s of the recording" in page
 
 
-def test_the_page_says_what_the_unit_does() -> None:
+def test_the_page_describes_the_unit() -> None:
     parts = unit_file()
-    assert f"{float(parts['Service']['RestartSec']):g} s later".removeprefix("0") in PAGE
-    assert float(parts["Service"]["TimeoutStopSec"]) > CLOSE_TIMEOUT_S, (
-        "the recorder may take so long to write what waits"
-    )
+    assert f"{float(parts['Service']['RestartSec']):g} s later" in PAGE
+    assert float(parts["Service"]["TimeoutStopSec"]) > CLOSE_TIMEOUT_S, "the recorder may need this time to write"
     assert parts["Service"]["ExecStart"].count("--overlay /etc/grd/vehicle.yaml") == 2
     assert "/etc/grd/vehicle.yaml" in PAGE
 
 
-def test_every_table_is_as_wide_as_its_head() -> None:
+def test_every_row_has_as_many_cells_as_its_header() -> None:
     lines = PAGE.splitlines()
-    odd = [
+    wrong = [
         b for a, b in pairwise(lines) if a.startswith("|") and b.startswith("|") and a.count(" | ") != b.count(" | ")
     ]
-    assert odd == []
+    assert wrong == []

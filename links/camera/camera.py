@@ -45,29 +45,29 @@ class CameraSettings(SourceSettings):
 
 
 class Camera(Source[CameraSettings]):
-    """One camera, greyscale. A frame that cannot be decoded is counted in `refused` and skipped."""
+    """One camera, greyscale. A frame that cannot be decoded is counted in `rejected` and skipped."""
 
     silent_after_s: ClassVar[float | None] = 4.0  # `timeout_s` is 3 s, and reopening starts immediately
 
     def __init__(self, settings: CameraSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._refused: int = 0
+        self._rejected: int = 0
         self._counts: Counter[str] = Counter()
         self._slow: tuple[int, float] = (0, 0.0)  # newest count of "too slow", and when it increased
 
     @property
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """Number of records without a complete JPEG image."""
-        return self._refused
+        return self._rejected
 
     @property
     def counters(self) -> dict[str, int]:
         """Totals since the start.
 
-        Frames: refused, damaged, stale (buffered for an unknown time), late (slow decoder), too slow (ten consecutive
+        Frames: rejected, damaged, stale (buffered for an unknown time), late (slow decoder), too slow (ten consecutive
         late ones), overtaken (replaced by a newer one). Times: lost, opened again.
         """
-        return {"refused": self._refused, **self._counts}
+        return {"rejected": self._rejected, **self._counts}
 
     @property
     def status(self) -> str | None:
@@ -118,7 +118,7 @@ class Camera(Source[CameraSettings]):
         try:
             return decode_image(record.stamp_ns, decode_compressed_image(record.data), 1e-3 * self.settings.readout_ms)
         except (ValueError, LinkError):
-            self._refused += 1
+            self._rejected += 1
             return None
 
 

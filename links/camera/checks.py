@@ -92,8 +92,10 @@ def camera_checks(
     assert isinstance(link, Camera)
     assert isinstance(observation, CameraObservation)
     if not observation.sizes_px:
-        refused = f"{observation.records.count} records without an image arrived; " if observation.records.count else ""
-        yield fail(f"{source.name} frames", f"{refused}{source.no_data_reason}")
+        rejected = (
+            f"{observation.records.count} records without an image arrived; " if observation.records.count else ""
+        )
+        yield fail(f"{source.name} frames", f"{rejected}{source.no_data_reason}")
         return
     yield _rate(source, link)
     yield _size(source.name, observation, rig_px)
@@ -108,16 +110,16 @@ def camera_checks(
 
 def _rate(source: ObservedSource, link: Camera) -> CheckResult:
     name, records = f"{source.name} frames", source.observation.records
-    refused = source.counters.get("refused", 0)
+    rejected = source.counters.get("rejected", 0)
     rate = f"{records.rate_hz:.1f} frames/s" if records.count > 1 else "one frame"
-    text = rate + (f", {refused} of {records.count} damaged" if refused else "")
+    text = rate + (f", {rejected} of {records.count} damaged" if rejected else "")
     if not records.rate_hz >= MIN_HZ or (source.live and source.status):
         why = source.status or "too slow for any motion"
         return fail(name, f"{text}: {why}")
     silent_s = records.longest_silence_s(source.end_ns)
     if source.live and silent_s > max(SILENT_S, 3.0 / records.rate_hz):
         return fail(name, f"{text}; then none for {silent_s:.1f} s: check its cable and power")
-    if refused > 0.01 * records.count:
+    if rejected > 0.01 * records.count:
         return warning(name, f"{text}: check cable and hub")
     if source.live and records.rate_hz < MIN_RATE_SHARE * link.settings.fps:
         return warning(

@@ -27,7 +27,7 @@ from links.runs.warm_up import warm_up
 from links.zenoh import host_graph
 
 TABLE_ROWS = 12
-REJECTED_COUNTERS = ("rejected", "refused")  # first words of the counters of rejected messages
+REJECTED_COUNTER = "rejected"  # first word of the counters of rejected messages
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEFAULT_REPLAY_CONFIG = REPOSITORY / "configs" / "replay.yaml"
 
@@ -238,7 +238,7 @@ def _print_result(run: RunResult) -> None:
         f"{name}: {count} {counter}"
         for name, counters in report.counters.items()
         for counter, count in counters.items()
-        if counter.startswith(REJECTED_COUNTERS) and count
+        if counter.startswith(REJECTED_COUNTER) and count
     ]
     if rejected:
         out.print(f"rejected: {'; '.join(rejected)}", markup=False)

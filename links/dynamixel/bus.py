@@ -77,10 +77,10 @@ class Gone(BusError):
     kind = "unplugged"
 
 
-class Refused(BusError):
+class RequestRejected(BusError):
     """The servo replied with an error number."""
 
-    kind = "refused by the servo"
+    kind = "rejected by the servo"
 
     def __init__(self, what: str, number: int) -> None:
         super().__init__(f"{what}: {mx28.ERRORS.get(number, f'error {number}')}")
@@ -216,7 +216,7 @@ class Bus:
         self._check(what, result)
         length = reply[5] | reply[6] << 8
         if error & ~mx28.ALERT:
-            raise Refused(what, error & ~mx28.ALERT)
+            raise RequestRejected(what, error & ~mx28.ALERT)
         if length != reply_bytes + STATUS_OVERHEAD or len(reply) < PARAMETERS_AT + reply_bytes:
             self.resync()
             raise WrongReply(f"{what}: a reply of {length - STATUS_OVERHEAD} bytes, not {reply_bytes}")

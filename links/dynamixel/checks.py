@@ -77,11 +77,11 @@ def servo_checks(source: ObservedSource) -> Iterator[CheckResult]:
     assert isinstance(link, Servo)
     assert isinstance(observation, ServoObservation)
     if not observation.errors:
-        refused = (
+        rejected = (
             f"{observation.records.count} records without a valid state arrived; " if observation.records.count else ""
         )
         advice = "" if source.status else ": is it powered (12 V) and wired?"
-        yield fail(f"{source.name} replies", f"{refused}{source.no_data_reason}{advice}")
+        yield fail(f"{source.name} replies", f"{rejected}{source.no_data_reason}{advice}")
         return
     yield _rate(source, link)
     yield _position(source.name, link, observation)

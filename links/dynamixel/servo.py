@@ -92,7 +92,7 @@ class ServoSettings(SourceSettings):
 
 
 class Servo(Source[ServoSettings]):
-    """The turntable's servo. A record without a valid state is counted in `refused` and skipped."""
+    """The turntable's servo. A record without a valid state is counted in `rejected` and skipped."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"goal"})
     silent_after_s: ClassVar[float | None] = (
@@ -110,9 +110,9 @@ class Servo(Source[ServoSettings]):
         self._error: int = 0  # newest Hardware Error Status
 
     @property
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """Number of records without a valid servo state."""
-        return self._counts["refused: no servo state"]
+        return self._counts["rejected: no servo state"]
 
     @property
     def counters(self) -> dict[str, int]:
@@ -145,7 +145,7 @@ class Servo(Source[ServoSettings]):
         try:
             return parse_state(record.stamp_ns, record.data)
         except ValueError:
-            self._counts["refused: no servo state"] += 1
+            self._counts["rejected: no servo state"] += 1
             return None
 
     def on_goal(self, goal: ServoGoal) -> None:
@@ -155,7 +155,7 @@ class Servo(Source[ServoSettings]):
             self._pending = goal_command(goal)
             self._counts[NOT_LIVE] += 1
         elif not (math.isfinite(goal.position_rad) and math.isfinite(goal.speed_radps)):
-            self._counts["goals refused: not finite"] += 1
+            self._counts["goals rejected: not finite"] += 1
         elif not process.send(self._within_limits(goal)):
             self._counts["goals_lost"] += 1
 

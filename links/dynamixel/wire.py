@@ -49,7 +49,7 @@ class Health(NamedTuple):
     no_reply: int
     damaged: int
     wrong: int  # late or foreign replies, discarded
-    refused: int  # instructions that the servo rejected with an error
+    rejected: int  # instructions that the servo rejected with an error
     unplugged: int  # how often the serial port disappeared
     set_ups: int  # at the start, and after each power cycle, reboot, torque loss, watchdog stop or replugged cable
     reboots: int

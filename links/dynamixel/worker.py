@@ -20,7 +20,7 @@ import time
 from collections import Counter
 
 from links.dynamixel import mx28, wire
-from links.dynamixel.bus import Bus, BusError, Gone, Refused
+from links.dynamixel.bus import Bus, BusError, Gone, RequestRejected
 from links.dynamixel.drive import ARRIVED_TICKS, Drive, DriveSettings, Measurement, SetupError, Shutdown
 from links.dynamixel.reading_filter import ReadingFilter
 
@@ -159,7 +159,7 @@ class Worker:
         assert self._drive is not None
         try:
             self._drive.go(goal.position_ticks, goal.velocity_units)
-        except Refused:
+        except RequestRejected:
             self._goal = None  # it would be rejected again
             self._health_ns = 0  # read the condition in the next cycle
             raise
@@ -262,7 +262,7 @@ class Worker:
             no_reply=faults["no reply"],
             damaged=faults["damaged"],
             wrong=faults["late or foreign"],
-            refused=faults["refused by the servo"],
+            rejected=faults["rejected by the servo"],
             unplugged=faults["unplugged"],
             set_ups=counts["set_ups"],
             reboots=counts["reboots"],

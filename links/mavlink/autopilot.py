@@ -103,7 +103,7 @@ class Autopilot(Source[AutopilotSettings]):
         self._not_connected: int = 0
 
     def decode(self, record: Record) -> AutopilotMessage | None:
-        """The message of one frame; None for an unused or refused frame (see `counters`)."""
+        """The message of one frame; None for an unused or rejected frame (see `counters`)."""
         return self._decoder.decode(record)
 
     def on_pose(self, pose: RelativePose) -> None:
@@ -161,9 +161,9 @@ class Autopilot(Source[AutopilotSettings]):
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals since the start: decoded, lost, refused by reason; live: sent, not sent, received, foreign."""
+        """Totals since the start: decoded, lost, rejected by reason; live: sent, not sent, received, foreign."""
         decoder = self._decoder
-        refused = {f"refused: {reason}": count for reason, count in dict(decoder.refused).items()}
+        rejected = {f"rejected: {reason}": count for reason, count in dict(decoder.rejected).items()}
         decoded = {
             "decoded": decoder.decoded,
             "unused": decoder.unused,
@@ -171,7 +171,7 @@ class Autopilot(Source[AutopilotSettings]):
             "clock restarts": decoder.clock.restarts,
             "timesync replies": decoder.clock.round_trips,
             **_clock_counters(decoder.clock),
-            **refused,
+            **rejected,
         }
         live = {} if self._session is None else self._session.counters
         not_connected = {"poses while not connected": self._not_connected} if self._not_connected else {}

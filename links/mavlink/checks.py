@@ -180,7 +180,7 @@ def _clock(source: ObservedSource, status: AutopilotStatus) -> CheckResult:
     if status.clock_offset_ns is None:
         return fail(name, "no message has a time stamp: request ATTITUDE")
     if status.clock_uncertainty_ns is None:
-        foreign = source.counters.get("refused: TIMESYNC for another component", 0)
+        foreign = source.counters.get("rejected: TIMESYNC for another component", 0)
         why = (
             "does it receive our frames?"
             if not foreign

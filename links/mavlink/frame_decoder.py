@@ -29,7 +29,7 @@ class FrameDecoder:
     def __init__(self, sender: tuple[int, int], own: tuple[int, int], clock: DeviceClock) -> None:
         self.clock = clock
         self.decoded = self.unused = self.lost = 0
-        self.refused: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter()
         self._sender, self._own = sender, own
         self._sequence: int | None = None
         self._last_ns: dict[str, int] = {}  # stamp of the newest message per type
@@ -37,7 +37,7 @@ class FrameDecoder:
         self._matched = False  # replies to our TIMESYNC are recorded with the request's time as stamp
 
     def decode(self, record: Record) -> AutopilotMessage | None:
-        """The message of one frame; None for an unused or refused frame (see `refused`)."""
+        """The message of one frame; None for an unused or rejected frame (see `rejected`)."""
         try:
             frame = parse_frame(record.data)
         except ValueError:
@@ -131,4 +131,4 @@ class FrameDecoder:
         )
 
     def _refuse(self, reason: str) -> None:
-        self.refused[reason] += 1
+        self.rejected[reason] += 1

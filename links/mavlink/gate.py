@@ -45,7 +45,7 @@ class RejectReason(enum.Enum):
 
 
 class PoseLimits(BaseModel):
-    """PoseLimits for sending a pose: one sigma of the worst axis, and age."""
+    """Limits for sending a pose: one sigma of the worst axis, and age."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

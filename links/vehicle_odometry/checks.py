@@ -39,13 +39,15 @@ def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult
     if not records.count:
         text = f"{source.no_data_reason}: the vehicle would be assumed parked"
         return fail(source.name, f"{text}; start it, or set port: null") if source.live else warning(source.name, text)
-    refused, age_ms = source.counters.get("refused", 0), 1e-6 * records.max_age_ns
-    text = f"{records.rate_hz:.0f} poses/s, at most {age_ms:.0f} ms old" + (f", {refused} refused" if refused else "")
-    if refused >= records.count:
+    rejected, age_ms = source.counters.get("rejected", 0), 1e-6 * records.max_age_ns
+    text = f"{records.rate_hz:.0f} poses/s, at most {age_ms:.0f} ms old" + (
+        f", {rejected} rejected" if rejected else ""
+    )
+    if rejected >= records.count:
         return fail(source.name, f"{text}: none is a valid pose (recordings/README.md, /vehicle/odometry)")
     silent_s = records.longest_silence_s(source.end_ns)
     if source.live and silent_s > ODOMETRY_SILENT_S:
         return fail(source.name, f"{text}; then none for {silent_s:.1f} s: is its sender still running?")
-    if not records.rate_hz >= ODOMETRY_HZ or age_ms > OLD_MS or refused:
+    if not records.rate_hz >= ODOMETRY_HZ or age_ms > OLD_MS or rejected:
         return warning(source.name, f"{text}: check its rate, its age_s and its clock")
     return ok(source.name, text)

@@ -47,24 +47,24 @@ class VehicleOdometrySettings(SourceSettings):
 
 
 class VehicleOdometry(Source[VehicleOdometrySettings]):
-    """The vehicle's motion. A record without a valid pose is counted in `refused` and skipped."""
+    """The vehicle's motion. A record without a valid pose is counted in `rejected` and skipped."""
 
     silent_after_s: ClassVar[float | None] = 2.0
 
     def __init__(self, settings: VehicleOdometrySettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._refused: int = 0
+        self._rejected: int = 0
         self._udp: Counter[str] = Counter()
 
     @property
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """Number of records without a valid pose."""
-        return self._refused
+        return self._rejected
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals since the start: refused, from other senders."""
-        return {"refused": self._refused, **self._udp}
+        """Totals since the start: rejected, from other senders."""
+        return {"rejected": self._rejected, **self._udp}
 
     def listen(self) -> AbstractContextManager[Iterator[Record]]:
         """Receive poses: `with odometry.listen() as records`. LinkError without `port`, or when it cannot be opened."""
@@ -79,7 +79,7 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
         try:
             return parse_pose(record.stamp_ns, record.data)
         except ValueError:
-            self._refused += 1
+            self._rejected += 1
             return None
 
 

@@ -86,7 +86,7 @@ def lidar_checks(source: ObservedSource) -> Iterator[CheckResult]:
         yield fail(f"{name} packets", _sentence(source.no_data_reason))
         return
     if not decoded:
-        why = source.status or _refused(source) or "none was valid"
+        why = source.status or _rejected(source) or "none was valid"
         yield fail(f"{name} packets", f"{observation.records.count} packets arrived, and {_sentence(why)}")
         return
     yield _rate(source, observation, link.settings.timeout_s)
@@ -106,8 +106,8 @@ def _sentence(text: str) -> str:
     return text if text.endswith((".", "?")) else f"{text}: is the LiDAR powered, and is this host on its subnet?"
 
 
-def _refused(source: ObservedSource) -> str:
-    prefix = "refused: "
+def _rejected(source: ObservedSource) -> str:
+    prefix = "rejected: "
     return ", ".join(
         f"{n} {what.removeprefix(prefix)}" for what, n in source.counters.items() if what.startswith(prefix) and n
     )
@@ -132,11 +132,11 @@ def _rate(source: ObservedSource, observation: LidarObservation, timeout_s: floa
 def _losses(source: ObservedSource, decoded: int) -> CheckResult:
     name, lost = f"{source.name} losses", source.counters.get("lost", 0)
     share = lost / (lost + decoded)
-    refused = _refused(source)
-    text = f"{lost} of {lost + decoded} packets lost" + (f"; refused: {refused}" if refused else "")
+    rejected = _rejected(source)
+    text = f"{lost} of {lost + decoded} packets lost" + (f"; rejected: {rejected}" if rejected else "")
     if share > FAIL_LOSS:
         return fail(name, f"{text}: is the network shared, or this host too busy (net.core.rmem_max)?")
-    return warning(name, text) if share > WARN_LOSS or refused else ok(name, text)
+    return warning(name, text) if share > WARN_LOSS or rejected else ok(name, text)
 
 
 def _mode(name: str, observation: LidarObservation) -> CheckResult:

@@ -29,7 +29,7 @@ from links.velodyne.udp import Channel, UdpCounters, listen_udp
 from stages.messages import LidarFirings
 
 POSITION_TOPIC = "/lidar/position"
-MAX_CONSECUTIVE_REFUSED = 100
+MAX_CONSECUTIVE_REJECTED = 100
 POSITION_TIMEOUT_S = 3.0  # a sensor sends several per second
 
 
@@ -70,9 +70,9 @@ class Lidar(Source[LidarSettings]):
         self._udp = UdpCounters()
 
     def decode(self, record: Record) -> LidarFirings | None:
-        """Pulses of one packet, or of `packets` packets with the last of them; None before that, or when refused.
+        """Pulses of one packet, or of `packets` packets with the last of them; None before that, or when rejected.
 
-        Raises LinkError for another LiDAR model, or after 100 consecutive refused packets.
+        Raises LinkError for another LiDAR model, or after 100 consecutive rejected packets.
         """
         return self._stream.decode(record)
 
@@ -147,21 +147,21 @@ class Lidar(Source[LidarSettings]):
 
     @property
     def counters(self) -> dict[str, int]:
-        """Totals since the start: packets decoded, lost, refused by reason, from other senders; clock disagreements."""
+        """Totals since the start: packets decoded, lost, rejected by reason, foreign; clock disagreements."""
         stream = self._stream
-        refused = {f"refused: {reason.value}": count for reason, count in stream.refused.items()}
+        rejected = {f"rejected: {reason.value}": count for reason, count in stream.rejected.items()}
         return {
             "decoded": stream.decoded,
             "lost": stream.lost,
             "clock disagreements": stream.clock.disagreements,
             "from other senders": self._udp.foreign,
             **self._pps.counters,
-            **refused,
+            **rejected,
         }
 
 
 class PacketStream:
-    """Decodes packets in order and counts lost and refused ones.
+    """Decodes packets in order and counts lost and rejected ones.
 
     A message holds consecutive packets: a gap ends it early.
     """
@@ -170,9 +170,9 @@ class PacketStream:
         self.clock = clock
         self.decoded = 0
         self.lost = 0
-        self.refused: Counter[RejectReason] = Counter()
+        self.rejected: Counter[RejectReason] = Counter()
         self._topic = topic
-        self._consecutive_refused = 0
+        self._consecutive_rejected = 0
         self._lost_before = 0
         self._packet_ns = vlp16.packet_ns(vlp16.STRONGEST)
         self._packets_per_message, self._rows = packets_per_message, FiringRows(packets_per_message)
@@ -198,16 +198,16 @@ class PacketStream:
         self.lost += lost
         self._lost_before = 0
         self.decoded += 1
-        self._consecutive_refused = 0
+        self._consecutive_rejected = 0
         previous, self._rows = self._rows, rows
         if rows.full:
             return rows.take()
         return previous.take() if rows is not previous else None
 
     def _refuse(self, reason: RejectReason, data: bytes) -> None:
-        self.refused[reason] += 1
-        self._consecutive_refused += 1
-        stuck = self._consecutive_refused % MAX_CONSECUTIVE_REFUSED == 0
+        self.rejected[reason] += 1
+        self._consecutive_rejected += 1
+        stuck = self._consecutive_rejected % MAX_CONSECUTIVE_REJECTED == 0
         if reason is RejectReason.MODEL and (self.decoded == 0 or stuck):
             model = vlp16.other_model(data)
             if model is not None:
@@ -216,9 +216,9 @@ class PacketStream:
                     f"(0x{vlp16.PRODUCT_ID:02X}). Use a recording of one of those, or check `sender` and `port`."
                 )
         if stuck:
-            reasons = ", ".join(f"{count} {reason.value}" for reason, count in self.refused.most_common())
+            reasons = ", ".join(f"{count} {reason.value}" for reason, count in self.rejected.most_common())
             raise LinkError(
-                f"{self._topic}: {MAX_CONSECUTIVE_REFUSED} consecutive packets are invalid (refused so far: "
+                f"{self._topic}: {MAX_CONSECUTIVE_REJECTED} consecutive packets are invalid (rejected so far: "
                 f"{reasons}). Is this VLP-16 data (UDP {vlp16.DATA_PORT}, {vlp16.PACKET_BYTES} bytes)? Check "
                 "`sender`, `port` and the sensor's settings."
             )

@@ -88,15 +88,15 @@ class Fuse(Stage[FuseSettings]):
         return Smoother(self.settings.lag_s)
 
     @property
-    def refused(self) -> Counter[str]:
+    def rejected(self) -> Counter[str]:
         """Invalid messages, by reason."""
-        return self._intake.refused
+        return self._intake.rejected
 
     @property
     def counters(self) -> dict[str, int]:
         """Invalid messages by reason, and resets of the back end."""
         begun = {"back end reset": self.recoveries} if self.recoveries else {}
-        return {f"refused: {why}": count for why, count in self.refused.items()} | begun
+        return {f"rejected: {why}": count for why, count in self.rejected.items()} | begun
 
     @property
     def recoveries(self) -> int:

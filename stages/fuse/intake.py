@@ -27,18 +27,18 @@ class Intake:
         self._lag_ns = lag_ns
         self._ahead = 0  # stamps far ahead, in a row
         self.now_ns: int | None = None
-        self.refused: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter()
 
     def is_valid(self, message: Message, what: str, *numbers: Array64) -> bool:
         """Whether a message is finite and its stamp plausible."""
         if not all(np.isfinite(v).all() for v in numbers):
-            self.refused[f"{what}: not finite"] += 1
+            self.rejected[f"{what}: not finite"] += 1
             return False
         if self.now_ns is not None and message.stamp_ns > self.now_ns + AHEAD_NS and self._ahead < MAX_REJECTED_STAMPS:
-            self.refused[f"{what}: from the future"] += 1
+            self.rejected[f"{what}: from the future"] += 1
             return False
         if self.now_ns is not None and message.stamp_ns < self.now_ns - self._lag_ns:
-            self.refused[f"{what}: older than the lag"] += 1
+            self.rejected[f"{what}: older than the lag"] += 1
             return False
         return True
 
@@ -46,7 +46,7 @@ class Intake:
         """Whether a matrix is a covariance: symmetric and positive definite."""
         if is_covariance(covariance):
             return True
-        self.refused[f"{what}: its covariance is not positive definite"] += 1
+        self.rejected[f"{what}: its covariance is not positive definite"] += 1
         return False
 
     def pass_time(self, stamp_ns: int) -> int | None:

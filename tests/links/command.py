@@ -1,4 +1,4 @@
-"""The command line as a user calls it, in this process."""
+"""Runs the command line in this process."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typer.testing import CliRunner
 from links.cli.app import app
 
 
-def grd(*words: object, code: int = 0) -> str:
-    """What `grd WORDS` prints, when it ends with that exit code. An error it does not put into words is raised."""
-    result = CliRunner().invoke(app, [str(word) for word in words])
+def grd(*arguments: object, code: int = 0) -> str:
+    """Output of `grd ARGUMENTS`, which must end with this exit code. An unexpected exception is raised."""
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
     assert result.exit_code == code, result.output

@@ -1,7 +1,7 @@
-"""The simulated rig in a process of its own, with faults on demand: python -m tests.links.faulty_rig SETTINGS
+"""The simulated rig as a process with faults on demand: python -m tests.links.faulty_rig SETTINGS
 
-Each line on standard input is a fault, or its end: `lidar off`, `servo late 0.05 20`, `autopilot reboot`. It says
-`ready` when it sends; it ends with its input, and leaves truth.mcap in its folder.
+Each line on standard input starts or ends a fault: `lidar off`, `servo late 0.05 20`, `autopilot reboot`. The process
+prints `ready` when it sends, ends with its input, and writes truth.mcap in its folder.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from links.simulated.rig.live_rig import LiveRigSettings
 
 
 class RestartedAutopilot(LiveAutopilot):
-    """An autopilot that can boot again: its clock begins anew."""
+    """An autopilot that can reboot, which resets its clock."""
 
     booted_ns = 0
 
     def reboot(self) -> None:
-        """Off, and on again at once; `silent` is how long it takes."""
+        """Reset the clock; `silent` stops the messages meanwhile."""
         self.booted_ns = super().device_ns()
 
     def device_ns(self) -> int:
@@ -36,16 +36,16 @@ class RestartedAutopilot(LiveAutopilot):
 
 
 class FaultyRig(RealTimeRig):
-    """`do("lidar off")` and so on, from any thread."""
+    """A rig with faults: `do("lidar off")` from any thread."""
 
     def __init__(self, rig: LiveRigSettings, folder: Path) -> None:
         super().__init__(rig, folder)
         self.lidar_off = False
         self.radio: RestartedAutopilot | None = None
-        cast = self.simulation.batch
+        simulate = self.simulation.batch
 
         def batch(first_ns: int, packets: int):
-            records, true = cast(first_ns, packets)
+            records, true = simulate(first_ns, packets)
             return ([] if self.lidar_off else records), true
 
         self.simulation.batch = batch
@@ -58,21 +58,21 @@ class FaultyRig(RealTimeRig):
         return radio
 
     def do(self, line: str) -> None:
-        who, what, *numbers = line.split()
-        if who == "lidar":
-            self.lidar_off = what == "off"
-        elif who == "autopilot":
-            self.radio.silent = what == "off"
-            if what == "reboot":
+        device, action, *numbers = line.split()
+        if device == "lidar":
+            self.lidar_off = action == "off"
+        elif device == "autopilot":
+            self.radio.silent = action == "off"
+            if action == "reboot":
                 self.radio.reboot()
         else:
             emulator = self.simulation.emulator
-            if what in ("garbage", "bad_crc"):
-                getattr(emulator, what)(count=int(numbers[0]))
-            elif what == "late":
+            if action in ("garbage", "bad_crc"):
+                getattr(emulator, action)(count=int(numbers[0]))
+            elif action == "late":
                 emulator.late(float(numbers[0]), int(numbers[1]))
             else:
-                getattr(emulator, what)(*map(float, numbers))
+                getattr(emulator, action)(*map(float, numbers))
 
 
 def main(settings: str) -> None:

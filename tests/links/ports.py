@@ -1,4 +1,4 @@
-"""Ports of this host that nobody listens on just now, and datagrams to them."""
+"""Unused ports of this host, and datagrams to them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 
 def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[int]:
-    """Different ones, for UDP or (SOCK_STREAM) TCP."""
+    """Different unused ports for UDP or (SOCK_STREAM) TCP."""
     with ExitStack() as stack:
         probes = [stack.enter_context(socket.socket(socket.AF_INET, kind)) for _ in range(count)]
         for probe in probes:
@@ -20,7 +20,7 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
 
 
 def send(port: int, *datagrams: bytes, host: str = "127.0.0.1") -> None:
-    """To a port of this host, from one of its loopback addresses."""
+    """Send datagrams to a port of this host from one of its loopback addresses."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.bind((host, 0))
         for data in datagrams:

@@ -1,6 +1,6 @@
-"""grd with a wall clock that somebody sets: python -m tests.links.stepped_clock FILE ARGUMENTS OF GRD...
+"""grd with a stepped wall clock: python -m tests.links.stepped_clock FILE ARGUMENTS OF GRD...
 
-The wall clock, and what the kernel stamps with it, is ahead by as many seconds as stand in FILE, looked at often.
+FILE holds the seconds by which the wall clock and the kernel's stamps are ahead; it is read every POLL_S.
 """
 
 from __future__ import annotations
@@ -10,24 +10,24 @@ import threading
 import time
 from pathlib import Path
 
-LOOK_S = 0.05
+POLL_S = 0.05
 FILE = Path(sys.argv.pop(1))
-really_ns = time.time_ns
+true_ns = time.time_ns
 ahead_ns = 0
 
 
-def look() -> None:
+def poll() -> None:
     global ahead_ns
     while True:
         text = FILE.read_text() if FILE.exists() else ""
         ahead_ns = round(1e9 * float(text)) if text else 0
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)
 
 
-time.time_ns = lambda: really_ns() + ahead_ns
+time.time_ns = lambda: true_ns() + ahead_ns
 
 from links.cli import main  # noqa: E402
-from links.clock import datagram_time  # noqa: E402 (after the clock is ours)
+from links.clock import datagram_time  # noqa: E402 (after the clock was replaced)
 
 kernel_ns = datagram_time.kernel_time_ns
 
@@ -40,5 +40,5 @@ def stamped(ancillary):
 datagram_time.kernel_time_ns = stamped
 
 if __name__ == "__main__":
-    threading.Thread(target=look, daemon=True).start()
+    threading.Thread(target=poll, daemon=True).start()
     main()

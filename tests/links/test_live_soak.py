@@ -1,9 +1,9 @@
-"""The field's stack against the simulated rig for an hour: does anything grow, does anything stop?
+"""The field configuration against the simulated rig for an hour: no growth of memory, no stop.
 
     python -m pytest -m slow -s tests/links/test_live_soak.py
 
-GRD_SOAK_S: seconds, 3600 unless told. It writes some 2 GB to the temporary folder. With both cameras, GRD_SOAK_PICTURES:
-the recording that configs/scenarios/live_street_cameras.yaml says how to make; then some 12 GB.
+GRD_SOAK_S: duration in seconds, 3600 by default. It writes about 2 GB to the temporary folder. GRD_SOAK_IMAGES adds both
+cameras: the recording that configs/scenarios/live_street_cameras.yaml describes; then about 12 GB.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ pytest.importorskip("embreex", reason="simulating needs embreex: pip install -e 
 
 ROOT = Path(__file__).resolve().parents[2]
 SOAK_S = float(os.environ.get("GRD_SOAK_S", "3600"))
-PICTURES = os.environ.get("GRD_SOAK_PICTURES")
+IMAGES = os.environ.get("GRD_SOAK_IMAGES")
 OVERLAY = """\
 links:
   sim: {{config: {{duration_s: {duration_s}, autopilot_port: {autopilot}}}}}
@@ -41,17 +41,17 @@ WITH_CAMERAS = """\
 """
 
 
-def test_an_hour_in_flight_grows_nothing_and_stops_nothing(tmp_path):
+def test_one_hour_without_growth_or_stop(tmp_path):
     names = ("lidar", "position", "odometry", "autopilot", "viewer", "vehicle", "drone")
     ports = dict(zip(names, free_ports(len(names)), strict=True))
     config, overlays = "configs/sim_live.yaml", [OVERLAY]
-    if PICTURES is not None:
+    if IMAGES is not None:
         config, overlays = "configs/sim_live_cameras.yaml", [OVERLAY, "links:\n" + WITH_CAMERAS]
     command = [sys.executable, "-c", "from links.cli import main; main()", "run", config]
     for number, text in enumerate(overlays):
         overlay = tmp_path / f"soak_{number}.yaml"
-        told = {**ports, "servo": tmp_path / "servo", "images": PICTURES, "duration_s": SOAK_S + 60.0}
-        overlay.write_text(text.format(**told))
+        values = {**ports, "servo": tmp_path / "servo", "images": IMAGES, "duration_s": SOAK_S + 60.0}
+        overlay.write_text(text.format(**values))
         command += ["--overlay", str(overlay)]
     command += ["--for", str(SOAK_S), "--out", str(tmp_path / "soak")]
     with (tmp_path / "log.txt").open("w") as log:
@@ -59,16 +59,16 @@ def test_an_hour_in_flight_grows_nothing_and_stops_nothing(tmp_path):
     assert code == 0, (tmp_path / "log.txt").read_text()[-2_000:]
     summary = json.loads((tmp_path / "soak" / "summary.json").read_text())
     usage = np.array([summary["live"]["usage"][name] for name in ("elapsed_s", "rss_mb", "threads", "files")]).T
-    begun, ended = usage[usage[:, 0] > 0.25 * SOAK_S][0], usage[-1]
+    begin, end = usage[usage[:, 0] > 0.25 * SOAK_S][0], usage[-1]
     poses = np.loadtxt(tmp_path / "soak" / "pose_vehicle_drone.tum", usecols=0)
     gaps_s = np.diff(poses)
     sys.stdout.write(
-        f"\n{SOAK_S:.0f} s: {begun[1]:.0f} MB after a quarter, {ended[1]:.0f} MB at the end; threads {begun[2]:.0f}, "
-        f"{ended[2]:.0f}; files {begun[3]:.0f}, {ended[3]:.0f}; {len(poses)} poses, gaps p99 "
+        f"\n{SOAK_S:.0f} s: {begin[1]:.0f} MB after a quarter, {end[1]:.0f} MB at the end; threads {begin[2]:.0f}, "
+        f"{end[2]:.0f}; files {begin[3]:.0f}, {end[3]:.0f}; {len(poses)} poses, gaps p99 "
         f"{1e3 * np.percentile(gaps_s, 99):.0f}, max {1e3 * gaps_s.max():.0f} ms; {summary['poses']['states']}; "
         f"dropped {summary['live']['dropped']}; {summary['truth_errors']}; rig {json.loads((tmp_path / 'soak' / 'rig.json').read_text())}\n"
     )
-    assert ended[1] < 1.05 * begun[1] + 10.0
-    assert ended[2] <= begun[2]
-    assert ended[3] <= begun[3] + 2
+    assert end[1] < 1.05 * begin[1] + 10.0
+    assert end[2] <= begin[2]
+    assert end[3] <= begin[3] + 2
     assert len(poses) > 0.98 * 50 * (SOAK_S - 5.0)

@@ -33,7 +33,7 @@ def test_a_frame_is_decoded_in_grey_at_the_records_time(progressive):
     check_arrays(image)
     assert (image.stamp_ns, image.frame_id) == (150, "camera_vehicle")
     assert np.abs(image.grey.astype(int) - ramp).max() < 6
-    assert camera.refused == 0
+    assert camera.rejected == 0
 
 
 def test_an_image_contains_its_readout_time():
@@ -61,11 +61,11 @@ def test_a_huge_frame_is_rejected_before_memory_is_allocated():
 def test_a_damaged_frame_is_counted_and_skipped(data):
     camera = Camera(topic="/camera/vehicle")
     assert camera.decode(record(data)) is None
-    assert camera.refused == 1
+    assert camera.rejected == 1
 
 
 def test_another_format_or_no_protobuf_is_counted_and_skipped():
     camera = Camera(topic="/camera/vehicle")
     assert camera.decode(record(jpeg()[1], "png")) is None
     assert camera.decode(Record("/camera/vehicle", 2, 1, b"\xff\xff\xff")) is None
-    assert camera.refused == 2
+    assert camera.rejected == 2

@@ -35,7 +35,7 @@ def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
         links={"lidar": LinkReport(state, 1200, 1)},
         counters={
             "lidar": {"lost": 7, "from other senders": 0},
-            "fuse": {"refused: fix: not finite": 3, "back end begun anew": 0},
+            "fuse": {"rejected: fix: not finite": 3, "back end begun anew": 0},
             "recorder": {"missed": 0},
         },
         switched_off=list(off),
@@ -121,7 +121,7 @@ def test_a_terminal_shows_every_edge_and_link():
     text = shown(report_of(), pose(), terminal=True, news=["servo: stalled"])
     for words in ("track.pulses", "sweep.swept_pulses", "150.0", "lidar", "lost 7", "FULL: seen now", "servo: stalled"):
         assert words in text
-    assert "fuse    refused: fix: not finite 3" in text
+    assert "fuse    rejected: fix: not finite 3" in text
     for nothing in ("recorder", "begun anew"):
         assert nothing not in text
     assert "from other senders" not in text, "counts of zero are left out"

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from links.dynamixel import mx28
-from links.dynamixel.bus import BadReply, BlockingPort, Bus, BusError, Gone, NoReply, Refused, WrongReply
+from links.dynamixel.bus import BadReply, BlockingPort, Bus, BusError, Gone, NoReply, RequestRejected, WrongReply
 from links.dynamixel.drive import POSITION_BLOCK, Drive, DriveSettings
 from links.simulated.sensors.dynamixel_emulator import DynamixelEmulator
 from links.simulated.sensors.protocol2 import status
@@ -59,10 +59,12 @@ def test_ping_returns_the_model_and_a_write_is_read_back(emulator, bus):
 
 
 def test_a_write_that_the_servo_rejects_raises_with_the_reason(emulator, bus):
-    with pytest.raises(Refused, match=r"write 4096 to Goal Position \(116\): the value is beyond the servo's limit"):
+    with pytest.raises(
+        RequestRejected, match=r"write 4096 to Goal Position \(116\): the value is beyond the servo's limit"
+    ):
         bus.write(mx28.GOAL_POSITION, 4096)
     bus.write(mx28.TORQUE_ENABLE, 1)
-    with pytest.raises(Refused, match=r"Return Delay Time \(9\).*torque on"):
+    with pytest.raises(RequestRejected, match=r"Return Delay Time \(9\).*torque on"):
         bus.write(mx28.RETURN_DELAY_TIME, 3)
 
 

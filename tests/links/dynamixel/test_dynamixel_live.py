@@ -193,7 +193,7 @@ def test_a_goal_that_is_not_finite_moves_nothing(emulator):
         servo.on_goal(ServoGoal(stamp_ns=0, position_rad=math.nan, speed_radps=1.0))
         servo.on_goal(ServoGoal(stamp_ns=0, position_rad=1.0, speed_radps=math.inf))
         assert {next(records).data for _ in range(20)} == {next(records).data}
-    assert servo.counters["goals refused: not finite"] == 2
+    assert servo.counters["goals rejected: not finite"] == 2
 
 
 def test_leaving_the_context_stops_a_moving_servo(emulator):

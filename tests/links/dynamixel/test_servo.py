@@ -51,7 +51,7 @@ def test_a_state_keeps_its_own_time_and_every_field():
 def test_a_record_without_a_valid_state_is_counted_and_skipped(data):
     servo = Servo()
     assert servo.decode(record(data)) is None
-    assert servo.refused == 1
+    assert servo.rejected == 1
 
 
 def test_a_reading_is_stamped_in_the_middle_of_its_exchange_and_arrives_with_the_reply():

@@ -128,7 +128,7 @@ def test_an_odometry_without_covariance_or_quality_has_none():
 def test_invalid_messages_are_counted_by_reason(message: Any, reason: str):
     link = Autopilot()
     assert link.decode(record(Sender().frame(message))) is None
-    assert link.counters[f"refused: {reason}"] == 1
+    assert link.counters[f"rejected: {reason}"] == 1
 
 
 def test_both_imus_are_si_in_drone_axes_and_gravity_is_measured_upwards():
@@ -222,7 +222,7 @@ def test_a_timesync_reply_for_another_component_is_ignored(target: tuple[int, in
     reply = timesync_reply(sender, HOST0 + 5 * MS, 7_010 * MS, target)
     assert link.decode(record(reply, 20.0)) is None
     assert link.counters["timesync replies"] == used
-    assert link.counters.get("refused: TIMESYNC for another component", 0) == 1 - used
+    assert link.counters.get("rejected: TIMESYNC for another component", 0) == 1 - used
     assert link.counters["lost"] == 0
 
 
@@ -250,7 +250,7 @@ def test_after_a_matched_reply_other_replies_are_ignored():
     assert offset_and_uncertainty_ms(1060.0) == (0, 50)
     link.decode(record(timesync_reply(sender, HOST0 + 1040 * MS, 8_000 * MS, (1, 197)), 1050.0))
     assert offset_and_uncertainty_ms(1070.0) == (0, 50)
-    assert (link.counters["timesync replies"], link.counters["refused: TIMESYNC for another component"]) == (2, 1)
+    assert (link.counters["timesync replies"], link.counters["rejected: TIMESYNC for another component"]) == (2, 1)
 
 
 def test_a_replay_with_another_id_still_recognises_our_replies():
@@ -275,7 +275,7 @@ def test_a_repeated_or_late_frame_is_refused_and_a_restarted_sequence_is_not():
     frames = [sender.attitude(20 * i) for i in range(200)]
     for i in (0, 1, 2, 2, 4, 3, *range(5, 200)):
         link.decode(record(frames[i], 20.0 * i))
-    assert link.counters["refused: repeated or late"] == 2
+    assert link.counters["rejected: repeated or late"] == 2
     restarted = Sender()
     kept = [link.decode(record(restarted.attitude(4000 + 20 * i), 4000.0 + 20 * i)) for i in range(3)]
     assert [message is None for message in kept] == [False, False, False]
@@ -290,7 +290,7 @@ def test_other_systems_are_ignored_and_do_not_affect_the_sequence():
     for i in range(10):
         link.decode(record(ours.attitude(20 * i), 20.0 * i))
         assert link.decode(record(radio.attitude(9_000_000), 20.0 * i)) is None
-    assert link.counters["refused: from another system"] == 10
+    assert link.counters["rejected: from another system"] == 10
     assert (link.counters["lost"], link.counters["clock restarts"], link.counters["decoded"]) == (0, 0, 10)
     other = Autopilot(system_id=51, component_id=68)
     assert isinstance(other.decode(record(radio.attitude(1))), DroneAttitude)
@@ -303,7 +303,7 @@ def test_a_message_outside_the_dialect_counts_as_a_frame_and_is_no_loss():
     private[7:10] = b"\xf0\xff\x00"
     assert link.decode(record(bytes(private), 20.0)) is None
     assert link.decode(record(sender.attitude(40), 40.0)) is not None
-    assert (link.counters["refused: unknown message"], link.counters["lost"]) == (1, 0)
+    assert (link.counters["rejected: unknown message"], link.counters["lost"]) == (1, 0)
 
 
 @pytest.mark.parametrize("cut", [0, 1, 7, 8, 20])
@@ -313,7 +313,7 @@ def test_a_damaged_frame_does_not_affect_the_others(cut: int):
     assert link.decode(record(whole[0])) is not None
     assert link.decode(record(whole[1][:cut], 20.0)) is None
     assert link.decode(record(whole[2], 40.0)) is not None
-    assert (link.counters["refused: damaged"], link.counters["lost"]) == (1, 1)
+    assert (link.counters["rejected: damaged"], link.counters["lost"]) == (1, 1)
 
 
 @given(st.binary(max_size=300))
@@ -342,7 +342,7 @@ def test_flipped_and_cut_bytes_are_counted_never_raised(frame: bytes, changes: l
     link.decode(record(bytes(data[:length])))
     counters = link.counters
     used = counters["decoded"] + counters["unused"] + counters["timesync replies"]
-    assert used + sum(n for name, n in counters.items() if name.startswith("refused")) == 1
+    assert used + sum(n for name, n in counters.items() if name.startswith("rejected")) == 1
 
 
 FLOATS = st.floats(width=32)
@@ -391,4 +391,4 @@ def test_a_real_log_decodes_with_increasing_stamps_before_arrival(
             last[kind] = message.stamp_ns
     assert link.counters["clock restarts"] == restarts
     assert 0.97 * attitudes < counts[DroneAttitude] <= attitudes
-    assert link.counters.get("refused: damaged", 0) == damaged
+    assert link.counters.get("rejected: damaged", 0) == damaged

@@ -274,7 +274,7 @@ def test_an_unrequested_timesync_reply_is_ignored_although_it_has_no_target():
     with listening() as listener, drone_for(listener, Px4Rules()) as drone:
         listener.wait(lambda: listener.link.counters["timesync replies"] >= 2)
         drone.send(mavlink.MAVLink_timesync_message(drone.device_ns(), host_time.now_ns() - 1000))
-        listener.wait(lambda: listener.link.counters.get("refused: TIMESYNC for another component", 0) == 1)
+        listener.wait(lambda: listener.link.counters.get("rejected: TIMESYNC for another component", 0) == 1)
         before = listener.link.counters["timesync replies"]
         listener.wait(lambda: listener.link.counters["timesync replies"] > before)
     replayed = Autopilot(own_component_id=191)
@@ -450,7 +450,7 @@ def test_another_system_on_the_same_address_is_recorded_and_gets_no_poses():
         listener.send_poses(lambda: len(drone.messages("ODOMETRY")) >= 5)
         with pytest.raises(TimeoutError):
             station.recv(300)
-    assert listener.link.counters["refused: from another system"] == 1
+    assert listener.link.counters["rejected: from another system"] == 1
 
 
 def test_echoes_of_our_own_frames_are_ignored():

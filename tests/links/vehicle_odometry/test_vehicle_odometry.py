@@ -97,7 +97,7 @@ def changed(row: int, column: int, value: float) -> list[float]:
 def test_a_record_without_a_valid_pose_is_counted_and_skipped(data: bytes) -> None:
     odometry = VehicleOdometry()
     assert odometry.decode(record(data)) is None
-    assert odometry.refused == 1
+    assert odometry.rejected == 1
 
 
 def test_the_simulated_odometry_is_decoded_with_its_covariance() -> None:
@@ -114,7 +114,7 @@ def test_the_simulated_odometry_is_decoded_with_its_covariance() -> None:
         assert motion.covariance is not None
         assert motion.stamp_ns == row.stamp_ns > before_ns
         before_ns = motion.stamp_ns
-    assert link.refused == 0
+    assert link.rejected == 0
     expected_m = np.array([15 * math.cos(math.pi / 6) + 9 / 2, -15 / 2 + 9 * math.cos(math.pi / 6), 0.0])
     assert motion.xyz_map_m == pytest.approx(expected_m, abs=0.5)
     assert motion.R_map_vehicle == pytest.approx(rotation_z(math.radians(40)), abs=0.03)

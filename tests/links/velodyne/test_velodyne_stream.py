@@ -42,8 +42,8 @@ def lost_in(records):
     return lost
 
 
-def refused(lidar, reason):
-    return lidar.counters.get(f"refused: {reason.value}", 0)
+def rejected(lidar, reason):
+    return lidar.counters.get(f"rejected: {reason.value}", 0)
 
 
 @pytest.mark.parametrize("start_ns", [0, HOUR_NS - 20 * SINGLE_PACKET_NS])
@@ -83,7 +83,7 @@ def test_repeated_and_overtaken_packets_are_ignored_and_counted():
     messages = [lidar.decode(r) for r in (a, c, b, c, d)]
     assert [message is not None for message in messages] == [True, True, False, False, True]
     assert [messages[k].lost_packets for k in (0, 1, 4)] == [0, 1, 0]
-    assert refused(lidar, RejectReason.ORDER) == 2
+    assert rejected(lidar, RejectReason.ORDER) == 2
 
 
 def decoded(records, packets):
@@ -152,7 +152,7 @@ def test_a_bad_packet_in_a_good_stream_is_ignored_and_counted_as_lost(data, reas
     first, _, third = exact_records(3)
     assert lidar.decode(first) is not None
     assert lidar.decode(record(data, SINGLE_PACKET_NS)) is None
-    assert refused(lidar, reason) == 1
+    assert rejected(lidar, reason) == 1
     assert lidar.decode(third).lost_packets == 1
     assert lidar.counters["decoded"] == 2
 
@@ -162,7 +162,7 @@ def test_dual_return_blocks_of_one_pulse_share_their_azimuth():
     data[102] += 1
     lidar = Lidar()
     assert lidar.decode(record(bytes(data))) is None
-    assert refused(lidar, RejectReason.AZIMUTH) == 1
+    assert rejected(lidar, RejectReason.AZIMUTH) == 1
 
 
 @pytest.mark.parametrize(

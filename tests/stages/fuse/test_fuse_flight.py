@@ -374,7 +374,7 @@ def test_a_message_without_sense_is_left_out_and_counted(spoilt, why):
     told = [pose for i in range(5) for pose in stage.on_fix(fix(0.1 * i, [0, 0, 10]))]
     told += stage.on_fix(spoilt)
     told += stage.on_fix(fix(0.6, [0, 0, 10]))
-    assert stage.refused == {why: 1}
+    assert stage.rejected == {why: 1}
     assert told[-1].stamp_ns == ns(0.6)
     assert np.allclose(told[-1].xyz_vehicle_m, [0, 0, 10], atol=1e-6)
 
@@ -383,7 +383,7 @@ def test_a_rotation_that_is_not_finite_is_left_out():
     stage = Fuse()
     list(stage.on_fix(fix(0.0, [0, 0, 10])))
     list(stage.on_rotation(rotation(0.1, np.full((3, 3), math.nan))))
-    assert stage.refused == {"rotation: not finite": 1}
+    assert stage.rejected == {"rotation: not finite": 1}
 
 
 def test_a_position_only_covariance_is_in_the_frames_own_axes():

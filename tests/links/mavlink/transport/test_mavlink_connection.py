@@ -112,7 +112,7 @@ def test_udp_out_accepts_only_its_destination_and_survives_a_closed_port():
         assert link.receive(5.0) == (b"hello", drone.getsockname())
     assert link.foreign == 1
     for _ in range(5):
-        link.send(b"pose")  # sometimes refused by the kernel: the port is closed
+        link.send(b"pose")  # sometimes rejected by the kernel: the port is closed
         assert link.receive(0.01) is None
     link.close()
 

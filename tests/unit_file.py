@@ -1,4 +1,4 @@
-"""deploy/grd.service as it is written."""
+"""Reads deploy/grd.service."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ UNIT = Path(__file__).resolve().parents[1] / "deploy" / "grd.service"
 
 
 def unit_file() -> ConfigParser:
-    """Sections with their settings; a setting that stands twice in a section is an error."""
+    """Sections with their settings; a repeated setting is an error."""
     parser = ConfigParser(interpolation=None, comment_prefixes=("#",), delimiters=("=",))
     parser.optionxform = str  # names keep their case
     parser.read_string(UNIT.read_text(encoding="utf-8"))

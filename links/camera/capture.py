@@ -45,7 +45,7 @@ _URL = re.compile(r"^[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
 class CaptureLost(Exception):
-    """The source cannot be opened, or delivers no more frames. The text says why."""
+    """The source cannot be opened, or delivers no more frames; the text is the reason."""
 
 
 class CaptureEnded(CaptureLost):

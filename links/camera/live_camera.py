@@ -21,7 +21,7 @@ from links.camera.capture import (
 from links.clock import host_time
 
 PAUSE_S, MAX_PAUSE_S = 0.25, 5.0  # between two attempts to open the camera
-END_S = 1.0  # limit of waiting for a read that hangs in a driver
+END_S = 1.0  # limit of waiting for a read that is blocked in a driver
 _WAKE_S = 0.2
 
 

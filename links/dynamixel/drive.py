@@ -27,7 +27,7 @@ ARRIVED_TICKS = 23  # 2 deg: within this distance the goal counts as reached
 
 
 class SetupError(Exception):
-    """The servo must not be driven until an operator changes something. The text says what."""
+    """The servo must not be driven until an operator changes something, which the text names."""
 
 
 @dataclass(frozen=True, slots=True)

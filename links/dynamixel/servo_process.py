@@ -91,7 +91,7 @@ class ServoProcess:
             return self._socket.recv(wire.MAX_BYTES)
 
     def close(self) -> None:
-        """Close the socket: the process stops the servo and ends. A process that hangs is killed."""
+        """Close the socket: the process stops the servo and ends. A process that does not end is killed."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()

@@ -2,7 +2,7 @@
 
 A separate process is not delayed by other threads, and the servo stops when it or its parent dies. When the parent
 ends, the socket closes and this process stops the servo. When this process ends, the servo receives no requests and its
-bus watchdog stops it. When the parent hangs, it sends no more `wire.Alive` packets and the servo is stopped.
+bus watchdog stops it. When the parent does not respond, it sends no more `wire.Alive` packets and the servo is stopped.
 
 After a fault no goals are sent. The servo is still read if it replies (it measures its angle without torque), and it is
 set up again, with increasing pauses while that fails. The pauses are short, so that a replugged cable is used soon;

@@ -28,8 +28,8 @@ from links.mavlink.origin import GlobalOrigin, OriginSender
 from links.mavlink.pose_sender import PoseMessage, PoseSender
 from links.mavlink.profiles import PROFILES, ProfileName
 from links.mavlink.readers import AutopilotMessage
-from links.mavlink.signing import Signer
 from links.mavlink.transport.connection import Udp, parse_connection
+from links.mavlink.transport.signing import Signer
 from links.mavlink.transport.stream_connection import open_connection
 from stages.messages import RelativePose
 

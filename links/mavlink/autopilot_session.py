@@ -26,13 +26,13 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from flow.link import LinkError, Record
-from links.mavlink.framing import FrameSplitter, dialect, header, packed
 from links.mavlink.gate import RejectReason
 from links.mavlink.origin import OriginSender
 from links.mavlink.pose_sender import PoseSender
-from links.mavlink.signing import Signer
 from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
+from links.mavlink.transport.framing import FrameSplitter, dialect, header, packed
+from links.mavlink.transport.signing import Signer
 from stages.messages import RelativePose
 
 WAKE_S = 0.05  # period of the thread, and of the check whether a waiting reader was closed

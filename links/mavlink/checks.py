@@ -14,9 +14,9 @@ from typing import Any
 from flow.graph import Graph
 from flow.link import LinkError, Record, Source
 from links.mavlink.autopilot import Autopilot
-from links.mavlink.framing import header, parse_frame
 from links.mavlink.parameters import ParameterValues, ask_parameters
 from links.mavlink.profiles import PROFILES, ProfileName, findings
+from links.mavlink.transport.framing import header, parse_frame
 from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
 from links.preflight.observations import Observation, Observations, ObservedSource

@@ -13,8 +13,8 @@ from typing import Any
 
 from flow.link import Record
 from links.clock.device_clock import DeviceClock
-from links.mavlink.framing import SEQUENCE, header, known, parse_frame, timesync_target
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
+from links.mavlink.transport.framing import SEQUENCE, header, known, parse_frame, timesync_target
 from stages.messages import AutopilotStatus
 
 HALF_MS_NS = 500_000  # time_boot_ms is truncated, on average half a millisecond early

@@ -2,7 +2,7 @@
 
 An EKF without GPS needs an origin before it fuses a position. The autopilot is asked for its origin first
 (GPS_GLOBAL_ORIGIN). Ours is sent only after three requests that it acknowledged without reporting an origin; a second
-acknowledgement of one request belongs to another requester. An autopilot that does not support the request gets no
+acknowledgement of one request is for another requester. An autopilot that does not support the request gets no
 origin, because its state is unknown.
 
 Source: https://mavlink.io/en/messages/common.html#SET_GPS_GLOBAL_ORIGIN; ArduPilot NavEKF3_core::setOrigin (rejects a
@@ -16,7 +16,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from links.mavlink.framing import dialect
+from links.mavlink.transport.framing import dialect
 
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN = 512, 49  # MAV_CMD, message id
 HAS_NONE = (0, 2, 4)  # MAV_RESULT accepted (and sends nothing), denied, failed: it supports the message

@@ -14,10 +14,10 @@ from typing import Any
 from flow.link import LinkError
 from links.clock import host_time
 from links.mavlink.autopilot import Autopilot
-from links.mavlink.framing import V1, FrameSplitter, dialect, header, packed
 from links.mavlink.profiles import PROFILES
-from links.mavlink.signing import Signer
 from links.mavlink.transport.connection import Connection, parse_connection
+from links.mavlink.transport.framing import V1, FrameSplitter, dialect, header, packed
+from links.mavlink.transport.signing import Signer
 from links.mavlink.transport.stream_connection import open_connection
 
 RETRY_S = 0.3  # period of requests for missing parameters

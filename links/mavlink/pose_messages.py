@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from links.mavlink.framing import SEQUENCE, dialect
 from links.mavlink.gate import PoseLimits, velocity_to_send, worst_sigmas
 from links.mavlink.ned_frd import (
     flip_yz,
@@ -32,6 +31,7 @@ from links.mavlink.ned_frd import (
     upper_from_velocity_covariance,
     wxyz_from_R_odom_drone,
 )
+from links.mavlink.transport.framing import SEQUENCE, dialect
 from stages.messages import PoseEstimate, RelativePose
 
 LOCAL_FRD, BODY_FRD = 20, 12  # MAV_FRAME: the only ones that ArduPilot accepts in ODOMETRY

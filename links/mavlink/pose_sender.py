@@ -17,9 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from links.mavlink.framing import SEQUENCE, dialect
 from links.mavlink.gate import PoseLimits, RejectReason, reject_reason
 from links.mavlink.pose_messages import landing_target, odometry, vision_position_estimate
+from links.mavlink.transport.framing import SEQUENCE, dialect
 from stages.messages import PoseState, RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]

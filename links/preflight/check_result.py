@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 
 class Level(enum.Enum):
-    """Severity of a result. A warning is for the operator to judge; only a failure forbids the flight."""
+    """Severity of a result. The operator decides about a warning; only a failure forbids the flight."""
 
     OK = "ok"
     WARNING = "warning"

@@ -1,6 +1,6 @@
 """Run all checks of one configuration in their order, live or on a recording.
 
-The checks of a link stand in its driver's `checks.py`; here is the loop over the links, and the motion checks.
+The checks of a link are in its driver's `checks.py`; this module holds the loop over the links and the motion checks.
 """
 
 from __future__ import annotations

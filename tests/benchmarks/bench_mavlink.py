@@ -20,9 +20,9 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.clock import host_time
 from links.mavlink import Autopilot
-from links.mavlink.framing import FrameSplitter, packed
 from links.mavlink.gate import PoseLimits, reject_reason
 from links.mavlink.pose_messages import odometry
+from links.mavlink.transport.framing import FrameSplitter, packed
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))
 from tests.links.mavlink.mavlink_poses import HOST0, good_pose

@@ -27,7 +27,7 @@ from flow.link import Tap
 from flow.replay import Replay
 from links.clock import host_time
 from links.mavlink import Autopilot
-from links.mavlink.framing import parse_frame
+from links.mavlink.transport.framing import parse_frame
 from links.recording import RecordingReader
 from links.runs.request import RunRequest
 from links.simulated.matrix.flights import Cell

@@ -38,7 +38,7 @@ from links.camera import Camera
 from links.dynamixel.bus import BlockingPort, Bus, BusError
 from links.dynamixel.servo import Servo
 from links.mavlink import Autopilot
-from links.mavlink.framing import FrameSplitter, dialect, frame_bytes
+from links.mavlink.transport.framing import FrameSplitter, dialect, frame_bytes
 from links.recording import CompressedImage, RecordingReader, RecordingWriter, encode_compressed_image
 from links.simulated.sensors.protocol2 import status
 from links.vehicle_odometry import VehicleOdometry

@@ -1,1 +1,1 @@
-"""Transport of MAVLink bytes: UDP, TCP and serial connections to an autopilot."""
+"""Transport of MAVLink frames: framing, signing, and UDP, TCP and serial connections to an autopilot."""

@@ -17,9 +17,9 @@ from ipaddress import IPv4Address
 from typing import Protocol
 
 from flow.link import LinkError
-from links.mavlink.framing import MAX_FRAME_BYTES
 from links.mavlink.timesync_monitor import LATE_NS
 from links.mavlink.transport.connection import Address, Connection, Endpoint, Udp
+from links.mavlink.transport.framing import MAX_FRAME_BYTES
 from links.mavlink.transport.serial_line import SerialLine
 from links.mavlink.transport.tcp_line import TcpLine
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.framing import FrameSplitter, header, packed, parse_frame
+from links.mavlink.transport.framing import FrameSplitter, header, packed, parse_frame
 from links.simulated.autopilot.autopilot import Autopilot
 from links.simulated.autopilot.px4_rules import Px4Rules
 from links.simulated.autopilot.rules import Rules

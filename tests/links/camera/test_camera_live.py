@@ -189,7 +189,7 @@ def test_a_files_frames_are_stamped_by_its_own_timeline(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("source", "words"),
+    ("source", "expected_text"),
     [
         ("/dev/video-none", "there is no /dev/video-none. Is the camera plugged in and in webcam mode"),
         ("missing.mp4", "there is no file missing.mp4.*did you mean /dev/video0 or a URL"),
@@ -197,9 +197,9 @@ def test_a_files_frames_are_stamped_by_its_own_timeline(tmp_path):
         (None, "set `source` to run live"),
     ],
 )
-def test_a_source_that_cannot_be_opened_is_an_error_that_names_what_to_check(source, words):
+def test_a_source_that_cannot_be_opened_is_an_error_that_names_what_to_check(source, expected_text):
     camera = Camera(topic="/camera/vehicle", source=source, timeout_s=1)
-    with pytest.raises(LinkError, match=words) as caught, camera.listen() as records:
+    with pytest.raises(LinkError, match=expected_text) as caught, camera.listen() as records:
         next(records)
     assert "secret" not in str(caught.value)
 
@@ -207,8 +207,8 @@ def test_a_source_that_cannot_be_opened_is_an_error_that_names_what_to_check(sou
 def test_a_file_that_is_no_video_is_an_error(tmp_path):
     (tmp_path / "no.avi").write_bytes(b"not a video" * 50)
     camera = Camera(topic="/camera/vehicle", source=str(tmp_path / "no.avi"))
-    words = r"no.avi cannot be opened. Is `source` the path of a video file"
-    with pytest.raises(LinkError, match=words), camera.listen() as records:
+    expected_text = r"no.avi cannot be opened. Is `source` the path of a video file"
+    with pytest.raises(LinkError, match=expected_text), camera.listen() as records:
         next(records)
 
 

@@ -162,8 +162,8 @@ def test_a_camera_that_delivers_only_damaged_images_is_lost(monkeypatch):
 
 def test_a_camera_of_another_size_is_an_error(monkeypatch):
     plug_in(monkeypatch, real_time=True)
-    words = "frames of 64 x 48 pixels, but the lens is calibrated for 720 x 720: set the camera's mode"
-    with pytest.raises(LinkError, match=words), camera_of(size_px=(720, 720)).listen() as records:
+    expected_text = "frames of 64 x 48 pixels, but the lens is calibrated for 720 x 720: set the camera's mode"
+    with pytest.raises(LinkError, match=expected_text), camera_of(size_px=(720, 720)).listen() as records:
         next(records)
 
 
@@ -187,6 +187,6 @@ def test_an_unplugged_camera_is_reopened_when_it_returns(monkeypatch):
 
 def test_a_camera_used_by_another_program_is_an_error_that_names_what_to_check(monkeypatch):
     plug_in(monkeypatch).plugged = False
-    words = "/dev/null cannot be opened as a camera. Is the camera plugged in.*does another program use it"
-    with pytest.raises(LinkError, match=words), camera_of().listen() as records:
+    expected_text = "/dev/null cannot be opened as a camera. Is the camera plugged in.*does another program use it"
+    with pytest.raises(LinkError, match=expected_text), camera_of().listen() as records:
         next(records)

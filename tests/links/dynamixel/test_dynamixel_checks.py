@@ -29,7 +29,7 @@ def test_a_healthy_servo_passes():
 
 
 @pytest.mark.parametrize(
-    ("records", "counters", "check", "words"),
+    ("records", "counters", "check", "expected_text"),
     [
         (states(step_ns=50_000_000), {}, "replies", "20 replies/s"),
         (states(position_deg=200.0), {}, "position", "outside limits_deg 0 to 180"),
@@ -39,10 +39,10 @@ def test_a_healthy_servo_passes():
         (states(), {"temperature_c": 79}, "supply", "79 deg C"),
     ],
 )
-def test_a_servo_that_is_not_ready_fails(records, counters, check, words):
+def test_a_servo_that_is_not_ready_fails(records, counters, check, expected_text):
     found = by_name(servo_checks(observe(Servo(), records, counters=HEALTH | counters)))[check]
     assert found.level is Level.FAIL
-    assert words in found.sentence
+    assert expected_text in found.sentence
 
 
 def test_a_silent_servo_fails_and_damaged_replies_are_a_warning():

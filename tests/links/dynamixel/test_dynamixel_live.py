@@ -463,7 +463,7 @@ def error_text(servo):
 
 
 @pytest.mark.parametrize(
-    ("register", "value", "words"),
+    ("register", "value", "expected_text"),
     [
         (mx28.MODEL_NUMBER, 29, "model number 29.*1.0 firmware.*DYNAMIXEL Wizard"),
         (mx28.FIRMWARE_VERSION, 37, "firmware is version 37; version 38 is needed"),
@@ -474,10 +474,10 @@ def error_text(servo):
         (mx28.MAX_POSITION_LIMIT, 1500, r"Max Position Limit \(48\) is 1500, not 2048"),
     ],
 )
-def test_a_servo_that_must_not_be_driven_is_an_error_that_names_the_setting(emulator, register, value, words):
+def test_a_servo_that_must_not_be_driven_is_an_error_that_names_the_setting(emulator, register, value, expected_text):
     emulator.set(register, value)
     servo = live(emulator)
-    with pytest.raises(LinkError, match=words), servo.listen() as records:
+    with pytest.raises(LinkError, match=expected_text), servo.listen() as records:
         until(records, lambda _: False)  # on a busy machine it is read before its settings are checked
     assert emulator.get(mx28.TORQUE_ENABLE) == 0
 
@@ -495,12 +495,12 @@ def test_with_write_settings_the_settings_are_corrected_and_kept(emulator):
 
 
 def test_no_servo_and_no_port_are_errors_that_name_what_to_check(emulator, tmp_path):
-    words = error_text(live(emulator, servo_id=7, start_timeout_s=0.2))
-    assert "the servo with id 7 does not reply at 1000000 baud" in words
-    assert "Is it powered (12 V) and wired" in words
-    words = error_text(Servo(port=str(tmp_path / "none"), start_timeout_s=0.2))
-    assert "cannot open" in words
-    assert "Is the USB adapter plugged in" in words
+    expected_text = error_text(live(emulator, servo_id=7, start_timeout_s=0.2))
+    assert "the servo with id 7 does not reply at 1000000 baud" in expected_text
+    assert "Is it powered (12 V) and wired" in expected_text
+    expected_text = error_text(Servo(port=str(tmp_path / "none"), start_timeout_s=0.2))
+    assert "cannot open" in expected_text
+    assert "Is the USB adapter plugged in" in expected_text
 
 
 @pytest.mark.parametrize(

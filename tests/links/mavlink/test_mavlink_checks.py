@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as m
 from flow.link import LinkError, Record
 from links.mavlink import Autopilot
 from links.mavlink.checks import autopilot_checks, parameter_check
-from links.mavlink.framing import packed
 from links.mavlink.parameters import ParameterValues, ask_parameters
+from links.mavlink.transport.framing import packed
 from links.preflight.check_result import Level
 from stages.messages import AutopilotEstimator, AutopilotStatus
 from tests.links.preflight.observed import observe
@@ -89,7 +89,7 @@ def test_an_autopilot_that_sends_all_needed_messages_passes():
 
 
 @pytest.mark.parametrize(
-    ("records", "given", "name", "words"),
+    ("records", "given", "name", "expected_text"),
     [
         (frames(autopilot=12), {}, "heartbeat", "set profile: px4"),
         (frames(), {"newest": status(armed=True)}, "heartbeat", "disarm it"),
@@ -104,10 +104,10 @@ def test_an_autopilot_that_sends_all_needed_messages_passes():
         (frames(), {"estimators": [estimator(ratio=1.6)]}, "estimate", "rejects velocity (1.6)"),
     ],
 )
-def test_an_autopilot_that_is_not_ready_fails(records, given, name, words):
+def test_an_autopilot_that_is_not_ready_fails(records, given, name, expected_text):
     found = check(records, **given)[f"it {name}"]
     assert found.level is Level.FAIL
-    assert words in found.sentence
+    assert expected_text in found.sentence
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_a_full_disk_for_the_signing_time_is_an_error_in_preflight(tmp_path, mon
     key = tmp_path / "key"
     key.write_bytes(b"k" * 32)
     key.chmod(0o600)
-    monkeypatch.setattr("links.mavlink.signing.os.fsync", full)
+    monkeypatch.setattr("links.mavlink.transport.signing.os.fsync", full)
     with pytest.raises(LinkError, match="signing time cannot be written: No space left"):
         ask_parameters(Autopilot(connection="udpin:127.0.0.1:0", signing_key=key))
 

@@ -24,8 +24,8 @@ from flow.stage import input_ports
 from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.autopilot_session import AutopilotSession
-from links.mavlink.framing import header, packed, parse_frame
-from links.mavlink.signing import AHEAD_TICKS
+from links.mavlink.transport.framing import header, packed, parse_frame
+from links.mavlink.transport.signing import AHEAD_TICKS
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.autopilot.px4_rules import Px4Rules
@@ -233,7 +233,7 @@ def test_half_a_frame_of_the_previous_connection_does_not_delay_the_new_one():
         assert listener.link.counters["stray bytes"] == 20
 
 
-def test_timesync_is_requested_and_answered():
+def test_timesync_is_requested_and_replied_to():
     with listening() as listener, drone_for(listener, Px4Rules()) as drone:
         before_ns = host_time.now_ns()
         listener.wait(lambda: any(m.tc1 != 0 for m in drone.messages("TIMESYNC")))
@@ -383,11 +383,11 @@ def test_a_slow_disk_for_the_signing_time_delays_no_pose(tmp_path: Path, monkeyp
         session = listener.link._session
         assert session is not None
         assert session._signer is not None
-        monkeypatch.setattr("links.mavlink.signing.os.fsync", slow)
+        monkeypatch.setattr("links.mavlink.transport.signing.os.fsync", slow)
         session._signer._reserved = session._signer._used + AHEAD_TICKS // 4  # a write is due, but not urgent
         listener.wait(writing.is_set)
         listener.link.on_pose(good_pose(host_time.now_ns()))
-        session._signer._reserved = 0  # it hangs until all reserved times are used
+        session._signer._reserved = 0  # it is blocked until all reserved times are used
         listener.link.on_pose(good_pose(host_time.now_ns()))
         assert listener.link.counters["sent: ODOMETRY"] == 2
         release.set()
@@ -416,7 +416,7 @@ def test_a_full_disk_for_the_signing_time_stops_nothing(tmp_path: Path, monkeypa
         assert session is not None
         signer = session._signer
         assert signer is not None
-        monkeypatch.setattr("links.mavlink.signing.os.fsync", full)
+        monkeypatch.setattr("links.mavlink.transport.signing.os.fsync", full)
         signer._reserved = 0
         listener.wait(lambda: listener.link.counters.get("signing time not written", 0) == 1)
         assert "signing time cannot be written" in (listener.link.status or "")
@@ -504,7 +504,7 @@ def test_without_a_connection_listening_is_an_error_that_names_the_setting():
 
 
 @pytest.mark.parametrize(
-    ("config", "words"),
+    ("config", "expected_text"),
     [
         ({"connection": "udp:14550"}, "udpin:127.0.0.1:14550"),
         ({"connection": "udpin:0.0.0.0:14550"}, "sender"),
@@ -515,6 +515,6 @@ def test_without_a_connection_listening_is_an_error_that_names_the_setting():
         ({"own_component_id": 1}, "must differ from the autopilot's component_id"),
     ],
 )
-def test_dangerous_settings_are_rejected_with_the_reason(config: Any, words: str):
-    with pytest.raises(ValidationError, match=words):
+def test_dangerous_settings_are_rejected_with_the_reason(config: Any, expected_text: str):
+    with pytest.raises(ValidationError, match=expected_text):
         Autopilot(**config)

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.framing import packed, parse_frame
 from links.mavlink.gate import PoseLimits
 from links.mavlink.pose_messages import landing_target, odometry, quality_percent, vision_position_estimate
 from links.mavlink.readers import read_odometry
+from links.mavlink.transport.framing import packed, parse_frame
 from stages.geometry.frames import rotation_from_rpy_deg
 from tests.links.mavlink.mavlink_poses import good_pose, position_of
 

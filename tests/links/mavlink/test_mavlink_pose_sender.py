@@ -102,13 +102,13 @@ def test_stopping_and_resuming_is_reported():
     for _ in range(60):
         output.pose()
     for _ in range(60):
-        output.pose(state=PoseState.AMBIGUOUS, reason="street and side street look alike")
+        output.pose(state=PoseState.AMBIGUOUS, reason="street and side street are similar")
     for _ in range(60):
         output.pose()
     severities = {text: severity for severity, text in output.texts}
     assert severities["grd: STOPPED: ambiguous rotation"] == 2  # critical
     assert severities["grd: sending poses"] == 5
-    assert severities["grd: AMBIGUOUS: street and side street look alike"] == 4
+    assert severities["grd: AMBIGUOUS: street and side street are similar"] == 4
     assert [text for _, text in output.texts].index(
         "grd: STOPPED: ambiguous rotation"
     ) == 2  # before the text of the state

@@ -29,7 +29,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 from flow.link import Record
 from links.clock import host_time
 from links.mavlink import Autopilot
-from links.mavlink.framing import packed, parse_frame
+from links.mavlink.transport.framing import packed, parse_frame
 from links.recording import RecordingReader, RecordingWriter
 from stages.geometry.frames import rotation_from_rpy_deg
 from stages.messages import PoseState, RelativePose

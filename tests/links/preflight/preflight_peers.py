@@ -13,8 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
 from flow.stage import Settings, Stage
-from links.mavlink.framing import packed, parse_frame
 from links.mavlink.profiles import PROFILES
+from links.mavlink.transport.framing import packed, parse_frame
 from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
 from links.simulated.sensors.vlp16_packets import encode_packet
 from links.simulated.world.flight import Flight

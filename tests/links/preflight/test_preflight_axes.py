@@ -38,7 +38,7 @@ def test_equal_vectors_agree_along_every_axis_and_noise_does_not_matter():
 
 
 @pytest.mark.parametrize(
-    ("permutation", "wrong", "words"),
+    ("permutation", "wrong", "expected_text"),
     [
         (np.diag([1.0, 1.0, -1.0]), "z", "z is measured as -z"),
         (np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, 1]]), "xy", "x is measured as y, y is measured as x"),
@@ -46,10 +46,10 @@ def test_equal_vectors_agree_along_every_axis_and_noise_does_not_matter():
         (np.array([[0, 0, 1.0], [0, 1, 0], [1, 0, 0]]), "xz", "x is measured as z, z is measured as x"),
     ],
 )
-def test_a_permutation_of_axes_is_reported(permutation, wrong, words):
+def test_a_permutation_of_axes_is_reported(permutation, wrong, expected_text):
     a = some()
     found = compare(a, a @ permutation.T, 0.1)
-    assert (found.wrong, found.permutation) == (wrong, words)
+    assert (found.wrong, found.permutation) == (wrong, expected_text)
 
 
 def test_a_small_motion_along_one_axis_is_compared_on_its_own():

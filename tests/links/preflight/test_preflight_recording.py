@@ -12,8 +12,8 @@ from links.cli.app import app
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def grd(*words, code):
-    result = CliRunner().invoke(app, ["preflight", *map(str, words)])
+def grd(*arguments, code):
+    result = CliRunner().invoke(app, ["preflight", *map(str, arguments)])
     assert result.exit_code == code, result.output
     return result.output
 
@@ -41,9 +41,11 @@ def test_a_recording_without_autopilot_is_no_go_where_the_configuration_declares
     assert "(autopilot heartbeat)" in text
 
 
-@pytest.mark.parametrize("words", [["nowhere.yaml"], [ROOT / "configs" / "replay.yaml", "--recording", "nowhere.mcap"]])
-def test_missing_files_are_wrong_use(words):
-    assert "nowhere" in grd(*words, code=2)
+@pytest.mark.parametrize(
+    "arguments", [["nowhere.yaml"], [ROOT / "configs" / "replay.yaml", "--recording", "nowhere.mcap"]]
+)
+def test_missing_files_are_wrong_use(arguments):
+    assert "nowhere" in grd(*arguments, code=2)
 
 
 def test_a_configuration_without_sources_is_wrong_use(tmp_path):

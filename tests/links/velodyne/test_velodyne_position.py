@@ -43,10 +43,11 @@ def test_a_missing_or_damaged_sentence_gives_no_time(nmea):
 
 
 @pytest.mark.parametrize(
-    ("data", "words"), [(bytes(1206), "512 bytes"), (position(pps=9), "PPS"), (position(time_us=2**32 - 1), "time")]
+    ("data", "expected_text"),
+    [(bytes(1206), "512 bytes"), (position(pps=9), "PPS"), (position(time_us=2**32 - 1), "time")],
 )
-def test_a_payload_that_is_no_position_packet_is_an_error(data, words):
-    with pytest.raises(LinkError, match=words):
+def test_a_payload_that_is_no_position_packet_is_an_error(data, expected_text):
+    with pytest.raises(LinkError, match=expected_text):
         parse_position(data)
 
 
@@ -122,10 +123,10 @@ def test_with_clock_utc_no_data_packet_is_accepted_before_the_sensor_is_locked(p
 
 
 @pytest.mark.parametrize(
-    ("position_packets", "words"),
+    ("position_packets", "expected_text"),
     [((), "no position packet has arrived"), ((position(pps=3),), "its PPS is error, its GPS time is valid")],
 )
-def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_with_the_reason(ports, position_packets, words):
+def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_with_the_reason(ports, position_packets, expected_text):
     lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc", timeout_s=0.5)
     with lidar.listen() as records:
         send(ports[1], *position_packets)
@@ -137,7 +138,7 @@ def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_with_the_reason(
         )
         sending.start()
         try:
-            with pytest.raises(LinkError, match=f"not locked to UTC: {words}.*clock: free"):
+            with pytest.raises(LinkError, match=f"not locked to UTC: {expected_text}.*clock: free"):
                 next(records)
         finally:
             stop.set()
@@ -145,13 +146,15 @@ def test_with_clock_utc_a_sensor_that_is_not_locked_is_an_error_with_the_reason(
 
 
 @pytest.mark.parametrize(
-    ("lost", "words"),
+    ("lost", "expected_text"),
     [
         (position(pps=0), "its PPS is absent, its GPS time is valid"),
         (position(GPRMC.replace("A", "V", 1)), "its PPS is locked, its GPS time is not valid"),
     ],
 )
-def test_with_clock_utc_a_lost_lock_is_reported_until_it_returns_and_packets_are_still_accepted(ports, lost, words):
+def test_with_clock_utc_a_lost_lock_is_reported_until_it_returns_and_packets_are_still_accepted(
+    ports, lost, expected_text
+):
     lidar = Lidar(port=ports[0], position_port=ports[1], clock="utc")
     statuses = []
     with lidar.listen() as records:
@@ -165,7 +168,7 @@ def test_with_clock_utc_a_lost_lock_is_reported_until_it_returns_and_packets_are
         statuses.append(lidar.status)
     before, not_yet, locked, lost_now, still_lost, after_damaged, locked_again = statuses
     assert (before, not_yet, locked, locked_again) == (None,) * 4, "a lock that never existed is another error, later"
-    assert words in lost_now
+    assert expected_text in lost_now
     assert "GPS antenna" in lost_now
     assert "set clock: free" in lost_now
     assert "PPS is synchronizing" in still_lost

@@ -13,11 +13,11 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink.autopilot_session import AutopilotSession
-from links.mavlink.framing import packed, parse_frame
 from links.mavlink.gate import PoseLimits
 from links.mavlink.origin import OriginSender
 from links.mavlink.pose_sender import PoseSender
 from links.mavlink.transport.connection import Address, Connection
+from links.mavlink.transport.framing import packed, parse_frame
 from links.mavlink.transport.stream_connection import StreamConnection
 from tests.links.mavlink.mavlink_poses import HOST0, good_pose
 

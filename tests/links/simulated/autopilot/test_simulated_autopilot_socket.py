@@ -13,8 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega
 from flow.link import Record
 from links.clock import host_time
 from links.mavlink import Autopilot as Receiver
-from links.mavlink.framing import packed, parse_frame
 from links.mavlink.transport.connection import Endpoint, Udp
+from links.mavlink.transport.framing import packed, parse_frame
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.framing import FrameSplitter, packed
+from links.mavlink.transport.framing import FrameSplitter, packed
 
 mavlink: Any = ardupilotmega
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.link import LinkError
-from links.mavlink.framing import SIGNATURE_BYTES, header, is_signed
+from links.mavlink.transport.framing import SIGNATURE_BYTES, header, is_signed
 
 KEY_BYTES = 32
 EPOCH_S = 1_420_070_400  # 2015-01-01, in seconds since 1970

@@ -15,8 +15,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import LinkError
-from links.mavlink.framing import packed
-from links.mavlink.signing import AHEAD_TICKS, RETRY_S, Signer, ticks_of
+from links.mavlink.transport.framing import packed
+from links.mavlink.transport.signing import AHEAD_TICKS, RETRY_S, Signer, ticks_of
 from tests.links.mavlink.mavlink_poses import HOST0, MS
 
 mavlink: Any = ardupilotmega
@@ -135,10 +135,10 @@ def full_disk(descriptor: int) -> None:
 
 def test_a_full_disk_is_reported_and_counted_and_times_still_increase(key_file: Path, monkeypatch: pytest.MonkeyPatch):
     now_s = 0.0
-    monkeypatch.setattr("links.mavlink.signing.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("links.mavlink.transport.signing.time.monotonic", lambda: now_s)
     signer = Signer(key_file, HOST0)
     with monkeypatch.context() as full:
-        full.setattr("links.mavlink.signing.os.fsync", full_disk)
+        full.setattr("links.mavlink.transport.signing.os.fsync", full_disk)
         times = signed_for_minutes(signer)
         assert signer.unwritten == 1  # not tried each time
         assert "cannot be written: No space left on device" in (signer.status or "")
@@ -161,7 +161,7 @@ def test_a_slow_and_failing_disk_does_not_block_signing(key_file: Path, monkeypa
             pytest.fail("signing waited for the disk")
         full_disk(descriptor)
 
-    monkeypatch.setattr("links.mavlink.signing.os.fsync", slow)
+    monkeypatch.setattr("links.mavlink.transport.signing.os.fsync", slow)
     late_ns = HOST0 + 61_000 * MS  # all reserved times are used
     times = [ticks(signed(signer, late_ns))]  # signing does not write
     assert not writing.is_set()
@@ -194,7 +194,7 @@ def test_the_key_may_be_hexadecimal_and_its_files_are_private(key_file: Path, tm
 
 
 @pytest.mark.parametrize(
-    ("content", "mode", "words"),
+    ("content", "mode", "expected_text"),
     [
         (SECRET, 0o640, "chmod 600"),
         (SECRET, 0o604, "chmod 600"),
@@ -206,13 +206,13 @@ def test_the_key_may_be_hexadecimal_and_its_files_are_private(key_file: Path, tm
     ],
 )
 def test_a_bad_key_file_is_an_error_without_its_content(
-    tmp_path: Path, content: bytes | None, mode: int, words: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, content: bytes | None, mode: int, expected_text: str, caplog: pytest.LogCaptureFixture
 ):
     path = tmp_path / "bad.key"
     if content is not None:
         path.write_bytes(content)
         path.chmod(mode)
-    with caplog.at_level(logging.DEBUG), pytest.raises(LinkError, match=words) as error:
+    with caplog.at_level(logging.DEBUG), pytest.raises(LinkError, match=expected_text) as error:
         Signer(path, HOST0)
     if content:
         assert content.hex() not in str(error.value) + caplog.text

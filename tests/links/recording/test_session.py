@@ -151,10 +151,10 @@ def test_calibrate_says_how_many_parts_it_took_and_what_is_missing(first, tmp_pa
     assert "flight-2.mcap: the last part here" in text
 
 
-def test_a_preflight_looks_through_all_parts(first):
+def test_preflight_checks_all_parts(first):
     config = ROOT / "configs" / "estimate.yaml"
     text = grd("preflight", config, "--recording", first, "--no-motion", code=1)  # it has no autopilot
-    assert "3 parts of the recording, looked through together" in text
+    assert "3 parts of the recording, checked together" in text
     whole = grd("preflight", config, "--recording", STREET, "--no-motion", code=1)
     (losses,) = (line for line in whole.split("ok ") if line.startswith("lidar losses"))
     assert losses in text

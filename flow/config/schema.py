@@ -47,7 +47,7 @@ _OF_STAGES = {"thread": _THREAD, "process": _PROCESS, "low_priority": _LOW_PRIOR
 
 
 def schema() -> dict[str, Any]:
-    """The schema of a configuration file with all classes of `flow.config.classes.known_classes`."""
+    """The schema of a configuration file with all classes of `known_classes` in flow/config/classes.py."""
     definitions: dict[str, Any] = {"edge": _ANY_EDGE}
     sections = {kind: _section(kind, definitions) for kind in KINDS}
     return {

@@ -46,7 +46,6 @@ from stages.messages import (
     SweptPulses,
     VehicleMotion,
 )
-from stages.sweep.pulses import middle_ns
 from stages.sweep.sweep import Travel
 
 PRUNE_PERIOD_NS = 84_300_000  # about twelve times a second
@@ -153,7 +152,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
             now.start_ns = now.pruned_ns = now.detector_instance = pulses.stamp_ns
-        part = Slice(pulses, *now.trail.at(middle_ns(pulses)), looking_along(pulses.direction_vehicle))
+        part = Slice(pulses, *now.trail.at(pulses.middle_ns), looking_along(pulses.direction_vehicle))
         changed = False
         observations = now.finder.feed(part, self._motion_known(now_ns))
         self._count_pass_throughs(now, part, now_ns)

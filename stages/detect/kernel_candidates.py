@@ -12,10 +12,33 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.detect.kernel_score import inner_half_px
 from stages.kernels.detect.kernel_candidates import company_pixels, lowest_places, middle_m, minima, own_pixels
+from stages.kernels.detect.kernel_score import score_kernel
 from stages.messages import DepthImage
 from stages.sweep.depth_image import unproject
+
+EMPTY_M = 1e18  # an empty pixel's depth in the outer box: 1 / 1e18 adds nothing, and its square still fits a float32
+
+
+def inner_half_px(depth_m: float, focal_px: float, span_m: float) -> int:
+    """Equation (3) as half a side: floor(s h / Z_c / (2 res)), h / res = focal_px. The inner side is twice this + 1."""
+    return int(np.float32(span_m * focal_px) / np.float32(depth_m) * np.float32(0.5))
+
+
+def score_image(
+    depth_m: NDArray[np.float32], focal_px: float, span_m: float, outer_side_px: int, eps_m: float, nearest_m: float
+) -> NDArray[np.float32]:
+    """Equation (1), e per pixel (h, w); NaN for pixels that are empty or nearer than nearest_m."""
+    half_outer = outer_side_px // 2
+    pad = max(half_outer, inner_half_px(nearest_m, focal_px, span_m))
+    padded = np.pad(depth_m, pad)
+    far = np.where(padded > 0.0, padded, np.float32(EMPTY_M))
+    score = np.full_like(depth_m, np.nan)
+    score_kernel(
+        depth_m, padded, far, pad, np.float32(span_m * focal_px), half_outer, np.float32(eps_m), nearest_m, score
+    )
+    return score
+
 
 FIRST_SORTED = 16_384  # pixels looked at first for minima; sorting all of a full image takes as long as scoring it
 

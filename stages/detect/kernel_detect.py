@@ -2,9 +2,8 @@
 
     t_hat_0 = unproject(argmin_c e(c))                                                      Equation (1)
 
-over all pixels with depth, e from `stages/detect/kernel_score.py`. The paper stops there and so always has a drone;
-here the local minima are walked from the lowest score up and each is accepted or refused, in words
-(`stages/detect/kernel_candidates.py`).
+over all pixels with depth, e from `stages/detect/kernel_candidates.py`. The paper stops there, so it always reports a
+drone. Here the local minima are taken in ascending order of score, and each is accepted or refused with a reason.
 `gates: null` is the paper literally: the lowest score is the drone.
 
 Source: P III.B, Equations 1-5; the gates are ours.
@@ -20,15 +19,14 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.detect.kernel_candidates import Gates, Pixel, local_minima, refusal
-from stages.detect.kernel_score import inner_half_px, score_image
+from stages.detect.kernel_candidates import Gates, Pixel, inner_half_px, local_minima, refusal, score_image
 from stages.kernels.detect.kernel_score import kernel_terms
 from stages.messages import DepthImage, Detections, ScoreImage
 from stages.sweep.depth_image import unproject
 
 
 class Candidate(NamedTuple):
-    """One local minimum, judged."""
+    """One local minimum and whether it is accepted."""
 
     pixel: Pixel
     accepted: bool

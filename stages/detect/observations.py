@@ -15,14 +15,12 @@ import numpy as np
 
 from stages.detect.candidate import Observation
 from stages.detect.chords import ChordFinder
-from stages.detect.isolation import LargeObjectMap
-from stages.detect.pulse_buffer import MAX_SLICES, RecentPulses
+from stages.detect.isolation import MAX_SLICES, LargeObjectMap, RecentPulses
 from stages.geometry.frames import Array64
 from stages.kernels.detect.observations import BIG, SMALL, kinds_of, one_thing, places_of_kind, round_and_rugged
 from stages.kernels.detect.pulse_buffer import WINDOW_NS
 from stages.kernels.sweep.pulses import HOLE, LONGEST, STEP
 from stages.messages import SweptPulses
-from stages.sweep.pulses import middle_ns
 
 BEAM_SPACING_RAD = math.radians(2.0)  # between two lasers of a VLP-16
 DELAY_NS = 3_300_000  # after which the surroundings of an observation were scanned
@@ -81,7 +79,7 @@ class ObservationFinder:
         now_ns = int(slice_.pulses.point_stamp_ns[-1])
         while self._slices and now_ns - self._slices[0].end_ns > WINDOW_NS:
             self._slices.popleft()
-        self._slices.append(_Kept(middle_ns(slice_.pulses), now_ns, slice_.R, slice_.t))
+        self._slices.append(_Kept(slice_.pulses.middle_ns, now_ns, slice_.R, slice_.t))
         self._recent.add(slice_.pulses, slice_.axis, now_ns)
         self._find(slice_, now_ns)
         if not self._waiting or now_ns - self._waiting[0].found_ns < DELAY_NS:

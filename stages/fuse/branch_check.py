@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from stages.fuse.motions import Motions
+from stages.fuse.motion_model import Motions
 from stages.geometry.frames import Array64
 from stages.heading.hypothesis_bank import BranchSettings, HypothesisBank
 from stages.heading.windows import Windows

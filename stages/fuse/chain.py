@@ -12,11 +12,10 @@ import math
 
 import numpy as np
 
-from stages.fuse.back_end import BackEnd
-from stages.fuse.correlated import InformationInflation, inflation
+from stages.fuse.consistency import InformationInflation, Rejected, inflation
 from stages.fuse.positions import GATE, Positions
-from stages.fuse.rejected import Rejected
 from stages.fuse.settings import FuseErrors
+from stages.fuse.smoother import BackEnd
 from stages.geometry.frames import Array64, heading_rad
 from stages.geometry.se3 import composed_covariance, mahalanobis2, position_covariance
 from stages.kernels.geometry.so3 import log_rotation

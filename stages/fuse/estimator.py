@@ -15,12 +15,12 @@ import math
 
 import numpy as np
 
-from stages.fuse.back_end import BackEnd
 from stages.fuse.branch_check import BranchCheck
 from stages.fuse.chain import PERIOD_NS, Chain
-from stages.fuse.motions import WAIT_NS, Motions
+from stages.fuse.motion_model import WAIT_NS, Motions
 from stages.fuse.positions import GATE, MeasurementCovariance, Positions
 from stages.fuse.settings import FuseErrors, FuseLimits
+from stages.fuse.smoother import BackEnd
 from stages.geometry.frames import Array64, heading_rad, rotation_z
 from stages.geometry.se3 import mahalanobis2, position_covariance
 from stages.heading.motion_yaw import MAX_ALTERNATIVE_ODDS, Point

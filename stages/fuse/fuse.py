@@ -25,13 +25,12 @@ from pydantic import Field
 
 from flow.message import Message
 from flow.stage import Settings, Stage
-from stages.fuse.back_end import BackEnd
 from stages.fuse.chain import yaw_sigma_rad
 from stages.fuse.estimator import Estimator
 from stages.fuse.intake import Intake
 from stages.fuse.pose_message import MapEstimate, Status, lost, pose
 from stages.fuse.settings import FuseErrors, FuseLimits
-from stages.fuse.smoother import Smoother
+from stages.fuse.smoother import BackEnd, Smoother
 from stages.fuse.status import Jumps, state_of, unconfirmed_reason
 from stages.fuse.track_continuity import TrackContinuity
 from stages.geometry.se3 import position_covariance

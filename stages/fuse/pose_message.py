@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.fuse.motions import Motions
+from stages.fuse.motion_model import Motions
 from stages.geometry.frames import Array64
 from stages.messages import PoseEstimate, PoseState, PositionEstimate, RelativePose
 

@@ -13,11 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stages.fuse.correlated import InformationInflation
+from stages.fuse.consistency import InformationInflation, Rejected
 from stages.fuse.drift import Drift
-from stages.fuse.motions import Motions
-from stages.fuse.propagated import Step
-from stages.fuse.rejected import Rejected
+from stages.fuse.motion_model import Motions, Step
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64
 from stages.geometry.se3 import mahalanobis2

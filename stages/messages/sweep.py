@@ -43,6 +43,11 @@ class SweptPulses(Message):
     turntable_rad: float  # turntable angle, mid-slice; NaN: not known
     origin_vehicle_m: tuple[float, float, float]  # origin of the beams, mid-slice
 
+    @property
+    def middle_ns(self) -> int:
+        """Firing time of the middle pulse: the vehicle's pose at that time is used for the whole slice."""
+        return int(self.point_stamp_ns[self.point_stamp_ns.size // 2])
+
 
 @message(schema=23)
 class DepthImage(Message):

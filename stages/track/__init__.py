@@ -1,4 +1,4 @@
-"""P III.C: where the drone is, look by look. The paper's mean shift, and ours by hits and misses."""
+"""P III.C: position of the tracked drone, by mean shift (paper) or by returns and pass-throughs (grd)."""
 
 from stages.track.likelihood_track import LikelihoodTrack as LikelihoodTrack
 from stages.track.mean_shift_track import MeanShiftTrack as MeanShiftTrack

@@ -1,14 +1,14 @@
-"""Track by hits and misses: each look at a drone, hits and misses together, moves its position and velocity.
+"""Track a drone by the likelihood of returns and pass-throughs: each scan pass updates its position and velocity.
 
     SEARCHING   no hypothesis
-    CANDIDATE   something worth another look is followed, silently
-    TRACKING    the detector accepted it, and it was hit lately: a DroneFix for every look with a hit
-    COASTING    not hit lately; predicted, the covariance grows
-    LOST        not hit for `lost_after_s`, nor known by its own word; or no longer taken for a drone
+    CANDIDATE   a candidate of the detector is followed; no fix is published
+    TRACKING    the detector accepted it and it returned pulses recently: a DroneFix for each scan pass with a return
+    COASTING    no recent return; the state is predicted and its covariance grows
+    LOST        no return for `lost_after_s` and no telemetry, or the detector no longer accepts it
 
-A look is one passing of the rotor. Its pulses are measured against where the drone is at each pulse's own time
-(de-skew by its velocity and the vehicle's motion), those beside it count as misses (stages/track/hull.py). Several
-hypotheses are followed while doubtful, several drones as long as each is hit.
+A scan pass is one passing of the rotor over the drone. Each pulse is compared with the position predicted for the
+pulse's own time (de-skewed by the velocities of drone and vehicle). Pulses that pass close to it without a return are
+pass-throughs (stages/track/hull.py). Several hypotheses are followed while it is ambiguous which one is the drone.
 
 Source: ours, for P III.C; DESIGN, The graph: track.
 """
@@ -38,40 +38,41 @@ from stages.messages import (
     TrackState,
     VehicleMotion,
 )
-from stages.sweep.pulses import middle_ns
 from stages.track.hypotheses import Hypotheses, Hypothesis
 from stages.track.scan_pass import ScanPass, collect_into, evaluate
 
-PASS_OVER_NS = 4_000_000  # this long after its last pulse a look is complete
-CANDIDATE_S = 1.5  # one that was not accepted is forgotten so long after its last hit
+PASS_OVER_NS = 4_000_000  # this long after its last pulse a scan pass is complete
+CANDIDATE_S = 1.5  # a hypothesis that is not accepted is removed this long after its last return
 
 
 class LikelihoodTrackSettings(Settings):
     """Settings of `LikelihoodTrack`."""
 
-    mount: LidarMount = LidarMount()  # of it, how well the servo's angle is known
+    mount: LidarMount = LidarMount()  # its pointing_sigma_deg enters the bias covariance
     span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
-    hull_share: float = Field(0.075, ge=-1, le=1)  # of its span: the centre lies so far behind the mean of its returns
+    hull_share: float = Field(
+        0.075, ge=-1, le=1
+    )  # distance from the mean of the returns back to the centre, over the span
     max_drones: int = Field(1, ge=1, le=8)
-    max_hypotheses: int = Field(4, ge=0, le=16)  # candidates followed beside them
-    own_sigma_m: float = Field(0.8, gt=0)  # less known, only the detector finds it again
+    max_hypotheses: int = Field(4, ge=0, le=16)  # unconfirmed candidates
+    own_sigma_m: float = Field(0.8, gt=0)  # beyond this sigma only the detector can reacquire it
     manoeuvre: float = Field(1.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
-    odometry_manoeuvre: float = Field(0.01, gt=0)  # and what is left of it where the drone tells how it flies
+    odometry_manoeuvre: float = Field(0.01, gt=0)  # the same with odometry
     coast_after_s: float = Field(0.35, gt=0)
-    lost_after_s: float = Field(6.0, gt=0)  # later where the drone tells its flight, as long as
-    lost_sigma_m: float = Field(5.0, gt=0)  # it is known as well as this
+    lost_after_s: float = Field(6.0, gt=0)  # later with odometry, while
+    lost_sigma_m: float = Field(5.0, gt=0)  # its largest sigma is below this
     start_sigma_mps: float = Field(1.5, gt=0)  # of the detector's velocity
     tilt_deg: float = Field(0.05, ge=0)  # of the servo's axis against the vehicle's, about x and y, one sigma each
-    range_sigma_m: float = Field(
-        0.017, ge=0
-    )  # of the LiDAR, constant: VLP-16 data sheet 63-9229, +-3 cm, taken as even
-    shape_share: float = Field(0.03, ge=0, le=1)  # of its span: returns lie so far off its middle, one sigma, an axis
-    use_pass_throughs: bool = True  # ablation: without, only hits count
-    de_skew: bool = True  # ablation: without, a look is taken to be one moment
+    range_sigma_m: float = Field(0.017, ge=0)  # of the LiDAR, constant: VLP-16 data sheet 63-9229, +-3 cm, uniform
+    shape_share: float = Field(
+        0.03, ge=0, le=1
+    )  # offset of the returns from the centre over the span, one sigma per axis
+    use_pass_throughs: bool = True  # False: only returns count (ablation)
+    de_skew: bool = True  # False: a scan pass has one time stamp (ablation)
 
 
 class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
-    """Hits and misses of every look, de-skewed, on as many drones as there are."""
+    """Track up to `max_drones` drones by the likelihood of returns and pass-throughs of each scan pass."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates", "motion", "drone_position", "drone_odometry"})
 
@@ -81,7 +82,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         self._detector_life: int | None = None  # that counts the candidates
         self._next_number: int = 1
         self._idle_ns: int = 0
-        self._why_idle: str = "nothing found yet"
+        self._why_idle: str = "no drone detected yet"
         settings = self.settings
         self._known = Hypotheses(
             settings.manoeuvre,
@@ -92,19 +93,19 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         )
 
     def on_motion(self, motion: VehicleMotion) -> None:
-        """Where the vehicle is; without it, it is taken to be parked."""
+        """Add the vehicle's pose; without any the vehicle is assumed to be parked."""
         self._trail.add(motion)
 
     def on_drone_position(self, position: DroneLocalPosition) -> None:
-        """What the drone says of its flight: a track moves as it says."""
+        """Add the drone's telemetry, by which tracks are predicted."""
         self._known.add_position(position)
 
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
-        """The same from an autopilot that sends this; taken where it sends both."""
+        """Add the drone's odometry; preferred when both are sent."""
         self._known.add_odometry(odometry)
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
-        """Follow the promising ones; drop what is no longer taken for a drone."""
+        """Start hypotheses at probable candidates; remove tracks whose candidate is no longer accepted."""
         if self._detector_life not in (None, candidates.detector_instance):
             self._known.clear_candidate_numbers()
         self._detector_life = candidates.detector_instance
@@ -120,23 +121,23 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             if known is not None:
                 seen_later = int(candidates.seen_ns[i]) > known.last_return_ns
                 uncertain = known.confirmed and seen_later and self._known.uncertain(known, candidates.stamp_ns)
-                own_candidate = known.candidate == number  # the detector itself has followed it on
+                own_candidate = known.candidate == number  # followed by the detector, too
                 if (
                     uncertain
                     and (0.5 if own_candidate else self._known.required_probability(known, candidates.stamp_ns)) <= P
                 ):
                     self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
-                # what is refused beside a track whose own candidate is taken for a drone is another one there
+                # an improbable candidate next to a track whose own candidate is probable is another object
                 sure = known.candidate == number or (candidates.scan_passes[i] >= 6 and known.candidate not in own)
                 if P < 0.2 and known.confirmed and sure:
                     yield from self._lose(
-                        known, candidates.stamp_ns, f"no longer taken for a drone: {candidates.reasons[i]}"
+                        known, candidates.stamp_ns, f"no longer accepted as a drone: {candidates.reasons[i]}"
                     )
             elif P >= 0.5 and len(self._known) - len(self._known.confirmed) < self.settings.max_hypotheses:
                 self._known.start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
 
     def on_detections(self, detections: Detections) -> Iterator[TrackState | DroneFix]:
-        """What the detector accepts becomes a track."""
+        """Confirm the accepted candidates as drones."""
         for i in np.nonzero(detections.accepted)[0]:
             seen_ns = detections.stamp_ns if detections.seen_ns is None else int(detections.seen_ns[i])
             number = -1 if detections.candidate_id is None else int(detections.candidate_id[i])
@@ -148,7 +149,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             if drone is not None and seen_ns > drone.last_return_ns and self._known.uncertain(drone, seen_ns):
                 self._known.move(drone, number, xyz, v, seen_ns, seen_ns)
             if drone is None and (old := self._known.oldest_unseen(seen_ns)):
-                yield from self._lose(old, seen_ns, "not hit, while the detector accepted a drone elsewhere")
+                yield from self._lose(old, seen_ns, "no return, while the detector accepted another drone")
             if track is None:
                 if len(self._known.confirmed) >= self.settings.max_drones:
                     continue
@@ -162,15 +163,15 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
                 yield self._state(track, max(detections.stamp_ns, track.stamp_ns))
 
     def on_pulses(self, pulses: SweptPulses) -> Iterator[DroneFix | TrackState]:
-        """Collect each track's pulses; close the looks that are over; tell who coasts or is lost."""
+        """Collect each track's pulses, evaluate complete scan passes, publish states and fixes."""
         if pulses.range_m.size == 0:
             return
         now_ns = int(pulses.point_stamp_ns[-1])
-        R, t = self._trail.at(middle_ns(pulses))
+        R, t = self._trail.at(pulses.middle_ns)
         axis = mean_direction(pulses.direction_vehicle)
         hypotheses, span_m, de_skew = self._known, self.settings.span_m, self.settings.de_skew
         for track in hypotheses:
-            if track not in hypotheses:  # dropped a moment ago as the same as another
+            if track not in hypotheses:  # removed in this loop as a duplicate
                 continue
             scan_pass = track.scan_pass
             if scan_pass is not None and pulses.stamp_ns - scan_pass.last_ns > PASS_OVER_NS:
@@ -198,7 +199,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             )
 
     def _watch(self, track: Hypothesis, now_ns: int) -> Iterator[TrackState]:
-        """Coasting and losing are told without a look."""
+        """Publish coasting and loss between scan passes; remove duplicates."""
         settings = self.settings
         silent_s = (now_ns - track.last_return_ns) * 1e-9
         gone = silent_s > (settings.lost_after_s if track.confirmed else CANDIDATE_S)
@@ -206,17 +207,17 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             known = self._known.sample(now_ns) is not None
             gone = not (known and largest_sigma_m(self._known.at(track, now_ns)[1]) < settings.lost_sigma_m)
         if gone or track.log_odds < -4.0:
-            why = f"not hit for {silent_s:.1f} s" if silent_s > 1.0 else "looked at again and again, not hit"
+            why = f"no return for {silent_s:.1f} s" if silent_s > 1.0 else "no return in repeated scan passes"
             yield from self._lose(track, now_ns, why)
         elif track.confirmed:
-            for other in self._known:  # two that became one
+            for other in self._known:  # duplicates
                 if other is not track and np.linalg.norm(other.x[:3] - track.x[:3]) < settings.span_m:
                     younger = other if not other.confirmed or other.number > track.number else track
                     if younger is not track:
                         yield from self._lose(other, now_ns, f"is the same as drone {track.number}")
             if now_ns - track.published_ns > 100_000_000:
                 if silent_s > settings.coast_after_s:
-                    track.reason = f"not hit for {silent_s:.1f} s"
+                    track.reason = f"no return for {silent_s:.1f} s"
                 yield self._state(track, now_ns)
         elif now_ns - track.published_ns > 100_000_000:
             yield self._state(track, now_ns)
@@ -230,7 +231,9 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         R, _ = self._trail.at(now_ns)
         xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
         covariance = R.T @ P[:3, :3] @ R + self._bias_covariance(xyz)
-        if silent_s > self.settings.coast_after_s:  # what is seen is seen from the vehicle, wherever that is
+        if (
+            silent_s > self.settings.coast_after_s
+        ):  # a recent return is relative to the vehicle and needs no vehicle pose
             covariance += self._vehicle_covariance_m2(now_ns, xyz)
         track.published_ns = now_ns
         return TrackState(
@@ -246,12 +249,12 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         )
 
     def _vehicle_covariance_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> Array64:
-        """What a place beside a vehicle that is not heard any more is wrong by (3, 3), its axes."""
-        place_m, yaw_rad = self._trail.extrapolation_sigma(stamp_ns)
+        """Covariance (3, 3) [m^2] of a position due to the extrapolated vehicle pose, vehicle axes."""
+        sigma_m, yaw_rad = self._trail.extrapolation_sigma(stamp_ns)
         level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * yaw_rad
-        return place_m**2 * np.eye(3) + np.outer(level, level)
+        return sigma_m**2 * np.eye(3) + np.outer(level, level)
 
-    # one look
+    # one scan pass
 
     def _close(self, track: Hypothesis, scan_pass: ScanPass) -> Iterator[DroneFix | TrackState]:
         settings = self.settings
@@ -274,7 +277,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         if seen.expected > 0.5:
             ratio = min(max(track.p_0 * seen.hits / seen.expected, 0.15), 0.95)
             track.p_0 += 0.1 * (ratio - track.p_0)
-        track.reason = f"{seen.hits} hits, {seen.beside} pulses beside it"
+        track.reason = f"{seen.hits} returns, {seen.beside} pulses next to it"
         if track.confirmed:
             self._known.learn(track)
             yield self._fix(track)

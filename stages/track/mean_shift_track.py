@@ -86,7 +86,7 @@ class MeanShiftTrack(Stage[MeanShiftTrackSettings]):
         now.hit_since_sweep = False
         if settings.rival_sweeps is not None and now.rivals and (unsupported or now.rivals >= settings.rival_sweeps):
             distance_m = float(np.linalg.norm(accepted[0] - now.t_hat))
-            why = "the last sweep had no hit here" if unsupported else f"{now.rivals} sweeps in a row saw it there"
+            why = "the last sweep had no return here" if unsupported else f"{now.rivals} sweeps in a row agree"
             self._start(detections.stamp_ns, accepted[0], f"moved {distance_m:.1f} m to a detection: {why}")
 
     def on_points(self, points: SweptPoints) -> Iterator[DroneFix | TrackState]:
@@ -161,13 +161,16 @@ class MeanShiftTrack(Stage[MeanShiftTrackSettings]):
                 now.t_hat = fix.xyz_vehicle_m
                 now.last_hit_ns = fix.stamp_ns
                 now.acquired = now.hit_since_sweep = True
-                state, reason = TrackingState.TRACKING, f"{hits} hits"
+                state, reason = TrackingState.TRACKING, f"{hits} returns"
                 yield fix
             elif silent_s > settings.lost_after_s:
-                state, reason = TrackingState.LOST, f"fewer than {settings.min_hits} hits a frame for {silent_s:.1f} s"
+                state, reason = (
+                    TrackingState.LOST,
+                    f"below {settings.min_hits} returns a frame for {silent_s:.1f} s",
+                )
                 now.t_hat, now.why = None, "lost the drone, waiting for a detection"
             else:
-                few = f"{hits} hits" if hits else "no hit"
+                few = f"{hits} returns" if hits else "no return"
                 state, reason = TrackingState.TRACKING, f"{few}, {silent_s:.2f} s since the last fix or detection"
             if now.why and now.t_hat is not None:
                 reason, now.why = f"{now.why}; {reason}", ""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stages.fuse import Fuse
-from stages.fuse.propagated import Step
+from stages.fuse.motion_model import Step
 from stages.fuse.settings import FuseErrors
 from stages.fuse.smoother import Smoother
 from stages.geometry.frames import rotation_z

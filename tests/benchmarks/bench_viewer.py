@@ -1,6 +1,6 @@
 """Cost of the viewer for the run: `see`, compared with drawing in the caller's thread, and thinning of a slice.
 
-Run: python -m pytest tests/benchoverlays/bench_viewer.py --benchmark-only
+Run: python -m pytest tests/benchmarks/bench_viewer.py --benchmark-only
 """
 
 from __future__ import annotations

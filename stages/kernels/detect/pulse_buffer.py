@@ -1,6 +1,6 @@
 """Compiled functions that buffer recent pulses and search them around a position.
 
-Source: see `stages/detect/pulse_buffer.py`.
+Source: see `stages/detect/isolation.py`.
 """
 
 from __future__ import annotations

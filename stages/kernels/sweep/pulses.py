@@ -1,6 +1,6 @@
 """Compiled functions that average the directions of pulses.
 
-Source: see `stages/sweep/pulses.py`.
+Source: ours.
 """
 
 from __future__ import annotations

@@ -1,6 +1,10 @@
-"""Compiled functions that exclude long runs of returns (walls) from a scan pass.
+"""Compiled removal of returns that belong to a wall: longer runs of returns than the drone is wide.
 
-Source: see `stages/track/runs.py`.
+The pulses of one laser follow each other 0.2 deg apart. Consecutive returns at nearly the same range are one run. The
+runs of a drone are short, even in front of a wall, because the range steps at its edge. A run with something nearer at
+both ends is a glimpse through a gap, between leaves for example: its true extent is not known.
+
+Source: ours, for P III.C; runs end as the detector's chords do (`stages/detect/chords.py`).
 """
 
 from __future__ import annotations

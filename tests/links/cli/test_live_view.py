@@ -86,7 +86,7 @@ def test_a_log_has_one_line_with_state_pose_lag_and_losses():
 
 
 def test_without_a_fused_pose_the_track_and_its_last_fix_are_shown():
-    track = TrackState(stamp_ns=1, state=TrackingState.TRACKING, reason="5 hits", hits=5, frame_s=0.1)
+    track = TrackState(stamp_ns=1, state=TrackingState.TRACKING, reason="5 returns", hits=5, frame_s=0.1)
     fix = DroneFix(
         stamp_ns=1,
         xyz_vehicle_m=np.array([3.0, 4.0, 5.0]),
@@ -95,7 +95,7 @@ def test_without_a_fused_pose_the_track_and_its_last_fix_are_shown():
         iterations=1,
         shift_m=0.0,
     )
-    assert "TRACKING: 5 hits; x 3.00  y 4.00  z 5.00 m  sigma 0.30 m; " in shown(report_of(), track, fix)
+    assert "TRACKING: 5 returns; x 3.00  y 4.00  z 5.00 m  sigma 0.30 m; " in shown(report_of(), track, fix)
     assert "no drone yet; 1234 records" in shown(report_of())
 
 

@@ -12,7 +12,7 @@ from flow.link import Run
 from links.evaluation.run_data import OutputKind, read_output
 from links.mavlink.gate import PoseLimits
 from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
-from stages.fuse.motions import Motions
+from stages.fuse.motion_model import Motions
 from stages.fuse.pose_message import MapEstimate, Status, lost, pose
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import quaternions_xyzw, rotation_z

@@ -275,7 +275,7 @@ def tracks(stamp_ns: int, t_s: float, second_lost_s: float) -> Iterator[tuple[st
             TrackState(
                 stamp_ns=stamp_ns,
                 state=TrackingState.LOST if lost else TrackingState.COASTING if coasts else TrackingState.TRACKING,
-                reason=f"not hit for {coasting_s:.1f} s" if coasts else "3 hits, 12 pulses beside it",
+                reason=f"no return for {coasting_s:.1f} s" if coasts else "3 returns, 12 pulses next to it",
                 hits=0 if lost or coasts else 3,
                 frame_s=0.1,
                 track_id=number,

@@ -7,8 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from stages.detect import kernel_candidates
-from stages.detect.kernel_candidates import Gates, Pixel, local_minima, refusal, width_px
-from stages.detect.kernel_score import score_image
+from stages.detect.kernel_candidates import Gates, Pixel, local_minima, refusal, score_image, width_px
 from stages.kernels.detect.kernel_candidates import company_pixels, middle_m, own_pixels
 from stages.sweep.depth_image import focal_length_px
 from tests.stages.made import depth_image, point_of, street_depth

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.detect.pulse_buffer import MAX_SLICES, RecentPulses
+from stages.detect.isolation import MAX_SLICES, RecentPulses
 from stages.kernels.detect.isolation import TALLY, look_around
 from stages.kernels.detect.pulse_buffer import WINDOW_NS
 from stages.messages import SweptPulses

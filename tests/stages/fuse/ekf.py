@@ -16,8 +16,8 @@ import math
 import numpy as np
 
 from stages.fuse import Fuse
-from stages.fuse.back_end import HUBER
-from stages.fuse.propagated import Step
+from stages.fuse.motion_model import Step
+from stages.fuse.smoother import HUBER
 from stages.geometry.frames import Array64
 from stages.geometry.se3 import composed_covariance
 from stages.kernels.geometry.so3 import exp_rotation, hat, log_rotation

@@ -7,13 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from stages.fuse.correlated import MOST, InformationInflation, inflation
+from stages.fuse.consistency import ENOUGH, MOST, InformationInflation, Rejected, inflation
 from stages.fuse.drift import Drift
 from stages.fuse.estimator import Estimator
-from stages.fuse.motions import Motions
+from stages.fuse.motion_model import MotionModel, Motions
 from stages.fuse.positions import MeasurementCovariance, Positions
-from stages.fuse.propagated import MotionModel
-from stages.fuse.rejected import ENOUGH, Rejected
 from stages.fuse.settings import FuseErrors, FuseLimits
 from stages.fuse.smoother import Smoother
 from stages.fuse.track_continuity import TrackContinuity

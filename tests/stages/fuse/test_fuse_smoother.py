@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 
-from stages.fuse.propagated import Step
+from stages.fuse.motion_model import Step
 from stages.fuse.smoother import Smoother
 from stages.geometry.frames import rotation_z
 from stages.geometry.se3 import composed_covariance

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.fuse import Fuse
-from stages.fuse.motions import Motions
+from stages.fuse.motion_model import Motions
 from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import rotation_z
 from stages.messages import PoseState, VehicleMotion

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stages.kernels.sweep.pulses import mean_direction
-from stages.sweep.pulses import middle_ns
 from tests.stages.caster import SIDEWAYS, dithering, pulses_seen, together
 from tests.stages.made import PACKET_NS, START_NS
 
@@ -22,4 +21,4 @@ def test_the_mean_direction_is_numpys_to_the_last_bit(n):
 @pytest.mark.parametrize("packets", [1, 2, 4])
 def test_the_middle_of_a_slice_is_half_its_time_from_its_start(packets):
     first = next(together(pulses_seen([], dithering(SIDEWAYS), 0.02), packets))
-    assert middle_ns(first) == pytest.approx(START_NS + packets * PACKET_NS / 2, abs=PACKET_NS / 20)
+    assert first.middle_ns == pytest.approx(START_NS + packets * PACKET_NS / 2, abs=PACKET_NS / 20)

@@ -148,17 +148,17 @@ def test_a_drone_that_goes_away_is_predicted_with_growing_covariance_and_then_lo
     assert len(coasting) >= 15
     assert all(np.diff(traces) > 0)
     assert traces[-1] > 10 * traces[0]
-    assert all("not hit for" in m.reason for m in coasting)
+    assert all("no return for" in m.reason for m in coasting)
     # misses at where it should be draw the prediction off its straight way; it stays within three sigma
     for m in coasting:
         away = m.xyz_vehicle_m - here(PASSING, (m.stamp_ns - START_NS) * 1e-9)
         assert away @ np.linalg.solve(m.covariance_m2, away) < 16.0
     (lost,) = [m for m in states_of(out) if m.state is TrackingState.LOST]
     assert lost.track_id == 1
-    assert "not hit for" in lost.reason
+    assert "no return for" in lost.reason
     searching = states_of(out)[-1]
     assert searching.xyz_vehicle_m is None
-    assert searching.reason.startswith("lost drone 1: not hit for")
+    assert searching.reason.startswith("lost drone 1: no return for")
 
 
 @pytest.mark.parametrize("gap_s", [0.5, 2.0])
@@ -221,7 +221,7 @@ def test_a_drone_not_hit_for_a_second_gives_way_to_one_accepted_elsewhere(accept
     out = run(things, [accepted(here(first)), accepted(here(second), t_s=accepted_s, number=2)], 3.0)
     assert {f.track_id for f in out if isinstance(f, DroneFix)} == numbers
     lost = [m.reason for m in states_of(out) if m.state is TrackingState.LOST]
-    assert lost == (["not hit, while the detector accepted a drone elsewhere"] if 2 in numbers else [])
+    assert lost == (["no return, while the detector accepted another drone"] if 2 in numbers else [])
 
 
 def test_a_lost_drone_that_is_accepted_again_elsewhere_has_a_new_number():
@@ -328,7 +328,7 @@ def test_a_track_whose_probability_falls_is_dropped_with_the_detectors_reason():
     out = run([Drone(way)], [accepted(here(way)), candidate(here(way), 0.1, t_s=1.0)], 2.0)
     (lost,) = [m for m in states_of(out) if m.state is TrackingState.LOST]
     assert lost.stamp_ns == at_s(1.0)
-    assert lost.reason == "no longer taken for a drone: flew as a bird does"
+    assert lost.reason == "no longer accepted as a drone: flew as a bird does"
     assert max(f.stamp_ns for f in fixes_of(out)) < at_s(1.0)
 
 
@@ -444,7 +444,7 @@ def test_the_velocity_told_is_relative_to_the_vehicle():
 def test_without_a_drone_it_says_twice_a_second_that_it_searches():
     states = states_of(run([], [], 2.0))
     assert 4 <= len(states) <= 5
-    assert all(m.state is TrackingState.SEARCHING and m.reason == "nothing found yet" for m in states)
+    assert all(m.state is TrackingState.SEARCHING and m.reason == "no drone detected yet" for m in states)
 
 
 def test_the_same_pulses_give_the_same_fixes():

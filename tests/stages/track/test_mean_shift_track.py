@@ -85,7 +85,7 @@ def test_the_best_accepted_detection_starts_the_track():
     fixes, states = run(stage, [empty(0), detections(T0, T0 + [9, 0, 0]), swept([T0, T0 + [9, 0, 0]], at(5))])
     np.testing.assert_allclose(fixes[0].xyz_vehicle_m, T0, atol=1e-5)
     assert states[0].state == TrackingState.TRACKING
-    assert states[0].reason == "started at a detection; 1 hits"
+    assert states[0].reason == "started at a detection; 1 returns"
 
 
 def test_the_first_hits_are_looked_for_farther_than_later_ones():
@@ -137,10 +137,10 @@ def test_frames_without_hits_are_normal_until_the_time_is_up_and_then_it_searche
     lost = kinds.index(TrackingState.LOST)
     assert kinds[:lost] == [TrackingState.TRACKING] * lost
     assert (states[lost].stamp_ns - START_NS) / 1e9 == pytest.approx(3.005, abs=0.121)
-    assert "hits a frame for 3.1 s" in states[lost].reason
+    assert "returns a frame for 3.1 s" in states[lost].reason
     assert set(kinds[lost + 1 :]) == {TrackingState.SEARCHING}
     assert states[lost + 1].reason == "lost the drone, waiting for a detection"
-    assert "no hit" in states[3].reason
+    assert "no return" in states[3].reason
 
 
 def test_after_loss_the_next_accepted_detection_starts_again():
@@ -192,7 +192,7 @@ def test_a_rival_wins_at_once_when_the_last_sweep_had_no_hit_here():
     stage.on_detections(detections(T0 + [10, 0, 0], stamp_ns=at(2900)))
     assert stage._now.t_hat[0] == pytest.approx(T0[0] + 10)
     _, states = run(stage, [empty(2950), empty(3100)])
-    assert any("moved 10.0 m to a detection: the last sweep had no hit here" in s.reason for s in states)
+    assert any("moved 10.0 m to a detection: the last sweep had no return here" in s.reason for s in states)
 
 
 def test_the_papers_tracker_never_looks_back():

@@ -144,7 +144,7 @@ class YawTracker:
             difference_deg = abs(math.degrees(quarter_difference(best.yaw_rad - found[1].yaw_rad)))
             return (
                 None,
-                f"two matches {difference_deg:.0f} deg from each other fit {best.likeness:.0%} and {second:.0%} of the lines",
+                f"two matches, {difference_deg:.0f} deg apart, fit {best.likeness:.0%} and {second:.0%}",
             )
         return best, ""
 

@@ -1,9 +1,9 @@
 """Axis tilt and servo zero, which a sweep does not determine, from the vehicle's stated orientation.
 
-A rotation of everything about the servo's axis does not change the thickness of any surface, and so does a tilt of the axis in
-the vehicle. The ground around a level vehicle determines that tilt. It does not determine the zero, since the axis is
-vertical and the ground is symmetric about it. The zero needs a wall parallel to the vehicle. The sigma of both includes
-the sigma of the stated orientation and the consistency of ground or wall.
+A rotation of everything about the servo's axis does not change the thickness of any surface, nor does a tilt of the
+axis in the vehicle. The ground around a level vehicle determines that tilt. It does not determine the zero, since the
+axis is vertical and the ground is symmetric about it. The zero needs a wall parallel to the vehicle. The sigma of both
+includes the sigma of the stated orientation and the consistency of ground or wall.
 
 Source: ours. Lines and planes with Cauchy's weights: Holland, Welsch (1977).
 """
@@ -101,8 +101,8 @@ def ground(normal: Array64, centre_m: Array64, below_m: float) -> tuple[Array64,
     slope, share = _fitted(near)
     if share < AGREE:
         raise _Undetermined(
-            f"of the ground's patches {100 * share:.0f} % lie on one plane: park where there is no kerb and no change of "
-            "slope"
+            f"of the ground's patches {100 * share:.0f} % lie on one plane: park where there is no kerb and no "
+            "change of slope"
         )
     bends = [_fitted(near[side], ROUGH_M)[0] - slope for side in _halves(near[:, :2]) if _is_wide(near[side])]
     if len(bends) < 3:

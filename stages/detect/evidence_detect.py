@@ -37,7 +37,7 @@ from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.candidate_table import first_within
-from stages.kernels.sweep.pulses import looking_along
+from stages.kernels.sweep.pulses import mean_unit_direction
 from stages.messages import (
     Candidates,
     Detections,
@@ -152,7 +152,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
             now.start_ns = now.pruned_ns = now.detector_instance = pulses.stamp_ns
-        part = Slice(pulses, *now.trail.at(pulses.middle_ns), looking_along(pulses.direction_vehicle))
+        part = Slice(pulses, *now.trail.at(pulses.middle_ns), mean_unit_direction(pulses.direction_vehicle))
         changed = False
         observations = now.finder.feed(part, self._motion_known(now_ns))
         self._count_pass_throughs(now, part, now_ns)

@@ -19,7 +19,7 @@ import numpy as np
 
 from stages.geometry.frames import Array64
 from stages.kernels.detect.isolation import MAP_SIZE, nearest_remembered, remember
-from stages.kernels.detect.pulse_buffer import keep_slice, look_around_all
+from stages.kernels.detect.pulse_buffer import keep_slice, tally_slices
 from stages.messages import SweptPulses
 
 MAX_SLICES = 16
@@ -53,8 +53,8 @@ class RecentPulses:
     def isolation(
         self, centre_m: Array64, disc_m: float, inner_m: float, close_m: float, outer_m: float, depth_m: float
     ) -> Array64:
-        """Sector counts (TALLY,) around a position (3,) in the vehicle frame; see `look_around`."""
-        return look_around_all(
+        """Sector counts (TALLY,) around a position (3,) in the vehicle frame; see `tally_pulses`."""
+        return tally_slices(
             self._direction, self._range_m, self._origin_m, self._fan, self._sizes,
             centre_m, disc_m, inner_m, close_m, outer_m, depth_m,
         )  # fmt: skip

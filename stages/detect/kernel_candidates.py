@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.kernels.detect.kernel_candidates import company_pixels, lowest_places, middle_m, minima, own_pixels
+from stages.kernels.detect.kernel_candidates import company_pixels, lowest_scores, middle_m, minima, own_pixels
 from stages.kernels.detect.kernel_score import score_kernel
 from stages.messages import DepthImage
 from stages.sweep.depth_image import unproject
@@ -88,7 +88,7 @@ def local_minima(
     flat = np.ascontiguousarray(score).ravel()
     few = FIRST_SORTED
     while True:
-        place = lowest_places(flat.view(np.uint32), few)
+        place = lowest_scores(flat.view(np.uint32), few)
         # scores are not negative, so their bits sort as they do; with the place below them one integer sort does both
         key = np.sort((flat[place].view(np.uint32).astype(np.uint64) << 32) | place.astype(np.uint64))
         found = minima((key & 0xFFFFFFFF).astype(np.int64), depth_m, radius_px, same_m, at_most)

@@ -17,7 +17,14 @@ from stages.detect.candidate import Observation
 from stages.detect.chords import ChordFinder
 from stages.detect.isolation import MAX_SLICES, LargeObjectMap, RecentPulses
 from stages.geometry.frames import Array64
-from stages.kernels.detect.observations import BIG, SMALL, kinds_of, one_thing, places_of_kind, round_and_rugged
+from stages.kernels.detect.observations import (
+    BIG,
+    SMALL,
+    count_ball_chords,
+    kinds_of,
+    positions_of_kind,
+    summarise_object,
+)
 from stages.kernels.detect.pulse_buffer import WINDOW_NS
 from stages.kernels.sweep.pulses import HOLE, LONGEST, STEP
 from stages.messages import SweptPulses
@@ -103,7 +110,7 @@ class ObservationFinder:
         kinds = np.empty(len(rows), dtype=np.int64)
         big, small, hidden = kinds_of(rows, pulses.origin_vehicle_m[2], *limits, kinds)
         if big:
-            self._large.add(places_of_kind(rows, kinds, BIG, big, slice_.R, slice_.t), pulses.stamp_ns)
+            self._large.add(positions_of_kind(rows, kinds, BIG, big, slice_.R, slice_.t), pulses.stamp_ns)
         if hidden:
             self.hidden["hidden at an end by something nearer"] += hidden
         if small:
@@ -116,8 +123,8 @@ class ObservationFinder:
         rows, stamp_ns = np.array([c.row for c in same]), same[0].stamp_ns
         away_ns = [abs(kept.middle_ns - stamp_ns) for kept in self._slices]
         then = self._slices[away_ns.index(min(away_ns))]
-        middle, local, returns, range_m, extent_m = one_thing(rows, then.R, then.t)
-        round_chords, rough = round_and_rugged(rows)
+        middle, local, returns, range_m, extent_m = summarise_object(rows, then.R, then.t)
+        round_chords, rough = count_ball_chords(rows)
         since_ns = stamp_ns - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
         return Observation(
             stamp_ns=stamp_ns,

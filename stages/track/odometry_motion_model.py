@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.kernels.track.odometry_motion_model import YAWS, move_as_told, weigh_yaws
+from stages.kernels.track.odometry_motion_model import YAWS, add_odometry_motion, weigh_yaws
 from stages.odometry.drone.telemetry import DroneTelemetry
 from stages.track.kalman import predicted
 
@@ -148,5 +148,5 @@ class OdometryMotionModel:
         self._follow_resets()
         confidence = self.confidence
         x, covariance = predicted(x, P, dt_s, confidence * q_odometry + (1.0 - confidence) * q_free)
-        move_as_told(x, covariance, dt_s, *before[2:], *after[2:], confidence, *self._moments)
+        add_odometry_motion(x, covariance, dt_s, *before[2:], *after[2:], confidence, *self._moments)
         return x, covariance

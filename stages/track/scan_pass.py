@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.sweep.pulses import LONGEST
 from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, MISS, NEARER, WHEN_S, A, B, collect, posterior
-from stages.kernels.track.runs import leave_out_walls
+from stages.kernels.track.runs import mask_walls
 from stages.kernels.track.scan_pass import largest_sigma_m, seen_from
 from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS, WIDTH, across
@@ -116,7 +116,7 @@ def evaluate(
     What is hit where the prediction is worse than own_sigma_m may be anything: that is for the detector to judge.
     """
     pulses, sigma_m = np.concatenate(scan_pass.parts), scan_pass.sigma_m
-    leave_out_walls(pulses, span_m)
+    mask_walls(pulses, span_m)
     pulses = pulses[np.hypot(pulses[:, A], pulses[:, B]) <= scan_pass.reach_m]
     missed = pulses[(pulses[:, KIND] == MISS) | (pulses[:, KIND] == NEARER)]
     H = across(scan_pass.line)

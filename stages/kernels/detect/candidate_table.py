@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M
-from stages.kernels.detect.isolation import INNER_HITS, INNER_PASSES, TALLY, look_around
+from stages.kernels.detect.isolation import INNER_HITS, INNER_PASSES, TALLY, tally_pulses
 
 FURTHEST_STEP_M = 2.5  # largest distance of a sighting from the prediction
-MOST_COST = 9.0  # of a sighting: squared sigmas
-SEEN_LATELY_NS = 1_500_000_000  # beyond this age a miss is not counted
+MOST_COST = 9.0  # largest cost of a sighting: squared sigmas
+RECENT_NS = 1_500_000_000  # beyond this age a miss is not counted
 FAN_COS = 0.93  # cosine of half the angle that a slice covers
 X, Y, Z, VX, VY, VZ, P_X, P_XV, P_V = range(9)  # [m], [m/s] in frame map, and their variances
 STAMP, SEEN = 0, 1  # [ns]
-NOTHING, NEAR, ELSEWHERE = 0, 1, 2  # of a candidate: nothing to say; pulses near its middle; the fan is elsewhere
+NOTHING, NEAR, OUT_OF_VIEW = 0, 1, 2  # of a candidate: no pulse near it; pulses near its middle; outside the fan
 
 
 @compiled
@@ -48,17 +48,17 @@ def nearest_row(
     ns: NDArray[np.int64],
     joined: NDArray[np.bool_],
     rows: int,
-    asked: bool,
+    joined_wanted: bool,
     stamp_ns: int,
     xyz_m: Array64,
 ) -> int:
-    """Row of the candidate, joined or not as asked, whose prediction is nearest to a sighting, in sigmas; -1: of none.
+    """Row of the candidate (joined, or not) with the prediction nearest to a sighting, in sigmas; -1: none.
 
-    Of the table the first `rows` count.
+    Only the first `rows` of the table are valid.
     """
     best, least = -1, MOST_COST
     for row in range(rows):
-        if joined[row] != asked or stamp_ns < ns[row, STAMP]:
+        if joined[row] != joined_wanted or stamp_ns < ns[row, STAMP]:
             continue
         x, y, z, variance = predicted(state[row], (stamp_ns - ns[row, STAMP]) * 1e-9)
         away2 = (xyz_m[0] - x) ** 2 + (xyz_m[1] - y) ** 2 + (xyz_m[2] - z) ** 2
@@ -69,10 +69,10 @@ def nearest_row(
 
 
 @compiled
-def look_at_all(
+def observe_candidates(
     state: Array64,
     ns: NDArray[np.int64],
-    told: NDArray[np.bool_],
+    enabled: NDArray[np.bool_],
     rows: int,
     now_ns: int,
     R: Array64,
@@ -85,16 +85,16 @@ def look_at_all(
     most_variance: float,
     found: NDArray[np.int64],
 ) -> int:
-    """Fill found (rows, 3) with NOTHING, NEAR or ELSEWHERE, and the pulses of a slice that hit and passed each middle.
+    """Fill found (rows, 3): NOTHING, NEAR or OUT_OF_VIEW, and the pulses of a slice that hit and passed each middle.
 
-    Returns of how many there is something to say. R, t are T_map_vehicle of the slice, axis (3,) its mean direction,
-    direction (k, 3) and range (k,) its pulses.
+    Returns the number of candidates that are not NOTHING. R, t are T_map_vehicle of the slice, axis (3,) its mean
+    direction, direction (k, 3) and range (k,) its pulses.
     """
     tally, away, centre = np.zeros(TALLY, dtype=np.int64), np.empty(3), np.empty(3)
-    said = 0
+    count = 0
     for row in range(rows):
         found[row] = 0
-        if not told[row] or now_ns - ns[row, SEEN] > SEEN_LATELY_NS:
+        if not enabled[row] or now_ns - ns[row, SEEN] > RECENT_NS:
             continue
         away[0], away[1], away[2], variance = predicted(state[row], (now_ns - ns[row, STAMP]) * 1e-9)
         if variance > most_variance:
@@ -109,10 +109,10 @@ def look_at_all(
         length = math.sqrt(length2)
         if length > 0.5 and ahead > length * FAN_COS:
             tally[INNER_HITS] = tally[INNER_PASSES] = 0
-            look_around(direction, range_m, origin_m, centre, disc_m, math.inf, math.inf, disc_m, 1.0, tally)
+            tally_pulses(direction, range_m, origin_m, centre, disc_m, math.inf, math.inf, disc_m, 1.0, tally)
             found[row, 1], found[row, 2] = tally[INNER_HITS], tally[INNER_PASSES]
             found[row, 0] = NEAR if tally[INNER_HITS] + tally[INNER_PASSES] > 0 else NOTHING
         else:
-            found[row, 0] = ELSEWHERE
-        said += found[row, 0] != NOTHING
-    return said
+            found[row, 0] = OUT_OF_VIEW
+        count += found[row, 0] != NOTHING
+    return count

@@ -23,7 +23,7 @@ MAP_SIZE = 1 << BITS
 
 
 @compiled
-def look_around(
+def tally_pulses(
     direction: NDArray[np.float32],
     range_m: NDArray[np.float32],
     origin_m: Array64,

@@ -17,7 +17,7 @@ INFINITY_BITS = 0x7F80_0000  # of a float32; those of finite numbers from 0 up a
 
 
 @compiled
-def lowest_places(bits: NDArray[np.uint32], few: int) -> NDArray[np.int64]:
+def lowest_scores(bits: NDArray[np.uint32], few: int) -> NDArray[np.int64]:
     """Indices of the `few` lowest scores, and all others with the same upper 16 bits. NaN is no score.
 
     A histogram instead of a partition: its time does not depend on the scores.
@@ -82,7 +82,7 @@ def distance_m(depth_m: NDArray[np.float32], focal_px: float, centre_m: Array64,
 def box_px(shape: tuple[int, int], focal_px: float, centre_m: Array64, far_m: float) -> tuple[int, int, int]:
     """(row, column, reach): points within far_m of centre_m project within `reach` pixels of it.
 
-    |x / d - x_c / d_c| <= far (1 + |x_c| / d_c) / d. Points nearer than half the centre's depth are not looked for.
+    |x / d - x_c / d_c| <= far (1 + |x_c| / d_c) / d. Points nearer than half the centre's depth are not searched.
     """
     height, width = shape
     x, y, depth = centre_m

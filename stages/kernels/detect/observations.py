@@ -31,7 +31,7 @@ def kinds_of(
     clear_m: float,
     kinds: NDArray[np.int64],
 ) -> tuple[int, int, int]:
-    """What chords (n, COLUMNS) are of: BIG, SMALL and free at both ends, HIDDEN: small, not free, or NONE of these.
+    """Kinds of chords (n, COLUMNS): BIG, SMALL and free at both ends, HIDDEN: small, not free, or NONE of these.
 
     Fills kinds (n,); returns how many are BIG, SMALL, HIDDEN.
     """
@@ -50,8 +50,8 @@ def kinds_of(
 
 
 @compiled
-def places_of_kind(rows: Array64, kinds: NDArray[np.int64], kind: int, n: int, R: Array64, t: Array64) -> Array64:
-    """Where the n chords of a kind are (n, 3), by R (3, 3) and t (3,)."""
+def positions_of_kind(rows: Array64, kinds: NDArray[np.int64], kind: int, n: int, R: Array64, t: Array64) -> Array64:
+    """Positions (n, 3) of the n chords of a kind, transformed by R (3, 3) and t (3,)."""
     places_m = np.empty((n, 3))
     k = 0
     for i in range(rows.shape[0]):
@@ -64,8 +64,8 @@ def places_of_kind(rows: Array64, kinds: NDArray[np.int64], kind: int, n: int, R
 
 
 @compiled
-def one_thing(rows: Array64, R: Array64, t: Array64) -> tuple[Array64, Array64, int, float, float]:
-    """Of chords (n, COLUMNS) of one thing: its middle (3,) and that by R (3, 3) and t (3,), hits, range, extent [m]."""
+def summarise_object(rows: Array64, R: Array64, t: Array64) -> tuple[Array64, Array64, int, float, float]:
+    """Of the chords (n, COLUMNS) of one object: middle (3,), and by R (3, 3) and t (3,), hits, range, extent [m]."""
     hits, places = np.ascontiguousarray(rows[:, chord.COUNT]), np.ascontiguousarray(rows[:, :3])
     middle = hits @ places / hits.sum()
     across2 = 0.0
@@ -76,8 +76,8 @@ def one_thing(rows: Array64, R: Array64, t: Array64) -> tuple[Array64, Array64, 
 
 
 @compiled
-def round_and_rugged(rows: Array64) -> tuple[int, int]:
-    """How many chords (n, COLUMNS) with five or more returns bulge as smoothly as a ball, and how many do not."""
+def count_ball_chords(rows: Array64) -> tuple[int, int]:
+    """Number of chords (n, COLUMNS) with at least five returns that are round and smooth as a ball, and of the others."""
     low, high = BALL_BULGE_PER_M
     balls = rugged = 0
     for i in range(rows.shape[0]):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-STRAY = 0.005  # eps: probability of a false return
+FALSE_RETURN = 0.005  # eps: probability of a false return
 # of a collected pulse: offsets [m], hit or miss, range over the prediction [m] (inf: no return), time, laser
 A, B, KIND, DEPTH, WHEN_S, LASER = range(6)
 MISS, HIT, NEARER = 0.0, 1.0, 2.0  # NEARER: no information, the space behind is hidden
@@ -50,8 +50,8 @@ def collect(
 ) -> int:
     """Fill found (n, COLUMNS) with the pulses that pass within reach_m of the moving centre; returns their number.
 
-    Each is measured against where the centre is at its own time (de-skew), along the `axes` (2, 3) across `line`, the
-    unit line of sight of the look. A return nearer than depth_m before it hides what is behind and says nothing.
+    Each is measured against the position of the centre at its own time (de-skew), along `axes` (2, 3) across `line`, the
+    unit line of sight of the scan pass. A return more than depth_m in front of it hides what is behind: no information.
     """
     ax, ay, az, bx, by, bz = axes[0, 0], axes[0, 1], axes[0, 2], axes[1, 0], axes[1, 1], axes[1, 2]
     x, y, z = centre_m[0] - origin_m[0], centre_m[1] - origin_m[1], centre_m[2] - origin_m[2]
@@ -112,7 +112,7 @@ def posterior(
     nothing = 0.0
     for k in range(pulses.shape[0]):
         if pulses[k, KIND] == HIT:
-            nothing += math.log(STRAY)
+            nothing += math.log(FALSE_RETURN)
     for i in range(CELLS):
         a = middle_a - half_m + i * step
         for j in range(CELLS):
@@ -123,7 +123,7 @@ def posterior(
                     continue
                 p = p_0 * math.exp(-((pulses[k, A] - a) ** 2 + (pulses[k, B] - b) ** 2) * inverse)
                 if pulses[k, KIND] == HIT:
-                    v += math.log(p + STRAY)
+                    v += math.log(p + FALSE_RETURN)
                 elif use_misses:
                     v += math.log(1.0 - p)
             value[i, j] = v

@@ -1,6 +1,6 @@
 """Compiled removal of returns that belong to a wall: longer runs of returns than the drone is wide.
 
-The pulses of one laser follow each other 0.2 deg apart. Consecutive returns at nearly the same range are one run. The
+Consecutive pulses of one laser differ by 0.2 deg. Consecutive returns at nearly the same range are one run. The
 runs of a drone are short, even in front of a wall, because the range steps at its edge. A run with something nearer at
 both ends is a glimpse through a gap, between leaves for example: its true extent is not known.
 
@@ -22,7 +22,7 @@ LASERS = 256
 
 
 @compiled
-def leave_out_walls(pulses: Array64, span_m: float) -> None:
+def mask_walls(pulses: Array64, span_m: float) -> None:
     """Mark returns of long runs among a scan pass's pulses (n, COLUMNS), in order of time, as NEARER: no information.
 
     Returns of a short run that is hidden at both ends become GLIMPSE.

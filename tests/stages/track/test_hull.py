@@ -10,12 +10,12 @@ import pytest
 from stages.kernels.track.hull import (
     CELLS,
     DEPTH,
+    FALSE_RETURN,
     HIT,
     KIND,
     LASER,
     MISS,
     NEARER,
-    STRAY,
     WHEN_S,
     A,
     B,
@@ -57,8 +57,8 @@ def brute_force(pulses, prior, half_m=1.2, cells=481, misses=True):
     for pulse in pulses:
         p = P_0 * np.exp(-((pulse[A] - a) ** 2 + (pulse[B] - b) ** 2) / (2 * S_M**2))
         if pulse[KIND] == HIT:
-            log += np.log(p + STRAY)
-            nothing += math.log(STRAY)
+            log += np.log(p + FALSE_RETURN)
+            nothing += math.log(FALSE_RETURN)
         elif pulse[KIND] == MISS and misses:
             log += np.log(1 - p)
     w = np.exp(log - log.max())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, LASER, MISS, NEARER, A
-from stages.kernels.track.runs import leave_out_walls
+from stages.kernels.track.runs import mask_walls
 from stages.track.hull import COLUMNS
 
 SPAN_M = 0.5
@@ -25,7 +25,7 @@ def scan_pass(depths, laser=0, spacing_m=0.07):
 
 
 def hits(pulses):
-    leave_out_walls(pulses, SPAN_M)
+    mask_walls(pulses, SPAN_M)
     return np.nonzero(pulses[:, KIND] == HIT)[0].tolist()
 
 
@@ -55,7 +55,7 @@ def test_a_hole_in_a_wall_is_none_unless_it_is_wide(hole):
 def test_each_laser_has_runs_of_its_own_and_the_order_of_pulses_is_that_of_time():
     wall, drone = scan_pass([0.0] * 20, laser=3), scan_pass([math.inf] * 8 + [0.0] * 4 + [math.inf] * 8, laser=5)
     both = np.stack([wall, drone], axis=1).reshape(-1, COLUMNS)  # fired in turn
-    leave_out_walls(both, SPAN_M)
+    mask_walls(both, SPAN_M)
     assert set(both[both[:, KIND] == HIT][:, LASER]) == {5.0}
     assert (both[:, KIND] == HIT).sum() == 4
 
@@ -68,7 +68,7 @@ def test_what_shows_through_a_gap_is_a_glimpse_and_beside_an_edge_a_hit(left_m, 
     depths = [-5.0] * 6 + [left_m] + [0.3] * 3 + [right_m] + [-4.0] * 6
     pulses = scan_pass(depths)
     pulses[np.array(depths) < -0.6, KIND] = NEARER
-    leave_out_walls(pulses, SPAN_M)
+    mask_walls(pulses, SPAN_M)
     assert set(pulses[7:10, KIND]) == {kind}
 
 
@@ -79,9 +79,9 @@ def test_a_glimpse_with_a_hole_in_it_is_one_and_a_long_one_is_a_wall():
     ):
         pulses = scan_pass(depths)
         pulses[[0, -1], KIND] = NEARER
-        leave_out_walls(pulses, SPAN_M)
+        mask_walls(pulses, SPAN_M)
         assert set(pulses[1:-1, KIND]) - {MISS} == {kind}
 
 
 def test_nothing_in_nothing_out():
-    leave_out_walls(np.empty((0, COLUMNS)), SPAN_M)
+    mask_walls(np.empty((0, COLUMNS)), SPAN_M)

@@ -20,7 +20,17 @@ from stages.messages import Image, VisualMotion
 from stages.odometry.drone import FisheyeOdometry
 from stages.odometry.vehicle import VisualLidarOdometry
 from stages.odometry.visual.two_view import Noise, relative_motion
-from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, degrees_between, lidar_slice, of, picture, point_rays
+from tests.stages.seen import (
+    LENS,
+    LOOKS_DOWN,
+    LOOKS_UP,
+    SIZE_PX,
+    degrees_between,
+    grey_image,
+    lidar_slice,
+    of,
+    point_rays,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -38,7 +48,7 @@ def pose(k):
 def flight(size_px, mount):
     """Images of a rotating, flying camera."""
     C = mount.matrix()[:3, :3]
-    return [picture(pose(k)[0] @ C, pose(k)[1], k, size_px) for k in range(IMAGES)]
+    return [grey_image(pose(k)[0] @ C, pose(k)[1], k, size_px) for k in range(IMAGES)]
 
 
 @pytest.mark.parametrize("size_px", [720, 1080, 1440])

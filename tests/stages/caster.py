@@ -1,4 +1,4 @@
-"""A small ray caster for the stages' tests: what a VLP-16 on its servo tells of balls, boxes, wires and drones.
+"""A small ray caster for the stages' tests: returns of a VLP-16 on its servo from balls, boxes, wires and drones.
 
 Beams are lines without width, the air is clear, nothing is noisy. It knows nothing of links/simulated: a mistake in one
 is not hidden by the same mistake in the other.
@@ -28,7 +28,7 @@ Servo = Callable[[np.ndarray], np.ndarray]  # times (n,) [s] -> angles (n,) [rad
 
 
 class Thing(Protocol):
-    """Anything a beam may meet."""
+    """Any object that a beam can hit."""
 
     def range_m(self, origin_m: np.ndarray, direction: np.ndarray, t_s: np.ndarray) -> np.ndarray:
         """Range (n,) at which beams (n, 3) from origins (n, 3) meet it; inf where they do not."""
@@ -116,7 +116,7 @@ class Drone:
 
 @dataclass(frozen=True)
 class During:
-    """A thing that is there between two times only."""
+    """An object that exists between two times only."""
 
     thing: Thing
     from_s: float
@@ -193,7 +193,7 @@ def pulses_seen(
     from_s: float = 0.0,
     mount: LidarMount = ON_ITS_SIDE,
 ) -> Iterator[SweptPulses]:
-    """The slices that Sweep makes of it, placed without error."""
+    """The slices of Sweep, placed without error."""
     for stamp_ns, range_m, origin_m, direction in packets_seen(things, servo_rad, from_s, to_s, mount):
         middle_s = (stamp_ns[192:193] - START_NS) * 1e-9
         yield SweptPulses(
@@ -227,7 +227,7 @@ def together(slices: Iterator[SweptPulses], packets: int) -> Iterator[SweptPulse
 def seen(
     things: Sequence[Thing], servo_rad: Servo, seconds: float, mount: LidarMount = ON_ITS_SIDE
 ) -> Iterator[LidarFirings | ServoState]:
-    """What the VLP-16 at 600 rpm and the servo at 100 Hz tell, in order of time."""
+    """Messages of the VLP-16 at 600 rpm and the servo at 100 Hz, in order of time."""
     next_servo_ns = START_NS
     for stamp_ns, range_m, _, _ in packets_seen(things, servo_rad, 0.0, seconds, mount):
         while next_servo_ns <= stamp_ns[0]:

@@ -74,8 +74,8 @@ def depth_image(depth_m, fov_deg=120.0, origin=(0.0, 0.0, 0.0)) -> DepthImage:
     )
 
 
-def detections(*xyz_accepted, stamp_ns=START_NS, refused=()) -> Detections:
-    xyz = np.array([*xyz_accepted, *refused], dtype=np.float64).reshape(-1, 3)
+def detections(*xyz_accepted, stamp_ns=START_NS, rejected=()) -> Detections:
+    xyz = np.array([*xyz_accepted, *rejected], dtype=np.float64).reshape(-1, 3)
     n = len(xyz)
     accepted = np.arange(n) < len(xyz_accepted)
     return Detections(

@@ -118,7 +118,7 @@ def find_chords(
     rows: Array64,
     row_ns: NDArray[np.int64],
 ) -> int:
-    """Continue the chord of each laser, pulse by pulse; fill rows and times of completed chords; return their number."""
+    """Continue each laser's chord pulse by pulse; fill rows and times of completed chords; return the count."""
     count = 0
     point, before = np.empty(3), np.empty(3)
     for i in range(range_m.size):

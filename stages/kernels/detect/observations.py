@@ -77,7 +77,7 @@ def summarise_object(rows: Array64, R: Array64, t: Array64) -> tuple[Array64, Ar
 
 @compiled
 def count_ball_chords(rows: Array64) -> tuple[int, int]:
-    """Number of chords (n, COLUMNS) with at least five returns that are round and smooth as a ball, and of the others."""
+    """Number of chords (n, COLUMNS) with at least five returns that are round and smooth, and of the others."""
     low, high = BALL_BULGE_PER_M
     balls = rugged = 0
     for i in range(rows.shape[0]):

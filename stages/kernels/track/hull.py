@@ -50,7 +50,7 @@ def collect(
 ) -> int:
     """Fill found (n, COLUMNS) with the pulses that pass within reach_m of the moving centre; returns their number.
 
-    Each is measured against the position of the centre at its own time (de-skew), along `axes` (2, 3) across `line`, the
+    Each is relative to the position of the centre at its own time (de-skew), along `axes` (2, 3) across `line`, the
     unit line of sight of the scan pass. A return more than depth_m in front of it hides what is behind: no information.
     """
     ax, ay, az, bx, by, bz = axes[0, 0], axes[0, 1], axes[0, 2], axes[1, 0], axes[1, 1], axes[1, 2]

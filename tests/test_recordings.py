@@ -60,16 +60,16 @@ def test_the_paper_baseline_detects_a_building_as_the_drone(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("recording", "verdict"),
+    ("recording", "result"),
     [
         ("einride_vlp16", ("no drone: 0 of 14917 returns lie within 60 deg of straight up", 13)),
         ("mrpt_vlp16_gps", ("no drone: 0 of 16978 returns lie within 60 deg of straight up", 3)),
     ],
 )
 @pytest.mark.parametrize("config", ["replay", "paper"])
-def test_a_real_lidar_without_returns_overhead_detects_no_drone_and_reports_why(tmp_path, recording, verdict, config):
+def test_a_real_lidar_without_returns_overhead_detects_no_drone_and_reports_why(tmp_path, recording, result, config):
     results, _, _ = run(tmp_path, recording, config)
-    assert results.search_results == [verdict]
+    assert results.search_results == [result]
     assert not results.fixes
     assert [t.state for t in results.transitions] == ["SEARCHING"]
 

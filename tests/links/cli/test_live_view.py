@@ -35,7 +35,7 @@ def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
         links={"lidar": LinkReport(state, 1200, 1)},
         counters={
             "lidar": {"lost": 7, "from other senders": 0},
-            "fuse": {"rejected: fix: not finite": 3, "back end begun anew": 0},
+            "fuse": {"rejected: fix: not finite": 3, "back end reset": 0},
             "recorder": {"missed": 0},
         },
         switched_off=list(off),
@@ -108,7 +108,7 @@ def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():
     assert "OFF: vp_drone; lidar no packet on UDP 2368 for 2 s\n" in line
 
 
-def test_news_are_told_at_once_even_between_two_lines(capsys):
+def test_news_are_printed_at_once_between_two_lines(capsys):
     stream = io.StringIO()
     with LiveView(Console(file=stream, width=160, soft_wrap=True)) as view:
         view.show(RunStatus(0.0, report_of, ["lidar: first"]))
@@ -122,12 +122,12 @@ def test_a_terminal_shows_every_edge_and_link():
     for words in ("track.pulses", "sweep.swept_pulses", "150.0", "lidar", "lost 7", "FULL: seen now", "servo: stalled"):
         assert words in text
     assert "fuse    rejected: fix: not finite 3" in text
-    for nothing in ("recorder", "begun anew"):
+    for nothing in ("recorder", "back end reset"):
         assert nothing not in text
     assert "from other senders" not in text, "counts of zero are left out"
 
 
 @pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (Image, False)])
-def test_the_view_takes_only_what_it_shows(kind, wanted):
+def test_the_view_receives_only_the_messages_that_it_shows(kind, wanted):
     assert LiveView().latest.wants(kind) is wanted
     assert Digest().wants(kind)

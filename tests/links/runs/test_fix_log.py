@@ -23,7 +23,7 @@ def made(k: int, velocity: bool) -> DroneFix:
     )
 
 
-def test_every_fix_comes_back_to_the_last_bit():
+def test_every_fix_round_trips_to_the_last_bit():
     given = [made(k, velocity=k % 2 == 0) for k in range(5)]
     log = FixLog()
     assert not log
@@ -35,8 +35,8 @@ def test_every_fix_comes_back_to_the_last_bit():
         check_arrays(same)
         for name, _, _ in array_fields(DroneFix):
             np.testing.assert_array_equal(getattr(fix, name), getattr(same, name))
-        told = [(f.stamp_ns, f.hits, f.iterations, f.shift_m, f.track_id) for f in (fix, same)]
-        assert told[0] == told[1]
+        values = [(f.stamp_ns, f.hits, f.iterations, f.shift_m, f.track_id) for f in (fix, same)]
+        assert values[0] == values[1]
         assert (fix.velocity_vehicle_mps is None) == (same.velocity_vehicle_mps is None)
         if fix.velocity_vehicle_mps is not None:
             np.testing.assert_array_equal(fix.velocity_vehicle_mps, same.velocity_vehicle_mps)

@@ -224,7 +224,7 @@ def candidates(stamp_ns: int, t_s: float) -> Candidates:
         seen_ns=np.full(n, stamp_ns - 20_000_000),
         scan_passes=np.full(n, 4),
         reasons=(
-            "9 looks; 8 of 8 sectors around it free",
+            "9 scan passes; 8 of 8 sectors around it free",
             "next to a large object; if not a drone, a lamp, wire or edge",
         )[:n],
     )
@@ -239,8 +239,8 @@ def classified(stamp_ns: int, t_s: float) -> Detections:
         e_inner=np.zeros(2),
         e_outer=np.zeros(2),
         accepted=np.array([True, False]),
-        reasons=("9 looks", "next to a large object; if not a drone, a lamp, wire or edge"),
-        summary="drone at (6.8, 3.1, 12.3) m, 99.2 %: 9 looks",
+        reasons=("9 scan passes", "next to a large object; if not a drone, a lamp, wire or edge"),
+        summary="drone at (6.8, 3.1, 12.3) m, 99.2 %: 9 scan passes",
         start_ns=START_NS,
         seen_ns=np.full(2, stamp_ns),
         velocity_vehicle_mps=np.zeros((2, 3)),

@@ -24,7 +24,7 @@ ALLOWED = Tolerances(STRAIGHT, math.radians(0.1), math.radians(0.5), math.radian
 
 
 def pairs(streets, per_direction, count=200):
-    """Pictures 0.1 s apart of a drone that turns."""
+    """Images at intervals of 0.1 s of a drone that turns."""
     out = []
     for i in range(count):
         made = {"per_direction": per_direction, "stamp_ns": START_NS + i * 100 * MS, "seed": i % 8}

@@ -1,4 +1,4 @@
-"""Camera frames and lenses. A frame's time against its period says how much slower than real time the simulator is.
+"""Camera frames and lenses. The time of a frame over its period is the factor by which the simulator is slower than real time.
 
     python -m pytest tests/benchmarks/bench_camera.py --benchmark-columns=min,median,iqr,rounds
 

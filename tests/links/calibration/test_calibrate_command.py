@@ -115,7 +115,7 @@ def test_a_vehicle_that_moved_by_its_odometry_is_rejected(tmp_path):
             data = json.dumps(pose).encode()
             writer.write(replace(record, topic="/vehicle/odometry", data=data, sequence=2 * k + 1))
     text = grd("calibrate", drove, code=1)
-    assert "odometry says that it drove 0." in text
+    assert "by its odometry it drove 0." in text
     assert list(tmp_path.iterdir()) == [drove]
 
 

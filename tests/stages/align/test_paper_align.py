@@ -90,7 +90,7 @@ def test_a_correct_initial_yaw_is_confirmed_without_a_jump():
     out = run(PaperAlign(), flight, 40)
     assert out[-1].state is BranchState.RESOLVED
     assert out[-1].switches == 0
-    assert out[-1].reason.endswith("motion agrees")
+    assert out[-1].reason.endswith("confirmed by motion")
     assert max(errors_deg(out, flight)[10:]) < 1.5
 
 

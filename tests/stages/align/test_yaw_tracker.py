@@ -53,7 +53,7 @@ def test_one_common_street_of_several_does_not_match():
 def test_without_a_common_street_there_is_no_match():
     tracker = YawTracker()
     reason, _ = follow(tracker, np.zeros(720), seen(3), at(0))
-    assert reason == "the two cameras' lines have no direction in common"
+    assert reason == "the lines of both cameras have no direction in common"
     assert tracker.offset_rad is None
 
 

@@ -189,10 +189,10 @@ def test_a_short_path_confirms_a_yaw_before_it_determines_one():
     """Its sigma is 15 deg, too much for a heading but small against 90 deg."""
     bank_ = MotionYaw(ERRORS, math.radians(6))
     p = points(circle())[0]
-    bank_._told = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(15) ** 2))
+    bank_._fit = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(15) ** 2))
     assert bank_.coarse_yaw is None
     assert bank_.confirms(p.stamp_ns, 0.4, 0.01)
     assert not bank_.confirms(p.stamp_ns, 0.4 + math.pi / 2, 0.01)
     assert not bank_.confirms(p.stamp_ns + 6 * S, 0.4, 0.01)
-    bank_._told = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(30) ** 2))
+    bank_._fit = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(30) ** 2))
     assert not bank_.confirms(p.stamp_ns, 0.3, 0.01)  # odds 1 : 19

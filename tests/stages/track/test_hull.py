@@ -9,14 +9,14 @@ import pytest
 
 from stages.kernels.track.hull import (
     CELLS,
+    DELAY_S,
     DEPTH,
-    HIT,
+    FALSE_RETURN,
     KIND,
     LASER,
-    MISS,
-    NEARER,
-    STRAY,
-    WHEN_S,
+    OCCLUDED,
+    PASS_THROUGH,
+    RETURN,
     A,
     B,
     basis,
@@ -32,7 +32,7 @@ P_0 = 0.8
 def scan_pass(hits=(), misses=(), nearer=()):
     """Pulses at offsets (a, b) [m]."""
     rows = []
-    for kind, offsets in ((HIT, hits), (MISS, misses), (NEARER, nearer)):
+    for kind, offsets in ((RETURN, hits), (PASS_THROUGH, misses), (OCCLUDED, nearer)):
         for a, b in offsets:
             row = np.zeros(COLUMNS)
             row[[A, B, KIND]] = a, b, kind
@@ -56,10 +56,10 @@ def brute_force(pulses, prior, half_m=1.2, cells=481, misses=True):
     nothing = 0.0
     for pulse in pulses:
         p = P_0 * np.exp(-((pulse[A] - a) ** 2 + (pulse[B] - b) ** 2) / (2 * S_M**2))
-        if pulse[KIND] == HIT:
-            log += np.log(p + STRAY)
-            nothing += math.log(STRAY)
-        elif pulse[KIND] == MISS and misses:
+        if pulse[KIND] == RETURN:
+            log += np.log(p + FALSE_RETURN)
+            nothing += math.log(FALSE_RETURN)
+        elif pulse[KIND] == PASS_THROUGH and misses:
             log += np.log(1 - p)
     w = np.exp(log - log.max())
     total = w.sum()
@@ -118,7 +118,7 @@ def test_misses_on_one_side_shift_the_estimate_away_from_them():
 
 def test_misses_at_both_ends_of_a_stroke_make_it_surer_along_it_and_without_them_hits_speak_alone():
     pulses = LOOKS["a stroke with its ends"]
-    hits_only = pulses[pulses[:, KIND] == HIT]
+    hits_only = pulses[pulses[:, KIND] == RETURN]
     mean, covariance, *_ = solve(pulses, misses=False)
     np.testing.assert_allclose(mean, solve(hits_only)[0])
     np.testing.assert_allclose(covariance, solve(hits_only)[1])
@@ -161,7 +161,7 @@ LINE = np.array([0.0, 1.0, 0.0])
 NO_MOTION = np.zeros(3)
 
 
-def collected(positions, ranges, stamps_ns=None, velocity=NO_MOTION, reach_m=1.0, depth_m=0.6, room=64):
+def collected(positions, ranges, stamps_ns=None, velocity=NO_MOTION, gate_m=1.0, depth_m=0.6, room=64):
     """Pulses towards places (n, 3), of which a range may be given, or None: as far as the place."""
     away = np.asarray(positions, dtype=np.float64) - ORIGIN
     length = np.linalg.norm(away, axis=1)
@@ -178,7 +178,7 @@ def collected(positions, ranges, stamps_ns=None, velocity=NO_MOTION, reach_m=1.0
         CENTRE,
         velocity,
         0,
-        reach_m,
+        gate_m,
         depth_m,
         LINE,
         across(LINE),
@@ -195,13 +195,13 @@ def test_each_pulse_is_measured_across_and_along_the_line_of_sight():
     np.testing.assert_allclose(found[:, A], [0.3, 0, 0, 0.4], atol=1e-5)
     np.testing.assert_allclose(found[:, B], [0, 0.2, 0, 0], atol=1e-5)
     np.testing.assert_allclose(found[:3, DEPTH], [0, 0, 0.1], atol=1e-5)
-    assert found[:, KIND].tolist() == [HIT, HIT, HIT, MISS]
+    assert found[:, KIND].tolist() == [RETURN, RETURN, RETURN, PASS_THROUGH]
     assert found[3, DEPTH] == math.inf
     assert found[:, LASER].tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(
-    ("range_m", "kind"), [(0.0, MISS), (30.0, MISS), (15.5, HIT), (14.5, HIT), (15.7, MISS), (14.3, NEARER)]
+    ("range_m", "kind"), [(0.0, PASS_THROUGH), (30.0, PASS_THROUGH), (15.5, RETURN), (14.5, RETURN), (15.7, PASS_THROUGH), (14.3, OCCLUDED)]
 )
 def test_a_return_counts_by_how_deep_it_lies(range_m, kind):
     assert collected([CENTRE], [range_m])[0, KIND] == kind
@@ -220,6 +220,6 @@ def test_hits_on_a_flying_drone_fall_onto_its_centre_when_de_skewed():
     positions = CENTRE + np.outer(stamps_ns * 1e-9, velocity)
     found = collected(positions, [None] * 9, stamps_ns, velocity)
     np.testing.assert_allclose(found[:, [A, B, DEPTH]], 0.0, atol=2e-3)
-    np.testing.assert_allclose(found[:, WHEN_S], stamps_ns * 1e-9)
+    np.testing.assert_allclose(found[:, DELAY_S], stamps_ns * 1e-9)
     smeared = collected(positions, [None] * 9, stamps_ns)
     assert np.ptp(smeared[:, A]) == pytest.approx(0.24, abs=0.01)

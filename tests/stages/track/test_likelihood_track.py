@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.geometry.frames import LidarMount
-from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, A, B
+from stages.kernels.track.hull import DEPTH, GAP_RETURN, KIND, RETURN, A, B
 from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
 from stages.track import LikelihoodTrack
 from stages.track.hull import COLUMNS
@@ -459,7 +459,7 @@ def scan_pass(points):
     """Hits of a look at (a, b, depth) [m]."""
     pulses = np.zeros((len(points), COLUMNS))
     pulses[:, [A, B, DEPTH]] = points
-    pulses[:, KIND] = HIT
+    pulses[:, KIND] = RETURN
     return pulses
 
 
@@ -484,7 +484,7 @@ def test_what_is_met_farther_off_than_a_drone_ever_is_is_something_else():
 def test_a_glimpse_through_a_gap_has_to_be_where_a_drone_nearly_always_is(depth_m, taken):
     pulses = scan_pass([(0.05, 0.0, depth_m), (0.05, 0.07, depth_m)])
     assert drone_returns(pulses, 0.5, 0.1) is not None
-    pulses[:, KIND] = GLIMPSE
+    pulses[:, KIND] = GAP_RETURN
     assert (drone_returns(pulses, 0.5, 0.1) is not None) == taken
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.kernels.geometry.so3 import exp_rotation
-from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, A
+from stages.kernels.track.hull import DEPTH, GAP_RETURN, KIND, RETURN, A
 from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS
 from stages.track.scan_pass import collect_into, drone_returns, evaluate
@@ -52,11 +52,11 @@ def test_a_drone_beside_the_prediction_is_found_on_its_own_side_however_the_vehi
     assert math.dist(seen.x[:2], drone_m[:2]) < 0.03
 
 
-@pytest.mark.parametrize(("behind_m", "kinds"), [(0.1, {HIT, GLIMPSE}), (0.4, {HIT}), (0.7, set())])
+@pytest.mark.parametrize(("behind_m", "kinds"), [(0.1, {RETURN, GAP_RETURN}), (0.4, {RETURN}), (0.7, set())])
 def test_what_is_seen_through_a_gap_has_to_be_nearer_to_the_prediction(behind_m, kinds):
     """Three returns behind it; one sigma there is .14 m: .7, 2.8 and 5 of them."""
     found = set()
-    for kind in (HIT, GLIMPSE):
+    for kind in (RETURN, GAP_RETURN):
         pulses = np.zeros((3, COLUMNS))
         pulses[:, A], pulses[:, DEPTH], pulses[:, KIND] = (-0.05, 0.0, 0.05), behind_m, kind
         if drone_returns(pulses, SPAN_M, 0.1) is not None:

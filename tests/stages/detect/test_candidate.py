@@ -17,7 +17,7 @@ from stages.detect.candidate import (
     Candidate,
     Observation,
 )
-from stages.kernels.detect.candidate import OPEN_LOOKS
+from stages.kernels.detect.candidate import OPEN_PASSES
 from stages.kernels.detect.isolation import FARTHER_0, FREE_0, OCCUPIED_0, TALLY
 from tests.stages.made import START_NS
 
@@ -163,7 +163,7 @@ def test_what_stands_behind_a_sector_that_is_free_again_and_again_is_not_what_ho
         seen.isolation[FARTHER_0] = farther
         return seen
 
-    known_free = [look(0.1 * k, 0) for k in range(OPEN_LOOKS)]
+    known_free = [look(0.1 * k, 0) for k in range(OPEN_PASSES)]
     assert candidate(look(0.0, 2)).neighbour_score > 0.0
     assert candidate(*known_free, look(1.0, 2)).neighbour_score == 0.0
 

@@ -38,7 +38,7 @@ def heard_so(*nats, displacement_m=FAR_M):
     return MotionLogRatios(*nats, misfit=0.0, displacement_m=displacement_m)
 
 
-NOTHING = heard_so(0.0, 0.0, 0.0, 0.0)
+NO_PULSE = heard_so(0.0, 0.0, 0.0, 0.0)
 
 
 def hanging(log_ratios=None, range_m=20.0):
@@ -72,7 +72,7 @@ def test_what_is_smaller_than_a_drone_is_met_nearby_so_far_off_it_is_less_likely
     )
     once = [candidate(observation(0.0, returns=2, range_m=r)) for r in ranges_m]
     for c in once:
-        c.log_ratios = NOTHING
+        c.log_ratios = NO_PULSE
     far = E.far * (50.0 - E.far_m)
     between = 0.5 * (E.false_return + E.false_return_far)
     priors = [E.false_return, E.false_return, between, E.false_return_far, E.false_return_far - far]
@@ -87,7 +87,7 @@ def test_what_is_smaller_than_a_drone_is_met_nearby_so_far_off_it_is_less_likely
 def test_what_hangs_still_where_what_would_hold_it_is_unseen_is_less_likely_a_drone_the_farther():
     plain = E.model_copy(update={"hover": 0.0})
     for range_m, share in ((15.0, 0.0), (25.0, 0.5), (30.0, 1.0)):
-        still, flew = hanging(NOTHING, range_m), hanging(heard_so(20.0, 20.0, 20.0, 20.0), range_m)
+        still, flew = hanging(NO_PULSE, range_m), hanging(heard_so(20.0, 20.0, 20.0, 20.0), range_m)
         log_odds = [over_clutter(still, e, True, True)[0] for e in (E, plain)]
         assert log_odds[1] - log_odds[0] == pytest.approx(share * E.hover)
         assert over_clutter(flew, E, True, True) == over_clutter(flew, plain, True, True)
@@ -95,7 +95,7 @@ def test_what_hangs_still_where_what_would_hold_it_is_unseen_is_less_likely_a_dr
 
 def test_from_28_m_on_what_may_stand_still_is_never_sure_enough_to_be_accepted_and_what_flew_is():
     for range_m, still_accepted in ((20.0, True), (27.0, True), (29.0, False), (31.0, False)):
-        for told, moves in ((NOTHING, False), (heard_so(20.0, 20.0, 20.0, 20.0), True)):
+        for told, moves in ((NO_PULSE, False), (heard_so(20.0, 20.0, 20.0, 20.0), True)):
             c = hanging(told, range_m)
             c.isolated_score, c.free, c.return_count_nats = 30.0, np.full(SECTORS, 12.0), 30.0
             c.rough_chords = 5
@@ -200,7 +200,7 @@ def test_whatever_share_of_its_word_counts_what_a_hanging_drone_says_is_no_motio
 
 
 def test_over_what_stands_it_replaces_whether_it_moved():
-    silent, nothing, flew = hanging(), hanging(NOTHING), hanging(heard_so(20.0, 0.0, 0.0, 20.0))
+    silent, nothing, flew = hanging(), hanging(NO_PULSE), hanging(heard_so(20.0, 0.0, 0.0, 20.0))
     (log_odds, remarks, _), (same, same_said, _), (more, more_said, _) = (
         over_clutter(c, E, False, True) for c in (silent, nothing, flew)
     )
@@ -211,7 +211,7 @@ def test_over_what_stands_it_replaces_whether_it_moved():
     assert more == pytest.approx(log_odds - E.static * 12 + E.max_telemetry)
     moved = candidate(*way((2.0, 0.0, 0.0), looks=12))
     silently, *_ = over_clutter(moved, E, False, True)
-    moved.log_ratios = NOTHING
+    moved.log_ratios = NO_PULSE
     assert over_clutter(moved, E, False, True)[0] == pytest.approx(silently - E.moves + E.static * 12)
 
 
@@ -232,7 +232,7 @@ def test_nearby_a_path_that_a_wire_followed_by_the_aim_would_show_is_no_flight_h
 
 
 def test_two_things_may_lie_as_the_drone_flew_by_chance_less_with_each_look_since():
-    c = hanging(NOTHING)
+    c = hanging(NO_PULSE)
     alone, _ = classify(c, E, True, True)
     c.reacquired_at = 10
     assert classify(c, E, True, True)[0] == pytest.approx(alone - E.reacquired / 2)
@@ -247,7 +247,7 @@ def test_where_the_drone_tells_nothing_the_odds_are_a_share_of_the_evidence_and_
     assert evidence != 0.0
     share = ClassifierWeights(no_telemetry_weight=0.5, no_telemetry_offset=-1.0)
     assert classify(hanging(), share, True, True)[0] == pytest.approx(0.5 * evidence - 1.0)
-    assert classify(hanging(NOTHING), share, True, True) == classify(hanging(NOTHING), E, True, True)
+    assert classify(hanging(NO_PULSE), share, True, True) == classify(hanging(NO_PULSE), E, True, True)
 
 
 def test_without_the_drones_word_what_is_accepted_and_looked_at_again_has_the_evidence_that_the_numbers_were_made_for():
@@ -288,7 +288,7 @@ def test_nearby_looks_with_nothing_beside_it_count_more_once_every_sector_was_cr
 def test_a_refused_neighbour_counts_only_against_what_may_stand():
     for log_ratios, counts in (
         (None, E.near_rejected),
-        (NOTHING, E.near_rejected),
+        (NO_PULSE, E.near_rejected),
         (heard_so(20.0, 0.0, 0.0, 20.0), 0.0),
     ):
         c = hanging(log_ratios)
@@ -298,7 +298,7 @@ def test_a_refused_neighbour_counts_only_against_what_may_stand():
 
 
 def test_what_stands_where_something_was_refused_counts_little_while_the_drone_flies():
-    c = hanging(NOTHING)
+    c = hanging(NO_PULSE)
     c.near_rejected = True
     beside, *_ = over_clutter(c, E, False, True)
     c.revisited = True
@@ -321,7 +321,7 @@ def come_to_a_wall(*told_on_the_way):
     for told in told_on_the_way:
         c.add_log_ratios(told)
     c.neighbour_score = 10.0
-    c.add_log_ratios(NOTHING)
+    c.add_log_ratios(NO_PULSE)
     return c
 
 
@@ -353,7 +353,7 @@ def test_a_drone_that_falls_silent_beside_a_wall_has_nothing_to_show():
 
 def test_the_words_say_whether_it_flies_as_the_drone_says():
     assert "odometry" not in classify(hanging(), E, True, True)[1]
-    assert "odometry" not in classify(hanging(NOTHING), E, True, True)[1]
+    assert "odometry" not in classify(hanging(NO_PULSE), E, True, True)[1]
     assert (
         "its path agrees with the drone's odometry" in classify(hanging(heard_so(9.0, 4.0, 4.0, 9.0)), E, True, True)[1]
     )
@@ -375,7 +375,7 @@ def test_what_it_is_if_it_is_no_drone_is_noted():
 
 
 @pytest.mark.parametrize(
-    ("log_ratios", "range_m", "birds"), [(NOTHING, 5.0, 24.0), (NOTHING, 40.0, 3.3), (None, 20.0, 1.65)]
+    ("log_ratios", "range_m", "birds"), [(NO_PULSE, 5.0, 24.0), (NO_PULSE, 40.0, 3.3), (None, 20.0, 1.65)]
 )
 def test_the_bird_prior_is_the_assumed_number_of_birds_for_each_drone(log_ratios, range_m, birds):
     """Two dozen at close range and three far away with telemetry; without it, before any motion was observed, 1.65."""

@@ -19,7 +19,7 @@ from stages.kernels.detect.isolation import (
     OCCUPIED_0,
     SECTORS,
     TALLY,
-    look_around,
+    count_sectors,
 )
 
 ORIGIN_M = np.array([0.5, -0.3, 0.35])
@@ -36,7 +36,7 @@ def isolation(offsets_m, ranges_m, centre_m=AHEAD_M, R=None):
     tally = np.zeros(TALLY, dtype=np.int64)
     ranges = np.asarray(ranges_m, dtype=np.float32).reshape(-1)
     centre = ORIGIN_M + R @ (centre_m - ORIGIN_M)
-    look_around(direction.astype(np.float32), ranges, ORIGIN_M, centre, 0.15, 0.55, CLOSE_M, OUTER_M, 0.5, tally)
+    count_sectors(direction.astype(np.float32), ranges, ORIGIN_M, centre, 0.15, 0.55, CLOSE_M, OUTER_M, 0.5, tally)
     return tally
 
 
@@ -94,7 +94,7 @@ def test_beside_it_something_may_slope_towards_the_beam_by_more_than_it_is_besid
 def test_pulses_the_other_way_do_not_count():
     tally = np.zeros(TALLY, dtype=np.int64)
     back = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=np.float32)
-    look_around(back, np.zeros(2, dtype=np.float32), ORIGIN_M, AHEAD_M, 0.15, 0.55, CLOSE_M, OUTER_M, 0.5, tally)
+    count_sectors(back, np.zeros(2, dtype=np.float32), ORIGIN_M, AHEAD_M, 0.15, 0.55, CLOSE_M, OUTER_M, 0.5, tally)
     assert tally.sum() == 0
 
 

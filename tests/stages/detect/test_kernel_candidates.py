@@ -7,8 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from stages.detect import kernel_candidates
-from stages.detect.kernel_candidates import Gates, Pixel, local_minima, refusal, score_image, width_px
-from stages.kernels.detect.kernel_candidates import company_pixels, middle_m, own_pixels
+from stages.detect.kernel_candidates import Gates, Pixel, local_minima, reject_reason, score_image, width_px
+from stages.kernels.detect.kernel_candidates import middle_m, neighbour_pixels, own_pixels
 from stages.sweep.depth_image import focal_length_px
 from tests.stages.made import depth_image, point_of, street_depth
 
@@ -21,7 +21,7 @@ def scores(values, shape=(40, 40)):
 
 
 def refuse(depth, row, column, **gates):
-    return refusal(depth_image(depth), Pixel(row, column), 0.5, 20, Gates(**gates))
+    return reject_reason(depth_image(depth), Pixel(row, column), 0.5, 20, Gates(**gates))
 
 
 def drone_depth(row=256, column=256, depth_m=20.0, size=3):
@@ -82,8 +82,8 @@ def test_own_and_company_are_counted_by_distance_in_space():
         np.testing.assert_allclose(
             middle_m(depth, image.focal_px, place) + image.origin_vehicle_m, points[distance <= 1.0].mean(axis=0)
         )
-        assert company_pixels(depth, image.focal_px, centre - image.origin_vehicle_m, 1.0, 2.0, 10**9) == company
-        assert company_pixels(depth, image.focal_px, centre - image.origin_vehicle_m, 1.0, 2.0, 5) == 5
+        assert neighbour_pixels(depth, image.focal_px, centre - image.origin_vehicle_m, 1.0, 2.0, 10**9) == company
+        assert neighbour_pixels(depth, image.focal_px, centre - image.origin_vehicle_m, 1.0, 2.0, 5) == 5
 
 
 def test_width_is_the_extent_across_the_longest_direction():
@@ -130,7 +130,7 @@ def test_a_part_of_something_larger_is_refused():
     line[240:300, 255:258] = 20.0
     for depth in (wall, edge, line):
         assert refuse(depth, 256, 256).startswith("part of something larger")
-        assert refuse(depth, 256, 256, max_company_ratio=None) is None
+        assert refuse(depth, 256, 256, max_neighbour_ratio=None) is None
     assert refuse(line, 240, 256).startswith("part of something larger")  # its end, too
 
 
@@ -157,7 +157,7 @@ def test_a_single_stroke_of_a_beam_is_refused():
 
 
 @pytest.mark.parametrize(
-    "settings", [{"min_inner_px": 0}, {"company_m": 0.0}, {"max_company_ratio": -1.0}, {"border": True}]
+    "settings", [{"min_inner_px": 0}, {"neighbour_m": 0.0}, {"max_neighbour_ratio": -1.0}, {"border": True}]
 )
 def test_impossible_gates_are_refused(settings):
     with pytest.raises(ValidationError):

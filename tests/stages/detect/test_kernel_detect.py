@@ -130,7 +130,7 @@ def test_an_accepted_candidate_is_given_out_even_when_many_refused_ones_score_lo
         {"span_m": 0.0},
         {"eps_m": 0.0},
         {"outer_side_px": 1},
-        {"gates": Gates(company_m=0.4)},
+        {"gates": Gates(neighbour_m=0.4)},
         {"gates": {"mistyped": 1}},
     ],
 )

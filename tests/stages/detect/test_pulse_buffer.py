@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.detect.isolation import MAX_SLICES, RecentPulses
-from stages.kernels.detect.isolation import TALLY, look_around
+from stages.kernels.detect.isolation import TALLY, count_sectors
 from stages.kernels.detect.pulse_buffer import WINDOW_NS
 from stages.messages import SweptPulses
 
@@ -41,7 +41,7 @@ def fan(rng: np.random.Generator, spread_rad: float) -> tuple[SweptPulses, np.nd
 def one_by_one(slices: list[SweptPulses], centre_m: np.ndarray) -> np.ndarray:
     tally = np.zeros(TALLY, dtype=np.int64)
     for s in slices:
-        look_around(s.direction_vehicle, s.range_m, np.array(s.origin_vehicle_m), centre_m, *AROUND, tally)
+        count_sectors(s.direction_vehicle, s.range_m, np.array(s.origin_vehicle_m), centre_m, *AROUND, tally)
     return tally.astype(float)
 
 

@@ -78,9 +78,7 @@ class BeamAimSettings(Settings):
     span_m: float = Field(0.5, gt=0, le=10)  # largest dimension of the drone
     travel_deg: tuple[float, float] = (0.0, 180.0)  # servo positions that may be commanded
     limit_rpm: float = Field(55.0, gt=0)  # maximum servo speed; MX-28AR at 12 V
-    search_rpm: float = Field(
-        20.0, gt=0
-    )  # servo speed of the sweep, adjusted to the rotor so that no direction is missed
+    search_rpm: float = Field(20.0, gt=0)  # of the sweep, adjusted so that the beams cover all directions
     latency_s: float = Field(0.03, ge=0)  # from a goal to the start of the servo's movement
     settle_s: float = Field(0.015, ge=0)  # from arrival at the goal to standstill
     max_observations: int = Field(25, ge=1)  # of a candidate; then it is excluded for `cooldown_s`

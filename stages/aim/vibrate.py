@@ -53,9 +53,7 @@ class SweepVibrateAimSettings(Settings):
     half_angle_deg: float = Field(5.0, gt=0, le=90)  # amplitude of the vibration
     goal_tolerance_deg: float = Field(0.5, gt=0)  # distance from the goal at which the servo reverses
     stall_s: float = Field(0.3, gt=0)  # a servo that comes no nearer to its goal for this long reverses, too
-    end_slack_deg: float = Field(
-        5.0, ge=0, le=15
-    )  # drone beyond the travel by at most this: the servo stays at the end
+    end_slack_deg: float = Field(5.0, ge=0, le=15)  # drone this far beyond an end of the travel: the servo stays there
 
     @model_validator(mode="after")
     def _settings_agree(self) -> SweepVibrateAimSettings:

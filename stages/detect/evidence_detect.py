@@ -99,9 +99,7 @@ class EvidenceDetectSettings(Settings):
     clear_m: float = Field(2.0, gt=0.2)  # radius that must be free; a lamp is this far from its pole
     accept_probability: float = Field(0.95, gt=0.5, lt=1)  # at which a candidate is accepted as a drone
     follow_up_probability: float = Field(0.014, gt=0, lt=0.5)  # at which a candidate is published for more observations
-    report_s: float = Field(
-        1.0, gt=0.05
-    )  # longest time between messages while a drone is accepted; else 3 times it
+    report_s: float = Field(1.0, gt=0.05)  # longest time between messages while a drone is accepted; else 3 times it
     settle_s: float = Field(0.15, ge=0)  # delay of a pass's report, so that its last observations are complete
     sweep_deg: float = Field(180.0, gt=3, le=360)  # travel of the turntable that completes a pass
     forget_s: float = Field(4.0, gt=0)  # a promising candidate is removed this long after its last observation

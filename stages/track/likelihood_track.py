@@ -50,9 +50,7 @@ class LikelihoodTrackSettings(Settings):
 
     mount: LidarMount = LidarMount()  # its pointing_sigma_deg enters the bias covariance
     span_m: float = Field(0.5, gt=0, le=10)  # largest dimension of the drone
-    hull_share: float = Field(
-        0.075, ge=-1, le=1
-    )  # distance of the centre behind the mean of the returns, over the span
+    hull_share: float = Field(0.075, ge=-1, le=1)  # distance of the centre behind the returns' mean, over the span
     max_drones: int = Field(1, ge=1, le=8)  # tracked at the same time
     max_hypotheses: int = Field(4, ge=0, le=16)  # unconfirmed candidates
     own_sigma_m: float = Field(0.8, gt=0)  # beyond this sigma only the detector can reacquire it
@@ -239,9 +237,8 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         R, _ = self._vehicle.at(now_ns)
         xyz, velocity = self._vehicle.to_vehicle(now_ns, x[:3], x[3:])
         covariance = R.T @ P[:3, :3] @ R + self._bias_covariance(xyz)
-        if (
-            silent_s > self.settings.coast_after_s
-        ):  # a recent return is relative to the vehicle and needs no vehicle pose
+        # a recent return is relative to the vehicle and needs no vehicle pose
+        if silent_s > self.settings.coast_after_s:
             covariance += self._vehicle_covariance_m2(now_ns, xyz)
         track.published_ns = now_ns
         return TrackState(

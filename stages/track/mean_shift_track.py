@@ -57,9 +57,7 @@ class MeanShiftTrackSettings(Settings):
     frame_s: float = Field(0.12, gt=0)  # duration of a frame
     min_hits: int = Field(1, ge=1)  # returns of a frame that are needed for a fix
     lost_after_s: float = Field(3.0, gt=0)  # without a fix; a whole sweep (2.6 s) may pass without a return
-    rival_sweeps: int | None = Field(
-        2, ge=1
-    )  # sweeps with a drone at another position that reset the track; null: none
+    rival_sweeps: int | None = Field(2, ge=1)  # sweeps with a rival that reset the track; null: none
     span_m: float = Field(0.5, gt=0, le=10)  # s, largest dimension of the drone, for the covariance
     range_noise_m: float = Field(0.03, ge=0)  # one sigma; VLP-16 datasheet 63-9229: typical accuracy +-3 cm
     pointing_deg: float = Field(0.1, ge=0)  # one sigma of encoder, calibration and servo time together

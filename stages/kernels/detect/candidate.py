@@ -9,9 +9,8 @@ from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.detect.isolation import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
 
-OPEN_PASSES = (
-    3  # a sector free in this many scan passes has no support: a return farther out is another object
-)
+# A sector that is free in this many scan passes has no support: a return farther out is another object.
+OPEN_PASSES = 3
 SIGMA_M = 0.15  # of an observation
 ACCELERATION_MPS2 = 4.0
 

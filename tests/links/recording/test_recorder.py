@@ -143,7 +143,7 @@ def test_a_disk_without_room_is_said_and_records_are_counted_as_missed(tmp_path)
 
 
 def test_a_disk_that_gets_full_ends_the_recording_properly_and_room_again_begins_a_new_part(tmp_path, monkeypatch):
-    monkeypatch.setattr("links.recording.recorder.AGAIN_S", 0.0)
+    monkeypatch.setattr("links.recording.recorder.RETRY_S", 0.0)
     recorder = opened(tmp_path)
     recorder.record(record(1))
     free = [0]
@@ -163,7 +163,7 @@ def test_a_disk_that_gets_full_ends_the_recording_properly_and_room_again_begins
 
 
 def test_a_disk_that_is_gone_is_said_and_the_recording_goes_on_when_it_is_back(tmp_path, monkeypatch):
-    monkeypatch.setattr("links.recording.recorder.AGAIN_S", 0.0)
+    monkeypatch.setattr("links.recording.recorder.RETRY_S", 0.0)
     recorder = opened(tmp_path)
 
     def gone(folder):

@@ -16,7 +16,7 @@ from stages.aim.beam_aim import INNER_RAD
 from stages.aim.targets import Targets
 from stages.geometry.frames import Harmonic, LidarMount
 from stages.messages import Candidates, ServoGoal, TrackingState, TrackState
-from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Way, beams_lidar, beams_vehicle, flying, packet, still
+from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Trajectory, beams_lidar, beams_vehicle, flying, packet, still
 from tests.stages.made import MS, ON_ITS_SIDE, PACKET_NS, START_NS, servo
 
 TICK_NS = 5 * MS  # 200 servo states a second
@@ -33,7 +33,7 @@ class Flight:
     servo_rad: list[float] = field(default_factory=list)
     goals: list[tuple[float, ServoGoal]] = field(default_factory=list)  # with the time [s] of each
 
-    def missed_m(self, way: Way) -> np.ndarray:
+    def missed_m(self, trajectory: Trajectory) -> np.ndarray:
         """Distance of the nearest pulse from the drone in each rotor turn, (turns,)."""
         packets = (self.stamp_ns[-1] - START_NS) // PACKET_NS
         nearest = np.full((self.stamp_ns[-1] - START_NS) // TURN_NS + 1, np.inf)
@@ -44,7 +44,7 @@ class Flight:
             servo_rad = np.interp(stamps - START_NS, np.array(self.stamp_ns) - START_NS, table_rad)
             beams = beams_lidar(stamps, np.tile(LASER, len(which)))
             origin_m, direction = beams_vehicle(self.mount, servo_rad, beams)
-            line = way((stamps - START_NS) * 1e-9) - origin_m
+            line = trajectory((stamps - START_NS) * 1e-9) - origin_m
             along = np.einsum("ij,ij->i", direction, line)
             rho2 = np.where(along > 0, np.einsum("ij,ij->i", line, line) - along**2, np.inf)
             np.minimum.at(nearest, (stamps - START_NS) // TURN_NS, rho2)
@@ -92,8 +92,10 @@ def fly(aim: BeamAim, seconds: float, publish: Publisher, start_rad=0.3, rotor=T
     return flight
 
 
-def track_state(way: Way, t_s: float, state=TrackingState.TRACKING, track_id=1, sigma_m=0.05) -> TrackState:
-    position_m, soon = way(np.array([t_s, t_s + 0.01]))
+def track_state(
+    trajectory: Trajectory, t_s: float, state=TrackingState.TRACKING, track_id=1, sigma_m=0.05
+) -> TrackState:
+    position_m, soon = trajectory(np.array([t_s, t_s + 0.01]))
     return TrackState(
         stamp_ns=START_NS + round(t_s * 1e9),
         state=state,
@@ -107,13 +109,13 @@ def track_state(way: Way, t_s: float, state=TrackingState.TRACKING, track_id=1, 
     )
 
 
-def tracking(*ways: Way, until_s=math.inf) -> Publisher:
+def tracking(*trajectories: Trajectory, until_s=math.inf) -> Publisher:
     """Publish each drone's position at 10 Hz."""
 
     def publish(aim, t_s):
         if round(t_s * 1000) % 100 == 0 and t_s < until_s:
-            for i, way in enumerate(ways):
-                aim.on_state(track_state(way, t_s, track_id=i + 1))
+            for i, trajectory in enumerate(trajectories):
+                aim.on_state(track_state(trajectory, t_s, track_id=i + 1))
 
     return publish
 
@@ -140,7 +142,7 @@ def nothing(aim, t_s):
     pass
 
 
-def towards(azimuth_deg, elevation_deg, range_m=20.0) -> Way:
+def towards(azimuth_deg, elevation_deg, range_m=20.0) -> Trajectory:
     a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
     x, y, z = (range_m * v for v in (math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)))
     return still(x, y, z + 0.35)
@@ -181,8 +183,8 @@ DIRECTIONS = {
 
 @pytest.mark.parametrize("where", DIRECTIONS)
 def test_a_beam_is_on_the_drone_turn_after_turn(where):
-    way = towards(*DIRECTIONS[where])
-    missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tracking(way), start_rad=1.0).missed_m(way)[10:]
+    trajectory = towards(*DIRECTIONS[where])
+    missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tracking(trajectory), start_rad=1.0).missed_m(trajectory)[10:]
     assert np.mean(missed < 0.2) > 0.75  # the others have an offset on purpose
     assert missed.max() < 0.35
     on_it = np.nonzero(missed < 0.2)[0]
@@ -191,10 +193,12 @@ def test_a_beam_is_on_the_drone_turn_after_turn(where):
 
 
 def test_with_the_middle_of_the_fan_the_drone_lies_between_two_beams():
-    way = towards(*DIRECTIONS["to the side"])
-    missed = fly(BeamAim(mount=ON_ITS_SIDE, beams=False), 3.0, tracking(way)).missed_m(way)[10:]
+    trajectory = towards(*DIRECTIONS["to the side"])
+    missed = fly(BeamAim(mount=ON_ITS_SIDE, beams=False), 3.0, tracking(trajectory)).missed_m(trajectory)[10:]
     assert np.median(missed) > 0.25  # 1 deg at 20 m is 0.35 m
-    assert np.median(missed) > 3 * np.median(fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tracking(way)).missed_m(way)[10:])
+    assert np.median(missed) > 3 * np.median(
+        fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tracking(trajectory)).missed_m(trajectory)[10:]
+    )
 
 
 def test_a_calibrated_mount_with_sign_zero_and_harmonics_is_aimed_as_well():
@@ -205,8 +209,8 @@ def test_a_calibrated_mount_with_sign_zero_and_harmonics_is_aimed_as_well():
             "servo_harmonics": (Harmonic(order=1, amplitude_deg=1.0, phase_deg=30.0),),
         }
     )
-    way = towards(70.0, 45.0)
-    missed = fly(BeamAim(mount=mount), 3.0, tracking(way)).missed_m(way)[10:]
+    trajectory = towards(70.0, 45.0)
+    missed = fly(BeamAim(mount=mount), 3.0, tracking(trajectory)).missed_m(trajectory)[10:]
     assert np.mean(missed < 0.2) > 0.85
 
 
@@ -221,31 +225,31 @@ def test_the_gears_backlash_is_compensated_in_both_directions():
 @pytest.mark.parametrize("latency_s", [0.0, LATENCY_S, 0.045])
 @pytest.mark.parametrize("velocity", [(8.0, 0.0, 0.0), (0.0, -6.0, 3.0)])
 def test_a_fast_drone_is_led_for_any_servo_latency(velocity, latency_s):
-    way = flying(np.array([-8.0, 12.0, 12.0]), velocity)
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 2.5, tracking(way), start_rad=2.0, latency_s=latency_s)
-    missed = flight.missed_m(way)[8:]
+    trajectory = flying(np.array([-8.0, 12.0, 12.0]), velocity)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 2.5, tracking(trajectory), start_rad=2.0, latency_s=latency_s)
+    missed = flight.missed_m(trajectory)[8:]
     assert np.mean(missed < 0.25) > 0.9
     assert np.median(missed) < 0.1
 
 
 def test_a_drone_on_the_axis_is_passed_at_the_fans_inner_beam():
-    way = towards(0.0, 90.0)
-    missed = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, tracking(way)).missed_m(way)[10:]
+    trajectory = towards(0.0, 90.0)
+    missed = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, tracking(trajectory)).missed_m(trajectory)[10:]
     assert missed.min() < 0.4  # no beam reaches it: 1 deg is the least distance
 
 
 def test_two_drones_share_the_rotor_turns():
-    ways = towards(30.0, 45.0), towards(110.0, 50.0)
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 6.0, tracking(*ways))
-    for way in ways:
-        met = np.nonzero(flight.missed_m(way)[10:] < 0.25)[0]
+    trajectories = towards(30.0, 45.0), towards(110.0, 50.0)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 6.0, tracking(*trajectories))
+    for trajectory in trajectories:
+        met = np.nonzero(flight.missed_m(trajectory)[10:] < 0.25)[0]
         assert len(met) >= 12  # of 50 turns
         assert np.diff(met).max() <= 12  # observed again within 1.2 s
 
 
 def test_a_likely_candidate_interrupts_the_sweep():
-    way = towards(60.0, 45.0)
-    position_m = way(np.zeros(1))[0]
+    trajectory = towards(60.0, 45.0)
+    position_m = trajectory(np.zeros(1))[0]
 
     def publish(aim, t_s):
         if t_s >= 0.9 and round(t_s * 1000) % 100 == 0:
@@ -256,8 +260,8 @@ def test_a_likely_candidate_interrupts_the_sweep():
     assert {round(p, 3) for p in before} <= {0.0, 3.142}
     first = next(goal for t, goal in flight.goals if t >= 0.9)
     assert 0.01 < first.position_rad < 3.13
-    assert np.degrees(np.ptp(flight.servo_rad[:180])) > 60.0  # the sweep was under way
-    assert np.mean(flight.missed_m(way)[12:] < 0.3) > 0.5
+    assert np.degrees(np.ptp(flight.servo_rad[:180])) > 60.0  # the sweep was running
+    assert np.mean(flight.missed_m(trajectory)[12:] < 0.3) > 0.5
 
 
 def test_an_unlikely_candidate_does_not_interrupt_it():
@@ -286,13 +290,13 @@ def test_a_candidate_without_returns_is_excluded_and_the_sweep_continues():
 
 
 def test_while_coasting_the_offsets_from_the_prediction_grow_until_the_whole_travel_is_swept():
-    way = towards(80.0, 45.0)
+    trajectory = towards(80.0, 45.0)
 
     def publish(aim, t_s):
         if round(t_s * 1000) % 100 == 0:
             coasting = t_s >= 1.0
             state = TrackingState.COASTING if coasting else TrackingState.TRACKING
-            aim.on_state(track_state(way, t_s, state, sigma_m=0.05 + (t_s - 1.0 if coasting else 0.0)))
+            aim.on_state(track_state(trajectory, t_s, state, sigma_m=0.05 + (t_s - 1.0 if coasting else 0.0)))
 
     flight = fly(BeamAim(mount=ON_ITS_SIDE, coast_sigma_m=2.0), 6.0, publish, start_rad=1.2)
     positions = np.degrees(flight.servo_rad)
@@ -303,13 +307,13 @@ def test_while_coasting_the_offsets_from_the_prediction_grow_until_the_whole_tra
 
 
 def test_after_a_loss_it_sweeps_again():
-    way = towards(80.0, 45.0)
+    trajectory = towards(80.0, 45.0)
 
     def publish(aim, t_s):
         if t_s < 1.0:
-            tracking(way)(aim, t_s)
+            tracking(trajectory)(aim, t_s)
         elif round(t_s * 1000) == 1000:
-            aim.on_state(track_state(way, t_s, TrackingState.LOST))
+            aim.on_state(track_state(trajectory, t_s, TrackingState.LOST))
 
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, publish)
     assert {round(goal.position_rad, 3) for t, goal in flight.goals if t > 1.05} <= {0.0, 3.142}
@@ -329,13 +333,13 @@ def test_a_cooldown_does_not_apply_to_the_same_id_of_another_detector_instance()
 @pytest.mark.parametrize("reported", [True, False])
 def test_a_track_ends_after_a_restart_of_its_tracker(reported):
     """A tracker that was restarted reports no track as LOST: it reports SEARCHING, or nothing."""
-    way = towards(80.0, 45.0)
+    trajectory = towards(80.0, 45.0)
 
     def publish(aim, t_s):
         if t_s < 1.0:
-            tracking(way)(aim, t_s)
+            tracking(trajectory)(aim, t_s)
         elif reported and round(t_s * 1000) == 1000:
-            state = track_state(way, t_s, TrackingState.SEARCHING, track_id=0)
+            state = track_state(trajectory, t_s, TrackingState.SEARCHING, track_id=0)
             aim.on_state(replace(state, xyz_vehicle_m=None, velocity_vehicle_mps=None, covariance_m2=None))
 
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 4.0 if reported else 12.5, publish)
@@ -365,8 +369,8 @@ SPACING_M = 20.0 * math.radians(2.0)  # between two beams, at 20 m
 @pytest.mark.parametrize("is_track", [False, True], ids=["candidate", "track"])
 def test_the_offsets_after_misses_cover_a_whole_beam_spacing(spacings, is_track):
     """Wherever the drone is between two beams, one of them passes within a quarter of its span."""
-    way = towards(60.0, 30.0)
-    expected_m = way(np.zeros(1))[0] + spacings * SPACING_M * ACROSS_M  # wrong by this offset
+    trajectory = towards(60.0, 30.0)
+    expected_m = trajectory(np.zeros(1))[0] + spacings * SPACING_M * ACROSS_M  # wrong by this offset
 
     def publish(aim, t_s):
         if round(t_s * 1000) % 100 == 0:
@@ -378,7 +382,7 @@ def test_the_offsets_after_misses_cover_a_whole_beam_spacing(spacings, is_track)
                 aim.on_candidates(candidates(expected_m, t_s, 0.95, seen_s=0.0))
 
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 0.9, publish, start_rad=math.radians(60.0))
-    missed = flight.missed_m(way)[1:]
+    missed = flight.missed_m(trajectory)[1:]
     assert missed.min() < 0.25 * 0.5 + 0.02
     goals = np.degrees([goal for _, goal in observations_of(flight)])
     assert len(goals) > 3
@@ -426,8 +430,8 @@ def test_a_candidate_with_occasional_returns_is_not_excluded():
 
 
 def test_a_candidate_of_unknown_heading_is_searched_at_the_distance_it_may_have_flown():
-    way = towards(60.0, 30.0)
-    position_m = way(np.zeros(1))[0]
+    trajectory = towards(60.0, 30.0)
+    position_m = trajectory(np.zeros(1))[0]
 
     def missed_m(undirected_speed_mps):
         def publish(aim, t_s):
@@ -436,7 +440,7 @@ def test_a_candidate_of_unknown_heading_is_searched_at_the_distance_it_may_have_
                     candidates(position_m, t_s, 0.9, seen_s=0.0, undirected_speed_mps=undirected_speed_mps)
                 )
 
-        return fly(BeamAim(mount=ON_ITS_SIDE), 0.3, publish, start_rad=math.radians(60.0)).missed_m(way)[1]
+        return fly(BeamAim(mount=ON_ITS_SIDE), 0.3, publish, start_rad=math.radians(60.0)).missed_m(trajectory)[1]
 
     assert missed_m(0.0) < 0.06  # it hovers
     assert missed_m(4.0) > 0.12  # at the next rotor turn it is most likely to either side
@@ -464,11 +468,11 @@ def test_the_cooldown_of_a_candidate_doubles_with_each_repetition_up_to_sixteen_
 @pytest.mark.parametrize("start_deg", [30.0, 42.0, 78.0, 90.0])
 @pytest.mark.parametrize("is_track", [False, True], ids=["candidate", "track"])
 def test_a_beam_near_the_fans_middle_is_used_even_if_an_outer_one_is_nearer(start_deg, is_track):
-    way = towards(60.0, 45.0)
-    position_m = way(np.zeros(1))[0]
+    trajectory = towards(60.0, 45.0)
+    position_m = trajectory(np.zeros(1))[0]
 
     def publish(aim, t_s):
-        tracking(way)(aim, t_s) if is_track else aim.on_candidates(candidates(position_m, t_s, 0.7))
+        tracking(trajectory)(aim, t_s) if is_track else aim.on_candidates(candidates(position_m, t_s, 0.7))
 
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 0.8, publish, start_rad=math.radians(start_deg))
     observations = observations_of(flight)
@@ -499,50 +503,50 @@ def test_an_observation_during_the_sweep_uses_the_nearest_beam_and_the_sweep_con
 
 
 def test_while_fewer_drones_than_expected_are_tracked_the_search_continues_between_observations():
-    way = towards(60.0, 45.0)
-    one = fly(BeamAim(mount=ON_ITS_SIDE), 5.0, tracking(way), start_rad=1.0)
-    two = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 5.0, tracking(way), start_rad=1.0)
+    trajectory = towards(60.0, 45.0)
+    one = fly(BeamAim(mount=ON_ITS_SIDE), 5.0, tracking(trajectory), start_rad=1.0)
+    two = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 5.0, tracking(trajectory), start_rad=1.0)
     ends = [[t for t, goal in flight.goals[1:] if goal.position_rad in (0.0, math.pi)] for flight in (one, two)]
     assert ends[0] == []
     assert len(ends[1]) > 2
     assert np.degrees(np.ptp(one.servo_rad[100:])) < 5.0
     assert np.degrees(np.ptp(two.servo_rad[100:])) > 90.0  # each segment continues where the last one ended
-    met = np.nonzero(two.missed_m(way)[10:] < 0.25)[0]
+    met = np.nonzero(two.missed_m(trajectory)[10:] < 0.25)[0]
     assert len(met) > 8  # of 40
     assert np.diff(met).max() <= 16  # observed again within 1.6 s: the movement there, `search_s` and the movement back
 
 
 def test_a_longer_search_segment_is_wider():
-    way = towards(60.0, 45.0)
+    trajectory = towards(60.0, 45.0)
     widths = []
     for search_s in (0.2, 0.6):
         aim = BeamAim(mount=ON_ITS_SIDE, max_drones=2, search_s=search_s)
-        widths.append(np.ptp(fly(aim, 2.0, tracking(way), start_rad=1.0).servo_rad[100:]))
+        widths.append(np.ptp(fly(aim, 2.0, tracking(trajectory), start_rad=1.0).servo_rad[100:]))
     assert widths[1] > 1.3 * widths[0]
 
 
 def test_with_as_many_drones_as_expected_the_search_ends():
-    ways = towards(30.0, 45.0), towards(110.0, 50.0)
-    flight = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 4.0, tracking(*ways), start_rad=0.5)
+    trajectories = towards(30.0, 45.0), towards(110.0, 50.0)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 4.0, tracking(*trajectories), start_rad=0.5)
     assert len(observations_of(flight)) == len(flight.goals) - 1  # except the first, before the rotor's rate was known
 
 
 def test_tracks_have_priority_over_candidates():
-    way, other = towards(80.0, 45.0), towards(20.0, 45.0)(np.zeros(1))[0]
+    trajectory, other = towards(80.0, 45.0), towards(20.0, 45.0)(np.zeros(1))[0]
 
     def publish(aim, t_s):
-        tracking(way)(aim, t_s)
+        tracking(trajectory)(aim, t_s)
         if round(t_s * 1000) % 100 == 0:
             aim.on_candidates(candidates(other, t_s, 0.9))
 
-    missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, publish).missed_m(way)[10:]
+    missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, publish).missed_m(trajectory)[10:]
     assert np.mean(missed < 0.2) > 0.85
 
 
 def test_the_goals_stay_within_a_narrow_travel():
-    way = towards(80.0, 45.0)
+    trajectory = towards(80.0, 45.0)
     aim = BeamAim(mount=ON_ITS_SIDE, travel_deg=(30.0, 60.0))
-    flight = fly(aim, 2.0, tracking(way), start_rad=math.radians(45))  # the limits are checked in fly
+    flight = fly(aim, 2.0, tracking(trajectory), start_rad=math.radians(45))  # the limits are checked in fly
     assert flight.goals
 
 

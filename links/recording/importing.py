@@ -32,8 +32,8 @@ _PROGRESS_EVERY = 1000  # records
 _SNIFF_BYTES = 4096
 
 DEFAULT_RIG = """\
-# Made by `grd import`: a capture does not say how its lidar was mounted. This assumes a VLP-16 bolted down upright,
-# without servo, 1.8 m over the vehicle's origin. The true mount is unknown: positions are relative to this guess.
+# Made by `grd import`: a capture does not contain the LiDAR's mount. This assumes an upright VLP-16 without
+# servo, 1.8 m over the vehicle's origin. The true mount is unknown: positions are relative to this guess.
 version: 1
 lidar:
   model: VLP-16
@@ -217,7 +217,7 @@ class _Capture(_ImportedFile):
             name = vlp16.OTHER_PRODUCTS.get(product, f"an unknown model (product id 0x{product:02x})")
             raise LinkError(
                 f"{self._source}: the packet at byte {datagram.offset} is from {name}, not a VLP-16:"
-                " its beams are elsewhere, every point would be misplaced. Import a VLP-16's capture"
+                " its beams have other elevations, so that every point would be wrong. Import a VLP-16's capture"
             )
 
 

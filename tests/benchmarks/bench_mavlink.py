@@ -1,4 +1,4 @@
-"""The autopilot link: from a pose to its bytes on a socket, and from received bytes to a message, next to pymavlink alone.
+"""The autopilot link: from a pose to its bytes on a socket, and from received bytes to a message, compared with pymavlink.
 
     python -m pytest tests/benchmarks/bench_mavlink.py --benchmark-columns=min,median,max,iqr -s
 

@@ -91,7 +91,7 @@ def test_a_packet_to_its_poses_datagram_by_computing() -> None:
                 elif record.topic == "/lidar/packets":
                     packet_ms.append(1e-6 * (time.perf_counter_ns() - begin))
     report("LiDAR packet taken in, one thread", packet_ms[len(packet_ms) // 10 :])  # the first are compiled meanwhile
-    report("record that triggers a pose -> datagram, one thread", pose_ms[len(pose_ms) // 10 :])
+    report("record that releases a pose -> datagram, one thread", pose_ms[len(pose_ms) // 10 :])
 
 
 @pytest.mark.skipif(FLIGHT is None, reason="GRD_FLIGHT names no recording of a live run")

@@ -48,7 +48,7 @@ out = []
 for path in paths:
     image = cv2.imread(path)
     seconds = []
-    for again in range(3):
+    for attempt in range(3):
         start = time.thread_time()
         found = detector.find_vps(image).tolist()
         seconds.append(time.thread_time() - start)
@@ -135,8 +135,8 @@ def ours_on_york(folders):
 def lu_on_york(folders):
     focal, column, row = york_camera()
     asked = json.dumps([focal, column, row, *(str(folder / f"{folder.name}.jpg") for folder in folders)])
-    completed = subprocess.run([LU_PYTHON, "-c", LU], input=asked, capture_output=True, text=True, check=True)
-    return [(seconds, np.array(found)) for seconds, found in json.loads(completed.stdout)]
+    result = subprocess.run([LU_PYTHON, "-c", LU], input=asked, capture_output=True, text=True, check=True)
+    return [(seconds, np.array(found)) for seconds, found in json.loads(result.stdout)]
 
 
 def errors_deg(found, truth):

@@ -24,8 +24,8 @@ from stages.kernels.compiled import compiled
     REFLECTIVITY,  # sum
     MISSED,  # pulses since the last hit
     HOLES,  # pulses between hits that were no hits
-    FREE_BEFORE,  # 1: the pulse before the first was longer or had no return
-    REPORTED,  # 1: too long, already reported
+    FREE_BEFORE,  # 1: the pulse before the first went farther or returned nothing
+    LONG_REPORTED,  # 1: too long, already reported
     BEFORE,  # range of the laser's last pulse [m]; inf: nothing, NaN: not known
     U1, U2, U3, U4,  # sums of powers of u, the displacement across the line of sight since the first hit [m]
     R1, RU1, RU2, R2,  # and with r, the range over the first hit's [m]
@@ -34,12 +34,13 @@ from stages.kernels.compiled import compiled
 ) = range(29)  # fmt: skip
 # Columns of the result.
 X, Y, Z, RANGE, LENGTH, DEPTH, COUNT, GAPS, SHADE, FREE, LASER, LONG, BULGE, ROUGH = range(14)
-FIRST, LAST, NEWEST = range(3)  # times per laser: first and last hit of its open chord, its newest pulse
-GAP_NS = 150_000  # a laser fires each 55.3 us (VLP-16); after a longer pause its direction has changed
+FIRST, LAST, NEWEST = range(3)  # times per laser: its open chord's first and last hit, its newest pulse
+# A laser fires each 55.3 us (VLP-16). After a longer pause packets are lost, and it points in another direction.
+GAP_NS = 150_000
 
 
 @compiled
-def _report(memory: Array64, free_after: bool, laser: int, long: bool, row: Array64) -> None:
+def _write_chord(memory: Array64, free_after: bool, laser: int, long: bool, row: Array64) -> None:
     hits = memory[HITS]
     for axis in range(3):
         row[X + axis] = memory[SUM_X + axis] / hits
@@ -118,7 +119,7 @@ def find_chords(
     rows: Array64,
     row_ns: NDArray[np.int64],
 ) -> int:
-    """Continue each laser's chord pulse by pulse; fill rows and times of completed chords; return the count."""
+    """Continue each laser's chord, pulse by pulse; fill rows and times of the completed chords, return their count."""
     count = 0
     point, before = np.empty(3), np.empty(3)
     for i in range(range_m.size):
@@ -128,8 +129,8 @@ def find_chords(
         seen = r > 0.0
         ended = False
         if stamp_ns[i] - times[k, NEWEST] > GAP_NS:
-            if m[HITS] > 0.0:  # its end is not known
-                _report(m, m[MISSED] >= 2.0, k, m[REPORTED] > 0.0, rows[count])
+            if m[HITS] > 0.0:  # its continuation is unknown
+                _write_chord(m, m[MISSED] >= 2.0, k, m[LONG_REPORTED] > 0.0, rows[count])
                 row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]
                 count += 1
                 m[HITS] = 0.0
@@ -153,18 +154,18 @@ def find_chords(
                 m[LEAST_RANGE] = min(m[LEAST_RANGE], r)
                 m[MOST_RANGE] = max(m[MOST_RANGE], r)
                 times[k, LAST] = stamp_ns[i]
-                if across2 > longest_m * longest_m:  # a wall: reported in pieces
-                    _report(m, False, k, True, rows[count])
+                if across2 > longest_m * longest_m:  # a wall: reported in parts
+                    _write_chord(m, False, k, True, rows[count])
                     row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]
                     count += 1
-                    m[REPORTED] = 1.0
+                    m[LONG_REPORTED] = 1.0
                     for axis in range(3):
                         m[SUM_X + axis] = point[axis]
                         m[FIRST_X + axis] = point[axis]
                     _begin(m, r, reflectivity[i])
                     times[k, FIRST] = stamp_ns[i]
-            elif seen and r < m[LAST_RANGE]:  # something nearer hides its end, unless it had ended before
-                _report(m, m[MISSED] >= 2.0, k, m[REPORTED] > 0.0, rows[count])
+            elif seen and r < m[LAST_RANGE]:  # something nearer hides its continuation, unless it had ended before
+                _write_chord(m, m[MISSED] >= 2.0, k, m[LONG_REPORTED] > 0.0, rows[count])
                 ended = True
             else:
                 m[MISSED] += 1.0
@@ -174,7 +175,7 @@ def find_chords(
                     before[axis] = m[LAST_X + axis] - origin_m[axis]
                     away2 += (m[LAST_RANGE] * direction[i, axis] - before[axis]) ** 2
                 if m[MISSED] >= 2.0 and away2 > hole_m * hole_m:
-                    _report(m, True, k, m[REPORTED] > 0.0, rows[count])
+                    _write_chord(m, True, k, m[LONG_REPORTED] > 0.0, rows[count])
                     ended = True
             if ended:
                 row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]
@@ -187,7 +188,7 @@ def find_chords(
                 m[FIRST_X + axis] = point[axis]
                 m[LAST_X + axis] = point[axis]
             _begin(m, r, reflectivity[i])
-            m[MISSED], m[REPORTED] = 0.0, 0.0
+            m[MISSED], m[LONG_REPORTED] = 0.0, 0.0
             m[FREE_BEFORE] = 1.0 if m[BEFORE] > r + jump_m else 0.0
             times[k, FIRST] = times[k, LAST] = stamp_ns[i]
         m[BEFORE] = r if seen else math.inf

@@ -30,7 +30,7 @@ LOOSE, LOOSE_MPS, LOOSE_MPS2 = 0.1, 2.0, 0.3  # assumed share of balloons that d
 def weigh(
     t_s: Array64, x_m: Array64, odometry_m: Array64, sigma_m: float, level_known: bool
 ) -> tuple[float, float, float, float, float]:
-    """`MotionLogRatios`, without its displacement: a path x (n, 3) at times t (n,) against the odometry (n, 3)."""
+    """Values of MotionLogRatios for a path x (n, 3) at times t (n,), compared with the drone's odometry (n, 3)."""
     x, d = x_m.copy(), odometry_m.copy()
     for axis in range(3):
         x[:, axis] -= x[:, axis].mean()

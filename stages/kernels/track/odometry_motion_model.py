@@ -32,18 +32,18 @@ def add_odometry_motion(
     m_2: complex,
 ) -> None:
     """Add to state (6,) and covariance (6, 6) the odometry's motion (3,) beyond constant velocity, at unknown yaw."""
-    reported = np.empty(2, dtype=np.complex128)  # horizontal: of position and velocity
+    steps = np.empty(2, dtype=np.complex128)  # horizontal: of position and velocity
     for k in range(2):
         step = (now_m - then_m - dt_s * then_mps) if k == 0 else (now_mps - then_mps)
         x[3 * k + 2] += confidence * step[2]
-        reported[k] = complex(step[0], step[1])
-        moved = reported[k] * m_1
+        steps[k] = complex(step[0], step[1])
+        moved = steps[k] * m_1
         x[3 * k] += moved.real
         x[3 * k + 1] += moved.imag
     for i in range(2):
         for j in range(2):
-            K = reported[i] * reported[j].conjugate() * (confidence - abs(m_1) ** 2)
-            pseudo = reported[i] * reported[j] * (m_2 - m_1 * m_1)
+            K = steps[i] * steps[j].conjugate() * (confidence - abs(m_1) ** 2)
+            pseudo = steps[i] * steps[j] * (m_2 - m_1 * m_1)
             P[3 * i, 3 * j] += 0.5 * (K + pseudo).real  # x of position and velocity
             P[3 * i + 1, 3 * j + 1] += 0.5 * (K - pseudo).real  # y of both
             across = 0.5 * (pseudo - K).imag  # E Re z Im z'
@@ -65,7 +65,7 @@ def weigh_yaws(t_s: Array64, x_m: Array64, odometry_m: Array64, sigma_m: float) 
         c, s = math.cos(math.tau * k / YAWS), math.sin(math.tau * k / YAWS)
         turned[k] = upright + log_p(drone, t_s, x[:, 0] - c * d[:, 0] + s * d[:, 1])
         turned[k] += log_p(drone, t_s, x[:, 1] - s * d[:, 0] - c * d[:, 1])
-    anything = 0.0
+    other = 0.0
     for axis in range(3):
-        anything += log_p(free, t_s, x[:, axis].copy())
-    return turned, anything
+        other += log_p(free, t_s, x[:, axis].copy())
+    return turned, other

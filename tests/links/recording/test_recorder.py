@@ -142,8 +142,8 @@ def test_a_full_disk_is_reported_and_records_are_counted_as_missed(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_disk_that_fills_up_ends_the_part_properly_and_free_space_begins_a_new_part(tmp_path, monkeypatch):
-    monkeypatch.setattr("links.recording.recorder.AGAIN_S", 0.0)
+def test_a_disk_that_gets_full_ends_the_recording_properly_and_room_again_begins_a_new_part(tmp_path, monkeypatch):
+    monkeypatch.setattr("links.recording.recorder.RETRY_S", 0.0)
     recorder = opened(tmp_path)
     recorder.record(record(1))
     free = [0]
@@ -162,8 +162,8 @@ def test_a_disk_that_fills_up_ends_the_part_properly_and_free_space_begins_a_new
         assert reader.finished
 
 
-def test_a_missing_disk_is_reported_and_the_recording_continues_when_it_returns(tmp_path, monkeypatch):
-    monkeypatch.setattr("links.recording.recorder.AGAIN_S", 0.0)
+def test_a_disk_that_is_gone_is_said_and_the_recording_goes_on_when_it_is_back(tmp_path, monkeypatch):
+    monkeypatch.setattr("links.recording.recorder.RETRY_S", 0.0)
     recorder = opened(tmp_path)
 
     def gone(folder):

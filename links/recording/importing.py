@@ -32,8 +32,8 @@ _PROGRESS_EVERY = 1000  # records
 _SNIFF_BYTES = 4096
 
 DEFAULT_RIG = """\
-# Made by `grd import`: a capture does not contain the LiDAR's mount. This assumes an upright VLP-16 without
-# servo, 1.8 m over the vehicle's origin. The true mount is unknown: positions are relative to this guess.
+# Made by `grd import`: a capture does not say how its lidar was mounted. This assumes a VLP-16 bolted down upright,
+# without servo, 1.8 m over the vehicle's origin. The true mount is unknown: positions are relative to this guess.
 version: 1
 lidar:
   model: VLP-16

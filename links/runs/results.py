@@ -24,6 +24,7 @@ from links.runs.fix_log import FixLog
 from links.runs.result_file import ResultFile
 from stages.geometry.frames import quaternions_xyzw
 from stages.messages import (
+    CandidateEvidence,
     Candidates,
     DepthImage,
     Detections,
@@ -179,7 +180,8 @@ class Results(Tap[ResultsSettings]):
             self._fixes.append(message)
             self._files[FIX_FILE].write(tum_line(message.stamp_ns, message.xyz_vehicle_m))
             upper = message.covariance_m2[UPPER_3]
-            counts = [message.hits, message.iterations, message.track_id]
+            iterations = "" if message.mean_shift is None else message.mean_shift.iterations
+            counts = [message.hits, iterations, message.track_id]
             self._covariance.writerow([stamp_s(message.stamp_ns), *_digits(upper), *counts])
         elif isinstance(message, DepthImage):
             self._sweep_start_ns = {message.stamp_ns: message.start_ns}
@@ -214,13 +216,15 @@ class Results(Tap[ResultsSettings]):
 
         The start of a search is in its message, else it is that of its depth image, else the end of the search before.
         """
-        start_ns = message.start_ns
-        if start_ns is None:
+        evidence = message.evidence
+        if isinstance(evidence, CandidateEvidence):
+            start_ns, scores = evidence.start_ns, evidence.log_odds
+        else:
             previous_ns = self._last_sweep_ns if self._last_sweep_ns is not None else message.stamp_ns
-            start_ns = self._sweep_start_ns.get(message.stamp_ns, previous_ns)
+            start_ns, scores = self._sweep_start_ns.get(message.stamp_ns, previous_ns), evidence.e
         self._last_sweep_ns = message.stamp_ns
         span = [stamp_s(start_ns), stamp_s(message.stamp_ns)]
-        accepted = zip(message.xyz_vehicle_m[message.accepted], message.score[message.accepted], strict=True)
+        accepted = zip(message.xyz_vehicle_m[message.accepted], scores[message.accepted], strict=True)
         lines = [[*span, *(f"{v:.4f}" for v in xyz), f"{score:.6g}"] for xyz, score in accepted]
         self._detections.writerows(lines or [[*span, "", "", "", ""]])
 

@@ -92,8 +92,6 @@ def test_without_a_fused_pose_the_track_and_its_last_fix_are_shown():
         xyz_vehicle_m=np.array([3.0, 4.0, 5.0]),
         covariance_m2=0.03 * np.eye(3),
         hits=5,
-        iterations=1,
-        shift_m=0.0,
     )
     assert "TRACKING: 5 returns; x 3.00  y 4.00  z 5.00 m  sigma 0.30 m; " in shown(report_of(), track, fix)
     assert "no drone yet; 1234 records" in shown(report_of())

@@ -24,7 +24,7 @@ from stages.detect.evidence_detect import HYSTERESIS_NATS, NEAR_REJECTED_M, NEAR
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
-from stages.messages import Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
+from stages.messages import CandidateEvidence, Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
 from tests.stages.caster import (
     Ball,
     Box,
@@ -155,14 +155,16 @@ def test_a_small_thing_that_moves_in_the_free_sky_is_a_drone_after_a_second_or_t
     assert 0.4 < accepted_after_s(detections) < 2.3
     last = detections[-1]
     assert last.accepted.tolist() == [True]
-    assert last.probability[0] >= 0.98
-    assert last.score[0] == pytest.approx(math.log(last.probability[0] / (1 - last.probability[0])))
-    truth = MOVING(np.array([(last.seen_ns[0] - START_NS) * 1e-9]))[0]
+    evidence = last.evidence
+    assert isinstance(evidence, CandidateEvidence)
+    assert evidence.probability[0] >= 0.98
+    assert evidence.log_odds[0] == pytest.approx(math.log(evidence.probability[0] / (1 - evidence.probability[0])))
+    truth = MOVING(np.array([(evidence.seen_ns[0] - START_NS) * 1e-9]))[0]
     np.testing.assert_allclose(last.xyz_vehicle_m[0], truth, atol=0.3)
-    np.testing.assert_allclose(last.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
+    np.testing.assert_allclose(evidence.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
     assert last.summary.startswith("drone at (")
     assert "sectors around it free" in last.reasons[0]
-    assert last.candidate_id[0] == candidates[0].candidate_id[0]  # the same thing keeps its number
+    assert evidence.candidate_id[0] == candidates[0].candidate_id[0]  # the same thing keeps its number
 
 
 def test_four_packets_together_tell_the_same_as_one_by_one():
@@ -299,16 +301,16 @@ def test_no_drone_is_a_normal_answer_at_the_end_of_each_pass():
     candidates, detections = run([], 2.0)
     assert candidates == []
     assert len(detections) >= 3
-    assert all(d.summary.startswith("no drone: ") and len(d.score) == 0 for d in detections)
+    assert all(d.summary.startswith("no drone: ") and len(d.accepted) == 0 for d in detections)
 
 
 def test_searched_intervals_follow_one_another_without_gap():
     for things in ([], [hanging()]):
         _, detections = run(things, 2.0)
-        assert detections[0].start_ns == START_NS
+        assert detections[0].evidence.start_ns == START_NS
         for before, after in pairwise(detections):
-            assert before.start_ns < before.stamp_ns
-            assert after.start_ns == before.stamp_ns + 1
+            assert before.evidence.start_ns < before.stamp_ns
+            assert after.evidence.start_ns == before.stamp_ns + 1
 
 
 def test_a_sweep_over_the_whole_sky_finds_houses_no_drone_and_says_how_many_were_refused():
@@ -412,7 +414,7 @@ def test_a_drone_that_falls_silent_is_judged_by_how_it_flies_alone():
     spoke = run([Drone(MOVING)], say=saying(MOVING, until_s=0.4))
     silent = run([Drone(MOVING)])
     assert "odometry" not in spoke[1][-1].reasons[0]
-    np.testing.assert_array_equal(spoke[1][-1].probability, silent[1][-1].probability)
+    np.testing.assert_array_equal(spoke[1][-1].evidence.probability, silent[1][-1].evidence.probability)
     np.testing.assert_array_equal(spoke[0][-1].velocity_vehicle_mps, silent[0][-1].velocity_vehicle_mps)
 
 
@@ -598,7 +600,10 @@ def test_the_same_pulses_give_the_same_answers():
     once, again = (run([Drone(still(*PLACE_M), seed=1)], 1.5) for _ in range(2))
     for a, b in zip(once[0] + once[1], again[0] + again[1], strict=True):
         assert a.reasons == b.reasons
+    for a, b in zip(once[0], again[0], strict=True):
         np.testing.assert_array_equal(a.probability, b.probability)
+    for a, b in zip(once[1], again[1], strict=True):
+        np.testing.assert_array_equal(a.evidence.probability, b.evidence.probability)
         np.testing.assert_array_equal(a.xyz_vehicle_m, b.xyz_vehicle_m)
 
 

@@ -10,7 +10,7 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.detect.kernel_candidates import Gates
 from stages.detect.kernel_detect import KernelDetect
-from stages.messages import Detections, ScoreImage
+from stages.messages import Detections, KernelScores, ScoreImage
 from tests.stages.made import depth_image, point_of, street_depth
 
 
@@ -20,7 +20,7 @@ def detect(image, **settings):
     assert isinstance(detections, Detections)
     check_arrays(score)
     check_arrays(detections)
-    assert len(detections.reasons) == len(detections.score)
+    assert len(detections.reasons) == len(detections.accepted)
     return score, detections
 
 
@@ -63,8 +63,9 @@ def test_without_gates_a_far_pixel_beats_the_drone_as_in_the_paper():
 
 def test_scores_are_sorted_and_the_sum_of_their_terms():
     _, detections = detect(depth_image(street_depth()))
-    assert (np.diff(detections.score) >= -1e-3).all()
-    np.testing.assert_allclose(detections.score, detections.e_inner + detections.e_outer)
+    assert isinstance(detections.evidence, KernelScores)
+    assert (np.diff(detections.evidence.e) >= -1e-3).all()
+    np.testing.assert_array_equal(detections.evidence.e, detections.evidence.e_inner + detections.evidence.e_outer)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
@@ -82,7 +83,7 @@ def test_moving_the_origin_moves_the_detection():
     _, here = detect(depth_image(street_depth()))
     _, there = detect(depth_image(street_depth(), origin=(1.0, -2.0, 0.5)))
     np.testing.assert_allclose(
-        there.xyz_vehicle_m - here.xyz_vehicle_m, np.tile([1.0, -2.0, 0.5], (len(here.score), 1))
+        there.xyz_vehicle_m - here.xyz_vehicle_m, np.tile([1.0, -2.0, 0.5], (len(here.accepted), 1))
     )
 
 
@@ -120,7 +121,7 @@ def test_an_accepted_candidate_is_given_out_even_when_many_refused_ones_score_lo
     for k in range(20):
         depth[60 + 20 * k, 256] = 45.0
     _, detections = detect(depth_image(depth), max_candidates=5)
-    assert len(detections.score) == 5
+    assert len(detections.accepted) == 5
     assert detections.accepted.tolist() == [False] * 4 + [True]
 
 

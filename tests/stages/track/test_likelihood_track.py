@@ -12,7 +12,15 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.geometry.frames import LidarMount
 from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, A, B
-from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
+from stages.messages import (
+    CandidateEvidence,
+    Candidates,
+    Detections,
+    DroneFix,
+    TrackingState,
+    TrackState,
+    VehicleMotion,
+)
 from stages.track import LikelihoodTrack
 from stages.track.hull import COLUMNS
 from stages.track.likelihood_track import PASS_OVER_NS
@@ -33,17 +41,17 @@ def accepted(xyz_m, velocity_mps=(0.0, 0.0, 0.0), t_s=0.0, number=1) -> Detectio
     return Detections(
         stamp_ns=at_s(t_s),
         xyz_vehicle_m=np.array([xyz_m], dtype=np.float64),
-        score=np.array([5.0]),
-        e_inner=np.zeros(1),
-        e_outer=np.zeros(1),
         accepted=np.array([True]),
         reasons=("made",),
         summary="made",
-        start_ns=at_s(t_s) - 1,
-        seen_ns=np.array([at_s(t_s)]),
-        velocity_vehicle_mps=np.array([velocity_mps], dtype=np.float64),
-        probability=np.array([0.995]),
-        candidate_id=np.array([number]),
+        evidence=CandidateEvidence(
+            start_ns=at_s(t_s) - 1,
+            candidate_id=np.array([number]),
+            seen_ns=np.array([at_s(t_s)]),
+            velocity_vehicle_mps=np.array([velocity_mps], dtype=np.float64),
+            log_odds=np.array([5.0]),
+            probability=np.array([0.995]),
+        ),
     )
 
 

@@ -33,6 +33,7 @@ def candidates_message(
     now_ns: int,
     detector_instance: int,
     at_most: int,
+    accept_probability: float,
     expected_mps: Array64,
     spread_mps: float,
     reported_mps: float,
@@ -55,6 +56,7 @@ def candidates_message(
         seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
         scan_passes=np.array([c.scan_passes for c in listed], dtype=np.int64),
         reasons=tuple(c.reason for c in listed),
+        accept_probability=accept_probability,
         undirected_speed_mps=np.array(undirected_speed_mps, dtype=np.float64),
         detector_instance=detector_instance,
     )

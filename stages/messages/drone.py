@@ -68,7 +68,7 @@ class Detections(Message):
         return SearchResult.ALL_REJECTED if len(self.accepted) else SearchResult.NO_CANDIDATE
 
 
-@message(schema=32)
+@message(schema=77)
 class Candidates(Message):
     """Open drone candidates that need more observations, most probable first; published on change."""
 
@@ -79,6 +79,7 @@ class Candidates(Message):
     seen_ns: PerPointI64
     scan_passes: PerPointI64  # rotor revolutions with a return from it
     reasons: tuple[str, ...]  # one per candidate: the evidence for and against
+    accept_probability: float  # the detector accepts a candidate from this probability on
     undirected_speed_mps: PerPointF64 | None = (
         None  # horizontal speed by telemetry whose direction is unknown; not in velocity_vehicle_mps
     )

@@ -122,11 +122,12 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             if known is not None:
                 seen_later = int(candidates.seen_ns[i]) > known.last_return_ns
                 uncertain = known.confirmed and seen_later and self._known.uncertain(known, candidates.stamp_ns)
-                own_candidate = known.candidate == number  # followed by the detector, too
-                if (
-                    uncertain
-                    and (0.5 if own_candidate else self._known.required_probability(known, candidates.stamp_ns)) <= P
-                ):
+                required = 0.5  # if the detector follows it, too
+                if uncertain and known.candidate != number:
+                    required = self._known.required_probability(
+                        known, candidates.stamp_ns, candidates.accept_probability
+                    )
+                if uncertain and required <= P:
                     self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
                 # an improbable candidate next to a track whose own candidate is probable is another object
                 sure = known.candidate == number or (candidates.scan_passes[i] >= 6 and known.candidate not in own)

@@ -225,6 +225,7 @@ def candidates(stamp_ns: int, t_s: float) -> Candidates:
             "9 looks; 8 of 8 sectors around it free",
             "next to a large object; if not a drone, a lamp, wire or edge",
         )[:n],
+        accept_probability=0.95,
     )
 
 

@@ -26,7 +26,6 @@ from stages.detect.classifier import (
 )
 from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.kernels.detect.isolation import SECTORS
-from stages.track.hypotheses import ACCEPTED_NATS
 from tests.stages.detect.test_candidate import candidate, observation, way
 
 E = ClassifierWeights()
@@ -256,9 +255,8 @@ def test_without_the_drones_word_what_is_accepted_and_looked_at_again_has_the_ev
         assert asked == pytest.approx(calibrated(E.no_telemetry_weight * evidence + E.no_telemetry_offset, E), abs=0.05)
 
 
-def test_tracker_and_evaluation_know_from_where_on_the_detector_accepts():
+def test_the_evaluation_groups_probabilities_at_the_detectors_threshold():
     accepts = EvidenceDetect.settings_type.model_fields["accept_probability"].default
-    assert pytest.approx(log_odds_of(accepts)) == ACCEPTED_NATS
     assert PROBABILITY_EDGES[-2] == accepts
 
 

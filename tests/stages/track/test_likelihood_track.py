@@ -66,6 +66,7 @@ def candidate(xyz_m, probability, t_s=0.0, number=1, looks=3, life_since_s=0.0) 
         seen_ns=np.array([at_s(t_s)]),
         scan_passes=np.array([looks]),
         reasons=("flew as a bird does",),
+        accept_probability=0.95,
     )
 
 
@@ -315,6 +316,7 @@ def test_what_is_refused_beside_a_track_costs_it_nothing_while_its_own_candidate
     both = Candidates(
         stamp_ns=one.stamp_ns,
         reasons=one.reasons + other.reasons,
+        accept_probability=one.accept_probability,
         **{
             name: np.concatenate([getattr(one, name), getattr(other, name)])
             for name in (

@@ -316,7 +316,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         if changed or new:
             listed = [c for c in now.table if c.is_promising or (c.was_promising and now_ns - c.seen_ns < 300_000_000)]
             motion = now.telemetry.expected_motion(now.trail, now_ns)
-            yield candidates_message(listed, now.trail, now_ns, now.detector_instance, settings.max_candidates, *motion)
+            limits = settings.max_candidates, settings.accept_probability
+            yield candidates_message(listed, now.trail, now_ns, now.detector_instance, *limits, *motion)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9
         here = any(c.seen_ns >= now.start_ns for c in accepted)

@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 from flow.stage import Settings, Stage
 from stages.detect.kernel_candidates import Gates, Pixel, inner_half_px, local_minima, reject_reason, score_image
 from stages.kernels.detect.kernel_score import kernel_terms
-from stages.messages import DepthImage, Detections, ScoreImage
+from stages.messages import DepthImage, Detections, KernelScores, ScoreImage
 from stages.sweep.depth_image import unproject
 
 
@@ -96,12 +96,10 @@ class KernelDetect(Stage[KernelDetectSettings]):
         return Detections(
             stamp_ns=image.stamp_ns,
             xyz_vehicle_m=xyz_vehicle_m,
-            score=terms.sum(axis=1),
-            e_inner=terms[:, 0].copy(),
-            e_outer=terms[:, 1].copy(),
             accepted=accepted,
             reasons=tuple(c.reason for c in listed),
             summary=summary,
+            evidence=KernelScores(e_inner=terms[:, 0].copy(), e_outer=terms[:, 1].copy()),
         )
 
     def _terms(self, image: DepthImage, pixel: Pixel) -> tuple[float, float]:

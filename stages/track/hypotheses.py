@@ -23,7 +23,6 @@ from stages.track.scan_pass import ScanPass
 REPLACE_AFTER_NS = 1_000_000_000  # without a return for this long, another accepted drone replaces it
 STALE_NS = 150_000_000  # an observation this much older than the track's returns is ignored
 START_SIGMA_M = 0.2
-ACCEPTED_NATS = math.log(0.95 / 0.05)  # log-odds of the detector's default acceptance threshold
 DETECTION_VOLUME_M3 = 2.0 / 3.0 * math.pi * 35.0**3  # half-sphere of the detection range
 
 
@@ -146,14 +145,15 @@ class Hypotheses:
         """Whether its position is so uncertain that a candidate there may be another object."""
         return largest_sigma_m(self.at(one, now_ns)[1]) > self._own_sigma_m
 
-    def required_probability(self, one: Hypothesis, now_ns: int) -> float:
+    def required_probability(self, one: Hypothesis, now_ns: int, accept_probability: float) -> float:
         """Probability a candidate near this hypothesis needs to be assigned to it; 0.5 if its covariance is small.
 
-        The detector's acceptance threshold is for the whole sky. Only clutter within three sigmas of here can be
-        mistaken for this drone, so the log-odds are reduced by the logarithm of that share of the sky's volume.
+        The detector's threshold, `accept_probability`, is for the whole sky. Only clutter within three sigmas of here
+        can be mistaken for this drone, so the log-odds are reduced by the logarithm of that share of the sky's volume.
         """
         share = 36.0 * math.pi * math.sqrt(float(np.linalg.det(self.at(one, now_ns)[1][:3, :3]))) / DETECTION_VOLUME_M3
-        return 1.0 / (1.0 + math.exp(-max(ACCEPTED_NATS + math.log(share), 0.0)))
+        accept_log_odds = math.log(accept_probability / (1.0 - accept_probability))
+        return 1.0 / (1.0 + math.exp(-max(accept_log_odds + math.log(share), 0.0)))
 
     def move(self, one: Hypothesis, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> None:
         """Reset a hypothesis to a candidate of the detector."""

@@ -28,6 +28,7 @@ from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.sweep.pulses import mean_direction
 from stages.kernels.track.scan_pass import largest_sigma_m
 from stages.messages import (
+    CandidateEvidence,
     Candidates,
     Detections,
     DroneFix,
@@ -117,12 +118,12 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             if track is not None:
                 seen_later = int(candidates.seen_ns[i]) > track.last_return_ns
                 uncertain = track.confirmed and seen_later and self._hypotheses.uncertain(track, candidates.stamp_ns)
-                own_candidate = track.candidate == number  # followed by the detector, too
-                if (
-                    uncertain
-                    and (0.5 if own_candidate else self._hypotheses.required_probability(track, candidates.stamp_ns))
-                    <= P
-                ):
+                required = 0.5  # if the detector follows it, too
+                if uncertain and track.candidate != number:
+                    required = self._hypotheses.required_probability(
+                        track, candidates.stamp_ns, candidates.accept_probability
+                    )
+                if uncertain and required <= P:
                     self._hypotheses.move(track, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
                 # an improbable candidate next to a track whose own candidate is probable is another object
                 is_same_object = track.candidate == number or (
@@ -137,11 +138,12 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
 
     def on_detections(self, detections: Detections) -> Iterator[TrackState | DroneFix]:
         """Confirm the accepted candidates as drones."""
+        evidence = detections.evidence
         for i in np.nonzero(detections.accepted)[0]:
-            seen_ns = detections.stamp_ns if detections.seen_ns is None else int(detections.seen_ns[i])
-            number = -1 if detections.candidate_id is None else int(detections.candidate_id[i])
-            velocity = detections.velocity_vehicle_mps
-            v = np.zeros(3) if velocity is None else velocity[i]
+            seen_ns, number, v = detections.stamp_ns, -1, np.zeros(3)
+            if isinstance(evidence, CandidateEvidence):
+                seen_ns, number = int(evidence.seen_ns[i]), int(evidence.candidate_id[i])
+                v = evidence.velocity_vehicle_mps[i]
             xyz, v = self._vehicle.to_map(seen_ns, detections.xyz_vehicle_m[i], v)
             track = self._hypotheses.near(xyz, seen_ns, number) or self._hypotheses.diverged(
                 number, xyz, v, seen_ns, seen_ns
@@ -298,8 +300,6 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             xyz_vehicle_m=xyz,
             covariance_m2=R.T @ P[:3, :3] @ R + bias_covariance_m2,
             hits=track.hits,
-            iterations=1,
-            shift_m=0.0,
             track_id=track.number,
             velocity_vehicle_mps=velocity,
             bias_covariance_m2=bias_covariance_m2,

@@ -29,7 +29,7 @@ from pydantic import Field
 from flow.stage import Settings, Stage
 from stages.geometry.frames import Array64
 from stages.kernels.track.mean_shift import mean_shift, within
-from stages.messages import Detections, DroneFix, SweptPoints, TrackingState, TrackState
+from stages.messages import Detections, DroneFix, MeanShiftResult, SweptPoints, TrackingState, TrackState
 from stages.track.mean_shift import crossings, fix_covariance_m2
 
 
@@ -202,6 +202,5 @@ class MeanShiftTrack(Stage[MeanShiftTrackSettings]):
             xyz_vehicle_m=t,
             covariance_m2=covariance_m2,
             hits=len(points_m),
-            iterations=iterations,
-            shift_m=shift_m,
+            mean_shift=MeanShiftResult(iterations=iterations, shift_m=shift_m),
         )

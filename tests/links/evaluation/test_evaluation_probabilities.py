@@ -107,6 +107,7 @@ def candidates(scan_passes, probability, life=7):
         seen_ns=np.zeros(n, dtype=np.int64),
         scan_passes=np.array(scan_passes),
         reasons=("",) * n,
+        accept_probability=0.95,
         detector_instance=life,
     )
 

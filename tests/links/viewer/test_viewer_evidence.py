@@ -28,6 +28,7 @@ def candidates(stamp_ns: int, **found: tuple[float, str]) -> Candidates:
         seen_ns=np.full(n, stamp_ns - 500_000_000),
         scan_passes=np.full(n, 3),
         reasons=tuple(why for _, why in found.values()),
+        accept_probability=0.95,
     )
 
 

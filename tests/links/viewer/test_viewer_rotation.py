@@ -25,7 +25,7 @@ def scalars(entity) -> list[float]:
 
 def at_a_fix():
     where = scene()
-    at = DroneFix(stamp_ns=0, xyz_vehicle_m=np.ones(3), covariance_m2=np.eye(3), hits=3, iterations=1, shift_m=0.0)
+    at = DroneFix(stamp_ns=0, xyz_vehicle_m=np.ones(3), covariance_m2=np.eye(3), hits=3)
     drawn(at, "track/drone_fix", where)
     return where
 

@@ -134,6 +134,7 @@ def candidates(
         seen_ns=np.array([START_NS + round((t_s if seen_s is None else seen_s) * 1e9)]),
         scan_passes=np.array([scan_passes]),
         reasons=("made",),
+        accept_probability=0.95,
         undirected_speed_mps=np.array([undirected_speed_mps]),
     )
 

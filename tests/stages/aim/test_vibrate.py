@@ -18,7 +18,7 @@ from stages.aim.vibrate import (
     vibration_ends_rad,
 )
 from stages.geometry.frames import Harmonic, LidarMount, Pose, rotation_z
-from stages.messages import Detections, DroneFix, ServoGoal, ServoState, TrackingState, TrackState
+from stages.messages import Detections, DroneFix, KernelScores, ServoGoal, ServoState, TrackingState, TrackState
 
 ON_ITS_SIDE = Pose(xyz_m=(0.0, 0.0, 0.10), rpy_deg=(90.0, 0.0, 0.0))
 MOUNT = LidarMount(T_vehicle_turntable=Pose(xyz_m=(0.0, 0.0, 0.25)), T_turntable_lidar=ON_ITS_SIDE)
@@ -36,9 +36,7 @@ def servo(position_deg: float, t_s: float = 0.0) -> ServoState:
 
 
 def fix(x: float, y: float, z: float) -> DroneFix:
-    return DroneFix(
-        stamp_ns=0, xyz_vehicle_m=np.array([x, y, z]), covariance_m2=np.eye(3), hits=3, iterations=2, shift_m=0.0
-    )
+    return DroneFix(stamp_ns=0, xyz_vehicle_m=np.array([x, y, z]), covariance_m2=np.eye(3), hits=3)
 
 
 def state(which: TrackingState) -> TrackState:
@@ -50,9 +48,7 @@ def detections(*xyz: tuple[float, float, float], accepted: tuple[bool, ...]) -> 
     return Detections(
         stamp_ns=0,
         xyz_vehicle_m=np.array(xyz, dtype=np.float64).reshape(-1, 3),
-        score=np.arange(n, dtype=np.float64),
-        e_inner=np.zeros(n),
-        e_outer=np.zeros(n),
+        evidence=KernelScores(e_inner=np.zeros(n), e_outer=np.zeros(n)),
         accepted=np.array(accepted, dtype=np.bool_),
         reasons=("",) * n,
         summary="",

@@ -139,8 +139,6 @@ class Flight:
             xyz_vehicle_m=self.R_world_vehicle(t).T @ xyz + rng.normal(0, self.fix_sigma_m, 3),
             covariance_m2=self.fix_sigma_m**2 * np.eye(3),
             hits=4,
-            iterations=1,
-            shift_m=0.0,
         )
 
     def _lines(self, stage: JointAlign, t: float) -> list[RelativeRotation]:

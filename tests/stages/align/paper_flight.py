@@ -43,8 +43,6 @@ class Flight:
             xyz_vehicle_m=self.R_vehicle(k).T @ (self.t_drone(k) - self.t_vehicle(k)),
             covariance_m2=0.01 * np.eye(3),
             hits=5,
-            iterations=1,
-            shift_m=0.0,
             track_id=track_id,
         )
 

@@ -26,7 +26,6 @@ from stages.detect.classifier import (
 )
 from stages.detect.motion_log_ratios import MotionLogRatios
 from stages.kernels.detect.isolation import SECTORS
-from stages.track.hypotheses import ACCEPTED_NATS
 from tests.stages.detect.test_candidate import candidate, observation, path
 
 E = ClassifierWeights()
@@ -258,9 +257,8 @@ def test_without_telemetry_the_thresholds_correspond_to_the_fitted_evidence():
         assert asked == pytest.approx(calibrated(E.no_telemetry_weight * evidence + E.no_telemetry_offset, E), abs=0.05)
 
 
-def test_tracker_and_evaluation_use_the_detectors_acceptance_threshold():
+def test_the_evaluation_groups_probabilities_at_the_detectors_threshold():
     accepts = EvidenceDetect.settings_type.model_fields["accept_probability"].default
-    assert pytest.approx(log_odds_of(accepts)) == ACCEPTED_NATS
     assert PROBABILITY_EDGES[-2] == accepts
 
 

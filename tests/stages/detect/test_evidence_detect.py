@@ -24,7 +24,15 @@ from stages.detect.evidence_detect import HYSTERESIS_NATS, NEAR_REJECTED_M, NEAR
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
-from stages.messages import Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
+from stages.messages import (
+    CandidateEvidence,
+    Candidates,
+    Detections,
+    DroneLocalPosition,
+    DroneOdometry,
+    SearchResult,
+    VehicleMotion,
+)
 from tests.stages.caster import (
     Ball,
     Box,
@@ -157,14 +165,18 @@ def test_a_small_moving_object_in_the_free_sky_is_accepted_within_seconds(seed):
     assert 0.4 < accepted_after_s(detections) < 2.3
     last = detections[-1]
     assert last.accepted.tolist() == [True]
-    assert last.probability[0] >= 0.98
-    assert last.score[0] == pytest.approx(math.log(last.probability[0] / (1 - last.probability[0])))
-    truth = MOVING(np.array([(last.seen_ns[0] - START_NS) * 1e-9]))[0]
+    evidence = last.evidence
+    assert isinstance(evidence, CandidateEvidence)
+    assert evidence.probability[0] >= 0.98
+    assert evidence.log_odds[0] == pytest.approx(math.log(evidence.probability[0] / (1 - evidence.probability[0])))
+    truth = MOVING(np.array([(evidence.seen_ns[0] - START_NS) * 1e-9]))[0]
     np.testing.assert_allclose(last.xyz_vehicle_m[0], truth, atol=0.3)
-    np.testing.assert_allclose(last.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
+    np.testing.assert_allclose(evidence.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
     assert last.summary.startswith("drone at (")
+    assert last.result is SearchResult.DRONE
+    assert candidates[-1].accept_probability == EvidenceDetect().settings.accept_probability
     assert "sectors around it free" in last.reasons[0]
-    assert last.candidate_id[0] == candidates[0].candidate_id[0]  # the same object keeps its number
+    assert evidence.candidate_id[0] == candidates[0].candidate_id[0]  # the same object keeps its number
 
 
 def test_slices_of_four_packets_give_the_same_result_as_single_packets():
@@ -301,16 +313,16 @@ def test_each_pass_without_a_drone_publishes_empty_detections():
     candidates, detections = run([], 2.0)
     assert candidates == []
     assert len(detections) >= 3
-    assert all(d.summary.startswith("no drone: ") and len(d.score) == 0 for d in detections)
+    assert all(d.summary.startswith("no drone: ") and len(d.accepted) == 0 for d in detections)
 
 
 def test_the_searched_intervals_are_contiguous():
     for things in ([], [hovering()]):
         _, detections = run(things, 2.0)
-        assert detections[0].start_ns == START_NS
+        assert detections[0].evidence.start_ns == START_NS
         for before, after in pairwise(detections):
-            assert before.start_ns < before.stamp_ns
-            assert after.start_ns == before.stamp_ns + 1
+            assert before.evidence.start_ns < before.stamp_ns
+            assert after.evidence.start_ns == before.stamp_ns + 1
 
 
 def test_a_sweep_over_houses_reports_the_number_of_rejected_objects():
@@ -418,7 +430,7 @@ def test_after_telemetry_ends_the_path_alone_decides():
     spoke = run([Drone(MOVING)], publish=telemetry_of(MOVING, until_s=0.4))
     silent = run([Drone(MOVING)])
     assert "odometry" not in spoke[1][-1].reasons[0]
-    np.testing.assert_array_equal(spoke[1][-1].probability, silent[1][-1].probability)
+    np.testing.assert_array_equal(spoke[1][-1].evidence.probability, silent[1][-1].evidence.probability)
     np.testing.assert_array_equal(spoke[0][-1].velocity_vehicle_mps, silent[0][-1].velocity_vehicle_mps)
 
 
@@ -616,7 +628,10 @@ def test_the_same_pulses_give_the_same_messages():
     once, again = (run([Drone(still(*PLACE_M), seed=1)], 1.5) for _ in range(2))
     for a, b in zip(once[0] + once[1], again[0] + again[1], strict=True):
         assert a.reasons == b.reasons
+    for a, b in zip(once[0], again[0], strict=True):
         np.testing.assert_array_equal(a.probability, b.probability)
+    for a, b in zip(once[1], again[1], strict=True):
+        np.testing.assert_array_equal(a.evidence.probability, b.evidence.probability)
         np.testing.assert_array_equal(a.xyz_vehicle_m, b.xyz_vehicle_m)
 
 

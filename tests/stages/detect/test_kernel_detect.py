@@ -10,7 +10,7 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.detect.kernel_candidates import Gates
 from stages.detect.kernel_detect import KernelDetect
-from stages.messages import Detections, ScoreImage
+from stages.messages import Detections, KernelScores, ScoreImage, SearchResult
 from tests.stages.made import depth_image, point_of, street_depth
 
 
@@ -20,7 +20,7 @@ def detect(image, **settings):
     assert isinstance(detections, Detections)
     check_arrays(score)
     check_arrays(detections)
-    assert len(detections.reasons) == len(detections.score)
+    assert len(detections.reasons) == len(detections.accepted)
     return score, detections
 
 
@@ -63,8 +63,9 @@ def test_without_gates_a_far_pixel_beats_the_drone_as_in_the_paper():
 
 def test_scores_are_sorted_and_the_sum_of_their_terms():
     _, detections = detect(depth_image(street_depth()))
-    assert (np.diff(detections.score) >= -1e-3).all()
-    np.testing.assert_allclose(detections.score, detections.e_inner + detections.e_outer)
+    assert isinstance(detections.evidence, KernelScores)
+    assert (np.diff(detections.evidence.e) >= -1e-3).all()
+    np.testing.assert_array_equal(detections.evidence.e, detections.evidence.e_inner + detections.evidence.e_outer)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
@@ -84,7 +85,7 @@ def test_the_detection_moves_with_the_origin():
     _, here = detect(depth_image(street_depth()))
     _, there = detect(depth_image(street_depth(), origin=(1.0, -2.0, 0.5)))
     np.testing.assert_allclose(
-        there.xyz_vehicle_m - here.xyz_vehicle_m, np.tile([1.0, -2.0, 0.5], (len(here.score), 1))
+        there.xyz_vehicle_m - here.xyz_vehicle_m, np.tile([1.0, -2.0, 0.5], (len(here.accepted), 1))
     )
 
 
@@ -93,6 +94,7 @@ def test_a_street_without_a_drone_has_no_detection_and_a_reason():
     assert not detections.accepted.any()
     assert detections.summary.startswith("no drone: ")
     assert "candidates rejected" in detections.summary
+    assert detections.result is SearchResult.ALL_REJECTED
     assert detections.reasons[0] in detections.summary
 
 
@@ -100,6 +102,7 @@ def test_for_an_empty_sky_the_summary_counts_the_returns():
     _, detections = detect(depth_image(np.zeros((512, 512))))
     assert detections.xyz_vehicle_m.shape == (0, 3)
     assert detections.summary == "no drone: 0 of 1000 returns lie within 60 deg of straight up"
+    assert detections.result is SearchResult.NO_CANDIDATE
 
 
 def test_pixels_nearer_than_nearest_m_are_no_candidates():
@@ -115,6 +118,7 @@ def test_two_drones_are_both_accepted_the_better_first():
     _, detections = detect(depth_image(depth))
     assert detections.accepted.sum() == 2
     assert detections.summary.endswith("1 more with a higher score")
+    assert detections.result is SearchResult.DRONE
 
 
 def test_an_accepted_candidate_is_published_even_if_many_rejected_ones_score_lower():
@@ -122,7 +126,7 @@ def test_an_accepted_candidate_is_published_even_if_many_rejected_ones_score_low
     for k in range(20):
         depth[60 + 20 * k, 256] = 45.0
     _, detections = detect(depth_image(depth), max_candidates=5)
-    assert len(detections.score) == 5
+    assert len(detections.accepted) == 5
     assert detections.accepted.tolist() == [False] * 4 + [True]
 
 

@@ -320,8 +320,6 @@ def fix(t, xyz, sigma=0.06, track_id=1, velocity=None, bias_covariance_m2=None) 
         xyz_vehicle_m=np.asarray(xyz, dtype=float),
         covariance_m2=sigma**2 * np.eye(3),
         hits=4,
-        iterations=1,
-        shift_m=0.0,
         track_id=track_id,
         velocity_vehicle_mps=velocity,
         bias_covariance_m2=bias_covariance_m2,

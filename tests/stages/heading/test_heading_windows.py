@@ -25,8 +25,6 @@ def fix(ms, xyz, track=1, sigma=0.03) -> DroneFix:
         xyz_vehicle_m=np.asarray(xyz, dtype=float),
         covariance_m2=sigma**2 * np.eye(3),
         hits=3,
-        iterations=1,
-        shift_m=0.0,
         track_id=track,
     )
 

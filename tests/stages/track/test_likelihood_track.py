@@ -12,9 +12,18 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.geometry.frames import LidarMount
 from stages.kernels.track.hull import DEPTH, GAP_RETURN, KIND, RETURN, A, B
-from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState, VehicleMotion
+from stages.messages import (
+    CandidateEvidence,
+    Candidates,
+    Detections,
+    DroneFix,
+    TrackingState,
+    TrackState,
+    VehicleMotion,
+)
 from stages.track import LikelihoodTrack
 from stages.track.hull import COLUMNS
+from stages.track.hypotheses import Hypotheses
 from stages.track.likelihood_track import PASS_OVER_NS
 from stages.track.scan_pass import drone_returns
 from tests.stages.caster import Box, Drone, During, Trajectory, dithering, flying, pulses_seen, still
@@ -33,17 +42,17 @@ def accepted(xyz_m, velocity_mps=(0.0, 0.0, 0.0), t_s=0.0, number=1) -> Detectio
     return Detections(
         stamp_ns=at_s(t_s),
         xyz_vehicle_m=np.array([xyz_m], dtype=np.float64),
-        score=np.array([5.0]),
-        e_inner=np.zeros(1),
-        e_outer=np.zeros(1),
         accepted=np.array([True]),
         reasons=("made",),
         summary="made",
-        start_ns=at_s(t_s) - 1,
-        seen_ns=np.array([at_s(t_s)]),
-        velocity_vehicle_mps=np.array([velocity_mps], dtype=np.float64),
-        probability=np.array([0.995]),
-        candidate_id=np.array([number]),
+        evidence=CandidateEvidence(
+            start_ns=at_s(t_s) - 1,
+            candidate_id=np.array([number]),
+            seen_ns=np.array([at_s(t_s)]),
+            velocity_vehicle_mps=np.array([velocity_mps], dtype=np.float64),
+            log_odds=np.array([5.0]),
+            probability=np.array([0.995]),
+        ),
     )
 
 
@@ -58,6 +67,7 @@ def candidate(xyz_m, probability, t_s=0.0, number=1, scan_passes=3, life_since_s
         seen_ns=np.array([at_s(t_s)]),
         scan_passes=np.array([scan_passes]),
         reasons=("flew as a bird does",),
+        accept_probability=0.95,
     )
 
 
@@ -321,6 +331,7 @@ def test_a_rejected_candidate_next_to_a_track_does_not_end_it_while_its_own_cand
     both = Candidates(
         stamp_ns=one.stamp_ns,
         reasons=one.reasons + other.reasons,
+        accept_probability=one.accept_probability,
         **{
             name: np.concatenate([getattr(one, name), getattr(other, name)])
             for name in (
@@ -519,3 +530,11 @@ def test_returns_with_many_adjacent_ones_belong_to_a_larger_object():
 def test_impossible_settings_are_rejected(settings):
     with pytest.raises(ValidationError):
         LikelihoodTrack(**settings)
+
+
+def test_near_an_uncertain_track_a_candidate_needs_more_of_a_stricter_detector():
+    hypotheses = Hypotheses(1.0, 0.01, 1.5, 0.8, 1)
+    one = hypotheses.start(1, np.array([0.0, 8.0, 10.0]), np.zeros(3), at_s(0.0), at_s(0.0))
+    needs = [hypotheses.required_probability(one, at_s(3.0), accept) for accept in (0.9, 0.95, 0.99)]
+    assert 0.5 < needs[0] < needs[1] < needs[2] < 0.99
+    assert hypotheses.required_probability(one, at_s(0.0), 0.95) == 0.5

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.frames import rotation_z
-from stages.messages import Detections, DroneFix, DroneLocalPosition, TrackingState, TrackState
+from stages.messages import CandidateEvidence, Detections, DroneFix, DroneLocalPosition, TrackingState, TrackState
 from stages.track import LikelihoodTrack
 from stages.track.kalman import predicted
 from stages.track.odometry_motion_model import NO_ODOMETRY_PRIOR, OdometryMotionModel, OdometrySample
@@ -231,14 +231,17 @@ def tracked(with_telemetry):
         Detections(
             stamp_ns=at_ns(0.0),
             xyz_vehicle_m=position[None],
-            score=np.array([5.0]),
-            e_inner=np.zeros(1),
-            e_outer=np.zeros(1),
             accepted=np.array([True]),
             reasons=("made",),
             summary="made",
-            seen_ns=np.array([at_ns(0.0)]),
-            velocity_vehicle_mps=velocity[None],
+            evidence=CandidateEvidence(
+                start_ns=at_ns(0.0) - 1,
+                candidate_id=np.array([-1]),
+                seen_ns=np.array([at_ns(0.0)]),
+                velocity_vehicle_mps=velocity[None],
+                log_odds=np.array([5.0]),
+                probability=np.array([0.993]),
+            ),
         )
     )
     for pulses in pulses_seen(seen, dithering(half_rad=math.radians(1.0)), 8.0):

@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from stages.messages import Detections, DroneFix, SweptPulses, TrackingState, TrackState
+from stages.messages import Detections, DroneFix, KernelScores, SweptPulses, TrackingState, TrackState
 from stages.track.likelihood_track import LikelihoodTrack
 
 CLOUDS = Path(__file__).resolve().parents[4] / "shared" / "data" / "drone_lidar"
@@ -122,9 +122,7 @@ def found_at(frame: Frame) -> Detections:
     return Detections(
         stamp_ns=frame.stamp_ns,
         xyz_vehicle_m=frame.xyz_m[frame.on_drone].mean(axis=0)[None],
-        score=np.zeros(1),
-        e_inner=np.zeros(1),
-        e_outer=np.zeros(1),
+        evidence=KernelScores(e_inner=np.zeros(1), e_outer=np.zeros(1)),
         accepted=np.ones(1, dtype=bool),
         reasons=("the only object near and above",),
         summary="drone",

@@ -23,6 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from flow.counters import Counters
 from flow.message import Message
 from flow.stage import Settings, Stage
 from stages.fuse.chain import yaw_sigma_rad
@@ -92,10 +93,9 @@ class Fuse(Stage[FuseSettings]):
         return self._intake.rejected
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """Invalid messages by reason, and resets of the back end."""
-        begun = {"back end reset": self.recoveries} if self.recoveries else {}
-        return {f"rejected: {why}": count for why, count in self.rejected.items()} | begun
+        return Counters({"back end reset": self.recoveries} if self.recoveries else {}, self.rejected)
 
     @property
     def recoveries(self) -> int:

@@ -10,6 +10,7 @@ import pytest
 
 from flow.events import EventMessage
 from flow.link import Tap
+from flow.live.report import LinkState
 from flow.message import Message
 from flow.stage import Settings
 from tests.flow.live_toys import PATIENCE_S, Collector, Line, Memory, Stuck, graph_of, run_live
@@ -226,7 +227,7 @@ def test_the_queue_of_a_slow_stage_keeps_what_its_edge_declares(tmp_path, policy
     line_of(live).put(1)
     assert gate_of(live)._entered.wait(PATIENCE_S)
     line_of(live).put(*range(2, 10), "end")  # after the end the line is no longer open
-    while live.report().links["line"].state == "open":
+    while live.report().links["line"].state is LinkState.OPEN:
         threading.Event().wait(0.01)
     gate_of(live)._open.set()
     assert collector_of(live).take(len(passed)) == passed

@@ -56,7 +56,7 @@ def test_a_configuration_with_drone_search_does_not_list_them(drive):
 
 def test_rejected_messages_of_links_and_stages_are_reported_with_reasons(drive):
     text = " ".join(command.grd("run", "drive.yaml").split())
-    assert "rejected: odometry: 2 rejected; motion: 1 rejected: odometry: " in text
+    assert "rejected: odometry: 2 no valid pose; motion: 1 odometry: " in text
 
 
 def test_a_run_that_left_nothing_out_has_no_such_line(drive):

@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from flow.config.edge import Edge, QueueSettings
-from flow.live.report import EdgeCount, LinkReport, LiveReport, edge_report
+from flow.counters import Counters
+from flow.live.report import EdgeCount, LinkReport, LinkState, LiveReport, edge_report
 from flow.taps import Digest
 from links.cli.live_view import LiveView
 from links.runs.live_run import RunStatus
@@ -25,18 +26,18 @@ from stages.messages import (
 )
 
 
-def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
+def report_of(lags_ms=(3.0, 150.0), dropped=2, state=LinkState.OPEN, reason="", off=()):
     count = EdgeCount(Edge("sweep", "swept_pulses", "track", "pulses", SweptPulses, QueueSettings("drop_oldest", 64)))
     for lag_ms in lags_ms:
         count.done(round(lag_ms * 1e6))
     return LiveReport(
         records=1234,
         edges={"track.pulses": edge_report(count, dropped)},
-        links={"lidar": LinkReport(state, 1200, 1)},
+        links={"lidar": LinkReport(state, 1200, 1, reason=reason)},
         counters={
-            "lidar": {"lost": 7, "from other senders": 0},
-            "fuse": {"rejected: fix: not finite": 3, "back end begun anew": 0},
-            "recorder": {"missed": 0},
+            "lidar": Counters({"lost": 7, "from other senders": 0}),
+            "fuse": Counters({"back end reset": 0}, {"fix: not finite": 3}),
+            "recorder": Counters({"missed": 0}),
         },
         switched_off=list(off),
     )
@@ -102,7 +103,7 @@ def test_a_lost_pose_has_no_numbers():
 
 
 def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():
-    line = shown(report_of(state="no packet on UDP 2368 for 2 s", off=["vp_drone"]))
+    line = shown(report_of(state=LinkState.FAILED, reason="no packet on UDP 2368 for 2 s", off=["vp_drone"]))
     assert "OFF: vp_drone; lidar no packet on UDP 2368 for 2 s\n" in line
 
 

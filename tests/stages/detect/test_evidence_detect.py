@@ -24,7 +24,15 @@ from stages.detect.evidence_detect import HYSTERESIS_NATS, NEAR_REJECTED_M, NEAR
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
-from stages.messages import CandidateEvidence, Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
+from stages.messages import (
+    CandidateEvidence,
+    Candidates,
+    Detections,
+    DroneLocalPosition,
+    DroneOdometry,
+    SearchResult,
+    VehicleMotion,
+)
 from tests.stages.caster import (
     Ball,
     Box,
@@ -163,6 +171,8 @@ def test_a_small_thing_that_moves_in_the_free_sky_is_a_drone_after_a_second_or_t
     np.testing.assert_allclose(last.xyz_vehicle_m[0], truth, atol=0.3)
     np.testing.assert_allclose(evidence.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
     assert last.summary.startswith("drone at (")
+    assert last.result is SearchResult.DRONE
+    assert candidates[-1].accept_probability == EvidenceDetect().settings.accept_probability
     assert "sectors around it free" in last.reasons[0]
     assert evidence.candidate_id[0] == candidates[0].candidate_id[0]  # the same thing keeps its number
 

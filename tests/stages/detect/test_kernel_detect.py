@@ -10,7 +10,7 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.detect.kernel_candidates import Gates
 from stages.detect.kernel_detect import KernelDetect
-from stages.messages import Detections, KernelScores, ScoreImage
+from stages.messages import Detections, KernelScores, ScoreImage, SearchResult
 from tests.stages.made import depth_image, point_of, street_depth
 
 
@@ -92,6 +92,7 @@ def test_a_street_without_a_drone_has_none_and_says_why():
     assert not detections.accepted.any()
     assert detections.summary.startswith("no drone: ")
     assert "candidates refused" in detections.summary
+    assert detections.result is SearchResult.ALL_REJECTED
     assert detections.reasons[0] in detections.summary
 
 
@@ -99,6 +100,7 @@ def test_an_empty_sky_says_how_many_returns_were_elsewhere():
     _, detections = detect(depth_image(np.zeros((512, 512))))
     assert detections.xyz_vehicle_m.shape == (0, 3)
     assert detections.summary == "no drone: 0 of 1000 returns lie within 60 deg of straight up"
+    assert detections.result is SearchResult.NO_CANDIDATE
 
 
 def test_what_is_nearer_than_the_roof_is_no_candidate():
@@ -114,6 +116,7 @@ def test_two_drones_are_both_accepted_the_better_first():
     _, detections = detect(depth_image(depth))
     assert detections.accepted.sum() == 2
     assert detections.summary.endswith("1 more with a higher score")
+    assert detections.result is SearchResult.DRONE
 
 
 def test_an_accepted_candidate_is_given_out_even_when_many_refused_ones_score_lower():

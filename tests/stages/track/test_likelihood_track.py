@@ -23,6 +23,7 @@ from stages.messages import (
 )
 from stages.track import LikelihoodTrack
 from stages.track.hull import COLUMNS
+from stages.track.hypotheses import Hypotheses
 from stages.track.likelihood_track import PASS_OVER_NS
 from stages.track.scan_pass import drone_returns
 from tests.stages.caster import Box, Drone, During, Way, dithering, flying, pulses_seen, still
@@ -509,3 +510,11 @@ def test_returns_with_many_more_beside_them_belong_to_something_bigger():
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValidationError):
         LikelihoodTrack(**settings)
+
+
+def test_near_an_uncertain_track_a_candidate_needs_more_of_a_stricter_detector():
+    hypotheses = Hypotheses(1.0, 0.01, 1.5, 0.8, 1)
+    one = hypotheses.start(1, np.array([0.0, 8.0, 10.0]), np.zeros(3), at_s(0.0), at_s(0.0))
+    needs = [hypotheses.required_probability(one, at_s(3.0), accept) for accept in (0.9, 0.95, 0.99)]
+    assert 0.5 < needs[0] < needs[1] < needs[2] < 0.99
+    assert hypotheses.required_probability(one, at_s(0.0), 0.95) == 0.5

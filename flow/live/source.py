@@ -47,7 +47,8 @@ class SourceThread(RunThread):
                 reason = str(error)
             if stopping.is_set():
                 break
-            self.report.state, self.report.reason = LinkState.FAILED, reason
+            self.report.reason = reason
+            self.report.state = LinkState.FAILED
             pause_s = FIRST_PAUSE_S if self.report.records > records_before else min(2 * pause_s, MAX_PAUSE_S)
             self.shared.events.report(self.node, f"{reason}; it is reopened")
             stopping.wait(pause_s)

@@ -103,8 +103,16 @@ class Autopilot(Source[AutopilotSettings]):
         self._not_connected: int = 0
 
     def decode(self, record: Record) -> AutopilotMessage | None:
-        """The message of one frame; None for an unused or rejected frame (see `counters`)."""
+        """The message of one frame; None for an unused or rejected frame (see `counters`), and for a sent one."""
+        if record.topic == SENT_TOPIC:
+            self._decoder.sent(record)
+            return None
         return self._decoder.decode(record)
+
+    @property
+    def replay_topics(self) -> tuple[str, ...]:
+        """See Source: also what was sent, which decides whether the autopilot's estimate is independent."""
+        return self.settings.topic, SENT_TOPIC
 
     def on_pose(self, pose: RelativePose) -> None:
         """Send a pose if the gate accepts it. Nothing is sent before the link is open, or in replay."""
@@ -141,6 +149,7 @@ class Autopilot(Source[AutopilotSettings]):
             self._signer,
             host_time.now_ns,
             (settings.topic, SENT_TOPIC),
+            self._decoder.independence,
         )
         self._session = session
         try:

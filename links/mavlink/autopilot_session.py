@@ -27,6 +27,7 @@ from typing import Any
 
 from flow.link import LinkError, Record
 from links.mavlink.gate import RejectReason
+from links.mavlink.independence import Independence
 from links.mavlink.origin import OriginSender
 from links.mavlink.pose_sender import PoseSender
 from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
@@ -58,12 +59,14 @@ class AutopilotSession:
         signer: Signer | None,
         now_ns: Callable[[], int],
         topics: tuple[str, str],
+        independence: Independence,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.connection, self.poses, self.origin = connection, poses, origin
         self._target, self._own = target, own
         self._signer, self._now_ns = signer, now_ns
         self._received_topic, self._sent_topic = topics
+        self._independence = independence
         self._splitter = FrameSplitter()
         self._split_connection = 0  # `reconnects` of the splitter's bytes
         self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
@@ -266,5 +269,6 @@ class AutopilotSession:
             self.counts[f"not sent: {kind}"] += 1
             return False
         self.counts[f"sent: {kind}"] += 1
+        self._independence.on_sent(kind, now_ns)
         self._sent.append(Record(self._sent_topic, now_ns, now_ns, frame))
         return True

@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink.autopilot_session import AutopilotSession
 from links.mavlink.gate import PoseLimits
+from links.mavlink.independence import Independence
 from links.mavlink.origin import OriginSender
 from links.mavlink.pose_sender import PoseSender
 from links.mavlink.transport.connection import Address, Connection
@@ -148,6 +149,7 @@ class SlowFlight:
             None,
             lambda: self.now_ns,
             ("/autopilot/rx", "/autopilot/tx"),
+            Independence(),
         )
         self._mav = mavlink.MAVLink(None, 1, 1)
         self._steps = 0

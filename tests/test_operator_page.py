@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from links.dynamixel.wire import Health
-from links.mavlink.gate import RejectReason as GateRejectReason
+from links.mavlink.poses.gate import RejectReason as GateRejectReason
 from links.recording import Recorder
 from links.recording.writer import CLOSE_TIMEOUT_S
 from links.velodyne.position import Pps

@@ -23,10 +23,10 @@ from links.clock import host_time
 from links.clock.device_clock import DeviceClock
 from links.mavlink.autopilot_session import AutopilotSession
 from links.mavlink.frame_decoder import FrameDecoder
-from links.mavlink.gate import PoseLimits
 from links.mavlink.origin import GlobalOrigin, OriginSender
-from links.mavlink.pose_sender import PoseMessage, PoseSender
-from links.mavlink.profiles import PROFILES, ProfileName
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
+from links.mavlink.profiles import PROFILES, ProfileName, RequiredParameter, YawOutput, required_parameters
 from links.mavlink.readers import AutopilotMessage
 from links.mavlink.transport.connection import Udp, parse_connection
 from links.mavlink.transport.signing import Signer
@@ -49,11 +49,18 @@ class AutopilotSettings(SourceSettings):
     sender: IPv4Address | None = None  # the autopilot's address, required when udpin listens beyond loopback
     profile: ProfileName = "ardupilot"
     send: tuple[PoseMessage, ...] = ("odometry",)  # messages per pose
+    yaw: YawOutput = "none"  # none: positions in the autopilot's axes; cameras: poses in `map`, EK3_SRCn_YAW 6
+    source_set: int = Field(2, ge=1, le=3)  # ArduPilot: EK3_SRCn_* that are grd's; set 1 flies without it
     limits: PoseLimits = PoseLimits()
     own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as a component of its vehicle
     own_component_id: int = Field(VISUAL_INERTIAL_ODOMETRY, ge=1, le=255)
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
     global_origin: GlobalOrigin | None = None  # sent to an autopilot without an origin
+
+    @property
+    def required_parameters(self) -> tuple[RequiredParameter, ...]:
+        """The parameters that the autopilot needs."""
+        return required_parameters(self.profile, self.yaw, self.source_set)
 
     @property
     def own_id(self) -> tuple[int, int]:
@@ -144,7 +151,13 @@ class Autopilot(Source[AutopilotSettings]):
             connection,
             target,
             settings.own_id,
-            PoseSender(settings.send, settings.limits, reset_counter=host_time.now_ns() // 1_000_000_000),
+            PoseSender(
+                settings.send,
+                settings.limits,
+                reset_counter=host_time.now_ns() // 1_000_000_000,
+                yaw=settings.yaw,
+                profile=settings.profile,
+            ),
             OriginSender(settings.global_origin, target),
             self._signer,
             host_time.now_ns,

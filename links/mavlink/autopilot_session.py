@@ -26,10 +26,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from flow.link import LinkError, Record
-from links.mavlink.gate import RejectReason
-from links.mavlink.independence import Independence
 from links.mavlink.origin import OriginSender
-from links.mavlink.pose_sender import PoseSender
+from links.mavlink.poses.attitude_monitor import AttitudeEvent, AttitudeMonitor
+from links.mavlink.poses.gate import RejectReason
+from links.mavlink.poses.independence import Independence
+from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
 from links.mavlink.transport.framing import FrameSplitter, dialect, header, packed
@@ -66,7 +67,7 @@ class AutopilotSession:
         self._target, self._own = target, own
         self._signer, self._now_ns = signer, now_ns
         self._received_topic, self._sent_topic = topics
-        self._independence = independence
+        self._independence, self._attitude = independence, AttitudeMonitor()
         self._splitter = FrameSplitter()
         self._split_connection = 0  # `reconnects` of the splitter's bytes
         self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
@@ -194,12 +195,25 @@ class AutopilotSession:
                 self._timesync.on_frame()
                 self._target_ns, self._target_connection = self._now_ns(), self.connection.reconnects
                 self.origin.on_message(message)
+                if message.get_type() == "ATTITUDE":
+                    self._on_attitude(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
                     if message.tc1 == 0:
                         self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
                     elif self._timesync.on_reply(message.ts1, arrival_ns, self.poses.sending):
                         return message.ts1
         return arrival_ns
+
+    def _on_attitude(self, message: Any, arrival_ns: int) -> None:
+        """The autopilot's attitude, and what it shows. The lock is held."""
+        event = self._attitude.add(message, arrival_ns)
+        if event is AttitudeEvent.BOOTED:
+            self.poses.on_boot()
+            self.origin.restart()
+        elif event is AttitudeEvent.YAW_RESET:
+            self.poses.on_yaw_reset()
+        if self._attitude.newest is not None:
+            self.poses.on_attitude(self._attitude.newest)
 
     def _accept_for_heartbeats(self, source: tuple[str, int]) -> None:
         """Send heartbeats, but no poses, to an autopilot that signs with an old time until it receives our time.

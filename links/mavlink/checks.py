@@ -15,7 +15,7 @@ from flow.graph import Graph
 from flow.link import LinkError, Record, Source
 from links.mavlink.autopilot import Autopilot
 from links.mavlink.parameters import ParameterValues, ask_parameters
-from links.mavlink.profiles import PROFILES, ProfileName, findings
+from links.mavlink.profiles import RequiredParameter, findings
 from links.mavlink.transport.framing import header, parse_frame
 from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
@@ -260,19 +260,19 @@ def _estimate(name: str, estimators: Sequence[AutopilotEstimator]) -> CheckResul
 
 def _parameters(name: str, link: Autopilot) -> CheckResult:
     try:
-        return parameter_check(name, link.settings.profile, ask_parameters(link))
+        return parameter_check(name, link.settings.required_parameters, ask_parameters(link))
     except LinkError as error:
         return fail(f"{name} parameters", str(error))
 
 
-def parameter_check(name: str, profile: ProfileName, received: ParameterValues) -> CheckResult:
+def parameter_check(name: str, required: Sequence[RequiredParameter], received: ParameterValues) -> CheckResult:
     """One result that names every wrong or missing parameter."""
     name = f"{name} parameters"
     if not received.frames:
         return fail(name, "the autopilot does not reply")
     if not received.values:
         return fail(name, "none was received: does it receive our frames, and may this link read parameters?")
-    wrong = findings(PROFILES[profile], received.values)
+    wrong = findings(required, received.values)
     if wrong:
         return fail(name, "; ".join(wrong))
-    return ok(name, f"all {len(PROFILES[profile].required)} as required for {profile}")
+    return ok(name, f"all {len(required)} as required")

@@ -17,7 +17,7 @@ from typing import Any
 
 from flow.link import Record
 from links.clock.device_clock import DeviceClock
-from links.mavlink.independence import Independence
+from links.mavlink.poses.independence import Independence
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
 from links.mavlink.transport.framing import SEQUENCE, header, known, parse_frame, timesync_target
 from stages.messages import AutopilotStatus, DroneAttitude, DroneLocalPosition, DroneOdometry

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from flow.link import Run, Tap
 from flow.message import Message
 from flow.stage import Settings
-from links.mavlink.gate import PoseLimits, reject_reason
+from links.mavlink.poses.gate import PoseLimits, reject_reason
 from links.runs.fix_log import FixLog
 from links.runs.result_file import ResultFile
 from stages.geometry.frames import quaternions_xyzw

@@ -23,7 +23,7 @@ from flow.stage import Stage
 from flow.subprocess_replay import can_use_subprocesses, replay_in_subprocesses
 from flow.taps import Digest
 from links.mavlink.autopilot import Autopilot
-from links.mavlink.gate import PoseLimits
+from links.mavlink.poses.gate import PoseLimits
 from links.recording import Progress, Session
 from links.runs.request import RunRequest, RunResult
 from links.runs.result_file import ResultFile

@@ -55,9 +55,7 @@ class GreatCircleVpSettings(Settings):
     line_sigma_deg: float = Field(0.25, gt=0, le=5)  # one sigma of straightness and parallelism of lines
     vertical_sigma_deg: float = Field(3.0, gt=0, le=60)  # of the mount's z axis against the vertical, without tilt
     tilt_age_s: float = Field(0.2, gt=0)  # maximum age of a tilt
-    search_deg: float | None = Field(
-        None, ge=0, le=90
-    )  # without tilt, the vertical is searched in this cone about z;
+    search_deg: float | None = Field(None, ge=0, le=90)  # without tilt, the vertical is searched in this cone about z;
     # 0: it is z, within `vertical_sigma_deg`. None: 0 for a vehicle, 35 for a drone, which tilts in flight
     max_frames: int = Field(3, ge=1, le=6)  # horizontal pairs; 1: Manhattan
     min_lines: int = Field(4, ge=2)  # of a horizontal pair

@@ -13,6 +13,7 @@ from flow.link import LinkError, Record
 from links.mavlink import Autopilot
 from links.mavlink.checks import autopilot_checks, parameter_check
 from links.mavlink.parameters import ParameterValues, ask_parameters
+from links.mavlink.profiles import required_parameters
 from links.mavlink.transport.framing import packed
 from links.preflight.check_result import Level
 from stages.messages import AutopilotEstimator, AutopilotStatus
@@ -170,15 +171,15 @@ def test_a_recorded_flight_may_be_armed():
 
 @pytest.mark.parametrize("profile", ["ardupilot", "px4"])
 def test_parameters_are_compared_with_the_profile(profile):
-    good = good_parameters(profile)
-    assert parameter_check("it", profile, ParameterValues(good, [], 40)).level is Level.OK
+    good, required = good_parameters(profile), required_parameters(profile, "none")
+    assert parameter_check("it", required, ParameterValues(good, [], 40)).level is Level.OK
     first, second = list(good)[:2]
-    bad = parameter_check("it", profile, ParameterValues({**good, first: 99.0} | {second: 98.0}, [], 40))
+    bad = parameter_check("it", required, ParameterValues({**good, first: 102.0} | {second: 98.0}, [], 40))
     assert bad.level is Level.FAIL
-    assert f"{first} is 99" in bad.sentence
+    assert f"{first} is 102" in bad.sentence
     assert f"{second} is 98" in bad.sentence
-    assert "does not reply" in parameter_check("it", profile, ParameterValues({}, list(good), 0)).sentence
-    assert "none was received" in parameter_check("it", profile, ParameterValues({}, list(good), 9)).sentence
+    assert "does not reply" in parameter_check("it", required, ParameterValues({}, list(good), 0)).sentence
+    assert "none was received" in parameter_check("it", required, ParameterValues({}, list(good), 9)).sentence
 
 
 def test_a_full_disk_for_the_signing_time_is_an_error_in_preflight(tmp_path, monkeypatch):

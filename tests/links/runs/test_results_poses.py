@@ -10,7 +10,7 @@ import pytest
 
 from flow.link import Run
 from links.evaluation.run_data import OutputKind, read_output
-from links.mavlink.gate import PoseLimits
+from links.mavlink.poses.gate import PoseLimits
 from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
 from stages.fuse.motion_model import Motions
 from stages.fuse.pose_message import MapEstimate, Status, lost, pose

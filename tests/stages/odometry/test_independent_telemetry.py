@@ -23,9 +23,7 @@ def attitude(independent: bool, yaw_rad: float = 0.0) -> DroneAttitude:
 
 
 def position(independent: bool) -> DroneLocalPosition:
-    return DroneLocalPosition(
-        stamp_ns=5, xyz_odom_m=np.ones(3), velocity_odom_mps=np.zeros(3), independent=independent
-    )
+    return DroneLocalPosition(stamp_ns=5, xyz_odom_m=np.ones(3), velocity_odom_mps=np.zeros(3), independent=independent)
 
 
 def odometry(independent: bool) -> DroneOdometry:
@@ -44,9 +42,7 @@ def odometry(independent: bool) -> DroneOdometry:
 
 
 def imu(stamp_ns: int) -> DroneImu:
-    return DroneImu(
-        stamp_ns=stamp_ns, acceleration_drone_mps2=np.array([0, 0, 9.8]), angular_velocity_drone_radps=GYRO
-    )
+    return DroneImu(stamp_ns=stamp_ns, acceleration_drone_mps2=np.array([0, 0, 9.8]), angular_velocity_drone_radps=GYRO)
 
 
 def test_an_independent_estimate_passes_unchanged():

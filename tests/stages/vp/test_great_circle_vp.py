@@ -24,7 +24,10 @@ def image(grey, stamp_ns=5, camera_mount="vehicle", readout_s=0.0):
 
 def tilt(R, stamp_ns=5, rate_radps=STILL, sigma_deg=1.0):
     return DroneTilt(
-        stamp_ns=stamp_ns, up_drone=R[2].copy(), sigma_rad=np.radians(sigma_deg), angular_velocity_drone_radps=rate_radps
+        stamp_ns=stamp_ns,
+        up_drone=R[2].copy(),
+        sigma_rad=np.radians(sigma_deg),
+        angular_velocity_drone_radps=rate_radps,
     )
 
 
@@ -132,9 +135,7 @@ def test_a_tilt_is_extrapolated_to_the_image_and_ignored_when_old():
     vp.on_tilt(tilt(before, 900_000_000, np.array([np.radians(60.0), 0, 0]), sigma_deg=0.3))
     found = vp.on_image(image(grey, 1_000_000_000, "drone"))
     assert off_deg(found.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) < 0.3
-    late = vp.on_image(
-        image(grey, 1_200_000_000, "drone")
-    )  # without tilt the mount's z is the vertical, 14 deg off
+    late = vp.on_image(image(grey, 1_200_000_000, "drone"))  # without tilt the mount's z is the vertical, 14 deg off
     assert not len(late.direction) or off_deg(late.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) > 1
 
 

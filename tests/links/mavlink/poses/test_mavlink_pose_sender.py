@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from links.mavlink.gate import PoseLimits
-from links.mavlink.pose_sender import TEXT_BYTES, PoseSender
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.poses.pose_sender import TEXT_BYTES, PoseSender
 from stages.messages import PoseState
 from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
 
@@ -16,7 +16,7 @@ class Output:
     """Sends poses at a rate and keeps the sent counters and texts."""
 
     def __init__(self, **settings: Any) -> None:
-        self.pose_sender = PoseSender(("odometry",), PoseLimits(), **settings)
+        self.pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="cameras", **settings)
         self.now_ns = HOST0
         self.counters: list[int] = []
         self.texts: list[tuple[int, str]] = []
@@ -155,7 +155,7 @@ def test_a_text_that_could_not_be_sent_is_kept_unless_a_newer_one_replaces_it():
 
 
 def test_without_messages_nothing_is_sent_or_stopped():
-    pose_sender = PoseSender((), PoseLimits())
+    pose_sender = PoseSender((), PoseLimits(), yaw="cameras")
     assert pose_sender.messages(good_pose(), HOST0) == []
     assert not pose_sender.sending
     texts = [m.text for i in range(40) for m in pose_sender.due_texts(HOST0 + 100 * i * MS)]

@@ -13,7 +13,7 @@ from flow.link import Record
 from links.clock import host_time
 from links.mavlink import Autopilot
 from links.mavlink.autopilot import SENT_TOPIC
-from links.mavlink.independence import Independence
+from links.mavlink.poses.independence import Independence
 from tests.links.mavlink.mavlink_poses import good_pose
 from tests.links.mavlink.test_mavlink_live import listening
 

@@ -86,7 +86,7 @@ TEXTS = {  # source file and its texts
         "closed: blocked",
         "sent late",
     ],
-    "links/mavlink/pose_sender.py": ["sending poses", "STOPPED: ", "no poses sent"],
+    "links/mavlink/poses/pose_sender.py": ["sending poses", "STOPPED: ", "no poses sent"],
     "links/mavlink/transport/stream_connection.py": [
         "is lost: is it plugged in and powered?",
         "Reopening",

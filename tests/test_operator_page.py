@@ -86,7 +86,10 @@ TEXTS = {  # source file and its texts
         "closed: blocked",
         "sent late",
     ],
-    "links/mavlink/poses/pose_sender.py": ["sending poses", "STOPPED: ", "no poses sent"],
+    "links/mavlink/poses/status_texts.py": ["sending poses", "STOPPED: "],
+    "links/mavlink/poses/pose_sender.py": ["no poses sent"],
+    "links/mavlink/poses/fusion_monitor.py": ["autopilot rejects the position ("],
+    "links/mavlink/origin.py": ["the autopilot does not confirm the origin"],
     "links/mavlink/transport/stream_connection.py": [
         "is lost: is it plugged in and powered?",
         "Reopening",

@@ -24,6 +24,7 @@ from links.clock.device_clock import DeviceClock
 from links.mavlink.autopilot_session import AutopilotSession
 from links.mavlink.frame_decoder import FrameDecoder
 from links.mavlink.origin import GlobalOrigin, OriginSender
+from links.mavlink.poses.fusion_monitor import OnRejection
 from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
 from links.mavlink.profiles import PROFILES, ProfileName, RequiredParameter, YawOutput, required_parameters
@@ -51,6 +52,7 @@ class AutopilotSettings(SourceSettings):
     send: tuple[PoseMessage, ...] = ("odometry",)  # messages per pose
     yaw: YawOutput = "none"  # none: positions in the autopilot's axes; cameras: poses in `map`, EK3_SRCn_YAW 6
     source_set: int = Field(2, ge=1, le=3)  # ArduPilot: EK3_SRCn_* that are grd's; set 1 flies without it
+    on_rejection: OnRejection = "stop"  # when the autopilot's EKF rejects the pose: stop, reset or report
     limits: PoseLimits = PoseLimits()
     own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as a component of its vehicle
     own_component_id: int = Field(VISUAL_INERTIAL_ODOMETRY, ge=1, le=255)
@@ -157,6 +159,7 @@ class Autopilot(Source[AutopilotSettings]):
                 reset_counter=host_time.now_ns() // 1_000_000_000,
                 yaw=settings.yaw,
                 profile=settings.profile,
+                on_rejection=settings.on_rejection,
             ),
             OriginSender(settings.global_origin, target),
             self._signer,

@@ -44,6 +44,9 @@ QUIET_NS = 1_500_000_000  # one and a half heartbeats: no poses are sent
 ONBOARD_CONTROLLER, NO_AUTOPILOT = 18, 8  # MAV_TYPE, MAV_AUTOPILOT_INVALID
 NO_CONNECTION = -1
 STANDBY, ACTIVE = 3, 4  # MAV_STATE
+REJECTED = (
+    "the autopilot's EKF rejects the position: no poses are sent. Is its compass, its GPS or the servo's mount wrong?"
+)
 SENT_RECORDS = 4096  # kept until `sent` is called
 
 
@@ -129,6 +132,10 @@ class AutopilotSession:
         with self._lock:
             rejected = {f"pose rejected: {reason.value}": count for reason, count in self.poses.rejected.items()}
             counts = dict(self.counts)
+            if self.poses.fusion.rejections:
+                counts["pose rejected by the autopilot"] = self.poses.fusion.rejections
+            if self.origin.sent_times:
+                counts["origin sent"] = self.origin.sent_times
             round_trip_ns = self._timesync.newest_ns
         return {
             **counts,
@@ -153,7 +160,8 @@ class AutopilotSession:
         if self.closed:
             return None
         signing = None if self._signer is None else self._signer.status
-        return self.connection.status or self._silence() or self._timesync.status or signing
+        own = self.origin.status or (REJECTED if self.poses.fusion.stopped else None)
+        return self.connection.status or self._silence() or self._timesync.status or own or signing
 
     def _silence(self) -> str | None:
         if self._now_ns() - self._target_ns < SILENT_S * SECOND_NS:
@@ -195,6 +203,7 @@ class AutopilotSession:
                 self._timesync.on_frame()
                 self._target_ns, self._target_connection = self._now_ns(), self.connection.reconnects
                 self.origin.on_message(message)
+                self.poses.on_estimator_status(message, arrival_ns)
                 if message.get_type() == "ATTITUDE":
                     self._on_attitude(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
@@ -254,7 +263,7 @@ class AutopilotSession:
             if self._send(dialect().MAVLink_timesync_message(0, request_ns)):
                 self._request_ns = now_ns
                 if self._timesync.on_request(request_ns):
-                    self.poses.warn("no TIMESYNC replies: latency unknown")
+                    self.poses.texts.warn("no TIMESYNC replies: latency unknown")
         if self.connection.left_late != self._left_late:
             self._left_late = self.connection.left_late
             self._timesync.on_late_frame(now_ns)
@@ -270,7 +279,7 @@ class AutopilotSession:
         """Send the text that is due. The lock is held."""
         for message in self.poses.due_texts(now_ns):
             if not self._send(message):
-                self.poses.on_text_not_sent()
+                self.poses.texts.on_not_sent()
 
     def _send(self, message: Any) -> bool:
         """Pack, sign and send one message. The lock is held."""

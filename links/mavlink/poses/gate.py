@@ -45,8 +45,9 @@ class RejectReason(enum.Enum):
     LINK_LATE = "link too slow"
     YAW_NOT_MEASURED = "yaw not measured by cameras"
     ODOM_YAW = "yaw of autopilot's axes unknown"
-    ODOM_YAW_SIGMA = "yaw of autopilot's axes too uncertain"
+    ODOM_YAW_SIGMA = "yaw of autopilot's axes uncertain"
     ODOM_YAW_RESET = "autopilot reset its yaw"
+    REJECTED_BY_AUTOPILOT = "autopilot rejects the position"
     NO_ATTITUDE = "no attitude from autopilot"
 
 

@@ -9,8 +9,7 @@ The reset counter is incremented with every jump of the pose, every change of th
 autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is arbitrary: after a
 restart of grd it should differ from the previous one.
 
-STATUSTEXT reports when sending stops (critical) and resumes (notice), and changes of the pose state. At most one text
-per half second is sent, the newest of its kind; a text is kept until it was sent or replaced.
+Texts: `status_texts.py`. Rejection of the pose by the autopilot: `fusion_monitor.py`.
 
 Source: ours; ArduPilot AP_VisualOdom (300 ms health), PX4 EKF2 EV_MAX_INTERVAL (200 ms to start, 400 ms to stop).
 """
@@ -20,25 +19,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
+from links.mavlink.poses.fusion_monitor import FusionMonitor, OnRejection
 from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason, yaw_reason
 from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
 from links.mavlink.poses.position_gate import position_reason
 from links.mavlink.poses.position_messages import OwnAttitude, position_odometry, position_vision_estimate
+from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
-from links.mavlink.transport.framing import SEQUENCE, dialect
-from stages.messages import PoseState, RelativePose
+from links.mavlink.transport.framing import SEQUENCE
+from stages.messages import RelativePose
 
 PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
-TextKind = Literal["output", "link", "state"]  # in order of priority; the newest text of each kind is kept
 
 SILENCE_NS = 300_000_000  # the autopilot's timeout for poses
 ATTITUDE_NS = 1_000_000_000  # largest age of the autopilot's attitude
-TEXT_NS = 500_000_000  # minimum interval of texts
-TEXT_BYTES = 50  # size of STATUSTEXT's text field
-CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
-SEVERITY = {PoseState.FULL: INFO, PoseState.COASTING: WARNING}  # of a state change; other states: warning
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +58,7 @@ class PoseSender:
         *,
         yaw: YawOutput,
         profile: ProfileName = "ardupilot",
+        on_rejection: OnRejection = "stop",
     ) -> None:
         self.rejected: Counter[RejectReason] = Counter()
         self.reset_counter = reset_counter % SEQUENCE
@@ -74,10 +71,8 @@ class PoseSender:
         self._sent: SentPose | None = None
         self._incremented = False  # the reset counter, since `_sent`
         self._sending = False
-        self._state: PoseState | None = None
-        self._texts: dict[TextKind, tuple[int, str]] = {}  # waiting: severity and text
-        self._text_ns: int | None = None
-        self._offered: tuple[TextKind, int, str] | None = None  # the newest result of `due_texts`
+        self.texts = StatusTexts()
+        self.fusion = FusionMonitor(on_rejection)
 
     @property
     def sending(self) -> bool:
@@ -86,9 +81,7 @@ class PoseSender:
 
     def messages(self, pose: RelativePose, now_ns: int, link_reason: RejectReason | None = None) -> list[Any]:
         """Messages of one pose; none if the gate rejects it, or with a `link_reason`. Then call `on_sent`."""
-        if pose.state is not self._state:
-            self._state = pose.state
-            self._texts["state"] = SEVERITY.get(pose.state, WARNING), f"{pose.state.name}: {pose.reason}"
+        self.texts.on_state(pose.state, pose.reason, now_ns)
         reasons: dict[PoseMessage, RejectReason | None] = {
             kind: self._reason(kind, pose, now_ns) or link_reason for kind in self._kinds
         }
@@ -113,6 +106,16 @@ class PoseSender:
     def on_boot(self) -> None:
         """The autopilot has booted."""
         self._poses_sent = self._yaw_reset = False
+        self.fusion.on_boot()
+
+    def on_estimator_status(self, message: Any, now_ns: int) -> None:
+        """EKF_STATUS_REPORT or ESTIMATOR_STATUS of the autopilot; others are ignored."""
+        rejected = self.fusion.add(message, self._sending, now_ns)
+        if rejected is not None:
+            text, reset = rejected
+            self.texts.warn(text)
+            if reset:
+                self.reset_counter = (self.reset_counter + 1) % SEQUENCE
 
     def on_sent(self, pose: RelativePose, now_ns: int) -> None:
         """A message of this pose was sent."""
@@ -120,29 +123,18 @@ class PoseSender:
         self._incremented, self._poses_sent = False, True
         if not self._sending:
             self._sending = True
-            self._texts["output"] = NOTICE, "sending poses"
+            self.texts.on_sending(now_ns)
 
     def due_texts(self, now_ns: int) -> list[Any]:
         """The STATUSTEXT that is due, if any. Also detects that no pose has been sent for SILENCE_NS."""
         if self._sending and self._sent is not None and now_ns - self._sent.at_ns > SILENCE_NS:
             self._stop("no poses sent")
-        return self._next_text(now_ns)
-
-    def warn(self, text: str) -> None:
-        """Queue a warning about the link."""
-        self._texts["link"] = WARNING, text
-
-    def on_text_not_sent(self) -> None:
-        """The text of `due_texts` could not be sent: queue it again. To be called before a newer text is queued."""
-        if self._offered is not None:
-            kind, severity, text = self._offered
-            self._texts[kind] = severity, text
-            self._offered = self._text_ns = None
+        return self.texts.due(now_ns)
 
     def _stop(self, reason: str) -> None:
         if self._sending:
             self._sending = False
-            self._texts["output"] = CRITICAL, f"STOPPED: {reason}"
+            self.texts.on_stopped(reason)
 
     def _update_reset_counter(self, pose: RelativePose, now_ns: int) -> None:
         last = self._sent
@@ -165,6 +157,8 @@ class PoseSender:
             old = own is None or now_ns - own.arrival_ns > ATTITUDE_NS
             if reason is None and old and self._profile == "ardupilot":
                 reason = RejectReason.NO_ATTITUDE
+        if reason is None and kind != "landing_target" and self.fusion.stopped:
+            reason = RejectReason.REJECTED_BY_AUTOPILOT
         if reason is None and self._sent is not None and pose.stamp_ns <= self._sent.stamp_ns:
             reason = RejectReason.NOT_NEWER
         return reason
@@ -184,13 +178,3 @@ class PoseSender:
             return position_odometry(pose, self.reset_counter, self._limits, own)
         assert own is not None  # PX4 has no VISION_POSITION_ESTIMATE
         return position_vision_estimate(pose, self.reset_counter, own)
-
-    def _next_text(self, now_ns: int) -> list[Any]:
-        if not self._texts or (self._text_ns is not None and 0 <= now_ns - self._text_ns < TEXT_NS):
-            return []
-        self._text_ns = now_ns
-        kind: TextKind = next(kind for kind in get_args(TextKind) if kind in self._texts)
-        severity, text = self._texts.pop(kind)
-        self._offered = kind, severity, text
-        data = f"grd: {text}".encode("ascii", "replace")[:TEXT_BYTES]
-        return [dialect().MAVLink_statustext_message(severity, data)]

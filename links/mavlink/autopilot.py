@@ -27,6 +27,7 @@ from links.mavlink.origin import GlobalOrigin, OriginSender
 from links.mavlink.poses.fusion_monitor import OnRejection
 from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
+from links.mavlink.poses.sent_state import SentState
 from links.mavlink.profiles import PROFILES, ProfileName, RequiredParameter, YawOutput, required_parameters
 from links.mavlink.readers import AutopilotMessage
 from links.mavlink.transport.connection import Udp, parse_connection
@@ -57,6 +58,7 @@ class AutopilotSettings(SourceSettings):
     own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as a component of its vehicle
     own_component_id: int = Field(VISUAL_INERTIAL_ODOMETRY, ge=1, le=255)
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
+    state_file: Path | None = None  # remembers over restarts that a pose was sent; None: a start is the first one
     global_origin: GlobalOrigin | None = None  # sent to an autopilot without an origin
 
     @property
@@ -166,6 +168,7 @@ class Autopilot(Source[AutopilotSettings]):
             host_time.now_ns,
             (settings.topic, SENT_TOPIC),
             self._decoder.independence,
+            SentState(settings.state_file, host_time.now_ns()),
         )
         self._session = session
         try:

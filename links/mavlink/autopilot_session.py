@@ -29,8 +29,9 @@ from flow.link import LinkError, Record
 from links.mavlink.origin import OriginSender
 from links.mavlink.poses.attitude_monitor import AttitudeEvent, AttitudeMonitor
 from links.mavlink.poses.gate import RejectReason
-from links.mavlink.poses.independence import Independence
+from links.mavlink.poses.independence import POSES, Independence
 from links.mavlink.poses.pose_sender import PoseSender
+from links.mavlink.poses.sent_state import SentState
 from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
 from links.mavlink.transport.framing import FrameSplitter, dialect, header, packed
@@ -47,6 +48,7 @@ STANDBY, ACTIVE = 3, 4  # MAV_STATE
 REJECTED = (
     "the autopilot's EKF rejects the position: no poses are sent. Is its compass, its GPS or the servo's mount wrong?"
 )
+EARLIER_POSE = "ODOMETRY"  # of an earlier run
 SENT_RECORDS = 4096  # kept until `sent` is called
 
 
@@ -64,6 +66,7 @@ class AutopilotSession:
         now_ns: Callable[[], int],
         topics: tuple[str, str],
         independence: Independence,
+        sent_state: SentState | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.connection, self.poses, self.origin = connection, poses, origin
@@ -71,10 +74,15 @@ class AutopilotSession:
         self._signer, self._now_ns = signer, now_ns
         self._received_topic, self._sent_topic = topics
         self._independence, self._attitude = independence, AttitudeMonitor()
+        self._sent_state = SentState(None, now_ns()) if sent_state is None else sent_state
         self._splitter = FrameSplitter()
         self._split_connection = 0  # `reconnects` of the splitter's bytes
         self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
         self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
+        if self._sent_state.earlier is not None:
+            earlier_ns, pose = self._sent_state.earlier
+            independence.on_sent(EARLIER_POSE, earlier_ns)
+            self._sent.append(Record(self._sent_topic, now_ns(), earlier_ns, pose))
         self._lock = threading.Lock()  # for numbering, signing and sending
         self._closed = threading.Event()
         self._heartbeat_ns = self._request_ns = 0
@@ -161,7 +169,14 @@ class AutopilotSession:
             return None
         signing = None if self._signer is None else self._signer.status
         own = self.origin.status or (REJECTED if self.poses.fusion.stopped else None)
-        return self.connection.status or self._silence() or self._timesync.status or own or signing
+        return (
+            self.connection.status
+            or self._silence()
+            or self._timesync.status
+            or own
+            or signing
+            or self._sent_state.status
+        )
 
     def _silence(self) -> str | None:
         if self._now_ns() - self._target_ns < SILENT_S * SECOND_NS:
@@ -249,8 +264,9 @@ class AutopilotSession:
         while not self._closed.wait(WAKE_S):
             with self._lock:
                 self._tick(self._now_ns())
+            self._sent_state.write()  # without the lock: the disk may be slow
             if self._signer is not None:
-                self._signer.write_timestamp()  # without the lock: the disk may be slow
+                self._signer.write_timestamp()
 
     def _send_periodic(self, now_ns: int) -> None:
         """Send HEARTBEAT and TIMESYNC if they are due. The lock is held."""
@@ -293,5 +309,7 @@ class AutopilotSession:
             return False
         self.counts[f"sent: {kind}"] += 1
         self._independence.on_sent(kind, now_ns)
+        if kind in POSES:
+            self._sent_state.on_sent(frame, now_ns)
         self._sent.append(Record(self._sent_topic, now_ns, now_ns, frame))
         return True

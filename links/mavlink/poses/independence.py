@@ -31,7 +31,7 @@ class Independence:
         self._reboots = 0
 
     def on_sent(self, kind: str, sent_ns: int) -> None:
-        """A message of this type was sent; call in order of time."""
+        """A message of this type was sent: by this session in order of time, after those of earlier ones."""
         if kind in POSES:
             self._pending.append(sent_ns)
 
@@ -50,7 +50,7 @@ class Independence:
         A pose sent shortly before the boot may still have been under way.
         """
         while self._pending and self._pending[0] < arrival_ns:
-            self._sent_ns = self._pending.popleft()
+            self._sent_ns = max(self._pending.popleft(), self._sent_ns or 0)
         if self._sent_ns is None:
             return True
         return self._booted_ns is not None and self._sent_ns < self._booted_ns - LATE_NS

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from links.mavlink.poses.fusion_monitor import FusionMonitor, OnRejection
-from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason, yaw_reason
+from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason
 from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
-from links.mavlink.poses.position_gate import position_reason
+from links.mavlink.poses.position_gate import gate_reason
 from links.mavlink.poses.position_messages import OwnAttitude, position_odometry, position_vision_estimate
 from links.mavlink.poses.status_texts import StatusTexts
 from links.mavlink.profiles import ProfileName, YawOutput
@@ -68,6 +68,8 @@ class PoseSender:
         self._profile: ProfileName = profile
         self._attitude: OwnAttitude | None = None
         self._poses_sent = self._yaw_reset = False  # since the autopilot's boot
+        self._odom_yaw_rad: float | None = None  # of the newest sent position
+        self._other_boot_rad: float | None = None  # yaw of its axes before its newest boot: not valid any more
         self._sent: SentPose | None = None
         self._incremented = False  # the reset counter, since `_sent`
         self._sending = False
@@ -104,8 +106,9 @@ class PoseSender:
         self._yaw_reset = self._yaw_reset or self._poses_sent
 
     def on_boot(self) -> None:
-        """The autopilot has booted."""
+        """The autopilot has booted: its axes are others, and their yaw has to be learnt again before a pose is sent."""
         self._poses_sent = self._yaw_reset = False
+        self._other_boot_rad, self._odom_yaw_rad = self._odom_yaw_rad, None
         self.fusion.on_boot()
 
     def on_estimator_status(self, message: Any, now_ns: int) -> None:
@@ -120,7 +123,7 @@ class PoseSender:
     def on_sent(self, pose: RelativePose, now_ns: int) -> None:
         """A message of this pose was sent."""
         self._sent = SentPose(now_ns, pose.stamp_ns, pose.resets, pose.track_id)
-        self._incremented, self._poses_sent = False, True
+        self._incremented, self._poses_sent, self._odom_yaw_rad = False, True, pose.odom_yaw_rad
         if not self._sending:
             self._sending = True
             self.texts.on_sending(now_ns)
@@ -145,23 +148,26 @@ class PoseSender:
             self._incremented = True
 
     def _reason(self, kind: PoseMessage, pose: RelativePose, now_ns: int) -> RejectReason | None:
-        if kind == "landing_target" or self._yaw == "cameras":
+        if kind == "landing_target":
             reason = reject_reason(pose, now_ns, self._limits)
-            if reason is None and kind != "landing_target":
-                reason = yaw_reason(pose, self._limits)
         else:
-            reason = position_reason(pose, now_ns, self._limits)
-            if reason is None and self._yaw_reset:
-                reason = RejectReason.ODOM_YAW_RESET
-            own = self._attitude
-            old = own is None or now_ns - own.arrival_ns > ATTITUDE_NS
-            if reason is None and old and self._profile == "ardupilot":
-                reason = RejectReason.NO_ATTITUDE
+            reason = gate_reason(pose, now_ns, self._limits, self._yaw)
+            if reason is None and self._yaw == "none":
+                reason = self._axes_reason(pose, now_ns)
         if reason is None and kind != "landing_target" and self.fusion.stopped:
             reason = RejectReason.REJECTED_BY_AUTOPILOT
         if reason is None and self._sent is not None and pose.stamp_ns <= self._sent.stamp_ns:
             reason = RejectReason.NOT_NEWER
         return reason
+
+    def _axes_reason(self, pose: RelativePose, now_ns: int) -> RejectReason | None:
+        """Why the autopilot's axes are not those that were learnt. The first ATTITUDE after a silence shows a boot."""
+        own = self._attitude
+        if own is None or now_ns - own.arrival_ns > ATTITUDE_NS:
+            return RejectReason.NO_ATTITUDE
+        if self._yaw_reset:
+            return RejectReason.ODOM_YAW_RESET
+        return RejectReason.ODOM_YAW if pose.odom_yaw_rad == self._other_boot_rad else None
 
     def _message(self, kind: PoseMessage, pose: RelativePose) -> Any:
         if kind != "landing_target" and self._yaw == "none":

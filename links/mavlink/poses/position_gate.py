@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from links.mavlink.poses.gate import PoseLimits, RejectReason, age_reason
+from links.mavlink.poses.gate import PoseLimits, RejectReason, age_reason, reject_reason, yaw_reason
+from links.mavlink.profiles import YawOutput
 from stages.geometry.frames import rotation_z
 from stages.messages import PoseEstimate, PoseState, RelativePose
 
@@ -63,6 +64,13 @@ def position_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> Reje
     if math.degrees(sigma_rad) > limits.odom_yaw_sigma_deg:
         return RejectReason.ODOM_YAW_SIGMA
     return age_reason(pose.stamp_ns, now_ns, limits)
+
+
+def gate_reason(pose: RelativePose, now_ns: int, limits: PoseLimits, yaw: YawOutput) -> RejectReason | None:
+    """Why ODOMETRY of the pose must not be sent now, by what it contains; None: it may be sent."""
+    if yaw == "none":
+        return position_reason(pose, now_ns, limits)
+    return reject_reason(pose, now_ns, limits) or yaw_reason(pose, limits)
 
 
 def odom_position(pose: RelativePose) -> OdomPosition:

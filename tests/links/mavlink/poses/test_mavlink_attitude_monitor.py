@@ -67,4 +67,17 @@ def test_after_a_yaw_reset_no_position_is_sent_until_the_autopilot_boots():
     assert sender.messages(good_pose(HOST0 + 20 * MS), HOST0 + 20 * MS) == []
     assert sender.rejected == {RejectReason.ODOM_YAW_RESET: 1}
     sender.on_boot()
-    assert len(sender.messages(good_pose(HOST0 + 40 * MS), HOST0 + 40 * MS)) == 1
+    assert len(sender.messages(good_pose(HOST0 + 40 * MS, odom_yaw_rad=0.5), HOST0 + 40 * MS)) == 1
+
+
+def test_after_a_boot_no_position_is_sent_in_the_axes_of_before():
+    sender = PoseSender(("odometry",), PoseLimits(), yaw="none")
+    sender.on_attitude(OwnAttitude(0.0, 0.0, 1.0, HOST0))
+    assert len(sender.messages(good_pose(), HOST0)) == 1
+    sender.on_sent(good_pose(), HOST0)
+    sender.on_boot()
+    same = good_pose(HOST0 + 20 * MS)
+    assert sender.messages(same, same.stamp_ns) == []
+    assert sender.rejected == {RejectReason.ODOM_YAW: 1}
+    learnt_again = good_pose(HOST0 + 40 * MS, odom_yaw_rad=0.01)
+    assert len(sender.messages(learnt_again, learnt_again.stamp_ns)) == 1

@@ -55,7 +55,7 @@ def test_ardupilot_receives_the_position_in_its_axes_and_its_own_attitude():
 
 
 def test_px4_receives_the_position_as_ned_and_no_rotation():
-    (message,) = sent(sender(profile="px4", attitude=False), position())
+    (message,) = sent(sender(profile="px4"), position())
     assert (message.frame_id, message.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
     np.testing.assert_allclose([message.x, message.y, message.z], [2, 101, -10], atol=1e-4)
     assert all(math.isnan(v) for v in message.q)
@@ -71,8 +71,10 @@ def test_vision_position_estimate_has_the_same_content():
 
 
 @pytest.mark.parametrize(("attitude", "later_ms"), [(False, 0), (True, 1020)])
-def test_without_a_recent_attitude_ardupilot_receives_nothing(attitude: bool, later_ms: int):
-    pose_sender, now_ns = sender(attitude=attitude), HOST0 + later_ms * MS
+@pytest.mark.parametrize("profile", ["ardupilot", "px4"])
+def test_without_a_recent_attitude_nothing_is_sent(profile: ProfileName, attitude: bool, later_ms: int):
+    """It may have booted: its axes may be others."""
+    pose_sender, now_ns = sender(profile=profile, attitude=attitude), HOST0 + later_ms * MS
     assert sent(pose_sender, position(now_ns), now_ns) == []
     assert pose_sender.rejected == {RejectReason.NO_ATTITUDE: 1}
 

@@ -23,7 +23,7 @@ from links.clock import host_time
 from links.clock.device_clock import DeviceClock
 from links.mavlink.autopilot_session import AutopilotSession
 from links.mavlink.frame_decoder import FrameDecoder
-from links.mavlink.origin import GlobalOrigin, OriginSender
+from links.mavlink.origin import GlobalOrigin, OriginSender, OriginState
 from links.mavlink.poses.fusion_monitor import OnRejection
 from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
@@ -175,6 +175,11 @@ class Autopilot(Source[AutopilotSettings]):
             yield session.records()
         finally:
             session.close()
+
+    @property
+    def origin(self) -> OriginState | None:
+        """Progress of the global origin; None before the link was open."""
+        return None if self._session is None else self._session.origin.state
 
     @property
     def port(self) -> int | None:

@@ -90,6 +90,16 @@ class RequiredParameter:
         return f"{self.at_least:g} to {self.at_most:g}"
 
 
+ARDUPILOT_STREAMS = {
+    "ATTITUDE": "SRn_EXTRA1",
+    "LOCAL_POSITION_NED": "SRn_POSITION",
+    "RAW_IMU": "SRn_RAW_SENS",
+    "EKF_STATUS_REPORT": "SRn_EXTRA3",
+    "ODOMETRY": "in no stream: MAV_CMD_SET_MESSAGE_INTERVAL",
+}
+"""Stream rate that each message depends on; n is the number of the port. Source: ArduCopter GCS_Mavlink.cpp."""
+
+
 @dataclass(frozen=True, slots=True)
 class Profile:
     """What one autopilot supports."""

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as m
 from flow.link import LinkError, Record
 from links.mavlink import Autopilot
 from links.mavlink.checks import autopilot_checks, parameter_check
+from links.mavlink.origin import OriginState
 from links.mavlink.parameters import ParameterValues, ask_parameters
 from links.mavlink.profiles import required_parameters
 from links.mavlink.transport.framing import packed
@@ -198,3 +199,29 @@ def test_the_clock_drift_is_reported_if_known():
     drifting = dataclasses.replace(status(), clock_drift_ppm=-18.04, clock_drift_sigma_ppm=1.4)
     assert "drift -18.0 +- 1.4 ppm" in check(frames(), newest=drifting)["it clock"].sentence
     assert "drift" not in check(frames())["it clock"].sentence
+
+
+@pytest.mark.parametrize(
+    ("state", "level"),
+    [
+        (OriginState.CONFIRMED, Level.OK),
+        (OriginState.PRESENT, Level.OK),
+        (OriginState.UNSUPPORTED, Level.WARNING),
+        (OriginState.SENT, Level.FAIL),
+        (None, Level.FAIL),
+    ],
+)
+def test_a_configured_origin_must_be_confirmed(monkeypatch, state, level):
+    monkeypatch.setattr(Autopilot, "origin", state)
+    link = Autopilot(global_origin={"latitude_deg": 1, "longitude_deg": 2, "altitude_m": 3})
+    found = {v.name: v for v in autopilot_checks(observe(link, frames()), [STATUS], ESTIMATORS)}
+    assert found["it origin"].level is level
+
+
+@pytest.mark.parametrize(("profile", "hint"), [("ardupilot", "ATTITUDE: SRn_EXTRA1"), ("px4", "MAV_n_MODE 2")])
+def test_a_missing_message_names_the_stream_that_it_comes_in(profile, hint):
+    link = Autopilot(profile=profile)
+    autopilot = 3 if profile == "ardupilot" else 12
+    records = frames(attitude_hz=0, autopilot=autopilot)
+    found = {v.name: v for v in autopilot_checks(observe(link, records), [STATUS], ESTIMATORS)}
+    assert hint in found["it rates"].sentence

@@ -68,7 +68,8 @@ class Source(Link[SourceS]):
     """A link that brings records in.
 
     Live, `listen` opens the hardware and iterates over records; in replay they come from a recording by `topic`.
-    Both go through the same `decode`, whose annotation declares the outputs.
+    Both go through the same `decode`, whose annotation declares the outputs. In replay a source may also read what it
+    sent itself (`replay_topics`): live it knows that without a record.
     """
 
     silent_after_s: ClassVar[float | None] = None  # a source that has sent records and then none for so long has failed
@@ -77,6 +78,11 @@ class Source(Link[SourceS]):
     def topic(self) -> str:
         """Topic of its records, `settings.topic`."""
         return self.settings.topic
+
+    @property
+    def replay_topics(self) -> tuple[str, ...]:
+        """Topics of the records that `decode` takes in replay."""
+        return (self.topic,)
 
     def decode(self, record: Record) -> Any:
         """Messages of one record: None, one message, or an iterable of messages."""

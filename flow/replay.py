@@ -122,7 +122,8 @@ class Replay:
         for name, spec in graph.nodes.items():
             node = self.nodes.get(name)
             if isinstance(node, Source):
-                self._topics[node.topic] = self._port(name, "decode", 0, node.decode)
+                port = self._port(name, "decode", 0, node.decode)
+                self._topics |= dict.fromkeys(node.replay_topics, port)
             if isinstance(node, Stage):
                 self._finishers.append((name, self._port(name, "finish", 0, lambda _, node=node: node.finish())))
             elif node is None and issubclass(spec.cls, Stage):

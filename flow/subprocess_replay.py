@@ -144,7 +144,7 @@ class _Partition:
     def __init__(self, graph: Graph, wanted: Sequence[str], digest: bool, strict: bool) -> None:
         self.graph = graph
         sources = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Source)]
-        self.topics = [source.topic for source in sources if isinstance(source, Source)]
+        self.topics = [topic for source in sources if isinstance(source, Source) for topic in source.replay_topics]
         self._options = wanted, digest, strict
         self._batch: list[bytes] = []
         self._batch_bytes = 0

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from links.dynamixel.wire import Health
-from links.mavlink.gate import RejectReason as GateRejectReason
+from links.mavlink.poses.gate import RejectReason as GateRejectReason
 from links.recording import Recorder
 from links.recording.writer import CLOSE_TIMEOUT_S
 from links.velodyne.position import Pps
@@ -86,7 +86,14 @@ TEXTS = {  # source file and its texts
         "closed: blocked",
         "sent late",
     ],
-    "links/mavlink/pose_sender.py": ["sending poses", "STOPPED: ", "no poses sent"],
+    "links/mavlink/poses/status_texts.py": ["sending poses", "STOPPED: "],
+    "links/mavlink/poses/pose_sender.py": ["no poses sent"],
+    "links/mavlink/poses/fusion_monitor.py": ["autopilot rejects the position ("],
+    "links/mavlink/poses/sent_state.py": [
+        "A restart would not know of sent poses",
+        "delete it after a reboot of the autopilot",
+    ],
+    "links/mavlink/origin.py": ["the autopilot does not confirm the origin"],
     "links/mavlink/transport/stream_connection.py": [
         "is lost: is it plugged in and powered?",
         "Reopening",

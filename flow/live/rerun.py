@@ -77,7 +77,7 @@ class Rerun:
             elif issubclass(spec.cls, Source):
                 source = spec.build()
                 assert isinstance(source, Source)
-                self._sources[source.topic] = spec.name, source
+                self._sources |= dict.fromkeys(source.replay_topics, (spec.name, source))
         if unknown := sorted(orders.keys() - self._stages.keys()):
             raise LinkError(f"the live run had stages that this graph does not have: {', '.join(unknown)}")
         for edge in graph.edges:

@@ -42,6 +42,8 @@ class DeviceClock:
         self.drift = ClockDrift()
         self.restarts = 0
         """How often the device's clock was reset."""
+        self.reboots = 0
+        """How often it ran backwards in a reset: the device booted. In other resets it may have been set."""
         self.round_trips = 0
         """Number of replies used."""
 
@@ -73,6 +75,7 @@ class DeviceClock:
             if self._disagreed < DISAGREEMENTS or self._was_buffered(device_ns, late_ns, arrival_ns):
                 return None
             self.restarts += 1
+            self.reboots += device_ns < self._newest_ns
             self._reset(arrival_ns - device_ns, arrival_ns)
             late_ns = 0
         self._disagreed = 0

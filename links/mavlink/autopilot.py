@@ -24,10 +24,12 @@ from links.clock import host_time
 from links.clock.device_clock import DeviceClock
 from links.mavlink.autopilot_session import AutopilotSession
 from links.mavlink.frame_decoder import FrameDecoder
-from links.mavlink.gate import PoseLimits
-from links.mavlink.origin import GlobalOrigin, OriginSender
-from links.mavlink.pose_sender import PoseMessage, PoseSender
-from links.mavlink.profiles import PROFILES, ProfileName
+from links.mavlink.origin import GlobalOrigin, OriginSender, OriginState
+from links.mavlink.poses.fusion_monitor import OnRejection
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
+from links.mavlink.poses.sent_state import SentState
+from links.mavlink.profiles import PROFILES, ProfileName, RequiredParameter, YawOutput, required_parameters
 from links.mavlink.readers import AutopilotMessage
 from links.mavlink.transport.connection import Udp, parse_connection
 from links.mavlink.transport.signing import Signer
@@ -50,11 +52,20 @@ class AutopilotSettings(SourceSettings):
     sender: IPv4Address | None = None  # the autopilot's address, required when udpin listens beyond loopback
     profile: ProfileName = "ardupilot"
     send: tuple[PoseMessage, ...] = ("odometry",)  # messages per pose
+    yaw: YawOutput = "none"  # none: positions in the autopilot's axes; cameras: poses in `map`, EK3_SRCn_YAW 6
+    source_set: int = Field(2, ge=1, le=3)  # ArduPilot: EK3_SRCn_* that are grd's; set 1 flies without it
+    on_rejection: OnRejection = "stop"  # when the autopilot's EKF rejects the pose: stop, reset or report
     limits: PoseLimits = PoseLimits()
     own_system_id: int | None = Field(None, ge=1, le=255)  # None: the autopilot's, as a component of its vehicle
     own_component_id: int = Field(VISUAL_INERTIAL_ODOMETRY, ge=1, le=255)
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
+    state_file: Path | None = None  # remembers over restarts that a pose was sent; None: a start is the first one
     global_origin: GlobalOrigin | None = None  # sent to an autopilot without an origin
+
+    @property
+    def required_parameters(self) -> tuple[RequiredParameter, ...]:
+        """The parameters that the autopilot needs."""
+        return required_parameters(self.profile, self.yaw, self.source_set)
 
     @property
     def own_id(self) -> tuple[int, int]:
@@ -104,8 +115,16 @@ class Autopilot(Source[AutopilotSettings]):
         self._not_connected: int = 0
 
     def decode(self, record: Record) -> AutopilotMessage | None:
-        """The message of one frame; None for an unused or rejected frame (see `counters`)."""
+        """The message of one frame; None for an unused or rejected frame (see `counters`), and for a sent one."""
+        if record.topic == SENT_TOPIC:
+            self._decoder.sent(record)
+            return None
         return self._decoder.decode(record)
+
+    @property
+    def replay_topics(self) -> tuple[str, ...]:
+        """See Source: also what was sent, which decides whether the autopilot's estimate is independent."""
+        return self.settings.topic, SENT_TOPIC
 
     def on_pose(self, pose: RelativePose) -> None:
         """Send a pose if the gate accepts it. Nothing is sent before the link is open, or in replay."""
@@ -137,17 +156,31 @@ class Autopilot(Source[AutopilotSettings]):
             connection,
             target,
             settings.own_id,
-            PoseSender(settings.send, settings.limits, reset_counter=host_time.now_ns() // 1_000_000_000),
+            PoseSender(
+                settings.send,
+                settings.limits,
+                reset_counter=host_time.now_ns() // 1_000_000_000,
+                yaw=settings.yaw,
+                profile=settings.profile,
+                on_rejection=settings.on_rejection,
+            ),
             OriginSender(settings.global_origin, target),
             self._signer,
             host_time.now_ns,
             (settings.topic, SENT_TOPIC),
+            self._decoder.independence,
+            SentState(settings.state_file, host_time.now_ns()),
         )
         self._session = session
         try:
             yield session.records()
         finally:
             session.close()
+
+    @property
+    def origin(self) -> OriginState | None:
+        """Progress of the global origin; None before the link was open."""
+        return None if self._session is None else self._session.origin.state
 
     @property
     def port(self) -> int | None:

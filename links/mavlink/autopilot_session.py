@@ -26,9 +26,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from flow.link import LinkError, Record
-from links.mavlink.gate import RejectReason
 from links.mavlink.origin import OriginSender
-from links.mavlink.pose_sender import PoseSender
+from links.mavlink.poses.attitude_monitor import AttitudeEvent, AttitudeMonitor
+from links.mavlink.poses.gate import RejectReason
+from links.mavlink.poses.independence import POSES, Independence
+from links.mavlink.poses.pose_sender import PoseSender
+from links.mavlink.poses.sent_state import SentState
 from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
 from links.mavlink.transport.framing import FrameSplitter, dialect, header, packed
@@ -42,6 +45,10 @@ QUIET_NS = 1_500_000_000  # one and a half heartbeats: no poses are sent
 ONBOARD_CONTROLLER, NO_AUTOPILOT = 18, 8  # MAV_TYPE, MAV_AUTOPILOT_INVALID
 NO_CONNECTION = -1
 STANDBY, ACTIVE = 3, 4  # MAV_STATE
+REJECTED = (
+    "the autopilot's EKF rejects the position: no poses are sent. Is its compass, its GPS or the servo's mount wrong?"
+)
+EARLIER_POSE = "ODOMETRY"  # of an earlier run
 SENT_RECORDS = 4096  # kept until `sent` is called
 
 
@@ -58,16 +65,24 @@ class AutopilotSession:
         signer: Signer | None,
         now_ns: Callable[[], int],
         topics: tuple[str, str],
+        independence: Independence,
+        sent_state: SentState | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.connection, self.poses, self.origin = connection, poses, origin
         self._target, self._own = target, own
         self._signer, self._now_ns = signer, now_ns
         self._received_topic, self._sent_topic = topics
+        self._independence, self._attitude = independence, AttitudeMonitor()
+        self._sent_state = SentState(None, now_ns()) if sent_state is None else sent_state
         self._splitter = FrameSplitter()
         self._split_connection = 0  # `reconnects` of the splitter's bytes
         self._mav = dialect().MAVLink(None, srcSystem=own[0], srcComponent=own[1])
         self._sent: deque[Record] = deque(maxlen=SENT_RECORDS)
+        if self._sent_state.earlier is not None:
+            earlier_ns, pose = self._sent_state.earlier
+            independence.on_sent(EARLIER_POSE, earlier_ns)
+            self._sent.append(Record(self._sent_topic, now_ns(), earlier_ns, pose))
         self._lock = threading.Lock()  # for numbering, signing and sending
         self._closed = threading.Event()
         self._heartbeat_ns = self._request_ns = 0
@@ -125,6 +140,10 @@ class AutopilotSession:
         with self._lock:
             rejected = {f"pose rejected: {reason.value}": count for reason, count in self.poses.rejected.items()}
             counts = dict(self.counts)
+            if self.poses.fusion.rejections:
+                counts["pose rejected by the autopilot"] = self.poses.fusion.rejections
+            if self.origin.sent_times:
+                counts["origin sent"] = self.origin.sent_times
             round_trip_ns = self._timesync.newest_ns
         return {
             **counts,
@@ -149,7 +168,15 @@ class AutopilotSession:
         if self.closed:
             return None
         signing = None if self._signer is None else self._signer.status
-        return self.connection.status or self._silence() or self._timesync.status or signing
+        own = self.origin.status or (REJECTED if self.poses.fusion.stopped else None)
+        return (
+            self.connection.status
+            or self._silence()
+            or self._timesync.status
+            or own
+            or signing
+            or self._sent_state.status
+        )
 
     def _silence(self) -> str | None:
         if self._now_ns() - self._target_ns < SILENT_S * SECOND_NS:
@@ -191,12 +218,26 @@ class AutopilotSession:
                 self._timesync.on_frame()
                 self._target_ns, self._target_connection = self._now_ns(), self.connection.reconnects
                 self.origin.on_message(message)
+                self.poses.on_estimator_status(message, arrival_ns)
+                if message.get_type() == "ATTITUDE":
+                    self._on_attitude(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
                     if message.tc1 == 0:
                         self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
                     elif self._timesync.on_reply(message.ts1, arrival_ns, self.poses.sending):
                         return message.ts1
         return arrival_ns
+
+    def _on_attitude(self, message: Any, arrival_ns: int) -> None:
+        """The autopilot's attitude, and what it shows. The lock is held."""
+        event = self._attitude.add(message, arrival_ns)
+        if event is AttitudeEvent.BOOTED:
+            self.poses.on_boot()
+            self.origin.restart()
+        elif event is AttitudeEvent.YAW_RESET:
+            self.poses.on_yaw_reset()
+        if self._attitude.newest is not None:
+            self.poses.on_attitude(self._attitude.newest)
 
     def _accept_for_heartbeats(self, source: tuple[str, int]) -> None:
         """Send heartbeats, but no poses, to an autopilot that signs with an old time until it receives our time.
@@ -223,8 +264,9 @@ class AutopilotSession:
         while not self._closed.wait(WAKE_S):
             with self._lock:
                 self._tick(self._now_ns())
+            self._sent_state.write()  # without the lock: the disk may be slow
             if self._signer is not None:
-                self._signer.write_timestamp()  # without the lock: the disk may be slow
+                self._signer.write_timestamp()
 
     def _send_periodic(self, now_ns: int) -> None:
         """Send HEARTBEAT and TIMESYNC if they are due. The lock is held."""
@@ -237,7 +279,7 @@ class AutopilotSession:
             if self._send(dialect().MAVLink_timesync_message(0, request_ns)):
                 self._request_ns = now_ns
                 if self._timesync.on_request(request_ns):
-                    self.poses.warn("no TIMESYNC replies: latency unknown")
+                    self.poses.texts.warn("no TIMESYNC replies: latency unknown")
         if self.connection.left_late != self._left_late:
             self._left_late = self.connection.left_late
             self._timesync.on_late_frame(now_ns)
@@ -253,7 +295,7 @@ class AutopilotSession:
         """Send the text that is due. The lock is held."""
         for message in self.poses.due_texts(now_ns):
             if not self._send(message):
-                self.poses.on_text_not_sent()
+                self.poses.texts.on_not_sent()
 
     def _send(self, message: Any) -> bool:
         """Pack, sign and send one message. The lock is held."""
@@ -266,5 +308,8 @@ class AutopilotSession:
             self.counts[f"not sent: {kind}"] += 1
             return False
         self.counts[f"sent: {kind}"] += 1
+        self._independence.on_sent(kind, now_ns)
+        if kind in POSES:
+            self._sent_state.on_sent(frame, now_ns)
         self._sent.append(Record(self._sent_topic, now_ns, now_ns, frame))
         return True

@@ -15,8 +15,9 @@ from flow.graph import Graph
 from flow.link import LinkError, Record, Source
 from links.mavlink.autopilot import Autopilot
 from links.mavlink.frame_decoder import FOREIGN_TIMESYNC
+from links.mavlink.origin import OriginState
 from links.mavlink.parameters import ParameterValues, ask_parameters
-from links.mavlink.profiles import PROFILES, ProfileName, findings
+from links.mavlink.profiles import ARDUPILOT_STREAMS, ProfileName, RequiredParameter, findings
 from links.mavlink.transport.framing import header, parse_frame
 from links.preflight.check_result import CheckResult, fail, ok, warning
 from links.preflight.link_checks import LinkChecks, declares
@@ -33,7 +34,6 @@ MIN_HZ, GOOD_HZ = 4.0, 10.0
 MAX_GAP_S = 1e-9 * BRIDGED_NS
 WARN_RATIO = 0.5  # innovation test ratio; above 1 the EKF rejects the measurement
 LINK_HINT = "is the radio out of range, or too slow for the requested messages?"
-RATE_HINT = "increase its rate (SRn_EXTRA1, SRn_POSITION of that port; PX4: its mavlink mode)"
 
 
 class AutopilotObservation(Observation):
@@ -112,8 +112,10 @@ def autopilot_checks(
     yield _heartbeat(source, link, observation, statuses[-1])
     yield _losses(source)
     yield _clock(source, statuses[-1])
-    yield _rates(source, observation)
-    yield _estimate(source.name, estimators)
+    yield _rates(source, link, observation)
+    yield _estimate(source.name, link, estimators)
+    if link.settings.global_origin is not None and source.live:
+        yield _origin(source.name, link.origin)
 
 
 def _silent(source: ObservedSource, observation: AutopilotObservation, who: str) -> CheckResult:
@@ -199,7 +201,7 @@ def _clock(source: ObservedSource, status: AutopilotStatus) -> CheckResult:
     )
 
 
-def _rates(source: ObservedSource, observation: AutopilotObservation) -> CheckResult:
+def _rates(source: ObservedSource, link: Autopilot, observation: AutopilotObservation) -> CheckResult:
     """Rates of the messages that grd needs, and their longest gaps."""
     name = f"{source.name} rates"
 
@@ -219,26 +221,46 @@ def _rates(source: ObservedSource, observation: AutopilotObservation) -> CheckRe
     attitude, odometry, position = (hz(kind) for kind in kinds)
     text = ", ".join(f"{kind} {hz(kind):.0f} Hz" for kind in kinds)
     if max(attitude, odometry) < MIN_HZ:
-        return fail(name, f"{text}: attitude is needed at {GOOD_HZ:.0f} Hz or more: {RATE_HINT}")
+        hint = rate_hint(link.settings.profile, "ATTITUDE")
+        return fail(name, f"{text}: attitude is needed at {GOOD_HZ:.0f} Hz or more: {hint}")
     attitude_gap = gap("attitude", "ATTITUDE", "ODOMETRY")
     if attitude_gap is not None:
         return fail(name, attitude_gap) if source.live else warning(name, attitude_gap)
+    hint = rate_hint(link.settings.profile, *kinds)
     if max(odometry, position) < MIN_HZ:
         return warning(
-            name, f"{text}: without odometry there is no pose while the LiDAR does not measure the drone: {RATE_HINT}"
+            name, f"{text}: without odometry there is no pose while the LiDAR does not measure the drone: {hint}"
         )
     position_gap = gap("odometry or position", "ODOMETRY", "LOCAL_POSITION_NED")
     if position_gap is not None:
         return warning(name, position_gap)
     slow = max(attitude, odometry) < GOOD_HZ or max(odometry, position) < GOOD_HZ
-    return warning(name, f"{text}: low rate; {RATE_HINT}") if slow else ok(name, text)
+    return warning(name, f"{text}: low rate; {hint}") if slow else ok(name, text)
 
 
-def _estimate(name: str, estimators: Sequence[AutopilotEstimator]) -> CheckResult:
+def rate_hint(profile: ProfileName, *kinds: str) -> str:
+    """How to increase the rate of messages."""
+    if profile == "px4":
+        return "increase its rate (MAV_n_MODE 2, onboard)"
+    return f"increase its rate ({', '.join(f'{kind}: {ARDUPILOT_STREAMS[kind]}' for kind in kinds)}; n: its port)"
+
+
+def _origin(name: str, state: OriginState | None) -> CheckResult:
+    """Whether the autopilot has a global origin."""
+    name = f"{name} origin"
+    if state in (OriginState.CONFIRMED, OriginState.PRESENT):
+        return ok(name, state.value)
+    if state is OriginState.UNSUPPORTED:
+        return warning(name, f"{state.value}: set it by the ground station")
+    return fail(name, f"{'not requested' if state is None else state.value}: without it the EKF uses no position")
+
+
+def _estimate(name: str, link: Autopilot, estimators: Sequence[AutopilotEstimator]) -> CheckResult:
     """Newest status of the EKF."""
     name = f"{name} estimate"
     if not estimators:
-        return warning(name, "no EKF status (EKF_STATUS_REPORT, ESTIMATOR_STATUS): " + RATE_HINT)
+        hint = rate_hint(link.settings.profile, "EKF_STATUS_REPORT")
+        return warning(name, f"no EKF status (EKF_STATUS_REPORT, ESTIMATOR_STATUS): {hint}")
     newest = estimators[-1]
     ratios = {
         "velocity": newest.velocity_ratio,
@@ -261,19 +283,19 @@ def _estimate(name: str, estimators: Sequence[AutopilotEstimator]) -> CheckResul
 
 def _parameters(name: str, link: Autopilot) -> CheckResult:
     try:
-        return parameter_check(name, link.settings.profile, ask_parameters(link))
+        return parameter_check(name, link.settings.required_parameters, ask_parameters(link))
     except LinkError as error:
         return fail(f"{name} parameters", str(error))
 
 
-def parameter_check(name: str, profile: ProfileName, received: ParameterValues) -> CheckResult:
+def parameter_check(name: str, required: Sequence[RequiredParameter], received: ParameterValues) -> CheckResult:
     """One result that names every wrong or missing parameter."""
     name = f"{name} parameters"
     if not received.frames:
         return fail(name, "the autopilot does not reply")
     if not received.values:
         return fail(name, "none was received: does it receive our frames, and may this link read parameters?")
-    wrong = findings(PROFILES[profile], received.values)
+    wrong = findings(required, received.values)
     if wrong:
         return fail(name, "; ".join(wrong))
-    return ok(name, f"all {len(PROFILES[profile].required)} as required for {profile}")
+    return ok(name, f"all {len(required)} as required")

@@ -3,24 +3,30 @@
 Each frame is decoded on its own, so a damaged one does not affect the next. Damaged, foreign and invalid frames are
 counted and skipped; no received bytes raise an exception.
 
+Each position, velocity and attitude is marked with whether it is independent of the poses that we sent
+(`independence.py`). In replay the sent frames are on a topic of their own.
+
 Source: https://mavlink.io/en/messages/common.html; the handling of late, lost and repeated frames is ours.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from typing import Any
 
 from flow.link import Record
 from links.clock.device_clock import DeviceClock
+from links.mavlink.poses.independence import Independence
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
 from links.mavlink.transport.framing import SEQUENCE, header, known, parse_frame, timesync_target
-from stages.messages import AutopilotStatus
+from stages.messages import AutopilotStatus, DroneAttitude, DroneLocalPosition, DroneOdometry
 
 HALF_MS_NS = 500_000  # time_boot_ms is truncated, on average half a millisecond early
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 CRITICAL = 5  # MAV_STATE_CRITICAL; above: emergency, poweroff, termination
 FOREIGN_TIMESYNC = "TIMESYNC for another component"  # reason in `rejected`
+ESTIMATES = (DroneAttitude, DroneLocalPosition, DroneOdometry)
 LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost frames
 
 
@@ -29,6 +35,7 @@ class FrameDecoder:
 
     def __init__(self, sender: tuple[int, int], own: tuple[int, int], clock: DeviceClock) -> None:
         self.clock = clock
+        self.independence = Independence()
         self.decoded = self.unused = self.lost = 0
         self.rejected: Counter[str] = Counter()
         self._sender, self._own = sender, own
@@ -73,6 +80,8 @@ class FrameDecoder:
             return self._refuse("not newer than the last one")
         try:
             message = reader(frame, stamp_ns)
+            if isinstance(message, ESTIMATES):
+                message = dataclasses.replace(message, independent=self._independent(record.arrival_ns))
         except ValueError as error:
             return self._refuse(str(error))
         self._last_ns[kind] = stamp_ns
@@ -85,6 +94,18 @@ class FrameDecoder:
         device_ns = frame.time_boot_ms * 1_000_000 if in_ms else frame.time_usec * 1_000
         stamp_ns = self.clock.read(device_ns, arrival_ns)
         return stamp_ns if stamp_ns is None else min(stamp_ns + HALF_MS_NS * in_ms, arrival_ns)
+
+    def sent(self, record: Record) -> None:
+        """A frame that we sent, from a recording."""
+        try:
+            self.independence.on_sent(parse_frame(record.data).get_type(), record.stamp_ns)
+        except ValueError:
+            self._refuse("damaged")
+
+    def _independent(self, arrival_ns: int) -> bool:
+        if self.clock.offset_ns is not None:
+            self.independence.on_clock(self.clock.offset_ns, self.clock.reboots)
+        return self.independence.at(arrival_ns)
 
     def _in_sequence(self, number: int) -> bool:
         if self._sequence is not None:

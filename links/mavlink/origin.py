@@ -3,7 +3,8 @@
 An EKF without GPS needs an origin before it fuses a position. The autopilot is asked for its origin first
 (GPS_GLOBAL_ORIGIN). Ours is sent only after three requests that it acknowledged without reporting an origin; a second
 acknowledgement of one request is for another requester. An autopilot that does not support the request gets no
-origin, because its state is unknown.
+origin, because its state is unknown. An EKF that is not ready ignores an origin: it is sent again after each further
+request without an origin, until GPS_GLOBAL_ORIGIN confirms it. All of this starts again after a silence or a reboot.
 
 Source: https://mavlink.io/en/messages/common.html#SET_GPS_GLOBAL_ORIGIN; ArduPilot NavEKF3_core::setOrigin (rejects a
 second origin; older versions did not).
@@ -22,6 +23,7 @@ REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN = 512, 49  # MAV_CMD, message id
 HAS_NONE = (0, 2, 4)  # MAV_RESULT accepted (and sends nothing), denied, failed: it supports the message
 REQUEST_NS = 1_000_000_000  # period of requests
 REQUESTS = 3
+UNCONFIRMED = 10  # times that an origin is sent before it is reported
 
 
 class GlobalOrigin(BaseModel):
@@ -39,7 +41,8 @@ class OriginState(enum.Enum):
 
     NOT_CONFIGURED = "no origin configured"
     REQUESTING = "requesting the autopilot's origin"
-    SENT = "origin sent"
+    SENT = "origin sent, not confirmed"
+    CONFIRMED = "the autopilot has confirmed the origin"
     PRESENT = "the autopilot has an origin"
     UNSUPPORTED = "the autopilot does not report its origin"
 
@@ -51,13 +54,23 @@ class OriginSender:
         self.state = OriginState.NOT_CONFIGURED if origin is None else OriginState.REQUESTING
         self._origin, self._target = origin, target
         self._requested_ns: int | None = None
+        self._unconfirmed = 0  # times that it was sent since the (re)start
         self._replies = 0
         self._replied = False  # to the newest request
+        self.sent_times = 0
+        """How often it was sent."""
 
     @property
     def done(self) -> bool:
         """Whether nothing remains to be sent."""
-        return self.state is not OriginState.REQUESTING
+        return self.state not in (OriginState.REQUESTING, OriginState.SENT)
+
+    @property
+    def status(self) -> str | None:
+        """Error text when the autopilot does not confirm the origin."""
+        if self.state is OriginState.SENT and self._unconfirmed >= UNCONFIRMED:
+            return "the autopilot does not confirm the origin (SET_GPS_GLOBAL_ORIGIN): read its own messages"
+        return None
 
     def due(self, now_ns: int) -> list[Any]:
         """Messages to send now."""
@@ -65,8 +78,10 @@ class OriginSender:
             return []
         if self._requested_ns is not None and now_ns - self._requested_ns < REQUEST_NS:
             return []
-        if self._replies >= REQUESTS:
-            self.state = OriginState.SENT
+        if self._replies >= (REQUESTS if self.state is OriginState.REQUESTING else 1):
+            self.state, self._replies, self._requested_ns = OriginState.SENT, 0, now_ns
+            self.sent_times += 1
+            self._unconfirmed += 1
             return [
                 dialect().MAVLink_set_gps_global_origin_message(
                     self._target[0],
@@ -87,11 +102,14 @@ class OriginSender:
         """Start again: the autopilot was silent, and may have rebooted without an origin."""
         if self._origin is not None:
             self.state, self._replies, self._replied, self._requested_ns = OriginState.REQUESTING, 0, False, None
+            self._unconfirmed = 0
 
     def on_not_sent(self) -> None:
         """The messages of `due` could not be sent."""
         if self.state is OriginState.SENT:
-            self.state = OriginState.REQUESTING
+            self._replies, self._requested_ns = REQUESTS, None
+            self.sent_times -= 1
+            self._unconfirmed -= 1
 
     def on_message(self, message: Any) -> None:
         """Take a message of the autopilot."""
@@ -99,7 +117,7 @@ class OriginSender:
             return
         kind = message.get_type()
         if kind == "GPS_GLOBAL_ORIGIN":
-            self.state = OriginState.PRESENT
+            self.state = OriginState.CONFIRMED if self.state is OriginState.SENT else OriginState.PRESENT
         elif kind == "COMMAND_ACK" and message.command == REQUEST_MESSAGE and self._requested_ns is not None:
             if message.result in HAS_NONE:
                 self._replies += not self._replied  # further ones reply to another requester

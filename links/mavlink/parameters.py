@@ -47,7 +47,7 @@ def ask_parameters(link: Autopilot, timeout_s: float = 5.0) -> ParameterValues:
     try:
         return read_parameters(
             connection,
-            [required.name for required in profile.required],
+            [required.name for required in link.settings.required_parameters],
             (link.settings.system_id, link.settings.component_id),
             link.settings.own_id,
             integers_bytewise=profile.integers_bytewise,

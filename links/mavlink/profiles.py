@@ -1,14 +1,22 @@
 """Parameters that each autopilot needs, and why. Preflight checks them.
 
-Both autopilots: the local frame of the poses is the vehicle's start frame, with x in the vehicle's forward direction
-and not north. Therefore the autopilot's yaw must come from grd alone; with the compass it would rotate the positions by
-the vehicle's initial heading.
+They depend on what the poses contain (`yaw` of the link):
 
-ArduPilot (4.3 and later; EKF3)
+    none      positions in the autopilot's own axes: its yaw must come from its compass (or GPS), never from grd
+    cameras   poses in the vehicle's start frame, x in the vehicle's forward direction and not north: the yaw must come
+              from grd alone; with the compass it would rotate the positions by the vehicle's initial heading
+
+grd is one source set of ArduPilot (`source_set`, EK3_SRC2_* by default); set 1 is the source that flies without grd.
+
+ArduPilot (4.3 to 4.6; EKF3)
 - ODOMETRY only in LOCAL_FRD / BODY_FRD, at 4 Hz or more; healthy for 300 ms after each message. At most one per 20 ms
   is fused (of two closer ones the second is dropped): 25 to 50 Hz is suitable.
+- EK3_SRC_OPTIONS bit 0, on by default, fuses the velocities of all source sets: one of an external pose in another
+  frame is a fly-away of a drone that flies by GPS. grd sends no velocity; the bit must be off all the same.
+- With VISO_TYPE set, arming is refused ("VisOdom: not healthy") until poses arrive, and grd sends none before the drone
+  has moved: the check of visual odometry (ARMING_CHECK bit 18) must be off, and with it bit 0 (all checks).
 - It converts the covariance to cbrt(a^2 + b^2 + c^2) of the three variances, not to a sigma (0.1 m each gives 0.067 m,
-  0.5 m gives 0.57 m), and never below VISO_POS_M_NSE and VISO_YAW_M_NSE; velocity always has VISO_VEL_M_NSE.
+  0.5 m gives 0.57 m), and never below VISO_POS_M_NSE and VISO_YAW_M_NSE.
 - time_usec is converted by the fastest message (JitterCorrection): a constant delay is not corrected. For grd it is
   only the transmission delay, because poses are predicted to the time of sending.
 - A change of reset_counter resets its position to the message's immediately.
@@ -17,13 +25,15 @@ ArduPilot (4.3 and later; EKF3)
 PX4 (1.14 and later; EKF2)
 - Fusion starts when two messages are less than 200 ms apart and stops after 400 ms without one; 30 to 50 Hz is
   suitable.
-- VISION_POSITION_ESTIMATE is assumed north-aligned, LANDING_TARGET is accepted only in its local NED: grd knows
-  neither.
+- A position in LOCAL_NED needs no rotation, and with GPS its offset to it is estimated; in LOCAL_FRD without external
+  yaw the position is rotated by the message's rotation.
+- VISION_POSITION_ESTIMATE contains angles, which cannot be left out; LANDING_TARGET is accepted only in its local NED.
 - time_usec is converted by its own TIMESYNC requests, which grd answers; until they have converged (500 requests) it
   uses the arrival time.
 - estimator_type must be VIO or VISION; LIDAR is rejected.
 
 Source: ArduPilot libraries/AP_VisualOdom/*.cpp, GCS_MAVLINK::handle_odometry, NavEKF3_core::writeExtNavData,
+AP_NavEKF_Source::useVelXYSource, AP_Arming::visodom_checks,
 https://ardupilot.org/dev/docs/mavlink-nongps-position-estimation.html; PX4 mavlink_receiver.cpp
 (handle_message_odometry, _vision_position_estimate, _landing_target), EKF2 aid_sources/external_vision/*.cpp,
 https://docs.px4.io/main/en/ros/external_position_estimation.html
@@ -32,23 +42,25 @@ https://docs.px4.io/main/en/ros/external_position_estimation.html
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 ProfileName = Literal["ardupilot", "px4"]
+YawOutput = Literal["none", "cameras"]
 WIRE_ERROR = 1e-6  # relative: parameters are 32-bit floats
 
 
 @dataclass(frozen=True, slots=True)
 class RequiredParameter:
-    """One parameter: its allowed values, best first, or a range or bits; and the reason."""
+    """One parameter: its allowed values, best first, or a range, or bits that are on or off; and the reason."""
 
     name: str
     values: tuple[float, ...] = ()
     at_least: float = -math.inf
     at_most: float = math.inf
     bits: int = 0  # all of these must be set
+    bits_off: int = 0  # none of these may be set
     why: str = ""
 
     def fits(self, value: float) -> bool:
@@ -58,92 +70,56 @@ class RequiredParameter:
         if self.values and not any(abs(value - v) <= WIRE_ERROR * max(1.0, abs(v)) for v in self.values):
             return False
         within = self.at_least - WIRE_ERROR <= value <= self.at_most + WIRE_ERROR
-        return within and round(value) & self.bits == self.bits
+        return within and round(value) & self.bits == self.bits and not round(value) & self.bits_off
+
+    @property
+    def best(self) -> float:
+        """An allowed value: the first, or the middle of the range, or the bits."""
+        if self.values:
+            return self.values[0]
+        if self.bits or self.bits_off:
+            return float(self.bits)
+        return 0.5 * (self.at_least + self.at_most)
 
     def __str__(self) -> str:
         if self.values:
             return " or ".join(f"{v:g}" for v in self.values)
-        if self.bits:
-            return f"with bits {self.bits}"
+        if self.bits or self.bits_off:
+            on, off = f"with bits {self.bits}" * bool(self.bits), f"without bits {self.bits_off}" * bool(self.bits_off)
+            return " and ".join(filter(None, (on, off)))
         return f"{self.at_least:g} to {self.at_most:g}"
+
+
+ARDUPILOT_STREAMS = {
+    "ATTITUDE": "SRn_EXTRA1",
+    "LOCAL_POSITION_NED": "SRn_POSITION",
+    "RAW_IMU": "SRn_RAW_SENS",
+    "EKF_STATUS_REPORT": "SRn_EXTRA3",
+    "ODOMETRY": "in no stream: MAV_CMD_SET_MESSAGE_INTERVAL",
+}
+"""Stream rate that each message depends on; n is the number of the port. Source: ArduCopter GCS_Mavlink.cpp."""
 
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Requirements of one autopilot."""
+    """What one autopilot supports."""
 
     name: ProfileName
-    required: tuple[RequiredParameter, ...]
     unsupported: Mapping[str, str] = field(default_factory=dict[str, str])  # message -> why it is not sent
     integers_bytewise: bool = False  # PARAM_VALUE holds an integer's bytes, not its value
 
 
 _ZERO_OFFSET = "grd sends the pose of the drone's body, not of a camera"
+_DELAY = "transmission delay only: poses are predicted to the time of sending"
+EXTERNAL = 6.0  # ExternalNav, of an EK3_SRC parameter
+VISUAL_ODOMETRY_CHECK = 1 << 18  # of ARMING_CHECK
 
-ARDUPILOT = Profile(
-    name="ardupilot",
-    required=(
-        RequiredParameter("AHRS_EKF_TYPE", (3.0,), why="only EKF3 fuses an external pose"),
-        RequiredParameter("EK3_ENABLE", (1.0,), why="EKF3 must run"),
-        RequiredParameter("VISO_TYPE", (1.0,), why="MAVLink; 3 (VOXL) would hide resets behind an offset"),
-        RequiredParameter("EK3_SRC1_POSXY", (6.0,), why="horizontal position from grd"),
-        RequiredParameter("EK3_SRC1_VELXY", (6.0, 0.0), why="velocity from grd if known, or none; not GPS"),
-        RequiredParameter("EK3_SRC1_POSZ", (6.0, 1.0), why="height from grd, or the barometer"),
-        RequiredParameter("EK3_SRC1_VELZ", (6.0, 0.0), why="climb rate from grd if known, or none"),
-        RequiredParameter(
-            "EK3_SRC1_YAW", (6.0,), why="yaw from grd: its frame is not north-aligned, a compass would rotate it"
-        ),
-        RequiredParameter("VISO_POS_X", (0.0,), why=_ZERO_OFFSET),
-        RequiredParameter("VISO_POS_Y", (0.0,), why=_ZERO_OFFSET),
-        RequiredParameter("VISO_POS_Z", (0.0,), why=_ZERO_OFFSET),
-        RequiredParameter("VISO_ORIENT", (0.0,), why=_ZERO_OFFSET),
-        RequiredParameter("VISO_SCALE", (1.0,), why="positions are in metres"),
-        RequiredParameter(
-            "VISO_DELAY_MS",
-            at_least=0.0,
-            at_most=50.0,
-            why="transmission delay only: poses are predicted to the time of sending",
-        ),
-        RequiredParameter(
-            "VISO_POS_M_NSE", at_least=0.05, at_most=0.5, why="minimum position sigma; grd's is 0.1 to 0.3 m"
-        ),
-        RequiredParameter("VISO_YAW_M_NSE", at_least=0.05, at_most=0.3, why="minimum yaw sigma"),
-        RequiredParameter(
-            "VISO_VEL_M_NSE", at_least=0.1, at_most=1.0, why="sigma of every velocity: the message's is not used"
-        ),
-        RequiredParameter("VISO_QUAL_MIN", at_least=0.0, at_most=50.0, why="-1 would accept failed poses"),
-    ),
-)
-
-_NOT_NORTH = "PX4 assumes a north-aligned frame, and grd's is not; send odometry"
+_NO_ROTATION = "its angles cannot be left out, and PX4 takes them as north-aligned; send odometry"
+ARDUPILOT = Profile(name="ardupilot")
 PX4 = Profile(
     name="px4",
-    required=(
-        RequiredParameter(
-            "EKF2_EV_CTRL", bits=1 | 8, why="1: horizontal position, 8: yaw; 2 (height) and 4 (velocity) are optional"
-        ),
-        RequiredParameter("EKF2_HGT_REF", (3.0, 0.0), why="height from grd, or the barometer"),
-        RequiredParameter(
-            "EKF2_GPS_CTRL", (0.0,), why="with GPS it rejects the yaw of a frame that is not north-aligned"
-        ),
-        RequiredParameter("EKF2_MAG_TYPE", (5.0,), why="no compass: the yaw is from grd"),
-        RequiredParameter("EKF2_EV_NOISE_MD", (0.0,), why="use the message's covariance"),
-        RequiredParameter(
-            "EKF2_EV_DELAY",
-            at_least=0.0,
-            at_most=50.0,
-            why="transmission delay only: poses are predicted to the time of sending",
-        ),
-        RequiredParameter("EKF2_EVP_NOISE", at_least=0.01, at_most=0.3, why="minimum position sigma"),
-        RequiredParameter("EKF2_EVA_NOISE", at_least=0.01, at_most=0.2, why="minimum angle sigma"),
-        RequiredParameter("EKF2_EVV_NOISE", at_least=0.05, at_most=0.5, why="minimum velocity sigma"),
-        RequiredParameter("EKF2_EV_QMIN", at_least=0.0, at_most=50.0, why="quality is 1 at grd's limits, 100 at best"),
-        RequiredParameter("EKF2_EV_POS_X", (0.0,), why=_ZERO_OFFSET),
-        RequiredParameter("EKF2_EV_POS_Y", (0.0,), why=_ZERO_OFFSET),
-        RequiredParameter("EKF2_EV_POS_Z", (0.0,), why=_ZERO_OFFSET),
-    ),
     unsupported={
-        "vision_position_estimate": _NOT_NORTH,
+        "vision_position_estimate": _NO_ROTATION,
         "landing_target": "PX4 accepts it only in its local NED frame, which grd does not know",
     },
     integers_bytewise=True,
@@ -152,10 +128,101 @@ PX4 = Profile(
 PROFILES: dict[ProfileName, Profile] = {"ardupilot": ARDUPILOT, "px4": PX4}
 
 
-def findings(profile: Profile, values: Mapping[str, float]) -> list[str]:
+def required_parameters(profile: ProfileName, yaw: YawOutput, source_set: int = 2) -> tuple[RequiredParameter, ...]:
+    """The parameters that an autopilot needs for these poses; `source_set`: that of grd (ArduPilot)."""
+    return _ardupilot(yaw, source_set) if profile == "ardupilot" else _px4(yaw)
+
+
+def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]:
+    own = f"EK3_SRC{source_set}_"
+    velocity = "grd sends no velocity"
+    by_cameras = (
+        RequiredParameter(own + "VELXY", (0.0, 5.0), why=f"{velocity}; GPS velocity is in another frame"),
+        RequiredParameter(own + "VELZ", (0.0,), why=velocity),
+        RequiredParameter(
+            own + "YAW", (EXTERNAL,), why="yaw from grd: its frame is not north-aligned, a compass would rotate it"
+        ),
+        RequiredParameter("VISO_YAW_M_NSE", at_least=0.05, at_most=0.3, why="minimum yaw sigma"),
+    )
+    without_yaw = (
+        RequiredParameter(own + "VELXY", (0.0, 3.0, 5.0), why=velocity),
+        RequiredParameter(own + "VELZ", (0.0, 3.0), why=velocity),
+        RequiredParameter(
+            own + "YAW", (1.0, 2.0, 3.0), why="compass or GPS: grd sends no yaw, but positions in its axes"
+        ),
+    )
+    other = (
+        RequiredParameter(
+            "EK3_SRC1_POSXY", (3.0, 0.0), why="set 1 flies without grd: GPS, or none where there is no GPS"
+        ),
+    )
+    return (
+        RequiredParameter("AHRS_EKF_TYPE", (3.0,), why="only EKF3 fuses an external pose"),
+        RequiredParameter("EK3_ENABLE", (1.0,), why="EKF3 must run"),
+        RequiredParameter("EK3_SRC_OPTIONS", bits_off=1, why="1 fuses the velocities of all source sets: a fly-away"),
+        RequiredParameter("VISO_TYPE", (1.0,), why="MAVLink; 3 (VOXL) would hide resets behind an offset"),
+        RequiredParameter(own + "POSXY", (EXTERNAL,), why="horizontal position from grd"),
+        RequiredParameter(own + "POSZ", (EXTERNAL, 1.0), why="height from grd, or the barometer"),
+        *(by_cameras if yaw == "cameras" else without_yaw),
+        *(other if source_set != 1 else ()),
+        RequiredParameter(
+            "ARMING_CHECK",
+            bits_off=1 | VISUAL_ODOMETRY_CHECK,
+            why="the check of visual odometry refuses arming before grd sends, and grd sends after the drone has moved",
+        ),
+        RequiredParameter("VISO_POS_X", (0.0,), why=_ZERO_OFFSET),
+        RequiredParameter("VISO_POS_Y", (0.0,), why=_ZERO_OFFSET),
+        RequiredParameter("VISO_POS_Z", (0.0,), why=_ZERO_OFFSET),
+        RequiredParameter("VISO_ORIENT", (0.0,), why=_ZERO_OFFSET),
+        RequiredParameter("VISO_SCALE", (1.0,), why="positions are in metres"),
+        RequiredParameter("VISO_DELAY_MS", at_least=0.0, at_most=50.0, why=_DELAY),
+        RequiredParameter(
+            "VISO_POS_M_NSE", at_least=0.05, at_most=0.5, why="minimum position sigma; grd's is 0.1 to 0.3 m"
+        ),
+        RequiredParameter("VISO_QUAL_MIN", at_least=0.0, at_most=50.0, why="-1 would accept failed poses"),
+    )
+
+
+def _px4(yaw: YawOutput) -> tuple[RequiredParameter, ...]:
+    by_cameras = (
+        RequiredParameter(
+            "EKF2_EV_CTRL",
+            bits=1 | 8,
+            bits_off=4,
+            why="1: horizontal position, 8: yaw; 2 (height) is optional, 4 (velocity) is not sent",
+        ),
+        RequiredParameter(
+            "EKF2_GPS_CTRL", (0.0,), why="with GPS it rejects the yaw of a frame that is not north-aligned"
+        ),
+        RequiredParameter("EKF2_MAG_TYPE", (5.0,), why="no compass: the yaw is from grd"),
+        RequiredParameter("EKF2_EVA_NOISE", at_least=0.01, at_most=0.2, why="minimum angle sigma"),
+    )
+    without_yaw = (
+        RequiredParameter(
+            "EKF2_EV_CTRL",
+            bits=1,
+            bits_off=4 | 8,
+            why="1: horizontal position; 2 (height) is optional, 4 (velocity) and 8 (yaw) are not sent",
+        ),
+        RequiredParameter("EKF2_MAG_TYPE", (0.0, 1.0), why="yaw from the compass: grd sends none"),
+    )
+    return (
+        *(by_cameras if yaw == "cameras" else without_yaw),
+        RequiredParameter("EKF2_HGT_REF", (0.0, 3.0, 1.0), why="height from the barometer, grd or GPS"),
+        RequiredParameter("EKF2_EV_NOISE_MD", (0.0,), why="use the message's covariance"),
+        RequiredParameter("EKF2_EV_DELAY", at_least=0.0, at_most=50.0, why=_DELAY),
+        RequiredParameter("EKF2_EVP_NOISE", at_least=0.01, at_most=0.3, why="minimum position sigma"),
+        RequiredParameter("EKF2_EV_QMIN", at_least=0.0, at_most=50.0, why="quality is 1 at grd's limits, 100 at best"),
+        RequiredParameter("EKF2_EV_POS_X", (0.0,), why=_ZERO_OFFSET),
+        RequiredParameter("EKF2_EV_POS_Y", (0.0,), why=_ZERO_OFFSET),
+        RequiredParameter("EKF2_EV_POS_Z", (0.0,), why=_ZERO_OFFSET),
+    )
+
+
+def findings(required: Sequence[RequiredParameter], values: Mapping[str, float]) -> list[str]:
     """One sentence per wrong or missing parameter; empty: all are correct."""
     found: list[str] = []
-    for parameter in profile.required:
+    for parameter in required:
         value = values.get(parameter.name)
         if value is None:
             found.append(f"{parameter.name} was not received; it must be {parameter} ({parameter.why})")

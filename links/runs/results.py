@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from flow.link import Run, Tap
 from flow.message import Message
 from flow.stage import Settings
-from links.mavlink.gate import PoseLimits, reject_reason
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.poses.position_gate import gate_reason
+from links.mavlink.profiles import YawOutput
 from links.runs.fix_log import FixLog
 from links.runs.result_file import ResultFile
 from stages.geometry.frames import quaternions_xyzw
@@ -88,6 +90,7 @@ class ResultsSettings(Settings):
     """Settings of `Results`."""
 
     limits: PoseLimits = PoseLimits()  # of the autopilot's gate: which poses it accepts
+    yaw: YawOutput = "none"  # what is sent to the autopilot
 
 
 class Results(Tap[ResultsSettings]):
@@ -286,7 +289,7 @@ class Results(Tap[ResultsSettings]):
         upper = _covariance(estimate)[UPPER_6]
         measured = "" if message.measured_ns is None else stamp_s(message.measured_ns)
         nis = "" if math.isnan(message.nis) else f"{message.nis:.4g}"
-        accepted = reject_reason(message, message.stamp_ns, self.settings.limits) is None
+        accepted = gate_reason(message, message.stamp_ns, self.settings.limits, self.settings.yaw) is None
         values = [
             message.state.name,
             int(accepted),

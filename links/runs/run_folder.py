@@ -23,7 +23,6 @@ from flow.stage import Stage
 from flow.subprocess_replay import can_use_subprocesses, replay_in_subprocesses
 from flow.taps import Digest
 from links.mavlink.autopilot import Autopilot
-from links.mavlink.gate import PoseLimits
 from links.recording import Progress, Session
 from links.runs.request import RunRequest, RunResult
 from links.runs.result_file import ResultFile
@@ -58,7 +57,7 @@ class RunFolder:
         self._folder, self._recording, self._request, self._graph = folder, recording, request, graph
         self._live = live
         self._started_s = time.monotonic() if started_s is None else started_s
-        self._results, self._open = Results(limits=_limits(graph)), ExitStack()
+        self._results, self._open = Results(**_gate(graph)), ExitStack()
         declared = [spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Tap)]
         self.taps: list[Tap] = [self._results, *(tap for tap in declared if isinstance(tap, Tap))]
 
@@ -141,10 +140,11 @@ def _stage_outputs(graph: Graph, report: RunReport) -> str:
     return "; ".join(f"{n} ({graph.nodes[n].cls.__name__}: {', '.join(c) or 'no output'})" for n, c in counts.items())
 
 
-def _limits(graph: Graph) -> PoseLimits:
-    """PoseLimits of the autopilot's gate, as configured."""
+def _gate(graph: Graph) -> dict[str, Any]:
+    """Settings of the autopilot's gate, as configured."""
     links = (spec.build() for spec in graph.nodes.values() if issubclass(spec.cls, Autopilot))
-    return next((link.settings.limits for link in links if isinstance(link, Autopilot)), PoseLimits())
+    settings = (link.settings for link in links if isinstance(link, Autopilot))
+    return next(({"limits": s.limits, "yaw": s.yaw} for s in settings), {})
 
 
 def _senders(graph: Graph) -> dict[str, dict[str, str]]:

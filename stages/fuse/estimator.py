@@ -25,7 +25,7 @@ from stages.geometry.frames import Array64, heading_rad, rotation_z
 from stages.geometry.se3 import mahalanobis2, position_covariance
 from stages.heading.motion_yaw import MAX_ALTERNATIVE_ODDS, Point
 from stages.heading.odometry_yaw import OdometryYaw
-from stages.heading.yaw_fit import apart_rad
+from stages.heading.yaw_fit import Yaw, apart_rad
 from stages.messages import DroneAttitude, DroneFix, DroneLocalPosition, DroneOdometry, VehicleMotion, VisualMotion
 
 LEAST_MPS = 0.5  # minimum speed for a direction of flight by the camera
@@ -95,6 +95,14 @@ class Estimator:
             R, _, P = self.chain.at(motion.from_ns)
             sigma = math.hypot(motion.direction_sigma_rad, math.sqrt(float(np.trace(P[:3, :3])) / 3))
             free.add_direction(R @ motion.direction_from, sigma)
+
+    @property
+    def raw_yaw(self) -> Yaw | None:
+        """Yaw in `map` of the autopilot's frame as it reports it now; None: not known, or the drone may be another."""
+        yaw, raw = self.odometry_yaw.yaw, self.motions.motion_model.autopilot.R_odom_raw
+        if yaw is None or self.unverified or self.odometry_yaw.heading.contradiction:
+            return None
+        return Yaw(yaw.stamp_ns, yaw.yaw_rad + heading_rad(raw), yaw.variance_rad2)
 
     # prediction
 

@@ -231,7 +231,8 @@ class Fuse(Stage[FuseSettings]):
 
     def _status(self, state: PoseState, reason: str) -> Status:
         e = self._estimator
-        return Status(state, reason, e.newest_fix_ns, e.track_id, e.resets + self._jumps.number, e.positions.nis)
+        resets = e.resets + self._jumps.number
+        return Status(state, reason, e.newest_fix_ns, e.track_id, resets, e.positions.nis, e.vp_rotation_ns, e.raw_yaw)
 
     def _known(self, now_ns: int) -> MapEstimate:
         """The estimate propagated to now, with the bias covariances added."""

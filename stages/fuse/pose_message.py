@@ -14,6 +14,7 @@ import numpy as np
 
 from stages.fuse.motion_model import Motions
 from stages.geometry.frames import Array64
+from stages.heading.yaw_fit import Yaw
 from stages.messages import PoseEstimate, PoseState, PositionEstimate, RelativePose
 
 
@@ -39,6 +40,8 @@ class Status:
     track_id: int
     resets: int
     nis: float
+    rotation_ns: int | None = None
+    odom_yaw: Yaw | None = None
 
 
 def lost(stamp_ns: int, status: Status) -> RelativePose:
@@ -83,6 +86,7 @@ def pose(estimate: MapEstimate, status: Status, motions: Motions) -> RelativePos
 def _message(
     stamp_ns: int, status: Status, estimate: PositionEstimate | PoseEstimate | None, nis: float
 ) -> RelativePose:
+    yaw = status.odom_yaw
     return RelativePose(
         stamp_ns=stamp_ns,
         state=status.state,
@@ -92,6 +96,9 @@ def _message(
         resets=status.resets,
         nis=nis,
         estimate=estimate,
+        rotation_ns=status.rotation_ns if isinstance(estimate, PoseEstimate) else None,
+        odom_yaw_rad=None if yaw is None else yaw.yaw_rad,
+        odom_yaw_sigma_rad=None if yaw is None else yaw.sigma_rad,
     )
 
 

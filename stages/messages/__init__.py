@@ -13,6 +13,7 @@ from stages.messages.autopilot import DroneAttitude as DroneAttitude
 from stages.messages.autopilot import DroneImu as DroneImu
 from stages.messages.autopilot import DroneLocalPosition as DroneLocalPosition
 from stages.messages.autopilot import DroneOdometry as DroneOdometry
+from stages.messages.autopilot import DroneTilt as DroneTilt
 from stages.messages.cameras import BranchState as BranchState
 from stages.messages.cameras import CameraMount as CameraMount
 from stages.messages.cameras import FollowedFeatures as FollowedFeatures

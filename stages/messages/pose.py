@@ -49,7 +49,7 @@ class PoseEstimate:
     velocity_covariance: Mat3  # of velocity_map_mps [m2/s2]
 
 
-@message(schema=74)
+@message(schema=76)
 class RelativePose(Message):
     """State and estimate of the drone relative to the vehicle and in `map`, predicted to stamp_ns.
 
@@ -63,6 +63,11 @@ class RelativePose(Message):
     resets: int  # how often the pose jumped since the start: a new branch, a new drone, a restart
     nis: float  # normalised innovation squared of the newest accepted LiDAR position, 3 degrees of freedom; NaN: none
     estimate: PositionEstimate | PoseEstimate | None  # a pose when FULL or COASTING; None when LOST
+    rotation_ns: int | None = None  # time of the newest rotation by cameras in the estimate; None: none
+    # yaw of the autopilot's frame in `map` as it reports it now, R_map_odom = Rz(yaw): learnt while its telemetry was
+    # independent of our poses, kept since. None: not known, or the drone may be another one
+    odom_yaw_rad: float | None = None
+    odom_yaw_sigma_rad: float | None = None  # when it was learnt
 
     @property
     def xyz_vehicle_m(self) -> Vec3 | None:

@@ -3,9 +3,9 @@
     image -> chains of edge points (edges.py) -> great-circle arcs (arcs.py) -> lines (clustering.py)
             -> vertical, from gravity or search; one or more horizontal pairs (search.py) -> directions with sigma
 
-On the drone, gravity is the autopilot's attitude. Without it, gravity is the mount's z axis within
+On the drone, gravity is the autopilot's tilt. Without it, gravity is the mount's z axis within
 `vertical_sigma_deg`, which is correct for a vehicle. With a rolling shutter (`readout_ms` of the camera link), each
-point is corrected to the exposure of the middle row with the angular rate of the mount: `attitude` on the drone,
+point is corrected to the exposure of the middle row with the angular rate of the mount: `tilt` on the drone,
 `motion` on the vehicle. An image without enough straight lines gives no directions, and a reason.
 
 Source: ours, for P IV and V.C; DESIGN, The graph: vp.
@@ -23,12 +23,12 @@ from flow.stage import Settings, Stage
 from stages.geometry.frames import Pose
 from stages.geometry.lens import Array64, Lens
 from stages.geometry.trajectory import VehicleTrajectory
-from stages.messages import CameraMount, DroneAttitude, Image, VanishingDirections, VehicleMotion
+from stages.messages import CameraMount, DroneTilt, Image, VanishingDirections, VehicleMotion
 from stages.vp.arcs import fit_arcs
 from stages.vp.clustering import cluster
 from stages.vp.directions import lines_of
 from stages.vp.edges import EdgeFinder
-from stages.vp.gravity import AttitudeBuffer
+from stages.vp.gravity import TiltBuffer
 from stages.vp.pixel_rays import PixelRays, Polygon, make_pixel_rays
 from stages.vp.search import FoundDirections, SearchLimits, VerticalPrior, find_structure
 
@@ -53,12 +53,9 @@ class GreatCircleVpSettings(Settings):
     tolerance_px: float = Field(1.0, gt=0, le=10)  # largest distance of a line's points from its great circle
     min_extent_px: float = Field(14.0, ge=5)  # shorter arcs are not used
     line_sigma_deg: float = Field(0.25, gt=0, le=5)  # one sigma of straightness and parallelism of lines
-    vertical_sigma_deg: float = Field(3.0, gt=0, le=60)  # of the mount's z axis against the vertical, without attitude
-    attitude_sigma_deg: float = Field(1.0, gt=0, le=30)  # of the attitude's roll and pitch
-    attitude_age_s: float = Field(0.2, gt=0)  # maximum age of an attitude
-    search_deg: float | None = Field(
-        None, ge=0, le=90
-    )  # without attitude, the vertical is searched in this cone about z;
+    vertical_sigma_deg: float = Field(3.0, gt=0, le=60)  # of the mount's z axis against the vertical, without tilt
+    tilt_age_s: float = Field(0.2, gt=0)  # maximum age of a tilt
+    search_deg: float | None = Field(None, ge=0, le=90)  # without tilt, the vertical is searched in this cone about z;
     # 0: it is z, within `vertical_sigma_deg`. None: 0 for a vehicle, 35 for a drone, which tilts in flight
     max_frames: int = Field(3, ge=1, le=6)  # horizontal pairs; 1: Manhattan
     min_lines: int = Field(4, ge=2)  # of a horizontal pair
@@ -75,20 +72,20 @@ class GreatCircleVpSettings(Settings):
 class GreatCircleVp(Stage[GreatCircleVpSettings]):
     """Vertical and horizontal directions of a street from one fisheye image, each with its sigma."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude", "motion"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"tilt", "motion"})
 
     def __init__(self, settings: GreatCircleVpSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._pixel_rays: PixelRays | None = None
         self._edges: EdgeFinder | None = None
-        self._attitudes = AttitudeBuffer()
+        self._tilts = TiltBuffer()
         self._vehicle = VehicleTrajectory()
 
-    def on_attitude(self, attitude: DroneAttitude) -> None:
-        """Roll, pitch and angular rate of the drone; its yaw is not used."""
+    def on_tilt(self, tilt: DroneTilt) -> None:
+        """Vertical and angular rate of the drone."""
         if self.settings.camera_mount is not CameraMount.DRONE:
-            raise ValueError("attitude belongs to the drone: connect it to the stage whose camera_mount is drone")
-        self._attitudes.add(attitude)
+            raise ValueError("tilt belongs to the drone: connect it to the stage whose camera_mount is drone")
+        self._tilts.add(tilt)
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Angular rate of the vehicle; nothing else of the message is used."""
@@ -122,15 +119,15 @@ class GreatCircleVp(Stage[GreatCircleVpSettings]):
     def _rate_radps(self, stamp_ns: int) -> Array64:
         """Angular rate (3,) of the mount, mount axes; zero when it is unknown."""
         if self.settings.camera_mount is CameraMount.DRONE:
-            rate = self._attitudes.rate_radps(stamp_ns, self.settings.attitude_age_s)
+            rate = self._tilts.rate_radps(stamp_ns, self.settings.tilt_age_s)
             return np.zeros(3) if rate is None else rate
         return self._vehicle.rate_radps(stamp_ns) if self._vehicle.known_at(stamp_ns) else np.zeros(3)
 
     def _prior(self, stamp_ns: int) -> VerticalPrior:
         settings = self.settings
-        up = self._attitudes.up_at(stamp_ns, settings.attitude_age_s)
-        if up is not None:
-            return VerticalPrior(up, math.radians(settings.attitude_sigma_deg), 0.0)
+        tilt = self._tilts.up_at(stamp_ns, settings.tilt_age_s)
+        if tilt is not None:
+            return VerticalPrior(*tilt, 0.0)
         search_deg = SEARCH_DEG[settings.camera_mount] if settings.search_deg is None else settings.search_deg
         sigma_deg = max(settings.vertical_sigma_deg, search_deg)
         return VerticalPrior(np.array([0.0, 0.0, 1.0]), math.radians(sigma_deg), math.radians(search_deg))

@@ -20,8 +20,8 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from links.clock import host_time
 from links.mavlink import Autopilot
-from links.mavlink.gate import PoseLimits, reject_reason
-from links.mavlink.pose_messages import odometry
+from links.mavlink.poses.gate import PoseLimits, reject_reason
+from links.mavlink.poses.pose_messages import odometry
 from links.mavlink.transport.framing import FrameSplitter, packed
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "mavlink"))

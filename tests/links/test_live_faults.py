@@ -121,6 +121,7 @@ class ResultPose:
 
     stamp_s: float
     good: bool
+    rotation: bool
     pose: tuple[float, ...]  # xyz, quaternion
 
 
@@ -128,10 +129,13 @@ def positions(folder: Path) -> list[ResultPose]:
     poses, table = folder / "pose_vehicle_drone.tum", folder / "pose_covariance.csv"
     if not poses.exists() or not table.exists():
         return []
-    good = {row["stamp_s"]: row["accepted"] == "1" for row in csv.DictReader(table.read_text().splitlines())}
+    good = {
+        row["stamp_s"]: (row["accepted"] == "1", row["rotation"] == "1")
+        for row in csv.DictReader(table.read_text().splitlines())
+    }
     lines = [line.split() for line in poses.read_text().splitlines() if line[:1].isdigit()]
     whole = [line for line in lines if len(line) == 8 and line[0] in good]
-    return [ResultPose(float(line[0]), good[line[0]], tuple(map(float, line[1:]))) for line in whole]
+    return [ResultPose(float(line[0]), *good[line[0]], tuple(map(float, line[1:]))) for line in whole]
 
 
 @pytest.fixture(scope="module")
@@ -327,7 +331,7 @@ _truth: dict[Path, TruthLog] = {}
 
 
 def errors_of(poses: list[ResultPose], folder: Path) -> np.ndarray:
-    """(n, 2): position error [m], yaw error [deg]."""
+    """(n, 2): position error [m], yaw error [deg], 0 without a rotation."""
     truth = _truth.get(folder)
     if truth is None:
         truth = _truth[folder] = TruthLog()
@@ -342,7 +346,7 @@ def errors_of(poses: list[ResultPose], folder: Path) -> np.ndarray:
         true_rad = np.interp(pose.stamp_s, stamps_ns * 1e-9, yaw_rad)
         error_rad = 2 * np.arctan2(pose.pose[5], pose.pose[6]) - true_rad
         error_deg = abs(np.degrees((error_rad + np.pi) % (2 * np.pi) - np.pi))
-        rows.append((float(np.linalg.norm(np.array(pose.pose[:3]) - true_m)), float(error_deg)))
+        rows.append((float(np.linalg.norm(np.array(pose.pose[:3]) - true_m)), float(error_deg) * pose.rotation))
     return np.array(rows).reshape(-1, 2)
 
 

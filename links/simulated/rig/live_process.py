@@ -28,7 +28,7 @@ from flow.link import TRUTH_TOPICS, LinkError, Record
 from flow.metrics import Latency
 from links.clock import host_time
 from links.mavlink.frame_decoder import ARMED
-from links.mavlink.profiles import ARDUPILOT
+from links.mavlink.profiles import required_parameters
 from links.recording import RecordingWriter
 from links.runs.truth import TRUTH_RECORDING
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
@@ -171,7 +171,7 @@ class RealTimeRig:
             send_to=send_to,
             flight=flight,
             scenario_ns=simulation.now_ns,
-            parameters={w.name: w.values[0] if w.values else w.at_least for w in ARDUPILOT.required},
+            parameters={w.name: w.best for w in required_parameters("ardupilot", "none")},
         )
         autopilot.armed = self._rig.armed
         return autopilot

@@ -147,6 +147,11 @@ class AutopilotTrajectory:
             last = self._positions[-1]
             self._positions[-1] = _Position(last.stamp_ns, last.xyz_odom_m, last.velocity_odom_mps, last.segment + 1)
 
+    @property
+    def R_odom_raw(self) -> Array64:
+        """Rotation (3, 3) of the autopilot's raw local frame, as it is now, in frame odom."""
+        return self._R_odom_raw
+
     def rate_radps(self, stamp_ns: int) -> float:
         """Angular speed of the drone [rad/s]; 0 where not known."""
         node = self._before(stamp_ns)

@@ -123,3 +123,12 @@ def test_no_input_raises(times: list[tuple[int, int, int]]):
         assert stamp is None or stamp <= arrival
         clock.round_trip(ts1, device, arrival)
         assert clock.uncertainty_ns is None or clock.uncertainty_ns >= 0
+
+
+@pytest.mark.parametrize(("device_s", "reboots"), [(2, 1), (2000, 0)])
+def test_only_a_clock_that_runs_backwards_has_booted(device_s: int, reboots: int):
+    clock = DeviceClock()
+    clock.read(BOOT, HOST0)
+    for i in range(DISAGREEMENTS + 1):
+        clock.read(device_s * S + i * MS, HOST0 + S + i * MS)
+    assert (clock.restarts, clock.reboots) == (1, reboots)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,9 @@ def good_pose(stamp_ns: int = HOST0, **changes: Any) -> RelativePose:
         track_id=1,
         resets=0,
         nis=1.0,
+        rotation_ns=stamp_ns,
+        odom_yaw_rad=0.0,
+        odom_yaw_sigma_rad=math.radians(1.0),
         estimate=dataclasses.replace(estimate, **{name: changes.pop(name) for name in names}),
     )
     return dataclasses.replace(pose, **changes)

@@ -12,7 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as m
 from flow.link import LinkError, Record
 from links.mavlink import Autopilot
 from links.mavlink.checks import autopilot_checks, parameter_check
+from links.mavlink.origin import OriginState
 from links.mavlink.parameters import ParameterValues, ask_parameters
+from links.mavlink.profiles import required_parameters
 from links.mavlink.transport.framing import packed
 from links.preflight.check_result import Level
 from stages.messages import AutopilotEstimator, AutopilotStatus
@@ -168,15 +170,15 @@ def test_a_recorded_flight_may_be_armed():
 
 @pytest.mark.parametrize("profile", ["ardupilot", "px4"])
 def test_parameters_are_compared_with_the_profile(profile):
-    good = good_parameters(profile)
-    assert parameter_check("it", profile, ParameterValues(good, [], 40)).level is Level.OK
+    good, required = good_parameters(profile), required_parameters(profile, "none")
+    assert parameter_check("it", required, ParameterValues(good, [], 40)).level is Level.OK
     first, second = list(good)[:2]
-    bad = parameter_check("it", profile, ParameterValues({**good, first: 99.0} | {second: 98.0}, [], 40))
+    bad = parameter_check("it", required, ParameterValues({**good, first: 102.0} | {second: 98.0}, [], 40))
     assert bad.level is Level.FAIL
-    assert f"{first} is 99" in bad.sentence
+    assert f"{first} is 102" in bad.sentence
     assert f"{second} is 98" in bad.sentence
-    assert "does not reply" in parameter_check("it", profile, ParameterValues({}, list(good), 0)).sentence
-    assert "none was received" in parameter_check("it", profile, ParameterValues({}, list(good), 9)).sentence
+    assert "does not reply" in parameter_check("it", required, ParameterValues({}, list(good), 0)).sentence
+    assert "none was received" in parameter_check("it", required, ParameterValues({}, list(good), 9)).sentence
 
 
 def test_a_full_disk_for_the_signing_time_is_an_error_in_preflight(tmp_path, monkeypatch):
@@ -195,3 +197,29 @@ def test_the_clock_drift_is_reported_if_known():
     drifting = dataclasses.replace(status(), clock_drift_ppm=-18.04, clock_drift_sigma_ppm=1.4)
     assert "drift -18.0 +- 1.4 ppm" in check(frames(), newest=drifting)["it clock"].sentence
     assert "drift" not in check(frames())["it clock"].sentence
+
+
+@pytest.mark.parametrize(
+    ("state", "level"),
+    [
+        (OriginState.CONFIRMED, Level.OK),
+        (OriginState.PRESENT, Level.OK),
+        (OriginState.UNSUPPORTED, Level.WARNING),
+        (OriginState.SENT, Level.FAIL),
+        (None, Level.FAIL),
+    ],
+)
+def test_a_configured_origin_must_be_confirmed(monkeypatch, state, level):
+    monkeypatch.setattr(Autopilot, "origin", state)
+    link = Autopilot(global_origin={"latitude_deg": 1, "longitude_deg": 2, "altitude_m": 3})
+    found = {v.name: v for v in autopilot_checks(observe(link, frames()), [STATUS], ESTIMATORS)}
+    assert found["it origin"].level is level
+
+
+@pytest.mark.parametrize(("profile", "hint"), [("ardupilot", "ATTITUDE: SRn_EXTRA1"), ("px4", "MAV_n_MODE 2")])
+def test_a_missing_message_names_the_stream_that_it_comes_in(profile, hint):
+    link = Autopilot(profile=profile)
+    autopilot = 3 if profile == "ardupilot" else 12
+    records = frames(attitude_hz=0, autopilot=autopilot)
+    found = {v.name: v for v in autopilot_checks(observe(link, records), [STATUS], ESTIMATORS)}
+    assert hint in found["it rates"].sentence

@@ -1,4 +1,4 @@
-"""Global origin: requested, sent once, never over an existing one, never to an autopilot that does not reply."""
+"""Global origin: requested, sent until confirmed, never over an existing one, only to an autopilot that replies."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ def run(sender: OriginSender, seconds: int, *replies: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("result", [0, 2, 4])
-def test_the_origin_is_sent_once_after_three_replies_without_an_origin(result: int):
+def test_the_origin_is_sent_after_three_replies_without_an_origin_and_again_until_it_is_confirmed(result: int):
     sender = OriginSender(ORIGIN, (1, 1))
-    sent = run(sender, 30, ack(result))
-    assert [m.get_type() for m in sent] == ["COMMAND_LONG"] * 3 + ["SET_GPS_GLOBAL_ORIGIN"]
+    sent = run(sender, 8, ack(result))
+    again = ["COMMAND_LONG", "SET_GPS_GLOBAL_ORIGIN"]
+    assert [m.get_type() for m in sent] == ["COMMAND_LONG"] * 3 + ["SET_GPS_GLOBAL_ORIGIN"] + again * 2
     assert (sent[0].command, sent[0].param1, sent[0].target_system) == (512, 49.0, 1)
     origin = sent[-1]
     assert (origin.target_system, origin.latitude, origin.longitude, origin.altitude) == (
@@ -46,6 +47,14 @@ def test_the_origin_is_sent_once_after_three_replies_without_an_origin(result: i
         -4250,
     )
     assert sender.state is OriginState.SENT
+    assert sender.status is None
+    run(sender, 60, ack(result))
+    assert "does not confirm the origin" in (sender.status or "")
+    sender.on_message(mavlink.MAVLink_gps_global_origin_message(1, 2, 3))
+    assert (sender.state, sender.done, sender.status) == (OriginState.CONFIRMED, True, None)
+    assert run(sender, 10, ack(result)) == []
+    sender.restart()
+    assert [m.get_type() for m in run(sender, 1, ack(result))] == ["COMMAND_LONG"]
 
 
 def test_an_autopilot_keeps_its_origin():

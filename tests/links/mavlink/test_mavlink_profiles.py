@@ -8,44 +8,85 @@ from typing import Any
 import pytest
 
 from links.mavlink.parameters import read_parameters
-from links.mavlink.profiles import ARDUPILOT, PROFILES, PX4, Profile, RequiredParameter, findings
+from links.mavlink.profiles import (
+    ARDUPILOT,
+    PROFILES,
+    PX4,
+    Profile,
+    ProfileName,
+    RequiredParameter,
+    YawOutput,
+    findings,
+    required_parameters,
+)
 from links.mavlink.transport.connection import Endpoint, Udp
 from links.mavlink.transport.stream_connection import open_connection
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.autopilot.px4_rules import Px4Rules
 
+ALL = [(profile, yaw) for profile in PROFILES for yaw in ("none", "cameras")]
 
-def valid(profile: Profile) -> dict[str, float]:
+
+def valid(required: tuple[RequiredParameter, ...]) -> dict[str, float]:
     """Allowed values."""
-    return {w.name: w.values[0] if w.values else float(w.bits) if w.bits else w.at_least for w in profile.required}
+    return {parameter.name: parameter.best for parameter in required}
 
 
-@pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
-def test_names_fit_the_message_field_and_each_has_a_reason(profile: Profile):
-    names = [parameter.name for parameter in profile.required]
+@pytest.mark.parametrize(("profile", "yaw"), ALL)
+@pytest.mark.parametrize("source_set", [1, 2, 3])
+def test_names_fit_the_message_field_and_each_has_a_reason(profile: ProfileName, yaw: YawOutput, source_set: int):
+    required = required_parameters(profile, yaw, source_set)
+    names = [parameter.name for parameter in required]
     assert len(set(names)) == len(names)
     assert all(0 < len(name) <= 16 for name in names)
-    assert all(parameter.why for parameter in profile.required)
-    assert findings(profile, valid(profile)) == []
+    assert all(parameter.why for parameter in required)
+    assert findings(required, valid(required)) == []
 
 
-@pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
-def test_each_wrong_or_missing_parameter_is_one_sentence(profile: Profile):
-    values = valid(profile)
-    first, second = profile.required[0].name, profile.required[1].name
-    values[first] = 99.0
+@pytest.mark.parametrize(("profile", "yaw"), ALL)
+def test_each_wrong_or_missing_parameter_is_one_sentence(profile: ProfileName, yaw: YawOutput):
+    required = required_parameters(profile, yaw)
+    values = valid(required)
+    first, second = required[0].name, required[1].name
+    values[first] = 102.0
     del values[second]
-    found = findings(profile, values)
+    found = findings(required, values)
     assert len(found) == 2
-    assert found[0].startswith(f"{first} is 99, but must be")
+    assert found[0].startswith(f"{first} is 102, but must be")
     assert found[1].startswith(f"{second} was not received")
 
 
-def test_a_compass_heading_is_found_for_both_autopilots():
-    ardupilot, px4 = valid(ARDUPILOT) | {"EK3_SRC1_YAW": 1.0}, valid(PX4) | {"EKF2_EV_CTRL": 7.0}
-    assert "a compass would rotate it" in findings(ARDUPILOT, ardupilot)[0]
-    assert "8: yaw" in findings(PX4, px4)[0]
+@pytest.mark.parametrize(
+    ("profile", "yaw", "name", "value", "why"),
+    [
+        ("ardupilot", "cameras", "EK3_SRC2_YAW", 1.0, "a compass would rotate it"),
+        ("ardupilot", "none", "EK3_SRC2_YAW", 6.0, "grd sends no yaw"),
+        ("ardupilot", "none", "EK3_SRC2_VELXY", 6.0, "grd sends no velocity"),
+        ("ardupilot", "none", "EK3_SRC2_VELZ", 6.0, "grd sends no velocity"),
+        ("ardupilot", "none", "EK3_SRC_OPTIONS", 1.0, "a fly-away"),
+        ("ardupilot", "none", "EK3_SRC_OPTIONS", 3.0, "a fly-away"),
+        ("ardupilot", "none", "EK3_SRC1_POSXY", 6.0, "set 1 flies without grd"),
+        ("ardupilot", "none", "ARMING_CHECK", 1.0, "refuses arming before grd sends"),
+        ("px4", "cameras", "EKF2_EV_CTRL", 3.0, "8: yaw"),
+        ("px4", "none", "EKF2_EV_CTRL", 9.0, "8 (yaw) are not sent"),
+        ("px4", "none", "EKF2_EV_CTRL", 5.0, "4 (velocity)"),
+        ("px4", "none", "EKF2_MAG_TYPE", 5.0, "yaw from the compass"),
+    ],
+)
+def test_a_source_that_does_not_fit_what_is_sent_is_found(
+    profile: ProfileName, yaw: YawOutput, name: str, value: float, why: str
+):
+    required = required_parameters(profile, yaw)
+    (found,) = findings(required, valid(required) | {name: value})
+    assert found.startswith(f"{name} is {value:g}, but must be")
+    assert why in found
+
+
+def test_a_mask_without_the_check_of_visual_odometry_lets_the_drone_arm():
+    required = required_parameters("ardupilot", "none")
+    all_but_it = float((1 << 20) - 2 - (1 << 18))
+    assert findings(required, valid(required) | {"ARMING_CHECK": all_but_it}) == []
 
 
 @pytest.mark.parametrize(
@@ -54,6 +95,7 @@ def test_a_compass_heading_is_found_for_both_autopilots():
         (RequiredParameter("A", (6.0, 0.0)), [6.0, 0.0], [1.0, 5.9, 6.01]),
         (RequiredParameter("B", at_least=0.05, at_most=0.3), [0.05, 0.3, 0.30000001192], [0.04, 0.31]),
         (RequiredParameter("C", bits=9), [9.0, 11.0, 15.0], [1.0, 8.0, 6.0]),
+        (RequiredParameter("D", bits=1, bits_off=4), [1.0, 3.0, 9.0], [0.0, 5.0, 4.0]),
     ],
 )
 def test_values_ranges_and_bits(parameter: RequiredParameter, allowed: list[float], rejected: list[float]):
@@ -65,12 +107,13 @@ def test_values_ranges_and_bits(parameter: RequiredParameter, allowed: list[floa
     ("rules", "profile"), [(ArduPilotRules(), ARDUPILOT), (Px4Rules(), PX4)], ids=["ardupilot", "px4"]
 )
 def test_parameters_are_read_over_a_socket_and_missing_ones_are_named(rules: Any, profile: Profile):
-    values = valid(profile)
-    absent = profile.required[-1].name
+    required = required_parameters(profile.name, "none")
+    values = valid(required)
+    absent = required[-1].name
     sent = {name: value for name, value in values.items() if name != absent}
     with AutopilotSocket(rules, parameters=sent) as drone:
         connection = open_connection(Endpoint("udpout", "127.0.0.1", drone.port))
-        names = [parameter.name for parameter in profile.required]
+        names = [parameter.name for parameter in required]
         received = read_parameters(
             connection, names, (1, 1), (1, 197), integers_bytewise=profile.integers_bytewise, timeout_s=1.0
         )
@@ -78,7 +121,7 @@ def test_parameters_are_read_over_a_socket_and_missing_ones_are_named(rules: Any
     assert received.missing == [absent]
     assert received.values == pytest.approx(sent)
     assert received.frames >= len(sent)
-    assert len(findings(profile, received.values)) == 1
+    assert len(findings(required, received.values)) == 1
 
 
 def test_integers_of_px4_are_decoded_bytewise_also_negative_ones():

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
 from flow.stage import Settings, Stage
-from links.mavlink.profiles import PROFILES
+from links.mavlink.profiles import required_parameters
 from links.mavlink.transport.framing import packed, parse_frame
 from links.simulated.autopilot.autopilot import Autopilot, AutopilotSettings
 from links.simulated.sensors.vlp16_packets import encode_packet
@@ -62,10 +62,7 @@ class SendingLidar:
 
 def good_parameters(profile="ardupilot") -> dict[str, float]:
     """The best allowed value of each parameter of a profile."""
-    return {
-        w.name: w.values[0] if w.values else float(w.bits) or (w.at_least + w.at_most) / 2
-        for w in PROFILES[profile].required
-    }
+    return {w.name: w.best for w in required_parameters(profile, "none")}
 
 
 def flight() -> Autopilot:

@@ -132,11 +132,11 @@ def test_a_full_disk_fails_although_all_else_passes(bench, emulator, monkeypatch
 
 def test_a_wrong_parameter_and_an_inverted_axis_fail(bench, emulator):
     graph = bench.write(emulator.path)
-    parameters = good_parameters() | {"EK3_SRC1_YAW": 1.0}
+    parameters = good_parameters() | {"EK3_SRC2_YAW": 6.0}
     with SendingLidar(bench.ports["lidar"]), bench.drone(flight=OnTheGround(upside_down=True), parameters=parameters):
         found = results_of(graph)
     assert {n for n, v in found.items() if v.level is Level.FAIL} == {"autopilot parameters", "axes: accelerometer"}
-    assert "EK3_SRC1_YAW is 1, but must be 6" in found["autopilot parameters"].sentence
+    assert "EK3_SRC2_YAW is 6, but must be 1 or 2 or 3" in found["autopilot parameters"].sentence
     assert "z is measured as -z" in found["axes: accelerometer"].sentence
 
 

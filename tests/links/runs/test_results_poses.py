@@ -10,7 +10,7 @@ import pytest
 
 from flow.link import Run
 from links.evaluation.run_data import OutputKind, read_output
-from links.mavlink.gate import PoseLimits
+from links.mavlink.poses.gate import PoseLimits
 from links.runs.results import POSE_COVARIANCE_FILE, POSE_FILE, UNKNOWN_RAD2, Results
 from stages.fuse.motion_model import Motions
 from stages.fuse.pose_message import MapEstimate, Status, lost, pose
@@ -23,7 +23,7 @@ FULL, POSITION_ONLY = PoseState.FULL, PoseState.POSITION_ONLY
 
 
 def status(state, resets=0, track_id=1):
-    return Status(state, f"why {state.name}", 2 * S, track_id, resets, 1.5)
+    return Status(state, f"why {state.name}", 2 * S, track_id, resets, 1.5, rotation_ns=2 * S)
 
 
 def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.001, 0.002, 0.003, 0.01, 0.02, 0.03)):
@@ -34,7 +34,7 @@ def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.001, 0.002, 
 @pytest.fixture
 def run(tmp_path):
     def write(messages):
-        results = Results()
+        results = Results(yaw="cameras")
         results.open(Run(tmp_path, "made", "", ""))
         for message in messages:
             results.see("fuse.relative_pose", message, message.stamp_ns)
@@ -84,7 +84,7 @@ def test_a_pose_is_good_when_the_autopilot_gate_accepts_it(tmp_path):
         (PoseLimits(), [True, False, False]),
         (PoseLimits(position_sigma_m=0.5), [True, True, False]),
     ):
-        results = Results(limits=limits)
+        results = Results(limits=limits, yaw="cameras")
         results.open(Run(tmp_path, "made", "", ""))
         for message in (made(1.0, R), made(1.02, R, variances=wide), made(1.04, R, variances=askew)):
             results.see("fuse.relative_pose", message, message.stamp_ns)
@@ -121,7 +121,7 @@ def test_a_number_that_is_not_known_is_empty(run):
 
 
 def test_poses_are_counted_by_state_and_their_jumps_reported(tmp_path):
-    results = Results()
+    results = Results(yaw="cameras")
     results.open(Run(tmp_path, "made", "", ""))
     assert results.pose_states == {}
     unknown = pose(
@@ -139,4 +139,4 @@ def test_poses_are_counted_by_state_and_their_jumps_reported(tmp_path):
 
 @pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (SweptPulses, False)])
 def test_a_live_run_passes_on_only_the_contents_of_the_files(kind, wanted):
-    assert Results().wants(kind) is wanted
+    assert Results(yaw="cameras").wants(kind) is wanted

@@ -9,7 +9,7 @@ from synthetic_street import LOOKS_DOWN, LOOKS_UP, fisheye, foliage, street
 
 from stages.geometry.frames import Pose, quaternions_xyzw, rotation_from_rpy_deg, rotation_z
 from stages.geometry.lens import KannalaBrandt
-from stages.messages import CameraMount, DroneAttitude, Image, VehicleMotion
+from stages.messages import CameraMount, DroneTilt, Image, VehicleMotion
 from stages.vp import GreatCircleVp
 
 LENS = fisheye()
@@ -22,8 +22,13 @@ def image(grey, stamp_ns=5, camera_mount="vehicle", readout_s=0.0):
     return Image(stamp_ns=stamp_ns, frame_id=f"camera_{camera_mount}", grey=grey, readout_s=readout_s)
 
 
-def attitude(R, stamp_ns=5, rate_radps=STILL):
-    return DroneAttitude(stamp_ns=stamp_ns, R_odom_drone=R, angular_velocity_drone_radps=rate_radps)
+def tilt(R, stamp_ns=5, rate_radps=STILL, sigma_deg=1.0):
+    return DroneTilt(
+        stamp_ns=stamp_ns,
+        up_drone=R[2].copy(),
+        sigma_rad=np.radians(sigma_deg),
+        angular_velocity_drone_radps=rate_radps,
+    )
 
 
 def vehicle_vp(**settings):
@@ -102,19 +107,19 @@ def test_walls_at_an_odd_angle_are_a_second_frame():
     assert set(alone.frame) == {-1, 0}
 
 
-def test_a_drone_takes_roll_and_pitch_from_its_attitude_and_no_yaw():
+def test_a_drone_takes_the_vertical_from_its_tilt():
     R_world_drone = rotation_from_rpy_deg((14.0, -20.0, 50.0))
     grey = street(R_world_drone @ LOOKS_DOWN, LENS, up_m=6.0)
     answers = []
     for heading_deg in (0.0, 123.0):
         vp = drone_vp()
-        vp.on_attitude(attitude(rotation_z(np.radians(heading_deg)) @ R_world_drone))
+        vp.on_tilt(tilt(rotation_z(np.radians(heading_deg)) @ R_world_drone))
         answers.append(vp.on_image(image(grey, camera_mount="drone")))
         assert off_deg(answers[-1].direction @ R_world_drone.T, np.eye(3)).max() < 0.3
     np.testing.assert_allclose(answers[0].direction, answers[1].direction, atol=1e-6)
 
 
-def test_a_drone_without_attitude_finds_the_vertical_by_itself():
+def test_a_drone_without_tilt_finds_the_vertical_by_itself():
     R_world_drone = rotation_from_rpy_deg((14.0, -20.0, 50.0))
     grey = street(R_world_drone @ LOOKS_DOWN, LENS, up_m=6.0)
     found = drone_vp().on_image(image(grey, camera_mount="drone"))
@@ -122,17 +127,15 @@ def test_a_drone_without_attitude_finds_the_vertical_by_itself():
     assert off_deg(found.direction @ R_world_drone.T, np.eye(3)).max() < 0.3
 
 
-def test_an_attitude_is_extrapolated_to_the_image_and_ignored_when_old():
+def test_a_tilt_is_extrapolated_to_the_image_and_ignored_when_old():
     R_world_drone = rotation_from_rpy_deg((14.0, 0.0, 20.0))
     grey = street(R_world_drone @ LOOKS_DOWN, LENS, up_m=6.0)
     before = R_world_drone @ rotation_from_rpy_deg((-6.0, 0.0, 0.0))  # 0.1 s ago, rolling at 60 deg/s
-    vp = drone_vp(attitude_sigma_deg=0.3, search_deg=0.0)
-    vp.on_attitude(attitude(before, 900_000_000, np.array([np.radians(60.0), 0, 0])))
+    vp = drone_vp(search_deg=0.0)
+    vp.on_tilt(tilt(before, 900_000_000, np.array([np.radians(60.0), 0, 0]), sigma_deg=0.3))
     found = vp.on_image(image(grey, 1_000_000_000, "drone"))
     assert off_deg(found.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) < 0.3
-    late = vp.on_image(
-        image(grey, 1_200_000_000, "drone")
-    )  # without attitude the mount's z is the vertical, 14 deg off
+    late = vp.on_image(image(grey, 1_200_000_000, "drone"))  # without tilt the mount's z is the vertical, 14 deg off
     assert not len(late.direction) or off_deg(late.direction[:1] @ R_world_drone.T, [[0, 0, 1]]) > 1
 
 
@@ -193,11 +196,11 @@ def test_a_mask_of_all_pixels_is_rejected_with_a_suggestion(level):
         vehicle_vp(masked_px=(everything,)).on_image(image(level))
 
 
-def test_an_image_or_attitude_of_another_mount_is_rejected(level):
+def test_an_image_or_tilt_of_another_mount_is_rejected(level):
     with pytest.raises(ValueError, match="the image is of camera_drone"):
         vehicle_vp().on_image(image(level, camera_mount="drone"))
-    with pytest.raises(ValueError, match="attitude belongs to the drone"):
-        vehicle_vp().on_attitude(attitude(np.eye(3)))
+    with pytest.raises(ValueError, match="tilt belongs to the drone"):
+        vehicle_vp().on_tilt(tilt(np.eye(3)))
 
 
 @pytest.mark.parametrize("rate_dps", [(0.0, 0.0, 60.0), (40.0, -30.0, 20.0)])
@@ -207,7 +210,7 @@ def test_a_rolling_shutter_is_corrected_with_the_drones_rate(rate_dps):
     of = []
     for readout_s in (0.03, 0.0):
         vp = drone_vp()
-        vp.on_attitude(attitude(np.eye(3), rate_radps=rate))
+        vp.on_tilt(tilt(np.eye(3), rate_radps=rate))
         found = vp.on_image(image(rolled, camera_mount="drone", readout_s=readout_s))
         of.append(off_deg(found.direction[:3], np.eye(3)).max())
     assert of[0] < 0.15

@@ -13,9 +13,10 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink.autopilot_session import AutopilotSession
-from links.mavlink.gate import PoseLimits
 from links.mavlink.origin import OriginSender
-from links.mavlink.pose_sender import PoseSender
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.poses.independence import Independence
+from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.transport.connection import Address, Connection
 from links.mavlink.transport.framing import packed, parse_frame
 from links.mavlink.transport.stream_connection import StreamConnection
@@ -138,7 +139,7 @@ class SlowFlight:
         monkeypatch.setattr("links.mavlink.transport.stream_connection.time.monotonic", lambda: self.s)
         monkeypatch.setattr(AutopilotSession, "_run", lambda session: None)  # the test calls its steps
         self.connection: Connection = RatedBridge(self.line) if bridge else StreamConnection(self.line)
-        pose_sender = PoseSender(("odometry",), PoseLimits())
+        pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="cameras")
         self.session = AutopilotSession(
             self.connection,
             (1, 1),
@@ -148,6 +149,7 @@ class SlowFlight:
             None,
             lambda: self.now_ns,
             ("/autopilot/rx", "/autopilot/tx"),
+            Independence(),
         )
         self._mav = mavlink.MAVLink(None, 1, 1)
         self._steps = 0

@@ -1,9 +1,10 @@
 """Gate of poses to the autopilot: a pose that could cause a wrong flight is rejected with a reason.
 
-All messages need the rotation, including LANDING_TARGET, which contains the vehicle's position in the drone's axes.
-Therefore a position without rotation is never sent. An autopilot arms with a pose that has a wrong yaw branch (90 deg)
-and crashes, so an unresolved branch is rejected regardless of its covariance. The rotation sigma is the largest about
-any axis: the autopilot takes roll and pitch from its own gyros, but an uncertain tilt indicates an invalid rotation.
+This gate is of poses with rotation: LANDING_TARGET, which contains the vehicle's position in the drone's axes, and
+poses with a yaw by cameras. Positions without yaw: `position_gate.py`. An autopilot arms with a pose that has a wrong
+yaw branch (90 deg) and crashes, so an unresolved branch is rejected regardless of its covariance. The rotation sigma is
+the largest about any axis: the autopilot takes roll and pitch from its own gyros, but an uncertain tilt indicates an
+invalid rotation.
 
 Source: ours; what ArduPilot and PX4 accept: `profiles.py`.
 """
@@ -42,6 +43,12 @@ class RejectReason(enum.Enum):
     NOT_NEWER = "not newer than the last sent pose"
     AUTOPILOT_SILENT = "autopilot silent"
     LINK_LATE = "link too slow"
+    YAW_NOT_MEASURED = "yaw not measured by cameras"
+    ODOM_YAW = "yaw of autopilot's axes unknown"
+    ODOM_YAW_SIGMA = "yaw of autopilot's axes uncertain"
+    ODOM_YAW_RESET = "autopilot reset its yaw"
+    REJECTED_BY_AUTOPILOT = "autopilot rejects the position"
+    NO_ATTITUDE = "no attitude from autopilot"
 
 
 class PoseLimits(BaseModel):
@@ -51,7 +58,8 @@ class PoseLimits(BaseModel):
 
     position_sigma_m: float = Field(default=0.35, gt=0, le=5)  # 95 % are within 2.8 sigma, 1 m
     rotation_sigma_deg: float = Field(default=5.0, gt=0, le=15)
-    velocity_sigma_mps: float = Field(default=0.5, gt=0, le=5)  # above it the pose is sent without velocity
+    odom_yaw_sigma_deg: float = Field(default=2.0, gt=0, le=15)  # of the autopilot's axes, for positions without yaw
+    rotation_age_s: float = Field(default=2.0, gt=0, le=10)  # of the rotation by cameras, for poses with yaw
     age_s: float = Field(default=0.15, gt=0, le=0.3)  # of the pose at the time of sending
 
 
@@ -76,7 +84,19 @@ def reject_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> Reject
         return RejectReason.POSITION_SIGMA
     if math.degrees(rotation_rad) > limits.rotation_sigma_deg:
         return RejectReason.ROTATION_SIGMA
-    age_ns = now_ns - pose.stamp_ns
+    return age_reason(pose.stamp_ns, now_ns, limits)
+
+
+def yaw_reason(pose: RelativePose, limits: PoseLimits) -> RejectReason | None:
+    """Why the yaw of a pose must not be sent; None: cameras measured it recently."""
+    measured_ns = pose.rotation_ns
+    old = measured_ns is None or pose.stamp_ns - measured_ns > 1e9 * limits.rotation_age_s
+    return RejectReason.YAW_NOT_MEASURED if old else None
+
+
+def age_reason(stamp_ns: int, now_ns: int, limits: PoseLimits) -> RejectReason | None:
+    """Why a pose of this time must not be sent now."""
+    age_ns = now_ns - stamp_ns
     if age_ns > 1e9 * limits.age_s:
         return RejectReason.OLD
     return RejectReason.FUTURE if age_ns < -AHEAD_NS else None
@@ -102,18 +122,6 @@ def pose_sigmas(*covariances: NDArray[np.float64]) -> tuple[float, float] | None
     blocks = np.concatenate([C[:, :3, :3], C[:, 3:, 3:]])
     worst = np.linalg.eigvalsh(blocks)[:, -1].tolist()
     return math.sqrt(max(worst[: len(C)])), math.sqrt(max(worst[len(C) :]))
-
-
-def velocity_to_send(pose: PoseEstimate, limits: PoseLimits) -> NDArray[np.float64] | None:
-    """The drone's velocity over ground in map axes; None: invalid, or its sigma exceeds the limit."""
-    velocity, covariance = pose.velocity_map_mps, pose.velocity_covariance
-    if not (np.isfinite(velocity).all() and np.isfinite(covariance).all()):
-        return None
-    if min(np.diagonal(covariance).tolist()) <= 0 or not _is_symmetric(covariance):
-        return None
-    eigenvalues = np.linalg.eigvalsh(covariance)
-    good = eigenvalues[0] >= 0 and math.sqrt(eigenvalues[-1]) <= limits.velocity_sigma_mps
-    return velocity if good else None
 
 
 def _is_symmetric(covariances: NDArray[np.float64]) -> bool:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import pytest
 
-from links.mavlink.gate import PoseLimits
-from links.mavlink.pose_sender import TEXT_BYTES, PoseSender
+from links.mavlink.poses.gate import PoseLimits, RejectReason
+from links.mavlink.poses.pose_sender import PoseSender
+from links.mavlink.poses.status_texts import TEXT_BYTES, fitted
 from stages.messages import PoseState
 from tests.links.mavlink.mavlink_poses import HOST0, MS, good_pose
 
@@ -16,7 +18,7 @@ class Output:
     """Sends poses at a rate and keeps the sent counters and texts."""
 
     def __init__(self, **settings: Any) -> None:
-        self.pose_sender = PoseSender(("odometry",), PoseLimits(), **settings)
+        self.pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="cameras", **settings)
         self.now_ns = HOST0
         self.counters: list[int] = []
         self.texts: list[tuple[int, str]] = []
@@ -99,71 +101,87 @@ def test_a_pose_that_is_not_newer_is_not_sent_and_stops_nothing():
 
 def test_stopping_and_resuming_is_reported():
     output = Output()
-    for _ in range(60):
+    for _ in range(300):
         output.pose()
-    for _ in range(60):
-        output.pose(state=PoseState.AMBIGUOUS, reason="street and side street are similar")
-    for _ in range(60):
+    for _ in range(300):
+        output.pose(state=PoseState.AMBIGUOUS, reason="street and side street are similar; 3 of 4")
+    for _ in range(300):
         output.pose()
     severities = {text: severity for severity, text in output.texts}
     assert severities["grd: STOPPED: ambiguous rotation"] == 2  # critical
     assert severities["grd: sending poses"] == 5
     assert severities["grd: AMBIGUOUS: street and side street are similar"] == 4
-    assert [text for _, text in output.texts].index(
-        "grd: STOPPED: ambiguous rotation"
-    ) == 2  # before the text of the state
+    texts = [text for _, text in output.texts]
+    assert texts.index("grd: STOPPED: ambiguous rotation") < texts.index(
+        "grd: AMBIGUOUS: street and side street are similar"
+    )
     assert output.pose_sender.sending
 
 
 def test_missing_poses_are_noticed_without_a_pose():
     output = Output()
-    output.pose()
-    output.wait(2000)
+    for _ in range(60):
+        output.pose()
+    output.wait(4000)
     assert (2, "grd: STOPPED: no poses sent") in output.texts
     assert not output.pose_sender.sending
 
 
-def test_flapping_states_send_at_most_two_texts_per_second_and_end_with_the_current_state():
+def test_flapping_states_send_no_text_of_their_own_and_the_last_state_is_reported():
     output = Output()
-    for i in range(500):
+    for i in range(1500):  # 30 s
         output.pose(state=PoseState.FULL if i % 2 else PoseState.LOST)
-    assert len(output.texts) <= 21  # 10 s
-    for _ in range(100):
+    assert output.texts == []
+    for _ in range(300):
         output.pose()
-    output_texts = [text for _, text in output.texts if "sending" in text or "STOPPED" in text]
-    assert output_texts[-1] == "grd: sending poses"
-    assert [text for _, text in output.texts if "FULL" in text or "LOST" in text][-1].startswith("grd: FULL")
+    assert [text for _, text in output.texts] == ["grd: sending poses", "grd: FULL: lidar and both cameras"]
+
+
+def test_at_most_one_text_in_two_seconds_is_sent():
+    output, times_ns = Output(), []
+    for i in range(3000):  # 60 s, a change each 1.2 s
+        before = len(output.texts)
+        output.pose(state=PoseState.FULL if i // 60 % 2 else PoseState.LOST)
+        times_ns += [output.now_ns] * (len(output.texts) - before)
+    assert len(times_ns) > 10
+    assert min(b - a for a, b in itertools.pairwise(times_ns)) >= 2_000 * MS
 
 
 def test_a_text_that_could_not_be_sent_is_kept_unless_a_newer_one_replaces_it():
     output = Output()
-    output.pose()
-    output.wait(1000)  # sent: sending, FULL, STOPPED, one after the other
-    output.wait(1000)
-    output.pose()
-    output.wait(250)
+    for _ in range(300):
+        output.pose()
     pose_sender, now_ns = output.pose_sender, output.now_ns + 600 * MS
     (first,) = pose_sender.due_texts(now_ns)
     assert first.text == "grd: STOPPED: no poses sent"
-    pose_sender.on_text_not_sent()
+    pose_sender.texts.on_not_sent()
     (repeated,) = pose_sender.due_texts(now_ns + MS)  # immediately
     assert repeated.text == first.text
-    pose_sender.on_text_not_sent()
-    output.now_ns = now_ns
-    output.pose()
-    assert output.texts[-1][1] == "grd: sending poses"
 
 
 def test_without_messages_nothing_is_sent_or_stopped():
-    pose_sender = PoseSender((), PoseLimits())
+    pose_sender = PoseSender((), PoseLimits(), yaw="cameras")
     assert pose_sender.messages(good_pose(), HOST0) == []
     assert not pose_sender.sending
     texts = [m.text for i in range(40) for m in pose_sender.due_texts(HOST0 + 100 * i * MS)]
     assert texts == ["grd: FULL: lidar and both cameras"]
 
 
-def test_a_text_fits_its_field_for_any_reason():
-    output = Output()
-    output.pose(state=PoseState.LOST, reason="Straße " * 30)
-    assert len(output.texts[0][1]) == TEXT_BYTES
-    assert output.texts[0][1].startswith("grd: LOST: Stra?e")
+@pytest.mark.parametrize("reason", RejectReason)
+def test_each_reason_for_stopping_fits_the_field(reason: RejectReason):
+    assert fitted(f"STOPPED: {reason.value}") == f"grd: STOPPED: {reason.value}".encode()
+
+
+@pytest.mark.parametrize(
+    ("text", "sent"),
+    [
+        ("Straße", b"grd: Stra?e"),
+        ("x" * 60, b"grd: " + b"x" * 45),
+        ("a " * 40, b"grd:" + b" a" * 23),
+        ("x" * 45 + " y", b"grd: " + b"x" * 45),
+        ("x" * 20 + " " + "y" * 40, b"grd: " + b"x" * 20),
+    ],
+)
+def test_a_text_ends_at_a_word_within_its_field(text: str, sent: bytes):
+    assert fitted(text) == sent
+    assert len(sent) <= TEXT_BYTES

@@ -1,12 +1,13 @@
-"""MAVLink messages of a relative pose: ODOMETRY, VISION_POSITION_ESTIMATE and LANDING_TARGET.
+"""MAVLink messages of a pose with rotation: ODOMETRY, VISION_POSITION_ESTIMATE and LANDING_TARGET.
 
 ODOMETRY and VISION_POSITION_ESTIMATE contain the drone's pose in the vehicle's *start* frame, which is static while the
 vehicle drives, as an EKF requires. Its x axis is the vehicle's forward direction at the start, not north: LOCAL_FRD.
-LANDING_TARGET contains the vehicle's position in the drone's body frame.
+Positions without yaw: `position_messages.py`. LANDING_TARGET contains the vehicle's position in the drone's body frame.
 
     p_drone_vehicle = -R_vehicle_drone^T t_vehicle_drone
 
-Unknown values are NaN, never 0: an EKF fuses a velocity of zero, and the drone drifts away.
+Unknown values are NaN, never 0: an EKF fuses a velocity of zero, and the drone drifts away. The velocity is never sent:
+ArduPilot fuses it also when its position comes from another source (EK3_SRC_OPTIONS bit 0), in another frame.
 
 quality: 100 for a sigma of 0, 1 at the limits (`PoseLimits`), by the worse of position and rotation; 0 would mean
 unknown. time_usec is host time (microseconds since 1970), the same as in TIMESYNC replies.
@@ -20,24 +21,20 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from links.mavlink.gate import PoseLimits, velocity_to_send, worst_sigmas
 from links.mavlink.ned_frd import (
     flip_yz,
     rpy_from_R_odom_drone,
     upper_from_pose_covariance,
-    upper_from_velocity_covariance,
     wxyz_from_R_odom_drone,
 )
+from links.mavlink.poses.gate import PoseLimits, worst_sigmas
 from links.mavlink.transport.framing import SEQUENCE, dialect
 from stages.messages import PoseEstimate, RelativePose
 
 LOCAL_FRD, BODY_FRD = 20, 12  # MAV_FRAME: the only ones that ArduPilot accepts in ODOMETRY
 VIO = 3  # MAV_ESTIMATOR_TYPE_VIO: accepted by PX4, unlike LIDAR
 VISION_OTHER = 3  # LANDING_TARGET_TYPE
-UNKNOWN = [math.nan] * 3
+UNKNOWN, UNKNOWN_COVARIANCE = [math.nan] * 3, [math.nan] * 21
 
 
 def quality_percent(pose: PoseEstimate, limits: PoseLimits) -> int:
@@ -53,17 +50,16 @@ def odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits) -> Any:
     """ODOMETRY of a pose that the gate has accepted."""
     estimate = _estimate(pose)
     R = estimate.R_map_drone
-    velocity = velocity_to_send(estimate, limits)
     return dialect().MAVLink_odometry_message(
         pose.stamp_ns // 1000,
         LOCAL_FRD,
         BODY_FRD,
         *flip_yz(estimate.xyz_map_m),
         wxyz_from_R_odom_drone(R),
-        *(UNKNOWN if velocity is None else flip_yz(R.T @ velocity)),
+        *UNKNOWN,  # velocity
         *UNKNOWN,  # angular velocity: the autopilot's gyros are better
         upper_from_pose_covariance(estimate.map_covariance, R),
-        _velocity_upper(estimate.velocity_covariance if velocity is not None else None, R),
+        UNKNOWN_COVARIANCE,
         reset_counter % SEQUENCE,
         VIO,
         quality_percent(estimate, limits),
@@ -115,12 +111,3 @@ def _estimate(pose: RelativePose) -> PoseEstimate:
     if not isinstance(pose.estimate, PoseEstimate):
         raise ValueError("the pose has no rotation: the gate must reject it")
     return pose.estimate
-
-
-def _velocity_upper(covariance_start: NDArray[np.float64] | None, R_map_drone: NDArray[np.float64]) -> list[float]:
-    """21 numbers, drone axes; those of the angular velocity are NaN, and all if the velocity is unknown."""
-    if covariance_start is None:
-        return [math.nan] * 21
-    covariance = np.full((6, 6), np.nan)
-    covariance[3:, 3:] = R_map_drone.T @ covariance_start @ R_map_drone
-    return upper_from_velocity_covariance(covariance)

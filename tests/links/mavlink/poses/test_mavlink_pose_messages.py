@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega
 
-from links.mavlink.gate import PoseLimits
-from links.mavlink.pose_messages import landing_target, odometry, quality_percent, vision_position_estimate
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.poses.pose_messages import landing_target, odometry, quality_percent, vision_position_estimate
 from links.mavlink.readers import read_odometry
 from links.mavlink.transport.framing import packed, parse_frame
 from stages.geometry.frames import rotation_from_rpy_deg
@@ -35,11 +35,10 @@ def test_odometry_is_the_drone_in_the_start_frame_forward_right_down():
     assert (message.reset_counter, message.time_usec) == (7, good_pose().stamp_ns // 1000)
 
 
-def test_a_drone_facing_left_has_yaw_minus_90_deg_and_its_velocity_is_in_its_body():
+def test_a_drone_facing_left_has_yaw_minus_90_deg():
     R = rotation_from_rpy_deg((0.0, 0.0, 90.0))  # counter-clockwise positions from above
     message = over_the_wire(odometry(good_pose(R_map_drone=R, R_vehicle_drone=R), 0, LIMITS))
     np.testing.assert_allclose(message.q, [math.sqrt(0.5), 0, 0, -math.sqrt(0.5)], atol=1e-6)
-    np.testing.assert_allclose([message.vx, message.vy, message.vz], [0, 1, 0], atol=1e-6)  # 1 m/s to its right
     estimate = over_the_wire(vision_position_estimate(good_pose(R_map_drone=R), 3))
     np.testing.assert_allclose([estimate.roll, estimate.pitch, estimate.yaw], [0, 0, -math.pi / 2], atol=1e-6)
     assert (estimate.x, estimate.y, estimate.z, estimate.reset_counter) == (101.0, -2.0, -10.0, 3)
@@ -55,9 +54,9 @@ ANGLES = st.tuples(st.floats(-40, 40), st.floats(-40, 40), st.floats(-180, 180))
 SPOTS = st.tuples(*[st.floats(-200, 200)] * 3)
 
 
-@given(ANGLES, SPOTS, SPOTS, st.integers(0, 10_000))
+@given(ANGLES, SPOTS, st.integers(0, 10_000))
 @settings(max_examples=50, deadline=None)
-def test_a_sent_pose_is_read_back_unchanged(rpy_deg: Any, xyz: Any, velocity: Any, seed: int):
+def test_a_sent_pose_is_read_back_unchanged(rpy_deg: Any, xyz: Any, seed: int):
     rng = np.random.default_rng(seed)
     root = rng.normal(0, 0.05, (6, 6))
     covariance = root @ root.T + 1e-4 * np.eye(6)
@@ -65,15 +64,14 @@ def test_a_sent_pose_is_read_back_unchanged(rpy_deg: Any, xyz: Any, velocity: An
         xyz_map_m=np.array(xyz),
         R_map_drone=rotation_from_rpy_deg(rpy_deg),
         map_covariance=covariance,
-        velocity_map_mps=np.array(velocity),
     )
     message = over_the_wire(odometry(pose, 0, LIMITS))
     message.rollspeed = message.pitchspeed = message.yawspeed = 0.0  # the reader needs finite values
+    message.vx = message.vy = message.vz = 0.0
     read = read_odometry(message, pose.stamp_ns)
     np.testing.assert_allclose(read.xyz_odom_m, xyz, rtol=1e-6, atol=1e-5)
     assert pose.R_map_drone is not None
     np.testing.assert_allclose(read.R_odom_drone, pose.R_map_drone, atol=1e-6)
-    np.testing.assert_allclose(pose.R_map_drone @ read.velocity_drone_mps, velocity, rtol=1e-5, atol=1e-4)
     assert read.pose_covariance is not None
     np.testing.assert_allclose(read.pose_covariance, covariance, rtol=1e-4, atol=1e-6)
 
@@ -87,31 +85,12 @@ def test_the_local_frame_is_static_while_the_vehicle_drives_below_a_hovering_dro
     assert positions == {(5.0, 0.0, -10.0)}
 
 
-@pytest.mark.parametrize(
-    "unknown",
-    [
-        {"velocity_map_mps": np.array([1.0, math.nan, 0.0])},
-        {"velocity_covariance": np.diag([1.0, 0.01, 0.01])},  # 1 m/s: above the limit
-        {"velocity_covariance": np.zeros((3, 3))},
-        {"velocity_covariance": np.diag([math.inf] * 3)},
-        {"velocity_covariance": np.array([[0.01, 0.1, 0], [0.1, 0.01, 0], [0, 0, 0.01]])},  # not positive
-    ],
-)
-def test_an_unknown_velocity_is_nan_and_never_zero(unknown: Any):
-    message = over_the_wire(odometry(good_pose(**unknown), 0, LIMITS))
+def test_velocities_are_never_sent_and_are_nan_and_not_zero():
+    message = over_the_wire(odometry(good_pose(), 0, LIMITS))
     assert all(math.isnan(v) for v in (message.vx, message.vy, message.vz))
-    assert math.isnan(message.velocity_covariance[0])
-    assert np.isfinite(message.pose_covariance).all()
-
-
-def test_angular_velocity_is_never_sent_and_velocity_variances_are():
-    R = rotation_from_rpy_deg((0.0, 0.0, 90.0))
-    pose = good_pose(R_map_drone=R, velocity_covariance=np.diag([0.01, 0.04, 0.09]))
-    message = over_the_wire(odometry(pose, 0, LIMITS))
     assert all(math.isnan(v) for v in (message.rollspeed, message.pitchspeed, message.yawspeed))
-    variances = [message.velocity_covariance[i] for i in (0, 6, 11)]
-    np.testing.assert_allclose(variances, [0.04, 0.01, 0.09], rtol=1e-6)  # along the body's forward and right
-    assert all(math.isnan(message.velocity_covariance[i]) for i in (15, 18, 20))
+    assert all(math.isnan(v) for v in message.velocity_covariance)
+    assert np.isfinite(message.pose_covariance).all()
 
 
 def test_quality_decreases_from_100_to_1_at_the_limit_by_the_worse_sigma():

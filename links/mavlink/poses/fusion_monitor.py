@@ -1,0 +1,85 @@
+"""Whether the autopilot's EKF rejects the pose that it is sent, by its own status messages.
+
+EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS have the innovation test ratio of the horizontal position: above 1 it
+is rejected. Neither says which source is meant, so the ratio counts only while poses are sent. The stream is not useful
+then, and a reset to a pose that contradicts the autopilot's own sensors may be wrong. What follows is a setting:
+
+    stop     no poses until the ratio was below RESUME for RESUME_NS (default)
+    reset    the reset counter changes, so that the EKF takes the pose; after MAX_RESETS in a row as `stop`
+    report   only a text and a counter
+
+Source: ours; ArduPilot NavEKF3_core::send_status_report (square roots of ratios), FS_EKF_THRESH 0.8 for 1 s;
+https://mavlink.io/en/messages/common.html#ESTIMATOR_STATUS.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+OnRejection = Literal["stop", "reset", "report"]
+
+REJECTED_NS = 600_000_000  # ratio above 1 for so long, before ArduPilot's failsafe of 1 s
+RESUME, RESUME_NS = 0.5, 3_000_000_000
+MAX_RESETS = 3
+SETTLED_NS = 5_000_000_000  # without rejection, after which resets are counted anew
+STALE_NS = 2_000_000_000  # between two status messages: no statement in between
+
+
+class FusionMonitor:
+    """Evaluates status messages in order."""
+
+    def __init__(self, on_rejection: OnRejection) -> None:
+        self.rejections = 0
+        """How often a rejection began."""
+        self.stopped = False
+        """Whether no pose may be sent."""
+        self._action: OnRejection = on_rejection
+        self._resets = 0
+        self._above_ns: int | None = None  # since when the ratio is above 1
+        self._below_ns: int | None = None  # since when it is below RESUME
+        self._newest_ns: int | None = None
+        self._rejected_ns: int | None = None
+
+    def add(self, message: Any, sending: bool, now_ns: int) -> tuple[str, bool] | None:
+        """Add a status message. (text, whether to change the reset counter) when a rejection begins."""
+        ratio = _ratio(message)
+        if ratio is None:
+            return None
+        if self._newest_ns is None or now_ns - self._newest_ns > STALE_NS:
+            self._above_ns = self._below_ns = None
+        self._newest_ns = now_ns
+        self._above_ns = (self._above_ns or now_ns) if ratio > 1 and (sending or self.stopped) else None
+        self._below_ns = (self._below_ns or now_ns) if ratio < RESUME else None
+        if self.stopped and self._below_ns is not None and now_ns - self._below_ns >= RESUME_NS:
+            self.stopped = False
+        if self.stopped or self._above_ns is None or now_ns - self._above_ns < REJECTED_NS:
+            return None
+        return self._reject(ratio, now_ns)
+
+    def on_boot(self) -> None:
+        """The autopilot has booted."""
+        self.stopped, self._resets = False, 0
+        self._above_ns = self._below_ns = self._newest_ns = self._rejected_ns = None
+
+    def _reject(self, ratio: float, now_ns: int) -> tuple[str, bool]:
+        settled = self._rejected_ns is None or now_ns - self._rejected_ns > SETTLED_NS
+        self._resets = 0 if settled else self._resets
+        self.rejections += 1
+        self._rejected_ns, self._above_ns = now_ns, None
+        reset = self._action == "reset" and self._resets < MAX_RESETS
+        self._resets += reset
+        self.stopped = self._action != "report" and not reset
+        return f"autopilot rejects the position ({ratio:.1f})", reset
+
+
+def _ratio(message: Any) -> float | None:
+    """Test ratio of the horizontal position, 1 at the gate; None: not such a message, or not known."""
+    kind = message.get_type()
+    if kind == "EKF_STATUS_REPORT":
+        value = message.pos_horiz_variance
+    elif kind == "ESTIMATOR_STATUS":
+        value = message.pos_horiz_ratio
+    else:
+        return None
+    return float(value) if math.isfinite(value) and value >= 0 else None

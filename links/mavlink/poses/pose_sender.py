@@ -1,0 +1,186 @@
+"""Messages and texts to the autopilot about the poses: which, when, and with which reset counter. No socket, no clock.
+
+`yaw` decides what ODOMETRY and VISION_POSITION_ESTIMATE contain, and which yaw source the autopilot needs:
+
+    none      a position in the autopilot's own axes; its yaw comes from its compass. It needs no rotation of the drone
+    cameras   a pose in `map` with yaw, while cameras measure it; its yaw comes from grd alone
+
+The reset counter is incremented with every jump of the pose, every change of the drone, and after every pause that the
+autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is arbitrary: after a
+restart of grd it should differ from the previous one.
+
+Texts: `status_texts.py`. Rejection of the pose by the autopilot: `fusion_monitor.py`.
+
+Source: ours; ArduPilot AP_VisualOdom (300 ms health), PX4 EKF2 EV_MAX_INTERVAL (200 ms to start, 400 ms to stop).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from links.mavlink.poses.fusion_monitor import FusionMonitor, OnRejection
+from links.mavlink.poses.gate import PoseLimits, RejectReason, reject_reason
+from links.mavlink.poses.pose_messages import landing_target, odometry, vision_position_estimate
+from links.mavlink.poses.position_gate import gate_reason
+from links.mavlink.poses.position_messages import OwnAttitude, position_odometry, position_vision_estimate
+from links.mavlink.poses.status_texts import StatusTexts
+from links.mavlink.profiles import ProfileName, YawOutput
+from links.mavlink.transport.framing import SEQUENCE
+from stages.messages import RelativePose
+
+PoseMessage = Literal["odometry", "vision_position_estimate", "landing_target"]
+
+SILENCE_NS = 300_000_000  # the autopilot's timeout for poses
+ATTITUDE_NS = 1_000_000_000  # largest age of the autopilot's attitude
+
+
+@dataclass(frozen=True, slots=True)
+class SentPose:
+    """The pose that was sent last."""
+
+    at_ns: int
+    stamp_ns: int
+    resets: int
+    track_id: int
+
+
+class PoseSender:
+    """Converts poses to messages, or rejects them and reports why. Call `due_texts` about ten times per second."""
+
+    def __init__(
+        self,
+        kinds: Sequence[PoseMessage],
+        limits: PoseLimits,
+        reset_counter: int = 0,
+        *,
+        yaw: YawOutput,
+        profile: ProfileName = "ardupilot",
+        on_rejection: OnRejection = "stop",
+    ) -> None:
+        self.rejected: Counter[RejectReason] = Counter()
+        self.reset_counter = reset_counter % SEQUENCE
+        self._kinds: tuple[PoseMessage, ...] = tuple(kinds)
+        self._limits = limits
+        self._yaw: YawOutput = yaw
+        self._profile: ProfileName = profile
+        self._attitude: OwnAttitude | None = None
+        self._poses_sent = self._yaw_reset = False  # since the autopilot's boot
+        self._odom_yaw_rad: float | None = None  # of the newest sent position
+        self._other_boot_rad: float | None = None  # yaw of its axes before its newest boot: not valid any more
+        self._sent: SentPose | None = None
+        self._incremented = False  # the reset counter, since `_sent`
+        self._sending = False
+        self.texts = StatusTexts()
+        self.fusion = FusionMonitor(on_rejection)
+
+    @property
+    def sending(self) -> bool:
+        """Whether poses are being sent."""
+        return self._sending
+
+    def messages(self, pose: RelativePose, now_ns: int, link_reason: RejectReason | None = None) -> list[Any]:
+        """Messages of one pose; none if the gate rejects it, or with a `link_reason`. Then call `on_sent`."""
+        self.texts.on_state(pose.state, pose.reason, now_ns)
+        reasons: dict[PoseMessage, RejectReason | None] = {
+            kind: self._reason(kind, pose, now_ns) or link_reason for kind in self._kinds
+        }
+        self.rejected.update({reason for reason in reasons.values() if reason is not None})
+        sendable: list[PoseMessage] = [kind for kind, reason in reasons.items() if reason is None]
+        if not sendable:
+            reason = next(iter(reasons.values()), None)
+            if reason is not None and reason is not RejectReason.NOT_NEWER:  # a newer one was sent
+                self._stop(reason.value)
+            return []
+        self._update_reset_counter(pose, now_ns)
+        return [self._message(kind, pose) for kind in sendable]
+
+    def on_attitude(self, attitude: OwnAttitude) -> None:
+        """The autopilot's own attitude: positions for ArduPilot contain it."""
+        self._attitude = attitude
+
+    def on_yaw_reset(self) -> None:
+        """The autopilot has reset its yaw. Once its telemetry contains our poses, its axes are then unknown."""
+        self._yaw_reset = self._yaw_reset or self._poses_sent
+
+    def on_boot(self) -> None:
+        """The autopilot has booted: its axes are others, and their yaw has to be learnt again before a pose is sent."""
+        self._poses_sent = self._yaw_reset = False
+        self._other_boot_rad, self._odom_yaw_rad = self._odom_yaw_rad, None
+        self.fusion.on_boot()
+
+    def on_estimator_status(self, message: Any, now_ns: int) -> None:
+        """EKF_STATUS_REPORT or ESTIMATOR_STATUS of the autopilot; others are ignored."""
+        rejected = self.fusion.add(message, self._sending, now_ns)
+        if rejected is not None:
+            text, reset = rejected
+            self.texts.warn(text)
+            if reset:
+                self.reset_counter = (self.reset_counter + 1) % SEQUENCE
+
+    def on_sent(self, pose: RelativePose, now_ns: int) -> None:
+        """A message of this pose was sent."""
+        self._sent = SentPose(now_ns, pose.stamp_ns, pose.resets, pose.track_id)
+        self._incremented, self._poses_sent, self._odom_yaw_rad = False, True, pose.odom_yaw_rad
+        if not self._sending:
+            self._sending = True
+            self.texts.on_sending(now_ns)
+
+    def due_texts(self, now_ns: int) -> list[Any]:
+        """The STATUSTEXT that is due, if any. Also detects that no pose has been sent for SILENCE_NS."""
+        if self._sending and self._sent is not None and now_ns - self._sent.at_ns > SILENCE_NS:
+            self._stop("no poses sent")
+        return self.texts.due(now_ns)
+
+    def _stop(self, reason: str) -> None:
+        if self._sending:
+            self._sending = False
+            self.texts.on_stopped(reason)
+
+    def _update_reset_counter(self, pose: RelativePose, now_ns: int) -> None:
+        last = self._sent
+        if last is None or self._incremented:
+            return
+        if now_ns - last.at_ns > SILENCE_NS or pose.resets != last.resets or pose.track_id != last.track_id:
+            self.reset_counter = (self.reset_counter + 1) % SEQUENCE
+            self._incremented = True
+
+    def _reason(self, kind: PoseMessage, pose: RelativePose, now_ns: int) -> RejectReason | None:
+        if kind == "landing_target":
+            reason = reject_reason(pose, now_ns, self._limits)
+        else:
+            reason = gate_reason(pose, now_ns, self._limits, self._yaw)
+            if reason is None and self._yaw == "none":
+                reason = self._axes_reason(pose, now_ns)
+        if reason is None and kind != "landing_target" and self.fusion.stopped:
+            reason = RejectReason.REJECTED_BY_AUTOPILOT
+        if reason is None and self._sent is not None and pose.stamp_ns <= self._sent.stamp_ns:
+            reason = RejectReason.NOT_NEWER
+        return reason
+
+    def _axes_reason(self, pose: RelativePose, now_ns: int) -> RejectReason | None:
+        """Why the autopilot's axes are not those that were learnt. The first ATTITUDE after a silence shows a boot."""
+        own = self._attitude
+        if own is None or now_ns - own.arrival_ns > ATTITUDE_NS:
+            return RejectReason.NO_ATTITUDE
+        if self._yaw_reset:
+            return RejectReason.ODOM_YAW_RESET
+        return RejectReason.ODOM_YAW if pose.odom_yaw_rad == self._other_boot_rad else None
+
+    def _message(self, kind: PoseMessage, pose: RelativePose) -> Any:
+        if kind != "landing_target" and self._yaw == "none":
+            return self._position_message(kind, pose)
+        if kind == "odometry":
+            return odometry(pose, self.reset_counter, self._limits)
+        if kind == "vision_position_estimate":
+            return vision_position_estimate(pose, self.reset_counter)
+        return landing_target(pose)
+
+    def _position_message(self, kind: PoseMessage, pose: RelativePose) -> Any:
+        own = self._attitude if self._profile == "ardupilot" else None
+        if kind == "odometry":
+            return position_odometry(pose, self.reset_counter, self._limits, own)
+        assert own is not None  # PX4 has no VISION_POSITION_ESTIMATE
+        return position_vision_estimate(pose, self.reset_counter, own)

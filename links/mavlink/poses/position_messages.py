@@ -1,0 +1,86 @@
+"""Positions without yaw as ODOMETRY and VISION_POSITION_ESTIMATE, in the autopilot's own north-aligned axes.
+
+ArduPilot   frame LOCAL_FRD, the only one it accepts; the position is taken as it is. Rotation: its own attitude with a
+            yaw variance of pi^2. The quaternion is checked for NaN nowhere, and if EK3_SRCn_YAW is 6 by mistake, its
+            own yaw does the least harm
+PX4         frame LOCAL_NED: with LOCAL_FRD it would rotate the position by the message's rotation. Rotation: NaN
+both        velocity NaN, which they skip
+
+Source: ArduPilot GCS_MAVLINK::handle_odometry, AP_VisualOdom_MAV::handle_pose_estimate, NavEKF3_core::writeExtNavData
+(checks position and its error for NaN, not the rotation); PX4 MavlinkReceiver::handle_message_odometry,
+Ekf::controlEvPosFusion (LOCAL_FRAME_NED, LOCAL_FRAME_FRD), Ekf::controlEvYawFusion.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from links.mavlink.ned_frd import R_odom_drone_from_rpy, flip_yz, upper_from_pose_covariance, wxyz_from_R_odom_drone
+from links.mavlink.poses.gate import PoseLimits
+from links.mavlink.poses.pose_messages import BODY_FRD, LOCAL_FRD, UNKNOWN, UNKNOWN_COVARIANCE, VIO
+from links.mavlink.poses.position_gate import odom_position, position_quality_percent
+from links.mavlink.transport.framing import SEQUENCE, dialect
+from stages.messages import RelativePose
+
+LOCAL_NED = 1  # MAV_FRAME
+TILT_RAD2 = math.radians(2.0) ** 2  # of the autopilot's own roll and pitch
+NO_YAW_RAD2 = math.pi**2  # of a yaw that is not measured
+
+
+@dataclass(frozen=True, slots=True)
+class OwnAttitude:
+    """The autopilot's attitude as it reported it: NED, FRD."""
+
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    arrival_ns: int
+
+
+def position_odometry(pose: RelativePose, reset_counter: int, limits: PoseLimits, own: OwnAttitude | None) -> Any:
+    """ODOMETRY of a position that the gate has accepted. `own`: for ArduPilot; None: for PX4."""
+    position = odom_position(pose)
+    return dialect().MAVLink_odometry_message(
+        pose.stamp_ns // 1000,
+        LOCAL_NED if own is None else LOCAL_FRD,
+        BODY_FRD,
+        *flip_yz(position.xyz_odom_m),
+        [math.nan] * 4 if own is None else wxyz_from_R_odom_drone(R_odom_drone_from_rpy(*_angles(own))),
+        *UNKNOWN,
+        *UNKNOWN,
+        _upper(position.covariance_m2, TILT_RAD2, NO_YAW_RAD2) if own else _upper(position.covariance_m2),
+        UNKNOWN_COVARIANCE,
+        reset_counter % SEQUENCE,
+        VIO,
+        position_quality_percent(pose, limits),
+    )
+
+
+def position_vision_estimate(pose: RelativePose, reset_counter: int, own: OwnAttitude) -> Any:
+    """VISION_POSITION_ESTIMATE of a position that the gate has accepted; for ArduPilot."""
+    position = odom_position(pose)
+    return dialect().MAVLink_vision_position_estimate_message(
+        pose.stamp_ns // 1000,
+        *flip_yz(position.xyz_odom_m),
+        *_angles(own),
+        _upper(position.covariance_m2, TILT_RAD2, NO_YAW_RAD2),
+        reset_counter % SEQUENCE,
+    )
+
+
+def _angles(own: OwnAttitude) -> tuple[float, float, float]:
+    return own.roll_rad, own.pitch_rad, own.yaw_rad
+
+
+def _upper(position_m2: Any, tilt_rad2: float = math.nan, yaw_rad2: float = math.nan) -> list[float]:
+    """MAVLink's 21 numbers; without variances of the angles these are NaN."""
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = position_m2
+    upper = upper_from_pose_covariance(covariance, np.eye(3))
+    for at, variance in ((15, tilt_rad2), (18, tilt_rad2), (20, yaw_rad2)):
+        upper[at] = variance
+    return upper

@@ -1,0 +1,77 @@
+"""The newest pose that was sent, kept on disk: grd that restarts in flight has to know that poses were sent before.
+
+The next session reports that pose once as a sent frame, with the time at which it was sent. So the decoder compares it
+with the autopilot's boot, live and in replay alike (`independence.py`): until the autopilot reboots, its estimate is
+not independent. Without a file every start is taken as the first one since the autopilot's boot.
+
+Times are host times. If the wall clock of a host without a battery is set between two runs, they are wrong: see
+deploy/grd.service, which orders grd after time-sync.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from links.mavlink.transport.framing import dialect
+
+WRITE_NS = 1_000_000_000  # period of writing
+
+
+class SentState:
+    """Reads the file when it is made; `write` is called regularly, by one thread, and may block."""
+
+    def __init__(self, file: Path | None, now_ns: int) -> None:
+        self.status: str | None = None
+        """Why the file cannot be read or written."""
+        self._file = file
+        self._newest: tuple[int, bytes] | None = None
+        self._written_ns: int | None = None
+        self.earlier = self._read(now_ns)
+        """Time and frame of the newest pose of earlier runs; None: none."""
+
+    def on_sent(self, frame: bytes, sent_ns: int) -> None:
+        """A pose was sent."""
+        self._newest = sent_ns, frame
+
+    def write(self) -> None:
+        """Write the newest pose, at most once a second. Until it succeeds it is repeated."""
+        newest = self._newest
+        if self._file is None or newest is None or newest[0] == self._written_ns:
+            return
+        if self._written_ns is not None and newest[0] - self._written_ns < WRITE_NS:
+            return
+        partial = self._file.with_suffix(".partial")
+        try:
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            partial.write_text(json.dumps({"sent_ns": newest[0], "frame": newest[1].hex()}), encoding="ascii")
+            os.replace(partial, self._file)
+        except OSError as error:
+            self.status = f"{self._file} cannot be written: {error.strerror}. A restart would not know of sent poses"
+        else:
+            self._written_ns, self.status = newest[0], None
+
+    def _read(self, now_ns: int) -> tuple[int, bytes] | None:
+        """A file that cannot be read counts as a pose sent now."""
+        if self._file is None:
+            return None
+        try:
+            fields = json.loads(self._file.read_text(encoding="ascii"))
+            return min(int(fields["sent_ns"]), now_ns), bytes.fromhex(fields["frame"])
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            self.status = f"{self._file} cannot be read ({error!r}): delete it after a reboot of the autopilot"
+            return now_ns, _unknown_pose()
+
+
+def _unknown_pose() -> bytes:
+    """An ODOMETRY frame without content."""
+    nan = float("nan")
+    message = dialect().MAVLink_odometry_message(
+        0, 20, 12, nan, nan, nan, [nan] * 4, nan, nan, nan, nan, nan, nan, [nan] * 21, [nan] * 21, 0, 0, -1
+    )
+    return bytes(message.pack(dialect().MAVLink(None)))

@@ -1,0 +1,101 @@
+"""STATUSTEXT about the output: which text, when, and short enough.
+
+    output   "STOPPED: " and the reason (critical) as soon as poses stop; "sending poses" (notice) after HOLD_NS of them
+    link     warnings about the link and the autopilot
+    state    state of the pose and the first clause of its reason, once it has lasted for HOLD_NS
+
+At most one text in TEXT_NS is sent, the newest of the most important kind; a text is kept until it was sent or
+replaced. A text ends at a word within the 50 bytes of the field; run.log has all of it.
+
+Source: ours; https://mavlink.io/en/messages/common.html#STATUSTEXT.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any, Literal, get_args
+
+from links.mavlink.transport.framing import dialect
+from stages.messages import PoseState
+
+TextKind = Literal["output", "link", "state"]  # in order of priority
+
+TEXT_NS = 2_000_000_000  # minimum interval of texts
+HOLD_NS = 1_000_000_000  # a state, or sending, is reported after it has lasted so long
+TEXT_BYTES = 50  # size of STATUSTEXT's text field
+PREFIX = "grd: "
+CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
+SEVERITY = {PoseState.FULL: INFO, PoseState.COASTING: WARNING}  # of a state; other states: warning
+CLAUSE = re.compile(r"[;:,]")
+
+
+def fitted(text: str) -> bytes:
+    """The text with its prefix as ASCII, cut after a word to fit the field."""
+    data = f"{PREFIX}{text}".encode("ascii", "replace")
+    if len(data) <= TEXT_BYTES:
+        return data
+    cut = data[: TEXT_BYTES + 1]
+    return cut.rpartition(b" ")[0] if b" " in cut[len(PREFIX) :] else data[:TEXT_BYTES]
+
+
+class StatusTexts:
+    """Waiting texts. Call `due` about ten times per second."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[TextKind, tuple[int, str]] = {}  # severity and text
+        self._text_ns: int | None = None
+        self._offered: tuple[TextKind, int, str] | None = None  # the newest result of `due`
+        self._state: tuple[PoseState, str, int] | None = None  # with the reason and the time of its start
+        self._reported: PoseState | None = None
+        self._sending_ns: int | None = None  # start of sending; None: not sending
+        self._sending_reported = False
+
+    def on_state(self, state: PoseState, reason: str, now_ns: int) -> None:
+        """The state of the newest pose."""
+        if self._state is None or self._state[0] is not state:
+            self._state = state, CLAUSE.split(reason)[0], now_ns
+
+    def on_sending(self, now_ns: int) -> None:
+        """Poses are sent from now on."""
+        self._sending_ns = now_ns
+
+    def on_stopped(self, reason: str) -> None:
+        """No poses are sent from now on."""
+        self._sending_ns = None
+        if self._sending_reported:
+            self._sending_reported = False
+            self._waiting["output"] = CRITICAL, f"STOPPED: {reason}"
+
+    def warn(self, text: str) -> None:
+        """Queue a warning about the link or the autopilot."""
+        self._waiting["link"] = WARNING, text
+
+    def due(self, now_ns: int) -> list[Any]:
+        """The STATUSTEXT to send now, if any."""
+        self._queue(now_ns)
+        if not self._waiting or (self._text_ns is not None and 0 <= now_ns - self._text_ns < TEXT_NS):
+            return []
+        self._text_ns = now_ns
+        kind: TextKind = next(kind for kind in get_args(TextKind) if kind in self._waiting)
+        severity, text = self._waiting.pop(kind)
+        self._offered = kind, severity, text
+        return [dialect().MAVLink_statustext_message(severity, fitted(text))]
+
+    def on_not_sent(self) -> None:
+        """The text of `due` could not be sent: queue it again, unless a newer one replaced it."""
+        if self._offered is not None:
+            kind, severity, text = self._offered
+            self._waiting.setdefault(kind, (severity, text))
+            self._offered = self._text_ns = None
+
+    def _queue(self, now_ns: int) -> None:
+        sending_ns = self._sending_ns
+        if sending_ns is not None and not self._sending_reported and now_ns - sending_ns >= HOLD_NS:
+            self._sending_reported = True
+            self._waiting["output"] = NOTICE, "sending poses"
+        if self._state is None:
+            return
+        state, reason, since_ns = self._state
+        if state is not self._reported and now_ns - since_ns >= HOLD_NS:
+            self._reported = state
+            self._waiting["state"] = SEVERITY.get(state, WARNING), f"{state.name}: {reason}"

@@ -1,0 +1,100 @@
+"""A restart of grd knows that poses were sent before."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega
+
+from links.clock import host_time
+from links.mavlink import Autopilot
+from links.mavlink.poses.sent_state import SentState
+from tests.links.mavlink.mavlink_poses import good_pose
+from tests.links.mavlink.test_mavlink_live import Listener, listening
+
+mavlink: Any = ardupilotmega
+S = 1_000_000_000
+
+
+def test_the_newest_pose_is_kept(tmp_path: Path):
+    file = tmp_path / "new" / "sent.json"
+    state = SentState(file, 5 * S)
+    assert state.earlier is None
+    state.write()
+    assert not file.exists()  # nothing was sent
+    for i in range(4):
+        state.on_sent(bytes([i]), (5 + i) * S)
+        state.write()
+    assert SentState(file, 10 * S).earlier == (8 * S, b"\x03")
+    assert SentState(file, 7 * S).earlier == (7 * S, b"\x03")  # not from the future
+
+
+def test_it_is_written_once_a_second(tmp_path: Path):
+    state = SentState(tmp_path / "sent.json", 0)
+    for i in range(1, 100):
+        state.on_sent(bytes([i]), i * S // 50)
+        state.write()
+    assert SentState(tmp_path / "sent.json", 10 * S).earlier == (51 * S // 50, bytes([51]))
+
+
+def test_a_damaged_file_counts_as_a_pose_sent_now_and_is_reported(tmp_path: Path):
+    file = tmp_path / "sent.json"
+    file.write_text("{")
+    state = SentState(file, 5 * S)
+    assert state.earlier is not None
+    assert state.earlier[0] == 5 * S
+    assert "delete it" in (state.status or "")
+
+
+def test_a_file_that_cannot_be_written_is_reported(tmp_path: Path):
+    (tmp_path / "file").touch()
+    state = SentState(tmp_path / "file" / "sent.json", 5 * S)
+    state.on_sent(b"x", 6 * S)
+    state.write()
+    assert "A restart would not know" in (state.status or "")
+
+
+class Drone:
+    """Sends attitudes of an autopilot that booted `uptime_s` ago."""
+
+    def __init__(self, uptime_s: float) -> None:
+        self._booted_ns = host_time.now_ns() - round(1e9 * uptime_s)
+        self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def send(self, listener: Listener, count: int, poses: bool) -> None:
+        before, pause = len(listener.messages), threading.Event()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+            for _ in range(count):
+                boot_ms = (host_time.now_ns() - self._booted_ns) // 1_000_000
+                message = mavlink.MAVLink_attitude_message(boot_ms, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0)
+                udp.sendto(bytes(message.pack(self._mav)), ("127.0.0.1", listener.link.port))
+                self._mav.seq = (self._mav.seq + 1) % 256
+                pause.wait(0.01)
+                if poses:
+                    listener.link.on_pose(good_pose(host_time.now_ns()))
+        listener.wait(lambda: len(listener.messages) >= before + count)
+
+
+@pytest.mark.parametrize(("rebooted", "independent"), [(False, False), (True, True)])
+def test_after_a_restart_the_estimate_is_independent_only_if_the_autopilot_has_rebooted(
+    tmp_path: Path, rebooted: bool, independent: bool
+):
+    state_file, drone = str(tmp_path / "sent.json"), Drone(uptime_s=60.0)
+    with listening(state_file=state_file) as listener:
+        drone.send(listener, 30, poses=True)
+    if rebooted:
+        threading.Event().wait(0.6)
+        drone = Drone(uptime_s=0.0)
+    with listening(state_file=state_file) as listener:
+        drone.send(listener, 10, poses=False)
+        listener.link.on_pose(good_pose(0))  # too old: not sent
+        sent = list(listener.link.sent())
+    live = [message.independent for message in listener.messages if message is not None]
+    assert live == [independent] * 10
+    replayed = Autopilot()
+    messages = [replayed.decode(r) for r in sorted([*listener.records, *sent], key=lambda r: r.arrival_ns)]
+    assert [message.independent for message in messages if message is not None] == live

@@ -1,0 +1,86 @@
+"""Telemetry that may contain poses of grd: only roll and pitch pass."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flow.message import check_arrays
+from stages.geometry.frames import rotation_z
+from stages.kernels.geometry.so3 import exp_rotation
+from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry, DroneTilt
+from stages.odometry.drone import IndependentTelemetry
+
+MS = 1_000_000
+RATE = np.array([0.1, 0.2, 0.3])
+GYRO = np.array([0.4, 0.5, 0.6])
+
+
+def attitude(independent: bool, yaw_rad: float = 0.0) -> DroneAttitude:
+    R = rotation_z(yaw_rad) @ exp_rotation(np.array([0.2, -0.1, 0.0]))
+    return DroneAttitude(stamp_ns=500 * MS, R_odom_drone=R, angular_velocity_drone_radps=RATE, independent=independent)
+
+
+def position(independent: bool) -> DroneLocalPosition:
+    return DroneLocalPosition(stamp_ns=5, xyz_odom_m=np.ones(3), velocity_odom_mps=np.zeros(3), independent=independent)
+
+
+def odometry(independent: bool) -> DroneOdometry:
+    return DroneOdometry(
+        stamp_ns=5,
+        xyz_odom_m=np.ones(3),
+        R_odom_drone=np.eye(3),
+        velocity_drone_mps=np.zeros(3),
+        angular_velocity_drone_radps=np.zeros(3),
+        pose_covariance=None,
+        velocity_covariance=None,
+        reset_counter=0,
+        quality_percent=None,
+        independent=independent,
+    )
+
+
+def imu(stamp_ns: int) -> DroneImu:
+    return DroneImu(stamp_ns=stamp_ns, acceleration_drone_mps2=np.array([0, 0, 9.8]), angular_velocity_drone_radps=GYRO)
+
+
+def test_an_independent_estimate_passes_unchanged():
+    stage = IndependentTelemetry()
+    assert stage.on_position(own := position(True)) is own
+    assert stage.on_odometry(own := odometry(True)) is own
+    given = attitude(True)
+    tilt, passed = stage.on_attitude(given)
+    assert passed is given
+    assert isinstance(tilt, DroneTilt)
+    np.testing.assert_array_equal(tilt.angular_velocity_drone_radps, RATE)
+    assert math.degrees(tilt.sigma_rad) == 1.0
+    assert stage.counters == {}
+
+
+def test_of_any_other_estimate_only_roll_and_pitch_pass():
+    stage = IndependentTelemetry()
+    assert stage.on_position(position(False)) is None
+    assert stage.on_odometry(odometry(False)) is None
+    (tilt,) = stage.on_attitude(attitude(False))
+    assert isinstance(tilt, DroneTilt)
+    check_arrays(tilt)
+    np.testing.assert_allclose(tilt.up_drone, attitude(False).R_odom_drone.T @ [0, 0, 1])
+    assert math.degrees(tilt.sigma_rad) == 2.0
+    assert tilt.angular_velocity_drone_radps is None
+    assert stage.counters == {"not independent": 3}
+
+
+def test_the_tilt_does_not_depend_on_yaw():
+    ups = [next(iter(IndependentTelemetry().on_attitude(attitude(False, yaw)))).up_drone for yaw in (0.0, 1.0, 3.0)]
+    np.testing.assert_allclose(ups, [ups[0]] * 3, atol=1e-12)
+
+
+def test_a_recent_gyro_sample_replaces_the_rate_of_an_estimate_that_is_not_independent():
+    stage = IndependentTelemetry()
+    stage.on_imu(imu(450 * MS))
+    (tilt,) = stage.on_attitude(attitude(False))
+    np.testing.assert_array_equal(tilt.angular_velocity_drone_radps, GYRO)
+    stage.on_imu(imu(300 * MS))
+    (tilt,) = stage.on_attitude(attitude(False))
+    assert tilt.angular_velocity_drone_radps is None

@@ -10,7 +10,7 @@ Source: https://mavlink.io/en/; requirements of each autopilot: `profiles.py`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -28,7 +28,7 @@ from links.mavlink.origin import GlobalOrigin, OriginSender
 from links.mavlink.pose_sender import PoseMessage, PoseSender
 from links.mavlink.profiles import PROFILES, ProfileName
 from links.mavlink.readers import AutopilotMessage
-from links.mavlink.transport.connection import Udp, parse_connection
+from links.mavlink.transport.connection import Connection, Udp, parse_connection
 from links.mavlink.transport.signing import Signer
 from links.mavlink.transport.stream_connection import open_connection
 from stages.messages import RelativePose
@@ -128,25 +128,33 @@ class Autopilot(Source[AutopilotSettings]):
         settings = self.settings
         if settings.connection is None:
             raise LinkError("no connection to the autopilot: set `connection`, as in udpin:127.0.0.1:14550")
-        target = settings.system_id, settings.component_id
         if settings.signing_key is not None and self._signer is None:
             self._signer = Signer(settings.signing_key, host_time.now_ns())
         connection = open_connection(parse_connection(settings.connection), settings.sender)
-        session = AutopilotSession(
-            connection,
-            target,
-            settings.own_id,
-            PoseSender(settings.send, settings.limits, reset_counter=host_time.now_ns() // 1_000_000_000),
-            OriginSender(settings.global_origin, target),
-            self._signer,
-            host_time.now_ns,
-            (settings.topic, SENT_TOPIC),
-        )
-        self._session = session
+        session = self.open_session(connection, host_time.now_ns)
         try:
             yield session.records()
         finally:
             session.close()
+
+    def open_session(
+        self, connection: Connection, now_ns: Callable[[], int], *, threaded: bool = True
+    ) -> AutopilotSession:
+        """Open a session on a connection. A simulation in virtual time has its own clock and no thread."""
+        settings = self.settings
+        target = settings.system_id, settings.component_id
+        self._session = AutopilotSession(
+            connection,
+            target,
+            settings.own_id,
+            PoseSender(settings.send, settings.limits, reset_counter=now_ns() // 1_000_000_000),
+            OriginSender(settings.global_origin, target),
+            self._signer,
+            now_ns,
+            (settings.topic, SENT_TOPIC),
+            threaded=threaded,
+        )
+        return self._session
 
     @property
     def port(self) -> int | None:

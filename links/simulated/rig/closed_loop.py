@@ -27,6 +27,7 @@ from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import NOT_LIVE, GoalCommand
 from links.runs.request import RunRequest
+from links.simulated.rig.pose_loop import PoseLoop, PoseTap, has_autopilot
 from links.simulated.sensors.servo import STEP_NS
 from stages.messages import ServoGoal
 
@@ -67,14 +68,28 @@ class ClosedLoop:
     ) -> None:
         """`loop_metadata` is for the recording, names the configuration; `taps` are open and see all messages."""
         self.loop_metadata = loop_metadata
-        self._digest, goals = Digest(), GoalTap()
-        self._replay = Replay(graph, (self._digest, goals, *taps))
+        self._digest, goals, poses = Digest(), GoalTap(), PoseTap()
+        self._replay = Replay(graph, (self._digest, goals, poses, *taps))
         name, output = servo_edge(graph)
         servo = self._replay.nodes[name]
         assert isinstance(servo, Servo)
         self._servo, self._servo_name = servo, name
         goals.watch(output, servo)
         self._compute_ns = round(settings.compute_s * 1e9)
+        self._poses: PoseLoop | None = None
+        self._connect = lambda: PoseLoop(self._replay, graph, poses, self._compute_ns) if has_autopilot(graph) else None
+
+    def connect_autopilot(self) -> None:
+        """The autopilot of the scenario flies on what the graph sends: open its session."""
+        self._poses = self._connect()
+
+    def receive(self, record: Record) -> Record | None:
+        """A record as it arrives at the host: a frame of the autopilot gets its stamp. None: not for the graph."""
+        return record if self._poses is None else self._poses.before(record)
+
+    def sent(self) -> list[Record]:
+        """Frames to the autopilot since the last call, stamped with the time at which they leave the host."""
+        return [] if self._poses is None else self._poses.sent()
 
     def take(self, record: Record) -> tuple[int, GoalCommand] | None:
         """Process a record that has arrived; returns the time at which a command leaves the host, and the command."""

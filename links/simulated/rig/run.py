@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path as FilePath
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.recording import RecordingWriter
 from links.simulated.autopilot.autopilot import Autopilot
+from links.simulated.autopilot.flight_stack.outcome import FlightOutcome, Outcome
+from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.lidar import lidar_poses
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
@@ -31,6 +34,7 @@ from links.simulated.sensors.vehicle_odometry import VehicleOdometry
 from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world.clearance import check_paths
 from links.simulated.world.flight import Flight
+from links.simulated.world.flown_motion import FlownMotion
 from links.simulated.world.path import Path
 from links.simulated.world.scene import Scene, Truth, drone_shapes
 from links.simulated.world.suspension import SuspendedPath
@@ -53,13 +57,16 @@ class SimulationReport:
     wall_s: float
     size_bytes: int
     output_hash: str | None = None  # of the closed loop; a replay with the same configuration has the same hash
+    outcome: Outcome | None = None  # of an autopilot in the loop
 
     def __str__(self) -> str:
         text = (
             f"seed {self.seed}: {self.records} records, {self.pulses} pulses, {self.returns} with a return, "
             f"{self.drone_returns} from the drone; {self.size_bytes / 1e6:.2f} MB in {self.wall_s:.1f} s"
         )
-        return text if self.output_hash is None else f"{text}; closed loop's output hash {self.output_hash}"
+        if self.output_hash is not None:
+            text += f"; closed loop's output hash {self.output_hash}"
+        return text if self.outcome is None else f"{text}\n{self.outcome}"
 
 
 class Simulation:
@@ -81,9 +88,19 @@ class Simulation:
         self.seed = self.scenario.seed
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
-        drone_motion: Path | Flight | None = drone.path if drone else None
-        self.telemetry_sources: list[Autopilot | VehicleOdometry] = []
-        if drone is not None and scenario.autopilot is not None:
+        drone_motion: Path | Flight | FlownMotion | None = drone.path if drone else None
+        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry] = []
+        self.stack: FlightStack | None = None
+        if drone is not None and scenario.autopilot is not None and scenario.autopilot.flight_stack is not None:
+            ground_m, vehicle_path = -scenario.vehicle.camera_height_m, scenario.vehicle.path
+            self.stack = FlightStack(
+                scenario.autopilot, drone.path, vehicle_path, ground_m, start_ns, duration_s, self.seed
+            )
+            drone_motion = self.stack.motion
+            self.telemetry_sources.append(self.stack)
+            if loop is not None:
+                loop.connect_autopilot()
+        elif drone is not None and scenario.autopilot is not None:
             drone_motion = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
             self.telemetry_sources.append(Autopilot(scenario.autopilot, drone_motion, start_ns, duration_s, self.seed))
         vehicle = scenario.vehicle
@@ -107,7 +124,9 @@ class Simulation:
             [drone_shapes(other.span_m, other.model) for other in others],
         )
         spans_m = [flying.span_m for flying in (drone, *others) if flying is not None]
-        check_paths(self._scene.world, self.truth, scenario.duration_s, spans_m)
+        planned = self.truth if self.stack is None else dataclasses.replace(self.truth, drone=drone and drone.path)
+        check_paths(self._scene.world, planned, scenario.duration_s, spans_m)
+        self.outcome = None if self.stack is None else FlightOutcome(self.stack, self._scene.world, self.truth)
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
         script = scenario.script if loop is None else ()
         commander = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)
@@ -119,6 +138,8 @@ class Simulation:
         )
         lidar_at = (lambda stamp_ns: self.T_world_lidar(stamp_ns)[1]) if scenario.truth_visible else None
         self._truth_records = TruthRecords(self.truth, self._scene.world, lidar_at)
+        self._waiting: list[tuple[int, int, Record]] = []  # by arrival
+        self._made = itertools.count()
         self.lidar_clock_ns = 0  # offset of the LiDAR's clock from the scenario's
         self.pulses = 0
         self.returns = 0
@@ -138,8 +159,8 @@ class Simulation:
 
     def records(self) -> Iterator[Record]:
         """All records in order of arrival, with sequence numbers."""
-        waiting: list[tuple[int, int, Record]] = []
-        made = sent = 0
+        waiting, made = self._waiting, self._made
+        sent = 0
         start_ns = self.scenario.start_ns
         end_ns = start_ns + round(self.scenario.duration_s * 1e9)
         packet_ns = firings_per_packet(self.scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
@@ -148,6 +169,8 @@ class Simulation:
         while first_ns < end_ns:
             packets = min(most, -(-(end_ns - first_ns) // packet_ns))
             next_ns = first_ns + packets * packet_ns
+            if self.stack is not None:
+                self.stack.advance(next_ns)
             records = self._servo.advance(next_ns)
             records += self.lidar_records(first_ns, packets, packet_ns)
             for camera in self._cameras:
@@ -156,16 +179,32 @@ class Simulation:
                 records += source.records(next_ns)
             records += self.truth_records(next_ns)
             for record in records:
-                heapq.heappush(waiting, (record.arrival_ns, made, record))
-                made += 1
+                if not self._is_lost(record):
+                    heapq.heappush(waiting, (record.arrival_ns, next(made), record))
+            if self.outcome is not None:
+                self.outcome.update()
             first_ns = next_ns
             while waiting and (waiting[0][0] < next_ns or first_ns >= end_ns):
-                record = dataclasses.replace(heapq.heappop(waiting)[2], sequence=sent)
+                record = heapq.heappop(waiting)[2]
+                if self.stack is not None and self._loop is not None and not record.topic.startswith(TRUTH_TOPICS):
+                    arrived = self._loop.receive(record)
+                    if arrived is None:
+                        continue
+                    record = arrived
+                record = dataclasses.replace(record, sequence=sent)
                 self._feed_loop(record)
                 yield record
                 sent += 1
         if self._loop is not None:
             self._loop.finish()
+
+    def _is_lost(self, record: Record) -> bool:
+        """Whether a gap of the LiDAR swallows a packet."""
+        gaps = self.scenario.lidar_gaps_s
+        if not gaps or record.topic != "/lidar/packets":
+            return False
+        time_s = (record.stamp_ns - self.scenario.start_ns) * 1e-9
+        return any(begin <= time_s < end for begin, end in gaps)
 
     def _feed_loop(self, record: Record) -> None:
         """Feed a record to the pipeline, except ground truth, and pass its command to the servo."""
@@ -175,6 +214,12 @@ class Simulation:
         if sent is not None:
             left_ns, command = sent
             self._servo.command(left_ns, command.position_rad, command.speed_radps)
+        if self.stack is not None:
+            for frame in self._loop.sent():
+                self.stack.receive(frame.data, frame.arrival_ns)
+                heapq.heappush(self._waiting, (frame.arrival_ns, next(self._made), frame))
+                if self.outcome is not None:
+                    self.outcome.on_sent(frame)
 
     def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """True poses of the LiDAR: rotations (n, 3, 3), positions (n, 3) [m]."""
@@ -295,4 +340,5 @@ def simulate_into(
         wall_s=time.perf_counter() - began,
         size_bytes=out.stat().st_size,
         output_hash=None if loop is None else loop.output_hash,
+        outcome=None if simulation.outcome is None else simulation.outcome.result(),
     )

@@ -29,6 +29,7 @@ from links.dynamixel.servo import NOT_LIVE, GoalCommand
 from links.runs.request import RunRequest
 from links.simulated.rig.pose_loop import PoseLoop, PoseTap, has_autopilot
 from links.simulated.sensors.servo import STEP_NS
+from links.velodyne import Lidar
 from stages.messages import ServoGoal
 
 LONGEST_BATCH_NS = 40_000_000  # longer batches are not faster
@@ -70,11 +71,13 @@ class ClosedLoop:
         self.loop_metadata = loop_metadata
         self._digest, goals, poses = Digest(), GoalTap(), PoseTap()
         self._replay = Replay(graph, (self._digest, goals, poses, *taps))
-        name, output = servo_edge(graph)
-        servo = self._replay.nodes[name]
-        assert isinstance(servo, Servo)
-        self._servo, self._servo_name = servo, name
-        goals.watch(output, servo)
+        self._servo: Servo | None = None
+        if any(issubclass(spec.cls, Lidar | Servo) for spec in graph.nodes.values()):
+            self._servo_name, output = servo_edge(graph)
+            servo = self._replay.nodes[self._servo_name]
+            assert isinstance(servo, Servo)
+            self._servo = servo
+            goals.watch(output, servo)
         self._compute_ns = round(settings.compute_s * 1e9)
         self._poses: PoseLoop | None = None
         self._connect = lambda: PoseLoop(self._replay, graph, poses, self._compute_ns) if has_autopilot(graph) else None
@@ -94,7 +97,7 @@ class ClosedLoop:
     def take(self, record: Record) -> tuple[int, GoalCommand] | None:
         """Process a record that has arrived; returns the time at which a command leaves the host, and the command."""
         self._replay.feed(record)
-        command = self._servo.take_command()
+        command = None if self._servo is None else self._servo.take_command()
         return None if command is None else (record.arrival_ns + self._compute_ns, command)
 
     def longest_batch_ns(self) -> int:
@@ -104,7 +107,8 @@ class ClosedLoop:
     def finish(self) -> RunReport:
         """Let the stages emit what they hold."""
         report = self._replay.finish()
-        report.counters[self._servo_name].pop(NOT_LIVE, None)  # these commands went to the simulated servo
+        if self._servo is not None:  # these commands went to the simulated servo
+            report.counters[self._servo_name].pop(NOT_LIVE, None)
         return report
 
     @property

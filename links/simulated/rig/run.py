@@ -22,6 +22,7 @@ from links.simulated.autopilot.flight_stack.outcome import FlightOutcome, Outcom
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.lidar import lidar_poses
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
+from links.simulated.rig.fix_sensor import FixSensor
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.rig.scripted_servo import ServoScript
@@ -127,6 +128,8 @@ class Simulation:
         planned = self.truth if self.stack is None else dataclasses.replace(self.truth, drone=drone and drone.path)
         check_paths(self._scene.world, planned, scenario.duration_s, spans_m)
         self.outcome = None if self.stack is None else FlightOutcome(self.stack, self._scene.world, self.truth)
+        fixes = scenario.fix_sensor
+        self._fixes = None if fixes is None else FixSensor(fixes, self.truth, scenario.lidar_gaps_s, self.seed)
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
         script = scenario.script if loop is None else ()
         commander = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)
@@ -171,8 +174,10 @@ class Simulation:
             next_ns = first_ns + packets * packet_ns
             if self.stack is not None:
                 self.stack.advance(next_ns)
-            records = self._servo.advance(next_ns)
-            records += self.lidar_records(first_ns, packets, packet_ns)
+            if self._fixes is not None:
+                records = self._fixes.records(next_ns)
+            else:
+                records = self._servo.advance(next_ns) + self.lidar_records(first_ns, packets, packet_ns)
             for camera in self._cameras:
                 records += camera.records(next_ns)
             for source in self.telemetry_sources:
@@ -181,9 +186,9 @@ class Simulation:
             for record in records:
                 if not self._is_lost(record):
                     heapq.heappush(waiting, (record.arrival_ns, next(made), record))
-            if self.outcome is not None:
-                self.outcome.update()
             first_ns = next_ns
+            if self.outcome is not None and self.outcome.is_over():
+                end_ns = next_ns
             while waiting and (waiting[0][0] < next_ns or first_ns >= end_ns):
                 record = heapq.heappop(waiting)[2]
                 if self.stack is not None and self._loop is not None and not record.topic.startswith(TRUTH_TOPICS):

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 
-from links.simulated.autopilot.flight_stack.ekf3 import Ekf3
-from links.simulated.autopilot.flight_stack.source_rules import EKF_CHECK_ITERATIONS, FS_EKF_THRESH, Source
+from links.simulated.autopilot.flight_stack.estimation.ekf3 import Ekf3
+from links.simulated.autopilot.flight_stack.estimation.source_rules import EKF_CHECK_ITERATIONS, FS_EKF_THRESH, Source
 
 
 class EkfCheck:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -86,8 +87,8 @@ class FlightOutcome:
             R = R_odom_drone_from_wxyz(message.q) if finite else np.full((3, 3), np.nan)
             self._poses.append((int(message.time_usec) * 1000, xyz, math.atan2(R[1, 0], R[0, 0])))
 
-    def update(self) -> None:
-        """Look at what was flown since the last call: obstacles and fly-aways."""
+    def is_over(self) -> bool:
+        """Look at what was flown since the last call, obstacles and fly-aways; True: lost some time ago."""
         position = self._stack.quadrotor.state[0:3].copy()
         if self._last is not None:
             step = position - self._last
@@ -99,6 +100,10 @@ class FlightOutcome:
         self._last = position
         if self._lost_s is None and (self._stack.quadrotor.crashed or self._stack.target_error_m > FLYAWAY_M):
             self._lost_s = self._stack.motion.until_s
+        wait_s = self._stack.settings.end_after_loss_s
+        failed_s = next((t for t, what in self._stack.events if what == "EKF failsafe"), math.inf)
+        first_s = min(failed_s, math.inf if self._lost_s is None else self._lost_s)
+        return wait_s is not None and self._stack.motion.until_s > first_s + wait_s
 
     def result(self) -> Outcome:
         """The outcome so far."""
@@ -144,7 +149,7 @@ class FlightOutcome:
         worst: float | None = None
         external = False
         events = [*self._stack.events, (self._stack.motion.until_s, "end")]
-        for (begin_s, what), (end_s, _) in zip(events[:-1], events[1:], strict=True):
+        for (begin_s, what), (end_s, _) in pairwise(events):
             external |= what.startswith("source set") and self._stack.external_sets[int(what.split()[-1]) - 1]
             if what != "plan: hold" or not external or end_s - begin_s < 2 * SETTLE_S:
                 continue

@@ -44,7 +44,12 @@ class Quadrotor:
     """Truth of the airframe. `motion` is for the simulated sensors of the rig; `state` for those of the drone."""
 
     def __init__(
-        self, settings: FlightStackSettings, position_m: Array64, yaw_rad: float, ground_m: float, duration_s: float,
+        self,
+        settings: FlightStackSettings,
+        position_m: Array64,
+        yaw_rad: float,
+        ground_m: float,
+        duration_s: float,
         seed: int,
     ) -> None:
         """Start at rest, in the air or, if so set, on the ground below (with its height `ground_m`)."""
@@ -76,7 +81,9 @@ class Quadrotor:
         self._coefficients = butterworth(settings.imu.filter_hz, 1 / STEP_S)
         self._filters = np.zeros((6, 2))
         rate_hz = settings.imu.rotor_hz * np.array(SPREAD)
-        self._rotors = np.hstack([rng.uniform(0, 2 * np.pi, (ROTORS, 1)), rate_hz[:, None], rng.uniform(0, 2 * np.pi, (ROTORS, 6))])
+        self._rotors = np.hstack(
+            [rng.uniform(0, 2 * np.pi, (ROTORS, 1)), rate_hz[:, None], rng.uniform(0, 2 * np.pi, (ROTORS, 6))]
+        )
         self._ticks = 0
 
     @property
@@ -161,5 +168,3 @@ def gain(cutoff_hz: float, at_hz: float, rate_hz: float) -> float:
     """|H| of `butterworth` at a frequency: 1 / sqrt(1 + (tan(pi f / fs) / tan(pi fc / fs))^4)."""
     ratio = math.tan(math.pi * (at_hz % rate_hz) / rate_hz) / math.tan(math.pi * cutoff_hz / rate_hz)
     return 1 / math.sqrt(1 + ratio**4)
-
-

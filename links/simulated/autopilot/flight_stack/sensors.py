@@ -60,7 +60,9 @@ class Sensors:
         self._gps_bias = Wander(gps.bias_m * np.array([1.0, 1.0, 1.5]), gps.bias_time_s, rng)
         self._baro_bias = Wander(np.array([baro.bias_m]), baro.bias_time_s, rng)
         self._baro_first = float(self._baro_bias.at(0.0)[0])  # calibrated at boot: height 0
-        self.yaw_bias_rad = math.radians(settings.compass.offset_deg + settings.compass.bias_deg * rng.standard_normal())
+        self.yaw_bias_rad = math.radians(
+            settings.compass.offset_deg + settings.compass.bias_deg * rng.standard_normal()
+        )
         self._gps_waiting: deque[tuple[float, GpsFix]] = deque()
         self._next_s = {"gps": 0.0, "compass": 0.0, "baro": 0.0}
 

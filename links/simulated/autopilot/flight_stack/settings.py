@@ -136,9 +136,7 @@ class UseSources(_Settings):
     for_s: float = Field(default=0.0, ge=0, le=0)
 
 
-PlanStep = Annotated[
-    FollowPath | Hold | GoTo | Square | Follow | TakeOff | UseSources, Field(discriminator="do")
-]
+PlanStep = Annotated[FollowPath | Hold | GoTo | Square | Follow | TakeOff | UseSources, Field(discriminator="do")]
 
 
 class FlightStackSettings(_Settings):
@@ -161,6 +159,7 @@ class FlightStackSettings(_Settings):
     airframe: Airframe = Airframe()
     reboot_s: tuple[float, ...] = ()  # the autopilot reboots in flight, with its motors running on, as a watchdog reset
     estimate_resets_m: tuple[tuple[float, Vector], ...] = ()  # (time, jump): the EKF's position jumps
+    end_after_loss_s: float | None = Field(default=5.0, ge=0)  # the simulation ends so long after a loss; None: never
     denied_intervals: tuple[int, ...] = ()  # message ids whose SET_MESSAGE_INTERVAL is denied
 
     @model_validator(mode="after")

@@ -22,7 +22,8 @@ from links.mavlink.transport.framing import packed
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.autopilot.flight_stack import streams, telemetry
 from links.simulated.autopilot.flight_stack.commands import handle_frame, send_origin
-from links.simulated.autopilot.flight_stack.estimator import Estimators
+from links.simulated.autopilot.flight_stack.estimation.estimator import Estimators
+from links.simulated.autopilot.flight_stack.estimation.source_rules import EKF_CHECK_HZ, SOURCE_SETS, Source
 from links.simulated.autopilot.flight_stack.failsafe import EkfCheck, arming_refusal
 from links.simulated.autopilot.flight_stack.guidance import (
     LAND_FAST_ABOVE_M,
@@ -37,7 +38,6 @@ from links.simulated.autopilot.flight_stack.guidance import (
 from links.simulated.autopilot.flight_stack.quadrotor import STEPS, TICK_S, Quadrotor, Tick
 from links.simulated.autopilot.flight_stack.sensors import Sensors
 from links.simulated.autopilot.flight_stack.settings import TakeOff, UseSources
-from links.simulated.autopilot.flight_stack.source_rules import EKF_CHECK_HZ, SOURCE_SETS, Source
 from links.simulated.autopilot.radio import Radio
 from links.simulated.kernels.motion import STEP_S
 from links.simulated.world.path import Path
@@ -97,6 +97,7 @@ class FlightStack:
         self._silent_until_ns = 0
         self._reboots, self._jumps = deque(sorted(s.reboot_s)), deque(sorted(s.estimate_resets_m))
         self._next = {"check": 0.0, "arm": 0.0}
+        self._switched_s = -10.0
         self.target_error_m = self.worst_target_error_m = 0.0  # distance of the true position from the true target
         self._texts: set[str] = set()
 
@@ -139,6 +140,7 @@ class FlightStack:
         """See Vehicle."""
         if not self.ekf.use_set(number - 1):
             return False
+        self._switched_s = self._tick * TICK_S
         self.text(6, f"Using EKF Source Set {number}")
         self._note(f"source set {number}")
         return True
@@ -207,15 +209,17 @@ class FlightStack:
             if self.quadrotor.grounded:
                 self.armed = False
                 self._note("landed")
-            above_m = estimate[2] + self._home[2] - self.quadrotor.ground_m
+            above_m = estimate[2] - self._frame().xyz_m[2] - self.quadrotor.ground_m
             climb = -LAND_FAST_MPS if above_m > LAND_FAST_ABOVE_M else -LAND_MPS
             yaw = math.atan2(2 * estimate[8] * estimate[9], 1 - 2 * estimate[8] ** 2)
             return self._controller.land(climb, estimate[3:6], yaw, False)
         target = self._guidance.update(time_s, self._frame())
         if self._climbing_to is not None:
             target.xyz_m[2] = min(target.xyz_m[2] + 1.0 * TICK_S, self._climbing_to)
-        away = rotate(target.xyz_m - self._frame().xyz_m, -self._frame().yaw_rad) - self.quadrotor.state[0:3]
-        self.target_error_m = float(np.linalg.norm(away))
+        frame = self._frame()
+        if time_s > self._switched_s + 1.0:  # until the estimate is reset, the target is in the frame of before
+            away = rotate(target.xyz_m - frame.xyz_m, -frame.yaw_rad) - self.quadrotor.state[0:3]
+            self.target_error_m = float(np.linalg.norm(away))
         self.worst_target_error_m = max(self.worst_target_error_m, self.target_error_m)
         return self._controller.command(target, estimate[0:3], estimate[3:6])
 
@@ -371,5 +375,3 @@ class FlightStack:
             streams.EKF_STATUS_REPORT: 5.0,
             streams.ESTIMATOR_STATUS: 5.0,
         }
-
-

@@ -37,9 +37,7 @@ def attitude(device_ns: int, estimate: Array64, gyro: Array64) -> Any:
 
 def local_position(device_ns: int, estimate: Array64) -> Any:
     """LOCAL_POSITION_NED."""
-    return mavlink.MAVLink_local_position_ned_message(
-        device_ns // MS, *flip_yz(estimate[0:3]), *flip_yz(estimate[3:6])
-    )
+    return mavlink.MAVLink_local_position_ned_message(device_ns // MS, *flip_yz(estimate[0:3]), *flip_yz(estimate[3:6]))
 
 
 def odometry(device_ns: int, estimate: Array64, gyro: Array64, P: Array64, resets: int) -> Any:

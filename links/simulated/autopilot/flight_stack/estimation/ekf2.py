@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from links.simulated.autopilot.flight_stack.ekf3 import NS, Ekf3, External
-from links.simulated.autopilot.flight_stack.lane import Lane
-from links.simulated.autopilot.flight_stack.sensors import GpsFix
-from links.simulated.autopilot.flight_stack.settings import GpsSettings
-from links.simulated.autopilot.flight_stack.source_rules import (
+from links.simulated.autopilot.flight_stack.estimation.ekf3 import NS, Ekf3, External
+from links.simulated.autopilot.flight_stack.estimation.lane import Lane
+from links.simulated.autopilot.flight_stack.estimation.source_rules import (
     EKF2,
     PX4_EV_RESETS,
     PX4_EV_START_S,
@@ -25,6 +23,8 @@ from links.simulated.autopilot.flight_stack.source_rules import (
     Source,
     Sources,
 )
+from links.simulated.autopilot.flight_stack.sensors import GpsFix
+from links.simulated.autopilot.flight_stack.settings import GpsSettings
 from stages.geometry.frames import Array64
 
 
@@ -70,7 +70,9 @@ class Ekf2(Ekf3):
     def _test_position(self, now: int, measured: Array64, variance: float) -> None:
         lane = self.lane
         innovation = measured - lane.x[0:2]
-        per_axis = [lane.ratio(slice(i, i + 1), innovation[i : i + 1], variance, lane.rules.position_gate) for i in (0, 1)]
+        per_axis = [
+            lane.ratio(slice(i, i + 1), innovation[i : i + 1], variance, lane.rules.position_gate) for i in (0, 1)
+        ]
         self.status.position = max(per_axis)
         if self.status.position <= 1:
             self._position_pass_ns, self.position_timeout = now, False

@@ -16,16 +16,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from links.simulated.autopilot.flight_stack.lane import Lane, ObservationBuffer
+from links.simulated.autopilot.flight_stack.estimation.lane import Lane, ObservationBuffer
+from links.simulated.autopilot.flight_stack.estimation.source_rules import (
+    EKF3,
+    Source,
+    Sources,
+    fuses_climb,
+    fuses_velocity,
+)
 from links.simulated.autopilot.flight_stack.sensors import GpsFix
 from links.simulated.autopilot.flight_stack.settings import GpsSettings
-from links.simulated.autopilot.flight_stack.source_rules import EKF3, Source, Sources, fuses_climb, fuses_velocity
 from stages.geometry.frames import Array64
 
 NS = 1_000_000_000
 RECENT_NS = 500_000_000  # minTestTime_ms: a source in use
 FRESH_NS = 250_000_000  # a reset uses data not older than this
-BARO_OFFSET_GAIN = 0.01  # of the offset between barometer and height while another source is used
+BARO_OFFSET_GAIN, BARO_OFFSET_STEP_M = 0.1, 5.0  # calcFiltBaroOffset, while another height source is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,7 +238,9 @@ class Ekf3:
     def _hold_position(self) -> None:
         """AID_NONE: a synthetic position keeps the tilt."""
         assert self._held is not None
-        self.lane.fuse_states(0, self._held - self.lane.x[0:2], 10.0**2 if self.in_flight else 0.5**2)  # EK3_NOAID_M_NSE
+        self.lane.fuse_states(
+            0, self._held - self.lane.x[0:2], 10.0**2 if self.in_flight else 0.5**2
+        )  # EK3_NOAID_M_NSE
 
     def _test_velocity(self, now: int, measured: Array64, sigma: float) -> None:
         lane = self.lane
@@ -292,7 +300,8 @@ class Ekf3:
         before = self._height_source
         self._height_source = Source.EXTERNAL if self.sources.height is Source.EXTERNAL and not lost else Source.BARO
         if baro is not None and self._height_source is not Source.BARO:
-            self._baro_offset += BARO_OFFSET_GAIN * (baro - lane.x[2] - self._baro_offset)
+            step = min(max(baro - lane.x[2] - self._baro_offset, -BARO_OFFSET_STEP_M), BARO_OFFSET_STEP_M)
+            self._baro_offset += BARO_OFFSET_GAIN * step
         if self._height_source is Source.EXTERNAL:
             if external is None:
                 return

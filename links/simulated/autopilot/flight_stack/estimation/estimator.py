@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from links.simulated.autopilot.flight_stack import telemetry
-from links.simulated.autopilot.flight_stack.ekf2 import Ekf2
-from links.simulated.autopilot.flight_stack.ekf3 import Ekf3
-from links.simulated.autopilot.flight_stack.external_input import ArduPilotInput, Px4Input
+from links.simulated.autopilot.flight_stack.estimation.ekf2 import Ekf2
+from links.simulated.autopilot.flight_stack.estimation.ekf3 import Ekf3
+from links.simulated.autopilot.flight_stack.estimation.external_input import ArduPilotInput, Px4Input
+from links.simulated.autopilot.flight_stack.estimation.source_rules import SOURCE_SETS, Source, Sources
 from links.simulated.autopilot.flight_stack.failsafe import EkfCheck
 from links.simulated.autopilot.flight_stack.quadrotor import TICK_S, Quadrotor
 from links.simulated.autopilot.flight_stack.sensors import GpsFix
 from links.simulated.autopilot.flight_stack.settings import FlightStackSettings
-from links.simulated.autopilot.flight_stack.source_rules import SOURCE_SETS, Source, Sources
 from stages.geometry.frames import Array64
 
 
@@ -47,7 +47,9 @@ class Estimators:
         count = self._settings.lanes
         gyro = [self._calibrated, self._calibrated + self._settings.imu.gyro_calibrated * self._other[0:3]]
         self.cores = [self._core(self._sets, yaw_rad if compass else None, gyro[i]) for i in range(count)]
-        self._independent = self._core(self._sets[:1], yaw_rad, gyro[0]) if self._settings.independent_telemetry else None
+        self._independent = (
+            self._core(self._sets[:1], yaw_rad, gyro[0]) if self._settings.independent_telemetry else None
+        )
         self._primary = 0
         self._resets: list[tuple[Array64, float]] = []
         delay = self._settings.viso_delay_ms

@@ -13,8 +13,8 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from links.simulated.autopilot.flight_stack.estimation.source_rules import FilterRules
 from links.simulated.autopilot.flight_stack.quadrotor import TICK_S
-from links.simulated.autopilot.flight_stack.source_rules import FilterRules
 from links.simulated.kernels.ekf import STATES, fuse, predict, propagated, reset_states, reset_yaw, yaw_and_jacobian
 from stages.geometry.frames import Array64
 
@@ -64,7 +64,12 @@ class Lane:
         self.resets: list[tuple[Array64, float]] = []  # jumps of position [m] and yaw [rad], until taken
         self.reset_count = 0
         self._noise = np.array(
-            [rules.gyro_noise_radps, rules.accelerometer_noise_mps2, rules.gyro_bias_noise, rules.accelerometer_bias_noise]
+            [
+                rules.gyro_noise_radps,
+                rules.accelerometer_noise_mps2,
+                rules.gyro_bias_noise,
+                rules.accelerometer_bias_noise,
+            ]
         )
         self._length = round(rules.horizon_s / TICK_S)
         self._moved = np.zeros((self._length, 6))

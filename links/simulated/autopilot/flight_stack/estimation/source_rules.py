@@ -38,12 +38,8 @@ class Sources:
 SOURCE_SETS: dict[SourceSet, Sources] = {
     "gps": Sources(Source.GPS, Source.GPS, Source.BARO, Source.GPS, Source.BARO),
     "external": Sources(*[Source.EXTERNAL] * 5),
-    "external_no_velocity": Sources(
-        Source.EXTERNAL, Source.NONE, Source.EXTERNAL, Source.NONE, Source.EXTERNAL
-    ),
-    "external_baro_height": Sources(
-        Source.EXTERNAL, Source.EXTERNAL, Source.BARO, Source.EXTERNAL, Source.EXTERNAL
-    ),
+    "external_no_velocity": Sources(Source.EXTERNAL, Source.NONE, Source.EXTERNAL, Source.NONE, Source.EXTERNAL),
+    "external_baro_height": Sources(Source.EXTERNAL, Source.EXTERNAL, Source.BARO, Source.EXTERNAL, Source.EXTERNAL),
     "external_position": Sources(Source.EXTERNAL, Source.NONE, Source.BARO, Source.NONE, Source.BARO),
     "none": Sources(Source.NONE, Source.NONE, Source.BARO, Source.NONE, Source.BARO),
 }
@@ -58,7 +54,7 @@ class FilterRules:
     gyro_bias_noise: float  # EK3_GBIAS_P_NSE, EKF2_GYR_B_NOISE [rad/s per s]
     accelerometer_bias_noise: float  # EK3_ABIAS_P_NSE, EKF2_ACC_B_NOISE [m/s^3]
     baro_noise_m: float  # EK3_ALT_M_NSE, EKF2_BARO_NOISE
-    compass_noise_rad: float  # EK3_YAW_M_NSE, EKF2_HEAD_NOISE
+    compass_noise_rad: float  # of a heading by the compass; EKF2_HEAD_NOISE
     external_velocity_noise_mps: float  # VISO_VEL_M_NSE, EKF2_EVV_NOISE
     position_gate: float  # EK3_POS_I_GATE / 100, EKF2_EVP_GATE
     velocity_gate: float
@@ -79,7 +75,7 @@ EKF3 = FilterRules(
     gyro_bias_noise=1.0e-3,
     accelerometer_bias_noise=0.02,
     baro_noise_m=2.0,
-    compass_noise_rad=0.5,
+    compass_noise_rad=0.1,  # of the three-axis fusion in flight: EK3_MAG_M_NSE 0.05 gauss in a field of 0.5 gauss
     external_velocity_noise_mps=0.1,
     position_gate=5.0,
     velocity_gate=5.0,

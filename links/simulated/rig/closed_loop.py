@@ -41,6 +41,7 @@ class ClosedLoopSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     compute_s: float = Field(default=0.02, ge=0.003, le=1)  # from arrival of a record to the goal leaving the host
+    killed_s: tuple[float, float] | None = None  # (from, to): grd is not running; it starts again without its state
 
 
 class GoalTap(Tap):
@@ -69,8 +70,17 @@ class ClosedLoop:
     ) -> None:
         """`loop_metadata` is for the recording, names the configuration; `taps` are open and see all messages."""
         self.loop_metadata = loop_metadata
-        self._digest, goals, poses = Digest(), GoalTap(), PoseTap()
-        self._replay = Replay(graph, (self._digest, goals, poses, *taps))
+        self._graph, self._settings = graph, settings
+        self._digest, self._taps = Digest(), taps
+        self._compute_ns = round(settings.compute_s * 1e9)
+        self._start_ns: int | None = None
+        self._running = True
+        self._start()
+
+    def _start(self) -> None:
+        """Build the graph's nodes, and, with an autopilot in the loop, open its session."""
+        graph, goals, poses = self._graph, GoalTap(), PoseTap()
+        self._replay = Replay(graph, (self._digest, goals, poses, *self._taps))
         self._servo: Servo | None = None
         if any(issubclass(spec.cls, Lidar | Servo) for spec in graph.nodes.values()):
             self._servo_name, output = servo_edge(graph)
@@ -78,17 +88,31 @@ class ClosedLoop:
             assert isinstance(servo, Servo)
             self._servo = servo
             goals.watch(output, servo)
-        self._compute_ns = round(settings.compute_s * 1e9)
-        self._poses: PoseLoop | None = None
-        self._connect = lambda: PoseLoop(self._replay, graph, poses, self._compute_ns) if has_autopilot(graph) else None
+        connected = self._start_ns is not None and has_autopilot(graph)
+        self._poses = PoseLoop(self._replay, graph, poses, self._compute_ns) if connected else None
 
-    def connect_autopilot(self) -> None:
-        """The autopilot of the scenario flies on what the graph sends: open its session."""
-        self._poses = self._connect()
+    def connect_autopilot(self, start_ns: int) -> None:
+        """The autopilot of a scenario that starts at a time flies on what the graph sends: open its session."""
+        self._start_ns = start_ns
+        self._start()
 
     def receive(self, record: Record) -> Record | None:
         """A record as it arrives at the host: a frame of the autopilot gets its stamp. None: not for the graph."""
+        if not self._is_running(record.arrival_ns):
+            return None
         return record if self._poses is None else self._poses.before(record)
+
+    def _is_running(self, now_ns: int) -> bool:
+        """Whether grd runs; after it was killed it starts anew."""
+        killed_s = self._settings.killed_s
+        if killed_s is None or self._start_ns is None:
+            return True
+        begin_ns, end_ns = (self._start_ns + round(1e9 * s) for s in killed_s)
+        running = not begin_ns <= now_ns < end_ns
+        if running and not self._running:
+            self._start()
+        self._running = running
+        return running
 
     def sent(self) -> list[Record]:
         """Frames to the autopilot since the last call, stamped with the time at which they leave the host."""

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.recording import RecordingWriter
 from links.simulated.autopilot.autopilot import Autopilot
-from links.simulated.autopilot.flight_stack.outcome import FlightOutcome, Outcome
+from links.simulated.autopilot.flight_stack.outcome import Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.lidar import lidar_poses
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
 from links.simulated.rig.fix_sensor import FixSensor
+from links.simulated.rig.flight_in_the_loop import FlightInTheLoop
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.rig.scripted_servo import ServoScript
@@ -91,16 +92,11 @@ class Simulation:
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
         drone_motion: Path | Flight | FlownMotion | None = drone.path if drone else None
         self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry] = []
-        self.stack: FlightStack | None = None
+        self.flight: FlightInTheLoop | None = None
         if drone is not None and scenario.autopilot is not None and scenario.autopilot.flight_stack is not None:
-            ground_m, vehicle_path = -scenario.vehicle.camera_height_m, scenario.vehicle.path
-            self.stack = FlightStack(
-                scenario.autopilot, drone.path, vehicle_path, ground_m, start_ns, duration_s, self.seed
-            )
-            drone_motion = self.stack.motion
-            self.telemetry_sources.append(self.stack)
-            if loop is not None:
-                loop.connect_autopilot()
+            self.flight = FlightInTheLoop(self.scenario, loop)
+            drone_motion = self.flight.stack.motion
+            self.telemetry_sources.append(self.flight.stack)
         elif drone is not None and scenario.autopilot is not None:
             drone_motion = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
             self.telemetry_sources.append(Autopilot(scenario.autopilot, drone_motion, start_ns, duration_s, self.seed))
@@ -125,9 +121,10 @@ class Simulation:
             [drone_shapes(other.span_m, other.model) for other in others],
         )
         spans_m = [flying.span_m for flying in (drone, *others) if flying is not None]
-        planned = self.truth if self.stack is None else dataclasses.replace(self.truth, drone=drone and drone.path)
+        planned = self.truth if self.flight is None else dataclasses.replace(self.truth, drone=drone and drone.path)
         check_paths(self._scene.world, planned, scenario.duration_s, spans_m)
-        self.outcome = None if self.stack is None else FlightOutcome(self.stack, self._scene.world, self.truth)
+        if self.flight is not None:
+            self.flight.watch(self._scene.world, self.truth)
         fixes = scenario.fix_sensor
         self._fixes = None if fixes is None else FixSensor(fixes, self.truth, scenario.lidar_gaps_s, self.seed)
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
@@ -162,7 +159,6 @@ class Simulation:
 
     def records(self) -> Iterator[Record]:
         """All records in order of arrival, with sequence numbers."""
-        waiting, made = self._waiting, self._made
         sent = 0
         start_ns = self.scenario.start_ns
         end_ns = start_ns + round(self.scenario.duration_s * 1e9)
@@ -172,59 +168,59 @@ class Simulation:
         while first_ns < end_ns:
             packets = min(most, -(-(end_ns - first_ns) // packet_ns))
             next_ns = first_ns + packets * packet_ns
-            if self.stack is not None:
-                self.stack.advance(next_ns)
-            if self._fixes is not None:
-                records = self._fixes.records(next_ns)
-            else:
-                records = self._servo.advance(next_ns) + self.lidar_records(first_ns, packets, packet_ns)
-            for camera in self._cameras:
-                records += camera.records(next_ns)
-            for source in self.telemetry_sources:
-                records += source.records(next_ns)
-            records += self.truth_records(next_ns)
-            for record in records:
-                if not self._is_lost(record):
-                    heapq.heappush(waiting, (record.arrival_ns, next(made), record))
+            self._push(self._made_records(first_ns, packets, packet_ns))
             first_ns = next_ns
-            if self.outcome is not None and self.outcome.is_over():
+            if self.flight is not None and self.flight.is_over():
                 end_ns = next_ns
-            while waiting and (waiting[0][0] < next_ns or first_ns >= end_ns):
-                record = heapq.heappop(waiting)[2]
-                if self.stack is not None and self._loop is not None and not record.topic.startswith(TRUTH_TOPICS):
-                    arrived = self._loop.receive(record)
-                    if arrived is None:
+            while self._waiting and (self._waiting[0][0] < next_ns or first_ns >= end_ns):
+                record: Record | None = heapq.heappop(self._waiting)[2]
+                if self.flight is not None:
+                    record = self.flight.arrived(record)
+                    if record is None:
                         continue
-                    record = arrived
                 record = dataclasses.replace(record, sequence=sent)
                 self._feed_loop(record)
                 yield record
                 sent += 1
         if self._loop is not None:
             self._loop.finish()
+        if self.flight is not None and (outcome := self.flight.record(end_ns)) is not None:
+            yield dataclasses.replace(outcome, sequence=sent)
 
-    def _is_lost(self, record: Record) -> bool:
-        """Whether a gap of the LiDAR swallows a packet."""
-        gaps = self.scenario.lidar_gaps_s
-        if not gaps or record.topic != "/lidar/packets":
-            return False
-        time_s = (record.stamp_ns - self.scenario.start_ns) * 1e-9
-        return any(begin <= time_s < end for begin, end in gaps)
+    def _made_records(self, first_ns: int, packets: int, packet_ns: int) -> list[Record]:
+        """Records of all sensors from a time on, for the duration of so many LiDAR packets."""
+        next_ns = first_ns + packets * packet_ns
+        if self.flight is not None:
+            self.flight.stack.advance(next_ns)
+        if self._fixes is not None:
+            records = self._fixes.records(next_ns)
+        else:
+            records = self._servo.advance(next_ns)
+            records += self.lidar_records(first_ns, packets, packet_ns)
+        for camera in self._cameras:
+            records += camera.records(next_ns)
+        for source in self.telemetry_sources:
+            records += source.records(next_ns)
+        return records + self.truth_records(next_ns)
+
+    def _push(self, records: list[Record]) -> None:
+        """Keep records until they arrive, except LiDAR packets in a gap."""
+        gaps_ns = [[self.scenario.start_ns + round(1e9 * s) for s in gap] for gap in self.scenario.lidar_gaps_s]
+        for record in records:
+            lidar = record.topic == "/lidar/packets"
+            if not (lidar and any(begin <= record.stamp_ns < end for begin, end in gaps_ns)):
+                heapq.heappush(self._waiting, (record.arrival_ns, next(self._made), record))
 
     def _feed_loop(self, record: Record) -> None:
-        """Feed a record to the pipeline, except ground truth, and pass its command to the servo."""
+        """Feed a record to the pipeline, except ground truth; pass on its command to the servo and its frames."""
         if self._loop is None or record.topic.startswith(TRUTH_TOPICS):
             return
         sent = self._loop.take(record)
         if sent is not None:
             left_ns, command = sent
             self._servo.command(left_ns, command.position_rad, command.speed_radps)
-        if self.stack is not None:
-            for frame in self._loop.sent():
-                self.stack.receive(frame.data, frame.arrival_ns)
-                heapq.heappush(self._waiting, (frame.arrival_ns, next(self._made), frame))
-                if self.outcome is not None:
-                    self.outcome.on_sent(frame)
+        if self.flight is not None:
+            self._push(self.flight.sent())
 
     def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """True poses of the LiDAR: rotations (n, 3, 3), positions (n, 3) [m]."""
@@ -345,5 +341,5 @@ def simulate_into(
         wall_s=time.perf_counter() - began,
         size_bytes=out.stat().st_size,
         output_hash=None if loop is None else loop.output_hash,
-        outcome=None if simulation.outcome is None else simulation.outcome.result(),
+        outcome=None if simulation.flight is None else simulation.flight.result(),
     )

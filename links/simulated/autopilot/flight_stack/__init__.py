@@ -1,1 +1,1 @@
-"""An autopilot in the loop: airframe, sensors, EKF, source sets, guidance, failsafes, telemetry; flown by what it is sent."""
+"""An autopilot in the loop: airframe, sensors, EKF, source sets, guidance, failsafes and telemetry."""

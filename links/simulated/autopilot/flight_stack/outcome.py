@@ -55,7 +55,8 @@ class Outcome:
         if self.sent_poses:
             parts.append(
                 f"{self.sent_poses} poses sent, {self.wrong_poses} wrong, worst {self.sent_worst_m:.2f} m "
-                f"{self.sent_yaw_worst_deg:.1f} deg, 95 % {self.sent_95_m:.2f} m, yaw RMS {self.sent_yaw_rms_deg:.1f} deg"
+                f"{self.sent_yaw_worst_deg:.1f} deg, 95 % {self.sent_95_m:.2f} m, "
+                f"yaw RMS {self.sent_yaw_rms_deg:.1f} deg"
             )
         else:
             parts.append("no pose sent")

@@ -1,4 +1,4 @@
-"""ArduPilot's EKF3 as far as position, velocity, height and yaw aiding go: sources, gates, timeouts, resets, aiding mode.
+"""ArduPilot's EKF3: aiding by position, velocity, height and yaw, with its sources, gates, timeouts and resets.
 
 Not modelled: wind and magnetic field states (the compass is fused as a heading), optical flow, ranges, the GSF yaw
 estimator, ground effect.

@@ -18,10 +18,9 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
 from links.mavlink.profiles import PROFILES
-from links.mavlink.transport.framing import packed
 from links.simulated.autopilot.autopilot import AutopilotSettings
-from links.simulated.autopilot.flight_stack import streams, telemetry
 from links.simulated.autopilot.flight_stack.commands import handle_frame, send_origin
+from links.simulated.autopilot.flight_stack.downlink import Downlink
 from links.simulated.autopilot.flight_stack.estimation.estimator import Estimators
 from links.simulated.autopilot.flight_stack.estimation.source_rules import EKF_CHECK_HZ, SOURCE_SETS, Source
 from links.simulated.autopilot.flight_stack.failsafe import EkfCheck, arming_refusal
@@ -35,17 +34,16 @@ from links.simulated.autopilot.flight_stack.guidance import (
     Target,
     rotate,
 )
-from links.simulated.autopilot.flight_stack.quadrotor import STEPS, TICK_S, Quadrotor, Tick
+from links.simulated.autopilot.flight_stack.quadrotor import TICK_S, Quadrotor
 from links.simulated.autopilot.flight_stack.sensors import Sensors
 from links.simulated.autopilot.flight_stack.settings import TakeOff, UseSources
 from links.simulated.autopilot.radio import Radio
-from links.simulated.kernels.motion import STEP_S
 from links.simulated.world.path import Path
 from stages.geometry.frames import Array64
 
 mavlink: Any = ardupilotmega
 NS = 1_000_000_000
-TICK_NS, STEP_NS = round(TICK_S * NS), round(STEP_S * NS)
+TICK_NS = round(TICK_S * NS)
 GUIDED, LAND = 4, 9  # custom modes of ArduCopter
 BOOT_S = 2.0  # a reboot is silent for so long
 ORIGIN = (356_895_000, 1_396_917_000, 40_000)  # latitude, longitude [1e-7 deg], altitude [mm] of the first GPS fix
@@ -69,7 +67,8 @@ class FlightStack:
         self._autopilot, self._start_ns = settings, start_ns
         self.own, self.px4 = (1, 1), s.kind == "px4"
         self.parameters = {w.name: w.values[0] if w.values else max(w.at_least, 0) for w in PROFILES[s.kind].required}
-        self.streams = streams.Streams(s.kind, self._rates(settings), s.denied_intervals)
+        self._downlink = Downlink(settings, start_ns, seed)
+        self.streams = self._downlink.streams
         self.origin: tuple[int, int, int] | None = None
         self.events: list[tuple[float, str]] = []  # time and what happened, for the outcome
         position, _, _, yaw = (part[0] for part in path.at(np.zeros(1)))
@@ -86,12 +85,8 @@ class FlightStack:
         self._plan: deque[Any] = deque(s.plan)
         self._step_ends_s = 0.0
         self._climbing_to: float | None = None
-        self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-        self._downlink = Radio(settings.downlink, start_ns, np.random.default_rng([seed, 31]))
         self._uplink = Radio(settings.uplink, start_ns, np.random.default_rng([seed, 32]))
         self._received: deque[tuple[int, bytes]] = deque()
-        self._waiting: deque[Any] = deque()
-        self._records: deque[tuple[int, Record]] = deque()
         self._tick = 0
         self._boot_ns = start_ns - round(NS * settings.boot_s)
         self._silent_until_ns = 0
@@ -117,10 +112,7 @@ class FlightStack:
     def records(self, until_ns: int) -> list[Record]:
         """Frames sent before `until_ns` that were not returned yet, stamped with their arrival."""
         self.advance(until_ns)
-        found: list[Record] = []
-        while self._records and self._records[0][0] < until_ns:
-            found.append(self._records.popleft()[1])
-        return found
+        return self._downlink.records(until_ns)
 
     def advance(self, until_ns: int) -> None:
         """Fly until the truth is known up to a time."""
@@ -130,7 +122,7 @@ class FlightStack:
 
     def send(self, message: Any) -> None:
         """Queue a message; it is sent at the next step of the main loop."""
-        self._waiting.append(message)
+        self._downlink.send(message)
 
     def take_pose(self, message: Any, device_ns: int) -> None:
         """See Vehicle."""
@@ -199,7 +191,7 @@ class FlightStack:
         tick = self.quadrotor.fly(estimate, command)
         self.ekf.step(self.device_ns(now_ns + TICK_NS), tick.moved)
         if alive:
-            self._send_due(now_ns, tick)
+            self._downlink.send_due(now_ns, tick, self.ekf, self.device_ns, self._heartbeat())
 
     def _command(self, time_s: float, estimate: Array64) -> Array64:
         """(6,) for the airframe."""
@@ -298,54 +290,13 @@ class FlightStack:
         """Boot again; in flight the motors keep the airframe level at hover thrust meanwhile."""
         self._note("reboot")
         self._boot_ns, self._silent_until_ns = now_ns, now_ns + round(BOOT_S * NS)
-        self.streams.restart()
-        self._waiting.clear()
+        self._downlink.restart()
         self.origin = None
         self.ekf.restart(self._true_yaw() + self._sensors.yaw_bias_rad)
         self._controller.reset()
         self._check = EkfCheck()
 
-    # --- sending ---
-
-    def _send_due(self, now_ns: int, tick: Tick) -> None:
-        reported, ekf = self.ekf.reported, self.ekf
-        drift = np.zeros(10)
-        if reported is not ekf.primary:
-            drift = reported.lane.output()[0:10]
-        for step in range(STEPS):
-            sent_ns = now_ns + step * STEP_NS + STEP_NS // 2
-            device_ns = self.device_ns(sent_ns)
-            estimate = tick.estimates[step] if reported is ekf.primary else drift
-            gyro = tick.samples[step, 0:3] - reported.lane.x[10:13]
-            for message in self.streams.due(device_ns):
-                built = self._message(message, device_ns, estimate, gyro, tick.samples[step])
-                if built is not None:
-                    self._waiting.append(built)
-            while self._waiting:
-                frame = packed(self._waiting.popleft(), self._mav)
-                arrival_ns = self._downlink.arrival_ns(sent_ns, len(frame))
-                if arrival_ns is not None:
-                    record = Record("/autopilot/rx", arrival_ns=arrival_ns, stamp_ns=arrival_ns, data=frame)
-                    self._records.append((sent_ns, record))
-
-    def _message(self, message: int, device_ns: int, estimate: Array64, gyro: Array64, sample: Array64) -> Any:
-        ekf = self.ekf.reported
-        if message == streams.HEARTBEAT:
-            return self._heartbeat()
-        if message == streams.ATTITUDE:
-            return telemetry.attitude(device_ns, estimate, gyro)
-        if message == streams.LOCAL_POSITION_NED:  # EKF3 reports no position in constant position mode
-            return telemetry.local_position(device_ns, estimate) if ekf.aiding and ekf.origin else None
-        if message == streams.ODOMETRY:
-            known = ekf.aiding and ekf.origin
-            return telemetry.odometry(device_ns, estimate, gyro, ekf.lane.P, ekf.lane.reset_count) if known else None
-        if message == streams.RAW_IMU:
-            return telemetry.raw_imu(device_ns, sample)
-        if message == streams.SCALED_IMU:
-            return telemetry.scaled_imu(device_ns, sample)
-        if message == streams.HIGHRES_IMU:
-            return telemetry.highres_imu(device_ns, sample)
-        return self.ekf.report(device_ns)
+    # --- status ---
 
     def _heartbeat(self) -> Any:
         base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0)
@@ -362,16 +313,3 @@ class FlightStack:
 
     def _note(self, what: str) -> None:
         self.events.append((self._tick * TICK_S, what))
-
-    @staticmethod
-    def _rates(settings: AutopilotSettings) -> dict[int, float]:
-        return {
-            streams.HEARTBEAT: 1.0,
-            streams.ATTITUDE: settings.attitude_hz,
-            streams.LOCAL_POSITION_NED: settings.position_hz,
-            streams.ODOMETRY: settings.odometry_hz,
-            streams.RAW_IMU: settings.imu_hz,
-            streams.HIGHRES_IMU: settings.imu_hz,
-            streams.EKF_STATUS_REPORT: 5.0,
-            streams.ESTIMATOR_STATUS: 5.0,
-        }

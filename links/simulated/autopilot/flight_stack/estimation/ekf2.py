@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from links.simulated.autopilot.flight_stack.estimation.ekf3 import NS, Ekf3, External
+from links.simulated.autopilot.flight_stack.estimation.ekf3 import NS, Ekf3
 from links.simulated.autopilot.flight_stack.estimation.lane import Lane
+from links.simulated.autopilot.flight_stack.estimation.observations import External
 from links.simulated.autopilot.flight_stack.estimation.source_rules import (
     EKF2,
     PX4_EV_RESETS,

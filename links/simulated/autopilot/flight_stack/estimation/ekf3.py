@@ -12,11 +12,11 @@ selectHeightForFusion), AP_NavEKF3_MagFusion.cpp (SelectMagFusion, alignYawAngle
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from links.simulated.autopilot.flight_stack.estimation.lane import Lane, ObservationBuffer
+from links.simulated.autopilot.flight_stack.estimation.lane import Lane
+from links.simulated.autopilot.flight_stack.estimation.observations import External, ObservationBuffer, Status
 from links.simulated.autopilot.flight_stack.estimation.source_rules import (
     EKF3,
     Source,
@@ -32,29 +32,6 @@ NS = 1_000_000_000
 RECENT_NS = 500_000_000  # minTestTime_ms: a source in use
 FRESH_NS = 250_000_000  # a reset uses data not older than this
 BARO_OFFSET_GAIN, BARO_OFFSET_STEP_M = 0.1, 5.0  # calcFiltBaroOffset, while another height source is used
-
-
-@dataclass(frozen=True, slots=True)
-class External:
-    """An external pose in frame odom's axes (z up)."""
-
-    time_ns: int
-    xyz_m: Array64
-    yaw_rad: float
-    velocity_mps: Array64 | None
-    position_sigma_m: float
-    yaw_sigma_rad: float
-    reset: bool  # its reset counter has changed
-
-
-@dataclass(slots=True)
-class Status:
-    """What EKF_STATUS_REPORT contains, and more; ratios are innovation test ratios, 1 at the gate."""
-
-    velocity: float = 0.0
-    position: float = 0.0
-    height: float = 0.0
-    yaw: float = 0.0
 
 
 class Ekf3:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
-from links.simulated.autopilot.flight_stack.estimation.ekf3 import External
+from links.simulated.autopilot.flight_stack.estimation.observations import External
 from links.simulated.autopilot.px4_rules import Px4Rules
 from links.simulated.autopilot.rules import ExternalPose, PoseResult
 

@@ -9,7 +9,6 @@ Source: ArduPilot AP_NavEKF3 (fusion time horizon, EKF_obs_buffer_t::recall, out
 from __future__ import annotations
 
 import math
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -17,35 +16,6 @@ from links.simulated.autopilot.flight_stack.estimation.source_rules import Filte
 from links.simulated.autopilot.flight_stack.quadrotor import TICK_S
 from links.simulated.kernels.ekf import STATES, fuse, predict, propagated, reset_states, reset_yaw, yaw_and_jacobian
 from stages.geometry.frames import Array64
-
-M = TypeVar("M")
-OLD_NS = 100_000_000  # recall: an observation older than this before the horizon is dropped
-MAX_WAITING = 64
-
-
-class ObservationBuffer(Generic[M]):
-    """Observations with their times; `recall` takes the newest that the horizon has reached."""
-
-    def __init__(self) -> None:
-        self._waiting: list[tuple[int, M]] = []
-
-    def push(self, time_ns: int, observation: M) -> None:
-        """Add one; they may arrive out of order."""
-        self._waiting.append((time_ns, observation))
-        self._waiting.sort(key=lambda item: item[0])
-        del self._waiting[:-MAX_WAITING]
-
-    def recall(self, horizon_ns: int) -> M | None:
-        """The newest at or before the horizon and not too old; it and all before it are removed."""
-        newest: M | None = None
-        while self._waiting and self._waiting[0][0] <= horizon_ns:
-            time_ns, observation = self._waiting.pop(0)
-            newest = observation if horizon_ns - time_ns < OLD_NS else None
-        return newest
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._waiting.clear()
 
 
 class Lane:

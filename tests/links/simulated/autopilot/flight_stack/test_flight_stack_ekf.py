@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from links.simulated.autopilot.flight_stack.estimation.lane import Lane, ObservationBuffer
+from links.simulated.autopilot.flight_stack.estimation.lane import Lane
+from links.simulated.autopilot.flight_stack.estimation.observations import ObservationBuffer
 from links.simulated.autopilot.flight_stack.estimation.source_rules import EKF3
 from links.simulated.kernels.airframe import turn
 from links.simulated.kernels.ekf import fuse, predict, reset_yaw, yaw_and_jacobian

@@ -17,7 +17,7 @@ from links.mavlink.transport.framing import packed
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.autopilot.flight_stack import streams, telemetry
 from links.simulated.autopilot.flight_stack.estimation.estimator import Estimators
-from links.simulated.autopilot.flight_stack.quadrotor import STEPS, Tick
+from links.simulated.autopilot.flight_stack.quadrotor import STEPS, FlownTick
 from links.simulated.autopilot.radio import Radio
 from links.simulated.kernels.motion import STEP_S
 from stages.geometry.frames import Array64
@@ -66,7 +66,7 @@ class Downlink:
         return found
 
     def send_due(
-        self, now_ns: int, tick: Tick, ekf: Estimators, device_ns_of: Callable[[int], int], heartbeat: Any
+        self, now_ns: int, tick: FlownTick, ekf: Estimators, device_ns_of: Callable[[int], int], heartbeat: Any
     ) -> None:
         """Send what is due in a tick, in the middle of each step of the main loop."""
         reported = ekf.reported

@@ -14,7 +14,11 @@ from __future__ import annotations
 import math
 
 from links.simulated.autopilot.flight_stack.estimation.ekf3 import Ekf3
-from links.simulated.autopilot.flight_stack.estimation.source_rules import EKF_CHECK_ITERATIONS, FS_EKF_THRESH, Source
+from links.simulated.autopilot.flight_stack.estimation.source_rules import (
+    EKF_CHECK_ITERATIONS,
+    FS_EKF_THRESH,
+    AidingSource,
+)
 
 
 class EkfCheck:
@@ -65,7 +69,7 @@ def arming_refusal(ekf: Ekf3, external_healthy: bool, uses_external: bool) -> st
     if not ekf.yaw_aligned:
         return "PreArm: AHRS: EKF3 Yaw inconsistent"
     if not ekf.has_position:
-        needs = "GPS" if ekf.sources.position is Source.GPS else "Position Estimate"
+        needs = "GPS" if ekf.sources.position is AidingSource.GPS else "Position Estimate"
         return f"PreArm: Need {needs}"
     if not ekf.origin:
         return "PreArm: AHRS: waiting for home"

@@ -32,7 +32,7 @@ CORNER_STOP_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class SurveyFrame:
     """Where the sources in use put the world frame: position and yaw may come from different ones."""
 
     yaw_rad: float  # of the world's x axis in the frame of the position source
@@ -45,7 +45,7 @@ class Frame:
 
 
 @dataclass(slots=True)
-class Target:
+class FlightTarget:
     """What is to be flown now, in the frame of the estimate."""
 
     xyz_m: Array64
@@ -57,7 +57,7 @@ class Target:
 class Guidance:
     """The plan, step by step, as targets."""
 
-    def __init__(self, path: Path, vehicle: Path, target: Target) -> None:
+    def __init__(self, path: Path, vehicle: Path, target: FlightTarget) -> None:
         self.target = target
         self._path, self._vehicle = path, vehicle
         self._step: PlanStep | None = None
@@ -80,7 +80,7 @@ class Guidance:
         self._from = self._from + jump_m
         self.target.yaw_rad += yaw_rad
 
-    def update(self, time_s: float, frame: Frame) -> Target:
+    def update(self, time_s: float, frame: SurveyFrame) -> FlightTarget:
         """The target at a time. `frame` maps surveyed positions to the sources in use."""
         step, since_s = self._step, time_s - self._begin_s
         if isinstance(step, FollowPath):
@@ -95,7 +95,7 @@ class Guidance:
             self._follow(time_s, frame)
         return self.target
 
-    def _follow_path(self, since_s: float, frame: Frame) -> None:
+    def _follow_path(self, since_s: float, frame: SurveyFrame) -> None:
         position, velocity, yaw = self._table
         row = min(round(since_s / TICK_S), len(yaw) - 2)
         self.target.xyz_m = frame.position(position[row])
@@ -119,7 +119,7 @@ class Guidance:
         leg = int(since_s // leg_s)
         self._leg(self._from + corners[leg % 4], self._from + corners[(leg + 1) % 4], step.speed_mps, since_s % leg_s)
 
-    def _follow(self, time_s: float, frame: Frame) -> None:
+    def _follow(self, time_s: float, frame: SurveyFrame) -> None:
         times = np.array([self._begin_s, time_s])
         position, velocity, _, _ = self._vehicle.at(times)
         self.target.xyz_m = self._from + rotate(position[1] - position[0], frame.yaw_rad)
@@ -136,7 +136,7 @@ class PositionController:
         """Forget the integrals."""
         self._integral[:] = 0.0
 
-    def command(self, target: Target, p: Array64, v: Array64) -> Array64:
+    def command(self, target: FlightTarget, p: Array64, v: Array64) -> Array64:
         """(6,) for `fly_steps`: acceleration + g, yaw, yaw rate, motors run."""
         error = target.xyz_m - p
         horizontal = float(np.hypot(error[0], error[1]))

@@ -32,7 +32,7 @@ SPREAD = (0.97, 1.01, 0.99, 1.03)  # rotation rates of the rotors relative to th
 
 
 @dataclass(slots=True)
-class Tick:
+class FlownTick:
     """One tick flown: per step what the IMU reports (4, 6) and the estimate (4, 10); the IMU's sums (6,)."""
 
     samples: Array64
@@ -115,12 +115,12 @@ class Quadrotor:
         """It has hit an obstacle: it falls with stopped motors."""
         self.state[CRASHED] = 1.0
 
-    def fly(self, estimate: Array64, command: Array64) -> Tick:
+    def fly(self, estimate: Array64, command: Array64) -> FlownTick:
         """Fly one tick; `estimate` (16,) is propagated by the IMU. command (6,) as of `fly_steps` without ground."""
         first = STEPS * self._ticks
         wind = self._wind[first : first + STEPS]
         rows = np.empty((STEPS, STATE_SIZE))
-        tick = Tick(np.empty((STEPS, 6)), np.empty((STEPS, 10)), np.empty(6))
+        tick = FlownTick(np.empty((STEPS, 6)), np.empty((STEPS, 10)), np.empty(6))
         tick.moved = fly_steps(
             self.state,
             estimate,

@@ -13,11 +13,11 @@ Vector = tuple[float, float, float]
 SourceSet = Literal["gps", "external", "external_no_velocity", "external_baro_height", "external_position", "none"]
 
 
-class _Settings(BaseModel):
+class _StackSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class ImuSettings(_Settings):
+class ImuSettings(_StackSettings):
     """IMU of the flight controller, 400 Hz, and the low-pass of what it reports (INS_ACCEL_FILTER, INS_GYRO_FILTER)."""
 
     gyro_bias_degps: float = Field(default=0.3, ge=0)  # one sigma, constant in a run; most of it is calibrated at boot
@@ -31,7 +31,7 @@ class ImuSettings(_Settings):
     filter_hz: float = Field(default=20.0, ge=5, le=190)
 
 
-class GpsSettings(_Settings):
+class GpsSettings(_StackSettings):
     """GPS receiver: white noise, a bias that wanders, and delay."""
 
     rate_hz: float = Field(default=5.0, ge=1, le=20)
@@ -45,7 +45,7 @@ class GpsSettings(_Settings):
     reported_mps: float = Field(default=0.3, gt=0)
 
 
-class CompassSettings(_Settings):
+class CompassSettings(_StackSettings):
     """Compass, as a heading: offset (a wrong calibration or a disturbance), slow bias and white noise."""
 
     offset_deg: float = Field(default=0.0, ge=-180, le=180)
@@ -53,7 +53,7 @@ class CompassSettings(_Settings):
     white_deg: float = Field(default=1.0, ge=0)
 
 
-class BaroSettings(_Settings):
+class BaroSettings(_StackSettings):
     """Barometric height."""
 
     white_m: float = Field(default=0.1, ge=0)
@@ -61,7 +61,7 @@ class BaroSettings(_Settings):
     bias_time_s: float = Field(default=100.0, gt=1)
 
 
-class WindSettings(_Settings):
+class WindSettings(_StackSettings):
     """Mean wind and gusts: a first-order Gauss-Markov process per axis."""
 
     mean_world_mps: Vector = (0.0, 0.0, 0.0)
@@ -69,7 +69,7 @@ class WindSettings(_Settings):
     gust_time_s: float = Field(default=1.5, gt=0.05, le=60)
 
 
-class Airframe(_Settings):
+class Airframe(_StackSettings):
     """How the airframe follows its attitude controller, as `links.simulated.world.flight.FlightSettings`."""
 
     attitude_gain_per_s: float = Field(default=8.0, gt=0, le=30)
@@ -80,21 +80,21 @@ class Airframe(_Settings):
     tilt_limit_deg: float = Field(default=30.0, gt=0, le=80)  # ANGLE_MAX
 
 
-class FollowPath(_Settings):
+class FollowPath(_StackSettings):
     """Fly the path of the scenario's drone, from the beginning."""
 
     do: Literal["path"] = "path"
     for_s: float = Field(gt=0)
 
 
-class Hold(_Settings):
+class Hold(_StackSettings):
     """Hold the present target."""
 
     do: Literal["hold"] = "hold"
     for_s: float = Field(gt=0)
 
 
-class GoTo(_Settings):
+class GoTo(_StackSettings):
     """Fly to a position in the world frame, as given by the source in use (GPS: by the surveyed map), and hold it."""
 
     do: Literal["go_to"] = "go_to"
@@ -104,7 +104,7 @@ class GoTo(_Settings):
     for_s: float = Field(gt=0)
 
 
-class Square(_Settings):
+class Square(_StackSettings):
     """Fly squares from the present target, along the axes of the estimate's frame, with a stop at each corner."""
 
     do: Literal["square"] = "square"
@@ -113,14 +113,14 @@ class Square(_Settings):
     for_s: float = Field(gt=0)
 
 
-class Follow(_Settings):
+class Follow(_StackSettings):
     """Keep the present offset from the vehicle while it drives; its position is that of its own odometry."""
 
     do: Literal["follow"] = "follow"
     for_s: float = Field(gt=0)
 
 
-class TakeOff(_Settings):
+class TakeOff(_StackSettings):
     """Arm, when the checks pass, and climb at 1 m/s to a height over the ground; time runs on while not armed."""
 
     do: Literal["take_off"] = "take_off"
@@ -128,7 +128,7 @@ class TakeOff(_Settings):
     for_s: float = Field(gt=0)
 
 
-class UseSources(_Settings):
+class UseSources(_StackSettings):
     """MAV_CMD_SET_EKF_SOURCE_SET of the pilot, at once."""
 
     do: Literal["use_sources"] = "use_sources"
@@ -139,7 +139,7 @@ class UseSources(_Settings):
 PlanStep = Annotated[FollowPath | Hold | GoTo | Square | Follow | TakeOff | UseSources, Field(discriminator="do")]
 
 
-class FlightStackSettings(_Settings):
+class FlightStackSettings(_StackSettings):
     """The autopilot in the loop. Without it the drone follows its path whatever it is sent."""
 
     kind: Literal["ardupilot", "px4"] = "ardupilot"
@@ -160,6 +160,7 @@ class FlightStackSettings(_Settings):
     reboot_s: tuple[float, ...] = ()  # the autopilot reboots in flight, with its motors running on, as a watchdog reset
     estimate_resets_m: tuple[tuple[float, Vector], ...] = ()  # (time, jump): the EKF's position jumps
     end_after_loss_s: float | None = Field(default=5.0, ge=0)  # the simulation ends so long after a loss; None: never
+    check_visual_odometry: bool = True  # bit of ARMING_CHECK: without it, it arms without external poses
     denied_intervals: tuple[int, ...] = ()  # message ids whose SET_MESSAGE_INTERVAL is denied
 
     @model_validator(mode="after")

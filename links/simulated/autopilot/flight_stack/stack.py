@@ -22,16 +22,16 @@ from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.autopilot.flight_stack.commands import handle_frame, send_origin
 from links.simulated.autopilot.flight_stack.downlink import Downlink
 from links.simulated.autopilot.flight_stack.estimation.estimator import Estimators
-from links.simulated.autopilot.flight_stack.estimation.source_rules import EKF_CHECK_HZ, SOURCE_SETS, Source
+from links.simulated.autopilot.flight_stack.estimation.source_rules import EKF_CHECK_HZ, SOURCE_SETS, AidingSource
 from links.simulated.autopilot.flight_stack.failsafe import EkfCheck, arming_refusal
 from links.simulated.autopilot.flight_stack.guidance import (
     LAND_FAST_ABOVE_M,
     LAND_FAST_MPS,
     LAND_MPS,
-    Frame,
+    FlightTarget,
     Guidance,
     PositionController,
-    Target,
+    SurveyFrame,
     rotate,
 )
 from links.simulated.autopilot.flight_stack.quadrotor import TICK_S, Quadrotor
@@ -79,7 +79,7 @@ class FlightStack:
         self.motion = self.quadrotor.motion
         self._sensors = Sensors(s, seed)
         self.ekf = Estimators(s, self._true_yaw() + self._sensors.yaw_bias_rad, self.quadrotor, seed)
-        self._guidance = Guidance(path, vehicle, Target(np.zeros(3), yaw_rad=self._true_yaw()))
+        self._guidance = Guidance(path, vehicle, FlightTarget(np.zeros(3), yaw_rad=self._true_yaw()))
         self._controller, self._check = PositionController(), EkfCheck()
         self.armed, self.mode = not s.on_ground, GUIDED
         self._plan: deque[Any] = deque(s.plan)
@@ -218,18 +218,18 @@ class FlightStack:
     @property
     def external_sets(self) -> list[bool]:
         """Whether the position of each source set is external."""
-        return [SOURCE_SETS[name].position is Source.EXTERNAL for name in self.settings.source_sets]
+        return [SOURCE_SETS[name].position is AidingSource.EXTERNAL for name in self.settings.source_sets]
 
-    def _frame(self) -> Frame:
+    def _frame(self) -> SurveyFrame:
         """Where the sources in use put the world."""
         sources = self.ekf.sources
         home_yaw, map_yaw = self._world_yaw, -float(self._map[1])
-        external = sources.position is Source.EXTERNAL
+        external = sources.position is AidingSource.EXTERNAL
         yaw, origin = (map_yaw, self._map[0]) if external else (home_yaw, self._home)
         xyz = -rotate(origin, yaw)
-        if sources.height is not Source.EXTERNAL:
+        if sources.height is not AidingSource.EXTERNAL:
             xyz[2] = -self._home[2]
-        return Frame(yaw, xyz, map_yaw if sources.yaw is Source.EXTERNAL else home_yaw)
+        return SurveyFrame(yaw, xyz, map_yaw if sources.yaw is AidingSource.EXTERNAL else home_yaw)
 
     def _do_plan(self, time_s: float) -> None:
         while self._plan and time_s >= self._step_ends_s - 1e-9:
@@ -251,7 +251,11 @@ class FlightStack:
                 self._ekf_check()
         if self._climbing_to is not None and not self.armed and time_s >= self._next["arm"]:
             self._next["arm"] = time_s + 1.0
-            refusal = arming_refusal(self.ekf.primary, self.ekf.external_healthy(device_ns), self.ekf.uses_external)
+            refusal = arming_refusal(
+                self.ekf.primary,
+                self.ekf.external_healthy(device_ns),
+                self.ekf.uses_external and self.settings.check_visual_odometry,
+            )
             if refusal is None and not self.quadrotor.crashed and self.mode == GUIDED:
                 self.armed = True
                 self._guidance.target.xyz_m = self.ekf.output()[0:3].copy()

@@ -21,7 +21,7 @@ from links.simulated.autopilot.flight_stack.estimation.source_rules import (
     PX4_EV_START_S,
     PX4_EV_STOP_S,
     PX4_NO_AID_S,
-    Source,
+    AidingSource,
     Sources,
 )
 from links.simulated.autopilot.flight_stack.sensors import GpsFix
@@ -51,8 +51,8 @@ class Ekf2(Ekf3):
                 self._position_source_reset = self._yaw_source_reset = True
         elif self._newest_ns is not None and now - self._newest_ns > PX4_EV_STOP_S * NS:
             self._started = False
-        usable = self._started if source is Source.EXTERNAL else gps is not None and self.origin
-        if not self.aiding and usable and source is not Source.NONE:
+        usable = self._started if source is AidingSource.EXTERNAL else gps is not None and self.origin
+        if not self.aiding and usable and source is not AidingSource.NONE:
             self.aiding = True
             self.position_timeout = self.velocity_timeout = False
             self._position_pass_ns = self._velocity_pass_ns = now

@@ -16,10 +16,10 @@ import math
 import numpy as np
 
 from links.simulated.autopilot.flight_stack.estimation.lane import Lane
-from links.simulated.autopilot.flight_stack.estimation.observations import External, ObservationBuffer, Status
+from links.simulated.autopilot.flight_stack.estimation.observations import External, InnovationRatios, ObservationBuffer
 from links.simulated.autopilot.flight_stack.estimation.source_rules import (
     EKF3,
-    Source,
+    AidingSource,
     Sources,
     fuses_climb,
     fuses_velocity,
@@ -42,7 +42,7 @@ class Ekf3:
     ) -> None:
         """yaw_rad: of the compass at boot; None without a compass: the yaw is not aligned."""
         self.lane = Lane(EKF3, np.zeros(3), yaw_rad or 0.0, gyro_bias)
-        self.status = Status()
+        self.status = InnovationRatios()
         self.active = 0
         self.origin = False
         self.aiding = False  # AID_ABSOLUTE; else AID_NONE, constant position
@@ -60,9 +60,9 @@ class Ekf3:
         self._last_external: External | None = None
         self._last_gps: GpsFix | None = None
         self._position_pass_ns = self._velocity_pass_ns = self._height_pass_ns = 0
-        self._position_source = self._yaw_source = Source.NONE
+        self._position_source = self._yaw_source = AidingSource.NONE
         self._position_source_reset = self._yaw_source_reset = False
-        self._height_source = Source.BARO
+        self._height_source = AidingSource.BARO
         self._baro_offset = 0.0
         self._held: Array64 | None = None  # position held without aiding
         self._ran = False
@@ -114,12 +114,12 @@ class Ekf3:
         source = self.sources.position
         if not self.aiding:
             ready = self.yaw_aligned and (
-                (source is Source.GPS and gps is not None and self.origin)
-                or (source is Source.EXTERNAL and external is not None)
+                (source is AidingSource.GPS and gps is not None and self.origin)
+                or (source is AidingSource.EXTERNAL and external is not None)
             )
             if ready:
                 self.aiding = True
-                name = "GPS" if source is Source.GPS else "external nav data"
+                name = "GPS" if source is AidingSource.GPS else "external nav data"
                 self.texts.append((6, f"EKF3 IMU0 is using {name}"))
                 self.position_timeout = self.velocity_timeout = False
                 self._position_pass_ns = self._velocity_pass_ns = now
@@ -148,17 +148,17 @@ class Ekf3:
         if source is not self._yaw_source:
             self._yaw_source, self._yaw_source_reset = source, True
         compass = self._compass.recall(self.lane.horizon_ns)
-        if source is Source.EXTERNAL:
+        if source is AidingSource.EXTERNAL:
             if external is None or not math.isfinite(external.yaw_rad):
                 return
             variance = max(external.yaw_sigma_rad, 0.05) ** 2
             measured = external.yaw_rad
         else:
-            if compass is None or source is Source.NONE:
+            if compass is None or source is AidingSource.NONE:
                 return
             variance, measured = self.lane.rules.compass_noise_rad**2, compass
         if not self.yaw_aligned or self._yaw_source_reset:
-            self.lane.reset_yaw(measured, variance if source is Source.EXTERNAL else math.radians(10) ** 2)
+            self.lane.reset_yaw(measured, variance if source is AidingSource.EXTERNAL else math.radians(10) ** 2)
             self.yaw_aligned, self._yaw_source_reset = True, False
             self.texts.append((6, "EKF3 IMU0 yaw aligned"))
             return
@@ -175,7 +175,7 @@ class Ekf3:
     def _fuse_horizontal(self, now: int, external: External | None, gps: GpsFix | None) -> None:
         source = self.sources.position
         if source is not self._position_source:
-            self._position_source_reset = source is not Source.NONE
+            self._position_source_reset = source is not AidingSource.NONE
             self._position_source = source
         if not self.aiding:
             self._hold_position()
@@ -184,28 +184,32 @@ class Ekf3:
         velocity: Array64 | None = None
         climb = False
         variance, velocity_sigma = 0.0, 0.0
-        if gps is not None and source is Source.GPS:
+        if gps is not None and source is AidingSource.GPS:
             position, variance = gps.xyz_m[:2], self._gps_settings.reported_m**2
             velocity_sigma = self._gps_settings.reported_mps
-            if fuses_velocity(Source.GPS, self.sources, self._sets, self._options):
+            if fuses_velocity(AidingSource.GPS, self.sources, self._sets, self._options):
                 velocity = gps.velocity_mps
-                climb = fuses_climb(Source.GPS, self.sources, self._sets, self._options)
-        elif external is not None and source is Source.EXTERNAL:
+                climb = fuses_climb(AidingSource.GPS, self.sources, self._sets, self._options)
+        elif external is not None and source is AidingSource.EXTERNAL:
             position, variance = external.xyz_m[:2], external.position_sigma_m**2
             self.used_external_ns = now
         if (
             external is not None
             and external.velocity_mps is not None
-            and fuses_velocity(Source.EXTERNAL, self.sources, self._sets, self._options)
+            and fuses_velocity(AidingSource.EXTERNAL, self.sources, self._sets, self._options)
         ):
             velocity, velocity_sigma = external.velocity_mps, self.lane.rules.external_velocity_noise_mps
-            climb = fuses_climb(Source.EXTERNAL, self.sources, self._sets, self._options)
-        fresh = gps if source is Source.GPS else external
-        reset = source is Source.EXTERNAL and external is not None and external.reset
+            climb = fuses_climb(AidingSource.EXTERNAL, self.sources, self._sets, self._options)
+        fresh = gps if source is AidingSource.GPS else external
+        reset = source is AidingSource.EXTERNAL and external is not None and external.reset
         if fresh is not None and (reset or self._position_source_reset):
             self._position_source_reset = False
             self._reset_position(now)
-            if source is Source.EXTERNAL and self._height_source is Source.EXTERNAL and external is not None:
+            if (
+                source is AidingSource.EXTERNAL
+                and self._height_source is AidingSource.EXTERNAL
+                and external is not None
+            ):
                 self.lane.reset(2, external.xyz_m[2:], external.position_sigma_m**2)
         if velocity is not None:
             self._test_velocity(now, velocity[: 3 if climb else 2], velocity_sigma)
@@ -249,17 +253,17 @@ class Ekf3:
 
     def _reset_position(self, now: int) -> None:
         source = self.sources.position
-        if source is Source.GPS and self._last_gps is not None:
+        if source is AidingSource.GPS and self._last_gps is not None:
             self.lane.reset(0, self._last_gps.xyz_m[:2], self._gps_settings.reported_m**2)
-        elif source is Source.EXTERNAL and self._last_external is not None:
+        elif source is AidingSource.EXTERNAL and self._last_external is not None:
             self.lane.reset(0, self._last_external.xyz_m[:2], self._last_external.position_sigma_m**2)
 
     def _reset_velocity(self, now: int) -> None:
         gps, external = self._last_gps, self._last_external
-        if self.sources.velocity is Source.GPS and gps is not None and now - gps.time_ns < 4 * FRESH_NS:
+        if self.sources.velocity is AidingSource.GPS and gps is not None and now - gps.time_ns < 4 * FRESH_NS:
             self.lane.reset(3, gps.velocity_mps[:2], self._gps_settings.reported_mps**2)
         elif (
-            self.sources.velocity is Source.EXTERNAL
+            self.sources.velocity is AidingSource.EXTERNAL
             and external is not None
             and external.velocity_mps is not None
             and now - external.time_ns < FRESH_NS
@@ -275,11 +279,13 @@ class Ekf3:
         baro = self._baro.recall(now)
         lost = now - self._external_ns > rules.external_height_lost_s * NS
         before = self._height_source
-        self._height_source = Source.EXTERNAL if self.sources.height is Source.EXTERNAL and not lost else Source.BARO
-        if baro is not None and self._height_source is not Source.BARO:
+        self._height_source = (
+            AidingSource.EXTERNAL if self.sources.height is AidingSource.EXTERNAL and not lost else AidingSource.BARO
+        )
+        if baro is not None and self._height_source is not AidingSource.BARO:
             step = min(max(baro - lane.x[2] - self._baro_offset, -BARO_OFFSET_STEP_M), BARO_OFFSET_STEP_M)
             self._baro_offset += BARO_OFFSET_GAIN * step
-        if self._height_source is Source.EXTERNAL:
+        if self._height_source is AidingSource.EXTERNAL:
             if external is None:
                 return
             measured, variance = float(external.xyz_m[2]), external.position_sigma_m**2
@@ -287,7 +293,7 @@ class Ekf3:
             if baro is None:
                 return
             measured, variance = baro - self._baro_offset, rules.baro_noise_m**2
-        if before is Source.BARO and self._height_source is Source.EXTERNAL and external is not None:
+        if before is AidingSource.BARO and self._height_source is AidingSource.EXTERNAL and external is not None:
             lane.reset(2, external.xyz_m[2:], variance)
         innovation = np.array([measured - lane.x[2]])
         self.status.height = lane.ratio(slice(2, 3), innovation, variance, rules.height_gate)

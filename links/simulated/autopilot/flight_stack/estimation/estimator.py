@@ -14,7 +14,7 @@ from links.simulated.autopilot.flight_stack import telemetry
 from links.simulated.autopilot.flight_stack.estimation.ekf2 import Ekf2
 from links.simulated.autopilot.flight_stack.estimation.ekf3 import Ekf3
 from links.simulated.autopilot.flight_stack.estimation.external_input import ArduPilotInput, Px4Input
-from links.simulated.autopilot.flight_stack.estimation.source_rules import SOURCE_SETS, Source, Sources
+from links.simulated.autopilot.flight_stack.estimation.source_rules import SOURCE_SETS, AidingSource, Sources
 from links.simulated.autopilot.flight_stack.failsafe import EkfCheck
 from links.simulated.autopilot.flight_stack.quadrotor import TICK_S, Quadrotor
 from links.simulated.autopilot.flight_stack.sensors import GpsFix
@@ -43,7 +43,7 @@ class Estimators:
 
     def restart(self, yaw_rad: float) -> None:
         """Boot: all cores begin again, with the yaw of the compass."""
-        compass = any(one.yaw is Source.BARO for one in self._sets)
+        compass = any(one.yaw is AidingSource.BARO for one in self._sets)
         count = self._settings.lanes
         gyro = [self._calibrated, self._calibrated + self._settings.imu.gyro_calibrated * self._other[0:3]]
         self.cores = [self._core(self._sets, yaw_rad if compass else None, gyro[i]) for i in range(count)]
@@ -78,7 +78,7 @@ class Estimators:
     @property
     def uses_external(self) -> bool:
         """Whether any set has an external source: VISO_TYPE is then set."""
-        return any(Source.EXTERNAL in (s.position, s.velocity, s.height, s.climb, s.yaw) for s in self._sets)
+        return any(AidingSource.EXTERNAL in (s.position, s.velocity, s.height, s.climb, s.yaw) for s in self._sets)
 
     @property
     def has_origin(self) -> bool:
@@ -180,7 +180,7 @@ class Estimators:
             position=core.has_position,
             height=not core.height_timeout,
             constant=not core.aiding,
-            gps=core.sources.position is Source.GPS,
+            gps=core.sources.position is AidingSource.GPS,
         )
         ratios = s.velocity, s.position, s.height, s.yaw
         if self._px4:

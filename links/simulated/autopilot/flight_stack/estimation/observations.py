@@ -29,7 +29,7 @@ class External:
 
 
 @dataclass(slots=True)
-class Status:
+class InnovationRatios:
     """What EKF_STATUS_REPORT contains, and more; ratios are innovation test ratios, 1 at the gate."""
 
     velocity: float = 0.0

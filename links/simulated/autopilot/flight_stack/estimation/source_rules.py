@@ -15,7 +15,7 @@ from links.simulated.autopilot.flight_stack.settings import SourceSet
 FUSE_ALL_VELOCITIES = 1  # bit of EK3_SRC_OPTIONS
 
 
-class Source(enum.Enum):
+class AidingSource(enum.Enum):
     """A source of one quantity. Values of ArduPilot's EK3_SRCn_POSXY, VELXY, POSZ, VELZ, YAW."""
 
     NONE = 0
@@ -28,20 +28,26 @@ class Source(enum.Enum):
 class Sources:
     """One source set, EK3_SRCn_*."""
 
-    position: Source
-    velocity: Source
-    height: Source
-    climb: Source
-    yaw: Source  # BARO stands for the compass, which has the same value
+    position: AidingSource
+    velocity: AidingSource
+    height: AidingSource
+    climb: AidingSource
+    yaw: AidingSource  # BARO stands for the compass, which has the same value
 
 
 SOURCE_SETS: dict[SourceSet, Sources] = {
-    "gps": Sources(Source.GPS, Source.GPS, Source.BARO, Source.GPS, Source.BARO),
-    "external": Sources(*[Source.EXTERNAL] * 5),
-    "external_no_velocity": Sources(Source.EXTERNAL, Source.NONE, Source.EXTERNAL, Source.NONE, Source.EXTERNAL),
-    "external_baro_height": Sources(Source.EXTERNAL, Source.EXTERNAL, Source.BARO, Source.EXTERNAL, Source.EXTERNAL),
-    "external_position": Sources(Source.EXTERNAL, Source.NONE, Source.BARO, Source.NONE, Source.BARO),
-    "none": Sources(Source.NONE, Source.NONE, Source.BARO, Source.NONE, Source.BARO),
+    "gps": Sources(AidingSource.GPS, AidingSource.GPS, AidingSource.BARO, AidingSource.GPS, AidingSource.BARO),
+    "external": Sources(*[AidingSource.EXTERNAL] * 5),
+    "external_no_velocity": Sources(
+        AidingSource.EXTERNAL, AidingSource.NONE, AidingSource.EXTERNAL, AidingSource.NONE, AidingSource.EXTERNAL
+    ),
+    "external_baro_height": Sources(
+        AidingSource.EXTERNAL, AidingSource.EXTERNAL, AidingSource.BARO, AidingSource.EXTERNAL, AidingSource.EXTERNAL
+    ),
+    "external_position": Sources(
+        AidingSource.EXTERNAL, AidingSource.NONE, AidingSource.BARO, AidingSource.NONE, AidingSource.BARO
+    ),
+    "none": Sources(AidingSource.NONE, AidingSource.NONE, AidingSource.BARO, AidingSource.NONE, AidingSource.BARO),
 }
 
 
@@ -118,14 +124,14 @@ PX4_EV_START_S, PX4_EV_STOP_S = 0.2, 0.4  # EV_MAX_INTERVAL and twice it
 PX4_EV_RESETS = 5  # _nb_ev_pos_reset_available
 
 
-def fuses_velocity(kind: Source, active: Sources, sets: tuple[Sources, ...], options: int) -> bool:
+def fuses_velocity(kind: AidingSource, active: Sources, sets: tuple[Sources, ...], options: int) -> bool:
     """AP_NavEKF_Source::useVelXYSource: the active set's velocity, or any set's with FUSE_ALL_VELOCITIES."""
     if active.velocity is kind:
         return True
     return bool(options & FUSE_ALL_VELOCITIES) and any(one.velocity is kind for one in sets)
 
 
-def fuses_climb(kind: Source, active: Sources, sets: tuple[Sources, ...], options: int) -> bool:
+def fuses_climb(kind: AidingSource, active: Sources, sets: tuple[Sources, ...], options: int) -> bool:
     """AP_NavEKF_Source::useVelZSource."""
     if active.climb is kind:
         return True

@@ -146,3 +146,12 @@ def test_a_leg_has_a_trapezoidal_speed() -> None:
 def test_far_from_the_target_the_speed_grows_with_the_root_of_the_distance() -> None:
     assert root_limited(1.0, 1.0, 2.5) == pytest.approx(1.0)
     assert root_limited(10.0, 1.0, 2.5) == pytest.approx((2 * 2.5 * (10 - 1.25)) ** 0.5)
+
+
+def test_without_that_bit_of_its_arming_checks_it_takes_off_on_gps_without_poses() -> None:
+    take_off = [{"do": "take_off", "height_m": 4.0, "for_s": 30}]
+    host = Host(14.0, on_ground=True, plan=take_off, check_visual_odometry=False)
+    host.sends = lambda time_s: False
+    host.run(14.0)
+    assert "armed" in host.events()
+    assert host.stack.quadrotor.state[2] == pytest.approx(-1.8 + 4.0, abs=1.5)

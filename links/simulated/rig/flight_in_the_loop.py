@@ -14,6 +14,7 @@ from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
 
 OUTCOME_TOPIC = f"{TRUTH_TOPICS}/flight"
+ODOMETRY_TOPIC = "/vehicle/odometry"
 
 
 class FlightInTheLoop:
@@ -46,6 +47,8 @@ class FlightInTheLoop:
 
     def arrived(self, record: Record) -> Record | None:
         """A record as the host receives it; None: it does not (the host is down, or rejects the frame)."""
+        if self._outcome is not None and record.topic == ODOMETRY_TOPIC:
+            self._outcome.on_odometry(record)
         if self._loop is None or record.topic.startswith(TRUTH_TOPICS):
             return record
         return self._loop.receive(record)

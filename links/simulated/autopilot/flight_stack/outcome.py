@@ -1,7 +1,8 @@
 """What became of a flight: crash, failsafe, errors of the sent poses, scatter of the hover. For statistics only.
 
 A flight is lost when it crashes (ground or an obstacle), when the EKF failsafe lands it, or when it leaves its plan by
-more than 20 m. Errors of a sent pose are those of ODOMETRY against the true T_map_drone at its time.
+more than 20 m. Errors of a sent pose are those of ODOMETRY against T_map_vehicle T_vehicle_drone at its time: the first
+by the vehicle's odometry, whose drift the autopilot's frame shares, the second true. Without odometry both are true.
 
 Source: ours.
 """
@@ -15,6 +16,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flow.link import Record
 from links.mavlink.ned_frd import R_odom_drone_from_wxyz, flip_yz
@@ -23,7 +25,7 @@ from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.motion import STEP_S
 from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
-from stages.geometry.frames import Array64
+from stages.geometry.frames import Array64, rotations_from_xyzw
 
 WRONG_M, WRONG_DEG = 1.0, 10.0  # a sent pose with a larger error is wrong
 SETTLE_S = 3.0  # of a hold, before its scatter counts
@@ -78,6 +80,12 @@ class FlightOutcome:
         self._lost_s: float | None = None
         self._last: Array64 | None = None
         self._poses: list[tuple[int, Array64, float]] = []  # stamp [ns], position in map [m], yaw [rad]
+        self._odometry: list[tuple[int, list[float], list[float]]] = []  # stamp [ns], position, quaternion xyzw
+
+    def on_odometry(self, record: Record) -> None:
+        """A pose by the vehicle's odometry."""
+        pose = json.loads(record.data)
+        self._odometry.append((record.stamp_ns, pose["xyz_m"], pose["quaternion_xyzw"]))
 
     def on_sent(self, record: Record) -> None:
         """A frame to the autopilot."""
@@ -133,16 +141,33 @@ class FlightOutcome:
         """Position [m] and yaw [deg] errors of the sent poses, in map."""
         if not self._poses:
             return np.empty(0), np.empty(0)
-        stamps = np.array([stamp for stamp, _, _ in self._poses], dtype=np.int64)
-        start = np.array([self._truth.start_ns])
-        R0, t0 = (part[0] for part in self._truth.T_world_vehicle(start))
         latest = self._truth.start_ns + round(self._stack.motion.until_s * 1e9)
-        R, t = self._truth.T_world_drone(np.minimum(stamps, latest))
-        true_m = (t - t0) @ R0
-        yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0]) - math.atan2(R0[1, 0], R0[0, 0])
+        stamps = np.minimum(np.array([stamp for stamp, _, _ in self._poses], dtype=np.int64), latest)
+        R_vehicle, t_vehicle = self._truth.T_world_vehicle(stamps)
+        R_drone, t_drone = self._truth.T_world_drone(stamps)
+        relative_m = np.einsum("nji,nj->ni", R_vehicle, t_drone - t_vehicle)
+        R_relative = np.swapaxes(R_vehicle, 1, 2) @ R_drone
+        R_map, t_map = self._map_vehicle(stamps)
+        expected_m = t_map + np.einsum("nij,nj->ni", R_map, relative_m)
+        R_expected = R_map @ R_relative
+        yaw = np.arctan2(R_expected[:, 1, 0], R_expected[:, 0, 0])
         sent_m = np.array([xyz for _, xyz, _ in self._poses])
         error = np.degrees(np.array([y for _, _, y in self._poses]) - yaw)
-        return np.linalg.norm(sent_m - true_m, axis=1), (np.nan_to_num(error) + 180) % 360 - 180
+        return np.linalg.norm(sent_m - expected_m, axis=1), (np.nan_to_num(error) + 180) % 360 - 180
+
+    def _map_vehicle(self, stamps: NDArray[np.int64]) -> tuple[Array64, Array64]:
+        """T_map_vehicle at times (n,) by the vehicle's odometry, interpolated; without it, the true one."""
+        if len(self._odometry) < 2:
+            R0, t0 = (part[0] for part in self._truth.T_world_vehicle(np.array([self._truth.start_ns])))
+            R, t = self._truth.T_world_vehicle(stamps)
+            return R0.T @ R, (t - t0) @ R0
+        at_s = [(stamp - self._truth.start_ns) * 1e-9 for stamp, _, _ in self._odometry]
+        rows = np.array([[*xyz, *quaternion] for _, xyz, quaternion in self._odometry])
+        rows[:, 3:] *= np.sign(rows[:, 3:] @ rows[0, 3:])[:, None]
+        now_s = (stamps - self._truth.start_ns) * 1e-9
+        values = np.column_stack([np.interp(now_s, at_s, rows[:, i]) for i in range(7)])
+        values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+        return rotations_from_xyzw(values[:, 3:]), values[:, :3]
 
     def _hover_scatter(self) -> float | None:
         """Worst 3D RMS of the position about its mean, over the holds after the switch."""

@@ -10,7 +10,7 @@ Source: https://mavlink.io/en/; requirements of each autopilot: `profiles.py`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -31,7 +31,7 @@ from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.profiles import PROFILES, ProfileName, RequiredParameter, YawOutput, required_parameters
 from links.mavlink.readers import AutopilotMessage
-from links.mavlink.transport.connection import Udp, parse_connection
+from links.mavlink.transport.connection import Connection, Udp, parse_connection
 from links.mavlink.transport.signing import Signer
 from links.mavlink.transport.stream_connection import open_connection
 from stages.messages import RelativePose
@@ -148,34 +148,42 @@ class Autopilot(Source[AutopilotSettings]):
         settings = self.settings
         if settings.connection is None:
             raise LinkError("no connection to the autopilot: set `connection`, as in udpin:127.0.0.1:14550")
-        target = settings.system_id, settings.component_id
         if settings.signing_key is not None and self._signer is None:
             self._signer = Signer(settings.signing_key, host_time.now_ns())
         connection = open_connection(parse_connection(settings.connection), settings.sender)
-        session = AutopilotSession(
+        session = self.open_session(connection, host_time.now_ns)
+        try:
+            yield session.records()
+        finally:
+            session.close()
+
+    def open_session(
+        self, connection: Connection, now_ns: Callable[[], int], *, threaded: bool = True
+    ) -> AutopilotSession:
+        """Open a session on a connection. A simulation in virtual time has its own clock and no thread."""
+        settings = self.settings
+        target = settings.system_id, settings.component_id
+        self._session = AutopilotSession(
             connection,
             target,
             settings.own_id,
             PoseSender(
                 settings.send,
                 settings.limits,
-                reset_counter=host_time.now_ns() // 1_000_000_000,
+                reset_counter=now_ns() // 1_000_000_000,
                 yaw=settings.yaw,
                 profile=settings.profile,
                 on_rejection=settings.on_rejection,
             ),
             OriginSender(settings.global_origin, target),
             self._signer,
-            host_time.now_ns,
+            now_ns,
             (settings.topic, SENT_TOPIC),
             self._decoder.independence,
-            SentState(settings.state_file, host_time.now_ns()),
+            SentState(settings.state_file, now_ns()),
+            threaded=threaded,
         )
-        self._session = session
-        try:
-            yield session.records()
-        finally:
-            session.close()
+        return self._session
 
     @property
     def origin(self) -> OriginState | None:

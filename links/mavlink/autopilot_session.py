@@ -67,7 +67,10 @@ class AutopilotSession:
         topics: tuple[str, str],
         independence: Independence,
         sent_state: SentState | None = None,
+        *,
+        threaded: bool = True,
     ) -> None:
+        """`threaded` False: nothing runs by itself; the caller gives received bytes to `receive` and calls `tick`."""
         self.counts: Counter[str] = Counter()
         self.connection, self.poses, self.origin = connection, poses, origin
         self._target, self._own = target, own
@@ -93,7 +96,8 @@ class AutopilotSession:
         if signer is not None:
             signer.write_timestamp()  # the signer may come from an earlier session
         self._thread = threading.Thread(target=self._run, name="mavlink housekeeping", daemon=True)
-        self._thread.start()
+        if threaded:
+            self._thread.start()
 
     def records(self) -> Iterator[Record]:
         """Frames as they arrive, until closed. Raises LinkError when the connection cannot recover."""
@@ -106,16 +110,18 @@ class AutopilotSession:
                 raise
             if received is None:
                 continue
-            arrival_ns = self._now_ns()
-            data, source = received
-            if self._split_connection != self.connection.reconnects:
-                self._splitter.reset()
-                self._split_connection = self.connection.reconnects
-            frames = self._splitter.datagram(data) if self.connection.datagrams else self._splitter.stream(data)
-            for frame, message in frames:
-                stamp_ns = self._on_frame(frame, message, source, arrival_ns)
-                if stamp_ns is not None:
-                    yield Record(self._received_topic, arrival_ns, stamp_ns, frame)
+            yield from self.receive(*received, self._now_ns())
+
+    def receive(self, data: bytes, source: tuple[str, int], arrival_ns: int) -> Iterator[Record]:
+        """Records of received bytes; answers to them are sent at once."""
+        if self._split_connection != self.connection.reconnects:
+            self._splitter.reset()
+            self._split_connection = self.connection.reconnects
+        frames = self._splitter.datagram(data) if self.connection.datagrams else self._splitter.stream(data)
+        for frame, message in frames:
+            stamp_ns = self._on_frame(frame, message, source, arrival_ns)
+            if stamp_ns is not None:
+                yield Record(self._received_topic, arrival_ns, stamp_ns, frame)
 
     def send_pose(self, pose: RelativePose) -> None:
         """Send a pose, or reject it. Never blocks."""
@@ -189,7 +195,8 @@ class AutopilotSession:
     def close(self) -> None:
         """Stop the thread and close the connection."""
         self._closed.set()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._thread.join()
         with self._lock:
             self.connection.close()
             if self._signer is not None:
@@ -262,9 +269,8 @@ class AutopilotSession:
 
     def _run(self) -> None:
         while not self._closed.wait(WAKE_S):
-            with self._lock:
-                self._tick(self._now_ns())
-            self._sent_state.write()  # without the lock: the disk may be slow
+            self.tick()
+            self._sent_state.write()
             if self._signer is not None:
                 self._signer.write_timestamp()
 
@@ -284,12 +290,15 @@ class AutopilotSession:
             self._left_late = self.connection.left_late
             self._timesync.on_late_frame(now_ns)
 
-    def _tick(self, now_ns: int) -> None:
-        self._send_periodic(now_ns)
-        for message in self.origin.due(now_ns):
-            if not self._send(message):
-                self.origin.on_not_sent()
-        self._send_texts(now_ns)
+    def tick(self) -> None:
+        """Send the periodic messages that are due; to be called every WAKE_S."""
+        with self._lock:
+            now_ns = self._now_ns()
+            self._send_periodic(now_ns)
+            for message in self.origin.due(now_ns):
+                if not self._send(message):
+                    self.origin.on_not_sent()
+            self._send_texts(now_ns)
 
     def _send_texts(self, now_ns: int) -> None:
         """Send the text that is due. The lock is held."""

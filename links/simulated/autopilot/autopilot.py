@@ -32,6 +32,7 @@ from links.mavlink.ned_frd import (
     upper_from_velocity_covariance,
     wxyz_from_R_odom_drone,
 )
+from links.simulated.autopilot.flight_stack.settings import FlightStackSettings
 from links.simulated.autopilot.radio import Radio, RadioSettings
 from links.simulated.sensors.drift import STEP_S, DriftingEstimate, DriftSettings
 from links.simulated.world.flight import Flight, FlightSettings
@@ -70,6 +71,7 @@ class AutopilotSettings(BaseModel):
     clock_ppm: float = Field(default=18.0, ge=-1000, le=1000)  # positive: faster than the host's clock
     downlink: RadioSettings = RadioSettings()
     uplink: RadioSettings = RadioSettings()
+    flight_stack: FlightStackSettings | None = None  # the autopilot in the loop; `flight` and `drift` are then not used
 
 
 class Autopilot:

@@ -28,7 +28,9 @@ from flow.taps import Digest
 from links.dynamixel import Servo
 from links.dynamixel.servo import NOT_LIVE, GoalCommand
 from links.runs.request import RunRequest
+from links.simulated.rig.pose_loop import PoseLoop, PoseTap, has_autopilot
 from links.simulated.sensors.servo import STEP_NS
+from links.velodyne import Lidar
 from stages.messages import ServoGoal
 
 LONGEST_BATCH_NS = 40_000_000  # longer batches are not faster
@@ -40,6 +42,7 @@ class ClosedLoopSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     compute_s: float = Field(default=0.02, ge=0.003, le=1)  # from arrival of a record to the goal leaving the host
+    killed_s: tuple[float, float] | None = None  # (from, to): grd is not running; it starts again without its state
 
 
 class GoalTap(Tap):
@@ -68,19 +71,58 @@ class ClosedLoop:
     ) -> None:
         """`loop_metadata` is for the recording, names the configuration; `taps` are open and see all messages."""
         self.loop_metadata = loop_metadata
-        self._digest, goals = Digest(), GoalTap()
-        self._replay = Replay(graph, (self._digest, goals, *taps))
-        name, output = servo_edge(graph)
-        servo = self._replay.nodes[name]
-        assert isinstance(servo, Servo)
-        self._servo, self._servo_name = servo, name
-        goals.watch(output, servo)
+        self._graph, self._settings = graph, settings
+        self._digest, self._taps = Digest(), taps
         self._compute_ns = round(settings.compute_s * 1e9)
+        self._start_ns: int | None = None
+        self._running = True
+        self._start()
+
+    def _start(self) -> None:
+        """Build the graph's nodes, and, with an autopilot in the loop, open its session."""
+        graph, goals, poses = self._graph, GoalTap(), PoseTap()
+        self._replay = Replay(graph, (self._digest, goals, poses, *self._taps))
+        self._servo: Servo | None = None
+        if any(issubclass(spec.cls, Lidar | Servo) for spec in graph.nodes.values()):
+            self._servo_name, output = servo_edge(graph)
+            servo = self._replay.nodes[self._servo_name]
+            assert isinstance(servo, Servo)
+            self._servo = servo
+            goals.watch(output, servo)
+        connected = self._start_ns is not None and has_autopilot(graph)
+        self._poses = PoseLoop(self._replay, graph, poses, self._compute_ns) if connected else None
+
+    def connect_autopilot(self, start_ns: int) -> None:
+        """The autopilot of a scenario that starts at a time flies on what the graph sends: open its session."""
+        self._start_ns = start_ns
+        self._start()
+
+    def receive(self, record: Record) -> Record | None:
+        """A record as it arrives at the host: a frame of the autopilot gets its stamp. None: not for the graph."""
+        if not self._is_running(record.arrival_ns):
+            return None
+        return record if self._poses is None else self._poses.before(record)
+
+    def _is_running(self, now_ns: int) -> bool:
+        """Whether grd runs; after it was killed it starts anew."""
+        killed_s = self._settings.killed_s
+        if killed_s is None or self._start_ns is None:
+            return True
+        begin_ns, end_ns = (self._start_ns + round(1e9 * s) for s in killed_s)
+        running = not begin_ns <= now_ns < end_ns
+        if running and not self._running:
+            self._start()
+        self._running = running
+        return running
+
+    def sent(self) -> list[Record]:
+        """Frames to the autopilot since the last call, stamped with the time at which they leave the host."""
+        return [] if self._poses is None else self._poses.sent()
 
     def take(self, record: Record) -> tuple[int, GoalCommand] | None:
         """Process a record that has arrived; returns the time at which a command leaves the host, and the command."""
         self._replay.feed(record)
-        command = self._servo.take_command()
+        command = None if self._servo is None else self._servo.take_command()
         return None if command is None else (record.arrival_ns + self._compute_ns, command)
 
     def longest_batch_ns(self) -> int:
@@ -90,9 +132,10 @@ class ClosedLoop:
     def finish(self) -> RunReport:
         """Let the stages emit what they hold."""
         report = self._replay.finish()
-        counters = report.counters[self._servo_name]
-        totals = {name: count for name, count in counters.totals.items() if name != NOT_LIVE}
-        report.counters[self._servo_name] = Counters(totals, counters.rejected)  # those went to the simulated servo
+        if self._servo is not None:  # these commands went to the simulated servo
+            counters = report.counters[self._servo_name]
+            totals = {name: count for name, count in counters.totals.items() if name != NOT_LIVE}
+            report.counters[self._servo_name] = Counters(totals, counters.rejected)
         return report
 
     @property

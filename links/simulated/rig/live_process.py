@@ -34,6 +34,7 @@ from links.runs.truth import TRUTH_RECORDING
 from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot import Autopilot
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
+from links.simulated.autopilot.flight_stack.flight_socket import FlightSocket
 from links.simulated.rig.image_cache import CachedCamera, ImageCache
 from links.simulated.rig.live_images import TimedImageServer
 from links.simulated.rig.live_rig import READY, RIG_REPORT, LiveRigSettings
@@ -49,6 +50,7 @@ from stages.geometry.frames import Array64
 WARM_PACKETS = 75  # one revolution of the rotor
 SKIP_NS = 200_000_000  # when it is this late, it skips packets: they are lost
 LOOPBACK = "127.0.0.1"
+DISCARD_PORT = 9
 POSITION_NS = 100_000_000  # period of the LiDAR's position packets
 TRUTH_NS = 100_000_000  # period of the ground truth, which nobody waits for: batches cost less
 SWITCH_S = 5e-4  # thread switch interval: the thread of the servo must not wait for the one that casts
@@ -59,9 +61,12 @@ class LiveSimulation(Simulation):
 
     def __init__(self, scenario: Scenario, images: ImageCache | None = None) -> None:
         super().__init__(scenario, images=images)
+        self.flight_socket: FlightSocket | None = None
         self.packet_ns = firings_per_packet(scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
         self.ahead_ns = 0
         self.emulator: DynamixelEmulator | None = None
+        if self.flight is not None:
+            self.flight.stack.advance(scenario.start_ns + WARM_PACKETS * self.packet_ns)
         self._servo.advance(scenario.start_ns + WARM_PACKETS * self.packet_ns)
         self.lidar_records(scenario.start_ns, WARM_PACKETS, self.packet_ns)  # compiles all that it uses
 
@@ -88,6 +93,8 @@ class LiveSimulation(Simulation):
 
     def batch(self, first_ns: int, packets: int) -> tuple[list[Record], list[Record]]:
         """LiDAR packets from a past time on, and their ground truth on the host's clock."""
+        if self.flight_socket is not None:
+            self.flight_socket.advance(first_ns + packets * self.packet_ns)
         records = self.lidar_records(first_ns, packets, self.packet_ns)
         truth = [self._on_host(record) for record in records if record.topic.startswith(TRUTH_TOPICS)]
         return [record for record in records if not record.topic.startswith(TRUTH_TOPICS)], truth
@@ -142,7 +149,7 @@ class RealTimeRig:
             truth_file = RecordingWriter(self._folder / TRUTH_RECORDING, rig_yaml=scenario.rig_yaml())
             open_parts.enter_context(truth_file)
             udp = open_parts.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            autopilot = self._autopilot(simulation)
+            autopilot = self._flight(simulation) or self._autopilot(simulation)
             if autopilot is not None:
                 open_parts.enter_context(autopilot)
             images = open_parts.enter_context(self._cameras(simulation))
@@ -152,7 +159,8 @@ class RealTimeRig:
                 truth_file.write(record)
             self.images = images.shown
             if autopilot is not None:
-                self.received = len(autopilot.received)
+                received = autopilot.received
+                self.received = received if isinstance(received, int) else len(received)
         self._report()
 
     def _cameras(self, simulation: LiveSimulation) -> TimedImageServer:
@@ -160,6 +168,14 @@ class RealTimeRig:
         ports = {f"/camera/{platform}": port for platform, port in served}
         end_ns = self._scenario.start_ns + round(1e9 * self._scenario.duration_s)
         return TimedImageServer(simulation.cached_cameras, ports, simulation.now_ns, end_ns)
+
+    def _flight(self, simulation: LiveSimulation) -> FlightSocket | None:
+        """An autopilot in the loop; without a port it flies without a link."""
+        if simulation.flight is None:
+            return None
+        send_to = LOOPBACK, self._rig.autopilot_port or DISCARD_PORT
+        simulation.flight_socket = FlightSocket(simulation.flight.stack, send_to, simulation.now_ns)
+        return simulation.flight_socket
 
     def _autopilot(self, simulation: LiveSimulation) -> AutopilotSocket | None:
         flight = next((source for source in simulation.telemetry_sources if isinstance(source, Autopilot)), None)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path as FilePath
@@ -17,8 +18,12 @@ from numpy.typing import NDArray
 from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.recording import RecordingWriter
 from links.simulated.autopilot.autopilot import Autopilot
+from links.simulated.autopilot.flight_stack.outcome import Outcome
+from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.lidar import lidar_poses
 from links.simulated.rig.closed_loop import ClosedLoop, load_loop
+from links.simulated.rig.fix_sensor import FixSensor
+from links.simulated.rig.flight_in_the_loop import FlightInTheLoop
 from links.simulated.rig.image_cache import CachedCamera, ImageCache, scenario_world
 from links.simulated.rig.scenario import Scenario, load_scenario
 from links.simulated.rig.scripted_servo import ServoScript
@@ -31,6 +36,7 @@ from links.simulated.sensors.vehicle_odometry import VehicleOdometry
 from links.simulated.sensors.vlp16_packets import FIRINGS_PER_BLOCK, encode_packet, firings_per_packet
 from links.simulated.world.clearance import check_paths
 from links.simulated.world.flight import Flight
+from links.simulated.world.flown_motion import FlownMotion
 from links.simulated.world.path import Path
 from links.simulated.world.scene import Scene, Truth, drone_shapes
 from links.simulated.world.suspension import SuspendedPath
@@ -53,13 +59,16 @@ class SimulationReport:
     wall_s: float
     size_bytes: int
     output_hash: str | None = None  # of the closed loop; a replay with the same configuration has the same hash
+    outcome: Outcome | None = None  # of an autopilot in the loop
 
     def __str__(self) -> str:
         text = (
             f"seed {self.seed}: {self.records} records, {self.pulses} pulses, {self.returns} with a return, "
             f"{self.drone_returns} from the drone; {self.size_bytes / 1e6:.2f} MB in {self.wall_s:.1f} s"
         )
-        return text if self.output_hash is None else f"{text}; closed loop's output hash {self.output_hash}"
+        if self.output_hash is not None:
+            text += f"; closed loop's output hash {self.output_hash}"
+        return text if self.outcome is None else f"{text}\n{self.outcome}"
 
 
 class Simulation:
@@ -81,9 +90,14 @@ class Simulation:
         self.seed = self.scenario.seed
         drone = scenario.drone
         start_ns, duration_s = scenario.start_ns, scenario.duration_s
-        drone_motion: Path | Flight | None = drone.path if drone else None
-        self.telemetry_sources: list[Autopilot | VehicleOdometry] = []
-        if drone is not None and scenario.autopilot is not None:
+        drone_motion: Path | Flight | FlownMotion | None = drone.path if drone else None
+        self.telemetry_sources: list[Autopilot | FlightStack | VehicleOdometry] = []
+        self.flight: FlightInTheLoop | None = None
+        if drone is not None and scenario.autopilot is not None and scenario.autopilot.flight_stack is not None:
+            self.flight = FlightInTheLoop(self.scenario, loop)
+            drone_motion = self.flight.stack.motion
+            self.telemetry_sources.append(self.flight.stack)
+        elif drone is not None and scenario.autopilot is not None:
             drone_motion = Flight(drone.path, scenario.autopilot.flight, duration_s, self.seed)
             self.telemetry_sources.append(Autopilot(scenario.autopilot, drone_motion, start_ns, duration_s, self.seed))
         vehicle = scenario.vehicle
@@ -107,7 +121,12 @@ class Simulation:
             [drone_shapes(other.span_m, other.model) for other in others],
         )
         spans_m = [flying.span_m for flying in (drone, *others) if flying is not None]
-        check_paths(self._scene.world, self.truth, scenario.duration_s, spans_m)
+        planned = self.truth if self.flight is None else dataclasses.replace(self.truth, drone=drone and drone.path)
+        check_paths(self._scene.world, planned, scenario.duration_s, spans_m)
+        if self.flight is not None:
+            self.flight.watch(self._scene.world, self.truth)
+        fixes = scenario.fix_sensor
+        self._fixes = None if fixes is None else FixSensor(fixes, self.truth, scenario.lidar_gaps_s, self.seed)
         self._lidar = Lidar(scenario.lidar, scenario.start_ns, self.seed, scenario.weather)
         script = scenario.script if loop is None else ()
         commander = ServoScript(script, self.drone_servo_rad if drone else None, self.seed)
@@ -119,6 +138,8 @@ class Simulation:
         )
         lidar_at = (lambda stamp_ns: self.T_world_lidar(stamp_ns)[1]) if scenario.truth_visible else None
         self._truth_records = TruthRecords(self.truth, self._scene.world, lidar_at)
+        self._waiting: list[tuple[int, int, Record]] = []  # by arrival
+        self._made = itertools.count()
         self.lidar_clock_ns = 0  # offset of the LiDAR's clock from the scenario's
         self.pulses = 0
         self.returns = 0
@@ -138,8 +159,7 @@ class Simulation:
 
     def records(self) -> Iterator[Record]:
         """All records in order of arrival, with sequence numbers."""
-        waiting: list[tuple[int, int, Record]] = []
-        made = sent = 0
+        sent = 0
         start_ns = self.scenario.start_ns
         end_ns = start_ns + round(self.scenario.duration_s * 1e9)
         packet_ns = firings_per_packet(self.scenario.lidar.return_mode) * vlp16.SEQUENCE_NS
@@ -148,33 +168,59 @@ class Simulation:
         while first_ns < end_ns:
             packets = min(most, -(-(end_ns - first_ns) // packet_ns))
             next_ns = first_ns + packets * packet_ns
-            records = self._servo.advance(next_ns)
-            records += self.lidar_records(first_ns, packets, packet_ns)
-            for camera in self._cameras:
-                records += camera.records(next_ns)
-            for source in self.telemetry_sources:
-                records += source.records(next_ns)
-            records += self.truth_records(next_ns)
-            for record in records:
-                heapq.heappush(waiting, (record.arrival_ns, made, record))
-                made += 1
+            self._push(self._made_records(first_ns, packets, packet_ns))
             first_ns = next_ns
-            while waiting and (waiting[0][0] < next_ns or first_ns >= end_ns):
-                record = dataclasses.replace(heapq.heappop(waiting)[2], sequence=sent)
+            if self.flight is not None and self.flight.is_over():
+                end_ns = next_ns
+            while self._waiting and (self._waiting[0][0] < next_ns or first_ns >= end_ns):
+                record: Record | None = heapq.heappop(self._waiting)[2]
+                if self.flight is not None:
+                    record = self.flight.arrived(record)
+                    if record is None:
+                        continue
+                record = dataclasses.replace(record, sequence=sent)
                 self._feed_loop(record)
                 yield record
                 sent += 1
         if self._loop is not None:
             self._loop.finish()
+        if self.flight is not None and (outcome := self.flight.record(end_ns)) is not None:
+            yield dataclasses.replace(outcome, sequence=sent)
+
+    def _made_records(self, first_ns: int, packets: int, packet_ns: int) -> list[Record]:
+        """Records of all sensors from a time on, for the duration of so many LiDAR packets."""
+        next_ns = first_ns + packets * packet_ns
+        if self.flight is not None:
+            self.flight.stack.advance(next_ns)
+        if self._fixes is not None:
+            records = self._fixes.records(next_ns)
+        else:
+            records = self._servo.advance(next_ns)
+            records += self.lidar_records(first_ns, packets, packet_ns)
+        for camera in self._cameras:
+            records += camera.records(next_ns)
+        for source in self.telemetry_sources:
+            records += source.records(next_ns)
+        return records + self.truth_records(next_ns)
+
+    def _push(self, records: list[Record]) -> None:
+        """Keep records until they arrive, except LiDAR packets in a gap."""
+        gaps_ns = [[self.scenario.start_ns + round(1e9 * s) for s in gap] for gap in self.scenario.lidar_gaps_s]
+        for record in records:
+            lidar = record.topic == "/lidar/packets"
+            if not (lidar and any(begin <= record.stamp_ns < end for begin, end in gaps_ns)):
+                heapq.heappush(self._waiting, (record.arrival_ns, next(self._made), record))
 
     def _feed_loop(self, record: Record) -> None:
-        """Feed a record to the pipeline, except ground truth, and pass its command to the servo."""
+        """Feed a record to the pipeline, except ground truth; pass on its command to the servo and its frames."""
         if self._loop is None or record.topic.startswith(TRUTH_TOPICS):
             return
         sent = self._loop.take(record)
         if sent is not None:
             left_ns, command = sent
             self._servo.command(left_ns, command.position_rad, command.speed_radps)
+        if self.flight is not None:
+            self._push(self.flight.sent())
 
     def T_world_lidar(self, stamp_ns: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """True poses of the LiDAR: rotations (n, 3, 3), positions (n, 3) [m]."""
@@ -295,4 +341,5 @@ def simulate_into(
         wall_s=time.perf_counter() - began,
         size_bytes=out.stat().st_size,
         output_hash=None if loop is None else loop.output_hash,
+        outcome=None if simulation.flight is None else simulation.flight.result(),
     )

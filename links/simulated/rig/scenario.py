@@ -17,6 +17,7 @@ from flow.config.tree import load_tree, resolve
 from flow.config_error import ConfigError, did_you_mean
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.rig.closed_loop import ClosedLoopSettings
+from links.simulated.rig.fix_sensor import FixSensorSettings
 from links.simulated.rig.scripted_servo import Segment, VibrateSegment
 from links.simulated.sensors.camera import CamerasSettings, rig_cameras
 from links.simulated.sensors.lidar import LidarSettings
@@ -33,7 +34,7 @@ from stages.geometry.frames import Array64, LidarMount, Pose
 CLEARANCE_M = 0.3  # minimum height of a drone above the road
 WHEELS_M = 0.15  # maximum height of the vehicle's motion above or below the road
 BLADE_STEPS = 4  # blade angles within half a turn, for the camera mask
-OPTIONAL_KEYS = ("other_drones", "truth_visible")  # written to a scenario file only where used
+OPTIONAL_KEYS = ("other_drones", "truth_visible", "lidar_gaps_s")  # written to a scenario file only where used
 
 
 class _ScenarioSettings(BaseModel):
@@ -87,6 +88,8 @@ class Scenario(_ScenarioSettings):
     vehicle_odometry: VehicleOdometrySettings | None = None
     script: tuple[Segment, ...] = ()
     closed_loop: ClosedLoopSettings = ClosedLoopSettings()  # replaces the script with --closed-loop
+    lidar_gaps_s: tuple[tuple[float, float], ...] = ()  # (from, to): no packet of the LiDAR arrives
+    fix_sensor: FixSensorSettings | None = None  # instead of LiDAR and servo: fast, for graphs with SimulatedFixes
     truth_visible: bool = False  # write /truth/visible: the LiDAR's line of sight to each drone
     rig: RigLidar = RigLidar()  # the rig file attached to the recording
     true_mount: LidarMount | None = None  # the true mount of the LiDAR, if it differs from the rig file

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from links.simulated.kernels.ray_casting import Array32, into_body, keep_nearer, rays_near
 from links.simulated.world.drone import BLADES, DroneModel, drone_mesh
 from links.simulated.world.flight import Flight
+from links.simulated.world.flown_motion import FlownMotion
 from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.movers import Mover
 from links.simulated.world.path import Path
@@ -38,7 +39,7 @@ class Truth:
 
     start_ns: int
     vehicle: Path | SuspendedPath  # a path stays level, a suspended path pitches and rolls
-    drone: Path | Flight | None  # a path is followed exactly, a flight obeys its own dynamics
+    drone: Path | Flight | FlownMotion | None  # followed exactly; with its own dynamics; flown by an autopilot
     others: tuple[Path, ...] = ()  # drones 2, 3, ...
 
     def seconds(self, stamp_ns: NDArray[np.int64]) -> Array64:

@@ -1,0 +1,72 @@
+"""The autopilot in the loop within a simulation: it flies the drone, and receives what the graph sends.
+
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from flow.link import TRUTH_TOPICS, Record
+from links.simulated.autopilot.flight_stack.outcome import FlightOutcome, Outcome
+from links.simulated.autopilot.flight_stack.stack import FlightStack
+from links.simulated.rig.closed_loop import ClosedLoop
+from links.simulated.rig.scenario import Scenario
+from links.simulated.world.mesh import RayScene
+from links.simulated.world.scene import Truth
+
+OUTCOME_TOPIC = f"{TRUTH_TOPICS}/flight"
+ODOMETRY_TOPIC = "/vehicle/odometry"
+
+
+class FlightInTheLoop:
+    """One flight. Without a `loop` the autopilot receives nothing."""
+
+    def __init__(self, scenario: Scenario, loop: ClosedLoop | None) -> None:
+        assert scenario.drone is not None
+        assert scenario.autopilot is not None
+        self.stack = FlightStack(
+            scenario.autopilot,
+            scenario.drone.path,
+            scenario.vehicle.path,
+            -scenario.vehicle.camera_height_m,
+            scenario.start_ns,
+            scenario.duration_s,
+            scenario.seed,
+        )
+        self._loop = loop
+        self._outcome: FlightOutcome | None = None
+        if loop is not None:
+            loop.connect_autopilot(scenario.start_ns)
+
+    def watch(self, world: RayScene, truth: Truth) -> None:
+        """Look for collisions with the scene, and compare sent poses with the truth."""
+        self._outcome = FlightOutcome(self.stack, world, truth)
+
+    def is_over(self) -> bool:
+        """Whether the flight was lost some time ago; called after each part of it."""
+        return self._outcome is not None and self._outcome.is_over()
+
+    def arrived(self, record: Record) -> Record | None:
+        """A record as the host receives it; None: it does not (the host is down, or rejects the frame)."""
+        if self._outcome is not None and record.topic == ODOMETRY_TOPIC:
+            self._outcome.on_odometry(record)
+        if self._loop is None or record.topic.startswith(TRUTH_TOPICS):
+            return record
+        return self._loop.receive(record)
+
+    def sent(self) -> list[Record]:
+        """Frames that the host has sent since the last call; they go to the autopilot."""
+        frames = [] if self._loop is None else self._loop.sent()
+        for frame in frames:
+            self.stack.receive(frame.data, frame.arrival_ns)
+            if self._outcome is not None:
+                self._outcome.on_sent(frame)
+        return frames
+
+    def result(self) -> Outcome | None:
+        """The outcome."""
+        return None if self._outcome is None else self._outcome.result()
+
+    def record(self, at_ns: int) -> Record | None:
+        """The outcome as a record."""
+        outcome = self.result()
+        return None if outcome is None else Record(OUTCOME_TOPIC, at_ns, at_ns, outcome.as_json())

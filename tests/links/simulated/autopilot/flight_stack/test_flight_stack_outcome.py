@@ -1,0 +1,85 @@
+"""The outcome of a flight: errors of sent poses, wrong ones, crashes, and the scatter of a hover."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from flow.link import Record
+from links.simulated.autopilot.flight_stack.outcome import FlightOutcome
+from links.simulated.world.mesh import RayScene, box
+from links.simulated.world.scene import Truth
+from tests.links.simulated.autopilot.flight_stack.sent_truth import PARKED, START_NS, Host
+
+
+def watched(host: Host, world: RayScene | None = None) -> FlightOutcome:
+    scene = world or RayScene(box((-500, -500, -500), (-499, -499, -499), "metal"))
+    return FlightOutcome(host.stack, scene, Truth(START_NS, PARKED, host.stack.motion))
+
+
+def sent(host: Host, outcome: FlightOutcome, shift_m: float = 0.0, yaw_deg: float = 0.0) -> None:
+    """One pose that is wrong by so much, forward and in yaw."""
+    half = math.radians(-yaw_deg) / 2  # NED
+
+    def change(message, time_s: float) -> None:
+        message.x += shift_m
+        w, x, y, z = message.q
+        c, s = math.cos(half), math.sin(half)
+        message.q = [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
+
+    host.edit = change
+    now_ns = START_NS + host.ticks * 10_000_000
+    frame = bytes(host.pose(now_ns).pack(host._mav))
+    outcome.on_sent(Record("/autopilot/tx", now_ns, now_ns, frame))
+
+
+@pytest.mark.parametrize(("shift_m", "yaw_deg", "wrong"), [(0.0, 0.0, 0), (1.5, 0.0, 1), (0.0, 15.0, 1), (0.7, 8.0, 0)])
+def test_a_pose_is_wrong_above_one_metre_or_ten_degrees(shift_m: float, yaw_deg: float, wrong: int) -> None:
+    host = Host(3.0)
+    outcome = watched(host)
+    host.run(2.0)
+    sent(host, outcome, shift_m, yaw_deg)
+    result = outcome.result()
+    assert (result.sent_poses, result.wrong_poses) == (1, wrong)
+    assert result.sent_worst_m == pytest.approx(shift_m, abs=0.2)
+    assert result.sent_yaw_worst_deg == pytest.approx(yaw_deg, abs=1.0)
+
+
+def test_a_drift_of_the_vehicles_odometry_is_no_error_of_the_pose() -> None:
+    host = Host(3.0)
+    outcome = watched(host)
+    host.run(2.0)
+    for time_s in (0.0, 3.0):
+        stamp_ns = START_NS + round(time_s * 1e9)
+        pose = {"xyz_m": [1.5, 0.0, 0.0], "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}
+        outcome.on_odometry(Record("/vehicle/odometry", stamp_ns, stamp_ns, json.dumps(pose).encode()))
+    sent(host, outcome, shift_m=1.5)
+    assert outcome.result().sent_worst_m == pytest.approx(0.0, abs=0.2)
+
+
+def test_flying_into_an_obstacle_is_a_crash() -> None:
+    """A wall 2 m ahead of a drone that flies forward."""
+    plan = [{"do": "go_to", "xyz_m": [14.0, 0.0, 10.0], "speed_mps": 3.0, "for_s": 20}]
+    host = Host(10.0, plan=plan, source_sets=["gps"])
+    outcome = watched(host, RayScene(box((9.0, -30.0, -2.0), (9.5, 30.0, 30.0), "metal")))
+    over = False
+    while host.time_s < 10.0 and not over:
+        host.run(host.time_s + 0.02)
+        over = outcome.is_over()
+    result = outcome.result()
+    assert result.crashed
+    assert result.lost_s is not None
+    assert str(result).startswith("flight: crashed at")
+
+
+def test_the_scatter_is_that_of_the_holds_on_external_poses() -> None:
+    host = Host(20.0, plan=[{"do": "hold", "for_s": 8}, {"do": "use_sources", "set": 2}, {"do": "hold", "for_s": 12}])
+    outcome = watched(host)
+    host.run(20.0)
+    states = host.stack.motion.states
+    held = states[round(11.0 * 400) :, 0:3]
+    expected = np.sqrt(((held - held.mean(axis=0)) ** 2).sum(axis=1).mean())
+    assert outcome.result().hover_scatter_m == pytest.approx(expected, abs=0.005)

@@ -1,0 +1,153 @@
+"""A whole flight in virtual time: the drone flies on what the graph sends; recorded, deterministic, without threads."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from flow.config_error import Location
+from flow.graph import load_graph
+from flow.link import Record
+from flow.replay import replay
+from flow.taps import Digest
+from links.mavlink.transport.framing import parse_frame
+from links.simulated.rig import closed_loop
+from links.simulated.rig.closed_loop import load_loop
+from links.simulated.rig.run import Simulation, simulate
+from links.simulated.rig.scenario import Scenario, load_scenario
+
+ROOT = Path(__file__).parents[4]
+CONFIG = ROOT / "configs/sim_flight_fixes.yaml"
+FLIGHT = ROOT / "configs/scenarios/flight/hover_fixes.yaml"
+
+
+def changed(scenario: Scenario, duration_s: float, stack: dict[str, Any] | None = None, **settings: Any) -> Scenario:
+    assert scenario.autopilot is not None
+    assert scenario.autopilot.flight_stack is not None
+    autopilot = scenario.autopilot.model_dump()
+    autopilot["flight_stack"] |= stack or {}
+    return scenario.changed(duration_s=duration_s, autopilot=autopilot, **settings)
+
+
+def fly(scenario: Scenario) -> tuple[list[Record], Simulation, str]:
+    loop = load_loop(CONFIG, scenario.rig_yaml(), "test", scenario.closed_loop)
+    simulation = Simulation(scenario, loop=loop)
+    return list(simulation.records()), simulation, loop.output_hash
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[list[Record], Simulation, str]:
+    """12 s: grd finds the heading and sends; the switch is at 9 s."""
+    plan = [{"do": "path", "for_s": 9}, {"do": "use_sources", "set": 2}, {"do": "hold", "for_s": 40}]
+    return fly(changed(load_scenario(FLIGHT), 12.0, {"plan": plan}))
+
+
+def messages(records: list[Record], topic: str, kind: str) -> list[tuple[Record, Any]]:
+    parsed = [(r, parse_frame(r.data)) for r in records if r.topic == topic]
+    return [(record, message) for record, message in parsed if message.get_type() == kind]
+
+
+def test_sent_poses_reach_the_autopilot_and_it_flies_on_them(flown) -> None:
+    records, simulation, _ = flown
+    assert len(messages(records, "/autopilot/tx", "ODOMETRY")) > 100
+    core = simulation.flight.stack.ekf.primary
+    assert core.used_external_ns is not None
+    assert core.active == 1
+    assert not simulation.flight.stack.quadrotor.crashed
+
+
+def test_the_session_does_what_it_does_live_at_its_times(flown) -> None:
+    """HEARTBEAT at 1 Hz, TIMESYNC at 4 Hz; replies to ours are stamped with the time of the request."""
+    records, _, _ = flown
+    assert len(messages(records, "/autopilot/tx", "HEARTBEAT")) == pytest.approx(12, abs=2)
+    asked = [m.ts1 for _, m in messages(records, "/autopilot/tx", "TIMESYNC") if m.tc1 == 0]
+    assert len(asked) == pytest.approx(48, abs=4)
+    replies = [(r, m) for r, m in messages(records, "/autopilot/rx", "TIMESYNC") if m.tc1 != 0]
+    assert len(replies) > 40
+    assert all(record.stamp_ns == message.ts1 and message.ts1 in asked for record, message in replies)
+
+
+def test_a_pose_leaves_after_the_compute_time(flown) -> None:
+    records, simulation, _ = flown
+    ages_s = [(r.arrival_ns / 1e3 - m.time_usec) * 1e-6 for r, m in messages(records, "/autopilot/tx", "ODOMETRY")]
+    compute_s = simulation.scenario.closed_loop.compute_s
+    assert min(ages_s) >= compute_s - 1e-6
+    assert max(ages_s) < compute_s + 0.05
+
+
+def test_records_are_in_order_of_arrival_and_the_outcome_is_the_last(flown) -> None:
+    records, _, _ = flown
+    arrivals = [r.arrival_ns for r in records[:-1]]
+    assert arrivals == sorted(arrivals)
+    assert [r.sequence for r in records] == list(range(len(records)))
+    outcome = json.loads(records[-1].data)
+    assert records[-1].topic == "/truth/flight"
+    assert outcome["crashed"] is False
+    assert outcome["sent_poses"] == len(messages(records, "/autopilot/tx", "ODOMETRY"))
+
+
+def test_a_replay_of_the_recording_takes_the_same_steps(flown) -> None:
+    records, simulation, output_hash = flown
+    rig = yaml.safe_load(simulation.scenario.rig_yaml()), Location("test", 0)
+    digest = Digest()
+    received = [r for r in records if not r.topic.startswith("/truth")]
+    replay(load_graph(CONFIG, sections={"rig": rig}), received, (digest,))
+    assert digest.hexdigest() == output_hash
+
+
+def test_the_same_seed_gives_the_same_bytes_however_far_it_looks_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    short = changed(load_scenario(FLIGHT), 4.0)
+    records, _, output_hash = fly(short)
+    monkeypatch.setattr(closed_loop, "LONGEST_BATCH_NS", 4_000_000)
+    again, _, again_hash = fly(short)
+    assert again == records
+    assert again_hash == output_hash
+    assert fly(short.changed(seed=2))[2] != output_hash
+
+
+def test_no_thread_is_started() -> None:
+    before = threading.active_count()
+    fly(changed(load_scenario(FLIGHT), 1.0))
+    assert threading.active_count() == before
+
+
+def test_a_gap_of_the_lidar_stops_the_fixes() -> None:
+    records, _, _ = fly(changed(load_scenario(FLIGHT), 5.0, lidar_gaps_s=((3.0, 4.0),)))
+    start_ns = records[0].arrival_ns
+    fixes = [
+        json.loads(r.data) for r in records if r.topic == "/simulated/fixes" and 3.05e9 < r.stamp_ns - start_ns < 3.95e9
+    ]
+    assert fixes
+    assert not any("xyz_m" in fix for fix in fixes)
+
+
+def test_after_a_kill_grd_starts_anew_and_the_flight_goes_on() -> None:
+    scenario = changed(load_scenario(FLIGHT), 12.0, {"plan": [{"do": "path", "for_s": 20}]})
+    scenario = scenario.changed(closed_loop={"killed_s": (8.0, 9.0)})
+    records, simulation, _ = fly(scenario)
+    start_ns = scenario.start_ns
+    sent_s = np.array([(r.arrival_ns - start_ns) * 1e-9 for r in records if r.topic == "/autopilot/tx"])
+    assert not ((sent_s > 8.05) & (sent_s < 9.0)).any()
+    assert (sent_s > 9.0).any()
+    counters = {m.reset_counter for _, m in messages(records, "/autopilot/tx", "ODOMETRY")}
+    assert counters
+    assert not simulation.flight.stack.quadrotor.crashed
+
+
+def test_the_command_writes_the_flight_and_says_what_became_of_it(tmp_path: Path) -> None:
+    report = simulate(FLIGHT, tmp_path / "flight.mcap", closed_loop=CONFIG, duration_s=1.0)
+    assert "flight: flown to the end; no pose sent" in str(report)
+
+
+def test_a_scenario_without_a_flight_stack_flies_as_before() -> None:
+    scenario = load_scenario(FLIGHT).changed(autopilot={}, duration_s=1.0)
+    assert "flight_stack" not in scenario.as_yaml()
+    records, simulation, _ = fly(scenario)
+    assert simulation.flight is None
+    assert not any(r.topic == "/truth/flight" for r in records)

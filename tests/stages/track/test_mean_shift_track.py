@@ -59,7 +59,7 @@ def test_nothing_is_tracked_before_a_detection():
 
 
 def test_a_rejected_detection_starts_no_track():
-    _, states = run(MeanShiftTrack(), [empty(0), detections(refused=[T0]), swept([T0], at(5))])
+    _, states = run(MeanShiftTrack(), [empty(0), detections(rejected=[T0]), swept([T0], at(5))])
     assert states[0].state == TrackingState.SEARCHING
 
 

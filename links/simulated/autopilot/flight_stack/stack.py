@@ -17,7 +17,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flow.link import Record
-from links.mavlink.profiles import PROFILES
+from links.mavlink.profiles import required_parameters
 from links.simulated.autopilot.autopilot import AutopilotSettings
 from links.simulated.autopilot.flight_stack.commands import handle_frame, send_origin
 from links.simulated.autopilot.flight_stack.downlink import Downlink
@@ -66,7 +66,10 @@ class FlightStack:
         s = self.settings = settings.flight_stack
         self._autopilot, self._start_ns = settings, start_ns
         self.own, self.px4 = (1, 1), s.kind == "px4"
-        self.parameters = {w.name: w.values[0] if w.values else max(w.at_least, 0) for w in PROFILES[s.kind].required}
+        required = required_parameters(s.kind, "none")
+        self.parameters: dict[str, float] = {
+            w.name: w.values[0] if w.values else max(w.at_least, 0.0) for w in required
+        }
         self._downlink = Downlink(settings, start_ns, seed)
         self.streams = self._downlink.streams
         self.origin: tuple[int, int, int] | None = None

@@ -44,9 +44,7 @@ GUIDED = 4  # mode number of ArduCopter
 LOOP_S = 1 / 400  # period of the main loop, within which a sample is sent
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the host
 OWN_TIMESYNC_S = 10.0
-IMU_DELAY_S = (
-    0.0125  # age of RAW_IMU's values at its stamp: links/mavlink/streams/imu_stamps.py
-)
+IMU_DELAY_S = 0.0125  # age of RAW_IMU's values at its stamp: links/mavlink/streams/imu_stamps.py
 QUALITY_PERCENT = 100
 INT16 = 32767
 

@@ -58,8 +58,8 @@ def local_position(
 ) -> DroneLocalPosition:
     return DroneLocalPosition(
         stamp_ns=stamp(at_ms),
-        xyz_odom_m=position(at_ms) + [jump_m, 0, 0],
-        velocity_odom_mps=velocity(at_ms) + [0, jump_mps, 0],
+        xyz_odom_m=position(at_ms) + np.array([jump_m, 0, 0]),
+        velocity_odom_mps=velocity(at_ms) + np.array([0, jump_mps, 0]),
         independent=independent,
     )
 

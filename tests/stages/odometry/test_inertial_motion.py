@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -45,7 +47,7 @@ def test_the_intervals_of_a_segment_follow_each_other_and_a_gap_begins_a_new_one
     times = [0, 20, 41, 60, 300, 320, 570.1, 590, 610]  # gaps of 240 and 250.1 ms
     made = [m for t in times if (m := stage.on_imu(imu(t)))]
     assert [m.segment for m in made] == [0, 0, 0, 0, 0, 1, 1]
-    for before, after in zip(made, made[1:], strict=False):
+    for before, after in pairwise(made):
         assert (before.stamp_ns == after.start_ns) == (before.segment == after.segment)
     assert stage.counters["segments"] == 2
 

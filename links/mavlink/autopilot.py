@@ -31,6 +31,7 @@ from links.mavlink.poses.pose_sender import PoseMessage, PoseSender
 from links.mavlink.poses.sent_state import SentState
 from links.mavlink.profiles import PROFILES, ProfileName, RequiredParameter, YawOutput, required_parameters
 from links.mavlink.readers import AutopilotMessage
+from links.mavlink.streams.message_intervals import MessageIntervals, MessageRates
 from links.mavlink.transport.connection import Connection, Udp, parse_connection
 from links.mavlink.transport.signing import Signer
 from links.mavlink.transport.stream_connection import open_connection
@@ -61,6 +62,7 @@ class AutopilotSettings(SourceSettings):
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
     state_file: Path | None = None  # remembers over restarts that a pose was sent; None: a start is the first one
     global_origin: GlobalOrigin | None = None  # sent to an autopilot without an origin
+    message_rates: MessageRates = MessageRates()  # requested from the autopilot
 
     @property
     def required_parameters(self) -> tuple[RequiredParameter, ...]:
@@ -176,6 +178,7 @@ class Autopilot(Source[AutopilotSettings]):
                 on_rejection=settings.on_rejection,
             ),
             OriginSender(settings.global_origin, target),
+            MessageIntervals(settings.message_rates, settings.profile, target, settings.own_id),
             self._signer,
             now_ns,
             (settings.topic, SENT_TOPIC),

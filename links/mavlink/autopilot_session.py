@@ -5,8 +5,9 @@
     poses: gate and PoseSender, then frames, sent immediately or not at all. None are sent to a silent autopilot,
         because a blocked autopilot or bridge would buffer them and use them as current later; none while they would
         arrive late (`timesync_monitor.py`).
-    a thread: HEARTBEAT once per second, TIMESYNC four times per second, texts and the origin, also without poses. A
-        message that finds the send buffer full is repeated at each step, before a pose; it is small.
+    a thread: HEARTBEAT once per second, TIMESYNC four times per second, texts, the origin and requests for messages
+        (`streams/message_intervals.py`), also without poses. A message that finds the send buffer full is repeated at
+        each step, before a pose; it is small.
 
 A reply to our own TIMESYNC is recorded with the time of its request as stamp. By that stamp the decoder distinguishes
 it from foreign replies, also in replay.
@@ -32,6 +33,7 @@ from links.mavlink.poses.gate import RejectReason
 from links.mavlink.poses.independence import POSES, Independence
 from links.mavlink.poses.pose_sender import PoseSender
 from links.mavlink.poses.sent_state import SentState
+from links.mavlink.streams.message_intervals import MessageIntervals
 from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
 from links.mavlink.transport.framing import FrameSplitter, dialect, header, packed
@@ -62,6 +64,7 @@ class AutopilotSession:
         own: tuple[int, int],
         poses: PoseSender,
         origin: OriginSender,
+        intervals: MessageIntervals,
         signer: Signer | None,
         now_ns: Callable[[], int],
         topics: tuple[str, str],
@@ -72,7 +75,7 @@ class AutopilotSession:
     ) -> None:
         """`threaded` False: nothing runs by itself; the caller gives received bytes to `receive` and calls `tick`."""
         self.counts: Counter[str] = Counter()
-        self.connection, self.poses, self.origin = connection, poses, origin
+        self.connection, self.poses, self.origin, self.intervals = connection, poses, origin, intervals
         self._target, self._own = target, own
         self._signer, self._now_ns = signer, now_ns
         self._received_topic, self._sent_topic = topics
@@ -151,9 +154,11 @@ class AutopilotSession:
             if self.origin.sent_times:
                 counts["origin sent"] = self.origin.sent_times
             round_trip_ns = self._timesync.newest_ns
+            intervals = self.intervals.counters
         return {
             **counts,
             **rejected,
+            **intervals,
             "stray bytes": self._splitter.stray_bytes,
             "from other senders": self.connection.foreign,
             "reconnects": self.connection.reconnects,
@@ -182,6 +187,7 @@ class AutopilotSession:
             or own
             or signing
             or self._sent_state.status
+            or self.intervals.status
         )
 
     def _silence(self) -> str | None:
@@ -220,6 +226,7 @@ class AutopilotSession:
                 self.connection.reply_to(source)
                 if self._now_ns() - self._target_ns > SILENT_S * SECOND_NS:
                     self.origin.restart()
+                    self.intervals.restart()
                 if not self._is_reachable(self._now_ns()):
                     self._timesync.reset()
                 self._timesync.on_frame()
@@ -228,6 +235,7 @@ class AutopilotSession:
                 self.poses.on_estimator_status(message, arrival_ns)
                 if message.get_type() == "ATTITUDE":
                     self._on_attitude(message, arrival_ns)
+                self.intervals.on_message(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
                     if message.tc1 == 0:
                         self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
@@ -298,6 +306,10 @@ class AutopilotSession:
             for message in self.origin.due(now_ns):
                 if not self._send(message):
                     self.origin.on_not_sent()
+            if self._target_connection is not None and self._is_reachable(now_ns):
+                request = self.intervals.due(now_ns)
+                if request is not None and not self._send(request):
+                    self.intervals.on_not_sent()
             self._send_texts(now_ns)
 
     def _send_texts(self, now_ns: int) -> None:

@@ -20,10 +20,12 @@ from stages.messages.cameras import FollowedFeatures as FollowedFeatures
 from stages.messages.cameras import RelativeRotation as RelativeRotation
 from stages.messages.cameras import VanishingDirections as VanishingDirections
 from stages.messages.cameras import VisualMotion as VisualMotion
+from stages.messages.drone import AutopilotMotion as AutopilotMotion
 from stages.messages.drone import CandidateEvidence as CandidateEvidence
 from stages.messages.drone import Candidates as Candidates
 from stages.messages.drone import Detections as Detections
 from stages.messages.drone import DroneFix as DroneFix
+from stages.messages.drone import DroneMotion as DroneMotion
 from stages.messages.drone import KernelScores as KernelScores
 from stages.messages.drone import MeanShiftResult as MeanShiftResult
 from stages.messages.drone import SearchResult as SearchResult
@@ -35,6 +37,7 @@ from stages.messages.pose import PositionEstimate as PositionEstimate
 from stages.messages.pose import RelativePose as RelativePose
 from stages.messages.sensors import Image as Image
 from stages.messages.sensors import LidarFirings as LidarFirings
+from stages.messages.sensors import MotionStatus as MotionStatus
 from stages.messages.sensors import ServoGoal as ServoGoal
 from stages.messages.sensors import ServoOffset as ServoOffset
 from stages.messages.sensors import ServoState as ServoState

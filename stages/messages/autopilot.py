@@ -18,7 +18,7 @@ class DroneAttitude(Message):
     independent: bool = False  # of poses that grd sent
 
 
-@message(schema=61)
+@message(schema=79)
 class DroneTilt(Message):
     """The vertical in drone axes, by the autopilot's roll and pitch; nothing of its yaw.
 

@@ -1,4 +1,4 @@
-"""Messages of drone detection and tracking by the LiDAR. P III.B, III.C."""
+"""Messages of drone detection and tracking by the LiDAR (P III.B, III.C), and of the drone's motion by its IMU."""
 
 from __future__ import annotations
 
@@ -130,3 +130,30 @@ class TrackState(Message):
     xyz_vehicle_m: Vec3 | None = None  # None: not predicted
     velocity_vehicle_mps: Vec3 | None = None
     covariance_m2: Mat3 | None = None  # of the position
+
+
+@message(schema=35)
+class AutopilotMotion:
+    """The autopilot's own estimate, at hand only while it cannot contain our pose. Frames: see DroneAttitude."""
+
+    xyz_odom_m: Vec3
+    R_odom_drone: Mat3
+    velocity_odom_mps: Vec3
+    odom_segment: int  # changes after each reset of the autopilot's estimator: positions of two segments do not compare
+
+
+@message(schema=75)
+class DroneMotion(Message):
+    """Measured motion of the drone over one IMU interval, from start_ns to stamp_ns.
+
+    The intervals of one segment follow each other without a gap. Means are over the interval, in drone axes.
+    """
+
+    start_ns: int
+    segment: int  # changes after a gap in the IMU's samples and after a restart of the autopilot
+    specific_force_drone_mps2: Vec3  # mean; +g along z at rest
+    angular_velocity_drone_radps: Vec3  # mean
+    specific_force_noise: float  # white-noise density [m/s^2/sqrt(Hz)] per axis, vibration included
+    angular_velocity_noise: float  # white-noise density [rad/s/sqrt(Hz)] per axis, vibration included
+    up_drone: Vec3 | None  # unit vector up, by the autopilot's roll and pitch (never its yaw); None: not at hand
+    autopilot: AutopilotMotion | None  # at stamp_ns; None: not at hand, or not independent of our pose

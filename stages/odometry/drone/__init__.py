@@ -2,3 +2,4 @@
 
 from stages.odometry.drone.fisheye_odometry import FisheyeOdometry as FisheyeOdometry
 from stages.odometry.drone.independent_telemetry import IndependentTelemetry as IndependentTelemetry
+from stages.odometry.drone.inertial_motion import InertialMotion as InertialMotion

@@ -320,6 +320,7 @@ def test_every_time_field_of_the_messages_is_known():
         "DepthImage.start_ns": False,
         "Detections.evidence.seen_ns": False,
         "Detections.evidence.start_ns": False,
+        "DroneMotion.start_ns": False,
         "VisualMotion.from_ns": False,
         "FollowedFeatures.from_ns": False,
         "LidarFirings.pulse_stamp_ns": False,

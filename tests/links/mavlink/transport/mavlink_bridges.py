@@ -17,6 +17,7 @@ from links.mavlink.origin import OriginSender
 from links.mavlink.poses.gate import PoseLimits
 from links.mavlink.poses.independence import Independence
 from links.mavlink.poses.pose_sender import PoseSender
+from links.mavlink.streams.message_intervals import MessageIntervals, MessageRates
 from links.mavlink.transport.connection import Address, Connection
 from links.mavlink.transport.framing import packed, parse_frame
 from links.mavlink.transport.stream_connection import StreamConnection
@@ -122,6 +123,9 @@ class RatedBridge:
     def close(self) -> None: ...
 
 
+NO_REQUESTS = MessageRates(imu_hz=0, attitude_hz=0, position_hz=0, estimator_hz=0)
+
+
 class SlowFlight:
     """A session over a slow line to an autopilot with ten frames/s that replies to TIMESYNC, on a simulated clock."""
 
@@ -146,6 +150,7 @@ class SlowFlight:
             (1, 197),
             pose_sender,
             OriginSender(None, (1, 1)),
+            MessageIntervals(NO_REQUESTS, "ardupilot", (1, 1), (1, 197)),
             None,
             lambda: self.now_ns,
             ("/autopilot/rx", "/autopilot/tx"),

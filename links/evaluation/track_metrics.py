@@ -3,7 +3,7 @@
 An output is false by its distance from the drone alone: a run that states a large sigma has as many as one that states
 none. False outputs whose own covariance excludes the drone are counted separately as overconfident.
 
-Source: grd; limits in association.py, autopilot gate in links/mavlink/gate.py.
+Source: grd; limits in association.py, autopilot gate in links/mavlink/poses.
 """
 
 from __future__ import annotations

@@ -67,14 +67,16 @@ def test_a_pose_to_the_peers_socket(benchmark: Any, tmp_path: Path, signed: bool
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         peer.bind(("127.0.0.1", 0))
         peer.settimeout(5.0)
-        link = Autopilot(connection=f"udpout:127.0.0.1:{peer.getsockname()[1]}", signing_key=key if signed else None)
+        connection = f"udpout:127.0.0.1:{peer.getsockname()[1]}"
+        link = Autopilot(connection=connection, yaw="cameras", signing_key=key if signed else None)
         took_ms: list[float] = []
         with link.listen():
             pose = good_pose()
 
             def send() -> None:
                 begin = time.perf_counter_ns()
-                link.on_pose(dataclasses.replace(pose, stamp_ns=host_time.now_ns()))
+                now_ns = host_time.now_ns()
+                link.on_pose(dataclasses.replace(pose, stamp_ns=now_ns, rotation_ns=now_ns))
                 while int.from_bytes(peer.recv(400)[7:10], "little") != 331:  # ODOMETRY; heartbeats pass by
                     pass
                 took_ms.append(1e-6 * (time.perf_counter_ns() - begin))

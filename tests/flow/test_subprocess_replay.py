@@ -169,7 +169,7 @@ def test_a_partition_is_a_stage_with_all_that_feeds_it_and_partitions_that_share
 
 def test_with_both_fisheyes_the_images_of_each_camera_have_a_partition():
     drone, vehicle = sorted(load_graph(CONFIGS / "vision.yaml").partitions(), key=len)
-    assert drone == {"camera_drone", "autopilot", "vp_drone", "drone_odometry"}
+    assert drone == {"camera_drone", "autopilot", "telemetry", "vp_drone", "drone_odometry"}
     assert {"camera_vehicle", "vp_vehicle", "sweep", "lidar"} < vehicle
     assert not vehicle & {"detect", "track", "align", "fuse"}
 

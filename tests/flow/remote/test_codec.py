@@ -325,6 +325,7 @@ def test_every_time_field_of_the_messages_is_known():
         "FollowedFeatures.from_ns": False,
         "LidarFirings.pulse_stamp_ns": False,
         "RelativePose.measured_ns": False,
+        "RelativePose.rotation_ns": False,
         "SweptPoints.point_stamp_ns": False,
         "SweptPulses.point_stamp_ns": False,
     }

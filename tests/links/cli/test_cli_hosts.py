@@ -154,5 +154,5 @@ def test_the_committed_hosts_file_assigns_all_nodes_of_the_field_configuration()
     field = PAPER.with_name("field.yaml")
     done = grd("check", field, "--hosts", ROOT / "deploy" / "hosts.yaml")
     assert done.exit_code == 0, done.output
-    assert "drone: runs camera_drone, vp_drone, drone_odometry" in done.output
+    assert "drone: runs camera_drone, drone_odometry, vp_drone" in done.output
     assert "image" not in done.output.partition("vehicle, the hub")[2], "no pictures cross"

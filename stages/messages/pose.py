@@ -49,7 +49,7 @@ class PoseEstimate:
     velocity_covariance: Mat3  # of velocity_map_mps [m2/s2]
 
 
-@message(schema=76)
+@message(schema=80)
 class RelativePose(Message):
     """State and estimate of the drone relative to the vehicle and in `map`, predicted to stamp_ns.
 

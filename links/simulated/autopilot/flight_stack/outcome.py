@@ -3,6 +3,7 @@
 A flight is lost when it crashes (ground or an obstacle), when the EKF failsafe lands it, or when it leaves its plan by
 more than 20 m. Errors of a sent pose are those of ODOMETRY against T_map_vehicle T_vehicle_drone at its time: the first
 by the vehicle's odometry, whose drift the autopilot's frame shares, the second true. Without odometry both are true.
+A position that is sent without yaw is compared in axes that point to the true north.
 
 Source: ours.
 """
@@ -25,9 +26,10 @@ from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.kernels.motion import STEP_S
 from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
-from stages.geometry.frames import Array64, rotations_from_xyzw
+from stages.geometry.frames import Array64, rotation_z, rotations_from_xyzw
 
 WRONG_M, WRONG_DEG = 1.0, 10.0  # a sent pose with a larger error is wrong
+NO_YAW_RAD2 = 9.0  # a larger yaw variance: the message holds no yaw
 SETTLE_S = 3.0  # of a hold, before its scatter counts
 FLYAWAY_M = 20.0
 
@@ -56,10 +58,11 @@ class Outcome:
             parts.append(f"EKF failsafe at {self.failsafe_s:.1f} s")
         if self.sent_poses:
             parts.append(
-                f"{self.sent_poses} poses sent, {self.wrong_poses} wrong, worst {self.sent_worst_m:.2f} m "
-                f"{self.sent_yaw_worst_deg:.1f} deg, 95 % {self.sent_95_m:.2f} m, "
-                f"yaw RMS {self.sent_yaw_rms_deg:.1f} deg"
+                f"{self.sent_poses} poses sent, {self.wrong_poses} wrong, worst {self.sent_worst_m:.2f} m, "
+                f"95 % {self.sent_95_m:.2f} m"
             )
+            if self.sent_yaw_rms_deg is not None:
+                parts.append(f"yaw worst {self.sent_yaw_worst_deg:.1f} deg, RMS {self.sent_yaw_rms_deg:.1f} deg")
         else:
             parts.append("no pose sent")
         if self.hover_scatter_m is not None:
@@ -79,7 +82,8 @@ class FlightOutcome:
         self._row = 0
         self._lost_s: float | None = None
         self._last: Array64 | None = None
-        self._poses: list[tuple[int, Array64, float]] = []  # stamp [ns], position in map [m], yaw [rad]
+        # stamp [ns], position [m], yaw in map [rad]; NaN: without yaw, and the position in north-aligned axes
+        self._poses: list[tuple[int, Array64, float]] = []
         self._odometry: list[tuple[int, list[float], list[float]]] = []  # stamp [ns], position, quaternion xyzw
 
     def on_odometry(self, record: Record) -> None:
@@ -92,8 +96,8 @@ class FlightOutcome:
         message: Any = parse_frame(record.data)
         if message.get_type() == "ODOMETRY":
             xyz = flip_yz(np.array([message.x, message.y, message.z]))
-            finite = all(map(math.isfinite, message.q))
-            R = R_odom_drone_from_wxyz(message.q) if finite else np.full((3, 3), np.nan)
+            has_yaw = all(map(math.isfinite, message.q)) and not message.pose_covariance[20] > NO_YAW_RAD2
+            R = R_odom_drone_from_wxyz(message.q) if has_yaw else np.full((3, 3), np.nan)
             self._poses.append((int(message.time_usec) * 1000, xyz, math.atan2(R[1, 0], R[0, 0])))
 
     def is_over(self) -> bool:
@@ -120,7 +124,8 @@ class FlightOutcome:
         failsafe = next((time_s for time_s, what in events if what == "EKF failsafe"), None)
         lost = [t for t in (self._lost_s, failsafe) if t is not None]
         position_m, yaw_deg = self._sent_errors()
-        wrong = (position_m > WRONG_M) | (np.abs(yaw_deg) > WRONG_DEG)
+        wrong = position_m > WRONG_M
+        wrong[self._with_yaw()] |= yaw_deg > WRONG_DEG
         sent = len(position_m)
         return Outcome(
             crashed=self._stack.quadrotor.crashed,
@@ -130,15 +135,18 @@ class FlightOutcome:
             wrong_poses=int(wrong.sum()),
             sent_worst_m=round(float(position_m.max()), 3) if sent else None,
             sent_95_m=round(float(np.percentile(position_m, 95)), 3) if sent else None,
-            sent_yaw_worst_deg=round(float(np.abs(yaw_deg).max()), 2) if sent else None,
-            sent_yaw_rms_deg=round(float(np.sqrt(np.mean(yaw_deg**2))), 2) if sent else None,
+            sent_yaw_worst_deg=round(float(yaw_deg.max()), 2) if len(yaw_deg) else None,
+            sent_yaw_rms_deg=round(float(np.sqrt(np.mean(yaw_deg**2))), 2) if len(yaw_deg) else None,
             hover_scatter_m=self._hover_scatter(),
             estimate_worst_m=round(self._stack.worst_target_error_m, 2),
             events=list(events),
         )
 
+    def _with_yaw(self) -> NDArray[np.bool_]:
+        return np.array([not math.isnan(yaw) for _, _, yaw in self._poses], dtype=bool)
+
     def _sent_errors(self) -> tuple[Array64, Array64]:
-        """Position [m] and yaw [deg] errors of the sent poses, in map."""
+        """Position errors [m] of all sent poses, in map, and yaw errors [deg] of those with yaw."""
         if not self._poses:
             return np.empty(0), np.empty(0)
         latest = self._truth.start_ns + round(self._stack.motion.until_s * 1e9)
@@ -152,8 +160,11 @@ class FlightOutcome:
         R_expected = R_map @ R_relative
         yaw = np.arctan2(R_expected[:, 1, 0], R_expected[:, 0, 0])
         sent_m = np.array([xyz for _, xyz, _ in self._poses])
-        error = np.degrees(np.array([y for _, _, y in self._poses]) - yaw)
-        return np.linalg.norm(sent_m - expected_m, axis=1), (np.nan_to_num(error) + 180) % 360 - 180
+        sent_yaw = np.array([yaw for _, _, yaw in self._poses])
+        without = np.isnan(sent_yaw)
+        expected_m[without] = expected_m[without] @ rotation_z(self._stack.north_yaw_of_map).T
+        error = np.degrees(sent_yaw[~without] - yaw[~without])
+        return np.linalg.norm(sent_m - expected_m, axis=1), np.abs((error + 180) % 360 - 180)
 
     def _map_vehicle(self, stamps: NDArray[np.int64]) -> tuple[Array64, Array64]:
         """T_map_vehicle at times (n,) by the vehicle's odometry, interpolated; without it, the true one."""

@@ -219,6 +219,11 @@ class FlightStack:
         return self._controller.command(target, estimate[0:3], estimate[3:6])
 
     @property
+    def north_yaw_of_map(self) -> float:
+        """Yaw [rad] that turns coordinates of `map` into axes that point to the true north (x north, y west)."""
+        return self._world_yaw + float(self._map[1])
+
+    @property
     def external_sets(self) -> list[bool]:
         """Whether the position of each source set is external."""
         return [SOURCE_SETS[name].position is AidingSource.EXTERNAL for name in self.settings.source_sets]

@@ -5,11 +5,12 @@ Source: ours.
 
 from __future__ import annotations
 
-from flow.link import TRUTH_TOPICS, Record
+from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.simulated.autopilot.flight_stack.outcome import FlightOutcome, Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.scenario import Scenario
+from links.simulated.world.clearance import under_open_sky
 from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
 
@@ -39,6 +40,10 @@ class FlightInTheLoop:
 
     def watch(self, world: RayScene, truth: Truth) -> None:
         """Look for collisions with the scene, and compare sent poses with the truth."""
+        start_m = self.stack.quadrotor.state[None, 0:3]
+        if self.stack.settings.on_ground and not under_open_sky(world, start_m)[0]:
+            x, y, _ = start_m[0]
+            raise LinkError(f"drone.path: something stands where it takes off, ({x:.1f}, {y:.1f}) m: move its start")
         self._outcome = FlightOutcome(self.stack, world, truth)
 
     def is_over(self) -> bool:

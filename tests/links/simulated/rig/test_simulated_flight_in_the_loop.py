@@ -13,7 +13,7 @@ import yaml
 
 from flow.config_error import Location
 from flow.graph import load_graph
-from flow.link import Record
+from flow.link import LinkError, Record
 from flow.replay import replay
 from flow.taps import Digest
 from links.mavlink.transport.framing import parse_frame
@@ -115,6 +115,12 @@ def test_the_same_seed_gives_the_same_bytes_however_far_it_looks_ahead(monkeypat
     assert again == records
     assert again_hash == output_hash
     assert fly(short.changed(seed=2))[2] != output_hash
+
+
+def test_a_take_off_below_an_obstacle_is_an_error() -> None:
+    blocked = changed(load_scenario(FLIGHT), 1.0, {"on_ground": True})  # a car is parked there
+    with pytest.raises(LinkError, match=r"drone.path: something stands where it takes off, \(7.0, 0.0\) m"):
+        Simulation(blocked)
 
 
 def test_no_thread_is_started() -> None:

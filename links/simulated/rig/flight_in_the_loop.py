@@ -5,15 +5,19 @@ Source: ours.
 
 from __future__ import annotations
 
-from flow.link import TRUTH_TOPICS, Record
+import numpy as np
+
+from flow.link import TRUTH_TOPICS, LinkError, Record
 from links.simulated.autopilot.flight_stack.outcome import FlightOutcome, Outcome
 from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.rig.closed_loop import ClosedLoop
 from links.simulated.rig.scenario import Scenario
+from links.simulated.world.clearance import visible
 from links.simulated.world.mesh import RayScene
 from links.simulated.world.scene import Truth
 
 OUTCOME_TOPIC = f"{TRUTH_TOPICS}/flight"
+ABOVE_M = 50.0  # over the place of a take-off, must be free
 ODOMETRY_TOPIC = "/vehicle/odometry"
 
 
@@ -39,6 +43,10 @@ class FlightInTheLoop:
 
     def watch(self, world: RayScene, truth: Truth) -> None:
         """Look for collisions with the scene, and compare sent poses with the truth."""
+        start_m = self.stack.quadrotor.state[None, 0:3]
+        if self.stack.settings.on_ground and not visible(world, start_m, start_m + np.array([0.0, 0.0, ABOVE_M]))[0]:
+            x, y, _ = start_m[0]
+            raise LinkError(f"drone.path: something stands where it takes off, ({x:.1f}, {y:.1f}) m: move its start")
         self._outcome = FlightOutcome(self.stack, world, truth)
 
     def is_over(self) -> bool:

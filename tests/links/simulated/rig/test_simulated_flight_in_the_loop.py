@@ -13,10 +13,11 @@ import yaml
 
 from flow.config_error import Location
 from flow.graph import load_graph
-from flow.link import Record
+from flow.link import LinkError, Record
 from flow.replay import replay
 from flow.taps import Digest
 from links.mavlink.transport.framing import parse_frame
+from links.simulated.autopilot.flight_stack.stack import FlightStack
 from links.simulated.rig import closed_loop
 from links.simulated.rig.closed_loop import load_loop
 from links.simulated.rig.run import Simulation, simulate
@@ -33,6 +34,11 @@ def changed(scenario: Scenario, duration_s: float, stack: dict[str, Any] | None 
     autopilot = scenario.autopilot.model_dump()
     autopilot["flight_stack"] |= stack or {}
     return scenario.changed(duration_s=duration_s, autopilot=autopilot, **settings)
+
+
+def stack_of(simulation: Simulation) -> FlightStack:
+    assert simulation.flight is not None
+    return simulation.flight.stack
 
 
 def fly(scenario: Scenario) -> tuple[list[Record], Simulation, str]:
@@ -56,10 +62,10 @@ def messages(records: list[Record], topic: str, kind: str) -> list[tuple[Record,
 def test_sent_poses_reach_the_autopilot_and_it_flies_on_them(flown) -> None:
     records, simulation, _ = flown
     assert len(messages(records, "/autopilot/tx", "ODOMETRY")) > 100
-    core = simulation.flight.stack.ekf.primary
+    core = stack_of(simulation).ekf.primary
     assert core.used_external_ns is not None
     assert core.active == 1
-    assert not simulation.flight.stack.quadrotor.crashed
+    assert not stack_of(simulation).quadrotor.crashed
 
 
 def test_the_session_does_what_it_does_live_at_its_times(flown) -> None:
@@ -111,6 +117,12 @@ def test_the_same_seed_gives_the_same_bytes_however_far_it_looks_ahead(monkeypat
     assert fly(short.changed(seed=2))[2] != output_hash
 
 
+def test_a_take_off_below_an_obstacle_is_an_error() -> None:
+    blocked = changed(load_scenario(FLIGHT), 1.0, {"on_ground": True})  # a car is parked there
+    with pytest.raises(LinkError, match=r"drone.path: something stands where it takes off, \(7.0, 0.0\) m"):
+        Simulation(blocked)
+
+
 def test_no_thread_is_started() -> None:
     before = threading.active_count()
     fly(changed(load_scenario(FLIGHT), 1.0))
@@ -137,7 +149,7 @@ def test_after_a_kill_grd_starts_anew_and_the_flight_goes_on() -> None:
     assert (sent_s > 9.0).any()
     counters = {m.reset_counter for _, m in messages(records, "/autopilot/tx", "ODOMETRY")}
     assert counters
-    assert not simulation.flight.stack.quadrotor.crashed
+    assert not stack_of(simulation).quadrotor.crashed
 
 
 def test_the_command_writes_the_flight_and_says_what_became_of_it(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 
 from flow.message import Mat3, Message, PerPointBool, PerPointF64, PerPointI64, Points64, Vec3, message
@@ -83,3 +84,30 @@ class TrackState(Message):
     xyz_vehicle_m: Vec3 | None = None  # None: not predicted
     velocity_vehicle_mps: Vec3 | None = None
     covariance_m2: Mat3 | None = None  # of the position
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AutopilotMotion:
+    """The autopilot's own estimate at the end of an interval, present only while it cannot contain our pose."""
+
+    xyz_odom_m: Vec3
+    R_odom_drone: Mat3
+    velocity_odom_mps: Vec3
+    odom_segment: int  # a new one after each reset of the autopilot's estimator
+
+
+@message(schema=75)
+class DroneMotion(Message):
+    """Motion of the drone over one IMU interval; stamp_ns is its end.
+
+    The intervals of one `segment` follow each other without a gap.
+    """
+
+    start_ns: int
+    segment: int
+    specific_force_drone_mps2: Vec3  # mean over the interval: +g along z at rest
+    angular_velocity_drone_radps: Vec3  # mean over the interval
+    specific_force_noise: float  # white-noise density [m/s^2/sqrt(Hz)], vibration included
+    angular_velocity_noise: float  # [rad/s/sqrt(Hz)]
+    up_drone: Vec3 | None  # unit vector up by the autopilot's roll and pitch, never its yaw; None: not at hand
+    autopilot: AutopilotMotion | None  # None: not independent of our pose, or not at hand

@@ -1,0 +1,164 @@
+"""State of the drone by IMU: attitude, position, velocity and both biases, for several hypotheses at once.
+
+Errors (15), in the order of GTSAM's keys: theta (R exp(theta), drone axes), position and velocity (map axes),
+accelerometer bias, gyroscope bias. Over an interval T with the preintegrated motion (dR, dv, dp):
+
+    R' = R dR,   v' = v + g T + R dv,   p' = p + v T + g T^2 / 2 + R dp
+
+Source: Forster et al. (T-RO 2017); Sola, Quaternion kinematics for the error-state Kalman filter (2017), 5 and 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.frames import Array64
+from stages.kernels.heading.preintegration import preintegrate
+
+GRAVITY_MPS2 = np.array([0.0, 0.0, -9.80665])  # standard gravity, map axes
+SIZE = 15
+THETA, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
+ACCEL_BIAS, GYRO_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
+ACCEL_WALK, GYRO_WALK = 0.005, 1e-4  # random walk of the biases [m/s^2 / sqrt(s)], [rad/s / sqrt(s)]
+
+
+@dataclass(frozen=True)
+class ImuIntervals:
+    """Consecutive IMU intervals."""
+
+    step_s: Array64  # (n,)
+    force_mps2: Array64  # (n, 3) specific force, drone axes
+    rate_radps: Array64  # (n, 3)
+    force_noise: Array64  # (n,) [m/s^2 / sqrt(Hz)]
+    rate_noise: Array64  # (n,) [rad/s / sqrt(Hz)]
+
+    @property
+    def seconds(self) -> float:
+        """Their whole length."""
+        return float(self.step_s.sum())
+
+
+@dataclass
+class InertialState:
+    """n hypotheses; each array has n rows."""
+
+    R: Array64  # (n, 3, 3) R_map_drone
+    xyz_m: Array64  # (n, 3) map
+    velocity_mps: Array64  # (n, 3) map
+    bias: Array64  # (n, 6) accelerometer [m/s^2], gyroscope [rad/s], drone axes
+    covariance: Array64  # (n, 15, 15)
+
+    def __len__(self) -> int:
+        return len(self.xyz_m)
+
+    def rows(self, index: Array64) -> InertialState:
+        """The hypotheses of an index array."""
+        return InertialState(
+            self.R[index], self.xyz_m[index], self.velocity_mps[index], self.bias[index], self.covariance[index]
+        )
+
+    @property
+    def yaw_rad(self) -> Array64:
+        """(n,) rotation about the vertical: of R with its tilt removed."""
+        R = self.R
+        return np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1])
+
+    @property
+    def yaw_variance_rad2(self) -> Array64:
+        """(n,) variance of the rotation about the vertical."""
+        up = self.R[:, 2, :]
+        return np.einsum("ni,nij,nj->n", up, self.covariance[:, THETA, THETA], up)
+
+    def moved(self, by: Array64) -> InertialState:
+        """Each hypothesis moved by an error (n, 15), same covariance; the rotation's tangent is transported."""
+        turn = exp_rotations(by[:, THETA])
+        reset = np.tile(np.eye(SIZE), (len(self), 1, 1))
+        reset[:, THETA, THETA] -= 0.5 * hats(by[:, THETA])
+        return InertialState(
+            self.R @ turn,
+            self.xyz_m + by[:, POSITION],
+            self.velocity_mps + by[:, VELOCITY],
+            self.bias + by[:, BIASES],
+            reset @ self.covariance @ np.swapaxes(reset, 1, 2),
+        )
+
+
+def hats(v: Array64) -> Array64:
+    """(n, 3, 3): cross product matrices of (n, 3)."""
+    out = np.zeros((len(v), 3, 3))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
+    return out
+
+
+def exp_rotations(phi_rad: Array64) -> Array64:
+    """Rotations (n, 3, 3) of rotation vectors (n, 3)."""
+    angle = np.linalg.norm(phi_rad, axis=1)[:, None, None]
+    K = hats(phi_rad)
+    a = np.maximum(angle, 1e-8)
+    return np.eye(3) + np.sin(a) / a * K + (1.0 - np.cos(a)) / a**2 * (K @ K)
+
+
+def log_rotations(R: Array64) -> Array64:
+    """Rotation vectors (n, 3) of rotations (n, 3, 3); the angle up to pi, accurate away from pi."""
+    axis = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sin, cos = np.linalg.norm(axis, axis=1), 0.5 * (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0)
+    angle = np.arctan2(sin, cos)
+    return axis * (angle / np.maximum(sin, 1e-12))[:, None]
+
+
+def predict(state: InertialState, imu: ImuIntervals, weight: Array64) -> InertialState:
+    """The state after some IMU intervals; `weight` (n,) sums to 1. The biases are corrected to first order."""
+    mean = weight @ state.bias
+    T = imu.seconds
+    dR, dv, dp, J, C = preintegrate(
+        imu.step_s, imu.force_mps2, imu.rate_radps, imu.force_noise, imu.rate_noise, mean.reshape(2, 3)
+    )
+    correction = (state.bias - mean) @ J.T  # (n, 9): theta, v, p
+    dR_each = dR @ exp_rotations(correction[:, :3])
+    dv_each, dp_each = dv + correction[:, 3:6], dp + correction[:, 6:]
+    R, n = state.R, len(state)
+    F = np.tile(np.eye(SIZE), (n, 1, 1))
+    F[:, THETA, THETA] = np.swapaxes(dR_each, 1, 2)
+    F[:, VELOCITY, THETA] = -R @ hats(dv_each)
+    F[:, POSITION, THETA] = -R @ hats(dp_each)
+    F[:, POSITION, VELOCITY] = T * np.eye(3)
+    F[:, THETA, BIASES] = J[:3]
+    F[:, VELOCITY, BIASES] = R @ J[3:6]
+    F[:, POSITION, BIASES] = R @ J[6:]
+    G = np.zeros((n, SIZE, 9))
+    G[:, THETA, :3], G[:, VELOCITY, 3:6], G[:, POSITION, 6:] = np.eye(3), R, R
+    P = F @ state.covariance @ np.swapaxes(F, 1, 2) + G @ C @ np.swapaxes(G, 1, 2)
+    diagonal = np.arange(SIZE)
+    P[:, diagonal[ACCEL_BIAS], diagonal[ACCEL_BIAS]] += ACCEL_WALK**2 * T
+    P[:, diagonal[GYRO_BIAS], diagonal[GYRO_BIAS]] += GYRO_WALK**2 * T
+    return InertialState(
+        R @ dR_each,
+        state.xyz_m + T * state.velocity_mps + 0.5 * T**2 * GRAVITY_MPS2 + np.einsum("nij,nj->ni", R, dp_each),
+        state.velocity_mps + T * GRAVITY_MPS2 + np.einsum("nij,nj->ni", R, dv_each),
+        state.bias,
+        0.5 * (P + np.swapaxes(P, 1, 2)),
+    )
+
+
+FREE_ACCELERATION, FREE_RATE = 2.2, 0.7  # densities without an IMU [m/s^2 / sqrt(Hz)], [rad/s / sqrt(Hz)]
+
+
+def predict_free(state: InertialState, seconds: float, dR: Array64 | None = None, dR_noise: float = FREE_RATE) -> InertialState:
+    """The state after a time without an IMU: constant velocity, and a rotation dR (3, 3) or an unknown one."""
+    n, T, turn = len(state), seconds, np.eye(3) if dR is None else dR
+    F = np.tile(np.eye(SIZE), (n, 1, 1))
+    F[:, THETA, THETA] = turn.T
+    F[:, POSITION, VELOCITY] = T * np.eye(3)
+    P = F @ state.covariance @ np.swapaxes(F, 1, 2)
+    q, three = FREE_ACCELERATION**2, np.eye(3)
+    P[:, THETA, THETA] += dR_noise**2 * T * three
+    P[:, VELOCITY, VELOCITY] += q * T * three
+    P[:, POSITION, POSITION] += q * T**3 / 3 * three
+    P[:, POSITION, VELOCITY] += q * T**2 / 2 * three
+    P[:, VELOCITY, POSITION] += q * T**2 / 2 * three
+    return InertialState(
+        state.R @ turn, state.xyz_m + T * state.velocity_mps, state.velocity_mps, state.bias, 0.5 * (P + np.swapaxes(P, 1, 2))
+    )

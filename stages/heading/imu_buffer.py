@@ -16,7 +16,7 @@ from stages.messages import DroneMotion
 
 KEPT = 1024  # intervals: 20 s at 50 Hz
 HELD_NS = 150_000_000  # the newest interval is held so long beyond its end
-HELD_NOISE = 2.0, 0.5  # densities while it is held: specific force [m/s^2 / sqrt(Hz)], rate [rad/s / sqrt(Hz)]
+HELD_NOISE = 0.3, 0.05  # densities while it is held: specific force [m/s^2 / sqrt(Hz)], rate [rad/s / sqrt(Hz)]
 CURRENT_NS = 1_000_000_000  # the IMU is in use for so long after its newest interval
 
 

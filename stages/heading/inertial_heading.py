@@ -18,7 +18,7 @@ from stages.geometry.frames import Array64
 from stages.heading import bank_measurements as measure
 from stages.heading.imu_buffer import ImuBuffer
 from stages.heading.inertial_bank import NEAR_RAD, InertialBank, start
-from stages.heading.inertial_state import ImuIntervals, InertialState
+from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
 from stages.heading.odometry_heading import YawEvidence
 from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import VisualMotion
@@ -57,6 +57,18 @@ class InertialHeading:
         self.bank = start(xyz_m, covariance_m2, velocity, up_drone, memory)
         self.stamp_ns, self.evidence, self._decisions = stamp_ns, None, 0
         self.kinds = set()
+
+    def resume(self, stamp_ns: int, state: InertialState) -> None:
+        """Continue from one decided hypothesis (one row)."""
+        self.bank = InertialBank(state, np.zeros(1))
+        self.stamp_ns, self.evidence, self._decisions = stamp_ns, None, DECISIONS
+
+    def restart_yaw(self) -> None:
+        """Every yaw is probable again; position and velocity stay."""
+        if self.bank is not None:
+            one = self.bank.mean()
+            covariance = one.covariance[0, POSITION, POSITION]
+            self.start(self.stamp_ns, one.xyz_m[0], covariance, one.velocity_mps[0], one.R[0, 2])
 
     def stop(self) -> None:
         """Drop all hypotheses."""

@@ -144,9 +144,12 @@ def predict(state: InertialState, imu: ImuIntervals, weight: Array64) -> Inertia
 
 
 FREE_ACCELERATION, FREE_RATE = 2.2, 0.7  # densities without an IMU [m/s^2 / sqrt(Hz)], [rad/s / sqrt(Hz)]
+FREE_MOST_RAD = 0.35  # sigma of each axis that the rotation reaches without an IMU: then it is not known
 
 
-def predict_free(state: InertialState, seconds: float, dR: Array64 | None = None, dR_noise: float = FREE_RATE) -> InertialState:
+def predict_free(
+    state: InertialState, seconds: float, dR: Array64 | None = None, dR_noise: float = FREE_RATE
+) -> InertialState:
     """The state after a time without an IMU: constant velocity, and a rotation dR (3, 3) or an unknown one."""
     n, T, turn = len(state), seconds, np.eye(3) if dR is None else dR
     F = np.tile(np.eye(SIZE), (n, 1, 1))
@@ -154,11 +157,11 @@ def predict_free(state: InertialState, seconds: float, dR: Array64 | None = None
     F[:, POSITION, VELOCITY] = T * np.eye(3)
     P = F @ state.covariance @ np.swapaxes(F, 1, 2)
     q, three = FREE_ACCELERATION**2, np.eye(3)
-    P[:, THETA, THETA] += dR_noise**2 * T * three
+    known = np.trace(P[:, THETA, THETA], axis1=1, axis2=2) < 3 * FREE_MOST_RAD**2
+    P[known, THETA, THETA] += min(dR_noise**2 * T, FREE_MOST_RAD**2) * three
     P[:, VELOCITY, VELOCITY] += q * T * three
     P[:, POSITION, POSITION] += q * T**3 / 3 * three
     P[:, POSITION, VELOCITY] += q * T**2 / 2 * three
     P[:, VELOCITY, POSITION] += q * T**2 / 2 * three
-    return InertialState(
-        state.R @ turn, state.xyz_m + T * state.velocity_mps, state.velocity_mps, state.bias, 0.5 * (P + np.swapaxes(P, 1, 2))
-    )
+    P = 0.5 * (P + np.swapaxes(P, 1, 2))
+    return InertialState(state.R @ turn, state.xyz_m + T * state.velocity_mps, state.velocity_mps, state.bias, P)

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
 from stages.geometry.frames import Array64
 from stages.heading.inertial_state import ImuIntervals, InertialState, predict, predict_free
-from stages.messages import DroneMotion
+from stages.messages import DroneMotion, VisualMotion
+from stages.odometry.drone.trajectory import AutopilotTrajectory, VisualTrajectory, rotation_between
 
 KEPT = 1024  # intervals: 20 s at 50 Hz
 HELD_NS = 150_000_000  # the newest interval is held so long beyond its end
@@ -20,16 +22,29 @@ HELD_NOISE = 0.3, 0.05  # densities while it is held: specific force [m/s^2 / sq
 CURRENT_NS = 1_000_000_000  # the IMU is in use for so long after its newest interval
 
 
+class Gap(NamedTuple):
+    """A time without an IMU."""
+
+    from_ns: int
+    to_ns: int
+
+
 class ImuBuffer:
-    """IMU intervals in the order of time."""
+    """IMU intervals in the order of time, and the turns by images for the times without."""
 
     def __init__(self) -> None:
         self._intervals: deque[DroneMotion] = deque(maxlen=KEPT)
+        self._images, self._no_autopilot = VisualTrajectory(), AutopilotTrajectory()
 
     @property
     def newest_ns(self) -> int | None:
         """End of the newest interval; None: no IMU so far."""
         return self._intervals[-1].stamp_ns if self._intervals else None
+
+    @property
+    def newest_image_ns(self) -> int | None:
+        """Time of the newest image of the drone; None: none so far."""
+        return self._images.newest_ns
 
     def is_current(self, now_ns: int) -> bool:
         """Whether intervals keep arriving."""
@@ -43,9 +58,13 @@ class ImuBuffer:
         self._intervals.append(motion)
         return True
 
-    def between(self, from_ns: int, to_ns: int) -> list[ImuIntervals | float]:
-        """The intervals from one time to a later one, cut at both; a number is a gap [s] without an IMU."""
-        out: list[ImuIntervals | float] = []
+    def add_visual_motion(self, motion: VisualMotion) -> None:
+        """Add a turn by images."""
+        self._images.add(motion)
+
+    def between(self, from_ns: int, to_ns: int) -> list[ImuIntervals | Gap]:
+        """The intervals from one time to a later one, cut at both."""
+        out: list[ImuIntervals | Gap] = []
         rows: list[tuple[float, Array64, Array64, float, float]] = []
         at_ns = from_ns
         intervals = self._intervals
@@ -56,7 +75,7 @@ class ImuBuffer:
                 break
             if m.start_ns > at_ns + 1_000:  # rounding of the stamps
                 _close(out, rows)
-                out.append((m.start_ns - at_ns) * 1e-9)
+                out.append(Gap(at_ns, m.start_ns))
                 at_ns = m.start_ns
             end_ns = min(m.stamp_ns, to_ns)
             rows.append(_row(m, end_ns - at_ns, m.specific_force_noise, m.angular_velocity_noise))
@@ -68,21 +87,26 @@ class ImuBuffer:
             at_ns = held_ns
         _close(out, rows)
         if at_ns < to_ns:
-            out.append((to_ns - at_ns) * 1e-9)
+            out.append(Gap(at_ns, to_ns))
         return out
 
     def propagate(self, state: InertialState, weight: Array64, from_ns: int, to_ns: int) -> InertialState:
         """The state at a later time; `weight` (n,) of the hypotheses."""
         for piece in self.between(from_ns, to_ns):
-            state = predict_free(state, piece) if isinstance(piece, float) else predict(state, piece, weight)
+            state = self._bridged(state, piece) if isinstance(piece, Gap) else predict(state, piece, weight)
         return state
+
+    def _bridged(self, state: InertialState, gap: Gap) -> InertialState:
+        turn = rotation_between(self._no_autopilot, self._images, gap.from_ns, gap.to_ns)
+        variance = turn.variance_rad2 if turn.measured else None
+        return predict_free(state, (gap.to_ns - gap.from_ns) * 1e-9, turn.R_from_to, variance)
 
 
 def _row(m: DroneMotion, step_ns: int, force: float, rate: float) -> tuple[float, Array64, Array64, float, float]:
     return step_ns * 1e-9, m.specific_force_drone_mps2, m.angular_velocity_drone_radps, force, rate
 
 
-def _close(out: list[ImuIntervals | float], rows: list[tuple[float, Array64, Array64, float, float]]) -> None:
+def _close(out: list[ImuIntervals | Gap], rows: list[tuple[float, Array64, Array64, float, float]]) -> None:
     if rows:
         step, force, rate, force_noise, rate_noise = zip(*rows, strict=True)
         out.append(

@@ -40,6 +40,7 @@ class InertialHeading:
         self.stamp_ns = 0
         self.evidence: YawEvidence | None = None
         self._decisions = 0
+        self.near_probability = 0.0  # of a yaw within 20 deg of the best one, at the newest LiDAR position
         self._direction_ns = 0
         self.kinds: set[str] = set()  # what has been used since the start
 
@@ -90,8 +91,8 @@ class InertialHeading:
             xyz_m, covariance_m2 = xyz_m + moved, covariance_m2 + (0.5 * LATE_MPS2 * late_s**2) ** 2 * np.eye(3)
         inlier = measure.add_position(self.bank, xyz_m, covariance_m2)
         self.bank.tidy()
-        near = self.near_probability()
-        self._decisions = self._decisions + 1 if near > DECIDED else 0
+        self.near_probability = self.bank.near_probability(self.log_factor())[1]
+        self._decisions = self._decisions + 1 if self.near_probability > DECIDED else 0
         return inlier
 
     def add_vertical(self, up_drone: Array64, sigma_rad: float) -> None:
@@ -145,41 +146,27 @@ class InertialHeading:
             return None
         return self.evidence.log_density(self.bank.state.yaw_rad, self.bank.state.yaw_variance_rad2)
 
-    def near_probability(self) -> float:
-        """Probability of a yaw within 20 deg of the best one."""
-        return 0.0 if self.bank is None else self.bank.near_probability(self.log_factor())[1]
-
     @property
     def decided(self) -> bool:
         """Whether the heading is known."""
         return self.bank is not None and self._decisions >= DECISIONS
 
     def decision(self) -> InertialState:
-        """One hypothesis: the moments of those near the best one. Odometry adds its yaw once."""
+        """One hypothesis: the moments of those near the best one.
+
+        The odometry's yaw is evidence for the decision alone: the error of its compass must not reach the estimate.
+        """
         assert self.bank is not None
         bank, factor = self.bank, self.log_factor()
         best, _ = bank.near_probability(factor)
         yaw = bank.state.yaw_rad
         near = np.flatnonzero(np.abs(np.remainder(yaw - yaw[best] + math.pi, 2 * math.pi) - math.pi) <= 1.5 * NEAR_RAD)
-        log_weight = bank.log_weight[near] + (0.0 if factor is None else factor[near])
-        chosen = InertialBank(bank.state.rows(near), log_weight)
-        if self.evidence is not None:
-            add_yaw(chosen, self.evidence)
-        return chosen.mean()
+        return InertialBank(bank.state.rows(near), bank.log_weight[near]).mean()
 
     def _late_s(self, stamp_ns: int) -> float | None:
         """How much older than the bank a time is [s]; None: too old."""
         late_ns = self.stamp_ns - stamp_ns
         return None if late_ns > LATE_NS else max(late_ns, 0) * 1e-9
-
-
-def add_yaw(bank: InertialBank, evidence: YawEvidence) -> None:
-    """Add a yaw with its outlier share."""
-    state = bank.state
-    H = np.zeros((len(state), 1, 15))
-    H[:, 0, :3] = state.R[:, 2, :]
-    off = np.remainder(evidence.yaw_rad - state.yaw_rad + math.pi, 2 * math.pi) - math.pi
-    bank.update(off[:, None], H, np.array([[evidence.sigma_rad**2]]), evidence.outlier_share, 1.0 / (2 * math.pi))
 
 
 def turn_between(imu: ImuBuffer, from_ns: int, to_ns: int, bias: Array64) -> tuple[Array64, float]:

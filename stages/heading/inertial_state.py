@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.geometry.frames import Array64
+from stages.kernels.heading.prediction import predict_states
 from stages.kernels.heading.preintegration import preintegrate
 
 GRAVITY_MPS2 = np.array([0.0, 0.0, -9.80665])  # standard gravity, map axes
@@ -116,31 +117,17 @@ def predict(state: InertialState, imu: ImuIntervals, weight: Array64) -> Inertia
     dR, dv, dp, J, C = preintegrate(
         imu.step_s, imu.force_mps2, imu.rate_radps, imu.force_noise, imu.rate_noise, mean.reshape(2, 3)
     )
-    correction = (state.bias - mean) @ J.T  # (n, 9): theta, v, p
-    dR_each = dR @ exp_rotations(correction[:, :3])
-    dv_each, dp_each = dv + correction[:, 3:6], dp + correction[:, 6:]
-    R, n = state.R, len(state)
-    F = np.tile(np.eye(SIZE), (n, 1, 1))
-    F[:, THETA, THETA] = np.swapaxes(dR_each, 1, 2)
-    F[:, VELOCITY, THETA] = -R @ hats(dv_each)
-    F[:, POSITION, THETA] = -R @ hats(dp_each)
-    F[:, POSITION, VELOCITY] = T * np.eye(3)
-    F[:, THETA, BIASES] = J[:3]
-    F[:, VELOCITY, BIASES] = R @ J[3:6]
-    F[:, POSITION, BIASES] = R @ J[6:]
-    G = np.zeros((n, SIZE, 9))
-    G[:, THETA, :3], G[:, VELOCITY, 3:6], G[:, POSITION, 6:] = np.eye(3), R, R
-    P = F @ state.covariance @ np.swapaxes(F, 1, 2) + G @ C @ np.swapaxes(G, 1, 2)
-    diagonal = np.arange(SIZE)
-    P[:, diagonal[ACCEL_BIAS], diagonal[ACCEL_BIAS]] += ACCEL_WALK**2 * T
-    P[:, diagonal[GYRO_BIAS], diagonal[GYRO_BIAS]] += GYRO_WALK**2 * T
-    return InertialState(
-        R @ dR_each,
-        state.xyz_m + T * state.velocity_mps + 0.5 * T**2 * GRAVITY_MPS2 + np.einsum("nij,nj->ni", R, dp_each),
-        state.velocity_mps + T * GRAVITY_MPS2 + np.einsum("nij,nj->ni", R, dv_each),
-        state.bias,
-        0.5 * (P + np.swapaxes(P, 1, 2)),
+    walk = np.zeros(SIZE)
+    walk[ACCEL_BIAS], walk[GYRO_BIAS] = ACCEL_WALK**2 * T, GYRO_WALK**2 * T
+    moved = predict_states(
+        np.ascontiguousarray(state.R),
+        np.ascontiguousarray(state.xyz_m),
+        np.ascontiguousarray(state.velocity_mps),
+        np.ascontiguousarray(state.bias),
+        np.ascontiguousarray(state.covariance),
+        *(dR, dv, dp, J, C, mean, T, GRAVITY_MPS2, walk),
     )
+    return InertialState(*moved[:3], state.bias, moved[3])
 
 
 FREE_ACCELERATION, FREE_RATE = 2.2, 0.7  # densities without an IMU [m/s^2 / sqrt(Hz)], [rad/s / sqrt(Hz)]
@@ -148,17 +135,21 @@ FREE_MOST_RAD = 0.35  # sigma of each axis that the rotation reaches without an 
 
 
 def predict_free(
-    state: InertialState, seconds: float, dR: Array64 | None = None, dR_noise: float = FREE_RATE
+    state: InertialState, seconds: float, turn: Array64, variance_rad2: float | None
 ) -> InertialState:
-    """The state after a time without an IMU: constant velocity, and a rotation dR (3, 3) or an unknown one."""
-    n, T, turn = len(state), seconds, np.eye(3) if dR is None else dR
+    """The state after a time without an IMU: constant velocity, and a rotation (3, 3) with the variance of each axis.
+
+    variance_rad2 None: the rotation is not measured, `turn` is a guess.
+    """
+    n, T = len(state), seconds
     F = np.tile(np.eye(SIZE), (n, 1, 1))
     F[:, THETA, THETA] = turn.T
     F[:, POSITION, VELOCITY] = T * np.eye(3)
     P = F @ state.covariance @ np.swapaxes(F, 1, 2)
     q, three = FREE_ACCELERATION**2, np.eye(3)
     known = np.trace(P[:, THETA, THETA], axis1=1, axis2=2) < 3 * FREE_MOST_RAD**2
-    P[known, THETA, THETA] += min(dR_noise**2 * T, FREE_MOST_RAD**2) * three
+    variance = min(FREE_RATE**2 * T, FREE_MOST_RAD**2) if variance_rad2 is None else variance_rad2
+    P[known, THETA, THETA] += variance * three
     P[:, VELOCITY, VELOCITY] += q * T * three
     P[:, POSITION, POSITION] += q * T**3 / 3 * three
     P[:, POSITION, VELOCITY] += q * T**2 / 2 * three

@@ -38,6 +38,7 @@ KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the head
 MEMORY_NS = 120_000_000_000
 FIT, MISFIT = 20, 7.0  # newest LiDAR positions, and their mean squared Mahalanobis distance (3 expected) that is no fit
 SAME_DRONE, MAYBE_ANOTHER = 0.9995, 0.9  # probability that a remembered heading holds
+IMAGE_NS = 300_000_000  # without an IMU, the next image of the drone is awaited for
 FREE_NS = 1_000_000_000  # without IMU and vanishing points a yaw is forgotten after
 Measurement = DroneFix | RelativeRotation | VisualMotion
 
@@ -94,15 +95,14 @@ class InertialEstimator:
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement; it is used when the horizon reaches its time."""
+        if isinstance(measurement, VisualMotion):
+            self.imu.add_visual_motion(measurement)
         self._count += 1
         heapq.heappush(self._waiting, (measurement.stamp_ns, self._count, measurement))
 
     def pass_time(self, now_ns: int) -> None:
         """Move the horizon and use the measurements before it."""
-        newest_ns = self.imu.newest_ns
-        horizon_ns = now_ns
-        if newest_ns is not None and self.imu.is_current(now_ns):
-            horizon_ns = min(newest_ns, now_ns - DELAY_NS)
+        horizon_ns = self._horizon_ns(now_ns)
         while self._waiting and self._waiting[0][0] <= horizon_ns:
             _, _, measurement = heapq.heappop(self._waiting)
             if isinstance(measurement, DroneFix):
@@ -114,6 +114,15 @@ class InertialEstimator:
         self._advance(horizon_ns)
         if self.fix_ns is not None and now_ns - self.fix_ns > KEPT_NS:
             self.lose()
+
+    def _horizon_ns(self, now_ns: int) -> int:
+        """Time up to which the drone's own motion is measured."""
+        newest_ns, image_ns = self.imu.newest_ns, self.imu.newest_image_ns
+        if newest_ns is not None and self.imu.is_current(now_ns):
+            return min(newest_ns, now_ns - DELAY_NS)
+        if image_ns is not None and now_ns - image_ns < IMAGE_NS:
+            return min(image_ns, now_ns)
+        return now_ns
 
     # state
 
@@ -223,7 +232,7 @@ class InertialEstimator:
             self.nis, self.fix_ns, self.bias_covariance_m2 = nis, max(stamp_ns, self.fix_ns or stamp_ns), covariance.bias
         self._add_odometry(stamp_ns, z, float(noise[0, 0] + noise[1, 1]) / 2)
         if self.graph.running:
-            self._add_to_graph(max(stamp_ns, self.stamp_ns), z, noise, nis)
+            self._add_to_graph(max(stamp_ns, self.stamp_ns), z, noise, nis, state)
         else:
             self.heading.advance(stamp_ns)
             self._add_vertical(self.heading.stamp_ns)
@@ -239,9 +248,9 @@ class InertialEstimator:
         assert self.heading.bank is not None
         return self.heading.bank.mean()
 
-    def _add_to_graph(self, stamp_ns: int, z: Array64, noise: Array64, nis: float) -> None:
+    def _add_to_graph(self, stamp_ns: int, z: Array64, noise: Array64, nis: float, predicted: InertialState) -> None:
         if nis <= GATE:
-            self.graph.add_position(stamp_ns, z, noise)
+            self.graph.add_position(stamp_ns, z, noise, predicted)
         else:
             self.graph.advance(stamp_ns)
         self._add_vertical(self.graph.stamp_ns)

@@ -251,4 +251,4 @@ def _hypotheses(estimator: InertialEstimator) -> tuple[Array64, Array64, Array64
     weight = weight / weight.sum()
     order = np.argsort(-weight, kind="stable")
     sigma = np.sqrt(bank.state.yaw_variance_rad2)
-    return bank.state.yaw_rad[order], sigma[order], weight[order], estimator.heading.near_probability()
+    return bank.state.yaw_rad[order], sigma[order], weight[order], estimator.heading.near_probability

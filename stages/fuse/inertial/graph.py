@@ -78,19 +78,20 @@ class InertialGraph:
     def advance(self, stamp_ns: int, max_step_ns: int = KEY_NS) -> None:
         """Add keys so that the newest one is less than `max_step_ns` before a time."""
         while self.running and self.stamp_ns + max_step_ns <= stamp_ns:
-            self._extend(self.stamp_ns + max_step_ns)
+            self._extend(self.stamp_ns + max_step_ns, self.at(self.stamp_ns + max_step_ns))
 
-    def add_position(self, stamp_ns: int, xyz_m: Array64, covariance_m2: Array64) -> bool:
-        """Add a LiDAR position, not before the newest key, at a key of its own. False: not usable."""
+    def add_position(self, stamp_ns: int, xyz_m: Array64, covariance_m2: Array64, predicted: InertialState) -> bool:
+        """Add a LiDAR position, not before the newest key, at a key of its own. False: not usable.
+
+        `predicted`: the state at its time.
+        """
         if not (self.running and np.isfinite(xyz_m).all() and is_covariance(covariance_m2)):
             return False
-        self.advance(stamp_ns)
-        noise = _robust(covariance_m2)
-        zero = np.zeros(3)
+        noise, zero = _robust(covariance_m2), np.zeros(3)
         if stamp_ns - self.stamp_ns <= NEWEST_NS:
             self._pending.append(lambda n: gtsam.GPSFactorArm(X(n), xyz_m, zero, noise))
             return self._flush()
-        return self._extend(stamp_ns, lambda n: gtsam.GPSFactorArm(X(n), xyz_m, zero, noise))
+        return self._extend(stamp_ns, predicted, lambda n: gtsam.GPSFactorArm(X(n), xyz_m, zero, noise))
 
     def add_vertical(self, up_drone: Array64, sigma_rad: float) -> None:
         """Add the autopilot's vertical (3,) in drone axes at the newest key."""
@@ -118,9 +119,10 @@ class InertialGraph:
         """The state (one row) propagated to a time."""
         return self._imu.propagate(self.state, np.ones(1), self.stamp_ns, stamp_ns)
 
-    def _extend(self, stamp_ns: int, factor: Callable[[int], Any] | None = None) -> bool:
-        """Add a key at a later time, with a factor of its own; then update."""
-        predicted = self.at(stamp_ns)
+    def _extend(
+        self, stamp_ns: int, predicted: InertialState, factor: Callable[[int], Any] | None = None
+    ) -> bool:
+        """Add a key at a later time, where `predicted` is the state, with a factor of its own; then update."""
         pieces = self._imu.between(self.stamp_ns, stamp_ns)
         if len(pieces) != 1 or not isinstance(pieces[0], ImuIntervals):
             self.start(stamp_ns, predicted)

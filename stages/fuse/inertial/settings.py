@@ -15,7 +15,7 @@ class InertialErrors(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     fix_variance: float = Field(default=0.65, gt=0)  # true variance of a fix over the one that the tracker reports
-    fix_time_s: float = Field(default=0.2, ge=0)  # time constant of the error of a fix
+    fix_time_s: float = Field(default=0.12, ge=0)  # time constant of the error of a fix
     # share of its variance that does not average out (calibration), where the tracker does not report it
     fix_bias_share: float = Field(default=0.25, ge=0, lt=1)
     clock_s: float = Field(default=0.01, ge=0)  # of the stamps of IMU and LiDAR against each other

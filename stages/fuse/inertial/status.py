@@ -45,7 +45,8 @@ def state_of(
         return state, f"heading not known: {undecided_reason(e, now_ns)}{unseen}"
     if unseen:
         return PoseState.COASTING, f"propagated by the IMU{unseen}"
-    source = "vanishing points and IMU" if rotations else "IMU and LiDAR positions"
+    imu = e.imu.is_current(now_ns)
+    source = ("vanishing points and IMU" if imu else "vanishing points") if rotations else "IMU and LiDAR positions"
     return PoseState.FULL, f"heading by {source}"
 
 
@@ -58,4 +59,4 @@ def undecided_reason(estimator: InertialEstimator, now_ns: int) -> str:
         return "the LiDAR positions do not move as the IMU measures"
     if e.decided:
         return "its sigma is beyond the limit"
-    return f"P {e.heading.near_probability():.3f} within 20 deg; manoeuvre"
+    return f"P {e.heading.near_probability:.3f} within 20 deg; manoeuvre"

@@ -73,8 +73,9 @@ class ImuFlight:
             a = 2.0 / 15.0 * t * rng.choice([-1, 1]) + rng.uniform(0, 6.28)
             at[:, 0], at[:, 1] = 15.0 * np.cos(a), 15.0 * np.sin(a)
         elif self.kind == "square":
-            s = (t / 5.0) % 4.0  # a side of 8 m takes 4 s, then a stop of 1 s
-            side, share = s.astype(int), np.clip((s % 1.0) / 0.8, 0, 1)
+            s = (t / 6.0) % 4.0  # a side of 8 m takes 5 s with least jerk, then a stop of 1 s
+            side, u = s.astype(int), np.clip((s % 1.0) * 6.0 / 5.0, 0, 1)
+            share = u**3 * (10 - 15 * u + 6 * u**2)
             corner = np.array([[0, 0], [8, 0], [8, 8], [0, 8], [0, 0]], dtype=float)
             at[:, :2] = corner[side] + (corner[side + 1] - corner[side]) * share[:, None]
             at[:, :2] = at[:, :2] @ rotation_z(rng.uniform(0, 6.28))[:2, :2].T
@@ -95,7 +96,8 @@ class ImuFlight:
         wind = self.wind_mps * np.array([*rng.normal(0, 0.7, 2), 0.0])
         gusts = 0.35 * self.wind_mps * np.repeat(gauss_markov(rng, 1.0, 2.0, 10 * FINE_S, n // 10 + 1), 10, axis=0)[:n]
         gusts[:, 2] *= 0.3
-        p, v, thrust, trim = goal[0].copy(), goal_v[0].copy(), np.array([0.0, 0.0, G]), np.zeros(3)
+        p, v, trim = goal[0].copy(), goal_v[0].copy(), np.zeros(3)
+        turning, thrust = np.array([0.0, 0.0, G]), np.array([0.0, 0.0, G])
         P, V, T, D = (np.zeros((n, 3)) for _ in range(4))
         for i in range(n):
             drag = DRAG * (wind + gusts[i] - v)
@@ -105,7 +107,8 @@ class ImuFlight:
             want = 1.5 * off + 2.2 * (goal_v[i] - v) + trim
             level = math.hypot(want[0], want[1])
             want[:2] *= min(1.0, 5.0 / max(level, 1e-9))
-            thrust = thrust + FINE_S / 0.12 * (want + [0, 0, G] - thrust)
+            turning = turning + FINE_S / 0.08 * (want + [0, 0, G] - turning)
+            thrust = thrust + FINE_S / 0.08 * (turning - thrust)  # attitude follows in two steps
             a = thrust + drag - [0, 0, G]
             p, v = p + FINE_S * v + 0.5 * FINE_S**2 * a, v + FINE_S * a
         yaw = rng.uniform(0, 6.28) + 0.3 * np.sin(2 * math.pi * t / rng.uniform(8, 20)) * (self.kind != "hover")
@@ -199,7 +202,7 @@ class ImuFlight:
         rng = np.random.default_rng([self.seed, 2])
         times = np.arange(0.4, self.until_s, 1 / self.fix_hz)
         times = times + rng.uniform(-0.02, 0.02, len(times))
-        e = gauss_markov(rng, math.sqrt(0.75) * self.fix_sigma_m, 0.15, 1 / self.fix_hz, len(times))
+        e = gauss_markov(rng, math.sqrt(0.75) * self.fix_sigma_m, 0.12, 1 / self.fix_hz, len(times))
         bias = math.sqrt(0.25) * self.fix_sigma_m * rng.standard_normal(3)  # vehicle axes
         for k, t in enumerate(times):
             if any(a <= t < b for a, b in self.gaps_s):

@@ -28,6 +28,7 @@ from links.mavlink.origin import GlobalOrigin, OriginSender
 from links.mavlink.pose_sender import PoseMessage, PoseSender
 from links.mavlink.profiles import PROFILES, ProfileName
 from links.mavlink.readers import AutopilotMessage
+from links.mavlink.streams.message_intervals import MessageIntervals, MessageRates
 from links.mavlink.transport.connection import Udp, parse_connection
 from links.mavlink.transport.signing import Signer
 from links.mavlink.transport.stream_connection import open_connection
@@ -54,6 +55,7 @@ class AutopilotSettings(SourceSettings):
     own_component_id: int = Field(VISUAL_INERTIAL_ODOMETRY, ge=1, le=255)
     signing_key: Path | None = None  # a file of 32 bytes or 64 hexadecimal digits, mode 0600
     global_origin: GlobalOrigin | None = None  # sent to an autopilot without an origin
+    message_rates: MessageRates = MessageRates()  # requested from the autopilot
 
     @property
     def own_id(self) -> tuple[int, int]:
@@ -138,6 +140,7 @@ class Autopilot(Source[AutopilotSettings]):
             settings.own_id,
             PoseSender(settings.send, settings.limits, reset_counter=host_time.now_ns() // 1_000_000_000),
             OriginSender(settings.global_origin, target),
+            MessageIntervals(settings.message_rates, settings.profile, target, settings.own_id),
             self._signer,
             host_time.now_ns,
             (settings.topic, SENT_TOPIC),

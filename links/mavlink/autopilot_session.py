@@ -5,8 +5,9 @@
     poses: gate and PoseSender, then frames, sent immediately or not at all. None are sent to a silent autopilot,
         because a blocked autopilot or bridge would buffer them and use them as current later; none while they would
         arrive late (`timesync_monitor.py`).
-    a thread: HEARTBEAT once per second, TIMESYNC four times per second, texts and the origin, also without poses. A
-        message that finds the send buffer full is repeated at each step, before a pose; it is small.
+    a thread: HEARTBEAT once per second, TIMESYNC four times per second, texts, the origin and requests for messages
+        (`streams/message_intervals.py`), also without poses. A message that finds the send buffer full is repeated at
+        each step, before a pose; it is small.
 
 A reply to our own TIMESYNC is recorded with the time of its request as stamp. By that stamp the decoder distinguishes
 it from foreign replies, also in replay.
@@ -29,6 +30,7 @@ from flow.link import LinkError, Record
 from links.mavlink.gate import RejectReason
 from links.mavlink.origin import OriginSender
 from links.mavlink.pose_sender import PoseSender
+from links.mavlink.streams.message_intervals import MessageIntervals
 from links.mavlink.timesync_monitor import REQUEST_NS, TimesyncMonitor
 from links.mavlink.transport.connection import Connection
 from links.mavlink.transport.framing import FrameSplitter, dialect, header, packed
@@ -55,12 +57,13 @@ class AutopilotSession:
         own: tuple[int, int],
         poses: PoseSender,
         origin: OriginSender,
+        intervals: MessageIntervals,
         signer: Signer | None,
         now_ns: Callable[[], int],
         topics: tuple[str, str],
     ) -> None:
         self.counts: Counter[str] = Counter()
-        self.connection, self.poses, self.origin = connection, poses, origin
+        self.connection, self.poses, self.origin, self.intervals = connection, poses, origin, intervals
         self._target, self._own = target, own
         self._signer, self._now_ns = signer, now_ns
         self._received_topic, self._sent_topic = topics
@@ -126,9 +129,11 @@ class AutopilotSession:
             rejected = {f"pose rejected: {reason.value}": count for reason, count in self.poses.rejected.items()}
             counts = dict(self.counts)
             round_trip_ns = self._timesync.newest_ns
+            intervals = self.intervals.counters
         return {
             **counts,
             **rejected,
+            **intervals,
             "stray bytes": self._splitter.stray_bytes,
             "from other senders": self.connection.foreign,
             "reconnects": self.connection.reconnects,
@@ -149,7 +154,7 @@ class AutopilotSession:
         if self.closed:
             return None
         signing = None if self._signer is None else self._signer.status
-        return self.connection.status or self._silence() or self._timesync.status or signing
+        return self.connection.status or self._silence() or self._timesync.status or signing or self.intervals.status
 
     def _silence(self) -> str | None:
         if self._now_ns() - self._target_ns < SILENT_S * SECOND_NS:
@@ -186,11 +191,13 @@ class AutopilotSession:
                 self.connection.reply_to(source)
                 if self._now_ns() - self._target_ns > SILENT_S * SECOND_NS:
                     self.origin.restart()
+                    self.intervals.restart()
                 if not self._is_reachable(self._now_ns()):
                     self._timesync.reset()
                 self._timesync.on_frame()
                 self._target_ns, self._target_connection = self._now_ns(), self.connection.reconnects
                 self.origin.on_message(message)
+                self.intervals.on_message(message, arrival_ns)
                 if message.get_type() == "TIMESYNC":
                     if message.tc1 == 0:
                         self._send(dialect().MAVLink_timesync_message(self._now_ns(), message.ts1))
@@ -247,6 +254,10 @@ class AutopilotSession:
         for message in self.origin.due(now_ns):
             if not self._send(message):
                 self.origin.on_not_sent()
+        if self._target_connection is not None and self._is_reachable(now_ns):
+            request = self.intervals.due(now_ns)
+            if request is not None and not self._send(request):
+                self.intervals.on_not_sent()
         self._send_texts(now_ns)
 
     def _send_texts(self, now_ns: int) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from flow.link import Record
 from links.clock.device_clock import DeviceClock
 from links.mavlink.readers import READERS, TIMELESS_READERS, AutopilotMessage
+from links.mavlink.streams.imu_stamps import DELAY_NS, ImuSelection, time_since_boot_us
 from links.mavlink.transport.framing import SEQUENCE, header, known, parse_frame, timesync_target
 from stages.messages import AutopilotStatus
 
@@ -34,6 +35,7 @@ class FrameDecoder:
         self._sequence: int | None = None
         self._last_ns: dict[str, int] = {}  # stamp of the newest message per type
         self._late: int | None = None  # an older sequence number, received immediately before
+        self._imu = ImuSelection()
         self._matched = False  # replies to our TIMESYNC are recorded with the request's time as stamp
 
     def decode(self, record: Record) -> AutopilotMessage | None:
@@ -62,7 +64,7 @@ class FrameDecoder:
             self.decoded += 1
             return timeless(frame, record.arrival_ns)
         reader = READERS.get(kind)
-        if reader is None:
+        if reader is None or not self._imu.accepts(kind, record.arrival_ns):
             self.unused += 1
             return None
         stamp_ns = self._stamp(frame, record.arrival_ns)
@@ -80,10 +82,17 @@ class FrameDecoder:
 
     def _stamp(self, frame: Any, arrival_ns: int) -> int | None:
         """Time of the measurement on the host's timeline; None while the device's clock is inconsistent."""
-        in_ms = hasattr(frame, "time_boot_ms")
-        device_ns = frame.time_boot_ms * 1_000_000 if in_ms else frame.time_usec * 1_000
+        in_ms, kind = hasattr(frame, "time_boot_ms"), frame.get_type()
+        device_ns = frame.time_boot_ms * 1_000_000 if in_ms else self._device_ns(kind, frame.time_usec, arrival_ns)
         stamp_ns = self.clock.read(device_ns, arrival_ns)
-        return stamp_ns if stamp_ns is None else min(stamp_ns + HALF_MS_NS * in_ms, arrival_ns)
+        if stamp_ns is None:
+            return None
+        return min(stamp_ns + HALF_MS_NS * in_ms, arrival_ns) - DELAY_NS.get(kind, 0)
+
+    def _device_ns(self, kind: str, time_usec: int, arrival_ns: int) -> int:
+        offset_ns = self.clock.offset_ns
+        expected_us = None if offset_ns is None else (arrival_ns - offset_ns) // 1000
+        return time_since_boot_us(kind, time_usec, expected_us) * 1000
 
     def _in_sequence(self, number: int) -> bool:
         if self._sequence is not None:

@@ -1,7 +1,8 @@
 """Conversion of an autopilot's MAVLink messages to grd's messages, axes and units: one function per message.
 
-RAW_IMU is read in ArduPilot's units (mg, mrad/s), HIGHRES_IMU (PX4) in SI units; an autopilot sends one of them. The
-functions raise ValueError for non-finite values.
+RAW_IMU is read in ArduPilot's units, which are SCALED_IMU's (mg, mrad/s), HIGHRES_IMU (PX4) in SI units; which of them
+is used: `streams/imu_stamps.py`. SCALED_IMU2 and SCALED_IMU3, of other sensors, are not read. The functions raise
+ValueError for non-finite values.
 
 Source: https://mavlink.io/en/messages/common.html; ArduPilot GCS_MAVLINK::send_raw_imu for RAW_IMU's units,
 NavEKF3_core::send_status_report and getVariances for EKF_STATUS_REPORT.
@@ -95,7 +96,7 @@ def read_odometry(frame: Any, stamp_ns: int) -> DroneOdometry:
 
 
 def read_raw_imu(frame: Any, stamp_ns: int) -> DroneImu:
-    """RAW_IMU in ArduPilot's units: mg and mrad/s."""
+    """RAW_IMU in ArduPilot's units, or SCALED_IMU: mg and mrad/s."""
     return DroneImu(
         stamp_ns=stamp_ns,
         acceleration_drone_mps2=_vector(frame, "xacc", "yacc", "zacc", unit=1e-3 * STANDARD_GRAVITY_MPS2),
@@ -150,6 +151,7 @@ READERS: dict[str, Reader] = {
     "LOCAL_POSITION_NED": read_local_position,
     "ODOMETRY": read_odometry,
     "RAW_IMU": read_raw_imu,
+    "SCALED_IMU": read_raw_imu,
     "HIGHRES_IMU": read_highres_imu,
     "ESTIMATOR_STATUS": read_estimator_status,
 }

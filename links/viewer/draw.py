@@ -38,6 +38,7 @@ from stages.messages import (
     DepthImage,
     Detections,
     DroneFix,
+    DroneMotion,
     FollowedFeatures,
     Image,
     LidarFirings,
@@ -76,6 +77,7 @@ draw.register(ServoGoal)(draw_sensors.servo_goal)
 draw.register(SweptPoints)(draw_sensors.swept_points)
 draw.register(SweptPulses)(draw_sensors.swept_pulses)
 draw.register(VehicleMotion)(draw_sensors.vehicle_motion)
+draw.register(DroneMotion)(draw_sensors.drone_motion)
 draw.register(DepthImage)(draw_sensors.depth_image)
 draw.register(ScoreImage)(draw_sensors.score_image)
 draw.register(Candidates)(draw_drone.candidates)

@@ -1,4 +1,4 @@
-"""Draws the sensors' messages: LiDAR firings and points, the servo, vehicle motion, depth and score images.
+"""Draws the sensors' messages: LiDAR firings and points, servo, motion of vehicle and drone, depth and score images.
 
 In the images zero means no data, and isolated pixels are enlarged so that they stay visible.
 
@@ -20,6 +20,7 @@ from links.viewer.message_queue import thin
 from links.viewer.scene import Scene, turntable_transform
 from stages.messages import (
     DepthImage,
+    DroneMotion,
     LidarFirings,
     ScoreImage,
     ServoGoal,
@@ -93,6 +94,20 @@ def vehicle_motion(message: VehicleMotion, name: str, scene: Scene) -> Entities:
     R = message.R_map_vehicle
     yield plot(f"plots/other/{name}/position", message.xyz_map_m, [f"vehicle {axis} [m]" for axis in "xyz"])
     yield plot(f"plots/other/{name}/yaw", [math.degrees(math.atan2(R[1, 0], R[0, 0]))], ["vehicle yaw [deg]"])
+
+
+def drone_motion(message: DroneMotion, name: str, scene: Scene) -> Entities:
+    """Specific force, rate and noise of the drone's IMU, as curves, and the numbers of its segments."""
+    del scene
+    axes, path = "xyz", f"plots/other/{name}"
+    yield plot(f"{path}/force", message.specific_force_drone_mps2, [f"drone force {a} [m/s2]" for a in axes])
+    rate_degps = np.degrees(message.angular_velocity_drone_radps)
+    yield plot(f"{path}/rate", rate_degps, [f"drone rate {a} [deg/s]" for a in axes])
+    noises = [message.specific_force_noise, math.degrees(message.angular_velocity_noise)]
+    yield plot(f"{path}/noise", noises, ["force [m/s2/sqrt(Hz)]", "rate [deg/s/sqrt(Hz)]"])
+    estimate = message.autopilot
+    segments = [message.segment, math.nan if estimate is None else estimate.odom_segment]
+    yield plot(f"{path}/segments", segments, ["IMU segment", "odom segment"])
 
 
 def depth_image(message: DepthImage, name: str, scene: Scene) -> Entities:

@@ -41,7 +41,7 @@ from stages.calibration.solve import (
     sandwich,
 )
 from stages.geometry.frames import Array64, LidarMount
-from stages.messages import LidarFirings, ServoOffset, ServoState, VehicleMotion
+from stages.messages import LidarFirings, MotionStatus, ServoOffset, ServoState, VehicleMotion
 
 TIME = NAMES.index("time")
 STEP_RAD = math.tau / 4096  # of the MX-28's encoder
@@ -101,7 +101,7 @@ class ServoClock(Stage[ServoClockSettings]):
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Buffer the vehicle's position."""
-        if motion.stamp_ns < self._resting_until_ns:
+        if motion.stamp_ns < self._resting_until_ns or motion.status is MotionStatus.DENIED:
             self._places.clear()
         self._places.append(motion.xyz_map_m)
         del self._places[:-MOST_PLACES]

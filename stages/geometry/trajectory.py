@@ -23,7 +23,7 @@ from stages.geometry.extrapolation import EXTRAPOLATION_S, LEAST_SPAN_NS, USUAL_
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation, nearest_rotation, nearly_rotation
 from stages.kernels.geometry.trajectory import STEP_NS, to_map, to_vehicle
-from stages.messages import VehicleMotion
+from stages.messages import MotionStatus, VehicleMotion
 
 KEPT = 512  # poses
 TOGETHER_NS = 10_000_000  # shortest interval that gives a speed
@@ -64,8 +64,12 @@ class VehicleTrajectory:
         A pose that is not newer than the last is ignored. One that is not reachable from the poses before is rejected
         until AGREE of them are consistent: then the start frame has jumped. The new start frame is aligned with the
         trajectory. After a silence that alignment is a guess, because an odometry that restarts unnoticed may begin
-        near the extrapolated pose. Where frames are not joined, a new frame begins, also after each silence.
+        near the extrapolated pose. Where frames are not joined, a new frame begins, also after each silence. A denied
+        pose withdraws the poses after it; the trajectory is extrapolated from it.
         """
+        if motion.status is MotionStatus.DENIED:
+            self._withdraw(motion.stamp_ns)
+            return False
         if not self._poses:
             self._append(motion)
             return not self._joined
@@ -82,6 +86,13 @@ class VehicleTrajectory:
         for pose in poses:
             self._append(pose)
         return displaced
+
+    def _withdraw(self, after_ns: int) -> None:
+        """Remove the poses after a time, except the first."""
+        while len(self._poses) > 1 and self._poses[-1][0] > after_ns:
+            self._poses.pop()
+        self._gate, self._rates = JumpGate(), None
+        self._cache.clear()
 
     def _is_reachable(self, motion: VehicleMotion) -> bool:
         """Whether a pose is reachable from the poses before it."""

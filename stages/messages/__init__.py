@@ -33,6 +33,7 @@ from stages.messages.pose import PositionEstimate as PositionEstimate
 from stages.messages.pose import RelativePose as RelativePose
 from stages.messages.sensors import Image as Image
 from stages.messages.sensors import LidarFirings as LidarFirings
+from stages.messages.sensors import MotionStatus as MotionStatus
 from stages.messages.sensors import ServoGoal as ServoGoal
 from stages.messages.sensors import ServoOffset as ServoOffset
 from stages.messages.sensors import ServoState as ServoState

@@ -1,27 +1,33 @@
-"""Messages from the drone's autopilot: attitude, position, odometry, IMU, status and estimator health."""
+"""Messages from the drone's autopilot: attitude, position, odometry, IMU, status and estimator health.
+
+`independent`: the estimate cannot contain poses that grd sent. An autopilot that fuses them returns them as its own
+position, velocity and yaw; as odometry they would confirm themselves.
+"""
 
 from __future__ import annotations
 
 from flow.message import Mat3, Mat6, Message, Vec3, message
 
 
-@message(schema=51)
+@message(schema=57)
 class DroneAttitude(Message):
     """Attitude of the drone in frame odom: x along the autopilot's north, z up. Its yaw is unrelated to frame map."""
 
     R_odom_drone: Mat3
     angular_velocity_drone_radps: Vec3
+    independent: bool = False  # of poses that grd sent
 
 
-@message(schema=52)
+@message(schema=58)
 class DroneLocalPosition(Message):
     """Position and velocity of the drone in frame odom (see DroneAttitude)."""
 
     xyz_odom_m: Vec3
     velocity_odom_mps: Vec3
+    independent: bool = False  # of poses that grd sent
 
 
-@message(schema=53)
+@message(schema=59)
 class DroneOdometry(Message):
     """The autopilot's full estimate: T_odom_drone and its velocities. Covariances are rotation first, drone axes."""
 
@@ -33,6 +39,7 @@ class DroneOdometry(Message):
     velocity_covariance: Mat6 | None  # [rad/s, m/s]
     reset_counter: int  # changes when the estimate jumps
     quality_percent: int | None  # None: not reported; 0: the estimate has failed
+    independent: bool = False  # of poses that grd sent
 
 
 @message(schema=54)

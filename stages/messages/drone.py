@@ -1,8 +1,7 @@
-"""Messages of drone detection and tracking by the LiDAR. P III.B, III.C."""
+"""Messages of drone detection and tracking by the LiDAR (P III.B, III.C), and of the drone's motion by its IMU."""
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 
 from flow.message import Mat3, Message, PerPointBool, PerPointF64, PerPointI64, Points64, Vec3, message
@@ -86,28 +85,28 @@ class TrackState(Message):
     covariance_m2: Mat3 | None = None  # of the position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@message(schema=35)
 class AutopilotMotion:
-    """The autopilot's own estimate at the end of an interval, present only while it cannot contain our pose."""
+    """The autopilot's own estimate, at hand only while it cannot contain our pose. Frames: see DroneAttitude."""
 
     xyz_odom_m: Vec3
     R_odom_drone: Mat3
     velocity_odom_mps: Vec3
-    odom_segment: int  # a new one after each reset of the autopilot's estimator
+    odom_segment: int  # changes after each reset of the autopilot's estimator: positions of two segments do not compare
 
 
 @message(schema=75)
 class DroneMotion(Message):
-    """Motion of the drone over one IMU interval; stamp_ns is its end.
+    """Measured motion of the drone over one IMU interval, from start_ns to stamp_ns.
 
-    The intervals of one `segment` follow each other without a gap.
+    The intervals of one segment follow each other without a gap. Means are over the interval, in drone axes.
     """
 
     start_ns: int
-    segment: int
-    specific_force_drone_mps2: Vec3  # mean over the interval: +g along z at rest
-    angular_velocity_drone_radps: Vec3  # mean over the interval
-    specific_force_noise: float  # white-noise density [m/s^2/sqrt(Hz)], vibration included
-    angular_velocity_noise: float  # [rad/s/sqrt(Hz)]
-    up_drone: Vec3 | None  # unit vector up by the autopilot's roll and pitch, never its yaw; None: not at hand
-    autopilot: AutopilotMotion | None  # None: not independent of our pose, or not at hand
+    segment: int  # changes after a gap in the IMU's samples and after a restart of the autopilot
+    specific_force_drone_mps2: Vec3  # mean; +g along z at rest
+    angular_velocity_drone_radps: Vec3  # mean
+    specific_force_noise: float  # white-noise density [m/s^2/sqrt(Hz)] per axis, vibration included
+    angular_velocity_noise: float  # white-noise density [rad/s/sqrt(Hz)] per axis, vibration included
+    up_drone: Vec3 | None  # unit vector up, by the autopilot's roll and pitch (never its yaw); None: not at hand
+    autopilot: AutopilotMotion | None  # at stamp_ns; None: not at hand, or not independent of our pose

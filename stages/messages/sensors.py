@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from typing import Annotated
 
 import numpy as np
@@ -72,13 +73,21 @@ class ServoGoal(Message):
     speed_radps: float  # upper limit; the motor may be slower
 
 
-@message(schema=16)
+class MotionStatus(enum.Enum):
+    """Whether a pose of the vehicle may be used."""
+
+    ACCEPTED = 0
+    DENIED = 1  # the source contradicts physics or the LiDAR: its poses after this one are withdrawn
+
+
+@message(schema=18)
 class VehicleMotion(Message):
     """T_map_vehicle by odometry: smooth, drifting."""
 
     xyz_map_m: Vec3
     R_map_vehicle: Mat3
     covariance: Mat6 | None  # rotation [rad] before translation [m]; None: not reported
+    status: MotionStatus = MotionStatus.ACCEPTED
 
 
 @message(schema=17)

@@ -44,6 +44,7 @@ GUIDED = 4  # mode number of ArduCopter
 LOOP_S = 1 / 400  # period of the main loop, within which a sample is sent
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the host
 OWN_TIMESYNC_S = 10.0
+IMU_DELAY_S = 0.0125  # age of RAW_IMU's values at its stamp: links/mavlink/streams/imu_stamps.py
 QUALITY_PERCENT = 100
 INT16 = 32767
 
@@ -205,7 +206,7 @@ class Autopilot:
 
     def _raw_imus(self, time_s: Array64, device_ns: NDArray[np.int64]) -> list[Any]:
         s = self._settings
-        rate, force = self._flight.imu(time_s)
+        rate, force = self._flight.imu(np.maximum(time_s - IMU_DELAY_S, 0.0))
         gyro_bias, force_bias = (
             np.radians(s.gyro_bias_degps) * self._biases[0],
             s.accelerometer_bias_mps2 * self._biases[1],

@@ -1,8 +1,9 @@
 """The simulated autopilot on a UDP socket, in real time: it sends, replies, and uses external poses by its rules.
 
 The messages about its flight come from `links.simulated.autopilot.autopilot.Autopilot`, each sent at its time. Without
-a flight it is on the ground and sends HEARTBEAT alone. It replies to TIMESYNC, PARAM_REQUEST_READ and requests for its
-origin, accepts an origin if it has none, and reports its estimator five times a second according to `rules`.
+a flight it is on the ground and sends HEARTBEAT, and the IMU when it is requested. It replies to TIMESYNC,
+PARAM_REQUEST_READ and requests for its origin and for messages (`requested_intervals.py`), accepts an origin if it has
+none, and reports its estimator five times a second according to `rules`.
 
     with AutopilotSocket(ArduPilotRules(), send_to=("127.0.0.1", port)) as drone:
         drone.wait_for(lambda: drone.rules.results[PoseResult.FUSED] > 10)
@@ -24,8 +25,9 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega
 
 from links.mavlink.transport.framing import FrameSplitter, header, packed, parse_frame
-from links.simulated.autopilot.autopilot import Autopilot
+from links.simulated.autopilot.autopilot import STANDARD_GRAVITY_MPS2, Autopilot
 from links.simulated.autopilot.px4_rules import Px4Rules
+from links.simulated.autopilot.requested_intervals import SET_MESSAGE_INTERVAL, RequestedIntervals
 from links.simulated.autopilot.rules import Rules
 
 mavlink: Any = ardupilotmega
@@ -37,6 +39,7 @@ REPORT_HZ = 5.0
 PX4_TIMESYNC_HZ = 10.0
 REQUEST_MESSAGE, GPS_GLOBAL_ORIGIN, UNSUPPORTED = 512, 49, 3
 REAL32, INT32 = 9, 6  # MAV_PARAM_TYPE
+RAW_IMU, HIGHRES_IMU = 27, 105  # message ids
 MAX_RECEIVED = 10_000  # received messages that are kept
 
 
@@ -66,6 +69,7 @@ class AutopilotSocket:
         self._begin_ns = scenario_ns()
         self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._own = (system_id, component_id)
+        self._intervals = RequestedIntervals()
         self._px4 = isinstance(rules, Px4Rules)
         self._peer = send_to
         self._splitter = FrameSplitter()
@@ -141,6 +145,8 @@ class AutopilotSocket:
             self._send(mavlink.MAVLink_timesync_message(self.device_ns(), message.ts1))
         elif kind == "PARAM_REQUEST_READ" and message.param_id in self.parameters:
             self._send(self._parameter(message.param_id))
+        elif kind == "COMMAND_LONG" and message.command == SET_MESSAGE_INTERVAL:
+            self._send(mavlink.MAVLink_command_ack_message(message.command, self._intervals.on_command(message)))
         elif kind == "COMMAND_LONG":
             is_origin_request = message.command == REQUEST_MESSAGE and message.param1 == GPS_GLOBAL_ORIGIN
             self._send(mavlink.MAVLink_command_ack_message(message.command, 0 if is_origin_request else UNSUPPORTED))
@@ -172,6 +178,8 @@ class AutopilotSocket:
         elif self._due("beat", 1.0):
             beat = (2, 12 if self._px4 else 3, 0, 0, 3, 3)  # quadrotor, autopilot type, standby
             self._send(mavlink.MAVLink_heartbeat_message(*beat))
+        if self._flight is None:
+            self._send_imu_at_rest()
         if self._due("report", REPORT_HZ):
             with self._changed:
                 report = self.rules.report(self.device_ns())
@@ -179,10 +187,21 @@ class AutopilotSocket:
         if self._px4 and self._due("timesync", PX4_TIMESYNC_HZ):
             self._send(mavlink.MAVLink_timesync_message(0, self.device_ns()))
 
+    def _send_imu_at_rest(self) -> None:
+        message_id, now_ns = HIGHRES_IMU if self._px4 else RAW_IMU, self.device_ns()
+        if not (self._intervals.requested(message_id) and self._intervals.passes(message_id, now_ns)):
+            return
+        if self._px4:
+            at_rest = 0.0, 0.0, -STANDARD_GRAVITY_MPS2, *[0.0] * 10, 0b111111
+            self._send(mavlink.MAVLink_highres_imu_message(now_ns // 1000, *at_rest))
+        else:
+            self._send(mavlink.MAVLink_raw_imu_message(now_ns // 1000, 0, 0, -1000, *[0] * 6))
+
     def _forward(self, frame: bytes) -> None:
         """Send a message of the flight with a sequence number of this socket, but no reply to the simulated host."""
         message = parse_frame(frame)
-        if not (message.get_type() == "TIMESYNC" and message.tc1 != 0):
+        is_reply = message.get_type() == "TIMESYNC" and message.tc1 != 0
+        if not is_reply and self._intervals.passes(message.get_msgId(), self.device_ns()):
             self._send(message)
 
     def _due(self, what: str, rate_hz: float) -> bool:

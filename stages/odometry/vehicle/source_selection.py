@@ -3,6 +3,7 @@
     odometry available             its poses are passed on unchanged
     odometry silent                the ego-motion continues from the vehicle's pose; later the odometry again
     odometry rejected              the same, as long as its poses are outliers
+    odometry frozen                the same, until it moves again (impossible_stop.py)
 
 Each source has its own start frame, and a source that returns may have a new one. At every change the new source is
 therefore aligned with the end of the old one:
@@ -11,13 +12,15 @@ therefore aligned with the end of the old one:
 
 with t the first stamp of the new source and T_map_vehicle(t) extrapolated (stages/geometry/extrapolation.py). The same
 happens when the start frame of a source jumps: its poses are rejected until three of them lie on one smooth path. Frame
-map is the start frame of the first source. The output has no jumps; it drifts.
+map is the start frame of the first source. The output has no jumps; it drifts. When the odometry turns out to be
+frozen, the last credible pose is published once more with status DENIED: the poses after it are withdrawn.
 
 Source: ours; P V.B for the camera's motion.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter, deque
 from enum import Enum
 from typing import Any, ClassVar
@@ -30,7 +33,8 @@ from stages.geometry.extrapolation import AcceptedPoses, constant_turn_rate
 from stages.geometry.frames import Array64, transform
 from stages.geometry.se3 import adjoint
 from stages.kernels.geometry.so3 import nearest_rotation
-from stages.messages import VehicleMotion
+from stages.messages import MotionStatus, VehicleMotion
+from stages.odometry.vehicle.impossible_stop import ImpossibleStop
 
 SILENT_S = 0.25  # the odometry is unavailable after this time without an accepted pose
 
@@ -61,6 +65,7 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         self._T_map_source: Array64 = np.eye(4)
         self._at_change: tuple[VehicleMotion, Array64 | None] | None = None  # the source's pose, and P in frame map
         self._rejected: Counter[str] = Counter()
+        self._stop = ImpossibleStop()
 
     @property
     def rejected(self) -> Counter[str]:
@@ -73,8 +78,29 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         return {f"rejected: {why}": count for why, count in self._rejected.items()}
 
     def on_odometry(self, motion: VehicleMotion) -> VehicleMotion | None:
-        """The vehicle's odometry, passed on immediately; None for a rejected pose."""
+        """The vehicle's odometry, passed on immediately; None for a rejected pose. DENIED: it is frozen."""
+        if self._stop.is_frozen_at(motion.xyz_map_m):
+            self._rejected["odometry: frozen"] += 1
+            return None
         return self._select(MotionSource.ODOMETRY, motion)
+
+    def _last_credible_ns(self, accepted: tuple[VehicleMotion, ...]) -> int | None:
+        """Stamp of the last credible pose of the odometry if it has just frozen."""
+        if len(accepted) > 1:
+            self._stop.restart()
+        stamps_ns = [self._stop.add(motion.stamp_ns, motion.xyz_map_m) for motion in accepted]
+        return next((stamp_ns for stamp_ns in stamps_ns if stamp_ns is not None), None)
+
+    def _deny(self, credible_ns: int) -> VehicleMotion | None:
+        """Withdraw the published poses of the odometry after its last credible one; None: all are older."""
+        self._rejected["odometry: frozen"] += 1
+        self._accepted[MotionSource.ODOMETRY] = AcceptedPoses()  # when it moves again, it has a new start frame
+        if self._source is not MotionSource.ODOMETRY:
+            return None
+        self._source = None
+        while len(self._published) > 1 and self._published[-1].stamp_ns > credible_ns:
+            self._published.pop()
+        return dataclasses.replace(self._published[-1], status=MotionStatus.DENIED) if self._published else None
 
     def on_ego(self, motion: VehicleMotion) -> VehicleMotion | None:
         """The camera's ego-motion; None while the odometry is available."""
@@ -94,6 +120,9 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         if not accepted:
             self._rejected[f"{source.value}: not reachable from the poses before"] += 1
             return None
+        credible_ns = self._last_credible_ns(accepted) if source is MotionSource.ODOMETRY else None
+        if credible_ns is not None:
+            return self._deny(credible_ns)
         if self._published and motion.stamp_ns <= self._published[-1].stamp_ns:
             return None
         if source is not self._source or len(accepted) > 1:
@@ -104,6 +133,8 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
 
     def _in_map(self, motion: VehicleMotion) -> VehicleMotion:
         """A pose of the source, in frame map."""
+        if self._at_change is None:
+            return motion
         T = self._T_map_source @ transform(motion.R_map_vehicle, motion.xyz_map_m)
         return VehicleMotion(
             stamp_ns=motion.stamp_ns,

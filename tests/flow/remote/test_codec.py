@@ -257,6 +257,7 @@ def test_every_time_field_of_the_messages_is_known():
         "AutopilotStatus.clock_uncertainty_ns": True,
         "Candidates.seen_ns": False,
         "DepthImage.start_ns": False,
+        "DroneMotion.start_ns": False,
         "Detections.seen_ns": False,
         "Detections.start_ns": False,
         "VisualMotion.from_ns": False,

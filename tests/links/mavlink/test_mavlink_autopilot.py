@@ -144,6 +144,47 @@ def test_both_imus_are_si_in_drone_axes_and_gravity_is_measured_upwards():
         np.testing.assert_allclose(imu.angular_velocity_drone_radps, [0.01, -0.02, -0.03], rtol=1e-6)
 
 
+def imu_frames(sender: Any, at_ms: int) -> tuple[bytes, bytes]:
+    raw = mavlink.MAVLink_raw_imu_message(1000 * at_ms, 0, 0, -1000, 0, 0, 0, 0, 0, 0)
+    scaled = mavlink.MAVLink_scaled_imu_message(at_ms, 0, 0, -1000, 0, 0, 0, 0, 0, 0)
+    return sender.frame(raw), sender.frame(scaled)
+
+
+def test_scaled_imu_is_used_only_while_raw_imu_does_not_arrive():
+    sender, link = Sender(), Autopilot()
+    raw, scaled = imu_frames(sender, 7000)
+    assert isinstance(link.decode(record(raw, 0)), DroneImu)
+    assert link.decode(record(scaled, 1)) is None
+    late = sender.frame(mavlink.MAVLink_scaled_imu_message(9500, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
+    assert isinstance(link.decode(record(late, 2500)), DroneImu)
+    only = Autopilot()
+    assert isinstance(only.decode(record(imu_frames(Sender(), 7000)[1], 0)), DroneImu)
+
+
+def test_the_stamp_of_an_imu_message_is_earlier_by_the_delay_of_its_values():
+    sender, link = Sender(), Autopilot()
+    attitude = link.decode(record(sender.attitude(7000, 0.0, 0.0, 0.0), 0))
+    imu = link.decode(record(imu_frames(sender, 7010)[0], 10))
+    assert isinstance(attitude, DroneAttitude)
+    assert isinstance(imu, DroneImu)
+    assert imu.stamp_ns - attitude.stamp_ns == pytest.approx((10 - 12.5) * MS, abs=0.6 * MS)
+
+
+def test_raw_imu_of_a_32_bit_counter_continues_when_the_counter_starts_again():
+    sender, link = Sender(), Autopilot()
+    wrap_ms = 2**32 // 1000
+    link.decode(record(sender.attitude(wrap_ms - 50, 0.0, 0.0, 0.0), -50))
+    stamps: list[int] = []
+    for i in range(-40, 40, 10):
+        counter_us = ((wrap_ms + i) * 1000) % 2**32
+        frame = sender.frame(mavlink.MAVLink_raw_imu_message(counter_us, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
+        imu = link.decode(record(frame, i))
+        assert isinstance(imu, DroneImu)
+        stamps.append(imu.stamp_ns)
+    np.testing.assert_allclose(np.diff(stamps), 10 * MS, atol=MS)
+    assert link.counters["clock restarts"] == 0
+
+
 @pytest.mark.parametrize(("mode", "state", "armed", "failsafe"), [(128 + 1, 4, True, False), (1, 5, False, True)])
 def test_a_heartbeat_gives_armed_mode_and_failsafe(mode: int, state: int, armed: bool, failsafe: bool):
     status = Autopilot().decode(record(Sender().frame(mavlink.MAVLink_heartbeat_message(2, 3, mode, 5, state, 3))))

@@ -31,7 +31,7 @@ from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.autopilot.px4_rules import Px4Rules
 from links.simulated.autopilot.rules import PoseResult
 from stages.geometry.frames import rotation_z
-from stages.messages import AutopilotEstimator, PoseState, RelativePose
+from stages.messages import AutopilotEstimator, DroneImu, PoseState, RelativePose
 from tests.links.mavlink.mavlink_poses import good_pose
 from tests.links.mavlink.transport.mavlink_bridges import Bridge
 
@@ -270,6 +270,21 @@ def test_no_poses_over_a_bridge_that_forwards_them_late_and_stopping_is_reported
         listener.wait(lambda: listener.link.status is None)
 
 
+@pytest.mark.parametrize(("rules", "profile"), [(ArduPilotRules, "ardupilot"), (Px4Rules, "px4")])
+def test_the_imu_arrives_at_the_requested_rate_and_its_stamps_are_its_samples(rules: type, profile: str):
+    with (
+        listening(profile=profile, message_rates={"imu_hz": 40.0}) as listener,
+        drone_for(listener, rules()) as drone,
+    ):
+        assert drone.port
+        listener.wait(lambda: listener.link.counters.get("IMU rate [Hz]", 0) >= 30)
+        assert listener.link.status is None
+        imu = [(r, m) for r, m in zip(listener.records, listener.messages, strict=False) if isinstance(m, DroneImu)]
+    np.testing.assert_allclose(imu[-1][1].acceleration_drone_mps2, [0, 0, 9.80665], atol=1e-5)
+    delay_ms = 12.5 if profile == "ardupilot" else 2.0
+    assert imu[-1][0].arrival_ns - imu[-1][1].stamp_ns >= 1e6 * delay_ms
+
+
 def test_an_unrequested_timesync_reply_is_ignored_although_it_has_no_target():
     with listening() as listener, drone_for(listener, Px4Rules()) as drone:
         listener.wait(lambda: listener.link.counters["timesync replies"] >= 2)
@@ -291,7 +306,7 @@ def test_an_origin_is_sent_to_an_autopilot_without_one_and_never_over_another():
     with listening(global_origin=origin) as listener, drone_for(listener, ArduPilotRules(), origin=existing) as drone:
         listener.wait(lambda: len(drone.messages("TIMESYNC")) >= 3)  # two seconds later
         assert drone.messages("SET_GPS_GLOBAL_ORIGIN") == []
-        assert len(drone.messages("COMMAND_LONG")) == 1
+        assert [m.command for m in drone.messages("COMMAND_LONG")].count(512) == 1
         assert drone.origin == existing
 
 

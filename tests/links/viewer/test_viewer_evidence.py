@@ -12,7 +12,16 @@ from drawing import document, drawn, numbers, scene, values_of
 
 from links.viewer import colours
 from links.viewer.message_queue import Slicer
-from stages.messages import Candidates, ServoGoal, SweptPulses, TrackingState, TrackState, VehicleMotion
+from stages.messages import (
+    AutopilotMotion,
+    Candidates,
+    DroneMotion,
+    ServoGoal,
+    SweptPulses,
+    TrackingState,
+    TrackState,
+    VehicleMotion,
+)
 
 
 def candidates(stamp_ns: int, **found: tuple[float, str]) -> Candidates:
@@ -326,4 +335,29 @@ def test_the_vehicles_position_is_three_curves_and_its_yaw_one():
     assert values == {
         "plots/other/odometry/vehicle_motion/position": [1.0, 2.0, 0.5],
         "plots/other/odometry/vehicle_motion/yaw": [pytest.approx(90.0)],
+    }
+
+
+def test_the_drones_motion_is_curves_of_force_rate_noise_and_segments():
+    estimate = AutopilotMotion(
+        xyz_odom_m=np.zeros(3), R_odom_drone=np.eye(3), velocity_odom_mps=np.zeros(3), odom_segment=4
+    )
+    motion = DroneMotion(
+        stamp_ns=20,
+        start_ns=0,
+        segment=2,
+        specific_force_drone_mps2=np.array([1.0, 2.0, 9.8]),
+        angular_velocity_drone_radps=np.radians([10.0, 20.0, 30.0]),
+        specific_force_noise=0.07,
+        angular_velocity_noise=np.radians(0.1),
+        up_drone=None,
+        autopilot=estimate,
+    )
+    values = {path: entity.values.tolist() for path, entity in drawn(motion, "drone_motion/drone_motion").items()}
+    path = "plots/other/drone_motion/drone_motion"
+    assert values == {
+        f"{path}/force": [1.0, 2.0, 9.8],
+        f"{path}/rate": pytest.approx([10.0, 20.0, 30.0]),
+        f"{path}/noise": pytest.approx([0.07, 0.1]),
+        f"{path}/segments": [2, 4],
     }

@@ -13,7 +13,8 @@ from pydantic import ValidationError
 from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.geometry.frames import rotation_z, transform
-from stages.messages import VehicleMotion
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.messages import MotionStatus, VehicleMotion
 from stages.odometry.vehicle import VehicleMotionSelector
 
 S = 1_000_000_000
@@ -210,3 +211,40 @@ def test_its_ports_are_the_two_sources_and_one_motion():
     assert set(output_ports(VehicleMotionSelector)) == {"vehicle_motion"}
     with pytest.raises(ValidationError):
         VehicleMotionSelector(silent_s=0.0)
+
+
+def frozen_at(time_s, frozen_s):
+    """The pose of the bend at a time, repeated from `frozen_s` on."""
+    return dataclasses.replace(pose(min(time_s, frozen_s)), stamp_ns=round(time_s * S))
+
+
+def test_a_frozen_odometry_is_denied_and_its_repeated_poses_are_withdrawn():
+    selector = VehicleMotionSelector()
+    out = published(selector, odometry=[frozen_at(t, 2.0) for t in seconds(0, 6, 0.02)])
+    assert [m.status for m in out].count(MotionStatus.DENIED) == 1
+    denied = out[-1]
+    assert denied.status is MotionStatus.DENIED
+    assert denied.stamp_ns <= 2.04 * S, "the last credible pose"
+    assert out[-2].stamp_ns <= 2.2 * S, "nothing after the detection"
+    assert selector.counters["rejected: odometry: frozen"] > 180
+    trajectory = VehicleTrajectory()
+    for motion in out:
+        trajectory.add(motion)
+    assert np.linalg.norm(trajectory.at(round(2.3 * S))[1] - at(2.3)[:3, 3]) < 0.2, "extrapolated with its speed"
+    assert not trajectory.known_at(round(2.8 * S))
+
+
+def test_a_frozen_odometry_is_replaced_by_the_ego_motion_and_used_again_when_it_moves():
+    odometry = [frozen_at(t, 2.0) if t < 4 else pose(t) for t in seconds(0, 8, 0.02)]
+    out = published(VehicleMotionSelector(), odometry=odometry, ego=[pose(t, OTHER_START) for t in seconds(0, 8, 0.2)])
+    accepted = [m for m in out if m.status is MotionStatus.ACCEPTED]
+    assert sum(2.3 * S < m.stamp_ns < 4 * S for m in accepted) >= 7, "ego-motion"
+    assert sum(m.stamp_ns > 5 * S for m in accepted) >= 140, "odometry"
+    for motion in accepted:
+        if not 2 * S < motion.stamp_ns < 2.2 * S:
+            assert off(motion, np.eye(4))[0] < 0.3
+
+
+def test_a_frozen_ego_motion_or_parked_vehicle_is_not_denied():
+    still = [frozen_at(t, 0.0) for t in seconds(0, 20, 0.02)]
+    assert all(m.status is MotionStatus.ACCEPTED for m in published(VehicleMotionSelector(), odometry=still))

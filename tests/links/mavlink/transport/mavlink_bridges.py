@@ -16,6 +16,7 @@ from links.mavlink.autopilot_session import AutopilotSession
 from links.mavlink.gate import PoseLimits
 from links.mavlink.origin import OriginSender
 from links.mavlink.pose_sender import PoseSender
+from links.mavlink.streams.message_intervals import MessageIntervals, MessageRates
 from links.mavlink.transport.connection import Address, Connection
 from links.mavlink.transport.framing import packed, parse_frame
 from links.mavlink.transport.stream_connection import StreamConnection
@@ -121,6 +122,9 @@ class RatedBridge:
     def close(self) -> None: ...
 
 
+NO_REQUESTS = MessageRates(imu_hz=0, attitude_hz=0, position_hz=0, estimator_hz=0)
+
+
 class SlowFlight:
     """A session over a slow line to an autopilot with ten frames/s that replies to TIMESYNC, on a simulated clock."""
 
@@ -145,6 +149,7 @@ class SlowFlight:
             (1, 197),
             pose_sender,
             OriginSender(None, (1, 1)),
+            MessageIntervals(NO_REQUESTS, "ardupilot", (1, 1), (1, 197)),
             None,
             lambda: self.now_ns,
             ("/autopilot/rx", "/autopilot/tx"),

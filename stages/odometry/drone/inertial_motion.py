@@ -1,0 +1,116 @@
+"""Motion of the drone over each interval between two IMU samples, with the noise of the samples.
+
+The one stage that reads the drone's motion from its autopilot: gaps, restarts and resets are resolved here, everybody
+else reads its DroneMotion. The mean over an interval is that of its two samples (trapezoid). A gap, and a clock that
+was set back, end a segment. Specific force, rate and the vertical are the drone's own measurements; the autopilot's
+position, velocity and yaw are added only while they cannot contain a pose that grd sent (`independent`).
+
+With a sample noise s, the noise density of an interval of dt is s sqrt(dt): integrated over many intervals, each sample
+counts once with dt, so that the variance of the velocity grows by s^2 dt per second.
+
+Source: ours; P V.B, V.E. Initial noise: ArduPilot EK3_ACC_P_NSE 0.35 m/s^2 and EK3_GYRO_P_NSE 0.015 rad/s; least noise:
+MPU-6000 product specification 3.4, 6.1 and 6.2 (400 ug/sqrt(Hz), 0.005 deg/s/sqrt(Hz)).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from flow.stage import Settings, Stage
+from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneMotion, DroneOdometry
+from stages.odometry.drone.autopilot_estimate import AutopilotEstimate
+from stages.odometry.drone.imu_noise import SampleNoise
+
+CLOCK_SET_NS = 1_000_000_000  # a stamp that is earlier by more: the clock was set; by less: late or repeated
+
+
+class InertialMotionSettings(Settings):
+    """Settings of `InertialMotion`."""
+
+    longest_gap_s: float = Field(0.25, gt=0, le=1)  # between two samples of a segment; 10 Hz with one sample lost
+    noise_window_s: float = Field(0.22, gt=0, le=2)  # of the local fit
+    noise_average_s: float = Field(2.0, gt=0, le=60)
+    initial_force_mps2: float = Field(0.35, gt=0)  # noise of a sample, until it is estimated
+    initial_rate_radps: float = Field(0.015, gt=0)
+    least_force_noise: float = Field(0.004, gt=0)  # density [m/s^2/sqrt(Hz)]
+    least_rate_noise: float = Field(9e-5, gt=0)  # density [rad/s/sqrt(Hz)]
+    autopilot_age_s: float = Field(0.25, gt=0, le=2)  # longest propagation of the autopilot's attitude and position
+
+
+class InertialMotion(Stage[InertialMotionSettings]):
+    """One DroneMotion per IMU interval. The autopilot's estimates are optional."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude", "position", "odometry"})
+
+    def __init__(self, settings: InertialMotionSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        self._autopilot = AutopilotEstimate(self.settings.autopilot_age_s)
+        self._noise = SampleNoise(self.settings.noise_window_s, self.settings.noise_average_s)
+        self._last: DroneImu | None = None
+        self._segment = 0
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Samples that were not used, segments and resets."""
+        return dict(self._counts) | {"segments": self._segment + 1, "autopilot resets": self._autopilot.segment}
+
+    def on_attitude(self, attitude: DroneAttitude) -> None:
+        """Attitude of the autopilot: roll and pitch always, its yaw only while it is independent."""
+        self._autopilot.on_attitude(attitude)
+
+    def on_position(self, position: DroneLocalPosition) -> None:
+        """Position and velocity of the autopilot."""
+        self._autopilot.on_position(position)
+
+    def on_odometry(self, odometry: DroneOdometry) -> None:
+        """Pose and velocity of the autopilot."""
+        self._autopilot.on_odometry(odometry)
+
+    def on_imu(self, imu: DroneImu) -> DroneMotion | None:
+        """The motion since the sample before; None for the first of a segment."""
+        last = self._last
+        if last is None:
+            return self._begin(imu)
+        dt_ns = imu.stamp_ns - last.stamp_ns
+        if -CLOCK_SET_NS < dt_ns <= 0:
+            self._counts["repeated or late samples"] += 1
+            return None
+        if not 0 < dt_ns <= 1e9 * self.settings.longest_gap_s:
+            self._segment += 1
+            return self._begin(imu)
+        force = 0.5 * (last.acceleration_drone_mps2 + imu.acceleration_drone_mps2)
+        rate = 0.5 * (last.angular_velocity_drone_radps + imu.angular_velocity_drone_radps)
+        self._add(imu)
+        self._autopilot.on_imu(force, rate)
+        force_noise, rate_noise = self._noise_densities(dt_ns * 1e-9)
+        return DroneMotion(
+            stamp_ns=imu.stamp_ns,
+            start_ns=last.stamp_ns,
+            segment=self._segment,
+            specific_force_drone_mps2=force,
+            angular_velocity_drone_radps=rate,
+            specific_force_noise=force_noise,
+            angular_velocity_noise=rate_noise,
+            up_drone=self._autopilot.up_drone(imu.stamp_ns),
+            autopilot=self._autopilot.at(imu.stamp_ns),
+        )
+
+    def _begin(self, imu: DroneImu) -> None:
+        self._noise.new_segment()
+        self._add(imu)
+
+    def _add(self, imu: DroneImu) -> None:
+        self._noise.add(imu.stamp_ns, imu.acceleration_drone_mps2, imu.angular_velocity_drone_radps)
+        self._last = imu
+
+    def _noise_densities(self, dt_s: float) -> tuple[float, float]:
+        """White-noise densities of specific force and rate over an interval."""
+        s, root = self.settings, math.sqrt(dt_s)
+        force, rate = self._noise.sigma or (s.initial_force_mps2, s.initial_rate_radps)
+        return max(force * root, s.least_force_noise), max(rate * root, s.least_rate_noise)

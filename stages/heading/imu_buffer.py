@@ -19,6 +19,7 @@ from stages.odometry.drone.trajectory import AutopilotTrajectory, VisualTrajecto
 KEPT = 1024  # intervals: 20 s at 50 Hz
 HELD_NS = 150_000_000  # the newest interval is held so long beyond its end
 HELD_NOISE = 0.3, 0.05  # densities while it is held: specific force [m/s^2 / sqrt(Hz)], rate [rad/s / sqrt(Hz)]
+TURN_CHANGE_RADPS = 0.35  # of the rate after the newest image, without an IMU
 CURRENT_NS = 1_000_000_000  # the IMU is in use for so long after its newest interval
 
 
@@ -98,7 +99,9 @@ class ImuBuffer:
 
     def _bridged(self, state: InertialState, gap: Gap) -> InertialState:
         turn = rotation_between(self._no_autopilot, self._images, gap.from_ns, gap.to_ns)
-        variance = turn.variance_rad2 if turn.measured else None
+        variance, image_ns = turn.variance_rad2 if turn.measured else None, self._images.newest_ns
+        if turn.measured and image_ns is not None and gap.to_ns > image_ns:  # the newest turn is continued
+            variance = ((gap.to_ns - max(gap.from_ns, image_ns)) * 1e-9 * TURN_CHANGE_RADPS) ** 2
         return predict_free(state, (gap.to_ns - gap.from_ns) * 1e-9, turn.R_from_to, variance)
 
 

@@ -37,7 +37,7 @@ STARTS, MOST = 12, 16
 START_TILT_RAD = math.radians(3.0)  # of the autopilot's roll and pitch
 START_YAW_RAD = 0.6 * 2 * math.pi / STARTS
 START_MPS = 4.0  # an unknown velocity, one axis
-START_ACCEL_BIAS, START_GYRO_BIAS = 0.2, 0.01  # [m/s^2], [rad/s] after the autopilot's calibration
+START_ACCEL_BIAS, START_GYRO_BIAS = 0.2, 0.007  # [m/s^2], [rad/s] after calibration at the autopilot's boot
 WIDEST_YAW_RAD = math.radians(22.0)  # a hypothesis with a larger sigma is split
 SPLIT_SHARE, SPLIT_SHIFT, SPLIT_SIGMA = 0.2252, 1.0566, 0.6716
 DROPPED = 1e-8  # a less probable hypothesis is dropped
@@ -51,6 +51,7 @@ class InertialBank:
 
     def __init__(self, state: InertialState, log_weight: Array64) -> None:
         self.state, self.log_weight = state, log_weight - _log_sum(log_weight)
+        self.log_evidence = 0.0  # log density of the newest measurement, outliers included
 
     @property
     def weight(self) -> Array64:
@@ -81,7 +82,8 @@ class InertialBank:
             state.R, state.xyz_m, state.velocity_mps, state.bias, 0.5 * (P + np.swapaxes(P, 1, 2))
         ).moved(beta[:, None] * step)
         log_weight = self.log_weight + log_all
-        self.log_weight = log_weight - _log_sum(log_weight)
+        self.log_evidence = _log_sum(log_weight)
+        self.log_weight = log_weight - self.log_evidence
         return float(self.weight @ beta)
 
     def tidy(self) -> None:

@@ -41,6 +41,7 @@ class InertialHeading:
         self.evidence: YawEvidence | None = None
         self._decisions = 0
         self.near_probability = 0.0  # of a yaw within 20 deg of the best one, at the newest LiDAR position
+        self.position_evidence = 0.0  # log density of the newest LiDAR position
         self._direction_ns = 0
         self.kinds: set[str] = set()  # what has been used since the start
 
@@ -90,6 +91,7 @@ class InertialHeading:
             moved = late_s * (self.bank.weight @ self.bank.state.velocity_mps)
             xyz_m, covariance_m2 = xyz_m + moved, covariance_m2 + (0.5 * LATE_MPS2 * late_s**2) ** 2 * np.eye(3)
         inlier = measure.add_position(self.bank, xyz_m, covariance_m2)
+        self.position_evidence = self.bank.log_evidence
         self.bank.tidy()
         self.near_probability = self.bank.near_probability(self.log_factor())[1]
         self._decisions = self._decisions + 1 if self.near_probability > DECIDED else 0

@@ -29,6 +29,7 @@ from stages.heading.inertial_bank import InertialBank
 from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
 from stages.heading.inertial_state import POSITION, THETA, VELOCITY, InertialState, log_rotations
 from stages.heading.odometry_heading import OdometryHeading
+from stages.heading.ownership import Ownership, log_evidence
 from stages.messages import AutopilotMotion, DroneFix, DroneMotion, RelativeRotation, VisualMotion
 
 DELAY_NS = 100_000_000  # measurements of one time arrive within
@@ -36,8 +37,8 @@ GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
 KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
 MEMORY_NS = 120_000_000_000
-FIT, MISFIT = 20, 7.0  # newest LiDAR positions, and their mean squared Mahalanobis distance (3 expected) that is no fit
 SAME_DRONE, MAYBE_ANOTHER = 0.9995, 0.9  # probability that a remembered heading holds
+VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # beyond its newest pose; longest wait for one
 IMAGE_NS = 300_000_000  # without an IMU, the next image of the drone is awaited for
 FREE_NS = 1_000_000_000  # without IMU and vanishing points a yaw is forgotten after
 Measurement = DroneFix | RelativeRotation | VisualMotion
@@ -59,6 +60,8 @@ class InertialEstimator:
         self.imu = ImuBuffer()
         self.heading = InertialHeading(self.imu)
         self.graph = InertialGraph(self.imu, lag_s)
+        self.ownership = Ownership()
+        self.suspect = False  # what was followed moved otherwise than the IMU measures, and nothing has shown since
         self._odometry = OdometryHeading(math.radians(errors.compass_deg), errors.compass_outliers)
         self._autopilot: deque[tuple[int, AutopilotMotion]] = deque(maxlen=128)
         self._up: deque[tuple[int, Array64]] = deque(maxlen=128)
@@ -78,7 +81,7 @@ class InertialEstimator:
         self._fix_inflation = InformationInflation(self._errors.fix_time_s)
         self._rotation_inflation = InformationInflation(self._errors.rotation_time_s)
         self._rejected, self._rejected_rotations = Rejected(), Rejected()
-        self._fits: deque[float] = deque(maxlen=FIT)
+        self.ownership.restart(self.suspect)
         self._vertical_ns = 0
         self.rotation_ns = None
 
@@ -116,13 +119,17 @@ class InertialEstimator:
             self.lose()
 
     def _horizon_ns(self, now_ns: int) -> int:
-        """Time up to which the drone's own motion is measured."""
+        """Time up to which the motion of the drone and of the vehicle is measured."""
         newest_ns, image_ns = self.imu.newest_ns, self.imu.newest_image_ns
+        horizon_ns = now_ns
         if newest_ns is not None and self.imu.is_current(now_ns):
-            return min(newest_ns, now_ns - DELAY_NS)
-        if image_ns is not None and now_ns - image_ns < IMAGE_NS:
-            return min(image_ns, now_ns)
-        return now_ns
+            horizon_ns = min(newest_ns, now_ns - DELAY_NS)
+        elif image_ns is not None and now_ns - image_ns < IMAGE_NS:
+            horizon_ns = min(image_ns, now_ns)
+        vehicle_ns = self._vehicle.newest_ns if self._vehicle.known_at(now_ns) else None
+        if vehicle_ns is not None:
+            horizon_ns = min(horizon_ns, max(vehicle_ns + VEHICLE_NS, now_ns - WAIT_NS))
+        return horizon_ns
 
     # state
 
@@ -134,12 +141,12 @@ class InertialEstimator:
     @property
     def decided(self) -> bool:
         """Whether the heading is known."""
-        return self.graph.running or (self.heading.decided and self.fits)
+        return self.graph.running or (self.heading.decided and self.is_own)
 
     @property
-    def fits(self) -> bool:
-        """Whether the newest LiDAR positions move as the IMU measures."""
-        return len(self._fits) < 4 or float(np.mean(self._fits)) <= MISFIT
+    def is_own(self) -> bool:
+        """Whether what the LiDAR follows moves as the IMU measures; without an IMU nothing speaks against it."""
+        return self.ownership.certain or not self.imu.is_current(self.stamp_ns)
 
     @property
     def stamp_ns(self) -> int:
@@ -222,7 +229,6 @@ class InertialEstimator:
         z, noise = z + late_s * v, noise + (0.75 * late_s**2) ** 2 * np.eye(3)
         off = z - state.xyz_m[0]
         nis = mahalanobis2(off, state.covariance[0, POSITION, POSITION] + noise)
-        self._fits.append(min(nis, 3.0 * MISFIT))
         if nis > GATE and self._rejected.add(stamp_ns, off, noise):
             self.forget()
             self._find(fix, z, covariance)
@@ -237,7 +243,9 @@ class InertialEstimator:
             self.heading.advance(stamp_ns)
             self._add_vertical(self.heading.stamp_ns)
             self.heading.add_position(self.heading.stamp_ns, z, noise)
-            if self.decided and self.imu.is_current(stamp_ns):
+            assert self.heading.bank is not None
+            self._add_ownership(stamp_ns, z, noise, self.heading.position_evidence)
+            if self.known and self.decided and self.imu.is_current(stamp_ns):
                 self._start_graph()
 
     def _at_horizon(self, stamp_ns: int) -> InertialState:
@@ -254,7 +262,18 @@ class InertialEstimator:
         else:
             self.graph.advance(stamp_ns)
         self._add_vertical(self.graph.stamp_ns)
-        if not self.fits:
+        off = z - predicted.xyz_m[0]
+        self._add_ownership(
+            stamp_ns, z, noise, log_evidence(off, predicted.covariance[0, POSITION, POSITION] + noise)
+        )
+
+    def _add_ownership(self, stamp_ns: int, z: Array64, noise: Array64, evidence: float) -> None:
+        """Whether the object is the drone; the estimate of another one ends, and nothing is published until it is."""
+        self.ownership.add(stamp_ns, z, noise, evidence if self.imu.is_current(stamp_ns) else None)
+        if self.ownership.certain:
+            self.suspect = False
+        if self.ownership.denied if self.graph.running else self.ownership.excluded:
+            self.suspect = True
             self.forget()
 
     def _start_graph(self) -> None:

@@ -64,7 +64,7 @@ class InertialFuseSettings(Settings):
     track_id: int | None = Field(None, ge=1)  # follow this drone; None: the lowest number that is TRACKING
     lag_s: float = Field(2.0, ge=0.5, le=10)
     errors: InertialErrors = InertialErrors()
-    limits: FuseLimits = FuseLimits()
+    limits: FuseLimits = FuseLimits(yaw_sigma_deg=5.0)  # 10 deg are 2 sigma
 
 
 class InertialFuse(Stage[InertialFuseSettings]):

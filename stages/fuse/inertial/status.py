@@ -32,6 +32,8 @@ def state_of(
         if e.newest_fix_ns is None:
             return PoseState.LOST, tracker
         return PoseState.LOST, f"no LiDAR position for {(now_ns - e.newest_fix_ns) * 1e-9:.1f} s; {tracker}"
+    if e.suspect and e.imu.is_current(now_ns):
+        return PoseState.LOST, "what the LiDAR follows does not move as the IMU measures: another drone?"
     age_s = (now_ns - e.fix_ns) * 1e-9
     worst_m = math.sqrt(float(np.linalg.eigvalsh(known.covariance[3:, 3:])[-1]))
     if age_s > limits.lost_after_s:
@@ -55,7 +57,7 @@ def undecided_reason(estimator: InertialEstimator, now_ns: int) -> str:
     e = estimator
     if not e.imu.is_current(now_ns) and e.rotation_ns is None:
         return "no IMU"
-    if not e.fits:
+    if not e.is_own and e.heading.decided:
         return "the LiDAR positions do not move as the IMU measures"
     if e.decided:
         return "its sigma is beyond the limit"

@@ -31,6 +31,7 @@ from tests.stages.fuse.made_drone_flight import START_NS, S, gauss_markov, ns
 FINE_S = 0.005
 G = 9.80665
 DRAG = 0.25  # [1/s] of the velocity through the air
+FIRST_FIX_S = 0.4
 KINDS = ("hover", "orbit", "square", "manoeuvre", "fast")
 
 
@@ -121,6 +122,11 @@ class ImuFlight:
         force = np.einsum("nji,nj->ni", R, T + D)
         self._made = {"t": t, "p": P, "v": V, "R": R, "force": force, "rate": np.vstack([rate, rate[-1:]])}
 
+    @property
+    def first_fix_s(self) -> float:
+        """Time of the first LiDAR position, without its jitter."""
+        return FIRST_FIX_S
+
     def truth(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """R_map_drone, position and velocity in map."""
         m, i = self._made, t / FINE_S
@@ -156,6 +162,7 @@ class ImuFlight:
         accel, gyro = rng.normal(0, 0.12, 3), rng.normal(0, 0.005, 3)
         accel = accel + np.cumsum(0.003 * math.sqrt(T) * rng.standard_normal((len(times), 3)), axis=0)
         gyro = gyro + np.cumsum(1e-4 * math.sqrt(T) * rng.standard_normal((len(times), 3)), axis=0)
+        self._made["bias"] = np.hstack([accel, gyro])  # one row a sample of the IMU
         tilt = gauss_markov(rng, math.radians(2.0) / math.sqrt(2), 15.0, T, len(times), 2)
         off_s = rng.normal(0, self.stamp_s)
         odometry = self._odometry(times, rng) if self.odometry else [None] * len(times)
@@ -200,7 +207,7 @@ class ImuFlight:
 
     def _fixes(self) -> Iterator[tuple[float, str, Message]]:
         rng = np.random.default_rng([self.seed, 2])
-        times = np.arange(0.4, self.until_s, 1 / self.fix_hz)
+        times = np.arange(FIRST_FIX_S, self.until_s, 1 / self.fix_hz)
         times = times + rng.uniform(-0.02, 0.02, len(times))
         e = gauss_markov(rng, math.sqrt(0.75) * self.fix_sigma_m, 0.12, 1 / self.fix_hz, len(times))
         bias = math.sqrt(0.25) * self.fix_sigma_m * rng.standard_normal(3)  # vehicle axes
@@ -257,7 +264,7 @@ class ImuFlight:
             (a, x, _), (b, y, _) = self.truth(t - 0.1), self.truth(t)
             moved = a.T @ (y - x)
             far = float(np.linalg.norm(moved)) > 0.05
-            direction = exp_rotation(rng.normal(0, 0.05, 3)) @ moved / np.linalg.norm(moved)
+            direction = exp_rotation(rng.normal(0, 0.05, 3)) @ moved / max(float(np.linalg.norm(moved)), 1e-9)
             if rng.random() < 0.1:
                 direction = rng.normal(0, 1, 3)
                 direction /= np.linalg.norm(direction)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64, rotation_z
 from stages.heading.inertial_state import (
@@ -44,6 +45,7 @@ DROPPED = 1e-8  # a less probable hypothesis is dropped
 ALIKE = 1.0  # squared distance of the yaws over their variances below which two hypotheses may be merged
 ALIKE_RAD = math.radians(3.0)
 NEAR_RAD = math.radians(20.0)
+LEAST_CANDIDATE = 0.05  # a less probable hypothesis is not the best one
 
 
 class InertialBank:
@@ -75,11 +77,11 @@ class InertialBank:
         beta = np.exp(log_in - log_all)
         step = np.einsum("nij,nj->ni", PHt, Sr)
         K = PHt @ inverse
-        P = P - beta[:, None, None] * (K @ np.swapaxes(PHt, 1, 2))
-        P += (beta * (1.0 - beta))[:, None, None] * step[:, :, None] * step[:, None, :]
+        after = P - beta[:, None, None] * (K @ np.swapaxes(PHt, 1, 2))
+        after += (beta * (1.0 - beta))[:, None, None] * step[:, :, None] * step[:, None, :]
         state = self.state
         self.state = InertialState(
-            state.R, state.xyz_m, state.velocity_mps, state.bias, 0.5 * (P + np.swapaxes(P, 1, 2))
+            state.R, state.xyz_m, state.velocity_mps, state.bias, 0.5 * (after + np.swapaxes(after, 1, 2))
         ).moved(beta[:, None] * step)
         log_weight = self.log_weight + log_all
         self.log_evidence = _log_sum(log_weight)
@@ -98,7 +100,7 @@ class InertialBank:
         while self._merge_nearest():
             pass
 
-    def _split(self, wide: Array64) -> None:
+    def _split(self, wide: NDArray[np.intp]) -> None:
         """Replace each of some hypotheses by three along its yaw."""
         state, log_weight = self.state.rows(wide), self.log_weight[wide]
         up = np.zeros((len(wide), SIZE))
@@ -143,7 +145,9 @@ class InertialBank:
         log_weight = self.log_weight if log_factor is None else self.log_weight + log_factor
         weight = np.exp(log_weight - _log_sum(log_weight))
         yaw, sigma = self.state.yaw_rad, np.sqrt(self.state.yaw_variance_rad2)
-        near = [_within(yaw - yaw[i], sigma, NEAR_RAD) @ weight if weight[i] > 0.05 else 0.0 for i in range(len(yaw))]
+        near = np.zeros(len(yaw))
+        for i in np.flatnonzero(weight > LEAST_CANDIDATE):
+            near[i] = _within(yaw - yaw[i], sigma, NEAR_RAD) @ weight
         best = int(np.argmax(near))
         return best, float(near[best])
 
@@ -229,7 +233,9 @@ def _within(off_rad: Array64, sigma_rad: Array64, reach_rad: float) -> Array64:
     """(n,) probability that a normal yaw lies within a reach of another."""
     off = np.abs(np.remainder(off_rad + math.pi, 2 * math.pi) - math.pi)
     s = np.sqrt(2.0) * sigma_rad
-    return np.array([0.5 * (math.erf((reach_rad - o) / k) + math.erf((reach_rad + o) / k)) for o, k in zip(off, s, strict=True)])
+    return np.array(
+        [0.5 * (math.erf((reach_rad - o) / k) + math.erf((reach_rad + o) / k)) for o, k in zip(off, s, strict=True)]
+    )
 
 
 def _log_sum(values: Array64) -> float:

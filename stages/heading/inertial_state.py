@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.kernels.heading.prediction import predict_states
@@ -54,7 +55,7 @@ class InertialState:
     def __len__(self) -> int:
         return len(self.xyz_m)
 
-    def rows(self, index: Array64) -> InertialState:
+    def rows(self, index: NDArray[np.intp]) -> InertialState:
         """The hypotheses of an index array."""
         return InertialState(
             self.R[index], self.xyz_m[index], self.velocity_mps[index], self.bias[index], self.covariance[index]
@@ -134,9 +135,7 @@ FREE_ACCELERATION, FREE_RATE = 2.2, 0.7  # densities without an IMU [m/s^2 / sqr
 FREE_MOST_RAD = 0.35  # sigma of each axis that the rotation reaches without an IMU: then it is not known
 
 
-def predict_free(
-    state: InertialState, seconds: float, turn: Array64, variance_rad2: float | None
-) -> InertialState:
+def predict_free(state: InertialState, seconds: float, turn: Array64, variance_rad2: float | None) -> InertialState:
     """The state after a time without an IMU: constant velocity, and a rotation (3, 3) with the variance of each axis.
 
     variance_rad2 None: the rotation is not measured, `turn` is a guess.
@@ -154,5 +153,6 @@ def predict_free(
     P[:, POSITION, POSITION] += q * T**3 / 3 * three
     P[:, POSITION, VELOCITY] += q * T**2 / 2 * three
     P[:, VELOCITY, POSITION] += q * T**2 / 2 * three
-    P = 0.5 * (P + np.swapaxes(P, 1, 2))
-    return InertialState(state.R @ turn, state.xyz_m + T * state.velocity_mps, state.velocity_mps, state.bias, P)
+    symmetric = 0.5 * (P + np.swapaxes(P, 1, 2))
+    xyz_m = state.xyz_m + T * state.velocity_mps
+    return InertialState(state.R @ turn, xyz_m, state.velocity_mps, state.bias, symmetric)

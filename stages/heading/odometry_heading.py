@@ -2,9 +2,9 @@
 
     z_i = c + Rz(psi) x_i + e_i
 
-z: LiDAR positions (map), x: the autopilot's positions (odom): psi is the yaw of `odom` in `map`, known within metres of
-flight. The body's yaw is psi plus the yaw of R_odom_drone, less the error of the autopilot's compass: its velocity by GPS
-is right while its attitude may be turned. No motion of the odometry alone shows that error, so it stays an
+z: LiDAR positions (map), x: the autopilot's positions (odom): psi is the yaw of `odom` in `map`, known within metres
+of flight. The body's yaw is psi plus the yaw of R_odom_drone, less the error of the autopilot's compass: its velocity
+by GPS is right while its attitude may be turned. No motion of the odometry alone shows that error, so it stays an
 uncertainty however long the drone flies:
 
     p(yaw) = (1 - o) N(yaw; psi + yaw_odom, sigma_psi^2 + sigma_c^2) + o / 2 pi
@@ -88,9 +88,9 @@ class OdometryHeading:
         t = np.array([p[0] - points[0][0] for p in points]) * 1e-9
         z, x = np.array([p[1] for p in points]), np.array([p[3] for p in points])
         variance = np.array([p[2] for p in points]) + FIX_FLOOR_M**2
-        W = np.linalg.inv(np.diag(variance) + DRIFT_MPS**2 * np.outer(t, t))
-        ones = W.sum(axis=1)
-        W = W - np.outer(ones, ones) / ones.sum()
+        inverse = np.linalg.inv(np.diag(variance) + DRIFT_MPS**2 * np.outer(t, t))
+        ones = inverse.sum(axis=1)
+        W = inverse - np.outer(ones, ones) / ones.sum()
         Wx = W @ x
         precision = float((x * Wx).sum())
         if precision * LEAST_M**2 < 1.0 or float(np.ptp(x, axis=0).max()) < LEAST_M:

@@ -31,7 +31,7 @@ class Ownership:
 
     def __init__(self) -> None:
         self._stamp_ns: int | None = None
-        self._x, self._P = np.zeros((2, 6)), np.zeros((2, 6, 6))
+        self._x, self._covariance = np.zeros((2, 6)), np.zeros((2, 6, 6))
         self._weight = np.full(2, 0.5)
         self.log_ratio = START
 
@@ -39,6 +39,11 @@ class Ownership:
     def certain(self) -> bool:
         """Whether the object is the drone, with P > 0.999."""
         return self.log_ratio > CERTAIN
+
+    @property
+    def cleared(self) -> bool:
+        """Whether an object that follows one that was denied is the drone."""
+        return self.log_ratio > 2.0 * CERTAIN
 
     @property
     def denied(self) -> bool:
@@ -60,8 +65,8 @@ class Ownership:
         if self._stamp_ns is None or stamp_ns <= self._stamp_ns:
             if self._stamp_ns is None:
                 self._x[:, :3], self._x[:, 3:] = xyz_m, 0.0
-                self._P[:, :3, :3], self._P[:, 3:, 3:] = covariance_m2, START_MPS**2 * np.eye(3)
-                self._P[:, :3, 3:] = self._P[:, 3:, :3] = 0.0
+                self._covariance[:, :3, :3], self._covariance[:, 3:, 3:] = covariance_m2, START_MPS**2 * np.eye(3)
+                self._covariance[:, :3, 3:] = self._covariance[:, 3:, :3] = 0.0
                 self._stamp_ns = stamp_ns
             return
         self._predict((stamp_ns - self._stamp_ns) * 1e-9)
@@ -75,18 +80,18 @@ class Ownership:
         F[:3, 3:] = dt * np.eye(3)
         unit = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(3))
         self._x = self._x @ F.T
-        self._P = F @ self._P @ F.T + np.square(ACCELERATIONS)[:, None, None] * unit
+        self._covariance = F @ self._covariance @ F.T + np.square(ACCELERATIONS)[:, None, None] * unit
 
     def _update(self, z: Array64, covariance_m2: Array64) -> float:
         """Returns the log density of the position."""
-        S = self._P[:, :3, :3] + covariance_m2
+        S = self._covariance[:, :3, :3] + covariance_m2
         off = z - self._x[:, :3]
-        K = np.swapaxes(np.linalg.solve(S, self._P[:, :3, :]), 1, 2)
+        K = np.swapaxes(np.linalg.solve(S, self._covariance[:, :3, :]), 1, 2)
         log_in = log_position(off, S)
         beta = np.exp(log_in - _with_outliers(log_in)) * (1.0 - POSITION_OUTLIERS)
         step = beta[:, None] * np.einsum("nij,nj->ni", K, off)
         self._x = self._x + step
-        self._P = self._P - beta[:, None, None] * (K @ self._P[:, :3, :])
+        self._covariance = self._covariance - beta[:, None, None] * (K @ self._covariance[:, :3, :])
         likelihood = self._weight * np.exp(_with_outliers(log_in))
         evidence = float(likelihood.sum())
         self._weight = np.maximum(likelihood / evidence, LEAST_SHARE)

@@ -146,6 +146,8 @@ class InertialEstimator:
     @property
     def is_own(self) -> bool:
         """Whether what the LiDAR follows moves as the IMU measures; without an IMU nothing speaks against it."""
+        if self.suspect:
+            return self.ownership.cleared
         return self.ownership.certain or not self.imu.is_current(self.stamp_ns)
 
     @property
@@ -190,10 +192,10 @@ class InertialEstimator:
             self.graph.advance(stamp_ns)
             return
         self.heading.advance(stamp_ns)
-        if not self.imu.is_current(stamp_ns) and self.rotation_ns is not None:
-            if stamp_ns - self.rotation_ns > FREE_NS:
-                self.heading.restart_yaw()
-                self.rotation_ns = None
+        last_ns = stamp_ns if self.rotation_ns is None else self.rotation_ns
+        if not self.imu.is_current(stamp_ns) and stamp_ns - last_ns > FREE_NS:
+            self.heading.restart_yaw()
+            self.rotation_ns = None
 
     def _to_bank(self) -> None:
         """The IMU has ended: go on with the bank, from the graph's state."""
@@ -235,7 +237,11 @@ class InertialEstimator:
             return
         if nis <= GATE:
             self._rejected.clear()
-            self.nis, self.fix_ns, self.bias_covariance_m2 = nis, max(stamp_ns, self.fix_ns or stamp_ns), covariance.bias
+            self.nis, self.fix_ns, self.bias_covariance_m2 = (
+                nis,
+                max(stamp_ns, self.fix_ns or stamp_ns),
+                covariance.bias,
+            )
         self._add_odometry(stamp_ns, z, float(noise[0, 0] + noise[1, 1]) / 2)
         if self.graph.running:
             self._add_to_graph(max(stamp_ns, self.stamp_ns), z, noise, nis, state)
@@ -263,14 +269,12 @@ class InertialEstimator:
             self.graph.advance(stamp_ns)
         self._add_vertical(self.graph.stamp_ns)
         off = z - predicted.xyz_m[0]
-        self._add_ownership(
-            stamp_ns, z, noise, log_evidence(off, predicted.covariance[0, POSITION, POSITION] + noise)
-        )
+        self._add_ownership(stamp_ns, z, noise, log_evidence(off, predicted.covariance[0, POSITION, POSITION] + noise))
 
     def _add_ownership(self, stamp_ns: int, z: Array64, noise: Array64, evidence: float) -> None:
         """Whether the object is the drone; the estimate of another one ends, and nothing is published until it is."""
         self.ownership.add(stamp_ns, z, noise, evidence if self.imu.is_current(stamp_ns) else None)
-        if self.ownership.certain:
+        if self.ownership.cleared:
             self.suspect = False
         if self.ownership.denied if self.graph.running else self.ownership.excluded:
             self.suspect = True
@@ -292,9 +296,7 @@ class InertialEstimator:
         self.heading.start(fix.stamp_ns, z, covariance.white + covariance.bias, velocity, level, memory)
         self.fix_ns, self.bias_covariance_m2 = fix.stamp_ns, covariance.bias
 
-    def _remembered(
-        self, stamp_ns: int, z: Array64, covariance: FixCovariance
-    ) -> tuple[float, float, float] | None:
+    def _remembered(self, stamp_ns: int, z: Array64, covariance: FixCovariance) -> tuple[float, float, float] | None:
         """Yaw known before, propagated by the gyroscope, its sigma and the probability that it holds."""
         if self._memory is None or stamp_ns - self._memory[0] > MEMORY_NS:
             return None

@@ -98,9 +98,9 @@ class InertialFuse(Stage[InertialFuseSettings]):
 
     def on_motion(self, motion: VehicleMotion) -> Poses:
         """Pose of the vehicle in `map`."""
-        if self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle):
-            if self._motions.add_vehicle_motion(motion):
-                self._estimator.forget()
+        valid = self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle)
+        if valid and self._motions.add_vehicle_motion(motion):
+            self._estimator.forget()
         yield from self._publish(motion)
 
     def on_drone_motion(self, motion: DroneMotion) -> Poses:

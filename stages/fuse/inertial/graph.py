@@ -2,8 +2,8 @@
 
     X_k, V_k, B_k     keys at LiDAR positions, and each KEY_NS in a gap without them
     k -- k+1          CombinedImuFactor, its noise as estimated from the IMU's stream
-    X_k               GPSFactorArm: a LiDAR position; AttitudeFactorPose3: roll and pitch; PoseRotationPrior3D: a rotation
-                      by vanishing points, referred to the key by the gyroscope
+    X_k               GPSFactorArm: a LiDAR position; AttitudeFactorPose3: roll and pitch;
+                      PoseRotationPrior3D: a rotation by vanishing points, referred to the key by the gyroscope
     B_k               a prior of the gyroscope's bias, by the turn between two images
     first key         the joint covariance (15, 15) of the bank: JacobianFactor in a LinearContainerFactor
 
@@ -119,9 +119,7 @@ class InertialGraph:
         """The state (one row) propagated to a time."""
         return self._imu.propagate(self.state, np.ones(1), self.stamp_ns, stamp_ns)
 
-    def _extend(
-        self, stamp_ns: int, predicted: InertialState, factor: Callable[[int], Any] | None = None
-    ) -> bool:
+    def _extend(self, stamp_ns: int, predicted: InertialState, factor: Callable[[int], Any] | None = None) -> bool:
         """Add a key at a later time, where `predicted` is the state, with a factor of its own; then update."""
         pieces = self._imu.between(self.stamp_ns, stamp_ns)
         if len(pieces) != 1 or not isinstance(pieces[0], ImuIntervals):

@@ -44,7 +44,12 @@ def predict_states(
     R (n, 3, 3), vectors (n, 3), bias (n, 6), covariance (n, 15, 15); walk (15,): variances that are added.
     """
     n, T = R.shape[0], seconds
-    R_out, xyz_out, v_out, P_out = np.empty_like(R), np.empty_like(xyz_m), np.empty_like(xyz_m), np.empty_like(covariance)
+    R_out, xyz_out, v_out, P_out = (
+        np.empty_like(R),
+        np.empty_like(xyz_m),
+        np.empty_like(xyz_m),
+        np.empty_like(covariance),
+    )
     for k in range(n):
         correction = J @ (bias[k] - mean_bias)
         turn = dR @ exp_rotation(correction[:3])
@@ -65,11 +70,10 @@ def predict_states(
         G[6:9, 3:6] = R_k
         G[3:6, 6:] = R_k
         P = F @ covariance[k].copy() @ F.T + G @ C @ G.T
-        P = 0.5 * (P + P.T)
+        P_out[k] = 0.5 * (P + P.T)
         for i in range(15):
-            P[i, i] += walk[i]
+            P_out[k, i, i] += walk[i]
         R_out[k] = R_k @ turn
         xyz_out[k] = xyz_m[k] + T * velocity_mps[k] + 0.5 * T * T * gravity_mps2 + R_k @ dp_k
         v_out[k] = velocity_mps[k] + T * gravity_mps2 + R_k @ dv_k
-        P_out[k] = P
     return R_out, xyz_out, v_out, P_out

@@ -43,8 +43,8 @@ def preintegrate(
             A[6 + k, 3 + k] = h
             B[k, 3 + k] = -h
         B[3:6, :3], B[6:, :3] = -h * middle, -0.5 * h * h * middle
-        J = A @ J + B
-        C = A @ C @ A.T
+        J[:] = A @ J + B
+        C[:] = A @ C @ A.T
         s, g = force_noise[i] ** 2, rate_noise[i] ** 2
         for k in range(3):
             C[k, k] += g * h

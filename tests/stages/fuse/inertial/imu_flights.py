@@ -30,6 +30,7 @@ from tests.stages.fuse.made_drone_flight import START_NS, S, gauss_markov, ns
 
 FINE_S = 0.005
 G = 9.80665
+LIFT = np.array([0.0, 0.0, G])
 DRAG = 0.25  # [1/s] of the velocity through the air
 FIRST_FIX_S = 0.4
 KINDS = ("hover", "orbit", "square", "manoeuvre", "fast")
@@ -87,7 +88,7 @@ class ImuFlight:
                     w = 2 * math.pi / period
                     at[:, axis] += want / math.sqrt(3.0) / w**2 * np.sin(w * t + rng.uniform(0, 6.28))
             at[:, 2] = 0.8 * np.sin(2 * math.pi * t / 11.0 + rng.uniform(0, 6.28))
-        return at + [*rng.normal(0, 4.0, 2), self.range_m]
+        return at + np.array([*rng.normal(0, 4.0, 2), self.range_m])
 
     def _fly(self) -> None:
         rng, n = self.rng, int(self.until_s / FINE_S) + 400
@@ -108,7 +109,7 @@ class ImuFlight:
             want = 1.5 * off + 2.2 * (goal_v[i] - v) + trim
             level = math.hypot(want[0], want[1])
             want[:2] *= min(1.0, 5.0 / max(level, 1e-9))
-            turning = turning + FINE_S / 0.08 * (want + [0, 0, G] - turning)
+            turning = turning + FINE_S / 0.08 * (want + LIFT - turning)
             thrust = thrust + FINE_S / 0.08 * (turning - thrust)  # attitude follows in two steps
             a = thrust + drag - [0, 0, G]
             p, v = p + FINE_S * v + 0.5 * FINE_S**2 * a, v + FINE_S * a
@@ -202,7 +203,9 @@ class ImuFlight:
             R, _, v = self.truth(t)
             v_odom = north @ (v + drift[k])
             at = at + T * v_odom
-            out.append(AutopilotMotion(xyz_odom_m=at, R_odom_drone=north @ wrong @ R, velocity_odom_mps=v_odom, odom_segment=0))
+            out.append(
+                AutopilotMotion(xyz_odom_m=at, R_odom_drone=north @ wrong @ R, velocity_odom_mps=v_odom, odom_segment=0)
+            )
         return out
 
     def _fixes(self) -> Iterator[tuple[float, str, Message]]:
@@ -230,8 +233,12 @@ class ImuFlight:
                     shift_m=0.0,
                 ),
             )
-            yield t + 0.07, "track", TrackState(
-                stamp_ns=ns(t), state=TrackingState.TRACKING, reason="made", hits=4, frame_s=0.1, track_id=1
+            yield (
+                t + 0.07,
+                "track",
+                TrackState(
+                    stamp_ns=ns(t), state=TrackingState.TRACKING, reason="made", hits=4, frame_s=0.1, track_id=1
+                ),
             )
 
     def _rotations(self) -> Iterator[tuple[float, str, Message]]:

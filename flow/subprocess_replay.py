@@ -24,7 +24,7 @@ from flow.link import LinkError, Record, Source, Tap
 from flow.ports import RemoteError, RunError
 from flow.remote.nodes import PartitionReport, Refusal, RemoteFailure, RemoteOutputs
 from flow.remote.stage_process import RemotePartition, WorkerProcess
-from flow.remote.stage_wire import TIME, Answer, Reply, Request, record_bytes
+from flow.remote.stage_wire import TIME, Answer, AnswerKind, Request, record_bytes
 from flow.replay import Replay, RunReport, gc_frozen, replay
 from flow.taps import Digest
 
@@ -174,14 +174,16 @@ class _Partition:
         self._remote.send(kind, *body)
 
     def outputs(self) -> RemoteOutputs:
-        """What the nodes gave for the next record, or as one finished. RunError: the process has ended."""
+        """Outputs for the next record, or of a node that finished. RunError: the process has ended."""
         answer = self._next()
-        return RemoteOutputs(self._remote.messages(answer), _failure(answer) if answer.kind == Reply.FAILED else None)
+        return RemoteOutputs(
+            self._remote.messages(answer), _failure(answer) if answer.kind == AnswerKind.FAILED else None
+        )
 
     def answer(self) -> Answer:
         """The answer to another request than records. Raises what a node raised."""
         answer = self._next()
-        if answer.kind == Reply.FAILED:
+        if answer.kind == AnswerKind.FAILED:
             failure = _failure(answer)
             raise failure.error from failure.cause
         return answer

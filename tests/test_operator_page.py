@@ -17,7 +17,7 @@ from links.mavlink.gate import RejectReason as GateRejectReason
 from links.recording import Recorder
 from links.recording.writer import CLOSE_TIMEOUT_S
 from links.velodyne.position import Pps
-from links.velodyne.reject_reason import RejectReason
+from links.velodyne.reject_reason import PacketRejectReason
 from stages.messages import BranchState, PoseState, TrackingState
 from tests.links.fault_bounds import BOUNDS, FIRST_POSE_S, FIRST_POSITION_S, KILLED, MAX_RECORDING_LOSS_S, REST_S
 from tests.unit_file import unit_file
@@ -35,7 +35,7 @@ VALUES = {  # table and the values in it
     "state of the rotation by cameras": [state.name for state in BranchState],
     "reason why no pose is sent": [reason.value for reason in GateRejectReason],
     "LiDAR": ["decoded", "lost", "from other senders", *(f"PPS {pps.name.lower()}" for pps in Pps), "PPS locks lost"],
-    "LiDAR, `rejected: ` and the reason": [reason.value for reason in RejectReason],
+    "LiDAR, `rejected: ` and the reason": [reason.value for reason in PacketRejectReason],
     "servo": list(Health._fields),
 }
 TEXTS = {  # source file and its texts

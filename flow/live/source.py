@@ -14,7 +14,7 @@ from time import perf_counter_ns
 
 from flow.link import LinkError, Record, Source
 from flow.live.report import LinkReport
-from flow.live.threads import Feed, Shared, Worker
+from flow.live.threads import Feed, RunThread, Shared
 from flow.message import Message
 from flow.metrics import Latency
 from flow.ports import Output, RunError, decoded, named
@@ -22,7 +22,7 @@ from flow.ports import Output, RunError, decoded, named
 FIRST_PAUSE_S, MAX_PAUSE_S = 0.5, 8.0  # before a link is reopened; it doubles each time
 
 
-class SourceThread(Worker):
+class SourceThread(RunThread):
     """Listens to one source."""
 
     def __init__(self, name: str, source: Source, outputs: dict[type[Message], Output[Feed]], shared: Shared) -> None:

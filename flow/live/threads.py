@@ -65,7 +65,7 @@ class Shared:
                 self.events.report("recording", str(error))
 
 
-class Worker(threading.Thread):
+class RunThread(threading.Thread):
     """A thread of the run; it does not keep the process alive."""
 
     def __init__(self, name: str, shared: Shared) -> None:
@@ -120,7 +120,7 @@ class StageRun:
         self.ended.set()
 
 
-class StageThread(Worker):
+class StageThread(RunThread):
     """Runs one stage, or several that share the thread: consumers before producers."""
 
     def __init__(
@@ -160,7 +160,7 @@ class StageThread(Worker):
             self.shared.stopping.wait(pause_s)
 
 
-class SinkThread(Worker):
+class SinkThread(RunThread):
     """Hands messages to a sink, and what it sent to the recorders."""
 
     def __init__(self, name: str, link: Link, inbox: Inbox, counts: list[EdgeCount], shared: Shared) -> None:
@@ -208,7 +208,7 @@ class SinkThread(Worker):
             self.shared.events.report(self.node, f"'{stage}' is switched off: {reaction}")
 
 
-class TapThread(Worker):
+class TapThread(RunThread):
     """Hands one tap the messages that it wants; those that it is too slow for are dropped and counted."""
 
     def __init__(self, name: str, tap: Tap, inbox: Inbox, outputs: list[str], shared: Shared) -> None:

@@ -35,9 +35,9 @@ from flow.remote.stage_wire import (
     CHUNK_BYTES,
     PORT,
     Answer,
+    AnswerKind,
     DisconnectedError,
     Frames,
-    Reply,
     Request,
     answer_of,
     frame,
@@ -179,7 +179,7 @@ class RemotePartition:
         if not self._started:
             answer = self._next()
             self._started = True
-            self._start_error = answer.head["text"] if answer.kind == Reply.FAILED else ""
+            self._start_error = answer.head["text"] if answer.kind == AnswerKind.FAILED else ""
         if self._start_error:
             raise RemoteError(self._start_error)
 
@@ -242,7 +242,7 @@ class RemoteStage:
         self._partition.send(kind, *body)
         answer = self._partition.answer()
         self.counters = answer.head["counters"][self._name]
-        if answer.kind == Reply.FAILED:
+        if answer.kind == AnswerKind.FAILED:
             cause, text = answer.head["cause"], answer.head["text"]
             raise RemoteError(cause) if cause else RunError(text)
         return [message for _, message in self._partition.messages(answer) if message is not None]

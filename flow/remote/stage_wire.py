@@ -40,7 +40,7 @@ class Request(enum.IntEnum):
     """Empty. Answer: REPORT."""
 
 
-class Reply(enum.IntEnum):
+class AnswerKind(enum.IntEnum):
     """Kinds of answers."""
 
     OUTPUTS = 10

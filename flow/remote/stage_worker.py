@@ -36,10 +36,10 @@ from flow.remote.stage_wire import (
     CHUNK_BYTES,
     PORT,
     TIME,
+    AnswerKind,
     DisconnectedError,
     Encoded,
     Frames,
-    Reply,
     Request,
     answer_frame,
     records_of,
@@ -91,7 +91,7 @@ class Partition:
         if kind == Request.RECORDS:
             for record in records_of(body):
                 runner.feed(record)
-                yield answer_frame(Reply.OUTPUTS, self._collector.take())
+                yield answer_frame(AnswerKind.OUTPUTS, self._collector.take())
         elif kind == Request.MESSAGE:
             (spec,) = self.graph.nodes.values()
             inputs = input_ports(spec.cls)
@@ -99,16 +99,16 @@ class Partition:
             port = list(inputs)[index]
             message = decode(body, {inputs[port].__name__: inputs[port]}, PORT.size)
             runner.deliver(spec.name, port, message, 0)
-            yield answer_frame(Reply.OUTPUTS, self._collector.take(), {"counters": runner.counters()})
+            yield answer_frame(AnswerKind.OUTPUTS, self._collector.take(), {"counters": runner.counters()})
         elif kind == Request.END:
             (runner.report.last_ns,) = TIME.unpack(body)
             refusals = [(refusal.arrival_ns, str(refusal.error)) for refusal in runner.sources_without_data()]
-            yield answer_frame(Reply.REFUSED, head={"refusals": refusals})
+            yield answer_frame(AnswerKind.REFUSED, head={"refusals": refusals})
         elif kind == Request.FINISH:
             next(self._finishing)
-            yield answer_frame(Reply.OUTPUTS, self._collector.take(), {"counters": runner.counters()})
+            yield answer_frame(AnswerKind.OUTPUTS, self._collector.take(), {"counters": runner.counters()})
         elif kind == Request.REPORT:
-            yield answer_frame(Reply.REPORT, head=self._report().to_json())
+            yield answer_frame(AnswerKind.REPORT, head=self._report().to_json())
 
     def _report(self) -> PartitionReport:
         report = self._runner.final_report()
@@ -119,7 +119,7 @@ class Partition:
         """The answer that reports an error, as a frame."""
         node = self._runner.running.partition(".")[0] or next(iter(self.graph.nodes))
         head = {**_described(error), "node": node, "counters": self._runner.counters()}
-        return answer_frame(Reply.FAILED, self._collector.take(), head)
+        return answer_frame(AnswerKind.FAILED, self._collector.take(), head)
 
 
 def _described(error: Exception) -> dict[str, Any]:
@@ -176,13 +176,13 @@ class PartitionThread(threading.Thread):
         try:
             partition = Partition(frames.next()[1])
             gc.freeze()  # modules are no garbage: not searching them saves 4 % of the time
-            yield answer_frame(Reply.OUTPUTS)
+            yield answer_frame(AnswerKind.OUTPUTS)
             while True:
                 yield from partition.answers(*frames.next())
         except DisconnectedError:
             raise
         except Exception as error:  # noqa: BLE001 - the parent raises it
-            yield partition.failed(error) if partition else answer_frame(Reply.FAILED, head=_described(error))
+            yield partition.failed(error) if partition else answer_frame(AnswerKind.FAILED, head=_described(error))
 
     def _read(self) -> None:
         try:

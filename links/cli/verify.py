@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from links.cli.console import EXIT_FAILED, out, progress_bar, report_errors
-from links.runs.output_hashes import Outcome, measure, read_pins, write_pins
+from links.runs.output_hashes import PinResult, measure, read_pins, write_pins
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -36,7 +36,7 @@ def verify(
     """
     folder = REPOSITORY / "recordings"
     pins = read_pins(folder, REPOSITORY / "configs", tuple(recordings or ()))
-    outcomes: list[Outcome] = []
+    outcomes: list[PinResult] = []
     with progress_bar("verify") as step:
         for outcome in measure(pins, jobs or os.cpu_count() or 1):
             outcomes.append(outcome)
@@ -51,7 +51,7 @@ def verify(
         raise typer.Exit(EXIT_FAILED)
 
 
-def _comparison(outcome: Outcome) -> str:
+def _comparison(outcome: PinResult) -> str:
     if outcome.matches:
         return f"{outcome.actual}  same"
     if outcome.pin.expected is None:

@@ -88,7 +88,7 @@ class RequestRejected(BusError):
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class BusReply:
     """One valid reply."""
 
     data: bytes
@@ -174,7 +174,7 @@ class Bus:
         with contextlib.suppress(*_GONE):
             self._port.closePort()
 
-    def read(self, address: int, length: int) -> Reply:
+    def read(self, address: int, length: int) -> BusReply:
         """Read a block of the control table."""
         parameters = address.to_bytes(2, "little") + length.to_bytes(2, "little")
         return self._exchange(f"read {address}..{address + length - 1}", INST_READ, parameters, length)
@@ -206,7 +206,7 @@ class Bus:
         except _GONE as error:
             raise Gone(f"the serial port is gone: {error}") from error
 
-    def _exchange(self, what: str, instruction: int, parameters: bytes, reply_bytes: int) -> Reply:
+    def _exchange(self, what: str, instruction: int, parameters: bytes, reply_bytes: int) -> BusReply:
         packet = [0] * (10 + len(parameters))  # header, id, length, instruction, parameters, CRC; the SDK completes it
         packet[4:8] = self._id, len(parameters) + 3, 0, instruction
         packet[8 : 8 + len(parameters)] = parameters
@@ -221,7 +221,7 @@ class Bus:
             self.resync()
             raise WrongReply(f"{what}: a reply of {length - STATUS_OVERHEAD} bytes, not {reply_bytes}")
         data = bytes(reply[PARAMETERS_AT : PARAMETERS_AT + reply_bytes])
-        return Reply(data, bool(error & mx28.ALERT), request_ns, reply_ns)
+        return BusReply(data, bool(error & mx28.ALERT), request_ns, reply_ns)
 
     def _call(self, method: Any, *arguments: Any) -> Any:
         try:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 
 from links.dynamixel import mx28
-from links.dynamixel.bus import Bus, BusError, NoReply, Reply
+from links.dynamixel.bus import Bus, BusError, BusReply, NoReply
 from links.dynamixel.mx28 import Register
 
 POSITION_BLOCK = mx28.PRESENT_LOAD.address  # load, velocity, position: 126..135
@@ -116,7 +116,7 @@ class Drive:
     def measure(self) -> Measurement:
         """Read the position. Each call requests another length, so that a late reply is not mistaken for this one's."""
         self._reads += 1
-        reply: Reply = self._bus.read(POSITION_BLOCK, POSITION_BYTES + self._reads % LENGTHS)
+        reply: BusReply = self._bus.read(POSITION_BLOCK, POSITION_BYTES + self._reads % LENGTHS)
         return Measurement(
             reply.request_ns,
             reply.reply_ns,

@@ -39,7 +39,7 @@ class ParentGone(Exception):
     """The parent has ended, or closed the socket."""
 
 
-class Worker:
+class ServoWorker:
     """Drives one servo for the process at the other end of `parent_socket`."""
 
     def __init__(self, parent_socket: socket.socket, settings: DriveSettings) -> None:
@@ -311,7 +311,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     with socket.socket(fileno=int(sys.argv[1])) as parent_socket:
         try:
-            Worker(parent_socket, DriveSettings.from_text(sys.argv[2])).run()
+            ServoWorker(parent_socket, DriveSettings.from_text(sys.argv[2])).run()
         except SetupError as error:
             parent_socket.send(wire.pack(wire.fatal(str(error))))
             return 1

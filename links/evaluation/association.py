@@ -39,7 +39,7 @@ class EvaluationLimits:
         return round(self.max_gap_s * 1e9)
 
 
-class Source(Enum):
+class EvaluationInput(Enum):
     """An input of an evaluation that a run may lack."""
 
     TRUTH = auto()
@@ -56,7 +56,7 @@ class DroneTruth:
     path: Trajectory | None = None
     returns_ns: Stamps | None = None  # when a pulse returned from it, rising
     occluded_ns: Stamps | None = None  # (m, 2) begin and end of occlusions, rising
-    missing: dict[Source, str] = field(default_factory=dict)
+    missing: dict[EvaluationInput, str] = field(default_factory=dict)
 
 
 def read_true_drones(folder: Path, truth_file: Path | None) -> tuple[tuple[DroneTruth, ...], bool]:
@@ -78,9 +78,9 @@ def read_true_drones(folder: Path, truth_file: Path | None) -> tuple[tuple[Drone
 
 def _read_drone(folder: Path, number: int, path: Trajectory | None, why_no_path: str) -> DroneTruth:
     missing = {
-        Source.TRUTH: why_no_path,
-        Source.RETURNS: "the recording does not hold which returns came from the drone",
-        Source.VISIBILITY: "the recording does not hold when the drone was occluded",
+        EvaluationInput.TRUTH: why_no_path,
+        EvaluationInput.RETURNS: "the recording does not hold which returns came from the drone",
+        EvaluationInput.VISIBILITY: "the recording does not hold when the drone was occluded",
     }
     returns, visible = (
         folder / results.drone_file(name, number) for name in (results.TRUTH_RETURNS_FILE, results.TRUTH_VISIBLE_FILE)

@@ -16,7 +16,7 @@ from scipy import signal, stats
 from scipy.spatial.transform import Rotation
 
 from links.evaluation.association import EvaluationLimits, bracket, interpolate, newest
-from links.evaluation.run_data import Output, RotationLog, RunData
+from links.evaluation.run_data import RotationLog, RunData, RunTrajectory
 from links.evaluation.text_files import Flags, Stamps, Trajectory
 from stages.geometry.frames import Array64
 
@@ -25,7 +25,7 @@ EULER = ["roll", "pitch", "yaw"]
 Z_95 = float(stats.norm.ppf(0.975))  # two-sided 95 % of the normal distribution
 
 
-def output_errors(output: Output, truth: Trajectory, limits: EvaluationLimits) -> pd.DataFrame:
+def output_errors(output: RunTrajectory, truth: Trajectory, limits: EvaluationLimits) -> pd.DataFrame:
     """Errors of the outputs at their own stamps, one row for each output that truth covers; the index is the output.
 
     Columns: stamp_ns; x, y, z and distance [m] of output - truth in vehicle axes; range [m] and true_x, true_y, true_z
@@ -60,7 +60,9 @@ def output_errors(output: Output, truth: Trajectory, limits: EvaluationLimits) -
     return frame
 
 
-def held_errors(output: Output, truth: Trajectory, span_ns: tuple[int, int], limits: EvaluationLimits) -> pd.DataFrame:
+def held_errors(
+    output: RunTrajectory, truth: Trajectory, span_ns: tuple[int, int], limits: EvaluationLimits
+) -> pd.DataFrame:
     """Errors of the newest output each GRID_NS, one row for each time at which truth is known.
 
     Columns: stamp_ns; range [m] of truth; in_reach; last, the newest output, -1 before the first; distance [m] of it

@@ -13,9 +13,9 @@ from enum import Enum
 import numpy as np
 import pandas as pd
 
-from links.evaluation.association import EvaluationLimits, Source
+from links.evaluation.association import EvaluationInput, EvaluationLimits
 from links.evaluation.errors import GRID_NS, wilson_interval
-from links.evaluation.run_data import Output, RunData
+from links.evaluation.run_data import RunData, RunTrajectory
 from links.evaluation.text_files import Flags, Stamps
 from stages.geometry.frames import Array64
 
@@ -25,7 +25,7 @@ NO_SPAN = "neither the recording's time nor truth is known"
 NO_OUTPUT = "no output at all"
 
 
-class Status(Enum):
+class MetricStatus(Enum):
     """Whether a metric has a value, and why not."""
 
     MEASURED = "measured"
@@ -43,7 +43,7 @@ class Value:
     low: float | None = None  # 95 % confidence interval, or 95 % bounds of a consistent estimator
     high: float | None = None
     note: str = ""
-    status: Status = Status.MEASURED
+    status: MetricStatus = MetricStatus.MEASURED
 
     def __post_init__(self) -> None:
         if self.value is not None and not math.isfinite(self.value):
@@ -52,22 +52,22 @@ class Value:
     @property
     def failed(self) -> bool:
         """The run is to blame for the missing value."""
-        return self.status is Status.FAILED
+        return self.status is MetricStatus.FAILED
 
 
 def failed(reason: str) -> Value:
     """No value, and the run is to blame."""
-    return Value(None, note=reason, status=Status.FAILED)
+    return Value(None, note=reason, status=MetricStatus.FAILED)
 
 
 def not_evaluated(reason: str) -> Value:
     """No value, because it could not be measured."""
-    return Value(None, note=reason, status=Status.NOT_EVALUATED)
+    return Value(None, note=reason, status=MetricStatus.NOT_EVALUATED)
 
 
 def not_applicable(reason: str) -> Value:
     """No value, because there was nothing to measure."""
-    return Value(None, note=reason, status=Status.NOT_APPLICABLE)
+    return Value(None, note=reason, status=MetricStatus.NOT_APPLICABLE)
 
 
 @dataclass
@@ -75,7 +75,7 @@ class Evaluation:
     """One output of one run against truth. `errors` and `held` are None without truth."""
 
     run: RunData
-    output: Output
+    output: RunTrajectory
     limits: EvaluationLimits
     span_ns: tuple[int, int] | None  # evaluated time
     values: dict[str, Value] = field(default_factory=dict)  # by metric, in the order of the catalogue
@@ -127,7 +127,7 @@ class Evaluation:
         """Why there is no error at all: no drone, or no truth."""
         if self.run.no_drone:
             return not_applicable(WITHOUT_DRONE)
-        return not_evaluated(self.run.why_missing(Source.TRUTH) or "no truth")
+        return not_evaluated(self.run.why_missing(EvaluationInput.TRUTH) or "no truth")
 
     def no_error(self) -> Value:
         """Why no output has an error although there is truth."""

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from links.evaluation import pose_metrics, stage_metrics, track_metrics
-from links.evaluation.association import EvaluationLimits, Source
+from links.evaluation.association import EvaluationInput, EvaluationLimits
 from links.evaluation.errors import GRID_NS, held_errors, output_errors, time_span
 from links.evaluation.evaluation import NO_SPAN, Evaluation, Value
 from links.evaluation.pose_metrics import BANDS_M, band_key, band_name
-from links.evaluation.run_data import Output, RunData
+from links.evaluation.run_data import RunData, RunTrajectory
 from links.evaluation.stage_metrics import MODULO_90, PUBLISHED
 
 
@@ -195,7 +195,7 @@ def rank(value: Value | None, better: Better) -> float:
     return math.nan if value is None or value.value is None else value.value
 
 
-def evaluate(run: RunData, output: Output, limits: EvaluationLimits | None = None) -> Evaluation:
+def evaluate(run: RunData, output: RunTrajectory, limits: EvaluationLimits | None = None) -> Evaluation:
     """Evaluate an output of a run: every metric has a value or a reason afterwards."""
     span_ns, source = time_span(run)
     e = Evaluation(run, output, limits or EvaluationLimits(), span_ns)
@@ -242,4 +242,4 @@ def _add_compute_time(e: Evaluation) -> None:
             span_ms = (e.span_ns[1] - e.span_ns[0]) / 1e6
             e.put(f"compute_{stage}_load", 100 * float(times["total"]) / span_ms)
     if not e.run.compute_ms:
-        e.remarks.append(f"compute time per stage not evaluated: {e.run.why_missing(Source.COMPUTE)}")
+        e.remarks.append(f"compute time per stage not evaluated: {e.run.why_missing(EvaluationInput.COMPUTE)}")

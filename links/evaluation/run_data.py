@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from flow.link import LinkError
-from links.evaluation.association import DroneTruth, EvaluationLimits, Source, follow, read_true_drones
+from links.evaluation.association import DroneTruth, EvaluationInput, EvaluationLimits, follow, read_true_drones
 from links.evaluation.text_files import Flags, Rows, Stamps, TextTable, Trajectory, read_stamp_ns, read_tum
 from links.runs import results
 from stages.geometry.frames import Array64, rotations_from_xyzw
@@ -39,7 +39,7 @@ class OutputKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Output:
+class RunTrajectory:
     """A trajectory of a run with the covariance and the marks of each pose."""
 
     kind: OutputKind
@@ -52,7 +52,7 @@ class Output:
     switches: int | None = None  # changes of its tracks to another drone; None: there was one drone
     has_rotation: Flags | None = None  # (n,) the rotation is known; None: the run does not mark that
 
-    def take(self, rows: Rows) -> Output:
+    def take(self, rows: Rows) -> RunTrajectory:
         """The poses of some rows, in that order."""
         names = ("covariance", "sendable", "returns", "track", "has_rotation")
         arrays = {name: None if (a := getattr(self, name)) is None else a[rows] for name in names}
@@ -89,7 +89,7 @@ class RunData:
 
     name: str  # as the user gave it
     recording: str  # runs of one recording are compared with each other
-    outputs: tuple[Output, ...]  # the first is the primary output
+    outputs: tuple[RunTrajectory, ...]  # the first is the primary output
     no_drone: bool  # truth, or the user, states that there was no drone
     drones: tuple[DroneTruth, ...]  # at least one
     drone: int = 1  # number of the selected drone
@@ -98,7 +98,7 @@ class RunData:
     searches: tuple[Search, ...] | None = None
     states: tuple[tuple[int, str, int], ...] = ()  # (since, TrackingState's name, track)
     compute_ms: dict[str, dict[str, float]] = field(default_factory=dict)
-    missing: dict[Source, str] = field(default_factory=dict)
+    missing: dict[EvaluationInput, str] = field(default_factory=dict)
     config: str = ""  # name of the configuration; empty when it is not known
     vehicle: Trajectory | None = None  # truth, T_world_vehicle
     rotations: RotationLog | None = None
@@ -114,7 +114,7 @@ class RunData:
         """T_vehicle_drone of the selected drone."""
         return self.target.path
 
-    def why_missing(self, source: Source) -> str:
+    def why_missing(self, source: EvaluationInput) -> str:
         """Why an input is missing; empty when it is not."""
         return (self.missing | self.target.missing).get(source, "")
 
@@ -140,7 +140,7 @@ def per_drone(run: RunData, limits: EvaluationLimits) -> list[RunData]:
     if len(known) < 2:
         return [run]
     paths = [(path.stamps_ns, path.xyz_m) for _, path in known]
-    parts: list[list[Output]] = [[] for _ in known]
+    parts: list[list[RunTrajectory]] = [[] for _ in known]
     for output in run.outputs:
         poses = output.poses
         tracks = np.ones(len(poses), dtype=np.int64) if output.track is None else output.track
@@ -156,15 +156,15 @@ def per_drone(run: RunData, limits: EvaluationLimits) -> list[RunData]:
 
 def _read_file(path: Path, truth_file: Path | None, no_drone: bool) -> RunData:
     why = f"{path.name} is a TUM file without a run"
-    missing = dict.fromkeys(Source, why) | {Source.TRUTH: "no truth was given (--truth FILE.tum)"}
-    output = Output(OutputKind.FILE, read_tum(path), why_no_covariance=why)
+    missing = dict.fromkeys(EvaluationInput, why) | {EvaluationInput.TRUTH: "no truth was given (--truth FILE.tum)"}
+    output = RunTrajectory(OutputKind.FILE, read_tum(path), why_no_covariance=why)
     truth = None if truth_file is None else read_tum(truth_file)
     return RunData(str(path), path.stem, (output,), no_drone, (DroneTruth(truth),), missing=missing)
 
 
 def _read_folder(folder: Path, truth_file: Path | None, no_drone: bool) -> RunData:
     summary = _read_summary(folder / results.SUMMARY_FILE)
-    outputs: list[Output] = []
+    outputs: list[RunTrajectory] = []
     if (folder / results.POSE_FILE).exists():
         outputs.append(read_output(OutputKind.POSE, folder))
     if (folder / results.FIX_FILE).exists():
@@ -196,8 +196,8 @@ def _read_folder(folder: Path, truth_file: Path | None, no_drone: bool) -> RunDa
         ),
         compute_ms=compute,
         missing={
-            Source.SEARCHES: f"the run has no {results.DETECTIONS_FILE}",
-            Source.COMPUTE: f"{results.SUMMARY_FILE} holds none",
+            EvaluationInput.SEARCHES: f"the run has no {results.DETECTIONS_FILE}",
+            EvaluationInput.COMPUTE: f"{results.SUMMARY_FILE} holds none",
         },
         config=_configuration(folder, recording, summary),
         vehicle=vehicle if vehicle is not None and len(vehicle) else None,
@@ -236,7 +236,7 @@ def _configuration(folder: Path, recording: str, summary: dict[str, Any]) -> str
     return " ".join(["+".join([stem, *overlays]), *sets])
 
 
-def read_output(kind: OutputKind, folder: Path) -> Output:
+def read_output(kind: OutputKind, folder: Path) -> RunTrajectory:
     """Poses with their covariances and marks, in order of time. Fixes of several tracks may share a stamp."""
     if kind is OutputKind.POSE:
         poses_file, covariance_file, upper = results.POSE_FILE, results.POSE_COVARIANCE_FILE, results.POSE_UPPER
@@ -245,7 +245,7 @@ def read_output(kind: OutputKind, folder: Path) -> Output:
         upper = tuple(f"c{name}_m2" for name in results.UPPER)
     if not (folder / covariance_file).exists():
         poses = read_tum(folder / poses_file, may_be_empty=True)
-        return Output(kind, poses, why_no_covariance=f"the run has no {covariance_file}")
+        return RunTrajectory(kind, poses, why_no_covariance=f"the run has no {covariance_file}")
     table = TextTable(folder / covariance_file, ("stamp_s", *upper))
     track = table.whole_numbers("track_id") if "track_id" in table else None
     one_track = track is None or len(np.unique(track)) < 2
@@ -257,8 +257,8 @@ def read_output(kind: OutputKind, folder: Path) -> Output:
     poses, rows = poses.take(order), rows[order]
     if absent := int(np.count_nonzero(rows < 0)):
         why = f"{absent} of {len(rows)} lines of {poses_file} have none in {covariance_file}"
-        return Output(kind, poses, why_no_covariance=why)
-    return Output(
+        return RunTrajectory(kind, poses, why_no_covariance=why)
+    return RunTrajectory(
         kind,
         poses,
         covariance[rows],

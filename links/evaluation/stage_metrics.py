@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from links.evaluation.association import Source
+from links.evaluation.association import EvaluationInput
 from links.evaluation.errors import EULER, GRID_NS, p95, path_length_m, position_at, rms, rotation_errors
 from links.evaluation.evaluation import (
     NO_SPAN,
@@ -41,7 +41,7 @@ def searches(e: Evaluation) -> Value | None:
     """Detection rate, missed searches and false detections."""
     found, truth = e.run.searches, e.run.truth
     if found is None:
-        return not_evaluated(e.run.why_missing(Source.SEARCHES))
+        return not_evaluated(e.run.why_missing(EvaluationInput.SEARCHES))
     if e.duration_s is None:
         return not_evaluated(NO_SPAN)
     if e.run.no_drone:
@@ -74,7 +74,7 @@ def _detection_rates(e: Evaluation, covered: list[tuple[Search, Array64]], at_dr
     else:
         e.put_none(not_evaluated(NO_SEARCH), "detection_rate")
     if e.run.target.returns_ns is None:
-        return not_evaluated(e.run.why_missing(Source.RETURNS))
+        return not_evaluated(e.run.why_missing(EvaluationInput.RETURNS))
     returns = np.diff(np.searchsorted(e.run.target.returns_ns, spans + np.array([0, 1])), axis=1)[:, 0]
     observable = returns >= e.limits.min_returns
     e.put("missed_searches", (observable & ~by_best).sum(), len(returns))

@@ -17,7 +17,7 @@ import pandas as pd
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from links.evaluation.evaluation import Evaluation, Status, Value
+from links.evaluation.evaluation import Evaluation, MetricStatus, Value
 from links.evaluation.metrics import CATALOGUE, Metric, metric_of, rank
 
 NOTHING = "-"
@@ -290,6 +290,6 @@ def not_evaluated_names(e: Evaluation) -> dict[str, list[str]]:
     """Names of the metrics that were not evaluated by their reason. Failures of the run are not among them."""
     reasons: dict[str, list[str]] = {}
     for key, value in e.values.items():
-        if value.status is Status.NOT_EVALUATED:
+        if value.status is MetricStatus.NOT_EVALUATED:
             reasons.setdefault(value.note, []).append(metric_of(key).name)
     return reasons

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from links.evaluation.association import Source
+from links.evaluation.association import EvaluationInput
 from links.evaluation.errors import GRID_NS, rms
 from links.evaluation.evaluation import (
     NO_OUTPUT,
@@ -155,7 +155,7 @@ def track_continuity(e: Evaluation) -> Value | None:
         e.put_none(failed("never accurate, so there was no track to keep"), "track_losses")
     _put_return_gaps(e, accurate_ns, merged(np.concatenate([occluded, out_of_reach])), note)
     if e.run.target.occluded_ns is None:
-        return not_evaluated(e.run.why_missing(Source.VISIBILITY))
+        return not_evaluated(e.run.why_missing(EvaluationInput.VISIBILITY))
     e.reacquisition_s = reacquisition_times_s(accurate_ns, long, out_of_reach, e.span_ns)
     n, missed = len(e.reacquisition_s), sum(map(math.isinf, e.reacquisition_s))
     if not n:
@@ -170,7 +170,7 @@ def _put_return_gaps(e: Evaluation, accurate_ns: Stamps, occluded: Spans, note: 
     returns_ns = e.run.target.returns_ns
     assert e.span_ns is not None
     if returns_ns is None:
-        why = not_evaluated(e.run.why_missing(Source.RETURNS))
+        why = not_evaluated(e.run.why_missing(EvaluationInput.RETURNS))
         e.put_none(why, "longest_return_gap_s", "longest_return_gap_total_s")
         return
     total_s = longest_gap_s(returns_ns, *e.span_ns, NO_SPANS)

@@ -42,7 +42,7 @@ class Pin:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class PinResult:
     """A pin and the output hash of its replay."""
 
     pin: Pin
@@ -89,7 +89,7 @@ def read_pins(folder: Path, configs: Path, only: tuple[str, ...] = ()) -> list[P
     ]
 
 
-def write_pins(folder: Path, outcomes: list[Outcome]) -> None:
+def write_pins(folder: Path, outcomes: list[PinResult]) -> None:
     """Pin the measured hashes; pins of other recordings stay."""
     pinned = _read(folder / HASHES_FILE)
     for outcome in outcomes:
@@ -98,15 +98,15 @@ def write_pins(folder: Path, outcomes: list[Outcome]) -> None:
     (folder / HASHES_FILE).write_text(text + "\n", encoding="utf-8")
 
 
-def measure(pins: list[Pin], jobs: int) -> Iterator[Outcome]:
+def measure(pins: list[Pin], jobs: int) -> Iterator[PinResult]:
     """Replay each pin, `jobs` at a time; outcomes in order of completion. Raises the errors of a replay."""
     if jobs == 1:
-        yield from (Outcome(pin, output_hash(pin.recording, pin.config)) for pin in pins)
+        yield from (PinResult(pin, output_hash(pin.recording, pin.config)) for pin in pins)
         return
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         futures = {pool.submit(output_hash, pin.recording, pin.config): pin for pin in pins}
         for future in as_completed(futures):
-            yield Outcome(futures[future], future.result())
+            yield PinResult(futures[future], future.result())
 
 
 def output_hash(recording: Path, config: Path) -> str:

@@ -24,7 +24,7 @@ from links.velodyne import vlp16
 from links.velodyne.decode import FiringRows, compile_kernels
 from links.velodyne.lidar_clock import ClockMode, LidarClock
 from links.velodyne.position import PpsMonitor
-from links.velodyne.reject_reason import RejectReason, reject_reason, timestamp_us
+from links.velodyne.reject_reason import PacketRejectReason, reject_reason, timestamp_us
 from links.velodyne.udp import Channel, UdpCounters, listen_udp
 from stages.messages import LidarFirings
 
@@ -170,7 +170,7 @@ class PacketStream:
         self.clock = clock
         self.decoded = 0
         self.lost = 0
-        self.rejected: Counter[RejectReason] = Counter()
+        self.rejected: Counter[PacketRejectReason] = Counter()
         self._topic = topic
         self._consecutive_rejected = 0
         self._lost_before = 0
@@ -184,7 +184,7 @@ class PacketStream:
         if reason is not None:
             return self._refuse(reason, data)
         time_or_reason = self.clock.read(timestamp_us(data), record.stamp_ns)
-        if isinstance(time_or_reason, RejectReason):
+        if isinstance(time_or_reason, PacketRejectReason):
             return self._refuse(time_or_reason, data)
         stamp_ns, gap_ns = time_or_reason
         # The previous packet lasted _packet_ns: if this one begins later than its end, packets are missing in between.
@@ -194,7 +194,7 @@ class PacketStream:
         rows = self._rows if follows or not self._rows.packets else FiringRows(self._packets_per_message)
         if not rows.add(data, stamp_ns, lost):
             self._lost_before = lost + 1
-            return self._refuse(RejectReason.AZIMUTH, data)
+            return self._refuse(PacketRejectReason.AZIMUTH, data)
         self.lost += lost
         self._lost_before = 0
         self.decoded += 1
@@ -204,11 +204,11 @@ class PacketStream:
             return rows.take()
         return previous.take() if rows is not previous else None
 
-    def _refuse(self, reason: RejectReason, data: bytes) -> None:
+    def _refuse(self, reason: PacketRejectReason, data: bytes) -> None:
         self.rejected[reason] += 1
         self._consecutive_rejected += 1
         stuck = self._consecutive_rejected % MAX_CONSECUTIVE_REJECTED == 0
-        if reason is RejectReason.MODEL and (self.decoded == 0 or stuck):
+        if reason is PacketRejectReason.MODEL and (self.decoded == 0 or stuck):
             model = vlp16.other_model(data)
             if model is not None:
                 raise LinkError(

@@ -21,7 +21,7 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 from links.velodyne import vlp16
-from links.velodyne.reject_reason import RejectReason
+from links.velodyne.reject_reason import PacketRejectReason
 
 ClockMode = Literal["free", "utc"]
 
@@ -52,11 +52,11 @@ class LidarClock:
         self.disagreements = 0
         """How often device and host differed by more than the limit; in mode `free` each resets the offset."""
 
-    def read(self, device_us: int, host_ns: int) -> PacketTime | RejectReason:
+    def read(self, device_us: int, host_ns: int) -> PacketTime | PacketRejectReason:
         """Time of a packet from its device time [us of the hour] and its host stamp [ns], or why it is rejected."""
         return self._read(device_us, host_ns)
 
-    def _read_free(self, device_us: int, host_ns: int) -> PacketTime | RejectReason:
+    def _read_free(self, device_us: int, host_ns: int) -> PacketTime | PacketRejectReason:
         if self._last_us is None:
             return self._anchor(device_us, host_ns)
         step_us = _wrap(device_us - self._last_us, vlp16.HOUR_US)
@@ -66,7 +66,7 @@ class LidarClock:
             self.disagreements += 1
             return self._anchor(device_us, host_ns)
         if step_us <= 0:
-            return RejectReason.ORDER
+            return PacketRejectReason.ORDER
         if device_ns >= self._half_ends_ns:
             gap = device_ns >= self._half_ends_ns + HALF_WINDOW_NS
             self._previous_min_ns = offset_ns if gap else self._min_ns
@@ -85,14 +85,14 @@ class LidarClock:
         self._half_ends_ns = HALF_WINDOW_NS
         return PacketTime(host_ns, 0)
 
-    def _read_utc(self, device_us: int, host_ns: int) -> PacketTime | RejectReason:
+    def _read_utc(self, device_us: int, host_ns: int) -> PacketTime | PacketRejectReason:
         early_ns = _wrap(1_000 * device_us - host_ns, 1_000 * vlp16.HOUR_US)
         if abs(early_ns) > self._limit_ns:
             self.disagreements += 1
-            return RejectReason.CLOCK
+            return PacketRejectReason.CLOCK
         step_us = 0 if self._last_us is None else _wrap(device_us - self._last_us, vlp16.HOUR_US)
         if self._last_us is not None and -REORDER_US <= step_us <= 0:
-            return RejectReason.ORDER
+            return PacketRejectReason.ORDER
         self._last_us = device_us
         return PacketTime(host_ns if abs(early_ns) <= RESOLUTION_NS else host_ns + early_ns, 1_000 * max(step_us, 0))
 

@@ -9,7 +9,7 @@ from links.velodyne import vlp16
 _FLAG_LOW, _FLAG_HIGH = (vlp16.BLOCK_FLAG[k : k + 1] * vlp16.BLOCKS for k in (0, 1))
 
 
-class RejectReason(enum.Enum):
+class PacketRejectReason(enum.Enum):
     """Reason to ignore a packet; the value is the text in counters and errors."""
 
     LENGTH = "not 1206 bytes long"
@@ -28,15 +28,15 @@ def timestamp_us(data: bytes) -> int:
     return int.from_bytes(data[vlp16.TIMESTAMP_AT : vlp16.TIMESTAMP_AT + 4], "little")
 
 
-def reject_reason(data: bytes) -> RejectReason | None:
+def reject_reason(data: bytes) -> PacketRejectReason | None:
     """Why a payload is not a VLP-16 data packet, by length, factory bytes, flags and time; None: it is one."""
     if len(data) != vlp16.PACKET_BYTES:
-        return RejectReason.POSITION if len(data) == vlp16.POSITION_BYTES else RejectReason.LENGTH
+        return PacketRejectReason.POSITION if len(data) == vlp16.POSITION_BYTES else PacketRejectReason.LENGTH
     if data[vlp16.PRODUCT_ID_AT] != vlp16.PRODUCT_ID:
-        return RejectReason.MODEL
+        return PacketRejectReason.MODEL
     if not vlp16.STRONGEST <= data[vlp16.RETURN_MODE_AT] <= vlp16.DUAL:
-        return RejectReason.RETURN_MODE
+        return PacketRejectReason.RETURN_MODE
     blocks_end, block_bytes = vlp16.TIMESTAMP_AT, vlp16.BLOCK_BYTES
     if data[0:blocks_end:block_bytes] != _FLAG_LOW or data[1:blocks_end:block_bytes] != _FLAG_HIGH:
-        return RejectReason.FLAG
-    return RejectReason.TIMESTAMP if timestamp_us(data) >= vlp16.HOUR_US else None
+        return PacketRejectReason.FLAG
+    return PacketRejectReason.TIMESTAMP if timestamp_us(data) >= vlp16.HOUR_US else None

@@ -31,7 +31,7 @@ from flow.message import Message
 from links.viewer import colours, draw_cameras, draw_drone, draw_pose, draw_sensors
 from links.viewer.entities import Entities, Entity, log_entry, plot, state_change
 from links.viewer.message_queue import thin
-from links.viewer.scene import Scene
+from links.viewer.scene import ViewerScene
 from stages.messages import (
     AutopilotEstimator,
     Candidates,
@@ -58,7 +58,7 @@ from stages.messages import (
 
 
 @singledispatch
-def draw(message: Any, name: str, scene: Scene) -> Entities:
+def draw(message: Any, name: str, scene: ViewerScene) -> Entities:
     """Entities of a message of output `name` ("track/drone_fix"). This body draws the remaining types."""
     for field in dataclasses.fields(message):
         if field.name != "stamp_ns":
@@ -66,7 +66,7 @@ def draw(message: Any, name: str, scene: Scene) -> Entities:
 
 
 @draw.register
-def event(message: EventMessage, name: str, scene: Scene) -> Entities:
+def event(message: EventMessage, name: str, scene: ViewerScene) -> Entities:
     """A status event of the run, with the text of the terminal."""
     yield log_entry(f"{name}/{message.node}", message.text, "INFO" if message.resolved else "WARN")
 
@@ -94,7 +94,7 @@ draw.register(AutopilotEstimator)(draw_pose.autopilot_estimator)
 draw.register(ServoOffset)(draw_pose.servo_offset)
 
 
-def _draw_field(value: Any, name: str, scene: Scene) -> Entities:
+def _draw_field(value: Any, name: str, scene: ViewerScene) -> Entities:
     if isinstance(value, Message) or dataclasses.is_dataclass(value):
         yield from draw.registry[object](value, name, scene)
     elif isinstance(value, enum.Enum):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from links.viewer import colours
 from links.viewer.entities import Entities, Entity, log_entry, plot, stage_of, state_change, state_path, strip_batch
 from links.viewer.lenses import arcs, pixels_of, strips
-from links.viewer.scene import LoggedImage, Scene, sphere_frame
+from links.viewer.scene import LoggedImage, ViewerScene, sphere_frame
 from stages.geometry.frames import Array64
 from stages.messages import FollowedFeatures, Image, VanishingDirections
 
@@ -27,7 +27,7 @@ JPEG_QUALITY = 75
 LINE_POINTS = 0.8
 
 
-def image(message: Image, name: str, scene: Scene) -> Entities:
+def image(message: Image, name: str, scene: ViewerScene) -> Entities:
     """The image, scaled down; a live run logs only some of them."""
     del name  # the entity path is that of the camera, for every link
     if not scene.image_is_due(message.frame_id, message.stamp_ns):
@@ -42,7 +42,7 @@ def image(message: Image, name: str, scene: Scene) -> Entities:
     yield Entity(f"camera/{message.frame_id}/image", encoded)
 
 
-def vanishing_directions(message: VanishingDirections, name: str, scene: Scene) -> Entities:
+def vanishing_directions(message: VanishingDirections, name: str, scene: ViewerScene) -> Entities:
     """Lines in the colour of their direction, on the sphere and on the image; without directions the reason."""
     by_direction = direction_colours(message)
     by_line = np.append(by_direction, np.uint32(colours.UNASSIGNED))[message.line_direction]  # -1 selects the last
@@ -65,7 +65,7 @@ def vanishing_directions(message: VanishingDirections, name: str, scene: Scene) 
     yield from _on_image(message, name, points, arc, by_line, by_direction, scene)
 
 
-def followed_features(message: FollowedFeatures, name: str, scene: Scene) -> Entities:
+def followed_features(message: FollowedFeatures, name: str, scene: ViewerScene) -> Entities:
     """Each feature as a line from its previous to its current pixel: green for inliers, red for others."""
     inliers = int(np.count_nonzero(message.agrees))
     yield plot(f"plots/other/{name}/features", [len(message.agrees), inliers], ["tracked features", "inliers"])
@@ -128,7 +128,7 @@ def _on_image(
     arc: NDArray[np.int64],
     by_line: NDArray[np.uint32],
     by_direction: NDArray[np.uint32],
-    scene: Scene,
+    scene: ViewerScene,
 ) -> Entities:
     frame_id = f"camera_{message.camera_mount.value}"
     logged = scene.images.get(frame_id)

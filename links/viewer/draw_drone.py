@@ -24,7 +24,7 @@ from links.viewer.entities import (
     state_change,
     state_path,
 )
-from links.viewer.scene import DRONE_FRAME, Scene, drone_transform
+from links.viewer.scene import DRONE_FRAME, ViewerScene, drone_transform
 from stages.geometry.frames import Array64
 from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState
 
@@ -39,7 +39,7 @@ PREDICTED_COLOURS = {
 }
 
 
-def candidates(message: Candidates, name: str, scene: Scene) -> Entities:
+def candidates(message: Candidates, name: str, scene: ViewerScene) -> Entities:
     """Points coloured by probability, the reasons for each candidate, and a log entry for each removed candidate."""
     for number, last in scene.removed_candidates(name, message):
         unseen_s = (message.stamp_ns - last.seen_ns) * 1e-9
@@ -66,7 +66,7 @@ def candidates(message: Candidates, name: str, scene: Scene) -> Entities:
     yield scene.reasons(1, f"{stage_of(name)}, now", rows or ["no candidate"])
 
 
-def detections(message: Detections, name: str, scene: Scene) -> Entities:
+def detections(message: Detections, name: str, scene: ViewerScene) -> Entities:
     """Accepted and rejected candidates of a search, with reasons: in 3D, in the depth image and as text."""
     numbers = np.arange(1, len(message.score) + 1) if message.candidate_id is None else message.candidate_id
     confidence = [f"e = {e:.1f}" for e in message.score]
@@ -101,7 +101,7 @@ def detections(message: Detections, name: str, scene: Scene) -> Entities:
     yield scene.reasons(2, f"{stage_of(name)}, last search", [message.summary, *rows])
 
 
-def drone_fix(message: DroneFix, name: str, scene: Scene) -> Entities:
+def drone_fix(message: DroneFix, name: str, scene: ViewerScene) -> Entities:
     """One drone: position with 95 % ellipsoid, trail, height above the vehicle, curves."""
     xyz_m, path = message.xyz_vehicle_m, _drone_path(name, message.track_id)
     scene.fixes[name, message.track_id] = message
@@ -134,7 +134,7 @@ def drone_fix(message: DroneFix, name: str, scene: Scene) -> Entities:
     yield scene.status(3, f"{stage_of(name)}, drone {message.track_id}", text)
 
 
-def track_state(message: TrackState, name: str, scene: Scene) -> Entities:
+def track_state(message: TrackState, name: str, scene: ViewerScene) -> Entities:
     """State of the tracker per drone, with reason, and the predicted position; its ellipsoid grows while coasting."""
     number = message.track_id
     prefix = f"drone {number}: " if number else ""
@@ -159,7 +159,7 @@ def track_state(message: TrackState, name: str, scene: Scene) -> Entities:
     yield scene.status(4, topic, prefix + text if lost else text)
 
 
-def _predicted(message: TrackState, path: str, scene: Scene) -> Entities:
+def _predicted(message: TrackState, path: str, scene: ViewerScene) -> Entities:
     """95 % ellipsoids and arrows of one second of motion: of one drone, or of all recent unnumbered hypotheses."""
     shown = [message] if message.track_id else scene.hypotheses(path, message)
     colour = PREDICTED_COLOURS.get(message.state, colours.NEUTRAL)
@@ -184,7 +184,7 @@ def _predicted(message: TrackState, path: str, scene: Scene) -> Entities:
             yield plot(f"plots/sigma/{path}", [sigma_m], names, style, dots=False)
 
 
-def _clear_lost_drone(message: TrackState, name: str, scene: Scene) -> Entities:
+def _clear_lost_drone(message: TrackState, name: str, scene: ViewerScene) -> Entities:
     """Clear all entities of a lost drone but its trail."""
     path = _drone_path(name, message.track_id)
     yield clear(f"vehicle/{path}")
@@ -197,7 +197,9 @@ def _clear_lost_drone(message: TrackState, name: str, scene: Scene) -> Entities:
             yield clear(cleared)
 
 
-def _rings(scene: Scene, path: str, xyz_m: Array64, labels: list[str], colour: int, *, show_labels: bool) -> Entity:
+def _rings(
+    scene: ViewerScene, path: str, xyz_m: Array64, labels: list[str], colour: int, *, show_labels: bool
+) -> Entity:
     assert scene.depth is not None
     pixels, inside = project_to_depth_image(scene.depth, xyz_m)
     rings = rr.Ellipses2D(

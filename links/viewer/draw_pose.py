@@ -24,7 +24,7 @@ from links.viewer.entities import (
     state_change,
     state_path,
 )
-from links.viewer.scene import DRONE_FRAME, Scene, drone_sphere, sphere_frame
+from links.viewer.scene import DRONE_FRAME, ViewerScene, drone_sphere, sphere_frame
 from stages.geometry.frames import Array64
 from stages.messages import (
     AutopilotEstimator,
@@ -54,7 +54,7 @@ MOTION_COLOURS = np.array([colours.DRONE, colours.NEUTRAL], dtype=np.uint32)
 AMBIGUOUS_AXES = (colours.AXES & np.uint32(0xFFFFFF00)) | np.uint32(0x60)
 
 
-def relative_pose(message: RelativePose, name: str, scene: Scene) -> Entities:
+def relative_pose(message: RelativePose, name: str, scene: ViewerScene) -> Entities:
     """Axes and 95 % ellipsoid of the pose, curves of its components and sigmas, its state as lane, log and text."""
     state = message.state.name
     yield from state_change(state_path(name), state, scene)
@@ -105,7 +105,7 @@ def position_covariance_vehicle_m2(estimate: PositionEstimate | PoseEstimate) ->
     return estimate.covariance_vehicle_m2
 
 
-def relative_rotation(message: RelativeRotation, name: str, scene: Scene) -> Entities:
+def relative_rotation(message: RelativeRotation, name: str, scene: ViewerScene) -> Entities:
     """Yaw branch probabilities, state, branch switches, angles with sigmas; the drone's axes at its fix."""
     state = message.state.name
     probability = message.branch_probability
@@ -140,7 +140,7 @@ def relative_rotation(message: RelativeRotation, name: str, scene: Scene) -> Ent
     yield scene.status(7, stage_of(name), f"{text}; {message.reason}" if message.reason else text)
 
 
-def visual_motion(message: VisualMotion, name: str, scene: Scene) -> Entities:
+def visual_motion(message: VisualMotion, name: str, scene: ViewerScene) -> Entities:
     """Number of inlier features, sigmas of rotation and direction of travel; the direction on the drone's sphere."""
     yield plot(f"plots/matches/{name}", [message.matches], ["inlier features"], MATCHES_COLOUR)
     rotation_deg = math.degrees(math.sqrt(float(np.linalg.eigvalsh(message.covariance_rad2)[-1])))
@@ -160,7 +160,7 @@ def visual_motion(message: VisualMotion, name: str, scene: Scene) -> Entities:
     yield scene.status(8, stage_of(name), f"{text}; {message.reason}" if message.reason else text)
 
 
-def autopilot_estimator(message: AutopilotEstimator, name: str, scene: Scene) -> Entities:
+def autopilot_estimator(message: AutopilotEstimator, name: str, scene: ViewerScene) -> Entities:
     """What the drone's EKF reports that it fuses, and its test ratios; a ratio above 1 is a rejected measurement."""
     good = {
         "attitude": message.attitude_good,
@@ -180,7 +180,7 @@ def autopilot_estimator(message: AutopilotEstimator, name: str, scene: Scene) ->
     yield scene.status(9, f"{stage_of(name)}, EKF", text)
 
 
-def servo_offset(message: ServoOffset, name: str, scene: Scene) -> Entities:
+def servo_offset(message: ServoOffset, name: str, scene: ViewerScene) -> Entities:
     """The estimated time offset of the servo's stamps against the LiDAR's, and the value in the rig file."""
     if message.offset_s is None or message.sigma_s is None:
         yield scene.status(9, stage_of(name), message.reason)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from links.viewer import colours
 from links.viewer.entities import Entities, Entity, plot, stage_of, state_change, state_path
 from links.viewer.message_queue import thin
-from links.viewer.scene import Scene, turntable_transform
+from links.viewer.scene import ViewerScene, turntable_transform
 from stages.messages import (
     DepthImage,
     DroneMotion,
@@ -40,7 +40,7 @@ ELEVATION_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, 
 ROW_OF_LASER = (15 - ELEVATION_DEG) // 2  # top row: the highest beam
 
 
-def lidar_firings(message: LidarFirings, name: str, scene: Scene) -> Entities:
+def lidar_firings(message: LidarFirings, name: str, scene: ViewerScene) -> Entities:
     """The range image and the number of lost packets.
 
     The image is a tensor, because a tensor view stretches 16 rows to a readable height.
@@ -51,7 +51,7 @@ def lidar_firings(message: LidarFirings, name: str, scene: Scene) -> Entities:
     yield from state_change(state_path(name), "packets lost" if message.lost_packets else "ok", scene)
 
 
-def servo_state(message: ServoState, name: str, scene: Scene) -> Entities:
+def servo_state(message: ServoState, name: str, scene: ViewerScene) -> Entities:
     """Servo angle, goal and error; the orientation of the turntable."""
     angles_deg = np.rad2deg([message.position_rad, message.goal_rad])
     yield plot(f"plots/servo/{name}", angles_deg, ["servo position", "servo goal"], SERVO_COLOURS, dots=False)
@@ -61,7 +61,7 @@ def servo_state(message: ServoState, name: str, scene: Scene) -> Entities:
         yield Entity("frames/turntable", turntable_transform(scene.mount, message.position_rad))
 
 
-def servo_goal(message: ServoGoal, name: str, scene: Scene) -> Entities:
+def servo_goal(message: ServoGoal, name: str, scene: ViewerScene) -> Entities:
     """The angle and speed that a stage requests of the servo."""
     del scene
     angle_deg = [math.degrees(message.position_rad)]
@@ -69,7 +69,7 @@ def servo_goal(message: ServoGoal, name: str, scene: Scene) -> Entities:
     yield plot(f"plots/other/{name}/speed", [math.degrees(message.speed_radps)], ["requested [deg/s]"])
 
 
-def swept_points(message: SweptPoints, name: str, scene: Scene) -> Entities:
+def swept_points(message: SweptPoints, name: str, scene: ViewerScene) -> Entities:
     """One slice of the cloud. The slices reuse `history_s / slice_s` entity paths, so the last `history_s` is shown."""
     xyz_m = message.xyz_vehicle_m[thin(message.xyz_vehicle_m, scene.max_points)]
     index = message.stamp_ns // scene.slice_ns % scene.slices
@@ -78,7 +78,7 @@ def swept_points(message: SweptPoints, name: str, scene: Scene) -> Entities:
     yield plot(f"plots/other/{name}", [message.pulses, len(message.xyz_vehicle_m)], ["pulses", "returns"])
 
 
-def swept_pulses(message: SweptPulses, name: str, scene: Scene) -> Entities:
+def swept_pulses(message: SweptPulses, name: str, scene: ViewerScene) -> Entities:
     """The number of pulses and the share without a return; points and range image show their geometry."""
     del scene
     count = message.range_m.size
@@ -88,7 +88,7 @@ def swept_pulses(message: SweptPulses, name: str, scene: Scene) -> Entities:
         yield plot(f"plots/other/{name}/empty", [empty], ["pulses without return [%]"])
 
 
-def vehicle_motion(message: VehicleMotion, name: str, scene: Scene) -> Entities:
+def vehicle_motion(message: VehicleMotion, name: str, scene: ViewerScene) -> Entities:
     """Position and yaw of the vehicle in the map frame, as curves."""
     del scene
     R = message.R_map_vehicle
@@ -96,7 +96,7 @@ def vehicle_motion(message: VehicleMotion, name: str, scene: Scene) -> Entities:
     yield plot(f"plots/other/{name}/yaw", [math.degrees(math.atan2(R[1, 0], R[0, 0]))], ["vehicle yaw [deg]"])
 
 
-def drone_motion(message: DroneMotion, name: str, scene: Scene) -> Entities:
+def drone_motion(message: DroneMotion, name: str, scene: ViewerScene) -> Entities:
     """Specific force, rate and noise of the drone's IMU, as curves, and the numbers of its segments."""
     del scene
     axes, path = "xyz", f"plots/other/{name}"
@@ -110,7 +110,7 @@ def drone_motion(message: DroneMotion, name: str, scene: Scene) -> Entities:
     yield plot(f"{path}/segments", segments, ["IMU segment", "odom segment"])
 
 
-def depth_image(message: DepthImage, name: str, scene: Scene) -> Entities:
+def depth_image(message: DepthImage, name: str, scene: ViewerScene) -> Entities:
     """The depth image of a sweep; the colours span its depths without the farthest 2 %."""
     scene.depth = message
     pixels = depth_counts(message)
@@ -124,7 +124,7 @@ def depth_image(message: DepthImage, name: str, scene: Scene) -> Entities:
     yield scene.status(1, stage_of(name), text)
 
 
-def score_image(message: ScoreImage, name: str, scene: Scene) -> Entities:
+def score_image(message: ScoreImage, name: str, scene: ViewerScene) -> Entities:
     """The score image of the paper's detector."""
     del scene
     colormap = rr.components.Colormap.Inferno

@@ -52,7 +52,7 @@ class LoggedImage(NamedTuple):
         return (pixels + 0.5) * self.scale
 
 
-class Scene:
+class ViewerScene:
     """State of one run, bounded: trails, candidates, last depth image, last value of each state lane."""
 
     def __init__(

@@ -25,7 +25,7 @@ from links.viewer.entities import Entity
 from links.viewer.layout import Vision, layout
 from links.viewer.lenses import Cameras
 from links.viewer.message_queue import MessageQueue, Slicer
-from links.viewer.scene import Scene, drone_sphere, initial_frames, spheres, static_entities
+from links.viewer.scene import ViewerScene, drone_sphere, initial_frames, spheres, static_entities
 from links.viewer.stream import LOOPBACK, Stream
 from stages.geometry.frames import LidarMount
 from stages.messages import CameraMount
@@ -163,7 +163,7 @@ class Viewer(Tap[ViewerSettings]):
         )
         for entity in (*_about(run), *static_entities(settings.mount), *(spheres() if vision.directions else ())):
             stream.put(entity, static=True)
-        scene = Scene(
+        scene = ViewerScene(
             mount=settings.mount,
             history_s=settings.history_s,
             slice_s=settings.slice_s,
@@ -185,7 +185,7 @@ class Viewer(Tap[ViewerSettings]):
         stream.close()
 
     def _draw(
-        self, stream: Stream, scene: Scene, initial: Iterable[Entity], ready: Iterable[tuple[str, int, Message]]
+        self, stream: Stream, scene: ViewerScene, initial: Iterable[Entity], ready: Iterable[tuple[str, int, Message]]
     ) -> None:
         for output, stamp_ns, message in ready:
             try:

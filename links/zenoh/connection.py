@@ -1,4 +1,4 @@
-"""Connection: the Zenoh session of a process, shared by its senders and receivers, which also measures peer clocks.
+"""The Zenoh session of a process, shared by its senders and receivers, which also measures peer clocks.
 
 A client that gets no reply from the hub for SILENT_NS opens a new session. Zenoh usually reconnects by itself, but not
 always: when the writer of a broken connection notices the loss after its reader, it closes the new connection (observed
@@ -44,7 +44,7 @@ class OpenSession:
     ended: threading.Event
 
 
-class Connection:
+class ZenohConnection:
     """Opens the session in a thread and requests the time of the other hosts periodically."""
 
     def __init__(self, settings: SessionSettings) -> None:
@@ -178,15 +178,15 @@ def _request_time(session: zenoh.Session, host: str, other: str, clock: PeerCloc
 
 
 _lock = threading.Lock()
-_in_use: dict[SessionSettings, tuple[Connection, int]] = {}
+_in_use: dict[SessionSettings, tuple[ZenohConnection, int]] = {}
 
 
 @contextmanager
-def connected(settings: SessionSettings) -> Iterator[Connection]:
+def connected(settings: SessionSettings) -> Iterator[ZenohConnection]:
     """The connection with these settings; opened by the first user, closed by the last."""
     check_ready(settings)
     with _lock:
-        connection, users = _in_use.get(settings) or (Connection(settings), 0)
+        connection, users = _in_use.get(settings) or (ZenohConnection(settings), 0)
         if users == 0:
             connection.start()
         _in_use[settings] = connection, users + 1

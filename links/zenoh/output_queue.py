@@ -18,7 +18,7 @@ from flow.message import Message, array_fields
 from flow.remote.codec import encode
 from flow.remote.codec_fields import CodecError
 from links.clock.host_time import now_ns
-from links.zenoh.connection import Connection
+from links.zenoh.connection import ZenohConnection
 from links.zenoh.envelope import RUN, Envelope
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class OutputQueue:
             self._waiting.append((now_ns(), message))
             self._changed.notify()
 
-    def run(self, connection: Connection, closing: threading.Event) -> None:
+    def run(self, connection: ZenohConnection, closing: threading.Event) -> None:
         """Send until closed; runs in the queue's thread."""
         import zenoh
 

@@ -19,7 +19,7 @@ from flow.remote.codec import decode
 from flow.remote.codec_fields import CodecError
 from flow.remote.timeline import in_local_time
 from links.clock.host_time import now_ns
-from links.zenoh.connection import Connection, OpenSession, connected
+from links.zenoh.connection import OpenSession, ZenohConnection, connected
 from links.zenoh.envelope import RECORD_HEAD, read_envelope
 from links.zenoh.peer_clock import PeerClock
 from links.zenoh.session_settings import SessionSettings, key_of
@@ -51,7 +51,7 @@ class Receiver(link.Source[ReceiverSettings]):
 
     def __init__(self, settings: ReceiverSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._connection: Connection | None = None
+        self._connection: ZenohConnection | None = None
         self._clock: PeerClock | None = None
         self._counts: Counter[str] = Counter()
         self._counting: Any = threading.Lock()
@@ -88,7 +88,7 @@ class Receiver(link.Source[ReceiverSettings]):
                     thread.join(JOIN_S / len(threads))
 
     def _receive(
-        self, connection: Connection, hop: Hop, records: queue.Queue[Record], closing: threading.Event
+        self, connection: ZenohConnection, hop: Hop, records: queue.Queue[Record], closing: threading.Event
     ) -> None:
         """Receive one output's messages, session after session; runs in the thread of a hop."""
         import zenoh
@@ -102,7 +102,7 @@ class Receiver(link.Source[ReceiverSettings]):
 
     def _receive_on(
         self,
-        connection: Connection,
+        connection: ZenohConnection,
         opened: OpenSession,
         hop: Hop,
         records: queue.Queue[Record],
@@ -120,7 +120,7 @@ class Receiver(link.Source[ReceiverSettings]):
             if record is not None:
                 _hand_over(record, records, closing)
 
-    def _record(self, connection: Connection, key: str, sample: zenoh.Sample) -> Record | None:
+    def _record(self, connection: ZenohConnection, key: str, sample: zenoh.Sample) -> Record | None:
         arrival_ns = now_ns()
         attachment = sample.attachment
         envelope = read_envelope(None if attachment is None else attachment.to_bytes())

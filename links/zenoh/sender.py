@@ -11,7 +11,7 @@ from flow import link
 from flow.config.hosts import Hop, port_of
 from flow.link import Record, SourceSettings
 from flow.message import Message
-from links.zenoh.connection import Connection, connected
+from links.zenoh.connection import ZenohConnection, connected
 from links.zenoh.output_queue import OutputQueue
 from links.zenoh.session_settings import SessionSettings, key_of
 
@@ -36,7 +36,7 @@ class Sender(link.Source[SenderSettings]):
     def __init__(self, settings: SenderSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._queues: dict[str, OutputQueue] = {}
-        self._connection: Connection | None = None
+        self._connection: ZenohConnection | None = None
         self._unopened: int = 0
         for hop in self.hops:
             deadline_ns = round(hop.queue.deadline_ms * 1e6)

@@ -17,7 +17,7 @@ from flow.link import Run
 from links.viewer import Viewer
 from links.viewer.draw import draw
 from links.viewer.message_queue import Slicer, thin
-from links.viewer.scene import Scene
+from links.viewer.scene import ViewerScene
 from links.viewer.stream import Stream
 
 sys.path.append(str(Path(__file__).parents[1] / "links" / "viewer"))
@@ -63,7 +63,7 @@ def test_draw_a_second_of_messages_in_the_caller(benchmark, tmp_path, run, slice
     stream = kind(tmp_path / "bench.rrd", None, "256MiB", Counter(), rrb.Blueprint())
 
     def draw_all():
-        scene = Scene(mount=synthetic.MOUNT, history_s=3.0, slice_s=0.1, max_points=6000, trail_s=20.0)
+        scene = ViewerScene(mount=synthetic.MOUNT, history_s=3.0, slice_s=0.1, max_points=6000, trail_s=20.0)
         slicer = Slicer(slice_s)
         for output, content in RUNS[run]:
             for name, stamp_ns, ready in slicer.add(output, content):

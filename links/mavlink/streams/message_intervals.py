@@ -59,10 +59,10 @@ class MessageRates(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    imu_hz: float = Field(50.0, ge=0, le=400)
-    attitude_hz: float = Field(25.0, ge=0, le=400)
-    position_hz: float = Field(25.0, ge=0, le=400)
-    estimator_hz: float = Field(5.0, ge=0, le=50)
+    imu_hz: float = Field(default=50.0, ge=0, le=400)
+    attitude_hz: float = Field(default=25.0, ge=0, le=400)
+    position_hz: float = Field(default=25.0, ge=0, le=400)
+    estimator_hz: float = Field(default=5.0, ge=0, le=50)
 
 
 @dataclass(slots=True)

@@ -60,7 +60,7 @@ class Task:
         return f"{self.cell.name}-s{self.seed}"
 
 
-class Status(enum.Enum):
+class TaskStatus(enum.Enum):
     """What was done for a task."""
 
     MADE = enum.auto()
@@ -70,10 +70,10 @@ class Status(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TaskResult:
     """Result of a task."""
 
-    status: Status
+    status: TaskStatus
     text: str = ""  # reason, unless it was made or kept
     stage_failed: bool = False  # a stage raised an exception; otherwise the cause is outside the graph
     replayed: bool = False  # the recording was kept, its run was missing
@@ -87,7 +87,7 @@ class MatrixReport:
     kept: int  # existing recordings
     replayed: int  # of those kept: their run was missing
     impossible: tuple[str, ...]  # cells that do not fit into the scene of a seed, with the reason
-    failed: tuple[Outcome, ...]
+    failed: tuple[TaskResult, ...]
 
 
 def make_matrix(
@@ -121,11 +121,11 @@ def make_matrix(
     folder.mkdir(parents=True, exist_ok=True)
     outcomes = run_all(make_one, tasks, jobs, report)
     return MatrixReport(
-        made=sum(outcome.status is Status.MADE for outcome in outcomes),
-        kept=sum(outcome.status is Status.KEPT for outcome in outcomes),
+        made=sum(outcome.status is TaskStatus.MADE for outcome in outcomes),
+        kept=sum(outcome.status is TaskStatus.KEPT for outcome in outcomes),
         replayed=sum(outcome.replayed for outcome in outcomes),
-        impossible=tuple(outcome.text for outcome in outcomes if outcome.status is Status.IMPOSSIBLE),
-        failed=tuple(outcome for outcome in outcomes if outcome.status is Status.FAILED),
+        impossible=tuple(outcome.text for outcome in outcomes if outcome.status is TaskStatus.IMPOSSIBLE),
+        failed=tuple(outcome for outcome in outcomes if outcome.status is TaskStatus.FAILED),
     )
 
 
@@ -138,42 +138,42 @@ def _checked_request(closed_loop: Path, conditions: Conditions, for_results: boo
     return RunRequest(closed_loop, sets=tuple(f"{name}.file=null" for name in viewers) if for_results else ())
 
 
-def make_one(task: Task, progress: Callable[[float], None]) -> Outcome:
+def make_one(task: Task, progress: Callable[[float], None]) -> TaskResult:
     """Make the recording and the run of a task, where they are missing."""
     try:
         scenario = scenario_of(task.cell, task.seed, task.making.conditions)
     except LinkError as error:
-        return Outcome(Status.IMPOSSIBLE, f"seed {task.seed}: {error}")
+        return TaskResult(TaskStatus.IMPOSSIBLE, f"seed {task.seed}: {error}")
     try:
         return _make(task, scenario, progress)
     except (LinkError, ConfigError, OSError) as error:
-        return Outcome(Status.FAILED, f"{task.name}: {error}")
+        return TaskResult(TaskStatus.FAILED, f"{task.name}: {error}")
     except RunError as error:
-        return Outcome(Status.FAILED, f"{task.name}: {error}", stage_failed=True)
+        return TaskResult(TaskStatus.FAILED, f"{task.name}: {error}", stage_failed=True)
 
 
-def _make(task: Task, scenario: Scenario, progress: Callable[[float], None]) -> Outcome:
+def _make(task: Task, scenario: Scenario, progress: Callable[[float], None]) -> TaskResult:
     file = task.making.folder / f"{task.name}.mcap"
     request = task.making.closed_loop
     if request is None:
         if is_made(file, scenario, {}):
-            return Outcome(Status.KEPT)
+            return TaskResult(TaskStatus.KEPT)
         _simulate(task, file, scenario, None, progress)
-        return Outcome(Status.MADE)
+        return TaskResult(TaskStatus.MADE)
     graph = request.graph(scenario.rig_yaml(), f"{scenario.name} (rig)")
     metadata = loop_metadata(request.config, graph)
     results = task.making.results
     folder = results and results / f"{task.name}-{request.config.stem}"
     if is_made(file, scenario, metadata):
         if folder is None or holds_run(folder, file, graph):
-            return Outcome(Status.KEPT)
+            return TaskResult(TaskStatus.KEPT)
         replay_into(folder, file, request, lambda done, whole: progress(done / whole))
-        return Outcome(Status.KEPT, replayed=True)
+        return TaskResult(TaskStatus.KEPT, replayed=True)
     if folder is None:
         _simulate(task, file, scenario, ClosedLoop(graph, scenario.closed_loop, metadata), progress)
     else:
         _simulate_and_keep_run(task, file, scenario, folder, request, graph, progress)
-    return Outcome(Status.MADE)
+    return TaskResult(TaskStatus.MADE)
 
 
 def _simulate_and_keep_run(

@@ -36,11 +36,11 @@ BLADE_STEPS = 4  # blade angles within half a turn, for the camera mask
 OPTIONAL_KEYS = ("other_drones", "truth_visible")  # written to a scenario file only where used
 
 
-class _Settings(BaseModel):
+class _ScenarioSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class VehicleSettings(_Settings):
+class VehicleSettings(_ScenarioSettings):
     """The vehicle: its camera is the origin of the vehicle frame."""
 
     camera_height_m: float = Field(default=1.8, ge=1.0, le=5.0)
@@ -48,7 +48,7 @@ class VehicleSettings(_Settings):
     suspension: SuspensionSettings | None = None  # pitch and roll; without it the vehicle stays level
 
 
-class DroneSettings(_Settings):
+class DroneSettings(_ScenarioSettings):
     """A drone and its path, world frame."""
 
     span_m: float = Field(default=0.5, ge=0.1, le=3.0)
@@ -56,7 +56,7 @@ class DroneSettings(_Settings):
     path: Path
 
 
-class RigLidar(_Settings):
+class RigLidar(_ScenarioSettings):
     """The LiDAR on its turntable, as in the rig file."""
 
     model: Literal["VLP-16"] = "VLP-16"
@@ -66,7 +66,7 @@ class RigLidar(_Settings):
     )
 
 
-class Scenario(_Settings):
+class Scenario(_ScenarioSettings):
     """A complete scenario. `with_drone` and `changed` make variants."""
 
     version: Literal[1] = 1

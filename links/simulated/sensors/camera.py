@@ -20,7 +20,7 @@ from links.simulated.sensors.camera_mask import own_body
 from links.simulated.sensors.camera_paint import Street
 from links.simulated.sensors.camera_rays import CameraScene
 from links.simulated.sensors.camera_sensor import SensorSettings, auto_exposure, develop, encode_jpeg, transmission
-from links.simulated.sensors.camera_view import PixelRays, Shutter, View, mean_radiance, render
+from links.simulated.sensors.camera_view import RenderRays, Shutter, View, mean_radiance, render
 from links.simulated.world.mesh import Mesh, RayScene
 from links.simulated.world.scene import Scene
 from links.simulated.world.sky import light
@@ -151,7 +151,7 @@ class Camera:
         own = next(i for i, body in enumerate(scene.bodies) if body.name == platform)
         self._platform = scene.bodies[own]
         self._T_mount_camera = T = mount.matrix()
-        self._pixels = PixelRays(settings.true_lens, settings.size_px)
+        self._pixels = RenderRays(settings.true_lens, settings.size_px)
         covered = scene.always_hit(own, T[:3, 3], self._pixels.direction @ T[:3, :3].T)
         self._view = View(scene, self._pixels, self.T_world_camera, own, covered)
         limit_rad = math.radians(settings.true_lens.max_off_axis_deg)

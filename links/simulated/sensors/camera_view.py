@@ -34,7 +34,7 @@ Poses = Callable[
 ]  # times (n,) [ns] -> R (n, 3, 3), t (n, 3) of T_world_camera
 
 
-class PixelRays:
+class RenderRays:
     """Rays of all pixels within the lens circle, in the camera frame, and their derivatives over a pixel."""
 
     def __init__(self, lens: Equidistant | KannalaBrandt | OCam, size_px: int) -> None:
@@ -87,7 +87,7 @@ class View:
     """A camera in its scene."""
 
     scene: CameraScene
-    pixels: PixelRays
+    pixels: RenderRays
     poses: Poses
     own: int  # index of the body that is the platform of the camera
     covered: NDArray[np.bool_]  # (n,) pixels that always show that body
@@ -183,7 +183,7 @@ def _refine(
 
 
 def world_rays(
-    pixels: PixelRays,
+    pixels: RenderRays,
     pick: NDArray[np.intp],
     jitter: Array32 | None,
     moment: NDArray[np.int64],

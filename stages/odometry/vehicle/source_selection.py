@@ -4,6 +4,7 @@
     odometry silent                the ego-motion continues from the vehicle's pose; later the odometry again
     odometry rejected              the same, as long as its poses are outliers
     odometry frozen                the same, until it moves again (impossible_stop.py)
+    odometry against the LiDAR     the same, until both agree again (lidar_consistency.py)
 
 Each source has its own start frame, and a source that returns may have a new one. At every change the new source is
 therefore aligned with the end of the old one:
@@ -13,7 +14,7 @@ therefore aligned with the end of the old one:
 with t the first stamp of the new source and T_map_vehicle(t) extrapolated (stages/geometry/extrapolation.py). The same
 happens when the start frame of a source jumps: its poses are rejected until three of them lie on one smooth path. Frame
 map is the start frame of the first source. The output has no jumps; it drifts. When the odometry turns out to be
-frozen, the last credible pose is published once more with status DENIED: the poses after it are withdrawn.
+frozen or wrong, the last credible pose is published once more with status DENIED: the poses after it are withdrawn.
 
 Source: ours; P V.B for the camera's motion.
 """
@@ -32,10 +33,15 @@ from flow.stage import Settings, Stage
 from stages.geometry.extrapolation import AcceptedPoses, constant_turn_rate
 from stages.geometry.frames import Array64, transform
 from stages.geometry.se3 import adjoint
+from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.geometry.so3 import nearest_rotation
-from stages.messages import MotionStatus, VehicleMotion
+from stages.messages import MotionStatus, SweptPulses, VehicleMotion
 from stages.odometry.vehicle.impossible_stop import ImpossibleStop
+from stages.odometry.vehicle.lidar_consistency import LidarConsistency
+from stages.odometry.vehicle.static_scan import StaticScan
 
+WAITING = 512  # slices, 0.7 s
+WITHDRAWN_NS = 300_000_000  # before the estimates that contradict the odometry
 SILENT_S = 0.25  # the odometry is unavailable after this time without an accepted pose
 
 
@@ -53,9 +59,9 @@ class VehicleMotionSelectorSettings(Settings):
 
 
 class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
-    """T_map_vehicle without jumps from whichever source is available. Both inputs are optional."""
+    """T_map_vehicle without jumps from whichever source is available. All inputs are optional."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry", "ego"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"odometry", "ego", "pulses"})
 
     def __init__(self, settings: VehicleMotionSelectorSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -66,6 +72,9 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         self._at_change: tuple[VehicleMotion, Array64 | None] | None = None  # the source's pose, and P in frame map
         self._rejected: Counter[str] = Counter()
         self._stop = ImpossibleStop()
+        self._reported = VehicleTrajectory()  # by the odometry, also while it is denied
+        self._waiting: deque[SweptPulses] = deque(maxlen=WAITING)  # slices that are newer than the odometry
+        self._scan, self._consistency = StaticScan(), LidarConsistency()
 
     @property
     def rejected(self) -> Counter[str]:
@@ -79,10 +88,27 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
 
     def on_odometry(self, motion: VehicleMotion) -> VehicleMotion | None:
         """The vehicle's odometry, passed on immediately; None for a rejected pose. DENIED: it is frozen."""
+        self._reported.add(motion)
         if self._stop.is_frozen_at(motion.xyz_map_m):
             self._rejected["odometry: frozen"] += 1
             return None
+        if self._consistency.contradicted:
+            self._rejected["odometry: contradicts the LiDAR"] += 1
+            return None
         return self._select(MotionSource.ODOMETRY, motion)
+
+    def on_pulses(self, pulses: SweptPulses) -> VehicleMotion | None:
+        """The LiDAR, against which the odometry is checked. DENIED: the odometry contradicts it."""
+        if not self._reported.known or pulses.range_m.size == 0:
+            return None
+        self._waiting.append(pulses)
+        newest_ns = self._reported.newest_ns
+        while newest_ns is not None and self._waiting and self._waiting[0].middle_ns <= newest_ns:
+            oldest = self._waiting.popleft()
+            error = self._scan.add(oldest, *self._reported.at(oldest.middle_ns))
+            if error is not None and self._consistency.add(error):
+                return self._deny(error.stamp_ns - WITHDRAWN_NS)
+        return None
 
     def _last_credible_ns(self, accepted: tuple[VehicleMotion, ...]) -> int | None:
         """Stamp of the last credible pose of the odometry if it has just frozen."""
@@ -93,7 +119,7 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
 
     def _deny(self, credible_ns: int) -> VehicleMotion | None:
         """Withdraw the published poses of the odometry after its last credible one; None: all are older."""
-        self._rejected["odometry: frozen"] += 1
+        self._rejected["odometry: denied"] += 1
         self._accepted[MotionSource.ODOMETRY] = AcceptedPoses()  # when it moves again, it has a new start frame
         if self._source is not MotionSource.ODOMETRY:
             return None
@@ -133,8 +159,6 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
 
     def _in_map(self, motion: VehicleMotion) -> VehicleMotion:
         """A pose of the source, in frame map."""
-        if self._at_change is None:
-            return motion
         T = self._T_map_source @ transform(motion.R_map_vehicle, motion.xyz_map_m)
         return VehicleMotion(
             stamp_ns=motion.stamp_ns,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from links.evaluation.association import EvaluationLimits
-from links.evaluation.evaluation import Evaluation, Status
+from links.evaluation.evaluation import Evaluation, MetricStatus
 from links.evaluation.run_data import OutputKind
 from tests.links.evaluation.made_runs import add_pose, evaluated, lines, make_run, truth_at, value, yaw_quaternion
 
@@ -186,7 +186,7 @@ def test_errors_are_by_true_range(tmp_path):
     assert value(e, "range_10_rmse_m") == pytest.approx(0.2)
     assert e.values["range_20_rmse_m"].failed
     assert value(e, "range_20_track_accuracy") == 0.0
-    assert e.values["range_50_rmse_m"].status is Status.NOT_APPLICABLE
+    assert e.values["range_50_rmse_m"].status is MetricStatus.NOT_APPLICABLE
 
 
 def test_gaps_of_truth_are_not_interpolated_over(tmp_path):
@@ -303,7 +303,7 @@ def test_poses_that_the_autopilot_gate_accepts_are_evaluated_separately(tmp_path
     assert (value(none, "sendable_share"), value(none, "sendable_false")) == (0, 0)
     assert none.values["sendable_max_m"].failed
     fix = evaluated(folder, which=1)
-    assert fix.values["sendable_share"].status is Status.NOT_APPLICABLE
+    assert fix.values["sendable_share"].status is MetricStatus.NOT_APPLICABLE
     (folder / "pose_vehicle_drone.tum").write_text("# never found\n")
     (folder / "pose_covariance.csv").write_text((folder / "pose_covariance.csv").read_text().splitlines()[0] + "\n")
     silent = evaluated(folder)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flow.link import LinkError
-from links.evaluation.association import Source
+from links.evaluation.association import EvaluationInput
 from links.evaluation.run_data import read_run
 from links.evaluation.text_files import read_stamp_ns, read_tum
 from links.runs.results import tum_line
@@ -146,4 +146,4 @@ def test_a_run_without_the_time_of_the_recording_is_evaluated_over_truth(tmp_pat
     e = evaluated(folder)
     assert e.run.start_ns is None
     assert e.remarks[0] == "evaluated over 10.00 s, the span of the truth"
-    assert "detections.csv" in e.run.why_missing(Source.SEARCHES)
+    assert "detections.csv" in e.run.why_missing(EvaluationInput.SEARCHES)

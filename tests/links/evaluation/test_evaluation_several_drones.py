@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 from flow.link import LinkError
 from links.cli.app import app
-from links.evaluation.association import Source, follow
+from links.evaluation.association import EvaluationInput, follow
 from links.evaluation.comparison import pair_up
-from links.evaluation.evaluation import Status
+from links.evaluation.evaluation import MetricStatus
 from links.evaluation.run_data import read_run
 from links.evaluation.tables import label
 from tests.links.evaluation.made_runs import START_NS, all_evaluated, lines, make_run, stamp, truth_at
@@ -80,7 +80,7 @@ def test_each_drone_is_evaluated_with_its_own_tracks(tmp_path):
     assert (len(one.run.target.returns_ns), len(two.run.target.returns_ns)) == (1, 3)
     assert one.run.target.occluded_ns is not None
     assert two.run.target.occluded_ns is None
-    assert two.values["reacquisition_s"].note == two.run.why_missing(Source.VISIBILITY)
+    assert two.values["reacquisition_s"].note == two.run.why_missing(EvaluationInput.VISIBILITY)
     assert two.values["reacquisition_s"].note == "the recording does not hold when the drone was occluded"
     pairs, warnings = pair_up([one, two], [one, two])
     assert [(p.own.run.drone, p.other.run.drone) for p in pairs] == [(1, 1), (2, 2)]
@@ -132,7 +132,7 @@ def test_one_drone_is_evaluated_with_all_tracks_in_the_order_of_time(tmp_path):
     assert e.output.covariance[second, 0, 0] == pytest.approx(0.04)
     assert e.output.poses.xyz_m[second, 2] == pytest.approx(42.0)
     assert e.values["false_outputs"].value == 10
-    assert e.values["identity_switches"].status is Status.NOT_APPLICABLE
+    assert e.values["identity_switches"].status is MetricStatus.NOT_APPLICABLE
 
 
 def test_one_track_must_still_rise(tmp_path):

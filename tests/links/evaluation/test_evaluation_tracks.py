@@ -10,7 +10,7 @@ from scipy import stats
 
 from flow.link import LinkError
 from links.evaluation.errors import poisson_upper
-from links.evaluation.evaluation import Status
+from links.evaluation.evaluation import MetricStatus
 from links.evaluation.run_data import read_run
 from links.evaluation.track_metrics import count_tracks, longest_gap_s, merged, reacquisition_times_s, track_losses
 from tests.links.evaluation.made_runs import evaluated, make_run, truth_at, value
@@ -81,8 +81,8 @@ def test_a_run_that_keeps_the_track_has_no_losses(tmp_path):
     e = evaluated(make_run(tmp_path / "a", EIGHT_HZ, truth_at(EIGHT_HZ), hits_s=hits, visible=[(0, 1)]))
     assert value(e, "track_losses") == 0
     assert value(e, "longest_return_gap_s") == pytest.approx(0.2)
-    assert e.values["reacquisition_s"].status is Status.NOT_APPLICABLE
-    assert e.values["identity_switches"].status is Status.NOT_APPLICABLE
+    assert e.values["reacquisition_s"].status is MetricStatus.NOT_APPLICABLE
+    assert e.values["identity_switches"].status is MetricStatus.NOT_APPLICABLE
 
 
 def test_occlusions_gaps_and_returns_of_a_whole_run(tmp_path):
@@ -155,7 +155,7 @@ def test_detection_rates_are_relative_to_the_observable_searches(tmp_path):
     assert value(e, "missed_searches") == 2
     assert (value(e, "return_share"), value(e, "observable_share"), value(e, "detection_rate")) == (80.0, 60.0, 40.0)
     unseen = evaluated(make_run(tmp_path / "b", EIGHT_HZ, truth_at(EIGHT_HZ), sweeps=searches[3:], hits_s=hits))
-    assert unseen.values["observable_detection_rate"].status is Status.NOT_APPLICABLE
+    assert unseen.values["observable_detection_rate"].status is MetricStatus.NOT_APPLICABLE
     assert value(unseen, "return_share") == 50.0
 
 

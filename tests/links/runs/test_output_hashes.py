@@ -12,8 +12,8 @@ from flow.message import Message
 from links.runs.output_hashes import (
     CAMERA_CONFIGS,
     CONFIGS,
-    Outcome,
     Pin,
+    PinResult,
     hash_matches,
     output_hash,
     read_pins,
@@ -76,7 +76,7 @@ def test_what_is_no_output_hash_is_refused(expected):
 
 def test_pinning_one_recording_keeps_the_pins_of_others(tmp_path):
     (tmp_path / "hashes.json").write_text('{"a.mcap": {"replay": "old"}, "b.mcap": {"replay": "kept"}}')
-    write_pins(tmp_path, [Outcome(Pin(tmp_path / "a.mcap", Path("replay.yaml"), "old"), "new")])
+    write_pins(tmp_path, [PinResult(Pin(tmp_path / "a.mcap", Path("replay.yaml"), "old"), "new")])
     text = (tmp_path / "hashes.json").read_text()
     assert '"new"' in text
     assert '"kept"' in text

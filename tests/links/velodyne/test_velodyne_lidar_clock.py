@@ -6,7 +6,7 @@ from hand_built import HOUR_NS, SINGLE_PACKET_NS, captured_records
 
 from links.velodyne import Lidar
 from links.velodyne.lidar_clock import LidarClock, PacketTime
-from links.velodyne.reject_reason import RejectReason
+from links.velodyne.reject_reason import PacketRejectReason
 
 START_NS = 1_700_000_000_000_000_123
 
@@ -101,8 +101,8 @@ def test_repeated_and_overtaken_packets_are_out_of_order(mode):
     first, second = START_NS, START_NS + SINGLE_PACKET_NS
     clock.read(device_us(first), first)
     clock.read(device_us(second), second)
-    assert clock.read(device_us(second), second + 90_000) is RejectReason.ORDER
-    assert clock.read(device_us(first), second + 90_000) is RejectReason.ORDER
+    assert clock.read(device_us(second), second + 90_000) is PacketRejectReason.ORDER
+    assert clock.read(device_us(first), second + 90_000) is PacketRejectReason.ORDER
 
 
 @pytest.mark.parametrize("late_ns", [400_000_000, -400_000_000])
@@ -114,7 +114,7 @@ def test_utc_uses_the_device_time_in_the_hour_nearest_to_the_host(late_ns):
 
 def test_utc_rejects_times_that_disagree_with_the_host():
     clock = LidarClock("utc", limit_ns=500_000_000)
-    assert clock.read(device_us(START_NS), START_NS + 600_000_000) is RejectReason.CLOCK
+    assert clock.read(device_us(START_NS), START_NS + 600_000_000) is PacketRejectReason.CLOCK
     assert clock.disagreements == 1
 
 

@@ -25,7 +25,7 @@ from flow.link import LinkError
 from flow.message import array_fields, check_arrays
 from flow.replay import replay
 from links.velodyne import Lidar
-from links.velodyne.reject_reason import RejectReason
+from links.velodyne.reject_reason import PacketRejectReason
 
 SWEEP = """\
 stages:
@@ -83,7 +83,7 @@ def test_repeated_and_overtaken_packets_are_ignored_and_counted():
     messages = [lidar.decode(r) for r in (a, c, b, c, d)]
     assert [message is not None for message in messages] == [True, True, False, False, True]
     assert [messages[k].lost_packets for k in (0, 1, 4)] == [0, 1, 0]
-    assert rejected(lidar, RejectReason.ORDER) == 2
+    assert rejected(lidar, PacketRejectReason.ORDER) == 2
 
 
 def decoded(records, packets):
@@ -136,15 +136,15 @@ def damaged(**change):
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", RejectReason.LENGTH),
-        (packet()[:-1], RejectReason.LENGTH),
-        (bytes(512), RejectReason.POSITION),
-        (damaged(flag=(700, b"\xff\xdd")), RejectReason.FLAG),
-        (damaged(azimuth=(602, (36_000).to_bytes(2, "little"))), RejectReason.AZIMUTH),
-        (damaged(azimuth=(602, (9_000).to_bytes(2, "little"))), RejectReason.AZIMUTH),
-        (damaged(mode=(1204, b"\x36")), RejectReason.RETURN_MODE),
-        (damaged(product=(1205, b"\x00")), RejectReason.MODEL),
-        (damaged(time=(1200, (3_600_000_000).to_bytes(4, "little"))), RejectReason.TIMESTAMP),
+        (b"", PacketRejectReason.LENGTH),
+        (packet()[:-1], PacketRejectReason.LENGTH),
+        (bytes(512), PacketRejectReason.POSITION),
+        (damaged(flag=(700, b"\xff\xdd")), PacketRejectReason.FLAG),
+        (damaged(azimuth=(602, (36_000).to_bytes(2, "little"))), PacketRejectReason.AZIMUTH),
+        (damaged(azimuth=(602, (9_000).to_bytes(2, "little"))), PacketRejectReason.AZIMUTH),
+        (damaged(mode=(1204, b"\x36")), PacketRejectReason.RETURN_MODE),
+        (damaged(product=(1205, b"\x00")), PacketRejectReason.MODEL),
+        (damaged(time=(1200, (3_600_000_000).to_bytes(4, "little"))), PacketRejectReason.TIMESTAMP),
     ],
 )
 def test_a_bad_packet_in_a_good_stream_is_ignored_and_counted_as_lost(data, reason):
@@ -162,7 +162,7 @@ def test_dual_return_blocks_of_one_pulse_share_their_azimuth():
     data[102] += 1
     lidar = Lidar()
     assert lidar.decode(record(bytes(data))) is None
-    assert rejected(lidar, RejectReason.AZIMUTH) == 1
+    assert rejected(lidar, PacketRejectReason.AZIMUTH) == 1
 
 
 @pytest.mark.parametrize(

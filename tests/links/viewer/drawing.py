@@ -8,15 +8,15 @@ import synthetic
 from flow.message import Message
 from links.viewer.draw import draw
 from links.viewer.entities import Entity
-from links.viewer.scene import Scene
+from links.viewer.scene import ViewerScene
 
 
-def scene(**changes) -> Scene:
+def scene(**changes) -> ViewerScene:
     settings = {"mount": synthetic.MOUNT, "history_s": 3.0, "slice_s": 0.1, "max_points": 6000, "trail_s": 20.0}
-    return Scene(**(settings | changes))
+    return ViewerScene(**(settings | changes))
 
 
-def drawn(content: Message, name: str, where: Scene | None = None) -> dict[str, Entity]:
+def drawn(content: Message, name: str, where: ViewerScene | None = None) -> dict[str, Entity]:
     return {entity.path: entity for entity in draw(content, name, where or scene())}
 
 

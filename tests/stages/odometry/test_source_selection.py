@@ -16,6 +16,7 @@ from stages.geometry.frames import rotation_z, transform
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.messages import MotionStatus, VehicleMotion
 from stages.odometry.vehicle import VehicleMotionSelector
+from tests.stages.odometry.test_static_scan import WALLS, slices
 
 S = 1_000_000_000
 
@@ -207,7 +208,7 @@ def test_a_source_without_covariance_gives_none():
 
 
 def test_its_ports_are_the_two_sources_and_one_motion():
-    assert set(input_ports(VehicleMotionSelector)) == {"odometry", "ego"}
+    assert set(input_ports(VehicleMotionSelector)) == {"odometry", "ego", "pulses"}
     assert set(output_ports(VehicleMotionSelector)) == {"vehicle_motion"}
     with pytest.raises(ValidationError):
         VehicleMotionSelector(silent_s=0.0)
@@ -248,3 +249,16 @@ def test_a_frozen_odometry_is_replaced_by_the_ego_motion_and_used_again_when_it_
 def test_a_frozen_ego_motion_or_parked_vehicle_is_not_denied():
     still = [frozen_at(t, 0.0) for t in seconds(0, 20, 0.02)]
     assert all(m.status is MotionStatus.ACCEPTED for m in published(VehicleMotionSelector(), odometry=still))
+
+
+@pytest.mark.parametrize(("reported", "denied"), [(1.0, 0), (0.0, 1), (1.2, 1)])
+def test_an_odometry_that_contradicts_the_lidar_is_denied(reported, denied):
+    selector, out = VehicleMotionSelector(), []
+    for pulses, at_m in slices(5.0, 2.0, WALLS):
+        motion = VehicleMotion(
+            stamp_ns=pulses.middle_ns, xyz_map_m=reported * at_m, R_map_vehicle=np.eye(3), covariance=None
+        )
+        out += [selector.on_odometry(motion), selector.on_pulses(pulses)]
+    states = [m.status for m in out if m is not None]
+    assert states.count(MotionStatus.DENIED) == denied
+    assert (states[-1] is MotionStatus.DENIED) == bool(denied), "nothing is published afterwards"

@@ -16,7 +16,7 @@ from links.recording import RecordingReader
 from links.runs.request import RunRequest
 from links.simulated.matrix import flights, making
 from links.simulated.matrix.flights import Cell
-from links.simulated.matrix.making import Outcome, Status, Task, is_made, make_matrix, make_one
+from links.simulated.matrix.making import Task, TaskResult, TaskStatus, is_made, make_matrix, make_one
 from links.simulated.matrix.matrix import Conditions, cells, scenario_of
 from links.simulated.rig.closed_loop import ClosedLoop, loop_metadata
 from links.simulated.rig.run import simulate_into
@@ -46,7 +46,7 @@ def silent(done: float, whole: float) -> None:
     """Ignored progress."""
 
 
-def make_short(task: Task, progress: Callable[[float], None]) -> Outcome:
+def make_short(task: Task, progress: Callable[[float], None]) -> TaskResult:
     """`make_one` in a process of its own, where nothing is patched; the file of one cell cannot be written."""
     flights.USUAL_DURATION_S = SHORT_S
     if task.cell.vehicle == "turning":
@@ -238,8 +238,10 @@ def test_two_processes_make_what_one_makes_and_an_error_affects_its_own_cell_onl
 def test_the_command_prints_failures_and_sets_its_exit_code(
     tmp_path, monkeypatch, stage_failed: bool, code: int
 ) -> None:
-    failed = Outcome(Status.FAILED, "campus-10m-hover-parked-s1: the disk is full", stage_failed)
-    monkeypatch.setattr(making, "make_one", lambda task, report: failed if task.seed == 1 else Outcome(Status.MADE))
+    failed = TaskResult(TaskStatus.FAILED, "campus-10m-hover-parked-s1: the disk is full", stage_failed)
+    monkeypatch.setattr(
+        making, "make_one", lambda task, report: failed if task.seed == 1 else TaskResult(TaskStatus.MADE)
+    )
     words = ["matrix", str(tmp_path), "--only", "campus-10m-hover-parked", "--seeds", "3"]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == code
@@ -249,7 +251,7 @@ def test_the_command_prints_failures_and_sets_its_exit_code(
 
 def test_seeds_start_at_first_seed(tmp_path, monkeypatch) -> None:
     made: list[int] = []
-    monkeypatch.setattr(making, "make_one", lambda task, report: made.append(task.seed) or Outcome(Status.MADE))
+    monkeypatch.setattr(making, "make_one", lambda task, report: made.append(task.seed) or TaskResult(TaskStatus.MADE))
     words = ["matrix", str(tmp_path), "--only", "campus-10m-hover-parked", "--seeds", "3", "--first-seed", "6"]
     assert CliRunner().invoke(app, words).exit_code == 0
     assert made == [6, 7, 8]

@@ -13,6 +13,7 @@ import enum
 import functools
 import re
 import struct
+import types
 from collections.abc import Callable
 from typing import (
     Annotated,
@@ -20,6 +21,7 @@ from typing import (
     ClassVar,
     Protocol,
     TypeVar,
+    Union,
     cast,
     dataclass_transform,
     get_args,
@@ -101,10 +103,31 @@ PerPointBool = Annotated[NDArray[np.bool_], Shape("n")]
 
 
 @functools.cache
-def array_fields(message_type: type[Message]) -> tuple[tuple[str, np.dtype[Any], Shape], ...]:
-    """(field, dtype, shape) of each declared array field of a message type."""
+def nested_fields(cls: type[Any]) -> tuple[tuple[str, tuple[type[Any], ...]], ...]:
+    """(field, classes) of each field of a dataclass that holds a dataclass, one of several (`X | Y`), or None."""
+    hints = get_type_hints(cls)
+    found: list[tuple[str, tuple[type[Any], ...]]] = []
+    for field in dataclasses.fields(cls):
+        hint = hints[field.name]
+        kinds: tuple[Any, ...] = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+        if nested := tuple(kind for kind in kinds if isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+            found.append((field.name, cast("tuple[type[Any], ...]", nested)))
+    return tuple(found)
+
+
+@functools.cache
+def array_fields(cls: type[Any]) -> tuple[tuple[str, np.dtype[Any], Shape], ...]:
+    """(field, dtype, shape) of each declared array field of a message type; in a nested dataclass: `field.inner`."""
+    found = list(_own_array_fields(cls))
+    for name, nested in nested_fields(cls):
+        found += [(f"{name}.{inner}", dtype, shape) for kind in nested for inner, dtype, shape in array_fields(kind)]
+    return tuple(dict.fromkeys(found))
+
+
+@functools.cache
+def _own_array_fields(cls: type[Any]) -> tuple[tuple[str, np.dtype[Any], Shape], ...]:
     found: list[tuple[str, np.dtype[Any], Shape]] = []
-    for name, hint in get_type_hints(message_type, include_extras=True).items():
+    for name, hint in get_type_hints(cls, include_extras=True).items():
         if get_origin(hint) is not Annotated:
             continue
         base, *extras = get_args(hint)
@@ -116,11 +139,17 @@ def array_fields(message_type: type[Message]) -> tuple[tuple[str, np.dtype[Any],
 
 
 def check_arrays(message: Message) -> None:
-    """Raise TypeError when an array's dtype or shape is not what the message type declares."""
-    sizes: dict[str, int] = {}
-    for name, dtype, shape in array_fields(type(message)):
-        value: Any = getattr(message, name)
-        where = f"{type(message).__name__}.{name}"
+    """Raise TypeError when an array's dtype or shape is not what the message type declares, also in its dataclasses.
+
+    A letter of a shape is one size in the whole message.
+    """
+    _check_arrays(message, type(message).__name__, {})
+
+
+def _check_arrays(holder: Any, path: str, sizes: dict[str, int]) -> None:
+    for name, dtype, shape in _own_array_fields(holder.__class__):
+        value: Any = getattr(holder, name)
+        where = f"{path}.{name}"
         array: NDArray[Any] = np.asarray(value)
         if array is not value or array.dtype != dtype or array.ndim != len(shape.dims):
             raise TypeError(f"{where}: declared {dtype} {shape}, got {array.dtype} {array.shape}")
@@ -128,6 +157,13 @@ def check_arrays(message: Message) -> None:
             wanted = sizes.setdefault(declared, size) if isinstance(declared, str) else declared
             if size != wanted:
                 raise TypeError(f"{where}: declared {shape} with {declared} = {wanted}, got {array.shape}")
+    for name, nested in nested_fields(holder.__class__):
+        inner: Any = getattr(holder, name)
+        if inner.__class__ in nested:
+            _check_arrays(inner, f"{path}.{name}", sizes)
+        elif inner is not None:
+            declared = " | ".join(kind.__name__ for kind in nested)
+            raise TypeError(f"{path}.{name}: declared {declared}, got {inner.__class__.__name__}")
 
 
 class Hasher(Protocol):

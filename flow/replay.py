@@ -25,6 +25,7 @@ from heapq import heappop, heappush
 from time import perf_counter_ns
 from typing import Any
 
+from flow.counters import Counters
 from flow.events import Event, Events
 from flow.graph import Graph
 from flow.link import RUN_TOPICS, LinkError, Record, Source, Tap
@@ -58,7 +59,7 @@ class RunReport:
     unwired_topics: Counter[str] = field(default_factory=Counter[str])  # number of records that no source takes
     nodes: dict[str, NodeReport] = field(default_factory=dict[str, NodeReport])
     events: list[Event] = field(default_factory=list[Event])
-    counters: dict[str, dict[str, int]] = field(default_factory=dict[str, dict[str, int]])  # of links and stages
+    counters: dict[str, Counters] = field(default_factory=dict[str, Counters])  # of links and stages
 
 
 class _Port:
@@ -251,9 +252,9 @@ class Replay:
         report.counters = {name: counts for name in report.nodes if (counts := counters.get(name))}
         return report
 
-    def counters(self) -> dict[str, dict[str, int]]:
+    def counters(self) -> dict[str, Counters]:
         """Each node's counters."""
-        return {name: dict(node.counters) for name, node in self.nodes.items()}
+        return {name: Counters.of(node.counters) for name, node in self.nodes.items()}
 
     def _step(self, port: _Port, arrival_ns: int, message: Any) -> tuple[Message, ...]:
         """Run one step: what a port gives for a message."""

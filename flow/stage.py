@@ -68,7 +68,10 @@ class Node(Generic[S]):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Totals since the start, for people: lost, rejected, foreign. A run shows them and writes them at its end."""
+        """Totals since the start, for people: lost, foreign. A run shows them and writes them at its end.
+
+        A node that rejects inputs returns `flow.counters.Counters`.
+        """
         return {}
 
 

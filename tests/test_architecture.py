@@ -17,7 +17,7 @@ from flow.graph import load_graph
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"flow": {"flow"}, "stages": {"flow", "stages"}, "links": {"flow", "stages", "links"}}
-BASES = {"flow.message", "flow.stage", "flow.compile_cache"}  # modules of the engine that a stage may import
+BASES = {"flow.message", "flow.stage", "flow.counters", "flow.compile_cache"}  # modules of the engine that a stage may import
 OUTSIDE = {
     "threading",
     "multiprocessing",

@@ -1,4 +1,4 @@
-"""The documents: links lead somewhere, commands exist, the README stays short."""
+"""The documents: links are valid, commands exist, the README is short."""
 
 from __future__ import annotations
 

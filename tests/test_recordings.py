@@ -16,6 +16,7 @@ from flow.taps import Digest
 from links.recording import RecordingReader
 from links.runs.results import Results
 from links.runs.truth import TruthLog, fix_errors
+from stages.messages import SearchResult
 
 ROOT = Path(__file__).resolve().parents[1]
 ON_ITS_SIDE = {
@@ -60,16 +61,16 @@ def test_the_paper_baseline_detects_a_building_as_the_drone(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("recording", "verdict"),
+    ("recording", "result"),
     [
-        ("einride_vlp16", ("no drone: 0 of 14917 returns lie within 60 deg of straight up", 13)),
-        ("mrpt_vlp16_gps", ("no drone: 0 of 16978 returns lie within 60 deg of straight up", 3)),
+        ("einride_vlp16", (13, "no drone: 0 of 14917 returns lie within 60 deg of straight up")),
+        ("mrpt_vlp16_gps", (3, "no drone: 0 of 16978 returns lie within 60 deg of straight up")),
     ],
 )
 @pytest.mark.parametrize("config", ["replay", "paper"])
-def test_a_real_lidar_without_returns_overhead_detects_no_drone_and_reports_why(tmp_path, recording, verdict, config):
+def test_a_real_lidar_without_returns_overhead_detects_no_drone_and_reports_why(tmp_path, recording, result, config):
     results, _, _ = run(tmp_path, recording, config)
-    assert results.search_results == [verdict]
+    assert results.search_results == [(SearchResult.NO_CANDIDATE, *result)]
     assert not results.fixes
     assert [t.state for t in results.transitions] == ["SEARCHING"]
 
@@ -79,7 +80,7 @@ def test_no_drone_is_detected_in_a_real_room(tmp_path, mount):
     """The returns as if the LiDAR lay on its side: the room fills the image and has no drone."""
     results, _, _ = run(tmp_path, "einride_vlp16", "replay", ON_ITS_SIDE[mount])
     assert (results.sweeps, results.sweeps_with_drone, len(results.fixes)) == (13, 0, 0)
-    assert all(text.startswith("no drone: ") for text, _ in results.search_results)
+    assert all(text.startswith("no drone: ") for _, _, text in results.search_results)
 
 
 @pytest.mark.parametrize("mount", ON_ITS_SIDE)

@@ -24,6 +24,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+from flow.counters import Counters
 from flow.events import Events
 from flow.graph import Graph
 from flow.link import Link, Record, Tap
@@ -161,7 +162,7 @@ class Live:
         compute |= {name: stage.compute for name, stage in stages.items()}
         failures = {name: stage.failures for name, stage in stages.items()}
         failures |= {sink.node: sink.failures for sink in threads.sinks}
-        counters = {name: dict(node.counters) for name, node in (threads.links | stages).items()}
+        counters = {name: Counters.of(node.counters) for name, node in (threads.links | stages).items()}
         edges = {name: edge.report() for name, edge in threads.edges.items()}
         return LiveReport(
             records=sum(source.report.records for source in threads.sources),

@@ -5,6 +5,7 @@ Source: ours.
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass, field
 
 from flow.config.edge import Edge
@@ -47,14 +48,29 @@ class EdgeReport:
     lag_ms: float  # of the newest
 
 
+class LinkState(enum.Enum):
+    """State of a source in a live run."""
+
+    OPENING = "opening"
+    OPEN = "open"
+    FAILED = "failed"  # it is opened again
+    CLOSED = "closed"
+
+
 @dataclass(slots=True)
 class LinkReport:
-    """The records of one source."""
+    """State and records of one source."""
 
-    state: str  # open, closed, or what is wrong
+    state: LinkState = LinkState.OPENING
     records: int = 0
     openings: int = 0
     undecoded: int = 0  # records whose decoding raised
+    reason: str = ""  # why it failed last
+
+    @property
+    def state_text(self) -> str:
+        """The state for people: why it failed, otherwise the state's name."""
+        return self.reason if self.state is LinkState.FAILED else self.state.value
 
 
 @dataclass(slots=True)

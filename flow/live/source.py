@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from time import perf_counter_ns
 
 from flow.link import LinkError, Record, Source
-from flow.live.report import LinkReport
+from flow.live.report import LinkReport, LinkState
 from flow.live.threads import Feed, RunThread, Shared
 from flow.message import Message
 from flow.metrics import Latency
@@ -29,7 +29,7 @@ class SourceThread(RunThread):
         super().__init__(f"listen {name}", shared)
         self.node, self.source = name, source
         self.compute = Latency()
-        self.report = LinkReport("opening")
+        self.report = LinkReport()
         self.first_ns = self.last_ns = 0
         self._outputs = outputs
         self._last_change = 0, 0.0  # number of records, and the time [s] when `silence` first found that number
@@ -47,11 +47,12 @@ class SourceThread(RunThread):
                 reason = str(error)
             if stopping.is_set():
                 break
-            self.report.state = reason
+            self.report.reason = reason
+            self.report.state = LinkState.FAILED
             pause_s = FIRST_PAUSE_S if self.report.records > records_before else min(2 * pause_s, MAX_PAUSE_S)
             self.shared.events.report(self.node, f"{reason}; it is reopened")
             stopping.wait(pause_s)
-        self.report.state = "closed"
+        self.report.state = LinkState.CLOSED
 
     def close(self) -> None:
         """End the listening, from any thread."""
@@ -65,7 +66,12 @@ class SourceThread(RunThread):
         after_s, records, now_s = self.source.silent_after_s, self.report.records, time.monotonic()
         if records != self._last_change[0]:
             self._last_change = records, now_s
-        if after_s is None or not records or self.report.state != "open" or now_s < self._last_change[1] + after_s:
+        if (
+            after_s is None
+            or not records
+            or self.report.state is not LinkState.OPEN
+            or now_s < self._last_change[1] + after_s
+        ):
             return None
         return f"has sent nothing for {after_s:g} s: is it powered, and its cable plugged in?"
 
@@ -78,7 +84,7 @@ class SourceThread(RunThread):
                 self._opened = opened
             self.report.openings += 1
             if self.report.openings == 1:
-                self.report.state = "open"
+                self.report.state = LinkState.OPEN
             try:
                 if self.shared.stopping.is_set():  # `close` came too early to close it
                     return
@@ -90,8 +96,8 @@ class SourceThread(RunThread):
                 self.close()
 
     def _take(self, record: Record) -> None:
-        if self.report.state != "open":
-            self.report.state = "open"
+        if self.report.state is not LinkState.OPEN:
+            self.report.state = LinkState.OPEN
             self.shared.events.report(self.node, "records arrive again", resolved=True)
         if record.arrival_ns < self.last_ns:  # a recording is read in the order of arrival, so it must not go back
             record = dataclasses.replace(record, arrival_ns=self.last_ns)

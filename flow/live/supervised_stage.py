@@ -7,12 +7,13 @@ Source: ours.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from time import perf_counter_ns
 from typing import Any
 
 from flow.config.node_spec import NodeSpec
+from flow.counters import Counters
 from flow.message import Message
 from flow.metrics import Latency
 from flow.ports import Output, RunError, admit, call
@@ -45,13 +46,13 @@ class SupervisedStage:
         self._build = build
         self._finished = False
         self._failed_ns: deque[int] = deque(maxlen=MAX_RESTARTS)
-        self._replaced_counters: Counter[str] = Counter()
+        self._replaced_counters = Counters()
         self._stage = build(spec)
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """The stage's counters, summed over all its restarts."""
-        return dict(self._replaced_counters + Counter(self._stage.counters))
+        return self._replaced_counters + Counters.of(self._stage.counters)
 
     def take(self, port: str, message: Message, arrival_ns: int) -> list[tuple[Output[Any], Message]]:
         """What the stage gives for one message, each with its output; nothing when it raises."""
@@ -87,6 +88,6 @@ class SupervisedStage:
         else:
             self._failed_ns.append(arrival_ns)
             self.restarts += 1
-            self._replaced_counters += Counter(self._stage.counters)
+            self._replaced_counters += Counters.of(self._stage.counters)
             self._stage = self._build(self._spec)
             self._report(f"{self.name} restarts", error)

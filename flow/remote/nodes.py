@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any, NamedTuple, Protocol
 
+from flow.counters import Counters
 from flow.events import Event
 from flow.link import LinkError
 from flow.message import Message
@@ -44,13 +45,15 @@ class PartitionReport(NamedTuple):
     steps: int
     compute: dict[str, Latency]  # by node
     events: list[Event]
-    counters: dict[str, dict[str, int]]  # by node
+    counters: dict[str, Counters]  # by node
     hashes: dict[str, str]  # of their outputs, as `Digest` computes them
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, for `of_json`."""
         compute = {name: latency.to_list() for name, latency in self.compute.items()}
-        return {**self._asdict(), "compute": compute, "events": [asdict(event) for event in self.events]}
+        counters = {name: counts.to_json() for name, counts in self.counters.items()}
+        events = [asdict(event) for event in self.events]
+        return {**self._asdict(), "compute": compute, "events": events, "counters": counters}
 
     @staticmethod
     def of_json(values: dict[str, Any]) -> PartitionReport:
@@ -59,7 +62,7 @@ class PartitionReport(NamedTuple):
             steps=values["steps"],
             compute={name: Latency.of_list(counts) for name, counts in values["compute"].items()},
             events=[Event(**fields) for fields in values["events"]],
-            counters=values["counters"],
+            counters={name: Counters.of_json(counts) for name, counts in values["counters"].items()},
             hashes=values["hashes"],
         )
 

@@ -27,6 +27,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from flow.config.node_spec import NodeSpec
+from flow.counters import Counters
 from flow.graph import Graph
 from flow.message import Message
 from flow.ports import RemoteError, RunError
@@ -213,7 +214,7 @@ class RemoteStage:
     """A stage in a worker process, its ports as methods: `on_<port>` and `finish` return when it has answered."""
 
     def __init__(self, spec: NodeSpec, process: WorkerProcess) -> None:
-        self.counters: dict[str, int] = {}
+        self.counters = Counters()
         """As of its newest answer."""
         self._name = spec.name
         self._partition = RemotePartition(process, Graph({spec.name: spec}, (), None, {}))
@@ -241,7 +242,7 @@ class RemoteStage:
     def _ask(self, kind: int, *body: bytes) -> list[Message]:
         self._partition.send(kind, *body)
         answer = self._partition.answer()
-        self.counters = answer.head["counters"][self._name]
+        self.counters = Counters.of_json(answer.head["counters"][self._name])
         if answer.kind == AnswerKind.FAILED:
             cause, text = answer.head["cause"], answer.head["text"]
             raise RemoteError(cause) if cause else RunError(text)

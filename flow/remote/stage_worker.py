@@ -99,14 +99,14 @@ class Partition:
             port = list(inputs)[index]
             message = decode(body, {inputs[port].__name__: inputs[port]}, PORT.size)
             runner.deliver(spec.name, port, message, 0)
-            yield answer_frame(AnswerKind.OUTPUTS, self._collector.take(), {"counters": runner.counters()})
+            yield answer_frame(AnswerKind.OUTPUTS, self._collector.take(), {"counters": _plain_counters(runner)})
         elif kind == Request.END:
             (runner.report.last_ns,) = TIME.unpack(body)
             refusals = [(refusal.arrival_ns, str(refusal.error)) for refusal in runner.sources_without_data()]
             yield answer_frame(AnswerKind.REFUSED, head={"refusals": refusals})
         elif kind == Request.FINISH:
             next(self._finishing)
-            yield answer_frame(AnswerKind.OUTPUTS, self._collector.take(), {"counters": runner.counters()})
+            yield answer_frame(AnswerKind.OUTPUTS, self._collector.take(), {"counters": _plain_counters(runner)})
         elif kind == Request.REPORT:
             yield answer_frame(AnswerKind.REPORT, head=self._report().to_json())
 
@@ -118,8 +118,12 @@ class Partition:
     def failed(self, error: Exception) -> bytes:
         """The answer that reports an error, as a frame."""
         node = self._runner.running.partition(".")[0] or next(iter(self.graph.nodes))
-        head = {**_described(error), "node": node, "counters": self._runner.counters()}
+        head = {**_described(error), "node": node, "counters": _plain_counters(self._runner)}
         return answer_frame(AnswerKind.FAILED, self._collector.take(), head)
+
+
+def _plain_counters(runner: Replay) -> dict[str, Any]:
+    return {name: counts.to_json() for name, counts in runner.counters().items()}
 
 
 def _described(error: Exception) -> dict[str, Any]:

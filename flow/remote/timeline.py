@@ -11,36 +11,45 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.message import Message
+from flow.message import nested_fields
 
 _I64 = np.iinfo(np.int64)
+M = TypeVar("M")
 
 
-def in_local_time(message: Message, offset_ns: int, uncertainty_ns: int) -> Message:
+def in_local_time(message: M, offset_ns: int, uncertainty_ns: int) -> M:
     """The message with `offset_ns` (local clock - remote clock, known to `uncertainty_ns`) added to its times.
 
-    OverflowError: a time would exceed 64 bits, so it is no time.
+    Times in nested dataclasses are shifted, too. OverflowError: a time would exceed 64 bits, so it is no time.
     """
     changed: dict[str, Any] = {}
-    for name, added_ns in _times(type(message), offset_ns, uncertainty_ns):
+    for name, grows in _own_time_fields(type(message)):
         value: Any = getattr(message, name)
         if value is not None:
-            changed[name] = _added(value, added_ns)
-    return dataclasses.replace(message, **changed)
-
-
-def _times(cls: type[Message], offset_ns: int, uncertainty_ns: int) -> list[tuple[str, int]]:
-    return [(name, uncertainty_ns if grows else offset_ns) for name, grows in time_fields(cls)]
+            changed[name] = _added(value, uncertainty_ns if grows else offset_ns)
+    for name, nested in nested_fields(type(message)):
+        inner: Any = getattr(message, name)
+        if type(inner) in nested:
+            changed[name] = in_local_time(inner, offset_ns, uncertainty_ns)
+    return dataclasses.replace(cast(Any, message), **changed)
 
 
 @functools.cache
-def time_fields(cls: type[Message]) -> tuple[tuple[str, bool], ...]:
-    """(field, whether it is an uncertainty) of all fields that hold nanoseconds."""
+def time_fields(cls: type[Any]) -> tuple[tuple[str, bool], ...]:
+    """(field, whether it is an uncertainty) of all fields that hold nanoseconds; a nested one is `field.inner`."""
+    found = list(_own_time_fields(cls))
+    for name, nested in nested_fields(cls):
+        found += [(f"{name}.{inner}", grows) for kind in nested for inner, grows in time_fields(kind)]
+    return tuple(dict.fromkeys(found))
+
+
+@functools.cache
+def _own_time_fields(cls: type[Any]) -> tuple[tuple[str, bool], ...]:
     names = [field.name for field in dataclasses.fields(cls) if field.name.endswith("_ns")]
     return tuple((name, name.endswith("_uncertainty_ns")) for name in names)
 

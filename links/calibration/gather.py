@@ -93,7 +93,7 @@ def gather(
         raise LinkError(f"{recording} holds no LiDAR packets in that time: is it the right recording, and the part?")
     if not servo_rad:
         raise LinkError(
-            f"{recording} holds no servo states in that time: a LiDAR that does not turn sees nothing twice, "
+            f"{recording} contains no servo states in that time: a LiDAR that does not turn observes no surface twice, "
             "so there is no servo mount to calibrate"
         )
     trace = ServoTrace.of(np.array(servo_stamps_ns), np.array(servo_rad), TICK_RAD)

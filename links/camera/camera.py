@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from flow.counters import Counters
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.camera.capture import CaptureSettings, Frame
 from links.camera.live_camera import LiveCamera
@@ -61,13 +62,13 @@ class Camera(Source[CameraSettings]):
         return self._rejected
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """Totals since the start.
 
         Frames: rejected, damaged, stale (buffered for an unknown time), late (slow decoder), too slow (ten consecutive
         late ones), overtaken (replaced by a newer one). Times: lost, opened again.
         """
-        return {"rejected": self._rejected, **self._counts}
+        return Counters(self._counts, {"no complete JPEG image": self._rejected})
 
     @property
     def status(self) -> str | None:

@@ -110,7 +110,7 @@ def camera_checks(
 
 def _rate(source: ObservedSource, link: Camera) -> CheckResult:
     name, records = f"{source.name} frames", source.observation.records
-    rejected = source.counters.get("rejected", 0)
+    rejected = sum(source.counters.rejected.values())
     rate = f"{records.rate_hz:.1f} frames/s" if records.count > 1 else "one frame"
     text = rate + (f", {rejected} of {records.count} damaged" if rejected else "")
     if not records.rate_hz >= MIN_HZ or (source.live and source.status):

@@ -122,7 +122,7 @@ def _calibrated(gathered: Gathered, parked: bool) -> Calibration:
 
     if gathered.driven_m is not None and gathered.driven_m > STILL_M + DRIFT_MPS * gathered.seconds:
         raise CannotCalibrate(
-            f"the vehicle did not stand still: its odometry says that it drove {gathered.driven_m:.2f} m. Take a "
+            f"the vehicle did not stand still: by its odometry it drove {gathered.driven_m:.2f} m. Take a "
             "recording of a parked vehicle, or a part of this one in which it stands (--from, --to)"
         )
     stood = parked or (gathered.driven_m is not None and gathered.driven_m <= STILL_M)

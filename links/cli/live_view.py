@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flow.link import Tap
-from flow.live.report import LiveReport
+from flow.live.report import LinkState, LiveReport
 from flow.message import Message
 from links.cli.console import err, out
 from links.runs.live_run import RunStatus
@@ -105,7 +105,7 @@ class LiveView:
     def _line(self, status: RunStatus) -> str:
         report = status.report()
         state, pose = self.latest.state_and_pose()
-        closed = [f"{name} {link.state}" for name, link in report.links.items() if link.state != "open"]
+        closed = [f"{n} {link.state_text}" for n, link in report.links.items() if link.state is not LinkState.OPEN]
         parts = [f"{status.elapsed_s:.1f} s", state, pose, _numbers(report), *closed]
         return "; ".join(part for part in parts if part)
 
@@ -124,7 +124,9 @@ class LiveView:
         links = Table("link", "records", "state", box=None, pad_edge=False)
         for name, link in report.links.items():
             counts = ", ".join(f"{key} {value}" for key, value in report.counters.get(name, {}).items() if value)
-            links.add_row(name, str(link.records), Text(f"{link.state}  {counts}", overflow="ellipsis", no_wrap=True))
+            links.add_row(
+                name, str(link.records), Text(f"{link.state_text}  {counts}", overflow="ellipsis", no_wrap=True)
+            )
         others = Table("others", "counts", box=None, pad_edge=False)
         for name, counted in report.counters.items():
             if name not in report.links and any(counted.values()):

@@ -27,7 +27,6 @@ from links.runs.warm_up import warm_up
 from links.zenoh import host_graph
 
 TABLE_ROWS = 12
-REJECTED_COUNTER = "rejected"  # first word of the counters of rejected messages
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEFAULT_REPLAY_CONFIG = REPOSITORY / "configs" / "replay.yaml"
 
@@ -220,8 +219,8 @@ def _print_result(run: RunResult) -> None:
     elif not results.sweeps:
         out.print("no drone: no sweep was completed")
     elif not results.fixes:
-        for text, count in results.search_results[:3]:
-            out.print(f"in {count} of {results.sweeps} sweeps: {text}", markup=False)
+        for result, count, example in results.search_results:
+            out.print(f"in {count} of {results.sweeps} sweeps: {result.value}; the first: {example}", markup=False)
     for change in results.transitions[-3:]:
         name = f"track {change.track_id}" if change.track_id > 1 else "tracker"
         out.print(f"{name} at {stamp_s(change.stamp_ns)} s: {change.state}, {change.reason}", markup=False)
@@ -235,10 +234,10 @@ def _print_result(run: RunResult) -> None:
         states = ", ".join(f"{count} {state}" for state, count in results.pose_states.items())
         out.print(f"fused poses: {states}; {results.resets} jumps")
     rejected = [
-        f"{name}: {count} {counter}"
+        f"{name}: {count} {reason}"
         for name, counters in report.counters.items()
-        for counter, count in counters.items()
-        if counter.startswith(REJECTED_COUNTER) and count
+        for reason, count in counters.rejected.items()
+        if count
     ]
     if rejected:
         out.print(f"rejected: {'; '.join(rejected)}", markup=False)

@@ -22,6 +22,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from flow.counters import Counters
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.clock import host_time
 from links.dynamixel import wire
@@ -102,6 +103,7 @@ class Servo(Source[ServoSettings]):
     def __init__(self, settings: ServoSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
         self._counts: Counter[str] = Counter()
+        self._rejected: int = 0
         self._pending: GoalCommand | None = None
         self._process: ServoProcess | None = None
         self._lock = threading.Lock()  # for replacing the process
@@ -112,17 +114,18 @@ class Servo(Source[ServoSettings]):
     @property
     def rejected(self) -> int:
         """Number of records without a valid servo state."""
-        return self._counts["rejected: no servo state"]
+        return self._rejected
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """Totals since the start, and the newest `connected`, voltage and temperature."""
         now = {} if self._health is None else self._health._asdict()
         totals = {name: now.get(name, 0) + self._ended[name] for name in TOTALS} | {
             name: now.get(name, 0) for name in STATES
         }
         own = dict(self._counts)
-        return {**totals, **own, "goals_lost": totals["goals_lost"] + own.get("goals_lost", 0)}
+        totals = {**totals, **own, "goals_lost": totals["goals_lost"] + own.get("goals_lost", 0)}
+        return Counters(totals, {"no servo state": self._rejected})
 
     @property
     def status(self) -> str | None:
@@ -145,7 +148,7 @@ class Servo(Source[ServoSettings]):
         try:
             return parse_state(record.stamp_ns, record.data)
         except ValueError:
-            self._counts["rejected: no servo state"] += 1
+            self._rejected += 1
             return None
 
     def on_goal(self, goal: ServoGoal) -> None:

@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field, field_validator, model_validator
 
+from flow.counters import Counters
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.clock import host_time
 from links.clock.device_clock import DeviceClock
@@ -163,10 +164,9 @@ class Autopilot(Source[AutopilotSettings]):
         return None if self._session is None else self._session.status
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """Totals since the start: decoded, lost, rejected by reason; live: sent, not sent, received, foreign."""
         decoder = self._decoder
-        rejected = {f"rejected: {reason}": count for reason, count in dict(decoder.rejected).items()}
         decoded = {
             "decoded": decoder.decoded,
             "unused": decoder.unused,
@@ -174,11 +174,10 @@ class Autopilot(Source[AutopilotSettings]):
             "clock restarts": decoder.clock.restarts,
             "timesync replies": decoder.clock.round_trips,
             **_clock_counters(decoder.clock),
-            **rejected,
         }
         live = {} if self._session is None else self._session.counters
         not_connected = {"poses while not connected": self._not_connected} if self._not_connected else {}
-        return decoded | live | not_connected
+        return Counters(decoded | live | not_connected, decoder.rejected)
 
 
 def _clock_counters(clock: DeviceClock) -> dict[str, int]:

@@ -14,6 +14,7 @@ from typing import Any
 from flow.graph import Graph
 from flow.link import LinkError, Record, Source
 from links.mavlink.autopilot import Autopilot
+from links.mavlink.frame_decoder import FOREIGN_TIMESYNC
 from links.mavlink.parameters import ParameterValues, ask_parameters
 from links.mavlink.profiles import PROFILES, ProfileName, findings
 from links.mavlink.transport.framing import header, parse_frame
@@ -180,7 +181,7 @@ def _clock(source: ObservedSource, status: AutopilotStatus) -> CheckResult:
     if status.clock_offset_ns is None:
         return fail(name, "no message has a time stamp: request ATTITUDE")
     if status.clock_uncertainty_ns is None:
-        foreign = source.counters.get("rejected: TIMESYNC for another component", 0)
+        foreign = source.counters.rejected.get(FOREIGN_TIMESYNC, 0)
         why = (
             "does it receive our frames?"
             if not foreign

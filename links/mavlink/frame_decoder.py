@@ -21,6 +21,7 @@ from stages.messages import AutopilotStatus
 HALF_MS_NS = 500_000  # time_boot_ms is truncated, on average half a millisecond early
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 CRITICAL = 5  # MAV_STATE_CRITICAL; above: emergency, poweroff, termination
+FOREIGN_TIMESYNC = "TIMESYNC for another component"  # reason in `rejected`
 LATE = 128  # a sequence number this far ahead is a late frame, not 128 lost frames
 
 
@@ -121,7 +122,7 @@ class FrameDecoder:
             self.clock.forget_replies()
         targets = zip(timesync_target(record.data), self._own, strict=True)
         if not matches and (self._matched or any(name not in (0, ours) for name, ours in targets)):
-            self._refuse("TIMESYNC for another component")
+            self._refuse(FOREIGN_TIMESYNC)
         elif not self.clock.round_trip(frame.ts1, frame.tc1, record.arrival_ns):
             self._refuse("TIMESYNC foreign or too slow")
 

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from flow.config.draw import mermaid
+from flow.counters import Counters
 from flow.graph import Graph
 from flow.link import TRUTH_TOPICS, Record, Run, Source, Tap
 from flow.live import Live
-from flow.live.report import LiveReport
+from flow.live.report import LinkState, LiveReport
 from flow.message import Message
 from flow.replay import Replay
 from links.clock import host_time
@@ -95,7 +96,7 @@ def collect_live(graph: Graph, meanwhile: Callable[[ObservationTap], None]) -> O
         meanwhile(tap)
         report, end_ns = live.report(), host_time.now_ns()
         statuses = {name: _status(name, link, report) for name, link in sources.items()}
-        counters = {name: dict(link.counters) for name, link in sources.items()}
+        counters = {name: Counters.of(link.counters) for name, link in sources.items()}
     finally:
         live.stop()
     observed = [
@@ -110,8 +111,8 @@ def _status(name: str, link: Source, report: LiveReport) -> str | None:
     if type(link).listen is Source.listen:
         return f"{type(link).__name__} cannot run live"
     reported = report.links[name]
-    if link.status is not None or reported.state not in ("open", "closed"):
-        return link.status or reported.state
+    if link.status is not None or reported.state not in (LinkState.OPEN, LinkState.CLOSED):
+        return link.status or reported.state_text
     raised = [event.text for event in report.events if event.node == name]
     return raised[-1] if reported.undecoded and raised else None
 
@@ -128,7 +129,7 @@ def collect_recording(graph: Graph, session: Session, progress: Progress | None 
             runner.feed(record)
     runner.finish()
     observed = [
-        ObservedSource(name, link, tap.observation(name), dict(link.counters), None, session.end_ns, live=False)
+        ObservedSource(name, link, tap.observation(name), Counters.of(link.counters), None, session.end_ns, live=False)
         for name, link in sources.items()
     ]
     return _observations(graph, observed, tap, live=False)

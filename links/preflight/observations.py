@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from flow.counters import Counters
 from flow.link import Link, Record
 from flow.message import Message
 from links.preflight.record_statistics import RecordStatistics
@@ -46,7 +47,7 @@ class ObservedSource:
     name: str
     link: Link
     observation: Observation
-    counters: Mapping[str, int]
+    counters: Counters
     status: str | None  # error text of the link; None: it works
     end_ns: int  # end of the observation, host time
     live: bool

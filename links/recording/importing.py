@@ -217,7 +217,7 @@ class _Capture(_ImportedFile):
             name = vlp16.OTHER_PRODUCTS.get(product, f"an unknown model (product id 0x{product:02x})")
             raise LinkError(
                 f"{self._source}: the packet at byte {datagram.offset} is from {name}, not a VLP-16:"
-                " its beams are elsewhere, every point would be misplaced. Import a VLP-16's capture"
+                " its beams have other elevations, so that every point would be wrong. Import a VLP-16's capture"
             )
 
 

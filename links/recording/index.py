@@ -1,7 +1,7 @@
-"""Where everything is in a recording: from the summary of a finished file, else by a scan from record to record.
+"""Index of a recording: read from the summary of a finished file, else built by a scan of the record headers.
 
-Both read record headers only, so that two hours of recording open in a moment. Nothing found in the file is believed
-before it is checked: lengths against the file's size, sizes against MAX_CHUNK_BYTES, contents against their CRC.
+Both read record headers only, so that a recording of two hours opens quickly. All values of the file are checked before
+use: lengths against the file's size, sizes against MAX_CHUNK_BYTES, contents against their CRC.
 
 Source: MCAP specification 0 (https://mcap.dev/spec).
 """

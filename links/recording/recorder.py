@@ -1,9 +1,9 @@
-"""The recorder of a live run: every record that came in and every one that was sent, from the first to the last.
+"""The recorder of a live run: every received and every sent record.
 
 A session is one file, or several parts (flight.mcap, flight-2.mcap, ...): each has the rig and the configuration and
-can be replayed alone. A thread of its own opens and closes parts and looks after the disk; a sensor's thread only puts
-its record into the writer's queue. When the disk is nearly full, or fails, recording stops, the run goes on, and it is
-tried again. A killed run leaves what was recorded up to 0.5 s before (`RecordingWriter`).
+can be replayed alone. A separate thread opens and closes parts and checks the disk; a sensor's thread only puts its
+record into the writer's queue. When the disk is nearly full, or fails, recording stops, the run continues, and
+recording is retried. A killed run leaves the records up to 0.5 s before (`RecordingWriter`).
 
 Source: ours; recordings/README.md.
 """
@@ -25,9 +25,9 @@ from flow.message import Message
 from flow.stage import Settings
 from links.recording.writer import RecordingWriter
 
-LOOK_S = 0.25  # how often size, age and disk are looked at
+CHECK_S = 0.25  # period of the checks of size, age and disk
 MB = 1_000_000
-AGAIN_S = 10.0  # a recording that had to stop is tried again so often
+RETRY_S = 10.0  # period of retries after a stop
 SESSION, PART = "session", "part"
 """Metadata of a recording: which run it is of, and its number among that run's parts, from 1."""
 
@@ -115,7 +115,7 @@ class Recorder(Tap[RecorderSettings]):
         self._end_part(self._swap(None))
 
     def _look_after(self) -> None:
-        while not self._closing.wait(LOOK_S):
+        while not self._closing.wait(CHECK_S):
             try:
                 self._look()
             except LinkError as error:
@@ -125,7 +125,7 @@ class Recorder(Tap[RecorderSettings]):
         settings = self.settings
         writer, now_s = self._intake.writer, time.monotonic()
         if writer is None:
-            if now_s >= self._stopped_s + AGAIN_S and self._free_bytes() > 2 * settings.reserve_mb * MB:
+            if now_s >= self._stopped_s + RETRY_S and self._free_bytes() > 2 * settings.reserve_mb * MB:
                 self._begin_part()
         elif writer.status is not None:
             self._give_up(writer.status)
@@ -194,7 +194,7 @@ class Recorder(Tap[RecorderSettings]):
         return self._before[0] + now[0], self._before[1] + now[1]
 
     def _free_bytes(self) -> int:
-        """LinkError when the disk does not say: it is gone, or the folder is."""
+        """Free space of the disk; LinkError when the disk or the folder is missing."""
         assert self._run is not None
         try:
             return shutil.disk_usage(self._run.out_dir).free

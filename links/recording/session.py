@@ -107,7 +107,7 @@ class Session:
         first = found[1].path.name if 1 in found else "which is not in the folder"
         text = f"{named.path} is part {named.number} of its run"
         if whole:
-            raise LinkError(f"{text}: a run is taken again from its first part, {first}")
+            raise LinkError(f"{text}: replay the run from its first part, {first}")
         self._note([f"{text}, and read alone; all parts are read where the first is named, {first}"])
 
     def _report_missing(self, missing: list[int], there: int, whole: bool) -> None:

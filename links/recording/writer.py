@@ -32,7 +32,7 @@ from links.recording.mcap_file import McapFile
 QUEUE_BYTES = 64 * 2**20  # waiting for the disk: 5 s of two cameras and the lidar
 FLUSH_S = 0.25
 SYNC_S = 1.0
-CLOSE_TIMEOUT_S = 30.0  # for a disk that hangs
+CLOSE_TIMEOUT_S = 30.0  # for a disk that does not respond
 _POLL_S = 0.05
 _RECORD_BYTES = 64  # queue size of a record in addition to its data
 
@@ -97,7 +97,7 @@ class RecordingWriter:
         except OSError as error:
             with suppress(OSError):  # what is buffered cannot be written either
                 self._stream.close()
-            if not overwrite and self.path.is_file():  # nothing is in it, and it would be in the way of the next try
+            if not overwrite and self.path.is_file():  # it is empty, and would block the next attempt
                 with suppress(OSError):
                     self.path.unlink()
             raise LinkError(self._disk_status(error)) from None

@@ -11,9 +11,10 @@ from typing import overload
 
 import numpy as np
 
-from stages.messages import DroneFix
+from stages.messages import DroneFix, MeanShiftResult
 
 INTEGERS, FLOATS = 4, 16  # numbers of each kind per fix
+NO_MEAN_SHIFT = -1, 0.0  # iterations and shift_m of a fix without it
 
 
 class FixLog(Sequence[DroneFix]):
@@ -25,8 +26,11 @@ class FixLog(Sequence[DroneFix]):
     def append(self, fix: DroneFix) -> None:
         """Append a fix."""
         velocity = fix.velocity_vehicle_mps
-        self._integers.extend((fix.stamp_ns, fix.hits, fix.iterations, fix.track_id))
-        self._floats.append(fix.shift_m)
+        iterations, shift_m = NO_MEAN_SHIFT
+        if fix.mean_shift is not None:
+            iterations, shift_m = fix.mean_shift.iterations, fix.mean_shift.shift_m
+        self._integers.extend((fix.stamp_ns, fix.hits, iterations, fix.track_id))
+        self._floats.append(shift_m)
         self._floats.extend(fix.xyz_vehicle_m.tolist())
         self._floats.extend(fix.covariance_m2.ravel().tolist())
         self._floats.extend((np.nan, np.nan, np.nan) if velocity is None else velocity.tolist())
@@ -51,8 +55,9 @@ class FixLog(Sequence[DroneFix]):
             xyz_vehicle_m=np.array(floats[:3]),
             covariance_m2=np.array(floats[3:12]).reshape(3, 3),
             hits=hits,
-            iterations=iterations,
-            shift_m=shift_m,
+            mean_shift=None
+            if iterations == NO_MEAN_SHIFT[0]
+            else MeanShiftResult(iterations=iterations, shift_m=shift_m),
             track_id=track_id,
             velocity_vehicle_mps=None if np.isnan(velocity[0]) else velocity,
         )

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import math
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from links.runs.fix_log import FixLog
 from links.runs.result_file import ResultFile
 from stages.geometry.frames import quaternions_xyzw
 from stages.messages import (
+    CandidateEvidence,
     Candidates,
     DepthImage,
     Detections,
@@ -33,6 +33,7 @@ from stages.messages import (
     PositionEstimate,
     RelativePose,
     RelativeRotation,
+    SearchResult,
     TrackState,
 )
 
@@ -53,7 +54,6 @@ POSE_HEAD = "# T_vehicle_drone, fused; '0 0 0 1' where the rotation is unknown: 
 UNKNOWN_RAD2 = math.pi**2  # variance of an unknown rotation in the table, which has no infinity
 UPPER_3, UPPER_6 = np.triu_indices(3), np.triu_indices(6)
 WRITTEN = (DroneFix, DepthImage, Detections, Candidates, TrackState, RelativeRotation, RelativePose)
-_NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
 
 
 def drone_file(name: str, number: int) -> str:
@@ -110,9 +110,8 @@ class Results(Tap[ResultsSettings]):
         self._sweep_start_ns: dict[int, int] = {}  # of the newest depth image, by its stamp
         self._last_sweep_ns: int | None = None
         self._fixes = FixLog()
-        self._sweeps: Counter[str] = Counter()
-        self._examples: dict[str, str] = {}  # of each kind of search result
-        self._sweeps_with_drone: int = 0
+        self._searches: Counter[SearchResult] = Counter()
+        self._examples: dict[SearchResult, str] = {}  # first summary of each
         self._transitions: list[Transition] = []
         self._state: dict[int, str] = {}  # of each track
         self._pose_state: PoseState | None = None
@@ -128,17 +127,17 @@ class Results(Tap[ResultsSettings]):
     @property
     def sweeps_with_drone(self) -> int:
         """Sweeps in which the detector accepted a candidate."""
-        return self._sweeps_with_drone
+        return self._searches[SearchResult.DRONE]
 
     @property
     def sweeps(self) -> int:
         """Sweeps that the detector searched."""
-        return sum(self._sweeps.values())
+        return sum(self._searches.values())
 
     @property
-    def search_results(self) -> list[tuple[str, int]]:
-        """Summaries by the detector and their counts, most frequent first; numbers in them are ignored."""
-        return [(self._examples[kind], count) for kind, count in self._sweeps.most_common()]
+    def search_results(self) -> list[tuple[SearchResult, int, str]]:
+        """Results of the searches with their counts and the detector's first summary of each, most frequent first."""
+        return [(result, count, self._examples[result]) for result, count in self._searches.most_common()]
 
     @property
     def pose_states(self) -> dict[str, int]:
@@ -179,16 +178,15 @@ class Results(Tap[ResultsSettings]):
             self._fixes.append(message)
             self._files[FIX_FILE].write(tum_line(message.stamp_ns, message.xyz_vehicle_m))
             upper = message.covariance_m2[UPPER_3]
-            counts = [message.hits, message.iterations, message.track_id]
+            iterations = "" if message.mean_shift is None else message.mean_shift.iterations
+            counts = [message.hits, iterations, message.track_id]
             self._covariance.writerow([stamp_s(message.stamp_ns), *_digits(upper), *counts])
         elif isinstance(message, DepthImage):
             self._sweep_start_ns = {message.stamp_ns: message.start_ns}
         elif isinstance(message, Detections):
             self._write_detections(message)
-            kind = _NUMBER.sub("#", message.summary)
-            self._sweeps[kind] += 1
-            self._examples.setdefault(kind, message.summary)
-            self._sweeps_with_drone += bool(message.accepted.any())
+            self._searches[message.result] += 1
+            self._examples.setdefault(message.result, message.summary)
             self._log(message.stamp_ns, output, message.summary)
         elif isinstance(message, Candidates):
             self._write_candidates(message)
@@ -214,13 +212,15 @@ class Results(Tap[ResultsSettings]):
 
         The start of a search is in its message, else it is that of its depth image, else the end of the search before.
         """
-        start_ns = message.start_ns
-        if start_ns is None:
+        evidence = message.evidence
+        if isinstance(evidence, CandidateEvidence):
+            start_ns, scores = evidence.start_ns, evidence.log_odds
+        else:
             previous_ns = self._last_sweep_ns if self._last_sweep_ns is not None else message.stamp_ns
-            start_ns = self._sweep_start_ns.get(message.stamp_ns, previous_ns)
+            start_ns, scores = self._sweep_start_ns.get(message.stamp_ns, previous_ns), evidence.e
         self._last_sweep_ns = message.stamp_ns
         span = [stamp_s(start_ns), stamp_s(message.stamp_ns)]
-        accepted = zip(message.xyz_vehicle_m[message.accepted], message.score[message.accepted], strict=True)
+        accepted = zip(message.xyz_vehicle_m[message.accepted], scores[message.accepted], strict=True)
         lines = [[*span, *(f"{v:.4f}" for v in xyz), f"{score:.6g}"] for xyz, score in accepted]
         self._detections.writerows(lines or [[*span, "", "", "", ""]])
 

@@ -35,7 +35,10 @@ def summary(run: RunResult, request: RunRequest) -> dict[str, Any]:
         "messages": report.messages,
         "sweeps": results.sweeps,
         "sweeps_with_drone": results.sweeps_with_drone,
-        "search_results": [{"sweeps": count, "example": example} for example, count in results.search_results],
+        "search_results": [
+            {"result": result.value, "sweeps": count, "example": example}
+            for result, count, example in results.search_results
+        ],
         "fixes": len(results.fixes),
         "poses": {"states": results.pose_states, "resets": results.resets},
         "states": [
@@ -43,7 +46,7 @@ def summary(run: RunResult, request: RunRequest) -> dict[str, Any]:
             for t in results.transitions
         ],
         "warnings": run.warnings,
-        "counters": report.counters,
+        "counters": {name: dict(counters) for name, counters in report.counters.items()},
         "wall_s": round(run.wall_s, 3),
         "compute_ms": {
             name: {
@@ -74,7 +77,7 @@ def _live_values(report: LiveReport, usage: Usage | None) -> dict[str, Any]:
         "dropped": report.dropped,
         "missed_deadlines": report.missed,
         "edges": edges,
-        "links": {name: asdict(link) for name, link in report.links.items()},
+        "links": {name: asdict(link) | {"state": link.state.value} for name, link in report.links.items()},
         "restarts": report.restarts,
         "failures": report.failures,
         "switched_off": report.switched_off,

@@ -39,7 +39,7 @@ def odometry_check(source: ObservedSource, link: VehicleOdometry) -> CheckResult
     if not records.count:
         text = f"{source.no_data_reason}: the vehicle would be assumed parked"
         return fail(source.name, f"{text}; start it, or set port: null") if source.live else warning(source.name, text)
-    rejected, age_ms = source.counters.get("rejected", 0), 1e-6 * records.max_age_ns
+    rejected, age_ms = sum(source.counters.rejected.values()), 1e-6 * records.max_age_ns
     text = f"{records.rate_hz:.0f} poses/s, at most {age_ms:.0f} ms old" + (
         f", {rejected} rejected" if rejected else ""
     )

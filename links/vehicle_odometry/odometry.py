@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field, model_validator
 
+from flow.counters import Counters
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.vehicle_odometry.udp import listen_udp
 from stages.geometry.frames import Array64, rotation_from_quaternion_xyzw
@@ -62,9 +63,9 @@ class VehicleOdometry(Source[VehicleOdometrySettings]):
         return self._rejected
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """Totals since the start: rejected, from other senders."""
-        return {"rejected": self._rejected, **self._udp}
+        return Counters(self._udp, {"no valid pose": self._rejected})
 
     def listen(self) -> AbstractContextManager[Iterator[Record]]:
         """Receive poses: `with odometry.listen() as records`. LinkError without `port`, or when it cannot be opened."""

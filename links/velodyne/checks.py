@@ -107,10 +107,7 @@ def _sentence(text: str) -> str:
 
 
 def _rejected(source: ObservedSource) -> str:
-    prefix = "rejected: "
-    return ", ".join(
-        f"{n} {what.removeprefix(prefix)}" for what, n in source.counters.items() if what.startswith(prefix) and n
-    )
+    return ", ".join(f"{count} {reason}" for reason, count in source.counters.rejected.items() if count)
 
 
 def _rate(source: ObservedSource, observation: LidarObservation, timeout_s: float) -> CheckResult:

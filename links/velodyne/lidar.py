@@ -19,6 +19,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
+from flow.counters import Counters
 from flow.link import LinkError, Record, Source, SourceSettings
 from links.velodyne import vlp16
 from links.velodyne.decode import FiringRows, compile_kernels
@@ -146,18 +147,17 @@ class Lidar(Source[LidarSettings]):
         )
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """Totals since the start: packets decoded, lost, rejected by reason, foreign; clock disagreements."""
         stream = self._stream
-        rejected = {f"rejected: {reason.value}": count for reason, count in stream.rejected.items()}
-        return {
+        totals = {
             "decoded": stream.decoded,
             "lost": stream.lost,
             "clock disagreements": stream.clock.disagreements,
             "from other senders": self._udp.foreign,
             **self._pps.counters,
-            **rejected,
         }
+        return Counters(totals, {reason.value: count for reason, count in stream.rejected.items()})
 
 
 class PacketStream:

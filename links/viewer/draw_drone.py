@@ -26,7 +26,7 @@ from links.viewer.entities import (
 )
 from links.viewer.scene import DRONE_FRAME, ViewerScene, drone_transform
 from stages.geometry.frames import Array64
-from stages.messages import Candidates, Detections, DroneFix, TrackingState, TrackState
+from stages.messages import CandidateEvidence, Candidates, Detections, DroneFix, KernelScores, TrackingState, TrackState
 
 RING_PX = 14.0  # radius of the ring around a candidate in the images
 PROBABILITY_COLOURS = np.array([colours.CANDIDATE, colours.NEUTRAL], dtype=np.uint32)
@@ -68,10 +68,11 @@ def candidates(message: Candidates, name: str, scene: ViewerScene) -> Entities:
 
 def detections(message: Detections, name: str, scene: ViewerScene) -> Entities:
     """Accepted and rejected candidates of a search, with reasons: in 3D, in the depth image and as text."""
-    numbers = np.arange(1, len(message.score) + 1) if message.candidate_id is None else message.candidate_id
-    confidence = [f"e = {e:.1f}" for e in message.score]
-    if message.probability is not None:
-        confidence = [_percent(p) for p in message.probability]
+    evidence = message.evidence
+    if isinstance(evidence, CandidateEvidence):
+        numbers, confidence = evidence.candidate_id, [_percent(p) for p in evidence.probability]
+    else:
+        numbers, confidence = np.arange(1, len(message.accepted) + 1), [f"e = {e:.1f}" for e in evidence.e]
     for kind, chosen, colour in (
         ("rejected", ~message.accepted, colours.REJECTED),
         ("accepted", message.accepted, colours.ACCEPTED),
@@ -82,10 +83,10 @@ def detections(message: Detections, name: str, scene: ViewerScene) -> Entities:
         yield Entity(f"vehicle/{name}/{kind}", points, frame="vehicle")
         if scene.depth is not None:
             yield _rings(scene, f"overlays/{name}/{kind}", xyz_m, labels, colour, show_labels=kind == "accepted")
-        if kind == "accepted" and message.candidate_id is None:  # else Candidates draws its current position
+        if kind == "accepted" and isinstance(evidence, KernelScores):  # else Candidates draws its current position
             yield label(name, xyz_m, [text.split(",")[0] for text in labels], colour)
-    if message.probability is not None:
-        percent = 100.0 * message.probability
+    if isinstance(evidence, CandidateEvidence):
+        percent = 100.0 * evidence.probability
         best = [percent[chosen].max(initial=0.0) for chosen in (message.accepted, ~message.accepted)]
         yield plot(f"plots/probability/{name}", best, ["accepted", "best rejected"], DETECTION_COLOURS)
     found = bool(message.accepted.any())
@@ -125,8 +126,9 @@ def drone_fix(message: DroneFix, name: str, scene: ViewerScene) -> Entities:
     yield plot(f"plots/position/{path}", xyz_m, axes, colours.AXES)
     sigma_m = np.sqrt(np.diag(message.covariance_m2))
     yield plot(f"plots/sigma/{path}", sigma_m, [f"{which}sigma {axis}" for axis in "xyz"], colours.AXES)
-    solver = [message.iterations, message.shift_m]
-    yield plot(f"plots/other/{path}", solver, [f"{which}iterations", f"{which}last shift [m]"])
+    if message.mean_shift is not None:
+        solver = [message.mean_shift.iterations, message.mean_shift.shift_m]
+        yield plot(f"plots/other/{path}", solver, [f"{which}iterations", f"{which}last shift [m]"])
     if message.velocity_vehicle_mps is not None:
         names = [f"{which}{axis} [m/s]" for axis in ("x forward", "y left", "z up")]
         yield plot(f"plots/other/{path}/velocity", message.velocity_vehicle_mps, names)

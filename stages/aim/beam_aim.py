@@ -1,14 +1,14 @@
-"""Aim beams: sweep without blind spots, stop at what may be a drone, and then keep a beam on it, turn after turn.
+"""Aiming of beams: sweeps without gaps, observes candidates until they are classified, and keeps a beam on each track.
 
-    no track, no candidate     sweep the whole travel, there and back
-    candidate                  look at it and at what is around it until the detector has decided, then go on
-    TRACKING, COASTING         each turn of the rotor one beam on the predicted place, a little beside it in turn;
-                               while coasting farther and farther beside it, then sweep
-    several drones             a few turns for each in turn; fewer than expected: a piece of the sweep between
+    no track, no candidate     sweep the whole travel, forth and back
+    candidate                  point beams at it and around it until the detector has classified it, then continue
+    TRACKING                   each rotor turn points one beam at the predicted position, with small alternating offsets
+    COASTING                   the offsets grow with the uncertainty; above `coast_sigma_m` sweep
+    several drones             a few observations of each in turn; fewer than expected: a segment of the sweep between
 
-The rotor's azimuth says when it passes a direction next. The table is moved between two passes and stands still when
-the rotor passes, so that offsets are chosen, not left to a beat between two periods. Of all beams that can be put on
-the place the one is taken that needs the least movement and lies near the fan's middle.
+The rotor's azimuth determines when it passes a direction next. The table moves between two passes and stands still
+during a pass, so that the offsets are chosen and do not depend on the beat of two periods. Of all beams that can be
+pointed at the position, the one of least movement near the fan's middle is used.
 
 Source: ours, for P III.A and III.C.
 """
@@ -23,43 +23,50 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.aim.beams import Rotor, cheapest, low_discrepancy, nearest, rotor_azimuth_rad, sweep_step_rad
-from stages.aim.search_offset import Look, best_offset_m
-from stages.aim.sweeping import Sweeping
+from stages.aim.beams import (
+    Rotor,
+    best_pointing,
+    low_discrepancy,
+    nearest_pointing,
+    rotor_azimuth_rad,
+    sweep_step_rad,
+)
+from stages.aim.search_offset import MissedObservation, best_offset_m
+from stages.aim.sweep_trajectory import SweepTrajectory
 from stages.aim.targets import Key, Target, Targets
 from stages.geometry.frames import LidarMount
 from stages.messages import Candidates, LidarFirings, ServoGoal, ServoState, TrackState
 from stages.sweep.turntable import GearPlay
 
-TOLD_NS = 12_000_000  # after its pass a look has been told of
-SHORTEST_LOOK_NS = 5_000_000
-FIRST_GUESS_S = 0.05  # to the rotor's next pass
-INNER_RAD = math.radians(8.0)
-GLANCE_RAD = math.radians(12.0)  # beside the sweep: its fan is 30 deg wide
-FRESH_NS = 350_000_000  # met a moment ago
-MOST_TRIED = 24  # looks that missed are remembered; it flies on
-HALF_SHARE = 0.3  # of its span: a beam so far from its middle meets it now and then
+RESULT_NS = 12_000_000  # from a pass to the detector's and tracker's output about it
+MIN_OBSERVATION_NS = 5_000_000
+INITIAL_PASS_S = 0.05  # first estimate of the time to the rotor's next pass
+INNER_RAD = math.radians(8.0)  # beams with a larger elevation are used only when others need much more movement
+SWEEP_DEVIATION_RAD = math.radians(12.0)  # of an observation during the sweep; the fan is 30 deg wide
+FRESH_NS = 350_000_000  # a candidate with a return this recent may be observed during the sweep
+MAX_MISSED = 24  # missed observations that are remembered; older ones are obsolete, the drone moves
+HALF_DETECTION = 0.3  # of the span: a beam so far from its middle has half the detection probability
 RPM_RADPS = math.tau / 60.0
 
 
 @dataclass(slots=True, eq=False)
-class _Now:
-    sweeping: Sweeping
+class _State:
+    sweep: SweepTrajectory
     play: GearPlay
     rotor: Rotor = field(default_factory=Rotor)
     servo_rad: float | None = None
     elevations_rad: tuple[float, ...] = ()
     targets: Targets = field(default_factory=Targets)
-    hold_until_ns: int = 0  # a look is planned until then
-    current: Key | None = None
-    turns: int = 0  # in a row for the current one
-    searching: bool = False  # for more drones, between looks at those there are
+    hold_until_ns: int = 0  # end of the planned observation
+    current: Key | None = None  # target of the planned observation
+    consecutive: int = 0  # observations of the current target, less one
+    searching: bool = False  # for more drones, between observations of tracks
     search_until_ns: int = 0
-    served: int = 0  # looks at tracks since the last piece of the search
+    track_observations: int = 0  # since the last search segment
 
     @property
     def spacing_rad(self) -> float:
-        """Between two beams of the fan."""
+        """Angle between two beams of the fan."""
         w = self.elevations_rad
         return (w[-1] - w[0]) / (len(w) - 1) if len(w) > 1 else math.tau
 
@@ -67,213 +74,226 @@ class _Now:
 class BeamAimSettings(Settings):
     """Settings of `BeamAim`."""
 
-    mount: LidarMount
-    span_m: float = Field(0.5, gt=0, le=10)
-    travel_deg: tuple[float, float] = (0.0, 180.0)
-    limit_rpm: float = Field(55.0, gt=0)  # MX-28AR at 12 V
-    search_rpm: float = Field(20.0, gt=0)  # about; adjusted to the rotor so that no direction is left out
-    lead_s: float = Field(0.03, ge=0)  # from deciding to the servo's obeying
-    settle_s: float = Field(0.015, ge=0)  # from arriving to standing still
-    candidate_looks: int = Field(25, ge=1)  # then it is left alone for `candidate_rest_s`
-    candidate_rest_s: float = Field(1.0, gt=0)
-    candidate_probability: float = Field(0.014, ge=0, lt=1)  # less is not worth stopping for
-    stop_probability: float = Field(0.3, ge=0, le=1)  # more, met `stop_looks` times, interrupts the sweep
-    patience: int = Field(8, ge=1, le=MOST_TRIED)  # looks in a row that missed a sure candidate; fewer, if doubtful
-    stop_looks: int = Field(2, ge=1)  # it was seen in so many turns of the rotor before it interrupts the sweep
-    glances: int = Field(3, ge=0)  # at a candidate in passing
-    turns_each: int = Field(3, ge=1)  # for each of several drones
-    max_drones: int = Field(1, ge=1, le=8)  # with fewer tracks the search goes on between looks at them
-    search_s: float = Field(0.35, gt=0)  # at a time
-    beams: bool = True  # ablation: without, the middle of the fan is put on the drone
-    coast_sigma_m: float = Field(3.0, gt=0)  # less known while coasting, the whole travel is swept
+    mount: LidarMount  # poses of turntable and LiDAR, and the servo's zero, sign and errors
+    span_m: float = Field(0.5, gt=0, le=10)  # largest dimension of the drone
+    travel_deg: tuple[float, float] = (0.0, 180.0)  # servo positions that may be commanded
+    limit_rpm: float = Field(55.0, gt=0)  # maximum servo speed; MX-28AR at 12 V
+    search_rpm: float = Field(20.0, gt=0)  # of the sweep, adjusted so that the beams cover all directions
+    latency_s: float = Field(0.03, ge=0)  # from a goal to the start of the servo's movement
+    settle_s: float = Field(0.015, ge=0)  # from arrival at the goal to standstill
+    max_observations: int = Field(25, ge=1)  # of a candidate; then it is excluded for `cooldown_s`
+    cooldown_s: float = Field(1.0, gt=0)  # doubles with each repetition, up to 16-fold
+    min_probability: float = Field(0.014, ge=0, lt=1)  # candidates with a lower one are ignored
+    stop_probability: float = Field(0.3, ge=0, le=1)  # with it and `stop_scan_passes` a candidate interrupts the sweep
+    stop_scan_passes: int = Field(2, ge=1)  # scan passes with returns, needed to interrupt the sweep
+    max_missed: int = Field(8, ge=1, le=MAX_MISSED)  # consecutive misses of a candidate of probability 1; else fewer
+    sweep_observations: int = Field(3, ge=0)  # of a candidate, without an interruption of the sweep
+    observations_per_track: int = Field(3, ge=1)  # consecutive ones of each track, if there are several
+    max_drones: int = Field(1, ge=1, le=8)  # with fewer tracks the search continues between observations of tracks
+    search_s: float = Field(0.35, gt=0)  # duration of a search segment between observations of tracks
+    beams: bool = True  # point a beam at the drone; False (ablation): the middle of the fan
+    coast_sigma_m: float = Field(3.0, gt=0)  # a track with a larger position sigma is searched with the full sweep
 
     @model_validator(mode="after")
     def _settings_agree(self) -> BeamAimSettings:
         if self.travel_deg[1] <= self.travel_deg[0]:
-            raise ValueError("travel_deg must be two growing angles")
+            raise ValueError("travel_deg must be two increasing angles")
         return self
 
 
 class BeamAim(Stage[BeamAimSettings]):
-    """Keeps a beam on the drone; searches when there is none."""
+    """Keeps a beam on each tracked drone, and searches while there are fewer than `max_drones`."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"candidates"})
 
     def __init__(self, settings: BeamAimSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._now = _Now(Sweeping(*self._travel_rad), GearPlay(self.settings.mount))
+        self._state = _State(SweepTrajectory(*self._travel_rad), GearPlay(self.settings.mount))
 
     @property
     def _travel_rad(self) -> tuple[float, float]:
         return math.radians(self.settings.travel_deg[0]), math.radians(self.settings.travel_deg[1])
 
     def on_firings(self, firings: LidarFirings) -> None:
-        """Keep track of the rotor."""
-        self._now.rotor.hear(firings)
-        if not self._now.elevations_rad:
-            self._now.elevations_rad = tuple(sorted(float(w) for w in firings.laser_elevation_rad))
+        """Update the rotor's azimuth and rate."""
+        self._state.rotor.update(firings)
+        if not self._state.elevations_rad:
+            self._state.elevations_rad = tuple(sorted(float(w) for w in firings.laser_elevation_rad))
 
     def on_candidates(self, candidates: Candidates) -> None:
-        """What is worth another look now."""
-        self._now.targets.hear_candidates(candidates, self.settings.candidate_probability)
+        """Update the candidates that need further observations."""
+        self._state.targets.update_candidates(candidates, self.settings.min_probability)
 
     def on_state(self, state: TrackState) -> None:
-        """Where each track is predicted."""
-        self._now.targets.hear_state(state)
+        """Update a track's predicted position."""
+        self._state.targets.update_track(state)
 
     def on_servo(self, servo: ServoState) -> ServoGoal | None:
-        """A new goal when the last look is over, or at once when something else is to be done."""
-        now = self._now
+        """A new goal at the end of the planned observation, or at once when the target changes; else None."""
+        state = self._state
         if not self.settings.mount.turns:
             return None
-        if now.servo_rad is not None:
-            now.play.move(math.remainder(servo.position_rad - now.servo_rad, math.tau))
-        now.servo_rad = servo.position_rad
+        if state.servo_rad is not None:
+            state.play.move(math.remainder(servo.position_rad - state.servo_rad, math.tau))
+        state.servo_rad = servo.position_rad
         target = self._choose(servo)
-        if target is None or now.rotor.rate_radps <= 0 or not now.elevations_rad:
-            if now.current is not None:
-                now.current = None
-                now.sweeping.stop()
+        if target is None or state.rotor.rate_radps <= 0 or not state.elevations_rad:
+            if state.current is not None:
+                state.current = None
+                state.sweep.stop()
             return self._sweep(servo)
-        planned = now.targets.get(now.current)
-        if servo.stamp_ns < now.hold_until_ns and planned is not None and (planned is target or target.glance):
+        planned = state.targets.get(state.current)
+        if servo.stamp_ns < state.hold_until_ns and planned is not None and (planned is target or target.keeps_sweep):
             return None
-        return self._look(servo, target)
+        return self._observe(servo, target)
 
-    # what to look at
+    # choice of the target
 
     def _choose(self, servo: ServoState) -> Target | None:
+        """The target of the next observation, or None to sweep."""
         settings = self.settings
-        now = self._now
-        now.targets.tidy(servo.stamp_ns, settings.candidate_looks, settings.candidate_rest_s)
-        tracks = now.targets.tracks(settings.coast_sigma_m)
+        state = self._state
+        state.targets.expire(servo.stamp_ns, settings.max_observations, settings.cooldown_s)
+        tracks = state.targets.tracks(settings.coast_sigma_m)
         if not tracks or len(tracks) >= settings.max_drones:
-            now.searching, now.served, now.sweeping.left_off_rad = False, 0, None
-        elif self._searches_on(len(tracks), servo):
-            return self._candidate(servo.stamp_ns)
+            state.searching, state.track_observations, state.sweep.resume_rad = False, 0, None
+        elif self._search_is_due(len(tracks), servo):
+            return self._choose_candidate(servo.stamp_ns)
         if not tracks:
-            return self._candidate(servo.stamp_ns)
-        current = now.targets.get(now.current)
-        if current in tracks and (len(tracks) == 1 or now.turns < settings.turns_each):
+            return self._choose_candidate(servo.stamp_ns)
+        current = state.targets.get(state.current)
+        if current in tracks and (len(tracks) == 1 or state.consecutive < settings.observations_per_track):
             return current
-        after = [t for t in tracks if now.current is not None and t.key > now.current]
+        after = [t for t in tracks if state.current is not None and t.key > state.current]
         return (after or tracks)[0]
 
-    def _searches_on(self, tracks: int, servo: ServoState) -> bool:
-        """Whether each track has had its turns: time for a piece of the sweep, from where the last one ended."""
+    def _search_is_due(self, track_count: int, servo: ServoState) -> bool:
+        """Whether each track had its observations, so that a segment of the sweep follows."""
         settings = self.settings
-        now = self._now
-        if now.searching and servo.stamp_ns < now.search_until_ns:
+        state = self._state
+        if state.searching and servo.stamp_ns < state.search_until_ns:
             return True
-        left_off = now.sweeping.left_off_rad
-        if now.searching:
-            now.searching, now.served = False, 0
-            now.sweeping.left_off_rad = left_off = servo.position_rad
-        if now.served >= settings.turns_each * tracks and servo.stamp_ns >= now.hold_until_ns:
-            way_rad = 0.0 if left_off is None else abs(left_off - servo.position_rad)
-            now.searching = True
-            now.search_until_ns = servo.stamp_ns + round(
-                (settings.search_s + way_rad / (settings.limit_rpm * RPM_RADPS)) * 1e9
+        resume_rad = state.sweep.resume_rad
+        if state.searching:
+            state.searching, state.track_observations = False, 0
+            state.sweep.resume_rad = resume_rad = servo.position_rad
+        due = state.track_observations >= settings.observations_per_track * track_count
+        if due and servo.stamp_ns >= state.hold_until_ns:
+            distance_rad = 0.0 if resume_rad is None else abs(resume_rad - servo.position_rad)
+            state.searching = True
+            state.search_until_ns = servo.stamp_ns + round(
+                (settings.search_s + distance_rad / (settings.limit_rpm * RPM_RADPS)) * 1e9
             )
-        return now.searching
+        return state.searching
 
-    def _candidate(self, now_ns: int) -> Target | None:
-        """The one to stop at, else the one to glance at in passing; None: sweep on."""
+    def _choose_candidate(self, stamp_ns: int) -> Target | None:
+        """The candidate that interrupts the sweep, else one to observe during the sweep, else None."""
         settings = self.settings
-        now = self._now
-        maybe = now.targets.candidates(now_ns)
-        current = now.targets.get(now.current)
-        worth = [t for t in maybe if t.probability >= settings.stop_probability and t.seen_looks >= settings.stop_looks]
-        if current in worth and not current.glance:
-            doubtful = 0.5 * settings.stop_probability  # so improbable it has none
-            if len(current.tried) < settings.patience * (current.probability - doubtful) / (1.0 - doubtful):
+        state = self._state
+        candidates = state.targets.candidates(stamp_ns)
+        current = state.targets.get(state.current)
+        stopping = [
+            t
+            for t in candidates
+            if t.probability >= settings.stop_probability and t.scan_passes >= settings.stop_scan_passes
+        ]
+        if current in stopping and not current.keeps_sweep:
+            least = 0.5 * settings.stop_probability  # the probability at which no miss is allowed
+            if len(current.missed) < settings.max_missed * (current.probability - least) / (1.0 - least):
                 return current
-            now.targets.leave(current, now_ns, settings.candidate_rest_s)  # not there, or most likely something else
-            worth.remove(current)
-            maybe.remove(current)
-        if worth:
-            best = max(worth, key=lambda t: (t.probability / (1.0 + t.looks), t.key))
-            best.glance = False
+            state.targets.exclude(current, stamp_ns, settings.cooldown_s)  # it has gone, or is most likely no drone
+            stopping.remove(current)
+            candidates.remove(current)
+        if stopping:
+            best = max(stopping, key=lambda t: (t.probability / (1.0 + t.observations), t.key))
+            best.keeps_sweep = False
             return best
-        # the sweep goes on by steps: each turn of the rotor a beam is put on something that was met a moment ago
-        fresh = [t for t in maybe if t.looks < settings.glances and now_ns - t.heard_ns < FRESH_NS]
+        # During the sweep each rotor turn points a beam at a candidate with a recent return.
+        fresh = [
+            t for t in candidates if t.observations < settings.sweep_observations and stamp_ns - t.seen_ns < FRESH_NS
+        ]
         for target in fresh:
-            target.glance = True
-        return max(fresh, key=lambda t: (t.probability / (1.0 + t.looks), t.key), default=None)
+            target.keeps_sweep = True
+        return max(fresh, key=lambda t: (t.probability / (1.0 + t.observations), t.key), default=None)
 
-    # one look
+    # one observation
 
-    def _look(self, servo: ServoState, target: Target) -> ServoGoal | None:
+    def _observe(self, servo: ServoState, target: Target) -> ServoGoal | None:
+        """The servo goal that points a beam at the target when the rotor passes it next."""
         settings = self.settings
-        now = self._now
-        now.turns = now.turns + 1 if now.current == target.key else 0
-        now.current = target.key
-        now.sweeping.stop()
-        centre_rad, inner_rad = servo.position_rad, INNER_RAD
-        if target.glance:
-            step_rad = self._search_radps() * math.tau / now.rotor.rate_radps
-            centre_rad, inner_rad = now.sweeping.glance_from(servo.position_rad, step_rad), math.inf
+        state = self._state
+        state.consecutive = state.consecutive + 1 if state.current == target.key else 0
+        state.current = target.key
+        state.sweep.stop()
+        start_rad, inner_rad = servo.position_rad, INNER_RAD
+        if target.keeps_sweep:
+            step_rad = self._search_radps() * math.tau / state.rotor.rate_radps
+            start_rad, inner_rad = state.sweep.advance(servo.position_rad, step_rad), math.inf
         else:
-            now.sweeping.beside_rad = None
+            state.sweep.nominal_rad = None
         T, T_tl = settings.mount.T_vehicle_turntable.matrix(), settings.mount.T_turntable_lidar.matrix()
         speed_radps, travel_rad = settings.limit_rpm * RPM_RADPS, self._travel_rad
-        elevations_rad = now.elevations_rad if settings.beams else (0.0,)
-        offset_m, goal_rad, pass_ns = 0.0, 0.0, servo.stamp_ns + round((settings.lead_s + FIRST_GUESS_S) * 1e9)
-        for _ in range(2):  # the place at the pass depends on when that is
-            place = T[:3, :3].T @ (target.at(pass_ns) - T[:3, 3])
-            range_m = max(float(np.linalg.norm(place - T_tl[:3, 3])), 0.5)
+        elevations_rad = state.elevations_rad if settings.beams else (0.0,)
+        offset_m, goal_rad, pass_ns = 0.0, 0.0, servo.stamp_ns + round((settings.latency_s + INITIAL_PASS_S) * 1e9)
+        for _ in range(2):  # the position at the pass depends on the time of the pass
+            p_turntable_m = T[:3, :3].T @ (target.at(pass_ns) - T[:3, 3])
+            range_m = max(float(np.linalg.norm(p_turntable_m - T_tl[:3, 3])), 0.5)
             offset_m = self._offset_m(target, range_m, pass_ns)
             offset_rad = offset_m / range_m
-            best = cheapest(settings.mount, travel_rad, elevations_rad, centre_rad, place, offset_rad, inner_rad)
+            best = best_pointing(
+                settings.mount, travel_rad, elevations_rad, start_rad, p_turntable_m, offset_rad, inner_rad
+            )
             if best is None and settings.beams:
-                best = nearest(settings.mount, travel_rad, place)
+                best = nearest_pointing(settings.mount, travel_rad, p_turntable_m)
             if best is None:
                 return self._sweep(servo)
-            goal_rad = now.play.goal_rad(servo.position_rad, best.servo_rad)
+            goal_rad = state.play.goal_rad(servo.position_rad, best.servo_rad)
             goal_rad = min(max(goal_rad, travel_rad[0]), travel_rad[1])
-            if target.glance and abs(best.servo_rad - centre_rad) > GLANCE_RAD:
-                target.looks = settings.glances  # the fan has passed it
+            if target.keeps_sweep and abs(best.servo_rad - start_rad) > SWEEP_DEVIATION_RAD:
+                target.observations = settings.sweep_observations  # the fan has passed it
                 return self._sweep(servo)
-            way_s = abs(goal_rad - servo.position_rad) / speed_radps
-            ready_ns = servo.stamp_ns + round((settings.lead_s + settings.settle_s + way_s) * 1e9)
-            pass_ns = now.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, place, best.table_rad), ready_ns)
-        target.tried.append(Look(target.reach_m(pass_ns), offset_m))
-        del target.tried[:-MOST_TRIED]
-        target.looks += 1
-        now.served += target.sure
-        now.hold_until_ns = max(pass_ns + TOLD_NS, servo.stamp_ns + SHORTEST_LOOK_NS)
+            move_s = abs(goal_rad - servo.position_rad) / speed_radps
+            ready_ns = servo.stamp_ns + round((settings.latency_s + settings.settle_s + move_s) * 1e9)
+            pass_ns = state.rotor.next_pass_ns(rotor_azimuth_rad(T_tl, p_turntable_m, best.table_rad), ready_ns)
+        target.missed.append(MissedObservation(target.spread_m(pass_ns), offset_m))  # until it has a return
+        del target.missed[:-MAX_MISSED]
+        target.observations += 1
+        state.track_observations += target.is_track
+        state.hold_until_ns = max(pass_ns + RESULT_NS, servo.stamp_ns + MIN_OBSERVATION_NS)
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=goal_rad, speed_radps=speed_radps)
 
     def _offset_m(self, target: Target, range_m: float, pass_ns: int) -> float:
-        """How far beside the place the beam goes, look by look.
+        """Offset [m] of the beam from the predicted position.
 
-        A drone that is met: a little to each side, its edges tell where it is; a candidate, too, or it is met at the
-        same edge for ever, and a wire along the beam's way would seem to fly. One that was missed, or was met only
-        once: where it most likely is by now.
+        A target whose last observation had returns gets small offsets to either side: returns from its edges determine
+        its position. Without offsets a candidate would be hit at the same edge again and again, and a wire along the
+        beam's movement would appear to fly. A target that was missed, or has returns of only one scan pass, gets the
+        offset with the highest detection probability.
         """
         settings = self.settings
-        if not target.tried and (target.sure or (target.looks and not target.undirected_speed_mps)):
-            wide_m = 0.175 * settings.span_m * min(1.0, 20.0 / range_m)
-            if target.sure:
-                wide_m = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * settings.span_m + 0.35 * target.sigma_m
-            return wide_m * low_discrepancy(target.looks % 16)
-        reach_m, headed = target.reach_m(pass_ns), target.undirected_speed_mps > 0.0
-        spacing_m = self._now.spacing_rad * range_m
-        return best_offset_m(reach_m, headed, target.tried, spacing_m, HALF_SHARE * settings.span_m)
+        if not target.missed and (target.is_track or (target.observations and not target.undirected_speed_mps)):
+            amplitude_m = 0.175 * settings.span_m * min(1.0, 20.0 / range_m)
+            if target.is_track:
+                amplitude_m = (0.06 + 0.35 * min(1.0, 10.0 / range_m)) * settings.span_m + 0.35 * target.sigma_m
+            return amplitude_m * low_discrepancy(target.observations % 16)
+        spread_m, heading_unknown = target.spread_m(pass_ns), target.undirected_speed_mps > 0.0
+        spacing_m = self._state.spacing_rad * range_m
+        return best_offset_m(spread_m, heading_unknown, target.missed, spacing_m, HALF_DETECTION * settings.span_m)
 
-    # search
+    # sweep
 
     def _sweep(self, servo: ServoState) -> ServoGoal | None:
-        back_radps = self.settings.limit_rpm * RPM_RADPS if self._now.searching else None
-        goal = self._now.sweeping.goal(servo.stamp_ns, servo.position_rad, self._search_radps(), back_radps)
+        resume_radps = self.settings.limit_rpm * RPM_RADPS if self._state.searching else None
+        goal = self._state.sweep.goal(servo.stamp_ns, servo.position_rad, self._search_radps(), resume_radps)
         if goal is None:
             return None
         return ServoGoal(stamp_ns=servo.stamp_ns, position_rad=goal[0], speed_radps=goal[1])
 
     def _search_radps(self) -> float:
-        now = self._now
+        """Servo speed of the sweep, at which the beams cover all directions."""
+        state = self._state
         limit_radps, wanted_radps = self.settings.limit_rpm * RPM_RADPS, self.settings.search_rpm * RPM_RADPS
-        if now.rotor.rate_radps <= 0 or len(now.elevations_rad) < 2:
+        if state.rotor.rate_radps <= 0 or len(state.elevations_rad) < 2:
             return min(wanted_radps, limit_radps)
-        turn_s = math.tau / now.rotor.rate_radps
-        return min(sweep_step_rad(now.spacing_rad, wanted_radps * turn_s) / turn_s, limit_radps)
+        turn_s = math.tau / state.rotor.rate_radps
+        return min(sweep_step_rad(state.spacing_rad, wanted_radps * turn_s) / turn_s, limit_radps)

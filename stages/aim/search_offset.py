@@ -1,13 +1,15 @@
-"""How far beside the place a beam most likely meets a drone, after looks that did not.
+"""Offset from the predicted position at which a beam most likely meets a drone that earlier beams missed.
 
-Where it is across the fan's beams is one of a few dozen places, each with a weight:
+The drone's position across the fan's beams is a discrete distribution. Its main component depends on what is known:
 
-    known well       x = sigma z,  z Gaussian
-    met once         x = v t cos(phi), phi all headings alike: how fast it flies is known, whither is not
-    nobody knows     a share of the weight lies anywhere between two beams: what is believed may be wrong
+    Gaussian            x = sigma z,  z standard normal
+    heading unknown     x = v t cos(phi),  phi uniform: the speed is known, the heading is not
+    uniform             a share of the weight is uniform between two beams, in case the prediction is wrong
 
-A look takes weight from the places it would have met; the next one goes where most is left. The beams of the fan stand
-apart alike, so all of them count. Source: ours, after search theory (Koopman, Search and Screening, 1946).
+A beam that missed reduces the weight of the positions it would have met. The next beam goes where the detection
+probability is highest. The beams are evenly spaced and all of them count.
+
+Source: ours, after search theory (Koopman, Search and Screening, 1946).
 """
 
 from __future__ import annotations
@@ -21,38 +23,41 @@ from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 
-PLACES = 36
-HEADINGS = np.cos(np.linspace(0.0, math.pi, PLACES, endpoint=False) + math.pi / (2 * PLACES))
-GAUSSIAN = np.array([NormalDist().inv_cdf((k + 0.5) / PLACES) for k in range(PLACES)])
-OFFSETS = 24  # between two beams
-ANYWHERE = 0.15  # share of the weight
-MET = 0.9  # of a drone that the beam crosses
+SAMPLES = 36  # of the main component
+HEADING_UNKNOWN = np.cos(np.linspace(0.0, math.pi, SAMPLES, endpoint=False) + math.pi / (2 * SAMPLES))
+GAUSSIAN = np.array([NormalDist().inv_cdf((k + 0.5) / SAMPLES) for k in range(SAMPLES)])
+OFFSETS = 24  # tested offsets between two beams
+UNIFORM_WEIGHT = 0.15  # of the uniform component
+DETECTION_PROBABILITY = 0.9  # of a drone whose middle the beam crosses
 
 
-class Look(NamedTuple):
-    """A look that did not meet it: how far it may have been beside the place then, and the beam [m]."""
+class MissedObservation(NamedTuple):
+    """A beam that did not meet the drone."""
 
-    reach_m: float
-    offset_m: float
+    spread_m: float  # of the drone's position at that time, as in `best_offset_m`
+    offset_m: float  # of the beam from the predicted position
 
 
-def best_offset_m(reach_m: float, headed: bool, tried: list[Look], spacing_m: float, half_m: float) -> float:
-    """How far beside the place to put a beam, within half the beams' spacing to each side.
+def best_offset_m(
+    spread_m: float, heading_unknown: bool, missed: list[MissedObservation], spacing_m: float, half_m: float
+) -> float:
+    """Offset [m] of a beam from the predicted position, at most half the beam spacing to either side.
 
-    `reach_m`: one sigma of its place, or, `headed`, how far it has flown any way by then; `half_m`: a beam so far from
-    its middle meets it about every other time.
+    `spread_m`: one sigma of the position, or with `heading_unknown` the distance flown in an unknown direction.
+    `half_m`: distance of a beam from the drone's middle that halves the detection probability.
     """
-    unit = HEADINGS if headed else GAUSSIAN
+    unit = HEADING_UNKNOWN if heading_unknown else GAUSSIAN
     offset = (np.arange(OFFSETS) - OFFSETS // 2 + 1) * (spacing_m / OFFSETS)
-    offset = offset[np.argsort(np.abs(offset), kind="stable")]  # of those alike the smallest
-    weight = np.repeat(((1.0 - ANYWHERE) / PLACES, ANYWHERE / OFFSETS), (PLACES, OFFSETS))
-    for look in tried:
-        weight *= 1.0 - MET * _meets(look.offset_m - np.append(look.reach_m * unit, offset), spacing_m, half_m)
-    gain = _meets(offset[:, np.newaxis] - np.append(reach_m * unit, offset), spacing_m, half_m) @ weight
+    offset = offset[np.argsort(np.abs(offset), kind="stable")]  # of equal ones the smallest is taken
+    weight = np.repeat(((1.0 - UNIFORM_WEIGHT) / SAMPLES, UNIFORM_WEIGHT / OFFSETS), (SAMPLES, OFFSETS))
+    for miss in missed:
+        distance_m = miss.offset_m - np.append(miss.spread_m * unit, offset)
+        weight *= 1.0 - DETECTION_PROBABILITY * _detection_factor(distance_m, spacing_m, half_m)
+    gain = _detection_factor(offset[:, np.newaxis] - np.append(spread_m * unit, offset), spacing_m, half_m) @ weight
     return float(offset[np.argmax(gain > gain.max() * (1.0 - 1e-9))])
 
 
-def _meets(beside_m: NDArray[Any], spacing_m: float, half_m: float) -> Array64:
-    """How likely the nearest beam meets a drone so far beside one of them."""
-    nearest_m = beside_m - spacing_m * np.round(beside_m / spacing_m)
+def _detection_factor(distance_m: NDArray[Any], spacing_m: float, half_m: float) -> Array64:
+    """Detection probability by the nearest beam, relative to a central hit; distances are from one of the beams."""
+    nearest_m = distance_m - spacing_m * np.round(distance_m / spacing_m)
     return np.exp(-math.log(2.0) * (nearest_m / half_m) ** 2)

@@ -26,30 +26,30 @@ from stages.kernels.geometry.so3 import log_rotation
 from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry, VehicleMotion, VisualMotion
 from stages.odometry.drone.trajectory import AutopilotTrajectory, VisualTrajectory, rotation_between
 
-VEHICLE_RAD_PER_S = math.radians(20.0)  # a vehicle that does not tell its turns may turn like this
+VEHICLE_RAD_PER_S = math.radians(20.0)  # turn rate of a vehicle without VehicleMotion
 VEHICLE_DRIFT_RAD2_PER_S = math.radians(0.1) ** 2
 
 
 @dataclass(frozen=True)
 class DeadReckonedYaw:
-    """Where dead reckoning has a pair's level axes, in the map frame."""
+    """Headings of the level axes of a pair of cameras by dead reckoning, in the map frame."""
 
     stamp_ns: int
     vehicle_rad: float  # heading of the vehicle's level axes
     drone_rad: float  # of the drone's, less an unknown offset
-    variance_rad2: float  # of both, gathered since the pair before
+    variance_rad2: float  # of both, gathered since the previous pair
 
     @property
     def yaw_rad(self) -> float:
-        """Of the drone's level axes in the vehicle's, less the offset."""
+        """Yaw of the drone's level axes in the vehicle's, less the offset."""
         return self.drone_rad - self.vehicle_rad
 
 
 class DeadReckoning:
-    """All that tells of turns, and the rotation carried on by them; it lacks the offset that images add."""
+    """Rotation of the drone in `map`, propagated by measured turns, without the offset that images add."""
 
     def __init__(self, parked: bool) -> None:
-        """`parked`: the vehicle stands, whether it says so or not."""
+        """`parked`: the vehicle is known to stand, also without VehicleMotion."""
         self._parked = parked
         self.vehicle = VehicleTrajectory()
         self.autopilot = AutopilotTrajectory()
@@ -57,40 +57,40 @@ class DeadReckoning:
         self._R_map_drone = np.eye(3)
         self._stamp_ns: int | None = None
         self._silences = 0
-        self._silent_rad2 = 0.0  # `_vehicle_silent_rad2` at the pair before; a half turn's where the frame is another
-        self.frames = 0  # how often the vehicle's map frame may have become another one
+        self._silent_rad2 = 0.0  # `_vehicle_silent_rad2` at the previous pair; pi^2 after a change of frame
+        self.frames = 0  # number of possible changes of the map frame
 
     def vehicle_known(self, stamp_ns: int) -> bool:
-        """Whether it is told where the vehicle is: not long after its last word."""
+        """Whether the vehicle's pose is known: not long after its newest message."""
         return self._parked or self.vehicle.known_at(stamp_ns)
 
     def add_vehicle(self, motion: VehicleMotion) -> None:
-        """The vehicle's pose since its start."""
+        """Add a pose of the vehicle in `map`."""
         first = not self.vehicle.known
         if self.vehicle.add(motion) or first:
             self.frames += 1
             self._silent_rad2 = math.pi**2
 
-    def add_autopilot(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
-        """What the autopilot says of itself."""
-        self.autopilot.add(word)
+    def add_autopilot(self, telemetry: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
+        """Add telemetry of the autopilot."""
+        self.autopilot.add(telemetry)
 
     def add_drone_motion(self, motion: VisualMotion) -> None:
-        """A step of the odometry by images."""
+        """Add a step of the visual odometry."""
         self.images.add(motion)
 
     def new_silences(self) -> int:
-        """Times since the last call that the autopilot was not heard for so long that it may have jumped."""
+        """Number of new telemetry gaps since the last call, each long enough to hide a jump of the autopilot's yaw."""
         new = self.autopilot.gaps - self._silences
         self._silences = self.autopilot.gaps
         return new
 
     def rate_radps(self, stamp_ns: int) -> float:
-        """How fast the drone turns."""
+        """Turn rate of the drone."""
         return self.autopilot.rate_radps(stamp_ns)
 
     def advance(self, vehicle_ns: int, drone_ns: int, vehicle: LevelLines, drone: LevelLines) -> DeadReckonedYaw:
-        """Turn on to a pair's moments."""
+        """Propagate to the times of a pair of images."""
         R_map_vehicle = self.vehicle.at(vehicle_ns)[0]
         variance, silent_rad2 = 0.0, self._vehicle_silent_rad2(vehicle_ns)
         if self._stamp_ns is None:
@@ -111,28 +111,28 @@ class DeadReckoning:
         )
 
     def correct(self, vehicle_ns: int, refined: Refined, dead_reckoned_rad: float) -> None:
-        """Take the tilts that the images tell; the yaw stays the dead reckoned one."""
-        self._R_map_drone = self._told(vehicle_ns, refined, dead_reckoned_rad)
+        """Take over the tilts measured in the images; the yaw stays the dead reckoned one."""
+        self._R_map_drone = self._measured_rotation(vehicle_ns, refined, dead_reckoned_rad)
 
     def tilt_off(self, vehicle_ns: int, refined: Refined, dead_reckoned_rad: float) -> Array64:
-        """How far (3,) [rad] the tilts that the images tell are from the dead reckoned ones, the drone's axes."""
-        R = self._told(vehicle_ns, refined, dead_reckoned_rad)
+        """Difference (3,) [rad] of the tilts measured in the images from the dead reckoned ones, drone axes."""
+        R = self._measured_rotation(vehicle_ns, refined, dead_reckoned_rad)
         off, up = log_rotation(np.ascontiguousarray(self._R_map_drone.T @ R)), R[2]
         return off - (off @ up) * up
 
-    def _told(self, vehicle_ns: int, refined: Refined, dead_reckoned_rad: float) -> Array64:
+    def _measured_rotation(self, vehicle_ns: int, refined: Refined, dead_reckoned_rad: float) -> Array64:
         level = refined.R_vehicle_level @ rotation_z(dead_reckoned_rad) @ refined.R_drone_level.T
         return self.vehicle.at(vehicle_ns)[0] @ level
 
     def R_map_odom(self, offset_rad: float) -> Array64 | None:
-        """How the autopilot's frame `odom` is turned in the map frame; None: it has no attitude now."""
+        """Rotation (3, 3) of the autopilot's frame `odom` in `map`; None: the autopilot has no attitude now."""
         if self._stamp_ns is None:
             return None
         R_odom_drone = self.autopilot.R_odom_drone(self._stamp_ns)
         return None if R_odom_drone is None else rotation_z(offset_rad) @ self._R_map_drone @ R_odom_drone.T
 
     def R_map_drone(self, offset_rad: float, stamps_ns: list[int]) -> dict[int, Array64]:
-        """The drone's rotation at those moments of which it is known."""
+        """Rotation of the drone at each time for which its turn is measured."""
         if self._stamp_ns is None:
             return {}
         R = rotation_z(offset_rad) @ self._R_map_drone
@@ -140,9 +140,9 @@ class DeadReckoning:
         return {ns: R @ turn.R_from_to for ns, turn in turns.items() if turn.measured}
 
     def at_common_time(self, vehicle_ns: int, drone_ns: int) -> tuple[Array64, Array64, int, float]:
-        """L, R so that L R_vehicle(vehicle_ns)_drone(drone_ns) R is the rotation at one moment, that, and its variance.
+        """L, R so that L R_vehicle(vehicle_ns)_drone(drone_ns) R is the rotation at one time, the time, the variance.
 
-        At the drone's image if the vehicle's turn is known, else at the vehicle's if the drone's is.
+        The time is the drone image's if the vehicle's turn is known, else the vehicle image's if the drone's turn is.
         """
         dt, one = abs(drone_ns - vehicle_ns) * 1e-9, np.eye(3)
         if self.vehicle.known_at(drone_ns):
@@ -154,13 +154,13 @@ class DeadReckoning:
         return one, one, drone_ns, self._vehicle_variance_rad2(drone_ns, dt)
 
     def _vehicle_variance_rad2(self, stamp_ns: int, seconds: float) -> float:
-        """Of the vehicle's yaw, gathered in a time up to then."""
+        """Variance that the vehicle's yaw gathers in the `seconds` before `stamp_ns`."""
         if self.vehicle.known_at(stamp_ns):
             return VEHICLE_DRIFT_RAD2_PER_S * seconds
         return 0.0 if self._parked else (VEHICLE_RAD_PER_S * seconds) ** 2
 
     def _vehicle_silent_rad2(self, stamp_ns: int) -> float:
-        """Variance of the heading that is told of a vehicle beyond where its trail ends."""
+        """Variance of the vehicle's heading, extrapolated beyond the end of its trajectory."""
         newest_ns = self.vehicle.newest_ns
         beyond_ns = 0 if newest_ns is None or self._parked else stamp_ns - newest_ns - FURTHEST_NS
         return (

@@ -64,18 +64,18 @@ class JointAlignSettings(Settings):
     """Settings of `JointAlign`."""
 
     max_apart_s: float = Field(0.1, gt=0, le=1)  # between the images of a pair; half the slower camera's period
-    straight_deg: float = Field(0.25, gt=0, le=5)  # how straight and parallel streets are, one sigma of a line
+    straight_deg: float = Field(0.25, gt=0, le=5)  # straightness of streets, one sigma of a line
     direction_sigma_deg: float = Field(0.1, gt=0, le=5)  # error of a street's direction that one camera's lines share
-    square_sigma_deg: float = Field(0.5, gt=0, le=5)  # how square crossings are
-    tilt_sigma_deg: float = Field(0.07, ge=0, le=5)  # error of a vertical beyond what its image says, in all images
-    # alike: a mount's 0.05 deg, and as much by a lens whose centre is 0.15 px off at 720 px
+    square_sigma_deg: float = Field(0.5, gt=0, le=5)  # deviation of crossings from a right angle, one sigma
+    tilt_sigma_deg: float = Field(0.07, ge=0, le=5)  # error of a vertical beyond its sigma, common to
+    # all images: 0.05 deg of a mount, and as much by a lens whose centre is 0.15 px off at 720 px
     min_lines: int = Field(5, ge=1)  # of each camera
-    parked: bool = False  # the vehicle stands: where the drone moves is known without VehicleMotion
+    parked: bool = False  # the vehicle stands: the drone's motion is used without VehicleMotion
     resolve_probability: float = Field(0.999, gt=0.5, lt=1)
     initial_yaw_deg: float | None = Field(None, ge=-360, le=360)  # the drone's heading in the vehicle's axes at first
     compass_deg: float | None = Field(None, ge=-360, le=360)  # the vehicle's at its start, clockwise from the north
     prior_sigma_deg: float = Field(20.0, gt=0, le=90)  # of either
-    prior_trust: float = Field(0.95, gt=0, lt=1)  # that it is right at all: alone it never resolves
+    prior_trust: float = Field(0.95, gt=0, lt=1)  # probability that it is valid; alone it never resolves a branch
     branches: BranchSettings = BranchSettings()
 
     @model_validator(mode="after")
@@ -86,7 +86,7 @@ class JointAlignSettings(Settings):
 
 
 class JointAlign(Stage[JointAlignSettings]):
-    """Joint alignment of both cameras' lines; four branches with probabilities."""
+    """Joint alignment of the lines of both cameras, with the probabilities of the four yaw branches."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset(
         {"motion", "visual_motion", "attitude", "position", "odometry", "fix"}
@@ -138,12 +138,12 @@ class JointAlign(Stage[JointAlignSettings]):
             yield self._align(pair)
 
     def on_drone(self, seen: VanishingDirections) -> Iterator[RelativeRotation]:
-        """Lines of the drone's camera: one rotation each, once the nearest image of the vehicle is known."""
+        """Lines of the drone's camera: one rotation for each image, once the nearest image of the vehicle is known."""
         for pair in self._parts.pairing.drone(_of(seen, CameraMount.DRONE, "drone")):
             yield self._align(pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
-        """Rotations of images that waited for a nearer one."""
+        """Publish the rotations of images that still wait for a nearer one."""
         for pair in self._parts.pairing.rest():
             yield self._align(pair)
 
@@ -154,7 +154,7 @@ class JointAlign(Stage[JointAlignSettings]):
         seen_by_vehicle, seen_by_drone = pair
         drone_ns = seen_by_drone.stamp_ns
         if seen_by_vehicle is None:
-            return parts.publisher.none(drone_ns, f"no picture of the vehicle's within {settings.max_apart_s:g} s")
+            return parts.publisher.none(drone_ns, f"no image of the vehicle camera within {settings.max_apart_s:g} s")
         vehicle_ns = seen_by_vehicle.stamp_ns
         straight_rad = math.radians(settings.straight_deg)
         vehicle, drone = level_lines(seen_by_vehicle, straight_rad), level_lines(seen_by_drone, straight_rad)
@@ -167,11 +167,11 @@ class JointAlign(Stage[JointAlignSettings]):
             )
         a, b = spectrum(vehicle), spectrum(drone)
         dead_reckoned = parts.dead_reckoning.advance(vehicle_ns, drone_ns, vehicle, drone)
-        told = parts.motion.heading(drone_ns)
-        if parts.tracker.denied(told):
+        motion_heading = parts.motion.heading(drone_ns)
+        if parts.tracker.is_contradicted(motion_heading):
             parts.tracker.release()
             self._reinitialise("the drone's motion contradicts the match: reset")
-        match = parts.tracker.choose(a, b, dead_reckoned, parts.dead_reckoning.rate_radps(drone_ns), told)
+        match = parts.tracker.choose(a, b, dead_reckoned, parts.dead_reckoning.rate_radps(drone_ns), motion_heading)
         if match.yaw_rad is None:
             return parts.publisher.none(drone_ns, match.reason)
         streets = street_directions(a, b, match.yaw_rad)
@@ -180,7 +180,7 @@ class JointAlign(Stage[JointAlignSettings]):
             return parts.publisher.none(drone_ns, "too few lines run along the same streets")
         if parts.tracker.reacquired:
             self._reinitialise("the lines match at another yaw for some time: reset there")
-        off_rad = parts.innovation_gate.tilt_off_rad(vehicle_ns, refined, dead_reckoned)
+        off_rad = parts.innovation_gate.tilt_innovation_rad(vehicle_ns, refined, dead_reckoned)
         refined = parts.innovation_gate.with_scatter(refined, dead_reckoned)
         weighed = parts.innovation_gate.weigh_yaw(refined, dead_reckoned)
         parts.motion.slip(parts.tracker.accept(refined.yaw_rad, refined.yaw_sigma_rad, dead_reckoned))

@@ -23,15 +23,15 @@ from stages.heading.hypothesis_bank import NONE, BranchSettings, HypothesisBank
 from stages.heading.windows import Windows
 from stages.messages import DroneFix, VisualMotion
 
-SILENCE_SHARE = 1e-4  # chance that the autopilot's heading jumped while it was not heard
-MAX_NONE = 0.99  # that none of the branches is right, from which all is reset
-NONE_AFTER_RESET = 0.95  # of that, then
-BEARING_RAD = math.radians(2.0)  # error of an odometry's heading within a window
+SILENCE_SHARE = 1e-4  # probability that the autopilot's heading jumped during a telemetry gap
+MAX_NONE = 0.99  # probability that no branch is right, above which all is reset
+NONE_AFTER_RESET = 0.95  # that probability after the reset
+BEARING_RAD = math.radians(2.0)  # heading error of an odometry within a window
 
 
 @dataclass(frozen=True)
 class Prior:
-    """The drone's heading as people or a compass tell it; at most one of them does."""
+    """Prior of the drone's heading by configuration or compass; at most one of them is set."""
 
     initial_yaw_rad: float | None  # in the vehicle's axes
     compass_rad: float | None  # the vehicle's at its start, clockwise from the north
@@ -40,7 +40,7 @@ class Prior:
 
 
 class MotionBranch:
-    """Weighs the windows."""
+    """Updates the branch probabilities and the heading by motion, window by window."""
 
     def __init__(
         self, settings: BranchSettings, prior: Prior, dead_reckoning: DeadReckoning, tracker: YawTracker
@@ -51,30 +51,30 @@ class MotionBranch:
         self._windows = Windows(settings.baseline_m)
         self._headings = HeadingBank(settings)
         self._heading_windows = Windows(settings.baseline_m, HeadingBank.HYPOTHESES)
-        self._frames = 0  # of the vehicle, as `reckoning` counts
+        self._frames = 0  # number of map frames, as `dead_reckoning` counts
 
     def add_visual_motion(self, motion: VisualMotion) -> None:
-        """A step of the drone's odometry by its camera."""
+        """Add a step of the drone's visual odometry."""
         self._windows.add_step(motion)
 
     def add_fix(self, fix: DroneFix) -> bool:
-        """Where the LiDAR saw the drone; True: its motion fits no branch, and the match followed is forgotten."""
+        """Add a LiDAR position; True: the motion fits no branch, and the tracked match is dropped."""
         dead_reckoning, tracker = self._dead_reckoning, self._tracker
         self._follow_frame()
-        if not dead_reckoning.vehicle_known(fix.stamp_ns):  # its way would be taken for the drone's
+        if not dead_reckoning.vehicle_known(fix.stamp_ns):  # its displacement would count as the drone's
             self._windows.restart()
             self._heading_windows.restart()
             return False
         at = dead_reckoning.vehicle.at(fix.stamp_ns)
         self._windows.add_fix(fix, *at, dead_reckoning.autopilot)
         self._heading_windows.add_fix(fix, *at, dead_reckoning.autopilot)
-        by_places = dead_reckoning.autopilot.position(fix.stamp_ns) is not None
-        self._weigh_headings(by_places)
+        has_positions = dead_reckoning.autopilot.position(fix.stamp_ns) is not None
+        self._weigh_headings(has_positions)
         if tracker.offset_rad is None:
             return False
         bearing_rad = math.hypot(math.sqrt(tracker.variance_rad2), BEARING_RAD)
         R_map_odom = dead_reckoning.R_map_odom(tracker.offset_rad)
-        if R_map_odom is not None and by_places:
+        if R_map_odom is not None and has_positions:
             moved = self._windows.close_metric(R_map_odom, bearing_rad)
         else:
             stamps_ns = self._windows.steps_since_start()
@@ -82,24 +82,24 @@ class MotionBranch:
         if moved is None:
             return False
         self.bank.see(moved)
-        nonsense = bool(self.bank.probability[NONE] > MAX_NONE)
-        if nonsense:
+        no_branch = bool(self.bank.probability[NONE] > MAX_NONE)
+        if no_branch:
             tracker.forget()
-        return nonsense
+        return no_branch
 
-    def _weigh_headings(self, by_places: bool) -> None:
-        """The way that the autopilot tells, laid on the LiDAR's: its heading, without a street."""
+    def _weigh_headings(self, has_positions: bool) -> None:
+        """Update the heading without vanishing points by the displacement of autopilot and LiDAR."""
         R_map_odom = self._dead_reckoning.R_map_odom(0.0)
-        if R_map_odom is None or not by_places:
+        if R_map_odom is None or not has_positions:
             return
         moved = self._heading_windows.close_metric(R_map_odom, 0.0)
         if moved is not None:
             self._headings.see(moved)
 
     def heading(self, stamp_ns: int) -> Heading | None:
-        """Let time go on to a image; the offset (yaw_tracker.py) as the drone's motion tells it by then.
+        """Advance to the time of an image; returns the offset (yaw_tracker.py) by the drone's motion.
 
-        It is forgotten, and the branches a little, when the autopilot may have turned its north unheard.
+        A telemetry gap that may hide a jump of the autopilot's yaw resets it and weakens the branches.
         """
         self._follow_frame()
         silences = self._dead_reckoning.new_silences()
@@ -112,7 +112,7 @@ class MotionBranch:
         return self._headings.heading
 
     def _follow_frame(self) -> None:
-        """What was seen in another map frame of the vehicle's does not count."""
+        """Drop the evidence of an earlier map frame."""
         if self._frames != self._dead_reckoning.frames:
             self._frames = self._dead_reckoning.frames
             self._windows.restart()
@@ -120,11 +120,11 @@ class MotionBranch:
             self._headings.reset()
 
     def slip(self, weights: Array64) -> None:
-        """The followed yaw may be quarter turns off what it was: weights (4,) of so many."""
+        """Shift the branches: weights (4,) that the tracked yaw has changed by m times 90 deg."""
         self.bank.slip(weights)
 
     def weigh_prior(self, refined: Refined) -> None:
-        """The word of people or of a compass, once."""
+        """Apply the prior, once."""
         if self._prior_weighed:
             return
         R_map_odom = self._dead_reckoning.R_map_odom(self._tracker.offset_rad or 0.0)
@@ -139,8 +139,8 @@ class MotionBranch:
             self._prior_weighed = True
 
     def reset(self) -> None:
-        """No branch is known, and likely none is right."""
+        """Reset the branches; most likely none is right."""
         self.bank.reset(NONE_AFTER_RESET)
         self._windows.restart()
         if self._prior.compass_rad is not None:
-            self._prior_weighed = False  # a compass has not changed its mind
+            self._prior_weighed = False  # the prior of a compass is still valid

@@ -17,7 +17,7 @@ Pair = tuple[VanishingDirections | None, VanishingDirections]
 
 
 class Pairing:
-    """Each drone image with the vehicle image nearest to it, told as soon as no nearer one can come."""
+    """Yields each drone image with its nearest vehicle image, as soon as no nearer one can arrive."""
 
     def __init__(self, furthest_ns: int) -> None:
         self._furthest_ns = furthest_ns
@@ -25,31 +25,31 @@ class Pairing:
         self._waiting: deque[VanishingDirections] = deque()
 
     def vehicle(self, seen: VanishingDirections) -> Iterator[Pair]:
-        """One more image of the vehicle's; one that is not newer than the last is ignored."""
+        """Add a vehicle image; one that is not newer than the previous one is ignored."""
         if not self._vehicle or seen.stamp_ns > self._vehicle[-1].stamp_ns:
             self._vehicle.append(seen)
         yield from self._ready()
 
     def drone(self, seen: VanishingDirections) -> Iterator[Pair]:
-        """One more image of the drone's."""
+        """Add a drone image."""
         self._waiting.append(seen)
         yield from self._ready()
 
     def rest(self) -> Iterator[Pair]:
-        """The drone's images that still wait, with what there is."""
+        """Yield the drone images that still wait, with the nearest vehicle image so far."""
         while self._waiting:
             drone = self._waiting.popleft()
             yield self._nearest(drone), drone
 
     def _ready(self) -> Iterator[Pair]:
-        while self._waiting and not self._may_come(self._waiting[0].stamp_ns):
+        while self._waiting and not self._may_arrive(self._waiting[0].stamp_ns):
             drone = self._waiting.popleft()
             yield self._nearest(drone), drone
 
-    def _may_come(self, stamp_ns: int) -> bool:
-        """Whether a image of the vehicle's may still come that is nearer than all so far."""
+    def _may_arrive(self, stamp_ns: int) -> bool:
+        """Whether a vehicle image that is nearer than all so far may still arrive."""
         if self._waiting[-1].stamp_ns - stamp_ns > 2 * self._furthest_ns:
-            return False  # it is late, or the camera is dead
+            return False  # it is late, or the camera has failed
         if not self._vehicle:
             return True
         newest_ns = self._vehicle[-1].stamp_ns

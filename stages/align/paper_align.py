@@ -1,25 +1,25 @@
-"""The drone's rotation in the vehicle's axes as the paper finds it, and its correction by motion.
+"""Rotation of the drone relative to the vehicle by the method of the paper, with its correction by motion.
 
     vehicle's and drone's directions, nearest in time -> smallest-angle matching -> V_G V_D^-1 (paper_match.py)
         -> Kalman filter with a slow angular rate (paper_filter.py)
     fixes, drone motion, vehicle motion -> R_f, once the last seven agree (paper_correction.py)
 
-The first matching goes by `initial_yaw_deg`: a wrong one picks a wrong branch, and every later match keeps to it, until
-the drone has moved for long enough to be corrected. The corrected rotation R_G^-1 R_f R_G R_GD0 is what the next
-images are matched under. If that gives the same pairs, the filter goes on; if it gives others, the branch was wrong
-and the filter restarts with them (`switches` counts it). So a correction's own error, some degrees of a 5-point
+The first match uses `initial_yaw_deg`. A wrong value selects a wrong branch, and every later match stays on it until
+the drone has moved far enough to be corrected. The next images are matched under the corrected rotation
+R_G^-1 R_f R_G R_GD0. If that gives the same pairs, the filter continues; if it gives others, the branch was wrong and
+the filter restarts with them (`switches` counts it). So the error of a correction, some degrees of a 5-point
 direction, never reaches the rotation.
 
-What is known of the branch: before any correction nothing but the initial yaw, which the paper takes on trust. All four
-get 1/4 and the state is AMBIGUOUS. After one it is RESOLVED as the paper has it, with the probability that the
-paper's rule earned where we measured it: wrong in up to 3.3 % (`wrong_share`), shared by the other three. One-hot would
-be a lie: seven pairs that are 14 images apart share most of their images and are no seven votes. Who wants
-P > 0.999 must not use this stage.
+Before any correction only the initial yaw is known, which the paper trusts: each branch has 1/4 and the state is
+AMBIGUOUS. After a correction the state is RESOLVED, as in the paper; the other three branches share the measured error
+rate of the paper's rule, up to 3.3 % (`wrong_share`). A one-hot probability would be overconfident: seven pairs with a
+spacing of 14 images share most of their images and are not independent. An application that needs P > 0.999 must not
+use this stage.
 
-A match is taken whatever its angle, as in the paper. A gate on it made things worse on our tuning streets: while it
-refused, the filter turned on at its last rate until the next branch fitted.
+A match is accepted at any angle, as in the paper. With a gate the filter would continue at its last rate during
+rejections, until the next branch fits.
 
-Without the optional inputs it stays AMBIGUOUS for good; without `motion` the vehicle is taken to stand.
+Without the optional inputs the state stays AMBIGUOUS; without `motion` the vehicle is assumed to stand.
 
 Source: P IV, Eq. 7-10, V.C-V.E; DESIGN, The paper's formulas and What we already measured (3.3 %).
 """
@@ -60,16 +60,16 @@ class PaperAlignSettings(Settings):
     max_apart_s: float = Field(0.1, gt=0, le=1)  # between the images of a pair; half the slower camera's period
     observation_deg: float = Field(1.0, gt=0)  # V_G V_D^-1, one axis
     rate_sigma_dps: float = Field(10.0, gt=0)  # the drone's rate against the vehicle, at the start
-    rate_noise_dps: float = Field(5.0, gt=0)  # how much that changes within a second
+    rate_noise_dps: float = Field(5.0, gt=0)  # its change within one second
     images_apart: int = Field(14, ge=1)  # j - i
     shortest_m: float = Field(1.0, gt=0)  # |f|
     last: int = Field(7, ge=1)
     cone_deg: float = Field(30.0, gt=0, lt=90)
-    wrong_share: float = Field(0.033, ge=0, lt=0.75)  # of corrections that leave or make a wrong branch
+    wrong_share: float = Field(0.033, ge=0, lt=0.75)  # share of corrections that result in a wrong branch
 
 
 class PaperAlign(Stage[PaperAlignSettings]):
-    """P IV and V.C-V.E: smallest-angle matching, EKF, and the branch put right by the drone's motion."""
+    """P IV and V.C-V.E: smallest-angle matching, EKF, and correction of the branch by the drone's motion."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"fix", "visual_motion", "motion"})
 
@@ -96,7 +96,7 @@ class PaperAlign(Stage[PaperAlignSettings]):
         self._correction.add_fix(fix)
 
     def on_visual_motion(self, motion: VisualMotion) -> None:
-        """dt_DD(i, j), or a link of it."""
+        """dt_DD(i, j), or one step of it."""
         self._correction.add_motion(motion)
 
     def on_motion(self, motion: VehicleMotion) -> None:
@@ -106,23 +106,23 @@ class PaperAlign(Stage[PaperAlignSettings]):
     def on_vehicle(self, directions: VanishingDirections) -> Iterator[RelativeRotation]:
         """V_G."""
         for pair in self._pairing.vehicle(_of(directions, CameraMount.VEHICLE, "vehicle")):
-            yield self._answer(*pair)
+            yield self._align(*pair)
 
     def on_drone(self, directions: VanishingDirections) -> Iterator[RelativeRotation]:
-        """V_D. One answer comes for each of the drone's images, once the vehicle's nearest one is known."""
+        """V_D. Yields one rotation for each drone image, once the nearest vehicle image is known."""
         for pair in self._pairing.drone(_of(directions, CameraMount.DRONE, "drone")):
-            yield self._answer(*pair)
+            yield self._align(*pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
-        """What still waited for a later image of the vehicle goes with what there is."""
+        """Publish the rotations of images that still wait for a nearer one."""
         for pair in self._pairing.rest():
-            yield self._answer(*pair)
+            yield self._align(*pair)
 
-    def _answer(self, vehicle: VanishingDirections | None, drone: VanishingDirections) -> RelativeRotation:
-        """What one image of the drone and the vehicle's nearest one say."""
+    def _align(self, vehicle: VanishingDirections | None, drone: VanishingDirections) -> RelativeRotation:
+        """Message of one drone image and the nearest vehicle image."""
         now_ns, estimate = drone.stamp_ns, self._filter
         estimate.predict(now_ns)
-        why = self._absence(vehicle, drone)
+        why = self._missing_reason(vehicle, drone)
         if vehicle is None or why:
             self._correction.add_image(now_ns, estimate.rotation if self._observed else None)
             return self._message(now_ns, None, why)
@@ -131,16 +131,16 @@ class PaperAlign(Stage[PaperAlignSettings]):
         self._correction.add_image(now_ns, estimate.rotation)
         return self._message(now_ns, estimate.rotation, reason)
 
-    def _absence(self, vehicle: VanishingDirections | None, drone: VanishingDirections) -> str:
-        """Why there is nothing to match; empty when there is."""
+    def _missing_reason(self, vehicle: VanishingDirections | None, drone: VanishingDirections) -> str:
+        """Why the pair cannot be matched; empty if it can."""
         if vehicle is None:
-            return f"no picture of the vehicle's within {self.settings.max_apart_s:g} s of the drone's"
+            return f"no image of the vehicle camera within {self.settings.max_apart_s:g} s of the drone image"
         return "; ".join(
             f"{one.camera_mount.value}: {one.reason}" for one in (vehicle, drone) if len(one.direction) < 2
         )
 
     def _observe(self, vehicle: Array64, drone: Array64, now_ns: int) -> str:
-        """Match, correct the branch if motion says so, update the filter. Returns what was done, in words."""
+        """Match, correct the branch by motion, update the filter. Returns the reason text of the message."""
         estimate, sigma_rad = self._filter, math.radians(self.settings.observation_deg)
         found = match(vehicle, drone, estimate.rotation)
         turn_rad = self._correction.turn_rad()
@@ -152,10 +152,10 @@ class PaperAlign(Stage[PaperAlignSettings]):
                 estimate.restart(corrected.R_vehicle_drone, sigma_rad)
                 self._correction.restart()
                 self._switches += 1
-                return f"branch corrected: motion says {math.degrees(turn_rad):.0f} deg about the vertical"
+                return f"branch corrected by motion: {math.degrees(turn_rad):.0f} deg about the vertical"
         estimate.observe(found.R_vehicle_drone, sigma_rad)
         return f"matched within {math.degrees(found.angle_rad):.1f} deg" + (
-            ", motion agrees" if turn_rad is not None else ""
+            ", confirmed by motion" if turn_rad is not None else ""
         )
 
     def _message(self, stamp_ns: int, R: Array64 | None, reason: str) -> RelativeRotation:

@@ -1,4 +1,4 @@
-"""The paper's Kalman filter on the relative rotation, with its slow angular rate.
+"""Extended Kalman filter of the paper on the relative rotation and its slowly varying angular rate.
 
     state       R, w: R_vehicle_drone and the drone's angular rate against the vehicle [rad/s], drone axes
     predict     R <- R exp(w dt), w stays, its change is white noise of `rate_noise`     (a rate that changes slowly)
@@ -16,14 +16,14 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation, nearest_rotation
 
-FURTHEST_S = 1.0  # beyond the newest observation the rate turns the estimate no further
+FURTHEST_S = 1.0  # the rate is applied for at most this time after the newest observation
 
 
 class RotationFilter:
     """Extended Kalman filter on R and its rate."""
 
     def __init__(self, R: Array64, sigma_rad: float, rate_sigma_radps: float, rate_noise: float) -> None:
-        """`rate_noise` [rad/s / sqrt(s)]: how much the rate may change within a second."""
+        """`rate_noise` [rad/s / sqrt(s)]: noise density of the rate."""
         self.rotation = R
         self.rate_radps = np.zeros(3)
         self.covariance: Array64 = np.diag([sigma_rad**2] * 3 + [rate_sigma_radps**2] * 3)
@@ -32,7 +32,7 @@ class RotationFilter:
         self._observed_ns: int | None = None
 
     def predict(self, stamp_ns: int) -> None:
-        """Move on to a time; one that is not later changes nothing."""
+        """Propagate to a time; an earlier time has no effect."""
         last_ns, self._stamp_ns = self._stamp_ns, max(stamp_ns, self._stamp_ns or stamp_ns)
         if last_ns is None or stamp_ns <= last_ns:
             return
@@ -59,7 +59,7 @@ class RotationFilter:
         self._observed_ns = self._stamp_ns
 
     def restart(self, R: Array64, sigma_rad: float) -> None:
-        """Begin anew from a rotation: another branch has another rate history."""
+        """Reset to a rotation with zero rate: another branch has another rate history."""
         self.rotation, self.rate_radps = R, np.zeros(3)
         self.covariance = np.diag([sigma_rad**2] * 3 + [self._rate_sigma_radps**2] * 3)
         self._observed_ns = self._stamp_ns

@@ -1,9 +1,9 @@
-"""Two cameras' vanishing directions to one rotation: the smallest angles under the previous one say which is which.
+"""Relative rotation from the vanishing directions of two cameras, matched by the smallest angles.
 
     V_G = R_GD V_D,   R_GD = V_G V_D^-1, made a rotation                       columns of V: matched directions
 
 A direction is an axis: v and -v are the same. Of all pairs (v_G, v_D) the one with the smallest angle between v_G and
-R_previous v_D is taken first, then the best of the rest; the third column is the cross product of the other two.
+R_previous v_D is matched first, then the best of the rest; the third column is the cross product of the other two.
 
 Source: P IV, Eq. 7-10; DESIGN, The paper's formulas.
 """
@@ -21,7 +21,7 @@ from stages.kernels.geometry.so3 import log_rotation, nearest_rotation
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """What two sets of directions say."""
+    """Rotation between two sets of directions."""
 
     R_vehicle_drone: Array64  # (3, 3)
     angle_rad: float  # the larger one of the two pairs, under the previous rotation

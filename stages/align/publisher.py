@@ -1,4 +1,4 @@
-"""Message of a pair of images: the rotation on its most probable branch, or why there is none, and whether it jumped.
+"""Message of a pair of images: the rotation on its most probable branch or the reason for its absence, and jumps.
 
 Source: ours.
 """
@@ -19,13 +19,13 @@ JUMP_RAD = math.radians(30.0)  # change of the published yaw that counts as a ju
 
 
 class Publisher:
-    """One for each pair of images."""
+    """Makes one message for each pair of images."""
 
     def __init__(self, bank: HypothesisBank, dead_reckoning: DeadReckoning, resolve_probability: float) -> None:
         self._bank, self._dead_reckoning = bank, dead_reckoning
         self._resolve_probability = resolve_probability
         self._branch = 0  # published, counted from the tracked yaw
-        self._given_rad: float | None = None  # published yaw less the dead reckoned one
+        self._published_rad: float | None = None  # last published yaw less the dead reckoned one
         self._switches = 0
         self._news = ""
 
@@ -36,20 +36,20 @@ class Publisher:
     def rotation(
         self, vehicle_ns: int, drone_ns: int, refined: Refined, dead_reckoned: DeadReckonedYaw, off_rad: Array64
     ) -> RelativeRotation:
-        """The most probable branch; `off_rad` (3,): by how much it contradicts what is known, its error then."""
+        """The most probable branch; `off_rad` (3,): its rejected tilt difference, added to the covariance."""
         before, self._branch = self._branch, self._bank.best(self._branch)
-        given_rad = refined.yaw_rad + self._branch * math.pi / 2 - dead_reckoned.yaw_rad
-        if self._given_rad is not None:
-            jump_rad = math.remainder(given_rad - self._given_rad, 2 * math.pi)
+        yaw_offset_rad = refined.yaw_rad + self._branch * math.pi / 2 - dead_reckoned.yaw_rad
+        if self._published_rad is not None:
+            jump_rad = math.remainder(yaw_offset_rad - self._published_rad, 2 * math.pi)
             if abs(jump_rad) > JUMP_RAD:
                 self._switches += 1
                 why = "by motion" if before != self._branch else "by vanishing points"
                 self._news = f"JUMP: {why} {math.degrees(jump_rad):+.0f} deg; {self._news}".rstrip("; ")
-        self._given_rad = given_rad
+        self._published_rad = yaw_offset_rad
         resolved = self._bank.resolved(self._branch, self._resolve_probability)
         left, right, stamp_ns, variance_rad2 = self._dead_reckoning.at_common_time(vehicle_ns, drone_ns)
         covariance = right.T @ (refined.covariance_rad2(self._branch) + np.outer(off_rad, off_rad)) @ right
-        told = f"{refined.directions} directions, {refined.vehicle_lines} and {refined.drone_lines} lines"
+        lines = f"{refined.directions} directions, {refined.vehicle_lines} and {refined.drone_lines} lines"
         known = f"{self._bank.windows} windows of motion, none right: {self._bank.probability[NONE]:.1g}"
         news, self._news = self._news, ""
         return RelativeRotation(
@@ -59,7 +59,7 @@ class Publisher:
             branch_probability=self._probability(),
             state=BranchState.RESOLVED if resolved else BranchState.AMBIGUOUS,
             switches=self._switches,
-            reason="; ".join(part for part in (news, told, known) if part),
+            reason="; ".join(part for part in (news, lines, known) if part),
         )
 
     def none(self, stamp_ns: int, reason: str) -> RelativeRotation:

@@ -1,13 +1,13 @@
-"""Both cameras at once: the tilt of each, the yaw between them and the streets' directions, from all lines together.
+"""Joint refinement of the tilts of both cameras, the yaw between them and the directions of the streets.
 
-    unknown    tilt of each camera (2 angles each), yaw, azimuth a_k of each direction k, and as each camera has it
+    unknown    tilt of each camera (2 angles each), yaw, azimuth a_k of each direction k, and its value in each camera
     line i     n_i . h(a_vk) = 0 in the vehicle's level axes,  n_i . h(a_dk) = 0 in the drone's       robust weights
-    camera     a_vk = a_k,  a_dk = a_k - yaw        up to `direction_rad`: errors that many lines have in common
+    camera     a_vk = a_k,  a_dk = a_k - yaw        up to `direction_rad`: errors that many lines share
     streets    a_j = a_k + 90 deg for two directions nearly at right angles      up to `square_rad`
-    tilt       as the images' verticals say, up to their sigma
+    tilt       that of the vertical of each image, up to its sigma
 
-Hundreds of lines along one street do not average its error away: they share the lens, the image and the street. So
-each camera has its own idea of each direction, and only these are tied together; the covariance is what is left.
+Hundreds of lines along one street do not average its error out: they share the lens, the image and the street. So each
+camera has its own estimate of each direction, and only these estimates are tied together.
 
 Source: ours, for P IV Eq. 7-10; DESIGN, Vision: raw covariance is overconfident (NEES/3 about 21).
 """
@@ -27,45 +27,45 @@ from stages.kernels.geometry.so3 import exp_rotation
 
 TILTS_AND_YAW = 5  # the first unknowns: tilt x, y of the vehicle, of the drone, yaw
 MOST_DIRECTIONS = 6
-APART_RAD = math.radians(4.0)  # directions nearer to each other than this are one
-WEAKEST = 0.08  # a direction with less of the strongest one's lines is none
-NEAR_RAD = math.radians(3.0)  # lines so near to a direction belong to it
+APART_RAD = math.radians(4.0)  # directions nearer to each other are the same
+WEAKEST = 0.08  # share of the strongest direction, below which a direction is ignored
+NEAR_RAD = math.radians(3.0)  # lines this near to a direction belong to it
 SQUARE_RAD = math.radians(2.5)  # two directions this near to a right angle are taken to be square
-CAUCHY = 2.0  # residuals, in sigmas, from which a line counts less
+CAUCHY = 2.0  # [sigma] residual from which the weight of a line falls
 ROUNDS = 4
-ODD = 16.0  # squared residuals count no more than this
-FEW = 20.0  # lines: a direction of so few is worse
+MAX_RESIDUAL2 = 16.0  # bound of a squared residual
+FEW = 20.0  # lines: the variance of a direction with fewer is inflated
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How far from perfect the world and the images are, one sigma [rad]."""
+    """Deviations of the scene and the images from the model, one sigma [rad]."""
 
     straight_rad: float  # a line of a street
-    direction_rad: float  # what all lines that one camera has of a street share
+    direction_rad: float  # error shared by all lines of a street in one camera
     square_rad: float  # a crossing
-    tilt_rad: float  # a vertical, beyond what its image says, and what all lines of a image share
+    tilt_rad: float  # error of a vertical beyond its sigma, shared by all lines of an image
 
 
 @dataclass(frozen=True)
 class Refined:
-    """R_vehicle_drone = R_vehicle_level Rz(yaw) R_drone_level^T, and how well its five angles are known."""
+    """R_vehicle_drone = R_vehicle_level Rz(yaw) R_drone_level^T, with the covariance of its five angles."""
 
     R_vehicle_level: Array64
     R_drone_level: Array64
     yaw_rad: float
     covariance: Array64  # (5, 5) of the tilts x, y of the vehicle's level axes, of the drone's, and yaw
-    directions: int  # along which lines of both cameras run
-    vehicle_lines: int  # lines that speak, weighed: a line that fits badly is less than one
+    directions: int  # seen by both cameras
+    vehicle_lines: int  # sum of the robust weights of the lines
     drone_lines: int
 
     @property
     def yaw_sigma_rad(self) -> float:
-        """Of the yaw alone."""
+        """Sigma of the yaw."""
         return math.sqrt(self.covariance[4, 4])
 
     def R_vehicle_drone(self, quarters: int) -> Array64:
-        """The rotation (3, 3), turned by so many quarter turns about the vertical."""
+        """The rotation (3, 3), turned by `quarters` times 90 deg about the vertical."""
         return self.R_vehicle_level @ rotation_z(self.yaw_rad + quarters * math.pi / 2) @ self.R_drone_level.T
 
     def covariance_rad2(self, quarters: int) -> Array64:
@@ -79,7 +79,7 @@ class Refined:
 
 
 def street_directions(vehicle: Array64, drone: Array64, yaw_rad: float) -> Array64:
-    """Azimuths (k,) in the vehicle's level axes of the strongest directions of both spectra (BINS,) together."""
+    """Azimuths (k,) in the vehicle's level axes of the strongest directions of both spectra (BINS,) combined."""
     together = vehicle + np.roll(drone, round(yaw_rad / BIN_RAD))
     left, right = np.roll(together, 1), np.roll(together, -1)
     tops = np.flatnonzero((together > left) & (together >= right) & (together > WEAKEST * together.max()))
@@ -99,20 +99,20 @@ def half_turn_difference(angle_rad: float) -> float:
 
 @dataclass
 class _Camera:
-    """One camera's share: its lines by direction, and its level axes as refined so far."""
+    """Lines of one camera by direction, and its level axes as refined so far."""
 
     R: Array64  # R_carrier_level
     normal: Array64  # (m, 3) camera_mount axes
     sigma: Array64  # (m,)
-    k: NDArray[np.int64]  # (m,) which direction
-    azimuth: Array64  # (K,) as this camera has it, in its own level axes
-    tilt: Array64  # (2,) turned so far from what the vertical says
+    k: NDArray[np.int64]  # (m,) index of the direction
+    azimuth: Array64  # (K,) estimate of this camera, in its own level axes
+    tilt: Array64  # (2,) rotation so far from the measured vertical
     tilt_sigma_rad: float
-    inflation: Array64  # (K,) how many times worse than usual this camera has a direction: few lines, or at odds
+    inflation: Array64  # (K,) sigma factor of each direction: few lines, or large residuals
     effective_lines: float = 0.0
 
     def rows(self, at: int, tilt_at: int, unknowns: int) -> tuple[Array64, Array64]:
-        """J (m, unknowns) and r (m,) of the lines, in sigmas and weighed."""
+        """J (m, unknowns) and r (m,) of the lines, in sigmas and weighted."""
         n = self.normal @ self.R
         a = self.azimuth[self.k]
         c, s = np.cos(a), np.sin(a)
@@ -125,14 +125,14 @@ class _Camera:
         weight = 1.0 / (1.0 + (scaled / CAUCHY) ** 2)
         self.effective_lines = float(weight.sum())
         lines = np.maximum(np.bincount(self.k, minlength=len(self.azimuth)), 1)
-        at_odds = np.bincount(self.k, np.minimum(scaled**2, ODD), minlength=len(self.azimuth)) / lines
-        self.inflation = np.maximum(at_odds, 1.0) * np.sqrt(1.0 + FEW / lines)
+        mean_residual2 = np.bincount(self.k, np.minimum(scaled**2, MAX_RESIDUAL2), minlength=len(self.azimuth)) / lines
+        self.inflation = np.maximum(mean_residual2, 1.0) * np.sqrt(1.0 + FEW / lines)
         root = np.sqrt(weight) / self.sigma
         return J * root[:, None], r * root
 
 
 def _camera(lines: LevelLines, directions: Array64, yaw_rad: float, allowed: Tolerances) -> _Camera:
-    """The lines near one of the directions (K,), which the vehicle has; `yaw_rad` turns them into the camera's."""
+    """Lines near one of the directions (K,) of the vehicle; `yaw_rad` turns the directions into this camera's axes."""
     azimuth = directions - yaw_rad
     off = lines.azimuth_rad[:, None] - azimuth
     off = np.abs((off + math.pi / 2) % math.pi - math.pi / 2)
@@ -160,7 +160,7 @@ def refine(
     yaw_rad: float,
     allowed: Tolerances,
 ) -> Refined:
-    """Gauss-Newton from the spectra's `yaw_rad` and `directions` (K,) on."""
+    """Gauss-Newton refinement, started at `yaw_rad` and `directions` (K,) of the spectra."""
     K = len(directions)
     unknowns = TILTS_AND_YAW + 3 * K
     street, own = TILTS_AND_YAW, (TILTS_AND_YAW + K, TILTS_AND_YAW + 2 * K)
@@ -186,7 +186,7 @@ def refine(
     for row, (i, j) in enumerate(squares, 2 * K):
         ties[row, [street + i, street + j]] = 1 / allowed.square_rad, -1 / allowed.square_rad
     information = np.eye(unknowns)
-    weight = np.ones(len(ties))  # of the ties: a street that the cameras see differently counts less
+    weight = np.ones(len(ties))  # of the ties: reduced where the cameras disagree on a street
     for _ in range(ROUNDS):
         off_square = [from_square(a[i] - a[j]) / allowed.square_rad for i, j in squares]
         r_ties = np.concatenate(
@@ -214,7 +214,7 @@ def refine(
         yaw += float(step[4])
         a = a + step[street : street + K]
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)[:TILTS_AND_YAW, :TILTS_AND_YAW]
-    covariance[range(4), range(4)] += allowed.tilt_rad**2  # hundreds of lines share this, too
+    covariance[range(4), range(4)] += allowed.tilt_rad**2  # shared by all lines, so it does not average out
     both = sum(1 for k in range(K) if all(np.any(camera.k == k) for camera in cameras))
     return Refined(
         R_vehicle_level=cameras[0].R,
@@ -228,5 +228,5 @@ def refine(
 
 
 def from_square(angle_rad: float) -> float:
-    """How far two azimuths, `angle_rad` apart modulo 180 deg, are from a right angle; positive: more than +90 deg."""
+    """Deviation from a right angle of the angle between two azimuths, modulo 180 deg; positive: more than +90 deg."""
     return half_turn_difference(angle_rad - math.pi / 2)

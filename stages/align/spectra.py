@@ -1,19 +1,20 @@
-"""Yaw spectra: how much line there is along each horizontal direction, and how two cameras' spectra lie on each other.
+"""Yaw spectra: length of lines along each horizontal direction, and the overlap of the spectra of two cameras.
 
 A line of the image lies on a great circle with normal n (level axes, z up). If the line is horizontal in the world,
 its direction is where the circle meets the horizon:
 
     h = z x n / |z x n|,   azimuth = atan2(h_y, h_x) mod 180 deg,   sigma_azimuth = sigma |t . h| / |z x n|
 
-with sigma the line's turn about its middle ray m and t = n x m: a roof's edge overhead tells its direction well and
-one far away at the horizon hardly. The spectrum S(a) is the sum
-of a von Mises kernel for each line, its area the line's length. Two cameras of the same street see spectra that are
-turned by the yaw between them: it is where they overlap best. Streets cross at right angles more often than not and
-one camera may see the one street, the other the other: yaw is told modulo 90 deg here.
+with sigma the angular error of the line about its middle ray m and t = n x m: the edge of a roof overhead determines
+its direction well, one far away at the horizon hardly. The spectrum S(a) is the sum of one von Mises kernel per line,
+with the length of the line as its area. The spectra of two cameras in the same street differ by the yaw between them:
+it is where they overlap best. Most streets cross at right angles, and each camera may see another one of them: yaw is
+determined modulo 90 deg here.
 
-Source: ours, for P IV; DESIGN, Vision: nearest matching of one frame per camera failed in 20 of 40. Plain correlation
-lays the strongest street of the one camera on the strongest of the other, whichever they are: on streets at many
-angles it was wrong in 13 of 20 tuning pairs where the overlap was wrong in none.
+Plain correlation would match the strongest street of one camera with the strongest of the other, even where these are
+different streets; the overlap does not.
+
+Source: ours, for P IV; DESIGN, Vision.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ from stages.kernels.align.spectra import BIN_RAD, BINS, add_kernels
 from stages.messages import VanishingDirections
 
 QUARTER = BINS // 2
-BROAD_RAD = math.radians(4.0)  # a line whose azimuth is worse says nothing of yaw
-LONG_RAD = 0.5  # longer lines count no more
+BROAD_RAD = math.radians(4.0)  # lines with a larger azimuth sigma are not used
+LONG_RAD = 0.5  # bound of the weight of a line
 NEAR_BINS = 4  # directions this near to each other are the same
-DIRECTION_SHARE = 0.04  # of all lines: a direction from which on it counts fully
+DIRECTION_SHARE = 0.04  # share of all lines from which a direction has full weight
 
 
 @dataclass(frozen=True)
 class LevelLines:
-    """A camera's lines that may be horizontal, in level axes: z is up, x the camera_mount's forward."""
+    """Lines of a camera that may be horizontal, in level axes: z is up, x is forward of the camera mount."""
 
     R_carrier_level: Array64  # (3, 3)
-    tilt_sigma_rad: float  # of up, each of two axes
+    tilt_sigma_rad: float  # of the vertical, each of two axes
     normal: Array64  # (m, 3)
     sigma_rad: Array64  # (m,) of n . h
     azimuth_rad: Array64  # (m,) in [0, pi)
@@ -48,7 +49,7 @@ class LevelLines:
 
 
 def level_axes(up: Array64) -> Array64:
-    """R_carrier_level (3, 3): z is `up` (3,), x the camera_mount's x made level (its y where x is upright)."""
+    """R_carrier_level (3, 3): z is `up` (3,), x is the levelled x axis of the camera mount (y where x is upright)."""
     z = up / np.linalg.norm(up)
     forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = forward - (forward @ z) * z
@@ -57,12 +58,12 @@ def level_axes(up: Array64) -> Array64:
 
 
 def level_lines(seen: VanishingDirections, sharpest_rad: float) -> LevelLines | None:
-    """The horizontal lines of a image; `sharpest_rad` is how straight streets are. None: it has no vertical."""
+    """Horizontal lines of an image; `sharpest_rad`: least azimuth sigma of a line. None: the image has no vertical."""
     upright = np.flatnonzero(seen.is_vertical)
     if upright.size == 0:
         return None
     up = seen.direction[upright[0]]
-    R = level_axes(up if up[2] >= 0 else -up)  # a camera_mount does not fly upside down
+    R = level_axes(up if up[2] >= 0 else -up)  # the camera mount is never upside down
     chosen = np.flatnonzero(seen.line_direction >= 0)
     chosen = chosen[~seen.is_vertical[seen.line_direction[chosen]]]
     normal = seen.line_normal[chosen] @ R
@@ -100,8 +101,8 @@ def overlap(vehicle: Array64, drone: Array64) -> Array64:
 
         L(yaw) = (sum_a p_v(a) q_d(a - yaw) + sum_a q_v(a) p_d(a - yaw)) / 2
 
-    p is the spectrum folded to 90 deg with sum 1, q is 1 where p has a direction and 0 elsewhere. Which directions
-    there are is the same for both cameras; how many lines each has along them is not. Zeros when a spectrum is empty.
+    p is the spectrum folded to 90 deg with sum 1, q is 1 where p has a direction and 0 otherwise. Both cameras see the
+    same directions, but not the same number of lines along them. Zeros when a spectrum is empty.
     """
     if vehicle.sum() <= 0 or drone.sum() <= 0:
         return np.zeros(QUARTER)
@@ -112,13 +113,13 @@ def overlap(vehicle: Array64, drone: Array64) -> Array64:
 
 
 def folded(spectrum_: Array64) -> Array64:
-    """Modulo 90 deg (QUARTER,), sum 1; the spectrum is not empty."""
+    """Spectrum modulo 90 deg (QUARTER,), with sum 1; the spectrum must not be empty."""
     p = spectrum_[:QUARTER] + spectrum_[QUARTER:]
     return p / p.sum()
 
 
 def nearby(p: Array64) -> Array64:
-    """How much of p (QUARTER,) lies within NEAR_BINS of each bin."""
+    """Sum (QUARTER,) of p within NEAR_BINS of each bin."""
     ends = np.concatenate([p[-NEAR_BINS:], p, p[:NEAR_BINS]])
     total = np.concatenate([[0.0], np.cumsum(ends)])
     return total[2 * NEAR_BINS + 1 :] - total[: -2 * NEAR_BINS - 1]
@@ -129,7 +130,7 @@ def _has_direction(p: Array64) -> Array64:
 
 
 def shared_directions(vehicle: Array64, drone: Array64, yaw_rad: float) -> int:
-    """Directions modulo 90 deg along which both cameras have a good share of their lines."""
+    """Number of directions modulo 90 deg along which both cameras have at least 2 DIRECTION_SHARE of their lines."""
     if vehicle.sum() <= 0 or drone.sum() <= 0:
         return 0
     both = np.minimum(nearby(folded(vehicle)), np.roll(nearby(folded(drone)), round(yaw_rad / BIN_RAD)))
@@ -144,16 +145,16 @@ class Peak:
     likeness: float
 
 
-def peaks(correlation: Array64, apart_rad: float) -> list[Peak]:
-    """Maxima, best first, each at least `apart_rad` from any better one; the place between bins is a parabola's."""
+def peaks(correlation: Array64, separation_rad: float) -> list[Peak]:
+    """Maxima, best first, at least `separation_rad` from any better one; interpolated between bins by a parabola."""
     left, right = np.roll(correlation, 1), np.roll(correlation, -1)
     tops = np.flatnonzero((correlation > left) & (correlation >= right) & (correlation > 0))
     found: list[Peak] = []
     for k in tops[np.argsort(-correlation[tops], kind="stable")].tolist():
         bend = left[k] - 2 * correlation[k] + right[k]
-        place = (k + 0.5 * (left[k] - right[k]) / bend) * BIN_RAD
-        if all(abs(quarter_difference(place - other.yaw_rad)) >= apart_rad for other in found):
-            found.append(Peak(float(place % (math.pi / 2)), float(correlation[k])))
+        position = (k + 0.5 * (left[k] - right[k]) / bend) * BIN_RAD
+        if all(abs(quarter_difference(position - other.yaw_rad)) >= separation_rad for other in found):
+            found.append(Peak(float(position % (math.pi / 2)), float(correlation[k])))
     return found
 
 

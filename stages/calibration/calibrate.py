@@ -72,9 +72,11 @@ def calibrate(
     `parked`: the vehicle is known to have stood still. A servo that sweeps in both directions does not need it.
     """
     if not rig.turns:
-        raise CannotCalibrate("the rig says that its LiDAR is bolted down (turns: false): there is no servo mount")
+        raise CannotCalibrate("the rig has a fixed LiDAR (turns: false): there is no servo mount")
     if len(trace.stamp_ns) < 2:
-        raise CannotCalibrate("the recording holds no servo states: a LiDAR that does not turn sees nothing twice")
+        raise CannotCalibrate(
+            "the recording contains no servo states: a LiDAR that does not turn observes no surface twice"
+        )
     if len(returns.stamp_ns) < FEWEST_RETURNS:
         raise CannotCalibrate(
             f"the LiDAR returned {len(returns.stamp_ns)} pulses, at least {FEWEST_RETURNS} are needed: was it running?"
@@ -83,20 +85,18 @@ def calibrate(
     numbers = servo_mount(rig)
     at = servo_at(trace, returns.stamp_ns, numbers, max_gap_s)
     if not np.isfinite(at.position_rad).any():
-        raise CannotCalibrate("no pulse of the LiDAR lies between two servo states: were their clocks the same?")
+        raise CannotCalibrate("no pulse of the LiDAR is between two servo states: were both stamped by one clock?")
     travel = Travel.of(at.position_rad, at.rate_radps)
     _check_travel(travel.angle_rad)
     if not (travel.both_ways or parked):
         raise CannotCalibrate(
             "the servo turned one way only, which does not show whether the vehicle stood still: sweep there and back, "
-            "or say that it stood with --parked"
+            "or pass --parked if it did"
         )
     solution = solve(returns, trace, numbers, max_gap_s)
     _check_still(returns, trace, numbers, solution, travel.both_ways, max_gap_s)
     if solution is None or len(solution.system.patches.first) < FEWEST_PATCHES:
-        raise CannotCalibrate(
-            "too few flat surfaces were seen more than once: drive to where there are walls, and stand still there"
-        )
+        raise CannotCalibrate("too few flat surfaces were observed more than once: park near walls")
     findings = assess(numbers, solution.mount, solution.covariance, travel)
     written = accepted(numbers, solution.mount, findings, solution.covariance, travel)
     curve_rad, mean_rad = curve_sigmas(solution.covariance, travel)
@@ -150,7 +150,7 @@ def _check_still(
     steady = drift(system, returns) if system and solution else None
     how = ""
     if between is not None and between.moved:
-        how = "what stands upright was elsewhere when it was seen again"
+        how = "upright objects had moved when they were observed again"
     elif steady is not None and (steady.moved_m > MOVED_M or steady.turned_rad > TURNED_RAD):
         how = f"surfaces fit a drive by {steady.moved_m:.2f} m and a turn by {math.degrees(steady.turned_rad):.2f} deg"
     if how:

@@ -1,9 +1,9 @@
 """Axis tilt and servo zero, which a sweep does not determine, from the vehicle's stated orientation.
 
-A rotation of everything about the servo's axis leaves each surface as thin as before, and so does a tilt of the axis in
-the vehicle. The ground around a level vehicle determines that tilt. It does not determine the zero, since the axis is
-vertical and the ground is symmetric about it. The zero needs a wall parallel to the vehicle. The sigma of both includes
-the sigma of the stated orientation and the consistency of ground or wall.
+A rotation of everything about the servo's axis does not change the thickness of any surface, nor does a tilt of the
+axis in the vehicle. The ground around a level vehicle determines that tilt. It does not determine the zero, since the
+axis is vertical and the ground is symmetric about it. The zero needs a wall parallel to the vehicle. The sigma of both
+includes the sigma of the stated orientation and the consistency of ground or wall.
 
 Source: ours. Lines and planes with Cauchy's weights: Holland, Welsch (1977).
 """
@@ -49,18 +49,18 @@ class _Undetermined(Exception):
     """The scene does not determine it; the text states why."""
 
 
-def stand(found: Calibration, rig: LidarMount, said: Standing) -> Calibration:
+def stand(found: Calibration, rig: LidarMount, stated: Standing) -> Calibration:
     """The calibration with axis tilt and zero, where the stated orientation and the scene determine them."""
     xyz_m = np.where(np.isfinite(found.after.xyz_m), found.after.xyz_m, found.patches.on_plane_m)
     centre, axes, _ = planes(xyz_m, found.patches.first, found.patches.patch)
     T = rig.T_vehicle_turntable.matrix()
     R_vehicle_base, findings, mount = T[:3, :3], list(found.findings), found.mount
     normal = axes[:, :, 0]
-    if said.level_rad is not None:
+    if stated.level_rad is not None:
         before = _tilt_deg(R_vehicle_base)
         try:
             up, ground_rad = ground(normal @ R_vehicle_base.T, centre @ R_vehicle_base.T, -T[2, 3])
-            sigma_rad, rejected = math.hypot(said.level_rad, ground_rad), ""
+            sigma_rad, rejected = math.hypot(stated.level_rad, ground_rad), ""
             R_vehicle_base = _upright(up) @ R_vehicle_base
             mount = mount.model_copy(update={"T_vehicle_turntable": _pose(rig.T_vehicle_turntable, R_vehicle_base)})
         except _Undetermined as why:
@@ -68,13 +68,13 @@ def stand(found: Calibration, rig: LidarMount, said: Standing) -> Calibration:
         for i, axis in enumerate("xy"):
             what, after = f"axis's tilt in the vehicle about {axis}", _tilt_deg(R_vehicle_base)[i]
             findings.append(Finding(f"level_{axis}", what, "deg", before[i], after, math.degrees(sigma_rad), rejected))
-    if said.parallel_rad is not None:
+    if stated.parallel_rad is not None:
         at = next(i for i, finding in enumerate(findings) if finding.name == "zero")
         try:
             where, heading_rad, wall_rad = wall(
-                normal @ R_vehicle_base.T, centre @ R_vehicle_base.T + T[:3, 3], said.parallel_rad
+                normal @ R_vehicle_base.T, centre @ R_vehicle_base.T + T[:3, 3], stated.parallel_rad
             )
-            sigma_deg = math.degrees(math.hypot(said.parallel_rad, wall_rad))
+            sigma_deg = math.degrees(math.hypot(stated.parallel_rad, wall_rad))
             if sigma_deg > UNCALIBRATED_DEG:
                 raise _Undetermined(f"sigma is {sigma_deg:.2f} deg, no better than a rig as bought")
             zero_deg = mount.servo_zero_deg + rig.servo_sign * math.degrees(heading_rad)
@@ -95,55 +95,57 @@ def ground(normal: Array64, centre_m: Array64, below_m: float) -> tuple[Array64,
     near = centre_m[lying & (np.hypot(centre_m[:, 0], centre_m[:, 1]) < GROUND_M)]
     if len(near) < FEWEST_GROUND or _narrowest_m(near[:, :2]) < WIDE_M:
         raise _Undetermined(
-            f"too little of the ground within {GROUND_M:g} m was seen on all sides ({len(near)} flat patches): "
-            "stand in the open"
+            f"too little of the ground within {GROUND_M:g} m was observed on all sides ({len(near)} flat patches): "
+            "park in the open"
         )
     slope, share = _fitted(near)
     if share < AGREE:
         raise _Undetermined(
-            f"of the ground's patches {100 * share:.0f} % lie on one plane: stand where there is no kerb, and no slope "
-            "begins"
+            f"of the ground's patches {100 * share:.0f} % lie on one plane: park where there is no kerb and no "
+            "change of slope"
         )
     bends = [_fitted(near[side], ROUGH_M)[0] - slope for side in _halves(near[:, :2]) if _is_wide(near[side])]
     if len(bends) < 3:
-        raise _Undetermined("the ground was seen on one side of the vehicle only: stand in the open")
+        raise _Undetermined("the ground was observed on one side of the vehicle only: park in the open")
     bent_rad = float(np.linalg.norm(bends, axis=1).max())
     if bent_rad > BENT_RAD:
         raise _Undetermined(
-            f"the ground bends by {math.degrees(bent_rad):.1f} deg about the vehicle: stand where it is even"
+            f"the ground bends by {math.degrees(bent_rad):.1f} deg about the vehicle: park where it is even"
         )
     up = np.array([-slope[0], -slope[1], 1.0])
     return up / np.linalg.norm(up), bent_rad
 
 
-def wall(normal: Array64, centre_m: Array64, said_rad: float) -> tuple[str, float, float]:
+def wall(normal: Array64, centre_m: Array64, stated_sigma_rad: float) -> tuple[str, float, float]:
     """Description, heading [rad] and sigma [rad] of the nearest wall next to the vehicle. Raises _Undetermined.
 
     Patches (m, 3) in the vehicle frame. A wall on the other side that is not much farther has to run the same way.
     """
-    beside = (np.abs(normal[:, 2]) < UPRIGHT) & (np.abs(normal[:, 1]) > math.cos(2 * SIDE_RAD))
-    beside &= np.abs(centre_m[:, 1]) < WALL_M
-    found = [(side, _nearest_wall(centre_m[beside & (side * centre_m[:, 1] > 0)])) for side in (1.0, -1.0)]
+    aside = (np.abs(normal[:, 2]) < UPRIGHT) & (np.abs(normal[:, 1]) > math.cos(2 * SIDE_RAD))
+    aside &= np.abs(centre_m[:, 1]) < WALL_M
+    found = [(side, _nearest_wall(centre_m[aside & (side * centre_m[:, 1] > 0)])) for side in (1.0, -1.0)]
     walls = sorted((*one, side) for side, one in found if one is not None)
     if not walls:
-        raise _Undetermined(f"no wall of {LONG_M:g} m was seen beside the vehicle, within {WALL_M:g} m: park along one")
+        raise _Undetermined(
+            f"no wall of {LONG_M:g} m was observed next to the vehicle, within {WALL_M:g} m: park along one"
+        )
     distance_m, heading_rad, sigma_rad, side = walls[0]
     where = f"{distance_m:.1f} m to the {'left' if side > 0 else 'right'}"
     if abs(heading_rad) > SIDE_RAD:
         raise _Undetermined(
             f"by the rig's zero the wall {where} is {math.degrees(abs(heading_rad)):.1f} deg off the vehicle's "
-            "heading, which would be seen by eye: set the zero roughly, or park along a wall"
+            "heading, too much for a zero error: set the zero roughly, or park along a wall"
         )
     if sigma_rad > BENT_RAD:
         raise _Undetermined(
-            f"the wall beside the vehicle bends by {math.degrees(sigma_rad):.1f} deg: park along a flat one"
+            f"the wall next to the vehicle bends by {math.degrees(sigma_rad):.1f} deg: park along a flat one"
         )
     for other_m, other_rad, other_sigma_rad, _ in walls[1:]:
         off_rad = abs(other_rad - heading_rad)
-        if other_m < 2 * distance_m and off_rad > 3 * math.hypot(said_rad, sigma_rad, other_sigma_rad):
+        if other_m < 2 * distance_m and off_rad > 3 * math.hypot(stated_sigma_rad, sigma_rad, other_sigma_rad):
             raise _Undetermined(
-                f"the walls on both sides differ by {math.degrees(off_rad):.1f} deg, and which one is meant is not "
-                "known: park nearer to one"
+                f"the walls on both sides differ by {math.degrees(off_rad):.1f} deg, and it is not known which "
+                "one is meant: park nearer to it"
             )
     return where, heading_rad, sigma_rad
 

@@ -26,7 +26,7 @@ EXPECTED = np.array([5.0, 5.0, 0.5, 0.2, 0.2, 0.5])  # [m/s], [rad/s]: prior sig
 CELL_M = 0.2
 CELLS = 512
 FARTHEST_M = 50.0
-UPRIGHT_M = 0.5  # a column with returns this far apart in height contains an upright object
+UPRIGHT_M = 0.5  # a column with returns over this range of height contains an upright object
 FEWEST_CELLS = 150
 SECTORS = 72
 BETTER = 1.1  # least gain of a shift over no shift
@@ -93,8 +93,8 @@ def shift(xyz_m: Array64, stamp_ns: NDArray[np.int64]) -> Shift | None:
 def _upright(xyz_m: Array64) -> Array64:
     """Map (CELLS, CELLS) from above: 1 where an upright object stands, else 0."""
     cell = np.floor(xyz_m[:, :2] / CELL_M).astype(np.int64) + CELLS // 2
-    place = cell[:, 0] * CELLS + cell[:, 1]
+    number = cell[:, 0] * CELLS + cell[:, 1]
     low, high = np.full(CELLS**2, np.inf), np.full(CELLS**2, -np.inf)
-    np.minimum.at(low, place, xyz_m[:, 2])
-    np.maximum.at(high, place, xyz_m[:, 2])
+    np.minimum.at(low, number, xyz_m[:, 2])
+    np.maximum.at(high, number, xyz_m[:, 2])
     return (high - low > UPRIGHT_M).astype(np.float64).reshape(CELLS, CELLS)

@@ -30,8 +30,8 @@ class Parameter:
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter("tilt_x", "LiDAR's tilt about the turntable's x", "deg", DEG, 1.0, 0.05, 0.0005),
     Parameter("tilt_y", "LiDAR's tilt about the turntable's y", "deg", DEG, 1.0, 0.05, 0.0005),
-    Parameter("axis_x", "LiDAR's place from the servo's axis, x", "mm", 1e-3, 30.0, 5.0, 0.7),
-    Parameter("axis_y", "LiDAR's place from the servo's axis, y", "mm", 1e-3, 30.0, 5.0, 0.7),
+    Parameter("axis_x", "LiDAR's offset from the servo's axis, x", "mm", 1e-3, 30.0, 5.0, 0.7),
+    Parameter("axis_y", "LiDAR's offset from the servo's axis, y", "mm", 1e-3, 30.0, 5.0, 0.7),
     *(
         Parameter(f"{part[:3]}_{order}", f"encoder's error, {part} of order {order}", "deg", DEG, 0.5, 0.05, 0.003)
         for order in ORDERS

@@ -1,7 +1,8 @@
-"""Flat patches: cells of space whose returns, from all looks of a sweep, lie on one plane.
+"""Flat patches: cells of space whose returns, from all scan passes of a sweep, lie on one plane.
 
-A cell is a cube, larger with the range, since what an angle error does grows with it. In each, planes are fitted to
-what lies near the plane before, so that few strays (a passing bird, leaves, the edge of a sill) do not tilt it.
+A cell is a cube that grows with the range, as the effect of an angle error does. In each cell, a plane is fitted
+repeatedly to the returns near the previous plane, so that few outliers (a passing bird, leaves, the edge of a sill) do
+not tilt it.
 
 Source: ours; planes as eigenvectors of a cell's scatter: Liu, Zhang, BALM (2021), section III.
 """
@@ -16,11 +17,11 @@ from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 
-CELLS_M = ((6.0, 0.5), (18.0, 1.0), (1e9, 2.0))  # up to which range, edge of the cube
+CELLS_M = ((6.0, 0.5), (18.0, 1.0), (1e9, 2.0))  # largest range, edge of the cube
 RANGE_NOISE_M = 0.012  # along the beam: noise of a laser without its bias
 ANGLE_NOISE_RAD = 5e-4  # across the beam: encoder steps, time stamps, beam width on a slope
-FEWEST = 24  # returns of a patch, at least
-MOST = 160  # returns of a patch, at most: no wall is flat enough for more
+FEWEST = 24  # least number of returns of a patch
+MOST = 160  # largest number of returns of a patch: no wall is flat enough for more
 WIDE = 0.15  # least width (one sigma of the narrower side) as a share of the cell
 MARGIN_M = 0.05  # excluded margin of a cell, where range noise decides whether a return is inside
 CLOSE_RAD = 0.003
@@ -95,7 +96,7 @@ def _on_grid(
     index = chosen[order[keep]]
     roughest = ROUGHEST if tolerance_rad < CLOSE_RAD else 1e9
     slack = 2.5 * RANGE_NOISE_M + range_m * tolerance_rad
-    for share in (1.0, 0.5, 0.5):  # of the slack: nearer to the plane each time
+    for share in (1.0, 0.5, 0.5):  # of the slack: closer to the plane each time
         index, first = _many(index, first)
         patch = _numbers(first, len(index))
         centre, axes, spread = planes(xyz_m[index], first, patch)
@@ -176,7 +177,7 @@ def _thinned(first: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], N
     sizes = np.diff(np.append(first, count))
     step = np.maximum(-(-sizes // MOST), 1)
     within = np.arange(count) - np.repeat(first, sizes)
-    # a step that shares no factor with the 16 lasers: every laser stays
+    # a step that shares no factor with the 16 lasers: every laser remains
     keep = np.nonzero(within % np.repeat(step + (step % 2 == 0), sizes) == 0)[0]
     return _subset(keep, np.repeat(np.arange(len(first)), sizes)[keep], np.ones(len(keep), dtype=np.bool_))
 

@@ -84,8 +84,10 @@ def curve_sigmas(covariance: Array64, travel: Travel) -> tuple[float, float]:
     chosen = [NAMES.index(name) for name in CURVE]
     inner = covariance[np.ix_(chosen, chosen)]
     mean = rows.mean(axis=0)
-    bent = rows - mean
-    return math.sqrt(float(np.einsum("ij,jk,ik->i", bent, inner, bent).mean())), math.sqrt(float(mean @ inner @ mean))
+    varying = rows - mean
+    return math.sqrt(float(np.einsum("ij,jk,ik->i", varying, inner, varying).mean())), math.sqrt(
+        float(mean @ inner @ mean)
+    )
 
 
 def assess(rig: ServoMount, found: ServoMount, covariance: Array64, travel: Travel) -> tuple[Finding, ...]:
@@ -102,7 +104,7 @@ def assess(rig: ServoMount, found: ServoMount, covariance: Array64, travel: Trav
             limit = f"the curve's sigma is {math.degrees(curve_rad):.3f} deg, more than 0.03 deg"
         elif parameter.name in blind:
             accepted, sigma[i] = False, parameter.expected * parameter.per_unit
-            limit = f"taken as {parameter.expected:g} {parameter.unit} uncertain"
+            limit = f"its sigma is assumed to be {parameter.expected:g} {parameter.unit}"
         else:
             accepted = sigma[i] < parameter.limit * parameter.per_unit
             sigma_unit = sigma[i] / parameter.per_unit
@@ -170,16 +172,18 @@ def unseen(travel: Travel) -> dict[str, str]:
     estimated from its braking.
     """
     found = {
-        "zero": "a turn of everything about the servo's axis leaves every surface thin, so no scene tells it: "
-        "measure it at the vehicle, or park parallel to a wall and say so (--parallel)"
+        "zero": "a rotation about the servo's axis leaves every surface thin, so no scene determines it: "
+        "measure it at the vehicle, or park parallel to a wall and pass --parallel"
     }
     if not travel.both_ways:
-        found["time"] = "the servo turned one way only, so a late clock looks like a zero: sweep there and back"
-        found["play"] = "the servo turned one way only, so the play never changed sides: sweep there and back"
+        found["time"] = (
+            "the servo turned one way only, so a time offset is not separable from the zero: sweep there and back"
+        )
+        found["play"] = "the servo turned one way only, so the side of the play never changed: sweep there and back"
     elif not travel.two_speeds:
         found["time"] = found["play"] = (
-            "the servo turned at one speed only, so a late clock and the play of the gear look alike: sweep at another "
-            "speed as well, or vibrate"
+            "the servo turned at one speed only, so a time offset and the play of the gear are not separable: sweep at "
+            "a second speed, or vibrate"
         )
     return found
 
@@ -188,9 +192,11 @@ def _why(i: int, sigma: Array64, correlation: Array64) -> str:
     """The reason why the scene does not determine a parameter."""
     if sigma[i] > BLIND * PARAMETERS[i].expected * PARAMETERS[i].per_unit:
         if NAMES[i] in ("play", "time", *CURVE):
-            return "too little that stands upright was seen more than once, and level ground does not show a turn"
-        return "the surfaces seen more than once do not show it: walls in two directions would"
+            return (
+                "too few upright surfaces were observed more than once, and level ground does not determine a rotation"
+            )
+        return "the surfaces observed more than once do not determine it: walls in two directions are needed"
     other = max((k for k in range(len(NAMES)) if k != i), key=lambda k: abs(float(correlation[i, k])))
     if abs(float(correlation[i, other])) > ALIKE:
-        return f"in this scene it cannot be told from the {PARAMETERS[other].what}"
-    return "too few surfaces were seen more than once from angles that show it"
+        return f"in this scene it is not separable from the {PARAMETERS[other].what}"
+    return "too few surfaces were observed more than once from angles that determine it"

@@ -49,7 +49,7 @@ MOVING_RADPS = 0.1  # slower, the direction of a state is not known
 BIN_RAD = math.radians(0.5)
 START_SIGMA_S = 0.02
 KNOWN_S = 1e-3  # below this sigma fewer iterations and fewer windows are used
-MOST_PLACES = 4096
+MAX_POSITIONS = 4096
 TRACE_NS = 500_000_000  # of servo states before a window
 AXIS_SIGMA_M = 3e-3
 FEWEST_PATCHES = 20
@@ -62,10 +62,8 @@ class ServoClockSettings(Settings):
 
     mount: LidarMount
     window_s: float = Field(3.0, ge=1, le=20)
-    every_packet: int = Field(12, ge=1, le=100)  # one in so many LiDAR messages is used
-    every_window: int = Field(
-        10, ge=1, le=1000
-    )  # of the windows this one is taken, once the offset is known to KNOWN_S
+    every_packet: int = Field(12, ge=1, le=100)  # every n-th LiDAR message is used
+    every_window: int = Field(10, ge=1, le=1000)  # every n-th window is evaluated, once the offset is known to KNOWN_S
     both_ways_deg: float = Field(5.0, gt=0)  # least angle passed in both directions
     play_sigma_deg: float = Field(0.05, gt=0)  # sigma of the rig's gear play
     angle_sigma_deg: float = Field(0.05, gt=0)  # sigma of the LiDAR's tilt and of the encoder error
@@ -83,11 +81,11 @@ class ServoClock(Stage[ServoClockSettings]):
         super().__init__(settings, **values)
         self._firings: list[LidarFirings] = []
         self._states: list[ServoState] = []
-        self._places: list[Array64] = []
+        self._positions: list[Array64] = []
         self._packets: int = 0
         self._offset_s: float = 0.0  # beyond the rig's
         self._variance_s2: float = START_SIGMA_S**2
-        self._shared_s: float = 0.0  # sigma of what all windows have in common
+        self._shared_s: float = 0.0  # sigma of the error common to all windows
         self._windows: int = 0
         self._known_ns: int | None = None
         self._resting_until_ns: int = 0
@@ -102,9 +100,9 @@ class ServoClock(Stage[ServoClockSettings]):
     def on_motion(self, motion: VehicleMotion) -> None:
         """Buffer the vehicle's position."""
         if motion.stamp_ns < self._resting_until_ns or motion.status is MotionStatus.DENIED:
-            self._places.clear()
-        self._places.append(motion.xyz_map_m)
-        del self._places[:-MOST_PLACES]
+            self._positions.clear()
+        self._positions.append(motion.xyz_map_m)
+        del self._positions[:-MAX_POSITIONS]
 
     def on_servo(self, servo: ServoState) -> None:
         """Buffer the servo state."""
@@ -113,7 +111,7 @@ class ServoClock(Stage[ServoClockSettings]):
         if not self._states or servo.stamp_ns > self._states[-1].stamp_ns:
             self._states.append(servo)
         if self._states[-1].stamp_ns - self._states[0].stamp_ns > 3.0 * self.settings.window_s * 1e9 + 2 * TRACE_NS:
-            self._states, self._firings, self._places = [], [], self._places[-1:]  # the LiDAR is silent: reset
+            self._states, self._firings, self._positions = [], [], self._positions[-1:]  # no data of the LiDAR: reset
 
     def on_firings(self, firings: LidarFirings) -> Iterator[ServoOffset]:
         """Buffer the packet; at the end of a window, publish the estimate."""
@@ -127,7 +125,7 @@ class ServoClock(Stage[ServoClockSettings]):
             reason = self._take_window()
             if self._known_ns == self._firings[-1].stamp_ns and self._variance_s2 < KNOWN_S**2:
                 self._resting_until_ns = firings.stamp_ns + round((settings.every_window - 1) * settings.window_s * 1e9)
-            self._firings, self._places = [], self._places[-1:]
+            self._firings, self._positions = [], self._positions[-1:]
             self._states = [s for s in self._states if s.stamp_ns > firings.stamp_ns - TRACE_NS]
             yield self._estimate(firings.stamp_ns, reason)
 
@@ -146,7 +144,7 @@ class ServoClock(Stage[ServoClockSettings]):
 
     def _take_window(self) -> str:
         """Evaluate the window; return its result, or why it has none."""
-        if len(self._places) > 1 and np.ptp(np.stack(self._places), axis=0).max() > self.settings.moved_m:
+        if len(self._positions) > 1 and np.ptp(np.stack(self._positions), axis=0).max() > self.settings.moved_m:
             return "the vehicle moved"
         states = self._states
         if len(states) < 10:
@@ -158,8 +156,8 @@ class ServoClock(Stage[ServoClockSettings]):
             return f"the servo passed {math.degrees(both_rad):.1f} deg in both directions, less than both_ways_deg"
         found = self._solve(ServoTrace.of(stamp_ns, position_rad, STEP_RAD))
         if found is None:
-            return "too few flat surfaces were seen"
-        return self._join(*found)
+            return "too few flat surfaces were observed"
+        return self._add(*found)
 
     def _solve(self, trace: ServoTrace) -> tuple[float, float, float] | None:
         """Offset beyond the rig's, its own sigma, and the sigma common to all windows [s]; None: too few patches."""
@@ -186,14 +184,14 @@ class ServoClock(Stage[ServoClockSettings]):
                 variance_s2 = float(covariance[TIME, TIME]) - INFLATION**2 * common_s2
         return float(x[TIME]), math.sqrt(variance_s2), math.sqrt(common_s2)
 
-    def _join(self, found_s: float, own_s: float, shared_s: float) -> str:
-        """x <- x + K (z - x), K = P / (P + R), after P <- P + q dt; P and R without what windows share."""
+    def _add(self, found_s: float, own_s: float, shared_s: float) -> str:
+        """x <- x + K (z - x), K = P / (P + R), after P <- P + q dt; P and R without the error common to all windows."""
         now_ns = self._firings[-1].stamp_ns
         if self._known_ns is not None:
             self._variance_s2 += WALK_S**2 * (now_ns - self._known_ns) * 1e-9
         self._known_ns = now_ns
-        alone_s, sigma_s = self.settings.mount.servo_time_offset_s + found_s, math.hypot(own_s, shared_s)
-        result = f"{1e3 * alone_s:.2f} ms, sigma {1e3 * sigma_s:.2f} ms"
+        window_s, sigma_s = self.settings.mount.servo_time_offset_s + found_s, math.hypot(own_s, shared_s)
+        result = f"{1e3 * window_s:.2f} ms, sigma {1e3 * sigma_s:.2f} ms"
         total_s2 = self._variance_s2 + own_s**2
         if self._windows and (found_s - self._offset_s) ** 2 > OUTLIER**2 * (
             total_s2 + shared_s**2 + self.settings.floor_s**2
@@ -213,8 +211,8 @@ class ServoClock(Stage[ServoClockSettings]):
 def shared_s2(system: System, prior: Array64) -> float:
     """The part of the offset's variance from errors of the rig's other parameters, common to all windows.
 
-    Off by e ~ P^-1 they move the offset by (B P e)_t: variance (B P B)_tt with B = (J^T J / v + P)^-1; the time's own
-    P is none of them.
+    Off by e ~ P^-1 they move the offset by (B P e)_t: variance (B P B)_tt with B = (J^T J / v + P)^-1; the prior
+    of the time itself is excluded.
     """
     J, v = system.columns, system.variance_factor
     others = prior.copy()

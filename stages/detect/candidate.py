@@ -17,7 +17,7 @@ import numpy as np
 from stages.detect.flight import Motion, fit_motion, lamp_sway_m, moves, wire_sway_m
 from stages.detect.motion_log_ratios import DENIED, MotionLogRatios
 from stages.geometry.frames import Array64
-from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M, what_stands_beside
+from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M, neighbour_score
 from stages.kernels.detect.isolation import SECTORS
 
 HISTORY = 40  # observations kept
@@ -148,7 +148,7 @@ class Candidate:
             )
         self.round_chords += s.round_chords
         self.rough_chords += s.rough_chords
-        weight, measured = what_stands_beside(s.isolation, self.free)
+        weight, measured = neighbour_score(s.isolation, self.free)
         self.neighbours = [(position_m, FADING * faded) for position_m, faded in self.neighbours[-HISTORY:]]
         if weight > 0.0:
             self.neighbours.append((s.xyz_map_m, weight))

@@ -14,7 +14,7 @@ import numpy as np
 from stages.detect.candidate import Candidate
 from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
-from stages.messages import Candidates, Detections
+from stages.messages import CandidateEvidence, Candidates, Detections
 
 
 def probability(log_odds: float) -> float:
@@ -33,6 +33,7 @@ def candidates_message(
     now_ns: int,
     detector_instance: int,
     at_most: int,
+    accept_probability: float,
     expected_mps: Array64,
     spread_mps: float,
     reported_mps: float,
@@ -55,6 +56,7 @@ def candidates_message(
         seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
         scan_passes=np.array([c.scan_passes for c in listed], dtype=np.int64),
         reasons=tuple(c.reason for c in listed),
+        accept_probability=accept_probability,
         undirected_speed_mps=np.array(undirected_speed_mps, dtype=np.float64),
         detector_instance=detector_instance,
     )
@@ -91,15 +93,15 @@ def detections_message(
     return Detections(
         stamp_ns=end_ns,
         xyz_vehicle_m=xyz_vehicle_m,
-        score=np.array([c.log_odds for c in listed], dtype=np.float64),
-        e_inner=np.zeros(len(listed)),
-        e_outer=np.zeros(len(listed)),
         accepted=np.array([c.accepted for c in listed], dtype=np.bool_),
         reasons=tuple(c.reason for c in listed),
         summary=summary,
-        start_ns=start_ns,
-        seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
-        velocity_vehicle_mps=np.array([v for _, v in seen]).reshape(-1, 3),
-        probability=np.array([probability(c.log_odds) for c in listed], dtype=np.float64),
-        candidate_id=np.array([c.number for c in listed], dtype=np.int64),
+        evidence=CandidateEvidence(
+            start_ns=start_ns,
+            candidate_id=np.array([c.number for c in listed], dtype=np.int64),
+            seen_ns=np.array([c.seen_ns for c in listed], dtype=np.int64),
+            velocity_vehicle_mps=np.array([v for _, v in seen]).reshape(-1, 3),
+            log_odds=np.array([c.log_odds for c in listed], dtype=np.float64),
+            probability=np.array([probability(c.log_odds) for c in listed], dtype=np.float64),
+        ),
     )

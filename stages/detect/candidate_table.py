@@ -14,7 +14,7 @@ import numpy as np
 from stages.detect.candidate import Candidate, Observation
 from stages.detect.observations import Slice
 from stages.geometry.frames import Array64
-from stages.kernels.detect.candidate_table import ELSEWHERE, NOTHING, look_at_all, nearest_row
+from stages.kernels.detect.candidate_table import NO_PULSE, OUTSIDE, count_pulses, nearest_row
 
 ROWS = 64  # initial size; the table grows
 STATE = 9  # columns: position, velocity, variances
@@ -78,15 +78,15 @@ class CandidateTable:
         came near or that the fan does not cover.
         """
         rows, pulses = len(self._candidates), part.pulses
-        remarks = look_at_all(
+        count = count_pulses(
             self._state, self._ns, self._promising, rows, now_ns, part.R, part.t, part.axis, origin_m,
             pulses.direction_vehicle, pulses.range_m, disc_m, most_variance, self._found,
         )  # fmt: skip
-        if not remarks:
+        if not count:
             return
         for row, (status, returns, pass_throughs) in enumerate(self._found[:rows].tolist()):
-            if status != NOTHING:
-                yield self._candidates[row], returns, pass_throughs, status == ELSEWHERE
+            if status != NO_PULSE:
+                yield self._candidates[row], returns, pass_throughs, status == OUTSIDE
 
 
 def positions_of(candidates: Iterable[Candidate]) -> Array64:

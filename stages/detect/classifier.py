@@ -90,9 +90,8 @@ class ClassifierWeights(BaseModel):
     # calibration
     no_telemetry_weight: float = 0.76  # without telemetry: factor and
     no_telemetry_offset: float = -0.37  # offset of the log-odds
-    calibration_knee: float = (
-        1.0  # above these log-odds (73 %) a drone is less frequent than independent evidence implies,
-    )
+    # above these log-odds (73 %) a drone is less frequent than independent evidence implies,
+    calibration_knee: float = 1.0
     calibration_slope: float = 0.72  # because scan passes err together: this share of the excess counts
     reacquired: float = 3.0  # penalty of a reacquisition by chance, divided by the scan passes since
 

@@ -1,6 +1,6 @@
 """Detector by evidence: classifies candidates as pulses arrive, each with a probability and its reasons.
 
-    pulses -> chords (chords.py): short, free at reacquired ends, above the horizon
+    pulses -> chords (chords.py): short, free at both ends, above the horizon
            -> observations (observations.py): one scan pass on one object, and its surroundings (isolation.py)
            -> candidates (candidate.py): observations that fit one moving object (flight.py)
            -> log-odds of a drone over a false return, a static object, a bird and a balloon (classifier.py)
@@ -37,7 +37,7 @@ from stages.geometry.frames import Array64
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.candidate import SIGMA_M
 from stages.kernels.detect.candidate_table import first_within
-from stages.kernels.sweep.pulses import looking_along
+from stages.kernels.sweep.pulses import mean_unit_direction
 from stages.messages import (
     Candidates,
     Detections,
@@ -92,21 +92,21 @@ class _State:
 class EvidenceDetectSettings(Settings):
     """Settings of `EvidenceDetect`."""
 
-    span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
-    lowest_deg: float = Field(4.0, ge=-30, le=80)  # candidates are this far above the LiDAR's horizon
-    nearest_m: float = Field(1.5, ge=0.3)
-    furthest_m: float = Field(65.0, gt=1)
+    span_m: float = Field(0.5, gt=0, le=10)  # largest dimension of the drone
+    lowest_deg: float = Field(4.0, ge=-30, le=80)  # least elevation of candidates above the LiDAR's horizon
+    nearest_m: float = Field(1.5, ge=0.3)  # least range of candidates
+    furthest_m: float = Field(65.0, gt=1)  # greatest range of candidates
     clear_m: float = Field(2.0, gt=0.2)  # radius that must be free; a lamp is this far from its pole
-    accept_probability: float = Field(0.95, gt=0.5, lt=1)
-    follow_up_probability: float = Field(0.014, gt=0, lt=0.5)
-    report_s: float = Field(1.0, gt=0.05)
+    accept_probability: float = Field(0.95, gt=0.5, lt=1)  # at which a candidate is accepted as a drone
+    follow_up_probability: float = Field(0.014, gt=0, lt=0.5)  # at which a candidate is published for more observations
+    report_s: float = Field(1.0, gt=0.05)  # longest time between messages while a drone is accepted; else 3 times it
     settle_s: float = Field(0.15, ge=0)  # delay of a pass's report, so that its last observations are complete
-    sweep_deg: float = Field(180.0, gt=3, le=360)
-    forget_s: float = Field(4.0, gt=0)
-    max_candidates: int = Field(12, ge=1)  # published
+    sweep_deg: float = Field(180.0, gt=3, le=360)  # travel of the turntable that completes a pass
+    forget_s: float = Field(4.0, gt=0)  # a promising candidate is removed this long after its last observation
+    max_candidates: int = Field(12, ge=1)  # per published message
     parked: bool = False  # the vehicle does not move: motion is known without VehicleMotion
     free_space: bool = True  # ablation: False ignores the measured surroundings
-    weights: ClassifierWeights = ClassifierWeights()
+    weights: ClassifierWeights = ClassifierWeights()  # log likelihood ratios of the classifier
 
     @model_validator(mode="after")
     def _settings_agree(self) -> EvidenceDetectSettings:
@@ -152,7 +152,7 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         now_ns = int(pulses.point_stamp_ns[-1])
         if now.start_ns is None:
             now.start_ns = now.pruned_ns = now.detector_instance = pulses.stamp_ns
-        part = Slice(pulses, *now.trail.at(pulses.middle_ns), looking_along(pulses.direction_vehicle))
+        part = Slice(pulses, *now.trail.at(pulses.middle_ns), mean_unit_direction(pulses.direction_vehicle))
         changed = False
         observations = now.finder.feed(part, self._motion_known(now_ns))
         self._count_pass_throughs(now, part, now_ns)
@@ -176,11 +176,10 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         if best is not None:
             return self._update(now, best, s) or reacquired is not None
         since_ns = s.stamp_ns - (NEAR_REJECTED_NS if self._motion_known(s.stamp_ns) else NEAR_REJECTED_NS // 20)
-        refused_m = now.rejected_map.nearest_m(s.xyz_map_m, 0.0, NEAR_REJECTED_M, since_ns)
-        near_rejected = math.isfinite(refused_m)
-        if (
-            reacquired is None and not near_rejected and not math.isfinite(s.large_object_m)
-        ):  # under trees something is everywhere
+        rejected_m = now.rejected_map.nearest_m(s.xyz_map_m, 0.0, NEAR_REJECTED_M, since_ns)
+        near_rejected = math.isfinite(rejected_m)
+        # under trees observations are frequent at any position, so that a reacquisition would be by chance
+        if reacquired is None and not near_rejected and not math.isfinite(s.large_object_m):
             self._reacquire(now, s)
         now.number += 1
         new = Candidate(
@@ -193,23 +192,23 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
             p=(SIGMA_M**2, 0.0, START_SPEED_MPS**2),
             first_returns=s.returns,
         )
-        new.near_rejected, new.revisited = near_rejected, refused_m < REVISITED_M and now.telemetry.moves(s.stamp_ns)
+        new.near_rejected, new.revisited = near_rejected, rejected_m < REVISITED_M and now.telemetry.moves(s.stamp_ns)
         new.add_observation(s)
-        news = self._classify(now, new)
+        changed = self._classify(now, new)
         if new.is_promising:
             new.velocity_mps = now.trail.velocity_mps(s.stamp_ns)  # a drone follows the vehicle
             now.table.put(new)
         else:
             now.rejected[new.rejection] += 1
             self._remember_rejected(now, new)
-        return news
+        return changed
 
     def _update(self, now: _State, c: Candidate, s: Observation) -> bool:
         """Update a candidate with an observation. True: publish a change."""
         c.update(s)
-        news = self._classify(now, c)
+        changed = self._classify(now, c)
         now.table.put(c)
-        return news
+        return changed
 
     def _reacquire(self, now: _State, s: Observation) -> None:
         """Continue a candidate at an observation at which the drone's odometry predicts it after a pause."""
@@ -317,7 +316,8 @@ class EvidenceDetect(Stage[EvidenceDetectSettings]):
         if changed or new:
             listed = [c for c in now.table if c.is_promising or (c.was_promising and now_ns - c.seen_ns < 300_000_000)]
             motion = now.telemetry.expected_motion(now.trail, now_ns)
-            yield candidates_message(listed, now.trail, now_ns, now.detector_instance, settings.max_candidates, *motion)
+            limits = settings.max_candidates, settings.accept_probability
+            yield candidates_message(listed, now.trail, now_ns, now.detector_instance, *limits, *motion)
         assert now.start_ns is not None
         since_s = (now_ns - now.start_ns) * 1e-9
         here = any(c.seen_ns >= now.start_ns for c in accepted)

@@ -18,8 +18,8 @@ from __future__ import annotations
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.kernels.detect.isolation import MAP_SIZE, nearest_remembered, remember
-from stages.kernels.detect.pulse_buffer import keep_slice, look_around_all
+from stages.kernels.detect.isolation import MAP_SIZE, mark_cells, nearest_marked
+from stages.kernels.detect.pulse_buffer import count_sectors_all, keep_slice
 from stages.messages import SweptPulses
 
 MAX_SLICES = 16
@@ -34,7 +34,7 @@ class RecentPulses:
         self._origin_m = np.zeros((MAX_SLICES, 3))
         self._sizes = np.zeros(MAX_SLICES, dtype=np.int64)  # 0: none, or too old
         self._end_ns = np.zeros(MAX_SLICES, dtype=np.int64)
-        self._fan = np.zeros((MAX_SLICES, 4))  # mean direction, and how far any pulse is beside it [rad]
+        self._fan = np.zeros((MAX_SLICES, 4))  # mean direction, and the largest angle of a pulse from it [rad]
         self._next = 0
 
     def add(self, pulses: SweptPulses, axis: Array64, end_ns: int) -> None:
@@ -53,8 +53,8 @@ class RecentPulses:
     def isolation(
         self, centre_m: Array64, disc_m: float, inner_m: float, close_m: float, outer_m: float, depth_m: float
     ) -> Array64:
-        """Sector counts (TALLY,) around a position (3,) in the vehicle frame; see `look_around`."""
-        return look_around_all(
+        """Sector counts (TALLY,) around a position (3,) in the vehicle frame; see `count_sectors`."""
+        return count_sectors_all(
             self._direction, self._range_m, self._origin_m, self._fan, self._sizes,
             centre_m, disc_m, inner_m, close_m, outer_m, depth_m,
         )  # fmt: skip
@@ -70,8 +70,8 @@ class LargeObjectMap:
 
     def add(self, points_m: Array64, stamp_ns: int) -> None:
         """Add points (n, 3) of large objects, in a static frame."""
-        remember(points_m, self._cell_m, stamp_ns, self._key, self._when)
+        mark_cells(points_m, self._cell_m, stamp_ns, self._key, self._when)
 
     def nearest_m(self, centre_m: Array64, least_m: float, most_m: float, since_ns: int) -> float:
         """Distance to the nearest one observed since then, beyond least_m (the object itself); inf beyond most_m."""
-        return float(nearest_remembered(centre_m, self._cell_m, least_m, most_m, since_ns, self._key, self._when))
+        return float(nearest_marked(centre_m, self._cell_m, least_m, most_m, since_ns, self._key, self._when))

@@ -1,10 +1,10 @@
-"""Detect: the depth image of a sweep becomes drone candidates with a score and a reason each.
+"""Detector of the paper: drone candidates in the depth image of a sweep, each with a score and a reason.
 
     t_hat_0 = unproject(argmin_c e(c))                                                      Equation (1)
 
-over all pixels with depth, e from `stages/detect/kernel_candidates.py`. The paper stops there, so it always reports a
-drone. Here the local minima are taken in ascending order of score, and each is accepted or refused with a reason.
-`gates: null` is the paper literally: the lowest score is the drone.
+over all pixels with depth, e from `stages/detect/kernel_candidates.py`. The paper always reports a drone at that
+pixel. Here the local minima are tested in ascending order of score, and each is accepted or rejected with a reason.
+`gates: null` is the paper's method: the pixel of lowest score is accepted.
 
 Source: P III.B, Equations 1-5; the gates are ours.
 """
@@ -19,9 +19,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flow.stage import Settings, Stage
-from stages.detect.kernel_candidates import Gates, Pixel, inner_half_px, local_minima, refusal, score_image
+from stages.detect.kernel_candidates import Gates, Pixel, inner_half_px, local_minima, reject_reason, score_image
 from stages.kernels.detect.kernel_score import kernel_terms
-from stages.messages import DepthImage, Detections, ScoreImage
+from stages.messages import DepthImage, Detections, KernelScores, ScoreImage
 from stages.sweep.depth_image import unproject
 
 
@@ -36,21 +36,21 @@ class Candidate(NamedTuple):
 class KernelDetectSettings(Settings):
     """Settings of `KernelDetect`.
 
-    `nearest_m`: nothing nearer is a candidate (the vehicle's own roof); it also bounds the inner box.
+    `nearest_m`: least depth of a candidate, farther than the vehicle's own roof; it also bounds the inner box.
     """
 
-    span_m: float = Field(0.5, gt=0, le=10)  # s, the drone's largest extent
-    outer_side_px: int = Field(20, ge=2, le=200)  # s_ao
-    eps_m: float = Field(0.1, ge=1e-3)  # eps
+    span_m: float = Field(0.5, gt=0, le=10)  # s, largest dimension of the drone
+    outer_side_px: int = Field(20, ge=2, le=200)  # s_ao, side of the outer box
+    eps_m: float = Field(0.1, ge=1e-3)  # eps of Equations 4 and 5
     nearest_m: float = Field(1.0, ge=0.1)
-    gates: Gates | None = Gates()
-    max_minima: int = Field(128, ge=1)  # looked at
-    max_candidates: int = Field(12, ge=1)  # given out
+    gates: Gates | None = Gates()  # null: the paper's method
+    max_minima: int = Field(128, ge=1)  # local minima that are tested
+    max_candidates: int = Field(12, ge=1)  # per published message
 
     @model_validator(mode="after")
     def _settings_agree(self) -> KernelDetectSettings:
-        if self.gates is not None and self.gates.company_m <= self.span_m:
-            raise ValueError("gates.company_m must be larger than span_m: it is where a drone has nothing beside it")
+        if self.gates is not None and self.gates.neighbour_m <= self.span_m:
+            raise ValueError("gates.neighbour_m must be larger than span_m: no object may be within it next to a drone")
         return self
 
 
@@ -58,7 +58,7 @@ class KernelDetect(Stage[KernelDetectSettings]):
     """P III.B: the two-box kernel. Accepted detections come from at most `max_minima` minima, best score first."""
 
     def on_image(self, image: DepthImage) -> Iterator[ScoreImage | Detections]:
-        """Score every pixel, then judge the minima."""
+        """Score every pixel, then accept or reject the minima."""
         settings = self.settings
         score = score_image(
             image.depth_m, image.focal_px, settings.span_m, settings.outer_side_px, settings.eps_m, settings.nearest_m
@@ -66,22 +66,22 @@ class KernelDetect(Stage[KernelDetectSettings]):
         yield ScoreImage(stamp_ns=image.stamp_ns, score=score)
         half_outer = settings.outer_side_px // 2
         minima = local_minima(score, image.depth_m, half_outer, settings.span_m, settings.max_minima)
-        judged = [self._judge(image, pixel, rank) for rank, pixel in enumerate(minima)]
-        yield self._detections(image, judged)
+        candidates = [self._candidate(image, pixel, rank) for rank, pixel in enumerate(minima)]
+        yield self._detections(image, candidates)
 
-    def _judge(self, image: DepthImage, pixel: Pixel, rank: int) -> Candidate:
+    def _candidate(self, image: DepthImage, pixel: Pixel, rank: int) -> Candidate:
         settings = self.settings
         if settings.gates is None:
             return Candidate(pixel, rank == 0, "lowest score" if rank == 0 else "not the lowest score")
-        why = refusal(image, pixel, settings.span_m, settings.outer_side_px, settings.gates)
-        return Candidate(pixel, why is None, why or "small, alone, and seen whole")
+        reason = reject_reason(image, pixel, settings.span_m, settings.outer_side_px, settings.gates)
+        return Candidate(pixel, reason is None, reason or "small, isolated, and measured completely")
 
-    def _detections(self, image: DepthImage, judged: list[Candidate]) -> Detections:
-        # accepted ones first in line for a place, then the list in the order of their scores again
-        places = sorted(range(len(judged)), key=lambda rank: (not judged[rank].accepted, rank))[
+    def _detections(self, image: DepthImage, candidates: list[Candidate]) -> Detections:
+        # accepted candidates have precedence; the message lists them in the order of their scores
+        ranks = sorted(range(len(candidates)), key=lambda rank: (not candidates[rank].accepted, rank))[
             : self.settings.max_candidates
         ]
-        listed = [judged[rank] for rank in sorted(places)]
+        listed = [candidates[rank] for rank in sorted(ranks)]
         xyz_vehicle_m = np.array([unproject(image, *c.pixel) for c in listed], dtype=np.float64).reshape(-1, 3)
         terms = np.array([self._terms(image, c.pixel) for c in listed], dtype=np.float64).reshape(-1, 2)
         accepted = np.array([c.accepted for c in listed], dtype=np.bool_)
@@ -92,16 +92,14 @@ class KernelDetect(Stage[KernelDetectSettings]):
             if accepted.sum() > 1:
                 summary += f"; {int(accepted.sum()) - 1} more with a higher score"
         else:
-            summary = f"no drone: {self._why_none(image, judged)}"
+            summary = f"no drone: {self._no_drone_reason(image, candidates)}"
         return Detections(
             stamp_ns=image.stamp_ns,
             xyz_vehicle_m=xyz_vehicle_m,
-            score=terms.sum(axis=1),
-            e_inner=terms[:, 0].copy(),
-            e_outer=terms[:, 1].copy(),
             accepted=accepted,
             reasons=tuple(c.reason for c in listed),
             summary=summary,
+            evidence=KernelScores(e_inner=terms[:, 0].copy(), e_outer=terms[:, 1].copy()),
         )
 
     def _terms(self, image: DepthImage, pixel: Pixel) -> tuple[float, float]:
@@ -109,10 +107,10 @@ class KernelDetect(Stage[KernelDetectSettings]):
         half_inner = inner_half_px(float(image.depth_m[pixel]), image.focal_px, settings.span_m)
         return kernel_terms(image.depth_m, *pixel, half_inner, settings.outer_side_px // 2, settings.eps_m)
 
-    def _why_none(self, image: DepthImage, judged: list[Candidate]) -> str:
-        if not judged:
+    def _no_drone_reason(self, image: DepthImage, candidates: list[Candidate]) -> str:
+        if not candidates:
             view_deg = math.degrees(math.atan(image.depth_m.shape[1] / 2 / image.focal_px))
             near = f", none of them {self.settings.nearest_m:g} m or more above the turntable" if image.points else ""
             return f"{image.points} of {image.returns} returns lie within {view_deg:.0f} deg of straight up{near}"
-        limit = f" (the {len(judged)} lowest scores)" if len(judged) == self.settings.max_minima else ""
-        return f"all {len(judged)} candidates refused{limit}; the best: {judged[0].reason}"
+        limit = f" (the {len(candidates)} lowest scores)" if len(candidates) == self.settings.max_minima else ""
+        return f"all {len(candidates)} candidates rejected{limit}; the best: {candidates[0].reason}"

@@ -17,7 +17,7 @@ from stages.detect.candidate import Observation
 from stages.detect.chords import ChordFinder
 from stages.detect.isolation import MAX_SLICES, LargeObjectMap, RecentPulses
 from stages.geometry.frames import Array64
-from stages.kernels.detect.observations import BIG, SMALL, kinds_of, one_thing, places_of_kind, round_and_rugged
+from stages.kernels.detect.observations import BIG, SMALL, kinds_of, merge_chords, positions_of_kind, round_and_rough
 from stages.kernels.detect.pulse_buffer import WINDOW_NS
 from stages.kernels.sweep.pulses import HOLE, LONGEST, STEP
 from stages.messages import SweptPulses
@@ -38,7 +38,7 @@ class Slice(NamedTuple):
 
 
 class ObservationLimits(NamedTuple):
-    """Where an observation may be."""
+    """Limits of an observation's position."""
 
     span_m: float
     lowest_rad: float  # over the LiDAR's horizon
@@ -55,7 +55,7 @@ class _Kept(NamedTuple):
 
 
 class _Chord(NamedTuple):
-    found_ns: int  # the end of the slice it was found in
+    found_ns: int  # end of the slice that completed it
     row: Array64
     middle_m: tuple[float, ...]  # its middle
     stamp_ns: int
@@ -103,25 +103,25 @@ class ObservationFinder:
         kinds = np.empty(len(rows), dtype=np.int64)
         big, small, hidden = kinds_of(rows, pulses.origin_vehicle_m[2], *limits, kinds)
         if big:
-            self._large.add(places_of_kind(rows, kinds, BIG, big, slice_.R, slice_.t), pulses.stamp_ns)
+            self._large.add(positions_of_kind(rows, kinds, BIG, big, slice_.R, slice_.t), pulses.stamp_ns)
         if hidden:
             self.hidden["hidden at an end by something nearer"] += hidden
         if small:
             for i in np.nonzero(kinds == SMALL)[0].tolist():
-                half_way_ns = int(found.first_ns[i] + found.last_ns[i]) // 2
-                self._waiting.append(_Chord(now_ns, rows[i], tuple(rows[i, :3].tolist()), half_way_ns))
+                middle_ns = int(found.first_ns[i] + found.last_ns[i]) // 2
+                self._waiting.append(_Chord(now_ns, rows[i], tuple(rows[i, :3].tolist()), middle_ns))
 
     def _observation(self, same: list[_Chord], motion_known: bool) -> Observation:
         span_m = self._limits.span_m
         rows, stamp_ns = np.array([c.row for c in same]), same[0].stamp_ns
         away_ns = [abs(kept.middle_ns - stamp_ns) for kept in self._slices]
         then = self._slices[away_ns.index(min(away_ns))]
-        middle, local, returns, range_m, extent_m = one_thing(rows, then.R, then.t)
-        round_chords, rough = round_and_rugged(rows)
+        middle, xyz_map_m, returns, range_m, extent_m = merge_chords(rows, then.R, then.t)
+        round_chords, rough = round_and_rough(rows)
         since_ns = stamp_ns - (MEMORY_NS if motion_known else SHORT_MEMORY_NS)
         return Observation(
             stamp_ns=stamp_ns,
-            xyz_map_m=local,
+            xyz_map_m=xyz_map_m,
             vehicle_map_m=then.t,
             range_m=range_m,
             returns=returns,
@@ -129,12 +129,12 @@ class ObservationFinder:
             round_chords=round_chords,
             rough_chords=rough,
             isolation=self._isolation(middle, range_m),
-            large_object_m=self._large.nearest_m(local, 1.1 * span_m, self._limits.clear_m, since_ns),
+            large_object_m=self._large.nearest_m(xyz_map_m, 1.1 * span_m, self._limits.clear_m, since_ns),
         )
 
     def _isolation(self, middle_m: Array64, range_m: float) -> Array64:
-        """What the last slices measured about a place of the vehicle frame: (TALLY,)."""
+        """Sector counts (TALLY,) of the last slices around a position in the vehicle frame."""
         span_m = self._limits.span_m
-        close_m = max(2.4 * span_m, 1.15 * BEAM_SPACING_RAD * range_m)  # two beams wide at least
+        close_m = max(2.4 * span_m, 1.15 * BEAM_SPACING_RAD * range_m)  # at least two beam spacings wide
         outer_m = max(self._limits.clear_m, 1.5 * BEAM_SPACING_RAD * range_m)
         return self._recent.isolation(middle_m, 0.3 * span_m, 1.1 * span_m, close_m, outer_m, 0.5)

@@ -35,7 +35,7 @@ class Chain:
         """Stop: drop the rotation and the rejected measurements."""
         self.running = False
         self.rotation_covariance_rad2 = np.zeros((3, 3))
-        self._refused = Rejected()
+        self._rejected = Rejected()
         self._inflation = InformationInflation(self._errors.rotation_time_s)
 
     def start(self, stamp_ns: int, R: Array64, covariance_rad2: Array64) -> None:
@@ -93,18 +93,18 @@ class Chain:
         R_expected, _, covariance = self.at(stamp_ns)
         off = log_rotation(R_expected.T @ R)
         if mahalanobis2(off, covariance[:3, :3] + covariance_rad2) <= GATE:
-            self._refused.clear()
+            self._rejected.clear()
             return True
-        return False if self._refused.add(stamp_ns, off, covariance_rad2) else None
+        return False if self._rejected.add(stamp_ns, off, covariance_rad2) else None
 
     def add_rotation(self, stamp_ns: int, R: Array64, covariance_rad2: Array64) -> None:
         """Add a rotation at its own time."""
         self.rotation_covariance_rad2 = covariance_rad2
-        worth = (1.0 - self._errors.rotation_bias_share) * self._inflation.factor(stamp_ns)
+        factor = (1.0 - self._errors.rotation_bias_share) * self._inflation.factor(stamp_ns)
         key_ns, R_key, _ = self.back.near(stamp_ns)
         step = self._positions.step(key_ns, stamp_ns, R_key)
         before = self.back.R_map_drone
-        self.back.add_rotation(key_ns, step, R, worth * covariance_rad2 + step.covariance[:3, :3])
+        self.back.add_rotation(key_ns, step, R, factor * covariance_rad2 + step.covariance[:3, :3])
         self._add_yaw_correction(before, self.back.R_map_drone)
 
     @property

@@ -82,11 +82,11 @@ class Drift:
         e = self._errors
         moved = np.zeros(3) if moved_m is None else moved_m
         keep = float(np.exp(-dt / e.drift_time_s)) if self.odometry else 1.0
-        walk = e.walk_m_per_sqrt_s**2 * dt if self.odometry else 0.0
+        random_walk = e.walk_m_per_sqrt_s**2 * dt if self.odometry else 0.0
         fresh = ((e.drift_scale if self.odometry else 0.7) * turned_mps) ** 2
         x = np.column_stack([self._x, self._by_yaw])
         u = np.array([[moved[0], -moved[1], moved[0]], [moved[1], moved[0], moved[1]], [moved[2], 0.0, 0.0]])
-        x, P = _step(x, self._covariance, u, dt, keep, self.q, walk, fresh)
+        x, P = _step(x, self._covariance, u, dt, keep, self.q, random_walk, fresh)
         residual = np.column_stack([xyz_m, np.zeros((3, 2))]) - x[:3]
         x, self._covariance = _correct(x, P, residual, covariance_m2)
         self._x, self._by_yaw = x[:, 0].copy(), x[:, 1:].copy()
@@ -133,7 +133,7 @@ class Drift:
 
 
 def _step(  # x: (6,), or columns (6, n) with theirs in `moved`
-    x: Array64, P: Array64, moved: Array64, dt: float, keep: float, q: float, walk: float, fresh: float
+    x: Array64, P: Array64, moved: Array64, dt: float, keep: float, q: float, random_walk: float, fresh: float
 ) -> tuple[Array64, Array64]:
     F = np.eye(6)
     for axis in range(3):
@@ -143,7 +143,7 @@ def _step(  # x: (6,), or columns (6, n) with theirs in `moved`
     ahead[:3] += moved
     spread = F @ P @ F.T
     for axis in range(3):
-        spread[axis, axis] += q * dt**3 / 3 + walk
+        spread[axis, axis] += q * dt**3 / 3 + random_walk
         spread[axis, axis + 3] += q * dt**2 / 2
         spread[axis + 3, axis] += q * dt**2 / 2
         spread[axis + 3, axis + 3] += q * dt + fresh

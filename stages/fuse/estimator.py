@@ -77,9 +77,9 @@ class Estimator:
             new_mps = vehicle.velocity_mps(motion.stamp_ns) - R_new_old @ velocity_mps
             self.positions.turn(R_new_old, t_after - R_new_old @ t, new_mps)
 
-    def add_autopilot(self, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
+    def add_autopilot(self, telemetry: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """Add telemetry of the autopilot."""
-        self.odometry_yaw.add(self.motions.motion_model.autopilot, word)
+        self.odometry_yaw.add(self.motions.motion_model.autopilot, telemetry)
 
     def add_visual_motion(self, motion: VisualMotion) -> None:
         """Add visual odometry of the drone: its turn, and its direction of flight where nothing better measures it."""
@@ -159,9 +159,9 @@ class Estimator:
             return False
         R_map_vehicle, t = self.motions.vehicle.at(fix.stamp_ns)
         R, expected_m, covariance = self.chain.at(fix.stamp_ns)
-        told_m2 = R_map_vehicle @ fix.covariance_m2 @ R_map_vehicle.T
+        fix_m2 = R_map_vehicle @ fix.covariance_m2 @ R_map_vehicle.T
         off_m = R_map_vehicle @ fix.xyz_vehicle_m + t - expected_m
-        return mahalanobis2(off_m, position_covariance(covariance, R) + told_m2) <= GATE
+        return mahalanobis2(off_m, position_covariance(covariance, R) + fix_m2) <= GATE
 
     def add_fix(self, fix: DroneFix) -> None:
         """Add a LiDAR position at its own time."""
@@ -173,46 +173,46 @@ class Estimator:
         z = R_map_vehicle @ fix.xyz_vehicle_m + t
         ahead_m2, _, _ = self.motions.vehicle_covariance_m2(stamp_ns, fix.xyz_vehicle_m)
         bias_covariance_m2 = fix.bias_covariance_m2
-        told = MeasurementCovariance(
+        noise = MeasurementCovariance(
             R_map_vehicle @ (fix.covariance_m2 + ahead_m2) @ R_map_vehicle.T,
             None if bias_covariance_m2 is None else R_map_vehicle @ bias_covariance_m2 @ R_map_vehicle.T,
         )
         if not self.positions.known:
-            self.positions.find(fix, z, told)
+            self.positions.find(fix, z, noise)
             return
         R, expected_m, covariance = self.at(stamp_ns)
         expected_m2 = covariance[3:, 3:] if R is None else position_covariance(covariance, R)
-        taken = self.positions.accepts(stamp_ns, z - expected_m, expected_m2, told)
+        taken = self.positions.accepts(stamp_ns, z - expected_m, expected_m2, noise)
         if taken is None:
             return
         if not taken:
-            self._reinitialise(fix, z, told)
+            self._reinitialise(fix, z, noise)
             return
-        worth = self.positions.worth(stamp_ns)
+        factor = self.positions.worth(stamp_ns)
         if R is not None:
-            self.chain.add_position(stamp_ns, R, z, worth * self.positions.fix_covariance_m2)
+            self.chain.add_position(stamp_ns, R, z, factor * self.positions.fix_covariance_m2)
         R_after = None if R is None else self.chain.at(stamp_ns)[0]  # what it explains is not drift
-        self.positions.follow(stamp_ns, z, worth, R_after)
+        self.positions.follow(stamp_ns, z, factor, R_after)
         self._branch_check.add_fix(fix)
-        self._add_motion_point(stamp_ns, z, told.whole_m2)
+        self._add_motion_point(stamp_ns, z, noise.whole_m2)
 
-    def _reinitialise(self, fix: DroneFix, z: Array64, told: MeasurementCovariance) -> None:
+    def _reinitialise(self, fix: DroneFix, z: Array64, noise: MeasurementCovariance) -> None:
         """Restart at fixes that agree with each other and contradict the estimate."""
         if self.chain.running and self.from_vanishing_points:
             self.odometry_yaw.heading.contradict("the LiDAR positions contradict the heading by vanishing points")
         self.lose()
-        self.positions.find(fix, z, told)
+        self.positions.find(fix, z, noise)
         self.odometry_yaw.yaw = None
         self.odometry_yaw.by_motion.restart()
         self._branch_check.restart()
         self.resets += 1
 
-    def _add_motion_point(self, stamp_ns: int, z: Array64, told_m2: Array64) -> None:
+    def _add_motion_point(self, stamp_ns: int, z: Array64, fix_m2: Array64) -> None:
         """Add an accepted fix with the autopilot's position: together they measure the heading."""
-        place = self.motions.motion_model.autopilot.position(stamp_ns)
-        if place is None or not self.motions.map_is_fixed(stamp_ns):
+        odometry = self.motions.motion_model.autopilot.position(stamp_ns)
+        if odometry is None or not self.motions.map_is_fixed(stamp_ns):
             return
-        if not self.odometry_yaw.add_point(Point(stamp_ns, z, 0.5 * float(told_m2[0, 0] + told_m2[1, 1]), *place)):
+        if not self.odometry_yaw.add_point(Point(stamp_ns, z, 0.5 * float(fix_m2[0, 0] + fix_m2[1, 1]), *odometry)):
             self.drop_rotation()
         elif self.odometry_yaw.motion_agrees(stamp_ns):
             self.from_vanishing_points = False

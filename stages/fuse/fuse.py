@@ -23,6 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from flow.counters import Counters
 from flow.message import Message
 from flow.stage import Settings, Stage
 from stages.fuse.chain import yaw_sigma_rad
@@ -92,10 +93,9 @@ class Fuse(Stage[FuseSettings]):
         return self._intake.rejected
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """Invalid messages by reason, and resets of the back end."""
-        begun = {"back end reset": self.recoveries} if self.recoveries else {}
-        return {f"rejected: {why}": count for why, count in self.rejected.items()} | begun
+        return Counters({"back end reset": self.recoveries} if self.recoveries else {}, self.rejected)
 
     @property
     def recoveries(self) -> int:
@@ -238,15 +238,17 @@ class Fuse(Stage[FuseSettings]):
         e = self._estimator
         R, xyz_m, covariance = e.at(now_ns)
         bias_covariance_m2 = e.positions.bias_covariance_m2
-        unsure = R is not None and yaw_sigma_rad(R, covariance) > math.radians(self.settings.limits.yaw_sigma_deg)
+        yaw_uncertain = R is not None and yaw_sigma_rad(R, covariance) > math.radians(
+            self.settings.limits.yaw_sigma_deg
+        )
         whole = covariance.copy()
-        if R is None or unsure:
+        if R is None or yaw_uncertain:
             whole[3:, 3:] = bias_covariance_m2 + (
                 covariance[3:, 3:] if R is None else position_covariance(covariance, R)
             )
         else:
             whole[:3, :3] += self.settings.errors.rotation_bias_share * e.chain.rotation_covariance_rad2
             whole[3:, 3:] += R.T @ bias_covariance_m2 @ R
-        R_known = None if unsure else R
+        R_known = None if yaw_uncertain else R
         yaw_sigma = 0.0 if R_known is None else yaw_sigma_rad(R_known, whole)
         return MapEstimate(now_ns, R_known, xyz_m, whole, *e.positions.velocity(now_ns, R_known, yaw_sigma))

@@ -49,12 +49,12 @@ class MotionModel:
     ) -> Step:
         """Motion from one time to another; R_map_drone at the first.
 
-        left, free: what is left over by the autopilot's odometry, and the motion without it. `still`: the map frame
-        is known to stand still; else an odometry over ground tells nothing in it. `since_ns`: time of the newest fix.
+        left, free: filters of the drift of the autopilot's odometry, and of the motion without it. `still`: the map
+        frame is known to be fixed; else odometry over ground is not usable. `since_ns`: time of the newest fix.
         """
         dt = (to_ns - from_ns) * 1e-9
         e = self._errors
-        R, turn_rad2, told = self._turn(from_ns, to_ns)
+        R, turn_rad2, turn_measured = self._turn(from_ns, to_ns)
         if not still:
             turn_rad2 += (VEHICLE_TURN_RAD_PER_S * dt) ** 2
         own = self.displacement_odom_m(from_ns, to_ns) if still and left.stamp_ns is not None else None
@@ -70,14 +70,14 @@ class MotionModel:
         spread = growth_covariance_m2 + e.walk_m_per_sqrt_s**2 * abs(dt) * np.eye(3)
         t = dt * (R_map_drone.T @ drift.velocity_mps)
         if own is not None and R_odom is not None:
-            way_m, beyond_s = own
-            t = t + R_odom.T @ way_m
+            displacement_m, beyond_s = own
+            t = t + R_odom.T @ displacement_m
             spread = spread + (0.5 * BEYOND_MPS2 * beyond_s**2) ** 2 * np.eye(3)
         R_map_after = R_map_drone @ R
         Q = np.zeros((6, 6))
         Q[:3, :3] = turn_rad2 * np.eye(3)
         Q[3:, 3:] = R_map_after.T @ spread @ R_map_after
-        return Step(R, t, Q, by_odometry, told)
+        return Step(R, t, Q, by_odometry, turn_measured)
 
     def R_odom_drone(self, stamp_ns: int) -> Array64 | None:
         """The autopilot's attitude, extrapolated shortly beyond its newest message; None: not known."""
@@ -96,17 +96,19 @@ class MotionModel:
         if a is None or b is None or a[1] != b[1]:
             return None
         beyond_ns = max(to_ns, from_ns) - newest
-        way = b[0] - a[0]
+        displacement = b[0] - a[0]
         kept_s = (max(to_ns - last, 0) - max(from_ns - last, 0)) * 1e-9
         velocity = self.autopilot.velocity_odom_mps(last) if kept_s else None
         if velocity is not None:
-            way = way + kept_s * velocity
-        return way, max(beyond_ns, 0) * 1e-9
+            displacement = displacement + kept_s * velocity
+        return displacement, max(beyond_ns, 0) * 1e-9
 
     def manoeuvre_m(self, from_ns: int, to_ns: int) -> Array64 | None:
-        """How far (3,) the autopilot's way, frame odom, is from straight on at the first moment's velocity."""
-        way, velocity = self.displacement_odom_m(from_ns, to_ns), self.autopilot.velocity_odom_mps(from_ns)
-        return None if way is None or velocity is None else way[0] - (to_ns - from_ns) * 1e-9 * velocity
+        """Displacement (3,) by the autopilot, frame odom, less that at the constant velocity of the first time."""
+        displacement, velocity = self.displacement_odom_m(from_ns, to_ns), self.autopilot.velocity_odom_mps(from_ns)
+        return (
+            None if displacement is None or velocity is None else displacement[0] - (to_ns - from_ns) * 1e-9 * velocity
+        )
 
     def _R_odom_held(self, stamp_ns: int) -> Array64 | None:
         newest = self.autopilot.attitude_ns
@@ -122,19 +124,19 @@ class MotionModel:
             beyond_s = max(max(from_ns, to_ns) - newest, 0) * 1e-9
             if a is not None and b is not None and beyond_s < 2e-9 * AHEAD_NS:
                 change = self.autopilot.rate_radps(to_ns) - self.autopilot.rate_radps(from_ns)
-                walk = math.radians(self._errors.turn_walk_deg_per_sqrt_s) ** 2 * dt
+                random_walk = math.radians(self._errors.turn_walk_deg_per_sqrt_s) ** 2 * dt
                 kept = (0.5 * max(1.0, self.autopilot.rate_radps(to_ns)) * beyond_s**2) ** 2  # the turn rate may change
-                return a.T @ b, walk + (CLOCK_S * change) ** 2 + kept, True
+                return a.T @ b, random_walk + (CLOCK_S * change) ** 2 + kept, True
         turn = rotation_between(self.autopilot, self.images, from_ns, to_ns)
         return turn.R_from_to, turn.variance_rad2, turn.measured
 
     def newest_ns(self, now_ns: int, positions: bool) -> int | None:
         """Time up to which sources of the last second measured the drone's motion; None: there were none."""
-        said = [self.autopilot.attitude_ns, self.autopilot.position_ns if positions else None]
-        heard = [ns for ns in said if ns is not None and now_ns - ns < 1_000_000_000]
-        if not heard and self.images.newest_ns is not None and now_ns - self.images.newest_ns < 1_000_000_000:
-            heard = [self.images.newest_ns]
-        return min(heard) if heard else None
+        stamps = [self.autopilot.attitude_ns, self.autopilot.position_ns if positions else None]
+        recent = [ns for ns in stamps if ns is not None and now_ns - ns < 1_000_000_000]
+        if not recent and self.images.newest_ns is not None and now_ns - self.images.newest_ns < 1_000_000_000:
+            recent = [self.images.newest_ns]
+        return min(recent) if recent else None
 
 
 WAIT_NS = 350_000_000  # longest wait for late odometry
@@ -173,7 +175,7 @@ class Motions:
         return self.motion_model.R_odom_drone(stamp_ns) if self.map_is_fixed(stamp_ns) else None
 
     def newest_ns(self, stamp_ns: int, now_ns: int) -> int | None:
-        """Time up to which the drone's motion is measured; None: nothing was received lately."""
+        """Time up to which the drone's motion is measured; None: no recent data."""
         return self.motion_model.newest_ns(now_ns, positions=self.map_is_fixed(stamp_ns))
 
     def must_wait(self, stamp_ns: int, now_ns: int) -> bool:

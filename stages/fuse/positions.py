@@ -21,7 +21,7 @@ from stages.geometry.frames import Array64
 from stages.geometry.se3 import mahalanobis2
 from stages.messages import DroneFix
 
-HELD_MPS = 0.1  # noise of the autopilot's velocity beside its drift, and of its age
+HELD_MPS = 0.1  # noise of the autopilot's velocity in addition to its drift
 GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
 
 
@@ -46,7 +46,7 @@ class Positions:
         self.fix_covariance_m2 = np.zeros((3, 3))  # map axes, of the newest fix used: the part that averages out,
         self.bias_covariance_m2 = np.zeros((3, 3))  # and the bias
         self.nis = math.nan
-        self._refused = Rejected()
+        self._rejected = Rejected()
         self._inflation = InformationInflation(self._errors.fix_time_s)
 
     @property
@@ -54,41 +54,41 @@ class Positions:
         """Whether a position is known."""
         return self.free.stamp_ns is not None
 
-    def find(self, fix: DroneFix, z: Array64, told: MeasurementCovariance) -> None:
+    def find(self, fix: DroneFix, z: Array64, noise: MeasurementCovariance) -> None:
         """Start at the first fix, or at the first after a reset."""
         velocity = fix.velocity_vehicle_mps
         if velocity is not None:
             velocity = self._motions.vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
-        self.free.start(fix.stamp_ns, z, told.whole_m2, velocity)
+        self.free.start(fix.stamp_ns, z, noise.whole_m2, velocity)
         self.fix_ns = fix.stamp_ns
-        self._accept(told)
+        self._accept(noise)
 
-    def accepts(self, stamp_ns: int, off_m: Array64, expected_m2: Array64, told: MeasurementCovariance) -> bool | None:
+    def accepts(self, stamp_ns: int, off_m: Array64, expected_m2: Array64, noise: MeasurementCovariance) -> bool | None:
         """True: within the gate. None: rejected. False: rejected, and it agrees with the rejected ones before it."""
-        nis = mahalanobis2(off_m, expected_m2 + told.whole_m2)
+        nis = mahalanobis2(off_m, expected_m2 + noise.whole_m2)
         if not nis <= GATE:
-            return False if self._refused.add(stamp_ns, off_m, told.whole_m2) else None
-        self._refused.clear()
+            return False if self._rejected.add(stamp_ns, off_m, noise.whole_m2) else None
+        self._rejected.clear()
         self.nis = nis
-        self._accept(told)
+        self._accept(noise)
         return True
 
-    def _accept(self, told: MeasurementCovariance) -> None:
+    def _accept(self, noise: MeasurementCovariance) -> None:
         variance, share = self._errors.fix_variance, self._errors.fix_bias_share
-        if told.bias_covariance_m2 is None:
-            self.fix_covariance_m2 = (1.0 - share) * variance * told.whole_m2
-            self.bias_covariance_m2 = share * variance * told.whole_m2
+        if noise.bias_covariance_m2 is None:
+            self.fix_covariance_m2 = (1.0 - share) * variance * noise.whole_m2
+            self.bias_covariance_m2 = share * variance * noise.whole_m2
         else:
             self.fix_covariance_m2, self.bias_covariance_m2 = (
-                variance * (told.whole_m2 - told.bias_covariance_m2),
-                told.bias_covariance_m2,
+                variance * (noise.whole_m2 - noise.bias_covariance_m2),
+                noise.bias_covariance_m2,
             )
 
     def worth(self, stamp_ns: int) -> float:
         """Variance factor of the fix just accepted."""
         return self._inflation.factor(stamp_ns)
 
-    def follow(self, stamp_ns: int, z: Array64, worth: float, R_map_drone: Array64 | None) -> None:
+    def follow(self, stamp_ns: int, z: Array64, factor: float, R_map_drone: Array64 | None) -> None:
         """Update both filters by an accepted fix: velocity without odometry, and drift of the odometry."""
         covariance_m2, trail = self.fix_covariance_m2, self._motions.motion_model.autopilot
         v0 = None if self.free.stamp_ns is None else trail.velocity_odom_mps(self.free.stamp_ns)
@@ -100,11 +100,11 @@ class Positions:
         R_odom, last_ns = self._motions.R_odom_drone(stamp_ns), self.left.stamp_ns
         if R_map_drone is None or R_odom is None:
             return
-        way = None if last_ns is None else self._motions.motion_model.displacement_odom_m(last_ns, stamp_ns)
-        if way is None:
-            self.left.start(stamp_ns, z, worth * covariance_m2, None)
+        displacement_m = None if last_ns is None else self._motions.motion_model.displacement_odom_m(last_ns, stamp_ns)
+        if displacement_m is None:
+            self.left.start(stamp_ns, z, factor * covariance_m2, None)
         else:
-            self.left.see(stamp_ns, z, worth * covariance_m2, R_map_drone @ R_odom.T @ way[0], turned_mps)
+            self.left.see(stamp_ns, z, factor * covariance_m2, R_map_drone @ R_odom.T @ displacement_m[0], turned_mps)
 
     def turn(self, R_new_old: Array64, t_m: Array64, velocity_mps: Array64) -> None:
         """Change to another map frame: p <- R p + t; the velocity R v + velocity_mps is a guess."""
@@ -146,7 +146,7 @@ class Positions:
         return xyz_m, covariance
 
     def velocity(self, stamp_ns: int, R_map_drone: Array64 | None, yaw_sigma_rad: float) -> tuple[Array64, Array64]:
-        """Over ground (3,), map axes, and its covariance; by the autopilot's velocity where the rotation is known."""
+        """Velocity over ground (3,), map axes, and its covariance; from the autopilot where the rotation is known."""
         age_s = 0.0 if self.fix_ns is None else max((stamp_ns - self.fix_ns) * 1e-9, 0.0)
         v_odom, R_odom = (
             self._motions.motion_model.autopilot.velocity_odom_mps(stamp_ns),
@@ -154,12 +154,12 @@ class Positions:
         )
         if R_map_drone is None or v_odom is None or R_odom is None or self.left.stamp_ns is None:
             return self.free.velocity_mps, self.free.velocity_covariance + self.free.q * age_s * np.eye(3)
-        told = R_map_drone @ R_odom.T @ v_odom
-        across = np.cross([0.0, 0.0, yaw_sigma_rad], told)
+        velocity = R_map_drone @ R_odom.T @ v_odom
+        across = np.cross([0.0, 0.0, yaw_sigma_rad], velocity)
         spread = self.left.velocity_covariance + (self.left.q * age_s + HELD_MPS**2) * np.eye(3)
-        return told + self.left.velocity_mps, spread + np.outer(across, across)
+        return velocity + self.left.velocity_mps, spread + np.outer(across, across)
 
     def _manoeuvre(self, stamp_ns: int) -> float:
         """Density of the acceleration that is not measured [m2/s3]."""
-        told = self._motions.motion_model.autopilot.velocity_odom_mps(stamp_ns) is not None
-        return self._errors.manoeuvre_with_odometry if told else self._errors.manoeuvre
+        measured = self._motions.motion_model.autopilot.velocity_odom_mps(stamp_ns) is not None
+        return self._errors.manoeuvre_with_odometry if measured else self._errors.manoeuvre

@@ -17,7 +17,7 @@ class FuseErrors(BaseModel):
     drift_mps: float = Field(default=0.12, gt=0)  # error of the drone's and the vehicle's velocity together, one axis
     drift_time_s: float = Field(default=15.0, gt=0)  # time constant of the drift
     drift_scale: float = Field(default=0.02, ge=0)  # of a change of velocity: scale and heading of the odometries
-    walk_m_per_sqrt_s: float = Field(default=0.04, gt=0)  # of the odometry's position, beside its drift
+    walk_m_per_sqrt_s: float = Field(default=0.04, gt=0)  # of the odometry's position, in addition to its drift
     turn_walk_deg_per_sqrt_s: float = Field(default=0.1, gt=0)  # of the autopilot's attitude
     tilt_deg: float = Field(default=1.0, gt=0)  # of the autopilot's vertical in the map frame
     tilt_time_s: float = Field(default=20.0, gt=0)

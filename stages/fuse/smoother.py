@@ -61,7 +61,7 @@ class BackEnd(Protocol):
 RAISED = (RuntimeError, IndexError, ValueError)  # C++ exceptions through GTSAM's wrapper
 FLOOR = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)  # smallest covariance of a step
 FARTHEST_M = 1e5  # distance from the start
-SLACK_S = 1e-3  # GTSAM keeps a pose for so much longer than it is asked for here: its times are floats
+SLACK_S = 1e-3  # GTSAM keeps a pose for this time beyond the lag: its times are floats
 UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 
 
@@ -71,7 +71,7 @@ def _robust(covariance: Array64) -> Any:
 
 
 class Smoother:
-    """See `stages.fuse.back_end.BackEnd`."""
+    """`BackEnd` by the incremental fixed-lag smoother of GTSAM."""
 
     def __init__(self, lag_s: float) -> None:
         self._lag_s, self._lag_ns = lag_s, round(1e9 * lag_s)
@@ -87,7 +87,7 @@ class Smoother:
         params: Any = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(0.01)
         params.relinearizeSkip = 1
-        params.findUnusedFactorSlots = True  # else its list of factors grows for ever
+        params.findUnusedFactorSlots = True  # else its list of factors grows without bound
         self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag_s + SLACK_S, params)
         self._number, self._first_ns, self._first_m = self._number + 1, stamp_ns, xyz_map_m
         self._keys.clear()
@@ -106,10 +106,10 @@ class Smoother:
         R, t_m = self.R_map_drone @ step.R, self.xyz_map_m + self.R_map_drone @ step.t_m
         P = composed_covariance(self.covariance, step.R, step.t_m, step.covariance + FLOOR)
         before, self._number = self._number, self._number + 1
-        way = gtsam.Pose3(gtsam.Rot3(step.R), step.t_m)
+        motion = gtsam.Pose3(gtsam.Rot3(step.R), step.t_m)
         noise = gtsam.noiseModel.Gaussian.Covariance(step.covariance + FLOOR)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        graph.add(gtsam.BetweenFactorPose3(X(before), X(self._number), way, noise))
+        graph.add(gtsam.BetweenFactorPose3(X(before), X(self._number), motion, noise))
         if up_drone is not None:
             sigma = gtsam.noiseModel.Isotropic.Variance(2, tilt_rad2)
             graph.add(gtsam.AttitudeFactorPose3(X(self._number), UP, sigma, gtsam.Unit3(up_drone)))

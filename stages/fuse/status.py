@@ -28,7 +28,7 @@ JUMP_MPS2, JUMP_RAD_PER_S = 10.0, 4.0  # what a drone can do between two outputs
 def state_of(
     known: MapEstimate | None, estimator: Estimator, limits: FuseLimits, now_ns: int, tracker: str, ambiguity: str
 ) -> tuple[PoseState, str]:
-    """The state, and why. `tracker`: what it says; `doubt`: why a rotation that is told is not believed, or empty."""
+    """The state and its reason. `tracker`: reason of the tracker; `ambiguity`: why a rotation is not used, or empty."""
     e = estimator
     fix_ns = e.positions.fix_ns
     if known is None or fix_ns is None:
@@ -78,7 +78,7 @@ class Jumps:
     def __init__(self, limits: FuseLimits) -> None:
         self._limits = limits
         self._last: MapEstimate | None = None
-        self._resets_told = 0
+        self._reported_resets = 0
         self.number = 0
 
     def lost(self) -> None:
@@ -88,9 +88,9 @@ class Jumps:
 
     def see(self, known: MapEstimate, resets: int) -> None:
         """Add a pose; `resets` of the estimator are counted there already."""
-        last, told = self._last, self._resets_told
-        self._last, self._resets_told = known, resets
-        if last is None or resets > told:
+        last, reported = self._last, self._reported_resets
+        self._last, self._reported_resets = known, resets
+        if last is None or resets > reported:
             return
         dt = (known.stamp_ns - last.stamp_ns) * 1e-9
         off_m = float(np.linalg.norm(known.xyz_map_m - last.xyz_map_m - dt * last.velocity_map_mps))

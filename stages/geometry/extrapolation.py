@@ -16,7 +16,7 @@ A pose further from the extrapolation than HARDEST_MANEUVER allows is an outlier
 (an odometry that restarts). The pose is rejected. When AGREE rejected poses in a row lie on one smooth path, they are
 accepted as poses in a new start frame. After seconds of silence HARDEST_MANEUVER allows nearly any pose, so a small
 jump during a silence is not detected. For the same reason one plausible pose does not end a series of AGREE outliers:
-continuing nonsense would produce a plausible pose sooner or later.
+a continuing series of invalid poses would contain a plausible one sooner or later.
 
 Source: ours.
 """

@@ -17,14 +17,14 @@ OCAMCALIB_ROWS = ("direct polynomial", "inverse polynomial", "centre", "affine c
 
 
 class CalibratedLens(NamedTuple):
-    """A lens and the size of the pictures that it was calibrated with."""
+    """A lens and the size of the images that it was calibrated with."""
 
     lens: KannalaBrandt | OCam
-    size_px: tuple[int, int] | None  # (width, height), where the file tells it
+    size_px: tuple[int, int] | None  # (width, height), where the file contains it
 
 
 class LensFileError(ValueError):
-    """What is wrong with a calibration program's file, and in which line; 0: all of it."""
+    """Error in a calibration file, with its line; 0: the whole file."""
 
     def __init__(self, text: str, line: int = 0) -> None:
         super().__init__(text)
@@ -34,7 +34,7 @@ class LensFileError(ValueError):
 def lens_from_kalibr(text: str, camera: str = "cam0", max_off_axis_deg: float = 117.5) -> CalibratedLens:
     """A camera of a Kalibr camchain YAML: `camera_model: pinhole` with `distortion_model: equidistant`.
 
-    Kalibr has no field of view of its own: say how far off axis the calibration may be trusted.
+    Kalibr has no field of view of its own: pass the largest valid angle off axis.
     """
     try:
         tree: Any = yaml.safe_load(text)
@@ -76,7 +76,7 @@ def lens_from_kalibr(text: str, camera: str = "cam0", max_off_axis_deg: float = 
             focal_px=(fu, fv), centre_px=(pu, pv), k=(k1, k2, k3, k4), max_off_axis_deg=max_off_axis_deg
         )
     except ValidationError as errors:
-        raise LensFileError(f"{camera}: {_said(errors)}", line("distortion_coeffs")) from None
+        raise LensFileError(f"{camera}: {_first_errors(errors)}", line("distortion_coeffs")) from None
     return CalibratedLens(lens, None if size is None else (int(size[0]), int(size[1])))
 
 
@@ -88,7 +88,7 @@ def lens_from_ocamcalib(text: str, max_off_axis_deg: float = 100.0) -> Calibrate
         if not words.strip() or words.lstrip().startswith("#"):
             continue
         try:
-            rows.append([float(word) for word in words.split()])
+            rows.append([float(number) for number in words.split()])
         except ValueError as error:
             raise _no_ocamcalib(str(error), number) from None
         lines.append(number)
@@ -112,7 +112,7 @@ def lens_from_ocamcalib(text: str, max_off_axis_deg: float = 100.0) -> Calibrate
             max_off_axis_deg=max_off_axis_deg,
         )
     except ValidationError as errors:
-        raise LensFileError(_said(errors), lines[0]) from None
+        raise LensFileError(_first_errors(errors), lines[0]) from None
     return CalibratedLens(lens, (int(width), int(height)))
 
 
@@ -120,14 +120,14 @@ def _no_ocamcalib(why: str, line: int) -> LensFileError:
     return LensFileError(f"this is no OCamCalib file ({', '.join(OCAMCALIB_ROWS)} on one line each): {why}", line)
 
 
-def _said(errors: ValidationError) -> str:
+def _first_errors(errors: ValidationError) -> str:
     first = errors.errors(include_url=False)[0]
     where = ".".join(str(part) for part in first["loc"])
     return f"{where}: {first['msg']}" if where else first["msg"].removeprefix("Value error, ")
 
 
 def _lines(text: str) -> dict[tuple[str, str], int]:
-    """Where each camera (key "") and each of its keys stands."""
+    """Line of each camera (key "") and of each of its keys."""
     root = cast(Any, yaml.compose(text, Loader=yaml.SafeLoader))  # pyright: ignore[reportUnknownMemberType]
     found: dict[tuple[str, str], int] = {}
     for camera, body in root.value if isinstance(root, yaml.MappingNode) else ():

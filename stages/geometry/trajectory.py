@@ -141,7 +141,7 @@ class VehicleTrajectory:
             after = bisect_right(poses, stamp_ns, key=lambda pose: pose[0])
         (t0, R0, x0), (t1, R1, x1) = poses[after - 1], poses[after]
         share = (stamp_ns - t0) / (t1 - t0)
-        # The poses are milliseconds apart: interpolate linearly and project back to a rotation.
+        # The poses differ by milliseconds: interpolate linearly and project back to a rotation.
         self._cache[stamp_ns] = nearly_rotation(R0 + share * (R1 - R0)), x0 + share * (x1 - x0)
         return self._cache[stamp_ns]
 

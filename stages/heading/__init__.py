@@ -1,4 +1,4 @@
-"""Yaw of the drone by its motion: yaw branches, or any heading, weighed by displacements by LiDAR and by odometry.
+"""Yaw of the drone by its motion: yaw branches, or any heading, weighted by the displacements of LiDAR and odometry.
 
-`align`, which publishes a rotation, and `fuse`, which checks it, both use it.
+`align` uses it to publish a rotation, `fuse` to check one.
 """

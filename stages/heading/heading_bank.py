@@ -1,6 +1,6 @@
 """Yaw of the drone's odometry without vanishing points: hypotheses over the whole circle.
 
-The windows that separate the branches (hypothesis_bank.py) weigh them too. Where streets have many directions, the
+They are weighted by the same windows as the branches (hypothesis_bank.py). Where streets have many directions, the
 heading by motion decides which of them both cameras see.
 
 Source: ours.
@@ -17,8 +17,8 @@ from stages.geometry.frames import Array64
 from stages.heading.hypothesis_bank import BranchSettings, HypothesisBank
 
 HEADING_STEP_DEG = 2.5
-MAX_NONSENSE = 0.01
-WORST_HEADING_RAD = math.radians(4.0)  # one sigma: streets are 14 deg and more apart
+MAX_NONE = 0.01
+WORST_HEADING_RAD = math.radians(4.0)  # one sigma: directions of streets differ by 14 deg or more
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,14 @@ class HeadingBank(HypothesisBank):
         super().__init__(settings, self.HYPOTHESES)
 
     def _first(self, none: float) -> Array64:
-        """Weights (h + 1,): all headings, then nonsense."""
+        """Weights (h + 1,): all headings, then `none`."""
         return np.append(np.full(len(self._R), (1 - none) / len(self._R)), none)
 
     @property
     def heading(self) -> Heading | None:
         """Mean heading; None while the spread is too large, the windows are too few, or `none` is probable."""
         weight = self._weight[:-1]
-        if self.windows < self.settings.least_windows or self._weight[-1] > MAX_NONSENSE:
+        if self.windows < self.settings.least_windows or self._weight[-1] > MAX_NONE:
             return None
         mean = complex((weight * np.exp(1j * self._turns_rad)).sum() / weight.sum())
         sigma_rad = math.sqrt(-2.0 * math.log(min(abs(mean), 1.0))) if abs(mean) > 0.5 else math.inf

@@ -3,14 +3,14 @@
     z_i = c + s Rz(psi) p_i + e_i,   a = s (cos psi, sin psi)      horizontally
 
 p: positions by the autopilot (odom), z: fixes (map). c and a are linear; e has the noise of the fixes and the drift of
-both odometries, correlated over the window, alike on both axes. So generalised least squares gives a with covariance
-I / Lambda, and the likelihood over the circle is exp(Lambda |a| cos(psi - peak)): one peak, whose sharpness grows with
-the displacement. It weighs hypotheses over the circle. There is no yaw
+both odometries, correlated over the window, with equal covariance on both axes. So generalised least squares gives a
+with covariance I / Lambda, and the likelihood over the circle is exp(Lambda |a| cos(psi - peak)): one peak, whose
+sharpness grows with the displacement. It weights hypotheses over the circle. There is no yaw
     while the drone has not moved: sigma is large
-    where both do not measure one motion: lengths (|a| is not 1), heights or paths disagree
+    where both do not measure the same motion: lengths (|a| is not 1), heights or paths disagree
     while a yaw farther than 45 deg from the peak has odds above 1 : 1000, or P of the peak is below 0.999
 
-Source: DESIGN, Yaw branch (a naive bank was 30 % wrong); Horn, JOSA A 4(4) (1987) for the complex number; ours.
+Source: DESIGN, Yaw branch; Horn, JOSA A 4(4) (1987) for the complex number; ours.
 """
 
 from __future__ import annotations
@@ -25,86 +25,86 @@ from stages.fuse.settings import FuseErrors
 from stages.geometry.frames import Array64, rotation_z
 from stages.heading.yaw_fit import Yaw
 
-APART_NS = 400_000_000  # of the fixes used: their errors last that long
+APART_NS = 400_000_000  # between the fixes used: their errors are correlated for that long
 WINDOW_NS = 30_000_000_000
 LEAST, MOST = 6, 48  # points
-MIN_TO_CONFIRM = 4  # that somebody else's yaw is none of its other quarter turns
+MIN_TO_CONFIRM = 4  # that another yaw is not on a wrong branch
 LEAST_M = 1.0  # of displacement
-FLOOR_M = 0.05  # no fix is better
-SCALE = 0.03  # of lengths; the drone's scale and the vehicle's
-BEND = 0.01  # of a displacement, gathered heading error of both odometries
+FLOOR_M = 0.05  # least sigma of a fix
+SCALE = 0.03  # relative error of length, by the scales of both odometries
+BEND = 0.01  # share of a displacement by the heading errors of both odometries
 HEIGHT_WALK_M = 0.08  # per sqrt(s)
-COARSE_RAD = math.radians(11.5)  # worse than this it is no yaw at all
-FALSE_SHARE = 0.2  # of the points may be false
+COARSE_RAD = math.radians(11.5)  # largest sigma of a coarse yaw
+FALSE_SHARE = 0.2  # largest share of false points
 BANK_RAD = 2 * math.pi / 72 * np.arange(72)
 NEAR_RAD = math.radians(45.0)
 MAX_ALTERNATIVE_ODDS = 1e-3
-CONFIRMED_NS = 5_000_000_000  # so long ago that is still said of now
+CONFIRMED_NS = 5_000_000_000  # age up to which the motion confirms a yaw
 ALIKE, SLACK_RAD = 3.0, math.radians(5.0)
 
 
 @dataclass(frozen=True)
 class Point:
-    """One fix and where the autopilot had the drone then."""
+    """One fix and the position by the autopilot at its time."""
 
     stamp_ns: int
     xyz_map_m: Array64
-    variance_m2: float  # level, one axis
+    variance_m2: float  # horizontal, one axis
     xyz_odom_m: Array64
     segment: int
 
 
 @dataclass(frozen=True)
 class YawLikelihood:
-    """The likelihood round the circle, exp(sharpness (cos(yaw - peak) - 1)), though it may be flat."""
+    """Likelihood over the circle, exp(sharpness (cos(yaw - peak) - 1)); it may be flat."""
 
     stamp_ns: int
     peak_rad: float
     sharpness: float
 
     def alternatives_odds(self, yaw_rad: float) -> float:
-        """Odds of the three other quarter turns together against a yaw."""
+        """Odds of the three other branches together against a yaw."""
         quarters = yaw_rad - self.peak_rad + 0.5 * math.pi * np.arange(1, 4)
         return float(np.exp(self.sharpness * (np.cos(quarters) - math.cos(yaw_rad - self.peak_rad))).sum())
 
 
 @dataclass(frozen=True)
 class YawFit:
-    """What the points say."""
+    """Result of fitting a yaw to the points."""
 
     reason: str
-    likelihood: YawLikelihood | None = None  # None: nothing, or that both do not tell one motion
-    yaw: Yaw | None = None  # None: they tell none
+    likelihood: YawLikelihood | None = None  # None: too few points, or both do not measure the same motion
+    yaw: Yaw | None = None  # None: not determined
 
 
 class MotionYaw:
-    """Collects points of one track and one segment of the autopilot's."""
+    """Collects points of one track and one segment of frame odom, and fits the yaw."""
 
     def __init__(self, errors: FuseErrors, sigma_rad: float) -> None:
-        """`sigma_rad`: a yaw known worse is not told."""
+        """`sigma_rad`: largest sigma of a published yaw."""
         self._errors, self._sigma_rad = errors, sigma_rad
         self._points: deque[Point] = deque(maxlen=MOST)
-        self._told = YawFit("no motion of the drone's seen yet")
+        self._fit = YawFit("no motion of the drone measured yet")
 
     @property
     def yaw(self) -> Yaw | None:
-        """Known well enough to be used."""
-        yaw = self._told.yaw
+        """The yaw with at most `sigma_rad`."""
+        yaw = self._fit.yaw
         return yaw if yaw is not None and yaw.sigma_rad <= self._sigma_rad else None
 
     @property
     def coarse_yaw(self) -> Yaw | None:
-        """Known well enough to speak against another quarter turn."""
-        return self._told.yaw
+        """The yaw with at most COARSE_RAD: enough to reject another branch."""
+        return self._fit.yaw
 
     @property
     def reason(self) -> str:
-        """Why there is none, or how well it is known."""
-        return self._told.reason
+        """Why there is no yaw, or its accuracy."""
+        return self._fit.reason
 
     def confirms(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
-        """Whether the motion seen lately agrees with a yaw, and with none of its other quarter turns."""
-        likelihood = self._told.likelihood
+        """Whether recent motion agrees with a yaw and with none of its other branches."""
+        likelihood = self._fit.likelihood
         if likelihood is None or likelihood.sharpness <= 0.0 or abs(stamp_ns - likelihood.stamp_ns) > CONFIRMED_NS:
             return False
         off = abs(math.remainder(yaw_rad - likelihood.peak_rad, 2 * math.pi))
@@ -112,20 +112,20 @@ class MotionYaw:
         return near and likelihood.alternatives_odds(yaw_rad) <= MAX_ALTERNATIVE_ODDS
 
     def fits(self, yaw: Yaw) -> bool | None:
-        """Whether what is followed moves as the drone says it does, with this yaw, or hangs as it hangs.
+        """Whether the tracked object moves, or hovers, as the autopilot reports, with this yaw.
 
-        None: too few points to say.
+        None: too few points.
         """
         points = tuple(self._points)
         return None if len(points) < MIN_TO_CONFIRM else moves_with(points, yaw, self._errors)
 
     def restart(self) -> None:
-        """Nothing before now counts."""
+        """Drop all points."""
         self._points.clear()
-        self._told = YawFit("its motion is being watched")
+        self._fit = YawFit("collecting its motion")
 
     def add(self, point: Point) -> bool:
-        """One more; True: the answer was weighed anew."""
+        """Add a point; True: the yaw was fitted again."""
         points = self._points
         if points and (point.segment != points[-1].segment or point.stamp_ns < points[-1].stamp_ns):
             self.restart()
@@ -134,20 +134,20 @@ class MotionYaw:
         points.append(point)
         while points[0].stamp_ns < point.stamp_ns - WINDOW_NS:
             points.popleft()
-        self._told = weigh(tuple(points), self._errors)
+        self._fit = weigh(tuple(points), self._errors)
         return True
 
 
 def weigh(points: tuple[Point, ...], errors: FuseErrors) -> YawFit:
-    """The yaw that points tell, or none, and why."""
-    few = YawFit(f"{len(points)} LiDAR positions beside the autopilot's, {LEAST} are needed")
+    """Fit the yaw to the points; without a yaw, `reason` states why."""
+    few = YawFit(f"{len(points)} LiDAR positions with an autopilot position, {LEAST} are needed")
     if len(points) < MIN_TO_CONFIRM:
         return few
     t = np.array([(p.stamp_ns - points[0].stamp_ns) * 1e-9 for p in points])
     z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_odom_m for p in points])
     moved_m = float(np.linalg.norm(own[:, :2] - own[0, :2], axis=1).max())
     if moved_m < LEAST_M:
-        return YawFit(f"the drone has moved {moved_m:.1f} m, too little to tell its heading")
+        return YawFit(f"the drone has moved {moved_m:.1f} m, too little to determine its heading")
     variance = np.array([p.variance_m2 for p in points]) + FLOOR_M**2
     false: list[int] = []
     while True:
@@ -161,34 +161,36 @@ def weigh(points: tuple[Point, ...], errors: FuseErrors) -> YawFit:
         if misfit <= chi2_999(2 * n - 4) and high <= chi2_999(n - 1):
             break
         if len(false) >= FALSE_SHARE * len(points) or n <= LEAST:
-            return YawFit("what the LiDAR follows does not move as the drone says it does")
+            return YawFit("the tracked object does not move as the autopilot reports")
         off = int(np.argmax(np.abs(rise - np.median(rise)) / np.sqrt(variance[rows]))) if misfit < high else worst
         false.append(int(rows[off]))
-    if precision <= 0.0:  # all points that are left have one place
-        return YawFit("the drone's own positions tell no motion")
+    if precision <= 0.0:  # all remaining points have the same position
+        return YawFit("the autopilot's positions contain no motion")
     length = float(np.linalg.norm(a))
     sigma = 1.0 / (math.sqrt(precision) * max(length, 1e-6))
     if abs(length - 1.0) > 3.3 * math.hypot(SCALE, 1.0 / math.sqrt(precision)):
-        return YawFit(f"the LiDAR sees {length:.2f} of the way that the drone says it flew")
+        return YawFit(f"the LiDAR measures {length:.2f} of the displacement that the autopilot reports")
     peak, nearest, odds = bank(a, precision)
     likelihood = YawLikelihood(points[-1].stamp_ns, peak, precision * length)
     if len(points) < LEAST:
         return YawFit(few.reason, likelihood)
     if sigma > COARSE_RAD:
-        return YawFit(f"heading by motion hardly known: {moved_m:.1f} m moved", likelihood)
+        return YawFit(f"heading by motion too uncertain: {moved_m:.1f} m moved", likelihood)
     if nearest < 1 - MAX_ALTERNATIVE_ODDS or odds > MAX_ALTERNATIVE_ODDS:
         return YawFit(f"several headings fit its motion: P {nearest:.3f}", likelihood)
-    told = f"heading by motion {math.degrees(peak):.0f} deg, sigma {math.degrees(sigma):.1f}, {moved_m:.1f} m moved"
-    return YawFit(told, likelihood, Yaw(points[-1].stamp_ns, peak, sigma**2))
+    reason = f"heading by motion {math.degrees(peak):.0f} deg, sigma {math.degrees(sigma):.1f}, {moved_m:.1f} m moved"
+    return YawFit(reason, likelihood, Yaw(points[-1].stamp_ns, peak, sigma**2))
 
 
 def moves_with(points: tuple[Point, ...], yaw: Yaw, errors: FuseErrors) -> bool:
-    """Whether the points lie on the way that the drone tells, turned by a yaw."""
+    """Whether the points match the displacements by the autopilot, rotated by a yaw."""
     t = np.array([(p.stamp_ns - points[0].stamp_ns) * 1e-9 for p in points])
     variance = np.array([p.variance_m2 for p in points]) + FLOOR_M**2
     z, own = np.array([p.xyz_map_m for p in points]), np.array([p.xyz_odom_m for p in points])
-    way = own[:, :2] - own[0, :2]
-    level = level_covariance(t, own[:, :2], variance, errors) + yaw.sigma_at(points[-1].stamp_ns) ** 2 * (way @ way.T)
+    displacement = own[:, :2] - own[0, :2]
+    level = level_covariance(t, own[:, :2], variance, errors) + yaw.sigma_at(points[-1].stamp_ns) ** 2 * (
+        displacement @ displacement.T
+    )
     left = z[:, :2] - own[:, :2] @ rotation_z(yaw.yaw_rad)[:2, :2].T
     height = np.diag(variance) + HEIGHT_WALK_M**2 * np.minimum.outer(t, t)
     aside = _about_mean(left[:, 0], level) + _about_mean(left[:, 1], level)
@@ -204,7 +206,7 @@ def bank(a: Array64, precision: float) -> tuple[float, float, float]:
 
 
 def level_covariance(t_s: Array64, odometry_m_of: Array64, variance_m2: Array64, errors: FuseErrors) -> Array64:
-    """(n, n) of e on one axis: fixes, the integral of a Gauss-Markov drift, walk, and gathered turns.
+    """(n, n) of e on one axis: fixes, integral of a Gauss-Markov drift, random walk, heading errors.
 
     Of the integral x of v with E[v v'] = s^2 exp(-|d| / T): E[x_a x_b] = s^2 T^2 (2 m / T - 1 + exp(-a / T) +
     exp(-b / T) - exp(-|a - b| / T)), m = min(a, b).
@@ -213,10 +215,10 @@ def level_covariance(t_s: Array64, odometry_m_of: Array64, variance_m2: Array64,
     first = np.minimum.outer(t_s, t_s)
     fade = np.exp(-t_s / T)
     drift = 2 * first / T - 1 + fade[:, None] + fade[None, :] - np.exp(-np.abs(np.subtract.outer(t_s, t_s)) / T)
-    way = odometry_m_of - odometry_m_of[0]
-    bent = BEND**2 * 0.5 * (way @ way.T)
-    walk = errors.walk_m_per_sqrt_s**2 * first
-    return np.diag(variance_m2) + (errors.drift_mps * T) ** 2 * drift + walk + bent
+    displacement = odometry_m_of - odometry_m_of[0]
+    turned = BEND**2 * 0.5 * (displacement @ displacement.T)
+    random_walk = errors.walk_m_per_sqrt_s**2 * first
+    return np.diag(variance_m2) + (errors.drift_mps * T) ** 2 * drift + random_walk + turned
 
 
 def fit(z_m: Array64, odometry_m_of: Array64, covariance_m2: Array64) -> tuple[Array64, float, float, int]:
@@ -249,6 +251,6 @@ def _about_mean(values: Array64, covariance: Array64) -> float:
 
 
 def chi2_999(dof: int) -> float:
-    """99.9 % point by Wilson and Hilferty (1931), right within 2 % from 3 degrees of freedom on."""
+    """99.9 % point by Wilson and Hilferty (1931), accurate to 2 % from 3 degrees of freedom on."""
     share = 2.0 / (9.0 * dof)
     return dof * (1.0 - share + 3.0902 * math.sqrt(share)) ** 3

@@ -36,12 +36,12 @@ class OdometryYaw:
         self.heading = Heading()
         self.yaw: Yaw | None = None
 
-    def add(self, trail: AutopilotTrajectory, word: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
+    def add(self, trail: AutopilotTrajectory, telemetry: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
         """Add telemetry to the trajectory; a silence that may hide a turn of frame odom adds variance."""
         before_ns, silences = trail.attitude_ns, trail.gaps
         R_before = None if before_ns is None else trail.R_odom_drone(before_ns)
         rate = 0.0 if before_ns is None else trail.rate_radps(before_ns)
-        trail.add(word)
+        trail.add(telemetry)
         after_ns = trail.attitude_ns
         if trail.gaps == silences or before_ns is None or R_before is None or after_ns is None:
             return
@@ -59,14 +59,14 @@ class OdometryYaw:
         if not self.by_motion.add(point) or self.by_motion.coarse_yaw is None:
             return True
         self.heading.add_motion_yaw(self.by_motion.coarse_yaw)
-        told, own = self.by_motion.yaw, self.useful(point.stamp_ns)
+        motion_yaw, own = self.by_motion.yaw, self.useful(point.stamp_ns)
         if own is not None:
             if not self.heading.denies(point.stamp_ns, own.yaw_rad, own.sigma_at(point.stamp_ns)):
                 return True
             self.yaw = None
             return False
-        if told is not None and not self.heading.contradiction:
-            self.yaw = told
+        if motion_yaw is not None and not self.heading.contradiction:
+            self.yaw = motion_yaw
         return True
 
     def confirms(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:

@@ -24,11 +24,11 @@ HANDFUL = 3  # fixes
 HANDFUL_NS = 400_000_000
 LONGEST_S = 20.0  # a drone that hardly moves starts a new window
 CLEAR = 3.0  # sigmas of the fixes' noise that a displacement must have
-FIX_FLOOR_M = 0.04  # no handful is placed better
-STRAIGHT = 0.7  # way told by directions alone: as the crow flies over flown
-COVERED = 0.8  # of a window, by images
-IMAGES_LATE_NS = 500_000_000  # a window that is long enough waits so long for the images of its end
-SLACK_M = 0.6  # the LiDAR may see so much more way than the odometry before that alone is a window
+FIX_FLOOR_M = 0.04  # least sigma of the median of a group
+STRAIGHT = 0.7  # straightness of a window by directions alone: net displacement over path length
+COVERED = 0.8  # share of a window that images must cover
+IMAGES_LATE_NS = 500_000_000  # longest wait of a long enough window for the images at its end
+SLACK_M = 0.6  # a displacement by LiDAR longer than the baseline by this closes a window without odometry
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class _Fix:
     stamp_ns: int
     xyz_map_m: Array64
     covariance_m2: Array64  # (2, 2) map frame, horizontal
-    own: tuple[Array64, int] | None  # where the odometry had the drone
+    own: tuple[Array64, int] | None  # position by odometry and its segment
 
 
 @dataclass(frozen=True)
@@ -46,37 +46,37 @@ class _Handful:
 
     @property
     def covariance_m2(self) -> Array64:
-        """(2, 2) of the median; errors of neighbouring fixes are alike, three are worth two."""
+        """(2, 2) of the median; errors of neighbouring fixes are correlated, three have the information of two."""
         mean = np.mean([f.covariance_m2 for f in self.fixes], axis=0)
         return mean / min(len(self.fixes), 2) + FIX_FLOOR_M**2 * np.eye(2)
 
 
 class Windows:
-    """Collects fixes and steps; `close` tells the displacement since the last window, once it is long enough."""
+    """Collects fixes and steps; `close_*` returns the displacement of the window, once it is long enough."""
 
     def __init__(self, baseline_m: float, hypotheses: int = DIRECTIONS) -> None:
-        """`hypotheses` round the circle, as the bank has that is told."""
+        """`hypotheses`: number over the circle, as in the bank that is updated."""
         self._baseline_m = baseline_m
         self._R = turns(hypotheses)
         self._recent: deque[_Fix] = deque(maxlen=HANDFUL)
         self._start: _Handful | None = None
-        self._waiting: _Handful | None = None  # the end of a window whose images are still to come
+        self._waiting: _Handful | None = None  # end of a window whose images have not arrived
         self._track: int | None = None
         self._steps: deque[VisualMotion] = deque(maxlen=512)
 
     def restart(self) -> None:
-        """Nothing before now counts."""
+        """Drop all fixes and the open window."""
         self._recent.clear()
         self._start = self._waiting = None
 
     def add_step(self, motion: VisualMotion) -> None:
-        """A step of the odometry by images: its direction."""
+        """Add a step of the visual odometry."""
         self._steps.append(motion)
 
     def add_fix(
         self, fix: DroneFix, R_map_vehicle: Array64, t_map_vehicle_m: Array64, own: AutopilotTrajectory
     ) -> None:
-        """A fix, with where the vehicle was; one of another track starts anew."""
+        """Add a fix with the pose of the vehicle at its time; another track restarts the window."""
         if fix.track_id != self._track or (self._recent and fix.stamp_ns <= self._recent[-1].stamp_ns):
             self.restart()
         self._track = fix.track_id
@@ -93,7 +93,7 @@ class Windows:
             self._start = self._handful()
 
     def close_metric(self, R_map_odom: Array64, bearing_rad: float) -> Displacement | None:
-        """The window since the last, told by the autopilot's positions; R_map_odom is branch 0's."""
+        """The window by the autopilot's positions; R_map_odom is that of branch 0. None: not long enough."""
         start, end = self._ends()
         if start is None or end is None:
             return None
@@ -102,12 +102,12 @@ class Windows:
             self._begin_at(end)
             return None
         anchor = odometry_m_of(start.fixes[0])
-        told = [[(R_map_odom @ (odometry_m_of(f) - anchor))[:2] for f in h.fixes] for h in (start, end)]
-        middle = [np.mean(t, axis=0) for t in told]
+        own_m = [[(R_map_odom @ (odometry_m_of(f) - anchor))[:2] for f in h.fixes] for h in (start, end)]
+        middle = [np.mean(t, axis=0) for t in own_m]
         odometry = middle[1] - middle[0]
-        left = [  # of the fixes, when the way told is taken off as each hypothesis turns it
+        left = [  # of the fixes, less the displacement by odometry as each hypothesis rotates it
             np.median(np.array([f.xyz_map_m[:2] for f in h.fixes]) - np.array(t) @ np.swapaxes(self._R, 1, 2), axis=1)
-            for h, t in zip((start, end), told, strict=True)
+            for h, t in zip((start, end), own_m, strict=True)
         ]
         lidar = left[1] - left[0] + self._R @ odometry
         noise = start.covariance_m2 + end.covariance_m2
@@ -120,41 +120,41 @@ class Windows:
         return Displacement(start.stamp_ns, end.stamp_ns, lidar, noise, odometry, bearing_rad, True)
 
     def close_bearing(self, R_map_drone: dict[int, Array64], bearing_rad: float) -> Displacement | None:
-        """The window since the last, told by directions between images; R_map_drone by from_ns is branch 0's."""
+        """The window by directions between images; R_map_drone, by from_ns, is that of branch 0. None: not usable."""
         start, end = self._ends()
         if start is None or end is None:
             return None
         newest_ns, end = end.stamp_ns, self._waiting or end
-        way = median_m(end) - median_m(start)
+        lidar_m = median_m(end) - median_m(start)
         noise = start.covariance_m2 + end.covariance_m2
-        if float(np.linalg.norm(way)) < max(self._baseline_m, CLEAR * math.sqrt(0.5 * float(np.trace(noise)))):
+        if float(np.linalg.norm(lidar_m)) < max(self._baseline_m, CLEAR * math.sqrt(0.5 * float(np.trace(noise)))):
             return None
         images_ns = self._steps[-1].stamp_ns if self._steps else 0
         if images_ns < end.stamp_ns and newest_ns - end.stamp_ns < IMAGES_LATE_NS:
             self._waiting = end
             return None
         self._begin_at(end)
-        flown, covered, flew, sigma = np.zeros(3), 0.0, 0.0, 0.0
+        direction_sum, covered, direction_ns, sigma = np.zeros(3), 0.0, 0.0, 0.0
         for step, overlap in self._keys_steps(start.stamp_ns, end.stamp_ns):
             if step.from_ns not in R_map_drone:
                 continue
             covered += overlap
             if step.direction_from is not None and step.direction_sigma_rad is not None:
-                flown += overlap * (R_map_drone[step.from_ns] @ step.direction_from)
-                flew += overlap
+                direction_sum += overlap * (R_map_drone[step.from_ns] @ step.direction_from)
+                direction_ns += overlap
                 sigma = max(sigma, step.direction_sigma_rad)
-        flat = float(np.linalg.norm(flown[:2]))
-        if covered < COVERED * (end.stamp_ns - start.stamp_ns) or flat < STRAIGHT * max(flew, 1.0):
+        flat = float(np.linalg.norm(direction_sum[:2]))
+        if covered < COVERED * (end.stamp_ns - start.stamp_ns) or flat < STRAIGHT * max(direction_ns, 1.0):
             return None
-        lidar = np.tile(way, (len(self._R), 1))
+        lidar = np.tile(lidar_m, (len(self._R), 1))
         return Displacement(
-            start.stamp_ns, end.stamp_ns, lidar, noise, flown[:2] / flat, math.hypot(sigma, bearing_rad), False
+            start.stamp_ns, end.stamp_ns, lidar, noise, direction_sum[:2] / flat, math.hypot(sigma, bearing_rad), False
         )
 
     def _keys_steps(self, start_ns: int, end_ns: int) -> list[tuple[VisualMotion, int]]:
-        """One step of each key image, with how much of the window [ns] it covers: most, and as little else."""
+        """One step of each key image with the part of the window [ns] that it covers: the shortest that covers most."""
         best: dict[int, tuple[VisualMotion, int]] = {}
-        for step in self._steps:  # those of one key from short to long: each covers what those before it do
+        for step in self._steps:  # the steps of a key come from short to long: each covers the ones before
             overlap = min(step.stamp_ns, end_ns) - max(step.from_ns, start_ns)
             if overlap > 0 and (step.from_ns not in best or overlap > best[step.from_ns][1]):
                 best[step.from_ns] = step, overlap
@@ -167,7 +167,7 @@ class Windows:
         return [step.from_ns for step in self._steps if step.stamp_ns > self._start.stamp_ns]
 
     def _begin_at(self, handful: _Handful) -> None:
-        """The next window's start."""
+        """Start the next window."""
         self._start, self._waiting = handful, None
 
     def _handful(self) -> _Handful:
@@ -175,7 +175,7 @@ class Windows:
         return _Handful(fixes[len(fixes) // 2].stamp_ns, fixes)
 
     def _ends(self) -> tuple[_Handful | None, _Handful | None]:
-        """The open window's start, and its end if there are enough new fixes close together."""
+        """Start of the open window, and its end if there are enough new fixes close in time."""
         recent = self._recent
         if self._start is None or len(recent) < HANDFUL:
             return None, None
@@ -190,11 +190,11 @@ class Windows:
 
 
 def odometry_m_of(fix: _Fix) -> Array64:
-    """Where the odometry had the drone at a fix that it covers."""
+    """Position by odometry at a fix that has one."""
     assert fix.own is not None
     return fix.own[0]
 
 
 def median_m(handful: _Handful) -> Array64:
-    """(2,) horizontal."""
+    """Horizontal median (2,) of the positions."""
     return np.median([f.xyz_map_m[:2] for f in handful.fixes], axis=0)

@@ -20,10 +20,14 @@ from stages.messages.cameras import RelativeRotation as RelativeRotation
 from stages.messages.cameras import VanishingDirections as VanishingDirections
 from stages.messages.cameras import VisualMotion as VisualMotion
 from stages.messages.drone import AutopilotMotion as AutopilotMotion
+from stages.messages.drone import CandidateEvidence as CandidateEvidence
 from stages.messages.drone import Candidates as Candidates
 from stages.messages.drone import Detections as Detections
 from stages.messages.drone import DroneFix as DroneFix
 from stages.messages.drone import DroneMotion as DroneMotion
+from stages.messages.drone import KernelScores as KernelScores
+from stages.messages.drone import MeanShiftResult as MeanShiftResult
+from stages.messages.drone import SearchResult as SearchResult
 from stages.messages.drone import TrackingState as TrackingState
 from stages.messages.drone import TrackState as TrackState
 from stages.messages.heading import HeadingEstimate as HeadingEstimate

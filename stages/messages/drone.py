@@ -2,34 +2,73 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
+
+import numpy as np
+from numpy.typing import NDArray
 
 from flow.message import Mat3, Message, PerPointBool, PerPointF64, PerPointI64, Points64, Vec3, message
 
 
-@message(schema=31)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class KernelScores:
+    """Scores of candidates by the paper's detector, which searches the depth image of one sweep. P III.B.
+
+    The score e = e_inner + e_outer is lower for a better candidate.
+    """
+
+    e_inner: PerPointF64
+    e_outer: PerPointF64
+
+    @property
+    def e(self) -> NDArray[np.float64]:
+        """Score (n,) of each candidate."""
+        return self.e_inner + self.e_outer
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class CandidateEvidence:
+    """Evidence for candidates by the detector that observes each of them repeatedly."""
+
+    start_ns: int  # start of the searched interval
+    candidate_id: PerPointI64  # constant for the same object
+    seen_ns: PerPointI64  # newest return of each
+    velocity_vehicle_mps: Points64
+    log_odds: PerPointF64  # that it is a drone
+    probability: PerPointF64  # the same as a probability
+
+
+class SearchResult(enum.Enum):
+    """What one search for the drone found."""
+
+    DRONE = "drone"  # at least one accepted candidate
+    ALL_REJECTED = "all candidates rejected"
+    NO_CANDIDATE = "no candidate"
+
+
+@message(schema=76)
 class Detections(Message):
     """Drone candidates of one search, best first. An empty list, or one without an accepted candidate, is normal.
 
-    stamp_ns: end of the searched interval. The paper's detector scores whole sweeps by e = e_inner + e_outer, lower is
-    better. EvidenceDetect scores incrementally and gives a probability.
+    stamp_ns: end of the searched interval.
     """
 
-    xyz_vehicle_m: Points64  # (n, 3) [m] at seen_ns
-    score: PerPointF64  # e, or the log-odds that it is a drone
-    e_inner: PerPointF64  # paper only, else 0
-    e_outer: PerPointF64
+    xyz_vehicle_m: Points64  # (n, 3) [m], at the time of its newest return or at some time in the sweep
     accepted: PerPointBool
     reasons: tuple[str, ...]  # one per candidate: why it was accepted or rejected
     summary: str  # one sentence: "drone at ..." or "no drone: ..."
-    start_ns: int | None = None  # start of the searched interval; None: the depth image's start
-    seen_ns: PerPointI64 | None = None  # newest return of each; None: at some time in the sweep
-    velocity_vehicle_mps: Points64 | None = None
-    probability: PerPointF64 | None = None  # that it is a drone; None: the detector gives none
-    candidate_id: PerPointI64 | None = None  # constant for the same object
+    evidence: KernelScores | CandidateEvidence  # depends on the detector
+
+    @property
+    def result(self) -> SearchResult:
+        """What the search found."""
+        if self.accepted.any():
+            return SearchResult.DRONE
+        return SearchResult.ALL_REJECTED if len(self.accepted) else SearchResult.NO_CANDIDATE
 
 
-@message(schema=32)
+@message(schema=77)
 class Candidates(Message):
     """Open drone candidates that need more observations, most probable first; published on change."""
 
@@ -40,6 +79,7 @@ class Candidates(Message):
     seen_ns: PerPointI64
     scan_passes: PerPointI64  # rotor revolutions with a return from it
     reasons: tuple[str, ...]  # one per candidate: the evidence for and against
+    accept_probability: float  # the detector accepts a candidate from this probability on
     undirected_speed_mps: PerPointF64 | None = (
         None  # horizontal speed by telemetry whose direction is unknown; not in velocity_vehicle_mps
     )
@@ -56,15 +96,22 @@ class TrackingState(enum.Enum):
     LOST = 4  # the track ended
 
 
-@message(schema=33)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MeanShiftResult:
+    """How the mean shift that found a position ended. P III.C."""
+
+    iterations: int
+    shift_m: float  # length of the last step
+
+
+@message(schema=78)
 class DroneFix(Message):
     """Drone position measured by the LiDAR; stamp_ns is the weighted mean time of the returns used. P III.C."""
 
     xyz_vehicle_m: Vec3
     covariance_m2: Mat3
     hits: int  # returns used
-    iterations: int
-    shift_m: float  # last mean shift step
+    mean_shift: MeanShiftResult | None = None  # None: the tracker does not use mean shift
     track_id: int = 1  # number of the track
     velocity_vehicle_mps: Vec3 | None = None  # relative to the vehicle; None: not estimated
     # the part of covariance_m2 that does not average out over fixes (calibration); None: not estimated

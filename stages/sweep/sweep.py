@@ -35,10 +35,10 @@ class SweepSettings(Settings):
     `reversal_deg`: a smaller reversal is encoder jitter; vibration (+-5 deg) reverses by far more.
     """
 
-    mount: LidarMount
-    image_size_px: int = Field(512, ge=16, le=4096)  # N
-    fov_deg: float = Field(120.0, gt=0, lt=180)  # 2 theta_max
-    sweep_deg: float = Field(180.0, gt=0, le=360)
+    mount: LidarMount  # poses of turntable and LiDAR, and the servo's zero, sign and errors
+    image_size_px: int = Field(512, ge=16, le=4096)  # N, side of the depth image
+    fov_deg: float = Field(120.0, gt=0, lt=180)  # 2 theta_max, field of view of the depth image
+    sweep_deg: float = Field(180.0, gt=0, le=360)  # travel of the turntable that completes a sweep
     tolerance_deg: float = Field(3.0, ge=0, lt=30)
     reversal_deg: float = Field(0.5, gt=0, lt=30)
     min_range_m: float = Field(0.6, ge=0)  # nearer returns come from the sensor's mount

@@ -1,17 +1,19 @@
-"""What one look says of where the body's centre is: every pulse near it counts, hits and misses alike.
+"""Likelihood of the drone's centre given the pulses of one scan pass, both returns and pass-throughs.
 
 A pulse that passes the centre at distance rho (across the line of sight) is returned by the drone with probability
 
     p(rho) = p_0 exp(-rho^2 / (2 s^2)),    s = 0.2 span
 
-(open arms, seen from any side: half of the pulses return at a quarter of the span; measured on simulated drones, and
-half as wide as the drone because rotors are mostly air). So over the offsets (a, b) of the centre
+The width s is that of simulated drones with open arms: half of the pulses return at a quarter of the span. It is half
+the drone's width because rotors are mostly air. With eps, the probability of a false return, the log-likelihood of the
+centre's offset (a, b) from the prediction is
 
-    ln L(a, b) = sum_hits ln(p + eps) + sum_misses ln(1 - p)
+    ln L(a, b) = sum_returns ln(p + eps) + sum_pass-throughs ln(1 - p)
 
-on a grid, times the prior; its mean and covariance go back to the filter. Misses beside hits draw the edge.
+It is evaluated on a grid and multiplied by the prior. Mean and covariance of the posterior update the filter.
+Pass-throughs next to returns determine the drone's edge.
 
-Source: ours; DESIGN, "the misses carry information".
+Source: ours.
 """
 
 from __future__ import annotations
@@ -26,6 +28,6 @@ COLUMNS = 6
 
 
 def across(line: Array64) -> Array64:
-    """(2, 3): the axes a and b across a unit line of sight, in the frame in which its a is to be level."""
+    """Axes a (horizontal) and b (2, 3) orthogonal to a unit line of sight (3,), in the same frame."""
     ax, ay, bx, by, bz = basis(line[0], line[1], line[2])
     return np.array([[ax, ay, 0.0], [bx, by, bz]])

@@ -23,8 +23,7 @@ from stages.track.scan_pass import ScanPass
 REPLACE_AFTER_NS = 1_000_000_000  # without a return for this long, another accepted drone replaces it
 STALE_NS = 150_000_000  # an observation this much older than the track's returns is ignored
 START_SIGMA_M = 0.2
-ACCEPTED_NATS = math.log(0.95 / 0.05)  # log-odds of the detector's default acceptance threshold
-SKY_M3 = 2.0 / 3.0 * math.pi * 35.0**3  # half-sphere of the detection range
+DETECTION_VOLUME_M3 = 2.0 / 3.0 * math.pi * 35.0**3  # half-sphere of the detection range
 
 
 @dataclass(slots=True, eq=False)
@@ -100,14 +99,14 @@ class Hypotheses:
 
     def at(self, one: Hypothesis, stamp_ns: int) -> tuple[Array64, Array64]:
         """Predicted state (6,) and covariance (6, 6) at a time, map frame."""
-        known = self._predicted.get(one)
-        if known is None or known[0] != stamp_ns:
+        cached = self._predicted.get(one)
+        if cached is None or cached[0] != stamp_ns:
             after = self.sample(stamp_ns)
             model = self._models[0 if after is None else after.source]
             dt_s = (stamp_ns - one.stamp_ns) * 1e-9
             at = model.predicted(one.x, one.P, dt_s, one.sample, after, self._manoeuvre, self._odometry_manoeuvre)
-            known = self._predicted[one] = (stamp_ns, *at)
-        return known[1], known[2]
+            cached = self._predicted[one] = (stamp_ns, *at)
+        return cached[1], cached[2]
 
     def update(self, one: Hypothesis, stamp_ns: int, x: Array64, P: Array64, sample: OdometrySample | None) -> None:
         """Set the state of a hypothesis at a time."""
@@ -121,11 +120,11 @@ class Hypotheses:
 
     def start(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> Hypothesis:
         """Start a hypothesis at a candidate, observed at `seen_ns` and predicted to `stamp_ns`."""
-        one = self._made(number, xyz, v, seen_ns, stamp_ns)
+        one = self._new(number, xyz, v, seen_ns, stamp_ns)
         self._all.append(one)
         return one
 
-    def _made(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> Hypothesis:
+    def _new(self, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> Hypothesis:
         P = np.diag([START_SIGMA_M**2] * 3 + [self._start_sigma_mps**2] * 3)
         if stamp_ns > seen_ns:
             xyz = xyz - (stamp_ns - seen_ns) * 1e-9 * v
@@ -146,18 +145,19 @@ class Hypotheses:
         """Whether its position is so uncertain that a candidate there may be another object."""
         return largest_sigma_m(self.at(one, now_ns)[1]) > self._own_sigma_m
 
-    def required_probability(self, one: Hypothesis, now_ns: int) -> float:
-        """Probability that a candidate near this hypothesis needs to be assigned to it; 0.5 where it is known well.
+    def required_probability(self, one: Hypothesis, now_ns: int, accept_probability: float) -> float:
+        """Probability a candidate near this hypothesis needs to be assigned to it; 0.5 if its covariance is small.
 
-        The detector's acceptance threshold is for the whole sky. Only clutter within three sigmas of here can be
-        mistaken for this drone, so the log-odds are reduced by the logarithm of that share of the sky's volume.
+        The detector's threshold, `accept_probability`, is for the whole sky. Only clutter within three sigmas of here
+        can be mistaken for this drone, so the log-odds are reduced by the logarithm of that share of the sky's volume.
         """
-        share = 36.0 * math.pi * math.sqrt(float(np.linalg.det(self.at(one, now_ns)[1][:3, :3]))) / SKY_M3
-        return 1.0 / (1.0 + math.exp(-max(ACCEPTED_NATS + math.log(share), 0.0)))
+        share = 36.0 * math.pi * math.sqrt(float(np.linalg.det(self.at(one, now_ns)[1][:3, :3]))) / DETECTION_VOLUME_M3
+        accept_log_odds = math.log(accept_probability / (1.0 - accept_probability))
+        return 1.0 / (1.0 + math.exp(-max(accept_log_odds + math.log(share), 0.0)))
 
     def move(self, one: Hypothesis, number: int, xyz: Array64, v: Array64, seen_ns: int, stamp_ns: int) -> None:
         """Reset a hypothesis to a candidate of the detector."""
-        new = self._made(number, xyz, v, seen_ns, stamp_ns)
+        new = self._new(number, xyz, v, seen_ns, stamp_ns)
         one.candidate, one.last_return_ns, one.scan_pass, one.log_odds = number, seen_ns, None, max(one.log_odds, 2.0)
         self.update(one, new.stamp_ns, new.x, new.P, new.sample)
         one.reason = "reacquired by the detector"
@@ -167,8 +167,8 @@ class Hypotheses:
 
         An observation older than the track's newest return is ignored.
         """
-        mine = (one for one in self.confirmed if one.candidate == number)
-        one = next((one for one in mine if seen_ns > one.last_return_ns - STALE_NS), None)
+        own = (one for one in self.confirmed if one.candidate == number)
+        one = next((one for one in own if seen_ns > one.last_return_ns - STALE_NS), None)
         if one is not None:
             self.move(one, number, xyz, v, seen_ns, stamp_ns)
             one.reason = "track diverged, reset by the detector"

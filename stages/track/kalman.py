@@ -1,9 +1,9 @@
-"""Position and velocity of one drone in the local frame, and how a look's answer changes them.
+"""Kalman filter of a drone's position and velocity in frame map, updated by the posterior of a scan pass.
 
     x = (p, v),  p' = p + dt v,  white acceleration of density q on each axis        [m, m/s, m^2/s^3]
 
-A look answers with mean and covariance of some projection y = H p; `condition` moves the state to it whatever its
-shape: x + K (m - y), P - K (S - S') K^T with K = P H^T S^-1, S the covariance of y before and S' after.
+A scan pass gives mean m and covariance S' of a projection y = H p. `condition` moves the state to them:
+x + K (m - y), P - K (S - S') K^T with K = P H^T S^-1, where S is the covariance of y before.
 
 Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 6.2; ours.
 """
@@ -23,7 +23,7 @@ def predicted(x: Array64, P: Array64, dt_s: float, q: float) -> tuple[Array64, A
 
 
 def condition(x: Array64, P: Array64, H: Array64, change: Array64, S_after: Array64) -> tuple[Array64, Array64]:
-    """State after y = H p (H (k, 3)) turned out `change` (k,) beside its prediction, with covariance S_after (k, k)."""
+    """State and covariance after y = H p, H (k, 3), moved by `change` (k,) and got the covariance S_after (k, k)."""
     wide = np.zeros((H.shape[0], 6))
     wide[:, :3] = H
     S = wide @ P @ wide.T
@@ -33,7 +33,7 @@ def condition(x: Array64, P: Array64, H: Array64, change: Array64, S_after: Arra
 
 
 def measured(x: Array64, P: Array64, h: Array64, residual: float, sigma: float) -> tuple[Array64, Array64]:
-    """Plain update by one number: `residual` beside h . p, with noise sigma."""
+    """State and covariance after a scalar measurement of h . p with this residual and noise sigma."""
     wide = np.concatenate([h, np.zeros(3)])
     S = float(wide @ P @ wide) + sigma**2
     K = P @ wide / S

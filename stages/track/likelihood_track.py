@@ -28,6 +28,7 @@ from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.sweep.pulses import mean_direction
 from stages.kernels.track.scan_pass import largest_sigma_m
 from stages.messages import (
+    CandidateEvidence,
     Candidates,
     Detections,
     DroneFix,
@@ -49,24 +50,20 @@ class LikelihoodTrackSettings(Settings):
     """Settings of `LikelihoodTrack`."""
 
     mount: LidarMount = LidarMount()  # its pointing_sigma_deg enters the bias covariance
-    span_m: float = Field(0.5, gt=0, le=10)  # the drone's largest extent
-    hull_share: float = Field(
-        0.075, ge=-1, le=1
-    )  # distance from the mean of the returns back to the centre, over the span
-    max_drones: int = Field(1, ge=1, le=8)
+    span_m: float = Field(0.5, gt=0, le=10)  # largest dimension of the drone
+    hull_share: float = Field(0.075, ge=-1, le=1)  # distance of the centre behind the returns' mean, over the span
+    max_drones: int = Field(1, ge=1, le=8)  # tracked at the same time
     max_hypotheses: int = Field(4, ge=0, le=16)  # unconfirmed candidates
     own_sigma_m: float = Field(0.8, gt=0)  # beyond this sigma only the detector can reacquire it
     manoeuvre: float = Field(1.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
     odometry_manoeuvre: float = Field(0.01, gt=0)  # the same with odometry
-    coast_after_s: float = Field(0.35, gt=0)
-    lost_after_s: float = Field(6.0, gt=0)  # later with odometry, while
-    lost_sigma_m: float = Field(5.0, gt=0)  # its largest sigma is below this
-    start_sigma_mps: float = Field(1.5, gt=0)  # of the detector's velocity
+    coast_after_s: float = Field(0.35, gt=0)  # time without a return from TRACKING to COASTING
+    lost_after_s: float = Field(6.0, gt=0)  # time without a return from COASTING to LOST; with odometry later,
+    lost_sigma_m: float = Field(5.0, gt=0)  # when its largest position sigma exceeds this
+    start_sigma_mps: float = Field(1.5, gt=0)  # one sigma of the detector's velocity
     tilt_deg: float = Field(0.05, ge=0)  # of the servo's axis against the vehicle's, about x and y, one sigma each
     range_sigma_m: float = Field(0.017, ge=0)  # of the LiDAR, constant: VLP-16 data sheet 63-9229, +-3 cm, uniform
-    shape_share: float = Field(
-        0.03, ge=0, le=1
-    )  # offset of the returns from the centre over the span, one sigma per axis
+    shape_share: float = Field(0.03, ge=0, le=1)  # constant offset of the returns over the span, one sigma per axis
     use_pass_throughs: bool = True  # False: only returns count (ablation)
     de_skew: bool = True  # False: a scan pass has one time stamp (ablation)
 
@@ -78,13 +75,13 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
 
     def __init__(self, settings: LikelihoodTrackSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
-        self._trail = VehicleTrajectory()
-        self._detector_life: int | None = None  # that counts the candidates
+        self._vehicle = VehicleTrajectory()
+        self._detector_instance: int | None = None  # candidate numbers are unique within one
         self._next_number: int = 1
         self._idle_ns: int = 0
-        self._why_idle: str = "no drone detected yet"
+        self._idle_reason: str = "no drone detected yet"
         settings = self.settings
-        self._known = Hypotheses(
+        self._hypotheses = Hypotheses(
             settings.manoeuvre,
             settings.odometry_manoeuvre,
             settings.start_sigma_mps,
@@ -94,67 +91,73 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
 
     def on_motion(self, motion: VehicleMotion) -> None:
         """Add the vehicle's pose; without any the vehicle is assumed to be parked."""
-        self._trail.add(motion)
+        self._vehicle.add(motion)
 
     def on_drone_position(self, position: DroneLocalPosition) -> None:
         """Add the drone's telemetry, by which tracks are predicted."""
-        self._known.add_position(position)
+        self._hypotheses.add_position(position)
 
     def on_drone_odometry(self, odometry: DroneOdometry) -> None:
         """Add the drone's odometry; preferred when both are sent."""
-        self._known.add_odometry(odometry)
+        self._hypotheses.add_odometry(odometry)
 
     def on_candidates(self, candidates: Candidates) -> Iterator[TrackState]:
         """Start hypotheses at probable candidates; remove tracks whose candidate is no longer accepted."""
-        if self._detector_life not in (None, candidates.detector_instance):
-            self._known.clear_candidate_numbers()
-        self._detector_life = candidates.detector_instance
+        if self._detector_instance not in (None, candidates.detector_instance):
+            self._hypotheses.clear_candidate_numbers()
+        self._detector_instance = candidates.detector_instance
         own = set(candidates.candidate_id[candidates.probability >= 0.5].tolist())
         for i in range(len(candidates.candidate_id)):
             number, P = int(candidates.candidate_id[i]), float(candidates.probability[i])
-            xyz, v = self._trail.to_map(
+            xyz, v = self._vehicle.to_map(
                 candidates.stamp_ns, candidates.xyz_vehicle_m[i], candidates.velocity_vehicle_mps[i]
             )
-            known = self._known.near(xyz, candidates.stamp_ns, number)
-            if known is None and P >= 0.5:
-                known = self._known.diverged(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
-            if known is not None:
-                seen_later = int(candidates.seen_ns[i]) > known.last_return_ns
-                uncertain = known.confirmed and seen_later and self._known.uncertain(known, candidates.stamp_ns)
-                own_candidate = known.candidate == number  # followed by the detector, too
-                if (
-                    uncertain
-                    and (0.5 if own_candidate else self._known.required_probability(known, candidates.stamp_ns)) <= P
-                ):
-                    self._known.move(known, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
-                # an improbable candidate next to a track whose own candidate is probable is another object
-                sure = known.candidate == number or (candidates.scan_passes[i] >= 6 and known.candidate not in own)
-                if P < 0.2 and known.confirmed and sure:
-                    yield from self._lose(
-                        known, candidates.stamp_ns, f"no longer accepted as a drone: {candidates.reasons[i]}"
+            track = self._hypotheses.near(xyz, candidates.stamp_ns, number)
+            if track is None and P >= 0.5:
+                track = self._hypotheses.diverged(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+            if track is not None:
+                seen_later = int(candidates.seen_ns[i]) > track.last_return_ns
+                uncertain = track.confirmed and seen_later and self._hypotheses.uncertain(track, candidates.stamp_ns)
+                required = 0.5  # if the detector follows it, too
+                if uncertain and track.candidate != number:
+                    required = self._hypotheses.required_probability(
+                        track, candidates.stamp_ns, candidates.accept_probability
                     )
-            elif P >= 0.5 and len(self._known) - len(self._known.confirmed) < self.settings.max_hypotheses:
-                self._known.start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+                if uncertain and required <= P:
+                    self._hypotheses.move(track, number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
+                # an improbable candidate next to a track whose own candidate is probable is another object
+                is_same_object = track.candidate == number or (
+                    candidates.scan_passes[i] >= 6 and track.candidate not in own
+                )
+                if P < 0.2 and track.confirmed and is_same_object:
+                    yield from self._lose(
+                        track, candidates.stamp_ns, f"no longer accepted as a drone: {candidates.reasons[i]}"
+                    )
+            elif P >= 0.5 and len(self._hypotheses) - len(self._hypotheses.confirmed) < self.settings.max_hypotheses:
+                self._hypotheses.start(number, xyz, v, int(candidates.seen_ns[i]), candidates.stamp_ns)
 
     def on_detections(self, detections: Detections) -> Iterator[TrackState | DroneFix]:
         """Confirm the accepted candidates as drones."""
+        evidence = detections.evidence
         for i in np.nonzero(detections.accepted)[0]:
-            seen_ns = detections.stamp_ns if detections.seen_ns is None else int(detections.seen_ns[i])
-            number = -1 if detections.candidate_id is None else int(detections.candidate_id[i])
-            velocity = detections.velocity_vehicle_mps
-            v = np.zeros(3) if velocity is None else velocity[i]
-            xyz, v = self._trail.to_map(seen_ns, detections.xyz_vehicle_m[i], v)
-            track = self._known.near(xyz, seen_ns, number) or self._known.diverged(number, xyz, v, seen_ns, seen_ns)
+            seen_ns, number, v = detections.stamp_ns, -1, np.zeros(3)
+            if isinstance(evidence, CandidateEvidence):
+                seen_ns, number = int(evidence.seen_ns[i]), int(evidence.candidate_id[i])
+                v = evidence.velocity_vehicle_mps[i]
+            xyz, v = self._vehicle.to_map(seen_ns, detections.xyz_vehicle_m[i], v)
+            track = self._hypotheses.near(xyz, seen_ns, number) or self._hypotheses.diverged(
+                number, xyz, v, seen_ns, seen_ns
+            )
             drone = track if track is not None and track.confirmed else None
-            if drone is not None and seen_ns > drone.last_return_ns and self._known.uncertain(drone, seen_ns):
-                self._known.move(drone, number, xyz, v, seen_ns, seen_ns)
-            if drone is None and (old := self._known.oldest_unseen(seen_ns)):
+            if drone is not None and seen_ns > drone.last_return_ns and self._hypotheses.uncertain(drone, seen_ns):
+                self._hypotheses.move(drone, number, xyz, v, seen_ns, seen_ns)
+            if drone is None and (old := self._hypotheses.oldest_unseen(seen_ns)):
                 yield from self._lose(old, seen_ns, "no return, while the detector accepted another drone")
             if track is None:
-                if len(self._known.confirmed) >= self.settings.max_drones:
+                if len(self._hypotheses.confirmed) >= self.settings.max_drones:
                     continue
-                track = self._known.start(number, xyz, v, seen_ns, seen_ns)
-            if not track.confirmed and len(self._known.confirmed) < self.settings.max_drones:
+                track = self._hypotheses.start(number, xyz, v, seen_ns, seen_ns)
+            if not track.confirmed and len(self._hypotheses.confirmed) < self.settings.max_drones:
                 track.confirmed = True
                 track.number, self._next_number = self._next_number, self._next_number + 1
                 track.candidate = number
@@ -167,9 +170,9 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         if pulses.range_m.size == 0:
             return
         now_ns = int(pulses.point_stamp_ns[-1])
-        R, t = self._trail.at(pulses.middle_ns)
+        R, t = self._vehicle.at(pulses.middle_ns)
         axis = mean_direction(pulses.direction_vehicle)
-        hypotheses, span_m, de_skew = self._known, self.settings.span_m, self.settings.de_skew
+        hypotheses, span_m, de_skew = self._hypotheses, self.settings.span_m, self.settings.de_skew
         for track in hypotheses:
             if track not in hypotheses:  # removed in this loop as a duplicate
                 continue
@@ -183,34 +186,39 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
             if before is None:
                 track.pass_sample = hypotheses.sample(pulses.stamp_ns)
             if track in hypotheses:
-                yield from self._watch(track, now_ns)
+                yield from self._publish_state(track, now_ns)
         if not len(hypotheses) and now_ns - self._idle_ns > 500_000_000:
             self._idle_ns = now_ns
             yield TrackState(
-                stamp_ns=now_ns, state=TrackingState.SEARCHING, reason=self._why_idle, hits=0, frame_s=0.5, track_id=0
+                stamp_ns=now_ns,
+                state=TrackingState.SEARCHING,
+                reason=self._idle_reason,
+                hits=0,
+                frame_s=0.5,
+                track_id=0,
             )
 
     def _lose(self, track: Hypothesis, now_ns: int, why: str) -> Iterator[TrackState]:
-        self._known.drop(track)
+        self._hypotheses.drop(track)
         if track.confirmed:
-            self._why_idle = f"lost drone {track.number}: {why}"
+            self._idle_reason = f"lost drone {track.number}: {why}"
             yield TrackState(
                 stamp_ns=now_ns, state=TrackingState.LOST, reason=why, hits=0, frame_s=0.1, track_id=track.number
             )
 
-    def _watch(self, track: Hypothesis, now_ns: int) -> Iterator[TrackState]:
+    def _publish_state(self, track: Hypothesis, now_ns: int) -> Iterator[TrackState]:
         """Publish coasting and loss between scan passes; remove duplicates."""
         settings = self.settings
         silent_s = (now_ns - track.last_return_ns) * 1e-9
         gone = silent_s > (settings.lost_after_s if track.confirmed else CANDIDATE_S)
         if track.confirmed and gone:
-            known = self._known.sample(now_ns) is not None
-            gone = not (known and largest_sigma_m(self._known.at(track, now_ns)[1]) < settings.lost_sigma_m)
+            has_odometry = self._hypotheses.sample(now_ns) is not None
+            gone = not (has_odometry and largest_sigma_m(self._hypotheses.at(track, now_ns)[1]) < settings.lost_sigma_m)
         if gone or track.log_odds < -4.0:
             why = f"no return for {silent_s:.1f} s" if silent_s > 1.0 else "no return in repeated scan passes"
             yield from self._lose(track, now_ns, why)
         elif track.confirmed:
-            for other in self._known:  # duplicates
+            for other in self._hypotheses:  # duplicates
                 if other is not track and np.linalg.norm(other.x[:3] - track.x[:3]) < settings.span_m:
                     younger = other if not other.confirmed or other.number > track.number else track
                     if younger is not track:
@@ -227,13 +235,12 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         state = TrackingState.CANDIDATE
         if track.confirmed:
             state = TrackingState.COASTING if silent_s > self.settings.coast_after_s else TrackingState.TRACKING
-        x, P = self._known.at(track, now_ns)
-        R, _ = self._trail.at(now_ns)
-        xyz, velocity = self._trail.to_vehicle(now_ns, x[:3], x[3:])
+        x, P = self._hypotheses.at(track, now_ns)
+        R, _ = self._vehicle.at(now_ns)
+        xyz, velocity = self._vehicle.to_vehicle(now_ns, x[:3], x[3:])
         covariance = R.T @ P[:3, :3] @ R + self._bias_covariance(xyz)
-        if (
-            silent_s > self.settings.coast_after_s
-        ):  # a recent return is relative to the vehicle and needs no vehicle pose
+        # a recent return is relative to the vehicle and needs no vehicle pose
+        if silent_s > self.settings.coast_after_s:
             covariance += self._vehicle_covariance_m2(now_ns, xyz)
         track.published_ns = now_ns
         return TrackState(
@@ -250,7 +257,7 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
 
     def _vehicle_covariance_m2(self, stamp_ns: int, xyz_vehicle_m: Array64) -> Array64:
         """Covariance (3, 3) [m^2] of a position due to the extrapolated vehicle pose, vehicle axes."""
-        sigma_m, yaw_rad = self._trail.extrapolation_sigma(stamp_ns)
+        sigma_m, yaw_rad = self._vehicle.extrapolation_sigma(stamp_ns)
         level = np.array([-xyz_vehicle_m[1], xyz_vehicle_m[0], 0.0]) * yaw_rad
         return sigma_m**2 * np.eye(3) + np.outer(level, level)
 
@@ -269,41 +276,39 @@ class LikelihoodTrack(Stage[LikelihoodTrackSettings]):
         track.hits = 0 if seen is None else seen.hits
         if seen is None:
             return
-        self._known.update(track, scan_pass.start_ns, seen.x, seen.P, track.pass_sample)
-        track.log_odds = min(max(track.log_odds + seen.evidence, -8.0), 8.0)
+        self._hypotheses.update(track, scan_pass.start_ns, seen.x, seen.P, track.pass_sample)
+        track.log_odds = min(max(track.log_odds + seen.log_likelihood_ratio, -8.0), 8.0)
         if seen.hits == 0:
             return
         track.last_return_ns = seen.return_ns
         if seen.expected > 0.5:
             ratio = min(max(track.p_0 * seen.hits / seen.expected, 0.15), 0.95)
             track.p_0 += 0.1 * (ratio - track.p_0)
-        track.reason = f"{seen.hits} returns, {seen.beside} pulses next to it"
+        track.reason = f"{seen.hits} returns, {seen.other_pulses} pulses next to it"
         if track.confirmed:
-            self._known.learn(track)
+            self._hypotheses.learn(track)
             yield self._fix(track)
         yield self._state(track, max(scan_pass.last_ns, track.last_return_ns, track.published_ns))
 
     def _fix(self, track: Hypothesis) -> DroneFix:
-        x, P = self._known.at(track, track.last_return_ns)
-        R, _ = self._trail.at(track.last_return_ns)
-        xyz, velocity = self._trail.to_vehicle(track.last_return_ns, x[:3], x[3:])
+        x, P = self._hypotheses.at(track, track.last_return_ns)
+        R, _ = self._vehicle.at(track.last_return_ns)
+        xyz, velocity = self._vehicle.to_vehicle(track.last_return_ns, x[:3], x[3:])
         bias_covariance_m2 = self._bias_covariance(xyz)
         return DroneFix(
             stamp_ns=track.last_return_ns,
             xyz_vehicle_m=xyz,
             covariance_m2=R.T @ P[:3, :3] @ R + bias_covariance_m2,
             hits=track.hits,
-            iterations=1,
-            shift_m=0.0,
             track_id=track.number,
             velocity_vehicle_mps=velocity,
             bias_covariance_m2=bias_covariance_m2,
         )
 
     def _bias_covariance(self, xyz_vehicle_m: Array64) -> Array64:
-        """What does not average out (3, 3): the turntable's zero and tilt, the range, the drone's outline.
+        """Covariance (3, 3) [m^2] that does not average out: turntable zero and tilt, range, and the drone's shape.
 
-        Axes of the vehicle; the line of sight is taken from its origin, decimetres beside the LiDAR's.
+        Vehicle axes. The line of sight is taken from the vehicle's origin, decimetres from the LiDAR's.
         """
         settings = self.settings
         along = xyz_vehicle_m * (settings.range_sigma_m / max(float(np.linalg.norm(xyz_vehicle_m)), 1e-9))

@@ -1,4 +1,4 @@
-"""Mean shift: the weighted mean of the returns around the drone's last position, and how far to trust it.
+"""Mean shift: the weighted mean of the returns around the drone's last position, and its covariance.
 
     C(t) = exp(-|t - t_hat|^2),  t^{n+1} = sum_F C(t) t / sum_F C(t)                        Equation (6)
 
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 
-NEW_CROSSING_NS = 10_000_000  # a laser silent on the target this long and back again is another pass of the fan
+NEW_CROSSING_NS = 10_000_000  # a longer pause between a laser's returns separates two passes of the fan
 
 
 def crossings(point_stamp_ns: NDArray[np.int64], laser: NDArray[np.uint8]) -> int:
-    """How many times a beam crossed the target: runs of one laser without a pause of NEW_CROSSING_NS."""
+    """Number of beam crossings of the target: runs of one laser without a pause of NEW_CROSSING_NS."""
     count = 0
     for beam in np.unique(laser):
         count += 1 + int((np.diff(np.sort(point_stamp_ns[laser == beam])) > NEW_CROSSING_NS).sum())
@@ -39,13 +39,13 @@ def fix_covariance_m2(
 
         P = S / n_eff + u u^T (sigma_r^2 + s^2 / 12) + (I - u u^T) (s^2 / (12 m) + R^2 (sigma_p^2 + beta^2 / 12))
 
-    S / n_eff    weighted scatter over n_eff = (sum C)^2 / sum C^2: chance of which spots of the drone were hit
+    S / n_eff    weighted scatter over n_eff = (sum C)^2 / sum C^2: random choice of the parts that were hit
     u, R         direction and distance from the LiDAR to the mean
     sigma_r      range noise. It is the same for neighbouring returns, so it is not divided by their number
-    s^2 / 12     along the ray the centre lies behind the hull that was hit, anywhere from 0 to s/2, and the mean is not
-                 moved for it: the mean square of a uniform offset in [0, s/2]
-    s^2 / (12 m) across the ray one crossing beam tells only that the drone is somewhere within its span: uniform,
-                 variance s^2 / 12; m crossings are m such looks
+    s^2 / 12     along the ray the centre lies behind the returns, by 0 to s/2. The mean is not corrected for it: this
+                 is the mean square of a uniform offset in [0, s/2]
+    s^2 / (12 m) across the ray one crossing beam determines the centre only within the span: uniform, variance
+                 s^2 / 12; m crossings are m such measurements
     sigma_p      pointing: encoder, calibration, servo time. Common to all returns of a frame, so not divided
     beta         beam divergence: a return may come from anywhere in the footprint, uniform over R beta
 

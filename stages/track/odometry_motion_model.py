@@ -1,25 +1,23 @@
-"""How the drone's own word moves a track: what it says of its flight, turned by a yaw that is learnt on the way.
+"""Motion model of a track from the drone's odometry, rotated by a yaw that is estimated from the track.
 
     p' = p + dt v + Rz(psi) (d - dt u),    v' = v + Rz(psi) w
 
-d, w: how far the autopilot says it flew since, and how its velocity changed; u: its velocity then; psi: the yaw of its
-frame in the local one. The track keeps a velocity of its own, so a drift of either odometry counts only as it changes.
-Its word comes late: a prediction beyond the newest word is made good by the next one, which begins with the word that
-this one ended with (`Word`), not with what was heard of that moment since.
+d, w: change of position and velocity over dt by the drone's odometry; u: its velocity at the start; psi: yaw of frame
+odom in frame map. The track has a velocity of its own, so that a constant velocity drift of either odometry has no
+effect. The odometry is delayed: a prediction beyond the newest message is extrapolated. The next prediction corrects
+it, because it starts from the odometry that the last one ended with (`OdometrySample`), not from a newer value for that
+time.
 
-psi is a grid of hypotheses, weighed by where the track was lately (stages/kernels/geometry/smooth_motion.py); one
-more
-says
-that the track does not fly as told. Of the grid two moments are needed, m_1 = E exp(i psi), m_2 = E exp(2 i psi): a
-level step
-is a complex number z = a exp(i psi), and for two of them
+psi is a grid of hypotheses, weighted by the recent positions of the track (stages/kernels/geometry/smooth_motion.py).
+One more hypothesis is that the track does not follow the odometry. Two moments of the grid are needed,
+m_1 = E exp(i psi) and m_2 = E exp(2 i psi): a horizontal step is a complex number z = a exp(i psi), and for two of them
 
     E z = a m_1,   E (z - Ez)(z' - Ez')* = a a'* (1 - |m_1|^2),   E (z - Ez)(z' - Ez') = a a' (m_2 - m_1^2)
 
-So with psi unknown (m = 0) a drone that says it hangs is predicted to hang, and one that turns hard is predicted
-widely; with psi known it is predicted where it went.
+With psi unknown (m = 0) a drone that hovers by its odometry is predicted to hover, and one that manoeuvres gets a large
+covariance; with psi known its manoeuvre is predicted.
 
-Source: ours; DESIGN, The graph: track "motion-predicted".
+Source: ours.
 """
 
 from __future__ import annotations
@@ -31,20 +29,20 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.geometry.frames import Array64
-from stages.kernels.track.odometry_motion_model import YAWS, move_as_told, weigh_yaws
+from stages.kernels.track.odometry_motion_model import YAWS, add_odometry_motion, weigh_yaws
 from stages.odometry.drone.telemetry import DroneTelemetry
 from stages.track.kalman import predicted
 
-NO_ODOMETRY_PRIOR = 0.02  # prior of a track that does not fly as told
+NO_ODOMETRY_PRIOR = 0.02  # prior probability that the track does not follow the odometry
 WINDOW_NS = 12_000_000_000
 SPACING_NS = 100_000_000
 MAX_POINTS = 32
-TEMPER = 0.5  # neighbouring places err together
-RETAINED_SHARE = 0.9  # of what is known of psi, for the next track
+TEMPER = 0.5  # exponent of the likelihood: errors of successive positions are correlated
+RETAINED_SHARE = 0.9  # weight of the last track's psi in the prior of the next track, the rest is uniform
 
 
 class OdometrySample(NamedTuple):
-    """What was believed of the drone's own place and velocity when a state was predicted, in the autopilot's frame."""
+    """Position and velocity by the drone's odometry at the time of a prediction, in frame odom."""
 
     source: int
     resets: int
@@ -53,14 +51,14 @@ class OdometrySample(NamedTuple):
 
 
 class OdometryMotionModel:
-    """Predicts tracks by the drone's word, and learns the yaw of that word from the confirmed one."""
+    """Predicts tracks by the drone's odometry, and estimates the yaw of frame odom from the confirmed track."""
 
     def __init__(self, source: int) -> None:
-        """`source`: the number of the messages it comes from, should there be several."""
+        """`source`: number of the odometry source, of several."""
         self._source = source
         self.telemetry = DroneTelemetry()
-        self._resets = 0  # of the frame whose yaw is learnt
-        self._number = 0  # of the track learnt from
+        self._resets = 0  # of frame odom, whose yaw is estimated
+        self._number = 0  # of the track that the yaw is estimated from
         self._positions: deque[tuple[int, Array64, float]] = deque()
         self._prior = np.full(YAWS, 1.0 / YAWS)
         self._p = (1.0 - NO_ODOMETRY_PRIOR) * self._prior
@@ -68,7 +66,7 @@ class OdometryMotionModel:
         self._moments = 0j, 0j
 
     def _follow_resets(self) -> None:
-        """What was learnt of psi is of no use once the autopilot's estimate jumped: it may have turned."""
+        """Reset psi after a reset of the autopilot's estimate, which may have changed its yaw."""
         if self._resets != self.telemetry.resets:
             self._resets = self.telemetry.resets
             self._positions.clear()
@@ -79,11 +77,11 @@ class OdometryMotionModel:
 
     @property
     def confidence(self) -> float:
-        """Probability that the track flies as told."""
+        """Probability that the track follows the odometry."""
         return self._confidence
 
     def learn(self, number: int, stamp_ns: int, xyz_map_m: Array64, sigma_m: float) -> None:
-        """Where confirmed track `number` was, and how well that is known, one sigma an axis."""
+        """Add a position of confirmed track `number`, with one sigma per axis."""
         self._follow_resets()
         if number != self._number:
             confidence = self.confidence
@@ -124,7 +122,7 @@ class OdometryMotionModel:
         self._moments = complex(self._p @ turn), complex(self._p @ turn**2)
 
     def sample(self, stamp_ns: int) -> OdometrySample | None:
-        """The drone's word for a time; None when it was silent then."""
+        """Odometry at a time; None when there is none."""
         state = self.telemetry.state(stamp_ns)
         return None if state is None else OdometrySample(self._source, self.telemetry.resets, *state)
 
@@ -138,15 +136,15 @@ class OdometryMotionModel:
         q_free: float,
         q_odometry: float,
     ) -> tuple[Array64, Array64]:
-        """State (6,) and covariance (6, 6) of a track dt_s later, by the words for then and now.
+        """State (6,) and covariance (6, 6) of a track dt_s later, given the odometry before and after.
 
-        q_told: density of its acceleration that they leave. Without two words of one source, and back in time, it is
-        q_free.
+        `q_odometry` and `q_free`: density of its acceleration [m^2/s^3] with and without odometry. Without two samples
+        of the same source and segment, and for negative dt_s, the prediction has constant velocity and q_free.
         """
         if before is None or after is None or before[:2] != after[:2] or dt_s <= 0:
             return predicted(x, P, dt_s, q_free)
         self._follow_resets()
         confidence = self.confidence
         x, covariance = predicted(x, P, dt_s, confidence * q_odometry + (1.0 - confidence) * q_free)
-        move_as_told(x, covariance, dt_s, *before[2:], *after[2:], confidence, *self._moments)
+        add_odometry_motion(x, covariance, dt_s, *before[2:], *after[2:], confidence, *self._moments)
         return x, covariance

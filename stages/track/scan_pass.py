@@ -1,4 +1,4 @@
-"""One look at a drone: the pulses that pass near it while the rotor goes by, and what they say of its place.
+"""Evaluation of one scan pass: the pulses near a track during one passing of the rotor update its state.
 
 Source: ours, for P III.C; the likelihood is that of `stages/track/hull.py`.
 """
@@ -14,32 +14,44 @@ from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.kernels.sweep.pulses import LONGEST
-from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, MISS, NEARER, WHEN_S, A, B, collect, posterior
-from stages.kernels.track.runs import leave_out_walls
-from stages.kernels.track.scan_pass import largest_sigma_m, seen_from
+from stages.kernels.track.hull import (
+    DELAY_S,
+    DEPTH,
+    GAP_RETURN,
+    KIND,
+    OCCLUDED,
+    PASS_THROUGH,
+    RETURN,
+    A,
+    B,
+    collect,
+    posterior,
+)
+from stages.kernels.track.runs import mask_walls
+from stages.kernels.track.scan_pass import largest_sigma_m, line_of_sight
 from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS, WIDTH, across
 from stages.track.kalman import condition, measured
 
-MAX_OFFSET_M = 6.0  # beside the prediction pulses are collected
-RANGE_NOISE = 0.1  # of one return about the body's middle, one sigma, over the span: it is as deep
+MAX_OFFSET_M = 6.0  # from the prediction, of collected pulses
+RANGE_NOISE = 0.1  # one sigma of a return's depth about the drone's centre, over the span
 RANGE_FLOOR_M = 0.02
 MAX_ROWS = 256
-OFF_SPAN = np.array([0.3, 0.3, 0.2])  # a, b, depth: of returns about the prediction beside its own sigma, over the span
-MIN_SCORE = -6.0  # of a group: of 3498 looks at drones followed in 25 flights as built none was worse than -4.8,
-MIN_GLIMPSE_SCORE = -1.5  # and one in a hundred worse than this
+OFF_SPAN = np.array([0.3, 0.3, 0.2])  # a, b, depth: spread of returns about the drone's centre, over the span
+MIN_SCORE = -6.0  # of a group of returns; those of simulated drones are above -4.8
+MIN_GAP_SCORE = -1.5  # of a group of gap returns; 99 % of the groups of simulated drones are above it
 
 
 @dataclass(slots=True, eq=False)
 class ScanPass:
-    """Pulses of one passing of the rotor, and the state they are measured against."""
+    """Pulses of one passing of the rotor, and the predicted state that they are measured from."""
 
     start_ns: int
     last_ns: int
-    x: Array64  # (6,) predicted at start_ns, local frame
+    x: Array64  # (6,) predicted at start_ns, frame map
     P: Array64
-    line: Array64  # unit line of sight, local frame
-    reach_m: float  # pulses so near the prediction count; those farther out show where a wall goes on
+    line: Array64  # unit line of sight, frame map
+    gate_m: float  # pulses within it are evaluated; those farther out only reveal walls
     parts: list[Array64] = field(default_factory=lambda: list[Array64]())
 
     @property
@@ -49,15 +61,15 @@ class ScanPass:
 
 
 class PassUpdate(NamedTuple):
-    """What a look says."""
+    """Result of a scan pass."""
 
-    x: Array64  # state at the look's start
+    x: Array64  # state at the start of the scan pass
     P: Array64
-    evidence: float  # ln of the likelihood, drone over nothing
-    hits: int
-    expected: float  # hits expected there
-    beside: int  # pulses that passed it
-    return_ns: int  # mean time of the hits; the look's start when there were none
+    log_likelihood_ratio: float  # of a drone over nothing
+    hits: int  # returns
+    expected: float  # expected number of returns
+    other_pulses: int  # pass-throughs and occluded pulses
+    return_ns: int  # mean time of the returns; the start of the scan pass when there are none
 
 
 def collect_into(
@@ -71,17 +83,17 @@ def collect_into(
     span_m: float,
     de_skew: bool,
 ) -> ScanPass | None:
-    """The look with this slice's pulses near the drone, a new one if there was none; None while there are none.
+    """The scan pass with this slice's pulses near the drone added; a new one if it was None; None without pulses.
 
-    R, t are T_map_vehicle of the slice, `axis` (3,) its mean direction; x, P the state predicted at the look's start.
+    R, t are T_map_vehicle of the slice, `axis` (3,) its mean direction; x, P the state predicted at the pass's start.
     """
     origin = np.array(pulses.origin_vehicle_m)
-    away, range_m, here = seen_from(R, t, origin, x, axis)
+    away, range_m, here = line_of_sight(R, t, origin, x, axis)
     if not here:
         return scan_pass
     start_ns = pulses.stamp_ns if scan_pass is None else scan_pass.start_ns
     sigma_m = largest_sigma_m(P)
-    reach_m = min(0.6 * span_m + 3.0 * sigma_m, MAX_OFFSET_M)
+    gate_m = min(0.6 * span_m + 3.0 * sigma_m, MAX_OFFSET_M)
     line = R @ away / range_m if scan_pass is None else scan_pass.line
     found = np.empty((pulses.range_m.size, COLUMNS))
     count = collect(
@@ -93,16 +105,16 @@ def collect_into(
         away + origin,
         R.T @ x[3:] if de_skew else np.zeros(3),
         start_ns,
-        reach_m + LONGEST * span_m,
+        gate_m + LONGEST * span_m,
         0.5 + 3.0 * sigma_m,
         R.T @ line,
-        across(line) @ R,  # level in the local frame, as `evaluate` takes them
+        across(line) @ R,  # horizontal in frame map, as in `evaluate`
         found,
     )
     if count == 0:
         return scan_pass
     if scan_pass is None:
-        scan_pass = ScanPass(start_ns, start_ns, x, P, line, reach_m)
+        scan_pass = ScanPass(start_ns, start_ns, x, P, line, gate_m)
     scan_pass.parts.append(found[:count])
     scan_pass.last_ns = int(pulses.point_stamp_ns[-1])
     return scan_pass
@@ -111,65 +123,66 @@ def collect_into(
 def evaluate(
     scan_pass: ScanPass, span_m: float, hull_offset_m: float, p_0: float, use_pass_throughs: bool, own_sigma_m: float
 ) -> PassUpdate | None:
-    """Where the drone is after a look; None when the look says nothing.
+    """The track's state after a scan pass; None when the scan pass has no information.
 
-    What is hit where the prediction is worse than own_sigma_m may be anything: that is for the detector to judge.
+    Returns are ignored if the predicted position's sigma exceeds own_sigma_m: they may come from any object, so that
+    the detector has to classify them.
     """
     pulses, sigma_m = np.concatenate(scan_pass.parts), scan_pass.sigma_m
-    leave_out_walls(pulses, span_m)
-    pulses = pulses[np.hypot(pulses[:, A], pulses[:, B]) <= scan_pass.reach_m]
-    missed = pulses[(pulses[:, KIND] == MISS) | (pulses[:, KIND] == NEARER)]
+    mask_walls(pulses, span_m)
+    pulses = pulses[np.hypot(pulses[:, A], pulses[:, B]) <= scan_pass.gate_m]
+    others = pulses[(pulses[:, KIND] == PASS_THROUGH) | (pulses[:, KIND] == OCCLUDED)]
     H = across(scan_pass.line)
     prior = H @ scan_pass.P[:3, :3] @ H.T
     mean, after = np.zeros(2), np.zeros((2, 2))
     rows = drone_returns(pulses, span_m, sigma_m) if sigma_m < own_sigma_m else None
     if rows is None:
-        alone = len(missed) == len(pulses) > 1
-        if not (use_pass_throughs and alone and sigma_m < 0.7 * span_m):
+        only_others = len(others) == len(pulses) > 1
+        if not (use_pass_throughs and only_others and sigma_m < 0.7 * span_m):
             return None
-        evidence, expected = posterior(missed, prior, 0.0, 0.0, 3.0 * sigma_m, p_0, WIDTH * span_m, True, mean, after)
+        ratio, expected = posterior(others, prior, 0.0, 0.0, 3.0 * sigma_m, p_0, WIDTH * span_m, True, mean, after)
         x, P = condition(scan_pass.x, scan_pass.P, H, mean, after)
-        return PassUpdate(x, P, max(evidence, -1.0), 0, expected, len(missed), scan_pass.start_ns)
+        return PassUpdate(x, P, max(ratio, -1.0), 0, expected, len(others), scan_pass.start_ns)
     hits = pulses[rows]
-    hits[:, KIND] = HIT
+    hits[:, KIND] = RETURN
     a, b = float(hits[:, A].mean()), float(hits[:, B].mean())
     half_m = max(0.6 * span_m, 0.6 * math.hypot(a, b) + 0.3 * span_m)
-    used = np.concatenate([hits, missed])
-    evidence, expected = posterior(used, prior, a, b, half_m, p_0, WIDTH * span_m, use_pass_throughs, mean, after)
-    x, sideways = condition(scan_pass.x, scan_pass.P, H, mean, after)
+    used = np.concatenate([hits, others])
+    ratio, expected = posterior(used, prior, a, b, half_m, p_0, WIDTH * span_m, use_pass_throughs, mean, after)
+    x, P_across = condition(scan_pass.x, scan_pass.P, H, mean, after)
     depth_m = float(np.median(hits[:, DEPTH])) + hull_offset_m
     noise_m = math.sqrt((RANGE_NOISE * span_m) ** 2 / len(hits) + RANGE_FLOOR_M**2)
-    along_m = depth_m - float(scan_pass.line @ (x[:3] - scan_pass.x[:3]))
-    x, both = measured(x, sideways, scan_pass.line, along_m, noise_m)
-    return_ns = scan_pass.start_ns + round(float(hits[:, WHEN_S].mean()) * 1e9)
-    return PassUpdate(x, both, min(evidence, 3.0), len(hits), expected, len(missed), return_ns)
+    residual_m = depth_m - float(scan_pass.line @ (x[:3] - scan_pass.x[:3]))
+    x, P_after = measured(x, P_across, scan_pass.line, residual_m, noise_m)
+    return_ns = scan_pass.start_ns + round(float(hits[:, DELAY_S].mean()) * 1e9)
+    return PassUpdate(x, P_after, min(ratio, 3.0), len(hits), expected, len(others), return_ns)
 
 
 def drone_returns(pulses: Array64, span_m: float, sigma_m: float) -> NDArray[np.intp] | None:
-    """Which of a look's pulses (n, COLUMNS) are the drone's returns: rows, or None when none are.
+    """Rows of the drone's returns among a scan pass's pulses (n, COLUMNS), or None when there are none.
 
-    The densest group of the drone's size, near the prediction rather than far; none when more stands right beside it:
-    then the returns are those of something bigger. What is seen through a gap has to be where a drone nearly always is.
+    They are the densest group of the drone's size, with a penalty for the distance from the prediction. A group with
+    more returns right next to it belongs to a larger object. Gap returns need a smaller distance from the prediction.
     """
-    rows = np.nonzero((pulses[:, KIND] == HIT) | (pulses[:, KIND] == GLIMPSE))[0]
+    rows = np.nonzero((pulses[:, KIND] == RETURN) | (pulses[:, KIND] == GAP_RETURN))[0]
     if len(rows) == 0:
         return None
-    place = pulses[rows][:, [A, B, DEPTH]]
+    position_m = pulses[rows][:, [A, B, DEPTH]]
     variance_m2 = sigma_m**2 + (span_m * OFF_SPAN) ** 2
-    if len(rows) > MAX_ROWS:  # a wall: what is nearest to the prediction will do
-        rows = rows[np.argsort(np.sum(place**2, axis=1), kind="stable")[:MAX_ROWS]]
-        place = pulses[rows][:, [A, B, DEPTH]]
-    apart = np.linalg.norm(place[:, None] - place[None], axis=2)
-    near = apart <= 0.5 * span_m
-    score = np.log(near.sum(axis=1)) - 0.5 * np.sum(place**2 / variance_m2, axis=1)
+    if len(rows) > MAX_ROWS:  # a wall: the returns nearest to the prediction suffice
+        rows = rows[np.argsort(np.sum(position_m**2, axis=1), kind="stable")[:MAX_ROWS]]
+        position_m = pulses[rows][:, [A, B, DEPTH]]
+    distance_m = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
+    near = distance_m <= 0.5 * span_m
+    score = np.log(near.sum(axis=1)) - 0.5 * np.sum(position_m**2 / variance_m2, axis=1)
     best = int(score.argmax())
-    glimpsed = (pulses[rows[near[best]], KIND] == GLIMPSE).all()
-    if score[best] < (MIN_GLIMPSE_SCORE if glimpsed else MIN_SCORE):
+    all_in_gap = (pulses[rows[near[best]], KIND] == GAP_RETURN).all()
+    if score[best] < (MIN_GAP_SCORE if all_in_gap else MIN_SCORE):
         return None
-    centre = place[near[best]].mean(axis=0)
-    away = np.linalg.norm(place - centre, axis=1)
-    group = away <= 0.6 * span_m
-    beside = (away > 0.9 * span_m) & (away < 2.0)
-    if beside.sum() > max(2, int(group.sum())):
+    centre = position_m[near[best]].mean(axis=0)
+    away_m = np.linalg.norm(position_m - centre, axis=1)
+    group = away_m <= 0.6 * span_m
+    adjacent = (away_m > 0.9 * span_m) & (away_m < 2.0)
+    if adjacent.sum() > max(2, int(group.sum())):
         return None
     return rows[group]

@@ -24,7 +24,7 @@ ALLOWED = Tolerances(STRAIGHT, math.radians(0.1), math.radians(0.5), math.radian
 
 
 def pairs(streets, per_direction, count=200):
-    """Pictures 0.1 s apart of a drone that turns."""
+    """Images of a turning drone at 10 Hz."""
     out = []
     for i in range(count):
         made = {"per_direction": per_direction, "stamp_ns": START_NS + i * 100 * MS, "seed": i % 8}
@@ -72,6 +72,6 @@ def test_refinement(benchmark, name):
 
 def test_a_window_of_motion(benchmark):
     bank = HypothesisBank(BranchSettings())
-    way = np.array([0.5, 0.1])
-    window = Displacement(S, 2 * S, np.tile(way, (DIRECTIONS, 1)), 0.01 * np.eye(2), way, 0.03, True)
+    displacement = np.array([0.5, 0.1])
+    window = Displacement(S, 2 * S, np.tile(displacement, (DIRECTIONS, 1)), 0.01 * np.eye(2), displacement, 0.03, True)
     benchmark(bank.see, window)

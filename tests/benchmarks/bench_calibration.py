@@ -1,4 +1,4 @@
-"""A round of the calibration: planes projected out of all patches at once, beside a least squares for each patch.
+"""A round of the calibration: planes projected out of all patches at once, compared with a least squares per patch.
 
 python -m pytest tests/benchmarks/bench_calibration.py
 """

@@ -1,8 +1,8 @@
-"""Camera frames and lenses. A frame's time against its period says how much slower than real time the simulator is.
+"""Camera frames and lenses. The ratio of a frame's time and its period is the simulator's slowdown against real time.
 
     python -m pytest tests/benchmarks/bench_camera.py --benchmark-columns=min,median,iqr,rounds
 
-Pin it to one core (`taskset -c 0`). Two cameras at 10 Hz make 20 frames a simulated second. Beside our lens: cv2.fisheye,
+Pin it to one core (`taskset -c 0`). Two cameras at 10 Hz make 20 frames a simulated second. Compared with grd's lens: cv2.fisheye,
 which is another model's twin only below 90 deg, on the same 100 000 rays up to 80 deg.
 """
 
@@ -59,20 +59,20 @@ def test_half_a_second_of_lidar_and_two_cameras_at_10_hz(benchmark):
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.model)
-@pytest.mark.parametrize("way", ["project", "unproject"])
-def test_100_000_rays(benchmark, lens, way):
+@pytest.mark.parametrize("direction", ["project", "unproject"])
+def test_100_000_rays(benchmark, lens, direction):
     rays = _rays(80.0)
-    argument = rays if way == "project" else lens.project(rays)
-    benchmark(getattr(lens, way), argument)
+    argument = rays if direction == "project" else lens.project(rays)
+    benchmark(getattr(lens, direction), argument)
 
 
-@pytest.mark.parametrize("way", ["project", "unproject"])
-def test_100_000_rays_by_cv2_fisheye_below_80_deg(benchmark, way):
+@pytest.mark.parametrize("direction", ["project", "unproject"])
+def test_100_000_rays_by_cv2_fisheye_below_80_deg(benchmark, direction):
     K = np.array([[170.0, 0, 360.5], [0, 171.0, 359.0], [0, 0, 1]])
     D = np.array(KANNALA_BRANDT.k)
     rays = _rays(80.0)
     pixels = KANNALA_BRANDT.project(rays)[:, None]
-    if way == "project":
+    if direction == "project":
         benchmark(cv2.fisheye.projectPoints, rays[:, None], np.zeros(3), np.zeros(3), K, D)
     else:
         benchmark(cv2.fisheye.undistortPoints, pixels, K, D)

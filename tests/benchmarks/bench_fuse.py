@@ -23,7 +23,7 @@ from tests.stages.heading.test_motion_yaw import circle, points
 STAGES = {"smoother": Fuse, "ekf": EkfFuse}
 BACKS = {"smoother": lambda: Smoother(3.0), "ekf": Ekf}
 TENTH = 100_000_000
-WAY = Step(rotation_z(0.05), np.array([0.3, 0.0, 0.0]), np.diag([0.002**2] * 3 + [0.01**2] * 3), True, True)
+STEP = Step(rotation_z(0.05), np.array([0.3, 0.0, 0.0]), np.diag([0.002**2] * 3 + [0.01**2] * 3), True, True)
 STAYS = Step(np.eye(3), np.zeros(3), np.zeros((6, 6)), True, True)
 
 
@@ -57,14 +57,14 @@ def flown(name, steps=40):
     back = BACKS[name]()
     back.start(0, np.eye(3), np.zeros(3), 0.01 * np.eye(6))
     for k in range(1, steps):
-        back.extend(k * TENTH, WAY, None, 0.1)
+        back.extend(k * TENTH, STEP, None, 0.1)
     return back
 
 
 @pytest.mark.parametrize("name", BACKS)
 def test_one_pose_more(benchmark, name):
     back = flown(name)
-    benchmark.pedantic(lambda: back.extend(back.stamp_ns + TENTH, WAY, None, 0.1), rounds=300, warmup_rounds=10)
+    benchmark.pedantic(lambda: back.extend(back.stamp_ns + TENTH, STEP, None, 0.1), rounds=300, warmup_rounds=10)
 
 
 @pytest.mark.parametrize("name", BACKS)
@@ -72,7 +72,7 @@ def test_one_position(benchmark, name):
     back = flown(name)
 
     def setup():
-        back.extend(back.stamp_ns + TENTH, WAY, None, 0.1)
+        back.extend(back.stamp_ns + TENTH, STEP, None, 0.1)
 
     def add():
         back.add_position(back.stamp_ns, STAYS, back.xyz_map_m + 0.02, 0.0025 * np.eye(3))

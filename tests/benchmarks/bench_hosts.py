@@ -37,9 +37,7 @@ MESSAGES = {
         turntable_rad=0.0,
         origin_vehicle_m=(0.0, 0.0, 0.0),
     ),
-    "fix": DroneFix(
-        stamp_ns=1, xyz_vehicle_m=np.zeros(3), covariance_m2=np.eye(3), hits=1, iterations=1, shift_m=0.0, track_id=1
-    ),
+    "fix": DroneFix(stamp_ns=1, xyz_vehicle_m=np.zeros(3), covariance_m2=np.eye(3), hits=1, track_id=1),
 }
 CLASSES = {cls.__name__: cls for cls in (Image, SweptPulses, DroneFix)}
 

@@ -1,4 +1,4 @@
-"""The live runner at the pace of the sensors: CPU, and how late each edge is, beside a replay of the same records.
+"""The live runner at the pace of the sensors: CPU, and the delay of each edge, compared with a replay of the same records.
 
     pytest tests/benchmarks/bench_live.py -s
 

@@ -1,8 +1,8 @@
-"""The autopilot link: from a pose to its bytes on a socket, and from received bytes to a message, beside pymavlink alone.
+"""The autopilot link: from a pose to its bytes on a socket, and from received bytes to a message, compared with pymavlink.
 
     python -m pytest tests/benchmarks/bench_mavlink.py --benchmark-columns=min,median,max,iqr -s
 
-`test_a_pose_to_the_peers_socket` also says the 99th percentile of pose -> datagram read at the other end.
+`test_a_pose_to_the_peers_socket` also prints the 99th percentile of pose -> datagram read at the other end.
 """
 
 from __future__ import annotations

@@ -20,7 +20,17 @@ from stages.messages import Image, VisualMotion
 from stages.odometry.drone import FisheyeOdometry
 from stages.odometry.vehicle import VisualLidarOdometry
 from stages.odometry.visual.two_view import Noise, relative_motion
-from tests.stages.seen import LENS, LOOKS_DOWN, LOOKS_UP, SIZE_PX, degrees_between, lidar_slice, of, picture, point_rays
+from tests.stages.seen import (
+    LENS,
+    LOOKS_DOWN,
+    LOOKS_UP,
+    SIZE_PX,
+    degrees_between,
+    grey_image,
+    lidar_slice,
+    of,
+    point_rays,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -38,7 +48,7 @@ def pose(k):
 def flight(size_px, mount):
     """Images of a rotating, flying camera."""
     C = mount.matrix()[:3, :3]
-    return [picture(pose(k)[0] @ C, pose(k)[1], k, size_px) for k in range(IMAGES)]
+    return [grey_image(pose(k)[0] @ C, pose(k)[1], k, size_px) for k in range(IMAGES)]
 
 
 @pytest.mark.parametrize("size_px", [720, 1080, 1440])
@@ -58,16 +68,16 @@ def test_ours(benchmark, size_px):
             of(odometry.on_image(Image(stamp_ns=k * STEP_NS, frame_id="camera", grey=images[at])), VisualMotion),
         )
 
-    places = {}
+    positions = {}
     for _ in range(5):
         k, at, _ = one()
-        places[k] = at
+        positions[k] = at
 
     def timed():
         k, at, motion = one()
-        places[k] = at
+        positions[k] = at
         if motion is not None:
-            (R0, p0), (R1, p1) = pose(places[motion.from_ns // STEP_NS]), pose(at)
+            (R0, p0), (R1, p1) = pose(positions[motion.from_ns // STEP_NS]), pose(at)
             turn.append(math.degrees(np.linalg.norm(log_rotation(motion.R_from_to.T @ R0.T @ R1))))
             if motion.direction_from is not None and np.linalg.norm(p1 - p0) > 0.1:
                 direction.append(degrees_between(motion.direction_from, R0.T @ (p1 - p0)))
@@ -132,13 +142,13 @@ def test_ego(benchmark, size_px):
     images, k = flight(size_px, LOOKS_UP), iter(range(1, 100_000))
     ego = VisualLidarOdometry(lens=LENS.scaled(size_px / SIZE_PX), T_vehicle_camera=LOOKS_UP)
 
-    def place(number):
+    def position(number):
         there = (number - 1) % (2 * IMAGES - 2)
         return min(there, 2 * IMAGES - 2 - there)
 
     def ready():
         number = next(k)
-        at = place(number)
+        at = position(number)
         slices = [lidar_slice(number * STEP_NS, *pose(at), number, 5000)]
         return (slices, Image(stamp_ns=number * STEP_NS, frame_id="camera", grey=images[at])), {}
 

@@ -6,7 +6,7 @@
 The first flies a simulated drone in closed loop through the whole graph, on one thread: it times each record, from when
 it is fed until it is taken in, or until the datagram of the pose that it lets out is read at a peer's socket: a LiDAR
 packet's pose leaves with the next 20 ms of poses, so both count, and it is the computing alone. With GRD_FLIGHT, the
-recording of a live run (`grd run`), threads and their queues are in it: a pose is predicted to the newest stamp heard,
+recording of a live run (`grd run`), threads and their queues are in it: a pose is predicted to the newest stamp received,
 so it could go out when the first record of that time or later had arrived; its ODOMETRY frame did so at the time recorded.
 """
 
@@ -66,7 +66,7 @@ class ToAutopilot(Tap):
         return newest
 
 
-def told(name: str, took_ms: list[float]) -> None:
+def report(name: str, took_ms: list[float]) -> None:
     p50, p99 = np.percentile(took_ms, [50, 99])
     print(f"\n{name}: p50 {p50:.2f}, p99 {p99:.2f}, max {max(took_ms):.1f} ms, {len(took_ms)} times")  # noqa: T201
 
@@ -90,8 +90,8 @@ def test_a_packet_to_its_poses_datagram_by_computing() -> None:
                     pose_ms.append(1e-6 * (out - begin))
                 elif record.topic == "/lidar/packets":
                     packet_ms.append(1e-6 * (time.perf_counter_ns() - begin))
-    told("LiDAR packet taken in, one thread", packet_ms[len(packet_ms) // 10 :])  # the first are compiled meanwhile
-    told("record that lets a pose out -> datagram, one thread", pose_ms[len(pose_ms) // 10 :])
+    report("LiDAR packet taken in, one thread", packet_ms[len(packet_ms) // 10 :])  # the first are compiled meanwhile
+    report("record that releases a pose -> datagram, one thread", pose_ms[len(pose_ms) // 10 :])
 
 
 @pytest.mark.skipif(FLIGHT is None, reason="GRD_FLIGHT names no recording of a live run")
@@ -108,5 +108,5 @@ def test_a_packet_to_its_poses_datagram_in_a_live_run() -> None:
     firsts = [bisect_left(stamps, stamp) for stamp, _ in sent]
     after = [1e-6 * (out - packets[i][1]) for (_, out), i in zip(sent, firsts, strict=True) if i < len(packets)]
     assert after, f"{FLIGHT} holds no ODOMETRY that was sent"
-    told("first record of the pose's time -> datagram, live", after)
-    told("stamp of the pose -> datagram, live", [1e-6 * (out - stamp) for stamp, out in sent])
+    report("first record of the pose's time -> datagram, live", after)
+    report("stamp of the pose -> datagram, live", [1e-6 * (out - stamp) for stamp, out in sent])

@@ -1,4 +1,4 @@
-"""Recording: records per second through the writer (lossless) and the reader, beside the mcap package's own.
+"""Recording: records per second through the writer (lossless) and the reader, compared with the mcap package.
 
 Run by name: python -m pytest tests/benchmarks/bench_recording.py
 """

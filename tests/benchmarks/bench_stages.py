@@ -199,13 +199,13 @@ def test_detect_by_kernel_once_a_sweep(benchmark, street):
 
 
 @pytest.mark.benchmark(group="10 ms of packets: track")
-def test_track_by_hits_and_misses(benchmark, street):
+def test_track_by_returns_and_pass_throughs(benchmark, street):
     mount, slices, drone = street
     sweep = Sweep(mount=mount)
     pulses = [of_kind(swept_by(sweep, part), SweptPulses) for part in slices]
     stage = started(LikelihoodTrack(lost_after_s=60.0), drone, pulses[0][0].stamp_ns)
     each_slice(benchmark, lambda part: fed(stage, "on_pulses", part), pulses)
-    assert len(stage._known)
+    assert len(stage._hypotheses)
 
 
 @pytest.mark.benchmark(group="10 ms of packets: track")
@@ -218,7 +218,7 @@ def test_track_by_mean_shift(benchmark, street):
 
 
 @pytest.mark.benchmark(group="10 ms of packets: all three")
-def test_ours_together(benchmark, street):
+def test_product_stages_together(benchmark, street):
     mount, slices, drone = street
     sweep, detect, track = Sweep(mount=mount), EvidenceDetect(), LikelihoodTrack(lost_after_s=60.0)
     started(track, drone, slices[0][0].stamp_ns)
@@ -233,7 +233,7 @@ def test_ours_together(benchmark, street):
 
 
 @pytest.mark.benchmark(group="10 ms of packets: all three")
-def test_the_papers_together(benchmark, street):
+def test_paper_stages_together(benchmark, street):
     mount, slices, drone = street
     sweep, detect, track = Sweep(mount=mount), KernelDetect(), MeanShiftTrack(lost_after_s=60.0)
     started(track, drone, slices[0][0].stamp_ns)

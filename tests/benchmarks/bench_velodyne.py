@@ -1,4 +1,4 @@
-"""Our VLP-16 decoder beside velodyne-decoder, on the same 1000 real packets in one run. One round decodes them all.
+"""grd's VLP-16 decoder compared with velodyne-decoder, on the same 1000 real packets in one run. One round decodes them all.
 
     python -m pytest tests/benchmarks/bench_velodyne.py --benchmark-columns=min,median,iqr,rounds
 

@@ -35,7 +35,7 @@ YORK = Path(__file__).resolve().parents[3] / "shared" / "data" / "vp_york_urban"
 LU_PYTHON = os.environ.get("GRD_LU_VP_PYTHON", "")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-R_MOUNT_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks forward
+R_MOUNT_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that points forward
 LU = """
 import json, sys, time
 import cv2
@@ -48,7 +48,7 @@ out = []
 for path in paths:
     image = cv2.imread(path)
     seconds = []
-    for again in range(3):
+    for attempt in range(3):
         start = time.thread_time()
         found = detector.find_vps(image).tolist()
         seconds.append(time.thread_time() - start)
@@ -135,8 +135,8 @@ def ours_on_york(folders):
 def lu_on_york(folders):
     focal, column, row = york_camera()
     asked = json.dumps([focal, column, row, *(str(folder / f"{folder.name}.jpg") for folder in folders)])
-    told = subprocess.run([LU_PYTHON, "-c", LU], input=asked, capture_output=True, text=True, check=True)
-    return [(seconds, np.array(found)) for seconds, found in json.loads(told.stdout)]
+    result = subprocess.run([LU_PYTHON, "-c", LU], input=asked, capture_output=True, text=True, check=True)
+    return [(seconds, np.array(found)) for seconds, found in json.loads(result.stdout)]
 
 
 def errors_deg(found, truth):

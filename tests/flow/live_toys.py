@@ -101,7 +101,7 @@ class Clinging(Line):
 
 
 class Jam(Link):
-    """A sink that hangs at its first number until a test releases it."""
+    """A sink that blocks at its first number until a test releases it."""
 
     def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -207,7 +207,7 @@ class Memory(Tap):
 
 
 class Stuck(Tap):
-    """A viewer that hangs at the first message until a test releases it."""
+    """A viewer that blocks at the first message until a test releases it."""
 
     def __init__(self, settings: Settings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)

@@ -11,7 +11,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flow.message import Mat3, Message, PerPointU8, Points32, Shape, check_arrays, hash_into, message, port_name
+from flow.message import (
+    Mat3,
+    Message,
+    PerPointU8,
+    Points32,
+    Shape,
+    array_fields,
+    check_arrays,
+    hash_into,
+    message,
+    nested_fields,
+    port_name,
+)
 
 
 class Colour(enum.Enum):
@@ -80,6 +92,63 @@ def test_arrays_as_declared_pass():
 def test_arrays_of_another_type_or_shape_are_named(changes, text):
     with pytest.raises(TypeError, match=text):
         check_arrays(cloud(**changes))
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Flat:
+    ring: PerPointU8
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Deep:
+    flat: Flat
+    covariance_m2: Mat3
+
+
+@message
+class Nested(Message):
+    xyz_m: Points32
+    shape: Flat | Deep | None
+    deep: Deep | None = None
+
+
+def flat(n=4):
+    return Flat(ring=np.zeros(n, np.uint8))
+
+
+def deep(n=4, covariance_m2=None):
+    return Deep(flat=flat(n), covariance_m2=np.eye(3) if covariance_m2 is None else covariance_m2)
+
+
+def test_arrays_in_nested_dataclasses_belong_to_the_message():
+    assert nested_fields(Nested) == (("shape", (Flat, Deep)), ("deep", (Deep,)))
+    assert [name for name, _, _ in array_fields(Nested)] == [
+        "xyz_m",
+        "shape.ring",
+        "shape.covariance_m2",
+        "shape.flat.ring",
+        "deep.covariance_m2",
+        "deep.flat.ring",
+    ]
+    for shape in (None, flat(), deep()):
+        check_arrays(Nested(stamp_ns=0, xyz_m=np.zeros((4, 3), np.float32), shape=shape, deep=deep()))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"shape": flat(3)}, r"Nested\.shape\.ring: declared \(n,\) with n = 4, got \(3,\)"),
+        ({"shape": deep(3)}, r"Nested\.shape\.flat\.ring: declared \(n,\) with n = 4, got \(3,\)"),
+        ({"deep": deep(covariance_m2=np.eye(2))}, r"Nested\.deep\.covariance_m2: declared \(3, 3\) with 3 = 3"),
+        ({"deep": deep(covariance_m2=[1])}, r"Nested\.deep\.covariance_m2: declared float64 \(3, 3\), got int64"),
+        ({"deep": flat()}, r"Nested\.deep: declared Deep, got Flat"),
+        ({"shape": "none"}, r"Nested\.shape: declared Flat \| Deep, got str"),
+    ],
+)
+def test_wrong_arrays_in_nested_dataclasses_are_named(changes, text):
+    fields = {"xyz_m": np.zeros((4, 3), np.float32), "shape": None}
+    with pytest.raises(TypeError, match=text):
+        check_arrays(Nested(stamp_ns=0, **(fields | changes)))
 
 
 @pytest.mark.parametrize(

@@ -106,13 +106,13 @@ def test_a_links_own_error_reaches_the_user_as_it_is(tmp_path):
         replay(graph_of(tmp_path), [Record("/numbers", 1, 1, b"refuse")])
 
 
-def test_records_that_a_source_refuses_are_reported_and_the_replay_continues(tmp_path):
+def test_records_that_a_source_rejects_are_reported_and_the_replay_continues(tmp_path):
     report = replay(graph_of(tmp_path), numbers("refuse", 1, "refuse", "refuse", 2))
     assert report.messages["numbers.number"] == 2
     assert [str(i) for i in report.events] == ["numbers: no numbers here: is the counter plugged in? (3 times)"]
 
 
-def test_a_source_that_refuses_all_records_ends_a_replay(tmp_path, monkeypatch):
+def test_a_source_that_rejects_all_records_ends_a_replay(tmp_path, monkeypatch):
     monkeypatch.setattr("flow.replay.MAX_REFUSALS", 3)
     taken = []
     with pytest.raises(LinkError, match="no numbers here"):

@@ -61,7 +61,7 @@ def test_a_node_takes_checked_settings_or_their_values():
     assert Counter(topic="/count").topic == "/count"
 
 
-def test_values_next_to_settings_are_refused():
+def test_values_next_to_settings_are_rejected():
     with pytest.raises(TypeError, match="Gain takes settings or their values, not both"):
         Gain(GainSettings(), gain=3.0)
 

@@ -224,7 +224,7 @@ def test_a_process_that_is_killed_is_named_with_the_signal(tmp_path):
         replay_in_subprocesses(graph, given)
 
 
-def test_refused_records_are_reported_and_a_source_that_refuses_all_ends_the_replay(tmp_path, monkeypatch):
+def test_rejected_records_are_reported_and_a_source_that_rejects_all_ends_the_replay(tmp_path, monkeypatch):
     given = records(60, 1)
     some = [
         Record(r.topic, r.arrival_ns, r.stamp_ns, b"refuse" if i % 7 == 0 else r.data, i) for i, r in enumerate(given)

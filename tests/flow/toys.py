@@ -149,7 +149,7 @@ class Undeclared(Stage):
     """Gives a message that it does not declare."""
 
     def on_number(self, number: Number) -> Sum | None:
-        return Text(stamp_ns=0, words="surprise")  # type: ignore[return-value]
+        return Text(stamp_ns=0, words="wrong type")  # type: ignore[return-value]
 
 
 class Untyped(Stage):

@@ -1,7 +1,7 @@
-"""A small ray caster for the stages' tests: what a VLP-16 on its servo tells of balls, boxes, wires and drones.
+"""A small ray caster for the stages' tests: a VLP-16 on its servo, and balls, boxes, wires and drones.
 
-Beams are lines without width, the air is clear, nothing is noisy. It knows nothing of links/simulated: a mistake in one
-is not hidden by the same mistake in the other.
+Beams are lines without width, the air is clear, nothing is noisy. It is independent of links/simulated, so that an error
+in one is not hidden by the same error in the other.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ LASER = np.tile(np.arange(16), 24).astype(np.uint8)
 TURN_NS = 100 * MS  # 600 rpm
 SIDEWAYS = math.pi / 2  # a servo angle at which the fan of ON_ITS_SIDE holds the y and the z axis
 
-Way = Callable[[np.ndarray], np.ndarray]  # times (n,) [s] since the start -> places (n, 3) [m], vehicle frame
+Trajectory = Callable[[np.ndarray], np.ndarray]  # times (n,) [s] since the start -> positions (n, 3) [m], vehicle frame
 Servo = Callable[[np.ndarray], np.ndarray]  # times (n,) [s] -> angles (n,) [rad]
 
 
 class Thing(Protocol):
-    """Anything a beam may meet."""
+    """Any object that a beam can hit."""
 
     def range_m(self, origin_m: np.ndarray, direction: np.ndarray, t_s: np.ndarray) -> np.ndarray:
         """Range (n,) at which beams (n, 3) from origins (n, 3) meet it; inf where they do not."""
         ...
 
 
-def still(x: float, y: float, z: float) -> Way:
+def still(x: float, y: float, z: float) -> Trajectory:
     return lambda t_s: np.broadcast_to([x, y, z], (len(t_s), 3))
 
 
-def flying(start_m, velocity_mps) -> Way:
+def flying(start_m, velocity_mps) -> Trajectory:
     return lambda t_s: np.asarray(start_m) + np.outer(t_s, velocity_mps)
 
 
 @dataclass(frozen=True)
 class Ball:
-    way: Way
+    trajectory: Trajectory
     radius_m: float
 
     def range_m(self, origin_m, direction, t_s):
-        centre = self.way(t_s) - origin_m
+        centre = self.trajectory(t_s) - origin_m
         along = np.einsum("ij,ij->i", direction, centre)
         below = along**2 - (np.einsum("ij,ij->i", centre, centre) - self.radius_m**2)
         return np.where((below > 0) & (along > 0), along - np.sqrt(np.maximum(below, 0.0)), np.inf)
@@ -96,7 +96,7 @@ class Wire:
 class Drone:
     """Mostly air: a pulse that passes its centre at rho returns with 0.9 exp(-rho^2 / (2 (span / 5)^2)), somewhere in it."""
 
-    way: Way
+    trajectory: Trajectory
     span_m: float = 0.5
     seed: int = 0
     _rng: np.random.Generator = field(init=False)
@@ -105,7 +105,7 @@ class Drone:
         self._rng = np.random.default_rng(self.seed)
 
     def range_m(self, origin_m, direction, t_s):
-        centre = self.way(t_s) - origin_m
+        centre = self.trajectory(t_s) - origin_m
         along = np.einsum("ij,ij->i", direction, centre)
         rho = np.linalg.norm(np.cross(direction, centre), axis=1)
         inside = (rho < 0.5 * self.span_m) & (along > 0)
@@ -116,7 +116,7 @@ class Drone:
 
 @dataclass(frozen=True)
 class During:
-    """A thing that is there between two times only."""
+    """A thing that is present between two times only."""
 
     thing: Thing
     from_s: float
@@ -193,7 +193,7 @@ def pulses_seen(
     from_s: float = 0.0,
     mount: LidarMount = ON_ITS_SIDE,
 ) -> Iterator[SweptPulses]:
-    """The slices that Sweep makes of it, placed without error."""
+    """The slices of Sweep, placed without error."""
     for stamp_ns, range_m, origin_m, direction in packets_seen(things, servo_rad, from_s, to_s, mount):
         middle_s = (stamp_ns[192:193] - START_NS) * 1e-9
         yield SweptPulses(
@@ -227,7 +227,7 @@ def together(slices: Iterator[SweptPulses], packets: int) -> Iterator[SweptPulse
 def seen(
     things: Sequence[Thing], servo_rad: Servo, seconds: float, mount: LidarMount = ON_ITS_SIDE
 ) -> Iterator[LidarFirings | ServoState]:
-    """What the VLP-16 at 600 rpm and the servo at 100 Hz tell, in order of time."""
+    """Packets of the VLP-16 at 600 rpm and servo states at 100 Hz, in order of time."""
     next_servo_ns = START_NS
     for stamp_ns, range_m, _, _ in packets_seen(things, servo_rad, 0.0, seconds, mount):
         while next_servo_ns <= stamp_ns[0]:

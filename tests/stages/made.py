@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stages.geometry.frames import LidarMount, Pose
-from stages.messages import DepthImage, Detections, LidarFirings, ServoState, SweptPoints
+from stages.messages import DepthImage, Detections, KernelScores, LidarFirings, ServoState, SweptPoints
 from stages.sweep.depth_image import focal_length_px, unproject
 
 MS = 1_000_000
@@ -74,16 +74,14 @@ def depth_image(depth_m, fov_deg=120.0, origin=(0.0, 0.0, 0.0)) -> DepthImage:
     )
 
 
-def detections(*xyz_accepted, stamp_ns=START_NS, refused=()) -> Detections:
-    xyz = np.array([*xyz_accepted, *refused], dtype=np.float64).reshape(-1, 3)
+def detections(*xyz_accepted, stamp_ns=START_NS, rejected=()) -> Detections:
+    xyz = np.array([*xyz_accepted, *rejected], dtype=np.float64).reshape(-1, 3)
     n = len(xyz)
     accepted = np.arange(n) < len(xyz_accepted)
     return Detections(
         stamp_ns=stamp_ns,
         xyz_vehicle_m=xyz,
-        score=np.zeros(n),
-        e_inner=np.zeros(n),
-        e_outer=np.zeros(n),
+        evidence=KernelScores(e_inner=np.zeros(n), e_outer=np.zeros(n)),
         accepted=accepted,
         reasons=("made",) * n,
         summary="made",

@@ -1,4 +1,4 @@
-"""A textured room and what cameras and LiDAR see in it: pictures, rays of points, swept points."""
+"""A textured room and the outputs of cameras and LiDAR in it: images, rays of points, swept points."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def walls() -> np.ndarray:
 
 @functools.cache
 def pixel_rays(size_px: int = SIZE_PX) -> np.ndarray:
-    """Rays (n, 3) of a square picture by rows; its lens is LENS enlarged."""
+    """Rays (n, 3) of a square image by rows; its lens is LENS enlarged."""
     column, row = np.meshgrid(np.arange(size_px, dtype=float), np.arange(size_px, dtype=float))
     return LENS.scaled(size_px / SIZE_PX).unproject(np.column_stack([column.ravel(), row.ravel()]))
 
@@ -47,8 +47,8 @@ def ranges(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.nd
     return away[row, axis], 2 * axis + (direction[row, axis] > 0)
 
 
-def picture(R_world_camera: np.ndarray, p_world_m: np.ndarray, seed: int = 0, size_px: int = SIZE_PX) -> np.ndarray:
-    """What the camera sees, with a little sensor noise."""
+def grey_image(R_world_camera: np.ndarray, p_world_m: np.ndarray, seed: int = 0, size_px: int = SIZE_PX) -> np.ndarray:
+    """The image of the camera, with a little sensor noise."""
     rays = pixel_rays(size_px)
     inside = np.isfinite(rays[:, 0])
     direction = rays[inside] @ R_world_camera.T
@@ -71,9 +71,9 @@ def picture(R_world_camera: np.ndarray, p_world_m: np.ndarray, seed: int = 0, si
 def image(
     stamp_ns: int, R_world_carrier: np.ndarray, p_world_m: np.ndarray, mount: Pose, name: str = "camera"
 ) -> Image:
-    """The picture of a camera mounted at its camera_mount's origin."""
+    """The image of a camera mounted at its camera_mount's origin."""
     R = R_world_carrier @ mount.matrix()[:3, :3]
-    return Image(stamp_ns=stamp_ns, frame_id=name, grey=picture(R, np.asarray(p_world_m, float), stamp_ns % 2**31))
+    return Image(stamp_ns=stamp_ns, frame_id=name, grey=grey_image(R, np.asarray(p_world_m, float), stamp_ns % 2**31))
 
 
 def lidar_slice(
@@ -134,7 +134,7 @@ def pinhole(focal_px: float, centre_px: tuple[float, float], max_off_axis_deg: f
 
 
 def of(messages, kind):
-    """The one message of a kind among those told, or None."""
+    """The one message of a type among the outputs, or None."""
     found = [m for m in messages if isinstance(m, kind)]
     assert len(found) < 2
     return found[0] if found else None

@@ -34,7 +34,7 @@ PATH_STEP = 5  # samples: the vehicle's path every 0.25 s, as `image_cache.scena
 ELEVATIONS_RAD = np.radians((45.0, 60.0, 75.0))
 MUST_SEE = 0.95  # fraction of the time with a line of sight
 HIDDEN_S = 3.0
-FARTHEST_M = 75.0  # limit of the vehicle's path: half way to the end of a scene
+FARTHEST_M = 75.0  # limit of the vehicle's path: half the distance to the end of a scene
 FAR_M = 105.0  # beyond the LiDAR's range
 SEPARATION_DEG = (40.0, 60.0)  # between two drones at the start, which is their minimum
 

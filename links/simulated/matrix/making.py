@@ -1,7 +1,7 @@
 """Makes the recordings of the scenario matrix and, in closed loop, the runs that belong to them.
 
-Existing recordings and runs are kept if they are complete and made in the same way. A recording gets its name when it
-is complete, a run gets its summary last; whatever was interrupted is made again.
+Existing recordings and runs are kept if they are complete and made with the same settings. A recording gets its name
+when it is complete, a run gets its summary last; interrupted ones are repeated.
 
 Source: ours.
 """

@@ -19,6 +19,7 @@ from pathlib import Path
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
+from flow.counters import Counters
 from flow.graph import Graph
 from flow.link import LinkError, Record, Tap
 from flow.message import Message
@@ -89,7 +90,9 @@ class ClosedLoop:
     def finish(self) -> RunReport:
         """Let the stages emit what they hold."""
         report = self._replay.finish()
-        report.counters[self._servo_name].pop(NOT_LIVE, None)  # these commands went to the simulated servo
+        counters = report.counters[self._servo_name]
+        totals = {name: count for name, count in counters.totals.items() if name != NOT_LIVE}
+        report.counters[self._servo_name] = Counters(totals, counters.rejected)  # those went to the simulated servo
         return report
 
     @property

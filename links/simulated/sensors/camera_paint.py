@@ -48,10 +48,10 @@ MATERIALS: dict[str, tuple[int, tuple[float, float, float], tuple[float, float, 
 _OBJECT_ENDS = ("roof", "rubber")  # a run of these faces ends an object in a mesh: a building, a car
 _NOISE = noise_tile(np.random.default_rng([20, 1]), falloff=1.1).astype(np.float32)
 
-Look = tuple[NDArray[np.int64], Array32, Array32]
+MaterialTable = tuple[NDArray[np.int64], Array32, Array32]
 
 
-def _material_table(surfaces: dict[str, tuple[float, float]]) -> Look:
+def _material_table(surfaces: dict[str, tuple[float, float]]) -> MaterialTable:
     """Rows of texture, base and second colour in the order of `surfaces`; a surface without a material is grey."""
     kinds, colours, others = [], [], []
     for name, (diffuse, _) in surfaces.items():

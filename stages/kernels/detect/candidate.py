@@ -1,4 +1,4 @@
-"""Compiled functions that rate from one tally whether something stands next to a candidate.
+"""Compiled functions that compute from sector counts whether an object is next to a candidate.
 
 Source: see `stages/detect/candidate.py`.
 """
@@ -9,24 +9,25 @@ from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.detect.isolation import FARTHER_0, FREE_0, OCCUPIED_0, SECTORS
 
-OPEN_LOOKS = 3  # a sector free in so many scan passes has no support: a return behind it is another object
-SIGMA_M = 0.15  # of a sighting
+# A sector that is free in this many scan passes has no support: a return farther out is another object.
+OPEN_PASSES = 3
+SIGMA_M = 0.15  # of an observation
 ACCELERATION_MPS2 = 4.0
 
 
 @compiled
-def what_stands_beside(around: Array64, free: Array64) -> tuple[float, bool]:
-    """How sure it is that something stands beside it, by one look (TALLY,), and whether half of the sectors were seen.
+def neighbour_score(counts: Array64, free: Array64) -> tuple[float, bool]:
+    """(score in [0, 1] that an object is next to it, whether half of the sectors are free) by one scan pass (TALLY,).
 
-    Adds the sectors that are free in this look to free (SECTORS,).
+    Adds the sectors that are free in this scan pass to free (SECTORS,).
     """
-    seen, taken, farther, behind = 0, False, False, False
+    seen, occupied, farther, behind = 0, False, False, False
     for k in range(SECTORS):
-        free[k] += around[FREE_0 + k] >= 2
-        seen += around[FREE_0 + k] >= 1
-        taken |= around[OCCUPIED_0 + k] >= 1
-        if around[FARTHER_0 + k] >= 1 and free[k] < OPEN_LOOKS:
+        free[k] += counts[FREE_0 + k] >= 2
+        seen += counts[FREE_0 + k] >= 1
+        occupied |= counts[OCCUPIED_0 + k] >= 1
+        if counts[FARTHER_0 + k] >= 1 and free[k] < OPEN_PASSES:
             farther = True
-            behind |= around[FREE_0 + k] < 1
-    standing = 1.0 if taken else (0.5 if behind else (0.15 if farther else 0.0))
-    return standing, seen >= SECTORS // 2
+            behind |= counts[FREE_0 + k] < 1
+    score = 1.0 if occupied else (0.5 if behind else (0.15 if farther else 0.0))
+    return score, seen >= SECTORS // 2

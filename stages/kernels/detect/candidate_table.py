@@ -1,4 +1,4 @@
-"""Compiled functions that associate sightings and slices of pulses with candidates.
+"""Compiled functions that associate observations and slices of pulses with candidates.
 
 Source: see `stages/detect/candidate_table.py`.
 """
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.detect.candidate import ACCELERATION_MPS2, SIGMA_M
-from stages.kernels.detect.isolation import INNER_HITS, INNER_PASSES, TALLY, look_around
+from stages.kernels.detect.isolation import INNER_HITS, INNER_PASSES, TALLY, count_sectors
 
-FURTHEST_STEP_M = 2.5  # largest distance of a sighting from the prediction
-MOST_COST = 9.0  # of a sighting: squared sigmas
-SEEN_LATELY_NS = 1_500_000_000  # beyond this age a miss is not counted
+FURTHEST_STEP_M = 2.5  # largest distance of an observation from the prediction
+MAX_COST = 9.0  # of an observation: squared sigmas
+RECENT_NS = 1_500_000_000  # pass-throughs are not counted for candidates observed longer ago
 FAN_COS = 0.93  # cosine of half the angle that a slice covers
 X, Y, Z, VX, VY, VZ, P_X, P_XV, P_V = range(9)  # [m], [m/s] in frame map, and their variances
 STAMP, SEEN = 0, 1  # [ns]
-NOTHING, NEAR, ELSEWHERE = 0, 1, 2  # of a candidate: nothing to say; pulses near its middle; the fan is elsewhere
+NO_PULSE, NEAR, OUTSIDE = 0, 1, 2  # status of a candidate: no pulse near its middle; pulses near it; outside the fan
 
 
 @compiled
-def first_within(places_m: Array64, xyz_m: Array64, reach_m: float) -> int:
+def first_within(positions_m: Array64, xyz_m: Array64, reach_m: float) -> int:
     """Index of the first of positions (n, 3) within reach_m of xyz_m (3,); -1: none."""
-    for k in range(places_m.shape[0]):
-        x, y, z = places_m[k, 0] - xyz_m[0], places_m[k, 1] - xyz_m[1], places_m[k, 2] - xyz_m[2]
+    for k in range(positions_m.shape[0]):
+        x, y, z = positions_m[k, 0] - xyz_m[0], positions_m[k, 1] - xyz_m[1], positions_m[k, 2] - xyz_m[2]
         if math.sqrt(x * x + y * y + z * z) < reach_m:
             return k
     return -1
@@ -46,19 +46,19 @@ def predicted(state: Array64, dt_s: float) -> tuple[float, float, float, float]:
 def nearest_row(
     state: Array64,
     ns: NDArray[np.int64],
-    joined: NDArray[np.bool_],
+    reacquired: NDArray[np.bool_],
     rows: int,
-    asked: bool,
+    select_reacquired: bool,
     stamp_ns: int,
     xyz_m: Array64,
 ) -> int:
-    """Row of the candidate, joined or not as asked, whose prediction is nearest to a sighting, in sigmas; -1: of none.
+    """Row of the candidate whose prediction is nearest to an observation, in sigmas; -1: none.
 
-    Of the table the first `rows` count.
+    Only the first `rows` rows count, of reacquired candidates or of the others.
     """
-    best, least = -1, MOST_COST
+    best, least = -1, MAX_COST
     for row in range(rows):
-        if joined[row] != asked or stamp_ns < ns[row, STAMP]:
+        if reacquired[row] != select_reacquired or stamp_ns < ns[row, STAMP]:
             continue
         x, y, z, variance = predicted(state[row], (stamp_ns - ns[row, STAMP]) * 1e-9)
         away2 = (xyz_m[0] - x) ** 2 + (xyz_m[1] - y) ** 2 + (xyz_m[2] - z) ** 2
@@ -69,10 +69,10 @@ def nearest_row(
 
 
 @compiled
-def look_at_all(
+def count_pulses(
     state: Array64,
     ns: NDArray[np.int64],
-    told: NDArray[np.bool_],
+    promising: NDArray[np.bool_],
     rows: int,
     now_ns: int,
     R: Array64,
@@ -85,16 +85,16 @@ def look_at_all(
     most_variance: float,
     found: NDArray[np.int64],
 ) -> int:
-    """Fill found (rows, 3) with NOTHING, NEAR or ELSEWHERE, and the pulses of a slice that hit and passed each middle.
+    """Fill found (rows, 3) with status, returns and pass-throughs of a slice's pulses at each candidate's middle.
 
-    Returns of how many there is something to say. R, t are T_map_vehicle of the slice, axis (3,) its mean direction,
+    Returns the number of rows that are not NO_PULSE. R, t are T_map_vehicle of the slice, axis (3,) its mean direction,
     direction (k, 3) and range (k,) its pulses.
     """
     tally, away, centre = np.zeros(TALLY, dtype=np.int64), np.empty(3), np.empty(3)
-    said = 0
+    count = 0
     for row in range(rows):
         found[row] = 0
-        if not told[row] or now_ns - ns[row, SEEN] > SEEN_LATELY_NS:
+        if not promising[row] or now_ns - ns[row, SEEN] > RECENT_NS:
             continue
         away[0], away[1], away[2], variance = predicted(state[row], (now_ns - ns[row, STAMP]) * 1e-9)
         if variance > most_variance:
@@ -109,10 +109,10 @@ def look_at_all(
         length = math.sqrt(length2)
         if length > 0.5 and ahead > length * FAN_COS:
             tally[INNER_HITS] = tally[INNER_PASSES] = 0
-            look_around(direction, range_m, origin_m, centre, disc_m, math.inf, math.inf, disc_m, 1.0, tally)
+            count_sectors(direction, range_m, origin_m, centre, disc_m, math.inf, math.inf, disc_m, 1.0, tally)
             found[row, 1], found[row, 2] = tally[INNER_HITS], tally[INNER_PASSES]
-            found[row, 0] = NEAR if tally[INNER_HITS] + tally[INNER_PASSES] > 0 else NOTHING
+            found[row, 0] = NEAR if tally[INNER_HITS] + tally[INNER_PASSES] > 0 else NO_PULSE
         else:
-            found[row, 0] = ELSEWHERE
-        said += found[row, 0] != NOTHING
-    return said
+            found[row, 0] = OUTSIDE
+        count += found[row, 0] != NO_PULSE
+    return count

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-# What an open chord remembers, a row per laser.
+# State of an open chord, a row per laser.
 (
     HITS,  # 0: no chord is open
     SUM_X, SUM_Y, SUM_Z,  # of its points [m]
@@ -25,21 +25,22 @@ from stages.kernels.compiled import compiled
     MISSED,  # pulses since the last hit
     HOLES,  # pulses between hits that were no hits
     FREE_BEFORE,  # 1: the pulse before the first went farther or returned nothing
-    TOLD,  # 1: too long, already told
+    LONG_REPORTED,  # 1: too long, already reported
     BEFORE,  # range of the laser's last pulse [m]; inf: nothing, NaN: not known
-    U1, U2, U3, U4,  # sums of powers of u, the way across the line of sight since the first hit [m]
+    U1, U2, U3, U4,  # sums of powers of u, the displacement across the line of sight since the first hit [m]
     R1, RU1, RU2, R2,  # and with r, the range over the first hit's [m]
     FIRST_RANGE,
     MEMORY,
 ) = range(29)  # fmt: skip
-# What is told of a chord: the columns of the result.
+# Columns of the result.
 X, Y, Z, RANGE, LENGTH, DEPTH, COUNT, GAPS, SHADE, FREE, LASER, LONG, BULGE, ROUGH = range(14)
-FIRST, LAST, NEWEST = range(3)  # times a laser remembers: its open chord's first and last hit, its newest pulse
-GAP_NS = 150_000  # a laser fires each 55.3 us (VLP-16); after a longer pause packets are lost, and it looks elsewhere
+FIRST, LAST, NEWEST = range(3)  # times per laser: its open chord's first and last hit, its newest pulse
+# A laser fires each 55.3 us (VLP-16). After a longer pause packets are lost, and it points in another direction.
+GAP_NS = 150_000
 
 
 @compiled
-def _tell(memory: Array64, free_after: bool, laser: int, long: bool, row: Array64) -> None:
+def _write_chord(memory: Array64, free_after: bool, laser: int, long: bool, row: Array64) -> None:
     hits = memory[HITS]
     for axis in range(3):
         row[X + axis] = memory[SUM_X + axis] / hits
@@ -63,7 +64,7 @@ def _tell(memory: Array64, free_after: bool, laser: int, long: bool, row: Array6
 def _profile(m: Array64) -> tuple[float, float]:
     """(b, s) of the parabola r = a_0 + a_1 u + b u^2 through a chord's hits and their distance from it, RMS [m].
 
-    A ball of radius rho bulges by b = 1 / (2 rho). NaN with fewer than 4 hits.
+    A ball of radius rho has b = 1 / (2 rho). NaN with fewer than 4 hits.
     """
     n = m[HITS]
     if n < 4.0:
@@ -90,7 +91,7 @@ def _begin(m: Array64, r: float, shade: float) -> None:
 
 @compiled
 def _add_to_profile(m: Array64, r: float, u2: float) -> None:
-    """One more hit, u^2 [m^2] across from the first."""
+    """Add a hit to the sums, u^2 [m^2] across from the first."""
     u, dr = math.sqrt(u2), r - m[FIRST_RANGE]
     m[U1] += u
     m[U2] += u2
@@ -118,8 +119,8 @@ def find_chords(
     rows: Array64,
     row_ns: NDArray[np.int64],
 ) -> int:
-    """Go on with each laser's chord, pulse by pulse; fill rows and times of those told, and return how many."""
-    told = 0
+    """Continue each laser's chord, pulse by pulse; fill rows and times of the completed chords, return their count."""
+    count = 0
     point, before = np.empty(3), np.empty(3)
     for i in range(range_m.size):
         k = laser[i]
@@ -128,10 +129,10 @@ def find_chords(
         seen = r > 0.0
         ended = False
         if stamp_ns[i] - times[k, NEWEST] > GAP_NS:
-            if m[HITS] > 0.0:  # how it went on nobody knows
-                _tell(m, m[MISSED] >= 2.0, k, m[TOLD] > 0.0, rows[told])
-                row_ns[told, 0], row_ns[told, 1] = times[k, FIRST], times[k, LAST]
-                told += 1
+            if m[HITS] > 0.0:  # its continuation is unknown
+                _write_chord(m, m[MISSED] >= 2.0, k, m[LONG_REPORTED] > 0.0, rows[count])
+                row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]
+                count += 1
                 m[HITS] = 0.0
             m[BEFORE] = math.nan
         times[k, NEWEST] = stamp_ns[i]
@@ -153,18 +154,18 @@ def find_chords(
                 m[LEAST_RANGE] = min(m[LEAST_RANGE], r)
                 m[MOST_RANGE] = max(m[MOST_RANGE], r)
                 times[k, LAST] = stamp_ns[i]
-                if across2 > longest_m * longest_m:  # a wall: told piece by piece
-                    _tell(m, False, k, True, rows[told])
-                    row_ns[told, 0], row_ns[told, 1] = times[k, FIRST], times[k, LAST]
-                    told += 1
-                    m[TOLD] = 1.0
+                if across2 > longest_m * longest_m:  # a wall: reported in parts
+                    _write_chord(m, False, k, True, rows[count])
+                    row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]
+                    count += 1
+                    m[LONG_REPORTED] = 1.0
                     for axis in range(3):
                         m[SUM_X + axis] = point[axis]
                         m[FIRST_X + axis] = point[axis]
                     _begin(m, r, reflectivity[i])
                     times[k, FIRST] = stamp_ns[i]
-            elif seen and r < m[LAST_RANGE]:  # something nearer hides how it goes on, unless it had ended before
-                _tell(m, m[MISSED] >= 2.0, k, m[TOLD] > 0.0, rows[told])
+            elif seen and r < m[LAST_RANGE]:  # something nearer hides its continuation, unless it had ended before
+                _write_chord(m, m[MISSED] >= 2.0, k, m[LONG_REPORTED] > 0.0, rows[count])
                 ended = True
             else:
                 m[MISSED] += 1.0
@@ -174,11 +175,11 @@ def find_chords(
                     before[axis] = m[LAST_X + axis] - origin_m[axis]
                     away2 += (m[LAST_RANGE] * direction[i, axis] - before[axis]) ** 2
                 if m[MISSED] >= 2.0 and away2 > hole_m * hole_m:
-                    _tell(m, True, k, m[TOLD] > 0.0, rows[told])
+                    _write_chord(m, True, k, m[LONG_REPORTED] > 0.0, rows[count])
                     ended = True
             if ended:
-                row_ns[told, 0], row_ns[told, 1] = times[k, FIRST], times[k, LAST]
-                told += 1
+                row_ns[count, 0], row_ns[count, 1] = times[k, FIRST], times[k, LAST]
+                count += 1
                 m[HITS] = 0.0
         if m[HITS] == 0.0 and seen:
             for axis in range(3):
@@ -187,8 +188,8 @@ def find_chords(
                 m[FIRST_X + axis] = point[axis]
                 m[LAST_X + axis] = point[axis]
             _begin(m, r, reflectivity[i])
-            m[MISSED], m[TOLD] = 0.0, 0.0
+            m[MISSED], m[LONG_REPORTED] = 0.0, 0.0
             m[FREE_BEFORE] = 1.0 if m[BEFORE] > r + jump_m else 0.0
             times[k, FIRST] = times[k, LAST] = stamp_ns[i]
         m[BEFORE] = r if seen else math.inf
-    return told
+    return count

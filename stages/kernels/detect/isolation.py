@@ -23,7 +23,7 @@ MAP_SIZE = 1 << BITS
 
 
 @compiled
-def look_around(
+def count_sectors(
     direction: NDArray[np.float32],
     range_m: NDArray[np.float32],
     origin_m: Array64,
@@ -83,7 +83,9 @@ def _cell(x: int, y: int, z: int) -> int:
 
 
 @compiled
-def remember(points_m: Array64, cell_m: float, stamp_ns: int, key: NDArray[np.int64], when: NDArray[np.int64]) -> None:
+def mark_cells(
+    points_m: Array64, cell_m: float, stamp_ns: int, key: NDArray[np.int64], when: NDArray[np.int64]
+) -> None:
     """Mark the cells of points (n, 3); a hash collision overwrites the older cell."""
     for i in range(points_m.shape[0]):
         x, y, z = (
@@ -91,13 +93,13 @@ def remember(points_m: Array64, cell_m: float, stamp_ns: int, key: NDArray[np.in
             math.floor(points_m[i, 1] / cell_m),
             math.floor(points_m[i, 2] / cell_m),
         )
-        place = _cell(x, y, z)
-        key[place] = (x + 4096) | ((y + 4096) << 16) | ((z + 4096) << 32)
-        when[place] = stamp_ns
+        cell = _cell(x, y, z)
+        key[cell] = (x + 4096) | ((y + 4096) << 16) | ((z + 4096) << 32)
+        when[cell] = stamp_ns
 
 
 @compiled
-def nearest_remembered(
+def nearest_marked(
     centre_m: Array64,
     cell_m: float,
     least_m: float,
@@ -117,8 +119,8 @@ def nearest_remembered(
     for x in range(x0 - reach, x0 + reach + 1):
         for y in range(y0 - reach, y0 + reach + 1):
             for z in range(z0 - reach, z0 + reach + 1):
-                place = _cell(x, y, z)
-                if when[place] < since_ns or key[place] != (x + 4096) | ((y + 4096) << 16) | ((z + 4096) << 32):
+                cell = _cell(x, y, z)
+                if when[cell] < since_ns or key[cell] != (x + 4096) | ((y + 4096) << 16) | ((z + 4096) << 32):
                     continue
                 away = math.sqrt(
                     ((x + 0.5) * cell_m - centre_m[0]) ** 2

@@ -17,7 +17,7 @@ INFINITY_BITS = 0x7F80_0000  # of a float32; those of finite numbers from 0 up a
 
 
 @compiled
-def lowest_places(bits: NDArray[np.uint32], few: int) -> NDArray[np.int64]:
+def lowest_indices(bits: NDArray[np.uint32], few: int) -> NDArray[np.int64]:
     """Indices of the `few` lowest scores, and all others with the same upper 16 bits. NaN is no score.
 
     A histogram instead of a partition: its time does not depend on the scores.
@@ -32,13 +32,13 @@ def lowest_places(bits: NDArray[np.uint32], few: int) -> NDArray[np.int64]:
         limit = upper
         if total >= few:
             break
-    place = np.empty(total, dtype=np.int64)
+    pixels = np.empty(total, dtype=np.int64)
     n = 0
     for i in range(bits.size):
         if bits[i] < INFINITY_BITS and bits[i] >> 16 <= limit:
-            place[n] = i
+            pixels[n] = i
             n += 1
-    return place
+    return pixels
 
 
 @compiled
@@ -49,22 +49,26 @@ def minima(
     same_m: float,
     at_most: int,
 ) -> NDArray[np.int64]:
+    """(row, column) (n, 2) of the local minima among the pixels in `order`, lowest score first, at most `at_most`.
+
+    A minimum suppresses the pixels within radius_px whose depth differs by at most same_m.
+    """
     height, width = depth_m.shape
-    silent = np.zeros((height, width), dtype=np.bool_)
+    suppressed = np.zeros((height, width), dtype=np.bool_)
     found = np.empty((at_most, 2), dtype=np.int64)
     n = 0
     for i in range(order.size):
         if n == at_most:
             break
         row, column = order[i] // width, order[i] % width
-        if silent[row, column]:
+        if suppressed[row, column]:
             continue
         found[n, 0], found[n, 1] = row, column
         n += 1
         for v in range(max(0, row - radius_px), min(height, row + radius_px + 1)):
             for u in range(max(0, column - radius_px), min(width, column + radius_px + 1)):
                 if abs(depth_m[v, u] - depth_m[row, column]) <= same_m:
-                    silent[v, u] = True
+                    suppressed[v, u] = True
     return found[:n]
 
 
@@ -82,7 +86,7 @@ def distance_m(depth_m: NDArray[np.float32], focal_px: float, centre_m: Array64,
 def box_px(shape: tuple[int, int], focal_px: float, centre_m: Array64, far_m: float) -> tuple[int, int, int]:
     """(row, column, reach): points within far_m of centre_m project within `reach` pixels of it.
 
-    |x / d - x_c / d_c| <= far (1 + |x_c| / d_c) / d. Points nearer than half the centre's depth are not looked for.
+    |x / d - x_c / d_c| <= far (1 + |x_c| / d_c) / d. Points nearer than half the centre's depth are ignored.
     """
     height, width = shape
     x, y, depth = centre_m
@@ -99,31 +103,31 @@ def own_pixels(depth_m: NDArray[np.float32], focal_px: float, centre_m: Array64,
     row, column, reach = box_px(depth_m.shape, focal_px, centre_m, near_m)
     top, bottom = max(0, row - reach), min(height, row + reach + 1)
     left, right = max(0, column - reach), min(width, column + reach + 1)
-    place = np.empty(((bottom - top) * (right - left), 2), dtype=np.int64)
+    pixels = np.empty(((bottom - top) * (right - left), 2), dtype=np.int64)
     n = 0
     for v in range(top, bottom):
         for u in range(left, right):
             if depth_m[v, u] > 0.0 and distance_m(depth_m, focal_px, centre_m, v, u) <= near_m:
-                place[n, 0], place[n, 1] = v, u
+                pixels[n, 0], pixels[n, 1] = v, u
                 n += 1
-    return place[:n]
+    return pixels[:n]
 
 
 @compiled
-def middle_m(depth_m: NDArray[np.float32], focal_px: float, place: NDArray[np.int64]) -> Array64:
+def middle_m(depth_m: NDArray[np.float32], focal_px: float, pixels: NDArray[np.int64]) -> Array64:
     """Mean (3,) of the points of pixels (n, 2), n > 0, counted from the image's origin."""
     height, width = depth_m.shape
     total = np.zeros(3)
-    for v, u in place:
+    for v, u in pixels:
         d = depth_m[v, u]
         total[0] += (u + 0.5 - 0.5 * width) / focal_px * d
         total[1] += (v + 0.5 - 0.5 * height) / focal_px * d
         total[2] += d
-    return total / len(place)
+    return total / len(pixels)
 
 
 @compiled
-def company_pixels(
+def neighbour_pixels(
     depth_m: NDArray[np.float32], focal_px: float, centre_m: Array64, near_m: float, far_m: float, enough: int
 ) -> int:
     """Filled pixels whose points lie between near_m and far_m from centre_m; counting ends at `enough`."""

@@ -28,10 +28,10 @@ LOOSE, LOOSE_MPS, LOOSE_MPS2 = 0.1, 2.0, 0.3  # assumed share of balloons that d
 
 @compiled
 def weigh(
-    t_s: Array64, x_m: Array64, told_m: Array64, sigma_m: float, level_known: bool
+    t_s: Array64, x_m: Array64, odometry_m: Array64, sigma_m: float, level_known: bool
 ) -> tuple[float, float, float, float, float]:
-    """What Heard holds but for its way: a path x (n, 3) at times t (n,) against what the drone told of itself."""
-    x, d = x_m.copy(), told_m.copy()
+    """Values of MotionLogRatios for a path x (n, 3) at times t (n,), compared with the drone's odometry (n, 3)."""
+    x, d = x_m.copy(), odometry_m.copy()
     for axis in range(3):
         x[:, axis] -= x[:, axis].mean()
         d[:, axis] -= d[:, axis].mean()
@@ -42,7 +42,7 @@ def weigh(
     upright = model_of(t_s, sigma_m, DRIFT_UP_MPS, 0.0)
     drone = log_p(upright, t_s, up - d[:, 2])
     off2, coordinates = misfit(upright, t_s, up - d[:, 2]), 1.0
-    still, long = log_p(upright, t_s, up), log_p(as_long, t_s, up)  # what stands drifts alike
+    still, long = log_p(upright, t_s, up), log_p(as_long, t_s, up)  # a static object has the same drift
     sliding = followed = still
     bird = log_p(model_of(t_s, sigma_m, BIRD[2], BIRD[3]), t_s, up)
     sway_mps = SWAY_M / max(t_s.max() - t_s.min(), 1e-3)

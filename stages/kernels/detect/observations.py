@@ -31,9 +31,9 @@ def kinds_of(
     clear_m: float,
     kinds: NDArray[np.int64],
 ) -> tuple[int, int, int]:
-    """What chords (n, COLUMNS) are of: BIG, SMALL and free at both ends, HIDDEN: small, not free, or NONE of these.
+    """Classify chords (n, COLUMNS): BIG, SMALL (free at both ends), HIDDEN (small, not free at both ends), or NONE.
 
-    Fills kinds (n,); returns how many are BIG, SMALL, HIDDEN.
+    Fills kinds (n,); returns the numbers of BIG, SMALL and HIDDEN.
     """
     kinds[:] = NONE
     for i in range(rows.shape[0]):
@@ -50,36 +50,36 @@ def kinds_of(
 
 
 @compiled
-def places_of_kind(rows: Array64, kinds: NDArray[np.int64], kind: int, n: int, R: Array64, t: Array64) -> Array64:
-    """Where the n chords of a kind are (n, 3), by R (3, 3) and t (3,)."""
-    places_m = np.empty((n, 3))
+def positions_of_kind(rows: Array64, kinds: NDArray[np.int64], kind: int, n: int, R: Array64, t: Array64) -> Array64:
+    """Positions (n, 3) of the n chords of a kind, transformed by R (3, 3) and t (3,)."""
+    positions_m = np.empty((n, 3))
     k = 0
     for i in range(rows.shape[0]):
         if kinds[i] == kind:
             x, y, z = rows[i, chord.X], rows[i, chord.Y], rows[i, chord.Z]
             for j in range(3):
-                places_m[k, j] = x * R[j, 0] + y * R[j, 1] + z * R[j, 2] + t[j]
+                positions_m[k, j] = x * R[j, 0] + y * R[j, 1] + z * R[j, 2] + t[j]
             k += 1
-    return places_m
+    return positions_m
 
 
 @compiled
-def one_thing(rows: Array64, R: Array64, t: Array64) -> tuple[Array64, Array64, int, float, float]:
-    """Of chords (n, COLUMNS) of one thing: its middle (3,) and that by R (3, 3) and t (3,), hits, range, extent [m]."""
-    hits, places = np.ascontiguousarray(rows[:, chord.COUNT]), np.ascontiguousarray(rows[:, :3])
-    middle = hits @ places / hits.sum()
+def merge_chords(rows: Array64, R: Array64, t: Array64) -> tuple[Array64, Array64, int, float, float]:
+    """(middle (3,), that transformed by R, t, returns, range [m], extent [m]) of chords (n, COLUMNS) of one object."""
+    hits, centres = np.ascontiguousarray(rows[:, chord.COUNT]), np.ascontiguousarray(rows[:, :3])
+    middle = hits @ centres / hits.sum()
     across2 = 0.0
     for axis in range(3):
-        across2 += (places[:, axis].max() - places[:, axis].min()) ** 2
+        across2 += (centres[:, axis].max() - centres[:, axis].min()) ** 2
     extent_m = max(math.sqrt(across2), rows[:, chord.LENGTH].max())
     return middle, R @ middle + t, int(hits.sum()), rows[:, chord.RANGE].mean(), extent_m
 
 
 @compiled
-def round_and_rugged(rows: Array64) -> tuple[int, int]:
-    """How many chords (n, COLUMNS) with five or more returns bulge as smoothly as a ball, and how many do not."""
+def round_and_rough(rows: Array64) -> tuple[int, int]:
+    """Numbers of chords (n, COLUMNS) with five or more returns that are smooth and round as a ball, and not."""
     low, high = BALL_BULGE_PER_M
-    balls = rugged = 0
+    balls = rough = 0
     for i in range(rows.shape[0]):
         if rows[i, chord.COUNT] < 5:
             continue
@@ -91,5 +91,5 @@ def round_and_rugged(rows: Array64) -> tuple[int, int]:
         ):
             balls += 1
         else:
-            rugged += 1
-    return balls, rugged
+            rough += 1
+    return balls, rough

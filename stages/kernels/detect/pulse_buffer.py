@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
-from stages.kernels.detect.isolation import TALLY, look_around
+from stages.kernels.detect.isolation import TALLY, count_sectors
 
 WINDOW_NS = 8_600_000  # length of the buffer: 31 deg of a rotor at 600 rpm and the newest slice
 ROUNDED_RAD = 1e-3  # bound of the rounding of directions
@@ -50,16 +50,16 @@ def keep_slice(
 
 
 @compiled
-def passes_by(fan: Array64, origin_m: Array64, centre_m: Array64, outer_m: float) -> bool:
-    """Whether no pulse of a slice comes within `outer_m` of a position (3,), as in `look_around`."""
+def is_outside(fan: Array64, origin_m: Array64, centre_m: Array64, outer_m: float) -> bool:
+    """Whether no pulse of a slice comes within `outer_m` of a position (3,), as in `count_sectors`."""
     x, y, z = centre_m[0] - origin_m[0], centre_m[1] - origin_m[1], centre_m[2] - origin_m[2]
     away_m = max(math.sqrt(x * x + y * y + z * z), 1e-9)
-    beside = math.acos(min(max((x * fan[0] + y * fan[1] + z * fan[2]) / away_m, -1.0), 1.0))
-    return beside > fan[3] + min(outer_m / away_m * 1.05, 1.5) + ROUNDED_RAD
+    angle_rad = math.acos(min(max((x * fan[0] + y * fan[1] + z * fan[2]) / away_m, -1.0), 1.0))
+    return angle_rad > fan[3] + min(outer_m / away_m * 1.05, 1.5) + ROUNDED_RAD
 
 
 @compiled
-def look_around_all(
+def count_sectors_all(
     direction: NDArray[np.float32],
     range_m: NDArray[np.float32],
     origin_m: Array64,
@@ -76,9 +76,9 @@ def look_around_all(
     tally = np.zeros(TALLY, dtype=np.int64)
     for k in range(sizes.size):
         n = sizes[k]
-        if n == 0 or passes_by(fan[k], origin_m[k], centre_m, outer_m):
+        if n == 0 or is_outside(fan[k], origin_m[k], centre_m, outer_m):
             continue
-        look_around(
+        count_sectors(
             direction[k, :n], range_m[k, :n], origin_m[k], centre_m, disc_m, inner_m, close_m, outer_m, depth_m, tally
         )
     return tally.astype(np.float64)

@@ -34,14 +34,17 @@ def preintegrate(
     for i in range(step_s.size):
         h = step_s[i]
         a, w = force_mps2[i] - bias[0], rate_radps[i] - bias[1]
-        middle = dR @ exp_rotation(0.5 * h * w)
+        half = exp_rotation(0.5 * h * w)
+        middle = dR @ half
         turned = middle @ a
         A[:3, :3] = exp_rotation(-h * w)
-        by_turn = -(middle @ hat(a)) * h
+        by_middle = -(middle @ hat(a)) * h
+        B[:3, 3:] = -h * np.eye(3) + 0.5 * h * h * hat(w)
+        by_turn, by_rate = by_middle @ half.T, -0.5 * h * by_middle
         A[3:6, :3], A[6:, :3] = by_turn, 0.5 * h * by_turn
+        B[3:6, 3:], B[6:, 3:] = by_rate, 0.5 * h * by_rate
         for k in range(3):
             A[6 + k, 3 + k] = h
-            B[k, 3 + k] = -h
         B[3:6, :3], B[6:, :3] = -h * middle, -0.5 * h * h * middle
         J[:] = A @ J + B
         C[:] = A @ C @ A.T

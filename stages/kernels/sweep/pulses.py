@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-# A laser's returns in a row, as shares of a drone's span: so long, they are of something larger; a step in range, or a
-# hole, so wide ends them.
+# Bounds of a run of returns of one laser, as shares of a drone's span: a longer run is of a larger object; a larger
+# step in range, or a wider hole, ends the run.
 LONGEST, STEP, HOLE = 1.6, 0.7, 0.6
 
 
@@ -31,7 +31,7 @@ def mean_direction(direction: NDArray[np.float32]) -> Array64:
 
 
 @compiled
-def looking_along(direction: NDArray[np.float32]) -> Array64:
+def mean_unit_direction(direction: NDArray[np.float32]) -> Array64:
     """`mean_direction` as a unit vector (3,); zero for a zero mean."""
     mean = mean_direction(direction)
     return mean / max(math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2), 1e-9)

@@ -96,8 +96,8 @@ def place_pulses(
 ) -> int:
     """Fill the last three arrays with every pulse of a packet: its row, unit direction, distance of its nearest return.
 
-    Both are seen from origin_vehicle_m (3,). Returns how many pulses there are, 0 when an angle is not known. A pulse
-    that returned nothing looks along (cos w sin a, cos w cos a, sin w) of the lidar frame.
+    Both are relative to origin_vehicle_m (3,). Returns the number of pulses, 0 if an angle is not known. A pulse
+    without a return has the direction (cos w sin a, cos w cos a, sin w) of the lidar frame.
     """
     A, B = T_vehicle_turntable, T_turntable_lidar
     n = 0

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 
-STRAY = 0.005  # eps: probability of a false return
-# of a collected pulse: offsets [m], hit or miss, range over the prediction [m] (inf: no return), time, laser
-A, B, KIND, DEPTH, WHEN_S, LASER = range(6)
-MISS, HIT, NEARER = 0.0, 1.0, 2.0  # NEARER: no information, the space behind is hidden
-GLIMPSE = 3.0  # a return seen through a gap: its extent behind is not known
+FALSE_RETURN = 0.005  # eps: probability of a false return
+# columns of a collected pulse: offsets [m], kind, range minus the predicted one [m] (inf: no return), time, laser
+A, B, KIND, DEPTH, DELAY_S, LASER = range(6)
+# kinds of pulses; OCCLUDED: no information, the space behind is hidden
+PASS_THROUGH, RETURN, OCCLUDED = 0.0, 1.0, 2.0
+GAP_RETURN = 3.0  # a return through a gap between nearer objects: the object's extent behind them is unknown
 CELLS = 25
 
 
@@ -42,21 +43,21 @@ def collect(
     centre_m: Array64,
     velocity_mps: Array64,
     centre_ns: int,
-    reach_m: float,
+    gate_m: float,
     depth_m: float,
     line: Array64,
     axes: Array64,
     found: Array64,
 ) -> int:
-    """Fill found (n, COLUMNS) with the pulses that pass within reach_m of the moving centre; returns their number.
+    """Fill found (n, COLUMNS) with the pulses that pass within gate_m of the moving centre; returns their number.
 
-    Each is measured against where the centre is at its own time (de-skew), along the `axes` (2, 3) across `line`, the
-    unit line of sight of the look. A return nearer than depth_m before it hides what is behind and says nothing.
+    Each is measured from the centre's position at the pulse's time (de-skew), along the `axes` (2, 3) across `line`,
+    the unit line of sight of the scan pass. A return more than depth_m before the centre is OCCLUDED.
     """
     ax, ay, az, bx, by, bz = axes[0, 0], axes[0, 1], axes[0, 2], axes[1, 0], axes[1, 1], axes[1, 2]
     x, y, z = centre_m[0] - origin_m[0], centre_m[1] - origin_m[1], centre_m[2] - origin_m[2]
     n = 0
-    least = math.cos(min(1.2 * reach_m / math.sqrt(x * x + y * y + z * z) + 0.01, 1.5))
+    least = math.cos(min(1.2 * gate_m / math.sqrt(x * x + y * y + z * z) + 0.01, 1.5))
     for i in range(range_m.size):
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
         along = dx * line[0] + dy * line[1] + dz * line[2]
@@ -67,18 +68,18 @@ def collect(
         R = cx * line[0] + cy * line[1] + cz * line[2]
         a = R / along * (dx * ax + dy * ay + dz * az) - (cx * ax + cy * ay + cz * az)
         b = R / along * (dx * bx + dy * by + dz * bz) - (cx * bx + cy * by + cz * bz)
-        if a * a + b * b > reach_m * reach_m:
+        if a * a + b * b > gate_m * gate_m:
             continue
         r = range_m[i]
         away = r * along - R
-        found[n, A], found[n, B], found[n, WHEN_S], found[n, LASER] = a, b, dt, laser[i]
+        found[n, A], found[n, B], found[n, DELAY_S], found[n, LASER] = a, b, dt, laser[i]
         found[n, DEPTH] = away if r > 0.0 else math.inf
         if r == 0.0 or away > depth_m:
-            found[n, KIND] = MISS
+            found[n, KIND] = PASS_THROUGH
         elif away < -depth_m:
-            found[n, KIND] = NEARER
+            found[n, KIND] = OCCLUDED
         else:
-            found[n, KIND] = HIT
+            found[n, KIND] = RETURN
         n += 1
         if n == found.shape[0]:
             break
@@ -94,14 +95,14 @@ def posterior(
     half_m: float,
     p_0: float,
     s_m: float,
-    use_misses: bool,
+    use_pass_throughs: bool,
     mean: Array64,
     covariance: Array64,
 ) -> tuple[float, float]:
     """Fill mean (2,) and covariance (2, 2) of the centre's offset [m], [m^2] from a scan pass's pulses (n, COLUMNS).
 
     prior (2, 2) is about (0, 0). The grid is square, half_m each way about the middle. Returns (ln of the likelihood
-    ratio drone over nothing, expected number of hits under the posterior).
+    ratio drone over nothing, expected number of returns under the posterior).
     """
     determinant = prior[0, 0] * prior[1, 1] - prior[0, 1] ** 2
     i00, i01, i11 = prior[1, 1] / determinant, -prior[0, 1] / determinant, prior[0, 0] / determinant
@@ -111,20 +112,20 @@ def posterior(
     inverse = 0.5 / (s_m * s_m)
     nothing = 0.0
     for k in range(pulses.shape[0]):
-        if pulses[k, KIND] == HIT:
-            nothing += math.log(STRAY)
+        if pulses[k, KIND] == RETURN:
+            nothing += math.log(FALSE_RETURN)
     for i in range(CELLS):
         a = middle_a - half_m + i * step
         for j in range(CELLS):
             b = middle_b - half_m + j * step
             v = -0.5 * (a * a * i00 + 2.0 * a * b * i01 + b * b * i11)
             for k in range(pulses.shape[0]):
-                if pulses[k, KIND] == NEARER:
+                if pulses[k, KIND] == OCCLUDED:
                     continue
                 p = p_0 * math.exp(-((pulses[k, A] - a) ** 2 + (pulses[k, B] - b) ** 2) * inverse)
-                if pulses[k, KIND] == HIT:
-                    v += math.log(p + STRAY)
-                elif use_misses:
+                if pulses[k, KIND] == RETURN:
+                    v += math.log(p + FALSE_RETURN)
+                elif use_pass_throughs:
                     v += math.log(1.0 - p)
             value[i, j] = v
             best = max(best, v)
@@ -153,6 +154,6 @@ def posterior(
     evidence = best + math.log(total * step * step / normal) - nothing
     expected = 0.0
     for k in range(pulses.shape[0]):
-        if pulses[k, KIND] != NEARER:
+        if pulses[k, KIND] != OCCLUDED:
             expected += p_0 * math.exp(-((pulses[k, A] - ma) ** 2 + (pulses[k, B] - mb) ** 2) * inverse)
     return evidence, expected

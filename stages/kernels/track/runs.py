@@ -1,6 +1,6 @@
 """Compiled removal of returns that belong to a wall: longer runs of returns than the drone is wide.
 
-The pulses of one laser follow each other 0.2 deg apart. Consecutive returns at nearly the same range are one run. The
+Consecutive pulses of one laser differ by 0.2 deg. Consecutive returns at nearly the same range are one run. The
 runs of a drone are short, even in front of a wall, because the range steps at its edge. A run with something nearer at
 both ends is a glimpse through a gap, between leaves for example: its true extent is not known.
 
@@ -16,16 +16,16 @@ import numpy as np
 from stages.geometry.frames import Array64
 from stages.kernels.compiled import compiled
 from stages.kernels.sweep.pulses import HOLE, LONGEST, STEP
-from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, LASER, NEARER, A, B
+from stages.kernels.track.hull import DEPTH, GAP_RETURN, KIND, LASER, OCCLUDED, RETURN, A, B
 
 LASERS = 256
 
 
 @compiled
-def leave_out_walls(pulses: Array64, span_m: float) -> None:
-    """Mark returns of long runs among a scan pass's pulses (n, COLUMNS), in order of time, as NEARER: no information.
+def mask_walls(pulses: Array64, span_m: float) -> None:
+    """Mark returns of long runs among a scan pass's pulses (n, COLUMNS), in order of time, as OCCLUDED: no information.
 
-    Returns of a short run that is hidden at both ends become GLIMPSE.
+    Returns of a short run that is hidden at both ends become GAP_RETURN.
     """
     first, last, newest = np.full(LASERS, -1), np.full(LASERS, -1), np.full(LASERS, -1)
     run = np.full(pulses.shape[0], -1)  # first row of each row's run
@@ -40,19 +40,19 @@ def leave_out_walls(pulses: Array64, span_m: float) -> None:
             and math.hypot(pulses[i, A] - pulses[j, A], pulses[i, B] - pulses[j, B]) <= HOLE * span_m
         )
         if j >= 0 and before == j:
-            hidden_after[first[k]] = not goes_on and pulses[i, KIND] == NEARER
+            hidden_after[first[k]] = not goes_on and pulses[i, KIND] == OCCLUDED
         if not math.isfinite(pulses[i, DEPTH]):
             continue
         if not goes_on:
             first[k] = i
-            hidden_before[i] = before >= 0 and pulses[before, KIND] == NEARER
+            hidden_before[i] = before >= 0 and pulses[before, KIND] == OCCLUDED
         last[k], run[i], j = i, first[k], first[k]
         hidden_after[j] = False
         long[j] |= math.hypot(pulses[i, A] - pulses[j, A], pulses[i, B] - pulses[j, B]) > LONGEST * span_m
     for i in range(pulses.shape[0]):
-        if pulses[i, KIND] == HIT:
+        if pulses[i, KIND] == RETURN:
             j = run[i]
             if long[j]:
-                pulses[i, KIND] = NEARER
+                pulses[i, KIND] = OCCLUDED
             elif hidden_before[j] and hidden_after[j]:
-                pulses[i, KIND] = GLIMPSE
+                pulses[i, KIND] = GAP_RETURN

@@ -23,13 +23,13 @@ def largest_sigma_m(P: Array64) -> float:
 
 @compiled
 def misfit(xyz_m: Array64, x: Array64, P: Array64) -> float:
-    """Squared Mahalanobis distance of a position (3,) from a state's, with 0.3 m sigma of its own."""
+    """Squared Mahalanobis distance of a position (3,), with a sigma of 0.3 m, from that of a state."""
     away = xyz_m - x[:3]
     return float(away @ np.linalg.solve(P[:3, :3] + 0.3**2 * np.eye(3), away))
 
 
 @compiled
-def seen_from(R: Array64, t: Array64, origin_m: Array64, x: Array64, axis: Array64) -> tuple[Array64, float, bool]:
+def line_of_sight(R: Array64, t: Array64, origin_m: Array64, x: Array64, axis: Array64) -> tuple[Array64, float, bool]:
     """(vector to a state's position (3,) [m], its length, whether the slice covers it), in the vehicle frame.
 
     R, t are T_map_vehicle at the slice; origin (3,) and axis (3,) are the origin and mean direction of its beams.
@@ -41,7 +41,7 @@ def seen_from(R: Array64, t: Array64, origin_m: Array64, x: Array64, axis: Array
 
 @compiled
 def forward_kernel(x: Array64, P: Array64, dt_s: float, q_p: float, q_pv: float, q_v: float) -> tuple[Array64, Array64]:
-    """State (6,) and covariance (6, 6) after dt_s of constant velocity; q_*: process noise per axis, see `forward`."""
+    """State (6,) and covariance (6, 6) after dt_s of constant velocity; q_*: process noise per axis."""
     F = np.eye(6)
     F[0, 3] = F[1, 4] = F[2, 5] = dt_s
     forward = F @ P @ F.T

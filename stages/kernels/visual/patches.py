@@ -127,17 +127,17 @@ def find(grey: Grey, templates: Array32, warp: Array64, guess: Array64) -> tuple
             for k in range(size):
                 mean += seen[k]
             mean /= size
-            power = alike = x_seen = y_seen = 0.0
+            power = product = x_seen = y_seen = 0.0
             for k in range(size):
                 value = seen[k] - mean
                 power += value * value
-                alike += value * known[k]
+                product += value * known[k]
                 x_seen += gx[k] * value
                 y_seen += gy[k] * value
             if not power > size * FLAT * FLAT:
                 correlation[i] = -1.0
                 break
-            gain = alike / power
+            gain = product / power
             correlation[i] = gain * math.sqrt(power / energy)
             r0, r1 = gain * x_seen - x_known, gain * y_seen - y_known
             s0, s1 = (c * r0 - b * r1) / det, (a * r1 - b * r0) / det

@@ -65,7 +65,7 @@ def follow(
     """
     height, width = grey.shape
     flat_x, flat_y, flat_free = dx.ravel(), dy.ravel(), free.ravel()
-    most, lowest = len(back), threshold.min()  # most places are told by it alone
+    most, lowest = len(back), threshold.min()  # decides most pixels alone
     chains, count = 0, 0
     for y in range(2, height - 2):
         for x in range(2 + (2 * y) % 5, width - 2, 5):
@@ -80,10 +80,10 @@ def follow(
             if ahead > square or behind > square or count + 2 * most > len(points) or chains + 2 > len(start):
                 continue
             low = int(LOW_SHARE * LOW_SHARE * threshold[grey[y, x] * LEVELS // 256])
-            backward = _walk(flat_x, flat_y, flat_free, width, at, -1, low, back)
+            backward = _follow(flat_x, flat_y, flat_free, width, at, -1, low, back)
             for k in range(backward):
                 points[count + k] = back[backward - 1 - k]
-            forward = _walk(flat_x, flat_y, flat_free, width, at, 1, low, back)  # begins with the seed again
+            forward = _follow(flat_x, flat_y, flat_free, width, at, 1, low, back)  # begins with the seed again
             for k in range(1, forward):
                 points[count + backward + k - 1] = back[k]
             total = backward + forward - 1
@@ -95,7 +95,7 @@ def follow(
 
 
 @compiled
-def _walk(
+def _follow(
     dx: Slopes, dy: Slopes, free: NDArray[np.uint8], width: int, at: int, way: int, low: int, out: NDArray[np.float32]
 ) -> int:
     """Follow the ridge with the brighter side on the left (way 1) or right (-1); returns the number of points.

@@ -67,7 +67,7 @@ def spread(
 
 @compiled
 def peaks_kernel(yaw_rad: Array64, score: Array64, most: int) -> Array64:
-    """The `most` highest peaks of a score over yaw, with period 90 deg, at least APART_RAD apart."""
+    """The `most` highest peaks of a score over yaw, with period 90 deg, at least APART_RAD from each other."""
     quarter = 0.5 * math.pi
     out = np.empty(most)
     left = np.ones(len(score), dtype=np.bool_)
@@ -80,6 +80,6 @@ def peaks_kernel(yaw_rad: Array64, score: Array64, most: int) -> Array64:
             return out[:count].copy()
         out[count] = yaw_rad[best]
         for k in range(len(score)):
-            apart = abs(yaw_rad[k] - yaw_rad[best])
-            left[k] &= min(apart, quarter - apart) > APART_RAD
+            difference = abs(yaw_rad[k] - yaw_rad[best])
+            left[k] &= min(difference, quarter - difference) > APART_RAD
     return out

@@ -29,6 +29,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from flow.counters import Counters
 from flow.stage import Settings, Stage
 from stages.geometry.extrapolation import AcceptedPoses, constant_turn_rate
 from stages.geometry.frames import Array64, transform
@@ -82,9 +83,9 @@ class VehicleMotionSelector(Stage[VehicleMotionSelectorSettings]):
         return self._rejected
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """Rejected poses by reason, for the run's summary."""
-        return {f"rejected: {why}": count for why, count in self._rejected.items()}
+        return Counters(rejected=self._rejected)
 
     def on_odometry(self, motion: VehicleMotion) -> VehicleMotion | None:
         """The vehicle's odometry, passed on immediately; None for a rejected pose. DENIED: it is frozen."""

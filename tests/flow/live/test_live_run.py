@@ -10,6 +10,7 @@ import pytest
 
 from flow.events import EventMessage
 from flow.link import Tap
+from flow.live.report import LinkState
 from flow.message import Message
 from flow.stage import Settings
 from tests.flow.live_toys import PATIENCE_S, Collector, Line, Memory, Stuck, graph_of, run_live
@@ -98,7 +99,7 @@ class Listener(Tap):
         self._received.append(message)
 
 
-def test_taps_get_each_event_at_its_time_and_not_again_and_again(tmp_path):
+def test_taps_get_each_event_once_at_its_time(tmp_path):
     listener = Listener()
     live = run_live(graph_of(tmp_path, DOUBLING.replace("brittle.number", "line.number")), [listener])
     line_of(live).put(*[13] * 50, 1, "cut", 2)
@@ -133,7 +134,7 @@ def wait_until(done):
 
 def test_only_the_record_that_cannot_be_decoded_is_lost(tmp_path):
     live = run_live(graph_of(tmp_path, DOUBLING))
-    line_of(live).put(1, "refuse", "nonsense", 2)
+    line_of(live).put(1, "refuse", "no number", 2)
     assert collector_of(live).take(2) == [2.0, 4.0]
     report = live.stop()
     assert report.links["line"].undecoded == 2
@@ -226,7 +227,7 @@ def test_the_queue_of_a_slow_stage_keeps_what_its_edge_declares(tmp_path, policy
     line_of(live).put(1)
     assert gate_of(live)._entered.wait(PATIENCE_S)
     line_of(live).put(*range(2, 10), "end")  # after the end the line is no longer open
-    while live.report().links["line"].state == "open":
+    while live.report().links["line"].state is LinkState.OPEN:
         threading.Event().wait(0.01)
     gate_of(live)._open.set()
     assert collector_of(live).take(len(passed)) == passed
@@ -235,7 +236,7 @@ def test_the_queue_of_a_slow_stage_keeps_what_its_edge_declares(tmp_path, policy
     assert [m.value for name, _, m in memory._seen if name == "line.number"] == [float(n) for n in range(1, 10)]
 
 
-def test_a_tap_that_hangs_stops_nothing_and_what_it_missed_is_counted(tmp_path):
+def test_a_blocked_tap_stops_nothing_and_its_missed_messages_are_counted(tmp_path):
     stuck = Stuck()
     live = run_live(graph_of(tmp_path, DOUBLING), [stuck])
     for _ in range(6):
@@ -248,7 +249,7 @@ def test_a_tap_that_hangs_stops_nothing_and_what_it_missed_is_counted(tmp_path):
     live.stop()
 
 
-def test_a_run_stops_although_a_stage_and_a_tap_hang(tmp_path):
+def test_a_run_stops_although_a_stage_and_a_tap_block(tmp_path):
     stuck = Stuck()
     live = run_live(graph_of(tmp_path, GATED), [stuck])
     line_of(live).put(1, 2, 3)
@@ -295,7 +296,7 @@ def test_a_run_stops_within_two_seconds_although_links_stages_and_a_tap_hang(tmp
 def test_missed_deadlines_are_counted_for_each_edge(tmp_path):
     text = DOUBLING.replace("number: line.number", "number: {from: line.number, deadline_ms: 0.001}")
     graph = graph_of(tmp_path, text)
-    live = run_live(graph)  # its clock says 2000 ns; arrivals are 1010, 1020, ...
+    live = run_live(graph)  # its clock is at 2000 ns; arrivals are 1010, 1020, ...
     line_of(live).put(*range(3))
     collector_of(live).take(3)
     report = live.stop()

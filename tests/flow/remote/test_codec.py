@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import struct
 import tracemalloc
@@ -22,10 +23,12 @@ from flow.remote.timeline import in_local_time, time_fields
 from stages.messages import (
     AutopilotStatus,
     CameraMount,
+    CandidateEvidence,
     Detections,
     DroneFix,
     Image,
     LidarFirings,
+    MeanShiftResult,
     RelativePose,
     TrackState,
 )
@@ -36,7 +39,11 @@ CLASSES = sorted(
 )
 EXPECTED = {cls.__name__: cls for cls in CLASSES}
 A_FIX = DroneFix(
-    stamp_ns=7, xyz_vehicle_m=np.array([1.0, 2.0, 3.0]), covariance_m2=np.eye(3), hits=3, iterations=2, shift_m=0.5
+    stamp_ns=7,
+    xyz_vehicle_m=np.array([1.0, 2.0, 3.0]),
+    covariance_m2=np.eye(3),
+    hits=3,
+    mean_shift=MeanShiftResult(iterations=2, shift_m=0.5),
 )
 
 
@@ -99,7 +106,8 @@ def test_a_message_that_is_not_what_its_class_declares_is_not_encoded():
         ({"xyz_vehicle_m": None}, "declared float64"),
         ({"hits": 2**63}, "DroneFix.hits"),
         ({"hits": 1.5}, "DroneFix.hits"),
-        ({"shift_m": "far"}, "DroneFix.shift_m"),
+        ({"mean_shift": MeanShiftResult(iterations=2, shift_m="far")}, "DroneFix.mean_shift"),
+        ({"mean_shift": 0.5}, "DroneFix.mean_shift: declared MeanShiftResult, got float"),
         ({"velocity_vehicle_mps": np.zeros((3, 1))}, "DroneFix.velocity_vehicle_mps"),
     ]:
         values = {name: getattr(A_FIX, name) for name in DroneFix.__slots__} | {"stamp_ns": 7} | wrong
@@ -188,8 +196,11 @@ def test_hostile_bytes_allocate_no_more_memory_than_they_have():
     """Sizes of gigabytes at every position that may hold a size."""
     sent = encode(
         Detections(
-            stamp_ns=1, xyz_vehicle_m=np.zeros((2, 3)), score=np.zeros(2), e_inner=np.zeros(2), e_outer=np.zeros(2),
-            accepted=np.zeros(2, bool), reasons=("a", "b"), summary="v", seen_ns=np.zeros(2, np.int64),
+            stamp_ns=1, xyz_vehicle_m=np.zeros((2, 3)), accepted=np.zeros(2, bool), reasons=("a", "b"), summary="v",
+            evidence=CandidateEvidence(
+                start_ns=0, candidate_id=np.zeros(2, np.int64), seen_ns=np.zeros(2, np.int64),
+                velocity_vehicle_mps=np.zeros((2, 3)), log_odds=np.zeros(2), probability=np.zeros(2),
+            ),
         )
     )  # fmt: skip
     body = sent[22 + len("Detections") :]
@@ -235,6 +246,56 @@ def test_only_times_are_shifted_to_the_local_clock():
     assert moved.score.tolist() == [3.0, 4.0]
 
 
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Offset:
+    offset_ns: int
+    clock_uncertainty_ns: int
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Observation:
+    seen_ns: PerPointI64
+    offset: Offset | None
+    score: PerPointF64
+
+
+@message
+class Nested(Message):
+    found: Observation | Offset | None
+
+
+def test_times_in_nested_dataclasses_are_shifted():
+    seen = Observation(
+        seen_ns=np.array([1, 2]), offset=Offset(offset_ns=5, clock_uncertainty_ns=1), score=np.array([3.0])
+    )
+    moved = in_local_time(Nested(stamp_ns=7, found=seen), 10, 4)
+    assert moved.stamp_ns == 17
+    assert isinstance(moved.found, Observation)
+    assert moved.found.seen_ns.tolist() == [11, 12]
+    assert moved.found.offset is not None
+    assert (moved.found.offset.offset_ns, moved.found.offset.clock_uncertainty_ns) == (15, 5)
+    assert moved.found.score.tolist() == [3.0]
+    assert seen.seen_ns.tolist() == [1, 2]
+    assert in_local_time(Nested(stamp_ns=7, found=None), 10, 4).found is None
+    moved = in_local_time(Nested(stamp_ns=7, found=Offset(offset_ns=5, clock_uncertainty_ns=1)), 10, 4)
+    assert isinstance(moved.found, Offset)
+    assert moved.found.offset_ns == 15
+    assert dict(time_fields(Nested)) == {
+        "stamp_ns": False,
+        "found.seen_ns": False,
+        "found.offset.offset_ns": False,
+        "found.offset.clock_uncertainty_ns": True,
+        "found.offset_ns": False,
+        "found.clock_uncertainty_ns": True,
+    }
+
+
+def test_a_nested_time_beyond_64_bits_raises():
+    late = Offset(offset_ns=2**63 - 1, clock_uncertainty_ns=0)
+    with pytest.raises(OverflowError, match="no time"):
+        in_local_time(Nested(stamp_ns=0, found=late), 1, 0)
+
+
 @message
 class Seen(Message):
     seen_ns: PerPointI64
@@ -258,8 +319,8 @@ def test_every_time_field_of_the_messages_is_known():
         "Candidates.seen_ns": False,
         "DepthImage.start_ns": False,
         "DroneMotion.start_ns": False,
-        "Detections.seen_ns": False,
-        "Detections.start_ns": False,
+        "Detections.evidence.seen_ns": False,
+        "Detections.evidence.start_ns": False,
         "VisualMotion.from_ns": False,
         "FollowedFeatures.from_ns": False,
         "LidarFirings.pulse_stamp_ns": False,

@@ -109,7 +109,7 @@ def test_a_killed_process_is_reported_and_replaced_for_all_its_stages(tmp_path):
     assert not runs(other)
 
 
-def test_a_remote_stage_that_hangs_does_not_keep_the_run_from_ending(tmp_path):
+def test_a_blocked_remote_stage_does_not_prevent_the_end_of_the_run(tmp_path):
     text = REMOTE.replace("live_toys.Brittle", "live_toys.Gate")
     live = run_live(graph_of(tmp_path, text))
     (pid,) = live.processes

@@ -1,4 +1,4 @@
-"""`grd calibrate` as a user meets it: a new rig that a replay takes, figures, and refusals in words."""
+"""`grd calibrate` from the command line: a new rig for a replay, figures, and rejections with reasons."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_without_matplotlib_the_rig_is_written_and_the_missing_extra_is_named(tm
     assert not (tmp_path / "rig.svg").exists()
 
 
-def test_an_old_rig_is_never_written_over_unasked(calibrated):
+def test_an_existing_rig_is_overwritten_on_request_only(calibrated):
     folder, _ = calibrated
     before = (folder / "street.rig.yaml").read_bytes()
     assert "--overwrite" in grd("calibrate", folder / "street.mcap", code=2)
@@ -93,7 +93,7 @@ def test_an_old_rig_is_never_written_over_unasked(calibrated):
 
 
 @pytest.mark.parametrize("name", ["einride_vlp16", "mrpt_vlp16_gps"])
-def test_a_real_capture_without_servo_is_rejected_in_a_sentence(name, tmp_path):
+def test_a_real_capture_without_servo_is_rejected_with_a_reason(name, tmp_path):
     text = grd("calibrate", ROOT / "recordings" / f"{name}.mcap", "-o", tmp_path / "rig.yaml", code=2)
     assert "no servo states" in text
     assert not (tmp_path / "rig.yaml").exists()
@@ -115,11 +115,11 @@ def test_a_vehicle_that_moved_by_its_odometry_is_rejected(tmp_path):
             data = json.dumps(pose).encode()
             writer.write(replace(record, topic="/vehicle/odometry", data=data, sequence=2 * k + 1))
     text = grd("calibrate", drove, code=1)
-    assert "odometry says that it drove 0." in text
+    assert "by its odometry it drove 0." in text
     assert list(tmp_path.iterdir()) == [drove]
 
 
-def test_an_odometry_that_drifts_a_little_while_parked_leaves_it_to_the_surfaces(tmp_path):
+def test_a_small_odometry_drift_while_parked_is_decided_by_the_surfaces(tmp_path):
     drifts = tmp_path / "drifts.mcap"
     with RecordingReader(STREET) as reader, RecordingWriter(drifts, rig_yaml=reader.rig_yaml or "") as writer:
         begin_ns = reader.start_ns
@@ -143,7 +143,7 @@ def test_the_lidars_clock_is_the_recorded_runs():
         assert lidar_of(other).settings.clock == "free"
 
 
-def test_a_rig_goes_into_a_yaml_file_only(tmp_path):
+def test_a_rig_is_written_to_a_yaml_file_only(tmp_path):
     assert ".yaml" in grd("calibrate", STREET, "-o", tmp_path / "rig.svg", code=2)
 
 

@@ -1,4 +1,4 @@
-"""`grd calibrate` on rigs that are not as their file says: ten scenes, each with errors of its own.
+"""`grd calibrate` on rigs that differ from their file: ten scenes, each with its own errors.
 
     python -m pytest -m slow -s tests/links/calibration/test_calibration_scenes.py
 
@@ -49,7 +49,7 @@ def axis(mount: LidarMount) -> np.ndarray:
 
 
 def wave_deg(error_rad: np.ndarray) -> float:
-    """How large an error over the servo's angle is beside its mean, which is alike a zero [deg]."""
+    """RMS of an error over the servo angle without its mean, which acts like a zero offset [deg]."""
     return math.degrees(float(np.std(error_rad)))
 
 
@@ -75,19 +75,19 @@ def found(tmp_path_factory):
         recording = tmp_path_factory.mktemp("scene") / f"s{seed}.mcap"
         simulate_into(recording, scenario)
         gathered = gather(recording, None, (0.0, math.inf))
-        told = calibrate(gathered.returns, gathered.trace, gathered.mount)
+        result = calibrate(gathered.returns, gathered.trace, gathered.mount)
         turned = GearTrain(scenario.servo, seed)
         wrong = np.array([turned.encoder_error_rad(p) for p in SERVO_RAD])
-        left = told.mount.turntable_rad(SERVO_RAD) - (SERVO_RAD - wrong)
-        off_s = told.mount.servo_time_offset_s - true.servo_time_offset_s
+        left = result.mount.turntable_rad(SERVO_RAD) - (SERVO_RAD - wrong)
+        off_s = result.mount.servo_time_offset_s - true.servo_time_offset_s
         rows.append(
             (
-                math.degrees(math.acos(min(1.0, float(axis(told.mount) @ axis(true))))),
+                math.degrees(math.acos(min(1.0, float(axis(result.mount) @ axis(true))))),
                 off_s,
                 wave_deg(wrong),
                 wave_deg(left),
-                math.degrees(told.curve_sigma_rad),
-                told.mount.servo_play_deg - servo["backlash_deg"],
+                math.degrees(result.curve_sigma_rad),
+                result.mount.servo_play_deg - servo["backlash_deg"],
             )
         )
         sys.stdout.write(f"\n{scenario.scene.kind:10} seed {seed}: " + " ".join(f"{v:.5f}" for v in rows[-1]))

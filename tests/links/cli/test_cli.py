@@ -48,11 +48,11 @@ def without_viewer(folder: Path) -> Path:
         "view",
     ],
 )
-def test_every_command_explains_itself_with_an_example(grd, command):
+def test_every_command_has_a_help_text_with_an_example(grd, command):
     assert f"Example: grd {command} " in grd(command, "--help").replace("\n  ", " ").replace("  ", " ")
 
 
-def test_quickstart_says_where_the_drone_is_and_where_to_look(grd, tmp_path):
+def test_quickstart_prints_the_position_of_the_drone_and_the_result_files(grd, tmp_path):
     text = grd("run", ROOT / "configs" / "quickstart.yaml")
     folder = tmp_path / "out" / "street_sweep-quickstart"
     for words in ("x forward [m]", "output hash", "run.rrd", "fix_vehicle_drone.tum", "errors against the truth"):
@@ -89,7 +89,7 @@ def test_two_replays_have_one_hash_and_one_never_overwrites_the_other(grd, tmp_p
 
 
 @pytest.mark.skipif(not can_use_subprocesses(), reason="one core, or no fork: there is one process anyway")
-def test_a_replay_in_several_processes_leaves_the_files_of_one(grd, tmp_path, monkeypatch):
+def test_a_replay_in_several_processes_writes_the_files_of_one(grd, tmp_path, monkeypatch):
     started = []
     start = subprocess_replay._Partition.start
     monkeypatch.setattr(
@@ -103,7 +103,7 @@ def test_a_replay_in_several_processes_leaves_the_files_of_one(grd, tmp_path, mo
     assert [sorted(topics) for topics in started] == [["/lidar/packets", "/servo/state"]]
     names = {path.name for path in (tmp_path / "together").iterdir()}
     assert names == {path.name for path in (tmp_path / "processes").iterdir()} > {"run.log", "fix_vehicle_drone.tum"}
-    for name in names - {"summary.json"}:  # it tells how long the run took
+    for name in names - {"summary.json"}:  # it contains the duration of the run
         assert (tmp_path / "together" / name).read_bytes() == (tmp_path / "processes" / name).read_bytes(), name
 
 
@@ -116,7 +116,7 @@ def test_a_changed_setting_changes_the_hash(grd, tmp_path):
     assert b["set"] == ["track.frame_s=0.1"]
 
 
-def test_all_that_is_wrong_with_a_configuration_is_said_at_once(grd, tmp_path):
+def test_all_errors_of_a_configuration_are_reported_together(grd, tmp_path):
     (tmp_path / "wrong.yaml").write_text(
         f"include: {ROOT}/configs/replay.yaml\nstages:\n  track:\n    config: {{radius: 2}}\n    inputs: {{points: sweep.depth_image}}\n"
     )
@@ -137,7 +137,7 @@ def test_all_that_is_wrong_with_a_configuration_is_said_at_once(grd, tmp_path):
         (b"hello, this is no recording\n" * 10, ""),
     ],
 )
-def test_a_recording_that_is_none_is_said_in_one_line(grd, tmp_path, content, words):
+def test_a_file_that_is_no_recording_is_reported_in_one_line(grd, tmp_path, content, words):
     if content is not None:
         (tmp_path / "x.mcap").write_bytes(content)
     text = grd("replay", "x.mcap", code=2)
@@ -147,7 +147,7 @@ def test_a_recording_that_is_none_is_said_in_one_line(grd, tmp_path, content, wo
     assert not (tmp_path / "out").exists()
 
 
-def test_a_truncated_recording_runs_as_far_as_it_goes_with_a_warning(grd, tmp_path):
+def test_a_truncated_recording_is_replayed_to_its_end_with_a_warning(grd, tmp_path):
     data = STREET.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
     text = grd("replay", "cut.mcap", "--overlay", without_viewer(tmp_path))
@@ -158,7 +158,7 @@ def test_a_truncated_recording_runs_as_far_as_it_goes_with_a_warning(grd, tmp_pa
     assert summary["warnings"]
 
 
-def test_a_configuration_without_a_recording_runs_live_and_says_what_is_missing(grd, tmp_path):
+def test_a_configuration_without_a_recording_runs_live_and_reports_missing_devices(grd, tmp_path):
     overlay = without_viewer(tmp_path)
     text = grd("run", ROOT / "configs" / "paper.yaml", "--for", 0.3, "--no-warm-up", "--overlay", overlay)
     assert "no links.recording.Recorder is configured: nothing is recorded" in text

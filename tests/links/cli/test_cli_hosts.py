@@ -47,7 +47,7 @@ def grd(*arguments):
     return CliRunner().invoke(app, [str(a) for a in arguments])
 
 
-def test_check_tells_what_each_host_runs_and_sends(hosts):
+def test_check_lists_what_each_host_runs_and_sends(hosts):
     done = grd("check", PAPER, "--hosts", hosts)
     assert done.exit_code == 0, done.output
     lines = done.output.splitlines()
@@ -59,7 +59,7 @@ def test_check_tells_what_each_host_runs_and_sends(hosts):
     assert lines[4] == "base: runs viewer"
 
 
-def test_check_says_at_its_line_what_is_wrong_with_the_hosts_file(hosts):
+def test_check_reports_errors_of_the_hosts_file_with_their_line(hosts):
     hosts.write_text(hosts.read_text().replace("  viewer: base", "  viewer: bas"))
     done = grd("check", PAPER, "--hosts", hosts)
     assert done.exit_code == 1
@@ -75,12 +75,12 @@ def test_graph_draws_a_box_for_each_host_or_the_part_of_one(hosts):
     assert "<svg" in grd("graph", PAPER, "--hosts", hosts, "--host", "vehicle", "--format", "svg").output
 
 
-def test_graph_says_which_option_is_missing(hosts):
+def test_graph_reports_a_missing_option(hosts):
     assert grd("graph", PAPER, "--host", "base").exit_code == 2
     assert grd("graph", PAPER, "--hosts", hosts, "--format", "svg").exit_code == 2
 
 
-def test_run_says_which_option_is_missing_and_that_a_replay_has_one_host(hosts):
+def test_run_reports_a_missing_option_and_that_a_replay_has_one_host(hosts):
     for options in (["--hosts", hosts], ["--host", "base"]):
         done = grd("run", PAPER, *options)
         assert done.exit_code == 2
@@ -90,7 +90,7 @@ def test_run_says_which_option_is_missing_and_that_a_replay_has_one_host(hosts):
     assert "--hosts is for live runs" in done.output
 
 
-def test_run_refuses_a_host_whose_certificates_are_not_there(hosts, tmp_path):
+def test_run_rejects_a_host_without_certificates(hosts, tmp_path):
     done = grd("run", PAPER, "--hosts", hosts, "--host", "base", "--no-warm-up", "--out", tmp_path / "out")
     assert done.exit_code == 2
     assert "c.pem" in done.output
@@ -127,12 +127,12 @@ def test_two_commands_run_one_graph_on_two_hosts(tmp_path):
     wait_for_numbers(tmp_path / "base" / "flight.mcap", running)
     for child in running.values():
         child.send_signal(signal.SIGINT)
-    said = {host: child.communicate(timeout=PATIENCE_S)[0] for host, child in running.items()}
-    assert [child.returncode for child in running.values()] == [0, 0], said
-    told = {host: json.loads((tmp_path / host / "summary.json").read_text()) for host in running}
-    assert told["vehicle"]["messages"]["ticker.number"] > 10
-    assert told["base"]["messages"]["order.number"] > 10
-    assert told["base"]["counters"]["ticker"]["received"] > 10
+    output = {host: child.communicate(timeout=PATIENCE_S)[0] for host, child in running.items()}
+    assert [child.returncode for child in running.values()] == [0, 0], output
+    summary = {host: json.loads((tmp_path / host / "summary.json").read_text()) for host in running}
+    assert summary["vehicle"]["messages"]["ticker.number"] > 10
+    assert summary["base"]["messages"]["order.number"] > 10
+    assert summary["base"]["counters"]["ticker"]["received"] > 10
     again = grd("replay", tmp_path / "base" / "flight.mcap", "--as-live", "--out", tmp_path / "again")
     assert again.exit_code == 2
     assert "was recorded on host 'base' of a run on several hosts" in again.output.replace("\n", " ")
@@ -150,7 +150,7 @@ def wait_for_numbers(recording, running):
     pytest.fail("nothing came over the line")
 
 
-def test_the_committed_hosts_file_places_all_of_the_fields_stack():
+def test_the_committed_hosts_file_assigns_all_nodes_of_the_field_configuration():
     field = PAPER.with_name("field.yaml")
     done = grd("check", field, "--hosts", ROOT / "deploy" / "hosts.yaml")
     assert done.exit_code == 0, done.output

@@ -20,7 +20,7 @@ def grd(tmp_path, monkeypatch):
     return command.grd
 
 
-def test_both_lenses_stand_in_the_rig_of_a_configuration_with_their_numbers(grd, tmp_path):
+def test_both_lenses_are_in_the_rig_of_a_configuration_with_their_numbers(grd, tmp_path):
     grd("lens", "camchain.yaml", "vehicle", "--max-off-axis-deg", "120", "-o", "vehicle.yaml")
     text = grd("lens", "calib_results.txt", "drone", "--max-off-axis-deg", "120")
     assert "1440 x 1440 px" in text
@@ -62,7 +62,7 @@ def test_a_wrong_file_is_named_with_its_line_and_nothing_is_written(grd, tmp_pat
     assert sorted(tmp_path.iterdir()) == sorted([*(f for f in before if f.suffix != ".txt"), tmp_path / "lens.mat"])
 
 
-def test_a_file_that_is_there_is_not_written_over_unasked_and_the_calibration_never(grd, tmp_path):
+def test_an_existing_file_is_overwritten_on_request_only_and_the_calibration_never(grd, tmp_path):
     grd("lens", "camchain.yaml", "drone")
     assert "--overwrite" in grd("lens", "camchain.yaml", "drone", code=2)
     grd("lens", "camchain.yaml", "drone", "--overwrite")

@@ -47,7 +47,7 @@ def grd(tmp_path, monkeypatch):
     return command.grd
 
 
-def test_a_live_run_leaves_its_folder_and_is_repeated_to_the_same_hash(grd, tmp_path):
+def test_a_live_run_writes_its_folder_and_is_repeated_to_the_same_hash(grd, tmp_path):
     text = grd("run", "ticks.yaml", "--for", 0.6, "--no-warm-up")
     folder = tmp_path / "out" / "live-ticks"
     assert {path.name for path in folder.iterdir()} >= {"flight.mcap", "summary.json", "config.yaml", "run.log"}
@@ -89,14 +89,14 @@ def test_a_run_in_several_parts_is_repeated_and_replayed_as_a_whole(grd, tmp_pat
     assert replayed["messages"]["ticker.number"] == summary["messages"]["ticker.number"] == summary["records"]
 
 
-def test_a_live_recording_says_with_the_channel_who_sent(tmp_path):
+def test_a_live_recording_has_the_sender_with_the_channel(tmp_path):
     lidar = "  lidar: {use: links.velodyne.Lidar, config: {port: 42368, sender: 127.0.0.9}}\n"
     (tmp_path / "lidar.yaml").write_text(CONFIG.replace("  recorder: {use: links.recording.Recorder}\n", lidar))
     asked = RunRequest(tmp_path / "lidar.yaml")
-    heard = RunFolder(tmp_path / "run", tmp_path / "flight.mcap", asked, live_graph(asked), live=True)
+    run_folder = RunFolder(tmp_path / "run", tmp_path / "flight.mcap", asked, live_graph(asked), live=True)
     recorder = Recorder()
-    heard.taps.append(recorder)
-    with heard:
+    run_folder.taps.append(recorder)
+    with run_folder:
         for topic in ("/lidar/packets", "/servo/state"):
             recorder.record(Record(topic, 2, 1, b"any"))
     with RecordingReader(tmp_path / "run" / "flight.mcap") as reader:
@@ -111,14 +111,14 @@ def test_a_repetition_that_differs_is_a_finding(grd, tmp_path, monkeypatch):
     assert "the same" not in text
 
 
-def test_what_cannot_be_repeated_says_why(grd):
+def test_a_run_that_cannot_be_repeated_has_a_reason(grd):
     street = ROOT / "recordings" / "street_sweep.mcap"
     assert "is not the recording of a live run" in grd("replay", street, "--as-live", code=2).replace("\n", " ")
     text = grd("replay", street, "--as-live", "--set", "track.radius_m=2", code=2)
     assert "--as-live takes the recording's own configuration" in text
 
 
-def test_a_stage_that_is_switched_off_is_a_finding_and_the_run_went_on(grd, tmp_path):
+def test_a_stage_that_is_switched_off_is_a_finding_and_the_run_continues(grd, tmp_path):
     text = CONFIG.replace("Ticker, ", "Ticker, config: {raise_at: 1}, ")
     (tmp_path / "bad.yaml").write_text(text)
     output = grd("run", "bad.yaml", "--for", 0.6, "--no-warm-up", code=1)
@@ -129,7 +129,7 @@ def test_a_stage_that_is_switched_off_is_a_finding_and_the_run_went_on(grd, tmp_
     assert "'ticker' was switched off after repeated errors" in output
 
 
-def test_a_run_without_a_recorder_says_that_nothing_is_recorded(grd, tmp_path):
+def test_a_run_without_a_recorder_reports_that_nothing_is_recorded(grd, tmp_path):
     (tmp_path / "none.yaml").write_text(CONFIG.replace("  recorder: {use: links.recording.Recorder}\n", ""))
     output = grd("run", "none.yaml", "--for", 0.2, "--no-warm-up")
     assert "no links.recording.Recorder is configured: nothing is recorded" in output
@@ -172,7 +172,7 @@ def wait_for_records(child: subprocess.Popen[str], last: Path, for_s: float) -> 
         threading.Event().wait(0.01)
 
 
-def test_a_run_begins_and_flies_on_though_the_disk_takes_nothing(tmp_path):
+def test_a_run_starts_and_continues_with_a_full_disk(tmp_path):
     """As after a restart in flight on a full disk; here no file may have a byte."""
     (tmp_path / "ticks.yaml").write_text(CONFIG)
     words = ["run", str(tmp_path / "ticks.yaml"), "--out", str(tmp_path / "run"), "--no-warm-up", "--for", "1"]
@@ -185,11 +185,11 @@ def test_a_run_begins_and_flies_on_though_the_disk_takes_nothing(tmp_path):
         timeout=PATIENCE_S,
         check=False,
     )
-    said = (done.stdout + done.stderr).replace("\n", " ")
-    assert done.returncode == 0, said
-    assert "results are being lost" in said
-    assert "nothing is recorded now, the run goes on" in said
-    assert int(re.search(r"(\d+) records, [\d.]+ s recorded", said)[1]) > 10
+    output = (done.stdout + done.stderr).replace("\n", " ")
+    assert done.returncode == 0, output
+    assert "results are being lost" in output
+    assert "nothing is recorded now, the run goes on" in output
+    assert int(re.search(r"(\d+) records, [\d.]+ s recorded", output)[1]) > 10
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -206,7 +206,7 @@ def test_a_signal_ends_a_run_in_order(tmp_path, number):
         assert reader.topics["/clock"] == summary["records"]
 
 
-def test_from_ctrl_c_to_the_end_of_the_process_it_takes_less_than_two_seconds(tmp_path):
+def test_the_process_ends_within_two_seconds_of_ctrl_c(tmp_path):
     """Recording, summary and all. The promise is of time: on a machine that is too busy for it, the best of three."""
     took_s = []
     while len(took_s) < 3 and min(took_s, default=2.0) >= 2.0:
@@ -223,10 +223,10 @@ def test_from_ctrl_c_to_the_end_of_the_process_it_takes_less_than_two_seconds(tm
 
 
 @pytest.mark.parametrize("status", [OSError(28, "No space left on device"), SystemExit(1)])
-def test_a_terminal_that_takes_no_more_ends_no_run(grd, tmp_path, status):
+def test_a_blocked_terminal_ends_no_run(grd, tmp_path, status):
     """A log on a full disk, or a pipe whose reader has gone (rich ends the program then)."""
 
-    def show(look):
+    def show(report):
         raise status
 
     asked = RunRequest(Path("ticks.yaml"), (), ())
@@ -237,7 +237,7 @@ def test_a_terminal_that_takes_no_more_ends_no_run(grd, tmp_path, status):
 
 
 @pytest.mark.parametrize("after_s", [0.7, 1.3])
-def test_a_run_killed_with_sigkill_loses_at_most_half_a_second_and_what_is_left_can_be_repeated(tmp_path, grd, after_s):
+def test_a_run_killed_with_sigkill_loses_at_most_half_a_second_and_the_rest_can_be_repeated(tmp_path, grd, after_s):
     child, last = start(tmp_path, CONFIG)
     try:
         wait_for_records(child, last, after_s)

@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from flow.config.edge import Edge, QueueSettings
-from flow.live.report import EdgeCount, LinkReport, LiveReport, edge_report
+from flow.counters import Counters
+from flow.live.report import EdgeCount, LinkReport, LinkState, LiveReport, edge_report
 from flow.taps import Digest
 from links.cli.live_view import LiveView
 from links.runs.live_run import RunStatus
@@ -25,18 +26,18 @@ from stages.messages import (
 )
 
 
-def report_of(lags_ms=(3.0, 150.0), dropped=2, state="open", off=()):
+def report_of(lags_ms=(3.0, 150.0), dropped=2, state=LinkState.OPEN, reason="", off=()):
     count = EdgeCount(Edge("sweep", "swept_pulses", "track", "pulses", SweptPulses, QueueSettings("drop_oldest", 64)))
     for lag_ms in lags_ms:
         count.done(round(lag_ms * 1e6))
     return LiveReport(
         records=1234,
         edges={"track.pulses": edge_report(count, dropped)},
-        links={"lidar": LinkReport(state, 1200, 1)},
+        links={"lidar": LinkReport(state, 1200, 1, reason=reason)},
         counters={
-            "lidar": {"lost": 7, "from other senders": 0},
-            "fuse": {"rejected: fix: not finite": 3, "back end begun anew": 0},
-            "recorder": {"missed": 0},
+            "lidar": Counters({"lost": 7, "from other senders": 0}),
+            "fuse": Counters({"back end reset": 0}, {"fix: not finite": 3}),
+            "recorder": Counters({"missed": 0}),
         },
         switched_off=list(off),
     )
@@ -92,8 +93,6 @@ def test_without_a_fused_pose_the_track_and_its_last_fix_are_shown():
         xyz_vehicle_m=np.array([3.0, 4.0, 5.0]),
         covariance_m2=0.03 * np.eye(3),
         hits=5,
-        iterations=1,
-        shift_m=0.0,
     )
     assert "TRACKING: 5 returns; x 3.00  y 4.00  z 5.00 m  sigma 0.30 m; " in shown(report_of(), track, fix)
     assert "no drone yet; 1234 records" in shown(report_of())
@@ -104,11 +103,11 @@ def test_a_lost_pose_has_no_numbers():
 
 
 def test_a_link_that_is_not_open_and_a_stage_that_is_off_are_in_the_line():
-    line = shown(report_of(state="no packet on UDP 2368 for 2 s", off=["vp_drone"]))
+    line = shown(report_of(state=LinkState.FAILED, reason="no packet on UDP 2368 for 2 s", off=["vp_drone"]))
     assert "OFF: vp_drone; lidar no packet on UDP 2368 for 2 s\n" in line
 
 
-def test_news_are_told_at_once_even_between_two_lines(capsys):
+def test_news_are_printed_at_once_between_two_lines(capsys):
     stream = io.StringIO()
     with LiveView(Console(file=stream, width=160, soft_wrap=True)) as view:
         view.show(RunStatus(0.0, report_of, ["lidar: first"]))
@@ -122,12 +121,12 @@ def test_a_terminal_shows_every_edge_and_link():
     for words in ("track.pulses", "sweep.swept_pulses", "150.0", "lidar", "lost 7", "FULL: seen now", "servo: stalled"):
         assert words in text
     assert "fuse    rejected: fix: not finite 3" in text
-    for nothing in ("recorder", "begun anew"):
+    for nothing in ("recorder", "back end reset"):
         assert nothing not in text
     assert "from other senders" not in text, "counts of zero are left out"
 
 
 @pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (Image, False)])
-def test_the_view_takes_only_what_it_shows(kind, wanted):
+def test_the_view_receives_only_the_messages_that_it_shows(kind, wanted):
     assert LiveView().latest.wants(kind) is wanted
     assert Digest().wants(kind)

@@ -96,8 +96,8 @@ def test_the_table_has_probabilities_and_shares_of_drones(tmp_path):
     assert "reliability of the detector's probabilities" in grd("evaluate", *folders, "--by", "config")
 
 
-def candidates(looks, probability, life=7):
-    n = len(looks)
+def candidates(scan_passes, probability, life=7):
+    n = len(scan_passes)
     return Candidates(
         stamp_ns=1_000_000_000,
         candidate_id=np.arange(1, n + 1),
@@ -105,8 +105,9 @@ def candidates(looks, probability, life=7):
         velocity_vehicle_mps=np.zeros((n, 3)),
         probability=np.array(probability),
         seen_ns=np.zeros(n, dtype=np.int64),
-        scan_passes=np.array(looks),
+        scan_passes=np.array(scan_passes),
         reasons=("",) * n,
+        accept_probability=0.95,
         detector_instance=life,
     )
 

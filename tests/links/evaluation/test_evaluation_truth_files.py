@@ -14,7 +14,7 @@ from links.evaluation.run_data import read_run
 from links.evaluation.text_files import read_tum
 from links.runs.results import Results
 from links.runs.truth import TruthLog
-from stages.messages import DepthImage, Detections, DroneFix, TrackingState, TrackState
+from stages.messages import CandidateEvidence, DepthImage, Detections, DroneFix, KernelScores, TrackingState, TrackState
 from tests.links.evaluation.made_runs import yaw_quaternion
 
 
@@ -109,8 +109,6 @@ def fix(stamp_ns: int, z_m: float, track_id: int) -> DroneFix:
         xyz_vehicle_m=where,
         covariance_m2=np.eye(3),
         hits=5,
-        iterations=1,
-        shift_m=0.0,
         track_id=track_id,
     )
 
@@ -171,11 +169,17 @@ def test_each_track_logs_its_own_changes_of_state(tmp_path):
 def test_a_search_with_a_start_time_keeps_it(tmp_path):
     results = Results()
     results.open(Run(tmp_path, "", "", ""))
+    empty, none = np.zeros(0), np.zeros(0, dtype=np.int64)
     for start, end in ((1_000_000_000, 2_000_000_000), (2_000_000_000, 2_500_000_000), (None, 3_000_000_000)):
-        empty = np.zeros(0)
+        evidence = KernelScores(e_inner=empty, e_outer=empty)
+        if start is not None:
+            evidence = CandidateEvidence(
+                start_ns=start, candidate_id=none, seen_ns=none, velocity_vehicle_mps=np.zeros((0, 3)),
+                log_odds=empty, probability=empty,
+            )  # fmt: skip
         found = Detections(
-            stamp_ns=end, xyz_vehicle_m=np.zeros((0, 3)), score=empty, e_inner=empty, e_outer=empty,
-            accepted=np.zeros(0, dtype=bool), reasons=(), summary="no drone", start_ns=start,
+            stamp_ns=end, xyz_vehicle_m=np.zeros((0, 3)), accepted=np.zeros(0, dtype=bool), reasons=(),
+            summary="no drone", evidence=evidence,
         )  # fmt: skip
         results.see("detect.detections", found, 0)
     results.close()
@@ -203,9 +207,7 @@ def test_every_sweep_has_a_line_with_its_accepted_candidates(tmp_path):
         found = Detections(
             stamp_ns=image.stamp_ns if any(accepted) else 4_000_000_000,
             xyz_vehicle_m=np.arange(9.0).reshape(3, 3),
-            score=np.array([1.0, 2.0, 3.0]),
-            e_inner=np.zeros(3),
-            e_outer=np.zeros(3),
+            evidence=KernelScores(e_inner=np.zeros(3), e_outer=np.array([1.0, 2.0, 3.0])),
             accepted=np.array(accepted),
             reasons=("", "", ""),
             summary="",

@@ -145,9 +145,7 @@ def test_gaps_that_the_rate_hides_are_reported():
 def test_timesync_replies_for_another_component_are_distinguished_from_none():
     none = check(frames(), newest=status(error_ns=None))["it clock"]
     assert "does it receive our frames" in none.sentence
-    foreign = check(frames(), newest=status(error_ns=None), counters={"rejected: TIMESYNC for another component": 7})[
-        "it clock"
-    ]
+    foreign = check(frames(), newest=status(error_ns=None), rejected={"TIMESYNC for another component": 7})["it clock"]
     assert "7 were for another component: check own_system_id, own_component_id" in foreign.sentence
 
 

@@ -1,4 +1,4 @@
-"""Global origin: requested, sent once, never over an existing one, never to an autopilot that cannot be asked."""
+"""Global origin: requested, sent once, never over an existing one, never to an autopilot that does not reply."""
 
 from __future__ import annotations
 

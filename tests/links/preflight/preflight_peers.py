@@ -167,8 +167,6 @@ class FakeTracker(Stage[FakeTrackerSettings]):
             xyz_vehicle_m=np.array([c * x - s * y + 3, s * x + c * y, z + 5]),
             covariance_m2=np.eye(3) * 0.01,
             hits=9,
-            iterations=1,
-            shift_m=0.0,
         )
 
 

@@ -86,7 +86,7 @@ def attitude(stamp_ns, rotation):
 
 
 def fix(stamp_ns, xyz_m):
-    return DroneFix(stamp_ns=stamp_ns, xyz_vehicle_m=xyz_m, covariance_m2=np.eye(3), hits=9, iterations=1, shift_m=0.0)
+    return DroneFix(stamp_ns=stamp_ns, xyz_vehicle_m=xyz_m, covariance_m2=np.eye(3), hits=9)
 
 
 def attitudes(seconds=6.0, rates_of=lambda w: w, rate_hz=50):

@@ -32,7 +32,7 @@ def ethernet(packet: bytes, ethertype: int = 0x0800, vlans: tuple[int, ...] = ()
 
 
 def pcap(frames: list[bytes], *, order: str = "<", nanoseconds: bool = False, link_type: int = 1) -> bytes:
-    """A capture of frames, 1.326001 ms apart."""
+    """A capture of frames at intervals of 1.326001 ms."""
     unit_ns = 1 if nanoseconds else 1000
     out = [struct.pack(order + "IHHiIII", 0xA1B23C4D if nanoseconds else 0xA1B2C3D4, 2, 4, 0, 0, 65535, link_type)]
     for frame, time_ns in zip(frames, times_ns(len(frames), unit_ns), strict=True):

@@ -1,4 +1,4 @@
-"""A live run whose disk takes no more than 3 MB a file: it says so, flies on, and prints what it counted.
+"""A live run with a limit of 3 MB per file: it reports the limit, continues, and prints its counters.
 
 python record_on_a_small_disk.py FOLDER
 """
@@ -33,7 +33,7 @@ def main(folder: Path) -> None:
     live.start()
     collector = live.nodes["collector"]
     numbers = 0
-    while recorder.status is None:  # a number is a record of 1 to 1000 digits; they do not shrink to nothing
+    while recorder.status is None:  # a number is a record of 1 to 1000 digits; they do not compress well
         for _ in range(50):
             numbers += 1
             live.nodes["line"].put(f"{numbers}.{hash(('a', numbers)) ** 40}"[:1000])
@@ -44,14 +44,14 @@ def main(folder: Path) -> None:
         threading.Event().wait(0.01)
     report = live.stop()
     recorder.close()
-    said = [str(event) for event in report.events]
-    told = {
+    events = [str(event) for event in report.events]
+    output = {
         "after": after,
-        "said": said,
+        "events": events,
         "counters": recorder.counters,
         "taken": report.edges["collector.number"].taken,
     }
-    sys.stdout.write(json.dumps(told))
+    sys.stdout.write(json.dumps(output))
 
 
 if __name__ == "__main__":

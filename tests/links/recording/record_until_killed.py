@@ -1,4 +1,4 @@
-"""Records at the rate of a lidar and a servo until it is killed; keeps the last arrival in a mapped file for the judge.
+"""Records at the rate of a lidar and a servo until it is killed; keeps the last arrival in a mapped file for the test.
 
 python record_until_killed.py RECORDING LAST_ARRIVAL
 """

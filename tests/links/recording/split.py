@@ -12,7 +12,7 @@ LATE_NS = 20_000_000
 
 
 def split(source: Path, folder: Path, cuts_s: tuple[float, ...], run: str = "a run", name: str = "flight") -> Path:
-    """The first of the parts that end at `cuts_s` and at the end; the last one says that the run ended.
+    """The first of the parts that end at `cuts_s` and at the end; the last one has the end of the run.
 
     Servo states are late at a cut: the part after it begins with some that came before it, as threads do.
     """

@@ -26,7 +26,7 @@ def test_the_bytes_are_those_of_the_protobuf_library():
     st.binary(max_size=300),
     st.sampled_from(["jpeg", "png", "webp", "avif"]),
 )
-def test_an_image_comes_back(stamp_ns: int, frame_id: str, data: bytes, image_format: str):
+def test_an_image_round_trips(stamp_ns: int, frame_id: str, data: bytes, image_format: str):
     image = CompressedImage(stamp_ns, frame_id, data, image_format)
     assert decode_compressed_image(encode_compressed_image(image)) == image
 
@@ -56,7 +56,7 @@ def test_damaged_bytes_are_an_error(data: bytes, text: str):
 
 
 @given(st.binary(max_size=60))
-def test_random_bytes_never_surprise(data: bytes):
+def test_random_bytes_raise_only_link_errors(data: bytes):
     try:
         decode_compressed_image(data)
     except LinkError:

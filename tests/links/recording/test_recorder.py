@@ -1,4 +1,4 @@
-"""The recorder of a live run: parts, a full disk, and what it leaves behind."""
+"""The recorder of a live run: parts, a full disk, and the files that it leaves."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_each_part_can_be_replayed_alone_and_together_they_are_all(tmp_path):
     assert recorder.counters == {"written": 30, "dropped": 0, "missed": 0, "parts": 3}
 
 
-def test_a_part_that_is_big_enough_is_followed_by_another_and_nothing_is_lost_between(tmp_path):
+def test_a_full_part_is_followed_by_another_without_loss(tmp_path):
     recorder = opened(tmp_path, split_mb=1)
     number = 0
     while recorder.counters["parts"] < 3:
@@ -109,7 +109,7 @@ def test_parts_split_by_time_have_the_static_data_each_and_every_record_once(tmp
     assert recorder.counters == {"written": number + 2, "dropped": 0, "missed": 0, "parts": 3}
 
 
-def test_parts_of_other_runs_beside_are_left_out_and_missing_ones_are_said(tmp_path):
+def test_parts_of_other_runs_are_ignored_and_missing_ones_are_reported(tmp_path):
     for name in ("flight.mcap", "other.mcap"):
         recorder = opened(tmp_path, file=name)
         for part in range(3):
@@ -126,13 +126,13 @@ def test_parts_of_other_runs_beside_are_left_out_and_missing_ones_are_said(tmp_p
         Session(tmp_path / "flight.mcap", whole=True)
 
 
-def test_a_recording_of_no_run_is_its_only_part():
+def test_a_recording_without_a_run_is_its_only_part():
     street = ROOT / "recordings" / "street_sweep.mcap"
     assert Session(street).parts == [street]
     assert Session(street).warnings == []
 
 
-def test_a_disk_without_room_is_said_and_records_are_counted_as_missed(tmp_path):
+def test_a_full_disk_is_reported_and_records_are_counted_as_missed(tmp_path):
     recorder = opened(tmp_path, reserve_mb=1e12)
     recorder.record(record(1))
     assert "less than 1e+12 MB are free at" in recorder.status
@@ -143,7 +143,7 @@ def test_a_disk_without_room_is_said_and_records_are_counted_as_missed(tmp_path)
 
 
 def test_a_disk_that_gets_full_ends_the_recording_properly_and_room_again_begins_a_new_part(tmp_path, monkeypatch):
-    monkeypatch.setattr("links.recording.recorder.AGAIN_S", 0.0)
+    monkeypatch.setattr("links.recording.recorder.RETRY_S", 0.0)
     recorder = opened(tmp_path)
     recorder.record(record(1))
     free = [0]
@@ -163,7 +163,7 @@ def test_a_disk_that_gets_full_ends_the_recording_properly_and_room_again_begins
 
 
 def test_a_disk_that_is_gone_is_said_and_the_recording_goes_on_when_it_is_back(tmp_path, monkeypatch):
-    monkeypatch.setattr("links.recording.recorder.AGAIN_S", 0.0)
+    monkeypatch.setattr("links.recording.recorder.RETRY_S", 0.0)
     recorder = opened(tmp_path)
 
     def gone(folder):
@@ -189,7 +189,7 @@ def wait_until(done):
     pytest.fail("nothing happened in ten seconds")
 
 
-def test_a_live_run_flies_on_when_the_disk_takes_no_more_and_says_so(tmp_path):
+def test_a_live_run_continues_with_a_full_disk_and_reports_it(tmp_path):
     child = subprocess.run(
         [sys.executable, str(CHILD), str(tmp_path)],
         cwd=ROOT,
@@ -200,12 +200,12 @@ def test_a_live_run_flies_on_when_the_disk_takes_no_more_and_says_so(tmp_path):
         check=False,
     )
     assert child.returncode == 0, child.stderr
-    told = json.loads(child.stdout)
-    assert told["after"] == 14.0
-    (said,) = [text for text in told["said"] if "nothing is recorded now" in text]
-    assert "flight.mcap: File too large after" in said
-    assert said.endswith("nothing is recorded now, the run goes on")
-    assert told["counters"]["dropped"] + told["counters"]["missed"] > 0
+    output = json.loads(child.stdout)
+    assert output["after"] == 14.0
+    (event,) = [text for text in output["events"] if "nothing is recorded now" in text]
+    assert "flight.mcap: File too large after" in event
+    assert event.endswith("nothing is recorded now, the run goes on")
+    assert output["counters"]["dropped"] + output["counters"]["missed"] > 0
     with RecordingReader(tmp_path / "flight.mcap") as reader:
         assert sum(1 for _ in reader.records()) > 0
 

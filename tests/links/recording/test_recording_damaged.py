@@ -1,4 +1,4 @@
-"""Damaged recordings: cut anywhere, flipped bits, lying lengths. The readable part comes back, or a LinkError."""
+"""Damaged recordings: truncation, flipped bits, wrong lengths. The readable part is read, or a LinkError is raised."""
 
 import io
 import re
@@ -64,7 +64,7 @@ def test_the_whole_file_is_read_without_warnings(tmp_path: Path):
     assert len(chunk_offsets(WHOLE)) == 6
 
 
-def test_cut_anywhere_the_readable_part_is_a_beginning_and_the_warning_says_where(tmp_path: Path):
+def test_the_readable_part_of_a_truncated_file_is_its_beginning_and_the_warning_has_the_byte(tmp_path: Path):
     path = tmp_path / "a.mcap"
     lengths = []
     for size in range(0, len(WHOLE), 3):
@@ -75,10 +75,10 @@ def test_cut_anywhere_the_readable_part_is_a_beginning_and_the_warning_says_wher
         records, warnings = read(path, WHOLE[:size])
         assert set(records) <= set(SENT)
         assert records == sorted(records)
-        said = re.search(r"ends at byte (\d+) of (\d+): (\d+) messages readable", warnings[-1])
-        assert said, warnings
-        assert int(said[1]) <= size == int(said[2])
-        assert int(said[3]) == len(records), f"cut at {size}"
+        match = re.search(r"ends at byte (\d+) of (\d+): (\d+) messages readable", warnings[-1])
+        assert match, warnings
+        assert int(match[1]) <= size == int(match[2])
+        assert int(match[3]) == len(records), f"cut at {size}"
         lengths.append(len(records))
     assert lengths == sorted(lengths)
     assert set(lengths) == {n for c in range(0, COUNT, 8) for n in (c, c + 7)} | {COUNT}
@@ -86,7 +86,7 @@ def test_cut_anywhere_the_readable_part_is_a_beginning_and_the_warning_says_wher
 
 @settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_flipped_bits_never_surprise(tmp_path: Path, data: st.DataObject):
+def test_flipped_bits_raise_only_link_errors(tmp_path: Path, data: st.DataObject):
     content = WHOLE
     for _ in range(data.draw(st.integers(1, 4))):
         content = flipped(content, data.draw(st.integers(0, len(WHOLE) - 1)), data.draw(st.integers(1, 255)))
@@ -103,7 +103,7 @@ def test_flipped_bits_never_surprise(tmp_path: Path, data: st.DataObject):
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(junk=st.binary(max_size=200), keep=st.integers(0, len(WHOLE)))
-def test_junk_after_any_beginning_never_surprises(tmp_path: Path, junk: bytes, keep: int):
+def test_junk_after_any_beginning_raises_only_link_errors(tmp_path: Path, junk: bytes, keep: int):
     try:
         records, _ = read(tmp_path / "a.mcap", WHOLE[:keep] + junk + WHOLE[keep:])
     except LinkError:
@@ -111,7 +111,7 @@ def test_junk_after_any_beginning_never_surprises(tmp_path: Path, junk: bytes, k
     assert set(records) <= set(SENT)
 
 
-def test_a_chunk_with_a_wrong_crc_costs_that_chunk_alone_and_its_bytes_are_named(tmp_path: Path):
+def test_a_chunk_with_a_wrong_crc_is_skipped_alone_and_its_bytes_are_reported(tmp_path: Path):
     offset = chunk_offsets(WHOLE)[2]
     records, warnings = read(tmp_path / "a.mcap", flipped(WHOLE, offset + 9 + 24, 0xFF))  # the CRC in the chunk's head
     assert [r[1] for r in records] == [i for i in range(COUNT) if not 16 <= i < 23]
@@ -120,7 +120,7 @@ def test_a_chunk_with_a_wrong_crc_costs_that_chunk_alone_and_its_bytes_are_named
     assert "its CRC is wrong" in warnings[0]
 
 
-def test_a_garbage_length_in_an_unfinished_file_costs_no_more_than_what_is_before_the_next_chunk(tmp_path: Path):
+def test_a_garbage_length_in_an_unfinished_file_loses_only_data_before_the_next_chunk(tmp_path: Path):
     cut = WHOLE[:DATA_END]
     offsets = chunk_offsets(cut)
     damaged = flipped(cut, offsets[1] + 6, 0x80)  # the length claims petabytes
@@ -129,14 +129,14 @@ def test_a_garbage_length_in_an_unfinished_file_costs_no_more_than_what_is_befor
     assert f"bytes {offsets[1]} to {offsets[2] - 1} cannot be read" in warnings[0]
 
 
-def test_a_tail_of_zeros_as_a_power_cut_leaves_is_the_end(tmp_path: Path):
+def test_a_tail_of_zeros_after_a_power_cut_is_the_end(tmp_path: Path):
     offset = chunk_offsets(WHOLE)[3]
     records, warnings = read(tmp_path / "a.mcap", WHOLE[:offset] + bytes(5000))
     assert len(records) == 24
     assert f"ends at byte {offset} of {offset + 5000}: 24 messages readable" in warnings[0]
 
 
-def test_a_damaged_summary_is_done_without(tmp_path: Path):
+def test_a_damaged_summary_is_ignored(tmp_path: Path):
     records, warnings = read(tmp_path / "a.mcap", flipped(WHOLE, DATA_END + 40, 0x55))
     assert records == SENT
     assert "the summary at the end is damaged (its CRC is wrong)" in warnings[0]
@@ -174,13 +174,13 @@ def zstd_with_claimed_size(size: int) -> bytes:
         (with_chunk(1000, b"short", b""), "unpacks to 5 bytes instead of 1000"),
     ],
 )
-def test_a_chunk_that_lies_about_its_size_is_left_out(tmp_path: Path, bomb: bytes, text: str):
+def test_a_chunk_with_a_wrong_size_is_skipped(tmp_path: Path, bomb: bytes, text: str):
     records, warnings = read(tmp_path / "a.mcap", bomb)
     assert records == SENT
     assert any(re.search(text, warning) for warning in warnings), warnings
 
 
-def test_lengths_inside_a_chunk_that_do_not_fit_are_named(tmp_path: Path):
+def test_inconsistent_lengths_inside_a_chunk_are_reported(tmp_path: Path):
     messages = b"\x05" + struct.pack("<Q", 2**50) + bytes(30)
     body = struct.pack("<QQQII", T0, T0, len(messages), zlib.crc32(messages), 0) + struct.pack("<Q", len(messages))
     record = b"\x06" + struct.pack("<Q", len(body) + len(messages)) + body + messages
@@ -189,7 +189,7 @@ def test_lengths_inside_a_chunk_that_do_not_fit_are_named(tmp_path: Path):
     assert "a record in it has the length 1125899906842624" in warnings[-1]
 
 
-def test_a_chunk_that_claims_other_times_than_its_messages_have_is_left_out(tmp_path: Path):
+def test_a_chunk_with_other_times_than_its_messages_is_skipped(tmp_path: Path):
     cut = WHOLE[:DATA_END]
     offset = chunk_offsets(cut)[1]
     records, warnings = read(tmp_path / "a.mcap", flipped(cut, offset + 9, 0x04))  # it starts earlier or later
@@ -197,7 +197,7 @@ def test_a_chunk_that_claims_other_times_than_its_messages_have_is_left_out(tmp_
     assert "its messages are outside the times it claims" in warnings[-1]
 
 
-def test_recover_writes_a_clean_copy_of_all_that_is_left(tmp_path: Path):
+def test_recover_writes_a_clean_copy_of_the_readable_data(tmp_path: Path):
     path = tmp_path / "flight.mcap"
     path.write_bytes(flipped(WHOLE[:DATA_END], chunk_offsets(WHOLE)[1] + 9 + 24, 0xFF))
     report = recover(path, tmp_path / "clean.mcap")
@@ -213,7 +213,7 @@ def test_recover_writes_a_clean_copy_of_all_that_is_left(tmp_path: Path):
         assert [r.sequence for r in copy.records()] == [i for i in range(COUNT) if not 8 <= i < 15]
 
 
-def test_recover_never_writes_over_its_source_nor_over_another_file(tmp_path: Path):
+def test_recover_never_overwrites_its_source_or_another_file(tmp_path: Path):
     path, other = tmp_path / "flight.mcap", tmp_path / "other.mcap"
     path.write_bytes(WHOLE)
     other.write_text("precious")

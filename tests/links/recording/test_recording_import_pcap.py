@@ -1,4 +1,4 @@
-"""Importing captures: every kind of file header and link type, what is skipped, what is refused, real captures."""
+"""Importing captures: every kind of file header and link type, skipped and rejected data, real captures."""
 
 import struct
 from pathlib import Path
@@ -71,7 +71,7 @@ def test_each_link_type_gives_the_same_packets(tmp_path: Path, link_type: int, h
     assert [r.data for r in records] == PACKETS
 
 
-def test_vlan_tags_and_ip_options_are_stepped_over(tmp_path: Path):
+def test_vlan_tags_and_ip_options_are_skipped(tmp_path: Path):
     tagged = ethernet(udp(PACKETS[0]), vlans=(0x88A8, 0x8100))
     datagram = struct.pack(">HHHH", 2368, 2368, 8 + 1206, 0) + PACKETS[1]
     with_options = ethernet(ipv4(datagram, options=bytes(8)))
@@ -80,7 +80,7 @@ def test_vlan_tags_and_ip_options_are_stepped_over(tmp_path: Path):
     assert [r.data for r in records] == PACKETS[:3]
 
 
-def test_an_unknown_link_type_and_pcapng_are_refused_with_advice(tmp_path: Path):
+def test_an_unknown_link_type_and_pcapng_are_rejected_with_advice(tmp_path: Path):
     with pytest.raises(LinkError, match="link type 127 is not supported: capture on an Ethernet"):
         run(tmp_path, pcap([b"x"], link_type=127))
     with pytest.raises(LinkError, match=r"is a pcapng capture: convert it with `editcap -F pcap .*drive\.pcap"):
@@ -90,7 +90,7 @@ def test_an_unknown_link_type_and_pcapng_are_refused_with_advice(tmp_path: Path)
 # ---- what is taken and what is passed over
 
 
-def test_position_packets_go_to_their_topic(tmp_path: Path):
+def test_position_packets_have_their_own_topic(tmp_path: Path):
     report, records = run(tmp_path, pcap([ethernet(udp(PACKETS[0])), ethernet(udp(bytes(512), port=8308))]))
     assert report.topics == {"/lidar/packets": 1, "/lidar/position": 1}
     assert [(r.topic, len(r.data)) for r in records] == [("/lidar/packets", 1206), ("/lidar/position", 512)]
@@ -130,7 +130,7 @@ def test_a_packet_cut_by_the_snapshot_length_is_counted_as_that(tmp_path: Path):
     assert report.skipped == {"cut short by the capture's snapshot length": 1}
 
 
-def test_of_two_lidars_one_is_taken_and_can_be_chosen(tmp_path: Path):
+def test_one_of_two_lidars_is_imported_and_can_be_chosen(tmp_path: Path):
     first, second = (192, 168, 1, 201), (192, 168, 1, 202)
     frames = [ethernet(udp(PACKETS[i], sender=(first, second)[i % 2])) for i in range(4)]
     report, records = run(tmp_path, pcap(frames))
@@ -140,7 +140,7 @@ def test_of_two_lidars_one_is_taken_and_can_be_chosen(tmp_path: Path):
     assert [r.data for r in records] == PACKETS[1::2]
 
 
-def test_another_port_is_offered_and_taken(tmp_path: Path):
+def test_another_port_is_suggested_and_accepted(tmp_path: Path):
     content = pcap([ethernet(udp(p, port=2369)) for p in PACKETS])
     with pytest.raises(
         LinkError, match=r"no VLP-16 packet \(1206 bytes\) on UDP port 2368; 4 on port 2369: try --port"
@@ -150,7 +150,7 @@ def test_another_port_is_offered_and_taken(tmp_path: Path):
     assert len(records) == 4
 
 
-def test_a_capture_without_a_lidar_says_what_it_has(tmp_path: Path):
+def test_a_capture_without_a_lidar_is_an_error_with_its_content(tmp_path: Path):
     with pytest.raises(LinkError, match=r"no VLP-16 packet .* on UDP port 2368; 2 packets on UDP port 53"):
         run(tmp_path, pcap([ethernet(udp(b"dns", port=53))] * 2))
     assert not (tmp_path / "drive.mcap").exists()
@@ -159,7 +159,7 @@ def test_a_capture_without_a_lidar_says_what_it_has(tmp_path: Path):
 @pytest.mark.parametrize(
     ("product", "name"), [(0x21, "HDL-32E"), (0x28, "VLP-32C"), (0x99, r"an unknown model \(product id 0x99\)")]
 )
-def test_another_model_is_refused_by_name_and_leaves_no_file(tmp_path: Path, product: int, name: str):
+def test_another_model_is_rejected_by_name_and_leaves_no_file(tmp_path: Path, product: int, name: str):
     content = pcap([ethernet(udp(PACKETS[0])), ethernet(udp(data_packet(1, product)))])
     with pytest.raises(LinkError, match=f"the packet at byte 1288 is from {name}, not a VLP-16"):
         run(tmp_path, content)
@@ -169,7 +169,7 @@ def test_another_model_is_refused_by_name_and_leaves_no_file(tmp_path: Path, pro
 # ---- what is attached
 
 
-def test_the_rig_given_is_attached_and_the_default_one_admits_that_it_is_a_guess(tmp_path: Path):
+def test_a_given_rig_is_attached_and_the_default_one_is_marked_as_a_guess(tmp_path: Path):
     content = pcap([ethernet(udp(PACKETS[0]))])
     report, _ = run(tmp_path, content)
     with RecordingReader(report.path) as reader:
@@ -189,10 +189,10 @@ def test_the_default_rig_is_a_valid_mount_that_does_not_turn(tmp_path: Path):
     assert set(rig) == {"version", "lidar", "drone"}
     assert not mount.turns
     assert mount.T_vehicle_turntable.xyz_m == (0.0, 0.0, 1.8)
-    assert mount.T_turntable_lidar.xyz_m == (0.0, 0.0, 0.0)  # the depth image looks from the lidar itself
+    assert mount.T_turntable_lidar.xyz_m == (0.0, 0.0, 0.0)  # the depth image has its origin at the lidar
 
 
-def test_neither_the_source_nor_an_existing_recording_is_written_over(tmp_path: Path):
+def test_neither_the_source_nor_an_existing_recording_is_overwritten(tmp_path: Path):
     path, other = tmp_path / "drive.pcap", tmp_path / "drive.mcap"
     path.write_bytes(pcap([ethernet(udp(PACKETS[0]))]))
     other.write_text("precious")
@@ -203,7 +203,7 @@ def test_neither_the_source_nor_an_existing_recording_is_written_over(tmp_path: 
     assert other.read_text() == "precious"
 
 
-def test_progress_goes_from_the_start_to_the_end(tmp_path: Path):
+def test_progress_increases_from_start_to_end(tmp_path: Path):
     seen: list[tuple[int, int]] = []
     content = pcap([ethernet(udp(PACKETS[i % 4])) for i in range(2500)])
     run(tmp_path, content, progress=lambda done, total: seen.append((done, total)))
@@ -245,7 +245,7 @@ def test_a_capture_cut_in_its_header_is_an_error(tmp_path: Path, size: int):
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(st.integers(0, 24 + 4 * 1264 - 1), st.integers(0, 255)), min_size=1, max_size=6))
-def test_flipped_bytes_never_surprise(tmp_path: Path, flips: list[tuple[int, int]]):
+def test_flipped_bytes_raise_only_link_errors(tmp_path: Path, flips: list[tuple[int, int]]):
     content = bytearray(pcap([ethernet(udp(p)) for p in PACKETS]))
     for offset, value in flips:
         content[offset] = value
@@ -260,7 +260,7 @@ def test_flipped_bytes_never_surprise(tmp_path: Path, flips: list[tuple[int, int
 # ---- real captures
 
 
-def test_the_real_captures_import_whole(tmp_path: Path):
+def test_the_real_captures_are_imported_completely(tmp_path: Path):
     if not SHARED.exists():
         pytest.skip("needs ../shared/data/lidar")
     report = import_file(SHARED / "vlp16_strongest_einride.pcap", tmp_path / "a.mcap")
@@ -278,7 +278,7 @@ def test_the_real_captures_import_whole(tmp_path: Path):
     ("recording", "capture"),
     [("einride_vlp16", "vlp16_strongest_einride"), ("mrpt_vlp16_gps", "vlp16_strongest_gps_mrpt")],
 )
-def test_the_committed_recordings_are_what_the_captures_give(tmp_path: Path, recording: str, capture: str):
+def test_the_committed_recordings_equal_the_imported_captures(tmp_path: Path, recording: str, capture: str):
     if not SHARED.exists():
         pytest.skip("needs ../shared/data/lidar")
     import_file(SHARED / f"{capture}.pcap", tmp_path / "again.mcap")

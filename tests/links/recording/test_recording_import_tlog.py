@@ -1,4 +1,4 @@
-"""Importing telemetry logs: where frames start and end, what is kept, what is counted, real logs."""
+"""Importing telemetry logs: frame boundaries, kept and counted data, real logs."""
 
 import struct
 from pathlib import Path
@@ -56,7 +56,7 @@ def test_the_checksum_is_mavlinks():
 
 
 @pytest.mark.parametrize(("version", "signed"), [(1, False), (2, False), (2, True)])
-def test_frames_of_both_versions_and_signed_ones_come_back_raw(tmp_path: Path, version: int, signed: bool):
+def test_frames_of_both_versions_and_signed_ones_are_kept_raw(tmp_path: Path, version: int, signed: bool):
     sent = frames(version=version, signed=signed)
     report, records = run(tmp_path, tlog(sent))
     assert [r.data for r in records] == sent
@@ -65,7 +65,7 @@ def test_frames_of_both_versions_and_signed_ones_come_back_raw(tmp_path: Path, v
     assert (report.topics, report.skipped, report.warnings) == ({"/autopilot/rx": 6}, {}, [])
 
 
-def test_bad_bytes_are_left_out_counted_and_located(tmp_path: Path):
+def test_bad_bytes_are_skipped_counted_and_located(tmp_path: Path):
     sent = frames()
     start = len(tlog(sent[:2]))
     content = tlog([*sent[:2], b"\x01\x02\xfe\x03garbage", *sent[2:]])
@@ -83,7 +83,7 @@ def test_a_frame_with_a_flipped_byte_between_good_ones_is_kept_and_counted(tmp_p
     assert "1 frames have a checksum that our MAVLink dialect does not expect: kept" in report.warnings[0]
 
 
-def test_a_bad_frame_is_not_believed_when_the_next_time_is_far_off(tmp_path: Path):
+def test_a_bad_frame_is_rejected_when_the_next_time_is_far_off(tmp_path: Path):
     sent = frames()
     damaged = sent[2][:15] + bytes([sent[2][15] ^ 0x40]) + sent[2][16:]
     content = tlog([*sent[:2], damaged])
@@ -93,7 +93,7 @@ def test_a_bad_frame_is_not_believed_when_the_next_time_is_far_off(tmp_path: Pat
     assert report.skipped == {"bytes that are no MAVLink frame": 8 + len(damaged)}
 
 
-def test_a_message_that_our_dialect_does_not_know_is_kept(tmp_path: Path):
+def test_a_message_outside_the_dialect_is_kept(tmp_path: Path):
     sent = frames()
     sent[3] = b"\xfd\x04\x00\x00\x07\x01\x01" + (0xABCDEF).to_bytes(3, "little") + b"abcd" + b"\x12\x34"
     _, records = run(tmp_path, tlog(sent))
@@ -117,13 +117,13 @@ def test_a_cut_log_gives_its_whole_frames_and_names_the_byte(tmp_path: Path):
 
 
 @pytest.mark.parametrize("content", [b"\x00" * 50, b"text", bytes(range(256)) * 4])
-def test_a_file_without_frames_is_refused(tmp_path: Path, content: bytes):
+def test_a_file_without_frames_is_rejected(tmp_path: Path, content: bytes):
     with pytest.raises(LinkError, match=r"no MAVLink frame in [0-9]+ bytes: is it a telemetry log"):
         run(tmp_path, content)
     assert not (tmp_path / "flight.mcap").exists()
 
 
-def test_what_is_neither_capture_nor_log_is_refused_and_a_recording_is_named(tmp_path: Path):
+def test_a_file_that_is_neither_capture_nor_log_is_rejected_and_a_recording_is_recognised(tmp_path: Path):
     (tmp_path / "a.bin").write_bytes(b"something else")
     with pytest.raises(LinkError, match="neither a pcap capture nor a MAVLink telemetry log"):
         import_file(tmp_path / "a.bin")
@@ -134,14 +134,14 @@ def test_what_is_neither_capture_nor_log_is_refused_and_a_recording_is_named(tmp
         import_file(tmp_path / "none.tlog")
 
 
-def test_a_log_is_known_by_its_bytes_whatever_its_name(tmp_path: Path):
+def test_a_log_is_recognised_by_its_bytes(tmp_path: Path):
     (tmp_path / "flight.log").write_bytes(tlog(frames()))
     assert import_file(tmp_path / "flight.log").topics == {"/autopilot/rx": 6}
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(st.integers(0, 200), st.integers(0, 255)), max_size=8), st.integers(0, 260))
-def test_no_byte_is_lost_in_silence(tmp_path: Path, flips: list[tuple[int, int]], size: int):
+def test_every_lost_byte_is_counted(tmp_path: Path, flips: list[tuple[int, int]], size: int):
     content = bytearray(tlog(frames()))
     for offset, value in flips:
         content[offset] = value

@@ -1,4 +1,4 @@
-"""A recording process is killed with SIGKILL, really; what is on disk is read and recovered."""
+"""A recording process is killed with SIGKILL; the data on disk is read and recovered."""
 
 import os
 import signal

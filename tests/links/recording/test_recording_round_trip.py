@@ -1,4 +1,4 @@
-"""What is written comes back: order, times, sequence, attachments; and the mcap package reads it, too."""
+"""Round trip: order, times, sequence, attachments; and the mcap package reads the file."""
 
 import errno
 import io
@@ -42,7 +42,7 @@ def read(path: Path) -> list[Record]:
 # ---- order, times, contents
 
 
-def test_records_come_back_by_arrival_then_sequence_with_both_times(tmp_path: Path):
+def test_records_are_read_by_arrival_then_sequence_with_both_times(tmp_path: Path):
     written = [
         Record("/servo/state", T0 + 30, T0 + 5, b'{"a":1}'),
         Record("/lidar/packets", T0 + 10, T0 + 9, b"x"),
@@ -77,7 +77,7 @@ def test_equal_arrivals_in_several_chunks_come_in_the_order_of_sequence(tmp_path
     assert [r.sequence for r in read(tmp_path / "a.mcap")] == list(range(4000))
 
 
-def test_too_much_overlap_is_an_error_not_a_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_too_much_overlap_is_an_error_instead_of_memory_growth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(reader_module, "MAX_OVERLAP_BYTES", 3 * 2**20)
     write(tmp_path / "a.mcap", [lidar(i, T0) for i in range(5000)])
     with RecordingReader(tmp_path / "a.mcap") as reader, pytest.raises(LinkError, match=r"at byte [0-9]+ more than"):
@@ -90,7 +90,7 @@ def test_a_long_recording_needs_no_more_memory_than_a_short_one(tmp_path: Path, 
     assert len(read(tmp_path / "a.mcap")) == 10_000
 
 
-def test_topics_can_be_chosen_and_progress_reaches_the_end(tmp_path: Path):
+def test_topics_can_be_selected_and_progress_reaches_the_end(tmp_path: Path):
     servo = Record("/servo/state", T0 + 1, T0, b"{}")
     write(tmp_path / "a.mcap", [*(lidar(i, T0 + i) for i in range(3000)), servo])
     seen: list[tuple[int, int]] = []
@@ -103,17 +103,17 @@ def test_topics_can_be_chosen_and_progress_reaches_the_end(tmp_path: Path):
     assert seen[-1][0] == seen[-1][1] > 0
 
 
-def test_an_empty_recording_is_a_recording(tmp_path: Path):
+def test_an_empty_recording_is_valid(tmp_path: Path):
     write(tmp_path / "a.mcap", [])
     with RecordingReader(tmp_path / "a.mcap") as reader:
         assert list(reader.records()) == []
         assert (reader.topics, reader.start_ns, reader.end_ns, reader.finished) == ({}, 0, 0, True)
 
 
-# ---- what stands beside the records
+# ---- attachments and metadata
 
 
-def test_rig_config_metadata_and_channels_come_back(tmp_path: Path):
+def test_rig_config_metadata_and_channels_are_read_back(tmp_path: Path):
     channels = {"/lidar/packets": {"model": "VLP-16", "port": "2368", "sender": "192.168.1.201"}}
     texts = {"rig_yaml": "version: 1 # ü\n", "config_yaml": "stages: {}\n"}
     write(tmp_path / "a.mcap", [lidar(0, T0)], **texts, metadata={"place": "Tokyo"}, channels=channels)
@@ -161,7 +161,7 @@ def test_the_mcap_package_reads_it(tmp_path: Path):
     assert summary.statistics.channel_count == len(TOPICS)
 
 
-def test_camera_chunks_are_stored_as_they_are_and_all_others_compressed(tmp_path: Path):
+def test_camera_chunks_are_stored_uncompressed_and_all_others_compressed(tmp_path: Path):
     write(tmp_path / "a.mcap", [Record("/camera/drone", T0, T0, b"jpeg"), lidar(0, T0), Record("/mine", T0, T0, b"?")])
     with (tmp_path / "a.mcap").open("rb") as stream:
         summary = mcap.reader.make_reader(stream).get_summary()
@@ -206,12 +206,12 @@ def test_a_full_disk_at_the_start_is_explained():
 
 
 @pytest.mark.parametrize("record", [Record("/x", -1, 0, b""), Record("/x", 0, 2**63, b""), Record("/x", 0, -5, b"")])
-def test_times_that_the_format_cannot_hold_are_refused(tmp_path: Path, record: Record):
+def test_times_outside_the_range_of_the_format_are_rejected(tmp_path: Path, record: Record):
     with RecordingWriter(tmp_path / "a.mcap") as writer, pytest.raises(LinkError, match="times must be nanoseconds"):
         writer.write(record)
 
 
-def test_writing_after_close_is_refused_and_closing_twice_is_not(tmp_path: Path):
+def test_writing_after_close_is_an_error_and_closing_twice_is_not(tmp_path: Path):
     writer = RecordingWriter(tmp_path / "a.mcap")
     writer.close()
     writer.close()
@@ -235,7 +235,7 @@ def use_disk(monkeypatch: pytest.MonkeyPatch, path: Path, before: Callable[[], N
     monkeypatch.setattr(writer_module, "create", lambda *_, **__: io.BufferedWriter(Disk(path, before), 4096))
 
 
-def test_when_the_disk_hangs_write_goes_on_and_the_dropped_records_are_told(tmp_path, monkeypatch):
+def test_a_blocked_disk_does_not_block_writing_and_dropped_records_are_reported(tmp_path, monkeypatch):
     path, works = tmp_path / "a.mcap", threading.Event()
     works.set()
     use_disk(monkeypatch, path, works.wait)
@@ -283,7 +283,7 @@ def failing_disk(monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
     use_disk(monkeypatch, path, fill)
 
 
-def test_a_recording_that_could_not_be_begun_is_not_in_the_way_of_the_next_try(tmp_path, monkeypatch):
+def test_a_recording_that_failed_to_start_does_not_prevent_a_retry(tmp_path, monkeypatch):
     path = tmp_path / "a.mcap"
 
     def fail() -> None:
@@ -297,7 +297,7 @@ def test_a_recording_that_could_not_be_begun_is_not_in_the_way_of_the_next_try(t
     RecordingWriter(path).close()
 
 
-def test_a_disk_that_fills_up_is_told_at_close_and_what_is_on_it_can_be_read(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_at_close_and_the_written_part_is_readable(tmp_path, monkeypatch):
     path = tmp_path / "a.mcap"
     failing_disk(monkeypatch, path)
     writer = RecordingWriter(path, queue_bytes=2**30)
@@ -312,7 +312,7 @@ def test_a_disk_that_fills_up_is_told_at_close_and_what_is_on_it_can_be_read(tmp
     assert "messages readable" in report.warnings[0]
 
 
-def test_lossless_tells_of_a_full_disk_while_writing(tmp_path, monkeypatch):
+def test_lossless_reports_a_full_disk_while_writing(tmp_path, monkeypatch):
     failing_disk(monkeypatch, tmp_path / "a.mcap")
     writer = RecordingWriter(tmp_path / "a.mcap", lossless=True, queue_bytes=100_000)
 
@@ -344,7 +344,7 @@ def test_another_profile_is_named(tmp_path: Path):
         RecordingReader(mcap_of(tmp_path / "a.mcap", "ros2", None))
 
 
-def test_a_newer_major_version_is_refused_and_a_newer_minor_is_read(tmp_path: Path):
+def test_a_newer_major_version_is_rejected_and_a_newer_minor_is_read(tmp_path: Path):
     with pytest.raises(LinkError, match=r"format 2\.0 is newer than this grd, which reads up to 1\.x: update grd"):
         RecordingReader(mcap_of(tmp_path / "a.mcap", "grd", "2.0"))
     with RecordingReader(mcap_of(tmp_path / "b.mcap", "grd", "1.7")) as reader:
@@ -381,7 +381,7 @@ def test_a_missing_file_and_a_folder_are_named(tmp_path: Path):
         RecordingReader(tmp_path)
 
 
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path):
+def test_a_pipe_is_rejected_without_waiting(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(LinkError, match="is no regular file"):
         RecordingReader(tmp_path / "pipe")

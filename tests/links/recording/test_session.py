@@ -1,4 +1,4 @@
-"""A live recording in several parts is read as one, by every command; what of it is not read is said."""
+"""A live recording in several parts is read as one by every command; parts that are not read are reported."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def first(tmp_path):
     return split(STREET, folder, CUTS_S)
 
 
-def beside(first: Path, part: int) -> Path:
+def part_path(first: Path, part: int) -> Path:
     return first.with_stem(f"{first.stem}-{part}")
 
 
@@ -40,10 +40,14 @@ def keys(records):
     return [(r.topic, r.arrival_ns, r.stamp_ns, r.data) for r in records if r.topic != END_TOPIC]
 
 
-def test_all_parts_are_read_in_the_order_of_one_file_though_they_overlap(first):
+def test_overlapping_parts_are_read_in_the_order_of_one_file(first):
     session = Session(first)
     assert [path.name for path in session.parts] == ["flight.mcap", "flight-2.mcap", "flight-3.mcap"]
-    with RecordingReader(first) as part, RecordingReader(beside(first, 2)) as after, RecordingReader(STREET) as whole:
+    with (
+        RecordingReader(first) as part,
+        RecordingReader(part_path(first, 2)) as after,
+        RecordingReader(STREET) as whole,
+    ):
         assert after.start_ns < part.end_ns
         assert (session.start_ns, session.end_ns) == (whole.start_ns, whole.end_ns)
         assert session.rig_yaml == whole.rig_yaml
@@ -51,68 +55,68 @@ def test_all_parts_are_read_in_the_order_of_one_file_though_they_overlap(first):
     assert session.warnings == []
 
 
-def test_the_progress_goes_once_from_nothing_to_all(first):
-    told: list[tuple[int, int]] = []
-    for _ in Session(first).records(progress=lambda done, of: told.append((done, of))):
+def test_the_progress_increases_once_from_zero_to_all(first):
+    progress_steps: list[tuple[int, int]] = []
+    for _ in Session(first).records(progress=lambda done, of: progress_steps.append((done, of))):
         pass
-    done = [step for step, _ in told]
+    done = [step for step, _ in progress_steps]
     size = sum(path.stat().st_size for path in first.parent.iterdir())
-    assert {of for _, of in told} == {size}
+    assert {of for _, of in progress_steps} == {size}
     assert done == sorted(done)
     assert done[0] < size / 3
     assert done[-1] == size
 
 
-def test_a_part_is_opened_only_when_its_time_comes(first):
+def test_a_part_is_opened_when_its_time_is_reached(first):
     records = Session(first).records()
     next(records)
-    beside(first, 3).unlink()
+    part_path(first, 3).unlink()
     with pytest.raises(LinkError, match=r"flight-3\.mcap: no such file"):
         list(records)
 
 
-def test_a_replay_reads_all_parts_says_so_and_has_the_hash_of_one_file(first, tmp_path):
+def test_a_replay_reads_and_reports_all_parts_and_has_the_hash_of_one_file(first, tmp_path):
     text = grd("replay", first, "--out", tmp_path / "split")
     grd("replay", STREET, "--out", tmp_path / "whole")
-    apart, whole = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("split", "whole"))
+    split_run, whole = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("split", "whole"))
     assert f"{whole['records'] + 1} records in 3 parts, 5.3 s recorded" in text  # and the run's end
-    assert apart["parts"] == 3
+    assert split_run["parts"] == 3
     assert "parts" not in whole
-    assert apart["output_hash"] == whole["output_hash"]
-    assert apart["truth_errors"] == whole["truth_errors"]
-    assert apart["warnings"] == whole["warnings"]
+    assert split_run["output_hash"] == whole["output_hash"]
+    assert split_run["truth_errors"] == whole["truth_errors"]
+    assert split_run["warnings"] == whole["warnings"]
 
 
-def test_a_later_part_is_replayed_alone_and_that_is_said(first, tmp_path):
-    text = grd("replay", beside(first, 2), "--out", tmp_path / "two")
+def test_a_later_part_is_replayed_alone_and_this_is_reported(first, tmp_path):
+    text = grd("replay", part_path(first, 2), "--out", tmp_path / "two")
     assert "flight-2.mcap is part 2 of its run, and read alone" in text
     assert "where the first is named, flight.mcap" in text
     assert "1.5 s recorded" in text
     assert "parts" not in json.loads((tmp_path / "two" / "summary.json").read_text())
 
 
-def test_a_missing_part_is_said_and_the_others_are_read(first):
-    beside(first, 2).unlink()
+def test_a_missing_part_is_reported_and_the_others_are_read(first):
+    part_path(first, 2).unlink()
     session = Session(first)
     assert [path.name for path in session.parts] == ["flight.mcap", "flight-3.mcap"]
-    (said,) = session.warnings
-    assert "part 2 of this run is missing, there are 2 others: what it held is left out" in said
+    (warning,) = session.warnings
+    assert "part 2 of this run is missing, there are 2 others: what it held is left out" in warning
     with pytest.raises(LinkError, match="part 2 of this run is missing"):
         Session(first, whole=True)
 
 
-def test_a_missing_last_part_is_said_because_the_run_does_not_end(first):
-    beside(first, 3).unlink()
-    (said,) = Session(first).warnings
-    assert "flight-2.mcap: the last part here, and the run did not end in it" in said
+def test_a_missing_last_part_is_reported_because_the_run_does_not_end(first):
+    part_path(first, 3).unlink()
+    (warning,) = Session(first).warnings
+    assert "flight-2.mcap: the last part here, and the run did not end in it" in warning
 
 
-def test_a_part_of_another_run_with_such_a_name_and_one_that_cannot_be_read_are_said(first):
-    for path in (beside(first, 2), beside(first, 3)):
+def test_a_part_of_another_run_and_an_unreadable_part_are_reported(first):
+    for path in (part_path(first, 2), part_path(first, 3)):
         path.rename(path.with_stem(f"mine{path.stem[-1]}"))
     split(STREET, first.parent, (1.0,), run="another", name="other")
-    beside(first, 2).hardlink_to(first.with_stem("other-2"))
-    beside(first, 4).touch()
+    part_path(first, 2).hardlink_to(first.with_stem("other-2"))
+    part_path(first, 4).touch()
     session = Session(first)
     assert [path.name for path in session.parts] == ["flight.mcap", "mine2.mcap", "mine3.mcap"]
     foreign, empty = session.warnings
@@ -121,8 +125,8 @@ def test_a_part_of_another_run_with_such_a_name_and_one_that_cannot_be_read_are_
     assert "flight-4.mcap is empty" in empty
 
 
-def test_what_cannot_be_read_of_a_later_part_is_said(first):
-    damaged = beside(first, 2)
+def test_unreadable_data_of_a_later_part_is_reported(first):
+    damaged = part_path(first, 2)
     data = bytearray(damaged.read_bytes())
     data[len(data) // 2] ^= 0xFF
     damaged.write_bytes(data)
@@ -133,18 +137,18 @@ def test_what_cannot_be_read_of_a_later_part_is_said(first):
 
 
 @pytest.mark.parametrize("part_s", [(0.0, math.inf), (1.0, 4.0)])
-def test_a_calibration_takes_all_parts_as_it_takes_one_file(first, part_s):
-    apart, whole = gather(first, None, part_s), gather(STREET, None, part_s)
-    assert (apart.parts, whole.parts) == (3, 1)
-    assert apart.warnings == []
+def test_a_calibration_reads_all_parts_like_one_file(first, part_s):
+    split_run, whole = gather(first, None, part_s), gather(STREET, None, part_s)
+    assert (split_run.parts, whole.parts) == (3, 1)
+    assert split_run.warnings == []
     for field in ("stamp_ns", "laser", "xyz_lidar_m"):
-        assert np.array_equal(getattr(apart.returns, field), getattr(whole.returns, field))
-    assert (apart.seconds, apart.mount) == (whole.seconds, whole.mount)
-    assert apart.seconds > 2.9
+        assert np.array_equal(getattr(split_run.returns, field), getattr(whole.returns, field))
+    assert (split_run.seconds, split_run.mount) == (whole.seconds, whole.mount)
+    assert split_run.seconds > 2.9
 
 
-def test_calibrate_says_how_many_parts_it_took_and_what_is_missing(first, tmp_path):
-    beside(first, 3).unlink()
+def test_calibrate_reports_the_number_of_parts_and_missing_ones(first, tmp_path):
+    part_path(first, 3).unlink()
     text = grd("calibrate", first, "-o", tmp_path / "rig.yaml")
     assert "of the 2 parts of flight.mcap" in text
     assert "warning: " in text

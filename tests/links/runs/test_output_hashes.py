@@ -64,12 +64,12 @@ def test_no_two_message_types_share_a_schema_number():
         ("0000000000000000", False),
     ],
 )
-def test_a_hash_is_expected_whole_or_for_its_values_alone(expected, same):
+def test_a_hash_is_compared_whole_or_by_its_values_alone(expected, same):
     assert hash_matches(expected, "0123456789abcdef-fedcba9876543210") is same
 
 
 @pytest.mark.parametrize("expected", ["", "0123", "0123456789ABCDEF", "x" * 33])
-def test_what_is_no_output_hash_is_refused(expected):
+def test_an_invalid_output_hash_is_rejected(expected):
     with pytest.raises(LinkError, match="is not an output hash: give 16 hex digits"):
         hash_matches(expected, "0123456789abcdef-fedcba9876543210")
 
@@ -84,5 +84,5 @@ def test_pinning_one_recording_keeps_the_pins_of_others(tmp_path):
 
 
 def test_an_unknown_recording_is_named_with_those_there_are(tmp_path):
-    with pytest.raises(LinkError, match=r"no recording 'nonsense' in .*; there is none"):
-        read_pins(tmp_path, tmp_path, ("nonsense",))
+    with pytest.raises(LinkError, match=r"no recording 'unknown' in .*; there is none"):
+        read_pins(tmp_path, tmp_path, ("unknown",))

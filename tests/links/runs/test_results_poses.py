@@ -55,7 +55,7 @@ def test_a_pose_is_a_line_of_both_files_and_reads_back(run):
     assert back.sendable.tolist() == [True, True]
 
 
-def test_each_pose_tells_which_drone_it_is_of(run):
+def test_each_pose_has_the_number_of_its_drone(run):
     known = [
         MapEstimate(t * S, None, np.array([x, 2.0, 3.0]), np.eye(6), np.zeros(3), np.eye(3))
         for t, x in ((1, 1), (2, 30))
@@ -78,7 +78,7 @@ def test_a_pose_without_rotation_is_marked_and_its_variance_is_no_infinity(run):
     assert (folder / POSE_FILE).read_text().splitlines()[1].endswith(" 0 0 0 1")
 
 
-def test_a_pose_is_good_when_the_autopilots_gate_lets_it_out(tmp_path):
+def test_a_pose_is_good_when_the_autopilot_gate_accepts_it(tmp_path):
     R, wide, askew = rotation_z(0.5), (0.001,) * 3 + (0.01, 0.01, 0.16), (0.001, 0.001, 0.01, 0.01, 0.01, 0.01)
     for limits, expected in (
         (PoseLimits(), [True, False, False]),
@@ -94,16 +94,16 @@ def test_a_pose_is_good_when_the_autopilots_gate_lets_it_out(tmp_path):
         assert [row["rotation"] for row in rows] == ["1"] * 3
 
 
-def test_a_lost_drone_has_no_line_and_the_log_tells_each_change(run):
+def test_a_lost_drone_has_no_line_and_the_log_has_each_change(run):
     R = np.eye(3)
     messages = [lost(S, status(PoseState.LOST)), made(1.02, R), made(1.04, R), lost(2 * S, status(PoseState.LOST))]
     folder = run(messages)
     assert len((folder / POSE_FILE).read_text().splitlines()) == 2 + 1
-    told = [line for line in (folder / "run.log").read_text().splitlines() if "fuse.relative_pose" in line]
-    assert [line.split(": ", 1)[1] for line in told] == ["LOST: why LOST", "FULL: why FULL", "LOST: why LOST"]
+    lines = [line for line in (folder / "run.log").read_text().splitlines() if "fuse.relative_pose" in line]
+    assert [line.split(": ", 1)[1] for line in lines] == ["LOST: why LOST", "FULL: why FULL", "LOST: why LOST"]
 
 
-def test_a_run_in_which_nobody_fuses_has_no_poses_not_even_old_ones(run):
+def test_a_run_without_fusion_has_no_poses_and_removes_old_ones(run):
     folder = run([made(1.0, np.eye(3))])
     assert (folder / POSE_FILE).exists()
     run([])
@@ -120,7 +120,7 @@ def test_a_number_that_is_not_known_is_empty(run):
     assert (row["nis"], row["measured_s"]) == ("", "")
 
 
-def test_poses_are_counted_by_state_and_their_jumps_told(tmp_path):
+def test_poses_are_counted_by_state_and_their_jumps_reported(tmp_path):
     results = Results()
     results.open(Run(tmp_path, "made", "", ""))
     assert results.pose_states == {}
@@ -138,5 +138,5 @@ def test_poses_are_counted_by_state_and_their_jumps_told(tmp_path):
 
 
 @pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (SweptPulses, False)])
-def test_a_live_run_hands_over_only_what_the_files_hold(kind, wanted):
+def test_a_live_run_passes_on_only_the_contents_of_the_files(kind, wanted):
     assert Results().wants(kind) is wanted

@@ -25,7 +25,7 @@ def clock(monkeypatch):
     return to
 
 
-def test_a_look_is_taken_when_it_is_due_and_no_more_often(clock):
+def test_a_sample_is_taken_when_it_is_due_and_no_more_often(clock):
     used = Usage()
     for elapsed_s in (0.0, 0.4, 1.0, 1.5, 2.1):
         clock(elapsed_s)
@@ -38,7 +38,7 @@ def test_a_look_is_taken_when_it_is_due_and_no_more_often(clock):
     assert used.columns["cpu_s"] == sorted(used.columns["cpu_s"])
 
 
-def test_an_hour_has_no_more_looks_than_some_minutes_and_keeps_its_start(clock):
+def test_an_hour_has_a_bounded_number_of_samples_and_keeps_its_start(clock):
     used = Usage()
     for elapsed_s in range(3600):
         clock(float(elapsed_s))
@@ -69,5 +69,5 @@ def test_other_processes_count_while_they_run(clock):
     assert used.subprocesses_cpu_s == 0.0
 
 
-def test_without_a_look_there_is_nothing_to_tell(clock):
+def test_without_a_sample_there_is_no_report(clock):
     assert str(Usage()) == ""

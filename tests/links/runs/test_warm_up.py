@@ -31,18 +31,18 @@ def recording(folder, *values):
     return folder / "warm.mcap"
 
 
-def test_the_graph_runs_over_the_whole_recording_and_tells_how_far_it_is(graph, tmp_path):
-    told = []
-    assert warm_up(graph, lambda done, total: told.append((done, total)), recording(tmp_path, b"1", b"2")) is None
-    assert told[-1][0] == told[-1][1] > 0
+def test_the_graph_runs_over_the_whole_recording_and_reports_progress(graph, tmp_path):
+    progress = []
+    assert warm_up(graph, lambda done, total: progress.append((done, total)), recording(tmp_path, b"1", b"2")) is None
+    assert progress[-1][0] == progress[-1][1] > 0
 
 
-def test_a_stage_that_raises_and_a_recording_that_is_not_there_are_told_and_no_more(graph, tmp_path):
-    said = warm_up(graph, lambda done, total: None, recording(tmp_path, b"1", b"666"))
-    assert said.startswith("warm-up on warm.mcap failed, the first messages may be late: brittle.number")
-    said = warm_up(graph, lambda done, total: None, tmp_path / "none.mcap")
-    assert "none.mcap: no such file" in said
+def test_a_stage_that_raises_and_a_missing_recording_are_only_reported(graph, tmp_path):
+    status = warm_up(graph, lambda done, total: None, recording(tmp_path, b"1", b"666"))
+    assert status.startswith("warm-up on warm.mcap failed, the first messages may be late: brittle.number")
+    status = warm_up(graph, lambda done, total: None, tmp_path / "none.mcap")
+    assert "none.mcap: no such file" in status
 
 
-def test_the_recording_for_it_comes_with_grd():
+def test_its_recording_is_part_of_grd():
     assert RECORDING.is_file()

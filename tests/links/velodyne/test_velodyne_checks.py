@@ -48,7 +48,7 @@ def test_an_absent_lidar_reports_the_status_of_its_link():
     assert "the recording holds nothing on /lidar/packets" in result.sentence
 
 
-def test_packets_of_another_device_are_reported_as_refused():
+def test_packets_of_another_device_are_reported_as_rejected():
     noise = [Record("/lidar/packets", BEGIN_NS + k * PACKET_NS, BEGIN_NS + k * PACKET_NS, b"x" * 9) for k in range(50)]
     (result,) = lidar_checks(observe(Lidar(), noise))
     assert result.level is Level.FAIL

@@ -205,6 +205,6 @@ def test_with_a_free_clock_a_lost_lock_is_not_reported(ports):
         assert lidar.status is None
 
 
-def test_clock_utc_without_position_packets_is_refused_live(ports):
+def test_clock_utc_without_position_packets_is_rejected_live(ports):
     with pytest.raises(LinkError, match=r"set position_port: 8308.*or clock: free"), Lidar(clock="utc").listen():
         pass

@@ -118,7 +118,7 @@ def test_a_gap_ends_a_message_and_the_next_one_holds_the_number_of_lost_packets(
     assert [message.lost_packets for message in messages if message] == [0, 3]
 
 
-def test_a_refused_packet_ends_a_message_and_keeps_the_packets_before_it():
+def test_a_rejected_packet_ends_a_message_and_keeps_the_packets_before_it():
     records = exact_records(6)
     with_bad = [*records[:2], record(packet(step=3_000, time_us=2_654), 2_654_208), *records[3:]]
     messages = decoded(with_bad, 3)
@@ -168,7 +168,7 @@ def test_dual_return_blocks_of_one_pulse_share_their_azimuth():
 @pytest.mark.parametrize(
     ("product", "name"), [(HDL32E, "HDL-32E"), (PUCK_HI_RES, "Puck Hi-Res"), (0x28, "VLP-32C"), (0xA1, "VLS-128")]
 )
-def test_another_model_is_refused_by_name_at_its_first_packet(product, name):
+def test_another_model_is_rejected_by_name_at_its_first_packet(product, name):
     with pytest.raises(LinkError, match=rf"Velodyne {name}.*grd supports the VLP-16"):
         Lidar().decode(record(packet(product=product)))
 
@@ -181,7 +181,7 @@ def test_an_hdl64_is_recognised_by_its_lower_blocks():
         Lidar().decode(record(bytes(data)))
 
 
-def test_a_real_hdl32_capture_is_refused_by_name():
+def test_a_real_hdl32_capture_is_rejected_by_name():
     with pytest.raises(LinkError, match=r"HDL-32E \(product id 0x21\)"):
         Lidar().decode(record(captured("hdl32_mrpt_WRONG_MODEL")[0][1]))
 

@@ -11,10 +11,12 @@ import numpy as np
 from flow.message import Message
 from stages.geometry.frames import LidarMount, Pose, rotation_z
 from stages.messages import (
+    CandidateEvidence,
     Candidates,
     DepthImage,
     Detections,
     DroneFix,
+    KernelScores,
     LidarFirings,
     ScoreImage,
     ServoGoal,
@@ -139,12 +141,10 @@ def detections(stamp_ns: int) -> Detections:
     return Detections(
         stamp_ns=stamp_ns,
         xyz_vehicle_m=xyz,
-        score=np.array([12.4, 88.0, 140.2]),
-        e_inner=np.array([2.0, 0.0, 60.0]),
-        e_outer=np.array([10.4, 88.0, 80.2]),
         accepted=np.array([True, False, False]),
         reasons=("drone: e = 12.4, lowest", "e_outer 88 over 40: touches a facade", "e_inner 60 over 20: not compact"),
         summary="drone at x 6.8, y 3.1, z 12.3 m: e = 12.4, the next is 88.0",
+        evidence=KernelScores(e_inner=np.array([2.0, 0.0, 60.0]), e_outer=np.array([10.4, 88.0, 80.2])),
     )
 
 
@@ -183,8 +183,6 @@ def run(duration_s: float) -> Iterator[tuple[str, Message]]:
                     xyz_vehicle_m=drone_xyz(t_s) + noise,
                     covariance_m2=covariance,
                     hits=hits,
-                    iterations=4,
-                    shift_m=0.004,
                 )
                 yield "track.drone_fix", fix
             state = TrackState(
@@ -224,9 +222,10 @@ def candidates(stamp_ns: int, t_s: float) -> Candidates:
         seen_ns=np.full(n, stamp_ns - 20_000_000),
         scan_passes=np.full(n, 4),
         reasons=(
-            "9 looks; 8 of 8 sectors around it free",
+            "9 scan passes; 8 of 8 sectors around it free",
             "next to a large object; if not a drone, a lamp, wire or edge",
         )[:n],
+        accept_probability=0.95,
     )
 
 
@@ -235,17 +234,17 @@ def classified(stamp_ns: int, t_s: float) -> Detections:
     return Detections(
         stamp_ns=stamp_ns,
         xyz_vehicle_m=np.array([drone_xyz(t_s), [-16.0, -23.0, 8.0]]),
-        score=np.array([4.8, -4.6]),
-        e_inner=np.zeros(2),
-        e_outer=np.zeros(2),
         accepted=np.array([True, False]),
-        reasons=("9 looks", "next to a large object; if not a drone, a lamp, wire or edge"),
-        summary="drone at (6.8, 3.1, 12.3) m, 99.2 %: 9 looks",
-        start_ns=START_NS,
-        seen_ns=np.full(2, stamp_ns),
-        velocity_vehicle_mps=np.zeros((2, 3)),
-        probability=np.array([0.992, 0.01]),
-        candidate_id=np.array([3, 5]),
+        reasons=("9 scan passes", "next to a large object; if not a drone, a lamp, wire or edge"),
+        summary="drone at (6.8, 3.1, 12.3) m, 99.2 %: 9 scan passes",
+        evidence=CandidateEvidence(
+            start_ns=START_NS,
+            candidate_id=np.array([3, 5]),
+            seen_ns=np.full(2, stamp_ns),
+            velocity_vehicle_mps=np.zeros((2, 3)),
+            log_odds=np.array([4.8, -4.6]),
+            probability=np.array([0.992, 0.01]),
+        ),
     )
 
 
@@ -264,8 +263,6 @@ def tracks(stamp_ns: int, t_s: float, second_lost_s: float) -> Iterator[tuple[st
                     xyz_vehicle_m=xyz,
                     covariance_m2=np.diag([0.05, 0.06, 0.09]) ** 2,
                     hits=3,
-                    iterations=1,
-                    shift_m=0.0,
                     track_id=number,
                     velocity_vehicle_mps=velocity,
                 ),

@@ -23,7 +23,8 @@ CAMERA = {
     "max_off_axis_deg": 110.0,
 }
 RIG_CAMERAS = {
-    "vehicle": CAMERA | {"T_vehicle_camera": {"rpy_deg": [0.0, 0.0, 90.0]}},  # looks up, image right is left's opposite
+    "vehicle": CAMERA
+    | {"T_vehicle_camera": {"rpy_deg": [0.0, 0.0, 90.0]}},  # points up, image right is left's opposite
     "drone": CAMERA | {"T_drone_camera": {"rpy_deg": [180.0, 0.0, -90.0]}},
 }
 CAMERAS = Cameras.model_validate(RIG_CAMERAS)

@@ -110,7 +110,7 @@ def test_a_line_is_drawn_at_the_projection_of_its_rays():
     )  # the zenith; the nadir is outside the field of view
 
 
-def test_the_drones_camera_looks_down():
+def test_the_drones_camera_points_down():
     where = camera_scene()
     drawn(camera_image(0, "camera_drone"), "camera_drone/image", where)
     ends = np.array([[0.0, 0.0, -1.0], [np.sin(0.5), 0.0, -np.cos(0.5)]])

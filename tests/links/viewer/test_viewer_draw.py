@@ -15,7 +15,16 @@ from links.viewer import colours, draw_sensors
 from links.viewer.entities import ellipsoid
 from links.viewer.scene import initial_frames, static_entities, turntable_transform
 from stages.geometry.frames import quaternions_xyzw, rotation_from_quaternion_xyzw, rotation_from_rpy_deg
-from stages.messages import DepthImage, Detections, DroneFix, ScoreImage, ServoState, TrackingState, TrackState
+from stages.messages import (
+    DepthImage,
+    Detections,
+    DroneFix,
+    KernelScores,
+    ScoreImage,
+    ServoState,
+    TrackingState,
+    TrackState,
+)
 
 
 def fix(stamp_ns: int = 0, xyz=(3.0, 4.0, 12.0), covariance=None) -> DroneFix:
@@ -24,8 +33,6 @@ def fix(stamp_ns: int = 0, xyz=(3.0, 4.0, 12.0), covariance=None) -> DroneFix:
         xyz_vehicle_m=np.array(xyz),
         covariance_m2=np.diag([0.01, 0.04, 0.09]) if covariance is None else covariance,
         hits=5,
-        iterations=3,
-        shift_m=0.001,
     )
 
 
@@ -110,9 +117,7 @@ def test_candidates_have_rings_at_their_pixels_in_the_depth_image():
     candidates = Detections(
         stamp_ns=0,
         xyz_vehicle_m=np.array([[2.0, -1.0, 10.25], [1.0, 1.0, 5.25], [0.0, 0.0, -3.0]]),
-        score=np.array([1.0, 2.0, 3.0]),
-        e_inner=np.zeros(3),
-        e_outer=np.zeros(3),
+        evidence=KernelScores(e_inner=np.zeros(3), e_outer=np.array([1.0, 2.0, 3.0])),
         accepted=np.array([True, False, False]),
         reasons=("lowest", "touches a wall", "below"),
         summary="drone at 10.4 m",
@@ -140,9 +145,7 @@ def test_a_search_without_candidates_is_drawn_as_no_drone():
     nothing = Detections(
         stamp_ns=0,
         xyz_vehicle_m=np.zeros((0, 3)),
-        score=np.zeros(0),
-        e_inner=np.zeros(0),
-        e_outer=np.zeros(0),
+        evidence=KernelScores(e_inner=np.zeros(0), e_outer=np.zeros(0)),
         accepted=np.zeros(0, dtype=bool),
         reasons=(),
         summary="no drone: no candidate",

@@ -37,6 +37,7 @@ def candidates(stamp_ns: int, **found: tuple[float, str]) -> Candidates:
         seen_ns=np.full(n, stamp_ns - 500_000_000),
         scan_passes=np.full(n, 3),
         reasons=tuple(why for _, why in found.values()),
+        accept_probability=0.95,
     )
 
 
@@ -68,14 +69,14 @@ def fix(number: int = 1, stamp_ns: int = 0, x_m: float = 3.0):
 
 
 def test_a_candidate_is_a_coloured_point_with_number_and_reason():
-    found = candidates(0, c7=(0.2, "it may be static"), c3=(0.999, "9 looks"))
+    found = candidates(0, c7=(0.2, "it may be static"), c3=(0.999, "9 scan passes"))
     entities = drawn(found, "detect/candidates")
     dots = entities["vehicle/detect/candidates"]
     assert dots.frame == "vehicle"
     np.testing.assert_allclose(numbers(dots.archetypes[0].positions), [[1, 2, 7], [1, 2, 3]])
     assert values_of(dots.archetypes[0].labels) == [
         "candidate 7: 20.0 %, it may be static",
-        "candidate 3: 99.9 %, 9 looks",
+        "candidate 3: 99.9 %, 9 scan passes",
     ]
     assert values_of(entities["labels/detect/candidates"].archetypes[0].labels) == ["7: 20.0 %", "3: 99.9 %"]
     packed = numbers(dots.archetypes[0].colors).astype(int).ravel().tolist()
@@ -132,7 +133,7 @@ def test_detections_list_the_reason_for_each_rejected_candidate():
     answer = next(c for output, c in synthetic.run_by_evidence(2.0) if output == "detect.detections")
     entities = drawn(answer, "detect/detections")
     assert values_of(entities["vehicle/detect/detections/accepted"].archetypes[0].labels) == [
-        "candidate 3, 99.2 %: 9 looks"
+        "candidate 3, 99.2 %: 9 scan passes"
     ]
     assert values_of(entities["vehicle/detect/detections/rejected"].archetypes[0].labels) == [
         "candidate 5, 1.0 %: next to a large object; if not a drone, a lamp, wire or edge"

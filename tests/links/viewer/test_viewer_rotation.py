@@ -25,7 +25,7 @@ def scalars(entity) -> list[float]:
 
 def at_a_fix():
     where = scene()
-    at = DroneFix(stamp_ns=0, xyz_vehicle_m=np.ones(3), covariance_m2=np.eye(3), hits=3, iterations=1, shift_m=0.0)
+    at = DroneFix(stamp_ns=0, xyz_vehicle_m=np.ones(3), covariance_m2=np.eye(3), hits=3)
     drawn(at, "track/drone_fix", where)
     return where
 
@@ -38,7 +38,7 @@ def test_the_four_branches_and_none_of_them_are_curves_that_sum_to_all():
 
 
 @pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (10.0, -20.0, 170.0), (-179.0, 80.0, -90.0)])
-def test_angles_come_back_from_a_rotation(rpy):
+def test_angles_round_trip_through_a_rotation(rpy):
     np.testing.assert_allclose(rpy_deg(rotation_from_rpy_deg(rpy)), rpy, atol=1e-9)
 
 

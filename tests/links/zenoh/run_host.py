@@ -38,7 +38,12 @@ def main() -> None:
             report = live.report()
             statuses = {name: link.status for name, link in live.nodes.items() if link.status}
             events = [str(event) for event in report.events]
-            print_line(kind="report", counters=report.counters, statuses=statuses, events=events)
+            print_line(
+                kind="report",
+                counters={name: dict(c) for name, c in report.counters.items()},
+                statuses=statuses,
+                events=events,
+            )
     begin_s = time.monotonic()
     live.stop()
     print_line(kind="stopped", took_s=time.monotonic() - begin_s)

@@ -1,4 +1,4 @@
-"""BeamAim with a servo and a rotor that obey physics: what the beams meet, turn by turn, is followed ray by ray."""
+"""BeamAim with a simulated servo and rotor. The distance of each beam from the drone is computed ray by ray."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stages.aim.beam_aim import INNER_RAD
 from stages.aim.targets import Targets
 from stages.geometry.frames import Harmonic, LidarMount
 from stages.messages import Candidates, ServoGoal, TrackingState, TrackState
-from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Way, beams_lidar, beams_vehicle, flying, packet, still
+from tests.stages.caster import LASER, PULSE_NS, TURN_NS, Trajectory, beams_lidar, beams_vehicle, flying, packet, still
 from tests.stages.made import MS, ON_ITS_SIDE, PACKET_NS, START_NS, servo
 
 TICK_NS = 5 * MS  # 200 servo states a second
@@ -26,48 +26,48 @@ LIMIT_RADPS = 55 * math.tau / 60
 
 @dataclass
 class Flight:
-    """What happened."""
+    """Servo positions and goals of a run."""
 
     mount: LidarMount
     stamp_ns: list[int] = field(default_factory=list)
     servo_rad: list[float] = field(default_factory=list)
-    goals: list[tuple[float, ServoGoal]] = field(default_factory=list)  # with the second each was given
+    goals: list[tuple[float, ServoGoal]] = field(default_factory=list)  # with the time [s] of each
 
-    def missed_m(self, way: Way) -> np.ndarray:
-        """How far from the place the nearest pulse of each turn of the rotor passed, (turns,)."""
+    def missed_m(self, trajectory: Trajectory) -> np.ndarray:
+        """Distance of the nearest pulse from the drone in each rotor turn, (turns,)."""
         packets = (self.stamp_ns[-1] - START_NS) // PACKET_NS
         nearest = np.full((self.stamp_ns[-1] - START_NS) // TURN_NS + 1, np.inf)
         for first in range(0, packets, 16):  # few at once stay in the processor's cache
             which = np.arange(first, min(first + 16, packets))
             stamps = (START_NS + which[:, np.newaxis] * PACKET_NS + PULSE_NS).ravel()
-            table_rad = hung_back(self.servo_rad, math.radians(self.mount.servo_play_deg) / 2)
+            table_rad = table_with_backlash(self.servo_rad, math.radians(self.mount.servo_play_deg) / 2)
             servo_rad = np.interp(stamps - START_NS, np.array(self.stamp_ns) - START_NS, table_rad)
             beams = beams_lidar(stamps, np.tile(LASER, len(which)))
             origin_m, direction = beams_vehicle(self.mount, servo_rad, beams)
-            line = way((stamps - START_NS) * 1e-9) - origin_m
+            line = trajectory((stamps - START_NS) * 1e-9) - origin_m
             along = np.einsum("ij,ij->i", direction, line)
             rho2 = np.where(along > 0, np.einsum("ij,ij->i", line, line) - along**2, np.inf)
             np.minimum.at(nearest, (stamps - START_NS) // TURN_NS, rho2)
         return np.sqrt(np.maximum(nearest[:-1], 0.0))  # the last turn is not whole
 
     def ends_reached(self):
-        """Goals of a sweep, in order, without those that repeat."""
-        places = [round(goal.position_rad, 3) for _, goal in self.goals]
-        return [p for i, p in enumerate(places) if i == 0 or p != places[i - 1]]
+        """Goals of a sweep, in order, without repetitions."""
+        goals = [round(goal.position_rad, 3) for _, goal in self.goals]
+        return [goal for i, goal in enumerate(goals) if i == 0 or goal != goals[i - 1]]
 
 
-def hung_back(servo_rad: list[float], half_play_rad: float) -> list[float]:
-    """Where a table with play stands while the servo goes this way: it is taken along at either end of the play."""
+def table_with_backlash(servo_rad: list[float], half_play_rad: float) -> list[float]:
+    """Table angles (n,) for servo angles (n,): the table follows the servo at either end of the backlash."""
     table = servo_rad[0]
     return [table := min(max(table, servo - half_play_rad), servo + half_play_rad) for servo in servo_rad]
 
 
-Tell = Callable[[BeamAim, float], None]
+Publisher = Callable[[BeamAim, float], None]
 
 
-def fly(aim: BeamAim, seconds: float, tell: Tell, start_rad=0.3, rotor=True, latency_s=LATENCY_S) -> Flight:
-    """Let the aim drive a servo that obeys after the latency, at most at 55 rpm."""
-    flight, position, orders, packets = Flight(aim.settings.mount), start_rad, [], 0
+def fly(aim: BeamAim, seconds: float, publish: Publisher, start_rad=0.3, rotor=True, latency_s=LATENCY_S) -> Flight:
+    """Run the stage in closed loop with a servo that follows after the latency, at most at 55 rpm."""
+    flight, position, pending, packets = Flight(aim.settings.mount), start_rad, [], 0
     low, high = (math.radians(v) for v in aim.settings.travel_deg)
     goal: ServoGoal | None = None
     for stamp_ns in range(START_NS, START_NS + round(seconds * 1e9), TICK_NS):
@@ -75,15 +75,15 @@ def fly(aim: BeamAim, seconds: float, tell: Tell, start_rad=0.3, rotor=True, lat
         while rotor and START_NS + packets * PACKET_NS + PULSE_NS[-1] < stamp_ns:
             aim.on_firings(packet(START_NS + packets * PACKET_NS + PULSE_NS, np.zeros(384)))
             packets += 1
-        tell(aim, t_s)
-        decided = aim.on_servo(servo(stamp_ns, position))
-        if decided is not None:
-            assert low - 1e-9 <= decided.position_rad <= high + 1e-9
-            assert 0 < decided.speed_radps <= LIMIT_RADPS + 1e-9
-            orders.append((stamp_ns + round(latency_s * 1e9), decided))
-            flight.goals.append((t_s, decided))
-        while orders and orders[0][0] <= stamp_ns:
-            goal = orders.pop(0)[1]
+        publish(aim, t_s)
+        new_goal = aim.on_servo(servo(stamp_ns, position))
+        if new_goal is not None:
+            assert low - 1e-9 <= new_goal.position_rad <= high + 1e-9
+            assert 0 < new_goal.speed_radps <= LIMIT_RADPS + 1e-9
+            pending.append((stamp_ns + round(latency_s * 1e9), new_goal))
+            flight.goals.append((t_s, new_goal))
+        while pending and pending[0][0] <= stamp_ns:
+            goal = pending.pop(0)[1]
         flight.stamp_ns.append(stamp_ns)
         flight.servo_rad.append(position)
         if goal is not None:
@@ -92,8 +92,10 @@ def fly(aim: BeamAim, seconds: float, tell: Tell, start_rad=0.3, rotor=True, lat
     return flight
 
 
-def track_state(way: Way, t_s: float, state=TrackingState.TRACKING, track_id=1, sigma_m=0.05) -> TrackState:
-    place, soon = way(np.array([t_s, t_s + 0.01]))
+def track_state(
+    trajectory: Trajectory, t_s: float, state=TrackingState.TRACKING, track_id=1, sigma_m=0.05
+) -> TrackState:
+    position_m, soon = trajectory(np.array([t_s, t_s + 0.01]))
     return TrackState(
         stamp_ns=START_NS + round(t_s * 1e9),
         state=state,
@@ -101,37 +103,38 @@ def track_state(way: Way, t_s: float, state=TrackingState.TRACKING, track_id=1, 
         hits=3,
         frame_s=0.1,
         track_id=track_id,
-        xyz_vehicle_m=np.array(place),
-        velocity_vehicle_mps=(soon - place) / 0.01,
+        xyz_vehicle_m=np.array(position_m),
+        velocity_vehicle_mps=(soon - position_m) / 0.01,
         covariance_m2=sigma_m**2 * np.eye(3),
     )
 
 
-def tracking(*ways: Way, until_s=math.inf) -> Tell:
-    """Ten times a second, where each drone is."""
+def tracking(*trajectories: Trajectory, until_s=math.inf) -> Publisher:
+    """Publish each drone's position at 10 Hz."""
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if round(t_s * 1000) % 100 == 0 and t_s < until_s:
-            for i, way in enumerate(ways):
-                aim.on_state(track_state(way, t_s, track_id=i + 1))
+            for i, trajectory in enumerate(trajectories):
+                aim.on_state(track_state(trajectory, t_s, track_id=i + 1))
 
-    return tell
+    return publish
 
 
 def candidates(
-    place_m, t_s, probability, looks=3, seen_s=None, undirected_speed_mps=0.0, detector_instance=START_NS
+    position_m, t_s, probability, scan_passes=3, seen_s=None, undirected_speed_mps=0.0, detector_instance=START_NS
 ) -> Candidates:
-    """One candidate; seen_s: when it was seen last, None: now."""
+    """One candidate; seen_s: time of its last return, None: t_s."""
     return Candidates(
         detector_instance=detector_instance,
         stamp_ns=START_NS + round(t_s * 1e9),
         candidate_id=np.array([1]),
-        xyz_vehicle_m=np.array([place_m], dtype=np.float64),
+        xyz_vehicle_m=np.array([position_m], dtype=np.float64),
         velocity_vehicle_mps=np.zeros((1, 3)),
         probability=np.array([probability]),
         seen_ns=np.array([START_NS + round((t_s if seen_s is None else seen_s) * 1e9)]),
-        scan_passes=np.array([looks]),
+        scan_passes=np.array([scan_passes]),
         reasons=("made",),
+        accept_probability=0.95,
         undirected_speed_mps=np.array([undirected_speed_mps]),
     )
 
@@ -140,7 +143,7 @@ def nothing(aim, t_s):
     pass
 
 
-def towards(azimuth_deg, elevation_deg, range_m=20.0) -> Way:
+def towards(azimuth_deg, elevation_deg, range_m=20.0) -> Trajectory:
     a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
     x, y, z = (range_m * v for v in (math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)))
     return still(x, y, z + 0.35)
@@ -152,7 +155,7 @@ def test_ports_are_what_the_graph_wires():
     assert "candidates" in BeamAim.optional_inputs
 
 
-def test_without_a_target_it_sweeps_the_whole_travel_to_and_fro():
+def test_without_a_target_it_sweeps_the_whole_travel_forth_and_back():
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 5.0, nothing)
     ends = flight.ends_reached()
     assert ends[:3] in ([3.142, 0.0, 3.142], [0.0, 3.142, 0.0])
@@ -160,8 +163,8 @@ def test_without_a_target_it_sweeps_the_whole_travel_to_and_fro():
     assert 3 <= len(flight.goals) <= 6  # a new goal at the ends, not in between
 
 
-def test_a_search_looks_at_every_direction_but_for_the_gaps_between_beams():
-    """No place in the sky is passed by farther than 0.7 beam spacings, also none that a beat would hide."""
+def test_a_search_covers_every_direction_except_the_gaps_between_beams():
+    """Each direction is passed within 0.7 beam spacings, also where aliasing of rotor and servo would hide it."""
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 2.2, nothing, start_rad=0.0)
     rng = np.random.default_rng(0)
     for azimuth, elevation in zip(rng.uniform(0, 360, 8), rng.uniform(15, 75, 8), strict=True):
@@ -181,20 +184,22 @@ DIRECTIONS = {
 
 @pytest.mark.parametrize("where", DIRECTIONS)
 def test_a_beam_is_on_the_drone_turn_after_turn(where):
-    way = towards(*DIRECTIONS[where])
-    missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tracking(way), start_rad=1.0).missed_m(way)[10:]
-    assert np.mean(missed < 0.2) > 0.75  # the rest is beside it on purpose
+    trajectory = towards(*DIRECTIONS[where])
+    missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tracking(trajectory), start_rad=1.0).missed_m(trajectory)[10:]
+    assert np.mean(missed < 0.2) > 0.75  # the others have an offset on purpose
     assert missed.max() < 0.35
     on_it = np.nonzero(missed < 0.2)[0]
-    assert np.diff([-1, *on_it, len(missed)]).max() <= 4  # never 0.4 s without
-    assert np.std(missed) > 0.005  # not always at the same spot of it: a little beside it in turn
+    assert np.diff([-1, *on_it, len(missed)]).max() <= 4  # at most 0.4 s without
+    assert np.std(missed) > 0.005  # the offsets alternate
 
 
-def test_the_middle_of_the_fan_would_leave_it_between_two_beams():
-    way = towards(*DIRECTIONS["to the side"])
-    missed = fly(BeamAim(mount=ON_ITS_SIDE, beams=False), 3.0, tracking(way)).missed_m(way)[10:]
+def test_with_the_middle_of_the_fan_the_drone_lies_between_two_beams():
+    trajectory = towards(*DIRECTIONS["to the side"])
+    missed = fly(BeamAim(mount=ON_ITS_SIDE, beams=False), 3.0, tracking(trajectory)).missed_m(trajectory)[10:]
     assert np.median(missed) > 0.25  # 1 deg at 20 m is 0.35 m
-    assert np.median(missed) > 3 * np.median(fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tracking(way)).missed_m(way)[10:])
+    assert np.median(missed) > 3 * np.median(
+        fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tracking(trajectory)).missed_m(trajectory)[10:]
+    )
 
 
 def test_a_calibrated_mount_with_sign_zero_and_harmonics_is_aimed_as_well():
@@ -205,96 +210,96 @@ def test_a_calibrated_mount_with_sign_zero_and_harmonics_is_aimed_as_well():
             "servo_harmonics": (Harmonic(order=1, amplitude_deg=1.0, phase_deg=30.0),),
         }
     )
-    way = towards(70.0, 45.0)
-    missed = fly(BeamAim(mount=mount), 3.0, tracking(way)).missed_m(way)[10:]
+    trajectory = towards(70.0, 45.0)
+    missed = fly(BeamAim(mount=mount), 3.0, tracking(trajectory)).missed_m(trajectory)[10:]
     assert np.mean(missed < 0.2) > 0.85
 
 
-def test_the_gears_play_is_made_good_whichever_way_the_table_turns():
+def test_the_gears_backlash_is_compensated_in_both_directions():
     mount = ON_ITS_SIDE.model_copy(update={"servo_play_deg": 2.0})
     there_and_back = lambda t: np.stack([14.0 + 0 * t, 3.0 * np.sin(2.0 * t), 14.0 + 0 * t], axis=-1)  # noqa: E731
     missed = fly(BeamAim(mount=mount), 5.0, tracking(there_and_back)).missed_m(there_and_back)[10:]
-    assert np.median(missed) < 0.1  # half the play is .35 m there
+    assert np.median(missed) < 0.1  # half the backlash is 0.35 m there
     assert np.mean(missed < 0.2) > 0.8
 
 
 @pytest.mark.parametrize("latency_s", [0.0, LATENCY_S, 0.045])
 @pytest.mark.parametrize("velocity", [(8.0, 0.0, 0.0), (0.0, -6.0, 3.0)])
-def test_a_fast_drone_is_led_however_soon_the_servo_obeys(velocity, latency_s):
-    way = flying(np.array([-8.0, 12.0, 12.0]), velocity)
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 2.5, tracking(way), start_rad=2.0, latency_s=latency_s)
-    missed = flight.missed_m(way)[8:]
+def test_a_fast_drone_is_led_for_any_servo_latency(velocity, latency_s):
+    trajectory = flying(np.array([-8.0, 12.0, 12.0]), velocity)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 2.5, tracking(trajectory), start_rad=2.0, latency_s=latency_s)
+    missed = flight.missed_m(trajectory)[8:]
     assert np.mean(missed < 0.25) > 0.9
     assert np.median(missed) < 0.1
 
 
-def test_a_drone_straight_over_the_axis_is_still_met_now_and_then():
-    way = towards(0.0, 90.0)
-    missed = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, tracking(way)).missed_m(way)[10:]
-    assert missed.min() < 0.4  # no beam goes there: 1 deg beside is as near as it gets
+def test_a_drone_on_the_axis_is_passed_at_the_fans_inner_beam():
+    trajectory = towards(0.0, 90.0)
+    missed = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, tracking(trajectory)).missed_m(trajectory)[10:]
+    assert missed.min() < 0.4  # no beam reaches it: 1 deg is the least distance
 
 
-def test_two_drones_share_the_turns():
-    ways = towards(30.0, 45.0), towards(110.0, 50.0)
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 6.0, tracking(*ways))
-    for way in ways:
-        met = np.nonzero(flight.missed_m(way)[10:] < 0.25)[0]
+def test_two_drones_share_the_rotor_turns():
+    trajectories = towards(30.0, 45.0), towards(110.0, 50.0)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 6.0, tracking(*trajectories))
+    for trajectory in trajectories:
+        met = np.nonzero(flight.missed_m(trajectory)[10:] < 0.25)[0]
         assert len(met) >= 12  # of 50 turns
-        assert np.diff(met).max() <= 12  # looked at again within 1.2 s
+        assert np.diff(met).max() <= 12  # observed again within 1.2 s
 
 
 def test_a_likely_candidate_interrupts_the_sweep():
-    way = towards(60.0, 45.0)
-    place = way(np.zeros(1))[0]
+    trajectory = towards(60.0, 45.0)
+    position_m = trajectory(np.zeros(1))[0]
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if t_s >= 0.9 and round(t_s * 1000) % 100 == 0:
-            aim.on_candidates(candidates(place, t_s, 0.7))
+            aim.on_candidates(candidates(position_m, t_s, 0.7))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 2.0, tell)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 2.0, publish)
     before = [goal.position_rad for t, goal in flight.goals if t < 0.9]
     assert {round(p, 3) for p in before} <= {0.0, 3.142}
     first = next(goal for t, goal in flight.goals if t >= 0.9)
     assert 0.01 < first.position_rad < 3.13
-    assert np.degrees(np.ptp(flight.servo_rad[:180])) > 60.0  # it was on its way
-    assert np.mean(flight.missed_m(way)[12:] < 0.3) > 0.5
+    assert np.degrees(np.ptp(flight.servo_rad[:180])) > 60.0  # the sweep was running
+    assert np.mean(flight.missed_m(trajectory)[12:] < 0.3) > 0.5
 
 
 def test_an_unlikely_candidate_does_not_interrupt_it():
-    place = towards(60.0, 45.0)(np.zeros(1))[0]
+    position_m = towards(60.0, 45.0)(np.zeros(1))[0]
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if round(t_s * 1000) % 100 == 0:
-            aim.on_candidates(candidates(place, t_s, 0.02, looks=1))
+            aim.on_candidates(candidates(position_m, t_s, 0.02, scan_passes=1))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 1.0, tell, start_rad=0.0)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 1.0, publish, start_rad=0.0)
     assert {round(goal.position_rad, 3) for _, goal in flight.goals} == {3.142}
 
 
-def test_a_candidate_that_is_never_there_is_left_alone_and_the_sweep_goes_on():
-    place = towards(60.0, 45.0)(np.zeros(1))[0]
+def test_a_candidate_without_returns_is_excluded_and_the_sweep_continues():
+    position_m = towards(60.0, 45.0)(np.zeros(1))[0]
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if t_s < 0.6 and round(t_s * 1000) % 100 == 0:
-            aim.on_candidates(candidates(place, t_s, 0.7))
+            aim.on_candidates(candidates(position_m, t_s, 0.7))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 6.0, tell)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 6.0, publish)
     late = [goal.position_rad for t, goal in flight.goals if t > 3.0]
     assert late
     assert {round(p, 3) for p in late} <= {0.0, 3.142}
     assert np.ptp(flight.servo_rad[600:]) > 3.0
 
 
-def test_while_coasting_it_looks_farther_and_farther_beside_the_prediction_and_then_everywhere():
-    way = towards(80.0, 45.0)
+def test_while_coasting_the_offsets_from_the_prediction_grow_until_the_whole_travel_is_swept():
+    trajectory = towards(80.0, 45.0)
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if round(t_s * 1000) % 100 == 0:
             coasting = t_s >= 1.0
             state = TrackingState.COASTING if coasting else TrackingState.TRACKING
-            aim.on_state(track_state(way, t_s, state, sigma_m=0.05 + (t_s - 1.0 if coasting else 0.0)))
+            aim.on_state(track_state(trajectory, t_s, state, sigma_m=0.05 + (t_s - 1.0 if coasting else 0.0)))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE, coast_sigma_m=2.0), 6.0, tell, start_rad=1.2)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE, coast_sigma_m=2.0), 6.0, publish, start_rad=1.2)
     positions = np.degrees(flight.servo_rad)
     tracked, coasted, searched = positions[60:200], positions[240:560], positions[700:]
     assert np.ptp(tracked) < 2.0
@@ -303,57 +308,57 @@ def test_while_coasting_it_looks_farther_and_farther_beside_the_prediction_and_t
 
 
 def test_after_a_loss_it_sweeps_again():
-    way = towards(80.0, 45.0)
+    trajectory = towards(80.0, 45.0)
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if t_s < 1.0:
-            tracking(way)(aim, t_s)
+            tracking(trajectory)(aim, t_s)
         elif round(t_s * 1000) == 1000:
-            aim.on_state(track_state(way, t_s, TrackingState.LOST))
+            aim.on_state(track_state(trajectory, t_s, TrackingState.LOST))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, tell)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 4.0, publish)
     assert {round(goal.position_rad, 3) for t, goal in flight.goals if t > 1.05} <= {0.0, 3.142}
     assert np.degrees(np.ptp(flight.servo_rad[250:])) > 150.0
 
 
-def test_a_new_candidate_is_not_left_alone_for_one_of_its_number_of_a_detector_that_was():
-    targets, place = Targets(), (0.0, 8.0, 10.0)
-    targets.hear_candidates(candidates(place, 0.0, 0.5, looks=6), 0.1)
-    targets.leave(targets.known["candidate", 1], START_NS, rest_s=10.0)
-    targets.hear_candidates(candidates(place, 1.0, 0.5, looks=7), 0.1)
-    assert not targets.known
-    targets.hear_candidates(candidates(place, 2.0, 0.5, looks=9, detector_instance=START_NS + 1), 0.1)
-    assert list(targets.known) == [("candidate", 1)]
+def test_a_cooldown_does_not_apply_to_the_same_id_of_another_detector_instance():
+    targets, position_m = Targets(), (0.0, 8.0, 10.0)
+    targets.update_candidates(candidates(position_m, 0.0, 0.5, scan_passes=6), 0.1)
+    targets.exclude(targets.by_key["candidate", 1], START_NS, cooldown_s=10.0)
+    targets.update_candidates(candidates(position_m, 1.0, 0.5, scan_passes=7), 0.1)
+    assert not targets.by_key
+    targets.update_candidates(candidates(position_m, 2.0, 0.5, scan_passes=9, detector_instance=START_NS + 1), 0.1)
+    assert list(targets.by_key) == [("candidate", 1)]
 
 
-@pytest.mark.parametrize("says", [True, False])
-def test_a_track_that_its_tracker_has_forgotten_is_not_looked_at_for_ever(says):
-    """A tracker that was started afresh says of no track that it is lost: it searches, or says nothing."""
-    way = towards(80.0, 45.0)
+@pytest.mark.parametrize("reported", [True, False])
+def test_a_track_ends_after_a_restart_of_its_tracker(reported):
+    """A tracker that was restarted reports no track as LOST: it reports SEARCHING, or nothing."""
+    trajectory = towards(80.0, 45.0)
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if t_s < 1.0:
-            tracking(way)(aim, t_s)
-        elif says and round(t_s * 1000) == 1000:
-            state = track_state(way, t_s, TrackingState.SEARCHING, track_id=0)
+            tracking(trajectory)(aim, t_s)
+        elif reported and round(t_s * 1000) == 1000:
+            state = track_state(trajectory, t_s, TrackingState.SEARCHING, track_id=0)
             aim.on_state(replace(state, xyz_vehicle_m=None, velocity_vehicle_mps=None, covariance_m2=None))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 4.0 if says else 12.5, tell)
-    assert np.degrees(np.ptp(flight.servo_rad[250 if says else -650 :])) > 150.0
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 4.0 if reported else 12.5, publish)
+    assert np.degrees(np.ptp(flight.servo_rad[250 if reported else -650 :])) > 150.0
 
 
-# what was missed
+# missed observations
 
 
-def elevation_deg(goal_rad, place_m):
-    """How far from the fan's middle a place is when the table stands at a servo position."""
+def elevation_deg(goal_rad, position_m):
+    """Elevation [deg] of a position over the fan's middle, for a servo position."""
     origin_m, middle = beams_vehicle(ON_ITS_SIDE, np.array([goal_rad]), np.array([[0.0, 0.0, 1.0]]))  # the spin axis
-    line = place_m - origin_m[0]
+    line = position_m - origin_m[0]
     return math.degrees(math.asin(float(line @ middle[0]) / float(np.linalg.norm(line))))
 
 
-def looks_of(flight):
-    """Goals that are no ends of a sweep, with their seconds."""
+def observations_of(flight):
+    """Goals that are no ends of a sweep, with their times [s]."""
     return [(t, goal.position_rad) for t, goal in flight.goals if 0.001 < goal.position_rad < 3.141]
 
 
@@ -361,193 +366,197 @@ ACROSS_M = np.array([-math.sin(math.radians(60.0)), math.cos(math.radians(60.0))
 SPACING_M = 20.0 * math.radians(2.0)  # between two beams, at 20 m
 
 
-@pytest.mark.parametrize("beside", [-0.5, -0.37, -0.25, -0.12, 0.12, 0.25, 0.37, 0.5])
-@pytest.mark.parametrize("sure", [False, True], ids=["candidate", "track"])
-def test_looks_that_miss_go_beside_it_until_a_whole_beam_spacing_is_covered(beside, sure):
-    """Wherever it is between two beams, one passes within a quarter of its span before the looks begin anew."""
-    way = towards(60.0, 30.0)
-    expected_m = way(np.zeros(1))[0] + beside * SPACING_M * ACROSS_M  # it is elsewhere
+@pytest.mark.parametrize("spacings", [-0.5, -0.37, -0.25, -0.12, 0.12, 0.25, 0.37, 0.5])
+@pytest.mark.parametrize("is_track", [False, True], ids=["candidate", "track"])
+def test_the_offsets_after_misses_cover_a_whole_beam_spacing(spacings, is_track):
+    """Wherever the drone is between two beams, one of them passes within a quarter of its span."""
+    trajectory = towards(60.0, 30.0)
+    expected_m = trajectory(np.zeros(1))[0] + spacings * SPACING_M * ACROSS_M  # wrong by this offset
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if round(t_s * 1000) % 100 == 0:
-            if sure:
+            if is_track:
                 coasting = TrackingState.TRACKING if t_s == 0 else TrackingState.COASTING
                 state = track_state(still(*expected_m), t_s, coasting, sigma_m=0.05 + 0.3 * t_s)
                 aim.on_state(replace(state, hits=0))
             else:
                 aim.on_candidates(candidates(expected_m, t_s, 0.95, seen_s=0.0))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 0.9, tell, start_rad=math.radians(60.0))
-    missed = flight.missed_m(way)[1:]
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 0.9, publish, start_rad=math.radians(60.0))
+    missed = flight.missed_m(trajectory)[1:]
     assert missed.min() < 0.25 * 0.5 + 0.02
-    goals = np.degrees([goal for _, goal in looks_of(flight)])
+    goals = np.degrees([goal for _, goal in observations_of(flight)])
     assert len(goals) > 3
-    assert len(set(np.round(goals, 2))) >= 3  # not the same look again and again
+    assert len(set(np.round(goals, 2))) >= 3  # the goals differ
 
 
-def test_a_candidate_that_is_met_is_looked_at_a_little_to_each_side_of_its_middle():
-    place = towards(60.0, 30.0)(np.zeros(1))[0]
+def test_a_candidate_with_returns_is_observed_with_small_offsets_to_either_side():
+    position_m = towards(60.0, 30.0)(np.zeros(1))[0]
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if round(t_s * 1000) % 20 == 0:
-            aim.on_candidates(candidates(place, t_s, 0.7))
+            aim.on_candidates(candidates(position_m, t_s, 0.7))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 1.5, tell, start_rad=math.radians(60.0))
-    assert len(looks_of(flight)) > 10
-    goals_m = 20.0 * np.array([goal for _, goal in looks_of(flight)])
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 1.5, publish, start_rad=math.radians(60.0))
+    assert len(observations_of(flight)) > 10
+    goals_m = 20.0 * np.array([goal for _, goal in observations_of(flight)])
     assert 0.02 < np.ptp(goals_m) < 0.2
 
 
-@pytest.mark.parametrize(("patience", "probability", "looks"), [(5, 0.999, 5), (8, 0.999, 8), (8, 0.6, 5), (8, 0.4, 3)])
-def test_so_many_looks_in_a_row_that_meet_nothing_end_the_patience_sooner_for_a_doubtful_one(
-    patience, probability, looks
-):
-    place = towards(60.0, 45.0)(np.zeros(1))[0]
+@pytest.mark.parametrize(
+    ("max_missed", "probability", "observations"), [(5, 0.999, 5), (8, 0.999, 8), (8, 0.6, 5), (8, 0.4, 3)]
+)
+def test_consecutive_misses_exclude_a_candidate_sooner_if_it_is_less_probable(max_missed, probability, observations):
+    position_m = towards(60.0, 45.0)(np.zeros(1))[0]
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if round(t_s * 1000) % 50 == 0:
-            aim.on_candidates(candidates(place, t_s, probability, seen_s=0.0))
+            aim.on_candidates(candidates(position_m, t_s, probability, seen_s=0.0))
 
-    aim = BeamAim(mount=ON_ITS_SIDE, patience=patience, candidate_rest_s=60.0)
-    flight = fly(aim, 2.0, tell, start_rad=math.radians(60.0))
-    assert len(looks_of(flight)) == looks
-    assert [round(goal.position_rad, 3) for _, goal in flight.goals[1 + looks :]] == [3.142, 0.0]
+    aim = BeamAim(mount=ON_ITS_SIDE, max_missed=max_missed, cooldown_s=60.0)
+    flight = fly(aim, 2.0, publish, start_rad=math.radians(60.0))
+    assert len(observations_of(flight)) == observations
+    assert [round(goal.position_rad, 3) for _, goal in flight.goals[1 + observations :]] == [3.142, 0.0]
 
 
-def test_a_candidate_that_is_met_now_and_then_keeps_the_patience():
-    place = towards(60.0, 45.0)(np.zeros(1))[0]
+def test_a_candidate_with_occasional_returns_is_not_excluded():
+    position_m = towards(60.0, 45.0)(np.zeros(1))[0]
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if round(t_s * 1000) % 50 == 0:
-            aim.on_candidates(candidates(place, t_s, 0.9, seen_s=0.4 * (t_s // 0.4)))  # every fourth look
+            aim.on_candidates(candidates(position_m, t_s, 0.9, seen_s=0.4 * (t_s // 0.4)))  # every fourth observation
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE, patience=6), 2.3, tell, start_rad=math.radians(60.0))
-    assert len(looks_of(flight)) > 18
+    flight = fly(BeamAim(mount=ON_ITS_SIDE, max_missed=6), 2.3, publish, start_rad=math.radians(60.0))
+    assert len(observations_of(flight)) > 18
 
 
-def test_what_was_met_once_is_looked_for_beside_where_it_was_as_far_as_it_may_have_flown():
-    way = towards(60.0, 30.0)
-    place = way(np.zeros(1))[0]
+def test_a_candidate_of_unknown_heading_is_searched_at_the_distance_it_may_have_flown():
+    trajectory = towards(60.0, 30.0)
+    position_m = trajectory(np.zeros(1))[0]
 
     def missed_m(undirected_speed_mps):
-        def tell(aim, t_s):
+        def publish(aim, t_s):
             if round(t_s * 1000) % 50 == 0:
-                aim.on_candidates(candidates(place, t_s, 0.9, seen_s=0.0, undirected_speed_mps=undirected_speed_mps))
+                aim.on_candidates(
+                    candidates(position_m, t_s, 0.9, seen_s=0.0, undirected_speed_mps=undirected_speed_mps)
+                )
 
-        return fly(BeamAim(mount=ON_ITS_SIDE), 0.3, tell, start_rad=math.radians(60.0)).missed_m(way)[1]
+        return fly(BeamAim(mount=ON_ITS_SIDE), 0.3, publish, start_rad=math.radians(60.0)).missed_m(trajectory)[1]
 
-    assert missed_m(0.0) < 0.06  # it hangs
-    assert missed_m(4.0) > 0.12  # by the next turn it is most likely on either side
+    assert missed_m(0.0) < 0.06  # it hovers
+    assert missed_m(4.0) > 0.12  # at the next rotor turn it is most likely to either side
 
 
-def test_each_rest_of_a_candidate_is_twice_as_long_as_the_one_before_up_to_sixteen_times():
-    place = towards(60.0, 45.0)(np.zeros(1))[0]
+def test_the_cooldown_of_a_candidate_doubles_with_each_repetition_up_to_sixteen_fold():
+    position_m = towards(60.0, 45.0)(np.zeros(1))[0]
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if round(t_s * 1000) % 50 == 0:
-            aim.on_candidates(candidates(place, t_s, 0.7))
+            aim.on_candidates(candidates(position_m, t_s, 0.7))
 
-    aim = BeamAim(mount=ON_ITS_SIDE, candidate_looks=2, candidate_rest_s=0.2)
-    flight = fly(aim, 17.0, tell, start_rad=math.radians(60.0))
-    looked_s = np.array([t for t, _ in looks_of(flight)])
-    rests_s = np.diff(looked_s)[1::2]  # two looks, a rest, two looks
-    np.testing.assert_allclose(rests_s - [0.2, 0.4, 0.8, 1.6, 3.2, 3.2, 3.2], 0.025, atol=0.03)  # till the next word
+    aim = BeamAim(mount=ON_ITS_SIDE, max_observations=2, cooldown_s=0.2)
+    flight = fly(aim, 17.0, publish, start_rad=math.radians(60.0))
+    observed_s = np.array([t for t, _ in observations_of(flight)])
+    cooldowns_s = np.diff(observed_s)[1::2]  # two observations, a cool-down, two observations
+    np.testing.assert_allclose(
+        cooldowns_s - [0.2, 0.4, 0.8, 1.6, 3.2, 3.2, 3.2], 0.025, atol=0.03
+    )  # until the next candidates
 
 
-# which beam
+# choice of the beam
 
 
 @pytest.mark.parametrize("start_deg", [30.0, 42.0, 78.0, 90.0])
-@pytest.mark.parametrize("sure", [False, True], ids=["candidate", "track"])
-def test_a_beam_near_the_fans_middle_is_put_on_it_even_where_an_outer_one_is_nearer(start_deg, sure):
-    way = towards(60.0, 45.0)
-    place = way(np.zeros(1))[0]
+@pytest.mark.parametrize("is_track", [False, True], ids=["candidate", "track"])
+def test_a_beam_near_the_fans_middle_is_used_even_if_an_outer_one_is_nearer(start_deg, is_track):
+    trajectory = towards(60.0, 45.0)
+    position_m = trajectory(np.zeros(1))[0]
 
-    def tell(aim, t_s):
-        tracking(way)(aim, t_s) if sure else aim.on_candidates(candidates(place, t_s, 0.7))
+    def publish(aim, t_s):
+        tracking(trajectory)(aim, t_s) if is_track else aim.on_candidates(candidates(position_m, t_s, 0.7))
 
-    flight = fly(BeamAim(mount=ON_ITS_SIDE), 0.8, tell, start_rad=math.radians(start_deg))
-    looks = looks_of(flight)
-    assert len(looks) > 3
-    for _, goal in looks:
-        assert abs(elevation_deg(goal, place)) < math.degrees(INNER_RAD) + 1.5  # and what it goes beside it
-        assert abs(elevation_deg(goal, place)) > 0.3  # no beam lies in the middle
+    flight = fly(BeamAim(mount=ON_ITS_SIDE), 0.8, publish, start_rad=math.radians(start_deg))
+    observations = observations_of(flight)
+    assert len(observations) > 3
+    for _, goal in observations:
+        assert abs(elevation_deg(goal, position_m)) < math.degrees(INNER_RAD) + 1.5  # and the offset
+        assert abs(elevation_deg(goal, position_m)) > 0.3  # no beam lies in the middle
 
 
-def test_a_glance_in_passing_takes_the_beam_that_is_nearest_and_the_sweep_goes_on():
-    place = towards(60.0, 45.0)(np.zeros(1))[0]
+def test_an_observation_during_the_sweep_uses_the_nearest_beam_and_the_sweep_continues():
+    position_m = towards(60.0, 45.0)(np.zeros(1))[0]
 
-    def tell(aim, t_s):
+    def publish(aim, t_s):
         if 0.3 <= t_s < 0.75 and round(t_s * 1000) % 50 == 0:
-            aim.on_candidates(candidates(place, t_s, 0.05, looks=1))
+            aim.on_candidates(candidates(position_m, t_s, 0.05, scan_passes=1))
 
     swept = fly(BeamAim(mount=ON_ITS_SIDE), 2.2, nothing)
-    glanced = fly(BeamAim(mount=ON_ITS_SIDE), 2.2, tell)
-    looks = [goal for _, goal in looks_of(glanced)]
-    assert 1 <= len(looks) <= 3
-    assert any(abs(elevation_deg(goal, place)) > math.degrees(INNER_RAD) + 1.5 for goal in looks)
-    at_s = [np.argmax(np.degrees(flight.servo_rad) > 175.0) * TICK_NS * 1e-9 for flight in (swept, glanced)]
+    observed = fly(BeamAim(mount=ON_ITS_SIDE), 2.2, publish)
+    goals = [goal for _, goal in observations_of(observed)]
+    assert 1 <= len(goals) <= 3
+    assert any(abs(elevation_deg(goal, position_m)) > math.degrees(INNER_RAD) + 1.5 for goal in goals)
+    at_s = [np.argmax(np.degrees(flight.servo_rad) > 175.0) * TICK_NS * 1e-9 for flight in (swept, observed)]
     assert at_s[0] > 0.5
     assert at_s[1] < at_s[0] + 0.25
 
 
-# how many there are
+# several drones
 
 
-def test_while_fewer_drones_than_expected_are_tracked_the_search_goes_on_between_looks_at_them():
-    way = towards(60.0, 45.0)
-    one = fly(BeamAim(mount=ON_ITS_SIDE), 5.0, tracking(way), start_rad=1.0)
-    two = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 5.0, tracking(way), start_rad=1.0)
+def test_while_fewer_drones_than_expected_are_tracked_the_search_continues_between_observations():
+    trajectory = towards(60.0, 45.0)
+    one = fly(BeamAim(mount=ON_ITS_SIDE), 5.0, tracking(trajectory), start_rad=1.0)
+    two = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 5.0, tracking(trajectory), start_rad=1.0)
     ends = [[t for t, goal in flight.goals[1:] if goal.position_rad in (0.0, math.pi)] for flight in (one, two)]
     assert ends[0] == []
     assert len(ends[1]) > 2
     assert np.degrees(np.ptp(one.servo_rad[100:])) < 5.0
-    assert np.degrees(np.ptp(two.servo_rad[100:])) > 90.0  # each piece goes on where the last one ended
-    met = np.nonzero(two.missed_m(way)[10:] < 0.25)[0]
+    assert np.degrees(np.ptp(two.servo_rad[100:])) > 90.0  # each segment continues where the last one ended
+    met = np.nonzero(two.missed_m(trajectory)[10:] < 0.25)[0]
     assert len(met) > 8  # of 40
-    assert np.diff(met).max() <= 16  # looked at again within 1.6 s: the way there, `search_s` and the way back
+    assert np.diff(met).max() <= 16  # observed again within 1.6 s: the movement there, `search_s` and the movement back
 
 
-def test_a_longer_search_between_is_a_wider_one():
-    way = towards(60.0, 45.0)
+def test_a_longer_search_segment_is_wider():
+    trajectory = towards(60.0, 45.0)
     widths = []
     for search_s in (0.2, 0.6):
         aim = BeamAim(mount=ON_ITS_SIDE, max_drones=2, search_s=search_s)
-        widths.append(np.ptp(fly(aim, 2.0, tracking(way), start_rad=1.0).servo_rad[100:]))
+        widths.append(np.ptp(fly(aim, 2.0, tracking(trajectory), start_rad=1.0).servo_rad[100:]))
     assert widths[1] > 1.3 * widths[0]
 
 
 def test_with_as_many_drones_as_expected_the_search_ends():
-    ways = towards(30.0, 45.0), towards(110.0, 50.0)
-    flight = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 4.0, tracking(*ways), start_rad=0.5)
-    assert len(looks_of(flight)) == len(flight.goals) - 1  # but for the first, before the rotor was known
+    trajectories = towards(30.0, 45.0), towards(110.0, 50.0)
+    flight = fly(BeamAim(mount=ON_ITS_SIDE, max_drones=2), 4.0, tracking(*trajectories), start_rad=0.5)
+    assert len(observations_of(flight)) == len(flight.goals) - 1  # except the first, before the rotor's rate was known
 
 
-def test_a_track_comes_before_a_candidate():
-    way, other = towards(80.0, 45.0), towards(20.0, 45.0)(np.zeros(1))[0]
+def test_tracks_have_priority_over_candidates():
+    trajectory, other = towards(80.0, 45.0), towards(20.0, 45.0)(np.zeros(1))[0]
 
-    def tell(aim, t_s):
-        tracking(way)(aim, t_s)
+    def publish(aim, t_s):
+        tracking(trajectory)(aim, t_s)
         if round(t_s * 1000) % 100 == 0:
             aim.on_candidates(candidates(other, t_s, 0.9))
 
-    missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, tell).missed_m(way)[10:]
+    missed = fly(BeamAim(mount=ON_ITS_SIDE), 3.0, publish).missed_m(trajectory)[10:]
     assert np.mean(missed < 0.2) > 0.85
 
 
-def test_a_narrow_travel_is_kept():
-    way = towards(80.0, 45.0)
+def test_the_goals_stay_within_a_narrow_travel():
+    trajectory = towards(80.0, 45.0)
     aim = BeamAim(mount=ON_ITS_SIDE, travel_deg=(30.0, 60.0))
-    flight = fly(aim, 2.0, tracking(way), start_rad=math.radians(45))  # the limits are checked in fly
+    flight = fly(aim, 2.0, tracking(trajectory), start_rad=math.radians(45))  # the limits are checked in fly
     assert flight.goals
 
 
-def test_while_the_rotor_is_not_known_it_sweeps():
+def test_while_the_rotors_rate_is_unknown_it_sweeps():
     flight = fly(BeamAim(mount=ON_ITS_SIDE), 1.0, tracking(towards(80.0, 45.0)), rotor=False)
     assert {round(goal.position_rad, 3) for _, goal in flight.goals} <= {0.0, 3.142}
 
 
-def test_a_servo_that_is_stuck_is_sent_the_other_way():
+def test_a_stalled_servo_is_reversed():
     aim, goals = BeamAim(mount=ON_ITS_SIDE), []
     for k in range(200):
         goal = aim.on_servo(servo(START_NS + k * TICK_NS, 1.0))
@@ -556,7 +565,7 @@ def test_a_servo_that_is_stuck_is_sent_the_other_way():
     assert goals[0] != goals[1]
 
 
-def test_a_lidar_that_is_bolted_down_is_not_aimed():
+def test_a_lidar_that_does_not_turn_gets_no_goal():
     assert BeamAim(mount=LidarMount(turns=False)).on_servo(servo(START_NS, 0.0)) is None
 
 
@@ -567,10 +576,10 @@ def test_a_lidar_that_is_bolted_down_is_not_aimed():
         {"mount": ON_ITS_SIDE, "travel_deg": (90.0, 90.0)},
         {"mount": ON_ITS_SIDE, "limit_rpm": 0},
         {"mount": ON_ITS_SIDE, "max_drones": 0},
-        {"mount": ON_ITS_SIDE, "patience": 0},
+        {"mount": ON_ITS_SIDE, "max_missed": 0},
         {"mount": ON_ITS_SIDE, "mistyped": 1},
     ],
 )
-def test_impossible_settings_are_refused(settings):
+def test_impossible_settings_are_rejected(settings):
     with pytest.raises((ValidationError, ValueError)):
         BeamAim(**settings)

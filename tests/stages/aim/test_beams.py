@@ -1,4 +1,4 @@
-"""Putting a beam on a place: checked by following the ray; and a search that leaves no direction out."""
+"""Pointing of beams, checked by ray tracing, and the step of a search that covers all directions."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ ASKEW = LidarMount(
 MOUNTS = {"on its side": ON_ITS_SIDE, "askew, with sign, zero and harmonics": ASKEW}
 
 
-def in_the_turntable(mount, place_vehicle_m):
+def p_turntable(mount, p_vehicle_m):
     T = mount.T_vehicle_turntable.matrix()
-    return T[:3, :3].T @ (np.asarray(place_vehicle_m) - T[:3, 3])
+    return T[:3, :3].T @ (np.asarray(p_vehicle_m) - T[:3, 3])
 
 
-def missed_by_rad(mount, servo_rad, azimuth_rad, elevation_rad, place_vehicle_m):
-    """Angle between a beam, with the table where the servo puts it, and the line of sight to the place."""
+def missed_by_rad(mount, servo_rad, azimuth_rad, elevation_rad, p_vehicle_m):
+    """Angle between a beam, for a servo position, and the line of sight to a position."""
     beam = np.array(
         [
             math.cos(elevation_rad) * math.sin(azimuth_rad),
@@ -47,11 +47,11 @@ def missed_by_rad(mount, servo_rad, azimuth_rad, elevation_rad, place_vehicle_m)
         ]
     )
     origin_m, direction = beams_vehicle(mount, np.array([servo_rad]), beam[np.newaxis])
-    line = np.asarray(place_vehicle_m) - origin_m[0]
+    line = np.asarray(p_vehicle_m) - origin_m[0]
     return math.atan2(np.linalg.norm(np.cross(direction[0], line)), float(direction[0] @ line))
 
 
-def places(n, seed=0, nearest_m=4.0):
+def positions(n, seed=0, nearest_m=4.0):
     rng = np.random.default_rng(seed)
     up = rng.normal(size=(n, 3))
     up[:, 2] = np.abs(up[:, 2]) + 0.05
@@ -59,22 +59,24 @@ def places(n, seed=0, nearest_m=4.0):
 
 
 @pytest.mark.parametrize("mount", MOUNTS.values(), ids=MOUNTS)
-def test_the_ray_of_the_chosen_beam_meets_the_place(mount):
+def test_the_ray_of_the_chosen_beam_meets_the_position(mount):
     T_tl, met = mount.T_turntable_lidar.matrix(), 0
-    for place in places(40):
-        p = in_the_turntable(mount, place)
+    for p_vehicle_m in positions(40):
+        p = p_turntable(mount, p_vehicle_m)
         for elevation in ELEVATION_RAD:
             for theta in table_angles_rad(T_tl, p, elevation):
                 azimuth = rotor_azimuth_rad(T_tl, p, theta)
                 for servo_rad in servo_positions_rad(mount, theta, (-math.tau, math.tau)):
-                    missed_m = missed_by_rad(mount, servo_rad, azimuth, elevation, place) * np.linalg.norm(place)
+                    missed_m = missed_by_rad(mount, servo_rad, azimuth, elevation, p_vehicle_m) * np.linalg.norm(
+                        p_vehicle_m
+                    )
                     assert missed_m < 0.01
                     met += 1
     assert met > 1000
 
 
-def test_any_place_at_all_is_met_by_some_beam_within_half_a_turn_except_right_on_the_axis():
-    """Beams lie at odd degrees: those of 1 deg reach to within 1 deg of the axis, and no nearer."""
+def test_within_half_a_turn_a_beam_meets_any_position_except_near_the_axis():
+    """The elevations are odd degrees: the beams of 1 deg reach to within 1 deg of the axis."""
     T_tl = ON_ITS_SIDE.T_turntable_lidar.matrix()
     for off_deg, azimuth_deg in [(1.05, 10.0), (1.05, 100.0), (3.0, 200.0), (20.0, 300.0), (89.0, 45.0)]:
         off, azimuth = math.radians(off_deg), math.radians(azimuth_deg)
@@ -90,18 +92,18 @@ def test_any_place_at_all_is_met_by_some_beam_within_half_a_turn_except_right_on
         ]
         assert found, (off_deg, azimuth_deg)
         assert all(0.0 <= servo_rad <= math.pi for servo_rad in found)
-    almost = np.array([0, 0, 0.1]) + 30.0 * np.array([math.sin(math.radians(0.95)), 0, math.cos(math.radians(0.95))])
-    assert not any(table_angles_rad(T_tl, almost, elevation) for elevation in ELEVATION_RAD)
+    near_axis = np.array([0, 0, 0.1]) + 30.0 * np.array([math.sin(math.radians(0.95)), 0, math.cos(math.radians(0.95))])
+    assert not any(table_angles_rad(T_tl, near_axis, elevation) for elevation in ELEVATION_RAD)
     assert table_angles_rad(T_tl, np.array([0, 0, 30.0]), 0.0) == ()  # on the axis no angle is better than another
 
 
-def test_the_beam_in_the_middle_of_the_fan_would_be_the_scan_plane():
+def test_a_beam_of_elevation_0_lies_in_the_scan_plane():
     found = table_angles_rad(ON_ITS_SIDE.T_turntable_lidar.matrix(), np.array([10.0, 10.0, 5.0]), 0.0)
     assert sorted(found) == pytest.approx([math.radians(45), math.radians(225)])
 
 
 @pytest.mark.parametrize("mount", MOUNTS.values(), ids=MOUNTS)
-def test_servo_positions_undo_sign_zero_and_harmonics_and_keep_to_the_travel(mount):
+def test_servo_positions_invert_sign_zero_and_harmonics_and_stay_within_the_travel(mount):
     for theta in np.linspace(0.0, math.tau, 50, endpoint=False):
         found = servo_positions_rad(mount, float(theta), (0.0, math.tau))
         assert 1 <= len(found) <= 2
@@ -113,7 +115,7 @@ def test_servo_positions_undo_sign_zero_and_harmonics_and_keep_to_the_travel(mou
     assert servo_positions_rad(ON_ITS_SIDE, -math.pi, TRAVEL_RAD) == [pytest.approx(math.pi)]
 
 
-def test_the_rotor_looks_along_its_own_axes():
+def test_the_rotor_azimuth_is_measured_from_the_lidars_y_axis():
     """Azimuth 0 is +y_lidar, growing towards +x_lidar; on its side the LiDAR has +y_lidar up and +x_lidar ahead."""
     T_tl = ON_ITS_SIDE.T_turntable_lidar.matrix()
     assert rotor_azimuth_rad(T_tl, np.array([0.0, 0.0, 20.0]), 0.3) == pytest.approx(0.0, abs=1e-12)
@@ -121,7 +123,7 @@ def test_the_rotor_looks_along_its_own_axes():
     assert rotor_azimuth_rad(T_tl, np.array([20.0, 0.0, 0.1]), math.pi) == pytest.approx(3 * math.pi / 2)
 
 
-def test_the_sequence_of_offsets_fills_its_range_evenly_from_the_first_on():
+def test_each_prefix_of_the_offset_sequence_fills_its_range_evenly():
     members = [low_discrepancy(k) for k in range(64)]
     assert members[:4] == [0.0, -0.5, 0.5, -0.75]
     assert len(set(members)) == 64
@@ -131,7 +133,7 @@ def test_the_sequence_of_offsets_fills_its_range_evenly_from_the_first_on():
 
 
 def largest_gap(step_rad, turns=50):
-    """Between directions looked at, of those that the whole fan has passed over, in beam spacings."""
+    """Largest gap between observed directions that the whole fan has passed, in beam spacings."""
     directions = np.sort((np.arange(turns)[:, np.newaxis] * step_rad + ELEVATION_RAD).ravel())
     inside = directions[
         (directions > ELEVATION_RAD.max()) & (directions < (turns - 1) * step_rad + ELEVATION_RAD.min())
@@ -140,13 +142,13 @@ def largest_gap(step_rad, turns=50):
 
 
 @pytest.mark.parametrize("wanted_deg", [0.3, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0])
-def test_a_search_never_looks_along_the_same_directions_again_and_between_them_never(wanted_deg):
+def test_the_search_step_avoids_aliasing_of_rotor_and_servo(wanted_deg):
     spacing = math.radians(2.0)
     step = sweep_step_rad(spacing, math.radians(wanted_deg))
-    assert abs(step - math.radians(wanted_deg)) <= spacing  # about as fast as asked for
+    assert abs(step - math.radians(wanted_deg)) <= spacing  # about the requested speed
     assert largest_gap(step) < 0.7
     if wanted_deg % 2 == 0:
-        assert largest_gap(math.radians(wanted_deg)) > 0.99  # as it would have been: beam on beam
+        assert largest_gap(math.radians(wanted_deg)) > 0.99  # the unadjusted step repeats the same directions
 
 
 def test_the_search_step_of_a_slow_table_spreads_over_the_whole_spacing():

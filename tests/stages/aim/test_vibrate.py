@@ -1,4 +1,4 @@
-"""Aiming by hand: where the scan plane meets the drone, and what the servo is told about it."""
+"""SweepVibrateAim: angles at which the scan plane contains the drone, and the servo's goals."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from stages.aim.vibrate import (
     nearest_within,
     plane_angles_rad,
     servo_angles_rad,
-    swing_rad,
+    vibration_ends_rad,
 )
 from stages.geometry.frames import Harmonic, LidarMount, Pose, rotation_z
-from stages.messages import Detections, DroneFix, ServoGoal, ServoState, TrackingState, TrackState
+from stages.messages import Detections, DroneFix, KernelScores, ServoGoal, ServoState, TrackingState, TrackState
 
 ON_ITS_SIDE = Pose(xyz_m=(0.0, 0.0, 0.10), rpy_deg=(90.0, 0.0, 0.0))
 MOUNT = LidarMount(T_vehicle_turntable=Pose(xyz_m=(0.0, 0.0, 0.25)), T_turntable_lidar=ON_ITS_SIDE)
@@ -36,9 +36,7 @@ def servo(position_deg: float, t_s: float = 0.0) -> ServoState:
 
 
 def fix(x: float, y: float, z: float) -> DroneFix:
-    return DroneFix(
-        stamp_ns=0, xyz_vehicle_m=np.array([x, y, z]), covariance_m2=np.eye(3), hits=3, iterations=2, shift_m=0.0
-    )
+    return DroneFix(stamp_ns=0, xyz_vehicle_m=np.array([x, y, z]), covariance_m2=np.eye(3), hits=3)
 
 
 def state(which: TrackingState) -> TrackState:
@@ -50,9 +48,7 @@ def detections(*xyz: tuple[float, float, float], accepted: tuple[bool, ...]) -> 
     return Detections(
         stamp_ns=0,
         xyz_vehicle_m=np.array(xyz, dtype=np.float64).reshape(-1, 3),
-        score=np.arange(n, dtype=np.float64),
-        e_inner=np.zeros(n),
-        e_outer=np.zeros(n),
+        evidence=KernelScores(e_inner=np.zeros(n), e_outer=np.zeros(n)),
         accepted=np.array(accepted, dtype=np.bool_),
         reasons=("",) * n,
         summary="",
@@ -69,26 +65,26 @@ def tracking(stage: SweepVibrateAim, azimuth_deg: float) -> None:
 
 
 class Rig:
-    """A stage and a servo that obeys at once, at no more than 55 rpm."""
+    """A stage and a servo without latency, of at most 55 rpm."""
 
     def __init__(self, start_deg: float, **settings) -> None:
         self.stage = aim(**settings)
         self.position, self.goal, self.speed, self.t_s = start_deg, start_deg, 0.0, 0.0
 
     def run(self, seconds: float) -> np.ndarray:
-        """Positions [deg] each 5 ms."""
+        """Positions [deg] at 200 Hz."""
         trace = []
         for _ in range(round(seconds / 0.005)):
-            told = self.stage.on_servo(servo(self.position, self.t_s))
-            if told is not None:
-                self.goal, self.speed = math.degrees(told.position_rad), min(math.degrees(told.speed_radps), 330.0)
+            goal = self.stage.on_servo(servo(self.position, self.t_s))
+            if goal is not None:
+                self.goal, self.speed = math.degrees(goal.position_rad), min(math.degrees(goal.speed_radps), 330.0)
             self.position += min(max(self.goal - self.position, -self.speed * 0.005), self.speed * 0.005)
             self.t_s += 0.005
             trace.append(self.position)
         return np.array(trace)
 
 
-def test_a_plane_through_the_axis_meets_a_point_at_its_azimuth_and_opposite() -> None:
+def test_a_plane_through_the_axis_contains_a_point_at_its_azimuth_and_opposite() -> None:
     angles = plane_angles_rad(ON_ITS_SIDE.matrix(), np.array([3.0, 4.0, 7.0]))
     azimuth = math.atan2(4.0, 3.0)
     assert sorted(angles) == pytest.approx([azimuth, azimuth + math.pi])
@@ -99,19 +95,21 @@ def test_a_plane_through_the_axis_meets_a_point_at_its_azimuth_and_opposite() ->
     st.tuples(st.floats(70, 110), st.floats(-15, 15), st.floats(-180, 180)),
     st.floats(-0.2, 0.2),
 )
-def test_the_turned_plane_holds_the_point(xyz, rpy_deg, offset_m) -> None:
+def test_the_turned_plane_contains_the_point(xyz, rpy_deg, offset_m) -> None:
     T = Pose(xyz_m=(offset_m, -0.03, 0.1), rpy_deg=rpy_deg).matrix()
     p = np.array(xyz)
     n, o = T[:3, 2], T[:3, 3]
     reach = math.hypot(n[0], n[1]) * math.hypot(p[0], p[1])
     if reach < 1e-6 or abs(n @ o - n[2] * p[2]) > reach:
-        return  # no angle does it
+        return  # no solution
     for theta in plane_angles_rad(T, p):
         assert n @ (rotation_z(-theta) @ p - o) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_point_that_no_angle_reaches_gets_the_nearest_one_and_one_on_the_axis_gets_none() -> None:
-    tilted = Pose(rpy_deg=(60.0, 0.0, 0.0)).matrix()  # the plane leans 30 deg: it never holds a point near overhead
+def test_without_a_solution_the_nearest_angle_is_returned_and_on_the_axis_none() -> None:
+    tilted = Pose(
+        rpy_deg=(60.0, 0.0, 0.0)
+    ).matrix()  # the plane is tilted by 30 deg: it never contains a point near the zenith
     a, b = plane_angles_rad(tilted, np.array([1.0, 0.0, 20.0]))
     distances = [abs(tilted[:3, 2] @ (rotation_z(-t) @ [1.0, 0.0, 20.0])) for t in np.linspace(0, math.tau, 721)]
     assert a == pytest.approx(b)
@@ -119,7 +117,7 @@ def test_a_point_that_no_angle_reaches_gets_the_nearest_one_and_one_on_the_axis_
     assert plane_angles_rad(ON_ITS_SIDE.matrix(), np.array([0.0, 0.0, 20.0])) == ()
 
 
-def test_servo_positions_undo_sign_zero_and_encoder_error() -> None:
+def test_servo_positions_invert_sign_zero_and_encoder_error() -> None:
     mount = LidarMount(
         T_vehicle_turntable=Pose(xyz_m=(0.2, 0.1, 0.25), rpy_deg=(0.0, 0.0, 30.0)),
         T_turntable_lidar=ON_ITS_SIDE,
@@ -135,14 +133,14 @@ def test_servo_positions_undo_sign_zero_and_encoder_error() -> None:
         assert ON_ITS_SIDE.matrix()[:3, 2] @ (rotation_z(-theta) @ p) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_turning_vehicle_and_drone_together_changes_nothing() -> None:
+def test_the_servo_position_is_invariant_to_a_common_rotation() -> None:
     turned = MOUNT.model_copy(update={"T_vehicle_turntable": Pose(xyz_m=(0.0, 0.0, 0.25), rpy_deg=(0.0, 0.0, 77.0))})
     drone = np.array([3.0, -6.0, 9.0])
     there = servo_angles_rad(turned, rotation_z(math.radians(77.0)) @ drone)
     np.testing.assert_allclose(np.mod(there, math.tau), np.mod(servo_angles_rad(MOUNT, drone), math.tau), atol=1e-9)
 
 
-def test_the_side_within_the_travel_is_taken_and_of_two_the_nearer() -> None:
+def test_the_angle_within_the_travel_is_used_and_of_two_the_nearer() -> None:
     travel, deg = (0.0, math.pi), math.radians
     assert nearest_within((deg(-60), deg(120), deg(300)), deg(0), travel, 0.0) == deg(120)
     assert nearest_within((deg(0.0), deg(180.0)), deg(170), travel, 0.0) == deg(180)
@@ -152,19 +150,19 @@ def test_the_side_within_the_travel_is_taken_and_of_two_the_nearer() -> None:
     assert nearest_within((), deg(33), travel, 0.0) == deg(33)
 
 
-def test_a_swing_stays_whole_within_the_travel() -> None:
-    assert swing_rad(1.0, 0.1, (0.0, 3.0)) == pytest.approx((0.9, 1.1))
-    assert swing_rad(0.02, 0.1, (0.0, 3.0)) == pytest.approx((0.0, 0.2))
-    assert swing_rad(-0.05, 0.1, (0.0, 3.0)) == pytest.approx((0.0, 0.2))
-    assert swing_rad(2.99, 0.1, (0.0, 3.0)) == pytest.approx((2.8, 3.0))
+def test_the_vibration_stays_within_the_travel() -> None:
+    assert vibration_ends_rad(1.0, 0.1, (0.0, 3.0)) == pytest.approx((0.9, 1.1))
+    assert vibration_ends_rad(0.02, 0.1, (0.0, 3.0)) == pytest.approx((0.0, 0.2))
+    assert vibration_ends_rad(-0.05, 0.1, (0.0, 3.0)) == pytest.approx((0.0, 0.2))
+    assert vibration_ends_rad(2.99, 0.1, (0.0, 3.0)) == pytest.approx((2.8, 3.0))
 
 
-def test_without_a_track_it_sweeps_to_and_fro_at_11_4_rpm() -> None:
+def test_without_a_track_it_sweeps_forth_and_back_at_11_4_rpm() -> None:
     stage = aim()
-    told = stage.on_servo(servo(0.0))
-    assert isinstance(told, ServoGoal)
-    assert told.position_rad == pytest.approx(math.pi)
-    assert told.speed_radps == pytest.approx(11.4 * RPM)
+    goal = stage.on_servo(servo(0.0))
+    assert isinstance(goal, ServoGoal)
+    assert goal.position_rad == pytest.approx(math.pi)
+    assert goal.speed_radps == pytest.approx(11.4 * RPM)
     assert stage.on_servo(servo(90.0, 1.0)) is None
     back = stage.on_servo(servo(179.6, 2.0))
     assert back is not None
@@ -172,20 +170,20 @@ def test_without_a_track_it_sweeps_to_and_fro_at_11_4_rpm() -> None:
     assert stage.on_servo(servo(100.0, 3.0)) is None
 
 
-def test_a_sweep_begins_with_the_nearer_end() -> None:
-    told = aim().on_servo(servo(150.0))
-    assert told is not None
-    assert told.position_rad == pytest.approx(math.pi)
+def test_a_sweep_starts_with_the_nearer_end() -> None:
+    goal = aim().on_servo(servo(150.0))
+    assert goal is not None
+    assert goal.position_rad == pytest.approx(math.pi)
 
 
 def test_tracking_vibrates_five_degrees_about_the_drones_azimuth_at_57_2_rpm() -> None:
     rig = Rig(0.0)
     rig.run(0.3)
     tracking(rig.stage, 60.0)
-    told = rig.stage.on_servo(servo(20.0, 0.3))
-    assert told is not None
-    assert math.degrees(told.position_rad) == pytest.approx(55.0)
-    assert told.speed_radps == pytest.approx(57.2 * RPM)
+    goal = rig.stage.on_servo(servo(20.0, 0.3))
+    assert goal is not None
+    assert math.degrees(goal.position_rad) == pytest.approx(55.0)
+    assert goal.speed_radps == pytest.approx(57.2 * RPM)
     rig = Rig(55.0)
     tracking(rig.stage, 60.0)
     positions = rig.run(1.0)[20:]
@@ -193,7 +191,7 @@ def test_tracking_vibrates_five_degrees_about_the_drones_azimuth_at_57_2_rpm() -
     assert positions.min() == pytest.approx(55.0, abs=0.51)
 
 
-def test_it_follows_a_moving_drone_swing_by_swing() -> None:
+def test_the_vibration_follows_a_moving_drone() -> None:
     rig = Rig(55.0)
     tracking(rig.stage, 60.0)
     rig.run(0.5)
@@ -201,15 +199,15 @@ def test_it_follows_a_moving_drone_swing_by_swing() -> None:
     assert rig.run(0.6)[40:].mean() == pytest.approx(80.0, abs=1.0)
 
 
-def test_a_drone_behind_is_seen_with_the_other_side_of_the_plane() -> None:
+def test_a_drone_behind_is_observed_with_the_opposite_side_of_the_plane() -> None:
     stage = aim()
     tracking(stage, -120.0)
-    told = stage.on_servo(servo(0.0))
-    assert told is not None
-    assert math.degrees(told.position_rad) == pytest.approx(55.0)
+    goal = stage.on_servo(servo(0.0))
+    assert goal is not None
+    assert math.degrees(goal.position_rad) == pytest.approx(55.0)
 
 
-def test_at_the_end_of_the_travel_it_stays_until_the_drone_is_well_beyond() -> None:
+def test_at_the_end_of_the_travel_it_stays_while_the_drone_is_within_the_slack() -> None:
     rig = Rig(5.0)
     tracking(rig.stage, 3.0)
     near = rig.run(0.5)
@@ -221,16 +219,16 @@ def test_at_the_end_of_the_travel_it_stays_until_the_drone_is_well_beyond() -> N
     assert rig.run(1.5)[-1] == pytest.approx(172.0, abs=5.1)
 
 
-def test_a_lost_drone_is_searched_for_again() -> None:
+def test_after_a_loss_it_sweeps() -> None:
     for gone in (TrackingState.LOST, TrackingState.SEARCHING):
         rig = Rig(55.0)
         tracking(rig.stage, 60.0)
         rig.run(0.3)
         rig.stage.on_state(state(gone))
-        told = rig.stage.on_servo(servo(60.0, 0.3))
-        assert told is not None
-        assert told.position_rad == 0.0
-        assert told.speed_radps == pytest.approx(11.4 * RPM)
+        goal = rig.stage.on_servo(servo(60.0, 0.3))
+        assert goal is not None
+        assert goal.position_rad == 0.0
+        assert goal.speed_radps == pytest.approx(11.4 * RPM)
 
 
 def test_before_the_first_fix_it_aims_at_the_best_accepted_detection() -> None:
@@ -239,11 +237,11 @@ def test_before_the_first_fix_it_aims_at_the_best_accepted_detection() -> None:
     rig.stage.on_state(state(TrackingState.TRACKING))
     assert rig.run(1.0)[100:].mean() == pytest.approx(90.0, abs=1.0)
     tracking(rig.stage, 40.0)
-    rig.stage.on_detections(detections(at_azimuth(150.0), accepted=(True,)))  # the track goes its own way
+    rig.stage.on_detections(detections(at_azimuth(150.0), accepted=(True,)))  # a fix has priority
     assert rig.run(1.0)[100:].mean() == pytest.approx(40.0, abs=1.0)
 
 
-def test_tracking_without_a_place_sweeps_on_and_a_refused_detection_is_no_place() -> None:
+def test_without_a_position_it_continues_the_sweep_and_rejected_detections_give_none() -> None:
     stage = aim()
     first = stage.on_servo(servo(0.0))
     stage.on_detections(detections(at_azimuth(20.0), accepted=(False,)))
@@ -253,24 +251,24 @@ def test_tracking_without_a_place_sweeps_on_and_a_refused_detection_is_no_place(
     assert stage.on_servo(servo(50.0, 1.0)) is None
 
 
-def test_a_drone_right_overhead_is_vibrated_about_where_the_servo_stands() -> None:
+def test_for_a_drone_on_the_axis_it_vibrates_about_the_servos_position() -> None:
     rig = Rig(100.0)
     rig.stage.on_fix(fix(0.0, 0.0, 20.0))
     rig.stage.on_state(state(TrackingState.TRACKING))
     assert rig.run(0.6)[40:].mean() == pytest.approx(100.0, abs=1.0)
 
 
-def test_a_servo_that_never_arrives_is_turned_round_after_the_patience() -> None:
-    stage = aim(patience_s=0.3)
+def test_a_stalled_servo_is_reversed_after_the_stall_time() -> None:
+    stage = aim(stall_s=0.3)
     stage.on_servo(servo(0.0, 0.0))
     assert stage.on_servo(servo(100.0, 1.0)) is None
     assert stage.on_servo(servo(100.0, 1.25)) is None
-    told = stage.on_servo(servo(100.0, 1.31))
-    assert told is not None
-    assert told.position_rad == 0.0
+    goal = stage.on_servo(servo(100.0, 1.31))
+    assert goal is not None
+    assert goal.position_rad == 0.0
 
 
-def test_a_lidar_that_is_bolted_down_is_not_aimed() -> None:
+def test_a_lidar_that_does_not_turn_gets_no_goal() -> None:
     stage = aim(mount=LidarMount(turns=False))
     tracking(stage, 60.0)
     assert stage.on_servo(servo(0.0)) is None
@@ -279,8 +277,8 @@ def test_a_lidar_that_is_bolted_down_is_not_aimed() -> None:
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        ({"travel_deg": (180.0, 0.0)}, "two growing angles at least twice half_angle_deg apart"),
-        ({"travel_deg": (80.0, 88.0)}, "two growing angles at least twice half_angle_deg apart"),
+        ({"travel_deg": (180.0, 0.0)}, "two increasing angles at least twice half_angle_deg apart"),
+        ({"travel_deg": (80.0, 88.0)}, "two increasing angles at least twice half_angle_deg apart"),
         ({"half_angle_deg": 0}, "greater than 0"),
         ({"sweep_rpm": -1}, "greater than 0"),
     ],

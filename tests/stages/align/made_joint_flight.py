@@ -1,4 +1,4 @@
-"""A flight over a parked or turning vehicle, as the stage hears of it: lines, fixes, autopilot or images."""
+"""A flight over a parked or turning vehicle, as inputs of the stage: lines, fixes, autopilot or images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ START_NS = 100 * S
 
 @dataclass
 class Flight:
-    """Everything as functions of time [s]; each part may be left out."""
+    """Everything as functions of time [s]; each part can be disabled."""
 
     speed_mps: float = 1.0
     yaw0_deg: float = 200.0  # of the drone in the world
@@ -40,16 +40,16 @@ class Flight:
     fixes: bool = True
     autopilot: str = "odometry"  # or "split": attitude and position; "attitude" alone; "none"
     images: bool = False  # VisualMotion
-    tells_vehicle: bool = True
-    vehicle_silent: tuple[float, float] = (math.inf, math.inf)  # no word of the vehicle
-    vehicle_afresh_deg: float = 0.0  # its map frame is turned after that
+    vehicle_odometry: bool = True
+    vehicle_silent: tuple[float, float] = (math.inf, math.inf)  # no VehicleMotion
+    vehicle_restart_deg: float = 0.0  # its map frame is turned after that
     fix_sigma_m: float = 0.05
-    false_yaw_deg: float = 0.0  # the fixes are turned: what a wrong branch would look like
+    false_yaw_deg: float = 0.0  # the fixes are turned: as by a wrong branch
     false_from_s: float = 0.0
-    reset_at_s: float = math.inf  # the autopilot's north jumps
+    reset_at_s: float = math.inf  # the yaw of frame odom jumps
     blind: tuple[float, float] = (math.inf, math.inf)  # no lines between these times
     silent: tuple[float, float] = (math.inf, math.inf)  # no autopilot, no images
-    apart_s: float = 0.0  # the vehicle's image is this much before the drone's
+    image_lead_s: float = 0.0  # the vehicle's image is this much before the drone's
     per_direction: int = 12
     seed: int = 0
 
@@ -67,11 +67,11 @@ class Flight:
     def R_local_world(self, t):
         return rotation_z(math.radians(self.local_yaw_deg + (70.0 if t >= self.reset_at_s else 0.0)))
 
-    def run(self, stage: JointAlign, until_s: float, picture_hz: float = 5.0) -> list[RelativeRotation]:
-        """Feed the stage; what it answers."""
+    def run(self, stage: JointAlign, until_s: float, image_hz: float = 5.0) -> list[RelativeRotation]:
+        """Feed the stage; returns its outputs."""
         rng = np.random.default_rng([self.seed, 9])
         events = [(t, "auto") for t in np.arange(0, until_s, 0.05)] + [(t, "fix") for t in np.arange(0, until_s, 0.1)]
-        events += [(t, "lines") for t in np.arange(0.25, until_s, 1 / picture_hz)]
+        events += [(t, "lines") for t in np.arange(0.25, until_s, 1 / image_hz)]
         out: list[RelativeRotation] = []
         for t, kind in sorted(events):
             t = float(t)
@@ -85,8 +85,8 @@ class Flight:
 
     def _autopilot(self, stage: JointAlign, t: float) -> None:
         ns = START_NS + round(t * S)
-        if self.tells_vehicle and not self.vehicle_silent[0] <= t < self.vehicle_silent[1]:
-            afresh_deg = self.vehicle_afresh_deg if t >= self.vehicle_silent[1] else 0.0
+        if self.vehicle_odometry and not self.vehicle_silent[0] <= t < self.vehicle_silent[1]:
+            afresh_deg = self.vehicle_restart_deg if t >= self.vehicle_silent[1] else 0.0
             R = rotation_z(math.radians(afresh_deg)) @ self.R_world_vehicle(t)
             stage.on_motion(VehicleMotion(stamp_ns=ns, xyz_map_m=np.zeros(3), R_map_vehicle=R, covariance=None))
         if self.silent[0] <= t < self.silent[1]:
@@ -139,36 +139,36 @@ class Flight:
             xyz_vehicle_m=self.R_world_vehicle(t).T @ xyz + rng.normal(0, self.fix_sigma_m, 3),
             covariance_m2=self.fix_sigma_m**2 * np.eye(3),
             hits=4,
-            iterations=1,
-            shift_m=0.0,
         )
 
     def _lines(self, stage: JointAlign, t: float) -> list[RelativeRotation]:
         streets = () if self.blind[0] <= t < self.blind[1] else self.streets
         made = dict(per_direction=self.per_direction, verticals=4, sigma_rad=0.003, seed=self.seed)
-        tv = t - self.apart_s
+        tv = t - self.image_lead_s
         vehicle = seen(
             CameraMount.VEHICLE, self.R_world_vehicle(tv), streets, stamp_ns=START_NS + round(tv * S), **made
         )
         drone = seen(CameraMount.DRONE, self.R_world_drone(t), streets, stamp_ns=START_NS + round(t * S), **made)
         return [*stage.on_vehicle(vehicle), *stage.on_drone(drone)]
 
-    def error_deg(self, told: RelativeRotation) -> float:
-        """Of the rotation given, with its branch."""
-        t = (told.stamp_ns - START_NS) / S
+    def error_deg(self, output: RelativeRotation) -> float:
+        """Error of the published rotation, with its branch."""
+        t = (output.stamp_ns - START_NS) / S
         R = self.R_world_vehicle(t).T @ self.R_world_drone(t)
-        return math.degrees(float(np.linalg.norm(log_rotation(R.T @ told.R_vehicle_drone))))
+        return math.degrees(float(np.linalg.norm(log_rotation(R.T @ output.R_vehicle_drone))))
 
-    def quarters_off(self, told: RelativeRotation) -> float:
+    def quarters_off(self, output: RelativeRotation) -> float:
         """Degrees to the nearest branch."""
-        t = (told.stamp_ns - START_NS) / S
+        t = (output.stamp_ns - START_NS) / S
         R = self.R_world_vehicle(t).T @ self.R_world_drone(t)
         return min(
-            math.degrees(float(np.linalg.norm(log_rotation(R.T @ rotation_z(k * math.pi / 2) @ told.R_vehicle_drone))))
+            math.degrees(
+                float(np.linalg.norm(log_rotation(R.T @ rotation_z(k * math.pi / 2) @ output.R_vehicle_drone)))
+            )
             for k in range(4)
         )
 
 
-def wrong_and_resolved(flight: Flight, told: list[RelativeRotation]) -> int:
-    """How many answers are RESOLVED and a branch off."""
-    return sum(m.state is BranchState.RESOLVED and flight.error_deg(m) > 30 for m in told)
+def wrong_and_resolved(flight: Flight, outputs: list[RelativeRotation]) -> int:
+    """Number of outputs that are RESOLVED on a wrong branch."""
+    return sum(m.state is BranchState.RESOLVED and flight.error_deg(m) > 30 for m in outputs)

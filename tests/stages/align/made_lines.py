@@ -1,4 +1,4 @@
-"""Lines of a street as two fisheyes see them, made without images: what `vp` would say, with errors of known size."""
+"""Lines of a street as two fisheyes see them, made without images: outputs of `vp` with errors of known size."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ def seen(
     stamp_ns: int = 0,
     per_direction: int | tuple[int, ...] = 20,
     verticals: int = 15,
-    stray: int = 0,
+    random_lines: int = 0,
     sigma_rad: float = 0.006,
     direction_error_rad: float = 0.0,
     up_error_rad: float = 0.0,
     up_sigma_rad: float = 0.004,
     seed: int = 0,
 ) -> VanishingDirections:
-    """A image's lines: some per street direction, some upright, some stray; the camera looks up or down.
+    """Lines of an image: some per street direction, some upright, some of no direction; the camera points up or down.
 
     `direction_error_rad` is common to all lines of a direction, `up_error_rad` to the vertical.
     """
     rng = np.random.default_rng([seed, 1 if camera_mount is CameraMount.DRONE else 0, stamp_ns % 2**31])
-    looks = 1.0 if camera_mount is CameraMount.VEHICLE else -1.0
+    up_or_down = 1.0 if camera_mount is CameraMount.VEHICLE else -1.0
     counts = per_direction if isinstance(per_direction, tuple) else (per_direction,) * len(azimuths_deg)
     roll, pitch = np.degrees(rng.normal(0, up_error_rad, 2)).tolist()
     up = rotation_from_rpy_deg((roll, pitch, 0.0))[:, 2]
@@ -48,14 +48,14 @@ def seen(
     for azimuth, count in zip(azimuths_deg, counts, strict=True):
         h = rotation_z(math.radians(azimuth) + rng.normal(0, direction_error_rad))[:, 0]
         for _ in range(count):
-            normals.append(line(h, looks, rng))
+            normals.append(line(h, up_or_down, rng))
             owner.append(len(directions))
         directions.append(h)
     for _ in range(verticals):
-        normals.append(line(up, looks, rng))
+        normals.append(line(up, up_or_down, rng))
         owner.append(0)
-    for _ in range(stray):
-        normals.append(line(rotation_z(rng.uniform(0, math.pi))[:, 0], looks, rng))
+    for _ in range(random_lines):
+        normals.append(line(rotation_z(rng.uniform(0, math.pi))[:, 0], up_or_down, rng))
         owner.append(1)
     for i, (normal, middle) in enumerate(normals):
         along = np.cross(normal, middle)
@@ -81,18 +81,18 @@ def seen(
     )
 
 
-def line(direction, looks: float, rng):
-    """Normal and middle of a line along `direction`, somewhere above (looks 1) or below the horizon."""
+def line(direction, up_or_down: float, rng):
+    """Normal and middle of a line along `direction`, somewhere above (up_or_down 1) or below the horizon."""
     while True:
         middle = rng.normal(size=3)
         middle /= np.linalg.norm(middle)
         normal = np.cross(direction, middle)
-        if looks * middle[2] > -0.3 and np.linalg.norm(normal) > 0.2:
+        if up_or_down * middle[2] > -0.3 and np.linalg.norm(normal) > 0.2:
             return normal / np.linalg.norm(normal), middle
 
 
 def nothing(camera_mount: CameraMount, stamp_ns: int = 0, reason: str = "too few lines") -> VanishingDirections:
-    """A image without structure."""
+    """An image without structure."""
     return VanishingDirections(
         stamp_ns=stamp_ns,
         camera_mount=camera_mount,

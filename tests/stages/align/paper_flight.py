@@ -1,4 +1,4 @@
-"""A vehicle and a drone that fly a made path: what their sensors would say, image by image, without noise."""
+"""A vehicle and a drone on a synthetic path: outputs of their sensors, image by image, without noise."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ START_NS = 1_700_000_000 * 10**9
 PERIOD_NS = 100_000_000
 
 
-def picture_ns(k: int) -> int:
+def image_ns(k: int) -> int:
     return START_NS + k * PERIOD_NS
 
 
@@ -39,26 +39,24 @@ class Flight:
 
     def fix(self, k, track_id=1) -> DroneFix:
         return DroneFix(
-            stamp_ns=picture_ns(k),
+            stamp_ns=image_ns(k),
             xyz_vehicle_m=self.R_vehicle(k).T @ (self.t_drone(k) - self.t_vehicle(k)),
             covariance_m2=0.01 * np.eye(3),
             hits=5,
-            iterations=1,
-            shift_m=0.0,
             track_id=track_id,
         )
 
     def vehicle(self, k) -> VehicleMotion:
         return VehicleMotion(
-            stamp_ns=picture_ns(k), xyz_map_m=self.t_vehicle(k), R_map_vehicle=self.R_vehicle(k), covariance=None
+            stamp_ns=image_ns(k), xyz_map_m=self.t_vehicle(k), R_map_vehicle=self.R_vehicle(k), covariance=None
         )
 
     def motion(self, i, j) -> VisualMotion:
         step = self.R_drone(i).T @ (self.t_drone(j) - self.t_drone(i))
         length = np.linalg.norm(step)
         return VisualMotion(
-            stamp_ns=picture_ns(j),
-            from_ns=picture_ns(i),
+            stamp_ns=image_ns(j),
+            from_ns=image_ns(i),
             R_from_to=self.R_drone(i).T @ self.R_drone(j),
             covariance_rad2=1e-6 * np.eye(3),
             direction_from=step / length if length > 1e-9 else None,
@@ -70,7 +68,7 @@ class Flight:
     def seen(self, camera_mount, k) -> VanishingDirections:
         """The world's axes, a row each, in the camera_mount's."""
         R = self.R_vehicle(k) if camera_mount is CameraMount.VEHICLE else self.R_drone(k)
-        return vanishing(camera_mount, picture_ns(k), R)
+        return vanishing(camera_mount, image_ns(k), R)
 
 
 def vanishing(camera_mount, stamp_ns, directions, reason="") -> VanishingDirections:

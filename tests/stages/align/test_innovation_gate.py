@@ -1,4 +1,4 @@
-"""A image's yaw beside the turns felt: weighed with them, and worth no more than the last images scattered."""
+"""Fusion of the yaw of an image with dead reckoning, with a variance of at least the scatter of recent images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def refined(yaw_deg: float, sigma_deg: float = 0.3) -> Refined:
 
 
 class Pair:
-    """The surprise and the lock it asks, as the stage uses them."""
+    """The innovation gate and its tracker, as the stage uses them."""
 
     def __init__(self, rate_hz: float = 5.0) -> None:
         self.rate_hz = rate_hz
@@ -32,27 +32,27 @@ class Pair:
         self.k = 0
 
     def see(self, yaw_deg: float, sigma_deg: float = 0.3, variance: float | None = None) -> Refined:
-        """One more image; dead reckoning has the yaw at zero."""
+        """Add an image; the dead reckoned yaw is zero."""
         self.k += 1
         variance = DRIFT * 5.0 / self.rate_hz if variance is None else variance
         at = DeadReckonedYaw(round(self.k * S / self.rate_hz), 0.0, 0.0, variance)
         self.tracker.variance_rad2 += variance
-        picture = self.innovation_gate.with_scatter(refined(yaw_deg, sigma_deg), at)
-        told = self.innovation_gate.weigh_yaw(picture, at)
-        self.tracker.accept(picture.yaw_rad, picture.yaw_sigma_rad, at)
-        return told
+        image = self.innovation_gate.with_scatter(refined(yaw_deg, sigma_deg), at)
+        output = self.innovation_gate.weigh_yaw(image, at)
+        self.tracker.accept(image.yaw_rad, image.yaw_sigma_rad, at)
+        return output
 
 
-def deg(told: Refined) -> tuple[float, float]:
-    return math.degrees(told.yaw_rad), math.degrees(told.yaw_sigma_rad)
+def deg(output: Refined) -> tuple[float, float]:
+    return math.degrees(output.yaw_rad), math.degrees(output.yaw_sigma_rad)
 
 
-def test_the_first_picture_is_told_as_it_is():
-    told = Pair().see(20.0)
-    assert deg(told) == pytest.approx((20.0, 0.3))
+def test_the_first_measurement_is_unchanged():
+    output = Pair().see(20.0)
+    assert deg(output) == pytest.approx((20.0, 0.3))
 
 
-def test_pictures_that_agree_are_told_no_worse_than_they_are():
+def test_consistent_images_keep_their_sigma():
     pair = Pair()
     for _ in range(20):
         yaw, sigma = deg(pair.see(20.0))
@@ -61,32 +61,32 @@ def test_pictures_that_agree_are_told_no_worse_than_they_are():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_pictures_that_scatter_more_than_they_know_are_told_as_they_scatter(seed):
+def test_images_with_more_scatter_than_their_sigma_get_the_sigma_of_the_scatter(seed):
     pair, rng = Pair(), np.random.default_rng(seed)
     errors = rng.normal(0.0, 0.9, 200)
-    told = np.array([deg(pair.see(20.0 + e)) for e in errors])[20:]
-    off = told[:, 0] - 20.0
+    output = np.array([deg(pair.see(20.0 + e)) for e in errors])[20:]
+    off = output[:, 0] - 20.0
     assert np.sqrt(np.mean(off**2)) < 0.35 * np.sqrt(np.mean(errors[20:] ** 2))
-    assert np.mean((off / told[:, 1]) ** 2) < 1.5  # as each image says of itself that would be 9
+    assert np.mean((off / output[:, 1]) ** 2) < 1.5  # with the sigma of each image it would be 9
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 30.0])
-def test_errors_that_last_are_not_averaged_away_by_more_pictures(rate_hz):
-    """A Gauss-Markov error of 0.6 deg that lasts 0.5 s, of images that say 0.3."""
+def test_correlated_errors_do_not_average_out_with_more_images(rate_hz):
+    """A Gauss-Markov error of 0.6 deg of 0.5 s, for images with a sigma of 0.3 deg."""
     off, sigma = [], []
     for seed in range(20):
         pair, rng = Pair(rate_hz), np.random.default_rng(seed)
         keep, error = math.exp(-1.0 / rate_hz / 0.5), 0.0
         for k in range(round(30 * rate_hz)):
             error = keep * error + rng.normal(0.0, 0.6 * math.sqrt(1.0 - keep**2))
-            yaw, told = deg(pair.see(20.0 + error))
+            yaw, yaw_sigma = deg(pair.see(20.0 + error))
             if k > 5 * rate_hz:
                 off.append(yaw - 20.0)
-                sigma.append(told)
-    assert np.mean((np.array(off) / np.array(sigma)) ** 2) < 2.5  # 5 were each image of 30 Hz taken for new
+                sigma.append(yaw_sigma)
+    assert np.mean((np.array(off) / np.array(sigma)) ** 2) < 2.5  # 5 if all images at 30 Hz counted as independent
 
 
-def test_one_odd_picture_is_told_as_doubtful_and_soon_forgotten():
+def test_one_outlier_inflates_the_variance_for_a_short_time():
     pair = Pair()
     for _ in range(20):
         pair.see(20.0)
@@ -96,24 +96,24 @@ def test_one_odd_picture_is_told_as_doubtful_and_soon_forgotten():
     assert deg(pair.see(20.0))[0] == pytest.approx(20.0, abs=0.2)
 
 
-def test_a_step_of_what_was_known_is_followed_and_told_as_doubtful_until_then():
-    """An autopilot that corrects its own yaw by 2 deg: both are wrong by no more than they say at any time."""
+def test_a_step_of_dead_reckoning_is_followed_with_inflated_variance():
+    """An autopilot that corrects its own yaw by 2 deg: the error stays within sigma at all times."""
     pair = Pair()
     for _ in range(20):
         pair.see(20.0)
-    told = [deg(pair.see(22.0)) for _ in range(25)]
-    assert all(abs(yaw - 22.0) < 1.7 * sigma for yaw, sigma in told)
-    assert told[-1] == pytest.approx((22.0, 0.25), abs=0.1)
+    output = [deg(pair.see(22.0)) for _ in range(25)]
+    assert all(abs(yaw - 22.0) < 1.7 * sigma for yaw, sigma in output)
+    assert output[-1] == pytest.approx((22.0, 0.25), abs=0.1)
 
 
-def test_turns_that_nobody_feels_contradict_nothing():
+def test_an_unmeasured_turn_is_no_contradiction():
     pair = Pair()
     pair.see(20.0)
-    told = pair.see(45.0, variance=math.radians(8.0) ** 2)
-    assert deg(told) == pytest.approx((45.0, 0.3))
+    output = pair.see(45.0, variance=math.radians(8.0) ** 2)
+    assert deg(output) == pytest.approx((45.0, 0.3))
 
 
-def test_the_covariance_stays_one():
+def test_the_covariance_stays_positive_definite():
     pair, rng = Pair(), np.random.default_rng(1)
     for e in rng.normal(0.0, 0.9, 50):
         covariance = pair.see(20.0 + e).covariance

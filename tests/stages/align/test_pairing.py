@@ -1,4 +1,4 @@
-"""Images are paired with the nearest, as soon as that is certain."""
+"""Images are paired with the nearest, as soon as no nearer one can arrive."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tests.stages.align.made_lines import MS, nothing
 
 
 def run(events, furthest_ms=100):
-    """Events ("v" or "d", ms) -> pairs (vehicle ms or None, drone ms), each with how many events it took."""
+    """Events ("v" or "d", ms) -> pairs (vehicle ms or None, drone ms), each with the number of events before it."""
     pairing, out = Pairing(furthest_ms * MS), []
     for count, (kind, ms) in enumerate(events, 1):
         camera_mount = CameraMount.VEHICLE if kind == "v" else CameraMount.DRONE
@@ -19,37 +19,37 @@ def run(events, furthest_ms=100):
     return out
 
 
-def test_one_at_the_same_moment_is_taken_at_once_whichever_comes_first():
+def test_images_of_the_same_time_are_paired_at_once_in_any_order():
     assert run([("v", 100), ("d", 100)]) == [(100, 100, 2)]
     assert run([("d", 100), ("v", 100)]) == [(100, 100, 2)]
 
 
-def test_the_next_picture_is_awaited_when_it_may_be_nearer():
+def test_the_next_image_is_awaited_when_it_may_be_nearer():
     assert run([("v", 0), ("v", 100), ("d", 180), ("v", 200)]) == [(200, 180, 4)]
 
 
-def test_the_next_picture_is_not_awaited_when_it_cannot_be_nearer():
+def test_the_next_image_is_not_awaited_when_it_cannot_be_nearer():
     assert run([("v", 0), ("v", 100), ("d", 140), ("v", 200)]) == [(100, 140, 3)]
 
 
-def test_each_drone_picture_is_answered_once_and_in_order():
+def test_each_drone_image_is_paired_once_and_in_order():
     events = sorted([("v", 33 + 100 * i) for i in range(8)] + [("d", 70 * i) for i in range(10)], key=lambda e: e[1])
     pairs = run(events)
     assert [d for _, d, _ in pairs] == [70 * i for i in range(10)]
     assert all(abs(v - d) <= 50 for v, d, _ in pairs)
 
 
-def test_without_a_vehicle_picture_near_there_is_none():
+def test_without_a_near_vehicle_image_the_pair_has_none():
     assert run([("v", 0), ("v", 100), ("d", 400), ("v", 700)]) == [(None, 400, 4)]
 
 
-def test_a_dead_camera_does_not_hold_answers_back():
+def test_a_failed_camera_does_not_block_pairs():
     assert run([("d", 100 * i) for i in range(5)])[0] == (None, 0, 4)
 
 
-def test_what_waits_at_the_end_goes_with_what_there_is():
+def test_waiting_images_are_paired_at_the_end():
     assert run([("v", 0), ("v", 100), ("d", 180)]) == [(100, 180, None)]
 
 
-def test_a_late_picture_of_the_vehicle_is_ignored():
+def test_a_late_image_of_the_vehicle_is_ignored():
     assert run([("v", 100), ("v", 40), ("d", 50)]) == [(100, 50, 3)]

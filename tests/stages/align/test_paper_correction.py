@@ -1,4 +1,4 @@
-"""Correction by motion: R_f by hand, the last seven, what is too short, too steep, at odds or unknown."""
+"""Correction by motion: R_f by hand, the last seven, and motions that are too short, too steep, inconsistent or unknown."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def turn_deg(correction):
         ((1, 0, 0), (math.cos(0.3), math.sin(0.3), 0.2), math.degrees(0.3)),
     ],
 )
-def test_the_heading_change_takes_one_heading_to_the_other(f_hat, f, deg):
+def test_the_heading_change_rotates_one_heading_to_the_other(f_hat, f, deg):
     f_hat, f = np.array(f_hat, float), np.array(f, float)
     angle = heading_change_rad(f_hat, f)
     assert math.degrees(angle) == pytest.approx(deg, abs=1e-6)
@@ -52,7 +52,7 @@ def test_the_heading_change_takes_one_heading_to_the_other(f_hat, f, deg):
     assert math.atan2(turned[1], turned[0]) == pytest.approx(math.atan2(f[1], f[0]), abs=1e-6)
 
 
-def test_what_stands_steep_has_no_heading():
+def test_a_steep_vector_has_no_heading():
     assert heading_change_rad(np.array([0.1, 0, 2.0]), np.array([1.0, 0, 0])) is None
     assert heading_change_rad(np.array([1.0, 0, 0]), np.array([0.0, 0.5, -3.0])) is None
     assert heading_change_rad(np.array([1.0, 0, 1.7]), np.array([1.0, 0, 0])) is not None, "just below 60 deg"
@@ -71,13 +71,13 @@ def test_turning_the_world_changes_nothing():
         assert turn_deg(fly(flight, 25, 90)) == pytest.approx(-90, abs=1e-6)
 
 
-def test_single_steps_are_chained_to_fourteen_pictures():
+def test_single_steps_are_chained_to_fourteen_images():
     flight = Flight(drone_yaw_deg=-30, drone_dps=20.0)
     assert turn_deg(fly(flight, 25, 90, step=1)) == pytest.approx(-90, abs=0.5)
     assert turn_deg(fly(flight, 25, 90, step=5)) == pytest.approx(-90, abs=0.5)
 
 
-def test_motions_from_key_pictures_are_chained_over_the_keys():
+def test_motions_from_key_images_are_chained_over_the_keys():
     """A key every 4 images: the motion to image k begins at the key before it."""
     flight = Flight(drone_yaw_deg=-30, drone_dps=20.0)
     correction = fly(flight, 30, 90, step=99)
@@ -86,7 +86,7 @@ def test_motions_from_key_pictures_are_chained_over_the_keys():
     assert turn_deg(correction) == pytest.approx(-90, abs=0.5)
 
 
-def test_a_chain_with_a_link_missing_tells_nothing():
+def test_a_chain_with_a_missing_step_gives_no_turn():
     flight = Flight()
     correction = fly(flight, 30, step=99)
     for k in range(1, 30):
@@ -101,21 +101,21 @@ def test_seven_are_needed():
     assert turn_deg(fly(flight, 14 + 7)) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_every_pair_speaks_once():
+def test_every_pair_is_used_once():
     flight = Flight()
     correction = fly(flight, 25, 90)
     assert turn_deg(correction) == pytest.approx(-90, abs=1e-6)
-    assert turn_deg(correction) is None, "the drone hovers: old motion says nothing of now"
+    assert turn_deg(correction) is None, "the drone hovers: old motion is not used"
 
 
 def test_less_than_a_metre_does_not_count():
-    assert turn_deg(fly(Flight(speed_mps=(0.7, 0, 0)), 40)) is None, "14 pictures: 0.98 m"
+    assert turn_deg(fly(Flight(speed_mps=(0.7, 0, 0)), 40)) is None, "14 images: 0.98 m"
     assert turn_deg(fly(Flight(speed_mps=(0.72, 0, 0)), 40)) is not None
     assert turn_deg(fly(Flight(speed_mps=(0.72, 0, 0)), 40, step=1)) is not None, "chained to 14, not to 13"
     assert turn_deg(fly(Flight(speed_mps=(0.7, 0, 0)), 40, step=1)) is None
 
 
-def test_directions_at_odds_correct_nothing():
+def test_inconsistent_directions_correct_nothing():
     flight = Flight()
 
     def swinging(i, j):
@@ -130,21 +130,21 @@ def test_a_climb_corrects_nothing():
     assert turn_deg(fly(Flight(speed_mps=(0.2, 0.1, 2.0)), 30)) is None
 
 
-def test_a_drone_that_was_seen_not_to_move_is_no_direction():
+def test_a_static_drone_has_no_direction():
     flight = Flight(speed_mps=(0.0, 0.0, 0.0))
     assert flight.motion(0, 14).direction_from is None
     assert turn_deg(fly(flight, 30)) is None
 
 
-def test_without_vehicle_odometry_the_vehicle_is_taken_to_stand():
+def test_without_vehicle_odometry_the_vehicle_is_assumed_to_stand():
     standing = Flight(vehicle_mps=0.0, vehicle_dps=0.0)
     assert turn_deg(fly(standing, 25, 90, vehicle=False)) == pytest.approx(-90, abs=1e-6)
 
 
-def test_places_lie_between_fixes_and_not_across_gaps():
+def test_positions_are_interpolated_between_fixes_but_not_across_gaps():
     flight = Flight(vehicle_dps=0.0)
     assert turn_deg(fly(flight, 30, 90, fixes=range(0, 31, 4))) == pytest.approx(-90, abs=1e-6)
-    assert turn_deg(fly(flight, 40, 90, fixes=range(0, 40, 6))) is None, "0.6 s apart"
+    assert turn_deg(fly(flight, 40, 90, fixes=range(0, 40, 6))) is None, "gaps of 0.6 s"
     assert turn_deg(fly(flight, 40, 90, fixes=())) is None
 
 
@@ -163,7 +163,7 @@ def test_a_pair_never_spans_two_tracks():
     assert until(39) == pytest.approx(-90, abs=1e-6)
 
 
-def test_pairs_seen_under_a_wrong_rotation_are_forgotten():
+def test_pairs_of_a_wrong_rotation_are_dropped():
     flight = Flight()
     correction = fly(flight, 25, 90)
     assert turn_deg(correction) == pytest.approx(-90, abs=1e-6)
@@ -182,7 +182,7 @@ def test_pairs_seen_under_a_wrong_rotation_are_forgotten():
     assert turn_deg(correction) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_motion_waits_for_the_fix_after_it_but_not_for_ever():
+def test_a_motion_waits_a_limited_time_for_the_fix_after_it():
     flight = Flight()
     correction = fly(flight, 21, fixes=range(18))
     assert turn_deg(correction) is None

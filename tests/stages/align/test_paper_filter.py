@@ -1,4 +1,4 @@
-"""The paper's filter: prediction and update by hand, the rate it learns, how slowly, and how far it is believed."""
+"""The paper's filter: prediction and update by hand, the estimated rate, its lag, and its limit in time."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_one_prediction_by_hand():
     np.testing.assert_allclose(P, P.T)
 
 
-def test_a_steady_turn_is_learned_and_predicted_about_any_axis():
+def test_a_steady_turn_is_estimated_and_predicted_about_any_axis():
     for axis in np.eye(3):
         estimate = fresh()
         assert turning(estimate, 10.0, 4.0, axis=axis[[0, 1, 2]]) < 0.2
@@ -75,7 +75,7 @@ def test_a_sudden_turn_is_followed_late_because_the_rate_is_slow():
     assert lag[0] > 5.0 > lag[1]
 
 
-def test_after_a_silence_the_rate_turns_it_no_further_while_doubt_grows():
+def test_after_a_gap_the_rate_is_not_applied_but_the_covariance_grows():
     estimate = fresh()
     turning(estimate, 10.0, 4.0)
     start = estimate.rotation
@@ -96,7 +96,7 @@ def test_a_time_that_is_not_later_changes_nothing():
     np.testing.assert_array_equal(estimate.covariance, before[1])
 
 
-def test_the_covariance_stays_one_and_the_rotation_a_rotation():
+def test_covariance_and_rotation_stay_valid():
     rng = np.random.default_rng(0)
     estimate = fresh()
     for k in range(300):
@@ -107,7 +107,7 @@ def test_the_covariance_stays_one_and_the_rotation_a_rotation():
     np.testing.assert_allclose(estimate.rotation.T @ estimate.rotation, np.eye(3), atol=1e-12)
 
 
-def test_a_restart_forgets_the_rate():
+def test_a_restart_resets_the_rate():
     estimate = fresh()
     turning(estimate, 10.0, 2.0)
     estimate.restart(rotation_z(1.0), 3 * DEG)

@@ -42,7 +42,7 @@ def test_the_rotation_is_V_G_V_D_inverse():
     st.integers(0, 1000),
 )
 @settings(max_examples=50, deadline=None)
-def test_order_and_sign_of_directions_mean_nothing(order_g, order_d, signs, seed):
+def test_order_and_sign_of_directions_have_no_effect(order_g, order_d, signs, seed):
     rng = np.random.default_rng(seed)
     drone = streets(rotation_from_rpy_deg((3, 4, 70)))
     vehicle = drone @ TRUE.T
@@ -52,7 +52,7 @@ def test_order_and_sign_of_directions_mean_nothing(order_g, order_d, signs, seed
     np.testing.assert_allclose(match(vehicle, drone, previous).R_vehicle_drone, TRUE, atol=1e-9)
 
 
-def test_turning_vehicle_or_drone_turns_the_answer_with_it():
+def test_turning_vehicle_or_drone_turns_the_rotation_with_it():
     drone = streets(rotation_from_rpy_deg((3, 4, 70)))
     vehicle = drone @ TRUE.T
     turn = rotation_from_rpy_deg((2, -1, 25))
@@ -62,7 +62,7 @@ def test_turning_vehicle_or_drone_turns_the_answer_with_it():
     np.testing.assert_allclose(found.R_vehicle_drone, TRUE @ turn.T, atol=1e-12)
 
 
-def test_directions_that_are_not_at_right_angles_give_a_rotation_all_the_same():
+def test_directions_that_are_not_at_right_angles_give_a_rotation():
     g = np.array([[1.0, 0, 0], [0.05, 0.9987, 0], [0, 0, 1.0]])
     d = np.array([[1.0, 0, 0], [-0.05, 0.9987, 0], [0, 0, 1.0]])
     R = match(g, d, np.eye(3)).R_vehicle_drone
@@ -71,7 +71,7 @@ def test_directions_that_are_not_at_right_angles_give_a_rotation_all_the_same():
     assert angle_between_rad(R, np.eye(3)) < 0.1
 
 
-def test_the_best_two_pairs_are_taken_and_the_third_is_theirs():
+def test_the_best_two_pairs_are_used_and_the_third_is_their_cross_product():
     """The x directions disagree by 10 deg: y and z decide."""
     g = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
     d = np.array([[math.cos(0.17), 0, math.sin(0.17)], [0, 1.0, 0], [0, 0, 1.0]])
@@ -92,8 +92,8 @@ def test_two_directions_each_are_enough():
 
 
 @pytest.mark.parametrize("quarter", [1, 2, 3])
-def test_a_start_a_quarter_turn_off_stays_a_quarter_turn_off(quarter):
-    """What the paper's correction by motion is for."""
+def test_an_initial_error_of_90_deg_stays(quarter):
+    """The correction by motion of the paper removes it."""
     turn = rotation_z(quarter * math.pi / 2)
     vehicle = np.eye(3)
     drone = vehicle @ TRUE
@@ -101,7 +101,7 @@ def test_a_start_a_quarter_turn_off_stays_a_quarter_turn_off(quarter):
     np.testing.assert_allclose(found.R_vehicle_drone, turn @ TRUE, atol=1e-9)
 
 
-def test_the_angle_told_is_that_of_the_worse_pair():
+def test_the_reported_angle_is_that_of_the_worse_pair():
     off = rotation_z(math.radians(12))
     assert math.degrees(match(np.eye(3), np.eye(3), off).angle_rad) == pytest.approx(12.0)
     assert math.degrees(angle_between_rad(np.eye(3), off)) == pytest.approx(12.0)

@@ -1,4 +1,4 @@
-"""The joint refinement: exact lines give the exact rotation, its covariance is that of the errors, a turned world turns it."""
+"""The joint refinement: exact lines give the exact rotation, its covariance matches the errors, symmetries."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ALLOWED = Tolerances(STRAIGHT, math.radians(0.1), math.radians(0.5), 0.0)
 
 
 def aligned(R_world_vehicle, R_world_drone, streets=MANHATTAN, allowed=ALLOWED, **kwargs) -> Refined:
-    """As the stage does it for one pair."""
+    """The refinement of one pair, as in the stage."""
     vehicle = level_lines(seen(CameraMount.VEHICLE, R_world_vehicle, streets, **kwargs), STRAIGHT)
     drone = level_lines(seen(CameraMount.DRONE, R_world_drone, streets, **kwargs), STRAIGHT)
     assert vehicle is not None
@@ -45,8 +45,8 @@ def test_perfect_lines_give_the_rotation_also_of_tilted_carriers(streets, yaw_de
     np.testing.assert_allclose(phi, 0.0, atol=1e-5)
 
 
-def test_a_wrong_vertical_is_put_right_by_the_streets():
-    """All level lines together know where up is."""
+def test_a_wrong_vertical_is_corrected_by_the_streets():
+    """All horizontal lines together determine the vertical."""
     R_v, R_d = turned(0, 0, 0), turned(0, 0, 31)
     off = [
         np.linalg.norm(
@@ -61,7 +61,7 @@ def test_a_wrong_vertical_is_put_right_by_the_streets():
     assert off[0] < 0.25 * off[1]
 
 
-def test_turning_the_world_turns_nothing():
+def test_turning_the_world_changes_nothing():
     R_v, R_d, turn = turned(1, 2, 3), turned(4, 5, 66), rotation_z(0.4)
     here = aligned(R_v, R_d)
     there = aligned(turn @ R_v, turn @ R_d, tuple(a + math.degrees(0.4) for a in MANHATTAN))
@@ -70,7 +70,7 @@ def test_turning_the_world_turns_nothing():
     )
 
 
-def test_the_four_branches_are_quarter_turns_about_the_vehicles_vertical():
+def test_the_four_branches_differ_by_90_deg_about_the_vertical():
     R_v, R_d = turned(5, -4, 0), turned(0, 0, 10)
     refined = aligned(R_v, R_d, sigma_rad=0.0)
     up = R_v.T[:, 2]
@@ -81,8 +81,8 @@ def test_the_four_branches_are_quarter_turns_about_the_vehicles_vertical():
 
 
 @pytest.mark.parametrize("streets", [MANHATTAN, ATLANTA, CAMPUS])
-def test_the_covariance_is_that_of_the_errors(streets):
-    """NEES over 120 pairs, with errors that lines share as the tolerances say; three degrees of freedom."""
+def test_the_covariance_matches_the_errors(streets):
+    """NEES over 120 pairs, with shared errors as in the tolerances; three degrees of freedom."""
     rng = np.random.default_rng(7)
     shared = math.radians(0.2)
     allowed = Tolerances(STRAIGHT, shared, math.radians(0.5), 0.0)
@@ -98,26 +98,26 @@ def test_the_covariance_is_that_of_the_errors(streets):
     assert np.mean(np.array(nees) < 7.815) > 0.9
 
 
-def test_more_lines_of_one_street_do_not_make_it_surer_than_what_they_share():
+def test_more_lines_of_one_street_do_not_reduce_sigma_below_their_shared_error():
     R_v, R_d = turned(0, 0, 0), turned(0, 0, 31)
     few, many = (aligned(R_v, R_d, per_direction=n, sigma_rad=0.003).yaw_sigma_rad for n in (20, 400))
     assert many < few
     assert many > math.radians(0.1)  # two cameras, two directions: 0.1 sqrt(2) / sqrt(2) at best
 
 
-def test_few_lines_and_lines_at_odds_make_it_less_sure():
+def test_few_or_inconsistent_lines_increase_sigma():
     R_v, R_d = turned(0, 0, 0), turned(0, 0, 31)
     good, few, odd = (
-        aligned(R_v, R_d, per_direction=n, sigma_rad=0.003, direction_error_rad=0.0, stray=s).yaw_sigma_rad
+        aligned(R_v, R_d, per_direction=n, sigma_rad=0.003, direction_error_rad=0.0, random_lines=s).yaw_sigma_rad
         for n, s in ((40, 0), (4, 0), (40, 2000))
     )
     assert few > 1.5 * good
     assert odd > 1.2 * good
 
 
-def test_stray_lines_hardly_move_it():
+def test_random_lines_hardly_change_the_yaw():
     R_v, R_d = turned(1, 1, 0), turned(-3, 2, 31)
-    phi, _ = error(aligned(R_v, R_d, per_direction=25, stray=25, sigma_rad=0.002), R_v, R_d)
+    phi, _ = error(aligned(R_v, R_d, per_direction=25, random_lines=25, sigma_rad=0.002), R_v, R_d)
     assert np.linalg.norm(phi) < math.radians(0.3)
 
 
@@ -131,7 +131,7 @@ def test_cameras_on_different_streets_of_a_crossing_are_tied_by_its_right_angle(
     refined = refine(vehicle, drone, directions, math.radians(25.0), ALLOWED)
     assert math.degrees(refined.yaw_rad) == pytest.approx(25.0, abs=0.01)
     assert math.radians(0.5) < refined.yaw_sigma_rad < math.radians(0.8)
-    assert refined.directions == 0  # none that both have
+    assert refined.directions == 0  # none in common
 
 
 def test_street_directions_are_the_strongest_of_both_and_not_too_many():

@@ -1,4 +1,4 @@
-"""Yaw spectra by formula, their symmetries, and what they say of streets that only one camera sees."""
+"""Yaw spectra by formula, their symmetries, and streets that only one camera sees."""
 
 from __future__ import annotations
 
@@ -45,21 +45,21 @@ def yaw_between(vehicle, drone):
 
 
 def test_a_line_has_the_azimuth_of_its_direction_and_its_turn_as_sigma():
-    """h = z x n / |z x n|, sigma |t . h| / |z x n| with t = n x m, and what streets are straight to."""
-    picture = seen(CameraMount.VEHICLE, np.eye(3), (30.0,), per_direction=6, verticals=0, sigma_rad=0.006)
-    told = level_lines(picture, STRAIGHT)
-    assert told is not None
-    np.testing.assert_allclose(np.degrees(told.azimuth_rad), 30.0, atol=3.0)
-    for i, (n, ends) in enumerate(zip(picture.line_normal, picture.line_end, strict=True)):
+    """h = z x n / |z x n|, sigma |t . h| / |z x n| with t = n x m, and the straightness of streets."""
+    image = seen(CameraMount.VEHICLE, np.eye(3), (30.0,), per_direction=6, verticals=0, sigma_rad=0.006)
+    lines = level_lines(image, STRAIGHT)
+    assert lines is not None
+    np.testing.assert_allclose(np.degrees(lines.azimuth_rad), 30.0, atol=3.0)
+    for i, (n, ends) in enumerate(zip(image.line_normal, image.line_end, strict=True)):
         middle = ends.sum(axis=0) / np.linalg.norm(ends.sum(axis=0))
         level = np.cross([0, 0, 1], n)
         flat = np.linalg.norm(level)
         h = level / flat
-        assert told.azimuth_rad[i] == pytest.approx(math.atan2(h[1], h[0]) % math.pi)
+        assert lines.azimuth_rad[i] == pytest.approx(math.atan2(h[1], h[0]) % math.pi)
         sigma = 0.006 * abs(np.cross(n, middle) @ h)
-        assert told.sigma_rad[i] == pytest.approx(sigma)
-        assert told.azimuth_sigma_rad[i] == pytest.approx(math.hypot(sigma / flat, STRAIGHT))
-        assert told.weight[i] == pytest.approx(min(math.acos(ends[0] @ ends[1]), 0.5))
+        assert lines.sigma_rad[i] == pytest.approx(sigma)
+        assert lines.azimuth_sigma_rad[i] == pytest.approx(math.hypot(sigma / flat, STRAIGHT))
+        assert lines.weight[i] == pytest.approx(min(math.acos(ends[0] @ ends[1]), 0.5))
 
 
 def test_a_kernel_has_its_lines_weight_as_area_and_its_sigma_as_width():
@@ -69,14 +69,14 @@ def test_a_kernel_has_its_lines_weight_as_area_and_its_sigma_as_width():
     assert s[164] / s[160] == pytest.approx(math.exp(-0.5), rel=1e-6)  # one degree is four bins and one sigma
 
 
-def test_a_kernel_at_the_seam_goes_round():
+def test_a_kernel_at_the_seam_wraps_around():
     s = spectrum_at(0.1)
     assert s[0] > 0
     assert s[BINS - 1] > 0
     np.testing.assert_allclose(np.roll(spectrum_at(50.1), -200), s, atol=1e-9)
 
 
-def test_a_line_whose_azimuth_is_hardly_known_is_left_out():
+def test_a_line_with_an_uncertain_azimuth_is_ignored():
     assert spectrum_at(40.0, sigma_deg=5.0).sum() == 0
 
 
@@ -98,24 +98,24 @@ def test_how_many_lines_run_along_a_street_does_not_matter():
     assert yaw_between(vehicle, drone) == pytest.approx(10.0, abs=0.2)
 
 
-def test_one_camera_on_the_one_street_and_one_on_its_crossing_match_at_a_quarter_turn():
+def test_cameras_on_two_crossing_streets_match_at_90_deg():
     assert yaw_between(spectrum_at([20.0] * 8), spectrum_at([110.0] * 8)) == pytest.approx(0.0, abs=0.2)
 
 
-def test_lines_in_all_directions_match_nowhere_better():
+def test_lines_in_all_directions_have_no_best_match():
     rng = np.random.default_rng(3)
     likeness = overlap(spectrum_at(rng.uniform(0, 180, 400)), spectrum_at(rng.uniform(0, 180, 400)))
     assert np.ptp(likeness) < 0.15
 
 
-def test_no_lines_are_like_nothing():
+def test_without_lines_the_overlap_is_zero():
     none = np.zeros(BINS)
     np.testing.assert_array_equal(overlap(none, spectrum_at(3.0)), np.zeros(QUARTER))
     assert peaks(overlap(none, none), 0.1) == []
     assert shared_directions(none, none, 0.0) == 0
 
 
-def test_shared_directions_are_counted_modulo_a_quarter():
+def test_shared_directions_are_counted_modulo_90_deg():
     vehicle = spectrum_at([0.0, 90.0, 0.0, 34.0, 34.0])
     drone = spectrum_at([0.0, 34.0, 34.0, 124.0, 70.0, 70.0])
     assert shared_directions(vehicle, drone, 0.0) == 2
@@ -123,7 +123,7 @@ def test_shared_directions_are_counted_modulo_a_quarter():
     assert shared_directions(vehicle, drone, math.radians(10.0)) == 0
 
 
-def test_nearby_is_a_sum_over_neighbours_round_the_seam():
+def test_nearby_is_a_sum_over_neighbours_across_the_seam():
     p = np.zeros(QUARTER)
     p[0], p[4], p[-5] = 1.0, 2.0, 4.0
     near = nearby(p)
@@ -151,23 +151,23 @@ def test_level_axes_keep_the_heading_and_stand_upright():
     np.testing.assert_allclose(level_axes(np.array([2.0, 0.0, 0.0]))[:, 2], [1, 0, 0])  # nose up: some axes
 
 
-def test_a_vertical_told_upside_down_is_the_same():
-    picture = seen(CameraMount.DRONE, turned(4.0, 7.0, 33.0))
-    flipped = dataclasses.replace(picture, direction=-picture.direction)
-    a, b = level_lines(picture, STRAIGHT), level_lines(flipped, STRAIGHT)
+def test_an_inverted_vertical_is_equivalent():
+    image = seen(CameraMount.DRONE, turned(4.0, 7.0, 33.0))
+    flipped = dataclasses.replace(image, direction=-image.direction)
+    a, b = level_lines(image, STRAIGHT), level_lines(flipped, STRAIGHT)
     assert a is not None
     assert b is not None
     np.testing.assert_array_equal(a.azimuth_rad, b.azimuth_rad)
 
 
-def test_a_picture_without_vertical_has_no_level_lines():
+def test_an_image_without_vertical_has_no_level_lines():
     assert level_lines(nothing(CameraMount.DRONE), STRAIGHT) is None
 
 
-def test_verticals_and_lines_of_no_direction_are_left_out():
-    told = level_lines(seen(CameraMount.DRONE, np.eye(3), per_direction=(3, 4), verticals=9), STRAIGHT)
-    assert told is not None
-    assert len(told.weight) == 7
+def test_verticals_and_lines_without_direction_are_ignored():
+    lines = level_lines(seen(CameraMount.DRONE, np.eye(3), per_direction=(3, 4), verticals=9), STRAIGHT)
+    assert lines is not None
+    assert len(lines.weight) == 7
 
 
 @pytest.mark.parametrize(("angle_deg", "nearest_deg"), [(0, 0), (46, -44), (-46, 44), (90, 0), (200, 20), (45, -45)])

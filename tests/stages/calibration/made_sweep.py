@@ -1,4 +1,4 @@
-"""A yard of flat walls, swept by a LiDAR whose mount is known to the last digit: what a calibration should find."""
+"""A yard of flat walls, swept by a LiDAR with an exactly known mount: ground truth of a calibration."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ THERE_AND_BACK_TWICE = ((0.0, 180.0, SLOW), (180.0, 0.0, SLOW), (0.0, 180.0, FAS
 
 
 def wrong_mount(seed: int = 0) -> ServoMount:
-    """The rig with errors of the kind that a real one has."""
+    """The rig with realistic errors."""
     rng = np.random.default_rng([seed, 1])
     return servo_mount(RIG).moved(
         {
@@ -49,7 +49,7 @@ class Sweep:
 
 
 def turned(true: ServoMount, legs, t_s):
-    """(encoder's true position, turntable's angle) at times, of a servo that goes leg after leg (from, to, deg/s)."""
+    """(encoder's true position, turntable's angle) at times, of a servo that follows legs (from, to, deg/s)."""
     knots, places = [0.0], [legs[0][0]]
     for _, to, speed in legs:
         knots.append(knots[-1] + abs(to - places[-1]) / speed)

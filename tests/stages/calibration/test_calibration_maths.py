@@ -105,7 +105,7 @@ def test_a_drive_moves_returns_along_and_a_turn_about_z():
     assert columns[0] == pytest.approx([0, 3, 0, 0, 0, 6])  # 3 s at 1 m/s along y; 3 s at 1 rad/s, 2 m out
 
 
-def test_the_encoders_steps_are_smoothed_away_but_not_its_turns():
+def test_encoder_steps_are_smoothed_but_not_its_motion():
     t = np.arange(400) * 5 * MS
     true = np.radians(np.interp(t * 1e-9, [0.0, 1.0, 2.0], [0.0, 66.3, 0.0]))
     coarse = np.round(true / STEP_RAD) * STEP_RAD
@@ -181,7 +181,7 @@ def test_scores_of_a_cluster_are_summed_before_they_are_squared():
     assert clustered(score, np.array([7, 7, 9]))[0, 0] == (1 + 2) ** 2 + 5**2
 
 
-def test_upright_things_that_stand_are_best_matched_where_they_are():
+def test_static_upright_objects_match_best_without_a_shift():
     made = sweep(wrong_mount(), planes=YARD, count=30_000)
     placed = place(
         made.returns, servo_at(made.trace, made.returns.stamp_ns, wrong_mount(), 0.1), wrong_mount(), np.zeros(16)
@@ -207,7 +207,7 @@ def test_unobservable_parameters_are_named_whatever_the_scene():
     assert not Travel.of(t, np.ones(100)).both_ways
 
 
-def test_a_patch_keeps_clear_of_its_cells_sides_where_noise_would_choose():
+def test_a_patch_excludes_the_margin_of_its_cell():
     xyz = wall(count=20_000)
     patches = find_patches(xyz, np.zeros_like(xyz), 0.003)
     for k in range(len(patches.first)):
@@ -215,7 +215,7 @@ def test_a_patch_keeps_clear_of_its_cells_sides_where_noise_would_choose():
         assert np.ptp(inside[:, 1:], axis=0).max() <= 1.0 - 2 * 0.05 + 1e-9  # cells of 1 m from 6 m on
 
 
-def test_errors_that_go_with_a_surface_make_the_sigmas_larger():
+def test_errors_common_to_a_surface_increase_the_sigmas():
     true = wrong_mount()
     made = sweep(true, count=30_000)
     system = linearise(made.returns, made.trace, true, np.zeros(16), 0.0026, 0.1)
@@ -226,7 +226,7 @@ def test_errors_that_go_with_a_surface_make_the_sigmas_larger():
     size = np.abs(rng.normal(size=len(system.residual)))
     along = np.sign(system.columns[:, 0])  # all of a surface push one number the same way
     together = replace(system, residual=size * along * rng.choice([-1, 1], surface.max() + 1)[surface])
-    apart = replace(system, residual=size * rng.choice([-1, 1], len(size)))
+    separate = replace(system, residual=size * rng.choice([-1, 1], len(size)))
     moments = np.arange(len(size)) * 10**9  # no two returns at one moment
-    ratio = np.sqrt(np.diag(sandwich(together, moments))[0] / np.diag(sandwich(apart, moments))[0])
+    ratio = np.sqrt(np.diag(sandwich(together, moments))[0] / np.diag(sandwich(separate, moments))[0])
     assert ratio > 5

@@ -1,4 +1,4 @@
-"""The zero and the axis's tilt, by how the vehicle stands: found, as sure as what was said, or rejected with a reason."""
+"""Zero and axis tilt by the stated orientation: found, with the sigma of the statement, or rejected with a reason."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TILT_DEG = (1.2, -0.8)
 
 
 def seen(plane, R):
-    """A plane in the axes of a base that stands so in the vehicle."""
+    """A plane in the axes of a base with this orientation in the vehicle."""
     *normal, distance = plane
     return (*(np.asarray(normal) @ R), distance)
 
@@ -35,13 +35,13 @@ def sloped(deg):
     return (0.0, math.sin(math.radians(deg)), -math.cos(math.radians(deg)), 2.0)
 
 
-def found_in(planes, zero_deg=0.5, tilt_deg=(0.0, 0.0), seed=3, **said):
-    """(mount that is true but for its encoder, the calibration) with what was said."""
+def found_in(planes, zero_deg=0.5, tilt_deg=(0.0, 0.0), seed=3, **stated):
+    """(true mount except its encoder, the calibration) with the stated orientation."""
     R = rotation_from_rpy_deg((*tilt_deg, 0.0))
     true = wrong_mount(seed).moved({"zero": math.radians(zero_deg)})
     made = sweep(true, planes=[seen(plane, R) for plane in planes], seed=seed)
     found = calibrate(made.returns, made.trace, RIG)
-    return true, stand(found, RIG, Standing(**said))
+    return true, stand(found, RIG, Standing(**stated))
 
 
 def finding(found, name):
@@ -49,7 +49,7 @@ def finding(found, name):
 
 
 def off_deg(true, found):
-    """How far the table points beside where it truly stands, in the mean over the sweep."""
+    """Mean error of the turntable angle over the sweep."""
     at = np.radians(np.linspace(5.0, 175.0, 171))
     wanted = true.sign * (at - true.zero_rad) - true.encoder_error_rad(at)
     return math.degrees(float(np.mean(found.mount.turntable_rad(at) - wanted)))
@@ -58,13 +58,15 @@ def off_deg(true, found):
 @pytest.mark.parametrize("zero_deg", [0.5, -0.5])
 def test_a_wall_next_to_the_vehicle_determines_the_zero(zero_deg):
     true, found = found_in((*GROUND, *WALLS, *ENDS), zero_deg, parallel_rad=SAID)
-    told = finding(found, "zero")
-    assert told.rejected == ""
+    result = finding(found, "zero")
+    assert result.rejected == ""
     assert abs(off_deg(true, found)) < 0.05
-    assert 0.15 <= told.sigma < 0.2
-    assert told.after == found.mount.servo_zero_deg
-    assert told.what == "servo's zero, by the wall 5.0 m to the left"
-    assert found.mount.pointing_sigma_deg == pytest.approx(math.hypot(told.sigma, math.degrees(found.curve_sigma_rad)))
+    assert 0.15 <= result.sigma < 0.2
+    assert result.after == found.mount.servo_zero_deg
+    assert result.what == "servo's zero, by the wall 5.0 m to the left"
+    assert found.mount.pointing_sigma_deg == pytest.approx(
+        math.hypot(result.sigma, math.degrees(found.curve_sigma_rad))
+    )
 
 
 def test_without_a_stated_orientation_nothing_changes():
@@ -75,7 +77,7 @@ def test_without_a_stated_orientation_nothing_changes():
     assert found.mount.pointing_sigma_deg < 0.15  # a zero set by eye
 
 
-def test_a_vehicle_that_stands_askew_beside_the_wall_gets_that_for_its_zero_and_a_sigma_that_says_so():
+def test_an_angle_to_the_wall_is_in_the_zero_and_within_its_sigma():
     askew = [turned(wall, 0.2) for wall in WALLS]
     true, found = found_in((*GROUND, *askew, *ENDS), parallel_rad=SAID)
     assert off_deg(true, found) == pytest.approx(-0.2, abs=0.05)
@@ -121,8 +123,8 @@ def test_ground_and_wall_together_determine_the_zero_of_a_tilted_axis():
     assert abs(off_deg(true, found)) < 0.06
 
 
-def test_a_vehicle_that_stands_on_a_slope_stands_level_on_it():
-    """The word is of the ground about it: an even slope is the vehicle's own, as its wheels stand on it."""
+def test_an_even_slope_counts_as_level():
+    """The statement is about the ground around the vehicle: its wheels stand on the same slope."""
     _, found = found_in((sloped(3.0), *WALLS, *ENDS), tilt_deg=(3.0, 0.0), level_rad=SAID)
     assert finding(found, "level_x").rejected == ""
     assert finding(found, "level_x").after == pytest.approx(0.0, abs=0.05)
@@ -138,8 +140,8 @@ def test_curved_ground_is_rejected(rises_deg):
 def test_a_slope_next_to_the_vehicle_is_rejected_or_in_the_sigma():
     for rises_deg in (0.4, 1.0, 2.0, 4.0):
         _, found = found_in((*GROUND, sloped(rises_deg), *WALLS, *ENDS), level_rad=SAID)
-        told = finding(found, "level_x")
-        assert told.rejected or abs(told.after) < 2 * told.sigma
+        result = finding(found, "level_x")
+        assert result.rejected or abs(result.after) < 2 * result.sigma
 
 
 def test_ground_that_was_not_observed_around_the_vehicle_is_rejected():

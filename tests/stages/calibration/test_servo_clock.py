@@ -1,4 +1,4 @@
-"""The servo's clock against the LiDAR's, on a simulated recording whose servo stamps are moved."""
+"""The servo's clock against the LiDAR's, on a simulated recording with shifted servo stamps."""
 
 from __future__ import annotations
 
@@ -39,26 +39,26 @@ def recorded():
     return mount, [m for m in messages if m is not None]
 
 
-def told(recorded, late_s=0.0, from_s=VIBRATING_S, to_s=9.0, motion=(), **settings):
-    """What the stage says when the servo's stamps are late by so much."""
+def outputs_of(recorded, late_s=0.0, from_s=VIBRATING_S, to_s=9.0, motion=(), **settings):
+    """Outputs of the stage when the servo's stamps are late by `late_s`."""
     mount, messages = recorded
     stage = ServoClock(mount=settings.pop("mount", mount), window_s=2.4, **settings)
     for message in motion:
         stage.on_motion(message)
-    said, start_ns = [], messages[0].stamp_ns
+    outputs, start_ns = [], messages[0].stamp_ns
     for message in messages:
         if not from_s * 1e9 <= message.stamp_ns - start_ns < to_s * 1e9:
             continue
         if isinstance(message, LidarFirings):
-            said += stage.on_firings(message)
+            outputs += stage.on_firings(message)
         else:
             stage.on_servo(dataclasses.replace(message, stamp_ns=message.stamp_ns + round(late_s * 1e9)))
-    return said
+    return outputs
 
 
 @pytest.mark.parametrize("late_s", [-2e-3, 0.0, 5e-4])
-def test_stamps_that_are_late_are_found_with_an_honest_sigma(recorded, late_s):
-    (offset,) = told(recorded, late_s)
+def test_late_stamps_are_estimated_with_a_consistent_sigma(recorded, late_s):
+    (offset,) = outputs_of(recorded, late_s)
     check_arrays(offset)
     assert offset.sigma_s < 4e-4
     assert abs(offset.offset_s + late_s) < 3 * offset.sigma_s
@@ -68,13 +68,13 @@ def test_stamps_that_are_late_are_found_with_an_honest_sigma(recorded, late_s):
 
 def test_the_rigs_offset_is_included(recorded):
     mount = recorded[0].model_copy(update={"servo_time_offset_s": 1e-3})
-    (offset,) = told(recorded, late_s=-1e-3, mount=mount)
+    (offset,) = outputs_of(recorded, late_s=-1e-3, mount=mount)
     assert offset.rig_offset_s == 1e-3
     assert abs(offset.offset_s - 1e-3) < 3 * offset.sigma_s
 
 
 def test_a_sweep_in_one_direction_gives_no_estimate(recorded):
-    (offset,) = told(recorded, late_s=1e-3, from_s=0.1, to_s=2.6)
+    (offset,) = outputs_of(recorded, late_s=1e-3, from_s=0.1, to_s=2.6)
     assert (offset.offset_s, offset.sigma_s, offset.windows) == (None, None, 0)
     assert "in both directions" in offset.reason
 
@@ -84,26 +84,26 @@ def driven(x_m):
 
 
 def test_a_moving_vehicle_gives_no_estimate(recorded):
-    (offset,) = told(recorded, motion=[driven(0.0), driven(0.1)])
+    (offset,) = outputs_of(recorded, motion=[driven(0.0), driven(0.1)])
     assert (offset.offset_s, offset.reason) == (None, "the vehicle moved")
-    (offset,) = told(recorded, motion=[driven(0.0), driven(0.01)])
+    (offset,) = outputs_of(recorded, motion=[driven(0.0), driven(0.01)])
     assert offset.offset_s is not None
 
 
 def test_a_fixed_lidar_gives_no_estimate(recorded):
-    assert told(recorded, mount=recorded[0].model_copy(update={"turns": False})) == []
+    assert outputs_of(recorded, mount=recorded[0].model_copy(update={"turns": False})) == []
 
 
 def test_windows_are_combined_except_outliers():
     stage = ServoClock(mount=LidarMount())
     stage._firings = [LidarFirings.__new__(LidarFirings)]
     object.__setattr__(stage._firings[0], "stamp_ns", 0)
-    stage._join(1e-3, 2e-4, 0.0)
-    assert "alone: 1.20 ms, sigma 0.20 ms" in stage._join(1.2e-3, 2e-4, 0.0)
+    stage._add(1e-3, 2e-4, 0.0)
+    assert "alone: 1.20 ms, sigma 0.20 ms" in stage._add(1.2e-3, 2e-4, 0.0)
     first = stage._estimate(0, "")
     assert first.offset_s == pytest.approx(1.1e-3, rel=1e-3)
     assert first.sigma_s == pytest.approx(math.hypot(2e-4 / math.sqrt(2), 3e-4), rel=1e-3)
-    assert "disagrees: 9.00 ms" in stage._join(9e-3, 2e-4, 0.0)
+    assert "disagrees: 9.00 ms" in stage._add(9e-3, 2e-4, 0.0)
     doubtful = stage._estimate(0, "")
     assert doubtful.offset_s == first.offset_s
     assert doubtful.sigma_s > 4 * first.sigma_s
@@ -114,14 +114,14 @@ def test_the_common_sigma_does_not_decrease_with_the_number_of_windows():
     stage._firings = [LidarFirings.__new__(LidarFirings)]
     object.__setattr__(stage._firings[0], "stamp_ns", 0)
     for _ in range(100):
-        said = stage._join(1e-3, 2e-4, 3e-4)
-    assert "sigma 0.36 ms" in said
+        result = stage._add(1e-3, 2e-4, 3e-4)
+    assert "sigma 0.36 ms" in result
     assert stage._estimate(0, "").sigma_s == pytest.approx(math.hypot(2e-5, 3e-4, 3e-4), rel=1e-3)
-    assert "alone" in stage._join(2.5e-3, 2e-4, 3e-4)  # a window may be off by what it shares with itself only
+    assert "alone" in stage._add(2.5e-3, 2e-4, 3e-4)  # a window may deviate by its own error only
 
 
 def test_unknown_play_is_in_the_common_sigma():
-    """Half of .1 deg of play at 68 deg/s is .7 ms, in each sweep there and back."""
+    """Half of 0.1 deg of play at 68 deg/s is 0.7 ms, in both directions of each sweep."""
     true = replace(servo_mount(RIG), play_rad=math.radians(0.1))
     made = sweep(true, legs=((30.0, 150.0, SLOW), (150.0, 30.0, SLOW)), count=20_000)
     returns, stage = made.returns, ServoClock(mount=RIG)
@@ -143,17 +143,17 @@ def test_only_angles_passed_both_ways_count():
     assert both_ways_rad(stamp_ns, np.full(200, 0.5)) == 0
 
 
-def test_once_it_is_known_it_rests_and_what_happens_meanwhile_does_not_count(recorded):
+def test_a_known_offset_skips_windows_and_ignores_their_data(recorded):
     later = [dataclasses.replace(m, stamp_ns=m.stamp_ns + 7_000_000_000) for m in recorded[1]]
     twice = recorded[0], [*recorded[1], *later]
-    each = told(twice, to_s=20.0, every_window=1)
-    stage_s = [(offset.stamp_ns - each[0].stamp_ns) * 1e-9 for offset in told(twice, to_s=20.0, every_window=3)]
+    each = outputs_of(twice, to_s=20.0, every_window=1)
+    stage_s = [(offset.stamp_ns - each[0].stamp_ns) * 1e-9 for offset in outputs_of(twice, to_s=20.0, every_window=3)]
     assert len(each) > 2
     assert len(stage_s) == 2
     assert stage_s[1] > 3 * 2.4 - 0.1
-    moved = told(twice, to_s=20.0, every_window=3, motion=[driven(0.0), driven(0.1)])
+    moved = outputs_of(twice, to_s=20.0, every_window=3, motion=[driven(0.0), driven(0.1)])
     assert moved[0].reason == "the vehicle moved"
-    assert moved[1].stamp_ns - moved[0].stamp_ns < 3e9  # nothing was known: it goes on at once
+    assert moved[1].stamp_ns - moved[0].stamp_ns < 3e9  # the offset is unknown: no window is skipped
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,7 @@ def test_impossible_clock_settings_are_errors(setting):
         ServoClock(mount=LidarMount(), **setting)
 
 
-def test_nothing_grows_while_the_lidar_is_silent():
+def test_buffers_are_bounded_without_lidar_data():
     clock = ServoClock(mount=LidarMount())
     for k in range(20_000):
         clock.on_servo(servo(k * 5_000_000, math.sin(0.01 * k)))

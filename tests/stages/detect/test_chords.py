@@ -1,4 +1,4 @@
-"""Chords: a ball, a wall told piece by piece, ends that are free or hidden, holes, lasers apart, the bulge by hand."""
+"""Chords: a ball, a wall in parts, ends that are free or hidden, holes, several lasers, the bulge by hand."""
 
 from __future__ import annotations
 
@@ -43,42 +43,42 @@ def finder(longest_m=0.8, jump_m=0.35, hole_m=0.3) -> ChordFinder:
 
 
 def feed(*slices, **settings):
-    """All chords told of some slices: rows, first and last time."""
+    """All chords of some slices: rows, first and last time."""
     find = finder(**settings)
-    told = [find.feed(part) for part in slices]
+    parts = [find.feed(part) for part in slices]
     return (
-        np.concatenate([t.rows for t in told]),
-        np.concatenate([t.first_ns for t in told]),
-        np.concatenate([t.last_ns for t in told]),
+        np.concatenate([part.rows for part in parts]),
+        np.concatenate([part.first_ns for part in parts]),
+        np.concatenate([part.last_ns for part in parts]),
     )
 
 
-def place(step, range_m):
+def position(step, range_m):
     return np.array(ORIGIN_M) + range_m * np.array([math.cos(step * STEP_RAD), math.sin(step * STEP_RAD), 0.0])
 
 
-def test_five_returns_in_the_open_are_one_short_chord_that_is_free_at_both_ends():
+def test_five_returns_in_free_space_are_one_short_chord_free_at_both_ends():
     r = 20.0
     rows, first_ns, last_ns = feed(pulses([0] * 10 + [r] * 5 + [0] * 20, reflectivity=40))
     assert len(rows) == 1
     (row,) = rows
-    np.testing.assert_allclose(row[: chord.Z + 1], np.mean([place(k, r) for k in range(10, 15)], axis=0), atol=1e-4)
+    np.testing.assert_allclose(row[: chord.Z + 1], np.mean([position(k, r) for k in range(10, 15)], axis=0), atol=1e-4)
     assert row[chord.LENGTH] == pytest.approx(2 * r * math.sin(2 * STEP_RAD), abs=1e-4)
     assert (row[chord.RANGE], row[chord.DEPTH], row[chord.SHADE]) == (20.0, 0.0, 40.0)
     assert (row[chord.COUNT], row[chord.GAPS], row[chord.FREE], row[chord.LONG]) == (5, 0, 2, 0)
     assert (first_ns[0] - START_NS, last_ns[0] - START_NS) == (10 * STEP_NS, 14 * STEP_NS)
 
 
-def test_a_chord_is_told_as_soon_as_the_beam_is_a_holes_width_past_it():
-    r = 20.0  # 7 cm a pulse: 0.3 m are past with the fifth
+def test_a_chord_is_reported_as_soon_as_the_beam_is_a_holes_width_past_it():
+    r = 20.0  # 7 cm per pulse: the fifth is 0.3 m past it
     find = finder()
-    told = [len(find.feed(pulses([value], first=k)).rows) for k, value in enumerate([0, r, r, 0, 0, 0, 0, 0, 0])]
-    assert told == [0, 0, 0, 0, 0, 0, 0, 1, 0]
+    parts = [len(find.feed(pulses([value], first=k)).rows) for k, value in enumerate([0, r, r, 0, 0, 0, 0, 0, 0])]
+    assert parts == [0, 0, 0, 0, 0, 0, 0, 1, 0]
 
 
 @pytest.mark.parametrize("lost", [0, 24, 96])
-def test_where_packets_are_lost_a_chord_ends_and_nobody_knows_how(lost):
-    """Two things at one range, and a hole in what was heard between them."""
+def test_a_packet_loss_ends_a_chord_without_a_free_end(lost):
+    """Two objects at the same range, with a packet loss between them."""
     r = 20.0
     before, after = pulses([0] * 10 + [r] * 4), pulses([r] * 4 + [0] * 20, first=14 + lost)
     rows, *_ = feed(before, after)
@@ -87,12 +87,12 @@ def test_where_packets_are_lost_a_chord_ends_and_nobody_knows_how(lost):
     assert not rows[:, chord.LONG].any()
 
 
-def test_what_a_laser_saw_before_a_hole_does_not_make_a_wall_free():
+def test_pulses_before_a_packet_loss_do_not_make_an_end_free():
     wall = pulses([20.0] * 3 + [0] * 10, first=200)
     assert feed(pulses([0] * 10), wall)[0][:, chord.FREE].tolist() == [1]
 
 
-def test_cutting_the_pulses_into_slices_changes_nothing():
+def test_the_chords_do_not_depend_on_the_slices():
     rng = np.random.default_rng(5)
     ranges = np.where(rng.random(400) < 0.6, 15.0 + rng.normal(0, 0.15, 400) + 3 * (rng.random(400) < 0.1), 0.0)
     whole = feed(pulses(ranges))
@@ -102,12 +102,12 @@ def test_cutting_the_pulses_into_slices_changes_nothing():
         np.testing.assert_allclose(a, b, atol=1e-5, equal_nan=True)
 
 
-def test_a_wall_is_told_piece_by_piece_and_each_piece_is_long():
+def test_a_wall_is_reported_in_parts_and_each_part_is_long():
     r = 10.0  # 3.5 cm a pulse
     rows, _, _ = feed(pulses([0] * 3 + [r] * 100 + [0] * 30))
-    assert len(rows) == 5  # 3.46 m in pieces of a little over 0.8 m, and what is left
+    assert len(rows) == 5  # 3.46 m in parts of a little over 0.8 m, and the remainder
     assert rows[:4, chord.LONG].tolist() == [1, 1, 1, 1]
-    assert rows[-1, chord.LONG] == 1  # the end of a wall is no short thing
+    assert rows[-1, chord.LONG] == 1  # the end of a wall is long, too
     assert np.all((rows[:4, chord.LENGTH] > 0.8) & (rows[:4, chord.LENGTH] < 0.84))
     along = np.arctan2(rows[:, chord.Y] - ORIGIN_M[1], rows[:, chord.X] - ORIGIN_M[0]) / STEP_RAD
     assert np.all(np.diff(along) > 0)
@@ -119,19 +119,19 @@ def test_a_wall_is_told_piece_by_piece_and_each_piece_is_long():
     [
         (0.0, 0.0, True),  # nothing on either side
         (40.0, 40.0, True),  # a wall far behind
-        (19.8, 0.0, False),  # grew out of something at its own range
+        (19.8, 0.0, False),  # it continues an object at its own range
         (0.0, 19.8, False),
-        (5.0, 0.0, False),  # something nearer hides how it begins
-        (0.0, 5.0, False),  # and how it ends
+        (5.0, 0.0, False),  # a nearer object hides its start
+        (0.0, 5.0, False),  # and its end
     ],
 )
-def test_an_end_is_free_only_where_the_pulses_beside_it_went_farther(before, after, free):
+def test_an_end_is_free_only_if_the_adjacent_pulses_went_farther(before, after, free):
     rows, _, _ = feed(pulses([before] * 10 + [20.0] * 3 + [after] * 10 + [0.0] * 30))
     of_it = rows[(np.abs(rows[:, chord.RANGE] - 20.0) < 0.25) & (rows[:, chord.LONG] == 0)]
     assert np.any(of_it[:, chord.FREE] == 2) == free
 
 
-def test_the_first_pulse_of_all_proves_no_free_end():
+def test_the_first_pulse_has_no_free_end():
     rows, _, _ = feed(pulses([20.0] * 3 + [0] * 10))
     assert rows[0, chord.FREE] == 1
 
@@ -142,12 +142,12 @@ def test_a_hole_smaller_than_allowed_is_bridged_and_counted():
     assert len(rows) == 1
     assert (rows[0, chord.COUNT], rows[0, chord.GAPS]) == (4, 3)
     assert rows[0, chord.LENGTH] == pytest.approx(2 * r * math.sin(3 * STEP_RAD), abs=1e-4)
-    apart, _, _ = feed(pulses([0, r, r, *[0] * 5, r, r, *[0] * 10]))  # 0.42 m: two things
-    assert apart[:, chord.COUNT].tolist() == [2, 2]
-    assert apart[:, chord.FREE].tolist() == [2, 2]
+    separate, _, _ = feed(pulses([0, r, r, *[0] * 5, r, r, *[0] * 10]))  # 0.42 m: two objects
+    assert separate[:, chord.COUNT].tolist() == [2, 2]
+    assert separate[:, chord.FREE].tolist() == [2, 2]
 
 
-def test_a_step_in_range_parts_two_things():
+def test_a_step_in_range_separates_two_chords():
     rows, _, _ = feed(pulses([0] * 2 + [20.0] * 3 + [20.3] * 3 + [22.0] * 2 + [0] * 10))
     assert rows[:, chord.COUNT].tolist() == [6]  # 0.3 m is within; what is farther behind is no end that hides
     assert rows[0, chord.DEPTH] == pytest.approx(0.3, abs=1e-3)
@@ -158,7 +158,7 @@ def test_a_step_in_range_parts_two_things():
     assert later[:, chord.FREE].tolist()[0] == 2  # two pulses had gone past its end before
 
 
-def test_lasers_do_not_know_of_each_other():
+def test_lasers_are_independent():
     a, b = [0, 0, 20.0, 20.0, 20.0, *[0] * 20], [7.0] * 4 + [0] * 21
     mixed = pulses(np.stack([a, b], axis=1).ravel(), lasers=np.tile([3, 9], len(a)))
     rows, _, _ = feed(mixed)
@@ -168,7 +168,7 @@ def test_lasers_do_not_know_of_each_other():
     np.testing.assert_allclose(np.delete(same, chord.LASER), np.delete(alone[0], chord.LASER), equal_nan=True)
 
 
-def test_the_bulge_of_a_ball_is_half_over_its_radius_and_that_of_a_board_nothing():
+def test_the_bulge_of_a_ball_is_half_over_its_radius_and_that_of_a_board_zero():
     """A ball of radius rho, its centre at R: r = R cos a - sqrt(rho^2 - R^2 sin^2 a), u = (R - rho) a.
 
     By the second derivative at a = 0, r = r_0 + u^2 R / (2 rho (R - rho)), which is 1 / (2 rho) far away.
@@ -188,7 +188,7 @@ def test_the_bulge_of_a_ball_is_half_over_its_radius_and_that_of_a_board_nothing
     assert abs(row[chord.BULGE]) < 0.1
 
 
-def test_a_rugged_thing_is_rough_and_three_returns_have_no_profile():
+def test_an_irregular_object_is_rough_and_three_returns_have_no_profile():
     rugged, _, _ = feed(pulses([0, 20.0, 20.2, 19.9, 20.25, 20.0, *[0] * 10]))
     assert rugged[0, chord.ROUGH] > 0.1
     few, _, _ = feed(pulses([0, 20.0, 20.1, 20.0, *[0] * 10]))
@@ -204,7 +204,7 @@ def fine(ranges, direction):
     return rows
 
 
-def test_a_sweep_over_a_ball_and_a_house_gives_short_free_chords_for_the_one_and_long_ones_for_the_other():
+def test_a_ball_gives_short_free_chords_and_a_house_long_ones():
     ball, house, wire = (
         Ball(flying((1.0, 8.0, 9.0), (0.3, 0.0, 0.0)), 0.25),
         Box((-6, -9, 0), (-3, -6, 12)),
@@ -217,10 +217,10 @@ def test_a_sweep_over_a_ball_and_a_house_gives_short_free_chords_for_the_one_and
     assert np.all((of_ball[:, chord.LONG] == 0) & (of_ball[:, chord.FREE] == 2) & (of_ball[:, chord.LENGTH] < 0.5))
     of_house = rows[(rows[:, chord.X] < -2.9) & (rows[:, chord.Y] < -5.9)]
     assert of_house[:, chord.LONG].mean() > 0.7
-    assert len(of_ball) + len(of_house) < len(rows)  # the rest is the wire's
+    assert len(of_ball) + len(of_house) < len(rows)  # the others are the wire's
 
 
-def test_an_empty_slice_tells_nothing():
+def test_an_empty_slice_has_no_chords():
     find = finder()
     assert len(find.feed(pulses([0.0] * 5)).rows) == 0
     empty = pulses([0.0] * 5)

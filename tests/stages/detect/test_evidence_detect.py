@@ -24,7 +24,15 @@ from stages.detect.evidence_detect import HYSTERESIS_NATS, NEAR_REJECTED_M, NEAR
 from stages.geometry.frames import rotation_from_rpy_deg, rotation_z
 from stages.geometry.trajectory import VehicleTrajectory
 from stages.kernels.detect.isolation import FREE_0, SECTORS, TALLY
-from stages.messages import Candidates, Detections, DroneLocalPosition, DroneOdometry, VehicleMotion
+from stages.messages import (
+    CandidateEvidence,
+    Candidates,
+    Detections,
+    DroneLocalPosition,
+    DroneOdometry,
+    SearchResult,
+    VehicleMotion,
+)
 from tests.stages.caster import (
     Ball,
     Box,
@@ -42,13 +50,13 @@ from tests.stages.detect.test_candidate import candidate
 from tests.stages.made import ON_ITS_SIDE, START_NS
 
 PLACE_M = (0.0, 8.0, 10.0)  # 12.7 m away, 51 deg up
-WATCHING = dithering(half_rad=math.radians(1.0))  # as the aim does: each turn a beam comes near
-PASS_DEG = 4.5  # so that each swing of it counts as a pass: a summary every 0.4 s
+WATCHING = dithering(half_rad=math.radians(1.0))  # as the aim stage does: a beam comes near in each rotor turn
+PASS_DEG = 4.5  # each swing completes a pass: a message every 0.4 s
 MOVING = flying((-0.8, 8.0, 10.0), (0.8, 0.0, 0.4))
-GLIDING = flying((-4.5, 8.0, 10.0), (3.0, 0.0, 0.0))  # as a drone may, and a bird
+GLIDING = flying((-4.5, 8.0, 10.0), (3.0, 0.0, 0.0))  # possible for a drone and for a bird
 
 
-def hanging(seed=0):
+def hovering(seed=0):
     return Drone(still(*PLACE_M), seed=seed)
 
 
@@ -61,7 +69,7 @@ def motion_at(t_s, velocity_mps=(0.0, 0.0, 0.0)):
     )
 
 
-def test_how_the_vehicle_moves_is_not_known_any_more_when_its_word_is_old():
+def test_the_vehicles_motion_is_unknown_after_a_pause_of_its_odometry():
     stage = EvidenceDetect()
     assert not stage._motion_known(START_NS)
     stage.on_motion(motion_at(0.0))
@@ -70,31 +78,31 @@ def test_how_the_vehicle_moves_is_not_known_any_more_when_its_word_is_old():
     assert EvidenceDetect(parked=True)._motion_known(START_NS)
 
 
-def test_what_was_just_accepted_is_told_though_it_was_seen_before_the_search_began():
+def test_an_accepted_candidate_is_published_though_its_last_observation_precedes_the_interval():
     c = candidate(observation(0.0, np.array(PLACE_M)))
     c.accepted, c.log_odds, c.reason = True, 6.0, "made"
     later_ns = c.seen_ns + 5_000_000
-    told = detections_message([c], VehicleTrajectory(), later_ns, later_ns + 1, Counter(), 3)
-    assert told.accepted.tolist() == [True]
+    messages = detections_message([c], VehicleTrajectory(), later_ns, later_ns + 1, Counter(), 3)
+    assert messages.accepted.tolist() == [True]
     c.announced = True
-    told = detections_message([c], VehicleTrajectory(), later_ns, later_ns + 1, Counter(), 3)
-    assert told.accepted.tolist() == []
+    messages = detections_message([c], VehicleTrajectory(), later_ns, later_ns + 1, Counter(), 3)
+    assert messages.accepted.tolist() == []
 
 
-def local_position(way, t_s, yaw_rad=0.9):
-    """What the drone's autopilot tells of a flight, in a frame of its own."""
+def local_position(trajectory, t_s, yaw_rad=0.9):
+    """Local position of the drone's autopilot along a trajectory, in its own frame."""
     R = rotation_z(yaw_rad)
-    place, soon = way(np.array([t_s, t_s + 0.01]))
+    position_m, soon = trajectory(np.array([t_s, t_s + 0.01]))
     return DroneLocalPosition(
         stamp_ns=START_NS + round(t_s * 1e9),
-        xyz_odom_m=R @ place + (30.0, -4.0, 5.0),
-        velocity_odom_mps=R @ (soon - place) / 0.01,
+        xyz_odom_m=R @ position_m + (30.0, -4.0, 5.0),
+        velocity_odom_mps=R @ (soon - position_m) / 0.01,
     )
 
 
-def odometry(way, t_s, R_odom_drone):
-    """The same from an autopilot that tells its velocity in the drone's axes."""
-    position = local_position(way, t_s)
+def odometry(trajectory, t_s, R_odom_drone):
+    """The same as odometry, with the velocity in drone axes."""
+    position = local_position(trajectory, t_s)
     return DroneOdometry(
         stamp_ns=position.stamp_ns,
         xyz_odom_m=position.xyz_odom_m,
@@ -109,38 +117,40 @@ def odometry(way, t_s, R_odom_drone):
 
 
 def run(
-    things, seconds=3.0, servo_rad=WATCHING, drives_mps=(0.0, 0.0, 0.0), say=None, stage=None, packets=1, **settings
+    things, seconds=3.0, servo_rad=WATCHING, drives_mps=(0.0, 0.0, 0.0), publish=None, stage=None, packets=1, **settings
 ):
-    """(Candidates, Detections) that the stage tells.
+    """(Candidates, Detections) that the stage publishes.
 
-    drives_mps None: the vehicle does not say how it moves. say(stage, t_s): what the drone says, 20 ms apart.
+    drives_mps None: no vehicle motion. publish(stage, t_s): publishes the drone's telemetry, each 20 ms.
     """
     stage = stage or EvidenceDetect(**{"sweep_deg": PASS_DEG, **settings})
-    told, next_s = [], 0.0
+    messages, next_s = [], 0.0
     for pulses in together(pulses_seen(things, servo_rad, seconds), packets):
         while START_NS + next_s * 1e9 <= pulses.point_stamp_ns[-1]:
             if drives_mps is not None:
                 stage.on_motion(motion_at(next_s, drives_mps))
-            if say is not None:
-                say(stage, next_s)
+            if publish is not None:
+                publish(stage, next_s)
             next_s += 0.02
-        told += stage.on_pulses(pulses)
-    for message in told:
+        messages += stage.on_pulses(pulses)
+    for message in messages:
         check_arrays(message)
-    return [m for m in told if isinstance(m, Candidates)], [m for m in told if isinstance(m, Detections)]
+    return [m for m in messages if isinstance(m, Candidates)], [m for m in messages if isinstance(m, Detections)]
 
 
-def saying(way, until_s=math.inf, yaw_rad=0.9):
-    return lambda stage, t_s: stage.on_drone_position(local_position(way, t_s, yaw_rad)) if t_s < until_s else None
+def telemetry_of(trajectory, until_s=math.inf, yaw_rad=0.9):
+    return lambda stage, t_s: (
+        stage.on_drone_position(local_position(trajectory, t_s, yaw_rad)) if t_s < until_s else None
+    )
 
 
 def accepted_after_s(detections):
-    """When the first was accepted, inf: never."""
+    """Time of the first accepted detection; inf: none."""
     return next(((d.stamp_ns - START_NS) * 1e-9 for d in detections if d.accepted.any()), math.inf)
 
 
 def reasons_of(candidates):
-    return " | ".join(reason for told in candidates for reason in told.reasons)
+    return " | ".join(reason for messages in candidates for reason in messages.reasons)
 
 
 def test_ports_are_what_the_graph_wires():
@@ -150,23 +160,27 @@ def test_ports_are_what_the_graph_wires():
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_small_thing_that_moves_in_the_free_sky_is_a_drone_after_a_second_or_two_of_looks(seed):
+def test_a_small_moving_object_in_the_free_sky_is_accepted_within_seconds(seed):
     candidates, detections = run([Drone(MOVING, seed=seed)])
     assert 0.4 < accepted_after_s(detections) < 2.3
     last = detections[-1]
     assert last.accepted.tolist() == [True]
-    assert last.probability[0] >= 0.98
-    assert last.score[0] == pytest.approx(math.log(last.probability[0] / (1 - last.probability[0])))
-    truth = MOVING(np.array([(last.seen_ns[0] - START_NS) * 1e-9]))[0]
+    evidence = last.evidence
+    assert isinstance(evidence, CandidateEvidence)
+    assert evidence.probability[0] >= 0.98
+    assert evidence.log_odds[0] == pytest.approx(math.log(evidence.probability[0] / (1 - evidence.probability[0])))
+    truth = MOVING(np.array([(evidence.seen_ns[0] - START_NS) * 1e-9]))[0]
     np.testing.assert_allclose(last.xyz_vehicle_m[0], truth, atol=0.3)
-    np.testing.assert_allclose(last.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
+    np.testing.assert_allclose(evidence.velocity_vehicle_mps[0], (0.8, 0.0, 0.4), atol=0.6)
     assert last.summary.startswith("drone at (")
+    assert last.result is SearchResult.DRONE
+    assert candidates[-1].accept_probability == EvidenceDetect().settings.accept_probability
     assert "sectors around it free" in last.reasons[0]
-    assert last.candidate_id[0] == candidates[0].candidate_id[0]  # the same thing keeps its number
+    assert evidence.candidate_id[0] == candidates[0].candidate_id[0]  # the same object keeps its number
 
 
-def test_four_packets_together_tell_the_same_as_one_by_one():
-    drives_mps = (5.0, 0.0, 0.0)  # and the drone with it
+def test_slices_of_four_packets_give_the_same_result_as_single_packets():
+    drives_mps = (5.0, 0.0, 0.0)  # and so does the drone
     (candidates, one), (together_4, four) = (run([Drone(MOVING)], drives_mps=drives_mps, packets=n) for n in (1, 4))
     assert accepted_after_s(four) == pytest.approx(accepted_after_s(one), abs=0.1)
     assert together_4[-1].scan_passes[0] == candidates[-1].scan_passes[0]
@@ -174,7 +188,7 @@ def test_four_packets_together_tell_the_same_as_one_by_one():
     np.testing.assert_allclose(together_4[-1].xyz_vehicle_m[0], candidates[-1].xyz_vehicle_m[0], atol=0.05)
 
 
-def test_what_was_accepted_stays_so_until_much_less_speaks_for_it(monkeypatch):
+def test_acceptance_has_a_hysteresis(monkeypatch):
     stage, c = EvidenceDetect(), candidate(observation(0.0, np.array(PLACE_M)))
     accept = log_odds_of(stage.settings.accept_probability)
     verdicts = []
@@ -191,11 +205,11 @@ def test_what_was_accepted_stays_so_until_much_less_speaks_for_it(monkeypatch):
         stage._classify(stage._now, c)
         verdicts.append(c.accepted)
     assert verdicts == [False, True, True, False, False]
-    assert accept - HYSTERESIS_NATS > 0.0  # a drone rather than not
+    assert accept - HYSTERESIS_NATS > 0.0  # more probably a drone than not
     assert HYSTERESIS_NATS > 1.0
 
 
-def test_its_probability_is_told_from_the_first_looks_on_and_grows():
+def test_the_probability_is_published_from_the_first_scan_passes_and_grows():
     candidates, _ = run([Drone(MOVING)])
     assert (candidates[0].stamp_ns - START_NS) * 1e-9 < 0.6
     probability = [float(c.probability[0]) for c in candidates]
@@ -204,58 +218,58 @@ def test_its_probability_is_told_from_the_first_looks_on_and_grows():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_hangs_quite_still_nearby_is_a_drone_once_all_that_could_hold_it_would_have_been_seen(seed):
-    candidates, detections = run([hanging(seed)], 4.2)
+def test_a_hovering_drone_at_close_range_is_accepted_once_a_support_would_be_visible(seed):
+    candidates, detections = run([hovering(seed)], 4.2)
     assert 1.0 < accepted_after_s(detections) < 3.0
     assert "it may be static" in candidates[-1].reasons[0]
-    _, told_to_doubt = run([hanging(seed)], 4.2, weights={"max_isolated_near": 0.0})
+    _, told_to_doubt = run([hovering(seed)], 4.2, weights={"max_isolated_near": 0.0})
     assert accepted_after_s(told_to_doubt) == math.inf
 
 
-def test_candidates_tell_which_life_of_the_detector_counts_them():
+def test_candidates_name_the_detector_instance():
     stage = EvidenceDetect(sweep_deg=PASS_DEG)
-    whole, _ = run([hanging()], 1.5, stage=stage)
+    whole, _ = run([hovering()], 1.5, stage=stage)
     assert {m.detector_instance for m in whole} == {START_NS}
-    later = [p for p in pulses_seen([hanging()], WATCHING, 1.5) if p.stamp_ns > START_NS + 700_000_000]
+    later = [p for p in pulses_seen([hovering()], WATCHING, 1.5) if p.stamp_ns > START_NS + 700_000_000]
     afresh = EvidenceDetect(sweep_deg=PASS_DEG)
-    told = [m for p in later for m in afresh.on_pulses(p) if isinstance(m, Candidates)]
-    assert {m.detector_instance for m in told} == {later[0].stamp_ns}
+    messages = [m for p in later for m in afresh.on_pulses(p) if isinstance(m, Candidates)]
+    assert {m.detector_instance for m in messages} == {later[0].stamp_ns}
 
 
-def test_far_away_it_stays_a_candidate_because_a_wire_would_not_be_seen():
+def test_at_long_range_a_hovering_drone_stays_a_candidate_because_a_wire_is_invisible():
     far_m = 2.6 * np.array(PLACE_M)
     candidates, detections = run([Drone(still(*far_m), span_m=0.9)], 4.2, span_m=0.9)
     assert accepted_after_s(detections) == math.inf
     assert 0.5 < max(c.probability.max() for c in candidates if c.probability.size) < 0.95
 
 
-BESIDE = {
+SUPPORTS = {
     "on a pole": (Wire((0.0, 8.0, 0.0), (0.0, 8.0, 9.9), 0.08), ("next to",)),
-    "beside a wall": (Box((0.7, 6.0, 0.0), (1.2, 12.0, 14.0)), ("next to",)),
+    "nearby a wall": (Box((0.7, 6.0, 0.0), (1.2, 12.0, 14.0)), ("next to",)),
     "on a wire": (Wire((-20.0, 8.0, 10.0), (20.0, 8.0, 10.0), 0.03), ("next to",)),
 }
 
 
-@pytest.mark.parametrize("where", BESIDE)
-def test_the_same_thing_is_refused_with_a_reason(where):
-    other, words = BESIDE[where]
-    candidates, detections = run([hanging(), other], 3.0)
+@pytest.mark.parametrize("where", SUPPORTS)
+def test_the_same_object_with_a_support_is_rejected_with_a_reason(where):
+    other, phrases = SUPPORTS[where]
+    candidates, detections = run([hovering(), other], 3.0)
     assert accepted_after_s(detections) == math.inf
     assert len(detections) >= 6
     remarks = reasons_of(candidates) + " | ".join(d.summary for d in detections)
-    assert all(word in remarks for word in words), remarks
+    assert all(phrase in remarks for phrase in phrases), remarks
     assert all(d.summary.startswith("no drone: ") for d in detections)
     assert all(c.probability.size == 0 or c.probability.max() < 0.9 for c in candidates)
 
 
-def test_what_is_half_hidden_by_something_nearer_is_counted_as_such():
+def test_chords_hidden_by_a_nearer_object_are_counted():
     edge = Box((-3.0, 4.0, 0.0), (3.0, 4.1, 5.2))  # a nearer wall that covers its lower half
     _, detections = run([Drone(still(*PLACE_M)), edge], 2.0)
     assert accepted_after_s(detections) == math.inf
     assert any("hidden at an end by something nearer" in d.summary for d in detections)
 
 
-def test_what_stands_far_behind_it_does_not_matter():
+def test_objects_far_behind_do_not_matter():
     wall = Box((-12.0, 16.0, 0.0), (12.0, 17.0, 30.0))
     _, detections = run([Drone(MOVING), wall])
     assert accepted_after_s(detections) < 2.3
@@ -266,9 +280,9 @@ def test_a_wire_alone_is_never_a_drone():
     assert accepted_after_s(detections) == math.inf
 
 
-def test_a_single_stray_return_is_not_even_worth_a_look_for_long():
-    stray = During(Ball(still(*PLACE_M), 0.02), 0.4, 0.6)
-    candidates, detections = run([stray], 2.0)
+def test_a_single_false_return_is_a_candidate_for_a_short_time_only():
+    false_return = During(Ball(still(*PLACE_M), 0.02), 0.4, 0.6)
+    candidates, detections = run([false_return], 2.0)
     assert accepted_after_s(detections) == math.inf
     assert not candidates or candidates[-1].candidate_id.size == 0 or candidates[-1].probability.max() < 0.1
 
@@ -287,7 +301,7 @@ def test_rain_is_never_a_drone():
     assert accepted_after_s(detections) == math.inf
 
 
-def test_a_smooth_ball_is_a_balloon_and_a_fast_thing_a_bird():
+def test_a_smooth_ball_is_a_balloon_and_a_fast_object_a_bird():
     balloon, refused = run([Ball(MOVING, 0.25)])
     assert accepted_after_s(refused) == math.inf
     assert "balloon" in reasons_of(balloon)
@@ -295,23 +309,23 @@ def test_a_smooth_ball_is_a_balloon_and_a_fast_thing_a_bird():
     assert accepted_after_s(refused) == math.inf
 
 
-def test_no_drone_is_a_normal_answer_at_the_end_of_each_pass():
+def test_each_pass_without_a_drone_publishes_empty_detections():
     candidates, detections = run([], 2.0)
     assert candidates == []
     assert len(detections) >= 3
-    assert all(d.summary.startswith("no drone: ") and len(d.score) == 0 for d in detections)
+    assert all(d.summary.startswith("no drone: ") and len(d.accepted) == 0 for d in detections)
 
 
-def test_searched_intervals_follow_one_another_without_gap():
-    for things in ([], [hanging()]):
+def test_the_searched_intervals_are_contiguous():
+    for things in ([], [hovering()]):
         _, detections = run(things, 2.0)
-        assert detections[0].start_ns == START_NS
+        assert detections[0].evidence.start_ns == START_NS
         for before, after in pairwise(detections):
-            assert before.start_ns < before.stamp_ns
-            assert after.start_ns == before.stamp_ns + 1
+            assert before.evidence.start_ns < before.stamp_ns
+            assert after.evidence.start_ns == before.stamp_ns + 1
 
 
-def test_a_sweep_over_the_whole_sky_finds_houses_no_drone_and_says_how_many_were_refused():
+def test_a_sweep_over_houses_reports_the_number_of_rejected_objects():
     street = [Box((-9, -40, 0), (-7, 40, 9)), Box((7, -40, 0), (9, 40, 9)), Wire((7.5, 0, 0), (5.0, 0, 11), 0.1)]
     _, detections = run(street, 3.3, servo_rad=sweeping(), sweep_deg=180.0)
     assert accepted_after_s(detections) == math.inf
@@ -320,146 +334,150 @@ def test_a_sweep_over_the_whole_sky_finds_houses_no_drone_and_says_how_many_were
     assert "short returns rejected at once" in detections[0].summary
 
 
-# what the drone tells of its flight
+# telemetry of the drone
 
 
-def test_a_drone_that_flies_as_it_says_is_told_so_and_accepted():
-    _, detections = run([Drone(MOVING)], say=saying(MOVING))
+def test_a_drone_whose_path_agrees_with_its_odometry_is_accepted():
+    _, detections = run([Drone(MOVING)], publish=telemetry_of(MOVING))
     assert 0.4 < accepted_after_s(detections) < 2.0
     assert "its path agrees with the drone's odometry" in detections[-1].reasons[0]
 
 
-def test_which_way_its_autopilots_axes_point_does_not_matter():
-    told = [run([Drone(MOVING)], 2.0, say=saying(MOVING, yaw_rad=yaw)) for yaw in (0.0, math.pi / 2, 0.13)]
-    at_s = [accepted_after_s(detections) for _, detections in told]
+def test_the_yaw_of_the_odometrys_frame_does_not_matter():
+    messages = [
+        run([Drone(MOVING)], 2.0, publish=telemetry_of(MOVING, yaw_rad=yaw)) for yaw in (0.0, math.pi / 2, 0.13)
+    ]
+    at_s = [accepted_after_s(detections) for _, detections in messages]
     assert at_s[1] == at_s[0] < 2.0
     assert at_s[2] == pytest.approx(at_s[0], abs=0.3)
-    assert told[1][0][-1].probability == pytest.approx(told[0][0][-1].probability, abs=1e-9)
+    assert messages[1][0][-1].probability == pytest.approx(messages[0][0][-1].probability, abs=1e-9)
 
 
 @pytest.mark.parametrize("tilt_deg", [(0.0, 0.0, 0.0), (20.0, -10.0, 130.0)])
-def test_an_autopilot_that_tells_its_odometry_is_understood_however_the_drone_is_turned(tilt_deg):
+def test_the_odometry_is_used_for_any_attitude_of_the_drone(tilt_deg):
     R = rotation_from_rpy_deg(tilt_deg)
-    by_position, _ = run([Drone(MOVING)], say=saying(MOVING))
-    by_odometry, detections = run([Drone(MOVING)], say=lambda s, t: s.on_drone_odometry(odometry(MOVING, t, R)))
+    by_position, _ = run([Drone(MOVING)], publish=telemetry_of(MOVING))
+    by_odometry, detections = run([Drone(MOVING)], publish=lambda s, t: s.on_drone_odometry(odometry(MOVING, t, R)))
     assert "its path agrees with the drone's odometry" in detections[-1].reasons[0]
     for a, b in zip(by_position, by_odometry, strict=True):
         np.testing.assert_allclose(a.probability, b.probability, atol=1e-9)
         np.testing.assert_allclose(a.velocity_vehicle_mps, b.velocity_vehicle_mps, atol=1e-6)
 
 
-def test_what_glides_by_while_the_drone_hangs_is_a_bird():
+def test_an_object_that_passes_while_the_drone_hovers_is_a_bird():
     glider = [Drone(GLIDING, span_m=0.5)]
     _, silent = run(glider)
-    assert accepted_after_s(silent) < 2.5  # nothing else would tell it from a drone
-    candidates, detections = run([Drone(GLIDING, span_m=0.5)], say=saying(still(0.0, 0.0, 0.0)))
+    assert accepted_after_s(silent) < 2.5  # nothing else separates it from a drone
+    candidates, detections = run([Drone(GLIDING, span_m=0.5)], publish=telemetry_of(still(0.0, 0.0, 0.0)))
     assert accepted_after_s(detections) == math.inf
     assert candidates[-1].probability.max() < 0.05
     assert "its path agrees with the drone's odometry" not in candidates[-1].reasons[0]
     assert "if not a drone: a bird" in candidates[-1].reasons[0]
 
 
-SHOWN_S = ((0.0, 0.1), (1.5, 1.8))  # a look, and some more a pass of the fan later
+SHOWN_S = ((0.0, 0.1), (1.5, 1.8))  # a scan pass, and some more a pass of the fan later
 PASSING_BY = flying((-3.0, 8.0, 10.0), (3.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize(("say", "again"), [(saying(PASSING_BY), True), (None, False)], ids=["speaks", "silent"])
-def test_a_drone_met_a_pass_later_where_it_says_it_would_be_goes_on_with_its_evidence(say, again):
+@pytest.mark.parametrize(
+    ("publish", "reacquired"), [(telemetry_of(PASSING_BY), True), (None, False)], ids=["telemetry", "no telemetry"]
+)
+def test_a_drone_reacquired_a_pass_later_keeps_its_evidence(publish, reacquired):
     shown = [During(Drone(PASSING_BY, seed=i), *when) for i, when in enumerate(SHOWN_S)]
-    candidates, _ = run(shown, seconds=2.0, say=say)
-    assert ("reacquired where the drone's odometry predicts it" in reasons_of(candidates)) == again
+    candidates, _ = run(shown, seconds=2.0, publish=publish)
+    assert ("reacquired where the drone's odometry predicts it" in reasons_of(candidates)) == reacquired
 
 
-def test_what_was_met_once_flies_on_at_the_speed_that_the_drone_says_nobody_knows_whither():
-    for say, speed_mps in ((saying(PASSING_BY), 3.0), (None, 0.0)):
-        candidates, _ = run([Drone(PASSING_BY)], seconds=1.0, say=say)
-        once = [told.undirected_speed_mps[told.scan_passes == 1] for told in candidates]
-        more = [told.undirected_speed_mps[told.scan_passes > 1] for told in candidates]
+def test_after_one_scan_pass_the_candidate_has_the_undirected_speed_of_the_telemetry():
+    for publish, speed_mps in ((telemetry_of(PASSING_BY), 3.0), (None, 0.0)):
+        candidates, _ = run([Drone(PASSING_BY)], seconds=1.0, publish=publish)
+        once = [messages.undirected_speed_mps[messages.scan_passes == 1] for messages in candidates]
+        more = [messages.undirected_speed_mps[messages.scan_passes > 1] for messages in candidates]
         np.testing.assert_allclose(np.concatenate(once), speed_mps, atol=0.01)
         assert np.concatenate(once).size
         assert not np.concatenate(more).any()
 
 
-def test_a_lamp_is_refused_while_the_drone_flies_and_not_while_it_hangs():
-    flies = saying(flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0)))
-    candidates, detections = run([hanging()], say=flies)
+def test_a_lamp_is_rejected_while_the_drone_flies_and_not_while_it_hovers():
+    flies = telemetry_of(flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0)))
+    candidates, detections = run([hovering()], publish=flies)
     assert accepted_after_s(detections) == math.inf
     assert candidates[-1].candidate_id.size == 0 or candidates[-1].probability.max() < 0.02
-    candidates, detections = run([hanging()], say=saying(still(0.0, 0.0, 0.0)))
+    candidates, detections = run([hovering()], publish=telemetry_of(still(0.0, 0.0, 0.0)))
     assert accepted_after_s(detections) < 3.0
     assert candidates[-1].probability.max() > 0.95
 
 
-def test_a_balloon_is_refused_though_it_drifts_as_the_drone_says_because_it_is_smooth():
-    candidates, detections = run([Ball(MOVING, 0.25)], say=saying(MOVING))
+def test_a_smooth_balloon_is_rejected_though_it_follows_the_odometry():
+    candidates, detections = run([Ball(MOVING, 0.25)], publish=telemetry_of(MOVING))
     assert accepted_after_s(detections) == math.inf
     assert "if not a drone: a balloon" in candidates[-1].reasons[0]
-    elsewhere, _ = run([Ball(MOVING, 0.25)], say=saying(flying((0.0, 0.0, 0.0), (3.0, 0.0, -0.5))))
-    assert elsewhere[-1].candidate_id.size == 0 or elsewhere[-1].probability[0] < 0.1 * candidates[-1].probability[0]
+    different, _ = run([Ball(MOVING, 0.25)], publish=telemetry_of(flying((0.0, 0.0, 0.0), (3.0, 0.0, -0.5))))
+    assert different[-1].candidate_id.size == 0 or different[-1].probability[0] < 0.1 * candidates[-1].probability[0]
 
 
-def test_sightings_from_before_its_first_word_do_not_silence_it():
+def test_observations_before_the_first_telemetry_do_not_disable_it():
     def late(stage, t_s):
         if t_s > 0.8:
             stage.on_drone_position(local_position(MOVING, t_s))
 
-    candidates, _ = run([Drone(MOVING)], say=late)
+    candidates, _ = run([Drone(MOVING)], publish=late)
     assert "odometry" not in candidates[0].reasons[0]
     assert "its path agrees with the drone's odometry" in candidates[-1].reasons[0]
 
 
-def test_a_drone_that_falls_silent_is_judged_by_how_it_flies_alone():
-    spoke = run([Drone(MOVING)], say=saying(MOVING, until_s=0.4))
+def test_after_telemetry_ends_the_path_alone_decides():
+    spoke = run([Drone(MOVING)], publish=telemetry_of(MOVING, until_s=0.4))
     silent = run([Drone(MOVING)])
     assert "odometry" not in spoke[1][-1].reasons[0]
-    np.testing.assert_array_equal(spoke[1][-1].probability, silent[1][-1].probability)
+    np.testing.assert_array_equal(spoke[1][-1].evidence.probability, silent[1][-1].evidence.probability)
     np.testing.assert_array_equal(spoke[0][-1].velocity_vehicle_mps, silent[0][-1].velocity_vehicle_mps)
 
 
-def test_from_a_vehicle_that_does_not_say_how_it_drives_only_heights_are_compared():
-    says = flying((0.0, 0.0, 0.0), (0.0, 0.0, 1.5))
+def test_without_vehicle_motion_only_heights_are_compared():
+    rising = flying((0.0, 0.0, 0.0), (0.0, 0.0, 1.5))
     passes_and_rises = Drone(flying((-2.0, 8.0, 8.0), (1.5, 0.0, 1.5)))
-    log_ratios, _ = run([passes_and_rises], 2.5, drives_mps=None, say=saying(says))
+    log_ratios, _ = run([passes_and_rises], 2.5, drives_mps=None, publish=telemetry_of(rising))
     assert "its path agrees with the drone's odometry" in log_ratios[-1].reasons[0]
     pass_throughs = Drone(flying((-2.0, 8.0, 10.0), (1.5, 0.0, 0.0)))
-    log_ratios, detections = run([pass_throughs], 2.5, drives_mps=None, say=saying(says))
+    log_ratios, detections = run([pass_throughs], 2.5, drives_mps=None, publish=telemetry_of(rising))
     assert accepted_after_s(detections) == math.inf
     assert log_ratios[-1].probability.max(initial=0.0) < 0.1
 
 
-def test_a_candidate_seen_twice_is_expected_to_fly_as_fast_as_the_drone_says():
-    """At first its velocity is known to some metres a second; a drone that hangs is expected to stay."""
-    hangs, _ = run([hanging()], 0.5, say=saying(still(0.0, 0.0, 0.0)))
-    flies, _ = run([hanging()], 0.5, say=saying(flying((0.0, 0.0, 0.0), (8.0, 0.0, 2.0))))
-    first_hangs, first_flies = hangs[0].velocity_vehicle_mps[0], flies[0].velocity_vehicle_mps[0]
-    assert np.abs(first_hangs).max() < 0.02
-    assert first_flies[2] == pytest.approx(2.0, abs=1.5)  # it rises as the drone says
+def test_a_candidate_observed_twice_has_the_speed_of_the_telemetry():
+    """At first its velocity is uncertain by some metres per second; a hovering drone is predicted to stay."""
+    hovers, _ = run([hovering()], 0.5, publish=telemetry_of(still(0.0, 0.0, 0.0)))
+    flies, _ = run([hovering()], 0.5, publish=telemetry_of(flying((0.0, 0.0, 0.0), (8.0, 0.0, 2.0))))
+    first_hovers, first_flies = hovers[0].velocity_vehicle_mps[0], flies[0].velocity_vehicle_mps[0]
+    assert np.abs(first_hovers).max() < 0.02
+    assert first_flies[2] == pytest.approx(2.0, abs=1.5)  # it rises as the telemetry does
 
 
-# what stood there before
+# static objects
 
 
 def looking_away(from_s, to_s):
-    """Watches, but for some seconds in which the fan holds another part of the sky."""
+    """Observes the same direction, except for some seconds."""
     return lambda t_s: WATCHING(t_s) + np.where((np.asarray(t_s) > from_s) & (np.asarray(t_s) < to_s), 0.8, 0.0)
 
 
-def test_what_stood_is_known_again_and_not_looked_at_anew():
+def test_a_static_object_is_reactivated():
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5, weights=ClassifierWeights(max_isolated_near=0.0))
-    candidates, detections = run([hanging()], 4.5, looking_away(1.5, 3.0), stage=stage)
-    numbers = {int(number) for told in candidates for number in told.candidate_id}
+    candidates, detections = run([hovering()], 4.5, looking_away(1.5, 3.0), stage=stage)
+    numbers = {int(number) for messages in candidates for number in messages.candidate_id}
     assert numbers == {1}
-    told = [c for c in candidates if c.candidate_id.size]
-    before = max(c.scan_passes[0] for c in told if c.stamp_ns < START_NS + 2e9)
-    again = next(c for c in told if c.stamp_ns > START_NS + 2.9e9)
+    messages = [c for c in candidates if c.candidate_id.size]
+    before = max(c.scan_passes[0] for c in messages if c.stamp_ns < START_NS + 2e9)
+    again = next(c for c in messages if c.stamp_ns > START_NS + 2.9e9)
     assert again.scan_passes[0] > before > 5
     assert accepted_after_s(detections) == math.inf
     assert len(stage._now.static) == 0  # it is a candidate again
 
 
-def test_what_stood_is_forgotten_with_an_unknown_vehicles_motion_and_what_flew_always():
+def test_static_objects_need_vehicle_motion_and_moving_ones_are_not_remembered():
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
-    run([hanging()], 2.5, looking_away(1.5, 9.0), drives_mps=None, stage=stage)
+    run([hovering()], 2.5, looking_away(1.5, 9.0), drives_mps=None, stage=stage)
     assert list(stage._now.table) == []
     assert len(stage._now.static) == 0
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
@@ -468,9 +486,9 @@ def test_what_stood_is_forgotten_with_an_unknown_vehicles_motion_and_what_flew_a
     assert len(stage._now.static) == 0
 
 
-def test_what_stood_is_forgotten_after_a_minute():
+def test_static_objects_are_forgotten_after_a_minute():
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5, parked=True)
-    run([hanging()], 2.5, looking_away(1.5, 9.0), stage=stage)
+    run([hovering()], 2.5, looking_away(1.5, 9.0), stage=stage)
     assert [c.number for c in stage._now.static] == [1]
     seen_ns = stage._now.static[0].seen_ns
     stage._prune(stage._now, seen_ns + STATIC_NS - 1)
@@ -496,8 +514,8 @@ def observation(t_s, xyz_m, free_sectors=SECTORS, returns=1):
     )
 
 
-def beside_a_refused(away_m, after_s, parked=True, returns=1):
-    """The candidate that appears beside something that was refused at once for want of free space."""
+def near_a_rejected(away_m, after_s, parked=True, returns=1):
+    """The candidate that appears next to an object that was rejected for lack of free space."""
     stage = EvidenceDetect(parked=parked)
     stage._associate(stage._now, observation(1.0, (0.0, 20.0, 20.0), free_sectors=0, returns=returns))
     assert list(stage._now.table) == []
@@ -506,47 +524,47 @@ def beside_a_refused(away_m, after_s, parked=True, returns=1):
     return candidate
 
 
-def test_beside_something_refused_lately_a_still_thing_is_less_likely_a_drone():
-    beside, apart = beside_a_refused(1.0, 5.0), beside_a_refused(NEAR_REJECTED_M + 1.0, 5.0)
-    assert "an object near it was rejected" in beside.reason
-    assert "an object near it was rejected" not in apart.reason
-    assert beside.log_odds < apart.log_odds
-    (less, *_), (more, *_) = (over_clutter(c, ClassifierWeights(), True, True) for c in (beside, apart))
+def test_near_a_recently_rejected_object_a_static_candidate_is_less_probable():
+    nearby, distant = near_a_rejected(1.0, 5.0), near_a_rejected(NEAR_REJECTED_M + 1.0, 5.0)
+    assert "an object near it was rejected" in nearby.reason
+    assert "an object near it was rejected" not in distant.reason
+    assert nearby.log_odds < distant.log_odds
+    (less, *_), (more, *_) = (over_clutter(c, ClassifierWeights(), True, True) for c in (nearby, distant))
     assert more - less == pytest.approx(
         ClassifierWeights().near_rejected, abs=0.01
-    )  # 1 m more to it is a hair farther away
+    )  # at 1 m distance from it the range differs slightly
 
 
 @pytest.mark.parametrize(
     ("parked", "memory_s"), [(True, NEAR_REJECTED_NS * 1e-9), (False, 0.05 * NEAR_REJECTED_NS * 1e-9)]
 )
-def test_a_refused_place_is_forgotten_sooner_when_the_vehicles_motion_is_unknown(parked, memory_s):
-    assert beside_a_refused(1.0, memory_s - 0.1, parked).near_rejected
-    assert not beside_a_refused(1.0, memory_s + 0.1, parked).near_rejected
+def test_a_rejected_position_is_forgotten_sooner_without_vehicle_motion(parked, memory_s):
+    assert near_a_rejected(1.0, memory_s - 0.1, parked).near_rejected
+    assert not near_a_rejected(1.0, memory_s + 0.1, parked).near_rejected
 
 
-def test_rain_is_no_place_where_something_stands():
+def test_rain_leaves_no_rejected_position():
     stage = EvidenceDetect(parked=True)
     stage._associate(
         stage._now, observation(1.0, (0.0, 45.0, 45.0), free_sectors=SECTORS)
-    )  # free all around, once, far away
+    )  # free all around, once, at long range
     assert list(stage._now.table) == []
     assert dict(stage._now.rejected) == {"a false return": 1}
     assert stage._now.rejected_map.nearest_m(np.array([0.0, 45.0, 45.0]), 0.0, NEAR_REJECTED_M, START_NS) == math.inf
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_from_a_driving_vehicle_only_its_odometry_tells_what_stands_still(told):
+@pytest.mark.parametrize("messages", [True, False])
+def test_from_a_driving_vehicle_static_objects_need_its_odometry(messages):
     drives = (1.5, 0.0, 0.0)
-    lamp = Ball(flying((2.0, 8.0, 10.0), (-1.5, 0.0, 0.0)), 0.2)  # in the world it stands
-    candidates, detections = run([lamp], 2.0, drives_mps=drives if told else None)
+    lamp = Ball(flying((2.0, 8.0, 10.0), (-1.5, 0.0, 0.0)), 0.2)  # static in frame map
+    candidates, detections = run([lamp], 2.0, drives_mps=drives if messages else None)
     assert accepted_after_s(detections) == math.inf
-    if told:
+    if messages:
         assert "it may be static" in candidates[-1].reasons[0]
 
 
 def jumping(at_s, by_m, silent_until_s=0.0):
-    """What a parked vehicle's odometry tells whose start frame jumps, maybe after a silence."""
+    """Odometry of a parked vehicle whose map frame jumps, optionally after a gap."""
 
     def compare_motion(stage, t_s):
         if not at_s <= t_s < silent_until_s:
@@ -557,31 +575,43 @@ def jumping(at_s, by_m, silent_until_s=0.0):
 
 
 @pytest.mark.parametrize("by_m", [(1.2, 0.5, 0.0), (300.0, -40.0, 0.0)])
-def test_where_the_vehicles_start_frame_jumps_nothing_is_lost_and_what_stands_has_not_moved(by_m):
+def test_a_jump_of_the_vehicles_odometry_keeps_candidates_and_static_objects(by_m):
     candidates, detections = run(
-        [hanging()], 3.0, drives_mps=None, say=jumping(1.0, by_m), weights=ClassifierWeights(max_isolated_near=0.0)
+        [hovering()], 3.0, drives_mps=None, publish=jumping(1.0, by_m), weights=ClassifierWeights(max_isolated_near=0.0)
     )
-    assert {int(number) for told in candidates for number in told.candidate_id} == {1}
+    assert {int(number) for messages in candidates for number in messages.candidate_id} == {1}
     assert accepted_after_s(detections) == math.inf
     assert "it may be static" in candidates[-1].reasons[0]
     assert candidates[-1].scan_passes[0] > 12
-    _, detections = run([Drone(MOVING)], 4.0, drives_mps=None, say=jumping(1.0, by_m))
+    _, detections = run([Drone(MOVING)], 4.0, drives_mps=None, publish=jumping(1.0, by_m))
     assert accepted_after_s(detections) < 3.0
 
 
-def test_where_it_jumped_in_a_silence_what_was_remembered_is_forgotten():
+def test_a_jump_during_a_gap_of_the_odometry_resets_the_memory():
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
     run(
-        [hanging()], 4.0, looking_away(1.5, 9.0), drives_mps=None, say=jumping(2.0, (300.0, 0.0, 0.0), 3.5), stage=stage
+        [hovering()],
+        4.0,
+        looking_away(1.5, 9.0),
+        drives_mps=None,
+        publish=jumping(2.0, (300.0, 0.0, 0.0), 3.5),
+        stage=stage,
     )
     assert len(stage._now.static) == len(list(stage._now.table)) == 0
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
-    run([hanging()], 4.0, looking_away(1.5, 9.0), drives_mps=None, say=jumping(2.0, (0.1, 0.0, 0.0), 3.5), stage=stage)
+    run(
+        [hovering()],
+        4.0,
+        looking_away(1.5, 9.0),
+        drives_mps=None,
+        publish=jumping(2.0, (0.1, 0.0, 0.0), 3.5),
+        stage=stage,
+    )
     assert len(stage._now.static) == 1
 
 
-def test_what_leaves_is_forgotten():
-    gone = During(hanging(), 0.0, 2.0)
+def test_a_candidate_without_observations_is_removed():
+    gone = During(hovering(), 0.0, 2.0)
     stage = EvidenceDetect(sweep_deg=PASS_DEG, forget_s=0.5)
     for pulses in pulses_seen([gone], WATCHING, 4.0):
         list(stage.on_pulses(pulses))
@@ -589,20 +619,23 @@ def test_what_leaves_is_forgotten():
     assert stage._now.watches == {}
 
 
-def test_without_free_space_the_sectors_are_not_even_named():
-    candidates, _ = run([hanging()], 2.0, free_space=False)
+def test_without_free_space_the_reasons_do_not_mention_sectors():
+    candidates, _ = run([hovering()], 2.0, free_space=False)
     assert "sectors" not in reasons_of(candidates)
 
 
-def test_the_same_pulses_give_the_same_answers():
+def test_the_same_pulses_give_the_same_messages():
     once, again = (run([Drone(still(*PLACE_M), seed=1)], 1.5) for _ in range(2))
     for a, b in zip(once[0] + once[1], again[0] + again[1], strict=True):
         assert a.reasons == b.reasons
+    for a, b in zip(once[0], again[0], strict=True):
         np.testing.assert_array_equal(a.probability, b.probability)
+    for a, b in zip(once[1], again[1], strict=True):
+        np.testing.assert_array_equal(a.evidence.probability, b.evidence.probability)
         np.testing.assert_array_equal(a.xyz_vehicle_m, b.xyz_vehicle_m)
 
 
-def test_a_slice_without_pulses_is_nothing():
+def test_a_slice_without_pulses_is_ignored():
     (pulses,) = list(pulses_seen([], WATCHING, 0.0014, mount=ON_ITS_SIDE))[:1]
     for name in ("point_stamp_ns", "direction_vehicle", "range_m", "laser", "reflectivity"):
         object.__setattr__(pulses, name, getattr(pulses, name)[:0])
@@ -619,18 +652,18 @@ def test_a_slice_without_pulses_is_nothing():
         {"weights": {"luck": 1}},
     ],
 )
-def test_impossible_settings_are_refused(settings):
+def test_impossible_settings_are_rejected(settings):
     with pytest.raises(ValidationError):
         EvidenceDetect(**settings)
 
 
-def test_a_lamp_that_was_refused_at_first_sight_is_not_told_anew_while_the_drone_says_that_it_flies():
-    """It is seen in each passing; who looks at it once more has less time for the drone."""
+def test_a_rejected_lamp_is_not_published_again_while_the_drone_flies():
+    """It is observed in each pass; another observation takes time from the drone."""
 
-    def told_again(way, again):
-        stage = EvidenceDetect(sweep_deg=PASS_DEG, weights=ClassifierWeights(revisited=again))
+    def told_again(trajectory, reacquired):
+        stage = EvidenceDetect(sweep_deg=PASS_DEG, weights=ClassifierWeights(revisited=reacquired))
         stage._now.rejected_map.add(np.array([PLACE_M]), START_NS)
-        candidates, _ = run([hanging()], 0.5, say=saying(way), stage=stage)
+        candidates, _ = run([hovering()], 0.5, publish=telemetry_of(trajectory), stage=stage)
         return sum(c.candidate_id.size > 0 for c in candidates)
 
     flies = flying((0.0, 0.0, 0.0), (3.0, 0.0, 0.0))
@@ -640,7 +673,7 @@ def test_a_lamp_that_was_refused_at_first_sight_is_not_told_anew_while_the_drone
 
 @pytest.mark.parametrize(("step_m", "remembered"), [(0.0, True), (0.5, False)])
 def test_only_static_candidates_are_remembered_as_rejected_objects(step_m, remembered):
-    """A rejected candidate that moved, a bird say, leaves nothing behind where it was."""
+    """A rejected candidate that moved, for example a bird, leaves no rejected position."""
     path = [observation(0.1 * k, (step_m * k, 20.0, 20.0)) for k in range(6)]
     c = candidate(*path)
     c.alternative = Alternative.STATIC

@@ -1,4 +1,4 @@
-"""KernelDetect: Equation 1's argmin, the verdict in words, and no drone where there is none."""
+"""KernelDetect: the argmin of Equation 1, acceptance with reasons, and scenes without a drone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flow.message import check_arrays
 from flow.stage import input_ports, output_ports
 from stages.detect.kernel_candidates import Gates
 from stages.detect.kernel_detect import KernelDetect
-from stages.messages import Detections, ScoreImage
+from stages.messages import Detections, KernelScores, ScoreImage, SearchResult
 from tests.stages.made import depth_image, point_of, street_depth
 
 
@@ -20,7 +20,7 @@ def detect(image, **settings):
     assert isinstance(detections, Detections)
     check_arrays(score)
     check_arrays(detections)
-    assert len(detections.reasons) == len(detections.score)
+    assert len(detections.reasons) == len(detections.accepted)
     return score, detections
 
 
@@ -29,7 +29,7 @@ def test_ports_are_what_the_graph_wires():
     assert set(output_ports(KernelDetect)) == {"score_image", "detections"}
 
 
-def test_the_drone_over_a_street_is_found_where_it_is():
+def test_a_drone_over_a_street_is_detected_at_its_position():
     image = depth_image(street_depth((200, 300)), origin=(0.1, 0.2, 0.25))
     score, detections = detect(image)
     assert detections.accepted.sum() == 1
@@ -52,55 +52,60 @@ def test_without_gates_the_lowest_score_is_the_drone():
 
 def test_without_gates_a_far_pixel_beats_the_drone_as_in_the_paper():
     depth = street_depth((200, 300))
-    depth[120, 256] = 60.0  # alone in the sky, its inner box is one pixel: e = 0
+    depth[120, 256] = 60.0  # isolated in the sky, its inner box is one pixel: e = 0
     image = depth_image(depth)
     assert detect(image, gates=None)[1].xyz_vehicle_m[0][2] == 60.0
     _, gated = detect(image)
     assert gated.xyz_vehicle_m[int(gated.accepted.argmax())][2] == 20.0
     assert gated.accepted.sum() == 1
-    assert gated.reasons[0] == "the inner box is 1 px at 60 m: beyond 37 m it cannot tell a drone"
+    assert gated.reasons[0] == "the inner box is 1 px at 60 m: beyond 37 m it cannot detect a drone"
 
 
 def test_scores_are_sorted_and_the_sum_of_their_terms():
     _, detections = detect(depth_image(street_depth()))
-    assert (np.diff(detections.score) >= -1e-3).all()
-    np.testing.assert_allclose(detections.score, detections.e_inner + detections.e_outer)
+    assert isinstance(detections.evidence, KernelScores)
+    assert (np.diff(detections.evidence.e) >= -1e-3).all()
+    np.testing.assert_array_equal(detections.evidence.e, detections.evidence.e_inner + detections.evidence.e_outer)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
-def test_turning_the_world_turns_the_detection(turns):
+def test_the_detection_rotates_with_the_scene(turns):
     depth = street_depth((200, 300))
     _, here = detect(depth_image(depth))
     _, there = detect(depth_image(np.rot90(depth, turns).copy()))
     x, y, z = here.xyz_vehicle_m[int(here.accepted.argmax())]
     expected = {1: (y, -x, z), 2: (-x, -y, z), 3: (-y, x, z)}[turns]
     found = there.xyz_vehicle_m[int(there.accepted.argmax())]
-    np.testing.assert_allclose(found, expected, atol=2 * 20.0 / 147.8)  # equal scores go by place: one pixel of play
+    np.testing.assert_allclose(
+        found, expected, atol=2 * 20.0 / 147.8
+    )  # equal scores are ordered by position: one pixel of tolerance
 
 
-def test_moving_the_origin_moves_the_detection():
+def test_the_detection_moves_with_the_origin():
     _, here = detect(depth_image(street_depth()))
     _, there = detect(depth_image(street_depth(), origin=(1.0, -2.0, 0.5)))
     np.testing.assert_allclose(
-        there.xyz_vehicle_m - here.xyz_vehicle_m, np.tile([1.0, -2.0, 0.5], (len(here.score), 1))
+        there.xyz_vehicle_m - here.xyz_vehicle_m, np.tile([1.0, -2.0, 0.5], (len(here.accepted), 1))
     )
 
 
-def test_a_street_without_a_drone_has_none_and_says_why():
+def test_a_street_without_a_drone_has_no_detection_and_a_reason():
     _, detections = detect(depth_image(street_depth(None)))
     assert not detections.accepted.any()
     assert detections.summary.startswith("no drone: ")
-    assert "candidates refused" in detections.summary
+    assert "candidates rejected" in detections.summary
+    assert detections.result is SearchResult.ALL_REJECTED
     assert detections.reasons[0] in detections.summary
 
 
-def test_an_empty_sky_says_how_many_returns_were_elsewhere():
+def test_for_an_empty_sky_the_summary_counts_the_returns():
     _, detections = detect(depth_image(np.zeros((512, 512))))
     assert detections.xyz_vehicle_m.shape == (0, 3)
     assert detections.summary == "no drone: 0 of 1000 returns lie within 60 deg of straight up"
+    assert detections.result is SearchResult.NO_CANDIDATE
 
 
-def test_what_is_nearer_than_the_roof_is_no_candidate():
+def test_pixels_nearer_than_nearest_m_are_no_candidates():
     depth = np.zeros((512, 512))
     depth[256, 256] = 0.7
     _, detections = detect(depth_image(depth))
@@ -113,14 +118,15 @@ def test_two_drones_are_both_accepted_the_better_first():
     _, detections = detect(depth_image(depth))
     assert detections.accepted.sum() == 2
     assert detections.summary.endswith("1 more with a higher score")
+    assert detections.result is SearchResult.DRONE
 
 
-def test_an_accepted_candidate_is_given_out_even_when_many_refused_ones_score_lower():
+def test_an_accepted_candidate_is_published_even_if_many_rejected_ones_score_lower():
     depth = street_depth((200, 300))
     for k in range(20):
         depth[60 + 20 * k, 256] = 45.0
     _, detections = detect(depth_image(depth), max_candidates=5)
-    assert len(detections.score) == 5
+    assert len(detections.accepted) == 5
     assert detections.accepted.tolist() == [False] * 4 + [True]
 
 
@@ -130,10 +136,10 @@ def test_an_accepted_candidate_is_given_out_even_when_many_refused_ones_score_lo
         {"span_m": 0.0},
         {"eps_m": 0.0},
         {"outer_side_px": 1},
-        {"gates": Gates(company_m=0.4)},
+        {"gates": Gates(neighbour_m=0.4)},
         {"gates": {"mistyped": 1}},
     ],
 )
-def test_impossible_settings_are_refused(settings):
+def test_impossible_settings_are_rejected(settings):
     with pytest.raises((ValidationError, ValueError)):
         KernelDetect(**settings)

@@ -42,7 +42,7 @@ def test_the_inner_side_follows_equation_3(depth_m, half_px):
     assert inner_half_px(depth_m, FOCAL, 0.5) == half_px == int(36.95 / depth_m)
 
 
-def test_a_lone_pixel_scores_its_empty_inner_box():
+def test_a_single_pixel_scores_its_empty_inner_box():
     depth = np.zeros((64, 64), dtype=np.float32)
     depth[30, 40] = 20.0
     score = score_image(depth, FOCAL, 0.5, 20, 0.1, 1.0)

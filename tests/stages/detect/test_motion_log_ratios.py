@@ -81,7 +81,7 @@ def by_hand(t, x, d, sigma, axes):
     drift = DRIFT_MPS if axes == (0, 1) else DRIFT_UP_MPS
     drone = log_mean([all_axes(x - d @ rotation_z(yaw).T, sigma, drift) for yaw in yaws])
     still, long = all_axes(x, sigma, drift), all_axes(x, SCATTERED_M)
-    sliding = all_axes(x, sigma, SLIDING_MPS) if axes == (0, 1) else still  # level only
+    sliding = all_axes(x, sigma, SLIDING_MPS) if axes == (0, 1) else still  # horizontal only
     followed = all_axes(x, sigma, FOLLOWED_MPS) if axes == (0, 1) else still
     sway_mps = SWAY_M / np.ptp(t)  # on its string
     balloon = flier((min(BALLOON[0], sway_mps), BALLOON[1]), (min(BALLOON[2], sway_mps), BALLOON[3]))
@@ -94,7 +94,7 @@ def by_hand(t, x, d, sigma, axes):
     return drone, still, long, sliding, bird, balloon, loose, followed
 
 
-def heard_by_hand(t, x, d, sigma, level_known):
+def log_ratios_by_hand(t, x, d, sigma, level_known):
     parts = np.array(by_hand(t, x, d, sigma, (2,)))
     if level_known:
         parts = parts + np.array(by_hand(t, x, d, sigma, (0, 1)))
@@ -113,14 +113,14 @@ def test_the_evidence_is_the_ratio_of_the_dense_marginal_likelihoods(seed, level
     d = rng.normal(0.0, 2.0, (n, 3)) + np.outer(t, rng.normal(0.0, 4.0, 3))
     x = d @ rotation_z(0.3 * seed).T + rng.normal(0.0, 0.3, (n, 3)) + rng.normal(0.0, 30.0, 3)
     for sigma_m in (0.1, 0.4):
-        expected = heard_by_hand(t, x, d, sigma_m, level_known)
+        expected = log_ratios_by_hand(t, x, d, sigma_m, level_known)
         found = weigh(t, x, d, sigma_m, level_known)
         np.testing.assert_allclose(found[:4], expected, rtol=1e-7, atol=1e-5)
         assert found[4] == pytest.approx(misfit_by_hand(t, x, d, sigma_m, level_known), rel=1e-6)
 
 
 def misfit_by_hand(t, x, d, sigma, level_known):
-    """e' C^-1 e of the drone's own covariances, a coordinate."""
+    """e' C^-1 e with the drone's covariances, per coordinate."""
     x, d = x - x.mean(axis=0), d - d.mean(axis=0)
 
     def off2(e, drift):
@@ -134,7 +134,7 @@ def misfit_by_hand(t, x, d, sigma, level_known):
     return (up + min(level)) / (3 * len(t))
 
 
-def test_the_paths_that_are_given_stay_as_they_are():
+def test_the_given_paths_are_not_changed():
     x, d = STRAIGHT_M + 5.0, turning()
     x_before, d_before = x.copy(), d.copy()
     weigh(T_S, x, d, SIGMA_M, True)
@@ -148,60 +148,62 @@ FLIGHTS = {"straight": STRAIGHT_M, "turning": turning(), "hanging": HANGING_M}
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_which_way_the_autopilots_axes_point_does_not_matter(flight):
-    """Exactly for the yaws that are tried, and by a nat or two, whatever the flight, between them."""
-    told = FLIGHTS[flight]
-    path = told + noise()
-    straight = against(path, told)
+def test_the_yaw_of_the_odometrys_frame_does_not_matter(flight):
+    """Exact for the yaws of the grid, and within two nats between them."""
+    odometry = FLIGHTS[flight]
+    path = odometry + noise()
+    straight = against(path, odometry)
     for k in (1, 5, 12, 23):
-        turned = told @ rotation_z(math.tau * k / YAWS).T
+        turned = odometry @ rotation_z(math.tau * k / YAWS).T
         np.testing.assert_allclose(against(path, turned), straight, atol=1e-6)
     for yaw in np.linspace(0.0, math.tau / YAWS, 7):
-        np.testing.assert_allclose(against(path, told @ rotation_z(yaw + 1.0).T), straight, atol=6.0)
+        np.testing.assert_allclose(against(path, odometry @ rotation_z(yaw + 1.0).T), straight, atol=6.0)
 
 
-def test_the_world_may_be_turned_too():
-    told, path = turning(), turning() + noise()
+def test_the_result_is_invariant_to_a_rotation_of_the_path():
+    odometry, path = turning(), turning() + noise()
     for k in (3, 7, 20):
         turned = path @ rotation_z(math.tau * k / YAWS).T
-        np.testing.assert_allclose(against(turned, told), against(path, told), atol=1e-6)
+        np.testing.assert_allclose(against(turned, odometry), against(path, odometry), atol=1e-6)
 
 
-def test_where_the_two_frames_begin_does_not_matter():
-    told, path = turning(), turning() + noise()
-    moved = against(path + np.array([300.0, -20.0, 7.0]), told - np.array([4.0, 900.0, 50.0]))
-    np.testing.assert_allclose(moved, against(path, told), atol=1e-6)
+def test_the_origins_of_the_two_frames_do_not_matter():
+    odometry, path = turning(), turning() + noise()
+    moved = against(path + np.array([300.0, -20.0, 7.0]), odometry - np.array([4.0, 900.0, 50.0]))
+    np.testing.assert_allclose(moved, against(path, odometry), atol=1e-6)
 
 
-def test_swapped_or_mirrored_axes_of_both_change_nothing():
-    told, path = turning(), turning() + noise()
-    expected = against(path, told)
-    np.testing.assert_allclose(against(path[:, [1, 0, 2]], told[:, [1, 0, 2]]), expected, atol=1e-6)
-    np.testing.assert_allclose(against(path * [1, -1, 1], told * [1, -1, 1]), expected, atol=1e-6)
-    np.testing.assert_allclose(against(path * [1, 1, -1], told * [1, 1, -1]), expected, atol=1e-6)
+def test_swapping_or_mirroring_the_axes_of_both_changes_nothing():
+    odometry, path = turning(), turning() + noise()
+    expected = against(path, odometry)
+    np.testing.assert_allclose(against(path[:, [1, 0, 2]], odometry[:, [1, 0, 2]]), expected, atol=1e-6)
+    np.testing.assert_allclose(against(path * [1, -1, 1], odometry * [1, -1, 1]), expected, atol=1e-6)
+    np.testing.assert_allclose(against(path * [1, 1, -1], odometry * [1, 1, -1]), expected, atol=1e-6)
 
 
-def test_up_is_not_swapped_with_level_and_a_mirrored_path_is_not_the_drones():
-    told = turning(3.0, 6.0)
-    path = told + noise()
-    assert against(path * [1, -1, 1], told).over_bird < against(path, told).over_bird - 50.0  # no yaw mirrors
+def test_a_mirrored_path_does_not_match():
+    odometry = turning(3.0, 6.0)
+    path = odometry + noise()
+    assert (
+        against(path * [1, -1, 1], odometry).over_bird < against(path, odometry).over_bird - 50.0
+    )  # no yaw mirrors a path
     rising = np.outer(T_S, (0.0, 0.0, 3.0))
     assert against(rising, rising[:, [2, 0, 1]]).over_bird < 0 < against(rising, rising).over_bird
 
 
-def test_the_order_of_the_sightings_does_not_matter():
-    told, path = turning(), turning() + noise()
+def test_the_order_of_the_observations_does_not_matter():
+    odometry, path = turning(), turning() + noise()
     order = np.random.default_rng(1).permutation(14)
-    shuffled = against(path[order], told[order], t_s=T_S[order])
-    np.testing.assert_allclose(shuffled, against(path, told), atol=1e-6)
+    shuffled = against(path[order], odometry[order], t_s=T_S[order])
+    np.testing.assert_allclose(shuffled, against(path, odometry), atol=1e-6)
 
 
-# what flies
+# paths of drones, birds, lamps, wires and balloons
 
 
 @pytest.mark.parametrize("flight", ["straight", "turning"])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_path_that_the_drone_tells_is_the_drones(flight, seed):
+def test_a_path_that_follows_the_odometry_is_the_drones(flight, seed):
     path = FLIGHTS[flight] @ rotation_z(0.4 + seed).T + noise(seed)
     log_ratios = against(path, FLIGHTS[flight])
     assert log_ratios.over_static > 15.0
@@ -209,7 +211,7 @@ def test_a_path_that_the_drone_tells_is_the_drones(flight, seed):
     assert log_ratios.over_balloon > 4.0
 
 
-def test_a_slow_drift_of_the_autopilots_velocity_is_forgiven_and_a_fast_one_is_not():
+def test_a_slow_velocity_drift_of_the_odometry_is_tolerated_and_a_fast_one_is_not():
     path = STRAIGHT_M + noise()
     clean = against(path, STRAIGHT_M).over_bird
     assert against(path + np.outer(T_S, (0.0, 0.3, 0.0)), STRAIGHT_M).over_bird > clean - 3.0
@@ -218,56 +220,56 @@ def test_a_slow_drift_of_the_autopilots_velocity_is_forgiven_and_a_fast_one_is_n
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("velocity", [(11.0, 0.0, 0.0), (-5.0, 8.0, 0.5), (0.0, -4.0, 0.5)])
-def test_a_bird_is_no_drone_that_hangs_or_flies_otherwise(velocity, seed):
+def test_a_bird_does_not_match_a_hovering_or_differently_flying_drone(velocity, seed):
     path = np.outer(T_S, velocity) + noise(seed)
     assert against(path, HANGING_M).over_bird < -10.0
     assert against(path, np.outer(T_S, (1.0, 1.0, 0.0))).over_bird < -5.0
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_lamp_is_no_drone_that_flies(seed):
+def test_a_lamp_does_not_match_a_flying_drone(seed):
     path = noise(seed)
     assert against(path, STRAIGHT_M).over_static < -30.0
     assert against(path, np.outer(T_S, (0.0, 0.0, 1.0))).over_static < -3.0
-    scattered = noise(seed, sigma_m=0.4)  # a wire is met here and there
+    scattered = noise(seed, sigma_m=0.4)  # observations of a wire scatter
     assert against(scattered, STRAIGHT_M).over_static < -10.0
 
 
-def test_a_wire_that_is_met_farther_and_farther_along_is_no_drone_that_flies_or_hangs():
+def test_observations_along_a_wire_do_not_match_a_flying_or_hovering_drone():
     slides = np.outer(T_S, (0.6, -0.5, 0.0)) + noise()
     assert against(slides, STRAIGHT_M).over_static < -10.0
     assert against(slides, HANGING_M).over_static < 1.0
-    rises = np.outer(T_S, (0.0, 0.0, 0.8)) + noise()  # none slides up
+    rises = np.outer(T_S, (0.0, 0.0, 0.8)) + noise()  # no wire is followed upwards
     assert against(rises, np.outer(T_S, (0.0, 0.0, 0.8))).over_static > 10.0
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_wire_looked_at_farther_along_as_fast_as_the_drone_flies_is_told_from_it_by_a_turn_alone(seed):
+def test_a_wire_followed_at_the_drones_speed_differs_only_in_a_turn(seed):
     slides = np.outer(T_S, (2.0, -1.5, 0.0)) + noise(seed)
     straight = against(slides, np.outer(T_S, (2.5, 0.0, 0.0)))
-    assert straight.over_static > 8.0  # what nobody looks along does not go so far
+    assert straight.over_static > 8.0  # a wire that the aim does not follow is not so long
     assert straight.over_wire < 4.0
     turned = turning()
     assert against(turned + noise(seed), turned).over_wire > 10.0
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_drone_that_hangs_still_says_nothing_against_a_lamp(seed):
+def test_a_hovering_drone_does_not_discriminate_against_a_lamp(seed):
     log_ratios = against(noise(seed), HANGING_M)
     assert -1.5 < log_ratios.over_static < 1.5
     assert log_ratios.over_bird > 5.0  # and much against birds
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_balloon_is_no_drone_that_flies_fast_and_nearly_one_that_drifts_as_it(seed):
+def test_a_balloon_does_not_match_a_fast_drone_and_nearly_matches_a_slow_one(seed):
     path = np.outer(T_S, (0.8, 0.2, 0.2)) + noise(seed)
     assert against(path, STRAIGHT_M).over_balloon < -10.0
     assert -2.0 < against(path, np.outer(T_S, (0.8, 0.2, 0.2))).over_balloon < 12.0
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_flies_straight_on_for_metres_is_hardly_a_balloon_on_a_string(seed):
-    """Slow and straight as a balloon may drift for a second: a drone had to be looked at for six seconds."""
+def test_a_straight_flight_of_metres_is_hardly_a_balloon_on_a_string(seed):
+    """A balloon may drift slowly and straight for a second, so that a drone needs six seconds of observation."""
 
     def over_balloon(seconds):
         t_s = np.linspace(0.0, seconds, 14)
@@ -279,35 +281,35 @@ def test_what_flies_straight_on_for_metres_is_hardly_a_balloon_on_a_string(seed)
     assert against(swaying + noise(seed), np.outer(T_S, (0.8, 0.3, 0.1))).over_balloon < -4.0
 
 
-def test_when_the_vehicles_motion_is_unknown_only_heights_are_compared():
-    told = turning()
-    passing = told + noise() + np.outer(T_S, (-12.0, 4.0, 0.0))  # seen from a vehicle that drives and does not say so
-    level, heights = against(passing, told), against(passing, told, level_known=False)
+def test_without_vehicle_motion_only_heights_are_compared():
+    odometry = turning()
+    passing = odometry + noise() + np.outer(T_S, (-12.0, 4.0, 0.0))  # observed from a driving vehicle without odometry
+    level, heights = against(passing, odometry), against(passing, odometry, level_known=False)
     assert level.over_bird < -50.0
     assert heights.over_bird > 0.0
-    elsewhere = passing * [0.0, 3.0, 1.0] + np.outer(T_S**2, (5.0, 1.0, 0.0))
-    np.testing.assert_allclose(against(elsewhere, told, level_known=False), heights, atol=1e-9)
-    assert against(passing * [1, 1, -8], told, level_known=False).over_bird < heights.over_bird - 5.0
+    displaced = passing * [0.0, 3.0, 1.0] + np.outer(T_S**2, (5.0, 1.0, 0.0))
+    np.testing.assert_allclose(against(displaced, odometry, level_known=False), heights, atol=1e-9)
+    assert against(passing * [1, 1, -8], odometry, level_known=False).over_bird < heights.over_bird - 5.0
 
 
-def test_more_looks_say_more():
-    told = turning()
-    path = told + noise(3)
-    log_ratios = [against(path[-n:], told[-n:], t_s=T_S[-n:]).over_static for n in (2, 4, 8, 14)]
+def test_the_log_ratio_grows_with_the_observations():
+    odometry = turning()
+    path = odometry + noise(3)
+    log_ratios = [against(path[-n:], odometry[-n:], t_s=T_S[-n:]).over_static for n in (2, 4, 8, 14)]
     assert log_ratios == sorted(log_ratios)
     assert log_ratios[-1] > log_ratios[0] + 20.0
 
 
-# what the drone tells
+# telemetry
 
 
-def telling(way, seconds=4.0, step_s=0.1, start_ns=START_NS, into=None):
-    """A motion_log_ratios that was told of a flight p(t), with the velocity that it has."""
+def telemetry_of(trajectory, seconds=4.0, step_s=0.1, start_ns=START_NS, into=None):
+    """DroneTelemetry with positions and velocities of a flight p(t)."""
     made = DroneTelemetry() if into is None else into
     for k in range(round(seconds / step_s) + 1):
         t = k * step_s
-        velocity = (np.asarray(way(t + 1e-4)) - way(t - 1e-4)) / 2e-4
-        made.add(start_ns + round(t * 1e9), np.asarray(way(t), dtype=np.float64), velocity)
+        velocity = (np.asarray(trajectory(t + 1e-4)) - trajectory(t - 1e-4)) / 2e-4
+        made.add(start_ns + round(t * 1e9), np.asarray(trajectory(t), dtype=np.float64), velocity)
     return made
 
 
@@ -316,7 +318,7 @@ def circle(t):
 
 
 def shifted(after_s, by_m):
-    """The circle from a time on, at another place."""
+    """The circle from a time on, at another position."""
     return lambda t: circle(after_s + t) + by_m * np.array([0.6, 0.0, 0.8])
 
 
@@ -324,61 +326,61 @@ def ns(*times_s):
     return [START_NS + round(t * 1e9) for t in times_s]
 
 
-def places(told, stamps_ns):
-    """Where it says it was (n, 3); None: it was silent at one of these times."""
-    states = [told.state(stamp_ns) for stamp_ns in stamps_ns]
+def positions(odometry, stamps_ns):
+    """Positions (n, 3) at these times; None: no telemetry at one of them."""
+    states = [odometry.state(stamp_ns) for stamp_ns in stamps_ns]
     return None if any(state is None for state in states) else np.array([state[0] for state in states])
 
 
-def test_between_and_just_beyond_its_words_a_drone_flies_on():
-    told = telling(circle)
+def test_telemetry_is_interpolated_and_briefly_extrapolated():
+    odometry = telemetry_of(circle)
     times = (0.0, 1.04, 2.5, 3.96, 4.05)
     expected = np.array([circle(t) for t in times])
-    np.testing.assert_allclose(places(told, ns(*times)), expected, atol=0.01)
-    assert places(told, ns(1.04)).shape == (1, 3)
+    np.testing.assert_allclose(positions(odometry, ns(*times)), expected, atol=0.01)
+    assert positions(odometry, ns(1.04)).shape == (1, 3)
 
 
-def test_a_place_is_taken_from_the_nearer_of_two_words():
-    told = DroneTelemetry()
-    told.add(START_NS, np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
-    told.add(START_NS + 400 * MS, np.array([0.0, 0.0, 0.0]), np.array([0.0, 2.0, 0.0]))
-    np.testing.assert_allclose(places(told, ns(0.1)), [[0.1, 0.0, 0.0]])
-    np.testing.assert_allclose(places(told, ns(0.3)), [[0.0, -0.2, 0.0]])
+def test_the_position_is_predicted_from_the_nearer_of_two_messages():
+    odometry = DroneTelemetry()
+    odometry.add(START_NS, np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+    odometry.add(START_NS + 400 * MS, np.array([0.0, 0.0, 0.0]), np.array([0.0, 2.0, 0.0]))
+    np.testing.assert_allclose(positions(odometry, ns(0.1)), [[0.1, 0.0, 0.0]])
+    np.testing.assert_allclose(positions(odometry, ns(0.3)), [[0.0, -0.2, 0.0]])
 
 
 @pytest.mark.parametrize(
-    "times", [(-0.1, 1.0), (1.0, 4.6), (3.0, 60.0)], ids=["before its first word", "long after its last", "later"]
+    "times", [(-0.1, 1.0), (1.0, 4.6), (3.0, 60.0)], ids=["before the first message", "long after the last", "later"]
 )
-def test_when_it_was_silent_nothing_is_known(times):
-    assert places(telling(circle), ns(*times)) is None
+def test_outside_the_telemetry_there_is_no_state(times):
+    assert positions(telemetry_of(circle), ns(*times)) is None
 
 
-def test_in_a_gap_nothing_is_known():
-    told = telling(lambda t: np.zeros(3), seconds=1.0)
-    telling(lambda t: np.zeros(3), seconds=1.0, start_ns=START_NS + 4_000 * MS, into=told)
-    assert places(told, ns(0.5, 4.5)) is not None
-    assert places(told, ns(0.5, 2.5, 4.5)) is None
+def test_in_a_gap_of_the_telemetry_there_is_no_state():
+    odometry = telemetry_of(lambda t: np.zeros(3), seconds=1.0)
+    telemetry_of(lambda t: np.zeros(3), seconds=1.0, start_ns=START_NS + 4_000 * MS, into=odometry)
+    assert positions(odometry, ns(0.5, 4.5)) is not None
+    assert positions(odometry, ns(0.5, 2.5, 4.5)) is None
 
 
-def test_one_word_is_not_enough_and_none_is_silence():
-    told = DroneTelemetry()
-    assert places(told, ns(0.0)) is None
-    assert told.speed_mps(START_NS) is None
-    told.add(START_NS, np.zeros(3), np.zeros(3))
-    assert places(told, ns(0.0)) is None
+def test_one_message_is_not_enough():
+    odometry = DroneTelemetry()
+    assert positions(odometry, ns(0.0)) is None
+    assert odometry.speed_mps(START_NS) is None
+    odometry.add(START_NS, np.zeros(3), np.zeros(3))
+    assert positions(odometry, ns(0.0)) is None
 
 
-def test_its_speed_is_level_and_up_while_it_is_heard():
-    told = DroneTelemetry()
-    told.add(START_NS, np.zeros(3), np.array([3.0, -4.0, -1.5]))
-    assert told.speed_mps(START_NS + AHEAD_NS) == pytest.approx((5.0, -1.5))
-    assert told.speed_mps(START_NS + AHEAD_NS + MS) is None
+def test_the_speed_is_horizontal_and_vertical_while_telemetry_is_recent():
+    odometry = DroneTelemetry()
+    odometry.add(START_NS, np.zeros(3), np.array([3.0, -4.0, -1.5]))
+    assert odometry.speed_mps(START_NS + AHEAD_NS) == pytest.approx((5.0, -1.5))
+    assert odometry.speed_mps(START_NS + AHEAD_NS + MS) is None
 
 
-def test_an_odometry_that_calls_itself_failed_is_not_heard():
-    told = DroneTelemetry()
+def test_odometry_of_failed_quality_is_ignored():
+    odometry = DroneTelemetry()
     for k, quality in enumerate((80, None, 0)):
-        told.add_odometry(
+        odometry.add_odometry(
             DroneOdometry(
                 stamp_ns=START_NS + k * 100 * MS,
                 xyz_odom_m=np.full(3, 0.1 * k),
@@ -391,122 +393,126 @@ def test_an_odometry_that_calls_itself_failed_is_not_heard():
                 quality_percent=quality,
             )
         )
-    assert told.span_ns == (START_NS, START_NS + 100 * MS)
+    assert odometry.span_ns == (START_NS, START_NS + 100 * MS)
 
 
-def test_a_word_that_is_not_newer_is_ignored():
-    told = telling(circle)
-    told.add(START_NS + 2_000 * MS, np.full(3, 99.0), np.zeros(3))
-    told.add(START_NS + 4_000 * MS, np.full(3, 99.0), np.zeros(3))
-    np.testing.assert_allclose(places(told, ns(2.0, 4.0)), [circle(2.0), circle(4.0)], atol=1e-6)
+def test_a_message_that_is_not_newer_is_ignored():
+    odometry = telemetry_of(circle)
+    odometry.add(START_NS + 2_000 * MS, np.full(3, 99.0), np.zeros(3))
+    odometry.add(START_NS + 4_000 * MS, np.full(3, 99.0), np.zeros(3))
+    np.testing.assert_allclose(positions(odometry, ns(2.0, 4.0)), [circle(2.0), circle(4.0)], atol=1e-6)
 
 
-def test_a_jump_that_its_velocity_does_not_explain_is_a_reset_and_what_was_before_is_forgotten():
-    told = telling(circle)
-    telling(shifted(4.1, JUMP_M + 0.2), 1.0, start_ns=START_NS + 4_100 * MS, into=told)
-    assert places(told, ns(3.0, 4.5)) is None
-    assert places(told, ns(4.2, 4.5)) is not None
+def test_a_jump_that_the_velocity_does_not_explain_is_a_reset():
+    odometry = telemetry_of(circle)
+    telemetry_of(shifted(4.1, JUMP_M + 0.2), 1.0, start_ns=START_NS + 4_100 * MS, into=odometry)
+    assert positions(odometry, ns(3.0, 4.5)) is None
+    assert positions(odometry, ns(4.2, 4.5)) is not None
 
 
 def test_a_small_correction_and_a_fast_flight_are_no_resets():
-    told = telling(circle)
-    telling(shifted(4.1, JUMP_M - 0.2), 1.0, start_ns=START_NS + 4_100 * MS, into=told)
-    assert places(told, ns(3.0, 4.5)) is not None
-    assert places(telling(lambda t: np.array([15.0 * t, 0.0, 0.0]), step_s=0.4), ns(0.5, 3.5)) is not None
+    odometry = telemetry_of(circle)
+    telemetry_of(shifted(4.1, JUMP_M - 0.2), 1.0, start_ns=START_NS + 4_100 * MS, into=odometry)
+    assert positions(odometry, ns(3.0, 4.5)) is not None
+    assert positions(telemetry_of(lambda t: np.array([15.0 * t, 0.0, 0.0]), step_s=0.4), ns(0.5, 3.5)) is not None
 
 
-def test_its_memory_is_bounded():
-    told = telling(lambda t: np.zeros(3), seconds=60.0)
-    assert len(told._ns) == len(told._xyz_m) == len(told._v_mps) == round(KEPT_NS * 1e-8) + 1
-    assert places(told, ns(39.0, 60.0)) is None
-    assert places(told, ns(40.0, 60.0)) is not None
+def test_the_memory_is_bounded():
+    odometry = telemetry_of(lambda t: np.zeros(3), seconds=60.0)
+    assert len(odometry._ns) == len(odometry._xyz_m) == len(odometry._v_mps) == round(KEPT_NS * 1e-8) + 1
+    assert positions(odometry, ns(39.0, 60.0)) is None
+    assert positions(odometry, ns(40.0, 60.0)) is not None
 
 
-# a path and the motion_log_ratios together
+# a path and telemetry together
 
 
-def path_of(way, times):
-    return ns(*times), [np.asarray(way(t)) for t in times]
+def path_of(trajectory, times):
+    return ns(*times), [np.asarray(trajectory(t)) for t in times]
 
 
-def test_a_path_is_compared_with_what_was_told_at_its_times():
+def test_a_path_is_compared_with_the_telemetry_at_its_times():
     times = np.linspace(1.0, 3.0, 9)
     yaw = rotation_z(math.tau * 3 / YAWS)
     stamps, path = path_of(lambda t: yaw @ circle(t) + [0.0, 40.0, -3.0], times)
-    log_ratios = compare_motion(telling(circle), stamps, path, SIGMA_M, True)
+    log_ratios = compare_motion(telemetry_of(circle), stamps, path, SIGMA_M, True)
     expected = weigh(times - times[-1], np.array(path), np.array([circle(t) for t in times]), SIGMA_M, True)
     np.testing.assert_allclose(log_ratios[:5], expected, atol=0.2)
     assert log_ratios.over_static > 30.0 < log_ratios.over_balloon
 
 
-def test_nothing_speaks_for_a_drone_where_a_path_is_far_from_the_drones_though_all_else_is_farther():
-    """A thing that swings two metres to each side where the drone swings three: no lamp, no bird, and not the drone."""
+def test_a_path_far_from_the_drones_has_no_positive_log_ratio():
+    """An object that swings by 2 m while the drone swings by 3 m is no lamp, no bird, and not the drone."""
 
     def swinging(t, by_m=3.0):
         return np.array([2.0 * t, by_m * math.sin(3.0 * t), 10.0])
 
     times = np.linspace(1.0, 3.0, 9)
     stamps, path = path_of(lambda t: swinging(t, 2.0), times)
-    told = np.array([swinging(t) for t in times])
-    assert min(weigh(times - times[-1], np.array(path), told, SIGMA_M, True)[:4]) > 5.0
-    log_ratios = compare_motion(telling(swinging), stamps, path, SIGMA_M, True)
+    odometry = np.array([swinging(t) for t in times])
+    assert min(weigh(times - times[-1], np.array(path), odometry, SIGMA_M, True)[:4]) > 5.0
+    log_ratios = compare_motion(telemetry_of(swinging), stamps, path, SIGMA_M, True)
     assert log_ratios.misfit > MAX_MISFIT
     assert max(log_ratios[:4]) == 0.0
     stamps, path = path_of(swinging, times)
-    log_ratios = compare_motion(telling(swinging), stamps, path, SIGMA_M, True)
+    log_ratios = compare_motion(telemetry_of(swinging), stamps, path, SIGMA_M, True)
     assert log_ratios.misfit < 1.0
     assert min(log_ratios[:4]) > 5.0
 
 
-def test_only_heights_are_heard_of_when_the_vehicle_does_not_say_how_it_drives():
+def test_without_vehicle_motion_only_heights_are_compared_with_telemetry():
     stamps, path = path_of(lambda t: [20.0 * t, 0.0, circle(t)[2]], np.linspace(1.0, 3.0, 9))
-    assert compare_motion(telling(circle), stamps, path, SIGMA_M, True).over_bird < -50.0
-    assert compare_motion(telling(circle), stamps, path, SIGMA_M, False).over_bird > -1.0
+    assert compare_motion(telemetry_of(circle), stamps, path, SIGMA_M, True).over_bird < -50.0
+    assert compare_motion(telemetry_of(circle), stamps, path, SIGMA_M, False).over_bird > -1.0
 
 
-def test_how_far_the_drone_went_is_its_farthest_from_where_it_was_at_first_and_only_up_where_heights_are_compared():
+def test_the_displacement_is_the_largest_distance_from_the_first_position():
     def out_and_back(t):
         return np.array([4.0 * math.sin(math.pi * (t - 1.0) / 2.0), 0.0, 10.0 + 0.7 * math.sin(math.pi * (t - 1.0))])
 
     stamps, path = path_of(out_and_back, np.linspace(1.0, 3.0, 9))
-    assert compare_motion(telling(out_and_back), stamps, path, SIGMA_M, True).displacement_m == pytest.approx(
+    assert compare_motion(telemetry_of(out_and_back), stamps, path, SIGMA_M, True).displacement_m == pytest.approx(
         4.0, abs=0.1
     )
-    assert compare_motion(telling(out_and_back), stamps, path, SIGMA_M, False).displacement_m == pytest.approx(
+    assert compare_motion(telemetry_of(out_and_back), stamps, path, SIGMA_M, False).displacement_m == pytest.approx(
         0.7, abs=0.1
     )
-    hanging = compare_motion(telling(lambda t: [3.0, 4.0, 10.0]), stamps, path, SIGMA_M, True)
+    hanging = compare_motion(telemetry_of(lambda t: [3.0, 4.0, 10.0]), stamps, path, SIGMA_M, True)
     assert hanging.displacement_m == pytest.approx(0.0, abs=1e-6)
 
 
-def test_silence_and_a_single_sighting_say_nothing():
+def test_no_telemetry_or_a_single_observation_gives_none():
     stamps, path = path_of(circle, np.linspace(1.0, 3.0, 9))
     assert compare_motion(DroneTelemetry(), stamps, path, SIGMA_M, True) is None
-    assert compare_motion(telling(circle, seconds=0.9), stamps, path, SIGMA_M, True) is None  # it fell silent long ago
-    assert compare_motion(telling(circle), stamps[:1], path[:1], SIGMA_M, True) is None
+    assert (
+        compare_motion(telemetry_of(circle, seconds=0.9), stamps, path, SIGMA_M, True) is None
+    )  # the telemetry ended long before
+    assert compare_motion(telemetry_of(circle), stamps[:1], path[:1], SIGMA_M, True) is None
 
 
-def test_sightings_at_which_it_was_silent_are_left_out():
+def test_observations_without_telemetry_are_omitted():
     times = np.linspace(0.5, 3.5, 13)
-    late, early = telling(circle, start_ns=START_NS), telling(circle, seconds=1.5)
+    late, early = telemetry_of(circle, start_ns=START_NS), telemetry_of(circle, seconds=1.5)
     between = DroneTelemetry()
-    telling(lambda t: circle(1.4 + t), seconds=1.2, start_ns=START_NS + 1_400 * MS, into=between)
-    for told, log_ratios in ((late, times >= 0.0), (early, times <= 2.0), (between, (times > 1.4) & (times < 3.1))):
-        expected = compare_motion(told, *path_of(circle, times[log_ratios]), SIGMA_M, True)
+    telemetry_of(lambda t: circle(1.4 + t), seconds=1.2, start_ns=START_NS + 1_400 * MS, into=between)
+    for odometry, log_ratios in ((late, times >= 0.0), (early, times <= 2.0), (between, (times > 1.4) & (times < 3.1))):
+        expected = compare_motion(odometry, *path_of(circle, times[log_ratios]), SIGMA_M, True)
         if log_ratios[-1]:
-            np.testing.assert_allclose(compare_motion(told, *path_of(circle, times), SIGMA_M, True), expected)
-        else:  # the same path, seen from a later moment
+            np.testing.assert_allclose(compare_motion(odometry, *path_of(circle, times), SIGMA_M, True), expected)
+        else:  # the same path, compared at a later time
             np.testing.assert_allclose(
-                compare_motion(told, *path_of(circle, times), SIGMA_M, True), expected, rtol=1e-6
+                compare_motion(odometry, *path_of(circle, times), SIGMA_M, True), expected, rtol=1e-6
             )
 
 
 def test_after_a_reset_a_path_from_before_it_is_not_compared():
-    told = telling(circle, seconds=2.0)
-    telling(shifted(2.1, 5.0), 2.0, start_ns=START_NS + 2_100 * MS, into=told)
-    assert compare_motion(told, *path_of(circle, np.linspace(0.5, 2.0, 9)), SIGMA_M, True) is None
-    after = compare_motion(told, *path_of(circle, np.linspace(2.25, 4.0, 8)), SIGMA_M, True)
-    np.testing.assert_allclose(compare_motion(told, *path_of(circle, np.linspace(1.0, 4.0, 13)), SIGMA_M, True), after)
+    odometry = telemetry_of(circle, seconds=2.0)
+    telemetry_of(shifted(2.1, 5.0), 2.0, start_ns=START_NS + 2_100 * MS, into=odometry)
+    assert compare_motion(odometry, *path_of(circle, np.linspace(0.5, 2.0, 9)), SIGMA_M, True) is None
+    after = compare_motion(odometry, *path_of(circle, np.linspace(2.25, 4.0, 8)), SIGMA_M, True)
+    np.testing.assert_allclose(
+        compare_motion(odometry, *path_of(circle, np.linspace(1.0, 4.0, 13)), SIGMA_M, True), after
+    )
 
 
 def test_only_the_latest_ten_seconds_and_so_many_points_of_them_are_compared(monkeypatch):
@@ -514,9 +520,9 @@ def test_only_the_latest_ten_seconds_and_so_many_points_of_them_are_compared(mon
     monkeypatch.setattr(
         motion_log_ratios, "weigh", lambda t, x, d, sigma_m, level: asked.append((t, x)) or (0.0, 0.0, 0.0, 0.0, 0.0)
     )
-    told = telling(circle, seconds=20.0)
+    odometry = telemetry_of(circle, seconds=20.0)
     stamps, path = path_of(circle, np.linspace(1.0, 19.0, 181))
-    compare_motion(told, stamps, path, SIGMA_M, True)
+    compare_motion(odometry, stamps, path, SIGMA_M, True)
     ((t, x),) = asked
     assert len(t) == len(x) == MAX_POINTS
     assert (t[0], t[-1]) == pytest.approx((-KEPT_NS / 2e9, 0.0))

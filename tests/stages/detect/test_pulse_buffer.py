@@ -1,4 +1,4 @@
-"""What was kept of the last slices is asked as a whole: as if every slice had been looked at by itself."""
+"""RecentPulses: the counts of all slices together equal the sum over the single slices."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.detect.isolation import MAX_SLICES, RecentPulses
-from stages.kernels.detect.isolation import TALLY, look_around
+from stages.kernels.detect.isolation import TALLY, count_sectors
 from stages.kernels.detect.pulse_buffer import WINDOW_NS
 from stages.messages import SweptPulses
 
@@ -41,30 +41,30 @@ def fan(rng: np.random.Generator, spread_rad: float) -> tuple[SweptPulses, np.nd
 def one_by_one(slices: list[SweptPulses], centre_m: np.ndarray) -> np.ndarray:
     tally = np.zeros(TALLY, dtype=np.int64)
     for s in slices:
-        look_around(s.direction_vehicle, s.range_m, np.array(s.origin_vehicle_m), centre_m, *AROUND, tally)
+        count_sectors(s.direction_vehicle, s.range_m, np.array(s.origin_vehicle_m), centre_m, *AROUND, tally)
     return tally.astype(float)
 
 
 @pytest.mark.parametrize("spread_rad", [0.02, 0.3, 1.2])
-def test_a_place_gets_of_all_slices_together_what_each_found_around_it(spread_rad) -> None:
+def test_the_buffer_counts_as_the_sum_of_its_slices(spread_rad) -> None:
     rng = np.random.default_rng(int(1000 * spread_rad))
     found = 0.0
     for _ in range(60):
-        lately, slices = RecentPulses(), []
+        recent, slices = RecentPulses(), []
         for k in range(int(rng.integers(1, 8))):
             pulses, mean = fan(rng, spread_rad)
-            lately.add(pulses, mean, k * STEP_NS)
+            recent.add(pulses, mean, k * STEP_NS)
             slices.append(pulses)
-        for slice_ in slices:  # a place some metres off one of its pulses: at the edge of what is looked at, too
+        for slice_ in slices:  # a position some metres from one of its pulses, also at the edge of the search
             along = slice_.direction_vehicle[int(rng.integers(len(slice_.range_m)))].astype(float)
             centre_m = rng.uniform(1.5, 30.0) * along + rng.standard_normal(3) * rng.uniform(0.0, 3.0)
-            told = lately.isolation(centre_m, *AROUND)
-            np.testing.assert_array_equal(told, one_by_one(slices, centre_m))
-            found += told.sum()
+            counts = recent.isolation(centre_m, *AROUND)
+            np.testing.assert_array_equal(counts, one_by_one(slices, centre_m))
+            found += counts.sum()
     assert found > 500
 
 
-def test_what_is_older_than_the_window_or_beyond_the_last_slices_is_forgotten() -> None:
+def test_slices_before_the_window_or_beyond_the_capacity_are_dropped() -> None:
     rng = np.random.default_rng(7)
     made = [fan(rng, 1.2) for _ in range(MAX_SLICES + 5)]
     centre_m = 8.0 * made[0][1]

@@ -24,7 +24,7 @@ from stages.kernels.geometry.so3 import exp_rotation, hat, log_rotation
 
 
 class Ekf:
-    """See `stages.fuse.back_end.BackEnd`."""
+    """See `stages.fuse.smoother.BackEnd`."""
 
     def __init__(self) -> None:
         self.stamp_ns, self.recoveries = 0, 0

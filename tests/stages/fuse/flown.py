@@ -1,6 +1,6 @@
-"""What the fusion hears in a recorded flight, taken out of a replay once, so that it can be fused again and again.
+"""Inputs of the fusion in a recorded flight, taken from a replay once, so that they can be fused repeatedly.
 
-A fault changes what is heard: messages left out, later, or false. `judge` holds the poses against the truth.
+A fault removes, delays or falsifies inputs. `judge` compares the poses with the truth.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ Fault = Callable[[list[Event]], list[Event]]
 
 
 @dataclass
-class Flown:
-    """A flight: what the fusion hears, in order, and where the drone truly was in the vehicle's frame."""
+class RecordedFlight:
+    """A flight: inputs of the fusion, in order, and the true pose of the drone in the vehicle frame."""
 
     name: str
     events: list[Event]
@@ -56,19 +56,19 @@ class Flown:
         )
 
     def fuse(self, stage: Fuse | None = None, fault: Fault | None = None) -> list[RelativePose]:
-        """The poses told when this is heard, with a fault."""
+        """Poses of the fusion of these inputs, with a fault."""
         stage, poses = stage or Fuse(), []
         for _, port, message in fault(self.events) if fault else self.events:
             poses += getattr(stage, f"on_{port}")(message)
         return poses
 
 
-def heard(recording: Path, config: Path, fuse: str = "fuse") -> Flown:
-    """Replay a recording and keep what its fusion hears."""
+def recorded_inputs(recording: Path, config: Path, fuse: str = "fuse") -> RecordedFlight:
+    """Replay a recording and keep the inputs of its fusion."""
     truth = TruthLog()
     with RecordingReader(recording) as reader:
         graph = RunRequest(config, sets=("viewer.file=null",)).graph(reader.rig_yaml, str(recording))
-        tap = Hearing(graph, fuse)
+        tap = InputTap(graph, fuse)
         runner = Replay(graph, (tap,))
         for record in truth.without_truth(reader.records()):
             runner.feed(record)
@@ -76,8 +76,8 @@ def heard(recording: Path, config: Path, fuse: str = "fuse") -> Flown:
     return flown(recording.stem, tap, truth)
 
 
-def flown(name: str, tap: Hearing, truth: TruthLog) -> Flown:
-    """What a tap heard, beside the truth."""
+def flown(name: str, tap: InputTap, truth: TruthLog) -> RecordedFlight:
+    """The flight of the recorded inputs, with the truth."""
     poses = truth.drones[1].pose
     stamps = sorted(truth.vehicle.keys() & poses.keys())
     R, xyz = [], []
@@ -86,33 +86,33 @@ def flown(name: str, tap: Hearing, truth: TruthLog) -> Flown:
         R_world_vehicle = rotation_from_quaternion_xyzw(q_vehicle)
         R.append(R_world_vehicle.T @ rotation_from_quaternion_xyzw(q_drone))
         xyz.append(R_world_vehicle.T @ (np.asarray(t_drone) - np.asarray(t_vehicle)))
-    return Flown(name, tap.all(), np.array(stamps), np.array(xyz), np.array(R))
+    return RecordedFlight(name, tap.all(), np.array(stamps), np.array(xyz), np.array(R))
 
 
-class Hearing(Tap):
-    """Keeps what goes to one stage, in the order in which a replay hands it over."""
+class InputTap(Tap):
+    """Keeps the inputs of one stage, in the order of the replay."""
 
     def __init__(self, graph: Graph, consumer: str) -> None:
         super().__init__()
         order = list(input_ports(graph.nodes[consumer].cls))
         edges = [e for e in graph.edges if e.consumer == consumer]
         self._ports = {f"{e.producer}.{e.output}": (order.index(e.port), e.port) for e in edges}
-        self._heard: list[tuple[int, int, int, Event]] = []
+        self._events: list[tuple[int, int, int, Event]] = []
 
     def see(self, output, message, arrival_ns) -> None:
         if output in self._ports:
             index, port = self._ports[output]
-            self._heard.append((arrival_ns, index, len(self._heard), (arrival_ns, port, message)))
+            self._events.append((arrival_ns, index, len(self._events), (arrival_ns, port, message)))
 
     def all(self) -> list[Event]:
-        return [event for *_, event in sorted(self._heard, key=lambda e: e[:3])]
+        return [event for *_, event in sorted(self._events, key=lambda e: e[:3])]
 
 
 # faults
 
 
 def without(ports: tuple[str, ...], from_s: float = -math.inf, until_s: float = math.inf) -> Fault:
-    """What these ports hear between two times of the flight, by its own time, is lost."""
+    """Messages of these ports between two times of the flight, by their stamps, are lost."""
 
     def fault(events: list[Event]) -> list[Event]:
         first = events[0][0]
@@ -122,7 +122,7 @@ def without(ports: tuple[str, ...], from_s: float = -math.inf, until_s: float = 
 
 
 def late(ports: tuple[str, ...], by_s: float) -> Fault:
-    """What these ports hear comes later, in the same order."""
+    """Messages of these ports are delayed, in the same order."""
 
     def fault(events: list[Event]) -> list[Event]:
         moved = [(at + round(by_s * 1e9) if port in ports else at, port, m) for at, port, m in events]
@@ -131,8 +131,8 @@ def late(ports: tuple[str, ...], by_s: float) -> Fault:
     return fault
 
 
-def inflation(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
-    """This share of what these ports hear is false: places by metres, turns by some tens of degrees."""
+def outliers(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
+    """This share of the messages of these ports is false: positions by metres, rotations by tens of degrees."""
 
     def fault(events: list[Event]) -> list[Event]:
         rng = np.random.default_rng(seed)
@@ -144,7 +144,7 @@ def inflation(ports: tuple[str, ...], share: float, seed: int = 1) -> Fault:
 
 
 def falsified(message: Any, rng: np.random.Generator) -> Any:
-    """The same message telling something else."""
+    """The same message with wrong values."""
     changed: dict[str, Any] = {}
     for name in message.__dataclass_fields__:
         value = getattr(message, name)
@@ -159,8 +159,10 @@ def falsified(message: Any, rng: np.random.Generator) -> Any:
     return replace(message, **changed)
 
 
-def with_rotations(flown: Flown, wrong_quarter: int = 0, after_s: float = 2.0, seed: int = 3) -> Flown:
-    """The same flight with rotations told five times a second, RESOLVED, as good as `align`'s in Manhattan."""
+def with_rotations(
+    flown: RecordedFlight, wrong_quarter: int = 0, after_s: float = 2.0, seed: int = 3
+) -> RecordedFlight:
+    """The same flight with RESOLVED rotations five times a second, as accurate as `align`'s in Manhattan."""
     rng = np.random.default_rng(seed)
     first = flown.events[0][0]
     times = np.arange(after_s, (flown.truth_ns[-1] - first) * 1e-9 - 0.1, 0.2)
@@ -172,18 +174,18 @@ def with_rotations(flown: Flown, wrong_quarter: int = 0, after_s: float = 2.0, s
         true = flown.truth(stamp_ns)
         if true is None:
             continue
-        told = rotation(0.0, quarter @ true[0] @ exp_rotation(e), math.radians(0.3))
-        more.append((stamp_ns + 80_000_000, "rotation", replace(told, stamp_ns=stamp_ns)))
+        message = rotation(0.0, quarter @ true[0] @ exp_rotation(e), math.radians(0.3))
+        more.append((stamp_ns + 80_000_000, "rotation", replace(message, stamp_ns=stamp_ns)))
     events = [e for e in flown.events if not isinstance(e[2], RelativeRotation)] + more
     return replace(flown, events=sorted(events, key=lambda e: e[0]))
 
 
-# judging
+# comparison with the truth
 
 
 @dataclass
 class Row(Errors):
-    """What came of a flight, or of several added up."""
+    """Result of a flight, or of several together."""
 
     states: Counter[PoseState] = field(default_factory=Counter)
     longest_gap_s: float = 0.0
@@ -198,8 +200,8 @@ class Row(Errors):
         return 100 * float((nees <= CHI2_95_3).mean()) if len(nees) else math.nan
 
 
-def judge(flown: Flown, poses: list[RelativePose], into: Row | None = None) -> Row:
-    """Poses against the truth; the gap is between two outputs, from the first to the end of what is heard."""
+def judge(flown: RecordedFlight, poses: list[RelativePose], into: Row | None = None) -> Row:
+    """Poses against the truth; the gap is between two outputs, from the first to the end of the inputs."""
     row = into or Row()
     stamps = [p.stamp_ns for p in poses] + [max(e[2].stamp_ns for e in flown.events)]
     row.longest_gap_s = max(row.longest_gap_s, float(np.diff(stamps).max()) * 1e-9)
@@ -218,5 +220,5 @@ def judge(flown: Flown, poses: list[RelativePose], into: Row | None = None) -> R
     return row
 
 
-def fixes_of(flown: Flown) -> list[DroneFix]:
+def fixes_of(flown: RecordedFlight) -> list[DroneFix]:
     return [m for _, _, m in flown.events if isinstance(m, DroneFix)]

@@ -1,4 +1,4 @@
-"""A flight as the fusion hears of it, with errors of known statistics: fixes, rotations, odometries, each with its delay.
+"""Inputs of the fusion in a flight, with errors of known statistics: fixes, rotations, odometries, each with its delay.
 
 Everything is a function of time; every part may be left out, delayed or spoilt. Errors that last are Gauss-Markov.
 """
@@ -50,7 +50,7 @@ def gauss_markov(rng, sigma, time_s, step_s, count, width=3):
 
 @dataclass
 class Made:
-    """How it flies, and how wrong each source is."""
+    """Path of the drone, and errors of each source."""
 
     until_s: float = 12.0
     seed: int = 0
@@ -74,9 +74,9 @@ class Made:
     fix_sigma_m: float = 0.06
     fix_time_s: float = 0.15
     fix_bias_share: float = 0.2
-    bias_m: float = 0.0  # of all fixes of a flight, one sigma an axis, beside that
-    bias_told: bool = True  # whether a fix says so
-    told_variance: float = 1.6  # of a fix, over the true one: trackers are careful
+    bias_m: float = 0.0  # of all fixes of a flight, one sigma per axis, in addition
+    bias_reported: bool = True  # whether a fix reports it
+    reported_variance: float = 1.6  # of a fix, over the true one: trackers are conservative
     rotation_sigma_deg: float = 0.3
     rotation_time_s: float = 1.0
     drift_mps: float = 0.08
@@ -85,8 +85,8 @@ class Made:
     delays_s: dict[str, float] = field(default_factory=dict)  # beyond the usual, by port
     gaps_s: dict[str, tuple[float, float]] = field(default_factory=dict)  # by port
     outliers: dict[str, float] = field(default_factory=dict)  # share, by port
-    quarters: tuple[tuple[float, int], ...] = ()  # from a time on, rotations are so many quarter turns off
-    switches: bool = True  # and say so
+    quarters: tuple[tuple[float, int], ...] = ()  # from a time on, rotations are off by a multiple of 90 deg
+    switches: bool = True  # and report it
     false_north: tuple[float, float] = (math.inf, 0.0)  # the autopilot's frame is turned [deg] from a time on
 
     def R_world_drone(self, t):
@@ -146,14 +146,14 @@ class Made:
         grid = np.arange(0, self.until_s + 0.1, FINE_S)
         drift = gauss_markov(rng, self.drift_mps, 10.0, FINE_S, len(grid))
         drift[:, 2] *= 0.4
-        walk = 0.02 * math.sqrt(FINE_S) * rng.standard_normal((len(grid), 3)) / FINE_S
+        random_walk = 0.02 * math.sqrt(FINE_S) * rng.standard_normal((len(grid), 3)) / FINE_S
         velocity = np.array([self.velocity_mps(t) for t in grid])
         velocity = velocity * [1 + self.drift_scale, 1 + self.drift_scale, 1.0] + drift
         turned = np.cumsum(math.radians(0.05) * math.sqrt(FINE_S) * rng.standard_normal(len(grid)))
         turned += math.radians(1.0) / 60 * grid
         likelihood = gauss_markov(rng, math.radians(0.4), 20.0, FINE_S, len(grid), 2)
         R_yaw = [rotation_z(math.radians(self.local_yaw_deg) + a) for a in turned]
-        way = np.cumsum([R @ (v + w) * FINE_S for R, v, w in zip(R_yaw, velocity, walk, strict=True)], axis=0)
+        way = np.cumsum([R @ (v + w) * FINE_S for R, v, w in zip(R_yaw, velocity, random_walk, strict=True)], axis=0)
         for i in range(0, len(grid) - 10, 3):
             t = float(grid[i])
             R_false = rotation_z(math.radians(self.false_north[1])) if t >= self.false_north[0] else np.eye(3)
@@ -198,7 +198,7 @@ class Made:
                 fix(
                     t,
                     xyz,
-                    math.hypot(math.sqrt(self.told_variance) * self.fix_sigma_m, self.bias_m),
+                    math.hypot(math.sqrt(self.reported_variance) * self.fix_sigma_m, self.bias_m),
                     bias_covariance_m2=self._lasting_m2(),
                     velocity=R_world_vehicle.T @ (self.velocity_mps(t) - [self.vehicle_mps, 0, 0])
                     + rng.normal(0, 0.3, 3),
@@ -208,7 +208,7 @@ class Made:
                 yield t + 0.012, "track", track(t, TrackingState.TRACKING)
 
     def _lasting_m2(self):
-        if self.bias_m == 0 or not self.bias_told:
+        if self.bias_m == 0 or not self.bias_reported:
             return None
         own = self.fix_bias_share * self.fix_sigma_m**2
         return (own + self.bias_m**2) * np.eye(3)
@@ -247,9 +247,9 @@ class Made:
                 ),
             )
 
-    def judge(self, poses: list[RelativePose], after_s: float = 0.0) -> Judged:
-        """Errors of what is told after a time."""
-        out = Judged()
+    def judge(self, poses: list[RelativePose], after_s: float = 0.0) -> PoseErrors:
+        """Errors of the poses after a time."""
+        out = PoseErrors()
         for pose in poses:
             t = (pose.stamp_ns - START_NS) / S
             if t < after_s:
@@ -266,7 +266,7 @@ class Made:
 
 @dataclass
 class Errors:
-    """Of each pose told with a position; the angle and `nees6` of those with a rotation."""
+    """Errors of each pose with a position; the angle and `nees6` of those with a rotation."""
 
     error_m: list[float] = field(default_factory=list)
     angle_deg: list[float] = field(default_factory=list)
@@ -280,7 +280,7 @@ def position_covariance_m2(estimate: PositionEstimate | PoseEstimate) -> np.ndar
 
 
 def add_errors(errors: Errors, pose: RelativePose, R: np.ndarray, xyz_m: np.ndarray) -> None:
-    """What a pose with a position is off, and by its own covariance, whose axes are the drone's where it has any."""
+    """Add the error of a pose with a position, and its NEES; its axes are the drone's where the rotation is known."""
     estimate = pose.estimate
     e = estimate.xyz_vehicle_m - xyz_m
     errors.error_m.append(float(np.linalg.norm(e)))
@@ -295,8 +295,8 @@ def add_errors(errors: Errors, pose: RelativePose, R: np.ndarray, xyz_m: np.ndar
 
 
 @dataclass
-class Judged(Errors):
-    """Of each pose told."""
+class PoseErrors(Errors):
+    """Errors of each pose."""
 
     states: Counter[PoseState] = field(default_factory=Counter)
     at_s: list[float] = field(default_factory=list)
@@ -320,8 +320,6 @@ def fix(t, xyz, sigma=0.06, track_id=1, velocity=None, bias_covariance_m2=None) 
         xyz_vehicle_m=np.asarray(xyz, dtype=float),
         covariance_m2=sigma**2 * np.eye(3),
         hits=4,
-        iterations=1,
-        shift_m=0.0,
         track_id=track_id,
         velocity_vehicle_mps=velocity,
         bias_covariance_m2=bias_covariance_m2,

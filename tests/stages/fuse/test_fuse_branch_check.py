@@ -1,5 +1,5 @@
 """A rotation by both cameras is FULL only when the drone's motion has agreed with it: a branch that is RESOLVED and wrong
-crashes a drone that hovers, too."""
+crashes a hovering drone, too."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def wrong(made, poses):
 
 @pytest.mark.parametrize("stage", [Fuse, EkfFuse])
 @pytest.mark.parametrize("quarter", range(4))
-def test_a_drone_that_hovers_is_never_full_by_the_streets_alone(quarter, stage):
+def test_a_hovering_drone_is_never_full_by_vanishing_points_alone(quarter, stage):
     made = Made(until_s=8, radius_m=0.0, quarters=((0.0, quarter),))
     poses = made.run(stage())
     assert not any(pose.R_vehicle_drone is not None for pose in poses)
     assert poses[-1].state is AMBIGUOUS
     assert "fly some metres" in poses[-1].reason
-    assert made.judge(poses, after_s=2).rmse_m() < 0.15  # its position is given all the same
+    assert made.judge(poses, after_s=2).rmse_m() < 0.15  # its position is published
 
 
 @pytest.mark.parametrize(("autopilot", "images"), [("odometry", False), ("attitude", True), ("none", True)])
@@ -60,23 +60,23 @@ def test_two_seconds_and_a_half_of_flight_make_it_full(autopilot, images):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("quarter", [1, 2, 3])
-def test_without_the_autopilots_way_the_pictures_speak_against_a_wrong_branch(quarter, seed):
+def test_without_autopilot_positions_the_images_reject_a_wrong_branch(quarter, seed):
     made = Made(until_s=9, autopilot="none", images=True, quarters=((0.0, quarter),), seed=seed)
     poses = made.run(Fuse())
     assert wrong(made, poses) == 0
     assert poses[-1].state is AMBIGUOUS
 
 
-@pytest.mark.parametrize("said", [True, False])
-def test_a_branch_that_changes_without_an_autopilot_ends_full(said):
-    made = Made(until_s=9, autopilot="none", images=True, quarters=((5.0, 1),), switches=said)
+@pytest.mark.parametrize("reported", [True, False])
+def test_a_branch_that_changes_without_an_autopilot_ends_full(reported):
+    made = Made(until_s=9, autopilot="none", images=True, quarters=((5.0, 1),), switches=reported)
     poses = made.run(Fuse())
     assert first(poses, FULL) is not None
     assert wrong(made, poses) == 0
     assert poses[-1].state is AMBIGUOUS
 
 
-def test_nobody_who_could_agree_is_no_agreement():
+def test_without_a_second_source_there_is_no_confirmation():
     poses = Made(until_s=6, autopilot="attitude").run(Fuse())
     assert poses[-1].state is AMBIGUOUS
 
@@ -94,8 +94,8 @@ def test_once_full_it_stays_so_through_a_hover():
 
 
 @pytest.mark.parametrize("trust", [0.95, 0.99999])
-def test_align_alone_resolves_nothing_by_a_word_without_motion(trust):
-    """A compass or the crew may make a branch as good as certain; RESOLVED it is not before windows of motion."""
+def test_align_does_not_resolve_by_a_prior_without_motion(trust):
+    """A prior may make a branch nearly certain, but only windows of motion make it RESOLVED."""
     bank = HypothesisBank(BranchSettings())
     bank.expect_yaw(0.0, math.radians(5), trust)
     bank.expect_yaw(0.0, math.radians(5), trust)

@@ -1,4 +1,4 @@
-"""Is the pose as sure as it may be? NEES and coverage over flights whose errors are drawn with known statistics.
+"""Consistency of the covariance: NEES and coverage over flights whose errors are drawn with known statistics.
 
 python -m pytest tests/stages/fuse/test_fuse_consistency.py -m slow -s     many flights, and memory over an hour
 """
@@ -20,7 +20,7 @@ CHI2_95 = {3: 7.815, 6: 12.592}
 
 
 def flights(count, **how):
-    """Flights of all kinds, by turns."""
+    """Flights of all kinds, in turn."""
     kinds = (
         {"speed_mps": 3.0, "radius_m": 12.0},
         {"speed_mps": 5.0, "radius_m": 20.0, "vehicle_mps": 4.0, "vehicle_dps": 8.0},
@@ -43,7 +43,7 @@ def pooled(stage, made):
     return np.array(nees3), np.array(nees6), np.array(error), np.array(angle)
 
 
-def told(name, nees3, nees6, error, angle):
+def report(name, nees3, nees6, error, angle):
     inside = [100 * float((n < CHI2_95[d]).mean()) for n, d in ((nees3, 3), (nees6, 6))]
     print(  # noqa: T201
         f"\n{name}: RMSE {rms(error):.3f} m, {rms(angle):.2f} deg, max {angle.max():.1f} deg; NEES {nees3.mean():.2f} of 3, "
@@ -53,7 +53,7 @@ def told(name, nees3, nees6, error, angle):
 
 
 @pytest.mark.parametrize("stage", [Fuse, EkfFuse])
-def test_the_covariance_holds_what_it_promises(stage):
+def test_the_covariance_is_consistent(stage):
     nees3, nees6, error, angle = pooled(stage, flights(4, until_s=8))
     assert nees3.mean() < 4
     assert nees6.mean() < 8
@@ -62,8 +62,8 @@ def test_the_covariance_holds_what_it_promises(stage):
     assert angle.max() < 5
 
 
-def test_taking_lasting_errors_for_fleeting_ones_promises_too_much():
-    """Why they are inflated: without, vanishing points 1 deg wrong for 1 s break the promise."""
+def test_without_inflation_correlated_errors_make_the_covariance_overconfident():
+    """Vanishing points with an error of 1 deg for 1 s."""
     made = flights(4, until_s=8, rotation_sigma_deg=1.0, rotation_time_s=1.0)
     naive = FuseErrors(rotation_time_s=0.0, rotation_bias_share=0.0, fix_time_s=0.0, fix_bias_share=0.0)
     _, honest, _, _ = pooled(Fuse, made)
@@ -73,18 +73,18 @@ def test_taking_lasting_errors_for_fleeting_ones_promises_too_much():
 
 
 @pytest.mark.parametrize("how", [{}, {"rotations": False, "autopilot": "none"}])
-def test_an_error_that_all_fixes_share_does_not_average_out_where_they_say_so(how):
-    """Told, the bias is in the covariance; not told, a fourth of the variance is taken to last, and that is too little."""
+def test_a_reported_bias_of_the_fixes_does_not_average_out(how):
+    """A reported bias is in the covariance; otherwise a fourth of the variance is assumed, which is too little."""
     mean = {}
-    for told in (True, False):
-        made = flights(8, until_s=7, bias_m=0.12, bias_told=told, **how)
+    for reported in (True, False):
+        made = flights(8, until_s=7, bias_m=0.12, bias_reported=reported, **how)
         nees = [flight.judge(flight.run(Fuse()), after_s=3).nees3 for flight in made]
-        mean[told] = np.mean([n for one in nees for n in one])
+        mean[reported] = np.mean([n for one in nees for n in one])
     assert 1.5 < mean[True] < 4.5
     assert mean[False] > 1.4 * mean[True]
 
 
-def test_a_heading_by_motion_is_never_another_quarter():
+def test_a_heading_by_motion_is_never_on_a_wrong_branch():
     made = [
         Made(seed=seed, rotations=False, until_s=8, radius_m=radius, speed_mps=speed, local_yaw_deg=37.0 * seed)
         for seed, (radius, speed) in enumerate([(5, 1), (5, 2), (12, 3), (25, 5), (0, 0), (3, 0.6)])
@@ -98,7 +98,7 @@ def test_a_heading_by_motion_is_never_another_quarter():
 @pytest.mark.parametrize("stage", [Fuse, EkfFuse])
 @pytest.mark.parametrize("rotations", [True, False])
 def test_over_many_flights_coverage_is_near_95_percent(stage, rotations):
-    inside = told(f"{stage.__name__}, rotations {rotations}", *pooled(stage, flights(32, rotations=rotations)))
+    inside = report(f"{stage.__name__}, rotations {rotations}", *pooled(stage, flights(32, rotations=rotations)))
     assert 92 < inside[0] <= 99.5
     assert 92 < inside[1] <= 99.9
 
@@ -125,7 +125,7 @@ def test_three_seconds_without_lidar_over_many_flights():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.05, 0.2])
-def test_wrong_quarters_are_never_full_over_many_flights(share):
+def test_wrong_branches_are_never_full_over_many_flights(share):
     """Streets that are RESOLVED and wrong from the start, or from some time on."""
     wrong = full = 0
     for seed in range(40):
@@ -139,7 +139,7 @@ def test_wrong_quarters_are_never_full_over_many_flights(share):
 
 
 @pytest.mark.slow
-def test_memory_stays_flat_over_an_hour():
+def test_memory_is_constant_over_an_hour():
     stage, made = Fuse(), Made(until_s=20.0, speed_mps=3.0, radius_m=12.0)
     events = made.events()
     peaks_mb = []

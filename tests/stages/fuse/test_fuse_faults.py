@@ -1,8 +1,8 @@
-"""Every input of the fusion gone, late or false, over simulated flights: what happens, as a table.
+"""Every input of the fusion missing, late or false, over simulated flights, as a table of results.
 
     pytest -m slow tests/stages/fuse/test_fuse_faults.py -s
 
-The flights are made first, in closed loop; without images, so rotations are made from the truth, as `align` tells
+The flights are made first, in closed loop; without images, so rotations are made from the truth, as `align` publishes
 them. GRD_FLIGHTS='some/*.mcap' takes recordings with images instead, replayed through configs/vision.yaml.
 """
 
@@ -25,14 +25,14 @@ from links.simulated.rig.run import Simulation
 from stages.messages import PoseState
 from tests.stages.fuse.flown import (
     Fault,
-    Flown,
-    Hearing,
+    InputTap,
+    RecordedFlight,
     Row,
     flown,
-    heard,
-    inflation,
     judge,
     late,
+    outliers,
+    recorded_inputs,
     with_rotations,
     without,
 )
@@ -57,26 +57,26 @@ FAULTS: dict[str, Callable[[tuple[str, ...]], Fault]] = {
     "gone for 3 s": lambda ports: without(ports, AT_S, AT_S + FOR_S),
     "gone": without,
     "300 ms late": lambda ports: late(ports, 0.3),
-    "20 % false": lambda ports: inflation(ports, 0.2),
+    "20 % false": lambda ports: outliers(ports, 0.2),
 }
 WITH_ROTATION = (PoseState.FULL, PoseState.COASTING)
 
 
-def made(cell: Cell, seed: int = 1) -> Flown:
-    """A flight of the matrix, flown for this test."""
+def made(cell: Cell, seed: int = 1) -> RecordedFlight:
+    """A flight of the matrix, simulated for this test."""
     scenario = scenario_of(cell, seed, Conditions(calibrated=True, odometry=True, autopilot=True))
     graph = RunRequest(CONFIGS / "estimate.yaml", sets=("viewer.file=null",)).graph(scenario.rig_yaml(), cell.name)
-    tap, truth = Hearing(graph, "fuse"), TruthLog()
+    tap, truth = InputTap(graph, "fuse"), TruthLog()
     truth.add_all(Simulation(scenario, loop=ClosedLoop(graph, scenario.closed_loop, {}, (tap,))).records())
     return with_rotations(flown(cell.name, tap, truth))
 
 
-def flights() -> list[Flown]:
+def flights() -> list[RecordedFlight]:
     recordings = sorted(glob.glob(os.environ.get("GRD_FLIGHTS", "")))
-    return [heard(Path(r), CONFIGS / "vision.yaml") for r in recordings] or [made(cell) for cell in CELLS]
+    return [recorded_inputs(Path(r), CONFIGS / "vision.yaml") for r in recordings] or [made(cell) for cell in CELLS]
 
 
-def rows(flights: list[Flown]) -> Iterator[tuple[str, str, Row]]:
+def rows(flights: list[RecordedFlight]) -> Iterator[tuple[str, str, Row]]:
     """Each input with each fault, all flights together."""
     faults = [("nothing", "wrong", None)]
     faults += [(name, what, fault(ports)) for name, ports in INPUTS.items() for what, fault in FAULTS.items()]
@@ -89,8 +89,8 @@ def rows(flights: list[Flown]) -> Iterator[tuple[str, str, Row]]:
 
 def line(row: Row) -> str:
     """A row of the table: of all positions, and of those with a rotation."""
-    told = sum(row.states.values())
-    shares = " ".join(f"{100 * row.states[state] / told:3.0f}" for state in reversed(PoseState))
+    total = sum(row.states.values())
+    shares = " ".join(f"{100 * row.states[state] / total:3.0f}" for state in reversed(PoseState))
     error_m = np.array(row.error_m)
     turned = np.array([state in WITH_ROTATION for state in row.state_of], dtype=bool)
     parts = []
@@ -102,7 +102,7 @@ def line(row: Row) -> str:
 
 
 @pytest.mark.slow
-def test_no_fault_of_an_input_makes_a_gap_or_a_wrong_quarter() -> None:
+def test_no_fault_of_an_input_causes_a_gap_or_a_wrong_branch() -> None:
     flown_ = flights()
     print(f"\n{len(flown_)} flights: {', '.join(f.name for f in flown_)}")  # noqa: T201
     print(  # noqa: T201
@@ -119,7 +119,7 @@ def test_no_fault_of_an_input_makes_a_gap_or_a_wrong_quarter() -> None:
         assert row.wrong_quarter_full == 0, fault
         assert row.longest_gap_s < 0.2, fault
         assert not row.nees3 or row.inside() > 85, fault
-    for what in FAULTS:  # what is not the LiDAR's costs no positions
+    for what in FAULTS:  # other inputs than the LiDAR cost no positions
         for name in list(INPUTS)[1:]:
             lost = found[name, what].states[PoseState.LOST]
             assert lost <= 1.3 * whole.states[PoseState.LOST] + 50, (name, what)

@@ -1,4 +1,4 @@
-"""The parts of the fusion by hand: correlated errors, drift, steps, refusals, whose word on the heading counts."""
+"""The parts of the fusion by hand: correlated errors, drift, steps, rejections, sources of the heading."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ ERRORS = FuseErrors()
 QUARTER = math.pi / 2
 
 
-# errors that last
+# correlated errors
 
 
-def test_a_measurement_within_the_time_of_its_error_is_worth_little():
+def test_a_measurement_within_the_correlation_time_has_little_information():
     assert inflation(None, 1.0) == 1.0
     assert inflation(0.1, 0.0) == 1.0
     assert inflation(0.1, 1.0) == pytest.approx(20.0, rel=0.01)  # 2 tau / dt
@@ -41,26 +41,26 @@ def test_a_measurement_within_the_time_of_its_error_is_worth_little():
     assert inflation(0.0, 1.0) == MOST
 
 
-def test_the_mean_of_inflated_measurements_is_as_good_as_it_says():
-    """Of errors that last 1 s, met each 0.1 s for 20 s: the mean's variance is R factor / n."""
+def test_the_mean_of_inflated_measurements_is_consistent():
+    """Errors with a time constant of 1 s, sampled every 0.1 s for 20 s: the mean's variance is R factor / n."""
     rng = np.random.default_rng(2)
     means = [gauss_markov(rng, 1.0, 1.0, 0.1, 200, 1).mean() for _ in range(400)]
     assert np.var(means) == pytest.approx(inflation(0.1, 1.0) / 200, rel=0.2)
 
 
 def test_each_measurement_is_counted_from_the_one_before():
-    worth = InformationInflation(1.0)
-    assert worth.factor(0) == 1.0
-    assert worth.factor(S // 10) == pytest.approx(20.0, rel=0.01)
-    assert worth.factor(20 * S) == pytest.approx(1.0)
-    assert worth.factor(20 * S - S // 10) == pytest.approx(20.0, rel=0.01)  # a late one
+    information = InformationInflation(1.0)
+    assert information.factor(0) == 1.0
+    assert information.factor(S // 10) == pytest.approx(20.0, rel=0.01)
+    assert information.factor(20 * S) == pytest.approx(1.0)
+    assert information.factor(20 * S - S // 10) == pytest.approx(20.0, rel=0.01)  # a late one
 
 
 # drift
 
 
 def drifting(odometry, velocity, until=60, moved=0.2, seed=0):
-    """Fixes each 0.1 s of a drone that goes `moved` a step by its odometry, and `velocity` m/s in truth besides."""
+    """Fixes each 0.1 s of a drone that moves by `moved` per step of its odometry, plus `velocity` m/s."""
     rng = np.random.default_rng([seed, 3])
     drift = Drift(ERRORS, odometry)
     way = np.array([moved, 0.0, 0.0])
@@ -72,13 +72,13 @@ def drifting(odometry, velocity, until=60, moved=0.2, seed=0):
     return drift
 
 
-def test_what_odometry_leaves_over_is_found():
+def test_the_drift_of_odometry_is_estimated():
     drift = drifting(True, [0.1, -0.15, 0.0])
     assert np.allclose(drift.velocity_mps, [0.1, -0.15, 0.0], atol=0.06)
     assert math.sqrt(drift.velocity_covariance[0, 0]) < 0.06
 
 
-def test_without_odometry_it_is_the_whole_velocity():
+def test_without_odometry_the_whole_velocity_is_estimated():
     drift = drifting(False, [0.0, 1.5, 0.0])
     sigma = np.sqrt(np.diag(drift.velocity_covariance))
     assert (np.abs(drift.velocity_mps - [2.0, 1.5, 0.0]) < 3 * sigma).all()
@@ -87,7 +87,7 @@ def test_without_odometry_it_is_the_whole_velocity():
     assert P[0, 0] > 0
 
 
-def test_a_gap_costs_by_its_square_and_cube():
+def test_the_variance_of_a_gap_grows_with_its_square_and_cube():
     drift = drifting(True, [0, 0, 0])
     V = [drift.growth_covariance_m2(t)[0, 0] for t in (0.0, 1.0, 2.0)]
     P_b = drift.velocity_covariance[0, 0]
@@ -96,14 +96,14 @@ def test_a_gap_costs_by_its_square_and_cube():
     assert V[2] == pytest.approx(4 * P_b + 8 * drift.q / 3)
 
 
-def test_a_fix_that_is_older_than_the_newest_is_left_to_others():
+def test_a_fix_older_than_the_newest_is_ignored():
     drift = drifting(True, [0, 0, 0])
     x = drift.xyz_map_m.copy()
     drift.see(S, np.array([99.0, 0, 0]), np.eye(3), np.zeros(3), 0.0)
     assert np.array_equal(drift.xyz_map_m, x)
 
 
-def test_a_direction_of_flight_turns_the_velocity_and_leaves_its_length_alone():
+def test_a_direction_of_flight_turns_the_velocity_and_keeps_its_length():
     drift = drifting(False, [0.0, 0.0, 0.0], until=5)
     before = drift.velocity_mps.copy()
     along = rotation_z(0.3) @ before / np.linalg.norm(before)
@@ -114,7 +114,7 @@ def test_a_direction_of_flight_turns_the_velocity_and_leaves_its_length_alone():
 
 
 def flown_askew(yaw_rad, until=12, mps=11.0):
-    """The same fixes of a fast drone, its ways turned too far by an angle; first with it, then without."""
+    """The same fixes of a fast drone, its displacements turned too far by an angle; first with the error, then without."""
     rng = np.random.default_rng(5)
     drift = Drift(ERRORS, odometry=True)
     drift.start(0, np.zeros(3), 0.05**2 * np.eye(3), None)
@@ -125,8 +125,8 @@ def flown_askew(yaw_rad, until=12, mps=11.0):
 
 
 @pytest.mark.parametrize("parts_rad", [(0.04,), (0.5,), (math.pi / 2,), (0.3, -1.0, 0.4)])
-def test_what_a_wrong_yaw_was_taken_for_is_no_drift_once_it_is_known(parts_rad):
-    """However wrong it was, and however often it is made good."""
+def test_a_corrected_yaw_error_does_not_stay_as_drift(parts_rad):
+    """For any error, corrected in any number of steps."""
     right, askew = flown_askew(0.0), flown_askew(sum(parts_rad))
     assert np.linalg.norm(askew.velocity_mps - right.velocity_mps) > 0.3
     for part_rad in parts_rad:
@@ -135,11 +135,11 @@ def test_what_a_wrong_yaw_was_taken_for_is_no_drift_once_it_is_known(parts_rad):
     assert np.allclose(askew.xyz_map_m, right.xyz_map_m, atol=1e-9)
     free = drifting(False, [0.0, 0.0, 0.0])
     before = free.velocity_mps.copy()
-    free.correct_yaw(0.1)  # whose ways nobody tells
+    free.correct_yaw(0.1)  # without odometry
     assert np.array_equal(free.velocity_mps, before)
 
 
-def test_another_start_frame_takes_position_and_velocity_along():
+def test_a_new_map_frame_transforms_position_and_velocity():
     drift = drifting(False, [0, 0, 0])
     x, v = drift.xyz_map_m.copy(), drift.velocity_mps.copy()
     drift.turn(rotation_z(1.0), np.array([1.0, 2.0, 3.0]))
@@ -150,7 +150,7 @@ def test_another_start_frame_takes_position_and_velocity_along():
 # steps
 
 
-def told(until_s=2.0, v=(1.0, 0.5, 0.0), rate=0.4, silent_after=math.inf):
+def model_of(until_s=2.0, v=(1.0, 0.5, 0.0), rate=0.4, silent_after=math.inf):
     motion_model = MotionModel(ERRORS)
     for t in np.arange(0, until_s, 0.05):
         if t < silent_after:
@@ -160,8 +160,8 @@ def told(until_s=2.0, v=(1.0, 0.5, 0.0), rate=0.4, silent_after=math.inf):
     return motion_model
 
 
-def test_a_step_is_the_way_told_and_the_drift_in_the_drones_axes():
-    motion_model, left, free = told(), Drift(ERRORS, True), Drift(ERRORS, False)
+def test_a_step_is_the_displacement_by_odometry_and_the_drift_in_drone_axes():
+    motion_model, left, free = model_of(), Drift(ERRORS, True), Drift(ERRORS, False)
     left.start(0, np.zeros(3), np.eye(3), None)
     R_map_odom = rotation_z(-1.1)
     R0 = R_map_odom @ rotation_z(0.3 + 0.4 * 0.5)
@@ -176,21 +176,21 @@ def test_a_step_is_the_way_told_and_the_drift_in_the_drones_axes():
     assert np.allclose(step.t_m + step.R @ back.t_m, 0, atol=1e-9)
 
 
-def test_without_a_frame_that_stands_still_the_way_over_ground_is_not_used():
+def test_with_a_moving_map_frame_the_displacement_over_ground_is_not_used():
     left, free = Drift(ERRORS, True), Drift(ERRORS, False)
     left.start(0, np.zeros(3), np.eye(3), None)
     free.start(0, np.zeros(3), np.eye(3), np.array([0.0, 0.0, 2.0]))
-    step = told().step(S // 2, S, np.eye(3), left, free, False, S // 2)
+    step = model_of().step(S // 2, S, np.eye(3), left, free, False, S // 2)
     assert not step.by_odometry
     assert np.allclose(step.t_m, [0, 0, 1.0])
     assert step.covariance[2, 2] > math.radians(9) ** 2
 
 
-def test_beyond_its_newest_word_an_odometry_is_believed_less_and_less():
+def test_the_covariance_grows_beyond_the_newest_odometry():
     left, free = Drift(ERRORS, True), Drift(ERRORS, False)
     left.start(0, np.zeros(3), np.eye(3), None)
     free.start(0, np.zeros(3), np.eye(3), None)
-    motion_model = told(silent_after=1.0)
+    motion_model = model_of(silent_after=1.0)
     spread = [
         np.trace(motion_model.step(9 * S // 10, round(t * S), np.eye(3), left, free, True, S).covariance)
         for t in (1.0, 1.2, 1.4, 1.8)
@@ -200,8 +200,8 @@ def test_beyond_its_newest_word_an_odometry_is_believed_less_and_less():
 
 
 @pytest.mark.parametrize("back", [Smoother, lambda lag_s: Ekf()])
-def test_a_yaw_made_good_by_fixes_is_not_taken_for_drift_too(back):
-    """At 11 m/s with the yaw 4 deg off, three fixes, 1.5 s none, three: they tell the yaw, hardly a drift."""
+def test_a_yaw_error_corrected_by_fixes_does_not_count_as_drift(back):
+    """At 11 m/s with the yaw 4 deg off, three fixes, 1.5 s none, three: they determine the yaw, hardly the drift."""
     estimator, yaw_rad = Estimator(back(3.0), ERRORS, FuseLimits(), parked=True), math.radians(4.0)
     rng = np.random.default_rng(2)
     for i in range(21):
@@ -220,47 +220,47 @@ def test_a_yaw_made_good_by_fixes_is_not_taken_for_drift_too(back):
     assert np.linalg.norm(estimator.positions.left.velocity_mps) < 0.15
 
 
-# refusals
+# rejections
 
 
-def refuse(offs, sigma=0.1):
-    refused = Rejected()
-    return [refused.add(i * S // 10, np.asarray(off, dtype=float), sigma**2 * np.eye(3)) for i, off in enumerate(offs)]
+def reject(offs, sigma=0.1):
+    rejected = Rejected()
+    return [rejected.add(i * S // 10, np.asarray(off, dtype=float), sigma**2 * np.eye(3)) for i, off in enumerate(offs)]
 
 
-def test_refusals_that_agree_are_believed_in_the_end():
-    assert refuse([[5.0, 1.0, 0.0]] * ENOUGH) == [False] * (ENOUGH - 1) + [True]
-    assert refuse([[0.2 * i, 1.0, 0.0] for i in range(ENOUGH)])[-1]  # on a line
+def test_consistent_rejections_reset_the_estimate():
+    assert reject([[5.0, 1.0, 0.0]] * ENOUGH) == [False] * (ENOUGH - 1) + [True]
+    assert reject([[0.2 * i, 1.0, 0.0] for i in range(ENOUGH)])[-1]  # on a line
 
 
-def test_refusals_that_scatter_are_not():
+def test_scattered_rejections_do_not():
     rng = np.random.default_rng(0)
-    assert not any(refuse(rng.normal(0, 3.0, (40, 3))))
+    assert not any(reject(rng.normal(0, 3.0, (40, 3))))
 
 
-def test_one_that_comes_again_and_again_agrees_with_nobody():
-    refused = Rejected()
-    assert not any(refused.add(S, np.ones(3), 0.01 * np.eye(3)) for _ in range(3 * ENOUGH))
-    assert not any(refused.add(i * S // 10, np.ones(3), 0.01 * np.eye(3)) for i in range(11, 9 + ENOUGH))
-    assert refused.add(2 * S, np.ones(3), 0.01 * np.eye(3))
+def test_a_repeated_measurement_counts_once():
+    rejected = Rejected()
+    assert not any(rejected.add(S, np.ones(3), 0.01 * np.eye(3)) for _ in range(3 * ENOUGH))
+    assert not any(rejected.add(i * S // 10, np.ones(3), 0.01 * np.eye(3)) for i in range(11, 9 + ENOUGH))
+    assert rejected.add(2 * S, np.ones(3), 0.01 * np.eye(3))
 
 
-def test_one_that_is_accepted_begins_the_count_anew():
-    refused = Rejected()
+def test_an_accepted_measurement_resets_the_count():
+    rejected = Rejected()
     for i in range(ENOUGH - 1):
-        refused.add(i * S // 10, np.ones(3), np.eye(3))
-    refused.clear()
-    assert not refused.add(S, np.ones(3), np.eye(3))
+        rejected.add(i * S // 10, np.ones(3), np.eye(3))
+    rejected.clear()
+    assert not rejected.add(S, np.ones(3), np.eye(3))
 
 
-# whose word on the heading
+# sources of the heading
 
 
 def by_motion(at_s, yaw, sigma_deg=2.0):
     return Yaw(round(at_s * S), yaw, math.radians(sigma_deg) ** 2)
 
 
-def test_two_that_contradict_are_not_believed_until_they_agree():
+def test_contradicting_sources_are_not_used_until_they_agree():
     heading = Heading()
     assert heading.add_vp_rotation(S, 0, 0.3, 0.01)
     heading.add_motion_yaw(by_motion(1.2, 0.3 + QUARTER))
@@ -271,7 +271,7 @@ def test_two_that_contradict_are_not_believed_until_they_agree():
     assert heading.contradiction == ""
 
 
-def test_a_contradiction_outlives_the_motions_silence_but_not_the_streets():
+def test_a_contradiction_lasts_without_motion_but_not_without_vanishing_points():
     heading = Heading()
     heading.add_motion_yaw(by_motion(1.0, 0.3 + QUARTER))
     assert not heading.add_vp_rotation(S, 0, 0.3, 0.01)
@@ -290,7 +290,7 @@ def test_small_differences_are_no_contradiction():
     assert heading.add_vp_rotation(S, 0, 0.3, 0.01)
 
 
-def test_another_branch_is_believed_after_two_seconds_or_with_a_witness():
+def test_another_branch_is_accepted_after_two_seconds_or_with_confirmation():
     heading = Heading()
     assert heading.add_vp_rotation(S, 0, 0.3, 0.01)
     assert not heading.add_vp_rotation(2 * S, 1, 0.3 + QUARTER, 0.01)
@@ -298,20 +298,20 @@ def test_another_branch_is_believed_after_two_seconds_or_with_a_witness():
     assert heading.add_vp_rotation(4 * S, 1, 0.3 + QUARTER, 0.01)
     heading.add_motion_yaw(by_motion(4.5, 0.3))
     assert heading.contradiction
-    witnessed = Heading()
-    witnessed.add_vp_rotation(S, 0, 0.3, 0.01)
-    witnessed.add_motion_yaw(by_motion(3.5, 0.3 + QUARTER))  # the streets spoke long before
-    assert witnessed.add_vp_rotation(4 * S, 1, 0.3 + QUARTER, 0.01)
+    confirmed = Heading()
+    confirmed.add_vp_rotation(S, 0, 0.3, 0.01)
+    confirmed.add_motion_yaw(by_motion(3.5, 0.3 + QUARTER))  # the rotation by vanishing points is old
+    assert confirmed.add_vp_rotation(4 * S, 1, 0.3 + QUARTER, 0.01)
 
 
-def test_a_remembered_yaw_is_worth_less_with_time():
+def test_the_sigma_of_a_remembered_yaw_grows():
     own = Yaw(0, 1.0, math.radians(1) ** 2)
     assert own.sigma_at(0) == pytest.approx(math.radians(1))
     assert own.sigma_at(60 * S) > 60 * DRIFT_RAD_PER_S
 
 
 def flown(odometry_yaw, at_s, yaw):
-    """Twelve fixes beside a drone's own positions, six metres along: whether motion denies what was believed."""
+    """Twelve fixes with autopilot positions over six metres; returns whether motion contradicts the yaw."""
     way = np.outer(np.arange(12) * 0.5, [1.0, 0.3, 0.0])
     points = [
         Point(round((at_s + 0.5 * k) * S), rotation_z(yaw) @ own, 0.05**2, own, 0) for k, own in enumerate(way * 2.0)
@@ -320,8 +320,8 @@ def flown(odometry_yaw, at_s, yaw):
 
 
 @pytest.mark.parametrize("age_s", [20.0, 600.0])
-def test_a_yaw_too_old_to_be_of_use_gives_way_to_what_motion_tells(age_s):
-    """After minutes without the drone nobody would deny it, and nobody could use it."""
+def test_a_yaw_too_old_to_be_used_is_replaced_by_that_of_motion(age_s):
+    """After minutes without the drone it is neither contradicted nor usable."""
     odometry_yaw = OdometryYaw(ERRORS, math.radians(8.0))
     odometry_yaw.yaw = Yaw(0, 0.5, math.radians(3.0) ** 2)
     assert all(flown(odometry_yaw, age_s, 0.55))
@@ -330,7 +330,7 @@ def test_a_yaw_too_old_to_be_of_use_gives_way_to_what_motion_tells(age_s):
     assert own.yaw_rad == pytest.approx(0.55 if age_s > 60 else 0.5, abs=0.01)
 
 
-def test_a_yaw_that_is_of_use_is_denied_by_motion():
+def test_a_usable_yaw_is_contradicted_by_motion():
     odometry_yaw = OdometryYaw(ERRORS, math.radians(8.0))
     odometry_yaw.yaw = Yaw(0, 0.5, math.radians(2.0) ** 2)
     assert False in flown(odometry_yaw, 5.0, 0.5 + QUARTER)
@@ -346,7 +346,7 @@ def attitude(t_s, yaw=0.0):
     ("silent_s", "turned_rad", "sigma_rad"),
     [(0.1, 0.0, 0.01), (2.0, 0.0, 0.02), (2.0, 0.3, 0.3), (2.0, QUARTER, None), (4.0, 0.0, None)],
 )
-def test_a_silence_of_the_autopilots_costs_and_a_long_one_costs_all(silent_s, turned_rad, sigma_rad):
+def test_a_telemetry_gap_inflates_the_yaw_and_a_long_one_drops_it(silent_s, turned_rad, sigma_rad):
     odometry_yaw, trail = OdometryYaw(ERRORS, 0.14), AutopilotTrajectory()
     for t in (0.0, 0.02, 0.04):
         odometry_yaw.add(trail, attitude(t))
@@ -358,7 +358,7 @@ def test_a_silence_of_the_autopilots_costs_and_a_long_one_costs_all(silent_s, tu
         assert odometry_yaw.yaw.sigma_at(0) == pytest.approx(sigma_rad, rel=0.05)
 
 
-# which drone
+# track continuity
 
 
 def test_without_track_states_the_first_drone_is_kept_until_it_is_silent():
@@ -383,7 +383,7 @@ def searching(at_s):
     )
 
 
-def test_a_tracker_that_starts_afresh_and_says_that_it_searches_follows_nothing_any_more():
+def test_a_restarted_tracker_that_searches_ends_the_track():
     following = TrackContinuity(None)
     following.add(track(0.0, TrackingState.TRACKING, 3))
     assert following.accepts(3, ns(0.0))
@@ -394,8 +394,8 @@ def test_a_tracker_that_starts_afresh_and_says_that_it_searches_follows_nothing_
 
 
 @pytest.mark.parametrize("pause_s", [0.0, 5.0])
-def test_a_track_of_which_nothing_is_said_while_the_tracker_speaks_is_gone(pause_s):
-    """A pause of the tracker's, as when the LiDAR is cut, says nothing of any track."""
+def test_a_track_that_is_no_longer_reported_has_ended(pause_s):
+    """A pause of all reports, as without LiDAR data, ends no track."""
     following = TrackContinuity(None)
     for number in (3, 4):
         following.add(track(0.0, TrackingState.TRACKING, number))
@@ -408,15 +408,15 @@ def test_a_track_of_which_nothing_is_said_while_the_tracker_speaks_is_gone(pause
     assert following.accepts(4, ns(pause_s + 2.5))
 
 
-def test_a_drone_that_tells_its_velocity_cannot_have_turned_unheard():
-    """Half a second after the last fix: q dt^3 / 3 of what nobody tells, beside the same velocity."""
+def test_a_reported_velocity_bounds_an_unmeasured_maneuver():
+    """Half a second after the last fix: q dt^3 / 3 without telemetry, less with a constant velocity."""
     sigmas, told_m2 = [], MeasurementCovariance(0.05**2 * np.eye(3), None)
-    for told in (False, True):
+    for reported in (False, True):
         motions = Motions(FuseErrors(), parked=True)
         positions = Positions(FuseErrors(), motions)
         for i in range(30):
             t = 0.1 * i
-            if told:
+            if reported:
                 motions.motion_model.autopilot.add(
                     DroneLocalPosition(
                         stamp_ns=ns(t), xyz_odom_m=np.array([2 * t, 0, 9]), velocity_odom_mps=np.array([2.0, 0, 0])

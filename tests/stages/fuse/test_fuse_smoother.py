@@ -1,4 +1,4 @@
-"""The two back ends: against each other, with late data, and through every error that GTSAM raises."""
+"""The two back ends: against each other, with late data, and after every error that GTSAM raises."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_chain_of_steps_is_their_product_and_its_covariance_theirs(make):
     assert np.allclose(back.covariance, P, rtol=0.02, atol=1e-7)
 
 
-def test_smoother_and_filter_agree_while_all_is_well():
+def test_smoother_and_filter_agree_on_valid_data():
     rng = np.random.default_rng(3)
     confirms = [Smoother(3.0), Ekf()]
     for back in confirms:
@@ -74,7 +74,7 @@ def test_smoother_and_filter_agree_while_all_is_well():
 
 @pytest.mark.parametrize("make", [lambda: Smoother(3.0), Ekf])
 def test_a_late_fix_moves_the_pose_at_its_own_time(make):
-    """Told where the drone was 0.5 s ago, with an offset: the pose now moves by the offset, not by the way flown."""
+    """A fix of 0.5 s ago with an offset: the newest pose moves by the offset, not by the displacement since."""
     back = started(make())
     before = back.xyz_map_m.copy()
     key_ns, R, x = back.near(15 * TENTH)
@@ -91,7 +91,7 @@ def test_a_late_fix_moves_the_pose_at_its_own_time(make):
     assert moved @ offset > 0.5 * offset @ offset
 
 
-def test_a_measurement_between_two_poses_hangs_on_the_one_before_it():
+def test_a_measurement_between_two_poses_is_referred_to_the_earlier_one():
     back = started(Smoother(3.0))
     assert back.near(15 * TENTH + 40_000_000)[0] == 15 * TENTH
     assert back.near(-5)[0] == 0
@@ -100,7 +100,7 @@ def test_a_measurement_between_two_poses_hangs_on_the_one_before_it():
 
 @pytest.mark.parametrize("make", [lambda: Smoother(3.0), Ekf])
 def test_a_rotations_covariance_is_in_the_drones_axes_then(make):
-    """The drone has turned by 90 deg since the chain's pose: what was sure about its x is so about the pose's y."""
+    """The drone has turned by 90 deg since the chain's pose: the small variance about its x is about the y of the pose."""
     back = make()
     back.start(0, np.eye(3), np.zeros(3), P0)
     turned = Step(rotation_z(np.pi / 2), np.zeros(3), np.zeros((6, 6)), True, True)
@@ -110,8 +110,8 @@ def test_a_rotations_covariance_is_in_the_drones_axes_then(make):
     assert sigma[0] == pytest.approx(0.02, rel=0.01)
 
 
-def test_a_false_fix_is_weighed_down():
-    """Huber: ten sigmas off pull like 1.345."""
+def test_a_false_fix_has_a_reduced_weight():
+    """Huber: a residual of ten sigmas acts like 1.345."""
     pulled = []
     for off in (0.5, 5.0):
         back = started(Ekf())
@@ -121,7 +121,7 @@ def test_a_false_fix_is_weighed_down():
     assert pulled[1] < 2.0 * pulled[0]
 
 
-def test_a_pose_that_has_left_the_window_takes_nothing_more():
+def test_a_pose_outside_the_window_accepts_no_measurement():
     back = started(Smoother(3.0), steps=60)
     assert not back.add_position(2 * TENTH, STAYS, np.zeros(3), np.eye(3))
     assert back.recoveries == 0
@@ -129,7 +129,7 @@ def test_a_pose_that_has_left_the_window_takes_nothing_more():
 
 @pytest.mark.parametrize("start_ns", [1_748_859_641_434_316_687, 1_748_859_641_434_316_801, 0, 97])
 def test_every_pose_of_the_window_can_be_read_also_the_oldest(start_ns):
-    """Stamps are 1.7e18 ns: as floats they are 256 ns apart, and a tenth of a second thirty times over is no 3 s."""
+    """Stamps are 1.7e18 ns: as floats they have a resolution of 256 ns, and 30 times 0.1 s is not exactly 3 s."""
     back = Smoother(3.0)
     back.start(start_ns, np.eye(3), np.zeros(3), P0)
     for k in range(1, 120):
@@ -150,7 +150,7 @@ def test_every_pose_of_the_window_can_be_read_also_the_oldest(start_ns):
         (np.zeros(3), -np.eye(3)),
     ],
 )
-def test_numbers_without_sense_are_not_handed_on(xyz, covariance):
+def test_invalid_numbers_are_rejected(xyz, covariance):
     back = started(Smoother(3.0))
     assert not back.add_position(back.stamp_ns, STAYS, xyz, covariance)
     assert back.recoveries == 0
@@ -198,7 +198,7 @@ def now(back):
 
 
 @pytest.mark.parametrize("spoil", [_marginalised, _nan, _indeterminate, _twice, _unknown, _unreadable])
-def test_after_every_error_of_gtsam_it_goes_on_from_the_last_good_pose(spoil):
+def test_after_every_error_of_gtsam_it_restarts_at_the_last_valid_pose(spoil):
     back = started(Smoother(3.0), steps=40)
     R, xyz, P = (a.copy() for a in now(back))
     assert not spoil(back)

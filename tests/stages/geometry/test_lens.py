@@ -97,15 +97,15 @@ def test_pixels_come_back_from_their_rays(lens):
     st.tuples(st.floats(-0.02, 0.03), st.floats(-0.004, 0.004), st.floats(0, 0.0005), st.floats(0, 1e-5)),
     st.floats(0.01, 1e3),
 )
-def test_any_growing_kannala_brandt_lens_goes_there_and_back(off_axis_deg, azimuth_deg, k, length):
+def test_any_monotonic_kannala_brandt_lens_round_trips(off_axis_deg, azimuth_deg, k, length):
     lens = KannalaBrandt(focal_px=(300.0, 290.0), centre_px=(500.0, 510.0), k=k, max_off_axis_deg=120.0)
     ray = rays_at([off_axis_deg], [azimuth_deg])
     np.testing.assert_allclose(lens.unproject(lens.project(length * ray)), ray, atol=1e-9)
 
 
 @each_lens
-def test_the_image_keeps_its_hand_and_grows_with_the_angle(lens):
-    """x of the ray is to the right, y down, also beyond 90 deg: nothing is mirrored or collapses there."""
+def test_the_image_is_not_mirrored_and_the_radius_grows_with_the_angle(lens):
+    """x of the ray is to the right, y down, also beyond 90 deg: no mirroring."""
     for off_axis_deg in (5.0, 60.0, 95.0, 118.0):
         right, down = lens.project(rays_at([off_axis_deg] * 2, [0.0, 90.0])) - lens.centre_px
         assert right[0] > abs(right[1])
@@ -124,14 +124,14 @@ def test_an_enlarged_image_shows_the_same_rays(lens):
 
 
 @each_lens
-def test_what_lies_beyond_the_lens_is_nan(lens):
+def test_rays_and_pixels_beyond_the_lens_are_nan(lens):
     assert np.isnan(lens.project(rays_at([120.01, 180.0], [45.0, 0.0]))).all()
     edge = np.add(lens.centre_px, (lens.circle_px * 1.01, 0.0))
     assert np.isnan(lens.unproject(edge[None])).all()
 
 
 @each_lens
-def test_no_direction_is_no_pixel(lens):
+def test_a_zero_ray_has_no_pixel(lens):
     for nothing in ([0.0, 0.0, 0.0], [np.nan, 0.0, 1.0], [0.0, 0.0, -1.0]):
         assert np.isnan(lens.project(np.array([nothing]))).all()
     assert np.isnan(lens.unproject(np.array([[np.nan, 3.0], [np.inf, 3.0]]))).all()
@@ -145,14 +145,14 @@ def test_arrays_of_another_shape_are_rejected():
         EQUIDISTANT.unproject(np.zeros((4, 3)))
 
 
-def test_a_lens_that_folds_back_names_the_angle_to_which_it_may_be_used():
+def test_a_non_monotonic_lens_reports_its_largest_valid_angle():
     settings = {"focal_px": (170.0, 170.0), "centre_px": (360.0, 360.0), "k": (-0.1, 0.0, 0.0, 0.0)}
     with pytest.raises(ValidationError, match=r"fold the image back at 10\d\.\d deg off axis: set max_off_axis_deg"):
         KannalaBrandt(**settings, max_off_axis_deg=117.5)  # 1 - 0.3 theta^2 = 0 at 104.6 deg
     KannalaBrandt(**settings, max_off_axis_deg=104.0)
 
 
-def test_a_lens_comes_back_from_a_rig_file():
+def test_a_lens_round_trips_through_a_rig_file():
     for lens in LENSES:
         assert RIG_LENS.validate_python(lens.model_dump(mode="json")) == lens
 

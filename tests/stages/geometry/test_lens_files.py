@@ -1,4 +1,4 @@
-"""Lenses of calibration programs' files: read, refused with what is missing, and a published calibration."""
+"""Lenses of calibration files: valid files, errors with their line, and a published calibration."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_kalibr_file_gives_its_equidistant_camera():
 
 
 @pytest.mark.parametrize(
-    ("text", "camera", "says", "line"),
+    ("text", "camera", "text_of_error", "line"),
     [
         (KALIBR, "cam2", "no camera 'cam2' in this Kalibr file; it has: cam0, cam1", 0),
         (KALIBR, "cam1", "pinhole-equi", 8),
@@ -64,8 +64,8 @@ def test_a_kalibr_file_gives_its_equidistant_camera():
         ("", "cam0", "it has: none", 0),
     ],
 )
-def test_a_wrong_kalibr_file_says_what_is_missing_and_where(text, camera, says, line):
-    with pytest.raises(LensFileError, match=says) as error:
+def test_an_invalid_kalibr_file_gives_the_error_and_its_line(text, camera, text_of_error, line):
+    with pytest.raises(LensFileError, match=text_of_error) as error:
         lens_from_kalibr(text, camera)
     assert error.value.line == line
 
@@ -75,7 +75,7 @@ def test_an_ocamcalib_file_gives_its_camera():
 
 
 @pytest.mark.parametrize(
-    ("text", "says", "line"),
+    ("text", "text_of_error", "line"),
     [
         ("", "no OCamCalib file", 0),
         (OCAMCALIB.replace("728.5", "x"), "no OCamCalib file", 8),
@@ -87,8 +87,8 @@ def test_an_ocamcalib_file_gives_its_camera():
         (OCAMCALIB.replace("1440 1440", ""), "4 lines of numbers", 11),
     ],
 )
-def test_a_wrong_ocamcalib_file_says_what_is_missing_and_where(text, says, line):
-    with pytest.raises(LensFileError, match=says) as error:
+def test_an_invalid_ocamcalib_file_gives_the_error_and_its_line(text, text_of_error, line):
+    with pytest.raises(LensFileError, match=text_of_error) as error:
         lens_from_ocamcalib(text)
     assert error.value.line == line
 
@@ -100,7 +100,7 @@ def kodak():
     return KODAK.read_text(encoding="utf-8")
 
 
-def test_a_real_calibration_goes_there_and_back_to_its_limit(kodak):
+def test_a_real_calibration_round_trips_up_to_its_limit(kodak):
     lens, size_px = lens_from_ocamcalib(kodak, max_off_axis_deg=105.0)
     assert size_px == (1440, 1440)
     assert 690 < lens.circle_px < 720  # the image circle of a 1440 px image

@@ -1,4 +1,4 @@
-"""Covariances of rigid motions: by formula, and against drawn poses."""
+"""Covariances of rigid motions: by formula, and against sampled poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The vehicle's trail: between two poses, a little beyond the newest, and a vehicle that never tells."""
+"""The vehicle's trajectory: interpolation, short extrapolation, and a vehicle without poses."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_beyond_the_newest_pose_the_turn_rate_is_constant(rate_radps):
 
 
 def test_poses_that_arrive_together_give_no_speed():
-    """A parked vehicle whose odometry is noisy by 2 mm, and whose words were held up and then came within 20 us."""
+    """A parked vehicle whose odometry is noisy by 2 mm, and whose poses were delayed and then arrived within 20 us."""
     poses = [motion(20 * k * MS, (0.002 * (k % 2), 0, 0), rotation_z(0.001 * (k % 2))) for k in range(10)]
     made = trail(*poses, motion(180 * MS + 20_000, (0, 0, 0)))
     for R, t in (made.at(START_NS + 180 * MS + FURTHEST_NS), made.constant_velocity(START_NS + 480 * MS)):
@@ -157,7 +157,7 @@ def test_a_fast_vehicles_second_pose_is_no_jump_and_the_first_real_one_after_zer
 
 
 @pytest.mark.parametrize(
-    ("first", "jump_m", "elsewhere"),
+    ("first", "jump_m", "displaced"),
     [
         (140, 0, True),
         (140, 8, True),
@@ -168,11 +168,11 @@ def test_a_fast_vehicles_second_pose_is_no_jump_and_the_first_real_one_after_zer
         (60, 500, False),
     ],
 )
-def test_after_a_silence_remembered_positions_may_be_displaced(first, jump_m, elsewhere):
-    """2.2 s: an odometry started afresh in it may begin anywhere near. 1.2 s: where it jumps. .6 s: that is joined."""
+def test_after_a_silence_remembered_positions_may_be_displaced(first, jump_m, displaced):
+    """2.2 s: a restarted odometry may begin anywhere near. 1.2 s: it jumps. 0.6 s: the frames are joined."""
     made = trail(*(driving(k) for k in range(30)))
     far = [motion(20 * k * MS, (0.2 * k + jump_m, 0, 0)) for k in range(first, first + 10)]
-    assert any([made.add(one) for one in far]) == elsewhere
+    assert any([made.add(one) for one in far]) == displaced
 
 
 def test_a_late_stamp_at_speed_is_no_jump():

@@ -1,4 +1,4 @@
-"""A heading from motion alone: any direction, within its sigma, and none from ways that are not the drone's."""
+"""A heading from motion alone: any direction, within its sigma, and none from displacements of another object."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ H = HeadingBank.HYPOTHESES
 
 
 def window(way_m, heading_deg, start_s, drift_mps=(0.0, 0.0)) -> Displacement:
-    """The odometry's way and, 1 s on, the LiDAR's, turned by a heading."""
+    """Displacement by odometry and by LiDAR over 1 s, turned by a heading."""
     a = math.radians(heading_deg)
     R = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
     lidar = R @ np.asarray(way_m) + drift_mps
@@ -25,8 +25,8 @@ def window(way_m, heading_deg, start_s, drift_mps=(0.0, 0.0)) -> Displacement:
     )
 
 
-def told(heading_deg, windows, speed_mps=2.0, drift_mps=(0.0, 0.0)) -> Heading | None:
-    """Of a drone that flies round in circles of 8 s."""
+def heading_of(heading_deg, windows, speed_mps=2.0, drift_mps=(0.0, 0.0)) -> Heading | None:
+    """Heading of a drone that flies in circles of 8 s."""
     bank = HeadingBank(BranchSettings())
     for i in range(windows):
         turn = 2 * math.pi * i / 8
@@ -36,21 +36,21 @@ def told(heading_deg, windows, speed_mps=2.0, drift_mps=(0.0, 0.0)) -> Heading |
 
 @pytest.mark.parametrize("heading_deg", [0.0, 33.0, 121.0, -147.0])
 @pytest.mark.parametrize("drift_mps", [(0.0, 0.0), (0.15, -0.1)])
-def test_ways_in_all_directions_tell_any_heading_within_its_sigma_though_the_odometry_drifts(heading_deg, drift_mps):
-    heading = told(heading_deg, 16, drift_mps=drift_mps)
+def test_motion_in_all_directions_determines_any_heading_within_its_sigma_despite_drift(heading_deg, drift_mps):
+    heading = heading_of(heading_deg, 16, drift_mps=drift_mps)
     assert heading is not None
     off = math.remainder(heading.turn_rad - math.radians(heading_deg), 2 * math.pi)
     assert abs(off) < 3.0 * heading.sigma_rad
     assert heading.sigma_rad < math.radians(3.0)
 
 
-def test_little_motion_tells_none_and_more_tells_it_better():
-    assert told(20.0, 2) is None
-    assert told(20.0, 12, speed_mps=0.3) is None
-    assert told(20.0, 24).sigma_rad < told(20.0, 8).sigma_rad
+def test_little_motion_gives_no_heading_and_more_motion_a_smaller_sigma():
+    assert heading_of(20.0, 2) is None
+    assert heading_of(20.0, 12, speed_mps=0.3) is None
+    assert heading_of(20.0, 24).sigma_rad < heading_of(20.0, 8).sigma_rad
 
 
-def test_ways_that_are_not_the_drones_tell_none():
+def test_motion_of_another_object_gives_no_heading():
     bank, rng = HeadingBank(BranchSettings()), np.random.default_rng(4)
     for i in range(12):
         bank.see(window(rng.normal(0, 2, 2), rng.uniform(-180, 180), i))

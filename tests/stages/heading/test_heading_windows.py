@@ -1,4 +1,4 @@
-"""Windows of motion: not before the baseline, without overlap, true to each hypothesis, robust to a false fix."""
+"""Windows of motion: baseline, no overlap, displacement of each hypothesis, robustness to a false fix."""
 
 from __future__ import annotations
 
@@ -25,8 +25,6 @@ def fix(ms, xyz, track=1, sigma=0.03) -> DroneFix:
         xyz_vehicle_m=np.asarray(xyz, dtype=float),
         covariance_m2=sigma**2 * np.eye(3),
         hits=3,
-        iterations=1,
-        shift_m=0.0,
         track_id=track,
     )
 
@@ -49,7 +47,7 @@ def metric(windows, own, until_ms, at=lambda ms: V * ms * 1e-3, R_map_odom=SAME,
     return out
 
 
-def test_windows_follow_each_other_and_are_as_long_as_they_must():
+def test_windows_do_not_overlap_and_have_the_baseline():
     moved = metric(Windows(0.4), autopilot(), 4000)
     assert len(moved) >= 5
     for a, b in pairwise(moved):
@@ -60,13 +58,13 @@ def test_windows_follow_each_other_and_are_as_long_as_they_must():
         np.testing.assert_allclose(one.lidar_m[0], V[:2] * one.seconds, atol=1e-9)
 
 
-def test_the_odometry_is_told_in_the_start_frame_by_branch_0():
+def test_the_odometry_is_in_the_map_frame_by_branch_0():
     moved = metric(Windows(0.4), autopilot(turned_rad=1.1), 2000, R_map_odom=rotation_z(-1.1))
     np.testing.assert_allclose(moved[0].odometry_m, V[:2] * moved[0].seconds, atol=1e-9)
 
 
-def test_each_hypothesis_brings_the_fixes_together_its_own_way():
-    """Where hypothesis i is true, its residual is nothing though the drone moves within a handful."""
+def test_each_hypothesis_moves_the_fixes_by_its_own_displacement():
+    """Where hypothesis i is true, its residual is zero though the drone moves within a group."""
     for i in (0, 3, 4, 9):
         R = np.eye(3)
         R[:2, :2] = turns(DIRECTIONS)[i]
@@ -75,7 +73,7 @@ def test_each_hypothesis_brings_the_fixes_together_its_own_way():
         assert moved.lidar_m.shape == (DIRECTIONS, 2)
 
 
-def test_one_false_fix_of_a_handful_does_no_harm():
+def test_one_false_fix_of_a_group_has_no_effect():
     def at(ms):
         return V * ms * 1e-3 + ([5.0, -5.0, 0.0] if ms == 200 else 0.0)
 
@@ -83,25 +81,25 @@ def test_one_false_fix_of_a_handful_does_no_harm():
     np.testing.assert_allclose(moved[0].lidar_m[0], moved[0].odometry_m, atol=0.02)
 
 
-def test_no_window_before_the_displacement_is_clear_of_the_noise():
+def test_no_window_before_the_displacement_exceeds_the_noise():
     near = metric(Windows(0.4), autopilot(), 4000, sigma=0.03)
     noisy = metric(Windows(0.4), autopilot(), 4000, sigma=0.4)
     assert noisy[0].seconds > 2 * near[0].seconds
 
 
-def test_a_hovering_drone_makes_no_windows():
+def test_a_hovering_drone_gives_no_windows():
     assert metric(Windows(0.4), autopilot(v=np.zeros(3)), 5000, at=lambda ms: np.zeros(3)) == []
 
 
-def test_fixes_that_run_away_from_a_hovering_odometry_are_a_window():
-    """The LiDAR follows something else: evidence, for none of the branches."""
+def test_moving_fixes_with_a_hovering_odometry_give_a_window():
+    """The LiDAR follows another object: evidence for none of the branches."""
     moved = metric(Windows(0.4), autopilot(v=np.zeros(3)), 5000)
     assert moved
     assert np.linalg.norm(moved[0].odometry_m) < 0.01
     assert np.linalg.norm(moved[0].lidar_m[0]) > 1.0
 
 
-def test_a_break_of_the_odometry_ends_a_window_without_evidence():
+def test_a_new_segment_of_the_odometry_ends_a_window_without_evidence():
     own = autopilot(until_ms=800)
     for ms in range(2000, 5000, 50):
         own.add_position(ms * MS, V * ms * 1e-3 + [50.0, 0, 0], V)
@@ -112,14 +110,14 @@ def test_a_break_of_the_odometry_ends_a_window_without_evidence():
     np.testing.assert_allclose(after[0].odometry_m, V[:2] * after[0].seconds, atol=1e-9)
 
 
-def test_another_track_starts_anew():
+def test_another_track_restarts_the_window():
     windows, own = Windows(0.4), autopilot()
     for i, ms in enumerate(range(100, 4000, 100)):
         windows.add_fix(fix(ms, V * ms * 1e-3, track=1 + i // 4), np.eye(3), np.zeros(3), own)
         assert windows.close_metric(np.eye(3), 0.03) is None
 
 
-def test_the_vehicles_own_way_is_added():
+def test_the_displacement_of_the_vehicle_is_added():
     windows, own, moved = Windows(0.4), autopilot(), None
     R = rotation_z(0.7)
     for ms in range(100, 1500, 100):
@@ -130,8 +128,8 @@ def test_the_vehicles_own_way_is_added():
     np.testing.assert_allclose(moved.lidar_m[0], moved.odometry_m, atol=1e-9)
 
 
-def by_pictures(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms=10**9):
-    """Bearing windows of fixes along V with a step of images each 100 ms; direction None: no motion seen.
+def by_images(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms=10**9):
+    """Bearing windows of fixes along V with a step of images each 100 ms; direction None: no motion.
 
     So many steps share a key; images come so late, and none of after `lost_ms`.
     """
@@ -162,9 +160,9 @@ def by_pictures(directions, reach_s=3.0, hole=None, of_key=1, late_ms=0, lost_ms
     return out
 
 
-def test_directions_from_pictures_are_added_up_over_a_window():
+def test_directions_of_images_are_summed_over_a_window():
     ahead = V / np.linalg.norm(V)
-    moved = by_pictures(lambda i: rotation_z(0.3 if i % 2 else -0.3) @ ahead)
+    moved = by_images(lambda i: rotation_z(0.3 if i % 2 else -0.3) @ ahead)
     assert len(moved) >= 3
     for one in moved:
         assert not one.metric
@@ -174,40 +172,40 @@ def test_directions_from_pictures_are_added_up_over_a_window():
         assert one.bearing_rad == pytest.approx(math.hypot(0.1, 0.03))
 
 
-def test_a_way_there_and_back_tells_no_direction():
+def test_a_return_flight_gives_no_direction():
     ahead = V / np.linalg.norm(V)
-    assert by_pictures(lambda i: ahead if i % 2 else -ahead) == []
+    assert by_images(lambda i: ahead if i % 2 else -ahead) == []
 
 
-def test_no_motion_seen_tells_no_direction():
-    assert by_pictures(lambda i: None) == []
+def test_no_motion_gives_no_direction():
+    assert by_images(lambda i: None) == []
 
 
-def test_a_window_that_pictures_hardly_cover_tells_nothing():
+def test_a_window_with_few_images_is_not_used():
     ahead = V / np.linalg.norm(V)
-    moved = by_pictures(lambda i: ahead, reach_s=4.0, hole=(800, 1600))
+    moved = by_images(lambda i: ahead, reach_s=4.0, hole=(800, 1600))
     assert moved
     assert all(one.end_ns <= 900 * MS or one.start_ns >= 1400 * MS for one in moved)
 
 
-def test_pictures_of_one_key_cover_their_time_once():
+def test_images_of_one_key_count_once():
     ahead = V / np.linalg.norm(V)
-    assert by_pictures(lambda i: ahead, of_key=8)
-    assert by_pictures(lambda i: ahead, of_key=8, hole=(600, 1200), reach_s=1.2) == []  # 0.3 of 0.4 s, by three images
+    assert by_images(lambda i: ahead, of_key=8)
+    assert by_images(lambda i: ahead, of_key=8, hole=(600, 1200), reach_s=1.2) == []  # 0.3 of 0.4 s, by three images
 
 
-def test_a_window_waits_for_the_pictures_of_its_end():
+def test_a_window_waits_for_the_images_of_its_end():
     ahead = V / np.linalg.norm(V)
-    in_time = by_pictures(lambda i: ahead)
-    late = by_pictures(lambda i: ahead, late_ms=300, reach_s=3.3)
+    in_time = by_images(lambda i: ahead)
+    late = by_images(lambda i: ahead, late_ms=300, reach_s=3.3)
     assert len(late) == len(in_time)
     assert [one.end_ns for one in late] == [one.end_ns for one in in_time]
 
 
-def test_a_window_does_not_wait_for_pictures_that_do_not_come():
+def test_a_window_waits_a_limited_time_for_images():
     ahead = V / np.linalg.norm(V)
-    moved = by_pictures(lambda i: ahead, hole=(1500, 3000), reach_s=4.5)
+    moved = by_images(lambda i: ahead, hole=(1500, 3000), reach_s=4.5)
     assert any(one.end_ns <= 1500 * MS for one in moved)
     after = [one for one in moved if one.start_ns > 1500 * MS]
-    assert len(after) >= 2  # what waited was given up, and its time is not in the next one
+    assert len(after) >= 2  # the waiting window was dropped, and its time is not in the next one
     assert all(one.seconds < 1.0 for one in after)

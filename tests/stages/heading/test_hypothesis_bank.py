@@ -1,4 +1,4 @@
-"""The bank of four by formula: Bayes over windows, drift shared by windows, nonsense, forgetting, slips."""
+"""The bank of four by formula: Bayes over windows, drift shared by windows, outliers, leak, slips."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def decided(k, **settings) -> HypothesisBank:
     return b
 
 
-def test_at_first_all_four_are_alike_and_perhaps_none_is_right():
+def test_the_prior_is_equal_for_all_four_with_a_probability_of_none():
     np.testing.assert_allclose(bank(none_right=0.08).probability, [0.23, 0.23, 0.23, 0.23, 0.08])
 
 
 @pytest.mark.parametrize("k", range(4))
 @pytest.mark.parametrize("metric", [True, False])
-def test_a_branch_is_known_by_the_way_it_turns_the_odometry(k, metric):
+def test_windows_resolve_the_branch_that_turns_the_odometry_onto_the_lidar(k, metric):
     b = bank()
     for i in range(6):
         way = np.array([0.8, 0.3])
@@ -63,7 +63,7 @@ def test_a_branch_is_known_by_the_way_it_turns_the_odometry(k, metric):
 
 
 def test_one_window_by_hand():
-    """Bayes with (1 - o) N(e; 0, S) + o / area, S of fixes, drift, direction and scale, along and across the way."""
+    """Bayes with (1 - o) N(e; 0, S) + o / area, S of fixes, drift, direction and scale, along and across the displacement."""
     b = bank()
     b.see(moved([1.0, 0.0], [1.0, 0.0], seconds=0.5))
     fresh = 0.12**2 * (1 - math.exp(-0.05)) / 3
@@ -83,7 +83,7 @@ def test_one_window_by_hand():
 
 
 def check_bayes(b: HypothesisBank, likelihood) -> None:
-    """Priors: 0.95 / 4 each branch, 0.049 for nonsense, 0.001 for the twelve angles between."""
+    """Priors: 0.95 / 4 each branch, 0.049 for none, 0.001 for the twelve angles between."""
     prior = np.array(([0.2375] + [0.001 / 12] * 3) * 4 + [0.049])
     weighed = prior * likelihood
     weighed /= weighed.sum()
@@ -105,7 +105,7 @@ def test_one_bearing_by_hand():
     check_bayes(b, [*likelihood, 1 / 2 / math.pi])
 
 
-def test_slow_straight_flight_never_decides_as_a_drift_could_explain_it():
+def test_slow_straight_flight_never_resolves_as_a_drift_explains_it():
     """At 0.15 m/s a drift of 0.21 m/s would make any branch right: the same drift, however many windows."""
     b = bank()
     for i in range(20):
@@ -114,14 +114,14 @@ def test_slow_straight_flight_never_decides_as_a_drift_could_explain_it():
     assert b.probability[0] < 0.999
 
 
-def test_the_same_way_flown_fast_decides():
+def test_the_same_path_at_higher_speed_resolves():
     b = bank()
     for i in range(3):
         b.see(moved([0.45, 0.0], [0.45, 0.0], start_s=0.5 * i))
     assert b.probability[0] > 0.999
 
 
-def test_drift_is_learnt_and_fast_flight_with_it_still_decides_right():
+def test_drift_is_estimated_and_fast_flight_with_drift_resolves_the_correct_branch():
     b = bank()
     for i in range(6):
         way = quarter_turned(np.array([0.5, 0.0]), i)
@@ -129,7 +129,7 @@ def test_drift_is_learnt_and_fast_flight_with_it_still_decides_right():
     assert b.probability[0] > 0.999
 
 
-def test_one_false_window_undoes_nothing():
+def test_one_false_window_changes_little():
     b = bank()
     for i in range(3):
         b.see(moved([0.6, 0.0], [0.6, 0.0], start_s=i))
@@ -138,35 +138,35 @@ def test_one_false_window_undoes_nothing():
 
 
 @pytest.mark.parametrize("metric", [True, False])
-def test_ways_of_one_length_in_unrelated_directions_feed_none_of_them(metric):
-    """Two in a row agree by chance now and then, three hardly; in the end none is right."""
+def test_displacements_in_unrelated_directions_favour_none_of_them(metric):
+    """Two in a row sometimes agree by chance, three hardly; finally none is right."""
     rng = np.random.default_rng(5)
-    lied = 0
+    wrong = 0
     for _ in range(50):
         b, ever = bank(), False
         for i in range(50):
-            told, seen = (np.array([math.cos(a), math.sin(a)]) for a in rng.uniform(0, 2 * math.pi, 2))
-            b.see(moved(told, seen, start_s=i, metric=metric))
+            odometry, seen = (np.array([math.cos(a), math.sin(a)]) for a in rng.uniform(0, 2 * math.pi, 2))
+            b.see(moved(odometry, seen, start_s=i, metric=metric))
             ever |= b.resolved(b.best(0), 0.999)
-        lied += ever
+        wrong += ever
         assert b.probability[NONE] > 0.9
-    assert lied <= 1  # flight of 50
+    assert wrong <= 1  # flight of 50
 
 
-@pytest.mark.parametrize("askew_deg", [18, 27, 35, 45, 60])
+@pytest.mark.parametrize("error_deg", [18, 27, 35, 45, 60])
 @pytest.mark.parametrize("bends", [1.0, 0.1])
-def test_streets_matched_askew_feed_none_of_them(askew_deg, bends):
-    """Also on a way that hardly bends, where a steady drift would explain it."""
-    b, turn = bank(), rotation_z(math.radians(askew_deg))[:2, :2]
+def test_streets_matched_at_a_wrong_angle_favour_none_of_them(error_deg, bends):
+    """Also on a nearly straight path, where a steady drift would explain it."""
+    b, turn = bank(), rotation_z(math.radians(error_deg))[:2, :2]
     for i in range(15):
-        told = rotation_z(bends * i)[:2, 0]
-        b.see(moved(told, turn @ told, start_s=i, seconds=0.7))
+        odometry = rotation_z(bends * i)[:2, 0]
+        b.see(moved(odometry, turn @ odometry, start_s=i, seconds=0.7))
         assert not b.resolved(b.best(0), 0.999)
     assert b.probability[NONE] > 0.95
 
 
-def test_a_late_flip_is_found():
-    """The followed yaw slipped unnoticed: from then on another branch is right."""
+def test_a_late_branch_flip_is_detected():
+    """The tracked yaw slips unnoticed: from then on another branch is correct."""
     b = bank()
     for i in range(20):
         b.see(moved([0.7, 0.0], [0.7, 0.0], start_s=i))
@@ -181,7 +181,7 @@ def test_a_late_flip_is_found():
     assert b.best(0) == 1
 
 
-def test_a_slip_moves_probability_round():
+def test_a_slip_shifts_the_probabilities():
     b = decided(0)
     before = b.probability
     b.slip(np.array([0.7, 0.3, 0.0, 0.0]))
@@ -189,19 +189,19 @@ def test_a_slip_moves_probability_round():
     assert b.probability[NONE] == pytest.approx(before[NONE])
 
 
-def test_time_and_doubt_give_back_what_was_known():
+def test_leak_and_mix_return_to_the_prior():
     b = decided(2, leak_per_s=0.01)
     before = b.probability
     b.pass_time(5 * S)
-    np.testing.assert_array_equal(b.probability, before)  # the first word starts the clock
+    np.testing.assert_array_equal(b.probability, before)  # the first call starts the clock
     b.pass_time(105 * S)
     left = math.exp(-1.0)
     np.testing.assert_allclose(b.probability, left * before + (1 - left) * np.array([0.2375] * 4 + [0.05]))
-    b.pass_time(50 * S)  # no way back
+    b.pass_time(50 * S)  # an earlier time has no effect
     np.testing.assert_allclose(b.probability, left * before + (1 - left) * np.array([0.2375] * 4 + [0.05]))
 
 
-def test_a_prior_alone_never_resolves_and_needs_less_motion():
+def test_a_prior_alone_never_resolves_but_less_motion_is_needed():
     b = bank()
     b.expect_yaw(0.1, math.radians(20), 0.95)
     assert b.best(1) == 0
@@ -220,12 +220,12 @@ def test_a_wrong_prior_is_overruled_by_motion():
     assert b.probability[0] > 0.999
 
 
-def test_the_branch_given_out_stays_where_others_are_as_probable():
+def test_the_published_branch_stays_while_others_are_equally_probable():
     b = bank()
     assert b.best(2) == 2
 
 
 @pytest.mark.parametrize("wrong", [{"baseline_m": 0}, {"metric_outliers": 1.0}, {"none_right": 0}, {"unknown": 1}])
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValueError):
         BranchSettings(**wrong)

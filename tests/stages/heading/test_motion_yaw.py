@@ -1,4 +1,4 @@
-"""The heading by motion: found, refused, and never a quarter turn wrong."""
+"""The heading by motion: accepted, rejected, and never on a wrong branch."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ S = 1_000_000_000
 
 
 def points(way_m, psi=0.7, noise=0.05, seed=0, false=(), drift_mps=0.08, step_s=0.5):
-    """A way (n, 3) told by the autopilot, and as the LiDAR has it: turned by psi, with drift, noise, false ones."""
+    """A path (n, 3) by the autopilot and by LiDAR: turned by psi, with drift, noise and false fixes."""
     rng = np.random.default_rng([seed, 8])
     n = len(way_m)
     drift = np.cumsum(gauss_markov(rng, drift_mps, 10.0, step_s, n) * step_s, axis=0) * [1, 1, 0.3]
@@ -50,14 +50,14 @@ def straight(n=16, length=8.0):
 
 
 @pytest.mark.parametrize("place", [0.0, 1 / 3, 1e3])
-def test_points_of_one_place_that_are_left_when_the_false_ones_are_out_tell_nothing(place):
+def test_points_at_one_position_after_outlier_rejection_give_no_yaw(place):
     way = np.full((14, 3), place)
     way[[4, 9], :2] += [[1.5, 0.0], [0.0, 1.5]]
-    told = weigh(points(way, drift_mps=0.0, false=(4, 9)), ERRORS)
-    assert told.yaw is None
+    result = weigh(points(way, drift_mps=0.0, false=(4, 9)), ERRORS)
+    assert result.yaw is None
 
 
-def test_the_fit_is_that_of_complex_numbers():
+def test_the_fit_is_that_of_a_complex_factor():
     """z = c + a p without errors: a is found, with the precision sum of |p - mean|^2 / variance."""
     p = np.array([[0.0, 0], [1, 0], [1, 2], [3, 1]])
     a = 0.9 * np.exp(0.5j)
@@ -68,7 +68,7 @@ def test_the_fit_is_that_of_complex_numbers():
     assert misfit == pytest.approx(0, abs=1e-9)
 
 
-def test_the_worst_point_is_named():
+def test_the_worst_point_is_found():
     p = circle()[:, :2]
     z = p.copy()
     z[5] += [0.5, -0.3]
@@ -77,34 +77,34 @@ def test_the_worst_point_is_named():
 
 @pytest.mark.parametrize("psi", [-3.0, -1.2, 0.0, 1.6, 3.1])
 @pytest.mark.parametrize("way", [circle(), straight()])
-def test_a_turned_world_has_a_turned_answer(psi, way):
-    told = weigh(points(way, psi), ERRORS)
-    assert told.yaw is not None
-    assert apart_rad(told.yaw.yaw_rad, psi) < 4 * told.yaw.sigma_rad
-    assert told.yaw.sigma_rad < math.radians(8)
+def test_a_turned_world_gives_a_turned_yaw(psi, way):
+    result = weigh(points(way, psi), ERRORS)
+    assert result.yaw is not None
+    assert apart_rad(result.yaw.yaw_rad, psi) < 4 * result.yaw.sigma_rad
+    assert result.yaw.sigma_rad < math.radians(8)
 
 
-def test_sigma_is_what_the_errors_are():
+def test_sigma_matches_the_errors():
     off = []
     for seed in range(150):
-        told = weigh(points(circle(), seed=seed), ERRORS)
-        if told.yaw is not None:
-            off.append(math.remainder(told.yaw.yaw_rad - 0.7, 2 * math.pi) / told.yaw.sigma_rad)
+        result = weigh(points(circle(), seed=seed), ERRORS)
+        if result.yaw is not None:
+            off.append(math.remainder(result.yaw.yaw_rad - 0.7, 2 * math.pi) / result.yaw.sigma_rad)
     assert len(off) > 140
     assert np.mean(np.square(off)) < 1.3
     assert np.abs(off).max() < 4.5
 
 
-def test_false_fixes_are_left_out_while_they_are_few():
-    told = weigh(points(circle(), false=(3, 9)), ERRORS)
-    assert told.yaw is not None
-    assert apart_rad(told.yaw.yaw_rad, 0.7) < 0.1
+def test_a_few_false_fixes_are_rejected():
+    result = weigh(points(circle(), false=(3, 9)), ERRORS)
+    assert result.yaw is not None
+    assert apart_rad(result.yaw.yaw_rad, 0.7) < 0.1
     assert weigh(points(circle(), false=(1, 3, 5, 7, 9, 11)), ERRORS).yaw is None
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_what_flies_otherwise_than_the_drone_gives_no_heading(seed):
-    """A bird beside it: as fast, elsewhere to, with a path of its own."""
+def test_another_moving_object_gives_no_heading(seed):
+    """A bird of the same speed on a path of its own."""
     rng = np.random.default_rng([seed, 9])
     way, bird = circle(), points(circle(), psi=0.0)
     other = np.cumsum(gauss_markov(rng, 1.5, 3.0, 0.5, len(way)) * 0.5, axis=0)
@@ -112,15 +112,15 @@ def test_what_flies_otherwise_than_the_drone_gives_no_heading(seed):
     assert weigh(mixed, ERRORS).yaw is None
 
 
-def test_a_way_of_another_length_gives_no_heading():
-    told = weigh(points(1.0 * straight(length=20.0)), ERRORS)
-    assert told.yaw is not None
+def test_a_displacement_of_another_length_gives_no_heading():
+    result = weigh(points(1.0 * straight(length=20.0)), ERRORS)
+    assert result.yaw is not None
     short = tuple(
         Point(p.stamp_ns, 0.7 * p.xyz_map_m, p.variance_m2, p.xyz_odom_m, 0) for p in points(straight(length=20.0))
     )
-    refused = weigh(short, ERRORS)
-    assert refused.yaw is None
-    assert "0.67 of the way" in refused.reason
+    rejected = weigh(short, ERRORS)
+    assert rejected.yaw is None
+    assert "0.67 of the displacement" in rejected.reason
 
 
 def test_heights_must_agree():
@@ -131,21 +131,21 @@ def test_heights_must_agree():
     assert weigh(climbs, ERRORS).yaw is None
 
 
-def test_a_drone_that_hardly_moves_tells_nothing():
-    told = weigh(points(0.05 * circle()), ERRORS)
-    assert told.yaw is None
-    assert told.likelihood is None
-    assert "too little" in told.reason
+def test_a_drone_that_hardly_moves_gives_no_heading():
+    result = weigh(points(0.05 * circle()), ERRORS)
+    assert result.yaw is None
+    assert result.likelihood is None
+    assert "too little" in result.reason
 
 
-def test_too_few_points_are_no_answer():
+def test_too_few_points_give_no_heading():
     few = weigh(points(circle())[: LEAST - 1], ERRORS)
     assert few.yaw is None
-    assert few.likelihood is not None  # enough to speak for another's
+    assert few.likelihood is not None  # enough to confirm another yaw
     assert weigh(points(circle())[: MIN_TO_CONFIRM - 1], ERRORS).likelihood is None
 
 
-def test_the_bank_has_one_peak_and_doubts_when_it_is_flat():
+def test_the_bank_has_one_peak_and_is_ambiguous_when_flat():
     peak, near, odds = bank(np.array([math.cos(2.0), math.sin(2.0)]), 400.0)
     assert peak == pytest.approx(2.0)
     assert near > 0.9999
@@ -154,7 +154,7 @@ def test_the_bank_has_one_peak_and_doubts_when_it_is_flat():
 
 
 def test_drift_of_both_odometries_is_correlated_as_an_integral_is():
-    """Of a velocity that hardly changes: s^2 t_a t_b."""
+    """For a nearly constant velocity: s^2 t_a t_b."""
     slow = FuseErrors(drift_mps=0.1, drift_time_s=1e4, walk_m_per_sqrt_s=1e-6)
     K = level_covariance(np.array([0.0, 2.0, 5.0]), np.zeros((3, 2)), np.zeros(3), slow)
     assert K[1, 1] == pytest.approx(0.01 * 4, rel=0.01)
@@ -162,11 +162,11 @@ def test_drift_of_both_odometries_is_correlated_as_an_integral_is():
 
 
 @pytest.mark.parametrize(("dof", "tabled"), [(3, 16.27), (10, 29.59), (40, 73.40)])
-def test_the_gates_are_those_of_the_tables(dof, tabled):
+def test_the_gates_match_tabulated_values(dof, tabled):
     assert chi2_999(dof) == pytest.approx(tabled, rel=0.02)
 
 
-def test_a_jump_of_the_autopilots_frame_begins_anew():
+def test_a_new_segment_restarts_the_collection():
     bank_ = MotionYaw(ERRORS, math.radians(6))
     for p in points(circle()):
         bank_.add(p)
@@ -177,22 +177,22 @@ def test_a_jump_of_the_autopilots_frame_begins_anew():
     assert not bank_.confirms(p.stamp_ns, 0.0, 0.01)
 
 
-def test_the_odds_of_other_quarters_are_the_likelihoods():
-    """exp(k (cos a - 1)): two quarter turns and one half against a yaw at the peak."""
+def test_the_odds_of_other_branches_follow_the_likelihood():
+    """exp(k (cos a - 1)): branches at +-90 and 180 deg against a yaw at the peak."""
     likelihood = YawLikelihood(0, 0.7, 3.0)
     assert likelihood.alternatives_odds(0.7) == pytest.approx(2 * math.exp(-3.0) + math.exp(-6.0))
-    assert likelihood.alternatives_odds(0.7 + math.pi / 4) > 1.0  # halfway to another one
+    assert likelihood.alternatives_odds(0.7 + math.pi / 4) > 1.0  # halfway to another branch
     assert likelihood.alternatives_odds(0.7 + math.pi / 2) > 10.0
 
 
-def test_a_short_way_backs_a_yaw_before_it_tells_one():
-    """Its sigma is 15 deg, too much for a heading and little beside a quarter turn."""
+def test_a_short_path_confirms_a_yaw_before_it_determines_one():
+    """Its sigma is 15 deg, too much for a heading but small against 90 deg."""
     bank_ = MotionYaw(ERRORS, math.radians(6))
     p = points(circle())[0]
-    bank_._told = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(15) ** 2))
+    bank_._fit = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(15) ** 2))
     assert bank_.coarse_yaw is None
     assert bank_.confirms(p.stamp_ns, 0.4, 0.01)
     assert not bank_.confirms(p.stamp_ns, 0.4 + math.pi / 2, 0.01)
     assert not bank_.confirms(p.stamp_ns + 6 * S, 0.4, 0.01)
-    bank_._told = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(30) ** 2))
+    bank_._fit = YawFit("", YawLikelihood(p.stamp_ns, 0.3, 1 / math.radians(30) ** 2))
     assert not bank_.confirms(p.stamp_ns, 0.3, 0.01)  # odds 1 : 19

@@ -1,4 +1,4 @@
-"""The cache of compiled code: it must not outlive any file whose code is in it."""
+"""The cache of compiled code: it must be invalidated by any change of a file whose code is in it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stages.kernels.compiled import CACHE_FOLDER, COMPILED
 REPOSITORY = Path(__file__).resolve().parents[3]
 
 
-def test_the_name_changes_with_any_file_and_not_with_where_it_lies(tmp_path):
+def test_the_name_changes_with_any_file_but_not_with_its_location(tmp_path):
     for name in ("one", "other"):
         (tmp_path / name / "deep").mkdir(parents=True)
         (tmp_path / name / "caller.py").write_text("x = 1\n")
@@ -25,14 +25,14 @@ def test_the_name_changes_with_any_file_and_not_with_where_it_lies(tmp_path):
     assert cache_name([tmp_path / "one"]) != first
 
 
-def test_every_compiled_function_lies_where_the_name_looks():
+def test_every_compiled_function_is_in_a_folder_of_the_name():
     users = [path for package in ("flow", "links", "stages") for path in (REPOSITORY / package).rglob("*.py")]
     users = [path for path in users if "import compiled" in path.read_text(encoding="utf-8")]
     assert len(users) > 20
     assert [path for path in users if not any(REPOSITORY / folder in path.parents for folder in COMPILED)] == []
 
 
-def test_numba_uses_it_and_a_folder_that_cannot_be_made_is_no_error(tmp_path, monkeypatch):
+def test_numba_uses_it_and_a_folder_that_cannot_be_created_is_no_error(tmp_path, monkeypatch):
     assert str(CACHE_FOLDER) == config.CACHE_DIR
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
@@ -45,8 +45,8 @@ CALLEE = "from stages.kernels.compiled import compiled\n@compiled\ndef inner(x):
 CALLER = "from stages.kernels.compiled import compiled\nfrom callee import inner\n@compiled\ndef outer(x):\n    return inner(x)\n"
 
 
-def test_a_changed_callee_in_another_file_is_noticed(tmp_path):
-    """With the cache named after these files, as it is after ours; numba alone goes on with the old code."""
+def test_a_changed_callee_in_another_file_is_detected(tmp_path):
+    """With the cache named after these files; numba alone would keep the old code."""
     (tmp_path / "caller.py").write_text(CALLER)
     program = (
         "import sys, pathlib, stages.kernels.compiled, flow.compile_cache as c\n"

@@ -1,4 +1,4 @@
-"""Turns and ways of the drone: between samples, beyond them, over jumps, and from pictures alone."""
+"""Rotations and displacements of the drone: interpolation, extrapolation, jumps, and images alone."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_late_or_repeated_sample_is_ignored():
 
 
 def test_a_yaw_reset_is_removed_by_the_rates():
-    """From 400 ms on the autopilot's north is 50 deg elsewhere; the drone turns on as its rates say."""
+    """From 400 ms on the yaw of frame odom is off by 50 deg; the drone continues to turn at its rate."""
     trail = AutopilotTrajectory()
     for i in range(40):
         R = exp_rotation(i * 0.02 * RATE)
@@ -78,7 +78,7 @@ def test_a_gap_in_which_a_jump_cannot_be_detected_is_counted():
 
 
 def test_in_a_gap_only_a_short_extrapolation_is_known():
-    """It turned 1.5 rad/s all the time: 6 rad in 4 s of silence, which the shorter way round would make a turn back."""
+    """It turned 1.5 rad/s all the time: 6 rad in 4 s of silence, which interpolation along the shorter angle would reverse."""
     trail = AutopilotTrajectory()
     for ms in [*range(0, 400, 20), *range(4400, 4800, 20)]:
         trail.add_attitude(ms * MS, exp_rotation(ms * 1e-3 * RATE), RATE)
@@ -90,24 +90,26 @@ def test_in_a_gap_only_a_short_extrapolation_is_known():
         assert trail.velocity_odom_mps(ms * MS) is None
         assert not rotation_between(trail, VisualTrajectory(), 200 * MS, ms * MS).measured
     np.testing.assert_allclose(trail.R_odom_drone(4400 * MS), exp_rotation(4.4 * RATE), atol=1e-9)
-    assert rotation_between(trail, VisualTrajectory(), 200 * MS, 4500 * MS).measured  # over it both ends tell
+    assert rotation_between(
+        trail, VisualTrajectory(), 200 * MS, 4500 * MS
+    ).measured  # across it, both ends are measured
 
 
-def test_samples_half_a_second_apart_are_interpolated():
+def test_samples_with_a_gap_of_half_a_second_are_interpolated():
     trail = AutopilotTrajectory()
     for ms in range(0, 2000, 500):
         trail.add_attitude(ms * MS, exp_rotation(ms * 1e-3 * RATE), RATE)
     np.testing.assert_allclose(trail.R_odom_drone(950 * MS), exp_rotation(0.95 * RATE), atol=1e-9)
 
 
-def test_images_far_apart_give_the_whole_rotation_but_no_interpolation():
-    pictures = VisualTrajectory()
+def test_images_with_a_long_gap_give_the_whole_rotation_but_no_interpolation():
+    images = VisualTrajectory()
     for one in (step(0, 200), step(200, 400), step(400, 2400), step(2400, 2600)):
-        pictures.add(one)
-    assert pictures.at(1400 * MS) is None
-    assert pictures.at(400 * MS) is not None
-    assert pictures.at(2400 * MS) is not None
-    assert rotation_between(AutopilotTrajectory(), pictures, 300 * MS, 2500 * MS).measured
+        images.add(one)
+    assert images.at(1400 * MS) is None
+    assert images.at(400 * MS) is not None
+    assert images.at(2400 * MS) is not None
+    assert rotation_between(AutopilotTrajectory(), images, 300 * MS, 2500 * MS).measured
 
 
 def flown(jump_at=None, jump_m=(5.0, 0, 0)) -> AutopilotTrajectory:
@@ -161,41 +163,41 @@ def test_a_gap_ends_the_segment():
 
 
 def test_consecutive_visual_motions_are_chained():
-    pictures = VisualTrajectory()
+    images = VisualTrajectory()
     for i in range(10):
-        pictures.add(step(100 * i, 100 * (i + 1)))
-    at = pictures.at(650 * MS)
+        images.add(step(100 * i, 100 * (i + 1)))
+    at = images.at(650 * MS)
     assert at is not None
     np.testing.assert_allclose(at[0], exp_rotation(0.65 * RATE), atol=1e-9)
     assert at[1] == pytest.approx(6.5e-6)
 
 
 def test_a_motion_that_skips_an_image_is_chained_at_its_from_stamp():
-    pictures = VisualTrajectory()
-    pictures.add(step(0, 100))
-    pictures.add(step(0, 200))
-    at = pictures.at(200 * MS)
+    images = VisualTrajectory()
+    images.add(step(0, 100))
+    images.add(step(0, 200))
+    at = images.at(200 * MS)
     assert at is not None
     np.testing.assert_allclose(at[0], exp_rotation(0.2 * RATE), atol=1e-9)
 
 
 def test_a_gap_between_steps_begins_a_new_chain():
-    pictures = VisualTrajectory()
-    pictures.add(step(0, 100))
-    pictures.add(step(300, 400))
-    turn = rotation_between(AutopilotTrajectory(), pictures, 50 * MS, 350 * MS)
+    images = VisualTrajectory()
+    images.add(step(0, 100))
+    images.add(step(300, 400))
+    turn = rotation_between(AutopilotTrajectory(), images, 50 * MS, 350 * MS)
     assert not turn.measured
     np.testing.assert_array_equal(turn.R_from_to, np.eye(3))
     assert math.degrees(math.sqrt(turn.variance_rad2)) == pytest.approx(12.0)  # 40 deg/s for 0.3 s
 
 
 def test_the_autopilot_takes_precedence_over_images_and_both_agree():
-    pictures = VisualTrajectory()
-    pictures.add(step(0, 500))
+    images = VisualTrajectory()
+    images.add(step(0, 500))
     expected = exp_rotation(0.3 * RATE)
     for trail in (turning(), AutopilotTrajectory()):
-        turn = rotation_between(trail, pictures, 100 * MS, 400 * MS)
+        turn = rotation_between(trail, images, 100 * MS, 400 * MS)
         assert turn.measured
         np.testing.assert_allclose(turn.R_from_to, expected, atol=1e-9)
-        back = rotation_between(trail, pictures, 400 * MS, 100 * MS)
+        back = rotation_between(trail, images, 400 * MS, 100 * MS)
         np.testing.assert_allclose(back.R_from_to, expected.T, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Corners and their templates: found where they are, followed to a fraction of a pixel, none where nothing is."""
+"""Corners and their templates: detection, sub-pixel tracking, and images without corners."""
 
 import math
 
@@ -10,7 +10,7 @@ from stages.kernels.geometry.so3 import exp_rotation
 from stages.kernels.visual.features import best_per_cell
 from stages.kernels.visual.patches import RADIUS_PX, SIDE_PX, at, find, sample, take
 from stages.odometry.visual.features import FeatureSettings, FeatureTracker, usable_pixels
-from tests.stages.seen import LENS, PIXEL_RAD, SIZE_PX, picture
+from tests.stages.seen import LENS, PIXEL_RAD, SIZE_PX, grey_image
 
 
 def tracked(poses, settings=None, expected=None):
@@ -18,13 +18,13 @@ def tracked(poses, settings=None, expected=None):
     seen = []
     for i, (R, p) in enumerate(poses):
         turn = np.eye(3) if i == 0 or expected is None else expected
-        tracker.follow(i + 1, picture(R, np.asarray(p, float), i), turn)
+        tracker.follow(i + 1, grey_image(R, np.asarray(p, float), i), turn)
         seen.append(tracker.complete(np.eye(3)))
     return seen
 
 
-def test_a_template_is_found_where_it_was_moved_to():
-    grey = picture(np.eye(3), np.zeros(3))
+def test_a_shifted_template_is_found():
+    grey = grey_image(np.eye(3), np.zeros(3))
     at = tracked([(np.eye(3), np.zeros(3))])[0].pixel
     shifted = np.roll(grey, (2, 1), axis=(0, 1))  # two rows down, one column right
     place, likeness = find(shifted, take(grey, at), np.stack([np.eye(2)] * len(at)), at)
@@ -42,12 +42,12 @@ def test_a_flat_template_and_an_edge_are_not_found():
         assert find(grey, take(grey, at), np.eye(2)[None], at)[1][0] == -1.0
 
 
-def test_a_template_turned_with_its_warp_is_found_and_without_it_is_not_so_well():
+def test_a_rotated_template_is_found_better_with_its_warp():
     angle = math.radians(25.0)
-    one = picture(np.eye(3), np.zeros(3))
+    one = grey_image(np.eye(3), np.zeros(3))
     c, s = math.cos(angle), math.sin(angle)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])  # about the optical axis
-    other = picture(R.T, np.zeros(3))  # the scene rotates by R in the image
+    other = grey_image(R.T, np.zeros(3))  # the scene rotates by R in the image
     corners = tracked([(np.eye(3), np.zeros(3))])[0].pixel
     centre = np.array(LENS.centre_px)
     there = (corners - centre) @ R[:2, :2].T + centre
@@ -66,8 +66,8 @@ def test_corners_are_spread_over_the_circle():
     off_axis = np.degrees(np.arctan2(np.hypot(*seen.ray[:, :2].T), seen.ray[:, 2]))
     assert off_axis.max() <= 100.5
     assert np.count_nonzero(off_axis > 90) > 5
-    apart = np.linalg.norm(seen.pixel[:, None] - seen.pixel, axis=2) + 1e9 * np.eye(len(seen.pixel))
-    assert apart.min() > 5.0
+    distance = np.linalg.norm(seen.pixel[:, None] - seen.pixel, axis=2) + 1e9 * np.eye(len(seen.pixel))
+    assert distance.min() > 5.0
 
 
 def test_tracks_keep_their_number_and_follow_the_rotation():
@@ -92,16 +92,16 @@ def test_a_mask_and_the_off_axis_limit_keep_corners_out():
 
 def test_a_blank_image_has_no_corners_and_loses_all_tracks():
     tracker = FeatureTracker(LENS, FeatureSettings())
-    assert len(tracker.follow(1, picture(np.eye(3), np.zeros(3)), np.eye(3)).number) == 0
+    assert len(tracker.follow(1, grey_image(np.eye(3), np.zeros(3)), np.eye(3)).number) == 0
     assert len(tracker.complete(np.eye(3)).number) > 100
     blank = np.full((SIZE_PX, SIZE_PX), 80, dtype=np.uint8)
     assert len(tracker.follow(2, blank, np.eye(3)).number) == 0
     assert len(tracker.complete(np.eye(3)).number) == 0
 
 
-def test_a_number_is_never_used_twice_and_forgotten_ones_are_gone():
+def test_a_number_is_never_reused_and_dropped_tracks_are_gone():
     tracker = FeatureTracker(LENS, FeatureSettings())
-    grey = picture(np.eye(3), np.zeros(3))
+    grey = grey_image(np.eye(3), np.zeros(3))
     tracker.follow(1, grey, np.eye(3))
     first = tracker.complete(np.eye(3)).number
     tracker.drop(first[::2])
@@ -114,14 +114,14 @@ def test_a_number_is_never_used_twice_and_forgotten_ones_are_gone():
 
 def test_another_image_size_restarts_and_a_tiny_one_is_rejected():
     tracker = FeatureTracker(LENS, FeatureSettings())
-    tracker.follow(1, picture(np.eye(3), np.zeros(3)), np.eye(3))
+    tracker.follow(1, grey_image(np.eye(3), np.zeros(3)), np.eye(3))
     tracker.complete(np.eye(3))
     assert len(tracker.follow(2, np.zeros((300, 300), np.uint8), np.eye(3)).number) == 0
     with pytest.raises(ValueError, match="16 x 20 pixels is too small"):
         tracker.follow(3, np.zeros((20, 16), np.uint8), np.eye(3))
 
 
-def test_the_best_corner_of_each_empty_cell_is_taken():
+def test_the_best_corner_of_each_empty_cell_is_selected():
     strength = np.zeros((40, 40), dtype=np.float32)
     strength[5, 6], strength[7, 3], strength[30, 31], strength[31, 12] = 3.0, 2.0, 5.0, 4.0
     usable = np.full((40, 40), 255, np.uint8)
@@ -131,7 +131,7 @@ def test_the_best_corner_of_each_empty_cell_is_taken():
     assert best_per_cell(strength, usable, np.array([[29.0, 33.0]]), 20.0, 1.0).tolist() == [[6, 5]]
 
 
-def test_what_is_usable_is_symmetric_about_the_lens():
+def test_the_usable_area_is_symmetric_about_the_lens():
     usable = usable_pixels(LENS, FeatureSettings(), (SIZE_PX, SIZE_PX))
     assert (usable == usable[::-1]).all()
     assert (usable == usable.T).all()

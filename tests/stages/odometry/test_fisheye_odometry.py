@@ -1,4 +1,4 @@
-"""The drone's motion from pictures of a room: both axes conventions, chaining, standing, gyro, and blank pictures."""
+"""The drone's motion from images of a room: both axes conventions, chaining, hover, gyro, and blank images."""
 
 import math
 from itertools import pairwise
@@ -22,7 +22,7 @@ YAW = np.array([0.0, 0.0, 1.0])
 
 
 def flown(turn_radps, velocity_mps, count, mount=LOOKS_DOWN, settings=None, imu=False):
-    """Odometry of a drone that turns and flies evenly: motions and true poses by stamp."""
+    """Odometry of a drone at constant velocity and turn rate: motions and true poses by stamp."""
     odometry = FisheyeOdometry(lens=LENS, T_drone_camera=mount, **(settings or {}))
     truth, motions = {}, []
     for k in range(count):
@@ -53,7 +53,7 @@ def turn_error_deg(truth, motion):
 
 @pytest.mark.parametrize("velocity", [(3, 0, 0), (0, 3, 0), (0, 0, 3), (-2, 1, 0.5)])
 @pytest.mark.parametrize("mount", [LOOKS_DOWN, LOOKS_UP])
-def test_direction_and_turn_are_told_in_the_drones_axes(velocity, mount):
+def test_direction_and_rotation_are_in_drone_axes(velocity, mount):
     motions, truth = flown(0.2 * YAW, velocity, 5, mount)
     assert motions[0] is None
     for motion in motions[1:]:
@@ -64,21 +64,21 @@ def test_direction_and_turn_are_told_in_the_drones_axes(velocity, mount):
         assert motion.matches > 60
 
 
-def test_motions_link_up_key_to_key_and_their_rotations_multiply():
+def test_motions_are_chained_from_key_to_key_and_their_rotations_multiply():
     motions, truth = flown((0.1, -0.1, 0.5), (3, 1, 0), 16)
-    told = motions[1:]
-    keys = list(dict.fromkeys(m.from_ns for m in told))
+    outputs = motions[1:]
+    keys = list(dict.fromkeys(m.from_ns for m in outputs))
     assert len(keys) > 2
     R = np.eye(3)
     for key, following in pairwise(keys):
-        *_, link = (m for m in told if m.from_ns == key)
+        *_, link = (m for m in outputs if m.from_ns == key)
         assert link.stamp_ns == following  # no gap
         R = R @ link.R_from_to
     error = log_rotation(R.T @ truth[keys[0]][0].T @ truth[keys[-1]][0])
     assert math.degrees(np.linalg.norm(error)) < 0.15
 
 
-def test_a_turn_of_120_degrees_a_second_is_followed():
+def test_a_turn_of_120_deg_per_second_is_tracked():
     motions, truth = flown(math.radians(120) * YAW, (1, 0, 0), 10)
     assert all(m is not None for m in motions[1:])
     assert max(turn_error_deg(truth, m) for m in motions[1:]) < 0.15
@@ -94,13 +94,13 @@ def test_hovering_has_no_direction_and_keeps_its_key():
         assert turn_error_deg(truth, motion) < 0.02
 
 
-def test_turning_on_the_spot_has_no_direction():
+def test_a_turn_without_translation_has_no_direction():
     motions, truth = flown(0.6 * YAW, (0, 0, 0), 8)
     assert all(m.direction_from is None for m in motions[1:])
     assert max(turn_error_deg(truth, m) for m in motions[1:]) < 0.1
 
 
-def test_the_errors_lie_within_what_the_covariance_says():
+def test_the_errors_match_the_covariance():
     motions, truth = flown((0.1, 0.2, 0.3), (2, -1, 0.5), 12)
     nees = []
     for m in motions[1:]:
@@ -123,19 +123,21 @@ def test_covariance_and_direction_are_turned_from_the_camera_into_the_drone():
     key, now = (Tracks(s, np.arange(40), np.zeros((40, 3)), np.zeros((40, 2))) for s in (5, 7))
     motion = visual_motion(Link(key, now, key.number, key.ray, now.ray, seen, False), C)
     np.testing.assert_allclose(motion.covariance_rad2, np.diag([4e-6, 1e-6, 9e-6]), atol=1e-18)  # x is the camera's y
-    np.testing.assert_allclose(motion.direction_from, [0, 0, 1], atol=1e-12)  # points sank away along the axis: it rose
+    np.testing.assert_allclose(
+        motion.direction_from, [0, 0, 1], atol=1e-12
+    )  # points move away along the axis: the drone rises
     assert motion.direction_sigma_rad == pytest.approx(math.sqrt(1e-5 + 2.5e-6))
     assert (motion.from_ns, motion.stamp_ns, motion.matches) == (5, 7, 40)
 
 
-def test_a_gyro_finds_again_what_jumped_further_than_was_expected():
+def test_a_gyro_predicts_features_after_a_large_rotation():
     turn = math.radians(400) * YAW
     with_gyro, truth = flown(turn, (0, 0, 0), 3, imu=True)
     assert all(m is not None for m in with_gyro[1:])
     assert max(turn_error_deg(truth, m) for m in with_gyro[1:]) < 0.2
 
 
-def test_the_gyro_is_summed_from_picture_to_picture_and_not_over_holes():
+def test_the_gyro_is_integrated_between_images_but_not_over_gaps():
     rate = np.array([0.0, 0.0, 1.0])
     ms = 1_000_000
     even = [(k * 10 * ms, rate) for k in range(11)]
@@ -146,21 +148,21 @@ def test_the_gyro_is_summed_from_picture_to_picture_and_not_over_holes():
     assert gyro_rotation([(80 * ms, rate)], 5 * ms, 95 * ms) is None
 
 
-def test_a_blank_picture_ends_the_chain_and_the_next_begins_one():
+def test_a_blank_image_ends_the_chain_and_the_next_begins_one():
     odometry = FisheyeOdometry(lens=LENS, T_drone_camera=LOOKS_DOWN)
     blank = np.full((SIZE_PX, SIZE_PX), 60, np.uint8)
     stamps = [1_000_000_000 + k * STEP_NS for k in range(6)]
-    told = []
+    outputs = []
     for k, stamp_ns in enumerate(stamps):
         seen = image(stamp_ns, np.eye(3), np.array([0.2 * k, 0, 0]), LOOKS_DOWN)
         if k in (2, 3):
             seen = Image(stamp_ns=stamp_ns, frame_id="camera", grey=blank)
-        told.append(of(odometry.on_image(seen), VisualMotion))
-    assert [m is not None for m in told] == [False, True, False, False, False, True]
-    assert told[5].from_ns == stamps[4]
+        outputs.append(of(odometry.on_image(seen), VisualMotion))
+    assert [m is not None for m in outputs] == [False, True, False, False, False, True]
+    assert outputs[5].from_ns == stamps[4]
 
 
-def test_a_picture_that_is_not_newer_is_left_out():
+def test_an_image_that_is_not_newer_is_ignored():
     odometry = FisheyeOdometry(lens=LENS, T_drone_camera=LOOKS_DOWN)
     seen = image(1_000_000_000, np.eye(3), np.zeros(3), LOOKS_DOWN)
     assert of(odometry.on_image(seen), VisualMotion) is None
@@ -169,14 +171,14 @@ def test_a_picture_that_is_not_newer_is_left_out():
     assert of(odometry.on_image(later), VisualMotion).from_ns == 1_000_000_000
 
 
-def test_it_shows_what_it_followed_between_which_pictures():
+def test_the_tracked_features_are_published_with_their_images():
     odometry = FisheyeOdometry(lens=LENS, T_drone_camera=LOOKS_DOWN)
     shift = np.array([0.2, 0, 0])
     for k in range(3):
-        told = list(odometry.on_image(image(1_000_000_000 + k * STEP_NS, np.eye(3), k * shift, LOOKS_DOWN)))
-        motion, followed = of(told, VisualMotion), of(told, FollowedFeatures)
+        outputs = list(odometry.on_image(image(1_000_000_000 + k * STEP_NS, np.eye(3), k * shift, LOOKS_DOWN)))
+        motion, followed = of(outputs, VisualMotion), of(outputs, FollowedFeatures)
         if k == 0:
-            assert told == []
+            assert outputs == []
             continue
         assert (followed.stamp_ns, followed.from_ns) == (motion.stamp_ns, motion.from_ns)
         assert followed.frame_id == "camera"
@@ -190,7 +192,7 @@ def test_it_shows_what_it_followed_between_which_pictures():
         assert np.median(followed.residual_rad[followed.agrees]) < 0.3 * PIXEL_RAD
 
 
-def test_the_same_pictures_give_the_same_motions():
+def test_the_same_images_give_the_same_motions():
     one, other = (flown(0.3 * YAW, (2, 0, 0), 5)[0] for _ in range(2))
     for a, b in zip(one[1:], other[1:], strict=True):
         assert (a.R_from_to == b.R_from_to).all()

@@ -1,4 +1,4 @@
-"""Real pictures of a drive, KITTI 00 frames 0-99, with GPS/INS poses: rotation 0.1 deg, direction 1.5 deg, median."""
+"""Real images of a drive, KITTI 00 frames 0-99, with GPS/INS poses: rotation 0.1 deg, direction 1.5 deg, median."""
 
 import math
 from pathlib import Path
@@ -18,12 +18,12 @@ STEP_NS = 100_000_000
 pytestmark = pytest.mark.skipif(not DRIVE.exists(), reason="needs ../shared/data/vo_kitti00")
 
 
-def test_a_real_drive_is_followed_picture_by_picture():
+def test_a_real_drive_is_tracked_image_by_image():
     K, poses = np.loadtxt(DRIVE / "K.txt"), np.loadtxt(DRIVE / "poses.txt").reshape(-1, 3, 4)
     odometry = FisheyeOdometry(
         lens=pinhole(K[0, 0], (K[0, 2], K[1, 2]), 42.9),
         T_drone_camera=Pose(),
-        link={"key_parallax_deg": 0.01},  # every picture is a key: motions from one to the next
+        link={"key_parallax_deg": 0.01},  # every image is a key: motions from one to the next
     )
     turn_deg, direction_deg = [], []
     for i, file in enumerate(sorted((DRIVE / "left").iterdir())):

@@ -1,4 +1,4 @@
-"""Depth of a ray from points around it: planes exactly, their sigma, and silence where there is no plane."""
+"""Depth of a ray from points around it: planes exactly, their sigma, and no depth without a plane."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def test_a_plane_gives_the_depth_of_the_ray_itself():
     assert abs(depth_of(points, turned)[0] - 8.0 / turned[2]) < 1e-6
 
 
-def test_slices_add_up():
+def test_slices_are_summed():
     points = plane((0.2, 0.1, 1), 6.0, 40, noise_m=0.05)
     rays = RayDepths(np.array([[0.0, 0.0, 1.0]]), REACH)
     for part in np.split(points, 4):
@@ -46,19 +46,19 @@ def test_the_stated_sigma_covers_noise():
     assert 0.2 < np.std(off) < 1.2
 
 
-def test_few_points_a_line_and_a_step_say_nothing():
+def test_few_points_a_line_or_a_step_give_no_depth():
     assert np.isnan(depth_of(plane((0, 0, 1), 8.0, 4))[0])
     line = plane((0, 0, 1), 8.0, 40)
     line[:, 0] = 0.0
     assert np.isnan(depth_of(line)[0])
     step = np.vstack([plane((0, 0, 1), 8.0, 20), plane((0, 0, 1), 12.0, 20, seed=1)])
     assert np.isnan(depth_of(step)[0])
-    assert np.isnan(depth_of(np.add(plane((0, 0, 1), 8.0, 40), [3.0, 0.0, 0.0]))[0])  # elsewhere
+    assert np.isnan(depth_of(np.add(plane((0, 0, 1), 8.0, 40), [3.0, 0.0, 0.0]))[0])  # at another position
     assert np.isnan(depth_of(-plane((0, 0, 1), 8.0, 40))[0])  # behind
     assert np.isnan(depth_of(plane((0, 0, 1), 0.3, 40))[0])  # the sensor's own mount
 
 
-def test_no_rays_and_no_points_are_fine():
+def test_no_rays_and_no_points_are_valid():
     rays = RayDepths(np.zeros((0, 3)), REACH)
     rays.add(plane((0, 0, 1), 8.0, 5))
     assert len(rays.depths().inverse_m) == 0

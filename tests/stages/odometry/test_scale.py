@@ -1,4 +1,4 @@
-"""The length of a motion: formula by hand, wrong depths left out, and too few."""
+"""The length of a motion: formula by hand, wrong depths, and too few."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_the_length_is_found_and_its_sigma_covers_the_error():
     assert 0.3 < np.std(off) < 1.6
 
 
-def test_a_third_of_wrong_depths_is_left_out():
+def test_a_third_of_wrong_depths_is_rejected():
     rho, sigma, inverse, inverse_sigma, length, _ = with_depths(60, 1e-4, 0.01)
     inverse[::3] *= 3.0
     assert length_of(rho, sigma, inverse, inverse_sigma).m == pytest.approx(length, rel=0.03)
@@ -61,7 +61,7 @@ def test_the_sigma_of_the_length_grows_with_the_sigma_of_the_depths():
     assert found.sigma_m / found.m == pytest.approx(np.hypot(np.hypot(0.2, 0.01) / 10.0, 0.004), rel=1e-6)
 
 
-def test_nothing_known_or_nothing_parted_is_no_length():
+def test_without_depths_or_parallax_there_is_no_length():
     rho, sigma, inverse, inverse_sigma, _, _ = with_depths(60)
     assert length_of(rho, sigma, np.full(60, np.nan), inverse_sigma) is None
     assert length_of(0.0 * rho, sigma, inverse, inverse_sigma) is None
@@ -69,7 +69,7 @@ def test_nothing_known_or_nothing_parted_is_no_length():
     assert length_of(rho, sigma, inverse, inverse_sigma) is None
 
 
-def test_few_features_are_believed_only_near_what_was_expected():
+def test_few_features_are_accepted_only_near_the_expected_length():
     rho, sigma, inverse, inverse_sigma, length, _ = with_depths(60, 1e-4, 0.01)
     many = length_of(rho, sigma, inverse, inverse_sigma)
     few = length_of(rho[:9], sigma[:9], inverse[:9], inverse_sigma[:9])
@@ -79,7 +79,7 @@ def test_few_features_are_believed_only_near_what_was_expected():
     assert is_plausible(few, type(few)(length, 0.1, 0))
 
 
-def test_steps_add_up_with_their_covariance():
+def test_steps_are_composed_with_their_covariance():
     rng = np.random.default_rng(2)
     start = Pose6(exp_rotation(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2.0, 3.0]), 1e-4 * np.eye(6))
     step = Step(

@@ -1,4 +1,4 @@
-"""Motion from rays: the error by hand, any direction of the sphere, noise, outliers, standing, and too little."""
+"""Motion from rays: the error by hand, any direction of the sphere, noise, outliers, no motion, and too few rays."""
 
 import math
 
@@ -54,7 +54,7 @@ def test_exact_rays_give_the_exact_motion():
 @pytest.mark.parametrize("turn", [(0, 0, 0), (0.3, 0, 0), (0, -0.3, 0), (0, 0, 0.3)])
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_every_axis_of_turn_and_travel_is_told_apart(turn, axis, sign):
+def test_every_axis_of_rotation_and_translation_is_distinguished(turn, axis, sign):
     move = np.zeros(3)
     move[axis] = 0.8 * sign
     earlier, later, R, t = point_rays(120, turn, move, noise_rad=3e-4)
@@ -63,7 +63,7 @@ def test_every_axis_of_turn_and_travel_is_told_apart(turn, axis, sign):
     assert degrees_between(found.t_hat_later, t) < 0.5
 
 
-def test_turning_both_cameras_turns_the_answer():
+def test_turning_both_cameras_turns_the_result():
     earlier, later, _, _ = point_rays(150, TURN, MOVE, noise_rad=2e-4)
     one = motion(earlier, later)
     Q = exp_rotation(np.array([0.4, 1.0, -0.7]))
@@ -72,7 +72,7 @@ def test_turning_both_cameras_turns_the_answer():
     assert degrees_between(other.t_hat_later, Q @ one.t_hat_later) < 0.05
 
 
-def test_forty_of_a_hundred_outliers_are_left_out():
+def test_40_percent_of_outliers_are_rejected():
     for seed in range(5):
         earlier, later, R, t = point_rays(200, TURN, MOVE, noise_rad=3e-4, outliers=0.4, seed=seed)
         found = motion(earlier, later)
@@ -81,7 +81,7 @@ def test_forty_of_a_hundred_outliers_are_left_out():
         assert 95 < np.count_nonzero(found.inlier) < 135
 
 
-def test_the_stated_covariance_is_that_of_the_errors():
+def test_the_covariance_matches_the_errors():
     turn_nees, direction_nees = [], []
     for seed in range(60):
         earlier, later, R, t = point_rays(100, TURN, MOVE, noise_rad=5e-4, seed=seed)
@@ -94,7 +94,7 @@ def test_the_stated_covariance_is_that_of_the_errors():
     assert 1.3 < np.mean(direction_nees) < 3.0  # 2 axes
 
 
-def test_the_motion_told_backwards_is_the_inverse():
+def test_the_reversed_motion_is_the_inverse():
     earlier, later, R, t = point_rays(150, TURN, MOVE, noise_rad=1e-4)
     found = backwards(motion(earlier, later))
     assert np.linalg.norm(log_rotation(found.R_earlier_later @ R)) < 1e-3
@@ -113,14 +113,14 @@ def test_rotation_alone_is_recognised_and_has_no_direction():
         assert (found.covariance[3:] == 0).all()
 
 
-def test_nothing_moves_and_nothing_is_told_to_move():
+def test_no_motion_gives_no_motion():
     earlier, later, _, _ = point_rays(150, (0, 0, 0), (0, 0, 0), noise_rad=3e-4, outliers=0.2)
     found = motion(earlier, later)
     assert found.t_hat_later is None
     assert np.linalg.norm(log_rotation(found.R_later_earlier)) < 3e-4
 
 
-def test_a_few_near_points_tell_of_a_motion_under_a_wide_sky():
+def test_a_few_near_points_determine_the_motion_under_a_wide_sky():
     sky = point_rays(200, TURN, (0, 0, 0), noise_rad=1e-4, seed=3)
     near = point_rays(40, TURN, MOVE, noise_rad=1e-4, seed=4)
     found = motion(np.vstack([sky[0], near[0]]), np.vstack([sky[1], near[1]]))
@@ -128,7 +128,7 @@ def test_a_few_near_points_tell_of_a_motion_under_a_wide_sky():
     assert degrees_between(found.t_hat_later, near[3]) < 1.0
 
 
-def test_the_error_that_all_share_limits_the_covariance():
+def test_the_common_error_limits_the_covariance():
     earlier, later, _, _ = point_rays(2000, TURN, MOVE)
     found = motion(earlier, later, noise=Noise(1e-4, 1e-3))
     assert math.sqrt(found.covariance[0, 0]) == pytest.approx(1e-3, rel=0.1)
@@ -143,7 +143,7 @@ def test_too_few_points_or_no_agreement_is_none():
     assert motion(one, other) is None
 
 
-def test_the_same_rays_give_the_same_answer():
+def test_the_same_rays_give_the_same_result():
     earlier, later, _, _ = point_rays(100, TURN, MOVE, noise_rad=1e-3, outliers=0.3)
     one, other = motion(earlier, later), motion(earlier, later)
     assert (one.R_later_earlier == other.R_later_earlier).all()
@@ -164,7 +164,7 @@ def test_the_cost_is_least_at_the_truth():
     assert cost_of(earlier, later, exp_rotation(np.array([0.0, 0.01, 0.0])) @ R, t, 2e-4)[0] > 2 * least
 
 
-def test_refining_comes_back_from_a_near_start():
+def test_refinement_converges_from_a_near_start():
     earlier, later, R, t = point_rays(100, TURN, MOVE)
     t = t / np.linalg.norm(t)
     away = t + 0.05 * across(t)[:, 0]

@@ -1,4 +1,4 @@
-"""The depth image: where a point falls, what stays, and the way back."""
+"""The depth image: projection, nearest return, and unprojection."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_canvas_gives_its_image_away_and_begins_empty():
     assert (image.start_ns, image.stamp_ns) == (START_NS, START_NS + 20)
     assert (image.points, image.returns, image.lost_packets, image.turned_rad) == (2, 3, 2, 3.0)
     assert (image.depth_m > 0).sum() == 2
-    again = canvas.take(START_NS + 30, turned_rad=0.0)
-    assert (again.points, again.returns, again.lost_packets) == (0, 0, 0)
-    assert not again.depth_m.any()
+    empty = canvas.take(START_NS + 30, turned_rad=0.0)
+    assert (empty.points, empty.returns, empty.lost_packets) == (0, 0, 0)
+    assert not empty.depth_m.any()
     assert image.depth_m.any()

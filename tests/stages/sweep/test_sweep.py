@@ -1,4 +1,4 @@
-"""Sweep: packets wait for their angle, a sweep ends where the servo has gone its way, and nothing is invented."""
+"""Sweep: packets wait for their angle, a sweep ends after its travel, and nothing is extrapolated."""
 
 from __future__ import annotations
 

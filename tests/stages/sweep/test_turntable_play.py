@@ -1,4 +1,4 @@
-"""A gear with play: the turntable hangs back by half of it, on the side it comes from."""
+"""Gear play: the turntable lags by half of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Prediction and update against the textbook, and against many small steps."""
+"""Prediction and update by hand and against many small steps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_prediction_by_hand():
     assert forward[0, 1] == forward[0, 4] == 0
 
 
-def test_one_step_is_as_many_small_ones():
+def test_one_step_equals_many_small_ones():
     at_once = predicted(X, P, 1.0, 2.0)
     x, P_ = X, P
     for _ in range(50):
@@ -33,7 +33,7 @@ def test_one_step_is_as_many_small_ones():
     np.testing.assert_allclose(P_, at_once[1])
 
 
-def test_no_time_changes_nothing_and_back_in_time_nothing_is_surer():
+def test_zero_time_changes_nothing_and_negative_time_does_not_reduce_the_covariance():
     same = predicted(X, P, 0.0, 2.0)
     np.testing.assert_array_equal(same[0], X)
     np.testing.assert_array_equal(same[1], P)
@@ -50,7 +50,7 @@ def test_conditioning_on_a_linear_measurement_is_the_kalman_update(rows):
     noise = 0.3 * np.eye(rows)
     S = H @ P @ H.T
     z = RNG.normal(size=rows)
-    change = S @ np.linalg.solve(S + noise, z)  # of y: z is beside the prediction
+    change = S @ np.linalg.solve(S + noise, z)  # of y, for the residual z
     S_after = S - S @ np.linalg.solve(S + noise, S)
     x, after = condition(X, P, H3, change, S_after)
     K = P @ H.T @ np.linalg.inv(S + noise)
@@ -58,14 +58,14 @@ def test_conditioning_on_a_linear_measurement_is_the_kalman_update(rows):
     np.testing.assert_allclose(after, (np.eye(6) - K @ H) @ P, atol=1e-9)
 
 
-def test_an_answer_like_the_prediction_changes_nothing():
+def test_a_posterior_equal_to_the_prediction_changes_nothing():
     H = RNG.normal(size=(2, 3))
     x, after = condition(X, P, H, np.zeros(2), H @ P[:3, :3] @ H.T)
     np.testing.assert_array_equal(x, X)
     np.testing.assert_allclose(after, P)
 
 
-def test_the_state_has_the_answers_mean_and_covariance_afterwards():
+def test_after_conditioning_the_state_has_the_posteriors_mean_and_covariance():
     H, change, S_after = RNG.normal(size=(2, 3)), np.array([0.4, -0.2]), np.array([[0.02, 0.01], [0.01, 0.03]])
     x, after = condition(X, P, H, change, S_after)
     np.testing.assert_allclose(H @ (x - X)[:3], change)
@@ -74,7 +74,7 @@ def test_the_state_has_the_answers_mean_and_covariance_afterwards():
     assert np.linalg.eigvalsh(after)[0] > 0
 
 
-def test_one_number_is_the_scalar_update_and_conditioning_agrees():
+def test_the_scalar_update_agrees_with_conditioning():
     h = np.array([0.6, 0.0, 0.8])
     x, after = measured(X, P, h, 0.5, 0.2)
     s = h @ P[:3, :3] @ h

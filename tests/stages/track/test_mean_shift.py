@@ -1,4 +1,4 @@
-"""Equation 6 of P III.C by hand and under turns and shifts; the covariance by hand."""
+"""Equation 6 of P III.C by hand and under rotation and translation; the covariance by hand."""
 
 # ruff: noqa: RUF005 (arrays are added here, not joined)
 
@@ -26,7 +26,7 @@ def test_one_step_is_equation_6_by_hand():
     assert (iterations, shift_m) == (1, pytest.approx(0.6 * w / (1 + w)))
 
 
-def test_each_step_weighs_anew_from_where_it_stands():
+def test_each_step_recomputes_the_weights():
     points = RNG.normal(0, 0.4, (30, 3)) + [1.0, 2.0, 20.0]
     t = np.array([0.8, 2.3, 19.9])
     for _ in range(3):
@@ -37,7 +37,7 @@ def test_each_step_weighs_anew_from_where_it_stands():
     assert iterations == 3
 
 
-def test_one_return_is_reached_in_one_step_and_the_next_stands_still():
+def test_one_return_is_reached_in_one_step():
     t, _, iterations, shift_m = mean_shift(np.array([[0.5, -0.2, 9.0]]), np.array([0.0, 0.0, 9.5]), 10, 1e-4)
     np.testing.assert_allclose(t, [0.5, -0.2, 9.0])
     assert iterations == 2
@@ -51,10 +51,10 @@ def test_it_ends_after_n_max_or_when_a_step_is_short():
     _, _, iterations, shift_m = mean_shift(points, start, 100, 1e-3)
     assert iterations < 30
     assert shift_m < 1e-3
-    np.testing.assert_array_equal(start, [0.7, 0.0, 0.0])  # the caller's t_0 is not touched
+    np.testing.assert_array_equal(start, [0.7, 0.0, 0.0])  # the caller's t_0 is unchanged
 
 
-def test_moving_and_turning_the_world_moves_and_turns_the_fix():
+def test_mean_shift_is_invariant_to_rotation_and_translation():
     points = RNG.normal(0, 0.3, (40, 3))
     start = np.array([0.2, -0.1, 0.3])
     t, *_ = mean_shift(points, start, 10, 1e-6)
@@ -86,7 +86,7 @@ def test_the_covariance_of_one_return_is_the_formula_by_hand():
     np.testing.assert_allclose(P, np.diag([0.0319, 0.0319, 0.0309]), atol=1e-12)
 
 
-def test_scatter_counts_by_its_effective_number_and_crossings_divide():
+def test_the_scatter_is_divided_by_the_effective_number_and_the_span_by_the_crossings():
     points = [[0.1, 0, 20.0], [-0.1, 0, 20.0]]
     P = covariance(points, beam_crossings=2)
     assert P[0, 0] == pytest.approx(0.01 / 2 + 0.015 + 0.0019)  # S = 0.01, n_eff = 2
@@ -95,7 +95,7 @@ def test_scatter_counts_by_its_effective_number_and_crossings_divide():
     assert weighted[0, 0] == pytest.approx(0.03 / (16 / 10) + 0.015 + 0.0019)  # mean 0, S = 0.03, n_eff = 16 / 10
 
 
-def test_the_covariance_turns_with_the_world_and_looks_from_the_lidar():
+def test_the_covariance_rotates_with_the_points_about_the_lidar():
     points = RNG.normal(0, 0.1, (9, 3)) + [8.0, 3.0, 12.0]
     R = rotation_z(math.pi / 2)
     np.testing.assert_allclose(covariance(points @ R.T), R @ covariance(points) @ R.T, atol=1e-12)

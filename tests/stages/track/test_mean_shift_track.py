@@ -1,4 +1,4 @@
-"""MeanShiftTrack: frames on the points' own clock, the states, loss, rivals, and a flight."""
+"""MeanShiftTrack: frames by the points' stamps, states, loss, rivals, and a flight."""
 
 # ruff: noqa: RUF005 (arrays are added here, not joined)
 
@@ -58,12 +58,12 @@ def test_nothing_is_tracked_before_a_detection():
     assert all(s.frame_s == 0.12 for s in states)
 
 
-def test_a_refused_detection_starts_nothing():
-    _, states = run(MeanShiftTrack(), [empty(0), detections(refused=[T0]), swept([T0], at(5))])
+def test_a_rejected_detection_starts_no_track():
+    _, states = run(MeanShiftTrack(), [empty(0), detections(rejected=[T0]), swept([T0], at(5))])
     assert states[0].state == TrackingState.SEARCHING
 
 
-def test_only_returns_within_the_radius_vote():
+def test_only_returns_within_the_radius_count():
     stage = MeanShiftTrack(acquire_radius_m=1.0)
     inside, outside = T0 + [0.99, 0, 0], T0 + [0, 1.01, 0]
     fixes, states = run(stage, [empty(0), detections(T0), swept([inside, outside], at(5))])
@@ -71,7 +71,7 @@ def test_only_returns_within_the_radius_vote():
     np.testing.assert_allclose(fixes[0].xyz_vehicle_m, inside, atol=1e-6)
 
 
-def test_the_radius_stays_around_where_the_frame_began():
+def test_the_radius_is_about_the_position_at_the_start_of_the_frame():
     """F is fixed for the frame: the second return is near the first, but not near t^0."""
     stage = MeanShiftTrack(acquire_radius_m=1.0)
     fixes, _ = run(
@@ -88,7 +88,7 @@ def test_the_best_accepted_detection_starts_the_track():
     assert states[0].reason == "started at a detection; 1 returns"
 
 
-def test_the_first_hits_are_looked_for_farther_than_later_ones():
+def test_the_first_returns_are_searched_within_the_acquisition_radius():
     far = T0 + [0, 2.5, 0]
     messages = [empty(0), detections(T0), swept([far], at(5)), swept([far + [0, 2.5, 0]], at(130))]
     fixes, _ = run(MeanShiftTrack(), messages)
@@ -97,7 +97,7 @@ def test_the_first_hits_are_looked_for_farther_than_later_ones():
     assert run(MeanShiftTrack(acquire_radius_m=1.0), messages)[0] == []  # the paper's
 
 
-def test_a_slice_over_the_frame_border_is_split_by_time():
+def test_a_slice_across_a_frame_boundary_is_split_by_time():
     points = [T0, T0 + [0.2, 0, 0], T0 + [0.4, 0, 0]]
     stamps = [at(119.9), at(120.0), at(120.1)]
     fixes, states = run(MeanShiftTrack(), [empty(0), detections(T0), swept(points, stamps)])
@@ -106,7 +106,7 @@ def test_a_slice_over_the_frame_border_is_split_by_time():
     assert fixes[1].xyz_vehicle_m[0] == pytest.approx(T0[0] + 0.3, abs=0.01)
 
 
-def test_how_points_are_sliced_does_not_matter():
+def test_the_fixes_do_not_depend_on_the_slices():
     rng = np.random.default_rng(1)
     stamps = np.sort(rng.integers(0, 1000 * MS, 400)) + START_NS
     points = T0 + rng.normal(0, 0.3, (400, 3))
@@ -122,14 +122,14 @@ def test_how_points_are_sliced_does_not_matter():
     assert digest(3) == digest(37) == digest(400)
 
 
-def test_the_fix_is_stamped_with_the_weighted_mean_time_of_its_hits():
+def test_the_fix_has_the_weighted_mean_time_of_its_returns():
     points, stamps = [T0 + [0.5, 0, 0], T0 - [0.5, 0, 0], T0], [at(10), at(20), at(60)]
     fixes, _ = run(MeanShiftTrack(), [empty(0), detections(T0), swept(points, stamps)])
     w = math.exp(-0.25)
     assert (fixes[0].stamp_ns - START_NS) / MS == pytest.approx((10 * w + 20 * w + 60) / (1 + 2 * w), abs=0.01)
 
 
-def test_frames_without_hits_are_normal_until_the_time_is_up_and_then_it_searches():
+def test_after_lost_after_s_without_returns_it_searches():
     messages = [empty(0), detections(T0), swept([T0], at(5)), *[empty(ms) for ms in range(10, 4000, 10)]]
     fixes, states = run(MeanShiftTrack(lost_after_s=3.0), messages)
     assert len(fixes) == 1
@@ -146,27 +146,27 @@ def test_frames_without_hits_are_normal_until_the_time_is_up_and_then_it_searche
 def test_after_loss_the_next_accepted_detection_starts_again():
     stage = MeanShiftTrack(lost_after_s=0.5)
     run(stage, [empty(0), detections(T0), *[empty(ms) for ms in range(10, 1000, 10)]], finish=False)
-    elsewhere = T0 + [15, 0, 0]
-    fixes, states = run(stage, [detections(elsewhere, stamp_ns=at(1000)), swept([elsewhere], at(1010))])
-    np.testing.assert_allclose(fixes[0].xyz_vehicle_m, elsewhere, atol=1e-5)
+    distant = T0 + [15, 0, 0]
+    fixes, states = run(stage, [detections(distant, stamp_ns=at(1000)), swept([distant], at(1010))])
+    np.testing.assert_allclose(fixes[0].xyz_vehicle_m, distant, atol=1e-5)
     assert states[-1].state == TrackingState.TRACKING
 
 
-def test_fewer_hits_than_asked_for_make_no_fix():
+def test_fewer_returns_than_min_hits_give_no_fix():
     fixes, states = run(MeanShiftTrack(min_hits=2), [empty(0), detections(T0), swept([T0], at(5))])
     assert fixes == []
     assert states[0].hits == 1
     assert states[0].state == TrackingState.TRACKING
 
 
-def test_a_long_silence_of_the_lidar_does_not_make_a_frame_for_each_0_12_s():
+def test_a_long_gap_of_the_lidar_gives_one_frame():
     _, states = run(MeanShiftTrack(), [empty(0), detections(T0), swept([T0], at(5)), empty(600_000), empty(600_130)])
     assert [s.state.name for s in states] == ["TRACKING", "LOST", "SEARCHING"]
     assert (states[1].stamp_ns - START_NS) % (120 * MS) == 0
 
 
 def sweeps(stage, rival_each, hits_here):
-    """Sweeps of 1 s; in each the track is hit or not, then a detection far away or none comes."""
+    """Sweeps of 1 s, each with or without returns of the track, and then a distant detection or none."""
     rival = T0 + [10, 0, 0]
     run(stage, [empty(0), detections(T0), swept([T0], at(5))], finish=False)
     states = []
@@ -176,26 +176,26 @@ def sweeps(stage, rival_each, hits_here):
         messages += [empty(start + ms) for ms in range(10, 900, 100)]
         messages.append(detections(rival, stamp_ns=at(start + 950)) if there else detections(stamp_ns=at(start + 950)))
         states += run(stage, messages, finish=False)[1]
-    return stage._now.t_hat, states
+    return stage._state.t_hat, states
 
 
-def test_a_rival_must_be_seen_in_two_sweeps_in_a_row():
+def test_a_rival_needs_two_successive_sweeps():
     assert sweeps(MeanShiftTrack(), [True], True)[0][0] == pytest.approx(T0[0])
     assert sweeps(MeanShiftTrack(), [True, False, True], True)[0][0] == pytest.approx(T0[0])
     moved, _ = sweeps(MeanShiftTrack(), [True, True], True)
     assert moved[0] == pytest.approx(T0[0] + 10)
 
 
-def test_a_rival_wins_at_once_when_the_last_sweep_had_no_hit_here():
+def test_a_rival_replaces_the_track_at_once_after_a_sweep_without_returns():
     stage = MeanShiftTrack(lost_after_s=10.0)
     assert sweeps(stage, [True], False)[0][0] == pytest.approx(T0[0])  # a hit since the start: at 5 ms
     stage.on_detections(detections(T0 + [10, 0, 0], stamp_ns=at(2900)))
-    assert stage._now.t_hat[0] == pytest.approx(T0[0] + 10)
+    assert stage._state.t_hat[0] == pytest.approx(T0[0] + 10)
     _, states = run(stage, [empty(2950), empty(3100)])
     assert any("moved 10.0 m to a detection: the last sweep had no return here" in s.reason for s in states)
 
 
-def test_the_papers_tracker_never_looks_back():
+def test_the_papers_tracker_ignores_rivals():
     assert sweeps(MeanShiftTrack(rival_sweeps=None), [True] * 4, True)[0][0] == pytest.approx(T0[0])
 
 
@@ -203,10 +203,10 @@ def test_a_detection_near_the_track_changes_nothing():
     stage = MeanShiftTrack()
     run(stage, [empty(0), detections(T0), swept([T0], at(5)), empty(130)], finish=False)
     stage.on_detections(detections(T0 + [0.5, 0, 0], T0 + [10, 0, 0], stamp_ns=at(140)))
-    np.testing.assert_allclose(stage._now.t_hat, T0, atol=1e-5)
+    np.testing.assert_allclose(stage._state.t_hat, T0, atol=1e-5)
 
 
-def test_the_tracker_follows_a_drone_slower_than_a_radius_a_frame():
+def test_a_drone_slower_than_a_radius_per_frame_is_tracked():
     rng = np.random.default_rng(4)
     messages = [empty(0), detections(T0)]
     for ms in range(5, 3000, 5):
@@ -220,7 +220,7 @@ def test_the_tracker_follows_a_drone_slower_than_a_radius_a_frame():
     assert {s.state for s in states} == {TrackingState.TRACKING}
 
 
-def test_turning_the_world_turns_the_fix():
+def test_the_fix_rotates_with_the_scene():
     rng = np.random.default_rng(2)
     points = T0 + rng.normal(0, 0.2, (30, 3))
 
@@ -234,29 +234,31 @@ def test_turning_the_world_turns_the_fix():
     np.testing.assert_allclose(there.covariance_m2, R @ here.covariance_m2 @ R.T, atol=1e-5)
 
 
-def test_packets_to_positions_the_whole_chain_finds_and_follows_a_ball():
-    """A half-turn sweep, then vibration +-5 deg with a beam on the ball, which drifts at 0.4 m/s."""
+def test_sweep_detection_and_tracking_follow_a_ball():
+    """A sweep of 180 deg, then vibration by +-5 deg about the ball, which moves at 0.4 m/s."""
 
-    way = flying((3.0, 2.0, 12.0), (0.4, 0.0, 0.0))
+    trajectory = flying((3.0, 2.0, 12.0), (0.4, 0.0, 0.0))
 
     def servo_rad(t):
         aimed_s = 206.0 / 90.0  # the fan's plane goes through the ball at 26 deg, and so at 206 deg
         return np.radians(np.where(t < aimed_s, 90.0 * t, 206.0 + 5.0 * np.sin(2 * np.pi * 2.86 * (t - aimed_s))))
 
     sweep, detect, track = Sweep(mount=ON_ITS_SIDE), KernelDetect(span_m=0.5), MeanShiftTrack()
-    fixes, verdicts = [], []
-    for message in seen([Ball(way, 0.25)], servo_rad, 3.5):
+    fixes, summaries = [], []
+    for message in seen([Ball(trajectory, 0.25)], servo_rad, 3.5):
         for out in sweep.on_servo(message) if hasattr(message, "goal_rad") else sweep.on_firings(message):
             if isinstance(out, DepthImage):
                 _, found = detect.on_image(out)
-                verdicts.append(found.summary)
+                summaries.append(found.summary)
                 track.on_detections(found)
             elif isinstance(out, SweptPoints):
                 fixes += [m for m in track.on_points(out) if isinstance(m, DroneFix)]
-    assert len(verdicts) == 1
-    assert verdicts[0].startswith("drone at (3.")
+    assert len(summaries) == 1
+    assert summaries[0].startswith("drone at (3.")
     assert len(fixes) >= 5
-    errors = np.array([f.xyz_vehicle_m for f in fixes]) - way(np.array([f.stamp_ns - START_NS for f in fixes]) * 1e-9)
+    errors = np.array([f.xyz_vehicle_m for f in fixes]) - trajectory(
+        np.array([f.stamp_ns - START_NS for f in fixes]) * 1e-9
+    )
     nees = [e @ np.linalg.solve(f.covariance_m2, e) for e, f in zip(errors, fixes, strict=True)]
     assert np.abs(errors).max() < 0.35
     assert np.mean(nees) < 9.0
@@ -266,6 +268,6 @@ def test_packets_to_positions_the_whole_chain_finds_and_follows_a_ball():
     "settings",
     [{"radius_m": 0.0}, {"frame_s": 0.0}, {"max_iterations": 0}, {"lost_after_s": -1}, {"min_hits": 0}, {"rival": 1}],
 )
-def test_impossible_settings_are_refused(settings):
+def test_impossible_settings_are_rejected(settings):
     with pytest.raises(ValidationError):
         MeanShiftTrack(**settings)

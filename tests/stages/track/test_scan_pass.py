@@ -1,4 +1,4 @@
-"""One look: where the drone is found beside the prediction, however the vehicle leans."""
+"""One scan pass: the drone's position relative to the prediction, for several vehicle attitudes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.kernels.geometry.so3 import exp_rotation
-from stages.kernels.track.hull import DEPTH, GLIMPSE, HIT, KIND, A
+from stages.kernels.track.hull import DEPTH, GAP_RETURN, KIND, RETURN, A
 from stages.messages import SweptPulses
 from stages.track.hull import COLUMNS
 from stages.track.scan_pass import collect_into, drone_returns, evaluate
@@ -19,7 +19,7 @@ EXPECTED_M = np.array([0.3, 0.4, 12.0])  # nearly overhead
 
 
 def fan(R_map_vehicle, drone_m):
-    """Pulses each 3 cm over a square metre about the prediction, from the vehicle's origin; the drone returns some."""
+    """Pulses each 3 cm over a square metre about the prediction; those that hit the drone return."""
     side = np.linspace(-0.5, 0.5, 34)
     positions = EXPECTED_M + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2) @ np.eye(2, 3)
     length = np.linalg.norm(positions, axis=1)
@@ -36,11 +36,11 @@ def fan(R_map_vehicle, drone_m):
     )
 
 
-@pytest.mark.parametrize("lean_deg", [(0, 0, 0), (8, 0, 0), (0, -15, 0), (5, 5, 120)])
-@pytest.mark.parametrize("beside_m", [(0.2, 0.0, 0.0), (0.0, -0.2, 0.0)])
-def test_a_drone_beside_the_prediction_is_found_on_its_own_side_however_the_vehicle_leans(lean_deg, beside_m):
-    R = exp_rotation(np.radians(lean_deg).astype(np.float64))
-    drone_m = EXPECTED_M + beside_m
+@pytest.mark.parametrize("tilt_deg", [(0, 0, 0), (8, 0, 0), (0, -15, 0), (5, 5, 120)])
+@pytest.mark.parametrize("offset_m", [(0.2, 0.0, 0.0), (0.0, -0.2, 0.0)])
+def test_a_drone_next_to_the_prediction_is_estimated_for_any_vehicle_attitude(tilt_deg, offset_m):
+    R = exp_rotation(np.radians(tilt_deg).astype(np.float64))
+    drone_m = EXPECTED_M + offset_m
     pulses = fan(R, drone_m)
     axis = pulses.direction_vehicle.mean(axis=0).astype(np.float64)
     x, P = np.concatenate([EXPECTED_M, np.zeros(3)]), np.diag([0.2**2] * 3 + [1.0] * 3)
@@ -52,11 +52,11 @@ def test_a_drone_beside_the_prediction_is_found_on_its_own_side_however_the_vehi
     assert math.dist(seen.x[:2], drone_m[:2]) < 0.03
 
 
-@pytest.mark.parametrize(("behind_m", "kinds"), [(0.1, {HIT, GLIMPSE}), (0.4, {HIT}), (0.7, set())])
-def test_what_is_seen_through_a_gap_has_to_be_nearer_to_the_prediction(behind_m, kinds):
-    """Three returns behind it; one sigma there is .14 m: .7, 2.8 and 5 of them."""
+@pytest.mark.parametrize(("behind_m", "kinds"), [(0.1, {RETURN, GAP_RETURN}), (0.4, {RETURN}), (0.7, set())])
+def test_gap_returns_have_to_be_nearer_to_the_prediction(behind_m, kinds):
+    """Three returns behind the prediction, at 0.7, 2.8 and 5 sigma of 0.14 m."""
     found = set()
-    for kind in (HIT, GLIMPSE):
+    for kind in (RETURN, GAP_RETURN):
         pulses = np.zeros((3, COLUMNS))
         pulses[:, A], pulses[:, DEPTH], pulses[:, KIND] = (-0.05, 0.0, 0.05), behind_m, kind
         if drone_returns(pulses, SPAN_M, 0.1) is not None:

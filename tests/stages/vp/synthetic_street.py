@@ -22,7 +22,7 @@ def street(R_world_camera, lens, size_px=480, wall_turns_deg=(0.0, 0.0), noise=1
     """Grey image of a street along x; its left and right walls are rotated, each by its own angle.
 
     The camera is `up_m` over the road; the walls stand 7 m away and are 10 m high. `row_turn` (3,) [rad]: how the
-    camera turns from row to row, its own axes; it is where R_world_camera says at the middle one.
+    camera turns from row to row, its own axes; R_world_camera is its rotation at the middle row.
     """
     middle = 0.5 * (size_px - 1)
     turns = [np.eye(3) if row_turn is None else exp_rotation((k - middle) * row_turn) for k in range(size_px)]

@@ -21,7 +21,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def lines_along(directions, each=20, turn_sigma_deg=0.5, noise_deg=0.2, seed=0, loose=0):
-    """Lines seen in all places that run along directions (k, 3), and loose ones that run anywhere."""
+    """Lines at random positions along directions (k, 3), and lines of random direction."""
     rng = np.random.default_rng(seed)
     normals, middles, sigmas = [], [], []
     for d in np.vstack([np.repeat(directions, each, axis=0), rng.normal(size=(loose, 3))]):

@@ -80,14 +80,14 @@ def test_the_edge_of_the_image_circle_is_no_line():
 
 
 def test_segments_are_the_longest_and_longest_first():
-    picture = np.full((200, 200), 60, dtype=np.uint8)
-    cv2.rectangle(picture, (40, 40), (160, 100), 200, -1)
+    image = np.full((200, 200), 60, dtype=np.uint8)
+    cv2.rectangle(image, (40, 40), (160, 100), 200, -1)
     v = view(off_axis_deg=30)
-    lengths = segment_length_px(v.segments(picture, 20.0, 100))
+    lengths = segment_length_px(v.segments(image, 20.0, 100))
     assert len(lengths) == 4
     np.testing.assert_allclose(lengths, [120, 120, 60, 60], atol=4)
-    assert len(v.segments(picture, 20.0, 2)) == 2
-    assert len(v.segments(picture, 100.0, 100)) == 2
+    assert len(v.segments(image, 20.0, 2)) == 2
+    assert len(v.segments(image, 100.0, 100)) == 2
     assert v.segments(np.full((200, 200), 9, dtype=np.uint8), 5.0, 9).shape == (0, 4)
 
 

@@ -90,7 +90,7 @@ def test_votes_near_a_taken_direction_do_not_count_on_either_side_of_the_sphere(
     lines = normals, np.ones(len(normals)), rng.uniform(0, math.pi, len(normals)), 90
     assert abs(fullest(*vote(*lines, NONE, APART))[0] @ first) > 0.999
     assert abs(fullest(*vote(*lines, -first[None], APART))[0] @ second) > 0.999
-    assert abs(fullest(*vote(*lines, first[None], 0.0))[0] @ first) > 0.999, "apart by 0: counts"
+    assert abs(fullest(*vote(*lines, first[None], 0.0))[0] @ first) > 0.999, "separation 0: counts"
 
 
 def test_without_lines_there_is_no_vote():

@@ -31,7 +31,7 @@ FAR = (-HALF_LENGTH_M, HALF_LENGTH_M)
 
 
 def campus(settings: SceneSettings, corridor: VehicleCorridor, rng: Generator) -> list[Mesh]:
-    """Large buildings far apart, in two directions; lawns, footpaths, trees, lamps."""
+    """Large, widely spaced buildings in two directions; lawns, footpaths, trees, lamps."""
     half = settings.road_width_m / 2
     parts = [plain(FAR, (-half, half), "asphalt"), *dashes((-HALF_LENGTH_M, 0), (HALF_LENGTH_M, 0))]
     for side in (-1, 1):

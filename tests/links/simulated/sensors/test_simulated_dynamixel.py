@@ -223,14 +223,14 @@ def test_in_its_own_process_it_reads_faults_from_standard_input(tmp_path):
             time.sleep(0.01)
         bus = Bus.open(str(path), 1_000_000, 1, 0.5)
         assert bus.ping() == 30
-        process.stdin.write("nonsense\nlate one\nsilence 1\n")
+        process.stdin.write("unknown\nlate one\nsilence 1\n")
         process.stdin.flush()
         errors = [process.stderr.readline(), process.stderr.readline()]
         assert fails(bus.ping)  # the line after the rejected ones is read now or soon
         bus.close()
         process.stdin.close()
         assert process.wait(10) == 0
-    assert "no such fault: 'nonsense'" in errors[0]
+    assert "no such fault: 'unknown'" in errors[0]
     assert errors[1].startswith("late: ")
 
 

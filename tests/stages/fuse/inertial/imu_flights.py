@@ -229,8 +229,6 @@ class ImuFlight:
                     xyz_vehicle_m=xyz,
                     covariance_m2=self.fix_sigma_m**2 / 0.65 * np.eye(3),  # trackers state more than the true error
                     hits=4,
-                    iterations=1,
-                    shift_m=0.0,
                 ),
             )
             yield (

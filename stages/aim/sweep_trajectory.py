@@ -1,0 +1,72 @@
+"""Trajectory of a sweep over the servo's travel, continued across observations of candidates and tracks.
+
+Source: ours, for P III.A.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+GOAL_TOLERANCE_RAD = math.radians(0.6)
+STALL_NS = 300_000_000  # a servo that comes no nearer to its goal for this long counts as arrived
+END_TOLERANCE_RAD = math.radians(2.0)  # from an end of the travel this near, the sweep starts away from it
+RESUME_TOLERANCE_RAD = math.radians(1.0)
+
+
+@dataclass(slots=True, eq=False)
+class SweepTrajectory:
+    """Goals of a sweep between two servo positions."""
+
+    low_rad: float
+    high_rad: float
+    goal_rad: float | None = None  # None: no sweep is under way
+    increasing: bool = True  # direction of the servo position
+    nominal_rad: float | None = None  # position of the sweep during observations that do not interrupt it
+    resume_rad: float | None = None  # where the last search segment between observations of tracks ended
+    _min_distance_rad: float = math.inf  # to the goal, since the goal was set
+    _min_distance_ns: int = 0  # when that minimum last decreased
+
+    def stop(self) -> None:
+        """End the sweep. The next one starts from the servo position at that time."""
+        self.goal_rad = None
+
+    def advance(self, position_rad: float, step_rad: float) -> float:
+        """Nominal position [rad] of the sweep one step later, reflected at the ends of the travel."""
+        start_rad = position_rad if self.nominal_rad is None else self.nominal_rad
+        if not self.low_rad <= start_rad + (step_rad if self.increasing else -step_rad) <= self.high_rad:
+            self.increasing = not self.increasing
+        nominal_rad = start_rad + (step_rad if self.increasing else -step_rad)
+        self.nominal_rad = min(max(nominal_rad, self.low_rad), self.high_rad)
+        return self.nominal_rad
+
+    def goal(
+        self, stamp_ns: int, position_rad: float, speed_radps: float, resume_radps: float | None
+    ) -> tuple[float, float] | None:
+        """A new goal [rad] and speed [rad/s], or None while the last goal holds.
+
+        With `resume_radps` the servo first returns to `resume_rad` at that speed.
+        """
+        self.nominal_rad = None
+        if resume_radps is not None and self.resume_rad is not None:
+            if abs(self.resume_rad - position_rad) > RESUME_TOLERANCE_RAD:
+                if self.goal_rad == self.resume_rad:
+                    return None
+                self.goal_rad = self.resume_rad
+                return self.resume_rad, resume_radps
+            self.resume_rad, self.goal_rad = None, None
+        distance_rad = math.inf if self.goal_rad is None else abs(self.goal_rad - position_rad)
+        if distance_rad < self._min_distance_rad:
+            self._min_distance_rad, self._min_distance_ns = distance_rad, stamp_ns
+        arrived = distance_rad < GOAL_TOLERANCE_RAD or stamp_ns - self._min_distance_ns > STALL_NS
+        if self.goal_rad is not None:
+            if not arrived:
+                return None
+            self.increasing = not self.increasing
+        if self.low_rad + END_TOLERANCE_RAD > position_rad:
+            self.increasing = True
+        elif self.high_rad - END_TOLERANCE_RAD < position_rad:
+            self.increasing = False
+        self.goal_rad = self.high_rad if self.increasing else self.low_rad
+        self._min_distance_rad, self._min_distance_ns = math.inf, stamp_ns
+        return self.goal_rad, speed_radps

@@ -31,6 +31,7 @@ from stages.messages.drone import MeanShiftResult as MeanShiftResult
 from stages.messages.drone import SearchResult as SearchResult
 from stages.messages.drone import TrackingState as TrackingState
 from stages.messages.drone import TrackState as TrackState
+from stages.messages.heading import HeadingEstimate as HeadingEstimate
 from stages.messages.pose import PoseEstimate as PoseEstimate
 from stages.messages.pose import PoseState as PoseState
 from stages.messages.pose import PositionEstimate as PositionEstimate

@@ -1,0 +1,387 @@
+"""Estimate of the drone that is followed, by IMU: a bank of headings until one is decided, then a graph.
+
+Measurements are used in the order of their times, up to the newest IMU interval: `pass_time` moves that horizon; what
+is published is propagated from there by the IMU. A measurement that arrives later than that is moved to the horizon.
+
+The heading of a drone that was lost is remembered and propagated by the gyroscope: a hypothesis when it is found again.
+
+Source: ours; DESIGN, Fusion.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.fuse.consistency import InformationInflation, Rejected, inflation
+from stages.fuse.inertial.graph import InertialGraph
+from stages.fuse.inertial.settings import InertialErrors
+from stages.geometry.frames import Array64
+from stages.geometry.se3 import mahalanobis2
+from stages.geometry.trajectory import VehicleTrajectory
+from stages.heading import bank_measurements as measure
+from stages.heading.imu_buffer import ImuBuffer
+from stages.heading.inertial_bank import InertialBank
+from stages.heading.inertial_heading import InertialHeading, bias_free_turn, turn_between
+from stages.heading.inertial_state import POSITION, THETA, VELOCITY, InertialState, log_rotations
+from stages.heading.odometry_heading import OdometryHeading
+from stages.heading.ownership import Ownership, log_evidence
+from stages.messages import AutopilotMotion, DroneFix, DroneMotion, RelativeRotation, VisualMotion
+
+DELAY_NS = 100_000_000  # measurements of one time arrive within
+GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
+TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
+KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
+MEMORY_NS = 120_000_000_000
+SAME_DRONE, MAYBE_ANOTHER = 0.9995, 0.9  # probability that a remembered heading holds
+VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # beyond its newest pose; longest wait for one
+IMAGE_NS = 300_000_000  # without an IMU, the next image of the drone is awaited for
+FREE_NS = 1_000_000_000  # without IMU and vanishing points a yaw is forgotten after
+Measurement = DroneFix | RelativeRotation | VisualMotion
+
+
+@dataclass(frozen=True)
+class FixCovariance:
+    """Error of a LiDAR position, map axes [m2]: white, and a bias that does not average out."""
+
+    white: Array64
+    bias: Array64
+
+
+class InertialEstimator:
+    """State of the drone that is followed."""
+
+    def __init__(self, errors: InertialErrors, vehicle: VehicleTrajectory, lag_s: float) -> None:
+        self._errors, self._vehicle = errors, vehicle
+        self.imu = ImuBuffer()
+        self.heading = InertialHeading(self.imu)
+        self.graph = InertialGraph(self.imu, lag_s)
+        self.ownership = Ownership()
+        self.suspect = False  # what was followed moved otherwise than the IMU measures, and nothing has shown since
+        self._odometry = OdometryHeading(math.radians(errors.compass_deg), errors.compass_outliers)
+        self._autopilot: deque[tuple[int, AutopilotMotion]] = deque(maxlen=128)
+        self._up: deque[tuple[int, Array64]] = deque(maxlen=128)
+        self._waiting: list[tuple[int, int, Measurement]] = []
+        self._count = 0
+        self.resets, self.too_late = 0, 0
+        self.fix_ns: int | None = None  # newest LiDAR position used
+        self.newest_fix_ns: int | None = None  # also when the drone is lost
+        self.rotation_ns: int | None = None  # newest rotation by vanishing points used
+        self.nis = math.nan
+        self.bias_covariance_m2 = np.zeros((3, 3))
+        self.rotation_bias_rad2 = np.zeros((3, 3))
+        self._memory: tuple[int, InertialState] | None = None
+        self._restart_filters()
+
+    def _restart_filters(self) -> None:
+        self._fix_inflation = InformationInflation(self._errors.fix_time_s)
+        self._rotation_inflation = InformationInflation(self._errors.rotation_time_s)
+        self._rejected, self._rejected_rotations = Rejected(), Rejected()
+        self.ownership.restart(self.suspect)
+        self._vertical_ns = 0
+        self.rotation_ns = None
+
+    # input
+
+    def add_motion(self, motion: DroneMotion) -> None:
+        """Add an IMU interval with the autopilot's vertical and, while independent, its odometry."""
+        if not self.imu.add(motion):
+            return
+        if motion.up_drone is not None:
+            self._up.append((motion.stamp_ns, motion.up_drone))
+        if motion.autopilot is not None:
+            self._autopilot.append((motion.stamp_ns, motion.autopilot))
+
+    def add(self, measurement: Measurement) -> None:
+        """Add a measurement; it is used when the horizon reaches its time."""
+        if isinstance(measurement, VisualMotion):
+            self.imu.add_visual_motion(measurement)
+        self._count += 1
+        heapq.heappush(self._waiting, (measurement.stamp_ns, self._count, measurement))
+
+    def pass_time(self, now_ns: int) -> None:
+        """Move the horizon and use the measurements before it."""
+        horizon_ns = self._horizon_ns(now_ns)
+        while self._waiting and self._waiting[0][0] <= horizon_ns:
+            _, _, measurement = heapq.heappop(self._waiting)
+            if isinstance(measurement, DroneFix):
+                self._use_fix(measurement)
+            elif isinstance(measurement, RelativeRotation):
+                self._use_rotation(measurement)
+            else:
+                self._use_visual_motion(measurement)
+        self._advance(horizon_ns)
+        if self.fix_ns is not None and now_ns - self.fix_ns > KEPT_NS:
+            self.lose()
+
+    def _horizon_ns(self, now_ns: int) -> int:
+        """Time up to which the motion of the drone and of the vehicle is measured."""
+        newest_ns, image_ns = self.imu.newest_ns, self.imu.newest_image_ns
+        horizon_ns = now_ns
+        if newest_ns is not None and self.imu.is_current(now_ns):
+            horizon_ns = min(newest_ns, now_ns - DELAY_NS)
+        elif image_ns is not None and now_ns - image_ns < IMAGE_NS:
+            horizon_ns = min(image_ns, now_ns)
+        vehicle_ns = self._vehicle.newest_ns if self._vehicle.known_at(now_ns) else None
+        if vehicle_ns is not None:
+            horizon_ns = min(horizon_ns, max(vehicle_ns + VEHICLE_NS, now_ns - WAIT_NS))
+        return horizon_ns
+
+    # state
+
+    @property
+    def known(self) -> bool:
+        """Whether a position is known."""
+        return self.graph.running or self.heading.bank is not None
+
+    @property
+    def decided(self) -> bool:
+        """Whether the heading is known."""
+        return self.graph.running or (self.heading.decided and self.is_own)
+
+    @property
+    def is_own(self) -> bool:
+        """Whether what the LiDAR follows moves as the IMU measures; without an IMU nothing speaks against it."""
+        if self.suspect:
+            return self.ownership.cleared
+        return self.ownership.certain or not self.imu.is_current(self.stamp_ns)
+
+    @property
+    def stamp_ns(self) -> int:
+        """The horizon's state is of this time."""
+        return self.graph.stamp_ns if self.graph.running else self.heading.stamp_ns
+
+    def at(self, stamp_ns: int) -> InertialState:
+        """One row: the state propagated to a time; its rotation is valid when `decided`."""
+        if self.graph.running:
+            return self.graph.at(stamp_ns)
+        assert self.heading.bank is not None
+        one = self.heading.decision() if self.decided else self.heading.bank.mean()
+        return self.imu.propagate(one, np.ones(1), self.heading.stamp_ns, stamp_ns)
+
+    def lose(self) -> None:
+        """Drop the position; the heading is remembered."""
+        if self.decided:
+            state = self.graph.state if self.graph.running else self.heading.decision()
+            self._memory = self.stamp_ns, state
+        self._drop()
+
+    def forget(self) -> None:
+        """Drop everything: another map frame, or a contradiction."""
+        self._drop()
+        self._memory = None
+        self._odometry.restart()
+
+    def _drop(self) -> None:
+        self.resets += self.known
+        self.graph.stop()
+        self.heading.stop()
+        self.fix_ns, self.nis = None, math.nan
+        self._restart_filters()
+
+    # measurements
+
+    def _advance(self, stamp_ns: int) -> None:
+        if self.graph.running and not self.imu.is_current(stamp_ns):
+            self._to_bank()
+        if self.graph.running:
+            self.graph.advance(stamp_ns)
+            return
+        self.heading.advance(stamp_ns)
+        last_ns = stamp_ns if self.rotation_ns is None else self.rotation_ns
+        if not self.imu.is_current(stamp_ns) and stamp_ns - last_ns > FREE_NS:
+            self.heading.restart_yaw()
+            self.rotation_ns = None
+
+    def _to_bank(self) -> None:
+        """The IMU has ended: go on with the bank, from the graph's state."""
+        self.heading.resume(self.graph.stamp_ns, self.graph.state)
+        self.graph.stop()
+
+    def fix_covariance(self, fix: DroneFix, R_map_vehicle: Array64) -> FixCovariance:
+        """Error of a LiDAR position, map axes."""
+        e = self._errors
+        whole = e.fix_variance * fix.covariance_m2
+        bias = e.fix_bias_share * whole
+        if fix.bias_covariance_m2 is not None:
+            bias = fix.bias_covariance_m2
+            whole = bias + e.fix_variance * (fix.covariance_m2 - bias)
+        R = R_map_vehicle
+        return FixCovariance(R @ (whole - bias) @ R.T, R @ bias @ R.T)
+
+    def _use_fix(self, fix: DroneFix) -> None:
+        stamp_ns = fix.stamp_ns
+        R_map_vehicle, t = self._vehicle.at(stamp_ns)
+        z, covariance = R_map_vehicle @ fix.xyz_vehicle_m + t, self.fix_covariance(fix, R_map_vehicle)
+        self.newest_fix_ns = max(stamp_ns, self.newest_fix_ns or stamp_ns)
+        if not self.known:
+            self._find(fix, z, covariance)
+            return
+        late_s = max(self.stamp_ns - stamp_ns, 0) * 1e-9
+        if late_s > 0.5:
+            self.too_late += 1
+            return
+        state = self._at_horizon(stamp_ns)
+        v = state.velocity_mps[0]
+        noise = covariance.white * self._fix_inflation.factor(stamp_ns) + (self._errors.clock_s**2) * np.outer(v, v)
+        z, noise = z + late_s * v, noise + (0.75 * late_s**2) ** 2 * np.eye(3)
+        off = z - state.xyz_m[0]
+        nis = mahalanobis2(off, state.covariance[0, POSITION, POSITION] + noise)
+        if nis > GATE and self._rejected.add(stamp_ns, off, noise):
+            self.forget()
+            self._find(fix, z, covariance)
+            return
+        if nis <= GATE:
+            self._rejected.clear()
+            self.nis, self.fix_ns, self.bias_covariance_m2 = (
+                nis,
+                max(stamp_ns, self.fix_ns or stamp_ns),
+                covariance.bias,
+            )
+        self._add_odometry(stamp_ns, z, float(noise[0, 0] + noise[1, 1]) / 2)
+        if self.graph.running:
+            self._add_to_graph(max(stamp_ns, self.stamp_ns), z, noise, nis, state)
+        else:
+            self.heading.advance(stamp_ns)
+            self._add_vertical(self.heading.stamp_ns)
+            self.heading.add_position(self.heading.stamp_ns, z, noise)
+            assert self.heading.bank is not None
+            self._add_ownership(stamp_ns, z, noise, self.heading.position_evidence)
+            if self.known and self.decided and self.imu.is_current(stamp_ns):
+                self._start_graph()
+
+    def _at_horizon(self, stamp_ns: int) -> InertialState:
+        """State at a measurement that is not before the horizon, else at the horizon."""
+        if self.graph.running:
+            return self.graph.at(max(stamp_ns, self.graph.stamp_ns))
+        self.heading.advance(stamp_ns)
+        assert self.heading.bank is not None
+        return self.heading.bank.mean()
+
+    def _add_to_graph(self, stamp_ns: int, z: Array64, noise: Array64, nis: float, predicted: InertialState) -> None:
+        if nis <= GATE:
+            self.graph.add_position(stamp_ns, z, noise, predicted)
+        else:
+            self.graph.advance(stamp_ns)
+        self._add_vertical(self.graph.stamp_ns)
+        off = z - predicted.xyz_m[0]
+        self._add_ownership(stamp_ns, z, noise, log_evidence(off, predicted.covariance[0, POSITION, POSITION] + noise))
+
+    def _add_ownership(self, stamp_ns: int, z: Array64, noise: Array64, evidence: float) -> None:
+        """Whether the object is the drone; the estimate of another one ends, and nothing is published until it is."""
+        self.ownership.add(stamp_ns, z, noise, evidence if self.imu.is_current(stamp_ns) else None)
+        if self.ownership.cleared:
+            self.suspect = False
+        if self.ownership.denied if self.graph.running else self.ownership.excluded:
+            self.suspect = True
+            self.forget()
+
+    def _start_graph(self) -> None:
+        self.graph.start(self.heading.stamp_ns, self.heading.decision())
+        self.heading.stop()
+
+    def _find(self, fix: DroneFix, z: Array64, covariance: FixCovariance) -> None:
+        """Start at a LiDAR position."""
+        velocity = fix.velocity_vehicle_mps
+        if velocity is not None:
+            velocity = self._vehicle.to_map(fix.stamp_ns, fix.xyz_vehicle_m, velocity)[1]
+        up = self._up_at(fix.stamp_ns)
+        self._restart_filters()
+        memory = self._remembered(fix.stamp_ns, z, covariance)
+        level = np.array([0.0, 0.0, 1.0]) if up is None else up
+        self.heading.start(fix.stamp_ns, z, covariance.white + covariance.bias, velocity, level, memory)
+        self.fix_ns, self.bias_covariance_m2 = fix.stamp_ns, covariance.bias
+
+    def _remembered(self, stamp_ns: int, z: Array64, covariance: FixCovariance) -> tuple[float, float, float] | None:
+        """Yaw known before, propagated by the gyroscope, its sigma and the probability that it holds."""
+        if self._memory is None or stamp_ns - self._memory[0] > MEMORY_NS:
+            return None
+        state = self.imu.propagate(self._memory[1], np.ones(1), self._memory[0], stamp_ns)
+        sigma = math.sqrt(float(state.yaw_variance_rad2[0]))
+        if sigma > math.radians(20.0):
+            return None
+        noise = covariance.white + covariance.bias + state.covariance[0, POSITION, POSITION]
+        same = mahalanobis2(z - state.xyz_m[0], noise) <= GATE and stamp_ns - self._memory[0] < KEPT_NS
+        return float(state.yaw_rad[0]), sigma, SAME_DRONE if same else MAYBE_ANOTHER
+
+    def _add_vertical(self, stamp_ns: int) -> None:
+        """The autopilot's roll and pitch, each tilt_period_s."""
+        e = self._errors
+        up = self._up_at(stamp_ns)
+        if up is None or (stamp_ns - self._vertical_ns) * 1e-9 < e.tilt_period_s:
+            return
+        self._vertical_ns = stamp_ns
+        sigma = math.radians(e.tilt_deg) * math.sqrt(inflation(e.tilt_period_s, TILT_TIME_S))
+        if self.graph.running:
+            self.graph.add_vertical(up, sigma)
+        else:
+            self.heading.add_vertical(up, sigma)
+
+    def _up_at(self, stamp_ns: int) -> Array64 | None:
+        near = min(self._up, key=lambda sample: abs(sample[0] - stamp_ns), default=None)
+        return None if near is None or abs(near[0] - stamp_ns) > 150_000_000 else near[1]
+
+    def _add_odometry(self, stamp_ns: int, z: Array64, variance_m2: float) -> None:
+        """The autopilot's own position at a LiDAR position: evidence for the heading while it is undecided."""
+        near = min(self._autopilot, key=lambda sample: abs(sample[0] - stamp_ns), default=None)
+        if near is None or abs(near[0] - stamp_ns) > 150_000_000 or self.graph.running:
+            self.heading.evidence = None
+            return
+        at_ns, own = near
+        xyz_odom_m = own.xyz_odom_m + (stamp_ns - at_ns) * 1e-9 * own.velocity_odom_mps
+        self._odometry.add(stamp_ns, z, variance_m2, xyz_odom_m, own.odom_segment)
+        self.heading.evidence = self._odometry.evidence(stamp_ns, own.R_odom_drone)
+
+    def _use_rotation(self, rotation: RelativeRotation) -> None:
+        if rotation.R_vehicle_drone is None or rotation.covariance_rad2 is None or not self.known:
+            return
+        stamp_ns, e = rotation.stamp_ns, self._errors
+        R_map_vehicle = self._vehicle.at(stamp_ns)[0]
+        R = R_map_vehicle @ rotation.R_vehicle_drone
+        white = (1.0 - e.rotation_bias_share) * rotation.covariance_rad2
+        factor = self._rotation_inflation.factor(stamp_ns)
+        if not self.graph.running:
+            self.heading.advance(stamp_ns)
+            if (self.heading.add_rotation(stamp_ns, R, R_map_vehicle, factor * white) or 0.0) > 0.5:
+                self._rotation_used(rotation)
+            return
+        if abs(stamp_ns - self.graph.stamp_ns) > 500_000_000:
+            self.too_late += 1
+            return
+        graph = self.graph
+        dR, variance = turn_between(self.imu, stamp_ns, graph.stamp_ns, graph.state.bias[0])
+        covariance = dR.T @ (factor * white) @ dR + variance * np.eye(3)
+        one = InertialBank(graph.state, np.zeros(1))
+        off = measure.nearest_quarter(one, R @ dR, R_map_vehicle)[0]
+        if mahalanobis2(off, graph.state.covariance[0, THETA, THETA] + covariance) > GATE:
+            if self._rejected_rotations.add(stamp_ns, off, covariance):
+                self.forget()
+            return
+        self._rejected_rotations.clear()
+        quarters = R_map_vehicle @ measure.QUARTERS @ R_map_vehicle.T @ (R @ dR)
+        turns = log_rotations(graph.state.R.transpose(0, 2, 1) @ quarters)
+        graph.add_rotation(quarters[int(np.argmin(np.linalg.norm(turns, axis=1)))], covariance)
+        self._rotation_used(rotation)
+
+    def _rotation_used(self, rotation: RelativeRotation) -> None:
+        assert rotation.covariance_rad2 is not None
+        self.rotation_ns = rotation.stamp_ns
+        self.rotation_bias_rad2 = self._errors.rotation_bias_share * rotation.covariance_rad2
+
+    def _use_visual_motion(self, motion: VisualMotion) -> None:
+        if not self.graph.running:
+            self.heading.advance(motion.stamp_ns)
+            self.heading.add_visual_motion(motion)
+            return
+        turn = bias_free_turn(self.imu, motion)
+        if turn is not None:
+            rate, by_images, covariance = turn
+            self.graph.add_gyro_bias(rate - by_images, math.sqrt(float(np.trace(covariance)) / 3))
+
+    def velocity(self, state: InertialState) -> tuple[Array64, Array64]:
+        """Velocity over ground (3,), map axes, and its covariance."""
+        return state.velocity_mps[0], state.covariance[0, VELOCITY, VELOCITY]

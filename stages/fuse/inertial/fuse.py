@@ -1,0 +1,254 @@
+"""InertialFuse: one pose of the drone, 50 times a second, from LiDAR positions, IMU and rotations by cameras.
+
+    fixes, rotations, IMU intervals, each at its own time (estimator.py)
+      -> bank of headings, then a graph of poses  -> propagated to now -> RelativePose, HeadingEstimate
+
+Now is the newest stamp received on any port, on a grid of 20 ms; it never decreases. Every port but `fix` may be
+unwired, fall silent and return. Without `motion` the vehicle frame serves as the map frame; only with the setting
+`parked` is it assumed to stand, so that the IMU is used. Without an IMU there are positions, and a rotation only while
+cameras give one whose branch is decided.
+
+The autopilot's own position and attitude are evidence for the heading only while they are independent of our pose
+(DroneMotion.autopilot); its yaw may be wrong by any angle.
+
+Source: ours; DESIGN, Fusion and The graph: fuse.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from flow.message import Message
+from flow.stage import Settings, Stage
+from stages.fuse.chain import yaw_sigma_rad
+from stages.fuse.inertial.estimator import InertialEstimator
+from stages.fuse.inertial.settings import InertialErrors
+from stages.fuse.inertial.status import state_of, undecided_reason
+from stages.fuse.intake import Intake
+from stages.fuse.motion_model import Motions
+from stages.fuse.pose_message import MapEstimate, Status, lost, pose
+from stages.fuse.settings import FuseErrors, FuseLimits
+from stages.fuse.status import Jumps
+from stages.fuse.track_continuity import TrackContinuity
+from stages.geometry.frames import Array64, heading_rad
+from stages.heading.inertial_state import POSITION, InertialState
+from stages.messages import (
+    DroneFix,
+    DroneMotion,
+    HeadingEstimate,
+    PoseState,
+    RelativePose,
+    RelativeRotation,
+    ServoState,
+    Tick,
+    TrackState,
+    VehicleMotion,
+    VisualMotion,
+)
+
+GRID_NS = 20_000_000
+HEADING_NS = 200_000_000  # between two HeadingEstimates
+Poses = Iterator[RelativePose | HeadingEstimate]
+
+
+class InertialFuseSettings(Settings):
+    """Settings of `InertialFuse`."""
+
+    parked: bool = False  # the vehicle stands, without VehicleMotion
+    track_id: int | None = Field(None, ge=1)  # follow this drone; None: the lowest number that is TRACKING
+    lag_s: float = Field(2.0, ge=0.5, le=10)
+    errors: InertialErrors = InertialErrors()
+    limits: FuseLimits = FuseLimits(yaw_sigma_deg=5.0)  # 10 deg are 2 sigma
+
+
+class InertialFuse(Stage[InertialFuseSettings]):
+    """Pose of the drone by IMU and LiDAR, with its state."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset(
+        {"rotation", "motion", "drone_motion", "visual_motion", "track", "servo", "tick"}
+    )
+
+    def __init__(self, settings: InertialFuseSettings | None = None, /, **values: Any) -> None:
+        super().__init__(settings, **values)
+        settings = self.settings
+        self._published_ns: int = 0
+        self._motions = Motions(FuseErrors(), settings.parked)
+        self._estimator = InertialEstimator(settings.errors, self._motions.vehicle, settings.lag_s)
+        self._track_continuity = TrackContinuity(settings.track_id)
+        self._intake, self._jumps = Intake(round(settings.lag_s * 1e9)), Jumps(settings.limits)
+        self._track_id = 0
+        self._map_was_fixed = False
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Invalid messages by reason, and resets of the smoother."""
+        rejected: Counter[str] = self._intake.rejected
+        counts = {f"rejected: {why}": count for why, count in rejected.items()}
+        if self._estimator.too_late:
+            counts["rejected: too late"] = self._estimator.too_late
+        if self._estimator.graph.recoveries:
+            counts["back end reset"] = self._estimator.graph.recoveries
+        return counts
+
+    def on_motion(self, motion: VehicleMotion) -> Poses:
+        """Pose of the vehicle in `map`."""
+        valid = self._intake.is_valid(motion, "vehicle motion", motion.xyz_map_m, motion.R_map_vehicle)
+        if valid and self._motions.add_vehicle_motion(motion):
+            self._estimator.forget()
+        yield from self._publish(motion)
+
+    def on_drone_motion(self, motion: DroneMotion) -> Poses:
+        """Interval of the drone's IMU."""
+        up = () if motion.up_drone is None else (motion.up_drone,)
+        noise = np.array([motion.specific_force_noise, motion.angular_velocity_noise])
+        numbers = (motion.specific_force_drone_mps2, motion.angular_velocity_drone_radps, noise, *up)
+        own = motion.autopilot
+        more = () if own is None else (own.xyz_odom_m, own.R_odom_drone, own.velocity_odom_mps)
+        if self._intake.is_valid(motion, "drone motion", *numbers, *more) and self._motions.map_is_fixed(
+            motion.stamp_ns
+        ):
+            self._estimator.add_motion(motion)
+        yield from self._publish(motion)
+
+    def on_visual_motion(self, motion: VisualMotion) -> Poses:
+        """Visual odometry of the drone: turns, and directions without scale."""
+        direction, sigma_rad = motion.direction_from, np.array(motion.direction_sigma_rad or 0.0)
+        numbers = (motion.R_from_to, motion.covariance_rad2, sigma_rad, *(() if direction is None else (direction,)))
+        if self._intake.is_valid(motion, "visual motion", *numbers) and self._motions.map_is_fixed(motion.stamp_ns):
+            self._estimator.add(motion)
+        yield from self._publish(motion)
+
+    def on_track(self, state: TrackState) -> Poses:
+        """State of a track."""
+        self._track_continuity.add(state)
+        yield from self._publish(state)
+
+    def on_fix(self, fix: DroneFix) -> Poses:
+        """LiDAR position."""
+        velocity = () if fix.velocity_vehicle_mps is None else (fix.velocity_vehicle_mps,)
+        bias_covariance_m2 = np.zeros((3, 3)) if fix.bias_covariance_m2 is None else fix.bias_covariance_m2
+        numbers = (fix.xyz_vehicle_m, fix.covariance_m2, bias_covariance_m2, *velocity)
+        if self._intake.is_valid(fix, "fix", *numbers) and self._intake.is_covariance(
+            fix.covariance_m2 - bias_covariance_m2, "fix"
+        ):
+            self._add_fix(fix)
+        yield from self._publish(fix)
+
+    def _add_fix(self, fix: DroneFix) -> None:
+        if not self._track_continuity.accepts(fix.track_id, fix.stamp_ns):
+            return
+        if fix.track_id != self._track_id and self._estimator.known:
+            self._estimator.lose()
+        self._track_id = fix.track_id
+        self._estimator.add(fix)
+
+    def on_rotation(self, rotation: RelativeRotation) -> Poses:
+        """Rotation by both cameras, up to a multiple of 90 deg: the heading decides which."""
+        R, covariance = rotation.R_vehicle_drone, rotation.covariance_rad2
+        if (
+            R is not None
+            and covariance is not None
+            and self._intake.is_valid(rotation, "rotation", R, covariance)
+            and self._intake.is_covariance(covariance, "rotation")
+        ):
+            self._estimator.add(rotation)
+        yield from self._publish(rotation)
+
+    def on_servo(self, servo: ServoState) -> Poses:
+        """Clock of a replay without other messages."""
+        yield from self._publish(servo)
+
+    def on_tick(self, tick: Tick) -> Poses:
+        """The host's clock."""
+        yield from self._publish(tick)
+
+    # output
+
+    def _publish(self, message: Message) -> Poses:
+        """Advance to the stamp of a message; yield a pose when that passes a point of the grid."""
+        now_ns = self._intake.pass_time(message.stamp_ns)
+        if now_ns is None:
+            return
+        at_ns = now_ns // GRID_NS * GRID_NS
+        if at_ns <= self._published_ns:
+            return
+        fixed = self._motions.map_is_fixed(now_ns)
+        if fixed != self._map_was_fixed:  # from now on the map frame moves with the vehicle, or stands
+            self._estimator.forget()
+        self._map_was_fixed = fixed
+        self._estimator.pass_time(now_ns)
+        heading = at_ns // HEADING_NS > self._published_ns // HEADING_NS
+        self._published_ns = at_ns
+        yield self._pose(at_ns)
+        if heading:
+            yield self._heading(at_ns)
+
+    def _pose(self, now_ns: int) -> RelativePose:
+        e = self._estimator
+        known = self._known(now_ns) if e.known else None
+        state, reason = state_of(known, e, self.settings.limits, now_ns, self._track_continuity.reason)
+        resets = e.resets
+        if state is PoseState.LOST or known is None:
+            self._jumps.lost()
+            return lost(now_ns, self._status(PoseState.LOST, reason))
+        self._jumps.see(known, resets)
+        return pose(known, self._status(state, reason), self._motions)
+
+    def _status(self, state: PoseState, reason: str) -> Status:
+        e = self._estimator
+        return Status(state, reason, e.newest_fix_ns, self._track_id, e.resets + self._jumps.number, e.nis)
+
+    def _known(self, now_ns: int) -> MapEstimate:
+        """The estimate propagated to now, with the bias covariances added."""
+        e = self._estimator
+        state = e.at(now_ns)
+        R, P = state.R[0], state.covariance[0]
+        whole = np.zeros((6, 6))
+        velocity = e.velocity(state)
+        if e.decided:
+            axes = np.eye(6)
+            axes[3:, 3:] = R.T  # position in drone axes
+            whole = axes @ P[:6, :6] @ axes.T
+            whole[:3, :3] += e.rotation_bias_rad2 if e.rotation_ns is not None else 0.0
+            whole[3:, 3:] += R.T @ e.bias_covariance_m2 @ R
+            if yaw_sigma_rad(R, whole) <= math.radians(self.settings.limits.yaw_sigma_deg):
+                return MapEstimate(now_ns, R, state.xyz_m[0], whole, *velocity)
+        whole[3:, 3:] = P[POSITION, POSITION] + e.bias_covariance_m2
+        return MapEstimate(now_ns, None, state.xyz_m[0], whole, *velocity)
+
+    def _heading(self, now_ns: int) -> HeadingEstimate:
+        e = self._estimator
+        yaw, sigma, probability, near = _hypotheses(e)
+        reason = "decided" if e.decided else undecided_reason(e, now_ns) if e.known else "no drone is followed"
+        return HeadingEstimate(
+            stamp_ns=now_ns,
+            yaw_map_rad=yaw,
+            sigma_rad=sigma,
+            probability=probability,
+            vehicle_yaw_rad=heading_rad(self._motions.vehicle.at(now_ns)[0]),
+            near_probability=near,
+            decided=e.decided,
+            reason=reason,
+        )
+
+
+def _hypotheses(estimator: InertialEstimator) -> tuple[Array64, Array64, Array64, float]:
+    """Yaw, sigma and probability of each hypothesis, most probable first; probability near the first."""
+    none = np.zeros(0)
+    if estimator.graph.running:
+        state: InertialState = estimator.graph.state
+        return state.yaw_rad, np.sqrt(state.yaw_variance_rad2), np.ones(1), 1.0
+    bank, factor = estimator.heading.bank, estimator.heading.log_factor()
+    if bank is None:
+        return none, none, none, 0.0
+    weight = bank.weight if factor is None else bank.weight * np.exp(factor)
+    weight = weight / weight.sum()
+    order = np.argsort(-weight, kind="stable")
+    sigma = np.sqrt(bank.state.yaw_variance_rad2)
+    return bank.state.yaw_rad[order], sigma[order], weight[order], estimator.heading.near_probability

@@ -1,0 +1,194 @@
+"""Heading of the drone's body, from the first LiDAR position until it is decided.
+
+The bank of hypotheses is propagated by the IMU from measurement to measurement, in the order of their times. A
+measurement a little older than the bank is moved to the bank's time by the drone's own motion since.
+
+The heading is decided when a yaw within 20 deg of the best one has P > 0.999 after DECISIONS LiDAR positions in a row.
+
+Source: ours; issue: heading once.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.geometry.frames import Array64
+from stages.heading import bank_measurements as measure
+from stages.heading.imu_buffer import ImuBuffer
+from stages.heading.inertial_bank import NEAR_RAD, InertialBank, start
+from stages.heading.inertial_state import POSITION, ImuIntervals, InertialState
+from stages.heading.odometry_heading import YawEvidence
+from stages.kernels.geometry.so3 import log_rotation
+from stages.messages import VisualMotion
+
+DECIDED, DECISIONS = 0.999, 3
+LATE_NS = 500_000_000  # an older measurement is not used
+LATE_MPS2 = 1.5  # change of velocity that moving a late position ignores
+DIRECTION_NS = 400_000_000  # between directions of flight by images that count as independent
+LONGEST_TURN_NS = 300_000_000
+FREE_SIGMA_MPS = 1.0  # of the tracker's velocity
+
+
+class InertialHeading:
+    """The bank with its time."""
+
+    def __init__(self, imu: ImuBuffer) -> None:
+        self._imu = imu
+        self.bank: InertialBank | None = None
+        self.stamp_ns = 0
+        self.evidence: YawEvidence | None = None
+        self._decisions = 0
+        self.near_probability = 0.0  # of a yaw within 20 deg of the best one, at the newest LiDAR position
+        self.position_evidence = 0.0  # log density of the newest LiDAR position
+        self._direction_ns = 0
+        self.kinds: set[str] = set()  # what has been used since the start
+
+    def start(
+        self,
+        stamp_ns: int,
+        xyz_m: Array64,
+        covariance_m2: Array64,
+        velocity_mps: Array64 | None,
+        up_drone: Array64,
+        memory: tuple[float, float, float] | None = None,
+    ) -> None:
+        """Start at a LiDAR position; see `inertial_bank.start`."""
+        velocity = None if velocity_mps is None else (velocity_mps, FREE_SIGMA_MPS)
+        self.bank = start(xyz_m, covariance_m2, velocity, up_drone, memory)
+        self.stamp_ns, self.evidence, self._decisions = stamp_ns, None, 0
+        self.kinds = set()
+
+    def resume(self, stamp_ns: int, state: InertialState) -> None:
+        """Continue from one decided hypothesis (one row)."""
+        self.bank = InertialBank(state, np.zeros(1))
+        self.stamp_ns, self.evidence, self._decisions = stamp_ns, None, DECISIONS
+
+    def restart_yaw(self) -> None:
+        """Every yaw is probable again; position and velocity stay."""
+        if self.bank is not None:
+            one = self.bank.mean()
+            covariance = one.covariance[0, POSITION, POSITION]
+            self.start(self.stamp_ns, one.xyz_m[0], covariance, one.velocity_mps[0], one.R[0, 2])
+
+    def stop(self) -> None:
+        """Drop all hypotheses."""
+        self.bank = None
+
+    def advance(self, stamp_ns: int) -> None:
+        """Propagate the bank to a later time."""
+        if self.bank is not None and stamp_ns > self.stamp_ns:
+            self.bank.state = self._imu.propagate(self.bank.state, self.bank.weight, self.stamp_ns, stamp_ns)
+            self.stamp_ns = stamp_ns
+
+    def add_position(self, stamp_ns: int, xyz_m: Array64, covariance_m2: Array64) -> float | None:
+        """Add a LiDAR position; returns the probability that it is no outlier, or None: too old."""
+        late_s = self._late_s(stamp_ns)
+        if self.bank is None or late_s is None:
+            return None
+        if late_s > 0.0:
+            moved = late_s * (self.bank.weight @ self.bank.state.velocity_mps)
+            xyz_m, covariance_m2 = xyz_m + moved, covariance_m2 + (0.5 * LATE_MPS2 * late_s**2) ** 2 * np.eye(3)
+        inlier = measure.add_position(self.bank, xyz_m, covariance_m2)
+        self.position_evidence = self.bank.log_evidence
+        self.bank.tidy()
+        self.near_probability = self.bank.near_probability(self.log_factor())[1]
+        self._decisions = self._decisions + 1 if self.near_probability > DECIDED else 0
+        return inlier
+
+    def add_vertical(self, up_drone: Array64, sigma_rad: float) -> None:
+        """Add the autopilot's vertical at the bank's time."""
+        if self.bank is not None:
+            measure.add_vertical(self.bank, up_drone, sigma_rad)
+
+    def add_rotation(
+        self, stamp_ns: int, R_map_drone: Array64, R_map_vehicle: Array64, covariance_rad2: Array64
+    ) -> float | None:
+        """Add a rotation by vanishing points; returns the probability that it is no outlier, or None: too old."""
+        late_s = self._late_s(stamp_ns)
+        if self.bank is None or late_s is None:
+            return None
+        dR, variance = self.turn(stamp_ns, self.stamp_ns)
+        covariance = dR.T @ covariance_rad2 @ dR + variance * np.eye(3)
+        self.kinds.add("vanishing points")
+        return measure.add_rotation(self.bank, R_map_drone @ dR, R_map_vehicle, covariance)
+
+    def add_visual_motion(self, motion: VisualMotion) -> None:
+        """Add a step of the drone's visual odometry that ended at the bank's time or shortly before."""
+        if self.bank is None or self._late_s(motion.stamp_ns) is None:
+            return
+        interval_ns = motion.stamp_ns - motion.from_ns
+        if not 0 < interval_ns <= LONGEST_TURN_NS:
+            return
+        turn = bias_free_turn(self._imu, motion)
+        if turn is not None:
+            measure.add_turn(self.bank, *turn)
+        if motion.direction_from is None or motion.direction_sigma_rad is None:
+            return
+        if motion.stamp_ns - self._direction_ns < DIRECTION_NS:
+            return
+        self._direction_ns = motion.stamp_ns
+        self.kinds.add("direction of flight by images")
+        since, _ = self.turn(motion.from_ns, self.stamp_ns)
+        late_s = (self.stamp_ns - motion.from_ns) * 1e-9
+        measure.add_direction(self.bank, since.T @ motion.direction_from, motion.direction_sigma_rad, late_s)
+
+    def turn(self, from_ns: int, to_ns: int) -> tuple[Array64, float]:
+        """The drone's rotation between two times by the gyroscope (3, 3), and the variance of each axis."""
+        return turn_between(self._imu, from_ns, to_ns, self.bank_bias())
+
+    def bank_bias(self) -> Array64:
+        """(6,) mean biases."""
+        return np.zeros(6) if self.bank is None else self.bank.weight @ self.bank.state.bias
+
+    def log_factor(self) -> Array64 | None:
+        """(n,) evidence of the autopilot's odometry, which is not part of the weights: its error is constant."""
+        if self.bank is None or self.evidence is None:
+            return None
+        return self.evidence.log_density(self.bank.state.yaw_rad, self.bank.state.yaw_variance_rad2)
+
+    @property
+    def decided(self) -> bool:
+        """Whether the heading is known."""
+        return self.bank is not None and self._decisions >= DECISIONS
+
+    def decision(self) -> InertialState:
+        """One hypothesis: the moments of those near the best one.
+
+        The odometry's yaw is evidence for the decision alone: the error of its compass must not reach the estimate.
+        """
+        assert self.bank is not None
+        bank, factor = self.bank, self.log_factor()
+        best, _ = bank.near_probability(factor)
+        yaw = bank.state.yaw_rad
+        near = np.flatnonzero(np.abs(np.remainder(yaw - yaw[best] + math.pi, 2 * math.pi) - math.pi) <= 1.5 * NEAR_RAD)
+        return InertialBank(bank.state.rows(near), bank.log_weight[near]).mean()
+
+    def _late_s(self, stamp_ns: int) -> float | None:
+        """How much older than the bank a time is [s]; None: too old."""
+        late_ns = self.stamp_ns - stamp_ns
+        return None if late_ns > LATE_NS else max(late_ns, 0) * 1e-9
+
+
+def turn_between(imu: ImuBuffer, from_ns: int, to_ns: int, bias: Array64) -> tuple[Array64, float]:
+    """Rotation (3, 3) from the drone's axes at one time to those at another, and the variance of each axis [rad2]."""
+    if from_ns == to_ns:
+        return np.eye(3), 0.0
+    if from_ns > to_ns:
+        R, variance = turn_between(imu, to_ns, from_ns, bias)
+        return R.T, variance
+    state = InertialState(np.eye(3)[None], np.zeros((1, 3)), np.zeros((1, 3)), bias[None], np.zeros((1, 15, 15)))
+    moved = imu.propagate(state, np.ones(1), from_ns, to_ns)
+    return moved.R[0], float(np.trace(moved.covariance[0, :3, :3])) / 3.0
+
+
+def bias_free_turn(imu: ImuBuffer, motion: VisualMotion) -> tuple[Array64, Array64, Array64] | None:
+    """Mean rates by the gyroscope and by images over a step, and the covariance of the difference."""
+    pieces = imu.between(motion.from_ns, motion.stamp_ns)
+    if len(pieces) != 1 or not isinstance(pieces[0], ImuIntervals):
+        return None
+    seconds = (motion.stamp_ns - motion.from_ns) * 1e-9
+    dR, variance = turn_between(imu, motion.from_ns, motion.stamp_ns, np.zeros(6))
+    covariance = (motion.covariance_rad2 + variance * np.eye(3)) / seconds**2
+    return log_rotation(dR) / seconds, log_rotation(motion.R_from_to) / seconds, covariance

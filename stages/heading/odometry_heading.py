@@ -1,0 +1,101 @@
+"""Yaw of the drone's body by the autopilot's own odometry, as evidence with an outlier share.
+
+    z_i = c + Rz(psi) x_i + e_i
+
+z: LiDAR positions (map), x: the autopilot's positions (odom): psi is the yaw of `odom` in `map`, known within metres
+of flight. The body's yaw is psi plus the yaw of R_odom_drone, less the error of the autopilot's compass: its velocity
+by GPS is right while its attitude may be turned. No motion of the odometry alone shows that error, so it stays an
+uncertainty however long the drone flies:
+
+    p(yaw) = (1 - o) N(yaw; psi + yaw_odom, sigma_psi^2 + sigma_c^2) + o / 2 pi
+
+Source: ours; Horn, JOSA A 4(4) (1987) for the fit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.frames import Array64, heading_rad
+
+APART_NS = 150_000_000
+WINDOW_NS = 10_000_000_000
+LEAST_POINTS, LEAST_M = 4, 1.0
+FIX_FLOOR_M = 0.05
+DRIFT_MPS = 0.12  # error of the odometry's velocity, constant over the window, one axis
+LENGTH_SLACK = 0.35  # displacements that differ more are not of one motion
+CURRENT_NS = 3_000_000_000
+
+
+@dataclass(frozen=True)
+class YawEvidence:
+    """A yaw of the body with the share of compasses that are wrong by any angle."""
+
+    yaw_rad: float
+    sigma_rad: float
+    outlier_share: float
+
+    def log_density(self, yaw_rad: Array64, variance_rad2: Array64) -> Array64:
+        """(n,) logarithm of the density for normal yaws, relative to a uniform one."""
+        s2 = self.sigma_rad**2 + variance_rad2
+        off = np.remainder(yaw_rad - self.yaw_rad + math.pi, 2 * math.pi) - math.pi
+        inlier = np.exp(-0.5 * off**2 / s2) * np.sqrt(2 * math.pi / s2)
+        return np.log((1.0 - self.outlier_share) * inlier + self.outlier_share)
+
+
+class OdometryHeading:
+    """Collects LiDAR positions with the autopilot's; one segment of odometry at a time."""
+
+    def __init__(self, compass_sigma_rad: float, compass_outliers: float) -> None:
+        """Error of the autopilot's yaw, and the share of autopilots whose yaw is wrong by any angle."""
+        self._compass_sigma_rad, self._outliers = compass_sigma_rad, compass_outliers
+        self._points: deque[tuple[int, Array64, float, Array64]] = deque()
+        self._segment: int | None = None
+
+    def restart(self) -> None:
+        """Drop all points."""
+        self._points.clear()
+
+    def add(self, stamp_ns: int, xyz_map_m: Array64, variance_m2: float, xyz_odom_m: Array64, segment: int) -> None:
+        """A LiDAR position (map) and the autopilot's position then; variance of one horizontal axis."""
+        if segment != self._segment:
+            self.restart()
+        self._segment = segment
+        points = self._points
+        if points and stamp_ns - points[-1][0] < APART_NS:
+            return
+        points.append((stamp_ns, xyz_map_m[:2], variance_m2, xyz_odom_m[:2]))
+        while points[0][0] < stamp_ns - WINDOW_NS:
+            points.popleft()
+
+    def evidence(self, stamp_ns: int, R_odom_drone: Array64) -> YawEvidence | None:
+        """Yaw of the body at a time with the autopilot's attitude then; None: the motion does not show it."""
+        yaw = self._odom_yaw(stamp_ns)
+        if yaw is None:
+            return None
+        sigma = math.hypot(yaw[1], self._compass_sigma_rad)
+        return YawEvidence(yaw[0] + heading_rad(R_odom_drone), sigma, self._outliers)
+
+    def _odom_yaw(self, stamp_ns: int) -> tuple[float, float] | None:
+        """Yaw of `odom` in `map` and its sigma."""
+        points = self._points
+        if len(points) < LEAST_POINTS or stamp_ns - points[-1][0] > CURRENT_NS:
+            return None
+        t = np.array([p[0] - points[0][0] for p in points]) * 1e-9
+        z, x = np.array([p[1] for p in points]), np.array([p[3] for p in points])
+        variance = np.array([p[2] for p in points]) + FIX_FLOOR_M**2
+        inverse = np.linalg.inv(np.diag(variance) + DRIFT_MPS**2 * np.outer(t, t))
+        ones = inverse.sum(axis=1)
+        W = inverse - np.outer(ones, ones) / ones.sum()
+        Wx = W @ x
+        precision = float((x * Wx).sum())
+        if precision * LEAST_M**2 < 1.0 or float(np.ptp(x, axis=0).max()) < LEAST_M:
+            return None
+        a = complex(float((Wx * z).sum()), float((Wx[:, 0] * z[:, 1] - Wx[:, 1] * z[:, 0]).sum())) / precision
+        if abs(abs(a) - 1.0) > LENGTH_SLACK:
+            return None
+        return math.atan2(a.imag, a.real), 1.0 / math.sqrt(precision)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
+import re
 import subprocess
 from collections import Counter
 from pathlib import Path
@@ -181,3 +182,14 @@ def test_each_class_that_an_error_suggests_can_be_imported() -> None:
         for use in known_classes(kind):
             module, _, name = use.rpartition(".")
             assert hasattr(importlib.import_module(module), name), use
+
+
+def test_every_message_type_has_its_own_schema_number():
+    numbers = Counter(
+        number
+        for package in PACKAGES
+        for file in sources(package)
+        for number in re.findall(r"^@message\(schema=(\d+)\)", file.read_text(encoding="utf-8"), re.MULTILINE)
+    )
+    assert len(numbers) > 20
+    assert not [number for number, count in numbers.items() if count > 1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from flow.message import Message, PerPointF64, message
 
 
-@message(schema=76)
+@message(schema=81)
 class HeadingEstimate(Message):
     """Yaw of the drone's body at stamp_ns: a mixture of normal distributions on the circle.
 

@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def draw_frames(file: Path) -> None:
-    """Vehicle, turntable, lidar, drone, map and odom, each with its axes; and FLU beside FRD and NED."""
+    """Vehicle, turntable, lidar, drone, map and odom, each with its axes; and FLU next to FRD and NED."""
     figure, axes = plt.subplots(figsize=(9.5, 4.2))
     axes.set(xlim=(-0.5, 12.5), ylim=(-0.9, 5.4), aspect="equal")
     axes.axis("off")

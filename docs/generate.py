@@ -1,4 +1,4 @@
-"""MkDocs hook: pages that are made from the code and from documents that lie beside it.
+"""MkDocs hook: pages that are made from the code and from documents outside docs.
 
 `reference/settings.md` comes from `configs/grd.schema.json`, `reference/commands.md` from the commands' own help. The
 operator's page, the recording format, the README of `links/zenoh`, CONTRIBUTING and the changelog are

@@ -17,7 +17,7 @@ from stages.geometry.frames import LidarMount, Pose
 
 DIGITS = 7
 ZERO_NOTE = (
-    "# A zero that differs from that takes back the mean of the encoder's error, which nothing tells from a zero."
+    "# A zero that differs from that removes the mean of the encoder's error, which is indistinguishable from a zero."
 )
 
 

@@ -58,7 +58,7 @@ def calibrate_recording(
             min=0.02,
             max=1.0,
             metavar="DEG",
-            help="The vehicle stands parallel to the wall beside it, within DEG (one sigma): gives the servo's zero.",
+            help="The vehicle stands parallel to a wall at its side, within DEG (one sigma): gives the servo's zero.",
         ),
     ] = None,
     from_s: Annotated[float, typer.Option("--from", min=0, help="Second of RECORDING to begin at.")] = 0.0,

@@ -140,7 +140,7 @@ class InertialBank:
     def near_probability(self, log_factor: Array64 | None = None) -> tuple[int, float]:
         """Index of the most probable hypothesis, and the probability of a yaw within 20 deg of it.
 
-        `log_factor` (n,): evidence beside the weights.
+        `log_factor` (n,): evidence in addition to the weights.
         """
         log_weight = self.log_weight if log_factor is None else self.log_weight + log_factor
         weight = np.exp(log_weight - _log_sum(log_weight))

@@ -22,7 +22,7 @@ STEEP_RAD = math.radians(60.0)  # pitch or roll beyond which yaw is not evaluate
 
 
 class AttitudeEvent(enum.Enum):
-    """What an ATTITUDE shows beside the attitude."""
+    """Event that an ATTITUDE shows in addition to the attitude."""
 
     BOOTED = enum.auto()
     YAW_RESET = enum.auto()

@@ -22,7 +22,7 @@ OnRejection = Literal["stop", "reset", "report"]
 REJECTED_NS = 600_000_000  # ratio above 1 for so long, before ArduPilot's failsafe of 1 s
 RESUME, RESUME_NS = 0.5, 3_000_000_000
 MAX_RESETS = 3
-SETTLED_NS = 5_000_000_000  # without rejection, after which resets are counted anew
+SETTLED_NS = 5_000_000_000  # without rejection, after which resets are counted again from zero
 STALE_NS = 2_000_000_000  # between two status messages: no statement in between
 
 

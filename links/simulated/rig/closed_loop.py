@@ -104,7 +104,7 @@ class ClosedLoop:
         return record if self._poses is None else self._poses.before(record)
 
     def _is_running(self, now_ns: int) -> bool:
-        """Whether grd runs; after it was killed it starts anew."""
+        """Whether grd runs; after it was killed it is restarted."""
         killed_s = self._settings.killed_s
         if killed_s is None or self._start_ns is None:
             return True

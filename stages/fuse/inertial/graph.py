@@ -173,7 +173,7 @@ class InertialGraph:
         return {X(n): at_s, V(n): at_s, B(n): at_s}
 
     def _guarded(self, graph: Any, values: Any, times: dict[int, float], fallback: InertialState) -> bool:
-        """Update and read the newest key; on failure start anew at the fallback."""
+        """Update and read the newest key; on failure restart at the fallback."""
         newest = None
         try:
             self._smoother.update(graph, values, times)

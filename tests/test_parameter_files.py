@@ -11,9 +11,9 @@ from links.mavlink.profiles import ProfileName, YawOutput, findings, required_pa
 FOLDER = Path(__file__).resolve().parents[1] / "deploy" / "parameters"
 FILES: dict[str, tuple[ProfileName, YawOutput]] = {
     "ardupilot_gps.param": ("ardupilot", "none"),
-    "ardupilot_no_gps.param": ("ardupilot", "cameras"),
+    "ardupilot_no_gps.param": ("ardupilot", "measured"),
     "px4_gps.params": ("px4", "none"),
-    "px4_no_gps.params": ("px4", "cameras"),
+    "px4_no_gps.params": ("px4", "measured"),
 }
 
 
@@ -38,4 +38,4 @@ def test_each_file_is_tested():
 
 def test_the_file_of_one_source_does_not_pass_for_the_other():
     values = values_of(FOLDER / "ardupilot_gps.param")
-    assert any("EK3_SRC2_YAW" in found for found in findings(required_parameters("ardupilot", "cameras"), values))
+    assert any("EK3_SRC2_YAW" in found for found in findings(required_parameters("ardupilot", "measured"), values))

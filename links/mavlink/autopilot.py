@@ -53,7 +53,7 @@ class AutopilotSettings(SourceSettings):
     sender: IPv4Address | None = None  # the autopilot's address, required when udpin listens beyond loopback
     profile: ProfileName = "ardupilot"
     send: tuple[PoseMessage, ...] = ("odometry",)  # messages per pose
-    yaw: YawOutput = "none"  # none: positions in the autopilot's axes; cameras: poses in `map`, EK3_SRCn_YAW 6
+    yaw: YawOutput = "none"  # none: positions in the autopilot's axes; measured: poses in `map`, EK3_SRCn_YAW 6
     source_set: int = Field(2, ge=1, le=3)  # ArduPilot: EK3_SRCn_* that are grd's; set 1 flies without it
     on_rejection: OnRejection = "stop"  # when the autopilot's EKF rejects the pose: stop, reset or report
     limits: PoseLimits = PoseLimits()

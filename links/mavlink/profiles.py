@@ -3,7 +3,7 @@
 They depend on what the poses contain (`yaw` of the link):
 
     none      positions in the autopilot's own axes: its yaw must come from its compass (or GPS), never from grd
-    cameras   poses in the vehicle's start frame, x in the vehicle's forward direction and not north: the yaw must come
+    measured  poses in the vehicle's start frame, x in the vehicle's forward direction and not north: the yaw must come
               from grd alone; with the compass it would rotate the positions by the vehicle's initial heading
 
 grd is one source set of ArduPilot (`source_set`, EK3_SRC2_* by default); set 1 is the source that flies without grd.
@@ -47,7 +47,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 ProfileName = Literal["ardupilot", "px4"]
-YawOutput = Literal["none", "cameras"]
+YawOutput = Literal["none", "measured"]
 WIRE_ERROR = 1e-6  # relative: parameters are 32-bit floats
 
 
@@ -136,7 +136,7 @@ def required_parameters(profile: ProfileName, yaw: YawOutput, source_set: int = 
 def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]:
     own = f"EK3_SRC{source_set}_"
     velocity = "grd sends no velocity"
-    by_cameras = (
+    measured = (
         RequiredParameter(own + "VELXY", (0.0, 5.0), why=f"{velocity}; GPS velocity is in another frame"),
         RequiredParameter(own + "VELZ", (0.0,), why=velocity),
         RequiredParameter(
@@ -163,7 +163,7 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
         RequiredParameter("VISO_TYPE", (1.0,), why="MAVLink; 3 (VOXL) would hide resets behind an offset"),
         RequiredParameter(own + "POSXY", (EXTERNAL,), why="horizontal position from grd"),
         RequiredParameter(own + "POSZ", (EXTERNAL, 1.0), why="height from grd, or the barometer"),
-        *(by_cameras if yaw == "cameras" else without_yaw),
+        *(measured if yaw == "measured" else without_yaw),
         *(other if source_set != 1 else ()),
         RequiredParameter(
             "ARMING_CHECK",
@@ -184,7 +184,7 @@ def _ardupilot(yaw: YawOutput, source_set: int) -> tuple[RequiredParameter, ...]
 
 
 def _px4(yaw: YawOutput) -> tuple[RequiredParameter, ...]:
-    by_cameras = (
+    measured = (
         RequiredParameter(
             "EKF2_EV_CTRL",
             bits=1 | 8,
@@ -207,7 +207,7 @@ def _px4(yaw: YawOutput) -> tuple[RequiredParameter, ...]:
         RequiredParameter("EKF2_MAG_TYPE", (0.0, 1.0), why="yaw from the compass: grd sends none"),
     )
     return (
-        *(by_cameras if yaw == "cameras" else without_yaw),
+        *(measured if yaw == "measured" else without_yaw),
         RequiredParameter("EKF2_HGT_REF", (0.0, 3.0, 1.0), why="height from the barometer, grd or GPS"),
         RequiredParameter("EKF2_EV_NOISE_MD", (0.0,), why="use the message's covariance"),
         RequiredParameter("EKF2_EV_DELAY", at_least=0.0, at_most=50.0, why=_DELAY),

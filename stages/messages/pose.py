@@ -63,7 +63,7 @@ class RelativePose(Message):
     resets: int  # how often the pose jumped since the start: a new branch, a new drone, a restart
     nis: float  # normalised innovation squared of the newest accepted LiDAR position, 3 degrees of freedom; NaN: none
     estimate: PositionEstimate | PoseEstimate | None  # a pose when FULL or COASTING; None when LOST
-    rotation_ns: int | None = None  # time of the newest rotation by cameras in the estimate; None: none
+    rotation_ns: int | None = None  # newest measurement of the rotation by cameras or raw IMU; None: none
     # yaw of the autopilot's frame in `map` as it reports it now, R_map_odom = Rz(yaw): learnt while its telemetry was
     # independent of our poses, kept since. None: not known, or the drone may be another one
     odom_yaw_rad: float | None = None

@@ -68,7 +68,7 @@ def test_a_pose_to_the_peers_socket(benchmark: Any, tmp_path: Path, signed: bool
         peer.bind(("127.0.0.1", 0))
         peer.settimeout(5.0)
         connection = f"udpout:127.0.0.1:{peer.getsockname()[1]}"
-        link = Autopilot(connection=connection, yaw="cameras", signing_key=key if signed else None)
+        link = Autopilot(connection=connection, yaw="measured", signing_key=key if signed else None)
         took_ms: list[float] = []
         with link.listen():
             pose = good_pose()

@@ -78,7 +78,7 @@ def test_a_packet_to_its_poses_datagram_by_computing() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         peer.bind(("127.0.0.1", 0))
         peer.settimeout(5.0)
-        link = Autopilot(connection=f"udpout:127.0.0.1:{peer.getsockname()[1]}", yaw="cameras")
+        link = Autopilot(connection=f"udpout:127.0.0.1:{peer.getsockname()[1]}", yaw="measured")
         with link.listen():
             tap.wire(link, peer)
             for record in simulate_records(scenario):

@@ -1,7 +1,7 @@
 """Gate of poses to the autopilot: a pose that could cause a wrong flight is rejected with a reason.
 
 This gate is of poses with rotation: LANDING_TARGET, which contains the vehicle's position in the drone's axes, and
-poses with a yaw by cameras. Positions without yaw: `position_gate.py`. An autopilot arms with a pose that has a wrong
+poses with a measured yaw. Positions without yaw: `position_gate.py`. An autopilot arms with a pose that has a wrong
 yaw branch (90 deg) and crashes, so an unresolved branch is rejected regardless of its covariance. The rotation sigma is
 the largest about any axis: the autopilot takes roll and pitch from its own gyros, but an uncertain tilt indicates an
 invalid rotation.
@@ -43,7 +43,7 @@ class RejectReason(enum.Enum):
     NOT_NEWER = "not newer than the last sent pose"
     AUTOPILOT_SILENT = "autopilot silent"
     LINK_LATE = "link too slow"
-    YAW_NOT_MEASURED = "yaw not measured by cameras"
+    YAW_NOT_MEASURED = "yaw not measured"
     ODOM_YAW = "yaw of autopilot's axes unknown"
     ODOM_YAW_SIGMA = "yaw of autopilot's axes uncertain"
     ODOM_YAW_RESET = "autopilot reset its yaw"
@@ -59,7 +59,7 @@ class PoseLimits(BaseModel):
     position_sigma_m: float = Field(default=0.35, gt=0, le=5)  # 95 % are within 2.8 sigma, 1 m
     rotation_sigma_deg: float = Field(default=5.0, gt=0, le=15)
     odom_yaw_sigma_deg: float = Field(default=2.0, gt=0, le=15)  # of the autopilot's axes, for positions without yaw
-    rotation_age_s: float = Field(default=2.0, gt=0, le=10)  # of the rotation by cameras, for poses with yaw
+    rotation_age_s: float = Field(default=2.0, gt=0, le=10)  # of the measured rotation, for poses with yaw
     age_s: float = Field(default=0.15, gt=0, le=0.3)  # of the pose at the time of sending
 
 
@@ -88,7 +88,7 @@ def reject_reason(pose: RelativePose, now_ns: int, limits: PoseLimits) -> Reject
 
 
 def yaw_reason(pose: RelativePose, limits: PoseLimits) -> RejectReason | None:
-    """Why the yaw of a pose must not be sent; None: cameras measured it recently."""
+    """Why the yaw of a pose must not be sent; None: it was measured recently, without the autopilot."""
     measured_ns = pose.rotation_ns
     old = measured_ns is None or pose.stamp_ns - measured_ns > 1e9 * limits.rotation_age_s
     return RejectReason.YAW_NOT_MEASURED if old else None

@@ -3,7 +3,7 @@
 `yaw` decides what ODOMETRY and VISION_POSITION_ESTIMATE contain, and which yaw source the autopilot needs:
 
     none      a position in the autopilot's own axes; its yaw comes from its compass. It needs no rotation of the drone
-    cameras   a pose in `map` with yaw, while cameras measure it; its yaw comes from grd alone
+    measured  a pose in `map` with yaw, while cameras or the raw IMU measure it; its yaw comes from grd alone
 
 The reset counter is incremented with every jump of the pose, every change of the drone, and after every pause that the
 autopilot noticed, so that it resets to the new pose instead of gating it. Its initial value is arbitrary: after a

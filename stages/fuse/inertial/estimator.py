@@ -134,6 +134,12 @@ class InertialEstimator:
     # state
 
     @property
+    def measured_rotation_ns(self) -> int | None:
+        """Newest measurement of the rotation: by vanishing points, or by a LiDAR position together with the IMU."""
+        by_imu = self.fix_ns if self.decided and self.imu.is_current(self.stamp_ns) else None
+        return max((ns for ns in (self.rotation_ns, by_imu) if ns is not None), default=None)
+
+    @property
     def known(self) -> bool:
         """Whether a position is known."""
         return self.graph.running or self.heading.bank is not None

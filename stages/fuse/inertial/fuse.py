@@ -17,13 +17,13 @@ Source: ours; DESIGN, Fusion and The graph: fuse.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
+from flow.counters import Counters
 from flow.message import Message
 from flow.stage import Settings, Stage
 from stages.fuse.chain import yaw_sigma_rad
@@ -86,15 +86,11 @@ class InertialFuse(Stage[InertialFuseSettings]):
         self._map_was_fixed = False
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counters:
         """Invalid messages by reason, and resets of the smoother."""
-        rejected: Counter[str] = self._intake.rejected
-        counts = {f"rejected: {why}": count for why, count in rejected.items()}
-        if self._estimator.too_late:
-            counts["rejected: too late"] = self._estimator.too_late
-        if self._estimator.graph.recoveries:
-            counts["back end reset"] = self._estimator.graph.recoveries
-        return counts
+        late = {"too late": self._estimator.too_late} if self._estimator.too_late else {}
+        recoveries = self._estimator.graph.recoveries
+        return Counters({"back end reset": recoveries} if recoveries else {}, {**self._intake.rejected, **late})
 
     def on_motion(self, motion: VehicleMotion) -> Poses:
         """Pose of the vehicle in `map`."""
@@ -202,7 +198,9 @@ class InertialFuse(Stage[InertialFuseSettings]):
 
     def _status(self, state: PoseState, reason: str) -> Status:
         e = self._estimator
-        return Status(state, reason, e.newest_fix_ns, self._track_id, e.resets + self._jumps.number, e.nis)
+        return Status(
+            state, reason, e.newest_fix_ns, self._track_id, e.resets + self._jumps.number, e.nis, e.measured_rotation_ns
+        )
 
     def _known(self, now_ns: int) -> MapEstimate:
         """The estimate propagated to now, with the bias covariances added."""

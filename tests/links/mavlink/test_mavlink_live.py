@@ -83,7 +83,7 @@ def bound_port(udp: socket.socket) -> int:
 
 @contextmanager
 def listening(**config: Any) -> Iterator[Listener]:
-    link = Autopilot(**{"connection": "udpin:127.0.0.1:0", "yaw": "cameras", **config})
+    link = Autopilot(**{"connection": "udpin:127.0.0.1:0", "yaw": "measured", **config})
     with link.listen() as records:
         listener = Listener(link, records)
         try:

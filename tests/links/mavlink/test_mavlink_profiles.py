@@ -25,7 +25,7 @@ from links.simulated.autopilot.ardupilot_rules import ArduPilotRules
 from links.simulated.autopilot.autopilot_socket import AutopilotSocket
 from links.simulated.autopilot.px4_rules import Px4Rules
 
-ALL = [(profile, yaw) for profile in PROFILES for yaw in ("none", "cameras")]
+ALL = [(profile, yaw) for profile in PROFILES for yaw in ("none", "measured")]
 
 
 def valid(required: tuple[RequiredParameter, ...]) -> dict[str, float]:
@@ -60,7 +60,7 @@ def test_each_wrong_or_missing_parameter_is_one_sentence(profile: ProfileName, y
 @pytest.mark.parametrize(
     ("profile", "yaw", "name", "value", "why"),
     [
-        ("ardupilot", "cameras", "EK3_SRC2_YAW", 1.0, "a compass would rotate it"),
+        ("ardupilot", "measured", "EK3_SRC2_YAW", 1.0, "a compass would rotate it"),
         ("ardupilot", "none", "EK3_SRC2_YAW", 6.0, "grd sends no yaw"),
         ("ardupilot", "none", "EK3_SRC2_VELXY", 6.0, "grd sends no velocity"),
         ("ardupilot", "none", "EK3_SRC2_VELZ", 6.0, "grd sends no velocity"),
@@ -68,7 +68,7 @@ def test_each_wrong_or_missing_parameter_is_one_sentence(profile: ProfileName, y
         ("ardupilot", "none", "EK3_SRC_OPTIONS", 3.0, "a fly-away"),
         ("ardupilot", "none", "EK3_SRC1_POSXY", 6.0, "set 1 flies without grd"),
         ("ardupilot", "none", "ARMING_CHECK", 1.0, "refuses arming before grd sends"),
-        ("px4", "cameras", "EKF2_EV_CTRL", 3.0, "8: yaw"),
+        ("px4", "measured", "EKF2_EV_CTRL", 3.0, "8: yaw"),
         ("px4", "none", "EKF2_EV_CTRL", 9.0, "8 (yaw) are not sent"),
         ("px4", "none", "EKF2_EV_CTRL", 5.0, "4 (velocity)"),
         ("px4", "none", "EKF2_MAG_TYPE", 5.0, "yaw from the compass"),

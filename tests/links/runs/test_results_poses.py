@@ -34,7 +34,7 @@ def made(t_s, R=None, state=FULL, xyz=(1.0, 2.0, 3.0), variances=(0.001, 0.002, 
 @pytest.fixture
 def run(tmp_path):
     def write(messages):
-        results = Results(yaw="cameras")
+        results = Results(yaw="measured")
         results.open(Run(tmp_path, "made", "", ""))
         for message in messages:
             results.see("fuse.relative_pose", message, message.stamp_ns)
@@ -84,7 +84,7 @@ def test_a_pose_is_good_when_the_autopilot_gate_accepts_it(tmp_path):
         (PoseLimits(), [True, False, False]),
         (PoseLimits(position_sigma_m=0.5), [True, True, False]),
     ):
-        results = Results(limits=limits, yaw="cameras")
+        results = Results(limits=limits, yaw="measured")
         results.open(Run(tmp_path, "made", "", ""))
         for message in (made(1.0, R), made(1.02, R, variances=wide), made(1.04, R, variances=askew)):
             results.see("fuse.relative_pose", message, message.stamp_ns)
@@ -121,7 +121,7 @@ def test_a_number_that_is_not_known_is_empty(run):
 
 
 def test_poses_are_counted_by_state_and_their_jumps_reported(tmp_path):
-    results = Results(yaw="cameras")
+    results = Results(yaw="measured")
     results.open(Run(tmp_path, "made", "", ""))
     assert results.pose_states == {}
     unknown = pose(
@@ -139,4 +139,4 @@ def test_poses_are_counted_by_state_and_their_jumps_reported(tmp_path):
 
 @pytest.mark.parametrize(("kind", "wanted"), [(RelativePose, True), (DroneFix, True), (SweptPulses, False)])
 def test_a_live_run_passes_on_only_the_contents_of_the_files(kind, wanted):
-    assert Results(yaw="cameras").wants(kind) is wanted
+    assert Results(yaw="measured").wants(kind) is wanted

@@ -27,7 +27,7 @@ class Flight:
     """Poses at 50 Hz, and a status five times a second."""
 
     def __init__(self, on_rejection: Any = "stop") -> None:
-        self.sender = PoseSender(("odometry",), PoseLimits(), yaw="cameras", on_rejection=on_rejection)
+        self.sender = PoseSender(("odometry",), PoseLimits(), yaw="measured", on_rejection=on_rejection)
         self.now_ns = HOST0
         self.counters: list[int] = []
         self.texts: list[str] = []

@@ -70,7 +70,7 @@ INVALID = [
 def test_an_invalid_pose_is_rejected_with_its_reason_and_nothing_is_sent(change: Any, why: RejectReason):
     pose = good_pose(**change)
     assert reject_reason(pose, HOST0, LIMITS) is why
-    pose_sender = PoseSender(("odometry", "landing_target"), LIMITS, yaw="cameras")
+    pose_sender = PoseSender(("odometry", "landing_target"), LIMITS, yaw="measured")
     assert pose_sender.messages(pose, HOST0) == []
     assert pose_sender.rejected == {why: 1}
 
@@ -95,7 +95,7 @@ def test_an_old_pose_and_one_from_the_future_are_rejected(age_ms: int, why: Reje
 
 def test_an_unresolved_yaw_branch_is_never_sent_whatever_its_covariance():
     """100 poses per state, each with a yaw error of 90 deg and a small covariance."""
-    pose_sender = PoseSender(("odometry",), LIMITS, yaw="cameras")
+    pose_sender = PoseSender(("odometry",), LIMITS, yaw="measured")
     wrong = rotation_z(math.pi / 2)
     sent = 0
     for i in range(300):
@@ -126,7 +126,7 @@ def test_whatever_one_number_becomes_sent_poses_are_finite_certain_and_recent(
     changed = np.array(getattr(good_pose().estimate, field))
     changed.flat[at % changed.size] = value
     pose = good_pose(state=state, **{field: changed})
-    messages = PoseSender(("odometry",), LIMITS, yaw="cameras").messages(pose, HOST0 + age_ms * MS)
+    messages = PoseSender(("odometry",), LIMITS, yaw="measured").messages(pose, HOST0 + age_ms * MS)
     for message in messages:
         assert state in (PoseState.FULL, PoseState.COASTING)
         assert -50 <= age_ms <= 150

@@ -18,7 +18,7 @@ class Output:
     """Sends poses at a rate and keeps the sent counters and texts."""
 
     def __init__(self, **settings: Any) -> None:
-        self.pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="cameras", **settings)
+        self.pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="measured", **settings)
         self.now_ns = HOST0
         self.counters: list[int] = []
         self.texts: list[tuple[int, str]] = []
@@ -160,7 +160,7 @@ def test_a_text_that_could_not_be_sent_is_kept_unless_a_newer_one_replaces_it():
 
 
 def test_without_messages_nothing_is_sent_or_stopped():
-    pose_sender = PoseSender((), PoseLimits(), yaw="cameras")
+    pose_sender = PoseSender((), PoseLimits(), yaw="measured")
     assert pose_sender.messages(good_pose(), HOST0) == []
     assert not pose_sender.sending
     texts = [m.text for i in range(40) for m in pose_sender.due_texts(HOST0 + 100 * i * MS)]

@@ -90,7 +90,7 @@ def test_a_position_sends_no_landing_target_and_a_full_pose_does():
 
 @pytest.mark.parametrize(("age_s", "messages"), [(1.9, 1), (2.1, 0), (None, 0)])
 def test_a_yaw_is_sent_only_while_cameras_measure_it(age_s: float | None, messages: int):
-    pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="cameras")
+    pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="measured")
     measured_ns = None if age_s is None else HOST0 - round(1e9 * age_s)
     assert len(pose_sender.messages(good_pose(rotation_ns=measured_ns), HOST0)) == messages
     assert pose_sender.rejected == ({} if messages else {RejectReason.YAW_NOT_MEASURED: 1})

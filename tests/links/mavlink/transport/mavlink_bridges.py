@@ -143,7 +143,7 @@ class SlowFlight:
         monkeypatch.setattr("links.mavlink.transport.stream_connection.time.monotonic", lambda: self.s)
         monkeypatch.setattr(AutopilotSession, "_run", lambda session: None)  # the test calls its steps
         self.connection: Connection = RatedBridge(self.line) if bridge else StreamConnection(self.line)
-        pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="cameras")
+        pose_sender = PoseSender(("odometry",), PoseLimits(), yaw="measured")
         self.session = AutopilotSession(
             self.connection,
             (1, 1),

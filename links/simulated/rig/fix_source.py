@@ -55,8 +55,6 @@ class SimulatedFixes(Source[SimulatedFixesSettings]):
             xyz_vehicle_m=xyz,
             covariance_m2=covariance,
             hits=RETURNS,
-            iterations=1,
-            shift_m=0.0,
             velocity_vehicle_mps=velocity,
             bias_covariance_m2=bias,
         )

@@ -17,7 +17,7 @@ import numpy as np
 
 from stages.geometry.frames import Array64
 from stages.kernels.geometry.so3 import exp_rotation, log_rotation
-from stages.messages import AutopilotMotion, DroneAttitude, DroneLocalPosition, DroneOdometry
+from stages.messages import AutopilotMotion, DroneAttitude, DroneLocalPosition, DroneOdometry, DroneTilt
 
 GRAVITY_MPS2 = 9.80665
 GAP_S = 0.5  # after a longer one a reset cannot be detected
@@ -48,6 +48,7 @@ class AutopilotEstimate:
 
     def __init__(self, age_s: float) -> None:
         self._age_ns = round(1e9 * age_s)  # longest propagation of a sample
+        self._tilt: DroneTilt | None = None
         self._attitude: _Attitude | None = None
         self._position: _Position | None = None
         self._odometry_ns: int | None = None
@@ -86,10 +87,16 @@ class AutopilotEstimate:
         xyz, velocity = message.xyz_odom_m, R @ message.velocity_drone_mps
         self._add_position(_Position(message.stamp_ns, xyz, velocity, message.independent))
 
+    def on_tilt(self, message: DroneTilt) -> None:
+        """Add the vertical by roll and pitch."""
+        self._tilt = message
+
     def up_drone(self, stamp_ns: int) -> Array64 | None:
-        """Unit vector up in drone axes: the attitude without its yaw. None: no recent attitude."""
-        R = self._R_odom_drone(stamp_ns)
-        return None if R is None else R[2].copy()
+        """Unit vector up in drone axes, propagated by the IMU. None: no recent one."""
+        tilt = self._tilt
+        if tilt is None or abs(stamp_ns - tilt.stamp_ns) > self._age_ns:
+            return None
+        return tilt.up_drone @ exp_rotation((stamp_ns - tilt.stamp_ns) * 1e-9 * self._rate_radps)
 
     def at(self, stamp_ns: int) -> AutopilotMotion | None:
         """The estimate at a time; None: not at hand, or it may contain poses that grd sent."""

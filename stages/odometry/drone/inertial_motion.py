@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from flow.stage import Settings, Stage
-from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneMotion, DroneOdometry
+from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneMotion, DroneOdometry, DroneTilt
 from stages.odometry.drone.autopilot_estimate import AutopilotEstimate
 from stages.odometry.drone.imu_noise import SampleNoise
 
@@ -45,7 +45,7 @@ class InertialMotionSettings(Settings):
 class InertialMotion(Stage[InertialMotionSettings]):
     """One DroneMotion per IMU interval. The autopilot's estimates are optional."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"attitude", "position", "odometry"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"tilt", "attitude", "position", "odometry"})
 
     def __init__(self, settings: InertialMotionSettings | None = None, /, **values: Any) -> None:
         super().__init__(settings, **values)
@@ -61,8 +61,12 @@ class InertialMotion(Stage[InertialMotionSettings]):
         return dict(self._counts) | {"segments": self._segment + 1, "autopilot resets": self._autopilot.segment}
 
     def on_attitude(self, attitude: DroneAttitude) -> None:
-        """Attitude of the autopilot: roll and pitch always, its yaw only while it is independent."""
+        """Attitude of the autopilot, used only while it is independent."""
         self._autopilot.on_attitude(attitude)
+
+    def on_tilt(self, tilt: DroneTilt) -> None:
+        """Vertical by the autopilot's roll and pitch."""
+        self._autopilot.on_tilt(tilt)
 
     def on_position(self, position: DroneLocalPosition) -> None:
         """Position and velocity of the autopilot."""

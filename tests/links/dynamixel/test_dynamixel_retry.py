@@ -25,7 +25,7 @@ class SimulatedWorker:
         monkeypatch.setattr(worker.Bus, "open", lambda *_: self.opened())
         monkeypatch.setattr(worker, "Drive", lambda *_: self)
         with own, peer:
-            process = worker.Worker(peer, Servo(start_timeout_s=60)._drive_settings())
+            process = worker.ServoWorker(peer, Servo(start_timeout_s=60)._drive_settings())
             end_ns = self.now_ns + seconds * S
 
             def wait():

@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.geometry.frames import rotation_z
 from stages.kernels.geometry.so3 import exp_rotation
-from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry
+from stages.messages import DroneAttitude, DroneImu, DroneLocalPosition, DroneOdometry, DroneTilt
 
 START, MS = 1_748_773_230_000_000_000, 1_000_000
 RATE = np.array([0.02, -0.03, 0.4])
@@ -50,6 +50,12 @@ def attitude(at_ms: float, independent: bool = True, R: np.ndarray | None = None
         R_odom_drone=R_odom_drone(at_ms) if R is None else R,
         angular_velocity_drone_radps=RATE,
         independent=independent,
+    )
+
+
+def tilt(at_ms: float) -> DroneTilt:
+    return DroneTilt(
+        stamp_ns=stamp(at_ms), up_drone=R_odom_drone(at_ms)[2].copy(), sigma_rad=0.02, angular_velocity_drone_radps=None
     )
 
 

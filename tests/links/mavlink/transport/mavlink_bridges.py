@@ -174,7 +174,7 @@ class SlowFlight:
             if self._steps % self.pose_steps == 0:
                 self.session.send_pose(good_pose(self.now_ns))
             if self._steps % TICK_STEPS == 3:
-                self.session._tick(self.now_ns)
+                self.session.tick()
             for frame in self.line.transmit(1e-9 * STEP_NS):
                 self._forward(parse_frame(frame))
             self.connection.receive(0.0)

@@ -17,9 +17,9 @@ from tests.stages.odometry.made_imu import (
     imu,
     local_position,
     odometry,
-    tilt,
     position,
     stamp,
+    tilt,
     velocity,
 )
 

@@ -233,11 +233,12 @@ class FlightStack:
         sources = self.ekf.sources
         home_yaw, map_yaw = self._world_yaw, -float(self._map[1])
         external = sources.position is AidingSource.EXTERNAL
-        yaw, origin = (map_yaw, self._map[0]) if external else (home_yaw, self._home)
+        own_yaw = sources.yaw is not AidingSource.EXTERNAL  # then positions come in its own, north-aligned axes
+        yaw, origin = home_yaw if own_yaw else map_yaw, self._map[0] if external else self._home
         xyz = -rotate(origin, yaw)
         if sources.height is not AidingSource.EXTERNAL:
             xyz[2] = -self._home[2]
-        return SurveyFrame(yaw, xyz, map_yaw if sources.yaw is AidingSource.EXTERNAL else home_yaw)
+        return SurveyFrame(yaw, xyz, yaw)
 
     def _do_plan(self, time_s: float) -> None:
         while self._plan and time_s >= self._step_ends_s - 1e-9:

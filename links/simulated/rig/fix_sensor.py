@@ -20,10 +20,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from flow.link import Record
+from links.simulated.rig.fix_source import FIX_TOPIC
 from links.simulated.world.scene import Truth
 
 NS = 1_000_000_000
-FIX_TOPIC = "/simulated/fixes"
 TICKS_PER_FIX = 5  # the host's clock ticks at 50 Hz
 
 

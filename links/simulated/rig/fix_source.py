@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from flow.link import Record, Source, SourceSettings
-from links.simulated.rig.fix_sensor import FIX_TOPIC
 from stages.messages import DroneFix, Tick, TrackingState, TrackState
 
+FIX_TOPIC = "/simulated/fixes"
 FRAME_S = 0.1
 RETURNS = 5
 

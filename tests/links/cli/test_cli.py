@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -193,3 +195,15 @@ def test_graph_and_schema_are_written(grd, tmp_path):
     assert (tmp_path / "graph.svg").read_text().startswith("<svg ")
     assert "flowchart LR" in grd("graph", ROOT / "configs" / "paper.yaml")
     assert json.loads(grd("schema"))["title"] == "grd configuration"
+
+
+def test_the_quickstart_runs_without_the_packages_of_any_extra(tmp_path):
+    """The README's first command installs none of them."""
+    packages = ("embreex", "evo", "matplotlib", "pandas", "zenoh", "hypothesis", "velodyne_decoder", "mkdocs", "pytest")
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({packages})); from links.cli import main; "
+        f"sys.argv = ['grd', 'run', 'configs/quickstart.yaml', '--out', {str(tmp_path / 'out')!r}]; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "output hash" in done.stdout

@@ -20,7 +20,6 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
-import numpy as np
 from pydantic import Field
 
 from flow.counters import Counters
@@ -129,9 +128,7 @@ class Fuse(Stage[FuseSettings]):
 
     def on_visual_motion(self, motion: VisualMotion) -> Poses:
         """Visual odometry of the drone: turns, and directions without scale."""
-        direction, sigma_rad = motion.direction_from, np.array(motion.direction_sigma_rad or 0.0)
-        numbers = (motion.R_from_to, motion.covariance_rad2, sigma_rad, *(() if direction is None else (direction,)))
-        if self._intake.is_valid(motion, "drone motion", *numbers):
+        if self._intake.is_valid_visual_motion(motion):
             self._estimator.add_visual_motion(motion)
         yield from self._publish(motion)
 
@@ -142,27 +139,19 @@ class Fuse(Stage[FuseSettings]):
 
     def on_fix(self, fix: DroneFix) -> Poses:
         """LiDAR position."""
-        velocity = () if fix.velocity_vehicle_mps is None else (fix.velocity_vehicle_mps,)
-        bias_covariance_m2 = np.zeros((3, 3)) if fix.bias_covariance_m2 is None else fix.bias_covariance_m2
-        numbers = (fix.xyz_vehicle_m, fix.covariance_m2, bias_covariance_m2, *velocity)
-        if self._intake.is_valid(fix, "fix", *numbers) and self._intake.is_covariance(
-            fix.covariance_m2 - bias_covariance_m2, "fix"
-        ):
+        if self._intake.is_valid_fix(fix):
             self._waiting.append(fix)
         yield from self._publish(fix)
 
     def on_rotation(self, rotation: RelativeRotation) -> Poses:
         """Rotation by both cameras; only a RESOLVED one corrects the pose."""
-        R, covariance = rotation.R_vehicle_drone, rotation.covariance_rad2
         self._rotation_reason = rotation.reason
-        if R is None or covariance is None:
+        if rotation.R_vehicle_drone is None or rotation.covariance_rad2 is None:
             pass
         elif rotation.state is not BranchState.RESOLVED:
             self._ambiguous_ns = rotation.stamp_ns
             self._estimator.unresolved()
-        elif self._intake.is_valid(rotation, "rotation", R, covariance) and self._intake.is_covariance(
-            covariance, "rotation"
-        ):
+        elif self._intake.is_valid_rotation(rotation):
             self._waiting.append(rotation)
         yield from self._publish(rotation)
 

@@ -14,6 +14,7 @@ import numpy as np
 from flow.message import Message
 from stages.geometry.frames import Array64
 from stages.geometry.se3 import is_covariance
+from stages.messages import DroneFix, RelativeRotation, VisualMotion
 
 AHEAD_NS = 1_000_000_000
 MAX_REJECTED_STAMPS = 5
@@ -48,6 +49,26 @@ class Intake:
             return True
         self.rejected[f"{what}: its covariance is not positive definite"] += 1
         return False
+
+    def is_valid_fix(self, fix: DroneFix) -> bool:
+        """Whether a LiDAR position can be used: also its covariance without that of its bias."""
+        velocity = () if fix.velocity_vehicle_mps is None else (fix.velocity_vehicle_mps,)
+        bias_m2 = np.zeros((3, 3)) if fix.bias_covariance_m2 is None else fix.bias_covariance_m2
+        numbers = (fix.xyz_vehicle_m, fix.covariance_m2, bias_m2, *velocity)
+        return self.is_valid(fix, "fix", *numbers) and self.is_covariance(fix.covariance_m2 - bias_m2, "fix")
+
+    def is_valid_rotation(self, rotation: RelativeRotation) -> bool:
+        """Whether a rotation by cameras can be used; one without an estimate is not counted as rejected."""
+        R, covariance = rotation.R_vehicle_drone, rotation.covariance_rad2
+        if R is None or covariance is None:
+            return False
+        return self.is_valid(rotation, "rotation", R, covariance) and self.is_covariance(covariance, "rotation")
+
+    def is_valid_visual_motion(self, motion: VisualMotion) -> bool:
+        """Whether a motion by the drone's camera can be used."""
+        direction = () if motion.direction_from is None else (motion.direction_from,)
+        sigma_rad = np.array(motion.direction_sigma_rad or 0.0)
+        return self.is_valid(motion, "visual motion", motion.R_from_to, motion.covariance_rad2, sigma_rad, *direction)
 
     def pass_time(self, stamp_ns: int) -> int | None:
         """The time after a stamp was received; None: the stamp is rejected."""

@@ -13,8 +13,6 @@ Source: ours; https://mavlink.io/en/services/timesync.html, /parameter.html; Ard
 
 from __future__ import annotations
 
-import select
-import socket
 import struct
 import threading
 import time
@@ -29,11 +27,11 @@ from links.simulated.autopilot.autopilot import STANDARD_GRAVITY_MPS2, Autopilot
 from links.simulated.autopilot.px4_rules import Px4Rules
 from links.simulated.autopilot.requested_intervals import SET_MESSAGE_INTERVAL, RequestedIntervals
 from links.simulated.autopilot.rules import Rules
+from links.simulated.autopilot.udp_thread import UdpThread
 
 mavlink: Any = ardupilotmega
 
 Address = tuple[str, int]
-STEP_S = 0.002  # resolution of the send times
 BOOT_NS = 100_000_000_000  # time since boot at the start, without a flight
 REPORT_HZ = 5.0
 PX4_TIMESYNC_HZ = 10.0
@@ -43,7 +41,7 @@ RAW_IMU, HIGHRES_IMU = 27, 105  # message ids
 MAX_RECEIVED = 10_000  # received messages that are kept
 
 
-class AutopilotSocket:
+class AutopilotSocket(UdpThread):
     """One autopilot. `received`: (time on its clock [ns], message); `origin`: (lat, lon, alt) in MAVLink's units."""
 
     def __init__(
@@ -59,6 +57,7 @@ class AutopilotSocket:
         system_id: int = 1,
         component_id: int = 1,
     ) -> None:
+        super().__init__(bind, "simulated autopilot")
         self.rules, self.origin = rules, origin
         self.parameters = dict(parameters or {})
         self.received: deque[tuple[int, Any]] = deque(maxlen=MAX_RECEIVED)
@@ -74,26 +73,7 @@ class AutopilotSocket:
         self._peer = send_to
         self._splitter = FrameSplitter()
         self._changed = threading.Condition()
-        self._closed = threading.Event()
         self._next_ns = {"report": 0, "timesync": 0, "beat": 0}
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(bind)
-        self._socket.setblocking(False)
-        self._thread = threading.Thread(target=self._run, name="simulated autopilot", daemon=True)
-
-    def __enter__(self) -> AutopilotSocket:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._closed.set()
-        self._thread.join()
-        self._socket.close()
-
-    @property
-    def port(self) -> int:
-        """The port on which it listens."""
-        return self._socket.getsockname()[1]
 
     def device_ns(self) -> int:
         """Its current time since boot."""
@@ -115,17 +95,11 @@ class AutopilotSocket:
         """Send a message, from the thread of the socket."""
         self._to_send.append(message)
 
-    def _run(self) -> None:
-        while not self._closed.is_set():
-            ready, _, _ = select.select([self._socket], [], [], STEP_S)
-            if ready:
-                try:
-                    data, source = self._socket.recvfrom(2048)
-                except OSError:  # the port of the other side is closed
-                    continue
-                if not self.silent:
-                    self._receive(data, source)
-            self._send_due()
+    def step(self, datagram: tuple[bytes, Address] | None) -> None:
+        """Handle a datagram, and send what is due."""
+        if datagram is not None and not self.silent:
+            self._receive(*datagram)
+        self._send_due()
 
     def _receive(self, data: bytes, source: Address) -> None:
         self._peer = self._peer or source

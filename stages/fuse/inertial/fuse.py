@@ -114,9 +114,7 @@ class InertialFuse(Stage[InertialFuseSettings]):
 
     def on_visual_motion(self, motion: VisualMotion) -> Poses:
         """Visual odometry of the drone: turns, and directions without scale."""
-        direction, sigma_rad = motion.direction_from, np.array(motion.direction_sigma_rad or 0.0)
-        numbers = (motion.R_from_to, motion.covariance_rad2, sigma_rad, *(() if direction is None else (direction,)))
-        if self._intake.is_valid(motion, "visual motion", *numbers) and self._motions.map_is_fixed(motion.stamp_ns):
+        if self._intake.is_valid_visual_motion(motion) and self._motions.map_is_fixed(motion.stamp_ns):
             self._estimator.add(motion)
         yield from self._publish(motion)
 
@@ -127,12 +125,7 @@ class InertialFuse(Stage[InertialFuseSettings]):
 
     def on_fix(self, fix: DroneFix) -> Poses:
         """LiDAR position."""
-        velocity = () if fix.velocity_vehicle_mps is None else (fix.velocity_vehicle_mps,)
-        bias_covariance_m2 = np.zeros((3, 3)) if fix.bias_covariance_m2 is None else fix.bias_covariance_m2
-        numbers = (fix.xyz_vehicle_m, fix.covariance_m2, bias_covariance_m2, *velocity)
-        if self._intake.is_valid(fix, "fix", *numbers) and self._intake.is_covariance(
-            fix.covariance_m2 - bias_covariance_m2, "fix"
-        ):
+        if self._intake.is_valid_fix(fix):
             self._add_fix(fix)
         yield from self._publish(fix)
 
@@ -146,13 +139,7 @@ class InertialFuse(Stage[InertialFuseSettings]):
 
     def on_rotation(self, rotation: RelativeRotation) -> Poses:
         """Rotation by both cameras, up to a multiple of 90 deg: the heading decides which."""
-        R, covariance = rotation.R_vehicle_drone, rotation.covariance_rad2
-        if (
-            R is not None
-            and covariance is not None
-            and self._intake.is_valid(rotation, "rotation", R, covariance)
-            and self._intake.is_covariance(covariance, "rotation")
-        ):
+        if self._intake.is_valid_rotation(rotation):
             self._estimator.add(rotation)
         yield from self._publish(rotation)
 

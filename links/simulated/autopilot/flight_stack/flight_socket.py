@@ -10,18 +10,15 @@ Source: ours.
 from __future__ import annotations
 
 import heapq
-import select
-import socket
 import threading
 from collections.abc import Callable
 
 from links.mavlink.transport.framing import FrameSplitter
 from links.simulated.autopilot.flight_stack.stack import FlightStack
+from links.simulated.autopilot.udp_thread import UdpThread
 
-STEP_S = 0.002
 
-
-class FlightSocket:
+class FlightSocket(UdpThread):
     """A flight stack with a peer. `received`: frames of the host so far."""
 
     def __init__(
@@ -32,54 +29,36 @@ class FlightSocket:
         bind: tuple[str, int] = ("127.0.0.1", 0),
     ) -> None:
         """`scenario_ns`: present time in the scenario, which has begun."""
+        super().__init__(bind, "flight stack")
         self.received = 0
         self._stack, self._peer, self._scenario_ns = stack, send_to, scenario_ns
         self._lock = threading.Lock()
-        self._closed = threading.Event()
         self._splitter = FrameSplitter()
         self._waiting: list[tuple[int, int, bytes]] = []  # arrival, number, frame
         self._count = 0
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(bind)
-        self._socket.setblocking(False)
-        self._thread = threading.Thread(target=self._run, name="flight stack", daemon=True)
-
-    def __enter__(self) -> FlightSocket:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._closed.set()
-        self._thread.join()
-        self._socket.close()
 
     def advance(self, until_ns: int) -> None:
         """Fly until the truth is known up to a time; for the sensors of the rig."""
         with self._lock:
             self._stack.advance(until_ns)
 
-    def _run(self) -> None:
-        while not self._closed.is_set():
-            ready, _, _ = select.select([self._socket], [], [], STEP_S)
-            now_ns = self._scenario_ns()
-            if ready:
-                self._receive(now_ns)
-            with self._lock:
-                for record in self._stack.records(now_ns):
-                    self._count += 1
-                    heapq.heappush(self._waiting, (record.arrival_ns, self._count, record.data))
-            while self._waiting and self._waiting[0][0] <= now_ns:
-                frame = heapq.heappop(self._waiting)[2]
-                try:
-                    self._socket.sendto(frame, self._peer)
-                except OSError:  # no receiver: lost, as on a radio
-                    continue
+    def step(self, datagram: tuple[bytes, tuple[str, int]] | None) -> None:
+        """Fly up to the present, and move frames."""
+        now_ns = self._scenario_ns()
+        if datagram is not None:
+            self._receive(datagram[0], now_ns)
+        with self._lock:
+            for record in self._stack.records(now_ns):
+                self._count += 1
+                heapq.heappush(self._waiting, (record.arrival_ns, self._count, record.data))
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            frame = heapq.heappop(self._waiting)[2]
+            try:
+                self._socket.sendto(frame, self._peer)
+            except OSError:  # no receiver: lost, as on a radio
+                continue
 
-    def _receive(self, now_ns: int) -> None:
-        try:
-            data, _ = self._socket.recvfrom(2048)
-        except OSError:  # the port of the other side is closed
-            return
+    def _receive(self, data: bytes, now_ns: int) -> None:
         for frame, _ in self._splitter.datagram(data):
             self.received += 1
             with self._lock:

@@ -36,7 +36,7 @@ from flow.remote.nodes import Refusal, RemoteFailure, RemoteNodes, RemoteOutputs
 from flow.stage import Node, Stage, input_ports
 from flow.taps import Digest
 
-MAX_REFUSALS = 1000  # records that a source could not decode, before it gave anything
+MAX_REFUSALS = 1000  # records that a source could not decode, before its first message
 
 
 @dataclass(slots=True)
@@ -184,7 +184,7 @@ class Replay:
                 self._publish_all(port, arrival_ns, self._step(port, arrival_ns, message))
 
     def _push_remote(self, outputs: RemoteOutputs, arrival_ns: int) -> None:
-        """Put what remote nodes gave into the heap."""
+        """Put the outputs of remote nodes into the heap."""
         for name, message in outputs.messages:
             self._sequence += 1
             output = self._by_name[name]

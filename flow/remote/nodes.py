@@ -26,7 +26,7 @@ class RemoteFailure(NamedTuple):
 
 
 class RemoteOutputs(NamedTuple):
-    """What remote nodes gave for one record, or as one of them finished, in order."""
+    """Outputs of remote nodes for one record, or for the end of one of them, in order."""
 
     messages: list[tuple[str, Message | None]]  # output, message; None: one that no node or tap here takes
     failure: RemoteFailure | None = None  # after the last of them
@@ -74,17 +74,17 @@ class RemoteNodes(Protocol):
     topics: frozenset[str]  # of the sources among them
 
     def outputs_of(self, topic: str) -> RemoteOutputs:
-        """What they gave for the next record of one of their topics."""
+        """Their outputs for the next record of one of their topics."""
         ...
 
     def end(self, last_ns: int) -> list[Refusal]:
-        """There are no more records; the sources that gave nothing but refusals."""
+        """Announce the end of the records. Returns the sources of which no record could be decoded."""
         ...
 
     def finish(self, node: str) -> RemoteOutputs:
-        """What they give as a stage finishes: asked of each, in order."""
+        """Their outputs at the end of a stage; called for each stage, in order."""
         ...
 
     def reports(self) -> list[PartitionReport]:
-        """Asked last."""
+        """Measurements of all partitions; called last."""
         ...

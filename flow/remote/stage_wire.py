@@ -44,9 +44,9 @@ class AnswerKind(enum.IntEnum):
     """Kinds of answers."""
 
     OUTPUTS = 10
-    """What the nodes gave."""
+    """Outputs of the nodes."""
     FAILED = 11
-    """What a node raised, after the messages that the nodes gave before; it answers any request."""
+    """Error of a node, after the outputs of the nodes before it; it can answer any request."""
     REFUSED = 12
     """The sources that could decode no record."""
     REPORT = 13

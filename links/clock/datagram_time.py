@@ -21,7 +21,7 @@ _TIMESPEC = struct.Struct("@ll")
 
 
 def enable_stamps(udp: socket.socket) -> None:
-    """Make the kernel stamp arriving datagrams. Raises OSError when the kernel refuses."""
+    """Make the kernel stamp arriving datagrams. Raises OSError when the kernel does not support it."""
     if _SO_TIMESTAMPNS is not None:
         udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
@@ -33,7 +33,7 @@ def arrival_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
 
 
 def kernel_time_ns(ancillary: list[tuple[int, int, bytes]]) -> int | None:
-    """The kernel's stamp on the wall clock; None: it gave none."""
+    """The kernel's stamp on the wall clock; None: the datagram has no stamp."""
     for level, kind, value in ancillary:
         if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(value) == _TIMESPEC.size:
             seconds, nanoseconds = _TIMESPEC.unpack(value)

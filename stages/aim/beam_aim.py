@@ -1,6 +1,6 @@
 """Aiming of beams: sweeps without gaps, observes candidates until they are classified, and keeps a beam on each track.
 
-    no track, no candidate     sweep the whole travel, forth and back
+    no track, no candidate     sweep the whole travel, back and forth
     candidate                  point beams at it and around it until the detector has classified it, then continue
     TRACKING                   each rotor turn points one beam at the predicted position, with small alternating offsets
     COASTING                   the offsets grow with the uncertainty; above `coast_sigma_m` sweep
@@ -59,7 +59,7 @@ class _State:
     targets: Targets = field(default_factory=Targets)
     hold_until_ns: int = 0  # end of the planned observation
     current: Key | None = None  # target of the planned observation
-    consecutive: int = 0  # observations of the current target, less one
+    consecutive: int = 0  # further observations of the current target after its first
     searching: bool = False  # for more drones, between observations of tracks
     search_until_ns: int = 0
     track_observations: int = 0  # since the last search segment
@@ -168,7 +168,7 @@ class BeamAim(Stage[BeamAimSettings]):
         return (after or tracks)[0]
 
     def _search_is_due(self, track_count: int, servo: ServoState) -> bool:
-        """Whether each track had its observations, so that a segment of the sweep follows."""
+        """Whether each track had `observations_per_track` observations, so that a segment of the sweep follows."""
         settings = self.settings
         state = self._state
         if state.searching and servo.stamp_ns < state.search_until_ns:
@@ -266,8 +266,8 @@ class BeamAim(Stage[BeamAimSettings]):
         """Offset [m] of the beam from the predicted position.
 
         A target whose last observation had returns gets small offsets to either side: returns from its edges determine
-        its position. Without offsets a candidate would be hit at the same edge again and again, and a wire along the
-        beam's movement would appear to fly. A target that was missed, or has returns of only one scan pass, gets the
+        its position. Without offsets the beam would always hit a candidate at the same edge, and a wire along the
+        beam's movement would appear to move. A target that was missed, or has returns of only one scan pass, gets the
         offset with the highest detection probability.
         """
         settings = self.settings

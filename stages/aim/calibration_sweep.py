@@ -1,4 +1,4 @@
-"""Sweep for `grd calibrate`: forth and back over the whole travel, alternately slow and fast.
+"""Sweep for `grd calibrate`: back and forth over the whole travel, alternately slow and fast.
 
 A wall that is observed in both directions determines the gear's backlash, and at two speeds the servo's clock offset;
 see `stages/calibration/result.py`.

@@ -2,11 +2,12 @@
 
     R_map_drone(t) = R_map_drone(t0) R_drone(t0)_drone(t),  R_vehicle_drone = R_map_vehicle(t)^T R_map_drone(t)
 
-The turn of the drone comes from its autopilot or its images, that of the vehicle from its motion. The yaw is that
-between the level axes of the two cameras, to which images add an offset (yaw_tracker.py).
+The drone's turn is measured by its autopilot or its images, the vehicle's by VehicleMotion. The propagated yaw is the
+angle between the level axes of the two cameras, up to a constant offset that the images determine (yaw_tracker.py).
 
-While the vehicle's motion is missing, that offset absorbs its turn, which the next message contains again. So at both
-times the heading is uncertain by the largest turn of the vehicle, and unknown where its map frame may have changed.
+While VehicleMotion is missing, the images put the vehicle's turn into that offset; the next VehicleMotion contains the
+same turn again. So the variance of the largest possible turn is added both when the gap begins and when it ends. If the
+map frame may have changed during the gap, the yaw is unknown.
 
 Source: ours.
 """
@@ -35,9 +36,9 @@ class DeadReckonedYaw:
     """Headings of the level axes of a pair of cameras by dead reckoning, in the map frame."""
 
     stamp_ns: int
-    vehicle_rad: float  # heading of the vehicle's level axes
-    drone_rad: float  # of the drone's, less an unknown offset
-    variance_rad2: float  # of both, gathered since the previous pair
+    vehicle_rad: float  # heading of the level axes of the vehicle's camera
+    drone_rad: float  # heading of the level axes of the drone's camera, less an unknown offset
+    variance_rad2: float  # of yaw_rad, added since the previous pair
 
     @property
     def yaw_rad(self) -> float:
@@ -49,7 +50,7 @@ class DeadReckoning:
     """Rotation of the drone in `map`, propagated by measured turns, without the offset that images add."""
 
     def __init__(self, parked: bool) -> None:
-        """`parked`: the vehicle is known to stand, also without VehicleMotion."""
+        """`parked`: the vehicle is known to be stationary, even without VehicleMotion."""
         self._parked = parked
         self.vehicle = VehicleTrajectory()
         self.autopilot = AutopilotTrajectory()
@@ -61,7 +62,7 @@ class DeadReckoning:
         self.frames = 0  # number of possible changes of the map frame
 
     def vehicle_known(self, stamp_ns: int) -> bool:
-        """Whether the vehicle's pose is known: not long after its newest message."""
+        """Whether the vehicle is parked, or its newest pose is recent enough to extrapolate."""
         return self._parked or self.vehicle.known_at(stamp_ns)
 
     def add_vehicle(self, motion: VehicleMotion) -> None:
@@ -86,7 +87,7 @@ class DeadReckoning:
         return new
 
     def rate_radps(self, stamp_ns: int) -> float:
-        """Turn rate of the drone."""
+        """Turn rate of the drone [rad/s]."""
         return self.autopilot.rate_radps(stamp_ns)
 
     def advance(self, vehicle_ns: int, drone_ns: int, vehicle: LevelLines, drone: LevelLines) -> DeadReckonedYaw:
@@ -111,7 +112,7 @@ class DeadReckoning:
         )
 
     def correct(self, vehicle_ns: int, refined: Refined, dead_reckoned_rad: float) -> None:
-        """Take over the tilts measured in the images; the yaw stays the dead reckoned one."""
+        """Replace roll and pitch by those measured in the images; the yaw stays dead reckoned."""
         self._R_map_drone = self._measured_rotation(vehicle_ns, refined, dead_reckoned_rad)
 
     def tilt_off(self, vehicle_ns: int, refined: Refined, dead_reckoned_rad: float) -> Array64:
@@ -140,7 +141,9 @@ class DeadReckoning:
         return {ns: R @ turn.R_from_to for ns, turn in turns.items() if turn.measured}
 
     def at_common_time(self, vehicle_ns: int, drone_ns: int) -> tuple[Array64, Array64, int, float]:
-        """L, R so that L R_vehicle(vehicle_ns)_drone(drone_ns) R is the rotation at one time, the time, the variance.
+        """Rotations L and R, the common time [ns] and the variance [rad^2] that moving to it adds.
+
+        L R_vehicle(vehicle_ns)_drone(drone_ns) R is R_vehicle_drone at the common time.
 
         The time is the drone image's if the vehicle's turn is known, else the vehicle image's if the drone's turn is.
         """
@@ -154,13 +157,13 @@ class DeadReckoning:
         return one, one, drone_ns, self._vehicle_variance_rad2(drone_ns, dt)
 
     def _vehicle_variance_rad2(self, stamp_ns: int, seconds: float) -> float:
-        """Variance that the vehicle's yaw gathers in the `seconds` before `stamp_ns`."""
+        """Variance [rad^2] by which the vehicle's yaw drifts in the `seconds` before `stamp_ns`."""
         if self.vehicle.known_at(stamp_ns):
             return VEHICLE_DRIFT_RAD2_PER_S * seconds
         return 0.0 if self._parked else (VEHICLE_RAD_PER_S * seconds) ** 2
 
     def _vehicle_silent_rad2(self, stamp_ns: int) -> float:
-        """Variance of the vehicle's heading, extrapolated beyond the end of its trajectory."""
+        """Variance [rad^2] of the vehicle's heading, extrapolated beyond the end of its trajectory."""
         newest_ns = self.vehicle.newest_ns
         beyond_ns = 0 if newest_ns is None or self._parked else stamp_ns - newest_ns - FURTHEST_NS
         return (

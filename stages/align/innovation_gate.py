@@ -1,13 +1,13 @@
 """Fusion of a pair of images with the prediction of tilt and yaw by dead reckoning.
 
     yaw     mean of the measured and the predicted one, weighted by their variances. The variance of the measured one is
-            at least the scatter of recent images; where both differ by more than both allow, either may be wrong, and
-            the spread between them is added
+            at least the scatter of recent images. Where both differ by more than their variances explain, either may be
+            wrong, and the squared difference inflates the variance of the result
     tilt    the measured one; where it contradicts dead reckoning its covariance covers the difference
 
-With few straight lines, other edges among them bias the yaw of an image by a degree or two, each image differently; the
-scatter of the next ones shows it. Leaves and cars have verticals of their own: one image that contradicts dead
-reckoning does not replace it, two do.
+Where few lines follow a street, other edges bias the yaw by a degree or two, differently in each image; the scatter
+from image to image measures this error. Leaves and cars give false verticals, so one image whose tilt contradicts dead
+reckoning does not replace it; two consecutive ones do.
 
 Source: ours.
 """
@@ -25,8 +25,8 @@ from stages.align.spectra import quarter_difference
 from stages.align.yaw_tracker import YawTracker
 from stages.geometry.frames import Array64
 
-GATE_FLOOR_RAD = math.radians(0.3)  # beyond the tilts' own errors
-GATE_SIGMAS = 3.0  # sigmas
+GATE_FLOOR_RAD = math.radians(0.3)  # added to the gate on tilt
+GATE_SIGMAS = 3.0  # gate on tilt
 MAX_TURN_RAD2 = math.radians(1.0) ** 2  # largest variance of a prediction that can contradict an image
 SCATTER_S = 2.0  # time over which the scatter of the images is averaged
 MIN_SEPARATION_NS = 180_000_000  # between two compared images: the errors of closer ones are correlated
@@ -34,7 +34,7 @@ MAX_SCATTER_RAD2 = math.radians(5.0) ** 2  # contribution of one image
 
 
 class InnovationGate:
-    """Compares each pair of images with dead reckoning, which takes over their tilts."""
+    """Compares each pair of images with dead reckoning, and corrects its roll and pitch by them."""
 
     def __init__(self, dead_reckoning: DeadReckoning, tracker: YawTracker) -> None:
         self._dead_reckoning, self._tracker = dead_reckoning, tracker
@@ -81,11 +81,11 @@ class InnovationGate:
         return replace(refined, yaw_rad=refined.yaw_rad + gain * off_rad, covariance=covariance)
 
     def _innovation_rad(self, refined: Refined, dead_reckoned: DeadReckonedYaw) -> float:
-        """Predicted yaw less the yaw of the image."""
+        """Predicted yaw less the yaw of the image, modulo 90 deg [rad]."""
         return quarter_difference(dead_reckoned.yaw_rad + (self._tracker.offset_rad or 0.0) - refined.yaw_rad)
 
     def tilt_innovation_rad(self, vehicle_ns: int, refined: Refined, dead_reckoned: DeadReckonedYaw) -> Array64:
-        """Rejected difference (3,) of the tilts from dead reckoning, drone axes; zero where they agree."""
+        """Difference (3,) [rad] of the measured tilts from dead reckoning, drone axes, if rejected; else zero."""
         off = self._dead_reckoning.tilt_off(vehicle_ns, refined, dead_reckoned.yaw_rad)
         tilts = float(np.trace(refined.covariance[:4, :4])) / 2 + dead_reckoned.variance_rad2
         rejected = float(np.linalg.norm(off)) > GATE_SIGMAS * math.sqrt(tilts) + GATE_FLOOR_RAD

@@ -4,14 +4,15 @@
     ones (dead_reckoning.py, yaw_tracker.py) -> all angles refined together (refine.py), fused with the prediction
     (innovation_gate.py) -> yaw branch by the drone's motion (motion_branch.py) -> message (publisher.py)
 
-Each image of the drone gives a rotation, or the reason why there is none. It is RESOLVED when one branch has
-`resolve_probability`; the rest of the four to 1 is the probability that none is right. Only motion, or motion and a
-prior, resolves a branch; it is no longer RESOLVED when dead reckoning is lost or motion contradicts it.
+Each image of the drone gives a rotation, or the reason why there is none. Its state is RESOLVED when the probability of
+one yaw branch reaches `resolve_probability`. The probabilities of the four branches sum to less than 1; the remainder
+is the probability that none is right. Only the drone's motion, alone or with a prior, resolves a branch. The state is
+no longer RESOLVED when dead reckoning is lost or motion contradicts the branch.
 
-Where streets have many directions, lines alone seldom decide which of them both cameras see. The drone's displacement
-by LiDAR and by its autopilot gives a heading without them: it selects the match, and rejects a wrong one.
+Where streets have many directions, lines alone seldom decide which of them both cameras see. The drone's displacement,
+measured by LiDAR and by the autopilot, gives a heading without lines: it selects the match, and rejects a wrong one.
 
-Without `motion` the vehicle is assumed to stand if `parked` is set; else the drone's motion is not used.
+Without the input `motion` the vehicle is assumed stationary if `parked` is set; else the drone's motion is not used.
 
 Source: ours, for P IV Eq. 7-10 and V.E; DESIGN, Vision and Yaw branch.
 """
@@ -64,17 +65,17 @@ class JointAlignSettings(Settings):
     """Settings of `JointAlign`."""
 
     max_apart_s: float = Field(0.1, gt=0, le=1)  # between the images of a pair; half the slower camera's period
-    straight_deg: float = Field(0.25, gt=0, le=5)  # straightness of streets, one sigma of a line
+    straight_deg: float = Field(0.25, gt=0, le=5)  # deviation of a line from its street's direction, one sigma
     direction_sigma_deg: float = Field(0.1, gt=0, le=5)  # error of a street's direction that one camera's lines share
     square_sigma_deg: float = Field(0.5, gt=0, le=5)  # deviation of crossings from a right angle, one sigma
     tilt_sigma_deg: float = Field(0.07, ge=0, le=5)  # error of a vertical beyond its sigma, common to
     # all images: 0.05 deg of a mount, and as much by a lens whose centre is 0.15 px off at 720 px
     min_lines: int = Field(5, ge=1)  # of each camera
-    parked: bool = False  # the vehicle stands: the drone's motion is used without VehicleMotion
+    parked: bool = False  # the vehicle is stationary: the drone's motion is used without VehicleMotion
     resolve_probability: float = Field(0.999, gt=0.5, lt=1)
-    initial_yaw_deg: float | None = Field(None, ge=-360, le=360)  # the drone's heading in the vehicle's axes at first
-    compass_deg: float | None = Field(None, ge=-360, le=360)  # the vehicle's at its start, clockwise from the north
-    prior_sigma_deg: float = Field(20.0, gt=0, le=90)  # of either
+    initial_yaw_deg: float | None = Field(None, ge=-360, le=360)  # initial yaw of the drone in the vehicle frame
+    compass_deg: float | None = Field(None, ge=-360, le=360)  # initial heading of the vehicle, clockwise from north
+    prior_sigma_deg: float = Field(20.0, gt=0, le=90)  # of initial_yaw_deg or compass_deg
     prior_trust: float = Field(0.95, gt=0, lt=1)  # probability that it is valid; alone it never resolves a branch
     branches: BranchSettings = BranchSettings()
 
@@ -143,7 +144,7 @@ class JointAlign(Stage[JointAlignSettings]):
             yield self._align(pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
-        """Publish the rotations of images that still wait for a nearer one."""
+        """Publish the rotations of drone images that still wait for a nearer vehicle image."""
         for pair in self._parts.pairing.rest():
             yield self._align(pair)
 

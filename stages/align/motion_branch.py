@@ -1,10 +1,10 @@
 """Yaw by the drone's motion: the branch of the vanishing points, and the heading without them.
 
-    windows of flight, by LiDAR and by the drone's odometry (stages/heading)
-      -> four branches, counted from the tracked yaw (yaw_tracker.py)
+    displacement of the drone in windows of flight, by LiDAR and by the drone's odometry (stages/heading)
+      -> probabilities of the four branches: the tracked yaw (yaw_tracker.py) plus 0, 90, 180 and 270 deg
       -> the heading of the odometry, without vanishing points: it selects the match and rejects a wrong one
 
-An initial yaw or a compass is weighed once, with the first rotation.
+The prior by an initial yaw or a compass is applied once, with the first rotation.
 
 Source: ours, for P V.E; DESIGN, Yaw branch.
 """
@@ -24,8 +24,8 @@ from stages.heading.windows import Windows
 from stages.messages import DroneFix, VisualMotion
 
 SILENCE_SHARE = 1e-4  # probability that the autopilot's heading jumped during a telemetry gap
-MAX_NONE = 0.99  # probability that no branch is right, above which all is reset
-NONE_AFTER_RESET = 0.95  # that probability after the reset
+MAX_NONE = 0.99  # probability that no branch is right, above which the match and the branches are reset
+NONE_AFTER_RESET = 0.95  # probability that no branch is right, after the reset
 BEARING_RAD = math.radians(2.0)  # heading error of an odometry within a window
 
 
@@ -34,7 +34,7 @@ class Prior:
     """Prior of the drone's heading by configuration or compass; at most one of them is set."""
 
     initial_yaw_rad: float | None  # in the vehicle's axes
-    compass_rad: float | None  # the vehicle's at its start, clockwise from the north
+    compass_rad: float | None  # initial heading of the vehicle, clockwise from north
     sigma_rad: float
     trust: float
 
@@ -51,7 +51,7 @@ class MotionBranch:
         self._windows = Windows(settings.baseline_m)
         self._headings = HeadingBank(settings)
         self._heading_windows = Windows(settings.baseline_m, HeadingBank.HYPOTHESES)
-        self._frames = 0  # number of map frames, as `dead_reckoning` counts
+        self._frames = 0  # number of map frame changes that `dead_reckoning` has counted
 
     def add_visual_motion(self, motion: VisualMotion) -> None:
         """Add a step of the drone's visual odometry."""
@@ -97,9 +97,10 @@ class MotionBranch:
             self._headings.see(moved)
 
     def heading(self, stamp_ns: int) -> Heading | None:
-        """Advance to the time of an image; returns the offset (yaw_tracker.py) by the drone's motion.
+        """Advance to the time of an image; returns the offset (yaw_tracker.py) by the drone's motion, None if unknown.
 
-        A telemetry gap that may hide a jump of the autopilot's yaw resets it and weakens the branches.
+        A telemetry gap that may hide a jump of the autopilot's yaw resets this heading and mixes the branch
+        probabilities with their prior.
         """
         self._follow_frame()
         silences = self._dead_reckoning.new_silences()
@@ -120,7 +121,7 @@ class MotionBranch:
             self._headings.reset()
 
     def slip(self, weights: Array64) -> None:
-        """Shift the branches: weights (4,) that the tracked yaw has changed by m times 90 deg."""
+        """Shift the branches: weights (4,) are the probabilities that the tracked yaw has changed by m times 90 deg."""
         self.bank.slip(weights)
 
     def weigh_prior(self, refined: Refined) -> None:
@@ -139,7 +140,7 @@ class MotionBranch:
             self._prior_weighed = True
 
     def reset(self) -> None:
-        """Reset the branches; most likely none is right."""
+        """Reset the branches with probability NONE_AFTER_RESET that none is right."""
         self.bank.reset(NONE_AFTER_RESET)
         self._windows.restart()
         if self._prior.compass_rad is not None:

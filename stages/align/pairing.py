@@ -36,7 +36,7 @@ class Pairing:
         yield from self._ready()
 
     def rest(self) -> Iterator[Pair]:
-        """Yield the drone images that still wait, with the nearest vehicle image so far."""
+        """Yield the waiting drone images with their nearest vehicle images; no more images will arrive."""
         while self._waiting:
             drone = self._waiting.popleft()
             yield self._nearest(drone), drone

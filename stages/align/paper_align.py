@@ -19,7 +19,7 @@ use this stage.
 A match is accepted at any angle, as in the paper. With a gate the filter would continue at its last rate during
 rejections, until the next branch fits.
 
-Without the optional inputs the state stays AMBIGUOUS; without `motion` the vehicle is assumed to stand.
+Without the optional inputs the state stays AMBIGUOUS; without `motion` the vehicle is assumed stationary.
 
 Source: P IV, Eq. 7-10, V.C-V.E; DESIGN, The paper's formulas and What we already measured (3.3 %).
 """
@@ -55,7 +55,7 @@ OTHER_BRANCH_RAD = math.radians(45.0)
 class PaperAlignSettings(Settings):
     """Settings of `PaperAlign`."""
 
-    initial_yaw_deg: float = Field(0.0, ge=-360, le=360)  # the drone's heading in the vehicle's axes at the start
+    initial_yaw_deg: float = Field(0.0, ge=-360, le=360)  # initial yaw of the drone in the vehicle frame
     initial_sigma_deg: float = Field(30.0, gt=0)
     max_apart_s: float = Field(0.1, gt=0, le=1)  # between the images of a pair; half the slower camera's period
     observation_deg: float = Field(1.0, gt=0)  # V_G V_D^-1, one axis
@@ -96,11 +96,11 @@ class PaperAlign(Stage[PaperAlignSettings]):
         self._correction.add_fix(fix)
 
     def on_visual_motion(self, motion: VisualMotion) -> None:
-        """dt_DD(i, j), or one step of it."""
+        """Direction of the drone's motion between two of its images: dt_DD(i, j), or one step of it."""
         self._correction.add_motion(motion)
 
     def on_motion(self, motion: VehicleMotion) -> None:
-        """R_G, t_G."""
+        """Pose R_G, t_G of the vehicle in `map`."""
         self._correction.add_vehicle(motion)
 
     def on_vehicle(self, directions: VanishingDirections) -> Iterator[RelativeRotation]:
@@ -109,12 +109,12 @@ class PaperAlign(Stage[PaperAlignSettings]):
             yield self._align(*pair)
 
     def on_drone(self, directions: VanishingDirections) -> Iterator[RelativeRotation]:
-        """V_D. Yields one rotation for each drone image, once the nearest vehicle image is known."""
+        """Directions V_D. Yields one rotation for each drone image, once the nearest vehicle image is known."""
         for pair in self._pairing.drone(_of(directions, CameraMount.DRONE, "drone")):
             yield self._align(*pair)
 
     def finish(self) -> Iterator[RelativeRotation]:
-        """Publish the rotations of images that still wait for a nearer one."""
+        """Publish the rotations of drone images that still wait for a nearer vehicle image."""
         for pair in self._pairing.rest():
             yield self._align(*pair)
 

@@ -7,8 +7,8 @@
     R_GD  = R_G^-1 R_f R_G R_GD0
 
 The camera does not measure length: f_hat has the length of f. Steps of the odometry shorter than 14 images are chained,
-each with its length by LiDAR. R_G and t_G are the vehicle's odometry; without it the vehicle is assumed to stand. A sum
-steeper than 60 deg has no usable heading about Z, so there is no correction (ours).
+each with its length by LiDAR. R_G and t_G are the vehicle's odometry; without it the vehicle is assumed stationary. A
+sum steeper than 60 deg has no usable heading about Z, so there is no correction (ours).
 
 Source: P V.E, V.C; DESIGN, The paper's formulas. Interpolation between fixes is ours.
 """

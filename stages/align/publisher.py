@@ -1,4 +1,4 @@
-"""Message of a pair of images: the rotation on its most probable branch or the reason for its absence, and jumps.
+"""Message of a pair of images: the rotation on its most probable branch, or why there is none; jumps are reported.
 
 Source: ours.
 """
@@ -24,7 +24,7 @@ class Publisher:
     def __init__(self, bank: HypothesisBank, dead_reckoning: DeadReckoning, resolve_probability: float) -> None:
         self._bank, self._dead_reckoning = bank, dead_reckoning
         self._resolve_probability = resolve_probability
-        self._branch = 0  # published, counted from the tracked yaw
+        self._branch = 0  # published branch: 90 deg turns from the tracked yaw
         self._published_rad: float | None = None  # last published yaw less the dead reckoned one
         self._switches = 0
         self._news = ""
@@ -36,7 +36,7 @@ class Publisher:
     def rotation(
         self, vehicle_ns: int, drone_ns: int, refined: Refined, dead_reckoned: DeadReckonedYaw, off_rad: Array64
     ) -> RelativeRotation:
-        """The most probable branch; `off_rad` (3,): its rejected tilt difference, added to the covariance."""
+        """Message with the most probable branch; `off_rad` (3,): rejected tilt difference, added to the covariance."""
         before, self._branch = self._branch, self._bank.best(self._branch)
         yaw_offset_rad = refined.yaw_rad + self._branch * math.pi / 2 - dead_reckoned.yaw_rad
         if self._published_rad is not None:

@@ -6,8 +6,8 @@
     streets    a_j = a_k + 90 deg for two directions nearly at right angles      up to `square_rad`
     tilt       that of the vertical of each image, up to its sigma
 
-Hundreds of lines along one street do not average its error out: they share the lens, the image and the street. So each
-camera has its own estimate of each direction, and only these estimates are tied together.
+Lines along one street share errors of the lens, the image and the street, which do not average out however many lines
+there are. So each camera has its own estimate of each direction, and constraints tie only these estimates together.
 
 Source: ours, for P IV Eq. 7-10; DESIGN, Vision: raw covariance is overconfident (NEES/3 about 21).
 """
@@ -30,7 +30,7 @@ MOST_DIRECTIONS = 6
 APART_RAD = math.radians(4.0)  # directions nearer to each other are the same
 WEAKEST = 0.08  # share of the strongest direction, below which a direction is ignored
 NEAR_RAD = math.radians(3.0)  # lines this near to a direction belong to it
-SQUARE_RAD = math.radians(2.5)  # two directions this near to a right angle are taken to be square
+SQUARE_RAD = math.radians(2.5)  # two directions this near to a right angle are constrained to it, with `square_rad`
 CAUCHY = 2.0  # [sigma] residual from which the weight of a line falls
 ROUNDS = 4
 MAX_RESIDUAL2 = 16.0  # bound of a squared residual
@@ -41,9 +41,9 @@ FEW = 20.0  # lines: the variance of a direction with fewer is inflated
 class Tolerances:
     """Deviations of the scene and the images from the model, one sigma [rad]."""
 
-    straight_rad: float  # a line of a street
+    straight_rad: float  # of a line from its street's direction
     direction_rad: float  # error shared by all lines of a street in one camera
-    square_rad: float  # a crossing
+    square_rad: float  # of two crossing streets from a right angle
     tilt_rad: float  # error of a vertical beyond its sigma, shared by all lines of an image
 
 
@@ -61,7 +61,7 @@ class Refined:
 
     @property
     def yaw_sigma_rad(self) -> float:
-        """Sigma of the yaw."""
+        """Sigma of the yaw [rad]."""
         return math.sqrt(self.covariance[4, 4])
 
     def R_vehicle_drone(self, quarters: int) -> Array64:

@@ -5,11 +5,11 @@ its direction is where the circle meets the horizon:
 
     h = z x n / |z x n|,   azimuth = atan2(h_y, h_x) mod 180 deg,   sigma_azimuth = sigma |t . h| / |z x n|
 
-with sigma the angular error of the line about its middle ray m and t = n x m: the edge of a roof overhead determines
-its direction well, one far away at the horizon hardly. The spectrum S(a) is the sum of one von Mises kernel per line,
-with the length of the line as its area. The spectra of two cameras in the same street differ by the yaw between them:
-it is where they overlap best. Most streets cross at right angles, and each camera may see another one of them: yaw is
-determined modulo 90 deg here.
+with sigma the angular error of the line about its middle ray m and t = n x m: a roof edge overhead determines the
+direction of its street well, an edge far away at the horizon hardly. The spectrum S(a) is the sum of one von Mises
+kernel per line, with the length of the line as its area. The spectra of two cameras in the same street differ by the
+yaw between them: it is where they overlap best. Most streets cross at right angles, and the cameras may see different
+ones of them: here the yaw is determined modulo 90 deg.
 
 Plain correlation would match the strongest street of one camera with the strongest of the other, even where these are
 different streets; the overlap does not.
@@ -95,7 +95,7 @@ def spectrum(lines: LevelLines) -> Array64:
 
 
 def overlap(vehicle: Array64, drone: Array64) -> Array64:
-    """Likeness (QUARTER,) of two spectra (BINS,) at yaw = k BIN_RAD modulo 90 deg, from 0 to 1.
+    """Overlap (QUARTER,) of two spectra (BINS,) at yaw = k BIN_RAD modulo 90 deg, from 0 to 1.
 
     The mean of two shares: of the vehicle's lines that run where the drone has any direction, and the other way round,
 

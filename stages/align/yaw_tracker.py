@@ -1,12 +1,13 @@
 """Track the yaw between the cameras through time: the match of the spectra and the multiple of 90 deg.
 
     dead reckoning    the last yaw, propagated by the measured turns of the drone and the vehicle
-    offset            difference of the images from it: slow, one number with a variance (a scalar Kalman filter)
-    maps              spectra of each camera over the last seconds, in the axes of dead reckoning
+    offset            yaw of the images less the dead reckoned yaw: it drifts slowly (a scalar Kalman filter)
+    maps              mean spectra of each camera over the last seconds, in the axes of dead reckoning
 
 The images give yaw modulo 90 deg; the match nearest to the prediction is used. The probability that the true yaw is
-a multiple of 90 deg away follows from the variance of the prediction and goes to the branches. Streets at other angles
-cause further matches. The first match comes from the maps, which contain more streets than one image, and only when
+a multiple of 90 deg away follows from the variance of the prediction and shifts the branch probabilities. Streets at
+other angles cause further matches. The first match comes from the maps, which contain more streets than one image, and
+is accepted only when
 
     nearly all lines of both cameras match and no other match is similar       (streets at right angles), or
     most lines match, along two directions or more, and no other is similar    (streets at other angles)
@@ -44,7 +45,7 @@ LOST_RAD2 = math.radians(20.0) ** 2  # a prediction with a larger variance is no
 BLUR_RAD2 = math.radians(1.0) ** 2  # a step with a larger variance clears the maps
 LATE_S = 0.02  # error of the stamps, which matters during a turn
 IMAGE_SIGMA_RAD = math.radians(0.7)  # of the yaw of one image, correlated in time
-PERIOD_S = 0.2  # images closer in time have correlated errors: together they have the information of one
+PERIOD_S = 0.2  # errors of images closer in time are correlated: all of them count as one image
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ class Candidate:
     announced: bool = False  # published as accepted
     is_promising: bool = False  # probable enough for further observation
     was_promising: bool = False  # it was promising once, so its further fate is published
-    calm_s: float = 0.0  # how long it significantly flew as no bird does
+    calm_s: float = 0.0  # time in which it significantly flew more calmly than any bird
     steady_s: float = 0.0  # how long it significantly flew straight
     path_ns: list[int] = field(default_factory=lambda: list[int]())
     path_m: list[Array64] = field(default_factory=lambda: list[Array64]())
@@ -178,7 +178,7 @@ class Candidate:
     def add_log_ratios(self, log_ratios: MotionLogRatios | None) -> None:
         """Store the newest comparison with telemetry, and its best value reached in open air.
 
-        Evidence of flight in open air remains when the candidate comes near an object, unless telemetry denies it.
+        Evidence of flight in open air remains when the candidate comes near an object, unless telemetry contradicts it.
         """
         self.log_ratios = log_ratios
         if log_ratios is None:

@@ -5,7 +5,8 @@
     bird                                         it is fast, or turns hard
     balloon                                      it is smooth and round
 
-Where the drone sends telemetry, its motion decides over static objects, birds and balloons
+Where the drone sends telemetry, the comparison of its motion with the candidate's decides against static objects, birds
+and balloons
 (stages/detect/motion_log_ratios.py).
 
     log-odds of a drone = -ln sum_k exp(-o_k),     o_k = log-odds of a drone over alternative k

@@ -1,9 +1,9 @@
 """Independent check of the yaw branch by the drone's camera, for an autopilot that reports no position.
 
 Each window of flight gives its direction twice: by LiDAR, and by the drone's camera, turned by the rotation from
-vanishing points. The windows weigh the four branches as in `align`, but without a prior and without the probabilities
-of `align`; the check restarts when the rotation jumps. Both use nearly the same evidence, so the result is a second
-condition and is never multiplied with the probability of `align`.
+vanishing points. The windows update the probabilities of the four branches as in `align`, but without a prior and
+without the probabilities of `align`; the check restarts when the rotation jumps. `align` uses nearly the same evidence,
+so the result is a second condition and is never multiplied with the probability of `align`.
 
 Source: ours; stages/heading; DESIGN, Yaw branch.
 """
@@ -23,7 +23,7 @@ from stages.messages import DroneFix, VisualMotion
 from stages.odometry.drone.trajectory import rotation_between
 
 BEARING_RAD = 0.05  # error by the lever arm of the drone's camera and by the vanishing points
-JUMP_RAD = math.radians(30.0)  # a rotation further from the propagated one is of another branch
+JUMP_RAD = math.radians(30.0)  # a rotation farther from the propagated one is on another branch
 LONG_NS = 5_000_000_000  # age of a rotation up to which directions of images are turned by it
 
 
@@ -38,7 +38,7 @@ class BranchCheck:
 
     @property
     def windows(self) -> int:
-        """Number of windows weighed since the last restart."""
+        """Number of windows used since the last restart."""
         return self._bank.windows
 
     def agrees(self, max_alternative_odds: float) -> bool:

@@ -24,7 +24,7 @@ PERIOD_NS = 100_000_000  # between poses of the chain
 
 
 class Chain:
-    """The back end with its lifecycle; its pose is valid only while `running`."""
+    """Starts, extends and stops the back end; its pose is valid only while `running`."""
 
     def __init__(self, back: BackEnd, errors: FuseErrors, positions: Positions) -> None:
         self.back = back

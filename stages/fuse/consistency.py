@@ -1,12 +1,12 @@
 """Consistency of measurements: variance inflation for errors correlated in time, and mutually consistent rejections.
 
 A Gauss-Markov error of time constant tau, sampled each dt, has correlation rho = exp(-dt / tau) between neighbours;
-the mean of n samples has the information of n (1 - rho) / (1 + rho) independent ones. So each gets the variance
+the mean of n samples has the information of n (1 - rho) / (1 + rho) independent ones. So each sample gets the variance
 
     R (1 + rho) / (1 - rho) = R coth(dt / 2 tau)
 
-and a filter that assumes independence gathers no more information than there is. A bias that outlasts a flight
-(calibration) does not average out at all: that share stays out of the filter and is added to its output.
+and a filter that assumes independence is not overconfident. A bias that is constant over a flight (calibration) does
+not average out at all: that share of the variance is not given to the filter but added to its output.
 
 When consecutive rejected measurements agree with each other, the estimate is wrong and is reset.
 

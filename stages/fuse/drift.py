@@ -6,9 +6,9 @@ With odometry b is its drift, a Gauss-Markov velocity that lasts for seconds; kn
 the error of a gap without fixes. Without odometry u = 0 and b is the whole velocity of the drone, with white
 acceleration, plus the change of velocity that the autopilot reports, in an unknown direction.
 
-The displacements u so far were turned by the yaw estimate of their time. When that estimate is corrected, `correct_yaw`
-corrects b, else one error would count as yaw and as drift. x is linear in u, so the filter propagates its derivative s
-by the displacements turned by 90 deg, and their level part c:
+Each displacement u was rotated by the yaw estimate at its time. When that estimate is corrected, `correct_yaw` corrects
+b too; otherwise one error would be counted both as yaw and as drift. x is linear in u, so the filter propagates s, its
+derivative by yaw (the displacements turned by 90 deg), and c, their level part:
 
     s' = F s + (z x u, 0) - K (F s + z x u)_p,     x(a) = x + sin(a) s + (cos(a) - 1) c
 

@@ -62,7 +62,7 @@ class Estimator:
     # motion
 
     def add_vehicle_motion(self, motion: VehicleMotion) -> None:
-        """Add a vehicle pose. The first one, or the first after a silence, may start another map frame."""
+        """Add a vehicle pose. The first one, or the first after a gap, may start another map frame."""
         at_ns, vehicle = self.positions.free.stamp_ns, self.motions.vehicle
         before = None if at_ns is None else (*vehicle.at(at_ns), vehicle.velocity_mps(at_ns))
         if not self.motions.add_vehicle_motion(motion):
@@ -199,7 +199,7 @@ class Estimator:
         factor = self.positions.worth(stamp_ns)
         if R is not None:
             self.chain.add_position(stamp_ns, R, z, factor * self.positions.fix_covariance_m2)
-        R_after = None if R is None else self.chain.at(stamp_ns)[0]  # what it explains is not drift
+        R_after = None if R is None else self.chain.at(stamp_ns)[0]  # what the fix corrects in rotation is not drift
         self.positions.follow(stamp_ns, z, factor, R_after)
         self._branch_check.add_fix(fix)
         self._add_motion_point(stamp_ns, z, noise.whole_m2)
@@ -261,8 +261,8 @@ class Estimator:
     ) -> None:
         """Start a chain by a rotation from vanishing points, once the motion measured by this stage confirms it.
 
-        `align` knows the branch by motion too. But once a pose is published the autopilot may fuse it, and from then on
-        its odometry agrees with it: so the first published pose has to be right.
+        `align` determines the branch by motion too. But once a pose is published the autopilot may fuse it, and from
+        then on its odometry agrees with it, right or wrong: so the first published pose has to be on the right branch.
         """
         if self.chain.running and apart_rad(heading_rad(R @ self.chain.at(stamp_ns)[0].T), 0.0) < BRANCH_RAD:
             self.chain.start(stamp_ns, R, covariance_rad2)  # consistent rejections: the estimate has drifted

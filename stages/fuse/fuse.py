@@ -4,8 +4,8 @@
       -> a chain of poses (smoother.py)  -> predicted to now -> RelativePose
 
 Now is the newest stamp received on any port, on a grid of 20 ms; it never decreases. Every port but `fix` may be
-unwired, fall silent and return. Without `motion` the vehicle frame serves as the map frame, as if the vehicle were
-parked; only with the setting `parked` is it assumed to stand, so that the drone's odometry is used.
+unwired, stop and resume. Without `motion` the vehicle frame serves as the map frame. The drone's odometry over ground
+is then used only with the setting `parked`, which states that the vehicle is stationary.
 
 A rotation comes from a RESOLVED RelativeRotation, or from the drone's motion by LiDAR and autopilot (motion_yaw.py):
 then FULL needs no images. A contradiction of the two (fused_heading.py) ends FULL at once. States: status.py.
@@ -58,7 +58,7 @@ Poses = Iterator[RelativePose]
 class FuseSettings(Settings):
     """Settings of `Fuse`."""
 
-    parked: bool = False  # the vehicle stands, without VehicleMotion
+    parked: bool = False  # the vehicle is stationary, even without VehicleMotion
     track_id: int | None = Field(None, ge=1)  # follow this drone; None: the lowest number that is TRACKING
     lag_s: float = Field(3.0, ge=0.5, le=20)
     errors: FuseErrors = FuseErrors()

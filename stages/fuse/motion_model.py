@@ -49,8 +49,9 @@ class MotionModel:
     ) -> Step:
         """Motion from one time to another; R_map_drone at the first.
 
-        left, free: filters of the drift of the autopilot's odometry, and of the motion without it. `still`: the map
-        frame is known to be fixed; else odometry over ground is not usable. `since_ns`: time of the newest fix.
+        `left`: filter of the drift that the autopilot's odometry leaves; `free`: filter of the velocity without that
+        odometry. `still`: the map frame is known to be fixed; else odometry over ground is not usable. `since_ns`: time
+        of the newest fix.
         """
         dt = (to_ns - from_ns) * 1e-9
         e = self._errors
@@ -115,7 +116,7 @@ class MotionModel:
         return None if newest is None else self.autopilot.R_odom_drone(min(stamp_ns, newest + AHEAD_NS))
 
     def _turn(self, from_ns: int, to_ns: int) -> tuple[Array64, float, bool]:
-        """R, its variance [rad2] about each axis, and whether it was measured."""
+        """Rotation (3, 3) of the drone, its variance [rad2] about each axis, and whether it was measured."""
         dt = abs(to_ns - from_ns) * 1e-9
         newest = self.autopilot.attitude_ns
         if newest is not None:
@@ -147,7 +148,7 @@ class Motions:
     """Trajectories of the vehicle and of the drone."""
 
     def __init__(self, errors: FuseErrors, parked: bool) -> None:
-        """`parked`: the vehicle stands, without VehicleMotion."""
+        """`parked`: the vehicle is stationary, even without VehicleMotion."""
         self._parked = parked
         self.vehicle = VehicleTrajectory(joined=False)
         self.motion_model = MotionModel(errors)

@@ -85,7 +85,7 @@ class Positions:
             )
 
     def worth(self, stamp_ns: int) -> float:
-        """Variance factor of the fix just accepted."""
+        """Variance inflation factor of the fix just accepted, for errors correlated in time (consistency.py)."""
         return self._inflation.factor(stamp_ns)
 
     def follow(self, stamp_ns: int, z: Array64, factor: float, R_map_drone: Array64 | None) -> None:
@@ -160,6 +160,6 @@ class Positions:
         return velocity + self.left.velocity_mps, spread + np.outer(across, across)
 
     def _manoeuvre(self, stamp_ns: int) -> float:
-        """Density of the acceleration that is not measured [m2/s3]."""
+        """Noise density of the acceleration that no measurement shows [m2/s3]."""
         measured = self._motions.motion_model.autopilot.velocity_odom_mps(stamp_ns) is not None
         return self._errors.manoeuvre_with_odometry if measured else self._errors.manoeuvre

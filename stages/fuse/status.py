@@ -73,7 +73,7 @@ def unconfirmed_reason(estimator: Estimator, stamp_ns: int) -> str:
 
 
 class Jumps:
-    """Counts jumps: poses away from the propagated pose before. The autopilot receives the count as resets."""
+    """Counts jumps: poses far from the previous pose, propagated. The autopilot receives the count as resets."""
 
     def __init__(self, limits: FuseLimits) -> None:
         self._limits = limits
@@ -87,7 +87,7 @@ class Jumps:
         self._last = None
 
     def see(self, known: MapEstimate, resets: int) -> None:
-        """Add a pose; `resets` of the estimator are counted there already."""
+        """Add a pose. `resets`: count of the estimator; jumps by a reset are not counted again."""
         last, reported = self._last, self._reported_resets
         self._last, self._reported_resets = known, resets
         if last is None or resets > reported:

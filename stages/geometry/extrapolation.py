@@ -14,8 +14,8 @@ Speeds are averaged over at least 0.1 s: poses that arrive together would otherw
 
 A pose further from the extrapolation than HARDEST_MANEUVER allows is an outlier, or the source's start frame has jumped
 (an odometry that restarts). The pose is rejected. When AGREE rejected poses in a row lie on one smooth path, they are
-accepted as poses in a new start frame. After seconds of silence HARDEST_MANEUVER allows nearly any pose, so a small
-jump during a silence is not detected. For the same reason one plausible pose does not end a series of AGREE outliers:
+accepted as poses in a new start frame. After a gap of seconds HARDEST_MANEUVER allows nearly any pose, so a small
+jump during a gap is not detected. For the same reason one plausible pose does not end a series of AGREE outliers:
 a continuing series of invalid poses would contain a plausible one sooner or later.
 
 Source: ours.

@@ -28,7 +28,7 @@ from stages.messages import MotionStatus, VehicleMotion
 KEPT = 512  # poses
 TOGETHER_NS = 10_000_000  # shortest interval that gives a speed
 RECENT_NS = 700_000_000  # the motion counts as known this long after a pose; visual odometry delivers 5 poses a second
-RESTART_NS = 2_000_000_000  # during a silence this long an odometry may restart without notice
+RESTART_NS = 2_000_000_000  # during a gap this long an odometry may restart unnoticed
 FURTHEST_NS = round(1e9 * EXTRAPOLATION_S)  # extrapolation beyond the newest pose
 
 
@@ -63,8 +63,8 @@ class VehicleTrajectory:
 
         A pose that is not newer than the last is ignored. One that is not reachable from the poses before is rejected
         until AGREE of them are consistent: then the start frame has jumped. The new start frame is aligned with the
-        trajectory. After a silence that alignment is a guess, because an odometry that restarts unnoticed may begin
-        near the extrapolated pose. Where frames are not joined, a new frame begins, also after each silence. A denied
+        trajectory. After a gap that alignment is a guess, because an odometry that restarts unnoticed may begin
+        near the extrapolated pose. Where frames are not joined, a new frame begins, also after each gap. A DENIED
         pose withdraws the poses after it; the trajectory is extrapolated from it.
         """
         if motion.status is MotionStatus.DENIED:

@@ -2,9 +2,9 @@
 
     LiDAR position      z = p + e
     vertical            u = R^T e_z, by the autopilot's roll and pitch
-    vanishing points    R Z^T = E: one of four rotations, a quarter turn apart, alike probable
+    vanishing points    R Z^T = E: one of four rotations, 90 deg of yaw apart, equally probable
     direction of flight |v| d = R^T v, by the drone's camera
-    turn between images the mean rate less the images' is the gyroscope's bias
+    turn between images the gyroscope's mean rate less the mean rate by images is the gyroscope's bias
 
 Source: ours; the outlier shares: stages/heading/hypothesis_bank.py.
 """
@@ -30,14 +30,14 @@ QUARTERS = np.array([rotation_z(0.5 * math.pi * k) for k in range(4)])
 
 
 def add_position(bank: InertialBank, xyz_m: Array64, covariance_m2: Array64) -> float:
-    """A LiDAR position in map. Returns the probability that it is no outlier."""
+    """Add a LiDAR position in map. Returns the probability that it is no outlier."""
     H = np.zeros((len(bank.state), 3, SIZE))
     H[:, :, POSITION] = np.eye(3)
     return bank.update(xyz_m - bank.state.xyz_m, H, covariance_m2, POSITION_OUTLIERS, POSITION_DENSITY)
 
 
 def add_vertical(bank: InertialBank, up_drone: Array64, sigma_rad: float) -> float:
-    """The vertical (3,) in drone axes."""
+    """Add the vertical (3,) in drone axes. Returns the probability that it is no outlier."""
     up = bank.state.R[:, 2, :]
     H = np.zeros((len(up), 3, SIZE))
     H[:, :, THETA] = hats(up)
@@ -54,7 +54,7 @@ def nearest_quarter(bank: InertialBank, R_map_drone: Array64, R_map_vehicle: Arr
 
 
 def add_rotation(bank: InertialBank, R_map_drone: Array64, R_map_vehicle: Array64, covariance_rad2: Array64) -> float:
-    """A rotation by vanishing points, branch 0; covariance in drone axes."""
+    """Add a rotation by vanishing points, its branch unknown; covariance in drone axes. Returns P of no outlier."""
     H = np.zeros((len(bank.state), 3, SIZE))
     H[:, :, THETA] = np.eye(3)
     residual = nearest_quarter(bank, R_map_drone, R_map_vehicle)
@@ -62,7 +62,7 @@ def add_rotation(bank: InertialBank, R_map_drone: Array64, R_map_vehicle: Array6
 
 
 def add_direction(bank: InertialBank, direction_drone: Array64, sigma_rad: float, interval_s: float) -> None:
-    """The direction of flight (3,) in drone axes now, over an interval that ended now."""
+    """Add the direction of flight (3,) over an interval that ends now, in drone axes of now."""
     state = bank.state
     speed = np.linalg.norm(state.velocity_mps, axis=1)
     if float(bank.weight @ speed) < LEAST_MPS:
@@ -77,7 +77,7 @@ def add_direction(bank: InertialBank, direction_drone: Array64, sigma_rad: float
 
 
 def add_turn(bank: InertialBank, rate_radps: Array64, rate_visual_radps: Array64, covariance: Array64) -> None:
-    """Mean rate of the gyroscope over an interval, and by images; covariance of the latter."""
+    """Add the mean rates (3,) over an interval by the gyroscope and by images; covariance of the latter, drone axes."""
     H = np.zeros((len(bank.state), 3, SIZE))
     H[:, :, GYRO_BIAS] = np.eye(3)
     residual = rate_radps - rate_visual_radps - bank.state.bias[:, 3:]

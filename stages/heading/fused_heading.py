@@ -1,11 +1,11 @@
 """Arbitration between the yaw by vanishing points (a RESOLVED RelativeRotation) and by the drone's own motion.
 
-A pose with a yaw error of 90 deg crashes the drone that uses it, so a contradiction wins:
+A pose with a yaw error of 90 deg crashes the drone that uses it, so a contradiction withdraws the yaw:
 
     both differ by more than 4 sigma and 5 deg     neither is used until they agree again, or no rotation by vanishing
                                                    points has come for 30 s
     the branch of the vanishing points switched    they are not used for 2 s, unless motion agrees
-    that branch is no longer RESOLVED              what came from them is not used unless motion agreed
+    that branch is no longer RESOLVED              a yaw from vanishing points is dropped unless motion agreed
 
 Source: ours; DESIGN: "never send an unresolved branch".
 """
@@ -58,12 +58,12 @@ class Heading:
         return self._switches is not None and switches != self._switches
 
     def agrees(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
-        """Whether a recent yaw by motion is the same."""
+        """Whether a recent yaw by motion agrees within ALIKE sigmas and SLACK_RAD."""
         m = self._fresh_motion(stamp_ns)
         return m is not None and apart_rad(m.yaw_rad, yaw_rad) <= ALIKE * math.hypot(m.sigma_rad, sigma_rad) + SLACK_RAD
 
     def denies(self, stamp_ns: int, yaw_rad: float, sigma_rad: float) -> bool:
-        """Whether a recent yaw by motion is clearly another."""
+        """Whether a recent yaw by motion differs by more than CLEAR sigmas and SLACK_RAD."""
         m = self._fresh_motion(stamp_ns)
         return m is not None and apart_rad(m.yaw_rad, yaw_rad) > CLEAR * math.hypot(m.sigma_rad, sigma_rad) + SLACK_RAD
 

@@ -1,4 +1,4 @@
-"""Hypothesis bank of the yaw branches: four hypotheses, and that none of them is right.
+"""Hypothesis bank of the yaw branches: probabilities of the four branches, and of none being right.
 
 The evidence is a displacement of the drone measured twice: by LiDAR in the map frame, and by the drone's odometry,
 rotated by each branch k. The evidence of window w for branch k is
@@ -10,9 +10,9 @@ rotated by each branch k. The evidence of window w for branch k is
 The drift of an odometry is correlated over seconds: b_k is the drift velocity that branch k would need, a Gauss-Markov
 process estimated by one Kalman filter per branch. A branch with an error of 90 deg needs a drift of 1.4 times the
 velocity of the flight, so windows of slow flight together give little evidence. `o` is the share of outliers (a false
-fix), `m` that of reversed directions. None of the four is right when the LiDAR follows another object: all directions
-are then equally likely, with the length of the odometry or any other; or when the streets were matched at a wrong
-angle: then an angle between the branches explains all windows, without the large steady drift that a branch needs.
+fix), `m` that of reversed directions. None of the four is right in two cases. If the LiDAR follows another object, all
+directions of d_lidar are equally likely, with the length of the odometry or any other. If the streets were matched at a
+wrong angle, a yaw between the branches explains all windows, without the large steady drift that a branch would need.
 
 Source: ours; DESIGN, Yaw branch.
 """
@@ -43,11 +43,11 @@ class BranchSettings(BaseModel):
     metric_outliers: float = Field(default=0.1, gt=0, lt=1)
     bearing_outliers: float = Field(default=0.3, gt=0, lt=1)
     bearing_reversed: float = Field(default=0.1, gt=0, lt=1)
-    drift_mps: float = Field(default=0.12, gt=0)  # odometry's velocity error, one axis, drone and vehicle together
+    drift_mps: float = Field(default=0.12, gt=0)  # velocity error of drone's and vehicle's odometry together, one axis
     drift_time_s: float = Field(default=20.0, gt=0)
     scale: float = Field(default=0.05, ge=0)  # relative error of the length of a displacement
     bearing_floor_deg: float = Field(default=9.0, gt=0)
-    none_right: float = Field(default=0.05, gt=0, lt=1)  # prior probability
+    none_right: float = Field(default=0.05, gt=0, lt=1)  # prior probability that none of the branches is right
     least_windows: int = Field(default=3, ge=1)  # two may agree by chance; with fewer, no branch is RESOLVED
     leak_per_s: float = Field(default=1e-6, ge=0)  # rate at which a known branch returns to the prior
 
@@ -101,7 +101,7 @@ class HypothesisBank:
         self._drift_ns: int | None = None
 
     def _first(self, none: float) -> Array64:
-        """Weights (h + 1,): the hypotheses over the circle, then `none`."""
+        """Prior weights (h + 1,): the hypotheses over the circle, then `none`; `none` is their prior probability."""
         weight = np.full(len(self._R) + 1, MISALIGNED_SHARE * none / (len(self._R) - 4))
         weight[self._branches] = (1 - none) / 4
         weight[-1] = (1 - MISALIGNED_SHARE) * none
@@ -114,7 +114,7 @@ class HypothesisBank:
         return np.append(branches, max(1.0 - branches.sum(), 0.0))
 
     def best(self, current: int) -> int:
-        """The most probable branch; `current` if it is as probable as any."""
+        """The most probable branch; `current` on a tie."""
         p = self._weight[self._branches]
         return current if p[current] >= p.max() * (1 - 1e-9) else int(np.argmax(p))
 

@@ -17,21 +17,21 @@ from stages.messages import DroneMotion, VisualMotion
 from stages.odometry.drone.trajectory import AutopilotTrajectory, VisualTrajectory, rotation_between
 
 KEPT = 1024  # intervals: 20 s at 50 Hz
-HELD_NS = 150_000_000  # the newest interval is held so long beyond its end
-HELD_NOISE = 0.3, 0.05  # densities while it is held: specific force [m/s^2 / sqrt(Hz)], rate [rad/s / sqrt(Hz)]
-TURN_CHANGE_RADPS = 0.35  # of the rate after the newest image, without an IMU
-CURRENT_NS = 1_000_000_000  # the IMU is in use for so long after its newest interval
+HELD_NS = 150_000_000  # longest extrapolation with the newest interval's values
+HELD_NOISE = 0.3, 0.05  # its noise densities: specific force [m/s^2 / sqrt(Hz)], rate [rad/s / sqrt(Hz)]
+TURN_CHANGE_RADPS = 0.35  # one sigma, of the turn rate after the newest image, without an IMU
+CURRENT_NS = 1_000_000_000  # age of the newest interval up to which the IMU is in use
 
 
 class Gap(NamedTuple):
-    """A time without an IMU."""
+    """A time span without IMU data."""
 
     from_ns: int
     to_ns: int
 
 
 class ImuBuffer:
-    """IMU intervals in the order of time, and the turns by images for the times without."""
+    """IMU intervals in order of time; turns measured by images bridge the gaps."""
 
     def __init__(self) -> None:
         self._intervals: deque[DroneMotion] = deque(maxlen=KEPT)

@@ -7,8 +7,8 @@ an outlier share o with a constant density u, so no single one excludes a hypoth
     L = (1 - o) N(r; 0, S) + o u,   w <- w L,   beta = (1 - o) N / L
     x <- x + beta K r,   P <- P - beta K S K^T + beta (1 - beta) K r r^T K^T        (moments of both cases)
 
-Hypotheses that agree are merged, improbable ones dropped. One whose yaw is poorly known is split in three, so that the
-linearisation holds.
+Hypotheses that agree are merged, improbable ones dropped. A hypothesis with a large yaw sigma is split in three, so
+that the linearisation holds.
 
 Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 11 (static multiple
 model), and PDA, 3.4 of Bar-Shalom and Li (1995), with one measurement; split: Faubel et al. (2009), 3 components.
@@ -49,7 +49,7 @@ LEAST_CANDIDATE = 0.05  # a less probable hypothesis is not the best one
 
 
 class InertialBank:
-    """Hypotheses with log weights, normalised."""
+    """Yaw hypotheses and their normalised log weights."""
 
     def __init__(self, state: InertialState, log_weight: Array64) -> None:
         self.state, self.log_weight = state, log_weight - _log_sum(log_weight)
@@ -89,7 +89,7 @@ class InertialBank:
         return float(self.weight @ beta)
 
     def tidy(self) -> None:
-        """Drop, split and merge."""
+        """Drop improbable hypotheses, split wide ones and merge those that agree."""
         keep = np.flatnonzero(self.log_weight > self.log_weight.max() + math.log(DROPPED))
         if len(keep) < len(self.log_weight):
             self.state, self.log_weight = self.state.rows(keep), self.log_weight[keep]
@@ -165,8 +165,8 @@ def start(
 ) -> InertialBank:
     """Hypotheses at yaws round the circle, at a LiDAR position.
 
-    velocity: map, with its sigma [m/s]. up_drone: the vertical in drone axes. memory: a yaw [rad] known before, its
-    sigma and the probability that it still holds.
+    velocity: map, with its sigma [m/s]. up_drone: the vertical in drone axes. memory: a yaw [rad] known before,
+    its sigma [rad] and the probability that it still holds.
     """
     yaws = 2 * math.pi / STARTS * np.arange(STARTS)
     sigma, log_weight = np.full(STARTS, START_YAW_RAD), np.zeros(STARTS)
@@ -199,7 +199,7 @@ def level(up_drone: Array64) -> Array64:
 
 
 def joined(states: list[InertialState]) -> InertialState:
-    """All hypotheses of some states."""
+    """The hypotheses of several states in one."""
     return InertialState(
         np.concatenate([s.R for s in states]),
         np.concatenate([s.xyz_m for s in states]),

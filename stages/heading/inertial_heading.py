@@ -3,7 +3,8 @@
 The bank of hypotheses is propagated by the IMU from measurement to measurement, in the order of their times. A
 measurement a little older than the bank is moved to the bank's time by the drone's own motion since.
 
-The heading is decided when a yaw within 20 deg of the best one has P > 0.999 after DECISIONS LiDAR positions in a row.
+The heading is decided when the yaws within 20 deg of the best one together have P > 0.999 at DECISIONS consecutive
+LiDAR positions.
 
 Source: ours; issue: heading once.
 """
@@ -32,7 +33,7 @@ FREE_SIGMA_MPS = 1.0  # of the tracker's velocity
 
 
 class InertialHeading:
-    """The bank with its time."""
+    """The bank of yaw hypotheses with its time, before the heading is decided."""
 
     def __init__(self, imu: ImuBuffer) -> None:
         self._imu = imu
@@ -66,7 +67,7 @@ class InertialHeading:
         self.stamp_ns, self.evidence, self._decisions = stamp_ns, None, DECISIONS
 
     def restart_yaw(self) -> None:
-        """Every yaw is probable again; position and velocity stay."""
+        """Reset the yaw to uniform; position and velocity stay."""
         if self.bank is not None:
             one = self.bank.mean()
             covariance = one.covariance[0, POSITION, POSITION]

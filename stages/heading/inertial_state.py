@@ -38,7 +38,7 @@ class ImuIntervals:
 
     @property
     def seconds(self) -> float:
-        """Their whole length."""
+        """Total duration [s]."""
         return float(self.step_s.sum())
 
 
@@ -131,8 +131,8 @@ def predict(state: InertialState, imu: ImuIntervals, weight: Array64) -> Inertia
     return InertialState(*moved[:3], state.bias, moved[3])
 
 
-FREE_ACCELERATION, FREE_RATE = 2.2, 0.7  # densities without an IMU [m/s^2 / sqrt(Hz)], [rad/s / sqrt(Hz)]
-FREE_MOST_RAD = 0.35  # sigma of each axis that the rotation reaches without an IMU: then it is not known
+FREE_ACCELERATION, FREE_RATE = 2.2, 0.7  # process noise without an IMU [m/s^2 / sqrt(Hz)], [rad/s / sqrt(Hz)]
+FREE_MOST_RAD = 0.35  # largest sigma of the rotation about each axis without an IMU
 
 
 def predict_free(state: InertialState, seconds: float, turn: Array64, variance_rad2: float | None) -> InertialState:

@@ -5,10 +5,11 @@
 p: positions by the autopilot (odom), z: fixes (map). c and a are linear; e has the noise of the fixes and the drift of
 both odometries, correlated over the window, with equal covariance on both axes. So generalised least squares gives a
 with covariance I / Lambda, and the likelihood over the circle is exp(Lambda |a| cos(psi - peak)): one peak, whose
-sharpness grows with the displacement. It weights hypotheses over the circle. There is no yaw
+sharpness grows with the displacement. It weights hypotheses over the circle. No yaw is published
     while the drone has not moved: sigma is large
-    where both do not measure the same motion: lengths (|a| is not 1), heights or paths disagree
-    while a yaw farther than 45 deg from the peak has odds above 1 : 1000, or P of the peak is below 0.999
+    where LiDAR and odometry do not measure the same motion: lengths (|a| is not 1), heights or paths disagree
+    while a yaw farther than 45 deg from the peak has more than 1/1000 of the peak's likelihood, or P within 45 deg of
+    the peak is below 0.999
 
 Source: DESIGN, Yaw branch; Horn, JOSA A 4(4) (1987) for the complex number; ours.
 """
@@ -28,7 +29,7 @@ from stages.heading.yaw_fit import Yaw
 APART_NS = 400_000_000  # between the fixes used: their errors are correlated for that long
 WINDOW_NS = 30_000_000_000
 LEAST, MOST = 6, 48  # points
-MIN_TO_CONFIRM = 4  # that another yaw is not on a wrong branch
+MIN_TO_CONFIRM = 4  # points: least number for a fit, or to compare a given yaw with
 LEAST_M = 1.0  # of displacement
 FLOOR_M = 0.05  # least sigma of a fix
 SCALE = 0.03  # relative error of length, by the scales of both odometries
@@ -63,7 +64,7 @@ class YawLikelihood:
     sharpness: float
 
     def alternatives_odds(self, yaw_rad: float) -> float:
-        """Odds of the three other branches together against a yaw."""
+        """Odds of the three other branches of a yaw together, relative to the yaw itself."""
         quarters = yaw_rad - self.peak_rad + 0.5 * math.pi * np.arange(1, 4)
         return float(np.exp(self.sharpness * (np.cos(quarters) - math.cos(yaw_rad - self.peak_rad))).sum())
 
@@ -199,7 +200,7 @@ def moves_with(points: tuple[Point, ...], yaw: Yaw, errors: FuseErrors) -> bool:
 
 
 def bank(a: Array64, precision: float) -> tuple[float, float, float]:
-    """Peak [rad], probability of the yaws within 45 deg of it, and the odds of the best one farther off."""
+    """Peak [rad], probability of the yaws within 45 deg of it, and the likelihood ratio of the best one beyond."""
     weight = np.exp(precision * float(np.linalg.norm(a)) * (np.cos(BANK_RAD) - 1.0))
     near = np.minimum(BANK_RAD, 2 * math.pi - BANK_RAD) <= NEAR_RAD
     return math.atan2(a[1], a[0]), float(weight[near].sum() / weight.sum()), float(weight[~near].max())

@@ -1,7 +1,8 @@
 """Yaw of the autopilot's frame `odom` in `map` (yaw_fit.py), and how long it stays valid.
 
 It is kept while nothing measures it, also over gaps of the LiDAR, until the headings of both odometries have drifted
-too far, the autopilot may have turned its yaw during a silence, or sources contradict each other (fused_heading.py).
+too far, the autopilot may have changed its yaw during a telemetry gap, or sources contradict each other
+(fused_heading.py).
 
 Source: ours.
 """
@@ -22,8 +23,8 @@ from stages.messages import DroneAttitude, DroneLocalPosition, DroneOdometry
 from stages.odometry.drone.trajectory import AutopilotTrajectory
 
 MOTION_DEG = 6.0  # largest sigma of a yaw by motion
-SILENCE_S, SILENCE_RAD = 3.0, math.radians(45.0)  # a longer silence may hide a turn of frame odom
-SILENT_RAD = math.radians(1.0)  # sigma added by a shorter silence
+SILENCE_S, SILENCE_RAD = 3.0, math.radians(45.0)  # a longer telemetry gap may hide a turn of frame odom
+SILENT_RAD = math.radians(1.0)  # sigma added by a shorter telemetry gap
 
 
 class OdometryYaw:
@@ -37,7 +38,7 @@ class OdometryYaw:
         self.yaw: Yaw | None = None
 
     def add(self, trail: AutopilotTrajectory, telemetry: DroneAttitude | DroneLocalPosition | DroneOdometry) -> None:
-        """Add telemetry to the trajectory; a silence that may hide a turn of frame odom adds variance."""
+        """Add telemetry to the trajectory; a gap that may hide a turn of frame odom adds variance."""
         before_ns, silences = trail.attitude_ns, trail.gaps
         R_before = None if before_ns is None else trail.R_odom_drone(before_ns)
         rate = 0.0 if before_ns is None else trail.rate_radps(before_ns)
@@ -79,7 +80,7 @@ class OdometryYaw:
         return self.yaw is not None and self.heading.agrees(stamp_ns, self.yaw.yaw_rad, self.yaw.sigma_at(stamp_ns))
 
     def useful(self, stamp_ns: int) -> Yaw | None:
-        """The yaw; None: none, or its drift since is too large."""
+        """The yaw; None: never measured, or it has drifted too far since."""
         return self.yaw if self.yaw is not None and self.yaw.sigma_at(stamp_ns) <= self._sigma_rad else None
 
     def known(self, stamp_ns: int) -> Yaw | None:
@@ -87,7 +88,7 @@ class OdometryYaw:
         return None if self.heading.contradiction else self.useful(stamp_ns)
 
     def remember(self, stamp_ns: int, R_map_odom: Array64, variance_rad2: float) -> None:
-        """Take the yaw of the pose, unless it is less certain."""
+        """Take the yaw of the pose, unless its variance is larger than that of the present yaw."""
         if self.yaw is None or math.sqrt(variance_rad2) <= self.yaw.sigma_at(stamp_ns):
             self.yaw = Yaw(stamp_ns, heading_rad(R_map_odom), variance_rad2)
 

@@ -1,8 +1,8 @@
-"""Whether the object that the LiDAR follows moves as the drone's IMU measures, or on its own.
+"""Whether the object that the LiDAR follows moves as the drone's IMU measures, or independently of it.
 
 The alternative is an object that moves without any relation to the IMU: Kalman filters of position and velocity with a
-white acceleration, gentle and hard. Both predict each LiDAR position; the logarithm of the ratio of their likelihoods
-adds up. It is bounded, so that a change of the followed object shows within seconds.
+white acceleration, one of low and one of high density. Both alternatives predict each LiDAR position; the log ratios of
+their likelihoods are summed. The sum is bounded, so that a change of the followed object is detected within seconds.
 
 Source: Bar-Shalom, Li, Kirubarajan (2001), 6.2 (white acceleration) and 11.6 (static multiple model); ours.
 """
@@ -19,10 +19,11 @@ from stages.heading.inertial_bank import log_normal
 
 ACCELERATIONS = 0.7, 2.2  # white noise densities [m/s^2 / sqrt(Hz)]
 START_MPS = 4.0  # one axis
-LEAST_SHARE = 1e-3  # of each of both
+LEAST_SHARE = 1e-3  # of each of the two filters
 BOUND = 18.0
 CERTAIN = math.log(999.0)
-START, START_SUSPECT = -2.0, -6.0  # prior: other drones and birds are followed at times; at once after one was denied
+START, START_SUSPECT = -2.0, -6.0  # prior log ratio: the tracker may follow other drones and birds;
+# START_SUSPECT after another object was followed
 EXCLUDED = -10.0
 
 
@@ -42,12 +43,12 @@ class Ownership:
 
     @property
     def cleared(self) -> bool:
-        """Whether an object that follows one that was denied is the drone."""
+        """Whether the object is the drone, by the stricter threshold for one that is followed after another object."""
         return self.log_ratio > 2.0 * CERTAIN
 
     @property
     def denied(self) -> bool:
-        """Whether another motion is more probable."""
+        """Whether a motion independent of the IMU is more probable."""
         return self.log_ratio < 0.0
 
     @property
@@ -56,7 +57,7 @@ class Ownership:
         return self.log_ratio < EXCLUDED
 
     def restart(self, suspect: bool = False) -> None:
-        """Another object may be followed from now on; `suspect`: the one before was not the drone."""
+        """Start again for a possibly different object; `suspect`: the previous one was not the drone."""
         self._stamp_ns, self._weight = None, np.full(2, 0.5)
         self.log_ratio = START_SUSPECT if suspect else START
 

@@ -1,8 +1,8 @@
 """Displacements of the drone by LiDAR and by its own odometry, in windows that do not overlap.
 
-A window runs from one group of fixes to a later one, once the drone is `baseline_m` away and that is well above the
-noise of the fixes. The fixes of a group are moved to one time along the displacement by odometry, which each hypothesis
-turns by its own yaw, and their median is taken: one false fix has no effect.
+A window begins at one group of fixes and ends at a later one, as soon as the drone is at least `baseline_m` away and
+this distance is well above the noise of the fixes. Each hypothesis rotates the displacement by odometry by its own yaw,
+and with it moves the fixes of a group to a common time. Their median is used, so that one false fix has no effect.
 
 Source: ours; DESIGN, Yaw branch: non-overlapping windows, baseline >= 0.4 m.
 """
@@ -20,10 +20,10 @@ from stages.heading.hypothesis_bank import DIRECTIONS, Displacement, turns
 from stages.messages import DroneFix, VisualMotion
 from stages.odometry.drone.trajectory import AutopilotTrajectory
 
-HANDFUL = 3  # fixes
+HANDFUL = 3  # number of fixes in a group
 HANDFUL_NS = 400_000_000
 LONGEST_S = 20.0  # a drone that hardly moves starts a new window
-CLEAR = 3.0  # sigmas of the fixes' noise that a displacement must have
+CLEAR = 3.0  # least displacement, in sigmas of the fixes' noise
 FIX_FLOOR_M = 0.04  # least sigma of the median of a group
 STRAIGHT = 0.7  # straightness of a window by directions alone: net displacement over path length
 COVERED = 0.8  # share of a window that images must cover

@@ -62,7 +62,7 @@ class ServoOffset(Message):
     sigma_s: float | None  # one sigma
     rig_offset_s: float  # `servo_time_offset_s` of the rig
     windows: int  # windows that gave an estimate so far
-    reason: str  # result of the newest window, or why it gave none
+    reason: str  # result of the newest window, or why it has none
 
 
 @message(schema=15)

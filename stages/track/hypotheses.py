@@ -60,7 +60,7 @@ class Hypotheses:
         self._models = OdometryMotionModel(0), OdometryMotionModel(1)
         # cache: all candidates need the same time
         self._predicted: dict[Hypothesis, tuple[int, Array64, Array64]] = {}
-        self._sample: tuple[int, OdometrySample | None] | None = None  # the same for the odometry
+        self._sample: tuple[int, OdometrySample | None] | None = None  # cached odometry sample, likewise
 
     def __iter__(self) -> Iterator[Hypothesis]:
         """Iterate over a copy: hypotheses may be added or removed meanwhile."""

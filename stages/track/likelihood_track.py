@@ -54,11 +54,11 @@ class LikelihoodTrackSettings(Settings):
     hull_share: float = Field(0.075, ge=-1, le=1)  # distance of the centre behind the returns' mean, over the span
     max_drones: int = Field(1, ge=1, le=8)  # tracked at the same time
     max_hypotheses: int = Field(4, ge=0, le=16)  # unconfirmed candidates
-    own_sigma_m: float = Field(0.8, gt=0)  # beyond this sigma only the detector can reacquire it
+    own_sigma_m: float = Field(0.8, gt=0)  # position sigma beyond which only the detector can reacquire the track
     manoeuvre: float = Field(1.0, gt=0)  # density q of the drone's acceleration [m^2/s^3]
     odometry_manoeuvre: float = Field(0.01, gt=0)  # the same with odometry
-    coast_after_s: float = Field(0.35, gt=0)  # time without a return from TRACKING to COASTING
-    lost_after_s: float = Field(6.0, gt=0)  # time without a return from COASTING to LOST; with odometry later,
+    coast_after_s: float = Field(0.35, gt=0)  # time without a return after which a track is COASTING
+    lost_after_s: float = Field(6.0, gt=0)  # time without a return after which a track is LOST; with odometry later,
     lost_sigma_m: float = Field(5.0, gt=0)  # when its largest position sigma exceeds this
     start_sigma_mps: float = Field(1.5, gt=0)  # one sigma of the detector's velocity
     tilt_deg: float = Field(0.05, ge=0)  # of the servo's axis against the vehicle's, about x and y, one sigma each

@@ -43,7 +43,7 @@ class _State:
     acquired: bool = False  # at least one frame with returns since the detection
     hit_since_sweep: bool = False
     rivals: int = 0  # successive sweeps that accepted a drone at another position only
-    event: str = "no drone detected yet"  # why it searches, or an event to report with the next state
+    event: str = "no drone detected yet"  # why the state is SEARCHING, or an event to report with the next state
     near: list[SweptPoints] = field(default_factory=lambda: list[SweptPoints]())  # F, slice by slice
 
 

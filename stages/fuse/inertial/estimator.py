@@ -1,9 +1,10 @@
-"""Estimate of the drone that is followed, by IMU: a bank of headings until one is decided, then a graph.
+"""Estimate of the drone by IMU: a bank of yaw hypotheses until the heading is decided, then a factor graph.
 
-Measurements are used in the order of their times, up to the newest IMU interval: `pass_time` moves that horizon; what
-is published is propagated from there by the IMU. A measurement that arrives later than that is moved to the horizon.
+Measurements are used in order of time, up to the horizon: the time up to which the motions of drone and vehicle are
+measured. The published state is propagated from the horizon by the IMU. A measurement that arrives after the horizon
+has passed its time is moved to the horizon.
 
-The heading of a drone that was lost is remembered and propagated by the gyroscope: a hypothesis when it is found again.
+The heading of a lost drone is remembered and propagated by the gyroscope: it is one hypothesis when a drone is found.
 
 Source: ours; DESIGN, Fusion.
 """
@@ -32,15 +33,15 @@ from stages.heading.odometry_heading import OdometryHeading
 from stages.heading.ownership import Ownership, log_evidence
 from stages.messages import AutopilotMotion, DroneFix, DroneMotion, RelativeRotation, VisualMotion
 
-DELAY_NS = 100_000_000  # measurements of one time arrive within
+DELAY_NS = 100_000_000  # measurements arrive at most this long after their stamp
 GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
 TILT_TIME_S = 20.0  # time constant of the error of roll and pitch
 KEPT_NS = 15_000_000_000  # without a LiDAR position the estimate ends; the heading is remembered
 MEMORY_NS = 120_000_000_000
 SAME_DRONE, MAYBE_ANOTHER = 0.9995, 0.9  # probability that a remembered heading holds
-VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # beyond its newest pose; longest wait for one
-IMAGE_NS = 300_000_000  # without an IMU, the next image of the drone is awaited for
-FREE_NS = 1_000_000_000  # without IMU and vanishing points a yaw is forgotten after
+VEHICLE_NS, WAIT_NS = 60_000_000, 350_000_000  # extrapolation of the vehicle's pose; longest wait for a newer one
+IMAGE_NS = 300_000_000  # without an IMU, longest wait for the drone's next image
+FREE_NS = 1_000_000_000  # without IMU and vanishing points the yaw is dropped after this time
 Measurement = DroneFix | RelativeRotation | VisualMotion
 
 
@@ -151,14 +152,14 @@ class InertialEstimator:
 
     @property
     def is_own(self) -> bool:
-        """Whether what the LiDAR follows moves as the IMU measures; without an IMU nothing speaks against it."""
+        """Whether the followed object moves as the IMU measures, and so is the drone; without an IMU: not suspect."""
         if self.suspect:
             return self.ownership.cleared
         return self.ownership.certain or not self.imu.is_current(self.stamp_ns)
 
     @property
     def stamp_ns(self) -> int:
-        """The horizon's state is of this time."""
+        """Time of the state at the horizon."""
         return self.graph.stamp_ns if self.graph.running else self.heading.stamp_ns
 
     def at(self, stamp_ns: int) -> InertialState:

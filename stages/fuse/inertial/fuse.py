@@ -4,9 +4,9 @@
       -> bank of headings, then a graph of poses  -> propagated to now -> RelativePose, HeadingEstimate
 
 Now is the newest stamp received on any port, on a grid of 20 ms; it never decreases. Every port but `fix` may be
-unwired, fall silent and return. Without `motion` the vehicle frame serves as the map frame; only with the setting
-`parked` is it assumed to stand, so that the IMU is used. Without an IMU there are positions, and a rotation only while
-cameras give one whose branch is decided.
+unwired, stop and resume. Without `motion` the vehicle frame serves as the map frame; the IMU is then used only with the
+setting `parked`, which states that the vehicle is stationary. Without an IMU there are positions, and a rotation only
+while cameras give one whose branch is decided.
 
 The autopilot's own position and attitude are evidence for the heading only while they are independent of our pose
 (DroneMotion.autopilot); its yaw may be wrong by any angle.
@@ -60,7 +60,7 @@ Poses = Iterator[RelativePose | HeadingEstimate]
 class InertialFuseSettings(Settings):
     """Settings of `InertialFuse`."""
 
-    parked: bool = False  # the vehicle stands, without VehicleMotion
+    parked: bool = False  # the vehicle is stationary, even without VehicleMotion
     track_id: int | None = Field(None, ge=1)  # follow this drone; None: the lowest number that is TRACKING
     lag_s: float = Field(2.0, ge=0.5, le=10)
     errors: InertialErrors = InertialErrors()

@@ -20,7 +20,7 @@ class InertialErrors(BaseModel):
     fix_bias_share: float = Field(default=0.25, ge=0, lt=1)
     clock_s: float = Field(default=0.01, ge=0)  # of the stamps of IMU and LiDAR against each other
     tilt_deg: float = Field(default=2.0, gt=0)  # of the autopilot's vertical
-    tilt_period_s: float = Field(default=0.5, gt=0)  # between two uses of it
+    tilt_period_s: float = Field(default=0.5, gt=0)  # between two uses of the autopilot's vertical
     rotation_time_s: float = Field(default=1.0, ge=0)  # time constant of the error of vanishing points
     rotation_bias_share: float = Field(default=0.2, ge=0, lt=1)
     compass_deg: float = Field(default=7.0, gt=0)  # of the autopilot's yaw

@@ -63,7 +63,7 @@ def score_kernel(
             column = pad + left
             for dv in range(reach + 1):
                 for du in range(1, reach + 1):
-                    # an offset and its three quarter turns: every one but (0, 0) comes once, four in one pass
+                    # an offset and its rotations by multiples of 90 deg: all but (0, 0) come once, four in one pass
                     ring = max(dv, du)
                     edge = np.float32(ring)
                     if ring > least and ring <= half_outer:  # outer box, Equations (4) and (5)

@@ -100,7 +100,7 @@ def _follow(
 ) -> int:
     """Follow the ridge with the brighter side on the left (way 1) or right (-1); returns the number of points.
 
-    Pictures are flat here: pixel `at` is column at % width of row at // width.
+    Images are flattened: pixel `at` is column at % width of row at // width.
     """
     count = 0
     row, column = at // width, at % width

@@ -45,7 +45,7 @@ class Vehicle(Protocol):
         ...
 
     def reboot(self) -> bool:
-        """Reboot; False: refused while armed."""
+        """Reboot; False: rejected while armed."""
         ...
 
 

@@ -101,7 +101,7 @@ class FlightOutcome:
             self._poses.append((int(message.time_usec) * 1000, xyz, math.atan2(R[1, 0], R[0, 0])))
 
     def is_over(self) -> bool:
-        """Look at what was flown since the last call, obstacles and fly-aways; True: lost some time ago."""
+        """Check the path since the last call for collisions and fly-aways; True: the flight was lost some time ago."""
         position = self._stack.quadrotor.state[0:3].copy()
         if self._last is not None:
             step = position - self._last

@@ -24,7 +24,7 @@ COMPASS_HZ, BARO_HZ = 10.0, 20.0
 
 @dataclass(frozen=True, slots=True)
 class GpsFix:
-    """One fix; time_ns is when the autopilot believes it was true, on its clock."""
+    """One fix; time_ns is the measurement time that the autopilot assumes, on its clock."""
 
     time_ns: int
     xyz_m: Array64

@@ -312,7 +312,7 @@ class Ekf3:
         return self.aiding and not self.position_timeout and self.yaw_aligned
 
     def set_origin(self) -> bool:
-        """SET_GPS_GLOBAL_ORIGIN: refused when there is one."""
+        """SET_GPS_GLOBAL_ORIGIN: rejected when an origin is set already."""
         if self.origin:
             return False
         self.origin = True

@@ -32,7 +32,7 @@ class Sources:
     velocity: AidingSource
     height: AidingSource
     climb: AidingSource
-    yaw: AidingSource  # BARO stands for the compass, which has the same value
+    yaw: AidingSource  # BARO means the compass here: both have the same number
 
 
 SOURCE_SETS: dict[SourceSet, Sources] = {
